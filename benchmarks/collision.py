@@ -1,14 +1,13 @@
-"""Collision detection: time of a search, of its phases, of its broad phases and reductions, against size and over frames.
+"""Collision detection: time of a search and its phases, broad phases and reductions, over size and over frames.
 
 taisoft bench collision [--quick] [--arch cpu|cuda] [--precision f32|f64] [--out FILE.json]
 
-Configurations: piles of 27 touching cubes, two cubes, and the report's scenes; bodies are hit by the proximity of their surfaces
-or through distance fields. A time is the median over rounds of one phase, or of a whole search (boxes, candidates, contacts,
-reduction), with nothing copied to the host; spread is the distance between the quartiles over the median. The first search,
-which compiles the kernels and lets the buffers grow, is timed apart. Figures named are those of the report, which `taisoft bench
-report` draws. The older code's times are quoted: of a whole step, contacts and solver, on this class of machine. Exit status: 0,
-or 1 where a limit is not met. --quick has small meshes, few rounds and frames, and no limit. The whole takes about fifteen
-minutes on two cores.
+Configurations: piles of 27 touching cubes, two cubes, and the report's scenes, by proximity of surfaces or by distance fields.
+A time is the median over rounds of one phase or of a whole search (boxes, candidates, contacts, reduction), without copies to
+the host; spread is the interquartile range over the median. The first search, which compiles kernels and grows buffers, is timed
+separately. Figure numbers are those of the report, which `taisoft bench report` draws. The older code's times are quoted: a whole
+step with contacts and solver on this class of machine. Exit status: 0, or 1 if a limit is not met. --quick has small meshes, few
+rounds and frames, and no limits. A full run takes about fifteen minutes on two cores.
 """
 
 import sys
@@ -38,13 +37,13 @@ from .document import Document, Limit, begin, crossovers, ms, table, timed_limit
 from .runner import make_parser, parse_options
 
 QUICK_FRAMES = 3
-LIMITS = {pile_setup(6).name: 8.0, pile_setup(LARGE_PILE).name: 80.0}  # [ms] of a whole search, f32 on two cores
-WANTED_GAIN = 1000.0  # of the sheet and cube over the older code
-REPORTS_BEST = 2.2  # ratio of cell to edge that the report found
+LIMITS = {pile_setup(6).name: 8.0, pile_setup(LARGE_PILE).name: 80.0}  # [ms] a whole search, f32 on two cores
+MIN_SPEEDUP = 1000.0  # sheet and cube, over the older code
+REPORTS_BEST = 2.2  # the report's best ratio of cell to edge
 
 
 def measure(quick: bool, runtime: Runtime, document: Document) -> dict:
-    """Everything, printed as it comes: rows, films and sweeps by name."""
+    """Measure and print everything: rows, films and sweeps by name."""
     rounds, frames = (QUICK_ROUNDS, QUICK_FRAMES) if quick else (ROUNDS, FRAMES)
     few = slice(2 if quick else None)
 
@@ -70,12 +69,12 @@ def measure(quick: bool, runtime: Runtime, document: Document) -> dict:
 
 
 def row_table(rows: list[Row]) -> str:
-    """A row a configuration and geometry; failures below."""
+    """A row per configuration and geometry; failures below."""
 
     def phase(name: str):
         return lambda r: ms(r.phase(name)) if r.whole else "-"
 
-    columns = [("<scene", "{.setup}"), ("<hit by", "{.geometry}")]
+    columns = [("<scene", "{.setup}"), ("<geometry", "{.geometry}")]
     columns += [(name, f"{{.{name}:,}}") for name in ("tets", "triangles", "active", "pairs", "found", "contacts")]
     columns += [(f"{name} [ms]", phase(name)) for name in PHASES]
     columns += [
@@ -89,7 +88,7 @@ def row_table(rows: list[Row]) -> str:
 
 
 def older_table(rows: list[Row]) -> str:
-    """The report's scenes beside a whole step of the older code, which is quoted."""
+    """The report's scenes and the quoted time of a whole step of the older code."""
 
     def quoted(r: Row) -> str:
         low, high = OLDER[r.setup]
@@ -97,31 +96,31 @@ def older_table(rows: list[Row]) -> str:
 
     columns = (
         ("<scene", "{.setup}"),
-        ("<hit by", "{.geometry}"),
+        ("<geometry", "{.geometry}"),
         ("search [ms]", lambda r: ms(r.timing.median)),
         ("older code, whole step [ms]", quoted),
-        ("at least faster", lambda r: f"{OLDER[r.setup][0] / (1e3 * r.timing.median):,.0f}"),
+        ("speed-up, at least", lambda r: f"{OLDER[r.setup][0] / (1e3 * r.timing.median):,.0f}"),
     )
     return table([r for r in rows if r.setup in OLDER and r.whole], columns)
 
 
 def film_table(films: list[Film]) -> str:
-    """Median and extremes over the frames of each number."""
+    """Median, minimum and maximum of each number over the frames."""
     lines = []
     for film in films:
         for name, values in film.numbers.items():
             seconds = isinstance(values[0], float)
             shown = [ms(v) if seconds else f"{v:,.0f}" for v in (np.median(values), min(values), max(values))]
             lines.append((film.setup, film.geometry, f"{name} [ms]" if seconds else name, *shown))
-    headings = ("<scene", "<hit by", "<number", "median", "least", "most")
+    headings = ("<scene", "<geometry", "<number", "median", "minimum", "maximum")
     return table(lines, [(heading, f"{{[{k}]}}") for k, heading in enumerate(headings)])
 
 
 def reduction_table(rows: list[Row]) -> str:
-    """Reduction of O(n) beside that of two nested loops."""
+    """The O(n) reduction and that by two nested loops."""
     columns = (
         ("<scene", "{.setup}"),
-        ("<hit by", "{.geometry}"),
+        ("<geometry", "{.geometry}"),
         ("tets", "{.tets:,}"),
         ("found", "{.found:,}"),
         ("contacts", "{.contacts:,}"),
@@ -134,7 +133,7 @@ def reduction_table(rows: list[Row]) -> str:
 
 
 def broad_table(sweeps: list[Sweep]) -> str:
-    """Broad phases beside each other, against tets."""
+    """Times of the broad phases over tets."""
     columns = [("<scene", "{.setup}"), ("tets", "{.tets:,}"), ("triangles", "{.triangles:,}")]
     columns += [("pairs, k = 6", lambda s: f"{s.pairs[HASH]:,}"), ("pairs, k = 18", lambda s: f"{s.pairs[TREES[-1]]:,}")]
     columns += [(f"{name} [ms]", lambda s, name=name: ms(s.median(name))) for name in (HASH, *TREES)]
@@ -142,7 +141,7 @@ def broad_table(sweeps: list[Sweep]) -> str:
 
 
 def crossover_text(sweeps: list[Sweep]) -> str:
-    """A sentence for each tree; the report found the hash slower below about 7,500 tets and faster above."""
+    """A line per tree; in the report the hash is slower below about 7,500 tets and faster above."""
     tets, lines = [s.tets for s in sweeps], []
     for name in TREES:
         hashed, trees = [s.median(HASH) for s in sweeps], [s.median(name) for s in sweeps]
@@ -154,7 +153,7 @@ def crossover_text(sweeps: list[Sweep]) -> str:
 
 
 def cell_table(sweeps: list[Sweep]) -> str:
-    """Time of the hash against the size of its cells, a column a scene, and the best."""
+    """Time of the hash over its cell size, a column per scene, and the best."""
     by = {(s.setup, s.at): s for s in sweeps}
     columns, notes = [("cell / edge", "{:g}")], []
     for scene, own in by_scene(sweeps).items():
@@ -167,37 +166,37 @@ def cell_table(sweeps: list[Sweep]) -> str:
 
 
 def by_scene(sweeps: list[Sweep]) -> dict[str, list[Sweep]]:
-    """The sweeps of each scene."""
+    """Sweeps by scene."""
     return {scene: [s for s in sweeps if s.setup == scene] for scene in dict.fromkeys(s.setup for s in sweeps)}
 
 
 def best_cell(sweeps: list[Sweep]) -> Sweep:
-    """The fastest."""
+    """The sweep with the fastest hash."""
     return min(sweeps, key=lambda s: s.median(HASH))
 
 
 def find_limits(rows: list[Row], films: list[Film]) -> list[Limit]:
-    """Times of whole searches, what the sheet and cube gains over the older code, and equal reductions."""
+    """Limits on the time of searches, the speed-up of sheet and cube over the older code, and equal reductions."""
     by = {(r.setup, r.geometry): r for r in rows}
     limits = []
-    for setup, most in LIMITS.items():
+    for setup, limit in LIMITS.items():
         for geometry in GEOMETRIES:
             r = by.get((setup, geometry))
             what = f"{setup}, {geometry}, {r.triangles if r else 0:,} triangles: whole search [ms]"
-            limits.append(timed_limit(what, r.timing if r else None, most, 1e3))
+            limits.append(timed_limit(what, r.timing if r else None, limit, 1e3))
     for r in (r for r in rows if r.setup == SHEET.name):
         gain = OLDER[r.setup][0] / (1e3 * r.timing.median) if r.whole else np.nan
         what = f"{r.setup}, {r.geometry}: older code's whole step (quoted) / search"
-        limits.append(Limit(what, gain, WANTED_GAIN, spread_of(r.timing) if r.whole else None, at_least=True))
+        limits.append(Limit(what, gain, MIN_SPEEDUP, spread_of(r.timing) if r.whole else None, at_least=True))
     unequal = sum(r.same is False for r in rows) + sum(not film.same for film in films)
-    return [*limits, Limit("reductions that kept other contacts than two nested loops", unequal, 0)]
+    return [*limits, Limit("reductions that differ from two nested loops", unequal, 0)]
 
 
 def main(argv=None) -> int:
-    """Measure and print. Raises OutputError, or SimulationError where the arch cannot be had."""
+    """Measure and print. Raises OutputError, or SimulationError if the arch is not available."""
     parser = make_parser("collision", __doc__)
-    parser.add_argument("--quick", action="store_true", help="small meshes, few rounds and frames, no limit")
-    parser.add_argument("--precision", choices=("f32", "f64"), default="f32", help="of all but positions (default f32)")
+    parser.add_argument("--quick", action="store_true", help="small meshes, few rounds and frames, no limits")
+    parser.add_argument("--precision", choices=("f32", "f64"), default="f32", help="of everything but positions (default f32)")
     options = parse_options(parser, argv)
     document, numbers = begin("Collision detection", options.arch, options.precision)
     with closing(open_runtime(options.arch, options.precision, "the benchmark of collision detection")) as runtime:

@@ -1,7 +1,7 @@
-"""What `collision.py` measures: searches for contacts phase by phase, frame by frame, broad phases and reductions beside others.
+"""Measurements of `collision.py`: searches for contacts by phase and by frame, broad phases, reductions.
 
-A search's phases are timed between synchronisations, in one round after another; the first search of a configuration, which
-compiles the kernels and lets the buffers grow, is timed apart.
+Phases are timed between synchronisations. The first search of a configuration compiles kernels and grows buffers and is timed
+separately.
 """
 
 from dataclasses import asdict, dataclass, field
@@ -29,13 +29,13 @@ HASH, TREES = "spatial_hash", ("bvh 6", "bvh 14", "bvh 18")
 DT = 1 / FPS
 ROUNDS, QUICK_ROUNDS = 15, 2
 FRAME_ROUNDS = 3
-TURNS = 3  # in which the rounds of broad phases beside each other are taken
+TURNS = 3  # the rounds of compared broad phases are divided into this many turns
 
 
 @dataclass
 class Row:
-    """A configuration's search. phases, whole, quadratic: wall seconds of each round; first: of the first search, compiling
-    included. same: whether the quadratic reduction kept the same contacts."""
+    """Search of a configuration. phases, whole, quadratic: wall seconds per round; first: of the first search, with compilation;
+    same: whether the quadratic reduction kept the same contacts."""
 
     setup: str
     geometry: str
@@ -56,24 +56,22 @@ class Row:
 
     @property
     def timing(self) -> Timing | None:
-        """Of a whole search [s]; None where it failed."""
+        """Timing of a whole search [s]; None if it failed."""
         return summarise(self.whole) if self.whole else None
 
     def phase(self, name: str) -> float:
-        """Median of a phase [s]."""
+        """Median time of a phase [s]."""
         return float(np.median(self.phases[name]))
 
     def record(self) -> dict:
-        """As plain data."""
+        """The row as plain data."""
         return asdict(self) | {"seconds": self.timing and asdict(self.timing)}
 
 
 @dataclass
 class Film:
-    """A configuration in motion: a list over frames of each number; times are medians over FRAME_ROUNDS [s].
-
-    same: whether the quadratic reduction kept the same contacts in every frame.
-    """
+    """A configuration in motion. numbers: a list over frames of each; times are medians over FRAME_ROUNDS [s]; same: whether the
+    quadratic reduction kept the same contacts in every frame."""
 
     setup: str
     geometry: str
@@ -82,14 +80,14 @@ class Film:
     numbers: dict[str, list] = field(default_factory=dict)
 
     def add(self, **numbers) -> None:
-        """A frame."""
+        """Append a frame."""
         for name, value in numbers.items():
             self.numbers.setdefault(name, []).append(value)
 
 
 @dataclass
 class Sweep:
-    """Times [s] of broad phases, rounds for each; `at` is what is swept: tets, or the cell's edge over the mean edge."""
+    """Times [s] of broad phases. at: the parameter, tets or cell size over the mean edge; rounds: times by broad phase."""
 
     what: str
     setup: str
@@ -100,7 +98,7 @@ class Sweep:
     rounds: dict[str, list[float]] = field(default_factory=dict)
 
     def median(self, name: str) -> float:
-        """Of one broad phase [s]."""
+        """Median time of a broad phase [s]."""
         return float(np.median(self.rounds[name]))
 
 
@@ -111,7 +109,7 @@ class Sweep:
 def reduce_by_pairs(
     r: ti.template(), out: ti.template(), order: ti.types.ndarray(), state: ti.template(), kept: ti.template(), tolerance: ti.f64
 ):
-    """Two nested loops over the list that a search has left: a contact is kept unless an earlier kept one is the same."""
+    """Two nested loops over the contacts of a search: a contact is kept unless an earlier kept one is the same."""
     ti.loop_config(serialize=True)
     for _ in range(1):
         n = 0
@@ -130,7 +128,7 @@ def reduce_by_pairs(
 
 
 class Quadratic:
-    """The reduction by two nested loops, of a detection's last search."""
+    """Reduction of a detection's last search by two nested loops."""
 
     def __init__(self, detection: Detection):
         self._detection, self._arena = detection, FieldArena()
@@ -139,16 +137,16 @@ class Quadratic:
         self._state, self._kept = (self._arena.field(name, ti.i32, n + 1) for name in ("state", "kept"))
 
     def fits(self) -> bool:
-        """Whether there is room for what the detection may find now."""
+        """Whether the buffers have the detection's capacity."""
         return self._capacity == self._detection.buffer.capacity
 
     def reduce(self) -> None:
-        """Decide every contact anew."""
+        """Reduce the contacts."""
         d = self._detection
         reduce_by_pairs(d._reduction, d.buffer.data, self._order(), self._state, self._kept, MERGED * d.edge)
 
     def _order(self) -> np.ndarray:
-        """Places of the contacts in the order in which they are kept: by kind and feature, then by place. Made once a search."""
+        """Indices of the contacts ordered by kind and feature, then by index; computed once per search."""
         d = self._detection
         place = d._reduction.place.to_numpy()[: d._reduction.count[FOUND]]
         feature = d.buffer.data.feature.to_numpy()[place]
@@ -159,7 +157,7 @@ class Quadratic:
         return known[2]
 
     def same(self) -> bool:
-        """Whether it kept what the detection's own reduction kept."""
+        """Whether it kept the same contacts as the detection's reduction."""
         r = self._detection._reduction
         found, left = r.count[FOUND], r.count[LEFT]
         if self._state.to_numpy()[found] != left:
@@ -167,7 +165,7 @@ class Quadratic:
         return np.array_equal(np.sort(self._kept.to_numpy()[:left]), np.sort(r.kept.to_numpy()[:left]))
 
     def release(self) -> None:
-        """Give the memory back."""
+        """Free the memory."""
         self._arena.release()
 
 
@@ -175,7 +173,7 @@ class Quadratic:
 
 
 class Rig:
-    """A configuration's model and detection, with the phases of a search apart; closed by `with`."""
+    """Model and detection of a configuration; a context manager."""
 
     def __init__(self, setup: Setup, geometry: str, runtime: Runtime):
         self.setup, self.runtime = setup, runtime
@@ -196,17 +194,17 @@ class Rig:
         self.detection.release()
         self._arena.release()
 
-    def place(self, share: float) -> None:
-        """Put the nodes where the motion has them, a fraction of the film done."""
-        x = start(self.scene) if self.setup.motion is None else self.setup.motion(self.scene, share)
+    def place(self, fraction: float) -> None:
+        """Move the nodes to their positions at a fraction of the film."""
+        x = start(self.scene) if self.setup.motion is None else self.setup.motion(self.scene, fraction)
         self.model.state.x.from_numpy(x)
 
     def search(self) -> None:
-        """A whole search."""
+        """Run a whole search."""
         self.detection.find(0.0, DT)
 
     def phases(self) -> dict[str, float]:
-        """The same search in its phases: wall seconds of each."""
+        """Run the phases of a search; returns the wall seconds of each."""
         d, times = self.detection, [clock()]
         d._move(0.0, DT)
         times.append(clock())
@@ -219,12 +217,12 @@ class Rig:
         return dict(zip(PHASES, np.diff(times).tolist()))
 
     def n_pairs(self, broad=None) -> int:
-        """Pairs that a broad phase finds, that of the detection by default."""
+        """Number of pairs of a broad phase, by default the detection's."""
         rows = (broad or self.detection.broad).find()
         return int((rows.end.to_numpy() - rows.start.to_numpy())[: self.detection.surface.n_triangles].sum()) // 2
 
     def broad_phase(self, name: str, ratio: float | None = None) -> SpatialHash | Bvh:
-        """A broad phase of this surface: HASH with that ratio of cell to mean edge, or one of TREES."""
+        """A broad phase of this surface: HASH with a ratio of cell to mean edge, or one of TREES."""
         d, arena = self.detection, FieldArena()
         x = start(self.scene)[d.topology.node]
         if name == HASH:
@@ -236,7 +234,7 @@ class Rig:
         return made
 
     def quadratic(self) -> Quadratic:
-        """The quadratic reduction of the last search; the same as before, unless the buffer of contacts has grown."""
+        """The quadratic reduction of the last search, rebuilt if the contact buffer has grown."""
         if self._quadratic is None or not self._quadratic.fits():
             self._quadratic = Quadratic(self.detection)
             self._others.append(self._quadratic)
@@ -244,7 +242,7 @@ class Rig:
 
 
 def measure_row(setup: Setup, geometry: str, runtime: Runtime, rounds: int) -> Row:
-    """A configuration's search: what it goes through, and its phases. A failure is kept in the row."""
+    """Counts and times of a configuration's search; the row records a failure."""
     row = Row(setup.name, geometry)
     try:
         with Rig(setup, geometry, runtime) as rig:
@@ -268,12 +266,12 @@ def measure_row(setup: Setup, geometry: str, runtime: Runtime, rounds: int) -> R
 
 
 def measure_film(setup: Setup, geometry: str, runtime: Runtime, frames: int = FRAMES, broad: bool = False) -> Film:
-    """Every frame's phases, and the quadratic reduction. broad: the broad phases beside each other too."""
+    """Phases and quadratic reduction of every frame. broad: also all broad phases."""
     with Rig(setup, geometry, runtime) as rig:
         film, others = Film(setup.name, geometry, rig.tets), {}
         if broad:
             others = {name: rig.broad_phase(name) for name in (HASH, *TREES)}
-        for k in range(-1, frames):  # the last frame first: it compiles, and buffers grow
+        for k in range(-1, frames):  # the last frame first, to compile and to grow buffers
             rig.place(1.0 if k < 0 else k / max(frames - 1, 1))
             rig.search()
             quadratic = rig.quadratic()
@@ -292,7 +290,7 @@ def measure_film(setup: Setup, geometry: str, runtime: Runtime, frames: int = FR
 
 
 def measure_broad(setup: Setup, runtime: Runtime, rounds: int, ratios=None, turns: int = TURNS) -> list[Sweep]:
-    """Broad phases of a configuration in the middle of its motion: all of them, or the hash over ratios of cell to edge."""
+    """All broad phases of a configuration in the middle of its motion, or the hash over ratios of cell to edge."""
     with Rig(setup, "proximity", runtime) as rig:
         rig.place(0.5)
         rig.search()
@@ -304,9 +302,9 @@ def measure_broad(setup: Setup, runtime: Runtime, rounds: int, ratios=None, turn
             sweeps = [Sweep("ratio", setup.name, ratio, *size) for ratio in ratios]
             jobs = [(sweep, HASH, rig.broad_phase(HASH, sweep.at)) for sweep in sweeps]
         for sweep, name, broad in jobs:
-            sweep.pairs[name] = rig.n_pairs(broad)  # compiles, and lets the buffers grow
+            sweep.pairs[name] = rig.n_pairs(broad)  # compiles and grows buffers
             rig.n_pairs(broad)
-        for _ in range(turns):  # so that a slow moment of the machine falls on all
+        for _ in range(turns):  # a slow moment of the machine affects all
             for sweep, name, broad in jobs:
                 some = repeated(broad.find, max(rounds // turns, 1))
                 sweep.rounds.setdefault(name, []).extend(some)

@@ -1,4 +1,4 @@
-"""Contact: solvers beside each other on the problems of whole scenes, colourings, the cost of steps, problems of rigid scenes.
+"""Contact: solvers on the problems of whole scenes, colourings, cost of steps, problems of rigid scenes.
 
 taisoft bench contact [--quick] [--arch cpu|cuda] [--out FILE.json]
 taisoft bench contact --capture DIR [--baseline FOLDER] [--only SCENE] [--quick]
@@ -6,24 +6,24 @@ taisoft bench contact --replay DIR [--baseline FOLDER] [--only SCENE] [--out FIL
 taisoft bench contact --drops [--baseline FOLDER] [--only SCENE] [--out FILE.json] [--quick]
 taisoft bench contact --free [--baseline FOLDER] [--only CASE] [--out FILE.json] [--quick]
 
-Scenes are demos, in f32; figures named are those of the report, which `taisoft bench report` draws. Of each frame of an explicit
-run the contact problem is taken where its solve would begin, and solved to a residual of 1e-4 by every solver, in turns, from the
-impulses of the step before and from none. Residuals are computed in NumPy. A solve's time holds its colouring; a
-solver's loops run on one thread on the CPU, or, where that is said, on all. A number is a median, its range in brackets; spread
-is the distance between the quartiles over the median. Compiling is apart. Exit status: 0, or 1 where a limit is not met. --quick
-has one scene, few frames, and no limit. The whole takes about six minutes on two cores.
+Scenes are demos, in f32; figure numbers are those of the report, which `taisoft bench report` draws. In each frame of an explicit
+run every solver solves the contact problem in turn to a residual of 1e-4, from the impulses of the previous step and from zero.
+Residuals are computed in NumPy. A solve's time includes its colouring and excludes compilation; loops run on one CPU thread, or
+on all if stated. Numbers are medians with their range in brackets; spread is the interquartile range over the median. Exit
+status: 0, or 1 if a limit is not met. --quick has one scene, few frames, and no limits. A full run takes about six minutes on two
+cores.
 
---capture runs twelve scenes and keeps the states before every fifth of their implicit steps and before the ten slowest; --replay
-solves each of them again, in f32 and f64, to 1e-4, and in halves where that does not converge, and compares with the same step
-solved to 1e-8 (errors over the mean surface edge). --baseline: another version's folder, which captures the states, or solves
-them beside this one. N: Newton iterations of the first try, which are assemblies of the matrix; launches and ms: of all tries.
-Scenes whose meshes are not there are left out. Capturing takes about ten minutes, replaying ten a version.
+--capture runs twelve scenes and saves the states before every fifth implicit step and before the ten slowest. --replay solves
+these steps again in f32 and f64 to 1e-4, divided into halves if that does not converge, and compares them with the same step
+solved to 1e-8 (errors over the mean surface edge). --baseline: folder of another version, which captures or also solves the
+states. N: Newton iterations (matrix assemblies) of the first attempt; launches and ms: of all attempts. Scenes whose meshes are
+absent are left out. Capturing takes about ten minutes, replaying ten per version.
 
---drops runs bodies that fall and come to rest, among them four real meshes: Newton and CG iterations a step, steps that did not
-converge, and times, beside those of the older version. It takes two minutes, with version 0.1 beside it six.
+--drops runs bodies that fall and come to rest, including four real meshes: iterations per step, unconverged steps and times, also
+of the older version. It takes two minutes, with version 0.1 six.
 
---free takes steps without contacts, of beams with and without inverted tets, and solves statics, versions in turns; steps and
-solves count that converge in every version. It takes two minutes, with version 0.1 beside it six.
+--free runs steps without contacts, of beams with and without inverted tets, and statics, with the versions in turn; only steps
+and solves that converge in every version count. It takes two minutes, with version 0.1 six.
 """
 
 import sys
@@ -75,17 +75,17 @@ FRAMES, QUICK_FRAMES = 90, 6
 STEPS, QUICK_STEPS = 400, 40
 RUN_SECONDS, QUICK_RUN_SECONDS = 2.0, 0.4
 QUICK_PROBLEMS, REPEATS = ("Rover1039", "Rover4396"), 3
-CONTACTS = {"cube_on_box": 198, "two_cubes_two_boxes": 286}  # of the report's figures 20 and 19
+CONTACTS = {"cube_on_box": 198, "two_cubes_two_boxes": 286}  # in the report's figures 20 and 19
 STEP_SCENE, STEP_LIMIT = "cube_on_box", 2.0  # [ms] an explicit step, f32, to a residual of GOAL
-PILE, PILE_SECONDS, PILE_LIMIT = "cube_pile", 2.0, 3.0  # simulated; wall seconds per simulated second
-SWEEP_LIMIT = 0  # problems of the films that the default solver of the CPU leaves above GOAL
+PILE, PILE_SECONDS, PILE_LIMIT = "cube_pile", 2.0, 3.0  # simulated seconds; wall seconds per simulated second
+SWEEP_LIMIT = 0  # problems of the films that the default CPU solver leaves above GOAL
 
 
 def measure(quick: bool, arch: str, document: Document) -> dict:
-    """Everything, printed as it comes, by name."""
+    """Measure and print everything; results by name."""
     found: dict = {"films": [], "steps": [], "runs": [], "colourings": []}
     demos = DEMOS[: 1 if quick else None]
-    for name in demos:  # film, step and colourings of a scene with one simulator
+    for name in demos:  # film, step and colourings with one simulator
         with open_explicit(name, arch) as sim:
             found["films"].append(measure_film(name, sim, QUICK_FRAMES if quick else FRAMES, Solvers(threads=not quick)))
             to_impulses(sim)
@@ -126,7 +126,7 @@ def _problems(quick: bool, document: Document) -> list[contact_problems.Row]:
 
 
 def count_table(films: list[Film]) -> str:
-    """Contacts of each film beside those of the report."""
+    """Contacts of each film and of the report."""
     columns = (
         ("<scene", "{.scene}"),
         ("tets", "{.tets}"),
@@ -142,7 +142,7 @@ def count_table(films: list[Film]) -> str:
 
 
 def solver_table(films: list[Film]) -> str:
-    """A row a scene and solver: medians over frames, and the worst."""
+    """A row per scene and solver: medians over frames, and the worst."""
     lines = []
     for f in films:
         for name in f.solvers:
@@ -152,12 +152,23 @@ def solver_table(films: list[Film]) -> str:
             times = *timed_cells(seconds), ms(max(seconds)), ms(np.median([o.median for o in cold]))
             residual = max(o.residual for o in warm + cold)
             lines.append((f.scene, name, *sweeps, *times, f"{residual:.1e}", f"{f.missed([name])} of {2 * len(warm)}"))
-    headings = ("scene", "solver", f"sweeps {WARM}", COLD, f"ms {WARM}", "spread", "most", COLD, "worst residual", "not solved")
+    headings = (
+        "scene",
+        "solver",
+        f"sweeps {WARM}",
+        COLD,
+        f"ms {WARM}",
+        "spread",
+        "maximum",
+        COLD,
+        "worst residual",
+        "not solved",
+    )
     return markdown(headings, lines, left=(0, 1))
 
 
 def run_table(runs: list[Run]) -> str:
-    """A row an implicit run: medians over steps with contacts; problems below."""
+    """A row per implicit run: medians over steps with contacts; problems below."""
     columns = [("<scene", "{.scene}"), ("<steps", "{.settings}"), ("with contacts", lambda r: str(len(r.seconds)))]
     counts = (("contacts", "contacts"), ("multipliers", "outer"), ("Newton", "newton"), ("CG", "linear"))
     columns += [(heading, lambda r, name=name: ranged(getattr(r, name))) for heading, name in counts]
@@ -171,7 +182,7 @@ def run_table(runs: list[Run]) -> str:
 
 
 def step_table(costs: list[StepCost]) -> str:
-    """Whole explicit steps and their parts, medians."""
+    """Medians of whole explicit steps and their parts."""
     columns = [
         ("<scene", "{.scene}"),
         ("<solver", "{.solver}"),
@@ -188,7 +199,7 @@ def step_table(costs: list[StepCost]) -> str:
 
 
 def find_limits(found: dict) -> list[Limit]:
-    """What is wanted of a step, of the pile, of the films' solves and of the problems' verdicts. found: see `measure`."""
+    """Limits on a step, the pile, the solves of the films and the verdicts of problems. found: see `measure`."""
     cost = next((c for c in found["steps"] if c.scene == STEP_SCENE), None)
     t = summarise(cost.whole) if cost else None
     pile = next((r for r in found["runs"] if r.scene == PILE), None)
@@ -200,7 +211,7 @@ def find_limits(found: dict) -> list[Limit]:
         Limit(f"{STEP_SCENE}, explicit: the worst residual of these steps", cost.residual if cost else np.nan, GOAL),
         Limit(f"{PILE}, {pile.settings if pile else 'implicit'}, f32: wall s per simulated s", wall, PILE_LIMIT),
         Limit(f"{PILE}: runs that do not end ok", bad, 0),
-        Limit(f"films: solves of gauss_seidel above {GOAL:g}, judged in NumPy", missed, SWEEP_LIMIT),
+        Limit(f"films: solves of gauss_seidel above {GOAL:g}, residuals by NumPy", missed, SWEEP_LIMIT),
     ]
     if found["problems"]:
         limits.append(Limit("contact problems: verdicts that fail", sum("FAIL" in row.verdict for row in found["problems"]), 0))
@@ -208,15 +219,15 @@ def find_limits(found: dict) -> list[Limit]:
 
 
 def main(argv=None) -> int:
-    """Measure and print. Raises OutputError, or SimulationError where the arch cannot be had."""
+    """Measure and print. Raises OutputError, or SimulationError if the arch is not available."""
     parser = make_parser("contact", __doc__)
-    parser.add_argument("--quick", action="store_true", help="one scene, few frames and sizes, no limit")
-    parser.add_argument("--capture", type=Path, metavar="DIR", help="keep states of implicit steps with contacts")
+    parser.add_argument("--quick", action="store_true", help="one scene, few frames and sizes, no limits")
+    parser.add_argument("--capture", type=Path, metavar="DIR", help="save states of implicit steps with contacts")
     parser.add_argument("--replay", type=Path, metavar="DIR", help="solve such states again")
     parser.add_argument("--drops", action="store_true", help="run bodies that fall in implicit steps")
-    parser.add_argument("--free", action="store_true", help="take steps without contacts, and solve statics")
+    parser.add_argument("--free", action="store_true", help="run steps without contacts, and statics")
     parser.add_argument("--baseline", type=Path, metavar="FOLDER", help="another version")
-    parser.add_argument("--only", action="append", metavar="SCENE", help="one of those scenes alone; repeatable")
+    parser.add_argument("--only", action="append", metavar="SCENE", help="only this scene; repeatable")
     options = parse_options(parser, argv)
     known = DROPS if options.drops else FREE_NAMES if options.free else SCENES
     if unknown := [name for name in options.only or () if name not in known]:

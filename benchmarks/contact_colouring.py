@@ -1,8 +1,8 @@
-"""Coloured Gauss-Seidel: colourings of contact graphs beside each other, and where it overtakes the serial one on all threads.
+"""Coloured Gauss-Seidel: colourings of contact graphs, and the crossover with serial Gauss-Seidel on all threads.
 
-The crossover's problems are made up: two plates of n x n cells, one on the other. The vertices of each touch the triangles of the
-other, which is turned by ten degrees; the upper plate falls, and all nodes move a little at random. So the number of contacts is
-free, about 2 n^2, and a contact has four nodes.
+The crossover uses artificial problems: two plates of n x n cells on each other, one turned by ten degrees. The vertices of each
+touch triangles of the other; the upper plate falls, and all nodes have small random velocities. This gives about 2 n^2 contacts
+of four nodes each.
 """
 
 from dataclasses import dataclass
@@ -21,7 +21,7 @@ from .document import crossovers, ms, table
 from .runner import clock
 
 SEEDS, QUICK_SEEDS = 15, 3  # of random colourings
-ROUNDS = 3  # of solvers, and of the colourings that give one result
+ROUNDS = 3  # of solvers and deterministic colourings
 REPORT = {"two_cubes_two_boxes": (286, {"greedy": 95, "random": 125})}  # contacts, colours
 SIZES, QUICK_SIZES = (4, 8, 16, 32, 64, 128, 192), (8, 16)  # cells along a plate
 TURN, FRICTION, SEED = np.radians(10.0), 0.5, 1
@@ -30,10 +30,10 @@ FALL, SHAKE = -0.04, 0.02  # [m/s]
 
 @dataclass(frozen=True)
 class Colouring:
-    """A way to colour one scene's contacts, the same as often as there are seeds or rounds.
+    """A method of colouring (`way`) on one scene's contacts, per seed or round.
 
-    least: colours that any colouring needs, since so many contacts meet at one node. numbers: colours; largest: contacts of the
-    largest colour; seconds: the graph included.
+    least: lower bound of the colours, the contacts that meet at one node. numbers: colours. largest: contacts of the largest
+    colour. seconds: time, including the graph.
     """
 
     scene: str
@@ -46,7 +46,7 @@ class Colouring:
 
 
 def proper(graph: sp.csr_matrix, colour: np.ndarray) -> bool:
-    """Whether no two neighbours have one colour."""
+    """Whether neighbours have different colours."""
     joined = graph.tocoo()
     return bool((colour >= 0).all() and (colour[joined.row] != colour[joined.col]).all())
 
@@ -58,21 +58,21 @@ def _parallel(p: ContactProblem) -> np.ndarray:
 
 
 def colour_all(scene: str, p: ContactProblem, seeds: int) -> tuple[list[Colouring], dict[str, np.ndarray]]:
-    """Colourings of the contacts that `p` holds, and a colour (k,) of each way."""
-    graph, k, made, colours = graph_of(p), int(p.count[0]), [], {}
+    """Colourings of the contacts of `p`, and the colours (k,) by method."""
+    graph, k, colourings, colours = graph_of(p), int(p.count[0]), [], {}
     start, movable = p.entry_start.to_numpy(), (p.inverse_mass.to_numpy() != 0.0).any(axis=1)
     least = int(np.diff(start)[movable].max())
     _parallel(p)  # compiles
-    ways = {
+    methods = {
         "greedy": lambda _: colour_greedy(graph_of(p)),
         "random": lambda seed: colour_random(graph_of(p), seed),
         "parallel": lambda _: _parallel(p),
     }
-    for name, way in ways.items():
+    for name, method in methods.items():
         numbers, largest, seconds = [], [], []
         for seed in range(seeds if name == "random" else ROUNDS):
             begin = clock()
-            colour = way(seed)
+            colour = method(seed)
             seconds.append(clock() - begin)
             if not proper(graph, colour):
                 raise ArithmeticError(f"{scene}: the {name} colouring gives neighbours one colour")
@@ -80,12 +80,12 @@ def colour_all(scene: str, p: ContactProblem, seeds: int) -> tuple[list[Colourin
             numbers.append(len(sizes))
             largest.append(int(sizes.max()))
             colours.setdefault(name, colour)
-        made.append(Colouring(scene, name, k, least, numbers, largest, seconds))
-    return made, colours
+        colourings.append(Colouring(scene, name, k, least, numbers, largest, seconds))
+    return colourings, colours
 
 
 def colour_table(colourings: list[Colouring]) -> str:
-    """A row a scene and way, those of the report below."""
+    """A row per scene and method, then those of the report."""
 
     def counts(values: list[int]) -> str:
         low, high = min(values), max(values)
@@ -97,8 +97,8 @@ def colour_table(colourings: list[Colouring]) -> str:
         lines.append((c.scene, c.way, c.contacts, c.least, counts(c.numbers), each, counts(c.largest), ms(np.median(c.seconds))))
     for scene in dict.fromkeys(c.scene for c in colourings):
         contacts, found = REPORT.get(scene, (0, {}))
-        lines += [(f"{scene}, the report", way, contacts, "-", n, f"{contacts / n:.1f}", "-", "-") for way, n in found.items()]
-    headings = ("<scene", "<colouring", "contacts", "at one node", "colours", "contacts a colour", "largest", "ms")
+        lines += [(f"{scene}, the report", name, contacts, "-", n, f"{contacts / n:.1f}", "-", "-") for name, n in found.items()]
+    headings = ("<scene", "<colouring", "contacts", "at one node", "colours", "contacts per colour", "largest", "ms")
     return table(lines, [(heading, f"{{[{k}]}}") for k, heading in enumerate(headings)])
 
 
@@ -107,7 +107,7 @@ def colour_table(colourings: list[Colouring]) -> str:
 
 @dataclass
 class Point:
-    """Both solvers on one problem, from no impulses to the tolerance."""
+    """Both solvers on one problem, from zero impulses to the tolerance."""
 
     contacts: int
     colours: int
@@ -116,13 +116,13 @@ class Point:
 
 
 def grid(n: int) -> np.ndarray:
-    """Vertices ((n + 1)^2, 2) of a square of n x n unit cells round the origin, row by row."""
+    """Vertices ((n + 1)^2, 2) of a square of n x n unit cells about the origin, row by row."""
     x = np.arange(n + 1) - 0.5 * n
     return np.stack(np.meshgrid(x, x, indexing="ij"), axis=-1).reshape(-1, 2)
 
 
 def find_under(points: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Which of points (k,2) lie on the square, and the vertices (m,3) and weights (m,3) of the triangles under those."""
+    """Indices of the points (k,2) on the square, and vertices (m,3) and weights (m,3) of the triangles below them."""
     place = points + 0.5 * n
     on = np.flatnonzero(((place >= 0) & (place <= n)).all(axis=1))
     cell = np.minimum(place[on].astype(int), n - 1)
@@ -135,7 +135,7 @@ def find_under(points: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray, np.n
 
 
 def build_plates(n: int, runtime: Runtime, arena: FieldArena) -> ContactProblem:
-    """The problem of two plates, in fields of the arena, without impulses."""
+    """The contact problem of two plates, with zero impulses."""
     rng, flat = np.random.default_rng(SEED), grid(n)
     c, s = np.cos(TURN), np.sin(TURN)
     turn = np.array([[c, -s], [s, c]])
@@ -173,7 +173,7 @@ def build_plates(n: int, runtime: Runtime, arena: FieldArena) -> ContactProblem:
 
 
 def measure_crossover(sizes, runtime: Runtime) -> list[Point]:
-    """Both solvers on plates of these numbers of cells."""
+    """Both solvers on plates with these numbers of cells."""
     points = []
     for n in sizes:
         arena = FieldArena()
@@ -191,7 +191,7 @@ def measure_crossover(sizes, runtime: Runtime) -> list[Point]:
 
 
 def crossover_table(points: list[Point]) -> str:
-    """A row a problem."""
+    """A row per problem."""
     columns = (
         ("contacts", "{.contacts:,}"),
         ("colours", "{.colours}"),
@@ -201,7 +201,7 @@ def crossover_table(points: list[Point]) -> str:
         ("coloured", "{.coloured.residual:.1e}"),
         ("solve, serial [ms]", lambda p: ms(p.serial.median)),
         ("coloured [ms]", lambda p: ms(p.coloured.median)),
-        ("of it colouring [ms]", lambda p: ms(np.median(p.coloured.colouring))),
+        ("of which colouring [ms]", lambda p: ms(np.median(p.coloured.colouring))),
         ("sweep, serial [ms]", lambda p: ms(p.serial.per_sweep)),
         ("coloured [ms]", lambda p: ms(p.coloured.per_sweep)),
     )
@@ -209,7 +209,7 @@ def crossover_table(points: list[Point]) -> str:
 
 
 def crossover_text(points: list[Point], arch: str) -> str:
-    """A sentence for whole solves and one for sweeps."""
+    """A line for whole solves and one for sweeps."""
     contacts, lines = [p.contacts for p in points], []
     for what, of in (("a whole solve, colouring included", lambda o: o.median), ("a sweep", lambda o: o.per_sweep)):
         serial, coloured = [of(p.serial) for p in points], [of(p.coloured) for p in points]

@@ -1,28 +1,22 @@
-"""Bodies that fall and come to rest in implicit steps: what a process of `taisoft bench contact --drops` does.
+"""Bodies that fall and come to rest in implicit steps: a process of `taisoft bench contact --drops`.
 
-python contact_drops.py SCENE [STEPS]: takes the steps of a scene of DROPS and prints, as a line of JSON, what they took.
-Nothing here is newer than version 0.1, so that both can be measured.
+python contact_drops.py SCENE [STEPS] runs a scene of DROPS and prints times and iterations as a line of JSON. It uses nothing
+newer than version 0.1, so that both versions can be measured.
 """
 
 import json
 import sys
-import time
 import warnings
 from collections.abc import Callable
 
 import taisoft as ts
 
-try:
-    from taisoft.backend.runtime import compile_clock
-except ImportError:  # version 0.1
-    from taisoft.runtime import compile_clock
-
 if __package__:
-    from .contact_states import DOWN, EULER, GROUND, IMPLICIT, MESHES, cloth, demo, figure, rubber
+    from .contact_states import DOWN, EULER, GROUND, IMPLICIT, MESHES, cloth, demo, figure, open_silently, rubber, take_steps
     from .programs.own import make_scene
     from .works.scenes import WORKS
 else:  # as a program
-    from contact_states import DOWN, EULER, GROUND, IMPLICIT, MESHES, cloth, demo, figure, rubber
+    from contact_states import DOWN, EULER, GROUND, IMPLICIT, MESHES, cloth, demo, figure, open_silently, rubber, take_steps
 
     from benchmarks.programs.own import make_scene
     from benchmarks.works.scenes import WORKS
@@ -48,7 +42,7 @@ def ledge() -> ts.Scene:
 
 
 def work(key: str) -> ts.Scene:
-    """W3 or W4, as `taisoft bench peers` has them."""
+    """W3 or W4 of `taisoft bench peers`."""
     return make_scene(next(one for one in WORKS if one.key == key))
 
 
@@ -66,22 +60,15 @@ DROPS: dict[str, tuple[Callable[[], ts.Scene], dict, int]] = {
 
 
 def can_build(name: str) -> bool:
-    """Whether the mesh that a scene needs is here."""
+    """Whether the scene's mesh is available."""
     return name not in MESH or (MESHES / MESH[name]).is_file()
 
 
 def drop(name: str, steps: int) -> dict:
-    """What the steps of a scene took, one by one, without compiling."""
+    """Times without compilation, iterations and contacts of each step of a scene."""
     build, settings, _ = DROPS[name]
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        sim = ts.Simulator(build(), **settings, precision="f32")
-    seconds, reports = [], []
-    with sim:
-        for _ in range(steps):
-            begin, compiled = time.perf_counter(), compile_clock()
-            reports.append(sim.advance(1))
-            seconds.append(time.perf_counter() - begin - (compile_clock() - compiled))
+    with open_silently(build(), **settings, precision="f32") as sim:
+        seconds, reports = take_steps(sim, steps)
         tets = sum(body.mesh.n_tets for body in sim.scene.bodies)
     return {
         "scene": name,

@@ -1,22 +1,21 @@
-"""Steps without contacts, and statics: what a process of `taisoft bench contact --free` does.
+"""Steps without contacts, and statics: a process of `taisoft bench contact --free`.
 
-python contact_free.py CASE [STEPS]: takes the steps of a case of CASES, or solves the static beams, and prints, as a line of
-JSON, what each took. Nothing here is newer than version 0.1, so that both can be measured.
+python contact_free.py CASE [STEPS] runs a case of CASES, or solves the static beams, and prints times and iterations as a line of
+JSON. It uses nothing newer than version 0.1, so that both versions can be measured.
 """
 
 import itertools
 import json
 import sys
-import time
 import warnings
 from dataclasses import dataclass
 
 import taisoft as ts
 
-try:
-    from taisoft.backend.runtime import compile_clock
-except ImportError:  # version 0.1
-    from taisoft.runtime import compile_clock
+if __package__:
+    from .contact_states import take_steps, timed
+else:  # as a program
+    from contact_states import take_steps, timed
 
 STATICS = "static beams"
 LAWS = ("stable_neo_hookean", "corotational", "st_venant_kirchhoff")
@@ -24,7 +23,7 @@ LAWS = ("stable_neo_hookean", "corotational", "st_venant_kirchhoff")
 
 @dataclass(frozen=True)
 class Case:
-    """Steps of a beam of 4 x 1 x 1 m that hangs from its end. first: the step from which they count."""
+    """Steps of a beam of 4 x 1 x 1 m clamped at one end. first: the first step that counts."""
 
     cells: tuple[int, int, int]
     law: str
@@ -43,21 +42,17 @@ CASES = {
     "inverted beam, midpoint": Case(LARGE, LAWS[2], "implicit_midpoint", 100, 70),
     "inverted beam, BDF2": Case(LARGE, LAWS[2], "bdf2", 100, 70),
 }
-INVERTED = ("inverted beam, midpoint", "inverted beam, BDF2")  # some 2,000 of their tets are, from `first` on
+INVERTED = ("inverted beam, midpoint", "inverted beam, BDF2")  # about 2,000 inverted tets from `first` on
 
 
 def beam_steps(case: Case, steps: int) -> dict:
-    """What the steps of a case took, one by one, without compiling."""
+    """Times without compilation and iterations of each step of a case."""
     scene = ts.Scene(gravity=(0.0, -9.8, 0.0))
     material = ts.Material(young=1e6, poisson=0.3, density=1000.0, law=case.law)
     beam = scene.add_body(ts.box_mesh(case.cells, (4.0, 1.0, 1.0)), material, name="beam")
     beam.fix(lambda x: x[:, 0] < -2.0 + 1e-9)
-    seconds, reports = [], []
     with ts.Simulator(scene, dt=case.dt, integrator=case.integrator, precision="f32") as sim:
-        for _ in range(steps):
-            begin, compiled = time.perf_counter(), compile_clock()
-            reports.append(sim.advance(1))
-            seconds.append(time.perf_counter() - begin - (compile_clock() - compiled))
+        seconds, reports = take_steps(sim, steps)
     first = min(case.first, steps - 1)
     return {
         "tets": beam.mesh.n_tets,
@@ -70,7 +65,7 @@ def beam_steps(case: Case, steps: int) -> dict:
 
 
 def static_beams(number: int) -> dict:
-    """What the statics of slender beams under their weight took, of three laws, two orders of elements and two stiffnesses."""
+    """Times and iterations of static slender beams under their weight: three laws, two element orders, two stiffnesses."""
     found: dict = {name: [] for name in ("seconds", "newton", "linear", "converged")}
     mesh = ts.box_mesh((12, 3, 3), (1.0, 0.25, 0.25))
     for law, order, young in itertools.islice(itertools.product(LAWS, (1, 2), (2e4, 2e5)), number):
@@ -78,9 +73,8 @@ def static_beams(number: int) -> dict:
         material = ts.Material(young=young, poisson=0.4, density=1000.0, law=law)
         beam = scene.add_body(mesh, material, name="beam", **({"order": 2} if order == 2 else {}))
         beam.fix(lambda x: x[:, 0] < -0.499)
-        begin, compiled = time.perf_counter(), compile_clock()
-        result = ts.solve_static(scene)
-        found["seconds"].append(time.perf_counter() - begin - (compile_clock() - compiled))
+        result, seconds = timed(lambda scene=scene: ts.solve_static(scene))
+        found["seconds"].append(seconds)
         found["newton"].append(result.iterations)
         found["linear"].append(result.linear_iterations)
         found["converged"].append(bool(result.converged))
@@ -88,7 +82,7 @@ def static_beams(number: int) -> dict:
 
 
 def take(name: str, count: int | None) -> dict:
-    """A case, or so many of its steps."""
+    """Run a case, or `count` of its steps or solves."""
     found = static_beams(count or 12) if name == STATICS else beam_steps(CASES[name], count or CASES[name].steps)
     return {"scene": name} | found
 

@@ -1,11 +1,10 @@
 """Contact solvers on frictional contact problems of rigid scenes: residual after 10, 100 and 1000 sweeps, and cost to 1e-6.
 
-A section of `taisoft bench contact`. The problems are from Siconos' test data and lie beside the repository, in
-shared/contact_problems, with the residuals of plain serial Gauss-Seidel as yardstick. Cost is told as a share of what 1000 sweeps
-of plain Gauss-Seidel take: time, the two run in turns, and floating-point operations (18 a block of W and sweep, 2/3 n^3 for a
-dense factorisation, what its fill says for a sparse one). Verdicts: Gauss-Seidel must be no worse than twice the yardstick; the
-best solver of every problem must reach 1e-6 at less than the cost of those sweeps, in operations and in time. A summary says how
-each solver fares on all of them.
+A section of `taisoft bench contact`. The problems are from Siconos' test data, in shared/contact_problems beside the repository;
+residuals of plain serial Gauss-Seidel are the yardstick. Cost is relative to 1000 sweeps of plain Gauss-Seidel: time, measured in
+turn, and floating-point operations (18 per block of W and sweep, 2/3 n^3 for a dense factorisation, the fill for a sparse one).
+Verdicts: Gauss-Seidel may be at most twice the yardstick; the best solver of every problem must reach 1e-6 at less than the cost
+of those sweeps, in operations and in time.
 """
 
 import time
@@ -28,7 +27,7 @@ from .runner import patched
 PROBLEMS = Path(__file__).resolve().parents[1].parent / "shared" / "contact_problems"
 SWEEPS = (10, 100, 1000)
 GOAL = 1e-6
-NONE = 1e-12  # below it a residual is rounding
+NONE = 1e-12  # residuals below are rounding
 PLAIN = "gauss_seidel, plain"
 YARDSTICK = {
     "BoxesStack1-i100000-32": (3e-2, 2e-3, 3e-5),
@@ -91,7 +90,7 @@ class Row:
 
     @property
     def cells(self) -> tuple[str, ...]:
-        """As HEADINGS has them."""
+        """Cells for HEADINGS."""
         reached = self.iterations is not None
         cost = (str(self.iterations), f"{self.time:.2f}", f"{self.operations:.3f}") if reached else ("-", "-", "-")
         residuals = (f"{r:.1e}" for r in self.residuals)
@@ -99,7 +98,7 @@ class Row:
 
 
 def load(name: str) -> Problem:
-    """One of the shared problems."""
+    """Load a shared problem."""
     data = np.load(PROBLEMS / f"{name}.npz")
     n = 3 * int(data["n_contacts"])
     W = sp.csr_matrix((data["val"], (data["row"], data["col"])), shape=(n, n))
@@ -107,7 +106,7 @@ def load(name: str) -> Problem:
 
 
 def seconds(calls: dict[str, Callable[[], object]], repeats: int) -> dict[str, float]:
-    """The median time of each call, all of them run in turns, once before to compile."""
+    """Median time of each call; the calls run in turn, once before to compile."""
     spent: dict[str, list[float]] = {name: [] for name in calls}
     for _ in range(repeats + 1):
         for name, call in calls.items():
@@ -119,10 +118,10 @@ def seconds(calls: dict[str, Callable[[], object]], repeats: int) -> dict[str, f
 
 @contextmanager
 def counted_operations(problem: Problem) -> Iterator[list[int]]:
-    """A list whose entries add up to the operations of the augmented Lagrangian meanwhile."""
+    """Context that yields a list; its entries sum to the operations of the augmented Lagrangian."""
     operations: list[int] = []
     module, dense = augmented_lagrangian, np.linalg.solve
-    sparse, look = module.splu, module._linearise
+    sparse, linearise = module.splu, module._linearise
 
     def count_dense(A, b):
         operations.append(2 * len(A) ** 3 // 3 + 2 * len(A) ** 2)
@@ -134,20 +133,20 @@ def counted_operations(problem: Problem) -> Iterator[list[int]]:
         operations.append(int(2 * (lower * upper).sum() + 2 * (lower.sum() + upper.sum())))
         return made
 
-    def count_look(q, *rest):  # with W' q and the blocks of the linearised equations, 3x3 by 3x3
+    def count_linearise(q, *rest):  # with W' q and the blocks of the linearised equations, 3x3 by 3x3
         operations.append(int(len(q) / problem.W.shape[0] * 4 * problem.sweep_cost))
-        return look(q, *rest)
+        return linearise(q, *rest)
 
     with (
         patched(np.linalg, "solve", count_dense),
         patched(module, "splu", count_sparse),
-        patched(module, "_linearise", count_look),
+        patched(module, "_linearise", count_linearise),
     ):
         yield operations
 
 
 def sweeper_rows(problem: Problem, repeats: int) -> list[Row]:
-    """All solvers that sweep; the first is plain Gauss-Seidel, the unit of the others' time."""
+    """Rows of the sweeping solvers; the first is plain Gauss-Seidel, the unit of time."""
     W, b, mu = problem.W, problem.b, problem.mu
     with api._problem(W, b, mu) as p:
         store(p, colour_greedy(matrix_graph(W)))
@@ -170,7 +169,7 @@ def sweeper_rows(problem: Problem, repeats: int) -> list[Row]:
     rows = []
     for name, (_, momentum) in SWEEPERS.items():
         done = found[name]
-        # a look at the residual is a product too, after every fifth sweep; momentum takes about 40 operations a contact
+        # the residual after every fifth sweep is a product too; momentum takes about 40 operations a contact
         cost = problem.sweep_cost * 1.2 + (40 * len(mu) if momentum else 0)
         relative = done.iterations * cost / (SWEEPS[-1] * problem.sweep_cost)
         reached = done.iterations if done.converged else None
@@ -179,7 +178,7 @@ def sweeper_rows(problem: Problem, repeats: int) -> list[Row]:
 
 
 def host_rows(problem: Problem, repeats: int) -> list[Row]:
-    """The augmented Lagrangian and "auto", by the public function's own parts; time beside 1000 plain sweeps once more."""
+    """Rows of the augmented Lagrangian and "auto", with 1000 plain sweeps timed again as the unit."""
     W, b, mu, rows = problem.W, problem.b, problem.mu, []
     none, sweeps = np.zeros((len(mu), 3)), SWEEPS[-1]
 
@@ -212,8 +211,8 @@ def host_rows(problem: Problem, repeats: int) -> list[Row]:
     return rows
 
 
-def judged(rows: list[Row]) -> list[Row]:
-    """The rows of one problem with their verdicts."""
+def with_verdicts(rows: list[Row]) -> list[Row]:
+    """The rows of one problem with verdicts."""
     yardstick = YARDSTICK[rows[0].problem]
     able = [row for row in rows if row.iterations is not None]
     best = min(able, key=lambda row: row.cost).solver if able else None
@@ -230,20 +229,20 @@ def judged(rows: list[Row]) -> list[Row]:
 
 
 def compute(names: tuple[str, ...] = tuple(YARDSTICK), repeats: int = 5) -> Iterator[Row]:
-    """The rows of these problems, of one after the other."""
+    """The rows of these problems."""
     for name in names:
         problem = load(name)
-        yield from judged(sweeper_rows(problem, repeats) + host_rows(problem, repeats))
+        yield from with_verdicts(sweeper_rows(problem, repeats) + host_rows(problem, repeats))
 
 
 def missing(names: tuple[str, ...] = tuple(YARDSTICK)) -> str | None:
-    """Why the problems cannot be solved here, or None."""
+    """Why the problems cannot be solved, or None."""
     absent = [name for name in names if not (PROBLEMS / f"{name}.npz").is_file()]
     return f"contact problems are absent from {PROBLEMS}: {', '.join(absent)}" if absent else None
 
 
 def summary(rows: list[Row]) -> str:
-    """A line for each solver: on how many problems it reaches 1e-6, and its largest cost there."""
+    """A line per solver: on how many problems it reaches 1e-6, and its largest cost there."""
     lines = []
     for solver in dict.fromkeys(row.solver for row in rows):
         of = [row for row in rows if row.solver == solver]
@@ -254,6 +253,6 @@ def summary(rows: list[Row]) -> str:
 
 
 def measure(names: tuple[str, ...], repeats: int) -> list[Row]:
-    """All rows of these problems, in f64 on the processor: Taichi must not be open in another kind."""
+    """All rows of these problems, in f64 on the processor; no other runtime may be open."""
     with closing(open_runtime("cpu", "f64", "the benchmark of contact problems")):
         return list(compute(names, repeats))

@@ -1,9 +1,8 @@
-"""What `contact.py` measures: contact problems of explicit steps, solved by every solver; costs of steps; implicit runs.
+"""Measurements of `contact.py`: contact problems of explicit steps with every solver, costs of steps, implicit runs.
 
-A film goes on from the first impulse, frame after frame; of each frame the contact problem of its last step is taken where its
-solve would begin, and solved by every solver, from the impulses of the step before and from none. Each solve is judged in NumPy,
-from the fields that say what the problem is: J from nodes, weights and frames, W = J M^-1 J^T, and the residual
-|r - prox(r - f (W r + b))| / |r| of what the solver left. The steps themselves are those of the default solver.
+A film starts at the first impulse. In each frame, every solver solves the contact problem of the last step, from the impulses of
+the previous step and from zero; the run itself continues with the default solver. NumPy computes the residual of each solution,
+|r - prox(r - f (W r + b))| / |r| with W = J M^-1 J^T, from the fields of the problem.
 """
 
 from collections.abc import Callable, Iterable, Iterator
@@ -27,13 +26,13 @@ from .runner import REST, Stopwatch, clock, patched, timed
 
 GOAL = 1e-4  # residual, that of explicit steps in f32
 SERIAL, COLOURED = "gauss_seidel", "coloured_gauss_seidel"
-THREADED = ", all threads"  # behind the name of a solver whose loops run on all threads
-DT, FPS = 1 / 240, 60.0  # of explicit steps and films [s, 1/s]
-LATEST = 2.0  # [s] by which bodies must have met
+THREADED = ", all threads"  # suffix of solvers whose loops run on all threads
+DT, FPS = 1 / 240, 60.0  # explicit steps and films [s, 1/s]
+LATEST = 2.0  # [s] time limit for the first impulse
 WARM, COLD = "from the step before", "from none"
 ROUNDS, COLD_ROUNDS = 3, 1
 SETTINGS = ("integrator", "contact_solver", "contact_tolerance", "newton_tolerance", "linear_tolerance", "dt")
-# parts of an explicit step: what is called, where it is looked up
+# parts of an explicit step and the functions called in them
 PARTS = {
     "search": ("find", "closing"),
     "problem": ("begin", "set_free_velocities", "find_factors"),
@@ -47,7 +46,7 @@ PARTS = {
 
 @dataclass
 class Outcome:
-    """A solver on one problem. residual: the judge's; seconds: of each round, those of the colouring included."""
+    """A solver on one problem. residual: by NumPy; seconds: per round, including the colouring."""
 
     sweeps: int = 0
     residual: float = 0.0
@@ -56,30 +55,30 @@ class Outcome:
 
     @property
     def median(self) -> float:
-        """Of the rounds [s]."""
+        """Median over the rounds [s]."""
         return float(np.median(self.seconds))
 
     @property
     def per_sweep(self) -> float:
-        """A sweep's share of what the colouring leaves [s]."""
+        """Time per sweep without colouring [s]."""
         return float(np.median(np.subtract(self.seconds, self.colouring))) / max(1, self.sweeps)
 
 
 @contextmanager
-def shown(look: Callable[[ContactProblem], None]) -> Iterator[None]:
-    """Each contact problem of explicit steps is shown to `look` when its solve would begin; it must leave it as it was."""
+def observe_problems(observe: Callable[[ContactProblem], None]) -> Iterator[None]:
+    """Context that calls observe(problem) before each contact solve of explicit steps; it must not change the problem."""
     plain = explicit_contact_stepper.solve
 
-    def looked_at(p, *rest):
-        look(p)
+    def observed(p, *rest):
+        observe(p)
         return plain(p, *rest)
 
-    with patched(explicit_contact_stepper, "solve", looked_at):
+    with patched(explicit_contact_stepper, "solve", observed):
         yield
 
 
 def contact_jacobian(p: ContactProblem) -> sp.csr_matrix:
-    """J (3k, 3 n_nodes): velocities of nodes to those of contacts, rows (normal, t1, t2) of each."""
+    """J (3k, 3 n_nodes) from nodal to contact velocities, with rows (normal, t1, t2) per contact."""
     k = int(p.count[0])
     node, weight = p.node.to_numpy()[:k], p.weight.to_numpy()[:k]
     normal, tangent = p.normal.to_numpy()[:k], p.tangent.to_numpy()[:k]
@@ -91,8 +90,8 @@ def contact_jacobian(p: ContactProblem) -> sp.csr_matrix:
     return sp.csr_matrix((entries.ravel(), (row.ravel(), column.ravel())), shape=(3 * k, 3 * p.n_nodes))
 
 
-def make_judge(p: ContactProblem) -> Callable[[np.ndarray], float]:
-    """The residual of impulses (k,3) in this problem."""
+def make_residual(p: ContactProblem) -> Callable[[np.ndarray], float]:
+    """A function that returns the residual of impulses (k,3) in this problem."""
     k = int(p.count[0])
     J, b, mu = contact_jacobian(p), p.b.to_numpy()[:k].ravel(), p.friction.to_numpy()[:k]
     W = (J @ sp.diags(p.inverse_mass.to_numpy().ravel()) @ J.T).tocsr()
@@ -100,16 +99,16 @@ def make_judge(p: ContactProblem) -> Callable[[np.ndarray], float]:
 
 
 class Solvers:
-    """The solvers by name, on the problems of one simulator.
+    """The solvers by name, for the problems of one simulator.
 
-    threads: also those whose loops run on all threads, where the simulator's own run on one.
+    threads: include solvers on all threads if the simulator's own run on one.
     """
 
     def __init__(self, threads: bool):
         self._threads, self._of, self._at_once = threads, None, None
 
     def names(self, p: ContactProblem) -> list[str]:
-        """Of the solvers that `p` is solved by."""
+        """Names of the solvers for `p`."""
         threaded = [f"{name}{THREADED}" for name in SOLVERS if name != SERIAL] if self._threads and p.serial else []
         return [*SOLVERS, *threaded]
 
@@ -123,10 +122,10 @@ class Solvers:
     def outcomes(
         self, p: ContactProblem, start: np.ndarray, rounds: int, names: Iterable[str] | None = None
     ) -> dict[str, Outcome]:
-        """Solve `p` to GOAL from the impulses `start` (capacity, 3) by each solver, in turns; `p` is left as it was."""
+        """Solve `p` to GOAL from the impulses `start` (capacity, 3) with each solver in turn; `p` is restored."""
         r, order, k = p.r.to_numpy(), p.order.to_numpy(), int(p.count[0])
         names = self.names(p) if names is None else list(names)
-        judge, found = make_judge(p), {name: Outcome() for name in names}
+        residual_of, found = make_residual(p), {name: Outcome() for name in names}
         for _ in range(rounds):
             for name in names:
                 form, method = self._form(p, name)
@@ -140,7 +139,7 @@ class Solvers:
                 found[name].seconds.append(clock() - begin)
                 found[name].colouring.append(coloured - begin)
                 found[name].sweeps = result.iterations
-                found[name].residual = judge(p.r.to_numpy()[:k])
+                found[name].residual = residual_of(p.r.to_numpy()[:k])
         p.r.from_numpy(r)
         p.order.from_numpy(order)
         return found
@@ -151,7 +150,7 @@ class Solvers:
 
 @dataclass
 class Film:
-    """Frames of an explicit run. outcomes: start -> solver -> of each frame; found: contacts before their reduction."""
+    """Frames of an explicit run. outcomes: start -> solver -> outcome per frame; found: contacts before reduction."""
 
     scene: str
     tets: int
@@ -164,22 +163,22 @@ class Film:
 
     @property
     def solvers(self) -> list[str]:
-        """Their names."""
+        """Names of the solvers."""
         return list(self.outcomes[WARM])
 
     def of(self, solver: str, start: str = WARM) -> list[Outcome]:
-        """A solver's outcomes, frame by frame."""
+        """Outcomes of a solver per frame."""
         return self.outcomes[start][solver]
 
     def missed(self, solvers: list[str]) -> int:
-        """Solves by these whose residual is above GOAL, by the judge; its sums round otherwise than the kernels'."""
+        """Number of solves with a residual above GOAL; NumPy's sums round differently from the kernels'."""
         return sum(not o.residual <= 1.001 * GOAL for name in solvers for start in self.outcomes for o in self.of(name, start))
 
 
 @dataclass
 class StepCost:
-    """Explicit steps from the first impulse on. whole: wall seconds of each `step`, its report included; parts: of the same
-    steps, done again."""
+    """Explicit steps from the first impulse on. whole: wall seconds of each `step` with its report; parts: of the same steps when
+    repeated."""
 
     scene: str
     solver: str
@@ -193,7 +192,7 @@ class StepCost:
 
 @dataclass
 class Run:
-    """An implicit run: lists over its steps with contacts; wall: of all steps, without compiling."""
+    """An implicit run: lists over its steps with contacts; wall: seconds of all steps without compilation."""
 
     scene: str
     settings: str
@@ -209,37 +208,37 @@ class Run:
 
 
 def open_scene(name: str, arch: str, refine: int | None = None, **settings) -> ts.Simulator:
-    """A simulator of a demo's scene in f32, refined so often; settings as they are, else the demo's own."""
+    """A simulator of a demo's scene in f32; without settings, with the demo's own. refine: number of refinements."""
     scene, own = load_scene(name, refine=refine)
     settings = settings or {key: own[key] for key in SETTINGS if key in own}
     return ts.Simulator(scene, precision="f32", arch=arch, **settings)
 
 
 def open_explicit(name: str, arch: str, refine: int | None = None) -> ts.Simulator:
-    """The same in explicit steps."""
+    """A simulator of a demo's scene with explicit steps."""
     return open_scene(name, arch, refine, dt=DT, integrator="symplectic_euler")
 
 
 def to_impulses(sim: ts.Simulator) -> None:
-    """Step until contacts bear something, if they do not. Raises SimulationError where that takes too long."""
+    """Step until a contact has an impulse. Raises SimulationError after LATEST seconds."""
     last = sim.time + LATEST
     while not sim._dynamics.contact.problem.r.to_numpy()[: sim._dynamics.contact.n_contacts].any():
         if sim.time > last:
-            raise ts.SimulationError(f"no contact bears anything within {LATEST:g} s")
+            raise ts.SimulationError(f"no contact has an impulse within {LATEST:g} s")
         sim.step()
 
 
 def measure_film(name: str, sim: ts.Simulator, frames: int, solvers: Solvers) -> Film:
-    """A film of so many frames; those whose contacts need no impulse are left out."""
+    """A film of `frames` frames, without those whose contacts need no impulse."""
     tets = sum(body.mesh.n_tets for body in sim.scene.bodies)
     film = Film(name, tets, sim.dt, sim.stable_dt)
     known: list[ContactProblem] = []
 
-    def look(p: ContactProblem) -> None:
+    def observe(p: ContactProblem) -> None:
         if p not in known:  # the first, or one with more room
             known.append(p)
             solvers.outcomes(p, p.r.to_numpy(), 1)  # compiles
-        if make_judge(p)(np.zeros((int(p.count[0]), 3))) == 0.0:
+        if make_residual(p)(np.zeros((int(p.count[0]), 3))) == 0.0:
             return
         for start, rounds, r in ((WARM, ROUNDS, p.r.to_numpy()), (COLD, COLD_ROUNDS, np.zeros((p.capacity, 3)))):
             for solver, outcome in solvers.outcomes(p, r, rounds).items():
@@ -254,20 +253,20 @@ def measure_film(name: str, sim: ts.Simulator, frames: int, solvers: Solvers) ->
     for _ in range(frames):
         for _ in range(per_frame - 1):
             sim.step()
-        with shown(look):
+        with observe_problems(observe):
             sim.step()
     return film
 
 
 def explicit_places(sim: ts.Simulator) -> list[tuple[str, object, str]]:
-    """Where the parts of the simulator's explicit steps are called, for `Stopwatch.on`."""
+    """The functions of each part of explicit steps, for `Stopwatch.on`."""
     contact = sim._dynamics.contact
     owners = {"find": contact.detection, "closing": contact.measures, "begin": contact}
     return [(part, owners.get(name, explicit_contact_stepper), name) for part, names in PARTS.items() for name in names]
 
 
 def measure_step(name: str, sim: ts.Simulator, steps: int) -> StepCost:
-    """What a step costs from the first impulse on; then the same steps again for their parts."""
+    """Cost of steps from the first impulse on, and of their parts when the same steps are repeated."""
     sim.reset()
     to_impulses(sim)
     cost = StepCost(name, sim._dynamics.stepper.method, [], {part: [] for part in (*PARTS, REST)}, [], [], 0.0, [])
@@ -291,7 +290,7 @@ def measure_step(name: str, sim: ts.Simulator, steps: int) -> StepCost:
 
 
 def measure_run(name: str, sim: ts.Simulator, seconds: float) -> Run:
-    """Some seconds of the demo's own implicit steps."""
+    """Run the demo's own implicit steps for some seconds."""
     spent: list[float] = []
     plain = sim.advance
 

@@ -1,10 +1,10 @@
-"""Steps with contacts, captured and taken again: what a process of `taisoft bench contact --capture` and `--replay` does.
+"""Captured steps with contacts: a process of `taisoft bench contact --capture` and `--replay`.
 
-python contact_states.py capture SCENE FILE [quick]: runs a scene of SCENES and keeps the states before every fifth step and
-before the ten steps that took most Newton iterations: positions, velocities, the past, contacts and impulses.
-python contact_states.py replay FILE PRECISION TOLERANCE [REFERENCE]: solves the stage of each of them, without substeps, and in
-halves where that does not converge. REFERENCE: where positions are kept, or, where they are there, what they are compared with.
-Each prints lines of JSON. Nothing here is newer than version 0.1, so that both can be measured on the same states.
+python contact_states.py capture SCENE FILE [quick] runs a scene of SCENES and saves the states before every fifth step and before
+the ten steps with the most Newton iterations: positions, velocities, multistep history, contacts and impulses.
+python contact_states.py replay FILE PRECISION TOLERANCE [REFERENCE] solves the stage of each state without substeps, divided into
+halves if it does not converge. REFERENCE: file of positions to compare with; it is written if it does not exist.
+Both print lines of JSON. They use nothing newer than version 0.1, so that both versions can be measured on the same states.
 """
 
 import json
@@ -28,13 +28,13 @@ except ImportError:  # version 0.1
 ROOT = Path(ts.__file__).resolve().parents[1]
 MESHES = Path(__file__).resolve().parents[2] / "shared" / "meshes"
 EVERY, SLOWEST, QUICK_STEPS = 5, 10, 3
-MOST_HALVES = 16
+MAX_HALVES = 16
 DOWN, GROUND = (0.0, -9.81, 0.0), ts.HalfSpace((0, 0, 0), (0, 1, 0))
 IMPLICIT = {"integrator": "implicit_euler"}
 
 
 def figure(name: str, height: float) -> ts.TetMesh:
-    """A mesh of shared/meshes, a metre long, above y = height."""
+    """A mesh of shared/meshes, scaled to 1 m, above y = height."""
     mesh = ts.read_mesh(MESHES / name)
     x = mesh.vertices - mesh.vertices.mean(axis=0)
     x = x / np.ptp(x, axis=0).max()
@@ -42,12 +42,12 @@ def figure(name: str, height: float) -> ts.TetMesh:
 
 
 def rubber(**changes) -> ts.Material:
-    """Of the real meshes."""
+    """The material of the real meshes."""
     return ts.Material(**({"young": 2e5, "poisson": 0.4, "density": 1000.0, "friction": 0.5} | changes))
 
 
 def landing(name: str, obstacle=GROUND) -> ts.Scene:
-    """Just before it lands with 1 m/s."""
+    """A mesh just before it lands at 1 m/s."""
     scene = ts.Scene(gravity=DOWN)
     scene.add_body(figure(name, 0.01), rubber(), name="figure", velocity=(0, -1, 0))
     scene.add_obstacle(obstacle, name="obstacle", friction=0.5)
@@ -55,7 +55,7 @@ def landing(name: str, obstacle=GROUND) -> ts.Scene:
 
 
 def on_another(name: str) -> ts.Scene:
-    """One falls on another, a little aside, on the ground."""
+    """A mesh falls on another on the ground, slightly off centre."""
     scene = ts.Scene(gravity=DOWN)
     below = figure(name, 0.001)
     scene.add_body(below, rubber(), name="below")
@@ -66,7 +66,7 @@ def on_another(name: str) -> ts.Scene:
 
 
 def cloth(height: float = 0.102, friction: float = 0.3) -> ts.Scene:
-    """A cloth of 2 mm falls on a sphere."""
+    """A cloth, 2 mm thick, falls on a sphere."""
     scene = ts.Scene(gravity=DOWN)
     material = ts.Material(young=1e5, poisson=0.3, density=500.0, friction=friction)
     scene.add_body(ts.sheet_mesh((20, 20), (0.5, 0.002, 0.5)), material, name="cloth", position=(0, height, 0))
@@ -75,7 +75,7 @@ def cloth(height: float = 0.102, friction: float = 0.3) -> ts.Scene:
 
 
 def mat() -> ts.Scene:
-    """A mat whose ends turn against each other, from no twist."""
+    """A mat that is twisted from rest."""
     scene = ts.Scene(gravity=(0, 0, 0))
     mesh = ts.box_mesh((20, 20, 1), (1.0, 1.0, 0.02))
     x = mesh.vertices + np.random.default_rng(0).uniform(-1e-4, 1e-4, mesh.n_verts)[:, None] * [0.0, 0.0, 1.0]
@@ -93,8 +93,8 @@ def gripper() -> ts.Scene:
     scene.add_body(ts.ball_mesh(0.1, 8), soft, name="ball", position=(0, 0.101, 0))
     scene.add_obstacle(GROUND, name="ground", friction=0.5)
     for name, side in (("left", -1.0), ("right", 1.0)):
-        way = [(0, 0, 0), (-side * 0.03, 0, 0), (-side * 0.03, 0.1, 0)]
-        path = ts.KeyFrames([0.0, 0.4, 1.0], way, smooth=True)
+        displacements = [(0, 0, 0), (-side * 0.03, 0, 0), (-side * 0.03, 0.1, 0)]
+        path = ts.KeyFrames([0.0, 0.4, 1.0], displacements, smooth=True)
         scene.add_obstacle(ts.Box((side * 0.115, 0.12, 0), (0.01, 0.06, 0.06)), name=name, friction=0.8, path=path)
     return scene
 
@@ -111,14 +111,14 @@ def slabs() -> ts.Scene:
 
 
 def demo(name: str) -> ts.Scene:
-    """A demo's scene."""
+    """The scene of a demo."""
     return runpy.run_path(str(ROOT / "demos" / f"{name}.py"))["build"]()
 
 
 BUNNY, ARMADILLO = "bunny.msh", "Armadillo13K.msh"
-SMALL_BOX = ts.Box((0, -0.2, 0), (0.25, 0.2, 0.25))  # smaller than what lands on it
+SMALL_BOX = ts.Box((0, -0.2, 0), (0.25, 0.2, 0.25))  # smaller than the mesh that lands on it
 EULER = IMPLICIT | {"dt": 0.01}
-# name: (scene, settings, steps, steps before the first that counts)
+# name: (scene, settings, steps that count, steps before them)
 SCENES: dict[str, tuple[Callable[[], ts.Scene], dict, int, int]] = {
     "bunny on ground": (lambda: landing(BUNNY), EULER, 40, 0),
     "bunny on box": (lambda: landing(BUNNY, SMALL_BOX), EULER, 40, 0),
@@ -136,9 +136,29 @@ SCENES: dict[str, tuple[Callable[[], ts.Scene], dict, int, int]] = {
 
 
 def can_build(name: str) -> bool:
-    """Whether the mesh that a scene needs is here."""
+    """Whether the scene's mesh is available."""
     mesh = {"bunny": BUNNY, "Armadillo": ARMADILLO}.get(name.split()[0])
     return mesh is None or (MESHES / mesh).is_file()
+
+
+def timed(call: Callable) -> tuple:
+    """The result of a call, and its seconds without compilation."""
+    begin, compiled = time.perf_counter(), compile_clock()
+    result = call()
+    return result, time.perf_counter() - begin - (compile_clock() - compiled)
+
+
+def take_steps(sim: ts.Simulator, steps: int) -> tuple[list[float], list]:
+    """Seconds without compilation, and reports, of single steps."""
+    taken = [timed(lambda: sim.advance(1)) for _ in range(steps)]
+    return [seconds for _, seconds in taken], [report for report, _ in taken]
+
+
+def open_silently(scene: ts.Scene, **settings) -> ts.Simulator:
+    """A simulator, without warnings."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return ts.Simulator(scene, **settings)
 
 
 def parts_of(sim: ts.Simulator) -> tuple:
@@ -149,13 +169,10 @@ def parts_of(sim: ts.Simulator) -> tuple:
 
 
 def capture(name: str, file: Path, quick: bool) -> None:
-    """Run a scene and keep its states. quick: of its first steps alone."""
+    """Run a scene and save its states. quick: of the first steps only."""
     build, settings, steps, before = SCENES[name]
     steps, found = QUICK_STEPS if quick else steps, []
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        sim = ts.Simulator(build(), **settings, precision="f32")
-    with sim:
+    with open_silently(build(), **settings, precision="f32") as sim:
         while sim.step_count < before:
             sim.advance(before - sim.step_count)
         for k in range(steps):
@@ -170,20 +187,17 @@ def capture(name: str, file: Path, quick: bool) -> None:
 
 
 def replay(file: Path, precision: str, tolerance: float, reference: Path | None) -> None:
-    """Solve each state's stage."""
+    """Solve the stage of each state."""
     data = pickle.loads(file.read_bytes())
     build, settings, _, _ = SCENES[data["scene"]]
     known = pickle.loads(reference.read_bytes()) if reference and reference.exists() else None
     ends = []
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        sim = ts.Simulator(build(), **settings, precision=precision)
-    with sim:
+    with open_silently(build(), **settings, precision=precision) as sim:
         scale = float(np.mean([edge(body.mesh) for body in sim.scene.bodies]))
         stepper = parts_of(sim)[0]
         stepper.tolerance = stepper.contact_tolerance = tolerance
         for k, state in enumerate(data["states"]):
-            row, x = solve(sim, state["kept"], sim.dt, 1 if reference and known is None else MOST_HALVES)
+            row, x = solve(sim, state["kept"], sim.dt, 1 if reference and known is None else MAX_HALVES)
             row |= {"scene": data["scene"], "step": state["step"], "captured": state["captured"]}
             if known is not None and known[k] is not None and row["halves"] == 1:  # a step in halves is another one
                 row["error"] = float(np.abs(x - known[k]).max() / scale)
@@ -194,13 +208,13 @@ def replay(file: Path, precision: str, tolerance: float, reference: Path | None)
 
 
 def edge(mesh: ts.TetMesh) -> float:
-    """Mean edge of a mesh's surface [m]."""
+    """Mean edge of the mesh's surface [m]."""
     p = mesh.vertices[mesh.surface]
     return float(np.linalg.norm(p - np.roll(p, 1, axis=1), axis=2).mean())
 
 
-def solve(sim: ts.Simulator, kept: dict, dt: float, most: int) -> tuple[dict, np.ndarray]:
-    """A stage of dt from a state, in halves where it does not converge; and the positions it ends with."""
+def solve(sim: ts.Simulator, kept: dict, dt: float, max_halves: int) -> tuple[dict, np.ndarray]:
+    """Solve a stage of dt from a state, divided into halves until it converges. Returns a row and the final positions."""
     stepper, world = parts_of(sim)
     take = next(getattr(stepper, name) for name in ("take_substep", "take", "_try_part") if hasattr(stepper, name))
     halves, newton, linear, first, seconds, launched = 1, 0, 0, None, 0.0, 0
@@ -221,7 +235,7 @@ def solve(sim: ts.Simulator, kept: dict, dt: float, most: int) -> tuple[dict, np
         linear += sum(r.linear_iterations for r in done if r)
         first = first or done[0]
         good = done[-1] is not None and done[-1].converged
-        if good or halves >= most:
+        if good or halves >= max_halves:
             break
         halves *= 2
     stage = first or done[-1]
@@ -242,10 +256,10 @@ def solve(sim: ts.Simulator, kept: dict, dt: float, most: int) -> tuple[dict, np
 
 
 def fitting(kept: dict, own: dict) -> dict:
-    """What was kept, as the version that is to take it keeps it: what it does not find there stays its own."""
+    """A saved snapshot in the layout of this version; entries that it lacks keep this version's values."""
     found = {}
     for name, value in own.items():
-        if name == "rows":  # contacts; one that was not kept is of no impact
+        if name == "rows":  # contacts; a missing column is zero, as without impact
             rows = kept[name]
             found[name] = {key: rows.get(key, np.zeros_like(rows["r"])) for key in value}
         else:

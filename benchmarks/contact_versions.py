@@ -1,7 +1,7 @@
-"""Implicit steps by this version and an older one: captured states, bodies that fall, steps without contacts, and statics.
+"""Implicit steps of this version and an older one: captured states, falling bodies, steps without contacts, statics.
 
-A section of `taisoft bench contact`. The versions take turns, each in processes of its own, which run `contact_states.py`,
-`contact_drops.py` or `contact_free.py`.
+A section of `taisoft bench contact`. The versions run in turn in processes that execute `contact_states.py`, `contact_drops.py`
+or `contact_free.py`.
 """
 
 import json
@@ -21,16 +21,16 @@ STATES, DROPS, FREE = (Path(module.__file__) for module in (contact_states, cont
 FREE_NAMES = (*contact_free.CASES, contact_free.STATICS)
 PRECISIONS, TOLERANCE, EXACT = ("f32", "f64"), 1e-4, 1e-8
 QUICK_STEPS, QUICK_COUNT, REPEATS = 5, 3, 3
-# what this version is held to in captured states: median and 90th percentile of Newton iterations, fraction that needs halving
+# limits for captured states: median and 90th percentile of Newton iterations, fraction of states that need halving
 MEDIAN, HIGH, HALVED = 5.0, 12.0, 0.03
-DROP_NEWTON = 8.0  # Newton iterations a step on average, of real meshes
-# how many times as long the older version must take: each real mesh, their steps with contacts in all, other scenes
+DROP_NEWTON = 8.0  # mean Newton iterations per step of real meshes
+# minimum time of the older version over this one's: each real mesh, all their steps with contacts, other scenes
 FASTER, FASTER_WITH_CONTACTS, FASTER_OTHERS = 3.0, 5.0, {"cloth": 10.0, "cube on sheet, Euler": 4.0, "cube on sheet, BDF2": 4.0}
-FREE_MORE, FREE_NEWTON = 1.05, 4.0  # times the older version's iterations and time; Newton iterations a step of inverted beams
+FREE_MORE, FREE_NEWTON = 1.05, 4.0  # iterations and time over the older version's; Newton iterations per step of inverted beams
 
 
 def answers(version: Version, program: Path, *task: str | int | Path) -> list[dict]:
-    """What a process of a version found. Raises SimulationError where it failed."""
+    """The results of a process of a version. Raises SimulationError if it fails."""
     return [json.loads(line) for line in version.run(program, *task) if line.startswith("{")]
 
 
@@ -38,11 +38,11 @@ def answers(version: Version, program: Path, *task: str | int | Path) -> list[di
 
 
 def capture(folder: Path, baseline: Path | None, only: list[str] | None, quick: bool) -> Iterator[str]:
-    """Capture each scene's states into the folder, by the older version where one is given; a line of text a scene."""
+    """Capture each scene's states into the folder, with the older version if given; yields a line of text per scene."""
     make_folder(folder)
     for name in only or contact_states.SCENES:
         if not contact_states.can_build(name):
-            yield f"{name}: left out, its mesh is not here"
+            yield f"{name}: left out, its mesh is absent"
             continue
         (folder / f"{name}.exact").unlink(missing_ok=True)
         task = ("capture", name, folder / f"{name}.pkl", *(["quick"] if quick else []))
@@ -51,15 +51,15 @@ def capture(folder: Path, baseline: Path | None, only: list[str] | None, quick: 
 
 
 def replay(folder: Path, baseline: Path | None, only: list[str] | None, document: Document) -> tuple[dict, list[Limit]]:
-    """Solve the captured states in both precisions; a table a version and precision, as they come."""
+    """Solve the captured states in both precisions; adds a table per version and precision."""
     files = [file for file in sorted(folder.glob("*.pkl")) if only is None or file.stem in only]
     if not files:
-        raise SimulationError(f"{folder} holds no captured states: make some by --capture")
+        raise SimulationError(f"{folder} has no captured states: create some with --capture")
 
     def solve(version: Version, file: Path, precision: str, tolerance: float) -> list[dict]:
         return answers(version, STATES, "replay", file, precision, tolerance, file.with_suffix(".exact"))
 
-    for file in files:  # the same steps to 1e-8, kept beside the states
+    for file in files:  # the same steps to 1e-8, saved beside the states
         if not file.with_suffix(".exact").exists():
             solve(version_in(HERE), file, "f64", EXACT)
     found: dict[str, list[dict]] = {}
@@ -73,12 +73,12 @@ def replay(folder: Path, baseline: Path | None, only: list[str] | None, document
 
 
 def values(rows: list[dict], name: str) -> np.ndarray:
-    """A number of each row that has it."""
+    """A number of every row that has it."""
     return np.array([row[name] for row in rows if name in row])
 
 
 def state_table(rows: list[dict]) -> str:
-    """A row a scene, and one for all. Newton and CG: of the first try, whole; launches and time: of all tries."""
+    """A row per scene and one for all. Newton and CG: of the first attempt; launches and time: of all attempts."""
     scenes = {name: [row for row in rows if row["scene"] == name] for name in dict.fromkeys(row["scene"] for row in rows)}
 
     def median(name: str, form: str = ".0f", scale: float = 1.0):
@@ -89,20 +89,20 @@ def state_table(rows: list[dict]) -> str:
         ("states", lambda item: str(len(item[1]))),
         ("N median", median("newton")),
         ("N 90 %", lambda item: f"{np.percentile(values(item[1], 'newton'), 90):.0f}"),
-        ("N most", lambda item: str(values(item[1], "newton").max())),
+        ("N maximum", lambda item: str(values(item[1], "newton").max())),
         ("CG median", median("linear")),
         ("launches", median("launches")),
         ("halved", lambda item: str((values(item[1], "halves") > 1).sum())),
         ("unconverged", lambda item: str((~values(item[1], "converged")).sum())),
         ("ms", median("seconds", ".1f", 1e3)),
         ("error median", lambda item: f"{np.median(e):.1e}" if len(e := values(item[1], "error")) else "-"),
-        ("error most", lambda item: f"{e.max():.1e}" if len(e := values(item[1], "error")) else "-"),
+        ("error maximum", lambda item: f"{e.max():.1e}" if len(e := values(item[1], "error")) else "-"),
     )
     return table([*scenes.items(), ("all", rows)], columns)
 
 
 def speed_text(found: dict[str, list[dict]], precision: str) -> str:
-    """The time of both versions."""
+    """The ratio of both versions' times."""
     new, old = (values(found[f"{label}, {precision}"], "seconds") for label in ("this version", "the baseline"))
     low, middle, high = np.percentile(old / new, [25, 50, 75])
     return (
@@ -117,7 +117,7 @@ def state_limits(rows: list[dict], precision: str) -> list[Limit]:
     return [
         Limit(f"{precision}: Newton iterations, median", float(np.median(newton)), MEDIAN),
         Limit(f"{precision}: Newton iterations, 90 %", float(np.percentile(newton, 90)), HIGH),
-        Limit(f"{precision}: states that need halving, share", float((values(rows, "halves") > 1).mean()), HALVED),
+        Limit(f"{precision}: states that need halving, fraction", float((values(rows, "halves") > 1).mean()), HALVED),
         Limit(f"{precision}: states that stay unconverged", float((~values(rows, "converged")).sum()), 0.0),
     ]
 
@@ -126,12 +126,12 @@ def state_limits(rows: list[dict], precision: str) -> list[Limit]:
 
 
 def drops(baseline: Path | None, only: list[str] | None, quick: bool, document: Document) -> tuple[dict, list[Limit]]:
-    """Run the scenes, versions in turns; a table of all, and limits where the runs are whole."""
+    """Run the scenes with the versions in turn. Returns the results and, unless quick, the limits."""
     versions = versions_beside(baseline)
     found: dict[str, dict[str, dict]] = {label: {} for label in versions}
     for name in only or contact_drops.DROPS:
         if not contact_drops.can_build(name):
-            document.add(f"{name}: left out, its mesh is not here")
+            document.add(f"{name}: left out, its mesh is absent")
             continue
         lines = []
         for label, version in versions.items():
@@ -145,19 +145,19 @@ def drops(baseline: Path | None, only: list[str] | None, quick: bool, document: 
         ("tets", "{[tets]:,}"),
         ("steps", lambda one: str(len(one["seconds"]))),
         ("<version", "{[version]}"),
-        ("N a step", lambda one: f"{np.mean(one['newton']):.1f}"),
-        ("CG a step", lambda one: f"{np.mean(one['linear']):.0f}"),
+        ("N per step", lambda one: f"{np.mean(one['newton']):.1f}"),
+        ("CG per step", lambda one: f"{np.mean(one['linear']):.0f}"),
         ("unconverged", "{[unconverged]}"),
-        ("s in all", lambda one: f"{sum(one['seconds']):.2f}"),
+        ("total s", lambda one: f"{sum(one['seconds']):.2f}"),
         ("s with contacts", lambda one: f"{with_contacts(one):.2f}"),
-        ("ms a step", lambda one: f"{1e3 * np.median(one['seconds']):.1f}"),
+        ("ms per step", lambda one: f"{1e3 * np.median(one['seconds']):.1f}"),
     )
     document.add("## Runs\n\n" + table(rows, columns))
     return found, [] if quick else list(drop_limits(found))
 
 
 def with_contacts(one: dict) -> float:
-    """Seconds of the steps that had contacts."""
+    """Seconds of the steps with contacts."""
     return float(np.array(one["seconds"])[np.array(one["contacts"]) > 0].sum())
 
 
@@ -165,24 +165,24 @@ def drop_limits(found: dict[str, dict[str, dict]]) -> Iterator[Limit]:
     """What this version is held to."""
     this, older = found["this"], found.get("older")
     for name, one in this.items():
-        yield Limit(f"{name}: steps that stay unconverged", float(one["unconverged"]), 0.0)
+        yield Limit(f"{name}: unconverged steps", float(one["unconverged"]), 0.0)
         if name in contact_drops.MESH:
-            yield Limit(f"{name}: Newton iterations a step", sum(one["newton"]) / len(one["newton"]), DROP_NEWTON)
+            yield Limit(f"{name}: Newton iterations per step", sum(one["newton"]) / len(one["newton"]), DROP_NEWTON)
         if older is not None:
             faster = sum(older[name]["seconds"]) / sum(one["seconds"])
-            wanted = FASTER_OTHERS.get(name, FASTER)
-            yield Limit(f"{name}: time of the older version over this one's", faster, wanted, at_least=True)
+            required = FASTER_OTHERS.get(name, FASTER)
+            yield Limit(f"{name}: time of the older version over this one's", faster, required, at_least=True)
     meshes = [name for name in this if name in contact_drops.MESH]
     if older is not None and meshes:
         faster = sum(with_contacts(older[name]) for name in meshes) / sum(with_contacts(this[name]) for name in meshes)
-        yield Limit("steps of real meshes with contacts, in all: the same", faster, FASTER_WITH_CONTACTS, at_least=True)
+        yield Limit("all steps of real meshes with contacts: the same ratio", faster, FASTER_WITH_CONTACTS, at_least=True)
 
 
 # --- without contacts ---------------------------------------------------------------------------------------------------
 
 
 def free(baseline: Path | None, only: list[str] | None, quick: bool, document: Document) -> tuple[dict, list[Limit]]:
-    """Run the cases, versions in turns; a table of all, and limits where the runs are whole."""
+    """Run the cases with the versions in turn. Returns the results and, unless quick, the limits."""
     versions = versions_beside(baseline)
     found: dict[str, dict[str, list[dict]]] = {}
     for name in only or FREE_NAMES:
@@ -204,7 +204,7 @@ def free(baseline: Path | None, only: list[str] | None, quick: bool, document: D
         ("converged", lambda row: str(sum(row[1][row[2]][0]["converged"]))),
         ("N each", each("newton", ".2f")),
         ("CG each", each("linear", ".0f")),
-        ("ms in all", lambda row: f"{1e3 * np.median(total(row[1], row[2], 'seconds')):.1f}"),
+        ("total ms", lambda row: f"{1e3 * np.median(total(row[1], row[2], 'seconds')):.1f}"),
         ("spread", lambda row: f"{100 * spread(total(row[1], row[2], 'seconds')):.0f} %"),
     )
     rows = [(name, own, label) for name, own in found.items() for label in own]
@@ -213,17 +213,17 @@ def free(baseline: Path | None, only: list[str] | None, quick: bool, document: D
 
 
 def counted(own: dict[str, list[dict]]) -> np.ndarray:
-    """Which steps or solves count: those that converge in every version."""
+    """Mask of the steps or solves that converge in every version."""
     return np.all([runs[0]["converged"] for runs in own.values()], axis=0)
 
 
 def total(own: dict[str, list[dict]], label: str, what: str) -> np.ndarray:
-    """Sum of a number over what counts, for each run of a version."""
+    """Sum of a number over the counted steps, for each run of a version."""
     return np.array([np.array(run[what])[counted(own)].sum() for run in own[label]])
 
 
 def spread(times: np.ndarray) -> float:
-    """Of runs, relative: the distance between the largest and the least over the median."""
+    """Range of the times over their median."""
     return float(np.ptp(times) / np.median(times))
 
 
@@ -232,7 +232,7 @@ def free_limits(found: dict[str, dict[str, list[dict]]]) -> Iterator[Limit]:
     for name, own in found.items():
         if name in contact_free.INVERTED:
             newton = total(own, "this", "newton")[0] / max(1, counted(own).sum())
-            yield Limit(f"{name}: Newton iterations a step", float(newton), FREE_NEWTON)
+            yield Limit(f"{name}: Newton iterations per step", float(newton), FREE_NEWTON)
         if "older" not in own:
             continue
         for what, unit in (("newton", "Newton iterations"), ("seconds", "time")):

@@ -2,11 +2,11 @@
 
 taisoft bench cuda_check [--arch cuda|cpu] [--budget SECONDS] [--quick] [--part NAME] [--out DIR]
 
-Each part runs in a process of its own with a time limit, and prints every number as soon as it is known. What a part found
-before it failed or ran out of time stays on the page, and the next part starts in any case. DIR/cuda-check.md and .json are
-written again after every part. Parts: tests marked `cuda`; the works W1 to W4, on the GPU and on the CPU of the same machine;
-coloured against serial Gauss-Seidel; steps of one and four million tets; how far reruns differ. Compiling is timed apart.
-Exit status: 0, or 1 where a part failed or did not end. benchmarks/cuda_check.sh installs what this needs from wheels first.
+Each part runs in its own process with a time limit and prints every number at once, so that results before a failure remain on
+the page; the next part starts in any case. DIR/cuda-check.md and .json are rewritten after every part. Parts: tests marked
+`cuda`; the works W1 to W4 on GPU and CPU; coloured against serial Gauss-Seidel; steps of one and four million tets; differences
+between reruns. Compilation is timed separately. Exit status: 0, or 1 if a part failed or did not end. benchmarks/cuda_check.sh
+installs the requirements from wheels first.
 """
 
 import argparse
@@ -33,12 +33,12 @@ from .runner import RESULT, make_parser, parse_result
 
 ROOT = Path(__file__).resolve().parent.parent
 BUDGET = 470.0  # seconds for all parts: ten less than eight minutes
-LAST_LINES = 15  # of what a failed process printed
+LAST_LINES = 15  # of a failed process's output
 
 
 @dataclass(frozen=True)
 class Part:
-    """A part of the page. seconds: its time limit; time that earlier parts leave is added to the later ones."""
+    """A part of the page. seconds: time limit; unused time of earlier parts is added."""
 
     name: str
     title: str
@@ -48,7 +48,7 @@ class Part:
 
 @dataclass
 class Outcome:
-    """What a part's process did. ended: "ok", "failed" or "out of time"; found: its results in order; tail: its last lines."""
+    """Result of a part's process. ended: "ok", "failed" or "out of time"; found: results in order; tail: last lines of output."""
 
     part: Part
     ended: str = ""
@@ -67,8 +67,8 @@ def make_parts(arch: str, quick: bool) -> list[Part]:
     ]
 
 
-def carry_out(part: Part, limit: float) -> Outcome:
-    """Run a part for at most `limit` seconds; its whole process group ends with it."""
+def run_part(part: Part, limit: float) -> Outcome:
+    """Run a part for at most `limit` seconds, then kill its process group."""
     outcome, start = Outcome(part), time.monotonic()
     path = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
     environment = os.environ | {"PYTHONPATH": path, "PYTHONUNBUFFERED": "1"}
@@ -124,31 +124,31 @@ def gpu_name() -> str:
 
 
 def part_text(o: Outcome) -> str:
-    """A part of the page, with what its process printed last where it failed."""
+    """Section of a part, with the last output of a failed process."""
     body = TABLES[o.part.name](o.found) if o.found else "It found nothing."
     head = f"## {o.part.title}\n\nEnded: {o.ended}, {o.seconds:.0f} s."
     return "\n\n".join([head, body, *([f"```\n{o.tail}\n```"] if o.tail else [])])
 
 
 def tests_text(found: list[dict]) -> str:
-    """How many tests ended how, and those that did not pass."""
+    """Counts of test results, and the tests that did not pass."""
     counts = Counter(one["result"] for one in found)
     bad = [f"* {one['test']}: {one['result']}" for one in found if one["result"] != "passed"]
     return "\n".join([", ".join(f"{n} {what}" for what, n in sorted(counts.items())) + ".", *(["", *bad] if bad else [])])
 
 
 def cell(name: str, form: str = "", scale: float = 1.0):
-    """A number of a result; empty where there is none or the measurement failed."""
+    """A cell function for a number of a result; empty if it is missing."""
     return lambda one: "" if one.get(name) is None else f"{one[name] * scale if scale != 1.0 else one[name]:{form}}"
 
 
 def or_failure(fill: Callable[[dict], str]):
-    """The first cell that a failure leaves empty says why."""
+    """A cell function that shows a failure in place of the number."""
     return lambda one: one["failure"] if "failure" in one else fill(one)
 
 
 def error_of(one: dict) -> str:
-    """The error of a work, or whether it stands."""
+    """Error of a work, or whether it stands."""
     if "failure" in one:
         return ""
     return f"{100 * one['error']:.2g} %" if one["error"] is not None else "stands" if one["stands"] else "does not stand"
@@ -201,7 +201,7 @@ TABLES = {"tests": tests_text} | {name: partial(table, columns=columns) for name
 
 
 def write_page(folder: Path, head: str, numbers: dict, outcomes: list[Outcome], waiting: list[Part]) -> None:
-    """The page and its numbers as far as they are known."""
+    """Write the page and the numbers known so far."""
     parts = [head, *map(part_text, outcomes)]
     if waiting:
         parts.append("Not yet run: " + ", ".join(part.name for part in waiting) + ".")
@@ -210,7 +210,7 @@ def write_page(folder: Path, head: str, numbers: dict, outcomes: list[Outcome], 
 
 
 def check(parts: list[Part], budget: float, folder: Path, arch: str) -> list[Outcome]:
-    """Carry out the parts within `budget` seconds, writing the page after each. Raises OutputError."""
+    """Run the parts within `budget` seconds, writing the page after each. Raises OutputError."""
     gpu = gpu_name()
     text, numbers = header("GPU check", f"arch {arch}", gpu, packages=("taichi", "numpy", "scipy", "meshio"))
     numbers |= {"arch": arch, "gpu": gpu}
@@ -222,7 +222,7 @@ def check(parts: list[Part], budget: float, folder: Path, arch: str) -> list[Out
             outcomes.append(Outcome(part, "out of time", tail="no time was left to start it"))
         else:
             print(f"{part.name}: at most {limit:.0f} s", file=sys.stderr, flush=True)
-            outcomes.append(carry_out(part, limit))
+            outcomes.append(run_part(part, limit))
         print(f"{part.name}: {outcomes[-1].ended}, {outcomes[-1].seconds:.0f} s", file=sys.stderr, flush=True)
         write_page(folder, text, numbers, outcomes, parts[k + 1 :])
     return outcomes
@@ -231,7 +231,7 @@ def check(parts: list[Part], budget: float, folder: Path, arch: str) -> list[Out
 def main(argv=None) -> int:
     """Check and write the page. Raises OutputError."""
     parser = make_parser("cuda_check", __doc__)
-    parser.add_argument("--arch", choices=("cuda", "cpu"), default="cuda", help="cpu checks the checking itself")
+    parser.add_argument("--arch", choices=("cuda", "cpu"), default="cuda", help="cpu tests this benchmark itself")
     parser.add_argument("--budget", type=float, default=BUDGET, metavar="SECONDS", help=f"for all parts (default {BUDGET:.0f})")
     parser.add_argument("--quick", action="store_true", help="small sizes")
     parser.add_argument("--part", action="append", choices=["tests", *JOBS], help="only this part; may be repeated")

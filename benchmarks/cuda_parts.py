@@ -1,4 +1,4 @@
-"""What `cuda_check.py` measures, each part in a process of its own, which prints a result as soon as it has it."""
+"""Parts of `cuda_check.py`; each runs in its own process and prints results as they come."""
 
 from collections.abc import Callable, Iterator
 from contextlib import closing
@@ -17,15 +17,15 @@ from .contact_colouring import measure_crossover
 from .elasticity_runs import MARGIN, beam_scene
 from .programs import own
 from .programs.session import Setting
-from .runner import patched, say
+from .runner import patched, print_result
 from .scaling_runs import cubes_on_ground
-from .works.judge import judge
+from .works.evaluation import evaluate
 from .works.references import MUJOCO, TAISOFT
 from .works.scenes import WORKS, Work
 
-EXPLICIT_STEPS = {"W1 12x3x3": 3, "W1 24x6x6": 5, "W1 48x12x12": 11, "W2": 3, "W3": 2, "W4": 19}  # in 10 ms, all of them stable
+EXPLICIT_STEPS = {"W1 12x3x3": 3, "W1 24x6x6": 5, "W1 48x12x12": 11, "W2": 3, "W3": 2, "W4": 19}  # stable steps in 10 ms
 TIMED_STEPS, IMPLICIT_STEPS = 200, 3
-SMALL = 4  # cells across the beam whose stable step is scaled to the larger ones
+SMALL = 4  # cells across the small beam; its stable step is scaled to larger ones
 PLATES, QUICK_PLATES = (8, 32, 64, 128, 192), (4,)
 SIZES, QUICK_SIZES = (37, 58), (6,)  # cells across a beam of 20 n^3 tets: 1.0 and 3.9 million
 RERUNS = 3
@@ -34,7 +34,7 @@ RERUNS = 3
 def run_job(name: str, arch: str, quick: bool) -> None:
     """Print the results of a part."""
     for found in JOBS[name][2](arch, quick):
-        say(found)
+        print_result(found)
 
 
 def works(arch: str, quick: bool) -> Iterator[dict]:
@@ -50,7 +50,7 @@ def works(arch: str, quick: bool) -> Iterator[dict]:
 
 
 def _timed(work: Work, setting: Setting) -> dict:
-    """Time, error and verdict of one setting, or why there is none."""
+    """Time, error and verdict of one setting, or its failure."""
     try:
         session = own.Run(work, setting)
         try:
@@ -58,7 +58,7 @@ def _timed(work: Work, setting: Setting) -> dict:
             _, seconds = session.run(follow=False)
         finally:
             session.close()
-        verdict = judge(work, setting.model, positions)
+        verdict = evaluate(work, setting.model, positions)
     except TaisoftError as error:
         return {"failure": str(error)}
     return {
@@ -72,7 +72,7 @@ def _timed(work: Work, setting: Setting) -> dict:
 
 
 def sweeps(arch: str, quick: bool) -> Iterator[dict]:
-    """Coloured against serial Gauss-Seidel on two plates, the numbers of contacts rising."""
+    """Coloured against serial Gauss-Seidel on two plates with increasing numbers of contacts."""
     for n in QUICK_PLATES if quick else PLATES:
         with closing(open_runtime(arch, "f32", "the check of solvers")) as runtime:
             (point,) = measure_crossover((n,), runtime)
@@ -103,14 +103,14 @@ def _timed_size(scene: Scene, integrator: str, dt: float, arch: str) -> dict:
         with sim:
             build = perf_counter() - start - sim.compile_seconds
             warm_up(sim)
-            stretch = advance(sim, TIMED_STEPS if integrator == "velocity_verlet" else IMPLICIT_STEPS)
+            timed_run = advance(sim, TIMED_STEPS if integrator == "velocity_verlet" else IMPLICIT_STEPS)
             return {
-                "step_ms": 1e3 * stretch.seconds / stretch.steps,
-                "steps": stretch.steps,
-                "linear": stretch.linear_iterations,
-                "newton": stretch.newton_iterations,
-                "unconverged": stretch.unconverged,
-                "inverted": stretch.inverted,
+                "step_ms": 1e3 * timed_run.seconds / timed_run.steps,
+                "steps": timed_run.steps,
+                "linear": timed_run.linear_iterations,
+                "newton": timed_run.newton_iterations,
+                "unconverged": timed_run.unconverged,
+                "inverted": timed_run.inverted,
                 "build_seconds": build,
                 "compile_seconds": sim.compile_seconds,
                 "field_bytes": sum(sim.field_bytes.values()),
@@ -120,7 +120,7 @@ def _timed_size(scene: Scene, integrator: str, dt: float, arch: str) -> dict:
 
 
 def reruns(arch: str, quick: bool) -> Iterator[dict]:
-    """How far runs of the same scene end from the first one, relative to its excursion."""
+    """Distance of the final states of reruns to the first run, relative to its excursion."""
     for name, build, integrator, dt, seconds in (
         ("hanging beam", lambda: beam_scene((12, 3, 3), "SNH"), "velocity_verlet", 0.002, 1.0),
         ("hanging beam", lambda: beam_scene((12, 3, 3), "SNH"), "bdf2", 0.01, 0.5),

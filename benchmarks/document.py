@@ -1,4 +1,4 @@
-"""What every benchmark does with its results: a page of tables and limits; numbers beside it; a look at an earlier run."""
+"""Results of a benchmark: a Markdown page of tables and limits, a JSON file, a comparison with an earlier run."""
 
 import argparse
 import json
@@ -21,29 +21,29 @@ from taisoft.output.report import json_text
 from taisoft.output.tables import markdown, percent, spread_of
 
 RESULTS = Path(__file__).resolve().parent / "results"
-SAME = ("processor", "cores", "arch", "quick")  # what two runs must share to be compared
+COMPARABLE = ("processor", "cores", "arch", "quick")  # runs are compared only if these agree
 
 
 # --- the page -----------------------------------------------------------------------------------------------------------
 
 
 class Document:
-    """What is printed, kept for the file."""
+    """A page that is printed as it grows."""
 
     def __init__(self) -> None:
         self.parts: list[str] = []
 
     def add(self, text: str) -> None:
-        """Print a part and keep it."""
+        """Print a part and append it."""
         self.parts.append(text)
         print(text, end="\n\n", flush=True)
 
     def text(self) -> str:
-        """All parts."""
+        """The whole page."""
         return "\n\n".join(self.parts) + "\n"
 
     def write(self, out: Path, numbers: dict) -> None:
-        """The numbers into `out`, a .json file, and the page beside it. Raises OutputError where they cannot be written."""
+        """Write the numbers to `out`, a .json file, and the page beside it. Raises OutputError."""
         write_bytes(out, json_text(plain(numbers)).encode())
         write_bytes(out.with_suffix(".md"), self.text().encode())
         print(f"written: {out} and {out.with_suffix('.md').name}")
@@ -51,9 +51,9 @@ class Document:
     def finish(
         self, options: argparse.Namespace, numbers: dict, limits: Sequence["Limit"] = (), draw: Callable | None = None
     ) -> int:
-        """Add the limits, write what `options` ask for, and return the exit status: 1 where a limit is not met.
+        """Add the limits, write --out and --plot, and return the exit status: 1 if a limit is not met.
 
-        draw: writes the picture of --plot into a path.
+        draw: writes the picture of --plot to a path.
         """
         if limits:
             self.add("## Limits\n\n" + limit_table(limits))
@@ -68,21 +68,21 @@ class Document:
 
 
 def begin(title: str, *how: str, packages: tuple[str, ...] = ("taichi", "numpy", "scipy")) -> tuple[Document, dict]:
-    """A document that begins with what is measured where and how, and the same as data."""
+    """A document with its header, and the header as data."""
     document, (text, numbers) = Document(), header(title, *how, packages=packages)
     document.add(text)
     return document, numbers
 
 
 def header(title: str, *how: str, packages: tuple[str, ...] = ("taichi", "numpy", "scipy")) -> tuple[str, dict]:
-    """What is measured where and how, as text and as data."""
+    """Title, machine, date and versions, as text and as data."""
     found = machine() | {"date": datetime.now().isoformat(timespec="minutes")}
     numbers = found | {"versions": {"taisoft": ts.__version__, **versions(*packages)}}
     return header_text(title, numbers, *how), numbers
 
 
 def header_text(title: str, numbers: dict, *how: str) -> str:
-    """Where and how stored numbers were measured."""
+    """The header of stored numbers."""
     return (
         f"# {title}\n\n{', '.join([numbers['processor'], str(numbers['cores']) + ' cores', *how])}, "
         f"load {load_text(numbers['load'])} at the start; {numbers['date']}\n"
@@ -96,7 +96,7 @@ def load_text(value: float | None) -> str:
 
 
 def plain(value):
-    """As plain data: records and dataclasses as dicts, in lists and dicts too."""
+    """The value as plain data: records and dataclasses become dicts, also inside lists and dicts."""
     if hasattr(value, "record"):
         return plain(value.record())
     if is_dataclass(value):
@@ -110,7 +110,7 @@ def plain(value):
 
 
 def check_out(path: Path | None, suffix: str) -> None:
-    """Raises OutputError, before minutes of measuring, where a file could not be written."""
+    """Raise OutputError, before minutes of measuring, if a file cannot be written."""
     if path is None:
         return
     if path.suffix != suffix:
@@ -120,13 +120,13 @@ def check_out(path: Path | None, suffix: str) -> None:
 
 
 def default_out(arch: str, what: str, suffix: str = ".json") -> Path:
-    """results/<what>-<machine><suffix> beside this file; without a suffix a folder."""
+    """results/<what>-<machine><suffix>; a folder without a suffix."""
     where = machine()
     return RESULTS / f"{what}-{slug(where['processor'])}-{where['cores']}-cores{'-cuda' if arch == 'cuda' else ''}{suffix}"
 
 
 def slug(text: str) -> str:
-    """The text as part of a file's name: lower case, trade marks dropped, everything else but letters and digits a dash."""
+    """The text as part of a file name: lower case, without trade marks, other characters as dashes."""
     text = re.sub(r"\((r|tm|c)\)", "", text.lower())
     return re.sub(r"[^a-z0-9]+", "-", text).strip("-")
 
@@ -137,9 +137,9 @@ Columns = Sequence[tuple[str, str | Callable[..., str]]]
 
 
 def table(rows: Iterable, columns: Columns, notes: Iterable[str] = ()) -> str:
-    """A line for each row, and each note as a bullet below.
+    """A Markdown table, with the notes as bullets below.
 
-    columns: heading, aligned left where it begins with "<", and cell: a format string of the row, or a function of it.
+    columns: (heading, cell); a heading that starts with "<" is left-aligned, a cell is a format string or a function of the row.
     """
     lines = [[cell.format(row) if isinstance(cell, str) else cell(row) for _, cell in columns] for row in rows]
     left = [k for k, (heading, _) in enumerate(columns) if heading.startswith("<")]
@@ -149,25 +149,25 @@ def table(rows: Iterable, columns: Columns, notes: Iterable[str] = ()) -> str:
 
 
 def ms(seconds: float) -> str:
-    """Milliseconds, three digits."""
+    """Milliseconds with three digits."""
     return f"{1e3 * seconds:.3g}"
 
 
 def timed_cells(seconds: Iterable[float]) -> tuple[str, str]:
-    """Median [ms] and spread of times as cells."""
+    """Median [ms] and spread of times."""
     t = summarise(seconds)
     return ms(t.median), percent(spread_of(t))
 
 
 def ranged(values: Sequence[float]) -> str:
-    """Median, least and most."""
+    """Median, minimum and maximum."""
     return f"{np.median(values):g} ({min(values):g} to {max(values):g})" if len(values) else "-"
 
 
 def exponent(x: Sequence[float], y: Sequence[float]) -> tuple[float, float]:
-    """p of y ~ x^p by least squares in the logarithms, and how far the farthest point lies off the fit, relative to y.
+    """p of y ~ x^p by least squares in the logarithms, and the largest relative residual.
 
-    Not numbers for fewer than two x, or where some y is 0.
+    nan for fewer than two x or if some y is 0.
     """
     if len(set(x)) < 2 or min(y) <= 0.0:
         return math.nan, math.nan
@@ -177,7 +177,7 @@ def exponent(x: Sequence[float], y: Sequence[float]) -> tuple[float, float]:
 
 
 def crossovers(at: Sequence[float], a: Sequence[float], b: Sequence[float]) -> list[float]:
-    """Where the faster of two becomes the slower: straight in the logarithms between neighbours; never beyond the ends."""
+    """Where the curves a and b cross, interpolated linearly in the logarithms."""
     found, ratio = [], np.log(np.asarray(a) / np.asarray(b))
     for k in range(len(at) - 1):
         if ratio[k] * ratio[k + 1] < 0:
@@ -191,7 +191,7 @@ def crossovers(at: Sequence[float], a: Sequence[float], b: Sequence[float]) -> l
 
 @dataclass(frozen=True)
 class Limit:
-    """A number beside its limit. spread: of the number, relative; None for one that does not vary. at_least: a lower limit."""
+    """A number and its limit. spread: relative spread of the number, None if it does not vary. at_least: a lower limit."""
 
     what: str
     value: float
@@ -201,16 +201,16 @@ class Limit:
 
     @property
     def met(self) -> bool:
-        """Whether the number keeps the limit; one that is not a number never does."""
+        """Whether the limit is met; nan never meets it."""
         return self.value >= self.limit if self.at_least else self.value <= self.limit
 
     @property
     def close(self) -> bool:
-        """Whether the spread is as large as the distance to the limit: another run may find otherwise."""
+        """Whether the distance to the limit is within the spread, so that another run may differ."""
         return self.spread is not None and abs(self.value - self.limit) <= self.spread * abs(self.value)
 
     def record(self) -> dict:
-        """As plain data."""
+        """The limit as plain data."""
         return asdict(self) | {"met": self.met, "close": self.close}
 
     def row(self) -> tuple[str, ...]:
@@ -226,20 +226,20 @@ class Limit:
 
 
 def timed_limit(what: str, t: Timing | None, limit: float, scale: float = 1.0, at_least: bool = False) -> Limit:
-    """The limit on a time's median, `scale` to its unit; without a time it is not met."""
+    """A limit on the median of a time, multiplied by `scale`; not met without a time."""
     return Limit(what, scale * t.median if t else math.nan, limit, spread_of(t) if t else None, at_least)
 
 
 def limit_table(limits: Iterable[Limit]) -> str:
-    """A row a limit."""
-    return markdown(("limit", "measured", "spread", "wanted", "verdict"), [x.row() for x in limits], left=(0, 3, 4))
+    """A row per limit."""
+    return markdown(("limit", "measured", "spread", "required", "verdict"), [x.row() for x in limits], left=(0, 3, 4))
 
 
 # --- an earlier run -----------------------------------------------------------------------------------------------------
 
 
 def earlier_numbers(path: Path | None) -> dict | None:
-    """What an earlier run wrote there, None where there is nothing that can be read."""
+    """The numbers that an earlier run wrote, None if they cannot be read."""
     try:
         return None if path is None else json.loads(path.read_text())
     except (OSError, ValueError):
@@ -247,17 +247,16 @@ def earlier_numbers(path: Path | None) -> dict | None:
 
 
 def agrees(one: dict, two: dict) -> bool:
-    """Whether two timings, as plain data, lie no farther apart than their spreads together."""
-    apart = abs(one["median"] - two["median"])
-    return apart <= one["spread"] * one["median"] + two["spread"] * two["median"]
+    """Whether two timings, as plain data, agree within the sum of their spreads."""
+    return abs(one["median"] - two["median"]) <= one["spread"] * one["median"] + two["spread"] * two["median"]
 
 
 def again_text(earlier: dict | None, times: dict[str, Timing], numbers: dict) -> str:
-    """How the times of an earlier run into the same file compare; earlier: its numbers, None where there are none."""
+    """Compare times with those of an earlier run with the same output file. earlier: its numbers or None."""
     head = "## Beside an earlier run\n\n"
     if earlier is None:
         return head + "There was no earlier run here."
-    differing = [name for name in SAME if earlier.get(name) != numbers.get(name)]
+    differing = [name for name in COMPARABLE if earlier.get(name) != numbers.get(name)]
     if differing:
         return head + f"The earlier run here had another {' and '.join(differing)}."
     before = earlier.get("times", {})

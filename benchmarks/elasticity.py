@@ -1,36 +1,35 @@
-"""The falling beam, taisoft beside MuJoCo: cost of a step, alone and in sim.run, time and error of whole runs.
+"""The falling beam in taisoft and MuJoCo: cost of a step, alone and in sim.run, time and error of whole runs.
 
 taisoft bench elasticity [--arch cpu|cuda] [--quick] [--no-peers] [--out [FILE.json]]
 
 A beam 4 x 1 x 1 m, E = 1 MPa, nu = 0.3, 1000 kg/m^3, clamped at one end, falls under 9.8 m/s^2 from rest. Both programs
-have the same tets (five a cell) and lumped masses and, in the runs, St. Venant-Kirchhoff material. The error is that of
-time integration alone: the largest distance of the tip, the mean of the end face, to the path of the same mesh exact in
-time, over its largest excursion, up to 1 s; in brackets up to 0.8 s, since from then on this law folds at the clamp and
-tets turn inside out. Spread is the distance between the quartiles over the median. Nothing here passes or fails: limits
-are marked as met or not. --out writes what is printed, as FILE.md, and all numbers, as FILE.json. The whole takes about
-a quarter of an hour on two cores; leave the package's files alone meanwhile, since kernels are compiled from them.
+use the same tets (five per cell) and lumped masses and, in the runs, St. Venant-Kirchhoff material. The error is that of
+time integration alone: the largest distance of the tip (mean of the end face) to the path of the same mesh exact in
+time, over its largest excursion, up to 1 s; in brackets up to 0.8 s, since tets invert at the clamp after that. Spread is
+the interquartile range over the median. The exit status is 0 also if limits are not met. --out writes the page, FILE.md,
+and all numbers, FILE.json. A full run takes about a quarter of an hour on two cores; do not edit the package meanwhile,
+since kernels are compiled from it.
 """
 
 import sys
 from dataclasses import dataclass
-from pathlib import Path
 
 from taisoft.cli.doctor import cuda
 from taisoft.errors import SimulationError
 from taisoft.machine import Timing, load_average
 from taisoft.output.tables import percent, spread_of
 
-from .document import RESULTS, Document, Limit, begin, check_out, default_out, limit_table, load_text, table
+from .document import Document, Limit, begin, limit_table, load_text, table
 from .elasticity_runs import MUJOCO, TAISOFT, Row, make_rows, measure_rows, n_tets, time_ratio
 from .elasticity_steps import cost_limits, cost_table, frame_limits, frame_table, measure_costs, measure_frames
 from .exact_path import MESHES, SECONDS
 from .programs.mujoco_flex import run_mujoco
-from .runner import add_arch, make_parser
+from .runner import add_arch, add_named_out, make_parser, named_out
 
-TARGET_MESH = MESHES[-1]  # whose implicit runs have targets
-SPEED_TARGET, ERROR_TARGET = 3.0, 0.0015  # MuJoCo's time over ours, at least; error of a path, at most
-# What is set beside each other: our integrator, theirs, and the steps theirs takes for one of the first in its rows:
-# explicit ones at their largest steps, implicit ones at 10 ms, and theirs at a quarter of that, nearer to our error.
+TARGET_MESH = MESHES[-1]  # the mesh with targets for implicit runs
+SPEED_TARGET, ERROR_TARGET = 3.0, 0.0015  # minimum of MuJoCo's time over ours; maximum error of a path
+# Compared runs: our integrator, MuJoCo's, and its steps per step of the first of its rows. Explicit integrators run at
+# their largest steps, implicit ones at 10 ms, and MuJoCo's also at 2.5 ms, where its error is closer to ours.
 PAIRS = (
     ("velocity_verlet", "euler_staggered", 1),
     ("symplectic_euler", "euler", 1),
@@ -43,7 +42,7 @@ PAIRS = (
 
 @dataclass(frozen=True)
 class Extent:
-    """How much is measured. rounds: for each mesh; repeats: samples of a step's cost; seconds: simulated in a run."""
+    """Extent of the measurement. rounds: per mesh; repeats: samples of a step's cost; seconds: simulated time of a run."""
 
     meshes: tuple
     precisions: tuple[str, ...]
@@ -57,7 +56,7 @@ QUICK = Extent(MESHES[:2], ("f32",), repeats=5, rounds=(1, 1))
 
 
 def run_table(rows: list[Row]) -> str:
-    """A row a run, with the failures and notes below."""
+    """A row per run, with failures and notes below."""
 
     def timing(cell) -> str:
         return lambda row: cell(row, row.timing) if row.timing else "-"
@@ -73,7 +72,7 @@ def run_table(rows: list[Row]) -> str:
         ("error", lambda row: "-" if row.error is None else f"{row.error:.4%}"),
         ("(0.8 s)", lambda row: "-" if row.error is None else f"({row.error_unfolded:.4%})"),
         ("build [s]", lambda row: f"{row.build_seconds[0]:.2f}" if row.build_seconds else "-"),
-        ("of it compiling", lambda row: f"{row.compile_seconds[0]:.2f}" if row.compile_seconds else "-"),
+        ("of which compiling", lambda row: f"{row.compile_seconds[0]:.2f}" if row.compile_seconds else "-"),
     )
 
     def troubles(row: Row) -> str:
@@ -90,7 +89,7 @@ def run_table(rows: list[Row]) -> str:
 
 
 def compare(rows: list[Row]) -> list[tuple[Row, Row, Timing]]:
-    """Our row, MuJoCo's, and its time over ours, for each of PAIRS that has run on this mesh."""
+    """(our row, MuJoCo's row, ratio of the times) of each of PAIRS that ran on this mesh."""
     found = []
     for own, other, finer in PAIRS:
         ours = next((row for row in rows if (row.program, row.integrator) == (TAISOFT, own)), None)
@@ -103,7 +102,7 @@ def compare(rows: list[Row]) -> list[tuple[Row, Row, Timing]]:
 
 
 def compare_table(pairs: list[tuple[Row, Row, Timing]]) -> str:
-    """A row a pair."""
+    """A row per pair."""
 
     def name(row: Row) -> str:
         return f"{row.integrator}, {1e3 * row.dt:.3f} ms"
@@ -140,7 +139,7 @@ def run_limits(rows: list[Row]) -> list[Limit]:
 
 
 def peer_problem() -> str | None:
-    """Why MuJoCo cannot be compared with, in a sentence, or None."""
+    """Why MuJoCo is not available, or None."""
     try:
         run_mujoco(MESHES[0], "discrete", 0.01, seconds=0.01)
     except SimulationError as error:
@@ -149,11 +148,11 @@ def peer_problem() -> str | None:
 
 
 def measure(extent: Extent, arch: str, peers: bool) -> tuple[Document, dict]:
-    """Everything, printed as it comes, and the numbers."""
+    """Measure and print everything; returns the page and the numbers."""
     document, numbers = begin("Elasticity: the falling beam", packages=("taichi", "mujoco", "numpy", "scipy"))
     device = cuda().removeprefix("yes: ") if arch == "cuda" else None
     where = f"taisoft on {device}, MuJoCo on the processor" if device else "both programs on the processor"
-    document.add(f"{where}, and there on one thread each")
+    document.add(f"{where}, each on one thread of the processor")
     problem = peer_problem() if peers else "left out with --no-peers"
     if problem:
         document.add(f"MuJoCo is not compared with: {problem}.")
@@ -164,7 +163,7 @@ def measure(extent: Extent, arch: str, peers: bool) -> tuple[Document, dict]:
             found = measure_costs(cells, precision, arch, extent.repeats)
             document.add(cost_table(found))
             costs += found
-    document.add("## Steps in a run, 60 frames a second, beside the steps alone, stable neo-Hookean, f32")
+    document.add("## Steps in a run at 60 frames per second and steps alone, stable neo-Hookean, f32")
     for found in measure_frames(extent.meshes, arch, extent.repeats):
         document.add(frame_table(found))
         frames += found
@@ -185,24 +184,14 @@ def measure(extent: Extent, arch: str, peers: bool) -> tuple[Document, dict]:
 
 
 def main(argv=None) -> int:
-    """Measure and print. Raises OutputError, or SimulationError where the arch cannot be had."""
+    """Measure and print. Raises OutputError, or SimulationError if the arch is not available."""
     parser = make_parser("elasticity", __doc__)
     add_arch(parser)
     parser.add_argument("--quick", action="store_true", help="two small meshes, f32, one round")
     parser.add_argument("--no-peers", action="store_true", help="leave MuJoCo out")
-    parser.add_argument(
-        "--out",
-        type=Path,
-        nargs="?",
-        const=RESULTS,
-        metavar="FILE.json",
-        help="write FILE.json and FILE.md too; without a name into benchmarks/results, named after the machine",
-    )
+    add_named_out(parser)
     options = parser.parse_args(argv)
-    out = options.out
-    if out is not None:
-        out = default_out(options.arch, "elasticity") if out == RESULTS else out
-        check_out(out, ".json")
+    out = named_out(options, "elasticity")
     document, numbers = measure(QUICK if options.quick else FULL, options.arch, not options.no_peers)
     if out is not None:
         document.write(out, numbers | {"quick": options.quick})

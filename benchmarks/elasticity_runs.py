@@ -1,9 +1,9 @@
-"""The falling beam of exact_path.py in taisoft, and whole runs of it over a second: time and error, taisoft and MuJoCo in turn.
+"""The falling beam of exact_path.py in taisoft, and whole runs of one second: time and error of taisoft and MuJoCo in turn.
 
-A round opens, runs and closes each program's each integrator once, so that a slow minute of the machine falls on all;
-ratios are taken round by round. A time is that of a whole run: MuJoCo's steps in pieces of 10 ms, taisoft's through
-sim.advance in the largest batches it takes, without compiling. The first round also follows the tip. Below
-model.PARALLEL_FROM tets or PARALLEL_THREADS threads taisoft steps on one thread of the CPU, and so does MuJoCo.
+A round opens, runs and closes every integrator of both programs once, so that a slow minute of the machine affects all; ratios
+are formed per round. A time is that of a whole run without compilation: MuJoCo in batches of 10 ms, taisoft in the largest
+batches of sim.advance. The first round also records the tip. Below model.PARALLEL_FROM tets or PARALLEL_THREADS threads taisoft
+uses one CPU thread, as MuJoCo does.
 """
 
 import math
@@ -23,10 +23,10 @@ from taisoft.study.measure import TimedRun, advance, warm_up
 
 from .exact_path import DENSITY, FOLDING_STARTS, GRAVITY, POISSON, SAMPLE, SIZE, YOUNG, load_exact
 from .programs.mujoco_flex import STABLE_STEPS, run_mujoco
+from .reference_cases.record import LAWS
 from .runner import progress
 
-LAWS = {"SNH": "stable_neo_hookean", "SVK": "st_venant_kirchhoff", "COR": "corotational"}
-MARGIN = 0.9  # of the largest stable step about the rest shape
+MARGIN = 0.9  # step over the largest stable step about the rest shape
 IMPLICIT = ("bdf2", "implicit_midpoint", "implicit_euler", "linearly_implicit_euler")
 TAISOFT, MUJOCO = "taisoft", "MuJoCo"
 ROUND_SECONDS, ROUND_RUNS = 0.3, 10  # a round repeats a run until this wall time or this number is reached
@@ -36,12 +36,12 @@ ROUND_SECONDS, ROUND_RUNS = 0.3, 10  # a round repeats a run until this wall tim
 
 
 def n_tets(cells) -> int:
-    """Number of tets, five a cell."""
+    """Number of tets, five per cell."""
     return 5 * math.prod(cells)
 
 
 def beam_scene(cells, law: str = "SVK") -> Scene:
-    """The beam, clamped at its left end face, straight and at rest. law: one of LAWS."""
+    """The beam at rest, clamped at its left end. law: one of LAWS."""
     scene = ts.Scene(gravity=(0.0, -GRAVITY, 0.0))
     rubber = ts.Material(law=LAWS[law], young=YOUNG, poisson=POISSON, density=DENSITY)
     beam = scene.add_body(ts.box_mesh(cells, SIZE), rubber, name="beam")
@@ -50,17 +50,17 @@ def beam_scene(cells, law: str = "SVK") -> Scene:
 
 
 def explicit_steps(scene: Scene) -> int:
-    """Smallest number of explicit steps in 10 ms whose dt is at most MARGIN of the limit."""
+    """Smallest number of explicit steps in 10 ms with dt at most MARGIN times the stability limit."""
     return math.ceil(SAMPLE / (MARGIN * stable_dt(scene, verlet=True)))
 
 
 def steps_within_limit(cells) -> int:
-    """Those of the beam; one limit for all laws."""
+    """`explicit_steps` of the beam, the same for all laws."""
     return explicit_steps(beam_scene(cells))
 
 
 def follow_tip(sim: ts.Simulator, steps: int, samples: int) -> tuple[np.ndarray, TimedRun]:
-    """Path (samples + 1, 3) [m] of the mean of the end face's nodes, every `steps` steps from the start, and the stretch."""
+    """Path (samples + 1, 3) [m] of the mean of the end face's nodes, every `steps` steps, and the timed run."""
     sim.reset()
     tip = np.flatnonzero(sim.scene.body("beam").rest_positions[:, 0] > SIZE[0] / 2 - 1e-9)
     path, whole = [sim.positions("beam")[tip].mean(axis=0)], TimedRun()
@@ -75,14 +75,14 @@ def follow_tip(sim: ts.Simulator, steps: int, samples: int) -> tuple[np.ndarray,
 
 @dataclass
 class Row:
-    """One program's integrator at one step size on one mesh. rounds: wall seconds per simulated second of every run."""
+    """One integrator of a program at one dt on one mesh. rounds: wall seconds per simulated second of every run."""
 
     tets: int
     program: str
     integrator: str
     steps: int  # within 10 ms
     rounds: list[list[float]] = field(default_factory=list)
-    build_seconds: list[float] = field(default_factory=list)  # to a simulator that steps, compiling included
+    build_seconds: list[float] = field(default_factory=list)  # until the simulator can step, including compilation
     compile_seconds: list[float] = field(default_factory=list)
     error: float | None = None
     error_unfolded: float | None = None
@@ -97,24 +97,24 @@ class Row:
 
     @property
     def timing(self) -> Timing | None:
-        """Of a simulated second [s], over all runs of all rounds; None where no run ended."""
+        """Timing of a simulated second [s] over all runs; None if no run ended."""
         runs = [seconds for one in self.rounds for seconds in one]
         return summarise(runs) if runs else None
 
-    def judge(self, cells, path: np.ndarray) -> None:
-        """Errors of the path (k,3) [m], a point every 10 ms."""
+    def set_errors(self, cells, path: np.ndarray) -> None:
+        """Set the errors from the path (k,3) [m], sampled every 10 ms."""
         exact, t = load_exact(cells), np.arange(len(path)) * SAMPLE
         self.error, self.error_unfolded = exact.error(t, path), exact.error(t, path, until=FOLDING_STARTS)
 
     def record(self) -> dict:
-        """As plain data."""
+        """The row as plain data."""
         return asdict(self) | {"dt": self.dt, "seconds_per_simulated_second": self.timing and asdict(self.timing)}
 
 
 def lasting_steps(scene: Scene, integrator: str, arch: str, seconds: float) -> tuple[int, str]:
-    """Smallest number of explicit steps in 10 ms, from MARGIN of the limit on, that lasts `seconds`; and what did not.
+    """Smallest number of explicit steps in 10 ms that is stable for `seconds`, and a note on those that diverged.
 
-    The limit is that of small vibrations about the rest shape; a law stiffens where a body is squeezed.
+    The stability limit is that of small vibrations about the rest shape; laws stiffen under compression.
     """
     least, failures = explicit_steps(scene), []
     samples = round(seconds / SAMPLE)
@@ -133,7 +133,7 @@ def lasting_steps(scene: Scene, integrator: str, arch: str, seconds: float) -> t
 
 
 def make_rows(cells, arch: str, peers: bool, seconds: float, implicit=IMPLICIT) -> list[Row]:
-    """The rows of a mesh, in the order of their measurement: each of taisoft beside one of MuJoCo."""
+    """The rows of a mesh in the order of measurement, alternating between taisoft and MuJoCo."""
     verlet, euler = (lasting_steps(beam_scene(cells), name, arch, seconds) for name in reversed(EXPLICIT))
     stable = STABLE_STEPS[tuple(cells)][0]
     own = [
@@ -152,7 +152,7 @@ def make_rows(cells, arch: str, peers: bool, seconds: float, implicit=IMPLICIT) 
 
 
 def measure_rows(rows: list[Row], cells, arch: str, rounds: int, seconds: float) -> None:
-    """Fill the rows in `rounds` rounds; a row that diverges says so and is left out of what follows."""
+    """Measure the rows in `rounds` rounds; a row that diverges records its failure and is skipped from then on."""
     for number in range(rounds):
         for row in rows:
             if row.failure:
@@ -172,7 +172,7 @@ def _taisoft_round(row: Row, cells, arch: str, seconds: float, first: bool) -> N
         warm_up(sim)
         if first:
             path, row.first_run = follow_tip(sim, row.steps, samples)
-            row.judge(cells, path)
+            row.set_errors(cells, path)
 
         def run() -> float:
             sim.reset()
@@ -194,7 +194,7 @@ def _mujoco_round(row: Row, cells, arch: str, seconds: float, first: bool) -> No
 
 
 def repeat_short(run: Callable[[], float]) -> Iterator[float]:
-    """Results of run(), seconds, until their sum or number is enough for a round; at least one."""
+    """Repeat run() until ROUND_SECONDS or ROUND_RUNS is reached; yields its seconds."""
     total, count = 0.0, 0
     while count == 0 or (total < ROUND_SECONDS and count < ROUND_RUNS):
         seconds = run()
@@ -203,6 +203,6 @@ def repeat_short(run: Callable[[], float]) -> Iterator[float]:
 
 
 def time_ratio(slow: Row, fast: Row) -> Timing | None:
-    """Time of `slow` over that of `fast`, from the medians of each round; None where one of them has no run."""
+    """Ratio of the times of `slow` and `fast` from the medians of each round; None without runs."""
     pairs = list(zip(slow.rounds, fast.rounds))
     return summarise(np.median(a) / np.median(b) for a, b in pairs) if pairs else None

@@ -1,8 +1,8 @@
-"""What a step costs: explicit ones by law and integrator, and what sim.run adds: reports, and launches that end with a frame.
+"""Cost of explicit steps by law and integrator, and the overhead of sim.run: reports, and launches that end with a frame.
 
-All simulators of a table are open together and take their samples in turn, so that noise hits all. A sample of a step's cost is
-a fall from rest of at most half a second, cut into steps enough for the time of a launch to be lost in them; the cost of a step
-does not depend on its dt. Beside steps in sim.run at FPS stand those of the stepper alone, in the largest launches it takes.
+All simulators of a table are open together and are sampled in turn, so that noise affects all. A sample is a fall from rest of at
+most half a second, with enough steps to make the launch time negligible; the cost of a step does not depend on dt. Steps in
+sim.run at FPS are compared with those of the stepper alone in its largest launches.
 """
 
 import contextlib
@@ -20,25 +20,25 @@ from .document import Limit, table
 from .elasticity_runs import LAWS, beam_scene, n_tets, steps_within_limit
 from .exact_path import SAMPLE
 
-SAMPLE_SECONDS = 0.05  # wall time of a sample, about
-GUESSED_SECONDS_PER_TET = 12e-9  # of a step, sizes a sample; 5 to 30 ns were met on the CPU
-GUESSED_LAUNCHES = {"cpu": 0.0, "cuda": 200e-6}  # s a step: on CUDA every sub-step is several launches
-LONGEST_FALL = 0.5  # s: the beam is bent by then, and St. Venant-Kirchhoff does not fold yet
-MOST_STEPS = 10_000
-# What a step may cost on this machine, f32: 7 us at 540 tets, 11 ns per tet at 34,560.
+SAMPLE_SECONDS = 0.05  # approximate wall time of a sample
+GUESSED_SECONDS_PER_TET = 12e-9  # of a step, to size a sample; measured on the CPU: 5 to 30 ns
+GUESSED_LAUNCHES = {"cpu": 0.0, "cuda": 200e-6}  # s per step: on CUDA a step is several launches
+LONGEST_FALL = 0.5  # s: the beam is bent, and St. Venant-Kirchhoff does not fold yet
+MAX_STEPS = 10_000
+# Limit of a step on this machine, f32: 7 us at 540 tets, 11 ns per tet at 34,560.
 STEP_LIMIT = {540: 7e-6, 34_560: 34_560 * 11e-9}  # s
 RATIO_LIMIT = {"SVK": 1.0, "COR": 3.0}  # cost over that of stable neo-Hookean
 FPS = 60
-STEPS_IN_FRAME = 84  # of explicit steps; within the limit on all meshes
-RUN_SAMPLE_SECONDS = 0.1  # wall time of a sample of a run, about, but a frame at least
-GUESSED_IMPLICIT = 250.0  # times an explicit step, sizes a sample
+STEPS_IN_FRAME = 84  # explicit steps, stable on all meshes
+RUN_SAMPLE_SECONDS = 0.1  # approximate wall time of a sample of a run, at least one frame
+GUESSED_IMPLICIT = 250.0  # implicit over explicit step, to size a sample
 INTEGRATORS = (*EXPLICIT, "implicit_euler")
 RUN_LIMIT = 1.05  # of the explicit integrators
 
 
 @dataclass
 class Cost:
-    """Cost of one law, integrator, precision and mesh: seconds per step, a sample each."""
+    """Cost of one law, integrator, precision and mesh: seconds per step of each sample."""
 
     tets: int
     law: str
@@ -49,7 +49,7 @@ class Cost:
 
     @property
     def timing(self) -> Timing:
-        """Of one step [s]."""
+        """Timing of one step [s]."""
         return summarise(self.samples)
 
     def record(self) -> dict:
@@ -58,10 +58,10 @@ class Cost:
 
 
 def measure_costs(cells, precision: str, arch: str, repeats: int, laws=tuple(LAWS), integrators=EXPLICIT) -> list[Cost]:
-    """Costs on one mesh; all simulators are open together and take their samples in turn, `repeats` each."""
+    """Costs on one mesh, from `repeats` samples each."""
     tets = n_tets(cells)
     guess = GUESSED_SECONDS_PER_TET * tets + GUESSED_LAUNCHES[arch]
-    steps = min(MOST_STEPS, max(1, round(SAMPLE_SECONDS / guess)))
+    steps = min(MAX_STEPS, max(1, round(SAMPLE_SECONDS / guess)))
     dt = min(SAMPLE / steps_within_limit(cells), LONGEST_FALL / steps)
     with contextlib.ExitStack() as stack:
         pairs = []
@@ -80,7 +80,7 @@ def measure_costs(cells, precision: str, arch: str, repeats: int, laws=tuple(LAW
 
 
 def cost_ratio(costs: Sequence[Cost], law: str) -> Timing | None:
-    """Cost of `law` over that of SNH, sample by sample; the costs are of one mesh, precision and integrator."""
+    """Cost of `law` over that of SNH per sample; all costs have the same mesh, precision and integrator."""
     by_law = {cost.law: cost.samples for cost in costs}
     if law not in by_law or "SNH" not in by_law:
         return None
@@ -88,7 +88,7 @@ def cost_ratio(costs: Sequence[Cost], law: str) -> Timing | None:
 
 
 def cost_table(costs: Sequence[Cost]) -> str:
-    """A row a cost, with its ratio to stable neo-Hookean."""
+    """A row per cost, with its ratio to stable neo-Hookean."""
 
     def ratio(cost: Cost) -> str:
         found = cost_ratio(_alike(costs, cost), cost.law)
@@ -97,7 +97,7 @@ def cost_table(costs: Sequence[Cost]) -> str:
     columns = [("tets", "{.tets:,}"), *((f"<{name}", f"{{.{name}}}") for name in ("precision", "integrator", "law"))]
     columns += [
         ("us/step", lambda cost: f"{1e6 * cost.timing.median:.2f}"),
-        ("least", lambda cost: f"{1e6 * cost.timing.minimum:.2f}"),
+        ("minimum", lambda cost: f"{1e6 * cost.timing.minimum:.2f}"),
         ("spread", lambda cost: percent(spread_of(cost.timing))),
         ("ns/tet", lambda cost: f"{1e9 * cost.timing.median / cost.tets:.2f}"),
         ("/ SNH", ratio),
@@ -124,7 +124,7 @@ def cost_limits(costs: Sequence[Cost]) -> list[Limit]:
 
 
 def _alike(costs: Sequence[Cost], one: Cost) -> list[Cost]:
-    """The costs that differ from `one` in the law alone."""
+    """The costs that differ from `one` only in the law."""
     key = (one.tets, one.precision, one.integrator)
     return [cost for cost in costs if (cost.tets, cost.precision, cost.integrator) == key]
 
@@ -134,7 +134,7 @@ def _alike(costs: Sequence[Cost], one: Cost) -> list[Cost]:
 
 @dataclass
 class Frames:
-    """Seconds of a step in a run and alone, a pair of samples each round. steps: in a frame."""
+    """Seconds of a step in a run and alone, a pair of samples per round. steps: per frame."""
 
     tets: int
     integrator: str
@@ -144,7 +144,7 @@ class Frames:
 
     @property
     def ratio(self) -> Timing:
-        """Of a step in a run to a step alone."""
+        """Time of a step in a run over that of a step alone."""
         return summarise(a / b for a, b in zip(self.run, self.alone))
 
     def record(self) -> dict:
@@ -153,7 +153,7 @@ class Frames:
 
 
 def measure_frames(meshes, arch: str, rounds: int, integrators=INTEGRATORS) -> Iterator[list[Frames]]:
-    """The rows of a mesh, f32 and stable neo-Hookean; all its simulators are open together and take turns."""
+    """Rows by mesh, in f32 with stable neo-Hookean; the simulators of a mesh are sampled in turn."""
     for cells in meshes:
         with contextlib.ExitStack() as stack:
             pairs = []
@@ -171,7 +171,7 @@ def measure_frames(meshes, arch: str, rounds: int, integrators=INTEGRATORS) -> I
 
 
 def _take(sim: ts.Simulator, row: Frames, arch: str) -> None:
-    """A pair of samples."""
+    """Take a pair of samples."""
     step = GUESSED_SECONDS_PER_TET * row.tets + GUESSED_LAUNCHES[arch]
     step *= 1.0 if row.integrator in EXPLICIT else GUESSED_IMPLICIT
     frames = max(1, round(RUN_SAMPLE_SECONDS / (row.steps * step)))
@@ -196,7 +196,7 @@ def _steps_alone(sim: ts.Simulator, steps: int) -> None:
 
 
 def frame_table(rows: list[Frames]) -> str:
-    """A row a mesh and integrator."""
+    """A row per mesh and integrator."""
 
     def alone(row: Frames) -> float:
         return summarise(row.alone).median
@@ -215,7 +215,7 @@ def frame_table(rows: list[Frames]) -> str:
 
 
 def frame_limits(rows: list[Frames]) -> list[Limit]:
-    """The limit on runs of explicit steps."""
+    """Limits on runs with explicit steps."""
     limits = []
     for row in rows:
         if row.integrator in EXPLICIT:

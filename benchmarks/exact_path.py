@@ -1,14 +1,13 @@
-"""The falling beam integrated exactly in time: what a solver on the same mesh is compared with.
+"""The falling beam integrated exactly in time, the reference for solvers on the same mesh.
 
 A beam 4 x 1 x 1 m of St. Venant-Kirchhoff material, psi = mu E:E + lam/2 tr(E)^2 with E = (F^T F - I)/2, is clamped at
-x = -2 and falls under gravity from rest, undamped. Mesh (five tets a cell) and lumped mass (each tet gives a quarter of
-its mass to each node) are fixed, so that the difference to a solver's path is its error in time alone. The ordinary
-differential equations are integrated by Runge-Kutta of order 8 (SciPy's DOP853) at two tolerances; the difference of
-the two paths is stored with the path as its uncertainty.
+x = -2 and falls under gravity from rest, undamped. The mesh (five tets per cell) and the lumped mass (a quarter of each tet's
+mass per node) are fixed, so that a solver's difference to this path is its time integration error. SciPy's DOP853 (Runge-Kutta
+of order 8) integrates the ordinary differential equations at two tolerances; the difference of the two paths is stored as the
+uncertainty.
 
-The law has no barrier against inversion: from about t = 0.8 s on the beam folds at the clamp and tets invert there. The
-path stays well defined (see `convergence` in the data), but it is a model's path, no longer a beam's. Hence an error
-is also quoted up to t = 0.8 s.
+The law has no barrier against inversion: from about t = 0.8 s the beam folds at the clamp and tets invert. The path remains well
+defined (see `convergence` in the data) but unphysical, so errors are also given up to t = 0.8 s.
 
 `python -m benchmarks.exact_path` integrates all meshes (about a minute) and writes data/falling_beam_svk.npz.
 """
@@ -30,17 +29,14 @@ SIZE = (4.0, 1.0, 1.0)  # m, centred at the origin
 YOUNG, POISSON, DENSITY = 1e6, 0.3, 1000.0  # Pa, 1, kg/m^3
 GRAVITY = 9.8  # m/s^2, along -y
 MESHES = ((12, 3, 3), (24, 6, 6), (48, 12, 12))  # 540, 4,320, 34,560 tets
-SAMPLE = 0.01  # s between two stored points of the path
+SAMPLE = 0.01  # s between stored points of the path
 SECONDS = 1.0
 FOLDING_STARTS = 0.8  # s
 DATA = Path(__file__).parent / "data" / "falling_beam_svk.npz"
 
 
 class FallingBeam(SemiDiscrete):
-    """The semi-discrete beam, by default that of the stored path.
-
-    cells: (nx, ny, nz). Further attributes: cells, tip (k,) ids of the nodes of the free end face x = 2.
-    """
+    """The semi-discrete beam, by default that of the stored path. cells: (nx, ny, nz); tip (k,): nodes of the free end x = 2."""
 
     def __init__(self, cells, law: str = "SVK", young: float = YOUNG, equal_masses: bool = False) -> None:
         mesh = box_mesh(cells, SIZE)
@@ -81,10 +77,10 @@ def integrate(beam: FallingBeam, tolerance: float, seconds: float = SECONDS, poi
 
 @dataclass(frozen=True)
 class ExactPath:
-    """Path of the tip (mean of the end face's nodes): t (k,) [s], path (k,3) [m], and how far it is converged.
+    """Path of the tip (mean of the end face's nodes): t (k,) [s], path (k,3) [m], and its convergence.
 
     excursion: largest distance of the tip from its start [m]. convergence (k,): difference to the path at the looser
-    tolerance, over the excursion: an upper bound of the path's own error.
+    tolerance over the excursion, an upper bound of the path's error.
     """
 
     t: np.ndarray

@@ -1,11 +1,11 @@
-"""Every measured page and figure in one go, then the manual's tables.
+"""All measured pages and figures, then the manual's tables.
 
 taisoft bench figures [--only NAME] [--quick] [--results DIR] [--logs DIR]
 
-Runs the benchmarks one after the other, each in a process of its own, and writes their pages into benchmarks/results, named
-after the machine; what they print goes to DIR/NAME.log. A benchmark that fails or misses a limit does not stop the next one.
-The machine should do nothing else meanwhile: the table shows the load at each start. The whole takes about three hours on two
-cores, and its parts can be made one by one. Exit status: 0, or 1 where a benchmark ended with another status.
+Runs the benchmarks one after the other in separate processes and writes their pages into benchmarks/results, named after the
+machine; their output goes to DIR/NAME.log. A benchmark that fails or misses a limit does not stop the next one. Run nothing else
+meanwhile: the table shows the load at each start. A full run takes about three hours on two cores; --only runs single parts. Exit
+status: 0, or 1 if a benchmark ended with another status.
 """
 
 import subprocess
@@ -21,7 +21,7 @@ from taisoft.output.files import make_folder
 from .document import RESULTS, default_out, load_text, table
 from .runner import make_parser, progress
 
-# name -> what of it is written: a page with numbers (json), a picture beside it (png), or a folder of both (folder)
+# name -> output: a page with numbers (json), a picture (png), or a folder of both (folder)
 WRITES = {
     "references": ("json",),
     "elasticity": ("json",),
@@ -39,8 +39,8 @@ NO_QUICK = ("references",)
 
 
 @dataclass
-class Ended:
-    """How a benchmark ended. load: of the machine when it began."""
+class Outcome:
+    """How a benchmark ended. load: of the machine at its start."""
 
     name: str
     status: int
@@ -49,14 +49,14 @@ class Ended:
 
 
 def command(name: str, quick: bool, results: Path) -> list[str]:
-    """The command line of a benchmark, its files named after the machine."""
+    """Command line of a benchmark, with files named after the machine."""
     outputs = [(option, default_out("cpu", name, suffix)) for option, suffix in (OPTIONS[kind] for kind in WRITES[name])]
     files = [part for option, path in outputs for part in (option, str(results / path.name))]
     return [sys.executable, "-m", "taisoft", "bench", name, *(["--quick"] if quick and name not in NO_QUICK else []), *files]
 
 
-def make(names: Iterable[str], quick: bool, results: Path, logs: Path) -> list[Ended]:
-    """Run the benchmarks, telling each as it ends."""
+def make(names: Iterable[str], quick: bool, results: Path, logs: Path) -> list[Outcome]:
+    """Run the benchmarks, printing each as it ends."""
     ended = []
     for name in names:
         load, start = load_average(), time.monotonic()
@@ -64,13 +64,13 @@ def make(names: Iterable[str], quick: bool, results: Path, logs: Path) -> list[E
             done = subprocess.run(
                 command(name, quick, results), stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT, check=False
             )
-        ended.append(Ended(name, done.returncode, time.monotonic() - start, load))
+        ended.append(Outcome(name, done.returncode, time.monotonic() - start, load))
         progress(f"{name}: status {done.returncode}, {ended[-1].seconds:.0f} s")
     return ended
 
 
 def main(argv=None) -> int:
-    """Make them. Raises OutputError."""
+    """Run the benchmarks. Raises OutputError."""
     parser = make_parser("figures", __doc__)
     parser.add_argument("--only", action="append", choices=WRITES, metavar="NAME", help=f"one of {', '.join(WRITES)}; repeatable")
     parser.add_argument("--quick", action="store_true", help="small cases; give --results too, the manual takes no quick ones")
@@ -83,7 +83,7 @@ def main(argv=None) -> int:
     ended = make(options.only or WRITES, options.quick, results, logs)
     if results == RESULTS:
         done = subprocess.run([sys.executable, "-m", "taisoft", "bench", "manual"], stdin=subprocess.DEVNULL, check=False)
-        ended.append(Ended("manual", done.returncode, 0.0, load_average()))
+        ended.append(Outcome("manual", done.returncode, 0.0, load_average()))
     columns = [("<benchmark", "{.name}"), ("exit status", "{.status}"), ("seconds", "{.seconds:.0f}")]
     print(table(ended, [*columns, ("load at its start", lambda one: load_text(one.load))]))
     return 0 if all(one.status == 0 for one in ended) else 1

@@ -1,7 +1,7 @@
-"""Runs of the hard cases: each variant, and its reference, in a process of its own, kept by what it depends on, and judged.
+"""Runs of the hard cases: each variant and reference in its own process, stored by a key of its inputs, with verdicts.
 
-A variant is solved when it ended as it must and every limit is kept. Columns say how it ended: ok, degraded, refused, stopped;
-wrong is an ok end that must not be one, or that misses a limit on the answer; each variant is in one column.
+A variant is solved if it ended as required and met every limit. It is in one column: ok, degraded, refused, stopped, or wrong,
+an ok end that is not allowed or that misses a limit on the answer.
 """
 
 import hashlib
@@ -21,18 +21,18 @@ from .hard_cases import CASES
 from .hard_cases.case import DEGRADED, END, FINER, OK, REFUSED, STOPPED, Case, Session, Variant, Verdict, judge
 
 CHILD = (sys.executable, "-m", "taisoft", "bench", "hard", "--child")
-ANSWERED = (OK, DEGRADED)  # ends of runs that came to their ends
-CHEAP_SECONDS = 60.0  # of a reference, guessed: a longer one is run only when asked for
+ANSWERED = (OK, DEGRADED)  # ends of complete runs
+CHEAP_SECONDS = 60.0  # estimated time up to which references run by default
 WRONG, NOT_RUN = "wrong", "not run"
 COLUMNS = (OK, DEGRADED, REFUSED, STOPPED, WRONG, NOT_RUN)
 
 
 @dataclass
 class Row:
-    """A variant of a case, what came of it, and what came of its reference, each None where it was not run.
+    """A variant of a case with the records of its run and its reference, None if not run.
 
-    left_out, reference_left_out: why there is no record of it. error: largest distance to the reference run over the case's
-    size, where both came to their ends.
+    left_out, reference_left_out: why there is no record. error: largest distance to the reference run over the case's size, if
+    both are complete.
     """
 
     case: Case
@@ -45,11 +45,11 @@ class Row:
     verdicts: list[Verdict] = field(default_factory=list)
 
     def judge(self) -> None:
-        """Fill the verdicts."""
+        """Set the verdicts."""
         self.verdicts = [] if self.record is None else judge(self.case, self.variant, self.record)
 
     def compare(self) -> None:
-        """Fill the error, from the points of both runs."""
+        """Set the error from the points of both runs."""
         if self.record is None or self.reference is None or self.reference["status"] not in ANSWERED:
             return
         own, finer = unpack(self.record["points"]), unpack(self.reference["points"])
@@ -58,7 +58,7 @@ class Row:
 
     @property
     def column(self) -> str:
-        """How it ended."""
+        """The column of its end."""
         if self.record is None:
             return NOT_RUN
         missed = any(verdict.passed is False and not verdict.cost for verdict in self.verdicts)
@@ -66,7 +66,7 @@ class Row:
 
     @property
     def faults(self) -> list[str]:
-        """Why it is not solved, in a few words each; empty where it is."""
+        """Why it is not solved, in a few words each; empty if it is."""
         if self.record is None:
             return [NOT_RUN]
         missed = [verdict.quantity for verdict in self.verdicts if verdict.passed is False]
@@ -80,7 +80,7 @@ class Row:
         return f"{status}, must be {must.text}"
 
     def data(self) -> dict:
-        """As plain data, without points."""
+        """The row as plain data, without points."""
 
         run, reference = (r and {key: r[key] for key in r if key != "points"} for r in (self.record, self.reference))
         return {
@@ -100,7 +100,7 @@ class Row:
 
 
 def stored(numbers: dict) -> list[Row]:
-    """All variants, with what stored results hold of them, judged anew."""
+    """Rows of all variants from stored results, with new verdicts."""
     known = {(row["case"], row["variant"]): row for row in numbers["rows"]}
     absent = {"run": None, "reference": None, "left_out": "not in the stored results", "reference_left_out": "", "error": None}
     rows = []
@@ -114,24 +114,24 @@ def stored(numbers: dict) -> list[Row]:
 
 
 def find(case: str, variant: str) -> tuple[Case, Variant]:
-    """The case of that id and its variant of that name."""
+    """A case by id and its variant by name."""
     found = next(one for one in CASES if one.id == case)
     return found, next(one for one in found.variants if one.name == variant)
 
 
 def run(case: Case, variant: Variant, arch: str, finer: int = 1) -> dict:
-    """The record of one run, as plain data, made in this process."""
+    """Run a variant in this process; returns its record as plain data."""
     record = Session(case, variant, arch, finer).record()
     return record | {"points": pack(record["points"])}
 
 
 def answer(request: dict) -> dict:
-    """For a child: the request's run."""
+    """In a child: answer a request with its run."""
     return {"answer": run(*find(request["case"], request["variant"]), request["arch"], request["finer"])}
 
 
 def sources() -> str:
-    """A digest of the files that say what the cases are and how they are run."""
+    """A digest of the files that define the cases."""
     total = hashlib.sha256()
     here = Path(__file__).parent
     for path in sorted([*here.glob("hard_cases/*.py"), *here.glob("reference_cases/*.py")]):
@@ -141,7 +141,7 @@ def sources() -> str:
 
 @dataclass
 class Runner:
-    """Where and how runs are made. seconds_left: of the budget; stop_requested: to begin no more; say: progress."""
+    """Runs rows in child processes. seconds_left: of the budget; stop_requested: whether to stop; say: prints progress."""
 
     arch: str
     store: Store | NoStore
@@ -150,7 +150,7 @@ class Runner:
     say: Callable[[str], None]
 
     def measure(self, rows: list[Row], references: bool) -> None:
-        """Fill the rows: all runs first, then the references that are cheap, or all of them. Raises OutputError."""
+        """Run all rows, then the cheap references or all of them. Raises OutputError."""
         self._carry_out(rows, 1)
         finer = [
             row

@@ -1,6 +1,6 @@
 """The page of the hard cases, in Markdown: the scoreboard, what is not solved, how each must end, and every number.
 
-A variant counts as solved by what `hard_runs.Row` says; the scoreboard counts how many are, and in which column each ended.
+The scoreboard counts the solved variants and those in each column of `hard_runs.Row`.
 """
 
 from collections.abc import Iterable
@@ -27,7 +27,7 @@ NOTHING = "-"
 
 
 def page(rows: list[Row]) -> list[str]:
-    """All parts in their order."""
+    """The parts of the page in order."""
     parts = [scoreboard(rows)]
     sections = {"Not solved": unsolved, "How each must end": ends, "Every number": details, "Notes": notes}
     for title, made in sections.items():
@@ -38,7 +38,7 @@ def page(rows: list[Row]) -> list[str]:
 
 
 def tally(rows: Iterable[Row]) -> dict[str, int]:
-    """How many are asked, solved, and in each column."""
+    """Number of variants, of solved ones, and of those in each column."""
     counts = dict.fromkeys((ASKED, SOLVED, *COLUMNS), 0)
     for row in rows:
         counts[ASKED] += 1
@@ -48,30 +48,30 @@ def tally(rows: Iterable[Row]) -> dict[str, int]:
 
 
 def cells(counts: dict[str, int], shown: Iterable[str]) -> list[str]:
-    """Numbers of a line of the scoreboard; a zero is left empty but of what is asked and solved."""
+    """Cells of a line of the scoreboard; zeros of columns are left empty."""
     return [str(counts[name]) if counts[name] or name in (ASKED, SOLVED) else "" for name in shown]
 
 
 def shown_columns(rows: Iterable[Row]) -> list[str]:
-    """Headings of the scoreboard: all but "not run" where everything was."""
+    """Headings of the scoreboard, without "not run" if everything was run."""
     return [name for name in tally(rows) if name != NOT_RUN or tally(rows)[NOT_RUN]]
 
 
 def headline(rows: list[Row]) -> str:
-    """The number solved of the number asked."""
+    """The number of solved variants and of all."""
     counts = tally(rows)
     return f"**{counts[SOLVED]} of {counts[ASKED]} variants are solved.**"
 
 
 def how_solved(rows: Iterable[Row]) -> str:
-    """How the solved ones ended, in a sentence."""
+    """How the solved variants ended, in a sentence."""
     counts = tally(row for row in rows if not row.faults)
     ended = [f"{counts[name]} {name}" for name in COLUMNS if counts[name]]
     return f"How the solved ones ended: {', '.join(ended)}." if ended else ""
 
 
 def scoreboard(rows: list[Row]) -> str:
-    """The headline, and the counts of each group of cases and of all."""
+    """The headline, and the counts per group of cases."""
     shown = shown_columns(rows)
     groups = {name: [row for row in rows if row.case in cases] for name, cases in GROUPS.items()}
     lines = [(name, *cells(tally(own), shown)) for name, own in groups.items() if own]
@@ -82,7 +82,7 @@ def scoreboard(rows: list[Row]) -> str:
 
 
 def unsolved(rows: Iterable[Row]) -> str:
-    """Each variant that is not solved, with its cause and the next idea."""
+    """Unsolved variants with cause and next idea."""
     groups: dict[str, dict[str, list[str]]] = {}  # names of variants, by case and by why they are not solved
     for row in rows:
         if row.faults:
@@ -113,7 +113,7 @@ def details(rows: Iterable[Row]) -> str:
 
 
 def row_lines(row: Row) -> list[tuple[str, ...]]:
-    """The cells of a row: the first line shows the run and its cost too."""
+    """Lines of a row; the first also shows the run and its cost."""
     if row.record is None:
         return [(row.case.id, row.variant.name, "not run", row.left_out or NOTHING, *[NOTHING] * (len(HEADINGS) - 4))]
     record = row.record
@@ -137,7 +137,7 @@ def row_lines(row: Row) -> list[tuple[str, ...]]:
 
 
 def limit(verdict: Verdict) -> str:
-    """What is asked."""
+    """The limit as text."""
     if verdict.limit is None:
         return NOTHING
     if isinstance(verdict.limit, str):
@@ -152,7 +152,7 @@ def _or_nothing(value: float | None, unit: float, form: str) -> str:
 
 
 def notes(rows: list[Row]) -> str:
-    """What is to be known of limits that were replaced, and what runs say of their ends."""
+    """Notes on replaced limits, and problems of runs."""
     cases: dict[str, Case] = {row.case.id: row.case for row in rows}
     parts = []
     for case in cases.values():
@@ -169,7 +169,7 @@ def notes(rows: list[Row]) -> str:
 
 
 def reference_trouble(row: Row) -> str:
-    """Why a reference that was begun gives no error."""
+    """Why there is no error although a reference was started."""
     if row.reference is not None and row.error is None:
         return f"{row.reference['status']}, " + ("; ".join(row.reference["problems"][:1]) or "at other times")
     return row.reference_left_out

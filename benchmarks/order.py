@@ -1,15 +1,14 @@
-"""First- beside second-order tets: error against time over refinements, in statics and in one motion.
+"""First- and second-order tets: error against time over refinements, in statics and in one motion.
 
 taisoft bench order [--quick] [--case NAME] [--arch cpu|cuda] [--out FILE.json] [--plot FILE.png]
 
-Computed in f64. Every case is solved on some meshes with linear tets (order 1) and with quadratic ones (order 2, four
-quadrature points; some with fourteen). A time is the median over rounds of the whole solution from the rest shape, on
-kernels that an earlier solution has compiled; the first launches are timed apart, as "compile". Spread is the distance
-between the quartiles over the median. Errors are relative, the largest of the numbers read, and "< " marks one below what
-the reference is good to. The time to 1 % error is read off between two meshes, straight in the logarithms; where all
-meshes lie on one side of 1 % it is a bound, marked > or <=, and nothing is extrapolated. Exit status: 0, or 1 where a limit
-is not met. --quick has the hanging beam alone, unless another case is named, two meshes an order and no limit. The whole
-takes about ten minutes on two cores.
+Computed in f64. Every case is solved on several meshes with linear tets (order 1) and quadratic tets (order 2, four quadrature
+points; some with fourteen). A time is the median over rounds of the whole solution from the rest shape with compiled kernels; the
+first launches are timed separately, as "compile". Spread is the interquartile range over the median. Errors are relative, the
+largest of the measured numbers; "< " marks errors below the reference's uncertainty. The time to 1 % error is interpolated
+between two meshes in the logarithms; if all meshes lie on one side of 1 % it is a bound, marked > or <=. Exit status: 0, or 1 if
+a limit is not met. --quick has only the hanging beam, unless another case is named, two meshes per order and no limits. A full
+run takes about ten minutes on two cores.
 """
 
 import math
@@ -32,18 +31,18 @@ from .runner import make_parser, parse_options
 
 ROUNDS, QUICK_ROUNDS, QUICK_MESHES = 5, 1, 2
 GOALS = (0.1, 0.03, 0.01)  # errors whose times are compared
-GOAL = GOALS[-1]  # the one that cases are summed up by
-WANTED_RATIO = 20.0  # of the hanging beam's times to that error, order 1 over order 2
+GOAL = GOALS[-1]  # the error of the summary
+MIN_SPEEDUP = 20.0  # time of the hanging beam to that error, order 1 over order 2
 ELASTICA_LIMIT = 0.005  # error of order 2 on its finest mesh
-LEAST_ERROR = 1e-12  # what no error at all counts as among logarithms
-DEFAULT_DEGREE = {1: None, 2: 2}  # of the quadrature of the elements that are compared
+LEAST_ERROR = 1e-12  # replaces zero errors in logarithms
+DEFAULT_DEGREE = {1: None, 2: 2}  # quadrature of the compared elements
 STYLES = {  # (order, degree) -> label, colour, marker, line
     (1, None): ("order 1", "#d55e00", "o", "-"),
     (2, 2): ("order 2, 4 points", "#0072b2", "s", "-"),
     (2, 4): ("order 2, 14 points", "#009e73", "^", ":"),
 }
 COLUMNS, PANEL = 3, (4.2, 3.2)  # panels in a row, their size in inches
-SURE = 1e-5  # the lowest error that is drawn, for references that are exact
+SURE = 1e-5  # the lowest error drawn, for exact references
 
 
 # --- times to an error --------------------------------------------------------------------------------------------------
@@ -51,7 +50,7 @@ SURE = 1e-5  # the lowest error that is drawn, for references that are exact
 
 @dataclass(frozen=True)
 class Reach:
-    """Time to an error [s]. bound: "=" read off between two meshes; "<=" the coarsest is below it; ">" the finest is above."""
+    """Time to an error [s]. bound: "=" interpolated; "<=" the coarsest mesh is below the error; ">" the finest is above."""
 
     seconds: float
     bound: str
@@ -80,10 +79,9 @@ class Comparison:
 
 
 def time_to(errors: Sequence[float], seconds: Sequence[float], goal: float) -> Reach | None:
-    """When meshes, coarse to fine, with these errors (k,) and times (k,) [s] get down to an error for good.
+    """Time from which the error stays below the goal; errors (k,) and times (k,) [s] of meshes from coarse to fine.
 
-    Straight in the logarithms between the last mesh above the goal and the next one; never beyond a mesh. None without
-    meshes.
+    Interpolated in the logarithms between the last mesh above the goal and the next; never extrapolated. None without meshes.
     """
     if not len(errors):
         return None
@@ -98,17 +96,17 @@ def time_to(errors: Sequence[float], seconds: Sequence[float], goal: float) -> R
 
 
 def claimed(row: Row, reference: Reference) -> float:
-    """The row's error, but not below what the reference is good to."""
+    """The row's error, at least the reference's uncertainty."""
     return max(row.error, reference.uncertainty)
 
 
 def chain(rows: list[Row], order: int) -> list[Row]:
-    """The rows of an order, with its default quadrature, that have an error and a time."""
+    """The rows of an order with its default quadrature, an error and a time."""
     return [r for r in rows if (r.order, r.degree) == (order, DEFAULT_DEGREE[order]) and r.error is not None and r.rounds]
 
 
 def compare(case: Case, rows: list[Row], reference: Reference, goal: float = GOAL) -> Comparison:
-    """Times to an error, and their ratio in each round that all meshes took part in; unknown below what can be claimed."""
+    """Times to an error, and their ratio in each complete round; unknown below the reference's uncertainty."""
     chains = {order: chain(rows, order) for order in DEFAULT_DEGREE}
     errors = {order: [claimed(r, reference) for r in found] for order, found in chains.items()}
 
@@ -127,7 +125,7 @@ def compare(case: Case, rows: list[Row], reference: Reference, goal: float = GOA
 
 
 def _ratio_bound(slow: Reach | None, fast: Reach | None) -> str:
-    """What is known of slow / fast: "=", a lower bound ">", an upper bound "<", or nothing "?"."""
+    """Kind of the ratio slow / fast: "=", a lower bound ">", an upper bound "<", or unknown "?"."""
     if slow is None or fast is None:
         return "?"
     at_least = slow.bound in "=>" and fast.bound in ("=", "<=")
@@ -139,7 +137,7 @@ def _ratio_bound(slow: Reach | None, fast: Reach | None) -> str:
 
 
 def row_table(rows: list[Row], reference: Reference) -> str:
-    """A row a mesh; failures below."""
+    """A row per mesh; failures below."""
 
     def error(row: Row) -> str:
         if row.error is None:
@@ -167,7 +165,7 @@ def row_table(rows: list[Row], reference: Reference) -> str:
 
 
 def compare_table(comparisons: list[Comparison]) -> str:
-    """A row a case and error."""
+    """A row per case and error."""
     columns = [("<case", "{.case}"), ("<law", "{.law}"), ("error", "{.goal:.0%}")]
     for k, heading in enumerate(("order 1", "order 2", "order 1 / order 2", "spread")):
         columns.append((heading, lambda c, k=k: c.texts()[k]))
@@ -175,14 +173,14 @@ def compare_table(comparisons: list[Comparison]) -> str:
 
 
 def find_limits(comparisons: list[Comparison], rows: list[Row]) -> list[Limit]:
-    """The wanted ratio of the hanging beam, and the errors of order 2 against the elastica."""
+    """Limits on the ratio of the hanging beam and on the errors of order 2 against the elastica."""
     limits = []
     for c in comparisons:
         if c.case == HANGING and c.goal == GOAL:
             known = c.ratio is not None and c.bound in "=>"
             what = f"{c.case}: order 1's time to {c.goal:.0%} error / order 2's"
             value, spread = (c.ratio.median, spread_of(c.ratio)) if known else (math.nan, None)
-            limits.append(Limit(what, value, WANTED_RATIO, spread, at_least=True))
+            limits.append(Limit(what, value, MIN_SPEEDUP, spread, at_least=True))
     for name in dict.fromkeys(row.case for row in rows if row.case.startswith("elastica")):
         own = [row for row in rows if row.case == name and (row.order, row.degree) == (2, DEFAULT_DEGREE[2])]
         value = math.nan if not own or own[-1].error is None else 100 * own[-1].error
@@ -194,7 +192,7 @@ def find_limits(comparisons: list[Comparison], rows: list[Row]) -> list[Limit]:
 
 
 def draw(cases: list[tuple[Case, list[Row], Reference]], path: Path) -> None:
-    """Write a PNG of all cases with their rows. Raises OutputError where it cannot be written or drawn."""
+    """Write a PNG with a panel per case. Raises OutputError."""
     require_matplotlib()
     from matplotlib import pyplot
 
@@ -217,7 +215,7 @@ def draw(cases: list[tuple[Case, list[Row], Reference]], path: Path) -> None:
 
 
 def _panel(panel, case: Case, rows: list[Row], reference: Reference) -> dict:
-    """One case; returns label -> handle of its lines."""
+    """Draw one case; returns label -> handle of its lines."""
     handles = {}
     for (order, degree), (name, colour, marker, line) in STYLES.items():
         own = [r for r in rows if (r.order, r.degree) == (order, degree) and r.error is not None and r.rounds]
@@ -246,23 +244,23 @@ def _panel(panel, case: Case, rows: list[Row], reference: Reference) -> dict:
 
 
 def case_text(case: Case, rows: list[Row], reference: Reference) -> str:
-    """A section: what the case is judged by, and its rows."""
+    """Section of a case: its reference and its rows."""
     values = ", ".join(f"{x:.7g}" for x in reference.values) or "none"
-    good = f", good to {reference.uncertainty:.2%}" if reference.uncertainty else ""
-    judged_by = f"{case.quantity}; reference: {values}{good}; {reference.source}."
+    good = f", uncertainty {reference.uncertainty:.2%}" if reference.uncertainty else ""
+    compared_with = f"{case.quantity}; reference: {values}{good}; {reference.source}."
     note = f"\nNote: {case.note}." if case.note else ""
-    return f"## {case.name}: {case.title}, {case.law}\n\n{judged_by}{note}\n\n{row_table(rows, reference)}"
+    return f"## {case.name}: {case.title}, {case.law}\n\n{compared_with}{note}\n\n{row_table(rows, reference)}"
 
 
 def chosen_meshes(case: Case, quick: bool) -> dict:
-    """The case's meshes for each element; in a quick run the first of the two elements that are compared."""
+    """The case's meshes per element; in a quick run the first ones of the two compared elements."""
     if not quick:
         return case.meshes
     return {element: case.meshes[element][:QUICK_MESHES] for element in (LINEAR, QUADRATIC)}
 
 
 def measure(cases: list[Case], quick: bool, arch: str, document: Document) -> tuple[list, list[Comparison]]:
-    """Everything, printed as it comes: (case, rows, reference) of each case, and the comparisons."""
+    """Measure and print: (case, rows, reference) of each case, and the comparisons."""
     found, comparisons = [], []
     with closing(open_runtime(arch, "f64", "the benchmark of orders")) as runtime:
         for case in cases:
@@ -278,12 +276,12 @@ def measure(cases: list[Case], quick: bool, arch: str, document: Document) -> tu
 
 
 def main(argv=None) -> int:
-    """Measure and print. Raises OutputError, or SimulationError where the arch cannot be had."""
+    """Measure and print. Raises OutputError, or SimulationError if the arch is not available."""
     names = [case.name for case in CASES]
     parser = make_parser("order", __doc__)
-    parser.add_argument("--quick", action="store_true", help="two meshes an order, one round")
+    parser.add_argument("--quick", action="store_true", help="two meshes per order, one round")
     parser.add_argument("--case", choices=names, metavar="NAME", help=f"only this one of {', '.join(names)}")
-    options = parse_options(parser, argv, "error against time, a panel a case")
+    options = parse_options(parser, argv, "error against time, a panel per case")
     name = options.case or (HANGING if options.quick else None)
     document, numbers = begin("First- and second-order tets: error against time")
     cases = [case for case in CASES if name in (None, case.name)]

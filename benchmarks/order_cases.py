@@ -1,8 +1,8 @@
-"""What `order.py` measures: static problems and one motion, each a scene for any cells and element, a reading, a reference.
+"""Cases of `order.py`: static problems and one motion, each with a scene, measured numbers and a reference.
 
-The references are numbers of other programs or closed forms, so that nothing beside this file is needed; `uncertainty` is
-what they are good to, and no error below it is claimed. Two problems have no such number: for one the order-2 meshes of the
-same run stand in, the other has none at all. All scenes are in SI units but Cook's panel, which has units of its own.
+References are results of other programs or closed forms; no error below their `uncertainty` is claimed. Two problems have none:
+one is compared with the extrapolated order-2 meshes of the same run, the other has no errors. Scenes use SI units, except Cook's
+panel.
 """
 
 from collections.abc import Callable
@@ -14,7 +14,7 @@ import taisoft as ts
 from taisoft.scene.scene import Body
 
 from .reference_cases.record import GRAVITY, LAWS, face, nearest, scene
-from .reference_cases.statics import cook_panel
+from .reference_cases.statics import cook_panel, turn_end
 
 
 @dataclass(frozen=True)
@@ -40,10 +40,8 @@ LINEAR, QUADRATIC, QUADRATIC_14 = Element(1), Element(2, 2), Element(2, 4)
 
 @dataclass(frozen=True)
 class Reference:
-    """What a case is judged by. values: of its first numbers; those beyond are only shown. source: where they are from.
-
-    uncertainty: relative, of the least sure value.
-    """
+    """Reference of a case. values: of its first numbers; further numbers are only shown. uncertainty: relative, of the worst
+    value."""
 
     values: tuple[float, ...]
     uncertainty: float
@@ -54,7 +52,7 @@ class Reference:
 class Case:
     """One problem with one law, and the cells of its meshes, coarse to fine, for each element.
 
-    reference None: with `extrapolated` what the last three order-2 meshes lead to, each of which halves the cells of the one
+    reference None: with `extrapolated` the value extrapolated from the last three order-2 meshes, each twice as fine as the one
     before; otherwise there are no errors. dt: step of a motion [s]; None for an equilibrium.
     """
 
@@ -85,7 +83,7 @@ class Case:
 
 
 def displacement(point, *axes: int) -> Callable[[Body, object], np.ndarray]:
-    """Reads the displacement of the node nearest to a point along axes [m]; the mean of several equally near."""
+    """Reader of the displacement along axes [m] of the node nearest to a point, or the mean of several equally near ones."""
 
     def read(body: Body, state) -> np.ndarray:
         nodes = nearest(body.rest_positions, point)
@@ -102,14 +100,6 @@ def _box(size, starts_at_zero: bool = False) -> Callable[[tuple], ts.TetMesh]:
 def _pulled(x: float, force: float, area: float) -> Callable[[Body], object]:
     """A dead force [N] along y, spread evenly over the face at x [m] of an area [m^2]."""
     return lambda body: body.add_traction(face(0, x), (0.0, force / area, 0.0))
-
-
-def _turned(body: Body) -> None:
-    """The face at x = 2 m turned by 90 degrees about x."""
-    end = face(0, 2.0)(body.rest_positions)
-    _, y, z = body.rest_positions[end].T
-    way = np.column_stack([np.zeros_like(y), -z - y, y - z])
-    body.move(end, lambda t: way)
 
 
 def _torque(body: Body, state) -> np.ndarray:
@@ -175,7 +165,7 @@ def _elastica(name: str, title: str, values: tuple, source: str, density: float 
     )
 
 
-HANGING = "hanging_beam"  # the case with a wanted ratio
+HANGING = "hanging_beam"  # the case with a limit on the speed-up
 CASES = (
     _beam(
         HANGING,
@@ -209,8 +199,8 @@ CASES = (
         material=RUBBER | {"poisson": 0.499},
         meshes=NESTED_MESHES | {QUADRATIC_14: ((6, 2, 2),)},
         extrapolated=True,
-        note="how far the limit lies beyond the finest mesh is taken for what it is good to; the next mesh, 24x8x8, needs "
-        "minutes, and with it the limit is -2.672 m",
+        note="the uncertainty is the distance from the finest mesh to the extrapolated value; the next mesh, 24x8x8, takes "
+        "minutes and gives -2.672 m",
     ),
     Case(
         "cook",
@@ -235,7 +225,7 @@ CASES = (
         read=_torque,
         meshes={LINEAR: ((8, 2, 2), (16, 4, 4), (32, 8, 8)), QUADRATIC: ((4, 1, 1), (8, 2, 2), (16, 4, 4))},
         gravity=False,
-        load=_turned,
+        load=turn_end,
     ),
     Case(
         "cantilever",
@@ -281,7 +271,7 @@ CASES = (
         read=None,
         meshes=MOTION_MESHES,
         dt=0.01,
-        note="BDF2 with steps of 10 ms up to 1.2 s; the time is that of all steps; when the tip is lowest is only shown, and to "
-        "be compared with 1.100 s, good to 0.7 %",
+        note="BDF2 with steps of 10 ms up to 1.2 s; the time is that of all steps; the time of the lowest tip is only shown, "
+        "to be compared with 1.100 s within 0.7 %",
     ),
 )

@@ -1,9 +1,8 @@
 """Runs of one case on its meshes: each is built and solved once, which compiles it, then all are timed in turn.
 
-A round times every mesh of a case one after another, so that a slow minute of the machine falls on all; ratios are taken
-round by round. A time is that of the whole solution from the rest shape, Newton, matrices and linear solves together,
-without the building of the scene and the compiling of its kernels. One of many seconds is not repeated: its time is that of
-the first solution without the first launch of each kernel, and has no spread.
+A round times every mesh of a case, so that a slow minute of the machine affects all; ratios are formed per round. A time is that
+of the whole solution from the rest shape, without building the scene and compiling kernels. Long solutions are not repeated:
+their time is that of the first solution without the first launch of each kernel, and has no spread.
 """
 
 from dataclasses import asdict, dataclass, field
@@ -21,18 +20,18 @@ from taisoft.study.measure import TimedRun, advance
 from .order_cases import Case, Element, Reference
 from .reference_cases.motion import parabola_vertex
 from .reference_cases.record import label, nearest
-from .runner import progress, repeated, timed, unwarned
+from .runner import progress, repeated, timed, without_warnings
 
 TOLERANCE = 1e-6  # of |residual| / |load|
 FALL_SECONDS = 1.2  # the first swing is over
 INTEGRATOR = "bdf2"
-ROUND_SECONDS, ROUND_RUNS = 0.1, 5  # a quick solution is repeated within a round until this wall time or this number
-ENOUGH_SECONDS = 4.0  # a slow one is left out of later rounds when its runs have taken this long, the first one included
+ROUND_SECONDS, ROUND_RUNS = 0.1, 5  # short solutions are repeated within a round until this wall time or number
+ENOUGH_SECONDS = 4.0  # a solution is not repeated once all its runs have taken this long
 
 
 @dataclass
 class Row:
-    """One element on one mesh. rounds: median wall seconds of each round; error: relative, the largest of the numbers read."""
+    """One element on one mesh. rounds: median wall seconds per round; error: largest relative error of the measured numbers."""
 
     case: str
     law: str
@@ -62,14 +61,14 @@ class Row:
 
 
 class Statics:
-    """An equilibrium that can be solved again and again."""
+    """An equilibrium that can be solved repeatedly."""
 
     def __init__(self, case: Case, scene: ts.Scene, runtime: Runtime):
         self._case, self._scene, self._arena = case, scene, FieldArena()
         self._static = StaticSolver(scene, runtime, self._arena, TOLERANCE, 0.0)
 
     def first(self, row: Row) -> None:
-        """Solve, and write down what was found. Raises SimulationError where no equilibrium is."""
+        """Solve and record the results. Raises SimulationError if there is no equilibrium."""
         result = self._static.solve()
         row.newton, row.linear = result.iterations, result.linear_iterations
         row.field_bytes = sum(self._arena.bytes.values())
@@ -84,12 +83,12 @@ class Statics:
         self._static.solve()
 
     def close(self) -> None:
-        """Give the memory back."""
+        """Free the memory."""
         self._arena.release()
 
 
 class Fall:
-    """A fall that can be run again and again."""
+    """A fall that can be run repeatedly."""
 
     def __init__(self, case: Case, scene: ts.Scene, runtime: Runtime):
         self._case, self._body = case, scene.bodies[0]
@@ -97,7 +96,7 @@ class Fall:
         self._sim = ts.Simulator(scene, dt=case.dt, integrator=INTEGRATOR, precision="f64", arch=runtime.arch)
 
     def first(self, row: Row) -> None:
-        """Run, and write down what was found. Raises SimulationError where a step fails or does not converge."""
+        """Run and record the results. Raises SimulationError if a step fails or does not converge."""
         tip, heights, whole = nearest(self._body.rest_positions, (2, 0, 0)), [], TimedRun()
         for _ in range(self._steps):
             whole += advance(self._sim, 1)
@@ -115,12 +114,12 @@ class Fall:
         advance(self._sim, self._steps)
 
     def close(self) -> None:
-        """Give the memory back."""
+        """Free the memory."""
         self._sim.close()
 
 
 def measure_case(case: Case, meshes: dict[Element, tuple], rounds: int, runtime: Runtime) -> tuple[list[Row], Reference]:
-    """All rows of a case and what they are judged by. A mesh that fails is a row that says so."""
+    """All rows of a case, and its reference. The row of a mesh that fails records why."""
     rows: list[Row] = []
     runs: list[tuple] = []  # (Statics or Fall, row)
     try:
@@ -132,7 +131,7 @@ def measure_case(case: Case, meshes: dict[Element, tuple], rounds: int, runtime:
                 _prepare(case, element, row, runs, runtime)
         reference = case.reference or own_reference(case, rows)
         for row in rows:
-            judge(row, reference)
+            set_error(row, reference)
         _time(runs, rounds)
     finally:
         for run, _ in runs:
@@ -141,14 +140,14 @@ def measure_case(case: Case, meshes: dict[Element, tuple], rounds: int, runtime:
 
 
 def _prepare(case: Case, element: Element, row: Row, runs: list[tuple], runtime: Runtime) -> None:
-    """Build, solve once and write down what was found; the run joins `runs`."""
+    """Build, solve once, record the results and append to `runs`."""
     compiled = compile_clock()
     try:
-        with unwarned():  # order 1 locks where nu is near 1/2: this is what is measured
+        with without_warnings():  # order 1 locks for nu near 1/2, which is measured here
             scene = case.build(row.cells, element)
         row.tets, row.nodes = scene.bodies[0].mesh.n_tets, len(scene.bodies[0].rest_positions)
         run = (Statics if case.dt is None else Fall)(case, scene, runtime)
-        runs.append((run, row))  # from here on it is closed at the end
+        runs.append((run, row))  # measure_case closes it
         _, seconds = timed(lambda: run.first(row))
         if seconds > ENOUGH_SECONDS:
             row.rounds.append(seconds)
@@ -158,15 +157,15 @@ def _prepare(case: Case, element: Element, row: Row, runs: list[tuple], runtime:
 
 
 def _time(runs: list[tuple], rounds: int) -> None:
-    """Time every run that ended well, in rounds."""
+    """Time all successful runs in rounds."""
     for _ in range(rounds):
         for run, row in runs:
             if not row.failure and sum(row.rounds) < ENOUGH_SECONDS:
-                row.rounds.append(float(np.median(repeated(run.again, ROUND_RUNS, ROUND_SECONDS, least=1))))
+                row.rounds.append(float(np.median(repeated(run.again, ROUND_RUNS, ROUND_SECONDS, min_rounds=1))))
 
 
 def own_reference(case: Case, rows: list[Row]) -> Reference:
-    """The limit that the last three order-2 meshes of the run lead to, where the case asks for it and they have solutions."""
+    """The extrapolated value of the last three order-2 meshes, if the case requires it and they have solutions."""
     solved = [np.array(row.measured) for row in rows if row.degree == 2 and row.measured]
     if not case.extrapolated or len(solved) < 3:
         return Reference((), 0.0, "nothing to take an error from")
@@ -176,8 +175,8 @@ def own_reference(case: Case, rows: list[Row]) -> Reference:
     return Reference(tuple(limit.tolist()), uncertainty, "the three finest order-2 meshes of this run, extrapolated")
 
 
-def judge(row: Row, reference: Reference) -> None:
-    """Set the error of a row that has numbers, where there are others to compare them with."""
+def set_error(row: Row, reference: Reference) -> None:
+    """Set the error of a row if there are numbers and a reference."""
     if row.measured and reference.values:
         exact = np.array(reference.values)
         row.error = float(np.abs(np.array(row.measured)[: len(exact)] / exact - 1.0).max())

@@ -1,24 +1,21 @@
-"""The works W1 to W4, taisoft beside MuJoCo, PyBullet and Newton: time against error, and what stands.
+"""The works W1 to W4 in taisoft, MuJoCo, PyBullet and Newton: time against error, and stability of stacks.
 
 taisoft bench peers [--work KEY] [--program NAME] [--arch cpu|cuda] [--rounds N] [--quick] [--out [FILE.json]]
 
-W1 is a beam that hangs from its end (three meshes; on the coarse one also 1e8 and 1e9 Pa), W2 a cube that drops on the ground, W3
-three cubes that fall on each other, W4 a cube that drops on a clamped sheet (benchmarks/works/scenes.py). Everyone gets the
-same nodes and tets. W1's and W2's errors are measured from the exact path of a program's own law and masses, at the largest in
-position over the excursion, or the root mean square of the mass centre's height over the 0.5 m it drops. W3 and W4 are to
-stand for a second: nothing falls or leans, turns inside out, or sinks in by 1 % of an edge (the least of the bodies' mean
-ones), and the last body, until something reaches it, falls as freely as a stone, to 20 % of its way ("free fall" is 1), as
-measured by taisoft in every program's positions every 10 ms. taisoft runs on as many threads as the machine has cores
-where that pays, the others on one core. Times are without building and compiling. A setting that takes more than 10 s, or more
-than 20 s to build, is measured in one round. MuJoCo's `passive` contact has no friction, everything else has. What else was
-tried has a table of its own (benchmarks/programs/tried.py). Nothing here passes or fails: limits are marked as met or not.
-With --work the other works of FILE.json are kept. The whole takes about 35 minutes on two cores.
+W1 is a hanging beam (three meshes; the coarse one also with 1e8 and 1e9 Pa), W2 a cube that drops on the ground, W3 three cubes
+that fall on each other, W4 a cube that drops on a clamped sheet (benchmarks/works/scenes.py). All programs get the same nodes
+and tets. W1 and W2 are compared with the exact path of each program's own law and masses: the largest position error over the
+excursion, or the root mean square error of the mass centre's height over the drop of 0.5 m. W3 and W4 must stand for one second:
+no body falls, leans, inverts a tet or penetrates by 1 % of an edge (the smallest of the bodies' mean edges), and until something
+reaches the last body it falls freely to within 20 % ("free fall" is 1). taisoft evaluates the positions of every program every
+10 ms. taisoft uses all cores if that is faster, the others one core. Times exclude building and compilation. A setting that takes
+more than 10 s, or more than 20 s to build, is measured in one round. MuJoCo's `passive` contact has no friction, all other
+contact has. A second table lists other settings that were tried (benchmarks/programs/tried.py). The exit status is 0 also if
+limits are not met. With --work the other works in FILE.json are kept. A full run takes about 35 minutes on two cores.
 """
 
-import argparse
 import sys
 from collections.abc import Iterable
-from pathlib import Path
 from types import ModuleType
 
 from taisoft.files import write_bytes
@@ -26,20 +23,10 @@ from taisoft.machine import Timing, load_average
 from taisoft.output.report import json_text
 from taisoft.output.tables import require_matplotlib
 
-from .document import (
-    RESULTS,
-    Document,
-    again_text,
-    check_out,
-    default_out,
-    earlier_numbers,
-    header,
-    limit_table,
-    load_text,
-    plain,
-)
+from .document import Document, again_text, earlier_numbers, header, limit_table, load_text, plain
 from .programs import mujoco_flex, newton_works, own, pybullet_soft
 from .programs.tried import TRIED, VERSIONS
+from .runner import add_arch, add_named_out, make_parser, named_out
 from .works.runs import Row, measure, row_of
 from .works.scenes import WORKS, Work
 from .works.table import compare_table, comparisons, draw, implicit_table, limits_of, run_table, tried_table
@@ -50,7 +37,7 @@ ROUNDS = 3
 
 
 def opening(arch: str, programs: list[ModuleType]) -> tuple[str, dict]:
-    """What is measured where, and which programs are missing, as text and as data."""
+    """Header with the missing programs, as text and as data."""
     packages = ("taichi", "mujoco", "pybullet", "newton", "warp-lang", "numpy")
     text, numbers = header("Speed against error, beside other programs", arch, packages=packages)
     text += "\n\n" + __doc__.partition("\n\n")[2].partition("\n\n")[2].strip()
@@ -60,7 +47,7 @@ def opening(arch: str, programs: list[ModuleType]) -> tuple[str, dict]:
 
 
 def page(text: str, found: list[list[Row]], document: Document) -> dict:
-    """Write the tables of all works. Returns their numbers."""
+    """Add the tables of all works. Returns their numbers."""
     document.add(text)
     for rows in found:
         work = rows[0].work
@@ -83,7 +70,7 @@ def page(text: str, found: list[list[Row]], document: Document) -> dict:
 
 
 def kept_rows(earlier: dict | None, works: list[Work], numbers: dict) -> dict[str, list[Row]]:
-    """By key the rows that an earlier run on the same machine has of the works that are not measured now."""
+    """Rows by key of the works that are not measured now, from an earlier run on the same machine."""
     if earlier is None or any(earlier.get(name) != numbers[name] for name in ("processor", "cores", "arch")):
         return {}
     rows: dict[str, list[Row]] = {}
@@ -98,15 +85,14 @@ def kept_rows(earlier: dict | None, works: list[Work], numbers: dict) -> dict[st
 def run(
     works: list[Work], programs: list[ModuleType], arch: str, rounds: int, document: Document, earlier: dict | None = None
 ) -> tuple[dict, list[list[Row]]]:
-    """Everything, printed. Returns the numbers, and the rows of each work. earlier: numbers of an earlier run, whose other works
-    are kept."""
+    """Measure and print. Returns the numbers and the rows of each work. earlier: numbers of a run whose other works are kept."""
     text, numbers = opening(arch, programs)
     here = [program for program in programs if program.NAME not in numbers["left_out"]]
     rows = kept_rows(earlier, works, numbers)
     for work in works:
         rows[work.key] = measure(work, here, rounds, arch)
     found = [rows[work.key] for work in WORKS if work.key in rows]
-    numbers |= {"quick": rounds < ROUNDS or len(here) < len(PROGRAMS)}  # not for the manual
+    numbers |= {"quick": rounds < ROUNDS or len(here) < len(PROGRAMS)}  # the manual ignores quick results
     numbers |= page(text, found, document)
     document.add(again_text(earlier, times_of(rows[work.key] for work in works), numbers))
     document.add(f"Load at the end: {load_text(load_average())}")
@@ -114,36 +100,26 @@ def run(
 
 
 def times_of(works: Iterable[list[Row]]) -> dict[str, Timing]:
-    """By name, of all rows that have one."""
+    """Timings of all rows, by name."""
     return {f"{row.work.key}: {row}": row.timing for rows in works for row in rows if row.timing is not None}
 
 
 def main(argv=None) -> int:
     """Measure and print. Raises OutputError, or SimulationError where the arch is not available."""
-    first, _, rest = __doc__.partition("\n")
-    parser = argparse.ArgumentParser(prog="taisoft bench peers", description=first, epilog=rest.partition("\n\n")[2])
-    parser.add_argument("--work", metavar="KEY", help=f"only those that begin so: {', '.join(work.key for work in WORKS)}")
+    parser = make_parser("peers", __doc__)
+    parser.add_argument("--work", metavar="KEY", help=f"only works with this prefix: {', '.join(work.key for work in WORKS)}")
     names = [program.NAME for program in PROGRAMS]
-    parser.add_argument("--program", choices=names[1:], action="append", help="only this one beside taisoft; may be repeated")
-    parser.add_argument("--arch", choices=("cpu", "cuda"), default="cpu", help="where taisoft computes (default cpu)")
+    parser.add_argument("--program", choices=names[1:], action="append", help="only taisoft and this program; repeatable")
+    add_arch(parser)
     parser.add_argument("--rounds", type=int, default=ROUNDS, help="rounds over all settings (default %(default)s)")
     parser.add_argument("--quick", action="store_true", help=f"only {' and '.join(QUICK)}, one round")
-    parser.add_argument(
-        "--out",
-        type=Path,
-        nargs="?",
-        const=RESULTS,
-        metavar="FILE.json",
-        help="write FILE.json, FILE.md and FILE.png; without a name into benchmarks/results, named after the machine",
-    )
+    add_named_out(parser, "FILE.json, FILE.md and FILE.png")
     options = parser.parse_args(argv)
     works = [work for work in WORKS if work.key.startswith(options.work or "") and (not options.quick or work.key in QUICK)]
     if not works:
         parser.error(f"no work begins with {options.work!r}")
-    out = options.out
+    out = named_out(options, "peers")
     if out is not None:
-        out = default_out(options.arch, "peers") if out == RESULTS else out
-        check_out(out, ".json")
         require_matplotlib("--out")
     programs = [one for one in PROGRAMS if one is own or not options.program or one.NAME in options.program]
     document = Document()

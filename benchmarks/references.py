@@ -1,13 +1,12 @@
-"""Every reference problem: measured beside reference, one row a check, pass or fail.
+"""All reference problems: measured and reference values, a row per check, pass or fail.
 
 taisoft bench references [--problem NAME] [--arch cpu|cuda] [--out FILE.json]
 
-Computed in f64. The reference values lie beside the repository, in shared/references; without them there is nothing to
-compare with. Rows without a limit only show how far a mesh or a step is off. Seconds include compiling the kernels; a
-case with several rows shows them in its first. Exit status: 0 all passed, 1 some failed, 2 nothing to compare with.
+Computed in f64. The reference values are in shared/references beside the repository. Rows without a limit only show the error of
+a mesh or a step. Seconds include compilation and are shown in a case's first row. Exit status: 0 all passed, 1 some failed, 2
+without reference values.
 """
 
-import argparse
 import json
 import sys
 import time
@@ -23,6 +22,7 @@ from taisoft.output.report import json_text
 
 from .reference_cases import CASES, PROBLEMS
 from .reference_cases.record import Case, Check, computed
+from .runner import add_arch, make_parser
 
 REFERENCES = Path(__file__).resolve().parents[1].parent / "shared" / "references"
 HEADINGS = ("problem", "law", "mesh", "quantity", "measured", "reference", "error", "limit", "", "seconds")
@@ -56,7 +56,7 @@ class Row:
 
 
 def run(case: Case, reference: dict, arch: str) -> list[Row]:
-    """The rows of a case; one that could not be computed is a failed row that says why."""
+    """The rows of a case; a computation that fails is a failed row with the reason."""
     start = time.perf_counter()
     checks = computed(lambda: case.compute(reference, arch))
     seconds = [time.perf_counter() - start] + [0.0] * (len(checks) - 1)
@@ -84,10 +84,10 @@ def _write(path: Path, arch: str, rows: list[Row]) -> None:
 
 
 def main(argv=None) -> int:
-    """Run the cases and print their table. Raises OutputError, or SimulationError where the arch is not available."""
-    parser = argparse.ArgumentParser(prog="taisoft bench references", description=__doc__.partition("\n")[0])
+    """Run the cases and print their table. Raises OutputError, or SimulationError if the arch is not available."""
+    parser = make_parser("references", __doc__)
     parser.add_argument("--problem", choices=PROBLEMS, metavar="NAME", help=f"only this one of {', '.join(PROBLEMS)}")
-    parser.add_argument("--arch", choices=("cpu", "cuda"), default="cpu", help="where to compute (default cpu)")
+    add_arch(parser)
     parser.add_argument("--out", type=Path, metavar="FILE.json", help="write the rows to this file too")
     options = parser.parse_args(argv)
     problems = (options.problem,) if options.problem else PROBLEMS

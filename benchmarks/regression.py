@@ -2,23 +2,21 @@
 
 taisoft bench regression [--update] [--case NAME] [--arch cpu|cuda]
 
-The numbers lie in benchmarks/data/regression.json, those of each arch apart. They show drifts that limits elsewhere let
-through: an error that has doubled within its limit, a solver that needs more iterations. A number counts as the same within
+The numbers are in benchmarks/data/regression.json, separately for each arch. They reveal drifts within limits: an error that has
+doubled, a solver that needs more iterations. A number counts as the same within
 
-    errors      5 % of the stored one, plus what another order of sums may make of it: 1e-5 in f32, 1e-9 in f64, or the case's own
+    errors      5 % of the stored one, plus the effect of another order of summation: 1e-5 in f32, 1e-9 in f64, or the case's own
     counts      5 %, at least 2: of Newton and CG iterations, sweeps, contacts, pairs
     memory      0.1 % of the bytes of all fields
     status      the same
 
-since runs on the CPU are the same bit by bit on one machine with one number of threads, while another processor or compiler
-rounds otherwise, which moves the last digits, and an iteration that stops at a tolerance by one. A number that is better than
-stored counts as changed too: --update stores what is found, after the differences have been printed for review. References
-that are no formulas are computed then, and kept.
+since CPU runs are bitwise reproducible on one machine with the same number of threads, while another processor or compiler rounds
+differently and may change iteration counts by one. A number better than stored counts as changed too: --update prints the
+differences and stores the new numbers. It also computes and stores references that are not formulas.
 
-Times are shown, and never judged: as a ratio to products of a sparse matrix with a vector (1 = 100 of 20,000 rows of 27), on one
-thread of the same machine in the same run. These gather and multiply as steps do, so that the ratio changes less between machines
-than seconds, or a ratio to a product of dense matrices, which are another kind of work. Exit status: 0, 1 where a number has
-changed, 2 where none is stored.
+Times are shown but not compared. Their unit is 100 products of a sparse matrix (20,000 rows of 27) with a vector, on one thread
+in the same run: these gather and multiply as steps do, so that the ratio varies less between machines than seconds. Exit status:
+0, 1 if a number has changed, 2 if none is stored.
 """
 
 import argparse
@@ -42,12 +40,12 @@ from .runner import add_arch, make_parser, progress
 
 STORE = Path(__file__).resolve().parent / "data" / "regression.json"
 ERROR_MARGIN, COUNT_MARGIN, COUNT_LEAST, MEMORY_MARGIN = 0.05, 0.05, 2, 1e-3
-ROWS, BESIDE, PRODUCTS = 20_000, 13, 100  # of the baseline: rows, entries on each side of the diagonal, products in one unit
+ROWS, BESIDE, PRODUCTS = 20_000, 13, 100  # baseline: rows, entries on each side of the diagonal, products per unit
 
 
 @dataclass(frozen=True)
 class Entry:
-    """The numbers of a case. reference: what it is judged by; time: over the baseline."""
+    """The numbers of a case. reference: expected numbers; time: over the baseline."""
 
     reference: list[float]
     error: float
@@ -58,7 +56,7 @@ class Entry:
 
 
 def baseline() -> float:
-    """Seconds of the unit of times: the best of several, on one thread."""
+    """The unit of times [s]: the best of several runs on one thread."""
     matrix = sp.diags([1.0] * (2 * BESIDE + 1), range(-BESIDE, BESIDE + 1), shape=(ROWS, ROWS), format="csr")
     x = np.ones(ROWS)
 
@@ -70,14 +68,14 @@ def baseline() -> float:
 
 
 def make_entry(found: Found, reference: list[float], unit: float) -> Entry:
-    """What is stored of a computation. unit: seconds of the baseline."""
+    """The stored numbers of a computation. unit: seconds of the baseline."""
     exact = np.array(reference)
     error = float(np.abs(np.array(found.measured) - exact).max() / np.abs(exact).max())
     return Entry(list(reference), error, found.counts, found.status, found.field_bytes, found.seconds / unit)
 
 
 def differences(case: Case, new: Entry, old: Entry) -> list[str]:
-    """What has changed beyond its margin, in words; times are no part of it."""
+    """Changes beyond the margins, in words, without times."""
     found = []
     if new.status != old.status:
         found.append(f"status '{new.status}', stored '{old.status}'")
@@ -93,7 +91,7 @@ def differences(case: Case, new: Entry, old: Entry) -> list[str]:
 
 
 def load(arch: str, path: Path) -> dict[str, Entry]:
-    """What is stored for an arch, by the name of the case. Raises OutputError where the file cannot be read."""
+    """Stored entries of an arch by case name. Raises OutputError if the file cannot be read."""
     try:
         stored = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
         return {name: Entry(**entry) for name, entry in stored.get(arch, {}).get("cases", {}).items()}
@@ -102,7 +100,7 @@ def load(arch: str, path: Path) -> dict[str, Entry]:
 
 
 def store(entries: dict[str, Entry], arch: str, path: Path) -> None:
-    """Put the entries in place of those stored for an arch; other cases and archs stay, cases that are no more go."""
+    """Replace the stored entries of an arch; other cases and archs stay, removed cases are deleted."""
     whole = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
     known = load(arch, path) | entries
     kept = {case.name: asdict(known[case.name]) for case in CASES if case.name in known}
@@ -112,7 +110,7 @@ def store(entries: dict[str, Entry], arch: str, path: Path) -> None:
 
 
 def check(case: Case, arch: str, stored: dict[str, Entry], unit: float = 1.0) -> tuple[Entry, list[str]]:
-    """A case computed and compared. Raises KeyError where nothing is stored of it."""
+    """Compute a case and compare it with its stored entry. Raises KeyError without one."""
     new = make_entry(case.run(arch), stored[case.name].reference, unit)
     return new, differences(case, new, stored[case.name])
 
@@ -130,10 +128,10 @@ HEADINGS = ("case", "", "error", "stored", "counts", "bytes", "time", "stored", 
 
 
 def main(argv=None) -> int:
-    """Compute, compare and print. Raises OutputError, or SimulationError where the arch cannot be had."""
+    """Compute, compare and print. Raises OutputError, or SimulationError if the arch is not available."""
     parser = make_parser("regression", __doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--update", action="store_true", help="store what is found")
-    parser.add_argument("--case", metavar="NAME", help="only those whose name begins so")
+    parser.add_argument("--update", action="store_true", help="store the new numbers")
+    parser.add_argument("--case", metavar="NAME", help="only cases with this prefix")
     add_arch(parser)
     options = parser.parse_args(argv)
     cases = [case for case in CASES if case.name.startswith(options.case or "")]

@@ -1,9 +1,9 @@
-"""Short computations whose errors, iterations and memory `regression.py` watches, as data.
+"""Cases of `regression.py`, as data.
 
-Each measures a few numbers and is judged by a reference of as many; the error is the largest difference over the largest number
-of the reference. Where a reference is not a formula it is the same scene in f64 with an eighth of the step, computed when the
-file of numbers is written, and kept there. Cases whose iterations a change of 1e-7 in the mesh moves by more than the margins, as
-stacks of flush cubes do, are not among them.
+Each case measures a few numbers and compares them with a reference; the error is the largest difference over the largest number
+of the reference. A reference is a formula, or the same scene in f64 with an eighth of the step, computed and stored by --update.
+Cases whose iterations change by more than the margins for a change of 1e-7 in the mesh, such as stacks of flush cubes, are
+excluded.
 """
 
 from collections.abc import Callable
@@ -28,17 +28,16 @@ from .hard_cases.shapes import SNH, G, box
 from .reference_cases.record import face
 from .runner import timed
 
-# of a reference: share of the step, and what contacts are solved to even in the step in which sliding ends
+# settings of a reference: fraction of the step, and tolerances that hold even in the step in which sliding ends
 FINER = {"dt": 1 / 8, "contact_tolerance": 1e-5, "newton_tolerance": 1e-6}
-ROUNDING = {"f32": 1e-5, "f64": 1e-9}  # what errors may differ by for no better reason than another order of sums
+ROUNDING = {"f32": 1e-5, "f64": 1e-9}  # change of errors by another order of summation
 ANGLE, FRICTION = np.arctan(0.5), 0.3  # of the slope
 METHODS = ("gauss_seidel", "coloured_gauss_seidel", "jacobi", "hybrid", "augmented_lagrangian")
 
 
 @dataclass
 class Found:
-    """What a computation came to. measured: the numbers that are judged; counts: iterations and the like; seconds: without
-    compiling."""
+    """Result of a computation. measured: the compared numbers; counts: iterations and the like; seconds: without compilation."""
 
     measured: list[float]
     counts: dict[str, int]
@@ -50,8 +49,8 @@ class Found:
 
 @dataclass(frozen=True)
 class Case:
-    """A computation. what: the numbers that are judged, and by what; reference: arch -> those numbers as they should be;
-    slack: error that rounding alone may make; quick: the tests run it always."""
+    """A computation. what: the numbers and their reference, in words; reference: arch -> expected numbers; slack: error due to
+    rounding; quick: always run by the tests."""
 
     name: str
     what: str
@@ -67,8 +66,7 @@ class Case:
 
 @dataclass(frozen=True)
 class Motion:
-    """A scene run for some seconds. read: simulator -> the numbers that are judged; settings: of the simulator, precision left
-    out."""
+    """A scene run for some seconds. read: simulator -> compared numbers; settings: of the simulator, without precision."""
 
     build: Callable[[], Scene]
     seconds: float
@@ -76,7 +74,7 @@ class Motion:
     settings: dict
 
     def run(self, precision: str, arch: str) -> Found:
-        """Computed as the case says."""
+        """Run the scene."""
         with ts.Simulator(self.build(), precision=precision, arch=arch, **self.settings) as sim:
             result, seconds = timed(partial(sim.run, self.seconds, fps=None))
             reports = result.step_reports
@@ -92,7 +90,7 @@ class Motion:
             return Found(self.read(sim).tolist(), counts, result.status, field_bytes, seconds, result.problems)
 
     def finer(self, arch: str) -> list[float]:
-        """The same numbers in f64, with finer steps. Raises SimulationError where they cannot be trusted."""
+        """The same numbers in f64 with finer steps. Raises SimulationError if the run is not ok."""
         finer = replace(self, settings=self.settings | FINER | {"dt": FINER["dt"] * self.settings["dt"]})
         found = finer.run("f64", arch)
         if found.status != "ok":
@@ -101,7 +99,7 @@ class Motion:
 
 
 def motion(name, what, precision, build, seconds, read, exact=None, quick=False, slack=None, **settings) -> Case:
-    """A case that is a motion. exact: the numbers as they should be, where there is a formula."""
+    """A case that is a motion. exact: expected numbers, if there is a formula."""
     one = Motion(build, seconds, read, settings)
     reference = one.finer if exact is None else lambda arch: list(exact)
     return Case(name, what, precision, partial(one.run, precision), reference, slack or ROUNDING[precision], quick)
@@ -115,8 +113,8 @@ def beam(law: str = "SNH", cells: tuple = (8, 2, 2), order: int = 1) -> Scene:
     return scene
 
 
-def way(sim: ts.Simulator) -> np.ndarray:
-    """How far the last body's nodes went on average (3,) [m]."""
+def mean_displacement(sim: ts.Simulator) -> np.ndarray:
+    """Mean displacement of the last body's nodes (3,) [m]."""
     body = sim.scene.bodies[-1]
     return (sim.positions(body.name) - body.rest_positions - body.position).mean(axis=0)
 
@@ -127,30 +125,30 @@ def cube_on_slope() -> Scene:
     return on_slope(box((2, 2, 2), (0.1,) * 3), cube, ANGLE, FRICTION)
 
 
-def way_down(sim: ts.Simulator) -> np.ndarray:
-    """How far the cube slid (1,) [m]."""
-    return np.array([way(sim) @ (np.cos(ANGLE), -np.sin(ANGLE), 0.0)])
+def slide_distance(sim: ts.Simulator) -> np.ndarray:
+    """Distance by which the cube slid (1,) [m]."""
+    return np.array([mean_displacement(sim) @ (np.cos(ANGLE), -np.sin(ANGLE), 0.0)])
 
 
 def slid(seconds: float) -> list[float]:
-    """How far a rigid cube slides [m]."""
+    """Distance by which a rigid cube slides [m]."""
     return [float(0.5 * G * (np.sin(ANGLE) - FRICTION * np.cos(ANGLE)) * seconds**2)]
 
 
 def demo(name: str, precision: str, seconds: float) -> Case:
-    """The beginning of a demo in its own steps; the way of the last body."""
+    """The start of a demo with its own settings: mean displacement of the last body."""
     from taisoft.cli.scene_file import load_scene
 
     own = {key: value for key, value in load_scene(name)[1].items() if key in SETTINGS}
-    what = f"mean way of the last body after {seconds:g} s; by steps of an eighth in f64"
-    return motion(f"demo {name}", what, precision, lambda: load_scene(name)[0], seconds, way, **own)
+    what = f"mean displacement of the last body after {seconds:g} s; reference: f64 with an eighth of the step"
+    return motion(f"demo {name}", what, precision, lambda: load_scene(name)[0], seconds, mean_displacement, **own)
 
 
 # --- the others -------------------------------------------------------------------------------------------------------
 
 
 def static(tolerance: float, order: int, arch: str) -> Found:
-    """The equilibrium of the beam: way of its nodes."""
+    """The equilibrium of the beam: mean displacement of its nodes."""
     arena, scene = FieldArena(), beam("SNH", order=order)
     with closing(open_runtime(arch, "f64", "the regression cases")) as runtime:
         try:
@@ -228,30 +226,30 @@ def self_collision(arch: str) -> Found:
 
 # --- all ------------------------------------------------------------------------------------------------------------------
 
-TIP = "mean way of the nodes after 0.2 s; by steps of an eighth in f64"
-FALL = {"integrator": "velocity_verlet", "dt": 1e-3, "slack": 2e-6}  # whose error is rounding, nearly
+TIP = "mean displacement of the nodes after 0.2 s; reference: f64 with an eighth of the step"
+FALL = {"integrator": "velocity_verlet", "dt": 1e-3, "slack": 2e-6}  # the error is mostly rounding
 SWING = {"integrator": "bdf2", "dt": 0.01}
-SLOPE = "way down the slope after 0.4 s; by the formula of a rigid cube"
-GAP = "least gap; as built"
+SLOPE = "distance down the slope after 0.4 s; reference: a rigid cube"
+GAP = "smallest gap; reference: as built"
 
-CASES: tuple[Case, ...] = (  # those of one precision follow each other: another one starts Taichi anew
-    motion("explicit beam SNH", TIP, "f32", beam, 0.2, way, quick=True, **FALL),
-    motion("explicit beam COR", TIP, "f32", partial(beam, "COR"), 0.2, way, **FALL),
-    motion("explicit beam SVK", TIP, "f32", partial(beam, "SVK"), 0.2, way, **FALL),
-    motion("implicit beam SNH", TIP, "f32", beam, 0.2, way, quick=True, **SWING),
-    motion("explicit slope", SLOPE, "f32", cube_on_slope, 0.4, way_down, slid(0.4), integrator="symplectic_euler", dt=8e-4),
+CASES: tuple[Case, ...] = (  # grouped by precision, since another one restarts Taichi
+    motion("explicit beam SNH", TIP, "f32", beam, 0.2, mean_displacement, quick=True, **FALL),
+    motion("explicit beam COR", TIP, "f32", partial(beam, "COR"), 0.2, mean_displacement, **FALL),
+    motion("explicit beam SVK", TIP, "f32", partial(beam, "SVK"), 0.2, mean_displacement, **FALL),
+    motion("implicit beam SNH", TIP, "f32", beam, 0.2, mean_displacement, quick=True, **SWING),
+    motion("explicit slope", SLOPE, "f32", cube_on_slope, 0.4, slide_distance, slid(0.4), integrator="symplectic_euler", dt=8e-4),
     demo("cube_on_box", "f32", 0.5),
     Case("search, two cubes", GAP, "f32", partial(search, cubes_setup(3)), lambda _: [-DEEP_PENETRATION / 3], 1e-6, quick=True),
     Case("search, sheet and cube", GAP, "f32", partial(search, SHEET), lambda arch: [-2e-4], 1e-6),
     Case("self-collision", GAP, "f32", self_collision, lambda arch: [2 * RADIUS - THICK], 1e-9),
-    motion("implicit slope", SLOPE, "f64", cube_on_slope, 0.4, way_down, slid(0.4), integrator="implicit_euler", dt=0.01),
-    motion("implicit beam COR", TIP, "f64", partial(beam, "COR"), 0.2, way, **SWING),
-    motion("implicit beam SVK", TIP, "f64", partial(beam, "SVK"), 0.2, way, **SWING),
-    motion("quadratic beam", TIP, "f64", partial(beam, "SNH", (4, 1, 1), 2), 0.2, way, **SWING),
+    motion("implicit slope", SLOPE, "f64", cube_on_slope, 0.4, slide_distance, slid(0.4), integrator="implicit_euler", dt=0.01),
+    motion("implicit beam COR", TIP, "f64", partial(beam, "COR"), 0.2, mean_displacement, **SWING),
+    motion("implicit beam SVK", TIP, "f64", partial(beam, "SVK"), 0.2, mean_displacement, **SWING),
+    motion("quadratic beam", TIP, "f64", partial(beam, "SNH", (4, 1, 1), 2), 0.2, mean_displacement, **SWING),
     *(
         Case(
             f"static beam, order {order}",
-            "mean way of the nodes; by a solution to 1e-12",
+            "mean displacement of the nodes; reference: a solution to 1e-12",
             "f64",
             partial(static, 1e-6, order),
             lambda arch, order=order: static(1e-12, order, arch).measured,
@@ -261,7 +259,7 @@ CASES: tuple[Case, ...] = (  # those of one precision follow each other: another
     ),
     Case(
         "contact problem",
-        "sums of the normal impulses; by a solution to 1e-13",
+        "sums of the normal impulses; reference: a solution to 1e-13",
         "f64",
         contact_problem,
         tight_contact_problem,

@@ -1,13 +1,13 @@
-"""The report's figures and experiments run again: its statement, our measurement, agree or not and why, on one page.
+"""The report's figures and experiments repeated: its claims, our measurements and a verdict, on one page.
 
 taisoft bench report [--quick] [--arch cpu|cuda] [--only NAME] [--out DIR]
 
-The page is DIR/README.md, with its pictures and all numbers (report.json) beside it. Scenes are ours: the report's text gives
-few sizes, and neither its machine nor its materials. A verdict follows from the numbers: a claim holds or not, and a part agrees,
-disagrees, or partly agrees. Times are medians; spread is the distance between the quartiles over the median; compiling is apart.
-A second run into the same folder says which times have not come again within the spreads. Exit status: 0, or 1 where a part could
-not be measured; a verdict, whatever it is, is no failure. --quick has fewer scenes, sizes and rounds; it and --only print alone,
-unless --out says where to write. The whole takes about twelve minutes on two cores.
+The page is DIR/README.md, with pictures and all numbers (report.json) beside it. Scenes are ours, since the report gives few
+sizes and neither its machine nor its materials. The numbers decide whether a claim holds; a part agrees, disagrees or partly
+agrees. Times are medians without compilation; spread is the interquartile range over the median. A second run into the same
+folder lists the times that differ by more than the spreads. Exit status: 0, or 1 if a part could not be measured; verdicts do not
+matter. --quick has fewer scenes, sizes and rounds; it and --only write files only with --out. A full run takes about twelve
+minutes on two cores.
 """
 
 import os
@@ -45,7 +45,7 @@ PAGE, NUMBERS = "README.md", "report.json"
 
 
 def measure_part(name: str, extent: Extent) -> Part:
-    """An experiment; where it could not be measured, a part that says why."""
+    """Measure an experiment; the part records a failure."""
     begin = time.perf_counter()
     try:
         part = PARTS[name](extent)
@@ -61,14 +61,14 @@ def page_text(head: str, numbers: dict, parts: list[Part], again: str) -> str:
         f"{head}\nload {load_text(numbers['load_at_the_end'])} at the end; {numbers['seconds']:.0f} s in all, "
         f"{numbers['compile_seconds']:.0f} s of them "
         f"compiling{'; a quick run, with fewer scenes, sizes and rounds' if numbers['quick'] else ''}.\n\nMade by `taisoft bench "
-        "report`; nothing on this page is written by hand. Claims are the report's in our words, and hold or not by the numbers "
-        "beside them. Times are medians; spread is the distance between the quartiles over the median."
+        "report`; nothing on this page is written by hand. Claims are the report's in our words; the numbers decide whether they "
+        "hold. Times are medians; spread is the interquartile range over the median."
     )
     return "\n\n".join([opening, summary_table(parts), *map(part_text, parts), short_text(parts), again]) + "\n"
 
 
 def write(folder: Path, head: str, numbers: dict, parts: list[Part]) -> None:
-    """The page, its pictures and its numbers. Raises OutputError."""
+    """Write the page, its pictures and its numbers. Raises OutputError."""
     times = {f"{part.name}: {name}": t for part in parts for name, t in part.times.items()}
     page = page_text(head, numbers, parts, again_text(earlier_numbers(folder / NUMBERS), times, numbers))
     for part in parts:
@@ -80,18 +80,17 @@ def write(folder: Path, head: str, numbers: dict, parts: list[Part]) -> None:
 
 
 def main(argv=None) -> int:
-    """Measure and write. Raises OutputError, or SimulationError where the arch cannot be had."""
+    """Measure and write. Raises OutputError, or SimulationError if the arch is not available."""
     parser = make_parser("report", __doc__)
     add_arch(parser)
     parser.add_argument("--quick", action="store_true", help="fewer scenes, sizes and rounds")
     parser.add_argument("--only", choices=tuple(PARTS), metavar="NAME", help=f"one of {', '.join(PARTS)}")
-    parser.add_argument("--out", type=Path, metavar="DIR", help="default of the whole: benchmarks/results/report-<machine>")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="default of a full run: benchmarks/results/report-<machine>")
     options = parser.parse_args(argv)
     folder = options.out or (None if options.quick or options.only else default_out(options.arch, "report", suffix=""))
     require_matplotlib("the page's plots")
-    if folder is not None:
-        if not os.access(make_folder(folder), os.W_OK):  # before minutes of measuring
-            raise OutputError(f"cannot write to the folder {folder}")
+    if folder is not None and not os.access(make_folder(folder), os.W_OK):  # before minutes of measuring
+        raise OutputError(f"cannot write to the folder {folder}")
     head, numbers = header("The report, measured again", options.arch)
     begin, compiled = time.perf_counter(), compile_clock()
     parts = []

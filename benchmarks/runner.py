@@ -1,6 +1,6 @@
-"""How benchmarks run: their options, times of calls and of their parts, and processes of this and of older versions.
+"""Options, timing and child processes of benchmarks.
 
-A time holds no compiling; what runs beside each other takes turns, so that a slow moment of the machine falls on all.
+Times exclude compilation. Alternatives are timed in turn, so that a slow moment of the machine affects all of them.
 """
 
 import argparse
@@ -24,29 +24,42 @@ from taisoft.errors import SimulationError
 from taisoft.output.files import make_folder
 from taisoft.output.tables import require_matplotlib
 
-from .document import check_out
+from .document import RESULTS, check_out, default_out
 
 HERE = Path(taisoft.__file__).resolve().parents[1]
-RESULT = "result: "  # before what a child found, among what Taichi prints
-REST = "rest"  # of a call: what no part of it took
+RESULT = "result: "  # marks a child's results among Taichi's output
+REST = "rest"  # time of a call outside its timed parts
 
 
 # --- options ------------------------------------------------------------------------------------------------------------
 
 
 def make_parser(name: str, doc: str, **more) -> argparse.ArgumentParser:
-    """The parser of `taisoft bench NAME`, with the module's docstring as help."""
+    """Parser of `taisoft bench NAME`; the help is the module's docstring."""
     first, _, rest = doc.partition("\n")
     return argparse.ArgumentParser(prog=f"taisoft bench {name}", description=first, epilog=rest.partition("\n\n")[2], **more)
 
 
 def add_arch(parser: argparse.ArgumentParser) -> None:
-    """--arch."""
+    """Add --arch."""
     parser.add_argument("--arch", choices=("cpu", "cuda"), default="cpu", help="where to compute (default cpu)")
 
 
+def add_named_out(parser: argparse.ArgumentParser, files: str = "FILE.json and FILE.md") -> None:
+    """Add --out [FILE.json]; without a name, `named_out` puts the file into benchmarks/results."""
+    text = f"write {files}; without a name into benchmarks/results, named after the machine"
+    parser.add_argument("--out", type=Path, nargs="?", const=RESULTS, metavar="FILE.json", help=text)
+
+
+def named_out(options: argparse.Namespace, name: str) -> Path | None:
+    """The file of --out, None without it. Raises OutputError if it cannot be written."""
+    out = default_out(options.arch, name) if options.out == RESULTS else options.out
+    check_out(out, ".json")
+    return out
+
+
 def parse_options(parser: argparse.ArgumentParser, argv: list[str] | None, drawn: str = "") -> argparse.Namespace:
-    """--arch, --out and, where something is drawn, --plot, beside the parser's own options; the files can be written."""
+    """Add --arch, --out and, if something is drawn, --plot; parse, and check that the files can be written."""
     add_arch(parser)
     parser.add_argument("--out", type=Path, metavar="FILE.json", help="write FILE.json and FILE.md too")
     if drawn:
@@ -60,7 +73,7 @@ def parse_options(parser: argparse.ArgumentParser, argv: list[str] | None, drawn
 
 
 def progress(text: str) -> None:
-    """Say on stderr what is being measured."""
+    """Print progress on stderr."""
     print(text, file=sys.stderr, flush=True)
 
 
@@ -68,22 +81,22 @@ def progress(text: str) -> None:
 
 
 def clock() -> float:
-    """Now [s], when the machine has done all that it was given."""
+    """The time [s] after all launched kernels have finished."""
     ti.sync()
     return time.perf_counter()
 
 
 def timed(call: Callable[[], object]) -> tuple[object, float]:
-    """What a call returns, and its seconds without compiling."""
+    """The result of a call, and its seconds without compilation."""
     begin, compiled = time.perf_counter(), compile_clock()
     result = call()
     return result, time.perf_counter() - begin - (compile_clock() - compiled)
 
 
-def repeated(call: Callable[[], object], rounds: int, enough: float = 3.0, least: int = 2) -> list[float]:
-    """Wall seconds of `rounds` calls, fewer if they take more than `enough` seconds together. Warm-up is left to the caller."""
+def repeated(call: Callable[[], object], rounds: int, max_seconds: float = 3.0, min_rounds: int = 2) -> list[float]:
+    """Wall seconds of `rounds` calls, or fewer once they take `max_seconds` together. The caller warms up."""
     seconds: list[float] = []
-    while len(seconds) < rounds and (len(seconds) < least or sum(seconds) < enough):
+    while len(seconds) < rounds and (len(seconds) < min_rounds or sum(seconds) < max_seconds):
         begin = clock()
         call()
         seconds.append(clock() - begin)
@@ -92,7 +105,7 @@ def repeated(call: Callable[[], object], rounds: int, enough: float = 3.0, least
 
 @contextmanager
 def patched(owner, name: str, value) -> Iterator[None]:
-    """An attribute of an object or a module has this value meanwhile."""
+    """Context in which an attribute of an object or a module has another value."""
     own, before = name in vars(owner), getattr(owner, name)
     setattr(owner, name, value)
     try:
@@ -105,23 +118,23 @@ def patched(owner, name: str, value) -> Iterator[None]:
 
 
 @contextmanager
-def unwarned() -> Iterator[None]:
-    """Without warnings to users, where what they warn of is what is measured."""
+def without_warnings() -> Iterator[None]:
+    """Context without UserWarnings, for benchmarks that measure what the warnings are about."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)
         yield
 
 
 class Stopwatch:
-    """Seconds by part, each call's own: what a call spends in another part counts there; and calls by name."""
+    """Seconds per part, without those of nested parts, and the number of calls by name."""
 
     def __init__(self) -> None:
         self.spent: Counter[str] = Counter()
         self.calls: Counter[str] = Counter()
-        self._inner: list[float] = []  # of the calls under way: seconds spent in calls inside
+        self._inner: list[float] = []  # per active call: seconds in nested calls
 
     def timed(self, call: Callable, part: str) -> Callable:
-        """The call, timed."""
+        """A timed version of the call."""
 
         def run(*arguments, **named):
             self.calls[getattr(call, "__name__", part)] += 1
@@ -139,14 +152,14 @@ class Stopwatch:
 
     @contextmanager
     def on(self, places: Iterable[tuple[str, object, str]]) -> Iterator[None]:
-        """Times calls meanwhile. places: part, and the owner and the name under which what is called is looked up."""
+        """Context in which calls are timed. places: part, owner and attribute name of each function."""
         with ExitStack() as stack:
             for part, owner, name in places:
                 stack.enter_context(patched(owner, name, self.timed(getattr(owner, name), part)))
             yield
 
     def parts_of(self, call: Callable[[], object]) -> dict[str, float]:
-        """Seconds of each part of one call, REST among them."""
+        """Seconds of each part of one call, including REST."""
         self.spent.clear()
         begin = clock()
         call()
@@ -158,7 +171,7 @@ class Stopwatch:
 
 
 def run_python(what: str, *arguments: str | int | Path, folder: Path = HERE, cache: Path | None = None) -> list[str]:
-    """The lines that a process of the version in `folder` prints. Raises SimulationError with its last line where it fails."""
+    """The output lines of a Python process with the version in `folder`. Raises SimulationError with its last line on failure."""
     paths = {"PYTHONPATH": os.pathsep.join(filter(None, (str(folder), os.environ.get("PYTHONPATH"))))}
     done = subprocess.run(
         [sys.executable, *map(str, arguments)],
@@ -174,39 +187,39 @@ def run_python(what: str, *arguments: str | int | Path, folder: Path = HERE, cac
     return done.stdout.splitlines()
 
 
-def say(found) -> None:
-    """In a child: print a result."""
-    print(RESULT + json.dumps(found), flush=True)
+def print_result(result) -> None:
+    """Print a child's result."""
+    print(RESULT + json.dumps(result), flush=True)
 
 
 def parse_result(line: str):
-    """What a line of a child's output found, None for any other line."""
+    """The result in a line of a child's output, None in other lines."""
     return json.loads(line.removeprefix(RESULT)) if line.startswith(RESULT) else None
 
 
 @dataclass(frozen=True)
 class Version:
-    """A version of taisoft by its folder. cache: where its compiled kernels are kept; None: where they always are."""
+    """A version of taisoft in a folder. cache: folder of its compiled kernels, None for the default."""
 
     folder: Path
     cache: Path | None = None
 
     def run(self, program: Path, *task: str | int | Path) -> list[str]:
-        """The lines that a program prints for a task. Raises SimulationError where it fails."""
+        """The output lines of a program. Raises SimulationError if it fails."""
         what = f"{self.folder}: task {' '.join(map(str, task))}"
         return run_python(what, program, *task, folder=self.folder, cache=self.cache)
 
     def files(self) -> set[Path]:
-        """What lies in the cache."""
+        """Files in the cache."""
         return {path for path in self.cache.rglob("*.tic*") if path.is_file()}
 
 
 def version_in(folder: Path) -> Version:
-    """The version in a folder; another one than this keeps a cache of kernels there."""
+    """The version in a folder; other versions than this keep their kernel cache there."""
     folder = folder.resolve()
     return Version(folder, None if folder == HERE else make_folder(folder / ".cache"))
 
 
 def versions_beside(baseline: Path | None) -> dict[str, Version]:
-    """This version and, where a folder is given, an older one."""
+    """This version and, given a folder, an older one."""
     return {"this": version_in(HERE)} | ({} if baseline is None else {"older": version_in(baseline)})

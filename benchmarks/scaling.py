@@ -3,13 +3,12 @@
 taisoft bench scaling [--quick] [--sizes LIST] [--kind NAME] [--arch cpu|cuda] [--out FILE.json] [--plot FILE.png]
 
 Explicit and implicit steps of a beam, searches for contacts in a pile of cubes, explicit and implicit steps of two cubes in
-contact; on CUDA also with a million tets. Each kind and size is measured in a process of its own, whose peak of memory is
-then that work's alone. A time is the median over samples, without compiling; spread is the distance between the quartiles over
-the median. Exponents: of time, set-up and memory over the tets, fitted in the logarithms; 1 is in proportion. Searches and sweeps
-over contacts grow with the surface, with the power 2/3 of the tets. Bytes moved are a floor: each array that a loop over the
-mesh uses counts once where it is read and once where it is written (benchmarks/scaling_bytes.py); they stand against the
-best copy of 256 MB on as many threads, measured first. Exit status: 0, or 1 where something could not be measured.
-The whole took ten minutes on two cores that others used, too.
+contact; on CUDA also with a million tets. Each kind and size runs in its own process, which makes its peak memory measurable. A
+time is the median over samples without compilation; spread is the interquartile range over the median. Exponents of time, set-up
+and memory over the tets are fitted in the logarithms; 1 is proportional, searches and sweeps over contacts grow with the surface,
+the power 2/3 of the tets. Bytes moved are a lower bound: each array that a loop uses counts once if read and once if written
+(benchmarks/scaling_bytes.py). They are compared with the best copy of 256 MB on as many threads. Exit status: 0, or 1 if
+something could not be measured. A full run takes about ten minutes on two cores.
 """
 
 import argparse
@@ -23,7 +22,7 @@ from taisoft.errors import OutputError, SimulationError
 from taisoft.output.tables import percent, require_matplotlib, save, spread_of, ticks
 
 from .document import again_text, begin, earlier_numbers, exponent, plain, table
-from .runner import make_parser, parse_options, parse_result, progress, run_python, say
+from .runner import make_parser, parse_options, parse_result, print_result, progress, run_python
 from .scaling_bytes import GROUPS, Copy, copy_rate, measure_copy
 from .scaling_runs import EXPLICIT, KINDS, ON_ONE, PRECISION, Row, measure
 
@@ -37,13 +36,13 @@ PANEL = (4.6, 3.6)  # inches
 
 
 def answer(job: str, arch: str) -> None:
-    """A child's part: measure "copy", or "kind:size", and print what was found."""
+    """In a child: measure "copy" or "kind:size", and print the result."""
     kind, _, size = job.rpartition(":")
-    say(plain(measure_copy(arch) if job == COPY else measure(kind, int(size), arch)))
+    print_result(plain(measure_copy(arch) if job == COPY else measure(kind, int(size), arch)))
 
 
-def ask(job: str, arch: str) -> list | dict | str:
-    """What a child finds, or a sentence about why it found nothing."""
+def run_child(job: str, arch: str) -> list | dict | str:
+    """The result of a child, or a sentence about its failure."""
     progress(job)
     try:
         lines = run_python(job, "-m", "taisoft", "bench", "scaling", "--child", job, "--arch", arch)
@@ -53,11 +52,11 @@ def ask(job: str, arch: str) -> list | dict | str:
 
 
 def measure_all(kinds: list[str], sizes: list[int], arch: str) -> Iterator[Row]:
-    """A row for each kind and size; one that failed says why. ON_ONE: only where the same work took several threads."""
+    """A row per kind and size, also for failures. ON_ONE runs only for sizes that used several threads."""
     several: set[int] = set()
     for kind in kinds:
         for size in sizes if kind != ON_ONE else sorted(several):
-            found = ask(f"{kind}:{size}", arch)
+            found = run_child(f"{kind}:{size}", arch)
             row = Row(kind, arch, tets=size, failure=found) if isinstance(found, str) else Row(**found)
             if kind == EXPLICIT and row.threads > 1 and arch == "cpu":
                 several.add(size)
@@ -69,8 +68,8 @@ def measure_all(kinds: list[str], sizes: list[int], arch: str) -> Iterator[Row]:
 
 @dataclass(frozen=True)
 class Growth:
-    """Exponents over the tets: of the time of a step by a fit through all meshes and between the last two, of what it takes to
-    set up, of the fields' bytes; nan where there are fewer than two meshes."""
+    """Exponents over the tets: time of a step (all meshes, and the last two), set-up time, bytes of the fields; nan for fewer
+    than two meshes."""
 
     kind: str
     meshes: int
@@ -81,12 +80,12 @@ class Growth:
 
 
 def measured(rows: Sequence[Row]) -> list[Row]:
-    """The rows that have times."""
+    """The rows with times."""
     return [row for row in rows if row.samples]
 
 
 def growths(rows: Sequence[Row]) -> list[Growth]:
-    """One of each kind of work, in the order of the rows."""
+    """Exponents per kind of work, in the order of the rows."""
     found = []
     for kind in dict.fromkeys(row.kind for row in measured(rows)):
         own = sorted((row for row in measured(rows) if row.kind == kind), key=lambda row: row.tets)
@@ -108,14 +107,14 @@ WORK = (("<work", "{.kind}"), ("tets", "{.tets:,}"))
 
 
 def time_table(rows: Sequence[Row]) -> str:
-    """Time of a step or a search; failures below."""
+    """Times of steps and searches; failures below."""
     columns = (
         *WORK,
         ("threads", "{.threads}"),
         ("ms", lambda row: f"{1e3 * row.timing.median:.4g}"),
         ("spread", lambda row: percent(spread_of(row.timing))),
         ("ns/tet", lambda row: f"{1e9 * row.timing.median / row.tets:.4g}"),
-        ("<of each, on average", lambda row: ", ".join(f"{value:,.4g} {name}" for name, value in row.counts.items() if value)),
+        ("<average counts", lambda row: ", ".join(f"{value:,.4g} {name}" for name, value in row.counts.items() if value)),
         ("set up [s]", "{.setup_seconds:.2f}"),
         ("compile [s]", "{.compile_seconds:.1f}"),
     )
@@ -123,17 +122,17 @@ def time_table(rows: Sequence[Row]) -> str:
 
 
 def phase_table(rows: Sequence[Row]) -> str:
-    """Share of each phase."""
+    """Fraction of time per phase."""
 
-    def shares(row: Row) -> str:
+    def fractions(row: Row) -> str:
         whole = sum(row.phases.values())
         return ", ".join(f"{name} {seconds / whole:.0%}" for name, seconds in row.phases.items())
 
-    return table(measured(rows), (*WORK, ("<share of each phase", shares)))
+    return table(measured(rows), (*WORK, ("<fraction of each phase", fractions)))
 
 
 def memory_table(rows: Sequence[Row]) -> str:
-    """Bytes of the fields per tet by group, and the most that the process held."""
+    """Bytes of the fields per tet by group, and the peak memory of the process."""
 
     def group(name: str):
         return lambda row: f"{row.field_bytes[name] / row.tets:,.0f}" if row.field_bytes.get(name) else ""
@@ -149,7 +148,7 @@ def memory_table(rows: Sequence[Row]) -> str:
 
 
 def rate_table(rows: Sequence[Row], copies: Sequence[Copy]) -> str:
-    """Bytes that a step moves at least, per second, against a copy on as many threads."""
+    """Lower bound of the bytes moved per second, compared with a copy on as many threads."""
 
     def rate(row: Row) -> float:
         return row.moved / row.timing.median
@@ -166,17 +165,17 @@ def rate_table(rows: Sequence[Row], copies: Sequence[Copy]) -> str:
 
 
 def copy_table(copies: Sequence[Copy]) -> str:
-    """A row a copy."""
+    """A row per copy."""
     return table(copies, (("<copy by", "{.by}"), ("threads", "{.threads}"), ("GB/s", lambda c: f"{c.rate / 1e9:.3g}")))
 
 
 def growth_table(found: Sequence[Growth]) -> str:
-    """A row a kind of work."""
+    """A row per kind of work."""
 
     def number(name: str):
         return lambda g: "-" if math.isnan(getattr(g, name)) else f"{getattr(g, name):.2f}"
 
-    names = {"time": "step", "of it, last two": "step_at_last", "set up": "setup", "fields": "memory"}
+    names = {"time": "step", "time, last two": "step_at_last", "set up": "setup", "fields": "memory"}
     columns = [("<work", "{.kind}"), ("meshes", "{.meshes}"), *((heading, number(name)) for heading, name in names.items())]
     return table(found, columns)
 
@@ -185,7 +184,7 @@ def growth_table(found: Sequence[Growth]) -> str:
 
 
 def draw(rows: Sequence[Row], copies: Sequence[Copy], path: Path) -> None:
-    """Write a PNG. Raises OutputError where it cannot be written or drawn."""
+    """Write a PNG. Raises OutputError."""
     require_matplotlib()
     from matplotlib import pyplot
 
@@ -223,18 +222,18 @@ def draw(rows: Sequence[Row], copies: Sequence[Copy], path: Path) -> None:
 
 
 def size_list(text: str) -> list[int]:
-    """Numbers of tets from a comma list."""
+    """Numbers of tets from a comma-separated list."""
     try:
         sizes = sorted({int(part) for part in text.split(",")})
     except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a comma list of numbers of tets") from None
+        raise argparse.ArgumentTypeError(f"{text!r} is not a comma-separated list of numbers of tets") from None
     if sizes[0] < 1:
         raise argparse.ArgumentTypeError("there must be at least one tet")
     return sizes
 
 
 def main(argv=None) -> int:
-    """Measure and print. Raises OutputError, or SimulationError where the arch cannot be had."""
+    """Measure and print. Raises OutputError, or SimulationError if the arch is not available."""
     parser = make_parser("scaling", __doc__)
     parser.add_argument("--quick", action="store_true", help="two small meshes of each kind")
     parser.add_argument("--sizes", type=size_list, metavar="LIST", help="numbers of tets; the nearest meshes are taken")
@@ -246,7 +245,7 @@ def main(argv=None) -> int:
         return 0
     sizes = options.sizes or list(QUICK_SIZES if options.quick else (*SIZES, *((CUDA_SIZE,) if options.arch == "cuda" else ())))
     document, numbers = begin("Scaling", options.arch, PRECISION)
-    copies = ask(COPY, options.arch)
+    copies = run_child(COPY, options.arch)
     if isinstance(copies, str):
         raise SimulationError(copies)
     copies = [Copy(**copy) for copy in copies]

@@ -1,10 +1,9 @@
-"""Bytes that work must move at least, and what a copy of memory reaches.
+"""Lower bound of the memory traffic of steps, and the bandwidth of a memory copy.
 
-A loop over the whole mesh must read each array that it uses from memory once and write each that it makes once: that is its
-floor, counted from the sizes of the fields. What a loop reads again, gathers by indices from a cache line that it uses in part,
-or fetches before it writes, is not counted; so a small mesh that stays in the caches exceeds a copy, and 100 % of a
-copy means that a step is as fast as memory lets it be. LOOPS names what each loop reads and writes. Contacts: a sweep reads the
-numbers of every contact, reads and writes its impulse, and reads and writes the velocities `w` of the nodes.
+A loop over the mesh must read each input array once and write each output array once: this lower bound follows from the sizes of
+the fields. Repeated reads, partly used cache lines and fetches before writes are not counted. A small mesh in the caches can
+exceed a copy; 100 % of a copy means that a step is limited by memory. LOOPS lists what each loop reads and writes. A sweep over
+contacts reads the numbers of every contact, and reads and writes its impulse and the velocities `w` of the nodes.
 """
 
 import math
@@ -42,17 +41,17 @@ LOOPS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {  # reads, writes
     "boxes": (("surface_triangle", "surface_x", "surface_move"), ("surface_lo", "surface_hi", "surface_normal", "surface_area")),
     "tree": (("surface_lo", "surface_hi", "bvh_link"), ("bvh_lo", "bvh_hi")),
     "cells": (("surface_lo", "surface_hi"), ("hash_first_cell", "hash_cell_count")),
-    # a sweep over as many contacts as there is room for
+    # a sweep over as many contacts as the buffers hold
     "sweep": (PROBLEM, ("problem_r",)),
 }
 GROUPS = ("elements and nodes", "matrix", "search", "contacts")
-COPY_BYTES, COPY_ROUNDS = 2**28, 7  # of one of the two arrays: larger than any cache
+COPY_BYTES, COPY_ROUNDS = 2**28, 7  # size of one of the two arrays, larger than any cache
 WIDTH = 16  # numbers that the kernel copies at a time
 
 
 @dataclass(frozen=True)
 class Copy:
-    """A copy of memory. rate: bytes per second, read and written both counted."""
+    """A memory copy. rate: bytes read and written per second."""
 
     by: str
     threads: int
@@ -60,7 +59,7 @@ class Copy:
 
 
 def floor_bytes(loops: Iterable[str], field_bytes: Mapping[str, int]) -> float:
-    """Bytes that these loops read and write at least, of fields with these sizes. Raises KeyError for one that is absent."""
+    """Lower bound of the bytes that these loops read and write. Raises KeyError for an absent field."""
     return float(sum(field_bytes[name] for loop in loops for names in LOOPS[loop] for name in names))
 
 
@@ -108,7 +107,7 @@ def measure_copy(arch: str, n_bytes: int = COPY_BYTES) -> list[Copy]:
 
 
 def _best(n_bytes: int, call: Callable[[], object]) -> float:
-    call()  # compiles, or has its pages made
+    call()  # compiles, or allocates pages
     return 2 * n_bytes / min(repeated(call, COPY_ROUNDS, math.inf))
 
 

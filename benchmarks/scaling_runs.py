@@ -1,14 +1,14 @@
-"""What `scaling.py` measures: one kind of work on one mesh, in a process that does nothing else.
+"""Measurements of `scaling.py`: one kind of work on one mesh.
 
 explicit:   velocity Verlet of a clamped beam that falls, stable neo-Hookean, at most 0.9 of the largest stable step.
-explicit, one thread: the same where taisoft would take all threads, on one.
+explicit, one thread: the same on one thread, for meshes on which taisoft uses all.
 implicit:   BDF2 of that beam, steps of 10 ms.
 search:     a search for contacts by proximity among 27 cubes at rest that touch, the pile of `collision.py`.
-explicit contact, implicit contact: two cubes on the ground, the upper one aside and sunk into the lower a little: symplectic
+explicit contact, implicit contact: two cubes on the ground, the upper one off centre and slightly penetrating: symplectic
             Euler and Gauss-Seidel at 0.9 of the largest stable step, implicit Euler and the augmented Lagrangian at 10 ms.
 
-All in f32. Steps are timed first as they are, then done again from the same start with a watch on their parts, whose looks at
-the clock cost a little. The first steps, which compile and let buffers grow, are left out.
+All in f32. Steps are timed first as a whole, then repeated from the same start with a stopwatch on their parts, which adds a
+small overhead. The first steps, which compile and grow buffers, are left out.
 """
 
 import math
@@ -38,13 +38,13 @@ from .collision_cases import pile_setup, two_cubes
 from .collision_runs import Rig
 from .contact_runs import explicit_places
 from .elasticity_runs import MARGIN, beam_scene, n_tets
-from .elasticity_steps import LONGEST_FALL, MOST_STEPS, SAMPLE_SECONDS
+from .elasticity_steps import LONGEST_FALL, MAX_STEPS, SAMPLE_SECONDS
 from .runner import Stopwatch, clock, patched, repeated, timed
 from .scaling_bytes import floor_bytes, group_bytes
 
 DT, TINY_DT = 0.01, 1e-6  # [s] of implicit steps; of explicit ones until their limit is known
 SAMPLES, ROUNDS = 7, 15  # of explicit steps without contacts; of searches
-WARM, ENOUGH_SECONDS, FEWEST, MOST = 3, 3.0, 3, 20  # steps before, and steps that are timed one by one: time and number
+WARM, ENOUGH_SECONDS, MIN_TIMED, MAX_TIMED = 3, 3.0, 3, 20  # steps before, and steps that are timed one by one: time and number
 COUNTS = {"newton": "newton_iterations", "linear": "linear_iterations", "sweeps": "contact_iterations", "contacts": "n_contacts"}
 PRECISION = "f32"
 EXPLICIT, ON_ONE = "explicit", "explicit, one thread"
@@ -52,9 +52,9 @@ EXPLICIT, ON_ONE = "explicit", "explicit, one thread"
 
 @dataclass
 class Row:
-    """A kind of work on one mesh. samples: seconds of a step or a search; phases: seconds of each phase of one, medians; counts:
-    of one, means; moved: bytes that one moves at least; field_bytes: by group; base, peak: resident bytes before the scene was
-    made, and the most; setup_seconds: of making the scene and the simulator, without compiling."""
+    """A kind of work on one mesh. samples: seconds of a step or a search; phases: median seconds per phase; counts: means; moved:
+    lower bound of the bytes moved; field_bytes: by group; base, peak: resident bytes before the scene was built, and at most;
+    setup_seconds: of building scene and simulator, without compilation."""
 
     kind: str
     arch: str
@@ -74,16 +74,16 @@ class Row:
 
     @property
     def timing(self) -> Timing | None:
-        """Of a step or a search [s]; None where there is none."""
+        """Timing of a step or a search [s], or None."""
         return summarise(self.samples) if self.samples else None
 
     def record(self) -> dict:
-        """As plain data, of which Row(**record) makes the row again."""
+        """The row as plain data; Row(**record) restores it."""
         return asdict(self)
 
 
 def measure(kind: str, size: int, arch: str) -> Row:
-    """A kind of work on a mesh of about so many tets. Raises TaisoftError where it cannot be done."""
+    """Measure a kind of work on a mesh of about `size` tets. Raises TaisoftError."""
     row = Row(kind, arch, base=peak_memory())
     before = compile_clock()
     KINDS[kind](row, size)
@@ -110,7 +110,7 @@ def cubes_on_ground(size: int) -> Scene:
 
 
 def _open(row: Row, build: Callable[[int], Scene], size: int, integrator: str, dt: float | None) -> ts.Simulator:
-    """A scene's simulator; its numbers go into the row. dt None: MARGIN of the largest stable one."""
+    """Open a scene's simulator and record its sizes in the row. dt None: MARGIN times the largest stable step."""
     begin = perf_counter()
     sim = ts.Simulator(build(size), dt=dt or TINY_DT, integrator=integrator, precision=PRECISION, arch=row.arch)
     if dt is None:
@@ -126,7 +126,7 @@ def _open(row: Row, build: Callable[[int], Scene], size: int, integrator: str, d
 
 
 def explicit_on_one(row: Row, size: int) -> None:
-    """The same on one thread, however large the mesh is."""
+    """Explicit steps on one thread for any mesh size."""
     with patched(model, "PARALLEL_FROM", math.inf):
         explicit(row, size)
 
@@ -136,11 +136,11 @@ def explicit(row: Row, size: int) -> None:
     with _open(row, beam, size, "velocity_verlet", None) as sim:
         warm_up(sim)
         a_few = advance(sim, 10).seconds / 10
-        steps = max(1, min(MOST_STEPS, round(SAMPLE_SECONDS / a_few)))
+        steps = max(1, min(MAX_STEPS, round(SAMPLE_SECONDS / a_few)))
         sim.dt = min(sim.dt, LONGEST_FALL / steps)
         _element_seconds(sim, steps)  # compiles
         fractions = []
-        for _ in range(SAMPLES):  # in turn, so that a slow moment of the machine falls on both
+        for _ in range(SAMPLES):  # in turn, so that a slow moment of the machine affects both
             sim.reset()
             row.samples.append(advance(sim, steps).seconds / steps)
             fractions.append(min(1.0, _element_seconds(sim, steps) / row.samples[-1]))
@@ -164,7 +164,7 @@ def repeat_elements(m: ti.template(), n: ti.i32):
 
 
 def _element_seconds(sim: ts.Simulator, n: int) -> float:
-    """Seconds of the element loop of a step, done n times."""
+    """Seconds of the element loop of a step, averaged over n runs."""
     m, begin = sim._dynamics.state.model, clock()
     if m.serial:
         repeat_elements(m, n)
@@ -184,7 +184,7 @@ def explicit_contact(row: Row, size: int) -> None:
 
 
 def implicit_places(sim: ts.Simulator) -> list[tuple[str, object, str]]:
-    """Where the parts of the simulator's implicit steps are called, for `Stopwatch.on`."""
+    """The functions of each part of implicit steps, for `Stopwatch.on`."""
     places = [
         *(("residual", stage_system, name) for name in ("move", "update_impulses", "form_residual")),
         *(("matrix", block_csr, name) for name in ("assemble", "to_system")),
@@ -200,7 +200,7 @@ def implicit_places(sim: ts.Simulator) -> list[tuple[str, object, str]]:
 
 
 def implicit(build: Callable[[int], Scene], integrator: str, row: Row, size: int) -> None:
-    """Implicit steps, with contacts inside the Newton loop or without. Bytes: without what contacts add."""
+    """Implicit steps with or without contacts; bytes moved exclude those of contacts."""
     with _open(row, build, size, integrator, DT) as sim:
         watch = _one_by_one(row, sim, implicit_places(sim))
         fields, steps = sim.field_bytes, len(row.samples)
@@ -217,7 +217,7 @@ def _one_by_one(row: Row, sim: ts.Simulator, places: list[tuple[str, object, str
     """Time steps one by one, then the same steps by their parts."""
     reports = []
     _warm(sim)
-    while len(row.samples) < FEWEST or (sum(row.samples) < ENOUGH_SECONDS and len(row.samples) < MOST):
+    while len(row.samples) < MIN_TIMED or (sum(row.samples) < ENOUGH_SECONDS and len(row.samples) < MAX_TIMED):
         begin = clock()
         reports.append(sim.step())
         row.samples.append(clock() - begin)

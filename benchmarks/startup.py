@@ -1,17 +1,17 @@
-"""Start-up: how long a user waits before the first steps, with and without compiled kernels at hand.
+"""Start-up: waiting time before the first steps, with and without cached kernels.
 
 taisoft bench startup [--quick] [--baseline FOLDER] [--out FILE.json]
 
 A beam of 540 tets in explicit steps, and a cube of 320 tets on a block in implicit steps with contacts, each to its tenth step:
-cold (a new process, an empty cache of kernels), warm (a new process, the same cache), and warm with a mesh size not had before.
-In one process: the first simulator, a second one of the same structure, and one of another size. Also three static solves of the
-beam, nine that find Young's modulus from a sag, what changes of an open simulator cost, the kernels that sheets on a block
-compile from 224 to 2,144 surface triangles (from 1,500 on, the search for contacts runs on all threads: other kernels), and the
-resident memory that twenty simulators leave behind, and four closed ones of a cube of 53,240 tets to which something refers.
-Times are wall and CPU seconds, those of a whole process with Python's start; a warm one is the median over rounds.
---baseline: another version's folder, measured in turns in the same run with its own cache; the limits compare with it, those of
-warm processes and of how fast kernels are (a beam of 34,560 tets, sheets that land) by the median of the ratio over rounds. It
-takes about eight minutes then. Exit status: 0, or 1 where a limit is not met or a process failed.
+cold (a new process, an empty kernel cache), warm (a new process, the same cache), and warm with a new mesh size. In one process:
+the first simulator, a second one of the same structure, and one of another size. Also three static solves of the beam, nine that
+find Young's modulus from a sag, what changes of an open simulator cost, the kernels that sheets on a block compile from 224 to
+2,144 surface triangles (from 1,500 on, the search for contacts runs on all threads: other kernels), and the resident memory that
+twenty simulators leave behind, and four closed ones of a cube of 53,240 tets to which something refers. Times are wall and CPU
+seconds of whole processes, including Python's start; warm times are medians over rounds. --baseline: folder of another version,
+measured in turn with its own cache. The limits compare with it; those of warm processes and of kernel speed (a beam of 34,560
+tets, landing sheets) use the median of the ratio over rounds. It then takes about eight minutes. Exit status: 0, or 1 if a limit
+is not met or a process failed.
 """
 
 import json
@@ -34,7 +34,7 @@ CHILD = Path(__file__).with_name("startup_child.py")
 SIZES = {"beam": (3, 4, 5, 6), "cube": (4, 5, 6, 7)}  # cells, and those of another size in each round
 TIMES = 20
 OTHER = "warm, other size"
-SLOWER = {  # than the baseline, at most
+SLOWER = {  # maximum time over the baseline's
     "symplectic_euler step": 1.2,
     "implicit_euler step": 1.25,
     "energies": 1.15,
@@ -57,8 +57,8 @@ TASKS = {
 }
 
 
-def ask(version: Version, *task: str | int) -> tuple[dict, dict]:
-    """What a child found, and wall and CPU seconds of its process. Raises SimulationError where it failed."""
+def run_child(version: Version, *task: str | int) -> tuple[dict, dict]:
+    """The result of a child, and wall and CPU seconds of its process. Raises SimulationError on failure."""
     used, start = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
     lines = version.run(CHILD, *task)
     wall, now = time.perf_counter() - start, resource.getrusage(resource.RUSAGE_CHILDREN)
@@ -67,7 +67,7 @@ def ask(version: Version, *task: str | int) -> tuple[dict, dict]:
 
 
 def measure(versions: list[Version], quick: bool) -> list[dict]:
-    """All figures of each version: the versions take turns, since the machine's speed changes."""
+    """Measure everything for each version, with the versions in turn, since the machine's speed varies."""
     found: list[dict] = [{} for _ in versions]
     for name in SIZES:
         for own, waiting in zip(found, measure_waiting(versions, name, quick)):
@@ -75,49 +75,51 @@ def measure(versions: list[Version], quick: bool) -> list[dict]:
     for what, task in TASKS.items():
         progress(what)
         for own, version in zip(found, versions):
-            own[what] = ask(version, what, *task[quick])[0]
+            own[what] = run_child(version, what, *task[quick])[0]
     for own, speed in zip(found, measure_speed(versions, quick)):
         own["speed"] = speed
     return found
 
 
 def measure_waiting(versions: list[Version], name: str, quick: bool) -> list[dict]:
-    """Of each version, what processes that simulate one scene take, leave on disk, and keep in memory.
+    """For each version: times, new cache files and memory of processes that simulate one scene.
 
-    Each round takes another mesh size: a version that compiles for every size is warm at one that it has had.
+    Each round uses another mesh size, since a version that compiles for every size is warm at sizes used before.
     """
     cells, *others = SIZES[name]
     progress(f"{name}, cold")
-    found = [{"cold": ask(version, "first", name, cells)[1], "warm": [], OTHER: [], "new files": []} for version in versions]
+    found = [
+        {"cold": run_child(version, "first", name, cells)[1], "warm": [], OTHER: [], "new files": []} for version in versions
+    ]
     for other in others[:1] if quick else others:
         progress(f"{name}, warm, then {other} cells")
         for own, version in zip(found, versions):
-            own["warm"].append(ask(version, "first", name, cells)[1])
+            own["warm"].append(run_child(version, "first", name, cells)[1])
         for own, version in zip(found, versions):
             before = version.files()
-            own[OTHER].append(ask(version, "first", name, other)[1])
+            own[OTHER].append(run_child(version, "first", name, other)[1])
             own["new files"].append(len(version.files() - before))
     progress(f"{name}, one process")
     for own, version in zip(found, versions):
         own |= {what: median(own[what]) for what in ("warm", OTHER)}
-        own["one process"] = ask(version, "again", name, cells, others[0])[0]
-        own["memory"] = ask(version, "grow", name, cells, 2 if quick else TIMES)[0]
+        own["one process"] = run_child(version, "again", name, cells, others[0])[0]
+        own["memory"] = run_child(version, "grow", name, cells, 2 if quick else TIMES)[0]
     return found
 
 
 def measure_speed(versions: list[Version], quick: bool) -> list[dict[str, list[float]]]:
-    """Of each version, times [s] by round."""
+    """Kernel times [s] of each version by round."""
     found: list[dict[str, list[float]]] = [{what: [] for what in SLOWER} for _ in versions]
     for k in range(1 if quick else SPEED_ROUNDS):
         progress(f"speed, round {k + 1}")
         for version, times in zip(versions, found):
-            for what, seconds in ask(version, "speed", 2 if quick else SPEED_CELLS, *SPEED_SHEETS)[0].items():
+            for what, seconds in run_child(version, "speed", 2 if quick else SPEED_CELLS, *SPEED_SHEETS)[0].items():
                 times[what].append(seconds)
     return found
 
 
 def median(times: list[dict]) -> dict:
-    """Of wall and CPU seconds, with the wall seconds of each round."""
+    """Medians of wall and CPU seconds, and the wall seconds of each round."""
     middle = {key: float(np.median([one[key] for one in times])) for key in ("wall", "cpu")}
     return middle | {"walls": [one["wall"] for one in times]}
 
@@ -126,7 +128,7 @@ def median(times: list[dict]) -> dict:
 
 
 def waiting_table(found: dict[str, dict]) -> str:
-    """A row for each thing a user waits for, a column for each version."""
+    """Waiting times: a row per task, a column per version."""
 
     def row(label: str, *keys: str) -> tuple[str, ...]:
         times = [reduce(getitem, keys, one) for one in found.values()]
@@ -142,14 +144,14 @@ def waiting_table(found: dict[str, dict]) -> str:
 
 
 def settings_table(found: dict[str, dict]) -> str:
-    """What changes of an open simulator cost."""
+    """Times of changes to an open simulator."""
     versions = list(found.values())
     rows = [(what, *(f"{1e3 * one['settings'][what]:.2f}" for one in versions)) for what in versions[0]["settings"]]
     return markdown(("cube with contacts, wall [ms]", *found), rows, left=(0,))
 
 
 def speed_table(found: dict[str, dict]) -> str:
-    """How fast kernels are, with the range over rounds."""
+    """Kernel times, with the range over rounds."""
 
     def cell(times: np.ndarray) -> str:
         return f"{np.median(times):.3g} ({times.min():.3g} to {times.max():.3g})"
@@ -159,7 +161,7 @@ def speed_table(found: dict[str, dict]) -> str:
 
 
 def count_table(found: dict[str, dict]) -> str:
-    """Kernels compiled, unknown of old versions, files in the cache, memory."""
+    """Compiled kernels (unknown in old versions), cache files, memory."""
     versions, rows = list(found.values()), []
 
     def count(n: int | None) -> str:
@@ -179,17 +181,17 @@ def count_table(found: dict[str, dict]) -> str:
 
 
 def growth(memory: dict) -> float:
-    """Of resident memory [MB]."""
+    """Growth of resident memory [MB]."""
     return memory["end"] - memory["start"]
 
 
 def growth_of(one: dict, name: str) -> str:
-    """What `growth` of a scene is over."""
+    """Label of `growth` of a scene."""
     return f"{name}: growth of resident memory over {one[name]['memory']['times']} simulators [MB]"
 
 
 def find_limits(now: dict, old: dict | None) -> list[Limit]:
-    """What start-up must keep."""
+    """Limits on start-up."""
     limits = [Limit("cube: cold, from process start to the tenth step [s]", now["cube"]["cold"]["wall"], 15.0)]
     for name in SCENES:
         one = now[name]["one process"]
@@ -199,7 +201,7 @@ def find_limits(now: dict, old: dict | None) -> list[Limit]:
         limits.append(Limit(growth_of(now, name), growth(now[name]["memory"]), 10.0))
     _, *later = now["surfaces"]
     for size in later:
-        if size != CROSSING:  # there the search takes other kernels
+        if size != CROSSING:  # there the search uses other kernels
             limits.append(Limit(f"sheet: kernels compiled, {size}", now["surfaces"][size], 0))
     kept = now["keep"]
     limits.append(Limit(f"growth of resident memory over {kept['times']} kept closed simulators [MB]", growth(kept), 10.0))
@@ -207,7 +209,7 @@ def find_limits(now: dict, old: dict | None) -> list[Limit]:
 
 
 def compare(now: dict, old: dict) -> list[Limit]:
-    """The limits that are shares of the baseline's times."""
+    """Limits relative to the baseline's times."""
     limits = []
     for name in SCENES:
         second = [one[name]["one process"]["second"]["wall"] for one in (now, old)]
@@ -217,18 +219,18 @@ def compare(now: dict, old: dict) -> list[Limit]:
     static = now["statics"]["1"]["wall"] / old["statics"]["1"]["wall"]
     limits.append(Limit("second static solve over the baseline's", static, 0.15))
     limits.append(Limit("nine static solves over the baseline's", now["identify"]["wall"] / old["identify"]["wall"], 0.1))
-    for what, most in SLOWER.items():
-        limits.append(Limit(f"{what} over the baseline's", ratio(now["speed"][what], old["speed"][what]), most))
+    for what, limit in SLOWER.items():
+        limits.append(Limit(f"{what} over the baseline's", ratio(now["speed"][what], old["speed"][what]), limit))
     return limits
 
 
 def ratio(now: list[float], old: list[float]) -> float:
-    """Median over rounds of the ratio within a round."""
+    """Median over rounds of the ratio within each round."""
     return float(np.median(np.array(now) / np.array(old)))
 
 
 def main(argv=None) -> int:
-    """Measure and print. Raises SimulationError where a process fails, OutputError where a file cannot be written."""
+    """Measure and print. Raises SimulationError if a process fails, OutputError if a file cannot be written."""
     parser = make_parser("startup", __doc__)
     parser.add_argument("--quick", action="store_true", help="one round, small meshes, two simulators for memory, no limit")
     parser.add_argument("--baseline", type=Path, metavar="FOLDER", help="another version of taisoft to compare with")

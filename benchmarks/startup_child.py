@@ -1,6 +1,6 @@
-"""What a process of `taisoft bench startup` does and measures: it uses public names alone, so that older versions run it too.
+"""A child process of `taisoft bench startup`; it uses public names only, so that older versions can run it.
 
-python startup_child.py TASK [NUMBER ...]; prints one line of JSON. Times are of this process, in seconds.
+python startup_child.py TASK [NUMBER ...] prints one line of JSON. Times are seconds of this process.
 """
 
 import gc
@@ -66,7 +66,7 @@ def timed(what: Callable) -> dict[str, float]:
 
 
 def compiled() -> int | None:
-    """How many kernels have been compiled so far, None where the version does not count them."""
+    """Number of kernels compiled so far, None if the version does not count them."""
     try:
         from taisoft.backend.runtime import n_compiled
     except ImportError:
@@ -75,16 +75,13 @@ def compiled() -> int | None:
 
 
 def memory() -> float:
-    """Resident memory of this process [MB]: pages in RAM, with those that Taichi and the allocator keep for reuse.
-
-    Cycles of objects are collected first, or their memory would count until Python happens to look at them.
-    """
+    """Resident memory of this process [MB] after garbage collection, including pages kept for reuse."""
     gc.collect()
     return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
 
 
 def simulate(name: str, cells: int, steps: int = 10, hard: bool = False) -> None:
-    """A simulator, and its first steps. hard: with the kernels of steps that are hard to solve, where a version has such."""
+    """Build a simulator and run its first steps. hard: also compile the kernels of steps that are hard to solve."""
     build, settings = SCENES[name]
     with ts.Simulator(build(cells), **settings) as sim:
         walk(sim, steps)
@@ -93,19 +90,19 @@ def simulate(name: str, cells: int, steps: int = 10, hard: bool = False) -> None
 
 
 def walk(sim: ts.Simulator, steps: int) -> None:
-    """So many steps: `advance` takes implicit ones one at a time, and may take fewer explicit ones than asked for."""
+    """Take `steps` steps; one `advance` may take fewer."""
     last = sim.step_count + steps
     while sim.step_count < last:
         sim.advance(last - sim.step_count)
 
 
 def first(name: str, cells: int) -> dict:
-    """From here to the tenth step."""
+    """Time to the tenth step."""
     return timed(lambda: simulate(name, cells))
 
 
 def again(name: str, cells: int, larger: int) -> dict:
-    """The first simulator, a second one like it, and one with more cells, each to its tenth step."""
+    """Times to the tenth step of a first simulator, a second one like it, and one with more cells."""
     found = {}
     for label, n in (("first", cells), ("second", cells), ("other size", larger)):
         before = compiled()
@@ -115,7 +112,7 @@ def again(name: str, cells: int, larger: int) -> dict:
 
 
 def since(before: int | None) -> int | None:
-    """Kernels compiled since `compiled` said `before`."""
+    """Kernels compiled since `compiled` returned `before`."""
     return None if before is None else compiled() - before
 
 
@@ -124,7 +121,7 @@ def surfaces(*sizes: int) -> dict:
     found = {}
     for cells in sizes:
         before = compiled()
-        if before is not None:  # else nothing would be learnt
+        if before is not None:
             simulate("sheet", cells, 3, hard=True)
         found[triangles(cells)] = since(before)
     return found
@@ -141,7 +138,7 @@ def grow(name: str, cells: int, times: int) -> dict:
 
 
 def keep(cells: int, times: int) -> dict:
-    """The same of simulators of one cube that are closed while something still refers to them."""
+    """The same for closed simulators of one cube that are still referenced."""
     build, arguments = SCENES["cube"]
     scene, kept, start = build(cells), [], 0.0
     for _ in range(2 + times):
@@ -165,17 +162,17 @@ def identify(cells: int) -> dict:
         return ts.solve_static(beam(cells, young)).positions()[:, 1].min()
 
     def search() -> None:
-        wanted, low, high = sag(3e6), 6.0, 7.0
+        target, low, high = sag(3e6), 6.0, 7.0
         for _ in range(8):
             middle = 0.5 * (low + high)
-            low, high = (middle, high) if sag(10.0**middle) < wanted else (low, middle)
+            low, high = (middle, high) if sag(10.0**middle) < target else (low, middle)
         assert abs(middle - np.log10(3e6)) < 0.01
 
     return timed(search)
 
 
 def settings(cells: int) -> dict:
-    """What changes of an open simulator cost, medians, and a new simulator beside them."""
+    """Median times of changes to an open simulator, and the time of a new simulator."""
     name = "cube"
     build, arguments = SCENES[name]
     simulate(name, cells, 2)
@@ -194,7 +191,7 @@ def settings(cells: int) -> dict:
 
 
 def speed(cells: int, small: int, large: int) -> dict:
-    """Seconds, medians: steps, energies and a force differential of a beam, searches and contact steps of two sheets."""
+    """Median seconds of steps, energies and a force differential of a beam, and of searches and contact steps of two sheets."""
     steps = 20
     with ts.Simulator(beam(cells), dt=2e-5, integrator="symplectic_euler") as sim:
         dx = 1e-3 * np.sin(sim.positions())
@@ -211,8 +208,8 @@ def speed(cells: int, small: int, large: int) -> dict:
 def landing(cells: int) -> dict[str, float]:
     """Seconds of a search for contacts, and of a step while a sheet lands.
 
-    Seven steps from the start, the last three with impacts: an impact multiplies rounding, and later steps of two versions
-    would need another number of iterations each.
+    Only seven steps, the last three with impacts: impacts amplify rounding, and later steps of two versions would need different
+    numbers of iterations.
     """
     steps = 7
     build, arguments = SCENES["sheet"]

@@ -47,9 +47,9 @@ from benchmarks.contact_runs import (
     measure_film,
     measure_run,
     measure_step,
+    observe_problems,
     open_explicit,
     open_scene,
-    shown,
     to_impulses,
 )
 from benchmarks.report_parts import phases
@@ -78,16 +78,16 @@ def sim():
 def next_problem(sim):
     """Take a step, and return its solved contact problem."""
     problems = []
-    with shown(problems.append):
+    with observe_problems(problems.append):
         sim.step()
     return problems[-1]
 
 
 def test_residuals_of_all_solvers_agree_with_the_oracle(sim, monkeypatch):
-    residuals, make_judge = [], contact_runs.make_judge
+    residuals, make_residual = [], contact_runs.make_residual
 
     def make_logged(p):
-        judge, contacts, W = make_judge(p), to_numpy(p), None
+        judge, contacts, W = make_residual(p), to_numpy(p), None
 
         def logged(r):
             nonlocal W
@@ -98,7 +98,7 @@ def test_residuals_of_all_solvers_agree_with_the_oracle(sim, monkeypatch):
 
         return logged
 
-    monkeypatch.setattr(contact_runs, "make_judge", make_logged)
+    monkeypatch.setattr(contact_runs, "make_residual", make_logged)
     film = measure_film(SCENE, sim, 6, Solvers(threads=False))
     assert film.tets == 215 and 0 < film.dt < film.stable_dt and film.solvers == list(SOLVERS)
     assert 2 <= len(film.time) == len(film.contacts) <= 6 and np.all(np.diff(film.time) > 0)
@@ -130,7 +130,7 @@ def test_solvers_leave_the_problem_unchanged_and_agree(sim):
         assert oracle.residual(contacts.W, contacts.b, contacts.friction, exact) < 1e-8
         checked.append((p, k, exact[:, 0].sum()))
 
-    with shown(check):
+    with observe_problems(check):
         report = sim.step()  # solves the problem itself after `check`
     p, n_contacts, normal_impulse = checked[-1]
     assert report.n_contacts == n_contacts and report.contact_residual <= GOAL

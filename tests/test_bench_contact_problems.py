@@ -41,16 +41,16 @@ def test_rows_of_all_solvers(shared):
 
 
 def test_verdicts_follow_from_residuals_and_costs():
-    verdicts = {row.solver: row.verdict for row in bench.judged(ROWS)}
+    verdicts = {row.solver: row.verdict for row in bench.with_verdicts(ROWS)}
     assert verdicts == {bench.PLAIN: "yardstick: pass", "jacobi": "", "hybrid": "best: pass"}
     slow = [replace(row, residuals=(1.0, 1.0, 1.0), time=5.0 + row.time) for row in ROWS]
-    assert {row.solver: row.verdict for row in bench.judged(slow)} == {
+    assert {row.solver: row.verdict for row in bench.with_verdicts(slow)} == {
         bench.PLAIN: "yardstick: FAIL",
         "jacobi": "",
         "hybrid": "best: FAIL",
     }
     unconverged = [replace(row, iterations=None) for row in ROWS]
-    assert all("FAIL" in row.verdict for row in bench.judged(unconverged))
+    assert all("FAIL" in row.verdict for row in bench.with_verdicts(unconverged))
     assert unconverged[0].cells[6] == "-"
 
 

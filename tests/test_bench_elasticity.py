@@ -83,7 +83,7 @@ def test_the_path_is_close_to_the_exact_one(verlet):
     path, timed = follow_tip(verlet, steps, 100)
     assert timed.steps == 100 * steps == verlet.step_count and timed.seconds > 0
     row = Row(540, "taisoft", "velocity_verlet", steps)
-    row.judge(CELLS, path)
+    row.set_errors(CELLS, path)
     assert row.error_unfolded <= row.error < 1e-4  # 2.9e-5 measured
     assert row.error == load_exact(CELLS).error(np.arange(101) * SAMPLE, path)
 

@@ -143,7 +143,7 @@ def test_end_and_causes_of_a_run(result, done, overlaps, status, causes):
     )
 
     def run(session):
-        session.go(sim, 2, follow=False)
+        session.run_steps(sim, 2, follow=False)
         return {}
 
     record = Session(*one_case(run), "cpu").record()
@@ -154,7 +154,7 @@ def test_the_worst_end_counts():
     reports = [RunReport("failed"), RunReport("degraded", step_reports=[StepReport(0.1, n_inverted=1)]), RunReport()]
     session = Session(*one_case(None), "cpu")
     for result in reports:
-        session.go(SimpleNamespace(dt=0.1, step_count=0, touches=False, run=lambda *_, r=result, **__: r), 1, follow=False)
+        session.run_steps(SimpleNamespace(dt=0.1, step_count=0, touches=False, run=lambda *_, r=result, **__: r), 1, follow=False)
     assert session.status == REFUSED and session.causes == {INVERTED}
 
 
@@ -189,7 +189,7 @@ def test_a_reference_has_smaller_steps_and_double_precision():
     def follow(session, law):
         scene = geometry.sliver_scene(law, 1.0)
         with session.simulator(scene) as sim:
-            result = session.go(sim, 40, every=10)
+            result = session.run_steps(sim, 40, every=10)
             steps.append((result.steps, sim.dt, sim.settings.precision, len(session.path)))
         return {}
 

@@ -19,7 +19,7 @@ import pytest
 from benchmarks import order, order_runs
 from benchmarks.order import Reach, compare, find_limits, row_table, time_to
 from benchmarks.order_cases import CASES, HANGING, HEAVY, LINEAR, QUADRATIC, QUADRATIC_14, STRIP, Reference
-from benchmarks.order_runs import Row, judge, measure_case, own_reference
+from benchmarks.order_runs import Row, measure_case, own_reference, set_error
 from benchmarks.reference_cases.record import GRAVITY
 from taisoft.backend.runtime import open_runtime
 from taisoft.errors import OutputError, SimulationError
@@ -154,9 +154,9 @@ def test_own_reference_is_the_limit_of_a_geometric_sequence():
 
 def test_the_largest_error_counts():
     found = row(measured=[-1.9, 4.4, 99.0], error=None)
-    judge(found, Reference((-2.0, 4.0), 0.0, ""))
+    set_error(found, Reference((-2.0, 4.0), 0.0, ""))
     assert found.error == pytest.approx(0.1)
-    judge(found, Reference((), 0.0, "none"))
+    set_error(found, Reference((), 0.0, "none"))
     assert found.error == pytest.approx(0.1)
 
 
@@ -302,7 +302,7 @@ def test_command_writes_and_plots_what_it_prints(faked, tmp_path, capsys, monkey
     assert numbers["precision"] == "f64" and numbers["references"]["beam_fall"]["values"] == [-3.774]
     kept = (tmp_path / "new" / "order.md").read_text()
     assert kept.strip() in shown and "* order 2, 3x3x3: no equilibrium beyond 90% of the load" in kept
-    for part in ("## hanging_beam: hanging beam, SNH", "## Time to 1% error", "## Limits", "good to 0.04%"):
+    for part in ("## hanging_beam: hanging beam, SNH", "## Time to 1% error", "## Limits", "uncertainty 0.04%"):
         assert part in kept
     assert plot.read_bytes()[:8] == b"\x89PNG\r\n\x1a\n" and len(plot.read_bytes()) > 10_000
 

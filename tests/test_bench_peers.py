@@ -19,7 +19,7 @@ import taisoft as ts
 from benchmarks import peers
 from benchmarks.programs import own
 from benchmarks.programs.session import Setting
-from benchmarks.works import judge, references, runs, scenes
+from benchmarks.works import evaluation, references, runs, scenes
 from benchmarks.works.references import MODELS, NEWTON, PYBULLET, TAISOFT
 from benchmarks.works.runs import Row, fastest_standing, fastest_within, measure
 from benchmarks.works.semi_discrete import LAWS, SemiDiscrete
@@ -100,7 +100,7 @@ def at_rest(work: scenes.Work, samples: int = 3) -> np.ndarray:
 def test_verdicts_detect_failures():
     work = scenes.stack()
     nodes = work.slices()
-    assert judge.judge(work, TAISOFT, at_rest(work)).stands
+    assert evaluation.evaluate(work, TAISOFT, at_rest(work)).stands
     for change, is_detected in (
         ([0.2, 0, 0], lambda v: v.fell == 0.01),  # leans
         ([0, -0.9, 0], lambda v: v.fell == 0.01 and v.penetration > 0.01),  # falls through
@@ -108,11 +108,11 @@ def test_verdicts_detect_failures():
     ):
         moved = at_rest(work)
         moved[1, nodes["cube 1"]] += change
-        verdict = judge.judge(work, TAISOFT, moved)
+        verdict = evaluation.evaluate(work, TAISOFT, moved)
         assert is_detected(verdict) and not verdict.stands
     mirrored = at_rest(work)
     mirrored[2, nodes["cube 2"], 0] *= -1
-    verdict = judge.judge(work, TAISOFT, mirrored)
+    verdict = evaluation.evaluate(work, TAISOFT, mirrored)
     assert verdict.inverted == work.bodies[2].mesh.n_tets and not verdict.stands
 
 
@@ -122,9 +122,9 @@ def test_floating_bodies_do_not_stand(work):
     falling = at_rest(work, 21)
     t = np.arange(21) * 0.01
     falling[:, last, 1] -= 0.5 * work.gravity * t[:, None] ** 2
-    assert judge.free_fall(work, falling) == pytest.approx(1.0)
-    assert judge.free_fall(work, at_rest(work, 21)) == 0.0 and judge.free_fall(work, at_rest(work)) is None
-    verdict = judge.Verdict(0, free_fall=1.1)
+    assert evaluation.free_fall(work, falling) == pytest.approx(1.0)
+    assert evaluation.free_fall(work, at_rest(work, 21)) == 0.0 and evaluation.free_fall(work, at_rest(work)) is None
+    verdict = evaluation.Verdict(0, free_fall=1.1)
     assert verdict.stands and not replace(verdict, free_fall=0.7).stands and not replace(verdict, free_fall=1.3).stands
 
 
@@ -132,7 +132,7 @@ def made_row(work: scenes.Work, program: str, seconds: float, error: float | Non
     row = Row(work, Setting(program, TAISOFT, "explicit", 2), [[seconds], [1.1 * seconds]], [0.1])
     penetration, edge = (0.0, 0.1) if work.touches else (None, None)
     good_to = None if error is None else 1e-6
-    row.verdict = judge.Verdict(inverted, error, good_to, penetration, edge)
+    row.verdict = evaluation.Verdict(inverted, error, good_to, penetration, edge)
     return row
 
 
@@ -201,7 +201,7 @@ def test_rows_are_measured_with_verdicts(capsys):
 
 @pytest.mark.parametrize("seconds, build_seconds, rounds", [(9.0, 19.0, 3), (11.0, 1.0, 1), (1.0, 21.0, 1)])
 def test_slow_runs_are_measured_once(seconds, build_seconds, rounds, monkeypatch):
-    monkeypatch.setattr(runs, "judge", lambda work, model, positions: judge.Verdict(0))
+    monkeypatch.setattr(runs, "evaluate", lambda work, model, positions: evaluation.Verdict(0))
 
     class Slow:
         NAME, build_time = "slow", build_seconds
@@ -278,7 +278,7 @@ def test_adapter_of_taisoft():
     assert positions.shape == (11, work.bodies[0].mesh.n_verts, 3) and again is None and seconds > 0.0
     assert np.array_equal(positions[0], work.start) and session.unconverged == 0
     assert positions[3, :, 1].mean() == pytest.approx(0.51 - 0.5 * 9.81 * 0.03**2, abs=1e-9)
-    assert judge.judge(work, TAISOFT, positions).stands
+    assert evaluation.evaluate(work, TAISOFT, positions).stands
 
 
 def adapter(name: str):

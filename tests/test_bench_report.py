@@ -88,8 +88,8 @@ def limits(power: float) -> tuple[list[bound.Limit], ...]:
 
 
 def test_claims_on_the_stable_step():
-    runs = [bound.Long("symplectic_euler", 1e6, f, 1.0 if f < 1 else np.inf, "ok" if f < 1 else "failed") for f in (0.5, 2.0)]
-    runs += [bound.Long("implicit_euler", 1e6, f, 1.0, "ok") for f in (1.0, 100.0)]
+    runs = [bound.LongRun("symplectic_euler", 1e6, f, 1.0 if f < 1 else np.inf, "ok" if f < 1 else "failed") for f in (0.5, 2.0)]
+    runs += [bound.LongRun("implicit_euler", 1e6, f, 1.0, "ok") for f in (1.0, 100.0)]
     claims = bound.claims_of(*limits(1.0), runs)
     assert holds(claims) == [True, True, False, True, True] and "h^1.00" in claims[2].found and "1.0%" in claims[0].found
     assert holds(bound.claims_of(*limits(2.0), runs))[2]
@@ -167,11 +167,11 @@ def test_claims_on_contact_points():
     assert points.claims_of(measured("2 threads", 1e-7, 2e-3), measured("1 thread", 1e-3, 2e-3))[1].holds
 
 
-def fractions(search: float, points_: float, reduced: float) -> list[phases.Shares]:
+def fractions(search: float, points_: float, reduced: float) -> list[phases.Profile]:
     parts = dict.fromkeys((*PHASES, phases.OTHER, *PARTS, REST), [0.01])
     parts.pop(phases.SEARCH)
     parts |= {phases.POINTS: [search * points_], "reduction": [reduced], "candidates": [reduced], REST: [1.0 - search]}
-    return [phases.Shares(*phases.REPORTS_WAY, 1e-3, parts)]
+    return [phases.Profile(*phases.REPORTED, 1e-3, parts)]
 
 
 def test_claims_on_phases():

@@ -119,20 +119,20 @@ def test_table_shows_failures():
 
 
 def test_a_child_answers_with_a_row_or_an_error():
-    found = scaling.ask(f"{EXPLICIT}:20", "cpu")
+    found = scaling.run_child(f"{EXPLICIT}:20", "cpu")
     assert Row(**found).tets == 20 and found["samples"]
-    assert "nonsense" in scaling.ask("nonsense:20", "cpu")
+    assert "nonsense" in scaling.run_child("nonsense:20", "cpu")
 
 
 def test_one_thread_is_measured_where_several_were_used(monkeypatch):
     jobs = []
 
-    def ask(job, arch):
+    def run_child(job, arch):
         jobs.append(job)
         kind, _, size = job.rpartition(":")
         return row(kind, int(size), threads=2 if int(size) > 50 and kind != ON_ONE else 1).record()
 
-    monkeypatch.setattr(scaling, "ask", ask)
+    monkeypatch.setattr(scaling, "run_child", run_child)
     rows = list(scaling.measure_all(list(KINDS), [10, 100], "cpu"))
     assert [job for job in jobs if job.startswith(ON_ONE)] == [f"{ON_ONE}:100"] and len(rows) == len(jobs) == 2 * len(KINDS) - 1
     jobs.clear()
@@ -143,13 +143,13 @@ def test_one_thread_is_measured_where_several_were_used(monkeypatch):
 def test_command_prints_writes_and_plots(monkeypatch, tmp_path, capsys):
     copies = [{"by": "NumPy", "threads": 1, "rate": 2e10}]
 
-    def ask(job, arch):
+    def run_child(job, arch):
         if job == scaling.COPY:
             return copies
         kind, _, size = job.rpartition(":")
         return "it broke" if job == "search:9" else row(kind, int(size)).record()
 
-    monkeypatch.setattr(scaling, "ask", ask)
+    monkeypatch.setattr(scaling, "run_child", run_child)
     out, plot = tmp_path / "s.json", tmp_path / "s.png"
     assert scaling.main(["--sizes", "900,300", "--out", str(out), "--plot", str(plot)]) == 0
     numbers = json.loads(out.read_text())
@@ -164,7 +164,7 @@ def test_command_prints_writes_and_plots(monkeypatch, tmp_path, capsys):
             scaling.main(["--sizes", wrong])
     with pytest.raises(OutputError):
         scaling.main(["--out", str(tmp_path / "s.txt")])
-    monkeypatch.setattr(scaling, "ask", lambda job, arch: "no CUDA here")
+    monkeypatch.setattr(scaling, "run_child", lambda job, arch: "no CUDA here")
     with pytest.raises(ts.SimulationError, match="no CUDA here"):
         scaling.main(["--arch", "cuda"])
 

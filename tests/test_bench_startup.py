@@ -25,11 +25,11 @@ def version(tmp_path_factory):
 
 @pytest.mark.parametrize("name, cells, other", [("beam", 1, 2), ("cube", 1, 2)])
 def test_only_the_first_simulator_compiles(version, name, cells, other):
-    found, times = startup.ask(version, "again", name, cells, other)
+    found, times = startup.run_child(version, "again", name, cells, other)
     assert found["first"]["compiled"] > 0 and found["second"]["compiled"] == found["other size"]["compiled"] == 0
     assert times["wall"] > found["first"]["wall"] > found["second"]["wall"]
     before = version.files()
-    startup.ask(version, "first", name, other + 1)
+    startup.run_child(version, "first", name, other + 1)
     assert before and version.files() == before
 
 
@@ -41,14 +41,14 @@ def test_walk_takes_the_given_steps():
 
 
 def test_a_larger_surface_compiles_only_parallel_detection(version):
-    first, second, crossing, last = startup.ask(version, "surfaces", *startup.TASKS["surfaces"][0])[0].items()
+    first, second, crossing, last = startup.run_child(version, "surfaces", *startup.TASKS["surfaces"][0])[0].items()
     assert (first[0], crossing[0]) == ("224 triangles", startup.CROSSING)
     assert first[1] > crossing[1] > 0 == second[1] == last[1]
 
 
 def test_memory_of_simulators_is_measured(version):
     for task in (("grow", "cube", 1, 1), ("keep", 1, 1)):
-        found = startup.ask(version, *task)[0]
+        found = startup.run_child(version, *task)[0]
         assert found["times"] == 1 and 0 < found["start"] < 2 * found["end"]
 
 
@@ -85,7 +85,7 @@ class Recorded:
 
 def test_versions_are_measured_alternately(monkeypatch):
     tasks: list = []
-    monkeypatch.setattr(startup, "ask", lambda version, *task: version.ask(*task))
+    monkeypatch.setattr(startup, "run_child", lambda version, *task: version.ask(*task))
     new, old = startup.measure_waiting([Recorded("new", tasks), Recorded("old", tasks)], "cube", quick=False)
     firsts = [(task[0], task[3]) for task in tasks if task[1] == "first"]
     assert firsts == [(name, n) for n in (4, 4, 5, 4, 6, 4, 7) for name in ("new", "old")]
@@ -95,7 +95,7 @@ def test_versions_are_measured_alternately(monkeypatch):
 
 def test_a_failing_child_is_named(version):
     with pytest.raises(SimulationError, match="task first nobody 1 ended with status 1: KeyError: 'nobody'"):
-        startup.ask(version, "first", "nobody", 1)
+        startup.run_child(version, "first", "nobody", 1)
 
 
 def numbers(seconds: float, compiled: int) -> dict:

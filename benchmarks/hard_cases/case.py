@@ -1,9 +1,8 @@
-"""What a hard case is, how one variant of it is run, and how the run is judged.
+"""Hard cases: their data, the run of a variant, and its verdicts.
 
-A case is data beside one function. The function gets a `Session` and a variant's parameters, runs, and returns numbers by their
-quantity; the criteria say which of them have a limit, and of which variants. Each variant says how it must end, and why: by the
-catalogue and by physics, never by what came out. A reference is the same run in f64 with an eighth of the step, looked at at the
-same times.
+A case is data and one function. The function gets a `Session` and a variant's parameters, runs, and returns numbers by quantity;
+criteria set limits on them. The catalogue and physics, never a result, determine how a variant must end. A reference is the same
+run in f64 with an eighth of the step, sampled at the same times.
 """
 
 import math
@@ -20,28 +19,28 @@ from taisoft.errors import TaisoftError
 from taisoft.output.report import peak_memory
 from taisoft.records import RunReport, StepReport
 
-MEASURED, ANALYTIC, PROPOSED = "measured", "analytic", "proposed"  # what a limit rests on
+MEASURED, ANALYTIC, PROPOSED = "measured", "analytic", "proposed"  # basis of a limit
 # How a variant ends. Refused: an error before a simulator's first step is done. Stopped: an error in a later step.
 OK, DEGRADED, REFUSED, STOPPED = WORST = ("ok", "degraded", "refused", "stopped")
-FAILED = "failed"  # what a RunReport calls both
+FAILED = "failed"  # both, in a RunReport
 
-# What degrades a run.
+# Causes of a degraded run.
 UNCONVERGED, INVERTED, DROPPED = "unconverged steps", "inverted tets", "dropped contacts"
 PENETRATION, OVERLAP, INTERRUPTED = "penetration", "overlap at the end", "interruption"
-END = "end of the run"  # the quantity of a variant's first verdict
+END = "end of the run"  # quantity of a variant's first verdict
 DEEPEST = "deepest penetration after any step [m]"
 
 IMPLICIT, EXPLICIT = "implicit_euler", "symplectic_euler"
-FINER = 8  # steps of a reference for one of the run
-FRAMES = 20  # of a run that are kept, at most about
+FINER = 8  # steps of a reference per step of the run
+FRAMES = 20  # approximate maximum of stored frames
 
 
 @dataclass(frozen=True)
 class Must:
-    """How a variant must end: OK, DEGRADED, REFUSED or STOPPED. reason: why, in one line.
+    """How a variant must end: OK, DEGRADED, REFUSED or STOPPED, and the reason in one line.
 
-    causes: what may degrade the run, because the setting itself brings it about. With OK and causes, both an ok end and one
-    that only they degrade count. Nothing else may have gone wrong in a run that is refused or stopped either.
+    causes: allowed causes of degradation, due to the setting itself. With OK and causes, an ok end and one degraded only by them
+    count. Refused and stopped runs may have no other causes either.
     """
 
     end: str
@@ -50,26 +49,24 @@ class Must:
 
     @property
     def text(self) -> str:
-        """As words."""
+        """The required end in words."""
         by = f"{DEGRADED} by {' and '.join(self.causes)}"
         return self.end if not self.causes or self.end in (REFUSED, STOPPED) else f"ok, or {by}" if self.end == OK else by
 
     def met(self, record: dict) -> bool:
-        """Whether a record ends so."""
+        """Whether a record ends as required."""
         status, causes = record["status"], set(record["causes"])
         if not causes <= set(self.causes):
             return False
         if status == DEGRADED:
-            return self.end in (OK, DEGRADED) and bool(causes)  # a run that cannot say what degraded it is not excused
+            return self.end in (OK, DEGRADED) and bool(causes)  # a run degraded without a known cause does not count
         return status == self.end and not (status == OK and causes)
 
 
 @dataclass(frozen=True)
 class Variant:
-    """One run of a case. settings: arguments of ts.Simulator; parameters: of the case's function.
-
-    must: how it must end. reference: whether its shape can be compared with that of a run in f64 with an eighth of the step.
-    """
+    """One run of a case. settings: arguments of ts.Simulator; parameters: of the case's function; must: how it must end;
+    reference: whether its shape is comparable with that of a reference run."""
 
     name: str
     settings: dict[str, Any]
@@ -78,7 +75,7 @@ class Variant:
     reference: bool = True
 
     def has(self, of: dict[str, Any]) -> bool:
-        """Whether it has the value, or one of the values, given for every name."""
+        """Whether every named setting has the given value, or one of them."""
         own = self.settings | self.parameters
         return all(own[key] in (value if isinstance(value, tuple) else (value,)) for key, value in of.items())
 
@@ -95,12 +92,12 @@ def explicit(dt: float, **more) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Criterion:
-    """A number that a case must keep to.
+    """A limit on a number of a case.
 
-    quantity: its name among the numbers of the case's function. basis: one of MEASURED, ANALYTIC, PROPOSED. at_least: a lower
-    limit. asked: the limit that the catalogue proposes, where another, an honest baseline, replaces it. note: what that is and
-    why. of: parameters and settings of the variants it applies to, by name; empty for all. cost: a limit on time, memory or
-    iterations; a run that misses it is not solved, but its answer is not wrong.
+    quantity: name of the number. basis: one of MEASURED, ANALYTIC, PROPOSED. at_least: a lower limit. asked: the catalogue's
+    limit, if replaced by a baseline. note: explanation of the replacement. of: parameters and settings of the variants it
+    applies to, by name; empty for all. cost: a limit on time, memory or iterations; a run that misses it is not solved, but
+    not wrong.
     """
 
     quantity: str
@@ -113,13 +110,13 @@ class Criterion:
     cost: bool = False
 
     def met(self, value: float) -> bool:
-        """Whether a value keeps the limit; one that is not a number never does."""
+        """Whether a value meets the limit; nan never does."""
         return math.isfinite(value) and (value >= self.limit if self.at_least else value <= self.limit)
 
 
 @dataclass(frozen=True)
 class Shortfall:
-    """Why variants of a case are not solved, and what to try next. of: which variants, as in Criterion."""
+    """Why variants of a case are not solved, and the next idea. of: the variants, as in Criterion."""
 
     cause: str
     next_idea: str
@@ -128,7 +125,7 @@ class Shortfall:
 
 @dataclass
 class Case:
-    """A hard case. size [m]: what errors are divided by. quick: variants that are cheap and solved."""
+    """A hard case. size [m]: the unit of errors. quick: cheap solved variants."""
 
     id: str
     name: str
@@ -148,21 +145,21 @@ class Case:
         self.criteria.append(Criterion(quantity, limit, basis, at_least, None, note, of, cost))
 
     def add_shortfall(self, cause: str, next_idea: str, **of) -> None:
-        """Add the explanation of variants that are not solved, see Shortfall."""
+        """Explain variants that are not solved, see Shortfall."""
         self.shortfalls.append(Shortfall(cause, next_idea, of))
 
     def criteria_of(self, variant: Variant) -> list[Criterion]:
-        """What is asked of one variant."""
+        """Criteria of one variant."""
         return [c for c in self.criteria if variant.has(c.of)]
 
     def shortfalls_of(self, variant: Variant) -> list[Shortfall]:
-        """Why one variant is not solved."""
+        """Shortfalls of one variant."""
         return [s for s in self.shortfalls if variant.has(s.of)]
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """A quantity of a run beside its limit. value and limit: numbers, or texts where the end of the run is judged."""
+    """A quantity of a run and its limit: numbers, or texts for the end of the run."""
 
     quantity: str
     value: float | str | None
@@ -170,19 +167,19 @@ class Verdict:
     at_least: bool = False
     basis: str = ""
     asked: float | None = None
-    passed: bool | None = None  # None where there is no limit
+    passed: bool | None = None  # None without a limit
     cost: bool = False
 
 
 def judge(case: Case, variant: Variant, record: dict) -> list[Verdict]:
-    """A record against a variant's criteria: its end first, then what has a limit, then what has none."""
+    """Verdicts on a record: its end, then quantities with limits, then those without."""
     causes = " and ".join(record["causes"]) if record["status"] == DEGRADED else ""
     ended = f"{record['status']} by {causes}" if causes else record["status"]
     verdicts = [Verdict(END, ended, variant.must.text, passed=variant.must.met(record))]
     numbers = record["numbers"]
     criteria = case.criteria_of(variant)
     for c in criteria:
-        value = numbers.get(c.quantity)  # null for what is not finite, absent in a run that could not be made
+        value = numbers.get(c.quantity)  # null if not finite, absent in a failed run
         met = value is not None and c.met(value)
         verdicts.append(Verdict(c.quantity, value, c.limit, c.at_least, c.basis, c.asked, met, c.cost))
     judged = {c.quantity for c in criteria}
@@ -190,42 +187,42 @@ def judge(case: Case, variant: Variant, record: dict) -> list[Verdict]:
 
 
 class Session:
-    """One variant being run. finer: 1, or FINER for its reference.
-
-    reports: of all steps so far. path: lists of points (n,3) [m] of the run, at its start, at FRAMES times and at its end.
-    """
+    """A running variant. finer: 1, or FINER for its reference; reports: of all steps so far; path: points (n,3) [m] at the start,
+    at FRAMES times and at the end."""
 
     def __init__(self, case: Case, variant: Variant, arch: str, finer: int = 1):
         self.case, self.variant, self.arch, self.finer = case, variant, arch, finer
         self.status = OK
-        self.causes: set[str] = set()  # what degraded its runs
+        self.causes: set[str] = set()  # causes of degradation
         self.problems: list[str] = []
         self.warned: list[warnings.WarningMessage] = []
         self.steps = 0
-        self.seconds = 0.0  # wall time of steps without compiling
-        self.step_seconds: list[float] = []  # of a step, of each advance
+        self.seconds = 0.0  # wall time of steps without compilation
+        self.step_seconds: list[float] = []  # per step, for each advance
         self.reports: list[StepReport] = []
         self.path: list[np.ndarray] = []
 
     def simulator(self, scene: ts.Scene, **changes) -> ts.Simulator:
-        """A simulator of the scene by the variant's settings, with changes; finer where this is a reference."""
+        """A simulator of the scene with the variant's settings and changes; with finer steps for a reference."""
         settings = self.variant.settings | changes
         settings["dt"] = settings["dt"] / self.finer
         if self.finer > 1:
             settings["precision"] = "f64"
         return ts.Simulator(scene, arch=self.arch, **settings)
 
-    def go(self, sim: ts.Simulator, steps: int, look: Callable | None = None, every: int = 1, follow: bool = True) -> RunReport:
-        """Run so many steps of the variant's length; look(sim, number, report) before them and after every `every` of them.
+    def run_steps(
+        self, sim: ts.Simulator, steps: int, observe: Callable | None = None, every: int = 1, follow: bool = True
+    ) -> RunReport:
+        """Run `steps` steps of the variant's dt; call observe(sim, number, report) first and after each `every` steps.
 
-        follow: keep some of its states for the comparison with the reference. A run that fails says so in the result.
+        follow: keep some states for comparison with the reference. The result reports a failed run.
         """
         dt, total = sim.dt * self.finer, steps // every
         kept = max(1, total // FRAMES)
 
         def frame(sim, number, report):
-            if look is not None:
-                look(sim, number, report)
+            if observe is not None:
+                observe(sim, number, report)
             if follow and (number % kept == 0 or number == total):
                 self.path.append(sim.positions())
 
@@ -242,22 +239,22 @@ class Session:
         return result
 
     def watch(self, sim: ts.Simulator, steps: int, *read: Callable, every: int = 1, follow: bool = True) -> list[list]:
-        """`go` with a list of what each of `read` returned, before the steps and after every `every` of them."""
+        """`run_steps`, returning the values of each of `read`: first and after each `every` steps."""
         found = [[] for _ in read]
 
-        def look(*_):
+        def observe(*_):
             for values, get in zip(found, read):
                 values.append(get())
 
-        self.go(sim, steps, look, every, follow)
+        self.run_steps(sim, steps, observe, every, follow)
         return found
 
     def refuse(self, sentence: str) -> None:
-        """A simulator refused what it was given."""
+        """Record a refusal by a simulator."""
         self._end(REFUSED, [sentence])
 
     def _end(self, status: str, problems: list[str]) -> None:
-        """How something ended; the worst counts."""
+        """Record how a run ended; the worst end counts."""
         self.status = max(self.status, status, key=WORST.index)
         self.problems += problems
 
@@ -268,19 +265,19 @@ class Session:
 
     @property
     def unconverged(self) -> int:
-        """Reports of steps that did not converge."""
+        """Number of unconverged steps."""
         return sum(not report.converged for report in self.reports)
 
-    def most(self, name: str) -> float:
-        """The largest of a number of the StepReports so far."""
+    def largest(self, name: str) -> float:
+        """The maximum of a number over all StepReports so far."""
         return max((getattr(report, name) for report in self.reports), default=0)
 
     def total(self, name: str) -> int:
-        """The sum of a number of the StepReports so far."""
+        """The sum of a number over all StepReports so far."""
         return sum(getattr(report, name) for report in self.reports)
 
     def record(self) -> dict:
-        """Run the variant. Returns plain data: its end, its numbers, its cost, its path."""
+        """Run the variant. Returns its end, numbers, cost and path as plain data."""
         start = time.perf_counter()
         with warnings.catch_warnings(record=True) as self.warned:
             warnings.simplefilter("always", UserWarning)
@@ -300,7 +297,7 @@ class Session:
             "total_seconds": time.perf_counter() - start,
             "step_seconds": float(np.median(self.step_seconds)) if self.step_seconds else None,
             **{f"{what}_iterations": self.total(f"{what}_iterations") for what in ("newton", "linear", "contact")},
-            "inverted": self.most("n_inverted"),
+            "inverted": self.largest("n_inverted"),
             "unconverged": self.unconverged,
             "peak_memory_bytes": peak_memory(),
             "points": np.concatenate(self.path) if self.path else np.empty((0, 3)),
@@ -308,7 +305,7 @@ class Session:
 
 
 def causes_of(sim: ts.Simulator, result: RunReport) -> set[str]:
-    """What degraded a run."""
+    """Causes of a degraded run."""
     steps = result.step_reports
     found = {
         UNCONVERGED: any(not step.converged for step in steps),
@@ -324,7 +321,7 @@ def causes_of(sim: ts.Simulator, result: RunReport) -> set[str]:
 
 
 def refusal(make: Callable[[], ts.Simulator]) -> str:
-    """The sentence with which a simulator refuses to be made; empty where it is made after all."""
+    """The message with which a simulator refuses to be built, or empty."""
     try:
         make().close()
     except TaisoftError as error:

@@ -23,18 +23,18 @@ def slope(session: Session, friction: float) -> dict[str, float]:
     down = np.array([np.cos(angle), -np.sin(angle), 0.0])
     rubber = ts.Material(law=SNH, young=1e6, poisson=0.3, density=1000.0)
     with session.simulator(on_slope(cube(3, 0.1), rubber, angle, 10.0)) as sim:
-        session.go(sim, 50)
+        session.run_steps(sim, 50)
         x = sim.positions()
         sim.set_contact("cube", "plane", friction=friction)
-        session.go(sim, 200)
-        way = (sim.positions() - x).mean(axis=0)
-    along = way @ down
+        session.run_steps(sim, 200)
+        displacement = (sim.positions() - x).mean(axis=0)
+    along = displacement @ down
     return {
-        "way [m]": np.linalg.norm(way),
+        "way [m]": np.linalg.norm(displacement),
         "way over 0.1755 m, less 1": abs(along / 0.1755 - 1.0),
         "way over 8.77 m, less 1": abs(along / 8.77 - 1.0),
-        "off the line of steepest descent [degrees]": abs(np.degrees(np.arctan2(way[2], along))),
-        DEEPEST: session.most("max_penetration"),
+        "off the line of steepest descent [degrees]": abs(np.degrees(np.arctan2(displacement[2], along))),
+        DEEPEST: session.largest("max_penetration"),
     }
 
 
@@ -72,7 +72,7 @@ def stack(session: Session, seed: int) -> dict[str, float]:
         "centroid's drift in the first second [m]": max(drifts[:41]),
         "centroid's drift in 2.5 s [m]": max(drifts[:101]),
         "centroid's drift [m]": max(drifts),
-        DEEPEST: session.most("max_penetration"),
+        DEEPEST: session.largest("max_penetration"),
     }
 
 
@@ -91,7 +91,7 @@ def spike_in_hole(session: Session) -> dict[str, float]:
         x = sim.positions()
     return {
         "numbers that are not finite at the end": not_finite(x),
-        DEEPEST: session.most("max_penetration"),
+        DEEPEST: session.largest("max_penetration"),
         "largest speed upwards [m/s]": max(rising),
         "depth of the tip under the rims at the end [m]": 0.05 - x[0, 1],
         "kinetic energy at the end [J]": session.reports[-1].kinetic,
@@ -153,7 +153,7 @@ def aligned(session: Session, over: str) -> dict[str, float]:
         "length of a normal, less 1, most": max(
             np.abs(np.linalg.norm(n, axis=1) - 1.0).max(initial=0.0) if np.isfinite(n).all() else np.inf for n in normals
         ),
-        DEEPEST: session.most("max_penetration"),
+        DEEPEST: session.largest("max_penetration"),
         "pairs of triangles that cut each other at the end": cut,
     }
 

@@ -48,12 +48,12 @@ def slivers(session: Session, law: str, s: float) -> dict[str, float]:
     numbers = {NAMED: mesh.volumes[worst] / (s * mesh.volumes.mean())}
     if session.variant.settings["integrator"] == EXPLICIT and s < 1.0:
         limit = LIMITS[s] * np.sqrt(DENSITY / 1000.0)
-        said = refusal(lambda: session.simulator(sliver_scene(law, s)))
-        if said:
-            session.refuse(said)
+        message = refusal(lambda: session.simulator(sliver_scene(law, s)))
+        if message:
+            session.refuse(message)
         with session.simulator(sliver_scene(law, s), dt=0.5 * limit) as sim:
             estimate = sim.stable_dt
-        return numbers | {"refused": "stability limit" in said, "estimated limit, off by": abs(estimate / limit - 1.0)}
+        return numbers | {"refused": "stability limit" in message, "estimated limit, off by": abs(estimate / limit - 1.0)}
     path, good = tip_path(session, law, s), tip_path(session, law, 1.0, follow=False)
     off = np.linalg.norm(path - good, axis=1) / LENGTH if len(path) == len(good) else np.array([np.nan])
     return numbers | {"tip off the bar's without slivers at the end, over L": off[-1], "the same, most": off.max()}
@@ -98,8 +98,8 @@ def knives(session: Session) -> dict[str, float]:
         "deepest of vertices and triangles' middles in a knife [m]": max(deepest),
         "pairs of triangles that cut each other, most": max(cut),
         "numbers that are not finite at the end": lost,
-        "inverted tets, most": session.most("n_inverted"),
-        "deepest of the contacts after any step [m]": session.most("max_penetration"),
+        "inverted tets, most": session.largest("n_inverted"),
+        "deepest of the contacts after any step [m]": session.largest("max_penetration"),
     }
 
 

@@ -1,4 +1,4 @@
-"""Materials at their worst: collapsed, mirrored and random shapes, squeezes, a bar that is drawn, twisted and released."""
+"""Materials under extreme deformation: collapsed, mirrored and random shapes, compression, a bar stretched, twisted, released."""
 
 import numpy as np
 
@@ -31,34 +31,34 @@ SMALLEST = "smallest volume ratio at the end"
 
 
 def start_of(name: str, X: np.ndarray) -> np.ndarray:
-    """Where the vertices X (n,3) [m] are put."""
+    """Initial positions of the vertices X (n,3) [m]."""
     if name == "random":
         return np.random.default_rng(1).uniform(-0.5, 0.5, X.shape)
     return X * {"plane": (1.0, 1.0, 0.0), "mirrored": (-1.0, 1.0, 1.0)}[name]
 
 
 def recover(session: Session, law: str, start: str, steps: int) -> dict[str, float]:
-    """M1, M2: a free cube of 1 m from a start in which tets have no volume or a negative one, for 14 s."""
+    """M1, M2: a free cube of 1 m that starts with flat or inverted tets, for 14 s."""
     scene, body = one_body("cube", cube(4, 1.0), law=law, young=1e5, poisson=0.4, mass_damping=6.0)
     with session.simulator(scene) as sim:
         sim.set_state(start_of(start, body.rest_positions))
-        session.go(sim, steps, every=max(1, steps // 700))
+        session.run_steps(sim, steps, every=max(1, steps // 700))
         return rest_at_last(sim, 1.0) | {FINITE: not_finite(sim.positions(), sim.velocities())}
 
 
 def squeeze(session: Session, law: str) -> dict[str, float]:
-    """M3: a cube of 0.1 m is squeezed to half its height, held, and drawn back."""
+    """M3: a cube of 0.1 m is compressed to half its height, held, and released slowly."""
     scene, body = one_body("cube", cube(4, 0.1), law=law, young=1e5, poisson=0.3)
     body.fix(face(1, -0.05))
     down = [0.0, 0.0, 0.0], [0.0, -0.05, 0.0]
     body.move(face(1, 0.05), KeyFrames([0.0, 1.0, 1.5, 2.5], [down[0], down[1], down[1], down[0]]))
     with session.simulator(scene) as sim:
-        session.go(sim, 350)
+        session.run_steps(sim, 350)
         found = rest_at_last(sim, 0.1)
-        way = np.linalg.norm(sim.positions() - body.rest_positions, axis=1).max()
+        displacement = np.linalg.norm(sim.positions() - body.rest_positions, axis=1).max()
     named = [text for text in session.warnings if "step " in text and "tet " in text and "softens" in text]
     return found | {
-        "largest displacement at the end [m]": way,
+        "largest displacement at the end [m]": displacement,
         "smallest volume ratio of all steps": min(report.min_volume_ratio for report in session.reports),
         "warnings of softening that name step and tet": len(named),
         "run is ok though tets are inverted at the end": session.status == OK and found[INVERTED_LAST] > 0.0,
@@ -66,7 +66,7 @@ def squeeze(session: Session, law: str) -> dict[str, float]:
 
 
 def draw_and_twist(session: Session, law: str) -> dict[str, float]:
-    """M4: a bar's end is drawn to four times its length, turned once and released."""
+    """M4: a bar is stretched to four times its length, twisted once and released."""
     mesh = box((10, 3, 3), (0.5, 0.15, 0.15), (0.25, 0.0, 0.0))
     scene, body = one_body("bar", mesh, law=law, young=3e4, poisson=0.4, mass_damping=2.0)
     body.fix(face(0, 0.0))
@@ -74,7 +74,7 @@ def draw_and_twist(session: Session, law: str) -> dict[str, float]:
     path = KeyFrames([0.0, 1.0, 2.0], [WEIGHTLESS, far, far], [WEIGHTLESS, WEIGHTLESS, turn], release=True)
     body.move(face(0, 0.5), path)
     with session.simulator(scene) as sim:
-        session.go(sim, 1000)
+        session.run_steps(sim, 1000)
         return rest_at_last(sim, 0.5) | {"steps that did not converge": session.unconverged}
 
 

@@ -41,10 +41,10 @@ def masses(session: Session, level: str) -> dict[str, float]:
     seconds = np.array(session.step_seconds)
     return {
         FORCE: np.abs(np.array(forces[-20:]) / weight - 1.0).max(),
-        DEEPEST: session.most("max_penetration"),
+        DEEPEST: session.largest("max_penetration"),
         SLOWEST: seconds.max() / np.median(seconds),
         "numbers that are not finite in the last state": lost,
-        "inverted tets, most": session.most("n_inverted"),
+        "inverted tets, most": session.largest("n_inverted"),
         "steps that did not converge": session.unconverged,
     }
 
@@ -73,7 +73,7 @@ def stiffnesses(session: Session) -> dict[str, float]:
         y = sim.positions("upper")[:, 1].reshape(13, 2, 13)
     thickness, reference = (y[:, 1] - y[:, 0])[inside].mean(), static_thickness(upper, soft, inside)
     return {
-        DEEPEST: session.most("max_penetration"),
+        DEEPEST: session.largest("max_penetration"),
         BETWEEN: np.abs(np.array(forces[-20:]) / (50.0 * G) - 1.0).max(),
         THICKNESS: abs(thickness / reference - 1.0),
     }
@@ -139,7 +139,7 @@ def flyer(session: Session, spoilt: bool) -> dict[str, float]:
                 spoil(sim, "B")
 
         with session.simulator(flyer_scene(with_flyer)) as sim:
-            result = session.go(sim, 300, look, follow=with_flyer)
+            result = session.run_steps(sim, 300, look, follow=with_flyer)
             return np.array(path), result.steps, memory[-1] / memory[1] - 1.0
 
     alone, _, _ = run(False)
@@ -181,7 +181,7 @@ def flood(session: Session, capacities: dict, broad_phase: str) -> dict[str, flo
 
     def run(**given) -> tuple[np.ndarray, dict]:
         with session.simulator(bin_scene(broad_phase=broad_phase, **given)) as sim:
-            session.go(sim, 200, follow=False)
+            session.run_steps(sim, 200, follow=False)
             return sim.positions(), sim.buffer_growths
 
     small, grown = None, {}

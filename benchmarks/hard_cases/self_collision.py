@@ -22,19 +22,19 @@ def mat_twist(session: Session, seed: int, seconds: float) -> dict[str, float]:
     for side in (-0.5, 0.5):
         body.move(face(0, side), KeyFrames([0.0, 5.0], rotations=[WEIGHTLESS, np.sign(side) * turn]))
     free = np.abs(mesh.vertices[:, 0]) < 0.499
-    aside = np.random.default_rng(seed).uniform(-1e-4, 1e-4, mesh.n_verts) * free
+    offset = np.random.default_rng(seed).uniform(-1e-4, 1e-4, mesh.n_verts) * free
     with session.simulator(scene) as sim:
         x = mesh.vertices.copy()
-        x[:, 2] += aside
+        x[:, 2] += offset
         sim.set_state(x)
         (cut,) = session.watch(sim, round(seconds / 0.04), lambda: len(sim.intersecting_triangles()))
     return {
         "pairs of triangles that cut each other, most": max(cut),
         "pairs of triangles that cut each other, over triangles": max(cut) / len(mesh.surface),
-        DEEPEST: session.most("max_penetration"),
-        "inverted tets, most": session.most("n_inverted"),
+        DEEPEST: session.largest("max_penetration"),
+        "inverted tets, most": session.largest("n_inverted"),
         "steps that did not converge": session.unconverged,
-        "contacts, most": session.most("n_contacts"),
+        "contacts, most": session.largest("n_contacts"),
     }
 
 
@@ -44,8 +44,8 @@ def clamp(session: Session, law: str) -> dict[str, float]:
     filled[2:, 2:5] = False
     mesh = voxels(filled, 0.02, (0.08, 0.07, 0.02))
     scene, body = one_body("clamp", mesh, law=law, young=5e4, poisson=0.4, friction=0.3, mass_damping=2.0)
-    for y, way in ((0.14, -0.04), (0.0, 0.04)):
-        moved = KeyFrames([0.0, 1.0, 1.5], [WEIGHTLESS, (0.0, way, 0.0), (0.0, way, 0.0)], release=True)
+    for y, travel in ((0.14, -0.04), (0.0, 0.04)):
+        moved = KeyFrames([0.0, 1.0, 1.5], [WEIGHTLESS, (0.0, travel, 0.0), (0.0, travel, 0.0)], release=True)
         body.move(lambda X, y=y: (np.abs(X[:, 0] - 0.16) < 1e-9) & (np.abs(X[:, 1] - y) < 1e-9), moved)
     mass = gravity_mass(body)
     with session.simulator(scene) as sim:
@@ -54,11 +54,11 @@ def clamp(session: Session, law: str) -> dict[str, float]:
         found = rest_at_last(sim, 0.16)
         decay = 1.0 + body.material.mass_damping * sim.dt  # of an implicit Euler step without forces
     free = np.array(momenta[151:])  # the step that ends at 1.5 s is prescribed
-    made = np.linalg.norm(decay * free[1:] - free[:-1], axis=1).max() if len(free) > 1 else np.nan
+    gained = np.linalg.norm(decay * free[1:] - free[:-1], axis=1).max() if len(free) > 1 else np.nan
     return found | {
-        "contacts, most": session.most("n_contacts"),
-        DEEPEST: session.most("max_penetration"),
-        GAINED: made / max(impulses),
+        "contacts, most": session.largest("n_contacts"),
+        DEEPEST: session.largest("max_penetration"),
+        GAINED: gained / max(impulses),
     }
 
 
@@ -91,7 +91,7 @@ def sheets(session: Session, parts: str) -> dict[str, float]:
         "momentum over that of one sheet, most": max(momenta) / (15.0 * mass[:n].sum()),
         "sentences that name speed, thickness and a safe dt": all(word in sentences for word in ("thick", "dt", "m/s")),
         "sentences or order kept": min(gaps) > 0.0,
-        DEEPEST: session.most("max_penetration"),
+        DEEPEST: session.largest("max_penetration"),
     }
 
 
@@ -101,7 +101,7 @@ def jack(session: Session, law: str) -> dict[str, float]:
     filled[:, 2, 2] = filled[2, :, 2] = filled[2, 2, :] = True
     mesh = voxels(filled.repeat(2, 0).repeat(2, 1).repeat(2, 2), 0.02)
     scene, _ = one_body("jack", mesh, law=law, young=1e4, poisson=0.4, mass_damping=2.0)
-    beyond, planes = [], []
+    depths, planes = [], []
     for axis in range(3):
         for side in (-1.0, 1.0):
             normal = -side * np.eye(3)[axis]
@@ -113,19 +113,19 @@ def jack(session: Session, law: str) -> dict[str, float]:
     def look(sim, k, report):
         if report is None or report.converged:
             x = sim.positions()
-            beyond.append(max(((point + path(sim.time)[0] - x) @ normal).max() for point, normal, path in planes))
+            depths.append(max(((point + path(sim.time)[0] - x) @ normal).max() for point, normal, path in planes))
 
     with session.simulator(scene) as sim:
-        session.go(sim, 650, look)
+        session.run_steps(sim, 650, look)
         found = rest_at_last(sim, 0.2)
         lost = not_finite(sim.positions())
     return found | {
         "numbers that are not finite in the last state": lost,
-        "deepest in a plane after steps that count as converged [m]": max(beyond),
-        "deepest in a plane or in itself after any step [m]": session.most("max_penetration"),
-        "pairs of triangles that cross, most": session.most("crossings"),
+        "deepest in a plane after steps that count as converged [m]": max(depths),
+        "deepest in a plane or in itself after any step [m]": session.largest("max_penetration"),
+        "pairs of triangles that cross, most": session.largest("crossings"),
         "steps that did not converge": session.unconverged,
-        "inverted tets, most": session.most("n_inverted"),
+        "inverted tets, most": session.largest("n_inverted"),
     }
 
 

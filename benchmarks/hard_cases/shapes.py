@@ -1,4 +1,4 @@
-"""Meshes and scenes of the hard cases, and how far a shape is from its rest."""
+"""Meshes and scenes of the hard cases, and the shape error."""
 
 import numpy as np
 
@@ -19,7 +19,7 @@ def box(cells, size, center=(0.0, 0.0, 0.0)) -> ts.TetMesh:
 
 
 def cube(cells: int, edge: float) -> ts.TetMesh:
-    """`box` with the same along all axes."""
+    """A cube-shaped `box`."""
     return box((cells,) * 3, (edge,) * 3)
 
 
@@ -43,19 +43,19 @@ def voxels(filled: np.ndarray, edge: float, center=(0.0, 0.0, 0.0)) -> ts.TetMes
 
 
 def one_body(name: str, mesh: ts.TetMesh, gravity=WEIGHTLESS, position=(0, 0, 0), velocity=(0, 0, 0), **material):
-    """A scene with one body, of 1000 kg/m^3 if no density is among the numbers of its material. Returns both."""
+    """A scene with one body, by default of 1000 kg/m^3. Returns both."""
     scene = ts.Scene(gravity=gravity)
     stuff = ts.Material(**{"density": 1000.0} | material)
     return scene, scene.add_body(mesh, stuff, name=name, position=position, velocity=velocity)
 
 
 def not_finite(*states: np.ndarray) -> float:
-    """1 where some number of the states is not finite, else 0."""
+    """1 if a number of the states is not finite, else 0."""
     return float(not all(np.isfinite(state).all() for state in states))
 
 
 def split(mesh: ts.TetMesh, times: int = 1) -> ts.TetMesh:
-    """Every tet cut into eight, some times."""
+    """Split every tet into eight, `times` times."""
     for _ in range(times):
         finer = make_nodes(mesh, 2)
         mesh = ts.TetMesh(finer.positions, finer.tets)
@@ -63,7 +63,7 @@ def split(mesh: ts.TetMesh, times: int = 1) -> ts.TetMesh:
 
 
 def shape_error(rest: np.ndarray, x: np.ndarray, length: float) -> float:
-    """Largest distance of the points x to the rest shape, both (n,3) [m], after the best rigid motion, over a length [m]."""
+    """Largest distance of the points x to the rest shape, both (n,3) [m], after the best rigid fit, over a length [m]."""
     a, b = rest - rest.mean(axis=0), x - x.mean(axis=0)
     u, _, vt = np.linalg.svd(a.T @ b)
     mirror = np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
@@ -77,7 +77,7 @@ def volume_ratios(sim: ts.Simulator, body: int = 0) -> np.ndarray:
 
 
 def rest_at_last(sim: ts.Simulator, length: float) -> dict[str, float]:
-    """How far the only body's shape is from its rest, over a length [m]."""
+    """Shape error over a length [m], inverted tets and smallest volume ratio of the only body."""
     J, x = volume_ratios(sim), sim.positions()
     return {
         "shape error at the end, over L": shape_error(sim.scene.bodies[0].rest_positions, x, length),

@@ -49,8 +49,8 @@ def bracket(session: Session, law: str) -> dict[str, float]:
     dt = session.variant.settings["dt"]
     numbers = {}
     if session.variant.settings.get("allow_unstable"):
-        said = refusal(lambda: session.simulator(scene, allow_unstable=False))
-        numbers["refused without allow_unstable"] = "stability limit" in said
+        message = refusal(lambda: session.simulator(scene, allow_unstable=False))
+        numbers["refused without allow_unstable"] = "stability limit" in message
     with warnings.catch_warnings(record=True) as warned:
         warnings.simplefilter("always")
         sim = session.simulator(scene)
@@ -75,7 +75,7 @@ def twist(session: Session, law: str) -> dict[str, float]:
             body.move(face(0, side), KeyFrames([0.0, 5.0], rotations=[WEIGHTLESS, np.sign(side) * ends]))
         with session.simulator(scene, dt=dt) as sim:
             before = session.seconds
-            result = session.go(sim, round(5.0 / dt))
+            result = session.run_steps(sim, round(5.0 / dt))
             x = sim.positions()
         finest = x if finest is None else finest
         what = f"dt {dt:g} s: "
@@ -107,7 +107,7 @@ def impact(session: Session, steps: int) -> dict[str, float]:
         change = (mass @ sim.velocities() - first)[1]
     return {
         "mean velocity away from the wall at the end [m/s]": (change + first[1]) / mass.sum(),
-        DEEPEST: session.most("max_penetration"),
+        DEEPEST: session.largest("max_penetration"),
         "largest energy over that of the start": max(energies) / energies[0],
         "inverted tets at the end": session.reports[-1].n_inverted,
         "contact impulses over the change of momentum, less 1": abs(
@@ -121,11 +121,11 @@ def stiff_cube(session: Session, law: str) -> dict[str, float]:
     scene, _ = one_body("cube", cube(4, 0.1), DOWN, (0, 0.15, 0), law=law, young=1e9, poisson=0.3, friction=0.5)
     scene.add_obstacle(ts.HalfSpace((0, 0, 0), (0, 1, 0)), name="plane", friction=0.5)
     with session.simulator(scene) as sim:
-        session.go(sim, 120)
+        session.run_steps(sim, 120)
         height = sim.positions().mean(axis=0)[1]
     late = [report.kinetic for report in session.reports if report.time > 1.5]
     return {
-        DEEPEST: session.most("max_penetration"),
+        DEEPEST: session.largest("max_penetration"),
         "kinetic energy after 1.5 s [J]": max(late),
         "height of its middle less 0.05 m [m]": abs(height - 0.05),
     }
@@ -162,12 +162,12 @@ def rest(session: Session) -> dict[str, float]:
     """L2: a cube on a slope neither creeps nor shakes in 60 s, and costs the same all the time."""
     soft = ts.Material(law=COR, young=1e5, poisson=0.3, density=1000.0)
     with session.simulator(on_slope(cube(4, 0.1), soft, np.radians(10.0), 0.5)) as sim:
-        session.go(sim, 100)
+        session.run_steps(sim, 100)
         start, fields, peak = sim.positions(), sum(sim.field_bytes.values()), peak_memory()
-        (ways,) = session.watch(sim, 5900, lambda: np.abs(sim.positions() - start).max())
+        (displacements,) = session.watch(sim, 5900, lambda: np.abs(sim.positions() - start).max())
         seconds = np.array(session.step_seconds)
         return {
-            "creep after 1 s, most [m]": max(ways),
+            "creep after 1 s, most [m]": max(displacements),
             "kinetic energy after 1 s, most [J]": max(report.kinetic for report in session.reports if report.time > 1.0),
             "growth of the fields after 1 s": sum(sim.field_bytes.values()) / fields - 1.0,
             "growth of the process's peak memory after 1 s": peak_memory() / peak - 1.0,
@@ -175,7 +175,7 @@ def rest(session: Session) -> dict[str, float]:
         }
 
 
-def go_on(session: Session) -> dict[str, float]:
+def resume(session: Session) -> dict[str, float]:
     """L3: 200 steps of a stack at once, against 100, a checkpoint, and 100 more in another process."""
     frames = []
     with tempfile.TemporaryDirectory() as folder, session.simulator(stack_scene(None)) as sim:
@@ -187,19 +187,19 @@ def go_on(session: Session) -> dict[str, float]:
             if k > 100:
                 frames.append(np.stack([sim.positions(), sim.velocities()]))
 
-        session.go(sim, 200, look)
+        session.run_steps(sim, 200, look)
         touching = session.reports[99].n_contacts
-        others = frames_elsewhere(saved)
-    different = [k for k, (a, b) in enumerate(zip(frames, others)) if not np.array_equal(a, b)]
+        resumed = frames_in_child(saved)
+    different = [k for k, (a, b) in enumerate(zip(frames, resumed)) if not np.array_equal(a, b)]
     return {
         "contacts when it was stopped": touching,
-        "frames": min(len(frames), len(others)),
+        "frames": min(len(frames), len(resumed)),
         "frames that differ in a bit": len(different),
-        "largest difference [m]": np.abs(np.array(frames)[:, 0] - others[:, 0]).max() if len(frames) == len(others) else np.nan,
+        "largest difference [m]": np.abs(np.array(frames)[:, 0] - resumed[:, 0]).max() if len(frames) == len(resumed) else np.nan,
     }
 
 
-ELSEWHERE = """
+CHILD_CODE = """
 import sys
 import numpy as np
 from taisoft.cli.scene_file import load_shipped
@@ -207,10 +207,10 @@ np.save(sys.argv[2], load_shipped("benchmarks", "hard_cases.time_step").frames_f
 """
 
 
-def frames_elsewhere(saved: Path) -> np.ndarray:
+def frames_in_child(saved: Path) -> np.ndarray:
     """`frames_from` in a process of its own. Raises CalledProcessError where that fails."""
     frames = saved.with_name("frames.npy")
-    subprocess.run([sys.executable, "-c", ELSEWHERE, saved, frames], check=True)
+    subprocess.run([sys.executable, "-c", CHILD_CODE, saved, frames], check=True)
     return np.load(frames)
 
 
@@ -289,7 +289,7 @@ L2.add_limit("growth of the process's peak memory after 1 s", 0.02, PROPOSED, co
 L2.add_limit("time of the last 1000 steps over that of the first", 1.1, PROPOSED, cost=True)
 
 GOES_ON = Must(OK, "a checkpoint holds all that the next step depends on")
-L3 = Case("L3", "stop and go on", go_on, size=5.0)
+L3 = Case("L3", "stop and go on", resume, size=5.0)
 L3.add_variant(SNH, implicit(0.025), GOES_ON, reference=False)
 L3.add_limit("contacts when it was stopped", 1.0, ANALYTIC, at_least=True)
 L3.add_limit("frames", 100.0, ANALYTIC, at_least=True)

@@ -1,1 +1,1 @@
-"""Simulators on the same works: one adapter a file, each with the settings found best for it."""
+"""Adapters of simulators for the works, one per file, each with its best settings."""

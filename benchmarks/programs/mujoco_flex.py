@@ -1,4 +1,4 @@
-"""MuJoCo's flex on the works: same vertices, tets and lumped masses as everyone, undamped.
+"""MuJoCo's flex on the works: the same vertices, tets and lumped masses as for all programs, undamped.
 
 A flex of dim 3 with elasticity is St. Venant-Kirchhoff on linear tets, of which much is squeezed inside out when W2's cube
 lands. Before version 4.0 it used twice the first Lamé parameter, so older versions are refused. By "discrete" alone and by
@@ -50,7 +50,7 @@ SWITCHED_OFF = (
     "EULERDAMP AUTORESET ISLAND"
 ).split()
 CONTACT = ("CONSTRAINT", "CONTACT", "MIDPHASE", "WARMSTART", "REFSAFE", "ISLAND")  # what contact needs of SWITCHED_OFF
-INERTIA = 0  # the warning that a matrix is nearly singular, as those of thin flexes are: it goes on, and well
+INERTIA = 0  # the warning of a nearly singular matrix, harmless for thin flexes
 FALSE_ALARM = "flex '.*' is not rigid and has no equality constraints or passive forces"  # it counts no elasticity
 
 
@@ -77,7 +77,7 @@ def problem() -> str:
 
 
 def settings(work: Work, arch: str = "cpu") -> list[Setting]:
-    """Explicit steps at the largest stable dt and finer, implicit ones ("discrete"); with contact rows and passive ones."""
+    """Explicit steps at the largest stable dt and finer, implicit ones ("discrete"); with contact rows and passive contact."""
     if work.cells is not None:
         return _of_beam(work)
     if work.kind == "path":
@@ -114,7 +114,7 @@ def _of_beam(work: Work) -> list[Setting]:
     implicit = (1,) if large else (1, 4)
     found += [Setting(NAME, model, "discrete", k) for model in (MODEL, NEO_HOOKEAN) for k in implicit]
     if work.cells == min(STABLE_STEPS) and not work.stiff:
-        found.append(Setting(NAME, MODEL, "implicitfast", 1))  # it is refused: the page says in which words
+        found.append(Setting(NAME, MODEL, "implicitfast", 1))  # refused; the page shows the message
     return found
 
 
@@ -159,7 +159,7 @@ class Run(Session):
             spec.option.enableflags = int(mujoco.mjtEnableBit.mjENBL_IPC)
 
     def _add_flex(self, spec, body: Body, mass: np.ndarray, contact: dict) -> None:
-        """A body of its mass (n,) [kg] with three slides for every free node, and the flex on them."""
+        """Add a body with three slide joints for every free node, with its mass (n,) [kg], and the flex on them."""
         mujoco, owners = self.mujoco, []
         for node, (position, kg, fixed) in enumerate(zip(body.mesh.vertices, mass, body.fixed)):
             owners.append("world" if fixed else f"{body.name} {node}")

@@ -1,4 +1,4 @@
-"""Newton on the works, on the processor, in float32. Warp captures the launches of 10 ms once and replays them as one graph.
+"""Newton on the works, on the processor in float32. Warp captures the launches of 10 ms and replays them as a graph.
 
 * "vbd": vertex block descent, implicit Euler with a fixed number of sweeps a step. Law SNH13 of works.semi_discrete. Contact is
   a spring of `stiffness` [N/m] a vertex; triangles of several bodies meet by `particle_enable_self_contact`, RADIUS apart, and
@@ -39,7 +39,7 @@ def problem() -> str:
 
 
 def _import_newton():
-    """Newton and Warp, without a line for every module that they compile."""
+    """Import Newton and Warp, without a log line per compiled module."""
     import warp
 
     warp.config.log_level = warp.LOG_WARNING
@@ -49,7 +49,7 @@ def _import_newton():
 
 
 def settings(work: Work, arch: str = "cpu") -> list[Setting]:
-    """Steps and sweeps, coarse to fine; large meshes the coarse ones only; on the ground soft and stiff springs."""
+    """Steps and sweeps from coarse to fine, for large meshes only coarse ones; on the ground soft and stiff springs."""
     if work.kind == "stand":
         gaps = ((1, 3, 0.06), (1, 5, 0.06), (1, 10, 0.06), (2, 5, 0.03), (1, 5, RADIUS))
         implicit = [(steps, sweeps, {"stiffness": 1e6, "gap": gap}) for steps, sweeps, gap in gaps]
@@ -69,7 +69,7 @@ def _explicit(work: Work) -> list[Setting]:
 
 
 class Run(Session):
-    """The graph of the launches of one SAMPLE is captured as it is built."""
+    """`build` captures the launches of one SAMPLE as a graph."""
 
     def build(self) -> None:
         newton, self.warp = _import_newton()
@@ -116,7 +116,7 @@ class Run(Session):
         return newton.solvers.SolverVBD(self.model, iterations=self.setting.options["sweeps"], **meeting)
 
     def _launch(self) -> None:
-        """The steps of 10 ms, which begin and end in the first of the states: a graph holds addresses."""
+        """The steps of 10 ms; they start and end in the first state, since a graph holds addresses."""
         now, then = self.states
         for _ in range(self.setting.steps):
             now.clear_forces()
@@ -144,7 +144,7 @@ class Run(Session):
 
 
 def _add(builder, body: Body, warp) -> None:
-    """A soft mesh with its surface, which contact between bodies needs."""
+    """Add a soft mesh with its surface, for contact between bodies."""
     material = ts.Material(young=body.young, poisson=POISSON)
     place = {"pos": warp.vec3(0.0), "rot": warp.quat_identity(), "scale": 1.0, "vel": warp.vec3(0.0)}
     law = {"density": DENSITY, "k_mu": material.mu, "k_lambda": material.lam, "k_damp": 0.0}
@@ -153,7 +153,7 @@ def _add(builder, body: Body, warp) -> None:
 
 
 def _add_bare(builder, body: Body, kg: np.ndarray, warp) -> None:
-    """Nodes and tets alone: no triangles of the surface, which semi_implicit would visit in every step."""
+    """Add nodes and tets without surface triangles, which semi_implicit would visit in every step."""
     material, first, n = ts.Material(young=body.young, poisson=POISSON), builder.particle_count, body.mesh.n_verts
     positions, at_rest = [warp.vec3(*x) for x in body.mesh.vertices], [warp.vec3(0.0)] * n
     radius = [builder.default_particle_radius] * n

@@ -1,8 +1,5 @@
 """taisoft on the works."""
 
-import contextlib
-import warnings
-
 import numpy as np
 
 import taisoft as ts
@@ -11,6 +8,7 @@ from taisoft.study.measure import TimedRun, advance, warm_up
 
 from ..elasticity_runs import lasting_steps
 from ..exact_path import DENSITY, POISSON, SAMPLE
+from ..runner import without_warnings
 from ..works.references import MUJOCO, TAISOFT, Model
 from ..works.scenes import Work
 from .session import Session, Setting
@@ -22,7 +20,7 @@ FINER = (1, 2, 4, 11)  # explicit steps of W1: errors of second order down to 1e
 
 
 def problem() -> str:
-    """Nothing: it is here."""
+    """taisoft is always available."""
     return ""
 
 
@@ -40,9 +38,9 @@ def make_scene(work: Work, model: Model = TAISOFT) -> Scene:
 
 
 def settings(work: Work, arch: str = "cpu") -> list[Setting]:
-    """Explicit steps at the largest dt that lasts and finer, implicit ones of 10 ms; W1 with the law that MuJoCo has, too."""
+    """Explicit steps at the largest stable dt and finer, implicit ones of 10 ms; W1 also with MuJoCo's law."""
     model = MUJOCO if work.cells is not None else TAISOFT
-    with unwarned():
+    with without_warnings():
         least, _ = lasting_steps(make_scene(work, model), "velocity_verlet", arch, work.seconds)
     f32, f64 = {"precision": "f32", "arch": arch}, {"precision": "f64", "arch": arch}
     finer = FINER if work.cells is not None else FINER[:3] if work.kind == "path" else FINER[:1]
@@ -57,20 +55,12 @@ def settings(work: Work, arch: str = "cpu") -> list[Setting]:
     return explicit + implicit
 
 
-@contextlib.contextmanager
-def unwarned():
-    """Without the warning that a body is soft for its weight: it shall be."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)
-        yield
-
-
 class Run(Session):
-    """Steps are taken in the largest batches that a Simulator takes."""
+    """Steps run in the largest batches of the Simulator."""
 
     def build(self) -> None:
         work, setting = self.work, self.setting
-        with unwarned():
+        with without_warnings():
             self.sim = ts.Simulator(make_scene(work, setting.model), dt=setting.dt, integrator=setting.method, **setting.options)
         warm_up(self.sim)
 

@@ -1,8 +1,7 @@
-"""PyBullet's deformable bodies on the works: stable neo-Hookean, explicit elasticity, the same mass at every node.
+"""PyBullet's deformable bodies on the works: stable neo-Hookean, explicit elasticity, equal nodal masses.
 
-Meshes go in as files. Nodes are held by anchors. Its springs beside the tets (loadSoftBody's useMassSpring) stay off, and its
-damping is zero. Contact of soft bodies among each other is a spring of `repulsion` [N/m] and a velocity solve; with the ground
-a velocity solve with a margin [m].
+Meshes are loaded from files; anchors fix nodes. Mass springs (loadSoftBody's useMassSpring) are off, damping is zero. Contact
+between soft bodies is a spring of `repulsion` [N/m] and a velocity solve, contact with the ground a velocity solve with a margin.
 """
 
 import contextlib
@@ -37,7 +36,7 @@ def problem() -> str:
 
 
 def settings(work: Work, arch: str = "cpu") -> list[Setting]:
-    """Steps from about the largest that lasts on; with several bodies two strengths of repulsion."""
+    """Steps from about the largest stable one on; with several bodies two repulsion stiffnesses."""
     steps = {"W2": (3, 4, 8, 16), "W3": (6, 8), "W4": (20,)}.get(work.key, (4, 8))
     if work.cells is not None:
         tets, young = work.tets, work.bodies[0].young
@@ -47,7 +46,7 @@ def settings(work: Work, arch: str = "cpu") -> list[Setting]:
 
 
 class Run(Session):
-    """Each reset builds the world anew."""
+    """Each reset rebuilds the world."""
 
     def build(self) -> None:
         with _silent():
@@ -90,7 +89,7 @@ class Run(Session):
             path.write_text(_vtk(body))
             made = self.bullet.loadSoftBody(str(path), **numbers, **self.here)
         if np.abs(self._positions_of(made) - body.mesh.vertices).max() > 1e-9:
-            raise SimulationError(f"{NAME} has put the nodes of {body.name!r} in another order")
+            raise SimulationError(f"{NAME} has reordered the nodes of {body.name!r}")
         for node in np.flatnonzero(body.fixed):
             self.bullet.createSoftBodyAnchor(made, int(node), -1, -1, **self.here)
         return made
@@ -114,7 +113,7 @@ class Run(Session):
 
 
 def _vtk(body: Body) -> str:
-    """The mesh as a legacy VTK file in the one layout that PyBullet reads."""
+    """The mesh as a legacy VTK file in the layout that PyBullet reads."""
     points = "\n".join("{:.17g} {:.17g} {:.17g}".format(*x) for x in body.mesh.vertices)
     cells = "\n".join("4 {} {} {} {}".format(*tet) for tet in body.mesh.tets)
     n, m = body.mesh.n_verts, body.mesh.n_tets
@@ -124,7 +123,7 @@ def _vtk(body: Body) -> str:
 
 @contextlib.contextmanager
 def _silent():
-    """Keep what PyBullet's library prints out of the tables; C keeps its text until it is flushed."""
+    """Context that discards the output of PyBullet's library, which C buffers until it is flushed."""
     library = ctypes.CDLL(None)
     sys.stdout.flush()
     kept, nowhere = os.dup(1), os.open(os.devnull, os.O_WRONLY)

@@ -1,7 +1,7 @@
-"""What a program is to the works: settings it is given for a work, and a run that carries one of them out.
+"""Interface of the compared programs: settings for a work, and a run with one of them.
 
-A program is a module with NAME, MODEL (what it solves, of works.references), `problem()` -> why it is not available, "" where it
-is, `settings(work, arch)` -> list of Setting, and `Run`, a Session. Positions are those of all nodes of a work, body after body.
+A program is a module with NAME, MODEL (see works.references), `problem()` (why it is not available, or ""), `settings(work,
+arch)` (a list of Setting) and `Run`, a Session. Positions are those of all nodes of a work, body after body.
 """
 
 from dataclasses import dataclass, field
@@ -18,7 +18,7 @@ from ..works.scenes import Work
 
 @dataclass(frozen=True)
 class Setting:
-    """method: in the program's own words. steps: within SAMPLE. options: what else decides the result."""
+    """method: the program's name for it. steps: per SAMPLE. options: other settings that affect the result."""
 
     program: str
     model: Model
@@ -37,16 +37,16 @@ class Setting:
 
 
 class Session:
-    """A program ready to do a work; a subclass has `build`, `reset`, `step` and `positions`.
+    """A program ready to run a work; subclasses define `build`, `reset`, `step` and `positions`.
 
-    build_seconds: what that took [s], compiling included. unconverged: steps of the followed run that did not, by the program's
-    own word; most say nothing.
+    build_seconds: time to build [s], including compilation. unconverged: unconverged steps of the recorded run, if the program
+    reports them.
     """
 
     unconverged = 0
 
     def __init__(self, work: Work, setting: Setting) -> None:
-        """Raises SimulationError, or SceneError where the program refuses the setting."""
+        """Raises SimulationError, or SceneError if the program refuses the setting."""
         self.work, self.setting = work, setting
         self.free = np.concatenate([~body.fixed for body in work.bodies])
         start = perf_counter()
@@ -54,9 +54,9 @@ class Session:
         self.build_seconds = perf_counter() - start
 
     def run(self, follow: bool) -> tuple[np.ndarray | None, float]:
-        """The whole work from its start: positions (k+1,n,3) [m] every SAMPLE, where followed, and wall time of the steps [s].
+        """Run the whole work: positions (k+1,n,3) [m] every SAMPLE, if `follow`, and wall time of the steps [s].
 
-        Raises SimulationError where it diverges: where a position is not finite or 1 km from the start.
+        Raises SimulationError if a position is not finite or 1 km from the start.
         """
         self.reset()
         start = self.work.start
@@ -73,16 +73,16 @@ class Session:
         return np.array(path) if follow else None, seconds
 
     def build(self) -> None:
-        """Build the program's model of the work, and compile what it takes."""
+        """Build the program's model of the work, and compile."""
 
     def reset(self) -> None:
-        """Return to the work's start."""
+        """Return to the initial state."""
 
     def step(self) -> None:
         """Take the steps of one SAMPLE."""
 
     def positions(self) -> np.ndarray:
-        """Of all nodes (n,3) [m], in an array of their own."""
+        """Positions of all nodes (n,3) [m], as a copy."""
 
     def close(self) -> None:
-        """Free what the program holds."""
+        """Free the program's resources."""

@@ -1,10 +1,10 @@
-"""What else was tried for the works and is not among the settings, and what came out; the page shows it as a table.
+"""Other settings that were tried for the works, with their results; a table of the page.
 
-By hand, one run each, so no times; with the versions of `VERSIONS`. Errors and depths are those of the page.
+Single manual runs with the versions of `VERSIONS`, without times. Errors and depths are defined as on the page.
 """
 
 VERSIONS = "mujoco 4.0.0, pybullet 3.2.7, newton 1.8.0, warp-lang 1.19.0, November 2026"
-TRIED = {  # by program: (work or "all", what was tried, what came out)
+TRIED = {  # by program: (work or "all", setting, result)
     "MuJoCo": (
         ("W1", "discrete with the solver Newton in place of CG", "the same path: without rows neither solver runs"),
         ("all", "integrator implicit", "refused in the same words as implicitfast"),

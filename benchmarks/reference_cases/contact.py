@@ -1,8 +1,8 @@
 """Contact: friction on slopes, stacks, impacts, momentum, and a ball pressed on a plane.
 
-Blocks are unit cubes of 2 x 2 x 2 cells. Those that slide are damped within, by their stiffness: a soft block that vibrates on
-its base slides further than a rigid one, as it lets go of the plane here and there. Contacts keep a contact offset; bodies that
-begin on a plane move up to it first, by about a millimetre.
+Blocks are unit cubes of 2 x 2 x 2 cells. Sliding blocks have stiffness damping: a soft block that vibrates loses contact in
+places and slides further than a rigid one. Contacts keep a contact offset; bodies that start on a plane first move up to it, by
+about a millimetre.
 """
 
 from dataclasses import replace
@@ -19,7 +19,7 @@ from .record import GRAVITY, Case, material, near, reported, rotation, small, su
 EXPLICIT, IMPLICIT = "symplectic_euler", "implicit_euler"
 STEP = {EXPLICIT: 1e-3, IMPLICIT: 1e-2}  # [s] of blocks of 1e7 Pa
 CONTACT_OFFSET = 2e-3  # of the mean surface edge
-STICKS = 10.0  # friction of what must not move
+STICKS = 10.0  # friction of blocks that must not move
 STILL, SLIP, STRAIGHT = 1e-5, 5e-3, 1e-4  # limits: [m], of a distance, sideways over distance
 UP = (0.0, 1.0, 0.0)
 
@@ -46,7 +46,7 @@ def add_plane(s: ts.Scene, **contact) -> None:
 
 
 def settled(sim: ts.Simulator, friction: float, angle: float = 0.0, held: bool = False) -> np.ndarray:
-    """Let the block settle on a slope [rad], held by more friction if wanted. Returns where it is (n,3) [m]."""
+    """Let the block settle on a slope [rad], with more friction if `held`. Returns its positions (n,3) [m]."""
     sim.reset()
     sim.set_gravity((GRAVITY * np.sin(angle), -GRAVITY * np.cos(angle), 0.0))
     sim.set_contact("block", "plane", friction=STICKS if held else friction)
@@ -68,13 +68,13 @@ def incline(integrator: str, reference: dict, arch: str):
             reports = sim.run(0.5, fps=None).step_reports  # a released block shakes at first
             before = sim.velocities().mean(axis=0)
             reports += sim.run(0.5, fps=None).step_reports
-            way = (sim.positions() - start).mean(axis=0)
+            displacement = (sim.positions() - start).mean(axis=0)
             if slips:
                 gain = (sim.velocities().mean(axis=0) - before) / 0.5
                 yield near(f"{what}: acceleration [m/s^2]", gain[0], case["acceleration"], SLIP)
-                yield small(f"{what}: sideways, over slip", way[2] / way[0], STRAIGHT)
+                yield small(f"{what}: sideways, over slip", displacement[2] / displacement[0], STRAIGHT)
             else:
-                yield small(f"{what}: slip in 1 s [m]", np.linalg.norm(way[[0, 2]]), STILL)
+                yield small(f"{what}: slip in 1 s [m]", np.linalg.norm(displacement[[0, 2]]), STILL)
             yield small(f"{what}: penetration [m]", max(report.max_penetration for report in reports), 1e-4)
 
 
@@ -98,7 +98,7 @@ def slide(integrator: str, reference: dict, arch: str):
 
 
 def stack(reference: dict, arch: str):
-    """Five cubes on each other, at rest: what each interface bears.
+    """Five cubes on each other at rest: the force at each interface.
 
     A column so high buckles under its own weight, and so does one of bonded cubes (Greenhill: 4.05 m for this material), at
     a rate of about 1/s. From a symmetric start it stays upright for the first seconds, in which damping brings it to rest.
@@ -155,8 +155,8 @@ def bar(integrator: str, law: str, reference: dict, arch: str):
     value, dt = reference["value"], 2e-4
     mesh = ts.box_mesh((2, 20, 2), (0.1, 1.0, 0.1))
     s = ts.Scene(gravity=(0.0, 0.0, 0.0))
-    place = (0, 0.5 + CONTACT_OFFSET * mean_surface_edge([(mesh.vertices, mesh.surface)]), 0)
-    body = s.add_body(mesh, material(reference, law), name="bar", position=place, velocity=(0, -0.1, 0))
+    position = (0, 0.5 + CONTACT_OFFSET * mean_surface_edge([(mesh.vertices, mesh.surface)]), 0)
+    body = s.add_body(mesh, material(reference, law), name="bar", position=position, velocity=(0, -0.1, 0))
     add_plane(s, friction=0.0, restitution=0.0)
     with ts.Simulator(s, dt=dt, integrator=integrator, precision="f64", arch=arch) as sim:
         forces = []
@@ -164,20 +164,20 @@ def bar(integrator: str, law: str, reference: dict, arch: str):
             sim.step()
             forces.append(-sim.contact_force("plane")[1])
         forces = np.array(forces)
-        pushed = np.flatnonzero(forces > 0.05 * value["force"])
+        loaded = np.flatnonzero(forces > 0.05 * value["force"])
         v = sim.velocities("bar")
         mass = 0.1 * 0.1 * 1.0 * body.material.density
     impulse = forces.sum() * dt
-    duration = (pushed[-1] + 1) * dt
+    duration = (loaded[-1] + 1) * dt
     yield near("impulse [N s]", impulse, value["impulse"], 0.05)
     yield near("duration [s]", duration, value["duration"], 0.05)
     yield near("mean force [N]", impulse / duration, value["force"], 0.05)
     yield near("rebound velocity [m/s]", impulse / mass - 0.1, value["rebound_velocity"], 0.1)
-    yield reported("of it in vibration, share of the speed", np.abs(v[:, 1] - v[:, 1].mean()).max() / 0.1)
+    yield reported("vibration after the impact, over the speed", np.abs(v[:, 1] - v[:, 1].mean()).max() / 0.1)
 
 
 def momentum(integrator: str, reference: dict, arch: str):
-    """Two cubes that collide in free space: what their momentum does."""
+    """Two cubes that collide in free space: conservation of momentum."""
     s = ts.Scene(gravity=(0.0, 0.0, 0.0))
     soft = replace(material(reference, "SNH"), friction=0.4)
     s.add_body(cube(), soft, name="left", position=(-0.6, 0, 0), velocity=(1.0, 0, 0))
@@ -218,13 +218,13 @@ def hertz(cells: int, limit: float | None, reference: dict, arch: str):
     whole = ts.ball_mesh(radius, cells)
     mesh = submesh(whole, whole.vertices[whole.tets].mean(axis=1)[:, 1] < 0.0)
     rows = [row for row in reference["value"]["SNH"] if row["d_over_R"] > 0.015]
-    way = [0.0] + [row["d"] for row in rows]
+    displacement = [0.0] + [row["d"] for row in rows]
     s = ts.Scene(gravity=(0.0, 0.0, 0.0))
     height = radius + CONTACT_OFFSET * mean_surface_edge([(mesh.vertices, mesh.surface)])
     ball = s.add_body(mesh, material(reference, "SNH"), name="ball", position=(0.0, height, 0.0))
     middle = np.flatnonzero(np.abs(mesh.vertices).max(axis=1) < 1e-9)
     flat = np.flatnonzero(np.abs(mesh.vertices[:, 1]) < 1e-9)
-    ball.move(flat, lambda t: (0.0, -float(np.interp(t, np.arange(len(way)), way)), 0.0), axes="y")
+    ball.move(flat, lambda t: (0.0, -float(np.interp(t, np.arange(len(displacement)), displacement)), 0.0), axes="y")
     ball.fix(middle, axes="xz")
     add_plane(s, friction=0.0, restitution=0.0)
     with ts.Simulator(s, dt=0.5, precision="f64", arch=arch, newton_tolerance=1e-8) as sim:

@@ -1,7 +1,7 @@
-"""Motion in time on a fixed mesh, against paths that were integrated exactly: order of accuracy, energies, momenta.
+"""Motion on a fixed mesh, against exactly integrated paths: order of accuracy, energies, momenta.
 
-Orders come from the largest error over the whole path, at two steps, the second half the first. The last problem leaves
-the fixed mesh: it shows how far finer and finer ones are from the beam itself.
+Orders come from the largest error over the whole path at two steps, the second half the first. The last problem refines the mesh
+and shows the discretisation error in space.
 """
 
 from collections import namedtuple

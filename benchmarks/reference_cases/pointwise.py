@@ -130,10 +130,10 @@ def free_fall(law: str, integrator: str, reference: dict, arch: str):
             sim.advance(n - sim.step_count)
         x, energies = sim.positions(), sim.energies()
     fall = -GRAVITY * dt * dt * _fallen(integrator, n)
-    way = (x - body.rest_positions)[:, 1]
+    displacement = (x - body.rest_positions)[:, 1]
     strain = np.abs(deformation_gradients(body, x) - np.eye(3)).max()
     return (
-        near("fall [m]", way[np.argmax(np.abs(way - fall))], fall, 1e-12),
+        near("fall [m]", displacement[np.argmax(np.abs(displacement - fall))], fall, 1e-12),
         small("largest |F - I|", strain, 1e-12),
         small("elastic / gravity energy", energies.elastic / abs(energies.gravity), 1e-12),
     )

@@ -1,8 +1,8 @@
-"""What a case of a reference problem is, what it finds, and what all cases share: checks, scenes, choices of nodes.
+"""Cases of reference problems, their checks, and shared helpers for scenes and nodes.
 
-A case gets the problem's file as a dict and the arch, computes in f64, and returns checks. Two kinds of error are kept
-apart: on the same mesh with the same element the numbers must agree to solver tolerance, and the check has a limit;
-against a value converged in space the error is the mesh's own, and the check has none: it is only shown.
+A case gets the problem's file as a dict and the arch, computes in f64, and returns checks. On the same mesh with the same
+element, numbers must agree to solver tolerance: the check has a limit. Against a value converged in space, the check only shows
+the discretisation error.
 """
 
 import math
@@ -17,12 +17,12 @@ from taisoft.scene.scene import Body
 
 LAWS = {"SNH": "stable_neo_hookean", "COR": "corotational", "SVK": "st_venant_kirchhoff"}
 GRAVITY = 9.8  # m/s^2 along -y, in every problem that has any
-SAME_MESH = 1e-6  # relative: what the values computed on the same mesh are good to
+SAME_MESH = 1e-6  # relative uncertainty of values computed on the same mesh
 
 
 @dataclass(frozen=True)
 class Check:
-    """A measured number beside its reference. error: relative unless the quantity says else; limit None: only reported."""
+    """A measured number and its reference. error: relative unless the quantity states otherwise; limit None: only shown."""
 
     quantity: str
     measured: float
@@ -32,17 +32,17 @@ class Check:
 
     @property
     def passed(self) -> bool:
-        """Whether the error is within the limit; one that is not a number never is."""
+        """Whether the error is within the limit; nan never is."""
         return math.isfinite(self.error) if self.limit is None else bool(self.error <= self.limit)
 
     @property
     def verdict(self) -> str:
-        """pass, FAIL, or - where there is no limit."""
+        """pass, FAIL, or - without a limit."""
         return "FAIL" if not self.passed else "-" if self.limit is None else "pass"
 
 
 def computed(compute: Callable[[], Iterable[Check]]) -> list[Check]:
-    """The checks of a computation; of one that fails, a check that says why and has not passed."""
+    """The checks of a computation; if it fails, one failed check with the reason."""
     try:
         return list(compute())
     except TaisoftError as error:
@@ -51,7 +51,7 @@ def computed(compute: Callable[[], Iterable[Check]]) -> list[Check]:
 
 @dataclass(frozen=True)
 class Case:
-    """One computation of a problem. fine: too long for the tests, only the benchmark runs it."""
+    """One computation of a problem. fine: only run by the benchmark, since it is too long for the tests."""
 
     problem: str  # the reference file's name
     law: str
@@ -72,7 +72,7 @@ def near(quantity: str, measured: float, reference: float, limit: float | None =
 
 
 def small(quantity: str, measured: float, limit: float) -> Check:
-    """A check that a number which ought to be 0 stays below `limit`."""
+    """A check that a number is 0 within `limit`."""
     return Check(quantity, float(measured), 0.0, abs(float(measured)), limit)
 
 
@@ -82,19 +82,19 @@ def reported(quantity: str, error: float) -> Check:
 
 
 def order(quantity: str, coarse: float, fine: float, expected: float, limit: float | None) -> Check:
-    """A check of the observed order log2(coarse/fine) of two errors, the step or the mesh width being halved."""
+    """A check of the observed order log2(coarse/fine) of two errors, with step or mesh width halved."""
     observed = math.log2(coarse / fine) if coarse > 0.0 and fine > 0.0 else math.nan
     return Check(quantity, observed, expected, abs(observed - expected), limit)
 
 
 def material(reference: dict, law: str) -> ts.Material:
-    """The problem's material with one of LAWS; where the problem has no mass, the density is 1 kg/m^3."""
+    """The problem's material with one of LAWS; 1 kg/m^3 if the problem has no mass."""
     numbers = reference["material"]
     return ts.Material(law=LAWS[law], young=numbers["E"], poisson=numbers["nu"], density=numbers["rho"] or 1.0)
 
 
 def scene(gravity: bool = False) -> ts.Scene:
-    """An empty scene with the problems' gravity or with none, whose bodies pass through each other."""
+    """An empty scene without contact forces, with the problems' gravity or none."""
     made = ts.Scene(gravity=(0.0, -GRAVITY if gravity else 0.0, 0.0))
     made.contact_forces = False
     return made
@@ -106,18 +106,18 @@ def label(cells) -> str:
 
 
 def face(axis: int, value: float) -> Callable[[np.ndarray], np.ndarray]:
-    """A choice of the points (n,3) whose coordinate `axis` is `value` [m], for fix, move and add_traction."""
+    """A selector of the points (n,3) with coordinate `axis` equal to `value` [m], for fix, move and add_traction."""
     return lambda X: np.abs(X[:, axis] - value) < 1e-9 * max(1.0, np.abs(X).max())
 
 
 def nearest(points: np.ndarray, point) -> np.ndarray:
-    """Indices of the points (n,d) nearest to a point (d,) [m]; all of them where several are equally near."""
+    """Indices of the points (n,d) nearest to a point (d,) [m]; several if equally near."""
     distance = np.linalg.norm(points - np.asarray(point, float), axis=1)
     return np.flatnonzero(distance <= distance.min() + 1e-9 * np.ptp(points))
 
 
 def submesh(mesh: ts.TetMesh, chosen: np.ndarray) -> ts.TetMesh:
-    """The chosen tets of a mesh (m,) bool, with the vertices that they use."""
+    """The chosen tets (m,) bool of a mesh, with their vertices."""
     used, tets = np.unique(mesh.tets[chosen], return_inverse=True)
     return ts.TetMesh(mesh.vertices[used], tets.reshape(-1, 4))
 
@@ -136,7 +136,7 @@ def deformation_gradients(body: Body, x: np.ndarray) -> np.ndarray:
 
 
 def worst(checks: Iterable[Check], what: str) -> Check:
-    """The check with the largest error of several alike, called `what`; one that is not a number counts as largest."""
+    """The check with the largest error of several, renamed `what`; nan counts as largest."""
     checks = list(checks)
     found = max(checks, key=lambda check: math.inf if math.isnan(check.error) else check.error)
     return replace(found, quantity=f"{what}, worst of {len(checks)}: {found.quantity}")

@@ -116,10 +116,15 @@ def soft_sheet(sheet: Body, reference: dict) -> None:
 def twisted_bar(bar: Body, reference: dict) -> None:
     """Thick bar, one end face clamped, the other turned by 90 degrees about x."""
     bar.fix(face(0, -2.0))
+    turn_end(bar)
+
+
+def turn_end(bar: Body) -> None:
+    """Turn the face at x = 2 m by 90 degrees about x."""
     end = face(0, 2.0)(bar.rest_positions)
     _, y, z = bar.rest_positions[end].T
-    way = np.column_stack([np.zeros_like(y), -z - y, y - z])
-    bar.move(end, lambda t: way)
+    displacement = np.column_stack([np.zeros_like(y), -z - y, y - z])
+    bar.move(end, lambda t: displacement)
 
 
 # --- what is read -----------------------------------------------------------------------------------------------------
@@ -197,8 +202,8 @@ def _mean_by_area(body: Body, result: StaticResult, choice) -> float:
     triangles = surface[choice(X)[surface].all(axis=1)]
     a, b, c = X[triangles].transpose(1, 0, 2)
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
-    way = (result.positions(body.name) - X)[:, 1]
-    return float(np.average(way[triangles].mean(axis=1), weights=area))
+    displacement = (result.positions(body.name) - X)[:, 1]
+    return float(np.average(displacement[triangles].mean(axis=1), weights=area))
 
 
 def column(law: str, reference: dict, arch: str):
@@ -212,8 +217,8 @@ def column(law: str, reference: dict, arch: str):
     value, errors = reference["value"], []
     for body in s.bodies:
         pushed = result.reactions(body.name)[:, 1].sum()
-        way = _mean_by_area(body, result, face(1, height))
-        top = near(f"uy of the top, {body.name} [m]", way, value["uy_top"][law])
+        displacement = _mean_by_area(body, result, face(1, height))
+        top = near(f"uy of the top, {body.name} [m]", displacement, value["uy_top"][law])
         errors.append(top.error)
         yield top
         yield near(f"base force, {body.name} [N]", pushed, value["base_force"], 1e-10)

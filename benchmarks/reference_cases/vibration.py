@@ -102,8 +102,8 @@ def _motion(sim: ts.Simulator, omega: float, start) -> np.ndarray:
     rows = [tuple(start)]
     while len(rows) <= STEPS and np.abs(rows[-1]).max() * AMPLITUDE < LARGEST:
         sim.step()
-        way = sim.positions()[APEX, 1] - rest[APEX, 1]
-        rows.append((way / AMPLITUDE, sim.velocities()[APEX, 1] / (omega * AMPLITUDE)))
+        displacement = sim.positions()[APEX, 1] - rest[APEX, 1]
+        rows.append((displacement / AMPLITUDE, sim.velocities()[APEX, 1] / (omega * AMPLITUDE)))
     return np.array(rows)
 
 

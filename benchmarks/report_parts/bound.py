@@ -1,9 +1,8 @@
-"""Section 3.3 of the report: how large a step may be, over Young's modulus, density and the size of the tets, by running it.
+"""Section 3.3 of the report: the largest stable step over Young's modulus, density and tet size, found by running it.
 
-The largest stable step is found by halving an interval of steps, each tried with a cube that is held on one side and kicked at
-random with some millionths of the speed of sound. Small vibrations move it by millionths of its size; where a step is too large
-they grow by orders of magnitude, so that where between the two the line is drawn (GROWTH) is of no account. Nothing of
-`stable_dt` enters; it stands beside.
+The largest stable step is found by bisection. Each dt is tried on a cube, held on one side, with random initial velocities of
+about 1e-6 of the speed of sound. Stable vibrations stay at about 1e-6 of the cube's size; unstable ones grow by orders of
+magnitude, so the threshold GROWTH is uncritical. `stable_dt` is only compared with.
 """
 
 from dataclasses import dataclass
@@ -15,28 +14,28 @@ from taisoft.errors import SimulationError
 from taisoft.study.measure import advance
 
 from ..document import exponent, table
-from ..runner import unwarned
+from ..runner import without_warnings
 from .page import COLOURS, Claim, Extent, Part, is_near, new_figure, plot_png
 
 EXPLICIT, IMPLICIT = "symplectic_euler", "implicit_euler"
 YOUNGS = (1e4, 1e5, 1e6, 1e7, 1e8, 1e9), (1e4, 1e6, 1e9)  # [Pa], in a full and in a quick run
 CELLS = (2, 3, 4, 6, 8), (2, 3, 4)  # along each edge of the cube, MESH among them
 DENSITIES = (100.0, 1000.0, 10000.0)  # [kg/m^3]
-YOUNG, DENSITY, MESH = 1e6, 1000.0, 3  # where another one varies
+YOUNG, DENSITY, MESH = 1e6, 1000.0, 3  # defaults when another parameter varies
 STEPS, GROWTH, KICK = 600, 100.0, 1e-6
-PRECISE = 1e-3  # relative: where the halving ends
+PRECISE = 1e-3  # relative width at which the bisection ends
 SEED = 5
-STRETCH, LONG = 0.1, 50  # at the start of a long run, and its steps
-FACTORS = (1.0, 10.0, 100.0, 1000.0)  # of the explicit limit: steps of implicit Euler
-AROUND = (0.25, 0.5, 0.8, 0.95, 1.05, 1.2, 2.0)  # of symplectic Euler
-BOUNDED = 3.0  # times the stretch at the start: what a stable run may reach
-FAR = 1e3  # times that: where a picture ends
-LOOSE = 0.1  # by which a measured exponent may miss that of theory
+STRETCH, LONG = 0.1, 50  # initial stretch and steps of a long run
+FACTORS = (1.0, 10.0, 100.0, 1000.0)  # steps of implicit Euler over the explicit limit
+AROUND = (0.25, 0.5, 0.8, 0.95, 1.05, 1.2, 2.0)  # steps of symplectic Euler over the limit
+BOUNDED = 3.0  # displacement of a stable run over the initial one, at most
+FAR = 1e3  # the same, at which the picture is cut
+LOOSE = 0.1  # tolerance of a measured exponent
 
 
 @dataclass(frozen=True)
 class Limit:
-    """A cube's largest stable step. stable_dt: as the simulator has it; both [s]."""
+    """Largest stable step of a cube, measured and by the simulator's stable_dt [s]."""
 
     cells: int
     young: float
@@ -46,9 +45,8 @@ class Limit:
 
 
 @dataclass(frozen=True)
-class Long:
-    """A run from a stretch. factor: its dt over the measured limit; reach: largest displacement over that at the start;
-    status: of the run."""
+class LongRun:
+    """A run from an initial stretch. factor: dt over the measured limit; reach: largest displacement over the initial one."""
 
     integrator: str
     young: float
@@ -58,12 +56,12 @@ class Long:
 
     @property
     def stable(self) -> bool:
-        """Whether it stayed where it was stretched to."""
+        """Whether the motion stayed bounded."""
         return self.reach <= BOUNDED
 
 
 class Cube:
-    """A unit cube of n^3 cells, held on one side; closed by `with`. Steps beyond the limit are allowed, and not warned of."""
+    """A unit cube of n^3 cells, held on one side; a context manager. Unstable steps are allowed without warnings."""
 
     def __init__(self, cells: int, integrator: str, arch: str, young: float = YOUNG):
         scene = ts.Scene(gravity=(0.0, 0.0, 0.0))
@@ -72,7 +70,7 @@ class Cube:
         body.fix(lambda X: X[:, 0] < -0.5 + 1e-9)
         explicit = integrator == EXPLICIT
         self.cells, self.rest, self.young, self.density = cells, body.rest_positions, young, DENSITY
-        with unwarned():
+        with without_warnings():
             self.sim = ts.Simulator(scene, 1e-5, integrator, precision="f64", arch=arch, allow_unstable=explicit)
 
     def __enter__(self) -> "Cube":
@@ -82,23 +80,23 @@ class Cube:
         self.sim.close()
 
     def set(self, young: float = YOUNG, density: float = DENSITY) -> None:
-        """Another material."""
+        """Change the material."""
         self.young, self.density = young, density
-        with unwarned():
+        with without_warnings():
             self.sim.set_material("cube", young=young, density=density)
 
     def _begin(self, dt: float, positions: np.ndarray | None = None, velocities: np.ndarray | None = None) -> None:
         self.sim.reset()
-        with unwarned():
+        with without_warnings():
             self.sim.dt = dt
         self.sim.set_state(positions, velocities)
 
-    def moved(self) -> float:
+    def largest_displacement(self) -> float:
         """Largest displacement of a node [m]."""
         return float(np.linalg.norm(self.sim.positions("cube") - self.rest, axis=1).max())
 
     def is_stable(self, dt: float) -> bool:
-        """Whether a kick stays small."""
+        """Whether small vibrations stay small."""
         sound = np.sqrt(self.young / self.density)
         kick = KICK * sound * np.random.default_rng(SEED).standard_normal(self.rest.shape)
         self._begin(dt, self.rest, kick)
@@ -106,10 +104,10 @@ class Cube:
             advance(self.sim, STEPS)
         except SimulationError:
             return False
-        return self.moved() < GROWTH * KICK  # [m]: the cube is 1 m long
+        return self.largest_displacement() < GROWTH * KICK  # [m]: the cube is 1 m long
 
     def limit(self) -> Limit:
-        """By halving, from an interval found by doubling."""
+        """Find the limit by bisection, from an interval found by doubling."""
         low = 0.1 / self.cells * np.sqrt(self.density / self.young)
         while not self.is_stable(low):
             low *= 0.5
@@ -121,28 +119,28 @@ class Cube:
             low, high = (middle, high) if self.is_stable(middle) else (low, middle)
         return Limit(self.cells, self.young, self.density, low, self.sim.stable_dt)
 
-    def long_run(self, factor: float, limit: float) -> Long:
-        """Let go from a stretch, in steps of so many times the limit [s]."""
+    def long_run(self, factor: float, limit: float) -> LongRun:
+        """Release the cube from a stretch, with dt = factor * limit [s]."""
         X = self.rest
         start = X + STRETCH * (X[:, :1] + 0.5) * np.array([1.0, 0.0, 0.0])
         dt = factor * limit
         self._begin(dt, start, np.zeros_like(X))
-        before, reach = self.moved(), 0.0
+        before, reach = self.largest_displacement(), 0.0
 
         def on_frame(_sim, _index, _report) -> None:
             nonlocal reach
-            reach = max(reach, self.moved() / before)
+            reach = max(reach, self.largest_displacement() / before)
 
         done = self.sim.run(LONG * dt, on_frame, fps=None)
         reach = np.inf if done.status == "failed" else reach
-        return Long(self.sim.settings.integrator, self.young, factor, float(reach), done.status)
+        return LongRun(self.sim.settings.integrator, self.young, factor, float(reach), done.status)
 
 
 # --- what it says -----------------------------------------------------------------------------------------------------
 
 
-def claims_of(youngs: list[Limit], sizes: list[Limit], densities: list[Limit], runs: list[Long]) -> list[Claim]:
-    """The exponents of the law, and what stays bounded. Each list of limits varies one number."""
+def claims_of(youngs: list[Limit], sizes: list[Limit], densities: list[Limit], runs: list[LongRun]) -> list[Claim]:
+    """Claims on the exponents and on bounded runs. Each list of limits varies one parameter."""
     by_young, off = exponent([x.young for x in youngs], [x.measured for x in youngs])
     by_size, _ = exponent([1.0 / x.cells for x in sizes], [x.measured for x in sizes])
     by_density, _ = exponent([x.density for x in densities], [x.measured for x in densities])
@@ -177,41 +175,41 @@ def claims_of(youngs: list[Limit], sizes: list[Limit], densities: list[Limit], r
             "beyond the bound semi-implicit steps are unstable.",
             not any(r.stable for r in beyond),
             f"at {', '.join(f'{r.factor:g}' for r in beyond if r.young == beyond[0].young)} times the limit "
-            f"{sum(not r.stable for r in beyond)} of {len(beyond)} runs go beyond {BOUNDED:g} times the stretch that they begin "
-            f"with, or fail; below it {sum(r.stable for r in explicit if r.factor < 1.0)} of "
+            f"{sum(not r.stable for r in beyond)} of {len(beyond)} runs exceed {BOUNDED:g} times the initial stretch or "
+            f"fail; below it {sum(r.stable for r in explicit if r.factor < 1.0)} of "
             f"{sum(r.factor < 1.0 for r in explicit)} stay.",
         ),
         Claim("implicit steps may be larger.", all(good), _implicit_text(implicit, good)),
     ]
 
 
-def _implicit_text(implicit: list[Long], good: list[bool]) -> str:
-    """How far the implicit runs went, and those that did not end as they should."""
+def _implicit_text(implicit: list[LongRun], good: list[bool]) -> str:
+    """Reach of the implicit runs, and those that failed or were not bounded."""
     factors = ", ".join(f"{f:g}" for f in dict.fromkeys(r.factor for r in implicit))
     bad = [f"E = {r.young:.0e} Pa at {r.factor:g}: reach {r.reach:.3g}, {r.status}" for r, ok in zip(implicit, good) if not ok]
     text = (
-        f"implicit Euler at {factors} times that limit stays within {BOUNDED:g} times the stretch that it begins with, and ends "
-        f"ok, in {sum(good)} of {len(good)} runs; the farthest goes to {max(r.reach for r in implicit):.3g} times"
+        f"implicit Euler at {factors} times that limit stays within {BOUNDED:g} times the initial stretch and ends "
+        f"ok in {sum(good)} of {len(good)} runs; the largest reach is {max(r.reach for r in implicit):.3g} times"
     )
     return f"{text}. {'; '.join(bad)}." if bad else f"{text}. No limit was found."
 
 
 def limit_table(limits: list[Limit]) -> str:
-    """A row a cube and material."""
+    """A row per cube and material."""
     columns = (
         ("E [Pa]", "{.young:.0e}"),
         ("density", "{.density:g}"),
         ("h [m]", "1/{.cells}"),
         ("by runs [ms]", lambda x: f"{1e3 * x.measured:.4g}"),
         ("stable_dt [ms]", lambda x: f"{1e3 * x.stable_dt:.4g}"),
-        ("runs / told", lambda x: f"{x.measured / x.stable_dt:.4f}"),
+        ("runs / stable_dt", lambda x: f"{x.measured / x.stable_dt:.4f}"),
         ("dt / (h (density / E)^1/2)", lambda x: f"{x.measured * x.cells * np.sqrt(x.young / x.density):.3f}"),
     )
     return table(limits, columns)
 
 
-def run_table(runs: list[Long]) -> str:
-    """A row a Young's modulus and integrator, the reach at each factor."""
+def run_table(runs: list[LongRun]) -> str:
+    """A row per Young's modulus and integrator: the reach at each factor."""
 
     def reaches(kind: tuple[str, float]) -> str:
         return ", ".join(f"{r.factor:g}: {r.reach:.3g} {r.status}" for r in runs if (r.integrator, r.young) == kind)
@@ -221,8 +219,8 @@ def run_table(runs: list[Long]) -> str:
     return table(kinds, (("<steps", "{[0]}"), ("E [Pa]", "{[1]:.0e}"), (heading, reaches)))
 
 
-def draw(youngs: list[Limit], sizes: list[Limit], runs: list[Long]) -> bytes:
-    """The limit over E and over h, and how far runs go."""
+def draw(youngs: list[Limit], sizes: list[Limit], runs: list[LongRun]) -> bytes:
+    """Plot the limit over E and h, and the reach of runs."""
     figure, ((over_young, over_size, reach),) = new_figure(3)
     over_young.plot([x.young for x in youngs], [1e3 * x.measured for x in youngs], "o", color=COLOURS[0], label="by runs")
     over_young.plot([x.young for x in youngs], [1e3 * x.stable_dt for x in youngs], "-", color=COLOURS[1], label="stable_dt")
@@ -267,8 +265,8 @@ def measure(extent: Extent) -> Part:
         "bound",
         "The largest stable step",
         "section 3.3, figure 21",
-        "a unit cube of n^3 cells (six tets each), held on one side, in f64. The limit: halving the interval until it is "
-        f"{PRECISE:.1%} wide, each dt tried for {STEPS} steps after a kick of {KICK:g} of the speed of sound. Then runs of "
+        "a unit cube of n^3 cells (six tets each), held on one side, in f64. The limit: bisection to a width of "
+        f"{PRECISE:.1%}, each dt tried for {STEPS} steps after a kick of {KICK:g} of the speed of sound. Then runs of "
         f"{LONG} steps from a stretch of {STRETCH:.0%}, at multiples of the limit.",
         claims_of(youngs, sizes, densities, runs),
         [limit_table([*youngs, *sizes, *densities]), run_table(runs)],

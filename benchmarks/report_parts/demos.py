@@ -1,7 +1,7 @@
-"""Demonstrations 1 to 3 and figures 1 to 4 of the report: our demos of those scenes, each with its own check of the physics.
+"""Demonstrations 1 to 3 and figures 1 to 4 of the report: our demos of these scenes, each with its check of the physics.
 
-A demo is run once with pictures, at moments like those of the report's figures, and again without them for its time. The
-time is that of the steps alone, without compiling and drawing.
+A demo runs once with pictures at moments like those of the report's figures, and again without them for the time of its steps,
+without compilation and drawing.
 """
 
 from collections.abc import Callable
@@ -25,8 +25,8 @@ REPORTS_HOURS, HOUR = 10.0, 3600.0  # of demonstration 3; [s]
 
 @dataclass(frozen=True)
 class Scene:
-    """A demo. said: of it in the report; moments [s]: of the pictures; number: read at each moment [m], called `what`;
-    shows: whether those numbers are as the report has it."""
+    """A demo. said: the report's description; moments [s]: of the pictures; number: read at each moment [m], named `what`; shows:
+    whether these numbers agree with the report."""
 
     demo: str
     where: str
@@ -112,8 +112,8 @@ def _at(sim: ts.Simulator, body: str, chosen: Callable[[np.ndarray], np.ndarray]
 
 @dataclass
 class DemoRun:
-    """A demo as run. numbers: at the moments [m]; problem: of its own check, empty where it passed; spent: wall seconds of the
-    steps of each round; contacts: most at a time."""
+    """Run of a demo. numbers: at the moments [m]; problem: failure of its check, or empty; spent: wall seconds of the steps per
+    round."""
 
     scene: Scene
     tets: int
@@ -132,12 +132,12 @@ class DemoRun:
 
     @property
     def good(self) -> bool:
-        """Whether the run is to be trusted: its status, and its own check."""
+        """Whether status and check are ok."""
         return self.result.status == "ok" and not self.problem
 
 
 def _problem(module: ModuleType, sim: ts.Simulator, result: RunReport) -> str:
-    """What the demo's check objects to."""
+    """Failure of the demo's check, or empty."""
     try:
         module.check(sim, result)
     except AssertionError as error:
@@ -146,7 +146,7 @@ def _problem(module: ModuleType, sim: ts.Simulator, result: RunReport) -> str:
 
 
 def show(scene: Scene, arch: str, rounds: int) -> DemoRun:
-    """Run a demo with pictures, check it, and run it again for its time."""
+    """Run a demo with pictures, check it, and run it again to time it."""
     gallery = load_module(shipped_folder("assets") / "make_gallery.py")
     _, size, view = gallery.STRIPS[scene.demo]
     module = load_module(shipped_files("demos")[scene.demo])
@@ -175,7 +175,7 @@ def show(scene: Scene, arch: str, rounds: int) -> DemoRun:
 
 
 def claim_of(shown: DemoRun) -> Claim:
-    """Whether the demo shows what the report's does, and is to be trusted."""
+    """Claim that the demo agrees with the report's."""
     s, r = shown.scene, shown.result
     heights = ", ".join(f"{y:.3f}" for y in shown.numbers)
     times = ", ".join(f"{t:.3g}" for t in s.moments)
@@ -185,23 +185,23 @@ def claim_of(shown: DemoRun) -> Claim:
 
 
 def hours_claim(seconds: float, simulated: float) -> Claim:
-    """Demonstration 3 took the report ten hours."""
+    """Claim on the ten hours of demonstration 3."""
     slow = seconds > HOUR
     times = HOUR * REPORTS_HOURS / seconds
     found = f"{simulated:g} s of it take {seconds:.2g} s of computing, {times:,.0f} times less than {REPORTS_HOURS:g} hours."
-    why = "The report tells neither its machine nor how much it simulated; it ran interpreted Python in small explicit steps."
+    why = "The report gives neither its machine nor the simulated time; it ran interpreted Python with small explicit steps."
     return Claim(f"demonstration 3 takes hours, about {REPORTS_HOURS:g} (section 3.1).", slow, found, "" if slow else why)
 
 
 def demo_table(shown: list[DemoRun]) -> str:
-    """A row a demo."""
+    """A row per demo."""
     columns = (
         ("<demo", "{.scene.demo}"),
         ("<in the report", "{.scene.where}"),
         ("tets", "{.tets:,}"),
         ("<steps", "{.settings}"),
         ("simulated [s]", "{.seconds:g}"),
-        ("contacts at most", lambda s: str(max((r.n_contacts for r in s.result.step_reports), default=0))),
+        ("max. contacts", lambda s: str(max((r.n_contacts for r in s.result.step_reports), default=0))),
         ("wall s per simulated s", lambda s: f"{s.timing.median:.3g}"),
         ("spread", lambda s: percent(spread_of(s.timing))),
         ("compile [s]", "{.result.compile_seconds:.1f}"),
@@ -212,13 +212,13 @@ def demo_table(shown: list[DemoRun]) -> str:
 
 
 def measure(extent: Extent) -> Part:
-    """All demos of the report's scenes; a quick run has demonstrations 1 to 3 once."""
+    """Run all demos of the report's scenes; a quick run has demonstrations 1 to 3."""
     part = Part(
         "demos",
         "The demonstrations",
         "demonstrations 1 to 3, figures 1 to 4",
         "each demo as `taisoft run` runs it, with its own check; times are of the steps alone, medians over "
-        f"{extent.of(ROUNDS, 1)} runs. Meshes and materials are ours, since the report does not tell its own.",
+        f"{extent.of(ROUNDS, 1)} runs. Meshes and materials are ours, since the report does not give its own.",
     )
     shown = [show(s, extent.arch, extent.of(ROUNDS, 1)) for s in SCENES if s.quick or not extent.quick]
     part.claims = [claim_of(s) for s in shown]
@@ -229,7 +229,7 @@ def measure(extent: Extent) -> Part:
         part.pictures[f"{s.scene.demo}.png"] = s.picture
         part.times[f"{s.scene.demo}, a simulated second"] = s.timing
         part.short += [f"{s.scene.demo} ends {s.result.status}: {'; '.join(s.result.problems)}"] * (s.result.status != "ok")
-    part.short.append("the report's pictures are not in its text, so the likeness to them is judged by its captions.")
+    part.short.append("the report's pictures are not in its text, so ours are compared with its captions.")
     if extent.quick:
         part.short.append("a quick run leaves out figure 1.")
     return part

@@ -1,7 +1,7 @@
-"""What an experiment of `report.py` hands over, how its verdict follows from its claims, and how both become Markdown.
+"""Result of an experiment of `report.py`: claims with verdicts, tables, pictures, and their Markdown.
 
-A claim is one statement of the report beside our numbers; whether it holds is computed where the numbers are. The verdict
-of a part is "agree" where all its claims hold, "disagree" where none does, else "partly".
+A claim is a statement of the report with our numbers; the experiment computes whether it holds. The verdict of a part is "agree"
+if all its claims hold, "disagree" if none does, else "partly".
 """
 
 import io
@@ -18,25 +18,25 @@ from ..document import plain, table
 
 AGREE, PARTLY, DISAGREE, MISSING = "agree", "partly", "disagree", "not measured"
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#555555")
-PALETTE = 128  # colours of a picture: a plot needs few, and a shaded scene shows no bands yet
-PANEL, DPI = (4.4, 3.1), 85  # size of a panel in inches
+PALETTE = 128  # colours of a picture, enough to avoid bands in shaded scenes
+PANEL, DPI = (4.4, 3.1), 85  # panel size in inches
 
 
 @dataclass(frozen=True)
 class Extent:
-    """How much is measured, and where."""
+    """Extent of the measurement, and the arch."""
 
     quick: bool
     arch: str
 
     def of(self, full, quick):
-        """The one or the other."""
+        """`quick` in a quick run, else `full`."""
         return quick if self.quick else full
 
 
 @dataclass(frozen=True)
 class Claim:
-    """said: the report's statement in our words; found: our numbers in a sentence; why: they agree with it, or do not."""
+    """said: the report's statement in our words; found: our numbers in a sentence; why: explanation of the verdict."""
 
     said: str
     holds: bool
@@ -44,15 +44,14 @@ class Claim:
     why: str = ""
 
     def __post_init__(self):
-        object.__setattr__(self, "holds", bool(self.holds))  # comparisons of NumPy numbers give no bool of Python
+        object.__setattr__(self, "holds", bool(self.holds))  # NumPy comparisons give no Python bool
 
 
 @dataclass
 class Part:
-    """An experiment as measured. where: in the report; method: what was run; times: what a second run is held against.
+    """A measured experiment. where: in the report; method: what was run; times: compared with those of a second run.
 
-    pictures: file name -> PNG; short: what is not as the report has it, or was left out; failure: why it could not be measured,
-    empty where it could.
+    pictures: file name -> PNG; short: differences from the report and omissions; failure: why it could not be measured, or empty.
     """
 
     name: str
@@ -69,16 +68,16 @@ class Part:
 
     @property
     def verdict(self) -> str:
-        """Of all claims together."""
+        """Verdict on all claims."""
         return verdict_of([claim.holds for claim in self.claims]) if not self.failure else MISSING
 
     def record(self) -> dict:
-        """As plain data, without the pictures."""
+        """The part as plain data, without pictures."""
         return plain(vars(self) | {"verdict": self.verdict, "pictures": sorted(self.pictures)})
 
 
 def verdict_of(holds: Sequence[bool]) -> str:
-    """Of claims that hold or not; of none at all MISSING."""
+    """Verdict on claims that hold or not; MISSING without claims."""
     if not holds:
         return MISSING
     return AGREE if all(holds) else PARTLY if any(holds) else DISAGREE
@@ -87,13 +86,13 @@ def verdict_of(holds: Sequence[bool]) -> str:
 # --- numbers ----------------------------------------------------------------------------------------------------------
 
 
-def is_near(value: float, wanted: float, tolerance: float) -> bool:
-    """Whether |value - wanted| <= tolerance; never of what is not a number."""
-    return math.isfinite(value) and abs(value - wanted) <= tolerance
+def is_near(value: float, expected: float, tolerance: float) -> bool:
+    """Whether |value - expected| <= tolerance; False for nan."""
+    return math.isfinite(value) and abs(value - expected) <= tolerance
 
 
 def clearly_less(a: Sequence[float], b: Sequence[float]) -> bool:
-    """Whether times `a` are less than `b` by more than their spread: the upper quartile of one below the lower of the other."""
+    """Whether the upper quartile of the times `a` is below the lower quartile of `b`."""
     return float(np.percentile(a, 75)) < float(np.percentile(b, 25))
 
 
@@ -124,7 +123,7 @@ def new_figure(columns: int, lines: int = 1):
 
 
 def plot_png(figure) -> bytes:
-    """A figure as a small PNG, its logarithmic axes with plain numbers; it is closed."""
+    """Close a figure and return it as a small PNG with plain numbers on logarithmic axes."""
     from matplotlib import pyplot
 
     for panel in figure.axes:
@@ -139,8 +138,8 @@ def plot_png(figure) -> bytes:
 
 
 def part_text(part: Part) -> str:
-    """A part's section of the page."""
-    lines = [f"## {part.title}", f"The report: {part.where}. Name: `{part.name}`. Took {part.seconds:.0f} s, compiling included."]
+    """Section of a part."""
+    lines = [f"## {part.title}", f"The report: {part.where}. Name: `{part.name}`. Took {part.seconds:.0f} s with compilation."]
     if part.failure:
         return "\n\n".join([*lines, f"**{MISSING}**: {part.failure}"])
     lines += [f"**{part.verdict}**", "\n".join(claim_text(claim) for claim in part.claims), f"Run: {part.method}"]
@@ -150,12 +149,12 @@ def part_text(part: Part) -> str:
 
 
 def claim_text(claim: Claim) -> str:
-    """A line for what is said, what was found, and why."""
+    """A bullet with claim, verdict, numbers and explanation."""
     return f"* The report: {claim.said} **{'Agree' if claim.holds else 'Disagree'}**: {claim.found} {claim.why}".rstrip()
 
 
 def summary_table(parts: Sequence[Part]) -> str:
-    """A row a part: the verdict, and how many claims hold."""
+    """A row per part: verdict and number of claims that hold."""
     columns = (
         ("<experiment", "{.title}"),
         ("<in the report", "{.where}"),
@@ -166,6 +165,6 @@ def summary_table(parts: Sequence[Part]) -> str:
 
 
 def short_text(parts: Sequence[Part]) -> str:
-    """What falls short, part by part."""
+    """Differences from the report and omissions, by part."""
     lines = [f"* {part.title}: {text}" for part in parts for text in ([part.failure] if part.failure else part.short)]
-    return "## What falls short\n\n" + ("\n".join(lines) if lines else "Nothing that this run knows of.")
+    return "## Differences and omissions\n\n" + ("\n".join(lines) if lines else "Nothing known.")

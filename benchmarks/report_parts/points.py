@@ -1,10 +1,10 @@
-"""Figures 11 and 12 of the report: time of the contact points per frame and over tets, on all threads, on one, and interpreted.
+"""Figures 11 and 12 of the report: time of contact points per frame and over tets; all threads, one thread, interpreted.
 
-One thread is a child process pinned to one core, so that Taichi has no other. The interpreted loop is the report's first program:
-Python, one pair of triangles after the other. Each of two triangles whose boxes meet goes to the material space of the other's
-tet, by the barycentric coordinates of its corners there, and Frank-Wolfe with steps 2 / (i + 2) looks for its deepest point in
-the signed distances at rest (report, section 2.3.2). Weak, as there: a tet far from the triangle maps it all the same, so most
-points are found many times. Pairs, distances and places are those of a `Rig`, so that both do the same work.
+The single thread is a child process pinned to one core. The interpreted loop is the report's first program, in Python, pair by
+pair: each of two triangles with overlapping boxes is mapped to the material space of the other's tet by barycentric coordinates,
+and Frank-Wolfe with steps 2 / (i + 2) finds its deepest point in the signed distance at rest (report, section 2.3.2). Weakness,
+as there: tets far from the triangle map it as well, so most points are found many times. Pairs and distances are those of a
+`Rig`, so that both do the same work.
 """
 
 import os
@@ -23,23 +23,23 @@ from taisoft.mesh.sdf import SdfGrid
 from ..collision_cases import Setup, cubes_setup, pile_setup
 from ..collision_runs import Rig
 from ..document import exponent, ms, table, timed_cells
-from ..runner import clock, parse_result, repeated, run_python, say
+from ..runner import clock, parse_result, print_result, repeated, run_python
 from .page import COLOURS, Claim, Extent, Part, clearly_less, new_figure, plot_png
 
-FRANK_WOLFE_STEPS, CLOSED = 32, 1e-4  # at most; gap, in lengths of the triangle, at which it ends
-CONTACT_MODES = "distance_field"  # the report's way
-FILM, FRAMES = ("cubes 9", "cubes 5"), (20, 4)  # of figure 11: a cube turns on another; the first has 1,944 triangles
+FRANK_WOLFE_STEPS, CLOSED = 32, 1e-4  # maximum; duality gap over the triangle's size at which it stops
+CONTACT_MODE = "distance_field"  # as in the report
+FILM, FRAMES = ("cubes 9", "cubes 5"), (20, 4)  # figure 11: a cube turns on another; full run: 1,944 triangles
 SIZES = ("cubes 5", "cubes 9", "cubes 11", "cubes 15", "cubes 20", "pile 6"), ("cubes 2", "cubes 5")  # full, quick
 ROUNDS, PLAIN_ROUNDS = (15, 3), 2
-MOST_PLAIN = 15_000  # pairs above which the interpreted loop is left out
-TENFOLD, FLAT = 10.0, 0.1  # what the report gained; exponent of a time that does not grow
+MAX_INTERPRETED = 15_000  # maximum pairs for the interpreted loop
+TENFOLD, FLAT = 10.0, 0.1  # the report's speed-up; largest exponent that counts as constant
 
 
 # --- interpreted --------------------------------------------------------------------------------------------------------
 
 
 def candidate_pairs(rig: Rig) -> np.ndarray:
-    """(k, 2) triangles of two bodies whose boxes meet, each pair once."""
+    """(k, 2) pairs of triangles of different bodies with overlapping boxes, each pair once."""
     rows, n = rig.detection.broad.find(), rig.detection.surface.n_triangles
     start, end, entry = (field.to_numpy() for field in (rows.start, rows.end, rows.entry))
     own = np.repeat(np.arange(n), (end - start)[:n])
@@ -49,7 +49,7 @@ def candidate_pairs(rig: Rig) -> np.ndarray:
 
 
 def sample(grid: SdfGrid, X: np.ndarray) -> tuple[float, np.ndarray]:
-    """Signed distance [m] and its gradient (3,) at a material point (3,), trilinear; outside of the grid, at its border."""
+    """Trilinear signed distance [m] and gradient (3,) at a material point (3,), clamped to the grid."""
     at = np.clip((X - grid.origin) / grid.spacing, 0.0, np.array(grid.phi.shape) - 1.0)
     i = np.minimum(at.astype(int), np.array(grid.phi.shape) - 2)
     u, v, w = at - i
@@ -62,7 +62,7 @@ def sample(grid: SdfGrid, X: np.ndarray) -> tuple[float, np.ndarray]:
 
 
 def deepest_point(grid: SdfGrid, corners: np.ndarray) -> tuple[np.ndarray, float]:
-    """Weights (3,) and signed distance [m] of the deepest point that Frank-Wolfe finds in a triangle (3,3) of material points."""
+    """Weights (3,) and signed distance [m] of the deepest point in a triangle (3,3) of material points, by Frank-Wolfe."""
     values = [sample(grid, X)[0] for X in corners]
     w = np.eye(3)[int(np.argmin(values))]
     best, least = w, min(values)
@@ -80,7 +80,7 @@ def deepest_point(grid: SdfGrid, corners: np.ndarray) -> tuple[np.ndarray, float
 
 
 class PlainPoints:
-    """Contact points of a rig's pairs by the plain loop."""
+    """Contact points of a rig's pairs by the interpreted loop."""
 
     def __init__(self, rig: Rig):
         d = rig.detection
@@ -92,7 +92,7 @@ class PlainPoints:
         self._rest = np.concatenate([b.nodes.positions for b in bodies])
 
     def find(self, pairs: np.ndarray) -> list[tuple[int, int, np.ndarray, float]]:
-        """(triangle, the other, weights (3,), signed distance [m]) of each whose deepest point is nearer than the margin."""
+        """(triangle, other triangle, weights (3,), signed distance [m]) of all deepest points within the margin."""
         x, margin, found = self._rig.model.state.x.to_numpy(), self._rig.detection.margin, []
         surface = x[self._rig.detection.topology.node]
         for pair in pairs:
@@ -111,8 +111,8 @@ class PlainPoints:
 
 @dataclass
 class Points:
-    """A configuration's contact points, each list in wall seconds of the rounds. first: of the first whole search, compiling
-    included; plain: of the interpreted loop, empty where it was left out; deepest: by either [m], negative inside."""
+    """Contact points of a configuration; lists are wall seconds per round. first: first whole search with compilation; plain:
+    interpreted loop, empty if left out; deepest, plain_deepest: signed distance [m]."""
 
     setup: str
     tets: int
@@ -127,7 +127,7 @@ class Points:
 
 @dataclass
 class Measured:
-    """By one number of threads, or on the GPU. frames, plain_frames: of the film, seconds of each frame's rounds."""
+    """Results for a number of threads, or the GPU. frames, plain_frames: seconds per frame and round of the film."""
 
     where: str
     frames: list[list[float]]
@@ -136,18 +136,18 @@ class Measured:
 
 
 def setup_of(name: str) -> Setup:
-    """ "cubes 5" and "pile 6" are those of `bench collision`."""
+    """A configuration of `bench collision`, such as "cubes 5" or "pile 6"."""
     kind, cells = name.split()
     return {"cubes": cubes_setup, "pile": pile_setup}[kind](int(cells))
 
 
 def contact_seconds(rig: Rig, rounds: int) -> list[float]:
-    """Of the contact points of a search, round by round; kernels and buffers are ready."""
+    """Seconds of the contact points of a search per round, after warm-up."""
     return [rig.phases()["contacts"] for _ in range(rounds)]
 
 
 def measure_size(rig: Rig, rounds: int, plain: PlainPoints | None) -> Points:
-    """A configuration at the middle of its motion; its first search is the rig's."""
+    """Measure a configuration in the middle of its motion, with the rig's first search."""
     rig.place(0.5)
     begin = clock()
     rig.search()
@@ -156,7 +156,7 @@ def measure_size(rig: Rig, rounds: int, plain: PlainPoints | None) -> Points:
     pairs = candidate_pairs(rig)
     found = Points(rig.setup.name, rig.tets, rig.detection.surface.n_triangles, len(pairs), first, contact_seconds(rig, rounds))
     found.deepest = float(rig.detection.contacts().gap.min())
-    if plain is not None and len(pairs) <= MOST_PLAIN:
+    if plain is not None and len(pairs) <= MAX_INTERPRETED:
         contacts: list = []
         found.plain = repeated(lambda: contacts.extend(plain.find(pairs)), PLAIN_ROUNDS)
         found.plain_deepest = min(depth for *_, depth in contacts)
@@ -164,7 +164,7 @@ def measure_size(rig: Rig, rounds: int, plain: PlainPoints | None) -> Points:
 
 
 def measure_film(rig: Rig, frames: int, rounds: int, plain: PlainPoints | None) -> tuple[list[list[float]], list[list[float]]]:
-    """Seconds of each frame's rounds of contact points, and of one round of the interpreted loop."""
+    """Seconds of the contact points per frame and round, and of one round of the interpreted loop."""
     compiled, interpreted = [], []
     for k in range(frames):
         rig.place(k / max(frames - 1, 1))
@@ -177,13 +177,13 @@ def measure_film(rig: Rig, frames: int, rounds: int, plain: PlainPoints | None) 
 
 
 def measure_here(quick: bool, arch: str, plain: bool) -> Measured:
-    """Everything in this process, on the threads that it has."""
+    """Measure everything in this process, on its threads."""
     k = int(quick)
     with closing(open_runtime(arch, "f32", "the report's contact points")) as runtime:
         n = threads()
         found = Measured("GPU" if arch == "cuda" else f"{n} thread{'s' * (n > 1)}", [], [])
         for name in SIZES[k]:
-            with Rig(setup_of(name), CONTACT_MODES, runtime) as rig:
+            with Rig(setup_of(name), CONTACT_MODE, runtime) as rig:
                 loop = PlainPoints(rig) if plain else None
                 found.sizes.append(measure_size(rig, ROUNDS[k], loop))
                 if name == FILM[k]:
@@ -197,15 +197,15 @@ CHILD = "from taisoft.cli.scene_file import load_shipped; load_shipped('benchmar
 
 
 def answer(quick: bool) -> None:
-    """In the child: everything on its first core alone."""
+    """The child: measure everything on one core."""
     os.sched_setaffinity(0, usable_cores()[:1])
-    say(asdict(measure_here(quick, "cpu", plain=False)))
+    print_result(asdict(measure_here(quick, "cpu", plain=False)))
 
 
 def measure_on_one_thread(quick: bool) -> Measured:
-    """The same in a child process. Raises SimulationError where it fails."""
+    """Measure in a child process pinned to one core. Raises SimulationError on failure."""
     if not hasattr(os, "sched_setaffinity"):
-        raise SimulationError("this system pins no process to one core, so that one thread cannot be measured")
+        raise SimulationError("this system cannot pin a process to one core, so one thread cannot be measured")
     lines = run_python("the process on one thread", "-c", CHILD.format(quick))
     found = parse_result(lines[-1])
     return Measured(**found | {"sizes": [Points(**p) for p in found["sizes"]]})
@@ -215,7 +215,7 @@ def measure_on_one_thread(quick: bool) -> Measured:
 
 
 def claims_of(many: Measured, one: Measured) -> list[Claim]:
-    """Figures 11 and 12. many: on all threads, or on the GPU."""
+    """Claims of figures 11 and 12. many: on all threads, or on the GPU."""
     here = f"on {many.where}"
     per_frame = [np.median(p) / np.median(c) for c, p in zip(many.frames, many.plain_frames)]
     faster = all(clearly_less(c, p) for c, p in zip(many.frames, many.plain_frames))
@@ -240,21 +240,21 @@ def claims_of(many: Measured, one: Measured) -> list[Claim]:
             "interpreted loop over the same pairs.",
         ),
         Claim(
-            "it is running in parallel that gains this.",
+            "parallel execution causes this speed-up.",
             min(by_threads) > max(by_compiling),
             f"compiled for one thread they take {min(by_compiling):,.0f} to {max(by_compiling):,.0f} times less than "
             f"interpreted; {here} they are {min(by_threads):.2f} to {max(by_threads):.2f} times as fast as that.",
             ""
             if min(by_threads) > max(by_compiling)
-            else "Most is gained by not interpreting, which a GPU kernel does not "
-            f"either; below {SERIAL_BELOW:,} triangles one thread does it all on the CPU, since waking others costs more.",
+            else "Compilation instead of interpretation gains most, as it would in a GPU kernel; "
+            f"below {SERIAL_BELOW:,} triangles the CPU uses one thread, since waking others takes longer.",
         ),
         Claim(
             "the parallel computation is slow at its start, and steady afterwards (figure 11).",
             slow,
             f"the first search takes {min(p.first for p in many.sizes):.1f} to {max(p.first for p in many.sizes):.1f} s, its "
             f"contact points {ms(steady)} ms afterwards.",
-            "Here the start is compiling the kernels, there it was moving data.",
+            "Here the start compiles kernels, there it moved data.",
         ),
         Claim(
             "its time stays near zero however many tets there are, while the plain one's grows (figure 12).",
@@ -262,14 +262,14 @@ def claims_of(many: Measured, one: Measured) -> list[Claim]:
             f"{span} the time grows like tets^{grown:.2f} {here}, like tets^{plain:.2f} interpreted.",
             ""
             if flat
-            else "Work grows with the pairs of near triangles on the surfaces that touch, about tets^(2/3), on any "
-            "machine; near zero it looks beside the interpreted loop.",
+            else "On any machine, work grows with the pairs of near triangles on touching surfaces, about tets^(2/3); it is "
+            "near zero only in comparison with the interpreted loop.",
         ),
     ]
 
 
 def size_table(many: Measured, one: Measured) -> str:
-    """A row a configuration."""
+    """A row per configuration."""
     columns = (
         ("<scene", "{[0].setup}"),
         *((name, f"{{[0].{name}:,}}") for name in ("tets", "triangles", "pairs")),
@@ -305,7 +305,7 @@ def draw(many: Measured, one: Measured) -> bytes:
 
 
 def measure(extent: Extent) -> Part:
-    """In this process and in a child on one thread."""
+    """Measure in this process and in a child on one thread."""
     many = measure_here(extent.quick, extent.arch, plain=True)
     one = measure_on_one_thread(extent.quick)
     part = Part(
@@ -314,7 +314,7 @@ def measure(extent: Extent) -> Part:
         "section 3.1.2, figures 11 and 12",
         "contact points alone of searches through distance fields (Frank-Wolfe), bodies as in `taisoft bench collision`, in "
         "f32: compiled on all threads, compiled on one (a process that has one core), and an interpreted NumPy loop over the "
-        f"same pairs, which is not run on more than {MOST_PLAIN:,}. The deepest point of both tells that they do the same.",
+        f"same pairs, which is not run on more than {MAX_INTERPRETED:,}. Equal deepest points show that both do the same.",
         claims_of(many, one),
         [size_table(many, one)],
         {"points.png": draw(many, one)},

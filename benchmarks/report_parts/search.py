@@ -1,7 +1,6 @@
-"""The search for contacts: figures 13 and 14 of the report, the reduction of contacts, and 17 and 18, the broad phase.
+"""The search for contacts: the reduction (figures 13 and 14 of the report) and the broad phase (figures 17 and 18).
 
-Spatial hash beside bounding volume hierarchy, and the size of the hash's cells; reduction by nested loops over a list, and by
-looking each contact up once.
+Spatial hash against bounding volume hierarchy; cell size of the hash; reduction by nested loops and by one lookup per contact.
 """
 
 from contextlib import closing
@@ -18,25 +17,25 @@ from ..collision_runs import HASH, QUICK_ROUNDS, ROUNDS, TREES, Film, Row, Sweep
 from ..document import crossovers, exponent, ms
 from .page import COLOURS, Claim, Extent, Part, clearly_less, new_figure, plot_png
 
-TREE = TREES[-1]  # k-DOPs of 18 planes, as wide as the report's
+TREE = TREES[-1]  # k-DOPs of 18 planes
 REPORTS_CROSSOVER = 7500  # tets
 QUICK_CELLS = (0.5, 1.0, 2.2, 4.0)
-CELL_ROUNDS, CELL_TURNS = 60, (20, 3)  # cells near each other differ by little
-NEAR_BEST = 1.1  # times the best: what a cell may take to be called as good
-NEAR_CROSSOVER = 2.0  # a factor from the report's that still counts as its
-CONTACT_MODE = "proximity"  # has the more contacts to reduce
-FILM, QUICK_FRAMES = 15, 6  # cells of two cubes that turn on each other
+CELL_ROUNDS, CELL_TURNS = 60, (20, 3)  # many, since similar cells differ little
+NEAR_BEST = 1.1  # largest time over the best that counts as equally good
+NEAR_CROSSOVER = 2.0  # largest factor from the report's crossover that counts as equal
+CONTACT_MODE = "proximity"  # has more contacts to reduce
+FILM, QUICK_FRAMES = 15, 6  # cells of two cubes turning on each other
 SIZES = PILES[:5], PILES[:2]
-HALF_WAY = 1.5  # between the exponents of what is linear and what is square
+HALF_WAY = 1.5  # exponent between linear and quadratic growth
 
 
 # --- broad phases -------------------------------------------------------------------------------------------------------
 
 
 def broad_claims(film: Film, sweeps: list[Sweep]) -> list[Claim]:
-    """Each frame at 1,250 tets, small and large scenes, and where the one overtakes the other."""
+    """Claims on each frame at 1,250 tets, on small and large scenes, and on the crossover."""
     hashed, trees = (np.array(film.numbers[name]) for name in (HASH, TREE))
-    share = float((hashed < trees).mean())
+    fraction = float((hashed < trees).mean())
     small = [s for s in sweeps if s.tets < REPORTS_CROSSOVER]
     large = [s for s in sweeps if s.tets > REPORTS_CROSSOVER]
     slower = [clearly_less(s.rounds[TREE], s.rounds[HASH]) for s in small]
@@ -46,16 +45,16 @@ def broad_claims(film: Film, sweeps: list[Sweep]) -> list[Claim]:
     ratios = [s.median(HASH) / s.median(TREE) for s in sweeps]
     crossed = f"they cross at {', '.join(f'{x:,.0f}' for x in places)} tets." if places else "they do not cross."
     why = (
-        "The trees here are built once and only refitted; a hash is filled anew in every search, and with the few surface "
-        "triangles of such scenes neither is short of work that the other saves."
+        "The trees here are built once and then refitted, while the hash is filled in every search; such scenes have few surface "
+        "triangles."
     )
     return [
         Claim(
             "at 1,250 tets the spatial hash takes less time than the tree in every frame (figure 17, left).",
-            share == 1.0,
-            f"at {film.tets:,} tets it does in {share:.0%} of {len(hashed)} frames; medians are {1e3 * np.median(hashed):.3g} "
+            fraction == 1.0,
+            f"at {film.tets:,} tets it does in {fraction:.0%} of {len(hashed)} frames; medians are {1e3 * np.median(hashed):.3g} "
             f"and {1e3 * np.median(trees):.3g} ms.",
-            "" if share == 1.0 else why,
+            "" if fraction == 1.0 else why,
         ),
         Claim(
             f"below about {REPORTS_CROSSOVER:,} tets the hash is the slower one (section 3.1.4).",
@@ -74,7 +73,7 @@ def broad_claims(film: Film, sweeps: list[Sweep]) -> list[Claim]:
 
 
 def cell_claims(sweeps: list[Sweep]) -> list[Claim]:
-    """The best size of the cells in each scene, and small cells."""
+    """Claims on the best cell size of each scene, and on small cells."""
     claims = []
     for own in by_scene(sorted(sweeps, key=lambda s: s.at)).values():
         best = best_cell(own)
@@ -102,7 +101,7 @@ def cell_claims(sweeps: list[Sweep]) -> list[Claim]:
 
 
 def draw_broad(film: Film, sweeps: list[Sweep]) -> bytes:
-    """Figure 17."""
+    """Plot figure 17."""
     figure, ((frames, sizes),) = new_figure(2)
     for name, colour in zip((HASH, TREES[0], TREE), COLOURS):
         frames.plot([1e3 * s for s in film.numbers[name]], color=colour, label=name)
@@ -115,7 +114,7 @@ def draw_broad(film: Film, sweeps: list[Sweep]) -> bytes:
 
 
 def draw_cells(sweeps: list[Sweep]) -> bytes:
-    """Figure 18, times over the best of each scene."""
+    """Plot figure 18: times over the best of each scene."""
     figure, ((panel,),) = new_figure(1)
     for own, colour in zip(by_scene(sweeps).values(), COLOURS):
         best = best_cell(own).median(HASH)
@@ -128,7 +127,7 @@ def draw_cells(sweeps: list[Sweep]) -> bytes:
 
 
 def measure_broad_phases(extent: Extent) -> Part:
-    """Over frames at the report's size, and over tets."""
+    """Measure over frames at the report's size, and over tets."""
     with closing(open_runtime(extent.arch, "f32", "the report's broad phases")) as runtime:
         rounds = extent.of(ROUNDS, QUICK_ROUNDS)
         film = measure_film(cubes_setup(SWEPT[0]), CONTACT_MODE, runtime, extent.of(FRAMES, 4), broad=True)
@@ -143,12 +142,12 @@ def measure_broad_phases(extent: Extent) -> Part:
         [broad_table(sweeps) + "\n\n" + crossover_text(sweeps)],
         {"broad.png": draw_broad(film, sweeps)},
         {f"{s.setup}, {name}": summarise(seconds) for s in sweeps for name, seconds in s.rounds.items()},
-        ["the report's scene and k are not told, and its hash is of another kind (a perfect one)."],
+        ["the report gives neither its scene nor k, and its hash is a perfect hash."],
     )
 
 
 def measure_cells(extent: Extent) -> Part:
-    """The hash over ratios of cell to mean edge, in scenes of the report's sizes."""
+    """Measure the hash over ratios of cell to mean edge, in scenes of the report's sizes."""
     ratios, rounds = extent.of(RATIOS, QUICK_CELLS), extent.of(CELL_ROUNDS, QUICK_ROUNDS)
     turns, sizes = extent.of(*CELL_TURNS), extent.of(SWEPT, SWEPT[:1])
     with closing(open_runtime(extent.arch, "f32", "the report's cells")) as runtime:
@@ -170,7 +169,7 @@ def measure_cells(extent: Extent) -> Part:
 
 
 def reduction_claims(rows: list[Row], film: Film) -> list[Claim]:
-    """The complexity, the times over tets, and those of each frame."""
+    """Claims on complexity, on times over tets, and on times per frame."""
     found = [r.found for r in rows]
     fast, _ = exponent(found, [r.phase("reduction") for r in rows])
     slow, _ = exponent(found, [float(np.median(r.quadratic)) for r in rows])
@@ -186,8 +185,8 @@ def reduction_claims(rows: list[Row], film: Film) -> list[Claim]:
             fast < HALF_WAY < slow,
             f"from {found[0]:,} to {found[-1]:,} contacts the nested loops grow like n^{slow:.2f}, ours like n^{fast:.2f}; both "
             f"keep the same contacts in {sum(bool(r.same) for r in rows)} of {len(rows)} scenes.",
-            "In the worst case a set of hashes is O(n^2) too, where all fall into one place; Theta(n) is what is expected. And "
-            "the old loop as printed does not reduce: its list starts empty, so nothing is ever put into it.",
+            "With all entries in one bucket a hash set is O(n^2) too; Theta(n) is the expected cost. The old "
+            "loop as printed does not reduce: its list starts empty and stays empty.",
         ),
         Claim(
             "at every size the new reduction is faster (figure 14).",
@@ -200,23 +199,23 @@ def reduction_claims(rows: list[Row], film: Film) -> list[Claim]:
             grown < 0.1,
             f"it grows like tets^{grown:.2f}, from {ms(rows[0].phase('reduction'))} ms at {tets[0]:,} tets to "
             f"{ms(rows[-1].phase('reduction'))} ms at {tets[-1]:,}.",
-            "" if grown < 0.1 else "Each contact is looked at, so what is linear in contacts grows with the surface.",
+            "" if grown < 0.1 else "The reduction visits each contact, and their number grows with the surface.",
         ),
         Claim(
             "over the frames the new one is steady, while the old one's time fluctuates (figure 13).",
             swing[0] < swing[1] and float(np.median(steady)) < float(np.median(before)),
             f"over {len(steady)} frames with {min(film.numbers['found']):,} to {max(film.numbers['found']):,} contacts the new "
-            f"one takes {ms(np.median(steady))} ms and the old one {ms(np.median(before))} ms, medians; largest less least, over "
-            f"the median, are {swing[0]:.0%} and {swing[1]:.0%}.",
+            f"one takes {ms(np.median(steady))} ms and the old one {ms(np.median(before))} ms, medians; their relative ranges "
+            f"are {swing[0]:.0%} and {swing[1]:.0%}.",
             ""
             if swing[0] < swing[1]
-            else "Both follow the number of contacts; at tenths of a millisecond the rest is the machine.",
+            else "Both follow the number of contacts; at tenths of a millisecond the rest is noise of the machine.",
         ),
     ]
 
 
 def draw_reduction(rows: list[Row], film: Film) -> bytes:
-    """Figure 13 on the left, 14 on the right."""
+    """Plot figures 13 and 14."""
     figure, ((frames, sizes),) = new_figure(2)
     for k, (name, label) in enumerate((("reduction", "O(n)"), ("quadratic", "O(n^2)"))):
         frames.plot([1e3 * s for s in film.numbers[name]], color=COLOURS[k], label=label)
@@ -229,7 +228,7 @@ def draw_reduction(rows: list[Row], film: Film) -> bytes:
 
 
 def measure_reduction(extent: Extent) -> Part:
-    """Piles of touching cubes for the sizes, a cube that turns on another for the frames."""
+    """Measure piles of touching cubes over tets, and a cube turning on another over frames."""
     with closing(open_runtime(extent.arch, "f32", "the report's reduction")) as runtime:
         rounds = extent.of(ROUNDS, QUICK_ROUNDS)
         rows = [measure_row(pile_setup(n), CONTACT_MODE, runtime, rounds) for n in extent.of(*SIZES)]
@@ -240,13 +239,12 @@ def measure_reduction(extent: Extent) -> Part:
         "reduction",
         "Reduction of contacts",
         "section 3.1.3, figures 13 and 14",
-        "the contacts of one search, reduced by a grid of cells that holds each once, and by two nested loops over the list; "
-        "both are compiled, the loops for one thread. Piles of 27 touching cubes over tets, two cubes turning on each other "
-        "over frames.",
+        "the contacts of one search, reduced by a grid of cells and by two nested loops over the list; both are compiled, the "
+        "loops for one thread. Piles of 27 touching cubes over tets, two cubes turning on each other over frames.",
         reduction_claims(rows, film),
         [reduction_table(rows)],
         {"reduction.png": draw_reduction(rows, film)},
         {f"{r.setup}, O(n)": summarise(r.phases["reduction"]) for r in rows}
         | {f"{r.setup}, O(n^2)": summarise(r.quadratic) for r in rows},
-        ["the report's loops are interpreted Python; these are compiled, so that they differ by their algorithms alone."],
+        ["the report's loops are interpreted Python; here both are compiled, so that only the algorithms differ."],
     )

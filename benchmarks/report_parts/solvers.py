@@ -1,7 +1,6 @@
-"""The contact solve: figure 19 of the report, colourings of the contact graph, and figure 20, the contact solvers.
+"""The contact solve: colourings of the contact graph (figure 19 of the report) and contact solvers (figure 20).
 
-Colourings are those of two cubes on two boxes; iterations and time of the solvers are measured on a cube on a box, and on plates
-with many contacts, of which the report expects more than it measures.
+Colourings are measured on two cubes on two boxes, solvers on a cube on a box and on plates with many contacts.
 """
 
 from contextlib import closing
@@ -33,24 +32,24 @@ from .page import COLOURS, Claim, Extent, Part, clearly_less, is_near, new_figur
 
 COLOURED_SCENE = "two_cubes_two_boxes"
 REPORTS_CONTACTS, COLOURS_FOUND = REPORT[COLOURED_SCENE]
-SETTLE = 60  # steps from the first impulse on, by which the cubes lie on their boxes
+SETTLE = 60  # steps after the first impulse until the cubes rest on their boxes
 SCENE = "cube_on_box"
 FRAMES, QUICK_FRAMES = 60, 5
-PLATES = (8, 32, 96)  # cells of two plates on each other: some 130 to 17,000 contacts
+PLATES = (8, 32, 96)  # cells of two plates on each other: about 130 to 17,000 contacts
 JACOBI, HYBRID = "jacobi", "hybrid"
-SPIKE = 5.0  # times the median: a frame that counts as a spike
-MOSTLY = 0.9  # of the frames in which what is by far the fastest is faster
-BANDS = COLOURS[:2]  # of groups in turn
-WAYS = ("random", "greedy")  # of the grouped Jacobians
+SPIKE = 5.0  # time over the median from which a frame is a spike
+MOSTLY = 0.9  # fraction of frames in which a solver must win to be by far the fastest
+BANDS = COLOURS[:2]  # alternating colours of groups
+COLOURINGS = ("random", "greedy")  # drawn as grouped Jacobians
 PICTURE = (640, 520)  # pixels of a scene
-NEAR = 0.25  # of a number of the report's, within which ours counts as its
+NEAR = 0.25  # relative difference from the report's number that counts as equal
 
 
 # --- colours ------------------------------------------------------------------------------------------------------------
 
 
 def colour_claims(found: list[Colouring]) -> list[Claim]:
-    """Numbers of colours and contacts. found: of scenes from coarse to fine, ways as `colour_all` has them."""
+    """Claims on colours and contacts. found: colourings of scenes from coarse to fine."""
     by = {(c.scene, c.way): c for c in found}
     scenes = list(dict.fromkeys(c.scene for c in found))
     greedy, random = ([float(np.median(by[scene, way].numbers)) for scene in scenes] for way in ("greedy", "random"))
@@ -64,26 +63,25 @@ def colour_claims(found: list[Colouring]) -> list[Claim]:
             f"the scene has {REPORTS_CONTACTS} contacts.",
             any(is_near(k, REPORTS_CONTACTS, NEAR * REPORTS_CONTACTS) for k in contacts),
             f"ours has {_listed(contacts)}, on the demo's mesh and on that once refined.",
-            "The number is that of the mesh, which the report does not tell, and of what its reduction leaves.",
+            "The number depends on the mesh, which the report does not give, and on its reduction.",
         ),
         Claim(
             f"greedy colouring needs fewer groups than random, {theirs} against {COLOURS_FOUND['random']}.",
             fewer,
             f"greedy needs {_listed(greedy)}, random {_listed(random)} (median over seeds), {each}.",
-            "" if fewer else "Both come to the fewest that there can be, so that neither can be better.",
+            "" if fewer else "Both reach the minimum.",
         ),
         Claim(
-            "so many groups are needed that each holds about three contacts.",
+            "each group holds only about three contacts.",
             all(groups),
             f"greedy groups hold {_listed(round(k / n, 1) for k, n in zip(contacts, greedy))} contacts each, {each}.",
             ""
             if all(groups)
-            else f"No colouring can do with fewer groups than contacts meet at one node, here "
-            f"{_listed(least)}, and greedy comes to about that. A greedy colouring of {theirs} colours says that some contact of "
-            f"the report's has at least {theirs - 1} neighbours.",
+            else f"A colouring needs at least as many groups as contacts meet at one node, here {_listed(least)}, and greedy "
+            f"needs about as many. With {theirs} greedy colours, a contact of the report had at least {theirs - 1} neighbours.",
         ),
         Claim(
-            "random colouring is not steady.",
+            "random colouring varies.",
             max(spans) > 0,
             f"over {len(by[scenes[0], 'random'].numbers)} seeds its numbers of groups span {_listed(spans)}.",
         ),
@@ -96,7 +94,7 @@ def _listed(values) -> str:
 
 @dataclass
 class Snapshot:
-    """A scene at one moment. image (h,w,3); touched (k, n_nodes) bool: which contact pushes which node; colours: way -> (k,)."""
+    """A scene at one moment. image (h,w,3); touched (k, n_nodes) bool: nodes of each contact; colours: method -> (k,)."""
 
     scene: str
     image: np.ndarray
@@ -105,7 +103,7 @@ class Snapshot:
 
 
 def take_snapshot(scene: str, sim, colours: dict[str, np.ndarray]) -> Snapshot:
-    """The present picture of a simulator and its contact Jacobian, of nodes that some contact pushes."""
+    """Picture of a simulator and its contact Jacobian, for nodes with contacts."""
     J = contact_jacobian(sim._dynamics.contact.problem).tocoo()
     touched = np.zeros((J.shape[0] // 3, J.shape[1] // 3), dtype=bool)
     touched[J.row // 3, J.col // 3] = True
@@ -114,15 +112,15 @@ def take_snapshot(scene: str, sim, colours: dict[str, np.ndarray]) -> Snapshot:
 
 
 def figure_19(panels, s: Snapshot) -> None:
-    """The scene, its Jacobian, and that with its rows grouped by colour; groups have two tints in turn."""
+    """Plot the scene, its Jacobian, and the Jacobian grouped by colour with alternating tints."""
     panels[0].imshow(s.image)
     panels[0].set_axis_off()
     panels[0].set_title(f"{s.scene} (as fig. 19)")
     _spy(panels[1], s.touched, np.zeros(len(s.touched), dtype=int), f"contact Jacobian: {len(s.touched)} contacts")
-    for panel, way in zip(panels[2:], WAYS):
-        order, start = groups(s.colours[way])
+    for panel, method in zip(panels[2:], COLOURINGS):
+        order, start = groups(s.colours[method])
         band = np.repeat(np.arange(len(start) - 1), np.diff(start))
-        _spy(panel, s.touched[order], band % len(BANDS), f"grouped, {way}: {len(start) - 1} colours")
+        _spy(panel, s.touched[order], band % len(BANDS), f"grouped, {method}: {len(start) - 1} colours")
         for at in start[1:-1]:
             panel.axhline(at - 0.5, color="#bbbbbb", lw=0.6, zorder=0)
 
@@ -131,13 +129,13 @@ def _spy(panel, touched: np.ndarray, band: np.ndarray, title: str) -> None:
     row, column = np.nonzero(touched)
     size = min(30.0, 4e4 / touched.size + 2.0)
     panel.scatter(column, row, s=size, marker="s", linewidths=0, c=np.array(BANDS)[band[row]])
-    panel.set(title=title, xlabel="nodes that are pushed", ylabel="contacts")
+    panel.set(title=title, xlabel="nodes in contact", ylabel="contacts")
     panel.set_xlim(-0.5, touched.shape[1] - 0.5)
     panel.set_ylim(touched.shape[0] - 0.5, -0.5)
 
 
 def measure_colours(extent: Extent) -> Part:
-    """The demo in explicit steps, as it is and, in a full run, refined once."""
+    """Measure the demo in explicit steps, in a full run also refined once."""
     found, times, picture = [], {}, b""
     for refine in extent.of((0, 1), (0,)):
         with open_explicit(COLOURED_SCENE, extent.arch, refine or None) as sim:
@@ -163,10 +161,7 @@ def measure_colours(extent: Extent) -> Part:
         [colour_table(found)],
         {"colours.png": picture},
         times,
-        [
-            f"the report's mesh is not told, so its {REPORTS_CONTACTS} contacts are met only about as well as a "
-            "refinement comes to them."
-        ],
+        [f"the report does not give its mesh, so its {REPORTS_CONTACTS} contacts are reproduced only approximately."],
     )
 
 
@@ -174,17 +169,17 @@ def measure_colours(extent: Extent) -> Part:
 
 
 def solver_claims(film: Film, points: list[Point]) -> list[Claim]:
-    """Iterations, times, spikes, serial against parallel. points: of the crossover, none in a quick run."""
+    """Claims on iterations, times, spikes, and serial against parallel. points: of the crossover, empty in a quick run."""
     contacts = float(np.median(film.contacts))
     sweeps = {name: np.array([o.sweeps for o in film.of(name)]) for name in film.solvers}
     times = {name: [o.median for o in film.of(name)] for name in film.solvers}
-    told = ", ".join(f"{name} {ms(np.median(t))}" for name, t in times.items())
+    times_text = ", ".join(f"{name} {ms(np.median(t))}" for name, t in times.items())
     beaten = float((sweeps[SERIAL] <= sweeps[JACOBI]).mean())
     few = beaten == 1.0 and np.median(sweeps[SERIAL]) < np.median(sweeps[JACOBI])
     fastest = min(times, key=lambda name: np.median(times[name]))
     hybrid = min((name for name in times if name.startswith(HYBRID)), key=lambda name: np.median(times[name]))
-    won = [float(np.less(times[hybrid], t).mean()) for name, t in times.items() if not name.startswith(HYBRID)]
-    clear = min(won) >= MOSTLY
+    wins = [float(np.less(times[hybrid], t).mean()) for name, t in times.items() if not name.startswith(HYBRID)]
+    is_clear = min(wins) >= MOSTLY
     parallel = [name for name in times if name.startswith(COLOURED)]
     slow = all(np.median(times[SERIAL]) <= np.median(times[name]) for name in parallel)
     jacobi = [name for name in times if name.startswith(JACOBI)]
@@ -194,24 +189,24 @@ def solver_claims(film: Film, points: list[Point]) -> list[Claim]:
             f"the scene has {CONTACTS[SCENE]} contacts.",
             is_near(contacts, CONTACTS[SCENE], NEAR * CONTACTS[SCENE]),
             f"ours has {contacts:g}, median over {len(film.contacts)} frames.",
-            "The number is that of the mesh, which the report does not tell, and of what its reduction leaves.",
+            "The number depends on the mesh, which the report does not give, and on its reduction.",
         ),
         Claim(
             "Gauss-Seidel needs fewer iterations than Jacobi in every frame.",
             bool(few),
             f"medians are {np.median(sweeps[SERIAL]):g} and {np.median(sweeps[JACOBI]):g} sweeps (hybrid "
-            f"{np.median(sweeps[HYBRID]):g}); Gauss-Seidel needs no more in {beaten:.0%} of the frames. The residual is looked "
-            "at after every fifth sweep.",
+            f"{np.median(sweeps[HYBRID]):g}); Gauss-Seidel needs no more in {beaten:.0%} of the frames. The residual is "
+            "computed after every fifth sweep.",
         ),
         Claim(
             "the parallel hybrid is by far the fastest.",
-            clear,
-            f"{fastest} is the fastest in the median; {hybrid} is faster than each of the others in at least {min(won):.0%} of "
-            f"the frames. Medians, in ms: {told}.",
+            is_clear,
+            f"{fastest} is the fastest in the median; {hybrid} is faster than each of the others in at least {min(wins):.0%} of "
+            f"the frames. Medians, in ms: {times_text}.",
             ""
-            if clear
-            else "Hybrid sweeps are Jacobi's with the newest normal impulse in the friction bound: they need about "
-            "as many. With tens of contacts a compiled serial sweep takes microseconds, less than waking a thread.",
+            if is_clear
+            else "Hybrid sweeps are Jacobi sweeps with the newest normal impulse in the friction bound and about as many. With "
+            "tens of contacts a compiled serial sweep takes microseconds, less than waking a thread.",
         ),
         Claim(
             "in so small a scene parallel Gauss-Seidel is no faster than serial.",
@@ -226,14 +221,14 @@ def solver_claims(film: Film, points: list[Point]) -> list[Claim]:
             "the slowest frame takes "
             + ", ".join(f"{s:.1f} times the median ({n})" for n, s in zip(jacobi, spikes))
             + f"; the frame with most sweeps has {sweeps[JACOBI].max() / np.median(sweeps[JACOBI]):.1f} times the median's.",
-            "The report blames the machine; frames that need more sweeps take longer, too.",
+            "The report attributes them to the machine; frames that need more sweeps take longer, too.",
         ),
     ]
     return claims + ([more_contacts(points)] if points else [])
 
 
 def more_contacts(points: list[Point]) -> Claim:
-    """What the report expects of larger scenes."""
+    """Claim on larger scenes."""
     last = points[-1]
     overtaken = clearly_less(last.coloured.seconds, last.serial.seconds)
     return Claim(
@@ -241,14 +236,12 @@ def more_contacts(points: list[Point]) -> Claim:
         overtaken,
         f"at {last.contacts:,} contacts a solve takes {ms(last.serial.median)} ms serial and {ms(last.coloured.median)} ms "
         f"coloured; a sweep alone {ms(last.serial.per_sweep)} and {ms(last.coloured.per_sweep)} ms.",
-        ""
-        if overtaken
-        else "On so few threads what a sweep gains is less than colouring costs and than the sweeps lose by their order.",
+        "" if overtaken else "On so few threads the gain per sweep is less than the cost of colouring and of additional sweeps.",
     )
 
 
 def draw(film: Film) -> bytes:
-    """Figure 20: sweeps and time of each solver over frames, and the contacts."""
+    """Plot figure 20: sweeps and time of each solver over frames, and the contacts."""
     figure, (panels,) = new_figure(3)
     for name, colour in zip(film.solvers, COLOURS):
         style = {"color": colour, "label": name, "lw": 1.2, "ls": "--" if name.endswith(THREADED) else "-"}
@@ -270,7 +263,7 @@ def draw(film: Film) -> bytes:
 
 
 def measure_solvers(extent: Extent) -> Part:
-    """A film of the demo's contact problems, each solved by every solver, and plates with many contacts."""
+    """Measure a film of the demo's contact problems with every solver, and plates with many contacts."""
     with open_explicit(SCENE, extent.arch) as sim:
         film = measure_film(SCENE, sim, extent.of(FRAMES, QUICK_FRAMES), Solvers(threads=not extent.quick))
     tables, points = [count_table([film]), solver_table([film])], []
@@ -283,14 +276,14 @@ def measure_solvers(extent: Extent) -> Part:
         "Contact solvers",
         "section 3.2.4, figure 20",
         f"the contact problems of explicit steps of the demo {SCENE}, one a frame, each solved to a residual of 1e-4 by all "
-        f"solvers in turns; loops run on one thread, or, where it says{THREADED}, on all. And two plates with many contacts.",
+        f"solvers in turn; loops run on one thread, or on all if marked '{THREADED}'. Also two plates with many contacts.",
         solver_claims(film, points),
         tables,
         {"solvers.png": draw(film)},
     )
     part.short.append(
-        f"the report's {CONTACTS[SCENE]} contacts are not reached: its mesh is not told, and ours has "
-        f"{np.median(film.contacts):g}. Its solvers were run to a tolerance that it does not tell."
+        f"the report's {CONTACTS[SCENE]} contacts are not reproduced: it does not give its mesh, and ours has "
+        f"{np.median(film.contacts):g}. It does not give the solvers' tolerance either."
     )
     if extent.quick:
         part.short.append("a quick run leaves out solvers on all threads and the plates with many contacts.")

@@ -1,1 +1,1 @@
-"""Works that programs are given to do: scenes as data, exact references, and how a result is judged."""
+"""Works for comparing programs: scenes as data, exact references, evaluation of results."""

@@ -1,11 +1,10 @@
-"""Exact paths of W1 and W2 for each program's own law and masses, stored in data/works.npz with what they are good to.
+"""Exact paths of W1 and W2 for each program's law and masses, stored in data/works.npz with their uncertainty.
 
-W1: the mean of the beam's end face, by Runge-Kutta of order 8 (exact_path.py, which stores St. Venant-Kirchhoff's at 1 MPa).
-W2: the mass centre's height, by velocity Verlet with contact at the nodes: those that would be below the ground after a step
-are stopped on it, and slowed along it by friction at most. That is of first order in dt; the path is that of DT / 2, and what
-it is good to its distance to that of DT.
+W1: the mean of the beam's end face, by Runge-Kutta of order 8 (exact_path.py, which stores St. Venant-Kirchhoff's at 1 MPa). W2:
+the mass centre's height, by velocity Verlet with contact at the nodes: those that would end a step below the ground stop on it,
+with Coulomb friction. This is of first order in dt; the path is that of DT / 2, its uncertainty the distance to that of DT.
 
-`python -m benchmarks.works.references` makes the file (some 20 minutes).
+`python -m benchmarks.works.references` computes the file (about 20 minutes).
 """
 
 import argparse
@@ -29,7 +28,7 @@ TOLERANCES = (1e-7, 1e-9)  # of W1
 
 @dataclass(frozen=True)
 class Model:
-    """What a program solves: its law (see semi_discrete.LAWS) and whether all nodes have the same mass."""
+    """Model of a program: its law (see semi_discrete.LAWS), and whether all nodes have equal masses."""
 
     law: str
     equal_masses: bool = False
@@ -44,14 +43,14 @@ MODELS = (TAISOFT, MUJOCO, PYBULLET, NEWTON)
 
 @dataclass(frozen=True)
 class Reference:
-    """path (k,d) [m], a point every SAMPLE from 0 on; good_to: the error of it, as `error` counts."""
+    """path (k,d) [m], a point every SAMPLE from 0 on; good_to: its uncertainty, as an `error`."""
 
     work: Work
     path: np.ndarray
     good_to: float
 
     def error(self, path: np.ndarray) -> float:
-        """Of a path (k,d) [m]: W1's largest distance over the excursion; W2's root mean square over 0.5 m, as it drops."""
+        """Error of a path (k,d) [m]: W1: largest distance over the excursion; W2: root mean square over the drop of 0.5 m."""
         away = np.linalg.norm(path - self.path, axis=1)
         if self.work.cells is None:
             return float(np.sqrt(np.mean(away**2)) / 0.5)
@@ -59,7 +58,7 @@ class Reference:
 
 
 def observed(work: Work, positions: np.ndarray, mass: np.ndarray) -> np.ndarray:
-    """What a reference knows of positions (k,n,3) [m]: W1's tip (k,3), W2's height of the mass centre (k,1)."""
+    """The compared quantity from positions (k,n,3) [m]: W1's tip (k,3), W2's height of the mass centre (k,1)."""
     if work.cells is None:
         return (positions[:, :, 1] @ mass / mass.sum())[:, None]
     x = work.start[:, 0]
@@ -67,7 +66,7 @@ def observed(work: Work, positions: np.ndarray, mass: np.ndarray) -> np.ndarray:
 
 
 def masses(work: Work, model: Model) -> np.ndarray:
-    """Of all nodes (n,) [kg]; of W3 and W4 body by body."""
+    """Masses of all nodes (n,) [kg], body after body."""
     return np.concatenate([_semi_discrete(work, k, model).mass for k in range(len(work.bodies))])
 
 
@@ -78,7 +77,7 @@ def _semi_discrete(work: Work, k: int, model: Model) -> SemiDiscrete:
 
 
 def fall_on_ground(body: SemiDiscrete, friction: float, dt: float, seconds: float) -> np.ndarray:
-    """Height of the mass centre (k,1) [m] every SAMPLE. Raises SimulationError where it diverges."""
+    """Height of the mass centre (k,1) [m] every SAMPLE. Raises SimulationError if it diverges."""
     steps = round(SAMPLE / dt)
     u, v = np.zeros((2, 3, len(body.mass)))
     height, heights = body.vertices[:, 1], []
@@ -86,7 +85,7 @@ def fall_on_ground(body: SemiDiscrete, friction: float, dt: float, seconds: floa
     for k in range(round(seconds / SAMPLE) * steps + 1):
         if k % steps == 0:
             heights.append(body.mass @ (height + u[1]) / body.mass.sum())
-        down = -(height + u[1]) / dt  # below it a velocity leads under the ground
+        down = -(height + u[1]) / dt  # lower velocities end below the ground
         hit = v[1] < down
         pushed = (down - v[1])[hit]
         v[1, hit] = down[hit]
@@ -100,7 +99,7 @@ def fall_on_ground(body: SemiDiscrete, friction: float, dt: float, seconds: floa
 
 
 def make(work: Work, model: Model) -> tuple[np.ndarray, float]:
-    """Path and what it is good to."""
+    """Compute a path and its uncertainty."""
     if work.cells is None:
         body = _semi_discrete(work, 0, model)
         loose, path = (fall_on_ground(body, work.friction, dt, work.seconds) for dt in (DT, DT / 2))
@@ -111,12 +110,12 @@ def make(work: Work, model: Model) -> tuple[np.ndarray, float]:
 
 
 def stored_elsewhere(work: Work, model: Model) -> bool:
-    """Whether exact_path.py has it."""
+    """Whether exact_path.py stores this path."""
     return work.cells is not None and model == MUJOCO and work.bodies[0].young == YOUNG
 
 
 def load(work: Work, model: Model) -> Reference:
-    """The stored reference. Raises SimulationError where there is none."""
+    """The stored reference. Raises SimulationError without one."""
     if stored_elsewhere(work, model):
         exact = load_exact(work.cells)
         return Reference(work, exact.path, float(exact.convergence.max()))
@@ -127,9 +126,9 @@ def load(work: Work, model: Model) -> Reference:
 
 
 def main(arguments=None) -> None:
-    """Make the file; what it holds already is kept unless --anew."""
+    """Compute the file; existing paths are kept without --anew."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--anew", action="store_true", help="make all of them")
+    parser.add_argument("--anew", action="store_true", help="recompute all")
     options = parser.parse_args(arguments)
     kept = dict(np.load(DATA)) if DATA.exists() and not options.anew else {}
     for work, model in product((work for work in WORKS if work.kind == "path"), MODELS):

@@ -1,6 +1,5 @@
-"""All programs' settings on one work, in rounds, so that a slow minute of the machine falls on all of them; and the fastest."""
+"""All programs' settings on one work, in rounds, so that a slow minute of the machine affects all; and the fastest."""
 
-import sys
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field
 from datetime import datetime
@@ -15,17 +14,18 @@ from taisoft.study.results import cheapest
 from ..elasticity_runs import TAISOFT as OWN
 from ..elasticity_runs import repeat_short
 from ..programs.session import Setting
-from .judge import Verdict, judge
+from ..runner import progress
+from .evaluation import Verdict, evaluate
 from .references import MODELS
 from .scenes import Work
 
-KEPT = ("rounds", "build_seconds", "unconverged", "failure")  # of a row, as they are in its record
-ENOUGH_SECONDS, ENOUGH_BUILDING = 10.0, 20.0  # wall time of a run, and of building for one, from which on it is not repeated
+KEPT = ("rounds", "build_seconds", "unconverged", "failure")  # attributes of a row that its record has unchanged
+ENOUGH_SECONDS, ENOUGH_BUILDING = 10.0, 20.0  # wall time of a run and of its building from which it is not repeated
 
 
 @dataclass
 class Row:
-    """One setting of one program on one work. rounds: wall seconds per simulated second of every run; failure: why none."""
+    """One setting of one program on one work. rounds: wall seconds per simulated second of every run."""
 
     work: Work
     setting: Setting
@@ -34,7 +34,7 @@ class Row:
     verdict: Verdict | None = None
     unconverged: int = 0
     failure: str = ""
-    date: str = ""  # when it was begun
+    date: str = ""  # of its start
 
     def __str__(self) -> str:
         s = self.setting
@@ -42,23 +42,23 @@ class Row:
 
     @property
     def timing(self) -> Timing | None:
-        """Of a simulated second [s]; None where no run ended."""
+        """Timing of a simulated second [s]; None if no run ended."""
         runs = [seconds for one in self.rounds for seconds in one]
         return summarise(runs) if runs else None
 
     @property
     def stood(self) -> bool:
-        """Whether it did a work that must stand."""
+        """Whether it stood, with all steps converged."""
         return self.verdict is not None and self.verdict.stands and not self.unconverged
 
     @property
     def claimed(self) -> float:
-        """Its error, at least what the reference is good to; not a number where it has none."""
+        """Its error, at least the reference's uncertainty; nan without one."""
         known = self.verdict is not None and self.verdict.error is not None
         return max(self.verdict.error, self.verdict.good_to) if known else float("nan")
 
     def record(self) -> dict:
-        """As plain data."""
+        """The row as plain data."""
         same = {name: getattr(self, name) for name in (*KEPT, "date")}
         return same | {
             "work": self.work.key,
@@ -70,7 +70,7 @@ class Row:
 
 
 def row_of(work: Work, record: dict, date: str) -> Row:
-    """The row that `Row.record` is of. date: where the record has none."""
+    """The row of a record. date: default if the record has none."""
     numbers = {key: value for key, value in record["setting"].items() if key != "dt"}
     setting = Setting(**numbers | {"model": next(model for model in MODELS if str(model) == numbers["model"])})
     verdict = record["verdict"] and Verdict(**record["verdict"])
@@ -78,29 +78,29 @@ def row_of(work: Work, record: dict, date: str) -> Row:
 
 
 def measure(work: Work, programs: Iterable[ModuleType], rounds: int, arch: str = "cpu") -> list[Row]:
-    """The rows of a work. What diverges or is refused says so and is left out of what follows."""
+    """Measure the rows of a work. A row that diverges or is refused records its failure and is skipped from then on."""
     adapters = {program.NAME: program for program in programs}
     date = datetime.now().isoformat(timespec="minutes")
     settings = [setting for program in adapters.values() for setting in program.settings(work, arch)]
     rows = [Row(work, setting, date=date) for setting in settings]
     for number in range(rounds):
         for row in rows:
-            if row.failure or (row.rounds and is_dear(row.rounds[0][0] * work.seconds, row.build_seconds[0])):
+            if row.failure or (row.rounds and is_expensive(row.rounds[0][0] * work.seconds, row.build_seconds[0])):
                 continue
-            print(f"{work.key}, round {number + 1} of {rounds}: {row.setting.program} {row.setting}", file=sys.stderr, flush=True)
+            progress(f"{work.key}, round {number + 1} of {rounds}: {row.setting.program} {row.setting}")
             positions = _round(row, adapters[row.setting.program])
             if positions is not None:
-                row.verdict = judge(work, row.setting.model, positions)
+                row.verdict = evaluate(work, row.setting.model, positions)
     return rows
 
 
-def is_dear(seconds: float, build_seconds: float) -> bool:
-    """Whether a run of so long [s] is not repeated."""
+def is_expensive(seconds: float, build_seconds: float) -> bool:
+    """Whether a run takes too long [s] to be repeated."""
     return seconds > ENOUGH_SECONDS or build_seconds > ENOUGH_BUILDING
 
 
 def _round(row: Row, program: ModuleType) -> np.ndarray | None:
-    """Run a row once more. Returns the positions of a run that was followed, the first; a failure is the row's."""
+    """Run a row once more. The first run returns its positions; the row records a failure."""
     positions = None
     try:
         session = program.Run(row.work, row.setting)
@@ -109,13 +109,13 @@ def _round(row: Row, program: ModuleType) -> np.ndarray | None:
             if row.verdict is None:
                 positions, seconds = session.run(follow=True)
                 row.unconverged = session.unconverged
-                if is_dear(seconds, session.build_seconds):
+                if is_expensive(seconds, session.build_seconds):
                     row.rounds.append([seconds / row.work.seconds])
                     return positions
             row.rounds.append(list(repeat_short(lambda: session.run(follow=False)[1] / row.work.seconds)))
         finally:
             session.close()
-    except Exception as error:  # of another program's own kinds; ours are known
+    except Exception as error:  # other programs raise exceptions of their own
         if program.NAME == OWN and not isinstance(error, TaisoftError):
             raise
         row.failure = str(error)
@@ -124,13 +124,13 @@ def _round(row: Row, program: ModuleType) -> np.ndarray | None:
 
 
 def fastest_within(rows: list[Row], error: float) -> Row | None:
-    """Of these rows the fastest whose error is at most that."""
+    """The fastest of these rows with at most this error."""
     timed = [row for row in rows if row.timing is not None]
     found = cheapest([(row.timing.median, row.claimed) for row in timed], error)
     return None if found is None else timed[found]
 
 
 def fastest_standing(rows: list[Row]) -> Row | None:
-    """Of these rows the fastest that stood."""
+    """The fastest of these rows that stood."""
     stood = [row for row in rows if row.timing is not None and row.stood]
     return min(stood, key=lambda row: row.timing.median, default=None)

@@ -1,6 +1,6 @@
 """The works as data: W1 a hanging beam, W2 a cube that drops on the ground, W3 three cubes on each other, W4 one on a sheet.
 
-All of 1000 kg/m^3 and Poisson's ratio 0.3, five tets a cell, undamped, at rest at the start.
+All have 1000 kg/m^3, Poisson's ratio 0.3 and five tets per cell; they are undamped and start at rest.
 """
 
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ G = 9.81  # m/s^2, where bodies drop
 
 @dataclass(frozen=True)
 class Body:
-    """mesh: where it starts [m]. young [Pa]. fixed: (n,) bool."""
+    """mesh: initial positions [m]. young [Pa]. fixed: (n,) bool."""
 
     name: str
     mesh: TetMesh
@@ -31,8 +31,8 @@ class Body:
 class Work:
     """kind: "path" (an exact path of a point is known) or "stand" (it must stand). ground: the plane y = 0. seconds [s].
 
-    gravity [m/s^2] along -y. friction: of everything. cells: of the beam's mesh, None elsewhere. free_until: how long the last
-    body falls freely [s], where that is judged: nothing has reached it.
+    gravity [m/s^2] along -y. friction: of all contacts. cells: of the beam's mesh, else None. free_until: time until which the
+    last body falls freely [s], if evaluated.
     """
 
     key: str
@@ -48,7 +48,7 @@ class Work:
 
     @property
     def stiff(self) -> bool:
-        """Whether explicit steps are far shorter than anything that is looked at."""
+        """Whether explicit steps are far shorter than the motion of interest."""
         return max(body.young for body in self.bodies) > 1e7
 
     @property
@@ -66,7 +66,7 @@ class Work:
         return self.ground or len(self.bodies) > 1
 
     def slices(self) -> dict[str, slice]:
-        """Where each body's nodes are in an array of all."""
+        """Slice of each body's nodes in an array of all."""
         ends = np.cumsum([body.mesh.n_verts for body in self.bodies])
         return {body.name: slice(end - body.mesh.n_verts, end) for body, end in zip(self.bodies, ends)}
 

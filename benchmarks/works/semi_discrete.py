@@ -1,7 +1,7 @@
-"""Soft bodies discrete in space and exact in time, in NumPy and double precision: what solvers of one law are measured by.
+"""Soft bodies discrete in space and continuous in time, in NumPy and double precision: the reference for solvers.
 
-Linear tets, lumped masses, one law, undamped. It shares no code with taisoft's own elasticity. Laws, F the deformation
-gradient, J = det F, I = tr(F^T F), mu and lam Lame's parameters:
+Linear tets, lumped masses, one law, undamped; independent of taisoft's elasticity. Laws, with F the deformation gradient,
+J = det F, I = tr(F^T F), mu and lam Lame's parameters:
 
 * "SVK", St. Venant and Kirchhoff: S = lam tr(E) 1 + 2 mu E, E = (F^T F - 1) / 2, P = F S;
 * "SNH", Smith, de Goes and Kim 2018, eq. 14: P = mu' (1 - 1/(I + 1)) F + (lam' (J - 1) - 3/4 mu') cof F with
@@ -53,8 +53,8 @@ class SemiDiscrete:
     """Bodies of one material as one mesh.
 
     mesh: n vertices [m], m tets. law: one of LAWS. young [Pa], poisson, density [kg/m^3]; gravity [m/s^2] along -y. free: (n,)
-    bool. equal_masses: the total shared by all vertices alike, as PyBullet does, instead of a quarter of each tet's mass to its
-    corners. Attributes: vertices (n,3), tets (m,4), volumes (m,), mass (n,) [kg], free, mu, lam [Pa].
+    bool. equal_masses: the total mass divided equally among all vertices, as in PyBullet, instead of a quarter of each tet's mass
+    per corner. Attributes: vertices (n,3), tets (m,4), volumes (m,), mass (n,) [kg], free, mu, lam [Pa].
     """
 
     def __init__(
@@ -105,6 +105,6 @@ class SemiDiscrete:
 
 
 def inverted(mesh: TetMesh, x: np.ndarray) -> int:
-    """How many tets are turned inside out at the positions x (n,3) [m]; one that is not finite counts."""
+    """Number of inverted or non-finite tets at the positions x (n,3) [m]."""
     edges = x[mesh.tets[:, 1:]] - x[mesh.tets[:, :1]]
     return int(np.sum(~(np.linalg.det(edges) > 0.0)))

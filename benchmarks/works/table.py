@@ -1,4 +1,4 @@
-"""Tables and the picture of the works: all runs of one, the programs beside each other at equal error, error against time."""
+"""Tables and the picture of the works: all runs of one, programs at equal error, error against time."""
 
 from pathlib import Path
 
@@ -19,14 +19,14 @@ COLUMNS, PANEL = 3, (4.2, 3.4)  # panels in a row, their size in inches
 
 
 def run_table(rows: list[Row]) -> str:
-    """A row a setting, with the failures below."""
+    """A row per setting, with failures below."""
     work = rows[0].work
     path = ("error", "good to") if work.kind == "path" else ("stands", "fell at [s]", "free fall")
     contact = ("penetration [mm]", "over an edge") if work.touches else ()
     counts = "inverted tets", "unconverged", "build [s]"
     headings = ("program", "law", "setting", "dt [ms]", "s/sim. s", "spread", *path, *contact, *counts)
     lines = [_line(row) for row in rows if row.timing is not None]
-    table = markdown(headings, lines, left=(0, 1, 2)) if lines else "Nothing ran to its end."
+    table = markdown(headings, lines, left=(0, 1, 2)) if lines else "No run ended."
     failed = [(row.setting, row.failure) for row in rows if row.failure]
     failures = [f"* {setting.program} {setting}, dt = {1e3 * setting.dt:.3g} ms: {why}" for setting, why in failed]
     return table + ("\n\n" + "\n".join(failures) if failures else "")
@@ -66,7 +66,7 @@ def own_and_peers(rows: list[Row]) -> tuple[list[Row], list[Row]]:
 
 
 def pairs_of(rows: list[Row]) -> list[tuple[str, Row | None, Row | None]]:
-    """At what, the fastest of taisoft and of the others; a path's at LEVELS, and of the law of that one where taisoft ran it."""
+    """(level, fastest row of taisoft, fastest of the others); for a path at LEVELS, with the other's law if taisoft ran it."""
     ours, others = own_and_peers(rows)
     if rows[0].work.kind == "stand":
         return [("stands", fastest_standing(ours), fastest_standing(others))]
@@ -79,7 +79,7 @@ def pairs_of(rows: list[Row]) -> list[tuple[str, Row | None, Row | None]]:
 
 
 def comparisons(works: list[list[Row]]) -> list[dict]:
-    """For each work and level the fastest of taisoft and of the others, as plain data."""
+    """The fastest of taisoft and of the others for each work and level, as plain data."""
     found = []
     for rows in works:
         work = {"work": rows[0].work.key, "tets": rows[0].work.tets, "stiff": rows[0].work.stiff}
@@ -91,7 +91,7 @@ def comparisons(works: list[list[Row]]) -> list[dict]:
 
 
 def compare_table(found: list[dict]) -> str:
-    """A row a work and level, of `comparisons`."""
+    """A row per work and level of `comparisons`."""
     lines = []
     for one in found:
         times = f"{one['ratio']:.3g}" if one["ratio"] else "-", percent(one["spread"])
@@ -108,7 +108,7 @@ def _named(row: Row | None) -> tuple[str, str]:
 
 
 def limits_of(rows: list[Row]) -> list[Limit]:
-    """What was aimed at, of a work; nothing of the stiff ones."""
+    """Limits of a work; none for stiff ones."""
     work = rows[0].work
     if work.stiff:
         return []
@@ -122,14 +122,14 @@ def limits_of(rows: list[Row]) -> list[Limit]:
     for at, a, b in pairs_of(rows):
         found.append(Limit(f"{work.key}, {at}: settings of taisoft that do", float(a is not None), 1.0, at_least=True))
         if a and b:
-            ratio, wanted = time_ratio(b, a), FASTER if work.kind == "path" else 1.0
+            ratio, required = time_ratio(b, a), FASTER if work.kind == "path" else 1.0
             what = f"{work.key}, {at}: time of {b.setting.program} / taisoft"
-            found.append(Limit(what, ratio.median, wanted, spread_of(ratio), at_least=True))
+            found.append(Limit(what, ratio.median, required, spread_of(ratio), at_least=True))
     return found
 
 
 def implicit_table(works: list[list[Row]]) -> str:
-    """Of stiff works every program's steps of 10 ms."""
+    """Every program's steps of 10 ms on stiff works."""
     lines = []
     for row in (row for rows in works for row in rows if row.work.stiff and row.setting.steps == 1):
         found = ("-", "-") if row.timing is None else (_percent(row.verdict.error), f"{row.timing.median:.3g}")
@@ -139,13 +139,13 @@ def implicit_table(works: list[list[Row]]) -> str:
 
 
 def tried_table() -> str:
-    """What is not among the settings, and why."""
+    """Other settings that were tried."""
     lines = [(program, *one) for program, rows in TRIED.items() for one in rows]
-    return markdown(("program", "work", "tried", "came out"), lines, left=(0, 1, 2, 3))
+    return markdown(("program", "work", "tried", "result"), lines, left=(0, 1, 2, 3))
 
 
 def draw(works: list[list[Row]], path: Path) -> None:
-    """Write a PNG of error against time, a panel a work; nothing where no path is known. Raises OutputError."""
+    """Write a PNG of error against time, a panel per work with an exact path. Raises OutputError."""
     works = [rows for rows in works if rows[0].work.kind == "path" and any(row.timing for row in rows)]
     if not works:
         return

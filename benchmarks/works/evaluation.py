@@ -1,4 +1,4 @@
-"""What a followed run is judged by, the same for every program: error where a path is known, else whether it stands."""
+"""Evaluation of recorded runs, the same for every program: error if an exact path is known, else whether it stands."""
 
 from dataclasses import dataclass
 
@@ -8,24 +8,25 @@ import taisoft as ts
 from taisoft.mesh.tet_mesh import mean_surface_edge
 
 from ..exact_path import SAMPLE
-from ..programs.own import make_scene, unwarned
+from ..programs.own import make_scene
+from ..runner import without_warnings
 from . import references
 from .scenes import Work
 from .semi_discrete import inverted
 
-SHALLOW = 0.01  # of an edge: what a body may sink in
-LEAN = 0.1  # of a width: how far a centre may be off the axis
-FREE = 0.2  # of a free fall: how far the way may be off; implicit Euler's steps of 10 ms are 7 %
-LEAST = 0.2  # of a height at rest: how far a centre is above what bears it, at least
+SHALLOW = 0.01  # maximum penetration over an edge
+LEAN = 0.1  # maximum distance of a centre from the axis over the width
+FREE = 0.2  # maximum relative error of a free fall; implicit Euler with 10 ms has 7 %
+LEAST = 0.2  # minimum height of a centre above its support over the height at rest
 
 
 @dataclass
 class Verdict:
-    """error: None where no path is known; good_to: of the reference. inverted: the most tets in one sample.
+    """error: None without an exact path; good_to: uncertainty of the reference. inverted: maximum over the samples.
 
-    penetration: the deepest in any sample [m], None where nothing can touch; edge: the least of the bodies' mean surface edges
-    [m]. fell: when it no longer stood [s], None where it always did, or need not. free_fall: the way of the last body while
-    nothing has reached it, over that of a free fall, None where that is not judged.
+    penetration: maximum over the samples [m], None without contacts; edge: smallest of the bodies' mean surface edges [m]. fell:
+    time at which it no longer stood [s], or None. free_fall: distance that the last body fell before anything reached it, over
+    that of a free fall, or None.
     """
 
     inverted: int
@@ -38,14 +39,14 @@ class Verdict:
 
     @property
     def stands(self) -> bool:
-        """Neither fell, nor hung in the air, nor turned a tet inside out, nor sank in by 1 % of an edge, where anything can."""
+        """Whether nothing fell, hung in the air, inverted a tet or penetrated by more than 1 % of an edge."""
         shallow = self.penetration is None or self.penetration <= SHALLOW * self.edge
         free = self.free_fall is None or abs(self.free_fall - 1.0) <= FREE
         return self.fell is None and self.inverted == 0 and shallow and free
 
 
-def judge(work: Work, model: references.Model, positions: np.ndarray) -> Verdict:
-    """Of the positions (k,n,3) [m] that a program with this model gave."""
+def evaluate(work: Work, model: references.Model, positions: np.ndarray) -> Verdict:
+    """Evaluate the positions (k,n,3) [m] of a program with this model."""
     parts = list(zip(work.bodies, work.slices().values()))
     verdict = Verdict(max(sum(inverted(body.mesh, x[nodes]) for body, nodes in parts) for x in positions))
     if work.kind == "path":
@@ -63,7 +64,7 @@ def judge(work: Work, model: references.Model, positions: np.ndarray) -> Verdict
 
 
 def free_fall(work: Work, positions: np.ndarray) -> float | None:
-    """How far the last body has come by `free_until`, over g t^2 / 2; None where that is not judged, or not followed so long."""
+    """Distance that the last body has fallen by `free_until` over g t^2 / 2; None if undefined or not recorded so long."""
     if work.free_until is None or round(work.free_until / SAMPLE) >= len(positions):
         return None
     height = positions[:, list(work.slices().values())[-1], 1].mean(axis=1)
@@ -71,11 +72,11 @@ def free_fall(work: Work, positions: np.ndarray) -> float | None:
 
 
 def deepest(work: Work, positions: np.ndarray) -> float:
-    """The deepest overlap of two bodies, or of one and the ground, in any of the samples [m], by taisoft's own measure.
+    """Deepest overlap of two bodies, or of one and the ground, in any sample [m], by taisoft in f64.
 
-    In f64: no simulator of another precision may be open.
+    No simulator of another precision may be open.
     """
-    with unwarned():
+    with without_warnings():
         sim = ts.Simulator(make_scene(work), dt=1e-6, integrator="velocity_verlet", precision="f64")
     depth = 0.0
     with sim:
@@ -86,7 +87,7 @@ def deepest(work: Work, positions: np.ndarray) -> float:
 
 
 def _stands(work: Work, x: np.ndarray) -> bool:
-    """Whether every body that is not held lies on the one before, or on the ground, and about the axis."""
+    """Whether every free body lies on the previous one or the ground, near the axis."""
     floor = 0.0
     for body, nodes in zip(work.bodies, work.slices().values()):
         size = np.ptp(body.mesh.vertices, axis=0)
