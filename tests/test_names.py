@@ -4,6 +4,7 @@ Only identifiers are checked, as Python's tokenizer finds them; comments and str
 """
 
 import io
+import re
 import tokenize
 from pathlib import Path
 
@@ -74,3 +75,10 @@ def test_the_scan_finds_identifiers_only(tmp_path):
     path = tmp_path / "fence.py"
     path.write_text('def told(standoff):  # of a carry\n    """The goal is told."""\n    return f"{standoff} survey"\n')
     assert {"told", "standoff", "fence"} <= identifiers(path) and not {"carry", "goal", "survey"} & identifiers(path)
+
+
+def test_tests_use_the_public_interface_of_a_simulator():
+    """Those of internals build a Dynamics of their own (`scenes.dynamics`)."""
+    private = re.compile(r"\bsim\._(?!_)|\._(dynamics|host|open)\b")
+    text = {path.name: path.read_text(encoding="utf-8") for path in Path(__file__).parent.glob("*.py") if path != Path(__file__)}
+    assert not {name: found[0] for name, content in text.items() if (found := private.findall(content))}
