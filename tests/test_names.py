@@ -79,6 +79,6 @@ def test_the_scan_finds_identifiers_only(tmp_path):
 
 def test_tests_use_the_public_interface_of_a_simulator():
     """Those of internals build a Dynamics of their own (`scenes.dynamics`)."""
-    private = re.compile(r"\bsim\._(?!_)|\._(dynamics|host|open)\b")
+    private = re.compile(r"\bsim\._(?!_)|\._(dynamics|host)\b")
     text = {path.name: path.read_text(encoding="utf-8") for path in Path(__file__).parent.glob("*.py") if path != Path(__file__)}
     assert not {name: found[0] for name, content in text.items() if (found := private.findall(content))}
