@@ -182,6 +182,10 @@ def test_scene_file_warns_once_per_body(tmp_path):
     (tmp_path / "scene.toml").write_text(body.format("one") + body.format("two"))
     found = warnings_of(lambda: ts.read_scene(tmp_path / "scene.toml"))
     assert [str(warning.message).split(":")[0] for warning in found] == ["body 'one'", "body 'two'"]
+    assert {warning.filename for warning in found} == {__file__}
+    (tmp_path / "scene.toml").write_text(body.format("one") + body.format("two") + "order = 3\n")
+    with pytest.warns(UserWarning, match="body 'one'"), pytest.raises(ts.SceneError, match="order"):
+        ts.read_scene(tmp_path / "scene.toml")
 
 
 def test_new_poissons_ratio_warns_at_the_callers_line():

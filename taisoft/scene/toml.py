@@ -55,14 +55,15 @@ def read_scene(path, allow_outside: bool = False) -> tuple[Scene, dict]:
         file = Path(path)
     except TypeError as error:
         raise SceneError(f"read_scene: path must be a file's name, not {path!r}") from error
-    with warnings.catch_warnings(record=True) as found:
-        warnings.simplefilter("always")
-        try:
+    found: list[warnings.WarningMessage] = []
+    try:
+        with warnings.catch_warnings(record=True) as found:
+            warnings.simplefilter("always")
             return _read(Table(file, "", _parsed(file), TOP_KEYS, ["bodies"]), allow_outside)
-        finally:
-            own = [warning.message for warning in found if issubclass(warning.category, UserWarning)]
-    for message in own:
-        warnings.warn(message, stacklevel=2)
+    finally:
+        for warning in found:
+            if issubclass(warning.category, UserWarning):
+                warnings.warn(warning.message, stacklevel=2)
 
 
 def _read(tables: Table, allow_outside: bool) -> tuple[Scene, dict]:
