@@ -7,7 +7,7 @@ from taisoft.attributes import thawed
 from taisoft.errors import SimulationError
 from taisoft.queries import body_index, check_rows, nodes_of
 from taisoft.scene.plan import CHANGEABLE, change_load, change_material
-from taisoft.settings import FIXED, NAMES, Settings, check_dt
+from taisoft.settings import FIXED, NAMES, check_dt
 
 if TYPE_CHECKING:
     from taisoft.simulator import Simulator
@@ -41,12 +41,13 @@ def set_dt(self: "Simulator", value: float) -> None:
     value = check_dt(value)
     if value == self.dt:
         return
-    check_stability(self.settings, value, self, stacklevel=4)
+    check_stability(self, value, stacklevel=4)
     self._host().set_dt(value)
 
 
-def check_stability(settings: Settings, dt: float, sim: "Simulator", stacklevel: int = 3) -> None:
+def check_stability(sim: "Simulator", dt: float, stacklevel: int = 3) -> None:
     """Refuse a dt [s] above the limit of an explicit integrator, or warn if the settings allow it."""
+    settings = sim.settings
     if not settings.explicit or dt <= sim.stable_dt:
         return
     limit = sim.stable_dt
@@ -99,7 +100,7 @@ def set_material(self: "Simulator", body: str, **numbers) -> None:
     change_material(changed, numbers, self.plan.on)
     self._stable_dt = None
     try:
-        check_stability(self.settings, self.dt, self)
+        check_stability(self, self.dt)
     except SimulationError:
         with thawed(changed):
             changed.material, self._stable_dt = old, old_limit

@@ -54,7 +54,7 @@ class Simulator(Guarded):
         self._stable_dt: float | None = None  # None: not computed yet, or outdated
         self.scene = scene.snapshot()  # run-time changes must not reach the user's scene
         self._start_scene, scene = scene, self.scene
-        changes.check_stability(self.settings, self.settings.dt, self)
+        changes.check_stability(self, self.settings.dt)
         for text in scale_warnings(scene):
             warnings.warn(text, UserWarning, stacklevel=2)
         self.plan = plan_of(scene, integrator, self_collision, draggable)

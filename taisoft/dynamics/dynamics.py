@@ -125,18 +125,11 @@ class Dynamics:
 
     def _report(self, result: StepResult) -> StepReport:
         """Return the report of a step: of its `StepResult`, and of the state and the contacts at its end."""
-        measure(self.model)
-        elastic, lowest, inverted, kinetic, gravity, _, loads = self.model.state.scalars.to_numpy()[: LOADS + 1].tolist()
-        report = StepReport(
-            **{name: value for name, value in vars(result).items() if name != "problems"},
-            time=self.state.time,
-            kinetic=kinetic,
-            elastic=elastic,
-            gravity=gravity,
-            loads=loads,
-        )
+        energies, lowest, inverted = self._measure()
+        own = {name: value for name, value in vars(result).items() if name != "problems"}
+        report = StepReport(**own, time=self.state.time, **vars(energies))
         report.min_volume_ratio = min(result.min_volume_ratio, lowest)
-        report.n_inverted = max(result.n_inverted, int(inverted))
+        report.n_inverted = max(result.n_inverted, inverted)
         if (contact := self.contact) is not None:
             report.n_contacts, report.max_penetration = contact.n_contacts, contact.penetration
             report.dropped_contacts, report.deep = contact.dropped, int(contact.is_deep)
@@ -214,9 +207,13 @@ class Dynamics:
 
     def energies(self) -> Energies:
         """Return the energies of the present state [J]."""
+        return self._measure()[0]
+
+    def _measure(self) -> tuple[Energies, float, int]:
+        """Return the energies of the present state [J], its smallest J, and its number of inverted tets."""
         measure(self.model)
-        elastic, _, _, kinetic, gravity, _, loads = self.model.state.scalars.to_numpy()[: LOADS + 1].tolist()
-        return Energies(kinetic, elastic, gravity, loads)
+        elastic, lowest, inverted, kinetic, gravity, _, loads = self.model.state.scalars.to_numpy()[: LOADS + 1].tolist()
+        return Energies(kinetic, elastic, gravity, loads), lowest, int(inverted)
 
     def describe_softening(self) -> str | None:
         """Name the tet that was first compressed so far that its material law softens; None if there is none."""

@@ -11,11 +11,9 @@ contacts and arrows so far that nothing hides them.
 """
 
 import numpy as np
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 
 from taisoft.errors import OutputError
-from taisoft.mesh.topology import triangle_edges
+from taisoft.mesh.topology import linked_groups, triangle_edges
 from taisoft.output.appearance import OBSTACLE_COLOUR, ObstacleSurface, body_colour, obstacle_surfaces, subdivide
 from taisoft.output.camera import MAX_WIDENING, Camera, start_positions
 from taisoft.view.colouring import Colouring, lit_colours
@@ -220,8 +218,7 @@ def smoothing_groups(rest: np.ndarray, surface: np.ndarray) -> tuple[np.ndarray,
             same_node = corner_vertex[end] == corner_vertex[other]
             links.append(np.stack([end[same_node], other[same_node]]))
     i, j = np.concatenate(links, axis=1)
-    graph = coo_matrix((np.ones(len(i), dtype=bool), (i, j)), shape=(3 * t, 3 * t))
-    n_drawn, group = connected_components(graph, directed=False)
+    n_drawn, group = linked_groups(i, j, 3 * t)
     nodes = np.empty(n_drawn, dtype=np.int64)
     nodes[group] = corner_vertex
     return nodes, group.reshape(t, 3)
