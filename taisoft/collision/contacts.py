@@ -24,9 +24,9 @@ from taisoft.collision.candidates import Parts
 from taisoft.collision.surface import cell_of, dvec, ivec
 
 # kinds of contacts; their two ids are: vertex and triangle; edge and edge (3 triangle + local edge); vertex and collider;
-# triangle and collider
-VERTEX_FACE, EDGE_EDGE, VERTEX_FIELD, FACE_FIELD = 0, 1, 2, 3
-KINDS = ("vertex_face", "edge_edge", "vertex_field", "face_field")
+# triangle and collider; a passage (`passages`)
+VERTEX_FACE, EDGE_EDGE, VERTEX_FIELD, FACE_FIELD, FACE_FACE = range(5)
+KINDS = ("vertex_face", "edge_edge", "vertex_field", "face_field", "face_face")
 
 SAME_NORMAL = 0.996  # cosine of 5 degrees
 UNKNOWN, KEPT, DROPPED = 0, 1, 2
@@ -61,7 +61,7 @@ class Contacts:
     body_b: np.ndarray  #: (k,) names; an obstacle is always b
     nodes: np.ndarray  #: (k,6) three of each side, numbered over all bodies, -1 where there is none
     weights: np.ndarray  #: (k,6) of these nodes, 0 where there is none
-    kind: np.ndarray  #: (k,) "vertex_face", "edge_edge", "vertex_field" or "face_field"
+    kind: np.ndarray  #: (k,) "vertex_face", "edge_edge", "vertex_field", "face_field" or "face_face"
     feature: np.ndarray  #: (k,2) ids that stay while the same two features meet
     friction: np.ndarray  #: (k,) of the pair
     restitution: np.ndarray  #: (k,) of the pair
@@ -201,8 +201,8 @@ def _bucket(r: ti.template(), cell):
 
 
 @ti.func
-def _fill_cells(r: ti.template(), out: ti.template(), inverse):
-    """Number the contacts over all parts and enter them into the cells."""
+def _fill_cells(r: ti.template(), out: ti.template(), inverse, lowest_gap):
+    """Number the contacts over all parts, drop those between surfaces whose gap is lower, and enter the others into the cells."""
     ti.loop_config(serialize=True)
     for _ in range(1):
         total = 0
@@ -224,7 +224,8 @@ def _fill_cells(r: ti.template(), out: ti.template(), inverse):
             for k in range(out.used[c]):
                 i, at = r.first[c] + k, c * out.part + k
                 r.place[i] = at
-                r.state[at] = UNKNOWN
+                by_surfaces = out.data.feature[at][0] == VERTEX_FACE or out.data.feature[at][0] == EDGE_EDGE
+                r.state[at] = ti.select(by_surfaces and out.data.gap[at] < lowest_gap, DROPPED, UNKNOWN)
                 b = _bucket(r, cell_of(out.data.point[at], inverse, PERIOD))
                 r.bucket[i] = b
                 ti.atomic_add(r.bucket_end[b], 1)
@@ -247,6 +248,7 @@ def is_same(out: ti.template(), a, b, tolerance):
     if (out.body[a] == out.body[b]).all():
         d = out.point[a] - out.point[b]
         result = d.dot(d) <= tolerance * tolerance and out.normal[a].dot(out.normal[b]) >= ti.cast(SAME_NORMAL, ti.f64)
+        result = result and out.feature[a][0] != FACE_FACE and out.feature[b][0] != FACE_FACE
     return result
 
 
@@ -317,9 +319,9 @@ def _list_kept(r: ti.template()):
 
 
 @kernel
-def begin_reduction(r: ti.template(), out: ti.template(), inverse: ti.f64, tolerance: ti.f64):
+def begin_reduction(r: ti.template(), out: ti.template(), inverse: ti.f64, tolerance: ti.f64, lowest_gap: ti.f64):
     """Enter the contacts into the cells and run the first round; more are needed only while contacts are undecided."""
-    _fill_cells(r, out, inverse)
+    _fill_cells(r, out, inverse, lowest_gap)
     _decide_all(r, out.data, inverse, tolerance)
     _list_kept(r)
 
@@ -331,9 +333,12 @@ def decide(r: ti.template(), out: ti.template(), inverse: ti.f64, tolerance: ti.
     _list_kept(r)
 
 
-def reduce_contacts(r: ReductionFields, out: Parts, tolerance: float, cell: float) -> None:
-    """Fill r.kept and r.count for a buffer of contacts. tolerance [m]; cell: edge of the cells [m], at least 2.5 tolerances."""
+def reduce_contacts(r: ReductionFields, out: Parts, tolerance: float, cell: float, lowest_gap: float = -np.inf) -> None:
+    """Fill r.kept and r.count for a buffer of contacts.
+
+    tolerance [m]; cell: edge of the cells [m], at least 2.5 tolerances; lowest_gap [m]: of surfaces that do not cross.
+    """
     inverse = 1.0 / max(cell, 2.5 * tolerance)
-    begin_reduction(r, out, inverse, tolerance)
+    begin_reduction(r, out, inverse, tolerance, lowest_gap)
     while r.count[UNDECIDED] > 0:
         decide(r, out, inverse, tolerance)

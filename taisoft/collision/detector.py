@@ -21,6 +21,7 @@ from taisoft.collision.edge_edge import find_proximity
 from taisoft.collision.features import BY_EDGES, BY_FACES, BY_FIELD
 from taisoft.collision.intersections import Intersections, find_crossings
 from taisoft.collision.overlap import Containment, Inside
+from taisoft.collision.passages import STILL, PathCheck, append_passages
 from taisoft.collision.spatial_hash import SpatialHash
 from taisoft.collision.surface import ACTIVE, NONFINITE, PAIRS, build_surface, move_obstacles, update_surface
 from taisoft.errors import SceneError, SimulationError
@@ -33,6 +34,7 @@ from taisoft.scene.scene import Scene
 MARGIN = 0.1  # of the mean surface edge: default distance within which contacts are found
 DEPTH = 0.1  # of the mean surface edge: depth to which flat faces that have passed each other are still found
 MERGED = 1e-3  # of the mean surface edge: distance below which contacts are merged
+FLOOR = 1e-5  # of the finest body's mean surface edge: distance that paths must keep, far above the rounding of f64
 REDUCTION_CELL = 0.25  # of the mean surface edge: cell size of the reduction
 MANY_COLLIDERS = 200  # colliders above which the spatial hash is used
 CONTACTS_PER_TRIANGLE = 1  # initial capacity
@@ -104,6 +106,10 @@ class Detection:
         self._reduction_arena = FieldArena()
         self._reduction = None
         self._intersections: Intersections | None = None
+        self._self_on, self.floor = properties["self_on"], FLOOR * float(self.edges[: len(bodies)].min())
+        self._path_check: PathCheck | None = None  # made at first use
+        self.none_cross = False  # whether no surfaces are known to cross at the positions that are searched
+        self.held = np.zeros((0, 4), dtype=np.int32), np.zeros(0)  # passages that every search adds as contacts, and their times
         self._containment = Containment(scene, self.topology, layout, self._rest, self._analytic, self_collision)
         self._placed = False  # whether obstacles have been placed
         self._broad_result: Trees | Candidates | None = None  # broad-phase result of the last search
@@ -211,6 +217,9 @@ class Detection:
                 append = 1
         if self.shapes.count:
             find_analytic(s, self.shapes, self.margin, out, append)
+            append = 1
+        if len(self.held[0]):
+            append_passages(s, self.shapes, self._paths.fields, *self.held, out, append)
 
     def _reduce(self) -> None:
         """Reduce the contacts and update the counts."""
@@ -220,7 +229,8 @@ class Detection:
             self._reduction = reduction_fields(arena, b.capacity, b.chunks, self.surface.serial_cheap, self.surface.cheap_spread)
             self._reduction_arena.release()
             self._reduction_arena = arena
-        reduce_contacts(self._reduction, b.parts, MERGED * self.edge, REDUCTION_CELL * self.edge)
+        lowest_gap = -self.floor if self.none_cross else -np.inf  # if none cross, a vertex behind a face is not inside
+        reduce_contacts(self._reduction, b.parts, MERGED * self.edge, REDUCTION_CELL * self.edge, lowest_gap)
         count, surface = self.counts, self.surface.count
         if self._has_pairs:
             count.active, count.pairs = surface[ACTIVE], surface[PAIRS]
@@ -272,12 +282,51 @@ class Detection:
                 break
         return depths
 
+    @property
+    def _paths(self) -> PathCheck:
+        if self._path_check is None:
+            settings = self.scene.collision
+            limits = settings.initial_capacity, settings.max_capacity
+            self._path_check = PathCheck(
+                self.surface, self.topology, self.shapes, self._self_on, self.reach, self.floor, self._arena, *limits
+            )
+        return self._path_check
+
+    def passages(self, mode: int) -> tuple[np.ndarray, np.ndarray] | None:
+        """Return the passages (k,4) on the paths from the positions of the last search, and the parts (k,) of the step until
+        which they are apart, or None, see `PathCheck.find`."""
+        return self._paths.find(self.model.state.x, self._broad_result, self._near_buffer, mode)
+
+    def forget_paths(self) -> None:
+        """Discard lists of near pairs, after positions were set."""
+        if self._path_check is not None:
+            self._path_check.forget()
+
+    def colliders_of(self, passages: np.ndarray) -> np.ndarray:
+        """Return the two colliders (k,2) of each of the given passages (k,4)."""
+        return self._paths.colliders(passages)
+
+    def exempt_crossing(self) -> bool:
+        """Exempt the pairs of colliders that cross or touch at the positions of the last search from further checks of paths, and
+        no others. Return whether there are any."""
+        n = len(self.scene.colliders)
+        pairs = np.zeros((n, n), dtype=bool)
+        self._paths.exempt(pairs)
+        found = self.colliders_of(self.passages(STILL)[0])
+        pairs[found[:, 0], found[:, 1]] = True
+        for one in self.contained():
+            pairs[one.a, one.b] = True
+        if pairs.any():
+            self._paths.exempt(pairs)
+        return bool(pairs.any())
+
     def contained(self) -> list[Inside]:
         """Return the parts of colliders that lie inside others at the positions of the last search, see `Containment`."""
         return self._containment.find(self.surface, self.model.state.x, self.shapes)
 
     def _buffers(self) -> list[Buffer]:
-        return [self.buffer, *((self._near_buffer, *self.broad.buffers) if self._has_pairs else ())]
+        paths = () if self._path_check is None else self._path_check.buffers
+        return [self.buffer, *((self._near_buffer, *self.broad.buffers) if self._has_pairs else ()), *paths]
 
     @property
     def field_bytes(self) -> dict[str, int]:
@@ -286,7 +335,7 @@ class Detection:
 
     def release(self) -> None:
         """Free all memory."""
-        for part in (self.broad, self._intersections, self._near_buffer):
+        for part in (self.broad, self._intersections, self._near_buffer, self._path_check):
             if part is not None:
                 part.release()
         self.buffer.release()

@@ -104,7 +104,7 @@ def find_crossings(
 
 
 @ti.func
-def _corner(corners, k):
+def row_of(corners, k):
     """Row k of a matrix of points."""
     return dvec(corners[k, 0], corners[k, 1], corners[k, 2])
 
@@ -123,7 +123,7 @@ def closest_segments(p0, p1, q0, q1):
         nearest = offset.dot(offset)
     for k in range(4):  # the two ends of p against q, then those of q against p
         other = 2 - 2 * (k // 2)
-        e, a, b = _corner(ends, k), _corner(ends, other), _corner(ends, other + 1)
+        e, a, b = row_of(ends, k), row_of(ends, other), row_of(ends, other + 1)
         at = ti.cast(k % 2, ti.f64)
         r = closest_on_segment(e, a, b)
         offset = e - (a + r * (b - a))
@@ -139,11 +139,11 @@ def closest_segments(p0, p1, q0, q1):
 def _is_clear_of_plane(corners, first, size):
     """Whether one triangle (rows from `first` on) lies strictly on one side of the other's plane."""
     other = 3 - first
-    a = _corner(corners, other)
-    n = (_corner(corners, other + 1) - a).cross(_corner(corners, other + 2) - a)
+    a = row_of(corners, other)
+    n = (row_of(corners, other + 1) - a).cross(row_of(corners, other + 2) - a)
     above, below = 0, 0
     for k in range(3):
-        r = _corner(corners, first + k) - a
+        r = row_of(corners, first + k) - a
         d = r.dot(n)
         clear = ti.cast(TOUCHING, ti.f64) * size * n.norm() + ti.cast(ROUNDING, ti.f64) * size * size * r.norm()
         above += ti.cast(d > clear, ti.i32)
@@ -156,7 +156,7 @@ def _longest_edge(corners):
     """Length of the longest edge of two triangles [m]."""
     longest = ti.cast(0.0, ti.f64)
     for k in range(6):
-        e = _corner(corners, k) - _corner(corners, k // 3 * 3 + (k + 1) % 3)
+        e = row_of(corners, k) - row_of(corners, k // 3 * 3 + (k + 1) % 3)
         longest = ti.max(longest, e.dot(e))
     return ti.sqrt(longest)
 
@@ -176,11 +176,11 @@ def _intersect(corners):
         offset = dvec(2.0 * touching)
         if k < 12:
             first = (k % 6) // 3 * 3
-            p = _corner(corners, k % 6)
-            a, b, c = _corner(corners, 3 - first), _corner(corners, 4 - first), _corner(corners, 5 - first)
+            p = row_of(corners, k % 6)
+            a, b, c = row_of(corners, 3 - first), row_of(corners, 4 - first), row_of(corners, 5 - first)
             test = 1
             if k < 6:
-                q = _corner(corners, first + (k + 1) % 3)
+                q = row_of(corners, first + (k + 1) % 3)
                 n = (b - a).cross(c - a)
                 above, below = (p - a).dot(n), (q - a).dot(n)
                 test = int((above > 0.0 and below < 0.0) or (above < 0.0 and below > 0.0))
@@ -191,8 +191,8 @@ def _intersect(corners):
                 offset = p - (w[0] * a + w[1] * b + w[2] * c)
         else:
             i, j = (k - 12) // 3, (k - 12) % 3
-            p0, p1 = _corner(corners, i), _corner(corners, (i + 1) % 3)
-            q0, q1 = _corner(corners, 3 + j), _corner(corners, 3 + (j + 1) % 3)
+            p0, p1 = row_of(corners, i), row_of(corners, (i + 1) % 3)
+            q0, q1 = row_of(corners, 3 + j), row_of(corners, 3 + (j + 1) % 3)
             s, t, _ = closest_segments(p0, p1, q0, q1)
             offset = p0 + s * (p1 - p0) - (q0 + t * (q1 - q0))
         if offset.norm() <= touching:

@@ -30,6 +30,7 @@ from taisoft.dynamics.contact_measures import (
     Crossing,
     find_displacement,
 )
+from taisoft.dynamics.contact_paths import ContactPaths
 from taisoft.dynamics.contact_record import read_rows, record_contacts, sum_impulses, write_rows
 from taisoft.dynamics.impact import Rebounds
 from taisoft.dynamics.simulation_state import SimulationState
@@ -53,6 +54,7 @@ class ContactStep:
         m, scene = simulation.model, simulation.scene
         self.detection = Detection(scene, m, simulation.layout, simulation.runtime, self_collision)
         self.measures = ContactMeasures(self.detection)
+        self.paths = ContactPaths(simulation, self.detection)
         d = self.detection
         self.contact_offset = CONTACT_OFFSET * float(d.edges[: len(scene.bodies)].min())
         if d.margin > 0.0:
@@ -108,6 +110,7 @@ class ContactStep:
         self._last_time = self.penetration = self.relative_penetration = self._step_dt = 0.0
         self._impulse_sum, self.crossing, self.last_crossing = None, None, Crossing()
         self.flight[:] = 0.0
+        self.paths.forget()
 
     def snapshot(self) -> dict:
         """Return the last step's contacts and impulses, and the capacity: a step that exceeds it starts without impulses.
@@ -125,6 +128,7 @@ class ContactStep:
             "met": self.had_impact,
             "dropped": self.dropped,
             "flight": self.flight.copy(),
+            "paths": self.paths.snapshot(),
             "rows": read_rows(self.problem),
         }
 
@@ -138,13 +142,15 @@ class ContactStep:
         self.relative_penetration = float(kept["relative_penetration"])
         self.had_impact, self.dropped = bool(kept["met"]), int(kept["dropped"])
         self.flight[:] = kept["flight"]
-        self.crossing, self.last_crossing = None, Crossing()
+        self.paths.restore(kept["paths"])
+        self.crossing, self.last_crossing = 0.0 if self.detection.none_cross else None, Crossing()
         self._searched = self._measured_end = None
         self._indexed = True  # so that the next step rebuilds the node index, even without contacts
 
     def reset_substep(self, discard_impulses: bool) -> None:
         """Discard the search after a substep was undone; the impulses warm-start the next attempt unless discarded, too."""
         self._searched = self._measured_end = None
+        self.paths.undo()
         if discard_impulses:
             self.problem.count[0], self._last_time = 0, 0.0
 
@@ -230,10 +236,12 @@ class ContactStep:
     def start_step(self, dt: float) -> None:
         """Begin a step of dt."""
         self._substep_fraction, self._step_dt, self.dropped, self._impulse_sum = 1.0, dt, 0, None
+        self.paths.held_back = ""
 
     def start_substep(self, dt: float) -> None:
         """Begin a substep of dt, or begin it again with another length."""
         self._substep_fraction = dt / self._step_dt
+        self.paths.begin()
 
     def end_substep(self) -> None:
         """Add the impulses of a substep."""
@@ -264,6 +272,7 @@ class ContactStep:
         if ended is not None and ended[1] == dt and abs(ended[0] - time) <= 1e-6 * dt:
             return self._depth
         self._searched = None
+        self.paths.use_active(self.problem)
         try:
             self.search(time, dt)
         except SimulationError:
@@ -272,7 +281,7 @@ class ContactStep:
             self._find(time, 0.0)  # a path ends here; the next step reports it
         closing = self.measures.closing(dt)
         depth, self.relative_penetration = float(closing[DEPTH]), float(closing[RELATIVE_PENETRATION])
-        if not self._explicit:
+        if self.paths.some_exempt and not self._explicit:
             crossing = self.measure_crossings()
             depth, self.relative_penetration = max(depth, crossing[0]), max(self.relative_penetration, crossing[1])
         if self._has_paths:
@@ -290,6 +299,7 @@ class ContactStep:
         surface edge. Set `crossing` and `last_crossing`."""
         self.last_crossing = found = self.measures.crossing()
         self.crossing = found.relative
+        self.paths.exempt_crossing()
         return found.depth, found.relative
 
     def left_searched_path(self, x_start) -> bool:
@@ -301,12 +311,26 @@ class ContactStep:
     def search_along_path(self, time: float, dt: float) -> bool:
         """Search along that displacement from the start state; return whether that finds new contacts."""
         self._searched = self._measured_end = None
+        self.paths.use_all()
         self._find(time, dt, path=self._path)
         self._searched, self._searched_dt = (time, dt), dt
         searched = set(map(tuple, download([self.problem.feature], self.n_contacts)[0].tolist()))
         kept = download([self.detection.kept], self.detection.counts.contacts)[0]
         found = self.detection.buffer.data.feature.to_numpy()[kept]
         return not searched.issuperset(map(tuple, found.tolist()))
+
+    def find_passages(self, as_searched: bool = False) -> bool:
+        """Return whether surfaces pass through each other on the way to the present state, or on the searched paths."""
+        return self.paths.find(as_searched)
+
+    def hold_back(self, x_start) -> None:
+        """Shorten the paths from x_start to the present state, see `ContactPaths.hold_back`."""
+        self.paths.hold_back(x_start)
+
+    @property
+    def held_back(self) -> str:
+        """A sentence about bodies that the last step held back, empty if there are none."""
+        return self.paths.held_back
 
     def measure_start(self, time: float, dt: float) -> tuple[float, float]:
         """Return the deepest penetration before a step of dt over the finer side's mean surface edge, and the largest closing
@@ -321,7 +345,7 @@ class ContactStep:
 
     def initial_crossing(self) -> float:
         """Return the depth of crossing triangles over the finer side's mean surface edge, at the start of a searched step."""
-        if self.crossing is None or self._has_paths:
+        if self.crossing is None:
             self.measure_crossings()
         return self.crossing
 

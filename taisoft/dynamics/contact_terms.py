@@ -14,7 +14,7 @@ import taichi as ti
 
 from taisoft.backend.arrays import FieldArena
 from taisoft.backend.runtime import kernel
-from taisoft.contact.build import gap_minus_target
+from taisoft.contact.build import contact_offset_of, gap_minus_target
 from taisoft.contact.problem import NODES, RESIDUAL, ContactProblem, residual_of
 from taisoft.contact.prox import dvec, into_disk, prox, scaled
 from taisoft.fem.model import Model
@@ -22,6 +22,7 @@ from taisoft.fem.node_graph import n_nodes_of, node_of
 from taisoft.linear.block_csr import BLOCK
 from taisoft.linear.coupling import NO_COUPLING, Coupling, build_coupling
 
+MAX_MISSED, MIN_KEPT = 0.5, 0.1  # largest part of a gap that a contact may miss; smallest such gap, over the contact offset
 PAST = 2  # multiplier updates that are stored
 
 
@@ -39,7 +40,8 @@ class ContactStageWork:
     rate: Any  # (capacity) 3-vectors f64: derivative of u along the step [m/s]
     kept: Any  # (capacity) 3-vectors f64: impulses at linearisation [N s]
     world_impulse: Any  # (capacity) 3-vectors f64: impulse in world axes [N s]
-    prox_residual: Any  # (capacity) 2-vectors f64: squared norms of the prox residual and of the impulse
+    prox_residual: Any  # (capacity) 3-vectors f64: squared norms of the prox residual and of the impulse; residual of the gap
+    gap_weight: Any  # (capacity) f64: residual per length by which the gap misses its target [1/m]
     block: Any  # (capacity) 12-vectors: D in world axes; J^T D J consists of weights times this
     active: Any  # (capacity) i32: 1 if the block is not 0
 
@@ -67,11 +69,18 @@ NO_CONTACTS = StageContacts(None, None, NO_COUPLING, *[None] * 4)
 
 @kernel
 def begin_contacts(
-    s: ti.template(), k: ti.template(), impact: ti.template(), beta: ti.f64, dt: ti.f64, gap_targets: ti.types.ndarray()
+    s: ti.template(),
+    k: ti.template(),
+    impact: ti.template(),
+    beta: ti.f64,
+    dt: ti.f64,
+    gap_targets: ti.types.ndarray(),
+    tolerance: ti.f64,
 ):
     """Set the constant contact data of a stage, in a step of dt [s].
 
     impact: whether the contacts' velocity must be `min_velocity`, regardless of gaps. gap_targets (4,): of `ContactStep`.
+    tolerance: of the laws' residual.
     """
     p, w = ti.static((k.problem, k.work))
     ti.loop_config(serialize=p.serial)
@@ -84,10 +93,16 @@ def begin_contacts(
         w.tangential_offset[c] = offset
         if ti.static(impact):
             w.gap_minus_target[c] = -beta * p.min_velocity[c] - (beta / dt) * p.normal[c].dot(p.obstacle_displacement[c])
+            w.gap_weight[c] = 0.0
         else:
             offset_target, fast, slow, fastest = gap_targets[0], gap_targets[1], gap_targets[2], gap_targets[3]
             gap_to_target = gap_minus_target(p, c, dt, offset_target, fast, slow, fastest, p.min_opening[c])
             w.gap_minus_target[c] = gap_to_target - p.normal[c].dot(p.obstacle_displacement[c])
+            wanted = contact_offset_of(p, c, offset_target)
+            kept = ti.min(ti.max(p.gap[c], ti.cast(MIN_KEPT, ti.f64) * wanted), wanted)
+            w.gap_weight[c] = 0.0
+            if kept > 0.0:
+                w.gap_weight[c] = tolerance / (MAX_MISSED * kept)
 
 
 @ti.func
@@ -159,7 +174,7 @@ def update_contact(m: ti.template(), k: ti.template(), c, beta, r_scale):
             w.block[c][4 * j + i] = ti.cast(Dn * n[i] * n[j] + D_along * e[i] * e[j] + D_across * g[i] * g[j], m.real)
     w.active[c] = int(Dn > 0.0 or D_along > 0.0 or D_across > 0.0)
     d = r - prox(r - scaled(p.factor[c], u), p.friction[c])
-    w.prox_residual[c] = ti.Vector([d.dot(d), r.dot(r)], ti.f64)
+    w.prox_residual[c] = dvec(d.dot(d), r.dot(r), -u[0] * beta * w.gap_weight[c])
 
 
 @ti.func
@@ -175,12 +190,19 @@ def impulse_on_node(k: ti.template(), i):
 
 @ti.func
 def sum_residual(k: ti.template()):
-    """Compute the residual of the laws over all contacts."""
+    """Compute the residual of the laws over all contacts.
+
+    It is relative to all impulses, so that a light contact beside heavy ones could let its gap close. The largest part of a gap,
+    or of the contact offset if that is less, by which a contact misses its target is therefore a residual, too: MAX_MISSED
+    corresponds to the tolerance.
+    """
     p, w = ti.static((k.problem, k.work))
-    sums = ti.Vector([0.0, 0.0], ti.f64)
+    sums, worst = ti.Vector([0.0, 0.0], ti.f64), ti.cast(0.0, ti.f64)
     for c in range(p.count[0]):
-        sums += w.prox_residual[c]
-    p.state[RESIDUAL] = residual_of(sums)
+        one = w.prox_residual[c]
+        sums += ti.Vector([one[0], one[1]], ti.f64)
+        worst = ti.max(worst, one[2])
+    p.state[RESIDUAL] = ti.max(residual_of(sums), worst)
 
 
 @kernel
@@ -229,7 +251,8 @@ def build_stage_contacts(arena: FieldArena, model: Model, problem: ContactProble
         arena.vectors("contact_rate", ti.f64, p.capacity),
         arena.vectors("contact_kept", ti.f64, p.capacity),
         arena.vectors("contact_world_impulse", ti.f64, p.capacity),
-        arena.vectors("contact_prox_residual", ti.f64, p.capacity, n=2),
+        arena.vectors("contact_prox_residual", ti.f64, p.capacity),
+        arena.field("contact_gap_weight", ti.f64, p.capacity),
         arena.vectors("contact_block", real, p.capacity, n=BLOCK),
         arena.field("contact_active", ti.i32, p.capacity),
     )

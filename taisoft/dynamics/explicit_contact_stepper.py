@@ -1,6 +1,6 @@
 """Explicit sub-steps with contacts: a search, a contact problem and a solve in each."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -16,6 +16,7 @@ from taisoft.dynamics.explicit_contact import find_acceleration, finish_verlet, 
 from taisoft.dynamics.explicit_stepper import ExplicitStepper
 from taisoft.dynamics.results import StepResult
 from taisoft.dynamics.simulation_state import SimulationState
+from taisoft.dynamics.substepping import MAX_PASSAGES
 from taisoft.errors import SimulationError
 from taisoft.fem.state import FAILED, LOWEST_J, MOST_INVERTED
 from taisoft.settings import Settings
@@ -74,7 +75,10 @@ class ContactExplicitStepper(ExplicitStepper):
             self.acceleration_stale = self.acceleration_stale or simulation.releases != releases
             n = len(targets)
         self.contact.start_step(dt)
-        relative_penetration = 0.0
+        relative_penetration, held_back = 0.0, ""
+        if self.contact.crossing is None:
+            self.contact.measure_start(start, dt)
+            self.contact.initial_crossing()
         try:
             while done < n:
                 keep_state(m, self._good)
@@ -83,10 +87,10 @@ class ContactExplicitStepper(ExplicitStepper):
                 results.append(self._substep(simulation.step_count + done + 1, start + done * dt, dt))
                 depth = max(depth, self.contact.end(start + (done + 1) * dt, dt))
                 relative_penetration = max(relative_penetration, self.contact.relative_penetration)
-                if done + 1 == n:  # once per batch: it costs about as much as a search
+                if done + 1 == n and self.contact.paths.some_exempt:  # once per batch: it costs about as much as a search
                     crossing = self.contact.measure_crossings()
                     depth, relative_penetration = max(depth, crossing[0]), max(relative_penetration, crossing[1])
-                done += 1
+                done, held_back = done + 1, held_back or self.contact.held_back
                 self._released = simulation.dirichlet.released()
         except BaseException:  # Ctrl-C, too
             self._restore()
@@ -100,9 +104,11 @@ class ContactExplicitStepper(ExplicitStepper):
             n_inverted=int(m.state.scalars[MOST_INVERTED]),
             contact_iterations=sum(r.iterations for r in results if r),
             contact_residual=max((r.residual for r in results if r), default=0.0),
-            converged=all(r.converged for r in results if r),
+            converged=all(r.converged for r in results if r) and not held_back,
         )
-        if not result.converged:
+        if held_back:
+            result.problems.append(held_back)
+        elif not result.converged:
             result.problems.append(f"the contact solver stopped at a residual of {result.contact_residual:.2e}")
         return result
 
@@ -115,10 +121,38 @@ class ContactExplicitStepper(ExplicitStepper):
         self.contact.forget()
 
     def _substep(self, step: int, time: float, dt: float) -> SolveResult | None:
-        """Take sub-step number `step` from a time; return the contact solver's result, None without contacts."""
-        m, s, contact = self.simulation.model, self.work, self.contact
+        """Take sub-step number `step` from a time, and repeat it while surfaces pass through each other on its paths.
+
+        Return the contact solver's result, None without contacts.
+        """
+        simulation, contact, good = self.simulation, self.contact, self._good
         if contact.measure_start(time, dt)[1] > 1.0:
             raise SimulationError(f"step {step}: {contact.describe_fast_closing(dt)}")
+        contact.start_substep(dt)
+        result = self._solve_and_move(step, time, dt)
+        for tries in range(MAX_PASSAGES + 1):
+            if not contact.find_passages():
+                break
+            end = simulation.state()
+            contact.left_searched_path(good.x)
+            self._restore_state(*download([good.x, good.v]))
+            contact.search_along_path(time, dt)
+            if contact.paths.uncovered:
+                if not contact.find_passages(as_searched=True):
+                    simulation.set_state(*end)
+                    break
+                contact.search_along_path(time, dt)
+            if tries == MAX_PASSAGES:
+                simulation.set_state(*end)
+                contact.hold_back(good.x)
+                self.acceleration_stale = True
+                return replace(result, converged=False) if result else None
+            result = self._solve_and_move(step, time, dt)
+        return result
+
+    def _solve_and_move(self, step: int, time: float, dt: float) -> SolveResult | None:
+        """Solve for the impulses of the contacts found, and move; return the contact solver's result, None without contacts."""
+        m, s, contact = self.simulation.model, self.work, self.contact
         if s.verlet and self.acceleration_stale:
             find_acceleration(m, s)
         self.acceleration_stale = False

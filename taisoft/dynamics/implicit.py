@@ -171,6 +171,8 @@ class ImplicitStepper:
                 f"Newton stopped after {step.newton_iterations} iterations at a relative residual of {step.residual:.2e}"
                 + (f" and a contact residual of {step.contact_residual:.2e}" if self.contact.n_contacts else "")
             )
+        if self.contact.held_back:
+            step.problems.append(self.contact.held_back)
         if name:
             step.problems.append(f"forces on {name} are unbalanced by {worst:.2g} of their size, beside larger forces elsewhere")
         return step
@@ -216,6 +218,10 @@ class ImplicitStepper:
         result = self.take_substep(time, dt, start)
         self._n_previous = min(self._n_previous, past)
         return result
+
+    def break_history(self) -> None:
+        """Let the next substep start without history, after the state was changed."""
+        self._n_previous = 0
 
     def undo_substep(self, released: list[bool], discard_impulses: bool) -> None:
         """Restore the start of the last substep and the groups released then, for another length of it."""

@@ -9,6 +9,7 @@ class NoContacts:
     idle = True
     n_contacts, had_impact = 0, False
     relative_penetration = crossing = penetration = 0.0
+    held_back = ""
 
     def __init__(self) -> None:
         self.flight = np.zeros(0)
@@ -17,6 +18,7 @@ class NoContacts:
         """Do nothing."""
 
     forget = set_impulse_fraction = start_step = start_substep = end_substep = reset_substep = count_flight = restore = _nothing
+    hold_back = _nothing
 
     def begin(self, time: float, dt: float) -> int:
         """Return the number of contacts of a step of dt [s] from a time: 0."""
@@ -41,6 +43,10 @@ class NoContacts:
 
     def left_searched_path(self, x_start) -> bool:
         """Return whether the surface left the searched path."""
+        return False
+
+    def find_passages(self, as_searched: bool = False) -> bool:
+        """Return whether surfaces pass through each other."""
         return False
 
     def penetrates_deeper(self, time: float, dt: float, before: float) -> bool:

@@ -191,7 +191,8 @@ class StageSystem:
             return
         self._allocate_contacts()
         self._k, impact = self._stage_contacts, kind == IMPACT
-        begin_contacts(self.work, self._k, impact, stage.beta, stage.dt, np.array(self.contact.gap_targets))
+        targets = np.array(self.contact.gap_targets)
+        begin_contacts(self.work, self._k, impact, stage.beta, stage.dt, targets, stage.contact_tolerance)
         self.form_matrix_and_factors(projected=impact)
 
     def evaluate(self, mode: int | None = STAY, step_length: float = 1.0, new_multipliers: bool = False) -> tuple[float, float]:

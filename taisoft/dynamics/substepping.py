@@ -11,6 +11,7 @@ No substep is shorter than the step over MAX_SUBSTEPS. Motion that closes too fa
 length, or after MAX_UNDONE others were undone, is kept and reported even if deep, unsettled or not converged.
 """
 
+from dataclasses import replace
 from enum import Enum, auto
 from typing import TYPE_CHECKING
 
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
 MAX_SUBSTEPS = 256  # per step
 MAX_CLOSING_RATIO = 2.0  # maximum closing ratio after a substep: its speed was not known when the step was cut
 MAX_SEARCHES = 3  # along a substep's actual path, if it left the expected one
+MAX_PASSAGES = 8  # repetitions of a substep with the pairs that would have passed through each other
 MAX_UNDONE = 16  # per step, for reasons other than speed: each costs a few solves
 WORSENING = 1.1  # growth of an existing penetration that counts as a new one
 RETRIES = 4  # maximum number of equal substeps after non-convergence; only shorter substeps are halved for that
@@ -35,6 +37,7 @@ class Fault(Enum):
 
     FAST = auto()  # a collision could have been missed
     UNSETTLED = auto()  # every path it was tried along had unknown contacts
+    CROSSED = auto()  # surfaces pass through each other on its path
     DEEP = auto()  # it ended in a new deep penetration or crossing
     UNCONVERGED = auto()  # it did not converge
 
@@ -112,6 +115,10 @@ class Substepping:
             result, fault = self._take_substep(time, length)
             if fault == Fault.FAST and length < 2.0 * shortest:
                 self._refuse_fast_closing(dt)
+            if fault == Fault.CROSSED and not may_cut:
+                contact.hold_back(stepper.history.x_now)
+                stepper.break_history()
+                result, fault = replace(result, converged=False), None
             if fault != Fault.FAST and not (fault and may_cut):
                 contact.penetration = contact.end(time + length, dt if last else length)
                 fault = self._find_fault(
@@ -161,17 +168,24 @@ class Substepping:
     def _take_substep(self, time: float, dt: float) -> tuple[StageResult, Fault | None]:
         """Take a substep of dt from a time, and repeat it while its path has new contacts. Leave its end as the state."""
         contact, stepper, before = self._contact, self._stepper, self._contact.relative_penetration
-        simulation, result = stepper.simulation, stepper.take_substep(time, dt)
-        for tries in range(MAX_SEARCHES + 1):
-            if not (contact.left_searched_path(stepper.history.x_now) or contact.penetrates_deeper(time + dt, dt, before)):
+        simulation, start, result = stepper.simulation, stepper.history.x_now, stepper.take_substep(time, dt)
+        for tries in range(MAX_PASSAGES + 1):
+            as_searched = not contact.left_searched_path(start)
+            passes = as_searched and contact.find_passages()
+            if as_searched and not passes and not contact.penetrates_deeper(time + dt, dt, before):
                 break
             state = simulation.state()
             stepper.restore_start()
             new = contact.search_along_path(time, dt)
-            if not new or tries == MAX_SEARCHES:
+            if not as_searched and contact.find_passages(as_searched=True):
+                passes, new = True, contact.search_along_path(time, dt)
+            limit = MAX_PASSAGES if passes else MAX_SEARCHES
+            if not (new or passes) or tries >= limit:
                 simulation.set_state(*state)
                 if contact.closing_ratio_along_path() > MAX_CLOSING_RATIO:
                     return result, Fault.FAST
+                if passes:
+                    return result, Fault.CROSSED
                 return result, Fault.UNSETTLED if new else None
             result = count_all(stepper.retry_substep(time, dt, state[1]), [result])
         return result, None

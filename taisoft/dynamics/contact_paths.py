@@ -1,0 +1,121 @@
+"""Nothing crosses: the passages on a substep's paths, the contacts that hold them apart, and what is held back if those fail.
+
+A substep is accepted only if no pair of surfaces passes through each other on its straight paths (`collision.passages`). A pair
+that would becomes a contact, and the substep is repeated with it. It remains one in the next substeps while it carries an
+impulse. If passages are left after all retries, whole bodies are held back: their paths are shortened until nothing passes, and
+the step counts as not converged.
+"""
+
+import numpy as np
+
+from taisoft.backend.arrays import download
+from taisoft.collision.contacts import FACE_FACE
+from taisoft.collision.detector import Detection
+from taisoft.collision.passages import FEATURES, KINDS, SEARCHED, TO_STATE
+from taisoft.contact.problem import ContactProblem
+from taisoft.dynamics.simulation_state import SimulationState
+from taisoft.errors import SimulationError
+
+NO_PASSAGES = np.zeros((0, 4), dtype=np.int32), np.zeros(0)
+SHORTENED = 0.9  # of the part of a path that is certainly free
+MAX_SHORTENINGS, LEAST = 30, 1e-6  # rounds, and part of a path: beyond these, bodies do not move at all
+
+
+class ContactPaths:
+    """Check the paths of substeps and hold the passages found."""
+
+    def __init__(self, simulation: SimulationState, detection: Detection):
+        self._simulation, self._detection = simulation, detection
+        self.some_exempt = False  # whether some colliders cross already, so that their paths are not checked
+        self.uncovered = False  # whether the paths of the last check left what was searched
+        self.held_back = ""  # a sentence about the last step, if bodies were held back
+        self._held = self._held_before = NO_PASSAGES
+
+    def forget(self) -> None:
+        """Discard all passages and lists, after the state was set."""
+        self._detection.forget_paths()
+        self._detection.held = self._held = self._held_before = NO_PASSAGES
+        self.some_exempt, self.held_back, self._detection.none_cross = False, "", False
+
+    def snapshot(self) -> dict:
+        """Return the passages (k,4) that the next search adds as contacts, and whether no surfaces cross."""
+        return {"held": self._detection.held[0], "none_cross": self._detection.none_cross}
+
+    def restore(self, kept: dict) -> None:
+        """Restore a `snapshot`."""
+        self.forget()
+        self._detection.held = np.asarray(kept["held"], dtype=np.int32).reshape(-1, 4), np.zeros(len(kept["held"]))
+        self._detection.none_cross = bool(kept["none_cross"])
+
+    def begin(self) -> None:
+        """Begin a substep."""
+        self._held = self._held_before = self._detection.held
+
+    def undo(self) -> None:
+        """Return to the passages held at the start of the substep."""
+        self._detection.held = self._held = self._held_before
+
+    def find(self, as_searched: bool = False) -> bool:
+        """Find the passages on the paths from the last search to the present state, or on the searched paths, and hold them from
+        now on. Return whether there are any, or whether the paths leave what was searched."""
+        found = self._detection.passages(SEARCHED if as_searched else TO_STATE)
+        self.uncovered = found is None
+        if found is None:
+            return True
+        pairs, times = found
+        if len(pairs):
+            every, time = np.concatenate([pairs, self._held[0]]), np.concatenate([times, self._held[1]])
+            _, first = np.unique(every, axis=0, return_index=True)  # of a pair held already, the new time
+            self._held = every[first], time[first]
+        return len(pairs) > 0
+
+    def use_all(self) -> None:
+        """Let the next search add all passages held, at their times along the searched paths."""
+        self._detection.held = self._held
+
+    def use_active(self, problem: ContactProblem) -> None:
+        """Let the next search add those that carry an impulse, at its positions."""
+        if len(self._held[0]) == 0:
+            return
+        feature, impulse = download([problem.feature, problem.r], problem.count[0])
+        active = feature[(feature[:, 0] == FACE_FACE) & (impulse[:, 0] > 0.0)]
+        one, other = active[:, 1], active[:, 2]
+        keys = set(zip(*(x.tolist() for x in (one % KINDS, one // KINDS, other // FEATURES, other % FEATURES))))
+        pairs = self._held[0]
+        kept = np.array([tuple(pair) in keys for pair in pairs.tolist()], dtype=bool)
+        self._detection.held = pairs[kept], np.zeros(int(kept.sum()))
+
+    def exempt_crossing(self) -> None:
+        """Exempt the colliders that cross at the last search, and no others."""
+        self.some_exempt = self._detection.exempt_crossing()
+        self._detection.none_cross = not self.some_exempt
+
+    def hold_back(self, x_start) -> None:
+        """Shorten the paths of bodies from x_start to the present state until nothing passes through anything. The last search
+        must have started there. Raise SimulationError if something that moves as prescribed passes through a body at rest."""
+        simulation, d = self._simulation, self._detection
+        start, (end, velocity) = x_start.to_numpy(), simulation.state()
+        bodies, part = simulation.scene.bodies, np.ones(len(d.scene.colliders))
+        n_bodies, n_rounds = len(bodies), 0
+        while len((found := d.passages(TO_STATE))[0]):
+            colliders, n_rounds = d.colliders_of(found[0]), n_rounds + 1
+            movable = (colliders < n_bodies) & (part[colliders] > 0.0)
+            if not movable.any(axis=1).all():
+                one, other = (d.scene.colliders[c].name for c in colliders[~movable.any(axis=1)][0])
+                raise SimulationError(
+                    f"step {simulation.step_count + 1}: '{one}' and '{other}' would pass through each other, although the bodies "
+                    "stay where they are: what moves as prescribed leaves no room"
+                )
+            shortened = np.ones(len(part))
+            for side in range(2):
+                np.minimum.at(shortened, colliders[:, side], SHORTENED * found[1])
+            part = np.where(shortened < 1.0, part * shortened if n_rounds < MAX_SHORTENINGS else 0.0, part)
+            part[part < LEAST] = 0.0
+            x, v = end.copy(), velocity.copy()
+            for body in range(n_bodies):
+                rows = simulation.layout.nodes(body)
+                x[rows], v[rows] = start[rows] + part[body] * (end[rows] - start[rows]), part[body] * velocity[rows]
+            simulation.set_state(x, v)
+        names = [bodies[k].name for k in np.flatnonzero(part[:n_bodies] < 1.0)]
+        listed = ", ".join(f"'{name}'" for name in names)
+        self.held_back = f"held back {listed}, which would have passed through another surface or through itself"
