@@ -13,7 +13,7 @@ import numpy as np
 import taisoft as ts
 
 from .hard_cases.contact import regular_tet
-from .hard_cases.shapes import COR, DOWN, SNH, SVK, WEIGHTLESS, one_body, split, voxels
+from .hard_cases.shapes import COR, DOWN, SNH, SVK, G, one_body, split, voxels
 
 STEPS = (1 / 480, 1 / 240, 1 / 120, 1 / 60, 1 / 30)  # [s] of implicit integrators
 IMPLICIT = ("implicit_euler", "bdf2", "linearly_implicit_euler")
@@ -39,12 +39,12 @@ def make_heap(number: int) -> Heap:
     """Heap of this number: even ones in single precision, every fifth, from number 4 on, with an explicit integrator."""
     rng = np.random.default_rng([number, 20])
     scene, kinds = ts.Scene(gravity=DOWN), []
-    add_ground(scene, rng)
+    lowest = add_ground(scene, rng)
     placed: list[tuple[np.ndarray, float]] = []
     for k in range(int(rng.integers(5, 21))):
         kind = str(rng.choice(list(KINDS)))
         mesh = turned_at_random(KINDS[kind](rng), rng)
-        place = free_place(placed, np.linalg.norm(mesh.vertices, axis=1).max(), rng)
+        place = free_place(placed, np.linalg.norm(mesh.vertices, axis=1).max(), lowest, rng)
         aim = np.array([0.0, 0.5 * place[1], 0.0]) - place + rng.normal(scale=0.3, size=3)
         velocity = rng.uniform(0.0, LARGEST_SPEED) * aim / np.linalg.norm(aim)
         scene.add_body(mesh, random_material(rng), name=f"{kind} {k}", position=place, velocity=velocity)
@@ -65,8 +65,8 @@ def stable_dt(scene: ts.Scene, integrator: str) -> float:
         return sim.stable_dt
 
 
-def add_ground(scene: ts.Scene, rng: np.random.Generator) -> None:
-    """Add a half-space or a box without a lid, and in half of the cases something that lies on it."""
+def add_ground(scene: ts.Scene, rng: np.random.Generator) -> float:
+    """Add a half-space or a box without a lid, and in half of the cases something that lies on it. Returns a free height [m]."""
 
     def friction() -> float:
         return float(rng.uniform(0.0, 1.0))
@@ -90,17 +90,16 @@ def add_ground(scene: ts.Scene, rng: np.random.Generator) -> None:
         wedge = turned_at_random(regular_tet(0.3), rng)
         place = np.array([x, 0.05, z]) - wedge.vertices.mean(axis=0)
         scene.add_obstacle(ts.MeshObstacle(wedge.vertices + place, wedge.surface), name="wedge", friction=friction())
+    return 0.35 if shape else GAP
 
 
-LOWEST = 0.4  # [m] above everything that lies on the ground
-
-
-def free_place(placed: list[tuple[np.ndarray, float]], radius: float, rng: np.random.Generator) -> np.ndarray:
-    """The lowest of a few random centers (3,) [m] at which a sphere around a body is free; adds it to those placed."""
+def free_place(placed: list[tuple[np.ndarray, float]], radius: float, lowest: float, rng: np.random.Generator) -> np.ndarray:
+    """The lowest of a few random centers (3,) [m] at which a sphere around a body is free, above `lowest`; adds it to those
+    placed."""
     room = max(0.0, WIDTH - GAP - radius)
     best = None
     for x, z in rng.uniform(-room, room, (8, 2)):
-        y, blocked = LOWEST + radius, True
+        y, blocked = lowest + radius, True
         while blocked:
             blocked = [p for p, r in placed if np.linalg.norm(p - (x, y, z)) < r + radius + GAP]
             y += 0.02 if blocked else 0.0
@@ -175,9 +174,11 @@ KINDS = {
 
 
 def folded_strip() -> ts.Scene:
-    """A strip of 1 x 0.1 x 0.01 m; one end is turned onto the other by 178 degrees about the middle within 2 s."""
+    """A strip of 1 x 0.1 x 0.01 m on the ground; one end is turned onto the other by 178 degrees about the middle within 2 s, and
+    its own weight lays the layers on each other."""
     mesh = ts.box_mesh((40, 4, 1), (1.0, 0.1, 0.01))
-    scene, body = one_body("strip", mesh, WEIGHTLESS, young=1e5, poisson=0.3)
+    scene, body = one_body("strip", mesh, (0.0, 0.0, -G), young=1e5, poisson=0.3)
+    scene.add_obstacle(ts.HalfSpace((0, 0, -0.006), (0, 0, 1)), name="ground")
     body.fix(lambda X: X[:, 0] < -0.499)
     end = mesh.vertices[mesh.vertices[:, 0] > 0.499]
 

@@ -50,6 +50,7 @@ class Watch:
     most: int = 0  # crossings in one state
     deepest: float = 0.0  # [m]
     least: float = NEAR  # [m], of every tenth state that does not cross; NEAR if it is larger
+    contacts: int = 0  # the engine's, in one step
     unconverged: int = 0
     inverted: int = 0
     judge_seconds: float = 0.0
@@ -66,6 +67,7 @@ class Watch:
         clock = time.perf_counter()
         self.states += 1
         self.unconverged += not report.converged
+        self.contacts = max(self.contacts, report.n_contacts)
         self.inverted = max(self.inverted, report.n_inverted)
         found = judge.find()
         if found.count:

@@ -9,9 +9,10 @@ Groups: demos, each as it is. hard: all variants of the hard cases that need not
 bodies, thrown at each other at up to 5 m/s, half of them in single precision and a fifth with explicit integrators. jittered: ten
 starts each, displaced by up to 0.1 mm at random, of a folded strip, the twisted mat (S1) and the trash compactor (S4).
 
-Each run has a process of its own. Depth: how far two crossing triangles must move to part, or how deep one is in a half-space,
-sphere or capsule. Least: the least distance of every tenth state that does not cross, up to 1 mm. --keep stores finished runs in
-DIR, and the same command resumes there. Exit status: 1 if any state crosses or a run crashes, else 0.
+Each run has a process of its own. Contacts: the most that the engine found in a step. Depth: how far two crossing triangles must
+move to part, or how deep one is in a half-space, sphere or capsule. Least: the least distance of every tenth state that does not
+cross, up to 1 mm. Nothing is judged where nothing can touch. --keep stores finished runs in DIR, and the same command resumes
+there. Exit status: 1 if any state crosses or a run crashes, else 0.
 """
 
 import argparse
@@ -62,6 +63,8 @@ def ran(rows: Iterable[dict]) -> list[dict]:
 
 def least_text(row: dict) -> str:
     """The least distance [mm]."""
+    if not row["states"]:
+        return ""
     return f"> {1e3 * NEAR:g}" if row["least"] >= NEAR else f"{1e3 * row['least']:.2g}"
 
 
@@ -69,6 +72,7 @@ COLUMNS = (
     ("<run", "{0[name]}"),
     ("<settings", "{0[settings]}"),
     ("bodies", lambda row: str(len(row["kinds"]) or "")),
+    ("contacts", "{0[contacts]}"),
     ("states", "{0[states]}"),
     ("cross", lambda row: str(row["crossing"] or "")),
     ("first", lambda row: str(row["first"]["step"]) if row["first"] else ""),
