@@ -9,10 +9,10 @@ Groups: demos, each as it is. hard: all variants of the hard cases that need not
 bodies, thrown at each other at up to 5 m/s, half of them in single precision and a fifth with explicit integrators. jittered: ten
 starts each, displaced by up to 0.1 mm at random, of a folded strip, the twisted mat (S1) and the trash compactor (S4).
 
-Each run has a process of its own. Contacts: the most that the engine found in a step. Depth: how far two crossing triangles must
-move to part, or how deep one is in a half-space, sphere or capsule. Least: the least distance of every tenth state that does not
-cross, up to 1 mm. Nothing is judged where nothing can touch. --keep stores finished runs in DIR, and the same command resumes
-there. Exit status: 1 if any state crosses or a run crashes, else 0.
+Each run has a process of its own. Nothing is judged where nothing can touch. Contacts, inverted: the most contacts, and inverted
+tets, in a step. Depth: how far two crossing triangles must move to part, or how deep one is in a half-space, sphere or capsule.
+Least: the least distance of every tenth state that does not cross, up to 1 mm. --keep stores finished runs in DIR, and the same
+command resumes there. Exit status: 1 if any state crosses or a run crashes, else 0.
 """
 
 import argparse
@@ -80,6 +80,7 @@ COLUMNS = (
     ("depth [mm]", lambda row: f"{1e3 * row['deepest']:.2g}" if row["crossing"] else ""),
     ("least [mm]", least_text),
     ("not converged", lambda row: str(row["unconverged"] or "")),
+    ("inverted", lambda row: str(row["inverted"] or "")),
     ("<status", "{0[status]}"),
     ("s", "{0[seconds]:.0f}"),
 )
