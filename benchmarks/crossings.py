@@ -1,0 +1,174 @@
+"""Crossings: does any surface cross another one, or itself, after any step?
+
+taisoft bench crossings [--what GROUP ...] [--only NAME] [--count N] [--budget SECONDS] [--quick] [--keep DIR] [--out [FILE.json]]
+
+ipctk judges every state: after each step of an implicit integrator, after each sub-step of an explicit one. Judged are bodies
+against each other and against obstacles, and against themselves where self-collision is on.
+
+Groups: demos, each as it is. hard: all variants of the hard cases that need not be refused. heaps: 200 random heaps of 5 to 20
+bodies, thrown at each other at up to 5 m/s, half of them in single precision and a fifth with explicit integrators. jittered: ten
+starts each, displaced by up to 0.1 mm at random, of a folded strip, the twisted mat (S1) and the trash compactor (S4).
+
+Each run has a process of its own. Nothing is judged where nothing can touch. Contacts, inverted: the most contacts, and inverted
+tets, in a step. Depth: how far two crossing triangles must move to part, or how deep one is in a half-space, sphere or capsule.
+Least: the least distance of every tenth state that does not cross, up to 1 mm. --keep stores finished runs in DIR, and the same
+command resumes there. Exit status: 1 if any state crosses or a run crashes, else 0.
+"""
+
+import argparse
+import sys
+import time
+from collections.abc import Iterable
+from contextlib import ExitStack, closing
+from pathlib import Path
+
+from taisoft.cli import Signals
+from taisoft.errors import OutputError
+from taisoft.machine import load_average
+from taisoft.output.files import FolderLock, make_folder
+from taisoft.study.output import NoStore, Store
+from taisoft.study.workers import serve
+
+from .crossing_runs import DEMOS, GROUPS, HARD, HEAPS, JITTERED, NEAR, answer, carry_out_all, runs_of
+from .document import Document, header, table
+from .runner import add_arch, add_named_out, make_parser, named_out, progress
+
+DAY = 86_400.0  # [s]
+TITLE = "Crossings"
+QUICK = {
+    DEMOS: ("cube_on_box", "sheet_on_box"),
+    HARD: ("S3: two bodies",),
+    HEAPS: ("heap 000", "heap 001", "heap 004"),
+    JITTERED: ("fold, start 0",),
+}
+QUICK_STEPS = 20
+SECONDS = ("seconds", "judge_seconds")
+MOST_PAIRS = 4  # of names in a sentence
+
+
+def chosen(what: Iterable[str], only: str, count: int | None, quick: bool, arch: str) -> list[dict]:
+    """The requests of the groups' runs whose names contain `only`."""
+    return [
+        {"group": group, "name": name, "arch": arch, "steps": QUICK_STEPS if quick else None}
+        for group in what
+        for name in (QUICK[group] if quick else runs_of(group, count))
+        if only in name
+    ]
+
+
+def ran(rows: Iterable[dict]) -> list[dict]:
+    """The rows with a record."""
+    return [row for row in rows if "left_out" not in row]
+
+
+def least_text(row: dict) -> str:
+    """The least distance [mm]."""
+    if not row["states"]:
+        return ""
+    return f"> {1e3 * NEAR:g}" if row["least"] >= NEAR else f"{1e3 * row['least']:.2g}"
+
+
+COLUMNS = (
+    ("<run", "{0[name]}"),
+    ("<settings", "{0[settings]}"),
+    ("bodies", lambda row: str(len(row["kinds"]) or "")),
+    ("contacts", "{0[contacts]}"),
+    ("states", "{0[states]}"),
+    ("cross", lambda row: str(row["crossing"] or "")),
+    ("first", lambda row: str(row["first"]["step"]) if row["first"] else ""),
+    ("most", lambda row: str(row["most"] or "")),
+    ("depth [mm]", lambda row: f"{1e3 * row['deepest']:.2g}" if row["crossing"] else ""),
+    ("least [mm]", least_text),
+    ("not converged", lambda row: str(row["unconverged"] or "")),
+    ("inverted", lambda row: str(row["inverted"] or "")),
+    ("<status", "{0[status]}"),
+    ("s", "{0[seconds]:.0f}"),
+)
+
+
+def first_text(row: dict) -> str:
+    """The first crossing of a run, in a line."""
+    one, more = row["first"], len(row["first"]["names"]) > MOST_PAIRS
+    names = ", ".join(one["names"][:MOST_PAIRS]) + (", ..." if more else "")
+    how = "" if one["converged"] else ", not converged"
+    return (
+        f"{row['name']} ({row['settings']}): step {one['step']}, t = {one['time']:.4g} s{how}: {names}, {one['count']} in all, "
+        f"{1e3 * one['depth']:.2g} mm deep; the deepest of the run {1e3 * row['deepest']:.2g} mm"
+    )
+
+
+def group_text(group: str, rows: list[dict]) -> str:
+    """The section of a group: its table, where each run first crosses, what went wrong."""
+    found = ran(rows)
+    notes = [f"First crossing of {first_text(row)}." for row in found if row["first"]]
+    notes += [f"{row['name']}: {row['starts_crossing']} starts cross before any step." for row in found if row["starts_crossing"]]
+    notes += [f"{row['name']}: {problem}" for row in found for problem in row["problems"]]
+    notes += [f"{row['name']} was not run: {row['left_out']}" for row in rows if "left_out" in row]
+    made = table(found, COLUMNS, notes) if found else "\n".join(f"* {note}" for note in notes)
+    return f"## {group}\n\n{made}\n\n{total_text(group, rows)}"
+
+
+def total_text(what: str, rows: list[dict]) -> str:
+    """How many states were judged, and how many cross."""
+    found = ran(rows)
+    states, crossing, seconds, judging = (sum(row[key] for row in found) for key in ("states", "crossing", *SECONDS))
+    runs = f"{sum(row['crossing'] > 0 for row in found)} of {len(found)} runs"
+    return f"**{what}: {states} states judged, {crossing} cross**, in {runs}; {seconds:.0f} s, of which {judging:.0f} s judging"
+
+
+def page(rows: list[dict]) -> list[str]:
+    """The parts of the page."""
+    groups = {group: [row for row in rows if row["group"] == group] for group in GROUPS}
+    return [*(group_text(group, own) for group, own in groups.items() if own), total_text("In all", rows)]
+
+
+def failed(rows: list[dict]) -> bool:
+    """Whether a state crosses or a run crashed."""
+    return any(row.get("crossing") or row.get("starts_crossing") or row.get("crashed") for row in rows)
+
+
+def main(argv=None) -> int:
+    """Run, judge and print. Raises OutputError."""
+    parser = make_parser("crossings", __doc__)
+    parser.add_argument("--what", nargs="+", choices=GROUPS, default=list(GROUPS), help="only these groups")
+    parser.add_argument("--only", default="", metavar="NAME", help="only runs whose name contains this, such as 'heap 017'")
+    parser.add_argument("--count", type=int, metavar="N", help="only the first N heaps, and N starts of each jittered scene")
+    parser.add_argument("--budget", type=float, default=DAY, metavar="SECONDS", help="start no run after this time")
+    parser.add_argument("--quick", action="store_true", help="a few runs, heaps and folds of 20 steps")
+    add_arch(parser)
+    parser.add_argument("--keep", type=Path, metavar="DIR", help="store finished runs there, and reuse those stored")
+    add_named_out(parser)
+    parser.add_argument("--child", action="store_true", help=argparse.SUPPRESS)  # how this command carries out one run
+    options = parser.parse_args(argv)
+    if options.child:
+        serve(answer)
+    try:
+        import ipctk  # noqa: F401
+    except ImportError:
+        raise OutputError("taisoft bench crossings needs ipctk, which judges: pip install ipctk") from None
+    requests = chosen(options.what, options.only, options.count, options.quick, options.arch)
+    if not requests:
+        parser.error(f"--only {options.only!r}: no run of {', '.join(options.what)} is called so")
+    out, document = named_out(options, "crossings"), Document()
+    text, numbers = header(TITLE, f"arch {options.arch}", packages=("taichi", "numpy", "ipctk"))
+    document.add(text)
+    end = time.monotonic() + options.budget
+    with Signals("ending; runs that are finished are kept") as signals, ExitStack() as stack:
+        store = NoStore()
+        if options.keep is not None:
+            folder = make_folder(options.keep)
+            stack.enter_context(closing(FolderLock(folder)))
+            store = Store(folder)
+        signals.run_began()
+        limits = {"seconds_left": lambda: end - time.monotonic(), "stop_requested": signals.requested}
+        rows = carry_out_all(requests, store, **limits, say=progress)
+    for part in (*page(rows), *store.damaged):
+        document.add(part)
+    if out is not None:
+        options = {key: getattr(options, key) for key in ("arch", "quick", "what", "only", "count")}
+        document.write(out, numbers | options | {"load_at_the_end": load_average(), "rows": rows})
+    return 1 if failed(rows) else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

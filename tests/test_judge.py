@@ -1,0 +1,195 @@
+"""The judge of crossing surfaces:
+
+* triangles that pierce each other cross, those that touch, share an edge or lie in one plane do not; a pair with a common vertex
+  crosses where the edge opposite it pierces the other triangle;
+* the pairs are those of all pairs in random crumpled bodies, and the least distance that of brute force;
+* distances from half-spaces, spheres and capsules are those of sampled points;
+* a surface wholly inside another one counts, and so do shapes inside a body; obstacles may cross each other.
+"""
+
+from fractions import Fraction
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+import taisoft as ts
+
+ipctk = pytest.importorskip("ipctk")
+from benchmarks import judge as judging  # noqa: E402
+
+FLAT = np.array([(0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)])
+THROUGH = np.array([(0.2, 0.2, -1.0), (0.3, 0.2, 1.0), (0.2, 0.9, 1.0)])
+
+
+def standing(scene: ts.Scene, x: dict[str, np.ndarray] | None = None, time: float = 0.0) -> SimpleNamespace:
+    """A simulator whose bodies are at x, those left out where they start."""
+    places = {b.name: b.rest_positions + b.position for b in scene.bodies} | (x or {})
+    return SimpleNamespace(scene=scene, time=time, positions=lambda: np.concatenate([places[b.name] for b in scene.bodies]))
+
+
+def scene_of(*positions, size: float = 1.0, cells: int = 1) -> ts.Scene:
+    """Cubes at some positions [m]."""
+    scene = ts.Scene()
+    for k, position in enumerate(positions):
+        scene.add_body(ts.box_mesh((cells,) * 3, (size,) * 3), ts.Material(), name=f"cube {k}", position=position)
+    return scene
+
+
+@pytest.mark.parametrize(
+    "other, crosses",
+    [
+        (THROUGH, True),
+        (THROUGH + [0.0, 0.0, 1.1], False),  # above it
+        (THROUGH + [1.0, 1.0, 0.0], False),  # beside it
+        (FLAT + [0.0, 0.0, 1e-12], False),  # parallel and very close
+        (FLAT + [0.1, 0.1, 0.0], False),  # in one plane
+        (THROUGH * [1.0, 1.0, -1.0], True),
+    ],
+)
+def test_two_triangles(other, crosses):
+    x = np.concatenate([FLAT, other])
+    a, b = np.arange(3)[None], np.arange(3, 6)[None]
+    assert judging.pierces(x, a, b)[0] == judging.pierces(x, b, a)[0] == crosses
+
+
+def test_triangles_with_common_vertices():
+    folded = np.concatenate([FLAT, [(0.3, 0.3, 0.5), (0.3, 0.3, -0.5)]])
+    beside = np.concatenate([FLAT, folded[3:] - [2.0, 0.0, 0.0]])
+    first, second = np.array([[0, 1, 2]]), np.array([[0, 3, 4]])
+    assert judging.pierces(folded, first, second)[0] and not judging.pierces(beside, first, second)[0]
+    assert not judging.pierces(folded, first, np.array([[0, 1, 4]]))[0]
+    assert judging.triangle_distance(beside, first[0], first[0]) == np.inf
+
+
+def test_orientation_is_exact():
+    """Points a rounding error off a plane, and in it, whose determinants in double precision have random signs."""
+    a, b, c = np.array([(0.1, 0.2, 0.3), (1.7, 0.3, 0.9), (0.4, 1.9, 0.2)])
+    weights = np.array([(0.5, 0.25, 0.25), (0.25, 0.5, 0.25), (0.125, 0.125, 0.75), (1.0, 0.0, 0.0)])
+    d = weights @ [a, b, c]
+    signs = judging.orientation(*(np.tile(one, (len(d), 1)) for one in (a, b, c)), d)
+    for sign, point in zip(signs, d):
+        rows = [[Fraction(float(p)) - Fraction(float(q)) for p, q in zip(one, point)] for one in (a, b, c)]
+        u, v, w = rows
+        det = sum(u[i] * (v[(i + 1) % 3] * w[(i + 2) % 3] - v[(i + 2) % 3] * w[(i + 1) % 3]) for i in range(3))
+        assert sign == (det > 0) - (det < 0)
+    assert signs[-1] == 0.0 and judging.orientation(*FLAT[:, None], np.array([[0.2, 0.2, -1e-300]]))[0] == 1.0
+
+
+def test_flush_and_aligned_cubes_touch_without_crossing():
+    for off, crosses in ((0.0, False), (1e-15, False), (-1e-9, True)):
+        for shift in ((0.0, 0.0), (0.5, 0.25), (0.3, 0.0)):
+            scene = scene_of((0, 0, 0), (shift[0], 1.0 + off, shift[1]), cells=2)
+            assert (judging.Judge(standing(scene), True).crossings() > 0) == (crosses and any(shift))
+
+
+def sampled(corners: np.ndarray, n: int = 60) -> np.ndarray:
+    """Points (m,3) spread over a triangle, edges included."""
+    i, j = (index.ravel() / n for index in np.meshgrid(np.arange(n + 1), np.arange(n + 1)))
+    inside = i + j <= 1.0
+    return corners[0] + i[inside, None] * (corners[1] - corners[0]) + j[inside, None] * (corners[2] - corners[0])
+
+
+def test_distances_of_triangles_and_axes_are_those_of_sampled_points():
+    rng = np.random.default_rng(0)
+    for _ in range(40):
+        x = rng.uniform(-1.0, 1.0, (6, 3)) + np.repeat([[0.0] * 3, [2.0, 0.0, 0.0]], 3, axis=0)
+        p, q = sampled(x[:3], 30), sampled(x[3:], 30)
+        brute = np.linalg.norm(p[:, None] - q[None], axis=2).min()
+        found = judging.triangle_distance(x, np.arange(3), np.arange(3, 6))
+        assert brute - 0.06 <= found <= brute + 1e-9
+        along = x[3] + np.linspace(0.0, 1.0, 200)[:, None] * (x[4] - x[3])
+        brute = np.linalg.norm(p[:, None] - along[None], axis=2).min()
+        assert brute - 0.06 <= judging.axis_distance(x[3], x[4], x[:3]) <= brute + 1e-9
+        brute = np.linalg.norm(p - x[3], axis=1).min()
+        assert brute - 0.06 <= judging.axis_distance(x[3], x[3], x[:3]) <= brute + 1e-9
+    assert judging.axis_distance(THROUGH[0], THROUGH[1], FLAT) == 0.0
+
+
+def test_depths():
+    a, b = FLAT[None], THROUGH[None]
+    assert judging.separation(a, b + [0.0, 0.0, 1.1])[0] == 0.0 and judging.separation(a, FLAT[None] + [5.0, 0.0, 0.0])[0] == 0.0
+    tip = np.array([[(0.3, 0.3, -1e-3), (0.2, 0.3, 1.0), (0.4, 0.3, 1.0)]])
+    assert judging.separation(a, tip)[0] == judging.separation(tip, a)[0] == pytest.approx(1e-3)
+    scene = scene_of((0, 0, 0), (0.2, 0.99, 0.3))
+    assert judging.Judge(standing(scene), False).find().depth == pytest.approx(0.01)
+
+
+def crumpled(scene: ts.Scene, seed: int) -> dict[str, np.ndarray]:
+    """Positions of each body, folded into itself by waves."""
+    rng = np.random.default_rng(seed)
+    k, amplitude = rng.uniform(-8.0, 8.0, (3, 4)), 0.3 * rng.standard_normal((4, 3))
+    start = {b.name: b.rest_positions + b.position for b in scene.bodies}
+    return {name: x + 0.2 * np.sin(x @ k) @ amplitude + 0.01 * rng.standard_normal(x.shape) for name, x in start.items()}
+
+
+def edges_and_triangles(t: np.ndarray, pairs):
+    """Every edge of one triangle of a pair with the other one, if they share no vertex."""
+    for a, b in pairs:
+        for p, q in ((t[a], t[b]), (t[b], t[a])):
+            yield from ((p[k - 1], p[k], q) for k in range(3) if p[k - 1] not in q and p[k] not in q)
+
+
+@pytest.mark.parametrize("self_collision", [True, False])
+def test_crossings_and_distances_are_those_of_all_pairs(self_collision):
+    scene, crossed = scene_of((0, 0, 0), (0.0, 0.55, 0.1), (0.3, -0.6, 0.0), size=0.5, cells=2), 0
+    for seed in range(3):
+        sim = standing(scene, crumpled(scene, seed))
+        judge = judging.Judge(sim, self_collision)
+        x, t = judge.vertices(), judge.triangles
+        owner = np.arange(len(t)) // (len(t) // 3)
+        may = [(a, b) for a in range(len(t)) for b in range(a) if self_collision or owner[a] != owner[b]]
+        crossings = judging.pierces(x, *t[np.array(may).T]).sum()
+        by_ipctk = sum(ipctk.is_edge_intersecting_triangle(x[i], x[j], *x[q]) for i, j, q in edges_and_triangles(t, may))
+        assert (crossings > 0) == (by_ipctk > 0)
+        crossed += crossings > 0
+        assert judge.crossings() == crossings or (crossings == 0 and not self_collision)
+        least = min(judging.triangle_distance(x, t[a], t[b]) for a, b in may)
+        assert judge.least_distance(10.0) == pytest.approx(least, rel=1e-9)
+        assert judge.least_distance(0.5 * least) == 0.5 * least
+    assert crossed >= 1
+
+
+def test_names_and_bodies_inside_others():
+    scene = scene_of((0, 0, 0), (0.9, 0.1, 0.1), (5, 0, 0))
+    scene.add_body(ts.box_mesh((1, 1, 1), (0.2,) * 3), ts.Material(), name="small", position=(5.0, 0.0, 0.0))
+    names = judging.Judge(standing(scene), False).find().names
+    assert set(names) == {("cube 0", "cube 1")}
+    apart = {"cube 1": scene.body("cube 1").rest_positions + [0.0, 5.0, 0.0]}
+    assert judging.Judge(standing(scene, apart), False).find().names == {("small", "cube 2"): 1}
+    apart["small"] = scene.body("small").rest_positions + [9.0, 0.0, 0.0]
+    assert judging.Judge(standing(scene, apart), True).crossings() == 0
+
+
+def test_obstacles():
+    scene = scene_of((0, 0.6, 0))
+    scene.add_obstacle(ts.HalfSpace((0, 0, 0), (0, 1, 0)), name="ground")
+    scene.add_obstacle(ts.Box((0, 0, 0), (3.0, 0.05, 3.0)), name="slab")  # it crosses the ground, which is allowed
+    scene.add_obstacle(ts.Sphere((0, 1.6, 0), 0.4), name="ball")
+    scene.add_obstacle(ts.Capsule((-1, 0.6, 1.2), (1, 0.6, 1.2), 0.5), name="bar")
+    body = scene.body("cube 0").rest_positions
+
+    def judged(y: float, time: float = 0.0) -> judging.Judge:
+        return judging.Judge(standing(scene, {"cube 0": body + [0.0, y, 0.0]}, time), False)
+
+    assert judged(0.6).crossings() == 0 and judged(0.6).least_distance(1.0) == pytest.approx(0.05)
+    assert judged(0.65).least_distance(1.0) == pytest.approx(0.05)  # from the ball
+    assert set(judged(0.72).find().names) == {("cube 0", "ball")}
+    assert judged(0.72).least_distance(1.0) == pytest.approx(-0.02)
+    assert set(judged(0.53).find().names) == {("cube 0", "slab")}
+    assert set(judged(0.4).find().names) == {("cube 0", "slab"), ("cube 0", "ground")}
+    inside = ts.Scene()
+    inside.add_body(ts.box_mesh((1, 1, 1), (1.0,) * 3), ts.Material(), name="cube")
+    inside.add_obstacle(ts.Sphere((0.1, 0, 0), 0.1), name="ball")
+    inside.add_obstacle(ts.Box((3.0, 0, 0), (1.0, 1.0, 1.0)), name="block")
+    assert judging.Judge(standing(inside), False).find().names == {("ball", "cube"): 1}
+    moved = {"cube": 0.5 * inside.body("cube").rest_positions + [3.1, 0.0, 0.0]}
+    assert judging.Judge(standing(inside, moved), False).find().names == {("cube", "block"): 1}
+
+
+def test_moving_obstacles_are_judged_where_they_are():
+    scene = scene_of((0, 0.6, 0))
+    scene.add_obstacle(ts.HalfSpace((0, 0, 0), (0, 1, 0)), name="ground", path=lambda t: (np.array([0.0, t, 0.0]), np.eye(3)))
+    scene.add_obstacle(ts.Sphere((0, 2, 0), 0.5), name="ball", path=lambda t: (np.array([0.0, -t, 0.0]), np.eye(3)))
+    assert [judging.Judge(standing(scene, time=t), False).crossings() > 0 for t in (0.0, 0.09, 0.11)] == [False, False, True]
+    assert set(judging.Judge(standing(scene, time=0.45), False).find().names) == {("cube 0", "ground"), ("cube 0", "ball")}
