@@ -15,6 +15,7 @@ an error or its surfaces crossed.
 """
 
 import argparse
+import importlib.util
 import math
 import sys
 
@@ -37,7 +38,7 @@ TOLERANCE = 1e-4
 def jobs(options: argparse.Namespace) -> list[Job]:
     """The runs of the chosen options."""
     size = options.size or (SMALL if options.quick else FULL)
-    budget = options.budget or (QUICK_BUDGET if options.quick else BUDGET)
+    budget = options.budget if options.budget is not None else (QUICK_BUDGET if options.quick else BUDGET)
     steps = options.steps or (QUICK_STEPS if options.quick else None)
     if not options.friction:
         names = options.scene or NAMES
@@ -117,30 +118,33 @@ def failed(record: Record) -> bool:
     return bool(record.crossed) or record.failed
 
 
+def parser() -> argparse.ArgumentParser:
+    """The options."""
+    made = make_parser("ipc", __doc__)
+    known = (*NAMES, *(case.name for case in EXTRA))
+    made.add_argument("--scene", nargs="+", choices=known, metavar="NAME", help=f"only these: {', '.join(known)}")
+    made.add_argument("--size", choices=SIZES, help="of the meshes (default full, with --quick small)")
+    made.add_argument("--budget", type=float, metavar="SECONDS", help=f"wall time of each scene (default {BUDGET:g})")
+    made.add_argument("--quick", action="store_true", help=f"small meshes, {QUICK_STEPS} steps")
+    made.add_argument("--steps", type=int, metavar="N", help="at most so many steps of each scene")
+    made.add_argument("--friction", action="store_true", help="the table of friction instead")
+    made.add_argument("--precision", choices=("f32", "f64"), default="f64", help="(default %(default)s)")
+    text = "newton_tolerance and contact_tolerance (default %(default)g)"
+    made.add_argument("--tolerance", type=float, default=TOLERANCE, metavar="NUMBER", help=text)
+    add_named_out(made)
+    made.add_argument("--child", metavar="JOB", help=argparse.SUPPRESS)  # how this command runs one scene
+    return made
+
+
 def main(argv=None) -> int:
     """Measure and print. Raises OutputError."""
-    parser = make_parser("ipc", __doc__)
-    known = (*NAMES, *(case.name for case in EXTRA))
-    parser.add_argument("--scene", nargs="+", choices=known, metavar="NAME", help=f"only these: {', '.join(known)}")
-    parser.add_argument("--size", choices=SIZES, help="of the meshes (default full, with --quick small)")
-    parser.add_argument("--budget", type=float, metavar="SECONDS", help=f"wall time of each scene (default {BUDGET:g})")
-    parser.add_argument("--quick", action="store_true", help=f"small meshes, {QUICK_STEPS} steps")
-    parser.add_argument("--steps", type=int, metavar="N", help="at most so many steps of each scene")
-    parser.add_argument("--friction", action="store_true", help="the table of friction instead")
-    parser.add_argument("--precision", choices=("f32", "f64"), default="f64", help="(default %(default)s)")
-    text = "newton_tolerance and contact_tolerance (default %(default)g)"
-    parser.add_argument("--tolerance", type=float, default=TOLERANCE, help=text)
-    add_named_out(parser)
-    parser.add_argument("--child", metavar="JOB", help=argparse.SUPPRESS)  # how this command runs one scene
-    options = parser.parse_args(argv)
+    options = parser().parse_args(argv)
     if options.child:
         answer(options.child)
         return 0
     options.arch = "cpu"
-    try:
-        import ipctk  # noqa: F401
-    except ImportError:
-        raise OutputError("taisoft bench ipc needs ipctk, which is missing: pip install 'taisoft[dev]'") from None
+    if importlib.util.find_spec("ipctk") is None:
+        raise OutputError("taisoft bench ipc needs ipctk, which is missing: pip install 'taisoft[dev]'")
     out = named_out(options, "ipc_friction" if options.friction else "ipc")
     document, numbers = begin("Scenes of incremental potential contact", "cpu", packages=("taichi", "numpy", "ipctk"))
     document.add(__doc__.partition("\n\n")[2].partition("\n\n")[2].strip())
