@@ -77,13 +77,14 @@ def scene_table(records: list[Record]) -> str:
         ("time [s] (steps)", reached),
         ("Newton", lambda r: number(mean(r.newton))),
         ("CG", lambda r: number(mean(r.cg), ".0f")),
+        ("substeps", lambda r: number(mean(r.substeps))),
         ("s/step: mean, median, largest", step_seconds),
         ("compiling [s]", lambda r: f"{r.compile_seconds:.0f}"),
         ("least distance [m]", lambda r: number(r.least_distance)),
         ("crossed", lambda r: f"{r.crossed}"),
         ("not converged", lambda r: f"{r.unconverged}"),
         ("inverted", lambda r: f"{r.inverted}"),
-        ("published s/step", lambda r: number(r.case.published_seconds)),
+        ("published s/step (other machine)", lambda r: number(r.case.published_seconds)),
         ("<status", lambda r: r.status),
     )
     notes = [f"{record.case.title}: {record.status}, {record.reason}" for record in records if record.reason]
@@ -101,7 +102,7 @@ def friction_table(records: list[Record]) -> str:
         ("s/step: mean, median, largest", step_seconds),
         ("creep [edges/s]", lambda r: number(r.creep)),
         ("work of friction [J]", lambda r: number(r.friction_work, ".4g")),
-        ("in substeps", lambda r: f"{r.cut}"),
+        ("steps in substeps", lambda r: f"{r.cut}"),
         ("crossed", lambda r: f"{r.crossed}"),
         ("<status", lambda r: r.status),
     )

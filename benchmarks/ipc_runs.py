@@ -53,8 +53,8 @@ class Record:
     """What a run did, as plain data. failed: whether it ended with an error.
 
     least_distance: [m], every DISTANCE_EVERY steps; math.inf if nothing was nearer than NEAR of an edge. crossed: number of steps
-    after which surfaces crossed. newton, cg: iterations of each step. seconds: of each step without compilation [s].
-    creep [1/s], friction_work [J], cut (steps left out): see `ipc_friction`; None and 0 unless it is measured.
+    after which surfaces crossed. newton, cg, substeps: of each step. seconds: of each step without compilation [s].
+    creep [1/s], friction_work [J], cut (steps in substeps): see `ipc_friction`; None and 0 unless it is measured.
     """
 
     job: Job
@@ -64,6 +64,7 @@ class Record:
     time: float = 0.0
     newton: list[int] = field(default_factory=list)
     cg: list[int] = field(default_factory=list)
+    substeps: list[int] = field(default_factory=list)
     seconds: list[float] = field(default_factory=list)
     compile_seconds: float = 0.0
     least_distance: float = math.inf
@@ -84,6 +85,7 @@ class Record:
         self.time = report.time
         self.newton.append(report.newton_iterations)
         self.cg.append(report.linear_iterations)
+        self.substeps.append(report.substeps)
         self.seconds.append(seconds)
         self.unconverged += not report.converged
         self.inverted = max(self.inverted, report.n_inverted)
@@ -103,10 +105,10 @@ class Record:
     def faults(self) -> list[str]:
         """What degrades the run, in a few words each."""
         counted = [
-            (self.crossed, f"{self.crossed} steps crossed"),
+            (self.crossed, f"{self.crossed} {'step' if self.crossed == 1 else 'steps'} crossed"),
             (self.unconverged, f"{self.unconverged} not converged"),
-            (self.inverted, f"up to {self.inverted} inverted tets"),
-            (self.deep, f"{self.deep} deep"),
+            (self.inverted, f"at most {self.inverted} inverted tets"),
+            (self.deep, f"{self.deep} with deep penetration"),
         ]
         return [text for count, text in counted if count]
 
