@@ -36,9 +36,9 @@ def nearest(X: array, out: array):
 
 
 @kernel
-def free(X: array, P: array, radius: ti.f64, floor: ti.f64, out: array):
+def free(X: array, P: array, radius: ti.f64, floor: ti.f64, are_apart: ti.i32, out: array):
     for i in range(X.shape[0]):
-        out[i], _ = separation.free_until(rows(X, i), rows(P, i), radius, floor)
+        out[i], _ = separation.free_until(rows(X, i), rows(P, i), radius, floor, are_apart)
 
 
 @pytest.fixture(scope="module", params=["f64", "f32"], autouse=True)
@@ -47,9 +47,9 @@ def runtime(request):
         yield made
 
 
-def free_until(x: np.ndarray, p: np.ndarray, radius: float = 0.0, floor: float = 1e-6) -> np.ndarray:
+def free_until(x: np.ndarray, p: np.ndarray, radius: float = 0.0, floor: float = 1e-6, are_apart: bool = True) -> np.ndarray:
     out = np.zeros(len(x))
-    free(np.ascontiguousarray(x), np.ascontiguousarray(p), radius, floor, out)
+    free(np.ascontiguousarray(x), np.ascontiguousarray(p), radius, floor, int(are_apart), out)
     return out
 
 
@@ -159,6 +159,13 @@ def test_touching_triangles_are_not_free():
     up[0, :3, 1] = 0.1
     for move in (up, -up, 0.0 * up):
         assert free_until(x, move) == 0.0
+
+
+def test_crossing_triangles_are_told_by_a_motion_of_nothing():
+    x = np.random.default_rng(5).standard_normal((500, 6, 3))
+    crossing = np.array([distance(y) == 0.0 for y in x])
+    assert 20 < crossing.sum() < 480
+    assert np.array_equal(free_until(x, 0.0 * x, are_apart=False) < 1.0, crossing)
 
 
 def test_frame_and_order_change_nothing():

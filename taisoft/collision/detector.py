@@ -107,7 +107,7 @@ class Detection:
         self._reduction = None
         self._intersections: Intersections | None = None
         self._self_on, self.floor = properties["self_on"], FLOOR * float(self.edges[: len(bodies)].min())
-        self._path_check: PathCheck | None = None  # made at first use
+        self._paths: PathCheck | None = None
         self.none_cross = False  # whether no surfaces are known to cross at the positions that are searched
         self.held = np.zeros((0, 4), dtype=np.int32), np.zeros(0)  # passages that every search adds as contacts, and their times
         self._containment = Containment(scene, self.topology, layout, self._rest, self._analytic, self_collision)
@@ -282,15 +282,12 @@ class Detection:
                 break
         return depths
 
-    @property
-    def _paths(self) -> PathCheck:
-        if self._path_check is None:
-            settings = self.scene.collision
-            limits = settings.initial_capacity, settings.max_capacity
-            self._path_check = PathCheck(
-                self.surface, self.topology, self.shapes, self._self_on, self.reach, self.floor, self._arena, *limits
-            )
-        return self._path_check
+    def prepare_paths(self) -> None:
+        """Allocate what the check of paths needs."""
+        settings = self.scene.collision
+        limits = settings.initial_capacity, settings.max_capacity
+        options = self._self_on, self.reach, self.floor, self._arena, *limits
+        self._paths = PathCheck(self.surface, self.topology, self.shapes, *options)
 
     def passages(self, mode: int) -> tuple[np.ndarray, np.ndarray] | None:
         """Return the passages (k,4) on the paths from the positions of the last search, and the parts (k,) of the step until
@@ -299,8 +296,8 @@ class Detection:
 
     def forget_paths(self) -> None:
         """Discard lists of near pairs, after positions were set."""
-        if self._path_check is not None:
-            self._path_check.forget()
+        if self._paths is not None:
+            self._paths.forget()
 
     def colliders_of(self, passages: np.ndarray) -> np.ndarray:
         """Return the two colliders (k,2) of each of the given passages (k,4)."""
@@ -325,7 +322,7 @@ class Detection:
         return self._containment.find(self.surface, self.model.state.x, self.shapes)
 
     def _buffers(self) -> list[Buffer]:
-        paths = () if self._path_check is None else self._path_check.buffers
+        paths = () if self._paths is None else self._paths.buffers
         return [self.buffer, *((self._near_buffer, *self.broad.buffers) if self._has_pairs else ()), *paths]
 
     @property
@@ -335,7 +332,7 @@ class Detection:
 
     def release(self) -> None:
         """Free all memory."""
-        for part in (self.broad, self._intersections, self._near_buffer, self._path_check):
+        for part in (self.broad, self._intersections, self._near_buffer, self._paths):
             if part is not None:
                 part.release()
         self.buffer.release()

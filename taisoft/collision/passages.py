@@ -208,7 +208,7 @@ def check_paths(
                             checked = g.exempt[s.body[a] * s.n_bodies + o.body[b]] == 0
                     if checked:
                         y, p = _rows(s, o, g, kind, a, b, g.path)
-                        time, features = free_until(y, p, _radius(o, kind, b), floor)
+                        time, features = free_until(y, p, _radius(o, kind, b), floor, mode != STILL)
                         if time < 1.0:
                             at = _write_passage(out.data, at, last, kind, a, b, features, time)
             out.used[c] = at - c * out.part

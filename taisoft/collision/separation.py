@@ -82,7 +82,7 @@ def _kept_until(y, q, n, need):
             now = (row_of(y, i) - row_of(y, 3 + j)).dot(n) - need
             then = now + (row_of(q, i) - row_of(q, 3 + j)).dot(n)
             if then < 0.0:
-                until = ti.min(until, ti.max(now, 0.0) / (now - then))
+                until = ti.min(until, ti.select(now > 0.0, now / (now - then), 0.0))
     return until
 
 
@@ -137,13 +137,14 @@ def _of_features(corners, k):
 
 
 @ti.func
-def free_until(x, p, radius, floor):
+def free_until(x, p, radius, floor, are_apart):
     """Fraction of the motion during which two triangles certainly stay apart, 1 if they do to its end; and the features that
     meet first, see `nearest_of`.
 
     x, p: (6,3) corners [m], three of each, and their displacements [m]; radius [m]: by which the second one is thicker; floor
-    [m]: distance that they keep, or half of their first distance if that is less. 0 if they touch at first. Triangles that no
-    plane separates for long, as they turn, are taken apart into their features: corner and triangle, or two edges.
+    [m]: distance that they keep, or half of their first distance if that is less; are_apart: whether they are known not to cross
+    at first. 0 if they touch at first. Triangles that no plane separates for long, as they turn, are taken apart into their
+    features, corner and triangle or two edges: if these stay apart, triangles that do not cross at first do not later.
     """
     result, features, k = ti.cast(1.0, ti.f64), 0, -1
     while k < 15:
@@ -175,7 +176,9 @@ def free_until(x, p, radius, floor):
                         part = later
                     time = later
             n += 1
-        if k == -1 and part >= 1.0:
+        if k == -1 and not are_apart:
+            result = part
+        if k == -1 and (part >= 1.0 or not are_apart):
             k = 15
         elif k >= 0 and part < result:
             result, features = part, k

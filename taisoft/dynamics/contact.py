@@ -143,7 +143,7 @@ class ContactStep:
         self.had_impact, self.dropped = bool(kept["met"]), int(kept["dropped"])
         self.flight[:] = kept["flight"]
         self.paths.restore(kept["paths"])
-        self.crossing, self.last_crossing = 0.0 if self.detection.none_cross else None, Crossing()
+        self.crossing, self.last_crossing = 0.0 if self.paths.none_cross else None, Crossing()
         self._searched = self._measured_end = None
         self._indexed = True  # so that the next step rebuilds the node index, even without contacts
 
@@ -244,7 +244,9 @@ class ContactStep:
         self.paths.begin()
 
     def end_substep(self) -> None:
-        """Add the impulses of a substep."""
+        """Add the impulses of a substep; check from now on the paths of colliders that do not cross any more."""
+        if not self.paths.none_cross:
+            self.paths.exempt_crossing()
         if self._substep_fraction < 1.0:
             impulses = sum_impulses(self.contacts(), self.simulation.scene)
             self._impulse_sum = impulses + (0.0 if self._impulse_sum is None else self._impulse_sum)
@@ -281,7 +283,7 @@ class ContactStep:
             self._find(time, 0.0)  # a path ends here; the next step reports it
         closing = self.measures.closing(dt)
         depth, self.relative_penetration = float(closing[DEPTH]), float(closing[RELATIVE_PENETRATION])
-        if self.paths.some_exempt and not self._explicit:
+        if not self._explicit:
             crossing = self.measure_crossings()
             depth, self.relative_penetration = max(depth, crossing[0]), max(self.relative_penetration, crossing[1])
         if self._has_paths:
@@ -296,10 +298,9 @@ class ContactStep:
 
     def measure_crossings(self) -> tuple[float, float]:
         """Return the depth of crossing triangles or contained colliders at the last search [m], and over the finer side's mean
-        surface edge. Set `crossing` and `last_crossing`."""
-        self.last_crossing = found = self.measures.crossing()
+        surface edge. Set `crossing` and `last_crossing`. If none crossed before, none do: their paths were checked."""
+        self.last_crossing = found = Crossing() if self.paths.none_cross else self.measures.crossing()
         self.crossing = found.relative
-        self.paths.exempt_crossing()
         return found.depth, found.relative
 
     def left_searched_path(self, x_start) -> bool:
@@ -347,6 +348,7 @@ class ContactStep:
         """Return the depth of crossing triangles over the finer side's mean surface edge, at the start of a searched step."""
         if self.crossing is None:
             self.measure_crossings()
+            self.paths.exempt_crossing()
         return self.crossing
 
     def describe_fast_closing(self, dt: float, substeps: int = 1) -> str:

@@ -26,16 +26,21 @@ class ContactPaths:
 
     def __init__(self, simulation: SimulationState, detection: Detection):
         self._simulation, self._detection = simulation, detection
-        self.some_exempt = False  # whether some colliders cross already, so that their paths are not checked
         self.uncovered = False  # whether the paths of the last check left what was searched
         self.held_back = ""  # a sentence about the last step, if bodies were held back
         self._held = self._held_before = NO_PASSAGES
+        detection.prepare_paths()
 
     def forget(self) -> None:
         """Discard all passages and lists, after the state was set."""
         self._detection.forget_paths()
         self._detection.held = self._held = self._held_before = NO_PASSAGES
-        self.some_exempt, self.held_back, self._detection.none_cross = False, "", False
+        self.held_back, self._detection.none_cross = "", False
+
+    @property
+    def none_cross(self) -> bool:
+        """Whether no colliders crossed at the start of the substep, so that all paths are checked."""
+        return self._detection.none_cross
 
     def snapshot(self) -> dict:
         """Return the passages (k,4) that the next search adds as contacts, and whether no surfaces cross."""
@@ -87,8 +92,7 @@ class ContactPaths:
 
     def exempt_crossing(self) -> None:
         """Exempt the colliders that cross at the last search, and no others."""
-        self.some_exempt = self._detection.exempt_crossing()
-        self._detection.none_cross = not self.some_exempt
+        self._detection.none_cross = not self._detection.exempt_crossing()
 
     def hold_back(self, x_start) -> None:
         """Shorten the paths of bodies from x_start to the present state until nothing passes through anything. The last search

@@ -75,7 +75,7 @@ class ContactExplicitStepper(ExplicitStepper):
             self.acceleration_stale = self.acceleration_stale or simulation.releases != releases
             n = len(targets)
         self.contact.start_step(dt)
-        relative_penetration, held_back = 0.0, ""
+        relative_penetration = 0.0
         if self.contact.crossing is None:
             self.contact.measure_start(start, dt)
             self.contact.initial_crossing()
@@ -87,10 +87,11 @@ class ContactExplicitStepper(ExplicitStepper):
                 results.append(self._substep(simulation.step_count + done + 1, start + done * dt, dt))
                 depth = max(depth, self.contact.end(start + (done + 1) * dt, dt))
                 relative_penetration = max(relative_penetration, self.contact.relative_penetration)
-                if done + 1 == n and self.contact.paths.some_exempt:  # once per batch: it costs about as much as a search
+                if done + 1 == n:  # once per batch: it costs about as much as a search
                     crossing = self.contact.measure_crossings()
                     depth, relative_penetration = max(depth, crossing[0]), max(relative_penetration, crossing[1])
-                done, held_back = done + 1, held_back or self.contact.held_back
+                done += 1
+                self.contact.end_substep()
                 self._released = simulation.dirichlet.released()
         except BaseException:  # Ctrl-C, too
             self._restore()
@@ -104,10 +105,10 @@ class ContactExplicitStepper(ExplicitStepper):
             n_inverted=int(m.state.scalars[MOST_INVERTED]),
             contact_iterations=sum(r.iterations for r in results if r),
             contact_residual=max((r.residual for r in results if r), default=0.0),
-            converged=all(r.converged for r in results if r) and not held_back,
+            converged=all(r.converged for r in results if r) and not self.contact.held_back,
         )
-        if held_back:
-            result.problems.append(held_back)
+        if self.contact.held_back:
+            result.problems.append(self.contact.held_back)
         elif not result.converged:
             result.problems.append(f"the contact solver stopped at a residual of {result.contact_residual:.2e}")
         return result

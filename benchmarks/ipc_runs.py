@@ -1,0 +1,242 @@
+"""Runs of the scenes of incremental potential contact: each in a process of its own, judged after every step.
+
+A child prints its record as it goes, so that a run that is killed in a long step is not lost.
+"""
+
+import json
+import math
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+import taisoft as ts
+from taisoft.errors import TaisoftError
+from taisoft.mesh.tet_mesh import mean_surface_edge
+from taisoft.records import StepReport
+
+from .ipc_cases import find
+from .ipc_cases.case import Case
+from .ipc_friction import FrictionMeter
+from .runner import HERE, parse_result, print_result, timed, without_warnings
+
+OK, DEGRADED, STOPPED, SKIPPED = "ok", "degraded", "stopped", "skipped"
+DISTANCE_EVERY = 10  # steps between two measurements of the least distance
+NEAR = 0.05  # of the mean surface edge: larger distances are not measured
+REPORT_EVERY = 10.0  # [s] between two printed records of a child
+GRACE = 300.0  # [s] after the budget, for one more step and its judgement
+
+
+@dataclass(frozen=True)
+class Job:
+    """What a child runs. budget: [s] of wall time without building. steps: at most so many, None for all of the case.
+
+    tolerance: newton_tolerance and contact_tolerance. friction: whether friction is measured.
+    """
+
+    case: str
+    size: str
+    budget: float
+    precision: str = "f64"
+    tolerance: float = 1e-4
+    steps: int | None = None
+    friction: bool = False
+
+
+@dataclass
+class Record:
+    """What a run did, as plain data. failed: whether it ended with an error.
+
+    least_distance: [m], every DISTANCE_EVERY steps; math.inf if nothing was nearer than NEAR of an edge. crossed: number of steps
+    after which surfaces crossed. newton, cg, substeps: of each step. seconds: of each step without compilation [s].
+    creep [1/s], friction_work [J], cut (steps in substeps): see `ipc_friction`; None and 0 unless it is measured.
+    """
+
+    job: Job
+    nodes: int = 0
+    tets: int = 0
+    wanted_steps: int = 0
+    time: float = 0.0
+    newton: list[int] = field(default_factory=list)
+    cg: list[int] = field(default_factory=list)
+    substeps: list[int] = field(default_factory=list)
+    seconds: list[float] = field(default_factory=list)
+    compile_seconds: float = 0.0
+    least_distance: float = math.inf
+    crossed: int = 0
+    first_crossed: float | None = None
+    unconverged: int = 0
+    inverted: int = 0
+    deep: int = 0
+    creep: float | None = None
+    friction_work: float | None = None
+    cut: int = 0
+    status: str = STOPPED
+    reason: str = ""
+    failed: bool = False
+
+    def add(self, report: StepReport, seconds: float) -> None:
+        """Add a step's report and its time [s]."""
+        self.time = report.time
+        self.newton.append(report.newton_iterations)
+        self.cg.append(report.linear_iterations)
+        self.substeps.append(report.substeps)
+        self.seconds.append(seconds)
+        self.unconverged += not report.converged
+        self.inverted = max(self.inverted, report.n_inverted)
+        self.deep += bool(report.deep)
+
+    @property
+    def case(self) -> Case:
+        """Its case."""
+        return find(self.job.case)
+
+    @property
+    def steps(self) -> int:
+        """Number of steps done."""
+        return len(self.seconds)
+
+    @property
+    def faults(self) -> list[str]:
+        """What degrades the run, in a few words each."""
+        counted = [
+            (self.crossed, f"{self.crossed} {'step' if self.crossed == 1 else 'steps'} crossed"),
+            (self.unconverged, f"{self.unconverged} not converged"),
+            (self.inverted, f"at most {self.inverted} inverted tets"),
+            (self.deep, f"{self.deep} with deep penetration"),
+        ]
+        return [text for count, text in counted if count]
+
+    def end(self, why: str = "", failed: bool = False) -> None:
+        """Set status and reason. why: why the run stopped early, empty if it did not. failed: whether by an error."""
+        self.failed = failed
+        self.status = STOPPED if why else DEGRADED if self.faults else OK
+        self.reason = "; ".join([*([why] if why else []), *self.faults])
+
+    def data(self) -> dict:
+        """The record as plain data; an infinite distance becomes None."""
+        known = self.least_distance if math.isfinite(self.least_distance) else None
+        return asdict(self) | {"least_distance": known}
+
+    @classmethod
+    def read(cls, data: dict) -> "Record":
+        """The record of plain data."""
+        least = math.inf if data["least_distance"] is None else data["least_distance"]
+        return cls(**data | {"job": Job(**data["job"]), "least_distance": least})
+
+
+def run(job: Job, report=lambda record: None) -> Record:
+    """Run a job in this process. report: called with the unfinished record from time to time."""
+    case, record = find(job.case), Record(job)
+    try:
+        with without_warnings():
+            scene = case.build(job.size)
+    except TaisoftError as error:
+        record.status, record.reason = SKIPPED, str(error)
+        return record
+    record.nodes = sum(body.n_nodes for body in scene.bodies)
+    record.tets = sum(body.mesh.n_tets for body in scene.bodies)
+    record.wanted_steps = case.steps if job.steps is None else min(job.steps, case.steps)
+    try:
+        with without_warnings(), simulator(case, job, scene) as sim:
+            try:
+                _advance(sim, case, job, record, report)
+            finally:
+                record.compile_seconds = sim.compile_seconds
+    except (TaisoftError, MemoryError) as error:
+        record.end(str(error) or type(error).__name__, failed=True)
+    return record
+
+
+def simulator(case: Case, job: Job, scene: ts.Scene) -> ts.Simulator:
+    """The simulator of a job."""
+    tolerances = {"newton_tolerance": job.tolerance, "contact_tolerance": job.tolerance}
+    return ts.Simulator(
+        scene, dt=case.dt, integrator="implicit_euler", self_collision=True, precision=job.precision, **tolerances
+    )
+
+
+def _advance(sim: ts.Simulator, case: Case, job: Job, record: Record, report) -> None:
+    from .judge import Judge  # needs ipctk
+
+    judge = Judge(sim, self_collision=True)
+    near = NEAR * mean_surface_edge([(b.rest_positions, b.nodes.surface) for b in sim.scene.bodies])
+    meter = FrictionMeter(sim) if job.friction else None
+    start = printed = time.monotonic()
+    while record.steps < record.wanted_steps:
+        step, seconds = timed(sim.step)
+        record.add(step, seconds)
+        if meter is not None:
+            meter.add(step.substeps)
+            record.creep, record.friction_work, record.cut = meter.creep, meter.work, meter.cut
+        if judge.crossings():
+            record.crossed += 1
+            record.first_crossed = sim.time if record.first_crossed is None else record.first_crossed
+        if record.steps % DISTANCE_EVERY == 1:
+            found = judge.least_distance(near)
+            record.least_distance = min(record.least_distance, found if found < near else math.inf)
+        now = time.monotonic()
+        if record.crossed and case.stop_at_crossing:
+            return record.end(f"surfaces cross at t = {sim.time:.3g} s")
+        if now - start > job.budget and record.steps < record.wanted_steps:
+            return record.end(f"budget of {job.budget:g} s")
+        if now - printed > REPORT_EVERY:
+            printed, record.compile_seconds = now, sim.compile_seconds
+            report(record)
+    return record.end()
+
+
+# --- processes --------------------------------------------------------------------------------------------------------
+
+
+def answer(text: str) -> None:
+    """In a child: run the job of this JSON text, and print its record, from time to time and at the end."""
+
+    def report(record: Record) -> None:
+        print_result(record.data())
+
+    report(run(Job(**json.loads(text)), report))
+
+
+def run_child(job: Job, grace: float = GRACE) -> Record:
+    """Run a job in a child process. Returns its last record if it crashes, or is killed `grace` [s] after the budget."""
+    arguments = [sys.executable, "-m", "taisoft", "bench", "ipc", "--child", json.dumps(asdict(job))]
+    paths = os.pathsep.join(filter(None, (str(HERE), os.environ.get("PYTHONPATH"))))
+    with tempfile.TemporaryDirectory() as folder:
+        out, err = Path(folder) / "out", Path(folder) / "err"
+        with out.open("wb") as stdout, err.open("wb") as stderr:
+            child = subprocess.Popen(
+                arguments, env=os.environ | {"PYTHONPATH": paths}, stdin=subprocess.DEVNULL, stdout=stdout, stderr=stderr
+            )
+            try:
+                code = child.wait(job.budget + grace)
+            except subprocess.TimeoutExpired:
+                code = None
+            finally:
+                child.kill()
+                child.wait()
+        found = [one for line in out.read_text(errors="replace").splitlines() if (one := _parsed(line)) is not None]
+        record = Record.read(found[-1]) if found else Record(job)
+        if code is None:
+            record.end(f"killed in a step that outlasted the budget of {job.budget:g} s by {grace:g} s", failed=True)
+        elif code:
+            last = (err.read_text(errors="replace").strip().splitlines() or ["nothing"])[-1]
+            record.end(f"its process ended with status {code}: {last}", failed=True)
+    return record
+
+
+def _parsed(line: str) -> dict | None:
+    try:
+        return parse_result(line)
+    except ValueError:  # cut by the end of the process
+        return None
+
+
+def mean(values: list) -> float:
+    """The mean, nan of nothing."""
+    return float(np.mean(values)) if values else math.nan
