@@ -31,6 +31,7 @@ from taisoft.linear.block_csr import to_scipy, unpacked
 from taisoft.linear.coupling import add_products, clear_products, form_product, gather_products, prepare_terms
 
 K, BETA, DT = 24, 0.002, 0.003  # contacts; [s]
+TOLERANCE = 1e-12  # of the contact laws: so small that missed gaps do not count
 GAP_TARGETS = 1e-3, 0.2, 0.02, 0.05  # contact offset [m], fractions corrected in a step, maximum speed of that [m/s]
 STIFFNESS = 5.0
 FIXED = [0, 7]  # nodes
@@ -114,7 +115,7 @@ def rig(request):
         x = start + 1e-3 * rng.standard_normal(start.shape)
         k.x_start.from_numpy(start)
         solver.work.x_hat.from_numpy(x_hat)
-        contact_terms.begin_contacts(solver.work, k, False, BETA, DT, np.array(GAP_TARGETS))
+        contact_terms.begin_contacts(solver.work, k, False, BETA, DT, np.array(GAP_TARGETS), TOLERANCE)
         J = found.jacobian
         W = J @ np.diag(free.ravel() / np.diag(A)) @ J.T
         yield SimpleNamespace(
@@ -200,6 +201,18 @@ def test_impulses_and_residual_of_the_contact_laws(rig, pressed):
     fixed_point = np.array([oracle.project(row, mu) for row, mu in zip(r - oracle.factors(rig.W) * u, rig.friction)])
     residual = np.linalg.norm(r - fixed_point) / np.linalg.norm(r)
     assert rig.p.state[RESIDUAL] == pytest.approx(residual, rel=10 * rig.close) and residual > 0.01
+
+
+def test_a_gap_that_misses_its_target_is_a_residual(rig, pressed):
+    """With a tolerance so large that it exceeds that of the impulses: half of the gap, or of the offset, corresponds to it."""
+    _, _, u = pressed
+    weights = rig.k.work.gap_weight.to_numpy()
+    kept = np.clip(rig.gap, 0.1 * GAP_TARGETS[0], GAP_TARGETS[0])
+    assert np.allclose(weights[:K], TOLERANCE / (0.5 * kept), rtol=1e-14)
+    rig.k.work.gap_weight.from_numpy(weights * (1e3 / TOLERANCE))
+    impulses_at(rig, rig.x)
+    rig.k.work.gap_weight.from_numpy(weights)
+    assert rig.p.state[RESIDUAL] == pytest.approx(1e3 * (-BETA * u[:, 0] / (0.5 * kept)).max(), rel=1e-6)
 
 
 def test_blocks_are_minus_the_derivative_of_the_impulses(rig, pressed):

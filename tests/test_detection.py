@@ -42,7 +42,7 @@ class TestZoo:
         touching = [("block", "ball"), ("block", "brick"), ("ball", "egg"), ("block", "ground"), ("block", "sphere")]
         touching += [("brick", "capsule"), ("ball", "box"), ("egg", "sheet")]
         assert pairs_of(c) == {frozenset(pair) for pair in touching}
-        assert set(c.kind) == set(KINDS) and c.found >= len(c) >= 12 and c.unmapped == 0
+        assert set(c.kind) == set(KINDS) - {"face_face"} and c.found >= len(c) >= 12 and c.unmapped == 0
         assert (c.gap < 0).any() and (c.gap > 0).any() and c.gap.max() <= 0.02 and c.gap.min() > -0.05
         assert np.abs(np.linalg.norm(c.normal, axis=1) - 1).max() < 1e-12 and (c.impulse == 0).all()
 

@@ -6,6 +6,7 @@
 * a substep that met unknown contacts is repeated with them;
 * a substep that ends in deep penetration, leaves the searched path, or whose contacts do not settle, is undone and halved, at
   most MAX_UNDONE times a step;
+* a substep in which something passes through something is repeated, then halved, then held back and told;
 * bodies that close too fast for the shortest substep raise an error; after an error the state is that before the step.
 """
 
@@ -13,7 +14,7 @@ import numpy as np
 import pytest
 
 from taisoft.dynamics.results import StageResult
-from taisoft.dynamics.substepping import MAX_SEARCHES, MAX_SUBSTEPS, MAX_UNDONE, Substepping
+from taisoft.dynamics.substepping import MAX_PASSAGES, MAX_SEARCHES, MAX_SUBSTEPS, MAX_UNDONE, Substepping
 from taisoft.errors import SimulationError
 
 DT = 0.1  # [s]
@@ -22,7 +23,7 @@ DT = 0.1  # [s]
 class FakeStepper:
     """Stepper, simulation state and contacts at once: x is the time reached. Tests set what its measurements return."""
 
-    idle, is_linear, dissipative, had_impact, n_contacts = False, False, True, False, 0
+    idle, is_linear, dissipative, had_impact, n_contacts, none_cross = False, False, True, False, 0, False
 
     def __init__(self):
         self.contact = self.simulation = self.dirichlet = self.history = self
@@ -35,7 +36,9 @@ class FakeStepper:
         self.converges = lambda time, dt: True
         self.closing = lambda time, dt: 0.0
         self.depth = lambda time, dt: 0.0
-        self.left_path = self.has_new_contacts = lambda time, dt: False
+        self.left_path = self.has_new_contacts = self.passes = lambda time, dt: False
+        self.held_back: list[tuple[float, float]] = []
+        self.broken = False
 
     # the stepper
 
@@ -88,10 +91,20 @@ class FakeStepper:
     def left_searched_path(self, x_now):
         return self.left_path(*self.kept[-1])
 
+    def find_passages(self, as_searched=False):
+        return self.passes(*(self.searched if as_searched else self.kept[-1]))
+
+    def hold_back(self, x_start):
+        self.held_back.append(self.kept[-1])
+
+    def break_history(self):
+        self.broken = True
+
     def penetrates_deeper(self, time, dt, before):
         return False
 
     def search_along_path(self, time, dt):
+        self.searched = time, dt
         return self.has_new_contacts(time, dt)
 
     def closing_ratio_along_path(self):
@@ -213,6 +226,35 @@ def test_contacts_that_do_not_settle_halve_a_substep(stepper):
     Substepping(stepper).step(0.0, DT)
     whole = [dt for _, dt in stepper.taken if dt == DT]
     assert covers_step(stepper) and len(stepper.kept) == 2 and len(whole) == MAX_SEARCHES + 1
+
+
+def test_passages_are_searched_again_and_then_halve_a_substep(stepper):
+    stepper.passes = lambda time, dt: dt > DT / 2
+    substepping = Substepping(stepper)
+    result = substepping.step(0.0, DT)
+    whole = [dt for _, dt in stepper.taken if dt == DT]
+    assert covers_step(stepper) and len(stepper.kept) == 2 and len(whole) == MAX_PASSAGES + 1
+    assert not stepper.held_back and result.converged
+
+
+def test_passages_end_with_the_repetition_that_has_none(stepper):
+    stepper.passes = lambda time, dt: len(stepper.taken) <= 4
+    result = Substepping(stepper).step(0.0, DT)
+    assert stepper.taken == [(0.0, DT)] * 5 and stepper.kept == [(0.0, DT)] and result.converged and not stepper.broken
+
+
+def test_what_passes_in_spite_of_all_is_held_back_and_told(stepper):
+    stepper.passes = lambda time, dt: True
+    result = Substepping(stepper).step(0.0, DT)
+    assert covers_step(stepper) and stepper.held_back == stepper.kept and stepper.broken and not result.converged
+    assert len(stepper.taken) <= (MAX_PASSAGES + 1) * (MAX_UNDONE + len(stepper.kept)) * 3  # retries of the step included
+
+
+def test_a_path_that_was_left_is_checked_where_it_was_searched(stepper):
+    stepper.left_path = lambda time, dt: len(stepper.taken) == 1
+    stepper.passes = lambda time, dt: len(stepper.taken) == 1
+    Substepping(stepper).step(0.0, DT)
+    assert stepper.taken == [(0.0, DT)] * 2 and stepper.searched == (0.0, DT)
 
 
 def test_error_restores_the_state_before_the_step(stepper):

@@ -303,6 +303,10 @@ class Detection:
         """Return the two colliders (k,2) of each of the given passages (k,4)."""
         return self._paths.colliders(passages)
 
+    def features_of(self, passages: np.ndarray) -> np.ndarray:
+        """Return the vertices (k,6) of the features that meet in passages (k,4), see `PathCheck.features`."""
+        return self._paths.features(passages)
+
     def exempt_crossing(self) -> bool:
         """Exempt the pairs of colliders that cross or touch at the positions of the last search from further checks of paths, and
         no others. Return whether there are any."""

@@ -403,6 +403,28 @@ class PathCheck:
                 result[k, 1] = t.body[other[k]] if kind == NEAR else self._shape_body[other[k]]
         return result
 
+    def features(self, passages: np.ndarray) -> np.ndarray:
+        """Return the vertices (k,6) of the features that meet in passages (k,4), equal for passages of the same two: an edge and
+        a corner belong to several triangles."""
+        t, (kind, a, b, f) = self._topology.triangle, passages.T.astype(np.int64)
+        sides = np.full((len(passages), 2, 3), -1)
+        near, adjacent, of_triangle = kind == NEAR, kind == ADJACENT, (kind == NEAR) | (kind == ROUND)
+        sides[of_triangle, 0], sides[near, 1] = t[a[of_triangle]], t[b[near]]
+        sides[adjacent] = self._rows[a[adjacent]].reshape(-1, 2, 3)
+        sides[kind == FLAT, 0] = a[kind == FLAT, None]
+        for side, k in enumerate((np.where(f < 6, f, 3 * ((f - 6) // 3)), np.where(f < 6, f, 3 + (f - 6) % 3))):
+            row, edge = np.arange(len(f)), f >= 6
+            own = np.where(edge, k - (0 if side == 0 else 3), k)
+            one, two = sides[row, side, own % 3], sides[row, side, (own + 1) % 3]
+            is_corner = ~edge & (f // 3 == side)
+            ends = np.stack([one, np.where(edge, two, one), one], axis=1)
+            sides[:, side] = np.where((edge | is_corner)[:, None], ends, sides[:, side])
+        sides[(kind == ROUND) | (kind == FLAT), 1] = -2 - b[(kind == ROUND) | (kind == FLAT), None]
+        sides.sort(axis=2)
+        swapped = sides[:, 0, 0] > sides[:, 1, 0]
+        sides[swapped] = sides[swapped][:, ::-1]
+        return sides.reshape(-1, 6)
+
     def forget(self) -> None:
         """Discard the list of near pairs, after positions were set."""
         self._is_listed = False

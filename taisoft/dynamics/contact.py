@@ -143,7 +143,7 @@ class ContactStep:
         self.had_impact, self.dropped = bool(kept["met"]), int(kept["dropped"])
         self.flight[:] = kept["flight"]
         self.paths.restore(kept["paths"])
-        self.crossing, self.last_crossing = 0.0 if self.paths.none_cross else None, Crossing()
+        self.crossing, self.last_crossing = 0.0 if self.none_cross else None, Crossing()
         self._searched = self._measured_end = None
         self._indexed = True  # so that the next step rebuilds the node index, even without contacts
 
@@ -245,7 +245,7 @@ class ContactStep:
 
     def end_substep(self) -> None:
         """Add the impulses of a substep; check from now on the paths of colliders that do not cross any more."""
-        if not self.paths.none_cross:
+        if not self.none_cross:
             self.paths.exempt_crossing()
         if self._substep_fraction < 1.0:
             impulses = sum_impulses(self.contacts(), self.simulation.scene)
@@ -299,7 +299,7 @@ class ContactStep:
     def measure_crossings(self) -> tuple[float, float]:
         """Return the depth of crossing triangles or contained colliders at the last search [m], and over the finer side's mean
         surface edge. Set `crossing` and `last_crossing`. If none crossed before, none do: their paths were checked."""
-        self.last_crossing = found = Crossing() if self.paths.none_cross else self.measures.crossing()
+        self.last_crossing = found = Crossing() if self.none_cross else self.measures.crossing()
         self.crossing = found.relative
         return found.depth, found.relative
 
@@ -327,6 +327,11 @@ class ContactStep:
     def hold_back(self, x_start) -> None:
         """Shorten the paths from x_start to the present state, see `ContactPaths.hold_back`."""
         self.paths.hold_back(x_start)
+
+    @property
+    def none_cross(self) -> bool:
+        """Whether no surfaces crossed at the start of the substep, so that all paths are checked."""
+        return self.paths.none_cross
 
     @property
     def held_back(self) -> str:

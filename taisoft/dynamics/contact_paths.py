@@ -67,12 +67,19 @@ class ContactPaths:
         self.uncovered = found is None
         if found is None:
             return True
-        pairs, times = found
-        if len(pairs):
-            every, time = np.concatenate([pairs, self._held[0]]), np.concatenate([times, self._held[1]])
-            _, first = np.unique(every, axis=0, return_index=True)  # of a pair held already, the new time
-            self._held = every[first], time[first]
-        return len(pairs) > 0
+        if len(found[0]):
+            self._hold(*found)
+        return len(found[0]) > 0
+
+    def _hold(self, pairs: np.ndarray, times: np.ndarray) -> None:
+        """Hold passages and the parts of the step until which they are apart; those of the same features once."""
+        every = np.concatenate([self._held[0], pairs])
+        time = np.concatenate([self._held[1], times])
+        _, first, group = np.unique(self._detection.features_of(every), axis=0, return_index=True, return_inverse=True)
+        group, n_held = group.reshape(-1), len(self._held[0])
+        earliest = np.full(len(first), np.inf)
+        np.minimum.at(earliest, group[n_held:], times)
+        self._held = every[first], np.where(np.isfinite(earliest), earliest, time[first])
 
     def use_all(self) -> None:
         """Let the next search add all passages held, at their times along the searched paths."""

@@ -9,7 +9,7 @@ class NoContacts:
     idle = True
     n_contacts, had_impact = 0, False
     relative_penetration = crossing = penetration = 0.0
-    held_back = ""
+    held_back, none_cross = "", True
 
     def __init__(self) -> None:
         self.flight = np.zeros(0)

@@ -2,13 +2,15 @@
 
 A step that does not converge is repeated in equal substeps. With contacts, each is also short enough to miss no collision.
 
-Before a substep: while contacts close fast, its length is limited by `contact_measures`. After it: it is undone and halved if the
-motion was much faster than known when it was cut, if searches along its path kept finding new contacts, if it left a new deep
+Before a substep: while contacts close fast, its length is limited by `contact_measures`. After it: it is repeated with contacts
+that were found along its path, and with pairs that would have passed through each other (`contact_paths`). It is undone and
+halved if these repetitions did not help, if the motion was much faster than known when it was cut, if it left a new deep
 penetration or crossing, or, if it was short, when it did not converge. A short event, such as an impact or a snap, therefore
 takes short substeps only while it lasts.
 
 No substep is shorter than the step over MAX_SUBSTEPS. Motion that closes too fast even for that is refused. A substep of minimum
-length, or after MAX_UNDONE others were undone, is kept and reported even if deep, unsettled or not converged.
+length, or after MAX_UNDONE others were undone, is kept and reported even if deep, unsettled or not converged; bodies that would
+still pass through something are held back.
 """
 
 from dataclasses import replace
@@ -177,15 +179,16 @@ class Substepping:
             state = simulation.state()
             stepper.restore_start()
             new = contact.search_along_path(time, dt)
-            if not as_searched and contact.find_passages(as_searched=True):
-                passes, new = True, contact.search_along_path(time, dt)
-            limit = MAX_PASSAGES if passes else MAX_SEARCHES
-            if not (new or passes) or tries >= limit:
+            if not as_searched:
+                passes = contact.find_passages(as_searched=True)
+                # contacts unknown so far matter only if something could have crossed
+                new = contact.search_along_path(time, dt) if passes else new and not contact.none_cross
+            if not (new or passes) or tries >= (MAX_PASSAGES if passes else MAX_SEARCHES):
                 simulation.set_state(*state)
-                if contact.closing_ratio_along_path() > MAX_CLOSING_RATIO:
-                    return result, Fault.FAST
                 if passes:
                     return result, Fault.CROSSED
+                if not contact.none_cross and contact.closing_ratio_along_path() > MAX_CLOSING_RATIO:
+                    return result, Fault.FAST
                 return result, Fault.UNSETTLED if new else None
             result = count_all(stepper.retry_substep(time, dt, state[1]), [result])
         return result, None
