@@ -249,7 +249,7 @@ def is_same(out: ti.template(), a, b, tolerance):
         d = out.point[a] - out.point[b]
         result = d.dot(d) <= tolerance * tolerance and out.normal[a].dot(out.normal[b]) >= ti.cast(SAME_NORMAL, ti.f64)
         # a passage that was found in spite of another contact must not be lost to that one
-        result = result and (out.feature[a][0] == FACE_FACE) == (out.feature[b][0] == FACE_FACE)
+        result = result and out.feature[a][0] != FACE_FACE and out.feature[b][0] != FACE_FACE
     return result
 
 

@@ -105,12 +105,17 @@ class ContactStep:
 
     def forget(self) -> None:
         """Discard the search and the impulses of the last step, after the state was set."""
+        self.return_to_start(none_crossed=False)
+
+    def return_to_start(self, none_crossed: bool) -> None:
+        """Discard them after a step's start was restored. none_crossed: whether no surfaces are known to cross there."""
         self._searched = self._measured_end = None
         self.problem.count[0] = 0
         self._last_time = self.penetration = self.relative_penetration = self._step_dt = 0.0
-        self._impulse_sum, self.crossing, self.last_crossing = None, None, Crossing()
+        self._impulse_sum, self.last_crossing = None, Crossing()
         self.flight[:] = 0.0
-        self.paths.forget()
+        self.paths.return_to_start(none_crossed)
+        self.crossing = 0.0 if none_crossed else None
 
     def snapshot(self) -> dict:
         """Return the last step's contacts and impulses, and the capacity: a step that exceeds it starts without impulses.

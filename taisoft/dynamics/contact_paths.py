@@ -31,11 +31,11 @@ class ContactPaths:
         self._held = self._held_before = NO_PASSAGES
         detection.prepare_paths()
 
-    def forget(self) -> None:
-        """Discard all passages and lists, after the state was set."""
+    def return_to_start(self, none_crossed: bool) -> None:
+        """Discard all passages and lists after a state was set. none_crossed: whether no surfaces are known to cross there."""
         self._detection.forget_paths()
         self._detection.held = self._held = self._held_before = NO_PASSAGES
-        self.held_back, self._detection.none_cross = "", False
+        self._detection.none_cross, self.held_back = none_crossed, ""
 
     @property
     def none_cross(self) -> bool:
@@ -48,9 +48,8 @@ class ContactPaths:
 
     def restore(self, kept: dict) -> None:
         """Restore a `snapshot`."""
-        self.forget()
+        self.return_to_start(bool(kept["none_cross"]))
         self._detection.held = np.asarray(kept["held"], dtype=np.int32).reshape(-1, 4), np.zeros(len(kept["held"]))
-        self._detection.none_cross = bool(kept["none_cross"])
 
     def begin(self) -> None:
         """Begin a substep."""

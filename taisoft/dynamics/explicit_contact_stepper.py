@@ -119,7 +119,7 @@ class ContactExplicitStepper(ExplicitStepper):
         if simulation.dirichlet.released() != self._released:
             simulation.dirichlet.set_released(self._released)
             simulation.upload_constraints()
-        self.contact.forget()
+        self.contact.return_to_start(self.contact.none_cross)
 
     def _substep(self, step: int, time: float, dt: float) -> SolveResult | None:
         """Take sub-step number `step` from a time, and repeat it while surfaces pass through each other on its paths.

@@ -110,7 +110,7 @@ class ImplicitStepper:
         balance = BodyBalance(simulation.scene)
         self._balance = balance if balance.n_pieces > 1 else None
         self._substepping = Substepping(self)
-        self._saved_start = None, [], contact.flight  # see `save_start`
+        self._saved_start = None, [], contact.flight, False  # see `save_start`
         self.forget()
 
     def forget(self) -> None:
@@ -185,18 +185,18 @@ class ImplicitStepper:
     def save_start(self) -> None:
         """Save the start of a step, to which `return_to_start` returns."""
         state = None if self.contact.idle else self.simulation.state()
-        self._saved_start = state, self.simulation.dirichlet.released(), self.contact.flight.copy()
+        self._saved_start = state, self.simulation.dirichlet.released(), self.contact.flight.copy(), self.contact.none_cross
 
     def return_to_start(self, already_undone: bool = False) -> None:
         """Restore the step's start, without history. already_undone: whether the only substep so far has been undone."""
-        state, released, flight = self._saved_start
+        state, released, flight, none_crossed = self._saved_start
         if state is None and not already_undone:
             restore(self.simulation.model, self.history)
             state = self.simulation.state()
-            self._saved_start = state, released, flight
+            self._saved_start = state, released, flight, none_crossed
         self._restore_state(state, released)
         self._n_previous = 0
-        self.contact.forget()
+        self.contact.return_to_start(none_crossed)
         self.contact.flight[:] = flight
 
     def _restore_state(self, state: tuple[np.ndarray, np.ndarray] | None, released: list[bool]) -> None:

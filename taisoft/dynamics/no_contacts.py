@@ -18,7 +18,7 @@ class NoContacts:
         """Do nothing."""
 
     forget = set_impulse_fraction = start_step = start_substep = end_substep = reset_substep = count_flight = restore = _nothing
-    hold_back = _nothing
+    hold_back = return_to_start = _nothing
 
     def begin(self, time: float, dt: float) -> int:
         """Return the number of contacts of a step of dt [s] from a time: 0."""
