@@ -412,13 +412,12 @@ class PathCheck:
         sides[of_triangle, 0], sides[near, 1] = t[a[of_triangle]], t[b[near]]
         sides[adjacent] = self._rows[a[adjacent]].reshape(-1, 2, 3)
         sides[kind == FLAT, 0] = a[kind == FLAT, None]
-        for side, k in enumerate((np.where(f < 6, f, 3 * ((f - 6) // 3)), np.where(f < 6, f, 3 + (f - 6) % 3))):
-            row, edge = np.arange(len(f)), f >= 6
-            own = np.where(edge, k - (0 if side == 0 else 3), k)
-            one, two = sides[row, side, own % 3], sides[row, side, (own + 1) % 3]
-            is_corner = ~edge & (f // 3 == side)
-            ends = np.stack([one, np.where(edge, two, one), one], axis=1)
-            sides[:, side] = np.where((edge | is_corner)[:, None], ends, sides[:, side])
+        row, is_edge = np.arange(len(f)), f >= 6
+        for side, edge in enumerate(((f - 6) // 3, (f - 6) % 3)):
+            first = np.where(is_edge, edge, f % 3)
+            ends = sides[row, side, first], sides[row, side, np.where(is_edge, (first + 1) % 3, first)]
+            chosen = is_edge | (f // 3 == side)  # of a corner's other triangle, all corners
+            sides[:, side] = np.where(chosen[:, None], np.stack([*ends, np.full(len(f), -1)], axis=1), sides[:, side])
         sides[(kind == ROUND) | (kind == FLAT), 1] = -2 - b[(kind == ROUND) | (kind == FLAT), None]
         sides.sort(axis=2)
         swapped = sides[:, 0, 0] > sides[:, 1, 0]

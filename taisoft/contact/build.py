@@ -2,7 +2,7 @@
 
 The target is the smallest gap that a contact may have at the end of a step. It is at most the contact offset, a distance that
 keeps surfaces apart despite the error of linearising the motion. A gap above the offset may close to it. A gap below it opens
-slowly, a true penetration within a few steps, and never faster than strains the softest body by one percent: bodies would fly
+slowly, unless it is far below, a true penetration within a few steps, and never faster than strains the softest body by one percent: bodies would fly
 apart otherwise. Contacts of a body with itself have SELF_CONTACT times the contact offset and are corrected SELF_CONTACT times
 as fast. Where the surfaces meet within the step, restitution raises the target (`restitution`). The impulse must satisfy
     u_n = (gap - target)/dt + n.(v_a - v_b) >= 0,
@@ -22,6 +22,7 @@ from taisoft.contact.prox import dvec, prox, tangent
 from taisoft.scene.scene import Scene
 
 NEGLIGIBLE = 1e-12  # a node with a smaller weight is left out of the contact
+LEAST_GAP = 0.1  # of the contact offset: a smaller gap opens to it at once, before surfaces that turn can cross
 SELF_CONTACT = 5.0  # factor of contact offset and correction rate in contacts of a body with itself: folds turn as they meet
 
 
@@ -229,9 +230,10 @@ def gap_minus_target(p: ti.template(), c, dt, common_offset, penetration_fractio
     target = contact_offset
     if gap < contact_offset:
         above = ti.max(gap, 0.0)
-        target = gap + ti.min(
-            own * (offset_fraction * (contact_offset - above) + penetration_fraction * (above - gap)), max_speed * dt
-        )
+        opening = own * (offset_fraction * (contact_offset - above) + penetration_fraction * (above - gap))
+        if gap >= 0.0:
+            opening = ti.max(opening, ti.cast(LEAST_GAP, ti.f64) * contact_offset - gap)
+        target = gap + ti.min(opening, max_speed * dt)
     if min_opening > 0.0:
         target = ti.max(target, gap + min_opening)
     return gap - target

@@ -22,7 +22,8 @@ from taisoft.fem.node_graph import n_nodes_of, node_of
 from taisoft.linear.block_csr import BLOCK
 from taisoft.linear.coupling import NO_COUPLING, Coupling, build_coupling
 
-MAX_MISSED, MIN_KEPT = 0.5, 0.1  # largest part of a gap that a contact may miss; smallest such gap, over the contact offset
+# largest part of its target that a contact's gap may miss at the end; smallest such target, over the contact offset
+MAX_MISSED, MIN_KEPT = 0.5, 1e-3
 PAST = 2  # multiplier updates that are stored
 
 
@@ -99,10 +100,10 @@ def begin_contacts(
             gap_to_target = gap_minus_target(p, c, dt, offset_target, fast, slow, fastest, p.min_opening[c])
             w.gap_minus_target[c] = gap_to_target - p.normal[c].dot(p.obstacle_displacement[c])
             wanted = contact_offset_of(p, c, offset_target)
-            kept = ti.min(ti.max(p.gap[c], ti.cast(MIN_KEPT, ti.f64) * wanted), wanted)
+            target = p.gap[c] - gap_to_target
             w.gap_weight[c] = 0.0
-            if kept > 0.0:
-                w.gap_weight[c] = tolerance / (MAX_MISSED * kept)
+            if target > 0.0:
+                w.gap_weight[c] = tolerance / (MAX_MISSED * ti.min(ti.max(target, ti.cast(MIN_KEPT, ti.f64) * wanted), wanted))
 
 
 @ti.func
@@ -192,8 +193,8 @@ def impulse_on_node(k: ti.template(), i):
 def sum_residual(k: ti.template()):
     """Compute the residual of the laws over all contacts.
 
-    It is relative to all impulses, so that a light contact beside heavy ones could let its gap close. The largest part of a gap,
-    or of the contact offset if that is less, by which a contact misses its target is therefore a residual, too: MAX_MISSED
+    It is relative to all impulses, so that a light contact beside heavy ones could let its gap close. The largest part of its
+    target, or of the contact offset if that is less, by which a gap ends short is therefore a residual, too: MAX_MISSED
     corresponds to the tolerance.
     """
     p, w = ti.static((k.problem, k.work))
