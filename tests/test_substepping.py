@@ -26,7 +26,7 @@ class FakeStepper:
     idle, is_linear, dissipative, had_impact, n_contacts, none_cross = False, False, True, False, 0, False
 
     def __init__(self):
-        self.contact = self.simulation = self.dirichlet = self.history = self
+        self.contact = self.paths = self.simulation = self.dirichlet = self.history = self
         self.x_now, self.step_count, self.flight = None, 4, np.zeros(0)
         self.x, self.saved = 0.0, 0.0
         self.taken: list[tuple[float, float]] = []
@@ -88,10 +88,10 @@ class FakeStepper:
     def initial_crossing(self):
         return 0.0
 
-    def left_searched_path(self, x_now):
+    def left_searched(self, x_now):
         return self.left_path(*self.kept[-1])
 
-    def find_passages(self, as_searched=False):
+    def find(self, as_searched=False):
         return self.passes(*(self.searched if as_searched else self.kept[-1]))
 
     def hold_back(self, x_start):

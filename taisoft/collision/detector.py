@@ -21,7 +21,8 @@ from taisoft.collision.edge_edge import find_proximity
 from taisoft.collision.features import BY_EDGES, BY_FACES, BY_FIELD
 from taisoft.collision.intersections import Intersections, find_crossings
 from taisoft.collision.overlap import Containment, Inside
-from taisoft.collision.passages import STILL, PathCheck, append_passages
+from taisoft.collision.passages import STILL, append_passages
+from taisoft.collision.path_check import PathCheck
 from taisoft.collision.spatial_hash import SpatialHash
 from taisoft.collision.surface import ACTIVE, NONFINITE, PAIRS, build_surface, move_obstacles, update_surface
 from taisoft.errors import SceneError, SimulationError

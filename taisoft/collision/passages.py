@@ -16,20 +16,17 @@ Pairs of colliders that cross already are exempt until they do not.
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
 import taichi as ti
 
-from taisoft.backend.arrays import Count, FieldArena, download
+from taisoft.backend.arrays import Count, FieldArena
 from taisoft.backend.runtime import kernel
-from taisoft.collision.analytic import CAPSULE, HALF_SPACE, SPHERE, AnalyticObstacles
-from taisoft.collision.candidates import TOTAL, WHOLE, Buffer, sum_parts
-from taisoft.collision.colliders import Topology
+from taisoft.collision.analytic import CAPSULE, HALF_SPACE, SPHERE
+from taisoft.collision.candidates import WHOLE, sum_parts
 from taisoft.collision.contacts import FACE_FACE, write_contact
 from taisoft.collision.features import unit
 from taisoft.collision.separation import at_weights, free_until, nearest_of, unit_row
-from taisoft.collision.surface import ACTIVE, Surface, dvec, integers, ivec, list_near, part_first
+from taisoft.collision.surface import ACTIVE, dvec, ivec, list_near, part_first
 
-IN_BOXES = 0.49  # of the reach: how far a vertex may leave its searched path and still be in the boxes, grown by half of it
 # kinds of passages, by two ids: two triangles; a row of `adjacent`; a triangle and a sphere or capsule; a vertex and a half-space
 NEAR, ADJACENT, ROUND, FLAT = range(4)
 KINDS, FEATURES = 4, 16  # factors in ids of contacts
@@ -322,160 +319,3 @@ class PassageFields:
 def passage_fields(arena: FieldArena, capacity: int) -> PassageFields:
     """Allocate a buffer for `capacity` passages."""
     return PassageFields(arena.vectors("passage_pair", ti.i32, capacity, n=4), arena.field("passage_time", ti.f64, capacity))
-
-
-def adjacent_rows(triangle: np.ndarray) -> np.ndarray:
-    """Return the vertices (k,6) of what must not pass each other among triangles (n,3) with common vertices: the edge of one
-    opposite the common vertex and the other; if an edge is common, the opposite corners and the sides between them."""
-    t = np.asarray(triangle, dtype=np.int64)
-    corner_of = t.reshape(-1)
-    order = np.argsort(corner_of, kind="stable")
-    count = np.bincount(corner_of, minlength=1)
-    start, size = (np.cumsum(count) - count)[corner_of[order]], count[corner_of[order]]
-    first = np.repeat(order, size)
-    second = order[np.arange(len(first)) - np.repeat(np.cumsum(size) - size, size) + np.repeat(start, size)]
-    a, b = first // 3, second // 3
-    common = (t[a][:, :, None] == t[b][:, None, :]).any(axis=2)
-    n_common = common.sum(axis=1)
-    one, k = n_common == 1, first % 3
-    opposite = np.stack([t[a, (k + 1) % 3], t[a, (k + 2) % 3], t[a, (k + 2) % 3]], axis=1)
-    rows = [np.concatenate([opposite, t[b]], axis=1)[one]]
-    both = (n_common == 2) & (a < b) & (first % 3 == common.argmax(axis=1))
-    a, b, shared = a[both], b[both], common[both]
-    p, q = t[a][np.arange(len(a)), shared.argmax(axis=1)], t[a][np.arange(len(a)), 2 - shared[:, ::-1].argmax(axis=1)]
-    c = t[a][np.arange(len(a)), (~shared).argmax(axis=1)]
-    d = np.where((t[b] != p[:, None]) & (t[b] != q[:, None]), t[b], -1).max(axis=1)
-    rows += [
-        np.stack(columns, axis=1) for columns in ((c, c, c, p, q, d), (d, d, d, p, q, c), (p, c, c, q, d, d), (q, c, c, p, d, d))
-    ]
-    return np.concatenate(rows)
-
-
-class PathCheck:
-    """Find passages on the paths from the positions of the last search. reach [m]: as of the detection; floor [m]: to be kept."""
-
-    def __init__(
-        self,
-        surface: Surface,
-        topology: Topology,
-        shapes: AnalyticObstacles,
-        self_on: np.ndarray,
-        reach: float,
-        floor: float,
-        arena: FieldArena,
-        capacity: int | None = None,
-        max_capacity: int | None = None,
-    ):
-        """self_on: (n_bodies,) whether a collider is checked against itself. capacity, max_capacity: of the lists, None for the
-        default."""
-        self.surface, self.shapes, self.limit, self.floor = surface, shapes, IN_BOXES * reach, floor
-        s, n = surface, max(surface.n_verts, 1)
-        self._topology, self._shape_body = topology, shapes.body.to_numpy() if shapes.any else np.zeros(0, dtype=np.int64)
-        self._rows = rows = adjacent_rows(topology.triangle[np.asarray(self_on, dtype=bool)[topology.body]])
-        vectors = (arena.vectors(f"path_{name}", ti.f64, n) for name in ("displacement", "listed_x", "listed_move"))
-        self.fields = PathFields(
-            *vectors,
-            arena.field("path_deviation", ti.f64, 1),
-            arena.field("path_exempt", ti.i32, s.n_bodies**2),
-            integers(arena, "path_adjacent", rows.reshape(-1, 6)),
-            len(rows),
-        )
-        limits = capacity or 4 * s.n_triangles + 64, max_capacity
-        self.near = Buffer("near_pairs", near_pairs, *limits, s.chunks, arena)
-        self.passages = Buffer("passages", passage_fields, 64 * s.chunks, max_capacity, s.chunks, arena)
-        self._is_listed = False
-
-    def exempt(self, pairs: np.ndarray) -> None:
-        """Exempt pairs of colliders, (n_bodies, n_bodies) bool, and no others."""
-        self.fields.exempt.from_numpy((pairs | pairs.T).astype(np.int32).reshape(-1))
-
-    def colliders(self, passages: np.ndarray) -> np.ndarray:
-        """Return the two colliders (k,2) of each passage (k,4)."""
-        t, one, other = self._topology, passages[:, 1].copy(), passages[:, 2]
-        body_of = np.append(t.body[t.ring[t.ring_start[:-1]]], -1) if len(t.ring) else np.zeros(1, dtype=np.int64)
-        result = np.zeros((len(passages), 2), dtype=np.int64)
-        for kind in range(KINDS):
-            k = passages[:, 0] == kind
-            if kind == ADJACENT:
-                result[k] = body_of[self._rows[one[k], 0]][:, None]
-            else:
-                result[k, 0] = body_of[one[k]] if kind == FLAT else t.body[one[k]]
-                result[k, 1] = t.body[other[k]] if kind == NEAR else self._shape_body[other[k]]
-        return result
-
-    def features(self, passages: np.ndarray) -> np.ndarray:
-        """Return the vertices (k,6) of the features that meet in passages (k,4), equal for passages of the same two: an edge and
-        a corner belong to several triangles."""
-        t, (kind, a, b, f) = self._topology.triangle, passages.T.astype(np.int64)
-        sides = np.full((len(passages), 2, 3), -1)
-        near, adjacent, of_triangle = kind == NEAR, kind == ADJACENT, (kind == NEAR) | (kind == ROUND)
-        sides[of_triangle, 0], sides[near, 1] = t[a[of_triangle]], t[b[near]]
-        sides[adjacent] = self._rows[a[adjacent]].reshape(-1, 2, 3)
-        sides[kind == FLAT, 0] = a[kind == FLAT, None]
-        row, is_edge = np.arange(len(f)), f >= 6
-        for side, edge in enumerate(((f - 6) // 3, (f - 6) % 3)):
-            first = np.where(is_edge, edge, f % 3)
-            ends = sides[row, side, first], sides[row, side, np.where(is_edge, (first + 1) % 3, first)]
-            chosen = is_edge | (f // 3 == side)  # of a corner's other triangle, all corners
-            sides[:, side] = np.where(chosen[:, None], np.stack([*ends, np.full(len(f), -1)], axis=1), sides[:, side])
-        sides[(kind == ROUND) | (kind == FLAT), 1] = -2 - b[(kind == ROUND) | (kind == FLAT), None]
-        sides.sort(axis=2)
-        swapped = sides[:, 0, 0] > sides[:, 1, 0]
-        sides[swapped] = sides[swapped][:, ::-1]
-        return sides.reshape(-1, 6)
-
-    def forget(self) -> None:
-        """Discard the list of near pairs, after positions were set."""
-        self._is_listed = False
-
-    def _list(self, broad, row: Buffer) -> None:
-        """List the near pairs of the last search."""
-        while True:
-            list_near_pairs(self.surface, self.fields, broad, row.parts, self.limit / IN_BOXES * 0.5, self.near.parts)
-            grown = row.grow_if_full()
-            if not self.near.grow_if_full() and not grown:
-                break
-        self._is_listed = True
-
-    def find(self, x, broad, row: Buffer | None, mode: int) -> tuple[np.ndarray, np.ndarray] | None:
-        """Return the passages (k,4), ordered, and the parts (k,) of the step until which they are apart; None if the paths leave
-        what the last search has covered.
-
-        x: field of the nodes' positions [m]; mode: which paths, see `check_paths`. broad, row: result of the last broad phase and
-        buffer of its rows, or None.
-        """
-        s, listed_now = self.surface, False
-        while True:
-            if not self._is_listed and broad is not None:
-                self._list(broad, row)
-                listed_now = True
-            limit = self.limit if broad is not None else np.inf
-            check_paths(s, x, self.shapes, self.fields, self.near.parts, self.passages.parts, mode, limit, self.floor)
-            if self.fields.deviation[0] > limit:
-                self._is_listed = False
-                if listed_now:
-                    return None
-            elif not self.passages.grow_if_full():
-                break
-        return self._read()
-
-    def _read(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the passages found."""
-        out = self.passages
-        if out.count[TOTAL] == 0:
-            return np.zeros((0, 4), dtype=np.int32), np.zeros(0)
-        pair, time, used = download([out.data.pair, out.data.time, out.used])
-        valid = np.arange(len(time)) % out.part < np.repeat(used, out.part)
-        pair, time = pair[valid], time[valid]
-        order = np.lexsort(pair.T[::-1])
-        return pair[order], time[order]
-
-    @property
-    def buffers(self) -> tuple[Buffer, ...]:
-        """The growing buffers."""
-        return self.near, self.passages
-
-    def release(self) -> None:
-        """Free the memory of the buffers."""
-        for buffer in self.buffers:
-            buffer.release()

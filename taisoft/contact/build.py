@@ -2,9 +2,10 @@
 
 The target is the smallest gap that a contact may have at the end of a step. It is at most the contact offset, a distance that
 keeps surfaces apart despite the error of linearising the motion. A gap above the offset may close to it. A gap below it opens
-slowly, unless it is far below, a true penetration within a few steps, and never faster than strains the softest body by one percent: bodies would fly
-apart otherwise. Contacts of a body with itself have SELF_CONTACT times the contact offset and are corrected SELF_CONTACT times
-as fast. Where the surfaces meet within the step, restitution raises the target (`restitution`). The impulse must satisfy
+slowly, but at once to LEAST_GAP of it, and a true penetration within a few steps, never faster than strains the softest body by
+one percent: bodies would fly apart otherwise. Contacts of a body with itself have SELF_CONTACT times the contact offset and are
+corrected SELF_CONTACT times as fast. Where the surfaces meet within the step, restitution raises the target (`restitution`). The
+impulse must satisfy
     u_n = (gap - target)/dt + n.(v_a - v_b) >= 0,
 which counts motion once, since the gap is the one at the start of the step.
 """

@@ -5,7 +5,6 @@ motion was too fast for the previous search.
 """
 
 import numpy as np
-import taichi as ti
 
 from taisoft.backend.arrays import FieldArena, download
 from taisoft.collision.contacts import Contacts
@@ -28,7 +27,6 @@ from taisoft.dynamics.contact_measures import (
     RELATIVE_PENETRATION,
     ContactMeasures,
     Crossing,
-    find_displacement,
 )
 from taisoft.dynamics.contact_paths import ContactPaths
 from taisoft.dynamics.contact_record import read_rows, record_contacts, sum_impulses, write_rows
@@ -66,8 +64,6 @@ class ContactStep:
         self.gap_targets = self._gap_targets()
         self._arena = FieldArena()
         self._allocate(2 * d.surface.n_triangles + EXTRA_CAPACITY)
-        self._path_arena = FieldArena()
-        self._path = self._path_arena.vectors("path", ti.f64, m.n_nodes)
         self._numbers_arena = FieldArena()
         self.numbers = build_pair_numbers(self._numbers_arena, scene)
         self.rebounds = Rebounds(simulation)
@@ -148,7 +144,7 @@ class ContactStep:
         self.had_impact, self.dropped = bool(kept["met"]), int(kept["dropped"])
         self.flight[:] = kept["flight"]
         self.paths.restore(kept["paths"])
-        self.crossing, self.last_crossing = 0.0 if self.none_cross else None, Crossing()
+        self.crossing, self.last_crossing = 0.0 if self.paths.none_cross else None, Crossing()
         self._searched = self._measured_end = None
         self._indexed = True  # so that the next step rebuilds the node index, even without contacts
 
@@ -250,7 +246,7 @@ class ContactStep:
 
     def end_substep(self) -> None:
         """Add the impulses of a substep; check from now on the paths of colliders that do not cross any more."""
-        if not self.none_cross:
+        if not self.paths.none_cross:
             self.paths.exempt_crossing()
         if self._substep_fraction < 1.0:
             impulses = sum_impulses(self.contacts(), self.simulation.scene)
@@ -304,44 +300,20 @@ class ContactStep:
     def measure_crossings(self) -> tuple[float, float]:
         """Return the depth of crossing triangles or contained colliders at the last search [m], and over the finer side's mean
         surface edge. Set `crossing` and `last_crossing`. If none crossed before, none do: their paths were checked."""
-        self.last_crossing = found = Crossing() if self.none_cross else self.measures.crossing()
+        self.last_crossing = found = Crossing() if self.paths.none_cross else self.measures.crossing()
         self.crossing = found.relative
         return found.depth, found.relative
 
-    def left_searched_path(self, x_start) -> bool:
-        """Return whether the surface left the searched path since x_start; keep its displacement for `search_along_path`."""
-        deviation = np.zeros(1)
-        find_displacement(self.simulation.model, self.detection.surface, x_start, self._path, deviation)
-        return bool(deviation[0] > 0.5 * self.detection.margin)
-
     def search_along_path(self, time: float, dt: float) -> bool:
-        """Search along that displacement from the start state; return whether that finds new contacts."""
+        """Search along `paths.displacement` from the start state; return whether that finds new contacts."""
         self._searched = self._measured_end = None
         self.paths.use_all()
-        self._find(time, dt, path=self._path)
+        self._find(time, dt, path=self.paths.displacement)
         self._searched, self._searched_dt = (time, dt), dt
         searched = set(map(tuple, download([self.problem.feature], self.n_contacts)[0].tolist()))
         kept = download([self.detection.kept], self.detection.counts.contacts)[0]
         found = self.detection.buffer.data.feature.to_numpy()[kept]
         return not searched.issuperset(map(tuple, found.tolist()))
-
-    def find_passages(self, as_searched: bool = False) -> bool:
-        """Return whether surfaces pass through each other on the way to the present state, or on the searched paths."""
-        return self.paths.find(as_searched)
-
-    def hold_back(self, x_start) -> None:
-        """Shorten the paths from x_start to the present state, see `ContactPaths.hold_back`."""
-        self.paths.hold_back(x_start)
-
-    @property
-    def none_cross(self) -> bool:
-        """Whether no surfaces crossed at the start of the substep, so that all paths are checked."""
-        return self.paths.none_cross
-
-    @property
-    def held_back(self) -> str:
-        """A sentence about bodies that the last step held back, empty if there are none."""
-        return self.paths.held_back
 
     def measure_start(self, time: float, dt: float) -> tuple[float, float]:
         """Return the deepest penetration before a step of dt over the finer side's mean surface edge, and the largest closing
@@ -372,10 +344,10 @@ class ContactStep:
     @property
     def field_bytes(self) -> dict[str, int]:
         """Bytes of every allocated field by name."""
-        return self.detection.field_bytes | self._arena.bytes | self._numbers_arena.bytes | self._path_arena.bytes
+        return self.detection.field_bytes | self._arena.bytes | self._numbers_arena.bytes | self.paths.field_bytes
 
     def release(self) -> None:
         """Free all memory."""
         self.detection.release()
-        for arena in (self._arena, self._numbers_arena, self._path_arena):
-            arena.release()
+        for owner in (self._arena, self._numbers_arena, self.paths):
+            owner.release()

@@ -7,12 +7,14 @@ the step counts as not converged.
 """
 
 import numpy as np
+import taichi as ti
 
-from taisoft.backend.arrays import download
+from taisoft.backend.arrays import FieldArena, download
 from taisoft.collision.contacts import FACE_FACE
 from taisoft.collision.detector import Detection
 from taisoft.collision.passages import FEATURES, KINDS, SEARCHED, TO_STATE
 from taisoft.contact.problem import ContactProblem
+from taisoft.dynamics.contact_measures import find_displacement
 from taisoft.dynamics.simulation_state import SimulationState
 from taisoft.errors import SimulationError
 
@@ -30,6 +32,8 @@ class ContactPaths:
         self.held_back = ""  # a sentence about the last step, if bodies were held back
         self._held = self._held_before = NO_PASSAGES
         detection.prepare_paths()
+        self._arena = FieldArena()
+        self.displacement = self._arena.vectors("path", ti.f64, simulation.model.n_nodes)  # of `left_searched` [m]
 
     def return_to_start(self, none_crossed: bool) -> None:
         """Discard all passages and lists after a state was set. none_crossed: whether no surfaces are known to cross there."""
@@ -58,6 +62,12 @@ class ContactPaths:
     def undo(self) -> None:
         """Return to the passages held at the start of the substep."""
         self._detection.held = self._held = self._held_before
+
+    def left_searched(self, x_start) -> bool:
+        """Return whether the surface left the searched path since x_start; keep its displacement for another search."""
+        deviation = np.zeros(1)
+        find_displacement(self._simulation.model, self._detection.surface, x_start, self.displacement, deviation)
+        return bool(deviation[0] > 0.5 * self._detection.margin)
 
     def find(self, as_searched: bool = False) -> bool:
         """Find the passages on the paths from the last search to the present state, or on the searched paths, and hold them from
@@ -129,3 +139,12 @@ class ContactPaths:
         names = [bodies[k].name for k in np.flatnonzero(part[:n_bodies] < 1.0)]
         listed = ", ".join(f"'{name}'" for name in names)
         self.held_back = f"held back {listed}, which would have passed through another surface or through itself"
+
+    @property
+    def field_bytes(self) -> dict[str, int]:
+        """Bytes of its fields by name."""
+        return self._arena.bytes
+
+    def release(self) -> None:
+        """Free their memory."""
+        self._arena.release()

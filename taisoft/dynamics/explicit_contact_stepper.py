@@ -105,10 +105,10 @@ class ContactExplicitStepper(ExplicitStepper):
             n_inverted=int(m.state.scalars[MOST_INVERTED]),
             contact_iterations=sum(r.iterations for r in results if r),
             contact_residual=max((r.residual for r in results if r), default=0.0),
-            converged=all(r.converged for r in results if r) and not self.contact.held_back,
+            converged=all(r.converged for r in results if r) and not self.contact.paths.held_back,
         )
-        if self.contact.held_back:
-            result.problems.append(self.contact.held_back)
+        if self.contact.paths.held_back:
+            result.problems.append(self.contact.paths.held_back)
         elif not result.converged:
             result.problems.append(f"the contact solver stopped at a residual of {result.contact_residual:.2e}")
         return result
@@ -119,7 +119,7 @@ class ContactExplicitStepper(ExplicitStepper):
         if simulation.dirichlet.released() != self._released:
             simulation.dirichlet.set_released(self._released)
             simulation.upload_constraints()
-        self.contact.return_to_start(self.contact.none_cross)
+        self.contact.return_to_start(self.contact.paths.none_cross)
 
     def _substep(self, step: int, time: float, dt: float) -> SolveResult | None:
         """Take sub-step number `step` from a time, and repeat it while surfaces pass through each other on its paths.
@@ -132,20 +132,20 @@ class ContactExplicitStepper(ExplicitStepper):
         contact.start_substep(dt)
         result = self._solve_and_move(step, time, dt)
         for tries in range(MAX_PASSAGES + 1):
-            if not contact.find_passages():
+            if not contact.paths.find():
                 break
             end = simulation.state()
-            contact.left_searched_path(good.x)
+            contact.paths.left_searched(good.x)
             self._restore_state(*download([good.x, good.v]))
             contact.search_along_path(time, dt)
             if contact.paths.uncovered:
-                if not contact.find_passages(as_searched=True):
+                if not contact.paths.find(as_searched=True):
                     simulation.set_state(*end)
                     break
                 contact.search_along_path(time, dt)
             if tries == MAX_PASSAGES:
                 simulation.set_state(*end)
-                contact.hold_back(good.x)
+                contact.paths.hold_back(good.x)
                 self.acceleration_stale = True
                 return replace(result, converged=False) if result else None
             result = self._solve_and_move(step, time, dt)

@@ -171,8 +171,8 @@ class ImplicitStepper:
                 f"Newton stopped after {step.newton_iterations} iterations at a relative residual of {step.residual:.2e}"
                 + (f" and a contact residual of {step.contact_residual:.2e}" if self.contact.n_contacts else "")
             )
-        if self.contact.held_back:
-            step.problems.append(self.contact.held_back)
+        if self.contact.paths.held_back:
+            step.problems.append(self.contact.paths.held_back)
         if name:
             step.problems.append(f"forces on {name} are unbalanced by {worst:.2g} of their size, beside larger forces elsewhere")
         return step
@@ -185,7 +185,7 @@ class ImplicitStepper:
     def save_start(self) -> None:
         """Save the start of a step, to which `return_to_start` returns."""
         state = None if self.contact.idle else self.simulation.state()
-        self._saved_start = state, self.simulation.dirichlet.released(), self.contact.flight.copy(), self.contact.none_cross
+        self._saved_start = state, self.simulation.dirichlet.released(), self.contact.flight.copy(), self.contact.paths.none_cross
 
     def return_to_start(self, already_undone: bool = False) -> None:
         """Restore the step's start, without history. already_undone: whether the only substep so far has been undone."""

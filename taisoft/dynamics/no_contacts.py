@@ -3,22 +3,35 @@
 import numpy as np
 
 
+class NoPaths:
+    """`ContactPaths` where nothing can pass through anything."""
+
+    held_back, none_cross = "", True
+
+    def left_searched(self, x_start) -> bool:
+        """Return whether the surface left the searched path."""
+        return False
+
+    def find(self, as_searched: bool = False) -> bool:
+        """Return whether surfaces pass through each other."""
+        return False
+
+
 class NoContacts:
     """`ContactStep` with an empty list of contacts."""
 
     idle = True
     n_contacts, had_impact = 0, False
     relative_penetration = crossing = penetration = 0.0
-    held_back, none_cross = "", True
 
     def __init__(self) -> None:
-        self.flight = np.zeros(0)
+        self.flight, self.paths = np.zeros(0), NoPaths()
 
     def _nothing(self, *_arguments, **_named) -> None:
         """Do nothing."""
 
     forget = set_impulse_fraction = start_step = start_substep = end_substep = reset_substep = count_flight = restore = _nothing
-    hold_back = return_to_start = _nothing
+    return_to_start = _nothing
 
     def begin(self, time: float, dt: float) -> int:
         """Return the number of contacts of a step of dt [s] from a time: 0."""
@@ -40,14 +53,6 @@ class NoContacts:
     def initial_crossing(self) -> float:
         """Return the relative depth of crossing triangles."""
         return 0.0
-
-    def left_searched_path(self, x_start) -> bool:
-        """Return whether the surface left the searched path."""
-        return False
-
-    def find_passages(self, as_searched: bool = False) -> bool:
-        """Return whether surfaces pass through each other."""
-        return False
 
     def penetrates_deeper(self, time: float, dt: float, before: float) -> bool:
         """Return whether a substep leaves a new or deeper penetration."""

@@ -118,7 +118,7 @@ class Substepping:
             if fault == Fault.FAST and length < 2.0 * shortest:
                 self._refuse_fast_closing(dt)
             if fault == Fault.CROSSED and not may_cut:
-                contact.hold_back(stepper.history.x_now)
+                contact.paths.hold_back(stepper.history.x_now)
                 stepper.break_history()
                 result, fault = replace(result, converged=False), None
             if fault != Fault.FAST and not (fault and may_cut):
@@ -172,22 +172,22 @@ class Substepping:
         contact, stepper, before = self._contact, self._stepper, self._contact.relative_penetration
         simulation, start, result = stepper.simulation, stepper.history.x_now, stepper.take_substep(time, dt)
         for tries in range(MAX_PASSAGES + 1):
-            as_searched = not contact.left_searched_path(start)
-            passes = as_searched and contact.find_passages()
+            as_searched = not contact.paths.left_searched(start)
+            passes = as_searched and contact.paths.find()
             if as_searched and not passes and not contact.penetrates_deeper(time + dt, dt, before):
                 break
             state = simulation.state()
             stepper.restore_start()
             new = contact.search_along_path(time, dt)
             if not as_searched:
-                passes = contact.find_passages(as_searched=True)
+                passes = contact.paths.find(as_searched=True)
                 # contacts unknown so far matter only if something could have crossed
-                new = contact.search_along_path(time, dt) if passes else new and not contact.none_cross
+                new = contact.search_along_path(time, dt) if passes else new and not contact.paths.none_cross
             if not (new or passes) or tries >= (MAX_PASSAGES if passes else MAX_SEARCHES):
                 simulation.set_state(*state)
                 if passes:
                     return result, Fault.CROSSED
-                if not contact.none_cross and contact.closing_ratio_along_path() > MAX_CLOSING_RATIO:
+                if not contact.paths.none_cross and contact.closing_ratio_along_path() > MAX_CLOSING_RATIO:
                     return result, Fault.FAST
                 return result, Fault.UNSETTLED if new else None
             result = count_all(stepper.retry_substep(time, dt, state[1]), [result])
