@@ -15,6 +15,7 @@ import pytest
 
 import taisoft as ts
 from taisoft.dynamics.contact_measures import next_length
+from taisoft.dynamics.contact_paths import ContactPaths
 
 THICK = 0.01  # [m] of the sheet
 DT = {"implicit_euler": 1 / 60, "symplectic_euler": 2e-4}  # [s]
@@ -88,12 +89,25 @@ def test_only_close_projectiles_take_substeps(sim):
     assert sim.step().substeps == 1
 
 
-def test_a_projectile_that_is_too_fast_is_refused(sim):
+def shoot_too_fast(sim) -> float:
+    """Shoot through the sheet within one step, or the shortest substep. Return the speed [m/s]."""
     explicit = sim.settings.explicit
     speed = (0.75 if explicit else 300.0) * THICK / sim.dt
     shoot(sim, speed)
     gap = 1e-3 if explicit else 0.015  # [m]; explicit steps check it once before the impact
     sim.set_state(positions=sim.positions("shot") - (0, 0.1 - 0.025 - 0.5 * THICK - gap, 0), body="shot")
+    return speed
+
+
+def test_no_projectile_is_too_fast(sim):
+    shoot_too_fast(sim)
+    assert fly(sim, 20 if sim.settings.explicit else 4) >= 1
+
+
+def test_a_projectile_that_is_too_fast_is_refused_where_paths_are_not_checked(sim, monkeypatch):
+    """As where surfaces cross already."""
+    monkeypatch.setattr(ContactPaths, "none_cross", property(lambda self: False))
+    explicit, speed = sim.settings.explicit, shoot_too_fast(sim)
     x, v = sim.positions(), sim.velocities()
     with pytest.raises(ts.SimulationError) as closing:
         sim.step()

@@ -127,7 +127,8 @@ class ContactExplicitStepper(ExplicitStepper):
         Return the contact solver's result, None without contacts.
         """
         simulation, contact, good = self.simulation, self.contact, self._good
-        if contact.measure_start(time, dt)[1] > 1.0:
+        closing_ratio = contact.measure_start(time, dt)[1]
+        if closing_ratio > 1.0 and not contact.paths.none_cross:
             raise SimulationError(f"step {step}: {contact.describe_fast_closing(dt)}")
         contact.start_substep(dt)
         result = self._solve_and_move(step, time, dt)

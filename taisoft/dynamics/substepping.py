@@ -8,7 +8,8 @@ halved if these repetitions did not help, if the motion was much faster than kno
 penetration or crossing, or, if it was short, when it did not converge. A short event, such as an impact or a snap, therefore
 takes short substeps only while it lasts.
 
-No substep is shorter than the step over MAX_SUBSTEPS. Motion that closes too fast even for that is refused. A substep of minimum
+No substep is shorter than the step over MAX_SUBSTEPS. Where surfaces cross already, motion that closes too fast even for that is
+refused. A substep of minimum
 length, or after MAX_UNDONE others were undone, is kept and reported even if deep, unsettled or not converged; bodies that would
 still pass through something are held back.
 """
@@ -109,7 +110,9 @@ class Substepping:
                 bool(results) and not undone,
             )
             if length < shortest:
-                self._refuse_fast_closing(dt)
+                if not contact.paths.none_cross:
+                    self._refuse_fast_closing(dt)
+                length = min(dt / MAX_SUBSTEPS, remaining)  # the check of its path suffices
             contact.start_substep(length)
             relative_penetration, last = contact.relative_penetration, length > remaining - shortest
             released = stepper.simulation.dirichlet.released()
