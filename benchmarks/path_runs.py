@@ -49,7 +49,7 @@ COST: dict[str, tuple[Callable[[], Made], float, int]] = {
     "W4, implicit_euler": (lambda: work("W4", "implicit_euler", 1), 0.8, 20),
     "cube_pile": (lambda: demo("cube_pile"), 1.2, 20),
     "drop_everything": (lambda: demo("drop_everything"), 1.2, 20),
-    BEAM: (lambda: demo(BEAM), 0.5, 400),
+    BEAM: (lambda: demo(BEAM), 0.5, 10_000),
 }
 WAYS = {"cube_pile": 60, "two_cubes_two_boxes": 60, "drop_everything": 120, "S1 B, start 0": 60}  # name -> steps captured
 
@@ -86,9 +86,8 @@ def pairs_checked(detection: Detection) -> int:
 
 @dataclass
 class Cost:
-    """Steps with and without the check. launches: in the window, by kernel; relisting: steps that made a new list; near: pairs
-    listed, mean; passages: steps of the window with any; same: whether both ways end in the same state; field_bytes: of its
-    fields."""
+    """Steps with and without the check. In the window, launches: by kernel; relisting: steps that made a new list; near: pairs
+    listed, mean; passages: steps with any. same: whether all runs end in the same state; field_bytes: of the check's fields."""
 
     name: str
     dt: float
@@ -132,10 +131,10 @@ def measure_cost(name: str, arch: str, rounds: int, steps: int | None = None, st
 
 
 def find_window(sim: ts.Simulator, cost: Cost) -> dict:
-    """Count in the first window without passages, or else the last one tried; returns the snapshot at its start."""
+    """Count in the first window where all steps have contacts and none passages, or the last; returns its start's snapshot."""
     contact, passing = sim._dynamics.contact, []
     for _ in range(WINDOWS):
-        kept, near, cost.start, cost.relisting = sim._dynamics.snapshot(), [], sim.time, 0
+        kept, near, contacts, cost.start, cost.relisting = sim._dynamics.snapshot(), [], [], sim.time, 0
         held = contact is not None and len(contact.detection.held[0])
         sim._dynamics.restore(kept)
         passing.clear()
@@ -144,12 +143,12 @@ def find_window(sim: ts.Simulator, cost: Cost) -> dict:
             before = launches.copy()
             for _ in range(cost.steps):
                 listed = launches[LIST]
-                report = sim.step()
+                contacts.append(sim.step().n_contacts)
                 cost.relisting += launches[LIST] > listed
                 near.append(contact.detection._paths.near.count[TOTAL] if contact and contact.detection._has_pairs else 0)
         cost.launches = {kernel: launches[kernel] - before[kernel] for kernel in KERNELS}
-        cost.near, cost.contacts, cost.passages = float(np.mean(near)), report.n_contacts, len(set(passing))
-        if not passing and not held:
+        cost.near, cost.contacts, cost.passages = float(np.mean(near)), contacts[-1], len(set(passing))
+        if contact is None or not passing and not held and min(contacts) > 0:
             break
     return kept
 
@@ -159,15 +158,15 @@ def find_window(sim: ts.Simulator, cost: Cost) -> dict:
 
 @dataclass
 class Ways:
-    """Captured substeps of a scene. accepted: at the first check; near: moving vertices within the margin, over all substeps;
-    over: of these, beyond the bound; ratios: largest displacement over its bound, by substep; pairs: checked by taisoft, over all
-    checks; seconds: of taisoft's checks; bound_pairs, search_seconds, bound_seconds: as often, of the bound."""
+    """Captured substeps of a scene. passing: without passages in any attempt; near: moving vertices within the margin, over all
+    substeps; over: of these, beyond the bound; ratios: largest displacement over its bound, by substep; pairs, seconds: of all
+    checks; bound_pairs, search_seconds, bound_seconds: of the bound, once a substep."""
 
     name: str
     steps: int
     dt: float = 0.0
     substeps: int = 0
-    accepted: int = 0
+    passing: int = 0
     held_back: int = 0
     passages: int = 0
     near: int = 0
@@ -217,8 +216,8 @@ class Bounds:
                 safe = np.minimum(safe, np.abs((x - shape.point) @ np.asarray(shape.normal)))
             elif isinstance(shape, Sphere | Capsule):
                 a, b = (np.asarray(p) for p in ([shape.center] * 2 if isinstance(shape, Sphere) else (shape.a, shape.b)))
-                lo, hi = np.minimum(a, b) - shape.radius - within, np.maximum(a, b) + shape.radius + within
-                corners = x[self.triangle]
+                corners, grown = x[self.triangle], shape.radius + within
+                lo, hi = np.minimum(a, b) - grown, np.maximum(a, b) + grown
                 near = (corners.min(axis=1) <= hi).all(axis=1) & (corners.max(axis=1) >= lo).all(axis=1)
                 far = [axis_distance(a, b, one) - shape.radius for one in corners[near]]
                 np.minimum.at(safe, self.triangle[near], np.array(far)[:, None])
@@ -227,20 +226,22 @@ class Bounds:
 
 def capture(sim: ts.Simulator, row: Ways, steps: int) -> list[tuple[np.ndarray, np.ndarray]]:
     """Take steps; returns positions (v,3) at the start and displacements (v,3) of surface vertices for each accepted substep."""
-    taken, last, plain = [], [], ContactStep.end_substep
+    taken, last, passages, plain = [], [], [], ContactStep.end_substep
     detection = sim._dynamics.contact.detection
 
     def after(paths: ContactPaths, found: bool, new: int, seconds: float) -> None:
         row.checks, row.pairs, row.seconds = row.checks + 1, row.pairs + pairs_checked(detection), row.seconds + seconds
         row.passages += new
+        passages.append(found and not paths.uncovered)
         last.append(None if found else (detection.surface.x.to_numpy(), detection._paths.fields.path.to_numpy()))
 
     def end_substep(self) -> None:
         plain(self)
         row.held_back += last[-1] is None
-        row.accepted += len(last) == 1 and last[-1] is not None
-        taken.extend([last[-1]] if last[-1] is not None else [])
+        row.passing += not any(passages)
+        taken.extend(one for one in last[-1:] if one is not None)
         last.clear()
+        passages.clear()
 
     row.dt = sim.dt
     with observed(after), patched(ContactStep, "end_substep", end_substep):
