@@ -112,8 +112,7 @@ def measure_cost(name: str, arch: str, rounds: int, steps: int | None = None, st
     with without_warnings(), ts.Simulator(scene, arch=arch, **settings) as sim:
         cost = Cost(name, sim.dt, steps or window)
         advance(sim, max(1, round((begins if start is None else start) / sim.dt)))
-        kept = find_window(sim, cost)
-        ends = []
+        kept, ends = find_window(sim, cost), []
         for number in range(rounds + 1):  # the first one compiles
             turns = [(cost.with_check, nullcontext), (cost.without, unchecked)]
             for seconds, how in turns if number % 2 else turns[::-1]:

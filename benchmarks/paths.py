@@ -46,6 +46,7 @@ def cost_table(rows: list[Cost]) -> str:
         ("spread", lambda r: timed_cells(r.without)[1]),
         ("ratio", lambda r: f"{ratio(r).median:.3f}"),
         ("least to most", lambda r: f"{ratio(r).minimum:.2f} to {ratio(r).maximum:.2f}"),
+        ("of the fastest", lambda r: f"{min(r.with_check) / min(r.without):.3f}"),
         (f"{CHECK} a step", lambda r: f"{r.launches[CHECK] / r.steps:.2f}"),
         (f"{LIST} a step", lambda r: f"{r.launches[LIST] / r.steps:.2f}"),
         ("near pairs", lambda r: f"{r.near:,.0f}"),
