@@ -187,6 +187,9 @@ def test_paths_that_leave_what_was_searched_are_not_judged():
             assert one.find(x + along * move + 1.001 * limit * aside) is None
         for beyond in (-1.01 * limit, 0.3 + 1.01 * limit):
             assert one.find(x + np.array([beyond, 0.0, 0.0]) * (move != 0.0).any(axis=1)[:, None]) is None
+        far = x.copy()
+        far[3, 1] = np.inf
+        assert one.find(far) is None
         assert len(one.find(x + move)[0]) == 0
         before = runtime.launches["list_near_pairs"]
         one.search(x + 3.0 * limit * aside, 0.0 * move)  # a new search, from where the old list is useless
@@ -195,3 +198,13 @@ def test_paths_that_leave_what_was_searched_are_not_judged():
     with checked([parts[0]], [obstacle(ts.Sphere((0.5, 0.5, 0.5), 0.2))], self_on=False) as one:  # needs no list
         one.search(parts[0][0], np.zeros((9, 3)))
         assert len(one.find(parts[0][0] + [0.0, 5.0, 0.0])[0]) > 0
+
+
+@pytest.mark.xfail(strict=True, reason="ti.max drops nan, so a position that is not a number does not deviate")
+def test_positions_that_are_not_numbers_are_not_judged():
+    x, t = sheet(2)
+    with checked([(x, t), (x + [0.0, 0.5, 0.0], t)]) as one:
+        one.search(np.concatenate([x, x + [0.0, 0.5, 0.0]]), np.zeros((18, 3)))
+        state = one.made.x.copy()
+        state[3, 1] = np.nan
+        assert one.find(state) is None
