@@ -13,7 +13,8 @@ from taisoft.backend.arrays import FieldArena
 from taisoft.collision.analytic import NO_SHAPES, build_analytic, place_analytic
 from taisoft.collision.bvh import Bvh
 from taisoft.collision.candidates import Buffer, entries
-from taisoft.collision.passages import SEARCHED, TO_STATE, PathCheck
+from taisoft.collision.passages import SEARCHED, TO_STATE
+from taisoft.collision.path_check import PathCheck
 from taisoft.scene.obstacles import Obstacle
 
 REACH, FLOOR = 0.1, 2e-4  # [m]; ipctk may call a step colliding that comes within some 1e-5 m

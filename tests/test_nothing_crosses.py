@@ -233,7 +233,6 @@ def test_what_leaves_no_room_is_refused(hammer, integrator, dt):
         assert str(error.value).startswith(f"step {sim.step_count + 1}: ") and Judge(sim, False).crossings() == 0
 
 
-@pytest.mark.xfail(strict=True, reason="prescribed nodes of a body that is held back leave their paths")
 @pytest.mark.parametrize("integrator, dt", [("implicit_euler", 1 / 60), ("velocity_verlet", 1e-3)])
 def test_prescribed_nodes_that_leave_no_room_are_refused(integrator, dt):
     """A cube fixed in place, and another one all of whose nodes are prescribed to move into it."""

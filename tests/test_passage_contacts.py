@@ -17,7 +17,8 @@ from scenes import dynamics, rows_of, set_state
 
 import taisoft as ts
 from taisoft.backend.arrays import FieldArena
-from taisoft.collision.passages import ADJACENT, FEATURES, FLAT, KINDS, NEAR, ROUND, SEARCHED, adjacent_rows
+from taisoft.collision.passages import ADJACENT, FEATURES, FLAT, KINDS, NEAR, ROUND, SEARCHED
+from taisoft.collision.path_check import adjacent_rows
 
 ipctk = pytest.importorskip("ipctk")
 from benchmarks.judge import axis_distance  # noqa: E402

@@ -116,7 +116,6 @@ def test_an_edge_or_corner_has_one_name_in_all_its_triangles():
         assert colliders.tolist() == [list(expected[kind]) for kind, *_ in rows]
 
 
-@pytest.mark.xfail(strict=True, reason="two edges of one body are named twice where their triangles' order differs")
 def test_features_have_one_name_within_a_body():
     """Its passages list triangles a < b, so either of two edges may come first."""
     with checked([sheet(4)]) as one:

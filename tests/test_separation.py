@@ -14,6 +14,7 @@ from lanes import opened
 
 from taisoft.backend.runtime import kernel
 from taisoft.collision import separation
+from taisoft.collision.intersections import row_of
 
 ipctk = pytest.importorskip("ipctk")
 array = ti.types.ndarray(dtype=ti.f64)
@@ -39,6 +40,15 @@ def nearest(X: array, out: array):
 def free(X: array, P: array, radius: ti.f64, floor: ti.f64, are_apart: ti.i32, out: array):
     for i in range(X.shape[0]):
         out[i], _ = separation.free_until(rows(X, i), rows(P, i), radius, floor, are_apart)
+
+
+@kernel
+def clear(X: array, P: array, floor: ti.f64, out: array):
+    for i in range(X.shape[0]):
+        x, p = rows(X, i), rows(P, i)
+        corners = [row_of(x, k) for k in ti.static(range(6))]
+        moves = [row_of(p, k) for k in ti.static(range(6))]
+        out[i] = separation.clearly_apart(*corners, *moves, floor)
 
 
 @pytest.fixture(scope="module", params=["f64", "f32"], autouse=True)
@@ -111,6 +121,17 @@ def test_free_motions_are_free(speed):
     assert (called & truth).sum() > 0.99 * truth.sum()
     for y, q, f in zip(x, p, free_until(x, p, floor=1e-3)):  # ipctk's own tolerance is 1e-6
         assert exactly_free(y, f * q)
+
+
+@pytest.mark.parametrize("speed", [0.0, 0.3, 2.0])
+def test_what_simple_tests_call_clear_is_free(speed):
+    x, p = apart(1500, np.random.default_rng(6), speed)
+    out, floor = np.zeros(len(x)), 1e-2
+    clear(x, p, floor, out)
+    free = free_until(x, p, floor=floor)
+    assert 300 < out.sum() < len(x) and (free[out == 1.0] == 1.0).all()
+    for y, q in zip(x[out == 1.0], p[out == 1.0]):
+        assert min(distance(y + t * q) for t in (0.0, 0.5, 1.0)) >= floor * (1.0 - 1e-9)
 
 
 def test_stopped_triangles_are_near():

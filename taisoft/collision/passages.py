@@ -24,7 +24,7 @@ from taisoft.collision.analytic import CAPSULE, HALF_SPACE, SPHERE
 from taisoft.collision.candidates import WHOLE, sum_parts
 from taisoft.collision.contacts import FACE_FACE, write_contact
 from taisoft.collision.features import unit
-from taisoft.collision.separation import at_weights, free_until, nearest_of, unit_row
+from taisoft.collision.separation import at_weights, clearly_apart, free_until, nearest_of, unit_row
 from taisoft.collision.surface import ACTIVE, dvec, ivec, list_near, part_first
 
 # kinds of passages, by two ids: two triangles; a row of `adjacent`; a triangle and a sphere or capsule; a vertex and a half-space
@@ -42,7 +42,7 @@ class PathFields:
     path: Any  # (n_verts) 3-vectors f64: displacements to be checked [m]
     listed_x: Any  # (n_verts) 3-vectors f64: positions and searched displacements when the near pairs were listed [m]
     listed_move: Any
-    deviation: Any  # (1) f64: how far a vertex is from those paths [m]
+    has_left: Any  # (1) i32: 1 if a vertex is too far from those paths
     exempt: Any  # (n_bodies^2) i32: 1 for pairs of colliders that cross already
     adjacent: Any  # (n_adjacent, 6) i32: vertices of two triangles
     n_adjacent: Count
@@ -107,6 +107,15 @@ def _rows(s: ti.template(), o: ti.template(), g: ti.template(), kind, a, b, move
 
 
 @ti.func
+def _clearly_apart(s: ti.template(), g: ti.template(), kind, a, b, floor):
+    """Whether simple tests show that two triangles stay farther apart than `floor` [m], see `clearly_apart`."""
+    i, j, k = _vertex(s, g, kind, a, b, 0), _vertex(s, g, kind, a, b, 1), _vertex(s, g, kind, a, b, 2)
+    l, m, n = _vertex(s, g, kind, a, b, 3), _vertex(s, g, kind, a, b, 4), _vertex(s, g, kind, a, b, 5)
+    p, q, r, u, v, w = g.path[i], g.path[j], g.path[k], g.path[l], g.path[m], g.path[n]
+    return clearly_apart(s.x[i], s.x[j], s.x[k], s.x[l], s.x[m], s.x[n], p, q, r, u, v, w, floor)
+
+
+@ti.func
 def _height(o: ti.template(), k, p, at_end):
     """Height [m] of point p over half-space k."""
     x, R = _pose(o, k, at_end)
@@ -121,8 +130,8 @@ def _body_of(s: ti.template(), i):
 
 @ti.func
 def _set_paths(s: ti.template(), x: ti.template(), g: ti.template(), mode, limit):
-    """Set the paths, see `check_paths`, and the deviation from the listed ones."""
-    g.deviation[0] = 0.0
+    """Set the paths, see `check_paths`, and whether they leave the listed ones by more than `limit` [m]."""
+    g.has_left[0] = 0
     ti.loop_config(serialize=s.serial_cheap)
     for i in range(s.n_verts):
         path = s.move[i]
@@ -132,15 +141,14 @@ def _set_paths(s: ti.template(), x: ti.template(), g: ti.template(), mode, limit
             path = x[s.node[i]] - s.x[i]
         g.path[i] = path
         d = g.listed_move[i]
-        square, farthest = d.dot(d), ti.cast(0.0, ti.f64)
+        square = d.dot(d)
         for end in range(2):
             r = s.x[i] + ti.cast(end, ti.f64) * path - g.listed_x[i]
             along = ti.cast(0.0, ti.f64)
             if square > 0.0:
                 along = ti.min(ti.max(r.dot(d) / square, 0.0), 1.0)
-            farthest = ti.max(farthest, (r - along * d).norm())
-        if not farthest <= limit:
-            ti.atomic_max(g.deviation[0], ti.min(farthest, ti.math.inf))
+            if not (r - along * d).norm() <= limit:  # also if it is not a number
+                g.has_left[0] = 1
 
 
 @ti.func
@@ -175,7 +183,7 @@ def check_paths(
         if task % s.spread == 0:
             c = task // s.spread
             at, last = c * out.part, (c + 1) * out.part
-            if g.deviation[0] <= limit:
+            if g.has_left[0] == 0:
                 if ti.static(o.any):
                     for i in range(part_first(c, s.n_verts, s.chunks), part_first(c + 1, s.n_verts, s.chunks)):
                         for k in range(o.count):
@@ -203,6 +211,8 @@ def check_paths(
                         checked = (o.kind[b] == SPHERE or o.kind[b] == CAPSULE) and s.soft[s.body[a]] == 1
                         if checked:
                             checked = g.exempt[s.body[a] * s.n_bodies + o.body[b]] == 0
+                    if checked and kind != ROUND:
+                        checked = not _clearly_apart(s, g, kind, a, b, floor)
                     if checked:
                         y, p = _rows(s, o, g, kind, a, b, g.path)
                         time, features = free_until(y, p, _radius(o, kind, b), floor, mode != STILL)

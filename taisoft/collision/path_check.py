@@ -75,7 +75,7 @@ class PathCheck:
         vectors = (arena.vectors(f"path_{name}", ti.f64, n) for name in ("displacement", "listed_x", "listed_move"))
         self.fields = PathFields(
             *vectors,
-            arena.field("path_deviation", ti.f64, 1),
+            arena.field("path_left", ti.i32, 1),
             arena.field("path_exempt", ti.i32, s.n_bodies**2),
             integers(arena, "path_adjacent", rows.reshape(-1, 6)),
             len(rows),
@@ -120,7 +120,8 @@ class PathCheck:
             sides[:, side] = np.where(chosen[:, None], np.stack([*ends, np.full(len(f), -1)], axis=1), sides[:, side])
         sides[(kind == ROUND) | (kind == FLAT), 1] = -2 - b[(kind == ROUND) | (kind == FLAT), None]
         sides.sort(axis=2)
-        swapped = sides[:, 0, 0] > sides[:, 1, 0]
+        order = sides[:, 0] - sides[:, 1]
+        swapped = order[np.arange(len(order)), (order != 0).argmax(axis=1)] > 0  # by the first vertex that differs
         sides[swapped] = sides[swapped][:, ::-1]
         return sides.reshape(-1, 6)
 
@@ -151,7 +152,7 @@ class PathCheck:
                 listed_now = True
             limit = self.limit if broad is not None else np.inf
             check_paths(s, x, self.shapes, self.fields, self.near.parts, self.passages.parts, mode, limit, self.floor)
-            if self.fields.deviation[0] > limit:
+            if self.fields.has_left[0]:
                 self._is_listed = False
                 if listed_now:
                     return None

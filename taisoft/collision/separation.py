@@ -184,3 +184,40 @@ def free_until(x, p, radius, floor, are_apart):
             result, features = part, k
         k += 1
     return result, features
+
+
+@ti.func
+def _least_height(a, b, c, base, n):
+    """Least height of three points over a base point along n (3,)."""
+    return ti.min((a - base).dot(n), (b - base).dot(n), (c - base).dot(n))
+
+
+@ti.func
+def _plane_separates(a0, b0, c0, a1, b1, c1, d0, e0, f0, d1, e1, f1, n, floor):
+    """Whether points a, b and c stay farther than `floor` beyond points d, e and f along n (3,), from 0 to 1."""
+    need = floor * n.norm()
+    first = _least_height(a0, b0, c0, d0, n) + _least_height(-d0, -e0, -f0, -d0, n)
+    last = _least_height(a1, b1, c1, d1, n) + _least_height(-d1, -e1, -f1, -d1, n)
+    return need > 0.0 and first >= need and last >= need
+
+
+@ti.func
+def clearly_apart(a0, b0, c0, d0, e0, f0, p, q, r, u, v, w, floor):
+    """Whether boxes around the paths of triangles abc and def, their planes or the one between their middles show that they stay
+    farther apart than `floor` [m]: most do, and planes at rest suffice for what slides on each other. All (3,): corners at first,
+    and their displacements [m]."""
+    a1, b1, c1, d1, e1, f1 = a0 + p, b0 + q, c0 + r, d0 + u, e0 + v, f0 + w
+    low, high = ti.min(a0, b0, c0, a1, b1, c1) - floor, ti.max(a0, b0, c0, a1, b1, c1) + floor
+    clear = (low > ti.max(d0, e0, f0, d1, e1, f1)).any() or (high < ti.min(d0, e0, f0, d1, e1, f1)).any()
+    side = 0
+    while side < 5 and not clear:
+        axis = (a0 + b0 + c0) - (d0 + e0 + f0)
+        if side == 1 or side == 2:
+            axis = (e0 - d0).cross(f0 - d0)
+        elif side > 2:
+            axis = (b0 - a0).cross(c0 - a0)
+        if side == 2 or side == 4:
+            axis = -axis
+        clear = _plane_separates(a0, b0, c0, a1, b1, c1, d0, e0, f0, d1, e1, f1, axis, floor)
+        side += 1
+    return clear

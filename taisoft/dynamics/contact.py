@@ -1,7 +1,6 @@
 """Contacts of a step: detection, contact problem and penetration checks, shared by explicit and implicit steps.
 
-The search at the end of each step also serves the next one. It measures how deep bodies penetrate each other, and whether the
-motion was too fast for the previous search.
+The search at the end of each step also serves the next one, and measures how deep bodies penetrate each other.
 """
 
 import numpy as np
@@ -245,7 +244,7 @@ class ContactStep:
         self.paths.begin()
 
     def end_substep(self) -> None:
-        """Add the impulses of a substep; check from now on the paths of colliders that do not cross any more."""
+        """Add the impulses of a substep; check the paths of colliders that do not cross any more."""
         if not self.paths.none_cross:
             self.paths.exempt_crossing()
         if self._substep_fraction < 1.0:
@@ -298,8 +297,8 @@ class ContactStep:
         return self.relative_penetration > DEEP_PENETRATION
 
     def measure_crossings(self) -> tuple[float, float]:
-        """Return the depth of crossing triangles or contained colliders at the last search [m], and over the finer side's mean
-        surface edge. Set `crossing` and `last_crossing`. If none crossed before, none do: their paths were checked."""
+        """Return how deep things cross at the last search [m], and over the finer side's mean surface edge. Set `crossing` and
+        `last_crossing`. If none crossed before, none do: their paths were checked."""
         self.last_crossing = found = Crossing() if self.paths.none_cross else self.measures.crossing()
         self.crossing = found.relative
         return found.depth, found.relative
@@ -311,13 +310,11 @@ class ContactStep:
         self._find(time, dt, path=self.paths.displacement)
         self._searched, self._searched_dt = (time, dt), dt
         searched = set(map(tuple, download([self.problem.feature], self.n_contacts)[0].tolist()))
-        kept = download([self.detection.kept], self.detection.counts.contacts)[0]
-        found = self.detection.buffer.data.feature.to_numpy()[kept]
+        found = self.detection.buffer.data.feature.to_numpy()[download([self.detection.kept], self.detection.counts.contacts)[0]]
         return not searched.issuperset(map(tuple, found.tolist()))
 
     def measure_start(self, time: float, dt: float) -> tuple[float, float]:
-        """Return the deepest penetration before a step of dt over the finer side's mean surface edge, and the largest closing
-        ratio in it."""
+        """Return the deepest penetration before a step of dt over the finer mean surface edge, and its largest closing ratio."""
         self.search(time, dt)
         closing = self.measures.closing(dt)
         return float(closing[RELATIVE_PENETRATION]), float(closing[CLOSING_RATIO])
@@ -334,7 +331,7 @@ class ContactStep:
         return self.crossing
 
     def describe_fast_closing(self, dt: float, substeps: int = 1) -> str:
-        """Return a sentence about colliders that close too fast for a step of dt [s], see `ContactMeasures`."""
+        """Return `ContactMeasures.describe_fast_closing` for a step of dt [s]."""
         return self.measures.describe_fast_closing(dt, self._searched_dt, substeps)
 
     def contacts(self) -> Contacts:

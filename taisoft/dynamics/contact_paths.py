@@ -114,31 +114,44 @@ class ContactPaths:
         """Shorten the paths of bodies from x_start to the present state until nothing passes through anything. The last search
         must have started there. Raise SimulationError if something that moves as prescribed passes through a body at rest."""
         simulation, d = self._simulation, self._detection
-        start, (end, velocity) = x_start.to_numpy(), simulation.state()
-        bodies, part = simulation.scene.bodies, np.ones(len(d.scene.colliders))
-        n_bodies, n_rounds = len(bodies), 0
+        path = x_start.to_numpy(), *simulation.state()
+        can_move = np.zeros(len(d.scene.colliders), dtype=bool)
+        for body in range(len(simulation.scene.bodies)):
+            can_move[body] = simulation.model.free.to_numpy()[simulation.layout.nodes(body)].any()
+        part, n_rounds = can_move.astype(np.float64), 0
         while len((found := d.passages(TO_STATE))[0]):
             colliders, n_rounds = d.colliders_of(found[0]), n_rounds + 1
-            movable = (colliders < n_bodies) & (part[colliders] > 0.0)
-            if not movable.any(axis=1).all():
-                one, other = (d.scene.colliders[c].name for c in colliders[~movable.any(axis=1)][0])
-                raise SimulationError(
-                    f"step {simulation.step_count + 1}: '{one}' and '{other}' would pass through each other, although the bodies "
-                    "stay where they are: what moves as prescribed leaves no room"
-                )
+            stuck = ~(part[colliders] > 0.0).any(axis=1)
+            if stuck.any():
+                self._refuse(*colliders[stuck][0])
             shortened = np.ones(len(part))
             for side in range(2):
                 np.minimum.at(shortened, colliders[:, side], SHORTENED * found[1])
             part = np.where(shortened < 1.0, part * shortened if n_rounds < MAX_SHORTENINGS else 0.0, part)
             part[part < LEAST] = 0.0
-            x, v = end.copy(), velocity.copy()
-            for body in range(n_bodies):
-                rows = simulation.layout.nodes(body)
-                x[rows], v[rows] = start[rows] + part[body] * (end[rows] - start[rows]), part[body] * velocity[rows]
-            simulation.set_state(x, v)
-        names = [bodies[k].name for k in np.flatnonzero(part[:n_bodies] < 1.0)]
-        listed = ", ".join(f"'{name}'" for name in names)
+            self._move_in_part(part, *path)
+        listed = ", ".join(f"'{d.scene.colliders[k].name}'" for k in np.flatnonzero(can_move & (part < 1.0)))
         self.held_back = f"held back {listed}, which would have passed through another surface or through itself"
+
+    def _refuse(self, a: int, b: int) -> None:
+        """Raise SimulationError about two colliders that pass through each other wherever bodies stay."""
+        one, other = (self._detection.scene.colliders[k].name for k in (a, b))
+        raise SimulationError(
+            f"step {self._simulation.step_count + 1}: '{one}' and '{other}' would pass through each other, although the bodies "
+            "stay where they are: what moves as prescribed leaves no room"
+        )
+
+    def _move_in_part(self, part: np.ndarray, start: np.ndarray, end: np.ndarray, velocity: np.ndarray) -> None:
+        """Set the state to a part of each body's path, given with its velocities, (n_nodes, 3); what is fixed or prescribed stays
+        at the end. part: (n_colliders,)."""
+        simulation, x, v = self._simulation, end.copy(), velocity.copy()
+        free = simulation.model.free.to_numpy() > 0
+        for body in range(len(simulation.scene.bodies)):
+            rows = simulation.layout.nodes(body)
+            if part[body] < 1.0:
+                x[rows] = np.where(free[rows], start[rows] + part[body] * (end[rows] - start[rows]), end[rows])
+                v[rows] = np.where(free[rows], part[body] * velocity[rows], velocity[rows])
+        simulation.set_state(x, v)
 
     @property
     def field_bytes(self) -> dict[str, int]:
