@@ -22,6 +22,7 @@ from .document import RESULTS, table
 from .hard_cases import CASES
 from .hard_runs import Row, stored
 from .hard_table import ALL, cells, headline, how_solved, shown_columns, tally
+from .ipc_runs import Record, mean
 from .order import DEFAULT_DEGREE, GOAL
 from .order_cases import HANGING
 from .reference_cases.record import label
@@ -148,6 +149,27 @@ def hard(results: Path) -> str:
     return f"{headline(rows)} {how_solved(rows)}\n\n{text}" + measured_on(numbers)
 
 
+def ipc(results: Path) -> str:
+    """How far the scenes of incremental potential contact came, and their seconds a step beside the published ones."""
+    numbers = newest(results, "ipc")
+    records = [Record.read(run) for run in numbers["runs"]]
+    columns = (
+        ("<scene", lambda r: r.case.title),
+        ("nodes", lambda r: f"{r.nodes:,}"),
+        ("dt [s]", lambda r: f"{r.case.dt:g}"),
+        ("time [s]", lambda r: f"{r.time:.3g} of {r.case.seconds:g}"),
+        ("Newton a step", lambda r: f"{mean(r.newton):.3g}"),
+        ("CG a step", lambda r: f"{mean(r.cg):,.0f}"),
+        ("s/step", lambda r: f"{mean(r.seconds):.3g}"),
+        ("published", lambda r: f"{r.case.published_seconds:g}"),
+        ("steps that crossed", lambda r: r.crossed),
+        ("not converged", lambda r: r.unconverged),
+        ("most inverted tets", lambda r: r.inverted),
+    )
+    budget = max(record.job.budget for record in records)
+    return table(records, columns) + measured_on(numbers, "f64", f"at most {budget:g} s a scene")
+
+
 TABLES: dict[str, Callable[[Path], str]] = {  # by marker
     "order_errors": order_errors,
     "order_times": order_times,
@@ -155,6 +177,7 @@ TABLES: dict[str, Callable[[Path], str]] = {  # by marker
     "scaling": scaling,
     "collision": collision,
     "hard": hard,
+    "ipc": ipc,
 }
 
 
