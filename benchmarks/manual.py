@@ -162,9 +162,9 @@ def ipc(results: Path) -> str:
         ("CG a step", lambda r: f"{mean(r.cg):,.0f}"),
         ("s/step", lambda r: f"{mean(r.seconds):.3g}"),
         ("published", lambda r: f"{r.case.published_seconds:g}"),
-        ("steps that crossed", lambda r: r.crossed),
-        ("not converged", lambda r: r.unconverged),
-        ("most inverted tets", lambda r: r.inverted),
+        ("steps that crossed", lambda r: f"{r.crossed}"),
+        ("not converged", lambda r: f"{r.unconverged}"),
+        ("most inverted tets", lambda r: f"{r.inverted}"),
     )
     budget = max(record.job.budget for record in records)
     return table(records, columns) + measured_on(numbers, "f64", f"at most {budget:g} s a scene")
