@@ -11,6 +11,7 @@ import json
 
 import numpy as np
 import pytest
+from scenes import dynamics, rows_of
 
 import taisoft as ts
 from benchmarks import path_runs, paths
@@ -66,7 +67,8 @@ def test_captured_substeps_follow_each_other():
     row = Ways("two_cubes_two_boxes", 10)
     with path_runs.without_warnings(), ts.Simulator(scene, **settings) as sim:
         taken = capture(sim, row, row.steps)
-        nodes = sim._dynamics.contact.detection.topology.node
+        nodes = [np.unique(body.nodes.surface) for body in sim.scene.bodies]
+        nodes = np.concatenate([n + rows_of(sim, body.name).start for n, body in zip(nodes, sim.scene.bodies)])
         assert sim.positions()[nodes] == pytest.approx(taken[-1][0] + taken[-1][1], abs=1e-12)
     assert len(taken) >= 10 and row.passages > 0 and row.held_back == 0 and row.passing < len(taken) < row.checks
     for (x, path), (following, _) in zip(taken, taken[1:]):
@@ -83,8 +85,8 @@ def test_least_distances_are_those_of_the_geometry():
         scene.add_body(ts.box_mesh((1, 1, 1), (0.1, 0.1, 0.1)), foam, name=name, position=(0.0, y, 0.0))
     scene.add_obstacle(ts.HalfSpace((0, 0, 0), (0, 1, 0)), name="ground")
     scene.add_obstacle(ts.Sphere(tuple(BALL[0]), 0.1), name="ball")
-    with ts.Simulator(scene, dt=0.01) as sim:
-        detection = sim._dynamics.contact.detection
+    with dynamics(scene, dt=0.01) as made:
+        detection = made.contact.detection
         detection.find(0.0, 0.01)
         bounds, x = Bounds(detection, self_collision=False), detection.surface.x.to_numpy()
         t = detection.topology

@@ -224,7 +224,7 @@ def test_what_leaves_no_room_is_refused(hammer, integrator, dt):
     shape = ts.Sphere((0, 0.5, 0), 0.2) if hammer == "sphere" else ts.MeshObstacle(box.vertices, box.surface)
     scene.add_obstacle(shape, name="hammer", path=lambda t: ((0, -2.0 * t, 0), np.eye(3)))
     with ts.Simulator(scene, dt=dt, integrator=integrator) as sim:
-        with pytest.raises(ts.SimulationError, match="'cube' and 'hammer' would pass through each other, although") as error:
+        with pytest.raises(ts.SimulationError, match="'cube' and 'hammer' from passing through each other") as error:
             while sim.time < 0.3:
                 before = sim.positions(), sim.velocities(), sim.time, sim.step_count
                 judged(sim, 1)
@@ -242,7 +242,24 @@ def test_prescribed_nodes_that_leave_no_room_are_refused(integrator, dt):
         cube.move(np.arange(8), lambda t, speed=2.0 * k: (0, -speed * t, 0))
     with ts.Simulator(scene, dt=dt, integrator=integrator) as sim:
         start = sim.positions("prescribed")
-        with pytest.raises(ts.SimulationError, match="'fixed' and 'prescribed' would pass through each other"):
+        with pytest.raises(ts.SimulationError, match="'fixed' and 'prescribed' from passing through each other"):
             while sim.time < 0.3:
                 judged(sim, 1)
                 assert np.abs(sim.positions("prescribed") - start + (0, 2.0 * sim.time, 0)).max() < 1e-6
+
+
+@pytest.mark.parametrize("precision", ["f32", "f64"])
+def test_a_clamped_body_that_touches_an_obstacle_converges(precision):
+    """Its lowest nodes are fixed at a gap of 0, so that no impulse can open it."""
+    scene = ts.Scene()
+    block = scene.add_body(
+        ts.box_mesh((2, 2, 2), (0.2, 0.2, 0.2)),
+        ts.Material(young=1e5, poisson=0.3, density=1000.0),
+        name="block",
+        position=(0.0, 0.1, 0.0),
+    )
+    block.fix(lambda X: X[:, 1] < 1e-9)
+    scene.add_obstacle(ts.Box((0.0, -0.5, 0.0), (1.0, 0.5, 1.0)), name="floor")
+    with ts.Simulator(scene, dt=0.01, precision=precision) as sim:
+        reports = [sim.step() for _ in range(5)]
+    assert all(report.converged for report in reports) and max(report.newton_iterations for report in reports) <= 10

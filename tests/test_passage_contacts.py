@@ -17,7 +17,7 @@ from scenes import dynamics, rows_of, set_state
 
 import taisoft as ts
 from taisoft.backend.arrays import FieldArena
-from taisoft.collision.passages import ADJACENT, FEATURES, FLAT, KINDS, NEAR, ROUND, SEARCHED
+from taisoft.collision.passages import ADJACENT, FLAT, N_FEATURES, N_KINDS, NEAR, ROUND, SEARCHED
 from taisoft.collision.path_check import adjacent_rows
 
 ipctk = pytest.importorskip("ipctk")
@@ -117,7 +117,7 @@ def test_held_passages_are_contacts(precision):
             c = d.contacts()
             own = np.flatnonzero(c.kind == "face_face")
             first, second = c.feature[own].T
-            keys = list(zip(first % KINDS, first // KINDS, second // FEATURES, second % FEATURES))
+            keys = list(zip(first % N_KINDS, first // N_KINDS, second // N_FEATURES, second % N_FEATURES))
             assert len(keys) == len(time) and set(keys) == set(time)
             for k, (kind, a, b, f) in zip(own, keys):
                 s, nodes, w, n = time[kind, a, b, f], c.nodes[k], c.weights[k], c.normal[k]

@@ -23,7 +23,7 @@ DT = 0.1  # [s]
 class FakeStepper:
     """Stepper, simulation state and contacts at once: x is the time reached. Tests set what its measurements return."""
 
-    idle, is_linear, dissipative, had_impact, n_contacts, none_cross = False, False, True, False, 0, False
+    idle, is_linear, dissipative, had_impact, n_contacts, none_cross, is_stuck = False, False, True, False, 0, False, False
 
     def __init__(self):
         self.contact = self.paths = self.simulation = self.dirichlet = self.history = self

@@ -29,7 +29,7 @@ from taisoft.collision.surface import ACTIVE, dvec, ivec, list_near, part_first
 
 # kinds of passages, by two ids: two triangles; a row of `adjacent`; a triangle and a sphere or capsule; a vertex and a half-space
 NEAR, ADJACENT, ROUND, FLAT = range(4)
-KINDS, FEATURES = 4, 16  # factors in ids of contacts
+N_KINDS, N_FEATURES = 4, 16  # factors in ids of contacts
 SEARCHED, TO_STATE, STILL = range(3)  # which paths are checked
 
 corners = ti.types.matrix(6, 3, ti.f64)
@@ -302,7 +302,7 @@ def append_passages(
                 if kind != ROUND:
                     body_b = _body_of(s, wall[0])
             if n.dot(n) > 0.0:
-                feature = ivec(FACE_FACE, KINDS * a + kind, FEATURES * b + features)
+                feature = ivec(FACE_FACE, N_KINDS * a + kind, N_FEATURES * b + features)
                 body_a = _body_of(s, corner[0])
                 write_contact(out.data, at, last, body_a, body_b, feature, point, n, gap, corner, 1.0 * u, wall, 1.0 * v)
                 at += 1

@@ -10,7 +10,7 @@ from taisoft.collision.colliders import Topology
 from taisoft.collision.passages import (
     ADJACENT,
     FLAT,
-    KINDS,
+    N_KINDS,
     NEAR,
     ROUND,
     PathFields,
@@ -94,7 +94,7 @@ class PathCheck:
         t, one, other = self._topology, passages[:, 1].copy(), passages[:, 2]
         body_of = np.append(t.body[t.ring[t.ring_start[:-1]]], -1) if len(t.ring) else np.zeros(1, dtype=np.int64)
         result = np.zeros((len(passages), 2), dtype=np.int64)
-        for kind in range(KINDS):
+        for kind in range(N_KINDS):
             k = passages[:, 0] == kind
             if kind == ADJACENT:
                 result[k] = body_of[self._rows[one[k], 0]][:, None]

@@ -20,6 +20,8 @@ from taisoft.collision.intersections import closest_segments, row_of
 from taisoft.collision.surface import dvec
 
 MAX_ADVANCES = 64
+LEAST, ROUNDING = 1e-3, 1e-12  # of the floor, and of the largest coordinate: distance below which triangles touch
+BELOW_LEAST = 0.999  # of it: what was certified to keep that distance does not touch
 PROGRESS = 2e-3  # of the remaining motion: an advance below it ends the search
 
 
@@ -142,11 +144,15 @@ def free_until(x, p, radius, floor, are_apart):
     meet first, see `nearest_of`.
 
     x, p: (6,3) corners [m], three of each, and their displacements [m]; radius [m]: by which the second one is thicker; floor
-    [m]: distance that they keep, or half of their first distance if that is less; are_apart: whether they are known not to cross
-    at first. 0 if they touch at first. Triangles that no plane separates for long, as they turn, are taken apart into their
-    features, corner and triangle or two edges: if these stay apart, triangles that do not cross at first do not later.
+    [m]: distance that they keep, or half of their first distance if that is less, but never below LEAST of the floor or
+    ROUNDING of the coordinates. are_apart: whether they are known not to cross at first. 0 if they are nearer than that at
+    first: they touch. Triangles that no plane separates for long, as they turn, are taken apart into their features, corner
+    and triangle or two edges: if these stay apart, triangles that do not cross at first do not later.
     """
     result, features, k = ti.cast(1.0, ti.f64), 0, -1
+    least = ti.cast(LEAST, ti.f64) * floor
+    for q in range(6):
+        least = ti.max(least, ti.cast(ROUNDING, ti.f64) * ti.abs(row_of(x, q)).max())
     while k < 15:
         own_x, own_p = _of_features(x, k), _of_features(p, k)
         time, need, part, n = ti.cast(0.0, ti.f64), floor, ti.cast(-1.0, ti.f64), 0
@@ -161,10 +167,10 @@ def free_until(x, p, radius, floor, are_apart):
             else:
                 _, offset = closest_features(y)
                 length = offset.norm()
-                if length <= radius:  # on which side of each other they are cannot be told
+                if length - radius < ti.cast(BELOW_LEAST, ti.f64) * least:  # they touch, and on which side cannot be told
                     part = time
                 elif n == 0 and 0.5 * (length - radius) < need:
-                    need = 0.5 * (length - radius)  # the planes are then tried once more
+                    need = ti.min(floor, ti.max(0.5 * (length - radius), least))  # the planes are then tried once more
                 else:
                     later = time
                     if length - radius > need:

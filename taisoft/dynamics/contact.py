@@ -33,7 +33,7 @@ from taisoft.dynamics.impact import Rebounds
 from taisoft.dynamics.simulation_state import SimulationState
 from taisoft.errors import SimulationError
 
-CONTACT_OFFSET = 2e-3  # of the finest body's mean surface edge: gap to keep, so that surfaces moving in curves do not cross
+CONTACT_OFFSET = 2e-3  # of the finest body's mean surface edge: gap to keep, so that motion in curves seldom needs a repetition
 PENETRATION_CORRECTION = {True: 0.05, False: 0.2}  # fraction of a penetration that an explicit (True) or implicit step corrects
 OFFSET_CORRECTION = {True: 0.005, False: 0.02}  # fraction of a missing contact offset, likewise
 MAX_OPENING_SPEED = 0.01  # of the slowest bar wave speed, sqrt(E / rho): maximum opening speed of both; a strain as large
@@ -236,7 +236,7 @@ class ContactStep:
     def start_step(self, dt: float) -> None:
         """Begin a step of dt."""
         self._substep_fraction, self._step_dt, self.dropped, self._impulse_sum = 1.0, dt, 0, None
-        self.paths.held_back = ""
+        self.paths.start_step()
 
     def start_substep(self, dt: float) -> None:
         """Begin a substep of dt, or begin it again with another length."""
@@ -328,10 +328,11 @@ class ContactStep:
         if self.crossing is None:
             self.measure_crossings()
             self.paths.exempt_crossing()
+            self._searched = None  # where none cross, other contacts are found
         return self.crossing
 
     def describe_fast_closing(self, dt: float, substeps: int = 1) -> str:
-        """Return `ContactMeasures.describe_fast_closing` for a step of dt [s]."""
+        """See `ContactMeasures.describe_fast_closing`; dt [s]."""
         return self.measures.describe_fast_closing(dt, self._searched_dt, substeps)
 
     def contacts(self) -> Contacts:

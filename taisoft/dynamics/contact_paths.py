@@ -12,13 +12,14 @@ import taichi as ti
 from taisoft.backend.arrays import FieldArena, download
 from taisoft.collision.contacts import FACE_FACE
 from taisoft.collision.detector import Detection
-from taisoft.collision.passages import FEATURES, KINDS, SEARCHED, TO_STATE
+from taisoft.collision.passages import N_FEATURES, N_KINDS, SEARCHED, TO_STATE
 from taisoft.contact.problem import ContactProblem
 from taisoft.dynamics.contact_measures import find_displacement
 from taisoft.dynamics.simulation_state import SimulationState
 from taisoft.errors import SimulationError
 
 NO_PASSAGES = np.zeros((0, 4), dtype=np.int32), np.zeros(0)
+MAX_UNCHANGED = 3  # such checks in a row after which repeating a substep does not help
 SHORTENED = 0.9  # of the part of a path that is certainly free
 MAX_SHORTENINGS, LEAST = 30, 1e-6  # rounds, and part of a path: beyond these, bodies do not move at all
 
@@ -29,7 +30,9 @@ class ContactPaths:
     def __init__(self, simulation: SimulationState, detection: Detection):
         self._simulation, self._detection = simulation, detection
         self.uncovered = False  # whether the paths of the last check left what was searched
-        self.held_back = ""  # a sentence about the last step, if bodies were held back
+        self.held_back = ""  # a sentence about the last step, if bodies were held back,
+        self._names: set[str] = set()  # and their names
+        self._n_unchanged = 0  # checks in a row that found no pairs but those held already
         self._held = self._held_before = NO_PASSAGES
         detection.prepare_paths()
         self._arena = FieldArena()
@@ -39,7 +42,18 @@ class ContactPaths:
         """Discard all passages and lists after a state was set. none_crossed: whether no surfaces are known to cross there."""
         self._detection.forget_paths()
         self._detection.held = self._held = self._held_before = NO_PASSAGES
-        self._detection.none_cross, self.held_back = none_crossed, ""
+        self._detection.none_cross = none_crossed
+        self.start_step()
+
+    @property
+    def is_stuck(self) -> bool:
+        """Whether repeating the substep does not help any more: the same pairs pass, although they are contacts."""
+        return self._n_unchanged >= MAX_UNCHANGED
+
+    def start_step(self) -> None:
+        """Begin a step, in which no bodies have been held back yet."""
+        self.held_back = ""
+        self._names.clear()
 
     @property
     def none_cross(self) -> bool:
@@ -58,6 +72,7 @@ class ContactPaths:
     def begin(self) -> None:
         """Begin a substep."""
         self._held = self._held_before = self._detection.held
+        self._n_unchanged = 0
 
     def undo(self) -> None:
         """Return to the passages held at the start of the substep."""
@@ -88,6 +103,7 @@ class ContactPaths:
         group, n_held = group.reshape(-1), len(self._held[0])
         earliest = np.full(len(first), np.inf)
         np.minimum.at(earliest, group[n_held:], times)
+        self._n_unchanged = self._n_unchanged + 1 if len(first) == n_held else 0
         self._held = every[first], np.where(np.isfinite(earliest), earliest, time[first])
 
     def use_all(self) -> None:
@@ -101,7 +117,7 @@ class ContactPaths:
         feature, impulse = download([problem.feature, problem.r], problem.count[0])
         active = feature[(feature[:, 0] == FACE_FACE) & (impulse[:, 0] > 0.0)]
         one, other = active[:, 1], active[:, 2]
-        keys = set(zip(*(x.tolist() for x in (one % KINDS, one // KINDS, other // FEATURES, other % FEATURES))))
+        keys = set(zip(*(x.tolist() for x in (one % N_KINDS, one // N_KINDS, other // N_FEATURES, other % N_FEATURES))))
         pairs = self._held[0]
         kept = np.array([tuple(pair) in keys for pair in pairs.tolist()], dtype=bool)
         self._detection.held = pairs[kept], np.zeros(int(kept.sum()))
@@ -112,7 +128,7 @@ class ContactPaths:
 
     def hold_back(self, x_start) -> None:
         """Shorten the paths of bodies from x_start to the present state until nothing passes through anything. The last search
-        must have started there. Raise SimulationError if something that moves as prescribed passes through a body at rest."""
+        must have started there. Raise SimulationError if nothing passes only where no body can be held back."""
         simulation, d = self._simulation, self._detection
         path = x_start.to_numpy(), *simulation.state()
         can_move = np.zeros(len(d.scene.colliders), dtype=bool)
@@ -130,15 +146,16 @@ class ContactPaths:
             part = np.where(shortened < 1.0, part * shortened if n_rounds < MAX_SHORTENINGS else 0.0, part)
             part[part < LEAST] = 0.0
             self._move_in_part(part, *path)
-        listed = ", ".join(f"'{d.scene.colliders[k].name}'" for k in np.flatnonzero(can_move & (part < 1.0)))
+        self._names.update(d.scene.colliders[k].name for k in np.flatnonzero(can_move & (part < 1.0)))
+        listed = ", ".join(f"'{name}'" for name in sorted(self._names))
         self.held_back = f"held back {listed}, which would have passed through another surface or through itself"
 
     def _refuse(self, a: int, b: int) -> None:
         """Raise SimulationError about two colliders that pass through each other wherever bodies stay."""
         one, other = (self._detection.scene.colliders[k].name for k in (a, b))
         raise SimulationError(
-            f"step {self._simulation.step_count + 1}: '{one}' and '{other}' would pass through each other, although the bodies "
-            "stay where they are: what moves as prescribed leaves no room"
+            f"step {self._simulation.step_count + 1}: no motion was found that keeps '{one}' and '{other}' from passing through "
+            "each other, as one of them moves as prescribed: leave more room, or take a smaller dt"
         )
 
     def _move_in_part(self, part: np.ndarray, start: np.ndarray, end: np.ndarray, velocity: np.ndarray) -> None:

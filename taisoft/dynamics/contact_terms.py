@@ -175,7 +175,8 @@ def update_contact(m: ti.template(), k: ti.template(), c, beta, r_scale):
             w.block[c][4 * j + i] = ti.cast(Dn * n[i] * n[j] + D_along * e[i] * e[j] + D_across * g[i] * g[j], m.real)
     w.active[c] = int(Dn > 0.0 or D_along > 0.0 or D_across > 0.0)
     d = r - prox(r - scaled(p.factor[c], u), p.friction[c])
-    w.prox_residual[c] = dvec(d.dot(d), r.dot(r), -u[0] * beta * w.gap_weight[c])
+    missed = ti.select(p.factor[c][0] > 0.0, -u[0] * beta * w.gap_weight[c], 0.0)  # only a node that can move can open a gap
+    w.prox_residual[c] = dvec(d.dot(d), r.dot(r), missed)
 
 
 @ti.func

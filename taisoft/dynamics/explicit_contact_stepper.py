@@ -144,7 +144,7 @@ class ContactExplicitStepper(ExplicitStepper):
                     simulation.set_state(*end)
                     break
                 contact.search_along_path(time, dt)
-            if tries == MAX_PASSAGES:
+            if tries == MAX_PASSAGES or contact.paths.is_stuck:
                 simulation.set_state(*end)
                 contact.paths.hold_back(good.x)
                 self.acceleration_stale = True

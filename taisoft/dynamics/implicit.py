@@ -166,7 +166,8 @@ class ImplicitStepper:
             contact_residual=result.contact_residual,
             converged=result.converged and not name,
         )
-        if not step.converged:
+        is_solved = result.residual <= self.tolerance and result.contact_residual <= self.contact_tolerance
+        if not (step.converged or (self.contact.paths.held_back and is_solved)):
             step.problems.append(
                 f"Newton stopped after {step.newton_iterations} iterations at a relative residual of {step.residual:.2e}"
                 + (f" and a contact residual of {step.contact_residual:.2e}" if self.contact.n_contacts else "")

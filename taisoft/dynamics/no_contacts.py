@@ -6,7 +6,7 @@ import numpy as np
 class NoPaths:
     """`ContactPaths` where nothing can pass through anything."""
 
-    held_back, none_cross = "", True
+    held_back, none_cross, is_stuck = "", True, False
 
     def left_searched(self, x_start) -> bool:
         """Return whether the surface left the searched path."""

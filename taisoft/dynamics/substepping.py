@@ -81,7 +81,8 @@ class Substepping:
                 self.may_retry = may_retry  # only a retry failed
             if result is not None:
                 discarded.append(result)
-            if not (unconverged and self.may_retry and (taken < RETRIES or substeps > 1)):
+            may_help = self.may_retry and not self._contact.paths.held_back
+            if not (unconverged and may_help and (taken < RETRIES or substeps > 1)):
                 break
             self.may_retry = taken < RETRIES
             substeps = min(2 * taken, RETRIES) if self.may_retry else 1
@@ -186,7 +187,7 @@ class Substepping:
                 passes = contact.paths.find(as_searched=True)
                 # contacts unknown so far matter only if something could have crossed
                 new = contact.search_along_path(time, dt) if passes else new and not contact.paths.none_cross
-            if not (new or passes) or tries >= (MAX_PASSAGES if passes else MAX_SEARCHES):
+            if not (new or passes) or tries >= (MAX_PASSAGES if passes else MAX_SEARCHES) or (passes and contact.paths.is_stuck):
                 simulation.set_state(*state)
                 if passes:
                     return result, Fault.CROSSED
