@@ -15,7 +15,7 @@ from scenes import dynamics, set_state
 import taisoft as ts
 from taisoft.backend.arrays import FieldArena
 from taisoft.backend.runtime import kernel, open_runtime
-from taisoft.contact.build import SELF_CONTACT, _warm_impulse, gap_minus_target, keep_impulses
+from taisoft.contact.build import LEAST_GAP, SELF_CONTACT, _warm_impulse, gap_minus_target, keep_impulses
 from taisoft.contact.problem import build_node_problem, fill_field
 from taisoft.contact.restitution import explicit_opening
 
@@ -187,7 +187,7 @@ def find_gaps_minus_targets(
     """force: velocity change by the forces of an explicit step [m/s]; before_impact: the fraction applied before the impact."""
     for c in range(f.count[0]):
         opening = explicit_opening(f, c, dt, contact_offset, f.approach[c] + force, before_impact)
-        out[c] = gap_minus_target(f, c, dt, contact_offset, fast, slow, fastest, opening)
+        out[c] = gap_minus_target(f, c, dt, contact_offset, fast, slow, fastest, opening, ti.cast(LEAST_GAP, ti.f64))
 
 
 @kernel

@@ -2,10 +2,10 @@
 
 The target is the smallest gap that a contact may have at the end of a step. It is at most the contact offset, a distance that
 keeps surfaces apart despite the error of linearising the motion. A gap above the offset may close to it. A gap below it opens
-slowly, but at once to LEAST_GAP of it, and a true penetration within a few steps, never faster than strains the softest body by
-one percent: bodies would fly apart otherwise. Contacts of a body with itself have SELF_CONTACT times the contact offset and are
-corrected SELF_CONTACT times as fast. Where the surfaces meet within the step, restitution raises the target (`restitution`). The
-impulse must satisfy
+slowly, but in implicit steps at once to LEAST_GAP of it; a true penetration opens within a few steps. Neither is faster than
+strains the softest body by one percent: bodies would fly apart otherwise. Contacts of a body with itself have SELF_CONTACT times
+the contact offset and are corrected SELF_CONTACT times as fast. Where the surfaces meet within the step, restitution raises the
+target (`restitution`). The impulse must satisfy
     u_n = (gap - target)/dt + n.(v_a - v_b) >= 0,
 which counts motion once, since the gap is the one at the start of the step.
 """
@@ -23,7 +23,9 @@ from taisoft.contact.prox import dvec, prox, tangent
 from taisoft.scene.scene import Scene
 
 NEGLIGIBLE = 1e-12  # a node with a smaller weight is left out of the contact
-LEAST_GAP = 0.1  # of the contact offset: a smaller gap opens to it at once, before surfaces that turn can cross
+# Of the contact offset: in an implicit step a smaller gap opens to it at once, before surfaces that turn can cross. In the far
+# shorter explicit steps that would be a hop.
+LEAST_GAP = 0.1
 SELF_CONTACT = 5.0  # factor of contact offset and correction rate in contacts of a body with itself: folds turn as they meet
 
 
@@ -221,11 +223,14 @@ def contact_offset_of(p: ti.template(), c, common):
 
 
 @ti.func
-def gap_minus_target(p: ti.template(), c, dt, common_offset, penetration_fraction, offset_fraction, max_speed, min_opening):
+def gap_minus_target(
+    p: ti.template(), c, dt, common_offset, penetration_fraction, offset_fraction, max_speed, min_opening, least_gap
+):
     """gap - target of contact c [m].
 
     common_offset: contact offset between different bodies [m]. penetration_fraction, offset_fraction: fractions of a penetration
     and of a missing contact offset that the step corrects, at most at max_speed [m/s]. min_opening: for restitution, or 0 [m].
+    least_gap: part of the contact offset to which a smaller gap opens at once.
     """
     gap, own, contact_offset = p.gap[c], _self_contact_factor(p, c), contact_offset_of(p, c, common_offset)
     target = contact_offset
@@ -233,7 +238,7 @@ def gap_minus_target(p: ti.template(), c, dt, common_offset, penetration_fractio
         above = ti.max(gap, 0.0)
         opening = own * (offset_fraction * (contact_offset - above) + penetration_fraction * (above - gap))
         if gap >= 0.0:
-            opening = ti.max(opening, ti.cast(LEAST_GAP, ti.f64) * contact_offset - gap)
+            opening = ti.max(opening, least_gap * contact_offset - gap)
         target = gap + ti.min(opening, max_speed * dt)
     if min_opening > 0.0:
         target = ti.max(target, gap + min_opening)

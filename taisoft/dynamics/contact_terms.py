@@ -14,7 +14,7 @@ import taichi as ti
 
 from taisoft.backend.arrays import FieldArena
 from taisoft.backend.runtime import kernel
-from taisoft.contact.build import contact_offset_of, gap_minus_target
+from taisoft.contact.build import LEAST_GAP, contact_offset_of, gap_minus_target
 from taisoft.contact.problem import NODES, RESIDUAL, ContactProblem, residual_of
 from taisoft.contact.prox import dvec, into_disk, prox, scaled
 from taisoft.fem.model import Model
@@ -97,7 +97,8 @@ def begin_contacts(
             w.gap_weight[c] = 0.0
         else:
             offset_target, fast, slow, fastest = gap_targets[0], gap_targets[1], gap_targets[2], gap_targets[3]
-            gap_to_target = gap_minus_target(p, c, dt, offset_target, fast, slow, fastest, p.min_opening[c])
+            least = ti.cast(LEAST_GAP, ti.f64)
+            gap_to_target = gap_minus_target(p, c, dt, offset_target, fast, slow, fastest, p.min_opening[c], least)
             w.gap_minus_target[c] = gap_to_target - p.normal[c].dot(p.obstacle_displacement[c])
             wanted = contact_offset_of(p, c, offset_target)
             target = p.gap[c] - gap_to_target

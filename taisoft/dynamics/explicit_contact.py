@@ -83,11 +83,8 @@ def set_free_velocities(
     for c in range(p.count[0]):
         b = to_frame(p, c, relative_velocity(p, m, c, dt))
         rise = explicit_opening(p, c, dt, contact_offset, b[0], kick_before_impact)
-        p.b[c] = dvec(
-            b[0] + gap_minus_target(p, c, dt, contact_offset, penetration_correction, offset_correction, max_speed, rise) / dt,
-            b[1],
-            b[2],
-        )
+        gap = gap_minus_target(p, c, dt, contact_offset, penetration_correction, offset_correction, max_speed, rise, 0.0)
+        p.b[c] = dvec(b[0] + gap / dt, b[1], b[2])
 
 
 @ti.func
