@@ -204,8 +204,8 @@ def test_bodies_without_impulses_are_held_back(monkeypatch, integrator, dt, step
             without.setattr(ContactStep, "search", lambda contact, *at: 0 * search(contact, *at))
             reports = judged(sim, steps)
         assert len(reports) == sim.step_count == steps and np.isfinite(sim.velocities()).all()
-        told = [" ".join(r.problems) for r in reports]
-        held = ["held back 'box 0', 'box 1', which would have passed through another surface" in text for text in told]
+        texts = [" ".join(r.problems) for r in reports]
+        held = ["held back 'box 0', 'box 1', which would have passed through another surface" in text for text in texts]
         assert any(held) and not any(r.converged for r, is_held in zip(reports, held) if is_held)
         assert all(r.n_contacts == 0 for r in reports)
         after = judged(sim, steps)

@@ -173,7 +173,7 @@ def _turn(angle: float, rng: np.random.Generator) -> np.ndarray:
 
 
 def test_touching_triangles_are_not_free():
-    """On which side they are cannot be told."""
+    """The side on which they are is unknown."""
     a = np.array([[0.0, 0, 0], [1, 0, 0], [0, 0, 1]])
     x = np.concatenate([a + [0.1, 0.0, 0.1], a])[None]
     up = np.zeros((1, 6, 3))

@@ -6,7 +6,7 @@
 * a substep that met unknown contacts is repeated with them;
 * a substep that ends in deep penetration, leaves the searched path, or whose contacts do not settle, is undone and halved, at
   most MAX_UNDONE times a step;
-* a substep in which something passes through something is repeated, then halved, then held back and told;
+* a substep in which something passes through something is repeated, then halved, then held back and reported;
 * bodies that close too fast for the shortest substep raise an error; after an error the state is that before the step.
 """
 
@@ -243,7 +243,7 @@ def test_passages_end_with_the_repetition_that_has_none(stepper):
     assert stepper.taken == [(0.0, DT)] * 5 and stepper.kept == [(0.0, DT)] and result.converged and not stepper.broken
 
 
-def test_what_passes_in_spite_of_all_is_held_back_and_told(stepper):
+def test_what_passes_in_spite_of_all_is_held_back_and_reported(stepper):
     stepper.passes = lambda time, dt: True
     result = Substepping(stepper).step(0.0, DT)
     assert covers_step(stepper) and stepper.held_back == stepper.kept and stepper.broken and not result.converged

@@ -128,7 +128,8 @@ def place_analytic(fields: AnalyticObstacles, obstacles: list[tuple[int, Obstacl
 
 
 @ti.func
-def _rows(f: ti.template(), k):
+def rotation_rows(f: ti.template(), k):
+    """Rotation (3,3) of obstacle k, from a field of rows."""
     return ti.Matrix.rows([f[3 * k], f[3 * k + 1], f[3 * k + 2]])
 
 
@@ -144,7 +145,7 @@ def _local(s: ti.template(), o: ti.template(), t, j, k, R, R1):
 def _obstacle_contacts(s: ti.template(), o: ti.template(), t, k, margin, out: ti.template(), start, end):
     """Write contacts of triangle t with obstacle k. Return the new count."""
     at = start
-    R, R1 = _rows(o.rotation, k), _rows(o.next_rotation, k)
+    R, R1 = rotation_rows(o.rotation, k), rotation_rows(o.next_rotation, k)
     # corners and their displacements in the obstacle's frame
     A, a = _local(s, o, t, 0, k, R, R1)
     B, b = _local(s, o, t, 1, k, R, R1)

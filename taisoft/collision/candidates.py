@@ -13,6 +13,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import taichi as ti
 
 from taisoft.backend.arrays import Count, FieldArena
@@ -75,6 +76,10 @@ class Buffer:
     def bytes(self) -> int:
         """Memory of the entries [bytes]."""
         return sum(self._arena.bytes.values())
+
+    def filled(self, used: np.ndarray) -> np.ndarray:
+        """Which entries the last search has filled, (capacity,) bool. used: downloaded, (chunks,)."""
+        return np.arange(self.capacity) % self.part < np.repeat(used, self.part)
 
     def grow_if_full(self) -> bool:
         """Grow if the last search did not fit. Return True if it has grown, so that the search must be repeated.

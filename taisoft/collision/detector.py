@@ -22,7 +22,7 @@ from taisoft.collision.features import BY_EDGES, BY_FACES, BY_FIELD
 from taisoft.collision.intersections import Intersections, find_crossings
 from taisoft.collision.overlap import Containment, Inside
 from taisoft.collision.passages import STILL, append_passages
-from taisoft.collision.path_check import PathCheck
+from taisoft.collision.path_check import NO_PASSAGES, PathCheck
 from taisoft.collision.spatial_hash import SpatialHash
 from taisoft.collision.surface import ACTIVE, NONFINITE, PAIRS, build_surface, move_obstacles, update_surface
 from taisoft.errors import SceneError, SimulationError
@@ -110,7 +110,7 @@ class Detection:
         self._self_on, self.floor = properties["self_on"], FLOOR * float(self.edges[: len(bodies)].min())
         self._paths: PathCheck | None = None
         self.none_cross = False  # whether no surfaces are known to cross at the positions that are searched
-        self.held = np.zeros((0, 4), dtype=np.int32), np.zeros(0)  # passages that every search adds as contacts, and their times
+        self.held = NO_PASSAGES  # passages that every search adds as contacts, and their times
         self._containment = Containment(scene, self.topology, layout, self._rest, self._analytic, self_collision)
         self._placed = False  # whether obstacles have been placed
         self._broad_result: Trees | Candidates | None = None  # broad-phase result of the last search

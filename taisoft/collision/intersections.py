@@ -264,7 +264,7 @@ class Intersections:
             if not self.pairs.grow_if_full():
                 break
         data, used = download([self.pairs.data, self.pairs.used])
-        return data[np.arange(len(data)) % self.pairs.part < np.repeat(used, self.pairs.part)]
+        return data[self.pairs.filled(used)]
 
     def release(self) -> None:
         """Free the memory of the buffer."""

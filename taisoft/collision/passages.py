@@ -20,7 +20,7 @@ import taichi as ti
 
 from taisoft.backend.arrays import Count, FieldArena
 from taisoft.backend.runtime import kernel
-from taisoft.collision.analytic import CAPSULE, HALF_SPACE, SPHERE
+from taisoft.collision.analytic import CAPSULE, HALF_SPACE, SPHERE, rotation_rows
 from taisoft.collision.candidates import WHOLE, sum_parts
 from taisoft.collision.contacts import FACE_FACE, write_contact
 from taisoft.collision.features import unit
@@ -51,9 +51,9 @@ class PathFields:
 @ti.func
 def _pose(o: ti.template(), k, at_end):
     """Origin and rotation of analytic obstacle k now, or at the end of the step."""
-    x, R = o.origin[k], ti.Matrix.rows([o.rotation[3 * k], o.rotation[3 * k + 1], o.rotation[3 * k + 2]])
+    x, R = o.origin[k], rotation_rows(o.rotation, k)
     if at_end == 1:
-        x, R = o.next_origin[k], ti.Matrix.rows([o.next_rotation[3 * k], o.next_rotation[3 * k + 1], o.next_rotation[3 * k + 2]])
+        x, R = o.next_origin[k], rotation_rows(o.next_rotation, k)
     return x, R
 
 

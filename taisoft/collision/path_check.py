@@ -21,6 +21,7 @@ from taisoft.collision.passages import (
 )
 from taisoft.collision.surface import Surface, integers
 
+NO_PASSAGES = np.zeros((0, 4), dtype=np.int32), np.zeros(0)  # as `PathCheck.find` returns them
 IN_BOXES = 0.49  # of the reach: how far a vertex may leave its searched path and still be in the boxes, grown by half of it
 
 
@@ -164,10 +165,10 @@ class PathCheck:
         """Return the passages found."""
         out = self.passages
         if out.count[TOTAL] == 0:
-            return np.zeros((0, 4), dtype=np.int32), np.zeros(0)
+            return NO_PASSAGES
         pair, time, used = download([out.data.pair, out.data.time, out.used])
-        valid = np.arange(len(time)) % out.part < np.repeat(used, out.part)
-        pair, time = pair[valid], time[valid]
+        filled = out.filled(used)
+        pair, time = pair[filled], time[filled]
         order = np.lexsort(pair.T[::-1])
         return pair[order], time[order]
 

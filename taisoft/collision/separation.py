@@ -167,7 +167,7 @@ def free_until(x, p, radius, floor, are_apart):
             else:
                 _, offset = closest_features(y)
                 length = offset.norm()
-                if length - radius < ti.cast(BELOW_LEAST, ti.f64) * least:  # they touch, and on which side cannot be told
+                if length - radius < ti.cast(BELOW_LEAST, ti.f64) * least:  # they touch, on an unknown side
                     part = time
                 elif n == 0 and 0.5 * (length - radius) < need:
                     need = ti.min(floor, ti.max(0.5 * (length - radius), least))  # the planes are then tried once more

@@ -13,12 +13,12 @@ from taisoft.backend.arrays import FieldArena, download
 from taisoft.collision.contacts import FACE_FACE
 from taisoft.collision.detector import Detection
 from taisoft.collision.passages import N_FEATURES, N_KINDS, SEARCHED, TO_STATE
+from taisoft.collision.path_check import NO_PASSAGES
 from taisoft.contact.problem import ContactProblem
 from taisoft.dynamics.contact_measures import find_displacement
 from taisoft.dynamics.simulation_state import SimulationState
 from taisoft.errors import SimulationError
 
-NO_PASSAGES = np.zeros((0, 4), dtype=np.int32), np.zeros(0)
 MAX_UNCHANGED = 3  # such checks in a row after which repeating a substep does not help
 SHORTENED = 0.9  # of the part of a path that is certainly free
 MAX_SHORTENINGS, LEAST = 30, 1e-6  # rounds, and part of a path: beyond these, bodies do not move at all
@@ -130,10 +130,11 @@ class ContactPaths:
         """Shorten the paths of bodies from x_start to the present state until nothing passes through anything. The last search
         must have started there. Raise SimulationError if nothing passes only where no body can be held back."""
         simulation, d = self._simulation, self._detection
-        path = x_start.to_numpy(), *simulation.state()
+        free = simulation.model.free.to_numpy() > 0
+        path = free, x_start.to_numpy(), *simulation.state()
         can_move = np.zeros(len(d.scene.colliders), dtype=bool)
         for body in range(len(simulation.scene.bodies)):
-            can_move[body] = simulation.model.free.to_numpy()[simulation.layout.nodes(body)].any()
+            can_move[body] = free[simulation.layout.nodes(body)].any()
         part, n_rounds = can_move.astype(np.float64), 0
         while len((found := d.passages(TO_STATE))[0]):
             colliders, n_rounds = d.colliders_of(found[0]), n_rounds + 1
@@ -158,11 +159,10 @@ class ContactPaths:
             "each other, as one of them moves as prescribed: leave more room, or take a smaller dt"
         )
 
-    def _move_in_part(self, part: np.ndarray, start: np.ndarray, end: np.ndarray, velocity: np.ndarray) -> None:
-        """Set the state to a part of each body's path, given with its velocities, (n_nodes, 3); what is fixed or prescribed stays
-        at the end. part: (n_colliders,)."""
+    def _move_in_part(self, part: np.ndarray, free: np.ndarray, start: np.ndarray, end: np.ndarray, velocity: np.ndarray) -> None:
+        """Set the state to a part of each body's path, given with its velocities, (n_nodes, 3); what is not free stays at the
+        end. part: (n_colliders,)."""
         simulation, x, v = self._simulation, end.copy(), velocity.copy()
-        free = simulation.model.free.to_numpy() > 0
         for body in range(len(simulation.scene.bodies)):
             rows = simulation.layout.nodes(body)
             if part[body] < 1.0:

@@ -9,9 +9,8 @@ penetration or crossing, or, if it was short, when it did not converge. A short 
 takes short substeps only while it lasts.
 
 No substep is shorter than the step over MAX_SUBSTEPS. Where surfaces cross already, motion that closes too fast even for that is
-refused. A substep of minimum
-length, or after MAX_UNDONE others were undone, is kept and reported even if deep, unsettled or not converged; bodies that would
-still pass through something are held back.
+refused. A substep of minimum length, or after MAX_UNDONE others were undone, is kept and reported even if deep, unsettled or not
+converged; bodies that would still pass through something are held back.
 """
 
 from dataclasses import replace
