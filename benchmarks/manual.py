@@ -19,6 +19,8 @@ from taisoft.files import write_bytes
 from taisoft.output.tables import markdown
 
 from .document import RESULTS, table
+from .error import Row as ErrorRow
+from .error import row_table
 from .hard_cases import CASES
 from .hard_runs import Row, stored
 from .hard_table import ALL, cells, headline, how_solved, shown_columns, tally
@@ -170,6 +172,31 @@ def ipc(results: Path) -> str:
     return table(records, columns) + measured_on(numbers, "f64", f"at most {budget:g} s a scene")
 
 
+def ipc_friction(results: Path) -> str:
+    """How well friction holds in four scenes at three tolerances."""
+    numbers = newest(results, "ipc_friction")
+    records = [Record.read(run) for run in numbers["runs"]]
+    columns = (
+        ("<scene", lambda r: r.case.title),
+        ("tolerance", lambda r: f"{r.job.tolerance:.0e}"),
+        ("steps", lambda r: f"{r.steps} of {r.wanted_steps}"),
+        ("Newton a step", lambda r: f"{mean(r.newton):.3g}"),
+        ("CG a step", lambda r: f"{mean(r.cg):,.0f}"),
+        ("s/step", lambda r: f"{mean(r.seconds):.3g}"),
+        ("creep [edges/s]", lambda r: "-" if r.creep is None else f"{r.creep:.2g}"),
+        ("work of friction [J]", lambda r: f"{r.friction_work:.4g}"),
+        ("not converged", lambda r: f"{r.unconverged}"),
+    )
+    return table(records, columns) + measured_on(numbers, "f64")
+
+
+def error(results: Path) -> str:
+    """Estimated errors over true ones."""
+    numbers = newest(results, "error")
+    rows = [ErrorRow(**row) for row in numbers["rows"]]
+    return row_table(rows) + measured_on(numbers)
+
+
 TABLES: dict[str, Callable[[Path], str]] = {  # by marker
     "order_errors": order_errors,
     "order_times": order_times,
@@ -178,6 +205,8 @@ TABLES: dict[str, Callable[[Path], str]] = {  # by marker
     "collision": collision,
     "hard": hard,
     "ipc": ipc,
+    "ipc_friction": ipc_friction,
+    "error": error,
 }
 
 

@@ -41,6 +41,7 @@ _MODULES = {  # public name -> the module that defines it
     "evaluate_law": "taisoft.fem.laws.evaluate",
     "solve_contact_problem": "taisoft.contact.api",
     "Energies": "taisoft.records",
+    "ErrorEstimate": "taisoft.records",
     "StepReport": "taisoft.records",
     "RunReport": "taisoft.records",
     "TaisoftError": "taisoft.errors",

@@ -7,9 +7,9 @@ import numpy as np
 from taisoft.backend import runtime
 from taisoft.backend.arrays import upload
 from taisoft.dynamics.drag_spring import Drag
-from taisoft.errors import SceneError
+from taisoft.errors import SceneError, SimulationError
 from taisoft.fem.terms import elasticity
-from taisoft.records import Energies
+from taisoft.records import Energies, ErrorEstimate
 from taisoft.stability import stable_dt as largest_stable_dt
 
 if TYPE_CHECKING:
@@ -92,6 +92,22 @@ def stable_dt(self: "Simulator") -> float:
     if self._stable_dt is None:
         self._stable_dt = largest_stable_dt(self.scene, self.settings.integrator == "velocity_verlet")
     return self._stable_dt
+
+
+def error_so_far(self: "Simulator") -> ErrorEstimate | None:
+    """Estimated error of the run so far, during a run with error=True; else None."""
+    return None if self._estimator is None else self._estimator.estimate()
+
+
+def nodal_errors(self: "Simulator", body: str | None = None) -> np.ndarray:
+    """Return estimated errors of the node positions (n_nodes,) [m] during a run with error=True; body: as for `positions`.
+
+    They are those of the last comparison with the twins, in time, of the solvers and, with error_mesh, in space, added; NaN
+    where none is known, as before the first comparison. Raises SimulationError outside such a run.
+    """
+    if self._estimator is None:
+        raise SimulationError("errors are estimated only during sim.run(..., error=True): ask for them in on_frame or on_step")
+    return self._estimator.nodal_errors()[nodes_of(self, body)]
 
 
 # --- contacts ---------------------------------------------------------------------------------------------------------

@@ -46,6 +46,43 @@ class StepReport:
 
 
 @dataclass
+class BodyError:
+    """Estimated errors of a body's positions, as in `ErrorEstimate`."""
+
+    time: float | None = None
+    space: float | None = None
+    solver: float | None = None
+
+
+@dataclass
+class ErrorEstimate:
+    """Estimated error of a run's positions: the largest distance of a node from its exact place at any compared time.
+
+    All errors are relative to the largest excursion, the largest distance of any node from its start. None where an error could
+    not be estimated; the notes say why. See `Simulator.run`.
+    """
+
+    time: float | None = None  #: of the steps
+    space: float | None = None  #: of the mesh; needs `error_mesh`
+    solver: float | None = None  #: of the solvers' tolerances
+    excursion: float = 0.0  #: [m]
+    order: float | None = None  #: in time, as observed, or assumed if one twin has a smaller step
+    agree_until: float | None = None  #: where the paths of different steps part: time until which they agree [s]
+    time_until_then: float | None = None  #: error in time up to `agree_until`
+    spread_after: dict[str, float] = field(default_factory=dict)  #: afterwards: by body, change of its mean position by the step
+    bodies: dict[str, BodyError] = field(default_factory=dict)  #: by name
+    energies: Energies | None = None  #: errors in time of the energies at the last comparison, magnitudes [J]
+    twins: list[str] = field(default_factory=list)  #: how the errors were estimated, a sentence each
+    notes: list[str] = field(default_factory=list)  #: reasons for caution, sentences
+    wall_seconds: float = 0.0  #: of the twins, without compile time [s]; not in the run's
+
+    @property
+    def total(self) -> float | None:
+        """Sum of the errors that are known; None without the error in time."""
+        return None if self.time is None else self.time + (self.space or 0.0) + (self.solver or 0.0)
+
+
+@dataclass
 class RunReport:
     """Result of a run."""
 
@@ -59,3 +96,4 @@ class RunReport:
     step_reports: list[StepReport] = field(default_factory=list)  #: one a step; of explicit runs one a frame
     dt: float | None = None  #: of its steps [s]
     dt_requested: float | None = None  #: that the simulator had, where the run changed it to fit the frames [s]
+    error_estimate: ErrorEstimate | None = None  #: of a run with error=True

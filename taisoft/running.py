@@ -14,6 +14,7 @@ from taisoft.records import RunReport, StepReport
 from taisoft.settings import check_positive
 
 if TYPE_CHECKING:
+    from taisoft.scene.scene import Scene
     from taisoft.simulator import Simulator
 
 FrameCallback = Callable[["Simulator", int, StepReport | None], None]
@@ -31,6 +32,8 @@ def run(
     stop: Callable[[], bool] | None = None,
     resumed: bool = False,
     on_step: StepCallback | None = None,
+    error: bool = False,
+    error_mesh: "str | Scene | None" = None,
 ) -> RunReport:
     """Step for `seconds` [s] from now, to the nearest step, with frames at fps, or after every step if fps is None.
 
@@ -38,9 +41,14 @@ def run(
     steps; True ends the run. dt is lowered once to the next divisor of 1/fps, or rounded to one within NEAR of it, which
     the report notes. resumed: seconds and frames count from time 0, not from now; the first frame is `first_frame`.
     on_step(report, seconds): called after every implicit step and every batch of explicit steps, with its wall time without
-    compilation [s]. A failed or interrupted run does not raise: see the report's status and problems. Raises SimulationError
-    for bad arguments.
+    compilation [s]. error: estimate the error of the positions by twins (`taisoft.estimation`), simulators that follow the run
+    with other steps and tighter tolerances; the report holds it. error_mesh: also estimate the error of the mesh, by a twin on
+    another one: "refined", "order" (the elements' other order), or the same scene on a mesh that shares nodes. A failed or
+    interrupted run does not raise: see the report's status and problems. Raises SimulationError for bad arguments, and for a
+    twin that cannot be made.
     """
+    if error_mesh is not None and not error:
+        raise SimulationError("error_mesh needs error=True")
     seconds = check_positive("seconds", seconds, "s")
     fps = None if fps is None else check_positive("fps", fps, "1/s")
     check_length(seconds, sim.dt, fps)
@@ -55,6 +63,7 @@ def run(
     elapsed_steps = round(sim.time / sim.dt) if resumed else 0  # steps of this dt since time 0
     first_step = start_count - elapsed_steps
     energy: EnergyCheck | None = None
+    estimator = sim._begin_estimate(total - elapsed_steps, error_mesh) if error else None
     try:
         energy = EnergyCheck(sim)
         frame, remainder = divmod(elapsed_steps, steps_per_frame)
@@ -68,17 +77,28 @@ def run(
                 break
             if sim.settings.explicit:
                 report.step_reports.append(merged)
-            if on_frame is not None and sim.step_count - first_step == frame_end:
-                on_frame(sim, frame, merged)
-    except (SimulationError, MemoryError) as error:
+            if sim.step_count - first_step == frame_end:
+                if estimator is not None:
+                    estimator.frame()
+                if on_frame is not None:
+                    on_frame(sim, frame, merged)
+    except (SimulationError, MemoryError) as failure:
         report.status = "failed"
-        report.problems.append(str(no_memory("the next step", error) if isinstance(error, MemoryError) else error))
+        report.problems.append(str(no_memory("the next step", failure) if isinstance(failure, MemoryError) else failure))
     except KeyboardInterrupt:
         _mark_interrupted(report)
+    except BaseException:
+        if estimator is not None:
+            sim._end_estimate()
+        raise
     report.steps = sim.step_count - start_count
     report.sim_seconds = sim.time - start_time
     report.wall_seconds = time.perf_counter() - clock - (sim.compile_seconds - compiled)
     report.compile_seconds = sim._take_compile_seconds()
+    if estimator is not None:
+        report.error_estimate = estimator.estimate()
+        report.wall_seconds -= report.error_estimate.wall_seconds
+        sim._end_estimate()
     _summarize_steps(report)
     if energy is not None:
         energy.add_problem(report)
@@ -91,9 +111,10 @@ def run(
     if report.steps and report.status != "failed":
         try:
             _check_final_overlap(sim, report)
-        except (SimulationError, MemoryError) as error:
+        except (SimulationError, MemoryError) as failure:
             report.status = "failed"
-            report.problems.append(str(no_memory("the final overlap check", error) if isinstance(error, MemoryError) else error))
+            text = no_memory("the final overlap check", failure) if isinstance(failure, MemoryError) else failure
+            report.problems.append(str(text))
         except KeyboardInterrupt:
             report.status = "degraded"
             _mark_interrupted(report)

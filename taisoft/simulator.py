@@ -2,6 +2,7 @@
 
 import dataclasses
 import warnings
+from typing import TYPE_CHECKING
 
 from taisoft import changes, checkpoint, queries, running
 from taisoft.attributes import Guarded, SimulationAttributeError, thawed
@@ -13,6 +14,9 @@ from taisoft.records import StepReport
 from taisoft.scene.scene import Scene
 from taisoft.settings import NAMES, Settings, check_count, check_settings, plan_of
 from taisoft.stability import scale_warnings
+
+if TYPE_CHECKING:
+    from taisoft.estimation.estimator import ErrorEstimator
 
 
 class Simulator(Guarded):
@@ -33,6 +37,7 @@ class Simulator(Guarded):
     _instead = changes.INSTEAD
     settings: Settings
     _dynamics: Dynamics | None = None  # None until it is made
+    _estimator: "ErrorEstimator | None" = None  # of a run with error=True, while it lasts
 
     def __init__(
         self,
@@ -99,6 +104,19 @@ class Simulator(Guarded):
 
     run = running.run
 
+    def _begin_estimate(self, steps: int, mesh: str | Scene | None) -> "ErrorEstimator":
+        """Make the twins of a run of `steps` steps; see `run`."""
+        from taisoft.estimation.estimator import ErrorEstimator  # loads modules with kernels that the run may not need
+
+        self._estimator = ErrorEstimator(self, steps, mesh)
+        return self._estimator
+
+    def _end_estimate(self) -> None:
+        """Release the twins of a run."""
+        if self._estimator is not None:
+            self._estimator.close()
+            self._estimator = None
+
     def _take_compile_seconds(self) -> float:
         """Return the compile time since the last call [s], so that each run reports its own."""
         before, self._compile_reported = self._compile_reported, runtime.compile_clock()
@@ -124,6 +142,8 @@ class Simulator(Guarded):
     deepest_overlap = queries.deepest_overlap
     overlaps = queries.overlaps
     intersecting_triangles = queries.intersecting_triangles
+    error_so_far = property(queries.error_so_far)
+    nodal_errors = queries.nodal_errors
     draggable = property(queries.draggable)
     dragged = property(queries.dragged)
     compile_seconds = property(queries.compile_seconds)
@@ -150,15 +170,24 @@ class Simulator(Guarded):
         discarded, as by `set_state`, and a drag ends. Both simulators are in memory during the call.
         Raises SimulationError if the settings cannot be met; this simulator is then unchanged.
         """
+        new = self._copy(**settings)
+        kept = {name: self.__dict__[name] for name in ("_start_scene", "_compiled_before", "_compile_reported")}
+        self.close()
+        self.__dict__.update(new.__dict__ | kept)
+
+    def _copy(self, **settings) -> "Simulator":
+        """Return a second simulator in the present state, as `rebuild` makes it."""
         before, start = self._open(), self.scene.snapshot()
         start.allow_initial_overlap = True  # bodies move to the present positions below
-        new = Simulator(start, **(dataclasses.asdict(self.settings) | {"dt": self.dt} | settings))
+        new = Simulator(start, **(self._arguments() | settings))
         with thawed(new.scene):
             new.scene.allow_initial_overlap = self.scene.allow_initial_overlap
         new._dynamics.continue_from(before)
-        kept = {name: self.__dict__[name] for name in ("_start_scene", "_compiled_before", "_compile_reported")}
-        before.close()
-        self.__dict__.update(new.__dict__ | kept)
+        return new
+
+    def _arguments(self) -> dict:
+        """Return the arguments, besides the scene, that make a simulator with the present settings."""
+        return dataclasses.asdict(self.settings) | {"dt": self.dt}
 
     # --- checkpoints and resources --------------------------------------------------------------------------------------
 
@@ -168,6 +197,7 @@ class Simulator(Guarded):
 
     def close(self) -> None:
         """Release memory and runtime; a closed simulator cannot be used."""
+        self._end_estimate()
         if self._dynamics is not None:
             self._dynamics.close()
 

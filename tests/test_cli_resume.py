@@ -196,7 +196,7 @@ def test_results_of_another_scene_are_not_overwritten(tmp_path, capsys):
     assert run(write(tmp_path / "beam.py", BEAM.replace('"beam"', '"other"')), "--out", other) == 0
     before = {file: file.read_bytes() for file in other.rglob("*") if file.is_file()}
     assert run(path, "--out", other, "--resume", out / "checkpoint.npz", "--seconds", "0.2") == 3
-    assert "is of another scene or frame rate" in capsys.readouterr().err
+    assert "is of another scene, frame rate or --error" in capsys.readouterr().err
     assert {file: file.read_bytes() for file in other.rglob("*.png")} == {f: b for f, b in before.items() if f.suffix == ".png"}
     assert usd(other) and (other / "steps.csv").read_bytes() == before[other / "steps.csv"]
 

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from taisoft.errors import SimulationError
+from taisoft.estimation.comparison import Error, distance, shared_nodes
 from taisoft.mesh.nodes import make_nodes
 from taisoft.mesh.shapes import box_mesh
-from taisoft.study.accuracy import Error, Reference, _momentum_error, distance, error_in_space, finest_own_error, shared_nodes
+from taisoft.study.accuracy import Reference, _momentum_error, error_in_space, finest_own_error
 
 COARSE = box_mesh((2, 1, 1), (2.0, 1.0, 1.0))
 FINE = make_nodes(COARSE, 2).positions

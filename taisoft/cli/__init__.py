@@ -205,11 +205,13 @@ def _add_run(add) -> None:
     option("--checkpoint-every", type=float, metavar="T", help=every)
     option("--video", action="store_true", help="also make video.mp4 from the pictures with ffmpeg (extra 'video')")
     option("--no-usd", action="store_true", help="write no scene.usdc")
-    colours = ("body", "stress", "stretch", "speed")
+    option("--error", action="store_true", help="estimate the error by runs with other steps and tolerances beside this one")
+    option("--error-mesh", choices=("refined", "order"), help="also by one on another mesh; implies --error")
+    colours = ("body", "stress", "stretch", "speed", "error")
     option("--colour", choices=colours, default="body", help="colouring of bodies in pictures and the window")
     layers = "what they show besides bodies: wires, contacts, tractions, fixed_nodes, or none"
     option("--layers", metavar="NAME,...", help=layers)
-    option("--plots", metavar="NAME,...", help="plots over time: energies, residuals, iterations, contacts, step_time")
+    option("--plots", metavar="NAME,...", help="plots over time: energies, residuals, iterations, contacts, step_time, error")
     option("--caption", action="store_true", help="write scene, frame, time and energies on pictures")
     option("--no-frames", action="store_true", help="write no pictures")
 

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from taisoft.errors import OutputError, SceneError
+from taisoft.estimation.forecast import describe_error
 from taisoft.output.files import RESULT_FILES, CheckpointWriter, OutputFolder
 from taisoft.output.frames import FRAMES_NAME, FrameWriter, ffmpeg_command, find_ffmpeg, picture_numbers, write_video
 from taisoft.output.report import body_records, write_report
@@ -29,7 +30,7 @@ PROBLEMS_SHOWN = 5
 class DisplayOptions:
     """colour: as in `Offscreen`; layers: names, or None for the defaults; plots: names; caption: the scene's name, or None.
 
-    window, pictures, usd: whether there is a window, and what is written to the folder.
+    window, pictures, usd: whether there is a window, and what is written to the folder; errors: whether they are estimated.
     """
 
     window: bool
@@ -39,6 +40,7 @@ class DisplayOptions:
     layers: tuple[str, ...] | None
     plots: tuple[str, ...]
     caption: str | None
+    errors: bool
 
     @property
     def in_pictures(self) -> tuple[str, ...]:
@@ -63,8 +65,14 @@ def display_options(arguments: Namespace, has_window: bool) -> DisplayOptions:
             raise SceneError(f"--{option} needs --out, the folder to write to, and pictures, so it excludes --no-frames")
     if pictures and (plots or arguments.caption) and text_missing():
         raise SceneError(f"{'--plots' if plots else '--caption'}: {text_missing()}")
-    caption = Path(arguments.scene).stem if arguments.caption else None
-    return DisplayOptions(has_window, pictures, not arguments.no_usd, arguments.colour, layers, plots, caption)
+    caption, errors = (
+        Path(arguments.scene).stem if arguments.caption else None,
+        arguments.error or arguments.error_mesh is not None,
+    )
+    for option, given in {"colour": arguments.colour == "error", "plots": "error" in plots}.items():
+        if given and not errors:
+            raise SceneError(f"--{option} error needs --error")
+    return DisplayOptions(has_window, pictures, not arguments.no_usd, arguments.colour, layers, plots, caption, errors)
 
 
 def _names(option: str, text: str | None, known) -> tuple[str, ...] | None:
@@ -83,7 +91,7 @@ def check_modelled(shown: DisplayOptions, sim) -> None:
     """Raise SceneError for a layer or plot of a feature that sim does not model."""
     if "contacts" in (shown.layers or ()) and not sim.plan.on["contact_forces"]:
         raise SceneError(f"--layers contacts: contact forces are not modelled ({sim.plan.why('contact_forces')})")
-    Plots(sim, shown.plots)
+    Plots(sim, shown.plots, shown.errors)
 
 
 class Observers:
@@ -147,6 +155,7 @@ class Recording:
         folder = self._folder.path
         if shown.usd:
             numbers = {"fps": fps or 1.0 / sim.dt, "self_collision": sim.settings.self_collision, "first": self._first or 0}
+            numbers["errors"] = shown.errors
             usd = UsdWriter(folder, sim.scene, **numbers)
             observers.members.append(usd)
             self._checkpoints.before = usd.flush
@@ -237,6 +246,8 @@ def print_summary(result: RunReport, sim, observers: Observers, recording: Recor
         _print_lines("problem", [problem])
     if len(problems) > PROBLEMS_SHOWN:
         _print_lines("", [f"and {len(problems) - PROBLEMS_SHOWN} more problems"])
+    if result.error_estimate is not None:
+        _print_lines("error", describe_error(result.error_estimate, result.wall_seconds))
     print_state(sim)
     output, compiling = f"{observers.seconds:.2f} s of it for output", f"{result.compile_seconds:.2f} s to compile"
     _print_lines("wall", [f"{result.wall_seconds:.2f} s, {output}; plus {compiling}"])

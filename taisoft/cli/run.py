@@ -66,6 +66,8 @@ def run(arguments: Namespace) -> int:
         _check_checkpoint_interval(arguments)
         shown = display_options(arguments, has_window=not arguments.headless and _window_is_possible())
         interactive = shown.window and arguments.out is None and arguments.seconds is None
+        if shown.errors and interactive:
+            raise SceneError("--error: a window without end has no error of a run: give --seconds, or --out")
         saved: Checkpoint | None = None
         if arguments.resume is None:
             settings = resolve(solver, arguments, Simulator)
@@ -206,7 +208,7 @@ def _show_window(sim: Simulator, settings: RunSettings, shown: DisplayOptions) -
 def _run(sim, settings: RunSettings, arguments, signals, warned: list[str], saved, shown: DisplayOptions) -> int:
     """Run until settings.seconds; save what was computed, however the run ends."""
     observers, recording, resumed, notes = Observers(), None, None, {}
-    plots = Plots(sim, shown.plots) if shown.plots or shown.window else None
+    plots = Plots(sim, shown.plots, shown.errors) if shown.plots or shown.window else None
     if saved is not None:
         notes = saved.notes
         resumed = {"checkpoint": str(saved.path), "time": sim.time, "frame": first_frame(sim, settings.fps)}
@@ -230,6 +232,8 @@ def _run(sim, settings: RunSettings, arguments, signals, warned: list[str], save
             stop=lambda: signals.requested() or bool(observers.errors),
             resumed=resumed is not None,
             on_step=plots.take if plots is not None else None,
+            error=shown.errors,
+            error_mesh=arguments.error_mesh,
         )
         observers.close()
         if recording is not None:

@@ -12,7 +12,8 @@ Time codes are frame numbers; units are metres, y up. A body is `/World/<name>` 
 guide, so that the two are not drawn over each other) and `material`. Both are linear: a second-order body is written as
 the linear triangles and tets that its elements are cut into, with all its nodes as points (`taisoft/mesh/nodes.py`).
 Both carry `primvars:vonMisesStress` [Pa]. If there can be contacts, the surface also carries `primvars:contactImpulse` [N s], the
-impulse of the last step before the frame on each point. `nodal_fields.py` defines both.
+impulse of the last step before the frame on each point. `nodal_fields.py` defines both. A run with error=True adds
+`primvars:estimatedError` [m], `Simulator.nodal_errors`.
 An obstacle is `/World/<name>` with `surface` and `material`; its points change over time if it follows a path. A half-space
 whose square lies entirely within others is left out. `/View` holds a camera and lights (`usd_scene.py`).
 """
@@ -27,11 +28,18 @@ from taisoft.errors import OutputError
 from taisoft.files import part_path, publish, replacing
 from taisoft.output.files import make_folder, output_errors
 from taisoft.output.nodal_fields import NodalMean, contact_impulses, von_mises
-from taisoft.output.usd_scene import IMPULSE, ROOT, STRESS, TRANSLATE, scene_layer
+from taisoft.output.usd_scene import ERROR, IMPULSE, ROOT, STRESS, TRANSLATE, scene_layer
 
 SCENE_NAME = "scene.usdc"
 CHUNKS_NAME = "chunks"
-TIME_VARYING = {"points", "extent", f"primvars:{STRESS}", f"primvars:{IMPULSE}", TRANSLATE}  # names of attributes
+TIME_VARYING = {
+    "points",
+    "extent",
+    f"primvars:{STRESS}",
+    f"primvars:{IMPULSE}",
+    f"primvars:{ERROR}",
+    TRANSLATE,
+}  # names of attributes
 
 
 class UsdWriter:
@@ -40,12 +48,19 @@ class UsdWriter:
     folder: the run's folder; scene: its meshes and names are read at construction; fps: frames per second of simulated time
     [1/s]; chunk_frames: frames per chunk, the most that are lost if the process is killed; self_collision: the simulator's
     setting, which decides with the scene whether there can be contacts; first: number of the first frame of a resumed run;
-    earlier frames are copied from the folder. Raises OutputError, also if an obstacle's path fails or the folder holds another
-    scene or frame rate.
+    earlier frames are copied from the folder; errors: whether the run estimates errors. Raises OutputError, also if an obstacle's
+    path fails or the folder holds another scene or frame rate.
     """
 
     def __init__(
-        self, folder: str | Path, scene, fps: float = 60.0, chunk_frames: int = 10, self_collision: bool = False, first: int = 0
+        self,
+        folder: str | Path,
+        scene,
+        fps: float = 60.0,
+        chunk_frames: int = 10,
+        self_collision: bool = False,
+        first: int = 0,
+        errors: bool = False,
     ):
         if not fps > 0:
             raise OutputError(f"USD export: fps is {fps}; it must be positive")
@@ -54,8 +69,8 @@ class UsdWriter:
         self.path = Path(folder) / SCENE_NAME
         self.chunks = make_folder(Path(folder) / CHUNKS_NAME)
         self.chunk_frames = chunk_frames
-        self._touching = scene.pushes(self_collision)
-        self._tracks, self._moving, self._view, self._template = scene_layer(scene, fps, self._touching)
+        self._touching, self._errors = scene.pushes(self_collision), errors
+        self._tracks, self._moving, self._view, self._template = scene_layer(scene, fps, self._touching, errors)
         self._mean = NodalMean(scene.bodies)
         self._joined = _Joined(self.path, self._template)
         self._chunk = None
@@ -72,7 +87,9 @@ class UsdWriter:
         for path in old:
             layer = _opened(path)
             if layer.timeCodesPerSecond != self._template.timeCodesPerSecond or _structure(layer) != _structure(self._template):
-                raise OutputError(f"{path} is of another scene or frame rate, so no run can resume in it: name another folder")
+                raise OutputError(
+                    f"{path} is of another scene, frame rate or --error, so no run can resume in it: name another folder"
+                )
             self._joined.append(layer, first)
         times = self._joined.layer.ListTimeSamplesForPath(self._view.attribute)
         if times:
@@ -90,6 +107,8 @@ class UsdWriter:
         points, fields = x.astype(np.float32), {STRESS: von_mises(self._mean(sim.stress())).astype(np.float32)}
         if self._touching:
             fields[IMPULSE] = contact_impulses(sim.contacts(), len(x)).astype(np.float32)
+        if self._errors:
+            fields[ERROR] = np.nan_to_num(sim.nodal_errors()).astype(np.float32)
         samples = [(self._view.attribute, Gf.Vec3d(*self._view.follow(x).tolist()))]
         for track in self._tracks:
             samples += track.samples(points, fields)

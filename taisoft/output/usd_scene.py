@@ -29,7 +29,8 @@ from taisoft.output.camera import MAX_WIDENING, Camera, start_positions
 from taisoft.scene.obstacles import HalfSpace, MeshObstacle
 
 ROOT, VIEW = "/World", "/View"
-STRESS, IMPULSE, TRANSLATE = "vonMisesStress", "contactImpulse", "xformOp:translate"  # primvars, and the camera's attribute
+STRESS, IMPULSE, ERROR = "vonMisesStress", "contactImpulse", "estimatedError"  # primvars
+TRANSLATE = "xformOp:translate"  # attribute of the camera
 MAX_NAME = 64  # characters of a prim name; the full name is stored as display name
 PICTURE = (16, 9)  # width and height
 SENSOR = 0.036  # width of the film back [m], as for 36 mm film
@@ -124,11 +125,11 @@ class ViewTrack:
         self.camera = replace(self.camera, distance=float(f"{distance:.12g}"))
 
 
-def scene_layer(scene, fps: float, touching: bool) -> tuple[list[Track], list, ViewTrack, object]:
+def scene_layer(scene, fps: float, touching: bool, errors: bool) -> tuple[list[Track], list, ViewTrack, object]:
     """Build a layer with everything that does not change, and the tracks that get values with the frames.
 
-    touching: whether there can be contacts. Returns the tracks of the bodies, (track, surface) of each obstacle that follows a
-    path, the camera's track and the layer.
+    touching: whether there can be contacts; errors: whether errors are estimated. Returns the tracks of the bodies, (track,
+    surface) of each obstacle that follows a path, the camera's track and the layer.
     """
     from pxr import Sdf, Usd, UsdGeom
 
@@ -145,7 +146,7 @@ def scene_layer(scene, fps: float, touching: bool) -> tuple[list[Track], list, V
     legal = prim_names([one.name for one in (*scene.bodies, *scene.obstacles)])
     tracks, first = [], 0
     for k, (body, name) in enumerate(zip(scene.bodies, legal)):
-        tracks += _define_body(stage, body, name, body_colour(k), first, touching)
+        tracks += _define_body(stage, body, name, body_colour(k), first, touching, errors)
         first += body.n_nodes
     view = ViewTrack(stage, scene)
     surfaces = [s for s in zip(obstacle_surfaces(scene), legal[len(scene.bodies) :]) if len(s[0].triangles)]
@@ -209,7 +210,7 @@ def _define_obstacle(stage, shown: ObstacleSurface, legal_name: str, eye: np.nda
     return Track(surface)
 
 
-def _define_body(stage, body, legal_name: str, srgb: np.ndarray, first: int, touching: bool) -> list[Track]:
+def _define_body(stage, body, legal_name: str, srgb: np.ndarray, first: int, touching: bool, errors: bool) -> list[Track]:
     """Define a body's surface, tets and primvars. first: index of its first node among the nodes of all bodies."""
     from pxr import Sdf, UsdGeom, Vt
 
@@ -231,8 +232,10 @@ def _define_body(stage, body, legal_name: str, srgb: np.ndarray, first: int, tou
         gprim.CreateExtentAttr()
         paint(gprim)
         define_primvar(gprim, STRESS, scalars, "von Mises equivalent of the mean Cauchy stress at the node [Pa]")
+        if errors:
+            define_primvar(gprim, ERROR, scalars, "estimated error of the node's position [m], 0 where unknown")
     if touching:
         define_primvar(surface, IMPULSE, vectors, "impulse of the contacts of the last step on the node [N s]")
     all_nodes = slice(first, first + body.n_nodes)
-    primvars = (STRESS, IMPULSE) if touching else (STRESS,)
-    return [Track(surface, first + nodes, primvars), Track(tets, all_nodes, (STRESS,))]
+    primvars = (STRESS, ERROR) if errors else (STRESS,)
+    return [Track(surface, first + nodes, (*primvars, IMPULSE) if touching else primvars), Track(tets, all_nodes, primvars)]

@@ -13,23 +13,14 @@ import zlib
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from taisoft.errors import SimulationError
+from taisoft.estimation.comparison import Error, distance, shared_nodes
 from taisoft.machine import Timing, summarise
 from taisoft.study import mesh_name
 
-COINCIDENCE = 1e-9  # distance over the body's size below which two nodes coincide
 RICHARDSON = 3.0  # 2^2 - 1
 ROUNDING = 1e-9  # relative change of momentum that counts as rounding
-
-
-@dataclass(frozen=True)
-class Error:
-    """Distance between two paths over the largest excursion."""
-
-    rms: float
-    max: float
 
 
 @dataclass
@@ -109,12 +100,6 @@ def unpack(packed: dict) -> np.ndarray:
         raise ValueError(f"{type(error).__name__}: {error}") from None
 
 
-def distance(path: np.ndarray, other: np.ndarray, excursion: float) -> Error:
-    """Return the error between two paths (k,n,3) [m], relative to the excursion [m]."""
-    squared = ((path - other) ** 2).sum(axis=2)
-    return Error(float(np.sqrt(squared.mean())) / excursion, float(np.sqrt(squared.max())) / excursion)
-
-
 def make_reference(fine: dict, coarse: dict, kind: str, order_in_time: int) -> Reference:
     """Build a reference from the records of its fine and coarse runs.
 
@@ -170,21 +155,6 @@ def error_in_space(path: np.ndarray, bodies: list, finest: Reference) -> Error:
     """
     own, theirs = shared_nodes(path[0], bodies, finest.path[0], finest.bodies)
     return distance(path[:, own], finest.path[:, theirs], finest.excursion)
-
-
-def shared_nodes(start: np.ndarray, bodies: list, other: np.ndarray, others: list) -> tuple[np.ndarray, np.ndarray]:
-    """Return ids in both meshes of the nodes that coincide in the same body. start, other: (n,3), (m,3) [m] initial positions."""
-    own, theirs, first, second = [], [], 0, 0
-    for (name, n), (_, m) in zip(bodies, others):
-        size = float(np.ptp(other[second : second + m], axis=0).max())
-        distances, nearest = cKDTree(other[second : second + m]).query(start[first : first + n])
-        same = np.flatnonzero(distances <= COINCIDENCE * size)
-        if not len(same):
-            raise SimulationError(f"body {name!r}: no node of one mesh is also in the other, so they cannot be compared")
-        own.append(first + same)
-        theirs.append(second + nearest[same])
-        first, second = first + n, second + m
-    return np.concatenate(own), np.concatenate(theirs)
 
 
 def row_of(record: dict, reference: Reference | None) -> Row:

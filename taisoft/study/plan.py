@@ -12,8 +12,9 @@ from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass
 from fractions import Fraction
 
-from taisoft.dynamics.schemes import EXPLICIT, INTEGRATORS, SECOND_ORDER
+from taisoft.dynamics.schemes import EXPLICIT, INTEGRATORS
 from taisoft.errors import SceneError, TaisoftError
+from taisoft.estimation.order import nominal_order
 from taisoft.scene.scene import Scene
 from taisoft.settings import check_settings
 from taisoft.stability import stable_dt
@@ -198,15 +199,8 @@ class Planner:
             self._check(scene, setting)
         except TaisoftError as error:
             raise SceneError(f"the reference ({mesh_name({'refine': refine, 'order': order})}): {error}") from error
-        order_in_time = 2 if integrator in SECOND_ORDER and self._is_smooth(scene) else 1
+        order_in_time = nominal_order(integrator, scene, self._touches(scene))
         return {"setting": asdict(setting), "kind": kind, "order_in_time": order_in_time, "steps": steps}
-
-    def _is_smooth(self, scene: Scene) -> bool:
-        """Return whether methods keep their order: not with contacts, velocity-dependent forces, or paths, which may jump."""
-        materials = [body.material for body in scene.bodies]
-        prescribed = any(c.path is not None for body in scene.bodies for c in body.constraints)
-        damped = any(material.mass_damping or material.stiffness_damping for material in materials)
-        return not (prescribed or damped or self._touches(scene))
 
     def _integrator(self, scene: Scene, mesh: tuple, kind: str, target: float) -> str:
         requested = self._request["reference_integrator"]

@@ -6,9 +6,10 @@ import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 
+from taisoft.estimation.comparison import Error
 from taisoft.output.tables import markdown, percent, spread_of
 from taisoft.study import AXES, Request, describe, mesh_name
-from taisoft.study.accuracy import Error, Reference, Row
+from taisoft.study.accuracy import Reference, Row
 
 ALWAYS_SHOWN = ("integrator", "dt")  # axes that have a column even if they do not vary
 LEFT_ALIGNED = ("", "integrator", "status", "precision", "contact solver")

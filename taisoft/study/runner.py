@@ -4,9 +4,10 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from taisoft.errors import SceneError, SimulationError
+from taisoft.estimation.comparison import Error
 from taisoft.machine import summarise, usable_cores
 from taisoft.study import Request, describe, mesh_name
-from taisoft.study.accuracy import Error, Reference, Row, error_in_space, finest_own_error, make_reference, row_of, unpack
+from taisoft.study.accuracy import Reference, Row, error_in_space, finest_own_error, make_reference, row_of, unpack
 from taisoft.study.output import NoStore, Store, digest
 from taisoft.study.results import Study
 from taisoft.study.workers import BUDGET_SPENT, CUT_BY_BUDGET, LocalPlace, Place, carry_out

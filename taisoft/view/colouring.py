@@ -1,4 +1,4 @@
-"""Colours of drawn vertices: by a quantity at the nodes (von Mises stress, largest principal stretch or speed), and shading.
+"""Colours of drawn vertices: by a quantity at the nodes (von Mises stress, largest stretch, speed, error), and shading.
 
 The scale begins at 0 (stretch: at 1). It ends at 1, 2 or 5 times a power of ten above a running maximum of the 99 % quantile over
 the nodes; a quantile, since stress in a nearly flat tet is unbounded. The running maximum decays slowly, and the end is lowered
@@ -19,12 +19,18 @@ from taisoft.fem.reference import inverse_rest_edges
 from taisoft.output.camera import Camera
 from taisoft.output.nodal_fields import NodalMean, von_mises
 
-UNITS = {"body": "", "stress": "Pa", "stretch": "", "speed": "m/s"}
-TITLES = {"body": "own colour", "stress": "von Mises stress", "stretch": "largest stretch", "speed": "speed"}
+UNITS = {"body": "", "stress": "Pa", "stretch": "", "speed": "m/s", "error": "m"}
+TITLES = {
+    "body": "own colour",
+    "stress": "von Mises stress",
+    "stretch": "largest stretch",
+    "speed": "speed",
+    "error": "estimated error",
+}
 QUANTILE = 0.99  # fraction of the nodes whose values lie within the scale
 DECAY = 0.998  # factor on the running maximum per picture
 LOWER_MARGIN = 1.5  # the end is lowered once this times the running maximum, rounded up, is below it
-MIN_SPAN = {"stress": 1.0, "stretch": 1e-3, "speed": 1e-3}  # smallest span of the scale, for a scene at rest
+MIN_SPAN = {"stress": 1.0, "stretch": 1e-3, "speed": 1e-3, "error": 1e-12}  # smallest span of the scale, for a scene at rest
 # sRGB, from low to high
 COLOURS = np.array([(0.27, 0.42, 0.80), (0.33, 0.70, 0.78), (0.72, 0.82, 0.45), (0.97, 0.70, 0.27), (0.82, 0.20, 0.17)])
 
@@ -39,6 +45,7 @@ class Colouring:
 
     def __init__(self, scene, surfaces, kind: str = "body"):
         self._bodies, self._surfaces = scene.bodies, surfaces
+        self._has_errors = kind == "error"
         self.choose(kind)
 
     def choose(self, kind: str) -> None:
@@ -49,8 +56,8 @@ class Colouring:
         self._peak = self.span = 0.0
 
     def choose_next(self) -> None:
-        """Colour by the next of UNITS."""
-        self.choose(following(tuple(UNITS), self.kind))
+        """Colour by the next of UNITS; by the error only if that was the first choice, since it needs a run with error=True."""
+        self.choose(following(tuple(kind for kind in UNITS if kind != "error" or self._has_errors), self.kind))
 
     @property
     def low(self) -> float:
@@ -61,6 +68,8 @@ class Colouring:
         """Return the quantity at the nodes of all bodies (n_nodes,) in sim's present state."""
         if self.kind == "stress":
             return von_mises(self._mean(sim.stress()))
+        if self.kind == "error":
+            return sim.nodal_errors()
         return self._mean(self._stretches(sim)) if self.kind == "stretch" else np.linalg.norm(sim.velocities(), axis=1)
 
     def base(self, sim) -> np.ndarray:

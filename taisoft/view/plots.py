@@ -1,8 +1,8 @@
-"""Plots over time of the step reports: energies, residuals, iterations, contacts, and the wall time of a step.
+"""Plots over time of the step reports: energies, residuals, iterations, contacts, wall time of a step, and estimated errors.
 
 This module keeps the history of a run and computes the curves in a unit square; `taisoft.view.annotations` draws them on pictures
 and in the window. Only simulated quantities are available: no contacts if nothing can touch, no Newton iterations for explicit
-steps.
+steps. Where errors are estimated, energies are drawn as bands: plus and minus the error in time at the last comparison.
 
 The history takes constant memory: minimum and maximum of every quantity over bins of consecutive steps. A bin holds one step
 until CAPACITY bins are full. Then neighbours are merged in pairs, and from there on a bin holds twice as many steps. So no peak
@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from taisoft.errors import SceneError
-from taisoft.records import StepReport
+from taisoft.records import ErrorEstimate, StepReport
 from taisoft.scene.checks import nearest
 from taisoft.view.colouring import round_up
 
@@ -28,12 +28,13 @@ MAX_DECADES = 12  # of a logarithmic axis; smaller values, and zero, lie on its 
 CAPACITY = 256  # bins, an even number
 ENERGIES = ("kinetic", "elastic", "gravity")  # [J]
 SOLVERS = ("newton_residual", "contact_residual", "newton_iterations", "linear_iterations", "contact_iterations", "n_contacts")
-QUANTITIES = (*ENERGIES, "total", *SOLVERS, "step_time")  # energies as changes since the start, wall time in [ms]
+ERRORS = ("time_error", "space_error", "solver_error")  # over the largest excursion, in percent
+QUANTITIES = (*ENERGIES, "total", *SOLVERS, "step_time", *ERRORS)  # energies as changes since the start, wall time in [ms]
 
 
 @dataclass(frozen=True)
 class Series:
-    """One curve of a plot. quantity: one of QUANTITIES; needs: "implicit" steps, "contact" forces, or "" for neither."""
+    """One curve of a plot. quantity: one of QUANTITIES; needs: "implicit" steps, "contact" forces, "error" estimates, or ""."""
 
     name: str
     quantity: str
@@ -72,6 +73,15 @@ PLOTS = {
     ),
     "contacts": Plot("contacts", "", (Series("contacts", "n_contacts", ORANGE, "contact"),)),
     "step_time": Plot("wall time of a step", "ms", (Series("step", "step_time", BLUE),), log=True),
+    "error": Plot(
+        "estimated error so far",
+        "%",
+        tuple(
+            Series(name, f"{name}_error", colour, "error")
+            for name, colour in zip(("time", "space", "solver"), (BLUE, ORANGE, GREEN))
+        ),
+        log=True,
+    ),
 }
 
 
@@ -111,12 +121,15 @@ class History:
         """Clear the history; energies are recorded relative to sim's present ones."""
         self._clear()
         self._start_energies, self.begin = _energies(sim.energies()), sim.time
-        self._append(sim.time, np.where(np.arange(len(QUANTITIES)) < 4, 0.0, np.nan))
+        self._append(sim.time, np.where(np.arange(len(QUANTITIES)) < 4, 0.0, np.nan), np.zeros(len(QUANTITIES)))
 
-    def take(self, report: StepReport, seconds: float, explicit: bool, touching: bool) -> None:
+    def take(
+        self, report: StepReport, seconds: float, explicit: bool, touching: bool, errors: ErrorEstimate | None = None
+    ) -> None:
         """Record a step, or a batch of explicit steps.
 
-        seconds: its total wall time [s]; touching: whether contact forces are simulated. Quantities not simulated are NaN.
+        seconds: its total wall time [s]; touching: whether contact forces are simulated; errors: so far, if estimated.
+        Quantities not simulated are NaN.
         """
         energies = _energies(report) - self._start_energies
         solved, touched = (np.nan if explicit else 1.0), (1.0 if touching else np.nan)
@@ -131,21 +144,26 @@ class History:
                 report.contact_iterations * touched / report.steps,
                 report.n_contacts * touched,
                 1e3 * seconds / report.steps,
+                *(100.0 * (getattr(errors, name[:-6], None) or np.nan) for name in ERRORS),
             ]
         )
-        self._append(report.time, np.where(np.isfinite(row), row, np.nan))
+        half = np.zeros(len(QUANTITIES))
+        if errors is not None and errors.energies is not None:
+            half[:4] = [*_energies(errors.energies), errors.energies.total]
+        self._append(report.time, np.where(np.isfinite(row), row, np.nan), half)
 
-    def _append(self, time: float, row: np.ndarray) -> None:
+    def _append(self, time: float, row: np.ndarray, half: np.ndarray) -> None:
+        """Append a row, with half the width of each band."""
         self.last = row
         if self._n and self._steps_in_last < self._steps_per_bin:
             k = self._n - 1
-            self._low[k], self._high[k] = np.fmin(self._low[k], row), np.fmax(self._high[k], row)
+            self._low[k], self._high[k] = np.fmin(self._low[k], row - half), np.fmax(self._high[k], row + half)
             self._steps_in_last += 1
         else:
             if self._n == len(self._times):
                 self._merge_pairs()
             k = self._n
-            self._low[k] = self._high[k] = row
+            self._low[k], self._high[k] = row - half, row + half
             self._n, self._steps_in_last = k + 1, 1
         self._times[k] = time
 
@@ -181,12 +199,12 @@ class Curves:
 class Plots:
     """History of a simulation, and which plots of it are shown (`shown`: name -> whether it is).
 
-    sim: a Simulator; names: of the plots shown initially. Raises SceneError for an unknown name or a plot of quantities that sim
-    does not simulate.
+    sim: a Simulator; names: of the plots shown initially; errors: whether the run estimates errors. Raises SceneError for an
+    unknown name or a plot of quantities that sim does not simulate.
     """
 
-    def __init__(self, sim, names: tuple[str, ...] = ()):
-        self._sim, self.history = sim, History()
+    def __init__(self, sim, names: tuple[str, ...] = (), errors: bool = False):
+        self._sim, self._errors, self.history = sim, errors, History()
         for name in names:
             if name not in PLOTS:
                 raise SceneError(f"plot '{name}' is unknown{nearest(name, PLOTS)}; there are {', '.join(PLOTS)}")
@@ -198,7 +216,7 @@ class Plots:
 
     def available(self) -> dict[str, Plot]:
         """Return the plots that have simulated quantities now, each with the curves of these."""
-        enabled = {"": True, "implicit": not self._sim.settings.explicit, "contact": self._touching}
+        enabled = {"": True, "implicit": not self._sim.settings.explicit, "contact": self._touching, "error": self._errors}
         kept = {name: tuple(s for s in plot.series if enabled[s.needs]) for name, plot in PLOTS.items()}
         return {name: replace(PLOTS[name], series=series) for name, series in kept.items() if series}
 
@@ -219,7 +237,8 @@ class Plots:
         if report.time < self.history.times[-1]:  # the simulation was reset
             self.history.start(self._sim)
         else:
-            self.history.take(report, seconds, self._sim.settings.explicit, self._touching)
+            errors = self._sim.error_so_far if self._errors else None
+            self.history.take(report, seconds, self._sim.settings.explicit, self._touching, errors)
 
     def restart(self) -> None:
         """Clear the history."""
@@ -237,6 +256,7 @@ class Plots:
         """Explain why a plot is not available."""
         reasons = {
             "implicit": f"steps of {self._sim.settings.integrator} are explicit and solve no equations",
+            "error": "the run does not estimate errors",
             "contact": f"contact forces are not modelled ({self._sim.plan.why('contact_forces')})",
         }
         needs = {series.needs for series in PLOTS[name].series}

@@ -1,0 +1,42 @@
+"""Distances between the paths of two runs, relative to the largest excursion, on one mesh or on two.
+
+The largest excursion is the largest distance of any node from its start at any compared time.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from taisoft.errors import SimulationError
+
+COINCIDENCE = 1e-9  # distance over the body's size below which two nodes coincide
+
+
+@dataclass(frozen=True)
+class Error:
+    """Distance between two paths over the largest excursion."""
+
+    rms: float
+    max: float
+
+
+def distance(path: np.ndarray, other: np.ndarray, excursion: float) -> Error:
+    """Return the error between two paths (k,n,3) [m], relative to the excursion [m]."""
+    squared = ((path - other) ** 2).sum(axis=2)
+    return Error(float(np.sqrt(squared.mean())) / excursion, float(np.sqrt(squared.max())) / excursion)
+
+
+def shared_nodes(start: np.ndarray, bodies: list, other: np.ndarray, others: list) -> tuple[np.ndarray, np.ndarray]:
+    """Return ids in both meshes of the nodes that coincide in the same body. start, other: (n,3), (m,3) [m] initial positions."""
+    own, theirs, first, second = [], [], 0, 0
+    for (name, n), (_, m) in zip(bodies, others):
+        size = float(np.ptp(other[second : second + m], axis=0).max())
+        distances, nearest = cKDTree(other[second : second + m]).query(start[first : first + n])
+        same = np.flatnonzero(distances <= COINCIDENCE * size)
+        if not len(same):
+            raise SimulationError(f"body {name!r}: no node of one mesh is also in the other, so they cannot be compared")
+        own.append(first + same)
+        theirs.append(second + nearest[same])
+        first, second = first + n, second + m
+    return np.concatenate(own), np.concatenate(theirs)

@@ -1,0 +1,256 @@
+"""Estimates the error of a run while it runs, from twins that keep step with it (`twins`, `order`).
+
+In time: two twins with twice and four times the step show the observed order, and cost three quarters of the run. Where explicit
+steps would be unstable, or the run has few steps, one twin has half the step; the order is then assumed to be the nominal one,
+on which the estimate depends little. Of the solvers: a twin with tighter tolerances. In space: a twin on another mesh.
+
+Twins and run are compared at the frames that lie at whole steps of all. Differences are reduced to their maximum over the nodes
+of each body, and to sums of squares. The order is that of the root mean square over nodes and times, which chance affects less
+than maxima. If the paths of different steps part, the error in time is known only up to then.
+
+Weak: twice the step may miss what happens within it; an error that all twins share, such as contacts that none of them finds,
+is not seen. Rounding is not estimated.
+"""
+
+import dataclasses
+import time
+import warnings
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from taisoft.dynamics.schemes import SECOND_ORDER
+from taisoft.estimation.order import MESH_ORDER, MIN_ORDER, agreement, error_over_difference, nominal_order, observed_order
+from taisoft.estimation.twins import TIGHTER, Twin, larger_steps, on_mesh, smaller_steps, tighter
+from taisoft.records import BodyError, Energies, ErrorEstimate
+from taisoft.scene.scene import Scene
+
+if TYPE_CHECKING:
+    from taisoft.simulator import Simulator
+
+MIN_STEPS = 32  # of a run whose error is estimated by larger steps
+SOLVER_FACTOR = error_over_difference(TIGHTER, 1)  # errors are about proportional to the tolerances
+PARTED = 0.1  # with one twin: difference, over the excursion, above which paths may have parted for good
+NEGLIGIBLE = {"f32": 1e-6, "f64": 1e-9}  # differences, over the excursion, that are rounding or the solvers' tolerances
+
+
+class Differences:
+    """Distances between two paths at each comparison. most: per body (k, n_bodies); squares: mean squares (k,)."""
+
+    def __init__(self, bodies: np.ndarray):
+        self._starts = np.flatnonzero(np.diff(bodies, prepend=-1))  # of the bodies, in the compared nodes
+        self.most: list[np.ndarray] = []
+        self.squares: list[float] = []
+        self.map = np.zeros(len(bodies))  # distances at the last comparison
+
+    def add(self, x: np.ndarray, other: np.ndarray) -> None:
+        """Compare positions (n,3) [m]."""
+        squared = ((x - other) ** 2).sum(axis=1)
+        self.squares.append(float(squared.mean()))
+        self.map = np.sqrt(squared)
+        self.most.append(np.maximum.reduceat(self.map, self._starts))
+
+    def largest(self, k: int | None = None) -> np.ndarray:
+        """Largest distance of each body over the first k comparisons (n_bodies,) [m]."""
+        return np.max(self.most[:k], axis=0)
+
+
+class ErrorEstimator:
+    """Twins of a run of `steps` steps. Call `frame` at every frame; `estimate` gives the errors so far.
+
+    mesh: see `twins.on_mesh`. Raises SceneError or SimulationError if a twin cannot be made.
+    """
+
+    def __init__(self, sim: "Simulator", steps: int, mesh: str | Scene | None = None):
+        begin, compiled = time.perf_counter(), sim.compile_seconds
+        self._sim, self._first, self._given = sim, sim.step_count, (sim._host().changes, sim.dt)
+        self._changed = ""
+        self._twins: list[Twin] = []
+        self.differences: list[Differences] = []
+        self.times: list[float] = []
+        bodies = sim.scene.bodies
+        self._bodies = np.repeat(np.arange(len(bodies)), [b.n_nodes for b in bodies])
+        self._start = sim.positions()
+        self._excursion = 0.0
+        self._energies = np.zeros(4)  # differences to the first twin at the last comparison [J]
+        self._means: list[list[np.ndarray]] = []  # per comparison: mean positions of the bodies, of the run and of the first twin
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", UserWarning)  # the run has given them
+                self._make_twins(steps, mesh)
+        except BaseException:
+            self.close()
+            raise
+        self.wall_seconds = time.perf_counter() - begin - (sim.compile_seconds - compiled)
+
+    def _make_twins(self, steps: int, mesh: str | Scene | None) -> None:
+        """Make the twins: first those of other steps, then those of tolerances and mesh."""
+        sim = self._sim
+        if mesh is not None:  # first, since it may be refused
+            self._space = self._add(on_mesh(sim, mesh))
+        else:
+            self._space = None
+        in_time = larger_steps(sim) if steps >= MIN_STEPS else []
+        self._in_time = [self._add(twin) for twin in in_time or smaller_steps(sim)]
+        tight = tighter(sim)
+        self._solver = None if tight is None else self._add(tight)
+        self._stride = max(self._twins[k].per for k in self._in_time)
+        if len(self._in_time) > 1:
+            self._between = Differences(self._bodies)  # of the two twins
+
+    def _add(self, twin: Twin) -> int:
+        """Add a twin; return its number."""
+        self._twins.append(twin)
+        self.differences.append(Differences(self._bodies[twin.own]))
+        return len(self._twins) - 1
+
+    def frame(self) -> None:
+        """Let the twins follow, and compare, if the run is at a whole step of all."""
+        steps = self._sim.step_count - self._first
+        if self._changed or not steps or steps % self._stride:
+            return
+        self._changed = self._change()
+        if self._changed:
+            return
+        begin, compiled = time.perf_counter(), self._sim.compile_seconds
+        for twin in self._twins:
+            twin.follow(steps)
+        self._compare()
+        self.wall_seconds += time.perf_counter() - begin - (self._sim.compile_seconds - compiled)
+
+    def _change(self) -> str:
+        """Why twins cannot follow any more; "" if they can."""
+        if self._sim.dragged is not None:
+            return "the run was dragged"
+        now = self._sim._host().changes, self._sim.dt
+        return "" if now == self._given else "its state or numbers were changed meanwhile"
+
+    def _compare(self) -> None:
+        x = self._sim.positions()
+        self._excursion = max(self._excursion, float(np.sqrt(((x - self._start) ** 2).sum(axis=1).max())))
+        self.times.append(self._sim.time)
+        found = [twin.positions() if not twin.failed else None for twin in self._twins]
+        for twin, differences, other in zip(self._twins, self.differences, found):
+            if other is not None:
+                differences.add(x[twin.own], other)
+        first, last = (found[self._in_time[k]] for k in (0, -1))
+        if len(self._in_time) > 1 and first is not None and last is not None:
+            self._between.add(first, last)
+        twin = self._twins[self._in_time[0]]
+        if not twin.failed:
+            pair = [dataclasses.astuple(sim.energies()) for sim in (self._sim, twin.sim)]
+            self._energies = np.abs(np.subtract(*pair))
+        self._means.append([self._body_means(path) for path in (x, first) if path is not None])
+
+    def _body_means(self, x: np.ndarray) -> np.ndarray:
+        return np.stack([x[self._bodies == k].mean(axis=0) for k in range(len(self._sim.scene.bodies))])
+
+    def nodal_errors(self) -> np.ndarray:
+        """Estimated errors of all nodes at the last comparison (n_nodes,) [m], all known kinds added; NaN if unknown."""
+        found = np.zeros(len(self._bodies))
+        factor = self._time_factor(len(self.times))[0] if self.times else None
+        if factor is None:
+            return np.full(len(found), np.nan)
+        kinds = [(self._in_time[0], factor), (self._solver, SOLVER_FACTOR), (self._space, self._space_factor())]
+        for k, scale in kinds:
+            if k is not None and not self._twins[k].failed:
+                found[self._twins[k].own] += scale * self.differences[k].map
+        return found
+
+    def _space_factor(self) -> float:
+        if self._space is None:
+            return 0.0
+        ratio = self._twins[self._space].ratio
+        return 1.0 if ratio == 1.0 else error_over_difference(ratio, MESH_ORDER)  # another order: the difference itself
+
+    def _time_factor(self, k: int) -> tuple[float | None, float | None]:
+        """Error in time over the difference to the first twin, and order, from the first k comparisons; None if unknown."""
+        twins = [self._twins[n] for n in self._in_time]
+        if any(twin.failed for twin in twins):
+            return None, None
+        fine = self.differences[self._in_time[0]]
+        if len(twins) == 1:
+            order = float(nominal_order(self._sim.settings.integrator, self._sim.scene, self._sim.touches))
+            return error_over_difference(twins[0].ratio, order), order
+        near, far = (float(np.sqrt(np.mean(d.squares[:k]))) for d in (fine, self._between))
+        if near <= self._negligible:
+            return error_over_difference(2.0, MIN_ORDER), None
+        most = 2.0 if self._sim.settings.integrator in SECOND_ORDER else 1.0
+        order = observed_order(near, far, most)
+        return (None, None) if order is None else (error_over_difference(2.0, order), order)
+
+    @property
+    def _negligible(self) -> float:
+        """Difference that shows no order [m]."""
+        return NEGLIGIBLE[self._sim.settings.precision] * self._excursion
+
+    def estimate(self) -> ErrorEstimate:
+        """The estimate of the run so far."""
+        made = ErrorEstimate(excursion=self._excursion, wall_seconds=self.wall_seconds)
+        made.bodies = {body.name: BodyError() for body in self._sim.scene.bodies}
+        if self._changed:
+            made.notes.append(f"the errors are unknown: {self._changed}")
+        elif not self.times or self._excursion == 0.0:
+            why = "nothing moves" if self.times else f"the run has fewer than {self._stride} steps"
+            made.notes.append(f"the errors are unknown: {why}")
+        else:
+            self._estimate_time(made)
+            for name, k, factor in (("solver", self._solver, SOLVER_FACTOR), ("space", self._space, self._space_factor())):
+                if k is not None:
+                    self._estimate(made, name, k, factor)
+            if self._solver is None:
+                made.solver = 0.0  # nothing is solved
+        made.twins = [twin.what for twin in self._twins]
+        return made
+
+    def _estimate(self, made: ErrorEstimate, name: str, k: int, factor: float, until: int | None = None) -> None:
+        """Set the error `name` from the first comparisons with twin k, or note why it is unknown."""
+        twin = self._twins[k]
+        if twin.failed:
+            made.notes.append(f"the error of {name} is unknown: its twin ({twin.what}) failed: {twin.failed}")
+            return
+        if twin.unconverged:
+            made.notes.append(f"of the twin with {twin.what}, {twin.unconverged} of {twin.reports} steps did not converge")
+        most = factor * self.differences[k].largest(until) / self._excursion
+        for body, value in zip(made.bodies.values(), most):
+            setattr(body, name, float(value))
+        setattr(made, name, float(most.max()))
+
+    def _estimate_time(self, made: ErrorEstimate) -> None:
+        """Set the error in time; where the paths part, only that until then."""
+        failed = [twin for k in self._in_time if (twin := self._twins[k]).failed]
+        if failed:
+            made.notes.append(f"the error in time is unknown: the twin with {failed[0].what} failed: {failed[0].failed}")
+            return
+        count = self._agreeing()
+        factor, made.order = self._time_factor(count) if count else (None, None)
+        if count == len(self.times) and factor is not None:
+            self._estimate(made, "time", self._in_time[0], factor)
+            made.energies = Energies(*(factor * self._energies).tolist())
+            return
+        if factor is not None:
+            made.agree_until = self.times[count - 1]
+            most = factor * self.differences[self._in_time[0]].largest(count).max() / self._excursion
+            made.time_until_then = float(most)
+            made.spread_after = self._spread(count)
+        when = f"after t = {made.agree_until:.4g} s" if made.agree_until is not None else "from the start"
+        made.notes.append(f"the error in time is unknown: the paths of different steps part {when}")
+
+    def _agreeing(self) -> int:
+        """Number of comparisons over which the paths of different steps agree."""
+        fine = self.differences[self._in_time[0]]
+        if len(self._in_time) > 1:
+            return agreement(np.array(fine.squares), np.array(self._between.squares), self._negligible**2)
+        parted = np.flatnonzero(np.max(fine.most, axis=1) > PARTED * self._excursion)
+        return int(parted[0]) if len(parted) else len(fine.most)
+
+    def _spread(self, count: int) -> dict[str, float]:
+        """Per body: distance of its mean positions in run and twin after the first `count` comparisons, over the excursion."""
+        run, twin = (np.mean([means[k] for means in self._means[count:]], axis=0) for k in (0, 1))
+        apart = np.linalg.norm(run - twin, axis=1) / self._excursion
+        return {body.name: float(value) for body, value in zip(self._sim.scene.bodies, apart)}
+
+    def close(self) -> None:
+        """Release the twins' memory; a second call does nothing."""
+        while self._twins:
+            self._twins.pop().sim.close()

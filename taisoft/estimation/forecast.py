@@ -1,0 +1,57 @@
+"""Error estimates in a sentence, and what a smaller error would cost.
+
+The error in time falls with dt^p, p the observed order, and the work grows with 1 / dt. The error in space falls with h^2, and
+the work grows with h^-4: tets with h^-3, and steps or iterations with 1 / h.
+"""
+
+import math
+
+from taisoft.estimation.order import MESH_ORDER
+from taisoft.records import ErrorEstimate
+
+MESH_WORK = 4  # exponent of the work in 1 / h
+LEAST = 1e-6  # smaller errors are shown as "below" it
+
+
+def describe_error(estimate: ErrorEstimate, wall_seconds: float) -> list[str]:
+    """Sentences for the summary of a run of wall_seconds [s]: the error, what a smaller one would cost, and the notes."""
+    parts = {name: getattr(estimate, name) for name in ("time", "space", "solver")}
+    known = {name: value for name, value in parts.items() if value is not None}
+    listed = ", ".join(f"{name} {percent(value)}" for name, value in known.items())
+    sentences = []
+    if estimate.total is not None:
+        on_mesh = "" if "space" in known else " on this mesh"
+        sentences.append(f"about {percent(estimate.total)} % of the largest excursion{on_mesh} ({listed})")
+        if forecast := wish(estimate, wall_seconds):
+            target, seconds = forecast
+            sentences[0] += f"; {percent(target)} %{on_mesh} would take about {seconds:.2g} s"
+    elif estimate.time_until_then is not None:
+        sentences.append(
+            f"about {percent(estimate.time_until_then)} % in time until t = {estimate.agree_until:.4g} s, then unknown"
+        )
+        apart = max(estimate.spread_after.values())
+        sentences.append(f"afterwards the mean positions of bodies change by up to {percent(apart)} % with the step")
+    return sentences + estimate.notes
+
+
+def wish(estimate: ErrorEstimate, wall_seconds: float) -> tuple[float, float] | None:
+    """The next power of ten below the error, and the wall time it would take [s]; None if that cannot be told."""
+    total = estimate.total
+    if total is None or not LEAST < total < math.inf:
+        return None
+    target = 10.0 ** (math.ceil(math.log10(total)) - 1)
+    return target, wall_seconds * work_for(estimate, target)
+
+
+def work_for(estimate: ErrorEstimate, target: float) -> float:
+    """Work for an error, over that of the run: half of it is left to time where both time and space are estimated."""
+    shares = [(estimate.time, 1.0 / (estimate.order or 1.0)), (estimate.space, MESH_WORK / MESH_ORDER)]
+    known = [(error, exponent) for error, exponent in shares if error]
+    return math.prod(max(1.0, len(known) * error / target) ** exponent for error, exponent in known)
+
+
+def percent(value: float) -> str:
+    """A fraction in percent, with two digits."""
+    if value >= 1.0:
+        return f"{100.0 * value:.0f}"
+    return f"{100.0 * value:.2g}" if value >= LEAST else f"< {100.0 * LEAST:.2g}" if value > 0.0 else "0"

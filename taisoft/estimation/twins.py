@@ -1,0 +1,137 @@
+"""Twins: simulators that accompany a run with other settings, or on another mesh, from the same state.
+
+All of them take whole steps, and meet the run at the times of the comparisons.
+"""
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from taisoft.dynamics.contact import TOLERANCE as CONTACT_TOLERANCE
+from taisoft.dynamics.implicit import DEFAULT_TOLERANCE
+from taisoft.errors import SimulationError, TaisoftError, no_memory
+from taisoft.estimation.comparison import shared_nodes
+from taisoft.scene.refine import refined, with_order
+from taisoft.scene.scene import Scene
+from taisoft.stability import stable_dt
+
+if TYPE_CHECKING:
+    from taisoft.simulator import Simulator
+
+STABLE_FRACTION = 0.9  # of the stable dt, for explicit steps of a twin
+TIGHTER = 0.1  # a twin's tolerances over those of the run; much less takes many iterations, and in f32 meets rounding
+REFINED, ORDER = "refined", "order"  # meshes of a twin, besides a scene
+MESHES = (REFINED, ORDER)
+SAME_STATE = 1e-6  # largest distance of shared nodes at the start, over the size of the scene
+
+
+class Twin:
+    """One twin. Nodes `own` of the run are compared with nodes `theirs` of the twin; a twin that fails says why in `failed`.
+
+    what: in words; ratio: of its step, or mesh width, over the run's; steps: taken while the run takes `per` steps.
+    """
+
+    def __init__(self, what: str, sim: "Simulator", ratio: float, steps: int = 1, per: int = 1, nodes=(slice(None), slice(None))):
+        self.what, self.sim, self.ratio, self.steps, self.per = what, sim, ratio, steps, per
+        self.own, self.theirs = nodes
+        self.failed = ""
+        self.reports = self.unconverged = 0
+        self._start = sim.step_count
+
+    def follow(self, run_steps: int) -> None:
+        """Take the steps that belong to `run_steps` steps of the run."""
+        end = self._start + run_steps * self.steps // self.per
+        try:
+            while self.sim.step_count < end and not self.failed:
+                report = self.sim.advance(end - self.sim.step_count)
+                self.reports += 1
+                self.unconverged += not report.converged
+        except (SimulationError, MemoryError) as error:
+            self.failed = str(no_memory("its next step", error) if isinstance(error, MemoryError) else error)
+
+    def positions(self) -> np.ndarray:
+        """Positions of the compared nodes (k,3) [m]."""
+        return self.sim.positions()[self.theirs]
+
+
+def larger_steps(sim: "Simulator") -> list[Twin]:
+    """Twins with twice and four times the step; empty where explicit steps would be unstable."""
+    if sim.settings.explicit and 4.0 * sim.dt > STABLE_FRACTION * sim.stable_dt:
+        return []
+    return [Twin(f"dt = {r * sim.dt:.4g} s", sim._copy(dt=r * sim.dt), r, per=r) for r in (2, 4)]
+
+
+def smaller_steps(sim: "Simulator") -> list[Twin]:
+    """A twin with half the step."""
+    return [Twin(f"dt = {0.5 * sim.dt:.4g} s", sim._copy(dt=0.5 * sim.dt), 0.5, steps=2)]
+
+
+def tighter(sim: "Simulator") -> Twin | None:
+    """A twin with tighter tolerances of all solvers; None if nothing is solved."""
+    given, precision = sim.settings, sim.settings.precision
+    used = {"linear_tolerance": given.linear_tolerance} if given.linear_tolerance else {}
+    if not given.explicit:
+        used["newton_tolerance"] = given.newton_tolerance or DEFAULT_TOLERANCE[precision]
+    if sim.touches:
+        used["contact_tolerance"] = given.contact_tolerance or CONTACT_TOLERANCE[precision]
+    tight = {name: TIGHTER * value for name, value in used.items()}
+    return Twin(f"tolerances x {TIGHTER:g}", sim._copy(**tight), TIGHTER) if tight else None
+
+
+def on_mesh(sim: "Simulator", mesh: str | Scene) -> Twin:
+    """A twin on another mesh: "refined", "order" (the other order of elements) or the scene itself on another mesh.
+
+    Raises SceneError or SimulationError if it cannot be made, or does not start as the run does.
+    """
+    scene = _other_mesh(sim, mesh)
+    dt, steps = sim.dt, 1
+    settings = sim._arguments()
+    if sim.settings.explicit:
+        limit = STABLE_FRACTION * stable_dt(scene, sim.settings.integrator == "velocity_verlet")
+        steps = max(1, math.ceil(dt / limit))
+    other = type(sim)(scene, **settings | {"dt": dt / steps})
+    try:
+        nodes = shared_nodes(*_nodes(sim), *_nodes(other))
+        _check_start(sim, other, nodes)
+    except TaisoftError:
+        other.close()
+        raise
+    ratio = (sum(b.mesh.n_tets for b in sim.scene.bodies) / sum(b.mesh.n_tets for b in scene.bodies)) ** (1.0 / 3.0)
+    what = mesh if isinstance(mesh, str) else f"{sum(b.mesh.n_tets for b in scene.bodies):,} tets"
+    return Twin(f"mesh: {what}", other, ratio, steps, nodes=nodes)
+
+
+def _other_mesh(sim: "Simulator", mesh: str | Scene) -> Scene:
+    if isinstance(mesh, Scene):
+        names = [[b.name for b in scene.bodies] for scene in (sim.scene, mesh)]
+        if names[0] != names[1]:
+            raise SimulationError(f"error_mesh: its bodies are {', '.join(names[1])}, and those of the run {', '.join(names[0])}")
+        return mesh
+    if mesh not in MESHES:
+        raise SimulationError(f"error_mesh {mesh!r} is unknown: it must be {' or '.join(map(repr, MESHES))}, or a scene")
+    if mesh == REFINED:
+        return refined(sim.scene)
+    orders = {b.order for b in sim.scene.bodies}
+    if len(orders) > 1:
+        raise SimulationError("error_mesh 'order': the bodies have both orders, so there is no other one: use 'refined'")
+    return with_order(sim.scene, 3 - orders.pop())
+
+
+def _nodes(sim: "Simulator") -> tuple[np.ndarray, list]:
+    """Rest positions (n,3) [m] of all nodes, and the number of nodes of each body by name."""
+    bodies = sim.scene.bodies
+    return np.concatenate([b.rest_positions for b in bodies]), [[b.name, b.n_nodes] for b in bodies]
+
+
+def _check_start(sim: "Simulator", other: "Simulator", nodes: tuple[np.ndarray, np.ndarray]) -> None:
+    """Raise SimulationError unless a twin on another mesh, which starts as its scene does, has the run's state."""
+    own, theirs = nodes
+    x, v, dt = sim.positions(), sim.velocities(), max(sim.dt, 1.0 / 60.0)
+    size = np.ptp(x, axis=0).max()
+    apart = np.abs(x[own] - other.positions()[theirs]).max()
+    faster = np.abs(v[own] - other.velocities()[theirs]).max() * dt
+    if sim.time != other.time or max(apart, faster) > SAME_STATE * size:
+        raise SimulationError(
+            "error_mesh: a twin on another mesh starts with the scene, so the run must start there too: reset()"
+        )
