@@ -247,7 +247,7 @@ def print_summary(result: RunReport, sim, observers: Observers, recording: Recor
     if len(problems) > PROBLEMS_SHOWN:
         _print_lines("", [f"and {len(problems) - PROBLEMS_SHOWN} more problems"])
     if result.error_estimate is not None:
-        _print_lines("error", describe_error(result.error_estimate, result.wall_seconds))
+        _print_lines("error", describe_error(result.error_estimate, result.wall_seconds - observers.seconds))
     print_state(sim)
     output, compiling = f"{observers.seconds:.2f} s of it for output", f"{result.compile_seconds:.2f} s to compile"
     _print_lines("wall", [f"{result.wall_seconds:.2f} s, {output}; plus {compiling}"])

@@ -14,7 +14,7 @@ LEAST = 1e-6  # smaller errors are shown as "below" it
 
 
 def describe_error(estimate: ErrorEstimate, wall_seconds: float) -> list[str]:
-    """Sentences for the summary of a run of wall_seconds [s]: the error, what a smaller one would cost, and the notes."""
+    """Sentences for the summary of a run of wall_seconds [s], without output: the error, what a smaller one would cost, and the notes."""
     parts = {name: getattr(estimate, name) for name in ("time", "space", "solver")}
     known = {name: value for name, value in parts.items() if value is not None}
     listed = ", ".join(f"{name} {percent(value)}" for name, value in known.items())
@@ -24,7 +24,7 @@ def describe_error(estimate: ErrorEstimate, wall_seconds: float) -> list[str]:
         sentences.append(f"about {percent(estimate.total)} % of the largest excursion{on_mesh} ({listed})")
         if forecast := wish(estimate, wall_seconds):
             target, seconds = forecast
-            sentences[0] += f"; {percent(target)} %{on_mesh} would take about {seconds:.2g} s"
+            sentences[0] += f"; {percent(target)} %{on_mesh} would take about {seconds:.{2 if seconds < 100.0 else 3}g} s"
     elif estimate.time_until_then is not None:
         sentences.append(
             f"about {percent(estimate.time_until_then)} % in time until t = {estimate.agree_until:.4g} s, then unknown"
