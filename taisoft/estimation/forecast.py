@@ -14,7 +14,7 @@ LEAST = 1e-6  # smaller errors are shown as "below" it
 
 
 def describe_error(estimate: ErrorEstimate, wall_seconds: float) -> list[str]:
-    """Sentences for the summary of a run of wall_seconds [s], without output: the error, what a smaller one would cost, and the notes."""
+    """Sentences on a run of wall_seconds [s] without output: the error, what a smaller one would cost, and the notes."""
     parts = {name: getattr(estimate, name) for name in ("time", "space", "solver")}
     known = {name: value for name, value in parts.items() if value is not None}
     listed = ", ".join(f"{name} {percent(value)}" for name, value in known.items())
