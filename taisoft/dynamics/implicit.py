@@ -122,7 +122,7 @@ class ImplicitStepper:
 
     def numbers_changed(self) -> None:
         """Update for changed gravity or material numbers."""
-        self.solver.rounding.measure()
+        self.solver.numbers_changed()
 
     def loads_changed(self) -> None:
         """Do nothing: every stage reads the loads."""
