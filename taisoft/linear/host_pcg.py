@@ -16,12 +16,7 @@ from taisoft.linear.pcg import MAX_NEGATIVE_STEP, LinearResult, PcgWork
 
 
 def solve(
-    m: Model,
-    A: BlockCsr,
-    w: PcgWork,
-    tolerance: float,
-    max_iterations: int,
-    precondition: Callable[[np.ndarray], np.ndarray],
+    m: Model, A: BlockCsr, w: PcgWork, tolerance: float, max_iterations: int, precondition: Callable[[np.ndarray], np.ndarray]
 ) -> LinearResult:
     """Solve for w.y given w.rhs, as `pcg.solve` without coupling and for all nodes.
 
