@@ -36,6 +36,7 @@ RATIO, OVERHEAD, BUILD, ITERATIONS = {ti.f32: 9.0, ti.f64: 5.0}, 10_000, 300, 10
 GROWTH, SLACK = 2.0, 10  # a solve that takes more than GROWTH times the first iterations + SLACK requires a new hierarchy
 LONGEST = 300  # iterations of a solve with a new hierarchy
 PERIOD = 128  # solves by multigrid between trials of pcg
+UNFINISHED = 2.0  # of the iterations of a solve that multigrid interrupted: how many it is expected to have needed
 RETRY = 4  # a failure of multigrid multiplies the savings needed for a next trial by this
 STATE = {"active": bool, "savings": float, "uses": int, "failures": int, "rate": float, "pcg_rate": float}  # in a checkpoint
 
@@ -45,13 +46,16 @@ class LinearSolver:
 
     def __init__(self, model: Model):
         self.model = model
+        self._ratio = RATIO[model.real] + OVERHEAD / model.n_nodes  # duration of an iteration of multigrid over one of pcg
+        self.forget()
+
+    def forget(self) -> None:
+        """Discard everything learned so far, after the state was set."""
         self.active = False  # multigrid is in use
         self.savings = 0.0  # iterations of pcg that multigrid would have saved since it was last in use, or has saved since
         self.uses = self.failures = 0  # solves by multigrid since the last trial of pcg; times that it did not pay
         self.rate = self.pcg_rate = 0.0  # iterations per decimal digit: first solve with the hierarchy, last one by pcg
-        self._ratio = RATIO[model.real] + OVERHEAD / model.n_nodes  # duration of an iteration of multigrid over one of pcg
-        self._built: tuple | None = None  # (c, beta, x, free) of the last build
-        self._hierarchy: Multigrid | None = None
+        self.release()
 
     @property
     def field_bytes(self) -> dict[str, int]:
@@ -60,7 +64,8 @@ class LinearSolver:
 
     def release(self) -> None:
         """Discard the hierarchy; the next solve by multigrid builds a new one."""
-        self._hierarchy = self._built = None
+        self._hierarchy: Multigrid | None = None
+        self._built: tuple | None = None  # (c, beta, x, free) of the last build
 
     def snapshot(self) -> dict:
         """Return what later solves depend on."""
@@ -107,6 +112,7 @@ class LinearSolver:
         self.pcg_rate = found.iterations / digits
         if most <= found.iterations < limit and not (found.converged or found.negative):
             self.active, self.savings = True, 0.0
+            self.pcg_rate *= UNFINISHED
         return found
 
     def _solve_multigrid(self, system: "StageSystem", tolerance: float, digits: float) -> pcg.LinearResult | None:

@@ -6,7 +6,8 @@ the coefficients of an orthonormal basis of its aggregate's rigid-body modes.
 Sources: Bell, Dalton and Olson, "Exposing fine-grained parallelism in algebraic multigrid methods", SIAM J. Sci. Comput. 34(4),
 2012 (aggregates); Vanek, Mandel and Brezina, "Algebraic multigrid by smoothed aggregation for second and fourth order elliptic
 problems", Computing 56, 1996 (modes).
-Weakness: aggregates follow the mesh's edges, not the strength of their coupling, so flat elements are coarsened in all directions.
+Weakness: aggregates follow the mesh's edges, not the strength of their coupling, so flat elements are coarsened in every
+direction.
 """
 
 import numpy as np
@@ -17,7 +18,7 @@ DEPENDENT = 1e-8  # of an aggregate's modes: a smaller remainder of a mode depen
 
 
 def rigid_modes(x: np.ndarray, free: np.ndarray) -> np.ndarray:
-    """Rigid-body modes (n, 3, 6) of positions x (n, 3) [m], 0 on constrained axes (free: n, 3); rotations by lengths of order 1."""
+    """Rigid-body modes (n, 3, 6) of positions x (n, 3) [m], 0 on constrained axes (free: (n, 3) bool), of order 1 at most."""
     arm = x - x.mean(axis=0)
     arm = arm / max(float(np.abs(arm).max()), 1e-300)
     modes = np.zeros((len(x), 3, MODES))
@@ -68,7 +69,8 @@ def prolongation(modes: np.ndarray, aggregates: np.ndarray) -> tuple[sp.bsr_matr
     basis, coarse = np.linalg.qr(stacked.reshape(n_coarse, -1, MODES))
     length = np.sqrt((stacked**2).sum(axis=(1, 2, 3)))
     unused = np.abs(np.diagonal(coarse, axis1=1, axis2=2)) <= DEPENDENT * length[:, None]
-    basis, coarse = np.where(unused[:, None, :], 0.0, basis), np.where(unused[:, :, None], 0.0, coarse)
+    moved = stacked.reshape(n_coarse, -1, MODES).any(axis=2)  # rounding must not move the others
+    basis, coarse = np.where(unused[:, None, :] | ~moved[:, :, None], 0.0, basis), np.where(unused[:, :, None], 0.0, coarse)
     blocks = np.zeros((n, d, MODES))
     blocks[order] = basis.reshape(n_coarse, -1, d, MODES)[owner, slot]
     row_start = np.concatenate([[0], np.cumsum(aggregates >= 0)])
