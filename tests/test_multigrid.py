@@ -197,6 +197,7 @@ def test_negative_curvature_is_reported():
 
 def test_iterations_hardly_grow_with_the_mesh(monkeypatch):
     monkeypatch.setattr(multigrid, "SMALL", 300)
+    monkeypatch.setattr(multigrid, "NARROW", 0)
     counts, plain = [], []
     for cells in ((6, 3, 3), (12, 6, 6), (24, 12, 12)):
         with built(held_box(cells), "f64") as made:
@@ -222,6 +223,9 @@ def without_multigrid(monkeypatch):
 
 @pytest.mark.parametrize("precision", ["f64", "f32"])
 def test_steps_are_those_without_multigrid_also_after_a_release(monkeypatch, precision):
+    monkeypatch.setattr(linear_solver, "RATIO", dict.fromkeys(linear_solver.RATIO, 1.0))
+    monkeypatch.setattr(linear_solver, "BUILD", 50)
+
     def run() -> tuple:
         scene = strip()
         scene.body("strip").move(lambda X: X[:, 0] > 4.99, lambda t: (0.0, 0.5 * t, 0.0) if t < 0.1 else None)
@@ -257,9 +261,9 @@ def test_steps_resume_bitwise(tmp_path, damping):
 
 def test_where_it_does_not_pay_it_is_given_up(monkeypatch):
     """Multigrid that is said to be slow is tried, and then only after several times the savings."""
-    monkeypatch.setattr(linear_solver, "RATIO", dict.fromkeys(linear_solver.RATIO, 60.0))
-    monkeypatch.setattr(linear_solver, "ITERATIONS", 1)
-    with ts.Simulator(held_box((24, 12, 12), 1e9), dt=1 / 30, integrator="implicit_euler", precision="f64") as sim:
+    monkeypatch.setattr(linear_solver, "RATIO", dict.fromkeys(linear_solver.RATIO, 400.0))
+    monkeypatch.setattr(linear_solver, "ITERATIONS", 0)
+    with ts.Simulator(strip(), dt=1 / 30, integrator="implicit_euler", precision="f64") as sim:
         used = [sim.step().multigrid_solves for _ in range(12)]
     assert 0 < sum(used) < 12 and used[-1] == 0
 
@@ -269,5 +273,5 @@ def test_a_soft_scene_does_not_use_it():
     with ts.Simulator(held_box(), dt=1 / 60, integrator="implicit_euler") as sim:
         reports = [sim.step() for _ in range(3)]
         assert "multigrid" not in sim.field_bytes
-    assert not any(r.multigrid_solves for r in reports) and sum(r.linear_iterations for r in reports) > 10
+    assert not any(r.multigrid_solves for r in reports) and sum(r.linear_iterations for r in reports) > 5
     assert runtime.launches["multiply"] == before
