@@ -95,6 +95,7 @@ class LinearSolver:
         self.uses += 1
         if found is None or self.savings < -BUILD:
             self.failures += 1
+            self.release()
             self.active, self.uses, self.savings = False, 0, -BUILD * float(RETRY**self.failures)
         elif self.uses >= PERIOD:
             self.active, self.uses, self.savings = False, 0, 0.8 * BUILD
