@@ -27,6 +27,7 @@ class StepReport:
     substeps: int = 1  #: of an implicit step; more than one if it did not converge or bodies would have passed each other
     newton_iterations: int = 0  #: with those of discarded attempts; an elimination counts by its share of the nodes
     linear_iterations: int = 0  #: of conjugate gradients, counted alike
+    multigrid_solves: int = 0  #: linear systems that multigrid preconditioned
     contact_iterations: int = 0  #: sweeps of explicit steps, multiplier updates of implicit ones
     residual: float = 0.0  #: relative residual of the implicit equations, 0 for explicit steps
     contact_residual: float = 0.0  #: residual of the contact laws, |p - prox(p - f u)| / |p|

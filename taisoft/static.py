@@ -33,6 +33,7 @@ class StaticResult:
     residual: float  #: |force on free axes| / |applied load|, without load relative to the constraint forces
     iterations: int  #: of Newton's method, over all load steps
     linear_iterations: int  #: of conjugate gradients
+    multigrid_solves: int  #: linear systems that multigrid preconditioned
     load_steps: int  #: steps that the load was applied in
     elastic: float  #: stored energy [J]
     n_inverted: int  #: tets with J <= 0
@@ -119,7 +120,7 @@ class StaticSolver:
     def solve(self) -> StaticResult:
         """Apply the full load in one step; if that fails, use load steps that halve on failure and grow by half on success."""
         rest = self.simulation.layout.rest
-        self.newton = self.linear = 0
+        self.newton = self.linear = self.multigrid = 0
         result, steps, applied = self._attempt(rest, 1.0, self.tolerance), 1, 1.0
         if not self._is_acceptable(result):
             applied, step, x, steps = 0.0, 0.25, rest, 0
@@ -153,6 +154,7 @@ class StaticSolver:
         result = solve(self.solver, Stage(0.0, 1.0, 1.0, tolerance, max_newton=max_newton))
         self.newton += result.newton_iterations
         self.linear += result.linear_iterations
+        self.multigrid += result.multigrid_solves
         return result
 
     def _residual(self, result: StageResult) -> float:
@@ -174,6 +176,7 @@ class StaticSolver:
             residual=self._residual(result),
             iterations=self.newton,
             linear_iterations=self.linear,
+            multigrid_solves=self.multigrid,
             load_steps=steps,
             elastic=float(scalars[ELASTIC]),
             n_inverted=int(scalars[N_INVERTED]),

@@ -36,6 +36,7 @@ def hard_matrices() -> dict[str, np.ndarray]:
         "tiny": 1e-6 * random,
         "mixed sizes": np.where(rng.random(random.shape) < 0.5, 1e-6, 1.0) * random,
         "huge": 1e30 * random,
+        "stiff, off the diagonal by 1e-30": np.diag([1e9, 1.0, 2.0])[None] + 1.2e-30 * (1.0 - np.eye(3)),
         "stretched 1e-3 to 1e3": stretched(rng, 10.0 ** rng.uniform(-3, 3, (400, 3))),
         "needles": stretched(rng, (1e3, 1e-3, -1e-3)),
     }

@@ -119,10 +119,11 @@ class ImplicitStepper:
         self._n_previous = 0  # previous states in the history
         self._beta = self._dt = 0.0  # of the last step
         self.contact.forget()
+        self.solver.linear_solver.forget()
 
     def numbers_changed(self) -> None:
         """Update for changed gravity or material numbers."""
-        self.solver.rounding.measure()
+        self.solver.numbers_changed()
 
     def loads_changed(self) -> None:
         """Do nothing: every stage reads the loads."""
@@ -161,6 +162,7 @@ class ImplicitStepper:
             substeps=self._substepping.substeps,
             newton_iterations=result.newton_iterations,
             linear_iterations=result.linear_iterations,
+            multigrid_solves=result.multigrid_solves,
             contact_iterations=result.contact_iterations,
             residual=max(result.residual, worst) if name else result.residual,
             contact_residual=result.contact_residual,

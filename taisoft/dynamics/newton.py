@@ -25,6 +25,7 @@ from taisoft.dynamics.frictional import FINER, MAX_MULTIPLIERS, PAST, PROGRESS, 
 from taisoft.dynamics.results import StageResult, relative
 from taisoft.dynamics.stage import AGAIN, ELASTIC_STAGE, IMPACT, LINEARISED, STEP
 from taisoft.dynamics.stage_system import Stage, StageSystem
+from taisoft.linear.pcg import LinearResult
 
 LINEAR_LIMIT = 0.01  # relative true residual above which a linearly implicit step has failed
 MAX_FORCING, INCREASE_FORCING = 0.1, 3e-2  # CG's maximum tolerance, and that after a step that increased |r|
@@ -47,7 +48,7 @@ class Newton:
         self.is_linearised = system.kind == LINEARISED  # the caller then handles an indefinite matrix
         self.floor = system.rounding.stage_floor(stage.c, stage.beta)
         self.max_forcing = MAX_FORCING if stage.c > 0.0 else STATIC_FORCING
-        self.newton = self.linear = self.multipliers = self.n_remembered = 0
+        self.newton = self.linear = self.multigrid = self.multipliers = self.n_remembered = 0
         self.eliminated = 0.0  # Newton iterations on few nodes, times their fraction of all nodes
         self.rounding = self.negative = False  # |r| is only rounding; negative curvature was found
 
@@ -126,8 +127,7 @@ class Newton:
     def _step(self) -> bool:
         """Solve for a direction and step along it; return whether the state moved."""
         system = self.system
-        solution = system.direction(self._linear_tolerance())
-        self.linear += solution.iterations
+        solution = self._direction(self._linear_tolerance())
         self.newton, self.n_inner = self.newton + 1, self.n_inner + 1
         self.previous, self.negative = self.r, self.negative or solution.negative
         if self.is_linearised and solution.negative:
@@ -141,6 +141,12 @@ class Newton:
         near_floor = self.r <= (ROUNDING if self.stage.c > 0.0 else 1.0) * self.floor
         self.rounding = near_floor and self.r > 0.5 * self.previous
         return moved
+
+    def _direction(self, tolerance: float) -> LinearResult:
+        """Solve for a direction and count the iterations."""
+        solution = self.system.direction(tolerance)
+        self.linear, self.multigrid = self.linear + solution.iterations, self.multigrid + solution.multigrid
+        return solution
 
     def _eliminate(self) -> bool:
         """Solve the few nodes that dominate |r| after a slow step; return whether there were any."""
@@ -189,6 +195,7 @@ class Newton:
             self.rounding or r <= self.floor,
             self.multipliers,
             system.contact_residual,
+            multigrid_solves=self.multigrid,
         )
 
     def solve_once(self) -> StageResult:
@@ -202,8 +209,7 @@ class Newton:
             tolerance = self.stage.linear_tolerance or min(self._linear_tolerance(), self.stage.tolerance)
             for projected in (False, True):  # an indefinite quadratic form has no minimum
                 system.form_matrix(projected)
-                solution = system.direction(tolerance)
-                self.linear += solution.iterations
+                solution = self._direction(tolerance)
                 if not solution.negative:
                     break
             solved = solution.converged and system.linear_residual() <= LINEAR_LIMIT

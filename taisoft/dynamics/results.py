@@ -16,6 +16,7 @@ class StageResult:
     contact_iterations: int = 0  # multipliers
     contact_residual: float = 0.0
     unbalanced: tuple[float, str] = (0.0, "")  # largest relative residual of a piece, and its name, if unbalanced
+    multigrid_solves: int = 0
 
 
 @dataclass
@@ -29,6 +30,7 @@ class StepResult:
     substeps: int = 1
     newton_iterations: int = 0
     linear_iterations: int = 0
+    multigrid_solves: int = 0
     contact_iterations: int = 0
     residual: float = 0.0
     contact_residual: float = 0.0
@@ -54,6 +56,7 @@ def merge(results: list[StageResult]) -> StageResult:
         sum(r.contact_iterations for r in results),
         max(r.contact_residual for r in results),
         max(r.unbalanced for r in results),
+        sum(r.multigrid_solves for r in results),
     )
 
 
@@ -64,5 +67,6 @@ def count_all(result: StageResult, discarded: list[StageResult]) -> StageResult:
         result,
         newton_iterations=total.newton_iterations,
         linear_iterations=total.linear_iterations,
+        multigrid_solves=total.multigrid_solves,
         contact_iterations=total.contact_iterations,
     )

@@ -27,6 +27,7 @@ from taisoft.dynamics.contact_terms import (
     save_diagonal,
     update_impulses,
 )
+from taisoft.dynamics.linear_solver import LinearSolver
 from taisoft.dynamics.linearised import LONGEST, advance, begin_linearised, end_linearised
 from taisoft.dynamics.stage import (
     AGAIN,
@@ -43,7 +44,7 @@ from taisoft.dynamics.stage import (
     set_direction_to_rest,
 )
 from taisoft.fem.model import Model
-from taisoft.fem.node_graph import EVERYTHING
+from taisoft.fem.node_graph import EVERYTHING, Subset
 from taisoft.fem.state import END_SLOPE, START_SLOPE, STEP_LENGTH
 from taisoft.linear import block_csr, pcg
 from taisoft.linear.block_csr import BlockCsr
@@ -110,6 +111,7 @@ class StageSystem:
             pcg=pcg.build_pcg(model, arena),
         )
         self.rounding = RoundingFloor(model, eps)
+        self.linear_solver = LinearSolver(model)
         self.kind = ELASTIC_STAGE
         self.scale = 0.0  # that |r| is relative to, at its last evaluation
         self.r_scale = 1.0  # R over the r-factors
@@ -125,23 +127,32 @@ class StageSystem:
 
     @property
     def field_bytes(self) -> dict[str, int]:
-        """Bytes by name of the fields allocated for contacts and for elimination."""
-        return self._contact_arena.bytes | (self._lists.field_bytes if self._lists else {})
+        """Bytes by name of the fields allocated for contacts, elimination and multigrid."""
+        lists = self._lists.field_bytes if self._lists else {}
+        return self._contact_arena.bytes | lists | self.linear_solver.field_bytes
 
     def release(self) -> None:
         """Free their memory."""
         self._contact_arena.release()
+        self.linear_solver.release()
         if self._lists:
             self._lists.release()
 
     def snapshot(self) -> dict:
-        """Return what persists between stages: rounding floor and reactions."""
-        return self.rounding.snapshot() | {"residual": self.work.residual.to_numpy()}
+        """Return what persists between stages: rounding floor, reactions, and the choice of the linear solver."""
+        own = {"residual": self.work.residual.to_numpy(), "linear_solver": self.linear_solver.snapshot()}
+        return self.rounding.snapshot() | own
 
     def restore(self, kept: dict) -> None:
         """Restore a `snapshot`."""
         self.rounding.restore(kept)
         upload([(self.work.residual, kept["residual"])])
+        self.linear_solver.restore(kept["linear_solver"])
+
+    def numbers_changed(self) -> None:
+        """Update for changed gravity or material numbers."""
+        self.rounding.measure()
+        self.linear_solver.release()
 
     def _allocate_contacts(self) -> None:
         """Allocate storage for the contacts of this step."""
@@ -303,12 +314,16 @@ class StageSystem:
 
     def form_matrix(self, projected: bool = False) -> None:
         """Form the matrix at the present state, without J^T D J, which the linear solve adds."""
-        m, stage, subset = self.model, self.stage, self.work.pcg.subset
-        block_csr.assemble(m, self.matrix, subset, projected)
-        block_csr.to_system(m, self.matrix, self.damper or self.matrix, subset, stage.c, stage.beta)
+        subset = self.work.pcg.subset
+        self.form(subset, projected, self.stage.c, self.stage.beta)
         self._same_matrix = False
         if self._k.any:
-            save_diagonal(m, self.matrix, self._k, subset)
+            save_diagonal(self.model, self.matrix, self._k, subset)
+
+    def form(self, subset: Subset, projected: bool, c: float, beta: float) -> None:
+        """Form the matrix of c and beta at the present positions, for the rows of a subset."""
+        block_csr.assemble(self.model, self.matrix, subset, projected)
+        block_csr.to_system(self.model, self.matrix, self.damper or self.matrix, subset, c, beta)
 
     def form_matrix_and_factors(self, projected: bool = False) -> None:
         """Form the matrix and the contacts' r-factors, which stay fixed during the stage."""
@@ -318,6 +333,8 @@ class StageSystem:
     def direction(self, tolerance: float) -> pcg.LinearResult:
         """Solve for y of pcg from -r."""
         m, w = self.model, self.work
+        if not self._k.any and not w.pcg.subset.restricted:
+            return self.linear_solver.solve(self, tolerance)
         solution = pcg.solve(m, self.matrix, w.pcg, tolerance, pcg.iteration_limit(m), self._k.coupling, self._same_matrix)
         self._same_matrix = True
         return solution
@@ -327,6 +344,7 @@ class StageSystem:
     def assemble_damper(self) -> None:
         """Assemble K_d, the projected K at the present x, for the new step."""
         if self.damper is not None:
+            self.linear_solver.release()  # its matrix contains K_d
             block_csr.assemble(self.model, self.damper, EVERYTHING, True)
 
     def linear_residual(self) -> float:

@@ -94,7 +94,8 @@ def _jacobi_angle(app, aqq, apq):
     """(cosine, sine) of the rotation that zeroes the off-diagonal apq of a symmetric 2x2 matrix."""
     small = abs(apq) <= 1e-30
     tau = (aqq - app) / ti.select(small, 1.0 + 0.0 * apq, 2.0 * apq)
-    t = ti.select(tau >= 0.0, 1.0 + 0.0 * tau, -1.0 + 0.0 * tau) / (abs(tau) + ti.sqrt(1.0 + tau * tau))
+    sign = ti.select(tau >= 0.0, 1.0 + 0.0 * apq, -1.0 + 0.0 * apq)  # not of tau, which overflows in f32 if apq is tiny
+    t = sign / (abs(tau) + ti.sqrt(1.0 + tau * tau))
     t0 = ti.select(small, 0.0 * t, t)
     c = 1.0 / ti.sqrt(1.0 + t0 * t0)
     return c, t0 * c

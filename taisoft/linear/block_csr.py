@@ -256,12 +256,17 @@ def unpacked(blocks: np.ndarray) -> np.ndarray:
     return blocks.reshape(-1, 3, 4)[:, :, :3].swapaxes(1, 2).astype(np.float64)
 
 
-def to_scipy(m: Model, A: BlockCsr) -> sp.csr_matrix:
-    """Copy the matrix to the host, (3 n_nodes, 3 n_nodes) float64."""
+def to_bsr(m: Model, A: BlockCsr) -> sp.bsr_matrix:
+    """Copy the matrix to the host, blocks (3, 3) float64 in ascending columns."""
     start, column, value, diagonal = download([A.row_start, A.column, A.value, A.diagonal])
     start, off, diagonal = start.astype(np.int64), unpacked(value), unpacked(diagonal)
     shape = (3 * m.n_nodes, 3 * m.n_nodes)
     rows = np.arange(m.n_nodes)
-    return (
-        sp.bsr_matrix((off, column, start), shape=shape) + sp.bsr_matrix((diagonal, rows, np.arange(m.n_nodes + 1)), shape=shape)
-    ).tocsr()
+    return sp.bsr_matrix((off, column, start), shape=shape) + sp.bsr_matrix(
+        (diagonal, rows, np.arange(m.n_nodes + 1)), shape=shape
+    )
+
+
+def to_scipy(m: Model, A: BlockCsr) -> sp.csr_matrix:
+    """Copy the matrix to the host, (3 n_nodes, 3 n_nodes) float64."""
+    return to_bsr(m, A).tocsr()

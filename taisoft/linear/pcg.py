@@ -69,6 +69,7 @@ class LinearResult:
     iterations: int
     converged: bool
     negative: bool  # whether negative curvature was found
+    multigrid: bool = False  # whether multigrid was the preconditioner
 
 
 def build_pcg(model: Model, arena: FieldArena) -> PcgWork:

@@ -1,0 +1,159 @@
+"""Choose the preconditioner of a linear solve without contacts: that of `pcg`, or multigrid where that is faster.
+
+A solve starts with `pcg`. What its iterations take beyond an expected solve by multigrid is added up over the solves; when that
+would have paid for building the hierarchy, it is built, and the solve starts again with it. From then on all solves use it,
+until they have lost the same amount against the last solve by `pcg`, which then needs a multiple of the saving before multigrid
+is tried again. After PERIOD solves `pcg` is tried again anyway.
+
+The hierarchy is built from the projected matrix, which is positive definite, at the present positions. It is kept over Newton
+iterations and steps, until a solve takes GROWTH times as many iterations as the first one did for the same accuracy. All
+decisions count iterations and nodes, so they are the same in every run. A checkpoint holds the positions of the last build, from
+which the hierarchy is built again.
+
+Solves with contacts, those of elimination and those on CUDA use `pcg`.
+"""
+
+import math
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import taichi as ti
+
+from taisoft.backend.arrays import upload
+from taisoft.fem.model import Model
+from taisoft.fem.node_graph import EVERYTHING
+from taisoft.linear import block_csr, host_pcg, pcg
+from taisoft.linear.aggregation import rigid_modes
+from taisoft.linear.multigrid import Multigrid
+
+if TYPE_CHECKING:
+    from taisoft.dynamics.stage_system import StageSystem
+
+# Durations in iterations of `pcg`, measured on one core: a multigrid iteration takes RATIO, by precision, plus OVERHEAD over the
+# number of nodes; building takes BUILD. A solve by multigrid is expected to take ITERATIONS, before the first one.
+RATIO, OVERHEAD, BUILD, ITERATIONS = {ti.f32: 9.0, ti.f64: 5.0}, 10_000, 300, 10
+GROWTH, SLACK = 2.0, 10  # a solve that takes more than GROWTH times the first iterations + SLACK requires a new hierarchy
+LONGEST = 300  # iterations of a solve with a new hierarchy
+PERIOD = 128  # solves by multigrid between trials of pcg
+UNFINISHED = 2.0  # of the iterations of a solve that multigrid interrupted: how many it is expected to have needed
+RETRY = 4  # a failure of multigrid multiplies the savings needed for a next trial by this
+STATE = {"active": bool, "savings": float, "uses": int, "failures": int, "rate": float, "pcg_rate": float}  # in a checkpoint
+
+
+class LinearSolver:
+    """Linear solver of one model's stages."""
+
+    def __init__(self, model: Model):
+        self.model = model
+        self._ratio = RATIO[model.real] + OVERHEAD / model.n_nodes  # duration of an iteration of multigrid over one of pcg
+        self.forget()
+
+    def forget(self) -> None:
+        """Discard everything learned so far, after the state was set."""
+        self.active = False  # multigrid is in use
+        self.savings = 0.0  # iterations of pcg that multigrid would have saved since it was last in use, or has saved since
+        self.uses = self.failures = 0  # solves by multigrid since the last trial of pcg; times that it did not pay
+        self.rate = self.pcg_rate = 0.0  # iterations per decimal digit: first solve with the hierarchy, last one by pcg
+        self.release()
+
+    @property
+    def field_bytes(self) -> dict[str, int]:
+        """Bytes of the hierarchy, if there is one."""
+        return {"multigrid": self._hierarchy.n_bytes} if self._hierarchy else {}
+
+    def release(self) -> None:
+        """Discard the hierarchy; the next solve by multigrid builds a new one."""
+        self._hierarchy: Multigrid | None = None
+        self._built: tuple | None = None  # (c, beta, x, free) of the last build
+
+    def snapshot(self) -> dict:
+        """Return what later solves depend on."""
+        c, beta, x, free = self._built or (0.0, 0.0, np.zeros((0, 3)), np.zeros((0, 3), dtype=bool))
+        return {name: getattr(self, name) for name in STATE} | {"c": c, "beta": beta, "x": x, "free": free}
+
+    def restore(self, kept: dict) -> None:
+        """Restore a `snapshot`."""
+        for name, kind in STATE.items():
+            setattr(self, name, kind(kept[name]))
+        self.release()
+        if len(kept["x"]):
+            self._built = float(kept["c"]), float(kept["beta"]), np.array(kept["x"]), np.array(kept["free"], dtype=bool)
+
+    def solve(self, system: "StageSystem", tolerance: float) -> pcg.LinearResult:
+        """Solve for y of pcg from its rhs. system: of a stage without contacts, on all nodes, whose matrix is formed."""
+        m, w, done = self.model, system.work.pcg, 0
+        if m.free.host is None:  # CUDA
+            return pcg.solve(m, system.matrix, w, tolerance, pcg.iteration_limit(m))
+        digits = max(-math.log10(tolerance), 1.0)
+        if not self.active:
+            found = self._solve_pcg(system, tolerance, digits)
+            if not self.active:
+                return found
+            done = found.iterations
+        found = self._solve_multigrid(system, tolerance, digits)
+        self.uses += 1
+        if found is None or self.savings < -BUILD:
+            self.failures += 1
+            self.release()
+            self.active, self.uses, self.savings = False, 0, -BUILD * float(RETRY**self.failures)
+        elif self.uses >= PERIOD:
+            self.active, self.uses, self.savings = False, 0, 0.8 * BUILD
+        if found is None:
+            found = pcg.solve(m, system.matrix, w, tolerance, pcg.iteration_limit(m))
+        return replace(found, iterations=done + found.iterations)
+
+    def _solve_pcg(self, system: "StageSystem", tolerance: float, digits: float) -> pcg.LinearResult:
+        """Solve without multigrid, or stop where it has become worth building: it is then active."""
+        worth = ITERATIONS * self._ratio
+        most = math.ceil(worth + BUILD - self.savings)
+        limit = pcg.iteration_limit(self.model)
+        found = pcg.solve(self.model, system.matrix, system.work.pcg, tolerance, min(most, limit))
+        self.savings = max(self.savings + found.iterations - worth, min(self.savings, 0.0))
+        self.pcg_rate = found.iterations / digits
+        if most <= found.iterations < limit and not (found.converged or found.negative):
+            self.active, self.savings = True, 0.0
+            self.pcg_rate *= UNFINISHED
+        return found
+
+    def _solve_multigrid(self, system: "StageSystem", tolerance: float, digits: float) -> pcg.LinearResult | None:
+        """Solve with the hierarchy, or with a new one if there is none or it is out of date; None if that fails too."""
+        m, w, free, wasted = self.model, system.work.pcg, self.model.free.host > 0.0, 0
+        if self._built is not None and np.array_equal(self._built[3], free):
+            if self._hierarchy is None:
+                self._build(system, *self._built)
+            most = math.ceil(GROWTH * self.rate * digits) + SLACK
+            found = host_pcg.solve(m, system.matrix, w, tolerance, most, self._hierarchy.apply)
+            if found.converged or found.negative:
+                return self._account(found, digits)
+            wasted = found.iterations
+            self.savings -= BUILD
+        self.release()
+        try:
+            self._build(system, system.stage.c, system.stage.beta, m.state.x.to_numpy(), free)
+        except np.linalg.LinAlgError:
+            return None
+        found = host_pcg.solve(m, system.matrix, w, tolerance, LONGEST, self._hierarchy.apply)
+        if not (found.converged or found.negative):
+            return None
+        self.rate = found.iterations / digits
+        return self._account(replace(found, iterations=wasted + found.iterations), digits)
+
+    def _account(self, found: pcg.LinearResult, digits: float) -> pcg.LinearResult:
+        """Add what a solve by multigrid saved, as far as it went on."""
+        if found.converged:
+            self.savings = min(self.savings + self.pcg_rate * digits - self._ratio * found.iterations, float(BUILD))
+        return replace(found, multigrid=True)
+
+    def _build(self, system: "StageSystem", c: float, beta: float, x: np.ndarray, free: np.ndarray) -> None:
+        """Build the hierarchy from the projected matrix at positions x."""
+        m, A = self.model, system.matrix
+        present = [(array, array.to_numpy()) for array in (m.state.x, A.value, A.diagonal)]
+        m.state.x.from_numpy(x)
+        system.form(EVERYTHING, True, c, beta)
+        matrix = block_csr.to_bsr(m, A)
+        upload(present)
+        row = np.repeat(np.arange(m.n_nodes), np.diff(matrix.indptr))
+        matrix.data *= free[row][:, :, None] & free[matrix.indices][:, None, :]
+        matrix.data[matrix.indices == row] += np.eye(3) * ~free[:, :, None]
+        self._hierarchy, self._built = Multigrid(matrix, rigid_modes(x, free)), (c, beta, x, free)
