@@ -172,6 +172,21 @@ def ipc(results: Path) -> str:
     return table(records, columns) + measured_on(numbers, "f64", f"at most {budget:g} s a scene")
 
 
+def crossings(results: Path) -> str:
+    """States judged and states that cross, by group of runs."""
+    numbers = newest(results, "crossings")
+    groups: dict[str, list[dict]] = {}
+    for row in numbers["rows"]:
+        groups.setdefault(row["group"], []).append(row)
+    columns = (
+        ("<group", lambda group: group),
+        ("runs", lambda group: f"{len(groups[group]):,}"),
+        ("states judged", lambda group: f"{sum(row['states'] for row in groups[group]):,}"),
+        ("states that cross", lambda group: f"{sum(row['crossing'] for row in groups[group]):,}"),
+    )
+    return table(list(groups), columns) + measured_on(numbers)
+
+
 def ipc_friction(results: Path) -> str:
     """How well friction holds in four scenes at three tolerances."""
     numbers = newest(results, "ipc_friction")
@@ -207,6 +222,7 @@ TABLES: dict[str, Callable[[Path], str]] = {  # by marker
     "ipc": ipc,
     "ipc_friction": ipc_friction,
     "error": error,
+    "crossings": crossings,
 }
 
 
