@@ -182,7 +182,11 @@ class Simulator(Guarded):
         new = Simulator(start, **(self._arguments() | settings))
         with thawed(new.scene):
             new.scene.allow_initial_overlap = self.scene.allow_initial_overlap
-        new._dynamics.continue_from(before)
+        try:
+            new._dynamics.continue_from(before)
+        except BaseException:
+            new.close()
+            raise
         return new
 
     def _arguments(self) -> dict:

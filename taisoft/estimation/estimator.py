@@ -90,8 +90,9 @@ class ErrorEstimator:
             self._space = self._add(on_mesh(sim, mesh))
         else:
             self._space = None
-        in_time = larger_steps(sim) if steps >= MIN_STEPS else []
-        self._in_time = [self._add(twin) for twin in in_time or smaller_steps(sim)]
+        self._in_time = [self._add(twin) for twin in larger_steps(sim)] if steps >= MIN_STEPS else []
+        if not self._in_time:
+            self._in_time.append(self._add(smaller_steps(sim)))
         tight = tighter(sim)
         self._solver = None if tight is None else self._add(tight)
         self._stride = max(self._twins[k].per for k in self._in_time)
