@@ -19,8 +19,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 import taisoft as ts
-from taisoft.estimation.comparison import distance, shared_nodes
+from taisoft.estimation.comparison import distance, largest_excursion, shared_nodes
 from taisoft.estimation.forecast import percent
+from taisoft.records import ERROR_KINDS
 from taisoft.scene.refine import refined
 from taisoft.scene.scene import Scene
 
@@ -108,7 +109,7 @@ def measured(case: Case) -> Row:
         steps=warm.steps,
         status=with_mesh.status,
         order=estimate.order,
-        estimated={what: getattr(estimate, what) for what in ("time", "space", "solver")},
+        estimated={what: getattr(estimate, what) for what in ERROR_KINDS},
         true=true_errors(case, dt, path, bodies),
         twins=result.error_estimate.wall_seconds / result.wall_seconds,
         notes=estimate.notes,
@@ -124,7 +125,7 @@ def true_errors(case: Case, dt: float, path: np.ndarray, bodies: list) -> dict[s
     truth, _ = path_of(case, case.build(), dt / TRUTH, precision="f64", **exact)
     solved, _ = path_of(case, case.build(), dt, precision="f64", **exact)
     fine, fine_bodies = path_of(case, refined(refined(case.build())), dt / 4 if explicit else dt)
-    excursion = float(np.sqrt(((truth - truth[0]) ** 2).sum(axis=2).max()))
+    excursion = largest_excursion(truth)
     own, theirs = shared_nodes(path[0], bodies, fine[0], fine_bodies)
     k = min(len(one) for one in (path, truth, solved, fine))  # a failed run is shorter
     return {

@@ -151,6 +151,13 @@ def hard(results: Path) -> str:
     return f"{headline(rows)} {how_solved(rows)}\n\n{text}" + measured_on(numbers)
 
 
+IPC_WORK = (  # columns of both tables of incremental potential contact
+    ("Newton a step", lambda r: f"{mean(r.newton):.3g}"),
+    ("CG a step", lambda r: f"{mean(r.cg):,.0f}"),
+    ("s/step", lambda r: f"{mean(r.seconds):.3g}"),
+)
+
+
 def ipc(results: Path) -> str:
     """How far the scenes of incremental potential contact came, and their seconds a step beside the published ones."""
     numbers = newest(results, "ipc")
@@ -160,9 +167,7 @@ def ipc(results: Path) -> str:
         ("nodes", lambda r: f"{r.nodes:,}"),
         ("dt [s]", lambda r: f"{r.case.dt:g}"),
         ("time [s]", lambda r: f"{r.time:.3g} of {r.case.seconds:g}"),
-        ("Newton a step", lambda r: f"{mean(r.newton):.3g}"),
-        ("CG a step", lambda r: f"{mean(r.cg):,.0f}"),
-        ("s/step", lambda r: f"{mean(r.seconds):.3g}"),
+        *IPC_WORK,
         ("published", lambda r: f"{r.case.published_seconds:g}"),
         ("steps that crossed", lambda r: f"{r.crossed}"),
         ("not converged", lambda r: f"{r.unconverged}"),
@@ -195,9 +200,7 @@ def ipc_friction(results: Path) -> str:
         ("<scene", lambda r: r.case.title),
         ("tolerance", lambda r: f"{r.job.tolerance:.0e}"),
         ("steps", lambda r: f"{r.steps} of {r.wanted_steps}"),
-        ("Newton a step", lambda r: f"{mean(r.newton):.3g}"),
-        ("CG a step", lambda r: f"{mean(r.cg):,.0f}"),
-        ("s/step", lambda r: f"{mean(r.seconds):.3g}"),
+        *IPC_WORK,
         ("creep [edges/s]", lambda r: "-" if r.creep is None else f"{r.creep:.2g}"),
         ("work of friction [J]", lambda r: f"{r.friction_work:.4g}"),
         ("not converged", lambda r: f"{r.unconverged}"),

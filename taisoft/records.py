@@ -46,6 +46,9 @@ class StepReport:
     problems: list[str] = field(default_factory=list)  #: sentences
 
 
+ERROR_KINDS = ("time", "space", "solver")  # fields of the following records
+
+
 @dataclass
 class BodyError:
     """Estimated errors of a body's positions, as in `ErrorEstimate`."""
@@ -60,7 +63,7 @@ class ErrorEstimate:
     """Estimated error of a run's positions: the largest distance of a node from its exact place at any compared time.
 
     All errors are relative to the largest excursion, the largest distance of any node from its start. None where an error could
-    not be estimated; the notes say why. See `Simulator.run`.
+    not be estimated; the notes give the reason. See `Simulator.run`.
     """
 
     time: float | None = None  #: of the steps

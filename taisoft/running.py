@@ -87,18 +87,16 @@ def run(
         report.problems.append(str(no_memory("the next step", failure) if isinstance(failure, MemoryError) else failure))
     except KeyboardInterrupt:
         _mark_interrupted(report)
-    except BaseException:
+    finally:
         if estimator is not None:
+            report.error_estimate = estimator.estimate()
             sim._end_estimate()
-        raise
     report.steps = sim.step_count - start_count
     report.sim_seconds = sim.time - start_time
     report.wall_seconds = time.perf_counter() - clock - (sim.compile_seconds - compiled)
     report.compile_seconds = sim._take_compile_seconds()
     if estimator is not None:
-        report.error_estimate = estimator.estimate()
-        report.wall_seconds -= report.error_estimate.wall_seconds
-        sim._end_estimate()
+        report.wall_seconds -= estimator.wall_seconds
     _summarize_steps(report)
     if energy is not None:
         energy.add_problem(report)

@@ -170,9 +170,9 @@ class Simulator(Guarded):
         discarded, as by `set_state`, and a drag ends. Both simulators are in memory during the call.
         Raises SimulationError if the settings cannot be met; this simulator is then unchanged.
         """
-        new = self._copy(**settings)
+        before, new = self._open(), self._copy(**settings)
         kept = {name: self.__dict__[name] for name in ("_start_scene", "_compiled_before", "_compile_reported")}
-        self.close()
+        before.close()
         self.__dict__.update(new.__dict__ | kept)
 
     def _copy(self, **settings) -> "Simulator":

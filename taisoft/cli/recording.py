@@ -65,10 +65,8 @@ def display_options(arguments: Namespace, has_window: bool) -> DisplayOptions:
             raise SceneError(f"--{option} needs --out, the folder to write to, and pictures, so it excludes --no-frames")
     if pictures and (plots or arguments.caption) and text_missing():
         raise SceneError(f"{'--plots' if plots else '--caption'}: {text_missing()}")
-    caption, errors = (
-        Path(arguments.scene).stem if arguments.caption else None,
-        arguments.error or arguments.error_mesh is not None,
-    )
+    caption = Path(arguments.scene).stem if arguments.caption else None
+    errors = arguments.error or arguments.error_mesh is not None
     for option, given in {"colour": arguments.colour == "error", "plots": "error" in plots}.items():
         if given and not errors:
             raise SceneError(f"--{option} error needs --error")
@@ -154,8 +152,8 @@ class Recording:
         """
         folder = self._folder.path
         if shown.usd:
-            numbers = {"fps": fps or 1.0 / sim.dt, "self_collision": sim.settings.self_collision, "first": self._first or 0}
-            numbers["errors"] = shown.errors
+            numbers = {"fps": fps or 1.0 / sim.dt, "self_collision": sim.settings.self_collision}
+            numbers |= {"first": self._first or 0, "errors": shown.errors}
             usd = UsdWriter(folder, sim.scene, **numbers)
             observers.members.append(usd)
             self._checkpoints.before = usd.flush

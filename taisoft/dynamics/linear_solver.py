@@ -25,7 +25,7 @@ from taisoft.fem.model import Model
 from taisoft.fem.node_graph import EVERYTHING
 from taisoft.linear import block_csr, host_pcg, pcg
 from taisoft.linear.aggregation import rigid_modes
-from taisoft.linear.multigrid import Multigrid
+from taisoft.linear.multigrid import Multigrid, block_rows
 
 if TYPE_CHECKING:
     from taisoft.dynamics.stage_system import StageSystem
@@ -153,7 +153,7 @@ class LinearSolver:
         system.form(EVERYTHING, True, c, beta)
         matrix = block_csr.to_bsr(m, A)
         upload(present)
-        row = np.repeat(np.arange(m.n_nodes), np.diff(matrix.indptr))
+        row = block_rows(matrix)
         matrix.data *= free[row][:, :, None] & free[matrix.indices][:, None, :]
         matrix.data[matrix.indices == row] += np.eye(3) * ~free[:, :, None]
         self._hierarchy, self._built = Multigrid(matrix, rigid_modes(x, free)), (c, beta, x, free)

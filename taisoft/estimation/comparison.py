@@ -21,6 +21,11 @@ class Error:
     max: float
 
 
+def largest_excursion(path: np.ndarray) -> float:
+    """Return the largest excursion of a path (k,n,3) [m]."""
+    return float(np.sqrt(((path - path[0]) ** 2).sum(axis=2).max()))
+
+
 def distance(path: np.ndarray, other: np.ndarray, excursion: float) -> Error:
     """Return the error between two paths (k,n,3) [m], relative to the excursion [m]."""
     squared = ((path - other) ** 2).sum(axis=2)

@@ -15,6 +15,7 @@ is not seen. Rounding is not estimated.
 import dataclasses
 import time
 import warnings
+from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -66,10 +67,12 @@ class ErrorEstimator:
         self._sim, self._first, self._given = sim, sim.step_count, (sim._host().changes, sim.dt)
         self._changed = ""
         self._twins: list[Twin] = []
-        self.differences: list[Differences] = []
+        self._differences: dict[Twin, Differences] = {}
         self.times: list[float] = []
+        self._made: ErrorEstimate | None = None  # since the last comparison
         bodies = sim.scene.bodies
-        self._bodies = np.repeat(np.arange(len(bodies)), [b.n_nodes for b in bodies])
+        self._sizes = np.array([b.n_nodes for b in bodies])
+        self._bodies = np.repeat(np.arange(len(bodies)), self._sizes)
         self._start = sim.positions()
         self._excursion = 0.0
         self._energies = np.zeros(4)  # differences to the first twin at the last comparison [J]
@@ -84,26 +87,31 @@ class ErrorEstimator:
         self.wall_seconds = time.perf_counter() - begin - (sim.compile_seconds - compiled)
 
     def _make_twins(self, steps: int, mesh: str | Scene | None) -> None:
-        """Make the twins: first those of other steps, then those of tolerances and mesh."""
+        """Make the twins: first that on another mesh, since it may be refused, then those of other steps and tolerances."""
         sim = self._sim
-        if mesh is not None:  # first, since it may be refused
-            self._space = self._add(on_mesh(sim, mesh))
-        else:
-            self._space = None
+        self._space = None if mesh is None else self._add(on_mesh(sim, mesh))
         self._in_time = [self._add(twin) for twin in larger_steps(sim)] if steps >= MIN_STEPS else []
         if not self._in_time:
             self._in_time.append(self._add(smaller_steps(sim)))
         tight = tighter(sim)
         self._solver = None if tight is None else self._add(tight)
-        self._stride = max(self._twins[k].per for k in self._in_time)
+        self._stride = max(twin.per for twin in self._in_time)
         if len(self._in_time) > 1:
             self._between = Differences(self._bodies)  # of the two twins
 
-    def _add(self, twin: Twin) -> int:
-        """Add a twin; return its number."""
+    def _add(self, twin: Twin) -> Twin:
+        """Add a twin, and return it."""
         self._twins.append(twin)
-        self.differences.append(Differences(self._bodies[twin.own]))
-        return len(self._twins) - 1
+        self._differences[twin] = Differences(self._bodies[twin.own])
+        return twin
+
+    def _others(self) -> Iterator[tuple[str, Twin, float]]:
+        """The twins of solvers and mesh: the kind of error, twin, and error over the difference to it."""
+        if self._solver is not None:
+            yield "solver", self._solver, SOLVER_FACTOR
+        if self._space is not None:
+            ratio = self._space.ratio  # 1 for another order: the difference itself
+            yield "space", self._space, 1.0 if ratio == 1.0 else error_over_difference(ratio, MESH_ORDER)
 
     def frame(self) -> None:
         """Let the twins follow, and compare, if the run is at a whole step of all."""
@@ -130,21 +138,21 @@ class ErrorEstimator:
         x = self._sim.positions()
         self._excursion = max(self._excursion, float(np.sqrt(((x - self._start) ** 2).sum(axis=1).max())))
         self.times.append(self._sim.time)
-        found = [twin.positions() if not twin.failed else None for twin in self._twins]
-        for twin, differences, other in zip(self._twins, self.differences, found):
-            if other is not None:
-                differences.add(x[twin.own], other)
-        first, last = (found[self._in_time[k]] for k in (0, -1))
-        if len(self._in_time) > 1 and first is not None and last is not None:
-            self._between.add(first, last)
-        twin = self._twins[self._in_time[0]]
-        if not twin.failed:
-            pair = [dataclasses.astuple(sim.energies()) for sim in (self._sim, twin.sim)]
-            self._energies = np.abs(np.subtract(*pair))
-        self._means.append([self._body_means(path) for path in (x, first) if path is not None])
+        found = {twin: twin.positions() for twin in self._twins if not twin.failed}
+        for twin, other in found.items():
+            self._differences[twin].add(x[twin.own], other)
+        self._made = None
+        if any(twin.failed for twin in self._in_time):
+            return
+        first = found[self._in_time[0]]
+        if len(self._in_time) > 1:
+            self._between.add(first, found[self._in_time[1]])
+        pair = [dataclasses.astuple(sim.energies()) for sim in (self._sim, self._in_time[0].sim)]
+        self._energies = np.abs(np.subtract(*pair))
+        self._means.append([self._body_means(path) for path in (x, first)])
 
     def _body_means(self, x: np.ndarray) -> np.ndarray:
-        return np.stack([x[self._bodies == k].mean(axis=0) for k in range(len(self._sim.scene.bodies))])
+        return np.add.reduceat(x, np.cumsum(self._sizes) - self._sizes) / self._sizes[:, None]
 
     def nodal_errors(self) -> np.ndarray:
         """Estimated errors of all nodes at the last comparison (n_nodes,) [m], all known kinds added; NaN if unknown."""
@@ -152,27 +160,19 @@ class ErrorEstimator:
         factor = self._time_factor(len(self.times))[0] if self.times else None
         if factor is None:
             return np.full(len(found), np.nan)
-        kinds = [(self._in_time[0], factor), (self._solver, SOLVER_FACTOR), (self._space, self._space_factor())]
-        for k, scale in kinds:
-            if k is not None and not self._twins[k].failed:
-                found[self._twins[k].own] += scale * self.differences[k].map
+        for _, twin, scale in (("time", self._in_time[0], factor), *self._others()):
+            if not twin.failed:
+                found[twin.own] += scale * self._differences[twin].map
         return found
-
-    def _space_factor(self) -> float:
-        if self._space is None:
-            return 0.0
-        ratio = self._twins[self._space].ratio
-        return 1.0 if ratio == 1.0 else error_over_difference(ratio, MESH_ORDER)  # another order: the difference itself
 
     def _time_factor(self, k: int) -> tuple[float | None, float | None]:
         """Error in time over the difference to the first twin, and order, from the first k comparisons; None if unknown."""
-        twins = [self._twins[n] for n in self._in_time]
-        if any(twin.failed for twin in twins):
+        if any(twin.failed for twin in self._in_time):
             return None, None
-        fine = self.differences[self._in_time[0]]
-        if len(twins) == 1:
+        fine = self._differences[self._in_time[0]]
+        if len(self._in_time) == 1:
             order = float(nominal_order(self._sim.settings.integrator, self._sim.scene, self._sim.touches))
-            return error_over_difference(twins[0].ratio, order), order
+            return error_over_difference(self._in_time[0].ratio, order), order
         near, far = (float(np.sqrt(np.mean(d.squares[:k]))) for d in (fine, self._between))
         if near <= self._negligible:
             return error_over_difference(2.0, MIN_ORDER), None
@@ -187,39 +187,43 @@ class ErrorEstimator:
 
     def estimate(self) -> ErrorEstimate:
         """The estimate of the run so far."""
+        changed = self._changed or self._change()
+        if self._made is None or changed != self._changed:
+            self._changed, self._made = changed, self._estimate_all(changed)
+        return self._made
+
+    def _estimate_all(self, changed: str) -> ErrorEstimate:
         made = ErrorEstimate(excursion=self._excursion, wall_seconds=self.wall_seconds)
         made.bodies = {body.name: BodyError() for body in self._sim.scene.bodies}
-        if self._changed:
-            made.notes.append(f"the errors are unknown: {self._changed}")
+        if changed:
+            made.notes.append(f"the errors are unknown: {changed}")
         elif not self.times or self._excursion == 0.0:
             why = "nothing moves" if self.times else f"the run has fewer than {self._stride} steps"
             made.notes.append(f"the errors are unknown: {why}")
         else:
             self._estimate_time(made)
-            for name, k, factor in (("solver", self._solver, SOLVER_FACTOR), ("space", self._space, self._space_factor())):
-                if k is not None:
-                    self._estimate(made, name, k, factor)
+            for kind, twin, factor in self._others():
+                self._estimate(made, kind, twin, factor)
             if self._solver is None:
                 made.solver = 0.0  # nothing is solved
         made.twins = [twin.what for twin in self._twins]
         return made
 
-    def _estimate(self, made: ErrorEstimate, name: str, k: int, factor: float, until: int | None = None) -> None:
-        """Set the error `name` from the first comparisons with twin k, or note why it is unknown."""
-        twin = self._twins[k]
+    def _estimate(self, made: ErrorEstimate, kind: str, twin: Twin, factor: float) -> None:
+        """Set one kind of error from the differences to a twin, or note the reason that it is unknown."""
         if twin.failed:
-            made.notes.append(f"the error of {name} is unknown: its twin ({twin.what}) failed: {twin.failed}")
+            made.notes.append(f"the error of {kind} is unknown: its twin ({twin.what}) failed: {twin.failed}")
             return
         if twin.unconverged:
             made.notes.append(f"of the twin with {twin.what}, {twin.unconverged} of {twin.reports} steps did not converge")
-        most = factor * self.differences[k].largest(until) / self._excursion
+        most = factor * self._differences[twin].largest() / self._excursion
         for body, value in zip(made.bodies.values(), most):
-            setattr(body, name, float(value))
-        setattr(made, name, float(most.max()))
+            setattr(body, kind, float(value))
+        setattr(made, kind, float(most.max()))
 
     def _estimate_time(self, made: ErrorEstimate) -> None:
         """Set the error in time; where the paths part, only that until then."""
-        failed = [twin for k in self._in_time if (twin := self._twins[k]).failed]
+        failed = [twin for twin in self._in_time if twin.failed]
         if failed:
             made.notes.append(f"the error in time is unknown: the twin with {failed[0].what} failed: {failed[0].failed}")
             return
@@ -231,7 +235,7 @@ class ErrorEstimator:
             return
         if factor is not None:
             made.agree_until = self.times[count - 1]
-            most = factor * self.differences[self._in_time[0]].largest(count).max() / self._excursion
+            most = factor * self._differences[self._in_time[0]].largest(count).max() / self._excursion
             made.time_until_then = float(most)
             made.spread_after = self._spread(count)
         when = f"after t = {made.agree_until:.4g} s" if made.agree_until is not None else "from the start"
@@ -239,7 +243,7 @@ class ErrorEstimator:
 
     def _agreeing(self) -> int:
         """Number of comparisons over which the paths of different steps agree."""
-        fine = self.differences[self._in_time[0]]
+        fine = self._differences[self._in_time[0]]
         if len(self._in_time) > 1:
             return agreement(np.array(fine.squares), np.array(self._between.squares), self._negligible**2)
         parted = np.flatnonzero(np.max(fine.most, axis=1) > PARTED * self._excursion)

@@ -7,7 +7,7 @@ the work grows with h^-4: tets with h^-3, and steps or iterations with 1 / h.
 import math
 
 from taisoft.estimation.order import MESH_ORDER
-from taisoft.records import ErrorEstimate
+from taisoft.records import ERROR_KINDS, ErrorEstimate
 
 MESH_WORK = 4  # exponent of the work in 1 / h
 LEAST = 1e-6  # smaller errors are shown as "below" it
@@ -15,7 +15,7 @@ LEAST = 1e-6  # smaller errors are shown as "below" it
 
 def describe_error(estimate: ErrorEstimate, wall_seconds: float) -> list[str]:
     """Sentences on a run of wall_seconds [s] without output: the error, what a smaller one would cost, and the notes."""
-    parts = {name: getattr(estimate, name) for name in ("time", "space", "solver")}
+    parts = {name: getattr(estimate, name) for name in ERROR_KINDS}
     known = {name: value for name, value in parts.items() if value is not None}
     listed = ", ".join(f"{name} {percent(value)}" for name, value in known.items())
     sentences = []
@@ -35,7 +35,7 @@ def describe_error(estimate: ErrorEstimate, wall_seconds: float) -> list[str]:
 
 
 def wish(estimate: ErrorEstimate, wall_seconds: float) -> tuple[float, float] | None:
-    """The next power of ten below the error, and the wall time it would take [s]; None if that cannot be told."""
+    """The next power of ten below the error, and the wall time it would take [s]; None if unknown."""
     total = estimate.total
     if total is None or not LEAST < total < math.inf:
         return None

@@ -28,7 +28,7 @@ SAME_STATE = 1e-6  # largest distance of shared nodes at the start, over the siz
 
 
 class Twin:
-    """One twin. Nodes `own` of the run are compared with nodes `theirs` of the twin; a twin that fails says why in `failed`.
+    """One twin. Nodes `own` of the run are compared with nodes `theirs` of the twin. failed: the reason, if it did, else "".
 
     what: in words; ratio: of its step, or mesh width, over the run's; steps: taken while the run takes `per` steps.
     """
@@ -86,7 +86,7 @@ def on_mesh(sim: "Simulator", mesh: str | Scene) -> Twin:
 
     Raises SceneError or SimulationError if it cannot be made, or does not start as the run does.
     """
-    scene = _other_mesh(sim, mesh)
+    scene = other_mesh(sim, mesh)
     dt, steps = sim.dt, 1
     settings = sim._arguments()
     if sim.settings.explicit:
@@ -99,12 +99,13 @@ def on_mesh(sim: "Simulator", mesh: str | Scene) -> Twin:
     except BaseException:
         other.close()
         raise
-    ratio = (sum(b.mesh.n_tets for b in sim.scene.bodies) / sum(b.mesh.n_tets for b in scene.bodies)) ** (1.0 / 3.0)
-    what = mesh if isinstance(mesh, str) else f"{sum(b.mesh.n_tets for b in scene.bodies):,} tets"
-    return Twin(f"mesh: {what}", other, ratio, steps, nodes=nodes)
+    own, theirs = (sum(b.mesh.n_tets for b in one.bodies) for one in (sim.scene, scene))
+    what = mesh if isinstance(mesh, str) else f"{theirs:,} tets"
+    return Twin(f"mesh: {what}", other, (own / theirs) ** (1.0 / 3.0), steps, nodes=nodes)
 
 
-def _other_mesh(sim: "Simulator", mesh: str | Scene) -> Scene:
+def other_mesh(sim: "Simulator", mesh: str | Scene) -> Scene:
+    """The scene of a twin on another mesh. Raises SceneError or SimulationError if there is none."""
     if isinstance(mesh, Scene):
         names = [[b.name for b in scene.bodies] for scene in (sim.scene, mesh)]
         if names[0] != names[1]:

@@ -83,7 +83,7 @@ class Multigrid:
         return x
 
 
-def _rows(A: sp.bsr_matrix) -> np.ndarray:
+def block_rows(A: sp.bsr_matrix) -> np.ndarray:
     """Block row of each block."""
     return np.repeat(np.arange(len(A.indptr) - 1), np.diff(A.indptr))
 
@@ -95,7 +95,7 @@ def _factorise(A: sp.bsr_matrix) -> BandedCholesky | None:
     order = reverse_cuthill_mckee(pattern, symmetric_mode=True)
     place = np.empty(n, dtype=np.int64)
     place[order] = np.arange(n)
-    i, j = place[_rows(A)], place[A.indices]
+    i, j = place[block_rows(A)], place[A.indices]
     band = (int(np.abs(i - j).max()) + 1) * d - 1
     if n * d > SMALL and (band > NARROW or (band + 1) * n * d > LARGEST_BAND):
         return None
@@ -113,19 +113,19 @@ def _coarsen(A: sp.bsr_matrix, modes: np.ndarray) -> tuple[Level, sp.bsr_matrix,
     """Return the level of A, and matrix and modes of the next."""
     n, d = len(A.indptr) - 1, A.blocksize[0]
     own = np.arange(n + 1)
-    inverse = np.linalg.inv(A.data[A.indices == _rows(A)])
+    inverse = np.linalg.inv(A.data[A.indices == block_rows(A)])
     included = modes.any(axis=(1, 2))
     largest = _largest_eigenvalue(A, sp.bsr_matrix((inverse, own[:-1], own), shape=A.shape), included)
     tentative, coarse_modes, unused = prolongation(modes, aggregate(A.indptr, A.indices, included))
     change = A @ tentative
-    change = sp.bsr_matrix((inverse[_rows(change)] @ change.data, change.indices, change.indptr), shape=change.shape)
+    change = sp.bsr_matrix((inverse[block_rows(change)] @ change.data, change.indices, change.indptr), shape=change.shape)
     P = (tentative - (PROLONGATOR / largest) * change).tobsr((d, MODES))
     P.sort_indices()
     transposed = P.T.tobsr((MODES, d))
     transposed.sort_indices()
     coarse = (transposed @ (A @ P)).tobsr((MODES, MODES))
     coarse.sort_indices()
-    diagonal = np.flatnonzero(coarse.indices == _rows(coarse))
+    diagonal = np.flatnonzero(coarse.indices == block_rows(coarse))
     node, mode = np.nonzero(unused)
     coarse.data[diagonal[node], mode, mode] = 1.0
     smoother = sp.bsr_matrix(((SMOOTHER / largest) * inverse, own[:-1], own), shape=A.shape)

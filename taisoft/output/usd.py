@@ -32,14 +32,7 @@ from taisoft.output.usd_scene import ERROR, IMPULSE, ROOT, STRESS, TRANSLATE, sc
 
 SCENE_NAME = "scene.usdc"
 CHUNKS_NAME = "chunks"
-TIME_VARYING = {
-    "points",
-    "extent",
-    f"primvars:{STRESS}",
-    f"primvars:{IMPULSE}",
-    f"primvars:{ERROR}",
-    TRANSLATE,
-}  # names of attributes
+TIME_VARYING = {"points", "extent", TRANSLATE, *(f"primvars:{name}" for name in (STRESS, IMPULSE, ERROR))}  # attributes
 
 
 class UsdWriter:

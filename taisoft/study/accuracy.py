@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from taisoft.errors import SimulationError
-from taisoft.estimation.comparison import Error, distance, shared_nodes
+from taisoft.estimation.comparison import Error, distance, largest_excursion, shared_nodes
 from taisoft.machine import Timing, summarise
 from taisoft.study import mesh_name
 
@@ -110,7 +110,7 @@ def make_reference(fine: dict, coarse: dict, kind: str, order_in_time: int) -> R
             setting, reason = record["task"]["setting"], record["problems"][-1]
             raise SimulationError(f"the reference {setting['integrator']}, dt = {setting['dt']:.3g} s, failed: {reason}")
     path = unpack(fine["path"])
-    excursion = float(np.sqrt(((path - path[0]) ** 2).sum(axis=2).max()))
+    excursion = largest_excursion(path)
     if excursion == 0.0:
         raise SimulationError("nothing moves in the reference, so errors relative to its motion are undefined")
     difference = distance(unpack(coarse["path"]), path, excursion)

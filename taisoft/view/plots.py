@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from taisoft.errors import SceneError
-from taisoft.records import ErrorEstimate, StepReport
+from taisoft.records import ERROR_KINDS, ErrorEstimate, StepReport
 from taisoft.scene.checks import nearest
 from taisoft.view.colouring import round_up
 
@@ -28,7 +28,7 @@ MAX_DECADES = 12  # of a logarithmic axis; smaller values, and zero, lie on its 
 CAPACITY = 256  # bins, an even number
 ENERGIES = ("kinetic", "elastic", "gravity")  # [J]
 SOLVERS = ("newton_residual", "contact_residual", "newton_iterations", "linear_iterations", "contact_iterations", "n_contacts")
-ERRORS = ("time_error", "space_error", "solver_error")  # over the largest excursion, in percent
+ERRORS = tuple(f"{kind}_error" for kind in ERROR_KINDS)  # over the largest excursion, in percent
 QUANTITIES = (*ENERGIES, "total", *SOLVERS, "step_time", *ERRORS)  # energies as changes since the start, wall time in [ms]
 
 
@@ -76,10 +76,7 @@ PLOTS = {
     "error": Plot(
         "estimated error so far",
         "%",
-        tuple(
-            Series(name, f"{name}_error", colour, "error")
-            for name, colour in zip(("time", "space", "solver"), (BLUE, ORANGE, GREEN))
-        ),
+        tuple(Series(name, f"{name}_error", colour, "error") for name, colour in zip(ERROR_KINDS, (BLUE, ORANGE, GREEN))),
         log=True,
     ),
 }
@@ -144,7 +141,7 @@ class History:
                 report.contact_iterations * touched / report.steps,
                 report.n_contacts * touched,
                 1e3 * seconds / report.steps,
-                *(100.0 * (getattr(errors, name[:-6], None) or np.nan) for name in ERRORS),
+                *(100.0 * (getattr(errors, kind, None) or np.nan) for kind in ERROR_KINDS),
             ]
         )
         half = np.zeros(len(QUANTITIES))
