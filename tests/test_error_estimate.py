@@ -254,6 +254,20 @@ def test_an_interrupted_run_has_an_estimate_and_releases_its_twins():
         assert sim.error_so_far is None
 
 
+def test_a_rebuild_after_the_last_comparison_leaves_the_error_unknown():
+    """The run goes on with the new settings, and keeps its twins until its end."""
+
+    def rebuilds(sim, k, _report):
+        if k == 20:
+            sim.rebuild(integrator="bdf2")
+            assert sim.error_so_far.time is None
+
+    with ts.Simulator(beam(), dt=1 / 60) as sim:
+        result = sim.run(21 / 60, on_frame=rebuilds, error=True)
+        assert result.steps == 21 and "changed meanwhile" in result.error_estimate.notes[0]
+        assert sim.error_so_far is None
+
+
 # --- reports ------------------------------------------------------------------------------------------------------------
 
 
@@ -293,6 +307,22 @@ def test_the_command_prints_and_writes_errors(tmp_path, capsys):
     stage = Usd.Stage.Open(str(tmp_path / "out" / "scene.usdc"))
     values = stage.GetPrimAtPath("/World/beam/tets").GetAttribute("primvars:estimatedError")
     assert max(values.Get(0.0)) == 0.0 and max(values.Get(3.0)) > 0.0
+
+
+BLOCK = "scene.add_body(ts.box_mesh((1, 1, 1), (1, 1, 1)), ts.Material(young=1e5), order=2, position=(9, 0, 0))"
+BOTH_ORDERS = BEAM.replace("    return scene", f"    {BLOCK}\n    return scene")
+
+
+@pytest.mark.parametrize("option", ["overwrite", "resume"])
+def test_a_mesh_that_is_refused_leaves_earlier_results(option, tmp_path, capsys):
+    scene, out = write(tmp_path / "beam.py", BOTH_ORDERS), tmp_path / "out"
+    assert run(scene, "--out", out, "--seconds", 0.05, *SHORT_OUTPUT) == 0
+    before = {path.name: path.read_bytes() for path in out.iterdir() if path.is_file()}
+    given = {"overwrite": ("--overwrite",), "resume": ("--resume", out / "checkpoint.npz", "--seconds", 0.1)}[option]
+    assert run(scene, "--out", out, *given, "--error-mesh", "order", *SHORT_OUTPUT) == EXIT_BAD_INPUT
+    message = {"overwrite": "beam.py: error_mesh 'order': the bodies have both orders", "resume": "excludes --resume"}[option]
+    assert message in capsys.readouterr().err
+    assert {path.name: path.read_bytes() for path in out.iterdir() if path.is_file()} == before
 
 
 @pytest.mark.parametrize("options", [("--colour", "error"), ("--plots", "error")])

@@ -68,6 +68,8 @@ def run(arguments: Namespace) -> int:
         interactive = shown.window and arguments.out is None and arguments.seconds is None
         if shown.errors and interactive:
             raise SceneError("--error: a window without end has no error of a run: give --seconds, or --out")
+        if arguments.error_mesh is not None and arguments.resume is not None:
+            raise SceneError("--error-mesh excludes --resume: a run on another mesh starts with the scene")
         saved: Checkpoint | None = None
         if arguments.resume is None:
             settings = resolve(solver, arguments, Simulator)
@@ -88,6 +90,10 @@ def run(arguments: Namespace) -> int:
             _check_time_left(sim, settings, arguments)
             with _prefix_errors(arguments.scene):
                 check_length(settings.seconds, sim.dt, settings.fps)
+                if arguments.error_mesh is not None:
+                    from taisoft.estimation.twins import other_mesh  # loads modules with kernels that the run may not need
+
+                    other_mesh(sim, arguments.error_mesh)  # refuse it before earlier results are removed
             return _run(sim, settings, arguments, signals, warned, saved, shown)
 
 
