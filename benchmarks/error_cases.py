@@ -149,8 +149,8 @@ def squeezed_ball() -> ts.Scene:
     rubber = _rubber(1e5, poisson=0.4, friction=0.5, mass_damping=5.0)
     scene.add_body(ts.ball_mesh(0.2, 2), rubber, name="ball", order=2)
     for name, side in (("upper", 1.0), ("lower", -1.0)):
-        way = [(0.0, 0.0, 0.0), (0.0, -side * 0.06, 0.0), (0.0, -side * 0.06, 0.0), (0.0, 0.0, 0.0)]
-        path = ts.KeyFrames([0.0, 0.5, 0.75, 1.25], way, smooth=True)
+        displacements = [(0.0, 0.0, 0.0), (0.0, -side * 0.06, 0.0), (0.0, -side * 0.06, 0.0), (0.0, 0.0, 0.0)]
+        path = ts.KeyFrames([0.0, 0.5, 0.75, 1.25], displacements, smooth=True)
         scene.add_obstacle(ts.Box((0.0, side * 0.26, 0.0), (0.4, 0.05, 0.4)), name=name, friction=0.5, path=path)
     return scene
 

@@ -75,7 +75,7 @@ class ErrorEstimate:
     time_until_then: float | None = None  #: error in time up to `agree_until`
     spread_after: dict[str, float] = field(default_factory=dict)  #: afterwards: by body, change of its mean position by the step
     bodies: dict[str, BodyError] = field(default_factory=dict)  #: by name
-    energies: Energies | None = None  #: errors in time of the energies at the last comparison, magnitudes [J]
+    energies: Energies | None = None  #: errors in time at the last comparison, energy minus exact energy [J]
     twins: list[str] = field(default_factory=list)  #: how the errors were estimated, a sentence each
     notes: list[str] = field(default_factory=list)  #: reasons for caution, sentences
     wall_seconds: float = 0.0  #: of the twins, without compile time [s]; not in the run's

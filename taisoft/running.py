@@ -14,6 +14,7 @@ from taisoft.records import RunReport, StepReport
 from taisoft.settings import check_positive
 
 if TYPE_CHECKING:
+    from taisoft.estimation.estimator import ErrorEstimator
     from taisoft.scene.scene import Scene
     from taisoft.simulator import Simulator
 
@@ -72,16 +73,13 @@ def run(
         while sim.step_count - first_step < total and not report.interrupted:
             frame += 1
             frame_end = min(total, frame * steps_per_frame)
-            merged = _advance_to(sim, first_step + frame_end, stop, report, on_step, energy)
+            merged = _advance_to(sim, first_step + frame_end, stop, report, on_step, energy, estimator)
             if merged is None:
                 break
             if sim.settings.explicit:
                 report.step_reports.append(merged)
-            if sim.step_count - first_step == frame_end:
-                if estimator is not None:
-                    estimator.frame()
-                if on_frame is not None:
-                    on_frame(sim, frame, merged)
+            if sim.step_count - first_step == frame_end and on_frame is not None:
+                on_frame(sim, frame, merged)
     except (SimulationError, MemoryError) as failure:
         report.status = "failed"
         report.problems.append(str(no_memory("the next step", failure) if isinstance(failure, MemoryError) else failure))
@@ -181,7 +179,13 @@ def dt_sentence(report: RunReport) -> str:
 
 
 def _advance_to(
-    sim: "Simulator", end: int, stop, report: RunReport, on_step: StepCallback | None, energy: EnergyCheck
+    sim: "Simulator",
+    end: int,
+    stop: Callable[[], bool] | None,
+    report: RunReport,
+    on_step: StepCallback | None,
+    energy: EnergyCheck,
+    estimator: "ErrorEstimator | None",
 ) -> StepReport | None:
     """Step up to step count `end`. Merge explicit batches into one report; list implicit steps one by one.
 
@@ -193,8 +197,11 @@ def _advance_to(
             _mark_interrupted(report)
             break
         energy.before_step()
-        latest = timed_advance(sim, end - sim.step_count, on_step)
+        until = end if estimator is None else estimator.next_comparison(end)
+        latest = timed_advance(sim, until - sim.step_count, on_step)
         energy.after_step(latest)
+        if estimator is not None and sim.step_count == until:
+            estimator.compare()
         if sim.settings.explicit:
             merged = latest if merged is None else _merge(merged, latest)
         else:

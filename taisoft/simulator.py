@@ -108,6 +108,8 @@ class Simulator(Guarded):
         """Make the twins of a run of `steps` steps; see `run`."""
         from taisoft.estimation.estimator import ErrorEstimator  # loads modules with kernels that the run may not need
 
+        if self._estimator is not None:
+            raise SimulationError("a run with error=True cannot be started during another one")
         self._estimator = ErrorEstimator(self, steps, mesh)
         return self._estimator
 

@@ -10,6 +10,7 @@
 import dataclasses
 import json
 import math
+import warnings
 
 import numpy as np
 import pytest
@@ -19,7 +20,7 @@ from scenes import cube, rubber
 import taisoft as ts
 from taisoft.cli import EXIT_BAD_INPUT
 from taisoft.errors import SceneError, SimulationError
-from taisoft.estimation.forecast import describe_error, percent, wish
+from taisoft.estimation.forecast import describe_error, forecast, percent
 from taisoft.estimation.order import agreement, error_over_difference, nominal_order, observed_order
 from taisoft.records import ErrorEstimate
 from taisoft.view.plots import Plots
@@ -86,7 +87,7 @@ def test_free_fall_in_steps_of_implicit_euler(precision):
     assert e.time * e.excursion == pytest.approx(5.0 / 64, rel=1e-3)
     assert e.solver < 1e-4 and e.space is None and e.total == pytest.approx(e.time + e.solver)
     assert e.bodies["block"].time == e.time and len(e.twins) == 3 and not e.notes
-    assert e.energies.gravity == pytest.approx(1000.0 * 0.99 * 10.0 * 5.0 / 64, rel=0.01)
+    assert e.energies.gravity == pytest.approx(-1000.0 * 0.99 * 10.0 * 5.0 / 64, rel=0.01)  # it falls too far
     assert result.status == "ok" and e.wall_seconds > 0.0 and result.wall_seconds > 0.0
 
 
@@ -181,8 +182,15 @@ def test_meshes_that_cannot_be_compared_are_refused():
             sim.run(0.1, error_mesh="refined")
         with pytest.raises(SimulationError, match="error_mesh 'fine' is unknown"):
             sim.run(0.1, error=True, error_mesh="fine")
+        with pytest.raises(SimulationError, match="body 'beam' has 20 tets there and 20 in the run: the mesh widths must differ"):
+            sim.run(0.1, error=True, error_mesh=beam())
         with pytest.raises(SimulationError, match="its bodies are block, and those of the run beam"):
             sim.run(0.1, error=True, error_mesh=falling())
+        held = beam((8, 2, 2))
+        held.body("beam").fix(lambda X: np.abs(X[:, 0] - np.round(X[:, 0])) < 1e-9)  # all that the meshes share
+        with pytest.raises(SimulationError, match="all nodes of both meshes that coincide are constrained"):
+            with ts.Simulator(held, dt=1 / 60) as other:
+                other.run(0.1, error=True, error_mesh=beam())
         assert sim.step_count == 0
         sim.step()
         with pytest.raises(SimulationError, match=r"the run must start there too: reset\(\)"):
@@ -207,6 +215,56 @@ def test_a_body_at_rest_has_no_relative_error():
         e = sim.run(1.0, error=True).error_estimate
     assert e.time is None and e.notes == ["the errors are unknown: nothing moves"]
     assert describe_error(e, 1.0) == e.notes
+
+
+def test_frames_need_not_lie_at_common_steps():
+    """Six steps a frame, comparisons at multiples of four: those of the last common step of every frame."""
+    frames = []
+    with ts.Simulator(falling(), dt=1 / 60, precision="f64") as sim:
+        result = sim.run(1.0, fps=10, on_frame=lambda sim, k, _: frames.append(sim.step_count), error=True)
+        few = sim.run(3 / 60, fps=20, error=True).error_estimate
+    assert frames == list(range(0, 61, 6)) and len(result.step_reports) == 60
+    e = result.error_estimate
+    assert e.order == pytest.approx(1.0, abs=1e-6) and e.time * e.excursion == pytest.approx(5.0 / 60, rel=1e-3) and not e.notes
+    assert few.time is not None
+
+
+def test_an_error_run_within_another_is_refused():
+    def nested(sim, k, _report):
+        if k == 2:
+            sim.run(0.1, error=True)
+
+    with ts.Simulator(falling(), dt=1 / 60) as sim:
+        result = sim.run(1.0, fps=15, on_frame=nested, error=True)
+        assert result.status == "failed" and "during another one" in result.problems[0]
+        assert sim.error_so_far is None
+
+
+def test_nodal_errors_are_unknown_after_a_change():
+    seen = []
+
+    def changes(sim, k, _report):
+        if k == 5:
+            sim.set_gravity((0.0, 0.0, 0.0))
+        seen.append(np.isnan(sim.nodal_errors()).all())
+
+    with ts.Simulator(falling(), dt=1 / 64) as sim:
+        sim.run(1.0, fps=8, on_frame=changes, error=True)
+    assert seen == [True] + 4 * [False] + 4 * [True]
+
+
+def test_warnings_of_twins_are_not_given(monkeypatch, recwarn):
+    advance = ts.Simulator.advance
+
+    def warns(sim, n):
+        if sim.dt > 1 / 50:
+            warnings.warn("of a twin", UserWarning, stacklevel=1)
+        return advance(sim, n)
+
+    monkeypatch.setattr(ts.Simulator, "advance", warns)
+    with ts.Simulator(falling(), dt=1 / 64) as sim:
+        assert sim.run(1.0, fps=16, error=True).error_estimate.time is not None
+    assert not [one for one in recwarn if "of a twin" in str(one.message)]
 
 
 def test_a_failed_twin_leaves_its_error_unknown(monkeypatch):
@@ -237,8 +295,9 @@ def test_paths_that_part_are_noticed():
         result = sim.run(3.0, fps=15, error=True)
     e = result.error_estimate
     assert e.time is None and 0.0 < e.agree_until < 3.0 and 0.0 < e.time_until_then
-    assert set(e.spread_after) == {f"block {k}" for k in range(6)} and "part after" in e.notes[-1]
+    assert set(e.spread_after) == {f"block {k}" for k in range(6)} and "part after" in e.notes[0]
     assert describe_error(e, 1.0)[0].endswith("then unknown")
+    assert e.solver is None and "the error of solver is unknown, since the paths part" in e.notes
 
 
 def test_an_interrupted_run_has_an_estimate_and_releases_its_twins():
@@ -273,13 +332,18 @@ def test_a_rebuild_after_the_last_comparison_leaves_the_error_unknown():
 
 def test_forecasts_follow_the_orders():
     only_time = ErrorEstimate(time=0.04, solver=0.0, order=2.0)
-    assert wish(only_time, 3.0) == (pytest.approx(0.01), pytest.approx(6.0))
+    assert forecast(only_time, 3.0) == (pytest.approx(0.01), pytest.approx(6.0))
     both = dataclasses.replace(only_time, time=0.02, space=0.02)
-    target, seconds = wish(both, 1.0)
+    target, seconds = forecast(both, 1.0)
     assert (target, seconds) == (pytest.approx(0.01), pytest.approx(4.0**0.5 * 4.0**2))
     (sentence,) = describe_error(both, 1.0)
     assert sentence == "about 4 % of the largest excursion (time 2, space 2, solver 0); 1 % would take about 32 s"
-    assert wish(ErrorEstimate(), 1.0) is None and wish(ErrorEstimate(time=0.0), 1.0) is None
+    solver = dataclasses.replace(only_time, solver=0.005)
+    assert forecast(solver, 1.0) == (pytest.approx(0.01), pytest.approx(8.0**0.5))
+    assert forecast(dataclasses.replace(solver, solver=0.02), 1.0) is None  # steps would not help
+    (sentence,) = describe_error(ErrorEstimate(space=0.1, solver=0.001), 1.0)
+    assert sentence == "unknown in time; in percent of the largest excursion space 10, solver 0.1"
+    assert forecast(ErrorEstimate(), 1.0) is None and forecast(ErrorEstimate(time=0.0), 1.0) is None
     assert [percent(value) for value in (0.0, 1e-9, 0.01234, 2.0)] == ["0", "< 0.0001", "1.2", "200"]
 
 
@@ -306,7 +370,7 @@ def test_the_command_prints_and_writes_errors(tmp_path, capsys):
 
     stage = Usd.Stage.Open(str(tmp_path / "out" / "scene.usdc"))
     values = stage.GetPrimAtPath("/World/beam/tets").GetAttribute("primvars:estimatedError")
-    assert max(values.Get(0.0)) == 0.0 and max(values.Get(3.0)) > 0.0
+    assert max(values.Get(0.0)) == -1.0 and min(values.Get(3.0)) >= 0.0 and max(values.Get(3.0)) > 0.0
 
 
 BLOCK = "scene.add_body(ts.box_mesh((1, 1, 1), (1, 1, 1)), ts.Material(young=1e5), order=2, position=(9, 0, 0))"

@@ -4,9 +4,9 @@ In time: two twins with twice and four times the step show the observed order, a
 steps would be unstable, or the run has few steps, one twin has half the step; the order is then assumed to be the nominal one,
 on which the estimate depends little. Of the solvers: a twin with tighter tolerances. In space: a twin on another mesh.
 
-Twins and run are compared at the frames that lie at whole steps of all. Differences are reduced to their maximum over the nodes
-of each body, and to sums of squares. The order is that of the root mean square over nodes and times, which chance affects less
-than maxima. If the paths of different steps part, the error in time is known only up to then.
+Twins and run are compared at the last step of every frame at which all of them meet. Differences are reduced to their maximum
+over the nodes of each body, and to sums of squares. The order is that of the root mean square over nodes and times, which chance
+affects less than maxima. If the paths of different steps part, so do those of all twins: the errors are known only up to then.
 
 Weak: twice the step may miss what happens within it; an error that all twins share, such as contacts that none of them finds,
 is not seen. Rounding is not estimated.
@@ -36,11 +36,11 @@ NEGLIGIBLE = {"f32": 1e-6, "f64": 1e-9}  # differences, over the excursion, that
 
 
 class Differences:
-    """Distances between two paths at each comparison. most: per body (k, n_bodies); squares: mean squares (k,)."""
+    """Distances between two paths at each comparison. maxima: per body (k, n_bodies); squares: mean squares (k,)."""
 
     def __init__(self, bodies: np.ndarray):
         self._starts = np.flatnonzero(np.diff(bodies, prepend=-1))  # of the bodies, in the compared nodes
-        self.most: list[np.ndarray] = []
+        self.maxima: list[np.ndarray] = []
         self.squares: list[float] = []
         self.map = np.zeros(len(bodies))  # distances at the last comparison
 
@@ -49,15 +49,15 @@ class Differences:
         squared = ((x - other) ** 2).sum(axis=1)
         self.squares.append(float(squared.mean()))
         self.map = np.sqrt(squared)
-        self.most.append(np.maximum.reduceat(self.map, self._starts))
+        self.maxima.append(np.maximum.reduceat(self.map, self._starts))
 
     def largest(self, k: int | None = None) -> np.ndarray:
         """Largest distance of each body over the first k comparisons (n_bodies,) [m]."""
-        return np.max(self.most[:k], axis=0)
+        return np.max(self.maxima[:k], axis=0)
 
 
 class ErrorEstimator:
-    """Twins of a run of `steps` steps. Call `frame` at every frame; `estimate` gives the errors so far.
+    """Twins of a run of `steps` steps. Call `compare` at steps for `next_comparison`; `estimate` gives the errors so far.
 
     mesh: see `twins.on_mesh`. Raises SceneError or SimulationError if a twin cannot be made.
     """
@@ -89,7 +89,11 @@ class ErrorEstimator:
     def _make_twins(self, steps: int, mesh: str | Scene | None) -> None:
         """Make the twins: first that on another mesh, since it may be refused, then those of other steps and tolerances."""
         sim = self._sim
-        self._space = None if mesh is None else self._add(on_mesh(sim, mesh))
+        self._space = None
+        if mesh is not None:
+            twin, ratios = on_mesh(sim, mesh)
+            self._space = self._add(twin)  # with another order the error is the difference itself
+            self._space_factors = np.array([error_over_difference(r, MESH_ORDER) if r else 1.0 for r in ratios])
         self._in_time = [self._add(twin) for twin in larger_steps(sim)] if steps >= MIN_STEPS else []
         if not self._in_time:
             self._in_time.append(self._add(smaller_steps(sim)))
@@ -105,15 +109,19 @@ class ErrorEstimator:
         self._differences[twin] = Differences(self._bodies[twin.own])
         return twin
 
-    def _others(self) -> Iterator[tuple[str, Twin, float]]:
-        """The twins of solvers and mesh: the kind of error, twin, and error over the difference to it."""
+    def _others(self) -> Iterator[tuple[str, Twin, np.ndarray]]:
+        """The twins of solvers and mesh: the kind of error, twin, and errors over the differences to it, per body (n_bodies,)."""
         if self._solver is not None:
-            yield "solver", self._solver, SOLVER_FACTOR
+            yield "solver", self._solver, np.full(len(self._sizes), SOLVER_FACTOR)
         if self._space is not None:
-            ratio = self._space.ratio  # 1 for another order: the difference itself
-            yield "space", self._space, 1.0 if ratio == 1.0 else error_over_difference(ratio, MESH_ORDER)
+            yield "space", self._space, self._space_factors
 
-    def frame(self) -> None:
+    def next_comparison(self, end: int) -> int:
+        """The step count at which to call `compare` before `end`, or else `end` itself."""
+        latest = end - (end - self._first) % self._stride
+        return latest if latest > self._sim.step_count else end
+
+    def compare(self) -> None:
         """Let the twins follow, and compare, if the run is at a whole step of all."""
         steps = self._sim.step_count - self._first
         if self._changed or not steps or steps % self._stride:
@@ -122,8 +130,10 @@ class ErrorEstimator:
         if self._changed:
             return
         begin, compiled = time.perf_counter(), self._sim.compile_seconds
-        for twin in self._twins:
-            twin.follow(steps)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # of twins, not of the run
+            for twin in self._twins:
+                twin.follow(steps)
         self._compare()
         self.wall_seconds += time.perf_counter() - begin - (self._sim.compile_seconds - compiled)
 
@@ -148,21 +158,24 @@ class ErrorEstimator:
         if len(self._in_time) > 1:
             self._between.add(first, found[self._in_time[1]])
         pair = [dataclasses.astuple(sim.energies()) for sim in (self._sim, self._in_time[0].sim)]
-        self._energies = np.abs(np.subtract(*pair))
+        self._energies = np.subtract(*pair)
         self._means.append([self._body_means(path) for path in (x, first)])
 
     def _body_means(self, x: np.ndarray) -> np.ndarray:
         return np.add.reduceat(x, np.cumsum(self._sizes) - self._sizes) / self._sizes[:, None]
 
     def nodal_errors(self) -> np.ndarray:
-        """Estimated errors of all nodes at the last comparison (n_nodes,) [m], all known kinds added; NaN if unknown."""
+        """Estimated errors of all nodes at the last comparison (n_nodes,) [m], of all kinds added; NaN if one is unknown."""
         found = np.zeros(len(self._bodies))
-        factor = self._time_factor(len(self.times))[0] if self.times else None
+        count = 0 if self._changed or self._change() else self._agreeing()
+        factor = self._time_factor(count)[0] if 0 < count == len(self.times) else None
         if factor is None:
             return np.full(len(found), np.nan)
-        for _, twin, scale in (("time", self._in_time[0], factor), *self._others()):
+        for _, twin, scales in (("time", self._in_time[0], np.full(len(self._sizes), factor)), *self._others()):
+            errors = np.full(len(found), np.nan)
             if not twin.failed:
-                found[twin.own] += scale * self._differences[twin].map
+                errors[twin.own] = scales[self._bodies[twin.own]] * self._differences[twin].map
+            found += errors
         return found
 
     def _time_factor(self, k: int) -> tuple[float | None, float | None]:
@@ -176,8 +189,7 @@ class ErrorEstimator:
         near, far = (float(np.sqrt(np.mean(d.squares[:k]))) for d in (fine, self._between))
         if near <= self._negligible:
             return error_over_difference(2.0, MIN_ORDER), None
-        most = 2.0 if self._sim.settings.integrator in SECOND_ORDER else 1.0
-        order = observed_order(near, far, most)
+        order = observed_order(near, far, 2.0 if self._sim.settings.integrator in SECOND_ORDER else 1.0)
         return (None, None) if order is None else (error_over_difference(2.0, order), order)
 
     @property
@@ -202,24 +214,28 @@ class ErrorEstimator:
             made.notes.append(f"the errors are unknown: {why}")
         else:
             self._estimate_time(made)
-            for kind, twin, factor in self._others():
-                self._estimate(made, kind, twin, factor)
+            for kind, twin, factors in self._others():
+                self._estimate(made, kind, twin, factors)
             if self._solver is None:
                 made.solver = 0.0  # nothing is solved
         made.twins = [twin.what for twin in self._twins]
         return made
 
-    def _estimate(self, made: ErrorEstimate, kind: str, twin: Twin, factor: float) -> None:
+    def _estimate(self, made: ErrorEstimate, kind: str, twin: Twin, factors: np.ndarray) -> None:
         """Set one kind of error from the differences to a twin, or note the reason that it is unknown."""
         if twin.failed:
             made.notes.append(f"the error of {kind} is unknown: its twin ({twin.what}) failed: {twin.failed}")
             return
         if twin.unconverged:
             made.notes.append(f"of the twin with {twin.what}, {twin.unconverged} of {twin.reports} steps did not converge")
-        most = factor * self._differences[twin].largest() / self._excursion
-        for body, value in zip(made.bodies.values(), most):
+        count = self._agreeing()
+        if 0 < len(self.times) != count:  # then these differences come from parted paths too
+            made.notes.append(f"the error of {kind} is unknown, since the paths part")
+            return
+        errors = factors * self._differences[twin].largest() / self._excursion
+        for body, value in zip(made.bodies.values(), errors):
             setattr(body, kind, float(value))
-        setattr(made, kind, float(most.max()))
+        setattr(made, kind, float(errors.max()))
 
     def _estimate_time(self, made: ErrorEstimate) -> None:
         """Set the error in time; where the paths part, only that until then."""
@@ -229,25 +245,31 @@ class ErrorEstimator:
             return
         count = self._agreeing()
         factor, made.order = self._time_factor(count) if count else (None, None)
+        twin = self._in_time[0]
         if count == len(self.times) and factor is not None:
-            self._estimate(made, "time", self._in_time[0], factor)
-            made.energies = Energies(*(factor * self._energies).tolist())
+            self._estimate(made, "time", twin, np.full(len(self._sizes), factor))
+            sign = 1.0 if twin.ratio < 1.0 else -1.0  # the exact path lies beyond the finer one
+            made.energies = Energies(*(sign * factor * self._energies).tolist())
             return
         if factor is not None:
             made.agree_until = self.times[count - 1]
-            most = factor * self._differences[self._in_time[0]].largest(count).max() / self._excursion
-            made.time_until_then = float(most)
+            made.time_until_then = float(factor * self._differences[twin].largest(count).max() / self._excursion)
             made.spread_after = self._spread(count)
         when = f"after t = {made.agree_until:.4g} s" if made.agree_until is not None else "from the start"
-        made.notes.append(f"the error in time is unknown: the paths of different steps part {when}")
+        parted = "the paths of different steps part"
+        if len(self._in_time) == 1:
+            parted = f"with half the step some node is over {PARTED:.0%} of the largest excursion away"
+        made.notes.append(f"the error in time is unknown: {parted} {when}")
 
     def _agreeing(self) -> int:
-        """Number of comparisons over which the paths of different steps agree."""
+        """Number of comparisons over which the paths of different steps agree; all of them if a twin failed, so that none can."""
+        if not self.times or any(twin.failed for twin in self._in_time):
+            return len(self.times)
         fine = self._differences[self._in_time[0]]
         if len(self._in_time) > 1:
             return agreement(np.array(fine.squares), np.array(self._between.squares), self._negligible**2)
-        parted = np.flatnonzero(np.max(fine.most, axis=1) > PARTED * self._excursion)
-        return int(parted[0]) if len(parted) else len(fine.most)
+        parted = np.flatnonzero(np.max(fine.maxima, axis=1) > PARTED * self._excursion)
+        return int(parted[0]) if len(parted) else len(fine.maxima)
 
     def _spread(self, count: int) -> dict[str, float]:
         """Per body: distance of its mean positions in run and twin after the first `count` comparisons, over the excursion."""

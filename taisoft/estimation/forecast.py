@@ -1,7 +1,8 @@
 """Error estimates in a sentence, and what a smaller error would cost.
 
 The error in time falls with dt^p, p the observed order, and the work grows with 1 / dt. The error in space falls with h^2, and
-the work grows with h^-4: tets with h^-3, and steps or iterations with 1 / h.
+the work grows with h^-4: tets with h^-3, and steps or iterations with 1 / h. The solvers' error stays: what it alone exceeds has
+no forecast.
 """
 
 import math
@@ -22,8 +23,8 @@ def describe_error(estimate: ErrorEstimate, wall_seconds: float) -> list[str]:
     if estimate.total is not None:
         on_mesh = "" if "space" in known else " on this mesh"
         sentences.append(f"about {percent(estimate.total)} % of the largest excursion{on_mesh} ({listed})")
-        if forecast := wish(estimate, wall_seconds):
-            target, seconds = forecast
+        if cost := forecast(estimate, wall_seconds):
+            target, seconds = cost
             sentences[0] += f"; {percent(target)} %{on_mesh} would take about {seconds:.{2 if seconds < 100.0 else 3}g} s"
     elif estimate.time_until_then is not None:
         sentences.append(
@@ -31,20 +32,23 @@ def describe_error(estimate: ErrorEstimate, wall_seconds: float) -> list[str]:
         )
         apart = max(estimate.spread_after.values())
         sentences.append(f"afterwards the mean positions of bodies change by up to {percent(apart)} % with the step")
+    elif known:
+        sentences.append(f"unknown in time; in percent of the largest excursion {listed}")
     return sentences + estimate.notes
 
 
-def wish(estimate: ErrorEstimate, wall_seconds: float) -> tuple[float, float] | None:
+def forecast(estimate: ErrorEstimate, wall_seconds: float) -> tuple[float, float] | None:
     """The next power of ten below the error, and the wall time it would take [s]; None if unknown."""
     total = estimate.total
     if total is None or not LEAST < total < math.inf:
         return None
     target = 10.0 ** (math.ceil(math.log10(total)) - 1)
-    return target, wall_seconds * work_for(estimate, target)
+    left = target - (estimate.solver or 0.0)
+    return None if left <= 0.0 else (target, wall_seconds * work_for(estimate, left))
 
 
 def work_for(estimate: ErrorEstimate, target: float) -> float:
-    """Work for an error, over that of the run: half of it is left to time where both time and space are estimated."""
+    """Work for an error of time and space, over that of the run: each gets half of it where both are estimated."""
     shares = [(estimate.time, 1.0 / (estimate.order or 1.0)), (estimate.space, MESH_WORK / MESH_ORDER)]
     known = [(error, exponent) for error, exponent in shares if error]
     return math.prod(max(1.0, len(known) * error / target) ** exponent for error, exponent in known)

@@ -14,8 +14,8 @@ from taisoft.dynamics.implicit import DEFAULT_TOLERANCE
 from taisoft.errors import SimulationError, no_memory
 from taisoft.estimation.comparison import shared_nodes
 from taisoft.scene.refine import refined, with_order
-from taisoft.scene.scene import Scene
-from taisoft.stability import stable_dt
+from taisoft.scene.scene import Body, Scene
+from taisoft.stability import constrained_axes, stable_dt
 
 if TYPE_CHECKING:
     from taisoft.simulator import Simulator
@@ -24,6 +24,7 @@ STABLE_FRACTION = 0.9  # of the stable dt, for explicit steps of a twin
 TIGHTER = 0.1  # a twin's tolerances over those of the run; much less takes many iterations, and in f32 meets rounding
 REFINED, ORDER = "refined", "order"  # meshes of a twin, besides a scene
 MESHES = (REFINED, ORDER)
+MIN_WIDTH_RATIO = 1.2  # of two meshes: below it chance rules their difference
 SAME_STATE = 1e-6  # largest distance of shared nodes at the start, over the size of the scene
 
 
@@ -81,12 +82,14 @@ def tighter(sim: "Simulator") -> Twin | None:
     return Twin(f"tolerances x {TIGHTER:g}", sim._copy(**tight), TIGHTER) if tight else None
 
 
-def on_mesh(sim: "Simulator", mesh: str | Scene) -> Twin:
+def on_mesh(sim: "Simulator", mesh: str | Scene) -> tuple[Twin, list[float | None]]:
     """A twin on another mesh: "refined", "order" (the other order of elements) or the scene itself on another mesh.
 
-    Raises SceneError or SimulationError if it cannot be made, or does not start as the run does.
+    Also return its mesh widths over those of the run, one a body, None where the order differs. Raises SceneError or
+    SimulationError if the twin cannot be made, does not start as the run does, or cannot show a body's error.
     """
     scene = other_mesh(sim, mesh)
+    ratios = [_width_ratio(*bodies) for bodies in zip(sim.scene.bodies, scene.bodies)]
     dt, steps = sim.dt, 1
     settings = sim._arguments()
     if sim.settings.explicit:
@@ -96,12 +99,35 @@ def on_mesh(sim: "Simulator", mesh: str | Scene) -> Twin:
     try:
         nodes = shared_nodes(*_nodes(sim), *_nodes(other))
         _check_start(sim, other, nodes)
+        _check_free(sim.scene, nodes[0])
     except BaseException:
         other.close()
         raise
-    own, theirs = (sum(b.mesh.n_tets for b in one.bodies) for one in (sim.scene, scene))
-    what = mesh if isinstance(mesh, str) else f"{theirs:,} tets"
-    return Twin(f"mesh: {what}", other, (own / theirs) ** (1.0 / 3.0), steps, nodes=nodes)
+    what = mesh if isinstance(mesh, str) else f"{sum(b.mesh.n_tets for b in scene.bodies):,} tets"
+    return Twin(f"mesh: {what}", other, 1.0, steps, nodes=nodes), ratios
+
+
+def _width_ratio(own: Body, other: Body) -> float | None:
+    """Mesh width of a body of a twin over that of the run; None if the orders differ. SimulationError if it is near 1."""
+    if own.order != other.order:
+        return None
+    ratio = (own.mesh.n_tets / other.mesh.n_tets) ** (1.0 / 3.0)
+    if max(ratio, 1.0 / ratio) < MIN_WIDTH_RATIO:
+        raise SimulationError(
+            f"error_mesh: body {own.name!r} has {other.mesh.n_tets:,} tets there and {own.mesh.n_tets:,} in the run: the mesh "
+            f"widths must differ by a factor of at least {MIN_WIDTH_RATIO:g}, or the orders, to show an error"
+        )
+    return ratio
+
+
+def _check_free(scene: Scene, shared: np.ndarray) -> None:
+    """Raise SimulationError if all nodes of a body that two meshes share are fixed or follow paths. shared: (k,) ids."""
+    first = 0
+    for body in scene.bodies:
+        own = shared[(shared >= first) & (shared < first + body.n_nodes)] - first
+        if constrained_axes(body, prescribed=True)[own].all():
+            raise SimulationError(f"error_mesh: body {body.name!r}: all nodes of both meshes that coincide are constrained")
+        first += body.n_nodes
 
 
 def other_mesh(sim: "Simulator", mesh: str | Scene) -> Scene:

@@ -13,7 +13,7 @@ guide, so that the two are not drawn over each other) and `material`. Both are l
 the linear triangles and tets that its elements are cut into, with all its nodes as points (`taisoft/mesh/nodes.py`).
 Both carry `primvars:vonMisesStress` [Pa]. If there can be contacts, the surface also carries `primvars:contactImpulse` [N s], the
 impulse of the last step before the frame on each point. `nodal_fields.py` defines both. A run with error=True adds
-`primvars:estimatedError` [m], `Simulator.nodal_errors`.
+`primvars:estimatedError` [m], `Simulator.nodal_errors`, -1 where unknown.
 An obstacle is `/World/<name>` with `surface` and `material`; its points change over time if it follows a path. A half-space
 whose square lies entirely within others is left out. `/View` holds a camera and lights (`usd_scene.py`).
 """
@@ -32,6 +32,7 @@ from taisoft.output.usd_scene import ERROR, IMPULSE, ROOT, STRESS, TRANSLATE, sc
 
 SCENE_NAME = "scene.usdc"
 CHUNKS_NAME = "chunks"
+UNKNOWN_ERROR = -1.0  # of points whose error is unknown
 TIME_VARYING = {"points", "extent", TRANSLATE, *(f"primvars:{name}" for name in (STRESS, IMPULSE, ERROR))}  # attributes
 
 
@@ -101,7 +102,7 @@ class UsdWriter:
         if self._touching:
             fields[IMPULSE] = contact_impulses(sim.contacts(), len(x)).astype(np.float32)
         if self._errors:
-            fields[ERROR] = np.nan_to_num(sim.nodal_errors()).astype(np.float32)
+            fields[ERROR] = np.nan_to_num(sim.nodal_errors(), nan=UNKNOWN_ERROR).astype(np.float32)
         samples = [(self._view.attribute, Gf.Vec3d(*self._view.follow(x).tolist()))]
         for track in self._tracks:
             samples += track.samples(points, fields)

@@ -32,6 +32,7 @@ DECAY = 0.998  # factor on the running maximum per picture
 LOWER_MARGIN = 1.5  # the end is lowered once this times the running maximum, rounded up, is below it
 MIN_SPAN = {"stress": 1.0, "stretch": 1e-3, "speed": 1e-3, "error": 1e-12}  # smallest span of the scale, for a scene at rest
 # sRGB, from low to high
+UNKNOWN = np.array([0.55, 0.55, 0.55])  # where the quantity is unknown
 COLOURS = np.array([(0.27, 0.42, 0.80), (0.33, 0.70, 0.78), (0.72, 0.82, 0.45), (0.97, 0.70, 0.27), (0.82, 0.20, 0.17)])
 
 LAMPS = ((np.array([-0.35, 0.60, 0.72]), 0.72), (np.array([0.85, 0.15, 0.45]), 0.22))  # direction (right, up, back), strength
@@ -82,7 +83,9 @@ class Colouring:
         self._peak = max(value, DECAY * self._peak, MIN_SPAN[self.kind])
         if self._peak > self.span or round_up(LOWER_MARGIN * self._peak) < self.span:
             self.span = round_up(self._peak)
-        return self._surfaces.coloured(colours_of(np.nan_to_num(above / self.span)))
+        colours = colours_of(np.nan_to_num(above / self.span))
+        colours[np.isnan(above)] = UNKNOWN
+        return self._surfaces.coloured(colours)
 
     def legend(self) -> list[tuple[str, np.ndarray]]:
         """Return lines of text from high to low, each with its colour (3,); none for the bodies' own colours."""

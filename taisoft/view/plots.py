@@ -141,12 +141,15 @@ class History:
                 report.contact_iterations * touched / report.steps,
                 report.n_contacts * touched,
                 1e3 * seconds / report.steps,
-                *(100.0 * (getattr(errors, kind, None) or np.nan) for kind in ERROR_KINDS),
+                *(
+                    100.0 * (np.nan if value is None else value)
+                    for value in (getattr(errors, kind, None) for kind in ERROR_KINDS)
+                ),
             ]
         )
         half = np.zeros(len(QUANTITIES))
         if errors is not None and errors.energies is not None:
-            half[:4] = [*_energies(errors.energies), errors.energies.total]
+            half[:4] = np.abs([*_energies(errors.energies), errors.energies.total])
         self._append(report.time, np.where(np.isfinite(row), row, np.nan), half)
 
     def _append(self, time: float, row: np.ndarray, half: np.ndarray) -> None:
