@@ -100,4 +100,5 @@ class RunReport:
     step_reports: list[StepReport] = field(default_factory=list)  #: one a step; of explicit runs one a frame
     dt: float | None = None  #: of its steps [s]
     dt_requested: float | None = None  #: that the simulator had, where the run changed it to fit the frames [s]
-    error_estimate: ErrorEstimate | None = None  #: of a run with error=True
+    pilot_seconds: float = 0.0  #: wall time of the pilots of a run with a tolerance, without compile time [s]
+    error_estimate: ErrorEstimate | None = None  #: of a run with error=True or a tolerance

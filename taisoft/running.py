@@ -3,13 +3,13 @@
 A failure ends the run and is reported; the results so far are kept.
 """
 
-import math
 import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from taisoft.energy_check import EnergyCheck
 from taisoft.errors import SimulationError, no_memory
+from taisoft.frames import ROUNDING, check_length, fit_dt
 from taisoft.records import RunReport, StepReport
 from taisoft.settings import check_positive
 
@@ -20,9 +20,6 @@ if TYPE_CHECKING:
 
 FrameCallback = Callable[["Simulator", int, StepReport | None], None]
 StepCallback = Callable[[StepReport, float], None]
-NEAR = 1e-6  # relative to dt: a divisor of the frame time this close is taken as intended, dt being written with 6 or 7 digits
-ROUNDING = 1e-9  # relative to the frame time: allowed error of dt times the steps per frame
-MAX_STEPS = 2.0**52  # of a run: beyond that, adding dt no longer changes a float64 time
 
 
 def run(
@@ -46,17 +43,38 @@ def run(
     with other steps and tighter tolerances; the report holds it. error_mesh: also estimate the error of the mesh, by a twin on
     another one: "refined", "order" (the elements' other order), or the same scene on a mesh that shares nodes. A failed or
     interrupted run does not raise: see the report's status and problems. Raises SimulationError for bad arguments, and for a
-    twin that cannot be made.
+    twin that cannot be made. A simulator with a tolerance first chooses integrator and dt by pilots, unless the run is resumed;
+    the report then holds the error in time.
     """
     if error_mesh is not None and not error:
         raise SimulationError("error_mesh needs error=True")
     seconds = check_positive("seconds", seconds, "s")
     fps = None if fps is None else check_positive("fps", fps, "1/s")
     check_length(seconds, sim.dt, fps)
+    arguments = {"on_frame": on_frame, "on_step": on_step, "error": error, "error_mesh": error_mesh}
+    if sim.settings.tolerance is None or resumed:
+        return run_steps(sim, seconds, fps=fps, stop=stop, resumed=resumed, **arguments)
+    from taisoft.estimation.tolerance import run_to_tolerance
+
+    return run_to_tolerance(sim, run_steps, seconds, fps, stop, **arguments)
+
+
+def run_steps(
+    sim: "Simulator",
+    seconds: float,
+    on_frame: FrameCallback | None = None,
+    fps: float | None = 60,
+    stop: Callable[[], bool] | None = None,
+    resumed: bool = False,
+    on_step: StepCallback | None = None,
+    error: bool = False,
+    error_mesh: "str | Scene | None" = None,
+) -> RunReport:
+    """Run as `run`, with the simulator's integrator and dt, and checked arguments."""
     report = RunReport()
     compiled = sim.compile_seconds
     clock = time.perf_counter()
-    steps_per_frame = _fit_dt(sim, fps, report)
+    steps_per_frame = fit_dt(sim, fps, report)
     total = max(1, round(seconds / sim.dt))
     if not resumed and seconds < 0.5 * sim.dt:
         report.problems.append(f"note: {seconds:.6g} s are less than half a step: one step of {sim.dt:.6g} s is taken")
@@ -115,67 +133,6 @@ def run(
             report.status = "degraded"
             _mark_interrupted(report)
     return report
-
-
-def check_length(seconds: float, dt: float, fps: float | None) -> None:
-    """Raise SimulationError if steps of dt [s], fitted to fps, would never reach `seconds` [s]."""
-    dt = _fit_to_frames(dt, fps)[1]
-    if not seconds <= MAX_STEPS * dt:
-        raise SimulationError(
-            f"seconds = {seconds:g} s in steps of {dt:g} s are more than {MAX_STEPS:.2g} steps: the run would never end"
-        )
-
-
-def first_frame(sim: "Simulator", fps: float | None) -> int:
-    """Return the number of a resumed run's first frame: that of the present state, or the next one if it lies between two."""
-    n, dt = _fit_to_frames(sim.dt, fps, sim)
-    return -(-round(sim.time / dt) // n)
-
-
-def _fit_to_frames(dt: float, fps: float | None, sim: "Simulator | None" = None) -> tuple[int, float]:
-    """Return the steps per frame and the dt [s] that fits them to a frame.
-
-    That dt is the divisor of 1/fps within NEAR of the given one, unless the simulator refuses it as unstable, else the largest
-    divisor below it.
-    """
-    if fps is None:
-        return 1, dt
-    frame = 1.0 / fps
-    if not frame <= MAX_STEPS * dt:  # such a run is refused by `check_length`
-        return 1, dt
-    n = max(1, round(frame / dt))
-    if abs(n * dt - frame) <= ROUNDING * frame:
-        return n, dt
-    if abs(n * dt - frame) > NEAR * frame or (frame / n > dt and sim is not None and not _allows_dt(sim, frame / n)):
-        n = max(1, math.ceil(frame / dt))
-    return n, frame / n
-
-
-def _allows_dt(sim: "Simulator", dt: float) -> bool:
-    """Return whether the simulator accepts a dt [s] as stable."""
-    return not sim.settings.explicit or sim.settings.allow_unstable or dt <= sim.stable_dt
-
-
-def _fit_dt(sim: "Simulator", fps: float | None, report: RunReport) -> int:
-    """Return the steps per frame. Set dt to a divisor of the frame time if it is none, and note that in the report."""
-    n, dt = _fit_to_frames(sim.dt, fps, sim)
-    if dt != sim.dt:
-        report.dt_requested, sim.dt = sim.dt, dt
-    report.dt = sim.dt
-    if report.dt_requested is not None:
-        report.problems.append(f"note: {dt_sentence(report)}, so that {n} steps make a frame of 1/{fps:g} s")
-    return n
-
-
-def dt_sentence(report: RunReport) -> str:
-    """Describe how a run changed the requested dt; "" if it did not."""
-    if report.dt_requested is None:
-        return ""
-    before, after = report.dt_requested, report.dt
-    change = "rounded" if abs(after - before) <= 1.01 * NEAR * before else "lowered"
-    texts = ((f"{before:.{digits}g}", f"{after:.{digits}g}") for digits in (6, 9, 17))
-    old, new = next(pair for pair in texts if pair[0] != pair[1])
-    return f"dt {change} from {old} s to {new} s"
 
 
 def _advance_to(

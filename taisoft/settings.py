@@ -33,6 +33,7 @@ class Settings:
     linear_tolerance: float | None = None
     contact_tolerance: float | None = None
     draggable: bool = False
+    tolerance: float | None = None  # of a run's positions, over the largest excursion
 
     @property
     def explicit(self) -> bool:

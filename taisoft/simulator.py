@@ -9,6 +9,7 @@ from taisoft.attributes import Guarded, SimulationAttributeError, thawed
 from taisoft.backend import runtime
 from taisoft.dynamics.dynamics import Dynamics
 from taisoft.errors import SceneError, SimulationError, no_memory
+from taisoft.estimation.first_choice import settings_for
 from taisoft.fem.laws import LAWS
 from taisoft.records import StepReport
 from taisoft.scene.scene import Scene
@@ -28,6 +29,8 @@ class Simulator(Guarded):
     "coloured_gauss_seidel", "jacobi" or "hybrid", in implicit ones "augmented_lagrangian". self_collision: whether bodies touch
     themselves. precision: "f32" or "f64". arch: "cpu" or "cuda". newton_tolerance, linear_tolerance, contact_tolerance: relative;
     None: the default of the precision, for linear solves adaptive. draggable: allow `drag`.
+    tolerance: wanted error of positions in time over the largest excursion; `run` then chooses integrator and dt by pilots
+    (`taisoft.estimation.tolerance`), whatever they were before, and tolerances that are None follow from it.
     An explicit integrator refuses a dt above `stable_dt`; with allow_unstable it only warns.
     Raises SceneError for a scene that cannot be simulated, SimulationError for settings that cannot be met.
     """
@@ -53,16 +56,19 @@ class Simulator(Guarded):
         linear_tolerance: float | None = None,
         contact_tolerance: float | None = None,
         draggable: bool = False,
+        tolerance: float | None = None,
     ):
         given = locals()  # of the arguments alone, as long as this is the first line
         self.settings = check_settings(scene, **{name: given[name] for name in NAMES})
         self._stable_dt: float | None = None  # None: not computed yet, or outdated
+        if tolerance is not None:
+            self.settings, self._stable_dt = settings_for(scene, self.settings)
         self.scene = scene.snapshot()  # run-time changes must not reach the user's scene
         self._start_scene, scene = scene, self.scene
         changes.check_stability(self, self.settings.dt)
         for text in scale_warnings(scene):
             warnings.warn(text, UserWarning, stacklevel=2)
-        self.plan = plan_of(scene, integrator, self_collision, draggable)
+        self.plan = plan_of(scene, self.settings.integrator, self_collision, draggable)
         self._may_soften = any(LAWS[b.material.law].SOFTENS_BELOW for b in scene.bodies)  # until a warning says so
         self._compiled_before = self._compile_reported = runtime.compile_clock()
         try:

@@ -38,7 +38,7 @@ ORDER = (
     ("dynamics.schemes",),
     ("settings",),
     ("dynamics",),
-    ("simulator", "queries", "changes", "energy_check", "running", "static", "checkpoint", "estimation"),
+    ("simulator", "queries", "changes", "energy_check", "frames", "running", "static", "checkpoint", "estimation"),
     ("output", "view"),
     ("study",),
     ("cli",),

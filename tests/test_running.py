@@ -18,15 +18,16 @@ from scenes import cube, element, rubber
 import taisoft as ts
 from taisoft.dynamics.explicit_stepper import ExplicitStepper
 from taisoft.dynamics.stage_system import StageSystem
+from taisoft.frames import first_frame
 from taisoft.records import Energies, StepReport
-from taisoft.running import first_frame, run
+from taisoft.running import run
 
 
 class StandIn:
     """A simulator that only counts steps; `events` maps a step to an exception or to fields of its report."""
 
     def __init__(self, explicit: bool, dt: float = 0.01, events=None, largest_batch: int = 4):
-        self.settings, self.touches = SimpleNamespace(explicit=explicit, integrator="symplectic_euler"), False
+        self.settings, self.touches = SimpleNamespace(explicit=explicit, integrator="symplectic_euler", tolerance=None), False
         self.dt, self.step_count, self.time, self.compile_seconds = dt, 0, 0.0, 0.0
         self.events, self.largest_batch = events or {}, largest_batch
         self.scene, self.stable_dt, self.is_driven, self.changes = ts.Scene(), 1.0, False, 0

@@ -193,6 +193,9 @@ def _add_run(add) -> None:
     _add_scene_name(option)
     option("--arch", choices=("cpu", "cuda"), help="where to compute (default cpu)")
     option("--precision", choices=("f32", "f64"), help="floating-point precision (default f32)")
+    option(
+        "--tolerance", type=float, metavar="X", help="choose integrator and dt for this error in time over the largest excursion"
+    )
     option("--headless", action="store_true", help="open no window")
     option("--seconds", type=float, metavar="T", help="simulated time [s] (default: the scene's, or 1)")
     option("--fps", type=float, metavar="N", help="frames per simulated second (default: the scene's, or 60)")

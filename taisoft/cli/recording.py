@@ -10,12 +10,12 @@ from pathlib import Path
 
 from taisoft.errors import OutputError, SceneError
 from taisoft.estimation.forecast import describe_error
+from taisoft.frames import dt_sentence
 from taisoft.output.files import RESULT_FILES, CheckpointWriter, OutputFolder
 from taisoft.output.frames import FRAMES_NAME, FrameWriter, ffmpeg_command, find_ffmpeg, picture_numbers, write_video
 from taisoft.output.report import body_records, write_report
 from taisoft.output.usd import UsdWriter
 from taisoft.records import RunReport
-from taisoft.running import dt_sentence
 from taisoft.scene.checks import nearest
 from taisoft.view.annotations import Annotations, text_missing
 from taisoft.view.offscreen import Offscreen
@@ -191,7 +191,7 @@ class Recording:
             result,
             arch=settings["arch"],
             precision=settings["precision"],
-            settings=settings | {"dt": sim.dt},
+            settings=settings | sim._arguments(),
             plan=sim.plan.entries,
             resumed=self._resumed,
             bodies=body_records(sim.scene),

@@ -26,10 +26,10 @@ from taisoft.cli.recording import (
 )
 from taisoft.cli.scene_file import OF_SCENE, load_scene, refuse_unknown
 from taisoft.errors import SceneError, SimulationError
+from taisoft.frames import check_length, first_frame
 from taisoft.output.files import check_free, read_last_good
 from taisoft.output.report import Progress
 from taisoft.records import RunReport
-from taisoft.running import check_length, first_frame
 from taisoft.scene import checks
 from taisoft.scene.scene import Scene
 from taisoft.simulator import Simulator
@@ -138,7 +138,7 @@ def _given(arguments: Namespace, keys: list[str]) -> dict:
             raise SceneError(f"--set {assignment}: write solver.KEY=VALUE, e.g. solver.dt=0.01")
         refuse_unknown([key], keys, f"--set {assignment}: ")
         given[key] = parse_scalar(text.strip(), assignment)
-    for key in ("arch", "precision", *RUN_KEYS):
+    for key in ("arch", "precision", "tolerance", *RUN_KEYS):
         option = getattr(arguments, key)
         if option is None:
             continue

@@ -32,7 +32,8 @@ if TYPE_CHECKING:
 MIN_STEPS = 32  # of a run whose error is estimated by larger steps
 SOLVER_FACTOR = error_over_difference(TIGHTER, 1)  # errors are about proportional to the tolerances
 PARTED = 0.1  # with one twin: difference, over the excursion, above which paths may have parted for good
-NEGLIGIBLE = {"f32": 1e-6, "f64": 1e-9}  # differences, over the excursion, that are rounding or the solvers' tolerances
+NEGLIGIBLE = {"f32": 1e-6, "f64": 1e-9}  # differences, over the excursion, that are rounding
+SOLVED = 0.01  # differences, over the excursion and Newton's tolerance, that come from this
 
 
 class Differences:
@@ -195,7 +196,9 @@ class ErrorEstimator:
     @property
     def _negligible(self) -> float:
         """Difference that shows no order [m]."""
-        return NEGLIGIBLE[self._sim.settings.precision] * self._excursion
+        settings = self._sim.settings
+        solved = 0.0 if settings.explicit else settings.newton_tolerance or 0.0
+        return max(NEGLIGIBLE[settings.precision], SOLVED * solved) * self._excursion
 
     def estimate(self) -> ErrorEstimate:
         """The estimate of the run so far."""

@@ -207,6 +207,7 @@ SOLVER_CHECKS = {  # key of the `solver` dict -> check
     "newton_tolerance": _tolerance,
     "linear_tolerance": _tolerance,
     "contact_tolerance": _tolerance,
+    "tolerance": _tolerance,
     "seconds": _positive,
     "fps": lambda value, what: value is None or _positive(value, what),
 }

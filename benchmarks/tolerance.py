@@ -1,0 +1,230 @@
+"""Wished against obtained errors, and what they cost: the scenes of `taisoft bench error`, run to a tolerance.
+
+taisoft bench tolerance [--scene NAME ...] [--quick] [--out [FILE.json]]
+
+Each scene runs with tolerances of 10, 1 and 0.1 % (`Simulator(tolerance=)`), and with a grid of fixed settings: all integrators
+at 1 to 64 steps a frame, explicit ones at up to 8 times their least. Errors are distances at the frames, over the largest
+excursion, to a run in double precision with small steps: 128 a frame, explicit ones 32 times the least, with tolerances of 1e-9,
+and 1e-8 of the contact laws. Implicit and explicit steps have a reference each, since quadratic elements have another mass matrix
+in explicit steps and impacts another law. A reference's own error is its distance to a run with half as many steps.
+Seconds are from the call of Simulator to the end of the run, with pilots, without compiling: medians of repeated runs. Best: the
+fastest fixed setting that meets the tolerance. Exit status: 0, or 1 if a limit is not met.
+"""
+
+import argparse
+import math
+import statistics
+import sys
+import time
+from dataclasses import dataclass
+
+import numpy as np
+
+import taisoft as ts
+from taisoft.dynamics.schemes import EXPLICIT, IMPLICIT, takes_contacts
+from taisoft.estimation.comparison import distance, largest_excursion
+from taisoft.estimation.first_choice import stable_steps
+from taisoft.estimation.forecast import percent
+
+from .document import Limit, begin, table
+from .error import EXACT, EXPLICIT_FPS
+from .error_cases import CASES, Case
+from .runner import add_named_out, make_parser, named_out, progress, without_warnings
+
+TOLERANCES = (0.1, 0.01, 0.001)
+STEPS = (1, 2, 4, 8, 16, 32, 64)  # of implicit integrators, a frame
+FINER = (1, 2, 4, 8)  # steps of explicit integrators over their least
+TRUTH = {False: 128, True: 32}  # steps a frame of the reference, explicit ones over their least; key: explicit
+REPEATS, SHORT, LONG = 3, 1.0, 10.0  # runs of up to SHORT [s] are repeated; a grid goes no further after one of LONG [s]
+ENOUGH, SLOWEST, MEDIAN = 11 / 12, 2.0, 1.3  # of the scenes that meet a tolerance; times over the best fixed setting
+QUICK = ("hanging beam", "incline")
+
+
+@dataclass
+class Fixed:
+    """A fixed setting: steps a frame, its true error and seconds."""
+
+    integrator: str
+    steps: int
+    error: float
+    seconds: float
+
+
+@dataclass
+class Row:
+    """A scene run to a tolerance. own: the reference's own error; best: the fastest fixed setting, None if none meets it."""
+
+    name: str
+    tolerance: float
+    integrator: str
+    steps: int  # a frame
+    status: str
+    estimated: float | None
+    true: float
+    own: float
+    seconds: float
+    pilots: float  # [s]
+    best: Fixed | None
+
+    @property
+    def met(self) -> bool:
+        """Whether the true error is within the tolerance."""
+        return self.true <= self.tolerance
+
+    @property
+    def ratio(self) -> float:
+        """Seconds over those of the best fixed setting; nan without one."""
+        return self.seconds / self.best.seconds if self.best else math.nan
+
+
+def fps_of(case: Case) -> float:
+    """Frames per second."""
+    return EXPLICIT_FPS if case.dt is None else 60.0
+
+
+class Scene:
+    """The references of a scene, and its frame. least: explicit steps a frame."""
+
+    def __init__(self, case: Case):
+        self.case, self.frame = case, 1.0 / fps_of(case)
+        with ts.Simulator(case.build(), dt=1e-9, integrator="velocity_verlet") as sim:
+            self.least, self.touches = stable_steps(sim.stable_dt, self.frame), sim.touches
+        self._truths: dict[bool, tuple[np.ndarray, float]] = {}
+
+    def path(self, integrator: str, steps: int, **settings) -> np.ndarray:
+        """Positions (k,n,3) [m] at the frames."""
+        found = []
+        with ts.Simulator(self.case.build(), dt=self.frame / steps, integrator=integrator, **settings) as sim:
+            sim.run(self.case.seconds, on_frame=lambda sim, *_: found.append(sim.positions()), fps=1.0 / self.frame)
+        return np.array(found)
+
+    def truth(self, explicit: bool) -> tuple[np.ndarray, float]:
+        """Path of the reference, and its own error."""
+        if explicit not in self._truths:
+            integrator = "velocity_verlet" if explicit else "bdf2" if self.touches else "implicit_midpoint"
+            exact = {} if explicit else {"newton_tolerance": EXACT["newton_tolerance"]}
+            exact |= {"contact_tolerance": EXACT["contact_tolerance"]} if self.touches else {}
+            steps = TRUTH[explicit] * (self.least if explicit else 1)
+            fine, coarse = (self.path(integrator, steps // k, precision="f64", **exact) for k in (1, 2))
+            self._truths[explicit] = fine, distance(coarse, fine, largest_excursion(fine)).max
+        return self._truths[explicit]
+
+    def error(self, integrator: str, path: np.ndarray) -> float:
+        """True error of a path (k,n,3) [m]."""
+        truth, _ = self.truth(integrator in EXPLICIT)
+        k = min(len(path), len(truth))  # a failed run is shorter
+        return distance(path[:k], truth[:k], largest_excursion(truth)).max if len(path) == len(truth) else math.inf
+
+    def timed(self, **settings) -> tuple[float, ts.RunReport, ts.Simulator]:
+        """Median seconds of the set-up and a run, without compiling; the last report, and its closed simulator."""
+        seconds = []
+        while not seconds or (seconds[0] < SHORT and len(seconds) < REPEATS):
+            start = time.perf_counter()
+            with ts.Simulator(self.case.build(), **settings) as sim:
+                report = sim.run(self.case.seconds, fps=1.0 / self.frame)
+                seconds.append(time.perf_counter() - start - sim.compile_seconds)
+        return statistics.median(seconds), report, sim
+
+    def grid(self) -> list[Fixed]:
+        """All fixed settings; an integrator goes no further after a long run."""
+        found = []
+        for integrator in (*EXPLICIT, *IMPLICIT):
+            explicit = integrator in EXPLICIT
+            if self.touches and not takes_contacts(integrator):
+                continue
+            for steps in [k * self.least for k in FINER] if explicit else STEPS:
+                seconds, report, _ = self.timed(dt=self.frame / steps, integrator=integrator)
+                if report.status != "failed":
+                    found.append(Fixed(integrator, steps, self.error(integrator, self.path(integrator, steps)), seconds))
+                if seconds > LONG:
+                    break
+        return found
+
+    def row(self, tolerance: float, grid: list[Fixed]) -> Row:
+        """A run to a tolerance."""
+        seconds, report, sim = self.timed(tolerance=tolerance)
+        integrator, steps = sim.settings.integrator, round(self.frame / sim.dt)
+        tolerances = {name: getattr(sim.settings, name) for name in ("newton_tolerance", "contact_tolerance")}
+        path = self.path(integrator, steps, **tolerances) if report.status != "failed" else np.empty((0, 0, 3))
+        enough = [fixed for fixed in grid if fixed.error <= tolerance]
+        return Row(
+            name=self.case.name,
+            tolerance=tolerance,
+            integrator=integrator,
+            steps=steps,
+            status=report.status,
+            estimated=report.error_estimate.time if report.error_estimate else None,
+            true=self.error(integrator, path),
+            own=self.truth(integrator in EXPLICIT)[1],
+            seconds=seconds,
+            pilots=report.pilot_seconds,
+            best=min(enough, key=lambda fixed: fixed.seconds) if enough else None,
+        )
+
+
+def row_table(rows: list[Row]) -> str:
+    """A row per scene and tolerance."""
+
+    def best(row: Row) -> str:
+        return f"{row.best.integrator} {row.best.steps}" if row.best else "none"
+
+    columns = (
+        ("<scene", lambda r: r.name),
+        ("wished [%]", lambda r: f"{100.0 * r.tolerance:.3g}"),
+        ("<integrator", lambda r: r.integrator),
+        ("steps a frame", lambda r: f"{r.steps:,}"),
+        ("estimated [%]", lambda r: "unknown" if r.estimated is None else percent(r.estimated)),
+        ("true [%]", lambda r: percent(r.true)),
+        ("own error [%]", lambda r: percent(r.own)),
+        ("<met", lambda r: "yes" if r.met else "no, but reported" if r.status != "ok" else "no"),
+        ("seconds", lambda r: f"{r.seconds:.3g}"),
+        ("of pilots", lambda r: f"{r.pilots:.2g}"),
+        ("<best fixed", best),
+        ("seconds over best", lambda r: "-" if math.isnan(r.ratio) else f"{r.ratio:.2f}"),
+    )
+    return table(rows, columns)
+
+
+def find_limits(rows: list[Row]) -> list[Limit]:
+    """How many scenes meet each tolerance, and times over the best fixed setting where there is one."""
+    found = []
+    for tolerance in sorted({row.tolerance for row in rows}, reverse=True):
+        chosen = [row.met for row in rows if row.tolerance == tolerance]
+        name = f"{100.0 * tolerance:.3g} %: fraction of scenes that meet it"
+        found.append(Limit(name, sum(chosen) / len(chosen), ENOUGH, at_least=True))
+    ratios = [row.ratio for row in rows if not math.isnan(row.ratio)] or [math.nan]
+    found.append(Limit("seconds over the best fixed setting, median", statistics.median(ratios), MEDIAN))
+    return [*found, Limit("seconds over the best fixed setting, largest", max(ratios), SLOWEST)]
+
+
+def parser() -> argparse.ArgumentParser:
+    """The options."""
+    made = make_parser("tolerance", __doc__)
+    names = [case.name for case in CASES]
+    made.add_argument("--scene", nargs="+", choices=names, metavar="NAME", help=f"only these: {', '.join(names)}")
+    made.add_argument("--quick", action="store_true", help=f"only {' and '.join(QUICK)}")
+    add_named_out(made)
+    return made
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Measure and print. Raises OutputError if a file cannot be written."""
+    options = parser().parse_args(argv)
+    options.arch = "cpu"
+    options.out = named_out(options, "tolerance")
+    document, numbers = begin("Runs to a tolerance", "cpu", "f32")
+    names = options.scene or (QUICK if options.quick else [case.name for case in CASES])
+    rows, grids, start = [], {}, time.perf_counter()
+    for case in CASES:
+        if case.name in names:
+            progress(f"{case.name}, {time.perf_counter() - start:.0f} s")
+            with without_warnings():
+                scene = Scene(case)
+                grids[case.name] = scene.grid()
+                rows += [scene.row(tolerance, grids[case.name]) for tolerance in TOLERANCES]
+    document.add(row_table(rows))
+    return document.finish(options, numbers | {"precision": "f32", "rows": rows, "grids": grids}, find_limits(rows))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
