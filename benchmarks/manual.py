@@ -29,6 +29,9 @@ from .order import DEFAULT_DEGREE, GOAL
 from .order_cases import HANGING
 from .reference_cases.record import label
 from .runner import make_parser
+from .tolerance import Fixed
+from .tolerance import Row as ToleranceRow
+from .tolerance import row_table as tolerance_table
 from .works.table import compare_table
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
@@ -215,6 +218,13 @@ def error(results: Path) -> str:
     return row_table(rows) + measured_on(numbers)
 
 
+def tolerance(results: Path) -> str:
+    """Wished, estimated and true errors."""
+    numbers = newest(results, "tolerance")
+    rows = [ToleranceRow(**row | {"best": row["best"] and Fixed(**row["best"])}) for row in numbers["rows"]]
+    return tolerance_table(rows) + measured_on(numbers)
+
+
 TABLES: dict[str, Callable[[Path], str]] = {  # by marker
     "order_errors": order_errors,
     "order_times": order_times,
@@ -225,6 +235,7 @@ TABLES: dict[str, Callable[[Path], str]] = {  # by marker
     "ipc": ipc,
     "ipc_friction": ipc_friction,
     "error": error,
+    "tolerance": tolerance,
     "crossings": crossings,
 }
 

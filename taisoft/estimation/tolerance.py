@@ -42,6 +42,7 @@ FEWEST = {EXPLICIT: 2, IMPLICIT: 3}  # pilots that show an error: coarse implici
 LARGEST_STEP = 4  # frames in a step of the first implicit pilot
 LEAST_STEPS = 8  # of a pilot
 MAX_PILOTS = 8
+MAX_PASSED = 2  # pilots that meet the tolerance but are degraded, and are passed over for a finer one
 MAX_PARTED = 2  # pilots in succession whose differences have not become smaller: the paths part
 COARSE = 2  # implicit pilots with fewer steps a frame do not count as parted
 SECOND_PILOT = Fraction(5, 4)  # its steps over those of the first, where velocities may jump
@@ -107,6 +108,7 @@ class Ladder:
     error: float | None = None
     order: float = 1.0
     parted: int = 0
+    passed: int = 0  # see MAX_PASSED
     tried: int = 0
     differences: list[float] = field(default_factory=list)  # root mean squares of the distances between successive pilots [m]
 
@@ -168,6 +170,9 @@ class Ladder:
         last = self.pilots[-1].per_frame
         few = len(self.pilots) < FEWEST[self.integrator]
         if self.error is not None and self.error <= tolerance and (not few or self.integrator == EXPLICIT):
+            if self.pilots[-1].report.status == "degraded" and self.passed < MAX_PASSED:
+                self.passed += 1
+                return None
             return math.ceil(last)
         if few:
             return None
