@@ -21,6 +21,7 @@ from taisoft.output.report import json_text
 from taisoft.output.tables import markdown, percent, spread_of
 
 RESULTS = Path(__file__).resolve().parent / "results"
+DIGITS = 8  # of stored numbers
 COMPARABLE = ("processor", "cores", "arch", "quick")  # runs are compared only if these agree
 
 
@@ -44,7 +45,7 @@ class Document:
 
     def write(self, out: Path, numbers: dict) -> None:
         """Write the numbers to `out`, a .json file, and the page beside it. Raises OutputError."""
-        write_bytes(out, json_text(plain(numbers)).encode())
+        write_bytes(out, compact_text(plain(numbers)).encode())
         write_bytes(out.with_suffix(".md"), self.text().encode())
         print(f"written: {out} and {out.with_suffix('.md').name}")
 
@@ -104,6 +105,21 @@ def plain(value):
     if isinstance(value, dict):
         return {key: plain(one) for key, one in value.items()}
     return [plain(one) for one in value] if isinstance(value, list | tuple) else value
+
+
+def compact_text(record: dict) -> str:
+    """JSON text of a record, one line for each of its entries, numbers with DIGITS digits: stored results are many."""
+
+    def rounded(value):
+        if isinstance(value, dict):
+            return {key: rounded(one) for key, one in value.items()}
+        if isinstance(value, list):
+            return [rounded(one) for one in value]
+        return float(f"{value:.{DIGITS}g}") if isinstance(value, float) else value
+
+    entries = rounded(json.loads(json_text(record))).items()
+    lines = (f"{json.dumps(key)}:{json.dumps(value, separators=(',', ':'))}" for key, value in entries)
+    return "{" + ",\n".join(lines) + "}\n"
 
 
 # --- files --------------------------------------------------------------------------------------------------------------

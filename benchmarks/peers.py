@@ -20,10 +20,9 @@ from types import ModuleType
 
 from taisoft.files import write_bytes
 from taisoft.machine import Timing, load_average
-from taisoft.output.report import json_text
 from taisoft.output.tables import require_matplotlib
 
-from .document import Document, again_text, earlier_numbers, header, limit_table, load_text, plain
+from .document import Document, again_text, compact_text, earlier_numbers, header, limit_table, load_text, plain
 from .programs import mujoco_flex, newton_works, own, pybullet_soft
 from .programs.tried import TRIED, VERSIONS
 from .runner import add_arch, add_named_out, make_parser, named_out
@@ -126,7 +125,7 @@ def main(argv=None) -> int:
     rounds = 1 if options.quick else options.rounds
     numbers, found = run(works, programs, options.arch, rounds, document, earlier_numbers(out))
     if out is not None:
-        write_bytes(out, json_text(numbers).encode())
+        write_bytes(out, compact_text(numbers).encode())
         picture = f"\n![]({out.stem}.png)\n" if any(rows[0].work.kind == "path" for rows in found) else ""
         write_bytes(out.with_suffix(".md"), f"{document.text()}{picture}".encode())
         draw(found, out.with_suffix(".png"))

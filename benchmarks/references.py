@@ -18,8 +18,8 @@ from taisoft.backend.runtime import open_runtime
 from taisoft.errors import OutputError
 from taisoft.files import write_bytes
 from taisoft.machine import machine, versions
-from taisoft.output.report import json_text
 
+from .document import compact_text
 from .reference_cases import CASES, PROBLEMS
 from .reference_cases.record import Case, Check, computed
 from .runner import add_arch, make_parser
@@ -80,7 +80,7 @@ def _rows(problems, arch: str) -> Iterator[Row]:
 
 def _write(path: Path, arch: str, rows: list[Row]) -> None:
     where = {"machine": machine(), "versions": versions("taisoft", "taichi", "numpy", "scipy")}
-    write_bytes(path, json_text({"arch": arch, "precision": "f64", **where, "rows": [row.record() for row in rows]}).encode())
+    write_bytes(path, compact_text({"arch": arch, "precision": "f64", **where, "rows": [row.record() for row in rows]}).encode())
 
 
 def main(argv=None) -> int:

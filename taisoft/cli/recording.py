@@ -248,7 +248,8 @@ def print_summary(result: RunReport, sim, observers: Observers, recording: Recor
         _print_lines("error", describe_error(result.error_estimate, result.wall_seconds - observers.seconds))
     print_state(sim)
     output, compiling = f"{observers.seconds:.2f} s of it for output", f"{result.compile_seconds:.2f} s to compile"
-    _print_lines("wall", [f"{result.wall_seconds:.2f} s, {output}; plus {compiling}"])
+    pilots = f"{result.pilot_seconds:.2f} s of pilots and " if result.pilot_seconds else ""
+    _print_lines("wall", [f"{result.wall_seconds:.2f} s, {output}; plus {pilots}{compiling}"])
     if result.step_reports:
         worst = min(result.step_reports, key=lambda report: report.min_volume_ratio)
         _print_lines("min J", [f"{worst.min_volume_ratio:.4g} at {worst.time:.4g} s, {worst.n_inverted} tets inverted"])
