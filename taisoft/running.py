@@ -53,7 +53,10 @@ def run(
     check_length(seconds, sim.dt, fps)
     arguments = {"on_frame": on_frame, "on_step": on_step, "error": error, "error_mesh": error_mesh}
     if sim.settings.tolerance is None or resumed:
-        return run_steps(sim, seconds, fps=fps, stop=stop, resumed=resumed, **arguments)
+        report = run_steps(sim, seconds, fps=fps, stop=stop, resumed=resumed, **arguments)
+        if resumed and sim.settings.tolerance is not None:
+            report.problems.append("note: the run keeps the steps that were chosen for the tolerance; its error is not estimated")
+        return report
     from taisoft.estimation.tolerance import run_to_tolerance
 
     return run_to_tolerance(sim, run_steps, seconds, fps, stop, **arguments)

@@ -58,7 +58,7 @@ def check_settings(scene: Scene, **given) -> Settings:
         checks.check_solver(**dataclasses.asdict(settings))
     except SceneError as error:
         raise SimulationError(str(error)) from None
-    given = {name: value for name in TOLERANCES if (value := getattr(settings, name)) is not None}
+    given = {name: value for name in (*TOLERANCES, "tolerance") if (value := getattr(settings, name)) is not None}
     settings = dataclasses.replace(settings, **{name: float(value) for name, value in given.items()})
     _check_name("integrator", settings.integrator, INTEGRATORS)
     _check_name("contact_solver", settings.contact_solver, CONTACT_SOLVERS)

@@ -174,10 +174,22 @@ class Simulator(Guarded):
     def rebuild(self, **settings) -> None:
         """Continue from the present state with other settings, arguments of this class; arch and precision cannot change.
 
+        Another tolerance changes those of the solvers that follow from it. With a tolerance the integrator cannot be set.
+
         Positions, velocities, time, step count, released nodes and changed numbers are kept. The integrator's history is
         discarded, as by `set_state`, and a drag ends. Both simulators are in memory during the call.
         Raises SimulationError if the settings cannot be met; this simulator is then unchanged.
         """
+        if "tolerance" in settings:
+            settings = {"newton_tolerance": None, "contact_tolerance": None} | settings
+        if "integrator" in settings and settings.get("tolerance", self.settings.tolerance) is not None:
+            raise SimulationError(
+                "with a tolerance, run() chooses the integrator: call sim.rebuild(tolerance=None, integrator=...)"
+            )
+        self._replace(**settings)
+
+    def _replace(self, **settings) -> None:
+        """Do as `rebuild`, with any settings."""
         before, new = self._open(), self._copy(**settings)
         kept = {name: self.__dict__[name] for name in ("_start_scene", "_compiled_before", "_compile_reported")}
         before.close()

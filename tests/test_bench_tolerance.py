@@ -17,7 +17,7 @@ def row(tolerance=0.01, true=1e-3, best=1.0, **more) -> Row:
     """A row with made-up numbers: it takes 1.2 s."""
     fixed = None if best is None else Fixed("bdf2", 4, true, best)
     numbers = {"name": "made up", "integrator": "bdf2", "steps": 4, "status": "ok", "estimated": 1e-3, "own": 1e-5}
-    return Row(tolerance=tolerance, true=true, best=fixed, **{"seconds": 1.2, "pilots": 0.2} | numbers | more)
+    return Row(tolerance=tolerance, true=true, best=fixed, **{"seconds": 1.2, "pilots": 0.2, "observed": 1.5} | numbers | more)
 
 
 def met(limits: list[Limit]) -> list[bool]:

@@ -3,7 +3,7 @@
 * the true error of beams and of an impact meets tolerances of 10, 1 and 0.1 %, and the estimate is near it;
 * integrator and dt are chosen by counts, so reruns are equal bitwise; stiff scenes take implicit steps;
 * pilots leave the state as it was, observers see the run alone, and a repeated run equals the pilot that it repeats;
-* where paths part, where pilots fail or are interrupted, the report says so;
+* where paths diverge, where pilots fail or are interrupted, the report says so;
 * checkpoints resume bitwise, without pilots; the command takes --tolerance.
 """
 
@@ -54,6 +54,13 @@ def true_error(build, sim: ts.Simulator, seconds: float) -> float:
     return distance(*paths, largest_excursion(paths[1])).max
 
 
+def dropped_damped() -> ts.Scene:
+    """The cube on the ground, strongly damped."""
+    scene = dropped()
+    scene.bodies[0].material = rubber(young=1e5, mass_damping=8.0)
+    return scene
+
+
 # --- errors -------------------------------------------------------------------------------------------------------------
 
 
@@ -68,7 +75,7 @@ def test_the_true_error_meets_the_tolerance(build, tolerance):
     assert result.problems[0].startswith(f"note: for a tolerance of {100 * tolerance:.3g} %: ")
     true = true_error(build, sim, 0.5)
     assert true <= tolerance
-    assert 0.05 * true < estimate.time  # expected errors may be ten times too small
+    assert 0.2 * true < estimate.time
 
 
 def test_smaller_tolerances_take_smaller_steps():
@@ -92,15 +99,15 @@ def test_the_estimate_is_that_of_twins():
     assert 0.3 < own.time / twins.time < 3.0 and own.bodies["beam"].time == own.time
 
 
-def test_what_does_not_move_meets_no_tolerance():
+def test_what_does_not_move_has_no_error():
     scene = ts.Scene(gravity=(0.0, 0.0, 0.0))
     scene.add_body(cube(), rubber())
     with ts.Simulator(scene, tolerance=0.01) as sim:
         result = sim.run(0.5)
-    assert result.error_estimate.notes == ["the errors are unknown: nothing moves"] and result.status == "degraded"
+    assert result.error_estimate.time == 0.0 and result.status == "ok" and "nothing moves" in result.error_estimate.notes[0]
 
 
-def test_paths_that_part_meet_no_tolerance():
+def test_paths_that_diverge_meet_no_tolerance():
     """Six blocks fall on each other: after the first impacts each step has its own path."""
     scene = ts.Scene(gravity=(0.0, -9.8, 0.0))
     scene.add_obstacle(ts.HalfSpace((0, 0, 0), (0, 1, 0)), name="ground", friction=0.5)
@@ -111,6 +118,36 @@ def test_paths_that_part_meet_no_tolerance():
     with ts.Simulator(scene, tolerance=0.01) as sim:
         result = sim.run(3.0)
     assert result.status == "degraded" and "and the tolerance is 1 %" in " ".join(result.problems)
+
+
+@pytest.mark.parametrize("fps", [4, 10, 60])
+def test_frames_do_not_loosen_the_result(fps):
+    """A stretched block vibrates 20 times faster than ten frames a second show."""
+    scene = ts.Scene(gravity=(0.0, 0.0, 0.0))
+    scene.add_body(ts.box_mesh((2, 1, 1), (0.2, 0.1, 0.1)), rubber(young=1e6), name="block")
+    with ts.Simulator(scene, tolerance=0.01) as sim:
+        x = sim.positions()
+        sim.set_state(positions=x * (1.1, 1.0, 1.0))
+        result = sim.run(0.5, fps=fps)
+        dt, integrator = sim.dt, sim.settings.integrator
+    ends = []
+    for step in (dt, dt / 8):
+        with ts.Simulator(scene, dt=step, integrator=integrator, precision="f64") as sim:
+            sim.set_state(positions=sim.positions() * (1.1, 1.0, 1.0))
+            sim.run(0.5, fps=fps)
+            ends.append(sim.positions())
+    true = np.linalg.norm(ends[0] - ends[1], axis=1).max() / result.error_estimate.excursion
+    assert result.status == "degraded" or true < 0.01
+
+
+def test_steps_near_the_stable_limit_are_confirmed():
+    """With little damping, large strains make the largest stable step of the rest shape wrong by 3 %."""
+    scene = ts.Scene(gravity=(0.0, -9.8, 0.0))
+    damped = rubber(young=1e6, stiffness_damping=0.02)
+    scene.add_body(ts.box_mesh((8, 2, 2), (4.0, 1.0, 1.0)), damped, name="beam").fix(lambda X: X[:, 0] < -1.99)
+    with ts.Simulator(scene, tolerance=0.01) as sim:
+        result = sim.run(1.0)
+    assert result.status == "ok" and true_error(lambda: scene, sim, 1.0) <= 0.01
 
 
 # --- choices ------------------------------------------------------------------------------------------------------------
@@ -151,6 +188,8 @@ def test_frames_of_any_rate_lie_at_steps(build, fps):
 
 
 def test_bad_tolerances_are_refused():
+    with pytest.raises(SimulationError, match="newton_tolerance = 0.01: with tolerance = 0.01 it must be at most 0.0001"):
+        ts.Simulator(stiff(), tolerance=0.01, newton_tolerance=0.01)
     for tolerance, message in ((0.0, "tolerance must be"), (1.0, "tolerance must be"), (1e-5, "or precision='f64'")):
         with pytest.raises(SimulationError, match=message):
             ts.Simulator(beam(), tolerance=tolerance)
@@ -158,6 +197,44 @@ def test_bad_tolerances_are_refused():
         pass
     with pytest.raises(SimulationError, match="with a tolerance it must be 'auto'"):
         ts.Simulator(dropped(), tolerance=0.01, contact_solver="jacobi", integrator="velocity_verlet")
+
+
+@pytest.mark.parametrize("seconds", [0.5, 0.511, 0.078])
+def test_parts_of_a_frame_do_not_count(seconds):
+    """A block in free flight needs no more steps where its run ends within a frame."""
+    scene = ts.Scene(gravity=(0.0, -9.8, 0.0))
+    scene.add_body(cube(), rubber(young=1e6), name="block", velocity=(1.0, 2.0, 0.0))
+    with ts.Simulator(scene, tolerance=0.001) as sim:
+        result = sim.run(seconds)
+        assert result.status == "ok" and sim.dt > 5e-4
+
+
+@pytest.mark.parametrize("build", [beam, dropped])
+def test_runs_shorter_than_a_frame(build):
+    found = []
+    for on_frame in (None, lambda *_: None):
+        with ts.Simulator(build(), tolerance=0.05) as sim:
+            result = sim.run(0.011, on_frame=on_frame)
+            found.append((result.status, result.steps, sim.time, result.error_estimate.time))
+    assert found[0] == found[1] and found[0][0] == "ok" and found[0][2] == pytest.approx(0.011, abs=0.002)
+
+
+def test_what_has_come_to_rest_takes_few_steps():
+    with ts.Simulator(dropped_damped(), tolerance=0.05) as sim:
+        assert sim.run(4.0).status == "ok"
+        steps = sim.run(0.5).steps
+        assert steps < 500
+
+
+def test_settings_change_by_rebuild():
+    with ts.Simulator(stiff(), tolerance=np.float32(0.1)) as sim:
+        assert isinstance(sim.settings.tolerance, float)
+        sim.rebuild(tolerance=1e-3)
+        assert sim.settings.newton_tolerance == 5e-5
+        with pytest.raises(SimulationError, match=r"run\(\) chooses the integrator"):
+            sim.rebuild(integrator="implicit_euler")
+        sim.rebuild(tolerance=None, integrator="implicit_euler")
+        assert sim.settings.newton_tolerance is None and sim.run(0.1).pilot_seconds == 0.0
 
 
 # --- pilots -------------------------------------------------------------------------------------------------------------
@@ -188,7 +265,7 @@ def test_pilots_start_from_the_present_state():
         end, dt = sim.positions(), sim.dt
     with ts.Simulator(beam(), dt=dt, integrator="velocity_verlet") as sim:
         sim.run(0.5)
-        assert end == pytest.approx(sim.positions(), abs=1e-5)
+        assert end == pytest.approx(sim.positions(), abs=1e-4)
 
 
 def test_an_interrupt_during_the_pilots_leaves_the_start():
@@ -221,6 +298,57 @@ def test_pilots_that_fail_end_the_run(monkeypatch):
         assert np.array_equal(sim.positions(), start)
 
 
+@pytest.mark.parametrize(
+    "change", [lambda sim: sim.set_gravity((0, -90, 0)), lambda sim: sim.set_state(velocities=sim.velocities())]
+)
+def test_a_change_during_the_run_leaves_the_error_unknown(change):
+    with ts.Simulator(beam(), tolerance=0.01) as sim:
+        result = sim.run(0.3, on_frame=lambda sim, k, _: change(sim) if k == 5 else None)
+    assert result.error_estimate.time is None and result.status == "degraded"
+    assert "changed during the run" in result.error_estimate.notes[0]
+
+
+def test_steps_that_always_fail_are_tried_twice():
+    scene = beam()
+    scene.body("beam").move(lambda X: X[:, 0] > 1.99, lambda t: (0.0, 0.0 if t < 0.1 else np.nan, 0.0))
+    with ts.Simulator(scene, tolerance=0.01) as sim:
+        settings, dt = sim.settings, sim.dt
+        result = sim.run(0.5)
+        assert result.status == "failed" and result.steps == 0 and "nan" in result.problems[0].lower()
+        assert (sim.settings.integrator, sim.dt, sim.step_count) == (settings.integrator, dt, 0)
+
+
+def test_an_exception_of_stop_restores_the_settings():
+    def stop():
+        raise ZeroDivisionError
+
+    with ts.Simulator(stiff(), tolerance=0.01, integrator="implicit_midpoint", dt=0.01) as sim:
+        with pytest.raises(ZeroDivisionError):
+            sim.run(0.5, stop=stop)
+        assert (sim.settings.integrator, sim.dt, sim.time) == ("implicit_midpoint", 0.01, 0.0)
+
+
+def test_warnings_are_those_of_the_run():
+    """A soft body whose law softens warns once, whether its pilot is the run or not."""
+    scene = ts.Scene(gravity=(0.0, -9.8, 0.0))
+    scene.add_obstacle(ts.HalfSpace((0.0, 0.0, 0.0), (0.0, 1.0, 0.0)), name="ground")
+    scene.add_body(cube(), rubber(young=2e4, law="st_venant_kirchhoff"), name="cube", position=(0.0, 0.8, 0.0))
+    for on_frame in (None, lambda *_: None):
+        with ts.Simulator(scene, tolerance=0.1) as sim, pytest.warns(UserWarning, match="softens") as given:
+            sim.run(0.5, on_frame=on_frame)
+        assert len(given) == 1
+
+
+def test_a_dragged_body_and_a_bad_mesh_are_refused_before_pilots(monkeypatch):
+    with ts.Simulator(beam(), tolerance=0.01, draggable=True) as sim:
+        monkeypatch.setattr("taisoft.estimation.tolerance.Chooser.choose", lambda _: pytest.fail("pilots ran"))
+        with pytest.raises(SimulationError, match="error_mesh 'bogus' is unknown"):
+            sim.run(0.1, error=True, error_mesh="bogus")
+        sim.drag("beam", [0], [1.0], (0.0, 1.0, 0.0), 100.0)
+        with pytest.raises(SimulationError, match="being dragged"):
+            sim.run(0.1)
+
+
 def test_changed_numbers_are_those_of_the_pilots():
     with ts.Simulator(beam(), tolerance=0.01) as sim:
         sim.set_gravity((0.0, 0.0, 0.0))
@@ -246,7 +374,7 @@ def test_checkpoints_resume_bitwise_without_pilots(build, tmp_path):
     with ts.Simulator.load_checkpoint(path, build()) as sim:
         assert sim.settings.tolerance == 0.01 and sim.step_count > 0
         result = sim.run(0.4, resumed=True)
-        assert result.pilot_seconds == 0.0 and result.error_estimate is None
+        assert result.pilot_seconds == 0.0 and result.error_estimate is None and "is not estimated" in result.problems[-1]
         assert np.array_equal(sim.positions(), end)
 
 
@@ -260,6 +388,12 @@ def test_the_command_chooses_steps(tmp_path, capsys):
     assert report["error_estimate"]["time"] <= 0.01 and report["pilot_seconds"] > 0.0
     assert run(scene, "--tolerance", 2) == EXIT_BAD_INPUT
     assert "tolerance must be below 1" in capsys.readouterr().err
+    assert run(scene, "--tolerance", 0.01, "--set", "solver.fps=none") == EXIT_BAD_INPUT
+    assert "needs frames at a rate" in capsys.readouterr().err
+    resumed = ("--resume", tmp_path / "out" / "checkpoint.npz", "--out", tmp_path / "out", "--seconds", 0.4, *SHORT_OUTPUT)
+    assert run(scene, *resumed, "--set", "solver.dt=0.001") == EXIT_BAD_INPUT
+    assert "its dt was chosen for a tolerance" in capsys.readouterr().err
+    assert run(scene, *resumed) == 0 and "keeps the steps" in capsys.readouterr().out
 
 
 def test_nothing_is_planned_without_a_tolerance():

@@ -73,6 +73,7 @@ def run(arguments: Namespace) -> int:
         saved: Checkpoint | None = None
         if arguments.resume is None:
             settings = resolve(solver, arguments, Simulator)
+            _check_tolerance(settings, interactive)
             if arguments.out is not None:
                 check_free(arguments.out, arguments.overwrite)
             with _prefix_errors(arguments.scene):
@@ -81,6 +82,8 @@ def run(arguments: Namespace) -> int:
             saved = read_last_good(arguments.resume)
             kept = saved.settings | ({"fps": saved.notes["fps"]} if "fps" in saved.notes else {})  # frames have numbers
             settings = resolve(solver, arguments, Simulator, kept)
+            if "dt" in settings.changed and saved.settings.get("tolerance") is not None:
+                raise SceneError(f"--resume {arguments.resume}: its dt was chosen for a tolerance and cannot change in a run")
             sim = _resumed(saved, scene, settings)
         with sim:
             check_modelled(shown, sim)
@@ -164,6 +167,16 @@ def _check_checkpoint_interval(arguments: Namespace) -> None:
         checks.number(arguments.checkpoint_every, "--checkpoint-every", above=0.0, unit="s")
 
 
+def _check_tolerance(settings: RunSettings, interactive: bool) -> None:
+    """Refuse a tolerance where there is no run to choose steps for, or no frames for its files."""
+    if settings.simulator.get("tolerance") is None:
+        return
+    if interactive:
+        raise SceneError("--tolerance: a window without end has no run to choose steps for: give --seconds, or --out")
+    if settings.fps is None:
+        raise SceneError("--tolerance needs frames at a rate, not after every step: give --fps")
+
+
 def _resumed(saved: Checkpoint, scene: Scene, settings: RunSettings) -> Simulator:
     """Return the resumed simulator, with another dt if requested."""
     sim = Simulator.from_checkpoint(saved, scene, arch=settings.simulator["arch"])
@@ -231,6 +244,8 @@ def _run(sim, settings: RunSettings, arguments, signals, warned: list[str], save
         if recording is not None:
             recording.add_writers(observers, sim, settings.fps, shown, plots)
         observers.members.append(Progress(settings.seconds, label=Path(arguments.scene).stem))
+        if sim.settings.tolerance is not None and resumed is None:
+            print("pilots   choose integrator and dt", flush=True)
         result = sim.run(
             settings.seconds,
             on_frame=observers.on_frame,

@@ -11,8 +11,8 @@ from taisoft.stability import stable_dt
 
 EXPLICIT, IMPLICIT = "velocity_verlet", "bdf2"
 STABLE_FRACTION = 0.9  # of the stable step
-FRAME = 1 / 60  # [s]; runs have their own
-FRACTION, LOOSEST = 0.05, 1e-4  # tolerances of Newton's method and contacts: the first times the tolerance, at most the second
+LIKELY_FRAME = 1 / 60  # [s]; runs have their own
+SOLVER_FRACTION, LOOSEST_SOLVER = 0.05, 1e-4  # tolerances of Newton's method and contacts: over the tolerance, and at most
 TIGHTEST = {"f32": 1e-4, "f64": 1e-7}  # tolerances above the errors of rounding
 
 
@@ -29,20 +29,25 @@ def settings_for(scene: Scene, settings: Settings) -> tuple[Settings, float | No
             f"tolerance = {settings.tolerance:g}: in {settings.precision} it must be at least {least:g}{instead}"
         )
     if settings.contact_solver != "auto":
-        raise SimulationError(f"contact_solver {settings.contact_solver!r}: with a tolerance it must be 'auto', since it follows")
+        given = settings.contact_solver
+        raise SimulationError(f"contact_solver {given!r}: with a tolerance it must be 'auto', since run() chooses the integrator")
     found, limit = {}, None
+    loosest = min(LOOSEST_SOLVER, SOLVER_FRACTION * settings.tolerance)
     for name in ("newton_tolerance", "contact_tolerance"):
-        if getattr(settings, name) is None:
-            found[name] = min(LOOSEST, FRACTION * settings.tolerance)
+        value = getattr(settings, name)
+        if value is None:
+            found[name] = loosest
+        elif value > loosest * (1.0 + 1e-9):
+            raise SimulationError(f"{name} = {value:g}: with tolerance = {settings.tolerance:g} it must be at most {loosest:g}")
     if settings.integrator == Settings.integrator:
         touches = scene.pushes(settings.self_collision)
         stable = stable_dt(scene, verlet=True)
-        steps = stable_steps(stable, FRAME)
+        steps = stable_steps(stable, LIKELY_FRAME)
         if steps * explicit_step(scene, touches) <= implicit_step(scene, touches):
-            found |= {"integrator": EXPLICIT, "dt": FRAME / steps}
+            found |= {"integrator": EXPLICIT, "dt": LIKELY_FRAME / steps}
             limit = stable
         else:
-            found |= {"integrator": IMPLICIT, "dt": FRAME}
+            found |= {"integrator": IMPLICIT, "dt": LIKELY_FRAME}
     return dataclasses.replace(settings, **found), limit
 
 

@@ -1,0 +1,125 @@
+"""Pilots from coarse to fine, and the error of the finest: from its distance to the one before, by the observed order.
+
+The first two explicit pilots take nearly the same steps. Their distance, and what the velocities of the second one show, give
+the expected error. It may be wrong by a factor of ten.
+
+Velocity Verlet solves x'' = a + dt^2/12 x'''' up to dt^4 (Hairer, Lubich, Wanner, "Geometric Numerical Integration", 2006,
+IX.9). A motion of frequency w thus lags by the phase (w dt)^2/24 w t, which is dt^2/24 times the total variation of its
+acceleration. An impact may be late by dt.
+"""
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from taisoft.estimation.first_choice import EXPLICIT, IMPLICIT
+from taisoft.estimation.order import MIN_ORDER, error_over_difference, observed_order
+from taisoft.estimation.pilots import Frames, Pilot, distances
+
+REACH = 8  # steps of a run over those of the last pilot, at most
+LEAST_REACH = 1.5  # the same, at least, where the run is not the last pilot: a smaller ratio would amplify chance
+FEWEST = {EXPLICIT: 2, IMPLICIT: 3}  # pilots that show an error: coarse implicit steps may agree and be wrong
+MAX_PILOTS = 8
+MAX_DEGRADED = 2  # pilots that meet the tolerance but are degraded, and are left for a finer one
+MAX_STALLED = 2  # pilots in succession whose differences have not become smaller: the paths diverge
+COARSE = 2  # implicit pilots with fewer steps a frame do not count as stalled
+DISPERSION, IMPACT = 3.0, 1.25  # factors on the errors that velocities show
+
+
+@dataclass
+class Ladder:
+    """Pilots of one integrator.
+
+    sudden: whether velocities may jump; error: of the last pilot, over the excursion, None if unknown; order: observed, else
+    None; tried: pilots, with failed ones; differences: root mean squares of the distances between successive pilots [m].
+    """
+
+    integrator: str
+    sudden: bool
+    frames: Frames
+    pilots: list[Pilot] = field(default_factory=list)
+    error: float | None = None
+    order: float | None = None
+    stalled: int = 0  # see MAX_STALLED
+    degraded: int = 0  # see MAX_DEGRADED
+    tried: int = 0
+    differences: list[float] = field(default_factory=list)
+
+    def add(self, pilot: Pilot) -> None:
+        """Add a pilot with a smaller step than the last one, and estimate its error. Those that fail are left out."""
+        self.tried += 1
+        if pilot.report.status == "failed":
+            return
+        if self.pilots:
+            self.pilots[-1].end = {}  # it will not be the run
+        self.pilots.append(pilot)
+        if len(self.pilots) < 2:
+            return
+        before, excursion = self.pilots[-2], self.excursion(pilot)
+        apart, ratio = distances(pilot, before), float(pilot.per_frame / before.per_frame)
+        self.differences.append(float(np.sqrt(np.mean(apart**2))))
+        self.order = self._observed_order() if ratio == 2.0 else None
+        order = self.order or (MIN_ORDER if len(self.differences) > 1 else 1.0)
+        self.error = float(apart.max()) * error_over_difference(ratio, order) / excursion if excursion else 0.0
+
+    def replace_first(self, pilot: Pilot) -> None:
+        """Replace the first pilot, explicit, by one with a slightly smaller step, and expect its error."""
+        self.tried += 1
+        if pilot.report.status == "failed":
+            return
+        before, self.pilots, excursion = self.pilots, [pilot], self.excursion(pilot)
+        if excursion == 0.0:
+            self.error = 0.0
+        elif before:
+            ratio = float(pilot.per_frame / before[0].per_frame)
+            apart = float(distances(pilot, before[0]).max()) / excursion
+            self.error = max(self._expected_error(pilot, excursion), apart * error_over_difference(ratio, 2.0))
+
+    def excursion(self, pilot: Pilot) -> float:
+        """A pilot's largest excursion [m], 0 if it is rounding."""
+        found = pilot.excursion
+        return found if found > self.frames.negligible else 0.0
+
+    def _observed_order(self) -> float | None:
+        """Order of the last three pilots; None if they show none."""
+        if len(self.differences) < 2:
+            return None
+        near, far = self.differences[-1], self.differences[-2]
+        stalled = near > self.frames.negligible and near >= max(self.differences[-3:-1]) * 0.5**MIN_ORDER
+        counts = self.integrator == EXPLICIT or self.pilots[-1].per_frame >= COARSE
+        self.stalled = self.stalled + 1 if stalled and counts else 0
+        return observed_order(near, far, 2.0)
+
+    def _expected_error(self, pilot: Pilot, excursion: float) -> float:
+        """Error of an explicit pilot, over the excursion, from its velocities; see above."""
+        frame = self.frames.seconds
+        dt = frame / float(pilot.per_frame)
+        error = dt * dt / 24.0 * (float(np.max(pilot.variations)) + 2.0 * pilot.jump) / frame
+        return (max(error, IMPACT * dt * pilot.jump) if self.sudden else DISPERSION * error) / excursion
+
+    @property
+    def diverges(self) -> bool:
+        """Whether the paths of different steps diverge."""
+        return self.stalled >= MAX_STALLED
+
+    @property
+    def is_over(self) -> bool:
+        """Whether no further pilot makes sense."""
+        return self.tried >= MAX_PILOTS or self.diverges
+
+    def steps_needed(self, tolerance: float) -> int | None:
+        """Steps of the run in the time of a frame, if the pilots show how many; None if they do not yet."""
+        if not self.pilots or self.error is None:
+            return None
+        last, few = self.pilots[-1].per_frame, len(self.pilots) < FEWEST[self.integrator]
+        if self.error <= tolerance and (not few or self.integrator == EXPLICIT):
+            if self.pilots[-1].report.status == "degraded" and self.degraded < MAX_DEGRADED:
+                self.degraded += 1
+                return None
+            return math.ceil(last)
+        if few:
+            return None
+        order = self.order or (MIN_ORDER if len(self.differences) > 1 else 1.0)
+        steps = float(last) * max(LEAST_REACH, (self.error / tolerance) ** (1.0 / order))
+        return math.ceil(steps) if steps <= REACH * last else None
