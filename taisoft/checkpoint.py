@@ -30,7 +30,7 @@ from taisoft.settings import NAMES, plan_of
 if TYPE_CHECKING:
     from taisoft.simulator import Simulator
 
-KIND, FORMAT = "taisoft checkpoint", 9  # increment FORMAT with every change of a file's content
+KIND, FORMAT = "taisoft checkpoint", 10  # increment FORMAT with every change of a file's content
 PARTS = ("settings", "numbers", "start", "fingerprint", "state", "notes")  # of the header, each a table
 
 
@@ -121,8 +121,12 @@ def restore_numbers(saved: Checkpoint, scene: Scene) -> None:
     """Set a scene's gravity, materials, contact pairs and loads from a checkpoint. Raises SceneError for invalid numbers."""
     with thawed(scene, *scene.bodies):
         scene.gravity = saved.numbers["gravity"]
-        for body, material in zip(scene.bodies, saved.numbers["materials"]):
-            body.material = Material(**material)
+        for body, kept in zip(scene.bodies, saved.numbers["materials"]):
+            materials = [Material(**material) for material in kept["materials"]]
+            by_region = dict(zip(body.composition.materials, materials, strict=True))
+            body.material = by_region if body.composition.has_regions else materials[0]
+            for name, values in kept["by_tet"].items():
+                setattr(body, name, values)
         scene.contact_pairs = {frozenset(names): (a, b) for names, a, b in saved.numbers["pairs"]}
         for k, body in enumerate(scene.bodies):
             for kind, name in LOADS.items():

@@ -66,7 +66,7 @@ def test_tets_are_grouped_in_blocks_by_kind_and_body(rig):
     """A body's last block is padded with tets of no volume."""
     lanes, volume = rig.model.lanes, rig.model.volume.to_numpy()
     body = rig.model.block_body.to_numpy()
-    assert lanes == 4 and list(rig.layout.n_tets) == [10, 5, 6, 5] and rig.model.n_blocks == 9
+    assert lanes == 4 and list(rig.layout.tet_start) == [0, 10, 15, 21, 26] and rig.model.n_blocks == 9
     groups = [(g.order, g.n_points, g.law.NAME, g.first, g.last) for g in rig.model.groups]
     if quadratic(rig):
         assert groups == [(1, 1, SVK, 0, 4), (2, 4, SNH, 4, 7), (2, 14, COR, 7, 9)]

@@ -19,8 +19,8 @@ from taisoft.backend.runtime import n_compiled
 from taisoft.dynamics.schemes import EXPLICIT
 from taisoft.errors import SimulationError
 from taisoft.mesh.shapes import box_mesh, sheet_mesh
-from taisoft.scene.body import LAWS
 from taisoft.scene.key_frames import KeyFrames
+from taisoft.scene.material import LAWS
 from taisoft.scene.obstacles import Box, HalfSpace, MeshObstacle
 from taisoft.scene.scene import Material, Scene
 

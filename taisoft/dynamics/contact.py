@@ -156,8 +156,7 @@ class ContactStep:
 
     def _gap_targets(self) -> tuple[float, float, float, float]:
         """Contact offset [m]; fractions of a penetration and of a missing offset corrected per substep; maximum speed [m/s]."""
-        materials = [b.material for b in self.simulation.scene.bodies]
-        slowest = min(np.sqrt(m.young / m.density) for m in materials)
+        slowest = min(np.sqrt(np.min(b.young / b.density)) for b in self.simulation.scene.bodies)
         return (
             self.contact_offset,
             self._substep_fraction * self._corrections[0],

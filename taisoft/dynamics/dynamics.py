@@ -220,12 +220,12 @@ class Dynamics:
         layout, first = self.state.layout, int(self.model.state.scalars[FIRST_SOFTENED])
         if first == NO_TET:
             return None
-        tets = first - layout.block_start * self.runtime.lanes  # its number in each body
-        k = int(np.flatnonzero((tets >= 0) & (tets < layout.n_tets))[0])
-        body = self.scene.bodies[k]
-        law = LAWS[body.material.law]
+        at = int(layout.tet_of_lane[first])
+        k = int(np.searchsorted(layout.tet_start, at, side="right")) - 1
+        body, tet = self.scene.bodies[k], at - layout.tet_start[k]
+        law = LAWS[body.composition.law_of_tet(tet)]
         return (
-            f"step {self.state.step_count}: tet {tets[k]} of body '{body.name}' is compressed below {law.SOFTENS_BELOW} of its "
+            f"step {self.state.step_count}: tet {tet} of body '{body.name}' is compressed below {law.SOFTENS_BELOW} of its "
             f"length, where {law.NAME} softens: tets may collapse or invert, and stay so"
         )
 

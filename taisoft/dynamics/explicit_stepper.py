@@ -67,7 +67,7 @@ class ExplicitStepper:
     def __init__(self, simulation: SimulationState, settings: Settings):
         self.simulation, verlet = simulation, settings.integrator == "velocity_verlet"
         m, arena, dirichlet = simulation.model, simulation.arena, simulation.dirichlet
-        n_tets = int(simulation.layout.n_tets.sum())
+        n_tets = len(simulation.layout.lane_of_tet)
         self.max_batch = largest_batch(m)
         n_prescribed, n_held = dirichlet.n_prescribed, len(dirichlet.held)
         self.rows = max(1, min(self.max_batch, TARGET_BYTES_PER_TET * n_tets // (24 * max(1, n_prescribed))))

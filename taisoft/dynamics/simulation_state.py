@@ -7,7 +7,7 @@ import numpy as np
 from taisoft.backend.arrays import FieldArena, download, upload
 from taisoft.backend.runtime import Runtime
 from taisoft.dynamics.dirichlet import DirichletConditions
-from taisoft.fem.model import Layout, Model, body_loads, damping_table, material_table, upload_mass_matrix
+from taisoft.fem.model import Layout, Model, body_loads, damping_table, law_table, upload_mass_matrix
 from taisoft.fem.reference import gravity_masses, lumped_masses
 from taisoft.scene.scene import Scene
 
@@ -66,7 +66,7 @@ class SimulationState:
     def upload_material(self, density: bool) -> None:
         """Upload material numbers of the bodies, and masses if a density changed."""
         m = self.model
-        numbers = [(m.law_constants, material_table([b.material for b in self.scene.bodies]))]
+        numbers = [(m.law_constants, law_table(self.scene, self.layout, m.elasticity_by_tet))]
         if m.damping is not None:
             numbers.append((m.damping, damping_table(self.scene)))
         if density:

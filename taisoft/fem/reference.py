@@ -108,7 +108,7 @@ def gravity_mass(body: Body) -> np.ndarray:
 
 
 def _distribute(body: Body, fractions: np.ndarray) -> np.ndarray:
-    values = body.material.density * np.outer(body.mesh.volumes, fractions)
+    values = np.reshape(body.density, (-1, 1)) * np.outer(body.mesh.volumes, fractions)
     return np.bincount(body.nodes.elements.reshape(-1), values.reshape(-1), body.n_nodes)
 
 
@@ -127,7 +127,7 @@ def unit_mass(order: int) -> np.ndarray:
 def consistent_mass(body: Body) -> sp.csr_matrix:
     """Consistent mass matrix (n,n), the same for each axis: int rho N_a N_b dV [kg]."""
     elements = body.nodes.elements
-    values = body.material.density * body.mesh.volumes[:, None, None] * unit_mass(body.order)
+    values = (body.density * body.mesh.volumes)[:, None, None] * unit_mass(body.order)
     rows, columns = np.broadcast_arrays(elements[:, :, None], elements[:, None, :])
     return sp.csr_matrix((values.reshape(-1), (rows.reshape(-1), columns.reshape(-1))), shape=(body.n_nodes,) * 2)
 

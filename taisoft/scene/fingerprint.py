@@ -47,9 +47,11 @@ def scene_digest(scene: Scene) -> str:
 
 def _body_parts(body: Body) -> dict[str, list]:
     """Return the values that define a body, by the part's name in messages."""
+    laws = [material.law for material in body.composition.materials.values()]
     return {
         "mesh": [body.mesh.vertices, body.mesh.tets],
-        "order, quadrature, law or collision": [body.order, body.quadrature_degree, body.material.law, body.collision],
+        "regions": [body.mesh.regions, list(body.composition.materials)] if body.composition.has_regions else [],
+        "order, quadrature, law or collision": [body.order, body.quadrature_degree, laws, body.collision],
         "start": [body.position, body.velocity],
         "constraints": [x for c in body.constraints for x in (c.nodes, c.axes, *_path_parts(c.path))],
         "loads": [
@@ -71,8 +73,14 @@ def _path_parts(path: Callable | None) -> list:
 def run_time_numbers(scene: Scene) -> dict:
     """Return the numbers of a scene that may change at run time, except its loads."""
     pairs = [[sorted(names), *numbers] for names, numbers in scene.contact_pairs.items()]
-    materials = [dataclasses.asdict(body.material) for body in scene.bodies]
-    return {"gravity": scene.gravity.tolist(), "materials": materials, "pairs": pairs}
+    return {"gravity": scene.gravity.tolist(), "materials": [_materials(body) for body in scene.bodies], "pairs": pairs}
+
+
+def _materials(body: Body) -> dict:
+    """Return a body's materials, in the order of its regions, and its numbers by tet."""
+    composition = body.composition
+    by_tet = {name: values.tolist() for name, values in composition.by_tet.items()}
+    return {"materials": [dataclasses.asdict(material) for material in composition.materials.values()], "by_tet": by_tet}
 
 
 def digest(values: list) -> str:

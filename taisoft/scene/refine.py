@@ -21,6 +21,8 @@ from taisoft.scene.body import Body, Constraint, NodalForce
 from taisoft.scene.key_frames import KeyFrames, NodePath
 from taisoft.scene.scene import Scene
 
+PARTS = 8  # of a tet; `make_nodes` lists the parts of each tet in sequence
+
 
 def refined(scene: Scene) -> Scene:
     """Return the scene with every tet split into eight. Raises SceneError if a constraint or load cannot be transferred."""
@@ -41,7 +43,8 @@ def _with_bodies(scene: Scene, bodies: list[Body]) -> Scene:
 
 def _refined(old: Body) -> Body:
     split = old.nodes if old.order == 2 else make_nodes(old.mesh, 2)
-    mesh = TetMesh(split.positions, split.tets)
+    regions = None if old.mesh.regions is None else np.repeat(old.mesh.regions, PARTS)
+    mesh = TetMesh(split.positions, split.tets, regions=regions, region_names=old.mesh.region_names)
     edges, _ = distinct_edges(mesh.tets if old.order == 2 else old.mesh.tets)
     new = _on_mesh(old, mesh, old.order, np.concatenate([_own_parents(old.n_nodes), edges]))
     # Row of the new surface -> triangle of the old one: split.surface lists the four parts of each triangle in sequence.
@@ -70,7 +73,9 @@ def _on_mesh(old: Body, mesh: TetMesh, order: int, parents: np.ndarray) -> Body:
     """Return the body on another mesh, without tractions. parents: (n,2), the two old nodes that each new node bisects."""
     velocity = old.velocity if old.velocity.shape == (3,) else old.velocity[parents].mean(axis=1)
     degree = old.quadrature_degree if order == old.order else None
-    new = Body(old.name, mesh, old.material, old.position, velocity, order, degree, old.collision)
+    copies = mesh.n_tets // old.mesh.n_tets
+    numbers = {name: np.repeat(values, copies) for name, values in old.composition.by_tet.items()}
+    new = Body(old.name, mesh, old.material, old.position, velocity, order, degree, old.collision, **numbers)
     for constraint in old.constraints:
         axes = "".join(axis for axis, held in zip("xyz", constraint.axes) if held)
         where = _chosen(old, constraint, parents)
