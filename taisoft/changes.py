@@ -128,7 +128,7 @@ def set_contact(
 def set_force(self: "Simulator", body: str, index: int, value) -> None:
     """Change a force added by `body.add_force`, from the next step on.
 
-    index: from 0 in the order added to this body. value: total (3,), or (k,3) with one row per node [N].
+    index: from 0 in the order added to this body. value: total (3,), or (k,3) with one row per node [N]; it replaces a path.
     Raises SceneError if there is no such force or the value is invalid.
     """
     _set_load(self, "force", body, index, value)
@@ -137,7 +137,7 @@ def set_force(self: "Simulator", body: str, index: int, value) -> None:
 def set_traction(self: "Simulator", body: str, index: int, value) -> None:
     """Change a traction added by `body.add_traction`, from the next step on; index and errors as for `set_force`.
 
-    value: (3,) per reference area [Pa].
+    value: (3,) per reference area [Pa]; it replaces a path.
     """
     _set_load(self, "traction", body, index, value)
 

@@ -62,7 +62,7 @@ class DragSpring:
         mass = 1.0 / float((weights**2 / masses[nodes]).sum())
         area = (mass * float(own.mesh.volumes.sum()) / own.mass) ** (2 / 3)
         max_force = min(STRAIN * float(np.min(own.young)) * area, HEAVY * EARTH * float(masses[layout.nodes(body)].sum()))
-        self._simulation.upload_loads()  # removes the force from the previous nodes
+        self.release()  # removes the force from the previous nodes
         self.drag = Drag(own.name, nodes, weights, target, stiffness, mass, max_force, target, np.zeros(3))
         self.drag.point = weights @ self._simulation.state()[0][nodes]
 
@@ -88,7 +88,5 @@ class DragSpring:
 
     def upload(self) -> None:
         """Upload the scene's loads, plus the drag force if something is dragged."""
-        if self.drag is None:
-            self._simulation.upload_loads()
-        else:
-            self._simulation.upload_loads(self.drag.nodes, np.outer(self.drag.weights, self.drag.force))
+        drag = self.drag
+        self._simulation.set_drag(None if drag is None else (drag.nodes, np.outer(drag.weights, drag.force)))

@@ -16,6 +16,7 @@ from taisoft.backend.arrays import Count, FieldArena, download, upload
 from taisoft.backend.runtime import Runtime, threads
 from taisoft.fem import reference
 from taisoft.fem.laws import LAWS
+from taisoft.fem.loads import SceneLoads
 from taisoft.fem.node_graph import PAIRS, NodeGraph, node_graph
 from taisoft.fem.state import State, build_state
 from taisoft.fem.terms import terms_of
@@ -156,21 +157,6 @@ def _rule_table(rules: tuple[reference.Quadrature, ...]) -> np.ndarray:
     return np.column_stack([weights, (s[:, :, 1:] - s[:, :, :1]).reshape(len(points), 27)])
 
 
-def body_loads(scene: Scene) -> np.ndarray:
-    """Nodal forces (n_nodes, 3) [N] of tractions and forces; total forces are distributed over their nodes by lumped mass."""
-    parts = []
-    for body in scene.bodies:
-        total = np.zeros((body.n_nodes, 3))
-        for t in body.tractions:
-            total += reference.traction_forces(body, t.triangles, t.value)
-        mass = reference.lumped_mass(body)
-        for f in body.forces:
-            weights = mass[f.nodes] / mass[f.nodes].sum()
-            total[f.nodes] += f.value if f.value.ndim == 2 else np.outer(weights, f.value)
-        parts.append(total)
-    return np.concatenate(parts)
-
-
 def _packed_tets(scene: Scene, layout: Layout, groups: tuple[Group, ...], lanes: int):
     """Node ids, a list with one (lanes, n_nodes) array per group; Dm^-1 and volume (0 in padding) of every lane."""
     n_tets, width = len(layout.lane_of_tet), max(g.n_nodes for g in groups)
@@ -292,7 +278,7 @@ def build_model(scene: Scene, runtime: Runtime, arena: FieldArena, on: dict[str,
         mass_matrix=None,
         free=arena.vectors("free", real, n_nodes, np.ones((n_nodes, 3), dtype=npr)),
         gravity=arena.vectors("gravity", real, 1, np.asarray(scene.gravity, dtype=npr)[None]),
-        loads=arena.vectors("loads", real, n_nodes, body_loads(scene).astype(npr)) if on["loads"] else None,
+        loads=arena.vectors("loads", real, n_nodes, SceneLoads(scene).at(0.0).astype(npr)) if on["loads"] else None,
         node_body=arena.field("node_body", ti.i32, n_nodes, node_body) if damped else None,
         damping=arena.field("damping", real, (n_bodies, 2), damping_table(scene).astype(npr)) if damped else None,
         consistent=on["consistent_mass"],

@@ -15,12 +15,13 @@ from taisoft.scene import checks
 from taisoft.scene.collision import CONTACT_MODES
 from taisoft.scene.composition import Composition, compose
 from taisoft.scene.key_frames import KeyFrames, NodePath
+from taisoft.scene.loads import NodalForce, Traction, value_and_path
 from taisoft.scene.material import Material
 
 NEARLY_INCOMPRESSIBLE = 0.49  # Poisson's ratio above which linear tets lock, so that they bend far too little
 QUADRATURE_DEGREES = {1: (1,), 2: (2, 4)}  # by element order: degrees of polynomials integrated exactly, the default first
 # other data depend on these
-_READ_ONLY = ("name", "mesh", "composition", "order", "quadrature_degree", "nodes", "rest_positions", "n_nodes", "mass")
+_READ_ONLY = ("name", "mesh", "composition", "order", "quadrature_degree", "nodes", "rest_positions", "n_nodes", "mass", "loads")
 USE_A_COPY = "change a copy made by scene.snapshot() and make a new Simulator of it"
 _SET_FORCE = f"call sim.set_force(body, index, value) for an existing one; otherwise {USE_A_COPY}"
 _SET_TRACTION = f"call sim.set_traction(body, index, value) for an existing one; otherwise {USE_A_COPY}"
@@ -38,31 +39,6 @@ class Constraint:
 
     def __post_init__(self):
         checks.store(self, nodes=self.nodes, axes=self.axes)
-
-
-@guarded_record("traction", "call sim.set_traction(body, index, value) in a simulation")
-@dataclass(frozen=True, eq=False)
-class Traction:
-    """A dead load on surface triangles."""
-
-    triangles: np.ndarray  #: (k,) int64 rows of mesh.surface
-    value: np.ndarray  #: (3,) force per reference area [Pa]
-
-    def __post_init__(self):
-        checks.store(self, triangles=self.triangles, value=self.value)
-
-
-@guarded_record("force", "call sim.set_force(body, index, value) in a simulation")
-@dataclass(frozen=True, eq=False)
-class NodalForce:
-    """A dead load on nodes: a total force distributed by lumped mass, or one force per node."""
-
-    nodes: np.ndarray  #: (k,) int64 node ids
-    value: np.ndarray  #: (3,) total force, or (k,3) one per node [N]
-    where: Callable | None = None  #: as in `Constraint`
-
-    def __post_init__(self):
-        checks.store(self, nodes=self.nodes, value=self.value)
 
 
 def tet_number(name: str, doc: str) -> property:
@@ -92,6 +68,7 @@ class Body(Guarded):
         "contact_mode": "set body.collision",
         "composition": "set body.material",
         "mass": "set body.density",
+        "loads": "call body.add_force or body.add_traction",
     }
     _contents = {
         "constraints": "call body.fix or body.move",
@@ -158,6 +135,11 @@ class Body(Guarded):
     def rest_positions(self) -> np.ndarray:
         """Stress-free node positions (n,3) [m], read-only; the mesh's vertices come first."""
         return self.nodes.positions
+
+    @property
+    def loads(self) -> list[Traction | NodalForce]:
+        """Its tractions, then its forces."""
+        return [*self.tractions, *self.forces]
 
     @property
     def n_nodes(self) -> int:
@@ -266,14 +248,14 @@ class Body(Guarded):
         """Apply a dead load per reference area to surface triangles.
 
         where: rows of mesh.surface, a bool mask (t,), or a callable that gets the triangles' centroids at rest (t,3)
-        and returns such a mask. traction: (3,) [Pa]. Raises SceneError if no triangle is chosen or a number is not
-        finite.
+        and returns such a mask. traction: (3,) [Pa], or its path: callable t [s] -> (3,), called once here for t = 0, or
+        `KeyFrames`, whose translations are the values. Raises SceneError if no triangle is chosen or a number is not finite.
         """
         self._check_open("add_traction")
         what = f"{self._label()}: add_traction"
         centroids = self.mesh.vertices[self.mesh.surface].mean(axis=1)
         triangles = checks.selection(where, centroids, what, "surface triangle")
-        load = Traction(triangles, checks.array(traction, f"{what}: traction", ((3,),)))
+        load = Traction(triangles, *value_and_path(traction, f"{what}: traction", ((3,),)))
         list.append(self.tractions, load)
         return load
 
@@ -281,12 +263,13 @@ class Body(Guarded):
         """Apply a dead load to nodes: a total force distributed by lumped mass, or one force per node.
 
         where: as for `fix`; a node chosen twice counts once. force: (3,) the total, or (k,3) in the order of the chosen
-        nodes [N]. Raises SceneError if no node is chosen or numbers are not finite.
+        nodes [N], or its path, as for `add_traction`. Raises SceneError if no node is chosen or numbers are not finite.
         """
         self._check_open("add_force")
         what = f"{self._label()}: add_force"
         nodes = checks.selection(where, self.rest_positions, what, "node")
-        load = NodalForce(nodes, checks.array(force, f"{what}: force", ((3,), (len(nodes), 3))), _callable_or_none(where))
+        value, path = value_and_path(force, f"{what}: force", ((3,), (len(nodes), 3)))
+        load = NodalForce(nodes, value, _callable_or_none(where), path)
         list.append(self.forces, load)
         return load
 

@@ -77,9 +77,10 @@ def make_plan(scene: Scene, explicit: bool, multistep: bool, self_collision: boo
         f"quadratic tets of {_shorten(quadratic)} in implicit steps",
         "explicit steps need a diagonal mass" if quadratic else "the mass of linear tets is lumped",
     )
-    loaded = [b.name for b in scene.bodies if b.tractions or b.forces]
+    loaded = [b.name for b in scene.bodies if b.loads]
     why = f"tractions or forces on {_shorten(loaded)}" if loaded else "bodies can be dragged"
     plan.add("loads", loaded or draggable, why, "no traction and no force")
+    add_if_any("load_paths", lambda b: any(load.path for load in b.loads), "on", "every load is constant")
     add_if_any("fixed_nodes", lambda b: any(c.path is None for c in b.constraints), "on", "no node is fixed")
     add_if_any("moving_nodes", lambda b: any(c.path is not None for c in b.constraints), "paths on", "no node follows a path")
     for damping in ("mass_damping", "stiffness_damping"):
@@ -153,7 +154,7 @@ def change_material(body: Body, numbers: dict, on: dict[str, bool], region: int 
 
 
 def change_load(body: Body, kind: str, index: int, value) -> None:
-    """Set the value of a body's load `index`, counted from 0 in the order added. kind: a key of LOADS.
+    """Set the value of a body's load `index`, counted from 0 in the order added; it replaces a path. kind: a key of LOADS.
 
     value: (3,) [N], or (k,3) for the k nodes of a force; (3,) [Pa] for a traction. Raises SceneError.
     """
@@ -161,8 +162,7 @@ def change_load(body: Body, kind: str, index: int, value) -> None:
     if not loads:
         raise SceneError(f"{what}: it has no {kind}: give it one of 0 by body.add_{kind} before the Simulator is made")
     old = loads[checks.whole(index, f"{what}: index", range(len(loads)))]
-    shapes = ((3,), (len(old.nodes), 3)) if kind == "force" else ((3,),)
-    new = replace(old, value=checks.array(value, f"{what}: {kind} {index}", shapes))
+    new = replace(old, value=checks.array(value, f"{what}: {kind} {index}", old.shapes), path=None)
     with thawed(body):
         getattr(body, LOADS[kind])[index] = new
 
@@ -180,7 +180,8 @@ def scene_numbers(scene: Scene) -> Numbers:
             numbers[f"body {body.name!r}: {name}{BY_TET_TEXT}"] = values.tolist()
         for kind, loads in LOADS.items():
             for i, load in enumerate(getattr(body, loads)):
-                numbers[f"body {body.name!r}: {kind} {i}"] = load.value.tolist()
+                if load.path is None:
+                    numbers[f"body {body.name!r}: {kind} {i}"] = load.value.tolist()
     for names, (friction, restitution) in scene.contact_pairs.items():
         pair = " and ".join(repr(name) for name in sorted(names))
         numbers |= {f"contact of {pair}: friction": friction, f"contact of {pair}: restitution": restitution}

@@ -7,7 +7,7 @@
     [bodies.NAME]             material (a name, or a table), mesh (below), and the arguments of Scene.add_body
     [bodies.NAME.materials]   instead of material: one for each region of the mesh, REGION = a name, or a table
     [[bodies.NAME.fix]]       nodes, axes                   [[bodies.NAME.move]]   nodes, path (KeyFrames), axes
-    [[bodies.NAME.traction]]  triangles, traction [Pa]      [[bodies.NAME.force]]  nodes, force [N]
+    [[bodies.NAME.traction]]  triangles, traction [Pa]      [[bodies.NAME.force]]  nodes, force [N], or their KeyFrames
     [obstacles.NAME]          shape and its arguments, friction, restitution, path (KeyFrames)
     [[contacts]]              between = ["a", "b"], friction, restitution
 
@@ -140,7 +140,9 @@ def _add_body(scene: Scene, name: str, table: Table, materials: dict[str, Materi
             extra = {"where": _selection(one, items)}
             if "path" in known:
                 extra["path"] = one.made("path", KeyFrames, "key frames: ")
-            others = [k for k in known if k not in (items, "path")]
+            elif isinstance(one.values.get(key), dict):  # a traction or force that varies
+                extra[key] = one.made(key, KeyFrames, "key frames: ")
+            others = [k for k in known if k not in (items, *extra)]
             one.make(getattr(body, method.__name__), f"body {name!r}: {method.__name__}: ", keys=others, **extra)
 
 

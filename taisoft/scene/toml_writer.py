@@ -18,6 +18,7 @@ from taisoft.mesh.tet_mesh import TetMesh
 from taisoft.scene.body import Body
 from taisoft.scene.checks import SOLVER_CHECKS, check_solver, nearest
 from taisoft.scene.key_frames import NodePath, ShapePath
+from taisoft.scene.loads import LoadPath, NodalForce, Traction
 from taisoft.scene.material import Material
 from taisoft.scene.obstacles import Obstacle
 from taisoft.scene.scene import Scene
@@ -121,10 +122,19 @@ def _body(body: Body, materials: dict[Material, str], stem: str, meshes: dict[st
         else:
             raise SceneError(f"body {body.name!r}: moves along a function, which a file cannot store: use ts.KeyFrames")
     for load in body.tractions:
-        table["traction"].append({"triangles": _ids(load.triangles, len(body.mesh.surface)), "traction": load.value})
+        table["traction"].append({"triangles": _ids(load.triangles, len(body.mesh.surface)), "traction": _load(body, load)})
     for load in body.forces:
-        table["force"].append({"nodes": _ids(load.nodes, body.n_nodes), "force": load.value})
+        table["force"].append({"nodes": _ids(load.nodes, body.n_nodes), "force": _load(body, load)})
     return table
+
+
+def _load(body: Body, load: Traction | NodalForce):
+    """Return a load's value, or the fields of its key frames."""
+    if load.path is None:
+        return load.value
+    if not isinstance(load.path, LoadPath):
+        raise SceneError(f"body {body.name!r}: has a load along a function, which a file cannot store: use ts.KeyFrames")
+    return _fields(load.path.frames)
 
 
 def _ids(ids: np.ndarray, n: int):
