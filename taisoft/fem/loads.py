@@ -20,9 +20,12 @@ class _Path(NamedTuple):
     nodes: np.ndarray
     weights: np.ndarray
 
-    def forces(self, t: float) -> np.ndarray:
-        """Forces (k,3) [N] on its nodes at t [s]."""
-        return _spread(value_at(self.load, t, self.name), self.weights)
+    def forces(self, times: list[float]) -> np.ndarray:
+        """Forces (r,k,3) [N] on its nodes at the times (r,) [s]."""
+        values = [value_at(self.load, t, self.name) for t in times]
+        if all(value.ndim == 1 for value in values):
+            return np.stack(values)[:, None] * self.weights[:, None]
+        return np.stack([_spread(value, self.weights) for value in values])
 
 
 class SceneLoads:
@@ -45,16 +48,14 @@ class SceneLoads:
         """Forces (n_nodes, 3) [N] on all nodes at t [s]. Raises SimulationError if a path fails."""
         total = self._constant.copy()
         for path in self._paths:
-            total[path.nodes] += path.forces(t)
+            total[path.nodes] += path.forces([t])[0]
         return total
 
     def rows(self, times: np.ndarray, nodes: np.ndarray) -> np.ndarray:
         """Forces (r, k, 3) [N] on some nodes (k,), ascending, which include `nodes`, at the times (r,) [s]."""
         rows = np.repeat(self._constant[nodes][None], len(times), axis=0)
         for path in self._paths:
-            columns = np.searchsorted(nodes, path.nodes)
-            for row, t in zip(rows, times.tolist()):
-                row[columns] += path.forces(t)
+            rows[:, np.searchsorted(nodes, path.nodes)] += path.forces(times.tolist())
         return rows
 
 

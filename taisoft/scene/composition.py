@@ -64,6 +64,11 @@ class Composition:
         """Lamé's parameters (mu, lambda) [Pa], each a float or (m,)."""
         return lame_parameters(self.number("young"), self.number("poisson"))
 
+    @cached_property
+    def lowest_wave_speed(self) -> float:
+        """The smallest sqrt(young / density) of a tet [m/s]."""
+        return float(np.sqrt(np.min(self.number("young") / self.number("density"))))
+
     def tets_of_law(self, law: str) -> np.ndarray:
         """Return the tets (k,) that follow a law, ascending."""
         if not self.has_regions:
