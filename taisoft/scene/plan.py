@@ -60,7 +60,7 @@ def make_plan(scene: Scene, explicit: bool, multistep: bool, self_collision: boo
     add_if_any(
         "elasticity_by_tet",
         lambda b: b.composition.elastic_by_tet,
-        "young or poisson differ between the tets of",
+        "young or poisson may differ between the tets of",
         "every body has one young and one poisson",
     )
     quadratic = [b.name for b in scene.bodies if b.order == 2]
