@@ -22,7 +22,7 @@ ASSETS = Path(__file__).resolve().parent
 GAP = 4  # white pixels between two moments
 MAX_BYTES = 200_000  # of a picture; the repository keeps them
 
-# demo: moments [s], size of each picture, camera (target [m], distance [m], azimuth, elevation [deg])
+# demo: moments [s], size of each picture, camera (target [m], distance [m], azimuth, elevation [deg]), colouring if not by body
 STRIPS = {
     "bunny_ears": ((0.0, 0.9, 1.1, 1.3, 2.0), (260, 360), ((0.1, 1.05, 0.0), 5.6, 32.0, 8.0)),
     "hanging_cloth": ((0.0, 0.2, 0.4, 0.7, 4.0), (260, 230), ((0.0, -0.45, -0.1), 3.2, 40.0, 16.0)),
@@ -37,6 +37,7 @@ STRIPS = {
     "hanging_beam": ((0.0, 0.5, 1.0, 1.5, 2.0), (260, 260), ((-0.2, -1.4, 0.0), 11.0, 28.0, 14.0)),
     "midpoint_traction": ((0.0, 0.5, 6.0), (440, 140), ((0.0, 0.05, 0.0), 3.2, 12.0, 8.0)),
     "bending_beam_orders": ((0.0, 0.7, 5.0), (440, 290), ((0.0, -1.15, 0.0), 9.0, 88.0, 3.0)),
+    "layered_beam": ((0.0, 0.5, 3.0), (440, 130), ((1.2, -0.05, 0.0), 2.0, 0.0, 4.0), "stress"),
     "twisting_bar": ((0.0, 0.75, 1.5, 4.0), (330, 200), ((0.0, 0.0, 0.0), 6.6, 32.0, 20.0)),
 }
 
@@ -74,13 +75,13 @@ def film(
     return np.concatenate([part for picture in pictures for part in (gap, picture)][1:], axis=1), result
 
 
-def strip(scene_file: Path, moments: tuple, size: tuple[int, int], view: tuple) -> np.ndarray:
+def strip(scene_file: Path, moments: tuple, size: tuple[int, int], view: tuple, colour: str = "body") -> np.ndarray:
     """The pictures of a scene at some times, uint8 (height, width, 3); its run ends with the last."""
     module = load_module(scene_file)
     settings = {name: value for name, value in module.solver.items() if name != "seconds"}
     fps = settings.pop("fps")
     with ts.Simulator(module.build(), **settings) as sim:
-        picture, result = film(sim, moments, size, view, moments[-1], fps)
+        picture, result = film(sim, moments, size, view, moments[-1], fps, colour=colour)
     if result.status != "ok":
         raise SystemExit(f"{scene_file}: the run is {result.status}: {'; '.join(result.problems)}")
     return picture
@@ -90,8 +91,7 @@ def main() -> None:
     """Writes gallery/<demo>.png for the demos named, or for all."""
     names = sys.argv[1:] or list(STRIPS)
     for name in names:
-        moments, size, view = STRIPS[name]
-        data = png_bytes(strip(ASSETS.parent / "demos" / f"{name}.py", moments, size, view))
+        data = png_bytes(strip(ASSETS.parent / "demos" / f"{name}.py", *STRIPS[name]))
         path = ASSETS / "gallery" / f"{name}.png"
         if len(data) > MAX_BYTES:
             raise SystemExit(f"{path}: {len(data)} bytes, at most {MAX_BYTES} are meant to be kept")

@@ -90,23 +90,25 @@ def set_gravity(self: "Simulator", gravity) -> None:
     dynamics.numbers_changed()
 
 
-def set_material(self: "Simulator", body: str, **numbers) -> None:
+def set_material(self: "Simulator", body: str, region: int | str | None = None, **numbers) -> None:
     """Change numbers of a body's material (young, poisson, density, mass_damping, stiffness_damping); the law stays.
 
+    Without a region they hold for all tets; young, poisson and density may also be (m,), young and poisson only if they were
+    given by tet or by region when the Simulator was made. With a region, given by name or id, the three change there only.
     Copies arrays and recomputes the rounding floor of the residual and the stable dt; compiles nothing.
     """
     dynamics, changed = self._open(), self.scene.bodies[body_index(self, body)]
-    old, old_limit = changed.material, self._stable_dt
-    change_material(changed, numbers, self.plan.on)
+    old, old_limit = changed.composition, self._stable_dt
+    change_material(changed, numbers, self.plan.on, region)
     self._stable_dt = None
     try:
         check_stability(self, self.dt)
     except SimulationError:
         with thawed(changed):
-            changed.material, self._stable_dt = old, old_limit
+            changed.composition, self._stable_dt = old, old_limit
         raise
     dynamics.state.upload_material("density" in numbers)
-    if "density" in numbers:  # a total force is spread by mass: the nodes' fractions change only by rounding
+    if "density" in numbers:  # total forces are spread by mass
         dynamics.upload_loads()
     dynamics.numbers_changed()
 
@@ -126,7 +128,7 @@ def set_contact(
 def set_force(self: "Simulator", body: str, index: int, value) -> None:
     """Change a force added by `body.add_force`, from the next step on.
 
-    index: from 0 in the order added to this body. value: total (3,), or (k,3) with one row per node [N].
+    index: from 0 in the order added to this body. value: total (3,), or (k,3) with one row per node [N]; it replaces a path.
     Raises SceneError if there is no such force or the value is invalid.
     """
     _set_load(self, "force", body, index, value)
@@ -135,7 +137,7 @@ def set_force(self: "Simulator", body: str, index: int, value) -> None:
 def set_traction(self: "Simulator", body: str, index: int, value) -> None:
     """Change a traction added by `body.add_traction`, from the next step on; index and errors as for `set_force`.
 
-    value: (3,) per reference area [Pa].
+    value: (3,) per reference area [Pa]; it replaces a path.
     """
     _set_load(self, "traction", body, index, value)
 

@@ -73,7 +73,7 @@ def write_checkpoint(
         "settings": settings,
         "numbers": run_time_numbers(scene),
         "start": scene_numbers(start or scene),
-        "fingerprint": scene_fingerprint(scene, features),
+        "fingerprint": scene_fingerprint(start or scene, features),
         "state": plain,
         "notes": notes,
     }
@@ -121,17 +121,23 @@ def restore_numbers(saved: Checkpoint, scene: Scene) -> None:
     """Set a scene's gravity, materials, contact pairs and loads from a checkpoint. Raises SceneError for invalid numbers."""
     with thawed(scene, *scene.bodies):
         scene.gravity = saved.numbers["gravity"]
-        for body, material in zip(scene.bodies, saved.numbers["materials"]):
-            body.material = Material(**material)
+        for body, kept in zip(scene.bodies, saved.numbers["materials"]):
+            materials = [Material(**material) for material in kept["materials"]]
+            by_region = dict(zip(body.composition.materials, materials, strict=True))
+            body.material = by_region if body.composition.has_regions else materials[0]
+            for name, values in kept["by_tet"].items():
+                setattr(body, name, values)
         scene.contact_pairs = {frozenset(names): (a, b) for names, a, b in saved.numbers["pairs"]}
         for k, body in enumerate(scene.bodies):
             for kind, name in LOADS.items():
                 for i in range(len(getattr(body, name))):
-                    change_load(body, kind, i, saved.state["loads"][str(k)][kind][str(i)])
+                    value = saved.state["loads"][str(k)][kind][str(i)]
+                    if value is not None:
+                        change_load(body, kind, i, value)
 
 
 def load_values(scene: Scene) -> dict:
-    """Return the present values of all loads of a scene, as part of a checkpoint's state."""
+    """Return the present values of all loads of a scene, None for one that follows its path, as part of a checkpoint's state."""
     return {
         str(k): {kind: {str(i): load.value for i, load in enumerate(getattr(body, name))} for kind, name in LOADS.items()}
         for k, body in enumerate(scene.bodies)

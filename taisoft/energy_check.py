@@ -112,5 +112,5 @@ def opening_energy(scene: Scene, distance: float) -> float:
 
 
 def _energy(scene: Scene, body: Body, strain: float, lift: float) -> float:
-    weight = body.material.density * float(np.linalg.norm(scene.gravity))
-    return float(body.mesh.volumes.sum()) * (0.5 * body.material.young * strain**2 + weight * lift)
+    stretched = 0.5 * float(np.sum(body.young * body.mesh.volumes)) * strain**2
+    return stretched + body.mass * float(np.linalg.norm(scene.gravity)) * lift

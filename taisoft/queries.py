@@ -52,11 +52,10 @@ def stress(self: "Simulator", body: str | None = None) -> np.ndarray:
     """Return the Cauchy stress per tet (m,3,3) [Pa], not finite in a flat tet; without a name, of all bodies as added."""
     state = self._open().state
     m, layout = state.model, state.layout
-    bodies = range(len(layout.n_tets)) if body is None else [body_index(self, body)]
+    lanes = layout.lane_of_tet if body is None else layout.lane_of_tet[layout.tets(body_index(self, body))]
     sigma = np.zeros((m.n_blocks * m.lanes, 9))
     elasticity.cauchy_stress(m, sigma)
-    first = layout.block_start * m.lanes
-    return np.concatenate([sigma[first[k] : first[k] + layout.n_tets[k]] for k in bodies]).reshape(-1, 3, 3)
+    return sigma[lanes].reshape(-1, 3, 3)
 
 
 def elastic_forces(self: "Simulator") -> np.ndarray:

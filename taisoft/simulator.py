@@ -69,7 +69,8 @@ class Simulator(Guarded):
         for text in scale_warnings(scene):
             warnings.warn(text, UserWarning, stacklevel=2)
         self.plan = plan_of(scene, self.settings.integrator, self_collision, draggable)
-        self._may_soften = any(LAWS[b.material.law].SOFTENS_BELOW for b in scene.bodies)  # until a warning says so
+        laws = {law for body in scene.bodies for law in body.composition.laws}
+        self._may_soften = any(LAWS[law].SOFTENS_BELOW for law in laws)  # until a warning says so
         self._compiled_before = self._compile_reported = runtime.compile_clock()
         try:
             self._dynamics = Dynamics(scene, self.settings, self.plan)

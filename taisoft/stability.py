@@ -19,8 +19,11 @@ LANCZOS_MARGIN = 1.005  # Lanczos approaches the highest frequency from below; i
 
 def hooke_differential(body: Body):
     """Return v -> K v of one body at rest, matrix-free: a function (n,3) -> (n,3) [N per unit of v]."""
-    nodes, mu, lam = body.nodes.elements, body.material.mu, body.material.lam
+    nodes, (mu, lam) = body.nodes.elements, body.composition.lame
     gradients, volumes = reference.shape_gradients(body)
+    if body.composition.elastic_by_tet:  # one row for each quadrature point
+        mu, lam = (np.repeat(np.broadcast_to(x, len(nodes)), volumes.shape[1])[:, None] for x in (mu, lam))
+        mu = mu[:, :, None]
     rows = gradients.swapaxes(2, 3)  # (m, p, 3, nodes of a tet): d/dX_j of v at each point; SciPy sums this layout fastest
     columns = np.broadcast_to(nodes[:, None, None, :], rows.shape)
     starts = np.arange(0, rows.size + 1, nodes.shape[1])
@@ -38,7 +41,8 @@ def hooke_differential(body: Body):
 
 def hooke_stiffness(body: Body) -> sp.csr_matrix:
     """Stiffness matrix (3n, 3n) of one body at rest [N/m]."""
-    nodes, mu, lam = body.nodes.elements, body.material.mu, body.material.lam
+    nodes, (mu, lam) = body.nodes.elements, body.composition.lame
+    mu, lam = (np.reshape(x, (-1, 1, 1, 1, 1)) for x in (mu, lam))
     gradients, volumes = reference.shape_gradients(body)
     # G_ab = sum_q V_q ga gb^T, and K_ab = mu (tr(G_ab) I + G_ab^T) + lambda G_ab
     G = np.einsum("eq,eqai,eqbj->eabij", volumes, gradients, gradients, optimize=True)
@@ -84,11 +88,11 @@ def scale_warnings(scene: Scene) -> list[str]:
     warnings = []
     for body in scene.bodies:
         size = float(np.ptp(body.rest_positions, axis=0).max())
-        material, gravity = body.material, float(np.linalg.norm(scene.gravity))
-        strain = material.density * gravity * size / material.young
+        mass, volume, gravity = body.mass, float(body.mesh.volumes.sum()), float(np.linalg.norm(scene.gravity))
+        young = volume / float(np.sum(body.mesh.volumes / body.young))  # of layers in series
+        strain = mass / volume * gravity * size / young
         if strain > MAX_WEIGHT_STRAIN:
-            mass = material.density * float(body.mesh.volumes.sum())
-            crossing = size / np.sqrt(material.young / material.density)
+            crossing = size / np.sqrt(young * volume / mass)
             warnings.append(
                 f"body '{body.name}': {size:.4g} m long and {mass:.3g} kg, its own weight strains it by about {strain:.2g}; "
                 f"a wave crosses it in {crossing:.2g} s, explicit steps must stay below "
@@ -122,7 +126,8 @@ def stable_dt(scene: Scene, verlet: bool) -> float:
     for body in scene.bodies:
         omega = highest_frequency(body)
         if omega > 0.0:
-            limit = min(limit, _stable_dt_of(omega, body.material.mass_damping, body.material.stiffness_damping, verlet))
+            material = body.composition.first
+            limit = min(limit, _stable_dt_of(omega, material.mass_damping, material.stiffness_damping, verlet))
     return float(limit)
 
 

@@ -59,7 +59,7 @@ class StaticResult:
 def solve_static(
     scene: Scene, tolerance: float = 1e-6, precision: str = "f64", arch: str = "cpu", time: float = 0.0
 ) -> StaticResult:
-    """Find the rest state under gravity, loads and constraints; prescribed nodes follow their paths at `time` [s].
+    """Find the rest state under gravity, loads and constraints; prescribed nodes and loads follow their paths at `time` [s].
 
     tolerance: on |residual on free axes| / |applied load| (without load, relative to the constraint forces). An open f64
     runtime is reused; otherwise one is opened and closed. Contact is ignored. Raises SceneError if a body is not constrained
@@ -115,6 +115,7 @@ class StaticSolver:
         self.target = self.simulation.next_target(time)
         self.simulation.upload_constraints()
         self.gravity = np.array(scene.gravity, dtype=np.float64)
+        self.simulation.set_load_time(time)
         self.loads = model.loads.to_numpy() if model.loaded else None
 
     def solve(self) -> StaticResult:

@@ -4,9 +4,29 @@ It reads a `Scene`'s plain records and shares no formula with the package: the l
 elements those of `oracle_elements`, and implicit steps and statics are dense Newton.
 """
 
+from dataclasses import replace
+
 import numpy as np
 from oracle_elements import Elements, Part, body_loads
 from oracle_laws import hessian, pk1, psi
+
+
+def tet_materials(body) -> list:
+    """The material (m,) of each tet of a body, with its own numbers."""
+    of_regions = body.material if isinstance(body.material, dict) else None
+    found = [of_regions[int(r)] for r in body.mesh.regions] if of_regions else [body.material] * body.mesh.n_tets
+    for name, values in body.composition.by_tet.items():
+        found = [replace(material, **{name: float(value)}) for material, value in zip(found, values)]
+    return found
+
+
+def parts_of(body, whole: Part) -> list[Part]:
+    """A part for each material of a body; whole: the part of all its tets."""
+    materials, parts = tet_materials(body), []
+    for material in dict.fromkeys(materials):
+        rows = np.repeat([one == material for one in materials], whole.points)
+        parts.append(Part(whole.nodes[rows], whole.gradients[rows], whole.weights[rows], material, whole.points))
+    return parts
 
 
 class Oracle:
@@ -22,16 +42,17 @@ class Oracle:
         elements, self.starts = [], [0]
         for body in scene.bodies:
             elements.append(Elements(body.mesh, body.order))
-            self.parts.append(elements[-1].part(body.quadrature_degree, body.material, self.starts[-1]))
+            self.parts += parts_of(body, elements[-1].part(body.quadrature_degree, None, self.starts[-1]))
             self.starts.append(self.starts[-1] + len(elements[-1].X))
         self.n = self.starts[-1]
         self.lumped, self.loads, self.rest, self.v = np.zeros((self.n, 1)), *(np.zeros((self.n, 3)) for _ in range(3))
         self.mass_damping, self.stiffness_damping = np.zeros((self.n, 1)), np.zeros((self.n, 1))
         self.mass, self.consistent = np.zeros((self.n, self.n)), np.zeros((self.n, self.n))
         for body, made, start, end in zip(scene.bodies, elements, self.starts, self.starts[1:]):
-            own, m = slice(start, end), body.material
-            lumped = made.lumped_mass(m.density)
-            self.consistent[own, own] = made.consistent_mass(m.density)
+            own, (m, *_) = slice(start, end), (materials := tet_materials(body))
+            density = np.array([material.density for material in materials])
+            lumped = made.lumped_mass(density)
+            self.consistent[own, own] = made.consistent_mass(density)
             self.mass[own, own] = self.consistent[own, own] if body.order == 2 else np.diag(lumped)
             self.lumped[own, 0], self.loads[own] = lumped, body_loads(body, made.X, lumped)
             self.rest[own], self.v[own] = made.X + body.position, body.velocity

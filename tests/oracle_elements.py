@@ -101,17 +101,17 @@ class Elements:
         nodes = np.repeat(self.tets + start, len(points), axis=0)
         return Part(nodes, g.reshape(-1, *g.shape[2:]), np.outer(self.volumes, weights).ravel(), material, len(points))
 
-    def consistent_mass(self, density: float) -> np.ndarray:
+    def consistent_mass(self, density) -> np.ndarray:
         """(n,n) integrals of density N_a N_b [kg]."""
         return self._assembled(self._mass_blocks(density))
 
-    def lumped_mass(self, density: float) -> np.ndarray:
+    def lumped_mass(self, density) -> np.ndarray:
         """(n,) the diagonal of each tet's consistent mass, scaled to the tet's mass (Hinton, Rock, Zienkiewicz) [kg]."""
         diagonal = np.einsum("eaa->ea", self._mass_blocks(density))
-        share = density * self.volumes[:, None] * diagonal / diagonal.sum(axis=1, keepdims=True)
+        share = (density * self.volumes)[:, None] * diagonal / diagonal.sum(axis=1, keepdims=True)
         return np.bincount(self.tets.ravel(), share.ravel(), len(self.X))
 
-    def _mass_blocks(self, density: float) -> np.ndarray:
+    def _mass_blocks(self, density) -> np.ndarray:
         points, weights = RULES[4]
         N = self.at(points)[1]
         return np.einsum("e,k,eka,ekb->eab", density * self.volumes, weights, N, N)

@@ -31,6 +31,12 @@ def cube(center=(0.0, 0.0, 0.0), cells=(1, 1, 1), size=(1.0, 0.9, 1.1), pattern=
     return ts.box_mesh(cells, size, center, pattern)
 
 
+def halved(mesh: ts.TetMesh) -> ts.TetMesh:
+    """The mesh with two regions: 3, called "left", of the tets whose centroid has x < 0, and 7."""
+    ids = np.where(mesh.vertices[mesh.tets].mean(axis=1)[:, 0] < 0.0, 3, 7)
+    return ts.TetMesh(mesh.vertices, mesh.tets, regions=ids, region_names={3: "left"})
+
+
 def rows_of(sim: ts.Simulator, name: str) -> slice:
     """Rows of a body's nodes among those of all bodies."""
     bodies = sim.scene.bodies
@@ -83,28 +89,34 @@ def mixed_scene(
     stiffness_damping: float = 0.0,
     order: int | str = 1,
     degrees: tuple[int, int] = (2, 4),
+    by_tet: bool = False,
 ) -> ts.Scene:
     """Four bodies whose order is not that of the laws, of 10, 5, 6 and 5 tets: none fills its last lanes.
 
     Each has another material, and is held and loaded in another way; the first and the third are damped. They do not touch.
     order: 1, 2, or "both": 2, 1, 2, 1. degrees: of the quadrature of the first and the third body, if they are quadratic.
+    by_tet: the first has two regions with different laws and numbers, the second and third have numbers by tet.
     """
     orders = (2, 1, 2, 1) if order == "both" else (order,) * 4
     scene = ts.Scene(gravity=(0.3, -9.81, 0.7))
     scene.contact_forces = False
     damping = {"mass_damping": mass_damping, "stiffness_damping": stiffness_damping}
-    beam = scene.add_body(
-        cube(cells=(2, 1, 1)), rubber(laws[0], **damping), name="beam", position=(0.5, 0, 0), **element(orders[0], degrees[0])
-    )
+    material, numbers = rubber(laws[0], **damping), [{}] * 2
+    mesh = cube(cells=(2, 1, 1))
+    if by_tet:
+        mesh = halved(mesh)
+        material = {"left": material, 7: rubber(laws[1], young=4e4, poisson=0.1, density=1700.0, **damping)}
+        numbers = {"young": np.linspace(4e4, 1e5, 5), "poisson": np.linspace(0, 0.4, 5)}, {"density": np.linspace(5e2, 1e3, 6)}
+    beam = scene.add_body(mesh, material, name="beam", position=(0.5, 0, 0), **element(orders[0], degrees[0]))
     beam.fix(lambda X: X[:, 0] < -0.49)
     beam.add_traction(lambda X: X[:, 0] > 0.49, (300.0, 2000.0, -500.0))
     softer = rubber(laws[1], young=7e4, poisson=0.2)
-    block = scene.add_body(cube((3, 0, 0)), softer, name="block", velocity=(0.5, 0, -0.3), **element(orders[1]))
+    block = scene.add_body(cube((3, 0, 0)), softer, name="block", velocity=(0.5, 0, -0.3), **element(orders[1]), **numbers[0])
     block.fix([0, 1], axes="x")
     block.fix([1, 2], axes="yz")
     block.add_force([5, 6, 7], (30.0, -10.0, 20.0))
     lighter, mesh = rubber(laws[2], density=800.0, **damping), cube((6, 0, 0), pattern="six")
-    tower = scene.add_body(mesh, lighter, name="tower", **element(orders[2], degrees[1]))
+    tower = scene.add_body(mesh, lighter, name="tower", **element(orders[2], degrees[1]), **numbers[1])
     tower.fix(lambda X: X[:, 1] < -0.44)
     mesh = cube((9, 0, 0))
     flying = {"velocity": spin(mesh, orders[3]), **element(orders[3])}

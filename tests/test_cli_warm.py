@@ -39,8 +39,8 @@ def key(scene: ts.Scene, integrator: str, **solver) -> tuple:
     """The properties of a scene that kernels are compiled for."""
     on = {name for name, is_on in plan_of(scene, integrator, solver.get("self_collision", False), False).on.items() if is_on}
     if integrator not in EXPLICIT:
-        on.discard("fixed_nodes")  # a mask of numbers there
-    groups = sorted({(b.order, b.quadrature_degree, b.material.law) for b in scene.bodies})
+        on -= {"fixed_nodes", "load_paths"}  # a mask, and forces that the host sets
+    groups = sorted({(b.order, b.quadrature_degree, law) for b in scene.bodies for law in b.composition.laws})
     analytic = any(not isinstance(o.shape, MeshObstacle) for o in scene.obstacles)
     surfaces = [o.shape.surface() for o in scene.obstacles]
     counts = [len(b.nodes.surface) for b in scene.bodies] + [len(s[1]) for s in surfaces if s is not None]
@@ -117,6 +117,7 @@ def test_scenes_have_the_features_of_their_structure(structure):
         ("fixed", "fixed_nodes"),
         ("prescribed", "moving_nodes"),
         ("loaded", "loads"),
+        ("by_tet", "elasticity_by_tet"),
         ("mass_damping", "mass_damping"),
         ("stiffness_damping", "stiffness_damping"),
     ):

@@ -27,7 +27,7 @@ NEVER_CROSS = ("sheet_and_cube", "sheet_on_box")
 def stiffer(sim: Simulator) -> None:
     """All bodies by 1 %."""
     for body in sim.scene.bodies:
-        sim.set_material(body.name, young=1.01 * body.material.young)
+        sim.set_material(body.name, young=1.01 * body.young)
 
 
 def rougher(sim: Simulator) -> None:

@@ -1,6 +1,7 @@
 """The elastic operator of four bodies, two linear and two quadratic, whose tets do not fill the last lanes.
 
-In f64 serial kernels, with two laws and the finer quadrature; in f32 parallel kernels, with one law and the coarser quadrature.
+In f64 serial kernels, with two laws and the finer quadrature, also with laws and numbers that differ between the tets of a body;
+in f32 parallel kernels, with one law and the coarser quadrature.
 
 * energies, volume ratios, forces and their differential are the oracle's;
 * forces are minus the gradient of the energy; a tet inverted at a single quadrature point counts as inverted;
@@ -24,13 +25,15 @@ from taisoft.linear import block_csr
 SQUEEZE = np.array([[0.6, 0.1, 0.0], [-0.15, 1.2, 0.05], [0.0, 0.1, 0.7]])
 
 
-@pytest.fixture(scope="module", params=["f64", "f32"])
+@pytest.fixture(scope="module", params=["f64", "f32", "by tet"])
 def rig(request):
     # compiling an assembly takes seconds per law and quadrature; the laws have tests of their own
-    double = request.param == "f64"
+    by_tet = request.param == "by tet"
+    double = request.param == "f64" or by_tet
     laws, degree = ((SNH, SVK, SNH, SVK), 4) if double else ((SNH,) * 4, 2)
-    scene = mixed_scene(laws, mass_damping=0.4, stiffness_damping=3e-3, order="both", degrees=(degree, degree))
-    with built(scene, request.param) as made:
+    damping = {"mass_damping": 0.4, "stiffness_damping": 3e-3}
+    scene = mixed_scene(laws, **damping, order="both", degrees=(degree, degree), by_tet=by_tet)
+    with built(scene, "f64" if double else "f32") as made:
         made.model = made.model if double else made.parallel
         made.force, made.dx, made.product = made.vectors("force"), made.vectors("dx"), made.vectors("product")
         made.matrix = block_csr.build_block_csr(made.model, made.arena)

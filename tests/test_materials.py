@@ -22,7 +22,7 @@ from taisoft.backend import runtime
 from taisoft.backend.runtime import kernel
 from taisoft.fem.laws import LAWS
 from taisoft.fem.laws.evaluate import evaluate_differential
-from taisoft.scene.body import LAWS as NAMES
+from taisoft.scene.material import LAWS as NAMES
 
 YOUNG, POISSON = 3e5, 0.35  # [Pa]; not round, so that mu, lambda and their multiples all differ
 each_law = pytest.mark.parametrize("law", LAWS)

@@ -29,7 +29,7 @@ def first_softened(rig, x) -> int:
     for k, part in enumerate(rig.oracle.parts):
         stretch = np.linalg.svd(rig.oracle.gradients(x, part), compute_uv=False)[:, -1].reshape(-1, part.points).min(axis=1)
         tets = np.flatnonzero(stretch < LAWS[part.material.law].SOFTENS_BELOW)
-        softened += [int(rig.layout.block_start[k] * rig.model.lanes + tet) for tet in tets]
+        softened += [int(rig.layout.lane_of_tet[rig.layout.tet_start[k] + tet]) for tet in tets]
     return min(softened)
 
 

@@ -14,7 +14,8 @@ from scenes import COR, SNH, SVK, built, driven_scene, mixed_scene
 
 import taisoft as ts
 from taisoft.backend.arrays import FieldArena
-from taisoft.fem.model import body_loads, build_model
+from taisoft.fem.loads import SceneLoads
+from taisoft.fem.model import build_model
 from taisoft.fem.reference import gravity_masses, lumped_masses, mass_matrix
 from taisoft.fem.terms import elasticity
 from taisoft.scene.plan import change_material, make_plan
@@ -66,7 +67,7 @@ def test_tets_are_grouped_in_blocks_by_kind_and_body(rig):
     """A body's last block is padded with tets of no volume."""
     lanes, volume = rig.model.lanes, rig.model.volume.to_numpy()
     body = rig.model.block_body.to_numpy()
-    assert lanes == 4 and list(rig.layout.n_tets) == [10, 5, 6, 5] and rig.model.n_blocks == 9
+    assert lanes == 4 and list(rig.layout.tet_start) == [0, 10, 15, 21, 26] and rig.model.n_blocks == 9
     groups = [(g.order, g.n_points, g.law.NAME, g.first, g.last) for g in rig.model.groups]
     if quadratic(rig):
         assert groups == [(1, 1, SVK, 0, 4), (2, 4, SNH, 4, 7), (2, 14, COR, 7, 9)]
@@ -97,18 +98,18 @@ def test_every_node_of_a_tet_is_gathered_once(rig):
 
 
 def test_loads_equal_the_oracle_and_add_up(rig):
-    total, start = body_loads(rig.scene), rig.layout.node_start
+    total, start = SceneLoads(rig.scene).at(0.0), rig.layout.node_start
     assert total == pytest.approx(rig.oracle.loads)
     assert total[: start[1]].sum(axis=0) == pytest.approx(0.9 * 1.1 * np.array([300, 2000, -500]))
     assert total[start[1] : start[2]].sum(axis=0) == pytest.approx([30, -10, 20])
     driven = driven_scene(order="both" if quadratic(rig) else 1)
-    assert not total[start[2] :].any() and body_loads(driven) == pytest.approx(Oracle(driven).loads)
+    assert not total[start[2] :].any() and SceneLoads(driven).at(0.0) == pytest.approx(Oracle(driven).loads)
 
 
 def test_a_force_may_have_one_value_per_node(rig):
     scene, forces = rig.scene.snapshot(), np.random.default_rng(0).standard_normal((3, 3))
     scene.body("tower").add_force([4, 2, 7], forces)
-    added = body_loads(scene) - body_loads(rig.scene)
+    added = SceneLoads(scene).at(0.0) - SceneLoads(rig.scene).at(0.0)
     nodes = rig.layout.node_start[2] + np.array([4, 2, 7])
     assert np.abs(added[nodes] - forces).max() < 1e-12 and np.count_nonzero(added) == 9
 

@@ -5,6 +5,7 @@
 * a simulator takes less than 1 kB per tet.
 """
 
+import numpy as np
 import pytest
 from scenes import block_scene, cube, driven_scene, mixed_scene, rubber
 
@@ -26,10 +27,12 @@ def test_reasons():
         "law:st_venant_kirchhoff": (True, "used by block, flyer"),
         "law:corotational": (True, "used by tower"),
         "law:stable_neo_hookean": (True, "used by beam"),
+        "elasticity_by_tet": (False, "every body has one young and one poisson"),
         "quadratic_tets": (False, "every body is of order 1"),
         "consistent_weight": (False, "on linear tets it is the lumped mass"),
         "consistent_mass": (False, "the mass of linear tets is lumped"),
         "loads": (True, "tractions or forces on beam, block"),
+        "load_paths": (False, "every load is constant"),
         "fixed_nodes": (True, "on beam, block, tower"),
         "moving_nodes": (False, "no node follows a path"),
         "mass_damping": (True, "material of beam, tower"),
@@ -50,6 +53,8 @@ def test_every_feature_can_be_on_and_off():
     off = make_plan(block_scene(), explicit=True, multistep=False).on
     full = driven_scene(order=2, mass_damping=1.0, stiffness_damping=1.0)
     full.add_obstacle(ts.HalfSpace((0, -9, 0), (0, 1, 0)))
+    full.body("beam").young = np.full(full.body("beam").mesh.n_tets, 1e5)
+    full.body("beam").add_force([4], lambda t: (t, 0, 0))
     full.body("beam").collision, full.contact_forces = "distance_field", True
     on = make_plan(full, explicit=False, multistep=True, self_collision=True).on
     laws = {name for name in on if name.startswith("law:")}

@@ -24,9 +24,9 @@ from taisoft.errors import OutputError, SimulationError
 @pytest.mark.parametrize("case", [c for c in CASES if not c.fine], ids=lambda case: case.name)
 def test_reference(case, shared):
     path = shared / "references" / f"{case.problem}.json"
-    if not path.is_file():
+    if not case.closed_form and not path.is_file():
         pytest.skip(f"{path.name} is absent")
-    checks = list(case.compute(json.loads(path.read_text(encoding="utf-8")), "cpu"))
+    checks = list(case.compute({} if case.closed_form else json.loads(path.read_text(encoding="utf-8")), "cpu"))
     assert any(check.limit is not None for check in checks)
     assert not [check for check in checks if not check.passed]
 

@@ -14,7 +14,7 @@ import pytest
 
 from taisoft.errors import SceneError
 from taisoft.mesh.shapes import box_mesh
-from taisoft.scene.body import LAWS
+from taisoft.scene.material import LAWS
 from taisoft.scene.scene import Material, Scene
 
 MESH = box_mesh((2, 2, 2), (1.0, 1.0, 1.0))
@@ -143,7 +143,7 @@ def test_default_names_skip_used_ones(scene):
         ({"velocity": (0, 0, np.inf)}, "velocity: .* not finite"),
         ({"velocity": "fast"}, "velocity must be numbers"),
         ({"mesh": MESH.vertices}, "mesh must be a TetMesh, not ndarray"),
-        ({"material": {"young": 1e6}}, "material must be a Material, not dict"),
+        ({"material": {"young": 1e6}}, "materials are given by region, but its mesh has no regions"),
         ({"collision": "distance"}, "'b': collision must be one of auto, distance_field, proximity, not 'distance'; did you"),
         ({"collision": None}, "'b': collision must be one of"),
     ],

@@ -69,6 +69,7 @@ EVERY_SETTING = {
     "arch": "cpu",
     "allow_unstable": False,
     "draggable": True,
+    "tolerance": 0.01,
     "newton_tolerance": 1e-5,
     "linear_tolerance": None,
     "contact_tolerance": 1e-3,

@@ -104,10 +104,12 @@ def data(scene: ts.Scene) -> dict:
         arrays = (b.rest_positions, b.nodes.elements, b.mesh.tets, b.mesh.surface, b.position, b.velocity)
         fixed = [(c.nodes.tolist(), c.axes.tolist()) for c in b.constraints if c.path is None]
         moved = [(c.nodes.tolist(), c.axes.tolist(), path_data(c.path)) for c in b.constraints if c.path is not None]
-        loads = [(load.triangles.tolist(), load.value.tobytes()) for load in b.tractions]
-        loads += [(load.nodes.tolist(), load.value.shape, load.value.tobytes()) for load in b.forces]
+        chosen = [t.triangles.tolist() for t in b.tractions] + [f.nodes.tolist() for f in b.forces]
+        values = [path_data(load.path) or (load.value.shape, load.value.tobytes()) for load in b.loads]
         numbers = (b.name, b.order, b.quadrature_degree, b.collision, b.material)
-        bodies.append((numbers, [a.tobytes() for a in arrays], fixed, moved, loads))
+        by_tet = {name: own.tobytes() for name, own in b.composition.by_tet.items()}
+        regions = b.mesh.regions if b.mesh.regions is None else (b.mesh.regions.tolist(), b.mesh.region_names)
+        bodies.append((numbers, [a.tobytes() for a in arrays], fixed, moved, chosen, values, by_tet, regions))
     obstacles = []
     for o in scene.obstacles:
         fields = {name: np.asarray(value).tobytes() for name, value in vars(o.shape).items()}

@@ -58,6 +58,7 @@ class Case:
     mesh: str
     compute: Callable[[dict, str], Iterable[Check]]  # (reference, arch) -> checks
     fine: bool = False
+    closed_form: bool = False  # the reference is a formula in the code, and there is no file
 
     @property
     def name(self) -> str:

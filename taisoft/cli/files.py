@@ -14,7 +14,7 @@ from taisoft.errors import OutputError
 from taisoft.mesh.files import WRITERS, check_ending, read_mesh, write_mesh
 from taisoft.mesh.surface_mesh import FORMATS, SurfaceMesh, read_surface, tetrahedralize
 from taisoft.mesh.tet_mesh import TetMesh, edge_lengths, mean_ratio
-from taisoft.scene.body import Material
+from taisoft.scene.material import Material
 from taisoft.scene.obstacles import HalfSpace
 from taisoft.scene.scene import Scene
 from taisoft.scene.toml_writer import write_scene
@@ -26,6 +26,7 @@ DROP = 0.25  # over the body's height
 RELATIVE_STIFFNESS = 100.0  # Young's modulus over the pressure under the body: it sags by about 1 %
 DENSITY = 1000.0  # [kg/m^3]
 GROUND = "ground"
+MAX_REGIONS = 20  # listed by name
 MESH_SUFFIXES = (*WRITERS, ".node", ".ele")
 
 
@@ -80,6 +81,7 @@ def describe(mesh: TetMesh) -> list[tuple[str, str]]:
     return [
         *_size_lines(counts, mesh.vertices),
         ("volume", f"{mesh.volumes.sum():.6g}"),
+        *_region_lines(mesh),
         _edge_line(lengths),
         ("quality", f"mean ratio {ratios}; 1 is a regular tet, {poor} are below {POOR_QUALITY}"),
         *_problem_lines(mesh.warnings),
@@ -100,6 +102,13 @@ def _describe_surface(surface: SurfaceMesh) -> list[tuple[str, str]]:
         *_problem_lines([*surface.warnings, *surface.faults()]),
         ("next", f"fill it with tets: taisoft tetrahedralize {command}"),
     ]
+
+
+def _region_lines(mesh: TetMesh) -> list[tuple[str, str]]:
+    """Return a line about the regions, if there are any: the first MAX_REGIONS by name or number, with their tets."""
+    counts = [f"{mesh.region_text(one)} of {np.count_nonzero(mesh.regions == one)} tets" for one in mesh.region_ids[:MAX_REGIONS]]
+    others = len(mesh.region_ids) - len(counts)
+    return [("regions", ", ".join(counts) + (f", and {others} more" if others else ""))] if counts else []
 
 
 def _pieces(number: int) -> str:

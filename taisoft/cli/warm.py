@@ -19,8 +19,8 @@ from taisoft.backend.runtime import n_compiled
 from taisoft.dynamics.schemes import EXPLICIT
 from taisoft.errors import SimulationError
 from taisoft.mesh.shapes import box_mesh, sheet_mesh
-from taisoft.scene.body import LAWS
 from taisoft.scene.key_frames import KeyFrames
+from taisoft.scene.material import LAWS
 from taisoft.scene.obstacles import Box, HalfSpace, MeshObstacle
 from taisoft.scene.scene import Material, Scene
 
@@ -89,8 +89,8 @@ def solve(structure: "Structure", precision: str) -> None:
 class Structure:
     """Features that kernels are compiled for. obstacles: "half-space", "box" or "mesh"; orders: element order of each body.
 
-    fixed, prescribed: some nodes are fixed, or follow a path; loaded: forces on nodes; thin: tets so flat that strains are
-    computed in f64; fine: a surface of more than 1,500 triangles, searched by parallel loops.
+    fixed, prescribed: some nodes are fixed, or follow a path; loaded: forces on nodes; by_tet: elasticity by tet; thin: tets so
+    flat that strains are computed in f64; fine: a surface of more than 1,500 triangles, searched by parallel loops.
     """
 
     integrator: str
@@ -100,6 +100,7 @@ class Structure:
     fixed: bool = False
     prescribed: bool = False
     loaded: bool = False
+    by_tet: bool = False
     mass_damping: bool = False
     stiffness_damping: bool = False
     thin: bool = False
@@ -151,6 +152,9 @@ def structures() -> Iterator[Structure]:
         yield Structure(integrator, orders=(2,), fixed=True, thin=True, mass_damping=True)
         yield Structure(integrator, orders=(1, 2), fixed=True, mass_damping=True, contacts=False)
         yield Structure(integrator, orders=PAIR, fixed=True, thin=True, mass_damping=True)
+    for integrator in ("symplectic_euler", "implicit_euler"):
+        yield Structure(integrator, fixed=True, by_tet=True)
+    yield Structure("implicit_euler", orders=(2,), fixed=True, loaded=True, by_tet=True, mass_damping=True)
     yield Structure("implicit_euler", obstacles=PLANE, fine=True)
     yield Structure("implicit_euler", obstacles=PLANE_AND_BOX, fine=True)
     yield Structure("implicit_euler", obstacles=BOX, thin=True, fine=True, mass_damping=True)
@@ -180,6 +184,8 @@ def build(structure: Structure) -> Scene:
         position, speed = (0.0, bottom + 0.5 * height, 0.0), SPEED if k > 0 or not structure.fixed else 0.0
         scene.add_body(mesh, soft, name=f"body {k}", position=position, order=order, velocity=(0.0, -speed, 0.0))
         mesh, bottom = box_mesh((2, 2, 2), (0.5 * SIZE, 0.5 * SIZE, 0.5 * SIZE)), bottom + height + 0.001 * SIZE
+    if structure.by_tet:
+        scene.bodies[0].young = np.full(scene.bodies[0].mesh.n_tets, soft.young)
     _add_conditions(scene.bodies[0], structure)
     for name in structure.obstacles:
         scene.add_obstacle(_obstacle(name), name=name, friction=0.5)

@@ -102,7 +102,8 @@ class RoundingFloor:
         m = self.model
         volume, Dm_inv, constants, body, mass = download([m.volume, m.Dm_inv, m.law_constants, m.block_body, m.mass])
         volume, Dm_inv, mass = (a.astype(np.float64) for a in (volume, Dm_inv, mass))
-        stiffness = np.abs(constants[:, :2]).sum(axis=1)[body]
+        stiffness = np.abs(constants[:, :2]).sum(axis=1)  # of each body, or of each lane
+        stiffness = stiffness if m.elasticity_by_tet else stiffness[body][:, None]
         g = np.sqrt((Dm_inv**2).sum(axis=1))
         if m.points is not None:  # the gradients of quadratic shape functions are larger
             steepest = float(np.abs(m.points.to_numpy()[:, 1:]).max())
@@ -110,7 +111,7 @@ class RoundingFloor:
                 g[group.first : group.last] *= steepest if group.order == 2 else 1.0
         largest = float(np.abs(download([m.state.x])[0]).max())
         strain = self.eps + np.finfo(np.float64).eps * largest * g  # rounding of F, and of the f64 positions it is computed from
-        squares = (stiffness[:, None] * volume * g * strain) ** 2
+        squares = (stiffness * volume * g * strain) ** 2
         self.force = float(np.sqrt(squares.sum()))
         self.force_by_body = np.sqrt(np.bincount(body, squares.sum(axis=1)))
         # rounding of v = (x - x_hat) / beta: |M| times the rounding of x, still to be divided by beta

@@ -156,13 +156,12 @@ class ContactStep:
 
     def _gap_targets(self) -> tuple[float, float, float, float]:
         """Contact offset [m]; fractions of a penetration and of a missing offset corrected per substep; maximum speed [m/s]."""
-        materials = [b.material for b in self.simulation.scene.bodies]
-        slowest = min(np.sqrt(m.young / m.density) for m in materials)
+        slowest = min(b.composition.lowest_wave_speed for b in self.simulation.scene.bodies)
         return (
             self.contact_offset,
             self._substep_fraction * self._corrections[0],
             self._substep_fraction * self._corrections[1],
-            MAX_OPENING_SPEED * float(slowest),
+            MAX_OPENING_SPEED * slowest,
         )
 
     def numbers_changed(self) -> None:

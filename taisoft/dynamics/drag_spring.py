@@ -7,7 +7,7 @@ This is stable if k T^2 and c T are small compared with the effective mass m_p =
 SOFT m_p / T^2, and c, half of the critical 2 sqrt(k m_p), to SOFT m_p / T. With SOFT = 0.5 a mass on such a spring comes to
 rest under every integrator here, including BDF2. Weakness: finer meshes and longer steps allow only weaker springs.
 |F| is limited, too, so that dragging inverts no tets: to STRAIN young A, where A = (m_p / density)^(2/3) is the dragged area,
-and to HEAVY times the body's weight.
+and to HEAVY times the body's weight. young is that of the body's softest tet, and density its mean.
 """
 
 from dataclasses import dataclass
@@ -60,9 +60,9 @@ class DragSpring:
         nodes, weights = nodes + layout.node_start[body], weights / weights.sum()
         masses = self._simulation.model.mass.to_numpy().astype(np.float64)
         mass = 1.0 / float((weights**2 / masses[nodes]).sum())
-        area = (mass / own.material.density) ** (2 / 3)
-        max_force = min(STRAIN * own.material.young * area, HEAVY * EARTH * float(masses[layout.nodes(body)].sum()))
-        self._simulation.upload_loads()  # removes the force from the previous nodes
+        area = (mass * float(own.mesh.volumes.sum()) / own.mass) ** (2 / 3)
+        max_force = min(STRAIN * float(np.min(own.young)) * area, HEAVY * EARTH * float(masses[layout.nodes(body)].sum()))
+        self.release()  # removes the force from the previous nodes
         self.drag = Drag(own.name, nodes, weights, target, stiffness, mass, max_force, target, np.zeros(3))
         self.drag.point = weights @ self._simulation.state()[0][nodes]
 
@@ -88,7 +88,5 @@ class DragSpring:
 
     def upload(self) -> None:
         """Upload the scene's loads, plus the drag force if something is dragged."""
-        if self.drag is None:
-            self._simulation.upload_loads()
-        else:
-            self._simulation.upload_loads(self.drag.nodes, np.outer(self.drag.weights, self.drag.force))
+        drag = self.drag
+        self._simulation.set_drag(None if drag is None else (drag.nodes, np.outer(drag.weights, drag.force)))

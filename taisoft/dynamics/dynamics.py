@@ -187,8 +187,7 @@ class Dynamics:
 
     def upload_loads(self) -> None:
         """Copy the scene's present loads, plus the force of the drag spring, to the device."""
-        self.state.loads = None
-        (self.drag_spring.upload if self.drag_spring is not None else self.state.upload_loads)()
+        self.state.upload_loads()
 
     def end_drag(self) -> None:
         """End the drag, if any."""
@@ -198,10 +197,11 @@ class Dynamics:
 
     @property
     def is_driven(self) -> bool:
-        """Whether anything but the scene's own forces does work now: a drag, prescribed nodes or moving obstacles."""
+        """Whether anything but constant forces does work now: a drag, prescribed nodes, moving obstacles, loads along paths."""
         moving = self.contact is not None and any(obstacle.path is not None for obstacle in self.scene.obstacles)
         dragged = self.drag_spring is not None and self.drag_spring.drag is not None
-        return moving or dragged or not all(self.state.dirichlet.released())
+        varied = self.model.loaded and len(self.state.loads.nodes) > 0
+        return moving or dragged or varied or not all(self.state.dirichlet.released())
 
     # --- queries ------------------------------------------------------------------------------------------------------
 
@@ -211,6 +211,7 @@ class Dynamics:
 
     def _measure(self) -> tuple[Energies, float, int]:
         """Return the energies of the present state [J], its smallest J, and its number of inverted tets."""
+        self.state.set_load_time(self.state.time)
         measure(self.model)
         elastic, lowest, inverted, kinetic, gravity, _, loads = self.model.state.scalars.to_numpy()[: LOADS + 1].tolist()
         return Energies(kinetic, elastic, gravity, loads), lowest, int(inverted)
@@ -220,12 +221,12 @@ class Dynamics:
         layout, first = self.state.layout, int(self.model.state.scalars[FIRST_SOFTENED])
         if first == NO_TET:
             return None
-        tets = first - layout.block_start * self.runtime.lanes  # its number in each body
-        k = int(np.flatnonzero((tets >= 0) & (tets < layout.n_tets))[0])
-        body = self.scene.bodies[k]
-        law = LAWS[body.material.law]
+        at = int(layout.tet_of_lane[first])
+        k = int(np.searchsorted(layout.tet_start, at, side="right")) - 1
+        body, tet = self.scene.bodies[k], at - layout.tet_start[k]
+        law = LAWS[body.composition.law_of_tet(tet)]
         return (
-            f"step {self.state.step_count}: tet {tets[k]} of body '{body.name}' is compressed below {law.SOFTENS_BELOW} of its "
+            f"step {self.state.step_count}: tet {tet} of body '{body.name}' is compressed below {law.SOFTENS_BELOW} of its "
             f"length, where {law.NAME} softens: tets may collapse or invert, and stay so"
         )
 

@@ -129,6 +129,13 @@ def save_prescribed_positions(m: ti.template(), s: ti.template()):
 
 
 @ti.func
+def set_loads(m: ti.template(), s: ti.template(), row):
+    """Set the loads that follow paths for this sub-step."""
+    for k in range(s.n_varied):
+        m.loads[s.varied_nodes[k]] = ti.cast(s.load_rows[row * s.n_varied + k], m.real)
+
+
+@ti.func
 def compute_reactions(m: ti.template(), s: ti.template(), dt):
     """Compute the constraint force on held nodes, m (v_new - v_old)/dt - f [N], v_old from `held_velocity`."""
     for k in range(s.n_held):
@@ -178,6 +185,8 @@ def advance_serial(m: ti.template(), s: ti.template(), n: ti.i32, dt64: ti.f64, 
                     verlet_drift(m, s, i, dt, verlet_half(m, s, i, dt))
                 if ti.static(s.has_prescribed):
                     prescribe(m, s, done, dt64)
+            if ti.static(s.has_varied_loads):
+                set_loads(m, s, done)
             lowest_now, inverted = elasticity.sum_elements_serially(m)
             lowest_by_lane = ti.min(lowest_by_lane, lowest_now)
             total = ti.Vector([0.0, 0.0, 0.0], m.real)
@@ -205,11 +214,11 @@ def advance_serial(m: ti.template(), s: ti.template(), n: ti.i32, dt64: ti.f64, 
 
 
 @kernel
-def set_targets(s: ti.template(), rows: ti.types.ndarray()):
-    """Set the targets of a batch, (sub-steps * n_prescribed, 3) [m]."""
+def set_rows(out: ti.template(), rows: ti.types.ndarray()):
+    """Set the first 3-vectors of a field, the targets or loads of a batch, to rows (sub-steps * nodes, 3)."""
     for k in range(rows.shape[0]):
         for a in ti.static(range(3)):
-            s.targets[k][a] = rows[k, a]
+            out[k][a] = rows[k, a]
 
 
 @kernel
@@ -242,6 +251,10 @@ def drift_parallel(m: ti.template(), s: ti.template(), row: ti.i32, dt64: ti.f64
             ti.loop_config(serialize=True)
             for _ in range(1):
                 prescribe(m, s, row, dt64)
+    if ti.static(s.has_varied_loads):
+        ti.loop_config(serialize=True)
+        for _ in range(1):
+            set_loads(m, s, row)
 
 
 @kernel

@@ -155,6 +155,7 @@ class ContactExplicitStepper(ExplicitStepper):
     def _solve_and_move(self, step: int, time: float, dt: float) -> SolveResult | None:
         """Solve for the impulses of the contacts found, and move; return the contact solver's result, None without contacts."""
         m, s, contact = self.simulation.model, self.work, self.contact
+        self.simulation.set_load_time(time)
         if s.verlet and self.acceleration_stale:
             find_acceleration(m, s)
         self.acceleration_stale = False
@@ -170,6 +171,7 @@ class ContactExplicitStepper(ExplicitStepper):
             result = solve(p, self.method, self.contact_tolerance, MAX_SWEEPS)
         move(m, s, contact.problem, dt, int(n > 0))
         if s.verlet:
+            self.simulation.set_load_time(time + dt)
             finish_verlet(m, s, contact.problem, dt, int(n > 0))
         if m.state.scalars[FAILED] != 0.0:
             raise SimulationError(f"step {step}: {self._describe_fault()}")

@@ -35,6 +35,9 @@ class SubstepWork:
     prescribed_nodes: Any  # (n_prescribed) i32
     prescribed_axes: Any  # (n_prescribed) 3-vectors i32
     targets: Any  # (rows * n_prescribed) 3-vectors f64
+    n_varied: Count
+    varied_nodes: Any  # (n_varied) i32: those whose loads follow a path
+    load_rows: Any  # (rows * n_varied) 3-vectors f64 [N]: their loads in each sub-step
     before: Any  # (n_prescribed) 3-vectors f64: position before the sub-step
     held: Any  # (n_held) i32
     held_velocity: Any  # (n_held) 3-vectors
@@ -44,6 +47,11 @@ class SubstepWork:
     def has_prescribed(self) -> bool:
         """Whether nodes have prescribed motion."""
         return self.prescribed_nodes is not None
+
+    @property
+    def has_varied_loads(self) -> bool:
+        """Whether loads follow paths."""
+        return self.varied_nodes is not None
 
     @property
     def has_held(self) -> bool:
@@ -67,10 +75,15 @@ class ExplicitStepper:
     def __init__(self, simulation: SimulationState, settings: Settings):
         self.simulation, verlet = simulation, settings.integrator == "velocity_verlet"
         m, arena, dirichlet = simulation.model, simulation.arena, simulation.dirichlet
-        n_tets = int(simulation.layout.n_tets.sum())
+        n_tets = len(simulation.layout.lane_of_tet)
         self.max_batch = largest_batch(m)
         n_prescribed, n_held = dirichlet.n_prescribed, len(dirichlet.held)
-        self.rows = max(1, min(self.max_batch, TARGET_BYTES_PER_TET * n_tets // (24 * max(1, n_prescribed))))
+        self._varied = simulation.loads.nodes if m.loaded else np.zeros(0, dtype=np.int64)
+        n_varied = len(self._varied)
+        self.rows = max(1, min(self.max_batch, TARGET_BYTES_PER_TET * n_tets // (24 * max(1, n_prescribed + n_varied))))
+
+        def ids(name: str, nodes: np.ndarray):
+            return arena.field(name, ti.i32, len(nodes), nodes.astype(np.int32)) if len(nodes) else None
 
         def vectors(name: str, count: int, dtype=m.real, needed: bool = True, data=None):
             return arena.vectors(name, dtype, count, data) if needed and count > 0 else None
@@ -81,15 +94,14 @@ class ExplicitStepper:
             n_held=n_held,
             acceleration=vectors("acceleration", m.n_nodes, needed=verlet),
             half_velocity=vectors("half_velocity", m.n_nodes, needed=verlet and m.stiffness_damping),
-            prescribed_nodes=(
-                arena.field("prescribed_nodes", ti.i32, n_prescribed, dirichlet.prescribed_nodes.astype(np.int32))
-                if n_prescribed
-                else None
-            ),
+            prescribed_nodes=ids("prescribed_nodes", dirichlet.prescribed_nodes),
             prescribed_axes=vectors("prescribed_axes", n_prescribed, ti.i32, data=dirichlet.prescribed_axes()),
             targets=vectors("targets", self.rows * n_prescribed, ti.f64),
+            n_varied=n_varied,
+            varied_nodes=ids("varied_nodes", self._varied),
+            load_rows=vectors("load_rows", self.rows * n_varied, ti.f64),
             before=vectors("position_before", n_prescribed, ti.f64),
-            held=arena.field("held", ti.i32, n_held, dirichlet.held.astype(np.int32)) if n_held else None,
+            held=ids("held", dirichlet.held),
             held_velocity=vectors("held_velocity", n_held),
             reaction=vectors("reaction", n_held),
         )
@@ -136,13 +148,18 @@ class ExplicitStepper:
         """
         n = min(n, self.max_batch)
         simulation = self.simulation
-        if self.work.n_prescribed:
+        simulation.set_load_time(simulation.time)
+        if self.work.n_prescribed or self.work.n_varied:
             n = min(n, self.rows)
+        if self.work.n_prescribed:
             releases = simulation.releases
             targets = simulation.next_targets(simulation.time + dt * np.arange(1, n + 1))
             self.acceleration_stale = self.acceleration_stale or simulation.releases != releases
             n = len(targets)
             self._upload_targets(targets)
+        if self.work.n_varied:
+            times = simulation.time + dt * (np.arange(n) + int(self.work.verlet))  # Euler's forces are those at the start
+            explicit.set_rows(self.work.load_rows, simulation.load_rows(times, self._varied).reshape(-1, 3))
         kept = simulation.state()
         try:
             result = self._launch(n, dt)
@@ -171,15 +188,18 @@ class ExplicitStepper:
         return self.simulation.find_nonfinite() or other
 
     def _upload_targets(self, targets: np.ndarray) -> None:
-        explicit.set_targets(self.work, targets.reshape(-1, 3))
+        explicit.set_rows(self.work.targets, targets.reshape(-1, 3))
         upload([(self.work.prescribed_axes, self.simulation.dirichlet.prescribed_axes())])
 
     def _restore_state(self, x: np.ndarray, v: np.ndarray) -> None:
         self.simulation.set_state(x, v)
+        self.simulation.set_load_time(self.simulation.time)
         self.acceleration_stale = True
 
     def _launch(self, n: int, dt: float) -> StepResult:
         m, s = self.simulation.model, self.work
+        if s.n_varied:
+            self.simulation.load_time = None  # sub-steps set them
         if m.serial:
             explicit.advance_serial(m, s, n, dt, int(self.acceleration_stale))
         else:
@@ -195,7 +215,7 @@ class ExplicitStepper:
             explicit.restart_parallel(m, s)
         explicit.begin_parallel(m)
         for row in range(n):
-            if s.verlet or s.n_prescribed or s.n_held:
+            if s.verlet or s.n_prescribed or s.n_held or s.n_varied:
                 explicit.drift_parallel(m, s, row, dt)
             explicit.elements_parallel(m)
             explicit.nodes_parallel(m, s, row, dt)

@@ -257,6 +257,7 @@ class ImplicitStepper:
                 accelerations = simulation.dirichlet.accelerations(time, dt, self.scheme.before == 0.0)
                 prescribed.append((w.prescribed_acceleration, accelerations))
             upload(prescribed)
+        simulation.set_load_time(time + (0.5 if scheme.midpoint else 1.0) * dt)
         self._beta = scheme.beta_over_dt * dt
         self.contact.set_impulse_fraction(scheme.beta_over_dt)
         self.solver.assemble_damper()

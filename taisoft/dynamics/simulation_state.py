@@ -7,14 +7,18 @@ import numpy as np
 from taisoft.backend.arrays import FieldArena, download, upload
 from taisoft.backend.runtime import Runtime
 from taisoft.dynamics.dirichlet import DirichletConditions
-from taisoft.fem.model import Layout, Model, body_loads, damping_table, material_table, upload_mass_matrix
+from taisoft.fem.loads import SceneLoads
+from taisoft.fem.model import Layout, Model, damping_table, law_table, upload_mass_matrix
 from taisoft.fem.reference import gravity_masses, lumped_masses
 from taisoft.scene.scene import Scene
 
 
 @dataclass
 class SimulationState:
-    """A scene on the device. time [s] is start + count * dt, so that it does not drift."""
+    """A scene on the device. time [s] is start + count * dt, so that it does not drift.
+
+    Loads on the device are those of one time, which `set_load_time` changes; steppers evaluate forces within a step.
+    """
 
     scene: Scene
     runtime: Runtime
@@ -25,7 +29,9 @@ class SimulationState:
     time: float = 0.0
     step_count: int = 0
     releases: int = 0  # number of releases of prescribed nodes; each invalidates the steppers' history
-    loads: np.ndarray | None = None  # (n_nodes, 3) [N] of the scene's tractions and forces; None: not computed, or outdated
+    drag: tuple[np.ndarray, np.ndarray] | None = None  # nodes (k,) and forces (k, 3) [N] of a drag spring
+    _loads: SceneLoads | None = None  # None: not computed, or outdated
+    load_time: float | None = None  # of the loads on the device; None: several, or outdated
 
     def state(self) -> tuple[np.ndarray, np.ndarray]:
         """Return positions and velocities of all nodes, in their stored precision."""
@@ -47,6 +53,7 @@ class SimulationState:
         self.upload_constraints()
         self.set_state(kept["x"], kept["v"])
         self.time, self.step_count = float(kept["time"]), int(kept["step_count"])
+        self.set_load_time(self.time)
 
     def restart(self) -> None:
         """Set the initial state of the scene."""
@@ -54,6 +61,7 @@ class SimulationState:
         self.upload_constraints()
         self.set_state(self.layout.rest, self._rest_velocities())  # compiles it before a step may need it
         self.time, self.step_count = 0.0, 0
+        self.set_load_time(0.0)
 
     def upload_constraints(self) -> None:
         """Upload the free axes."""
@@ -66,7 +74,7 @@ class SimulationState:
     def upload_material(self, density: bool) -> None:
         """Upload material numbers of the bodies, and masses if a density changed."""
         m = self.model
-        numbers = [(m.law_constants, material_table([b.material for b in self.scene.bodies]))]
+        numbers = [(m.law_constants, law_table(self.scene, self.layout, m.elasticity_by_tet))]
         if m.damping is not None:
             numbers.append((m.damping, damping_table(self.scene)))
         if density:
@@ -77,17 +85,41 @@ class SimulationState:
         if density and m.consistent:
             upload_mass_matrix(self.scene, m.mass_matrix)
 
-    def upload_loads(self, nodes: np.ndarray | None = None, forces: np.ndarray | None = None) -> None:
-        """Upload the scene's loads, plus forces (k, 3) [N] on nodes (k,) if given."""
-        if not self.model.loaded:
+    @property
+    def loads(self) -> SceneLoads:
+        """The scene's loads with their present values."""
+        if self._loads is None:
+            self._loads = SceneLoads(self.scene)
+        return self._loads
+
+    def upload_loads(self) -> None:
+        """Upload the loads of the present time, after some changed, with the drag force."""
+        self._loads = self.load_time = None
+        self.set_load_time(self.time)
+
+    def set_drag(self, drag: tuple[np.ndarray, np.ndarray] | None) -> None:
+        """Set nodes and forces of a drag spring, or None, and upload the loads of the present time."""
+        self.drag, self.load_time = drag, None
+        self.set_load_time(self.time)
+
+    def set_load_time(self, time: float) -> None:
+        """Upload the loads of a time [s], with the drag force, unless the device has them or they are the same at any time."""
+        if not self.model.loaded or self.load_time == time or (self.load_time is not None and not len(self.loads.nodes)):
             return
-        if self.loads is None:
-            self.loads = body_loads(self.scene)
-        loads = self.loads
-        if nodes is not None:
-            loads = loads.copy()
-            np.add.at(loads, nodes, forces)
+        loads = self.loads.at(time)
+        if self.drag is not None:
+            np.add.at(loads, *self.drag)
         upload([(self.model.loads, loads)])
+        self.load_time = time
+
+    def load_rows(self, times: np.ndarray, nodes: np.ndarray) -> np.ndarray:
+        """Return loads (r, k, 3) [N] at times (r,) on nodes (k,), ascending, for kernels that set them."""
+        rows = self.loads.rows(times, nodes)
+        if self.drag is not None:
+            forces = np.zeros((self.model.n_nodes, 3))
+            np.add.at(forces, *self.drag)
+            rows += forces[nodes]
+        return rows
 
     def _rest_velocities(self) -> np.ndarray:
         """Return initial velocities, 0 on constrained axes, (n_nodes, 3)."""

@@ -23,8 +23,8 @@ def nominal_order(integrator: str, scene: Scene, touches: bool) -> int:
 
 def is_smooth(scene: Scene, touches: bool) -> bool:
     """Whether second-order methods keep their order: not with contacts, velocity-dependent forces, or paths, which may jump."""
-    materials = [body.material for body in scene.bodies]
-    prescribed = any(c.path is not None for body in scene.bodies for c in body.constraints)
+    materials = [body.composition.first for body in scene.bodies]
+    prescribed = any(one.path is not None for body in scene.bodies for one in (*body.constraints, *body.loads))
     damped = any(material.mass_damping or material.stiffness_damping for material in materials)
     return not (prescribed or damped or touches)
 

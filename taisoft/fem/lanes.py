@@ -30,9 +30,14 @@ def volumes(m: ti.template(), b, real: ti.template()):
 
 @ti.func
 def law_constants(m: ti.template(), b, real: ti.template()):
-    """The four law constants of block b's body [Pa and pure numbers], in every lane."""
-    body = m.block_body[b]
-    return [broadcast(ti.cast(m.law_constants[body, k], real), m.lanes) for k in ti.static(range(4))]
+    """The four law constants of the tets of block b [Pa and pure numbers]: their own, or those of their body in every lane."""
+    if ti.static(m.elasticity_by_tet):
+        return [
+            ti.Vector([ti.cast(m.law_constants[b, k, q], real) for q in ti.static(range(m.lanes))]) for k in ti.static(range(4))
+        ]
+    else:
+        body = m.block_body[b]
+        return [broadcast(ti.cast(m.law_constants[body, k], real), m.lanes) for k in ti.static(range(4))]
 
 
 @ti.func

@@ -2,8 +2,8 @@
 
 Kernels are compiled for laws, orders, flags and precision. Topology, rest shape and sizes are constant but run-time data, as are
 gravity, material numbers, loads and constraint masks. Nodes keep the order of the bodies and of their meshes. Tets are grouped
-by order, quadrature and law; a kernel runs one group's blocks in one loop. A body's last block is padded with copies of its last
-tet that have volume 0.
+by order, quadrature and law; a kernel runs one group's blocks in one loop. A body whose regions follow several laws has blocks in
+several groups. Its last block in each is padded with copies of its last tet there that have volume 0.
 """
 
 from dataclasses import dataclass, replace
@@ -16,10 +16,11 @@ from taisoft.backend.arrays import Count, FieldArena, download, upload
 from taisoft.backend.runtime import Runtime, threads
 from taisoft.fem import reference
 from taisoft.fem.laws import LAWS
+from taisoft.fem.loads import SceneLoads
 from taisoft.fem.node_graph import PAIRS, NodeGraph, node_graph
 from taisoft.fem.state import State, build_state
 from taisoft.fem.terms import terms_of
-from taisoft.scene.scene import Material, Scene
+from taisoft.scene.scene import Scene
 
 # Least quadrature points and CPU threads for parallel loops; below, one serial kernel runs. With two threads, parallel loops took
 # 3.4 times as long (213,000 tets, `taisoft bench scaling`)
@@ -77,7 +78,7 @@ class Model:
     Dm_inv: Any  # (n_blocks, 9, lanes) [1/m]
     volume: Any  # (n_blocks, lanes) [m^3]
     block_body: Any  # (n_blocks) i32
-    law_constants: Any  # (n_bodies, 4)
+    law_constants: Any  # (n_bodies, 4), or (n_blocks, 4, lanes) if elasticity_by_tet
     gather_start: Any  # (n_nodes + 1) i32: first entry of each node in gather_entry
     gather_entry: Any  # i32: base index into State.element_force of each node of each tet
     mass: Any  # (n_nodes) lumped mass [kg]
@@ -92,6 +93,7 @@ class Model:
     loaded: bool
     damped: bool
     stiffness_damping: bool
+    elasticity_by_tet: bool  # law_constants may differ between the tets of a body
     chunks: int  # parts of a loop, each with its own partial sums
 
 
@@ -100,30 +102,39 @@ class Layout:
     """Host-side index ranges of bodies and tets in the model."""
 
     node_start: np.ndarray  # (n_bodies + 1)
-    block_start: np.ndarray  # (n_bodies,) first block of each body
-    n_tets: np.ndarray  # (n_bodies,)
+    tet_start: np.ndarray  # (n_bodies + 1), among the tets of all bodies
+    tet_of_lane: np.ndarray  # (n_blocks * lanes,) tet among those of all bodies; padding repeats the tet before it
+    lane_of_tet: np.ndarray  # (n_tets,) its lane, counted through all blocks
     rest: np.ndarray  # (n_nodes, 3) rest positions in the scene [m]
+    lanes: int
 
     def nodes(self, body: int) -> slice:
         """Rows of a body's nodes."""
         return slice(self.node_start[body], self.node_start[body + 1])
 
+    def tets(self, body: int) -> slice:
+        """Rows of a body's tets."""
+        return slice(self.tet_start[body], self.tet_start[body + 1])
+
 
 def _layout(scene: Scene, lanes: int) -> tuple[Layout, tuple[Group, ...]]:
     bodies, laws = scene.bodies, list(LAWS)
-    n_tets = np.array([b.mesh.n_tets for b in bodies])
-    blocks = -(-n_tets // lanes)
-    block_start = np.zeros(len(bodies), dtype=np.int64)
-    kind_of = [(b.order, b.quadrature_degree, laws.index(b.material.law)) for b in bodies]
-    n_points = {degree: len(reference.quadrature(degree).weights) for _, degree, _ in kind_of}
+    tet_start = np.concatenate([[0], np.cumsum([b.mesh.n_tets for b in bodies])])
+    parts: dict[tuple, list[np.ndarray]] = {}  # tets of one body and one law, by their kind
+    for k, b in enumerate(bodies):
+        for law in b.composition.laws:
+            kind = b.order, b.quadrature_degree, laws.index(law)
+            parts.setdefault(kind, []).append(tet_start[k] + b.composition.tets_of_law(law))
+    n_points = {degree: len(reference.quadrature(degree).weights) for _, degree, _ in parts}
+    tet_of_lane = []
     groups, block, nodes_at, force_at, matrix_at = [], 0, 0, 0, 0
-    for kind in sorted(set(kind_of)):
+    for kind in sorted(parts):
         order, degree, law = kind
         first = block
-        for k in range(len(bodies)):
-            if kind_of[k] == kind:
-                block_start[k] = block
-                block += int(blocks[k])
+        for tets in parts[kind]:
+            padded = -(-len(tets) // lanes) * lanes
+            tet_of_lane.append(tets[np.minimum(np.arange(padded), len(tets) - 1)])
+            block += padded // lanes
         n_nodes, count = len(reference.unit_mass(order)), (block - first) * lanes
         points_at = sum(n for other, n in n_points.items() if 1 < other < degree)  # order 1 has degree 1 and no table
         offsets = first, block, nodes_at, force_at, matrix_at, points_at
@@ -133,7 +144,9 @@ def _layout(scene: Scene, lanes: int) -> tuple[Layout, tuple[Group, ...]]:
         matrix_at += (block - first) * MATRIX_BLOCKS[order] * 9
     rest = np.concatenate([b.rest_positions + b.position for b in bodies])
     node_start = np.concatenate([[0], np.cumsum([b.n_nodes for b in bodies])])
-    return Layout(node_start, block_start, n_tets, rest), tuple(groups)
+    tet_of_lane = np.concatenate(tet_of_lane)
+    lane_of_tet = np.unique(tet_of_lane, return_index=True)[1]
+    return Layout(node_start, tet_start, tet_of_lane, lane_of_tet, rest, lanes), tuple(groups)
 
 
 def _rule_table(rules: tuple[reference.Quadrature, ...]) -> np.ndarray:
@@ -144,40 +157,21 @@ def _rule_table(rules: tuple[reference.Quadrature, ...]) -> np.ndarray:
     return np.column_stack([weights, (s[:, :, 1:] - s[:, :, :1]).reshape(len(points), 27)])
 
 
-def body_loads(scene: Scene) -> np.ndarray:
-    """Nodal forces (n_nodes, 3) [N] of tractions and forces; total forces are distributed over their nodes by lumped mass."""
-    parts = []
-    for body in scene.bodies:
-        total = np.zeros((body.n_nodes, 3))
-        for t in body.tractions:
-            total += reference.traction_forces(body, t.triangles, t.value)
-        mass = reference.lumped_mass(body)
-        for f in body.forces:
-            weights = mass[f.nodes] / mass[f.nodes].sum()
-            total[f.nodes] += f.value if f.value.ndim == 2 else np.outer(weights, f.value)
-        parts.append(total)
-    return np.concatenate(parts)
-
-
 def _packed_tets(scene: Scene, layout: Layout, groups: tuple[Group, ...], lanes: int):
     """Node ids, a list with one (lanes, n_nodes) array per group; Dm^-1 and volume (0 in padding) of every lane."""
-    count = groups[-1].last * lanes
-    nodes = [np.zeros(((g.last - g.first) * lanes, g.n_nodes), dtype=np.int64) for g in groups]
-    Dm_inv, volume = np.zeros((count, 3, 3)), np.zeros(count)
+    n_tets, width = len(layout.lane_of_tet), max(g.n_nodes for g in groups)
+    elements, Dm_inv, volumes = np.zeros((n_tets, width), dtype=np.int64), np.zeros((n_tets, 3, 3)), np.zeros(n_tets)
     for k, body in enumerate(scene.bodies):
         # sort nodes: F and V do not depend on their order, and every node pair then has the same direction in all its tets.
         # Mid-edge nodes are numbered like their ends, so they can be sorted separately
-        elements = body.nodes.elements
-        elements = np.concatenate([np.sort(elements[:, :4], axis=1), np.sort(elements[:, 4:], axis=1)], axis=1)
-        inverse, v = reference.inverse_rest_edges(body.mesh.vertices, elements[:, :4])
-        first, m = layout.block_start[k] * lanes, body.mesh.n_tets
-        last = first + -(-m // lanes) * lanes
-        padded = np.minimum(np.arange(last - first), m - 1)
-        j = next(j for j, g in enumerate(groups) if g.first <= layout.block_start[k] < g.last)
-        start = first - groups[j].first * lanes
-        nodes[j][start : start + len(padded)] = elements[padded] + layout.node_start[k]
-        Dm_inv[first:last], volume[first : first + m] = inverse[padded], v
-    return nodes, Dm_inv, volume
+        own, rows = body.nodes.elements, layout.tets(k)
+        own = np.concatenate([np.sort(own[:, :4], axis=1), np.sort(own[:, 4:], axis=1)], axis=1)
+        Dm_inv[rows], volumes[rows] = reference.inverse_rest_edges(body.mesh.vertices, own[:, :4])
+        elements[rows, : own.shape[1]] = own + layout.node_start[k]
+    nodes = [elements[layout.tet_of_lane[g.first * lanes : g.last * lanes], : g.n_nodes] for g in groups]
+    volume = np.zeros(len(layout.tet_of_lane))
+    volume[layout.lane_of_tet] = volumes
+    return nodes, Dm_inv[layout.tet_of_lane], volume
 
 
 def _worst_condition(nodes, Dm_inv: np.ndarray, layout: Layout) -> float:
@@ -222,9 +216,18 @@ def lane_layout(values: np.ndarray, lanes: int) -> np.ndarray:
     return values.reshape(-1, lanes, values.shape[1]).transpose(0, 2, 1)
 
 
-def material_table(materials: list[Material]) -> np.ndarray:
-    """Law constants (n_bodies, 4)."""
-    return np.array([LAWS[m.law].constants(m.mu, m.lam) for m in materials])
+def law_table(scene: Scene, layout: Layout, by_tet: bool) -> np.ndarray:
+    """Law constants (n_bodies, 4), or (n_blocks, 4, lanes) if they may differ between the tets of a body."""
+    if not by_tet:
+        return np.array([LAWS[b.composition.first.law].constants(*b.composition.lame) for b in scene.bodies])
+    table = np.zeros((len(layout.lane_of_tet), 4))
+    for k, body in enumerate(scene.bodies):
+        mu, lam = (np.broadcast_to(x, body.mesh.n_tets) for x in body.composition.lame)
+        for law in body.composition.laws:
+            tets = body.composition.tets_of_law(law)
+            for c, values in enumerate(LAWS[law].constants(mu[tets], lam[tets])):
+                table[layout.tet_start[k] + tets, c] = values
+    return lane_layout(table[layout.tet_of_lane], layout.lanes)
 
 
 def build_model(scene: Scene, runtime: Runtime, arena: FieldArena, on: dict[str, bool]) -> tuple[Model, Layout]:
@@ -234,9 +237,7 @@ def build_model(scene: Scene, runtime: Runtime, arena: FieldArena, on: dict[str,
     n_nodes, n_blocks = len(layout.rest), groups[-1].last
     nodes, Dm_inv, volume = _packed_tets(scene, layout, groups, lanes)
     start, entry = _gather_table(nodes, groups, volume > 0, n_nodes, lanes)
-    block_body = np.zeros(n_blocks, dtype=np.int32)
-    for k in range(len(scene.bodies)):
-        block_body[layout.block_start[k] : layout.block_start[k] + -(-layout.n_tets[k] // lanes)] = k
+    block_body = (np.searchsorted(layout.tet_start, layout.tet_of_lane[::lanes], side="right") - 1).astype(np.int32)
     work = sum((g.last - g.first) * lanes * g.n_points for g in groups)
     serial = runtime.arch == "cpu" and (work < PARALLEL_FROM or threads() < PARALLEL_THREADS)
     chunks = 1 if serial else CHUNKS[runtime.arch]
@@ -246,6 +247,7 @@ def build_model(scene: Scene, runtime: Runtime, arena: FieldArena, on: dict[str,
     node_body = np.repeat(np.arange(n_bodies, dtype=np.int32), np.diff(layout.node_start))
     velocity = np.concatenate([np.broadcast_to(b.velocity, b.rest_positions.shape) for b in scene.bodies])
     flat_nodes = np.concatenate([lane_layout(own, lanes).reshape(-1) for own in nodes])
+    laws = law_table(scene, layout, on["elasticity_by_tet"])
     rules = tuple(reference.quadrature(d) for d in sorted({b.quadrature_degree for b in scene.bodies if b.order == 2}))
     table = _rule_table(rules) if rules else None
     rest_lanes = lane_layout(Dm_inv.reshape(-1, 9), lanes).astype(npr if strain_real == real else np.float64)
@@ -268,7 +270,7 @@ def build_model(scene: Scene, runtime: Runtime, arena: FieldArena, on: dict[str,
         Dm_inv=arena.field("Dm_inv", strain_real, (n_blocks, 9, lanes), rest_lanes),
         volume=arena.field("volume", real, (n_blocks, lanes), volume.reshape(n_blocks, lanes).astype(npr)),
         block_body=arena.field("block_body", ti.i32, n_blocks, block_body),
-        law_constants=arena.field("law_constants", ti.f64, (n_bodies, 4), material_table([b.material for b in scene.bodies])),
+        law_constants=arena.field("law_constants", ti.f64, laws.shape, laws),
         gather_start=arena.field("gather_start", ti.i32, n_nodes + 1, start),
         gather_entry=arena.field("gather_entry", ti.i32, len(entry), entry),
         mass=mass,
@@ -276,13 +278,14 @@ def build_model(scene: Scene, runtime: Runtime, arena: FieldArena, on: dict[str,
         mass_matrix=None,
         free=arena.vectors("free", real, n_nodes, np.ones((n_nodes, 3), dtype=npr)),
         gravity=arena.vectors("gravity", real, 1, np.asarray(scene.gravity, dtype=npr)[None]),
-        loads=arena.vectors("loads", real, n_nodes, body_loads(scene).astype(npr)) if on["loads"] else None,
+        loads=arena.vectors("loads", real, n_nodes, SceneLoads(scene).at(0.0).astype(npr)) if on["loads"] else None,
         node_body=arena.field("node_body", ti.i32, n_nodes, node_body) if damped else None,
         damping=arena.field("damping", real, (n_bodies, 2), damping_table(scene).astype(npr)) if damped else None,
         consistent=on["consistent_mass"],
         loaded=on["loads"],
         damped=damped,
         stiffness_damping=on["stiffness_damping"],
+        elasticity_by_tet=on["elasticity_by_tet"],
         chunks=chunks,
     )
     if on["consistent_mass"]:
@@ -312,4 +315,5 @@ def upload_mass_matrix(scene: Scene, mass: MassMatrix) -> None:
 
 def damping_table(scene: Scene) -> np.ndarray:
     """Mass damping [1/s] and stiffness damping [s] of each body (n_bodies, 2)."""
-    return np.array([[b.material.mass_damping, b.material.stiffness_damping] for b in scene.bodies])
+    materials = [b.composition.first for b in scene.bodies]
+    return np.array([[material.mass_damping, material.stiffness_damping] for material in materials])

@@ -108,7 +108,7 @@ def gravity_mass(body: Body) -> np.ndarray:
 
 
 def _distribute(body: Body, fractions: np.ndarray) -> np.ndarray:
-    values = body.material.density * np.outer(body.mesh.volumes, fractions)
+    values = np.reshape(body.density, (-1, 1)) * np.outer(body.mesh.volumes, fractions)
     return np.bincount(body.nodes.elements.reshape(-1), values.reshape(-1), body.n_nodes)
 
 
@@ -127,7 +127,7 @@ def unit_mass(order: int) -> np.ndarray:
 def consistent_mass(body: Body) -> sp.csr_matrix:
     """Consistent mass matrix (n,n), the same for each axis: int rho N_a N_b dV [kg]."""
     elements = body.nodes.elements
-    values = body.material.density * body.mesh.volumes[:, None, None] * unit_mass(body.order)
+    values = (body.density * body.mesh.volumes)[:, None, None] * unit_mass(body.order)
     rows, columns = np.broadcast_arrays(elements[:, :, None], elements[:, None, :])
     return sp.csr_matrix((values.reshape(-1), (rows.reshape(-1), columns.reshape(-1))), shape=(body.n_nodes,) * 2)
 
@@ -148,10 +148,10 @@ def mass_matrix(scene: Scene) -> sp.csr_matrix:
     return sp.block_diag(parts, format="csr")
 
 
-def traction_forces(body: Body, triangles: np.ndarray, traction: np.ndarray) -> np.ndarray:
-    """Nodal forces (n,3) [N] of a uniform dead traction (3,) [Pa] per reference area on rows (k,) of mesh.surface.
+def triangle_areas(body: Body, triangles: np.ndarray) -> np.ndarray:
+    """Reference areas at the nodes (n,) [m^2] of rows (k,) of mesh.surface: a uniform traction times them is the nodal forces.
 
-    A third of a triangle's force goes to each corner for linear tets, to each mid-edge node for quadratic ones.
+    A third of a triangle goes to each corner for linear tets, to each mid-edge node for quadratic ones.
     """
     corners = body.mesh.surface[triangles]
     a, b, c = (body.mesh.vertices[corners[:, k]] for k in range(3))
@@ -160,5 +160,4 @@ def traction_forces(body: Body, triangles: np.ndarray, traction: np.ndarray) -> 
         nodes = corners
     else:  # the last of a face's four triangles connects the mid-edge nodes
         nodes = body.nodes.surface.reshape(-1, 4, 3)[triangles, 3]
-    area_per_node = np.bincount(nodes.reshape(-1), np.repeat(area / 3.0, 3), body.n_nodes)
-    return area_per_node[:, None] * np.asarray(traction, dtype=np.float64)
+    return np.bincount(nodes.reshape(-1), np.repeat(area / 3.0, 3), body.n_nodes)

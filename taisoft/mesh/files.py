@@ -1,15 +1,18 @@
 """Read and write tetrahedral meshes in files.
 
-Gmsh's and TetGen's files are read by `formats.py`, every other format by meshio in a child process (`safe_reading.py`).
+Gmsh's files are read by `gmsh.py`, TetGen's by `tetgen.py`, every other format by meshio in a child process (`safe_reading.py`).
 
 Second-order tets in a file have ten nodes, four corners and then one on each edge. Only the corners enter the mesh:
 second-order bodies have straight edges at rest and mid-edge nodes of their own. Curved edges are reported. Formats differ in
 the order of the edges, and readers do not always know it, so the order is inferred from the nodes' positions.
+
+Regions are numbers of the elements: physical groups, references, or other cell data. Weak: only .msh holds their names.
 """
 
 import contextlib
 import io
 import re
+import warnings
 from pathlib import Path
 
 import meshio
@@ -17,14 +20,18 @@ import numpy as np
 
 from taisoft.errors import MeshError
 from taisoft.files import replacing
-from taisoft.mesh.formats import read_gmsh, read_tetgen
-from taisoft.mesh.safe_reading import Blocks, read_by_meshio, read_content
+from taisoft.mesh.gmsh import PHYSICAL, read_gmsh
+from taisoft.mesh.regions import LARGEST_ID
+from taisoft.mesh.safe_reading import Blocks, FileContent, read_by_meshio, read_content
 from taisoft.mesh.tet_mesh import LARGEST_COORDINATE, TetMesh, edge_lengths, merge_labels
+from taisoft.mesh.tetgen import read_tetgen
 from taisoft.mesh.topology import EDGES
 
 TETS = ("tetra", "tetra10")
 BOUNDARY = ("vertex", "line", "line3", "triangle", "triangle6")  # boundary markers that meshers add; ignored with a warning
 WRITERS = {".msh": "gmsh", ".vtk": "vtk", ".vtu": "vtu", ".mesh": "medit"}
+REGION, REFERENCE = "region", "medit:ref"  # names of cell data that hold regions, as PHYSICAL does
+NONE_IF_ZERO = (PHYSICAL, REFERENCE)  # such data are in files without regions too, where all are 0
 
 # Pattern that counts the faces in a file of a format that cannot hold tets.
 SURFACES = {
@@ -43,13 +50,15 @@ KNOWN_ORDER = 0.25  # largest median of that ratio for which the inferred node o
 _PLURALS = {"vertex": "vertices", "line": "lines", "triangle": "triangles", "quad": "quads", "hexahedron": "hexahedra"}
 
 
-def read_mesh(path, fix_orientation: bool = False, weld: float | None = None) -> TetMesh:
+def read_mesh(path, fix_orientation: bool = False, weld: float | None = None, regions: str | None = None) -> TetMesh:
     """Read a tetrahedral mesh from a file of any format that meshio knows.
 
-    path: the file; its extension selects the format. fix_orientation: as for `TetMesh`. weld: merge vertices at most this
-    far apart [m]; 0 merges only equal ones, None merges nothing. Points, lines and triangles beside the tets, and vertices of
-    no tet, are ignored with a warning; any other element type is refused with its name and count. Second-order tets keep only
-    their corners; a warning reports the number of curved edges that become straight. Raises MeshError.
+    path: the file; its extension selects the format. fix_orientation: as for `TetMesh`. weld: merge vertices at most this far
+    apart [m]; 0 merges only equal ones, None merges nothing. regions: name of the cell data that hold the tets' regions; by
+    default the physical groups of .msh, the references of .mesh, or data called "region". Points, lines and triangles beside
+    the tets, and vertices of no tet, are ignored with a warning; any other element type is refused with its name and count.
+    Second-order tets keep only their corners; a warning reports the number of curved edges that become straight. Raises
+    MeshError.
     """
     try:
         file = Path(path)
@@ -61,30 +70,58 @@ def read_mesh(path, fix_orientation: bool = False, weld: float | None = None) ->
     if ending in SURFACES:
         found = _count_faces(ending, data)
         raise MeshError(f"{name}: no tetrahedra; {found} found; make a volume mesh first: taisoft tetrahedralize")
-    mesh = None
+    content = None
     if ending == ".msh" and data.lstrip()[:1] == b"$":
-        mesh = read_gmsh(name, data)
+        content = read_gmsh(name, data)
     elif ending in (".node", ".ele"):
-        mesh = read_tetgen(file)
-    points, cells = mesh or _read_by_meshio(file, data)
-    blocks, notes = _tet_blocks(name, cells)
-    return _clean_mesh(name, points, blocks, notes, fix_orientation, weld)
+        content = read_tetgen(file)
+    content = content or _read_by_meshio(file, data)
+    blocks, notes = _tet_blocks(name, content.cells)
+    ids, region_notes = _regions(name, content, regions)
+    present = set() if ids is None else set(ids.tolist())
+    names = {region: text for region, text in content.region_names.items() if region in present and text.strip()}
+    labels = {"regions": ids, "region_names": names}
+    return _clean_mesh(name, content.points, blocks, notes + region_notes, fix_orientation, weld, labels)
 
 
 def write_mesh(path, mesh: TetMesh) -> None:
-    """Write a mesh atomically as .msh (Gmsh 4.1, text), .vtk, .vtu or .mesh (Medit).
+    """Write a mesh atomically as .msh (Gmsh 4.1, with regions 2.2, text), .vtk, .vtu or .mesh (Medit).
 
-    Raises MeshError for another extension or anything but a TetMesh, OutputError if the file cannot be written.
+    Regions become physical groups in .msh, references in .mesh, and else cell data called "region"; a warning says where their
+    names are lost. Raises MeshError for another extension, anything but a TetMesh, or regions that would be read as none,
+    OutputError if the file cannot be written.
     """
     file = Path(path)
     ending = check_ending(file)
     if not isinstance(mesh, TetMesh):
         raise MeshError(f"{file}: write_mesh needs a TetMesh, not {type(mesh).__name__}")
     record = meshio.Mesh(mesh.vertices, [("tetra", mesh.tets)])
-    options = {"binary": False} if ending == ".msh" else {}
+    options = {"file_format": WRITERS[ending]} | ({"binary": False} if ending == ".msh" else {})
+    if mesh.regions is not None:
+        options |= _add_regions(file, record, mesh)
+    elif ending == ".mesh":
+        record.cell_data[REFERENCE] = [np.zeros(mesh.n_tets, dtype=np.int32)]  # meshio would write 1
     with replacing(file) as part:
         with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
-            meshio.write(part, record, file_format=WRITERS[ending], **options)
+            meshio.write(part, record, **options)
+
+
+def _add_regions(file: Path, record: meshio.Mesh, mesh: TetMesh) -> dict:
+    """Add a mesh's regions to meshio's record of it; return options of the writer."""
+    ending = file.suffix.lower()
+    name = {".msh": PHYSICAL, ".mesh": REFERENCE}.get(ending, REGION)
+    if name in NONE_IF_ZERO and not mesh.regions.any():
+        raise MeshError(
+            f"{file}: a mesh whose only region is 0 cannot be written, since in {ending} 0 means none: use another number"
+        )
+    record.cell_data[name] = [mesh.regions.astype(np.int32)]
+    if ending != ".msh":
+        if mesh.region_names:
+            warnings.warn(f"{file}: {ending} cannot hold the names of regions, only their numbers", UserWarning, stacklevel=3)
+        return {}
+    record.cell_data["gmsh:geometrical"] = record.cell_data[name]
+    record.field_data = {text: np.array([region, 3]) for region, text in mesh.region_names.items()}
+    return {"file_format": "gmsh22"}  # 4.1 would need a block of elements for each region, in another order
 
 
 def check_ending(file: Path) -> str:
@@ -107,7 +144,28 @@ def _count_faces(ending: str, data: bytes) -> str:
     return _format_counts({"triangle": len(found)})
 
 
-def _read_by_meshio(file: Path, data: bytes) -> tuple[np.ndarray, Blocks]:
+def _regions(name: str, content: FileContent, requested: str | None) -> tuple[np.ndarray | None, list[str]]:
+    """Return the region (m,) of each tet, or None, and warnings. requested: name of the cell data, or None for the known ones."""
+    if requested is not None and requested not in content.cell_data:
+        known = ", ".join(repr(one) for one in content.cell_data) or "none"
+        raise MeshError(f"{name}: no cell data are called {requested!r}; there are {known}")
+    key = next((one for one in (requested, *NONE_IF_ZERO, REGION) if one in content.cell_data), None)
+    if key is None:
+        return None, []
+    blocks = [values for (kind, nodes), values in zip(content.cells, content.cell_data[key]) if kind in TETS and len(nodes)]
+    values = np.concatenate(blocks)
+    whole = np.isfinite(values) & (np.abs(values) <= LARGEST_ID) & (np.floor(values) == values)
+    if not whole.all():
+        tet = int(np.argmin(whole))
+        text = f"cell data {key!r} are no regions, since that of tet {tet} is {values[tet]:g}, not a whole number of 32 bits"
+        if requested is not None:
+            raise MeshError(f"{name}: {text}")
+        return None, [text]
+    ids = values.astype(np.int64)
+    return (None if key in NONE_IF_ZERO and not ids.any() and requested is None else ids), []
+
+
+def _read_by_meshio(file: Path, data: bytes) -> FileContent:
     known = meshio.extension_to_filetypes
     if not any("".join(file.suffixes[-n:]).lower() in known for n in (1, 2)):
         raise MeshError(f"{file}: not a supported mesh: the ending {file.suffix.lower()!r} is not known")
@@ -143,7 +201,7 @@ def _format_counts(counts: dict[str, int]) -> str:
     return ", ".join(f"{n} {kind if n == 1 else _PLURALS.get(kind, f'{kind} elements')}" for kind, n in counts.items())
 
 
-def _clean_mesh(name, points, blocks, notes, fix_orientation, weld) -> TetMesh:
+def _clean_mesh(name, points, blocks, notes, fix_orientation, weld, labels) -> TetMesh:
     """Return the TetMesh of the corners, unused vertices removed, the rest welded. TetMesh itself refuses invalid arrays."""
     tets = np.concatenate([nodes[..., :4] for nodes in blocks])
     valid = (
@@ -158,7 +216,7 @@ def _clean_mesh(name, points, blocks, notes, fix_orientation, weld) -> TetMesh:
         and all(nodes.dtype.kind in "iu" for nodes in blocks)
     )
     if not valid:
-        return TetMesh(points, tets, fix_orientation, source=name, notes=tuple(notes))
+        return TetMesh(points, tets, fix_orientation, source=name, notes=tuple(notes), **labels)
     points = points.astype(np.float64)
     unused = np.ones(len(points), dtype=bool)
     unused[tets] = False
@@ -177,7 +235,7 @@ def _clean_mesh(name, points, blocks, notes, fix_orientation, weld) -> TetMesh:
     if weld is not None:
         points, tets, note = _weld(name, points, tets, weld)
         notes += note
-    return TetMesh(points, tets, fix_orientation, source=name, notes=tuple(notes))
+    return TetMesh(points, tets, fix_orientation, source=name, notes=tuple(notes), **labels)
 
 
 def _curved_edge_warnings(name: str, points: np.ndarray, cells: np.ndarray) -> list[str]:

@@ -15,6 +15,7 @@ import sys
 import tempfile
 from codecs import BOM_UTF8
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -33,6 +34,16 @@ MAX_ITERATIONS = 80  # its maximum number of optimisation iterations
 _open = open  # the child replaces the built-in one
 
 Blocks = list[tuple[str, np.ndarray]]  # element blocks: meshio's type name, (k,nodes) indices from 0
+MAX_EXACT_INT = 2.0**53  # float64 holds every integer up to here exactly
+
+
+class FileContent(NamedTuple):
+    """What a mesh file holds."""
+
+    points: np.ndarray  # (n,3)
+    cells: Blocks
+    cell_data: dict[str, list[np.ndarray]] = {}  # by name, the numbers (k,) of each block's elements
+    region_names: dict[int, str] = {}
 
 
 def read_content(file: Path) -> bytes:
@@ -78,8 +89,8 @@ def one_line(text: str) -> str:
     return text if len(text) <= 120 else text[:117] + "..."
 
 
-def read_by_meshio(file: Path, data: bytes, kind: str) -> tuple[np.ndarray, Blocks]:
-    """Return points and element blocks of a file. data: its content. kind: "mesh" or "surface", for messages.
+def read_by_meshio(file: Path, data: bytes, kind: str) -> FileContent:
+    """Return what a file holds. data: its bytes. kind: "mesh" or "surface", for messages.
 
     Raises MeshError for every failure of meshio.
     """
@@ -93,7 +104,9 @@ def read_by_meshio(file: Path, data: bytes, kind: str) -> tuple[np.ndarray, Bloc
             found = run_child(folder, "read", str(source), str(seconds), seconds=WALL_FACTOR * seconds)
         except MeshError as error:
             raise MeshError(f"{file}: not a supported {kind} ({error})") from None
-    return found["points"], [(str(name), found[f"cells{i}"]) for i, name in enumerate(found["kinds"])]
+    cells = [(str(name), found[f"cells{i}"]) for i, name in enumerate(found["kinds"])]
+    cell_data = {str(name): [found[f"data{j},{i}"] for i in range(len(cells))] for j, name in enumerate(found["data"])}
+    return FileContent(found["points"], cells, cell_data, dict(zip(found["region_ids"].tolist(), found["region_names"].tolist())))
 
 
 def run_child(folder: str, task: str, *arguments: str, seconds: float | None = None) -> dict[str, np.ndarray]:
@@ -156,9 +169,12 @@ def _read(path: str, seconds: str) -> dict[str, np.ndarray]:
         with np.errstate(all="ignore"):
             mesh = _first_fitting(path, data)
             arrays = [np.asarray(mesh.points), *(np.asarray(block.data) for block in mesh.cells)]
+            data_of_cells = {name: list(map(np.asarray, of_blocks)) for name, of_blocks in mesh.cell_data.items()}
+            names = {int(tag): name for name, (tag, dim) in mesh.field_data.items() if dim == 3}
         if any(array.dtype.hasobject for array in arrays):
             raise meshio.ReadError("rows of different lengths")
-        if sum(array.size for array in arrays) > MAX_ENTRIES_PER_BYTE * len(data):
+        of_cells = [one for of_blocks in data_of_cells.values() for one in of_blocks]
+        if sum(array.size for array in (*arrays, *of_cells)) > MAX_ENTRIES_PER_BYTE * len(data):
             raise MemoryError
     except ImportError as error:
         sys.exit(f"its format needs the Python package {error.name or error}")
@@ -167,8 +183,12 @@ def _read(path: str, seconds: str) -> dict[str, np.ndarray]:
     except (Exception, SystemExit) as error:
         text = str(error) if isinstance(error, meshio.ReadError) else f"{type(error).__name__}: {error}"
         sys.exit(_without_content(text, data.lower()) or "its structure is broken")
-    kinds = np.array([block.type for block in mesh.cells], dtype=str)
-    return {"points": arrays[0], "kinds": kinds} | {f"cells{i}": cells for i, cells in enumerate(arrays[1:])}
+    numbers = {name: of for name, of in data_of_cells.items() if all(one.ndim == 1 and one.dtype.kind in "iuf" for one in of)}
+    texts = {"kinds": [block.type for block in mesh.cells], "data": list(numbers), "region_names": list(names.values())}
+    found = {"points": arrays[0], "region_ids": np.array(list(names), dtype=np.int64)}
+    found |= {name: np.array(values, dtype=str) for name, values in texts.items()}
+    found |= {f"data{j},{i}": one for j, of_blocks in enumerate(numbers.values()) for i, one in enumerate(of_blocks)}
+    return found | {f"cells{i}": cells for i, cells in enumerate(arrays[1:])}
 
 
 def _limit_resources(memory: int, seconds: int) -> None:

@@ -151,8 +151,8 @@ def read_surface(path, weld: float = 0.0) -> SurfaceMesh:
     if reader:
         points, polygons = reader(name, data)
     else:
-        points, blocks = read_by_meshio(file, data, "surface")
-        polygons = [nodes for kind, nodes in blocks if kind in ("triangle", "quad") or "polygon" in kind]
+        points, cells = read_by_meshio(file, data, "surface")[:2]
+        polygons = [nodes for kind, nodes in cells if kind in ("triangle", "quad") or "polygon" in kind]
     # Split each polygon as a fan around its first corner.
     fans = [nodes[:, [0, k, k + 1]] for nodes in polygons for k in range(1, nodes.shape[1] - 1)]
     triangles = np.concatenate([np.empty((0, 3), dtype=np.int64), *fans])

@@ -13,6 +13,7 @@ import scipy
 
 from taisoft.attributes import Guarded, MeshAttributeError
 from taisoft.errors import MeshError
+from taisoft.mesh.regions import checked_names, checked_regions, region_id, region_text
 from taisoft.mesh.topology import EDGES, Faces, connected_pieces, first_repeated_tet, joint_edges, joint_vertices, linked_groups
 
 DEGENERATE = 1e-9  # a tet has no volume if it is below this times its longest edge cubed
@@ -30,18 +31,30 @@ class TetMesh(Guarded):
     vertices: (n,3) float64 [m]. tets: (m,4) int64, every det(x1-x0, x2-x0, x3-x0) > 0. volumes: (m,) [m^3].
     surface: (t,3) int64, the faces that belong to one tet, normals outward; surface_tets: (t,) int64, the tet of each.
     flipped: int64 indices of the tets whose orientation was changed. n_components: number of parts connected by vertices.
+    regions: (m,) int64, of each tet, or None; region_names: {region: name}, of regions that have one.
     warnings: list of str, each also issued as a UserWarning. recipe: for a mesh from `box_mesh`, `sheet_mesh` or
     `ball_mesh` the shape's name and the arguments that reproduce its arrays, else None.
     """
 
     _error = MeshAttributeError
 
-    def __init__(self, vertices, tets, fix_orientation: bool = False, *, source: str | None = None, notes: tuple[str, ...] = ()):
+    def __init__(
+        self,
+        vertices,
+        tets,
+        fix_orientation: bool = False,
+        *,
+        regions=None,
+        region_names: dict[int, str] | None = None,
+        source: str | None = None,
+        notes: tuple[str, ...] = (),
+    ):
         """Validate and copy the arrays.
 
-        vertices: (n,3) numbers [m]. tets: (m,4) integers, counted from 0. fix_orientation: if only some tets are inverted,
-        flip them and list them in `warnings` instead of refusing them. source: the mesh's origin, such as a file's name,
-        which starts every message. notes: a reader's warnings, added to `warnings`. Raises MeshError.
+        vertices: (n,3) numbers [m]. tets: (m,4) integers, counted from 0. fix_orientation: if only some tets are inverted, flip
+        them and list them in `warnings` instead of refusing them. regions: (m,) integers, which say what material each tet is
+        made of, see `Scene.add_body`; region_names: names of some or all of these numbers. source: the mesh's origin, such as a
+        file's name, which starts every message. notes: a reader's warnings, added to `warnings`. Raises MeshError.
         """
         self.source = source
         self.recipe: dict | None = None
@@ -49,6 +62,8 @@ class TetMesh(Guarded):
         self.vertices = self._checked_vertices(vertices)
         self.tets = self._checked_tets(tets)
         self.volumes = self._oriented_volumes(fix_orientation)
+        self.regions = checked_regions(regions, self.n_tets, self._mesh_error)
+        self.region_names = checked_names(region_names, self.regions, self._mesh_error)
         faces = self._checked_faces()
         rows = faces.surface()
         self.surface = faces.triangles[rows]
@@ -85,8 +100,22 @@ class TetMesh(Guarded):
         """Number of tetrahedra m."""
         return len(self.tets)
 
+    @property
+    def region_ids(self) -> tuple[int, ...]:
+        """The regions that tets are in, ascending; empty if the mesh has none."""
+        return () if self.regions is None else tuple(np.unique(self.regions).tolist())
+
+    def region_id(self, region: int | str) -> int:
+        """Return the id of a region given by its name or id. Raises MeshError if no tet is in it."""
+        return region_id(region, self.regions, self.region_names, self._mesh_error)
+
+    def region_text(self, region: int) -> str:
+        """Return a region's name in quotes, or its id, for messages."""
+        return region_text(region, self.region_names)
+
     def __repr__(self) -> str:
-        return f"TetMesh({self.n_verts} vertices, {self.n_tets} tets, {len(self.surface)} surface triangles)"
+        regions = f", {len(self.region_ids)} regions" if self.regions is not None else ""
+        return f"TetMesh({self.n_verts} vertices, {self.n_tets} tets, {len(self.surface)} surface triangles{regions})"
 
     def _warn_distance(self) -> None:
         """Warn of a mesh far from the origin: its positions lose some of their 16 digits to the distance."""

@@ -46,11 +46,13 @@ def write_report(folder: str | Path, result: RunReport, *, resumed: dict | None 
 
 
 def body_records(scene) -> list[dict]:
-    """Describe each body of a scene: its name, law, order, and numbers of vertices, tets, nodes and connected pieces."""
+    """Describe each body of a scene: name, laws, order, and numbers of regions with own materials, vertices, tets, nodes
+    and connected pieces."""
     return [
         {
             "name": b.name,
-            "law": b.material.law,
+            "law": " and ".join(b.composition.laws),
+            "regions": len(b.composition.materials) if b.composition.has_regions else 0,
             "order": b.order,
             "vertices": b.mesh.n_verts,
             "tets": b.mesh.n_tets,

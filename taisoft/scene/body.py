@@ -1,68 +1,30 @@
-"""Describe an elastic body as plain data: mesh, material with its elastic law, constraints, loads and contact geometry."""
+"""Describe an elastic body as plain data: mesh, materials, constraints, loads and contact geometry."""
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
-from taisoft.attributes import Guarded, guarded_record
+from taisoft.attributes import Guarded, guarded_record, thawed
 from taisoft.errors import SceneError
 from taisoft.mesh.nodes import Nodes, make_nodes
 from taisoft.mesh.tet_mesh import TetMesh
 from taisoft.mesh.thickness import coarse_bending
 from taisoft.scene import checks
 from taisoft.scene.collision import CONTACT_MODES
+from taisoft.scene.composition import Composition, compose
 from taisoft.scene.key_frames import KeyFrames, NodePath
+from taisoft.scene.loads import NodalForce, Traction, value_and_path
+from taisoft.scene.material import Material
 
-LAWS = ("st_venant_kirchhoff", "corotational", "stable_neo_hookean")
 NEARLY_INCOMPRESSIBLE = 0.49  # Poisson's ratio above which linear tets lock, so that they bend far too little
 QUADRATURE_DEGREES = {1: (1,), 2: (2, 4)}  # by element order: degrees of polynomials integrated exactly, the default first
-_READ_ONLY = ("name", "mesh", "order", "quadrature_degree", "nodes", "rest_positions", "n_nodes")  # other data depend on these
+# other data depend on these
+_READ_ONLY = ("name", "mesh", "composition", "order", "quadrature_degree", "nodes", "rest_positions", "n_nodes", "mass", "loads")
 USE_A_COPY = "change a copy made by scene.snapshot() and make a new Simulator of it"
 _SET_FORCE = f"call sim.set_force(body, index, value) for an existing one; otherwise {USE_A_COPY}"
 _SET_TRACTION = f"call sim.set_traction(body, index, value) for an existing one; otherwise {USE_A_COPY}"
-
-
-@guarded_record("material", "make another one by dataclasses.replace, or call sim.set_material(body, {name}=...) in a simulation")
-@dataclass(frozen=True)
-class Material:
-    """An elastic material with damping and surface parameters. Raises SceneError for values outside the rules below."""
-
-    law: str = "stable_neo_hookean"  #: "st_venant_kirchhoff", "corotational" or "stable_neo_hookean"
-    young: float = 1e6  #: Young's modulus [Pa], > 0
-    poisson: float = 0.3  #: Poisson's ratio, in the open interval (-1, 0.5)
-    density: float = 1000.0  #: [kg/m^3], > 0
-    friction: float = 0.5  #: Coulomb's coefficient, >= 0
-    restitution: float = 0.0  #: ratio of the normal speeds after and before an impact, 0 to 1
-    mass_damping: float = 0.0  #: [1/s], >= 0
-    stiffness_damping: float = 0.0  #: [s], >= 0
-
-    def __post_init__(self):
-        checks.choice(self.law, "material: law", LAWS)
-        limits = {
-            "young": {"above": 0.0, "unit": "Pa"},
-            "poisson": {},
-            "density": {"above": 0.0, "unit": "kg/m^3"},
-            "friction": {"minimum": 0.0},
-            "restitution": {"minimum": 0.0, "maximum": 1.0},
-            "mass_damping": {"minimum": 0.0, "unit": "1/s"},
-            "stiffness_damping": {"minimum": 0.0, "unit": "s"},
-        }
-        numbers = {k: checks.number(getattr(self, k), f"material: {k}", **limit) for k, limit in limits.items()}
-        checks.store(self, **numbers)
-        if not -1.0 < self.poisson < 0.5:
-            raise SceneError(f"material: poisson must lie in the open interval (-1, 0.5), not {self.poisson:g}")
-
-    @property
-    def mu(self) -> float:
-        """Lamé's second parameter, the shear modulus [Pa]."""
-        return self.young / (2.0 * (1.0 + self.poisson))
-
-    @property
-    def lam(self) -> float:
-        """Lamé's first parameter [Pa]."""
-        return self.young * self.poisson / ((1.0 + self.poisson) * (1.0 - 2.0 * self.poisson))
 
 
 @guarded_record("constraint", "add another one by body.fix or body.move")
@@ -79,44 +41,35 @@ class Constraint:
         checks.store(self, nodes=self.nodes, axes=self.axes)
 
 
-@guarded_record("traction", "call sim.set_traction(body, index, value) in a simulation")
-@dataclass(frozen=True, eq=False)
-class Traction:
-    """A dead load on surface triangles."""
+def tet_number(name: str, doc: str) -> property:
+    """Return a property of a body for a number that may differ from tet to tet."""
 
-    triangles: np.ndarray  #: (k,) int64 rows of mesh.surface
-    value: np.ndarray  #: (3,) force per reference area [Pa]
+    def assign(body: "Body", value) -> None:
+        body._compose(body.composition.changed(body._label(), {name: value}))
 
-    def __post_init__(self):
-        checks.store(self, triangles=self.triangles, value=self.value)
-
-
-@guarded_record("force", "call sim.set_force(body, index, value) in a simulation")
-@dataclass(frozen=True, eq=False)
-class NodalForce:
-    """A dead load on nodes: a total force distributed by lumped mass, or one force per node."""
-
-    nodes: np.ndarray  #: (k,) int64 node ids
-    value: np.ndarray  #: (3,) total force, or (k,3) one per node [N]
-    where: Callable | None = None  #: as in `Constraint`
-
-    def __post_init__(self):
-        checks.store(self, nodes=self.nodes, value=self.value)
+    return property(lambda body: body.composition.number(name), assign, doc=doc)
 
 
 class Body(Guarded):
     """One elastic body of a scene; made by `Scene.add_body`.
 
-    name, mesh, material. position: (3,) [m]; nodes start at rest_positions + position. velocity: (3,) or (n,3) [m/s], initial.
-    order: 1 or 2, of the elements' shape functions; quadrature_degree: degree of polynomials integrated exactly. nodes:
-    `Nodes`, the mesh's vertices and for order 2 its mid-edge nodes. constraints, tractions, forces: lists of `Constraint`,
-    `Traction`, `NodalForce`; items can be removed, but only methods add them. collision: one of CONTACT_MODES. Only material,
-    position, velocity and collision can be assigned; each is validated. `warn_locking` and `warn_bending` warn if tets of order
-    1 are far too stiff; `Scene.add_body` calls both.
+    name, mesh. material: a `Material`, or a dict of one for each region, by its id. young, poisson, density: what the tets
+    have, a float, or (m,) where it may differ from tet to tet; setting one replaces the material's. position: (3,) [m]; nodes
+    start at rest_positions + position. velocity: (3,) or (n,3) [m/s], initial. order: 1 or 2, of the elements' shape functions;
+    quadrature_degree: degree of polynomials integrated exactly. nodes: `Nodes`, the mesh's vertices and for order 2 its mid-
+    edge nodes. constraints, tractions, forces: lists of `Constraint`, `Traction`, `NodalForce`; items can be removed, but only
+    methods add them. collision: one of CONTACT_MODES. Only material, its numbers, position, velocity and collision can be
+    assigned; each is validated. `warn_locking` and `warn_bending` warn if tets of order 1 are far too stiff; `Scene.add_body`
+    calls both.
     """
 
     _read_only = frozenset(_READ_ONLY)
-    _instead = dict.fromkeys(_READ_ONLY, "add another body by scene.add_body") | {"contact_mode": "set body.collision"}
+    _instead = dict.fromkeys(_READ_ONLY, "add another body by scene.add_body") | {
+        "contact_mode": "set body.collision",
+        "composition": "set body.material",
+        "mass": "set body.density",
+        "loads": "call body.add_force or body.add_traction",
+    }
     _contents = {
         "constraints": "call body.fix or body.move",
         "tractions": "call body.add_traction",
@@ -125,6 +78,7 @@ class Body(Guarded):
     _default_frozen = USE_A_COPY
     _instead_frozen = {
         "material": "call sim.set_material(body, young=...)",
+        **{name: f"call sim.set_material(body, {name}=...)" for name in ("young", "poisson", "density")},
         "position": "call sim.set_state(positions=..., body=...)",
         "velocity": "call sim.set_state(velocities=..., body=...)",
         "add_force": _SET_FORCE,
@@ -137,17 +91,19 @@ class Body(Guarded):
         self,
         name: str,
         mesh: TetMesh,
-        material: Material,
+        material: Material | Mapping,
         position,
         velocity,
         order: int,
         quadrature_degree: int | None,
         collision: str,
+        **numbers,
     ):
+        """The arguments of `Scene.add_body`; numbers: young, poisson and density, if they replace the material's."""
         what = f"body {name!r}"
         if not isinstance(mesh, TetMesh):
             raise SceneError(f"{what}: mesh must be a TetMesh, not {type(mesh).__name__}")
-        self.name, self.mesh, self.material = name, mesh, material
+        self.name, self.mesh, self.composition = name, mesh, compose(what, mesh, material, **numbers)
         self.order = checks.whole(order, f"{what}: order", tuple(QUADRATURE_DEGREES))
         degrees = QUADRATURE_DEGREES[self.order]
         degree = degrees[0] if quadrature_degree is None else quadrature_degree
@@ -181,22 +137,39 @@ class Body(Guarded):
         return self.nodes.positions
 
     @property
+    def loads(self) -> list[Traction | NodalForce]:
+        """Its tractions, then its forces."""
+        return [*self.tractions, *self.forces]
+
+    @property
     def n_nodes(self) -> int:
         """Number of nodes."""
         return len(self.nodes.positions)
 
     @property
-    def material(self) -> Material:
-        """Material. Setting it raises SceneError for any other type and warns if linear tets lock."""
-        return self._material
+    def material(self) -> Material | dict[int, Material]:
+        """Material, or {region: Material}. Setting it replaces all numbers; raises SceneError and warns if linear tets lock."""
+        return dict(self.composition.materials) if self.composition.has_regions else self.composition.first
 
     @material.setter
-    def material(self, value: Material) -> None:
-        if not isinstance(value, Material):
-            raise SceneError(f"{self._label()}: material must be a Material, not {type(value).__name__}")
-        self._material = value
-        if self._sealed:  # add_body and the simulator issue their own warnings
-            self.warn_locking(stacklevel=3)
+    def material(self, value: Material | Mapping) -> None:
+        self._compose(compose(self._label(), self.mesh, value))
+
+    def _compose(self, composition: Composition) -> None:
+        warns = self._sealed  # add_body and the simulator issue their own warnings
+        with thawed(self):
+            self.composition = composition
+        if warns:
+            self.warn_locking(stacklevel=4)
+
+    young = tet_number("young", "Young's modulus [Pa], a float or (m,).")
+    poisson = tet_number("poisson", "Poisson's ratio, a float or (m,).")
+    density = tet_number("density", "Density [kg/m^3], a float or (m,).")
+
+    @property
+    def mass(self) -> float:
+        """Mass [kg]."""
+        return float(np.sum(self.density * self.mesh.volumes))
 
     def check(self) -> None:
         """Raise SceneError if in-place changes made the arrays of position or velocity invalid."""
@@ -210,11 +183,11 @@ class Body(Guarded):
 
     def __repr__(self) -> str:
         kind = f"{self.mesh.n_tets} tets of order {self.order}"
-        return f"Body({self.name!r}, {self.n_nodes} nodes, {kind}, {self.material.law})"
+        return f"Body({self.name!r}, {self.n_nodes} nodes, {kind}, {' and '.join(self.composition.laws)})"
 
     def warn_locking(self, stacklevel: int) -> None:
         """Warn if linear tets lock, at a Poisson's ratio above 0.49. stacklevel: 1 is the caller's line."""
-        poisson = self.material.poisson
+        poisson = float(np.max(self.poisson))
         if self.order == 1 and poisson > NEARLY_INCOMPRESSIBLE:
             warnings.warn(
                 f"{self._label()}: poisson = {poisson:g} is above {NEARLY_INCOMPRESSIBLE}, where linear tets lock and bend "
@@ -275,14 +248,14 @@ class Body(Guarded):
         """Apply a dead load per reference area to surface triangles.
 
         where: rows of mesh.surface, a bool mask (t,), or a callable that gets the triangles' centroids at rest (t,3)
-        and returns such a mask. traction: (3,) [Pa]. Raises SceneError if no triangle is chosen or a number is not
-        finite.
+        and returns such a mask. traction: (3,) [Pa], or its path: callable t [s] -> (3,), called once here for t = 0, or
+        `KeyFrames`, whose translations are the values. Raises SceneError if no triangle is chosen or a number is not finite.
         """
         self._check_open("add_traction")
         what = f"{self._label()}: add_traction"
         centroids = self.mesh.vertices[self.mesh.surface].mean(axis=1)
         triangles = checks.selection(where, centroids, what, "surface triangle")
-        load = Traction(triangles, checks.array(traction, f"{what}: traction", ((3,),)))
+        load = Traction(triangles, *value_and_path(traction, f"{what}: traction", ((3,),)))
         list.append(self.tractions, load)
         return load
 
@@ -290,12 +263,13 @@ class Body(Guarded):
         """Apply a dead load to nodes: a total force distributed by lumped mass, or one force per node.
 
         where: as for `fix`; a node chosen twice counts once. force: (3,) the total, or (k,3) in the order of the chosen
-        nodes [N]. Raises SceneError if no node is chosen or numbers are not finite.
+        nodes [N], or its path, as for `add_traction`. Raises SceneError if no node is chosen or numbers are not finite.
         """
         self._check_open("add_force")
         what = f"{self._label()}: add_force"
         nodes = checks.selection(where, self.rest_positions, what, "node")
-        load = NodalForce(nodes, checks.array(force, f"{what}: force", ((3,), (len(nodes), 3))), _callable_or_none(where))
+        value, path = value_and_path(force, f"{what}: force", ((3,), (len(nodes), 3)))
+        load = NodalForce(nodes, value, _callable_or_none(where), path)
         list.append(self.forces, load)
         return load
 

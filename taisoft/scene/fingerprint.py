@@ -9,7 +9,7 @@ import numpy as np
 
 from taisoft.scene.body import Body
 from taisoft.scene.key_frames import NodePath, ShapePath
-from taisoft.scene.plan import LOADS
+from taisoft.scene.loads import LoadPath
 from taisoft.scene.scene import Scene
 
 FEATURES = "the features that it needs"  # last entry of a fingerprint: of the plan, which follows from the parts and numbers
@@ -39,7 +39,7 @@ def scene_fingerprint(scene: Scene, features: dict[str, bool]) -> dict[str, str]
 
 def scene_digest(scene: Scene) -> str:
     """Return a digest of everything comparable in a scene: its parts as a checkpoint compares them, and its numbers."""
-    loads = [load.value for body in scene.bodies for name in LOADS.values() for load in getattr(body, name)]
+    loads = [load.value for body in scene.bodies for load in body.loads]
     return digest(
         [json.dumps(scene_fingerprint(scene, {})), json.dumps(run_time_numbers(scene)), scene.allow_initial_overlap, *loads]
     )
@@ -47,32 +47,41 @@ def scene_digest(scene: Scene) -> str:
 
 def _body_parts(body: Body) -> dict[str, list]:
     """Return the values that define a body, by the part's name in messages."""
+    laws = [material.law for material in body.composition.materials.values()]
     return {
         "mesh": [body.mesh.vertices, body.mesh.tets],
-        "order, quadrature, law or collision": [body.order, body.quadrature_degree, body.material.law, body.collision],
+        "regions": [body.mesh.regions, list(body.composition.materials)] if body.composition.has_regions else [],
+        "order, quadrature, law or collision": [body.order, body.quadrature_degree, laws, body.collision],
         "start": [body.position, body.velocity],
         "constraints": [x for c in body.constraints for x in (c.nodes, c.axes, *_path_parts(c.path))],
         "loads": [
-            *(x for t in body.tractions for x in ("traction", t.triangles)),
-            *(x for f in body.forces for x in ("force", f.nodes)),
+            *(x for t in body.tractions for x in ("traction", t.triangles, *_path_parts(t.path))),
+            *(x for f in body.forces for x in ("force", f.nodes, *_path_parts(f.path))),
         ],
     }
 
 
 def _path_parts(path: Callable | None) -> list:
     """Return the comparable values of a path: the data of key frames; of another function only that it exists."""
-    if not isinstance(path, (NodePath, ShapePath)):
+    if not isinstance(path, (NodePath, ShapePath, LoadPath)):
         return [path is None]
     frames = path.frames
     values = [frames.times, frames.translations, frames.rotations, frames.pivot, frames.smooth, frames.release]
-    return [*values, path.starts if isinstance(path, NodePath) else path.center]
+    start = {NodePath: "starts", ShapePath: "center"}.get(type(path))  # in whose frame key frames are
+    return values + ([getattr(path, start)] if start else [])
 
 
 def run_time_numbers(scene: Scene) -> dict:
     """Return the numbers of a scene that may change at run time, except its loads."""
     pairs = [[sorted(names), *numbers] for names, numbers in scene.contact_pairs.items()]
-    materials = [dataclasses.asdict(body.material) for body in scene.bodies]
-    return {"gravity": scene.gravity.tolist(), "materials": materials, "pairs": pairs}
+    return {"gravity": scene.gravity.tolist(), "materials": [_materials(body) for body in scene.bodies], "pairs": pairs}
+
+
+def _materials(body: Body) -> dict:
+    """Return a body's materials, in the order of its regions, and its numbers by tet."""
+    composition = body.composition
+    by_tet = {name: values.tolist() for name, values in composition.by_tet.items()}
+    return {"materials": [dataclasses.asdict(material) for material in composition.materials.values()], "by_tet": by_tet}
 
 
 def digest(values: list) -> str:

@@ -23,6 +23,7 @@ PARALLEL = 1e-12  # sine of the angle between two axes below which they count as
 class KeyFrames:
     """A path for `Body.move` and `Scene.add_obstacle`. Calling it with t [s] returns (translation (3,) [m], rotation (3,3)).
 
+    Also one for `Body.add_force` and `add_traction`: the translations are then values in N or Pa, and there is nothing else.
     Points move as x -> rotation @ (x - pivot) + pivot + translation, where x is the start position. Raises SceneError.
     """
 

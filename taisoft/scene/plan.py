@@ -11,13 +11,15 @@ from dataclasses import dataclass, field, replace
 from taisoft.attributes import thawed
 from taisoft.errors import SceneError
 from taisoft.scene import checks
-from taisoft.scene.body import LAWS, Body
+from taisoft.scene.body import Body
 from taisoft.scene.collision import has_sharp_edges
+from taisoft.scene.material import LAWS
 from taisoft.scene.obstacles import Box, MeshObstacle
 from taisoft.scene.scene import Scene
 
 CHANGEABLE = ("young", "poisson", "density", "mass_damping", "stiffness_damping")  # numbers of a material
 LOADS = {"force": "forces", "traction": "tractions"}  # kind of load -> the body's list of them
+BY_TET_TEXT = " by tet"  # ends the names of numbers that differ from tet to tet
 Numbers = dict[str, float | list | None]  # of a scene, by name
 
 
@@ -54,7 +56,13 @@ def make_plan(scene: Scene, explicit: bool, multistep: bool, self_collision: boo
         plan.add(feature, bool(names), f"{why} {_shorten(names)}", why_not)
 
     for law in LAWS:
-        add_if_any(f"law:{law}", lambda b, law=law: b.material.law == law, "used by", "no body uses it")
+        add_if_any(f"law:{law}", lambda b, law=law: law in b.composition.laws, "used by", "no body uses it")
+    add_if_any(
+        "elasticity_by_tet",
+        lambda b: b.composition.elastic_by_tet,
+        "young or poisson may differ between the tets of",
+        "every body has one young and one poisson",
+    )
     quadratic = [b.name for b in scene.bodies if b.order == 2]
     add_if_any("quadratic_tets", lambda b: b.order == 2, "bodies of order 2:", "every body is of order 1")
     plan.add(
@@ -69,13 +77,14 @@ def make_plan(scene: Scene, explicit: bool, multistep: bool, self_collision: boo
         f"quadratic tets of {_shorten(quadratic)} in implicit steps",
         "explicit steps need a diagonal mass" if quadratic else "the mass of linear tets is lumped",
     )
-    loaded = [b.name for b in scene.bodies if b.tractions or b.forces]
+    loaded = [b.name for b in scene.bodies if b.loads]
     why = f"tractions or forces on {_shorten(loaded)}" if loaded else "bodies can be dragged"
     plan.add("loads", loaded or draggable, why, "no traction and no force")
+    add_if_any("load_paths", lambda b: any(load.path for load in b.loads), "on", "every load is constant")
     add_if_any("fixed_nodes", lambda b: any(c.path is None for c in b.constraints), "on", "no node is fixed")
     add_if_any("moving_nodes", lambda b: any(c.path is not None for c in b.constraints), "paths on", "no node follows a path")
     for damping in ("mass_damping", "stiffness_damping"):
-        add_if_any(damping, lambda b, d=damping: getattr(b.material, d) > 0, "material of", f"every {damping} is 0")
+        add_if_any(damping, lambda b, d=damping: getattr(b.composition.first, d) > 0, "material of", f"every {damping} is 0")
     plan.add("assembled_stiffness", not explicit, "implicit steps solve linear systems", "explicit steps need forces only")
     plan.add("past_states", multistep, "the integrator uses the two previous steps", "a one-step integrator")
     plan.add(
@@ -117,31 +126,35 @@ def _add_collision(plan: Plan, scene: Scene, self_collision: bool) -> None:
     )
 
 
-def change_material(body: Body, numbers: dict[str, float], on: dict[str, bool]) -> None:
-    """Replace numbers of a body's material. The law and damping that is compiled out cannot change at run time.
+def change_material(body: Body, numbers: dict, on: dict[str, bool], region: int | str | None = None) -> None:
+    """Replace numbers of a body's material, or of one of its regions; young, poisson and density may be (m,).
 
-    on: the plan's switches. Warnings point to the line of the caller's caller. Raises SceneError.
+    Laws cannot change at run time, nor what is compiled out: damping, and elasticity that differs from tet to tet. on: the plan's
+    switches. Warnings point to the line of the caller's caller. Raises SceneError.
     """
     what = f"body {body.name!r}"
-    for name, value in numbers.items():
+    for name in numbers:
         if name not in CHANGEABLE:
             hint = checks.nearest(name, CHANGEABLE)
             raise SceneError(f"{what}: {name} cannot change while it runs{hint}; {', '.join(CHANGEABLE)} can")
-        if name in on and not on[name] and value != 0.0:
+    composition = body.composition.changed(what, numbers, region)
+    for name in numbers:
+        if name in on and not on[name] and getattr(composition.first, name) != 0.0:
             rule = "was 0 everywhere at the start and is not modelled; start with a small value to change it later"
             raise SceneError(f"{what}: {name} {rule}")
-    try:
-        material = replace(body.material, **numbers)
-    except SceneError as error:
-        raise SceneError(f"{what}: {error}") from None
+    if composition.elastic_by_tet and not on["elasticity_by_tet"]:
+        raise SceneError(
+            f"{what}: young and poisson cannot differ between tets, since those of no body did at the start: give them by tet to "
+            "add_body"
+        )
     with thawed(body):
-        body.material = material
+        body.composition = composition
     if "poisson" in numbers:
         body.warn_locking(stacklevel=3)
 
 
 def change_load(body: Body, kind: str, index: int, value) -> None:
-    """Set the value of a body's load `index`, counted from 0 in the order added. kind: a key of LOADS.
+    """Set the value of a body's load `index`, counted from 0 in the order added; it replaces a path. kind: a key of LOADS.
 
     value: (3,) [N], or (k,3) for the k nodes of a force; (3,) [Pa] for a traction. Raises SceneError.
     """
@@ -149,8 +162,7 @@ def change_load(body: Body, kind: str, index: int, value) -> None:
     if not loads:
         raise SceneError(f"{what}: it has no {kind}: give it one of 0 by body.add_{kind} before the Simulator is made")
     old = loads[checks.whole(index, f"{what}: index", range(len(loads)))]
-    shapes = ((3,), (len(old.nodes), 3)) if kind == "force" else ((3,),)
-    new = replace(old, value=checks.array(value, f"{what}: {kind} {index}", shapes))
+    new = replace(old, value=checks.array(value, f"{what}: {kind} {index}", old.shapes), path=None)
     with thawed(body):
         getattr(body, LOADS[kind])[index] = new
 
@@ -159,12 +171,17 @@ def scene_numbers(scene: Scene) -> Numbers:
     """Return as plain data gravity, all material numbers, load values, and friction and restitution set for pairs."""
     numbers: Numbers = {"gravity": scene.gravity.tolist()}
     for body in scene.bodies:
-        for name, value in dataclasses.asdict(body.material).items():
-            if name != "law":
-                numbers[f"body {body.name!r}: {name}"] = value
+        for region, material in body.composition.materials.items():
+            own = "" if region is None else f"region {body.mesh.region_text(region)}: "
+            for name, value in dataclasses.asdict(material).items():
+                if name != "law":
+                    numbers[f"body {body.name!r}: {own}{name}"] = value
+        for name, values in body.composition.by_tet.items():
+            numbers[f"body {body.name!r}: {name}{BY_TET_TEXT}"] = values.tolist()
         for kind, loads in LOADS.items():
             for i, load in enumerate(getattr(body, loads)):
-                numbers[f"body {body.name!r}: {kind} {i}"] = load.value.tolist()
+                if load.path is None:
+                    numbers[f"body {body.name!r}: {kind} {i}"] = load.value.tolist()
     for names, (friction, restitution) in scene.contact_pairs.items():
         pair = " and ".join(repr(name) for name in sorted(names))
         numbers |= {f"contact of {pair}: friction": friction, f"contact of {pair}: restitution": restitution}
@@ -177,9 +194,10 @@ def first_difference(before: Numbers, now: Numbers) -> str:
         old, new = before.get(name), now.get(name)
         if old == new:
             continue
-        if _is_nested(old) and _is_nested(new) and len(old) == len(new):  # one force per node
+        item = "tet" if name.endswith(BY_TET_TEXT) else "row" if _is_nested(old) and _is_nested(new) else None  # a force per node
+        if item and old and new and len(old) == len(new):
             row = next(i for i, pair in enumerate(zip(old, new)) if pair[0] != pair[1])
-            name, old, new = f"{name}, row {row}", old[row], new[row]
+            name, old, new = f"{name}, {item} {row}", old[row], new[row]
         old, new = ("not set" if value is None else reprlib.repr(value) for value in (old, new))
         return f"{name} is {new} in this scene and was {old} at the start of the saved run"
     return ""

@@ -17,9 +17,12 @@ from taisoft.errors import SceneError
 from taisoft.mesh.nodes import make_nodes
 from taisoft.mesh.tet_mesh import TetMesh
 from taisoft.mesh.topology import distinct_edges
-from taisoft.scene.body import Body, Constraint, NodalForce
+from taisoft.scene.body import Body, Constraint
 from taisoft.scene.key_frames import KeyFrames, NodePath
+from taisoft.scene.loads import LoadPath, NodalForce, Traction
 from taisoft.scene.scene import Scene
+
+PARTS = 8  # of a tet; `make_nodes` lists the parts of each tet in sequence
 
 
 def refined(scene: Scene) -> Scene:
@@ -41,14 +44,15 @@ def _with_bodies(scene: Scene, bodies: list[Body]) -> Scene:
 
 def _refined(old: Body) -> Body:
     split = old.nodes if old.order == 2 else make_nodes(old.mesh, 2)
-    mesh = TetMesh(split.positions, split.tets)
+    regions = None if old.mesh.regions is None else np.repeat(old.mesh.regions, PARTS)
+    mesh = TetMesh(split.positions, split.tets, regions=regions, region_names=old.mesh.region_names)
     edges, _ = distinct_edges(mesh.tets if old.order == 2 else old.mesh.tets)
     new = _on_mesh(old, mesh, old.order, np.concatenate([_own_parents(old.n_nodes), edges]))
     # Row of the new surface -> triangle of the old one: split.surface lists the four parts of each triangle in sequence.
     rows = {tuple(sorted(t)): k // 4 for k, t in enumerate(split.surface.tolist())}
     parents = np.array([rows[tuple(sorted(t))] for t in mesh.surface.tolist()])
     for load in old.tractions:
-        new.add_traction(np.isin(parents, load.triangles), load.value)
+        new.add_traction(np.isin(parents, load.triangles), _load_of(load))
     return new
 
 
@@ -58,7 +62,7 @@ def _of_order(old: Body, order: int) -> Body:
         parents = np.concatenate([parents, distinct_edges(old.mesh.tets)[0]])
     new = _on_mesh(old, old.mesh, order, parents)
     for load in old.tractions:
-        new.add_traction(load.triangles, load.value)
+        new.add_traction(load.triangles, _load_of(load))
     return new
 
 
@@ -70,7 +74,9 @@ def _on_mesh(old: Body, mesh: TetMesh, order: int, parents: np.ndarray) -> Body:
     """Return the body on another mesh, without tractions. parents: (n,2), the two old nodes that each new node bisects."""
     velocity = old.velocity if old.velocity.shape == (3,) else old.velocity[parents].mean(axis=1)
     degree = old.quadrature_degree if order == old.order else None
-    new = Body(old.name, mesh, old.material, old.position, velocity, order, degree, old.collision)
+    copies = mesh.n_tets // old.mesh.n_tets
+    numbers = {name: np.repeat(values, copies) for name, values in old.composition.by_tet.items()}
+    new = Body(old.name, mesh, old.material, old.position, velocity, order, degree, old.collision, **numbers)
     for constraint in old.constraints:
         axes = "".join(axis for axis, held in zip("xyz", constraint.axes) if held)
         where = _chosen(old, constraint, parents)
@@ -79,13 +85,19 @@ def _on_mesh(old: Body, mesh: TetMesh, order: int, parents: np.ndarray) -> Body:
         else:
             new.move(where, _path(old, constraint), axes)
     for force in old.forces:
-        if force.value.ndim == 1:
-            new.add_force(_chosen(old, force, parents), force.value)
+        is_total = np.shape(force.path(0.0) if force.value is None else force.value) == (3,)
+        if is_total:
+            new.add_force(_chosen(old, force, parents), _load_of(force))
             continue
         if force.nodes.max() >= new.n_nodes or not (parents[force.nodes] == force.nodes[:, None]).all():
             raise SceneError(f"body {old.name!r}: linear tets have no mid-edge nodes for its forces")
-        new.add_force(force.nodes, force.value)
+        new.add_force(force.nodes, _load_of(force))
     return new
+
+
+def _load_of(load: Traction | NodalForce):
+    """Return what `add_force` or `add_traction` was given: a value or a path."""
+    return load.value if load.path is None else load.path.frames if isinstance(load.path, LoadPath) else load.path
 
 
 def _chosen(old: Body, item: Constraint | NodalForce, parents: np.ndarray):

@@ -6,7 +6,7 @@ Every input is validated and converted to arrays when it is added, so an existin
 import copy
 import difflib
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import numpy as np
 
@@ -14,8 +14,9 @@ from taisoft.attributes import Guarded, thawed
 from taisoft.errors import SceneError
 from taisoft.mesh.tet_mesh import TetMesh
 from taisoft.scene import checks
-from taisoft.scene.body import USE_A_COPY, Body, Material
+from taisoft.scene.body import USE_A_COPY, Body
 from taisoft.scene.collision import CollisionSettings
+from taisoft.scene.material import Material
 from taisoft.scene.obstacles import Obstacle, Shape, surface_numbers
 
 
@@ -107,26 +108,32 @@ class Scene(Guarded):
     def add_body(
         self,
         mesh: TetMesh,
-        material: Material,
+        material: Material | Mapping[int | str, Material],
         name: str | None = None,
         position=(0.0, 0.0, 0.0),
         velocity=(0.0, 0.0, 0.0),
         order: int = 1,
         quadrature_degree: int | None = None,
         collision: str = "auto",
+        young: float | np.ndarray | None = None,
+        poisson: float | np.ndarray | None = None,
+        density: float | np.ndarray | None = None,
     ) -> Body:
         """Add a body and return it.
 
-        mesh: its shape at rest. name: unique; "body0" and so on by default. position: (3,) [m], initial translation.
-        velocity: (3,) for all nodes or (n,3) [m/s]. order: 1, linear tets, or 2, quadratic ones with nodes in the middle of
-        every edge. quadrature_degree: None for the default; order 2 has four points (2) or fourteen (4). collision: contact
-        geometry, "proximity", also for "auto", or "distance_field". Warns if tets of order 1 are far too stiff: at a Poisson's
-        ratio above 0.49, or in a thin body with so few tets through its thickness that it bends at most half as far as it
-        should. Raises SceneError.
+        mesh: its shape at rest. material: for all tets, or a dict that gives each of the mesh's regions, by name or id, its
+        own; laws may differ, but friction, restitution and damping must be the same in all. young [Pa], poisson, density
+        [kg/m^3]: numbers that replace the material's, one for the body, or (m,) with one for each tet. name: unique; "body0"
+        and so on by default. position: (3,) [m], initial translation. velocity: (3,) for all nodes or (n,3) [m/s]. order: 1,
+        linear tets, or 2, quadratic ones with nodes in the middle of every edge. quadrature_degree: None for the default; order
+        2 has four points (2) or fourteen (4). collision: contact geometry, "proximity", also for "auto", or "distance_field".
+        Warns if tets of order 1 are far too stiff: at a Poisson's ratio above 0.49, or in a thin body with so few tets through
+        its thickness that it bends at most half as far as it should. Raises SceneError.
         """
         self._check_open("add_body")
         name = self._free_name(name, "body")
-        body = Body(name, mesh, material, position, velocity, order, quadrature_degree, collision)
+        numbers = {"young": young, "poisson": poisson, "density": density}
+        body = Body(name, mesh, material, position, velocity, order, quadrature_degree, collision, **numbers)
         list.append(self.bodies, body)
         body.warn_locking(stacklevel=2)
         body.warn_bending(stacklevel=2)
@@ -196,7 +203,7 @@ class Scene(Guarded):
     def surface_of(self, name: str) -> Material | Obstacle:
         """Return the record that holds a collider's own friction and restitution."""
         one = _find(self.colliders, name, "body or obstacle")
-        return one.material if isinstance(one, Body) else one
+        return one.composition.first if isinstance(one, Body) else one
 
     def _free_name(self, name: str | None, kind: str) -> str:
         """Return the name, or the first free default name if it is None. Raises SceneError if it is taken."""

@@ -5,8 +5,9 @@
     [solver]                  arguments of Simulator, seconds, fps; "none" for Python's None
     [materials.NAME]          Material
     [bodies.NAME]             material (a name, or a table), mesh (below), and the arguments of Scene.add_body
+    [bodies.NAME.materials]   instead of material: one for each region of the mesh, REGION = a name, or a table
     [[bodies.NAME.fix]]       nodes, axes                   [[bodies.NAME.move]]   nodes, path (KeyFrames), axes
-    [[bodies.NAME.traction]]  triangles, traction [Pa]      [[bodies.NAME.force]]  nodes, force [N]
+    [[bodies.NAME.traction]]  triangles, traction [Pa]      [[bodies.NAME.force]]  nodes, force [N], or their KeyFrames
     [obstacles.NAME]          shape and its arguments, friction, restitution, path (KeyFrames)
     [[contacts]]              between = ["a", "b"], friction, restitution
 
@@ -28,9 +29,10 @@ from taisoft.mesh.safe_reading import UTF16, utf16_head
 from taisoft.mesh.shapes import ball_mesh, box_mesh, sheet_mesh
 from taisoft.mesh.tet_mesh import TetMesh
 from taisoft.scene import checks
-from taisoft.scene.body import Body, Material
+from taisoft.scene.body import Body
 from taisoft.scene.collision import CollisionSettings
 from taisoft.scene.key_frames import KeyFrames
+from taisoft.scene.material import Material
 from taisoft.scene.obstacles import Box, Capsule, HalfSpace, MeshObstacle, Sphere
 from taisoft.scene.scene import Scene
 from taisoft.scene.tables import Table, arguments_of, check_values, value_text
@@ -85,7 +87,7 @@ def _read(tables: Table, allow_outside: bool) -> tuple[Scene, dict]:
     known, _ = arguments_of(Scene.add_body, "name")
     meshes: dict[str, TetMesh] = {}  # bodies with equal mesh tables share one mesh
     for name in bodies.known:
-        table = bodies.table(name, [*known, *METHODS], ["material", "mesh"])
+        table = bodies.table(name, [*known, *METHODS, "materials"], ["mesh"])
         mesh_text = str(table.values["mesh"])
         meshes[mesh_text] = meshes.get(mesh_text) or _mesh(table, allow_outside)
         _add_body(scene, name, table, materials, meshes[mesh_text])
@@ -122,14 +124,13 @@ def _parsed(file: Path) -> dict:
 
 
 def _add_body(scene: Scene, name: str, table: Table, materials: dict[str, Material], mesh: TetMesh) -> None:
-    material = table.values["material"]
-    if not isinstance(material, str):
-        material = table.made("material", Material, "material: ")
-    elif material in materials:
-        material = materials[material]
+    if "material" in table and "materials" in table:
+        raise table.error("", "must have either a material or materials, one for each region")
+    if "materials" not in table:
+        material = _material(table, "material", materials)
     else:
-        near = checks.nearest(material, materials)
-        raise table.error("material", f"{value_text(material)} is not among the materials{near}")
+        regions = table.named("materials")
+        material = {_region(mesh, key): _material(regions, key, materials) for key in regions.known}
     keys, _ = arguments_of(Scene.add_body, "name", "mesh", "material")
     body = table.make(scene.add_body, f"body {name!r}: ", "scene: ", keys=keys, mesh=mesh, material=material, name=name)
     for key, method in METHODS.items():  # the argument `where` is called nodes or triangles in the file
@@ -139,8 +140,28 @@ def _add_body(scene: Scene, name: str, table: Table, materials: dict[str, Materi
             extra = {"where": _selection(one, items)}
             if "path" in known:
                 extra["path"] = one.made("path", KeyFrames, "key frames: ")
-            others = [k for k in known if k not in (items, "path")]
+            elif isinstance(one.values.get(key), dict):  # a traction or force that varies
+                extra[key] = one.made(key, KeyFrames, "key frames: ")
+            others = [k for k in known if k not in (items, *extra)]
             one.make(getattr(body, method.__name__), f"body {name!r}: {method.__name__}: ", keys=others, **extra)
+
+
+def _material(table: Table, key: str, materials: dict[str, Material]) -> Material:
+    """Return the material under a key: the name of one, or a table."""
+    if key not in table:
+        raise table.error(key, "is missing")
+    name = table.values[key]
+    if not isinstance(name, str):
+        return table.made(key, Material, "material: ")
+    if name not in materials:
+        raise table.error(key, f"{value_text(name)} is not among the materials{checks.nearest(name, materials)}")
+    return materials[name]
+
+
+def _region(mesh: TetMesh, key: str) -> str | int:
+    """Return the name of a region, or its id if the text is no name but a whole number."""
+    is_id = key not in mesh.region_names.values() and re.fullmatch(r"-?\d{1,10}", key)
+    return int(key) if is_id else key
 
 
 def _mesh(table: Table, allow_outside: bool) -> TetMesh:

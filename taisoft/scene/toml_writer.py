@@ -18,6 +18,8 @@ from taisoft.mesh.tet_mesh import TetMesh
 from taisoft.scene.body import Body
 from taisoft.scene.checks import SOLVER_CHECKS, check_solver, nearest
 from taisoft.scene.key_frames import NodePath, ShapePath
+from taisoft.scene.loads import LoadPath, NodalForce, Traction
+from taisoft.scene.material import Material
 from taisoft.scene.obstacles import Obstacle
 from taisoft.scene.scene import Scene
 from taisoft.scene.tables import key_path, key_text, quote
@@ -59,9 +61,10 @@ def write_scene(path, scene: Scene, solver: dict | None = None, overwrite: bool 
 
 def _document(scene: Scene, solver: dict, stem: str, meshes: dict[str, TetMesh]) -> dict:
     """Return the file's tables. Meshes that need a file are added to `meshes`, file name -> mesh."""
-    materials = {}
+    materials: dict[Material, str] = {}
     for body in scene.bodies:
-        materials.setdefault(body.material, f"material{len(materials)}")
+        for material in body.composition.materials.values():
+            materials.setdefault(material, f"material{len(materials)}")
     order = [one.name for one in scene.colliders]
     present = (pair for pair in scene.contact_pairs if pair <= set(order))  # bodies may have been removed since
     contacts = []
@@ -74,7 +77,7 @@ def _document(scene: Scene, solver: dict, stem: str, meshes: dict[str, TetMesh])
         "collision": _fields(scene.collision),
         "solver": _solver(solver),
         "materials": {name: _fields(material) for material, name in materials.items()},
-        "bodies": {body.name: _body(body, materials[body.material], stem, meshes) for body in scene.bodies},
+        "bodies": {body.name: _body(body, materials, stem, meshes) for body in scene.bodies},
         "obstacles": {obstacle.name: _obstacle(obstacle) for obstacle in scene.obstacles},
         "contacts": contacts,
     }
@@ -96,12 +99,15 @@ def _solver(solver: dict) -> dict:
     return {key: NONE_TEXT if value is None else value for key, value in plain.items()}
 
 
-def _body(body: Body, material: str, stem: str, meshes: dict[str, TetMesh]) -> dict:
+def _body(body: Body, materials: dict[Material, str], stem: str, meshes: dict[str, TetMesh]) -> dict:
     name = next((name for name, mesh in meshes.items() if mesh is body.mesh), None)
     if body.mesh.recipe is None and name is None:
         name = f"{stem}_mesh{len(meshes)}.msh"
         meshes[name] = body.mesh
-    table = {"material": material, "mesh": {"file": name} if name else body.mesh.recipe}
+    composition = body.composition
+    names = {body.mesh.region_names.get(key, str(key)): materials[one] for key, one in composition.materials.items()}
+    table = {"materials": names} if composition.has_regions else {"material": materials[composition.first]}
+    table |= {"mesh": {"file": name} if name else body.mesh.recipe} | composition.by_tet
     table |= {key: getattr(body, key) for key in ("position", "velocity", "order", "quadrature_degree", "collision")}
     table |= {key: [] for key in ("fix", "move", "traction", "force")}
     for c in body.constraints:
@@ -116,10 +122,19 @@ def _body(body: Body, material: str, stem: str, meshes: dict[str, TetMesh]) -> d
         else:
             raise SceneError(f"body {body.name!r}: moves along a function, which a file cannot store: use ts.KeyFrames")
     for load in body.tractions:
-        table["traction"].append({"triangles": _ids(load.triangles, len(body.mesh.surface)), "traction": load.value})
+        table["traction"].append({"triangles": _ids(load.triangles, len(body.mesh.surface)), "traction": _load(body, load)})
     for load in body.forces:
-        table["force"].append({"nodes": _ids(load.nodes, body.n_nodes), "force": load.value})
+        table["force"].append({"nodes": _ids(load.nodes, body.n_nodes), "force": _load(body, load)})
     return table
+
+
+def _load(body: Body, load: Traction | NodalForce):
+    """Return a load's value, or the fields of its key frames."""
+    if load.path is None:
+        return load.value
+    if not isinstance(load.path, LoadPath):
+        raise SceneError(f"body {body.name!r}: has a load along a function, which a file cannot store: use ts.KeyFrames")
+    return _fields(load.path.frames)
 
 
 def _ids(ids: np.ndarray, n: int):

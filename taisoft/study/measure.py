@@ -11,7 +11,8 @@ import numpy as np
 
 from taisoft.backend import runtime
 from taisoft.errors import SimulationError, TaisoftError
-from taisoft.fem.reference import gravity_mass, lumped_mass, traction_forces
+from taisoft.fem.loads import SceneLoads
+from taisoft.fem.reference import gravity_mass, lumped_mass
 from taisoft.machine import load_average, usable_cores
 from taisoft.mesh.tet_mesh import edge_lengths
 from taisoft.output.report import extremes, machine, peak_memory, versions
@@ -84,34 +85,29 @@ def measure(scene: Scene, task: dict) -> dict:
 def _scene_facts(scene: Scene, task: dict) -> dict:
     """Return what is known before the run: sizes, and which conservation laws hold."""
     bodies = scene.bodies
-    mass_damped = any(b.material.mass_damping for b in bodies)
-    damped = mass_damped or any(b.material.stiffness_damping for b in bodies)
+    mass_damped = any(b.composition.first.mass_damping for b in bodies)
+    damped = mass_damped or any(b.composition.first.stiffness_damping for b in bodies)
     prescribed = any(c.path is not None for b in bodies for c in b.constraints) or any(
         o.path is not None for o in scene.obstacles
     )
-    loaded = any(b.tractions or b.forces for b in bodies)
+    loads = [load for b in bodies for load in b.loads]
     touches = scene.pushes(task["fixed"].get("self_collision", False))
-    free = not (any(b.constraints for b in bodies) or mass_damped or (touches and scene.obstacles))
+    varied = any(load.path is not None for load in loads)
+    free = not (varied or any(b.constraints for b in bodies) or mass_damped or (touches and scene.obstacles))
     return {
         "bodies": [[b.name, b.n_nodes] for b in bodies],
         "nodes": sum(b.n_nodes for b in bodies),
         "tets": sum(b.mesh.n_tets for b in bodies),
         "orders": sorted({b.order for b in bodies}),
         "smallest_edge": min(float(edge_lengths(b.mesh.vertices, b.mesh.tets).min()) for b in bodies),  # [m]
-        "keeps_energy": not (damped or prescribed or loaded or touches),
+        "keeps_energy": not (damped or prescribed or loads or touches),
         "momentum_rate": _total_load(scene).tolist() if free else None,  # [N]
     }
 
 
 def _total_load(scene: Scene) -> np.ndarray:
     """Return the sum of weights, tractions and forces (3,) [N]."""
-    total = sum(gravity_mass(b).sum() for b in scene.bodies) * scene.gravity
-    for body in scene.bodies:
-        for load in body.tractions:
-            total = total + traction_forces(body, load.triangles, load.value).sum(axis=0)
-        for load in body.forces:
-            total = total + (load.value if load.value.ndim == 1 else load.value.sum(axis=0))
-    return total
+    return sum(gravity_mass(b).sum() for b in scene.bodies) * scene.gravity + SceneLoads(scene).at(0.0).sum(axis=0)
 
 
 def _run(scene: Scene, simulator: dict, task: dict) -> dict:

@@ -68,7 +68,7 @@ class Panel:
         self._g = float(np.linalg.norm(g))
         self._max_g = MAX_GRAVITY * (self._g or EARTH)
         self._g_direction = g / self._g if self._g else np.array([0.0, -1.0, 0.0])
-        self._young = {body.name: body.material.young for body in scene.bodies}  # initial values [Pa]
+        self._young = {body.name: body.young for body in scene.bodies}  # initial values [Pa], floats or (m,)
         self._young_exponent = dict.fromkeys(self._young, 0.0)  # decades
         self._pairs = self._contact_pairs()
         self._friction = scene.contact_numbers(*self._pairs[0])[0] if self._pairs else 0.0
@@ -203,7 +203,9 @@ class Panel:
             self._all_bodies = not self._all_bodies
         present = self._young_exponent[self.chosen]
         young = self._young[self.chosen] * 10.0**present
-        exponent = gui.slider_float(f"E {young:.3g} Pa###young", present, -YOUNG_DECADES, YOUNG_DECADES)
+        low, high = (f"{end(young):.3g}" for end in (np.min, np.max))
+        text = low if low == high else f"{low} to {high}"
+        exponent = gui.slider_float(f"E {text} Pa###young", present, -YOUNG_DECADES, YOUNG_DECADES)
         if changed(exponent, present):
             for name in self._young if self._all_bodies else (self.chosen,):
                 if self._loop.guarded(lambda name=name: self._set_young(name, exponent)):
@@ -285,7 +287,7 @@ class MouseDrag:
         self.body = body.name
         rest = np.asarray(body.rest_positions)
         self._diagonal = float(np.linalg.norm(rest.max(axis=0) - rest.min(axis=0)))
-        self._mass = float(body.material.density * body.mesh.volumes.sum())
+        self._mass = body.mass
         self.nodes, self.weights = _patch(rest, hit, PATCH * self._diagonal)
         self._plane = hit.point
         self._offset = self.weights @ sim.positions(body.name)[self.nodes] - hit.point

@@ -16,6 +16,7 @@ from taisoft.errors import OutputError
 from taisoft.mesh.topology import linked_groups, triangle_edges
 from taisoft.output.appearance import OBSTACLE_COLOUR, ObstacleSurface, body_colour, obstacle_surfaces, subdivide
 from taisoft.output.camera import MAX_WIDENING, Camera, start_positions
+from taisoft.scene.loads import value_at
 from taisoft.view.colouring import Colouring, lit_colours
 
 CREASE = 35.0  # [deg] between the normals of neighbouring triangles at rest
@@ -126,7 +127,7 @@ class Layers:
         x = sim.positions()
         marks = self._contact_lines(sim) if self.shown["contacts"] else []
         if self.shown["tractions"]:
-            tractions = [t.value for body in sim.scene.bodies for t in body.tractions]  # the present values
+            tractions = [value_at(t, sim.time, body.name) for body in sim.scene.bodies for t in body.tractions]
             longest = max((float(np.linalg.norm(t)) for t in tractions), default=0.0) or 1.0
             for corners, traction in zip(self._loaded, tractions):
                 arrow = ARROW * self._size / longest * traction

@@ -1,4 +1,7 @@
-"""Dead loads: tractions and nodal forces of constant direction and magnitude, f_a = F_a, psi = -sum_a F_a.x_a."""
+"""Dead loads: tractions and nodal forces that do not depend on x, f_a = F_a(t), psi = -sum_a F_a(t).x_a.
+
+`fem.loads` computes F_a; steppers set it for the time at which they evaluate forces.
+"""
 
 import taichi as ti
 

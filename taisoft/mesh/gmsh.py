@@ -1,23 +1,21 @@
-"""Read Gmsh's and TetGen's files, where meshio falls short (`safe_reading.py` reads other formats by meshio).
+"""Read Gmsh's files of versions 2 (text) and 4.1 (text and binary), with the physical groups of elements.
 
-Gmsh, versions 2 (text) and 4.1 (text and binary): meshio refuses parametric nodes and big-endian numbers, makes a mesh of some
-files that are cut off inside a node's number, and names no line. TetGen: meshio knows neither comments nor tets of ten nodes.
-Here every count is checked against the file's content before memory is allocated, and errors name their line.
-Sources: the Gmsh reference manual, "File formats"; the TetGen manual, "File formats".
-Weak: text is read as float64, so tags above 2^53 are refused.
+meshio refuses parametric nodes and big-endian numbers, makes a mesh of some files that are cut off inside a node's number, and
+names no line. Here every count is checked against the file's content before memory is allocated, and errors name their line.
+Source: the Gmsh reference manual, "File formats".
+Weak: text is read as float64, so tags above 2^53 are refused. Of the groups of a volume in several, only the first is used.
 """
 
 import re
-from pathlib import Path
 
 import numpy as np
 from meshio._common import num_nodes_per_cell
 from meshio.gmsh import gmsh_to_meshio_type
 
 from taisoft.errors import MeshError
-from taisoft.mesh.safe_reading import Blocks, content_lines, read_content
+from taisoft.mesh.safe_reading import MAX_EXACT_INT, Blocks, FileContent
 
-_MAX_EXACT_INT = 2.0**53  # float64 holds every integer up to here exactly
+PHYSICAL = "gmsh:physical"  # meshio's name of the elements' physical groups; 0 is none
 
 
 class _Text:
@@ -56,7 +54,7 @@ class _Text:
 
     def as_ints(self, values: np.ndarray, first: int, stride: int = 1) -> np.ndarray:
         """Return values as integers; they are the section's numbers first, first + stride, ..."""
-        whole = (np.floor(values) == values) & (np.abs(values) <= _MAX_EXACT_INT)
+        whole = (np.floor(values) == values) & (np.abs(values) <= MAX_EXACT_INT)
         if not whole.all():
             k = int(np.argmin(whole))
             raise self.error(f"{values[k]:g} is not a whole number", first + k * stride)
@@ -103,13 +101,14 @@ class _Binary:
 
 
 _GMSH_HEAD = re.compile(rb"\s*(?:\$Comments.*?\$EndComments\s*)?\$MeshFormat\s+(\S+)\s+([01])\s+(\d{1,2})[ \t\r]*\n", re.DOTALL)
+_VOLUME_NAME = re.compile(rb'^[ \t]*3[ \t]+(\d{1,10})[ \t]+"([^"\n]*)"', re.MULTILINE)  # in $PhysicalNames
 _OPENING = re.compile(rb"^[ \t]*\$(?!End)(\w+)[ \t\r]*\n", re.MULTILINE)
 
 
-def read_gmsh(name: str, data: bytes) -> tuple[np.ndarray, Blocks] | None:
-    """Return points (n,3) and element blocks of a .msh file; None for other versions than 2 (text) and 4.1.
+def read_gmsh(name: str, data: bytes) -> FileContent | None:
+    """Return the content of a .msh file, with the physical groups PHYSICAL; None for other versions than 2 (text) and 4.1.
 
-    name: the file's name for messages. data: its content. Only $Nodes and $Elements are read. Raises MeshError.
+    name: the file's name for messages. data: its content. Raises MeshError.
     """
     found = _GMSH_HEAD.match(data)
     if found is None:
@@ -123,14 +122,17 @@ def read_gmsh(name: str, data: bytes) -> tuple[np.ndarray, Blocks] | None:
         order = {b"\x01\0\0\0": "<", b"\0\0\0\x01": ">"}.get(data[at : at + 4], "")
         if not order or size not in (4, 8):
             raise MeshError(f"{name}: line 3 ($MeshFormat): the byte order or the size {size} of a number is not known")
-    readers = {"Nodes": _nodes_2, "Elements": _elements_2} if major == "2" else {"Nodes": _nodes_4, "Elements": _elements_4}
-    sections = {}
+    needed = {"Nodes": _nodes_2, "Elements": _elements_2} if major == "2" else {"Nodes": _nodes_4, "Elements": _elements_4}
+    readers = needed if major == "2" else needed | {"Entities": _entities_4}
+    sections, names = {}, {}
     while opening := _OPENING.search(data, at):
         section, at = opening[1].decode("ascii", "replace"), opening.end()
         if section not in readers:
-            at = data.find(b"$End" + opening[1], at)
+            start, at = at, data.find(b"$End" + opening[1], at)
             if at < 0:
                 raise _truncated(name, data, section)
+            if section == "PhysicalNames":
+                names = {int(tag): text.decode("utf-8", "replace") for tag, text in _VOLUME_NAME.findall(data[start:at])}
             continue
         if section in sections:
             line = data.count(b"\n", 0, at)
@@ -138,11 +140,15 @@ def read_gmsh(name: str, data: bytes) -> tuple[np.ndarray, Blocks] | None:
         numbers = _Binary(name, data, at, section, order, size) if binary else _Text(name, data, at, section)
         sections[section] = readers[section](numbers)
         at = numbers.close()
-    for section in readers:
+    for section in needed:
         if section not in sections:
             raise MeshError(f"{name}: there is no ${section} section")
     tags, points = sections["Nodes"]
-    return points, _tags_to_indices(name, tags, sections["Elements"])
+    blocks, groups = sections["Elements"]
+    if major == "4":  # of an entity, whose elements are one block or several
+        physical = sections.get("Entities", {})
+        groups = [np.full(len(block[1]), physical.get(entity, 0)) for block, entity in zip(blocks, groups)]
+    return FileContent(points, _tags_to_indices(name, tags, blocks), {PHYSICAL: groups}, names)
 
 
 def _truncated(name: str, data: bytes, section: str) -> MeshError:
@@ -178,16 +184,34 @@ def _nodes_4(numbers) -> tuple[np.ndarray, np.ndarray]:
     return np.concatenate(tags), np.concatenate(points)
 
 
-def _elements_4(numbers) -> Blocks:
-    """Read type names and node tags (k,nodes), version 4.1."""
+def _entities_4(numbers) -> dict[tuple[int, int], int]:
+    """Read the first physical group of each entity that is in one, by (dimension, tag), version 4.1."""
+    found = {}
+    counts = numbers.ints(4).tolist()
+    for dim, n in enumerate(counts):
+        for _ in range(n):
+            tag = int(numbers.ints(1, "int")[0])
+            numbers.floats(6 if dim else 3)  # a point's place, or a bounding box
+            groups = numbers.ints(_count(numbers), "int")
+            if dim:
+                numbers.ints(_count(numbers), "int")  # the entities of its boundary
+            if len(groups):
+                found[dim, tag] = abs(int(groups[0]))  # negative: of reversed orientation
+    return found
+
+
+def _elements_4(numbers) -> tuple[Blocks, list[tuple[int, int]]]:
+    """Read type names and node tags (k,nodes), and the entity (dimension, tag) of each block, version 4.1."""
     n_blocks, total = numbers.ints(4)[:2]
-    blocks = []
+    blocks, entities = [], []
     for _ in range(n_blocks):
-        kind, n_nodes = _element_type(numbers, int(numbers.ints(3, "int")[2]))
+        dim, entity, code = numbers.ints(3, "int").tolist()
+        kind, n_nodes = _element_type(numbers, code)
+        entities.append((dim, entity))
         n = _count(numbers)
         blocks.append((kind, numbers.ints(n * (1 + n_nodes)).reshape(n, 1 + n_nodes)[:, 1:]))
     _check_total(numbers, total, sum(len(tags) for _, tags in blocks), "elements")
-    return blocks
+    return blocks, entities
 
 
 def _check_total(numbers, total: int, found: int, what: str) -> None:
@@ -208,11 +232,14 @@ def _nodes_2(numbers: _Text) -> tuple[np.ndarray, np.ndarray]:
     return numbers.as_ints(rows[:, 0], 1, stride=4), rows[:, 1:]
 
 
-def _elements_2(numbers: _Text) -> Blocks:
-    """Read type names and node tags (k,nodes), version 2: a count, then rows of tag, type, number of labels, labels, nodes."""
+def _elements_2(numbers: _Text) -> tuple[Blocks, list[np.ndarray]]:
+    """Read type names and node tags (k,nodes), and the physical group of each element (k,) of each block, version 2.
+
+    A count, then rows of tag, type, number of labels, labels, nodes; the first label is the group.
+    """
     n, start = _count(numbers), numbers.at
     values = numbers.ints(len(numbers.numbers) - start).tolist()
-    found: dict[tuple[str, int], list[int]] = {}
+    found: dict[tuple[str, int], tuple[list[int], list[int]]] = {}
     at = 0
     for _ in range(n):
         numbers.at = start + at + 2  # the place of an error
@@ -222,9 +249,12 @@ def _elements_2(numbers: _Text) -> Blocks:
         at = first + kind[1]
         if n_labels < 0 or at > len(values):
             raise numbers.error("this element is not complete")
-        found.setdefault(kind, []).extend(values[first:at])
+        tags, groups = found.setdefault(kind, ([], []))
+        tags.extend(values[first:at])
+        groups.append(values[first - n_labels] if n_labels else 0)
     numbers.at = start + at
-    return [(name, np.array(tags, dtype=np.int64).reshape(-1, n_nodes)) for (name, n_nodes), tags in found.items()]
+    blocks = [(name, np.array(tags, dtype=np.int64).reshape(-1, n)) for (name, n), (tags, _) in found.items()]
+    return blocks, [np.array(groups, dtype=np.int64) for _, groups in found.values()]
 
 
 def _tags_to_indices(name: str, tags: np.ndarray, blocks: Blocks) -> Blocks:
@@ -245,53 +275,3 @@ def _tags_to_indices(name: str, tags: np.ndarray, blocks: Blocks) -> Blocks:
             raise MeshError(f"{name}: {label} {e}: node {nodes[tuple(unknown[0])]} does not exist ({len(tags)} nodes)")
         result.append((kind, order[at]))
     return result
-
-
-def read_tetgen(file: Path) -> tuple[np.ndarray, Blocks]:
-    """Return points (n,3) and one block of tets with 4 or 10 nodes. file: NAME.node (vertices) or NAME.ele (tets).
-
-    Each file is a header line of counts followed by rows. Vertices count from 0 or 1, the first number in NAME.node.
-    Attributes and boundary markers are skipped. Raises MeshError.
-    """
-    node, ele = file.with_suffix(".node"), file.with_suffix(".ele")
-    rows = _tetgen_rows(node, "vertices", "3 coordinates", (3,))
-    first = _whole(rows[:1, 0], node)[0] if len(rows) else 0
-    if first not in (0, 1):
-        raise MeshError(f"{node}: vertices must count from 0 or 1, not from {first}")
-    tets = _tetgen_rows(ele, "tets", "4 or 10 nodes", (4, 10))
-    return rows[:, 1:], [("tetra" if tets.shape[1] == 5 else "tetra10", _whole(tets[:, 1:], ele) - first)]
-
-
-def _tetgen_rows(file: Path, what: str, rule: str, allowed: tuple[int, ...]) -> np.ndarray:
-    """Return the rows that the header declares, a number and then as many as the header's second count, one of `allowed`."""
-    try:
-        lines = content_lines(str(file), read_content(file))
-    except MeshError as error:
-        raise MeshError(f"{error}; TetGen's files come in pairs") from error
-    try:
-        n_rows, n_columns = [int(word) for word in lines[0][1]][:2]
-        if min(n_rows, n_columns) < 0:
-            raise ValueError
-    except ValueError:
-        raise MeshError(f"{file}: line {lines[0][0]}: not a supported mesh: expected the counts of TetGen's format") from None
-    if n_columns not in allowed:
-        raise MeshError(f"{file}: {what} must have {rule}, not {n_columns}")
-    last, found = lines[-1][0], len(lines) - 1
-    if n_rows > found:
-        raise MeshError(f"{file}: line {last}: {n_rows} {what} were declared, but the file ends after {found}")
-    rows = np.empty((n_rows, 1 + n_columns))
-    for row, (number, words) in zip(rows, lines[1:]):
-        try:
-            if len(words) <= n_columns:
-                raise ValueError
-            row[:] = [float(word) for word in words[: 1 + n_columns]]
-        except ValueError:
-            raise MeshError(f"{file}: line {number}: expected {1 + n_columns} numbers") from None
-    return rows
-
-
-def _whole(values: np.ndarray, file: Path) -> np.ndarray:
-    bad = np.argwhere((np.floor(values) != values) | ~(np.abs(values) < _MAX_EXACT_INT))
-    if len(bad):
-        raise MeshError(f"{file}: row {bad[0, 0]}: {values[tuple(bad[0])]:g} is not a whole number")
-    return values.astype(np.int64)

@@ -1,0 +1,74 @@
+"""Dead loads of a scene as nodal forces at a time: f_a(t) = sum over loads of w_a F(t).
+
+w_a is the reference area at node a for a traction, the fraction of the lumped mass for a total force, and 1 for a force per node.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from taisoft.fem import reference
+from taisoft.scene.loads import NodalForce, Traction, value_at
+from taisoft.scene.scene import Body, Scene
+
+
+class _Path(NamedTuple):
+    """A load that varies: its name in messages, its nodes (k,) of the scene, and their weights (k,)."""
+
+    name: str
+    load: Traction | NodalForce
+    nodes: np.ndarray
+    weights: np.ndarray
+
+    def forces(self, times: list[float]) -> np.ndarray:
+        """Forces (r,k,3) [N] on its nodes at the times (r,) [s]."""
+        values = [value_at(self.load, t, self.name) for t in times]
+        if all(value.ndim == 1 for value in values):
+            return np.stack(values)[:, None] * self.weights[:, None]
+        return np.stack([_spread(value, self.weights) for value in values])
+
+
+class SceneLoads:
+    """The loads of a scene with its present values. nodes: those whose loads follow a path, ascending."""
+
+    def __init__(self, scene: Scene):
+        starts = np.cumsum([0, *(body.n_nodes for body in scene.bodies)])
+        self._constant, self._paths = np.zeros((starts[-1], 3)), []
+        for body, start in zip(scene.bodies, starts):
+            for kind, loads in (("traction", body.tractions), ("force", body.forces)):
+                for k, load in enumerate(loads):
+                    nodes, weights = _weights(body, load)
+                    if load.path is None:
+                        self._constant[start + nodes] += _spread(load.value, weights)
+                    else:
+                        self._paths.append(_Path(f"body {body.name!r}: {kind} {k}", load, start + nodes, weights))
+        self.nodes = np.unique(np.concatenate([np.zeros(0, dtype=np.int64), *(path.nodes for path in self._paths)]))
+
+    def at(self, t: float) -> np.ndarray:
+        """Forces (n_nodes, 3) [N] on all nodes at t [s]. Raises SimulationError if a path fails."""
+        total = self._constant.copy()
+        for path in self._paths:
+            total[path.nodes] += path.forces([t])[0]
+        return total
+
+    def rows(self, times: np.ndarray, nodes: np.ndarray) -> np.ndarray:
+        """Forces (r, k, 3) [N] on some nodes (k,), ascending, which include `nodes`, at the times (r,) [s]."""
+        rows = np.repeat(self._constant[nodes][None], len(times), axis=0)
+        for path in self._paths:
+            rows[:, np.searchsorted(nodes, path.nodes)] += path.forces(times.tolist())
+        return rows
+
+
+def _weights(body: Body, load: Traction | NodalForce) -> tuple[np.ndarray, np.ndarray]:
+    """Nodes (k,) of the body on which a load acts, and their weights (k,)."""
+    if isinstance(load, Traction):
+        areas = reference.triangle_areas(body, load.triangles)
+        nodes = np.flatnonzero(areas)
+        return nodes, areas[nodes]
+    mass = reference.lumped_mass(body)[load.nodes]
+    return load.nodes, mass / mass.sum()
+
+
+def _spread(value: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Forces (k,3) of a value: one per node (k,3), or (3,) times the weights (k,)."""
+    return value if value.ndim == 2 else np.outer(weights, value)

@@ -1,0 +1,71 @@
+"""Regions of a tetrahedral mesh: a whole number for each tet, and names for these numbers. They say where which material is."""
+
+import difflib
+from collections.abc import Callable
+
+import numpy as np
+
+from taisoft.errors import MeshError
+
+LARGEST_ID = 2**31 - 1  # of a region: mesh files hold 32-bit integers
+
+
+def checked_regions(values, n_tets: int, error: Callable[[str], MeshError]) -> np.ndarray | None:
+    """Return a copy (m,) int64 of the regions of all tets; None for None. error: makes an error of its text."""
+    if values is None:
+        return None
+    try:
+        array = np.asarray(values)
+    except (ValueError, TypeError, OverflowError) as reason:
+        raise error(f"regions must be an array of integers ({reason})") from reason
+    if array.dtype.kind not in "iu":
+        raise error(f"regions must be integers, not of type {array.dtype}")
+    if array.shape != (n_tets,):
+        raise error(f"regions must have shape ({n_tets},), one for each tet, not {array.shape}")
+    bad = np.flatnonzero(np.abs(array.astype(np.float64)) > LARGEST_ID)
+    if len(bad):
+        raise error(f"tet {bad[0]}: region {array[bad[0]]} does not fit into 32 bits")
+    return array.astype(np.int64)
+
+
+def checked_names(names, regions: np.ndarray | None, error: Callable[[str], MeshError]) -> dict[int, str]:
+    """Return a copy of the names, {id: name} by ascending id. regions: as returned by `checked_regions`."""
+    if not names:
+        return {}
+    if not isinstance(names, dict):
+        raise error(f"region_names must be a dict of names by region, not {names!r}")
+    if regions is None:
+        raise error("region_names are given without regions")
+    present = set(np.unique(regions).tolist())
+    found: dict[int, str] = {}
+    for key, name in names.items():
+        if isinstance(key, bool) or not isinstance(key, (int, np.integer)) or int(key) not in present:
+            raise error(f"region_names: no tet is in region {key!r}")
+        if not isinstance(name, str) or not name.strip() or not name.isprintable() or '"' in name:
+            raise error(f"region_names: the name of region {key} must be a line of text without quotes, not {name!r}")
+        if name in found.values():
+            raise error(f"region_names: {name!r} is the name of two regions")
+        found[int(key)] = name
+    return dict(sorted(found.items()))
+
+
+def region_id(key, regions: np.ndarray | None, names: dict[int, str], error: Callable[[str], MeshError]) -> int:
+    """Return the id of a region given by its name or id."""
+    if regions is None:
+        raise error("the mesh has no regions")
+    ids = np.unique(regions).tolist()
+    if isinstance(key, str):
+        for one, name in names.items():
+            if name == key:
+                return one
+        near = difflib.get_close_matches(key, names.values(), n=1)
+        hint = f"; did you mean {near[0]!r}?" if near else f"; there are {', '.join(region_text(one, names) for one in ids)}"
+        raise error(f"no region is called {key!r}{hint}")
+    if isinstance(key, bool) or not isinstance(key, (int, np.integer)) or int(key) not in ids:
+        raise error(f"no tet is in region {key!r}; there are {', '.join(region_text(one, names) for one in ids)}")
+    return int(key)
+
+
+def region_text(region: int, names: dict[int, str]) -> str:
+    """Return a region's name in quotes, or its id."""
+    return repr(names[region]) if region in names else str(region)

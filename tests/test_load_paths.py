@@ -1,0 +1,332 @@
+"""Forces and tractions that follow paths in time:
+
+* the momentum of a free body is the integrator's own quadrature of the load, and the oracle's deformation that of each step;
+* a constant path gives the bits of a constant load; a batch of explicit sub-steps gives what single steps give;
+* statics take the loads of their time; energies are those of the present time, and the check of energy knows of the work;
+* `set_force` and `set_traction` replace a path by a value; checkpoints resume bitwise before and after that;
+* scene files hold key frames; refined scenes keep paths; the plan and the digests tell loads apart;
+* paths that fail or give other shapes are refused in one sentence.
+"""
+
+import numpy as np
+import pytest
+from scenes import SNH, cube, dynamics, rubber
+from toml_scenes import there_and_back
+
+import taisoft as ts
+from taisoft.dynamics.schemes import EXPLICIT, IMPLICIT
+from taisoft.errors import SceneError
+from taisoft.scene.fingerprint import scene_digest
+from taisoft.scene.refine import refined, with_order
+
+DT, STEPS = 1e-3, 12
+RAMP = ts.KeyFrames((0.0, 0.004, 0.02), [(0, 0, 0), (60, -20, 10), (10, 40, -30)], smooth=True)
+INTEGRATORS = [*EXPLICIT, *IMPLICIT]
+
+
+def push(t: float) -> np.ndarray:
+    return np.array([80 * np.sin(300 * t), 20 - 3e3 * t, 5.0])
+
+
+def free_body(force, order: int = 1, ground: bool = False, held: bool = False) -> ts.Scene:
+    scene = ts.Scene(gravity=(0, 0, 0))
+    body = scene.add_body(cube(cells=(2, 1, 1)), rubber(), name="body", order=order)
+    body.add_force(lambda X: X[:, 0] > 0.49, force)
+    if held:
+        body.fix(lambda X: X[:, 0] < -0.49)
+    if ground:
+        scene.add_obstacle(ts.HalfSpace((0, -9, 0), (0, 1, 0)))
+    return scene
+
+
+def simulator(scene: ts.Scene, integrator: str, **settings) -> ts.Simulator:
+    tight = {} if integrator in EXPLICIT else {"newton_tolerance": 1e-12, "linear_tolerance": 1e-12}
+    return ts.Simulator(scene, dt=DT, integrator=integrator, precision="f64", **tight, **settings)
+
+
+def momenta(integrator: str) -> np.ndarray:
+    """Momentum (STEPS + 1, 3) [N s] of a free body from rest, by the integrator's formula for M v' = F(t)."""
+    F, p = [push(k * DT / 2) for k in range(2 * STEPS + 1)], [np.zeros(3)]  # of half steps
+    for n in range(STEPS):
+        start, middle, end = F[2 * n : 2 * n + 3]
+        if integrator == "bdf2" and n:
+            p.append((4 * p[n] - p[n - 1] + 2 * DT * end) / 3)
+            continue
+        mean = {"symplectic_euler": start, "velocity_verlet": (start + end) / 2, "implicit_midpoint": middle}.get(integrator, end)
+        p.append(p[n] + DT * mean)
+    return np.array(p)
+
+
+@pytest.mark.parametrize("ground", [False, True])
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_momentum_is_the_quadrature_of_the_load(integrator, ground):
+    if ground and integrator == "implicit_midpoint":
+        pytest.skip("takes no contacts")
+    wanted = momenta(integrator)
+    with simulator(free_body(push, ground=ground), integrator) as sim:
+        mass = sim.scene.bodies[0].mass
+        for n in range(STEPS):
+            sim.step()
+            # the lumped mass is uniform enough only in the mean: weigh by it
+            v, weights = sim.velocities(), lumped(sim)
+            assert weights @ v == pytest.approx(wanted[n + 1], rel=1e-9, abs=1e-12 * mass)
+        if integrator in EXPLICIT:
+            sim.reset()
+            sim.advance(5)
+            sim.advance(STEPS - 5)
+            assert lumped(sim) @ sim.velocities() == pytest.approx(wanted[-1], rel=1e-9)
+
+
+def lumped(sim: ts.Simulator) -> np.ndarray:
+    from taisoft.fem.reference import lumped_masses
+
+    return lumped_masses(sim.scene)
+
+
+@pytest.mark.parametrize("integrator", ["symplectic_euler", "velocity_verlet", "implicit_euler"])
+@pytest.mark.parametrize("ground", [False, True])
+def test_a_constant_path_gives_the_same_bits(integrator, ground):
+    results = []
+    for force in ((30.0, -10.0, 5.0), lambda t: (30.0, -10.0, 5.0), ts.KeyFrames((0.0,), [(30.0, -10.0, 5.0)])):
+        with simulator(free_body(force, ground=ground, held=True), integrator) as sim:
+            sim.advance(7)
+            sim.advance(6)
+            results.append((sim.positions(), sim.velocities(), sim.reactions(), sim.energies().loads))
+    for other in results[1:]:
+        assert all(np.array_equal(a, b) for a, b in zip(results[0], other))
+
+
+@pytest.mark.parametrize("integrator", EXPLICIT)
+def test_batches_equal_single_steps(integrator):
+    results = []
+    for batches in ([1] * STEPS, [5, STEPS - 5]):
+        with simulator(free_body(RAMP, held=True), integrator) as sim:
+            for n in batches:
+                sim.advance(n)
+            results.append((sim.positions(), sim.velocities(), sim.reactions()))
+    assert np.abs(results[0][0] - results[1][0]).max() < 1e-14 and np.abs(results[0][1] - results[1][1]).max() < 1e-12
+    assert results[0][2] == pytest.approx(results[1][2], rel=1e-9, abs=1e-9) and np.abs(results[0][1]).max() > 1e-4
+
+
+@pytest.mark.parametrize("integrator", EXPLICIT)
+def test_parallel_kernels_give_the_same(integrator):
+    results = []
+    for serial in (True, False):
+        with dynamics(free_body(RAMP, held=True), dt=DT, integrator=integrator, precision="f64") as made:
+            made.stepper.simulation.model = _with_serial(made.state.model, serial)
+            made.advance(STEPS)
+            results.append(made.state.state())
+    assert all(np.abs(a - b).max() < 1e-12 for a, b in zip(*results))
+
+
+def _with_serial(model, serial: bool):
+    from dataclasses import replace
+
+    return replace(model, serial=serial)
+
+
+def test_a_tractions_path_is_a_force_of_the_area():
+    results = []
+    for name, value in (("add_traction", lambda t: (0, 1e4 * t, 0)), ("add_force", lambda t: (0, 1e4 * t * 0.99, 0))):
+        scene = ts.Scene(gravity=(0, 0, 0))
+        body = scene.add_body(cube(), rubber(), name="body")
+        where = (lambda X: X[:, 0] > 0.49) if name == "add_traction" else (lambda X: np.ones(len(X), dtype=bool))
+        getattr(body, name)(where, value)
+        with simulator(scene, "implicit_euler") as sim:
+            sim.step()
+            results.append(lumped(sim) @ sim.velocities())
+    assert results[0] == pytest.approx(results[1], rel=1e-6, abs=1e-9) and results[0][1] > 0
+
+
+def test_forces_per_node_may_follow_paths():
+    scene = ts.Scene(gravity=(0, 0, 0))
+    body = scene.add_body(cube(), rubber(), name="body")
+    rows = np.random.default_rng(0).standard_normal((3, 3))
+    body.add_force([5, 2, 7], lambda t: (1 + 1e3 * t) * rows)
+    body.add_force([5], (0, 0, 0.25))
+    with simulator(scene, "implicit_euler") as sim:
+        sim.step()
+        assert lumped(sim) @ sim.velocities() == pytest.approx(DT * (2 * rows.sum(axis=0) + (0, 0, 0.25)), rel=1e-6)
+
+
+def test_statics_take_the_loads_of_their_time():
+    scene, same = free_body(RAMP, held=True, order=2), free_body(RAMP(0.003)[0], held=True, order=2)
+    assert np.array_equal(ts.solve_static(scene, time=0.003).positions(), ts.solve_static(same).positions())
+    assert np.abs(ts.solve_static(scene).positions() - scene.bodies[0].rest_positions).max() < 1e-12
+
+
+@pytest.mark.parametrize("integrator", ["symplectic_euler", "implicit_midpoint"])
+def test_energies_are_of_the_present_time(integrator):
+    with simulator(free_body(push, held=True), integrator) as sim:
+        report = sim.advance(1)
+        body, weights = sim.scene.bodies[0], lumped(sim)
+        nodes = body.forces[0].nodes
+        mean = weights[nodes] @ sim.positions()[nodes] / weights[nodes].sum()
+        assert report.loads == pytest.approx(-push(DT) @ mean, rel=1e-12) and sim.energies().loads == report.loads
+        sim.reset()
+        mean = weights[nodes] @ body.rest_positions[nodes] / weights[nodes].sum()
+        assert sim.energies().loads == pytest.approx(-push(0.0) @ mean, rel=1e-12)
+
+
+def test_the_work_of_a_path_is_no_created_energy():
+    """A force that pushes a free body to and fro adds energy without bound."""
+    scene = free_body(lambda t: (3e3 * np.sign(np.sin(40 * t)), 0, 0))
+    with ts.Simulator(scene, dt=1e-3, integrator="symplectic_euler") as sim:
+        assert sim.run(seconds=0.3).status == "ok"
+
+
+def test_a_drag_acts_beside_paths():
+    scene = free_body(lambda t: (0, 30.0, 0))
+    for integrator in ("symplectic_euler", "implicit_euler"):
+        with simulator(scene.snapshot(), integrator, draggable=True) as sim:
+            nodes = sim.scene.bodies[0].forces[0].nodes
+            sim.drag("body", nodes, np.ones(len(nodes)), (50.0, 0, 0), 1.0)
+            sim.advance(1)
+            drag = sim.dragged.force
+            assert (
+                lumped(sim) @ sim.velocities() == pytest.approx(DT * (drag + (0, 30.0, 0)), rel=1e-6, abs=1e-9) and drag[0] > 1.0
+            )
+            sim.release()
+            before = lumped(sim) @ sim.velocities()
+            sim.advance(1)
+            assert lumped(sim) @ sim.velocities() - before == pytest.approx([0, 30.0 * DT, 0], rel=1e-6, abs=1e-9)
+
+
+# --- changes and checkpoints ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("integrator", ["velocity_verlet", "bdf2"])
+@pytest.mark.parametrize("replaced", [False, True])
+def test_checkpoints_resume_bitwise(tmp_path, integrator, replaced):
+    def scene():
+        made = free_body(RAMP, held=True)
+        made.bodies[0].add_traction([0, 1], ts.KeyFrames((0, 1), [(0, 0, 0), (0, 1e5, 0)]))
+        return made
+
+    with simulator(scene(), integrator) as sim:
+        sim.advance(4)
+        sim.advance(1)
+        if replaced:
+            sim.set_force("body", 0, (5.0, 6.0, 7.0))
+        sim.step()
+        sim.save_checkpoint(tmp_path / "c.npz")
+        for _ in range(4):
+            sim.step()
+        wanted = sim.positions(), sim.velocities(), sim.energies().loads
+    with ts.Simulator.load_checkpoint(tmp_path / "c.npz", scene()) as sim:
+        assert (sim.scene.bodies[0].forces[0].path is None) == replaced
+        for _ in range(4):
+            sim.step()
+        found = sim.positions(), sim.velocities(), sim.energies().loads
+    assert all(np.array_equal(a, b) for a, b in zip(wanted, found))
+    for force in (ts.KeyFrames((0, 1), [(0, 0, 0), (1, 0, 0)]), (0, 0, 0)):
+        other = free_body(force, held=True)
+        other.bodies[0].add_traction([0, 1], ts.KeyFrames((0, 1), [(0, 0, 0), (0, 1e5, 0)]))
+        with pytest.raises(SceneError, match="differs in body 'body': loads"):
+            ts.Simulator.load_checkpoint(tmp_path / "c.npz", other)
+
+
+@pytest.mark.parametrize("integrator", ["symplectic_euler", "implicit_euler"])
+def test_a_value_replaces_a_path(integrator):
+    value = (3.0, -4.0, 5.0)
+    with simulator(free_body(push), integrator) as sim:
+        sim.set_force("body", 0, value)
+        sim.advance(1)
+        sim.advance(1)
+        assert lumped(sim) @ sim.velocities() == pytest.approx(2 * DT * np.array(value), rel=1e-6)
+        sim.reset()
+        sim.step()
+        assert lumped(sim) @ sim.velocities() == pytest.approx(DT * np.array(value), rel=1e-6)
+        with pytest.raises(
+            SceneError, match=r"body 'body': set_force: force 0 must have shape \(3,\) or \(3, 3\), not \(2,\)|must"
+        ):
+            sim.set_force("body", 0, (1.0, 2.0))
+
+
+# --- copies -----------------------------------------------------------------------------------------------------------
+
+
+def test_scene_files_hold_key_frames(tmp_path):
+    scene = free_body(RAMP)
+    scene.bodies[0].add_traction([0, 3], ts.KeyFrames((0, 1 / 3), [(0, 0, 0), (1 / 7, 0, 0)]))
+    there_and_back(tmp_path / "a.toml", scene, {"dt": 0.01})
+    again = ts.read_scene(tmp_path / "a.toml")[0]
+    assert again.bodies[0].forces[0].path(0.003).tolist() == RAMP(0.003)[0].tolist()
+    with pytest.raises(SceneError, match="body 'body': has a load along a function, which a file cannot store: use ts.KeyFrames"):
+        ts.write_scene(tmp_path / "b.toml", free_body(push))
+
+
+@pytest.mark.parametrize(
+    "old, new, message",
+    [
+        ("smooth = true", "rotations = [[0, 0, 0], [0, 0, 1], [0, 0, 2]]", "force.*a load has translations only"),
+        ("release = false", "release = true", "force.*a load has translations only"),
+        ("smooth = true", "smoth = true", r"bodies.body.force\[0\].force.smoth is not known .did you mean smooth"),
+        ("times = [0.0, 0.004, 0.02]", "times = [0.0, 0.02, 0.004]", r"bodies.body.force\[0\].force.times must ascend"),
+    ],
+)
+def test_bad_key_frames_of_loads_are_refused(tmp_path, old, new, message):
+    path = tmp_path / "a.toml"
+    ts.write_scene(path, free_body(RAMP))
+    assert old in path.read_text()
+    path.write_text(path.read_text().replace(old, new))
+    with pytest.raises(SceneError, match=message):
+        ts.read_scene(path)
+
+
+@pytest.mark.parametrize("change", [refined, lambda scene: with_order(scene, 2)], ids=["refined", "order"])
+def test_refined_scenes_keep_paths(change):
+    scene = free_body(RAMP)
+    body = scene.bodies[0]
+    body.add_traction(lambda c: c[:, 1] > 0.44, push)
+    body.add_force([0, 3], lambda t: t * np.array([(1, 0, 0), (0, 1, 0)]))
+    new = change(scene).bodies[0]
+    assert [load.path is None for load in new.loads] == [False] * 3 and new.tractions[0].path is push
+    assert new.forces[0].path.frames is RAMP and new.forces[1].nodes.tolist() == [0, 3]
+
+
+def test_the_plan_and_the_digest_tell_paths_apart():
+    scenes = [free_body(force) for force in ((0, 0, 0), lambda t: (0, 0, 0), RAMP, ts.KeyFrames((0,), [(0, 0, 0)]))]
+    assert len({scene_digest(scene) for scene in scenes}) == 4
+    for scene in scenes[:2]:
+        with ts.Simulator(scene, dt=DT) as sim:
+            assert sim.plan.on["load_paths"] == (scene is not scenes[0])
+
+
+# --- bad input --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "path, message",
+    [
+        (lambda t: 1 / t, "add_force: force: the path failed at t = 0: ZeroDivisionError: "),
+        (lambda t: (1.0, 2.0), r"add_force: force at t = 0 must have shape \(3,\) or \(3, 3\), not \(2,\)|must have shape"),
+        (lambda t: (1.0, 2.0, np.nan), r"add_force: force at t = 0: entry \[2\] is nan"),
+        (ts.KeyFrames((0,), [(0, 0, 0)], release=True), "add_force: force: key frames: a load has translations only"),
+        ("north", "add_force: force must be numbers"),
+    ],
+)
+def test_bad_paths_are_refused(path, message):
+    scene = ts.Scene()
+    body = scene.add_body(cube(), rubber(SNH), name="body")
+    with pytest.raises(SceneError, match=f"^body 'body': {message}"):
+        body.add_force([1, 2, 3], path)
+    assert body.forces == []
+    with pytest.raises(SceneError, match="loads cannot be set: call body.add_force or body.add_traction"):
+        body.loads = []
+
+
+@pytest.mark.parametrize("integrator", ["velocity_verlet", "implicit_euler"])
+def test_a_path_that_fails_later_stops_the_run(integrator):
+    for bad, text in (
+        (np.full(3, np.inf), "gave .inf, inf, inf. at t = 0.00[345]"),
+        (np.zeros(2), r"gave .0.0, 0.0. at t = 0.00[345]"),
+    ):
+        with simulator(free_body(lambda t, bad=bad: (1, 0, 0) if t < 0.0035 else bad), integrator) as sim:
+            sim.step()
+            with pytest.raises(
+                ts.SimulationError, match=rf"body 'body': force 0: its path {text} s: it must be finite, of shape"
+            ):
+                for _ in range(9):
+                    sim.step()
+            assert 0.002 < sim.time < 0.0045 and np.isfinite(sim.positions()).all()
