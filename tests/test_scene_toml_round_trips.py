@@ -69,10 +69,10 @@ EVERY_SETTING = {
     "arch": "cpu",
     "allow_unstable": False,
     "draggable": True,
-    "tolerance": 0.01,
     "newton_tolerance": 1e-5,
     "linear_tolerance": None,
     "contact_tolerance": 1e-3,
+    "tolerance": 0.01,
     "seconds": 2,
     "fps": None,
 }
