@@ -330,3 +330,23 @@ def test_a_path_that_fails_later_stops_the_run(integrator):
                 for _ in range(9):
                     sim.step()
             assert 0.002 < sim.time < 0.0045 and np.isfinite(sim.positions()).all()
+
+
+@pytest.mark.parametrize("integrator", ["symplectic_euler", "velocity_verlet"])
+def test_a_path_may_reuse_its_array(integrator):
+    """A batch of explicit steps takes each step's own value."""
+    reused, ends = np.zeros(3), []
+
+    def reusing(t: float) -> np.ndarray:
+        reused[0] = 1e3 * t
+        return reused
+
+    for path in (reusing, lambda t: np.array([1e3 * t, 0.0, 0.0])):
+        scene = ts.Scene(gravity=(0.0, 0.0, 0.0))
+        scene.add_body(ts.box_mesh((1, 1, 1), (1.0, 1.0, 1.0)), ts.Material(young=1e5), name="b").add_force(
+            lambda X: X[:, 0] > 0.0, path
+        )
+        with ts.Simulator(scene, dt=1e-4, integrator=integrator) as sim:
+            sim.advance(50)
+            ends.append(sim.positions())
+    assert np.array_equal(*ends)

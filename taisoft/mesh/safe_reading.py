@@ -170,7 +170,9 @@ def _read(path: str, seconds: str) -> dict[str, np.ndarray]:
             mesh = _first_fitting(path, data)
             arrays = [np.asarray(mesh.points), *(np.asarray(block.data) for block in mesh.cells)]
             data_of_cells = {name: list(map(np.asarray, of_blocks)) for name, of_blocks in mesh.cell_data.items()}
-            names = {int(tag): name for name, (tag, dim) in mesh.field_data.items() if dim == 3}
+            fields = {name: np.asarray(value) for name, value in mesh.field_data.items()}  # of any kind, such as a time
+            pairs = {name: value for name, value in fields.items() if value.shape == (2,) and value.dtype.kind in "iu"}
+            names = {int(tag): name for name, (tag, dim) in pairs.items() if dim == 3}
         if any(array.dtype.hasobject for array in arrays):
             raise meshio.ReadError("rows of different lengths")
         of_cells = [one for of_blocks in data_of_cells.values() for one in of_blocks]

@@ -57,7 +57,9 @@ class Composition:
         """Return one of BY_TET: a float if one holds for all tets by design, else (m,)."""
         if name in self.by_tet or not self.has_regions:
             return self.by_tet.get(name, getattr(self.first, name))
-        return np.array([getattr(material, name) for material in self.materials.values()])[self._row]
+        values = np.array([getattr(material, name) for material in self.materials.values()])[self._row]
+        values.flags.writeable = False
+        return values
 
     @property
     def lame(self) -> tuple[float | np.ndarray, float | np.ndarray]:

@@ -84,7 +84,7 @@ def value_at(load: Traction | NodalForce, t: float, what: str) -> np.ndarray:
     if load.path is None:
         return load.value
     try:
-        value = np.asarray(load.path(t), dtype=np.float64)
+        value = np.array(load.path(t), dtype=np.float64)  # a copy, since a path may reuse its array
     except Exception as error:  # a user's function may raise anything
         raise SimulationError(f"{what}: its path failed at t = {t:g} s: {type(error).__name__}: {error}") from error
     if value.shape not in load.shapes or not np.isfinite(value).all():
