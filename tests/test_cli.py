@@ -128,7 +128,8 @@ def test_values_that_are_no_scalars_are_refused(text):
 
 
 def test_options_override_set_and_set_overrides_the_scene():
-    arguments = Namespace(arch=None, precision="f64", seconds=2.0, fps=None, assignments=["solver.dt=0.5", "solver.fps=none"])
+    given = {"arch": None, "precision": "f64", "tolerance": None, "seconds": 2.0, "fps": None}
+    arguments = Namespace(**given, assignments=["solver.dt=0.5", "solver.fps=none"])
     resolved = resolve({"dt": 0.1, "precision": "f32", "seconds": 1.0, "fps": 30}, arguments, FakeSimulator)
     assert resolved.simulator == {"dt": 0.5, "precision": "f64"}
     assert (resolved.seconds, resolved.fps) == (2.0, None)
