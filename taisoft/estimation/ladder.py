@@ -60,8 +60,7 @@ class Ladder:
         apart, ratio = distances(pilot, before), float(pilot.per_frame / before.per_frame)
         self.differences.append(float(np.sqrt(np.mean(apart**2))))
         self.order = self._observed_order() if ratio == 2.0 else None
-        order = self.order or (MIN_ORDER if len(self.differences) > 1 else 1.0)
-        self.error = float(apart.max()) * error_over_difference(ratio, order) / excursion if excursion else 0.0
+        self.error = float(apart.max()) * self.error_over_difference(ratio) / excursion if excursion else 0.0
 
     def replace_first(self, pilot: Pilot) -> None:
         """Replace the first pilot, explicit, by one with a slightly smaller step, and expect its error."""
@@ -75,6 +74,15 @@ class Ladder:
             ratio = float(pilot.per_frame / before[0].per_frame)
             apart = float(distances(pilot, before[0]).max()) / excursion
             self.error = max(self._expected_error(pilot, excursion), apart * error_over_difference(ratio, 2.0))
+
+    @property
+    def assumed_order(self) -> float:
+        """The observed order; where it was not observed the smallest, and 1 where two pilots could not show it."""
+        return self.order or (MIN_ORDER if len(self.differences) > 1 else 1.0)
+
+    def error_over_difference(self, ratio: float) -> float:
+        """Error of a run over its distance to one with steps larger by a ratio."""
+        return error_over_difference(ratio, self.assumed_order)
 
     def excursion(self, pilot: Pilot) -> float:
         """A pilot's largest excursion [m], 0 if it is rounding."""
@@ -120,6 +128,5 @@ class Ladder:
             return math.ceil(last)
         if few:
             return None
-        order = self.order or (MIN_ORDER if len(self.differences) > 1 else 1.0)
-        steps = float(last) * max(LEAST_REACH, (self.error / tolerance) ** (1.0 / order))
+        steps = float(last) * max(LEAST_REACH, (self.error / tolerance) ** (1.0 / self.assumed_order))
         return math.ceil(steps) if steps <= REACH * last else None

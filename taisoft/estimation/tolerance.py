@@ -24,7 +24,6 @@ from taisoft.errors import SimulationError, no_memory
 from taisoft.estimation.costs import explicit_step, implicit_step
 from taisoft.estimation.first_choice import EXPLICIT, IMPLICIT, stable_steps
 from taisoft.estimation.ladder import Ladder
-from taisoft.estimation.order import MIN_ORDER, error_over_difference
 from taisoft.estimation.pilots import Pilot, Recorder, RunFunction, distances, make_frames
 from taisoft.records import BodyError, ErrorEstimate, RunReport
 from taisoft.scene.scene import Scene
@@ -260,8 +259,7 @@ class Chooser:
                 )
         else:
             made.order, ratio = ladder.order, float(run.per_frame / coarser[-1].per_frame)
-            factor = error_over_difference(ratio, made.order or (MIN_ORDER if len(ladder.differences) > 1 else 1.0))
-            errors = factor * distances(run, coarser[-1]).max(axis=0) / made.excursion
+            errors = ladder.error_over_difference(ratio) * distances(run, coarser[-1]).max(axis=0) / made.excursion
             for k, body in enumerate(made.bodies.values()):
                 body.time = float(errors[self._frames.bodies == k].max(initial=0.0))
             made.time = float(errors.max())
