@@ -116,7 +116,7 @@ class StaticSolver:
         self.simulation.upload_constraints()
         self.gravity = np.array(scene.gravity, dtype=np.float64)
         self.simulation.set_load_time(time)
-        self.loads = model.loads.to_numpy() if model.loaded else None
+        self.loads = [(field, field.to_numpy()) for field in (model.loads, model.amplitudes) if field is not None]
 
     def solve(self) -> StaticResult:
         """Apply the full load in one step; if that fails, use load steps that halve on failure and grow by half on success."""
@@ -145,8 +145,7 @@ class StaticSolver:
         """Solve with a fraction of the load, starting at x."""
         m, w = self.simulation.model, self.solver.work
         start = [(m.gravity, fraction * self.gravity[None]), (w.x_hat, x), (m.state.x, x), (m.state.v, np.zeros_like(x))]
-        if self.loads is not None:
-            start.append((m.loads, fraction * self.loads))
+        start += [(field, fraction * full) for field, full in self.loads]
         if self.target is not None:
             rest = self.simulation.layout.rest[self.simulation.dirichlet.prescribed_nodes]
             axes = self.simulation.dirichlet.prescribed_axes()
@@ -160,7 +159,7 @@ class StaticSolver:
 
     def _residual(self, result: StageResult) -> float:
         """The residual of the result; 0 without load and constraint forces, where it would be rounding over rounding."""
-        loaded = self.gravity.any() or (self.loads is not None and self.loads.any())
+        loaded = self.gravity.any() or any(full.any() for _, full in self.loads)
         only_rounding = not loaded and np.linalg.norm(self.solver.held_residual()) <= self.solver.rounding.force
         return 0.0 if only_rounding and result.converged else result.residual
 

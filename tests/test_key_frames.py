@@ -89,7 +89,7 @@ def test_nodes_are_released_at_the_last_time():
         ({"times": (0, 2, 1)}, "times must ascend, but 1 follows 2"),
         ({"times": (0, 1, np.inf)}, "times: .* not finite"),
         ({"times": (0, 1)}, r"translations must have shape \(2, 3\), not \(3, 3\)"),
-        ({"translations": None}, "translations or rotations are needed"),
+        ({"translations": None}, "translations, rotations or values are needed"),
         ({"translations": "up"}, "translations must be numbers"),
         ({"rotations": [(0, 0, 0)]}, r"rotations must have shape \(3, 3\), not \(1, 3\)"),
         ({"rotations": np.full((3, 3), 1e7)}, r"rotations must be at most 1e\+06 rad"),

@@ -200,8 +200,7 @@ class Dynamics:
         """Whether anything but constant forces does work now: a drag, prescribed nodes, moving obstacles, loads along paths."""
         moving = self.contact is not None and any(obstacle.path is not None for obstacle in self.scene.obstacles)
         dragged = self.drag_spring is not None and self.drag_spring.drag is not None
-        varied = self.model.loaded and len(self.state.loads.nodes) > 0
-        return moving or dragged or varied or not all(self.state.dirichlet.released())
+        return moving or dragged or self.state.loads.vary or not all(self.state.dirichlet.released())
 
     # --- queries ------------------------------------------------------------------------------------------------------
 

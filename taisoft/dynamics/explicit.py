@@ -131,8 +131,12 @@ def save_prescribed_positions(m: ti.template(), s: ti.template()):
 @ti.func
 def set_loads(m: ti.template(), s: ti.template(), row):
     """Set the loads that follow paths for this sub-step."""
-    for k in range(s.n_varied):
-        m.loads[s.varied_nodes[k]] = ti.cast(s.load_rows[row * s.n_varied + k], m.real)
+    if ti.static(s.has_varied_nodes):
+        for k in range(s.n_varied):
+            m.loads[s.varied_nodes[k]] = ti.cast(s.load_rows[row * s.n_varied + k], m.real)
+    if ti.static(s.has_varied_amplitudes):
+        for k in range(s.n_amplitudes):
+            m.amplitudes[k] = s.amplitude_rows[row * s.n_amplitudes + k]
 
 
 @ti.func
@@ -219,6 +223,13 @@ def set_rows(out: ti.template(), rows: ti.types.ndarray()):
     for k in range(rows.shape[0]):
         for a in ti.static(range(3)):
             out[k][a] = rows[k, a]
+
+
+@kernel
+def set_numbers(out: ti.template(), numbers: ti.types.ndarray()):
+    """Set the first entries of a field to numbers (k,)."""
+    for k in range(numbers.shape[0]):
+        out[k] = numbers[k]
 
 
 @kernel

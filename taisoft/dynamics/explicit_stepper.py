@@ -38,6 +38,8 @@ class SubstepWork:
     n_varied: Count
     varied_nodes: Any  # (n_varied) i32: those whose loads follow a path
     load_rows: Any  # (rows * n_varied) 3-vectors f64 [N]: their loads in each sub-step
+    n_amplitudes: Count  # loads that are one number, if any follows a path; else 0
+    amplitude_rows: Any  # (rows * n_amplitudes) f64: their values in each sub-step
     before: Any  # (n_prescribed) 3-vectors f64: position before the sub-step
     held: Any  # (n_held) i32
     held_velocity: Any  # (n_held) 3-vectors
@@ -51,7 +53,17 @@ class SubstepWork:
     @property
     def has_varied_loads(self) -> bool:
         """Whether loads follow paths."""
+        return self.has_varied_nodes or self.has_varied_amplitudes
+
+    @property
+    def has_varied_nodes(self) -> bool:
+        """Whether dead loads follow paths."""
         return self.varied_nodes is not None
+
+    @property
+    def has_varied_amplitudes(self) -> bool:
+        """Whether loads that are one number follow paths."""
+        return self.amplitude_rows is not None
 
     @property
     def has_held(self) -> bool:
@@ -80,7 +92,9 @@ class ExplicitStepper:
         n_prescribed, n_held = dirichlet.n_prescribed, len(dirichlet.held)
         self._varied = simulation.loads.nodes if m.loaded else np.zeros(0, dtype=np.int64)
         n_varied = len(self._varied)
-        self.rows = max(1, min(self.max_batch, TARGET_BYTES_PER_TET * n_tets // (24 * max(1, n_prescribed + n_varied))))
+        n_amplitudes = simulation.loads.n_amplitudes if simulation.loads.amplitudes_vary else 0
+        row_bytes = 24 * (n_prescribed + n_varied) + 8 * n_amplitudes
+        self.rows = max(1, min(self.max_batch, TARGET_BYTES_PER_TET * n_tets // max(24, row_bytes)))
 
         def ids(name: str, nodes: np.ndarray):
             return arena.field(name, ti.i32, len(nodes), nodes.astype(np.int32)) if len(nodes) else None
@@ -100,6 +114,8 @@ class ExplicitStepper:
             n_varied=n_varied,
             varied_nodes=ids("varied_nodes", self._varied),
             load_rows=vectors("load_rows", self.rows * n_varied, ti.f64),
+            n_amplitudes=n_amplitudes,
+            amplitude_rows=arena.field("amplitude_rows", ti.f64, self.rows * n_amplitudes) if n_amplitudes else None,
             before=vectors("position_before", n_prescribed, ti.f64),
             held=ids("held", dirichlet.held),
             held_velocity=vectors("held_velocity", n_held),
@@ -149,7 +165,7 @@ class ExplicitStepper:
         n = min(n, self.max_batch)
         simulation = self.simulation
         simulation.set_load_time(simulation.time)
-        if self.work.n_prescribed or self.work.n_varied:
+        if self.work.n_prescribed or self.work.has_varied_loads:
             n = min(n, self.rows)
         if self.work.n_prescribed:
             releases = simulation.releases
@@ -157,9 +173,9 @@ class ExplicitStepper:
             self.acceleration_stale = self.acceleration_stale or simulation.releases != releases
             n = len(targets)
             self._upload_targets(targets)
-        if self.work.n_varied:
+        if self.work.has_varied_loads:
             times = simulation.time + dt * (np.arange(n) + int(self.work.verlet))  # Euler's forces are those at the start
-            explicit.set_rows(self.work.load_rows, simulation.load_rows(times, self._varied).reshape(-1, 3))
+            self._upload_loads(times)
         kept = simulation.state()
         try:
             result = self._launch(n, dt)
@@ -191,6 +207,13 @@ class ExplicitStepper:
         explicit.set_rows(self.work.targets, targets.reshape(-1, 3))
         upload([(self.work.prescribed_axes, self.simulation.dirichlet.prescribed_axes())])
 
+    def _upload_loads(self, times: np.ndarray) -> None:
+        """Upload the loads that follow paths, one row for each time [s]."""
+        if self.work.n_varied:
+            explicit.set_rows(self.work.load_rows, self.simulation.load_rows(times, self._varied).reshape(-1, 3))
+        if self.work.has_varied_amplitudes:
+            explicit.set_numbers(self.work.amplitude_rows, self.simulation.loads.amplitudes(times).reshape(-1))
+
     def _restore_state(self, x: np.ndarray, v: np.ndarray) -> None:
         self.simulation.set_state(x, v)
         self.simulation.set_load_time(self.simulation.time)
@@ -198,7 +221,7 @@ class ExplicitStepper:
 
     def _launch(self, n: int, dt: float) -> StepResult:
         m, s = self.simulation.model, self.work
-        if s.n_varied:
+        if s.has_varied_loads:
             self.simulation.load_time = None  # sub-steps set them
         if m.serial:
             explicit.advance_serial(m, s, n, dt, int(self.acceleration_stale))
@@ -215,7 +238,7 @@ class ExplicitStepper:
             explicit.restart_parallel(m, s)
         explicit.begin_parallel(m)
         for row in range(n):
-            if s.verlet or s.n_prescribed or s.n_held or s.n_varied:
+            if s.verlet or s.n_prescribed or s.n_held or s.has_varied_loads:
                 explicit.drift_parallel(m, s, row, dt)
             explicit.elements_parallel(m)
             explicit.nodes_parallel(m, s, row, dt)

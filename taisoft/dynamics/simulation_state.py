@@ -104,12 +104,19 @@ class SimulationState:
 
     def set_load_time(self, time: float) -> None:
         """Upload the loads of a time [s], with the drag force, unless the device has them or they are the same at any time."""
-        if not self.model.loaded or self.load_time == time or (self.load_time is not None and not len(self.loads.nodes)):
+        m = self.model
+        has_loads = m.loaded or m.amplitudes is not None
+        if not has_loads or self.load_time == time or (self.load_time is not None and not self.loads.vary):
             return
-        loads = self.loads.at(time)
-        if self.drag is not None:
-            np.add.at(loads, *self.drag)
-        upload([(self.model.loads, loads)])
+        fields = []
+        if m.loaded:
+            loads = self.loads.at(time)
+            if self.drag is not None:
+                np.add.at(loads, *self.drag)
+            fields.append((m.loads, loads))
+        if m.amplitudes is not None:
+            fields.append((m.amplitudes, self.loads.amplitudes([time])[0]))
+        upload(fields)
         self.load_time = time
 
     def load_rows(self, times: np.ndarray, nodes: np.ndarray) -> np.ndarray:

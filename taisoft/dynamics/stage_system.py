@@ -323,7 +323,7 @@ class StageSystem:
     def form(self, subset: Subset, projected: bool, c: float, beta: float) -> None:
         """Form the matrix of c and beta at the present positions, for the rows of a subset."""
         block_csr.assemble(self.model, self.matrix, subset, projected)
-        block_csr.to_system(self.model, self.matrix, self.damper or self.matrix, subset, c, beta)
+        block_csr.to_system(self.model, self.matrix, self.damper or self.matrix, subset, int(projected), c, beta)
 
     def form_matrix_and_factors(self, projected: bool = False) -> None:
         """Form the matrix and the contacts' r-factors, which stay fixed during the stage."""

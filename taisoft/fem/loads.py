@@ -1,6 +1,7 @@
-"""Dead loads of a scene as nodal forces at a time: f_a(t) = sum over loads of w_a F(t).
+"""Loads of a scene at a time: dead loads as nodal forces f_a(t) = sum over loads of w_a F(t), and loads that are one number.
 
 w_a is the reference area at node a for a traction, the fraction of the lumped mass for a total force, and 1 for a force per node.
+Numbers, such as pressures, which force terms turn into nodal forces at the present x, are the model's `amplitudes`.
 """
 
 from typing import NamedTuple
@@ -8,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from taisoft.fem import reference
-from taisoft.scene.loads import NodalForce, Traction, value_at
+from taisoft.scene.loads import NodalForce, ScalarLoad, Traction, value_at
 from taisoft.scene.scene import Body, Scene
 
 
@@ -43,6 +44,27 @@ class SceneLoads:
                     else:
                         self._paths.append(_Path(f"body {body.name!r}: {kind} {k}", load, start + nodes, weights))
         self.nodes = np.unique(np.concatenate([np.zeros(0, dtype=np.int64), *(path.nodes for path in self._paths)]))
+        self._scalars = scalar_loads(scene)
+
+    @property
+    def n_amplitudes(self) -> int:
+        """Number of loads that are one number."""
+        return len(self._scalars)
+
+    @property
+    def amplitudes_vary(self) -> bool:
+        """Whether any of these follows a path."""
+        return any(load.path is not None for _, load in self._scalars)
+
+    @property
+    def vary(self) -> bool:
+        """Whether any load follows a path."""
+        return bool(self._paths) or self.amplitudes_vary
+
+    def amplitudes(self, times: np.ndarray | list[float]) -> np.ndarray:
+        """Values (r, n_amplitudes) at the times (r,) [s], in the order of `scalar_loads`. Raises SimulationError."""
+        rows = [[float(value_at(load, float(t), name)) for name, load in self._scalars] for t in times]
+        return np.array(rows).reshape(len(times), self.n_amplitudes)
 
     def at(self, t: float) -> np.ndarray:
         """Forces (n_nodes, 3) [N] on all nodes at t [s]. Raises SimulationError if a path fails."""
@@ -57,6 +79,11 @@ class SceneLoads:
         for path in self._paths:
             rows[:, np.searchsorted(nodes, path.nodes)] += path.forces(times.tolist())
         return rows
+
+
+def scalar_loads(scene: Scene) -> list[tuple[str, ScalarLoad]]:
+    """The loads of a scene that are one number, each with its name in messages, in the order of the model's `amplitudes`."""
+    return []
 
 
 def _weights(body: Body, load: Traction | NodalForce) -> tuple[np.ndarray, np.ndarray]:

@@ -87,6 +87,7 @@ class Model:
     free: Any  # (n_nodes) 3-vectors: 1 on free axes, 0 on constrained ones
     gravity: Any  # () 3-vector [m/s^2]
     loads: Any  # (n_nodes) 3-vectors [N], or None: tractions and forces
+    amplitudes: Any  # f64, or None: present values of the loads that are one number, see `fem.loads.scalar_loads`
     node_body: Any  # (n_nodes) i32; None unless damping needs it
     damping: Any  # (n_bodies, 2), or None: mass damping [1/s], stiffness damping [s]
     consistent: bool  # mass_matrix is used
@@ -247,6 +248,8 @@ def build_model(scene: Scene, runtime: Runtime, arena: FieldArena, on: dict[str,
     node_body = np.repeat(np.arange(n_bodies, dtype=np.int32), np.diff(layout.node_start))
     velocity = np.concatenate([np.broadcast_to(b.velocity, b.rest_positions.shape) for b in scene.bodies])
     flat_nodes = np.concatenate([lane_layout(own, lanes).reshape(-1) for own in nodes])
+    scene_loads = SceneLoads(scene)
+    n_amplitudes = scene_loads.n_amplitudes
     laws = law_table(scene, layout, on["elasticity_by_tet"])
     rules = tuple(reference.quadrature(d) for d in sorted({b.quadrature_degree for b in scene.bodies if b.order == 2}))
     table = _rule_table(rules) if rules else None
@@ -278,7 +281,8 @@ def build_model(scene: Scene, runtime: Runtime, arena: FieldArena, on: dict[str,
         mass_matrix=None,
         free=arena.vectors("free", real, n_nodes, np.ones((n_nodes, 3), dtype=npr)),
         gravity=arena.vectors("gravity", real, 1, np.asarray(scene.gravity, dtype=npr)[None]),
-        loads=arena.vectors("loads", real, n_nodes, SceneLoads(scene).at(0.0).astype(npr)) if on["loads"] else None,
+        loads=arena.vectors("loads", real, n_nodes, scene_loads.at(0.0).astype(npr)) if on["loads"] else None,
+        amplitudes=arena.field("amplitudes", ti.f64, n_amplitudes, scene_loads.amplitudes([0.0])[0]) if n_amplitudes else None,
         node_body=arena.field("node_body", ti.i32, n_nodes, node_body) if damped else None,
         damping=arena.field("damping", real, (n_bodies, 2), damping_table(scene).astype(npr)) if damped else None,
         consistent=on["consistent_mass"],

@@ -131,10 +131,13 @@ def gather_edge(m: ti.template(), A: ti.template(), e):
 
 
 @kernel
-def to_system(m: ti.template(), A: ti.template(), damper: ti.template(), subset: ti.template(), c: ti.f64, beta: ti.f64):
-    """Set A = (c + beta a) M + beta^2 A + beta b K_d in place, for the rows of a subset.
+def to_system(
+    m: ti.template(), A: ti.template(), damper: ti.template(), subset: ti.template(), projected: ti.i32, c: ti.f64, beta: ti.f64
+):
+    """Set A = (c + beta a) M + beta^2 (A + K_t) + beta b K_d in place, for the rows of a subset.
 
-    a, b: mass and stiffness damping of the row's body; K_d: values of the matrix `damper`.
+    a, b: mass and stiffness damping of the row's body; K_d: values of the matrix `damper`; K_t: stiffness of the terms that have
+    STIFFNESS, without their negative part if projected.
     """
     ti.loop_config(serialize=m.serial)
     for j in range(n_nodes_of(m, subset)):
@@ -159,6 +162,9 @@ def to_system(m: ti.template(), A: ti.template(), damper: ti.template(), subset:
         for r in ti.static(range(3)):
             d[5 * r] += inertia * mass
         A.diagonal[i] = d
+        for term in ti.static(m.terms):
+            if ti.static(term.STIFFNESS):
+                term.add_stiffness(m, A, i, beta, projected)
 
 
 @ti.func

@@ -1,4 +1,4 @@
-"""Dead loads of a body, constant or along a path: on surface triangles, and on nodes."""
+"""Loads of a body, constant or along a path: on surface triangles, and on nodes."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -49,8 +49,24 @@ class NodalForce:
 
 
 @dataclass(frozen=True, eq=False)
+class ScalarLoad:
+    """A load that is one number."""
+
+    value: np.ndarray | None  #: (), in the unit of the load; None if it follows a path
+    path: Callable | None = None  #: t [s] -> such a number
+
+    def __post_init__(self):
+        checks.store(self, value=self.value)
+
+    @property
+    def shapes(self) -> tuple[tuple[int, ...], ...]:
+        """Shapes that its values may have."""
+        return ((),)
+
+
+@dataclass(frozen=True, eq=False)
 class LoadPath:
-    """Key frames as a path of a load: t [s] -> value (3,), their translations in the unit of the load."""
+    """Key frames as a path of a load: t [s] -> value (3,), their translations in the unit of the load, or a number, theirs."""
 
     frames: KeyFrames
 
@@ -58,13 +74,18 @@ class LoadPath:
         if self.frames.rotations is not None or self.frames.release or self.frames.pivot is not None:
             raise SceneError("key frames: a load has translations only, which are its values; not rotations, pivot or release")
 
-    def __call__(self, t: float) -> np.ndarray:
-        return self.frames(t)[0]
+    def __call__(self, t: float) -> np.ndarray | float:
+        return self.frames(t)[0] if self.frames.values is None else self.frames.value_at(t)
 
 
 def value_and_path(load, what: str, shapes: tuple[tuple[int, ...], ...]) -> tuple[np.ndarray | None, Callable | None]:
-    """Return (value, None) or (None, path) of a load given as a value, a function of time, or `KeyFrames`. Raises SceneError."""
+    """Return (value, None) or (None, path) of a load given as a value, a function of time, or `KeyFrames`. Raises SceneError.
+
+    shapes: those that a value may have; () for a number.
+    """
     if isinstance(load, KeyFrames):
+        if (load.values is None) != (() not in shapes):
+            raise SceneError(f"{what}: key frames need {'values' if () in shapes else 'translations'} here")
         try:
             load = LoadPath(load)
         except SceneError as error:

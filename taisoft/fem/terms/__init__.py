@@ -6,6 +6,9 @@ A term is a module with
     ACCELERATION      whether explicit steps use `acceleration(m, i)` [m/s^2] instead of `force`
     force(m, i)       on node i at the present x [N]; for elasticity, after its elements have been summed
     energy(m, i)      node i's part of its potential [J], in f64; elasticity has `element_energy` instead
+    STIFFNESS         whether it depends on x and has add_stiffness(m, A, i, beta, projected), which adds node i's row of its
+                      beta^2 K to the matrix A of implicit steps, and beta times its damping; elasticity's blocks are assembled
+                      by `linear.block_csr` itself
 and is listed in TERMS, which explicit steps, Newton's method, statics and reports iterate over. Dampers have no potential, and
 integrators treat them differently: `rayleigh_damping` holds their rates and forces. The drag spring of the window is constant
 over a step and is therefore applied as a dead load (`dynamics.drag_spring`).

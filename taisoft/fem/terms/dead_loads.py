@@ -5,7 +5,7 @@
 
 import taichi as ti
 
-SWITCH, LOAD, ACCELERATION = "loads", True, False
+SWITCH, LOAD, ACCELERATION, STIFFNESS = "loads", True, False, False
 
 
 @ti.func

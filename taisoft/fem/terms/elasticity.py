@@ -30,7 +30,7 @@ from taisoft.fem.math3 import determinant, matmul_nt, matmul_tn
 from taisoft.fem.node_graph import BLOCKS, EVERYTHING, block_of, count_of
 from taisoft.fem.state import FAILED, INVERTED_NOW, LOWEST_J
 
-SWITCH, LOAD, ACCELERATION = None, False, False
+SWITCH, LOAD, ACCELERATION, STIFFNESS = None, False, False, False
 HUGE = 1e30  # above any volume ratio
 EXPLODED = 1e9  # |J| of an inverted tet beyond which a motion has diverged: stretched a thousandfold along every axis
 

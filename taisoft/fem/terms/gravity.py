@@ -5,7 +5,7 @@ m_a is the lumped mass, or int rho N_a dV on quadratic tets in implicit steps. E
 
 import taichi as ti
 
-SWITCH, LOAD, ACCELERATION = None, True, True
+SWITCH, LOAD, ACCELERATION, STIFFNESS = None, True, True, False
 
 
 @ti.func
