@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 from taisoft.attributes import thawed
 from taisoft.errors import SimulationError
 from taisoft.queries import body_index, check_rows, nodes_of
-from taisoft.scene.plan import CHANGEABLE, change_load, change_material
+from taisoft.scene.plan import CHANGEABLE, change_load, change_material, change_tension
 from taisoft.settings import FIXED, NAMES, check_dt
 
 if TYPE_CHECKING:
@@ -19,6 +19,7 @@ INSTEAD = {  # what to do instead of assigning to an attribute that a simulator 
     **{name: f"call sim.rebuild({name}=...)" for name in NAMES if name not in FIXED},
     **dict.fromkeys(("force", "forces"), "call sim.set_force(body, index, value)"),
     **dict.fromkeys(("traction", "tractions"), "call sim.set_traction(body, index, value)"),
+    **dict.fromkeys(("tension", "tendons"), "call sim.set_tension(name, force)"),
     **dict.fromkeys(("time", "step_count"), "call sim.reset() to go back to the start"),
     **dict.fromkeys(("arch", "precision"), "make a new Simulator"),
     "gravity": "call sim.set_gravity(gravity)",
@@ -140,6 +141,13 @@ def set_traction(self: "Simulator", body: str, index: int, value) -> None:
     value: (3,) per reference area [Pa]; it replaces a path.
     """
     _set_load(self, "traction", body, index, value)
+
+
+def set_tension(self: "Simulator", name: str, value: float) -> None:
+    """Change the tension [N] of a tendon, from the next step on; it replaces a path. Raises SceneError."""
+    dynamics = self._open()
+    change_tension(self.scene, name, value)
+    dynamics.loads_changed()
 
 
 def _set_load(sim: "Simulator", kind: str, body: str, index: int, value) -> None:

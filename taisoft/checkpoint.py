@@ -23,7 +23,7 @@ from taisoft.attributes import thawed
 from taisoft.errors import SceneError, SimulationError
 from taisoft.files import replacing
 from taisoft.scene.fingerprint import FEATURES, digest, run_time_numbers, scene_fingerprint
-from taisoft.scene.plan import LOADS, Numbers, change_load, first_difference, scene_numbers
+from taisoft.scene.plan import LOADS, Numbers, change_load, change_tension, first_difference, scene_numbers
 from taisoft.scene.scene import Material, Scene
 from taisoft.settings import NAMES, plan_of
 
@@ -134,14 +134,20 @@ def restore_numbers(saved: Checkpoint, scene: Scene) -> None:
                     value = saved.state["loads"][str(k)][kind][str(i)]
                     if value is not None:
                         change_load(body, kind, i, value)
+        for name, value in saved.state.get("loads", {}).get("tendons", {}).items():
+            if value is not None:
+                change_tension(scene, name, value)
 
 
 def load_values(scene: Scene) -> dict:
     """Return the present values of all loads of a scene, None for one that follows its path, as part of a checkpoint's state."""
-    return {
+    values = {
         str(k): {kind: {str(i): load.value for i, load in enumerate(getattr(body, name))} for kind, name in LOADS.items()}
         for k, body in enumerate(scene.bodies)
     }
+    if scene.tendons:
+        values["tendons"] = {one.name: None if one.value is None else float(one.value) for one in scene.tendons}
+    return values
 
 
 def _flat(state: dict, prefix: str = "") -> tuple[dict, dict[str, np.ndarray]]:

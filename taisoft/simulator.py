@@ -139,6 +139,7 @@ class Simulator(Guarded):
     velocities = queries.velocities
     energies = queries.energies
     reactions = queries.reactions
+    joint_force = queries.joint_force
     stress = queries.stress
     elastic_forces = queries.elastic_forces
     force_differential = queries.force_differential
@@ -169,6 +170,7 @@ class Simulator(Guarded):
     set_contact = changes.set_contact
     set_force = changes.set_force
     set_traction = changes.set_traction
+    set_tension = changes.set_tension
     drag = changes.drag
     release = changes.release
 

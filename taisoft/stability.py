@@ -11,6 +11,8 @@ import scipy.sparse.linalg as spl
 
 from taisoft.errors import SceneError
 from taisoft.fem import reference
+from taisoft.fem.loads import SceneLoads
+from taisoft.fem.springs import spring_table
 from taisoft.scene.scene import Body, Scene
 
 MAX_WEIGHT_STRAIN = 0.5  # strain of a body under its own weight above which its scale is questioned
@@ -120,24 +122,70 @@ def _verlet_matrix(z: float, alpha: float, beta: float) -> np.ndarray:
 def stable_dt(scene: Scene, verlet: bool) -> float:
     """Largest stable step [s] of an explicit integrator about the rest shape; infinite if nothing can vibrate.
 
-    It is 2/omega_max without damping, else the dt at which an eigenvalue of the step matrix leaves the unit disk.
+    It is 2/omega_max without damping, else the dt at which an eigenvalue of the step matrix leaves the unit disk. Springs add
+    their own largest omega^2 and damping rate to those of the bodies that they connect, which is an upper bound.
     """
     limit = np.inf
+    connected = {owner for one in scene.connections for owner in one.owners}
+    square, rate = spring_rates(scene) if connected else (0.0, 0.0)
     for body in scene.bodies:
-        omega = highest_frequency(body)
+        omega, material, own_square, own_rate = highest_frequency(body), body.composition.first, 0.0, 0.0
         if omega > 0.0:
-            material = body.composition.first
-            limit = min(limit, _stable_dt_of(omega, material.mass_damping, material.stiffness_damping, verlet))
+            if body.name in connected:
+                own_square, own_rate = square, rate
+            own_rate += material.stiffness_damping * omega**2
+            limit = min(limit, _stable_dt_of(np.sqrt(omega**2 + own_square), material.mass_damping, own_rate, verlet))
     return float(limit)
 
 
-def _stable_dt_of(omega: float, mass_damping: float, stiffness_damping: float, verlet: bool) -> float:
-    if mass_damping == 0.0 and stiffness_damping == 0.0:
+def spring_rates(scene: Scene) -> tuple[float, float]:
+    """Upper bounds of the largest omega^2 [1/s^2] and damping rate [1/s] that springs alone give the nodes at the start.
+
+    Each acts as if it had its stiffness, or its tension over its length if that is larger, in all directions.
+    """
+    table = spring_table(scene)
+    length = np.linalg.norm(table.vectors(_start_positions(scene)), axis=1)
+    given = np.append(SceneLoads(scene).amplitudes([0.0])[0], 0.0)[table.slot]
+    largest = np.maximum(table.stiffness, given / np.where(given > 0.0, length, 1.0))
+    scaled = sp.csr_matrix((table.weight / np.sqrt(reference.lumped_masses(scene)[table.node]), table.node, table.start))
+    return tuple(_largest_eigenvalue(scaled, weights) for weights in (largest, table.damping))
+
+
+def _start_positions(scene: Scene) -> np.ndarray:
+    return np.concatenate([body.rest_positions + body.position for body in scene.bodies])
+
+
+def _largest_eigenvalue(rows: sp.csr_matrix, weights: np.ndarray) -> float:
+    """Upper bound of the largest eigenvalue of sum_e w_e r_e^T r_e, within a percent."""
+    if not weights.any():
+        return 0.0
+    rows = sp.diags(np.sqrt(weights)) @ rows
+    gram = (rows @ rows.T).tocsr()  # has the same one
+    if gram.shape[0] <= 100:
+        return float(np.linalg.eigvalsh(gram.toarray())[-1])
+    start = np.random.default_rng(0).normal(size=gram.shape[0])
+    top = spl.eigsh(gram, k=1, which="LA", tol=LANCZOS_MARGIN - 1.0, v0=start, return_eigenvectors=False)
+    return LANCZOS_MARGIN**2 * float(top[0])
+
+
+def spring_stiffness(scene: Scene) -> sp.csr_matrix:
+    """Stiffness matrix (3n, 3n) of a scene's springs, tendons and attachments at the start [N/m]."""
+    table = spring_table(scene)
+    e = table.vectors(_start_positions(scene))
+    given = np.append(SceneLoads(scene).amplitudes([0.0])[0], 0.0)[table.slot]
+    blocks = table.stiffness_blocks(e, given)
+    rows = sp.csr_matrix((table.weight, table.node, table.start), shape=(len(e), len(_start_positions(scene))))
+    C = sp.kron(rows, sp.identity(3), format="csr")
+    return (C.T @ sp.block_diag(blocks, format="csr") @ C).tocsr()
+
+
+def _stable_dt_of(omega: float, mass_damping: float, damping_rate: float, verlet: bool) -> float:
+    if mass_damping == 0.0 and damping_rate == 0.0:
         return 2.0 / omega
     step = _verlet_matrix if verlet else _euler_matrix
 
     def stable(dt: float) -> bool:
-        matrix = step(omega * dt, mass_damping * dt, stiffness_damping * omega**2 * dt)
+        matrix = step(omega * dt, mass_damping * dt, damping_rate * dt)
         return np.abs(np.linalg.eigvals(matrix)).max() <= 1.0 + 1e-9
 
     low, high = 0.0, 2.0 / omega
@@ -169,7 +217,8 @@ def modes(scene: Scene, k: int, mass: str = "lumped") -> Modes:
     n_free = int(free.sum())
     if isinstance(k, bool) or not isinstance(k, (int, np.integer)) or not 1 <= k <= n_free:
         raise SceneError(f"k = {k!r}: it must be a whole number from 1 to the {n_free} free axes of the scene")
-    K = sp.block_diag([hooke_stiffness(b) for b in scene.bodies], format="csr")[free][:, free]
+    K = sp.block_diag([hooke_stiffness(b) for b in scene.bodies], format="csr")
+    K = (K + spring_stiffness(scene) if scene.connections else K)[free][:, free]
     if mass == "lumped":
         M = sp.diags(np.repeat(reference.lumped_masses(scene), 3)[free], format="csc")
     else:

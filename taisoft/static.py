@@ -92,13 +92,24 @@ def _check(scene: Scene, tolerance: float) -> None:
             f"solve_static does not model contact, so the scene must have no obstacles ('{scene.obstacles[0].name}'): step it "
             "to rest with mass damping instead"
         )
+    held = {body.name: np.any([c.axes for c in body.constraints], axis=0) for body in scene.bodies if body.constraints}
+    for names in _connected(scene):
+        together = np.any([held.get(name, np.zeros(3, dtype=bool)) for name in names], axis=0)
+        held |= dict.fromkeys(names, together | any(name not in [body.name for body in scene.bodies] for name in names))
     for body in scene.bodies:
-        constrained = np.zeros(3, dtype=bool)
-        for c in body.constraints:
-            constrained |= c.axes
+        constrained = held.get(body.name, np.zeros(3, dtype=bool))
         if not constrained.all():
             missing = "".join(a for a, is_constrained in zip("xyz", constrained, strict=True) if not is_constrained)
             raise SceneError(f"body '{body.name}': nothing holds it along {missing}, so it has no static state")
+
+
+def _connected(scene: Scene) -> list[set[str]]:
+    """Return the names of bodies and obstacles that connections join, a set for each group."""
+    groups: list[set[str]] = []
+    for one in scene.connections:
+        joined = [group for group in groups if group & set(one.owners)]
+        groups = [group for group in groups if group not in joined] + [set(one.owners).union(*joined)]
+    return groups
 
 
 class StaticSolver:
@@ -107,7 +118,10 @@ class StaticSolver:
     def __init__(self, scene: Scene, runtime: Runtime, arena: FieldArena, tolerance: float, time: float):
         plan = make_plan(scene, explicit=False, multistep=False)
         model, layout = build_model(
-            scene, runtime, arena, {**plan.on, "mass_damping": False, "stiffness_damping": False, "consistent_mass": False}
+            scene,
+            runtime,
+            arena,
+            plan.on | dict.fromkeys(("mass_damping", "stiffness_damping", "spring_damping", "consistent_mass"), False),
         )
         self.simulation = SimulationState(scene, runtime, arena, model, layout, DirichletConditions(scene, layout))
         self.solver = StageSystem(model, arena, runtime.eps, self.simulation.dirichlet.prescribed_nodes, NoContacts())

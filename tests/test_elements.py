@@ -17,6 +17,7 @@ from scenes import cube, rubber
 
 import taisoft as ts
 from taisoft.fem import reference
+from taisoft.mesh.nodes import shape_functions
 
 ORDERS = (1, 2)
 POINTS = np.random.default_rng(3).dirichlet(np.ones(4), 20)  # barycentric
@@ -52,17 +53,17 @@ def test_nodes(order):
 
 @pytest.mark.parametrize("order", ORDERS)
 def test_shape_functions(order):
-    N, s = reference.shape_functions(order, POINTS), reference.shape_derivatives(order, POINTS)
+    N, s = shape_functions(order, POINTS), reference.shape_derivatives(order, POINTS)
     assert N.shape == (20, (4, 10)[order - 1]) and np.abs(N.sum(axis=1) - 1).max() < 1e-15
     # grad N_a = s_ak grad l_k, and the grad l_k sum to 0: the grad N_a sum to 0 if the sums over a are equal for all k
     assert np.ptp(s.sum(axis=1), axis=1).max() < 1e-14
     at_nodes = np.concatenate([np.eye(4), [(np.eye(4)[a] + np.eye(4)[b]) / 2 for a, b in reference.EDGES]])
     at_nodes = at_nodes[: N.shape[1]]
-    assert np.array_equal(reference.shape_functions(order, at_nodes), np.eye(N.shape[1]))
+    assert np.array_equal(shape_functions(order, at_nodes), np.eye(N.shape[1]))
     h = 1e-6
     for k in range(4):  # N is a polynomial in all four coordinates
         step = h * np.eye(4)[k]
-        change = reference.shape_functions(order, POINTS + step) - reference.shape_functions(order, POINTS - step)
+        change = shape_functions(order, POINTS + step) - shape_functions(order, POINTS - step)
         assert np.abs(s[:, :, k] - change / (2 * h)).max() < 1e-9
 
 

@@ -2,8 +2,8 @@
 
 Symplectic Euler (semi-implicit Euler): v += dt a(x, v); x += dt v. First order, stable for dt < 2/omega_max.
 Velocity Verlet: half kick, drift, force, half kick. Second order, same cost and stability limit.
-Damping: the stiffness part -c K(x) v enters the force (K projected positive; Verlet extrapolates v to the force's time,
-which keeps it second order); the mass part is a factor on v, exact in Verlet and `1 - dt a` in Euler.
+Damping: the stiffness part -c K(x) v enters the force (K projected positive), as that of springs does; Verlet extrapolates v to
+the force's time, which keeps it second order; the mass part is a factor on v, exact in Verlet and `1 - dt a` in Euler.
 A small mesh runs all its sub-steps in one serial kernel; a large one takes two parallel loops per sub-step.
 """
 
@@ -71,9 +71,9 @@ def verlet_half(m: ti.template(), s: ti.template(), i, dt):
 
 @ti.func
 def verlet_drift(m: ti.template(), s: ti.template(), i, dt, half):
-    """Drift by the mid-step velocity; with stiffness damping, then extrapolate v to the force's time."""
+    """Drift by the mid-step velocity; if forces depend on v, then extrapolate it to their time."""
     m.state.x[i] = m.state.x[i] + ti.cast(dt * half, ti.f64)
-    if ti.static(m.stiffness_damping):
+    if ti.static(m.depends_on_velocity):
         s.half_velocity[i] = half
         m.state.v[i] = half + 0.5 * dt * s.acceleration[i]
     else:
@@ -85,7 +85,7 @@ def verlet_kick(m: ti.template(), s: ti.template(), i, dt):
     """Apply the second half kick and return v."""
     a = acceleration(m, i)
     half = m.state.v[i]
-    if ti.static(m.stiffness_damping):
+    if ti.static(m.depends_on_velocity):
         half = s.half_velocity[i]
     v = half + 0.5 * dt * a
     if ti.static(m.damped):

@@ -31,7 +31,7 @@ class SubstepWork:
     n_prescribed: Count
     n_held: Count
     acceleration: Any  # (n_nodes) 3-vectors, Verlet
-    half_velocity: Any  # (n_nodes) 3-vectors, Verlet with stiffness damping
+    half_velocity: Any  # (n_nodes) 3-vectors, Verlet with forces that depend on v
     prescribed_nodes: Any  # (n_prescribed) i32
     prescribed_axes: Any  # (n_prescribed) 3-vectors i32
     targets: Any  # (rows * n_prescribed) 3-vectors f64
@@ -107,7 +107,7 @@ class ExplicitStepper:
             n_prescribed=n_prescribed,
             n_held=n_held,
             acceleration=vectors("acceleration", m.n_nodes, needed=verlet),
-            half_velocity=vectors("half_velocity", m.n_nodes, needed=verlet and m.stiffness_damping),
+            half_velocity=vectors("half_velocity", m.n_nodes, needed=verlet and m.depends_on_velocity),
             prescribed_nodes=ids("prescribed_nodes", dirichlet.prescribed_nodes),
             prescribed_axes=vectors("prescribed_axes", n_prescribed, ti.i32, data=dirichlet.prescribed_axes()),
             targets=vectors("targets", self.rows * n_prescribed, ti.f64),

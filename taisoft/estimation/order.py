@@ -24,8 +24,10 @@ def nominal_order(integrator: str, scene: Scene, touches: bool) -> int:
 def is_smooth(scene: Scene, touches: bool) -> bool:
     """Whether second-order methods keep their order: not with contacts, velocity-dependent forces, or paths, which may jump."""
     materials = [body.composition.first for body in scene.bodies]
-    prescribed = any(one.path is not None for body in scene.bodies for one in (*body.constraints, *body.loads))
+    constraints = [constraint for body in scene.bodies for constraint in body.constraints]
+    prescribed = any(one.path is not None for one in (*constraints, *scene.loads))
     damped = any(material.mass_damping or material.stiffness_damping for material in materials)
+    damped = damped or any(one.damping for one in scene.connections)
     return not (prescribed or damped or touches)
 
 

@@ -8,8 +8,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from taisoft.errors import SimulationError
 from taisoft.fem import reference
-from taisoft.scene.loads import NodalForce, ScalarLoad, Traction, value_at
+from taisoft.scene.connections import Tendon
+from taisoft.scene.loads import NodalForce, Traction, value_at
 from taisoft.scene.scene import Body, Scene
 
 
@@ -63,7 +65,7 @@ class SceneLoads:
 
     def amplitudes(self, times: np.ndarray | list[float]) -> np.ndarray:
         """Values (r, n_amplitudes) at the times (r,) [s], in the order of `scalar_loads`. Raises SimulationError."""
-        rows = [[float(value_at(load, float(t), name)) for name, load in self._scalars] for t in times]
+        rows = [[_number_at(load, float(t), name) for name, load in self._scalars] for t in times]
         return np.array(rows).reshape(len(times), self.n_amplitudes)
 
     def at(self, t: float) -> np.ndarray:
@@ -81,9 +83,21 @@ class SceneLoads:
         return rows
 
 
-def scalar_loads(scene: Scene) -> list[tuple[str, ScalarLoad]]:
+def _number_at(load: Tendon, t: float, what: str) -> float:
+    value = float(value_at(load, t, what))
+    if value < 0.0:
+        raise SimulationError(f"{what}: its path gave {value:g} N at t = {t:g} s: a tendon cannot push")
+    return value
+
+
+def scalar_loads(scene: Scene) -> list[tuple[str, Tendon]]:
     """The loads of a scene that are one number, each with its name in messages, in the order of the model's `amplitudes`."""
-    return []
+    return [(f"tendon {tendon.name!r}: force", tendon) for tendon in scene.tendons]
+
+
+def tension_slots(scene: Scene) -> dict[str, int]:
+    """The place of each tendon's tension among the model's `amplitudes`, by the tendon's name."""
+    return {load.name: k for k, (_, load) in enumerate(scalar_loads(scene)) if isinstance(load, Tendon)}
 
 
 def _weights(body: Body, load: Traction | NodalForce) -> tuple[np.ndarray, np.ndarray]:

@@ -5,7 +5,7 @@ import taichi as ti
 from taisoft.backend.runtime import kernel
 from taisoft.fem.lanes import broadcast, mass_times
 from taisoft.fem.state import ELASTIC, FIRST_SOFTENED, GRAVITY, KINETIC, LOADS, MIN_J, N_INVERTED
-from taisoft.fem.terms import dead_loads, elasticity, gravity
+from taisoft.fem.terms import dead_loads, elasticity, gravity, springs
 from taisoft.fem.terms.elasticity import HUGE
 
 NO_TET = 2**31 - 1  # above any tet index
@@ -73,3 +73,7 @@ def measure(m: ti.template()):
                 else:
                     total += value
             m.state.scalars[k] = total
+        if ti.static(m.has_springs):
+            for s in range(m.springs.n):
+                m.state.scalars[ELASTIC] = m.state.scalars[ELASTIC] + springs.elastic_energy(m, s)
+                m.state.scalars[LOADS] = m.state.scalars[LOADS] + springs.load_energy(m, s)

@@ -14,7 +14,7 @@ import taichi as ti
 
 from taisoft.backend.arrays import Count, FieldArena, download, upload
 from taisoft.backend.runtime import Runtime, threads
-from taisoft.fem import reference
+from taisoft.fem import reference, springs
 from taisoft.fem.laws import LAWS
 from taisoft.fem.loads import SceneLoads
 from taisoft.fem.node_graph import PAIRS, NodeGraph, node_graph
@@ -86,6 +86,7 @@ class Model:
     mass_matrix: Any  # MassMatrix, or None: consistent mass
     free: Any  # (n_nodes) 3-vectors: 1 on free axes, 0 on constrained ones
     gravity: Any  # () 3-vector [m/s^2]
+    springs: Any  # fem.springs.Springs, or None
     loads: Any  # (n_nodes) 3-vectors [N], or None: tractions and forces
     amplitudes: Any  # f64, or None: present values of the loads that are one number, see `fem.loads.scalar_loads`
     node_body: Any  # (n_nodes) i32; None unless damping needs it
@@ -94,8 +95,19 @@ class Model:
     loaded: bool
     damped: bool
     stiffness_damping: bool
+    spring_damping: bool
     elasticity_by_tet: bool  # law_constants may differ between the tets of a body
     chunks: int  # parts of a loop, each with its own partial sums
+
+    @property
+    def has_springs(self) -> bool:
+        """Whether there are springs, tendons or attachments."""
+        return self.springs is not None
+
+    @property
+    def depends_on_velocity(self) -> bool:
+        """Whether forces other than mass damping depend on velocities."""
+        return self.stiffness_damping or self.spring_damping
 
 
 @dataclass(frozen=True)
@@ -198,7 +210,7 @@ def _gather_table(nodes, groups: tuple[Group, ...], real: np.ndarray, n_nodes: i
 
 
 def model_graph(model: Model) -> tuple[NodeGraph, np.ndarray]:
-    """Node pairs that share a tet, and for each pair of each tet its index in the assembly buffer times lanes, plus its lane."""
+    """Pairs of nodes that share a tet or a spring, and for each pair of each tet where the assembly buffer has its block."""
     (nodes, volume), lanes = download([model.nodes, model.volume]), model.lanes
     flat, real = nodes.astype(np.int64), volume.reshape(-1) > 0
     ends, entries = [], []
@@ -209,7 +221,11 @@ def model_graph(model: Model) -> tuple[NodeGraph, np.ndarray]:
         ends.append(own[:, pairs].reshape(-1, 2))
         base = g.matrix_at + (lane // lanes)[:, None] * (MATRIX_BLOCKS[g.order] * 9) + 9 * np.arange(len(pairs))
         entries.append((base * lanes + (lane % lanes)[:, None]).reshape(-1))
-    return node_graph(np.concatenate(ends), model.n_nodes), np.concatenate(entries)
+    entries = np.concatenate(entries)
+    if model.springs is not None:
+        ends.append(springs.node_pairs(*download([model.springs.start, model.springs.node])))
+    graph = node_graph(np.concatenate(ends), model.n_nodes)
+    return replace(graph, pair=graph.pair[: len(entries)]), entries
 
 
 def lane_layout(values: np.ndarray, lanes: int) -> np.ndarray:
@@ -281,6 +297,7 @@ def build_model(scene: Scene, runtime: Runtime, arena: FieldArena, on: dict[str,
         mass_matrix=None,
         free=arena.vectors("free", real, n_nodes, np.ones((n_nodes, 3), dtype=npr)),
         gravity=arena.vectors("gravity", real, 1, np.asarray(scene.gravity, dtype=npr)[None]),
+        springs=springs.build_springs(scene, arena, n_nodes, on["assembled_stiffness"]) if on["springs"] else None,
         loads=arena.vectors("loads", real, n_nodes, scene_loads.at(0.0).astype(npr)) if on["loads"] else None,
         amplitudes=arena.field("amplitudes", ti.f64, n_amplitudes, scene_loads.amplitudes([0.0])[0]) if n_amplitudes else None,
         node_body=arena.field("node_body", ti.i32, n_nodes, node_body) if damped else None,
@@ -289,6 +306,7 @@ def build_model(scene: Scene, runtime: Runtime, arena: FieldArena, on: dict[str,
         loaded=on["loads"],
         damped=damped,
         stiffness_damping=on["stiffness_damping"],
+        spring_damping=on["spring_damping"],
         elasticity_by_tet=on["elasticity_by_tet"],
         chunks=chunks,
     )

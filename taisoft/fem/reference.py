@@ -53,14 +53,6 @@ def quadrature(degree: int) -> Quadrature:
     return Quadrature(np.array(points), np.array(weights) / np.sum(weights))
 
 
-def shape_functions(order: int, points: np.ndarray) -> np.ndarray:
-    """N_a (p, 4 or 10) at barycentric points (p,4)."""
-    if order == 1:
-        return points.copy()
-    middles = [4.0 * points[:, a] * points[:, b] for a, b in EDGES]
-    return np.concatenate([points * (2.0 * points - 1.0), np.stack(middles, axis=1)], axis=1)
-
-
 def shape_derivatives(order: int, points: np.ndarray) -> np.ndarray:
     """s (p, 4 or 10, 4) with grad N_a = sum_k s_ak grad l_k at barycentric points (p,4)."""
     corner = np.eye(4) * (np.ones((len(points), 1)) if order == 1 else 4.0 * points - 1.0)[:, :, None]

@@ -18,6 +18,7 @@ from taisoft.backend.runtime import kernel
 from taisoft.errors import SimulationError
 from taisoft.fem.model import MATRIX_BLOCKS, Model, model_graph
 from taisoft.fem.node_graph import BLOCKS, EDGES, block_of, count_of, edge_of, n_nodes_of, node_of
+from taisoft.fem.springs import set_pair_entries
 from taisoft.fem.terms import rayleigh_damping
 from taisoft.linear.element_blocks import element_blocks, pair_terms
 
@@ -56,6 +57,8 @@ def build_block_csr(model: Model, arena: FieldArena, prefix: str = "stiffness") 
     if base.max(initial=0) > np.iinfo(np.int32).max - 9 * model.lanes:
         raise SimulationError(f"{int(model.volume.shape[0]) * model.lanes} tets are too many to assemble a stiffness matrix")
     n_edges, rules = len(graph.ends), {}
+    if model.springs is not None:
+        set_pair_entries(model.springs, graph.row_start, graph.column)
 
     def copied(name: str, data: np.ndarray, dtype=ti.i32):
         return arena.field(f"{prefix}_{name}", dtype, data.shape, data)

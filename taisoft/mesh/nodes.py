@@ -76,6 +76,14 @@ def make_nodes(mesh: TetMesh, order: int) -> Nodes:
     return Nodes(positions, elements, surface, surface_tets, tets.reshape(-1, 4))
 
 
+def shape_functions(order: int, points: np.ndarray) -> np.ndarray:
+    """N_a (p, 4 or 10) at barycentric points (p,4)."""
+    if order == 1:
+        return points.copy()
+    middles = [4.0 * points[:, a] * points[:, b] for a, b in EDGES]
+    return np.concatenate([points * (2.0 * points - 1.0), np.stack(middles, axis=1)], axis=1)
+
+
 def _shortest_diagonals(mesh: TetMesh) -> np.ndarray:
     """Return (m,) k = 0, 1 or 2: the diagonal between edges k and 5 - k is the octahedron's shortest."""
     ascending = np.argsort(mesh.tets, axis=1)  # local corners by ascending vertex number

@@ -8,6 +8,7 @@ from collections.abc import Callable
 import numpy as np
 
 from taisoft.scene.body import Body
+from taisoft.scene.connections import Attachment, Connection, Tendon
 from taisoft.scene.key_frames import NodePath, ShapePath
 from taisoft.scene.loads import LoadPath
 from taisoft.scene.scene import Scene
@@ -31,6 +32,8 @@ def scene_fingerprint(scene: Scene, features: dict[str, bool]) -> dict[str, str]
         fingerprint[f"{owner}: shape, friction, restitution or path"] = digest(
             [type(shape).__name__, *values, obstacle.friction, obstacle.restitution, *_path_parts(obstacle.path)]
         )
+    for one in scene.connections:
+        fingerprint[f"{type(one).__name__.lower()} '{one.name}'"] = digest(_connection_parts(one))
     fingerprint["collision settings"] = digest([json.dumps(dataclasses.asdict(scene.collision)), scene.contact_forces])
     # features unused at the start, such as damping 0, are compiled out
     fingerprint[FEATURES] = digest([json.dumps(features)])
@@ -39,7 +42,7 @@ def scene_fingerprint(scene: Scene, features: dict[str, bool]) -> dict[str, str]
 
 def scene_digest(scene: Scene) -> str:
     """Return a digest of everything comparable in a scene: its parts as a checkpoint compares them, and its numbers."""
-    loads = [load.value for body in scene.bodies for load in body.loads]
+    loads = [load.value for load in scene.loads]
     return digest(
         [json.dumps(scene_fingerprint(scene, {})), json.dumps(run_time_numbers(scene)), scene.allow_initial_overlap, *loads]
     )
@@ -61,12 +64,20 @@ def _body_parts(body: Body) -> dict[str, list]:
     }
 
 
+def _connection_parts(one: Connection) -> list:
+    """Return the values that define a connection; the tension of a tendon is one of the numbers that may change."""
+    if isinstance(one, Attachment):
+        return [one.a, one.nodes, one.b, one.stiffness, one.damping]
+    points = [part for point in one.points for part in (point.owner, point.position)]
+    return points + (_path_parts(one.path) if isinstance(one, Tendon) else [one.stiffness, one.rest_length, one.damping])
+
+
 def _path_parts(path: Callable | None) -> list:
     """Return the comparable values of a path: the data of key frames; of another function only that it exists."""
     if not isinstance(path, (NodePath, ShapePath, LoadPath)):
         return [path is None]
     frames = path.frames
-    values = [frames.times, frames.translations, frames.rotations, frames.pivot, frames.smooth, frames.release]
+    values = [frames.times, frames.translations, frames.rotations, frames.pivot, frames.smooth, frames.release, frames.values]
     start = {NodePath: "starts", ShapePath: "center"}.get(type(path))  # in whose frame key frames are
     return values + ([getattr(path, start)] if start else [])
 

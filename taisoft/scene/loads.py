@@ -49,22 +49,6 @@ class NodalForce:
 
 
 @dataclass(frozen=True, eq=False)
-class ScalarLoad:
-    """A load that is one number."""
-
-    value: np.ndarray | None  #: (), in the unit of the load; None if it follows a path
-    path: Callable | None = None  #: t [s] -> such a number
-
-    def __post_init__(self):
-        checks.store(self, value=self.value)
-
-    @property
-    def shapes(self) -> tuple[tuple[int, ...], ...]:
-        """Shapes that its values may have."""
-        return ((),)
-
-
-@dataclass(frozen=True, eq=False)
 class LoadPath:
     """Key frames as a path of a load: t [s] -> value (3,), their translations in the unit of the load, or a number, theirs."""
 

@@ -13,6 +13,7 @@ from taisoft.errors import SceneError
 from taisoft.scene import checks
 from taisoft.scene.body import Body
 from taisoft.scene.collision import has_sharp_edges
+from taisoft.scene.connections import check_tension
 from taisoft.scene.material import LAWS
 from taisoft.scene.obstacles import Box, MeshObstacle
 from taisoft.scene.scene import Scene
@@ -85,6 +86,10 @@ def make_plan(scene: Scene, explicit: bool, multistep: bool, self_collision: boo
     add_if_any("moving_nodes", lambda b: any(c.path is not None for c in b.constraints), "paths on", "no node follows a path")
     for damping in ("mass_damping", "stiffness_damping"):
         add_if_any(damping, lambda b, d=damping: getattr(b.composition.first, d) > 0, "material of", f"every {damping} is 0")
+    connected = [one.name for one in scene.connections]
+    plan.add("springs", connected, _shorten(connected), "no spring, tendon or attachment")
+    damped = [one.name for one in scene.connections if one.damping > 0.0]
+    plan.add("spring_damping", damped, _shorten(damped), "no spring or attachment is damped")
     plan.add("assembled_stiffness", not explicit, "implicit steps solve linear systems", "explicit steps need forces only")
     plan.add("past_states", multistep, "the integrator uses the two previous steps", "a one-step integrator")
     plan.add(
@@ -167,6 +172,18 @@ def change_load(body: Body, kind: str, index: int, value) -> None:
         getattr(body, LOADS[kind])[index] = new
 
 
+def change_tension(scene: Scene, name: str, value) -> None:
+    """Set the tension [N] of a tendon; it replaces a path. Raises SceneError."""
+    names = [tendon.name for tendon in scene.tendons]
+    if name not in names:
+        raise SceneError(f"set_tension: no tendon is called {name!r}{checks.nearest(str(name), names)}")
+    index, what = names.index(name), f"tendon {name!r}: force"
+    new = replace(scene.tendons[index], value=checks.array(value, what, ((),)), path=None)
+    check_tension(new.value, what)
+    with thawed(scene):
+        scene.tendons[index] = new
+
+
 def scene_numbers(scene: Scene) -> Numbers:
     """Return as plain data gravity, all material numbers, load values, and friction and restitution set for pairs."""
     numbers: Numbers = {"gravity": scene.gravity.tolist()}
@@ -182,6 +199,7 @@ def scene_numbers(scene: Scene) -> Numbers:
             for i, load in enumerate(getattr(body, loads)):
                 if load.path is None:
                     numbers[f"body {body.name!r}: {kind} {i}"] = load.value.tolist()
+    numbers |= {f"tendon {one.name!r}: force": float(one.value) for one in scene.tendons if one.path is None}
     for names, (friction, restitution) in scene.contact_pairs.items():
         pair = " and ".join(repr(name) for name in sorted(names))
         numbers |= {f"contact of {pair}: friction": friction, f"contact of {pair}: restitution": restitution}

@@ -18,6 +18,7 @@ from taisoft.mesh.nodes import make_nodes
 from taisoft.mesh.tet_mesh import TetMesh
 from taisoft.mesh.topology import distinct_edges
 from taisoft.scene.body import Body, Constraint
+from taisoft.scene.connections import Attachment
 from taisoft.scene.key_frames import KeyFrames, NodePath
 from taisoft.scene.loads import LoadPath, NodalForce, Traction
 from taisoft.scene.scene import Scene
@@ -32,38 +33,48 @@ def refined(scene: Scene) -> Scene:
 
 def with_order(scene: Scene, order: int) -> Scene:
     """Return the scene with all bodies of order 1 or 2. Raises SceneError as `refined` does."""
-    return _with_bodies(scene, [copy.copy(body) if body.order == order else _of_order(body, order) for body in scene.bodies])
+    made = []
+    for body in scene.bodies:
+        same = copy.copy(body), _own_parents(body.n_nodes)
+        made.append(same if body.order == order else _of_order(body, order))
+    return _with_bodies(scene, made)
 
 
-def _with_bodies(scene: Scene, bodies: list[Body]) -> Scene:
-    copied = scene.snapshot()
+def _with_bodies(scene: Scene, made: list[tuple[Body, np.ndarray]]) -> Scene:
+    """Return the scene with other bodies. made: each with the two old nodes that each of its nodes bisects."""
+    copied, by_name = scene.snapshot(), {body.name: (body, parents) for body, parents in made}
     with thawed(copied):
-        copied.bodies = bodies
+        copied.bodies = [body for body, _ in made]
+        copied.attachments = []
+    for one in scene.attachments:
+        where = _chosen(scene.body(one.a), one, by_name[one.a][1])
+        copied.attach(one.a, where, one.b, one.stiffness, one.damping, one.name)
     return copied
 
 
-def _refined(old: Body) -> Body:
+def _refined(old: Body) -> tuple[Body, np.ndarray]:
     split = old.nodes if old.order == 2 else make_nodes(old.mesh, 2)
     regions = None if old.mesh.regions is None else np.repeat(old.mesh.regions, PARTS)
     mesh = TetMesh(split.positions, split.tets, regions=regions, region_names=old.mesh.region_names)
     edges, _ = distinct_edges(mesh.tets if old.order == 2 else old.mesh.tets)
-    new = _on_mesh(old, mesh, old.order, np.concatenate([_own_parents(old.n_nodes), edges]))
+    parents_of_nodes = np.concatenate([_own_parents(old.n_nodes), edges])
+    new = _on_mesh(old, mesh, old.order, parents_of_nodes)
     # Row of the new surface -> triangle of the old one: split.surface lists the four parts of each triangle in sequence.
     rows = {tuple(sorted(t)): k // 4 for k, t in enumerate(split.surface.tolist())}
     parents = np.array([rows[tuple(sorted(t))] for t in mesh.surface.tolist()])
     for load in old.tractions:
         new.add_traction(np.isin(parents, load.triangles), _load_of(load))
-    return new
+    return new, parents_of_nodes
 
 
-def _of_order(old: Body, order: int) -> Body:
+def _of_order(old: Body, order: int) -> tuple[Body, np.ndarray]:
     parents = _own_parents(old.mesh.n_verts)
     if order == 2:
         parents = np.concatenate([parents, distinct_edges(old.mesh.tets)[0]])
     new = _on_mesh(old, old.mesh, order, parents)
     for load in old.tractions:
         new.add_traction(load.triangles, _load_of(load))
-    return new
+    return new, parents
 
 
 def _own_parents(n: int) -> np.ndarray:
@@ -100,7 +111,7 @@ def _load_of(load: Traction | NodalForce):
     return load.value if load.path is None else load.path.frames if isinstance(load.path, LoadPath) else load.path
 
 
-def _chosen(old: Body, item: Constraint | NodalForce, parents: np.ndarray):
+def _chosen(old: Body, item: Constraint | NodalForce | Attachment, parents: np.ndarray):
     """Return the selection of new nodes: the function that chose the old ones, or ids (k,)."""
     if item.where is not None:
         return item.where

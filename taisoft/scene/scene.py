@@ -1,4 +1,4 @@
-"""Describe a scene as plain data: elastic bodies, obstacles, gravity, and contact parameters of pairs.
+"""Describe a scene as plain data: elastic bodies, obstacles, connections, gravity, and contact parameters of pairs.
 
 Every input is validated and converted to arrays when it is added, so an existing scene can be simulated.
 """
@@ -16,21 +16,27 @@ from taisoft.mesh.tet_mesh import TetMesh
 from taisoft.scene import checks
 from taisoft.scene.body import USE_A_COPY, Body
 from taisoft.scene.collision import CollisionSettings
+from taisoft.scene.connections import Attachment, Connection, Spring, Tendon, add_spring, add_tendon, attach, check_connections
 from taisoft.scene.material import Material
 from taisoft.scene.obstacles import Obstacle, Shape, surface_numbers
 
 
 class Scene(Guarded):
-    """Input of a simulation: gravity, bodies and obstacles. SI units, y up.
+    """Input of a simulation: gravity, bodies, obstacles and connections. SI units, y up.
+
+    springs, tendons, attachments: what connects points of bodies, see `add_spring`, `add_tendon` and `attach`.
 
     contact_pairs: {frozenset of two names, or of one for a body with itself: (friction, restitution)}, each a number, or
-    None for the default of `contact_numbers`; read-only, changed by `set_contact`. Bodies and obstacles can be removed from
-    their lists, but only methods add them. A Simulator freezes the scene that it takes, see `freeze`.
+    None for the default of `contact_numbers`; read-only, changed by `set_contact`. Bodies, obstacles and connections can be
+    removed from their lists, but only methods add them. A Simulator freezes the scene that it takes, see `freeze`.
     """
 
     _contents = {
         "bodies": "call scene.add_body",
         "obstacles": "call scene.add_obstacle",
+        "springs": "call scene.add_spring",
+        "tendons": "call scene.add_tendon",
+        "attachments": "call scene.attach",
         "contact_pairs": "call scene.set_contact(name_a, name_b, friction=...)",
     }
     _default_frozen = USE_A_COPY
@@ -45,6 +51,9 @@ class Scene(Guarded):
         self.gravity = gravity
         self.bodies: list[Body] = []
         self.obstacles: list[Obstacle] = []
+        self.springs: list[Spring] = []
+        self.tendons: list[Tendon] = []
+        self.attachments: list[Attachment] = []
         self.contact_pairs: dict[frozenset[str], tuple[float | None, float | None]] = {}
         self.collision = CollisionSettings()
         self.allow_initial_overlap, self.contact_forces = False, True
@@ -98,6 +107,19 @@ class Scene(Guarded):
         self._check_gravity(self.gravity)
         for body in self.bodies:
             body.check()
+        check_connections(self)
+
+    @property
+    def connections(self) -> list[Connection]:
+        """Springs, then tendons, then attachments, each in the order added."""
+        return [*self.springs, *self.tendons, *self.attachments]
+
+    @property
+    def loads(self) -> list:
+        """The loads of all bodies, then the tendons: what has a value or a path."""
+        return [*(load for body in self.bodies for load in body.loads), *self.tendons]
+
+    add_spring, add_tendon, attach = add_spring, add_tendon, attach
 
     def freeze(self) -> None:
         """Refuse all later changes of the scene and its bodies. A Simulator calls this when it takes the scene, since changes
@@ -161,6 +183,10 @@ class Scene(Guarded):
         """Return the obstacle with this name. Raises SceneError if there is none."""
         return _find(self.obstacles, name, "obstacle")
 
+    def collider(self, name: str) -> Body | Obstacle:
+        """Return the body or obstacle with this name. Raises SceneError if there is none."""
+        return _find(self.colliders, name, "body or obstacle")
+
     def set_contact(self, name_a: str, name_b: str, friction: float | None = None, restitution: float | None = None) -> None:
         """Set friction and restitution of two bodies, a body and an obstacle, or a body and itself (its name twice).
 
@@ -195,14 +221,14 @@ class Scene(Guarded):
 
     def _pair(self, name_a: str, name_b: str) -> frozenset[str]:
         """Return the key of a pair that can collide. Raises SceneError for any other pair."""
-        found = [_find(self.colliders, name, "body or obstacle") for name in (name_a, name_b)]
+        found = [self.collider(name) for name in (name_a, name_b)]
         if not any(isinstance(one, Body) for one in found):
             raise SceneError(f"scene: contact of {name_a!r} and {name_b!r}: one of the two must be a body")
         return frozenset((name_a, name_b))
 
     def surface_of(self, name: str) -> Material | Obstacle:
         """Return the record that holds a collider's own friction and restitution."""
-        one = _find(self.colliders, name, "body or obstacle")
+        one = self.collider(name)
         return one.composition.first if isinstance(one, Body) else one
 
     def _free_name(self, name: str | None, kind: str) -> str:

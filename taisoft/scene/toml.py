@@ -10,10 +10,13 @@
     [[bodies.NAME.traction]]  triangles, traction [Pa]      [[bodies.NAME.force]]  nodes, force [N], or their KeyFrames
     [obstacles.NAME]          shape and its arguments, friction, restitution, path (KeyFrames)
     [[contacts]]              between = ["a", "b"], friction, restitution
+    [springs.NAME]            a = ["body", POINT], b, and the other arguments of Scene.add_spring
+    [tendons.NAME]            points = [["body", POINT], ...], force [N], or its KeyFrames
+    [attachments.NAME]        a = "body", nodes, b = "body", and the other arguments of Scene.attach
 
 A mesh is a shape with the arguments of its function, or a file with fix_orientation and weld. nodes and triangles are "all",
 a list of ids, or a table box = { min, max } or half_space = { point, normal }, which selects nodes by rest position and
-triangles by centroid, boundary included. Keys and defaults are those of the Python functions.
+triangles by centroid, boundary included. POINT is a position or a node id. Keys and defaults are those of the Python functions.
 """
 
 import re
@@ -36,12 +39,24 @@ from taisoft.scene.material import Material
 from taisoft.scene.obstacles import Box, Capsule, HalfSpace, MeshObstacle, Sphere
 from taisoft.scene.scene import Scene
 from taisoft.scene.tables import Table, arguments_of, check_values, value_text
+from taisoft.scene.toml_connections import add_connections
 
 MESHES = {"box": box_mesh, "sheet": sheet_mesh, "ball": ball_mesh}
 SHAPES = {"half_space": HalfSpace, "sphere": Sphere, "box": Box, "capsule": Capsule, "mesh": MeshObstacle}
 METHODS = {"fix": Body.fix, "move": Body.move, "traction": Body.add_traction, "force": Body.add_force}
 SCENE_KEYS = ("gravity", "allow_initial_overlap", "contact_forces")  # attributes of a Scene at top level
-TOP_KEYS = [*SCENE_KEYS, "collision", "solver", "materials", "bodies", "obstacles", "contacts"]
+TOP_KEYS = [
+    *SCENE_KEYS,
+    "collision",
+    "solver",
+    "materials",
+    "bodies",
+    "obstacles",
+    "contacts",
+    "springs",
+    "tendons",
+    "attachments",
+]
 SURFACE_KEYS = ("friction", "restitution")
 STANDALONE = (*WRITERS, ".node", ".ele")  # formats whose files reference no other files
 NONE_TEXT = "none"
@@ -95,6 +110,7 @@ def _read(tables: Table, allow_outside: bool) -> tuple[Scene, dict]:
     for name in obstacles.known:
         _add_obstacle(scene, name, obstacles)
     _set_contacts(scene, tables)
+    add_connections(scene, tables, selection)
     return scene, solver
 
 
@@ -137,7 +153,7 @@ def _add_body(scene: Scene, name: str, table: Table, materials: dict[str, Materi
         items = "triangles" if key == "traction" else "nodes"
         known, required = ([items if k == "where" else k for k in keys] for keys in arguments_of(method))
         for one in table.listed(key, known, required):
-            extra = {"where": _selection(one, items)}
+            extra = {"where": selection(one, items)}
             if "path" in known:
                 extra["path"] = one.made("path", KeyFrames, "key frames: ")
             elif isinstance(one.values.get(key), dict):  # a traction or force that varies
@@ -214,7 +230,7 @@ def _kind(table: Table, kinds: dict) -> str:
         return checks.choice(table.values["shape"], "shape", tuple(kinds))
 
 
-def _selection(table: Table, key: str):
+def selection(table: Table, key: str):
     """Return ids, or a function of points (n,3) that returns a bool mask (n,) and also works on another mesh."""
     value = table.values[key]
     if value == "all":

@@ -24,6 +24,7 @@ from taisoft.scene.obstacles import Obstacle
 from taisoft.scene.scene import Scene
 from taisoft.scene.tables import key_path, key_text, quote
 from taisoft.scene.toml import NONE_TEXT, SCENE_KEYS, SHAPES, SURFACE_KEYS
+from taisoft.scene.toml_connections import connection_tables
 
 MAX_LINE = 100  # maximum number of characters of numbers in a line
 FOREIGN_PATH = "rotates along a path made for {}, which a file cannot store: pass the ts.KeyFrames themselves"
@@ -80,6 +81,7 @@ def _document(scene: Scene, solver: dict, stem: str, meshes: dict[str, TetMesh])
         "bodies": {body.name: _body(body, materials, stem, meshes) for body in scene.bodies},
         "obstacles": {obstacle.name: _obstacle(obstacle) for obstacle in scene.obstacles},
         "contacts": contacts,
+        **connection_tables(scene, _ids, _fields),
     }
 
 

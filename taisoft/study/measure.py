@@ -87,20 +87,21 @@ def _scene_facts(scene: Scene, task: dict) -> dict:
     bodies = scene.bodies
     mass_damped = any(b.composition.first.mass_damping for b in bodies)
     damped = mass_damped or any(b.composition.first.stiffness_damping for b in bodies)
+    damped = damped or any(one.damping for one in scene.connections)
     prescribed = any(c.path is not None for b in bodies for c in b.constraints) or any(
         o.path is not None for o in scene.obstacles
     )
-    loads = [load for b in bodies for load in b.loads]
     touches = scene.pushes(task["fixed"].get("self_collision", False))
-    varied = any(load.path is not None for load in loads)
-    free = not (varied or any(b.constraints for b in bodies) or mass_damped or (touches and scene.obstacles))
+    varied = any(load.path is not None for load in scene.loads)
+    anchored = {name for one in scene.connections for name in one.owners} - {b.name for b in bodies}
+    free = not (varied or anchored or any(b.constraints for b in bodies) or mass_damped or (touches and scene.obstacles))
     return {
         "bodies": [[b.name, b.n_nodes] for b in bodies],
         "nodes": sum(b.n_nodes for b in bodies),
         "tets": sum(b.mesh.n_tets for b in bodies),
         "orders": sorted({b.order for b in bodies}),
         "smallest_edge": min(float(edge_lengths(b.mesh.vertices, b.mesh.tets).min()) for b in bodies),  # [m]
-        "keeps_energy": not (damped or prescribed or loads or touches),
+        "keeps_energy": not (damped or prescribed or scene.loads or touches),
         "momentum_rate": _total_load(scene).tolist() if free else None,  # [N]
     }
 

@@ -5,7 +5,7 @@
 
 import taichi as ti
 
-SWITCH, LOAD, ACCELERATION, STIFFNESS = "loads", True, False, False
+SWITCH, LOAD, ACCELERATION, STIFFNESS, PREPARED = "loads", True, False, False, False
 
 
 @ti.func

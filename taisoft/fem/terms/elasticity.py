@@ -30,7 +30,7 @@ from taisoft.fem.math3 import determinant, matmul_nt, matmul_tn
 from taisoft.fem.node_graph import BLOCKS, EVERYTHING, block_of, count_of
 from taisoft.fem.state import FAILED, INVERTED_NOW, LOWEST_J
 
-SWITCH, LOAD, ACCELERATION, STIFFNESS = None, False, False, False
+SWITCH, LOAD, ACCELERATION, STIFFNESS, PREPARED = None, False, False, False, False
 HUGE = 1e30  # above any volume ratio
 EXPLODED = 1e9  # |J| of an inverted tet beyond which a motion has diverged: stretched a thousandfold along every axis
 
@@ -97,11 +97,22 @@ def record_volumes(m: ti.template(), b, J):
 
 @ti.func
 def sum_elements(m: ti.template(), subset: ti.template()):
-    """Run `element_force` over all blocks of a subset, as top-level loops of a kernel."""
+    """Run `element_force` over all blocks of a subset and prepare other terms, as top-level loops of a kernel."""
     for n, g in ti.static(enumerate(m.groups)):
         ti.loop_config(serialize=m.serial)
         for j in range(count_of(subset, BLOCKS + n, g.first), count_of(subset, BLOCKS + n + 1, g.last)):
             element_force(m, g, False, block_of(subset, j))
+    prepare_terms(m)
+
+
+@ti.func
+def prepare_terms(m: ti.template()):
+    """Prepare the forces of other terms, as top-level loops of a kernel."""
+    for term in ti.static(m.terms):
+        if ti.static(term.PREPARED):
+            ti.loop_config(serialize=m.serial)
+            for k in range(term.count(m)):
+                term.prepare(m, k)
 
 
 @ti.func
@@ -111,6 +122,7 @@ def sum_elements_with_damping(m: ti.template()):
         ti.loop_config(serialize=m.serial)
         for b in range(g.first, g.last):
             record_volumes(m, b, element_force(m, g, m.stiffness_damping, b))
+    prepare_terms(m)
 
 
 @ti.func
@@ -123,6 +135,10 @@ def sum_elements_serially(m: ti.template()):
             J = element_force(m, g, m.stiffness_damping, b)
             lowest = ti.min(lowest, J)
             inverted += count_inverted(m, b, J)
+    for term in ti.static(m.terms):
+        if ti.static(term.PREPARED):
+            for k in range(term.count(m)):
+                term.prepare(m, k)
     return lowest, inverted
 
 

@@ -5,7 +5,7 @@ m_a is the lumped mass, or int rho N_a dV on quadratic tets in implicit steps. E
 
 import taichi as ti
 
-SWITCH, LOAD, ACCELERATION, STIFFNESS = None, True, True, False
+SWITCH, LOAD, ACCELERATION, STIFFNESS, PREPARED = None, True, True, False, False
 
 
 @ti.func

@@ -1,0 +1,257 @@
+"""Springs, tendons and attachments: forces between points of bodies, and between these and obstacles at rest.
+
+A point of a body is given by its rest position, in the coordinates of body.rest_positions, or as a node; a point of an obstacle
+by its position. Each function here that takes a scene is a method of `Scene`, whose class body lists them.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from taisoft.attributes import guarded_record
+from taisoft.errors import SceneError
+from taisoft.scene import checks
+from taisoft.scene.body import Body
+from taisoft.scene.loads import value_and_path
+from taisoft.scene.locate import locate
+
+if TYPE_CHECKING:
+    from taisoft.scene.scene import Scene
+
+MAX_OUTSIDE = 0.1  # heights of a tet by which a point may lie outside a body: curved surfaces do not meet exactly
+_ADD_ANOTHER = "remove it from its list and add another one before the Simulator is made"
+
+
+@guarded_record("point", _ADD_ANOTHER)
+@dataclass(frozen=True, eq=False)
+class Point:
+    """A point of a body or of an obstacle."""
+
+    owner: str  #: name of the body or obstacle
+    position: np.ndarray  #: (3,) [m], of a body at rest, of an obstacle in the scene
+
+    def __post_init__(self):
+        checks.store(self, position=self.position)
+
+
+@guarded_record("spring", _ADD_ANOTHER)
+@dataclass(frozen=True, eq=False)
+class Spring:
+    """A spring between two points, which pulls with stiffness times its extension, plus damping times its rate."""
+
+    name: str
+    points: tuple[Point, Point]
+    stiffness: float  #: [N/m]
+    rest_length: float | None  #: [m]; None: the distance of the points at the start
+    damping: float  #: [N s/m]
+
+    @property
+    def owners(self) -> list[str]:
+        """Names of the bodies and obstacles of its points."""
+        return [point.owner for point in self.points]
+
+
+@guarded_record("tendon", "call sim.set_tension(name, force) in a simulation")
+@dataclass(frozen=True, eq=False)
+class Tendon:
+    """A line through points, along which it slides without friction, under a given tension."""
+
+    name: str
+    points: tuple[Point, ...]
+    value: np.ndarray | None  #: () tension [N]; None if it follows a path
+    path: Callable | None = None  #: t [s] -> tension [N]
+
+    def __post_init__(self):
+        checks.store(self, value=self.value)
+
+    @property
+    def shapes(self) -> tuple[tuple[int, ...], ...]:
+        """Shapes that its values may have."""
+        return ((),)
+
+    @property
+    def damping(self) -> float:
+        """[N s/m]"""
+        return 0.0
+
+    @property
+    def owners(self) -> list[str]:
+        """Names of the bodies and obstacles of its points."""
+        return [point.owner for point in self.points]
+
+
+@guarded_record("attachment", _ADD_ANOTHER)
+@dataclass(frozen=True, eq=False)
+class Attachment:
+    """Nodes of a body, each pulled by a spring of rest length 0 to where it lies in another body or an obstacle at the start."""
+
+    name: str
+    a: str
+    nodes: np.ndarray  #: (k,) int64 node ids of body a
+    b: str  #: name of a body or obstacle
+    stiffness: float  #: [N/m] of each node
+    damping: float = 0.0  #: [N s/m] of each node
+    where: Callable | None = None  #: as in `Constraint`
+
+    def __post_init__(self):
+        checks.store(self, nodes=self.nodes)
+
+    @property
+    def owners(self) -> list[str]:
+        """Names of its body, and of what that is attached to."""
+        return [self.a, self.b]
+
+
+Connection = Spring | Tendon | Attachment
+
+
+def add_spring(
+    self: "Scene", a, b, stiffness: float, rest_length: float | None = None, damping: float = 0.0, name: str | None = None
+) -> Spring:
+    """Connect two points by a spring and return it.
+
+    a, b: each (name, point): the name of a body and the point's rest position (3,) [m] or a node id; or the name of an obstacle
+    at rest and a position. stiffness [N/m]; rest_length [m], by default the points' distance at the start; damping [N s/m], of
+    the rate of its length, or, of a spring of rest length 0, in all directions. name: unique; "spring0" and so on by default.
+    Raises SceneError.
+    """
+    self._check_open("add_spring")
+    name = _free_name(self, name, "spring")
+    what = f"spring {name!r}"
+    points = tuple(_point(self, end, f"{what}: {label}") for label, end in (("a", a), ("b", b)))
+    _check_any_body(self, points, what)
+    if points[0].owner == points[1].owner and np.array_equal(points[0].position, points[1].position):
+        raise SceneError(f"{what}: a and b are the same point of body {points[0].owner!r}")
+    stiffness = checks.number(stiffness, f"{what}: stiffness", minimum=0.0, unit="N/m")
+    if rest_length is not None:
+        rest_length = checks.number(rest_length, f"{what}: rest_length", minimum=0.0, unit="m")
+    damping = checks.number(damping, f"{what}: damping", minimum=0.0, unit="N s/m")
+    spring = Spring(name, points, stiffness, rest_length, damping)
+    list.append(self.springs, spring)
+    return spring
+
+
+def add_tendon(self: "Scene", points, force, name: str | None = None) -> Tendon:
+    """Lead a tendon through points, which it pulls together with a given tension, and return it.
+
+    points: at least two, each as in `add_spring`, consecutive ones distinct. force: the tension [N], not negative, or its path:
+    callable t [s] -> tension, called once here for t = 0, or `KeyFrames` with values. name: unique; "tendon0" and so on by
+    default. Raises SceneError.
+    """
+    self._check_open("add_tendon")
+    name = _free_name(self, name, "tendon")
+    what = f"tendon {name!r}"
+    if not isinstance(points, (list, tuple)) or len(points) < 2:
+        raise SceneError(f"{what}: points must be a list of at least two")
+    made = tuple(_point(self, end, f"{what}: point {k}") for k, end in enumerate(points))
+    _check_any_body(self, made, what)
+    for k, (p, q) in enumerate(zip(made, made[1:])):
+        if np.array_equal(start_of(self, p), start_of(self, q)):
+            raise SceneError(f"{what}: points {k} and {k + 1} coincide")
+    tendon = Tendon(name, made, *value_and_path(force, f"{what}: force", ((),)))
+    check_tension(tendon.path(0.0) if tendon.value is None else tendon.value, f"{what}: force")
+    list.append(self.tendons, tendon)
+    return tendon
+
+
+def attach(self: "Scene", a: str, where, b: str, stiffness: float, damping: float = 0.0, name: str | None = None) -> Attachment:
+    """Attach nodes of a body to where they lie in another body, or to an obstacle at rest, by springs; return the attachment.
+
+    a: name of the body; where: its nodes, as for `Body.fix`; b: name of another body, or of an obstacle. The chosen nodes must
+    lie in or on body b at the start, or outside by at most a tenth of the height of a tet. stiffness [N/m] and damping [N s/m] of
+    each node's spring, whose rest length is 0. name: unique; "attachment0" and so on by default. Raises SceneError.
+    """
+    self._check_open("attach")
+    name = _free_name(self, name, "attachment")
+    what = f"attachment {name!r}"
+    body = self.body(a)
+    nodes = checks.selection(where, body.rest_positions, what, "node")
+    if b == a:
+        raise SceneError(f"{what}: a body cannot be attached to itself")
+    owner = _owner(self, b, what)
+    stiffness = checks.number(stiffness, f"{what}: stiffness", above=0.0, unit="N/m")
+    damping = checks.number(damping, f"{what}: damping", minimum=0.0, unit="N s/m")
+    attachment = Attachment(name, body.name, nodes, owner.name, stiffness, damping, where if callable(where) else None)
+    if isinstance(owner, Body):
+        locate_nodes(self, attachment)
+    list.append(self.attachments, attachment)
+    return attachment
+
+
+def check_connections(scene: "Scene") -> None:
+    """Raise SceneError if a body or obstacle of a connection was removed, or nodes no longer lie where they are attached."""
+    for one in scene.connections:
+        found = [_owner(scene, owner, f"{type(one).__name__.lower()} {one.name!r}") for owner in one.owners]
+        if isinstance(one, Attachment) and isinstance(found[1], Body):
+            locate_nodes(scene, one)
+
+
+def check_tension(value: float, what: str) -> None:
+    """Raise SceneError if a tension [N] is negative."""
+    if value < 0.0:
+        raise SceneError(f"{what} must be at least 0 N, not {float(value):g}: a tendon cannot push")
+
+
+def start_of(scene: "Scene", point: Point) -> np.ndarray:
+    """Position (3,) [m] of a point at the start."""
+    owner = _owner(scene, point.owner, "point")
+    return point.position + owner.position if isinstance(owner, Body) else point.position
+
+
+def locate_nodes(scene: "Scene", attachment: Attachment) -> tuple[np.ndarray, np.ndarray]:
+    """Nodes (k, 4 or 10) of body b and weights, which follow the points where the attached nodes lie. Raises SceneError."""
+    a, b = scene.body(attachment.a), scene.body(attachment.b)
+    points = a.rest_positions[attachment.nodes] + (a.position - b.position)
+    nodes, weights, outside = locate(b, points)
+    _check_outside(outside, f"attachment {attachment.name!r}: node {{}} of body {a.name!r}", b, attachment.nodes)
+    return nodes, weights
+
+
+def _check_outside(outside: np.ndarray, what: str, body: Body, labels) -> None:
+    k = int(np.argmax(outside))
+    if outside[k] > MAX_OUTSIDE:
+        raise SceneError(
+            f"{what.format(labels[k])} lies outside of body {body.name!r}, by {outside[k]:.2g} times the height of the nearest "
+            f"tet: at most {MAX_OUTSIDE:g} is allowed"
+        )
+
+
+def _point(scene: "Scene", end, what: str) -> Point:
+    """Return the point that (name, position or node id) describes."""
+    if not isinstance(end, (list, tuple)) or len(end) != 2:
+        raise SceneError(f"{what} must be (name, point), the name of a body or obstacle and a position or a node id")
+    owner = _owner(scene, end[0], what)
+    is_node = isinstance(end[1], (int, np.integer)) and not isinstance(end[1], bool)
+    if is_node and isinstance(owner, Body):
+        node = checks.whole(end[1], f"{what}: the node", range(owner.n_nodes))
+        return Point(owner.name, owner.rest_positions[node].copy())
+    position = checks.array(end[1], f"{what}: the point", ((3,),))
+    if isinstance(owner, Body):
+        _check_outside(locate(owner, position[None])[2], f"{what}: {{}}", owner, ["the point"])
+    return Point(owner.name, position)
+
+
+def _owner(scene: "Scene", name: str, what: str):
+    """Return a body, or an obstacle at rest. Raises SceneError."""
+    try:
+        owner = scene.collider(name)
+    except SceneError as error:
+        raise SceneError(f"{what}: {str(error).removeprefix('scene: ')}") from None
+    if not isinstance(owner, Body) and owner.path is not None:
+        raise SceneError(f"{what}: obstacle {name!r} moves; only bodies and obstacles at rest can be connected")
+    return owner
+
+
+def _check_any_body(scene: "Scene", points: tuple[Point, ...], what: str) -> None:
+    if not any(isinstance(scene.collider(point.owner), Body) for point in points):
+        raise SceneError(f"{what}: at least one point must be of a body")
+
+
+def _free_name(scene: "Scene", name: str | None, kind: str) -> str:
+    """Return the name, or the first free default name; names are unique among all connections. Raises SceneError."""
+    taken = [one.name for one in scene.connections]
+    if name is None:
+        name = next(free for free in (f"{kind}{i}" for i in range(len(taken) + 1)) if free not in taken)
+    return checks.name(name, f"scene: {kind} name", taken)

@@ -1,0 +1,49 @@
+"""Find points in bodies: the nodes and weights whose sum w_i x_i follows a point of a body's elements as it deforms."""
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import scipy
+
+from taisoft.mesh.nodes import shape_functions
+
+if TYPE_CHECKING:
+    from taisoft.scene.body import Body
+
+NEAREST = 64  # tets by their centroids that are tried first
+INSIDE = -1e-9  # barycentric coordinate from which a point counts as inside a tet
+PAIRS_AT_ONCE = 2_000_000  # of points and tets; bounds the memory, about 100 bytes each
+WEIGHTLESS = 1e-12  # smaller barycentric coordinates are rounding
+
+
+def locate(body: "Body", points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Find points (p,3) [m], in the coordinates of body.rest_positions, in a body at rest.
+
+    Returns nodes (p, 4 or 10), weights of the same shape, and (p,) how far each lies outside the body, in heights of its tet; 0
+    inside. The weights of a point outside extrapolate from the tet in whose heights it is nearest. They sum to 1 and reproduce
+    the point, so that they follow every affine motion exactly.
+    """
+    corners = body.mesh.vertices[body.mesh.tets]
+    inverse = np.linalg.inv((corners[:, 1:] - corners[:, :1]).transpose(0, 2, 1))
+    _, near = scipy.spatial.cKDTree(corners.mean(axis=1)).query(points, k=min(NEAREST, len(corners)))
+    tet = _deepest(corners, inverse, points, near.reshape(len(points), -1))
+    far = np.flatnonzero(_barycentric(corners[tet], inverse[tet], points).min(axis=1) < INSIDE)
+    chunk, everything = max(1, PAIRS_AT_ONCE // len(corners)), np.arange(len(corners))
+    for rows in np.split(far, range(chunk, len(far), chunk)):
+        tet[rows] = _deepest(corners, inverse, points[rows], np.broadcast_to(everything, (len(rows), len(corners))))
+    barycentric = _barycentric(corners[tet], inverse[tet], points)
+    barycentric[np.abs(barycentric) < WEIGHTLESS] = 0.0
+    outside = np.maximum(-barycentric.min(axis=1), 0.0)
+    return body.nodes.elements[tet], shape_functions(body.order, barycentric), outside
+
+
+def _deepest(corners: np.ndarray, inverse: np.ndarray, points: np.ndarray, tried: np.ndarray) -> np.ndarray:
+    """Return for each point that tet (p,) among those tried (p,k) whose smallest barycentric coordinate is largest."""
+    least = _barycentric(corners[tried], inverse[tried], points[:, None]).min(axis=2)
+    return tried[np.arange(len(points)), np.argmax(least, axis=1)]
+
+
+def _barycentric(corners: np.ndarray, inverse: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Barycentric coordinates (..., 4) of points (..., 3) in tets with corners (..., 4, 3) and inverse edges (..., 3, 3)."""
+    upper = np.einsum("...ij,...j->...i", inverse, points - corners[..., 0, :])
+    return np.concatenate([1.0 - upper.sum(axis=-1, keepdims=True), upper], axis=-1)

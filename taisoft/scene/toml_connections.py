@@ -1,0 +1,67 @@
+"""Read and write the springs, tendons and attachments of a scene file."""
+
+from collections.abc import Callable
+
+from taisoft.errors import SceneError
+from taisoft.scene.connections import Point
+from taisoft.scene.key_frames import KeyFrames
+from taisoft.scene.loads import LoadPath
+from taisoft.scene.scene import Scene
+from taisoft.scene.tables import Table, arguments_of
+
+
+def add_connections(scene: Scene, tables: Table, selection: Callable) -> None:
+    """Add the connections in the tables of a file. selection: (table, key) -> what chooses nodes. Raises SceneError."""
+    for kind, method in (("springs", scene.add_spring), ("tendons", scene.add_tendon), ("attachments", scene.attach)):
+        parent, item = tables.named(kind), kind[:-1]
+        known, required = arguments_of(method, "name")
+        known, required = (["nodes" if key == "where" else key for key in keys] for keys in (known, required))
+        for name in parent.known:
+            table = parent.table(name, known, required)
+            points = {} if kind == "attachments" else {key: table.values[key] for key in ("a", "b", "points") if key in table}
+            extra = {key: _points(table, key) if key == "points" else _point(table, key, at) for key, at in points.items()}
+            if kind == "attachments":
+                extra |= {"where": selection(table, "nodes")}
+            elif isinstance(table.values.get("force"), dict):  # a tension that varies
+                extra["force"] = table.made("force", KeyFrames, "key frames: ")
+            keys = [key for key in known if key not in (*extra, "nodes")]
+            table.make(method, f"{item} {name!r}: ", f"scene: {item} ", keys=keys, name=name, **extra)
+
+
+def _points(table: Table, key: str) -> list:
+    if not isinstance(table.values[key], list):
+        raise table.error(key, 'must be a list of points ["NAME", POINT]')
+    return [_point(table, f"{key}[{k}]", value) for k, value in enumerate(table.values[key])]
+
+
+def _point(table: Table, key: str, value) -> tuple:
+    """Return the name and the point of a list of the two."""
+    if not isinstance(value, list) or len(value) != 2 or not isinstance(value[0], str):
+        raise table.error(key, 'must be ["NAME", POINT], a body or an obstacle, and a position or a node id')
+    return tuple(value)
+
+
+def connection_tables(scene: Scene, ids: Callable, fields: Callable) -> dict:
+    """Return the tables of a scene's connections. ids: (nodes, n) and fields: record, as the file's writer stores them.
+
+    Raises SceneError for a tendon along a function.
+    """
+    springs, tendons, attachments = {}, {}, {}
+    for one in scene.springs:
+        springs[one.name] = dict(zip("ab", map(_pair, one.points))) | {"stiffness": one.stiffness, "damping": one.damping}
+        if one.rest_length is not None:
+            springs[one.name]["rest_length"] = one.rest_length
+    for one in scene.tendons:
+        if one.path is not None and not isinstance(one.path, LoadPath):
+            raise SceneError(f"tendon {one.name!r}: pulls along a function, which a file cannot store: use ts.KeyFrames")
+        force = float(one.value) if one.path is None else fields(one.path.frames)
+        tendons[one.name] = {"points": [_pair(point) for point in one.points], "force": force}
+    for one in scene.attachments:
+        nodes = ids(one.nodes, scene.body(one.a).n_nodes)
+        own = {"a": one.a, "nodes": nodes, "b": one.b, "stiffness": one.stiffness, "damping": one.damping}
+        attachments[one.name] = own
+    return {"springs": springs, "tendons": tendons, "attachments": attachments}
+
+
+def _pair(point: Point) -> list:
+    return [point.owner, point.position.tolist()]
