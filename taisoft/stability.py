@@ -11,6 +11,7 @@ import scipy.sparse.linalg as spl
 
 from taisoft.errors import SceneError
 from taisoft.fem import reference
+from taisoft.fem.dependents import dependent_table
 from taisoft.fem.loads import SceneLoads
 from taisoft.fem.springs import spring_table
 from taisoft.scene.scene import Body, Scene
@@ -123,16 +124,19 @@ def stable_dt(scene: Scene, verlet: bool) -> float:
     """Largest stable step [s] of an explicit integrator about the rest shape; infinite if nothing can vibrate.
 
     It is 2/omega_max without damping, else the dt at which an eigenvalue of the step matrix leaves the unit disk. Springs add
-    their own largest omega^2 and damping rate to those of the bodies that they connect, which is an upper bound.
+    their own largest omega^2 and damping rate to those of the bodies that they connect, and nodes attached exactly multiply omega
+    by `DependentTable.growth`, which are upper bounds.
     """
     limit = np.inf
     connected = {owner for one in scene.connections for owner in one.owners}
     square, rate = spring_rates(scene) if connected else (0.0, 0.0)
+    dependents = dependent_table(scene)
+    growth = 1.0 if dependents is None else dependents.growth
     for body in scene.bodies:
         omega, material, own_square, own_rate = highest_frequency(body), body.composition.first, 0.0, 0.0
         if omega > 0.0:
             if body.name in connected:
-                own_square, own_rate = square, rate
+                omega, own_square, own_rate = growth * omega, square, rate
             own_rate += material.stiffness_damping * omega**2
             limit = min(limit, _stable_dt_of(np.sqrt(omega**2 + own_square), material.mass_damping, own_rate, verlet))
     return float(limit)
@@ -144,6 +148,8 @@ def spring_rates(scene: Scene) -> tuple[float, float]:
     Each acts as if it had its stiffness, or its tension over its length if that is larger, in all directions.
     """
     table = spring_table(scene)
+    if table is None:
+        return 0.0, 0.0
     length = np.linalg.norm(table.vectors(_start_positions(scene)), axis=1)
     given = np.append(SceneLoads(scene).amplitudes([0.0])[0], 0.0)[table.slot]
     largest = np.maximum(table.stiffness, given / np.where(given > 0.0, length, 1.0))
@@ -214,16 +220,21 @@ def modes(scene: Scene, k: int, mass: str = "lumped") -> Modes:
     if not scene.bodies:
         raise SceneError("the scene holds no body")
     free = np.concatenate([~constrained_axes(b, prescribed=True) for b in scene.bodies]).reshape(-1)
+    dependents = dependent_table(scene)
+    T = sp.identity(len(free), format="csr") if dependents is None else sp.kron(dependents.matrix, sp.identity(3), format="csr")
+    if dependents is not None:
+        free.reshape(-1, 3)[dependents.node] = False
     n_free = int(free.sum())
     if isinstance(k, bool) or not isinstance(k, (int, np.integer)) or not 1 <= k <= n_free:
         raise SceneError(f"k = {k!r}: it must be a whole number from 1 to the {n_free} free axes of the scene")
     K = sp.block_diag([hooke_stiffness(b) for b in scene.bodies], format="csr")
-    K = (K + spring_stiffness(scene) if scene.connections else K)[free][:, free]
+    K = K if spring_table(scene) is None else K + spring_stiffness(scene)
+    K = (T.T @ K @ T)[free][:, free]
     if mass == "lumped":
         M = sp.diags(np.repeat(reference.lumped_masses(scene), 3)[free], format="csc")
     else:
         scalar = sp.block_diag([reference.consistent_mass(b) for b in scene.bodies])
-        M = sp.kron(scalar, sp.identity(3), format="csr")[free][:, free]
+        M = (T.T @ sp.kron(scalar, sp.identity(3), format="csr") @ T)[free][:, free]
     if n_free <= max(200, 2 * k):
         values, vectors = _dense_modes(K, M, k)
     else:
@@ -234,6 +245,7 @@ def modes(scene: Scene, k: int, mass: str = "lumped") -> Modes:
     order = np.argsort(values)
     shapes = np.zeros((int(k), free.size))
     shapes[:, free] = vectors[:, order].T
+    shapes = shapes @ T.T
     noise = 1e-9 * K.diagonal().max() / M.diagonal().max()  # eigenvalues of rigid motions are rounding errors of either sign
     eigenvalues = np.where(np.abs(values[order]) < noise, 0.0, values[order])
     return Modes(np.sqrt(np.maximum(eigenvalues, 0.0)) / (2.0 * np.pi), shapes.reshape(int(k), -1, 3))

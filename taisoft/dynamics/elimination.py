@@ -49,7 +49,9 @@ def choose_nodes(residual: np.ndarray, start: np.ndarray, column: np.ndarray) ->
 
 
 def eliminate(system: StageSystem, stage: Stage, r: float) -> Eliminated | None:
-    """Solve a stage on the few nodes with nearly all of |r|, see `solve_on`; return None if they are many."""
+    """Solve a stage on the few nodes with nearly all of |r|, see `solve_on`; None if they are many or nodes depend on others."""
+    if system.model.has_dependents:  # whose tets act on nodes that may not be among the few
+        return None
     residual, free = download([system.work.residual, system.model.free])
     lists = system.lists
     nodes = choose_nodes(free * residual, lists.start, lists.column)

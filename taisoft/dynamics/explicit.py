@@ -10,6 +10,7 @@ A small mesh runs all its sub-steps in one serial kernel; a large one takes two 
 import taichi as ti
 
 from taisoft.backend.runtime import kernel
+from taisoft.fem.dependents import force_with_dependents, place, place_all
 from taisoft.fem.lanes import broadcast
 from taisoft.fem.state import FAILED, INVERTED_NOW, LOWEST_J, MOST_INVERTED, STEPS_DONE
 from taisoft.fem.terms import elasticity, rayleigh_damping
@@ -31,7 +32,7 @@ def forces(m: ti.template(), i):
         if ti.static(term.ACCELERATION):
             a += term.acceleration(m, i)
         else:
-            f += term.force(m, i)
+            f += force_with_dependents(m, term, i)
     return f, a
 
 
@@ -213,6 +214,9 @@ def advance_serial(m: ti.template(), s: ti.template(), n: ti.i32, dt64: ti.f64, 
                 min_J = ti.min(min_J, lowest_by_lane[q])
             running = min_J > -EXPLODED and not nonfinite(ti.cast(total[0] + total[1] + total[2], ti.f64))
             done += 1
+        if ti.static(m.has_dependents):
+            for k in range(m.dependents.n):
+                place(m, k)
         m.state.scalars[STEPS_DONE] = done - (0 if running else 1)
         m.state.scalars[LOWEST_J], m.state.scalars[MOST_INVERTED] = min_J, max_inverted
 
@@ -284,6 +288,7 @@ def nodes_parallel(m: ti.template(), s: ti.template(), row: ti.i32, dt64: ti.f64
         ti.loop_config(serialize=True)
         for _ in range(1):
             prescribe(m, s, row, dt64)
+    place_all(m)
     if ti.static(s.has_held):
         ti.loop_config(serialize=True)
         for _ in range(1):

@@ -24,6 +24,7 @@ from taisoft.dynamics.explicit import (
     verlet_half,
     verlet_kick,
 )
+from taisoft.fem.dependents import place_all
 from taisoft.fem.state import FAILED, INVERTED_NOW, MOST_INVERTED
 from taisoft.fem.terms import elasticity
 
@@ -129,6 +130,7 @@ def move(m: ti.template(), s: ti.template(), p: ti.template(), dt64: ti.f64, has
         ti.loop_config(serialize=True)
         for _ in range(1):
             prescribe_positions(m, s, 0)
+    place_all(m)
     ti.loop_config(serialize=True)
     for _ in range(1):
         if ti.static(not s.verlet):
@@ -148,6 +150,7 @@ def finish_verlet(m: ti.template(), s: ti.template(), p: ti.template(), dt64: ti
         ti.loop_config(serialize=True)
         for _ in range(1):
             prescribe_velocities(m, s, 0, dt64)
+    place_all(m)
     ti.loop_config(serialize=True)
     for _ in range(1):
         close_substep(m, s, p, dt64, has_contacts)

@@ -23,6 +23,7 @@ from taisoft.dynamics.simulation_state import SimulationState
 from taisoft.dynamics.stage_system import Stage, StageSystem
 from taisoft.dynamics.substepping import Substepping
 from taisoft.errors import SimulationError
+from taisoft.fem.dependents import place_all
 from taisoft.settings import Settings
 
 MAX_NEWTON, MAX_NEWTON_WITH_CONTACTS = 50, 25  # a step that needs more is cut in substeps, or reported as not converged
@@ -69,6 +70,7 @@ def finish_midpoint(m: ti.template(), h: ti.template()):
     for i in range(m.n_nodes):
         m.state.x[i] = 2.0 * m.state.x[i] - h.x_now[i]
         m.state.v[i] = m.state.v[i] + m.free[i] * (m.state.v[i] - h.v_now[i])
+    place_all(m)
 
 
 @kernel
@@ -325,7 +327,8 @@ class ImplicitStepper:
     def compile_hard_steps(self) -> None:
         """Compile the kernels that only hard steps need, by running them on the current stage; its state is then invalid."""
         free = np.flatnonzero(self.simulation.model.free.to_numpy().any(axis=1))
-        solve_on(self.solver, replace(self.solver.stage, tolerance=0.0), free[:1], 0.0)
+        if not self.simulation.model.has_dependents:
+            solve_on(self.solver, replace(self.solver.stage, tolerance=0.0), free[:1], 0.0)
         self.solver.form_matrix(projected=True)
 
     def reactions(self) -> np.ndarray:

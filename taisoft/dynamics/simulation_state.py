@@ -7,6 +7,7 @@ import numpy as np
 from taisoft.backend.arrays import FieldArena, download, upload
 from taisoft.backend.runtime import Runtime
 from taisoft.dynamics.dirichlet import DirichletConditions
+from taisoft.fem.dependents import DependentTable, dependent_table
 from taisoft.fem.loads import SceneLoads
 from taisoft.fem.model import Layout, Model, damping_table, law_table, upload_mass_matrix
 from taisoft.fem.reference import gravity_masses, lumped_masses
@@ -31,7 +32,11 @@ class SimulationState:
     releases: int = 0  # number of releases of prescribed nodes; each invalidates the steppers' history
     drag: tuple[np.ndarray, np.ndarray] | None = None  # nodes (k,) and forces (k, 3) [N] of a drag spring
     _loads: SceneLoads | None = None  # None: not computed, or outdated
+    dependents: DependentTable | None = None
     load_time: float | None = None  # of the loads on the device; None: several, or outdated
+
+    def __post_init__(self):
+        self.dependents = dependent_table(self.scene)
 
     def state(self) -> tuple[np.ndarray, np.ndarray]:
         """Return positions and velocities of all nodes, in their stored precision."""
@@ -39,7 +44,11 @@ class SimulationState:
         return x, v
 
     def set_state(self, x: np.ndarray, v: np.ndarray) -> None:
-        """Set positions [m] and velocities [m/s] of all nodes, (n_nodes, 3)."""
+        """Set positions [m] and velocities [m/s] of all nodes, (n_nodes, 3); those of dependent nodes follow from the others'."""
+        if self.dependents is not None:
+            x, v = x.copy(), v.copy()
+            self.dependents.place(x)
+            self.dependents.place(v)
         upload([(self.model.state.x, x), (self.model.state.v, v)])
 
     def snapshot(self) -> dict:
@@ -65,7 +74,10 @@ class SimulationState:
 
     def upload_constraints(self) -> None:
         """Upload the free axes."""
-        upload([(self.model.free, ~self.dirichlet.constrained())])
+        free = ~self.dirichlet.constrained()
+        if self.dependents is not None:
+            free[self.dependents.node] = False
+        upload([(self.model.free, free)])
 
     def upload_gravity(self) -> None:
         """Upload the scene's gravity."""

@@ -17,6 +17,7 @@ from taisoft.backend.arrays import Count, FieldArena, download, upload
 from taisoft.backend.runtime import kernel
 from taisoft.dynamics.contact_terms import impulse_on_node
 from taisoft.dynamics.impact import impact_residual
+from taisoft.fem.dependents import force_with_dependents
 from taisoft.fem.lanes import mass_times
 from taisoft.fem.model import Model
 from taisoft.fem.node_graph import BLOCKS, EDGES, NODES, Subset, n_nodes_of, node_of
@@ -100,9 +101,9 @@ def residual_parts(m: ti.template(), w: ti.template(), i, beta):
     internal, loads, damping = zero, zero, zero
     for term in ti.static(m.terms):
         if ti.static(term.LOAD):
-            loads += term.force(m, i)
+            loads += force_with_dependents(m, term, i)
         else:
-            internal += term.force(m, i)
+            internal += force_with_dependents(m, term, i)
     if ti.static(m.stiffness_damping):
         damping += rayleigh_damping.stiffness_force(m, i, row_times(m, w.damper, i, m.state.v))
     inertia = ti.cast(mass_times(m, i, w.change), m.real)

@@ -15,6 +15,7 @@ import taichi as ti
 from taisoft.backend.arrays import Count, FieldArena, download, upload
 from taisoft.backend.runtime import Runtime, threads
 from taisoft.fem import reference, springs
+from taisoft.fem.dependents import build_dependents, dependent_table, expanded_pairs, table_of
 from taisoft.fem.laws import LAWS
 from taisoft.fem.loads import SceneLoads
 from taisoft.fem.node_graph import PAIRS, NodeGraph, node_graph
@@ -87,6 +88,7 @@ class Model:
     free: Any  # (n_nodes) 3-vectors: 1 on free axes, 0 on constrained ones
     gravity: Any  # () 3-vector [m/s^2]
     springs: Any  # fem.springs.Springs, or None
+    dependents: Any  # fem.dependents.Dependents, or None
     loads: Any  # (n_nodes) 3-vectors [N], or None: tractions and forces
     amplitudes: Any  # f64, or None: present values of the loads that are one number, see `fem.loads.scalar_loads`
     node_body: Any  # (n_nodes) i32; None unless damping needs it
@@ -98,6 +100,11 @@ class Model:
     spring_damping: bool
     elasticity_by_tet: bool  # law_constants may differ between the tets of a body
     chunks: int  # parts of a loop, each with its own partial sums
+
+    @property
+    def has_dependents(self) -> bool:
+        """Whether nodes are attached exactly."""
+        return self.dependents is not None
 
     @property
     def has_springs(self) -> bool:
@@ -209,8 +216,12 @@ def _gather_table(nodes, groups: tuple[Group, ...], real: np.ndarray, n_nodes: i
     return start.astype(np.int32), entry[order].astype(np.int32)
 
 
-def model_graph(model: Model) -> tuple[NodeGraph, np.ndarray]:
-    """Pairs of nodes that share a tet or a spring, and for each pair of each tet where the assembly buffer has its block."""
+def model_graph(model: Model) -> tuple[NodeGraph, np.ndarray, np.ndarray | None]:
+    """Pairs of nodes that share a tet or a spring, and where the assembly buffer has the blocks (e,) that they sum up.
+
+    The latter are indices times lanes, plus the lane, in the order of the graph's `pair`. With dependent nodes also the factors
+    (e,2) of `expanded_pairs`, else None.
+    """
     (nodes, volume), lanes = download([model.nodes, model.volume]), model.lanes
     flat, real = nodes.astype(np.int64), volume.reshape(-1) > 0
     ends, entries = [], []
@@ -221,11 +232,15 @@ def model_graph(model: Model) -> tuple[NodeGraph, np.ndarray]:
         ends.append(own[:, pairs].reshape(-1, 2))
         base = g.matrix_at + (lane // lanes)[:, None] * (MATRIX_BLOCKS[g.order] * 9) + 9 * np.arange(len(pairs))
         entries.append((base * lanes + (lane % lanes)[:, None]).reshape(-1))
-    entries = np.concatenate(entries)
+    ends, entries, factors, others = np.concatenate(ends), np.concatenate(entries), None, []
+    if model.dependents is not None:
+        others.append(np.unique(np.sort(ends, axis=1), axis=0))
+        ends, rows, factors = expanded_pairs(table_of(model.dependents, model.n_nodes), ends)
+        entries = entries[rows]
     if model.springs is not None:
-        ends.append(springs.node_pairs(*download([model.springs.start, model.springs.node])))
-    graph = node_graph(np.concatenate(ends), model.n_nodes)
-    return replace(graph, pair=graph.pair[: len(entries)]), entries
+        others.append(springs.node_pairs(*download([model.springs.start, model.springs.node])))
+    graph = node_graph(np.concatenate([ends, *others]), model.n_nodes)
+    return replace(graph, pair=graph.pair[: len(entries)]), entries, factors
 
 
 def lane_layout(values: np.ndarray, lanes: int) -> np.ndarray:
@@ -273,6 +288,7 @@ def build_model(scene: Scene, runtime: Runtime, arena: FieldArena, on: dict[str,
     weight = mass = arena.field("mass", real, n_nodes, reference.lumped_masses(scene).astype(npr))
     if on["consistent_weight"]:
         weight = arena.field("gravity_mass", real, n_nodes, reference.gravity_masses(scene).astype(npr))
+    dependents = dependent_table(scene)
     model = Model(
         real=real,
         strain_real=strain_real,
@@ -297,6 +313,7 @@ def build_model(scene: Scene, runtime: Runtime, arena: FieldArena, on: dict[str,
         mass_matrix=None,
         free=arena.vectors("free", real, n_nodes, np.ones((n_nodes, 3), dtype=npr)),
         gravity=arena.vectors("gravity", real, 1, np.asarray(scene.gravity, dtype=npr)[None]),
+        dependents=build_dependents(dependents, arena) if dependents is not None else None,
         springs=springs.build_springs(scene, arena, n_nodes, on["assembled_stiffness"]) if on["springs"] else None,
         loads=arena.vectors("loads", real, n_nodes, scene_loads.at(0.0).astype(npr)) if on["loads"] else None,
         amplitudes=arena.field("amplitudes", ti.f64, n_amplitudes, scene_loads.amplitudes([0.0])[0]) if n_amplitudes else None,
@@ -316,7 +333,7 @@ def build_model(scene: Scene, runtime: Runtime, arena: FieldArena, on: dict[str,
 
 
 def _build_mass_matrix(scene: Scene, model: Model, arena: FieldArena, npr: type) -> MassMatrix:
-    graph, _ = model_graph(model)
+    graph = model_graph(model)[0]
     mass = MassMatrix(
         row_start=arena.field("mass_row_start", ti.i32, model.n_nodes + 1, graph.row_start.astype(np.int32)),
         column=arena.field("mass_column", ti.i32, len(graph.column), graph.column.astype(np.int32)),

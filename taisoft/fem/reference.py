@@ -18,6 +18,7 @@ from itertools import permutations
 import numpy as np
 import scipy.sparse as sp
 
+from taisoft.fem.dependents import dependent_table
 from taisoft.mesh.topology import EDGES
 from taisoft.scene.scene import Body, Scene
 
@@ -126,18 +127,21 @@ def consistent_mass(body: Body) -> sp.csr_matrix:
 
 def lumped_masses(scene: Scene) -> np.ndarray:
     """Lumped masses (n_nodes,) [kg], bodies in order."""
-    return np.concatenate([lumped_mass(b) for b in scene.bodies])
+    masses, table = np.concatenate([lumped_mass(b) for b in scene.bodies]), dependent_table(scene)
+    return masses if table is None else table.lump(masses)
 
 
 def gravity_masses(scene: Scene) -> np.ndarray:
     """Masses used for weight, int rho N_a dV, (n_nodes,) [kg]."""
-    return np.concatenate([gravity_mass(b) for b in scene.bodies])
+    masses, table = np.concatenate([gravity_mass(b) for b in scene.bodies]), dependent_table(scene)
+    return masses if table is None else table.matrix.T @ masses
 
 
 def mass_matrix(scene: Scene) -> sp.csr_matrix:
     """Mass matrix of implicit steps (n_nodes, n_nodes) [kg]: consistent for bodies of order 2, else lumped."""
     parts = [consistent_mass(b) if b.order == 2 else sp.diags(lumped_mass(b)) for b in scene.bodies]
-    return sp.block_diag(parts, format="csr")
+    M, table = sp.block_diag(parts, format="csr"), dependent_table(scene)
+    return M if table is None else (table.matrix.T @ M @ table.matrix).tocsr()
 
 
 def triangle_areas(body: Body, triangles: np.ndarray) -> np.ndarray:

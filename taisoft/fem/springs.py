@@ -11,9 +11,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import scipy.sparse as sp
 import taichi as ti
 
 from taisoft.backend.arrays import Count, FieldArena, download, upload
+from taisoft.fem.dependents import dependent_table
 from taisoft.fem.loads import tension_slots
 from taisoft.scene.body import Body
 from taisoft.scene.connections import Attachment, Point, locate_nodes, start_of
@@ -104,7 +106,7 @@ def spring_table(scene: Scene) -> SpringTable | None:
     for tendon in scene.tendons:
         segments = [made.between(p, q) for p, q in zip(tendon.points, tendon.points[1:])]
         made.add(tendon.name, segments, 0.0, 0.0, 0.0, slots[tendon.name])
-    for attachment in scene.attachments:
+    for attachment in [one for one in scene.attachments if one.stiffness is not None]:
         made.add(attachment.name, made.attached(attachment), attachment.stiffness, 0.0, attachment.damping, -1)
     return made.table() if made.elements else None
 
@@ -149,8 +151,11 @@ class _Builder:
 
     def table(self) -> SpringTable:
         """All elements, without nodes of weight 0."""
-        nodes, weights = [], []
+        nodes, weights, dependents = [], [], dependent_table(self.scene)
         for own, c, _ in self._entries:
+            if dependents is not None:
+                row = sp.csr_matrix((c, (np.zeros(len(own), dtype=int), own)), shape=(1, dependents.n_nodes)) @ dependents.matrix
+                own, c = row.indices, row.data
             distinct, place = np.unique(own, return_inverse=True)
             total = np.bincount(place, c)
             nodes.append(distinct[total != 0.0])

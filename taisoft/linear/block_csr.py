@@ -49,11 +49,17 @@ class BlockCsr:
     term_start: Any = None  # this and the next two only for quadratic tets, see `element_blocks.pair_terms`
     term_pair: Any = None
     term_factor: Any = None
+    edge_factor: Any = None  # (entries, 2), see `fem.dependents.expanded_pairs`; only with dependent nodes
+
+    @property
+    def is_expanded(self) -> bool:
+        """Whether blocks of tets act on other nodes than the tets'."""
+        return self.edge_factor is not None
 
 
 def build_block_csr(model: Model, arena: FieldArena, prefix: str = "stiffness") -> BlockCsr:
     """Build the pattern and gather table from the model's tets. `assemble` fills the values."""
-    graph, base = model_graph(model)
+    graph, base, shares = model_graph(model)
     if base.max(initial=0) > np.iinfo(np.int32).max - 9 * model.lanes:
         raise SimulationError(f"{int(model.volume.shape[0]) * model.lanes} tets are too many to assemble a stiffness matrix")
     n_edges, rules = len(graph.ends), {}
@@ -67,6 +73,9 @@ def build_block_csr(model: Model, arena: FieldArena, prefix: str = "stiffness") 
         start, pairs, factors = pair_terms(model.rules)
         rules["term_start"], rules["term_pair"] = copied("term_start", start), copied("term_pair", pairs)
         rules["term_factor"] = copied("term_factor", factors, model.real)
+    by_edge = np.argsort(graph.pair, kind="stable")
+    if shares is not None:
+        rules["edge_factor"] = copied("edge_factor", shares[by_edge], model.real)
     size = sum((g.last - g.first) * MATRIX_BLOCKS[g.order] * 9 for g in model.groups)
     element = arena.lanes(f"{prefix}_element", model.real, size * model.lanes)
     return BlockCsr(
@@ -80,7 +89,7 @@ def build_block_csr(model: Model, arena: FieldArena, prefix: str = "stiffness") 
         element_at=element.at // model.lanes,
         element_mask=element.mask // model.lanes,
         edge_start=copied("edge_start", np.concatenate([[0], np.cumsum(np.bincount(graph.pair, minlength=n_edges))])),
-        edge_entry=copied("edge_entry", base[np.argsort(graph.pair, kind="stable")]),
+        edge_entry=copied("edge_entry", base[by_edge]),
         edge_upper=copied("edge_upper", graph.upper),
         edge_lower=copied("edge_lower", graph.lower),
         **rules,
@@ -126,7 +135,11 @@ def gather_edge(m: ti.template(), A: ti.template(), e):
         at = (A.element_at * m.lanes + A.edge_entry[k]) & (A.element_mask * m.lanes + m.lanes - 1)
         for r in ti.static(range(3)):
             for c in ti.static(range(3)):
-                s[4 * c + r] += A.element[at + (3 * r + c) * m.lanes]
+                if ti.static(A.is_expanded):
+                    transposed = A.element[at + (3 * c + r) * m.lanes]
+                    s[4 * c + r] += A.edge_factor[k, 0] * A.element[at + (3 * r + c) * m.lanes] + A.edge_factor[k, 1] * transposed
+                else:
+                    s[4 * c + r] += A.element[at + (3 * r + c) * m.lanes]
     A.value[A.edge_upper[e]] = s
     for r in ti.static(range(3)):
         for c in ti.static(range(3)):

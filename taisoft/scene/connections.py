@@ -85,13 +85,13 @@ class Tendon:
 @guarded_record("attachment", _ADD_ANOTHER)
 @dataclass(frozen=True, eq=False)
 class Attachment:
-    """Nodes of a body, each pulled by a spring of rest length 0 to where it lies in another body or an obstacle at the start."""
+    """Nodes of a body, each kept where it lies in another body at the start, or pulled there by a spring of rest length 0."""
 
     name: str
     a: str
     nodes: np.ndarray  #: (k,) int64 node ids of body a
     b: str  #: name of a body or obstacle
-    stiffness: float  #: [N/m] of each node
+    stiffness: float | None  #: [N/m] of each node's spring; None: it moves with body b exactly
     damping: float = 0.0  #: [N s/m] of each node
     where: Callable | None = None  #: as in `Constraint`
 
@@ -156,12 +156,15 @@ def add_tendon(self: "Scene", points, force, name: str | None = None) -> Tendon:
     return tendon
 
 
-def attach(self: "Scene", a: str, where, b: str, stiffness: float, damping: float = 0.0, name: str | None = None) -> Attachment:
-    """Attach nodes of a body to where they lie in another body, or to an obstacle at rest, by springs; return the attachment.
+def attach(
+    self: "Scene", a: str, where, b: str, stiffness: float | None = None, damping: float = 0.0, name: str | None = None
+) -> Attachment:
+    """Attach nodes of a body to where they lie in another body, or to an obstacle at rest; return the attachment.
 
     a: name of the body; where: its nodes, as for `Body.fix`; b: name of another body, or of an obstacle. The chosen nodes must
-    lie in or on body b at the start, or outside by at most a tenth of the height of a tet. stiffness [N/m] and damping [N s/m] of
-    each node's spring, whose rest length is 0. name: unique; "attachment0" and so on by default. Raises SceneError.
+    lie in or on body b at the start, or outside by at most a tenth of the height of a tet. stiffness: None, they move with body b
+    exactly; else [N/m] of a spring of rest length 0 for each node, whose damping [N s/m] is given too. Bodies that are attached
+    exactly do not collide with each other. name: unique; "attachment0" and so on by default. Raises SceneError.
     """
     self._check_open("attach")
     name = _free_name(self, name, "attachment")
@@ -171,8 +174,13 @@ def attach(self: "Scene", a: str, where, b: str, stiffness: float, damping: floa
     if b == a:
         raise SceneError(f"{what}: a body cannot be attached to itself")
     owner = _owner(self, b, what)
-    stiffness = checks.number(stiffness, f"{what}: stiffness", above=0.0, unit="N/m")
+    if stiffness is not None:
+        stiffness = checks.number(stiffness, f"{what}: stiffness", above=0.0, unit="N/m")
     damping = checks.number(damping, f"{what}: damping", minimum=0.0, unit="N s/m")
+    if stiffness is None and damping > 0.0:
+        raise SceneError(f"{what}: damping is that of springs: give a stiffness, too")
+    if stiffness is None and not isinstance(owner, Body):
+        raise SceneError(f"{what}: {b!r} is an obstacle: fix the nodes by body.fix instead, or give a stiffness")
     attachment = Attachment(name, body.name, nodes, owner.name, stiffness, damping, where if callable(where) else None)
     if isinstance(owner, Body):
         locate_nodes(self, attachment)
@@ -186,6 +194,23 @@ def check_connections(scene: "Scene") -> None:
         found = [_owner(scene, owner, f"{type(one).__name__.lower()} {one.name!r}") for owner in one.owners]
         if isinstance(one, Attachment) and isinstance(found[1], Body):
             locate_nodes(scene, one)
+    _check_exact(scene)
+
+
+def _check_exact(scene: "Scene") -> None:
+    """Raise SceneError if an exactly attached node is constrained or attached twice, or bodies differ in stiffness damping."""
+    taken: dict[str, set[int]] = {}
+    for one in scene.attachments:
+        if one.stiffness is not None:
+            continue
+        what, body, own = f"attachment {one.name!r}", scene.body(one.a), taken.setdefault(one.a, set())
+        fixed = {node for constraint in body.constraints for node in constraint.nodes.tolist()}
+        for rule, others in (("fixed or moved, too: leave it out there or here", fixed), ("attached already", own)):
+            if both := sorted(others & set(one.nodes.tolist())):
+                raise SceneError(f"{what}: node {both[0]} of body {one.a!r} is {rule}")
+        own |= set(one.nodes.tolist())
+        if body.composition.first.stiffness_damping != scene.body(one.b).composition.first.stiffness_damping:
+            raise SceneError(f"{what}: bodies {one.a!r} and {one.b!r} must have the same stiffness_damping")
 
 
 def check_tension(value: float, what: str) -> None:

@@ -86,8 +86,10 @@ def make_plan(scene: Scene, explicit: bool, multistep: bool, self_collision: boo
     add_if_any("moving_nodes", lambda b: any(c.path is not None for c in b.constraints), "paths on", "no node follows a path")
     for damping in ("mass_damping", "stiffness_damping"):
         add_if_any(damping, lambda b, d=damping: getattr(b.composition.first, d) > 0, "material of", f"every {damping} is 0")
-    connected = [one.name for one in scene.connections]
-    plan.add("springs", connected, _shorten(connected), "no spring, tendon or attachment")
+    exact = [one.name for one in scene.exact_attachments]
+    connected = [one.name for one in scene.connections if one.name not in exact]
+    plan.add("springs", connected, _shorten(connected), "no spring, tendon or attachment by springs")
+    plan.add("dependent_nodes", exact, _shorten(exact), "no node is attached exactly")
     damped = [one.name for one in scene.connections if one.damping > 0.0]
     plan.add("spring_damping", damped, _shorten(damped), "no spring or attachment is damped")
     plan.add("assembled_stiffness", not explicit, "implicit steps solve linear systems", "explicit steps need forces only")

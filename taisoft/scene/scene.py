@@ -110,6 +110,11 @@ class Scene(Guarded):
         check_connections(self)
 
     @property
+    def exact_attachments(self) -> list[Attachment]:
+        """The attachments without springs."""
+        return [one for one in self.attachments if one.stiffness is None]
+
+    @property
     def connections(self) -> list[Connection]:
         """Springs, then tendons, then attachments, each in the order added."""
         return [*self.springs, *self.tendons, *self.attachments]

@@ -58,8 +58,8 @@ def connection_tables(scene: Scene, ids: Callable, fields: Callable) -> dict:
         tendons[one.name] = {"points": [_pair(point) for point in one.points], "force": force}
     for one in scene.attachments:
         nodes = ids(one.nodes, scene.body(one.a).n_nodes)
-        own = {"a": one.a, "nodes": nodes, "b": one.b, "stiffness": one.stiffness, "damping": one.damping}
-        attachments[one.name] = own
+        springs_of = {} if one.stiffness is None else {"stiffness": one.stiffness, "damping": one.damping}
+        attachments[one.name] = {"a": one.a, "nodes": nodes, "b": one.b} | springs_of
     return {"springs": springs, "tendons": tendons, "attachments": attachments}
 
 

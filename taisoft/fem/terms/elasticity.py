@@ -9,6 +9,7 @@ Simulation" (University of Copenhagen), at every quadrature point, with two corr
 import taichi as ti
 
 from taisoft.backend.runtime import kernel
+from taisoft.fem.dependents import place, place_all
 from taisoft.fem.lanes import (
     add_forces,
     broadcast,
@@ -98,6 +99,7 @@ def record_volumes(m: ti.template(), b, J):
 @ti.func
 def sum_elements(m: ti.template(), subset: ti.template()):
     """Run `element_force` over all blocks of a subset and prepare other terms, as top-level loops of a kernel."""
+    place_all(m)
     for n, g in ti.static(enumerate(m.groups)):
         ti.loop_config(serialize=m.serial)
         for j in range(count_of(subset, BLOCKS + n, g.first), count_of(subset, BLOCKS + n + 1, g.last)):
@@ -118,6 +120,7 @@ def prepare_terms(m: ti.template()):
 @ti.func
 def sum_elements_with_damping(m: ti.template()):
     """As `sum_elements` over all blocks, with stiffness damping if it is on. scalars: LOWEST_J, INVERTED_NOW, FAILED."""
+    place_all(m)
     for g in ti.static(m.groups):
         ti.loop_config(serialize=m.serial)
         for b in range(g.first, g.last):
@@ -130,6 +133,9 @@ def sum_elements_serially(m: ti.template()):
     """The same inside a serial loop. Returns the smallest J and the number of inverted tets, per lane."""
     lowest = broadcast(ti.cast(HUGE, m.real), m.lanes)
     inverted = broadcast(ti.cast(0, ti.i32), m.lanes)
+    if ti.static(m.has_dependents):
+        for k in range(m.dependents.n):
+            place(m, k)
     for g in ti.static(m.groups):
         for b in range(g.first, g.last):
             J = element_force(m, g, m.stiffness_damping, b)

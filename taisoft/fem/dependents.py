@@ -1,0 +1,216 @@
+"""Dependent nodes: those of exact attachments, x_d = sum_i w_i x_i of independent nodes i.
+
+With x = T q of the independent positions q, forces act as T^T f, and matrices as T^T A T. The lumped mass of a dependent node
+goes to its independent ones in proportion to |w_i|: any share conserves momentum and angular momentum, and masses stay positive
+where quadratic tets have negative weights. Weight acts by w_i. A node may depend on nodes that are dependent themselves; T then
+maps through them.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import scipy.sparse as sp
+import taichi as ti
+
+from taisoft.backend.arrays import Count, FieldArena, download
+from taisoft.errors import SceneError
+from taisoft.scene.connections import locate_nodes
+from taisoft.scene.scene import Scene
+
+# Of its own mass, what a dependent node keeps: kernels divide by masses, whose quotients they then discard
+KEPT_MASS = 1e-12
+
+
+@dataclass(frozen=True, eq=False)
+class DependentTable:
+    """d dependent nodes of n; s weights in all."""
+
+    n_nodes: int
+    node: np.ndarray  # (d,) ascending
+    start: np.ndarray  # (d + 1) first weight of each
+    master: np.ndarray  # (s,) independent nodes
+    weight: np.ndarray  # (s,)
+
+    @cached_property
+    def rows(self) -> sp.csr_matrix:
+        """The rows of T of the dependent nodes (d, n_nodes)."""
+        return sp.csr_matrix((self.weight, self.master, self.start), shape=(len(self.node), self.n_nodes))
+
+    @cached_property
+    def matrix(self) -> sp.csr_matrix:
+        """T (n_nodes, n_nodes); columns of dependent nodes are 0."""
+        independent = np.ones(self.n_nodes)
+        independent[self.node] = 0.0
+        placed = sp.csr_matrix((np.ones(len(self.node)), (self.node, np.arange(len(self.node)))), (self.n_nodes, len(self.node)))
+        return (sp.diags(independent) + placed @ self.rows).tocsr()
+
+    def place(self, x: np.ndarray) -> None:
+        """Set the rows of the dependent nodes in x (n_nodes, 3)."""
+        x[self.node] = self.rows @ x.astype(np.float64)
+
+    def lump(self, mass: np.ndarray) -> np.ndarray:
+        """Lumped masses (n_nodes,) [kg] after the dependent nodes' have moved."""
+        share = abs(self.rows)
+        share = sp.diags(1.0 / np.asarray(share.sum(axis=1)).ravel()) @ share
+        moved = mass + share.T @ mass[self.node]
+        moved[self.node] = KEPT_MASS * mass[self.node]
+        return moved
+
+    @property
+    def growth(self) -> float:
+        """Largest sum |w_i|, at least 1: by its square the highest frequency of the dependent nodes' tets may grow."""
+        return float(abs(self.rows).sum(axis=1).max())
+
+
+@dataclass(frozen=True, eq=False)
+class Dependents:
+    """A `DependentTable` on the device, by dependent and by independent node."""
+
+    n: Count
+    node: Any  # (n) i32
+    start: Any  # (n + 1) i32
+    master: Any  # (s) i32
+    weight: Any  # (s) f64
+    of_start: Any  # (n_nodes + 1) i32: first of each independent node in the next two
+    of_node: Any  # (s) i32: dependent nodes
+    of_weight: Any  # (s) f64
+
+
+def dependent_table(scene: Scene) -> DependentTable | None:
+    """The dependent nodes of a scene; None if it has none. Raises SceneError for nodes that depend on themselves."""
+    exact = scene.exact_attachments
+    if not exact:
+        return None
+    starts = dict(zip((b.name for b in scene.bodies), np.cumsum([0, *(b.n_nodes for b in scene.bodies)])))
+    n = sum(body.n_nodes for body in scene.bodies)
+    rows, columns, weights = [], [], []
+    for one in exact:
+        nodes, own = locate_nodes(scene, one)
+        rows.append(np.repeat(starts[one.a] + one.nodes, nodes.shape[1]))
+        columns.append((starts[one.b] + nodes).reshape(-1))
+        weights.append(own.reshape(-1))
+    direct = sp.csr_matrix((np.concatenate(weights), (np.concatenate(rows), np.concatenate(columns))), shape=(n, n))
+    direct.eliminate_zeros()
+    node = np.unique(np.concatenate(rows))
+    on_dependent, total = sp.diags(np.isin(np.arange(n), node).astype(float)), direct
+    for _ in exact:
+        chained = total @ on_dependent
+        chained.eliminate_zeros()
+        if chained.nnz == 0:
+            break
+        total = (total - chained + chained @ direct).tocsr()
+        total.eliminate_zeros()
+    else:
+        _refuse_cycle(scene, (total @ on_dependent).tocsr(), starts)
+    total.sort_indices()
+    own = total[node]
+    return DependentTable(n, node, own.indptr.astype(np.int64), own.indices.astype(np.int64), own.data)
+
+
+def _refuse_cycle(scene: Scene, chained: sp.csr_matrix, starts: dict[str, int]) -> None:
+    chained.eliminate_zeros()
+    if chained.nnz == 0:
+        return
+    first = int(np.flatnonzero(np.diff(chained.indptr))[0])
+    body = [b for b in scene.bodies if starts[b.name] <= first][-1]
+    raise SceneError(
+        f"attachments: node {first - starts[body.name]} of body {body.name!r} is attached, through others, to itself"
+    )
+
+
+def build_dependents(table: DependentTable, arena: FieldArena) -> Dependents:
+    """Copy a table to the device."""
+    by_master = table.rows.tocsc()
+    by_master.sort_indices()
+
+    def ids(name: str, data: np.ndarray):
+        return arena.field(name, ti.i32, len(data), data.astype(np.int32))
+
+    return Dependents(
+        n=len(table.node),
+        node=ids("dependent_node", table.node),
+        start=ids("dependent_start", table.start),
+        master=ids("dependent_master", table.master),
+        weight=arena.field("dependent_weight", ti.f64, len(table.weight), table.weight),
+        of_start=ids("dependent_of_start", by_master.indptr),
+        of_node=ids("dependent_of_node", table.node[by_master.indices]),
+        of_weight=arena.field("dependent_of_weight", ti.f64, len(table.weight), by_master.data),
+    )
+
+
+def table_of(dependents: Dependents, n_nodes: int) -> DependentTable:
+    """The table on the device."""
+    d = dependents
+    node, start, master, weight = download([d.node, d.start, d.master, d.weight])
+    return DependentTable(n_nodes, *(a.astype(np.int64) for a in (node, start, master)), weight)
+
+
+@ti.func
+def place(m: ti.template(), k):
+    """Set x and v of dependent node number k."""
+    x, v = ti.Vector([0.0, 0.0, 0.0], ti.f64), ti.Vector([0.0, 0.0, 0.0], ti.f64)
+    for e in range(m.dependents.start[k], m.dependents.start[k + 1]):
+        x += m.dependents.weight[e] * m.state.x[m.dependents.master[e]]
+        v += m.dependents.weight[e] * ti.cast(m.state.v[m.dependents.master[e]], ti.f64)
+    m.state.x[m.dependents.node[k]] = x
+    m.state.v[m.dependents.node[k]] = ti.cast(v, m.real)
+
+
+@ti.func
+def place_all(m: ti.template()):
+    """Set x and v of the dependent nodes, as a top-level loop of a kernel."""
+    if ti.static(m.has_dependents):
+        ti.loop_config(serialize=m.serial)
+        for k in range(m.dependents.n):
+            place(m, k)
+
+
+@ti.func
+def force_with_dependents(m: ti.template(), term: ti.template(), i):
+    """Force of a term on node i, and on the nodes that depend on it [N]."""
+    f = term.force(m, i)
+    if ti.static(m.has_dependents):
+        for e in range(m.dependents.of_start[i], m.dependents.of_start[i + 1]):
+            f += ti.cast(m.dependents.of_weight[e], m.real) * term.force(m, m.dependents.of_node[e])
+    return f
+
+
+def expanded_pairs(table: DependentTable, ends: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Where the block K_ab of each pair (k,2) of nodes of a tet acts, if some of them are dependent.
+
+    Returns pairs (e,2), i < j, the row of `ends` of each, and factors (e,2): K_ij gets factor 0 times K_ab plus factor 1 times
+    its transpose. The tet's diagonal blocks are minus the sums of its rows, so in x^T K x the pair stands for
+    2 x_a.K_ab x_b - x_a.K_ab x_a - x_b.K_ab^T x_b, in which x_a and x_b are replaced by their sums.
+    """
+    dependent = np.zeros(table.n_nodes, dtype=bool)
+    dependent[table.node] = True
+    involved = dependent[ends].any(axis=1)
+    plain = np.flatnonzero(~involved)
+    rows = np.flatnonzero(involved)
+    width = max(1, int(np.diff(table.start).max()))
+    (nodes_a, weights_a), (nodes_b, weights_b) = (_padded(table, dependent, ends[rows, side], width) for side in (0, 1))
+    nodes, zero = np.concatenate([nodes_a, nodes_b], axis=1), np.zeros_like(weights_a)
+    A, B = np.concatenate([weights_a, zero], axis=1), np.concatenate([zero, weights_b], axis=1)
+    first = A[:, :, None] * (B - A)[:, None, :]
+    second = B[:, :, None] * (A - B)[:, None, :]
+    kept = (nodes[:, :, None] < nodes[:, None, :]) & ((first != 0.0) | (second != 0.0))
+    at, r, s = np.nonzero(kept)
+    pairs = np.concatenate([ends[plain], np.stack([nodes[at, r], nodes[at, s]], axis=1)])
+    factors = np.concatenate([np.tile([1.0, 0.0], (len(plain), 1)), np.stack([first[at, r, s], second[at, r, s]], axis=1)])
+    return pairs, np.concatenate([plain, rows[at]]), factors
+
+
+def _padded(table: DependentTable, dependent: np.ndarray, nodes: np.ndarray, width: int) -> tuple[np.ndarray, np.ndarray]:
+    """Independent nodes and weights (k, width) of nodes (k,), padded with weights of 0."""
+    own, weights = np.repeat(nodes[:, None], width, axis=1), np.zeros((len(nodes), width))
+    weights[:, 0] = 1.0
+    for k in np.flatnonzero(dependent[nodes]):
+        row = int(np.searchsorted(table.node, nodes[k]))
+        entries = slice(table.start[row], table.start[row + 1])
+        count = entries.stop - entries.start
+        own[k, :count], weights[k] = table.master[entries], 0.0
+        own[k, count:] = table.master[entries.start]
+        weights[k, :count] = table.weight[entries]
+    return own, weights
