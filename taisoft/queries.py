@@ -8,11 +8,8 @@ from taisoft.backend import runtime
 from taisoft.backend.arrays import upload
 from taisoft.dynamics.drag_spring import Drag
 from taisoft.errors import SceneError, SimulationError
-from taisoft.fem.springs import spring_table
 from taisoft.fem.terms import elasticity
 from taisoft.records import Energies, ErrorEstimate
-from taisoft.scene.checks import nearest
-from taisoft.scene.connections import Attachment
 from taisoft.stability import stable_dt as largest_stable_dt
 
 if TYPE_CHECKING:
@@ -52,16 +49,14 @@ def reactions(self: "Simulator", body: str | None = None) -> np.ndarray:
 
 
 def joint_force(self: "Simulator", name: str) -> float | np.ndarray:
-    """Return the force of a connection in the present state [N]; a copy."""
-    dynamics = self._open()
-    names = [one.name for one in self.scene.connections]
-    if name not in names:
-        raise SceneError(f"joint_force: no spring, tendon or attachment is called {name!r}{nearest(str(name), names)}")
-    x, v = dynamics.state.state()
-    loads = dynamics.state.loads.amplitudes([self.time])[0]
-    table = spring_table(self.scene)
-    pulls = table.pulls(x, v.astype(np.float64), loads)[table.elements[name]]
-    return pulls if isinstance(self.scene.connections[names.index(name)], Attachment) else float(np.linalg.norm(pulls[0]))
+    """Return the force of a connection in the present state [N].
+
+    Of a spring or a tendon the tension, positive where it pulls; of an attachment the forces (k,3) on its nodes, in their order;
+    where they are attached exactly, with their mean acceleration in the last step. Raises SceneError.
+    """
+    from taisoft.dynamics.joints import joint_force as of_dynamics
+
+    return of_dynamics(self._open(), name)
 
 
 def stress(self: "Simulator", body: str | None = None) -> np.ndarray:

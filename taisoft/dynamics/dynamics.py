@@ -43,7 +43,8 @@ class Dynamics:
     """
 
     def __init__(self, scene: Scene, settings: Settings, plan: Plan):
-        self.scene, self.dt = scene, settings.dt
+        self.scene, self.plan, self.dt = scene, plan, settings.dt
+        self._velocities_before: tuple[np.ndarray, float] | None = None  # before the last step, and its time [s]; of joints only
         self.tangent = None  # fields of `Simulator.force_differential`; made on request
         self.changes = 0  # count of user changes to the state or to numbers; at each the energy jumps
         self._time_base = 0.0, 0  # time [s] and step count when dt, the state or the settings last changed
@@ -103,6 +104,8 @@ class Dynamics:
             # the time of a whole batch even if n is smaller: the spring's stiffness, which depends on it, must not change
             spring.apply(held * self.dt)
             self.stepper.loads_changed()
+        if self.model.has_dependents:
+            self._velocities_before = self.state.state()[1].astype(np.float64), self.state.time
         try:
             result = self.stepper.advance(n, self.dt)
         except SimulationError as error:
@@ -166,6 +169,7 @@ class Dynamics:
     def state_changed(self) -> None:
         """Discard the stepper's history, after the state was set."""
         self.changes += 1
+        self._velocities_before = None
         self.stepper.forget()
 
     def numbers_changed(self) -> None:
@@ -201,6 +205,16 @@ class Dynamics:
         moving = self.contact is not None and any(obstacle.path is not None for obstacle in self.scene.obstacles)
         dragged = self.drag_spring is not None and self.drag_spring.drag is not None
         return moving or dragged or self.state.loads.vary or not all(self.state.dirichlet.released())
+
+    def mean_acceleration(self, nodes: np.ndarray) -> np.ndarray:
+        """Return the mean acceleration (k,3) [m/s^2] of nodes (k,) in the last step or batch; 0 before the first one.
+
+        Kept only in scenes with exact attachments.
+        """
+        if self._velocities_before is None:
+            return np.zeros((len(nodes), 3))
+        before, start = self._velocities_before
+        return (self.state.state()[1][nodes] - before[nodes]) / (self.state.time - start)
 
     # --- queries ------------------------------------------------------------------------------------------------------
 
