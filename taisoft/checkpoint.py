@@ -276,20 +276,22 @@ def from_checkpoint(cls: type["Simulator"], saved: Checkpoint, scene: Scene, arc
     if set(settings) != set(NAMES):
         raise SimulationError(f"{saved.path} holds no state of this scene: its settings are not those of this version")
     check_scene(saved, scene, plan_of(scene, *(settings[key] for key in ("integrator", "self_collision", "draggable"))).on)
-    start = scene.snapshot()
-    start.allow_initial_overlap = True  # bodies move to the saved positions below
-    sim = cls(start, **settings)
+    present, sim = scene.snapshot(scene), None
+    present.allow_initial_overlap = True  # bodies move to the saved positions below
     try:
-        with thawed(sim.scene):
+        restore_numbers(saved, present)
+        sim = cls(
+            present, **settings | {"dt": saved.state["dt"]}
+        )  # stable with these numbers, not always with those at the start
+        with thawed(sim, sim.scene):
+            sim.settings = dataclasses.replace(sim.settings, dt=settings["dt"])
             sim.scene.allow_initial_overlap = scene.allow_initial_overlap
-        restore_numbers(saved, sim.scene)
-        sim._stable_dt = None
         sim._dynamics.restore(saved.state)
-    except (KeyError, TypeError, ValueError) as error:  # the checksum is right, but the content does not fit this scene
-        sim.close()
-        raise SimulationError(f"{saved.path} holds no state of this scene: {type(error).__name__}: {error}") from None
-    except BaseException:
-        sim.close()
+    except BaseException as error:
+        if sim is not None:
+            sim.close()
+        if isinstance(error, (KeyError, TypeError, ValueError)):  # the checksum is right, but the content does not fit this scene
+            raise SimulationError(f"{saved.path} holds no state of this scene: {type(error).__name__}: {error}") from None
         raise
     scene.freeze()
     return sim
