@@ -350,3 +350,30 @@ def test_a_path_may_reuse_its_array(integrator):
             sim.advance(50)
             ends.append(sim.positions())
     assert np.array_equal(*ends)
+
+
+# --- failures ---------------------------------------------------------------------------------------------------------
+
+
+def kick(t: float) -> tuple:
+    """A force that no velocity of a light body survives."""
+    return (3e38 if t > 5.5 * DT else 0.0, 0.0, 0.0)
+
+
+def pull_apart(t: float) -> tuple:
+    """A displacement too large for a velocity."""
+    return (3e37 if t > 5.5 * DT else 0.0, 0.0, 0.0)
+
+
+@pytest.mark.parametrize("integrator", EXPLICIT)
+@pytest.mark.parametrize(
+    "drive", [lambda body: body.add_force([0, 3], kick), lambda body: body.move([0, 3], pull_apart)], ids=["load", "target"]
+)
+def test_the_reason_of_a_failure_is_found_at_the_step_that_failed(integrator, drive):
+    message = r"step [67]: body 'body', node [03]: position, velocity or force is no longer finite"
+    for n in (1, 10):
+        scene = ts.Scene(gravity=(0, 0, 0))
+        drive(scene.add_body(cube(), rubber(young=1e-3, density=1e-3), name="body"))
+        with simulator(scene, integrator) as sim, pytest.raises(ts.SimulationError, match=message):
+            for _ in range(10):
+                sim.advance(n)

@@ -149,6 +149,7 @@ class ExplicitStepper:
         n = min(n, self.max_batch)
         simulation = self.simulation
         simulation.set_load_time(simulation.time)
+        targets = loads = None
         if self.work.n_prescribed or self.work.n_varied:
             n = min(n, self.rows)
         if self.work.n_prescribed:
@@ -156,10 +157,10 @@ class ExplicitStepper:
             targets = simulation.next_targets(simulation.time + dt * np.arange(1, n + 1))
             self.acceleration_stale = self.acceleration_stale or simulation.releases != releases
             n = len(targets)
-            self._upload_targets(targets)
         if self.work.n_varied:
             times = simulation.time + dt * (np.arange(n) + int(self.work.verlet))  # Euler's forces are those at the start
-            explicit.set_rows(self.work.load_rows, simulation.load_rows(times, self._varied).reshape(-1, 3))
+            loads = simulation.load_rows(times, self._varied)
+        self._upload_rows(targets, loads)
         kept = simulation.state()
         try:
             result = self._launch(n, dt)
@@ -171,12 +172,13 @@ class ExplicitStepper:
             if result.steps > 0:  # deterministic on the CPU: repeat up to the last good sub-step
                 self._launch(result.steps, dt)
             good = simulation.state()
+            simulation.step_count += result.steps
+            simulation.time += result.steps * dt
             self._restore_state(*good)
+            self._upload_rows(*(None if rows is None else rows[result.steps :] for rows in (targets, loads)))
             self._launch(1, dt)
             fault = self._describe_fault()
             self._restore_state(*good)
-            simulation.step_count += result.steps
-            simulation.time += result.steps * dt
             raise SimulationError(f"step {simulation.step_count + 1}: {fault}")
         return result
 
@@ -186,6 +188,13 @@ class ExplicitStepper:
         exploded = f"a tet is inverted by {-lowest:.1e} times its volume: the motion has diverged, and a smaller dt is needed"
         other = exploded if lowest <= -explicit.EXPLODED else "a velocity is no longer finite"
         return self.simulation.find_nonfinite() or other
+
+    def _upload_rows(self, targets: np.ndarray | None, loads: np.ndarray | None) -> None:
+        """Upload targets and loads (r, k, 3) of the next sub-steps; None without any."""
+        if targets is not None:
+            self._upload_targets(targets)
+        if loads is not None:
+            explicit.set_rows(self.work.load_rows, loads.reshape(-1, 3))
 
     def _upload_targets(self, targets: np.ndarray) -> None:
         explicit.set_rows(self.work.targets, targets.reshape(-1, 3))
