@@ -23,7 +23,9 @@ from taisoft.errors import MeshError, SceneError
 BOX = ts.box_mesh((2, 1, 1), (0.3, 0.1, 1 / 3))
 IDS = np.arange(10) // 4 + 1
 NAMED = ts.TetMesh(BOX.vertices, BOX.tets, regions=IDS, region_names={1: "bone", 3: "soft tissue"})
-texts = st.text(min_size=1, max_size=8).filter(lambda text: text.strip() and text.isprintable() and '"' not in text)
+texts = st.text(min_size=1, max_size=8).filter(
+    lambda text: text.strip() and text.isprintable() and '"' not in text and not text.isdigit()
+)
 
 
 def written(path, data: dict, **options):

@@ -338,6 +338,33 @@ def test_scene_files_keep_everything(tmp_path):
     assert '[bodies.beam.materials]\nleft = "material0"\n7 = "material1"\n' in text
 
 
+def test_scene_files_need_a_region_that_their_meshes_can_hold(tmp_path):
+    """All meshes are checked before the first is written; a body that does not use its only region does without it."""
+    zero = ts.TetMesh(MESH.vertices, MESH.tets, regions=0 * MESH.regions, region_names={0: "all"})
+    scene = ts.Scene()
+    scene.add_body(named(MESH), rubber(), name="names")
+    scene.add_body(zero, rubber(), name="plain", position=(0, 5, 0))
+    with pytest.warns(
+        UserWarning, match="body 'plain': its mesh has no region but 0, which its file cannot tell from none"
+    ) as caught:
+        ts.write_scene(tmp_path / "a.toml", scene)
+    assert caught[0].filename == __file__
+    again = ts.read_scene(tmp_path / "a.toml")[0]
+    assert scene_digest(again) == scene_digest(scene) and again.bodies[1].mesh.regions is None
+    assert again.bodies[0].mesh.region_names == {3: "left", 7: "right"}
+    scene.add_body(zero, {"all": rubber()}, name="split", position=(0, 9, 0))
+    with pytest.raises(SceneError, match="body 'split': its mesh has no region but 0, .*: use another number"):
+        ts.write_scene(tmp_path / "b.toml", scene)
+    assert not list(tmp_path.glob("b*"))
+
+
+def test_a_name_may_be_its_regions_own_number(tmp_path):
+    mesh = ts.TetMesh(MESH.vertices, MESH.tets, regions=MESH.regions, region_names={3: "3", 7: "08"})
+    scene = ts.Scene()
+    scene.add_body(mesh, {"3": rubber(), "08": rubber(young=3e5)}, name="body")
+    there_and_back(tmp_path / "a.toml", scene, {"dt": 0.01})
+
+
 def test_checkpoints_keep_everything(tmp_path):
     path, E = tmp_path / "checkpoint.npz", np.linspace(1e5, 2e5, 5)
 
@@ -423,6 +450,11 @@ def test_bad_input_is_refused(arguments, message):
         ({"regions": [1] * 15, "region_names": {2: "a"}}, "region_names: no tet is in region 2"),
         ({"regions": [1] * 15, "region_names": {1: " "}}, "region_names: the name of region 1 must be a line of text"),
         ({"regions": [1] * 14 + [2], "region_names": {1: "a", 2: "a"}}, "region_names: 'a' is the name of two regions"),
+        ({"regions": [1] * 15, "region_names": []}, r"region_names must be a dict of names by region, not \[\]"),
+        (
+            {"regions": [1] * 14 + [-2], "region_names": {1: "-2"}},
+            "region_names: '-2', the name of region 1, is the number of another",
+        ),
         ({"regions": [1] * 15, "region_names": ["a"]}, r"region_names must be a dict of names by region, not \['a'\]"),
     ],
 )

@@ -84,12 +84,12 @@ def read_mesh(path, fix_orientation: bool = False, weld: float | None = None, re
     return _clean_mesh(name, content.points, blocks, notes + region_notes, fix_orientation, weld, labels)
 
 
-def write_mesh(path, mesh: TetMesh) -> None:
+def write_mesh(path, mesh: TetMesh, regions: bool = True) -> None:
     """Write a mesh atomically as .msh (Gmsh 4.1, with regions 2.2, text), .vtk, .vtu or .mesh (Medit).
 
     Regions become physical groups in .msh, references in .mesh, and else cell data called "region"; a warning says where their
-    names are lost. Raises MeshError for another extension, anything but a TetMesh, or regions that would be read as none,
-    OutputError if the file cannot be written.
+    names are lost. regions: whether to write them. Raises MeshError for another extension, anything but a TetMesh, or regions
+    that would be read as none, OutputError if the file cannot be written.
     """
     file = Path(path)
     ending = check_ending(file)
@@ -97,7 +97,7 @@ def write_mesh(path, mesh: TetMesh) -> None:
         raise MeshError(f"{file}: write_mesh needs a TetMesh, not {type(mesh).__name__}")
     record = meshio.Mesh(mesh.vertices, [("tetra", mesh.tets)])
     options = {"file_format": WRITERS[ending]} | ({"binary": False} if ending == ".msh" else {})
-    if mesh.regions is not None:
+    if regions and mesh.regions is not None:
         options |= _add_regions(file, record, mesh)
     elif ending == ".mesh":
         record.cell_data[REFERENCE] = [np.zeros(mesh.n_tets, dtype=np.int32)]  # meshio would write 1

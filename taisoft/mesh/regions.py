@@ -30,13 +30,14 @@ def checked_regions(values, n_tets: int, error: Callable[[str], MeshError]) -> n
 
 def checked_names(names, regions: np.ndarray | None, error: Callable[[str], MeshError]) -> dict[int, str]:
     """Return a copy of the names, {id: name} by ascending id. regions: as returned by `checked_regions`."""
+    if names is not None and not isinstance(names, dict):
+        raise error(f"region_names must be a dict of names by region, not {names!r}")
     if not names:
         return {}
-    if not isinstance(names, dict):
-        raise error(f"region_names must be a dict of names by region, not {names!r}")
     if regions is None:
         raise error("region_names are given without regions")
     present = set(np.unique(regions).tolist())
+    numbers = {str(region) for region in present}  # as scene files write regions without names
     found: dict[int, str] = {}
     for key, name in names.items():
         if isinstance(key, bool) or not isinstance(key, (int, np.integer)) or int(key) not in present:
@@ -45,6 +46,8 @@ def checked_names(names, regions: np.ndarray | None, error: Callable[[str], Mesh
             raise error(f"region_names: the name of region {key} must be a line of text without quotes, not {name!r}")
         if name in found.values():
             raise error(f"region_names: {name!r} is the name of two regions")
+        if name in numbers - {str(key)}:
+            raise error(f"region_names: {name!r}, the name of region {key}, is the number of another region")
         found[int(key)] = name
     return dict(sorted(found.items()))
 
