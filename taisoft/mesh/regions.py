@@ -1,11 +1,12 @@
 """Regions of a tetrahedral mesh: a whole number for each tet, and names for these numbers. They say where which material is."""
 
 import difflib
+from collections import Counter
 from collections.abc import Callable
 
 import numpy as np
 
-from taisoft.errors import MeshError
+from taisoft.errors import MeshError, listed, value_text
 
 LARGEST_ID = 2**31 - 1  # of a region: mesh files hold 32-bit integers
 
@@ -42,7 +43,7 @@ def checked_names(names, regions: np.ndarray | None, error: Callable[[str], Mesh
     for key, name in names.items():
         if isinstance(key, bool) or not isinstance(key, (int, np.integer)) or int(key) not in present:
             raise error(f"region_names: no tet is in region {key!r}")
-        if not isinstance(name, str) or not name.strip() or not name.isprintable() or '"' in name:
+        if not isinstance(name, str) or not _is_name(name):
             raise error(f"region_names: the name of region {key} must be a line of text without quotes, not {name!r}")
         if name in found.values():
             raise error(f"region_names: {name!r} is the name of two regions")
@@ -50,6 +51,42 @@ def checked_names(names, regions: np.ndarray | None, error: Callable[[str], Mesh
             raise error(f"region_names: {name!r}, the name of region {key}, is the number of another region")
         found[int(key)] = name
     return dict(sorted(found.items()))
+
+
+def usable_names(given: dict[int, str], ids: list[int]) -> tuple[dict[int, str], list[str]]:
+    """Return names of some of the regions `ids`, ascending, that a mesh can have, and a warning if they differ from given ones.
+
+    given: of any regions, from a file; single surrogates stand for bytes that are not UTF-8. Blank names are left out.
+    """
+    printable, changes = {}, []
+    for region in ids:
+        text = given.get(region, "")
+        try:
+            text.encode()
+        except UnicodeEncodeError:
+            text = text.encode("utf-8", "surrogateescape").decode("latin-1")
+        if not _is_name(text):
+            text = " ".join("".join(c if c.isprintable() and c != '"' else " " for c in text).split())
+        if text:
+            printable[region] = text
+    shared, numbers, names = Counter(printable.values()), {str(region) for region in ids}, {}
+    for region, text in printable.items():
+        if shared[text] > 1 or text in numbers - {str(region)}:
+            text = f"{text} ({region})"
+            while text in shared:
+                text += "'"
+        names[region] = text
+    for region in ids:
+        old, new = given.get(region, ""), names.get(region)
+        if new != old and old.strip():
+            becomes = "without a name" if new is None else f"called {value_text(new)}"
+            changes.append(f"region {region} is {becomes} instead of {value_text(old)}")
+    rule = "names of regions must be different lines of UTF-8 text, and not numbers of other regions"
+    return names, [f"{rule}: {listed(changes, 3)}"] if changes else []
+
+
+def _is_name(text: str) -> bool:
+    return bool(text.strip()) and text.isprintable() and '"' not in text
 
 
 def region_id(key, regions: np.ndarray | None, names: dict[int, str], error: Callable[[str], MeshError]) -> int:

@@ -18,8 +18,8 @@ from pathlib import Path
 import numpy as np
 
 from taisoft.attributes import MeshAttributeError, guarded_record
-from taisoft.errors import MeshError
-from taisoft.mesh.safe_reading import content_lines, one_line, read_by_meshio, read_content, run_child
+from taisoft.errors import MeshError, one_line
+from taisoft.mesh.safe_reading import content_lines, read_by_meshio, read_content, run_child
 from taisoft.mesh.tet_mesh import TetMesh, merge_labels
 from taisoft.mesh.topology import connected_pieces, linked_groups, triangle_edges
 

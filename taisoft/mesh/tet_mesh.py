@@ -12,7 +12,7 @@ import numpy as np
 import scipy
 
 from taisoft.attributes import Guarded, MeshAttributeError
-from taisoft.errors import MeshError
+from taisoft.errors import MeshError, listed
 from taisoft.mesh.regions import checked_names, checked_regions, region_id, region_text
 from taisoft.mesh.topology import EDGES, Faces, connected_pieces, first_repeated_tet, joint_edges, joint_vertices, linked_groups
 
@@ -22,7 +22,6 @@ LARGEST_COORDINATE = float(np.finfo(np.float32).max)  # [m], since forces may be
 MAX_OFFSET_RATIO = 1e5  # distance from the origin over size above which a warning is issued
 COINCIDENT = 1e-9  # vertices closer than this times the mesh's diagonal are coincident
 GENERIC_DIRECTION = np.array([0.56071, 0.64493, 0.51922])  # distinct projections for grid vertices; length at most 1
-MAX_LISTED = 20  # maximum number of indices listed in a message
 
 
 class TetMesh(Guarded):
@@ -209,7 +208,7 @@ class TetMesh(Guarded):
                 "fix_orientation=True flips and lists them"
             )
         elif len(inverted):
-            self._warn(f"{len(inverted)} of {self.n_tets} inverted tets have been flipped: {_index_text(inverted)}")
+            self._warn(f"{len(inverted)} of {self.n_tets} inverted tets have been flipped: {listed(inverted)}")
         self.tets[inverted] = self.tets[inverted][:, [0, 1, 3, 2]]
         return np.abs(volumes)
 
@@ -223,7 +222,7 @@ class TetMesh(Guarded):
             owners = np.sort(rows // 4)
             corners = tuple(np.sort(faces.triangles[rows[0]]).tolist())
             raise self._mesh_error(
-                f"face {corners} is shared by {len(rows)} tets ({_index_text(owners)}); a face may have at most two"
+                f"face {corners} is shared by {len(rows)} tets ({listed(owners)}); a face may have at most two"
             )
         # The outward faces of neighbours on opposite sides have opposite orientation; equal orientation means overlap.
         pairs = faces.pairs()
@@ -256,7 +255,7 @@ class TetMesh(Guarded):
             self._warn(f"parts are joined at an edge only at {len(edges)} edges, the first is {first}")
         vertices = np.setdiff1d(joint_vertices(self.tets, faces), edges)
         if len(vertices):
-            self._warn(f"parts are joined at a vertex only at {len(vertices)} vertices: {_index_text(vertices)}")
+            self._warn(f"parts are joined at a vertex only at {len(vertices)} vertices: {listed(vertices)}")
 
     def _warn_coincident(self) -> None:
         """Warn of vertices that coincide with another one; they do not connect their tets."""
@@ -317,9 +316,3 @@ def _may_be_near(points: np.ndarray, tolerance: float) -> bool:
     projections = np.sort(points @ GENERIC_DIRECTION)
     rounding = 8.0 * np.finfo(np.float64).eps * float(np.abs(points).max(initial=0.0))
     return bool((np.diff(projections) <= tolerance + rounding).any())
-
-
-def _index_text(indices: np.ndarray) -> str:
-    """Return indices as text, shortened after MAX_LISTED."""
-    text = ", ".join(str(i) for i in indices[:MAX_LISTED].tolist())
-    return text if len(indices) <= MAX_LISTED else f"{text}, ... ({len(indices)} in all)"
