@@ -15,7 +15,7 @@ from taisoft.scene import checks
 from taisoft.scene.collision import CONTACT_MODES
 from taisoft.scene.composition import Composition, compose
 from taisoft.scene.key_frames import KeyFrames, NodePath
-from taisoft.scene.loads import NodalForce, Traction, value_and_path
+from taisoft.scene.loads import NodalForce, Traction, value_or_path
 from taisoft.scene.material import Material
 
 NEARLY_INCOMPRESSIBLE = 0.49  # Poisson's ratio above which linear tets lock, so that they bend far too little
@@ -235,13 +235,8 @@ class Body(Guarded):
             path = NodePath(path, self.rest_positions[nodes] + self.position)
         if not callable(path):
             raise SceneError(f"{what}: path must be a function of time, not {path!r}")
-        try:
-            start = path(0.0)
-        except Exception as error:
-            raise SceneError(f"{what}: the path failed at t = 0: {type(error).__name__}: {error}") from error
-        if start is None:
+        if checks.path_value(path, 0.0, what, "displacement", ((3,), (len(nodes), 3))) is None:
             raise SceneError(f"{what}: the path must give a displacement at t = 0, not None")
-        checks.array(start, f"{what}: the path's displacement at t = 0", ((3,), (len(nodes), 3)))
         return self._add_constraint(Constraint(nodes, mask, path, _callable_or_none(where)), what)
 
     def add_traction(self, where, traction) -> Traction:
@@ -255,7 +250,7 @@ class Body(Guarded):
         what = f"{self._label()}: add_traction"
         centroids = self.mesh.vertices[self.mesh.surface].mean(axis=1)
         triangles = checks.selection(where, centroids, what, "surface triangle")
-        load = Traction(triangles, *value_and_path(traction, f"{what}: traction", ((3,),)))
+        load = Traction(triangles, **value_or_path(traction, what, "traction", ((3,),)))
         list.append(self.tractions, load)
         return load
 
@@ -268,8 +263,8 @@ class Body(Guarded):
         self._check_open("add_force")
         what = f"{self._label()}: add_force"
         nodes = checks.selection(where, self.rest_positions, what, "node")
-        value, path = value_and_path(force, f"{what}: force", ((3,), (len(nodes), 3)))
-        load = NodalForce(nodes, value, _callable_or_none(where), path)
+        given = value_or_path(force, what, "force", ((3,), (len(nodes), 3)))
+        load = NodalForce(nodes, where=_callable_or_none(where), **given)
         list.append(self.forces, load)
         return load
 

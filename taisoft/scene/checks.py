@@ -11,7 +11,7 @@ from numbers import Real
 
 import numpy as np
 
-from taisoft.errors import SceneError
+from taisoft.errors import SceneError, reason
 
 LARGEST, SMALLEST = float(np.finfo(np.float32).max), float(np.finfo(np.float32).tiny)  # limits of 32-bit floats
 MAX_TOLERANCE = {"newton_tolerance": 0.1}  # a residual of a tenth of the forces is no solution; others: 1
@@ -56,6 +56,18 @@ def array(value, what: str, shapes: tuple[tuple[int, ...], ...]) -> np.ndarray:
     if len(bad):
         raise SceneError(f"{what}: entry {bad[0].tolist()} is {result[tuple(bad[0])]:g}, too large for a 32-bit float")
     return result
+
+
+def path_value(path: Callable, t: float, what: str, quantity: str, shapes: tuple[tuple[int, ...], ...]) -> np.ndarray | None:
+    """Return what a path, a function of time [s], gives at t, checked as `array` does; None for None.
+
+    what: start of the message, quantity: what it should give.
+    """
+    try:
+        value = path(t)
+    except Exception as error:  # a user's function may raise anything
+        raise SceneError(f"{what}: the path failed at t = {t:g}: {reason(error)}") from error
+    return None if value is None else array(value, f"{what}: the path's {quantity} at t = {t:g}", shapes)
 
 
 def length(value) -> int:
@@ -131,7 +143,7 @@ def selection(where, points: np.ndarray, what: str, items: str, *, repeats: bool
         try:
             mask = np.asarray(where(points.copy()))
         except Exception as error:
-            raise SceneError(f"{what}: the selection function failed: {type(error).__name__}: {error}") from error
+            raise SceneError(f"{what}: the selection function failed: {reason(error)}") from error
         if mask.dtype != bool or mask.shape != (n,):
             raise SceneError(
                 f"{what}: the selection function must return a bool mask of shape ({n},), not {mask.dtype} of shape {mask.shape}"

@@ -162,7 +162,7 @@ def change_load(body: Body, kind: str, index: int, value) -> None:
     if not loads:
         raise SceneError(f"{what}: it has no {kind}: give it one of 0 by body.add_{kind} before the Simulator is made")
     old = loads[checks.whole(index, f"{what}: index", range(len(loads)))]
-    new = replace(old, value=checks.array(value, f"{what}: {kind} {index}", old.shapes), path=None)
+    new = replace(old, value=checks.array(value, f"{what}: {kind} {index}", old.shapes), path=None, path_shape=None)
     with thawed(body):
         getattr(body, LOADS[kind])[index] = new
 
