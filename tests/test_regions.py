@@ -36,6 +36,8 @@ from taisoft.view.scene_view import Layers
 from taisoft.view.window import Loop
 
 MESH = halved(cube(cells=(3, 1, 1)))
+GRID = ts.box_mesh((20, 5, 2), (4, 1, 1))
+MANY = ts.TetMesh(GRID.vertices, GRID.tets, regions=range(1, 1001))
 TIGHT = {"newton_tolerance": 1e-13, "linear_tolerance": 1e-13}
 
 
@@ -275,7 +277,7 @@ def test_refused_changes_leave_everything():
         for numbers, message in (
             ({"region": "lefty", "young": 1.0}, r"body 'beam': no region is called 'lefty'; did you mean 'left'\?"),
             ({"region": 4, "young": 1.0}, "body 'beam': no tet is in region 4; there are 'left', 7"),
-            ({"region": 7, "young": -1.0}, "body 'beam': region 7: material: young must be greater than 0"),
+            ({"region": 7, "young": -1.0}, "body 'beam': region 7: young must be greater than 0 Pa, not -1.0$"),
             ({"region": 7, "mass_damping": 0.0}, "mass_damping is one number for the whole body"),
             ({"young": [1e5, 2e5]}, r"body 'beam': young must have shape \(15,\), not \(2,\)"),
             ({"mass_damping": np.zeros(15)}, "mass_damping must be a number"),
@@ -305,6 +307,22 @@ def test_assignments_replace_the_material_or_its_numbers():
         body.poisson = np.linspace(0.1, 0.495, MESH.n_tets)
     with pytest.raises(SceneError, match="mass cannot be set: set body.density"):
         body.mass = 3.0
+
+
+def test_the_materials_of_regions_are_read_only_and_can_be_passed_on():
+    body, other = (beam({"left": rubber(SVK), 7: rubber(COR)}).bodies[0] for _ in range(2))
+    with pytest.raises(TypeError):
+        body.material[7] = rubber()
+    body.material = {3: rubber(), 7: rubber(young=3e5)}
+    other.material = body.material
+    assert other.material == body.material and set(other.young) == {1e5, 3e5}
+
+
+def test_an_array_of_one_number_is_a_number():
+    body = beam(rubber(), young=np.array(2e5)).bodies[0]
+    assert body.young == 2e5 and isinstance(body.young, float) and not body.composition.elastic_by_tet
+    body.density = np.array(500)
+    assert body.density == 500.0 and rubber(young=np.array(3e5)) == rubber(young=3e5)
 
 
 # --- copies -----------------------------------------------------------------------------------------------------------
@@ -428,8 +446,15 @@ def test_the_digest_tells_compositions_apart():
         ({"density": np.append(-1.0, np.ones(14))}, "density of tet 0 must be greater than 0 kg/m.3, not -1"),
         ({"poisson": np.append(np.zeros(14), 0.5)}, r"poisson of tet 14 must lie in the open interval \(-1, 0.5\), not 0.5"),
         ({"young": [1e5] * 14 + [float("nan")]}, r"young: entry \[14\] is nan, not finite"),
-        ({"young": -1.0}, "material: young must be greater than 0"),
-        ({"young": "1e5"}, "material: young must be a number"),
+        ({"young": -1.0}, "young must be greater than 0 Pa, not -1.0$"),
+        ({"young": "1e5"}, "young must be a number, not '1e5'$"),
+        ({"young": np.array(-1.0)}, "young must be greater than 0 Pa, not "),
+        ({"young": np.array(["a"] * 1000)}, r"young must be numbers of shape \(15,\), not .{1,120}$"),
+        ({"young": "a\n" * 1000}, "young must be a number, not .{1,120}$"),
+        (
+            {"material": dict.fromkeys(range(1000), rubber()), "mesh": MANY},
+            r"material: no tet is in region 0; there are .{1,180}\(1000 in all\)$",
+        ),
     ],
 )
 def test_bad_input_is_refused(arguments, message):

@@ -18,7 +18,7 @@ from pathlib import Path
 import meshio
 import numpy as np
 
-from taisoft.errors import MeshError
+from taisoft.errors import MeshError, listed, value_text
 from taisoft.files import replacing
 from taisoft.mesh.gmsh import PHYSICAL, read_gmsh, split_names
 from taisoft.mesh.regions import LARGEST_ID, usable_names
@@ -151,10 +151,10 @@ def _regions(name: str, content: FileContent, requested: str | None) -> tuple[np
     requested: name of the cell data, or None for the known ones.
     """
     if requested is not None and not isinstance(requested, str):
-        raise MeshError(f"{name}: regions must be the name of cell data, or None, not {requested!r}")
+        raise MeshError(f"{name}: regions must be the name of cell data, or None, not {value_text(requested)}")
     if requested is not None and requested not in content.cell_data:
-        known = ", ".join(repr(one) for one in content.cell_data) or "none"
-        raise MeshError(f"{name}: no cell data are called {requested!r}; there are {known}")
+        known = listed([value_text(one) for one in content.cell_data]) or "none"
+        raise MeshError(f"{name}: no cell data are called {value_text(requested)}; there are {known}")
     key = next((one for one in (requested, *NONE_IF_ZERO, REGION) if one in content.cell_data), None)
     if key is None:
         return None, {}, []
@@ -275,7 +275,7 @@ def _curved_edge_warnings(name: str, points: np.ndarray, cells: np.ndarray) -> l
 def _weld(name: str, points: np.ndarray, tets: np.ndarray, weld) -> tuple[np.ndarray, np.ndarray, list[str]]:
     """Merge vertices at most `weld` [m] apart into the first of each group; return points, tets and warnings."""
     if isinstance(weld, bool) or not isinstance(weld, (int, float, np.number)) or not 0 <= weld < np.inf:
-        raise MeshError(f"{name}: weld must be a distance of at least 0 m, or None, not {weld!r}")
+        raise MeshError(f"{name}: weld must be a distance of at least 0 m, or None, not {value_text(weld)}")
     shortest = float(edge_lengths(points, tets).min())
     if weld >= shortest > 0:
         raise MeshError(f"{name}: weld = {float(weld):g} m must be less than the shortest edge, {shortest:g} m")

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from taisoft.errors import MeshError, listed, value_text
+from taisoft.errors import MeshError, listed, one_line, value_text
 
 LARGEST_ID = 2**31 - 1  # of a region: mesh files hold 32-bit integers
 
@@ -32,7 +32,7 @@ def checked_regions(values, n_tets: int, error: Callable[[str], MeshError]) -> n
 def checked_names(names, regions: np.ndarray | None, error: Callable[[str], MeshError]) -> dict[int, str]:
     """Return a copy of the names, {id: name} by ascending id. regions: as returned by `checked_regions`."""
     if names is not None and not isinstance(names, dict):
-        raise error(f"region_names must be a dict of names by region, not {names!r}")
+        raise error(f"region_names must be a dict of names by region, not {value_text(names)}")
     if not names:
         return {}
     if regions is None:
@@ -42,13 +42,13 @@ def checked_names(names, regions: np.ndarray | None, error: Callable[[str], Mesh
     found: dict[int, str] = {}
     for key, name in names.items():
         if isinstance(key, bool) or not isinstance(key, (int, np.integer)) or int(key) not in present:
-            raise error(f"region_names: no tet is in region {key!r}")
+            raise error(f"region_names: no tet is in region {value_text(key)}")
         if not isinstance(name, str) or not _is_name(name):
-            raise error(f"region_names: the name of region {key} must be a line of text without quotes, not {name!r}")
+            raise error(f"region_names: the name of region {key} must be a line of text without quotes, not {value_text(name)}")
         if name in found.values():
-            raise error(f"region_names: {name!r} is the name of two regions")
+            raise error(f"region_names: {value_text(name)} is the name of two regions")
         if name in numbers - {str(key)}:
-            raise error(f"region_names: {name!r}, the name of region {key}, is the number of another region")
+            raise error(f"region_names: {value_text(name)}, the name of region {key}, is the number of another region")
         found[int(key)] = name
     return dict(sorted(found.items()))
 
@@ -94,15 +94,16 @@ def region_id(key, regions: np.ndarray | None, names: dict[int, str], error: Cal
     if regions is None:
         raise error("the mesh has no regions")
     ids = np.unique(regions).tolist()
+    there_are = listed([one_line(region_text(one, names)) for one in ids])
     if isinstance(key, str):
         for one, name in names.items():
             if name == key:
                 return one
         near = difflib.get_close_matches(key, names.values(), n=1)
-        hint = f"; did you mean {near[0]!r}?" if near else f"; there are {', '.join(region_text(one, names) for one in ids)}"
-        raise error(f"no region is called {key!r}{hint}")
+        hint = f"; did you mean {value_text(near[0])}?" if near else f"; there are {there_are}"
+        raise error(f"no region is called {value_text(key)}{hint}")
     if isinstance(key, bool) or not isinstance(key, (int, np.integer)) or int(key) not in ids:
-        raise error(f"no tet is in region {key!r}; there are {', '.join(region_text(one, names) for one in ids)}")
+        raise error(f"no tet is in region {value_text(key)}; there are {there_are}")
     return int(key)
 
 

@@ -12,7 +12,7 @@ from typing import ClassVar
 import numpy as np
 
 from taisoft.attributes import guarded_record
-from taisoft.errors import MeshError, SceneError, reason
+from taisoft.errors import MeshError, SceneError, reason, value_text
 from taisoft.mesh.shapes import box_mesh
 from taisoft.mesh.topology import normals_and_heights, opposite_half_edges
 from taisoft.scene import checks
@@ -264,7 +264,7 @@ class Obstacle:
         path = ShapePath(self.path, self.shape.pivot) if isinstance(self.path, KeyFrames) else self.path
         checks.store(self, friction=friction, restitution=restitution, path=path)
         if self.path is not None and not callable(self.path):
-            raise SceneError(f"{what}: path must be a function of time, not {self.path!r}")
+            raise SceneError(f"{what}: path must be a function of time, not {value_text(self.path)}")
         self.pose(0.0)
 
     def pose(self, t: float) -> tuple[np.ndarray, np.ndarray]:
