@@ -11,6 +11,7 @@ two materials against closed forms, test_region_files.py the readers. Here:
 * bad input is refused in one sentence that names the body, the region or tet, and the rule.
 """
 
+import pickle
 import warnings
 
 import numpy as np
@@ -486,3 +487,20 @@ def test_bad_input_is_refused(arguments, message):
 def test_bad_regions_are_refused(arguments, message):
     with pytest.raises(ts.MeshError, match=f"^part: {message}"):
         ts.TetMesh(MESH.vertices, MESH.tets, source="part", **arguments)
+
+
+# --- look-ups ---------------------------------------------------------------------------------------------------------
+
+
+def test_regions_are_sorted_once(monkeypatch):
+    mesh = ts.TetMesh(MESH.vertices, MESH.tets, regions=MESH.regions, region_names={3: "left"})
+    copies = pickle.loads(pickle.dumps(mesh)), mesh
+    monkeypatch.setattr(np, "unique", None)
+    for one in copies:
+        assert one.region_ids == (3, 7) and one.region_ids is one.region_ids
+        assert [one.region_id(key) for key in ("left", 3, np.int64(7))] == [3, 3, 7]
+        for key in (3.0, True, "7", None, [3]):
+            with pytest.raises(ts.MeshError, match="no tet is in region|no region is called"):
+                one.region_id(key)
+    with pytest.raises(ts.MeshError, match="region_ids"):
+        mesh.region_ids = ()

@@ -21,11 +21,12 @@ import numpy as np
 from taisoft.errors import MeshError, listed, value_text
 from taisoft.files import replacing
 from taisoft.mesh.gmsh import PHYSICAL, read_gmsh, split_names
+from taisoft.mesh.quality import edge_lengths
 from taisoft.mesh.regions import LARGEST_ID, usable_names
 from taisoft.mesh.safe_reading import Blocks, FileContent, read_by_meshio, read_content
-from taisoft.mesh.tet_mesh import LARGEST_COORDINATE, TetMesh, edge_lengths, merge_labels
+from taisoft.mesh.tet_mesh import LARGEST_COORDINATE, TetMesh
 from taisoft.mesh.tetgen import read_tetgen
-from taisoft.mesh.topology import EDGES
+from taisoft.mesh.topology import EDGES, merge_labels
 
 TETS = ("tetra", "tetra10")
 BOUNDARY = ("vertex", "line", "line3", "triangle", "triangle6")  # boundary markers that meshers add; ignored with a warning

@@ -29,27 +29,29 @@ def checked_regions(values, n_tets: int, error: Callable[[str], MeshError]) -> n
     return array.astype(np.int64)
 
 
-def checked_names(names, regions: np.ndarray | None, error: Callable[[str], MeshError]) -> dict[int, str]:
-    """Return a copy of the names, {id: name} by ascending id. regions: as returned by `checked_regions`."""
+def checked_names(names, ids: tuple[int, ...], error: Callable[[str], MeshError]) -> dict[int, str]:
+    """Return a copy of the names, {id: name} by ascending id. ids: the regions of a mesh, ascending."""
     if names is not None and not isinstance(names, dict):
         raise error(f"region_names must be a dict of names by region, not {value_text(names)}")
     if not names:
         return {}
-    if regions is None:
+    if not ids:
         raise error("region_names are given without regions")
-    present = set(np.unique(regions).tolist())
+    present = set(ids)
     numbers = {str(region) for region in present}  # as scene files write regions without names
     found: dict[int, str] = {}
+    taken: set[str] = set()
     for key, name in names.items():
         if isinstance(key, bool) or not isinstance(key, (int, np.integer)) or int(key) not in present:
             raise error(f"region_names: no tet is in region {value_text(key)}")
         if not isinstance(name, str) or not _is_name(name):
             raise error(f"region_names: the name of region {key} must be a line of text without quotes, not {value_text(name)}")
-        if name in found.values():
+        if name in taken:
             raise error(f"region_names: {value_text(name)} is the name of two regions")
-        if name in numbers - {str(key)}:
+        if name in numbers and name != str(key):
             raise error(f"region_names: {value_text(name)}, the name of region {key}, is the number of another region")
         found[int(key)] = name
+        taken.add(name)
     return dict(sorted(found.items()))
 
 
@@ -71,7 +73,7 @@ def usable_names(given: dict[int, str], ids: list[int]) -> tuple[dict[int, str],
             printable[region] = text
     shared, numbers, names = Counter(printable.values()), {str(region) for region in ids}, {}
     for region, text in printable.items():
-        if shared[text] > 1 or text in numbers - {str(region)}:
+        if shared[text] > 1 or (text in numbers and text != str(region)):
             text = f"{text} ({region})"
             while text in shared:
                 text += "'"
@@ -89,22 +91,19 @@ def _is_name(text: str) -> bool:
     return bool(text.strip()) and text.isprintable() and '"' not in text
 
 
-def region_id(key, regions: np.ndarray | None, names: dict[int, str], error: Callable[[str], MeshError]) -> int:
-    """Return the id of a region given by its name or id."""
-    if regions is None:
+def region_id(key, region_of: dict[int | str, int], error: Callable[[str], MeshError]) -> int:
+    """Return the id of a region given by its name or id. region_of: the ids by ids and by names."""
+    if not region_of:
         raise error("the mesh has no regions")
-    ids = np.unique(regions).tolist()
-    there_are = listed([one_line(region_text(one, names)) for one in ids])
-    if isinstance(key, str):
-        for one, name in names.items():
-            if name == key:
-                return one
-        near = difflib.get_close_matches(key, names.values(), n=1)
-        hint = f"; did you mean {value_text(near[0])}?" if near else f"; there are {there_are}"
-        raise error(f"no region is called {value_text(key)}{hint}")
-    if isinstance(key, bool) or not isinstance(key, (int, np.integer)) or int(key) not in ids:
+    if isinstance(key, (str, int, np.integer)) and not isinstance(key, bool) and key in region_of:
+        return region_of[key]
+    names = {region: name for name, region in region_of.items() if isinstance(name, str)}
+    there_are = listed([one_line(region_text(region, names)) for region in region_of if not isinstance(region, str)])
+    if not isinstance(key, str):
         raise error(f"no tet is in region {value_text(key)}; there are {there_are}")
-    return int(key)
+    near = difflib.get_close_matches(key, names.values(), n=1)
+    hint = f"did you mean {value_text(near[0])}?" if near else f"there are {there_are}"
+    raise error(f"no region is called {value_text(key)}; {hint}")
 
 
 def region_text(region: int, names: dict[int, str]) -> str:
