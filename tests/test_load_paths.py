@@ -153,6 +153,9 @@ def test_statics_take_the_loads_of_their_time():
     scene, same = free_body(RAMP, held=True, order=2), free_body(RAMP(0.003)[0], held=True, order=2)
     assert np.array_equal(ts.solve_static(scene, time=0.003).positions(), ts.solve_static(same).positions())
     assert np.abs(ts.solve_static(scene).positions() - scene.bodies[0].rest_positions).max() < 1e-12
+    for time, message in ((np.nan, "time must be finite, not nan"), (None, "time must be a number, not None")):
+        with pytest.raises(SceneError, match=f"^{message}$"):
+            ts.solve_static(scene, time=time)
 
 
 @pytest.mark.parametrize("integrator", ["symplectic_euler", "implicit_midpoint"])

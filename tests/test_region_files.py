@@ -263,7 +263,9 @@ def test_scene_files_give_materials_by_region(tmp_path):
         ('bone = "stiff"', 'bone = "stif"', "bodies.leg.materials.bone 'stif' is not among the materials .did you mean stiff"),
         ("young = 1e4", "young = -1", 'bodies.leg.materials."soft tissue".young must be greater than 0'),
         ("[bodies.leg.materials]", 'material = "stiff"\n[bodies.leg.materials]', "bodies.leg must have either a material or mat"),
-        ("[bodies.leg.materials]", "materials = 3\n[bodies.leg.x]", "bodies.leg.* must be|bodies.leg.x is not known"),
+        (SCENE[SCENE.index("[bodies.leg.materials]") :], "materials = 3\n", "bodies.leg.materials must be tables .*, not 3$"),
+        ("2 =", "02 =", "bodies.leg.*no region is called '02'; there are 'bone', 2, 'soft tissue'"),
+        ("2 =", '"٢" =', "bodies.leg.*no region is called '٢'; there are 'bone', 2, 'soft tissue'"),
         (
             "[bodies.leg.materials]",
             "young = [1e5]\n[bodies.leg.materials]",
