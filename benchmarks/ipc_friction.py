@@ -14,7 +14,7 @@ import numpy as np
 
 from taisoft import Simulator
 from taisoft.collision.contacts import Contacts
-from taisoft.mesh.tet_mesh import mean_surface_edge
+from taisoft.mesh.quality import mean_surface_edge
 
 STICKING = 0.9  # of the cone: impulses inside it must stick
 TOLERANCES = (1e-2, 1e-4, 1e-6)

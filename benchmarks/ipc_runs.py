@@ -17,7 +17,7 @@ import numpy as np
 
 import taisoft as ts
 from taisoft.errors import TaisoftError
-from taisoft.mesh.tet_mesh import mean_surface_edge
+from taisoft.mesh.quality import mean_surface_edge
 from taisoft.records import StepReport
 
 from .ipc_cases import find

@@ -2,11 +2,11 @@
 
 A file holds arrays without pickled objects, `header`, and `sha256` over all else. `header` is JSON text: versions, the
 Simulator's settings, the numbers that may change at run time (present and initial values), all scalars of the state, and a
-digest of each part of the scene. Each class saves its state between steps by `snapshot` and restores it by `restore`; this
-module only flattens it, joining names by slashes. Meshes, constraints, where loads act, and paths are not in the file: they come
-from the scene passed at loading. Its digests must equal those of the saved scene, and its numbers those at the start, since
-other numbers would be ignored. With the same machine, versions and number of threads, a run continues bitwise as if it had not
-been interrupted.
+digest of each part of the scene. Each class saves its state between steps by `snapshot` and restores it by `restore`; an
+array's name is its path in there, joined by slashes. Meshes, constraints, where loads act, and paths are not in the file:
+they come from the scene passed at loading. Its digests must equal those of the saved scene, and its numbers those at the
+start, since other numbers would be ignored. With the same machine, versions and number of threads, a run continues bitwise as
+if it had not been interrupted.
 """
 
 import dataclasses
@@ -22,6 +22,7 @@ from taisoft import __version__
 from taisoft.attributes import thawed
 from taisoft.errors import SceneError, SimulationError
 from taisoft.files import replacing
+from taisoft.nested import join_arrays, part_arrays
 from taisoft.scene.fingerprint import FEATURES, digest, run_time_numbers, scene_fingerprint
 from taisoft.scene.plan import LOADS, Numbers, change_load, change_tension, first_difference, scene_numbers
 from taisoft.scene.scene import Material, Scene
@@ -30,7 +31,7 @@ from taisoft.settings import NAMES, plan_of
 if TYPE_CHECKING:
     from taisoft.simulator import Simulator
 
-KIND, FORMAT = "taisoft checkpoint", 10  # increment FORMAT with every change of a file's content
+KIND, FORMAT = "taisoft checkpoint", 11  # increment FORMAT with every change of a file's content
 PARTS = ("settings", "numbers", "start", "fingerprint", "state", "notes")  # of the header, each a table
 
 
@@ -38,9 +39,9 @@ PARTS = ("settings", "numbers", "start", "fingerprint", "state", "notes")  # of 
 class Checkpoint:
     """Content of a checkpoint file.
 
-    settings: arguments of Simulator; numbers: the scene's run-time numbers; start: those numbers and the load values at the start
-    of the run; fingerprint: digests of the scene's parts by name; state: nested dict of numbers and arrays; notes: the writer's
-    own plain data.
+    settings: arguments of Simulator; numbers: the scene's run-time numbers, of which those by tet are arrays; start: those
+    numbers and the load values at the start of the run; fingerprint: digests of the scene's parts by name; state: nested dict
+    of numbers and arrays; notes: the writer's own plain data.
     """
 
     path: Path
@@ -65,16 +66,16 @@ def write_checkpoint(
 
     features: of its plan; notes: see Checkpoint; start: the scene at the start of the run, if its numbers may have changed since.
     """
-    plain, arrays = _flat(state)
+    arrays: dict[str, np.ndarray] = {}
     header = {
         "kind": KIND,
         "format": FORMAT,
         "taisoft": __version__,
         "settings": settings,
-        "numbers": run_time_numbers(scene),
-        "start": scene_numbers(start or scene),
+        "state": part_arrays(state, arrays),
+        "numbers": part_arrays(run_time_numbers(scene), arrays, "numbers"),
+        "start": part_arrays(scene_numbers(start or scene), arrays, "start"),
         "fingerprint": scene_fingerprint(start or scene, features),
-        "state": plain,
         "notes": notes,
     }
     text = np.frombuffer(json.dumps(header).encode(), dtype=np.uint8)
@@ -85,14 +86,10 @@ def write_checkpoint(
 def read_checkpoint(path: str | Path) -> Checkpoint:
     """Return a file's content. Raises SimulationError if it is absent, damaged, no checkpoint, or of another format version."""
     header, arrays = _contents(Path(path))
-    state: dict = {}
-    for name, value in [*header["state"].items(), *arrays.items()]:
-        *folders, last = name.split("/")
-        table = state
-        for folder in folders:
-            table = table.setdefault(folder, {})
-        table[last] = value
-    return Checkpoint(Path(path), state=state, **{name: header[name] for name in PARTS if name != "state"})
+    try:
+        return Checkpoint(Path(path), **{name: join_arrays(header[name], arrays) for name in PARTS})
+    except (KeyError, TypeError) as error:
+        raise _no_checkpoint(Path(path), error) from None
 
 
 def check_scene(saved: Checkpoint, scene: Scene, features: dict[str, bool]) -> None:
@@ -148,21 +145,6 @@ def load_values(scene: Scene) -> dict:
     if scene.tendons:
         values["tendons"] = {one.name: None if one.value is None else float(one.value) for one in scene.tendons}
     return values
-
-
-def _flat(state: dict, prefix: str = "") -> tuple[dict, dict[str, np.ndarray]]:
-    """Flatten a nested dict into plain values (numbers, lists, None) and arrays, with keys joined by slashes."""
-    plain, arrays = {}, {}
-    for name, value in state.items():
-        if isinstance(value, dict):
-            inner = _flat(value, f"{prefix}{name}/")
-            plain |= inner[0]
-            arrays |= inner[1]
-        elif isinstance(value, np.ndarray):
-            arrays[f"{prefix}{name}"] = value
-        else:
-            plain[f"{prefix}{name}"] = value
-    return plain, arrays
 
 
 def _checksum(header: np.ndarray, arrays: dict[str, np.ndarray]) -> np.ndarray:
@@ -282,20 +264,22 @@ def from_checkpoint(cls: type["Simulator"], saved: Checkpoint, scene: Scene, arc
     if set(settings) != set(NAMES):
         raise SimulationError(f"{saved.path} holds no state of this scene: its settings are not those of this version")
     check_scene(saved, scene, plan_of(scene, *(settings[key] for key in ("integrator", "self_collision", "draggable"))).on)
-    start = scene.snapshot()
-    start.allow_initial_overlap = True  # bodies move to the saved positions below
-    sim = cls(start, **settings)
+    present, sim = scene.snapshot(scene), None
+    present.allow_initial_overlap = True  # bodies move to the saved positions below
     try:
-        with thawed(sim.scene):
+        restore_numbers(saved, present)
+        sim = cls(
+            present, **settings | {"dt": saved.state["dt"]}
+        )  # stable with these numbers, not always with those at the start
+        with thawed(sim, sim.scene):
+            sim.settings = dataclasses.replace(sim.settings, dt=settings["dt"])
             sim.scene.allow_initial_overlap = scene.allow_initial_overlap
-        restore_numbers(saved, sim.scene)
-        sim._stable_dt = None
         sim._dynamics.restore(saved.state)
-    except (KeyError, TypeError, ValueError) as error:  # the checksum is right, but the content does not fit this scene
-        sim.close()
-        raise SimulationError(f"{saved.path} holds no state of this scene: {type(error).__name__}: {error}") from None
-    except BaseException:
-        sim.close()
+    except BaseException as error:
+        if sim is not None:
+            sim.close()
+        if isinstance(error, (KeyError, TypeError, ValueError)):  # the checksum is right, but the content does not fit this scene
+            raise SimulationError(f"{saved.path} holds no state of this scene: {type(error).__name__}: {error}") from None
         raise
     scene.freeze()
     return sim

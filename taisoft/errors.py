@@ -1,5 +1,9 @@
 """Errors that users can get. Each message is one sentence: the object, the index, the rule it breaks."""
 
+from collections.abc import Sequence
+
+MAX_TEXT, MAX_LISTED = 120, 20  # in a message, maximum number of characters of a text or value, and of items of a list
+
 
 class TaisoftError(Exception):
     """Base of every error that taisoft raises on purpose."""
@@ -27,3 +31,25 @@ def no_memory(what: str, error: MemoryError) -> SimulationError:
 
     reason = str(error).rstrip(".") or "the system refused more"
     return SimulationError(f"not enough memory for {what}: {reason}; available: {format_bytes(available_memory())}")
+
+
+def one_line(text: str) -> str:
+    """Return the text on one line with single spaces, shortened to MAX_TEXT characters."""
+    text = " ".join(text.split())
+    return text if len(text) <= MAX_TEXT else text[: MAX_TEXT - 3] + "..."
+
+
+def value_text(value) -> str:
+    """Return a value that breaks a rule as short text on one line."""
+    return one_line(repr(value))
+
+
+def reason(error: BaseException) -> str:
+    """Return the type and the text of an error of other code, such as a user's function, on one line."""
+    return one_line(f"{type(error).__name__}: {error}")
+
+
+def listed(items: Sequence, limit: int = MAX_LISTED) -> str:
+    """Return items as text, at most `limit` of them."""
+    text = ", ".join(map(str, items[:limit]))
+    return text if len(items) <= limit else f"{text}, ... ({len(items)} in all)"

@@ -63,12 +63,12 @@ class Simulator(Guarded):
         self._stable_dt: float | None = None  # None: not computed yet, or outdated
         if tolerance is not None:
             self.settings, self._stable_dt = settings_for(scene, self.settings)
-        self.scene = scene.snapshot()  # run-time changes must not reach the user's scene
-        self._start_scene, scene = scene, self.scene
+        given_scene, self._start_scene = scene, scene.start
+        self.scene = scene = scene.snapshot()  # run-time changes must not reach the user's scene
         changes.check_stability(self, self.settings.dt)
         for text in scale_warnings(scene):
             warnings.warn(text, UserWarning, stacklevel=2)
-        self.plan = plan_of(scene, self.settings.integrator, self_collision, draggable)
+        self.plan = plan_of(self._start_scene, self.settings.integrator, self_collision, draggable)
         laws = {law for body in scene.bodies for law in body.composition.laws}
         self._may_soften = any(LAWS[law].SOFTENS_BELOW for law in laws)  # until a warning says so
         self._compiled_before = self._compile_reported = runtime.compile_clock()
@@ -80,7 +80,7 @@ class Simulator(Guarded):
             if isinstance(error, MemoryError):
                 raise no_memory("this scene", error) from None
             raise
-        for one in (self._start_scene, scene):
+        for one in (given_scene, scene):
             one.freeze()
         self._seal(Simulator.__init__)
 
@@ -194,13 +194,13 @@ class Simulator(Guarded):
     def _replace(self, **settings) -> None:
         """Do as `rebuild`, with any settings."""
         before, new = self._open(), self._copy(**settings)
-        kept = {name: self.__dict__[name] for name in ("_start_scene", "_compiled_before", "_compile_reported")}
+        kept = {name: self.__dict__[name] for name in ("_compiled_before", "_compile_reported")}
         before.close()
         self.__dict__.update(new.__dict__ | kept)
 
     def _copy(self, **settings) -> "Simulator":
         """Return a second simulator in the present state, as `rebuild` makes it."""
-        before, start = self._open(), self.scene.snapshot()
+        before, start = self._open(), self.scene.snapshot(self._start_scene)
         start.allow_initial_overlap = True  # bodies move to the present positions below
         new = Simulator(start, **(self._arguments() | settings))
         with thawed(new.scene):

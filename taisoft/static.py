@@ -16,6 +16,7 @@ from taisoft.errors import SceneError, SimulationError
 from taisoft.fem.measure import measure
 from taisoft.fem.model import Layout, build_model
 from taisoft.fem.state import ELASTIC, N_INVERTED
+from taisoft.scene import checks
 from taisoft.scene.plan import make_plan
 from taisoft.scene.scene import Scene
 
@@ -63,10 +64,11 @@ def solve_static(
 
     tolerance: on |residual on free axes| / |applied load| (without load, relative to the constraint forces). An open f64
     runtime is reused; otherwise one is opened and closed. Contact is ignored. Raises SceneError if a body is not constrained
-    along every axis or the scene has obstacles and contact forces, SimulationError if the runtime is in use. A solve that
-    does not converge returns converged=False.
+    along every axis, the scene has obstacles and contact forces, or `time` is no finite number, SimulationError if the runtime
+    is in use. A solve that does not converge returns converged=False.
     """
     _check(scene, tolerance)
+    time = checks.number(time, "time")
     kind = open_kind()
     arch = kind[0] if kind is not None and kind[1] == precision else arch
     runtime = open_runtime(arch, precision, "solve_static")

@@ -19,7 +19,7 @@ from scenes import rows_of
 import taisoft as ts
 from taisoft.dynamics import contact
 from taisoft.fem.reference import lumped_masses
-from taisoft.mesh.tet_mesh import mean_surface_edge
+from taisoft.mesh.quality import mean_surface_edge
 from taisoft.settings import EXPLICIT_CONTACT
 
 EXPLICIT, IMPLICIT = ("symplectic_euler", "velocity_verlet"), ("implicit_euler", "linearly_implicit_euler", "bdf2")

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from taisoft.mesh.files import read_mesh
+from taisoft.mesh.quality import edge_lengths, mean_ratio
 from taisoft.mesh.shapes import box_mesh, sheet_mesh
-from taisoft.mesh.tet_mesh import TetMesh, edge_lengths, mean_ratio
+from taisoft.mesh.tet_mesh import TetMesh
 
 REGULAR = np.array([(1.0, 1, 1), (-1, 1, -1), (1, -1, -1), (-1, -1, 1)])
 ONE = np.array([(0, 1, 2, 3)])

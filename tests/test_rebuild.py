@@ -2,6 +2,7 @@
 
 * positions, velocities, time, steps, changed numbers and released nodes are kept bit for bit, and the next step is that of a new
   simulator with those settings and that state;
+* what is modelled, and what a checkpoint needs, follows from the scene at the start, whatever numbers changed;
 * settings that cannot be met are refused with a new simulator's message, and nothing changes;
 * the memory of the previous settings is released.
 """
@@ -12,7 +13,7 @@ import numpy as np
 import pytest
 from checkpoint_scenes import cubes
 from fake_simulator import beam_scene
-from scenes import RELEASE, driven_scene
+from scenes import RELEASE, cube, driven_scene, rubber
 
 import taisoft as ts
 from taisoft.backend import runtime
@@ -100,3 +101,61 @@ def test_another_contact_solver_continues_with_bodies_in_contact():
         assert_same(kept_values(sim), before)
         report = sim.advance(20)
         assert report.n_contacts > 0 and report.converged and report.max_penetration < 1e-3
+
+
+def varied_scene() -> ts.Scene:
+    """A free cube with everything that a change can make superfluous: damping, moduli by tet, a load along a path."""
+    scene = ts.Scene()
+    body = scene.add_body(cube(), rubber(mass_damping=2.0, stiffness_damping=1e-4), name="cube", young=np.linspace(1e5, 2e5, 5))
+    body.add_force([0, 3], lambda t: (30.0 * t, 1.0, 0.0))
+    return scene
+
+
+CHANGES = {
+    "force": lambda sim: sim.set_force("cube", 0, (1.0, 2.0, 3.0)),
+    "mass_damping": lambda sim: sim.set_material("cube", mass_damping=0.0),
+    "stiffness_damping": lambda sim: sim.set_material("cube", stiffness_damping=0.0),
+    "young": lambda sim: sim.set_material("cube", young=1e5),
+}
+
+
+@pytest.mark.parametrize("change", CHANGES.values(), ids=CHANGES)
+def test_changed_numbers_neither_end_a_feature_nor_a_checkpoint(tmp_path, change):
+    """What is modelled follows from the scene as it was at the start."""
+    with ts.Simulator(varied_scene(), dt=1e-3, integrator="implicit_euler", precision="f64") as sim:
+        sim.step()
+        change(sim)
+        features = sim.plan.on
+        sim.rebuild(integrator="velocity_verlet", dt=1e-4)
+        assert sim.plan.on == features | {"assembled_stiffness": False, "inversion_handling": False}
+        sim.set_material("cube", young=np.linspace(1e5, 3e5, 5), mass_damping=1.0, stiffness_damping=1e-4)
+        change(sim)
+        sim.advance(5)
+        sim.save_checkpoint(tmp_path / "c.npz")
+        sim.advance(5)
+        wanted = kept_values(sim)
+    with ts.Simulator.load_checkpoint(tmp_path / "c.npz", varied_scene()) as sim:
+        sim.advance(5)
+        assert_same(kept_values(sim), wanted)
+        sim.set_material("cube", young=np.linspace(1e5, 3e5, 5), mass_damping=1.0, stiffness_damping=1e-4)
+
+
+@pytest.mark.parametrize("rebuilt", [False, True])
+def test_a_checkpoint_needs_a_stable_step_only_for_the_present_numbers(tmp_path, rebuilt):
+    """A softened body takes steps that it could not take at the start; a stiffened one no longer takes those of the start."""
+    for young, dt in ((1e3, 0.2), (1e9, 1e-4)):
+        scene = beam_scene(cells=(3, 1, 1))
+        with ts.Simulator(scene, dt=0.02, integrator="velocity_verlet") as sim:
+            if young > 1e5:
+                sim.dt = dt
+            sim.set_material("beam", young=young)
+            sim.dt = dt
+            if rebuilt:
+                sim.rebuild(self_collision=True)
+            started_with = sim.settings.dt
+            sim.advance(3)
+            sim.save_checkpoint(tmp_path / "c.npz")
+            wanted, limit = kept_values(sim), sim.stable_dt
+        with ts.Simulator.load_checkpoint(tmp_path / "c.npz", beam_scene(cells=(3, 1, 1))) as sim:
+            assert_same(kept_values(sim), wanted)
+            assert sim.dt == dt and sim.settings.dt == started_with and sim.stable_dt == limit

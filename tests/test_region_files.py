@@ -23,7 +23,9 @@ from taisoft.errors import MeshError, SceneError
 BOX = ts.box_mesh((2, 1, 1), (0.3, 0.1, 1 / 3))
 IDS = np.arange(10) // 4 + 1
 NAMED = ts.TetMesh(BOX.vertices, BOX.tets, regions=IDS, region_names={1: "bone", 3: "soft tissue"})
-texts = st.text(min_size=1, max_size=8).filter(lambda text: text.strip() and text.isprintable() and '"' not in text)
+texts = st.text(min_size=1, max_size=8).filter(
+    lambda text: text.strip() and text.isprintable() and '"' not in text and not text.isdigit()
+)
 
 
 def written(path, data: dict, **options):
@@ -115,6 +117,74 @@ def test_physical_groups_of_binary_version_4(tmp_path, order):
         ts.read_mesh(tmp_path / "a.msh")
 
 
+def named_file(path, names: dict[int, str], ids=IDS, binary: bool = False, encoding: str = "utf-8"):
+    """A file of version 2 whose physical groups of volumes have any names, as Gmsh allows."""
+    groups = [np.asarray(ids, dtype=np.int32)]
+    record = meshio.Mesh(BOX.vertices, [("tetra", BOX.tets)], cell_data={"gmsh:physical": groups, "gmsh:geometrical": groups})
+    meshio.write(path, record, file_format="gmsh22", binary=binary)
+    rows = "".join(f'3 {region} "{name}"\n' for region, name in names.items())
+    section = f"$PhysicalNames\n{len(names)}\n{rows}$EndPhysicalNames\n".encode(encoding)
+    path.write_bytes(path.read_bytes().replace(b"$Nodes", section + b"$Nodes", 1))
+    return path
+
+
+@pytest.mark.parametrize("binary", [False, True])
+@pytest.mark.parametrize(
+    "names, encoding, found, message",
+    [
+        (
+            {1: "bone", 2: "bone", 3: "skin"},
+            "utf-8",
+            {1: "bone (1)", 2: "bone (2)", 3: "skin"},
+            r"region 1 is called 'bone \(1\)' instead of 'bone', region 2 is called 'bone \(2\)' instead of 'bone'$",
+        ),
+        ({1: "a", 2: "a", 3: "a (2)"}, "utf-8", {1: "a (1)", 2: "a (2)'", 3: "a (2)"}, "region 2 is called"),
+        (
+            {1: "soft\ttissue", 2: "b\xa0c"},
+            "utf-8",
+            {1: "soft tissue", 2: "b c"},
+            r"region 1 is called 'soft tissue' instead of 'soft\\tti",
+        ),
+        ({1: "a b", 2: "a\tb"}, "utf-8", {1: "a b (1)", 2: "a b (2)"}, r"region 2 is called 'a b \(2\)' instead of 'a\\tb'"),
+        (
+            {1: "Fußknochen", 3: "hüft"},
+            "latin-1",
+            {1: "Fußknochen", 3: "hüft"},
+            "region 1 is called 'Fußknochen' instead of 'Fu.udcdf",
+        ),
+        ({1: "\x01", 2: "b"}, "utf-8", {2: "b"}, "region 1 is without a name instead of '.x01'$"),
+        ({1: "2", 3: "3"}, "utf-8", {1: "2 (1)", 3: "3"}, r"region 1 is called '2 \(1\)' instead of '2'$"),
+    ],
+)
+def test_names_that_a_mesh_cannot_have_are_changed_with_a_warning(tmp_path, names, encoding, found, message, binary):
+    path = named_file(tmp_path / "a.msh", names, binary=binary, encoding=encoding)
+    with pytest.warns(UserWarning, match=f"a.msh: names of regions must be different lines of UTF-8 text.*{message}") as caught:
+        mesh = ts.read_mesh(path)
+    assert len(caught) == 1 and mesh.region_names == found and mesh.regions.tolist() == IDS.tolist()
+
+
+@pytest.mark.parametrize("binary", [False, True])
+def test_names_that_a_mesh_can_have_are_kept(tmp_path, binary):
+    """Apostrophes and blanks in them, and groups below 1."""
+    ids = [-1] * 4 + [0] * 4 + [7] * 2
+    mesh = ts.read_mesh(named_file(tmp_path / "a.msh", {-1: "l'os", 0: " two  blanks", 7: "7"}, ids, binary))
+    assert mesh.regions.tolist() == ids and mesh.warnings == []
+    assert mesh.region_names == {-1: "l'os", 0: " two  blanks", 7: "7"}
+
+
+def test_the_warning_of_many_names_is_short(tmp_path):
+    big = ts.box_mesh((20, 5, 4), (4, 1, 1))
+    mesh = ts.TetMesh(big.vertices, big.tets, regions=np.arange(big.n_tets), region_names={k: f"part {k}" for k in range(2000)})
+    path = tmp_path / "a.msh"
+    ts.write_mesh(path, mesh)
+    path.write_bytes(
+        b"\n".join(line.rpartition(b" ")[0] + b' x"' if b"part" in line else line for line in path.read_bytes().split(b"\n"))
+    )
+    with pytest.warns(UserWarning, match=r"\(2000 in all\)$") as caught:
+        assert ts.read_mesh(path).region_names[5] == "part x (5)"
+    assert len(str(caught[0].message)) < 600
+
+
 @pytest.mark.parametrize("binary", [False, True])
 def test_physical_groups_of_version_2(tmp_path, binary):
     path, groups = tmp_path / "a.msh", [IDS.astype(np.int32)]
@@ -138,6 +208,9 @@ def test_references_and_cell_data(tmp_path):
         ts.read_mesh(path, regions="heat")
     with pytest.raises(MeshError, match="c.vtu: no cell data are called 'stress'; there are 'MaterialIds', 'heat'"):
         ts.read_mesh(path, regions="stress")
+    for bad in (["x"], 3, b"x"):
+        with pytest.raises(MeshError, match="b.mesh: regions must be the name of cell data, or None, not"):
+            ts.read_mesh(tmp_path / "b.mesh", regions=bad)
     with pytest.raises(MeshError, match="b.mesh: no cell data are called 'x'; there are 'medit:ref'"):
         ts.read_mesh(tmp_path / "b.mesh", regions="x")
     with pytest.warns(UserWarning, match="cell data 'region' are no regions, since that of tet 0 is nan"):
@@ -190,7 +263,9 @@ def test_scene_files_give_materials_by_region(tmp_path):
         ('bone = "stiff"', 'bone = "stif"', "bodies.leg.materials.bone 'stif' is not among the materials .did you mean stiff"),
         ("young = 1e4", "young = -1", 'bodies.leg.materials."soft tissue".young must be greater than 0'),
         ("[bodies.leg.materials]", 'material = "stiff"\n[bodies.leg.materials]', "bodies.leg must have either a material or mat"),
-        ("[bodies.leg.materials]", "materials = 3\n[bodies.leg.x]", "bodies.leg.* must be|bodies.leg.x is not known"),
+        (SCENE[SCENE.index("[bodies.leg.materials]") :], "materials = 3\n", "bodies.leg.materials must be tables .*, not 3$"),
+        ("2 =", "02 =", "bodies.leg.*no region is called '02'; there are 'bone', 2, 'soft tissue'"),
+        ("2 =", '"٢" =', "bodies.leg.*no region is called '٢'; there are 'bone', 2, 'soft tissue'"),
         (
             "[bodies.leg.materials]",
             "young = [1e5]\n[bodies.leg.materials]",

@@ -11,6 +11,7 @@ two materials against closed forms, test_region_files.py the readers. Here:
 * bad input is refused in one sentence that names the body, the region or tet, and the rule.
 """
 
+import pickle
 import warnings
 
 import numpy as np
@@ -36,6 +37,8 @@ from taisoft.view.scene_view import Layers
 from taisoft.view.window import Loop
 
 MESH = halved(cube(cells=(3, 1, 1)))
+GRID = ts.box_mesh((20, 5, 2), (4, 1, 1))
+MANY = ts.TetMesh(GRID.vertices, GRID.tets, regions=range(1, 1001))
 TIGHT = {"newton_tolerance": 1e-13, "linear_tolerance": 1e-13}
 
 
@@ -275,7 +278,7 @@ def test_refused_changes_leave_everything():
         for numbers, message in (
             ({"region": "lefty", "young": 1.0}, r"body 'beam': no region is called 'lefty'; did you mean 'left'\?"),
             ({"region": 4, "young": 1.0}, "body 'beam': no tet is in region 4; there are 'left', 7"),
-            ({"region": 7, "young": -1.0}, "body 'beam': region 7: material: young must be greater than 0"),
+            ({"region": 7, "young": -1.0}, "body 'beam': region 7: young must be greater than 0 Pa, not -1.0$"),
             ({"region": 7, "mass_damping": 0.0}, "mass_damping is one number for the whole body"),
             ({"young": [1e5, 2e5]}, r"body 'beam': young must have shape \(15,\), not \(2,\)"),
             ({"mass_damping": np.zeros(15)}, "mass_damping must be a number"),
@@ -307,6 +310,22 @@ def test_assignments_replace_the_material_or_its_numbers():
         body.mass = 3.0
 
 
+def test_the_materials_of_regions_are_read_only_and_can_be_passed_on():
+    body, other = (beam({"left": rubber(SVK), 7: rubber(COR)}).bodies[0] for _ in range(2))
+    with pytest.raises(TypeError):
+        body.material[7] = rubber()
+    body.material = {3: rubber(), 7: rubber(young=3e5)}
+    other.material = body.material
+    assert other.material == body.material and set(other.young) == {1e5, 3e5}
+
+
+def test_an_array_of_one_number_is_a_number():
+    body = beam(rubber(), young=np.array(2e5)).bodies[0]
+    assert body.young == 2e5 and isinstance(body.young, float) and not body.composition.elastic_by_tet
+    body.density = np.array(500)
+    assert body.density == 500.0 and rubber(young=np.array(3e5)) == rubber(young=3e5)
+
+
 # --- copies -----------------------------------------------------------------------------------------------------------
 
 
@@ -336,6 +355,33 @@ def test_scene_files_keep_everything(tmp_path):
     assert scene_digest(again) == scene_digest(everything()) and again.bodies[2].mesh.region_names == {3: "left", 7: "right"}
     text = (tmp_path / "a.toml").read_text()
     assert '[bodies.beam.materials]\nleft = "material0"\n7 = "material1"\n' in text
+
+
+def test_scene_files_need_a_region_that_their_meshes_can_hold(tmp_path):
+    """All meshes are checked before the first is written; a body that does not use its only region does without it."""
+    zero = ts.TetMesh(MESH.vertices, MESH.tets, regions=0 * MESH.regions, region_names={0: "all"})
+    scene = ts.Scene()
+    scene.add_body(named(MESH), rubber(), name="names")
+    scene.add_body(zero, rubber(), name="plain", position=(0, 5, 0))
+    with pytest.warns(
+        UserWarning, match="body 'plain': its mesh has no region but 0, which its file cannot tell from none"
+    ) as caught:
+        ts.write_scene(tmp_path / "a.toml", scene)
+    assert caught[0].filename == __file__
+    again = ts.read_scene(tmp_path / "a.toml")[0]
+    assert scene_digest(again) == scene_digest(scene) and again.bodies[1].mesh.regions is None
+    assert again.bodies[0].mesh.region_names == {3: "left", 7: "right"}
+    scene.add_body(zero, {"all": rubber()}, name="split", position=(0, 9, 0))
+    with pytest.raises(SceneError, match="body 'split': its mesh has no region but 0, .*: use another number"):
+        ts.write_scene(tmp_path / "b.toml", scene)
+    assert not list(tmp_path.glob("b*"))
+
+
+def test_a_name_may_be_its_regions_own_number(tmp_path):
+    mesh = ts.TetMesh(MESH.vertices, MESH.tets, regions=MESH.regions, region_names={3: "3", 7: "08"})
+    scene = ts.Scene()
+    scene.add_body(mesh, {"3": rubber(), "08": rubber(young=3e5)}, name="body")
+    there_and_back(tmp_path / "a.toml", scene, {"dt": 0.01})
 
 
 def test_checkpoints_keep_everything(tmp_path):
@@ -370,6 +416,23 @@ def test_checkpoints_keep_everything(tmp_path):
             ts.Simulator.load_checkpoint(path, scene)
 
 
+def test_checkpoints_hold_numbers_by_tet_as_arrays(tmp_path):
+    """Once, if they did not change: 8 bytes a number, and no text."""
+    path, E = tmp_path / "c.npz", np.linspace(1e5, 2e5, GRID.n_tets) / 3
+    sizes = []
+    for arguments in ({}, {"young": E}, {"density": E}):
+        with ts.Simulator(beam(rubber(), mesh=GRID, **arguments), dt=1e-3) as sim:
+            for young in (None, E[::-1].copy()):
+                if young is not None and arguments.keys() == {"young"}:
+                    sim.set_material("beam", young=young)
+                sim.save_checkpoint(path)
+                sizes.append(path.stat().st_size)
+                with np.load(path) as file:
+                    assert len(file["header"]) < 5000
+    extra = (np.array(sizes) - sizes[0]) / (8 * GRID.n_tets)
+    assert extra.round().tolist() == [0.0, 0.0, 1.0, 2.0, 1.0, 1.0]
+
+
 def test_the_digest_tells_compositions_apart():
     one = rubber()
     scenes = [beam(one), beam({"left": one, 7: one}), beam(one, young=np.full(15, 1e5)), beam(one, density=np.full(15, 1e3))]
@@ -401,8 +464,15 @@ def test_the_digest_tells_compositions_apart():
         ({"density": np.append(-1.0, np.ones(14))}, "density of tet 0 must be greater than 0 kg/m.3, not -1"),
         ({"poisson": np.append(np.zeros(14), 0.5)}, r"poisson of tet 14 must lie in the open interval \(-1, 0.5\), not 0.5"),
         ({"young": [1e5] * 14 + [float("nan")]}, r"young: entry \[14\] is nan, not finite"),
-        ({"young": -1.0}, "material: young must be greater than 0"),
-        ({"young": "1e5"}, "material: young must be a number"),
+        ({"young": -1.0}, "young must be greater than 0 Pa, not -1.0$"),
+        ({"young": "1e5"}, "young must be a number, not '1e5'$"),
+        ({"young": np.array(-1.0)}, "young must be greater than 0 Pa, not "),
+        ({"young": np.array(["a"] * 1000)}, r"young must be numbers of shape \(15,\), not .{1,120}$"),
+        ({"young": "a\n" * 1000}, "young must be a number, not .{1,120}$"),
+        (
+            {"material": dict.fromkeys(range(1000), rubber()), "mesh": MANY},
+            r"material: no tet is in region 0; there are .{1,180}\(1000 in all\)$",
+        ),
     ],
 )
 def test_bad_input_is_refused(arguments, message):
@@ -423,9 +493,31 @@ def test_bad_input_is_refused(arguments, message):
         ({"regions": [1] * 15, "region_names": {2: "a"}}, "region_names: no tet is in region 2"),
         ({"regions": [1] * 15, "region_names": {1: " "}}, "region_names: the name of region 1 must be a line of text"),
         ({"regions": [1] * 14 + [2], "region_names": {1: "a", 2: "a"}}, "region_names: 'a' is the name of two regions"),
+        ({"regions": [1] * 15, "region_names": []}, r"region_names must be a dict of names by region, not \[\]"),
+        (
+            {"regions": [1] * 14 + [-2], "region_names": {1: "-2"}},
+            "region_names: '-2', the name of region 1, is the number of another",
+        ),
         ({"regions": [1] * 15, "region_names": ["a"]}, r"region_names must be a dict of names by region, not \['a'\]"),
     ],
 )
 def test_bad_regions_are_refused(arguments, message):
     with pytest.raises(ts.MeshError, match=f"^part: {message}"):
         ts.TetMesh(MESH.vertices, MESH.tets, source="part", **arguments)
+
+
+# --- look-ups ---------------------------------------------------------------------------------------------------------
+
+
+def test_regions_are_sorted_once(monkeypatch):
+    mesh = ts.TetMesh(MESH.vertices, MESH.tets, regions=MESH.regions, region_names={3: "left"})
+    copies = pickle.loads(pickle.dumps(mesh)), mesh
+    monkeypatch.setattr(np, "unique", None)
+    for one in copies:
+        assert one.region_ids == (3, 7) and one.region_ids is one.region_ids
+        assert [one.region_id(key) for key in ("left", 3, np.int64(7))] == [3, 3, 7]
+        for key in (3.0, True, "7", None, [3]):
+            with pytest.raises(ts.MeshError, match="no tet is in region|no region is called"):
+                one.region_id(key)
+    with pytest.raises(ts.MeshError, match="region_ids"):
+        mesh.region_ids = ()

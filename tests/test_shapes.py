@@ -14,8 +14,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from taisoft.errors import MeshError
+from taisoft.mesh.quality import edge_lengths, mean_ratio
 from taisoft.mesh.shapes import ball_mesh, box_mesh, sheet_mesh
-from taisoft.mesh.tet_mesh import edge_lengths, mean_ratio
 
 PATTERNS = {"five": 5, "six": 6}
 EVEN_MIDDLE = {(0, 0, 0), (1, 1, 0), (1, 0, 1), (0, 1, 1)}

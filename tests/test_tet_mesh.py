@@ -15,8 +15,8 @@ from hypothesis.extra import numpy as hnp
 
 from taisoft.errors import MeshError
 from taisoft.mesh.shapes import box_mesh
-from taisoft.mesh.tet_mesh import TetMesh, merge_labels
-from taisoft.mesh.topology import TET_FACES
+from taisoft.mesh.tet_mesh import TetMesh
+from taisoft.mesh.topology import TET_FACES, merge_labels
 
 CORNER = np.array([(0.0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)])  # a positive tet
 ONE = np.array([(0, 1, 2, 3)])

@@ -12,7 +12,7 @@ import numpy as np
 
 import taisoft as ts
 from taisoft.fem.reference import lumped_masses
-from taisoft.mesh.tet_mesh import mean_surface_edge
+from taisoft.mesh.quality import mean_surface_edge
 
 from .record import GRAVITY, Case, material, near, reported, rotation, small, submesh, worst
 

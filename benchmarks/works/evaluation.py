@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 import taisoft as ts
-from taisoft.mesh.tet_mesh import mean_surface_edge
+from taisoft.mesh.quality import mean_surface_edge
 
 from ..exact_path import SAMPLE
 from ..programs.own import make_scene

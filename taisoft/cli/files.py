@@ -12,8 +12,9 @@ from taisoft.cli import Signals, printed_warnings
 from taisoft.cli.scene_file import load_scene
 from taisoft.errors import OutputError
 from taisoft.mesh.files import WRITERS, check_ending, read_mesh, write_mesh
+from taisoft.mesh.quality import edge_lengths, mean_ratio
 from taisoft.mesh.surface_mesh import FORMATS, SurfaceMesh, read_surface, tetrahedralize
-from taisoft.mesh.tet_mesh import TetMesh, edge_lengths, mean_ratio
+from taisoft.mesh.tet_mesh import TetMesh
 from taisoft.scene.material import Material
 from taisoft.scene.obstacles import HalfSpace
 from taisoft.scene.scene import Scene

@@ -27,7 +27,7 @@ from taisoft.collision.spatial_hash import SpatialHash
 from taisoft.collision.surface import ACTIVE, NONFINITE, PAIRS, build_surface, move_obstacles, update_surface
 from taisoft.errors import SceneError, SimulationError
 from taisoft.fem.model import Layout, Model
-from taisoft.mesh.tet_mesh import mean_surface_edge
+from taisoft.mesh.quality import mean_surface_edge
 from taisoft.scene.obstacles import MeshObstacle
 from taisoft.scene.plan import make_plan
 from taisoft.scene.scene import Scene

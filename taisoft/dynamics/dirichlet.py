@@ -4,8 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from taisoft.errors import SimulationError
+from taisoft.errors import SceneError, SimulationError
 from taisoft.fem.model import Layout
+from taisoft.scene import checks
 from taisoft.scene.body import Constraint
 from taisoft.scene.scene import Scene
 
@@ -124,7 +125,7 @@ class DirichletConditions:
                 displacement = self._displacement(g, start + fraction * dt)
                 if displacement is None:
                     raise SimulationError(
-                        f"body '{g.name}': the path of its moved nodes gave None at t = {start + fraction * dt:g} s, "
+                        f"body '{g.name}': moved nodes: the path gave None at t = {start + fraction * dt:g}, "
                         "but a displacement later: released nodes stay free"
                     )
                 total[g.rows] += weight / dt**2 * displacement
@@ -133,18 +134,8 @@ class DirichletConditions:
     @staticmethod
     def _displacement(group: _Group, t: float) -> np.ndarray | None:
         """Return a path's displacement at t, checked; a SimulationError names the body, the time and the rule."""
-        subject = f"body '{group.name}': the path of its moved nodes"
+        what = f"body {group.name!r}: moved nodes"
         try:
-            displacement = group.constraint.path(t)
-            if displacement is None:
-                return None
-            displacement = np.asarray(displacement, dtype=np.float64)
-        except Exception as error:  # a user's function may raise anything
-            raise SimulationError(f"{subject} failed at t = {t:g} s: {type(error).__name__}: {error}") from error
-        if displacement.shape not in ((3,), (len(group.nodes), 3)) or not np.isfinite(displacement).all():
-            raise SimulationError(
-                f"{subject} gave {displacement.tolist() if displacement.size < 10 else displacement.shape} "
-                f"at t = {t:g} s: "
-                f"it must be finite, of shape (3,) or ({len(group.nodes)}, 3)"
-            )
-        return displacement
+            return checks.path_value(group.constraint.path, t, what, "displacement", ((3,), (len(group.nodes), 3)))
+        except SceneError as error:
+            raise SimulationError(str(error)) from error.__cause__

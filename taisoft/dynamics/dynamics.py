@@ -277,19 +277,10 @@ class Dynamics:
         return own | {"simulation": self.state.snapshot(), "stepper": self.stepper.snapshot()}
 
     def restore(self, kept: dict) -> None:
-        """Restore a `snapshot`, after the scene's numbers were restored."""
-        self.upload_numbers()
+        """Restore a `snapshot` of the same scene with the same numbers."""
         self.dt, self._time_base = check_dt(kept["dt"]), (float(kept["time_base"]), int(kept["count_base"]))
         self.state.restore(kept["simulation"])
         self.stepper.restore(kept["stepper"])
-
-    def upload_numbers(self) -> None:
-        """Copy all of the scene's numbers that may change to the device."""
-        self.state.upload_gravity()
-        self.state.upload_material(density=True)
-        self.upload_loads()
-        if self.contact is not None:
-            self.contact.numbers_changed()
 
     def continue_from(self, other: "Dynamics") -> None:
         """Take over the state of another instance of the same scene, as `state_changed` does without history."""

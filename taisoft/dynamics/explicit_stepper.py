@@ -165,6 +165,7 @@ class ExplicitStepper:
         n = min(n, self.max_batch)
         simulation = self.simulation
         simulation.set_load_time(simulation.time)
+        targets = loads = None
         if self.work.n_prescribed or self.work.has_varied_loads:
             n = min(n, self.rows)
         if self.work.n_prescribed:
@@ -172,10 +173,10 @@ class ExplicitStepper:
             targets = simulation.next_targets(simulation.time + dt * np.arange(1, n + 1))
             self.acceleration_stale = self.acceleration_stale or simulation.releases != releases
             n = len(targets)
-            self._upload_targets(targets)
         if self.work.has_varied_loads:
             times = simulation.time + dt * (np.arange(n) + int(self.work.verlet))  # Euler's forces are those at the start
-            self._upload_loads(times)
+            loads = self._load_rows(times)
+        self._upload_rows(targets, loads)
         kept = simulation.state()
         try:
             result = self._launch(n, dt)
@@ -187,12 +188,16 @@ class ExplicitStepper:
             if result.steps > 0:  # deterministic on the CPU: repeat up to the last good sub-step
                 self._launch(result.steps, dt)
             good = simulation.state()
+            simulation.step_count += result.steps
+            simulation.time += result.steps * dt
             self._restore_state(*good)
+            rest = slice(result.steps, None)
+            self._upload_rows(
+                None if targets is None else targets[rest], None if loads is None else tuple(rows[rest] for rows in loads)
+            )
             self._launch(1, dt)
             fault = self._describe_fault()
             self._restore_state(*good)
-            simulation.step_count += result.steps
-            simulation.time += result.steps * dt
             raise SimulationError(f"step {simulation.step_count + 1}: {fault}")
         return result
 
@@ -203,16 +208,23 @@ class ExplicitStepper:
         other = exploded if lowest <= -explicit.EXPLODED else "a velocity is no longer finite"
         return self.simulation.find_nonfinite() or other
 
+    def _upload_rows(self, targets: np.ndarray | None, loads: tuple[np.ndarray, np.ndarray] | None) -> None:
+        """Upload targets (r,k,3) and loads, as `_load_rows` returns them, of the next sub-steps; None without any."""
+        if targets is not None:
+            self._upload_targets(targets)
+        if loads is not None and self.work.has_varied_nodes:
+            explicit.set_rows(self.work.load_rows, loads[0].reshape(-1, 3))
+        if loads is not None and self.work.has_varied_amplitudes:
+            explicit.set_numbers(self.work.amplitude_rows, loads[1].reshape(-1))
+
     def _upload_targets(self, targets: np.ndarray) -> None:
         explicit.set_rows(self.work.targets, targets.reshape(-1, 3))
         upload([(self.work.prescribed_axes, self.simulation.dirichlet.prescribed_axes())])
 
-    def _upload_loads(self, times: np.ndarray) -> None:
-        """Upload the loads that follow paths, one row for each time [s]."""
-        if self.work.n_varied:
-            explicit.set_rows(self.work.load_rows, self.simulation.load_rows(times, self._varied).reshape(-1, 3))
-        if self.work.has_varied_amplitudes:
-            explicit.set_numbers(self.work.amplitude_rows, self.simulation.loads.amplitudes(times).reshape(-1))
+    def _load_rows(self, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the loads (r,k,3) [N] that follow paths at the times (r,) [s], and the amplitudes (r,n) if any does."""
+        simulation = self.simulation
+        return simulation.load_rows(times, self._varied), simulation.loads.amplitudes(times)
 
     def _restore_state(self, x: np.ndarray, v: np.ndarray) -> None:
         self.simulation.set_state(x, v)

@@ -92,7 +92,7 @@ def _number_at(load: Tendon, t: float, what: str) -> float:
 
 def scalar_loads(scene: Scene) -> list[tuple[str, Tendon]]:
     """The loads of a scene that are one number, each with its name in messages, in the order of the model's `amplitudes`."""
-    return [(f"tendon {tendon.name!r}: force", tendon) for tendon in scene.tendons]
+    return [(f"tendon {tendon.name!r}", tendon) for tendon in scene.tendons]
 
 
 def tension_slots(scene: Scene) -> dict[str, int]:

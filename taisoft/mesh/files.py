@@ -18,14 +18,15 @@ from pathlib import Path
 import meshio
 import numpy as np
 
-from taisoft.errors import MeshError
+from taisoft.errors import MeshError, listed, value_text
 from taisoft.files import replacing
-from taisoft.mesh.gmsh import PHYSICAL, read_gmsh
-from taisoft.mesh.regions import LARGEST_ID
+from taisoft.mesh.gmsh import PHYSICAL, read_gmsh, split_names
+from taisoft.mesh.quality import edge_lengths
+from taisoft.mesh.regions import LARGEST_ID, usable_names
 from taisoft.mesh.safe_reading import Blocks, FileContent, read_by_meshio, read_content
-from taisoft.mesh.tet_mesh import LARGEST_COORDINATE, TetMesh, edge_lengths, merge_labels
+from taisoft.mesh.tet_mesh import LARGEST_COORDINATE, TetMesh
 from taisoft.mesh.tetgen import read_tetgen
-from taisoft.mesh.topology import EDGES
+from taisoft.mesh.topology import EDGES, merge_labels
 
 TETS = ("tetra", "tetra10")
 BOUNDARY = ("vertex", "line", "line3", "triangle", "triangle6")  # boundary markers that meshers add; ignored with a warning
@@ -73,23 +74,24 @@ def read_mesh(path, fix_orientation: bool = False, weld: float | None = None, re
     content = None
     if ending == ".msh" and data.lstrip()[:1] == b"$":
         content = read_gmsh(name, data)
+        if content is None:
+            names, rest = split_names(data)
+            content = _read_by_meshio(file, rest)._replace(region_names=names)
     elif ending in (".node", ".ele"):
         content = read_tetgen(file)
     content = content or _read_by_meshio(file, data)
     blocks, notes = _tet_blocks(name, content.cells)
-    ids, region_notes = _regions(name, content, regions)
-    present = set() if ids is None else set(ids.tolist())
-    names = {region: text for region, text in content.region_names.items() if region in present and text.strip()}
+    ids, names, region_notes = _regions(name, content, regions)
     labels = {"regions": ids, "region_names": names}
     return _clean_mesh(name, content.points, blocks, notes + region_notes, fix_orientation, weld, labels)
 
 
-def write_mesh(path, mesh: TetMesh) -> None:
+def write_mesh(path, mesh: TetMesh, regions: bool = True) -> None:
     """Write a mesh atomically as .msh (Gmsh 4.1, with regions 2.2, text), .vtk, .vtu or .mesh (Medit).
 
     Regions become physical groups in .msh, references in .mesh, and else cell data called "region"; a warning says where their
-    names are lost. Raises MeshError for another extension, anything but a TetMesh, or regions that would be read as none,
-    OutputError if the file cannot be written.
+    names are lost. regions: whether to write them. Raises MeshError for another extension, anything but a TetMesh, or regions
+    that would be read as none, OutputError if the file cannot be written.
     """
     file = Path(path)
     ending = check_ending(file)
@@ -97,7 +99,7 @@ def write_mesh(path, mesh: TetMesh) -> None:
         raise MeshError(f"{file}: write_mesh needs a TetMesh, not {type(mesh).__name__}")
     record = meshio.Mesh(mesh.vertices, [("tetra", mesh.tets)])
     options = {"file_format": WRITERS[ending]} | ({"binary": False} if ending == ".msh" else {})
-    if mesh.regions is not None:
+    if regions and mesh.regions is not None:
         options |= _add_regions(file, record, mesh)
     elif ending == ".mesh":
         record.cell_data[REFERENCE] = [np.zeros(mesh.n_tets, dtype=np.int32)]  # meshio would write 1
@@ -144,14 +146,19 @@ def _count_faces(ending: str, data: bytes) -> str:
     return _format_counts({"triangle": len(found)})
 
 
-def _regions(name: str, content: FileContent, requested: str | None) -> tuple[np.ndarray | None, list[str]]:
-    """Return the region (m,) of each tet, or None, and warnings. requested: name of the cell data, or None for the known ones."""
+def _regions(name: str, content: FileContent, requested: str | None) -> tuple[np.ndarray | None, dict[int, str], list[str]]:
+    """Return the region (m,) of each tet, or None, names of regions, and warnings.
+
+    requested: name of the cell data, or None for the known ones.
+    """
+    if requested is not None and not isinstance(requested, str):
+        raise MeshError(f"{name}: regions must be the name of cell data, or None, not {value_text(requested)}")
     if requested is not None and requested not in content.cell_data:
-        known = ", ".join(repr(one) for one in content.cell_data) or "none"
-        raise MeshError(f"{name}: no cell data are called {requested!r}; there are {known}")
+        known = listed([value_text(one) for one in content.cell_data]) or "none"
+        raise MeshError(f"{name}: no cell data are called {value_text(requested)}; there are {known}")
     key = next((one for one in (requested, *NONE_IF_ZERO, REGION) if one in content.cell_data), None)
     if key is None:
-        return None, []
+        return None, {}, []
     blocks = [values for (kind, nodes), values in zip(content.cells, content.cell_data[key]) if kind in TETS and len(nodes)]
     values = np.concatenate(blocks)
     whole = np.isfinite(values) & (np.abs(values) <= LARGEST_ID) & (np.floor(values) == values)
@@ -160,9 +167,11 @@ def _regions(name: str, content: FileContent, requested: str | None) -> tuple[np
         text = f"cell data {key!r} are no regions, since that of tet {tet} is {values[tet]:g}, not a whole number of 32 bits"
         if requested is not None:
             raise MeshError(f"{name}: {text}")
-        return None, [text]
+        return None, {}, [text]
     ids = values.astype(np.int64)
-    return (None if key in NONE_IF_ZERO and not ids.any() and requested is None else ids), []
+    if key in NONE_IF_ZERO and not ids.any() and requested is None:
+        return None, {}, []
+    return ids, *usable_names(content.region_names if key == PHYSICAL else {}, np.unique(ids).tolist())
 
 
 def _read_by_meshio(file: Path, data: bytes) -> FileContent:
@@ -267,7 +276,7 @@ def _curved_edge_warnings(name: str, points: np.ndarray, cells: np.ndarray) -> l
 def _weld(name: str, points: np.ndarray, tets: np.ndarray, weld) -> tuple[np.ndarray, np.ndarray, list[str]]:
     """Merge vertices at most `weld` [m] apart into the first of each group; return points, tets and warnings."""
     if isinstance(weld, bool) or not isinstance(weld, (int, float, np.number)) or not 0 <= weld < np.inf:
-        raise MeshError(f"{name}: weld must be a distance of at least 0 m, or None, not {weld!r}")
+        raise MeshError(f"{name}: weld must be a distance of at least 0 m, or None, not {value_text(weld)}")
     shortest = float(edge_lengths(points, tets).min())
     if weld >= shortest > 0:
         raise MeshError(f"{name}: weld = {float(weld):g} m must be less than the shortest edge, {shortest:g} m")

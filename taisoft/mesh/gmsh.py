@@ -101,7 +101,8 @@ class _Binary:
 
 
 _GMSH_HEAD = re.compile(rb"\s*(?:\$Comments.*?\$EndComments\s*)?\$MeshFormat\s+(\S+)\s+([01])\s+(\d{1,2})[ \t\r]*\n", re.DOTALL)
-_VOLUME_NAME = re.compile(rb'^[ \t]*3[ \t]+(\d{1,10})[ \t]+"([^"\n]*)"', re.MULTILINE)  # in $PhysicalNames
+_NAMES = re.compile(rb"^[ \t]*\$PhysicalNames\b.*?^[ \t]*\$EndPhysicalNames\b[^\n]*\n?", re.MULTILINE | re.DOTALL)
+_VOLUME_NAME = re.compile(rb'^[ \t]*3[ \t]+(-?\d{1,10})[ \t]+"([^"\n]*)"', re.MULTILINE)
 _OPENING = re.compile(rb"^[ \t]*\$(?!End)(\w+)[ \t\r]*\n", re.MULTILINE)
 
 
@@ -124,15 +125,13 @@ def read_gmsh(name: str, data: bytes) -> FileContent | None:
             raise MeshError(f"{name}: line 3 ($MeshFormat): the byte order or the size {size} of a number is not known")
     needed = {"Nodes": _nodes_2, "Elements": _elements_2} if major == "2" else {"Nodes": _nodes_4, "Elements": _elements_4}
     readers = needed if major == "2" else needed | {"Entities": _entities_4}
-    sections, names = {}, {}
+    sections = {}
     while opening := _OPENING.search(data, at):
         section, at = opening[1].decode("ascii", "replace"), opening.end()
         if section not in readers:
-            start, at = at, data.find(b"$End" + opening[1], at)
+            at = data.find(b"$End" + opening[1], at)
             if at < 0:
                 raise _truncated(name, data, section)
-            if section == "PhysicalNames":
-                names = {int(tag): text.decode("utf-8", "replace") for tag, text in _VOLUME_NAME.findall(data[start:at])}
             continue
         if section in sections:
             line = data.count(b"\n", 0, at)
@@ -148,7 +147,19 @@ def read_gmsh(name: str, data: bytes) -> FileContent | None:
     if major == "4":  # of an entity, whose elements are one block or several
         physical = sections.get("Entities", {})
         groups = [np.full(len(block[1]), physical.get(entity, 0)) for block, entity in zip(blocks, groups)]
-    return FileContent(points, _tags_to_indices(name, tags, blocks), {PHYSICAL: groups}, names)
+    return FileContent(points, _tags_to_indices(name, tags, blocks), {PHYSICAL: groups}, split_names(data)[0])
+
+
+def split_names(data: bytes) -> tuple[dict[int, str], bytes]:
+    """Return the names of the physical groups of volumes, and the file without them: meshio fails on some of them.
+
+    Bytes that are not UTF-8 become single surrogates.
+    """
+    found = _NAMES.search(data, 0, max(data.find(b"$Nodes"), 0))
+    if found is None:
+        return {}, data
+    names = {int(tag): text.decode("utf-8", "surrogateescape") for tag, text in _VOLUME_NAME.findall(found[0])}
+    return names, data[: found.start()] + data[found.end() :]
 
 
 def _truncated(name: str, data: bytes, section: str) -> MeshError:

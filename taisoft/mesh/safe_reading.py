@@ -19,7 +19,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from taisoft.errors import MeshError
+from taisoft.errors import MeshError, one_line
 
 UTF16 = "the file is UTF-16 text; save it as UTF-8"
 HEAD = 64  # characters inspected to detect UTF-16 text
@@ -81,12 +81,6 @@ def content_lines(name: str, data: bytes) -> list[tuple[int, list[str]]]:
     if not lines:
         raise MeshError(f"{name}: the file is empty")
     return lines
-
-
-def one_line(text: str) -> str:
-    """Return the text on one line with single spaces, shortened to 120 characters."""
-    text = " ".join(text.split())
-    return text if len(text) <= 120 else text[:117] + "..."
 
 
 def read_by_meshio(file: Path, data: bytes, kind: str) -> FileContent:

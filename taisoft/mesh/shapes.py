@@ -11,7 +11,7 @@ from numbers import Integral
 import numpy as np
 
 from taisoft.attributes import thawed
-from taisoft.errors import MeshError
+from taisoft.errors import MeshError, value_text
 from taisoft.mesh.tet_mesh import TetMesh
 
 MAX_TETS = 50_000_000  # about 20 GB of memory while a mesh is built and checked
@@ -31,7 +31,7 @@ def box_mesh(cells, size, center=(0.0, 0.0, 0.0), pattern: str = "five") -> TetM
     cells = _checked_cells(cells, "box_mesh", (3,))
     size, center = _checked_vector(size, "box_mesh", "size", positive=True), _checked_vector(center, "box_mesh", "center")
     if pattern not in ("five", "six"):
-        raise MeshError(f"box_mesh: pattern must be 'five' or 'six', not {pattern!r}")
+        raise MeshError(f"box_mesh: pattern must be 'five' or 'six', not {value_text(pattern)}")
     _check_count(cells, 5 if pattern == "five" else 6, "box_mesh")
     vertices = center + size * _grid_points(cells)
     corners = _cell_corners(cells)
@@ -69,7 +69,7 @@ def ball_mesh(radius: float, cells: int, center=(0.0, 0.0, 0.0)) -> TetMesh:
     the sphere, which would make it nearly flat.
     """
     if isinstance(cells, bool) or not isinstance(cells, Integral) or cells < 2 or cells % 2:
-        raise MeshError(f"ball_mesh: cells must be an even integer, at least 2, not {cells!r}")
+        raise MeshError(f"ball_mesh: cells must be an even integer, at least 2, not {value_text(cells)}")
     radius = float(_checked_vector([radius] * 3, "ball_mesh", "radius", positive=True)[0])
     center = _checked_vector(center, "ball_mesh", "center")
     grid = np.array([cells] * 3)
@@ -136,7 +136,7 @@ def _checked_cells(cells, shape: str, lengths: tuple[int, ...]) -> np.ndarray:
     valid = all(isinstance(c, Integral) and not isinstance(c, bool) and c > 0 for c in values)
     if len(values) not in lengths or not valid:
         counts = " or ".join({2: "two", 3: "three"}[n] for n in lengths)
-        raise MeshError(f"{shape}: cells must be {counts} positive integers, not {cells!r}")
+        raise MeshError(f"{shape}: cells must be {counts} positive integers, not {value_text(cells)}")
     if max(values) > MAX_TETS:
         raise MeshError(f"{shape}: {max(values)} cells along an axis give more than the {MAX_TETS} tets allowed")
     return np.array([int(c) for c in values])
@@ -155,9 +155,9 @@ def _checked_vector(values, shape: str, what: str, positive: bool = False) -> np
     try:
         array = np.asarray(values)
     except ValueError as error:
-        raise MeshError(f"{shape}: {what} must be three numbers, not {values!r}") from error
+        raise MeshError(f"{shape}: {what} must be three numbers, not {value_text(values)}") from error
     if array.shape != (3,) or array.dtype.kind not in "fiu" or not np.isfinite(array).all():
-        raise MeshError(f"{shape}: {what} must be three finite numbers, not {values!r}")
+        raise MeshError(f"{shape}: {what} must be three finite numbers, not {value_text(values)}")
     if positive and not (array > 0).all():
-        raise MeshError(f"{shape}: {what} must be positive, not {values!r}")
+        raise MeshError(f"{shape}: {what} must be positive, not {value_text(values)}")
     return array.astype(np.float64)

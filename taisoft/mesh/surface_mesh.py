@@ -18,10 +18,10 @@ from pathlib import Path
 import numpy as np
 
 from taisoft.attributes import MeshAttributeError, guarded_record
-from taisoft.errors import MeshError
-from taisoft.mesh.safe_reading import content_lines, one_line, read_by_meshio, read_content, run_child
-from taisoft.mesh.tet_mesh import TetMesh, merge_labels
-from taisoft.mesh.topology import connected_pieces, linked_groups, triangle_edges
+from taisoft.errors import MeshError, one_line
+from taisoft.mesh.safe_reading import content_lines, read_by_meshio, read_content, run_child
+from taisoft.mesh.tet_mesh import TetMesh
+from taisoft.mesh.topology import connected_pieces, linked_groups, merge_labels, triangle_edges
 
 FORMATS = (".obj", ".stl", ".ply", ".off")
 HEAD = re.compile(r"(?:ST)?C?N?OFF(\d*)$")  # of .off; some programs write no space before the counts

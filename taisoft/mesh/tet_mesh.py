@@ -9,20 +9,18 @@ no face are not detected.
 import warnings
 
 import numpy as np
-import scipy
 
 from taisoft.attributes import Guarded, MeshAttributeError
-from taisoft.errors import MeshError
+from taisoft.errors import MeshError, listed
+from taisoft.mesh.quality import edge_lengths, mean_ratio
 from taisoft.mesh.regions import checked_names, checked_regions, region_id, region_text
-from taisoft.mesh.topology import EDGES, Faces, connected_pieces, first_repeated_tet, joint_edges, joint_vertices, linked_groups
+from taisoft.mesh.topology import Faces, connected_pieces, first_repeated_tet, joint_edges, joint_vertices, merge_labels
 
 DEGENERATE = 1e-9  # a tet has no volume if it is below this times its longest edge cubed
 NEARLY_FLAT = 0.02  # mean ratio below which a tet causes a warning; grids and common meshers stay above
 LARGEST_COORDINATE = float(np.finfo(np.float32).max)  # [m], since forces may be computed in 32 bits
 MAX_OFFSET_RATIO = 1e5  # distance from the origin over size above which a warning is issued
 COINCIDENT = 1e-9  # vertices closer than this times the mesh's diagonal are coincident
-GENERIC_DIRECTION = np.array([0.56071, 0.64493, 0.51922])  # distinct projections for grid vertices; length at most 1
-MAX_LISTED = 20  # maximum number of indices listed in a message
 
 
 class TetMesh(Guarded):
@@ -31,7 +29,8 @@ class TetMesh(Guarded):
     vertices: (n,3) float64 [m]. tets: (m,4) int64, every det(x1-x0, x2-x0, x3-x0) > 0. volumes: (m,) [m^3].
     surface: (t,3) int64, the faces that belong to one tet, normals outward; surface_tets: (t,) int64, the tet of each.
     flipped: int64 indices of the tets whose orientation was changed. n_components: number of parts connected by vertices.
-    regions: (m,) int64, of each tet, or None; region_names: {region: name}, of regions that have one.
+    regions: (m,) int64, of each tet, or None; region_ids: tuple of those that tets are in, ascending; region_names: {region:
+    name}, of regions that have one.
     warnings: list of str, each also issued as a UserWarning. recipe: for a mesh from `box_mesh`, `sheet_mesh` or
     `ball_mesh` the shape's name and the arguments that reproduce its arrays, else None.
     """
@@ -63,7 +62,9 @@ class TetMesh(Guarded):
         self.tets = self._checked_tets(tets)
         self.volumes = self._oriented_volumes(fix_orientation)
         self.regions = checked_regions(regions, self.n_tets, self._mesh_error)
-        self.region_names = checked_names(region_names, self.regions, self._mesh_error)
+        self.region_ids = () if self.regions is None else tuple(np.unique(self.regions).tolist())
+        self.region_names = checked_names(region_names, self.region_ids, self._mesh_error)
+        self._region_of = {key: one for one in self.region_ids for key in (one, self.region_names.get(one, one))}
         faces = self._checked_faces()
         rows = faces.surface()
         self.surface = faces.triangles[rows]
@@ -100,14 +101,9 @@ class TetMesh(Guarded):
         """Number of tetrahedra m."""
         return len(self.tets)
 
-    @property
-    def region_ids(self) -> tuple[int, ...]:
-        """The regions that tets are in, ascending; empty if the mesh has none."""
-        return () if self.regions is None else tuple(np.unique(self.regions).tolist())
-
     def region_id(self, region: int | str) -> int:
         """Return the id of a region given by its name or id. Raises MeshError if no tet is in it."""
-        return region_id(region, self.regions, self.region_names, self._mesh_error)
+        return region_id(region, self._region_of, self._mesh_error)
 
     def region_text(self, region: int) -> str:
         """Return a region's name in quotes, or its id, for messages."""
@@ -209,7 +205,7 @@ class TetMesh(Guarded):
                 "fix_orientation=True flips and lists them"
             )
         elif len(inverted):
-            self._warn(f"{len(inverted)} of {self.n_tets} inverted tets have been flipped: {_index_text(inverted)}")
+            self._warn(f"{len(inverted)} of {self.n_tets} inverted tets have been flipped: {listed(inverted)}")
         self.tets[inverted] = self.tets[inverted][:, [0, 1, 3, 2]]
         return np.abs(volumes)
 
@@ -223,7 +219,7 @@ class TetMesh(Guarded):
             owners = np.sort(rows // 4)
             corners = tuple(np.sort(faces.triangles[rows[0]]).tolist())
             raise self._mesh_error(
-                f"face {corners} is shared by {len(rows)} tets ({_index_text(owners)}); a face may have at most two"
+                f"face {corners} is shared by {len(rows)} tets ({listed(owners)}); a face may have at most two"
             )
         # The outward faces of neighbours on opposite sides have opposite orientation; equal orientation means overlap.
         pairs = faces.pairs()
@@ -256,7 +252,7 @@ class TetMesh(Guarded):
             self._warn(f"parts are joined at an edge only at {len(edges)} edges, the first is {first}")
         vertices = np.setdiff1d(joint_vertices(self.tets, faces), edges)
         if len(vertices):
-            self._warn(f"parts are joined at a vertex only at {len(vertices)} vertices: {_index_text(vertices)}")
+            self._warn(f"parts are joined at a vertex only at {len(vertices)} vertices: {listed(vertices)}")
 
     def _warn_coincident(self) -> None:
         """Warn of vertices that coincide with another one; they do not connect their tets."""
@@ -269,57 +265,3 @@ class TetMesh(Guarded):
                 f"{len(extra)} vertices coincide with another one, the first is vertex {extra[0]} on vertex {original}; "
                 "they are not connected (read_mesh can weld them)"
             )
-
-
-def edge_lengths(vertices: np.ndarray, tets: np.ndarray) -> np.ndarray:
-    """Return the lengths (m,6) [m] of every tet's edges, in the order of EDGES. vertices: (n,3) [m]. tets: (m,4) int."""
-    corners = vertices[tets]
-    return np.stack([np.linalg.norm(corners[:, a] - corners[:, b], axis=1) for a, b in EDGES], axis=1)
-
-
-def mean_ratio(lengths: np.ndarray, volumes: np.ndarray) -> np.ndarray:
-    """Return the mean ratio (m,) of tets, 12 (3 V)^(2/3) / sum of squared edge lengths: 1 if regular, 0 if flat.
-
-    lengths: (m,6) [m], of the edges. volumes: (m,) [m^3], positive.
-    Source: Liu, Joe 1994, Relationship between tetrahedron shape measures, BIT 34.
-    """
-    return 12.0 * np.cbrt(3.0 * volumes) ** 2 / (lengths**2).sum(axis=1)
-
-
-def mean_surface_edge(surfaces: list[tuple[np.ndarray, np.ndarray]]) -> float:
-    """Return the mean edge length [m] over all triangles. surfaces: pairs of vertices (n,3) [m] and triangles (t,3)."""
-    lengths = [np.linalg.norm(x[t] - x[np.roll(t, -1, axis=1)], axis=2).reshape(-1) for x, t in surfaces]
-    return float(np.concatenate(lengths).mean())
-
-
-def merge_labels(points: np.ndarray, tolerance: float) -> np.ndarray:
-    """Return labels (n,), from 0: points at most `tolerance` [m] apart, directly or through others, share a label.
-
-    points: (n,3) [m]. Labels follow the order in which a group first appears.
-    """
-    # Merge equal points first: n of them in one place would make n^2 pairs.
-    distinct, labels = np.unique(points + 0.0, axis=0, return_inverse=True)  # + 0.0 makes -0.0 equal to 0.0
-    labels = labels.ravel()
-    if tolerance > 0 and _may_be_near(distinct, tolerance):
-        pairs = scipy.spatial.cKDTree(distinct).query_pairs(tolerance, output_type="ndarray")
-        labels = linked_groups(*pairs.T, len(distinct))[1][labels]
-    first, inverse = np.unique(labels, return_index=True, return_inverse=True)[1:]
-    rank = np.empty(len(first), dtype=np.int64)
-    rank[np.argsort(first)] = np.arange(len(first))
-    return rank[inverse.ravel()]
-
-
-def _may_be_near(points: np.ndarray, tolerance: float) -> bool:
-    """Return False if projections on GENERIC_DIRECTION show that no two points are at most `tolerance` apart, else True.
-
-    A cheap test that spares most meshes the k-d tree.
-    """
-    projections = np.sort(points @ GENERIC_DIRECTION)
-    rounding = 8.0 * np.finfo(np.float64).eps * float(np.abs(points).max(initial=0.0))
-    return bool((np.diff(projections) <= tolerance + rounding).any())
-
-
-def _index_text(indices: np.ndarray) -> str:
-    """Return indices as text, shortened after MAX_LISTED."""
-    text = ", ".join(str(i) for i in indices[:MAX_LISTED].tolist())
-    return text if len(indices) <= MAX_LISTED else f"{text}, ... ({len(indices)} in all)"

@@ -4,6 +4,7 @@ Half-edge 3t + k runs from corner k of triangle t to corner (k + 1) mod 3.
 """
 
 import numpy as np
+import scipy
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
@@ -13,6 +14,7 @@ from taisoft.errors import MeshError
 TET_FACES = np.array([(1, 2, 3), (0, 3, 2), (0, 1, 3), (0, 2, 1)])
 
 EDGES = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))  # corners of a tet's six edges; edges k and 5-k are opposite
+GENERIC_DIRECTION = np.array([0.56071, 0.64493, 0.51922])  # distinct projections for grid vertices; length at most 1
 HALF_EDGES = np.array([(0, 1), (1, 2), (2, 0)])  # corners of a triangle's half-edges
 
 
@@ -165,3 +167,30 @@ def joint_vertices(tets: np.ndarray, faces: Faces) -> np.ndarray:
     fans = np.unique(np.stack([vertex_of[used], labels[used]], axis=1), axis=0)[:, 0]
     vertices, counts = np.unique(fans, return_counts=True)
     return vertices[counts > 1]
+
+
+def merge_labels(points: np.ndarray, tolerance: float) -> np.ndarray:
+    """Return labels (n,), from 0: points at most `tolerance` [m] apart, directly or through others, share a label.
+
+    points: (n,3) [m]. Labels follow the order in which a group first appears.
+    """
+    # Merge equal points first: n of them in one place would make n^2 pairs.
+    distinct, labels = np.unique(points + 0.0, axis=0, return_inverse=True)  # + 0.0 makes -0.0 equal to 0.0
+    labels = labels.ravel()
+    if tolerance > 0 and _may_be_near(distinct, tolerance):
+        pairs = scipy.spatial.cKDTree(distinct).query_pairs(tolerance, output_type="ndarray")
+        labels = linked_groups(*pairs.T, len(distinct))[1][labels]
+    first, inverse = np.unique(labels, return_index=True, return_inverse=True)[1:]
+    rank = np.empty(len(first), dtype=np.int64)
+    rank[np.argsort(first)] = np.arange(len(first))
+    return rank[inverse.ravel()]
+
+
+def _may_be_near(points: np.ndarray, tolerance: float) -> bool:
+    """Return False if projections on GENERIC_DIRECTION show that no two points are at most `tolerance` apart, else True.
+
+    A cheap test that spares most meshes the k-d tree.
+    """
+    projections = np.sort(points @ GENERIC_DIRECTION)
+    rounding = 8.0 * np.finfo(np.float64).eps * float(np.abs(points).max(initial=0.0))
+    return bool((np.diff(projections) <= tolerance + rounding).any())

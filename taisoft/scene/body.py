@@ -3,11 +3,12 @@
 import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 
 import numpy as np
 
 from taisoft.attributes import Guarded, guarded_record, thawed
-from taisoft.errors import SceneError
+from taisoft.errors import SceneError, value_text
 from taisoft.mesh.nodes import Nodes, make_nodes
 from taisoft.mesh.tet_mesh import TetMesh
 from taisoft.mesh.thickness import coarse_bending
@@ -15,7 +16,7 @@ from taisoft.scene import checks
 from taisoft.scene.collision import CONTACT_MODES
 from taisoft.scene.composition import Composition, compose
 from taisoft.scene.key_frames import KeyFrames, NodePath
-from taisoft.scene.loads import NodalForce, Traction, value_and_path
+from taisoft.scene.loads import NodalForce, Traction, value_or_path
 from taisoft.scene.material import Material
 
 NEARLY_INCOMPRESSIBLE = 0.49  # Poisson's ratio above which linear tets lock, so that they bend far too little
@@ -53,14 +54,14 @@ def tet_number(name: str, doc: str) -> property:
 class Body(Guarded):
     """One elastic body of a scene; made by `Scene.add_body`.
 
-    name, mesh. material: a `Material`, or a dict of one for each region, by its id. young, poisson, density: what the tets
-    have, a float, or (m,) where it may differ from tet to tet; setting one replaces the material's. position: (3,) [m]; nodes
-    start at rest_positions + position. velocity: (3,) or (n,3) [m/s], initial. order: 1 or 2, of the elements' shape functions;
-    quadrature_degree: degree of polynomials integrated exactly. nodes: `Nodes`, the mesh's vertices and for order 2 its mid-
-    edge nodes. constraints, tractions, forces: lists of `Constraint`, `Traction`, `NodalForce`; items can be removed, but only
-    methods add them. collision: one of CONTACT_MODES. Only material, its numbers, position, velocity and collision can be
-    assigned; each is validated. `warn_locking` and `warn_bending` warn if tets of order 1 are far too stiff; `Scene.add_body`
-    calls both.
+    name, mesh. material: a `Material`, or a read-only dict of one for each region, by its id. young, poisson, density: what
+    the tets have, a float, or (m,) where it may differ from tet to tet; setting one replaces the material's. position: (3,)
+    [m]; nodes start at rest_positions + position. velocity: (3,) or (n,3) [m/s], initial. order: 1 or 2, of the elements'
+    shape functions; quadrature_degree: degree of polynomials integrated exactly. nodes: `Nodes`, the mesh's vertices and for
+    order 2 its mid-edge nodes. constraints, tractions, forces: lists of `Constraint`, `Traction`, `NodalForce`; items can be
+    removed, but only methods add them. collision: one of CONTACT_MODES. Only material, its numbers, position, velocity and
+    collision can be assigned; each is validated. `warn_locking` and `warn_bending` warn if tets of order 1 are far too stiff;
+    `Scene.add_body` calls both.
     """
 
     _read_only = frozenset(_READ_ONLY)
@@ -147,9 +148,12 @@ class Body(Guarded):
         return len(self.nodes.positions)
 
     @property
-    def material(self) -> Material | dict[int, Material]:
-        """Material, or {region: Material}. Setting it replaces all numbers; raises SceneError and warns if linear tets lock."""
-        return dict(self.composition.materials) if self.composition.has_regions else self.composition.first
+    def material(self) -> Material | Mapping[int, Material]:
+        """Material, or {id of region: Material}, which is read-only.
+
+        Setting it replaces all numbers; raises SceneError and warns if linear tets lock.
+        """
+        return MappingProxyType(self.composition.materials) if self.composition.has_regions else self.composition.first
 
     @material.setter
     def material(self, value: Material | Mapping) -> None:
@@ -234,14 +238,9 @@ class Body(Guarded):
         if isinstance(path, KeyFrames):
             path = NodePath(path, self.rest_positions[nodes] + self.position)
         if not callable(path):
-            raise SceneError(f"{what}: path must be a function of time, not {path!r}")
-        try:
-            start = path(0.0)
-        except Exception as error:
-            raise SceneError(f"{what}: the path failed at t = 0: {type(error).__name__}: {error}") from error
-        if start is None:
+            raise SceneError(f"{what}: path must be a function of time, not {value_text(path)}")
+        if checks.path_value(path, 0.0, what, "displacement", ((3,), (len(nodes), 3))) is None:
             raise SceneError(f"{what}: the path must give a displacement at t = 0, not None")
-        checks.array(start, f"{what}: the path's displacement at t = 0", ((3,), (len(nodes), 3)))
         return self._add_constraint(Constraint(nodes, mask, path, _callable_or_none(where)), what)
 
     def add_traction(self, where, traction) -> Traction:
@@ -255,7 +254,7 @@ class Body(Guarded):
         what = f"{self._label()}: add_traction"
         centroids = self.mesh.vertices[self.mesh.surface].mean(axis=1)
         triangles = checks.selection(where, centroids, what, "surface triangle")
-        load = Traction(triangles, *value_and_path(traction, f"{what}: traction", ((3,),)))
+        load = Traction(triangles, **value_or_path(traction, what, "traction", ((3,),)))
         list.append(self.tractions, load)
         return load
 
@@ -268,8 +267,8 @@ class Body(Guarded):
         self._check_open("add_force")
         what = f"{self._label()}: add_force"
         nodes = checks.selection(where, self.rest_positions, what, "node")
-        value, path = value_and_path(force, f"{what}: force", ((3,), (len(nodes), 3)))
-        load = NodalForce(nodes, value, _callable_or_none(where), path)
+        given = value_or_path(force, what, "force", ((3,), (len(nodes), 3)))
+        load = NodalForce(nodes, where=_callable_or_none(where), **given)
         list.append(self.forces, load)
         return load
 

@@ -11,7 +11,7 @@ from numbers import Real
 
 import numpy as np
 
-from taisoft.errors import SceneError
+from taisoft.errors import SceneError, reason, value_text
 
 LARGEST, SMALLEST = float(np.finfo(np.float32).max), float(np.finfo(np.float32).tiny)  # limits of 32-bit floats
 MAX_TOLERANCE = {"newton_tolerance": 0.1}  # a residual of a tenth of the forces is no solution; others: 1
@@ -19,19 +19,20 @@ MAX_TOLERANCE = {"newton_tolerance": 0.1}  # a residual of a tenth of the forces
 
 def number(value, what: str, *, above=None, minimum=None, maximum=None, unit: str = "") -> float:
     """Return value as a finite float in the 32-bit range, > above, >= minimum, <= maximum where given."""
+    value = value[()] if isinstance(value, np.ndarray) and value.ndim == 0 else value
     if isinstance(value, (bool, np.bool_)) or not isinstance(value, Real):
-        raise SceneError(f"{what} must be a number, not {value!r}")
+        raise SceneError(f"{what} must be a number, not {value_text(value)}")
     try:
         result = float(value)
     except OverflowError:
         result = float("inf")
     if not np.isfinite(result):
-        raise SceneError(f"{what} must be finite, not {value!r}")
+        raise SceneError(f"{what} must be finite, not {value_text(value)}")
     rules = (("greater than", operator.gt, above), ("at least", operator.ge, minimum), ("at most", operator.le, maximum))
     rules = [rule for rule in rules if rule[2] is not None]
     if not all(holds(result, limit) for _, holds, limit in rules):
         rule = " and ".join(f"{words} {limit:g}" for words, _, limit in rules)
-        raise SceneError(f"{what} must be {rule}{unit and ' ' + unit}, not {value!r}")
+        raise SceneError(f"{what} must be {rule}{unit and ' ' + unit}, not {value_text(value)}")
     if abs(result) > LARGEST or (above == 0.0 and result < SMALLEST):
         raise SceneError(f"{what} is {result:g}, too {'large' if abs(result) > 1.0 else 'small'} for a 32-bit float")
     return result
@@ -45,7 +46,7 @@ def array(value, what: str, shapes: tuple[tuple[int, ...], ...]) -> np.ndarray:
     except (ValueError, TypeError, OverflowError):
         result = np.empty(0, dtype=object)
     if result.dtype.kind not in "fiu":
-        raise SceneError(f"{what} must be numbers of shape {shapes_text}, not {value!r}")
+        raise SceneError(f"{what} must be numbers of shape {shapes_text}, not {value_text(value)}")
     if result.shape not in shapes:
         raise SceneError(f"{what} must have shape {shapes_text}, not {result.shape}")
     result = np.array(result, dtype=np.float64)
@@ -56,6 +57,18 @@ def array(value, what: str, shapes: tuple[tuple[int, ...], ...]) -> np.ndarray:
     if len(bad):
         raise SceneError(f"{what}: entry {bad[0].tolist()} is {result[tuple(bad[0])]:g}, too large for a 32-bit float")
     return result
+
+
+def path_value(path: Callable, t: float, what: str, quantity: str, shapes: tuple[tuple[int, ...], ...]) -> np.ndarray | None:
+    """Return what a path, a function of time [s], gives at t, checked as `array` does; None for None.
+
+    what: start of the message, quantity: what it should give.
+    """
+    try:
+        value = path(t)
+    except Exception as error:  # a user's function may raise anything
+        raise SceneError(f"{what}: the path failed at t = {t:g}: {reason(error)}") from error
+    return None if value is None else array(value, f"{what}: the path's {quantity} at t = {t:g}", shapes)
 
 
 def length(value) -> int:
@@ -72,7 +85,7 @@ def choice(value, what: str, allowed: tuple[str, ...]) -> str:
         return value
     near = difflib.get_close_matches(value.lower(), allowed, n=1) if isinstance(value, str) and len(allowed) > 2 else []
     hint = f"; did you mean {near[0]!r}?" if near else ""
-    raise SceneError(f"{what} must be one of {', '.join(allowed)}, not {value!r}{hint}")
+    raise SceneError(f"{what} must be one of {', '.join(allowed)}, not {value_text(value)}{hint}")
 
 
 def nearest(name: str, known) -> str:
@@ -84,7 +97,7 @@ def nearest(name: str, known) -> str:
 def flag(value, what: str) -> bool:
     """Return value if it is True or False."""
     if not isinstance(value, bool):
-        raise SceneError(f"{what} must be True or False, not {value!r}")
+        raise SceneError(f"{what} must be True or False, not {value_text(value)}")
     return value
 
 
@@ -93,30 +106,30 @@ def whole(value, what: str, allowed: tuple[int, ...] | range) -> int:
     if isinstance(value, (bool, np.bool_)) or not isinstance(value, (int, np.integer)) or int(value) not in allowed:
         is_range = isinstance(allowed, range)
         rule = f"a whole number from {allowed[0]} to {allowed[-1]}" if is_range else " or ".join(map(str, allowed))
-        raise SceneError(f"{what} must be {rule}, not {value!r}")
+        raise SceneError(f"{what} must be {rule}, not {value_text(value)}")
     return int(value)
 
 
 def text(value, what: str) -> str:
     """Return value if it is a string."""
     if not isinstance(value, str):
-        raise SceneError(f"{what} must be a text, not {value!r}")
+        raise SceneError(f"{what} must be a text, not {value_text(value)}")
     return value
 
 
 def name(value, what: str, taken: list[str]) -> str:
     """Return value if it is a non-blank string that is not in `taken`."""
     if not isinstance(value, str) or not value.strip():
-        raise SceneError(f"{what} must be a text that is not empty, not {value!r}")
+        raise SceneError(f"{what} must be a text that is not empty, not {value_text(value)}")
     if value in taken:
-        raise SceneError(f"{what} {value!r} is taken; names must be unique")
+        raise SceneError(f"{what} {value_text(value)} is taken; names must be unique")
     return value
 
 
 def axes(value, what: str) -> np.ndarray:
     """Return (3,) bool for a string such as "xz": some of x, y, z, without repetition."""
     if not isinstance(value, str) or not value or set(value) - set("xyz") or len(set(value)) != len(value):
-        raise SceneError(f"{what}: axes must be some of 'x', 'y', 'z' without repetition, not {value!r}")
+        raise SceneError(f"{what}: axes must be some of 'x', 'y', 'z' without repetition, not {value_text(value)}")
     return np.array([axis in value for axis in "xyz"])
 
 
@@ -131,7 +144,7 @@ def selection(where, points: np.ndarray, what: str, items: str, *, repeats: bool
         try:
             mask = np.asarray(where(points.copy()))
         except Exception as error:
-            raise SceneError(f"{what}: the selection function failed: {type(error).__name__}: {error}") from error
+            raise SceneError(f"{what}: the selection function failed: {reason(error)}") from error
         if mask.dtype != bool or mask.shape != (n,):
             raise SceneError(
                 f"{what}: the selection function must return a bool mask of shape ({n},), not {mask.dtype} of shape {mask.shape}"
@@ -152,7 +165,7 @@ def _ids(where, n: int, what: str, items: str) -> np.ndarray:
     try:
         ids = np.asarray(where)
     except (ValueError, TypeError, OverflowError) as error:
-        raise SceneError(f"{what}: choose by {items} ids, a bool mask or a function, not {where!r}") from error
+        raise SceneError(f"{what}: choose by {items} ids, a bool mask or a function, not {value_text(where)}") from error
     if ids.size == 0:
         return np.empty(0, dtype=np.int64)
     if ids.dtype == bool:
@@ -160,7 +173,7 @@ def _ids(where, n: int, what: str, items: str) -> np.ndarray:
             raise SceneError(f"{what}: a mask must have shape ({n},), not {ids.shape}")
         return np.flatnonzero(ids)
     if ids.dtype.kind not in "iu" or ids.ndim > 1:
-        raise SceneError(f"{what}: {items} ids must be a list of integers, not {where!r}")
+        raise SceneError(f"{what}: {items} ids must be a list of integers, not {value_text(where)}")
     ids = np.atleast_1d(ids)
     bad = np.flatnonzero((ids < 0) | (ids >= n))
     if len(bad):
@@ -192,7 +205,7 @@ def _positive(value, what: str) -> None:
 def _tolerance(value, what: str) -> None:
     limit = MAX_TOLERANCE.get(what.rpartition(".")[2], 1.0)
     if value is not None and number(value, what, above=0.0) >= limit:
-        raise SceneError(f"{what} must be below {limit:g}, or None for the default, not {value!r}")
+        raise SceneError(f"{what} must be below {limit:g}, or None for the default, not {value_text(value)}")
 
 
 SOLVER_CHECKS = {  # key of the `solver` dict -> check

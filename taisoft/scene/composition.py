@@ -10,7 +10,7 @@ from functools import cached_property
 
 import numpy as np
 
-from taisoft.errors import MeshError, SceneError
+from taisoft.errors import MeshError, SceneError, value_text
 from taisoft.mesh.tet_mesh import TetMesh
 from taisoft.scene import checks
 from taisoft.scene.material import LAWS, Material, lame_parameters
@@ -91,7 +91,7 @@ class Composition:
             return self._changed_in(what, numbers, region)
         by_tet, everywhere = dict(self.by_tet), {}
         for name, value in numbers.items():
-            if name in BY_TET and isinstance(value, (np.ndarray, list, tuple)):
+            if name in BY_TET and (isinstance(value, (list, tuple)) or getattr(value, "ndim", 0)):
                 by_tet[name] = _tet_numbers(f"{what}: {name}", name, value, self.mesh.n_tets)
             else:
                 by_tet.pop(name, None)
@@ -140,7 +140,9 @@ def _by_region(what: str, mesh: TetMesh, materials: Mapping) -> dict[int, Materi
         except MeshError as error:
             raise SceneError(f"{what}: material: {error}") from None
         if not isinstance(material, Material):
-            raise SceneError(f"{what}: the material of region {key!r} must be a Material, not {type(material).__name__}")
+            raise SceneError(
+                f"{what}: the material of region {value_text(key)} must be a Material, not {type(material).__name__}"
+            )
         if region in found:
             raise SceneError(f"{what}: region {mesh.region_text(region)} is given two materials, by its name and by its id")
         found[region] = material
@@ -162,8 +164,8 @@ def _by_region(what: str, mesh: TetMesh, materials: Mapping) -> dict[int, Materi
 def _replaced(what: str, material: Material, numbers: dict) -> Material:
     try:
         return replace(material, **numbers) if numbers else material
-    except SceneError as error:
-        raise SceneError(f"{what}: {error}") from None
+    except SceneError as error:  # of an argument
+        raise SceneError(f"{what}: {str(error).removeprefix('material: ')}") from None
 
 
 def _tet_numbers(what: str, name: str, value, n_tets: int) -> np.ndarray:

@@ -6,7 +6,7 @@ by its position. Each function here that takes a scene is a method of `Scene`, w
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from taisoft.attributes import guarded_record
 from taisoft.errors import SceneError
 from taisoft.scene import checks
 from taisoft.scene.body import Body
-from taisoft.scene.loads import value_and_path
+from taisoft.scene.loads import value_or_path
 from taisoft.scene.locate import locate
 
 if TYPE_CHECKING:
@@ -62,6 +62,8 @@ class Tendon:
     points: tuple[Point, ...]
     value: np.ndarray | None  #: () tension [N]; None if it follows a path
     path: Callable | None = None  #: t [s] -> tension [N]
+    path_shape: tuple[int, ...] | None = None  #: of all values along the path
+    kind: ClassVar[str] = "force"
 
     def __post_init__(self):
         checks.store(self, value=self.value)
@@ -150,7 +152,7 @@ def add_tendon(self: "Scene", points, force, name: str | None = None) -> Tendon:
     for k, (p, q) in enumerate(zip(made, made[1:])):
         if np.array_equal(start_of(self, p), start_of(self, q)):
             raise SceneError(f"{what}: points {k} and {k + 1} coincide")
-    tendon = Tendon(name, made, *value_and_path(force, f"{what}: force", ((),)))
+    tendon = Tendon(name, made, **value_or_path(force, what, "force", ((),)))
     check_tension(tendon.path(0.0) if tendon.value is None else tendon.value, f"{what}: force")
     list.append(self.tendons, tendon)
     return tendon

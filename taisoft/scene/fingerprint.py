@@ -42,10 +42,9 @@ def scene_fingerprint(scene: Scene, features: dict[str, bool]) -> dict[str, str]
 
 def scene_digest(scene: Scene) -> str:
     """Return a digest of everything comparable in a scene: its parts as a checkpoint compares them, and its numbers."""
+    numbers = json.dumps(run_time_numbers(scene), default=lambda array: digest([array]))
     loads = [load.value for load in scene.loads]
-    return digest(
-        [json.dumps(scene_fingerprint(scene, {})), json.dumps(run_time_numbers(scene)), scene.allow_initial_overlap, *loads]
-    )
+    return digest([json.dumps(scene_fingerprint(scene, {})), numbers, scene.allow_initial_overlap, *loads])
 
 
 def _body_parts(body: Body) -> dict[str, list]:
@@ -83,16 +82,15 @@ def _path_parts(path: Callable | None) -> list:
 
 
 def run_time_numbers(scene: Scene) -> dict:
-    """Return the numbers of a scene that may change at run time, except its loads."""
+    """Return the numbers of a scene that may change at run time, except its loads: plain data, and arrays by tet."""
     pairs = [[sorted(names), *numbers] for names, numbers in scene.contact_pairs.items()]
     return {"gravity": scene.gravity.tolist(), "materials": [_materials(body) for body in scene.bodies], "pairs": pairs}
 
 
 def _materials(body: Body) -> dict:
     """Return a body's materials, in the order of its regions, and its numbers by tet."""
-    composition = body.composition
-    by_tet = {name: values.tolist() for name, values in composition.by_tet.items()}
-    return {"materials": [dataclasses.asdict(material) for material in composition.materials.values()], "by_tet": by_tet}
+    materials = [dataclasses.asdict(material) for material in body.composition.materials.values()]
+    return {"materials": materials, "by_tet": body.composition.by_tet}
 
 
 def digest(values: list) -> str:

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
@@ -16,9 +17,11 @@ from taisoft.scene.key_frames import KeyFrames
 class Traction:
     """A dead load on surface triangles."""
 
+    kind: ClassVar[str] = "traction"
     triangles: np.ndarray  #: (k,) int64 rows of mesh.surface
     value: np.ndarray | None  #: (3,) force per reference area [Pa]; None if it follows a path
     path: Callable | None = None  #: t [s] -> such a value
+    path_shape: tuple[int, ...] | None = None  #: of all values along the path
 
     def __post_init__(self):
         checks.store(self, triangles=self.triangles, value=self.value)
@@ -34,10 +37,12 @@ class Traction:
 class NodalForce:
     """A dead load on nodes: a total force distributed by lumped mass, or one force per node."""
 
+    kind: ClassVar[str] = "force"
     nodes: np.ndarray  #: (k,) int64 node ids
     value: np.ndarray | None  #: (3,) total force, or (k,3) one per node [N]; None if it follows a path
     where: Callable | None = None  #: as in `Constraint`
     path: Callable | None = None  #: t [s] -> such a value
+    path_shape: tuple[int, ...] | None = None  #: of all values along the path
 
     def __post_init__(self):
         checks.store(self, nodes=self.nodes, value=self.value)
@@ -62,26 +67,21 @@ class LoadPath:
         return self.frames(t)[0] if self.frames.values is None else self.frames.value_at(t)
 
 
-def value_and_path(load, what: str, shapes: tuple[tuple[int, ...], ...]) -> tuple[np.ndarray | None, Callable | None]:
-    """Return (value, None) or (None, path) of a load given as a value, a function of time, or `KeyFrames`. Raises SceneError.
+def value_or_path(load, what: str, kind: str, shapes: tuple[tuple[int, ...], ...]) -> dict:
+    """Return the fields value, path and path_shape of a load given as a value, a function of time, or `KeyFrames`.
 
-    shapes: those that a value may have; () for a number.
+    what: start of messages; kind: "force" or "traction"; shapes: those that a value may have, () for a number. Raises SceneError.
     """
     if isinstance(load, KeyFrames):
         if (load.values is None) != (() not in shapes):
-            raise SceneError(f"{what}: key frames need {'values' if () in shapes else 'translations'} here")
+            raise SceneError(f"{what}: {kind}: key frames need {'values' if () in shapes else 'translations'} here")
         try:
             load = LoadPath(load)
         except SceneError as error:
-            raise SceneError(f"{what}: {error}") from None
+            raise SceneError(f"{what}: {kind}: {error}") from None
     if not callable(load):
-        return checks.array(load, what, shapes), None
-    try:
-        start = load(0.0)
-    except Exception as error:
-        raise SceneError(f"{what}: the path failed at t = 0: {type(error).__name__}: {error}") from error
-    checks.array(start, f"{what} at t = 0", shapes)
-    return None, load
+        return {"value": checks.array(load, f"{what}: {kind}", shapes)}
+    return {"value": None, "path": load, "path_shape": _along(load, 0.0, what, kind, shapes).shape}
 
 
 def value_at(load: Traction | NodalForce, t: float, what: str) -> np.ndarray:
@@ -89,11 +89,14 @@ def value_at(load: Traction | NodalForce, t: float, what: str) -> np.ndarray:
     if load.path is None:
         return load.value
     try:
-        value = np.array(load.path(t), dtype=np.float64)  # a copy, since a path may reuse its array
-    except Exception as error:  # a user's function may raise anything
-        raise SimulationError(f"{what}: its path failed at t = {t:g} s: {type(error).__name__}: {error}") from error
-    if value.shape not in load.shapes or not np.isfinite(value).all():
-        given = value.tolist() if value.size < 10 else value.shape
-        rule = f"finite, of shape {' or '.join(map(str, load.shapes))}"
-        raise SimulationError(f"{what}: its path gave {given} at t = {t:g} s: it must be {rule}")
+        return _along(load.path, t, what, load.kind, (load.path_shape,))
+    except SceneError as error:
+        raise SimulationError(str(error)) from error.__cause__
+
+
+def _along(path: Callable, t: float, what: str, kind: str, shapes: tuple[tuple[int, ...], ...]) -> np.ndarray:
+    """Return the value of a load's path at t [s], a copy, since a path may reuse its array."""
+    value = checks.path_value(path, t, what, kind, shapes)
+    if value is None:
+        raise SceneError(f"{what}: the path must give a {kind} at t = {t:g}, not None")
     return value

@@ -12,7 +12,7 @@ from typing import ClassVar
 import numpy as np
 
 from taisoft.attributes import guarded_record
-from taisoft.errors import MeshError, SceneError
+from taisoft.errors import MeshError, SceneError, reason, value_text
 from taisoft.mesh.shapes import box_mesh
 from taisoft.mesh.topology import normals_and_heights, opposite_half_edges
 from taisoft.scene import checks
@@ -264,7 +264,7 @@ class Obstacle:
         path = ShapePath(self.path, self.shape.pivot) if isinstance(self.path, KeyFrames) else self.path
         checks.store(self, friction=friction, restitution=restitution, path=path)
         if self.path is not None and not callable(self.path):
-            raise SceneError(f"{what}: path must be a function of time, not {self.path!r}")
+            raise SceneError(f"{what}: path must be a function of time, not {value_text(self.path)}")
         self.pose(0.0)
 
     def pose(self, t: float) -> tuple[np.ndarray, np.ndarray]:
@@ -278,8 +278,7 @@ class Obstacle:
         try:
             translation, rotation = self.path(t)
         except Exception as error:
-            cause = f"{type(error).__name__}: {error}"
-            raise SceneError(f"{what} must give (translation, rotation) and failed at t = {t:g}: {cause}") from error
+            raise SceneError(f"{what} must give (translation, rotation) and failed at t = {t:g}: {reason(error)}") from error
         translation = checks.array(translation, f"{what}'s translation at t = {t:g}", ((3,),))
         rotation = checks.array(rotation, f"{what}'s rotation at t = {t:g}", ((3, 3),))
         with np.errstate(over="ignore", invalid="ignore"):

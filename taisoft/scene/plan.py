@@ -8,6 +8,8 @@ import dataclasses
 import reprlib
 from dataclasses import dataclass, field, replace
 
+import numpy as np
+
 from taisoft.attributes import thawed
 from taisoft.errors import SceneError
 from taisoft.scene import checks
@@ -20,8 +22,7 @@ from taisoft.scene.scene import Scene
 
 CHANGEABLE = ("young", "poisson", "density", "mass_damping", "stiffness_damping")  # numbers of a material
 LOADS = {"force": "forces", "traction": "tractions"}  # kind of load -> the body's list of them
-BY_TET_TEXT = " by tet"  # ends the names of numbers that differ from tet to tet
-Numbers = dict[str, float | list | None]  # of a scene, by name
+Numbers = dict[str, float | list | np.ndarray | None]  # of a scene, by name
 
 
 @dataclass
@@ -169,7 +170,7 @@ def change_load(body: Body, kind: str, index: int, value) -> None:
     if not loads:
         raise SceneError(f"{what}: it has no {kind}: give it one of 0 by body.add_{kind} before the Simulator is made")
     old = loads[checks.whole(index, f"{what}: index", range(len(loads)))]
-    new = replace(old, value=checks.array(value, f"{what}: {kind} {index}", old.shapes), path=None)
+    new = replace(old, value=checks.array(value, f"{what}: {kind} {index}", old.shapes), path=None, path_shape=None)
     with thawed(body):
         getattr(body, LOADS[kind])[index] = new
 
@@ -180,14 +181,17 @@ def change_tension(scene: Scene, name: str, value) -> None:
     if name not in names:
         raise SceneError(f"set_tension: no tendon is called {name!r}{checks.nearest(str(name), names)}")
     index, what = names.index(name), f"tendon {name!r}: force"
-    new = replace(scene.tendons[index], value=checks.array(value, what, ((),)), path=None)
+    new = replace(scene.tendons[index], value=checks.array(value, what, ((),)), path=None, path_shape=None)
     check_tension(new.value, what)
     with thawed(scene):
         scene.tendons[index] = new
 
 
 def scene_numbers(scene: Scene) -> Numbers:
-    """Return as plain data gravity, all material numbers, load values, and friction and restitution set for pairs."""
+    """Return gravity, all material numbers, load values, and friction and restitution set for pairs.
+
+    Arrays are the numbers by tet (m,), and forces per node (k,3).
+    """
     numbers: Numbers = {"gravity": scene.gravity.tolist()}
     for body in scene.bodies:
         for region, material in body.composition.materials.items():
@@ -196,11 +200,11 @@ def scene_numbers(scene: Scene) -> Numbers:
                 if name != "law":
                     numbers[f"body {body.name!r}: {own}{name}"] = value
         for name, values in body.composition.by_tet.items():
-            numbers[f"body {body.name!r}: {name}{BY_TET_TEXT}"] = values.tolist()
+            numbers[f"body {body.name!r}: {name} by tet"] = values
         for kind, loads in LOADS.items():
             for i, load in enumerate(getattr(body, loads)):
                 if load.path is None:
-                    numbers[f"body {body.name!r}: {kind} {i}"] = load.value.tolist()
+                    numbers[f"body {body.name!r}: {kind} {i}"] = load.value if load.value.ndim == 2 else load.value.tolist()
     numbers |= {f"tendon {one.name!r}: force": float(one.value) for one in scene.tendons if one.path is None}
     for names, (friction, restitution) in scene.contact_pairs.items():
         pair = " and ".join(repr(name) for name in sorted(names))
@@ -212,16 +216,12 @@ def first_difference(before: Numbers, now: Numbers) -> str:
     """Return a sentence about the first difference between two scenes' numbers; "" if there is none."""
     for name in before | now:
         old, new = before.get(name), now.get(name)
-        if old == new:
+        if isinstance(old, np.ndarray) == isinstance(new, np.ndarray) and np.array_equal(old, new):
             continue
-        item = "tet" if name.endswith(BY_TET_TEXT) else "row" if _is_nested(old) and _is_nested(new) else None  # a force per node
-        if item and old and new and len(old) == len(new):
-            row = next(i for i, pair in enumerate(zip(old, new)) if pair[0] != pair[1])
-            name, old, new = f"{name}, {item} {row}", old[row], new[row]
+        if isinstance(old, np.ndarray) and isinstance(new, np.ndarray) and old.shape == new.shape:
+            row = int(np.argmax((old != new).reshape(len(old), -1).any(axis=1)))
+            name, old, new = f"{name}, {'row' if old.ndim == 2 else 'tet'} {row}", old[row], new[row]
+        old, new = (value.tolist() if isinstance(value, (np.ndarray, np.generic)) else value for value in (old, new))
         old, new = ("not set" if value is None else reprlib.repr(value) for value in (old, new))
         return f"{name} is {new} in this scene and was {old} at the start of the saved run"
     return ""
-
-
-def _is_nested(value) -> bool:
-    return isinstance(value, list) and bool(value) and isinstance(value[0], list)

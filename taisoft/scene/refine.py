@@ -96,8 +96,7 @@ def _on_mesh(old: Body, mesh: TetMesh, order: int, parents: np.ndarray) -> Body:
         else:
             new.move(where, _path(old, constraint), axes)
     for force in old.forces:
-        is_total = np.shape(force.path(0.0) if force.value is None else force.value) == (3,)
-        if is_total:
+        if (3,) == (force.path_shape if force.value is None else force.value.shape):  # a total force
             new.add_force(_chosen(old, force, parents), _load_of(force))
             continue
         if force.nodes.max() >= new.n_nodes or not (parents[force.nodes] == force.nodes[:, None]).all():

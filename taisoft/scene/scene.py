@@ -57,6 +57,7 @@ class Scene(Guarded):
         self.contact_pairs: dict[frozenset[str], tuple[float | None, float | None]] = {}
         self.collision = CollisionSettings()
         self.allow_initial_overlap, self.contact_forces = False, True
+        self._start: Scene | None = None  # see `snapshot`
         self._seal(Scene.__init__)
 
     def _check_gravity(self, value) -> np.ndarray:
@@ -95,12 +96,21 @@ class Scene(Guarded):
             names += f", obstacles={[obstacle.name for obstacle in self.obstacles]}"
         return f"Scene(gravity={tuple(self.gravity.tolist())}, {names})"
 
-    def snapshot(self) -> "Scene":
-        """Return an independent, unfrozen copy of the scene and its bodies; meshes are shared."""
+    def snapshot(self, start: "Scene | None" = None) -> "Scene":
+        """Return an independent, unfrozen copy of the scene and its bodies; meshes are shared.
+
+        start: the scene that a run began with, if this one holds the run's present numbers: a Simulator of the copy then
+        continues the run, and what it models follows from `start`.
+        """
         copied = copy.copy(self)
         with thawed(copied):
-            copied.bodies = [copy.copy(body) for body in self.bodies]
+            copied.bodies, copied._start = [copy.copy(body) for body in self.bodies], start
         return copied
+
+    @property
+    def start(self) -> "Scene":
+        """The scene that the run began with, see `snapshot`; else this one."""
+        return self._start or self
 
     def check(self) -> None:
         """Raise SceneError if in-place changes made an array, such as gravity, invalid."""

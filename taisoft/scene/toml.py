@@ -175,8 +175,8 @@ def _material(table: Table, key: str, materials: dict[str, Material]) -> Materia
 
 
 def _region(mesh: TetMesh, key: str) -> str | int:
-    """Return the name of a region, or its id if the text is no name but a whole number."""
-    is_id = key not in mesh.region_names.values() and re.fullmatch(r"-?\d{1,10}", key)
+    """Return the name of a region, or its id if the text is no name but a whole number as `write_scene` writes it."""
+    is_id = key not in mesh.region_names.values() and re.fullmatch(r"0|-?[1-9][0-9]{0,9}", key)
     return int(key) if is_id else key
 
 

@@ -6,6 +6,7 @@ can rotating key frames that were bound to other nodes or another obstacle, whos
 """
 
 import dataclasses
+import warnings
 from numbers import Real
 from pathlib import Path
 
@@ -35,7 +36,7 @@ def write_scene(path, scene: Scene, solver: dict | None = None, overwrite: bool 
 
     path: a name that ends in .toml. solver: arguments of Simulator, seconds and fps. overwrite: replace existing files. Raises
     SceneError for content that cannot be stored, before any file is written, and OutputError. Files are written atomically,
-    the TOML last.
+    the TOML last. Warns of a mesh whose only region, 0, is not stored.
     """
     file = Path(path)
     if file.suffix != ".toml":
@@ -50,14 +51,30 @@ def write_scene(path, scene: Scene, solver: dict | None = None, overwrite: bool 
         data = text.encode("utf-8")
     except UnicodeEncodeError as error:
         raise SceneError(f"{file}: {text[error.start]!r} in a name is not a character of Unicode") from None
+    with_regions = {}
+    for name, mesh in meshes.items():
+        with_regions[name] = _keeps_regions(scene, mesh)
     files = [file, *(file.with_name(name) for name in meshes)]
     for one in files:
         if one.exists() and not overwrite:
             raise OutputError(f"{one}: the file exists, and overwrite is not set")
     for name, mesh in meshes.items():
-        write_mesh(file.with_name(name), mesh)
+        write_mesh(file.with_name(name), mesh, with_regions[name])
     write_bytes(file, data)
     return files
+
+
+def _keeps_regions(scene: Scene, mesh: TetMesh) -> bool:
+    """Return whether a mesh file can hold the regions of a mesh. Raises SceneError if it cannot and a body uses them."""
+    if mesh.regions is None or mesh.regions.any():
+        return True
+    rule = "its mesh has no region but 0, which its file cannot tell from none"
+    bodies = [body for body in scene.bodies if body.mesh is mesh]
+    for body in bodies:
+        if body.composition.has_regions:
+            raise SceneError(f"body {body.name!r}: {rule}: use another number")
+    warnings.warn(f"body {bodies[0].name!r}: {rule}, and which is not stored", UserWarning, stacklevel=3)
+    return False
 
 
 def _document(scene: Scene, solver: dict, stem: str, meshes: dict[str, TetMesh]) -> dict:

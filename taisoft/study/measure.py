@@ -14,7 +14,7 @@ from taisoft.errors import SimulationError, TaisoftError
 from taisoft.fem.loads import SceneLoads
 from taisoft.fem.reference import gravity_mass, lumped_mass
 from taisoft.machine import load_average, usable_cores
-from taisoft.mesh.tet_mesh import edge_lengths
+from taisoft.mesh.quality import edge_lengths
 from taisoft.output.report import extremes, machine, peak_memory, versions
 from taisoft.scene.scene import Scene
 from taisoft.simulator import Simulator

@@ -1,0 +1,44 @@
+"""Nested values and their arrays:
+
+* random ones come back through JSON and the flat dict, whatever their keys; every array has a name of its own;
+* an array that appears twice is kept once; a missing one is found.
+"""
+
+import json
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from taisoft.nested import join_arrays, part_arrays
+
+leaves = st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | st.text() | hnp.arrays(float, st.integers(0, 3))
+keys = st.text(max_size=3) | st.sampled_from(["x", "#0", "0", "a/b", "body 'a': young"])
+values = st.recursive(leaves, lambda inner: st.lists(inner, max_size=3) | st.dictionaries(keys, inner, max_size=4), max_leaves=8)
+
+
+def same(a, b) -> bool:
+    if isinstance(a, dict):
+        return isinstance(b, dict) and list(a) == list(b) and all(same(a[key], b[key]) for key in a)
+    if isinstance(a, list):
+        return isinstance(b, list) and len(a) == len(b) and all(map(same, a, b))
+    return type(a) is type(b) and np.array_equal(a, b, equal_nan=isinstance(a, np.ndarray))
+
+
+@given(values)
+def test_random_values_come_back(value):
+    arrays = {}
+    text = json.dumps(part_arrays(value, arrays))
+    assert same(join_arrays(json.loads(text), arrays), value)
+
+
+def test_names_of_arrays():
+    x, arrays = np.arange(3), {}
+    parted = part_arrays({"simulation": {"x": x, "0": np.ones(2)}, "a/b": [x, np.zeros(2)]}, arrays)
+    assert list(arrays) == ["simulation/x", "simulation/0", "#1/1"]
+    again = join_arrays(parted, arrays)
+    assert again["a/b"][0] is x and again["simulation"]["x"] is x
+    with pytest.raises(KeyError):
+        join_arrays(parted, {})
