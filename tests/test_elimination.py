@@ -19,7 +19,7 @@ from taisoft.dynamics import contact_newton
 from taisoft.dynamics.contact_terms import NO_CONTACTS
 from taisoft.dynamics.elimination import FEW, choose_nodes, eliminate, solve_on
 from taisoft.dynamics.no_contacts import NoContacts
-from taisoft.dynamics.stage import ELASTIC_STAGE, STAY, SubsetLists, entries_of, form_residual, move
+from taisoft.dynamics.stage import ELASTIC_STAGE, STAY, SubsetLists, form_residual, move
 from taisoft.dynamics.stage_system import Stage, StageSystem
 from taisoft.fem.node_graph import BLOCKS, EDGES, NODES
 from taisoft.linear import block_csr, pcg
@@ -34,13 +34,6 @@ def line(n: int) -> tuple[np.ndarray, np.ndarray]:
     """Rows of a graph in which each node has the next one and the last one as neighbours."""
     rows = [[j for j in (i - 1, i + 1) if 0 <= j < n] for i in range(n)]
     return np.cumsum([0] + [len(row) for row in rows]), np.concatenate(rows)
-
-
-def test_entries_of_rows():
-    start = np.array([0, 2, 2, 5, 6])
-    assert entries_of(start, np.array([2, 0])).tolist() == [2, 3, 4, 0, 1]
-    assert entries_of(start, np.array([1, 3])).tolist() == [5]
-    assert entries_of(start, np.array([], dtype=int)).size == 0
 
 
 def test_nodes_that_hold_the_residual_are_chosen():

@@ -25,6 +25,7 @@ from taisoft.backend.runtime import Runtime, kernel
 from taisoft.collision.candidates import WHOLE, Buffer, Candidates, entries, is_candidate, sort_row, sum_parts
 from taisoft.collision.colliders import Topology
 from taisoft.collision.surface import ACTIVE, Surface, dvec, integers, list_near, part_first
+from taisoft.ranges import expand
 
 LEAVES = {"cpu": 64, "cuda": 8}  # triangles per chunk: the fastest of 4 to 256 on the CPU, small on CUDA for enough threads
 ROW_PER_TRIANGLE = 24  # row entries, initial capacity
@@ -82,8 +83,7 @@ def _split(order: np.ndarray, start: np.ndarray, count: np.ndarray, centroid: np
     if len(count) == 0:
         return
     offset = np.cumsum(count) - count
-    which = np.repeat(np.arange(len(count)), count)
-    at = np.arange(len(which)) - offset[which] + start[which]
+    which, at = expand(start, count)
     points = centroid[order[at]]
     extent = np.maximum.reduceat(points, offset) - np.minimum.reduceat(points, offset)
     key = points[np.arange(len(which)), extent.argmax(axis=1)[which]]

@@ -7,6 +7,7 @@ import numpy as np
 from taisoft.errors import MeshError
 from taisoft.fem.model import Layout
 from taisoft.mesh.sdf import SdfGrid, cached_sdf_grid
+from taisoft.ranges import owners
 from taisoft.scene.body import Body
 from taisoft.scene.collision import principal_extents
 from taisoft.scene.obstacles import Box, HalfSpace, MeshObstacle, Obstacle
@@ -52,7 +53,7 @@ def make_topology(parts: list[tuple[np.ndarray, np.ndarray]]) -> Topology:
     owner[used] = ring[start[:-1][used]]  # the first triangle around a vertex
     corner_owned = owner[t] == np.arange(len(t))[:, None]
     bits = np.concatenate([corner_owned, edge_owned], axis=1) @ (1 << np.arange(6))
-    body, node = np.repeat(np.arange(len(parts)), np.diff(first)), np.concatenate([nodes for _, nodes in parts])
+    body, node = owners(np.diff(first)), np.concatenate([nodes for _, nodes in parts])
     adjacent = _adjacent_vertices(t, vertex_first[-1])
     return Topology(t, body, first, vertex_first, node, neighbour, bits, start, ring, *adjacent)
 

@@ -20,6 +20,7 @@ from taisoft.collision.passages import (
     passage_fields,
 )
 from taisoft.collision.surface import Surface, integers
+from taisoft.ranges import expand
 
 NO_PASSAGES = np.zeros((0, 4), dtype=np.int32), np.zeros(0)  # as `PathCheck.find` returns them
 IN_BOXES = 0.49  # of the reach: how far a vertex may leave its searched path and still be in the boxes, grown by half of it
@@ -33,8 +34,7 @@ def adjacent_rows(triangle: np.ndarray) -> np.ndarray:
     order = np.argsort(corner_of, kind="stable")
     count = np.bincount(corner_of, minlength=1)
     start, size = (np.cumsum(count) - count)[corner_of[order]], count[corner_of[order]]
-    first = np.repeat(order, size)
-    second = order[np.arange(len(first)) - np.repeat(np.cumsum(size) - size, size) + np.repeat(start, size)]
+    first, second = (order[at] for at in expand(start, size))
     a, b = first // 3, second // 3
     common = (t[a][:, :, None] == t[b][:, None, :]).any(axis=2)
     n_common = common.sum(axis=1)

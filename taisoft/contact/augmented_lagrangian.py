@@ -19,6 +19,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import splu
 
 from taisoft.contact.colouring import matrix_graph
+from taisoft.ranges import owners
 
 DENSE = 90  # largest island, in rows, with a dense solve; that of a larger one may run on several threads
 RHO_START, RHO_MAX, RHO_MIN = 1e4, 1e7, 1e-2
@@ -127,7 +128,7 @@ def _islands(W: sp.csr_matrix, b: np.ndarray, friction: np.ndarray, r: np.ndarra
     for contact in np.split(order, np.flatnonzero(np.diff(island_of[order])) + 1) if len(order) else []:
         rows = (3 * contact[:, None] + np.arange(3)).ravel()
         part = W[rows][:, rows].tobsr((3, 3))
-        row = np.repeat(np.arange(len(contact)), np.diff(part.indptr))
+        row = owners(np.diff(part.indptr))
         diagonal = np.flatnonzero(part.indices == row)
         islands.append(_Island(contact, part, row, diagonal, b[rows], friction[contact], factor[contact]))
         islands[-1].take(r[contact])

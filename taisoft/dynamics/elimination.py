@@ -13,8 +13,9 @@ import numpy as np
 
 from taisoft.backend.arrays import download
 from taisoft.dynamics.newton import Newton
-from taisoft.dynamics.stage import STAY, entries_of
+from taisoft.dynamics.stage import STAY
 from taisoft.dynamics.stage_system import Stage, StageSystem
+from taisoft.ranges import entries_of
 
 CONCENTRATED, FEW = 0.99, 0.35  # minimum fraction of |r|^2 on the chosen nodes, and maximum fraction of nodes
 RINGS = 2  # of neighbours added to them

@@ -25,6 +25,7 @@ from taisoft.fem.state import END_SLOPE, N_NORMS, OTHER_SUM, START_SLOPE, SUM
 from taisoft.fem.terms import elasticity, rayleigh_damping
 from taisoft.linear.block_csr import BlockCsr, row_times
 from taisoft.linear.pcg import PcgWork, dot64, total
+from taisoft.ranges import entries_of
 
 STAY, STEP, AGAIN = range(3)  # modes of `move`: stay, full step, another length of the same step
 ELASTIC_STAGE, LINEARISED, IMPACT = range(3)  # kinds of stages; IMPACT: see `impact`
@@ -233,13 +234,6 @@ def form_residual(
         for j in ti.static(range(N_NORMS) if kind == ELASTIC_STAGE else (0, 4)):
             norms[j] = total(m, j)
         m.state.scalars[END_SLOPE] = total(m, SUM)
-
-
-def entries_of(start: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """Return the indices of all entries of some rows, row by row. start: (n + 1) first index of each row."""
-    counts = start[rows + 1] - start[rows]
-    ends = np.cumsum(counts)
-    return np.arange(counts.sum()) + np.repeat(start[rows] - ends + counts, counts)
 
 
 class SubsetLists:

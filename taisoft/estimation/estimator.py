@@ -23,6 +23,7 @@ import numpy as np
 from taisoft.dynamics.schemes import SECOND_ORDER
 from taisoft.estimation.order import MESH_ORDER, MIN_ORDER, agreement, error_over_difference, nominal_order, observed_order
 from taisoft.estimation.twins import TIGHTER, Twin, larger_steps, on_mesh, smaller_steps, tighter
+from taisoft.ranges import owners
 from taisoft.records import BodyError, Energies, ErrorEstimate
 from taisoft.scene.scene import Scene
 
@@ -73,7 +74,7 @@ class ErrorEstimator:
         self._made: ErrorEstimate | None = None  # since the last comparison
         bodies = sim.scene.bodies
         self._sizes = np.array([b.n_nodes for b in bodies])
-        self._bodies = np.repeat(np.arange(len(bodies)), self._sizes)
+        self._bodies = owners(self._sizes)
         self._start = sim.positions()
         self._excursion = 0.0
         self._energies = np.zeros(4)  # differences to the first twin at the last comparison [J]

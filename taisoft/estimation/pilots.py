@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from taisoft.estimation.comparison import largest_excursion
+from taisoft.ranges import owners
 from taisoft.records import RunReport
 
 if TYPE_CHECKING:
@@ -133,7 +134,7 @@ class Frames:
 def make_frames(sim: "Simulator", length: float, seconds: float) -> Frames:
     """The frames of a run of `length` [s], one after every `seconds` [s]."""
     sizes = [body.n_nodes for body in sim.scene.bodies]
-    bodies = np.repeat(np.arange(len(sizes)), sizes)
+    bodies = owners(sizes)
     nodes = np.arange(0, len(bodies), -(-len(bodies) // MAX_NODES))
     size = float(np.ptp(sim.positions(), axis=0).max())
     return Frames(seconds, length, nodes, bodies[nodes], NEGLIGIBLE[sim.settings.precision] * size)

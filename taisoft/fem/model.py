@@ -21,6 +21,7 @@ from taisoft.fem.loads import SceneLoads
 from taisoft.fem.node_graph import PAIRS, NodeGraph, node_graph
 from taisoft.fem.state import State, build_state
 from taisoft.fem.terms import terms_of
+from taisoft.ranges import owners
 from taisoft.scene.scene import Scene
 
 # Least quadrature points and CPU threads for parallel loops; below, one serial kernel runs. With two threads, parallel loops took
@@ -276,7 +277,7 @@ def build_model(scene: Scene, runtime: Runtime, arena: FieldArena, on: dict[str,
     strain_real = ti.f64 if real == ti.f32 and _worst_condition(nodes, Dm_inv, layout) > ILL_CONDITIONED else real
     damped = on["mass_damping"] or on["stiffness_damping"]
     n_bodies = len(scene.bodies)
-    node_body = np.repeat(np.arange(n_bodies, dtype=np.int32), np.diff(layout.node_start))
+    node_body = owners(np.diff(layout.node_start)).astype(np.int32)
     velocity = np.concatenate([np.broadcast_to(b.velocity, b.rest_positions.shape) for b in scene.bodies])
     flat_nodes = np.concatenate([lane_layout(own, lanes).reshape(-1) for own in nodes])
     scene_loads = SceneLoads(scene)
@@ -348,7 +349,7 @@ def upload_mass_matrix(scene: Scene, mass: MassMatrix) -> None:
     """Fill the device matrix from the bodies' densities."""
     M = reference.mass_matrix(scene)
     start, column = download([mass.row_start, mass.column])
-    rows = np.repeat(np.arange(len(start) - 1), np.diff(start))
+    rows = owners(np.diff(start))
     upload([(mass.value, np.asarray(M[rows, column]).reshape(-1)), (mass.diagonal, M.diagonal())])
 
 

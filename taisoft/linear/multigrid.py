@@ -20,6 +20,7 @@ import scipy.sparse as sp
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from taisoft.linear.aggregation import MODES, aggregate, prolongation
+from taisoft.ranges import owners
 
 SMOOTHER, PROLONGATOR = 1.5, 4.0 / 3.0  # over the largest eigenvalue of D^-1 A: omega and omega_P
 POWER_STEPS = 12  # for that eigenvalue, which they give to about a tenth
@@ -85,7 +86,7 @@ class Multigrid:
 
 def block_rows(A: sp.bsr_matrix) -> np.ndarray:
     """Block row of each block."""
-    return np.repeat(np.arange(len(A.indptr) - 1), np.diff(A.indptr))
+    return owners(np.diff(A.indptr))
 
 
 def _factorise(A: sp.bsr_matrix) -> BandedCholesky | None:

@@ -23,6 +23,7 @@ import scipy
 from taisoft.errors import MeshError, OutputError
 from taisoft.files import cache_folders, replacing
 from taisoft.mesh.topology import linked_groups, normals_and_heights, opposite_half_edges
+from taisoft.ranges import owners
 
 FORMAT = 1  # version of cached grids; increase it when their numbers or meaning change
 MIN_CELLS = 8  # smallest number of cells across a side
@@ -160,7 +161,7 @@ class BallTree:
         for rows, tree, radius in self._groups:
             lists = tree.query_ball_point(points, (1.0 + _SLACK) * (reach + radius))
             ball = np.concatenate([np.zeros(0), *lists]).astype(np.int64)
-            found.append(np.stack([np.repeat(np.arange(len(lists)), [len(near) for near in lists]), rows[ball]]))
+            found.append(np.stack([owners([len(near) for near in lists]), rows[ball]]))
         return tuple(np.concatenate(found, axis=1))
 
 

@@ -15,6 +15,7 @@ import numpy as np
 from taisoft.backend.runtime import open_kind
 from taisoft.errors import OutputError
 from taisoft.output.camera import Camera
+from taisoft.ranges import expand
 from taisoft.view.colouring import background
 from taisoft.view.ggui import Canvas, vulkan_missing, window_holder
 from taisoft.view.scene_view import IN_PICTURES, SceneView
@@ -168,7 +169,7 @@ def rasterise(projected: np.ndarray, triangles: np.ndarray, colours: np.ndarray,
     nearest = np.zeros(height * width)  # 1/depth
     owner = np.full(height * width, -1)
     for triangle, row, first, count in _spans(corners, planes, width, height):
-        span, pixels = _expand(row * width + first, count)
+        span, pixels = expand(row * width + first, count)
         slope = depth_plane[triangle, 0]
         start = slope * 0.5 + depth_plane[triangle, 1] * (row + 0.5) + depth_plane[triangle, 2] - slope * (row * width)
         depth = start[span] + slope[span] * pixels
@@ -217,7 +218,7 @@ def _spans(corners: np.ndarray, planes: np.ndarray, width: int, height: int):
     """Yield (triangle, row, first pixel, number of pixels) arrays of the covered spans, about PIXELS_AT_ONCE pixels at a time."""
     low = np.clip(np.ceil(corners[:, :, 1].min(axis=1) - 0.5), 0, height).astype(np.int64)
     high = np.clip(np.floor(corners[:, :, 1].max(axis=1) - 0.5), -1, height - 1).astype(np.int64)
-    owner, row = _expand(low, np.maximum(high - low + 1, 0))
+    owner, row = expand(low, np.maximum(high - low + 1, 0))
     a, b, c = np.moveaxis(planes[owner], 2, 0)
     rest = b * (row + 0.5)[:, None] + c  # weight k = a x + rest >= 0 inside
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -234,10 +235,3 @@ def _spans(corners: np.ndarray, planes: np.ndarray, width: int, height: int):
     cuts = np.searchsorted(total, np.arange(PIXELS_AT_ONCE, total[-1] if len(total) else 0, PIXELS_AT_ONCE))
     for part in np.split(np.arange(len(count)), cuts):
         yield owner[part], row[part], first[part], count[part]
-
-
-def _expand(start: np.ndarray, count: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Expand ranges start, start+1, ... of count items: return the range that each item belongs to, and the item."""
-    index = np.repeat(np.arange(len(count)), count)
-    offset = np.arange(len(index)) - np.repeat(np.cumsum(count) - count, count)
-    return index, start[index] + offset
