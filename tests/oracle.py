@@ -13,7 +13,7 @@ from oracle_laws import hessian, pk1, psi
 
 def tet_materials(body) -> list:
     """The material (m,) of each tet of a body, with its own numbers."""
-    of_regions = body.material if isinstance(body.material, dict) else None
+    of_regions = body.material if body.composition.has_regions else None
     found = [of_regions[int(r)] for r in body.mesh.regions] if of_regions else [body.material] * body.mesh.n_tets
     for name, values in body.composition.by_tet.items():
         found = [replace(material, **{name: float(value)}) for material, value in zip(found, values)]
