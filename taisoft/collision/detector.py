@@ -28,6 +28,7 @@ from taisoft.collision.surface import ACTIVE, NONFINITE, PAIRS, build_surface, m
 from taisoft.errors import SceneError, SimulationError
 from taisoft.fem.model import Layout, Model
 from taisoft.mesh.quality import mean_surface_edge
+from taisoft.scene.connections import attached_pairs
 from taisoft.scene.obstacles import MeshObstacle
 from taisoft.scene.plan import make_plan
 from taisoft.scene.scene import Scene
@@ -88,7 +89,7 @@ class Detection:
         modes = [BY_FACES if b.contact_mode == "proximity" else BY_FIELD for b in bodies]
         modes += [BY_FACES if isinstance(o.shape, MeshObstacle) else BY_EDGES for o in obstacles]
         properties = {"soft": soft, "self_on": soft & self_collision, "mode": np.array(modes)}
-        properties |= {"thickness": self.thickness, "edge": self.edges}
+        properties |= {"thickness": self.thickness, "edge": self.edges, "attached": attached_pairs(scene)}
         self.surface = s = build_surface(self.topology, self._rest, properties, runtime, arena, serial)
         self.broad = self._make_broad(runtime) if self._has_pairs else None
         self._unmapped = arena.field("unmapped", ti.i32, 1)

@@ -32,6 +32,7 @@ from taisoft.mesh.solids import (
     segment_distance,
 )
 from taisoft.scene.body import Body
+from taisoft.scene.connections import attached_pairs
 from taisoft.scene.obstacles import Capsule, HalfSpace, Obstacle, Sphere
 from taisoft.scene.scene import Scene
 
@@ -58,11 +59,11 @@ def find_overlaps(detection: "Detection") -> list[Overlap]:
     def update_depth(a: int, b: int, new_depth: float) -> None:
         depth[a, b] = max(depth.get((a, b), 0.0), new_depth)
 
-    n_bodies = len(detection.scene.bodies)
+    n_bodies, attached = len(detection.scene.bodies), attached_pairs(detection.scene)
     lo, hi = (np.array(corner) for corner in zip(*(solid.box for solid in solids)))
     for a in range(n_bodies):
         overlapping = ((lo[a] <= hi[a + 1 :]) & (lo[a + 1 :] <= hi[a])).all(axis=1)
-        for b in a + 1 + np.flatnonzero(overlapping):
+        for b in a + 1 + np.flatnonzero(overlapping & ~attached[a, a + 1 :]):
             update_depth(a, int(b), overlap_depth(solids[a], solids[b]))
     if detection.shapes.count:
         owner, origin, rotation = download([detection.shapes.body, detection.shapes.origin, detection.shapes.rotation])
@@ -168,6 +169,7 @@ class Containment:
         self._own_part = np.concatenate([*(np.arange(n) for n in counts), np.zeros(len(self._round), dtype=np.int64)])
         own, other = self._owner[:, None], self._solid
         self._testable = (self._soft[own] | self._soft[other]) & self._closed[other]  # (points, solid): whether to test
+        self._testable &= ~attached_pairs(self._scene)[own, other]
         self._testable &= (own != other) | (self._self_on & (self._n_parts[other] > 1))
         self._separations: dict[tuple[int, int], tuple] = {}  # point and surface when last apart, and their distance [m]
         self._corners = self._inner_points = np.zeros((0, 3))  # last triangles, and the inner points behind them

@@ -54,6 +54,7 @@ class Surface:
     first_of: Any  # (n_bodies + 1) i32: first triangle of each collider
     soft: Any  # (n_bodies) i32: 1 for soft bodies
     self_on: Any  # (n_bodies) i32: 1 if a body is tested against itself
+    attached: Any  # (n_bodies^2) i32: 1 for pairs that are not tested, since they are attached to each other; None: no pair is
     mode: Any  # (n_bodies) i32: contact mode, see `features`
     thickness: Any  # (n_bodies) f64: thickness [m], inf for half-spaces
     edge: Any  # (n_bodies) f64: mean surface edges of the bodies [m], inf for obstacles
@@ -74,6 +75,11 @@ class Surface:
     inside: Any  # (n_verts) i32: bit k % INSIDE_BITS is set if the vertex is in collider k and has contacts that move it out
     exit_direction: Any  # (n_verts) 3-vectors f64: summed exit displacements of those contacts [m]
 
+    @property
+    def has_attached(self) -> bool:
+        """Whether colliders are attached to each other."""
+        return self.attached is not None
+
 
 def build_surface(
     topology: Topology,
@@ -83,8 +89,8 @@ def build_surface(
     arena: FieldArena,
     serial: bool | None = None,
 ) -> Surface:
-    """Allocate and fill the fields. rest: (v,3) [m]; properties: soft, self_on, mode, thickness and edge, (n_bodies,) each.
-    serial: None decides by size."""
+    """Allocate and fill the fields. rest: (v,3) [m]; properties: soft, self_on, mode, thickness, edge, (n_bodies,) each, and
+    attached. serial: None decides by size."""
     t, bodies = topology, len(properties["soft"])
     n, v = len(t.triangle), len(t.node)
     serial_cheap = serial
@@ -113,6 +119,7 @@ def build_surface(
         spread=1 if serial else SPREAD[runtime.arch],
         cheap_spread=1 if serial_cheap else SPREAD[runtime.arch],
         mode=integers(arena, "contact_mode", properties["mode"]),
+        attached=integers(arena, "attached", properties["attached"].reshape(-1)) if properties["attached"].any() else None,
         rest=arena.vectors("surface_rest", ti.f64, max(v, 1), rest if v else None),
         area=arena.field("surface_area", ti.f64, max(n, 1)),
         exit_direction=arena.vectors("surface_exit_direction", ti.f64, max(v, 1)),
@@ -146,12 +153,14 @@ def cell_of(x, inverse, size: ti.template()):
 
 @ti.func
 def may_touch(s: ti.template(), t, u):
-    """Whether two triangles are a valid pair: of different colliders, one of them soft; or of one body that is tested against
-    itself, without a common vertex."""
+    """Whether two triangles are a valid pair: of different colliders, one of them soft, that are not attached to each other; or
+    of one body that is tested against itself, without a common vertex."""
     a, b = s.body[t], s.body[u]
     result = 0
     if a != b:
         result = s.soft[a] | s.soft[b]
+        if ti.static(s.has_attached):
+            result &= 1 - s.attached[a * s.n_bodies + b]
     elif s.self_on[a] == 1:
         result = 1
         for k in range(3):
@@ -243,6 +252,8 @@ def list_near(s: ti.template(), c, own):
             accepted = s.self_on[own]
         elif s.soft[own] | s.soft[b]:
             accepted = int((s.body_lo[own] <= s.body_hi[b]).all()) & int((s.body_lo[b] <= s.body_hi[own]).all())
+        if ti.static(s.has_attached):
+            accepted &= 1 - s.attached[own * s.n_bodies + b]
         if accepted == 1:
             s.near[c * s.n_bodies + n] = b
             n += 1

@@ -101,17 +101,42 @@ def obstacle_displacement_at(o: ti.template(), body, x):
 
 
 @ti.func
-def _add_vertex(p: ti.template(), s: ti.template(), c, k, v, weight, sign):
+def _add_masters(p: ti.template(), m: ti.template(), c, n_before, i, weight):
+    """Add node i to contact c, or the nodes that it depends on; nodes that the contact has already get the sum of weights. Return
+    the contact's new number of nodes."""
+    n, k = n_before, m.dependents.number[i]
+    first, last = 0, 1
+    if k >= 0:
+        first, last = m.dependents.start[k], m.dependents.start[k + 1]
+    for e in range(first, last):
+        node, part = i, weight
+        if k >= 0:
+            node, part = m.dependents.master[e], weight * m.dependents.weight[e]
+        at = n
+        for j in range(n):
+            if p.node[c, j] == node:
+                at = j
+        if at == n:
+            p.node[c, n], p.weight[c, n] = node, 0.0
+            n += 1
+        p.weight[c, at] += part
+    return n
+
+
+@ti.func
+def _add_vertex(p: ti.template(), m: ti.template(), s: ti.template(), c, k, v, weight, sign):
     """Add vertex v of the surface to contact c, which has k nodes. Return its new number of nodes."""
     n = k
     if v >= 0:
         if ti.abs(weight) > NEGLIGIBLE:
-            if s.node[v] >= 0:
+            if s.node[v] < 0:  # obstacle vertex
+                p.obstacle_displacement[c] = p.obstacle_displacement[c] + weight * s.move[v]
+            elif ti.static(m.has_dependents):
+                n = _add_masters(p, m, c, n, s.node[v], sign * weight)
+            else:
                 p.node[c, k] = s.node[v]
                 p.weight[c, k] = sign * weight
                 n = k + 1
-            else:  # obstacle vertex
-                p.obstacle_displacement[c] = p.obstacle_displacement[c] + weight * s.move[v]
     return n
 
 
@@ -198,9 +223,9 @@ def fill(
         p.obstacle_displacement[c] = dvec(0.0)
         k = 0
         for j in ti.static(range(3)):
-            k = _add_vertex(p, s, c, k, found.nodes_a[row][j], found.weights_a[row][j], 1.0)
+            k = _add_vertex(p, m, s, c, k, found.nodes_a[row][j], found.weights_a[row][j], 1.0)
         for j in ti.static(range(3)):
-            k = _add_vertex(p, s, c, k, found.nodes_b[row][j], found.weights_b[row][j], -1.0)
+            k = _add_vertex(p, m, s, c, k, found.nodes_b[row][j], found.weights_b[row][j], -1.0)
         p.arity[c] = k
         if ti.static(o.any):
             if found.nodes_b[row][0] < 0:

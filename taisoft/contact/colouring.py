@@ -16,7 +16,7 @@ import scipy.sparse as sp
 import taichi as ti
 
 from taisoft.backend.runtime import kernel
-from taisoft.contact.problem import NODES, ContactProblem, fill_field, index_nodes
+from taisoft.contact.problem import ContactProblem, fill_field, index_nodes
 from taisoft.errors import SimulationError
 
 UNCOLOURED = -1
@@ -29,7 +29,7 @@ BITS = 30  # colours tested at a time, as bits of an integer
 def node_graph(node: np.ndarray, arity: np.ndarray, inverse_mass: np.ndarray) -> sp.csr_matrix:
     """Adjacency (k,k), bool, of contacts over nodes.
 
-    node: (k, NODES), the first arity[c] are used; inverse_mass: (n_nodes, 3) [1/kg].
+    node: (k, width), the first arity[c] are used; inverse_mass: (n_nodes, 3) [1/kg].
     """
     k = len(arity)
     used = np.arange(node.shape[1]) < arity[:, None]
@@ -134,7 +134,7 @@ def _first_free(p: ti.template(), c):
             i = p.node[c, k]
             if (p.inverse_mass[i] != 0.0).any():
                 for e in range(p.entry_start[i], p.entry_start[i + 1]):
-                    d = p.entry[e] // NODES
+                    d = p.entry[e] // p.width
                     if _priority(d) > _priority(c):
                         colour = p.colour[d]
                         if colour == UNCOLOURED:

@@ -57,15 +57,16 @@ class ContactProblem:
     block: Any = None  # (blocks, 9) f64
     # W over nodes
     n_nodes: Count = 0
-    node: Any = None  # (capacity, NODES) i32, the first arity[c] are in use
+    width: int = NODES  # largest number of nodes of a contact: more than NODES if some depend on others
+    node: Any = None  # (capacity, width) i32, the first arity[c] are in use
     arity: Any = None  # i32
-    weight: Any = None  # (capacity, NODES) f64: positive on side a, negative on side b
+    weight: Any = None  # (capacity, width) f64: positive on side a, negative on side b, unless nodes depend on others
     normal: Any = None  # 3-vectors: from b to a
     tangent: Any = None  # 3-vectors: t1; t2 = normal x t1
     inverse_mass: Any = None  # (n_nodes) 3-vectors [1/kg], 0 on constrained axes
     w: Any = None  # (n_nodes) 3-vectors [m/s]: M^-1 J^T r
     entry_start: Any = None  # (n_nodes + 1) i32: contacts of each node
-    entry: Any = None  # i32: NODES * contact + index of the node in it
+    entry: Any = None  # i32: width * contact + index of the node in it
     # of detected contacts, see `build`
     body: Any = None  # 2-vectors i32: colliders
     feature: Any = None  # 3-vectors i32
@@ -84,19 +85,20 @@ class ContactProblem:
     slot: Any = None  # (n_slots) i32: hash table of the previous step's contacts, -1 if empty
 
 
-def build_node_problem(arena: FieldArena, capacity: int, n_nodes: int, serial: bool) -> ContactProblem:
-    """Allocate a problem for contacts between the nodes of a model."""
-    n, n_slots = capacity, 1 << (2 * capacity - 1).bit_length()
+def build_node_problem(arena: FieldArena, capacity: int, n_nodes: int, serial: bool, masters: int = 1) -> ContactProblem:
+    """Allocate a problem for contacts between the nodes of a model. masters: largest number of nodes that a node depends on."""
+    n, width, n_slots = capacity, NODES * masters, 1 << (2 * capacity - 1).bit_length()
     vectors = "normal tangent point obstacle_displacement impact_impulse previous_point previous_impulse"
     return ContactProblem(
         n,
         serial,
         False,
         n_nodes=n_nodes,
+        width=width,
         n_slots=n_slots,
         **_solver_fields(arena, n),
-        **_fields(arena, "node", ti.i32, (n, NODES)),
-        **_fields(arena, "weight", ti.f64, (n, NODES)),
+        **_fields(arena, "node", ti.i32, (n, width)),
+        **_fields(arena, "weight", ti.f64, (n, width)),
         **_fields(arena, "arity", ti.i32, n),
         **_fields(arena, vectors, ti.f64, n, 3),
         **_fields(arena, "gap approach restitution min_velocity min_opening", ti.f64, n),
@@ -104,7 +106,7 @@ def build_node_problem(arena: FieldArena, capacity: int, n_nodes: int, serial: b
         **_fields(arena, "feature previous_feature", ti.i32, n, 3),
         **_fields(arena, "inverse_mass w", ti.f64, n_nodes, 3),
         **_fields(arena, "entry_start", ti.i32, n_nodes + 1),
-        **_fields(arena, "entry", ti.i32, NODES * n),
+        **_fields(arena, "entry", ti.i32, width * n),
         **_fields(arena, "slot", ti.i32, n_slots),
     )
 
@@ -216,7 +218,7 @@ def impulse_on(p: ti.template(), i):
     """(J^T r) of node i [N s], summed over its contacts in a fixed order."""
     d = dvec(0.0)
     for e in range(p.entry_start[i], p.entry_start[i + 1]):
-        c, k = p.entry[e] // NODES, p.entry[e] % NODES
+        c, k = p.entry[e] // p.width, p.entry[e] % p.width
         d += p.weight[c, k] * to_world(p, c, p.r[c])
     return d
 
@@ -308,4 +310,4 @@ def index_nodes(p: ti.template()):
             for k in range(p.arity[c]):
                 i = p.node[c, k]
                 p.entry_start[i] -= 1
-                p.entry[p.entry_start[i]] = NODES * c + k
+                p.entry[p.entry_start[i]] = p.width * c + k

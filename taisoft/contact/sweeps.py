@@ -20,7 +20,7 @@ The norms are upper bounds: sqrt(|B|_1 |B|_inf) for a matrix, absolute values of
 import taichi as ti
 
 from taisoft.backend.runtime import kernel
-from taisoft.contact.problem import NODES, STEP, ContactProblem, add_impulse, own_block, velocity
+from taisoft.contact.problem import STEP, ContactProblem, add_impulse, own_block, velocity
 from taisoft.contact.prox import dvec, into_disk, prox, scaled
 
 SIMULTANEOUS = ("jacobi", "hybrid")  # methods that relax all contacts with the impulses of the last sweep
@@ -139,8 +139,8 @@ def _row_norm(p: ti.template(), c):
             i = p.node[c, k]
             weights = ti.cast(0.0, ti.f64)
             for e in range(p.entry_start[i], p.entry_start[i + 1]):
-                d = p.entry[e] // NODES
-                weights += ti.abs(p.weight[d, p.entry[e] % NODES]) * _roots(p, d).max()
+                d = p.entry[e] // p.width
+                weights += ti.abs(p.weight[d, p.entry[e] % p.width]) * _roots(p, d).max()
             total += ti.abs(p.weight[c, k]) * p.inverse_mass[i].max() * a.max() * weights
     return total
 

@@ -84,7 +84,8 @@ class ContactStep:
 
     def _allocate(self, capacity: int) -> None:
         arena, m = FieldArena(), self.simulation.model
-        self.problem = build_node_problem(arena, capacity, m.n_nodes, m.serial)  # of the last step begun
+        masters = 1 if self.simulation.dependents is None else self.simulation.dependents.most_masters
+        self.problem = build_node_problem(arena, capacity, m.n_nodes, m.serial, masters)  # of the last step begun
         self._arena.release()
         self._arena, self._last_time, self._indexed = arena, 0.0, False
 

@@ -8,6 +8,7 @@ the step counts as not converged.
 
 import numpy as np
 import taichi as ti
+from scipy.sparse.csgraph import connected_components
 
 from taisoft.backend.arrays import FieldArena, download
 from taisoft.collision.contacts import FACE_FACE
@@ -18,6 +19,7 @@ from taisoft.contact.problem import ContactProblem
 from taisoft.dynamics.contact_measures import find_displacement
 from taisoft.dynamics.simulation_state import SimulationState
 from taisoft.errors import SimulationError
+from taisoft.scene.connections import attached_pairs
 
 MAX_UNCHANGED = 3  # such checks in a row after which repeating a substep does not help
 SHORTENED = 0.9  # of the part of a path that is certainly free
@@ -34,6 +36,8 @@ class ContactPaths:
         self._names: set[str] = set()  # and their names
         self._n_unchanged = 0  # checks in a row that found no pairs but those held already
         self._held = self._held_before = NO_PASSAGES
+        n, group = connected_components(attached_pairs(detection.scene))
+        self._attached = [np.flatnonzero(group == k) for k in range(n) if (group == k).sum() > 1]  # move as one if held back
         detection.prepare_paths()
         self._arena = FieldArena()
         self.displacement = self._arena.vectors("path", ti.f64, simulation.model.n_nodes)  # of `left_searched` [m]
@@ -146,6 +150,8 @@ class ContactPaths:
                 np.minimum.at(shortened, colliders[:, side], SHORTENED * found[1])
             part = np.where(shortened < 1.0, part * shortened if n_rounds < MAX_SHORTENINGS else 0.0, part)
             part[part < LEAST] = 0.0
+            for together in self._attached:
+                part[together] = part[together].min()
             self._move_in_part(part, *path)
         self._names.update(d.scene.colliders[k].name for k in np.flatnonzero(can_move & (part < 1.0)))
         listed = ", ".join(f"'{name}'" for name in sorted(self._names))

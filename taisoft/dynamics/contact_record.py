@@ -5,7 +5,7 @@ import numpy as np
 from taisoft.backend.arrays import download, upload
 from taisoft.collision.contacts import Contacts
 from taisoft.collision.detector import Detection
-from taisoft.contact.problem import NODES, ContactProblem
+from taisoft.contact.problem import ContactProblem
 from taisoft.scene.scene import Scene
 
 
@@ -29,13 +29,13 @@ def sum_impulses(contacts: Contacts, scene: Scene) -> np.ndarray:
 
 
 def _sides(node: np.ndarray, weight: np.ndarray, arity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return nodes and weights (n,6) of a problem's contacts, three per side, as the record stores them."""
-    n, used = len(node), np.arange(NODES) < arity[:, None]
+    """Return nodes and weights (n, width) of a problem's contacts, half of them per side, as the record stores them."""
+    (n, width), used = node.shape, np.arange(node.shape[1]) < arity[:, None]
     side_b = used & (weight < 0.0)
     n_a = (used & ~side_b).sum(axis=1)  # side a comes first
     row, column = np.nonzero(used)
-    place = np.where(side_b[row, column], NODES // 2 + column - n_a[row], column)
-    nodes, weights = np.full((n, NODES), -1), np.zeros((n, NODES))
+    place = np.where(side_b[row, column], width // 2 + column - n_a[row], column)
+    nodes, weights = np.full((n, width), -1), np.zeros((n, width))
     nodes[row, place], weights[row, place] = node[row, column], np.abs(weight[row, column])
     return nodes, weights
 

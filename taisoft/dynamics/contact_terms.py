@@ -15,7 +15,7 @@ import taichi as ti
 from taisoft.backend.arrays import FieldArena
 from taisoft.backend.runtime import kernel
 from taisoft.contact.build import LEAST_GAP, contact_offset_of, gap_minus_target
-from taisoft.contact.problem import NODES, RESIDUAL, ContactProblem, residual_of
+from taisoft.contact.problem import RESIDUAL, ContactProblem, residual_of
 from taisoft.contact.prox import dvec, into_disk, prox, scaled
 from taisoft.fem.model import Model
 from taisoft.fem.node_graph import n_nodes_of, node_of
@@ -186,7 +186,7 @@ def impulse_on_node(k: ti.template(), i):
     p, w = ti.static((k.problem, k.work))
     d = dvec(0.0)
     for e in range(p.entry_start[i], p.entry_start[i + 1]):
-        c, slot = p.entry[e] // NODES, p.entry[e] % NODES
+        c, slot = p.entry[e] // p.width, p.entry[e] % p.width
         d += p.weight[c, slot] * w.world_impulse[c]
     return d
 

@@ -59,6 +59,11 @@ class DependentTable:
         return moved
 
     @property
+    def most_masters(self) -> int:
+        """Largest number of nodes that a node depends on."""
+        return int(np.diff(self.start).max())
+
+    @property
     def growth(self) -> float:
         """Largest sum |w_i|, at least 1: by its square the highest frequency of the dependent nodes' tets may grow."""
         return float(abs(self.rows).sum(axis=1).max())
@@ -73,6 +78,7 @@ class Dependents:
     start: Any  # (n + 1) i32
     master: Any  # (s) i32
     weight: Any  # (s) f64
+    number: Any  # (n_nodes) i32: place of a dependent node in `node`, -1 for others
     of_start: Any  # (n_nodes + 1) i32: first of each independent node in the next two
     of_node: Any  # (s) i32: dependent nodes
     of_weight: Any  # (s) f64
@@ -124,6 +130,7 @@ def build_dependents(table: DependentTable, arena: FieldArena) -> Dependents:
     """Copy a table to the device."""
     by_master = table.rows.tocsc()
     by_master.sort_indices()
+    every = np.arange(table.n_nodes)
 
     def ids(name: str, data: np.ndarray):
         return arena.field(name, ti.i32, len(data), data.astype(np.int32))
@@ -134,6 +141,7 @@ def build_dependents(table: DependentTable, arena: FieldArena) -> Dependents:
         start=ids("dependent_start", table.start),
         master=ids("dependent_master", table.master),
         weight=arena.field("dependent_weight", ti.f64, len(table.weight), table.weight),
+        number=ids("dependent_number", np.where(np.isin(every, table.node), np.searchsorted(table.node, every), -1)),
         of_start=ids("dependent_of_start", by_master.indptr),
         of_node=ids("dependent_of_node", table.node[by_master.indices]),
         of_weight=arena.field("dependent_of_weight", ti.f64, len(table.weight), by_master.data),
@@ -189,7 +197,7 @@ def expanded_pairs(table: DependentTable, ends: np.ndarray) -> tuple[np.ndarray,
     involved = dependent[ends].any(axis=1)
     plain = np.flatnonzero(~involved)
     rows = np.flatnonzero(involved)
-    width = max(1, int(np.diff(table.start).max()))
+    width = table.most_masters
     (nodes_a, weights_a), (nodes_b, weights_b) = (_padded(table, dependent, ends[rows, side], width) for side in (0, 1))
     nodes, zero = np.concatenate([nodes_a, nodes_b], axis=1), np.zeros_like(weights_a)
     A, B = np.concatenate([weights_a, zero], axis=1), np.concatenate([zero, weights_b], axis=1)

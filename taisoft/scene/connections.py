@@ -215,6 +215,16 @@ def _check_exact(scene: "Scene") -> None:
             raise SceneError(f"{what}: bodies {one.a!r} and {one.b!r} must have the same stiffness_damping")
 
 
+def attached_pairs(scene: "Scene") -> np.ndarray:
+    """Return which colliders are attached to each other exactly, (n,n) bool: these do not collide."""
+    names = [one.name for one in scene.colliders]
+    pairs = np.zeros((len(names), len(names)), dtype=bool)
+    for one in scene.exact_attachments:
+        a, b = names.index(one.a), names.index(one.b)
+        pairs[a, b] = pairs[b, a] = True
+    return pairs
+
+
 def check_tension(value: float, what: str) -> None:
     """Raise SceneError if a tension [N] is negative."""
     if value < 0.0:
