@@ -102,8 +102,8 @@ def check_scene(saved: Checkpoint, scene: Scene, features: dict[str, bool]) -> N
                 f"{fingerprint[kinds]}"
             )
     differing = [name for name in fingerprint | saved.fingerprint if fingerprint.get(name) != saved.fingerprint.get(name)]
-    if differing and differing[0] != FEATURES:
-        raise SceneError(f"{saved.path} is a checkpoint of another scene, which differs in {differing[0]}")
+    if parts := [name for name in differing if name != FEATURES]:
+        raise SceneError(f"{saved.path} is a checkpoint of another scene, which differs in {parts[0]}")
     found = first_difference(saved.start, scene_numbers(scene))
     if found:
         raise SceneError(
