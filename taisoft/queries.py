@@ -52,16 +52,20 @@ def reactions(self: "Simulator", body: str | None = None) -> np.ndarray:
 
 
 def joint_force(self: "Simulator", name: str) -> float | np.ndarray:
-    """Return the force of a connection in the present state [N]; a copy."""
+    """Return the force of a connection in the present state [N].
+
+    Of a spring its tension, with damping, negative if it pushes; of a tendon its tension; of an attachment the forces (k,3) on
+    the attached nodes. Raises SceneError.
+    """
     dynamics = self._open()
     names = [one.name for one in self.scene.connections]
     if name not in names:
         raise SceneError(f"joint_force: no spring, tendon or attachment is called {name!r}{nearest(str(name), names)}")
     x, v = dynamics.state.state()
     loads = dynamics.state.loads.amplitudes([self.time])[0]
-    table = spring_table(self.scene)
-    pulls = table.pulls(x, v.astype(np.float64), loads)[table.elements[name]]
-    return pulls if isinstance(self.scene.connections[names.index(name)], Attachment) else float(np.linalg.norm(pulls[0]))
+    table, is_attachment = spring_table(self.scene), isinstance(self.scene.connections[names.index(name)], Attachment)
+    forces = (table.pulls if is_attachment else table.tensions)(x, v.astype(np.float64), loads)[table.elements[name]]
+    return forces if is_attachment else float(forces[0])
 
 
 def stress(self: "Simulator", body: str | None = None) -> np.ndarray:
