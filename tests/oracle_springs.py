@@ -1,6 +1,6 @@
 """Springs, tendons and attachments once more, from their definitions: where their points are, and their energy, in NumPy.
 
-Points are found by trying every tet, forces by the complex step, stiffness by differences; nothing is shared with the package.
+Points are found by trying every tet, stiffness by the complex step; nothing is shared with the package.
 """
 
 import numpy as np
@@ -39,6 +39,7 @@ class OracleSprings:
             length = one.rest_length
             if length is None:
                 length = np.linalg.norm(self.start(*ends[0]) - self.start(*ends[1]))
+                length = 0.0 if length < 1e-12 else length
             self.elements[one.name] = [self.between(*ends, one.stiffness, length, one.damping, 0.0)]
         for one in scene.tendons:
             tension, ends = float(one.value), [self.point(p.owner, p.position) for p in one.points]
@@ -88,34 +89,23 @@ class OracleSprings:
         return total
 
     def force(self, x, v=None) -> np.ndarray:
-        """Forces (n,3) [N], with damping if there are velocities."""
-        f = np.zeros((self.n, 3))
-        for i, j in np.ndindex(f.shape):
-            step = np.zeros(f.shape, dtype=complex)
-            step[i, j] = 1e-30j
-            f[i, j] = -np.imag(self.energy(x + step)) / 1e-30
-        for row, offset, _, length, c, tension in self.all if v is not None else ():
-            e, rate = row @ x + offset, row @ v
-            if length > 0.0 or tension > 0.0:
-                rate = (rate @ e) * e / (e @ e)
-            f -= c * row[:, None] * rate
+        """Forces (n,3) [N], with damping if there are velocities; x may be complex."""
+        f = np.zeros((self.n, 3), dtype=x.dtype)
+        for row, offset, k, length, c, tension in self.all:
+            e, rate = row @ x + offset, np.zeros(3) if v is None else row @ v
+            if length == 0.0 and tension == 0.0:
+                f -= np.outer(row, k * e + c * rate)
+            else:
+                l = np.sqrt(e @ e)
+                f -= np.outer(row, (k * (l - length) + tension + c * (rate @ e) / l) * e / l)
         return f
 
-    def stiffness(self, x, h: float = 1e-6) -> np.ndarray:
-        """-df/dx (3n,3n) [N/m]."""
-        K = np.zeros((3 * self.n, 3 * self.n))
-        for j in range(3 * self.n):
-            step = np.zeros(3 * self.n)
-            step[j] = h
-            step = step.reshape(-1, 3)
-            K[:, j] = -(self.force(x + step) - self.force(x - step)).reshape(-1) / (2 * h)
-        return K
+    def stiffness(self, x) -> np.ndarray:
+        """-df/dx (3n,3n) [N/m] without damping, by the complex step."""
+        steps = 1e-30j * np.eye(3 * self.n).reshape(-1, self.n, 3)
+        return np.column_stack([-np.imag(self.force(x + step)).reshape(-1) / 1e-30 for step in steps])
 
     def damping(self, x) -> np.ndarray:
         """-df/dv (3n,3n) [N s/m]; forces are linear in v."""
-        C, zero = np.zeros((3 * self.n, 3 * self.n)), self.force(x)
-        for j in range(3 * self.n):
-            v = np.zeros(3 * self.n)
-            v[j] = 1.0
-            C[:, j] = (zero - self.force(x, v.reshape(-1, 3))).reshape(-1)
-        return C
+        zero, units = self.force(x), np.eye(3 * self.n).reshape(-1, self.n, 3)
+        return np.column_stack([(zero - self.force(x, v)).reshape(-1) for v in units])

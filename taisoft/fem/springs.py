@@ -16,7 +16,7 @@ import taichi as ti
 from taisoft.backend.arrays import Count, FieldArena, download, upload
 from taisoft.fem.loads import tension_slots
 from taisoft.scene.body import Body
-from taisoft.scene.connections import Attachment, Point, locate_nodes, start_of
+from taisoft.scene.connections import Attachment, Point, coincide, locate_nodes, start_of
 from taisoft.scene.locate import locate
 from taisoft.scene.scene import Scene
 
@@ -112,7 +112,7 @@ def spring_table(scene: Scene) -> SpringTable | None:
         length = spring.rest_length
         if length is None:
             a, b = (start_of(scene, point) for point in spring.points)
-            length = float(np.linalg.norm(a - b))
+            length = 0.0 if coincide(scene, *spring.points) else float(np.linalg.norm(a - b))
         made.add(spring.name, [made.between(*spring.points)], spring.stiffness, length, spring.damping, -1)
     for tendon in scene.tendons:
         segments = [made.between(p, q) for p, q in zip(tendon.points, tendon.points[1:])]

@@ -123,7 +123,7 @@ def add_spring(
     what = f"spring {name!r}"
     points = tuple(_point(self, end, f"{what}: {label}") for label, end in (("a", a), ("b", b)))
     _check_any_body(self, points, what)
-    if points[0].owner == points[1].owner and _coincide(self, *points):
+    if points[0].owner == points[1].owner and coincide(self, *points):
         raise SceneError(f"{what}: a and b are the same point of body {points[0].owner!r}")
     stiffness = checks.number(stiffness, f"{what}: stiffness", minimum=0.0, unit="N/m")
     if rest_length is not None:
@@ -149,7 +149,7 @@ def add_tendon(self: "Scene", points, force, name: str | None = None) -> Tendon:
     made = tuple(_point(self, end, f"{what}: point {k}") for k, end in enumerate(points))
     _check_any_body(self, made, what)
     for k, (p, q) in enumerate(zip(made, made[1:])):
-        if _coincide(self, p, q):
+        if coincide(self, p, q):
             raise SceneError(f"{what}: points {k} and {k + 1} coincide")
     tendon = Tendon(name, made, *value_and_path(force, f"{what}: force", ((),)))
     check_tension(tendon.path(0.0) if tendon.value is None else tendon.value, f"{what}: force")
@@ -218,7 +218,7 @@ def locate_nodes(scene: "Scene", attachment: Attachment) -> tuple[np.ndarray, np
     return nodes, weights
 
 
-def _coincide(scene: "Scene", p: Point, q: Point) -> bool:
+def coincide(scene: "Scene", p: Point, q: Point) -> bool:
     """Return whether two points are at the same place at the start, within rounding."""
     own = [owner for name in (p.owner, q.owner) if isinstance(owner := scene.collider(name), Body)]
     size = max(float(np.abs(a).max()) for a in (p.position, q.position, *(body.rest_positions for body in own)))
