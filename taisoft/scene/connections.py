@@ -172,7 +172,7 @@ def attach(self: "Scene", a: str, where, b: str, stiffness: float, damping: floa
         raise SceneError(f"{what}: {a!r} is an obstacle: give the body first")
     nodes = checks.selection(where, body.rest_positions, what, "node")
     if b == a:
-        raise SceneError(f"{what}: a body cannot be attached to itself")
+        raise SceneError(f"{what}: body {a!r} cannot be attached to itself")
     owner = _owner(self, b, what)
     stiffness = checks.number(stiffness, f"{what}: stiffness", above=0.0, unit="N/m")
     damping = checks.number(damping, f"{what}: damping", minimum=0.0, unit="N s/m")
