@@ -7,12 +7,14 @@
 * `stable_dt` and `modes` against dense algebra; contacts act beside springs.
 """
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import scipy.linalg as la
 from oracle import Oracle
 from oracle_springs import OracleSprings
-from scenes import built, connected_scene, cube, rubber
+from scenes import built, connected_scene, cube, dynamics, rubber
 from spring_rig import assembled, kernel_forces
 
 import taisoft as ts
@@ -287,6 +289,23 @@ def test_paths_of_tensions_are_those_of_the_integrators_times(integrator):
             p.append(p[n] + dt * mean.get(integrator, end))
     for momentum in results:
         assert momentum == pytest.approx((p[-1], 0, 0), rel=1e-6, abs=1e-6 * p[-1])
+
+
+@pytest.mark.parametrize("integrator", EXPLICIT)
+def test_parallel_and_batched_substeps_equal_serial_single_ones(integrator):
+    """With damping, a tension along a path, and what the two keep between sub-steps."""
+    results = []
+    for serial, batches in ((True, [1] * 12), (True, [5, 7]), (False, [12])):
+        scene = connected_scene(damping=8.0)
+        scene.add_tendon([("a", 5), ("b", 2)], ts.KeyFrames((0.0, 0.004, 0.02), values=(10.0, 900.0, 0.0)))
+        with dynamics(scene, dt=1e-3, integrator=integrator, precision="f64") as made:
+            made.stepper.simulation.model = replace(made.state.model, serial=serial)
+            for n in batches:
+                made.advance(n)
+            results.append(made.state.state())
+    assert np.abs(results[0][1]).max() > 0.1
+    for other in results[1:]:
+        assert all(np.abs(a - b).max() < 1e-12 for a, b in zip(results[0], other))
 
 
 @pytest.mark.parametrize("integrator", ["symplectic_euler", "implicit_euler"])
