@@ -144,7 +144,7 @@ def set_traction(self: "Simulator", body: str, index: int, value) -> None:
 
 
 def set_tension(self: "Simulator", name: str, value: float) -> None:
-    """Change the tension [N] of a tendon, from the next step on; it replaces a path. Raises SceneError."""
+    """Change the tension [N] of a tendon, from the next step on; it replaces a path. `stable_dt` stays. Raises SceneError."""
     dynamics = self._open()
     change_tension(self.scene, name, value)
     dynamics.loads_changed()

@@ -131,9 +131,10 @@ def restore_numbers(saved: Checkpoint, scene: Scene) -> None:
                     value = saved.state["loads"][str(k)][kind][str(i)]
                     if value is not None:
                         change_load(body, kind, i, value)
-        for name, value in saved.state.get("loads", {}).get("tendons", {}).items():
+        for i, tendon in enumerate(scene.tendons):
+            value = saved.state["loads"]["tendons"][str(i)]
             if value is not None:
-                change_tension(scene, name, value)
+                change_tension(scene, tendon.name, value)
 
 
 def load_values(scene: Scene) -> dict:
@@ -143,7 +144,7 @@ def load_values(scene: Scene) -> dict:
         for k, body in enumerate(scene.bodies)
     }
     if scene.tendons:
-        values["tendons"] = {one.name: None if one.value is None else float(one.value) for one in scene.tendons}
+        values["tendons"] = {str(i): None if one.value is None else float(one.value) for i, one in enumerate(scene.tendons)}
     return values
 
 

@@ -51,8 +51,8 @@ def reactions(self: "Simulator", body: str | None = None) -> np.ndarray:
 def joint_force(self: "Simulator", name: str) -> float | np.ndarray:
     """Return the force of a connection in the present state [N].
 
-    Of a spring or a tendon the tension, positive where it pulls; of an attachment the forces (k,3) on its nodes, in their order;
-    where they are attached exactly, with their mean acceleration in the last step. Raises SceneError.
+    Of a spring its tension, with damping, negative if it pushes; of a tendon its tension; of an attachment the forces (k,3) on
+    the attached nodes, where they are attached exactly with their mean acceleration in the last step. Raises SceneError.
     """
     from taisoft.dynamics.joints import joint_force as of_dynamics
 

@@ -151,7 +151,7 @@ def spring_rates(scene: Scene) -> tuple[float, float]:
     if table is None:
         return 0.0, 0.0
     length = np.linalg.norm(table.vectors(_start_positions(scene)), axis=1)
-    given = np.append(SceneLoads(scene).amplitudes([0.0])[0], 0.0)[table.slot]
+    given = table.given(SceneLoads(scene).amplitudes([0.0])[0])
     largest = np.maximum(table.stiffness, given / np.where(given > 0.0, length, 1.0))
     scaled = sp.csr_matrix((table.weight / np.sqrt(reference.lumped_masses(scene)[table.node]), table.node, table.start))
     return tuple(_largest_eigenvalue(scaled, weights) for weights in (largest, table.damping))
@@ -178,7 +178,7 @@ def spring_stiffness(scene: Scene) -> sp.csr_matrix:
     """Stiffness matrix (3n, 3n) of a scene's springs, tendons and attachments at the start [N/m]."""
     table = spring_table(scene)
     e = table.vectors(_start_positions(scene))
-    given = np.append(SceneLoads(scene).amplitudes([0.0])[0], 0.0)[table.slot]
+    given = table.given(SceneLoads(scene).amplitudes([0.0])[0])
     blocks = table.stiffness_blocks(e, given)
     rows = sp.csr_matrix((table.weight, table.node, table.start), shape=(len(e), len(_start_positions(scene))))
     C = sp.kron(rows, sp.identity(3), format="csr")

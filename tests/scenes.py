@@ -127,11 +127,14 @@ def mixed_scene(
 RELEASE = 0.0095  # [s] when the driven scene's first led nodes let go
 
 
-def driven_scene(law: str = SNH, mass_damping: float = 0.0, stiffness_damping: float = 0.0, order: int | str = 1) -> ts.Scene:
+def driven_scene(
+    law: str = SNH, mass_damping: float = 0.0, stiffness_damping: float = 0.0, order: int | str = 1, connected: bool = False
+) -> ts.Scene:
     """A beam that is held, led and loaded in every way there is, and a flyer; vertices 8..11 are the beam's right end.
 
     Two nodes are led along x and y until they are released, one along z by a path of its own, and their other axes are
     free. damping: of the beam; the flyer has a third of its mass damping. order: 1, 2, or "both": 2 for the beam.
+    connected: with springs and a tendon, within the beam and between the two.
     """
     orders = (2, 1) if order == "both" else (order,) * 2
     scene = ts.Scene(gravity=(0.3, -9.81, 0.7))
@@ -149,6 +152,40 @@ def driven_scene(law: str = SNH, mass_damping: float = 0.0, stiffness_damping: f
     mesh = cube((3, 0, 0))
     flying = {"velocity": spin(mesh, orders[1]), **element(orders[1])}
     scene.add_body(mesh, rubber(law, young=7e4, mass_damping=mass_damping / 3), name="flyer", **flying)
+    if connected:
+        scene.add_spring(("beam", (0.3, 0.1, -0.2)), ("flyer", (2.7, 0.0, 0.1)), 400.0, rest_length=1.0)
+        scene.add_spring(("beam", (-0.3, 0.0, 0.1)), ("beam", (0.4, 0.3, 0.4)), 300.0, rest_length=2.0)
+        scene.add_spring(("beam", 5), ("flyer", 2), 50.0, rest_length=0.0)
+        scene.add_tendon([("beam", (0.2, 0.2, 0.2)), ("flyer", (2.8, -0.1, 0.0)), ("beam", (0.0, -0.4, 0.1))], 70.0)
+    return scene
+
+
+def connected_scene(order: int = 1, damping: float = 0.0, gravity=(0.0, 0.0, 0.0), anchored: bool = True) -> ts.Scene:
+    """Two bodies, the second away from the origin and partly inside the first, with connections of every kind.
+
+    There are a compressed and a stretched spring, one between points of one tet, one between bodies at one place, a tendon that
+    passes each body twice and, if anchored, two obstacles in sequence, and an attachment of each kind. damping: of the springs
+    and attachments [N s/m].
+    """
+    scene = ts.Scene(gravity=gravity)
+    scene.contact_forces = False
+    scene.add_body(cube(cells=(2, 1, 1)), rubber(), name="a", order=order)
+    # its first four nodes lie inside a
+    scene.add_body(
+        cube(center=(0.7, 0.1, 0.0), size=(0.8, 0.5, 0.6)), rubber(young=6e4), name="b", position=(0.05, 0, 0.1), order=order
+    )
+    scene.add_obstacle(ts.Sphere((0, 3, 0), 0.2), name="pin")
+    scene.add_obstacle(ts.HalfSpace((0, -9, 0), (0, 1, 0)), name="wall")
+    scene.add_spring(("a", (-0.4, 0.1, 0.2)), ("b", (0.9, 0.2, -0.1)), 300.0, rest_length=2.0, damping=damping, name="pushes")
+    scene.add_spring(("b", (0.6, 0.0, 0.1)), ("a", 3), 500.0, rest_length=0.2, damping=damping, name="pulls")
+    scene.add_spring(("a", (0.02, 0.03, 0.01)), ("a", (0.05, -0.02, 0.04)), 200.0, rest_length=0.02, name="within a tet")
+    scene.add_spring(("a", (0.45, 0.1, 0.2)), ("b", (0.4, 0.1, 0.1)), 250.0, damping=damping, name="at one place")
+    line = [("b", (0.7, 0.3, 0.1)), ("a", 1), ("a", (0.3, -0.3, -0.4)), ("b", 6)]
+    if anchored:
+        line = [*line[:2], ("pin", (0.1, 2.8, 0.0)), ("wall", (0.0, -9.0, 1.0)), *line[2:]]
+        scene.attach("a", [0, 2], "pin", 150.0, damping, name="to an obstacle")
+    scene.add_tendon(line, 40.0, name="line")
+    scene.attach("b", [0, 1, 2, 3], "a", 120.0, damping, name="to a body")
     return scene
 
 

@@ -32,7 +32,10 @@ def loaded() -> ts.Scene:
     body.add_force([6, 7], (1, 0, 0))
     body.add_traction([0], (0, 1, 0))
     scene.add_body(cube((3, 0, 0)), rubber(), name="other")
+    scene.add_spring(("block", 0), ("other", 0), 1.0, name="spring")
+    scene.add_tendon([("block", 1), ("other", 1)], 1.0, name="line")
     scene.add_obstacle(ts.Sphere((0, -9, 0), 1.0), name="ball")
+    scene.attach("block", [2, 3], "ball", 1.0, name="pins")
     scene.set_contact("block", "ball", friction=0.3)
     return scene
 
@@ -55,6 +58,15 @@ def loaded() -> ts.Scene:
         (lambda s: s.obstacle("ball").shape, "radius", "^sphere: radius cannot change: make another shape"),
         (lambda s: s.collision, "margn", "^collision settings has no attribute 'margn'; did you mean 'margin'[?]$"),
         (lambda s: s.collision, "margin", "^collision settings: margin cannot change: .*CollisionSettings.margin=...."),
+        (lambda s: s.springs[0], "stifness", "^spring 'spring' has no attribute 'stifness'; did you mean 'stiffness'[?]$"),
+        (
+            lambda s: s.springs[0],
+            "stiffness",
+            "^spring 'spring': stiffness cannot change: remove it from its list and add another",
+        ),
+        (lambda s: s.springs[0].points[0], "position", "^point: position cannot change: remove it from its list and add another"),
+        (lambda s: s.tendons[0], "value", "^tendon 'line': value cannot change: call sim.set_tension.name, force."),
+        (lambda s: s.attachments[0], "nodes", "^attachment 'pins': nodes cannot change: remove it from its list and add another"),
         (lambda s: s.body("block").forces[0], "value", "^force: value cannot change: call sim.set_force"),
         (lambda s: s.body("block").tractions[0], "value", "^traction: value cannot change: call sim.set_traction"),
     ],
@@ -118,6 +130,12 @@ CHANGES = {
     "contact_pairs": (lambda s: s.contact_pairs.clear(), "call sim.set_contact"),
     "bodies": (lambda s: s.bodies.pop(), "scene.snapshot"),
     "obstacles": (lambda s: setattr(s, "obstacles", []), "scene.snapshot"),
+    "add_spring": (lambda s: s.add_spring(("block", 0), ("other", 1), 1.0), "scene.snapshot"),
+    "add_tendon": (lambda s: s.add_tendon([("block", 0), ("other", 1)], 1.0), "call sim.set_tension"),
+    "attach": (lambda s: s.attach("block", [0], "ball", 1.0), "scene.snapshot"),
+    "springs": (lambda s: setattr(s, "springs", []), "scene.snapshot"),
+    "tendons": (lambda s: setattr(s, "tendons", []), "call sim.set_tension"),
+    "attachments": (lambda s: s.attachments.append(1), "scene.snapshot"),
     "material": (lambda s: setattr(s.body("block"), "material", rubber()), "call sim.set_material"),
     "position": (lambda s: setattr(s.body("block"), "position", np.zeros(3)), "call sim.set_state"),
     "velocity": (lambda s: setattr(s.body("block"), "velocity", np.zeros(3)), "call sim.set_state"),
@@ -131,7 +149,17 @@ CHANGES = {
     "constraints": (lambda s: s.body("block").constraints.clear(), "scene.snapshot"),
     "mesh": (lambda s: delattr(s.body("block"), "mesh"), "scene.snapshot"),
 }
-ALWAYS_REFUSED = {"obstacles", "contact_pairs", "name", "forces", "tractions", "mesh"}  # not assignable before freezing either
+ALWAYS_REFUSED = {
+    "obstacles",
+    "contact_pairs",
+    "name",
+    "forces",
+    "tractions",
+    "mesh",
+    "springs",
+    "tendons",
+    "attachments",
+}  # not assignable before freezing either
 
 
 @pytest.mark.parametrize("name", CHANGES)
@@ -155,7 +183,18 @@ def test_changes_to_a_frozen_scene_are_refused(frozen, name):
 def test_arrays_of_a_frozen_scene_are_read_only(frozen):
     scene, _, before = frozen
     body = scene.body("block")
-    arrays = scene.gravity, body.position, body.velocity, body.forces[0].value, body.tractions[0].value, body.constraints[0].nodes
+    connections = scene.springs[0].points[0].position, scene.attachments[0].nodes
+    with pytest.raises(ValueError, match="read-only"):
+        scene.tendons[0].value[()] = 2.0
+    arrays = (
+        *connections,
+        scene.gravity,
+        body.position,
+        body.velocity,
+        body.forces[0].value,
+        body.tractions[0].value,
+        body.constraints[0].nodes,
+    )
     for array in (*arrays, body.rest_positions, body.mesh.vertices):
         with pytest.raises(ValueError, match="read-only"):
             array[0] = 1
@@ -189,6 +228,8 @@ def test_set_methods_change_the_simulators_copy_alone(frozen):
     sim.set_material("block", young=2e4)
     sim.set_contact("block", "ball", friction=0.1)
     sim.set_force("block", 0, (2, 0, 0))
+    sim.set_tension("line", 3.0)
+    assert (sim.scene.tendons[0].value, scene.tendons[0].value) == (3.0, 1.0)
     assert (sim.scene.gravity[1], sim.scene.body("block").material.young) == (-1, 2e4)
     assert sim.scene.contact_numbers("block", "ball")[0] == 0.1 and sim.scene.body("block").forces[0].value[0] == 2
     assert (scene.gravity[1], scene.body("block").material.young) == (-9.81, 1e5)
@@ -243,6 +284,7 @@ def test_only_a_successful_construction_freezes(frozen, tmp_path, monkeypatch):
         ("young", "^simulator has no attribute 'young': call sim.set_material.body, young=....$"),
         ("friction", "^simulator has no attribute 'friction': call sim.set_contact"),
         ("integrator", "^simulator has no attribute 'integrator': call sim.rebuild.integrator=....$"),
+        ("tension", "^simulator has no attribute 'tension': call sim.set_tension.name, force.$"),
         ("positions", "^simulator: positions is a method and cannot be set: call sim.set_state"),
         ("step", "^simulator: step is a method and cannot be set$"),
         ("time", "^simulator: time cannot be set: call sim.reset"),

@@ -7,7 +7,7 @@
 
 import numpy as np
 import pytest
-from scenes import block_scene, cube, driven_scene, mixed_scene, rubber
+from scenes import block_scene, connected_scene, cube, driven_scene, mixed_scene, rubber
 
 import taisoft as ts
 from taisoft.backend import runtime
@@ -37,6 +37,8 @@ def test_reasons():
         "moving_nodes": (False, "no node follows a path"),
         "mass_damping": (True, "material of beam, tower"),
         "stiffness_damping": (False, "every stiffness_damping is 0"),
+        "springs": (False, "no spring, tendon or attachment"),
+        "spring_damping": (False, "no spring or attachment is damped"),
         "assembled_stiffness": (False, "explicit steps need forces only"),
         "past_states": (False, "a one-step integrator"),
         "inversion_handling": (False, entries["inversion_handling"][1]),
@@ -51,7 +53,8 @@ def test_reasons():
 
 def test_every_feature_can_be_on_and_off():
     off = make_plan(block_scene(), explicit=True, multistep=False).on
-    full = driven_scene(order=2, mass_damping=1.0, stiffness_damping=1.0)
+    full = driven_scene(order=2, mass_damping=1.0, stiffness_damping=1.0, connected=True)
+    full.add_spring(("beam", 0), ("flyer", 0), 1.0, damping=1.0)
     full.add_obstacle(ts.HalfSpace((0, -9, 0), (0, 1, 0)))
     full.body("beam").young = np.full(full.body("beam").mesh.n_tets, 1e5)
     full.body("beam").add_force([4], lambda t: (t, 0, 0))
@@ -59,6 +62,12 @@ def test_every_feature_can_be_on_and_off():
     on = make_plan(full, explicit=False, multistep=True, self_collision=True).on
     laws = {name for name in on if name.startswith("law:")}
     assert {name for name in on if not on[name]} < laws and {name for name in off if off[name]} < laws
+
+
+def test_connections_are_named():
+    entries = {e["feature"]: (e["on"], e["why"]) for e in make_plan(connected_scene(damping=2.0), True, False).entries}
+    assert entries["springs"] == (True, "pushes, pulls, within a tet and 4 more")
+    assert entries["spring_damping"] == (True, "pushes, pulls, at one place and 2 more")
 
 
 def test_quadratic_bodies_get_a_consistent_mass_in_implicit_steps_only():
@@ -126,6 +135,7 @@ def test_features_that_are_off_allocate_nothing(integrator):
     with ts.Simulator(block_scene(), dt=1e-3, integrator=integrator) as sim:
         fields = set(sim.field_bytes)
         assert all(size > 0 for size in sim.field_bytes.values())
+    assert not any(field.startswith(("spring", "amplitude")) for field in fields)
     assert not fields & (LOADS | DAMPING | PRESCRIBED | HELD | DAMPED_VERLET) and not any(f.startswith("damping") for f in fields)
     assert bool(fields & VERLET) == (integrator == "velocity_verlet")
     assert any(f.startswith("stiffness") for f in fields) == any(f.startswith("pcg") for f in fields)
@@ -137,6 +147,18 @@ def test_features_that_are_on_allocate_their_fields():
     scene = driven_scene(mass_damping=1.0, stiffness_damping=1e-3)
     with ts.Simulator(scene, dt=1e-4, integrator="velocity_verlet") as sim:
         assert LOADS | DAMPING | PRESCRIBED | HELD | VERLET | DAMPED_VERLET <= set(sim.field_bytes)
+
+
+@pytest.mark.parametrize("integrator", ["velocity_verlet", "implicit_euler"])
+def test_connections_allocate_their_fields_and_damping_what_it_needs(integrator):
+    sizes = []
+    for damping in (0.0, 1.0):
+        with ts.Simulator(connected_scene(damping=damping), dt=1e-4, integrator=integrator) as sim:
+            fields = sim.field_bytes
+        assert {"spring_node", "spring_pull", "amplitudes"} <= set(fields) and "amplitude_rows" not in fields
+        assert ("spring_pair_at" in fields) == (integrator == "implicit_euler")
+        sizes.append(fields)
+    assert (sizes[0].keys() ^ sizes[1].keys()) == (DAMPED_VERLET if integrator == "velocity_verlet" else set())
 
 
 def launched(sim, steps: int) -> dict[str, int]:

@@ -54,6 +54,14 @@ def everything() -> ts.Scene:
     scene.add_obstacle(ts.Box((0, 0, 0), (1, 1 / 3, 1)), path=turn)
     scene.add_obstacle(ts.Capsule((0, 0, 0), (1 / 3, 0, 0), 2))
     scene.add_obstacle(ts.MeshObstacle(TURNED.vertices, TURNED.surface))
+    scene.add_spring(("a", (0.1, 1 / 3, 0.2)), ("ground", (1 / 3, -0.0, 9)), 1 / 3, name="s.1")
+    scene.add_spring(("c.d", 3), ("1", (0.1, 0.01, -0.2)), 1e-20, rest_length=1 / 7, damping=0.1)
+    points = [("a", 12), ("ground", (0, 1 / 3, 0)), ("obstacle2", (0, 0, 1)), ('b "2"\n\\ü', 4)]
+    scene.add_tendon(points, 1 / 3, name='line "1"')
+    scene.add_tendon(points[::3], ts.KeyFrames((0, 1 / 3), values=(0.1, 5.0), smooth=True))
+    scene.attach("a", lambda X: X[:, 0] > 0, "ground", 1 / 3, 1e-3)
+    scene.attach("c.d", [4, 2], "obstacle2", 5.0, name="pins")
+    scene.attach('b "2"\n\\ü', [4, 2], "a", 1e9)
     scene.set_contact("ground", "a", friction=0.3)
     scene.set_contact("a", "a", restitution=0.3)
     scene.set_contact("a", 'b "2"\n\\ü', 0.1, 0.2)
@@ -167,6 +175,10 @@ def test_scenes_that_a_file_cannot_store_are_refused(tmp_path):
     with pytest.raises(ts.SceneError, match="body 'a': moves along a function, which a file cannot store: use ts.KeyFrames"):
         ts.write_scene(path, scene)
     body.constraints.clear()
+    tendon = scene.add_tendon([("a", 0), ("a", 5)], lambda t: 1.0, name="line")
+    with pytest.raises(ts.SceneError, match="tendon 'line': pulls along a function, which a file cannot store: use ts.KeyFrames"):
+        ts.write_scene(path, scene)
+    scene.tendons.remove(tendon)
     scene.add_body(TURNED, ts.Material(), name="\ud800")
     with pytest.raises(ts.SceneError, match="not a character of Unicode"):
         ts.write_scene(path, scene)

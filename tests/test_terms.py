@@ -1,9 +1,11 @@
 """Forces of every term in random states of both orders, in f64, serial and parallel:
 
 * the force is minus the finite difference of the energy;
-* internal forces have no resultant force or moment and rotate with the state; loads do not depend on the state;
+* internal forces have no resultant force or moment, elastic ones on each body, and rotate with the state; loads ignore the state;
 * dampers dissipate, except in rigid translation.
 """
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -16,12 +18,13 @@ from taisoft.fem.measure import measure
 from taisoft.fem.model import damping_table
 from taisoft.fem.node_graph import EVERYTHING
 from taisoft.fem.state import ELASTIC, GRAVITY, LOADS
-from taisoft.fem.terms import TERMS, dead_loads, elasticity, gravity, rayleigh_damping
+from taisoft.fem.terms import TERMS, dead_loads, elasticity, gravity, rayleigh_damping, springs
 from taisoft.fem.terms.elasticity import elastic_forces
 from taisoft.linear import block_csr
 from taisoft.linear.block_csr import row_times
 
-ENERGY = {elasticity: ELASTIC, gravity: GRAVITY, dead_loads: LOADS}  # index in State.scalars, written by `measure`
+# indices in State.scalars, written by `measure`
+ENERGY = {elasticity: (ELASTIC,), springs: (ELASTIC, LOADS), gravity: (GRAVITY,), dead_loads: (LOADS,)}
 H = 1e-6  # [m]
 
 
@@ -44,7 +47,7 @@ def damping_of(m: ti.template(), damper: ti.template(), mass: ti.template(), sti
 
 @pytest.fixture(scope="module", params=[1, 2])
 def rig(request):
-    with built(driven_scene(mass_damping=3.0, stiffness_damping=0.004, order=request.param), "f64") as made:
+    with built(driven_scene(mass_damping=3.0, stiffness_damping=0.004, order=request.param, connected=True), "f64") as made:
         rng = np.random.default_rng(5)
         made.x = made.oracle.rest + 0.02 * rng.standard_normal(made.oracle.rest.shape)
         made.outs = [made.vectors(f"term_{k}") for k in range(2)]
@@ -61,8 +64,14 @@ def forces(rig, term, x: np.ndarray) -> np.ndarray:
 def energy(rig, term, x: np.ndarray, model=None) -> float:
     model = model or rig.model
     model.state.x.from_numpy(x)
+    without = measured(replace(model, springs=None), term)
+    return measured(model, term) - without if term is springs else without
+
+
+def measured(model, term) -> float:
+    """The energies to which a term contributes."""
     measure(model)
-    return model.state.scalars[ENERGY[term]]
+    return sum(model.state.scalars[k] for k in ENERGY[term])
 
 
 def test_scene_activates_every_term(rig):
@@ -91,7 +100,7 @@ def test_rigid_motions_rotate_internal_forces(rig, term):
         return
     tolerance = 1e-10 * np.abs(f).max()
     assert np.abs(moved - f @ R.T).max() < tolerance
-    start = rig.layout.node_start
+    start = rig.layout.node_start if term is elasticity else rig.layout.node_start[[0, -1]]  # springs act between bodies
     for first, last in zip(start[:-1], start[1:]):
         force, x = f[first:last], rig.x[first:last]
         assert np.abs(force.sum(axis=0)).max() < 100 * tolerance

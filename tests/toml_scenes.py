@@ -92,9 +92,14 @@ MESH = '[bodies.a]\nmaterial = {{}}\nmesh = {{ file = "{}" }}\n'
 def path_data(path):
     """Of a path, its frames and where what it leads starts."""
     frames = getattr(path, "frames", path)
-    names = ("times", "translations", "rotations", "pivot", "smooth", "release")
+    names = ("times", "translations", "rotations", "pivot", "smooth", "release", "values")
     said = {name: np.asarray(getattr(frames, name)).tobytes() for name in names} if path else None
     return said and said | {name: getattr(path, name).tobytes() for name in ("starts", "center") if hasattr(path, name)}
+
+
+def points_data(connection) -> list:
+    """Names and positions of the points of a spring or tendon."""
+    return [(point.owner, point.position.tobytes()) for point in connection.points]
 
 
 def data(scene: ts.Scene) -> dict:
@@ -114,8 +119,14 @@ def data(scene: ts.Scene) -> dict:
     for o in scene.obstacles:
         fields = {name: np.asarray(value).tobytes() for name, value in vars(o.shape).items()}
         obstacles.append((o.name, type(o.shape), fields, o.friction, o.restitution, path_data(o.path)))
+    connections = [
+        *((s.name, points_data(s), s.stiffness, s.rest_length, s.damping) for s in scene.springs),
+        *((t.name, points_data(t), path_data(t.path) or float(t.value)) for t in scene.tendons),
+        *((a.name, a.a, a.nodes.tolist(), a.b, a.stiffness, a.damping) for a in scene.attachments),
+    ]
     own = (scene.gravity.tobytes(), scene.collision, scene.allow_initial_overlap, scene.contact_forces)
-    return {"bodies": bodies, "obstacles": obstacles, "own": own, "pairs": scene.contact_pairs}
+    pairs = scene.contact_pairs
+    return {"bodies": bodies, "obstacles": obstacles, "own": own, "pairs": pairs, "connections": connections}
 
 
 def read(tmp_path: Path, text: str, **options) -> tuple[ts.Scene, dict]:

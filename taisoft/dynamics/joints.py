@@ -44,9 +44,10 @@ def joint_force(dynamics: "Dynamics", name: str) -> float | np.ndarray:
     if isinstance(one, Attachment) and one.stiffness is None:
         return _exact(dynamics, one)
     x, v = state.state()
-    table = spring_table(scene)
-    pulls = table.pulls(x, v.astype(np.float64), state.loads.amplitudes([state.time])[0])[table.elements[name]]
-    return pulls if isinstance(one, Attachment) else float(np.linalg.norm(pulls[0]))
+    table, is_attachment = spring_table(scene), isinstance(one, Attachment)
+    loads = state.loads.amplitudes([state.time])[0]
+    forces = (table.pulls if is_attachment else table.tensions)(x, v.astype(np.float64), loads)[table.elements[name]]
+    return forces if is_attachment else float(forces[0])
 
 
 def _exact(dynamics: "Dynamics", one: Attachment) -> np.ndarray:

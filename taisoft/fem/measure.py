@@ -74,6 +74,9 @@ def measure(m: ti.template()):
                     total += value
             m.state.scalars[k] = total
         if ti.static(m.has_springs):
+            elastic, potential = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64)
             for s in range(m.springs.n):
-                m.state.scalars[ELASTIC] = m.state.scalars[ELASTIC] + springs.elastic_energy(m, s)
-                m.state.scalars[LOADS] = m.state.scalars[LOADS] + springs.load_energy(m, s)
+                elastic += springs.elastic_energy(m, s)
+                potential += springs.load_energy(m, s)
+            m.state.scalars[ELASTIC] = m.state.scalars[ELASTIC] + elastic
+            m.state.scalars[LOADS] = m.state.scalars[LOADS] + potential

@@ -18,7 +18,7 @@ from taisoft.backend.arrays import Count, FieldArena, download, upload
 from taisoft.fem.dependents import dependent_table
 from taisoft.fem.loads import tension_slots
 from taisoft.scene.body import Body
-from taisoft.scene.connections import Attachment, Point, locate_nodes, start_of
+from taisoft.scene.connections import Attachment, Point, coincide, locate_nodes, start_of
 from taisoft.scene.locate import locate
 from taisoft.scene.scene import Scene
 
@@ -50,20 +50,27 @@ class SpringTable:
         """sum_j c_j v_j (e,3)."""
         return np.add.reduceat(self.weight[:, None] * v[self.node], self.start[:-1], axis=0)
 
+    def given(self, amplitudes: np.ndarray) -> np.ndarray:
+        """T_0 (e,) [N]; amplitudes: of all loads, see `fem.loads`."""
+        return np.append(amplitudes, 0.0)[self.slot]
+
+    def tensions(self, x: np.ndarray, v: np.ndarray, amplitudes: np.ndarray) -> np.ndarray:
+        """Tension (e,) [N] with damping; negative: it pushes."""
+        length, d = _length_and_direction(self.vectors(x))
+        return (
+            self.stiffness * (length - self.rest_length) + self.given(amplitudes) + self.damping * (self.rates(v) * d).sum(axis=1)
+        )
+
     def pulls(self, x: np.ndarray, v: np.ndarray, amplitudes: np.ndarray) -> np.ndarray:
-        """Force (e,3) [N] of each element on its first point; amplitudes: of all loads, see `fem.loads`."""
-        e, rate = self.vectors(x), self.rates(v)
-        length = np.linalg.norm(e, axis=1)
-        given = np.append(amplitudes, 0.0)[self.slot]
-        direction = e / np.where(length > 0.0, length, 1.0)[:, None]
-        pull = (self.stiffness * (length - self.rest_length) + given)[:, None] * direction
-        along = np.where(self.is_isotropic[:, None], rate, (rate * direction).sum(axis=1)[:, None] * direction)
-        return -(pull + self.damping[:, None] * along)
+        """Force (e,3) [N] of each element on its first point."""
+        d, rate = _length_and_direction(self.vectors(x))[1], self.rates(v)
+        across = rate - (rate * d).sum(axis=1)[:, None] * d
+        damped = np.where(self.is_isotropic, self.damping, 0.0)
+        return -(self.tensions(x, v, amplitudes)[:, None] * d + damped[:, None] * across)
 
     def stiffness_blocks(self, e: np.ndarray, given: np.ndarray) -> np.ndarray:
         """S (e,3,3) [N/m] of stretched vectors (e,3) and given tensions (e,)."""
-        length = np.linalg.norm(e, axis=1)
-        d = e / np.where(length > 0.0, length, 1.0)[:, None]
+        length, d = _length_and_direction(e)
         t = self.stiffness + (given - self.stiffness * self.rest_length) / np.where(length > 0.0, length, np.inf)
         t = np.where(self.is_isotropic, self.stiffness, t)[:, None, None]
         return t * np.eye(3) + (self.stiffness[:, None, None] - t) * d[:, :, None] * d[:, None, :]
@@ -72,6 +79,12 @@ class SpringTable:
     def is_isotropic(self) -> np.ndarray:
         """Whether (e,) an element has no rest length and no given tension: it then pulls by k e, and damps in all directions."""
         return (self.rest_length == 0.0) & (self.slot < 0)
+
+
+def _length_and_direction(e: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """l (k,) and d (k,3) of vectors (k,3); d is 0 where l is."""
+    length = np.linalg.norm(e, axis=1)
+    return length, e / np.where(length > 0.0, length, 1.0)[:, None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,7 +114,7 @@ def spring_table(scene: Scene) -> SpringTable | None:
         length = spring.rest_length
         if length is None:
             a, b = (start_of(scene, point) for point in spring.points)
-            length = float(np.linalg.norm(a - b))
+            length = 0.0 if coincide(scene, *spring.points) else float(np.linalg.norm(a - b))
         made.add(spring.name, [made.between(*spring.points)], spring.stiffness, length, spring.damping, -1)
     for tendon in scene.tendons:
         segments = [made.between(p, q) for p, q in zip(tendon.points, tendon.points[1:])]

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from taisoft.scene.scene import Scene
 
 MAX_OUTSIDE = 0.1  # heights of a tet by which a point may lie outside a body: curved surfaces do not meet exactly
+SAME = 1e-9  # of the largest coordinate of their bodies: points that are closer coincide
 _ADD_ANOTHER = "remove it from its list and add another one before the Simulator is made"
 
 
@@ -124,7 +125,7 @@ def add_spring(
     what = f"spring {name!r}"
     points = tuple(_point(self, end, f"{what}: {label}") for label, end in (("a", a), ("b", b)))
     _check_any_body(self, points, what)
-    if points[0].owner == points[1].owner and np.array_equal(points[0].position, points[1].position):
+    if points[0].owner == points[1].owner and coincide(self, *points):
         raise SceneError(f"{what}: a and b are the same point of body {points[0].owner!r}")
     stiffness = checks.number(stiffness, f"{what}: stiffness", minimum=0.0, unit="N/m")
     if rest_length is not None:
@@ -150,7 +151,7 @@ def add_tendon(self: "Scene", points, force, name: str | None = None) -> Tendon:
     made = tuple(_point(self, end, f"{what}: point {k}") for k, end in enumerate(points))
     _check_any_body(self, made, what)
     for k, (p, q) in enumerate(zip(made, made[1:])):
-        if np.array_equal(start_of(self, p), start_of(self, q)):
+        if coincide(self, p, q):
             raise SceneError(f"{what}: points {k} and {k + 1} coincide")
     tendon = Tendon(name, made, **value_or_path(force, what, "force", ((),)))
     check_tension(tendon.path(0.0) if tendon.value is None else tendon.value, f"{what}: force")
@@ -171,10 +172,12 @@ def attach(
     self._check_open("attach")
     name = _free_name(self, name, "attachment")
     what = f"attachment {name!r}"
-    body = self.body(a)
+    body = _owner(self, a, what)
+    if not isinstance(body, Body):
+        raise SceneError(f"{what}: {a!r} is an obstacle: give the body first")
     nodes = checks.selection(where, body.rest_positions, what, "node")
     if b == a:
-        raise SceneError(f"{what}: a body cannot be attached to itself")
+        raise SceneError(f"{what}: body {a!r} cannot be attached to itself")
     owner = _owner(self, b, what)
     if stiffness is not None:
         stiffness = checks.number(stiffness, f"{what}: stiffness", above=0.0, unit="N/m")
@@ -191,10 +194,16 @@ def attach(
 
 
 def check_connections(scene: "Scene") -> None:
-    """Raise SceneError if a body or obstacle of a connection was removed, or nodes no longer lie where they are attached."""
+    """Raise SceneError if a body or obstacle of a connection was removed, or another one in its place lies elsewhere."""
     for one in scene.connections:
-        found = [_owner(scene, owner, f"{type(one).__name__.lower()} {one.name!r}") for owner in one.owners]
-        if isinstance(one, Attachment) and isinstance(found[1], Body):
+        what = f"{type(one).__name__.lower()} {one.name!r}"
+        found = [_owner(scene, owner, what) for owner in one.owners]
+        if not isinstance(one, Attachment):
+            for k, (point, owner) in enumerate(zip(one.points, found)):
+                _check_inside(owner, point.position, f"{what}: point {k}")
+        elif not isinstance(found[0], Body) or one.nodes.max() >= found[0].n_nodes:
+            raise SceneError(f"{what}: {one.a!r} is no longer the body whose nodes are attached")
+        elif isinstance(found[1], Body):
             locate_nodes(scene, one)
     _check_exact(scene)
 
@@ -242,15 +251,22 @@ def locate_nodes(scene: "Scene", attachment: Attachment) -> tuple[np.ndarray, np
     a, b = scene.body(attachment.a), scene.body(attachment.b)
     points = a.rest_positions[attachment.nodes] + (a.position - b.position)
     nodes, weights, outside = locate(b, points)
-    _check_outside(outside, f"attachment {attachment.name!r}: node {{}} of body {a.name!r}", b, attachment.nodes)
+    _check_outside(outside, lambda k: f"attachment {attachment.name!r}: node {attachment.nodes[k]} of body {a.name!r}", b)
     return nodes, weights
 
 
-def _check_outside(outside: np.ndarray, what: str, body: Body, labels) -> None:
+def coincide(scene: "Scene", p: Point, q: Point) -> bool:
+    """Return whether two points are at the same place at the start, within rounding."""
+    own = [owner for name in (p.owner, q.owner) if isinstance(owner := scene.collider(name), Body)]
+    size = max(float(np.abs(a).max()) for a in (p.position, q.position, *(body.rest_positions for body in own)))
+    return bool(np.abs(start_of(scene, p) - start_of(scene, q)).max() <= SAME * size)
+
+
+def _check_outside(outside: np.ndarray, label: Callable[[int], str], body: Body) -> None:
     k = int(np.argmax(outside))
     if outside[k] > MAX_OUTSIDE:
         raise SceneError(
-            f"{what.format(labels[k])} lies outside of body {body.name!r}, by {outside[k]:.2g} times the height of the nearest "
+            f"{label(k)} lies outside of body {body.name!r}, by {outside[k]:.2g} times the height of the nearest "
             f"tet: at most {MAX_OUTSIDE:g} is allowed"
         )
 
@@ -265,9 +281,13 @@ def _point(scene: "Scene", end, what: str) -> Point:
         node = checks.whole(end[1], f"{what}: the node", range(owner.n_nodes))
         return Point(owner.name, owner.rest_positions[node].copy())
     position = checks.array(end[1], f"{what}: the point", ((3,),))
-    if isinstance(owner, Body):
-        _check_outside(locate(owner, position[None])[2], f"{what}: {{}}", owner, ["the point"])
+    _check_inside(owner, position, f"{what}: the point")
     return Point(owner.name, position)
+
+
+def _check_inside(owner, position: np.ndarray, what: str) -> None:
+    if isinstance(owner, Body):
+        _check_outside(locate(owner, position[None])[2], lambda _: what, owner)
 
 
 def _owner(scene: "Scene", name: str, what: str):

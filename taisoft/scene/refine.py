@@ -4,7 +4,8 @@ Old nodes keep their positions and come first; new nodes are edge midpoints, so 
 geometry stays that of the mesh: new nodes of a ball do not move to the sphere. Functions that choose nodes are evaluated again.
 For nodes chosen by id, a midpoint is chosen if its edge belongs to a surface triangle or tet whose nodes are all chosen; if
 only the two ends are chosen, the case is ambiguous and refused. Tractions pass to the parts of their triangles. Forces given
-per node stay point forces.
+per node stay point forces. The stiffness and damping of an attachment stay the same in all: each of its nodes gets less if there
+are more of them.
 """
 
 import copy
@@ -17,6 +18,7 @@ from taisoft.errors import SceneError
 from taisoft.mesh.nodes import make_nodes
 from taisoft.mesh.tet_mesh import TetMesh
 from taisoft.mesh.topology import distinct_edges
+from taisoft.scene import checks
 from taisoft.scene.body import Body, Constraint
 from taisoft.scene.connections import Attachment
 from taisoft.scene.key_frames import KeyFrames, NodePath
@@ -47,8 +49,10 @@ def _with_bodies(scene: Scene, made: list[tuple[Body, np.ndarray]]) -> Scene:
         copied.bodies = [body for body, _ in made]
         copied.attachments = []
     for one in scene.attachments:
-        where = _chosen(scene.body(one.a), one, by_name[one.a][1])
-        copied.attach(one.a, where, one.b, one.stiffness, one.damping, one.name)
+        new, parents = by_name[one.a]
+        where = _chosen(scene.body(one.a), one, parents)
+        share = len(one.nodes) / len(checks.selection(where, new.rest_positions, f"attachment {one.name!r}", "node"))
+        copied.attach(one.a, where, one.b, share * one.stiffness, share * one.damping, one.name)
     return copied
 
 

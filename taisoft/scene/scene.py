@@ -44,6 +44,7 @@ class Scene(Guarded):
         "gravity": "call sim.set_gravity(gravity)",
         "set_contact": "call sim.set_contact(name_a, name_b, friction=...)",
         "contact_pairs": "call sim.set_contact(name_a, name_b, friction=...)",
+        **dict.fromkeys(("tendons", "add_tendon"), "call sim.set_tension(name, force)"),
     }
 
     def __init__(self, gravity=(0.0, -9.81, 0.0)):

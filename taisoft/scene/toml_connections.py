@@ -7,7 +7,7 @@ from taisoft.scene.connections import Point
 from taisoft.scene.key_frames import KeyFrames
 from taisoft.scene.loads import LoadPath
 from taisoft.scene.scene import Scene
-from taisoft.scene.tables import Table, arguments_of
+from taisoft.scene.tables import Table, arguments_of, key_path
 
 
 def add_connections(scene: Scene, tables: Table, selection: Callable) -> None:
@@ -31,14 +31,15 @@ def add_connections(scene: Scene, tables: Table, selection: Callable) -> None:
 def _points(table: Table, key: str) -> list:
     if not isinstance(table.values[key], list):
         raise table.error(key, 'must be a list of points ["NAME", POINT]')
-    return [_point(table, f"{key}[{k}]", value) for k, value in enumerate(table.values[key])]
+    return [_point(table, key, value, f"[{k}]") for k, value in enumerate(table.values[key])]
 
 
-def _point(table: Table, key: str, value) -> tuple:
-    """Return the name and the point of a list of the two."""
+def _point(table: Table, key: str, value, entry: str = "") -> tuple:
+    """Return the name and the point of a list of the two. entry: where it is in the key's value."""
     if not isinstance(value, list) or len(value) != 2 or not isinstance(value[0], str):
-        raise table.error(key, 'must be ["NAME", POINT], a body or an obstacle, and a position or a node id')
-    return tuple(value)
+        place = f"{table.file}: {key_path(table.place, key)}{entry}"
+        raise SceneError(f'{place} must be ["NAME", POINT], a body or an obstacle, and a position or a node id')
+    return value[0], value[1]
 
 
 def connection_tables(scene: Scene, ids: Callable, fields: Callable) -> dict:

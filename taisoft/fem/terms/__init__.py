@@ -5,7 +5,7 @@ A term is a module with
     LOAD              whether it is an applied load, which static residuals are relative to
     ACCELERATION      whether explicit steps use `acceleration(m, i)` [m/s^2] instead of `force`
     force(m, i)       on node i at the present x [N]; for elasticity, after its elements have been summed
-    energy(m, i)      node i's part of its potential [J], in f64; elasticity has `element_energy` instead
+    energy(m, i)      node i's part of its potential [J], in f64; elasticity and springs have energies of elements instead
     STIFFNESS         whether it depends on x and has add_stiffness(m, A, i, beta, projected), which adds node i's row of its
                       beta^2 K to the matrix A of implicit steps, and beta times its damping; elasticity's blocks are assembled
                       by `linear.block_csr` itself

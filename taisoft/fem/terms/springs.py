@@ -8,7 +8,7 @@ l = 0 the direction of an element that has a rest length is undefined: it does n
 import taichi as ti
 
 SWITCH, LOAD, ACCELERATION, STIFFNESS, PREPARED = "springs", False, False, True, True
-TINY = 1e-200  # [m]; avoids a division by 0
+TINY = 1e-30  # [m]; avoids a division by 0, and is no smaller since literals may be f32
 
 
 @ti.func
