@@ -313,7 +313,7 @@ def test_a_tension_that_becomes_negative_along_its_path_stops_the_run(integrator
     scene = ts.Scene(gravity=(0, 0, 0))
     scene.add_body(cube(), rubber(), name="a")
     scene.add_tendon([("a", 0), ("a", 4)], lambda t: 1.0 - 1e3 * t, name="line")
-    message = "tendon 'line': force: its path gave -[0-9.]+ N at t = 0.00[0-9]+ s: a tendon cannot push"
+    message = "tendon 'line': its path gave -[0-9.]+ N at t = 0.00[0-9]+ s: a tendon cannot push"
     with simulator(scene, integrator, 1e-4) as sim, pytest.raises(ts.SimulationError, match=message):
         for _ in range(20):
             sim.step()

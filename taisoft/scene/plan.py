@@ -82,7 +82,8 @@ def make_plan(scene: Scene, explicit: bool, multistep: bool, self_collision: boo
     loaded = [b.name for b in scene.bodies if b.loads]
     why = f"tractions or forces on {_shorten(loaded)}" if loaded else "bodies can be dragged"
     plan.add("loads", loaded or draggable, why, "no traction and no force")
-    add_if_any("load_paths", lambda b: any(load.path for load in b.loads), "on", "every load is constant")
+    varied = [b.name for b in scene.bodies if any(load.path for load in b.loads)] + [t.name for t in scene.tendons if t.path]
+    plan.add("load_paths", varied, f"on {_shorten(varied)}", "every load is constant")
     add_if_any("fixed_nodes", lambda b: any(c.path is None for c in b.constraints), "on", "no node is fixed")
     add_if_any("moving_nodes", lambda b: any(c.path is not None for c in b.constraints), "paths on", "no node follows a path")
     for damping in ("mass_damping", "stiffness_damping"):
