@@ -98,7 +98,7 @@ def test_a_colour_bar_fits_a_small_picture(size):
 
 def test_a_caption_beside_plots_leaves_the_bodies_visible():
     sim, scene, plots = FakeSimulator(beam_scene()), beam_scene(), filled()
-    picture = Offscreen(scene, SIZE, renderer="software").image(sim)
+    picture = Offscreen(scene, SIZE).image(sim)
     both = Annotations(plots, "beam").draw(picture, sim, 0)
     assert np.array_equal(both[10:280, : SIZE[0] - 160], picture[10:280, : SIZE[0] - 160])
 

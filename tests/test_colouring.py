@@ -64,7 +64,7 @@ def test_pictures_by_stress():
     sim = FakeSimulator(scene)
     sim.time = 1.0
     for colour in ("body", "stress"):
-        images.append(Offscreen(scene, (160, 90), renderer="software", colour=colour).image(sim).astype(int))
+        images.append(Offscreen(scene, (160, 90), colour=colour).image(sim).astype(int))
     own, stress = images
     differs = np.abs(own - stress).max(axis=2) > 30
     assert 0.03 < differs.mean() < 0.4, "bodies only"

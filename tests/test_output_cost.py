@@ -1,6 +1,6 @@
 """The cost of output:
 
-* rendering compiles no kernels, so that a run of another mesh adds none to the cache on disk;
+* pictures of another mesh compile no kernels, and the window's renderer none at all;
 * compilation within an observer counts as compile time, not as output time, which is part of the run's wall time.
 """
 
@@ -38,7 +38,6 @@ def kernels(cache) -> set[str]:
     return {path.name for path in cache.glob("taisoft/kernels/*.tic")}
 
 
-@needs_vulkan
 def test_images_of_another_mesh_add_no_kernels_to_the_cache(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     cached = []
@@ -47,7 +46,7 @@ def test_images_of_another_mesh_add_no_kernels_to_the_cache(tmp_path, monkeypatc
         process = child("run", scene, "--headless", "--no-usd", "--layers", "wires", "--out", tmp_path / scene.stem)
         _, error = process.communicate(timeout=120)
         assert process.returncode == 0, error
-        assert (tmp_path / scene.stem / "frames/00003.png").is_file() and "in software" not in error
+        assert (tmp_path / scene.stem / "frames/00003.png").is_file()
         cached.append(kernels(tmp_path / "cache"))
     assert cached[0] and cached[1] == cached[2] == cached[0]
 
