@@ -156,7 +156,7 @@ class Recording:
             numbers |= {"first": self._first or 0, "errors": shown.errors}
             usd = UsdWriter(folder, sim.scene, **numbers)
             observers.members.append(usd)
-            self._checkpoints.before = usd.flush
+            self._checkpoints.before.append(usd.flush)
         if self._first is not None:
             self._folder.clear(self._first)
         drawing = annotate = None
@@ -165,7 +165,9 @@ class Recording:
             drawing.resume(self._notes.get("camera"))
             if shown.plots or shown.caption is not None:
                 annotate = Annotations(plots if shown.plots else None, shown.caption, drawing.colouring).draw
-            observers.members.append(FrameWriter(folder, drawing, annotate))
+            pictures = FrameWriter(folder, drawing, annotate)
+            observers.members.append(pictures)
+            self._checkpoints.before.append(pictures.flush)
         self._checkpoints.notes = lambda: {"fps": fps, "camera": drawing.camera.distance if drawing else None}
         observers.members.append(self._checkpoints)
 
