@@ -4,8 +4,8 @@ taisoft bench pictures [--quick] [--out FILE.json]
 
 A scene of about 20,000 triangles, a ball and a cube on the ground, drawn by the kernels and by the rasteriser in NumPy of earlier
 versions, in turn in one process, and the coding of its picture as PNG. Each is the median of rounds, with the range. Then runs of
-demos with 60 pictures and without any, in turn: wall times, the time spent before the next step may begin, and their ratio. Kernels
-are compiled before. Exit status: 0, or 1 if pictures are less than eight times as cheap as NumPy's.
+demos without pictures and with 60, in turn: wall times, the part in which the simulation waits for a picture, and their ratio.
+Kernels are compiled before. Exit status: 0, or 1 if pictures are less than eight times as cheap as NumPy's.
 """
 
 import sys
@@ -65,11 +65,7 @@ def measure_picture(quick: bool) -> dict:
         kernels, numpy, first = Offscreen(scene), NumpyOffscreen(scene), time.perf_counter()
         picture = kernels.image(sim)
         first = time.perf_counter() - first
-        ways = {
-            "NumPy": lambda: numpy.image(sim),
-            "kernels": lambda: kernels.image(sim),
-            "PNG": lambda: png_bytes(picture),
-        }
+        ways = {"NumPy": lambda: numpy.image(sim), "kernels": lambda: kernels.image(sim), "PNG": lambda: png_bytes(picture)}
         seconds: dict[str, list[float]] = {what: [] for what in ways}
         for _ in range(QUICK_ROUNDS if quick else ROUNDS):
             for what, way in ways.items():

@@ -120,6 +120,14 @@ def test_four_samples_are_averaged(runtime):
     assert (picture[:, :2] == 0).all() and (picture[:, 2] == 100).all() and (picture[:, 3:] == 200).all()
 
 
+@pytest.mark.parametrize("depth", [2.0**k for k in (-3, -2, -1, 0, 40)])
+def test_depths_whose_bits_are_round(runtime, depth):
+    """Keys are compared and combined as integers: those of 1/depth = 2 add up to 0."""
+    points = np.array([[-300.0, -300, depth], [900, -300, depth], [-300, 900, depth]])
+    picture, inverse = drawn(points, np.array([[0, 1, 2]]), np.eye(3)[[0, 0, 0]], near=0.01)
+    assert (picture == (255, 0, 0)).all() and np.allclose(inverse, 1 / depth, rtol=1e-8)
+
+
 def test_invisible_triangles_are_skipped(runtime):
     """Near the eye, without area, not finite, far outside: none of them changes the picture or disturbs a good one."""
     good = np.array([[10.0, 10, 2], [90, 20, 2], [30, 80, 2]])

@@ -3,8 +3,8 @@
 The picture is cut into square tiles (Fuchs et al. 1989). A serial loop lists the triangles of every tile in their order, and a
 parallel loop draws tile by tile. No two threads write to one sample, so a picture is the same in every run. A triangle covers the
 samples of a row between its edges. Two triangles that share an edge compute its crossing with the row from the same numbers, so
-they leave no gap. The z-buffer holds 1/depth, which like attribute/depth is linear in the picture. Its lowest bits hold the
-triangle's number in the tile's list instead, so that the larger of two such keys, as integers, is that of the nearer triangle.
+they leave no gap. The z-buffer holds keys: the bits of 1/depth, which like attribute/depth is linear in the picture, with the
+triangle's number in the tile's list in the lowest ones. So the larger of two keys, as integers, is that of the nearer triangle.
 
 All numbers are f64 in every runtime: pictures do not depend on the precision of the simulation. Arrays are NumPy's; on CUDA
 Taichi copies them for every launch.
@@ -21,7 +21,6 @@ MAX_COORDINATE = 1e6  # samples; triangles beyond are skipped, and `Camera.clipp
 MIN_AREA = 1e-10  # samples^2; twice that of a triangle that is drawn
 FLAT = 1e-12  # samples; an edge that rises less bounds no row
 UNBOUNDED = 1e30  # samples, where an edge does not bound a row
-BUFFERS = 1024  # z-buffers of a tile each; Taichi runs parallel loops of fewer iterations on one thread
 MAX_LISTED = 2**31 - 1
 ARRAY = ti.types.ndarray()
 
@@ -33,7 +32,6 @@ class Raster:
         self.size = size
         self._columns, rows = (-(-extent // TILE) for extent in size)
         self._ends = np.zeros(self._columns * rows + 1, dtype=np.int64)
-        self._keys = np.zeros(min(self._columns * rows, BUFFERS) * TILE**2, dtype=np.int64)
         self._listed = np.zeros(1, dtype=np.int32)
         self._planes = np.zeros((0, 0))
 
@@ -83,7 +81,7 @@ class Raster:
         has_picture, has_depths = picture is not None, depths is not None
         images = picture if has_picture else np.zeros((1, 1, 3), np.uint8), depths if has_depths else np.zeros((1, 1))
         sizes = n, self.size[0], self._columns, has_picture, has_depths
-        draw(*sizes, *of_triangles, self._listed, self._keys, shadows, *images)
+        draw(*sizes, *of_triangles, self._listed, shadows, *images)
 
 
 @kernel(cse=False)
@@ -183,15 +181,14 @@ def draw(
     boxes: ARRAY,
     ends: ARRAY,
     listed: ARRAY,
-    keys: ARRAY,
     shadows: ARRAY,
     picture: ARRAY,
     depths: ARRAY,
 ):
     """List the first n triangles by tile, and draw tile by tile: colours into picture, and 1/depth into depths.
 
-    ends: the beginning of every tile's list becomes its end, which is the next one's beginning. keys: z-buffers of a tile each.
-    An iteration draws several tiles, one after the other, into one of them, so that they stay in the cache.
+    ends: the beginning of every tile's list becomes its end, which is the next one's beginning. A tile is drawn by pairs of rows,
+    whose keys are local vectors: its z-buffer needs no memory.
     """
     ti.loop_config(serialize=True)
     for t in range(n):
@@ -202,60 +199,44 @@ def draw(
                     listed[ti.i32(ends[tile])] = t
                     ends[tile] = ends[tile] + 1
 
-    n_buffers = keys.shape[0] // TILE**2
-    for buffer in range(n_buffers):
-        n_tiles, start = ends.shape[0] - 1, buffer * TILE**2
-        for turn in range((n_tiles + n_buffers - 1) // n_buffers):
-            tile = turn * n_buffers + buffer
-            first, last = 0, 0
-            if tile < n_tiles:
-                last = ti.i32(ends[tile])
-                if tile > 0:
-                    first = ti.i32(ends[tile - 1])
-            if first < last:
-                top, left = tile // columns * TILE, tile % columns * TILE
-                cover(first, last, top, left, width, start, edges, planes, boxes, listed, keys)
-                if has_picture:
-                    resolve(first, top // SAMPLES, left // SAMPLES, start, planes, boxes, listed, keys, shadows, picture)
+    for tile in range(ends.shape[0] - 1):
+        first, last = 0, ti.i32(ends[tile])
+        if tile > 0:
+            first = ti.i32(ends[tile - 1])
+        if first < last:
+            top, left = tile // columns * TILE, tile % columns * TILE
+            right = ti.min(left + TILE, width) - 1
+            for pair in range(TILE // SAMPLES):
+                row = top + SAMPLES * pair
+                upper = ti.Vector([ti.i64(0)] * TILE)
+                lower = ti.Vector([ti.i64(0)] * TILE)
+                for index in range(first, last):
+                    t = listed[index]
+                    cover(upper, t, index - first, row, left, right, edges, planes, boxes)
+                    cover(lower, t, index - first, row + 1, left, right, edges, planes, boxes)
+                if has_picture and row // SAMPLES < picture.shape[0]:
+                    resolve(upper, lower, first, row // SAMPLES, left // SAMPLES, planes, boxes, listed, shadows, picture)
                 if has_depths:
-                    for sample in range(TILE**2):
-                        row, column = top + sample // TILE, left + sample % TILE
-                        if row < depths.shape[0] and column < depths.shape[1]:
-                            depths[row, column] = ti.bit_cast(keys[start + sample] & ~ORDINALS, ti.f64)
+                    for column in range(TILE):
+                        if left + column < depths.shape[1]:
+                            if row < depths.shape[0]:
+                                depths[row, left + column] = ti.bit_cast(upper[column] & ~ORDINALS, ti.f64)
+                            if row + 1 < depths.shape[0]:
+                                depths[row + 1, left + column] = ti.bit_cast(lower[column] & ~ORDINALS, ti.f64)
 
 
 @ti.func
-def cover(
-    first,
-    last,
-    top,
-    left,
-    width,
-    start,
-    edges: ti.template(),
-    planes: ti.template(),
-    boxes: ti.template(),
-    listed: ti.template(),
-    keys: ti.template(),
-):
-    """Draw the triangles of a list into the z-buffer of a tile, keys[start] and the following; 0 is the background."""
-    for sample in range(start, start + TILE**2):
-        keys[sample] = ti.i64(0)
-    right = ti.min(left + TILE, width) - 1
-    for index in range(first, last):
-        t, ordinal = listed[index], ti.i64(index - first)
-        slopes = ti.Vector([edges[t, 0], edges[t, 1], edges[t, 2]])
-        lefts = ti.Vector([edges[t, 3], edges[t, 4], edges[t, 5]])
-        rights = ti.Vector([edges[t, 6], edges[t, 7], edges[t, 8]])
-        a, b, c = planes[t, 0], planes[t, 1], planes[t, 2]
-        for row in range(ti.max(boxes[t, 2], top), ti.min(boxes[t, 3], top + TILE - 1) + 1):
-            y = ti.f64(row) + 0.5
-            begin = ti.ceil(ti.max((lefts + slopes * y).max() - 0.5, ti.f64(left)))
-            end = ti.floor(ti.min((rights + slopes * y).min() - 0.5, ti.f64(right)))
-            at_row, at = b * y + c, start + (row - top) * TILE - left
-            if begin <= end:
-                for column in range(ti.i32(begin), ti.i32(end) + 1):
-                    value = a * (ti.f64(column) + 0.5) + at_row
-                    key = ti.bit_cast(value, ti.i64) & ~ORDINALS | ordinal
-                    if key > keys[at + column]:
-                        keys[at + column] = key
+def cover(keys: ti.template(), t, ordinal, row, left, right, edges: ti.template(), planes: ti.template(), boxes: ti.template()):
+    """Draw triangle t, number `ordinal` of its tile, into the keys of a row of samples; a key of 0 is the background."""
+    if boxes[t, 2] <= row and row <= boxes[t, 3]:
+        y = ti.f64(row) + 0.5
+        begin = ti.max(edges[t, 3] + edges[t, 0] * y, ti.max(edges[t, 4] + edges[t, 1] * y, edges[t, 5] + edges[t, 2] * y))
+        end = ti.min(edges[t, 6] + edges[t, 0] * y, ti.min(edges[t, 7] + edges[t, 1] * y, edges[t, 8] + edges[t, 2] * y))
+        begin, end = ti.ceil(ti.max(begin - 0.5, ti.f64(left))), ti.floor(ti.min(end - 0.5, ti.f64(right)))
+        if begin <= end:
+            a, at_row = planes[t, 0], planes[t, 0] * (left + 0.5) + planes[t, 1] * y + planes[t, 2]
+            number, first, last = ti.i64(ordinal), ti.i32(begin) - left, ti.i32(end) - left
+            for column in range(TILE):  # all of the row: the compiler makes SIMD of a loop of fixed length
+                key = ti.bit_cast(a * ti.f64(column) + at_row, ti.i64) & ~ORDINALS | number
+                key = ti.select(column >= first and column <= last, key, ti.i64(0))
+                keys[column] = ti.max(keys[column], key)
