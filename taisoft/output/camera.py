@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -60,13 +61,13 @@ class Camera:
         """Position of the eye (3,) [m]."""
         return self.target - self.distance * self.forward
 
-    @property
+    @cached_property
     def forward(self) -> np.ndarray:
         """Unit vector (3,) from the eye to the target."""
         azimuth, elevation = math.radians(self.azimuth), math.radians(self.elevation)
         return -np.array([math.sin(azimuth) * math.cos(elevation), math.sin(elevation), math.cos(azimuth) * math.cos(elevation)])
 
-    @property
+    @cached_property
     def axes(self) -> np.ndarray:
         """Orthonormal axes of the picture (3,3), rows right, up, forward."""
         right = np.cross(self.forward, UP)

@@ -21,7 +21,7 @@ from taisoft.output.files import make_folder
 
 FRAMES_NAME, VIDEO_NAME = "frames", "video.mp4"
 WAITING = 8  # pictures, of 2.8 MB each at 1280 x 720
-COMPRESSION = 4  # zlib level, 1 to 9: higher levels take twice the time for hardly fewer bytes
+COMPRESSION, SMALLEST = 4, 9  # zlib levels; 9 takes several times as long for a tenth fewer bytes
 TIMEOUT = 600.0  # of the encoding [s]
 ENCODING = "-c:v libx264 -crf 18 -pix_fmt yuv420p -vf pad=ceil(iw/2)*2:ceil(ih/2)*2 -movflags +faststart -f mp4"
 
@@ -80,8 +80,11 @@ class FrameWriter:
             raise self._error
 
 
-def png_bytes(image: np.ndarray) -> bytes:
-    """Encode an 8-bit RGB image (height, width, 3) as PNG (ISO/IEC 15948), with rows filtered by their upper neighbour."""
+def png_bytes(image: np.ndarray, level: int = COMPRESSION) -> bytes:
+    """Encode an 8-bit RGB image (height, width, 3) as PNG (ISO/IEC 15948), with rows filtered by their upper neighbour.
+
+    level: of compression by zlib, 1 to 9. Raises ValueError for another array.
+    """
     if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3 or 0 in image.shape:
         raise ValueError(f"a picture must be uint8 (height, width, 3), not {image.dtype} {image.shape}")
     height, width = image.shape[:2]
@@ -92,7 +95,7 @@ def png_bytes(image: np.ndarray) -> bytes:
     np.subtract(rows[1:], rows[:-1], out=filtered[1:, 1:])  # modulo 256, as the format requires
     header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)  # 8 bits, RGB, not interlaced
     png = b"\x89PNG\r\n\x1a\n"
-    for kind, data in ((b"IHDR", header), (b"IDAT", zlib.compress(filtered, COMPRESSION)), (b"IEND", b"")):
+    for kind, data in ((b"IHDR", header), (b"IDAT", zlib.compress(filtered, level)), (b"IEND", b"")):
         png += struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
     return png
 
