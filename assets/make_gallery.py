@@ -14,7 +14,7 @@ import taisoft as ts
 from taisoft.cli.scene_file import load_module
 from taisoft.files import write_bytes
 from taisoft.output.camera import Camera
-from taisoft.output.frames import png_bytes
+from taisoft.output.frames import SMALLEST, png_bytes
 from taisoft.view.offscreen import Offscreen
 from taisoft.view.scene_view import IN_PICTURES
 
@@ -91,7 +91,7 @@ def main() -> None:
     """Writes gallery/<demo>.png for the demos named, or for all."""
     names = sys.argv[1:] or list(STRIPS)
     for name in names:
-        data = png_bytes(strip(ASSETS.parent / "demos" / f"{name}.py", *STRIPS[name]))
+        data = png_bytes(strip(ASSETS.parent / "demos" / f"{name}.py", *STRIPS[name]), SMALLEST)
         path = ASSETS / "gallery" / f"{name}.png"
         if len(data) > MAX_BYTES:
             raise SystemExit(f"{path}: {len(data)} bytes, at most {MAX_BYTES} are meant to be kept")

@@ -33,6 +33,7 @@ WRITES = {
     "hard": ("json",),
     "report": ("folder",),
     "startup": ("json",),
+    "pictures": ("json",),
 }
 OPTIONS = {"json": ("--out", ".json"), "png": ("--plot", ".png"), "folder": ("--out", "")}
 NO_QUICK = ("references",)

@@ -27,6 +27,8 @@ from .hard_table import ALL, cells, headline, how_solved, shown_columns, tally
 from .ipc_runs import Record, mean
 from .order import DEFAULT_DEGREE, GOAL
 from .order_cases import HANGING
+from .pictures import picture_table
+from .pictures import run_table as picture_runs
 from .reference_cases.record import label
 from .runner import make_parser
 from .tolerance import Fixed
@@ -134,6 +136,12 @@ def scaling(results: Path) -> str:
     return markdown(headings, lines, left=(0,)) + measured_on(numbers)
 
 
+def pictures(results: Path) -> str:
+    """Times of a picture, and of runs without and with pictures."""
+    numbers = newest(results, "pictures")
+    return f"{picture_table(numbers['picture'])}\n\n{picture_runs(numbers['runs'])}{measured_on(numbers)}"
+
+
 def hard(results: Path) -> str:
     """The hard cases: how many variants are solved, how they ended, and why the others are not solved."""
     numbers = newest(results, "hard")
@@ -237,6 +245,7 @@ TABLES: dict[str, Callable[[Path], str]] = {  # by marker
     "error": error,
     "tolerance": tolerance,
     "crossings": crossings,
+    "pictures": pictures,
 }
 
 

@@ -12,7 +12,7 @@ from make_gallery import film  # noqa: E402
 
 import taisoft as ts  # noqa: E402
 from taisoft.files import write_bytes  # noqa: E402
-from taisoft.output.frames import png_bytes  # noqa: E402
+from taisoft.output.frames import SMALLEST, png_bytes  # noqa: E402
 
 GROUND = ts.HalfSpace((0, 0, 0), (0, 1, 0))
 
@@ -61,7 +61,7 @@ PICTURES = {"drop": drop, "ring": ring, "identify": identify}
 
 def main(names: list[str]) -> None:
     for name in names or PICTURES:
-        data = png_bytes(PICTURES[name]())
+        data = png_bytes(PICTURES[name](), SMALLEST)
         write_bytes(Path(__file__).parent / "pictures" / f"{name}.png", data)
         print(f"{name}: {len(data):,} bytes")
 

@@ -16,7 +16,7 @@ from test_view import body_mask
 from taisoft.errors import OutputError
 from taisoft.view import annotations
 from taisoft.view.annotations import Annotations
-from taisoft.view.colouring import Colouring
+from taisoft.view.colouring import COLOURS, Colouring
 from taisoft.view.offscreen import Offscreen
 from taisoft.view.plots import PLOTS, QUANTITIES
 from taisoft.view.scene_view import Surfaces
@@ -96,9 +96,27 @@ def test_a_colour_bar_fits_a_small_picture(size):
     assert (coloured != plain).any()
 
 
+def test_a_colour_bar_alone():
+    """Its ends have the colours of the ends of the scale, and it follows the scale."""
+    sim, scene = FakeSimulator(beam_scene()), beam_scene()
+    colouring = Colouring(scene, Surfaces(scene), "stress")
+    drawing = Annotations(colouring=colouring)
+    assert np.array_equal(drawing.draw(grey((1280, 720)), sim, 0), grey((1280, 720))), "no scale yet"
+    pictures = []
+    for sim.time in (0.0, 0.0, 9.0):
+        colouring.base(sim)
+        pictures.append(drawing.draw(grey((1280, 720)), sim, 0))
+    left, top, right, bottom = bounds(pictures[0], grey((1280, 720)))
+    assert 8 < left < 18 and 230 < right < 252 and 640 < top and bottom <= 704
+    bar = pictures[0][681, 16:236]
+    assert np.abs(bar[[0, 110, -1]] - 255 * COLOURS[[0, 2, -1]]).max() < 6
+    assert np.array_equal(pictures[0], pictures[1]) and not np.array_equal(pictures[1], pictures[2])
+    assert np.array_equal(pictures[2][681, 16:236], bar), "only the numbers differ"
+
+
 def test_a_caption_beside_plots_leaves_the_bodies_visible():
     sim, scene, plots = FakeSimulator(beam_scene()), beam_scene(), filled()
-    picture = Offscreen(scene, SIZE, renderer="software").image(sim)
+    picture = Offscreen(scene, SIZE).image(sim)
     both = Annotations(plots, "beam").draw(picture, sim, 0)
     assert np.array_equal(both[10:280, : SIZE[0] - 160], picture[10:280, : SIZE[0] - 160])
 

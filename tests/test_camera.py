@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
+from benchmarks.numpy_raster import rasterise
 from taisoft.output.camera import BORDER, FILL, Camera
-from taisoft.view.offscreen import MAX_COORDINATE, rasterise
+from taisoft.view.raster import MAX_COORDINATE
 
 SIZE = (320, 180)
 

@@ -104,7 +104,8 @@ def test_a_killed_run_continues(single, tmp_path):
     path, out = write(tmp_path / "scene.py", LED.replace("{body}", dying)), tmp_path / "out"
     process = child("run", path, "--headless", "--out", out, "--seconds", "0.2", "--checkpoint-every", str(2 / 30))
     process.communicate(timeout=120)
-    assert process.returncode == 9 and not (out / "scene.usdc").exists() and (out / "frames" / "00005.png").exists()
+    assert process.returncode == 9 and not (out / "scene.usdc").exists()
+    assert {f"{k:05d}.png" for k in range(5)} <= {path.name for path in (out / "frames").iterdir()}, "those of the checkpoint"
     assert read_checkpoint(out / "checkpoint.npz").state["simulation"]["time"] == pytest.approx(4 / 30)
     write(path, GENTLE)
     assert run(path, "--out", out, "--resume", out / "checkpoint.npz", "--seconds", "0.2") == 0

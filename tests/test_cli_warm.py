@@ -81,12 +81,12 @@ def test_demos_compile_nothing_after_warming(tmp_path):
         "warm.structures, warm.static_structures = t.DEMOS.values, tuple\nmain(['warm'])"
     )
     done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
-    assert len(done.stdout.splitlines()) == len(DEMOS) + 1 and done.stderr == ""
+    assert len(done.stdout.splitlines()) == len(DEMOS) + 2 and done.stderr == ""
     before = set(tmp_path.rglob("*.tic"))
     assert len(before) > 5
     for name in DEMOS:
-        command = [sys.executable, "-m", "taisoft", "run", name, "--headless", "--seconds", "0.1", "--no-frames"]
-        command += ["--out", str(tmp_path / name)]  # with a scene.usdc
+        command = [sys.executable, "-m", "taisoft", "run", name, "--headless", "--seconds", "0.1"]
+        command += ["--out", str(tmp_path / name)]  # with pictures and a scene.usdc
         done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
         assert set(tmp_path.rglob("*.tic")) == before, name
         assert "compiling" not in done.stderr
@@ -135,5 +135,6 @@ def test_precisions(requested, simulated, static, monkeypatch, capsys):
     monkeypatch.setattr(warm, "static_structures", lambda: [structure])
     monkeypatch.setattr(warm, "simulate", lambda structure, precision: found.append(precision))
     monkeypatch.setattr(warm, "solve", lambda structure, precision: found.append(precision))
+    monkeypatch.setattr(warm, "draw", lambda structure, precision: found.append(precision))
     assert main(["warm", *(["--precision", requested] if requested else [])]) == 0
-    assert found == [simulated, static] and f"statics in {static}" in capsys.readouterr().out
+    assert found == [simulated, static, simulated] and f"statics in {static}" in capsys.readouterr().out

@@ -3,15 +3,17 @@
 * a bar stretched by s has stretch s at every node, linear and quadratic, in any orientation;
 * the scale ends at 1, 2 or 5 times a power of ten, rises immediately, does not flicker, and falls when it is far too high;
 * markers and obstacles keep their colours, unknown names are refused;
-* pictures by stress differ from those in the bodies' colours; `taisoft run --colour` makes them.
+* pictures by stress differ from those in the bodies' colours; `taisoft run --colour` makes them, with a colour bar if it can.
 """
 
 import numpy as np
 import pytest
 from command import BEAM, run, write
 from fake_simulator import FakeSimulator, beam_scene
+from png import decode
 
 import taisoft as ts
+from taisoft.cli import recording
 from taisoft.errors import OutputError
 from taisoft.view.colouring import COLOURS, Colouring, round_up
 from taisoft.view.offscreen import Offscreen
@@ -64,7 +66,7 @@ def test_pictures_by_stress():
     sim = FakeSimulator(scene)
     sim.time = 1.0
     for colour in ("body", "stress"):
-        images.append(Offscreen(scene, (160, 90), renderer="software", colour=colour).image(sim).astype(int))
+        images.append(Offscreen(scene, (160, 90), colour=colour).image(sim).astype(int))
     own, stress = images
     differs = np.abs(own - stress).max(axis=2) > 30
     assert 0.03 < differs.mean() < 0.4, "bodies only"
@@ -72,13 +74,18 @@ def test_pictures_by_stress():
     assert red[:, 80:].any() and not red[:, :60].any(), "the stress of FakeSimulator grows along x"
 
 
-def test_colour_option(tmp_path):
-    scene = write(tmp_path / "beam.py", BEAM)
+def test_colour_option(tmp_path, monkeypatch, capsys):
+    """With a colour bar at the lower left, or a line that says why there is none."""
+    scene, missing = write(tmp_path / "beam.py", BEAM), "text in pictures needs Pillow: pip install 'taisoft[plot]'"
     pictures = []
-    for colour in ("body", "stress"):
-        out = tmp_path / colour
-        assert run(scene, "--out", out, "--no-usd", "--colour", colour) == 0
-        pictures.append((out / "frames" / "00003.png").read_bytes())
-    assert pictures[0] != pictures[1]
+    for name, colour, reason in (("own", "body", ""), ("bar", "stress", ""), ("bare", "stress", missing)):
+        monkeypatch.setattr(recording, "text_missing", lambda reason=reason: reason)
+        assert run(scene, "--out", tmp_path / name, "--no-usd", "--colour", colour) == 0
+        assert (f"pictures have no colour bar: {missing}" in capsys.readouterr().err) == bool(reason)
+        pictures.append(decode((tmp_path / name / "frames" / "00003.png").read_bytes()).astype(int))
+    own, bar, bare = pictures
+    corner = np.s_[640:710, :250]
+    assert np.array_equal(own[corner], bare[corner]) and (np.abs(bar - bare)[corner].max(axis=2) > 60).mean() > 0.1
+    assert (np.abs(own - bare).max(axis=2) > 30).mean() > 0.03
     with pytest.raises(SystemExit, match="2"):
         run(scene, "--colour", "heat")

@@ -1,20 +1,29 @@
 """Image files, and the progress of a run:
 
 * a PNG decodes to the same image, and frames are numbered with five digits;
+* pictures are written by a thread while the run goes on, at most WAITING wait, and all are there after a flush or a close;
+* a picture that cannot be written is an error at the next frame, flush or close, and no later one is written;
 * progress is a bar on a terminal and lines elsewhere, both with steps/s and the time left.
 """
 
 import io
 import re
+import subprocess
+import sys
+import threading
+from pathlib import Path
 
 import numpy as np
 import pytest
 from fake_simulator import FakeSimulator, beam_scene
 from png import decode
 
-from taisoft.output import report
+from taisoft.errors import OutputError
+from taisoft.output import frames, report
 from taisoft.output.frames import FrameWriter, png_bytes
 from taisoft.output.report import Progress
+
+ROOT = Path(__file__).resolve().parents[1]
 
 
 @pytest.mark.parametrize("shape", [(1, 1, 3), (7, 5, 3), (48, 64, 3)])
@@ -52,6 +61,79 @@ def test_frames_are_numbered_files(tmp_path):
     files = sorted((tmp_path / "frames").iterdir())
     assert [path.name for path in files] == ["00000.png", "00001.png", "00002.png"]
     assert [decode(path.read_bytes())[0, 0, 0] for path in files] == [0, 1, 2]
+
+
+def writing(tmp_path, monkeypatch, write):
+    """A writer whose files are written by `write(path, data)`."""
+    monkeypatch.setattr(frames, "write_bytes", write)
+    return FrameWriter(tmp_path, GreyRenderer()), FakeSimulator(beam_scene())
+
+
+def test_pictures_wait_for_a_slow_disk(tmp_path, monkeypatch):
+    """WAITING pictures are taken while the disk is stuck with one; the next `frame` waits for it."""
+    stuck, written = threading.Event(), []
+
+    def slow(path, data):
+        assert stuck.wait(60)
+        written.append((path.name, decode(data)[0, 0, 0]))
+
+    writer, sim = writing(tmp_path, monkeypatch, slow)
+    for index in range(frames.WAITING + 1):
+        writer.frame(sim, index)
+        sim.step()
+    assert written == []
+    last = threading.Thread(target=writer.frame, args=(sim, frames.WAITING + 1))
+    last.start()
+    last.join(0.2)
+    assert last.is_alive() and written == []
+    stuck.set()
+    last.join(60)
+    writer.flush()
+    assert written == [(f"{k:05d}.png", k) for k in range(frames.WAITING + 2)]
+    writer.close()
+    writer.close()
+    assert len(written) == frames.WAITING + 2
+
+
+@pytest.mark.parametrize("error", [OutputError("the disk is full"), RuntimeError("a defect")])
+@pytest.mark.parametrize("moment", ["frame", "flush", "close"])
+def test_an_error_of_writing_is_raised_once_it_is_known(tmp_path, monkeypatch, error, moment):
+    written = []
+
+    def failing(path, data):
+        written.append(path.name)
+        if path.name == "00001.png":
+            raise error
+
+    writer, sim = writing(tmp_path, monkeypatch, failing)
+    for index in range(2):
+        writer.frame(sim, index)
+    if moment == "frame":
+        with pytest.raises(type(error), match=str(error)):
+            for index in range(2, 10_000):
+                writer.frame(sim, index)
+    elif moment == "flush":
+        with pytest.raises(type(error), match=str(error)):
+            writer.flush()
+    with pytest.raises(type(error), match=str(error)):
+        writer.close()
+    assert writer.renderer.closed and written == ["00000.png", "00001.png"]
+
+
+def test_a_writer_that_is_not_closed_does_not_keep_the_process(tmp_path):
+    code = "import sys; sys.path[:0] = ['tests', '.']\nimport test_output_frames as t\nt.leave_open(sys.argv[1])"
+    done = subprocess.run(
+        [sys.executable, "-c", code, tmp_path], cwd=ROOT, timeout=60, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0 and done.stdout == "left\n", done.stderr
+    assert all(path.suffix == ".png" and decode(path.read_bytes()).size for path in (tmp_path / "frames").glob("*.png"))
+
+
+def leave_open(folder):
+    writer, sim = FrameWriter(folder, GreyRenderer()), FakeSimulator(beam_scene())
+    for index in range(5):
+        writer.frame(sim, index)
+    print("left", flush=True)
 
 
 class Terminal(io.StringIO):

@@ -107,7 +107,7 @@ def take_snapshot(scene: str, sim, colours: dict[str, np.ndarray]) -> Snapshot:
     J = contact_jacobian(sim._dynamics.contact.problem).tocoo()
     touched = np.zeros((J.shape[0] // 3, J.shape[1] // 3), dtype=bool)
     touched[J.row // 3, J.col // 3] = True
-    image = Offscreen(sim.scene, PICTURE, renderer="software").image(sim)
+    image = Offscreen(sim.scene, PICTURE).image(sim)
     return Snapshot(scene, image, touched[:, touched.any(axis=0)], colours)
 
 

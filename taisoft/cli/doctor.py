@@ -65,8 +65,8 @@ def cuda() -> str:
 
 
 def vulkan() -> str:
-    """Return whether Taichi finds a Vulkan driver, which windows and pictures need."""
-    hint = "no pictures, no window; install a driver (Debian: apt install mesa-vulkan-drivers)"
+    """Return whether Taichi finds a Vulkan driver, which windows need."""
+    hint = "no window; install a driver (Debian: apt install mesa-vulkan-drivers)"
     try:
         probe = subprocess.run(
             [sys.executable, "-c", VULKAN_PROBE], capture_output=True, text=True, timeout=PROBE_SECONDS, check=False

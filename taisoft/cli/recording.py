@@ -24,6 +24,7 @@ from taisoft.view.scene_view import IN_PICTURES, IN_WINDOW, LAYERS
 
 WIDTH = 118  # of the terminal
 PROBLEMS_SHOWN = 5
+MOST = 0.5  # fraction of a run's wall time above which the summary says what pictures cost
 
 
 @dataclass(frozen=True)
@@ -95,22 +96,24 @@ def check_modelled(shown: DisplayOptions, sim) -> None:
 class Observers:
     """Passes every frame to its members; after the first write error the run should end.
 
-    errors: the distinct messages of all OutputErrors; seconds: wall time spent in the members [s], without compiling, as in
-    the wall time of a run. A member has frame(sim, index) and close().
+    errors: the distinct messages of all OutputErrors; seconds, picture_seconds: wall time spent in the members, and in writers
+    of pictures [s], without compiling, as in the wall time of a run. A member has frame(sim, index) and close().
     """
 
     def __init__(self) -> None:
         self.members: list = []
         self.errors: list[str] = []
-        self.seconds = 0.0
+        self.seconds = self.picture_seconds = 0.0
 
     def on_frame(self, sim, index: int, _report) -> None:
         """Pass to Simulator.run. Never raises OutputError, because computed results must still be reported."""
-        start, compiled = time.perf_counter(), sim.compile_seconds
         for member in self.members:
+            start, compiled = time.perf_counter(), sim.compile_seconds
             if not self.errors:
                 self.guard(member.frame, sim, index)
-        self.seconds += time.perf_counter() - start - (sim.compile_seconds - compiled)
+            seconds = time.perf_counter() - start - (sim.compile_seconds - compiled)
+            self.seconds += seconds
+            self.picture_seconds += seconds if isinstance(member, FrameWriter) else 0.0
 
     def close(self) -> None:
         """Close all members, last first, even if some fail."""
@@ -156,16 +159,21 @@ class Recording:
             numbers |= {"first": self._first or 0, "errors": shown.errors}
             usd = UsdWriter(folder, sim.scene, **numbers)
             observers.members.append(usd)
-            self._checkpoints.before = usd.flush
+            self._checkpoints.before.append(usd.flush)
         if self._first is not None:
             self._folder.clear(self._first)
         drawing = annotate = None
         if shown.pictures:
             drawing = Offscreen(sim.scene, colour=shown.colour, layers=shown.in_pictures)
             drawing.resume(self._notes.get("camera"))
-            if shown.plots or shown.caption is not None:
+            no_bar = shown.colour != "body" and text_missing()
+            if no_bar:
+                print(f"taisoft: pictures have no colour bar: {no_bar}", file=sys.stderr)
+            elif shown.plots or shown.caption is not None or shown.colour != "body":
                 annotate = Annotations(plots if shown.plots else None, shown.caption, drawing.colouring).draw
-            observers.members.append(FrameWriter(folder, drawing, annotate))
+            pictures = FrameWriter(folder, drawing, annotate)
+            observers.members.append(pictures)
+            self._checkpoints.before.append(pictures.flush)
         self._checkpoints.notes = lambda: {"fps": fps, "camera": drawing.camera.distance if drawing else None}
         observers.members.append(self._checkpoints)
 
@@ -250,6 +258,9 @@ def print_summary(result: RunReport, sim, observers: Observers, recording: Recor
     output, compiling = f"{observers.seconds:.2f} s of it for output", f"{result.compile_seconds:.2f} s to compile"
     pilots = f"{result.pilot_seconds:.2f} s of pilots and " if result.pilot_seconds else ""
     _print_lines("wall", [f"{result.wall_seconds:.2f} s, {output}; plus {pilots}{compiling}"])
+    if observers.picture_seconds > MOST * result.wall_seconds:
+        share = f"{observers.picture_seconds:.2f} s of it, {observers.picture_seconds / result.wall_seconds:.0%}, for pictures"
+        _print_lines("", [f"{share}: a lower --fps draws fewer, --no-frames none"])
     if result.step_reports:
         worst = min(result.step_reports, key=lambda report: report.min_volume_ratio)
         _print_lines("min J", [f"{worst.min_volume_ratio:.4g} at {worst.time:.4g} s, {worst.n_inverted} tets inverted"])

@@ -23,6 +23,7 @@ from taisoft.scene.key_frames import KeyFrames
 from taisoft.scene.material import LAWS
 from taisoft.scene.obstacles import Box, HalfSpace, MeshObstacle
 from taisoft.scene.scene import Material, Scene
+from taisoft.view.offscreen import Offscreen
 
 IMPLICIT = ("implicit_euler", "bdf2")  # the common ones
 STATIC = ""  # in place of an integrator
@@ -44,6 +45,7 @@ def warm(arguments: Namespace) -> int:
         for structure in static_structures():
             precision = arguments.precision or "f64"
             _report(f"statics in {precision}, {structure}", solve, structure, precision)
+        _report("pictures", draw, Structure("implicit_euler", obstacles=PLANE), arguments.precision or "f32")
     print(f"{n_compiled() - before} kernels in {time.perf_counter() - start:.0f} s")
     return 0
 
@@ -83,6 +85,13 @@ def solve(structure: "Structure", precision: str) -> None:
     scene = build(structure)
     scene.gravity = STRONG_GRAVITY
     ts.solve_static(scene, precision=precision)
+
+
+def draw(structure: "Structure", precision: str) -> None:
+    """Draw a picture with a shadow; its kernels depend on nothing but the precision."""
+    scene = build(structure)
+    with ts.Simulator(scene, dt=STEPS[False][0], integrator=structure.integrator, precision=precision) as sim:
+        Offscreen(scene, (64, 36)).image(sim)
 
 
 @dataclass(frozen=True)

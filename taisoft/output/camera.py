@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -60,13 +61,13 @@ class Camera:
         """Position of the eye (3,) [m]."""
         return self.target - self.distance * self.forward
 
-    @property
+    @cached_property
     def forward(self) -> np.ndarray:
         """Unit vector (3,) from the eye to the target."""
         azimuth, elevation = math.radians(self.azimuth), math.radians(self.elevation)
         return -np.array([math.sin(azimuth) * math.cos(elevation), math.sin(elevation), math.cos(azimuth) * math.cos(elevation)])
 
-    @property
+    @cached_property
     def axes(self) -> np.ndarray:
         """Orthonormal axes of the picture (3,3), rows right, up, forward."""
         right = np.cross(self.forward, UP)
@@ -98,9 +99,9 @@ class Camera:
         return float(np.max(needed, initial=0.0, where=np.isfinite(needed)))
 
     def clipped(
-        self, x: np.ndarray, triangles: np.ndarray, colours: np.ndarray, size: tuple[int, int]
+        self, x: np.ndarray, triangles: np.ndarray, attributes: np.ndarray, size: tuple[int, int]
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Clip vertices x (n,3) [m], triangles (t,3) and colours (n,3) at the near plane and the guard band.
+        """Clip vertices x (n,3) [m], triangles (t,3) and attributes (n,k) at the near plane and the guard band.
 
         size: width and height of the picture. New vertices follow the given ones; triangles that are not finite are dropped.
         """
@@ -109,6 +110,8 @@ class Camera:
         half_width = half_height * size[0] / size[1]
         near = depth - self.clipping[0] * (1.0 + 1e-6)
         planes = [near, half_width - right, half_width + right, half_height - up, half_height + up]
+        if all((plane > 0).all() for plane in planes):
+            return x, triangles, attributes
         inside = np.stack(planes, axis=1)  # positive on each plane's inner side
         with np.errstate(invalid="ignore"):
             within = inside[triangles] > 0  # (t, corners, planes)
@@ -116,16 +119,17 @@ class Camera:
         crossing = within.any(axis=1).all(axis=1) & ~whole & np.isfinite(inside[triangles]).all(axis=(1, 2))
         faces, points = [], []
         for corners in triangles[crossing]:
-            polygon = np.concatenate([inside[corners], x[corners], colours[corners]], axis=1)
+            polygon = np.concatenate([inside[corners], x[corners], attributes[corners]], axis=1)
             for k in range(inside.shape[1]):
                 polygon = clip_polygon(polygon, k)
             first = len(x) + len(points)
             faces += [(first, first + k, first + k + 1) for k in range(1, len(polygon) - 1)]
             points += [row[inside.shape[1] :] for row in polygon]
         if not faces:
-            return x, triangles[whole], colours
+            return x, triangles[whole], attributes
         new = np.array(points)
-        return np.concatenate([x, new[:, :3]]), np.concatenate([triangles[whole], faces]), np.concatenate([colours, new[:, 3:]])
+        attributes = np.concatenate([attributes, new[:, 3:]])
+        return np.concatenate([x, new[:, :3]]), np.concatenate([triangles[whole], faces]), attributes
 
     def clipped_lines(self, ends: np.ndarray, colours: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Clip lines, ends (2k,3) [m] and colours (2k,3), at the near plane; lines that are not finite are dropped."""

@@ -201,12 +201,13 @@ class CheckpointWriter:
 
     every: simulated time between checkpoints, which are written at frames [s]; None: only at the end. resumed: the checkpoint
     from which the run resumes; if it is the folder's own it is kept as the previous one, that of another run is not. before:
-    called before each checkpoint at an interval, to flush the run's other files. notes: returns data to store with the state.
+    functions called before each checkpoint at an interval, to flush the run's other files. notes: returns data to store with
+    the state.
     """
 
     def __init__(self, folder: str | Path, every: float | None = None, resumed: str | Path | None = None):
         self.path, self.every = Path(folder) / CHECKPOINT_NAME, every
-        self.before: Callable[[], None] = lambda: None
+        self.before: list[Callable[[], None]] = []
         self.notes: Callable[[], dict] = dict
         self._last: float | None = None  # simulated time of the last checkpoint, or of the start
         self._previous = self.path.with_name(PREVIOUS_NAME)
@@ -219,7 +220,8 @@ class CheckpointWriter:
         if self._last is None:
             self._last = sim.time
         elif self.every is not None and sim.time - self._last >= self.every * (1.0 - 1e-9):
-            self.before()
+            for flush in self.before:
+                flush()
             self.write(sim)
 
     def write(self, sim) -> None:

@@ -3,9 +3,11 @@
 The video is encoded by ffmpeg: the one on PATH, else that of the extra `video`.
 """
 
+import queue
 import shutil
 import struct
 import subprocess
+import threading
 import zlib
 from collections.abc import Callable
 from importlib.util import find_spec
@@ -18,37 +20,71 @@ from taisoft.files import replacing, write_bytes
 from taisoft.output.files import make_folder
 
 FRAMES_NAME, VIDEO_NAME = "frames", "video.mp4"
-COMPRESSION = 4  # zlib level, 1 to 9: higher levels take twice the time for hardly fewer bytes
+WAITING = 8  # pictures, of 2.8 MB each at 1280 x 720
+COMPRESSION, SMALLEST = 2, 9  # zlib levels; 4 takes 1.7 times as long as 2 for a fifth fewer bytes, 9 several times as long
 TIMEOUT = 600.0  # of the encoding [s]
 ENCODING = "-c:v libx264 -crf 18 -pix_fmt yuv420p -vf pad=ceil(iw/2)*2:ceil(ih/2)*2 -movflags +faststart -f mp4"
 
 
 class FrameWriter:
-    """Observer that writes folder/frames/<index>.png.
+    """Observer that writes folder/frames/<index>.png, in a thread, so that the simulation goes on meanwhile.
 
     folder: the run's folder; renderer: an object with `image(sim) -> uint8 (height, width, 3)` and `close()`, such as
     `taisoft.view.offscreen.Offscreen`, which is closed with this writer; annotate: (picture, sim, index) -> picture to write.
-    Raises OutputError.
+    At most WAITING pictures wait; then `frame` waits too. A picture that cannot be written raises OutputError at the next
+    `frame`, `flush` or `close`; later ones are not written. Raises OutputError.
     """
 
     def __init__(self, folder: str | Path, renderer, annotate: Callable | None = None):
         self.folder = make_folder(Path(folder) / FRAMES_NAME)
         self.renderer, self._annotate = renderer, annotate
+        self._waiting: queue.Queue[tuple[Path, np.ndarray] | None] = queue.Queue(WAITING)
+        self._error: Exception | None = None
+        self._thread = threading.Thread(target=self._write_all, name="pictures", daemon=True)  # an exit does not wait for it
+        self._thread.start()
 
     def frame(self, sim, index: int) -> None:
-        """Draw sim's present state and write it as picture number index. Raises OutputError."""
+        """Draw sim's present state, to be written as picture number index. Raises OutputError."""
+        self._raise()
         picture = self.renderer.image(sim)
         if self._annotate is not None:
             picture = self._annotate(picture, sim, index)
-        write_bytes(self.folder / f"{index:05d}.png", png_bytes(picture))
+        self._waiting.put((self.folder / f"{index:05d}.png", picture))
+
+    def flush(self) -> None:
+        """Wait until all pictures are written. Raises OutputError."""
+        self._waiting.join()
+        self._raise()
 
     def close(self) -> None:
-        """Close the renderer."""
-        self.renderer.close()
+        """Write the pictures that wait, and close the renderer; a second call does nothing. Raises OutputError."""
+        if self._thread.is_alive():
+            self._waiting.put(None)
+            self._thread.join()
+            self.renderer.close()
+            self._raise()
+
+    def _write_all(self) -> None:
+        """Write pictures until None comes."""
+        while (item := self._waiting.get()) is not None:
+            try:
+                if self._error is None:
+                    write_bytes(item[0], png_bytes(item[1]))
+            except Exception as error:  # raised in the thread that draws
+                self._error = error
+            finally:
+                self._waiting.task_done()
+
+    def _raise(self) -> None:
+        if self._error is not None:
+            raise self._error
 
 
-def png_bytes(image: np.ndarray) -> bytes:
-    """Encode an 8-bit RGB image (height, width, 3) as PNG (ISO/IEC 15948), with rows filtered by their upper neighbour."""
+def png_bytes(image: np.ndarray, level: int = COMPRESSION) -> bytes:
+    """Encode an 8-bit RGB image (height, width, 3) as PNG (ISO/IEC 15948), with rows filtered by their upper neighbour.
+
+    level: of compression by zlib, 1 to 9. Raises ValueError for another array.
+    """
     if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3 or 0 in image.shape:
         raise ValueError(f"a picture must be uint8 (height, width, 3), not {image.dtype} {image.shape}")
     height, width = image.shape[:2]
@@ -59,7 +95,7 @@ def png_bytes(image: np.ndarray) -> bytes:
     np.subtract(rows[1:], rows[:-1], out=filtered[1:, 1:])  # modulo 256, as the format requires
     header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)  # 8 bits, RGB, not interlaced
     png = b"\x89PNG\r\n\x1a\n"
-    for kind, data in ((b"IHDR", header), (b"IDAT", zlib.compress(filtered, COMPRESSION)), (b"IEND", b"")):
+    for kind, data in ((b"IHDR", header), (b"IDAT", zlib.compress(filtered, level)), (b"IEND", b"")):
         png += struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
     return png
 

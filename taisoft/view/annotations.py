@@ -26,14 +26,14 @@ from taisoft.view.plots import CAPACITY, ENERGIES, GRID_LINES, PLOTS, Curves, Pl
 HEIGHT = 720.0  # of the picture that lengths refer to
 MARGIN, WIDTH = 16, 300  # of the plots
 TITLE_SIZE, TEXT_SIZE, SMALL_SIZE = 22, 15, 12  # font sizes
-CAPTION_HEIGHT = 160  # of the area for the whole caption
+CAPTION_HEIGHT = 76  # of the area for the caption
 PADDING = (22, 16, 4)  # above the curves, below them, and around a plot
 CURVE_HEIGHT, MIN_CURVE_HEIGHT = 92, 40  # the smaller one if there are many plots
 SAMPLES = 2  # per pixel and axis
 INK, FAINT, FRAME, PAPER = (38, 41, 46), (112, 116, 122), (160, 163, 168), (252, 252, 253)  # sRGB
 GRID = (222, 224, 226)
 OPACITY = 0.86  # of the plots' background
-BAR = (220, 12)  # width and height of the colour bar
+BAR, BAR_HEIGHT = (220, 12), 64  # width and height of the colour bar; height with its texts
 
 # in the window
 BOX, TEXT, GAP, LINE, TITLE = 230, 200, 8, 17, 34  # widths; heights of a line of text and of title and borders [pixels]
@@ -52,10 +52,11 @@ def text_missing() -> str:
 
 
 class Annotations:
-    """Draws plots and a caption on the pictures of a run.
+    """Draws plots, a caption and a colour bar on the pictures of a run.
 
-    plots: the visible ones are drawn; name: the scene's name for the caption, or None for no caption; colouring: for the colour
-    bar. Raises OutputError if Pillow, or matplotlib, which supplies the font, is missing.
+    plots: the visible ones are drawn; name: the scene's name for the caption, or None for no caption; colouring: its scale is
+    drawn as a colour bar, unless bodies have their own colours. Raises OutputError if Pillow, or matplotlib, which supplies the
+    font, is missing.
     """
 
     def __init__(self, plots: Plots | None = None, name: str | None = None, colouring: Colouring | None = None):
@@ -65,6 +66,7 @@ class Annotations:
         import matplotlib
 
         self._plots, self._name, self._colouring = plots, name, colouring
+        self._bar: tuple | None = None  # what it shows, and its layer
         self._names = plots.visible() if plots is not None else []  # fixed now: a window may change what is visible
         self._font_file = Path(matplotlib.get_data_path()) / "fonts/ttf/DejaVuSans.ttf"
 
@@ -78,25 +80,55 @@ class Annotations:
         if names:
             with self._overlay(result, (size[0] - MARGIN - WIDTH, MARGIN, size[0] - MARGIN, size[1] - MARGIN)):
                 self._draw_plots(names, size)
+        caption = size[1] - CAPTION_HEIGHT if self._name is not None else size[1] - MARGIN
         if self._name is not None:
-            with self._overlay(result, (0.0, size[1] - CAPTION_HEIGHT, size[0] - WIDTH * bool(names), size[1])):
+            with self._overlay(result, (0.0, caption, size[0] - WIDTH * bool(names), size[1])):
                 self._draw_caption(sim, index, size)
+        legend = self._colouring.legend() if self._colouring is not None else []
+        if legend:
+            box = (0.0, caption - BAR_HEIGHT, 2 * MARGIN + BAR[0], caption)
+            self._compose(result, box, self._bar_layer(legend, caption, self._blank(result, box)))
         return result
+
+    def _bar_layer(self, legend: list[tuple[str, np.ndarray]], bottom: float, blank):
+        """Return the colour bar as a layer; it is drawn again only when the legend or the size of the pictures changes."""
+        key = self._colouring.kind, *(text for text, _ in legend), blank.size
+        if self._bar is None or self._bar[0] != key:
+            self._draw_colour_bar(legend, bottom)
+            self._bar = key, blank.reduce(SAMPLES)
+        return self._bar[1]
 
     @contextmanager
     def _overlay(self, picture: np.ndarray, box: tuple[float, float, float, float]) -> Iterator[None]:
         """Draw in the block on a transparent layer over a part of the picture: left, top, right, bottom, in lengths."""
+        layer = self._blank(picture, box)
+        yield
+        self._compose(picture, box, layer.reduce(SAMPLES))
+
+    def _blank(self, picture: np.ndarray, box: tuple[float, float, float, float]):
+        """Return a transparent layer, SAMPLES times as large as its part of the picture, and draw on it from now on."""
         from PIL import Image, ImageDraw
 
-        factor = self._unit / SAMPLES
-        left, top, right, bottom = (max(0, round(factor * length)) for length in box)
-        part = picture[top:bottom, left:right]
-        layer = Image.new("RGBA", (SAMPLES * part.shape[1], SAMPLES * part.shape[0]), (*PAPER, 0))
+        left, top, right, bottom = self._pixels(picture, box)
+        layer = Image.new("RGBA", (SAMPLES * (right - left), SAMPLES * (bottom - top)), (*PAPER, 0))
         self._pen, self._origin = ImageDraw.Draw(layer), np.array([SAMPLES * left, SAMPLES * top], dtype=float)
-        yield
+        return layer
+
+    def _compose(self, picture: np.ndarray, box: tuple[float, float, float, float], layer) -> None:
+        """Draw a finished layer over its part of the picture."""
+        from PIL import Image
+
+        left, top, right, bottom = self._pixels(picture, box)
+        part = picture[top:bottom, left:right]
         under = Image.fromarray(np.ascontiguousarray(part)).convert("RGBA")
-        under.alpha_composite(layer.reduce(SAMPLES))
+        under.alpha_composite(layer)
         part[:] = np.asarray(under)[..., :3]
+
+    def _pixels(self, picture: np.ndarray, box: tuple[float, float, float, float]) -> list[int]:
+        """Convert a box to pixels, within the picture."""
+        height, width = picture.shape[:2]
+        edges = [max(0, round(self._unit / SAMPLES * length)) for length in box]
+        return [min(edge, limit) for edge, limit in zip(edges, (width, height, width, height))]
 
     # --- plots --------------------------------------------------------------------------------------------------------
 
@@ -142,9 +174,6 @@ class Annotations:
         text = "   ".join(f"{name} {getattr(energies, name):.4g} J" for name in ENERGIES)
         self._write(MARGIN, bottom, f"frame {index}   t = {sim.time:.4f} s   {text}", TEXT_SIZE, INK, anchor="lb", halo=True)
         self._write(MARGIN, bottom - TEXT_SIZE - 8, self._name, TITLE_SIZE, INK, anchor="lb", halo=True)
-        legend = self._colouring.legend() if self._colouring is not None else []
-        if legend:
-            self._draw_colour_bar(legend, bottom - TEXT_SIZE - TITLE_SIZE - 30)
 
     def _draw_colour_bar(self, legend: list[tuple[str, np.ndarray]], bottom: float) -> None:
         """Draw the colour bar from low to high, its limits below it, and the name of its quantity above."""

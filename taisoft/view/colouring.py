@@ -4,7 +4,7 @@ The scale begins at 0 (stretch: at 1). It ends at 1, 2 or 5 times a power of ten
 the nodes; a quantile, since stress in a nearly flat tet is unbounded. The running maximum decays slowly, and the end is lowered
 only when it is clearly too high. So the scale does not flicker, and recovers after an impact.
 
-Shading is computed per drawn vertex on the host, so that it is the same for every renderer:
+Shading is computed per drawn vertex on the host, so that it is the same in pictures and in the window:
 colour = base * (hemisphere of sky and ground light + key light + fill light) * darkening at grazing angles, which emphasizes
 silhouettes. The lamps move with the camera, so that every view is lit alike.
 """

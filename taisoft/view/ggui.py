@@ -116,9 +116,8 @@ class Canvas:
         arch, precision = open_kind() or ("cpu", "f32")
         if arch != "cpu":
             raise OutputError(f"cannot open a window: arch is '{arch}', and windows need arch cpu")
-        owner = "a window" if visible else "a picture renderer"
-        self._runtime = open_runtime(arch, precision, owner=owner)
-        _holder.append(owner)
+        self._runtime = open_runtime(arch, precision, owner="a window")
+        _holder.append("a window")
         self._surfaces, self._line_width = surfaces, line_width
         self._vertices = VertexBuffer(len(surfaces.colours))
         self._vertices.normals[:] = 0.0, 1.0, 0.0  # no effect: the colours are lit already

@@ -17,6 +17,7 @@ from taisoft.mesh.topology import linked_groups, triangle_edges
 from taisoft.output.appearance import OBSTACLE_COLOUR, ObstacleSurface, body_colour, obstacle_surfaces, subdivide
 from taisoft.output.camera import MAX_WIDENING, Camera, start_positions
 from taisoft.scene.loads import value_at
+from taisoft.scene.obstacles import HalfSpace
 from taisoft.view.colouring import Colouring, lit_colours
 
 CREASE = 35.0  # [deg] between the normals of neighbouring triangles at rest
@@ -63,8 +64,8 @@ class SceneView:
 class Surfaces:
     """All drawn surfaces as one triangle mesh of fixed topology and colours.
 
-    scene: its bodies and obstacles are read once. triangles: int32 (t,3) of drawn vertices; colours: float (n,3), unshaded
-    sRGB.
+    scene: its bodies and obstacles are read once. triangles: int32 (t,3) of drawn vertices, and body_triangles those of bodies
+    without markers; colours: float (n,3), unshaded sRGB.
     """
 
     def __init__(self, scene):
@@ -75,9 +76,17 @@ class Surfaces:
         self._nodes = np.concatenate(nodes)  # of the bodies' drawn vertices, numbered over all bodies; -1 for markers
         self.with_markers = True  # of fixed nodes
         parts = [*self._bodies, *self._obstacles]
-        firsts = np.cumsum([0] + [len(part.colours) for part in parts])
+        firsts = np.cumsum([0] + [len(part.colours) for part in parts])  # drawn vertex of each part
         self.triangles = np.concatenate([part.triangles + n for part, n in zip(parts, firsts)]).astype(np.int32)
         self.colours = np.concatenate([part.colours for part in parts])
+        self.n_of_bodies = int(firsts[len(self._bodies)])  # drawn vertices of bodies, which come first
+        self.body_triangles = np.concatenate([part.own_triangles + n for part, n in zip(self._bodies, firsts)]).astype(np.int32)
+        ranges = [slice(*ends) for ends in zip(firsts[len(self._bodies) :], firsts[len(self._bodies) + 1 :])]
+        self._half_spaces = [(at, part.surface) for at, part in zip(ranges, self._obstacles) if part.is_half_space]
+
+    def half_spaces(self, t: float) -> list[tuple[slice, np.ndarray]]:
+        """Return, for every half-space, its range of drawn vertices and the vertices (k,3) [m] of its square at time t [s]."""
+        return [(at, surface.at(t)) for at, surface in self._half_spaces]
 
     def coloured(self, colours: np.ndarray) -> np.ndarray:
         """Return colours (n,3) of all drawn vertices, given colours (n_nodes,3) of the bodies' nodes."""
@@ -166,7 +175,7 @@ class _BodySurface:
         counts = len(self._nodes), len(self._ball) * len(self._marked)
         starts = len(self._nodes) + len(self._ball) * np.arange(len(self._marked))
         markers = (starts[:, None, None] + ball_triangles).reshape(-1, 3)
-        self.triangles = np.concatenate([self._corners, markers])
+        self.own_triangles, self.triangles = self._corners, np.concatenate([self._corners, markers])
         self.colours = np.repeat([colour, MARKER_COLOUR], counts, axis=0)
         self.nodes = np.concatenate([self._nodes, np.full(counts[1], -1)])  # of each drawn vertex; -1 for markers
 
@@ -181,13 +190,13 @@ class _RigidSurface:
     """Surface of an obstacle. Triangles share no vertices, so that each can be culled."""
 
     def __init__(self, surface: ObstacleSurface):
-        self._surface = surface
+        self.surface, self.is_half_space = surface, isinstance(surface.obstacle.shape, HalfSpace)
         self._nodes, self._corners = smoothing_groups(surface.vertices, surface.triangles)
         self.triangles = np.arange(self._corners.size).reshape(-1, 3)
         self.colours = np.tile(OBSTACLE_COLOUR, (self._corners.size, 1))
 
     def vertices(self, t: float, eye: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        x = self._surface.at(t)[self._nodes]
+        x = self.surface.at(t)[self._nodes]
         corners, normals = x[self._corners], vertex_normals(x, self._corners)[self._corners]
         a, b, c = np.moveaxis(corners, 1, 0)
         back_facing = np.einsum("ti,ti->t", np.cross(b - a, c - a), eye - a) <= 0

@@ -1,0 +1,92 @@
+"""Soft shadows of the bodies on half-spaces, as maps of the fraction of light that is missing.
+
+Light falls along -UP. The bodies' triangles are drawn into a map of the half-space's boundary, each point with
+exp(-height / FADE), so that a shadow is darkest where a body touches. The map is then blurred. A map covers only the shadows, so
+that its texels are small. Obstacles cast no shadow, and receive none unless they are half-spaces.
+"""
+
+import numpy as np
+
+from taisoft.output.camera import UP, start_positions
+from taisoft.view.raster import Raster
+
+TEXELS = 128  # per side of a map
+SOFTNESS, FADE = 0.025, 0.4  # standard deviation of the blur; height: in diagonals of the bodies' bounding box at the start
+STRENGTH = 0.5  # fraction of the ground's light that a body in contact takes away
+MIN_SLOPE = 0.3  # smallest component along UP of the normal of a half-space that gets shadows
+REACH = 2.0  # standard deviations of the blur on either side
+
+
+class Shadows:
+    """Shadow maps of the half-spaces of `Surfaces`. scene: read once."""
+
+    def __init__(self, scene, surfaces):
+        self._surfaces = surfaces
+        self._size = float(np.linalg.norm(np.ptp(start_positions(scene), axis=0)))
+        self._raster: Raster | None = None  # made for the first half-space
+
+    def draw(self, x: np.ndarray, t: float) -> tuple[np.ndarray, np.ndarray]:
+        """Draw the maps for drawn vertices x (n,3) [m] at time t [s].
+
+        Returns the maps (maps, v, u) and, for every vertex, u and v in texels and the number of its map, -1 if none: (n,3).
+        """
+        at = np.zeros((len(x), 3))
+        at[:, 2] = -1.0
+        maps = []
+        for vertices, boundary in self._surfaces.half_spaces(t):
+            origin, axes = boundary[0], _frame(boundary)
+            if axes is None or axes[2] @ UP < MIN_SLOPE:
+                continue
+            found = self._map(x[: self._surfaces.n_of_bodies], origin, axes, boundary)
+            if found is not None:
+                darkness, low, texel = found
+                at[vertices, :2] = ((x[vertices] - origin) @ axes[:2].T - low) / texel
+                at[vertices, 2] = len(maps)
+                maps.append(darkness)
+        return np.array(maps) if maps else np.zeros((1, 2, 2)), at
+
+    def _map(self, x: np.ndarray, origin, axes, boundary) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+        """Return a map (v, u), the coordinates (2,) of its corner and the size (2,) of a texel [m]; None without a shadow."""
+        height = (x - origin) @ axes[2] / (axes[2] @ UP)
+        shadow = (x - origin) @ axes[:2].T - height[:, None] * (axes[:2] @ UP)
+        drawn = shadow[np.isfinite(shadow).all(axis=1)]
+        if len(drawn) == 0:
+            return None
+        sigma = SOFTNESS * self._size
+        square = (boundary - origin) @ axes[:2].T
+        low = np.maximum(drawn.min(axis=0) - 2 * REACH * sigma, square.min(axis=0))
+        high = np.minimum(drawn.max(axis=0) + 2 * REACH * sigma, square.max(axis=0))
+        texel = (high - low) / TEXELS
+        if (texel <= 0.0).any():
+            return None
+        if self._raster is None:
+            self._raster = Raster((TEXELS, TEXELS))
+        with np.errstate(invalid="ignore"):  # triangles with nodes that are not finite are skipped
+            depth = np.exp(np.clip(height / (FADE * self._size), 0.0, 50.0))
+        points = np.column_stack([(shadow - low) / texel, depth])
+        darkness = STRENGTH * self._raster.inverse_depths(points, self._surfaces.body_triangles)
+        return blurred(darkness, sigma / texel[::-1]), low, texel
+
+
+def _frame(boundary: np.ndarray) -> np.ndarray | None:
+    """Return orthonormal axes (3,3), two in the plane of the boundary (n,3) and its normal; None without an area."""
+    if len(boundary) < 3:
+        return None
+    along, other = boundary[1] - boundary[0], boundary[2] - boundary[0]
+    normal = np.cross(along, other)
+    if not (length := float(np.linalg.norm(normal))) > 0.0:
+        return None
+    along, normal = along / np.linalg.norm(along), normal / length
+    return np.array([along, np.cross(normal, along), normal])
+
+
+def blurred(image: np.ndarray, sigma: tuple[float, float]) -> np.ndarray:
+    """Return image (h,w) smoothed by a Gaussian of sigma texels along each axis, with zeros beyond it."""
+    for axis in (0, 1):
+        reach = int(np.ceil(REACH * sigma[axis]))
+        weights = np.exp(-0.5 * (np.arange(-reach, reach + 1) / max(sigma[axis], 1e-9)) ** 2)
+        padded = np.pad(np.moveaxis(image, axis, 0), [(reach, reach), (0, 0)])
+        n = image.shape[axis]
+        total = sum(weight * padded[k : k + n] for k, weight in enumerate(weights / weights.sum()))
+        image = np.moveaxis(total, 0, axis)
+    return image

@@ -1,0 +1,240 @@
+"""The rasteriser of pictures, against the one in NumPy and a plain loop:
+
+* coverage, order and colours of random, thin, tiny and huge triangles, in both precisions of the runtime and the same in both;
+* neighbours leave no gap, samples are averaged, and the last of two triangles at one depth is in front;
+* triangles near the eye, without area, or with vertices that are not finite are skipped, and no triangles change nothing;
+* a shadow map darkens the triangles that have one, between its texels; too many triangles are refused.
+"""
+
+import numpy as np
+import pytest
+
+from benchmarks.numpy_raster import averaged, rasterise
+from taisoft.backend.runtime import open_runtime
+from taisoft.errors import OutputError
+from taisoft.view import raster
+from taisoft.view.raster import MAX_COORDINATE, Raster
+from taisoft.view.shading import N_ATTRIBUTES, SAMPLES, TILE
+
+NEAR = 0.5
+SHAPE = (3 * TILE + 10, 4 * TILE + 6)  # samples; the last tiles are cut off
+
+
+@pytest.fixture(params=["f32", "f64"])
+def runtime(request):
+    runtime = open_runtime("cpu", request.param)
+    yield runtime
+    runtime.close()
+
+
+def drawn(points, triangles, colours, shape=SHAPE, near=NEAR, background=200, shadows=None, texels=None):
+    """The picture and 1/depth of the kernels."""
+    made = Raster(shape[::-1])
+    attributes = np.zeros((len(points), N_ATTRIBUTES))
+    attributes[:, :3], attributes[:, 5] = colours, -1.0
+    if texels is not None:
+        attributes[:, 3:] = texels
+    picture = np.full((shape[0] // SAMPLES, shape[1] // SAMPLES, 3), background, np.uint8)
+    made.draw(points, triangles, attributes, near, np.zeros((1, 2, 2)) if shadows is None else shadows, picture)
+    return picture, made.inverse_depths(points, triangles, near)
+
+
+def expected(points, triangles, colours, shape=SHAPE, near=NEAR, background=200):
+    """The picture of NumPy, and the mask of covered samples."""
+    image = np.full((*shape, 3), background, np.uint8)
+    mask = rasterise(points, triangles, colours, near, image)
+    return averaged(image), mask
+
+
+def scattered(rng, n, radius):
+    """n triangles of about a radius [samples], partly outside the picture."""
+    centre = rng.uniform(-radius, np.array(SHAPE[::-1]) + radius, (n, 1, 2))
+    points = np.concatenate([centre + rng.uniform(-radius, radius, (n, 3, 2)), rng.uniform(2.0, 3.0, (n, 3, 1))], axis=2)
+    return points.reshape(-1, 3), np.arange(3 * n).reshape(n, 3)
+
+
+KINDS = {"small": (400, 6.0), "large": (60, 60.0), "tiny": (9000, 0.9), "huge": (12, 1e5)}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("seed", [0, 1])
+def test_random_triangles_equal_those_of_numpy(runtime, kind, seed):
+    rng = np.random.default_rng(seed)
+    points, triangles = scattered(rng, *KINDS[kind])
+    flat = np.repeat(rng.uniform(0, 1, (len(triangles), 3)), 3, axis=0)  # one colour a triangle: only the order matters
+    picture, inverse = drawn(points, triangles, flat)
+    reference, covered = expected(points, triangles, flat)
+    assert 0.1 < covered.mean() <= 1.0 and np.array_equal(inverse > 0, covered)
+    assert np.abs(picture.astype(int) - reference).max() <= 1
+
+
+def test_thin_triangles_cover_the_same_samples(runtime):
+    rng = np.random.default_rng(2)
+    a = rng.uniform((0, 0), SHAPE[::-1], (300, 2))
+    b = a + rng.uniform(-40, 40, (300, 2))
+    c = 0.5 * (a + b) + rng.uniform(-0.05, 0.05, (300, 2))
+    points = np.column_stack([np.stack([a, b, c], axis=1).reshape(-1, 2), np.full(900, 2.0)])
+    triangles = np.arange(900).reshape(-1, 3)
+    picture, inverse = drawn(points, triangles, np.zeros((900, 3)))
+    reference, covered = expected(points, triangles, np.zeros((900, 3)))
+    assert 50 < covered.sum() < 0.2 * covered.size and np.array_equal(inverse > 0, covered)
+    assert np.array_equal(picture, reference)
+
+
+def test_colours_are_interpolated_in_perspective(runtime):
+    """Depths of 1 to 10 in one triangle. A pixel inside takes the colour at its centre, which differs little from the mean."""
+    points = np.array([[-4.1, -3.2, 1.0], [150.3, 20.1, 10.0], [10.7, 120.9, 4.0]])
+    colours, triangles = np.eye(3), np.array([[0, 1, 2]])
+    picture, _ = drawn(points, triangles, colours)
+    reference, covered = expected(points, triangles, colours)
+    assert covered.mean() > 0.3 and np.abs(picture.astype(int) - reference).max() <= 2
+    linear, _ = expected(points * (1, 1, 0) + (0, 0, 1), triangles, colours)
+    assert np.abs(linear.astype(int) - reference).max() > 50, "the test tells perspective from linear interpolation"
+
+
+def test_a_fan_leaves_no_gap_and_covers_no_sample_twice(runtime):
+    rng = np.random.default_rng(5)
+    angle = np.sort(rng.uniform(0, 2 * np.pi, 40))
+    rim = np.column_stack([60 + 200 * np.cos(angle), 50 + 200 * np.sin(angle), np.ones(40)])
+    points, k = np.vstack([[61.3, 48.7, 1.0], rim]), np.arange(1, 41)
+    triangles = np.stack([np.zeros(40, int), k, np.roll(k, -1)], axis=1)
+    assert (drawn(points, triangles, np.ones((41, 3)))[1] > 0).all()
+    counts = sum((drawn(points, triangles[[t]], np.ones((41, 3)))[1] > 0).astype(int) for t in range(40))
+    assert (counts == 1).all()
+
+
+def test_the_order_is_by_depth_and_then_by_number(runtime):
+    square = np.array([[0.0, 0, 0], [40, 0, 0], [40, 40, 0], [0, 40, 0]])
+    points = np.concatenate([square + (0, 0, depth) for depth in (3.0, 2.0, 2.0, 2.0 * (1 + 1e-7))])
+    corners = np.array([[0, 1, 2], [0, 2, 3]])
+    for order, front in (((0, 1), 1), ((1, 0), 1), ((1, 2), 2), ((2, 1), 1), ((2, 3), 2), ((3, 2), 2)):
+        triangles = np.concatenate([4 * k + corners for k in order])
+        picture, _ = drawn(points, triangles, np.repeat(np.linspace(0, 1, 4), 4)[:, None] * np.ones(3))
+        assert (picture[:19, :19] == round(255 * front / 3)).all()
+
+
+def test_four_samples_are_averaged(runtime):
+    """A triangle with a vertical edge at x = 2.75 pixels covers one of the two columns of samples in pixel 2."""
+    points = np.array([[-300.0, 50.0, 1.0], [5.5 - 0.1, -900.0, 1.0], [5.5 - 0.1, 900.0, 1.0]])
+    picture, _ = drawn(points, np.array([[0, 1, 2]]), np.zeros((3, 3)))
+    assert (picture[:, :2] == 0).all() and (picture[:, 2] == 100).all() and (picture[:, 3:] == 200).all()
+
+
+@pytest.mark.parametrize("depth", [2.0**k for k in (-3, -2, -1, 0, 40)])
+def test_depths_whose_bits_are_round(runtime, depth):
+    """Keys are compared and combined as integers: those of 1/depth = 2 add up to 0."""
+    points = np.array([[-300.0, -300, depth], [900, -300, depth], [-300, 900, depth]])
+    picture, inverse = drawn(points, np.array([[0, 1, 2]]), np.eye(3)[[0, 0, 0]], near=0.01)
+    assert (picture == (255, 0, 0)).all() and np.allclose(inverse, 1 / depth, rtol=1e-8)
+
+
+def test_invisible_triangles_are_skipped(runtime):
+    """Near the eye, without area, not finite, far outside: none of them changes the picture or disturbs a good one."""
+    good = np.array([[10.0, 10, 2], [90, 20, 2], [30, 80, 2]])
+    bad = [good.copy() for _ in range(9)]
+    bad[0][1, 2], bad[1][2, 2] = NEAR, -1.0
+    bad[2][0, 0], bad[3][1, 1], bad[4][2, 2] = np.nan, np.inf, np.nan
+    bad[5][0, 0] = 1.01 * MAX_COORDINATE
+    bad[6][:] = good[0]
+    bad[7][:, 0] -= 500.0
+    bad[8][:, 2] = np.inf, np.nan, -np.inf
+    points, n = np.concatenate([good, *bad]), 3 * (1 + len(bad))
+    colours = np.random.default_rng(0).uniform(0, 1, (n, 3))
+    alone = drawn(points, np.array([[0, 1, 2]]), colours)
+    for triangles in (np.arange(n).reshape(-1, 3), np.arange(n).reshape(-1, 3)[::-1]):
+        assert all(np.array_equal(a, b) for a, b in zip(drawn(points, triangles, colours), alone))
+    picture, inverse = drawn(points, np.arange(3, n).reshape(-1, 3), colours)
+    assert (picture == 200).all() and (inverse == 0).all() and (alone[1] > 0).any()
+
+
+def test_no_triangles_change_nothing(runtime):
+    picture, inverse = drawn(np.zeros((0, 3)), np.zeros((0, 3), int), np.zeros((0, 3)))
+    assert (picture == 200).all() and (inverse == 0).all()
+
+
+@pytest.mark.parametrize("shape", [(2, 2), (2, 400), (66, 34)])
+def test_pictures_of_any_size(runtime, shape):
+    points = np.array([[-1e3, -1e3, 1], [3e3, -1e3, 1], [-1e3, 3e3, 1]])
+    picture, inverse = drawn(points, np.array([[0, 1, 2]]), np.ones((3, 3)), shape)
+    assert inverse.shape == shape and (inverse > 0).all() and (picture == 255).all()
+
+
+def test_pictures_are_the_same_bytes_in_every_run_and_precision():
+    points, triangles = scattered(np.random.default_rng(3), 3000, 9.0)
+    colours = np.random.default_rng(4).uniform(0, 1, points.shape)
+    found = []
+    for precision in ("f32", "f32", "f64"):
+        runtime = open_runtime("cpu", precision)
+        found.append(b"".join(part.tobytes() for part in drawn(points, triangles, colours)))
+        runtime.close()
+    assert found[0] == found[1] == found[2]
+
+
+def test_a_raster_is_reused_for_other_triangles(runtime):
+    rng, made = np.random.default_rng(6), Raster(SHAPE[::-1])
+    for n in (200, 20, 2000):
+        points, triangles = scattered(rng, n, 8.0)
+        _, covered = expected(points, triangles, np.zeros((len(points), 3)))
+        assert np.array_equal(made.inverse_depths(points, triangles, NEAR) > 0, covered)
+
+
+def test_a_shadow_map_darkens_between_its_texels(runtime):
+    """Texels of 8 samples; the map's second column is dark. A triangle without a map stays light."""
+    square = np.array([[0.0, 0, 1], [64, 0, 1], [64, 64, 1], [0, 64, 1]])
+    points = np.concatenate([square, square + (0, 64, 0)])
+    texels = np.concatenate([np.column_stack([square[:, :2] / 8, np.ones(4)]), np.tile([0.0, 0.0, -1.0], (4, 1))])
+    triangles, shadows = np.array([[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]]), np.zeros((2, 8, 8))
+    shadows[1, :, 1] = 0.5
+    picture, _ = drawn(points, triangles, np.full((8, 3), 0.8), shape=(128, 64), shadows=shadows, texels=texels)
+    lit, x = 0.8 * 255, (np.arange(32) + 0.5) / 4  # of pixels, in texels
+    shade = 0.5 * np.clip(1 - np.abs(x - 1.5), 0, 1) * (x > 0.5)
+    assert np.abs(picture[8:24, :, 0] - lit * (1 - shade)).max() <= 0.51
+    assert (picture[32:] == 204).all()
+
+
+def test_too_many_triangles_are_refused(runtime, monkeypatch):
+    points, triangles = scattered(np.random.default_rng(0), 5, 30.0)
+    monkeypatch.setattr(raster, "MAX_LISTED", 3)
+    with pytest.raises(OutputError, match="5 triangles of this size"):
+        drawn(points, triangles, np.zeros((15, 3)))
+    monkeypatch.setattr(raster, "ORDINALS", 4)
+    with pytest.raises(OutputError, match="cannot show 5 triangles: at most 4"):
+        drawn(points, triangles, np.zeros((15, 3)))
+
+
+# --- the rasteriser in NumPy ---
+
+
+def plain_raster(projected, triangles, colours, near, shape):
+    """A picture in which each pixel shows the nearest triangle that contains its centre."""
+    image, nearest = np.zeros((*shape, 3)), np.zeros(shape)
+    for triangle in triangles:
+        p, depth = projected[triangle, :2], projected[triangle, 2]
+        if not (depth > near).all():
+            continue
+        matrix = np.vstack([p.T, np.ones(3)])
+        if abs(np.linalg.det(matrix)) < 1e-12:
+            continue
+        for i in range(shape[0]):
+            for j in range(shape[1]):
+                weights = np.linalg.solve(matrix, [j + 0.5, i + 0.5, 1.0])
+                inverse = weights @ (1.0 / depth)
+                if (weights >= 0).all() and inverse > nearest[i, j]:
+                    nearest[i, j] = inverse
+                    image[i, j] = (weights / depth) @ colours[triangle] / inverse
+    return image, nearest > 0
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_rasterised_picture_equals_a_plain_loop(seed):
+    rng = np.random.default_rng(seed)
+    shape = (24, 32)
+    projected = rng.uniform((-8, -8, 1), (40, 32, 5), (36, 3))  # partly outside the picture
+    projected[0, 2], projected[4, 2] = -1.0, np.nan
+    colours, triangles = rng.uniform(0, 1, (36, 3)), np.arange(36).reshape(12, 3)
+    expected, covered = plain_raster(projected, triangles, colours, 0.5, shape)
+    image = np.zeros((*shape, 3), np.uint8)
+    mask = rasterise(projected, triangles, colours, 0.5, image)
+    assert 100 < covered.sum() < covered.size
+    assert np.array_equal(mask, covered)
+    assert np.abs(image.astype(float) - 255 * expected).max() <= 0.51
