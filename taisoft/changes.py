@@ -19,6 +19,7 @@ INSTEAD = {  # what to do instead of assigning to an attribute that a simulator 
     **{name: f"call sim.rebuild({name}=...)" for name in NAMES if name not in FIXED},
     **dict.fromkeys(("force", "forces"), "call sim.set_force(body, index, value)"),
     **dict.fromkeys(("traction", "tractions"), "call sim.set_traction(body, index, value)"),
+    **dict.fromkeys(("pressure", "pressures"), "call sim.set_pressure(body, index, value)"),
     **dict.fromkeys(("time", "step_count"), "call sim.reset() to go back to the start"),
     **dict.fromkeys(("arch", "precision"), "make a new Simulator"),
     "gravity": "call sim.set_gravity(gravity)",
@@ -140,6 +141,14 @@ def set_traction(self: "Simulator", body: str, index: int, value) -> None:
     value: (3,) per reference area [Pa]; it replaces a path.
     """
     _set_load(self, "traction", body, index, value)
+
+
+def set_pressure(self: "Simulator", body: str, index: int, value: float) -> None:
+    """Change a pressure added by `body.add_pressure`, from the next step on; index and errors as for `set_force`.
+
+    value: a number [Pa]; it replaces a path.
+    """
+    _set_load(self, "pressure", body, index, value)
 
 
 def _set_load(sim: "Simulator", kind: str, body: str, index: int, value) -> None:

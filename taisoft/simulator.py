@@ -169,6 +169,7 @@ class Simulator(Guarded):
     set_contact = changes.set_contact
     set_force = changes.set_force
     set_traction = changes.set_traction
+    set_pressure = changes.set_pressure
     drag = changes.drag
     release = changes.release
 

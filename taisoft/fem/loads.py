@@ -30,7 +30,11 @@ class _Path(NamedTuple):
 
 
 class SceneLoads:
-    """The loads of a scene with its present values. nodes: those whose loads follow a path, ascending."""
+    """The loads of a scene with its present values.
+
+    nodes: those whose loads follow a path, ascending. has_potential: whether no work of theirs depends on the path that a body
+    takes, as that of a pressure on an open surface does.
+    """
 
     def __init__(self, scene: Scene):
         starts = np.cumsum([0, *(body.n_nodes for body in scene.bodies)])
@@ -45,6 +49,8 @@ class SceneLoads:
                         self._paths.append(_Path(f"body {body.name!r}: {kind} {k}", load, start + nodes, weights))
         self.nodes = np.unique(np.concatenate([np.zeros(0, dtype=np.int64), *(path.nodes for path in self._paths)]))
         self._scalars = scalar_loads(scene)
+        pressures = [p for body in scene.bodies for p in body.pressures if not p.closed]
+        self.has_potential = not any(p.path is not None or p.value.any() for p in pressures)
 
     @property
     def n_amplitudes(self) -> int:
@@ -83,7 +89,7 @@ class SceneLoads:
 
 def scalar_loads(scene: Scene) -> list[tuple[str, ScalarLoad]]:
     """The loads of a scene that are one number, each with its name in messages, in the order of the model's `amplitudes`."""
-    return []
+    return [(f"body {body.name!r}: pressure {k}", load) for body in scene.bodies for k, load in enumerate(body.pressures)]
 
 
 def _weights(body: Body, load: Traction | NodalForce) -> tuple[np.ndarray, np.ndarray]:

@@ -9,13 +9,14 @@ import numpy as np
 from taisoft.attributes import Guarded, guarded_record, thawed
 from taisoft.errors import SceneError
 from taisoft.mesh.nodes import Nodes, make_nodes
+from taisoft.mesh.solids import is_closed
 from taisoft.mesh.tet_mesh import TetMesh
 from taisoft.mesh.thickness import coarse_bending
 from taisoft.scene import checks
 from taisoft.scene.collision import CONTACT_MODES
 from taisoft.scene.composition import Composition, compose
 from taisoft.scene.key_frames import KeyFrames, NodePath
-from taisoft.scene.loads import NodalForce, Traction, value_and_path
+from taisoft.scene.loads import NodalForce, Pressure, Traction, value_and_path
 from taisoft.scene.material import Material
 
 NEARLY_INCOMPRESSIBLE = 0.49  # Poisson's ratio above which linear tets lock, so that they bend far too little
@@ -25,6 +26,7 @@ _READ_ONLY = ("name", "mesh", "composition", "order", "quadrature_degree", "node
 USE_A_COPY = "change a copy made by scene.snapshot() and make a new Simulator of it"
 _SET_FORCE = f"call sim.set_force(body, index, value) for an existing one; otherwise {USE_A_COPY}"
 _SET_TRACTION = f"call sim.set_traction(body, index, value) for an existing one; otherwise {USE_A_COPY}"
+_SET_PRESSURE = f"call sim.set_pressure(body, index, value) for an existing one; otherwise {USE_A_COPY}"
 
 
 @guarded_record("constraint", "add another one by body.fix or body.move")
@@ -57,9 +59,9 @@ class Body(Guarded):
     have, a float, or (m,) where it may differ from tet to tet; setting one replaces the material's. position: (3,) [m]; nodes
     start at rest_positions + position. velocity: (3,) or (n,3) [m/s], initial. order: 1 or 2, of the elements' shape functions;
     quadrature_degree: degree of polynomials integrated exactly. nodes: `Nodes`, the mesh's vertices and for order 2 its mid-
-    edge nodes. constraints, tractions, forces: lists of `Constraint`, `Traction`, `NodalForce`; items can be removed, but only
-    methods add them. collision: one of CONTACT_MODES. Only material, its numbers, position, velocity and collision can be
-    assigned; each is validated. `warn_locking` and `warn_bending` warn if tets of order 1 are far too stiff; `Scene.add_body`
+    edge nodes. constraints, tractions, forces, pressures: lists of `Constraint`, `Traction`, `NodalForce`, `Pressure`; items
+    can be removed, but only methods add them. collision: one of CONTACT_MODES. Only material, its numbers, position, velocity
+    and collision can be assigned; each is validated. `warn_locking` and `warn_bending` warn if tets of order 1 are far too stiff; `Scene.add_body`
     calls both.
     """
 
@@ -68,12 +70,13 @@ class Body(Guarded):
         "contact_mode": "set body.collision",
         "composition": "set body.material",
         "mass": "set body.density",
-        "loads": "call body.add_force or body.add_traction",
+        "loads": "call body.add_force, body.add_traction or body.add_pressure",
     }
     _contents = {
         "constraints": "call body.fix or body.move",
         "tractions": "call body.add_traction",
         "forces": "call body.add_force",
+        "pressures": "call body.add_pressure",
     }
     _default_frozen = USE_A_COPY
     _instead_frozen = {
@@ -85,6 +88,8 @@ class Body(Guarded):
         "forces": _SET_FORCE,
         "add_traction": _SET_TRACTION,
         "tractions": _SET_TRACTION,
+        "add_pressure": _SET_PRESSURE,
+        "pressures": _SET_PRESSURE,
     }
 
     def __init__(
@@ -113,6 +118,7 @@ class Body(Guarded):
         self.constraints: list[Constraint] = []
         self.tractions: list[Traction] = []
         self.forces: list[NodalForce] = []
+        self.pressures: list[Pressure] = []
         self._seal(Body.__init__)
 
     def _label(self) -> str:
@@ -137,9 +143,9 @@ class Body(Guarded):
         return self.nodes.positions
 
     @property
-    def loads(self) -> list[Traction | NodalForce]:
-        """Its tractions, then its forces."""
-        return [*self.tractions, *self.forces]
+    def loads(self) -> list[Traction | NodalForce | Pressure]:
+        """Its tractions, then its forces, then its pressures."""
+        return [*self.tractions, *self.forces, *self.pressures]
 
     @property
     def n_nodes(self) -> int:
@@ -253,11 +259,29 @@ class Body(Guarded):
         """
         self._check_open("add_traction")
         what = f"{self._label()}: add_traction"
-        centroids = self.mesh.vertices[self.mesh.surface].mean(axis=1)
-        triangles = checks.selection(where, centroids, what, "surface triangle")
-        load = Traction(triangles, *value_and_path(traction, f"{what}: traction", ((3,),)))
+        load = Traction(self._triangles(where, what), *value_and_path(traction, f"{what}: traction", ((3,),)))
         list.append(self.tractions, load)
         return load
+
+    def add_pressure(self, where, pressure) -> Pressure:
+        """Apply a pressure that acts along the deformed inward normal of surface triangles, and on their deformed area.
+
+        where: as for `add_traction`. pressure: [Pa], a number, negative for suction, or its path: callable t [s] -> number,
+        called once here for t = 0, or `KeyFrames` with values. Pressures on the same triangle add. Raises SceneError if no
+        triangle is chosen or a number is not finite.
+        """
+        self._check_open("add_pressure")
+        what = f"{self._label()}: add_pressure"
+        triangles = self._triangles(where, what)
+        value, path = value_and_path(pressure, f"{what}: pressure", ((),))
+        load = Pressure(value, path, triangles=triangles, closed=is_closed(self.mesh.surface[triangles]))
+        list.append(self.pressures, load)
+        return load
+
+    def _triangles(self, where, what: str) -> np.ndarray:
+        """Return the chosen rows of mesh.surface, by their centroids at rest."""
+        centroids = self.mesh.vertices[self.mesh.surface].mean(axis=1)
+        return checks.selection(where, centroids, what, "surface triangle")
 
     def add_force(self, where, force) -> NodalForce:
         """Apply a dead load to nodes: a total force distributed by lumped mass, or one force per node.

@@ -57,6 +57,7 @@ def _body_parts(body: Body) -> dict[str, list]:
         "loads": [
             *(x for t in body.tractions for x in ("traction", t.triangles, *_path_parts(t.path))),
             *(x for f in body.forces for x in ("force", f.nodes, *_path_parts(f.path))),
+            *(x for p in body.pressures for x in ("pressure", p.triangles, *_path_parts(p.path))),
         ],
     }
 
@@ -66,7 +67,7 @@ def _path_parts(path: Callable | None) -> list:
     if not isinstance(path, (NodePath, ShapePath, LoadPath)):
         return [path is None]
     frames = path.frames
-    values = [frames.times, frames.translations, frames.rotations, frames.pivot, frames.smooth, frames.release]
+    values = [frames.times, frames.translations, frames.rotations, frames.pivot, frames.smooth, frames.release, frames.values]
     start = {NodePath: "starts", ShapePath: "center"}.get(type(path))  # in whose frame key frames are
     return values + ([getattr(path, start)] if start else [])
 

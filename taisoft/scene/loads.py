@@ -1,4 +1,4 @@
-"""Loads of a body, constant or along a path: on surface triangles, and on nodes."""
+"""Loads of a body, constant or along a path: tractions and pressures on surface triangles, forces on nodes."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -62,6 +62,18 @@ class ScalarLoad:
     def shapes(self) -> tuple[tuple[int, ...], ...]:
         """Shapes that its values may have."""
         return ((),)
+
+
+@guarded_record("pressure", "call sim.set_pressure(body, index, value) in a simulation")
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Pressure(ScalarLoad):
+    """A follower load on surface triangles: its value [Pa] pushes along the deformed inward normal."""
+
+    triangles: np.ndarray  #: (k,) int64 rows of mesh.surface
+    closed: bool  #: whether these have no border; the load then has a potential
+
+    def __post_init__(self):
+        checks.store(self, value=self.value, triangles=self.triangles)
 
 
 @dataclass(frozen=True, eq=False)

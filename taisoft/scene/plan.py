@@ -18,7 +18,7 @@ from taisoft.scene.obstacles import Box, MeshObstacle
 from taisoft.scene.scene import Scene
 
 CHANGEABLE = ("young", "poisson", "density", "mass_damping", "stiffness_damping")  # numbers of a material
-LOADS = {"force": "forces", "traction": "tractions"}  # kind of load -> the body's list of them
+LOADS = {"force": "forces", "traction": "tractions", "pressure": "pressures"}  # kind of load -> the body's list of them
 BY_TET_TEXT = " by tet"  # ends the names of numbers that differ from tet to tet
 Numbers = dict[str, float | list | None]  # of a scene, by name
 
@@ -77,9 +77,10 @@ def make_plan(scene: Scene, explicit: bool, multistep: bool, self_collision: boo
         f"quadratic tets of {_shorten(quadratic)} in implicit steps",
         "explicit steps need a diagonal mass" if quadratic else "the mass of linear tets is lumped",
     )
-    loaded = [b.name for b in scene.bodies if b.loads]
+    loaded = [b.name for b in scene.bodies if b.tractions or b.forces]
     why = f"tractions or forces on {_shorten(loaded)}" if loaded else "bodies can be dragged"
     plan.add("loads", loaded or draggable, why, "no traction and no force")
+    add_if_any("pressure", lambda b: b.pressures, "on", "no surface is under pressure")
     add_if_any("load_paths", lambda b: any(load.path for load in b.loads), "on", "every load is constant")
     add_if_any("fixed_nodes", lambda b: any(c.path is None for c in b.constraints), "on", "no node is fixed")
     add_if_any("moving_nodes", lambda b: any(c.path is not None for c in b.constraints), "paths on", "no node follows a path")
@@ -156,7 +157,8 @@ def change_material(body: Body, numbers: dict, on: dict[str, bool], region: int 
 def change_load(body: Body, kind: str, index: int, value) -> None:
     """Set the value of a body's load `index`, counted from 0 in the order added; it replaces a path. kind: a key of LOADS.
 
-    value: (3,) [N], or (k,3) for the k nodes of a force; (3,) [Pa] for a traction. Raises SceneError.
+    value: (3,) [N], or (k,3) for the k nodes of a force; (3,) [Pa] for a traction; a number [Pa] for a pressure. Raises
+    SceneError.
     """
     loads, what = getattr(body, LOADS[kind]), f"body {body.name!r}: set_{kind}"
     if not loads:

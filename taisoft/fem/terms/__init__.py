@@ -14,9 +14,9 @@ integrators treat them differently: `rayleigh_damping` holds their rates and for
 over a step and is therefore applied as a dead load (`dynamics.drag_spring`).
 """
 
-from taisoft.fem.terms import dead_loads, elasticity, gravity
+from taisoft.fem.terms import dead_loads, elasticity, gravity, pressure
 
-TERMS = (elasticity, gravity, dead_loads)
+TERMS = (elasticity, gravity, dead_loads, pressure)
 
 
 def terms_of(on: dict[str, bool]) -> tuple:
