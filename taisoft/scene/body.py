@@ -61,8 +61,8 @@ class Body(Guarded):
     quadrature_degree: degree of polynomials integrated exactly. nodes: `Nodes`, the mesh's vertices and for order 2 its mid-
     edge nodes. constraints, tractions, forces, pressures: lists of `Constraint`, `Traction`, `NodalForce`, `Pressure`; items
     can be removed, but only methods add them. collision: one of CONTACT_MODES. Only material, its numbers, position, velocity
-    and collision can be assigned; each is validated. `warn_locking` and `warn_bending` warn if tets of order 1 are far too stiff; `Scene.add_body`
-    calls both.
+    and collision can be assigned; each is validated. `warn_locking` and `warn_bending` warn if tets of order 1 are far too
+    stiff; `Scene.add_body` calls both.
     """
 
     _read_only = frozenset(_READ_ONLY)

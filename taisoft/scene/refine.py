@@ -75,7 +75,7 @@ def _own_parents(n: int) -> np.ndarray:
 
 
 def _on_mesh(old: Body, mesh: TetMesh, order: int, parents: np.ndarray) -> Body:
-    """Return the body on another mesh, without loads on triangles. parents: (n,2), the two old nodes that each new node bisects."""
+    """Return the body on another mesh, without loads on triangles. parents: (n,2), the old nodes that each new one bisects."""
     velocity = old.velocity if old.velocity.shape == (3,) else old.velocity[parents].mean(axis=1)
     degree = old.quadrature_degree if order == old.order else None
     copies = mesh.n_tets // old.mesh.n_tets
