@@ -22,6 +22,7 @@ INSTEAD = {  # what to do instead of assigning to an attribute that a simulator 
     **dict.fromkeys(("pressure", "pressures"), "call sim.set_pressure(body, index, value)"),
     **dict.fromkeys(("time", "step_count"), "call sim.reset() to go back to the start"),
     **dict.fromkeys(("arch", "precision"), "make a new Simulator"),
+    **dict.fromkeys(("cavity", "cavities"), "call sim.set_cavity(name, value)"),
     "gravity": "call sim.set_gravity(gravity)",
     "material": "call sim.set_material(body, young=...)",
     "scene": "make a new Simulator of the other scene",
@@ -149,6 +150,15 @@ def set_pressure(self: "Simulator", body: str, index: int, value: float) -> None
     value: a number [Pa]; it replaces a path.
     """
     _set_load(self, "pressure", body, index, value)
+
+
+def set_cavity(self: "Simulator", name: str, value: float) -> None:
+    """Change the pressure [Pa] in a cavity, or its volume [m^3], whichever was given, from the next step on; replaces a path.
+
+    Raises SceneError if there is no cavity of this name or the value is invalid.
+    """
+    body, cavity = self.scene.cavity(name)
+    _set_load(self, "cavity", body.name, body.cavities.index(cavity), value)
 
 
 def _set_load(sim: "Simulator", kind: str, body: str, index: int, value) -> None:

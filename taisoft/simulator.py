@@ -139,6 +139,8 @@ class Simulator(Guarded):
     velocities = queries.velocities
     energies = queries.energies
     reactions = queries.reactions
+    cavity_volume = queries.cavity_volume
+    cavity_pressure = queries.cavity_pressure
     stress = queries.stress
     elastic_forces = queries.elastic_forces
     force_differential = queries.force_differential
@@ -170,6 +172,7 @@ class Simulator(Guarded):
     set_force = changes.set_force
     set_traction = changes.set_traction
     set_pressure = changes.set_pressure
+    set_cavity = changes.set_cavity
     drag = changes.drag
     release = changes.release
 

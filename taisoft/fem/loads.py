@@ -9,8 +9,11 @@ from typing import NamedTuple
 import numpy as np
 
 from taisoft.fem import reference
+from taisoft.fem.pressure import pressures_of
 from taisoft.scene.loads import NodalForce, ScalarLoad, Traction, value_at
 from taisoft.scene.scene import Body, Scene
+
+FOLLOWS = ScalarLoad(np.zeros(()))  # the pressure in a cavity of given volume, which steppers find
 
 
 class _Path(NamedTuple):
@@ -32,8 +35,9 @@ class _Path(NamedTuple):
 class SceneLoads:
     """The loads of a scene with its present values.
 
-    nodes: those whose loads follow a path, ascending. has_potential: whether no work of theirs depends on the path that a body
-    takes, as that of a pressure on an open surface does.
+    nodes: those whose loads follow a path, ascending. given_volumes: amplitudes that are the pressures in cavities of given
+    volume. has_potential: whether energies count the work of all constant loads: not
+    that of a pressure on an open surface, which depends on the path of its border, and of the fluid in a given volume.
     """
 
     def __init__(self, scene: Scene):
@@ -49,8 +53,9 @@ class SceneLoads:
                         self._paths.append(_Path(f"body {body.name!r}: {kind} {k}", load, start + nodes, weights))
         self.nodes = np.unique(np.concatenate([np.zeros(0, dtype=np.int64), *(path.nodes for path in self._paths)]))
         self._scalars = scalar_loads(scene)
-        pressures = [p for body in scene.bodies for p in body.pressures if not p.closed]
-        self.has_potential = not any(p.path is not None or p.value.any() for p in pressures)
+        self.given_volumes = np.array([n for n, (_, load) in enumerate(self._scalars) if load is FOLLOWS], dtype=np.int64)
+        others = [load for _, load in pressures_of(scene) if not load.has_potential]
+        self.has_potential = not any(load.path is not None or load.value.any() for load in others)
 
     @property
     def n_amplitudes(self) -> int:
@@ -89,7 +94,11 @@ class SceneLoads:
 
 def scalar_loads(scene: Scene) -> list[tuple[str, ScalarLoad]]:
     """The loads of a scene that are one number, each with its name in messages, in the order of the model's `amplitudes`."""
-    return [(f"body {body.name!r}: pressure {k}", load) for body in scene.bodies for k, load in enumerate(body.pressures)]
+    found: list[tuple[str, ScalarLoad]] = []
+    for body in scene.bodies:
+        found += [(f"body {body.name!r}: pressure {k}", load) for k, load in enumerate(body.pressures)]
+        found += [(f"cavity {cavity.name!r}", FOLLOWS if cavity.given == "volume" else cavity) for cavity in body.cavities]
+    return found
 
 
 def _weights(body: Body, load: Traction | NodalForce) -> tuple[np.ndarray, np.ndarray]:

@@ -20,6 +20,7 @@ import taichi as ti
 from taisoft.backend.arrays import FieldArena
 from taisoft.fem.node_graph import NodeGraph
 from taisoft.scene.body import Body
+from taisoft.scene.loads import Cavity, Pressure
 from taisoft.scene.scene import Scene
 
 CANCELLED = 1e-12  # weights below it are rounding; others are above 1e-3
@@ -35,12 +36,12 @@ class PressureTable:
     stiffness_start: Any  # (n_nodes + 1) i32; None in explicit steps, as the next two
     stiffness_nodes: Any  # 3-vectors i32: entry (i, j) of the matrix, c, and the index of p
     stiffness_weight: Any  # f64: u_ijc
-    has_potential: Any  # i32, of each pressure: 1 if its surface is closed
+    has_potential: Any  # i32, of each pressure: 1 if energies count its work
 
 
-def pressures_of(scene: Scene) -> list[tuple[int, Any]]:
-    """All pressures of a scene, each with the number of its body, in the order of Model.amplitudes."""
-    return [(k, pressure) for k, body in enumerate(scene.bodies) for pressure in body.pressures]
+def pressures_of(scene: Scene) -> list[tuple[int, Pressure | Cavity]]:
+    """All pressures and cavities of a scene, each with the number of its body, in the order of Model.amplitudes."""
+    return [(k, load) for k, body in enumerate(scene.bodies) for load in (*body.pressures, *body.cavities)]
 
 
 @cache
@@ -100,6 +101,31 @@ def merged(ids: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray
     return rows[kept], sums[kept]
 
 
+class CavityForm:
+    """The volume of a cavity as a function of all nodes' positions."""
+
+    def __init__(self, body: Body, cavity: Cavity, first_node: int):
+        rows, self._weights = merged(*force_terms(triangle_nodes(body, cavity.triangles), triangle_weights(body.order)))
+        self.nodes, place = np.unique(rows, return_inverse=True)
+        self._rows = place.reshape(-1, 3)
+        self.nodes = self.nodes + first_node
+
+    def volume_and_gradient(self, x: np.ndarray) -> tuple[float, np.ndarray]:
+        """V [m^3], and dV/dx (k, 3) [m^2] at its nodes. x: (n_nodes, 3) [m] of the scene."""
+        own = x[self.nodes] - x[self.nodes[0]]
+        i, b, c = (own[rows] for rows in self._rows.T)
+        parts = -self._weights[:, None] * np.cross(b - i, c - i)
+        gradient = np.stack([np.bincount(self._rows[:, 0], parts[:, a], len(own)) for a in range(3)], axis=1)
+        return float((own * gradient).sum()) / 3.0, gradient
+
+
+def cavity_form(scene: Scene, name: str) -> CavityForm:
+    """The form of the cavity with this name. Raises SceneError if there is none."""
+    body, cavity = scene.cavity(name)
+    first = sum(one.n_nodes for one in scene.bodies[: scene.bodies.index(body)])
+    return CavityForm(body, cavity, first)
+
+
 def all_terms(scene: Scene, node_start: np.ndarray, terms) -> tuple[np.ndarray, np.ndarray]:
     """Rows (i, b, c, index of p) of all pressures of a scene, ascending, and their weights. terms: one of the functions above."""
     ids, weights = [np.zeros((0, 4), dtype=np.int64)], [np.zeros(0)]
@@ -134,5 +160,5 @@ def build_pressures(scene: Scene, node_start: np.ndarray, arena: FieldArena, gra
         keys = np.repeat(np.arange(n_nodes), np.diff(graph.row_start)) * n_nodes + graph.column
         rows[:, 1] = np.searchsorted(keys, rows[:, 0] * n_nodes + rows[:, 1])
         arrays |= table("stiffness", rows, weights)
-    closed = np.array([pressure.closed for _, pressure in pressures_of(scene)])
+    closed = np.array([pressure.has_potential for _, pressure in pressures_of(scene)])
     return PressureTable(**arrays, has_potential=arena.field("pressure_has_potential", ti.i32, len(closed), closed))

@@ -75,6 +75,30 @@ class Pressure(ScalarLoad):
     def __post_init__(self):
         checks.store(self, value=self.value, triangles=self.triangles)
 
+    @property
+    def has_potential(self) -> bool:
+        """Whether its work does not depend on the path that the body takes."""
+        return self.closed
+
+
+@guarded_record("cavity", "call sim.set_cavity(name, value) in a simulation")
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Cavity(ScalarLoad):
+    """A closed inner surface with a fluid of given pressure [Pa], or an incompressible one of given volume [m^3], its value."""
+
+    name: str
+    triangles: np.ndarray  #: (k,) int64 rows of mesh.surface
+    given: str  #: "pressure" or "volume"
+    rest_volume: float  #: [m^3]
+
+    def __post_init__(self):
+        checks.store(self, value=self.value, triangles=self.triangles)
+
+    @property
+    def has_potential(self) -> bool:
+        """Whether energies count the work of its fluid: that of a given volume is left out."""
+        return self.given == "pressure"
+
 
 @dataclass(frozen=True, eq=False)
 class LoadPath:

@@ -11,14 +11,19 @@ from dataclasses import dataclass, field, replace
 from taisoft.attributes import thawed
 from taisoft.errors import SceneError
 from taisoft.scene import checks
-from taisoft.scene.body import Body
+from taisoft.scene.body import Body, check_volume
 from taisoft.scene.collision import has_sharp_edges
 from taisoft.scene.material import LAWS
 from taisoft.scene.obstacles import Box, MeshObstacle
 from taisoft.scene.scene import Scene
 
 CHANGEABLE = ("young", "poisson", "density", "mass_damping", "stiffness_damping")  # numbers of a material
-LOADS = {"force": "forces", "traction": "tractions", "pressure": "pressures"}  # kind of load -> the body's list of them
+LOADS = {
+    "force": "forces",
+    "traction": "tractions",
+    "pressure": "pressures",
+    "cavity": "cavities",
+}  # kind of load -> the body's list of them
 BY_TET_TEXT = " by tet"  # ends the names of numbers that differ from tet to tet
 Numbers = dict[str, float | list | None]  # of a scene, by name
 
@@ -80,7 +85,9 @@ def make_plan(scene: Scene, explicit: bool, multistep: bool, self_collision: boo
     loaded = [b.name for b in scene.bodies if b.tractions or b.forces]
     why = f"tractions or forces on {_shorten(loaded)}" if loaded else "bodies can be dragged"
     plan.add("loads", loaded or draggable, why, "no traction and no force")
-    add_if_any("pressure", lambda b: b.pressures, "on", "no surface is under pressure")
+    add_if_any("pressure", lambda b: b.pressures or b.cavities, "on", "no surface is under pressure")
+    given = [cavity.name for b in scene.bodies for cavity in b.cavities if cavity.given == "volume"]
+    plan.add("cavity_volumes", given, f"the fluid in {_shorten(given)} is incompressible", "no cavity has a given volume")
     add_if_any("load_paths", lambda b: any(load.path for load in b.loads), "on", "every load is constant")
     add_if_any("fixed_nodes", lambda b: any(c.path is None for c in b.constraints), "on", "no node is fixed")
     add_if_any("moving_nodes", lambda b: any(c.path is not None for c in b.constraints), "paths on", "no node follows a path")
@@ -157,14 +164,16 @@ def change_material(body: Body, numbers: dict, on: dict[str, bool], region: int 
 def change_load(body: Body, kind: str, index: int, value) -> None:
     """Set the value of a body's load `index`, counted from 0 in the order added; it replaces a path. kind: a key of LOADS.
 
-    value: (3,) [N], or (k,3) for the k nodes of a force; (3,) [Pa] for a traction; a number [Pa] for a pressure. Raises
-    SceneError.
+    value: (3,) [N], or (k,3) for the k nodes of a force; (3,) [Pa] for a traction; a number [Pa] for a pressure, or as
+    given for a cavity. Raises SceneError.
     """
     loads, what = getattr(body, LOADS[kind]), f"body {body.name!r}: set_{kind}"
     if not loads:
         raise SceneError(f"{what}: it has no {kind}: give it one of 0 by body.add_{kind} before the Simulator is made")
     old = loads[checks.whole(index, f"{what}: index", range(len(loads)))]
     new = replace(old, value=checks.array(value, f"{what}: {kind} {index}", old.shapes), path=None)
+    if kind == "cavity":
+        check_volume(new, f"{what}: volume")
     with thawed(body):
         getattr(body, LOADS[kind])[index] = new
 

@@ -19,7 +19,7 @@ from taisoft.mesh.tet_mesh import TetMesh
 from taisoft.mesh.topology import distinct_edges
 from taisoft.scene.body import Body, Constraint
 from taisoft.scene.key_frames import KeyFrames, NodePath
-from taisoft.scene.loads import LoadPath, NodalForce, Pressure, Traction
+from taisoft.scene.loads import Cavity, LoadPath, NodalForce, Pressure, Traction
 from taisoft.scene.scene import Scene
 
 PARTS = 8  # of a tet; `make_nodes` lists the parts of each tet in sequence
@@ -55,6 +55,8 @@ def _refined(old: Body) -> Body:
         new.add_traction(np.isin(parents, load.triangles), _load_of(load))
     for load in old.pressures:
         new.add_pressure(np.isin(parents, load.triangles), _load_of(load))
+    for cavity in old.cavities:
+        new.add_cavity(np.isin(parents, cavity.triangles), name=cavity.name, **{cavity.given: _load_of(cavity)})
     return new
 
 
@@ -67,6 +69,8 @@ def _of_order(old: Body, order: int) -> Body:
         new.add_traction(load.triangles, _load_of(load))
     for load in old.pressures:
         new.add_pressure(load.triangles, _load_of(load))
+    for cavity in old.cavities:
+        new.add_cavity(cavity.triangles, name=cavity.name, **{cavity.given: _load_of(cavity)})
     return new
 
 
@@ -99,7 +103,7 @@ def _on_mesh(old: Body, mesh: TetMesh, order: int, parents: np.ndarray) -> Body:
     return new
 
 
-def _load_of(load: Traction | NodalForce | Pressure):
+def _load_of(load: Traction | NodalForce | Pressure | Cavity):
     """Return what the method that added a load was given: a value or a path."""
     return load.value if load.path is None else load.path.frames if isinstance(load.path, LoadPath) else load.path
 

@@ -8,7 +8,7 @@
     [bodies.NAME.materials]   instead of material: one for each region of the mesh, REGION = a name, or a table
     [[bodies.NAME.fix]]       nodes, axes                   [[bodies.NAME.move]]   nodes, path (KeyFrames), axes
     [[bodies.NAME.traction]]  triangles, traction [Pa]      [[bodies.NAME.force]]  nodes, force [N], or their KeyFrames
-    [[bodies.NAME.pressure]]  triangles, pressure [Pa]
+    [[bodies.NAME.pressure]]  triangles, pressure [Pa]      [[bodies.NAME.cavity]] triangles, pressure or volume, name
     [obstacles.NAME]          shape and its arguments, friction, restitution, path (KeyFrames)
     [[contacts]]              between = ["a", "b"], friction, restitution
 
@@ -46,8 +46,9 @@ METHODS = {
     "traction": Body.add_traction,
     "force": Body.add_force,
     "pressure": Body.add_pressure,
+    "cavity": Body.add_cavity,
 }
-ON_TRIANGLES = ("traction", "pressure")  # methods that choose surface triangles, not nodes
+ON_TRIANGLES = ("traction", "pressure", "cavity")  # methods that choose surface triangles, not nodes
 SCENE_KEYS = ("gravity", "allow_initial_overlap", "contact_forces")  # attributes of a Scene at top level
 TOP_KEYS = [*SCENE_KEYS, "collision", "solver", "materials", "bodies", "obstacles", "contacts"]
 SURFACE_KEYS = ("friction", "restitution")
@@ -148,8 +149,9 @@ def _add_body(scene: Scene, name: str, table: Table, materials: dict[str, Materi
             extra = {"where": _selection(one, items)}
             if "path" in known:
                 extra["path"] = one.made("path", KeyFrames, "key frames: ")
-            elif isinstance(one.values.get(key), dict):  # a load that varies
-                extra[key] = one.made(key, KeyFrames, "key frames: ")
+            for argument in (key, "pressure", "volume"):
+                if argument in known and isinstance(one.values.get(argument), dict):  # a load that varies
+                    extra[argument] = one.made(argument, KeyFrames, "key frames: ")
             others = [k for k in known if k not in (items, *extra)]
             one.make(getattr(body, method.__name__), f"body {name!r}: {method.__name__}: ", keys=others, **extra)
 
