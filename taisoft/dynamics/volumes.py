@@ -8,8 +8,8 @@ by conjugate gradients on the host with block-Jacobi preconditioning; the rank-o
 cavities are several columns. r is evaluated with p + k c, the gradient of the augmented Lagrangian in x, by whose slope the step
 length is searched; A is formed with p alone.
 With contacts, and on CUDA, p is fixed while a stage is solved. Then p and v are corrected by q = c / (beta g.z) and q z, with
-z = A^-1 beta g and the contacts' terms in A, and the stage is solved again from there, until c is small. Near the largest pressure
-of a balloon that does not converge.
+z = A^-1 beta g, the contacts' terms in A and A projected, and the stage is solved again from there, until c is small. Near the
+largest pressure of a balloon that does not converge.
 Source: Nocedal, Wright, Numerical Optimization, 2nd ed. 2006, sections 11.1, 16.1 and 17.3.
 """
 
@@ -58,9 +58,8 @@ class Volumes:
         wanted = np.array([float(value_at(one, time, f"cavity {one.name!r}")) for one in self._cavities])
         for cavity, volume in zip(self._cavities, wanted):
             if volume <= 0.0:
-                raise SimulationError(
-                    f"cavity {cavity.name!r}: its volume is {volume:g} m^3 at t = {time:g} s: it must be above 0"
-                )
+                name = cavity.name
+                raise SimulationError(f"cavity {name!r}: its volume at t = {time:g} s must be above 0, not {volume:g} m^3")
         self.targets = self._rest + fraction * (wanted - self._rest)
         self.pressures = self._simulation.cavity_pressures.copy()
         young = np.array([float(np.max(bodies[k].young)) for k, _ in self._places])
@@ -154,8 +153,7 @@ class Volumes:
         """Change the pressures, and v along with them, to reach the volumes to first order; return the linear iterations."""
         m, w = system.model, system.work.pcg
         G, z, n = self._rows(system.stage.beta), [], 0
-        if system.n_contacts == 0:
-            system.form_matrix()
+        system.form_matrix(projected=True)
         for row in G:
             upload([(w.rhs, row.reshape(-1, 3))])
             n += system.solve_linear(SLOPE_TOLERANCE).iterations

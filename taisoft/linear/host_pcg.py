@@ -49,7 +49,8 @@ def solve(
         block_csr.multiply(m, A, w.p, w.q)
         p, q = w.p.host.astype(np.float64).reshape(-1), free * w.q.host.reshape(-1)
         if low_rank is not None:
-            q += (low_rank[1] * (low_rank[0] @ p)) @ low_rank[0]
+            G, s = low_rank
+            q += np.einsum("k,kn->n", s * np.einsum("kn,n->k", G, p), G)  # BLAS would start threads for these few numbers
         curvature = float(p @ q)
         if not curvature > 0.0:
             y += (min(rz / -curvature, MAX_NEGATIVE_STEP) if curvature < 0.0 else MAX_NEGATIVE_STEP) * p

@@ -60,10 +60,10 @@ class Body(Guarded):
     have, a float, or (m,) where it may differ from tet to tet; setting one replaces the material's. position: (3,) [m]; nodes
     start at rest_positions + position. velocity: (3,) or (n,3) [m/s], initial. order: 1 or 2, of the elements' shape functions;
     quadrature_degree: degree of polynomials integrated exactly. nodes: `Nodes`, the mesh's vertices and for order 2 its mid-
-    edge nodes. constraints, tractions, forces, pressures, cavities: lists of `Constraint`, `Traction`, `NodalForce`, `Pressure`,
-    `Cavity`; items can be removed, but only methods add them. collision: one of CONTACT_MODES. Only material, its numbers, position, velocity
-    and collision can be assigned; each is validated. `warn_locking` and `warn_bending` warn if tets of order 1 are far too
-    stiff; `Scene.add_body` calls both.
+    edge nodes. constraints, tractions, forces, pressures, cavities: lists of `Constraint`, `Traction`, `NodalForce`,
+    `Pressure`, `Cavity`; items can be removed, but only methods add them. collision: one of CONTACT_MODES. Only material, its
+    numbers, position, velocity and collision can be assigned; each is validated. `warn_locking` and `warn_bending` warn if
+    tets of order 1 are far too stiff; `Scene.add_body` calls both.
     """
 
     _read_only = frozenset(_READ_ONLY)
