@@ -188,6 +188,7 @@ def solve_with_volumes(system: "StageSystem", stage: "Stage", solve_stage: "Call
         discarded.append(result)
         linear += volumes.correct(system)
         result = solve(system, stage)
-    volumes.end()
     result = replace(count_all(result, discarded), converged=result.converged and volumes.hold)
+    if result.converged:
+        volumes.end()
     return replace(result, linear_iterations=result.linear_iterations + linear)
