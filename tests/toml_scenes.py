@@ -92,7 +92,7 @@ MESH = '[bodies.a]\nmaterial = {{}}\nmesh = {{ file = "{}" }}\n'
 def path_data(path):
     """Of a path, its frames and where what it leads starts."""
     frames = getattr(path, "frames", path)
-    names = ("times", "translations", "rotations", "pivot", "smooth", "release")
+    names = ("times", "translations", "rotations", "pivot", "smooth", "release", "values")
     said = {name: np.asarray(getattr(frames, name)).tobytes() for name in names} if path else None
     return said and said | {name: getattr(path, name).tobytes() for name in ("starts", "center") if hasattr(path, name)}
 
@@ -104,7 +104,8 @@ def data(scene: ts.Scene) -> dict:
         arrays = (b.rest_positions, b.nodes.elements, b.mesh.tets, b.mesh.surface, b.position, b.velocity)
         fixed = [(c.nodes.tolist(), c.axes.tolist()) for c in b.constraints if c.path is None]
         moved = [(c.nodes.tolist(), c.axes.tolist(), path_data(c.path)) for c in b.constraints if c.path is not None]
-        chosen = [t.triangles.tolist() for t in b.tractions] + [f.nodes.tolist() for f in b.forces]
+        chosen = [t.triangles.tolist() for t in (*b.tractions, *b.pressures)] + [f.nodes.tolist() for f in b.forces]
+        chosen += [(c.name, c.given, c.triangles.tolist()) for c in b.cavities]
         values = [path_data(load.path) or (load.value.shape, load.value.tobytes()) for load in b.loads]
         numbers = (b.name, b.order, b.quadrature_degree, b.collision, b.material)
         by_tet = {name: own.tobytes() for name, own in b.composition.by_tet.items()}

@@ -4,8 +4,8 @@ Small strains, inner radius a, outer radius b, pressure p (Timoshenko, Goodier, 
     u(r) = p a^3 / (E (b^3 - a^3)) ((1 - 2 nu) r + (1 + nu) b^3 / (2 r^2)).
 Large strains, r(R) with the stresses of F = diag(r', r/R, r/R):
     dP_r/dR + 2 (P_r - P_t) / R = 0,   P_r = -p (r/R)^2 at R = a,   P_r = 0 at R = b,
-solved by collocation. The mesh is an eighth of a sphere of flat facets, scaled so that they enclose the cavity's volume; the radius
-is that of a ball with the volume of the deformed cavity, enclosed by the curved faces of quadratic tets.
+solved by collocation. The mesh is an eighth of a sphere of flat facets, scaled so that they enclose the volume of the cavity. The
+radius is that of a ball with the volume of the deformed cavity.
 """
 
 from collections.abc import Callable
@@ -23,7 +23,7 @@ INNER, OUTER = 1.0, 2.0  # [m]
 YOUNG, POISSON = 1e5, 0.3
 SMALL, LARGE = 100.0, 2e4  # [Pa]: strains of 1e-3, and a quarter
 SMALL_LIMIT, LARGE_LIMIT = 0.005, 0.01  # relative, of the displacement
-DIFFERENCE = 1e-6  # of stretches, for the derivatives of stresses
+DIFFERENCE = 1e-5  # of stretches, for the derivatives of stresses
 
 
 def thick_sphere(inner: float, outer: float, across: int, layers: int, whole: bool = False) -> ts.TetMesh:
@@ -90,7 +90,7 @@ def inflated(pk1: Callable[[np.ndarray], np.ndarray], inner: float, outer: float
         return np.array([P_r[0] + pressure * stretch[0] ** 2, P_r[1]]) / pressure
 
     R = np.linspace(inner, outer, 41)
-    found = solve_bvp(slopes, ends, R, np.stack([R, np.ones_like(R)]), tol=1e-7, max_nodes=20000)
+    found = solve_bvp(slopes, ends, R, np.stack([R, np.ones_like(R)]), tol=1e-6, max_nodes=20000)
     if not found.success:
         raise RuntimeError(f"the radial balance was not solved: {found.message}")
     return float(found.y[0, 0])
@@ -121,5 +121,5 @@ def sphere(law: str, across: int, layers: int, _reference: dict, arch: str):
 
 CASES = tuple(
     Case("thick_sphere", law, f"{across}x{layers}", partial(sphere, law, across, layers), fine, closed_form=True)
-    for law, across, layers, fine in (("SNH", 6, 3, False), ("SVK", 6, 3, False), ("SNH", 10, 5, True))
+    for law, across, layers, fine in (("SNH", 6, 3, False), ("COR", 6, 3, True), ("SNH", 10, 5, True))
 )

@@ -92,7 +92,7 @@ def _scene_facts(scene: Scene, task: dict) -> dict:
     )
     loads = [load for b in bodies for load in b.loads]
     touches = scene.pushes(task["fixed"].get("self_collision", False))
-    varied = any(load.path is not None for load in loads)
+    varied = any(load.path is not None for load in loads) or any(not p.closed for b in bodies for p in b.pressures)
     free = not (varied or any(b.constraints for b in bodies) or mass_damped or (touches and scene.obstacles))
     return {
         "bodies": [[b.name, b.n_nodes] for b in bodies],
