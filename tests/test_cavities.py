@@ -13,6 +13,7 @@ from shells import hold_planes, inflated, inside, thick_sphere
 from toml_scenes import there_and_back
 
 import taisoft as ts
+from taisoft.cli.files import describe
 from taisoft.errors import SceneError, SimulationError
 from taisoft.scene.fingerprint import scene_digest
 from taisoft.scene.refine import refined, with_order
@@ -203,3 +204,9 @@ def test_names_are_unique_and_paths_checked():
         with pytest.raises(SimulationError, match=sim_error):
             for _ in range(3):
                 sim.step()
+
+
+def test_info_lists_cavities():
+    lines = dict(describe(MESH))
+    assert lines["cavities"].startswith("4.18879 around (") and "more" not in lines["cavities"]
+    assert "cavities" not in dict(describe(ts.ball_mesh(1.0, 4)))
