@@ -349,7 +349,8 @@ class StageSystem:
 
     def direction(self, tolerance: float) -> pcg.LinearResult:
         """Solve for y of pcg from -r."""
-        if self.volumes is not None and self.volumes.penalised:
+        restricted = self.work.pcg.subset.restricted
+        if self.volumes is not None and self.volumes.penalised and not restricted:
             return self.volumes.direction(self, tolerance)
         return self.solve_linear(tolerance)
 

@@ -86,8 +86,6 @@ def make_plan(scene: Scene, explicit: bool, multistep: bool, self_collision: boo
     why = f"tractions or forces on {_shorten(loaded)}" if loaded else "bodies can be dragged"
     plan.add("loads", loaded or draggable, why, "no traction and no force")
     add_if_any("pressure", lambda b: b.pressures or b.cavities, "on", "no surface is under pressure")
-    given = [cavity.name for b in scene.bodies for cavity in b.cavities if cavity.given == "volume"]
-    plan.add("cavity_volumes", given, f"the fluid in {_shorten(given)} is incompressible", "no cavity has a given volume")
     add_if_any("load_paths", lambda b: any(load.path for load in b.loads), "on", "every load is constant")
     add_if_any("fixed_nodes", lambda b: any(c.path is None for c in b.constraints), "on", "no node is fixed")
     add_if_any("moving_nodes", lambda b: any(c.path is not None for c in b.constraints), "paths on", "no node follows a path")
