@@ -20,8 +20,10 @@ INSTEAD = {  # what to do instead of assigning to an attribute that a simulator 
     **dict.fromkeys(("force", "forces"), "call sim.set_force(body, index, value)"),
     **dict.fromkeys(("traction", "tractions"), "call sim.set_traction(body, index, value)"),
     **dict.fromkeys(("tension", "tendons"), "call sim.set_tension(name, force)"),
+    **dict.fromkeys(("pressure", "pressures"), "call sim.set_pressure(body, index, value)"),
     **dict.fromkeys(("time", "step_count"), "call sim.reset() to go back to the start"),
     **dict.fromkeys(("arch", "precision"), "make a new Simulator"),
+    **dict.fromkeys(("cavity", "cavities"), "call sim.set_cavity(name, value)"),
     "gravity": "call sim.set_gravity(gravity)",
     "material": "call sim.set_material(body, young=...)",
     "scene": "make a new Simulator of the other scene",
@@ -148,6 +150,23 @@ def set_tension(self: "Simulator", name: str, value: float) -> None:
     dynamics = self._open()
     change_tension(self.scene, name, value)
     dynamics.loads_changed()
+
+
+def set_pressure(self: "Simulator", body: str, index: int, value: float) -> None:
+    """Change a pressure added by `body.add_pressure`, from the next step on; index and errors as for `set_force`.
+
+    value: a number [Pa]; it replaces a path.
+    """
+    _set_load(self, "pressure", body, index, value)
+
+
+def set_cavity(self: "Simulator", name: str, value: float) -> None:
+    """Change the pressure [Pa] in a cavity, or its volume [m^3], whichever was given, from the next step on; replaces a path.
+
+    Raises SceneError if there is no cavity of this name or the value is invalid.
+    """
+    body, cavity = self.scene.cavity(name)
+    _set_load(self, "cavity", body.name, body.cavities.index(cavity), value)
 
 
 def _set_load(sim: "Simulator", kind: str, body: str, index: int, value) -> None:

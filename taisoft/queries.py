@@ -8,6 +8,7 @@ from taisoft.backend import runtime
 from taisoft.backend.arrays import upload
 from taisoft.dynamics.drag_spring import Drag
 from taisoft.errors import SceneError, SimulationError
+from taisoft.fem.pressure import cavity_form
 from taisoft.fem.terms import elasticity
 from taisoft.records import Energies, ErrorEstimate
 from taisoft.stability import stable_dt as largest_stable_dt
@@ -57,6 +58,20 @@ def joint_force(self: "Simulator", name: str) -> float | np.ndarray:
     from taisoft.dynamics.joints import joint_force as of_dynamics
 
     return of_dynamics(self._open(), name)
+
+
+def cavity_volume(self: "Simulator", name: str) -> float:
+    """Return the present volume [m^3] of a cavity. Raises SceneError if there is none of this name."""
+    return cavity_form(self.scene, name).volume_and_gradient(self._open().state.state()[0])[0]
+
+
+def cavity_pressure(self: "Simulator", name: str) -> float:
+    """Return the pressure [Pa] in a cavity: as given at the present time, or that of the last step if its volume is given.
+
+    Raises SceneError if there is none of this name.
+    """
+    self.scene.cavity(name)
+    return self._open().state.cavity_pressures_by_name(self.time)[name]
 
 
 def stress(self: "Simulator", body: str | None = None) -> np.ndarray:

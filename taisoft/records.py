@@ -10,7 +10,7 @@ class Energies:
     kinetic: float  #: [J]
     elastic: float  #: [J], 0 at rest
     gravity: float  #: -sum m g.x [J], 0 at the origin
-    loads: float = 0.0  #: -sum f.x of forces, tractions and a drag [J], 0 at the origin
+    loads: float = 0.0  #: -sum f.x of forces, tractions and a drag, 0 at the origin, and p V of pressures on closed surfaces [J]
 
     @property
     def total(self) -> float:

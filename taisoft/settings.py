@@ -14,6 +14,7 @@ from taisoft.scene.plan import Plan, make_plan
 from taisoft.scene.scene import Scene
 
 IMPLICIT_CONTACT = ("augmented_lagrangian",)
+VOLUMES = ("implicit_euler", "bdf2")  # integrators that can keep the volume of a cavity: others fix the forces before the end
 CONTACT_SOLVERS = ("auto", *EXPLICIT_CONTACT, *IMPLICIT_CONTACT)
 
 
@@ -63,6 +64,7 @@ def check_settings(scene: Scene, **given) -> Settings:
     _check_name("integrator", settings.integrator, INTEGRATORS)
     _check_name("contact_solver", settings.contact_solver, CONTACT_SOLVERS)
     _check_contact_solver(settings, scene.pushes(settings.self_collision))
+    _check_volumes(settings, scene)
     return settings
 
 
@@ -101,6 +103,14 @@ def _check_name(name: str, value: str, known: tuple[str, ...]) -> None:
         near = difflib.get_close_matches(value, known, 1)
         hint = f" (did you mean '{near[0]}'?)" if near else ""
         raise SimulationError(f"{name} {value!r} is unknown{hint}: it must be one of {', '.join(known)}")
+
+
+def _check_volumes(settings: Settings, scene: Scene) -> None:
+    """Raise SimulationError unless the integrator can keep given volumes of cavities."""
+    given = [cavity.name for body in scene.bodies for cavity in body.cavities if cavity.given == "volume"]
+    if given and (settings.integrator not in VOLUMES or settings.tolerance is not None):
+        instead = " or ".join(VOLUMES)
+        raise SimulationError(f"cavity {given[0]!r} of given volume needs integrator {instead}, without a tolerance of the run")
 
 
 def _check_contact_solver(settings: Settings, touching: bool) -> None:

@@ -140,6 +140,8 @@ class Simulator(Guarded):
     energies = queries.energies
     reactions = queries.reactions
     joint_force = queries.joint_force
+    cavity_volume = queries.cavity_volume
+    cavity_pressure = queries.cavity_pressure
     stress = queries.stress
     elastic_forces = queries.elastic_forces
     force_differential = queries.force_differential
@@ -171,6 +173,8 @@ class Simulator(Guarded):
     set_force = changes.set_force
     set_traction = changes.set_traction
     set_tension = changes.set_tension
+    set_pressure = changes.set_pressure
+    set_cavity = changes.set_cavity
     drag = changes.drag
     release = changes.release
 

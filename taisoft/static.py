@@ -1,6 +1,7 @@
 """Static equilibrium: Newton's method on the elastic forces, with load steps if the full load fails in one step."""
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -12,9 +13,11 @@ from taisoft.dynamics.no_contacts import NoContacts
 from taisoft.dynamics.results import StageResult
 from taisoft.dynamics.simulation_state import SimulationState
 from taisoft.dynamics.stage_system import Stage, StageSystem
+from taisoft.dynamics.volumes import Volumes, solve_with_volumes
 from taisoft.errors import SceneError, SimulationError
 from taisoft.fem.measure import measure
 from taisoft.fem.model import Layout, build_model
+from taisoft.fem.pressure import cavity_form
 from taisoft.fem.state import ELASTIC, N_INVERTED
 from taisoft.scene import checks
 from taisoft.scene.plan import make_plan
@@ -42,6 +45,7 @@ class StaticResult:
     _layout: Layout
     _positions: np.ndarray
     _reactions: np.ndarray
+    _pressures: dict[str, float]
 
     def positions(self, name: str | None = None) -> np.ndarray:
         """Positions (n_nodes, 3) [m] of a body, or of all bodies concatenated."""
@@ -50,6 +54,15 @@ class StaticResult:
     def reactions(self, name: str | None = None) -> np.ndarray:
         """Constraint forces (n_nodes, 3) [N] of a body, or of all bodies concatenated."""
         return self._reactions[self._rows(name)].copy()
+
+    def cavity_volume(self, name: str) -> float:
+        """Volume [m^3] of a cavity."""
+        return cavity_form(self._scene, name).volume_and_gradient(self._positions)[0]
+
+    def cavity_pressure(self, name: str) -> float:
+        """Pressure [Pa] in a cavity."""
+        self._scene.cavity(name)
+        return self._pressures[name]
 
     def _rows(self, name: str | None) -> slice:
         if name is None:
@@ -126,7 +139,12 @@ class StaticSolver:
             plan.on | dict.fromkeys(("mass_damping", "stiffness_damping", "spring_damping", "consistent_mass"), False),
         )
         self.simulation = SimulationState(scene, runtime, arena, model, layout, DirichletConditions(scene, layout))
-        self.solver = StageSystem(model, arena, runtime.eps, self.simulation.dirichlet.prescribed_nodes, NoContacts())
+        self.volumes, self.time = None, time
+        if len(self.simulation.loads.given_volumes):
+            self.simulation.set_cavity_pressures(np.zeros(len(self.simulation.loads.given_volumes)))
+            self.volumes = Volumes(self.simulation)
+        prescribed = self.simulation.dirichlet.prescribed_nodes
+        self.solver = StageSystem(model, arena, runtime.eps, prescribed, NoContacts(), volumes=self.volumes)
         self.tolerance = tolerance
         self.target = self.simulation.next_target(time)
         self.simulation.upload_constraints()
@@ -167,7 +185,10 @@ class StaticSolver:
             axes = self.simulation.dirichlet.prescribed_axes()
             start += [(w.targets, rest + fraction * (self.target - rest)), (w.prescribed_axes, axes)]
         upload(start)
-        result = solve(self.solver, Stage(0.0, 1.0, 1.0, tolerance, max_newton=max_newton))
+        if self.volumes is not None:
+            self.volumes.begin(self.time, fraction)
+        stage = Stage(0.0, 1.0, 1.0, tolerance, max_newton=max_newton)
+        result = solve_with_volumes(self.solver, stage, partial(solve, self.solver, stage))
         self.newton += result.newton_iterations
         self.linear += result.linear_iterations
         self.multigrid += result.multigrid_solves
@@ -175,7 +196,7 @@ class StaticSolver:
 
     def _residual(self, result: StageResult) -> float:
         """The residual of the result; 0 without load and constraint forces, where it would be rounding over rounding."""
-        loaded = self.gravity.any() or any(full.any() for _, full in self.loads)
+        loaded = self.gravity.any() or any(full.any() for _, full in self.loads) or self.volumes is not None
         only_rounding = not loaded and np.linalg.norm(self.solver.held_residual()) <= self.solver.rounding.force
         return 0.0 if only_rounding and result.converged else result.residual
 
@@ -200,4 +221,5 @@ class StaticSolver:
             _layout=simulation.layout,
             _positions=simulation.model.state.x.to_numpy(),
             _reactions=self.solver.held_residual(),
+            _pressures=simulation.cavity_pressures_by_name(self.time),
         )

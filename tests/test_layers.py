@@ -29,7 +29,7 @@ ORDER = (
     ("backend.runtime",),
     ("mesh", "scene"),
     ("fem.state", "fem.math3", "fem.node_graph"),
-    ("fem.laws", "fem.lanes", "fem.dependents", "fem.reference", "fem.loads", "fem.springs"),
+    ("fem.laws", "fem.lanes", "fem.dependents", "fem.reference", "fem.loads", "fem.springs", "fem.pressure"),
     ("fem.terms",),
     ("fem.model",),
     ("fem.measure", "stability"),

@@ -354,7 +354,7 @@ def test_bad_paths_are_refused(path, message):
     with pytest.raises(SceneError, match=f"^body 'body': {message}"):
         body.add_force([1, 2, 3], path)
     assert body.forces == []
-    with pytest.raises(SceneError, match="loads cannot be set: call body.add_force or body.add_traction"):
+    with pytest.raises(SceneError, match="loads cannot be set: call body.add_force, body.add_traction or body.add_p"):
         body.loads = []
 
 

@@ -32,6 +32,7 @@ def test_reasons():
         "consistent_weight": (False, "on linear tets it is the lumped mass"),
         "consistent_mass": (False, "the mass of linear tets is lumped"),
         "loads": (True, "tractions or forces on beam, block"),
+        "pressure": (False, "no surface is under pressure"),
         "load_paths": (False, "every load is constant"),
         "fixed_nodes": (True, "on beam, block, tower"),
         "moving_nodes": (False, "no node follows a path"),
@@ -61,6 +62,7 @@ def test_every_feature_can_be_on_and_off():
     full.add_obstacle(ts.HalfSpace((0, -9, 0), (0, 1, 0)))
     full.body("beam").young = np.full(full.body("beam").mesh.n_tets, 1e5)
     full.body("beam").add_force([4], lambda t: (t, 0, 0))
+    full.body("beam").add_pressure([4], 1.0)
     full.body("beam").collision, full.contact_forces = "distance_field", True
     on = make_plan(full, explicit=False, multistep=True, self_collision=True).on
     laws = {name for name in on if name.startswith("law:")}

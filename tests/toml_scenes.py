@@ -109,7 +109,8 @@ def data(scene: ts.Scene) -> dict:
         arrays = (b.rest_positions, b.nodes.elements, b.mesh.tets, b.mesh.surface, b.position, b.velocity)
         fixed = [(c.nodes.tolist(), c.axes.tolist()) for c in b.constraints if c.path is None]
         moved = [(c.nodes.tolist(), c.axes.tolist(), path_data(c.path)) for c in b.constraints if c.path is not None]
-        chosen = [t.triangles.tolist() for t in b.tractions] + [f.nodes.tolist() for f in b.forces]
+        chosen = [t.triangles.tolist() for t in (*b.tractions, *b.pressures)] + [f.nodes.tolist() for f in b.forces]
+        chosen += [(c.name, c.given, c.triangles.tolist()) for c in b.cavities]
         values = [path_data(load.path) or (load.value.shape, load.value.tobytes()) for load in b.loads]
         numbers = (b.name, b.order, b.quadrature_degree, b.collision, b.material)
         by_tet = {name: own.tobytes() for name, own in b.composition.by_tet.items()}

@@ -15,6 +15,7 @@ from taisoft.mesh.files import WRITERS, check_ending, read_mesh, write_mesh
 from taisoft.mesh.quality import edge_lengths, mean_ratio
 from taisoft.mesh.surface_mesh import FORMATS, SurfaceMesh, read_surface, tetrahedralize
 from taisoft.mesh.tet_mesh import TetMesh
+from taisoft.mesh.topology import connected_pieces
 from taisoft.scene.material import Material
 from taisoft.scene.obstacles import HalfSpace
 from taisoft.scene.scene import Scene
@@ -28,6 +29,7 @@ RELATIVE_STIFFNESS = 100.0  # Young's modulus over the pressure under the body: 
 DENSITY = 1000.0  # [kg/m^3]
 GROUND = "ground"
 MAX_REGIONS = 20  # listed by name
+MAX_CAVITIES = 5  # listed by volume
 MESH_SUFFIXES = (*WRITERS, ".node", ".ele")
 
 
@@ -82,6 +84,7 @@ def describe(mesh: TetMesh) -> list[tuple[str, str]]:
     return [
         *_size_lines(counts, mesh.vertices),
         ("volume", f"{mesh.volumes.sum():.6g}"),
+        *_cavity_lines(mesh),
         *_region_lines(mesh),
         _edge_line(lengths),
         ("quality", f"mean ratio {ratios}; 1 is a regular tet, {poor} are below {POOR_QUALITY}"),
@@ -110,6 +113,17 @@ def _region_lines(mesh: TetMesh) -> list[tuple[str, str]]:
     counts = [f"{mesh.region_text(one)} of {np.count_nonzero(mesh.regions == one)} tets" for one in mesh.region_ids[:MAX_REGIONS]]
     others = len(mesh.region_ids) - len(counts)
     return [("regions", ", ".join(counts) + (f", and {others} more" if others else ""))] if counts else []
+
+
+def _cavity_lines(mesh: TetMesh) -> list[tuple[str, str]]:
+    """Return a line about the cavities, if there are any: the first MAX_CAVITIES, by volume and middle."""
+    n, part = connected_pieces(mesh.surface, mesh.n_verts)
+    corners = mesh.vertices[mesh.surface]
+    volumes = -np.bincount(part[mesh.surface[:, 0]], np.linalg.det(corners - corners[0, 0]), n) / 6.0
+    found = np.flatnonzero(volumes > 0.0)  # their normals point inward
+    texts = [f"{volumes[k]:.6g} around {_triple(mesh.vertices[part == k].mean(axis=0))}" for k in found[:MAX_CAVITIES]]
+    others = len(found) - len(texts)
+    return [("cavities", ", ".join(texts) + (f", and {others} more" if others else ""))] if texts else []
 
 
 def _pieces(number: int) -> str:

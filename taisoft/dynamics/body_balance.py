@@ -3,7 +3,7 @@
 Newton's method ends on the residual norm of the whole scene, relative to the forces of the whole scene. All forces on a body
 that is much lighter or less strained than others can be smaller than that: it would neither fall nor rest. So each body, and
 each connected piece of one, is checked separately:
-    |r|_b <= LIMIT s_b,   s_b = |M (v - v_hat)|_b + beta (|f_el|_b + |M g + loads|_b),
+    |r|_b <= LIMIT s_b,   s_b = |M (v - v_hat)|_b + beta (|f_el|_b + |M g + loads|_b), loads with pressures,
 unless its residual is rounding. The mean of r over a piece without constraints moves the piece as a whole. Elastic forces and
 their rounding cancel in it, so only the rounding of momenta counts there. This check applies to linearly implicit steps, too;
 the rest of their residual is the linearisation error.
@@ -19,6 +19,7 @@ import numpy as np
 from taisoft.backend.arrays import download
 from taisoft.fem.model import Model
 from taisoft.fem.terms.elasticity import gather_forces
+from taisoft.fem.terms.pressure import gather_pressures
 from taisoft.mesh.topology import connected_pieces
 from taisoft.scene.scene import Scene
 
@@ -60,6 +61,9 @@ class BodyBalance:
         fields = [w.residual, m.state.v, w.v_hat, w.pcg.q, m.free, m.mass, m.gravity_mass, *([m.loads] if m.loaded else [])]
         residual, v, v_hat, elastic, free, mass, gravity_mass, *loads = (a.astype(np.float64) for a in download(fields))
         external = gravity_mass[:, None] * m.gravity.to_numpy()[0] + (loads[0] if loads else 0.0)
+        if m.has_pressure:
+            gather_pressures(m, w.pcg.q)
+            external += w.pcg.q.to_numpy()
         r, inertia, momentum, elastic, external, masses = (
             self._norm(free * a)
             for a in (residual, mass[:, None] * (v - v_hat), mass[:, None] * v, elastic, external, mass[:, None] * np.ones(3))

@@ -198,7 +198,8 @@ def solve(system: StageSystem, stage: Stage) -> StageResult:
     """
     system.begin(stage)
     if system.n_contacts == 0:
-        newton = Newton(system, stage, eliminate=eliminate)
+        # elimination knows no constraint of all nodes of a cavity
+        newton = Newton(system, stage, eliminate=eliminate if system.volumes is None else None)
         if stage.linearised:
             return newton.solve_once()
         r, scale, _ = choose_start(system, *system.evaluate())

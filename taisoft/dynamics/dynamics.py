@@ -201,10 +201,12 @@ class Dynamics:
 
     @property
     def is_driven(self) -> bool:
-        """Whether anything but constant forces does work now: a drag, prescribed nodes, moving obstacles, loads along paths."""
+        """Whether anything does work now that energies do not count: a drag, prescribed nodes, moving obstacles, loads along
+        paths or without a potential."""
         moving = self.contact is not None and any(obstacle.path is not None for obstacle in self.scene.obstacles)
         dragged = self.drag_spring is not None and self.drag_spring.drag is not None
-        return moving or dragged or self.state.loads.vary or not all(self.state.dirichlet.released())
+        driven = self.state.loads.vary or not self.state.loads.has_potential
+        return moving or dragged or driven or not all(self.state.dirichlet.released())
 
     def mean_acceleration(self, nodes: np.ndarray) -> np.ndarray:
         """Return the mean acceleration (k,3) [m/s^2] of nodes (k,) in the last step or batch; 0 before the first one.

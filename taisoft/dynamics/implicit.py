@@ -5,6 +5,7 @@ step's midpoint.
 """
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import taichi as ti
@@ -22,6 +23,7 @@ from taisoft.dynamics.schemes import SCHEMES, Scheme
 from taisoft.dynamics.simulation_state import SimulationState
 from taisoft.dynamics.stage_system import Stage, StageSystem
 from taisoft.dynamics.substepping import Substepping
+from taisoft.dynamics.volumes import Volumes, solve_with_volumes
 from taisoft.errors import SimulationError
 from taisoft.fem.dependents import place_all
 from taisoft.settings import Settings
@@ -105,7 +107,8 @@ class ImplicitStepper:
             arena.vectors("x_before", ti.f64, m.n_nodes) if self.scheme.before else None,
         )
         prescribed = simulation.dirichlet.prescribed_nodes
-        self.solver = StageSystem(m, arena, simulation.runtime.eps, prescribed, contact, self.history.x_now)
+        self._volumes = Volumes(simulation) if len(simulation.loads.given_volumes) else None
+        self.solver = StageSystem(m, arena, simulation.runtime.eps, prescribed, contact, self.history.x_now, self._volumes)
         self.tolerance = settings.newton_tolerance or DEFAULT_TOLERANCE[settings.precision]
         self.contact_tolerance = settings.contact_tolerance or TOLERANCE[settings.precision]
         self.linear_tolerance = settings.linear_tolerance
@@ -178,6 +181,8 @@ class ImplicitStepper:
             )
         if self.contact.paths.held_back:
             step.problems.append(self.contact.paths.held_back)
+        if self._volumes is not None:
+            step.problems += self._volumes.problems()
         if name:
             step.problems.append(f"forces on {name} are unbalanced by {worst:.2g} of their size, beside larger forces elsewhere")
         return step
@@ -260,6 +265,8 @@ class ImplicitStepper:
                 prescribed.append((w.prescribed_acceleration, accelerations))
             upload(prescribed)
         simulation.set_load_time(time + (0.5 if scheme.midpoint else 1.0) * dt)
+        if self._volumes is not None:
+            self._volumes.begin(time + dt)
         self._beta = scheme.beta_over_dt * dt
         self.contact.set_impulse_fraction(scheme.beta_over_dt)
         self.solver.assemble_damper()
@@ -322,7 +329,7 @@ class ImplicitStepper:
             # prescribed nodes change their velocity once a step, not twice within the midpoint's half step
             0.5 if scheme.midpoint else 1.0,
         )
-        return solve_bouncing(self.solver, stage) if bounces else solve(self.solver, stage)
+        return solve_with_volumes(self.solver, stage, partial(solve_bouncing if bounces else solve, self.solver, stage))
 
     def compile_hard_steps(self) -> None:
         """Compile the kernels that only hard steps need, by running them on the current stage; its state is then invalid."""

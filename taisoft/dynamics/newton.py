@@ -91,7 +91,7 @@ class Newton:
         """Return whether |r| is small enough for the present multipliers."""
         target = self._target()
         if not self.has_contacts or self.stage.keeps_multipliers:
-            return self.r <= target or self.rounding
+            return (self.r <= target or self.rounding) and self.system.volumes_hold
         laws_hold = self.system.contact_residual <= self.stage.contact_tolerance
         # in an impact whose laws hold, only the momenta remain to be balanced
         inner = (FINER if self.multipliers >= self.stage.extrapolate_after else 1.0) * self.stage.inner_tolerance * self.scale

@@ -10,7 +10,9 @@ from taisoft.dynamics.dirichlet import DirichletConditions
 from taisoft.fem.dependents import DependentTable, dependent_table
 from taisoft.fem.loads import SceneLoads
 from taisoft.fem.model import Layout, Model, damping_table, law_table, upload_mass_matrix
+from taisoft.fem.pressure import pressures_of
 from taisoft.fem.reference import gravity_masses, lumped_masses
+from taisoft.scene.loads import Cavity
 from taisoft.scene.scene import Scene
 
 
@@ -34,6 +36,7 @@ class SimulationState:
     _loads: SceneLoads | None = None  # None: not computed, or outdated
     dependents: DependentTable | None = None
     load_time: float | None = None  # of the loads on the device; None: several, or outdated
+    cavity_pressures: np.ndarray | None = None  # (k,) [Pa] in the cavities of given volume; None without such cavities
 
     def __post_init__(self):
         self.dependents = dependent_table(self.scene)
@@ -54,7 +57,8 @@ class SimulationState:
     def snapshot(self) -> dict:
         """Return the state for a checkpoint; see `taisoft/checkpoint.py`."""
         x, v = self.state()
-        return {"time": self.time, "step_count": self.step_count, "released": self.dirichlet.released(), "x": x, "v": v}
+        own = {"time": self.time, "step_count": self.step_count, "released": self.dirichlet.released(), "x": x, "v": v}
+        return own if self.cavity_pressures is None else own | {"cavity_pressures": self.cavity_pressures}
 
     def restore(self, kept: dict) -> None:
         """Restore a `snapshot`, also one of another instance of the same scene."""
@@ -62,6 +66,8 @@ class SimulationState:
         self.upload_constraints()
         self.set_state(kept["x"], kept["v"])
         self.time, self.step_count = float(kept["time"]), int(kept["step_count"])
+        if self.cavity_pressures is not None:
+            self.set_cavity_pressures(kept["cavity_pressures"])
         self.set_load_time(self.time)
 
     def restart(self) -> None:
@@ -70,6 +76,8 @@ class SimulationState:
         self.upload_constraints()
         self.set_state(self.layout.rest, self._rest_velocities())  # compiles it before a step may need it
         self.time, self.step_count = 0.0, 0
+        if len(self.loads.given_volumes):
+            self.set_cavity_pressures(np.zeros(len(self.loads.given_volumes)))
         self.set_load_time(0.0)
 
     def upload_constraints(self) -> None:
@@ -109,6 +117,10 @@ class SimulationState:
         self._loads = self.load_time = None
         self.set_load_time(self.time)
 
+    def set_cavity_pressures(self, pressures: np.ndarray) -> None:
+        """Set the pressures (k,) [Pa] in the cavities of given volume; `set_load_time` uploads them."""
+        self.cavity_pressures, self.load_time = np.array(pressures), None
+
     def set_drag(self, drag: tuple[np.ndarray, np.ndarray] | None) -> None:
         """Set nodes and forces of a drag spring, or None, and upload the loads of the present time."""
         self.drag, self.load_time = drag, None
@@ -127,9 +139,21 @@ class SimulationState:
                 np.add.at(loads, *self.drag)
             fields.append((m.loads, loads))
         if m.amplitudes is not None:
-            fields.append((m.amplitudes, self.loads.amplitudes([time])[0]))
+            fields.append((m.amplitudes, self.amplitudes(time)))
         upload(fields)
         self.load_time = time
+
+    def amplitudes(self, time: float) -> np.ndarray:
+        """Return the loads that are one number at a time [s], with the present pressures in cavities of given volume."""
+        amplitudes = self.loads.amplitudes([time])[0]
+        if self.cavity_pressures is not None:
+            amplitudes[self.loads.given_volumes] = self.cavity_pressures
+        return amplitudes
+
+    def cavity_pressures_by_name(self, time: float) -> dict[str, float]:
+        """Return the pressures [Pa] in all cavities at a time [s]."""
+        found = zip(pressures_of(self.scene), self.amplitudes(time))
+        return {load.name: float(p) for (_, load), p in found if isinstance(load, Cavity)}
 
     def load_rows(self, times: np.ndarray, nodes: np.ndarray) -> np.ndarray:
         """Return loads (r, k, 3) [N] at times (r,) on nodes (k,), ascending, for kernels that set them."""

@@ -52,6 +52,7 @@ from taisoft.linear.block_csr import BlockCsr
 if TYPE_CHECKING:
     from taisoft.dynamics.contact import ContactStep
     from taisoft.dynamics.no_contacts import NoContacts
+    from taisoft.dynamics.volumes import Volumes
 
 
 @dataclass(frozen=True)
@@ -90,9 +91,13 @@ class StageSystem:
         prescribed: np.ndarray,
         contact: "ContactStep | NoContacts",
         x_start: Any = None,
+        volumes: "Volumes | None" = None,
     ):
-        """prescribed: nodes that follow a path. x_start: (n_nodes) 3-vectors f64, positions at the start of the step."""
-        self.model, self.contact, self.x_start = model, contact, x_start
+        """prescribed: nodes that follow a path. x_start: (n_nodes) 3-vectors f64, positions at the start of the step.
+
+        volumes: the cavities of given volume, if there are any.
+        """
+        self.model, self.contact, self.x_start, self.volumes = model, contact, x_start, volumes
         self.matrix: BlockCsr = block_csr.build_block_csr(model, arena)
         self.damper = block_csr.sibling(self.matrix, model, arena, "damping") if model.stiffness_damping else None
         n, k = model.n_nodes, len(prescribed)
@@ -183,7 +188,13 @@ class StageSystem:
     def slopes(self) -> tuple[float, float]:
         """(r.y at the start of the step, r.y at its end); negative: descent."""
         scalars = self.model.state.scalars
-        return scalars[START_SLOPE], scalars[END_SLOPE]
+        start = scalars[START_SLOPE] + (self.volumes.slope_change if self.volumes is not None else 0.0)
+        return start, scalars[END_SLOPE]
+
+    @property
+    def volumes_hold(self) -> bool:
+        """Whether all cavities have the volume that is given, or are not the concern of the present solve."""
+        return self.volumes is None or not self.volumes.penalised or self.volumes.hold
 
     def begin(self, stage: Stage) -> None:
         """Begin a stage at its first iterate; with contacts, form the matrix, which the r-factors depend on."""
@@ -214,6 +225,8 @@ class StageSystem:
         m, w, k, stage = self.model, self.work, self._k, self.stage
         if mode is not None:
             move(m, w, k, self.kind, mode, step_length, stage.c, stage.beta)
+            if self.volumes is not None:
+                self.volumes.measure()
         if k.any:
             update_impulses(m, k, int(new_multipliers), stage.beta, self.r_scale)
         form_residual(m, w, self.matrix, k, self.kind, stage.beta, self.norms)
@@ -323,7 +336,11 @@ class StageSystem:
     def form(self, subset: Subset, projected: bool, c: float, beta: float) -> None:
         """Form the matrix of c and beta at the present positions, for the rows of a subset."""
         block_csr.assemble(self.model, self.matrix, subset, projected)
+        if self.volumes is not None:
+            self.volumes.upload(self.volumes.pressures)
         block_csr.to_system(self.model, self.matrix, self.damper or self.matrix, subset, int(projected), c, beta)
+        if self.volumes is not None and self.volumes.penalised:
+            self.volumes.upload(self.volumes.effective)
 
     def form_matrix_and_factors(self, projected: bool = False) -> None:
         """Form the matrix and the contacts' r-factors, which stay fixed during the stage."""
@@ -332,6 +349,13 @@ class StageSystem:
 
     def direction(self, tolerance: float) -> pcg.LinearResult:
         """Solve for y of pcg from -r."""
+        restricted = self.work.pcg.subset.restricted
+        if self.volumes is not None and self.volumes.penalised and not restricted:
+            return self.volumes.direction(self, tolerance)
+        return self.solve_linear(tolerance)
+
+    def solve_linear(self, tolerance: float) -> pcg.LinearResult:
+        """Solve for y of pcg from its right side."""
         m, w = self.model, self.work
         if not self._k.any and not w.pcg.subset.restricted:
             return self.linear_solver.solve(self, tolerance)

@@ -10,9 +10,12 @@ import numpy as np
 
 from taisoft.errors import SimulationError
 from taisoft.fem import reference
+from taisoft.fem.pressure import pressures_of
 from taisoft.scene.connections import Tendon
-from taisoft.scene.loads import NodalForce, Traction, value_at
+from taisoft.scene.loads import NodalForce, ScalarLoad, Traction, value_at
 from taisoft.scene.scene import Body, Scene
+
+FOLLOWS = ScalarLoad(np.zeros(()))  # the pressure in a cavity of given volume, which steppers find
 
 
 class _Path(NamedTuple):
@@ -32,7 +35,12 @@ class _Path(NamedTuple):
 
 
 class SceneLoads:
-    """The loads of a scene with its present values. nodes: those whose loads follow a path, ascending."""
+    """The loads of a scene with its present values.
+
+    nodes: those whose loads follow a path, ascending. given_volumes: amplitudes that are the pressures in cavities of given
+    volume. has_potential: whether energies count the work of all constant loads: not
+    that of a pressure on an open surface, which depends on the path of its border, and of the fluid in a given volume.
+    """
 
     def __init__(self, scene: Scene):
         starts = np.cumsum([0, *(body.n_nodes for body in scene.bodies)])
@@ -47,6 +55,9 @@ class SceneLoads:
                         self._paths.append(_Path(f"body {body.name!r}: {kind} {k}", load, start + nodes, weights))
         self.nodes = np.unique(np.concatenate([np.zeros(0, dtype=np.int64), *(path.nodes for path in self._paths)]))
         self._scalars = scalar_loads(scene)
+        self.given_volumes = np.array([n for n, (_, load) in enumerate(self._scalars) if load is FOLLOWS], dtype=np.int64)
+        others = [load for _, load in pressures_of(scene) if not load.has_potential]
+        self.has_potential = not any(load.path is not None or load.value.any() for load in others)
 
     @property
     def n_amplitudes(self) -> int:
@@ -92,7 +103,11 @@ def _number_at(load: Tendon, t: float, what: str) -> float:
 
 def scalar_loads(scene: Scene) -> list[tuple[str, Tendon]]:
     """The loads of a scene that are one number, each with its name in messages, in the order of the model's `amplitudes`."""
-    return [(f"tendon {tendon.name!r}", tendon) for tendon in scene.tendons]
+    found: list[tuple[str, ScalarLoad | Tendon]] = []
+    for body in scene.bodies:
+        found += [(f"body {body.name!r}: pressure {k}", load) for k, load in enumerate(body.pressures)]
+        found += [(f"cavity {cavity.name!r}", FOLLOWS if cavity.given == "volume" else cavity) for cavity in body.cavities]
+    return found + [(f"tendon {tendon.name!r}", tendon) for tendon in scene.tendons]
 
 
 def tension_slots(scene: Scene) -> dict[str, int]:

@@ -5,7 +5,7 @@ import taichi as ti
 from taisoft.backend.runtime import kernel
 from taisoft.fem.lanes import broadcast, mass_times
 from taisoft.fem.state import ELASTIC, FIRST_SOFTENED, GRAVITY, KINETIC, LOADS, MIN_J, N_INVERTED
-from taisoft.fem.terms import dead_loads, elasticity, gravity, springs
+from taisoft.fem.terms import dead_loads, elasticity, gravity, pressure, springs
 from taisoft.fem.terms.elasticity import HUGE
 
 NO_TET = 2**31 - 1  # above any tet index
@@ -60,6 +60,8 @@ def measure(m: ti.template()):
             weight += gravity.energy(m, i)
             if ti.static(m.loaded):
                 loads += dead_loads.energy(m, i)
+            if ti.static(m.has_pressure):
+                loads += pressure.energy(m, i)
         m.state.partial[c, KINETIC], m.state.partial[c, GRAVITY], m.state.partial[c, LOADS] = kinetic, weight, loads
         m.state.partial[c, FIRST_SOFTENED] = ti.cast(_lane_min(softened), ti.f64)
     ti.loop_config(serialize=True)

@@ -19,6 +19,7 @@ from taisoft.fem.dependents import build_dependents, dependent_table, expanded_p
 from taisoft.fem.laws import LAWS
 from taisoft.fem.loads import SceneLoads
 from taisoft.fem.node_graph import PAIRS, NodeGraph, node_graph
+from taisoft.fem.pressure import PressureTable, build_pressures
 from taisoft.fem.state import State, build_state
 from taisoft.fem.terms import terms_of
 from taisoft.ranges import owners
@@ -92,6 +93,7 @@ class Model:
     dependents: Any  # fem.dependents.Dependents, or None
     loads: Any  # (n_nodes) 3-vectors [N], or None: tractions and forces
     amplitudes: Any  # f64, or None: present values of the loads that are one number, see `fem.loads.scalar_loads`
+    pressure: PressureTable | None
     node_body: Any  # (n_nodes) i32; None unless damping needs it
     damping: Any  # (n_bodies, 2), or None: mass damping [1/s], stiffness damping [s]
     consistent: bool  # mass_matrix is used
@@ -116,6 +118,11 @@ class Model:
     def depends_on_velocity(self) -> bool:
         """Whether forces other than mass damping depend on velocities."""
         return self.stiffness_damping or self.spring_damping
+
+    @property
+    def has_pressure(self) -> bool:
+        """Whether pressures act on surfaces."""
+        return self.pressure is not None
 
 
 @dataclass(frozen=True)
@@ -318,6 +325,7 @@ def build_model(scene: Scene, runtime: Runtime, arena: FieldArena, on: dict[str,
         springs=springs.build_springs(scene, arena, n_nodes, on["assembled_stiffness"]) if on["springs"] else None,
         loads=arena.vectors("loads", real, n_nodes, scene_loads.at(0.0).astype(npr)) if on["loads"] else None,
         amplitudes=arena.field("amplitudes", ti.f64, n_amplitudes, scene_loads.amplitudes([0.0])[0]) if n_amplitudes else None,
+        pressure=None,
         node_body=arena.field("node_body", ti.i32, n_nodes, node_body) if damped else None,
         damping=arena.field("damping", real, (n_bodies, 2), damping_table(scene).astype(npr)) if damped else None,
         consistent=on["consistent_mass"],
@@ -330,6 +338,9 @@ def build_model(scene: Scene, runtime: Runtime, arena: FieldArena, on: dict[str,
     )
     if on["consistent_mass"]:
         model = replace(model, mass_matrix=_build_mass_matrix(scene, model, arena, npr))
+    if on["pressure"]:
+        graph = model_graph(model)[0] if on["assembled_stiffness"] else None
+        model = replace(model, pressure=build_pressures(scene, layout.node_start, arena, graph))
     return model, layout
 
 

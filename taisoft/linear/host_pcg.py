@@ -16,12 +16,19 @@ from taisoft.linear.pcg import MAX_NEGATIVE_STEP, LinearResult, PcgWork
 
 
 def solve(
-    m: Model, A: BlockCsr, w: PcgWork, tolerance: float, max_iterations: int, precondition: Callable[[np.ndarray], np.ndarray]
+    m: Model,
+    A: BlockCsr,
+    w: PcgWork,
+    tolerance: float,
+    max_iterations: int,
+    precondition: Callable[[np.ndarray], np.ndarray],
+    low_rank: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> LinearResult:
     """Solve for w.y given w.rhs, as `pcg.solve` without coupling and for all nodes.
 
     precondition: symmetric positive definite on the free axes, from a residual (3 n_nodes) f64; 0 on the others. If rounding
-    keeps it from being so, the solve ends without convergence.
+    keeps it from being so, the solve ends without convergence. low_rank: (G, s), rows (k, 3 n_nodes) and factors (k,): G^T s G is
+    added to A.
     """
     free = m.free.host.astype(np.float64).reshape(-1)
     r = free * w.rhs.host.reshape(-1)
@@ -41,6 +48,9 @@ def solve(
         w.p.host[...] = (z + beta * p).reshape(-1, 3)
         block_csr.multiply(m, A, w.p, w.q)
         p, q = w.p.host.astype(np.float64).reshape(-1), free * w.q.host.reshape(-1)
+        if low_rank is not None:
+            G, s = low_rank
+            q += np.einsum("k,kn->n", s * np.einsum("kn,n->k", G, p), G)  # BLAS would start threads for these few numbers
         curvature = float(p @ q)
         if not curvature > 0.0:
             y += (min(rz / -curvature, MAX_NEGATIVE_STEP) if curvature < 0.0 else MAX_NEGATIVE_STEP) * p

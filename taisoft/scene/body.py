@@ -10,13 +10,14 @@ import numpy as np
 from taisoft.attributes import Guarded, guarded_record, thawed
 from taisoft.errors import SceneError, value_text
 from taisoft.mesh.nodes import Nodes, make_nodes
+from taisoft.mesh.solids import is_closed
 from taisoft.mesh.tet_mesh import TetMesh
 from taisoft.mesh.thickness import coarse_bending
 from taisoft.scene import checks
 from taisoft.scene.collision import CONTACT_MODES
 from taisoft.scene.composition import Composition, compose
 from taisoft.scene.key_frames import KeyFrames, NodePath
-from taisoft.scene.loads import NodalForce, Traction, value_or_path
+from taisoft.scene.loads import Cavity, NodalForce, Pressure, Traction, value_or_path
 from taisoft.scene.material import Material
 
 NEARLY_INCOMPRESSIBLE = 0.49  # Poisson's ratio above which linear tets lock, so that they bend far too little
@@ -26,6 +27,8 @@ _READ_ONLY = ("name", "mesh", "composition", "order", "quadrature_degree", "node
 USE_A_COPY = "change a copy made by scene.snapshot() and make a new Simulator of it"
 _SET_FORCE = f"call sim.set_force(body, index, value) for an existing one; otherwise {USE_A_COPY}"
 _SET_TRACTION = f"call sim.set_traction(body, index, value) for an existing one; otherwise {USE_A_COPY}"
+_SET_CAVITY = f"call sim.set_cavity(name, value) for an existing one; otherwise {USE_A_COPY}"
+_SET_PRESSURE = f"call sim.set_pressure(body, index, value) for an existing one; otherwise {USE_A_COPY}"
 
 
 @guarded_record("constraint", "add another one by body.fix or body.move")
@@ -58,10 +61,10 @@ class Body(Guarded):
     the tets have, a float, or (m,) where it may differ from tet to tet; setting one replaces the material's. position: (3,)
     [m]; nodes start at rest_positions + position. velocity: (3,) or (n,3) [m/s], initial. order: 1 or 2, of the elements'
     shape functions; quadrature_degree: degree of polynomials integrated exactly. nodes: `Nodes`, the mesh's vertices and for
-    order 2 its mid-edge nodes. constraints, tractions, forces: lists of `Constraint`, `Traction`, `NodalForce`; items can be
-    removed, but only methods add them. collision: one of CONTACT_MODES. Only material, its numbers, position, velocity and
-    collision can be assigned; each is validated. `warn_locking` and `warn_bending` warn if tets of order 1 are far too stiff;
-    `Scene.add_body` calls both.
+    order 2 its mid-edge nodes. constraints, tractions, forces, pressures, cavities: lists of `Constraint`, `Traction`,
+    `NodalForce`, `Pressure`, `Cavity`; items can be removed, but only methods add them. collision: one of CONTACT_MODES. Only
+    material, its numbers, position, velocity and collision can be assigned; each is validated. `warn_locking` and
+    `warn_bending` warn if tets of order 1 are far too stiff; `Scene.add_body` calls both.
     """
 
     _read_only = frozenset(_READ_ONLY)
@@ -69,12 +72,14 @@ class Body(Guarded):
         "contact_mode": "set body.collision",
         "composition": "set body.material",
         "mass": "set body.density",
-        "loads": "call body.add_force or body.add_traction",
+        "loads": "call body.add_force, body.add_traction or body.add_pressure",
     }
     _contents = {
         "constraints": "call body.fix or body.move",
         "tractions": "call body.add_traction",
         "forces": "call body.add_force",
+        "pressures": "call body.add_pressure",
+        "cavities": "call body.add_cavity",
     }
     _default_frozen = USE_A_COPY
     _instead_frozen = {
@@ -86,6 +91,10 @@ class Body(Guarded):
         "forces": _SET_FORCE,
         "add_traction": _SET_TRACTION,
         "tractions": _SET_TRACTION,
+        "add_pressure": _SET_PRESSURE,
+        "pressures": _SET_PRESSURE,
+        "add_cavity": _SET_CAVITY,
+        "cavities": _SET_CAVITY,
     }
 
     def __init__(
@@ -114,6 +123,8 @@ class Body(Guarded):
         self.constraints: list[Constraint] = []
         self.tractions: list[Traction] = []
         self.forces: list[NodalForce] = []
+        self.pressures: list[Pressure] = []
+        self.cavities: list[Cavity] = []
         self._seal(Body.__init__)
 
     def _label(self) -> str:
@@ -138,9 +149,9 @@ class Body(Guarded):
         return self.nodes.positions
 
     @property
-    def loads(self) -> list[Traction | NodalForce]:
-        """Its tractions, then its forces."""
-        return [*self.tractions, *self.forces]
+    def loads(self) -> list[Traction | NodalForce | Pressure | Cavity]:
+        """Its tractions, then its forces, its pressures and its cavities."""
+        return [*self.tractions, *self.forces, *self.pressures, *self.cavities]
 
     @property
     def n_nodes(self) -> int:
@@ -252,11 +263,66 @@ class Body(Guarded):
         """
         self._check_open("add_traction")
         what = f"{self._label()}: add_traction"
-        centroids = self.mesh.vertices[self.mesh.surface].mean(axis=1)
-        triangles = checks.selection(where, centroids, what, "surface triangle")
-        load = Traction(triangles, **value_or_path(traction, what, "traction", ((3,),)))
+        load = Traction(self._triangles(where, what), **value_or_path(traction, what, "traction", ((3,),)))
         list.append(self.tractions, load)
         return load
+
+    def add_pressure(self, where, pressure) -> Pressure:
+        """Apply a pressure that acts along the deformed inward normal of surface triangles, and on their deformed area.
+
+        where: as for `add_traction`. pressure: [Pa], a number, negative for suction, or its path: callable t [s] -> number,
+        called once here for t = 0, or `KeyFrames` with values. Pressures on the same triangle add. Raises SceneError if no
+        triangle is chosen or a number is not finite.
+        """
+        self._check_open("add_pressure")
+        what = f"{self._label()}: add_pressure"
+        triangles = self._triangles(where, what)
+        given = value_or_path(pressure, what, "pressure", ((),))
+        load = Pressure(**given, triangles=triangles, closed=is_closed(self.mesh.surface[triangles]))
+        list.append(self.pressures, load)
+        return load
+
+    def add_cavity(self, where, pressure=None, volume=None, name: str | None = None) -> Cavity:
+        """Fill a cavity with a fluid of given pressure, or with an incompressible fluid of given volume.
+
+        where: its surface triangles, as for `add_traction`: closed, with normals into the cavity. pressure: [Pa] above the
+        ambient pressure, as for `add_pressure`. volume: [m^3], above 0, a number or a path; the pressure then follows, in
+        implicit Euler and BDF2 steps and in statics. name: unique in the scene; by default "NAME cavity 0" and so on, NAME the
+        body's. Raises SceneError.
+        """
+        self._check_open("add_cavity")
+        what = f"{self._label()}: add_cavity"
+        if (pressure is None) == (volume is None):
+            raise SceneError(f"{what}: give either a pressure or a volume")
+        own = [cavity.name for cavity in self.cavities]
+        if name is None:
+            name = next(free for k in range(len(own) + 1) if (free := f"{self.name} cavity {k}") not in own)
+        name = checks.name(name, f"{what}: name", own)
+        triangles = self._triangles(where, what)
+        if not is_closed(self.mesh.surface[triangles]):
+            raise SceneError(f"{what}: the chosen triangles have a border: they must enclose the cavity")
+        rest_volume = self._enclosed(triangles)
+        if rest_volume <= 0.0:
+            raise SceneError(f"{what}: the normals of the chosen triangles point outward: they must point into the cavity")
+        given = "pressure" if volume is None else "volume"
+        content = value_or_path(pressure if volume is None else volume, what, given, ((),))
+        cavity = Cavity(**content, name=name, triangles=triangles, given=given, rest_volume=rest_volume)
+        check_volume(cavity, f"{what}: volume")
+        list.append(self.cavities, cavity)
+        return cavity
+
+    def enclosed_volume(self, where) -> float:
+        """Return the volume [m^3] at rest of the cavity with these surface triangles, chosen as for `add_cavity`."""
+        return self._enclosed(self._triangles(where, f"{self._label()}: enclosed_volume"))
+
+    def _enclosed(self, triangles: np.ndarray) -> float:
+        corners = self.mesh.vertices[self.mesh.surface[triangles]]
+        return -float(np.linalg.det(corners - corners[0, 0]).sum()) / 6.0
+
+    def _triangles(self, where, what: str) -> np.ndarray:
+        """Return the chosen rows of mesh.surface, by their centroids at rest."""
+        centroids = self.mesh.vertices[self.mesh.surface].mean(axis=1)
+        return checks.selection(where, centroids, what, "surface triangle")
 
     def add_force(self, where, force) -> NodalForce:
         """Apply a dead load to nodes: a total force distributed by lumped mass, or one force per node.
@@ -284,6 +350,13 @@ class Body(Guarded):
                 raise SceneError(f"{what}: node {nodes[0]} is already {verb} along {'xyz'[axes[0]]}")
         list.append(self.constraints, constraint)
         return constraint
+
+
+def check_volume(cavity: Cavity, what: str) -> None:
+    """Raise SceneError if a volume is not above 0; of a path, at t = 0."""
+    start = cavity.value if cavity.path is None else cavity.path(0.0)
+    if cavity.given == "volume" and float(start) <= 0.0:
+        raise SceneError(f"{what} must be above 0, not {float(start):g}")
 
 
 def _callable_or_none(where) -> Callable | None:

@@ -41,12 +41,15 @@ def number(value, what: str, *, above=None, minimum=None, maximum=None, unit: st
 def array(value, what: str, shapes: tuple[tuple[int, ...], ...]) -> np.ndarray:
     """Return a float64 copy of finite numbers in one of the shapes. what: start of the message."""
     shapes_text = " or ".join(str(shape) for shape in shapes)
+    numbers_text = "a number" if shapes == ((),) else f"numbers of shape {shapes_text}"
     try:
         result = np.asarray(value)
     except (ValueError, TypeError, OverflowError):
         result = np.empty(0, dtype=object)
     if result.dtype.kind not in "fiu":
-        raise SceneError(f"{what} must be numbers of shape {shapes_text}, not {value_text(value)}")
+        raise SceneError(f"{what} must be {numbers_text}, not {value_text(value)}")
+    if result.shape not in shapes and shapes == ((),):
+        raise SceneError(f"{what} must be a number, not of shape {result.shape}")
     if result.shape not in shapes:
         raise SceneError(f"{what} must have shape {shapes_text}, not {result.shape}")
     result = np.array(result, dtype=np.float64)

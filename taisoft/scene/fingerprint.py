@@ -59,6 +59,8 @@ def _body_parts(body: Body) -> dict[str, list]:
         "loads": [
             *(x for t in body.tractions for x in ("traction", t.triangles, *_path_parts(t.path))),
             *(x for f in body.forces for x in ("force", f.nodes, *_path_parts(f.path))),
+            *(x for p in body.pressures for x in ("pressure", p.triangles, *_path_parts(p.path))),
+            *(x for c in body.cavities for x in ("cavity", c.name, c.given, c.triangles, *_path_parts(c.path))),
         ],
     }
 

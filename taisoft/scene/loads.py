@@ -1,4 +1,4 @@
-"""Loads of a body, constant or along a path: on surface triangles, and on nodes."""
+"""Loads of a body, constant or along a path: tractions and pressures on surface triangles, forces on nodes."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -51,6 +51,66 @@ class NodalForce:
     def shapes(self) -> tuple[tuple[int, ...], ...]:
         """Shapes that its values may have."""
         return ((3,), (len(self.nodes), 3))
+
+
+@dataclass(frozen=True, eq=False)
+class ScalarLoad:
+    """A load that is one number."""
+
+    kind: ClassVar[str] = "number"
+    value: np.ndarray | None  #: (), in the unit of the load; None if it follows a path
+    path: Callable | None = None  #: t [s] -> such a number
+    path_shape: tuple[int, ...] | None = None  #: of all values along the path
+
+    def __post_init__(self):
+        checks.store(self, value=self.value)
+
+    @property
+    def shapes(self) -> tuple[tuple[int, ...], ...]:
+        """Shapes that its values may have."""
+        return ((),)
+
+
+@guarded_record("pressure", "call sim.set_pressure(body, index, value) in a simulation")
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Pressure(ScalarLoad):
+    """A follower load on surface triangles: its value [Pa] pushes along the deformed inward normal."""
+
+    kind: ClassVar[str] = "pressure"
+    triangles: np.ndarray  #: (k,) int64 rows of mesh.surface
+    closed: bool  #: whether these have no border; the load then has a potential
+
+    def __post_init__(self):
+        checks.store(self, value=self.value, triangles=self.triangles)
+
+    @property
+    def has_potential(self) -> bool:
+        """Whether its work does not depend on the path that the body takes."""
+        return self.closed
+
+
+@guarded_record("cavity", "call sim.set_cavity(name, value) in a simulation")
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Cavity(ScalarLoad):
+    """A closed inner surface with a fluid of given pressure [Pa], or an incompressible one of given volume [m^3], its value."""
+
+    name: str
+    triangles: np.ndarray  #: (k,) int64 rows of mesh.surface
+    given: str  #: "pressure" or "volume"
+    rest_volume: float  #: [m^3]
+
+    def __post_init__(self):
+        checks.store(self, value=self.value, triangles=self.triangles)
+
+    @property
+    def kind(self) -> str:
+        """What its value is."""
+        return self.given
+
+    @property
+    def has_potential(self) -> bool:
+        """Whether energies count the work of its fluid: that of a given volume is left out."""
+        return self.given == "pressure"
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,7 +13,7 @@ import numpy as np
 from taisoft.attributes import thawed
 from taisoft.errors import SceneError
 from taisoft.scene import checks
-from taisoft.scene.body import Body
+from taisoft.scene.body import Body, check_volume
 from taisoft.scene.collision import has_sharp_edges
 from taisoft.scene.connections import check_tension
 from taisoft.scene.material import LAWS
@@ -21,7 +21,12 @@ from taisoft.scene.obstacles import Box, MeshObstacle
 from taisoft.scene.scene import Scene
 
 CHANGEABLE = ("young", "poisson", "density", "mass_damping", "stiffness_damping")  # numbers of a material
-LOADS = {"force": "forces", "traction": "tractions"}  # kind of load -> the body's list of them
+LOADS = {  # kind of load -> the body's list of them
+    "force": "forces",
+    "traction": "tractions",
+    "pressure": "pressures",
+    "cavity": "cavities",
+}
 Numbers = dict[str, float | list | np.ndarray | None]  # of a scene, by name
 
 
@@ -79,9 +84,10 @@ def make_plan(scene: Scene, explicit: bool, multistep: bool, self_collision: boo
         f"quadratic tets of {_shorten(quadratic)} in implicit steps",
         "explicit steps need a diagonal mass" if quadratic else "the mass of linear tets is lumped",
     )
-    loaded = [b.name for b in scene.bodies if b.loads]
+    loaded = [b.name for b in scene.bodies if b.tractions or b.forces]
     why = f"tractions or forces on {_shorten(loaded)}" if loaded else "bodies can be dragged"
     plan.add("loads", loaded or draggable, why, "no traction and no force")
+    add_if_any("pressure", lambda b: b.pressures or b.cavities, "on", "no surface is under pressure")
     varied = [b.name for b in scene.bodies if any(load.path for load in b.loads)] + [t.name for t in scene.tendons if t.path]
     plan.add("load_paths", varied, f"on {_shorten(varied)}", "every load is constant")
     add_if_any("fixed_nodes", lambda b: any(c.path is None for c in b.constraints), "on", "no node is fixed")
@@ -165,13 +171,16 @@ def change_material(body: Body, numbers: dict, on: dict[str, bool], region: int 
 def change_load(body: Body, kind: str, index: int, value) -> None:
     """Set the value of a body's load `index`, counted from 0 in the order added; it replaces a path. kind: a key of LOADS.
 
-    value: (3,) [N], or (k,3) for the k nodes of a force; (3,) [Pa] for a traction. Raises SceneError.
+    value: (3,) [N], or (k,3) for the k nodes of a force; (3,) [Pa] for a traction; a number [Pa] for a pressure, or as
+    given for a cavity. Raises SceneError.
     """
     loads, what = getattr(body, LOADS[kind]), f"body {body.name!r}: set_{kind}"
     if not loads:
         raise SceneError(f"{what}: it has no {kind}: give it one of 0 by body.add_{kind} before the Simulator is made")
     old = loads[checks.whole(index, f"{what}: index", range(len(loads)))]
     new = replace(old, value=checks.array(value, f"{what}: {kind} {index}", old.shapes), path=None, path_shape=None)
+    if kind == "cavity":
+        check_volume(new, f"{what}: volume")
     with thawed(body):
         getattr(body, LOADS[kind])[index] = new
 

@@ -3,9 +3,9 @@
 Old nodes keep their positions and come first; new nodes are edge midpoints, so two solutions can be compared node by node. The
 geometry stays that of the mesh: new nodes of a ball do not move to the sphere. Functions that choose nodes are evaluated again.
 For nodes chosen by id, a midpoint is chosen if its edge belongs to a surface triangle or tet whose nodes are all chosen; if
-only the two ends are chosen, the case is ambiguous and refused. Tractions pass to the parts of their triangles. Forces given
-per node stay point forces. The stiffness and damping of an attachment stay the same in all: each of its nodes gets less if there
-are more of them.
+only the two ends are chosen, the case is ambiguous and refused. Tractions and pressures pass to the parts of their triangles.
+Forces given per node stay point forces. The stiffness and damping of an attachment stay the same in all: each of its nodes gets
+less if there are more of them.
 """
 
 import copy
@@ -22,7 +22,7 @@ from taisoft.scene import checks
 from taisoft.scene.body import Body, Constraint
 from taisoft.scene.connections import Attachment
 from taisoft.scene.key_frames import KeyFrames, NodePath
-from taisoft.scene.loads import LoadPath, NodalForce, Traction
+from taisoft.scene.loads import Cavity, LoadPath, NodalForce, Pressure, Traction
 from taisoft.scene.scene import Scene
 
 PARTS = 8  # of a tet; `make_nodes` lists the parts of each tet in sequence
@@ -68,6 +68,10 @@ def _refined(old: Body) -> tuple[Body, np.ndarray]:
     parents = np.array([rows[tuple(sorted(t))] for t in mesh.surface.tolist()])
     for load in old.tractions:
         new.add_traction(np.isin(parents, load.triangles), _load_of(load))
+    for load in old.pressures:
+        new.add_pressure(np.isin(parents, load.triangles), _load_of(load))
+    for cavity in old.cavities:
+        new.add_cavity(np.isin(parents, cavity.triangles), name=cavity.name, **{cavity.given: _load_of(cavity)})
     return new, parents_of_nodes
 
 
@@ -78,6 +82,10 @@ def _of_order(old: Body, order: int) -> tuple[Body, np.ndarray]:
     new = _on_mesh(old, old.mesh, order, parents)
     for load in old.tractions:
         new.add_traction(load.triangles, _load_of(load))
+    for load in old.pressures:
+        new.add_pressure(load.triangles, _load_of(load))
+    for cavity in old.cavities:
+        new.add_cavity(cavity.triangles, name=cavity.name, **{cavity.given: _load_of(cavity)})
     return new, parents
 
 
@@ -86,7 +94,7 @@ def _own_parents(n: int) -> np.ndarray:
 
 
 def _on_mesh(old: Body, mesh: TetMesh, order: int, parents: np.ndarray) -> Body:
-    """Return the body on another mesh, without tractions. parents: (n,2), the two old nodes that each new node bisects."""
+    """Return the body on another mesh, without loads on triangles. parents: (n,2), the old nodes that each new one bisects."""
     velocity = old.velocity if old.velocity.shape == (3,) else old.velocity[parents].mean(axis=1)
     degree = old.quadrature_degree if order == old.order else None
     copies = mesh.n_tets // old.mesh.n_tets
@@ -109,8 +117,8 @@ def _on_mesh(old: Body, mesh: TetMesh, order: int, parents: np.ndarray) -> Body:
     return new
 
 
-def _load_of(load: Traction | NodalForce):
-    """Return what `add_force` or `add_traction` was given: a value or a path."""
+def _load_of(load: Traction | NodalForce | Pressure | Cavity):
+    """Return what the method that added a load was given: a value or a path."""
     return load.value if load.path is None else load.path.frames if isinstance(load.path, LoadPath) else load.path
 
 

@@ -17,6 +17,7 @@ from taisoft.scene import checks
 from taisoft.scene.body import USE_A_COPY, Body
 from taisoft.scene.collision import CollisionSettings
 from taisoft.scene.connections import Attachment, Connection, Spring, Tendon, add_spring, add_tendon, attach, check_connections
+from taisoft.scene.loads import Cavity
 from taisoft.scene.material import Material
 from taisoft.scene.obstacles import Obstacle, Shape, surface_numbers
 
@@ -118,6 +119,12 @@ class Scene(Guarded):
         self._check_gravity(self.gravity)
         for body in self.bodies:
             body.check()
+        names: set[str] = set()
+        for body in self.bodies:
+            for cavity in body.cavities:
+                if cavity.name in names:
+                    raise SceneError(f"body {body.name!r}: cavity name {cavity.name!r} is taken; names must be unique")
+                names.add(cavity.name)
         check_connections(self)
 
     @property
@@ -195,6 +202,13 @@ class Scene(Guarded):
         """Return the body with this name. Raises SceneError if there is none."""
         return _find(self.bodies, name, "body")
 
+    def cavity(self, name: str) -> tuple[Body, Cavity]:
+        """Return the cavity with this name, and its body. Raises SceneError if there is none."""
+        owners = [body for body in self.bodies for _ in body.cavities]
+        cavities = [cavity for body in self.bodies for cavity in body.cavities]
+        found = _find(cavities, name, "cavity")
+        return owners[cavities.index(found)], found
+
     def obstacle(self, name: str) -> Obstacle:
         """Return the obstacle with this name. Raises SceneError if there is none."""
         return _find(self.obstacles, name, "obstacle")
@@ -255,7 +269,7 @@ class Scene(Guarded):
         return checks.name(name, f"scene: {kind} name", taken)
 
 
-def _find(items: list, name: str, kind: str) -> Body | Obstacle:
+def _find(items: list, name: str, kind: str) -> Body | Obstacle | Cavity:
     """Return the item with this name. Raises SceneError with the closest name if there is none."""
     for item in items:
         if item.name == name:

@@ -8,6 +8,7 @@
     [bodies.NAME.materials]   instead of material: one for each region of the mesh, REGION = a name, or a table
     [[bodies.NAME.fix]]       nodes, axes                   [[bodies.NAME.move]]   nodes, path (KeyFrames), axes
     [[bodies.NAME.traction]]  triangles, traction [Pa]      [[bodies.NAME.force]]  nodes, force [N], or their KeyFrames
+    [[bodies.NAME.pressure]]  triangles, pressure [Pa]      [[bodies.NAME.cavity]] triangles, pressure or volume, name
     [obstacles.NAME]          shape and its arguments, friction, restitution, path (KeyFrames)
     [[contacts]]              between = ["a", "b"], friction, restitution
     [springs.NAME]            a = ["body", POINT], b, and the other arguments of Scene.add_spring
@@ -43,7 +44,15 @@ from taisoft.scene.toml_connections import add_connections
 
 MESHES = {"box": box_mesh, "sheet": sheet_mesh, "ball": ball_mesh}
 SHAPES = {"half_space": HalfSpace, "sphere": Sphere, "box": Box, "capsule": Capsule, "mesh": MeshObstacle}
-METHODS = {"fix": Body.fix, "move": Body.move, "traction": Body.add_traction, "force": Body.add_force}
+METHODS = {
+    "fix": Body.fix,
+    "move": Body.move,
+    "traction": Body.add_traction,
+    "force": Body.add_force,
+    "pressure": Body.add_pressure,
+    "cavity": Body.add_cavity,
+}
+ON_TRIANGLES = ("traction", "pressure", "cavity")  # methods that choose surface triangles, not nodes
 SCENE_KEYS = ("gravity", "allow_initial_overlap", "contact_forces")  # attributes of a Scene at top level
 TOP_KEYS = [
     *SCENE_KEYS,
@@ -150,14 +159,15 @@ def _add_body(scene: Scene, name: str, table: Table, materials: dict[str, Materi
     keys, _ = arguments_of(Scene.add_body, "name", "mesh", "material")
     body = table.make(scene.add_body, f"body {name!r}: ", "scene: ", keys=keys, mesh=mesh, material=material, name=name)
     for key, method in METHODS.items():  # the argument `where` is called nodes or triangles in the file
-        items = "triangles" if key == "traction" else "nodes"
+        items = "triangles" if key in ON_TRIANGLES else "nodes"
         known, required = ([items if k == "where" else k for k in keys] for keys in arguments_of(method))
         for one in table.listed(key, known, required):
             extra = {"where": selection(one, items)}
             if "path" in known:
                 extra["path"] = one.made("path", KeyFrames, "key frames: ")
-            elif isinstance(one.values.get(key), dict):  # a traction or force that varies
-                extra[key] = one.made(key, KeyFrames, "key frames: ")
+            for argument in (key, "pressure", "volume"):
+                if argument in known and isinstance(one.values.get(argument), dict):  # a load that varies
+                    extra[argument] = one.made(argument, KeyFrames, "key frames: ")
             others = [k for k in known if k not in (items, *extra)]
             one.make(getattr(body, method.__name__), f"body {name!r}: {method.__name__}: ", keys=others, **extra)
 

@@ -19,7 +19,7 @@ from taisoft.mesh.tet_mesh import TetMesh
 from taisoft.scene.body import Body
 from taisoft.scene.checks import SOLVER_CHECKS, check_solver, nearest
 from taisoft.scene.key_frames import NodePath, ShapePath
-from taisoft.scene.loads import LoadPath, NodalForce, Traction
+from taisoft.scene.loads import Cavity, LoadPath, NodalForce, Pressure, Traction
 from taisoft.scene.material import Material
 from taisoft.scene.obstacles import Obstacle
 from taisoft.scene.scene import Scene
@@ -128,7 +128,7 @@ def _body(body: Body, materials: dict[Material, str], stem: str, meshes: dict[st
     table = {"materials": names} if composition.has_regions else {"material": materials[composition.first]}
     table |= {"mesh": {"file": name} if name else body.mesh.recipe} | composition.by_tet
     table |= {key: getattr(body, key) for key in ("position", "velocity", "order", "quadrature_degree", "collision")}
-    table |= {key: [] for key in ("fix", "move", "traction", "force")}
+    table |= {key: [] for key in ("fix", "move", "traction", "force", "pressure", "cavity")}
     for c in body.constraints:
         entry = {"nodes": _ids(c.nodes, body.n_nodes), "axes": "".join(np.array(list("xyz"))[c.axes])}
         if c.path is None:
@@ -142,15 +142,20 @@ def _body(body: Body, materials: dict[Material, str], stem: str, meshes: dict[st
             raise SceneError(f"body {body.name!r}: moves along a function, which a file cannot store: use ts.KeyFrames")
     for load in body.tractions:
         table["traction"].append({"triangles": _ids(load.triangles, len(body.mesh.surface)), "traction": _load(body, load)})
+    for load in body.pressures:
+        table["pressure"].append({"triangles": _ids(load.triangles, len(body.mesh.surface)), "pressure": _load(body, load)})
+    for cavity in body.cavities:
+        entry = {"name": cavity.name, "triangles": _ids(cavity.triangles, len(body.mesh.surface))}
+        table["cavity"].append(entry | {cavity.given: _load(body, cavity)})
     for load in body.forces:
         table["force"].append({"nodes": _ids(load.nodes, body.n_nodes), "force": _load(body, load)})
     return table
 
 
-def _load(body: Body, load: Traction | NodalForce):
+def _load(body: Body, load: Traction | NodalForce | Pressure | Cavity):
     """Return a load's value, or the fields of its key frames."""
     if load.path is None:
-        return load.value
+        return load.value if load.value.ndim else float(load.value)
     if not isinstance(load.path, LoadPath):
         raise SceneError(f"body {body.name!r}: has a load along a function, which a file cannot store: use ts.KeyFrames")
     return _fields(load.path.frames)

@@ -92,7 +92,7 @@ def _scene_facts(scene: Scene, task: dict) -> dict:
         o.path is not None for o in scene.obstacles
     )
     touches = scene.pushes(task["fixed"].get("self_collision", False))
-    varied = any(load.path is not None for load in scene.loads)
+    varied = any(load.path is not None for load in scene.loads) or any(not p.closed for b in bodies for p in b.pressures)
     anchored = {name for one in scene.connections for name in one.owners} - {b.name for b in bodies}
     free = not (varied or anchored or any(b.constraints for b in bodies) or mass_damped or (touches and scene.obstacles))
     return {

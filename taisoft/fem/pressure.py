@@ -1,0 +1,171 @@
+"""Follower pressure as sparse trilinear forms of the nodes, in NumPy.
+
+The force of a pressure p on node i of a surface x(s, t), s and t along two edges of its triangle, is
+    f_i = -p int N_i x_s cross x_t ds dt = -p sum_(b<c) w_ibc (x_b - x_i) cross (x_c - x_i),
+    w_ibc = int N_i (N_b,s N_c,t - N_c,s N_b,t) ds dt,
+with the shape functions of the flat triangle, or of the curved one with six nodes. The integrals are exact. On a closed surface
+f = -p dV/dx, V the enclosed volume, and -df/dx is symmetric. In general its symmetric part has the blocks
+    S_ij = p sum_c u_ijc [x_c - x_i]x,   u_ijc = -(w_ijc - w_jic) / 2,
+with [a]x b = a cross b, and S_ii = 0. Terms of neighbouring triangles are added here, and those that cancel are dropped.
+Source: Bonet, Wood, Nonlinear Continuum Mechanics for Finite Element Analysis, 2nd ed. 2008, sections 8.5.2 and 9.5.2.
+"""
+
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import numpy as np
+import taichi as ti
+
+from taisoft.backend.arrays import FieldArena
+from taisoft.fem.node_graph import NodeGraph
+from taisoft.scene.body import Body
+from taisoft.scene.loads import Cavity, Pressure
+from taisoft.scene.scene import Scene
+
+CANCELLED = 1e-12  # weights below it are rounding; others are above 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class PressureTable:
+    """Terms of the forces and of the stiffness of all pressures, by node."""
+
+    force_start: Any  # (n_nodes + 1) i32: first force term of each node
+    force_nodes: Any  # 3-vectors i32: b, c, and the index of p in Model.amplitudes
+    force_weight: Any  # f64: w_ibc
+    stiffness_start: Any  # (n_nodes + 1) i32; None in explicit steps, as the next two
+    stiffness_nodes: Any  # 3-vectors i32: entry (i, j) of the matrix, c, and the index of p
+    stiffness_weight: Any  # f64: u_ijc
+    has_potential: Any  # i32, of each pressure: 1 if energies count its work
+    force: Any  # (n_nodes) 3-vectors f64 [N]: scratch of explicit steps, else None
+
+    @property
+    def is_prepared(self) -> bool:
+        """Whether forces are computed before any node moves."""
+        return self.force is not None
+
+
+def pressures_of(scene: Scene) -> list[tuple[int, Pressure | Cavity]]:
+    """All pressures and cavities of a scene, each with the number of its body, in the order of Model.amplitudes."""
+    return [(k, load) for k, body in enumerate(scene.bodies) for load in (*body.pressures, *body.cavities)]
+
+
+@cache
+def triangle_weights(order: int) -> np.ndarray:
+    """w (n, n, n) of a triangle with n = 3 or 6 nodes, those between the corners 0 and 1, 1 and 2, 2 and 0 last."""
+    # Gauss points (s, t) = (a, (1 - a) b): exact for degree 4, the highest that occurs
+    point, weight = np.polynomial.legendre.leggauss(3)
+    a, b = (g.reshape(-1) for g in np.meshgrid(0.5 + 0.5 * point, 0.5 + 0.5 * point, indexing="ij"))
+    weights = np.outer(0.5 * weight, 0.5 * weight).reshape(-1) * (1.0 - a)
+    corner = np.stack([1.0 - a - (1.0 - a) * b, a, (1.0 - a) * b])
+    slopes = np.array([(-1.0, -1.0), (1.0, 0.0), (0.0, 1.0)])  # of the barycentric coordinates along s and t
+    if order == 1:
+        value, slope = corner, np.broadcast_to(slopes[:, :, None], (3, 2, len(a)))
+    else:
+        ends = [(0, 1), (1, 2), (2, 0)]
+        value = np.concatenate([corner * (2.0 * corner - 1.0), [4.0 * corner[k] * corner[l] for k, l in ends]])
+        own = (4.0 * corner - 1.0)[:, None] * slopes[:, :, None]
+        middle = [4.0 * (slopes[k][:, None] * corner[l] + corner[k] * slopes[l][:, None]) for k, l in ends]
+        slope = np.concatenate([own, middle])
+    product = np.einsum("q,iq,bq,cq->ibc", weights, value, slope[:, 0], slope[:, 1])
+    return product - product.transpose(0, 2, 1)
+
+
+def triangle_nodes(body: Body, triangles: np.ndarray) -> np.ndarray:
+    """Nodes (k, 3 or 6) of rows (k,) of mesh.surface: corners, then the middles of their edges."""
+    if body.order == 1:
+        return body.mesh.surface[triangles]
+    split = body.nodes.surface.reshape(-1, 4, 3)[triangles]  # (a, ab, ca), (ab, b, bc), (ca, bc, c), ...
+    return np.stack([split[:, 0, 0], split[:, 1, 1], split[:, 2, 2], split[:, 0, 1], split[:, 1, 2], split[:, 0, 2]], axis=1)
+
+
+def force_terms(nodes: np.ndarray, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Nodes (i, b, c), b < c, of the force terms of triangles (k, n), and their weights w_ibc."""
+    i, b, c = np.nonzero(np.abs(w) > CANCELLED)
+    others = (i != b) & (i != c) & (b < c)
+    i, b, c = i[others], b[others], c[others]
+    ids = np.stack([nodes[:, i], nodes[:, b], nodes[:, c]], axis=2).reshape(-1, 3)
+    weights = np.tile(w[i, b, c], len(nodes))
+    swapped = ids[:, 1] > ids[:, 2]
+    return np.where(swapped[:, None], ids[:, [0, 2, 1]], ids), np.where(swapped, -weights, weights)
+
+
+def stiffness_terms(nodes: np.ndarray, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Nodes (i, j, c), c other than i, of the stiffness terms of triangles (k, n), and their weights u_ijc."""
+    u = -0.5 * (w - w.transpose(1, 0, 2))
+    i, j, c = np.nonzero(np.abs(u) > CANCELLED)
+    others = (i != j) & (i != c)
+    i, j, c = i[others], j[others], c[others]
+    return np.stack([nodes[:, i], nodes[:, j], nodes[:, c]], axis=2).reshape(-1, 3), np.tile(u[i, j, c], len(nodes))
+
+
+def merged(ids: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Rows of ids (k, m) in ascending order without repetitions, and the sums of their weights; sums that cancel are dropped."""
+    rows, place = np.unique(ids, axis=0, return_inverse=True)
+    sums = np.bincount(place.reshape(-1), weights, len(rows))
+    kept = np.abs(sums) > CANCELLED
+    return rows[kept], sums[kept]
+
+
+class CavityForm:
+    """The volume of a cavity as a function of all nodes' positions."""
+
+    def __init__(self, body: Body, cavity: Cavity, first_node: int):
+        rows, self._weights = merged(*force_terms(triangle_nodes(body, cavity.triangles), triangle_weights(body.order)))
+        self.nodes, place = np.unique(rows, return_inverse=True)
+        self._rows = place.reshape(-1, 3)
+        self.nodes = self.nodes + first_node
+
+    def volume_and_gradient(self, x: np.ndarray) -> tuple[float, np.ndarray]:
+        """V [m^3], and dV/dx (k, 3) [m^2] at its nodes. x: (n_nodes, 3) [m] of the scene."""
+        own = x[self.nodes] - x[self.nodes[0]]
+        i, b, c = (own[rows] for rows in self._rows.T)
+        parts = -self._weights[:, None] * np.cross(b - i, c - i)
+        gradient = np.stack([np.bincount(self._rows[:, 0], parts[:, a], len(own)) for a in range(3)], axis=1)
+        return float((own * gradient).sum()) / 3.0, gradient
+
+
+def cavity_form(scene: Scene, name: str) -> CavityForm:
+    """The form of the cavity with this name. Raises SceneError if there is none."""
+    body, cavity = scene.cavity(name)
+    first = sum(one.n_nodes for one in scene.bodies[: scene.bodies.index(body)])
+    return CavityForm(body, cavity, first)
+
+
+def all_terms(scene: Scene, node_start: np.ndarray, terms) -> tuple[np.ndarray, np.ndarray]:
+    """Rows (i, b, c, index of p) of all pressures of a scene, ascending, and their weights. terms: one of the functions above."""
+    ids, weights = [np.zeros((0, 4), dtype=np.int64)], [np.zeros(0)]
+    for n, (k, pressure) in enumerate(pressures_of(scene)):
+        body = scene.bodies[k]
+        nodes = node_start[k] + triangle_nodes(body, pressure.triangles)
+        own, w = merged(*terms(nodes, triangle_weights(body.order)))
+        ids.append(np.column_stack([own, np.full(len(own), n)]))
+        weights.append(w)
+    rows, w = np.concatenate(ids), np.concatenate(weights)
+    order = np.argsort(rows[:, 0], kind="stable")
+    return rows[order], w[order]
+
+
+def build_pressures(scene: Scene, node_start: np.ndarray, arena: FieldArena, graph: NodeGraph | None) -> PressureTable:
+    """Fill the table. node_start: first node of each body, then their number; graph: of the matrix, None in explicit steps."""
+    n_nodes = int(node_start[-1])
+
+    def table(name: str, rows: np.ndarray, weights: np.ndarray) -> dict:
+        start = np.concatenate([[0], np.cumsum(np.bincount(rows[:, 0], minlength=n_nodes))])
+        return {
+            f"{name}_start": arena.field(f"pressure_{name}_start", ti.i32, n_nodes + 1, start),
+            f"{name}_nodes": arena.vectors(f"pressure_{name}_nodes", ti.i32, len(rows), rows[:, 1:]),
+            f"{name}_weight": arena.field(f"pressure_{name}_weight", ti.f64, len(rows), weights),
+        }
+
+    arrays = table("force", *all_terms(scene, node_start, force_terms))
+    if graph is None:
+        arrays |= dict.fromkeys(("stiffness_start", "stiffness_nodes", "stiffness_weight"))
+    else:
+        rows, weights = all_terms(scene, node_start, stiffness_terms)
+        keys = np.repeat(np.arange(n_nodes), np.diff(graph.row_start)) * n_nodes + graph.column
+        rows[:, 1] = np.searchsorted(keys, rows[:, 0] * n_nodes + rows[:, 1])
+        arrays |= table("stiffness", rows, weights)
+    closed = np.array([pressure.has_potential for _, pressure in pressures_of(scene)])
+    arrays["has_potential"] = arena.field("pressure_has_potential", ti.i32, len(closed), closed)
+    return PressureTable(**arrays, force=arena.vectors("pressure_force", ti.f64, n_nodes) if graph is None else None)

@@ -1,0 +1,212 @@
+"""Cavities of given pressure and of given volume, on linear and quadratic tets:
+
+* a given pressure acts as `add_pressure` does; volumes and pressures can be asked for;
+* a given volume is kept to 1e-6 in statics, also where the pressure falls as the volume grows, and in steps with and without
+  contacts; its pressure is that of the law's radial balance, and a given pressure of this size gives back the volume;
+* paths, changes while it runs, two cavities, checkpoints, scene files, refinement, and what is refused.
+"""
+
+import numpy as np
+import pytest
+from scenes import SNH, rubber
+from shells import hold_planes, inflated, inside, thick_sphere
+from toml_scenes import there_and_back
+
+import taisoft as ts
+from taisoft.cli.files import describe
+from taisoft.errors import SceneError, SimulationError
+from taisoft.scene.fingerprint import scene_digest
+from taisoft.scene.refine import refined, with_order
+
+MESH = thick_sphere(1.0, 2.0, 2, 1, whole=True)
+BALL = 4.0 / 3.0 * np.pi  # [m^3] of the cavity at rest
+KEPT = 1e-6  # of the volume
+
+
+def balloon(order: int = 2, held: bool = True, mesh: ts.TetMesh = MESH, **cavity) -> ts.Scene:
+    scene = ts.Scene(gravity=(0.0, 0.0, 0.0))
+    body = scene.add_body(mesh, rubber(), name="ball", order=order)
+    if held:
+        hold_planes(body)
+    if cavity:
+        body.add_cavity(inside(mesh, 1.0), **cavity)
+    return scene
+
+
+def test_a_given_pressure_is_add_pressure():
+    scene, other = balloon(pressure=8e3, name="air"), balloon()
+    other.bodies[0].add_pressure(inside(MESH, 1.0), 8e3)
+    found, wanted = ts.solve_static(scene), ts.solve_static(other)
+    assert found.converged and np.array_equal(found.positions(), wanted.positions())
+    assert found.cavity_pressure("air") == 8e3 and found.cavity_volume("air") > 1.1 * BALL
+    assert scene.bodies[0].enclosed_volume(inside(MESH, 1.0)) == pytest.approx(BALL, rel=1e-12)
+    with ts.Simulator(scene, dt=1e-3, integrator="velocity_verlet", precision="f64") as sim:
+        assert sim.cavity_volume("air") == pytest.approx(BALL, rel=1e-12) and sim.cavity_pressure("air") == 8e3
+        start = sim.energies()
+        for _ in range(20):
+            sim.step()
+        now = sim.energies()
+        assert start.loads == pytest.approx(-8e3 * BALL)
+        assert now.loads == pytest.approx(-8e3 * sim.cavity_volume("air")) and now.loads < start.loads - 100.0
+        assert now.total + now.loads == pytest.approx(start.total + start.loads, abs=0.05 * now.kinetic)
+        sim.set_cavity("air", 2e3)
+        assert sim.cavity_pressure("air") == 2e3
+
+
+@pytest.mark.parametrize("order", [1, 2])
+def test_static_volumes(order):
+    """The pressure rises, and falls beyond its largest value; given as such, it leads to the same volume."""
+    pressures = []
+    for ratio in (1.0, 1.5, 8.0, 40.0):
+        found = ts.solve_static(balloon(order, volume=ratio * BALL, name="water"))
+        assert found.converged and found.load_steps == 1 and found.iterations <= 20
+        assert found.cavity_volume("water") == pytest.approx(ratio * BALL, rel=KEPT)
+        pressures.append(found.cavity_pressure("water"))
+    assert abs(pressures[0]) < 1.0 and 5e3 < pressures[1] < pressures[2] and pressures[3] < pressures[2]
+    again = ts.solve_static(balloon(order, pressure=pressures[1], name="air"), tolerance=1e-8)
+    assert again.cavity_volume("air") == pytest.approx(1.5 * BALL, rel=1e-5)
+
+
+def test_pressure_of_a_volume():
+    wanted = inflated(SNH, 1e5, 0.3, 1.0, 2.0, 2e4)
+    mesh = thick_sphere(1.0, 2.0, 4, 2, whole=True)
+    found = ts.solve_static(balloon(mesh=mesh, volume=BALL * wanted**3, name="water"))
+    assert found.converged and found.cavity_pressure("water") == pytest.approx(2e4, rel=0.02)
+
+
+@pytest.mark.parametrize("integrator, precision", [("implicit_euler", "f64"), ("bdf2", "f32")])
+@pytest.mark.parametrize("order", [1, 2])
+def test_steps_keep_volumes(order, integrator, precision):
+    scene = balloon(order, held=False, volume=lambda t: BALL * (1.0 + 3.0 * t), name="water")
+    scene.gravity = (0.0, -9.81, 0.0)
+    with ts.Simulator(scene, dt=0.01, integrator=integrator, precision=precision) as sim:
+        for _ in range(10):
+            report = sim.step()
+            assert report.converged and sim.cavity_volume("water") == pytest.approx(BALL * (1 + 3 * sim.time), rel=KEPT)
+        assert sim.cavity_pressure("water") > 1e3
+        fall = sim.velocities()[:, 1].mean()
+        assert sim.energies().loads == 0.0 and fall == pytest.approx(-9.81 * sim.time, rel=0.05)
+
+
+@pytest.mark.parametrize("order", [1, 2])
+def test_contacts_keep_volumes(order):
+    mesh = thick_sphere(1.0, 1.5, 2, 1, whole=True)
+    scene = ts.Scene()
+    body = scene.add_body(mesh, rubber(), name="ball", order=order, position=(0, 1.56, 0), velocity=(0, -2, 0))
+    scene.add_obstacle(ts.HalfSpace((0, 0, 0), (0, 1, 0)), name="ground")
+    body.add_cavity(inside(mesh, 1.0), volume=BALL, name="water")
+    with ts.Simulator(scene, dt=1 / 60) as sim:
+        for _ in range(12):
+            report = sim.step()
+            assert report.converged and sim.cavity_volume("water") == pytest.approx(BALL, rel=KEPT)
+        assert report.n_contacts > 0 and sim.cavity_pressure("water") > 500.0
+        assert sim.contact_force("ground")[1] < -9.81 * body.mass
+
+
+def test_changes_and_checkpoints(tmp_path):
+    def make() -> ts.Scene:
+        return balloon(1, volume=1.2 * BALL, name="water")
+
+    def steps(sim, n: int) -> None:
+        for _ in range(n):
+            assert sim.step().converged
+
+    with ts.Simulator(make(), dt=0.01) as sim:
+        steps(sim, 2)
+        sim.set_cavity("water", 1.3 * BALL)
+        steps(sim, 1)
+        assert sim.cavity_volume("water") == pytest.approx(1.3 * BALL, rel=KEPT)
+        sim.save_checkpoint(tmp_path / "c.npz")
+        steps(sim, 3)
+        wanted = sim.positions(), sim.cavity_pressure("water")
+        with pytest.raises(SceneError, match="volume must be above 0, not -1"):
+            sim.set_cavity("water", -1.0)
+        with pytest.raises(SceneError, match="no cavity is called 'watr'; did you mean 'water'"):
+            sim.set_cavity("watr", 1.0)
+        with pytest.raises(SimulationError, match="needs integrator implicit_euler or bdf2"):
+            sim.rebuild(integrator="velocity_verlet")
+        sim.reset()
+        assert sim.cavity_pressure("water") == 0.0
+    with ts.Simulator.load_checkpoint(tmp_path / "c.npz", make()) as sim:
+        steps(sim, 3)
+        assert np.array_equal(sim.positions(), wanted[0]) and sim.cavity_pressure("water") == wanted[1]
+    with pytest.raises(SceneError, match="differs in body 'ball': loads"):
+        ts.Simulator.load_checkpoint(tmp_path / "c.npz", balloon(1, pressure=1.2 * BALL, name="water"))
+
+
+def test_two_cavities():
+    scene = balloon(1, volume=1.2 * BALL)
+    other = scene.add_body(MESH, rubber(young=2e5), name="other", position=(5, 0, 0))
+    hold_planes(other)
+    other.add_cavity(inside(MESH, 1.0), volume=1.2 * BALL)
+    found = ts.solve_static(scene)
+    names = ["ball cavity 0", "other cavity 0"]
+    assert found.converged
+    assert [found.cavity_volume(name) for name in names] == pytest.approx([1.2 * BALL] * 2, rel=KEPT)
+    soft, stiff = (found.cavity_pressure(name) for name in names)
+    assert stiff == pytest.approx(2.0 * soft, rel=1e-3)
+
+
+def test_scene_files_and_refinement(tmp_path):
+    scene = balloon(1, volume=ts.KeyFrames((0.0, 1.0), values=(BALL, 2 * BALL)), name="water")
+    there_and_back(tmp_path / "a.toml", scene, {"dt": 0.01})
+    again = ts.read_scene(tmp_path / "a.toml")[0]
+    assert scene_digest(again) == scene_digest(scene)
+    cavity = again.cavity("water")[1]
+    assert cavity.given == "volume" and cavity.path(0.5) == 1.5 * BALL and cavity.rest_volume == pytest.approx(BALL)
+    for change in (refined, lambda one: with_order(one, 2)):
+        new = change(scene).cavity("water")[1]
+        assert new.rest_volume == pytest.approx(BALL) and new.path.frames is scene.cavity("water")[1].path.frames
+    assert scene_digest(balloon(pressure=1.0)) != scene_digest(balloon(volume=1.0))
+    with ts.Simulator(scene, dt=0.01) as sim:
+        assert sim.plan.on["pressure"] and sim.plan.why("pressure") == "on ball"
+
+
+@pytest.mark.parametrize(
+    "arguments, message",
+    [
+        ({}, "give either a pressure or a volume"),
+        ({"pressure": 1.0, "volume": 1.0}, "give either a pressure or a volume"),
+        ({"volume": 0.0}, "volume must be above 0, not 0"),
+        ({"volume": lambda t: t - 1.0}, "volume must be above 0, not -1"),
+        ({"volume": (1.0, 2.0)}, "volume must be a number, not of shape .2,."),
+        ({"volume": 1.0, "name": " "}, "name must be a text that is not empty"),
+        ({"volume": 1.0, "where": [0, 1]}, "the chosen triangles have a border"),
+        ({"volume": 1.0, "where": "outside"}, "the normals of the chosen triangles point outward"),
+    ],
+)
+def test_bad_cavities_are_refused(arguments, message):
+    body = balloon().bodies[0]
+    outside = np.setdiff1d(np.arange(len(MESH.surface)), inside(MESH, 1.0))
+    where = arguments.pop("where", inside(MESH, 1.0))
+    with pytest.raises(SceneError, match=f"^body 'ball': add_cavity: {message}"):
+        body.add_cavity(outside if isinstance(where, str) else where, **arguments)
+    assert body.cavities == []
+
+
+@pytest.mark.parametrize("integrator", ["velocity_verlet", "linearly_implicit_euler", "implicit_midpoint"])
+def test_integrators_that_cannot_keep_a_volume_are_refused(integrator):
+    with pytest.raises(SimulationError, match="cavity 'ball cavity 0' of given volume needs integrator implicit_euler or bdf2"):
+        ts.Simulator(balloon(volume=BALL), integrator=integrator)
+    with pytest.raises(SimulationError, match="without a tolerance"):
+        ts.Simulator(balloon(volume=BALL), tolerance=1e-2)
+
+
+def test_names_are_unique_and_paths_checked():
+    scene = balloon(1, pressure=1.0, name="air")
+    scene.bodies[0].collision = "proximity"
+    other = scene.add_body(MESH, rubber(), name="other", position=(5, 0, 0))
+    other.add_cavity(inside(MESH, 1.0), pressure=1.0, name="air")
+    with pytest.raises(SceneError, match="body 'other': cavity name 'air' is taken"):
+        ts.Simulator(scene, dt=0.01)
+    with ts.Simulator(balloon(1, volume=lambda t: 1.0 - 60.0 * t, name="water"), dt=0.01) as sim:
+        sim_error = "cavity 'water': its volume at t = 0.0[0-9]+ s must be above 0"
+        with pytest.raises(SimulationError, match=sim_error):
+            for _ in range(3):
+                sim.step()
+
+
+def test_info_lists_cavities():
+    lines = dict(describe(MESH))
+    assert lines["cavities"].startswith("4.18879 around (") and "more" not in lines["cavities"]
+    assert "cavities" not in dict(describe(ts.ball_mesh(1.0, 4)))
