@@ -96,7 +96,7 @@ def rig(request):
         p.count[0] = K
         index_nodes(p)
         block_csr.assemble(m, solver.matrix, EVERYTHING, False)
-        block_csr.to_system(m, solver.matrix, solver.matrix, EVERYTHING, 1.0, BETA)
+        block_csr.to_system(m, solver.matrix, solver.matrix, EVERYTHING, 0, 1.0, BETA)
         contact_terms.save_diagonal(m, solver.matrix, k, EVERYTHING)
         find_factors(p)
         A = to_scipy(m, solver.matrix).toarray()

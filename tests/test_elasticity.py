@@ -197,7 +197,7 @@ def test_system(rig):
     for field, values in zip(fields, numbers):
         field.from_numpy(values)
     K, K_d = (block_csr.to_scipy(rig.model, A).toarray() for A in (rig.matrix, rig.damper))
-    block_csr.to_system(rig.model, rig.matrix, rig.damper, EVERYTHING, c, beta)
+    block_csr.to_system(rig.model, rig.matrix, rig.damper, EVERYTHING, 0, c, beta)
     expected = (c + beta * a) * M + beta**2 * K + beta * b * K_d
     assert_close(rig, block_csr.to_scipy(rig.model, rig.matrix).toarray(), expected, 10)
 

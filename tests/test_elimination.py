@@ -202,7 +202,7 @@ def evaluate(rig, model, nodes) -> tuple[np.ndarray, ...]:
     move(model, w, NO_CONTACTS, ELASTIC_STAGE, STAY, 0.0, 1.0, BETA)
     form_residual(model, w, A, NO_CONTACTS, ELASTIC_STAGE, BETA, norms)
     block_csr.assemble(model, A, subset, True)
-    block_csr.to_system(model, A, A, subset, 1.0, BETA)
+    block_csr.to_system(model, A, A, subset, 0, 1.0, BETA)
     answer = pcg.solve(model, A, w.pcg, rig.close, 2000)
     system.restrict(None)
     assert answer.converged
