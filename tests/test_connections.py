@@ -212,6 +212,12 @@ def test_bodies_may_move_before_the_start():
     scene.add_spring(A, B, 1.0)
     scene.body("b").position = (0, 3, 0)
     assert spring_table(scene).rest_length == pytest.approx([3.0])
+    tendon = scene.add_tendon([A, B], 1.0, name="line")
+    scene.body("b").position = (0, 0, 0)
+    assert spring_table(scene).rest_length[0] == 0.0
+    with pytest.raises(SceneError, match="^tendon 'line': points 0 and 1 coincide"):
+        scene.check()
+    scene.tendons.remove(tendon)
     scene.body("b").position = (0, 0.9, 0)
     scene.attach("a", [2, 3], "b", 1.0, name="x")
     scene.check()

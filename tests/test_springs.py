@@ -12,6 +12,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scipy.linalg as la
+import scipy.sparse as sp
 from oracle import Oracle
 from oracle_springs import OracleSprings
 from scenes import built, connected_scene, cube, dynamics, rubber
@@ -22,7 +23,7 @@ from taisoft.dynamics.schemes import EXPLICIT, IMPLICIT
 from taisoft.fem.reference import gravity_masses, lumped_masses
 from taisoft.fem.springs import spring_table
 from taisoft.linear import block_csr
-from taisoft.stability import stable_dt
+from taisoft.stability import hooke_stiffness, spring_stiffness, stable_dt
 
 INTEGRATORS = [*EXPLICIT, *IMPLICIT]
 
@@ -420,6 +421,20 @@ def test_stable_dt_is_a_lower_bound_of_the_limit(order, stiffness, tension):
     found = stable_dt(scene, verlet=False)
     assert 0.7 * limit < found < 1.0001 * limit
     assert stable_dt(scene, verlet=True) == found
+
+
+@pytest.mark.parametrize("stiffness", [1e2, 1e5])
+def test_stable_dt_with_many_attached_nodes(stiffness, recwarn):
+    """Their largest eigenvalue comes from Lanczos' method."""
+    scene = ts.Scene()
+    for name, y in (("a", 0.0), ("b", 0.5)):
+        scene.add_body(ts.box_mesh((10, 1, 10), (2, 0.5, 2), (0, y, 0)), rubber(), name=name)
+    scene.attach("a", lambda X: X[:, 1] > 0.24, "b", stiffness)
+    assert len(spring_table(scene).offset) == 121
+    K = sp.block_diag([hooke_stiffness(body) for body in scene.bodies]).toarray() + spring_stiffness(scene).toarray()
+    scale = np.repeat(1 / np.sqrt(lumped_masses(scene)), 3)
+    limit = 2 / np.sqrt(la.eigvalsh(scale[:, None] * K * scale, subset_by_index=[len(K) - 1] * 2)[0])
+    assert 0.7 * limit < stable_dt(scene, verlet=False) < 1.0001 * limit
 
 
 @pytest.mark.parametrize("integrator", EXPLICIT)
