@@ -4,7 +4,7 @@
 * bodies and obstacles that a connection names must stay; other bodies in their place are noticed;
 * scene files say where they are wrong; refined scenes and those of another order keep the connections;
 * checkpoints resume bitwise, also with a tension that follows a path or was set; numbers and parts of connections are compared;
-* the window's and the study's facts know of them.
+* the assumed order of integrators knows of damping and paths; copies have connections of their own.
 """
 
 import re
