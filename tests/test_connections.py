@@ -4,7 +4,7 @@
 * bodies and obstacles that a connection names must stay; other bodies in their place are noticed;
 * scene files say where they are wrong; refined scenes and those of another order keep the connections;
 * checkpoints resume bitwise, also with a tension that follows a path or was set; numbers and parts of connections are compared;
-* the window's and the study's facts know of them.
+* the assumed order of integrators knows of damping and paths; copies have connections of their own.
 """
 
 import re
@@ -215,6 +215,12 @@ def test_bodies_may_move_before_the_start():
     scene.add_spring(A, B, 1.0)
     scene.body("b").position = (0, 3, 0)
     assert spring_table(scene).rest_length == pytest.approx([3.0])
+    tendon = scene.add_tendon([A, B], 1.0, name="line")
+    scene.body("b").position = (0, 0, 0)
+    assert spring_table(scene).rest_length[0] == 0.0
+    with pytest.raises(SceneError, match="^tendon 'line': points 0 and 1 coincide"):
+        scene.check()
+    scene.tendons.remove(tendon)
     scene.body("b").position = (0, 0.9, 0)
     scene.attach("a", [2, 3], "b", 1.0, name="x")
     scene.check()

@@ -150,9 +150,7 @@ def add_tendon(self: "Scene", points, force, name: str | None = None) -> Tendon:
         raise SceneError(f"{what}: points must be a list of at least two")
     made = tuple(_point(self, end, f"{what}: point {k}") for k, end in enumerate(points))
     _check_any_body(self, made, what)
-    for k, (p, q) in enumerate(zip(made, made[1:])):
-        if coincide(self, p, q):
-            raise SceneError(f"{what}: points {k} and {k + 1} coincide")
+    _check_distinct(self, made, what)
     tendon = Tendon(name, made, **value_or_path(force, what, "force", ((),)))
     check_tension(tendon.path(0.0) if tendon.value is None else tendon.value, f"{what}: force")
     list.append(self.tendons, tendon)
@@ -201,6 +199,8 @@ def check_connections(scene: "Scene") -> None:
         if not isinstance(one, Attachment):
             for k, (point, owner) in enumerate(zip(one.points, found)):
                 _check_inside(owner, point.position, f"{what}: point {k}")
+            if isinstance(one, Tendon):
+                _check_distinct(scene, one.points, what)
         elif not isinstance(found[0], Body) or one.nodes.max() >= found[0].n_nodes:
             raise SceneError(f"{what}: {one.a!r} is no longer the body whose nodes are attached")
         elif isinstance(found[1], Body):
@@ -299,6 +299,12 @@ def _owner(scene: "Scene", name: str, what: str):
     if not isinstance(owner, Body) and owner.path is not None:
         raise SceneError(f"{what}: obstacle {name!r} moves; only bodies and obstacles at rest can be connected")
     return owner
+
+
+def _check_distinct(scene: "Scene", points: tuple[Point, ...], what: str) -> None:
+    for k, (p, q) in enumerate(zip(points, points[1:])):
+        if coincide(scene, p, q):
+            raise SceneError(f"{what}: points {k} and {k + 1} coincide")
 
 
 def _check_any_body(scene: "Scene", points: tuple[Point, ...], what: str) -> None:
