@@ -397,7 +397,7 @@ def test_plan_and_digest():
         ([0], (0, 1, 0), "add_pressure: pressure must be a number, not of shape .3,."),
         ([0], "high", "add_pressure: pressure must be a number, not 'high'"),
         ([0], np.nan, r"add_pressure: pressure: entry \[\] is nan, not finite"),
-        ([0], lambda t: (1, 2), "add_pressure: pressure at t = 0 must be a number"),
+        ([0], lambda t: (1, 2), "add_pressure: the path's pressure at t = 0 must be a number"),
         ([0], ts.KeyFrames((0,), [(0, 0, 0)]), "add_pressure: pressure: key frames need values here"),
         ([99], 1.0, "add_pressure: surface triangle 99 does not exist"),
         ([], 1.0, "add_pressure: no surface triangle is chosen"),
@@ -413,7 +413,9 @@ def test_bad_pressures_are_refused(where, pressure, message):
 def test_a_path_that_fails_later_stops_the_run():
     for integrator in ("velocity_verlet", "implicit_euler"):
         with ts.Simulator(free(lambda t: 1.0 if t < 0.0035 else np.inf), dt=1e-3, integrator=integrator) as sim:
-            with pytest.raises(ts.SimulationError, match="body 'body': pressure 0: its path gave inf at t = 0.00[345] s"):
+            with pytest.raises(
+                ts.SimulationError, match="body 'body': pressure 0: the path's pressure at t = 0.00[345] is inf, not finite"
+            ):
                 for _ in range(9):
                     sim.step()
             assert np.isfinite(sim.positions()).all()

@@ -94,9 +94,9 @@ class SceneLoads:
         return rows
 
 
-def _number_at(load: Tendon, t: float, what: str) -> float:
+def _number_at(load: ScalarLoad | Tendon, t: float, what: str) -> float:
     value = float(value_at(load, t, what))
-    if value < 0.0:
+    if isinstance(load, Tendon) and value < 0.0:
         raise SimulationError(f"{what}: its path gave {value:g} N at t = {t:g} s: a tendon cannot push")
     return value
 

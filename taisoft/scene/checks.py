@@ -53,12 +53,11 @@ def array(value, what: str, shapes: tuple[tuple[int, ...], ...]) -> np.ndarray:
     if result.shape not in shapes:
         raise SceneError(f"{what} must have shape {shapes_text}, not {result.shape}")
     result = np.array(result, dtype=np.float64)
-    bad = np.argwhere(~np.isfinite(result))
-    if len(bad):
-        raise SceneError(f"{what}: entry {bad[0].tolist()} is {result[tuple(bad[0])]}, not finite")
-    bad = np.argwhere(np.abs(result) > LARGEST)
-    if len(bad):
-        raise SceneError(f"{what}: entry {bad[0].tolist()} is {result[tuple(bad[0])]:g}, too large for a 32-bit float")
+    for rule, bad in (("not finite", ~np.isfinite(result)), ("too large for a 32-bit float", np.abs(result) > LARGEST)):
+        if bad.any():
+            at = np.argwhere(bad)[0]
+            entry = f"{what}: entry {at.tolist()}" if result.ndim else what
+            raise SceneError(f"{entry} is {result[tuple(at)]:g}, {rule}")
     return result
 
 

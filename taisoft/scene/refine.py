@@ -52,7 +52,8 @@ def _with_bodies(scene: Scene, made: list[tuple[Body, np.ndarray]]) -> Scene:
         new, parents = by_name[one.a]
         where = _chosen(scene.body(one.a), one, parents)
         share = len(one.nodes) / len(checks.selection(where, new.rest_positions, f"attachment {one.name!r}", "node"))
-        copied.attach(one.a, where, one.b, share * one.stiffness, share * one.damping, one.name)
+        stiffness = None if one.stiffness is None else share * one.stiffness
+        copied.attach(one.a, where, one.b, stiffness, share * one.damping, one.name)
     return copied
 
 
