@@ -396,7 +396,7 @@ def test_plan_and_digest():
     [
         ([0], (0, 1, 0), "add_pressure: pressure must be a number, not of shape .3,."),
         ([0], "high", "add_pressure: pressure must be a number, not 'high'"),
-        ([0], np.nan, r"add_pressure: pressure: entry \[\] is nan, not finite"),
+        ([0], np.nan, r"add_pressure: pressure is nan, not finite"),
         ([0], lambda t: (1, 2), "add_pressure: the path's pressure at t = 0 must be a number"),
         ([0], ts.KeyFrames((0,), [(0, 0, 0)]), "add_pressure: pressure: key frames need values here"),
         ([99], 1.0, "add_pressure: surface triangle 99 does not exist"),
