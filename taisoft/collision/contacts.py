@@ -59,7 +59,7 @@ class Contacts:
     impulse: np.ndarray  #: (k,3) on a [N s]; b gets the opposite
     body_a: np.ndarray  #: (k,) names
     body_b: np.ndarray  #: (k,) names; an obstacle is always b
-    nodes: np.ndarray  #: (k,6) three of each side, numbered over all bodies, -1 where there is none
+    nodes: np.ndarray  #: (k,6) three of each side, numbered over all bodies, -1 where there is none; more with exact attachments
     weights: np.ndarray  #: (k,6) of these nodes, 0 where there is none
     kind: np.ndarray  #: (k,) "vertex_face", "edge_edge", "vertex_field", "face_field" or "face_face"
     feature: np.ndarray  #: (k,2) ids that stay while the same two features meet

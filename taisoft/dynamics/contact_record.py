@@ -5,7 +5,7 @@ import numpy as np
 from taisoft.backend.arrays import download, upload
 from taisoft.collision.contacts import Contacts
 from taisoft.collision.detector import Detection
-from taisoft.contact.problem import ContactProblem
+from taisoft.contact.problem import NODES, ContactProblem
 from taisoft.scene.scene import Scene
 
 
@@ -29,14 +29,18 @@ def sum_impulses(contacts: Contacts, scene: Scene) -> np.ndarray:
 
 
 def _sides(node: np.ndarray, weight: np.ndarray, arity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return nodes and weights (n, width) of a problem's contacts, half of them per side, as the record stores them."""
-    (n, width), used = node.shape, np.arange(node.shape[1]) < arity[:, None]
+    """Return nodes and weights (n, 2 k) of a problem's contacts, k of each side, as the record stores them.
+
+    A node is on side a if its weight is positive. If nodes depend on others, those of one side may have weights of both signs.
+    """
+    n, width = node.shape
+    used, half = np.arange(width) < arity[:, None], NODES // 2 if width == NODES else width
     side_b = used & (weight < 0.0)
-    n_a = (used & ~side_b).sum(axis=1)  # side a comes first
-    row, column = np.nonzero(used)
-    place = np.where(side_b[row, column], width // 2 + column - n_a[row], column)
-    nodes, weights = np.full((n, width), -1), np.zeros((n, width))
-    nodes[row, place], weights[row, place] = node[row, column], np.abs(weight[row, column])
+    nodes, weights = np.full((n, 2 * half), -1), np.zeros((n, 2 * half))
+    for side, first in ((used & ~side_b, 0), (side_b, half)):
+        row, column = np.nonzero(side)
+        place = first + np.cumsum(side, axis=1)[row, column] - 1
+        nodes[row, place], weights[row, place] = node[row, column], np.abs(weight[row, column])
     return nodes, weights
 
 
