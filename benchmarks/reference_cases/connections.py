@@ -1,10 +1,11 @@
-"""Springs and tendons against closed forms: the period and the extension of a mass on springs, a load on a tendon.
+"""Springs and tendons against closed forms, and a bar of attached parts against the whole.
 
 period:     T = 2 pi sqrt(m / k), of a cube each of whose nodes hangs on a spring in proportion to its mass, so that it moves as
             a point mass; steps of omega dt change it by about (omega dt)^2 / 24 in Verlet,
 extension:  u = m g / k of the same cube,
 tendon:     a load W slides along a tendon of tension T to where both segments lie at the angle a with the vertical,
-            cos a = W / (2 T), whatever the heights of the two supports.
+            cos a = W / (2 T), whatever the heights of the two supports,
+parts:      a clamped bar cut in three and attached exactly at matching nodes sags as the whole does.
 """
 
 from functools import partial
@@ -81,7 +82,31 @@ def tendon(law: str, heights: tuple[float, float], _reference: dict, arch: str):
         yield near(f"{name} of the load's point [m]", found[axis], expected[axis], 1e-6)
 
 
+def _bar(parts: int, law: str) -> ts.Scene:
+    made, size = scene(True), (0.9 / parts, 0.1, 0.1)
+    material = ts.Material(law=LAWS[law], young=1e6)
+    for k in range(parts):
+        mesh = ts.box_mesh((9 // parts, 1, 1), size, ((k + 0.5) * size[0], 0.0, 0.0), pattern="six")
+        body = made.add_body(mesh, material, name=f"part{k}", order=2)
+        if k == 0:
+            body.fix(lambda X: X[:, 0] < 1e-9)
+        else:
+            made.attach(body.name, lambda X, x=k * size[0]: X[:, 0] < x + 1e-9, f"part{k - 1}")
+    return made
+
+
+def attached_parts(law: str, _reference: dict, arch: str):
+    """Lowest point of the bar in parts, against that of the whole."""
+    lowest = []
+    for parts in (1, 3):
+        made = _bar(parts, law)
+        x = ts.solve_static(made, tolerance=1e-9, arch=arch).positions(f"part{parts - 1}")
+        lowest.append(-float(x[:, 1].min()))
+    yield near("deflection [m]", lowest[1], lowest[0], 1e-6)
+
+
 CASES = (
+    Case("attached_parts", "SNH", "order 2", partial(attached_parts, "SNH"), closed_form=True),
     *(Case("spring_mass", "SNH", name, partial(period, "SNH", name), closed_form=True) for name in PERIODS),
     Case("spring_mass", "SNH", "at rest", partial(extension, "SNH"), closed_form=True),
     Case("tendon", "SNH", "level supports", partial(tendon, "SNH", (1.5, 1.5)), closed_form=True),
