@@ -29,7 +29,7 @@ ORDER = (
     ("backend.runtime",),
     ("mesh", "scene"),
     ("fem.state", "fem.math3", "fem.node_graph"),
-    ("fem.laws", "fem.lanes", "fem.reference", "fem.loads"),
+    ("fem.laws", "fem.lanes", "fem.reference", "fem.loads", "fem.mean_dilatation"),
     ("fem.terms",),
     ("fem.model",),
     ("fem.measure", "stability"),

@@ -6,6 +6,7 @@ by order, quadrature and law; a kernel runs one group's blocks in one loop. A bo
 several groups. Its last block in each is padded with copies of its last tet there that have volume 0.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -17,10 +18,11 @@ from taisoft.backend.runtime import Runtime, threads
 from taisoft.fem import reference
 from taisoft.fem.laws import LAWS
 from taisoft.fem.loads import SceneLoads
+from taisoft.fem.mean_dilatation import MeanDilatation, build_mean_dilatation
 from taisoft.fem.node_graph import PAIRS, NodeGraph, node_graph
 from taisoft.fem.state import State, build_state
 from taisoft.fem.terms import terms_of
-from taisoft.scene.scene import Scene
+from taisoft.scene.scene import Body, Scene
 
 # Least quadrature points and CPU threads for parallel loops; below, one serial kernel runs. With two threads, parallel loops took
 # 3.4 times as long (213,000 tets, `taisoft bench scaling`)
@@ -41,6 +43,7 @@ class Group:
     order: int
     n_nodes: int  # of an element
     n_points: int
+    mean_dilatation: bool
     first: Count  # first block
     last: Count  # one past the last block
     nodes_at: Count  # offset in Model.nodes
@@ -93,6 +96,8 @@ class Model:
     loaded: bool
     damped: bool
     stiffness_damping: bool
+    mean_dilatation: bool  # of some group
+    mean: MeanDilatation | None
     elasticity_by_tet: bool  # law_constants may differ between the tets of a body
     chunks: int  # parts of a loop, each with its own partial sums
 
@@ -123,13 +128,13 @@ def _layout(scene: Scene, lanes: int) -> tuple[Layout, tuple[Group, ...]]:
     parts: dict[tuple, list[np.ndarray]] = {}  # tets of one body and one law, by their kind
     for k, b in enumerate(bodies):
         for law in b.composition.laws:
-            kind = b.order, b.quadrature_degree, laws.index(law)
+            kind = b.order, b.quadrature_degree, laws.index(law), b.dilatation == "mean"
             parts.setdefault(kind, []).append(tet_start[k] + b.composition.tets_of_law(law))
-    n_points = {degree: len(reference.quadrature(degree).weights) for _, degree, _ in parts}
+    n_points = {degree: len(reference.quadrature(degree).weights) for _, degree, *_ in parts}
     tet_of_lane = []
     groups, block, nodes_at, force_at, matrix_at = [], 0, 0, 0, 0
     for kind in sorted(parts):
-        order, degree, law = kind
+        order, degree, law, mean = kind
         first = block
         for tets in parts[kind]:
             padded = -(-len(tets) // lanes) * lanes
@@ -138,7 +143,7 @@ def _layout(scene: Scene, lanes: int) -> tuple[Layout, tuple[Group, ...]]:
         n_nodes, count = len(reference.unit_mass(order)), (block - first) * lanes
         points_at = sum(n for other, n in n_points.items() if 1 < other < degree)  # order 1 has degree 1 and no table
         offsets = first, block, nodes_at, force_at, matrix_at, points_at
-        groups.append(Group(LAWS[laws[law]], order, n_nodes, n_points[degree], *offsets))
+        groups.append(Group(LAWS[laws[law]], order, n_nodes, n_points[degree], mean, *offsets))
         nodes_at += count * n_nodes
         force_at += count * n_nodes * 3
         matrix_at += (block - first) * MATRIX_BLOCKS[order] * 9
@@ -196,18 +201,47 @@ def _gather_table(nodes, groups: tuple[Group, ...], real: np.ndarray, n_nodes: i
     return start.astype(np.int32), entry[order].astype(np.int32)
 
 
-def model_graph(model: Model) -> tuple[NodeGraph, np.ndarray]:
-    """Node pairs that share a tet, and for each pair of each tet its index in the assembly buffer times lanes, plus its lane."""
+def group_nodes(model: Model) -> Iterator[tuple[Group, np.ndarray, np.ndarray]]:
+    """For each group its lanes (k,) that are not padding, counted from its first, and the nodes (k, n_nodes) of their tets."""
     (nodes, volume), lanes = download([model.nodes, model.volume]), model.lanes
     flat, real = nodes.astype(np.int64), volume.reshape(-1) > 0
-    ends, entries = [], []
     for g in model.groups:
-        pairs, lane = np.array(PAIRS[g.order]), np.flatnonzero(real[g.first * lanes : g.last * lanes])
+        lane = np.flatnonzero(real[g.first * lanes : g.last * lanes])
         block = flat[g.nodes_at :][: (g.last - g.first) * g.n_nodes * lanes].reshape(-1, g.n_nodes, lanes)
-        own = block.transpose(0, 2, 1).reshape(-1, g.n_nodes)[lane]
+        yield g, lane, block.transpose(0, 2, 1).reshape(-1, g.n_nodes)[lane]
+
+
+def patch_nodes(model: Model) -> tuple[np.ndarray, np.ndarray]:
+    """Patches (k,), ascending, and their nodes (k,), ascending in each patch."""
+    patch, lanes, pairs = model.mean.patch.to_numpy().reshape(-1).astype(np.int64), model.lanes, []
+    for g, lane, own in group_nodes(model):
+        if g.mean_dilatation:
+            pairs.append(np.unique(patch[g.first * lanes + lane][:, None] * model.n_nodes + own))
+    return np.divmod(np.unique(np.concatenate(pairs)), model.n_nodes)
+
+
+def patch_pairs(patch: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Indices (k,), (k,) of all pairs of entries with the same patch, the lower first. patch: ascending."""
+    firsts, seconds = [], []
+    for distance in range(1, int(np.bincount(patch).max())):
+        first = np.flatnonzero(patch[distance:] == patch[:-distance])
+        firsts.append(first)
+        seconds.append(first + distance)
+    return np.concatenate(firsts), np.concatenate(seconds)
+
+
+def model_graph(model: Model) -> tuple[NodeGraph, np.ndarray]:
+    """Node pairs that share a tet or a patch, and for each pair of each tet its index in the assembly buffer times lanes, plus
+    its lane. The last pairs given to the graph are those of `patch_pairs`."""
+    ends, entries, lanes = [], [], model.lanes
+    for g, lane, own in group_nodes(model):
+        pairs = np.array(PAIRS[g.order])
         ends.append(own[:, pairs].reshape(-1, 2))
         base = g.matrix_at + (lane // lanes)[:, None] * (MATRIX_BLOCKS[g.order] * 9) + 9 * np.arange(len(pairs))
         entries.append((base * lanes + (lane % lanes)[:, None]).reshape(-1))
+    if model.mean_dilatation:
+        patch, node = patch_nodes(model)
+        ends.append(node[np.stack(patch_pairs(patch), axis=1)])
     return node_graph(np.concatenate(ends), model.n_nodes), np.concatenate(entries)
 
 
@@ -216,13 +250,19 @@ def lane_layout(values: np.ndarray, lanes: int) -> np.ndarray:
     return values.reshape(-1, lanes, values.shape[1]).transpose(0, 2, 1)
 
 
+def _local_lame(body: Body) -> tuple:
+    """Lamé's parameters (mu, lambda) of the energy of each quadrature point: lambda is 0 if the patches have its part."""
+    mu, lam = body.composition.lame
+    return (mu, 0.0 * lam) if body.dilatation == "mean" else (mu, lam)
+
+
 def law_table(scene: Scene, layout: Layout, by_tet: bool) -> np.ndarray:
     """Law constants (n_bodies, 4), or (n_blocks, 4, lanes) if they may differ between the tets of a body."""
     if not by_tet:
-        return np.array([LAWS[b.composition.first.law].constants(*b.composition.lame) for b in scene.bodies])
+        return np.array([LAWS[b.composition.first.law].constants(*_local_lame(b)) for b in scene.bodies])
     table = np.zeros((len(layout.lane_of_tet), 4))
     for k, body in enumerate(scene.bodies):
-        mu, lam = (np.broadcast_to(x, body.mesh.n_tets) for x in body.composition.lame)
+        mu, lam = (np.broadcast_to(x, body.mesh.n_tets) for x in _local_lame(body))
         for law in body.composition.laws:
             tets = body.composition.tets_of_law(law)
             for c, values in enumerate(LAWS[law].constants(mu[tets], lam[tets])):
@@ -285,6 +325,8 @@ def build_model(scene: Scene, runtime: Runtime, arena: FieldArena, on: dict[str,
         loaded=on["loads"],
         damped=damped,
         stiffness_damping=on["stiffness_damping"],
+        mean_dilatation=on["mean_dilatation"],
+        mean=build_mean_dilatation(scene, layout, arena) if on["mean_dilatation"] else None,
         elasticity_by_tet=on["elasticity_by_tet"],
         chunks=chunks,
     )
