@@ -104,12 +104,6 @@ class RoundingFloor:
         volume, Dm_inv, mass = (a.astype(np.float64) for a in (volume, Dm_inv, mass))
         stiffness = np.abs(constants[:, :2]).sum(axis=1)  # of each body, or of each lane
         stiffness = stiffness if m.elasticity_by_tet else stiffness[body][:, None]
-        if m.mean_dilatation:
-            stiffness = np.broadcast_to(stiffness, volume.shape).copy()
-            for group in m.groups:
-                if group.mean_dilatation:
-                    patch, modulus = download([m.mean.patch, m.mean.modulus])
-                    stiffness[group.first : group.last] += np.abs(modulus[patch[group.first : group.last]])
         g = np.sqrt((Dm_inv**2).sum(axis=1))
         if m.points is not None:  # the gradients of quadratic shape functions are larger
             steepest = float(np.abs(m.points.to_numpy()[:, 1:]).max())

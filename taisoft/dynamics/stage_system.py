@@ -121,6 +121,7 @@ class StageSystem:
         self._whole, self._restricted = self.work, None  # `work` for all nodes, and for a subset
         self._lists: SubsetLists | None = None
         self._same_matrix = False  # whether the matrix is that of the last linear solve of this stage
+        self.n_formed = 0  # times that the matrix was formed
         self.norms = np.zeros(5)  # result of `form_residual`
 
     # --- state ----------------------------------------------------------------------------------------------------
@@ -134,7 +135,7 @@ class StageSystem:
     def release(self) -> None:
         """Free their memory."""
         self._contact_arena.release()
-        self.linear_solver.release()
+        self.linear_solver.free()
         if self._lists:
             self._lists.release()
 
@@ -152,7 +153,7 @@ class StageSystem:
     def numbers_changed(self) -> None:
         """Update for changed gravity or material numbers."""
         self.rounding.measure()
-        self.linear_solver.release()
+        self.linear_solver.numbers_changed()
 
     def _allocate_contacts(self) -> None:
         """Allocate storage for the contacts of this step."""
@@ -322,6 +323,7 @@ class StageSystem:
 
     def form(self, subset: Subset, projected: bool, c: float, beta: float) -> None:
         """Form the matrix of c and beta at the present positions, for the rows of a subset."""
+        self.n_formed += 1
         block_csr.assemble(self.model, self.matrix, subset, projected)
         block_csr.to_system(self.model, self.matrix, self.damper or self.matrix, subset, c, beta)
 

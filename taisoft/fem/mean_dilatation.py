@@ -115,22 +115,17 @@ def store_content(m: ti.template(), b, content):
 
 
 @ti.func
-def element_dilatation(m: ti.template(), g: ti.template(), b, precise: ti.template()):
-    """Set the content of the tets of block b to their volumes times mean dilatations. precise: compute in f64."""
-    if ti.static(precise):
-        X, M = differences(m, g, m.state.x, b, ti.f64), rest_gradients(m, b, ti.f64)
-        total = broadcast(ti.cast(0.0, ti.f64), m.lanes)
-        for q in range(g.n_points):
-            F = gradient_at(m, g, X, M, q, ti.f64)
-            total += weight_at(m, g, q, ti.f64) * g.law.dilatation(F)
-        store_content(m, b, volumes(m, b, ti.f64) * total)
-    else:
-        X, N = position_differences(m, g, b), rest_gradients_of_F(m, b)
-        total = broadcast(ti.cast(0.0, m.real), m.lanes)
-        for q in range(g.n_points):
-            F = deformation_gradient(m, g, X, N, q)
-            total += weight_at(m, g, q, m.real) * g.law.dilatation(F)
-        store_content(m, b, volumes(m, b, m.real) * total)
+def element_dilatation(m: ti.template(), g: ti.template(), b):
+    """Set the content of the tets of block b to their volumes times mean dilatations.
+
+    It is computed in f64: near incompressibility the rounding of F in f32, times lambda, would exceed all other stress errors.
+    """
+    X, M = differences(m, g, m.state.x, b, ti.f64), rest_gradients(m, b, ti.f64)
+    total = broadcast(ti.cast(0.0, ti.f64), m.lanes)
+    for q in range(g.n_points):
+        F = gradient_at(m, g, X, M, q, ti.f64)
+        total += weight_at(m, g, q, ti.f64) * g.law.dilatation(F)
+    store_content(m, b, volumes(m, b, ti.f64) * total)
 
 
 @ti.func
@@ -157,14 +152,14 @@ def patch_mean(m: ti.template(), p):
 
 
 @ti.func
-def find_dilatations(m: ti.template(), precise: ti.template()):
-    """Compute the patches' dilatations at x, if there are any, as top-level loops of a kernel. precise: in f64."""
+def find_dilatations(m: ti.template()):
+    """Compute the patches' dilatations at x, if there are any, as top-level loops of a kernel."""
     if ti.static(m.mean_dilatation):
         for g in ti.static(m.groups):
             if ti.static(g.mean_dilatation):
                 ti.loop_config(serialize=m.serial)
                 for b in range(g.first, g.last):
-                    element_dilatation(m, g, b, precise)
+                    element_dilatation(m, g, b)
         ti.loop_config(serialize=m.serial)
         for p in range(m.mean.n_patches):
             m.mean.dilatation[p] = patch_mean(m, p)
@@ -191,7 +186,7 @@ def find_serially(m: ti.template()):
         for g in ti.static(m.groups):
             if ti.static(g.mean_dilatation):
                 for b in range(g.first, g.last):
-                    element_dilatation(m, g, b, False)
+                    element_dilatation(m, g, b)
         for p in range(m.mean.n_patches):
             m.mean.dilatation[p] = patch_mean(m, p)
         if ti.static(m.stiffness_damping):

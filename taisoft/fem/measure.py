@@ -35,7 +35,7 @@ def measure(m: ti.template()):
 
     They are written to `State.scalars` at SCALARS; FIRST_SOFTENED is NO_TET if there is none.
     """
-    find_dilatations(m, True)
+    find_dilatations(m)
     ti.loop_config(serialize=m.serial)
     for c in range(m.chunks):
         energy = broadcast(ti.cast(0.0, ti.f64), m.lanes)

@@ -83,7 +83,7 @@ def patch_stiffness(m: ti.template(), p):
 @ti.func
 def find_gradients(m: ti.template(), A: ti.template()):
     """Compute dilatations and gradients at x, as top-level loops of a kernel; uses A.element."""
-    find_dilatations(m, False)
+    find_dilatations(m)
     for g in ti.static(m.groups):
         if ti.static(g.mean_dilatation):
             ti.loop_config(serialize=m.serial)

@@ -104,7 +104,7 @@ def record_volumes(m: ti.template(), b, J):
 @ti.func
 def sum_elements(m: ti.template(), subset: ti.template()):
     """Run `element_force` over all blocks of a subset, as top-level loops of a kernel."""
-    find_dilatations(m, False)
+    find_dilatations(m)
     for n, g in ti.static(enumerate(m.groups)):
         ti.loop_config(serialize=m.serial)
         for j in range(count_of(subset, BLOCKS + n, g.first), count_of(subset, BLOCKS + n + 1, g.last)):
@@ -114,7 +114,7 @@ def sum_elements(m: ti.template(), subset: ti.template()):
 @ti.func
 def sum_elements_with_damping(m: ti.template()):
     """As `sum_elements` over all blocks, with stiffness damping if it is on. scalars: LOWEST_J, INVERTED_NOW, FAILED."""
-    find_dilatations(m, False)
+    find_dilatations(m)
     if ti.static(m.stiffness_damping):
         find_rates(m, m.state.v)
     for g in ti.static(m.groups):
@@ -175,7 +175,7 @@ def elastic_forces(m: ti.template()):
 @kernel
 def force_differential(m: ti.template(), dx: ti.template(), df: ti.template()):
     """Compute df = (df/dx)(x) dx, matrix-free: (n_nodes) 3-vectors, dx [m], df [N]."""
-    find_dilatations(m, False)
+    find_dilatations(m)
     find_rates(m, dx)
     for g in ti.static(m.groups):
         ti.loop_config(serialize=m.serial)
@@ -213,7 +213,7 @@ def gather_forces(m: ti.template(), f: ti.template()):
 @kernel
 def cauchy_stress(m: ti.template(), sigma: ti.types.ndarray()):
     """Compute the mean of sigma = P F^T / J over each deformed tet, (n_blocks * lanes, 9) [Pa]; not finite for flat tets."""
-    find_dilatations(m, True)
+    find_dilatations(m)
     for g in ti.static(m.groups):
         ti.loop_config(serialize=m.serial)
         for b in range(g.first, g.last):
