@@ -133,17 +133,26 @@ class LinearSolver:
     def _solve_plain(self, system: "StageSystem", tolerance: float, most: int) -> pcg.LinearResult:
         """Solve by `volume_pcg` or `pcg`."""
         m, A, w = self.model, system.matrix, system.work.pcg
+        if self.volumes(A) is None:
+            return pcg.solve(m, A, w, tolerance, most)
+        self.prepare(system)
+        return volume_pcg.solve(m, A, w, self._volumes, tolerance, most)
+
+    def volumes(self, A: block_csr.BlockCsr) -> volume_pcg.VolumeSystem | None:
+        """Return the system of `volume_pcg` for matrices like A if it is to be used."""
+        m = self.model
         if self._use_volumes is None:
             self._use_volumes = m.mean_dilatation and m.serial and volume_pcg.is_nearly_incompressible(m)
             if self._use_volumes and self._volumes is None:
                 self._volumes = volume_pcg.build_volume_system(m, A, self._arena)
                 self._use_volumes = self._volumes is not None
-        if self._use_volumes:
-            if self._prepared != system.n_formed:
-                volume_pcg.prepare(m, A, w, self._volumes, system.stage.beta**2)
-                self._prepared = system.n_formed
-            return volume_pcg.solve(m, A, w, self._volumes, tolerance, most)
-        return pcg.solve(m, A, w, tolerance, most)
+        return self._volumes if self._use_volumes else None
+
+    def prepare(self, system: "StageSystem") -> None:
+        """Prepare `volume_pcg` for the system's matrix, unless it is."""
+        if self._prepared != system.n_formed:
+            volume_pcg.prepare(self.model, system.matrix, system.work.pcg, self._volumes, system.stage.beta**2)
+            self._prepared = system.n_formed
 
     def _solve_multigrid(self, system: "StageSystem", tolerance: float, digits: float) -> pcg.LinearResult | None:
         """Solve with the hierarchy, or with a new one if there is none or it is out of date; None if that fails too."""

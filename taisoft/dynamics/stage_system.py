@@ -46,12 +46,15 @@ from taisoft.dynamics.stage import (
 from taisoft.fem.model import Model
 from taisoft.fem.node_graph import EVERYTHING, Subset
 from taisoft.fem.state import END_SLOPE, START_SLOPE, STEP_LENGTH
-from taisoft.linear import block_csr, pcg
+from taisoft.linear import block_csr, pcg, volume_pcg
 from taisoft.linear.block_csr import BlockCsr
 
 if TYPE_CHECKING:
     from taisoft.dynamics.contact import ContactStep
     from taisoft.dynamics.no_contacts import NoContacts
+
+
+VOLUME_PASSES = 2  # corrections of the first iterate, each of which leaves errors of second order
 
 
 @dataclass(frozen=True)
@@ -186,10 +189,26 @@ class StageSystem:
         scalars = self.model.state.scalars
         return scalars[START_SLOPE], scalars[END_SLOPE]
 
-    def begin(self, stage: Stage) -> None:
-        """Begin a stage at its first iterate; with contacts, form the matrix, which the r-factors depend on."""
-        begin_stage(self.model, self.work, stage.beta, stage.prescribed_fraction)
+    def begin(self, stage: Stage) -> bool:
+        """Begin a stage at its first iterate; with contacts, form the matrix, which the r-factors depend on.
+
+        Nearly incompressible bodies with mean dilatation get a first iterate that keeps their volumes, from the matrix at the
+        start of the step. Return whether that is formed.
+        """
+        m, start, volumes = self.model, self._whole, None
+        if stage.c > 0.0 and not stage.linearised and self.contact.n_contacts == 0:
+            volumes = self.linear_solver.volumes(self.matrix)
+        if volumes is not None:
+            self.restrict(None)
+            self.stage = stage
+            self.form_matrix()
+            self.linear_solver.prepare(self)
+            volume_pcg.save_volumes(m, volumes)
+        begin_stage(m, start, stage.beta, stage.prescribed_fraction)
+        for _ in range(VOLUME_PASSES if volumes is not None else 0):
+            volume_pcg.restore_volumes(m, volumes, start.x_hat, stage.beta)
         self._begin(stage, ELASTIC_STAGE)
+        return volumes is not None
 
     def begin_impact(self, stage: Stage) -> StageContacts:
         """Begin the impact before a step, and form the matrix."""

@@ -19,6 +19,7 @@ from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from taisoft.backend.arrays import Count, FieldArena, download
 from taisoft.backend.runtime import kernel
+from taisoft.fem.mean_dilatation import find_dilatations
 from taisoft.fem.model import Model
 from taisoft.linear.block_csr import BlockCsr, block_times, definite_inverse, row_times
 from taisoft.linear.patch_terms import patch_stiffness
@@ -56,6 +57,7 @@ class VolumeSystem:
     row: Any  # i32: row of S of each patch of each node
     column: Any  # 3-vectors: D^-1 G^T for that node and patch
     factor: Any  # (n_patches * width) f64: the band by columns, of S and then of its Cholesky factor
+    target: Any  # (n_patches) f64: dilatation of each patch at the start of a step
     rhs: Any  # (n_patches) f64: right-hand side, then the solution
 
 
@@ -87,6 +89,7 @@ def build_volume_system(m: Model, A: BlockCsr, arena: FieldArena) -> VolumeSyste
         row=arena.field("volume_row", ti.i32, len(entry), place[patch[entry]]),
         column=arena.vectors("volume_column", m.real, len(entry)),
         factor=arena.field("volume_factor", ti.f64, n * width),
+        target=arena.field("volume_target", ti.f64, n),
         rhs=arena.field("volume_rhs", ti.f64, n),
     )
 
@@ -214,6 +217,32 @@ def precondition(m: ti.template(), w: ti.template(), s: ti.template()):
         w.z[i] = z
         rz += dot64(w.r[i], z)
     return rz
+
+
+@kernel
+def save_volumes(m: ti.template(), s: ti.template()):
+    """Save the dilatations at x for `restore_volumes`."""
+    find_dilatations(m)
+    for p in range(s.n_patches):
+        s.target[p] = m.mean.dilatation[p]
+
+
+@kernel
+def restore_volumes(m: ti.template(), s: ti.template(), x_hat: ti.template(), beta: ti.f64):
+    """Correct x, and v = (x - x_hat) / beta, to first order towards the saved dilatations, by the smallest change in D."""
+    find_dilatations(m)
+    ti.loop_config(serialize=True)
+    for _ in range(1):
+        for p in range(s.n_patches):
+            s.rhs[s.place[p]] = m.mean.volume[p] * (m.mean.dilatation[p] - s.target[p])
+        solve_volumes(s)
+        for i in range(m.n_nodes):
+            change = ti.Vector([0.0, 0.0, 0.0], ti.f64)
+            for n in range(s.node_start[i], s.node_start[i + 1]):
+                change += s.rhs[s.row[n]] * ti.cast(s.column[n], ti.f64)
+            x = m.state.x[i] - change
+            m.state.x[i] = x
+            m.state.v[i] = ti.cast((x - x_hat[i]) / beta, m.real)
 
 
 @kernel
