@@ -106,7 +106,7 @@ def data(scene: ts.Scene) -> dict:
         moved = [(c.nodes.tolist(), c.axes.tolist(), path_data(c.path)) for c in b.constraints if c.path is not None]
         chosen = [t.triangles.tolist() for t in b.tractions] + [f.nodes.tolist() for f in b.forces]
         values = [path_data(load.path) or (load.value.shape, load.value.tobytes()) for load in b.loads]
-        numbers = (b.name, b.order, b.quadrature_degree, b.collision, b.material)
+        numbers = (b.name, b.order, b.quadrature_degree, b.dilatation, b.collision, b.material)
         by_tet = {name: own.tobytes() for name, own in b.composition.by_tet.items()}
         regions = b.mesh.regions if b.mesh.regions is None else (b.mesh.regions.tolist(), b.mesh.region_names)
         bodies.append((numbers, [a.tobytes() for a in arrays], fixed, moved, chosen, values, by_tet, regions))
