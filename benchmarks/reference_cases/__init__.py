@@ -1,8 +1,8 @@
 """The reference problems as data: every case that `benchmarks/references.py` runs, in the order of its table."""
 
-from . import contact, layers, motion, pointwise, statics, vibration
+from . import contact, layers, locking, motion, pointwise, statics, vibration
 from .record import Case
 
-PARTS = (pointwise, statics, layers, vibration, motion, contact)
+PARTS = (pointwise, statics, layers, locking, vibration, motion, contact)
 CASES: tuple[Case, ...] = tuple(case for part in PARTS for case in part.CASES)
 PROBLEMS: tuple[str, ...] = tuple(dict.fromkeys(case.problem for case in CASES))
