@@ -53,6 +53,8 @@ def compute(cells: tuple[int, int, int], fine: bool, _reference: dict, arch: str
         usual = _error(cells, 0.3, order, "local", arch)
         errors = {nu: _error(cells, nu, order, "mean", arch) for nu in SAG}
         yield Check(f"order {order}: error of the sag, nu = 0.3, local dilatation", usual, 0.0, usual)
+        locked = _error(cells, 0.499, order, "local", arch)
+        yield Check(f"order {order}: error of the sag, nu = 0.499, local dilatation", locked, 0.0, locked)
         for nu, error in errors.items():
             limit = ERROR_LIMIT if order == 2 and fine else None
             yield Check(f"order {order}: error of the sag, nu = {nu}, mean dilatation", error, 0.0, error, limit)

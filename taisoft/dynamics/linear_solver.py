@@ -151,7 +151,7 @@ class LinearSolver:
     def prepare(self, system: "StageSystem") -> None:
         """Prepare `volume_pcg` for the system's matrix, unless it is."""
         if self._prepared != system.n_formed:
-            volume_pcg.prepare(self.model, system.matrix, system.work.pcg, self._volumes, system.stage.beta**2)
+            volume_pcg.prepare_volumes(self.model, system.matrix, system.work.pcg, self._volumes, system.stage.beta**2)
             self._prepared = system.n_formed
 
     def _solve_multigrid(self, system: "StageSystem", tolerance: float, digits: float) -> pcg.LinearResult | None:

@@ -95,17 +95,17 @@ def build_volume_system(m: Model, A: BlockCsr, arena: FieldArena) -> VolumeSyste
 
 
 def solve(m: Model, A: BlockCsr, w: PcgWork, s: VolumeSystem, tolerance: float, max_iterations: int) -> LinearResult:
-    """Solve for w.y given w.rhs, as `pcg.solve` without coupling and for all nodes, after `prepare`."""
+    """Solve for w.y given w.rhs, as `pcg.solve` without coupling and for all nodes, after `prepare_volumes`."""
     done, batch = 0, batch_of(m, A)
     while True:
-        iterate(m, A, w, s, min(batch, max_iterations - done), tolerance, int(done == 0))
+        iterate_with_volumes(m, A, w, s, min(batch, max_iterations - done), tolerance, int(done == 0))
         done, status = int(w.state[COUNT]), int(w.state[STATUS])
         if status != RUNNING or done >= max_iterations:
             return LinearResult(done, status == CONVERGED, status == NEGATIVE)
 
 
 @kernel
-def prepare(m: ti.template(), A: ti.template(), w: ti.template(), s: ti.template(), beta2: ti.f64):
+def prepare_volumes(m: ti.template(), A: ti.template(), w: ti.template(), s: ti.template(), beta2: ti.f64):
     """Compute D^-1, as w.inverse, and the factor of S, serially. beta2: the square of the beta with which A was formed."""
     t, mean = ti.static((A.patches, m.mean))
     ti.loop_config(serialize=True)
@@ -246,7 +246,9 @@ def restore_volumes(m: ti.template(), s: ti.template(), x_hat: ti.template(), be
 
 
 @kernel
-def iterate(m: ti.template(), A: ti.template(), w: ti.template(), s: ti.template(), n: ti.i32, tolerance: ti.f64, begin: ti.i32):
+def iterate_with_volumes(
+    m: ti.template(), A: ti.template(), w: ti.template(), s: ti.template(), n: ti.i32, tolerance: ti.f64, begin: ti.i32
+):
     """Run up to n iterations. begin: 1 to start from y = 0, 0 to go on."""
     ti.loop_config(serialize=True)
     for _ in range(1):
