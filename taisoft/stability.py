@@ -1,6 +1,7 @@
 """Linear vibration about the rest shape: Hooke stiffness, highest frequency, stable steps, eigenmodes. NumPy and SciPy.
 
-All three laws linearise to Hooke's law at F = I, so they share one stiffness: sigma = 2 mu eps + lambda tr(eps) I.
+All three laws linearise to Hooke's law at F = I, so they share one stiffness: sigma = 2 mu eps + lambda tr(eps) I. With mean
+dilatation tr(eps) is averaged over patches.
 """
 
 from typing import NamedTuple
@@ -27,6 +28,9 @@ def hooke_differential(body: Body):
     if body.composition.elastic_by_tet:  # one row for each quadrature point
         mu, lam = (np.repeat(np.broadcast_to(x, len(nodes)), volumes.shape[1])[:, None] for x in (mu, lam))
         mu = mu[:, :, None]
+    average = None
+    if body.dilatation == "mean":
+        lam, average = _patch_average(body, volumes)
     rows = gradients.swapaxes(2, 3)  # (m, p, 3, nodes of a tet): d/dX_j of v at each point; SciPy sums this layout fastest
     columns = np.broadcast_to(nodes[:, None, None, :], rows.shape)
     starts = np.arange(0, rows.size + 1, nodes.shape[1])
@@ -36,10 +40,23 @@ def hooke_differential(body: Body):
     def apply(v: np.ndarray) -> np.ndarray:
         H = (gradient @ v).reshape(-1, 3, 3)
         P = mu * (H + H.transpose(0, 2, 1))
-        P[:, (0, 1, 2), (0, 1, 2)] += lam * (H[:, 0, 0] + H[:, 1, 1] + H[:, 2, 2])[:, None]
+        theta = H[:, 0, 0] + H[:, 1, 1] + H[:, 2, 2]
+        P[:, (0, 1, 2), (0, 1, 2)] += lam * (theta if average is None else average(theta))[:, None]
         return divergence @ (weight * P).reshape(-1, 3)
 
     return apply
+
+
+def _patch_average(body: Body, volumes: np.ndarray):
+    """Return lambda (m p, 1) at all quadrature points and the function that averages values (m p,) over patches.
+
+    volumes: (m, p) of the points.
+    """
+    patch = reference.tet_patches(body)
+    of_point, weights = np.repeat(patch, volumes.shape[1]), volumes.reshape(-1)
+    total = np.bincount(of_point, weights)
+    lam = reference.patch_moduli(body, patch)[of_point][:, None]
+    return lam, lambda theta: (np.bincount(of_point, weights * theta) / total)[of_point]
 
 
 def hooke_stiffness(body: Body) -> sp.csr_matrix:
@@ -49,12 +66,23 @@ def hooke_stiffness(body: Body) -> sp.csr_matrix:
     gradients, volumes = reference.shape_gradients(body)
     # G_ab = sum_q V_q ga gb^T, and K_ab = mu (tr(G_ab) I + G_ab^T) + lambda G_ab
     G = np.einsum("eq,eqai,eqbj->eabij", volumes, gradients, gradients, optimize=True)
+    is_mean = body.dilatation == "mean"
+    lam = 0.0 if is_mean else lam
     K = mu * (np.einsum("eabii->eab", G)[..., None, None] * np.eye(3) + G.swapaxes(3, 4)) + lam * G
     dof = 3 * nodes[:, :, None] + np.arange(3)
     rows = np.broadcast_to(dof[:, :, None, :, None], K.shape)
     columns = np.broadcast_to(dof[:, None, :, None, :], K.shape)
     size = 3 * body.n_nodes
-    return sp.csr_matrix((K.reshape(-1), (rows.reshape(-1), columns.reshape(-1))), shape=(size, size))
+    local = sp.csr_matrix((K.reshape(-1), (rows.reshape(-1), columns.reshape(-1))), shape=(size, size))
+    return local + _patch_stiffness(body, np.einsum("eq,eqai->eai", volumes, gradients), dof) if is_mean else local
+
+
+def _patch_stiffness(body: Body, divergence: np.ndarray, dof: np.ndarray) -> sp.csr_matrix:
+    """Stiffness matrix of the patches' mean dilatations. divergence: (m, a, 3) of each tet by its nodes, dof: (m, a, 3)."""
+    patch = reference.tet_patches(body)
+    rows = np.broadcast_to(patch[:, None, None], dof.shape).reshape(-1)
+    D = sp.csr_matrix((divergence.reshape(-1), (rows, dof.reshape(-1))), shape=(int(patch.max()) + 1, 3 * body.n_nodes))
+    return D.T @ sp.diags(reference.patch_moduli(body, patch) / np.bincount(patch, body.mesh.volumes)) @ D
 
 
 def constrained_axes(body: Body, prescribed: bool) -> np.ndarray:

@@ -101,7 +101,9 @@ def test_lists_of_a_mesh_are_immutable():
 # --- bodies -----------------------------------------------------------------------------------------------------------
 
 ANOTHER = "add another body by scene.add_body"
-READ_ONLY = dict.fromkeys(("name", "mesh", "order", "quadrature_degree", "nodes", "rest_positions", "n_nodes"), ANOTHER) | {
+READ_ONLY = dict.fromkeys(
+    ("name", "mesh", "order", "quadrature_degree", "dilatation", "nodes", "rest_positions", "n_nodes"), ANOTHER
+) | {
     "constraints": "call body.fix or body.move",
     "forces": "call body.add_force",
     "tractions": "call body.add_traction",

@@ -291,6 +291,19 @@ def test_refusals():
     refused("name 'joint1' is taken", lambda s: s.attach("part1", [0], "part0", name="joint1"))
 
 
+def test_mean_dilatation_is_refused():
+    scene = ts.Scene()
+    for k in range(2):
+        mesh = ts.box_mesh((1, 1, 1), (0.1, 0.1, 0.1))
+        scene.add_body(mesh, RUBBER, name=f"part{k}", position=(0.1 * k, 0.0, 0.0), dilatation="local" if k else "mean")
+    scene.attach("part0", lambda X: X[:, 0] > 0.0, "part1")
+    with pytest.raises(ts.SceneError, match="nodes of body 'part0' cannot be attached exactly, since its dilatation is a mean"):
+        scene.check()
+    scene.attachments.clear()
+    scene.attach("part1", lambda X: X[:, 0] < 0.0, "part0")
+    scene.check()
+
+
 def test_stiffness_damping_must_agree():
     scene = ts.Scene()
     for k in range(2):

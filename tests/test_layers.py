@@ -29,7 +29,10 @@ ORDER = (
     ("backend.runtime",),
     ("mesh", "scene"),
     ("fem.state", "fem.math3", "fem.node_graph"),
-    ("fem.laws", "fem.lanes", "fem.dependents", "fem.reference", "fem.loads", "fem.springs", "fem.pressure"),
+    (
+        *("fem.laws", "fem.lanes", "fem.dependents", "fem.reference", "fem.loads", "fem.springs", "fem.pressure"),
+        "fem.mean_dilatation",
+    ),
     ("fem.terms",),
     ("fem.model",),
     ("fem.measure", "stability"),

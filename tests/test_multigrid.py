@@ -19,8 +19,9 @@ import taisoft as ts
 from taisoft.backend import runtime
 from taisoft.dynamics import linear_solver
 from taisoft.linear import block_csr, host_pcg, multigrid, pcg
-from taisoft.linear.aggregation import MODES, aggregate, prolongation, rigid_modes
+from taisoft.linear.aggregation import MODES, prolongation, rigid_modes
 from taisoft.linear.multigrid import Multigrid
+from taisoft.mesh.aggregates import aggregate
 
 
 def held_box(cells=(6, 3, 3), young: float = 1e5) -> ts.Scene:

@@ -45,7 +45,7 @@ def everything() -> ts.Scene:
     a.add_force([2, 1], [(0, 0, 1), (1 / 3, 0, 0)])
     velocity = np.random.default_rng(0).standard_normal((12, 3))
     scene.add_body(TURNED, foam, name='b "2"\n\\ü', velocity=velocity)
-    scene.add_body(ts.ball_mesh(0.3, 4, (1, 2, 3)), rubber, name="c.d")
+    scene.add_body(ts.ball_mesh(0.3, 4, (1, 2, 3)), rubber, name="c.d", dilatation="mean")
     scene.add_body(ts.sheet_mesh((3, 3), (1, 0.3, 1), pattern="six"), rubber, name="1")
     lift = ts.KeyFrames((1,), [(0, 1 / 3, 0)])
     scene.add_obstacle(ts.HalfSpace((0, 0, 0), (1, 2, 3)), name="ground", friction=0.1, restitution=0.9)

@@ -112,7 +112,7 @@ def data(scene: ts.Scene) -> dict:
         chosen = [t.triangles.tolist() for t in (*b.tractions, *b.pressures)] + [f.nodes.tolist() for f in b.forces]
         chosen += [(c.name, c.given, c.triangles.tolist()) for c in b.cavities]
         values = [path_data(load.path) or (load.value.shape, load.value.tobytes()) for load in b.loads]
-        numbers = (b.name, b.order, b.quadrature_degree, b.collision, b.material)
+        numbers = (b.name, b.order, b.quadrature_degree, b.dilatation, b.collision, b.material)
         by_tet = {name: own.tobytes() for name, own in b.composition.by_tet.items()}
         regions = b.mesh.regions if b.mesh.regions is None else (b.mesh.regions.tolist(), b.mesh.region_names)
         bodies.append((numbers, [a.tobytes() for a in arrays], fixed, moved, chosen, values, by_tet, regions))

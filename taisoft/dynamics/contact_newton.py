@@ -196,14 +196,14 @@ def solve(system: StageSystem, stage: Stage) -> StageResult:
 
     The caller sets x_hat, v_hat, the targets and the contacts.
     """
-    system.begin(stage)
+    fresh = system.begin(stage)
     if system.n_contacts == 0:
         # elimination knows no constraint of all nodes of a cavity
         newton = Newton(system, stage, eliminate=eliminate if system.volumes is None else None)
         if stage.linearised:
             return newton.solve_once()
         r, scale, _ = choose_start(system, *system.evaluate())
-        return newton.run(r, scale, fresh=False)
+        return newton.run(r, scale, fresh)
     return solve_linearised(system, stage) if stage.linearised else ContactNewton(system, stage).run()
 
 

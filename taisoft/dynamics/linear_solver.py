@@ -10,7 +10,8 @@ iterations and steps, until a solve takes GROWTH times as many iterations as the
 decisions count iterations and nodes, so they are the same in every run. A checkpoint holds the positions of the last build, from
 which the hierarchy is built again.
 
-Solves with contacts, those of elimination and those on CUDA use `pcg`.
+Nearly incompressible bodies with mean dilatation have the preconditioner of `volume_pcg` instead of that of `pcg`, if its band
+is narrow enough. Solves with contacts, those of elimination and those on CUDA use `pcg`.
 """
 
 import math
@@ -20,10 +21,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 import taichi as ti
 
-from taisoft.backend.arrays import upload
+from taisoft.backend.arrays import FieldArena, upload
 from taisoft.fem.model import Model
 from taisoft.fem.node_graph import EVERYTHING
-from taisoft.linear import block_csr, host_pcg, pcg
+from taisoft.linear import block_csr, host_pcg, pcg, volume_pcg
 from taisoft.linear.aggregation import rigid_modes
 from taisoft.linear.multigrid import Multigrid, block_rows
 
@@ -46,6 +47,9 @@ class LinearSolver:
 
     def __init__(self, model: Model):
         self.model = model
+        self._arena, self._volumes = FieldArena(), None  # of `volume_pcg`, built on first use
+        self._use_volumes: bool | None = None  # None: to be decided
+        self._prepared = -1  # `StageSystem.n_formed` of the matrix it was prepared for
         self._ratio = RATIO[model.real] + OVERHEAD / model.n_nodes  # duration of an iteration of multigrid over one of pcg
         self.forget()
 
@@ -60,7 +64,17 @@ class LinearSolver:
     @property
     def field_bytes(self) -> dict[str, int]:
         """Bytes of the hierarchy, if there is one."""
-        return {"multigrid": self._hierarchy.n_bytes} if self._hierarchy else {}
+        return self._arena.bytes | ({"multigrid": self._hierarchy.n_bytes} if self._hierarchy else {})
+
+    def numbers_changed(self) -> None:
+        """Update for changed material numbers."""
+        self._use_volumes = None
+        self.release()
+
+    def free(self) -> None:
+        """Free all memory."""
+        self.release()
+        self._arena.release()
 
     def release(self) -> None:
         """Discard the hierarchy; the next solve by multigrid builds a new one."""
@@ -100,7 +114,7 @@ class LinearSolver:
         elif self.uses >= PERIOD:
             self.active, self.uses, self.savings = False, 0, 0.8 * BUILD
         if found is None:
-            found = pcg.solve(m, system.matrix, w, tolerance, pcg.iteration_limit(m))
+            found = self._solve_plain(system, tolerance, pcg.iteration_limit(m))
         return replace(found, iterations=done + found.iterations)
 
     def _solve_pcg(self, system: "StageSystem", tolerance: float, digits: float) -> pcg.LinearResult:
@@ -108,13 +122,37 @@ class LinearSolver:
         worth = ITERATIONS * self._ratio
         most = math.ceil(worth + BUILD - self.savings)
         limit = pcg.iteration_limit(self.model)
-        found = pcg.solve(self.model, system.matrix, system.work.pcg, tolerance, min(most, limit))
+        found = self._solve_plain(system, tolerance, min(most, limit))
         self.savings = max(self.savings + found.iterations - worth, min(self.savings, 0.0))
         self.pcg_rate = found.iterations / digits
         if most <= found.iterations < limit and not (found.converged or found.negative):
             self.active, self.savings = True, 0.0
             self.pcg_rate *= UNFINISHED
         return found
+
+    def _solve_plain(self, system: "StageSystem", tolerance: float, most: int) -> pcg.LinearResult:
+        """Solve by `volume_pcg` or `pcg`."""
+        m, A, w = self.model, system.matrix, system.work.pcg
+        if self.volumes(A) is None:
+            return pcg.solve(m, A, w, tolerance, most)
+        self.prepare(system)
+        return volume_pcg.solve(m, A, w, self._volumes, tolerance, most)
+
+    def volumes(self, A: block_csr.BlockCsr) -> volume_pcg.VolumeSystem | None:
+        """Return the system of `volume_pcg` for matrices like A if it is to be used."""
+        m = self.model
+        if self._use_volumes is None:
+            self._use_volumes = m.mean_dilatation and m.serial and volume_pcg.is_nearly_incompressible(m)
+            if self._use_volumes and self._volumes is None:
+                self._volumes = volume_pcg.build_volume_system(m, A, self._arena)
+                self._use_volumes = self._volumes is not None
+        return self._volumes if self._use_volumes else None
+
+    def prepare(self, system: "StageSystem") -> None:
+        """Prepare `volume_pcg` for the system's matrix, unless it is."""
+        if self._prepared != system.n_formed:
+            volume_pcg.prepare_volumes(self.model, system.matrix, system.work.pcg, self._volumes, system.stage.beta**2)
+            self._prepared = system.n_formed
 
     def _solve_multigrid(self, system: "StageSystem", tolerance: float, digits: float) -> pcg.LinearResult | None:
         """Solve with the hierarchy, or with a new one if there is none or it is out of date; None if that fails too."""

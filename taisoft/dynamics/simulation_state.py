@@ -9,6 +9,7 @@ from taisoft.backend.runtime import Runtime
 from taisoft.dynamics.dirichlet import DirichletConditions
 from taisoft.fem.dependents import DependentTable, dependent_table
 from taisoft.fem.loads import SceneLoads
+from taisoft.fem.mean_dilatation import patch_moduli
 from taisoft.fem.model import Layout, Model, damping_table, law_table, upload_mass_matrix
 from taisoft.fem.pressure import pressures_of
 from taisoft.fem.reference import gravity_masses, lumped_masses
@@ -95,6 +96,8 @@ class SimulationState:
         """Upload material numbers of the bodies, and masses if a density changed."""
         m = self.model
         numbers = [(m.law_constants, law_table(self.scene, self.layout, m.elasticity_by_tet))]
+        if m.mean_dilatation:
+            numbers.append((m.mean.modulus, patch_moduli(self.scene)))
         if m.damping is not None:
             numbers.append((m.damping, damping_table(self.scene)))
         if density:

@@ -19,7 +19,7 @@ from taisoft.dynamics.contact_terms import impulse_on_node
 from taisoft.dynamics.impact import impact_residual
 from taisoft.fem.dependents import force_with_dependents
 from taisoft.fem.lanes import mass_times
-from taisoft.fem.model import Model
+from taisoft.fem.model import Model, patch_nodes
 from taisoft.fem.node_graph import BLOCKS, EDGES, NODES, Subset, n_nodes_of, node_of
 from taisoft.fem.state import END_SLOPE, N_NORMS, OTHER_SUM, START_SLOPE, SUM
 from taisoft.fem.terms import elasticity, rayleigh_damping
@@ -236,6 +236,16 @@ def form_residual(
         m.state.scalars[END_SLOPE] = total(m, SUM)
 
 
+def _with_patches(m: Model, start: np.ndarray, block: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Add to the blocks at each node those of its patches. start (n + 1), block: rows of a table, in and out."""
+    patch, node = patch_nodes(m)
+    tet_start, tet = download([m.mean.tet_start, m.mean.tet])
+    counts = np.diff(tet_start)[patch]
+    key = np.concatenate([np.repeat(np.arange(len(start) - 1), np.diff(start)), np.repeat(node, counts)]) * m.n_blocks
+    key = np.unique(key + np.concatenate([block, tet[entries_of(tet_start, patch)] // m.lanes]))
+    return np.searchsorted(key, np.arange(len(start)) * m.n_blocks), key % m.n_blocks
+
+
 class SubsetLists:
     """Edges and blocks at each node of a model, on the host, and storage for a subset."""
 
@@ -250,6 +260,8 @@ class SubsetLists:
             size = 3 * g.n_nodes * m.lanes
             own = (entry >= g.force_at) & (entry < g.force_at + (g.last - g.first) * size)
             self._block[own] = g.first + (entry[own] - g.force_at) // size
+        if m.mean_dilatation:  # a node changes the pressure on all tets of its patches
+            self._tet_start, self._block = _with_patches(m, self._tet_start, self._block)
         self._arena = FieldArena()
         count = self._arena.field("subset_count", ti.i32, BLOCKS + len(m.groups) + 1)
         sizes = {"node": m.n_nodes, "edge": A.n_edges, "block": m.groups[-1].last}

@@ -46,13 +46,16 @@ from taisoft.dynamics.stage import (
 from taisoft.fem.model import Model
 from taisoft.fem.node_graph import EVERYTHING, Subset
 from taisoft.fem.state import END_SLOPE, START_SLOPE, STEP_LENGTH
-from taisoft.linear import block_csr, pcg
+from taisoft.linear import block_csr, pcg, volume_pcg
 from taisoft.linear.block_csr import BlockCsr
 
 if TYPE_CHECKING:
     from taisoft.dynamics.contact import ContactStep
     from taisoft.dynamics.no_contacts import NoContacts
     from taisoft.dynamics.volumes import Volumes
+
+
+VOLUME_PASSES = 2  # corrections of the first iterate, each of which leaves errors of second order
 
 
 @dataclass(frozen=True)
@@ -126,6 +129,7 @@ class StageSystem:
         self._whole, self._restricted = self.work, None  # `work` for all nodes, and for a subset
         self._lists: SubsetLists | None = None
         self._same_matrix = False  # whether the matrix is that of the last linear solve of this stage
+        self.n_formed = 0  # times that the matrix was formed
         self.norms = np.zeros(5)  # result of `form_residual`
 
     # --- state ----------------------------------------------------------------------------------------------------
@@ -139,7 +143,7 @@ class StageSystem:
     def release(self) -> None:
         """Free their memory."""
         self._contact_arena.release()
-        self.linear_solver.release()
+        self.linear_solver.free()
         if self._lists:
             self._lists.release()
 
@@ -157,7 +161,7 @@ class StageSystem:
     def numbers_changed(self) -> None:
         """Update for changed gravity or material numbers."""
         self.rounding.measure()
-        self.linear_solver.release()
+        self.linear_solver.numbers_changed()
 
     def _allocate_contacts(self) -> None:
         """Allocate storage for the contacts of this step."""
@@ -196,10 +200,26 @@ class StageSystem:
         """Whether all cavities have the volume that is given, or are not the concern of the present solve."""
         return self.volumes is None or not self.volumes.penalised or self.volumes.hold
 
-    def begin(self, stage: Stage) -> None:
-        """Begin a stage at its first iterate; with contacts, form the matrix, which the r-factors depend on."""
-        begin_stage(self.model, self.work, stage.beta, stage.prescribed_fraction)
+    def begin(self, stage: Stage) -> bool:
+        """Begin a stage at its first iterate; with contacts, form the matrix, which the r-factors depend on.
+
+        Nearly incompressible bodies with mean dilatation get a first iterate that keeps their volumes, from the matrix at the
+        start of the step. Return whether that is formed.
+        """
+        m, start, volumes = self.model, self._whole, None
+        if stage.c > 0.0 and not stage.linearised and self.contact.n_contacts == 0:
+            volumes = self.linear_solver.volumes(self.matrix)
+        if volumes is not None:
+            self.restrict(None)
+            self.stage = stage
+            self.form_matrix()
+            self.linear_solver.prepare(self)
+            volume_pcg.save_volumes(m, volumes)
+        begin_stage(m, start, stage.beta, stage.prescribed_fraction)
+        for _ in range(VOLUME_PASSES if volumes is not None else 0):
+            volume_pcg.restore_volumes(m, volumes, start.x_hat, stage.beta)
         self._begin(stage, ELASTIC_STAGE)
+        return volumes is not None
 
     def begin_impact(self, stage: Stage) -> StageContacts:
         """Begin the impact before a step, and form the matrix."""
@@ -335,6 +355,7 @@ class StageSystem:
 
     def form(self, subset: Subset, projected: bool, c: float, beta: float) -> None:
         """Form the matrix of c and beta at the present positions, for the rows of a subset."""
+        self.n_formed += 1
         block_csr.assemble(self.model, self.matrix, subset, projected)
         if self.volumes is not None:
             self.volumes.upload(self.volumes.pressures)

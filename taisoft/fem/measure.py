@@ -4,6 +4,7 @@ import taichi as ti
 
 from taisoft.backend.runtime import kernel
 from taisoft.fem.lanes import broadcast, mass_times
+from taisoft.fem.mean_dilatation import find_dilatations
 from taisoft.fem.state import ELASTIC, FIRST_SOFTENED, GRAVITY, KINETIC, LOADS, MIN_J, N_INVERTED
 from taisoft.fem.terms import dead_loads, elasticity, gravity, pressure, springs
 from taisoft.fem.terms.elasticity import HUGE
@@ -34,6 +35,7 @@ def measure(m: ti.template()):
 
     They are written to `State.scalars` at SCALARS; FIRST_SOFTENED is NO_TET if there is none.
     """
+    find_dilatations(m)
     ti.loop_config(serialize=m.serial)
     for c in range(m.chunks):
         energy = broadcast(ti.cast(0.0, ti.f64), m.lanes)

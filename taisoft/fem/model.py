@@ -6,6 +6,7 @@ by order, quadrature and law; a kernel runs one group's blocks in one loop. A bo
 several groups. Its last block in each is padded with copies of its last tet there that have volume 0.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -18,12 +19,13 @@ from taisoft.fem import reference, springs
 from taisoft.fem.dependents import build_dependents, dependent_table, expanded_pairs, table_of
 from taisoft.fem.laws import LAWS
 from taisoft.fem.loads import SceneLoads
+from taisoft.fem.mean_dilatation import MeanDilatation, build_mean_dilatation
 from taisoft.fem.node_graph import PAIRS, NodeGraph, node_graph
 from taisoft.fem.pressure import PressureTable, build_pressures
 from taisoft.fem.state import State, build_state
 from taisoft.fem.terms import terms_of
 from taisoft.ranges import owners
-from taisoft.scene.scene import Scene
+from taisoft.scene.scene import Body, Scene
 
 # Least quadrature points and CPU threads for parallel loops; below, one serial kernel runs. With two threads, parallel loops took
 # 3.4 times as long (213,000 tets, `taisoft bench scaling`)
@@ -44,6 +46,7 @@ class Group:
     order: int
     n_nodes: int  # of an element
     n_points: int
+    mean_dilatation: bool
     first: Count  # first block
     last: Count  # one past the last block
     nodes_at: Count  # offset in Model.nodes
@@ -101,6 +104,8 @@ class Model:
     damped: bool
     stiffness_damping: bool
     spring_damping: bool
+    mean_dilatation: bool  # of some group
+    mean: MeanDilatation | None
     elasticity_by_tet: bool  # law_constants may differ between the tets of a body
     chunks: int  # parts of a loop, each with its own partial sums
 
@@ -151,13 +156,13 @@ def _layout(scene: Scene, lanes: int) -> tuple[Layout, tuple[Group, ...]]:
     parts: dict[tuple, list[np.ndarray]] = {}  # tets of one body and one law, by their kind
     for k, b in enumerate(bodies):
         for law in b.composition.laws:
-            kind = b.order, b.quadrature_degree, laws.index(law)
+            kind = b.order, b.quadrature_degree, laws.index(law), b.dilatation == "mean"
             parts.setdefault(kind, []).append(tet_start[k] + b.composition.tets_of_law(law))
-    n_points = {degree: len(reference.quadrature(degree).weights) for _, degree, _ in parts}
+    n_points = {degree: len(reference.quadrature(degree).weights) for _, degree, *_ in parts}
     tet_of_lane = []
     groups, block, nodes_at, force_at, matrix_at = [], 0, 0, 0, 0
     for kind in sorted(parts):
-        order, degree, law = kind
+        order, degree, law, mean = kind
         first = block
         for tets in parts[kind]:
             padded = -(-len(tets) // lanes) * lanes
@@ -166,7 +171,7 @@ def _layout(scene: Scene, lanes: int) -> tuple[Layout, tuple[Group, ...]]:
         n_nodes, count = len(reference.unit_mass(order)), (block - first) * lanes
         points_at = sum(n for other, n in n_points.items() if 1 < other < degree)  # order 1 has degree 1 and no table
         offsets = first, block, nodes_at, force_at, matrix_at, points_at
-        groups.append(Group(LAWS[laws[law]], order, n_nodes, n_points[degree], *offsets))
+        groups.append(Group(LAWS[laws[law]], order, n_nodes, n_points[degree], mean, *offsets))
         nodes_at += count * n_nodes
         force_at += count * n_nodes * 3
         matrix_at += (block - first) * MATRIX_BLOCKS[order] * 9
@@ -224,19 +229,44 @@ def _gather_table(nodes, groups: tuple[Group, ...], real: np.ndarray, n_nodes: i
     return start.astype(np.int32), entry[order].astype(np.int32)
 
 
-def model_graph(model: Model) -> tuple[NodeGraph, np.ndarray, np.ndarray | None]:
-    """Pairs of nodes that share a tet or a spring, and where the assembly buffer has the blocks (e,) that they sum up.
-
-    The latter are indices times lanes, plus the lane, in the order of the graph's `pair`. With dependent nodes also the factors
-    (e,2) of `expanded_pairs`, else None.
-    """
+def group_nodes(model: Model) -> Iterator[tuple[Group, np.ndarray, np.ndarray]]:
+    """For each group its lanes (k,) that are not padding, counted from its first, and the nodes (k, n_nodes) of their tets."""
     (nodes, volume), lanes = download([model.nodes, model.volume]), model.lanes
     flat, real = nodes.astype(np.int64), volume.reshape(-1) > 0
-    ends, entries = [], []
     for g in model.groups:
-        pairs, lane = np.array(PAIRS[g.order]), np.flatnonzero(real[g.first * lanes : g.last * lanes])
+        lane = np.flatnonzero(real[g.first * lanes : g.last * lanes])
         block = flat[g.nodes_at :][: (g.last - g.first) * g.n_nodes * lanes].reshape(-1, g.n_nodes, lanes)
-        own = block.transpose(0, 2, 1).reshape(-1, g.n_nodes)[lane]
+        yield g, lane, block.transpose(0, 2, 1).reshape(-1, g.n_nodes)[lane]
+
+
+def patch_nodes(model: Model) -> tuple[np.ndarray, np.ndarray]:
+    """Patches (k,), ascending, and their nodes (k,), ascending in each patch."""
+    patch, lanes, pairs = model.mean.patch.to_numpy().reshape(-1).astype(np.int64), model.lanes, []
+    for g, lane, own in group_nodes(model):
+        if g.mean_dilatation:
+            pairs.append(np.unique(patch[g.first * lanes + lane][:, None] * model.n_nodes + own))
+    return np.divmod(np.unique(np.concatenate(pairs)), model.n_nodes)
+
+
+def patch_pairs(patch: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Indices (k,), (k,) of all pairs of entries with the same patch, the lower first. patch: ascending."""
+    firsts, seconds = [], []
+    for distance in range(1, int(np.bincount(patch).max())):
+        first = np.flatnonzero(patch[distance:] == patch[:-distance])
+        firsts.append(first)
+        seconds.append(first + distance)
+    return np.concatenate(firsts), np.concatenate(seconds)
+
+
+def model_graph(model: Model) -> tuple[NodeGraph, np.ndarray, np.ndarray | None]:
+    """Pairs of nodes that share a tet, a patch or a spring, and where the assembly buffer has the blocks (e,) that they sum up.
+
+    The latter are indices times lanes, plus the lane, in the order of the graph's `pair`, which goes on with those of
+    `patch_pairs`. With dependent nodes also the factors (e,2) of `expanded_pairs`, else None.
+    """
+    ends, entries, lanes = [], [], model.lanes
+    for g, lane, own in group_nodes(model):
+        pairs = np.array(PAIRS[g.order])
         ends.append(own[:, pairs].reshape(-1, 2))
         base = g.matrix_at + (lane // lanes)[:, None] * (MATRIX_BLOCKS[g.order] * 9) + 9 * np.arange(len(pairs))
         entries.append((base * lanes + (lane % lanes)[:, None]).reshape(-1))
@@ -245,10 +275,14 @@ def model_graph(model: Model) -> tuple[NodeGraph, np.ndarray, np.ndarray | None]
         others.append(np.unique(np.sort(ends, axis=1), axis=0))
         ends, rows, factors = expanded_pairs(table_of(model.dependents, model.n_nodes), ends)
         entries = entries[rows]
+    patches = np.zeros((0, 2), dtype=np.int64)
+    if model.mean_dilatation:
+        patch, node = patch_nodes(model)
+        patches = node[np.stack(patch_pairs(patch), axis=1)]
     if model.springs is not None:
         others.append(springs.node_pairs(*download([model.springs.start, model.springs.node])))
-    graph = node_graph(np.concatenate([ends, *others]), model.n_nodes)
-    return replace(graph, pair=graph.pair[: len(entries)]), entries, factors
+    graph = node_graph(np.concatenate([ends, patches, *others]), model.n_nodes)
+    return replace(graph, pair=graph.pair[: len(entries) + len(patches)]), entries, factors
 
 
 def lane_layout(values: np.ndarray, lanes: int) -> np.ndarray:
@@ -256,13 +290,19 @@ def lane_layout(values: np.ndarray, lanes: int) -> np.ndarray:
     return values.reshape(-1, lanes, values.shape[1]).transpose(0, 2, 1)
 
 
+def _local_lame(body: Body) -> tuple:
+    """Lamé's parameters (mu, lambda) of the energy of each quadrature point: lambda is 0 if the patches have its part."""
+    mu, lam = body.composition.lame
+    return (mu, 0.0 * lam) if body.dilatation == "mean" else (mu, lam)
+
+
 def law_table(scene: Scene, layout: Layout, by_tet: bool) -> np.ndarray:
     """Law constants (n_bodies, 4), or (n_blocks, 4, lanes) if they may differ between the tets of a body."""
     if not by_tet:
-        return np.array([LAWS[b.composition.first.law].constants(*b.composition.lame) for b in scene.bodies])
+        return np.array([LAWS[b.composition.first.law].constants(*_local_lame(b)) for b in scene.bodies])
     table = np.zeros((len(layout.lane_of_tet), 4))
     for k, body in enumerate(scene.bodies):
-        mu, lam = (np.broadcast_to(x, body.mesh.n_tets) for x in body.composition.lame)
+        mu, lam = (np.broadcast_to(x, body.mesh.n_tets) for x in _local_lame(body))
         for law in body.composition.laws:
             tets = body.composition.tets_of_law(law)
             for c, values in enumerate(LAWS[law].constants(mu[tets], lam[tets])):
@@ -333,6 +373,8 @@ def build_model(scene: Scene, runtime: Runtime, arena: FieldArena, on: dict[str,
         damped=damped,
         stiffness_damping=on["stiffness_damping"],
         spring_damping=on["spring_damping"],
+        mean_dilatation=on["mean_dilatation"],
+        mean=build_mean_dilatation(scene, layout, arena) if on["mean_dilatation"] else None,
         elasticity_by_tet=on["elasticity_by_tet"],
         chunks=chunks,
     )

@@ -19,6 +19,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from taisoft.fem.dependents import dependent_table
+from taisoft.mesh import aggregates
 from taisoft.mesh.topology import EDGES
 from taisoft.scene.scene import Body, Scene
 
@@ -82,6 +83,20 @@ def shape_gradients(body: Body) -> tuple[np.ndarray, np.ndarray]:
     barycentric = np.concatenate([-Dm_inv.sum(axis=1, keepdims=True), Dm_inv], axis=1)
     rule = quadrature(body.quadrature_degree)
     return shape_derivatives(body.order, rule.points) @ barycentric[:, None], np.outer(volumes, rule.weights)
+
+
+def tet_patches(body: Body) -> np.ndarray:
+    """Patch (m,) of each tet, from 0, over which mean dilatation averages: each quadratic tet is one."""
+    if body.order == 2:
+        return np.arange(body.mesh.n_tets)
+    regions = body.mesh.regions if body.composition.has_regions else np.zeros(body.mesh.n_tets, dtype=np.int64)
+    return aggregates.tet_patches(body.mesh.tets, body.mesh.volumes, regions)
+
+
+def patch_moduli(body: Body, patch: np.ndarray) -> np.ndarray:
+    """Mean lambda (n_patches,) [Pa] of the patches. patch: `tet_patches`."""
+    volumes, lam = body.mesh.volumes, body.composition.lame[1]
+    return np.bincount(patch, volumes * lam) / np.bincount(patch, volumes)
 
 
 def lumped_mass(body: Body) -> np.ndarray:

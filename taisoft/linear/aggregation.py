@@ -1,11 +1,9 @@
-"""Aggregates of neighbouring nodes, and the prolongation that makes each of them a rigid body.
+"""Rigid-body modes, and the prolongation that makes each aggregate of nodes a rigid body.
 
-Aggregates grow around roots that are more than two edges apart (a maximal independent set of distance 2, found in parallel
-rounds): a root takes its neighbours, and the nodes left over join the aggregate of a neighbour. A coarse node has six unknowns,
-the coefficients of an orthonormal basis of its aggregate's rigid-body modes.
-Sources: Bell, Dalton and Olson, "Exposing fine-grained parallelism in algebraic multigrid methods", SIAM J. Sci. Comput. 34(4),
-2012 (aggregates); Vanek, Mandel and Brezina, "Algebraic multigrid by smoothed aggregation for second and fourth order elliptic
-problems", Computing 56, 1996 (modes).
+Aggregates are those of `mesh.aggregates`. A coarse node has six unknowns, the coefficients of an orthonormal basis of its
+aggregate's rigid-body modes.
+Source: Vanek, Mandel and Brezina, "Algebraic multigrid by smoothed aggregation for second and fourth order elliptic problems",
+Computing 56, 1996.
 Weakness: aggregates follow the mesh's edges, not the strength of their coupling, so flat elements are coarsened in every
 direction.
 """
@@ -27,28 +25,6 @@ def rigid_modes(x: np.ndarray, free: np.ndarray) -> np.ndarray:
         i, j = (k + 1) % 3, (k + 2) % 3
         modes[:, j, 3 + k], modes[:, i, 3 + k] = arm[:, i], -arm[:, j]
     return modes * free[:, :, None]
-
-
-def aggregate(start: np.ndarray, column: np.ndarray, included: np.ndarray) -> np.ndarray:
-    """Aggregate of each node (n), -1 for nodes that are not included (n) bool.
-
-    start (n + 1), column: the nodes' graph as CSR rows, each with its diagonal. The priorities are the same in every run.
-    """
-
-    def highest(value: np.ndarray) -> np.ndarray:
-        return np.maximum.reduceat(value[column], start[:-1])
-
-    n = len(included)
-    priority = np.random.default_rng(0).permutation(n) + 1
-    root, open_nodes = np.zeros(n, dtype=bool), included.copy()
-    while open_nodes.any():
-        value = np.where(root, n + priority, np.where(open_nodes, priority, 0))
-        best = highest(highest(value))
-        root |= open_nodes & (best == priority)
-        open_nodes &= (best <= n) & ~root
-    label = np.where(root, np.cumsum(root), 0)
-    near = highest(label)
-    return np.where(included, np.where(near > 0, near, highest(near)), 0) - 1
 
 
 def prolongation(modes: np.ndarray, aggregates: np.ndarray) -> tuple[sp.bsr_matrix, np.ndarray, np.ndarray]:

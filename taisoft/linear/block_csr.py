@@ -21,6 +21,7 @@ from taisoft.fem.node_graph import BLOCKS, EDGES, block_of, count_of, edge_of, n
 from taisoft.fem.springs import set_pair_entries
 from taisoft.fem.terms import rayleigh_damping
 from taisoft.linear.element_blocks import element_blocks, pair_terms
+from taisoft.linear.patch_terms import PatchTerms, add_patches, build_patch_terms, find_gradients
 
 # A block is a 12-vector, column by column, each padded with a zero: entry (r, c) is at 4 c + r. All entries share one address,
 # and a column times a number is one SIMD instruction.
@@ -50,6 +51,7 @@ class BlockCsr:
     term_pair: Any = None
     term_factor: Any = None
     edge_factor: Any = None  # (entries, 2), see `fem.dependents.expanded_pairs`; only with dependent nodes
+    patches: PatchTerms | None = None  # of mean dilatation
 
     @property
     def is_expanded(self) -> bool:
@@ -73,9 +75,12 @@ def build_block_csr(model: Model, arena: FieldArena, prefix: str = "stiffness") 
         start, pairs, factors = pair_terms(model.rules)
         rules["term_start"], rules["term_pair"] = copied("term_start", start), copied("term_pair", pairs)
         rules["term_factor"] = copied("term_factor", factors, model.real)
-    by_edge = np.argsort(graph.pair, kind="stable")
+    of_tets, of_patches = graph.pair[: len(base)], graph.pair[len(base) :]
+    by_edge = np.argsort(of_tets, kind="stable")
     if shares is not None:
         rules["edge_factor"] = copied("edge_factor", shares[by_edge], model.real)
+    if model.mean_dilatation:
+        rules["patches"] = build_patch_terms(model, arena, prefix, of_patches, n_edges)
     size = sum((g.last - g.first) * MATRIX_BLOCKS[g.order] * 9 for g in model.groups)
     element = arena.lanes(f"{prefix}_element", model.real, size * model.lanes)
     return BlockCsr(
@@ -88,7 +93,7 @@ def build_block_csr(model: Model, arena: FieldArena, prefix: str = "stiffness") 
         element=element.memory,
         element_at=element.at // model.lanes,
         element_mask=element.mask // model.lanes,
-        edge_start=copied("edge_start", np.concatenate([[0], np.cumsum(np.bincount(graph.pair, minlength=n_edges))])),
+        edge_start=copied("edge_start", np.concatenate([[0], np.cumsum(np.bincount(of_tets, minlength=n_edges))])),
         edge_entry=copied("edge_entry", base[by_edge]),
         edge_upper=copied("edge_upper", graph.upper),
         edge_lower=copied("edge_lower", graph.lower),
@@ -111,13 +116,15 @@ def _values(model: Model, arena: FieldArena, prefix: str, n_edges: int) -> dict[
 @kernel
 def assemble(m: ti.template(), A: ti.template(), subset: ti.template(), projected: ti.template()):
     """Assemble the rows of a subset of A = K(x) [N/m]. projected: with positive semi-definite element contributions."""
+    if ti.static(m.mean_dilatation):
+        find_gradients(m, A)
     for n, g in ti.static(enumerate(m.groups)):
         ti.loop_config(serialize=m.serial)
         for j in range(count_of(subset, BLOCKS + n, g.first), count_of(subset, BLOCKS + n + 1, g.last)):
             element_blocks(m, g, A, block_of(subset, j), projected)
     ti.loop_config(serialize=m.serial)
     for j in range(count_of(subset, EDGES, A.n_edges)):
-        gather_edge(m, A, edge_of(subset, j))
+        gather_edge(m, A, edge_of(subset, j), projected)
     ti.loop_config(serialize=m.serial)
     for j in range(n_nodes_of(m, subset)):
         i = node_of(subset, j)
@@ -128,8 +135,8 @@ def assemble(m: ti.template(), A: ti.template(), subset: ti.template(), projecte
 
 
 @ti.func
-def gather_edge(m: ti.template(), A: ti.template(), e):
-    """Sum the element blocks of one edge and write K_ij and K_ji."""
+def gather_edge(m: ti.template(), A: ti.template(), e, projected: ti.template()):
+    """Sum the element blocks, and terms of patches, of one edge and write K_ij and K_ji."""
     s = ti.Vector([0.0 for _ in ti.static(range(BLOCK))], m.real)
     for k in range(A.edge_start[e], A.edge_start[e + 1]):
         at = (A.element_at * m.lanes + A.edge_entry[k]) & (A.element_mask * m.lanes + m.lanes - 1)
@@ -140,6 +147,8 @@ def gather_edge(m: ti.template(), A: ti.template(), e):
                     s[4 * c + r] += A.edge_factor[k, 0] * A.element[at + (3 * r + c) * m.lanes] + A.edge_factor[k, 1] * transposed
                 else:
                     s[4 * c + r] += A.element[at + (3 * r + c) * m.lanes]
+    if ti.static(m.mean_dilatation):
+        add_patches(m, A, e, s, projected)
     A.value[A.edge_upper[e]] = s
     for r in ti.static(range(3)):
         for c in ti.static(range(3)):

@@ -11,7 +11,6 @@ import taichi as ti
 from taisoft.fem.lanes import (
     broadcast,
     deformation_gradient,
-    law_constants,
     load_lanes,
     position_differences,
     rest_gradients,
@@ -20,6 +19,7 @@ from taisoft.fem.lanes import (
     volumes,
 )
 from taisoft.fem.laws import dpk1_projected, prepare_projected
+from taisoft.fem.mean_dilatation import stress_constants
 from taisoft.fem.model import MATRIX_BLOCKS
 from taisoft.fem.node_graph import PAIRS
 from taisoft.fem.reference import Quadrature, shape_derivatives
@@ -53,7 +53,7 @@ def pair_terms(rules: list[Quadrature]) -> tuple[np.ndarray, np.ndarray, np.ndar
 def element_blocks(m: ti.template(), g: ti.template(), A: ti.template(), b, projected: ti.template()):
     """Write K_ab of the node pairs of block b of group g to A.element."""
     X, N = position_differences(m, g, b), rest_gradients_of_F(m, b)
-    p = law_constants(m, b, m.real)
+    p = stress_constants(m, g, b, m.real)
     M = rest_gradients(m, b, m.real)
     V = volumes(m, b, m.real)
     base = (A.element_at + g.matrix_at + (b - g.first) * (MATRIX_BLOCKS[g.order] * 9)) & A.element_mask  # see `LanePool`

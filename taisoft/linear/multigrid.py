@@ -19,7 +19,8 @@ import scipy.linalg as sl
 import scipy.sparse as sp
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
-from taisoft.linear.aggregation import MODES, aggregate, prolongation
+from taisoft.linear.aggregation import MODES, prolongation
+from taisoft.mesh.aggregates import aggregate
 from taisoft.ranges import owners
 
 SMOOTHER, PROLONGATOR = 1.5, 4.0 / 3.0  # over the largest eigenvalue of D^-1 A: omega and omega_P

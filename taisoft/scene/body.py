@@ -21,9 +21,11 @@ from taisoft.scene.loads import Cavity, NodalForce, Pressure, Traction, value_or
 from taisoft.scene.material import Material
 
 NEARLY_INCOMPRESSIBLE = 0.49  # Poisson's ratio above which linear tets lock, so that they bend far too little
+DILATATIONS = ("local", "mean")  # of each tet's quadrature points, or averaged over patches of tets, or a quadratic tet
 QUADRATURE_DEGREES = {1: (1,), 2: (2, 4)}  # by element order: degrees of polynomials integrated exactly, the default first
 # other data depend on these
-_READ_ONLY = ("name", "mesh", "composition", "order", "quadrature_degree", "nodes", "rest_positions", "n_nodes", "mass", "loads")
+_SHAPE = ("name", "mesh", "order", "quadrature_degree", "dilatation", "nodes", "rest_positions", "n_nodes")
+_READ_ONLY = (*_SHAPE, "composition", "mass", "loads")
 USE_A_COPY = "change a copy made by scene.snapshot() and make a new Simulator of it"
 _SET_FORCE = f"call sim.set_force(body, index, value) for an existing one; otherwise {USE_A_COPY}"
 _SET_TRACTION = f"call sim.set_traction(body, index, value) for an existing one; otherwise {USE_A_COPY}"
@@ -60,11 +62,11 @@ class Body(Guarded):
     name, mesh. material: a `Material`, or a read-only dict of one for each region, by its id. young, poisson, density: what
     the tets have, a float, or (m,) where it may differ from tet to tet; setting one replaces the material's. position: (3,)
     [m]; nodes start at rest_positions + position. velocity: (3,) or (n,3) [m/s], initial. order: 1 or 2, of the elements'
-    shape functions; quadrature_degree: degree of polynomials integrated exactly. nodes: `Nodes`, the mesh's vertices and for
-    order 2 its mid-edge nodes. constraints, tractions, forces, pressures, cavities: lists of `Constraint`, `Traction`,
-    `NodalForce`, `Pressure`, `Cavity`; items can be removed, but only methods add them. collision: one of CONTACT_MODES. Only
-    material, its numbers, position, velocity and collision can be assigned; each is validated. `warn_locking` and
-    `warn_bending` warn if tets of order 1 are far too stiff; `Scene.add_body` calls both.
+    shape functions; quadrature_degree: degree of polynomials integrated exactly. dilatation: one of DILATATIONS. nodes:
+    `Nodes`, the mesh's vertices and for order 2 its mid-edge nodes. constraints, tractions, forces, pressures, cavities: lists
+    of `Constraint`, `Traction`, `NodalForce`, `Pressure`, `Cavity`; items can be removed, but only methods add them.
+    collision: one of CONTACT_MODES. Only material, its numbers, position, velocity and collision can be assigned; each is
+    validated. `warn_locking` and `warn_bending` warn if tets of order 1 are far too stiff; `Scene.add_body` calls both.
     """
 
     _read_only = frozenset(_READ_ONLY)
@@ -107,6 +109,7 @@ class Body(Guarded):
         order: int,
         quadrature_degree: int | None,
         collision: str,
+        dilatation: str = "local",
         **numbers,
     ):
         """The arguments of `Scene.add_body`; numbers: young, poisson and density, if they replace the material's."""
@@ -118,6 +121,7 @@ class Body(Guarded):
         degrees = QUADRATURE_DEGREES[self.order]
         degree = degrees[0] if quadrature_degree is None else quadrature_degree
         self.quadrature_degree = checks.whole(degree, f"{what}: quadrature_degree of order {self.order}", degrees)
+        self.dilatation = checks.choice(dilatation, f"{what}: dilatation", DILATATIONS)
         self.nodes: Nodes = make_nodes(mesh, self.order)
         self.position, self.velocity, self.collision = position, velocity, collision
         self.constraints: list[Constraint] = []
@@ -203,10 +207,10 @@ class Body(Guarded):
     def warn_locking(self, stacklevel: int) -> None:
         """Warn if linear tets lock, at a Poisson's ratio above 0.49. stacklevel: 1 is the caller's line."""
         poisson = float(np.max(self.poisson))
-        if self.order == 1 and poisson > NEARLY_INCOMPRESSIBLE:
+        if self.order == 1 and self.dilatation == "local" and poisson > NEARLY_INCOMPRESSIBLE:
             warnings.warn(
                 f"{self._label()}: poisson = {poisson:g} is above {NEARLY_INCOMPRESSIBLE}, where linear tets lock and bend "
-                "far too little: order=2 locks less",
+                'far too little: dilatation="mean" does not lock, and order=2 locks less',
                 UserWarning,
                 stacklevel=stacklevel + 1,
             )

@@ -220,6 +220,8 @@ def _check_exact(scene: "Scene") -> None:
             if both := sorted(others & set(one.nodes.tolist())):
                 raise SceneError(f"{what}: node {both[0]} of body {one.a!r} is {rule}")
         own |= set(one.nodes.tolist())
+        if body.dilatation != "local":
+            raise SceneError(f"{what}: nodes of body {one.a!r} cannot be attached exactly, since its dilatation is a mean")
         if body.composition.first.stiffness_damping != scene.body(one.b).composition.first.stiffness_damping:
             raise SceneError(f"{what}: bodies {one.a!r} and {one.b!r} must have the same stiffness_damping")
 

@@ -53,7 +53,13 @@ def _body_parts(body: Body) -> dict[str, list]:
     return {
         "mesh": [body.mesh.vertices, body.mesh.tets],
         "regions": [body.mesh.regions, list(body.composition.materials)] if body.composition.has_regions else [],
-        "order, quadrature, law or collision": [body.order, body.quadrature_degree, laws, body.collision],
+        "order, quadrature, dilatation, law or collision": [
+            body.order,
+            body.quadrature_degree,
+            body.dilatation,
+            laws,
+            body.collision,
+        ],
         "start": [body.position, body.velocity],
         "constraints": [x for c in body.constraints for x in (c.nodes, c.axes, *_path_parts(c.path))],
         "loads": [

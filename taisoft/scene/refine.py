@@ -100,7 +100,7 @@ def _on_mesh(old: Body, mesh: TetMesh, order: int, parents: np.ndarray) -> Body:
     degree = old.quadrature_degree if order == old.order else None
     copies = mesh.n_tets // old.mesh.n_tets
     numbers = {name: np.repeat(values, copies) for name, values in old.composition.by_tet.items()}
-    new = Body(old.name, mesh, old.material, old.position, velocity, order, degree, old.collision, **numbers)
+    new = Body(old.name, mesh, old.material, old.position, velocity, order, degree, old.collision, old.dilatation, **numbers)
     for constraint in old.constraints:
         axes = "".join(axis for axis, held in zip("xyz", constraint.axes) if held)
         where = _chosen(old, constraint, parents)

@@ -163,6 +163,7 @@ class Scene(Guarded):
         young: float | np.ndarray | None = None,
         poisson: float | np.ndarray | None = None,
         density: float | np.ndarray | None = None,
+        dilatation: str = "local",
     ) -> Body:
         """Add a body and return it.
 
@@ -172,13 +173,15 @@ class Scene(Guarded):
         and so on by default. position: (3,) [m], initial translation. velocity: (3,) for all nodes or (n,3) [m/s]. order: 1,
         linear tets, or 2, quadratic ones with nodes in the middle of every edge. quadrature_degree: None for the default; order
         2 has four points (2) or fourteen (4). collision: contact geometry, "proximity", also for "auto", or "distance_field".
+        dilatation: "local", or "mean", averaged over patches of a few linear tets, or each quadratic tet, so that a Poisson's
+        ratio near 0.5 does not lock them.
         Warns if tets of order 1 are far too stiff: at a Poisson's ratio above 0.49, or in a thin body with so few tets through
         its thickness that it bends at most half as far as it should. Raises SceneError.
         """
         self._check_open("add_body")
         name = self._free_name(name, "body")
         numbers = {"young": young, "poisson": poisson, "density": density}
-        body = Body(name, mesh, material, position, velocity, order, quadrature_degree, collision, **numbers)
+        body = Body(name, mesh, material, position, velocity, order, quadrature_degree, collision, dilatation, **numbers)
         list.append(self.bodies, body)
         body.warn_locking(stacklevel=2)
         body.warn_bending(stacklevel=2)

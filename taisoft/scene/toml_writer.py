@@ -127,7 +127,9 @@ def _body(body: Body, materials: dict[Material, str], stem: str, meshes: dict[st
     names = {body.mesh.region_names.get(key, str(key)): materials[one] for key, one in composition.materials.items()}
     table = {"materials": names} if composition.has_regions else {"material": materials[composition.first]}
     table |= {"mesh": {"file": name} if name else body.mesh.recipe} | composition.by_tet
-    table |= {key: getattr(body, key) for key in ("position", "velocity", "order", "quadrature_degree", "collision")}
+    table |= {
+        key: getattr(body, key) for key in ("position", "velocity", "order", "quadrature_degree", "collision", "dilatation")
+    }
     table |= {key: [] for key in ("fix", "move", "traction", "force", "pressure", "cavity")}
     for c in body.constraints:
         entry = {"nodes": _ids(c.nodes, body.n_nodes), "axes": "".join(np.array(list("xyz"))[c.axes])}

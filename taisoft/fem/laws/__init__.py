@@ -6,6 +6,10 @@ which it softens, 0 for none), POINT_SECONDS (approximate time of a quadrature p
 same differential along e_k (x) g_a, times g_b, for assembly) and `hessian_eigen(s, p)`. Tests over the registry check them
 against each other by finite differences.
 
+For mean dilatation a law is psi(F; mu, lambda) = psi(F; mu, 0) + lambda/2 theta(F)^2, with the lane functions `dilatation`,
+theta, and `dilatation_gradient`. p then has a fifth entry, a pressure q [Pa], for which `pk1`, `prepare`, `dpk1`, `block` and
+`hessian_eigen` are those of psi(F; p) + q theta(F).
+
 `hessian_eigen` splits the second derivative in the frame of F's signed SVD: with F = U diag(s) V^T and dF = U X V^T it is a 3x3
 block over X's diagonal (nine entries) and, for each pair (0,1), (0,2), (1,2), a symmetric and an antisymmetric mode of
 (X_ij, X_ji) with one eigenvalue each [Pa]; it returns these three. The positive semi-definite part is exact: the eigenvalues of

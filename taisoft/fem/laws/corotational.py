@@ -88,6 +88,27 @@ def rotation(F):
     return R
 
 
+@arithmetic
+def _trace_stress(t, p):
+    """lambda t [Pa], t = tr(R^T F) - 3. p[4]: see `laws`."""
+    s = p[1] * t
+    return s if ti.static(len(p) == 4) else s + p[4]
+
+
+@ti.func
+def dilatation(F):
+    """tr(R^T F) - 3."""
+    R = rotation(F)
+    D = [F[k] - R[k] for k in ti.static(range(9))]
+    return ddot(R, D)
+
+
+@ti.func
+def dilatation_gradient(F):
+    """Derivative of `dilatation` by F."""
+    return rotation(F)
+
+
 @ti.func
 def psi(F, p):
     """Energy density [Pa], 0 at rest."""
@@ -102,7 +123,7 @@ def pk1(F, p):
     """First Piola-Kirchhoff stress 2 mu (F - R) + lambda (tr(R^T F) - 3) R [Pa]; any F is valid."""
     R = rotation(F)
     D = [F[k] - R[k] for k in ti.static(range(9))]
-    t = p[1] * ddot(R, D)
+    t = _trace_stress(ddot(R, D), p)
     return [2.0 * p[0] * D[k] + t * R[k] for k in ti.static(range(9))]
 
 
@@ -118,7 +139,7 @@ def prepare(F, p):
     tiny = 1e-12 * abs(t * t * t) + 1e-30
     inverse = 1.0 / ti.select(abs(det) > tiny, det, tiny)
     C = cofactor(K)
-    return R + [inverse * C[k] for k in ti.static(range(9))] + [p[0], p[1], p[1] * (t - 3.0) - 2.0 * p[0]]
+    return R + [inverse * C[k] for k in ti.static(range(9))] + [p[0], p[1], _trace_stress(t - 3.0, p) - 2.0 * p[0]]
 
 
 @arithmetic
@@ -164,7 +185,7 @@ def hessian_eigen(s, p):
     """Second derivatives in the SVD frame [Pa], over the stretches s: see `laws`."""
     A = [(2.0 * p[0] if ti.static(i == j) else 0.0) + p[1] + 0.0 * s[0] for i in ti.static(range(3)) for j in ti.static(range(3))]
     symmetric = [2.0 * p[0] + 0.0 * s[0], 2.0 * p[0] + 0.0 * s[0], 2.0 * p[0] + 0.0 * s[0]]
-    factor = 2.0 * p[1] * (s[0] + s[1] + s[2] - 3.0) - 4.0 * p[0]
+    factor = 2.0 * _trace_stress(s[0] + s[1] + s[2] - 3.0, p) - 4.0 * p[0]
     pair = [s[0] + s[1], s[0] + s[2], s[1] + s[2]]
     floor = 1e-12 * (s[0] + 1e-18)
     antisymmetric = [2.0 * p[0] + factor / ti.max(pair[k], floor) for k in ti.static(range(3))]

@@ -30,9 +30,29 @@ def _green_strain(F):
 
 
 @arithmetic
+def _trace_stress(t, p):
+    """lambda t [Pa], t = tr(E). p[4]: see `laws`."""
+    s = p[1] * t
+    return s if ti.static(len(p) == 4) else s + p[4]
+
+
+@arithmetic
+def dilatation(F):
+    """tr(E)."""
+    E = _green_strain(F)
+    return E[0] + E[4] + E[8]
+
+
+@arithmetic
+def dilatation_gradient(F):
+    """Derivative of `dilatation` by F."""
+    return F
+
+
+@arithmetic
 def _second_pk(E, p):
     """S = 2 mu E + lambda tr(E) I [Pa]."""
-    t = p[1] * (E[0] + E[4] + E[8])
+    t = _trace_stress(E[0] + E[4] + E[8], p)
     return add_to_diagonal([2.0 * p[0] * E[k] for k in ti.static(range(9))], t)
 
 
@@ -49,7 +69,7 @@ def pk1(F, p):
     """First Piola-Kirchhoff stress [Pa]; any F is valid. Evaluated as mu F C + (lambda/2 (tr C - 3) - mu) F, C = F^T F."""
     C = matmul_tn(F, F)
     FC = matmul(F, C)
-    t = 0.5 * p[1] * (C[0] + C[4] + C[8] - 3.0) - p[0]
+    t = _trace_stress(0.5 * (C[0] + C[4] + C[8] - 3.0), p) - p[0]
     return [p[0] * FC[k] + t * F[k] for k in ti.static(range(9))]
 
 
@@ -83,7 +103,7 @@ def block(F, S, ga, gb):
 @arithmetic
 def hessian_eigen(s, p):
     """Second derivatives in the SVD frame [Pa], over the stretches s: see `laws`."""
-    h = 0.5 * p[1] * (s[0] * s[0] + s[1] * s[1] + s[2] * s[2] - 3.0)
+    h = _trace_stress(0.5 * (s[0] * s[0] + s[1] * s[1] + s[2] * s[2] - 3.0), p)
     A = [
         p[1] * s[i] * s[j] + ((p[0] * (3.0 * s[i] * s[i] - 1.0) + h) if ti.static(i == j) else 0.0)
         for i in ti.static(range(3))

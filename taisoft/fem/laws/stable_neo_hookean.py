@@ -25,6 +25,32 @@ def constants(mu: float, lam: float) -> tuple[float, float, float, float]:
 
 
 @arithmetic
+def _volume_change(H):
+    """J - 1 of F = I + H, without cancellation at small strains."""
+    G = cofactor(H)
+    return H[0] + H[4] + H[8] + (G[0] + G[4] + G[8]) + H[0] * G[0] + H[1] * G[1] + H[2] * G[2]
+
+
+@arithmetic
+def _volume_stress(J, p):
+    """Derivative by J of the terms in J [Pa]. p[4]: see `laws`."""
+    b = p[1] * (J - p[2])
+    return b if ti.static(len(p) == 4) else b + p[4]
+
+
+@arithmetic
+def dilatation(F):
+    """J - 1."""
+    return _volume_change([F[k] - (1.0 if ti.static(k % 4 == 0) else 0.0) for k in ti.static(range(9))])
+
+
+@arithmetic
+def dilatation_gradient(F):
+    """Derivative of `dilatation` by F."""
+    return cofactor(F)
+
+
+@arithmetic
 def psi(F, p):
     """Energy density [Pa], 0 at rest.
 
@@ -35,8 +61,7 @@ def psi(F, p):
     trace = H[0] + H[4] + H[8]
     norm2 = ddot(H, H)
     d = 2.0 * trace + norm2
-    G = cofactor(H)
-    e = trace + (G[0] + G[4] + G[8]) + H[0] * G[0] + H[1] * G[1] + H[2] * G[2]
+    e = _volume_change(H)
     z = 0.25 * d
     u = 1.0 + z  # log1p as a quotient that cancels the rounding of 1 + z
     log1p = ti.select(u == 1.0, z, ti.log(u) * z / ti.select(u == 1.0, 1.0 + 0.0 * u, u - 1.0))
@@ -49,7 +74,7 @@ def pk1(F, p):
     G = cofactor(F)
     J = dot(F, G)
     a = p[0] - p[0] / (ddot(F, F) + 1.0)
-    b = p[1] * (J - p[2])
+    b = _volume_stress(J, p)
     return [a * F[k] + b * G[k] for k in ti.static(range(9))]
 
 
@@ -59,7 +84,7 @@ def prepare(F, p):
     G = cofactor(F)
     J = dot(F, G)
     q = 1.0 / (ddot(F, F) + 1.0)
-    return G + [p[0] - p[0] * q, 2.0 * p[0] * q * q, p[1], p[1] * (J - p[2])]
+    return G + [p[0] - p[0] * q, 2.0 * p[0] * q * q, p[1], _volume_stress(J, p)]
 
 
 @arithmetic
@@ -100,7 +125,7 @@ def hessian_eigen(s, p):
     q = 1.0 / (Ic + 1.0)
     a, f = p[0] - p[0] * q, 2.0 * p[0] * q * q
     g = [s[1] * s[2], s[0] * s[2], s[0] * s[1]]
-    b = p[1] * (s[0] * g[0] - p[2])
+    b = _volume_stress(s[0] * g[0], p)
     A = [
         (a if ti.static(i == j) else b * s[(3 - i - j) % 3]) + f * s[i] * s[j] + p[1] * g[i] * g[j]
         for i in ti.static(range(3))

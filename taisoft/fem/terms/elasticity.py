@@ -28,6 +28,7 @@ from taisoft.fem.lanes import (
 )
 from taisoft.fem.laws import dpk1_projected, prepare_projected
 from taisoft.fem.math3 import determinant, matmul_nt, matmul_tn
+from taisoft.fem.mean_dilatation import find_dilatations, find_rates, find_serially, patch_energy, patch_values, stress_constants
 from taisoft.fem.node_graph import BLOCKS, EVERYTHING, block_of, count_of
 from taisoft.fem.state import FAILED, INVERTED_NOW, LOWEST_J
 
@@ -44,7 +45,7 @@ def element_force(m: ti.template(), g: ti.template(), damped: ti.template(), b):
     """
     X, N = position_differences(m, g, b), rest_gradients_of_F(m, b)
     M = rest_gradients(m, b, m.real)
-    p = law_constants(m, b, m.real)
+    p = stress_constants(m, g, b, m.real)
     S = zero_forces(m, g)
     lowest = broadcast(ti.cast(HUGE, m.real), m.lanes)
     if ti.static(damped):
@@ -57,7 +58,12 @@ def element_force(m: ti.template(), g: ti.template(), damped: ti.template(), b):
             D = dpk1_projected(K, dF)
             P = g.law.pk1(F, p)
             Q = [P[k] + c * D[k] for k in ti.static(range(9))]
-            add_forces(m, g, S, Q, M, q)
+            if ti.static(g.mean_dilatation):
+                G = g.law.dilatation_gradient(F)
+                r = c * patch_values(m, b, m.mean.rate, m.real)
+                add_forces(m, g, S, [Q[k] + r * G[k] for k in ti.static(range(9))], M, q)
+            else:
+                add_forces(m, g, S, Q, M, q)
             lowest = ti.min(lowest, determinant(F))
     else:
         for q in range(g.n_points):
@@ -100,6 +106,7 @@ def record_volumes(m: ti.template(), b, J):
 def sum_elements(m: ti.template(), subset: ti.template()):
     """Run `element_force` over all blocks of a subset and prepare other terms, as top-level loops of a kernel."""
     place_all(m)
+    find_dilatations(m)
     for n, g in ti.static(enumerate(m.groups)):
         ti.loop_config(serialize=m.serial)
         for j in range(count_of(subset, BLOCKS + n, g.first), count_of(subset, BLOCKS + n + 1, g.last)):
@@ -121,6 +128,9 @@ def prepare_terms(m: ti.template()):
 def sum_elements_with_damping(m: ti.template()):
     """As `sum_elements` over all blocks, with stiffness damping if it is on. scalars: LOWEST_J, INVERTED_NOW, FAILED."""
     place_all(m)
+    find_dilatations(m)
+    if ti.static(m.stiffness_damping):
+        find_rates(m, m.state.v)
     for g in ti.static(m.groups):
         ti.loop_config(serialize=m.serial)
         for b in range(g.first, g.last):
@@ -136,6 +146,7 @@ def sum_elements_serially(m: ti.template()):
     if ti.static(m.has_dependents):
         for k in range(m.dependents.n):
             place(m, k)
+    find_serially(m)
     for g in ti.static(m.groups):
         for b in range(g.first, g.last):
             J = element_force(m, g, m.stiffness_damping, b)
@@ -160,6 +171,8 @@ def element_energy(m: ti.template(), g: ti.template(), b):
     p = law_constants(m, b, ti.f64)
     V = volumes(m, b, ti.f64)
     energy = broadcast(ti.cast(0.0, ti.f64), m.lanes)
+    if ti.static(g.mean_dilatation):
+        energy += V * patch_energy(m, b)
     lowest = broadcast(ti.cast(HUGE, ti.f64), m.lanes)
     minor = broadcast(ti.cast(HUGE, ti.f64), m.lanes)
     for q in range(g.n_points):
@@ -184,20 +197,27 @@ def elastic_forces(m: ti.template()):
 @kernel
 def force_differential(m: ti.template(), dx: ti.template(), df: ti.template()):
     """Compute df = (df/dx)(x) dx, matrix-free: (n_nodes) 3-vectors, dx [m], df [N]."""
+    find_dilatations(m)
+    find_rates(m, dx)
     for g in ti.static(m.groups):
         ti.loop_config(serialize=m.serial)
         for b in range(g.first, g.last):
             X, N = position_differences(m, g, b), rest_gradients_of_F(m, b)
             dX = differences(m, g, dx, b, m.real)
             M = rest_gradients(m, b, m.real)
-            p = law_constants(m, b, m.real)
+            p = stress_constants(m, g, b, m.real)
             S = zero_forces(m, g)
             for q in range(g.n_points):
                 F = deformation_gradient(m, g, X, N, q)
                 dF = gradient_at(m, g, dX, M, q, m.real)
                 K = g.law.prepare(F, p)
                 dP = g.law.dpk1(F, K, dF)
-                add_forces(m, g, S, dP, M, q)
+                if ti.static(g.mean_dilatation):
+                    G = g.law.dilatation_gradient(F)
+                    r = patch_values(m, b, m.mean.rate, m.real)
+                    add_forces(m, g, S, [dP[k] + r * G[k] for k in ti.static(range(9))], M, q)
+                else:
+                    add_forces(m, g, S, dP, M, q)
             store_forces(m, g, b, S)
     ti.loop_config(serialize=m.serial)
     for i in range(m.n_nodes):
@@ -215,12 +235,13 @@ def gather_forces(m: ti.template(), f: ti.template()):
 @kernel
 def cauchy_stress(m: ti.template(), sigma: ti.types.ndarray()):
     """Compute the mean of sigma = P F^T / J over each deformed tet, (n_blocks * lanes, 9) [Pa]; not finite for flat tets."""
+    find_dilatations(m)
     for g in ti.static(m.groups):
         ti.loop_config(serialize=m.serial)
         for b in range(g.first, g.last):
             X = differences(m, g, m.state.x, b, ti.f64)
             M = rest_gradients(m, b, ti.f64)
-            p = law_constants(m, b, ti.f64)
+            p = stress_constants(m, g, b, ti.f64)
             volume_ratio = broadcast(ti.cast(0.0, ti.f64), m.lanes)  # deformed volume / rest volume: sum of w_q J_q
             for k in range(9):
                 for q in ti.static(range(m.lanes)):
