@@ -4,8 +4,9 @@ import warnings
 from typing import TYPE_CHECKING
 
 from taisoft.attributes import thawed
-from taisoft.errors import SimulationError
+from taisoft.errors import SceneError, SimulationError
 from taisoft.queries import body_index, check_rows, nodes_of
+from taisoft.scene.connections import check_exact
 from taisoft.scene.plan import CHANGEABLE, change_load, change_material, change_tension
 from taisoft.settings import FIXED, NAMES, check_dt
 
@@ -105,8 +106,9 @@ def set_material(self: "Simulator", body: str, region: int | str | None = None, 
     change_material(changed, numbers, self.plan.on, region)
     self._stable_dt = None
     try:
+        check_exact(self.scene)
         check_stability(self, self.dt)
-    except SimulationError:
+    except (SceneError, SimulationError):
         with thawed(changed):
             changed.composition, self._stable_dt = old, old_limit
         raise

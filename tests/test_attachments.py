@@ -14,6 +14,7 @@ from scenes import dynamics, set_state
 from scipy.spatial import cKDTree
 
 import taisoft as ts
+from taisoft.dynamics.schemes import EXPLICIT
 from taisoft.fem.dependents import dependent_table
 from taisoft.fem.node_graph import EVERYTHING
 from taisoft.fem.reference import lumped_masses, mass_matrix
@@ -22,7 +23,14 @@ from taisoft.scene.refine import refined, with_order
 
 LENGTH, SIDE = 0.6, 0.1
 RUBBER = ts.Material("stable_neo_hookean", young=1e5, poisson=0.3, density=1000.0)
-INTEGRATORS = {"implicit_euler": 0.01, "bdf2": 0.01, "implicit_midpoint": 0.01, "symplectic_euler": 3e-4, "velocity_verlet": 3e-4}
+INTEGRATORS = {
+    "implicit_euler": 0.01,
+    "bdf2": 0.01,
+    "implicit_midpoint": 0.01,
+    "linearly_implicit_euler": 0.01,
+    "symplectic_euler": 3e-4,
+    "velocity_verlet": 3e-4,
+}
 TIGHT = {"precision": "f64", "newton_tolerance": 1e-11}
 
 
@@ -50,7 +58,7 @@ def distance(scene: ts.Scene, x: np.ndarray, whole: ts.Scene, y: np.ndarray) -> 
 
 
 def run(scene: ts.Scene, integrator: str, seconds: float, **settings) -> tuple[np.ndarray, "ts.RunReport"]:
-    implicit = integrator in ("implicit_euler", "bdf2", "implicit_midpoint")
+    implicit = integrator not in EXPLICIT
     given = (TIGHT if implicit else {"precision": "f64"}) | settings
     with ts.Simulator(scene.snapshot(), dt=INTEGRATORS[integrator], integrator=integrator, **given) as sim:
         report = sim.run(seconds=seconds)
@@ -143,7 +151,7 @@ def unlike(order_a: int, order_b: int, gravity=(0.0, 0.0, 0.0), **numbers) -> ts
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 def test_momentum_is_kept(orders, integrator):
     scene = unlike(*orders)
-    implicit = integrator in ("implicit_euler", "bdf2", "implicit_midpoint")
+    implicit = integrator not in EXPLICIT
     consistent = implicit and 2 in orders  # masses of linear tets are lumped
 
     def momenta(sim) -> tuple[np.ndarray, np.ndarray]:
@@ -191,7 +199,9 @@ def standing(cut: bool) -> ts.Scene:
 
 
 @pytest.mark.filterwarnings("ignore:body")
-@pytest.mark.parametrize("integrator", ["bdf2", "implicit_euler", "symplectic_euler", "velocity_verlet"])
+@pytest.mark.parametrize(
+    "integrator", ["bdf2", "implicit_euler", "linearly_implicit_euler", "symplectic_euler", "velocity_verlet"]
+)
 def test_contact_of_parts_equals_the_whole(integrator):
     whole, cut = standing(False), standing(True)
     y, _ = run(whole, integrator, 0.12)
@@ -219,6 +229,86 @@ def test_attached_nodes_touch_others(integrator):
             weight = 9.81 * (block.mass + skid.mass)
             assert sim.contact_force("ground")[1] == pytest.approx(-weight, rel=0.2)
         assert (sim.positions("skid")[:, 1] > -0.001).all()
+
+
+@pytest.mark.parametrize("integrator", ["bdf2", "symplectic_euler"])
+@pytest.mark.parametrize("cells", [2, 3])
+def test_two_parts_meet_on_a_third(integrator, cells):
+    """Contacts of nodes that depend on the same ones are left out."""
+    x = []
+    for touches in (True, False):
+        scene, size = ts.Scene(), (0.1, 0.1, 0.1)
+        scene.contact_forces = touches
+        scene.add_body(ts.box_mesh((2, 2, 2), size), RUBBER, name="corner")
+        for name, axis in (("right", 0), ("top", 1)):
+            place = np.eye(3)[axis] * 0.1
+            scene.add_body(ts.box_mesh((cells,) * 3, size), RUBBER, name=name, position=place)
+            scene.attach(name, lambda X, axis=axis: X[:, axis] < -0.0499, "corner")
+        with ts.Simulator(scene, dt=0.005 if integrator == "bdf2" else 2e-4, integrator=integrator, precision="f64") as sim:
+            report = sim.run(seconds=0.1)
+            assert report.status == "ok"
+            x.append(sim.positions())
+    assert np.abs(x[0] - x[1]).max() < 1e-8
+
+
+@pytest.mark.filterwarnings("ignore:body")
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_reactions_are_those_of_the_whole(integrator):
+    settings = TIGHT if integrator not in EXPLICIT else {"precision": "f64"}
+    totals = []
+    for parts in (1, 2):
+        with ts.Simulator(bar(parts), dt=INTEGRATORS[integrator], integrator=integrator, **settings) as sim:
+            sim.run(seconds=0.05)
+            totals.append(sim.reactions().sum(axis=0))
+    assert totals[1] == pytest.approx(totals[0], abs=1e-5 * np.abs(totals[0]).max())
+    found = ts.solve_static(bar(2), tolerance=1e-9)
+    weight = 9.81 * sum(body.mass for body in bar(2).bodies)
+    assert sum(found.reactions(name) for name in ("part0", "part1")).sum(axis=0)[1] == pytest.approx(weight, rel=1e-6)
+
+
+@pytest.mark.filterwarnings("ignore:body")
+def test_an_attached_node_can_be_dragged():
+    moved = []
+    for parts in (1, 2):
+        with ts.Simulator(
+            bar(parts, gravity=(0, 0, 0)), dt=0.01, integrator="implicit_euler", draggable=True, precision="f64"
+        ) as sim:
+            body = sim.scene.bodies[-1]
+            node = int(np.argmin(np.linalg.norm(body.rest_positions - (0.3, 0.05, 0.05), axis=1)))
+            sim.drag(body.name, [node], [1.0], (0.3, 0.3, 0.05), 100.0)
+            sim.run(seconds=0.1)
+            moved.append(sim.positions(body.name)[node])
+    assert moved[0][1] > 0.06 and moved[1] == pytest.approx(moved[0], abs=1e-3)
+
+
+@pytest.mark.filterwarnings("ignore:body")
+def test_a_cavity_of_given_volume_with_attached_nodes():
+    scene = ts.Scene(gravity=(0.0, 0.0, 0.0))
+    box = ts.box_mesh((5, 5, 5), (0.1, 0.1, 0.1))
+    solid = (np.abs(box.vertices[box.tets].mean(axis=1)) > 0.03).any(axis=1)
+    used, tets = np.unique(box.tets[solid], return_inverse=True)
+    shell = scene.add_body(ts.TetMesh(box.vertices[used], tets.reshape(-1, 4)), RUBBER, name="shell")
+    scene.add_body(ts.box_mesh((3, 2, 3), (0.1, 0.08, 0.1)), RUBBER, name="base", position=(0.0, -0.04, 0.0))
+    scene.attach("shell", lambda X: X[:, 1] < -0.029, "base")
+    scene.body("base").fix(lambda X: X[:, 1] < -0.039)
+    inner = lambda c: (np.abs(c) < 0.0301).all(axis=1)  # noqa: E731
+    volume = 1.1 * shell.enclosed_volume(inner)
+    shell.add_cavity(inner, volume=volume, name="air")
+    with ts.Simulator(scene, dt=0.02, integrator="implicit_euler", precision="f64") as sim:
+        reports = [sim.step() for _ in range(5)]
+        assert all(report.converged and report.newton_iterations < 9 for report in reports)
+        assert sim.cavity_volume("air") == pytest.approx(volume, rel=1e-6)
+
+
+@pytest.mark.filterwarnings("ignore:body")
+def test_refined_where_nodes_lie_outside():
+    scene = ts.Scene()
+    for k, name in enumerate(("left", "right")):
+        scene.add_body(ts.box_mesh((2, 2, 2), (0.1, 0.1, 0.1)), RUBBER, name=name, position=(0.1035 * k, 0.0, 0.0))
+    scene.attach("right", lambda X: X[:, 0] < -0.0499, "left")
+    finer = refined(scene)
+    finer.check()
+    assert len(finer.attachments[0].nodes) == 25
 
 
 def test_attached_bodies_do_not_collide():
@@ -278,7 +368,7 @@ def test_refusals():
 
     refused("'ground' is an obstacle: fix the nodes by body.fix instead", lambda s: s.attach("part0", [0], "ground"))
     refused("damping is that of springs: give a stiffness, too", lambda s: s.attach("part0", [35], "part1", damping=1.0))
-    refused("a body cannot be attached to itself", lambda s: s.attach("part0", [0], "part0"))
+    refused("body 'part0' cannot be attached to itself", lambda s: s.attach("part0", [0], "part0"))
     refused("no body or obstacle is called 'part3'", lambda s: s.attach("part0", [0], "part3"))
     refused(
         "node 0 of body 'part0' lies outside of body 'part1', by .* times the height", lambda s: s.attach("part0", [0], "part1")

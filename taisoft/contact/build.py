@@ -23,6 +23,7 @@ from taisoft.contact.prox import dvec, prox, tangent
 from taisoft.scene.scene import Scene
 
 NEGLIGIBLE = 1e-12  # a node with a smaller weight is left out of the contact
+VANISHING = 1e-9  # a contact with smaller weights alone is rounding: its sides move as one
 # Of the contact offset: in an implicit step a smaller gap opens to it at once, before surfaces that turn can cross. In the far
 # shorter explicit steps that would be a hop.
 LEAST_GAP = 0.1
@@ -195,6 +196,40 @@ def relative_velocity(p: ti.template(), m: ti.template(), c, dt):
 
 
 @kernel
+def drop_vanishing(
+    p: ti.template(), m: ti.template(), s: ti.template(), found: ti.template(), kept: ti.template(), n: ti.i32
+) -> ti.i32:
+    """Leave out of kept[:n] the contacts whose weights cancel, since both sides depend on the same nodes.
+
+    Returns the number of contacts left.
+    """
+    left = 0
+    ti.loop_config(serialize=True)
+    for _ in range(1):
+        for c in range(n):
+            row = kept[c]
+            k = _add_sides(p, m, s, 0, found, row)
+            largest = ti.cast(0.0, ti.f64)
+            for j in range(k):
+                largest = ti.max(largest, ti.abs(p.weight[0, j]))
+            if k == 0 or largest > VANISHING:
+                kept[left] = row
+                left += 1
+    return left
+
+
+@ti.func
+def _add_sides(p: ti.template(), m: ti.template(), s: ti.template(), c, found: ti.template(), row):
+    """Add the nodes of both sides of a detected contact to contact c; return their number."""
+    k = 0
+    for j in ti.static(range(3)):
+        k = _add_vertex(p, m, s, c, k, found.nodes_a[row][j], found.weights_a[row][j], 1.0)
+    for j in ti.static(range(3)):
+        k = _add_vertex(p, m, s, c, k, found.nodes_b[row][j], found.weights_b[row][j], -1.0)
+    return k
+
+
+@kernel
 def fill(
     p: ti.template(),
     m: ti.template(),
@@ -221,12 +256,7 @@ def fill(
         p.body[c], p.feature[c] = found.body[row], found.feature[row]
         p.friction[c], p.restitution[c] = _pair_coefficients(q, p.body[c][0], p.body[c][1])
         p.obstacle_displacement[c] = dvec(0.0)
-        k = 0
-        for j in ti.static(range(3)):
-            k = _add_vertex(p, m, s, c, k, found.nodes_a[row][j], found.weights_a[row][j], 1.0)
-        for j in ti.static(range(3)):
-            k = _add_vertex(p, m, s, c, k, found.nodes_b[row][j], found.weights_b[row][j], -1.0)
-        p.arity[c] = k
+        p.arity[c] = _add_sides(p, m, s, c, found, row)
         if ti.static(o.any):
             if found.nodes_b[row][0] < 0:
                 p.obstacle_displacement[c] = obstacle_displacement_at(o, p.body[c][1], point - 0.5 * gap * normal)

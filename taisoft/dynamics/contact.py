@@ -11,6 +11,7 @@ from taisoft.collision.detector import Detection
 from taisoft.contact.build import (
     SELF_CONTACT,
     build_pair_numbers,
+    drop_vanishing,
     fill,
     has_impact,
     keep_impulses,
@@ -201,6 +202,8 @@ class ContactStep:
         if n > self.problem.capacity:
             self._allocate(2 * n)
         p = self.problem
+        if m.has_dependents and n:
+            n = drop_vanishing(p, m, d.surface, d.buffer.data, d.kept, n)
         keep_impulses(p)
         warm = dt / self._last_time if self._last_time > 0.0 else 0.0
         fill(p, m, d.surface, d.shapes, self.numbers, d.buffer.data, d.kept, n, dt, warm)

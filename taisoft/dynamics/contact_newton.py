@@ -18,6 +18,7 @@ from taisoft.dynamics.newton import DECREASE, ELIMINATION_RATIO, Newton, choose_
 from taisoft.dynamics.results import StageResult, relative
 from taisoft.dynamics.stage import AGAIN
 from taisoft.dynamics.stage_system import Stage, StageSystem
+from taisoft.fem.dependents import place_dependents
 
 SOLVES, FORCING = 60, 0.3  # maximum linear solves of a frictional problem, and their tolerance
 LATER_FORCING = 0.01  # minimum tolerance of those after the first, which no longer change rigid motion
@@ -220,6 +221,8 @@ def solve_linearised(system: StageSystem, stage: Stage) -> StageResult:
             break
         r, scale = system.end_linearised(accept=False)
         system.form_matrix(projected=True)
+    if system.model.has_dependents:  # linearised steps move only the nodes that they depend on
+        place_dependents(system.model)
     at_floor = found.r <= system.rounding.stage_floor(stage.c, stage.beta)
     return StageResult(
         found.solves, linear, relative(found.r, scale), found.converged, at_floor, found.multipliers, system.contact_residual

@@ -139,6 +139,9 @@ class ContactPaths:
         can_move = np.zeros(len(d.scene.colliders), dtype=bool)
         for body in range(len(simulation.scene.bodies)):
             can_move[body] = free[simulation.layout.nodes(body)].any()
+        for together in self._attached:  # a body all of whose nodes depend on others moves with them
+            inert = [k for k in together if not can_move[k] and not simulation.scene.bodies[k].constraints]
+            can_move[inert] = can_move[together].any()
         part, n_rounds = can_move.astype(np.float64), 0
         while len((found := d.passages(TO_STATE))[0]):
             colliders, n_rounds = d.colliders_of(found[0]), n_rounds + 1
@@ -151,7 +154,8 @@ class ContactPaths:
             part = np.where(shortened < 1.0, part * shortened if n_rounds < MAX_SHORTENINGS else 0.0, part)
             part[part < LEAST] = 0.0
             for together in self._attached:
-                part[together] = part[together].min()
+                moving = together[can_move[together]]
+                part[moving] = part[moving].min(initial=1.0)
             self._move_in_part(part, *path)
         self._names.update(d.scene.colliders[k].name for k in np.flatnonzero(can_move & (part < 1.0)))
         listed = ", ".join(f"'{name}'" for name in sorted(self._names))

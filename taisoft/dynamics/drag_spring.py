@@ -58,10 +58,13 @@ class DragSpring:
         target = checks.array(target, f"body '{own.name}': the target of a pull", ((3,),))
         stiffness = checks.number(stiffness, "the stiffness of a pull", above=0.0, unit="N/m")
         nodes, weights = nodes + layout.node_start[body], weights / weights.sum()
-        masses = self._simulation.model.mass.to_numpy().astype(np.float64)
+        masses, dependents = self._simulation.model.mass.to_numpy().astype(np.float64), self._simulation.dependents
+        if dependents is not None:
+            every = np.bincount(nodes, weights, dependents.n_nodes) @ dependents.matrix
+            nodes, weights = np.flatnonzero(every), every[every != 0.0]
         mass = 1.0 / float((weights**2 / masses[nodes]).sum())
         area = (mass * float(own.mesh.volumes.sum()) / own.mass) ** (2 / 3)
-        max_force = min(STRAIN * float(np.min(own.young)) * area, HEAVY * EARTH * float(masses[layout.nodes(body)].sum()))
+        max_force = min(STRAIN * float(np.min(own.young)) * area, HEAVY * EARTH * own.mass)
         self.release()  # removes the force from the previous nodes
         self.drag = Drag(own.name, nodes, weights, target, stiffness, mass, max_force, target, np.zeros(3))
         self.drag.point = weights @ self._simulation.state()[0][nodes]

@@ -104,12 +104,12 @@ class Dynamics:
             # the time of a whole batch even if n is smaller: the spring's stiffness, which depends on it, must not change
             spring.apply(held * self.dt)
             self.stepper.loads_changed()
-        if self.model.has_dependents:
-            self._velocities_before = self.state.state()[1].astype(np.float64), self.state.time
+        before = (self.state.state()[1].astype(np.float64), self.state.time) if self.model.has_dependents else None
         try:
             result = self.stepper.advance(n, self.dt)
         except SimulationError as error:
             raise self._failure(error) from None
+        self._velocities_before = before
         self.state.step_count = start + result.steps
         base, count = self._time_base
         self.state.time = base + (self.state.step_count - count) * self.dt
@@ -209,9 +209,9 @@ class Dynamics:
         return moving or dragged or driven or not all(self.state.dirichlet.released())
 
     def mean_acceleration(self, nodes: np.ndarray) -> np.ndarray:
-        """Return the mean acceleration (k,3) [m/s^2] of nodes (k,) in the last step or batch; 0 before the first one.
+        """Return the mean acceleration (k,3) [m/s^2] of nodes (k,) in the last step or batch; 0 before the first one here.
 
-        Kept only in scenes with exact attachments.
+        Kept only in scenes with exact attachments, and not in checkpoints.
         """
         if self._velocities_before is None:
             return np.zeros((len(nodes), 3))
@@ -282,6 +282,7 @@ class Dynamics:
         """Restore a `snapshot` of the same scene with the same numbers."""
         self.dt, self._time_base = check_dt(kept["dt"]), (float(kept["time_base"]), int(kept["count_base"]))
         self.state.restore(kept["simulation"])
+        self._velocities_before = None
         self.stepper.restore(kept["stepper"])
 
     def continue_from(self, other: "Dynamics") -> None:

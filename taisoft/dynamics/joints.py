@@ -1,7 +1,8 @@
 """Forces of connections: of springs, tendons and attachments by springs from their elements, of exact attachments from balance.
 
 Body b acts on an exactly attached node of body a with m (a - g) - f, where m is the node's own lumped mass, a its acceleration,
-the mean over the last step or batch of explicit steps, g gravity, and f the force of its own tets and loads at the end.
+the mean over the last step or batch of explicit steps, g gravity, and f the force of its own tets and loads at the end, without
+damping. Contacts and springs at the node act on body b at once, and are not part of it.
 """
 
 from typing import TYPE_CHECKING

@@ -222,6 +222,9 @@ def form_residual(
                 r, inertia, f, external = residual_parts(m, s, i, beta)
             if ti.static(k.any):
                 r -= ti.cast(impulse_on_node(k, i), m.real)
+            if ti.static(m.has_dependents):  # whose forces act on other nodes
+                if m.dependents.number[i] >= 0:
+                    r = zero
             s.residual[i] = r
             s.pcg.rhs[i] = -free * r
             sums += squares(r, inertia, f, external, free)

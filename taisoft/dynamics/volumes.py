@@ -113,6 +113,8 @@ class Volumes:
         rows = np.zeros((len(self._forms), m.n_nodes, 3))
         for row, form, gradient in zip(rows, self._forms, self._gradients):
             row[form.nodes] = beta * gradient
+        if self._simulation.dependents is not None:
+            rows = np.stack([self._simulation.dependents.matrix.T @ row for row in rows])
         return (rows * m.free.to_numpy()).reshape(len(rows), -1)
 
     def direction(self, system: "StageSystem", tolerance: float) -> pcg.LinearResult:

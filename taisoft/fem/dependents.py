@@ -15,6 +15,7 @@ import scipy.sparse as sp
 import taichi as ti
 
 from taisoft.backend.arrays import Count, FieldArena, download
+from taisoft.backend.runtime import kernel
 from taisoft.errors import SceneError
 from taisoft.scene.connections import locate_nodes
 from taisoft.scene.scene import Scene
@@ -175,6 +176,12 @@ def place_all(m: ti.template()):
             place(m, k)
 
 
+@kernel
+def place_dependents(m: ti.template()):
+    """Set x and v of the dependent nodes."""
+    place_all(m)
+
+
 @ti.func
 def force_with_dependents(m: ti.template(), term: ti.template(), i):
     """Force of a term on node i, and on the nodes that depend on it [N]."""
@@ -214,11 +221,9 @@ def _padded(table: DependentTable, dependent: np.ndarray, nodes: np.ndarray, wid
     """Independent nodes and weights (k, width) of nodes (k,), padded with weights of 0."""
     own, weights = np.repeat(nodes[:, None], width, axis=1), np.zeros((len(nodes), width))
     weights[:, 0] = 1.0
-    for k in np.flatnonzero(dependent[nodes]):
-        row = int(np.searchsorted(table.node, nodes[k]))
-        entries = slice(table.start[row], table.start[row + 1])
-        count = entries.stop - entries.start
-        own[k, :count], weights[k] = table.master[entries], 0.0
-        own[k, count:] = table.master[entries.start]
-        weights[k, :count] = table.weight[entries]
+    at = np.flatnonzero(dependent[nodes])
+    row = np.searchsorted(table.node, nodes[at])
+    entry = np.minimum(table.start[row][:, None] + np.arange(width), table.start[row + 1][:, None] - 1)
+    used = np.arange(width) < np.diff(table.start)[row][:, None]
+    own[at], weights[at] = table.master[entry], np.where(used, table.weight[entry], 0.0)
     return own, weights

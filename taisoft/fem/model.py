@@ -272,7 +272,7 @@ def model_graph(model: Model) -> tuple[NodeGraph, np.ndarray, np.ndarray | None]
         entries.append((base * lanes + (lane % lanes)[:, None]).reshape(-1))
     ends, entries, factors, others = np.concatenate(ends), np.concatenate(entries), None, []
     if model.dependents is not None:
-        others.append(np.unique(np.sort(ends, axis=1), axis=0))
+        others.append(ends)
         ends, rows, factors = expanded_pairs(table_of(model.dependents, model.n_nodes), ends)
         entries = entries[rows]
     patches = np.zeros((0, 2), dtype=np.int64)

@@ -97,6 +97,7 @@ class Attachment:
     stiffness: float | None  #: [N/m] of each node's spring; None: it moves with body b exactly
     damping: float = 0.0  #: [N s/m] of each node
     where: Callable | None = None  #: as in `Constraint`
+    reach: float = MAX_OUTSIDE  #: heights of a tet by which the nodes may lie outside body b
 
     def __post_init__(self):
         checks.store(self, nodes=self.nodes)
@@ -205,11 +206,11 @@ def check_connections(scene: "Scene") -> None:
             raise SceneError(f"{what}: {one.a!r} is no longer the body whose nodes are attached")
         elif isinstance(found[1], Body):
             locate_nodes(scene, one)
-    _check_exact(scene)
+    check_exact(scene)
 
 
-def _check_exact(scene: "Scene") -> None:
-    """Raise SceneError if an exactly attached node is constrained or attached twice, or bodies differ in stiffness damping."""
+def check_exact(scene: "Scene") -> None:
+    """Raise SceneError if an exactly attached node is constrained or attached twice, or bodies differ in damping."""
     taken: dict[str, set[int]] = {}
     for one in scene.attachments:
         if one.stiffness is not None:
@@ -222,8 +223,9 @@ def _check_exact(scene: "Scene") -> None:
         own |= set(one.nodes.tolist())
         if body.dilatation != "local":
             raise SceneError(f"{what}: nodes of body {one.a!r} cannot be attached exactly, since its dilatation is a mean")
-        if body.composition.first.stiffness_damping != scene.body(one.b).composition.first.stiffness_damping:
-            raise SceneError(f"{what}: bodies {one.a!r} and {one.b!r} must have the same stiffness_damping")
+        for damping in ("mass_damping", "stiffness_damping"):  # a force on one body's node acts on the other's
+            if len({getattr(scene.body(name).composition.first, damping) for name in one.owners}) > 1:
+                raise SceneError(f"{what}: bodies {one.a!r} and {one.b!r} must have the same {damping}")
 
 
 def attached_pairs(scene: "Scene") -> np.ndarray:
@@ -253,7 +255,11 @@ def locate_nodes(scene: "Scene", attachment: Attachment) -> tuple[np.ndarray, np
     a, b = scene.body(attachment.a), scene.body(attachment.b)
     points = a.rest_positions[attachment.nodes] + (a.position - b.position)
     nodes, weights, outside = locate(b, points)
-    _check_outside(outside, lambda k: f"attachment {attachment.name!r}: node {attachment.nodes[k]} of body {a.name!r}", b)
+
+    def label(k: int) -> str:
+        return f"attachment {attachment.name!r}: node {attachment.nodes[k]} of body {a.name!r}"
+
+    _check_outside(outside, label, b, attachment.reach)
     return nodes, weights
 
 
@@ -264,12 +270,12 @@ def coincide(scene: "Scene", p: Point, q: Point) -> bool:
     return bool(np.abs(start_of(scene, p) - start_of(scene, q)).max() <= SAME * size)
 
 
-def _check_outside(outside: np.ndarray, label: Callable[[int], str], body: Body) -> None:
+def _check_outside(outside: np.ndarray, label: Callable[[int], str], body: Body, reach: float = MAX_OUTSIDE) -> None:
     k = int(np.argmax(outside))
-    if outside[k] > MAX_OUTSIDE:
+    if outside[k] > reach:
         raise SceneError(
             f"{label(k)} lies outside of body {body.name!r}, by {outside[k]:.2g} times the height of the nearest "
-            f"tet: at most {MAX_OUTSIDE:g} is allowed"
+            f"tet: at most {reach:g} is allowed"
         )
 
 

@@ -30,7 +30,7 @@ PARTS = 8  # of a tet; `make_nodes` lists the parts of each tet in sequence
 
 def refined(scene: Scene) -> Scene:
     """Return the scene with every tet split into eight. Raises SceneError if a constraint or load cannot be transferred."""
-    return _with_bodies(scene, [_refined(body) for body in scene.bodies])
+    return _with_bodies(scene, [_refined(body) for body in scene.bodies], finer=2.0)
 
 
 def with_order(scene: Scene, order: int) -> Scene:
@@ -42,8 +42,9 @@ def with_order(scene: Scene, order: int) -> Scene:
     return _with_bodies(scene, made)
 
 
-def _with_bodies(scene: Scene, made: list[tuple[Body, np.ndarray]]) -> Scene:
-    """Return the scene with other bodies. made: each with the two old nodes that each of its nodes bisects."""
+def _with_bodies(scene: Scene, made: list[tuple[Body, np.ndarray]], finer: float = 1.0) -> Scene:
+    """Return the scene with other bodies. made: each with the two old nodes that each of its nodes bisects; finer: old over new
+    heights of tets."""
     copied, by_name = scene.snapshot(), {body.name: (body, parents) for body, parents in made}
     with thawed(copied):
         copied.bodies = [body for body, _ in made]
@@ -51,9 +52,11 @@ def _with_bodies(scene: Scene, made: list[tuple[Body, np.ndarray]]) -> Scene:
     for one in scene.attachments:
         new, parents = by_name[one.a]
         where = _chosen(scene.body(one.a), one, parents)
-        share = len(one.nodes) / len(checks.selection(where, new.rest_positions, f"attachment {one.name!r}", "node"))
+        nodes = checks.selection(where, new.rest_positions, f"attachment {one.name!r}", "node")
+        share = len(one.nodes) / len(nodes)
         stiffness = None if one.stiffness is None else share * one.stiffness
-        copied.attach(one.a, where, one.b, stiffness, share * one.damping, one.name)
+        changed = {"stiffness": stiffness, "damping": share * one.damping, "reach": finer * one.reach}
+        list.append(copied.attachments, replace(one, nodes=nodes, **changed))
     return copied
 
 
