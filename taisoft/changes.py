@@ -69,7 +69,7 @@ def reset(self: "Simulator") -> None:
 def set_state(self: "Simulator", positions=None, velocities=None, body: str | None = None) -> None:
     """Set positions [m] and velocities [m/s], (n_nodes, 3) each. Velocities on constrained axes become 0.
 
-    Copies arrays; compiles nothing.
+    Nodes that are attached exactly follow the other body's. Copies arrays; compiles nothing.
     """
     dynamics, rows = self._open(), nodes_of(self, body)
     for name, value in (("positions", positions), ("velocities", velocities)):

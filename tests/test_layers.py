@@ -34,7 +34,7 @@ ORDER = (
         "fem.mean_dilatation",
     ),
     ("fem.terms",),
-    ("fem.model",),
+    ("fem.model", "fem.pattern"),
     ("fem.measure", "stability"),
     ("linear",),
     ("collision", "contact"),

@@ -19,8 +19,9 @@ from taisoft.dynamics.contact_terms import impulse_on_node
 from taisoft.dynamics.impact import impact_residual
 from taisoft.fem.dependents import force_with_dependents
 from taisoft.fem.lanes import mass_times
-from taisoft.fem.model import Model, patch_nodes
+from taisoft.fem.model import Model
 from taisoft.fem.node_graph import BLOCKS, EDGES, NODES, Subset, n_nodes_of, node_of
+from taisoft.fem.pattern import patch_nodes
 from taisoft.fem.state import END_SLOPE, N_NORMS, OTHER_SUM, START_SLOPE, SUM
 from taisoft.fem.terms import elasticity, rayleigh_damping
 from taisoft.linear.block_csr import BlockCsr, row_times

@@ -16,8 +16,9 @@ import taichi as ti
 from taisoft.backend.arrays import Count, FieldArena, download
 from taisoft.backend.runtime import kernel
 from taisoft.errors import SimulationError
-from taisoft.fem.model import MATRIX_BLOCKS, Model, model_graph
+from taisoft.fem.model import Model
 from taisoft.fem.node_graph import BLOCKS, EDGES, block_of, count_of, edge_of, n_nodes_of, node_of
+from taisoft.fem.pattern import MATRIX_BLOCKS, model_graph
 from taisoft.fem.springs import set_pair_entries
 from taisoft.fem.terms import rayleigh_damping
 from taisoft.linear.element_blocks import element_blocks, pair_terms

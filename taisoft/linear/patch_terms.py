@@ -23,7 +23,8 @@ from taisoft.fem.lanes import (
     zero_forces,
 )
 from taisoft.fem.mean_dilatation import find_dilatations
-from taisoft.fem.model import MATRIX_BLOCKS, Model, group_nodes, patch_nodes, patch_pairs
+from taisoft.fem.model import Model
+from taisoft.fem.pattern import MATRIX_BLOCKS, group_nodes, patch_nodes, patch_pairs
 
 
 @dataclass(frozen=True, eq=False)
