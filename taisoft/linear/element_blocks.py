@@ -20,8 +20,8 @@ from taisoft.fem.lanes import (
 )
 from taisoft.fem.laws import dpk1_projected, prepare_projected
 from taisoft.fem.mean_dilatation import stress_constants
-from taisoft.fem.pattern import MATRIX_BLOCKS
 from taisoft.fem.node_graph import PAIRS
+from taisoft.fem.pattern import MATRIX_BLOCKS
 from taisoft.fem.reference import Quadrature, shape_derivatives
 
 N_PAIRS = len(PAIRS[2])
