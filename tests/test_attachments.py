@@ -318,6 +318,8 @@ def test_attached_bodies_do_not_collide():
     with pytest.raises(ts.SceneError, match="overlap at the start"):
         ts.Simulator(scene, dt=0.01, integrator="bdf2")
     scene.attach("core", lambda X: X[:, 0] < 0.03, "block")
+    assert not scene.pushes(self_collision=False) and scene.pushes(self_collision=True)
+    scene.add_obstacle(ts.HalfSpace((0.0, -1.0, 0.0), (0.0, 1.0, 0.0)))
     with ts.Simulator(scene.snapshot(), dt=0.01, integrator="bdf2", precision="f64") as sim:
         report = sim.run(seconds=0.1)
         assert report.status == "ok" and len(sim.contacts().gap) == 0 and not sim.intersecting_triangles()

@@ -19,6 +19,7 @@ from taisoft.fem.dependents import build_dependents, dependent_table
 from taisoft.fem.laws import LAWS
 from taisoft.fem.loads import SceneLoads
 from taisoft.fem.mean_dilatation import MeanDilatation, build_mean_dilatation
+from taisoft.fem.node_graph import NodeGraph
 from taisoft.fem.pattern import MATRIX_BLOCKS, model_graph
 from taisoft.fem.pressure import PressureTable, build_pressures
 from taisoft.fem.state import State, build_state
@@ -320,16 +321,16 @@ def build_model(scene: Scene, runtime: Runtime, arena: FieldArena, on: dict[str,
         elasticity_by_tet=on["elasticity_by_tet"],
         chunks=chunks,
     )
+    needs_graph = on["consistent_mass"] or (on["pressure"] and on["assembled_stiffness"])
+    graph = model_graph(model)[0] if needs_graph else None
     if on["consistent_mass"]:
-        model = replace(model, mass_matrix=_build_mass_matrix(scene, model, arena, npr))
+        model = replace(model, mass_matrix=_build_mass_matrix(scene, model, arena, graph))
     if on["pressure"]:
-        graph = model_graph(model)[0] if on["assembled_stiffness"] else None
         model = replace(model, pressure=build_pressures(scene, layout.node_start, arena, graph))
     return model, layout
 
 
-def _build_mass_matrix(scene: Scene, model: Model, arena: FieldArena, npr: type) -> MassMatrix:
-    graph = model_graph(model)[0]
+def _build_mass_matrix(scene: Scene, model: Model, arena: FieldArena, graph: NodeGraph) -> MassMatrix:
     mass = MassMatrix(
         row_start=arena.field("mass_row_start", ti.i32, model.n_nodes + 1, graph.row_start.astype(np.int32)),
         column=arena.field("mass_column", ti.i32, len(graph.column), graph.column.astype(np.int32)),

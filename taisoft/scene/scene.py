@@ -16,7 +16,17 @@ from taisoft.mesh.tet_mesh import TetMesh
 from taisoft.scene import checks
 from taisoft.scene.body import USE_A_COPY, Body
 from taisoft.scene.collision import CollisionSettings
-from taisoft.scene.connections import Attachment, Connection, Spring, Tendon, add_spring, add_tendon, attach, check_connections
+from taisoft.scene.connections import (
+    Attachment,
+    Connection,
+    Spring,
+    Tendon,
+    add_spring,
+    add_tendon,
+    attach,
+    attached_pairs,
+    check_connections,
+)
 from taisoft.scene.loads import Cavity
 from taisoft.scene.material import Material
 from taisoft.scene.obstacles import Obstacle, Shape, surface_numbers
@@ -85,7 +95,9 @@ class Scene(Guarded):
 
     def pushes(self, self_collision: bool) -> bool:
         """Return whether contact forces can occur. self_collision: whether bodies collide with themselves."""
-        return self.contact_forces and (self_collision or len(self.colliders) > 1)
+        if not self.contact_forces or self_collision or not self.exact_attachments:
+            return self.contact_forces and (self_collision or len(self.colliders) > 1)
+        return bool(np.triu(~attached_pairs(self), 1)[: len(self.bodies)].any())
 
     @property
     def colliders(self) -> list[Body | Obstacle]:
