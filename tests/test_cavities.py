@@ -17,7 +17,10 @@ import taisoft as ts
 from taisoft.backend.arrays import FieldArena
 from taisoft.backend.runtime import open_runtime
 from taisoft.cli.files import describe
+from taisoft.dynamics import implicit
+from taisoft.dynamics.simulation_state import SimulationState
 from taisoft.errors import SceneError, SimulationError
+from taisoft.fem.pressure import CavityForm
 from taisoft.scene.fingerprint import scene_digest
 from taisoft.scene.refine import refined, with_order
 from taisoft.static import StaticSolver
@@ -160,6 +163,28 @@ def test_a_singular_system_ends_as_not_converged(monkeypatch):
         assert not report.converged and "cavity 'water' has a volume of" in " ".join(report.problems)
         monkeypatch.undo()
         assert sim.step().converged
+
+
+def test_pressures_of_undone_substeps_are_not_kept(monkeypatch):
+    """Where a step is cut, fails near its end, and is taken whole again, its start has the pressure from before."""
+    monkeypatch.setattr(implicit, "MAX_NEWTON", 4)
+    scene = balloon(1, volume=lambda t: BALL * (1.0 + t if t < 0.0199 else 30.0), name="water")
+    found, keep = [], SimulationState.set_cavity_pressures
+    with ts.Simulator(scene, dt=0.01) as sim:
+        assert sim.step().converged
+        before = sim.cavity_pressure("water")
+        monkeypatch.setattr(SimulationState, "set_cavity_pressures", lambda own, p: (found.append(float(p[0])), keep(own, p)))
+        report = sim.step()
+        assert not report.converged and report.substeps == 1
+        assert any(p != before for p in found) and sim.cavity_pressure("water") == before
+
+
+def test_forms_of_cavities_are_built_once(monkeypatch):
+    built, build = [], CavityForm.__init__
+    monkeypatch.setattr(CavityForm, "__init__", lambda own, *rest: (built.append(own), build(own, *rest))[1])
+    with ts.Simulator(balloon(1, volume=BALL, name="water"), dt=0.01) as sim:
+        assert sim.cavity_volume("water") == sim.cavity_volume("water") == pytest.approx(BALL, rel=1e-6)
+    assert len(built) == 1
 
 
 def test_slopes_of_pressures_are_not_kept(monkeypatch):
