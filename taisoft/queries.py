@@ -8,7 +8,6 @@ from taisoft.backend import runtime
 from taisoft.backend.arrays import upload
 from taisoft.dynamics.drag_spring import Drag
 from taisoft.errors import SceneError, SimulationError
-from taisoft.fem.pressure import cavity_form
 from taisoft.fem.terms import elasticity
 from taisoft.records import Energies, ErrorEstimate
 from taisoft.stability import stable_dt as largest_stable_dt
@@ -64,7 +63,8 @@ def joint_force(self: "Simulator", name: str) -> float | np.ndarray:
 
 def cavity_volume(self: "Simulator", name: str) -> float:
     """Return the present volume [m^3] of a cavity. Raises SceneError if there is none of this name."""
-    return cavity_form(self.scene, name).volume_and_gradient(self._open().state.state()[0])[0]
+    state = self._open().state
+    return state.cavity_form(name).volume_and_gradient(state.state()[0])[0]
 
 
 def cavity_pressure(self: "Simulator", name: str) -> float:

@@ -9,6 +9,9 @@
 * a scene that needs few iterations does not use it: no memory, no kernel.
 """
 
+import ast
+from pathlib import Path
+
 import numpy as np
 import pytest
 import scipy.sparse as sp
@@ -276,3 +279,9 @@ def test_a_soft_scene_does_not_use_it():
         assert "multigrid" not in sim.field_bytes
     assert not any(r.multigrid_solves for r in reports) and sum(r.linear_iterations for r in reports) > 5
     assert runtime.launches["multiply"] == before
+
+
+def test_sums_do_not_depend_on_the_number_of_threads():
+    """The operator @ on dense vectors calls BLAS, which splits sums among threads."""
+    tree = ast.parse(Path(host_pcg.__file__).read_text())
+    assert not [node.lineno for node in ast.walk(tree) if isinstance(node, ast.MatMult) or getattr(node, "attr", "") == "dot"]

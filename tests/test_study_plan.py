@@ -12,6 +12,7 @@ import itertools
 import numpy as np
 import pytest
 from command import write
+from shells import inside, thick_sphere
 
 import taisoft as ts
 from taisoft.cli.scene_file import load_scene
@@ -207,6 +208,20 @@ def test_damping_motion_or_integrator_reduce_the_reference_to_first_order():
     assert plan_of(moved, {"dt": [0.01]})["references"][0]["order_in_time"] == 1
     plan = plan_of(bar_scene(), {"dt": [0.01]}, reference_integrator="implicit_euler")
     assert plan["references"][0]["order_in_time"] == 1
+
+
+def test_references_can_keep_given_volumes():
+    """Also where an explicit reference would be cheap; the grid lists the integrators that cannot."""
+    mesh, rule = thick_sphere(1.0, 2.0, 2, 1, whole=True), "cavity 'water' of given volume needs"
+    scene = ts.Scene(gravity=(0.0, 0.0, 0.0))
+    scene.add_body(mesh, ts.Material(young=1e5), name="ball").add_cavity(inside(mesh, 1.0), volume=4.2, name="water")
+    plan = plan_of(scene, {"dt": [0.01], "integrator": ["implicit_midpoint", "bdf2"]})
+    assert [one["setting"]["integrator"] for one in plan["references"]] == ["bdf2"]
+    assert rule in refusals(plan)["implicit_midpoint", 0.01] and refusals(plan)["bdf2", 0.01] == ""
+    with pytest.raises(
+        SceneError, match=f"^the reference .refine 0.: --reference-integrator implicit_midpoint: {rule} implicit_euler or bdf2$"
+    ):
+        plan_of(scene, {"dt": [0.01], "integrator": ["bdf2"]}, reference_integrator="implicit_midpoint")
 
 
 def test_reference_integrator_with_another_mass_matrix_is_replaced_with_a_note():

@@ -115,7 +115,8 @@ class ImplicitStepper:
         balance = BodyBalance(simulation.scene)
         self._balance = balance if balance.n_pieces > 1 else None
         self._substepping = Substepping(self)
-        self._saved_start = None, [], contact.flight, False  # see `save_start`
+        self._saved_start = None, [], contact.flight, False, None  # see `save_start`
+        self._start_pressures = None  # in the cavities of given volume, at the start of the last substep
         self.forget()
 
     def forget(self) -> None:
@@ -195,23 +196,29 @@ class ImplicitStepper:
     def save_start(self) -> None:
         """Save the start of a step, to which `return_to_start` returns."""
         state = None if self.contact.idle else self.simulation.state()
-        self._saved_start = state, self.simulation.dirichlet.released(), self.contact.flight.copy(), self.contact.paths.none_cross
+        simulation, contact = self.simulation, self.contact
+        flight, none_cross = contact.flight.copy(), contact.paths.none_cross
+        self._saved_start = state, simulation.dirichlet.released(), flight, none_cross, simulation.cavity_pressures
 
     def return_to_start(self, already_undone: bool = False) -> None:
         """Restore the step's start, without history. already_undone: whether the only substep so far has been undone."""
-        state, released, flight, none_crossed = self._saved_start
+        state, released, flight, none_crossed, pressures = self._saved_start
         if state is None and not already_undone:
             restore(self.simulation.model, self.history)
             state = self.simulation.state()
-            self._saved_start = state, released, flight, none_crossed
-        self._restore_state(state, released)
+            self._saved_start = state, released, flight, none_crossed, pressures
+        self._restore_state(state, released, pressures)
         self._n_previous = 0
         self.contact.return_to_start(none_crossed)
         self.contact.flight[:] = flight
 
-    def _restore_state(self, state: tuple[np.ndarray, np.ndarray] | None, released: list[bool]) -> None:
-        """Restore a state, if not None, and the released groups."""
+    def _restore_state(
+        self, state: tuple[np.ndarray, np.ndarray] | None, released: list[bool], pressures: np.ndarray | None
+    ) -> None:
+        """Restore a state, if not None, the released groups and the pressures (k,) [Pa] in cavities of given volume, if any."""
         simulation = self.simulation
+        if pressures is not None:
+            simulation.set_cavity_pressures(pressures)
         if state is not None:
             simulation.set_state(*state)
         if simulation.dirichlet.released() != released:
@@ -224,9 +231,9 @@ class ImplicitStepper:
 
     def retry_substep(self, time: float, dt: float, start: np.ndarray) -> StageResult:
         """Repeat the restored substep with other contacts. start: (n_nodes, 3) [m/s] velocities reached before."""
-        past, self._n_previous = self._n_previous, 0
+        past, self._n_previous, pressures = self._n_previous, 0, self._start_pressures
         result = self.take_substep(time, dt, start)
-        self._n_previous = min(self._n_previous, past)
+        self._n_previous, self._start_pressures = min(self._n_previous, past), pressures
         return result
 
     def break_history(self) -> None:
@@ -236,7 +243,7 @@ class ImplicitStepper:
     def undo_substep(self, released: list[bool], discard_impulses: bool) -> None:
         """Restore the start of the last substep and the groups released then, for another length of it."""
         self.restore_start()
-        self._restore_state(None, released)
+        self._restore_state(None, released, self._start_pressures)
         self._n_previous = 0
         # BDF2 detects impacts by the contacts without impulse in the last step
         self.contact.reset_substep(discard_impulses or self.scheme.before > 0.0)
@@ -244,7 +251,7 @@ class ImplicitStepper:
     def take_substep(self, time: float, dt: float, start: np.ndarray | None = None) -> StageResult:
         """Take a substep of dt from a time with the contacts of one search. start: (n_nodes, 3) [m/s] first iterate of v."""
         simulation, m, h, w = self.simulation, self.simulation.model, self.history, self.solver.work
-        releases = simulation.releases
+        releases, self._start_pressures = simulation.releases, simulation.cavity_pressures
         target = simulation.next_target(time + dt)
         if simulation.releases != releases or dt != self._dt:
             self._n_previous = 0

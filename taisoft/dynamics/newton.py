@@ -180,8 +180,8 @@ class Newton:
         else:
             wanted, safeguard = 0.9 * (self.r / self.previous) ** 2, 0.9 * self.forcing**2
             self.forcing = min(self.max_forcing, max(wanted, safeguard if safeguard > 0.1 else 0.0))
-        # the last solve need not go far below Newton's tolerance
-        tolerance = max(self.forcing, 0.1 * target / self.r, 1e-12)
+        # the last solve need not go far below Newton's tolerance; |r| may be below it while volumes of cavities do not hold
+        tolerance = max(self.forcing, 0.1 * target / self.r if self.r > target else 0.1, 1e-12)
         # if rounding of stiff stress hides the rigid motion in |r|, only a tight solve gets that motion right
         return min(tolerance, self.stage.tolerance) if self.floor > target else tolerance
 

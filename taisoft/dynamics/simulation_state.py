@@ -1,6 +1,6 @@
 """Simulation state shared by all steppers: model, constraints, loads and time."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -11,7 +11,7 @@ from taisoft.fem.dependents import DependentTable, dependent_table
 from taisoft.fem.loads import SceneLoads
 from taisoft.fem.mean_dilatation import patch_moduli
 from taisoft.fem.model import Layout, Model, damping_table, law_table, upload_mass_matrix
-from taisoft.fem.pressure import pressures_of
+from taisoft.fem.pressure import CavityForm, cavity_form, pressures_of
 from taisoft.fem.reference import gravity_masses, lumped_masses
 from taisoft.scene.loads import Cavity
 from taisoft.scene.scene import Scene
@@ -38,6 +38,7 @@ class SimulationState:
     dependents: DependentTable | None = None
     load_time: float | None = None  # of the loads on the device; None: several, or outdated
     cavity_pressures: np.ndarray | None = None  # (k,) [Pa] in the cavities of given volume; None without such cavities
+    _cavity_forms: dict[str, CavityForm] = field(default_factory=dict)  # those built so far, by name
 
     def __post_init__(self):
         self.dependents = dependent_table(self.scene)
@@ -157,6 +158,12 @@ class SimulationState:
         """Return the pressures [Pa] in all cavities at a time [s]."""
         found = zip(pressures_of(self.scene), self.amplitudes(time))
         return {load.name: float(p) for (_, load), p in found if isinstance(load, Cavity)}
+
+    def cavity_form(self, name: str) -> CavityForm:
+        """Return the form of a cavity, built on first use. Raises SceneError if there is none of this name."""
+        if name not in self._cavity_forms:
+            self._cavity_forms[name] = cavity_form(self.scene, name)
+        return self._cavity_forms[name]
 
     def load_rows(self, times: np.ndarray, nodes: np.ndarray) -> np.ndarray:
         """Return loads (r, k, 3) [N] at times (r,) on nodes (k,), ascending, for kernels that set them."""

@@ -21,8 +21,8 @@ import numpy as np
 from taisoft.backend.arrays import upload
 from taisoft.dynamics.results import StageResult, count_all
 from taisoft.dynamics.simulation_state import SimulationState
-from taisoft.errors import SimulationError
-from taisoft.fem.pressure import CavityForm, pressures_of
+from taisoft.errors import SceneError, SimulationError
+from taisoft.fem.pressure import pressures_of
 from taisoft.linear import block_csr, host_pcg, pcg
 from taisoft.scene.loads import value_at
 
@@ -34,7 +34,8 @@ if TYPE_CHECKING:
 TOLERANCE = 1e-6  # of |V - V_0| over V_0
 PENALTY = 10.0  # k V_0 over Young's modulus of the body
 MAX_CORRECTIONS = 20  # of p, with contacts
-SLOPE_TOLERANCE = 1e-3  # of the linear solves for z, with contacts
+SLOPE_TOLERANCE = 1e-3  # of the linear solves for z, at most; with contacts, always
+HELD = 1e-9  # of the largest component of g: if those on free axes are smaller, they are rounding
 SINGULAR = 1e-6  # of a diagonal block's largest eigenvalue: smaller ones are raised to it in the preconditioner
 
 
@@ -46,10 +47,22 @@ class Volumes:
         self._at = simulation.loads.given_volumes
         found = [pressures_of(scene)[n] for n in self._at]
         self._places = [(k, scene.bodies[k].cavities.index(cavity)) for k, cavity in found]
-        self._forms = [CavityForm(scene.bodies[k], cavity, simulation.layout.node_start[k]) for k, cavity in found]
+        self._forms = [simulation.cavity_form(cavity.name) for _, cavity in found]
+        self._refuse_held([cavity.name for _, cavity in found])
         self._rest = np.array([cavity.rest_volume for _, cavity in found])
         self.penalised = False  # whether the stage's residual is that of p + k c
         self.slope_change = 0.0  # of the residual along y, by the last change of p
+
+    def _refuse_held(self, names: list[str]) -> None:
+        """Raise SceneError for a cavity whose volume cannot change. A dependent node moves if those it depends on can."""
+        moves, dependents = ~self._simulation.dirichlet.constrained(), self._simulation.dependents
+        if dependents is not None:
+            moves[dependents.node] = False
+            moves = abs(dependents.matrix) @ moves.astype(np.float64) > 0.0
+        for name, form in zip(names, self._forms):
+            size = np.abs(form.volume_and_gradient(self._simulation.layout.rest)[1])
+            if (size * moves[form.nodes]).max() <= HELD * size.max():
+                raise SceneError(f"cavity {name!r}: its volume cannot be given, because its surface is fixed or prescribed")
 
     def begin(self, time: float, fraction: float = 1.0) -> None:
         """Set the volumes of a time [s], or a fraction of the way there from those at rest. Raises SimulationError."""
@@ -64,6 +77,7 @@ class Volumes:
         self.pressures = self._simulation.cavity_pressures.copy()
         young = np.array([float(np.max(bodies[k].young)) for k, _ in self._places])
         self._penalty = PENALTY * young / self._rest
+        self.slope_change = 0.0
 
     def measure(self) -> None:
         """Compute volumes and gradients of the present state, and upload the pressures of the residual there."""
@@ -118,7 +132,10 @@ class Volumes:
         return (rows * m.free.to_numpy()).reshape(len(rows), -1)
 
     def direction(self, system: "StageSystem", tolerance: float) -> pcg.LinearResult:
-        """Solve the bordered system for y of pcg, and change the pressures."""
+        """Solve the bordered system for y of pcg, and change the pressures.
+
+        Where it is singular, or A indefinite even when projected, y is y_0 and the pressures stay; where A is not finite, y is 0.
+        """
         solution = self._solve_bordered(system, tolerance)
         if not solution.negative:
             return solution
@@ -129,30 +146,38 @@ class Volumes:
     def _solve_bordered(self, system: "StageSystem", tolerance: float) -> pcg.LinearResult:
         m, w, A = system.model, system.work.pcg, system.matrix
         G, right = self._rows(system.stage.beta), w.rhs.host.copy()
+        self.slope_change = 0.0
         inverse = block_inverse(A.diagonal.to_numpy(), m.free.to_numpy())
+        if inverse is None:
+            w.y.host[...] = 0.0
+            return pcg.LinearResult(0, False, False)
 
         def precondition(r: np.ndarray) -> np.ndarray:
             return np.einsum("nrc,nc->nr", inverse, r.reshape(-1, 3)).reshape(-1)
 
         found, solutions = [], []
-        for rhs in (right, *G):
+        for k, rhs in enumerate((right, *G)):
             w.rhs.host[...] = rhs.reshape(-1, 3)
-            limit = pcg.iteration_limit(m)
-            found.append(host_pcg.solve(m, A, w, tolerance, limit, precondition, (G, self._penalty)))
+            accuracy = tolerance if k == 0 else min(tolerance, SLOPE_TOLERANCE)
+            found.append(host_pcg.solve(m, A, w, accuracy, pcg.iteration_limit(m), precondition, (G, self._penalty)))
             solutions.append(w.y.host.astype(np.float64).reshape(-1))
         w.rhs.host[...] = right
         y, z = solutions[0], np.array(solutions[1:])
-        change = np.linalg.solve(G @ z.T, self.missing - G @ y)
         negative = any(one.negative for one in found)
-        if not negative:
-            y = y + change @ z
-            w.y.host[...] = y.reshape(-1, 3)
+        change = None if negative else solve_small(products(G, z), self.missing - products(G, y[None])[:, 0])
+        if change is not None:
+            y = y + np.einsum("k,kn->n", change, z)
             self.pressures = self.pressures + change
-            self.slope_change = -float(change @ (G @ y))
-        return pcg.LinearResult(sum(one.iterations for one in found), all(one.converged for one in found), negative)
+            self.slope_change = -float(change @ products(G, y[None])[:, 0])
+        w.y.host[...] = y.reshape(-1, 3)
+        converged = change is not None and all(one.converged for one in found)
+        return pcg.LinearResult(sum(one.iterations for one in found), converged, negative)
 
-    def correct(self, system: "StageSystem") -> int:
-        """Change the pressures, and v along with them, to reach the volumes to first order; return the linear iterations."""
+    def correct(self, system: "StageSystem") -> tuple[int, bool]:
+        """Change the pressures, and v along with them, to reach the volumes to first order.
+
+        Return the linear iterations, and whether it was possible; if not, nothing is changed.
+        """
         m, w = system.model, system.work.pcg
         G, z, n = self._rows(system.stage.beta), [], 0
         system.form_matrix(projected=True)
@@ -160,15 +185,36 @@ class Volumes:
             upload([(w.rhs, row.reshape(-1, 3))])
             n += system.solve_linear(SLOPE_TOLERANCE).iterations
             z.append(w.y.to_numpy().astype(np.float64).reshape(-1))
-        change = np.linalg.solve(G @ np.array(z).T, self.missing)
+        change = solve_small(products(G, np.array(z)), self.missing)
+        if change is None:
+            return n, False
         self.pressures = self.pressures + change
-        upload([(m.state.v, m.state.v.to_numpy() + (change @ np.array(z)).reshape(-1, 3))])
+        upload([(m.state.v, m.state.v.to_numpy() + np.einsum("k,kn->n", change, np.array(z)).reshape(-1, 3))])
         self.upload(self.pressures)
-        return n
+        return n, True
 
 
-def block_inverse(diagonal: np.ndarray, free: np.ndarray) -> np.ndarray:
-    """Positive definite inverses (n, 3, 3) of the diagonal blocks, 0 on constrained axes. diagonal: (n, 12) as stored."""
+def products(G: np.ndarray, z: np.ndarray) -> np.ndarray:
+    """G z^T of rows (k, n) and (l, n), without BLAS, whose threads cost more and whose sums depend on their number."""
+    return np.einsum("kn,ln->kl", G, z)
+
+
+def solve_small(A: np.ndarray, b: np.ndarray) -> np.ndarray | None:
+    """A^-1 b (k,); None if A is singular or the result not finite."""
+    try:
+        x = np.linalg.solve(A, b)
+    except np.linalg.LinAlgError:
+        return None
+    return x if np.isfinite(x).all() else None
+
+
+def block_inverse(diagonal: np.ndarray, free: np.ndarray) -> np.ndarray | None:
+    """Positive definite inverses (n, 3, 3) of the diagonal blocks, 0 on constrained axes; None if a block is not finite.
+
+    diagonal: (n, 12) as stored.
+    """
+    if not np.isfinite(diagonal).all():
+        return None
     mask = free[:, :, None] * free[:, None, :]
     blocks = block_csr.unpacked(diagonal) * mask + np.eye(3) * (1.0 - free[:, :, None])
     values, vectors = np.linalg.eigh(blocks)
@@ -187,8 +233,11 @@ def solve_with_volumes(system: "StageSystem", stage: "Stage", solve_stage: "Call
     volumes.penalised = system.contact.n_contacts == 0 and system.model.free.host is not None
     result, discarded, linear = solve_stage(), [], 0
     while not volumes.penalised and result.converged and not volumes.hold and len(discarded) < MAX_CORRECTIONS:
+        iterations, corrected = volumes.correct(system)
+        linear += iterations
+        if not corrected:
+            break
         discarded.append(result)
-        linear += volumes.correct(system)
         result = solve(system, stage)
     result = replace(count_all(result, discarded), converged=result.converged and volumes.hold)
     if result.converged:

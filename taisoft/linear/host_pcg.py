@@ -37,7 +37,7 @@ def solve(
     count, limit = 0, 0.0
     while True:
         z = precondition(r)
-        last, rz = rz, float(r @ z)
+        last, rz = rz, inner_product(r, z)
         if count == 0:
             limit = tolerance * tolerance * rz
         else:
@@ -50,8 +50,8 @@ def solve(
         p, q = w.p.host.astype(np.float64).reshape(-1), free * w.q.host.reshape(-1)
         if low_rank is not None:
             G, s = low_rank
-            q += np.einsum("k,kn->n", s * np.einsum("kn,n->k", G, p), G)  # BLAS would start threads for these few numbers
-        curvature = float(p @ q)
+            q += np.einsum("k,kn->n", s * np.einsum("kn,n->k", G, p), G)
+        curvature = inner_product(p, q)
         if not curvature > 0.0:
             y += (min(rz / -curvature, MAX_NEGATIVE_STEP) if curvature < 0.0 else MAX_NEGATIVE_STEP) * p
             status["negative"] = True
@@ -61,3 +61,8 @@ def solve(
         count += 1
     w.y.host[...] = y.reshape(-1, 3)
     return LinearResult(count, **status)
+
+
+def inner_product(a: np.ndarray, b: np.ndarray) -> float:
+    """a.b, without BLAS, which would start threads for these few numbers and sum in an order that depends on their number."""
+    return float(np.einsum("n,n->", a, b))

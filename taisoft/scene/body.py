@@ -292,7 +292,7 @@ class Body(Guarded):
         where: its surface triangles, as for `add_traction`: closed, with normals into the cavity. pressure: [Pa] above the
         ambient pressure, as for `add_pressure`. volume: [m^3], above 0, a number or a path; the pressure then follows, in
         implicit Euler and BDF2 steps and in statics. name: unique in the scene; by default "NAME cavity 0" and so on, NAME the
-        body's. Raises SceneError.
+        body's. A triangle belongs to one cavity at most. Raises SceneError.
         """
         self._check_open("add_cavity")
         what = f"{self._label()}: add_cavity"
@@ -305,6 +305,9 @@ class Body(Guarded):
         triangles = self._triangles(where, what)
         if not is_closed(self.mesh.surface[triangles]):
             raise SceneError(f"{what}: the chosen triangles have a border: they must enclose the cavity")
+        for other in self.cavities:
+            if len(shared := np.intersect1d(triangles, other.triangles)):
+                raise SceneError(f"{what}: surface triangle {shared[0]} of cavity {name!r} belongs to cavity {other.name!r}")
         rest_volume = self._enclosed(triangles)
         if rest_volume <= 0.0:
             raise SceneError(f"{what}: the normals of the chosen triangles point outward: they must point into the cavity")

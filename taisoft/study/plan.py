@@ -16,7 +16,7 @@ from taisoft.dynamics.schemes import EXPLICIT, INTEGRATORS
 from taisoft.errors import SceneError, TaisoftError
 from taisoft.estimation.order import nominal_order
 from taisoft.scene.scene import Scene
-from taisoft.settings import check_settings
+from taisoft.settings import VOLUMES, check_settings
 from taisoft.stability import stable_dt
 from taisoft.study import AXES, DEFAULTS, Setting, mesh_name
 
@@ -204,9 +204,13 @@ class Planner:
 
     def _integrator(self, scene: Scene, mesh: tuple, kind: str, target: float) -> str:
         requested = self._request["reference_integrator"]
+        given = [cavity.name for body in scene.bodies for cavity in body.cavities if cavity.given == "volume"]
         if requested is not None:
             if requested not in INTEGRATORS:
                 raise SceneError(f"--reference-integrator {requested}: it must be one of {', '.join(INTEGRATORS)}")
+            if given and requested not in VOLUMES:
+                rule = f"cavity {given[0]!r} of given volume needs {' or '.join(VOLUMES)}"
+                raise SceneError(f"--reference-integrator {requested}: {rule}")
             if not kind or (kind == "explicit") == (requested in EXPLICIT):
                 return requested
             instead = "velocity_verlet" if kind == "explicit" else "bdf2"
@@ -216,7 +220,7 @@ class Planner:
             return instead
         if kind == "explicit":
             return "velocity_verlet"
-        if self._touches(scene):
+        if given or self._touches(scene):
             return "bdf2"
         limit = STABLE_FRACTION * self._limit(mesh, "velocity_verlet")
         return "velocity_verlet" if not kind and limit > 2.0 * target / EXPLICIT_DT_RATIO else "implicit_midpoint"
