@@ -5,6 +5,7 @@ import sys
 import textwrap
 import time
 from argparse import Namespace
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -117,8 +118,10 @@ class Observers:
 
     def close(self) -> None:
         """Close all members, last first, even if some fail."""
-        while self.members:
-            self.guard(self.members.pop().close)
+        with ExitStack() as stack:  # closes the others even if one raises another error
+            for member in self.members:
+                stack.callback(self.guard, member.close)
+            self.members = []
 
     def guard(self, write, *arguments) -> bool:
         """Call write(*arguments) and return whether it succeeded; an OutputError is recorded, not raised."""

@@ -50,7 +50,12 @@ class Offscreen(SceneView):
             self.camera = replace(self.camera, distance=float(distance))
 
     def image(self, sim) -> np.ndarray:
-        """Return a picture of sim's present state, uint8 (height, width, 3), first row on top."""
+        """Return a picture of sim's present state, uint8 (height, width, 3), first row on top.
+
+        Raises OutputError after `close`.
+        """
+        if self._raster is None:
+            raise OutputError("a picture cannot be drawn: its renderer is closed")
         x, colours, lines = self._drawn(sim, self.size)
         picture = self._background.copy()
         runtime = open_runtime(*(open_kind() or ("cpu", "f32")), owner="a picture renderer")
