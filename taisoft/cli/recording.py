@@ -168,7 +168,7 @@ class Recording:
         drawing = annotate = None
         if shown.pictures:
             drawing = Offscreen(sim.scene, colour=shown.colour, layers=shown.in_pictures)
-            drawing.resume(self._notes.get("camera"))
+            drawing.resume(self._notes)
             no_bar = shown.colour != "body" and text_missing()
             if no_bar:
                 print(f"taisoft: pictures have no colour bar: {no_bar}", file=sys.stderr)
@@ -177,7 +177,7 @@ class Recording:
             pictures = FrameWriter(folder, drawing, annotate)
             observers.members.append(pictures)
             self._checkpoints.before.append(pictures.flush)
-        self._checkpoints.notes = lambda: {"fps": fps, "camera": drawing.camera.distance if drawing else None}
+        self._checkpoints.notes = lambda: {"fps": fps} | (drawing.kept(sim.time) if drawing else {})
         observers.members.append(self._checkpoints)
 
     def checkpoint(self, sim) -> None:
