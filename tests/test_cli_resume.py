@@ -70,6 +70,19 @@ def test_two_parts_equal_one_run(single, tmp_path, capsys):
     assert f"resumed  from {out / 'checkpoint.npz'}, t = 0.1 s" in capsys.readouterr().out
 
 
+@pytest.mark.parametrize("options", [("--colour", "speed"), ("--layers", "contacts")], ids=" ".join)
+def test_two_parts_draw_the_pictures_of_one_run(tmp_path, options):
+    """The scale of colours and that of impulses depend on earlier pictures; the cube lands before the first part ends."""
+    out, single = tmp_path / "out", tmp_path / "single"
+    arguments = ("--no-usd", *options)
+    assert run("cube_on_box", "--out", out, "--seconds", "0.4", *arguments) == 0
+    assert run("cube_on_box", "--out", out, "--resume", out / "checkpoint.npz", "--seconds", "0.8", *arguments) == 0
+    assert run("cube_on_box", "--out", single, "--seconds", "0.8", *arguments) == 0
+    pictures = [{path.name: path.read_bytes() for path in (folder / "frames").iterdir()} for folder in (out, single)]
+    assert pictures[0].keys() == pictures[1].keys() and len(pictures[0]) > 20
+    assert [name for name in sorted(pictures[0]) if pictures[0][name] != pictures[1][name]] == []
+
+
 def test_an_interrupted_run_continues(single, tmp_path):
     raising = f"import signal; signal.raise_signal({int(signal.SIGTERM)}) if 0.1 < t < 0.1042 else None\n    return (0, -t, 0)"
     path, out = write(tmp_path / "scene.py", LED.replace("{body}", raising)), tmp_path / "out"

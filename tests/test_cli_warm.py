@@ -24,6 +24,7 @@ from taisoft.cli.warm import Structure, build, static_structures, structures
 from taisoft.collision.surface import SERIAL_BELOW
 from taisoft.dynamics.elimination import solve_on
 from taisoft.dynamics.schemes import EXPLICIT
+from taisoft.fem.dependents import dependent_table
 from taisoft.fem.model import ILL_CONDITIONED
 from taisoft.fem.reference import inverse_rest_edges
 from taisoft.scene.obstacles import MeshObstacle
@@ -44,7 +45,7 @@ def key(scene: ts.Scene, integrator: str, **solver) -> tuple:
     analytic = any(not isinstance(o.shape, MeshObstacle) for o in scene.obstacles)
     surfaces = [o.shape.surface() for o in scene.obstacles]
     counts = [len(b.nodes.surface) for b in scene.bodies] + [len(s[1]) for s in surfaces if s is not None]
-    touches = "contact_forces" in on
+    touches, table = "contact_forces" in on, dependent_table(scene)
     return (
         integrator,
         tuple(sorted(on)),
@@ -54,6 +55,8 @@ def key(scene: ts.Scene, integrator: str, **solver) -> tuple:
         touches and len(counts) > 1,
         touches and sum(counts) >= SERIAL_BELOW,
         solver.get("contact_solver", "auto"),
+        solver.get("precision", "f32"),
+        0 if table is None else table.most_masters,
     )
 
 
@@ -65,7 +68,7 @@ def is_thin(body) -> bool:
 
 @pytest.fixture(scope="module")
 def covered() -> set:
-    return {key(build(structure), structure.integrator) for structure in structures()}
+    return {key(build(one), one.integrator, precision="f64" if one.double else "f32") for one in structures()}
 
 
 @pytest.mark.parametrize("name", shipped_files("demos"))
@@ -90,6 +93,18 @@ def test_demos_compile_nothing_after_warming(tmp_path):
         done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
         assert set(tmp_path.rglob("*.tic")) == before, name
         assert "compiling" not in done.stderr
+
+
+@pytest.mark.parametrize("name", ["inflated_finger", "gripper"])
+def test_demos_in_double_precision_compile_nothing_after_warming(name):
+    scene, solver = load_scene(name)
+    solver = {"integrator": "implicit_euler", "dt": solver["dt"], "precision": solver["precision"]}
+    structure = next(one for one in structures() if one.double and one.attached == bool(scene.exact_attachments))
+    warm.simulate(structure, "f64")
+    before = n_compiled()
+    with ts.Simulator(scene, **solver) as sim:
+        sim.advance(10)
+        assert np.isfinite(sim.stress()).all() and sim.energies().kinetic > 0.0 and n_compiled() == before
 
 
 def test_scenes_of_other_sizes_compile_nothing():
@@ -117,6 +132,10 @@ def test_scenes_have_the_features_of_their_structure(structure):
         ("fixed", "fixed_nodes"),
         ("prescribed", "moving_nodes"),
         ("loaded", "loads"),
+        ("pressed", "pressure"),
+        ("tied", "springs"),
+        ("attached", "dependent_nodes"),
+        ("mean_dilatation", "mean_dilatation"),
         ("by_tet", "elasticity_by_tet"),
         ("mass_damping", "mass_damping"),
         ("stiffness_damping", "stiffness_damping"),

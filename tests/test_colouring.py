@@ -2,9 +2,12 @@
 
 * a bar stretched by s has stretch s at every node, linear and quadratic, in any orientation;
 * the scale ends at 1, 2 or 5 times a power of ten, rises immediately, does not flicker, and falls when it is far too high;
+* a resumed run continues the scale of the same quantity;
 * markers and obstacles keep their colours, unknown names are refused;
 * pictures by stress differ from those in the bodies' colours; `taisoft run --colour` makes them, with a colour bar if it can.
 """
+
+import json
 
 import numpy as np
 import pytest
@@ -45,6 +48,29 @@ def test_the_scale_does_not_flicker():
     assert spans[:4] == [5.0, 5.0, 5.0, 10.0] and set(spans[3:105]) == {10.0}
     assert spans[-1] == 0.5 and (np.diff(spans[105:]) <= 0).all()
     assert [round_up(v) for v in (1.0, 1.1, 2.3, 0.07, 5e4)] == [1.0, 2.0, 5.0, 0.1, 5e4]
+
+
+@pytest.mark.parametrize("after", [0.0, 0.01])
+def test_a_scale_continues_from_what_is_kept(after):
+    """A picture of the time at which it is kept is drawn again, so its step of the running maximum must not count twice."""
+    scene = beam_scene()
+    sim = FakeSimulator(scene)
+
+    def image(drawing, time, speed):
+        sim.time, sim.velocities = time, lambda: np.full(sim.positions().shape, speed / np.sqrt(3))
+        drawing.image(sim)
+
+    first, other, later = (Offscreen(scene, (32, 18), colour=colour) for colour in ("speed", "stress", "speed"))
+    image(first, 0.0, 3.0)
+    image(first, 0.1, 0.1)
+    kept = json.loads(json.dumps(first.kept(0.1 + after)))  # plain data
+    later.resume(kept)
+    other.resume(kept)
+    assert other.colouring.scale == ("stress", 0.0, 0.0)
+    if after == 0.0:
+        image(later, 0.1, 0.1)
+    assert later.colouring.scale == first.colouring.scale and first.colouring.scale[1] == pytest.approx(0.998 * 3.0, rel=1e-5)
+    assert later.camera.distance == first.camera.distance
 
 
 def test_markers_and_obstacles_keep_their_colours():

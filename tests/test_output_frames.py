@@ -3,6 +3,7 @@
 * a PNG decodes to the same image, and frames are numbered with five digits;
 * pictures are written by a thread while the run goes on, at most WAITING wait, and all are there after a flush or a close;
 * a picture that cannot be written is an error at the next frame, flush or close, and no later one is written;
+* a closed writer refuses pictures; observers are all closed, and report what could not be written;
 * progress is a bar on a terminal and lines elsewhere, both with steps/s and the time left.
 """
 
@@ -12,12 +13,14 @@ import subprocess
 import sys
 import threading
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from fake_simulator import FakeSimulator, beam_scene
 from png import decode
 
+from taisoft.cli.recording import Observers
 from taisoft.errors import OutputError
 from taisoft.output import frames, report
 from taisoft.output.frames import FrameWriter, png_bytes
@@ -95,10 +98,10 @@ def test_pictures_wait_for_a_slow_disk(tmp_path, monkeypatch):
     assert len(written) == frames.WAITING + 2
 
 
-@pytest.mark.parametrize("error", [OutputError("the disk is full"), RuntimeError("a defect")])
+@pytest.mark.parametrize("error", [OutputError("the disk is full"), MemoryError("a defect")])
 @pytest.mark.parametrize("moment", ["frame", "flush", "close"])
 def test_an_error_of_writing_is_raised_once_it_is_known(tmp_path, monkeypatch, error, moment):
-    written = []
+    written, message = [], "^the disk is full$" if isinstance(error, OutputError) else "00001.png: MemoryError: a defect$"
 
     def failing(path, data):
         written.append(path.name)
@@ -109,15 +112,45 @@ def test_an_error_of_writing_is_raised_once_it_is_known(tmp_path, monkeypatch, e
     for index in range(2):
         writer.frame(sim, index)
     if moment == "frame":
-        with pytest.raises(type(error), match=str(error)):
+        with pytest.raises(OutputError, match=message):
             for index in range(2, 10_000):
                 writer.frame(sim, index)
     elif moment == "flush":
-        with pytest.raises(type(error), match=str(error)):
+        with pytest.raises(OutputError, match=message):
             writer.flush()
-    with pytest.raises(type(error), match=str(error)):
+    with pytest.raises(OutputError, match=message):
         writer.close()
     assert writer.renderer.closed and written == ["00000.png", "00001.png"]
+
+
+def test_a_closed_writer_refuses_pictures(tmp_path):
+    writer, sim = FrameWriter(tmp_path, GreyRenderer()), FakeSimulator(beam_scene())
+    writer.frame(sim, 0)
+    writer.close()
+    with pytest.raises(OutputError, match=r"^picture 1 cannot be written to .*frames: its writer is closed$"):
+        writer.frame(sim, 1)
+    flushing = threading.Thread(target=writer.flush, daemon=True)
+    flushing.start()
+    flushing.join(10)
+    assert not flushing.is_alive() and len(list((tmp_path / "frames").iterdir())) == 1
+
+
+def test_observers_close_all_members_and_report_errors_of_writing(tmp_path, monkeypatch):
+    def failing(path, data):
+        raise MemoryError("no memory")
+
+    def defect():
+        raise RuntimeError("a defect")
+
+    writer, sim = writing(tmp_path, monkeypatch, failing)
+    observers = Observers()
+    observers.members += [writer, SimpleNamespace(close=defect)]
+    writer.frame(sim, 0)
+    with pytest.raises(RuntimeError, match="a defect"):
+        observers.close()
+    assert writer.renderer.closed and observers.members == [] and len(observers.errors) == 1
+    assert observers.errors[0].endswith("00000.png: MemoryError: no memory")
+    observers.close()
 
 
 def test_a_writer_that_is_not_closed_does_not_keep_the_process(tmp_path):

@@ -244,6 +244,14 @@ def test_one_window_per_process():
     Canvas(Surfaces(scene), SIZE, visible=False).close()
 
 
+def test_a_closed_renderer_refuses_pictures():
+    scene = beam_scene()
+    drawing = Offscreen(scene, SIZE)
+    drawing.close()
+    with pytest.raises(OutputError, match="^a picture cannot be drawn: its renderer is closed$"):
+        drawing.image(FakeSimulator(scene))
+
+
 def test_pictures_leave_the_runtime_free():
     """The same picture whatever precision is open, and none is claimed between pictures."""
     scene, images = beam_scene(), []

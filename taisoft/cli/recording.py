@@ -5,6 +5,7 @@ import sys
 import textwrap
 import time
 from argparse import Namespace
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -117,8 +118,10 @@ class Observers:
 
     def close(self) -> None:
         """Close all members, last first, even if some fail."""
-        while self.members:
-            self.guard(self.members.pop().close)
+        with ExitStack() as stack:  # closes the others even if one raises another error
+            for member in self.members:
+                stack.callback(self.guard, member.close)
+            self.members = []
 
     def guard(self, write, *arguments) -> bool:
         """Call write(*arguments) and return whether it succeeded; an OutputError is recorded, not raised."""
@@ -165,7 +168,7 @@ class Recording:
         drawing = annotate = None
         if shown.pictures:
             drawing = Offscreen(sim.scene, colour=shown.colour, layers=shown.in_pictures)
-            drawing.resume(self._notes.get("camera"))
+            drawing.resume(self._notes)
             no_bar = shown.colour != "body" and text_missing()
             if no_bar:
                 print(f"taisoft: pictures have no colour bar: {no_bar}", file=sys.stderr)
@@ -174,7 +177,7 @@ class Recording:
             pictures = FrameWriter(folder, drawing, annotate)
             observers.members.append(pictures)
             self._checkpoints.before.append(pictures.flush)
-        self._checkpoints.notes = lambda: {"fps": fps, "camera": drawing.camera.distance if drawing else None}
+        self._checkpoints.notes = lambda: {"fps": fps} | (drawing.kept(sim.time) if drawing else {})
         observers.members.append(self._checkpoints)
 
     def checkpoint(self, sim) -> None:

@@ -27,7 +27,7 @@ from taisoft.view.offscreen import Offscreen
 
 IMPLICIT = ("implicit_euler", "bdf2")  # the common ones
 STATIC = ""  # in place of an integrator
-SIZE = 0.1  # [m] of a cube
+SIZE, UPPER = 0.1, 0.06  # [m] of the lowest cube and of the others
 SPEED = 2.0  # [m/s] of falling bodies: fast enough that collisions retry steps
 STEPS = {True: (1e-5, 200), False: (1e-2, 10)}  # explicit integrator: (dt [s], number of steps)
 LONG_DT = 1.0  # [s]
@@ -37,11 +37,12 @@ RANDOM_SPEED = 0.5  # of nodes, in smallest extents of the scene per step
 
 
 def warm(arguments: Namespace) -> int:
-    """Compile, print one line per structure, and return 0. Without --precision simulations use f32, statics f64."""
+    """Compile, print one line per structure, and return 0. By default simulations use f32, double structures and statics f64."""
     start, before = time.perf_counter(), n_compiled()
     with compile_message.silenced():
         for structure in dict.fromkeys(structures()):  # some laws and integrators have structures in common
-            _report(str(structure), simulate, structure, arguments.precision or "f32")
+            precision = arguments.precision or ("f64" if structure.double else "f32")
+            _report(str(structure), simulate, structure, precision)
         for structure in static_structures():
             precision = arguments.precision or "f64"
             _report(f"statics in {precision}, {structure}", solve, structure, precision)
@@ -98,8 +99,10 @@ def draw(structure: "Structure", precision: str) -> None:
 class Structure:
     """Features that kernels are compiled for. obstacles: "half-space", "box" or "mesh"; orders: element order of each body.
 
-    fixed, prescribed: some nodes are fixed, or follow a path; loaded: forces on nodes; by_tet: elasticity by tet; thin: tets so
-    flat that strains are computed in f64; fine: a surface of more than 1,500 triangles, searched by parallel loops.
+    fixed, prescribed: some nodes are fixed, or follow a path; loaded: forces on nodes; pressed: a surface is under pressure;
+    tied: a tendon pulls; attached: the second body to the first, exactly; by_tet: elasticity by tet; thin: tets so flat that
+    strains are computed in f64; fine: a surface of more than 1,500 triangles, searched by parallel loops; double: a simulation in
+    f64 unless --precision is given.
     """
 
     integrator: str
@@ -109,11 +112,16 @@ class Structure:
     fixed: bool = False
     prescribed: bool = False
     loaded: bool = False
+    pressed: bool = False
+    tied: bool = False
+    attached: bool = False
     by_tet: bool = False
+    mean_dilatation: bool = False
     mass_damping: bool = False
     stiffness_damping: bool = False
     thin: bool = False
     fine: bool = False
+    double: bool = False
     contacts: bool = True  # whether contact forces are modelled
 
     def __str__(self) -> str:
@@ -164,6 +172,12 @@ def structures() -> Iterator[Structure]:
     for integrator in ("symplectic_euler", "implicit_euler"):
         yield Structure(integrator, fixed=True, by_tet=True)
     yield Structure("implicit_euler", orders=(2,), fixed=True, loaded=True, by_tet=True, mass_damping=True)
+    yield Structure("implicit_euler", fixed=True, pressed=True)
+    yield Structure("implicit_euler", fixed=True, mean_dilatation=True)
+    finger = {"orders": (2,), "fixed": True, "pressed": True, "by_tet": True}
+    gripper = {"orders": (2, 2, 1), "obstacles": PLANE, "prescribed": True, "tied": True, "attached": True}
+    for features in (finger, gripper):
+        yield Structure("implicit_euler", **features, mass_damping=True, double=True)
     yield Structure("implicit_euler", obstacles=PLANE, fine=True)
     yield Structure("implicit_euler", obstacles=PLANE_AND_BOX, fine=True)
     yield Structure("implicit_euler", obstacles=BOX, thin=True, fine=True, mass_damping=True)
@@ -183,19 +197,24 @@ def build(structure: Structure) -> Scene:
     scene = Scene()
     scene.contact_forces = structure.contacts
     damping = {"mass_damping": float(structure.mass_damping), "stiffness_damping": 1e-3 * structure.stiffness_damping}
-    soft = Material(law=structure.law, young=1e5, poisson=0.3, density=1000.0, friction=0.5, **damping)
-    mesh, bottom = box_mesh((2, 2, 2), (SIZE, SIZE, SIZE)), 0.001 * SIZE
+    poisson = 0.499 if structure.mean_dilatation else 0.3  # near incompressibility linear systems are solved in another way
+    soft = Material(law=structure.law, young=1e5, poisson=poisson, density=1000.0, friction=0.5, **damping)
+    mesh, gap = box_mesh((2, 2, 2), (SIZE, SIZE, SIZE)), 0.001 * SIZE
+    bottom = gap
     if structure.thin or structure.fine:
         cells = 20 if structure.fine else 2
         mesh = sheet_mesh((cells, cells), (SIZE * cells, SIZE / 50 if structure.thin else SIZE, SIZE * cells))
     for k, order in enumerate(structure.orders):
         height = float(np.ptp(mesh.vertices[:, 1]))
         position, speed = (0.0, bottom + 0.5 * height, 0.0), SPEED if k > 0 or not structure.fixed else 0.0
-        scene.add_body(mesh, soft, name=f"body {k}", position=position, order=order, velocity=(0.0, -speed, 0.0))
-        mesh, bottom = box_mesh((2, 2, 2), (0.5 * SIZE, 0.5 * SIZE, 0.5 * SIZE)), bottom + height + 0.001 * SIZE
+        given = {"order": order, "dilatation": "mean" if structure.mean_dilatation else "local", "velocity": (0.0, -speed, 0.0)}
+        scene.add_body(mesh, soft, name=f"body {k}", position=position, **given)
+        mesh, bottom = box_mesh((2, 2, 2), (UPPER, UPPER, UPPER)), bottom + height
+        bottom += 0.0 if structure.attached and k == 0 else gap  # attached nodes lie in triangles: most depend on 6 nodes
     if structure.by_tet:
         scene.bodies[0].young = np.full(scene.bodies[0].mesh.n_tets, soft.young)
     _add_conditions(scene.bodies[0], structure)
+    _add_connections(scene, structure)
     for name in structure.obstacles:
         scene.add_obstacle(_obstacle(name), name=name, friction=0.5)
     return scene
@@ -210,6 +229,19 @@ def _add_conditions(body, structure: Structure) -> None:
         body.move(lambda X: X[:, 0] > side, KeyFrames([0.0, 1.0], [(0.0, 0.0, 0.0), (0.1 * SIZE, 0.0, 0.0)], release=True))
     if structure.loaded:
         body.add_force(lambda X: X[:, 0] > side, (0.0, 1.0, 0.0))
+    if structure.pressed:
+        body.add_pressure(lambda c: c[:, 0] > side, KeyFrames([0.0, 1.0], values=(100.0, 1000.0)))
+
+
+def _add_connections(scene: Scene, structure: Structure) -> None:
+    """Attach the second body to the first, and lead a tendon up through the last of these."""
+    name = scene.bodies[int(structure.attached)].name
+    if structure.attached:
+        low = scene.body(name).rest_positions[:, 1].min() + 1e-9
+        scene.attach(name, lambda X: X[:, 1] < low, scene.bodies[0].name)
+    if structure.tied:
+        path = KeyFrames([0.0, 1.0], values=(0.0, 1.0))
+        scene.add_tendon([(name, (0.0, height * SIZE, 0.0)) for height in (-0.2, 0.0, 0.2)], path)
 
 
 def _obstacle(name: str):

@@ -344,6 +344,7 @@ class ImplicitStepper:
         if not self.simulation.model.has_dependents:
             solve_on(self.solver, replace(self.solver.stage, tolerance=0.0), free[:1], 0.0)
         self.solver.form_matrix(projected=True)
+        self.solver.linear_residual()  # multiplies by the matrix, as multigrid does
 
     def reactions(self) -> np.ndarray:
         """Return the constraint forces of the last step, (n_nodes, 3) [N]."""

@@ -31,20 +31,22 @@ class FrameWriter:
 
     folder: the run's folder; renderer: an object with `image(sim) -> uint8 (height, width, 3)` and `close()`, such as
     `taisoft.view.offscreen.Offscreen`, which is closed with this writer; annotate: (picture, sim, index) -> picture to write.
-    At most WAITING pictures wait; then `frame` waits too. A picture that cannot be written raises OutputError at the next
-    `frame`, `flush` or `close`; later ones are not written. Raises OutputError.
+    At most WAITING pictures wait; then `frame` waits too. A picture that cannot be written, for whatever reason, raises
+    OutputError at the next `frame`, `flush` or `close`; later ones are not written. Raises OutputError.
     """
 
     def __init__(self, folder: str | Path, renderer, annotate: Callable | None = None):
         self.folder = make_folder(Path(folder) / FRAMES_NAME)
         self.renderer, self._annotate = renderer, annotate
         self._waiting: queue.Queue[tuple[Path, np.ndarray] | None] = queue.Queue(WAITING)
-        self._error: Exception | None = None
+        self._error: OutputError | None = None
         self._thread = threading.Thread(target=self._write_all, name="pictures", daemon=True)  # an exit does not wait for it
         self._thread.start()
 
     def frame(self, sim, index: int) -> None:
         """Draw sim's present state, to be written as picture number index. Raises OutputError."""
+        if not self._thread.is_alive():
+            raise OutputError(f"picture {index} cannot be written to {self.folder}: its writer is closed")
         self._raise()
         picture = self.renderer.image(sim)
         if self._annotate is not None:
@@ -61,8 +63,10 @@ class FrameWriter:
         if self._thread.is_alive():
             self._waiting.put(None)
             self._thread.join()
-            self.renderer.close()
-            self._raise()
+            try:
+                self.renderer.close()
+            finally:
+                self._raise()
 
     def _write_all(self) -> None:
         """Write pictures until None comes."""
@@ -70,10 +74,14 @@ class FrameWriter:
             try:
                 if self._error is None:
                     write_bytes(item[0], png_bytes(item[1]))
-            except Exception as error:  # raised in the thread that draws
+            except OutputError as error:  # raised in the thread that draws
                 self._error = error
+            except Exception as error:
+                self._error = OutputError(f"cannot write {item[0]}: {type(error).__name__}: {error}")
+                self._error.__cause__ = error
             finally:
                 self._waiting.task_done()
+        self._waiting.task_done()
 
     def _raise(self) -> None:
         if self._error is not None:

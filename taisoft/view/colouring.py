@@ -56,6 +56,16 @@ class Colouring:
         self.kind = kind
         self._peak = self.span = 0.0
 
+    @property
+    def scale(self) -> tuple[str, float, float]:
+        """The quantity, its running maximum and the span of the scale, which later pictures depend on."""
+        return self.kind, self._peak, self.span
+
+    def resume(self, kind: str, peak: float, span: float) -> None:
+        """Continue the `scale` of an earlier run, unless it was of another quantity."""
+        if kind == self.kind:
+            self._peak, self.span = float(peak), float(span)
+
     def choose_next(self) -> None:
         """Colour by the next of UNITS; by the error only if that was the first choice, since it needs a run with error=True."""
         self.choose(following(tuple(kind for kind in UNITS if kind != "error" or self._has_errors), self.kind))

@@ -43,14 +43,35 @@ class Offscreen(SceneView):
         self._background = background(self.size)
         self._raster = Raster(self._samples)
         self._shadows = Shadows(scene, self.surfaces)
+        self._drawn_at: float | None = None  # time of the latest picture [s]
+        self._before: dict = {}  # what was kept before it
 
-    def resume(self, distance: float | None) -> None:
-        """Set the camera's distance [m] to that of an earlier run; None keeps it."""
-        if distance is not None:
-            self.camera = replace(self.camera, distance=float(distance))
+    def kept(self, time: float) -> dict:
+        """Return, as plain data, what pictures from time [s] on depend on: distance of the camera [m], scales, recent maxima.
+
+        A picture already drawn at that time does not count, since a resumed run draws it again.
+        """
+        return self._before if time == self._drawn_at else self._present()
+
+    def resume(self, kept: dict) -> None:
+        """Continue from what an earlier run kept; entries that are missing start anew."""
+        if kept.get("camera") is not None:
+            self.camera = replace(self.camera, distance=float(kept["camera"]))
+        self.colouring.resume(*kept.get("scale", self.colouring.scale))
+        self.layers.peak = float(kept.get("impulse", 0.0))
+
+    def _present(self) -> dict:
+        return {"camera": self.camera.distance, "scale": list(self.colouring.scale), "impulse": self.layers.peak}
 
     def image(self, sim) -> np.ndarray:
-        """Return a picture of sim's present state, uint8 (height, width, 3), first row on top."""
+        """Return a picture of sim's present state, uint8 (height, width, 3), first row on top.
+
+        Raises OutputError after `close`.
+        """
+        if self._raster is None:
+            raise OutputError("a picture cannot be drawn: its renderer is closed")
+        if sim.time != self._drawn_at:
+            self._before, self._drawn_at = self._present(), sim.time
         x, colours, lines = self._drawn(sim, self.size)
         picture = self._background.copy()
         runtime = open_runtime(*(open_kind() or ("cpu", "f32")), owner="a picture renderer")

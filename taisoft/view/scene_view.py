@@ -111,8 +111,8 @@ class Surfaces:
 class Layers:
     """Optional layers beside the surfaces.
 
-    shown: name -> whether it is visible, initially those in `names`; n_segments: largest number of lines that `lines` returns.
-    Raises OutputError for an unknown name.
+    shown: name -> whether it is visible, initially those in `names`; n_segments: largest number of lines that `lines` returns;
+    peak: recent maximum of impulses [N s], which scales their lines. Raises OutputError for an unknown name.
     """
 
     def __init__(self, scene, names: tuple[str, ...] = IN_WINDOW):
@@ -124,7 +124,7 @@ class Layers:
         self._edges = np.concatenate([triangle_edges(np.asarray(b.nodes.surface))[0] + n for b, n in zip(scene.bodies, starts)])
         self.n_segments = len(self._edges) + MAX_MARK_LINES
         self._size = float(np.linalg.norm(np.ptp(start_positions(scene), axis=0)))
-        self._peak = 0.0  # [N s]
+        self.peak = 0.0
         self._loaded = [  # per traction, nodes (k,3) of the triangles that get an arrow
             body.mesh.surface[t.triangles[:: -(-len(t.triangles) // MAX_ARROWS)]] + n
             for body, n in zip(scene.bodies, starts)
@@ -152,8 +152,8 @@ class Layers:
         found = sim.contacts()
         k = slice(0, MAX_MARK_LINES // 4)
         point, normal, impulse = found.point[k], found.normal[k], found.impulse[k]
-        self._peak = max(DECAY * self._peak, float(np.linalg.norm(impulse, axis=1).max(initial=0.0)))
-        relative = impulse / self._peak if self._peak > 0.0 else 0.0 * impulse
+        self.peak = max(DECAY * self.peak, float(np.linalg.norm(impulse, axis=1).max(initial=0.0)))
+        relative = impulse / self.peak if self.peak > 0.0 else 0.0 * impulse
         return [
             (_segments(point, point + NORMAL * self._size * normal), NORMAL_COLOUR),
             (_segments(point, point + IMPULSE * self._size * relative), IMPULSE_COLOUR),
