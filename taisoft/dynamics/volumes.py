@@ -34,7 +34,8 @@ if TYPE_CHECKING:
 TOLERANCE = 1e-6  # of |V - V_0| over V_0
 PENALTY = 10.0  # k V_0 over Young's modulus of the body
 MAX_CORRECTIONS = 20  # of p, with contacts
-SLOPE_TOLERANCE = 1e-3  # of the linear solves for z, at most; with contacts, always
+MAX_TOLERANCE = 3e-2  # of the linear solves for z without contacts, which the size of r says nothing about
+SLOPE_TOLERANCE = 1e-3  # of those with contacts
 HELD = 1e-9  # of the largest component of g: if those on free axes are smaller, they are rounding
 SINGULAR = 1e-6  # of a diagonal block's largest eigenvalue: smaller ones are raised to it in the preconditioner
 
@@ -158,7 +159,7 @@ class Volumes:
         found, solutions = [], []
         for k, rhs in enumerate((right, *G)):
             w.rhs.host[...] = rhs.reshape(-1, 3)
-            accuracy = tolerance if k == 0 else min(tolerance, SLOPE_TOLERANCE)
+            accuracy = tolerance if k == 0 else min(tolerance, MAX_TOLERANCE)
             found.append(host_pcg.solve(m, A, w, accuracy, pcg.iteration_limit(m), precondition, (G, self._penalty)))
             solutions.append(w.y.host.astype(np.float64).reshape(-1))
         w.rhs.host[...] = right
