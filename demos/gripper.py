@@ -26,8 +26,8 @@ INNER, LOW = 0.03, 0.015  # distance of a finger's inner face from the middle, a
 def build(friction: float = FRICTION) -> ts.Scene:
     """The open gripper above the cube. friction: of everything."""
     scene = ts.Scene()
-    soft = ts.Material(young=YOUNG, poisson=0.3, density=1000.0, mass_damping=5.0, friction=friction)
-    stiff = ts.Material(young=1e8, poisson=0.3, density=1000.0, friction=friction)
+    shared = {"poisson": 0.3, "density": 1000.0, "mass_damping": 5.0, "friction": friction}
+    soft, stiff = ts.Material(young=YOUNG, **shared), ts.Material(young=1e8, **shared)
     light = ts.Material(young=1e6, poisson=0.3, density=DENSITY, friction=friction)
     top = LOW + FINGER[1]
     palm = scene.add_body(ts.box_mesh((4, 1, 1), PALM), stiff, name="palm", position=(0.0, top + PALM[1] / 2, 0.0), order=2)

@@ -301,7 +301,7 @@ def with_material(scene, **numbers):
             lambda scene: scene.add_obstacle(ts.HalfSpace((0, 0, 0), (0, 1, 0)), name="floor"),
             'its obstacles are [], those here ["floor"]',
         ),
-        (lambda scene: with_material(scene, law="corotational"), "in body 'flyer': order, quadrature, law"),
+        (lambda scene: with_material(scene, law="corotational"), "in body 'flyer': order, quadrature, dilatation, law"),
         (
             lambda scene: with_material(scene, mass_damping=0.1),
             "body 'flyer': mass_damping is 0.1 in this scene and was 0.0 at the start",

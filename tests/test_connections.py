@@ -113,10 +113,10 @@ REFUSALS = [
     (lambda s: s.add_tendon([("a", (0, 0.45, 0)), ("b", (0, -0.45, 0))], 1.0), "tendon 'tendon0': points 0 and 1 coincide"),
     (lambda s: s.add_tendon([A, B], -1.0), "tendon 'tendon0': force must be at least 0 N, not -1: a tendon cannot push"),
     (lambda s: s.add_tendon([A, B], lambda t: -2.0 - t), "tendon 'tendon0': force must be at least 0 N, not -2: a tendon cannot"),
-    (lambda s: s.add_tendon([A, B], (1, 2, 3)), "tendon 'tendon0': force must have shape (), not (3,)"),
+    (lambda s: s.add_tendon([A, B], (1, 2, 3)), "tendon 'tendon0': force must be a number, not of shape (3,)"),
     (
         lambda s: s.add_tendon([A, B], lambda t: (1, 2)),
-        "tendon 'tendon0': the path's force at t = 0 must have shape (), not (2,)",
+        "tendon 'tendon0': the path's force at t = 0 must be a number, not of shape (2,)",
     ),
     (lambda s: s.add_tendon([A, B], lambda t: 1 / t), "tendon 'tendon0': the path failed at t = 0: ZeroDivisionError"),
     (lambda s: s.add_tendon([A, B], ts.KeyFrames([0], [(0, 0, 0)])), "tendon 'tendon0': force: key frames need values here"),

@@ -89,9 +89,9 @@ def build_surface(
     arena: FieldArena,
     serial: bool | None = None,
 ) -> Surface:
-    """Allocate and fill the fields. rest: (v,3) [m]; properties: soft, self_on, mode, thickness, edge, (n_bodies,) each, and
-    attached. serial: None decides by size."""
-    t, bodies = topology, len(properties["soft"])
+    """Allocate and fill the fields. rest: (v,3) [m]; properties: soft, self_on, mode, thickness, edge, (n_bodies,) each; attached,
+    (n_bodies, n_bodies) bool, if any are. serial: None decides by size."""
+    t, bodies, attached = topology, len(properties["soft"]), properties.get("attached")
     n, v = len(t.triangle), len(t.node)
     serial_cheap = serial
     if serial is None:
@@ -119,7 +119,7 @@ def build_surface(
         spread=1 if serial else SPREAD[runtime.arch],
         cheap_spread=1 if serial_cheap else SPREAD[runtime.arch],
         mode=integers(arena, "contact_mode", properties["mode"]),
-        attached=integers(arena, "attached", properties["attached"].reshape(-1)) if properties["attached"].any() else None,
+        attached=integers(arena, "attached", attached.reshape(-1)) if attached is not None and attached.any() else None,
         rest=arena.vectors("surface_rest", ti.f64, max(v, 1), rest if v else None),
         area=arena.field("surface_area", ti.f64, max(n, 1)),
         exit_direction=arena.vectors("surface_exit_direction", ti.f64, max(v, 1)),
