@@ -17,6 +17,9 @@ demo: $(READY)
 	$(BIN)/taisoft run hanging_beam --headless --out $(DEMO_OUT) --overwrite
 	@echo "Written to $(DEMO_OUT): report.json (what happened), steps.csv (every step), frames/ (pictures), scene.usdc (USD)."
 
+# One thread for the dense algebra of each worker: more only spin on cores that the others need.
+test test-long: export OPENBLAS_NUM_THREADS := 1
+
 test: $(READY)
 	$(BIN)/python -m pytest -q -n auto --maxprocesses 8 --dist loadfile --no-loadscope-reorder
 

@@ -92,7 +92,10 @@ def rotation(F):
 def _trace_stress(t, p):
     """lambda t [Pa], t = tr(R^T F) - 3. p[4]: see `laws`."""
     s = p[1] * t
-    return s if ti.static(len(p) == 4) else s + p[4]
+    total = s
+    if ti.static(len(p) > 4):
+        total = s + p[4]
+    return total
 
 
 @ti.func

@@ -33,7 +33,10 @@ def _green_strain(F):
 def _trace_stress(t, p):
     """lambda t [Pa], t = tr(E). p[4]: see `laws`."""
     s = p[1] * t
-    return s if ti.static(len(p) == 4) else s + p[4]
+    total = s
+    if ti.static(len(p) > 4):
+        total = s + p[4]
+    return total
 
 
 @arithmetic

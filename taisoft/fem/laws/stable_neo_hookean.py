@@ -35,7 +35,10 @@ def _volume_change(H):
 def _volume_stress(J, p):
     """Derivative by J of the terms in J [Pa]. p[4]: see `laws`."""
     b = p[1] * (J - p[2])
-    return b if ti.static(len(p) == 4) else b + p[4]
+    total = b
+    if ti.static(len(p) > 4):
+        total = b + p[4]
+    return total
 
 
 @arithmetic
