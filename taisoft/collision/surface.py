@@ -89,8 +89,11 @@ def build_surface(
     arena: FieldArena,
     serial: bool | None = None,
 ) -> Surface:
-    """Allocate and fill the fields. rest: (v,3) [m]; properties: soft, self_on, mode, thickness, edge, (n_bodies,) each; attached,
-    (n_bodies, n_bodies) bool, if any are. serial: None decides by size."""
+    """Allocate and fill the fields.
+
+    rest: (v,3) [m]; properties: soft, self_on, mode, thickness and edge, (n_bodies,) each, and attached, (n_bodies, n_bodies)
+    bool, if any are. serial: None decides by size.
+    """
     t, bodies, attached = topology, len(properties["soft"]), properties.get("attached")
     n, v = len(t.triangle), len(t.node)
     serial_cheap = serial
