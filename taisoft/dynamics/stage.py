@@ -26,7 +26,7 @@ from taisoft.fem.state import END_SLOPE, N_NORMS, OTHER_SUM, START_SLOPE, SUM
 from taisoft.fem.terms import elasticity, rayleigh_damping
 from taisoft.linear.block_csr import BlockCsr, row_times
 from taisoft.linear.pcg import PcgWork, dot64, total
-from taisoft.ranges import entries_of
+from taisoft.ranges import entries_of, owners
 
 STAY, STEP, AGAIN = range(3)  # modes of `move`: stay, full step, another length of the same step
 ELASTIC_STAGE, LINEARISED, IMPACT = range(3)  # kinds of stages; IMPACT: see `impact`
@@ -245,7 +245,7 @@ def _with_patches(m: Model, start: np.ndarray, block: np.ndarray) -> tuple[np.nd
     patch, node = patch_nodes(m)
     tet_start, tet = download([m.mean.tet_start, m.mean.tet])
     counts = np.diff(tet_start)[patch]
-    key = np.concatenate([np.repeat(np.arange(len(start) - 1), np.diff(start)), np.repeat(node, counts)]) * m.n_blocks
+    key = np.concatenate([owners(np.diff(start)), np.repeat(node, counts)]) * m.n_blocks
     key = np.unique(key + np.concatenate([block, tet[entries_of(tet_start, patch)] // m.lanes]))
     return np.searchsorted(key, np.arange(len(start)) * m.n_blocks), key % m.n_blocks
 

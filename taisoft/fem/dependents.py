@@ -90,7 +90,7 @@ def dependent_table(scene: Scene) -> DependentTable | None:
     exact = scene.exact_attachments
     if not exact:
         return None
-    starts = dict(zip((b.name for b in scene.bodies), np.cumsum([0, *(b.n_nodes for b in scene.bodies)])))
+    starts = scene.first_nodes
     n = sum(body.n_nodes for body in scene.bodies)
     rows, columns, weights = [], [], []
     for one in exact:

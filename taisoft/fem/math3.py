@@ -192,3 +192,12 @@ def clamp_symmetric(A, sweeps: ti.template()):
     d = [ti.max(D[4 * k], 0.0) for k in ti.static(range(3))]
     QD = [Q[3 * i + j] * d[j] for i in ti.static(range(3)) for j in ti.static(range(3))]
     return matmul_nt(QD, Q)
+
+
+@arithmetic
+def plus_pressure(s, p):
+    """A stress s plus the pressure p[4] of mean dilatation, if a law's constants p have it; see `fem.laws`."""
+    total = s
+    if ti.static(len(p) > 4):
+        total = s + p[4]
+    return total

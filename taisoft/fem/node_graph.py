@@ -12,6 +12,7 @@ import numpy as np
 import taichi as ti
 
 from taisoft.mesh import topology
+from taisoft.ranges import owners
 
 # Pairs of an element's nodes, the lower first. Order 2: corner-corner (as order 1), corner-midpoint, midpoint-midpoint.
 PAIRS = {1: topology.EDGES, 2: (*topology.EDGES, *product(range(4), range(4, 10)), *combinations(range(4, 10), 2))}
@@ -28,6 +29,11 @@ class NodeGraph:
     upper: np.ndarray  # (n_pairs) index of (i, j) in column
     lower: np.ndarray  # (n_pairs) index of (j, i) in column
     pair: np.ndarray  # (k,) index in ends of each given pair
+
+    def entries(self, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
+        """Return the index in `column` of each (row, column), of pairs in the graph."""
+        n = np.int64(len(self.row_start) - 1)
+        return np.searchsorted(owners(np.diff(self.row_start)) * n + self.column, rows * n + columns)
 
 
 def node_graph(pairs: np.ndarray, n_nodes: int) -> NodeGraph:

@@ -128,8 +128,7 @@ class CavityForm:
 def cavity_form(scene: Scene, name: str) -> CavityForm:
     """The form of the cavity with this name. Raises SceneError if there is none."""
     body, cavity = scene.cavity(name)
-    first = sum(one.n_nodes for one in scene.bodies[: scene.bodies.index(body)])
-    return CavityForm(body, cavity, first)
+    return CavityForm(body, cavity, scene.first_nodes[body.name])
 
 
 def all_terms(scene: Scene, node_start: np.ndarray, terms) -> tuple[np.ndarray, np.ndarray]:
@@ -163,8 +162,7 @@ def build_pressures(scene: Scene, node_start: np.ndarray, arena: FieldArena, gra
         arrays |= dict.fromkeys(("stiffness_start", "stiffness_nodes", "stiffness_weight"))
     else:
         rows, weights = all_terms(scene, node_start, stiffness_terms)
-        keys = np.repeat(np.arange(n_nodes), np.diff(graph.row_start)) * n_nodes + graph.column
-        rows[:, 1] = np.searchsorted(keys, rows[:, 0] * n_nodes + rows[:, 1])
+        rows[:, 1] = graph.entries(rows[:, 0], rows[:, 1])
         arrays |= table("stiffness", rows, weights)
     closed = np.array([pressure.has_potential for _, pressure in pressures_of(scene)])
     arrays["has_potential"] = arena.field("pressure_has_potential", ti.i32, len(closed), closed)

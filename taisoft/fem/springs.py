@@ -17,6 +17,8 @@ import taichi as ti
 from taisoft.backend.arrays import Count, FieldArena, download, upload
 from taisoft.fem.dependents import dependent_table
 from taisoft.fem.loads import tension_slots
+from taisoft.fem.node_graph import NodeGraph
+from taisoft.ranges import owners
 from taisoft.scene.body import Body
 from taisoft.scene.connections import Attachment, Point, coincide, locate_nodes, start_of
 from taisoft.scene.locate import locate
@@ -40,7 +42,7 @@ class SpringTable:
     @property
     def element(self) -> np.ndarray:
         """Element (s,) of each entry."""
-        return np.repeat(np.arange(len(self.offset)), np.diff(self.start))
+        return owners(np.diff(self.start))
 
     def vectors(self, x: np.ndarray) -> np.ndarray:
         """e (e,3) [m] of node positions (n,3), or its rate of velocities if the offsets are left out."""
@@ -129,7 +131,7 @@ class _Builder:
 
     def __init__(self, scene: Scene):
         self.scene, self.elements = scene, {}
-        self._starts = dict(zip((b.name for b in scene.bodies), np.cumsum([0, *(b.n_nodes for b in scene.bodies)])))
+        self._starts = scene.first_nodes
         self._entries, self._numbers = [], []
 
     def between(self, p: Point, q: Point):
@@ -216,15 +218,13 @@ def build_springs(scene: Scene, arena: FieldArena, n_nodes: int, assembled: bool
     )
 
 
-def set_pair_entries(springs: Springs, row_start: np.ndarray, column: np.ndarray) -> None:
-    """Set `pair_at` for a matrix given as CSR rows with ascending columns, without the diagonal."""
+def set_pair_entries(springs: Springs, graph: NodeGraph) -> None:
+    """Set `pair_at` for a matrix with this pattern."""
     start, node = (a.astype(np.int64) for a in download([springs.start, springs.node]))
     groups = [node[first:last] for first, last in zip(start, start[1:])]
     rows = np.concatenate([np.repeat(own, len(own)) for own in groups])
     columns = np.concatenate([np.tile(own, len(own)) for own in groups])
-    n = len(row_start) - 1
-    keys = np.repeat(np.arange(n), np.diff(row_start)) * n + column
-    upload([(springs.pair_at, np.where(rows == columns, -1, np.searchsorted(keys, rows * n + columns)))])
+    upload([(springs.pair_at, np.where(rows == columns, -1, graph.entries(rows, columns)))])
 
 
 def _ids(arena: FieldArena, name: str, data: np.ndarray):

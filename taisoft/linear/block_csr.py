@@ -67,7 +67,7 @@ def build_block_csr(model: Model, arena: FieldArena, prefix: str = "stiffness") 
         raise SimulationError(f"{int(model.volume.shape[0]) * model.lanes} tets are too many to assemble a stiffness matrix")
     n_edges, rules = len(graph.ends), {}
     if model.springs is not None:
-        set_pair_entries(model.springs, graph.row_start, graph.column)
+        set_pair_entries(model.springs, graph)
 
     def copied(name: str, data: np.ndarray, dtype=ti.i32):
         return arena.field(f"{prefix}_{name}", dtype, data.shape, data)

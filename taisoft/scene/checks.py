@@ -128,6 +128,13 @@ def name(value, what: str, taken: list[str]) -> str:
     return value
 
 
+def free_name(value, kind: str, taken: list[str]) -> str:
+    """Return value as a `name` of a scene's kind of thing, or, if it is None, the first free one of kind0, kind1 and so on."""
+    if value is None:
+        value = next(free for free in (f"{kind}{i}" for i in range(len(taken) + 1)) if free not in taken)
+    return name(value, f"scene: {kind} name", taken)
+
+
 def axes(value, what: str) -> np.ndarray:
     """Return (3,) bool for a string such as "xz": some of x, y, z, without repetition."""
     if not isinstance(value, str) or not value or set(value) - set("xyz") or len(set(value)) != len(value):

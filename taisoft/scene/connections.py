@@ -212,9 +212,7 @@ def check_connections(scene: "Scene") -> None:
 def check_exact(scene: "Scene") -> None:
     """Raise SceneError if an exactly attached node is constrained or attached twice, or bodies differ in damping."""
     taken: dict[str, set[int]] = {}
-    for one in scene.attachments:
-        if one.stiffness is not None:
-            continue
+    for one in scene.exact_attachments:
         what, body, own = f"attachment {one.name!r}", scene.body(one.a), taken.setdefault(one.a, set())
         fixed = {node for constraint in body.constraints for node in constraint.nodes.tolist()}
         for rule, others in (("fixed or moved, too: leave it out there or here", fixed), ("attached already", own)):
@@ -322,7 +320,4 @@ def _check_any_body(scene: "Scene", points: tuple[Point, ...], what: str) -> Non
 
 def _free_name(scene: "Scene", name: str | None, kind: str) -> str:
     """Return the name, or the first free default name; names are unique among all connections. Raises SceneError."""
-    taken = [one.name for one in scene.connections]
-    if name is None:
-        name = next(free for free in (f"{kind}{i}" for i in range(len(taken) + 1)) if free not in taken)
-    return checks.name(name, f"scene: {kind} name", taken)
+    return checks.free_name(name, kind, [one.name for one in scene.connections])

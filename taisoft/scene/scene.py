@@ -140,6 +140,11 @@ class Scene(Guarded):
         check_connections(self)
 
     @property
+    def first_nodes(self) -> dict[str, int]:
+        """The first node of each body, by its name, where nodes are counted through all bodies."""
+        return dict(zip((body.name for body in self.bodies), np.cumsum([0, *(body.n_nodes for body in self.bodies)]).tolist()))
+
+    @property
     def exact_attachments(self) -> list[Attachment]:
         """The attachments without springs."""
         return [one for one in self.attachments if one.stiffness is None]
@@ -278,10 +283,7 @@ class Scene(Guarded):
 
     def _free_name(self, name: str | None, kind: str) -> str:
         """Return the name, or the first free default name if it is None. Raises SceneError if it is taken."""
-        taken = [one.name for one in self.colliders]
-        if name is None:
-            name = next(free for free in (f"{kind}{i}" for i in range(len(taken) + 1)) if free not in taken)
-        return checks.name(name, f"scene: {kind} name", taken)
+        return checks.free_name(name, kind, [one.name for one in self.colliders])
 
 
 def _find(items: list, name: str, kind: str) -> Body | Obstacle | Cavity:

@@ -21,6 +21,7 @@ from taisoft.fem.math3 import (
     matmul,
     matmul_nt,
     matmul_tn,
+    plus_pressure,
     signed_svd,
     transform,
 )
@@ -91,11 +92,7 @@ def rotation(F):
 @arithmetic
 def _trace_stress(t, p):
     """lambda t [Pa], t = tr(R^T F) - 3. p[4]: see `laws`."""
-    s = p[1] * t
-    total = s
-    if ti.static(len(p) > 4):
-        total = s + p[4]
-    return total
+    return plus_pressure(p[1] * t, p)
 
 
 @ti.func

@@ -9,7 +9,7 @@ reflection), so compressed bodies collapse.
 import taichi as ti
 
 from taisoft.backend.tracing import arithmetic
-from taisoft.fem.math3 import add_to_diagonal, ddot, dot, matmul, matmul_nt, matmul_tn, transform
+from taisoft.fem.math3 import add_to_diagonal, ddot, dot, matmul, matmul_nt, matmul_tn, plus_pressure, transform
 
 NAME = "st_venant_kirchhoff"
 SOFTENS_BELOW = 0.6  # stretch that triggers a warning, slightly above 1/sqrt(3)
@@ -32,11 +32,7 @@ def _green_strain(F):
 @arithmetic
 def _trace_stress(t, p):
     """lambda t [Pa], t = tr(E). p[4]: see `laws`."""
-    s = p[1] * t
-    total = s
-    if ti.static(len(p) > 4):
-        total = s + p[4]
-    return total
+    return plus_pressure(p[1] * t, p)
 
 
 @arithmetic

@@ -10,7 +10,7 @@ rubber. Stress-free states exist only with the log term, which is kept here.
 import taichi as ti
 
 from taisoft.backend.tracing import arithmetic
-from taisoft.fem.math3 import cofactor, cofactor_differential, cross, ddot, dot, transform
+from taisoft.fem.math3 import cofactor, cofactor_differential, cross, ddot, dot, plus_pressure, transform
 
 NAME = "stable_neo_hookean"
 SOFTENS_BELOW = 0.0
@@ -34,11 +34,7 @@ def _volume_change(H):
 @arithmetic
 def _volume_stress(J, p):
     """Derivative by J of the terms in J [Pa]. p[4]: see `laws`."""
-    b = p[1] * (J - p[2])
-    total = b
-    if ti.static(len(p) > 4):
-        total = b + p[4]
-    return total
+    return plus_pressure(p[1] * (J - p[2]), p)
 
 
 @arithmetic
