@@ -8,8 +8,11 @@ from taisoft.backend import runtime
 from taisoft.backend.arrays import upload
 from taisoft.dynamics.drag_spring import Drag
 from taisoft.errors import SceneError, SimulationError
+from taisoft.fem.reference import gravity_mass
 from taisoft.fem.terms import elasticity
 from taisoft.records import Energies, ErrorEstimate
+from taisoft.scene.body import Body
+from taisoft.scene.rigid import Pose, RigidBody, Twist
 from taisoft.stability import stable_dt as largest_stable_dt
 
 if TYPE_CHECKING:
@@ -176,9 +179,54 @@ def contacts(self: "Simulator") -> "Contacts":
 
 def contact_force(self: "Simulator", name: str) -> np.ndarray:
     """Return the total contact force (3,) on a body or an obstacle in the last step [N]."""
-    contact, scene = self._open().contact, self.scene
+    return _contact_force_and_moment(self, name)[:3]
+
+
+def contact_torque(self: "Simulator", name: str) -> np.ndarray:
+    """Return the torque (3,) of the contact forces on a body about its centre of mass, on an obstacle about its pivot, of the
+    last step [N m]."""
+    total, one = _contact_force_and_moment(self, name), self.scene.collider(name)
+    if isinstance(one, Body):
+        nodes, (x, _) = nodes_of(self, name), self._host().state.state()
+        centre = np.average(x[nodes], axis=0, weights=gravity_mass(one))
+    else:
+        centre = one.shape.pivot + one.pose(self.time)[0]
+    return total[3:] - np.cross(centre, total[:3])
+
+
+def _contact_force_and_moment(sim: "Simulator", name: str) -> np.ndarray:
+    """Force [N] on a collider and its moment about the origin [N m], (6,)."""
+    contact, scene = sim._open().contact, sim.scene
     scene.surface_of(name)
-    return np.zeros(3) if contact is None else contact.force([c.name for c in scene.colliders].index(name))
+    return np.zeros(6) if contact is None else contact.force_and_moment([c.name for c in scene.colliders].index(name))
+
+
+# --- rigid bodies -----------------------------------------------------------------------------------------------------
+
+
+def pose(self: "Simulator", name: str) -> Pose:
+    """Return translation (3,) [m] of a rigid body's centre since the start, and rotation (3,3) about it.
+
+    A point at X in the mesh is at rotation @ (X - body.centre) + body.centre + body.position + translation. Raises SceneError.
+    """
+    return _rigid(self, name).pose(self.positions(name))
+
+
+def twist(self: "Simulator", name: str) -> Twist:
+    """Return the velocity (3,) [m/s] of a rigid body's centre, and its angular velocity (3,) [rad/s]. Raises SceneError."""
+    return _rigid(self, name).twist(self.positions(name), self.velocities(name))
+
+
+def rigid_strain(self: "Simulator", name: str) -> float:
+    """Return the largest strain of a rigid body in the present state, which its stiffness keeps small. Raises SceneError."""
+    return _rigid(self, name).strain(self.positions(name))
+
+
+def _rigid(sim: "Simulator", name: str) -> RigidBody:
+    body = sim.scene.body(name)
+    if not isinstance(body, RigidBody):
+        raise SceneError(f"body {name!r} is not rigid: its motion is that of its nodes, see positions and velocities")
+    return body
 
 
 def deepest_overlap(self: "Simulator") -> "Overlap | None":

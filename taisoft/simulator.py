@@ -151,6 +151,10 @@ class Simulator(Guarded):
     detect_contacts = queries.detect_contacts
     contacts = queries.contacts
     contact_force = queries.contact_force
+    contact_torque = queries.contact_torque
+    pose = queries.pose
+    twist = queries.twist
+    rigid_strain = queries.rigid_strain
     deepest_overlap = queries.deepest_overlap
     overlaps = queries.overlaps
     intersecting_triangles = queries.intersecting_triangles

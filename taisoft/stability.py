@@ -98,7 +98,8 @@ def highest_frequency(body: Body) -> float:
     """omega_max [rad/s] of a body at rest with lumped mass, by Lanczos; overestimated by a fraction of a percent."""
     mass = reference.lumped_mass(body)
     free = ~constrained_axes(body, prescribed=False)  # a path may release its nodes
-    scale = np.where(free, 1.0 / np.sqrt(mass)[:, None], 0.0)
+    free[body.nodes.n_elastic :] = False
+    scale = np.where(free, 1.0 / np.sqrt(np.where(free, mass[:, None], 1.0)), 0.0)
     if not free.any():
         return 0.0
     apply = hooke_differential(body)
@@ -120,7 +121,7 @@ def scale_warnings(scene: Scene) -> list[str]:
     for body in scene.bodies:
         size = float(np.ptp(body.rest_positions, axis=0).max())
         mass, volume, gravity = body.mass, float(body.mesh.volumes.sum()), float(np.linalg.norm(scene.gravity))
-        young = volume / float(np.sum(body.mesh.volumes / body.young))  # of layers in series
+        young = volume / float(np.sum(body.mesh.volumes / body.composition.number("young")))  # of layers in series
         strain = mass / volume * gravity * size / young
         if strain > MAX_WEIGHT_STRAIN:
             crossing = size / np.sqrt(young * volume / mass)
@@ -159,7 +160,8 @@ def stable_dt(scene: Scene, verlet: bool) -> float:
     connected = {owner for one in scene.connections for owner in one.owners}
     square, rate = spring_rates(scene) if connected else (0.0, 0.0)
     dependents = dependent_table(scene)
-    growth = 1.0 if dependents is None else dependents.growth
+    elastic = np.concatenate([np.arange(body.n_nodes) < body.nodes.n_elastic for body in scene.bodies])
+    growth = 1.0 if dependents is None else dependents.growth(elastic)
     for body in scene.bodies:
         omega, material, own_square, own_rate = highest_frequency(body), body.composition.first, 0.0, 0.0
         if omega > 0.0:

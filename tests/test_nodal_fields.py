@@ -15,7 +15,8 @@ from rotations import rotation
 from scenes import SNH, SVK, mixed_scene, rubber
 
 import taisoft as ts
-from taisoft.output.nodal_fields import NodalMean, contact_impulses, von_mises
+from taisoft.dynamics.contact_record import nodal_impulses
+from taisoft.output.nodal_fields import NodalMean, von_mises
 
 Q = rotation((1, -2, 0.5), 1.1)
 F = np.array([[1.1, 0.05, 0.0], [0.02, 0.95, -0.04], [0.03, 0.0, 1.02]])
@@ -123,14 +124,14 @@ def test_nodal_impulses_add_up_to_those_of_the_contacts():
     touching, kinds = set(), set()
     with ts.Simulator(scene, dt=dt, integrator="symplectic_euler", precision="f64") as sim:
         n = len(sim.positions())
-        assert contact_impulses(sim.contacts(), n).shape == (n, 3) and not contact_impulses(sim.contacts(), n).any()
+        assert nodal_impulses(sim.contacts(), n).shape == (n, 3) and not nodal_impulses(sim.contacts(), n).any()
         for _ in range(40):
             sim.step()
             c = sim.contacts()
             active = c.impulse.any(axis=1)
             touching |= set(zip(c.body_a[active], c.body_b[active]))
             kinds |= set(c.kind[active])
-            impulses, first = contact_impulses(c, n), 0
+            impulses, first = nodal_impulses(c, n), 0
             rounding = 1e-15 * np.abs(c.impulse).sum()
             for body in scene.bodies:
                 own = impulses[first : first + body.n_nodes]

@@ -56,7 +56,7 @@ def test_first_order_is_the_mesh(mesh):
     nodes = make_nodes(mesh, 1)
     assert nodes.positions is mesh.vertices and nodes.surface is mesh.surface
     assert nodes.elements is mesh.tets and nodes.tets is mesh.tets
-    assert np.array_equal(nodes.surface_tets, mesh.tets[mesh.surface_tets])
+    assert np.array_equal(nodes.boundary_tets, mesh.tets[mesh.surface_tets])
 
 
 @each_mesh
@@ -113,16 +113,16 @@ def test_linear_triangles_are_the_boundary_of_the_linear_tets(mesh):
 @each_mesh
 def test_each_triangle_is_an_outward_face_of_its_tet(mesh, order):
     nodes = make_nodes(mesh, order)
-    assert (volumes(nodes.positions, nodes.surface_tets) > 0).all()
+    assert (volumes(nodes.positions, nodes.boundary_tets) > 0).all()
     all_tets = {tuple(sorted(tet)) for tet in nodes.tets.tolist()}
-    for triangle, tet in zip(nodes.surface, nodes.surface_tets):
+    for triangle, tet in zip(nodes.surface, nodes.boundary_tets):
         assert canonical(triangle) in [canonical(tet[face]) for face in TET_FACES]
         assert tuple(sorted(tet.tolist())) in all_tets
         (top,) = set(tet.tolist()) - set(triangle.tolist())
         a, b, c, d = nodes.positions[[*triangle, top]]
         assert np.dot(np.cross(b - a, c - a), d - a) < 0
     owner = mesh.tets[mesh.surface_tets] if order == 1 else np.repeat(nodes.elements[mesh.surface_tets], 4, axis=0)
-    assert (nodes.surface_tets[:, :, None] == owner[:, None, :]).any(axis=2).all()
+    assert (nodes.boundary_tets[:, :, None] == owner[:, None, :]).any(axis=2).all()
 
 
 def canonical(triangle) -> tuple[int, ...]:
@@ -144,7 +144,7 @@ def test_the_split_does_not_depend_on_the_order_of_corners(seed, which):
     reordered = TetMesh(mesh.vertices, np.take_along_axis(mesh.tets, order, axis=1))
     a, b = make_nodes(mesh, 2), make_nodes(reordered, 2)
     assert np.array_equal(a.positions, b.positions) and as_sets(a) == as_sets(b)
-    key = lambda n: {(canonical(f), tuple(sorted(t))) for f, t in zip(n.surface, n.surface_tets.tolist())}  # noqa: E731
+    key = lambda n: {(canonical(f), tuple(sorted(t))) for f, t in zip(n.surface, n.boundary_tets.tolist())}  # noqa: E731
     assert key(a) == key(b)
 
 
@@ -157,7 +157,7 @@ def test_rounding_does_not_choose_among_equal_diagonals():
 @pytest.mark.parametrize("order", [1, 2])
 def test_arrays_are_read_only(order):
     nodes = make_nodes(MESHES[0], order)
-    for array in (nodes.positions, nodes.elements, nodes.surface, nodes.surface_tets, nodes.tets):
+    for array in (nodes.positions, nodes.elements, nodes.surface, nodes.boundary_tets, nodes.tets):
         with pytest.raises(ValueError, match="read-only"):
             array[0] = 0
 

@@ -25,9 +25,10 @@ from fake_simulator import FakeSimulator, beam_scene
 from pxr import Tf, Usd, UsdGeom, UsdLux, UsdShade
 from usd_stage import check_frames, faults
 
+from taisoft.dynamics.contact_record import nodal_impulses
 from taisoft.errors import OutputError
 from taisoft.output.camera import Camera, start_positions
-from taisoft.output.nodal_fields import NodalMean, contact_impulses, von_mises
+from taisoft.output.nodal_fields import NodalMean, von_mises
 from taisoft.output.usd import UsdWriter, join_chunks
 from taisoft.output.usd_scene import prim_names
 
@@ -95,14 +96,14 @@ def primvar(stage, path, name, index):
     return np.array(values.Get(index))
 
 
-def test_points_have_stress_and_contact_impulses(exported):
+def test_points_have_stress_and_nodal_impulses(exported):
     _, scene, _, stage = exported
     sim, mean = FakeSimulator(scene), NodalMean(scene.bodies)
     first = np.cumsum([0] + [body.n_nodes for body in scene.bodies])
     for index in (0, 1, 22):
         sim.time = index / 30
         contacts = sim.contacts()
-        stress, impulses = von_mises(mean(sim.stress())), contact_impulses(contacts, first[-1])
+        stress, impulses = von_mises(mean(sim.stress())), nodal_impulses(contacts, first[-1])
         assert stress.min() >= 0 and np.ptp(stress) > 1e3 and impulses.any()
         for k, (body, prim_name) in enumerate(zip(scene.bodies, prim_names(list(NAMES)))):
             own, path = slice(first[k], first[k + 1]), f"/World/{prim_name}"

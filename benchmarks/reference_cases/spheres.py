@@ -104,7 +104,7 @@ def inner_radius(mesh: ts.TetMesh, law: str, pressure: float, arch: str = "cpu")
     triangles = inside(mesh, INNER)
     body.add_pressure(triangles, pressure)
     result = ts.solve_static(made, arch=arch)
-    facets = body.nodes.surface.reshape(len(mesh.surface), 4, 3)[triangles].reshape(-1, 3)
+    facets = body.nodes.boundary.reshape(len(mesh.surface), 4, 3)[triangles].reshape(-1, 3)
     return float(np.cbrt(cone_volume(result.positions(), facets) * 6.0 / np.pi)), result
 
 

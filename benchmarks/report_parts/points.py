@@ -88,7 +88,7 @@ class PlainPoints:
         bodies = rig.scene.bodies
         self._grids = [body_grid(b, rig.scene.collision.field_cells, 2.0 * d.margin) for b in bodies]
         starts = np.cumsum([0] + [b.n_nodes for b in bodies])
-        self._behind = np.concatenate([b.nodes.surface_tets + n for b, n in zip(bodies, starts)])
+        self._behind = np.concatenate([b.nodes.boundary_tets + n for b, n in zip(bodies, starts)])
         self._rest = np.concatenate([b.nodes.positions for b in bodies])
 
     def find(self, pairs: np.ndarray) -> list[tuple[int, int, np.ndarray, float]]:

@@ -94,7 +94,7 @@ def build_fields(
     n, count = max(int(first[-1]), 1), len(used)
     behind, tet_corner, inverse = np.zeros((n, 4), dtype=np.int32), np.zeros((n, 3)), np.zeros((n, 3, 3))
     for k, body in enumerate(bodies):
-        rows, tets = slice(first[k], first[k + 1]), body.nodes.surface_tets
+        rows, tets = slice(first[k], first[k + 1]), body.nodes.boundary_tets
         rest = body.nodes.positions[tets]
         behind[rows], tet_corner[rows] = tets + node_start[k], rest[:, 0]
         inverse[rows] = np.linalg.inv((rest[:, 1:] - rest[:, :1]).transpose(0, 2, 1))

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+import scipy.sparse as sp
 
 from taisoft.backend.arrays import download
 from taisoft.collision.analytic import AnalyticObstacles
@@ -30,9 +31,11 @@ from taisoft.mesh.solids import (
     is_closed,
     overlap_depth,
     segment_distance,
+    shell_tets,
 )
 from taisoft.scene.body import Body
 from taisoft.scene.connections import attached_pairs
+from taisoft.scene.locate import locate
 from taisoft.scene.obstacles import Capsule, HalfSpace, Obstacle, Sphere
 from taisoft.scene.scene import Scene
 
@@ -85,11 +88,14 @@ def _solids(detection: "Detection") -> list[Solid]:
     solids = []
     for k, collider in enumerate(detection.scene.colliders):
         used, triangles = np.unique(topology.triangle[topology.first[k] : topology.first[k + 1]], return_inverse=True)
-        if k < len(detection.scene.bodies):
+        triangles = triangles.reshape(-1, 3)
+        if k < len(detection.scene.bodies) and collider.nodes.embedded is not None:
+            body = shell_tets(x[used], triangles, float(detection.thickness[k]))
+        elif k < len(detection.scene.bodies):
             body = nodes[start[k] : start[k + 1]], collider.nodes.tets
         else:
             body = np.zeros((0, 3)), np.zeros((0, 4), dtype=np.int64)
-        solids.append(Solid(x[used], triangles.reshape(-1, 3), *body))
+        solids.append(Solid(x[used], triangles, *body))
     return solids
 
 
@@ -147,14 +153,18 @@ class Containment:
         self._soft = np.arange(len(colliders)) < n_bodies
         self._part = np.zeros(len(topology.triangle), dtype=np.int64)  # part of each triangle, from 0 in each collider
         self._closed, self._n_parts = np.zeros(len(colliders), dtype=bool), np.zeros(len(colliders), dtype=np.int64)
-        nodes, triangles, inner_depth, room = [np.zeros((0, 4), dtype=np.int64)], [np.zeros(0, dtype=np.int64)], [np.zeros(0)], []
+        n_nodes = len(self._layout.rest)
+        inner, triangles, inner_depth, room = [sp.csr_matrix((0, n_nodes))], [np.zeros(0, dtype=np.int64)], [np.zeros(0)], []
         for k in self._solid:
             first, last = topology.first[k : k + 2]
             own = topology.triangle[first:last]
             self._closed[k] = is_closed(own)
             if k < n_bodies:
-                best, rooms = self._inner_tets(colliders[k], slice(first, last))
-                nodes.append(self._layout.node_start[k] + colliders[k].nodes.tets[best])
+                find = self._inner_tets if colliders[k].nodes.embedded is None else self._inner_of_embedded
+                nodes, weights, rooms = find(colliders[k], slice(first, last))
+                best, nodes = nodes, nodes + self._layout.node_start[k]
+                starts = np.arange(len(nodes) + 1) * nodes.shape[1]
+                inner.append(sp.csr_matrix((weights.reshape(-1), nodes.reshape(-1), starts), shape=(len(nodes), n_nodes)))
             else:
                 self._part[first:last] = connected_parts(own)
                 best, depths, rooms = inner_depths(self._rest, own, self._part[first:last])
@@ -162,7 +172,10 @@ class Containment:
                 inner_depth.append(depths)
             self._n_parts[k] = len(best)
             room.append(rooms)
-        self._nodes, self._triangles, self._inner_depth = (np.concatenate(x) for x in (nodes, triangles, inner_depth))
+        self._inner, self._triangles, self._inner_depth = (
+            sp.vstack(inner, format="csr"),
+            *map(np.concatenate, (triangles, inner_depth)),
+        )
         self._room = np.concatenate([*room, [shape.radius for _, _, shape in self._round]])
         counts = self._n_parts[self._solid]
         self._owner = np.concatenate([np.repeat(self._solid, counts), np.array([k for _, k, _ in self._round], dtype=np.int64)])
@@ -175,14 +188,26 @@ class Containment:
         self._corners = self._inner_points = np.zeros((0, 3))  # last triangles, and the inner points behind them
         self._ready = True
 
-    def _inner_tets(self, body: Body, rows: slice) -> tuple[np.ndarray, np.ndarray]:
-        """`inner_tets` of a body at rest with triangles `rows`."""
+    def _inner_tets(self, body: Body, rows: slice) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Nodes (k,4) and weights (k,4) of an inner point of each part of a body with triangles `rows`, and its clearance [m]."""
         tets = body.nodes.tets
         parts = connected_parts(tets) if body.mesh.n_components > 1 else np.zeros(len(tets), dtype=np.int64)
         of_node = np.zeros(body.n_nodes, dtype=np.int64)
         of_node[tets] = parts[:, None]
         self._part[rows] = of_node[body.nodes.surface[:, 0]]
-        return inner_tets(body.rest_positions, tets, parts)
+        best, rooms = inner_tets(body.rest_positions, tets, parts)
+        return tets[best], np.full((len(best), 4), 0.25), rooms
+
+    def _inner_of_embedded(self, body: Body, rows: slice) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The same of a body whose surface is embedded: nodes and weights (k, 4 or 10)."""
+        own, x = body.nodes.surface, body.rest_positions
+        self._part[rows] = connected_parts(own)
+        best, depths, rooms = inner_depths(x, own, self._part[rows])
+        corners = x[own[best]]
+        normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+        nodes, weights, _ = locate(body, corners.mean(axis=1) - depths[:, None] * normal)
+        return nodes, weights, rooms
 
     def find(self, surface: Surface, x_nodes, shapes: AnalyticObstacles) -> list[Inside]:
         """Return all containments. surface, shapes: as of the last search; x_nodes: field of the model's nodes [m]."""
@@ -204,13 +229,13 @@ class Containment:
             results = (self._test_point(int(k), int(self._solid[b]), points[k], x) for k, b in np.argwhere(boxed))
             found += [result for result in results if result is not None]
         for i, b, shape in self._round:
-            depth = _round_depths(shape, (points[: len(self._nodes)] - frames[0][i]) @ frames[1][3 * i : 3 * i + 3])
+            depth = _round_depths(shape, (points[: self._inner.shape[0]] - frames[0][i]) @ frames[1][3 * i : 3 * i + 3])
             found += [Inside(int(self._owner[k]), b, float(depth[k]), float(self._room[k])) for k in np.flatnonzero(depth > 0.0)]
         return found
 
     def _points(self, x: np.ndarray | None, nodes: np.ndarray, frames: list[np.ndarray] | None) -> np.ndarray:
         """Return the inner points (n,3) [m] of bodies, of obstacles with triangles, and of round obstacles."""
-        points = [0.25 * nodes[self._nodes].sum(axis=1)]
+        points = [self._inner @ nodes]
         if len(self._triangles):
             corners = x[self._topology.triangle[self._triangles]]
             if not np.array_equal(corners, self._corners):  # most obstacles are static

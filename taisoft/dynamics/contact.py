@@ -29,7 +29,7 @@ from taisoft.dynamics.contact_measures import (
     Crossing,
 )
 from taisoft.dynamics.contact_paths import ContactPaths
-from taisoft.dynamics.contact_record import read_rows, record_contacts, sum_impulses, write_rows
+from taisoft.dynamics.contact_record import read_rows, record_contacts, sum_impulses, sum_moments, write_rows
 from taisoft.dynamics.impact import Rebounds
 from taisoft.dynamics.simulation_state import SimulationState
 from taisoft.errors import SimulationError
@@ -77,7 +77,7 @@ class ContactStep:
         self._last_time = 0.0
         self.penetration = 0.0  # at the end of the last step [m],
         self.relative_penetration = 0.0  # and over the finer side's mean surface edge
-        self._impulse_sum: np.ndarray | None = None  # (n_colliders, 3) [N s] over the last step's substeps, if several
+        self._impulse_sum: np.ndarray | None = None  # (n_colliders, 6) over the last step's substeps, if several: see `_impulses`
         self._step_dt = 0.0  # of the last step [s]
         self._impulse_fraction = 1.0
         self.had_impact = False  # whether surfaces met in the last step
@@ -180,12 +180,7 @@ class ContactStep:
         simulation, d, searched = self.simulation, self.detection, self._searched
         if searched is None or searched[1] != dt or abs(searched[0] - time) > 1e-6 * dt:
             self._searched = None
-            prescribed_nodes = simulation.dirichlet.prescribed_nodes
-            prescribed = None
-            if len(prescribed_nodes):
-                x = simulation.model.state.x.to_numpy()[prescribed_nodes]
-                prescribed = prescribed_nodes, simulation.dirichlet.target_positions(time + dt) - x
-            self._find(time, dt, prescribed)
+            self._find(time, dt, simulation.prescribed_moves(time + dt))
             self._searched, self._searched_dt = (time, dt), dt
         return d.counts.contacts
 
@@ -251,13 +246,18 @@ class ContactStep:
         if not self.paths.none_cross:
             self.paths.exempt_crossing()
         if self._substep_fraction < 1.0:
-            impulses = sum_impulses(self.contacts(), self.simulation.scene)
+            impulses = self._impulses()
             self._impulse_sum = impulses + (0.0 if self._impulse_sum is None else self._impulse_sum)
 
-    def force(self, collider: int) -> np.ndarray:
-        """Return the mean contact force (3,) on a collider over the last step [N]."""
-        total = sum_impulses(self.contacts(), self.simulation.scene) if self._impulse_sum is None else self._impulse_sum
-        return total[collider] / self._step_dt if self._step_dt > 0.0 else np.zeros(3)
+    def _impulses(self) -> np.ndarray:
+        """Impulses [N s] and their moments about the origin [N m s] on the colliders in the last substep, (n_colliders, 6)."""
+        contacts, scene, x = self.contacts(), self.simulation.scene, self.simulation.state()[0]
+        return np.hstack([sum_impulses(contacts, scene), sum_moments(contacts, scene, x)])
+
+    def force_and_moment(self, collider: int) -> np.ndarray:
+        """Return the mean contact force [N] on a collider over the last step, and its moment about the origin [N m], (6,)."""
+        total = self._impulses() if self._impulse_sum is None else self._impulse_sum
+        return total[collider] / self._step_dt if self._step_dt > 0.0 else np.zeros(6)
 
     def penetrates_deeper(self, time: float, dt: float, before: float) -> bool:
         """Return whether a substep of dt that ends at a time leaves a new or deeper penetration.

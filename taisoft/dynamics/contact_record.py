@@ -28,6 +28,36 @@ def sum_impulses(contacts: Contacts, scene: Scene) -> np.ndarray:
     return total
 
 
+def sum_moments(contacts: Contacts, scene: Scene, x: np.ndarray) -> np.ndarray:
+    """Return the moment of the given contacts' impulses on each collider about the origin, (n_colliders, 3) [N m s].
+
+    x: (n_nodes, 3) [m]; impulses act on a body at its nodes, and on an obstacle at the contact points.
+    """
+    starts = np.cumsum([0, *(body.n_nodes for body in scene.bodies)])
+    moments = np.concatenate([np.zeros((1, 3)), np.cross(x, nodal_impulses(contacts, len(x))).cumsum(axis=0)])
+    total = np.zeros((len(scene.colliders), 3))
+    total[: len(scene.bodies)] = np.diff(moments[starts], axis=0)
+    for k, obstacle in enumerate(scene.obstacles, len(scene.bodies)):
+        own = contacts.body_b == obstacle.name
+        total[k] = -np.cross(contacts.point[own], contacts.impulse[own]).sum(axis=0)
+    return total
+
+
+def nodal_impulses(contacts: Contacts, n_nodes: int) -> np.ndarray:
+    """Return the contact impulses (n_nodes, 3) [N s] on the nodes of all bodies, in the order added.
+
+    contacts: a record from `Simulator.contacts`. Each impulse is distributed to the nodes that it acted on in the solver, by
+    their weights, with its sign on side a and the opposite on side b, so that sums over a body are those of its contacts.
+    """
+    signs = np.repeat([1.0, -1.0], contacts.weights.shape[1] // 2)
+    parts = (signs * contacts.weights)[:, :, None] * contacts.impulse[:, None]  # (k,6 or more,3)
+    used = contacts.nodes >= 0
+    total = np.zeros((n_nodes, 3))
+    for axis in range(3):
+        total[:, axis] = np.bincount(contacts.nodes[used], parts[used][:, axis], n_nodes)
+    return total
+
+
 def _sides(node: np.ndarray, weight: np.ndarray, arity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return nodes and weights (n, 2 k) of a problem's contacts, k of each side, as the record stores them.
 

@@ -82,6 +82,20 @@ class SimulationState:
             self.set_cavity_pressures(np.zeros(len(self.loads.given_volumes)))
         self.set_load_time(0.0)
 
+    def prescribed_moves(self, t: float) -> tuple[np.ndarray, np.ndarray] | None:
+        """Return nodes (k,) whose motion from the present state to a time t [s] is prescribed, those that depend on such nodes
+        included, and their displacements (k,3) [m], nan where free; None if there are none."""
+        nodes = self.dirichlet.prescribed_nodes
+        if not len(nodes):
+            return None
+        moves = self.dirichlet.target_positions(t) - self.model.state.x.to_numpy()[nodes]
+        if self.dependents is None:
+            return nodes, moves
+        every = np.where(self.dirichlet.constrained(), 0.0, np.nan)  # of fixed nodes, and of those whose path gives None
+        row, axis = np.nonzero(~np.isnan(moves))
+        every[nodes[row], axis] = moves[row, axis]
+        return np.concatenate([nodes, self.dependents.node]), np.concatenate([moves, self.dependents.rows @ every])
+
     def upload_constraints(self) -> None:
         """Upload the free axes."""
         free = ~self.dirichlet.constrained()

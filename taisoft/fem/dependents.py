@@ -1,4 +1,4 @@
-"""Dependent nodes: those of exact attachments, x_d = sum_i w_i x_i of independent nodes i.
+"""Dependent nodes, x_d = sum_i w_i x_i of independent nodes i: those of exact attachments, and of embedded surfaces.
 
 With x = T q of the independent positions q, forces act as T^T f, and matrices as T^T A T. The lumped mass of a dependent node
 goes to its independent ones in proportion to |w_i|: any share conserves momentum and angular momentum, and masses stay positive
@@ -56,7 +56,8 @@ class DependentTable:
         share = abs(self.rows)
         share = sp.diags(1.0 / np.asarray(share.sum(axis=1)).ravel()) @ share
         moved = mass + share.T @ mass[self.node]
-        moved[self.node] = KEPT_MASS * mass[self.node]
+        own = mass[self.node]
+        moved[self.node] = KEPT_MASS * np.where(own > 0.0, own, share @ mass)  # embedded nodes have none
         return moved
 
     @property
@@ -64,10 +65,13 @@ class DependentTable:
         """Largest number of nodes that a node depends on."""
         return int(np.diff(self.start).max())
 
-    @property
-    def growth(self) -> float:
-        """Largest sum |w_i|, at least 1: by its square the highest frequency of the dependent nodes' tets may grow."""
-        return float(abs(self.rows).sum(axis=1).max())
+    def growth(self, elastic: np.ndarray) -> float:
+        """Largest sum |w_i|, at least 1: by its square the highest frequency of the dependent nodes' tets may grow.
+
+        elastic: (n_nodes,) bool, which nodes belong to tets.
+        """
+        sums = np.asarray(abs(self.rows).sum(axis=1)).ravel()
+        return float(sums[elastic[self.node]].max(initial=1.0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,8 +91,8 @@ class Dependents:
 
 def dependent_table(scene: Scene) -> DependentTable | None:
     """The dependent nodes of a scene; None if it has none. Raises SceneError for nodes that depend on themselves."""
-    exact = scene.exact_attachments
-    if not exact:
+    exact, embedding = scene.exact_attachments, [body for body in scene.bodies if body.nodes.embedded is not None]
+    if not exact and not embedding:
         return None
     starts = scene.first_nodes
     n = sum(body.n_nodes for body in scene.bodies)
@@ -98,11 +102,16 @@ def dependent_table(scene: Scene) -> DependentTable | None:
         rows.append(np.repeat(starts[one.a] + one.nodes, nodes.shape[1]))
         columns.append((starts[one.b] + nodes).reshape(-1))
         weights.append(own.reshape(-1))
+    for body in embedding:
+        embedded, first = body.nodes.embedded.tocoo(), starts[body.name]
+        rows.append(first + body.nodes.n_elastic + embedded.row)
+        columns.append(first + embedded.col)
+        weights.append(embedded.data)
     direct = sp.csr_matrix((np.concatenate(weights), (np.concatenate(rows), np.concatenate(columns))), shape=(n, n))
     direct.eliminate_zeros()
     node = np.unique(np.concatenate(rows))
     on_dependent, total = sp.diags(np.isin(np.arange(n), node).astype(float)), direct
-    for _ in exact:
+    for _ in (*exact, *embedding[:1]):  # embedded nodes depend on others of their body alone
         chained = total @ on_dependent
         chained.eliminate_zeros()
         if chained.nnz == 0:

@@ -75,7 +75,7 @@ def triangle_nodes(body: Body, triangles: np.ndarray) -> np.ndarray:
     """Nodes (k, 3 or 6) of rows (k,) of mesh.surface: corners, then the middles of their edges."""
     if body.order == 1:
         return body.mesh.surface[triangles]
-    split = body.nodes.surface.reshape(-1, 4, 3)[triangles]  # (a, ab, ca), (ab, b, bc), (ca, bc, c), ...
+    split = body.nodes.boundary.reshape(-1, 4, 3)[triangles]  # (a, ab, ca), (ab, b, bc), (ca, bc, c), ...
     return np.stack([split[:, 0, 0], split[:, 1, 1], split[:, 2, 2], split[:, 0, 1], split[:, 1, 2], split[:, 0, 2]], axis=1)
 
 

@@ -116,7 +116,7 @@ def gravity_mass(body: Body) -> np.ndarray:
 
 
 def _distribute(body: Body, fractions: np.ndarray) -> np.ndarray:
-    values = np.reshape(body.density, (-1, 1)) * np.outer(body.mesh.volumes, fractions)
+    values = np.reshape(body.composition.number("density"), (-1, 1)) * np.outer(body.mesh.volumes, fractions)
     return np.bincount(body.nodes.elements.reshape(-1), values.reshape(-1), body.n_nodes)
 
 
@@ -135,7 +135,7 @@ def unit_mass(order: int) -> np.ndarray:
 def consistent_mass(body: Body) -> sp.csr_matrix:
     """Consistent mass matrix (n,n), the same for each axis: int rho N_a N_b dV [kg]."""
     elements = body.nodes.elements
-    values = (body.density * body.mesh.volumes)[:, None, None] * unit_mass(body.order)
+    values = (body.composition.number("density") * body.mesh.volumes)[:, None, None] * unit_mass(body.order)
     rows, columns = np.broadcast_arrays(elements[:, :, None], elements[:, None, :])
     return sp.csr_matrix((values.reshape(-1), (rows.reshape(-1), columns.reshape(-1))), shape=(body.n_nodes,) * 2)
 
@@ -170,5 +170,5 @@ def triangle_areas(body: Body, triangles: np.ndarray) -> np.ndarray:
     if body.order == 1:
         nodes = corners
     else:  # the last of a face's four triangles connects the mid-edge nodes
-        nodes = body.nodes.surface.reshape(-1, 4, 3)[triangles, 3]
+        nodes = body.nodes.boundary.reshape(-1, 4, 3)[triangles, 3]
     return np.bincount(nodes.reshape(-1), np.repeat(area / 3.0, 3), body.n_nodes)

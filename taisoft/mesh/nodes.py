@@ -7,9 +7,10 @@ not on the order of a tet's corners. Edges are straight at rest, so the eight fi
 interpolate the nodes linearly and differ from the curved element.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy.sparse as sp
 
 from taisoft.attributes import MeshAttributeError, guarded_record
 from taisoft.errors import MeshError
@@ -39,19 +40,28 @@ class Nodes:
     """Nodes of a body and their connectivity; arrays are read-only.
 
     positions: (n,3) float64 [m] at rest. elements: (m,4) int64, or (m,10): corners, then the midpoints of EDGES.
-    surface: (k,3) int64, flat triangles, normals outward; surface_tets: (k,4) int64, the linear tet behind each.
+    boundary: (b,3) int64, the elements' flat triangles, normals outward; boundary_tets: (b,4) int64, the linear tet behind each.
     tets: (j,4) int64, linear tets that fill the body. Tets are positive, det(x1-x0, x2-x0, x3-x0) > 0.
+    surface: (k,3) int64, the triangles that touch and are touched: the boundary, unless vertices of a skin are embedded.
+    embedded: (v, n - v) weights, or None: the last v nodes belong to no element but lie at these sums of the others.
     """
 
     positions: np.ndarray
     elements: np.ndarray
-    surface: np.ndarray
-    surface_tets: np.ndarray
+    boundary: np.ndarray
+    boundary_tets: np.ndarray
     tets: np.ndarray
+    surface: np.ndarray
+    embedded: sp.csr_matrix | None = None
 
     def __post_init__(self):
-        for array in (self.positions, self.elements, self.surface, self.surface_tets, self.tets):
+        for array in (self.positions, self.elements, self.boundary, self.boundary_tets, self.tets, self.surface):
             array.setflags(write=False)
+
+    @property
+    def n_elastic(self) -> int:
+        """Number of nodes of elements, which come first."""
+        return len(self.positions) - (0 if self.embedded is None else self.embedded.shape[0])
 
 
 def make_nodes(mesh: TetMesh, order: int) -> Nodes:
@@ -65,7 +75,7 @@ def make_nodes(mesh: TetMesh, order: int) -> Nodes:
     if isinstance(order, bool) or order not in (1, 2):
         raise MeshError(f"make_nodes: order must be 1 or 2, not {order!r}")
     if order == 1:
-        return Nodes(mesh.vertices, mesh.tets, mesh.surface, mesh.tets[mesh.surface_tets], mesh.tets)
+        return Nodes(mesh.vertices, mesh.tets, mesh.surface, mesh.tets[mesh.surface_tets], mesh.tets, mesh.surface)
     edges, edge_of_tet = distinct_edges(mesh.tets)
     positions = np.concatenate([mesh.vertices, 0.5 * (mesh.vertices[edges[:, 0]] + mesh.vertices[edges[:, 1]])])
     elements = np.concatenate([mesh.tets, mesh.n_verts + edge_of_tet], axis=1)
@@ -73,7 +83,13 @@ def make_nodes(mesh: TetMesh, order: int) -> Nodes:
     local = np.concatenate([np.broadcast_to(_CORNER_TETS, (mesh.n_tets, 4, 4)), inner], axis=1)
     tets = np.take_along_axis(elements, local.reshape(-1, 32), axis=1).reshape(-1, 8, 4)
     surface, surface_tets = _split_surface(mesh, elements, tets)
-    return Nodes(positions, elements, surface, surface_tets, tets.reshape(-1, 4))
+    return Nodes(positions, elements, surface, surface_tets, tets.reshape(-1, 4), surface)
+
+
+def embed(nodes: Nodes, vertices: np.ndarray, triangles: np.ndarray, weights: sp.csr_matrix) -> Nodes:
+    """Return nodes with embedded vertices (v,3) [m] whose triangles (k,3) are touched. weights: (v,n) of nodes without any."""
+    positions = np.concatenate([nodes.positions, vertices])
+    return replace(nodes, positions=positions, surface=triangles + len(nodes.positions), embedded=weights)
 
 
 def shape_functions(order: int, points: np.ndarray) -> np.ndarray:

@@ -30,6 +30,7 @@ ALLOWED = 1e-6  # largest depth that is not an overlap, over the smaller solid's
 EDGE_TOLERANCE = 1e-9  # tolerance in barycentric coordinates, so that no ray passes between adjacent triangles
 PARALLEL = 1e-6  # sine below which two edges count as parallel and give no axis
 EQUAL = 1e-9  # relative size difference that counts as a tie; ties take the first element, independent of rounding
+SHELL = 0.01  # depth of `shell_tets`
 _POINT_PAIRS = 1 << 16  # maximum number of point-triangle pairs processed at once, about 500 bytes each
 _TET_PAIRS = 1 << 14  # maximum number of triangle-tet pairs processed at once, about 10 kB each
 
@@ -289,6 +290,20 @@ def overlap_depth(a: Solid, b: Solid) -> float:
     if max(depth, centroid_depth) <= tolerance:
         return depth
     return max(depth, *(one.depth_of(np.concatenate([two.nodes, two.centroids]), lo, hi) for one, two in ((a, b), (b, a))))
+
+
+def shell_tets(vertices: np.ndarray, triangles: np.ndarray, thickness: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return points and flat tets (t,4) behind the triangles of a closed surface, for a solid without tets of its own.
+
+    thickness: of the solid [m]; the tets reach SHELL times that, or times the triangle's height, into it.
+    """
+    normals, heights = normals_and_heights(vertices, triangles)
+    longest = np.linalg.norm(vertices[triangles] - vertices[np.roll(triangles, 1, axis=1)], axis=2).max(axis=1)
+    depth = SHELL * np.minimum(heights * longest, thickness)
+    apexes = vertices[triangles].mean(axis=1) - depth[:, None] * normals
+    return np.concatenate([vertices, apexes]), np.column_stack(
+        [triangles[:, [0, 2, 1]], len(vertices) + np.arange(len(triangles))]
+    )
 
 
 def _cuts(cutter: Solid, cut: Solid, lo: np.ndarray, hi: np.ndarray, slack: float) -> tuple[np.ndarray, float]:

@@ -47,18 +47,3 @@ def von_mises(sigma: np.ndarray) -> np.ndarray:
     """Return the von Mises stress (...,) [Pa] of stresses (..., 3, 3) [Pa]: 0 for pure pressure, |s| for uniaxial tension s."""
     deviator = sigma - np.trace(sigma, axis1=-2, axis2=-1)[..., None, None] / 3.0 * np.eye(3)
     return np.sqrt(1.5 * np.einsum("...ij,...ij->...", deviator, deviator))
-
-
-def contact_impulses(contacts, n_nodes: int) -> np.ndarray:
-    """Return the contact impulses (n_nodes, 3) [N s] on the nodes of all bodies, in the order added.
-
-    contacts: a record from `Simulator.contacts`. Each impulse is distributed to the nodes that it acted on in the solver, by
-    their weights, with its sign on side a and the opposite on side b, so that sums over a body are those of its contacts.
-    """
-    signs = np.repeat([1.0, -1.0], contacts.weights.shape[1] // 2)
-    parts = (signs * contacts.weights)[:, :, None] * contacts.impulse[:, None]  # (k,6 or more,3)
-    used = contacts.nodes >= 0
-    total = np.zeros((n_nodes, 3))
-    for axis in range(3):
-        total[:, axis] = np.bincount(contacts.nodes[used], parts[used][:, axis], n_nodes)
-    return total

@@ -24,10 +24,11 @@ from pathlib import Path
 
 import numpy as np
 
+from taisoft.dynamics.contact_record import nodal_impulses
 from taisoft.errors import OutputError
 from taisoft.files import part_path, publish, replacing
 from taisoft.output.files import make_folder, output_errors
-from taisoft.output.nodal_fields import NodalMean, contact_impulses, von_mises
+from taisoft.output.nodal_fields import NodalMean, von_mises
 from taisoft.output.usd_scene import ERROR, IMPULSE, ROOT, STRESS, TRANSLATE, scene_layer
 
 SCENE_NAME = "scene.usdc"
@@ -100,7 +101,7 @@ class UsdWriter:
         x = sim.positions()
         points, fields = x.astype(np.float32), {STRESS: von_mises(self._mean(sim.stress())).astype(np.float32)}
         if self._touching:
-            fields[IMPULSE] = contact_impulses(sim.contacts(), len(x)).astype(np.float32)
+            fields[IMPULSE] = nodal_impulses(sim.contacts(), len(x)).astype(np.float32)
         if self._errors:
             fields[ERROR] = np.nan_to_num(sim.nodal_errors(), nan=UNKNOWN_ERROR).astype(np.float32)
         samples = [(self._view.attribute, Gf.Vec3d(*self._view.follow(x).tolist()))]

@@ -4,6 +4,7 @@ import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
+from typing import ClassVar
 
 import numpy as np
 
@@ -83,6 +84,7 @@ class Body(Guarded):
         "pressures": "call body.add_pressure",
         "cavities": "call body.add_cavity",
     }
+    extent: ClassVar[str] = "the height of the nearest tet"  # the unit of `distance_outside`
     _default_frozen = USE_A_COPY
     _instead_frozen = {
         "material": "call sim.set_material(body, young=...)",
@@ -188,7 +190,7 @@ class Body(Guarded):
     @property
     def mass(self) -> float:
         """Mass [kg]."""
-        return float(np.sum(self.density * self.mesh.volumes))
+        return float(np.sum(self.composition.number("density") * self.mesh.volumes))
 
     def check(self) -> None:
         """Raise SceneError if in-place changes made the arrays of position or velocity invalid."""
@@ -227,6 +229,14 @@ class Body(Guarded):
                 stacklevel=stacklevel + 1,
             )
 
+    def distance_outside(self, points: np.ndarray, heights: np.ndarray) -> np.ndarray:
+        """Return how far points (p,3) [m] lie outside of the body at rest, given that in heights of the nearest tet (p,)."""
+        return heights
+
+    def select_nodes(self, where, what: str, repeats: bool = True) -> np.ndarray:
+        """Return the ids (k,) of chosen nodes of tets. where: as for `fix`; what: start of messages. Raises SceneError."""
+        return checks.selection(where, self.rest_positions[: self.nodes.n_elastic], what, "node", repeats=repeats)
+
     def fix(self, where, axes: str = "xyz") -> Constraint:
         """Fix nodes at their start positions.
 
@@ -235,7 +245,7 @@ class Body(Guarded):
         """
         self._check_open("fix")
         what = f"{self._label()}: fix"
-        nodes = checks.selection(where, self.rest_positions, what, "node")
+        nodes = self.select_nodes(where, what)
         return self._add_constraint(Constraint(nodes, checks.axes(axes, what), None, _callable_or_none(where)), what)
 
     def move(self, where, path: Callable | KeyFrames, axes: str = "xyz") -> Constraint:
@@ -248,7 +258,7 @@ class Body(Guarded):
         """
         self._check_open("move")
         what = f"{self._label()}: move"
-        nodes = checks.selection(where, self.rest_positions, what, "node", repeats=False)
+        nodes = self.select_nodes(where, what, repeats=False)
         mask = checks.axes(axes, what)
         if isinstance(path, KeyFrames):
             path = NodePath(path, self.rest_positions[nodes] + self.position)
@@ -339,7 +349,7 @@ class Body(Guarded):
         """
         self._check_open("add_force")
         what = f"{self._label()}: add_force"
-        nodes = checks.selection(where, self.rest_positions, what, "node")
+        nodes = self.select_nodes(where, what)
         given = value_or_path(force, what, "force", ((3,), (len(nodes), 3)))
         load = NodalForce(nodes, where=_callable_or_none(where), **given)
         list.append(self.forces, load)

@@ -16,6 +16,7 @@ from taisoft.scene import checks
 from taisoft.scene.body import Body
 from taisoft.scene.loads import value_or_path
 from taisoft.scene.locate import locate
+from taisoft.scene.rigid import RigidBody
 
 if TYPE_CHECKING:
     from taisoft.scene.scene import Scene
@@ -174,7 +175,9 @@ def attach(
     body = _owner(self, a, what)
     if not isinstance(body, Body):
         raise SceneError(f"{what}: {a!r} is an obstacle: give the body first")
-    nodes = checks.selection(where, body.rest_positions, what, "node")
+    if isinstance(body, RigidBody) and stiffness is None:
+        raise SceneError(f"{what}: {a!r} is rigid: attach the other body's nodes to it, or give a stiffness")
+    nodes = body.select_nodes(where, what)
     if b == a:
         raise SceneError(f"{what}: body {a!r} cannot be attached to itself")
     owner = _owner(self, b, what)
@@ -272,8 +275,7 @@ def _check_outside(outside: np.ndarray, label: Callable[[int], str], body: Body,
     k = int(np.argmax(outside))
     if outside[k] > reach:
         raise SceneError(
-            f"{label(k)} lies outside of body {body.name!r}, by {outside[k]:.2g} times the height of the nearest "
-            f"tet: at most {reach:g} is allowed"
+            f"{label(k)} lies outside of body {body.name!r}, by {outside[k]:.2g} times {body.extent}: at most {reach:g} is allowed"
         )
 
 

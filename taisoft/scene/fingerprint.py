@@ -51,7 +51,11 @@ def _body_parts(body: Body) -> dict[str, list]:
     """Return the values that define a body, by the part's name in messages."""
     laws = [material.law for material in body.composition.materials.values()]
     return {
-        "mesh": [body.mesh.vertices, body.mesh.tets],
+        "mesh": [
+            body.mesh.vertices,
+            body.mesh.tets,
+            *([body.rest_positions, body.nodes.surface] if body.nodes.embedded is not None else []),
+        ],
         "regions": [body.mesh.regions, list(body.composition.materials)] if body.composition.has_regions else [],
         "order, quadrature, dilatation, law or collision": [
             body.order,

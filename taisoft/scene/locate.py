@@ -19,8 +19,8 @@ WEIGHTLESS = 1e-12  # smaller barycentric coordinates are rounding
 def locate(body: "Body", points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Find points (p,3) [m], in the coordinates of body.rest_positions, in a body at rest.
 
-    Returns nodes (p, 4 or 10), weights of the same shape, and (p,) how far each lies outside the body, in heights of its tet; 0
-    inside. The weights of a point outside extrapolate from the tet in whose heights it is nearest. They sum to 1 and reproduce
+    Returns nodes (p, 4 or 10), weights of the same shape, and (p,) how far each lies outside the body, in heights of its tet, or
+    in sizes of a rigid body; 0 inside. The weights of a point outside extrapolate from the tet in whose heights it is nearest. They sum to 1 and reproduce
     the point, so that they follow every affine motion exactly.
     """
     corners = body.mesh.vertices[body.mesh.tets]
@@ -33,7 +33,7 @@ def locate(body: "Body", points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np
         tet[rows] = _deepest(corners, inverse, points[rows], np.broadcast_to(everything, (len(rows), len(corners))))
     barycentric = _barycentric(corners[tet], inverse[tet], points)
     barycentric[np.abs(barycentric) < WEIGHTLESS] = 0.0
-    outside = np.maximum(-barycentric.min(axis=1), 0.0)
+    outside = body.distance_outside(points, np.maximum(-barycentric.min(axis=1), 0.0))
     return body.nodes.elements[tet], shape_functions(body.order, barycentric), outside
 
 

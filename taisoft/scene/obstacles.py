@@ -276,20 +276,29 @@ class Obstacle:
             return np.zeros(3), np.eye(3)
         what = f"obstacle {self.name!r}: the path"
         try:
-            translation, rotation = self.path(t)
+            value = self.path(t)
         except Exception as error:
             raise SceneError(f"{what} must give (translation, rotation) and failed at t = {t:g}: {reason(error)}") from error
-        translation = checks.array(translation, f"{what}'s translation at t = {t:g}", ((3,),))
-        rotation = checks.array(rotation, f"{what}'s rotation at t = {t:g}", ((3, 3),))
-        with np.errstate(over="ignore", invalid="ignore"):
-            rigid = np.abs(rotation.T @ rotation - np.eye(3)).max() <= RIGID_TOLERANCE and np.linalg.det(rotation) > 0
-        if not rigid:
-            rule = f"must be orthonormal to {RIGID_TOLERANCE:g} with determinant 1, not {rotation.tolist()}"
-            raise SceneError(f"{what}'s rotation at t = {t:g} {rule}")
-        return translation, rotation
+        return checked_pose(value, t, what)
 
     def points_at(self, t: float, points: np.ndarray) -> np.ndarray:
         """Return the positions (n,3) [m] at time t [s] of points (n,3) given on the undisplaced shape."""
         translation, rotation = self.pose(t)
         pivot = self.shape.pivot
         return (points - pivot) @ rotation.T + pivot + translation
+
+
+def checked_pose(value, t: float, what: str) -> tuple[np.ndarray, np.ndarray]:
+    """Return the translation (3,) and rotation (3,3) that a path gave at t [s]. what: start of messages. Raises SceneError."""
+    try:
+        translation, rotation = value
+    except Exception as error:
+        raise SceneError(f"{what} must give (translation, rotation) and failed at t = {t:g}: {reason(error)}") from error
+    translation = checks.array(translation, f"{what}'s translation at t = {t:g}", ((3,),))
+    rotation = checks.array(rotation, f"{what}'s rotation at t = {t:g}", ((3, 3),))
+    with np.errstate(over="ignore", invalid="ignore"):
+        rigid = np.abs(rotation.T @ rotation - np.eye(3)).max() <= RIGID_TOLERANCE and np.linalg.det(rotation) > 0
+    if not rigid:
+        rule = f"must be orthonormal to {RIGID_TOLERANCE:g} with determinant 1, not {rotation.tolist()}"
+        raise SceneError(f"{what}'s rotation at t = {t:g} {rule}")
+    return translation, rotation

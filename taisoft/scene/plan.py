@@ -18,6 +18,7 @@ from taisoft.scene.collision import has_sharp_edges
 from taisoft.scene.connections import check_tension
 from taisoft.scene.material import LAWS
 from taisoft.scene.obstacles import Box, MeshObstacle
+from taisoft.scene.rigid import RigidBody
 from taisoft.scene.scene import Scene
 
 CHANGEABLE = ("young", "poisson", "density", "mass_damping", "stiffness_damping")  # numbers of a material
@@ -98,7 +99,11 @@ def make_plan(scene: Scene, explicit: bool, multistep: bool, self_collision: boo
     exact = [one.name for one in scene.exact_attachments]
     connected = [one.name for one in scene.connections if one.name not in exact]
     plan.add("springs", connected, _shorten(connected), "no spring, tendon or attachment by springs")
-    plan.add("dependent_nodes", exact, _shorten(exact), "no node is attached exactly")
+    embedded = [body.name for body in scene.bodies if body.nodes.embedded is not None]
+    why_not = "no node is attached exactly, and no surface embedded"
+    plan.add("dependent_nodes", exact or embedded, _shorten(exact + embedded), why_not)
+    rigid = [body.name for body in scene.rigid_bodies]
+    plan.add("rigid_bodies", rigid, _shorten(rigid), "every body is elastic")
     damped = [one.name for one in scene.connections if one.damping > 0.0]
     plan.add("spring_damping", damped, _shorten(damped), "no spring or attachment is damped")
     plan.add("assembled_stiffness", not explicit, "implicit steps solve linear systems", "explicit steps need forces only")
@@ -149,6 +154,8 @@ def change_material(body: Body, numbers: dict, on: dict[str, bool], region: int 
     switches. Warnings point to the line of the caller's caller. Raises SceneError.
     """
     what = f"body {body.name!r}"
+    if isinstance(body, RigidBody):
+        raise SceneError(f"rigid body {body.name!r}: its numbers cannot change: add another one before the Simulator is made")
     for name in numbers:
         if name not in CHANGEABLE:
             hint = checks.nearest(name, CHANGEABLE)

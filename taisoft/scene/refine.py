@@ -23,6 +23,7 @@ from taisoft.scene.body import Body, Constraint
 from taisoft.scene.connections import Attachment
 from taisoft.scene.key_frames import KeyFrames, NodePath
 from taisoft.scene.loads import Cavity, LoadPath, NodalForce, Pressure, Traction
+from taisoft.scene.rigid import RigidBody
 from taisoft.scene.scene import Scene
 
 PARTS = 8  # of a tet; `make_nodes` lists the parts of each tet in sequence
@@ -30,16 +31,21 @@ PARTS = 8  # of a tet; `make_nodes` lists the parts of each tet in sequence
 
 def refined(scene: Scene) -> Scene:
     """Return the scene with every tet split into eight. Raises SceneError if a constraint or load cannot be transferred."""
-    return _with_bodies(scene, [_refined(body) for body in scene.bodies], finer=2.0)
+    return _with_bodies(
+        scene, [_same(body) if isinstance(body, RigidBody) else _refined(body) for body in scene.bodies], finer=2.0
+    )
 
 
 def with_order(scene: Scene, order: int) -> Scene:
     """Return the scene with all bodies of order 1 or 2. Raises SceneError as `refined` does."""
     made = []
     for body in scene.bodies:
-        same = copy.copy(body), _own_parents(body.n_nodes)
-        made.append(same if body.order == order else _of_order(body, order))
+        made.append(_same(body) if isinstance(body, RigidBody) or body.order == order else _of_order(body, order))
     return _with_bodies(scene, made)
+
+
+def _same(body: Body) -> tuple[Body, np.ndarray]:
+    return copy.copy(body), _own_parents(body.n_nodes)
 
 
 def _with_bodies(scene: Scene, made: list[tuple[Body, np.ndarray]], finer: float = 1.0) -> Scene:
@@ -51,6 +57,9 @@ def _with_bodies(scene: Scene, made: list[tuple[Body, np.ndarray]], finer: float
         copied.attachments = []
     for one in scene.attachments:
         new, parents = by_name[one.a]
+        if isinstance(new, RigidBody):
+            list.append(copied.attachments, replace(one, reach=finer * one.reach))
+            continue
         where = _chosen(scene.body(one.a), one, parents)
         nodes = checks.selection(where, new.rest_positions, f"attachment {one.name!r}", "node")
         share = len(one.nodes) / len(nodes)
@@ -134,7 +143,7 @@ def _chosen(old: Body, item: Constraint | NodalForce | Attachment, parents: np.n
     selected[item.nodes] = True
     chosen = selected[parents].all(axis=1)
     inner = chosen & (parents[:, 0] != parents[:, 1])
-    whole = [set(map(tuple, _edges_of(cells[selected[cells].all(axis=1)]))) for cells in (old.nodes.surface, old.nodes.tets)]
+    whole = [set(map(tuple, _edges_of(cells[selected[cells].all(axis=1)]))) for cells in (old.nodes.boundary, old.nodes.tets)]
     for a, b in np.sort(parents[inner], axis=1).tolist():
         if (a, b) not in whole[0] and (a, b) not in whole[1]:
             raise SceneError(

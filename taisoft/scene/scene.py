@@ -12,6 +12,7 @@ import numpy as np
 
 from taisoft.attributes import Guarded, thawed
 from taisoft.errors import SceneError
+from taisoft.mesh.surface_mesh import SurfaceMesh
 from taisoft.mesh.tet_mesh import TetMesh
 from taisoft.scene import checks
 from taisoft.scene.body import USE_A_COPY, Body
@@ -30,6 +31,7 @@ from taisoft.scene.connections import (
 from taisoft.scene.loads import Cavity
 from taisoft.scene.material import Material
 from taisoft.scene.obstacles import Obstacle, Shape, surface_numbers
+from taisoft.scene.rigid import RigidBody
 
 
 class Scene(Guarded):
@@ -119,7 +121,15 @@ class Scene(Guarded):
         copied = copy.copy(self)
         with thawed(copied):
             copied.bodies, copied._start = [copy.copy(body) for body in self.bodies], start
+        soft = [body for body in copied.bodies if not isinstance(body, RigidBody)]
+        for body in copied.rigid_bodies:
+            body.stiffen(copied.gravity, soft)
         return copied
+
+    @property
+    def rigid_bodies(self) -> list[RigidBody]:
+        """The rigid ones among the bodies."""
+        return [body for body in self.bodies if isinstance(body, RigidBody)]
 
     @property
     def start(self) -> "Scene":
@@ -202,6 +212,31 @@ class Scene(Guarded):
         list.append(self.bodies, body)
         body.warn_locking(stacklevel=2)
         body.warn_bending(stacklevel=2)
+        return body
+
+    def add_rigid_body(
+        self,
+        mesh: TetMesh | SurfaceMesh,
+        density: float = 1000.0,
+        name: str | None = None,
+        position=(0.0, 0.0, 0.0),
+        velocity=(0.0, 0.0, 0.0),
+        angular_velocity=(0.0, 0.0, 0.0),
+        friction: float = 0.5,
+        restitution: float = 0.0,
+        young: float | None = None,
+    ) -> RigidBody:
+        """Add a rigid body and return it; it touches everything as other bodies do.
+
+        mesh: its shape at rest, a closed surface or tets, of which only the surface counts. density: [kg/m^3]. name: unique;
+        "rigid0" and so on by default. position: (3,) [m], initial translation. velocity: (3,) [m/s] of its centre;
+        angular_velocity: (3,) [rad/s]. young: [Pa], how stiff it is; by default so stiff that its weight, its spin, its speed at
+        the start and soft bodies strain it by far less than 1e-4, see `sim.rigid_strain`. Raises SceneError.
+        """
+        self._check_open("add_rigid_body")
+        name = self._free_name(name, "rigid")
+        body = RigidBody(name, mesh, density, position, velocity, angular_velocity, friction, restitution, young)
+        list.append(self.bodies, body)
         return body
 
     def add_obstacle(

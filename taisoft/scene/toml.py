@@ -9,13 +9,17 @@
     [[bodies.NAME.fix]]       nodes, axes                   [[bodies.NAME.move]]   nodes, path (KeyFrames), axes
     [[bodies.NAME.traction]]  triangles, traction [Pa]      [[bodies.NAME.force]]  nodes, force [N], or their KeyFrames
     [[bodies.NAME.pressure]]  triangles, pressure [Pa]      [[bodies.NAME.cavity]] triangles, pressure or volume, name
+    [rigid_bodies.NAME]       mesh (below, or a surface), and the arguments of Scene.add_rigid_body
+    [[rigid_bodies.NAME.fix]] axes, rotations               [[rigid_bodies.NAME.move]] path (KeyFrames), axes
+    [[rigid_bodies.NAME.force]] nodes (vertices; without them the centre of mass), force [N], or its KeyFrames
     [obstacles.NAME]          shape and its arguments, friction, restitution, path (KeyFrames)
     [[contacts]]              between = ["a", "b"], friction, restitution
     [springs.NAME]            a = ["body", POINT], b, and the other arguments of Scene.add_spring
     [tendons.NAME]            points = [["body", POINT], ...], force [N], or its KeyFrames
     [attachments.NAME]        a = "body", nodes, b = "body", and the other arguments of Scene.attach
 
-A mesh is a shape with the arguments of its function, or a file with fix_orientation and weld. nodes and triangles are "all",
+A mesh is a shape with the arguments of its function, or a file with fix_orientation and weld; a surface is a file with weld, or
+vertices and triangles. nodes and triangles are "all",
 a list of ids, or a table box = { min, max } or half_space = { point, normal }, which selects nodes by rest position and
 triangles by centroid, boundary included. POINT is a position or a node id. Keys and defaults are those of the Python functions.
 """
@@ -28,9 +32,7 @@ from pathlib import Path
 import numpy as np
 
 from taisoft.errors import SceneError
-from taisoft.mesh.files import WRITERS, read_mesh
 from taisoft.mesh.safe_reading import UTF16, utf16_head
-from taisoft.mesh.shapes import ball_mesh, box_mesh, sheet_mesh
 from taisoft.mesh.tet_mesh import TetMesh
 from taisoft.scene import checks
 from taisoft.scene.body import Body
@@ -41,8 +43,9 @@ from taisoft.scene.obstacles import Box, Capsule, HalfSpace, MeshObstacle, Spher
 from taisoft.scene.scene import Scene
 from taisoft.scene.tables import Table, arguments_of, check_values, value_text
 from taisoft.scene.toml_connections import add_connections
+from taisoft.scene.toml_meshes import kind_of, mesh_of
+from taisoft.scene.toml_rigid import add_rigid_body
 
-MESHES = {"box": box_mesh, "sheet": sheet_mesh, "ball": ball_mesh}
 SHAPES = {"half_space": HalfSpace, "sphere": Sphere, "box": Box, "capsule": Capsule, "mesh": MeshObstacle}
 METHODS = {
     "fix": Body.fix,
@@ -60,6 +63,7 @@ TOP_KEYS = [
     "solver",
     "materials",
     "bodies",
+    "rigid_bodies",
     "obstacles",
     "contacts",
     "springs",
@@ -67,7 +71,6 @@ TOP_KEYS = [
     "attachments",
 ]
 SURFACE_KEYS = ("friction", "restitution")
-STANDALONE = (*WRITERS, ".node", ".ele")  # formats whose files reference no other files
 NONE_TEXT = "none"
 
 
@@ -85,7 +88,7 @@ def read_scene(path, allow_outside: bool = False) -> tuple[Scene, dict]:
     try:
         with warnings.catch_warnings(record=True) as found:
             warnings.simplefilter("always")
-            return _read(Table(file, "", _parsed(file), TOP_KEYS, ["bodies"]), allow_outside)
+            return _read(Table(file, "", _parsed(file), TOP_KEYS), allow_outside)
     finally:
         for warning in found:
             if issubclass(warning.category, UserWarning):
@@ -105,16 +108,18 @@ def _read(tables: Table, allow_outside: bool) -> tuple[Scene, dict]:
         solver = tables.table("solver", list(checks.SOLVER_CHECKS)).make(_solver)
     parent = tables.named("materials")
     materials = {name: parent.made(name, Material, "material: ") for name in parent.known}
-    bodies = tables.named("bodies")
-    if not bodies.known:
-        raise tables.error("bodies", "must hold a table [bodies.NAME]")
+    bodies, rigid = tables.named("bodies"), tables.named("rigid_bodies")
+    if not bodies.known and not rigid.known:
+        raise tables.error("bodies", "must hold a table [bodies.NAME], or rigid_bodies a table [rigid_bodies.NAME]")
     known, _ = arguments_of(Scene.add_body, "name")
     meshes: dict[str, TetMesh] = {}  # bodies with equal mesh tables share one mesh
     for name in bodies.known:
         table = bodies.table(name, [*known, *METHODS, "materials"], ["mesh"])
         mesh_text = str(table.values["mesh"])
-        meshes[mesh_text] = meshes.get(mesh_text) or _mesh(table, allow_outside)
+        meshes[mesh_text] = meshes.get(mesh_text) or mesh_of(table, allow_outside)
         _add_body(scene, name, table, materials, meshes[mesh_text])
+    for name in rigid.known:
+        add_rigid_body(scene, name, rigid, selection, allow_outside)
     obstacles = tables.named("obstacles")
     for name in obstacles.known:
         _add_obstacle(scene, name, obstacles)
@@ -190,56 +195,6 @@ def _region(mesh: TetMesh, key: str) -> str | int:
     return int(key) if is_id else key
 
 
-def _mesh(table: Table, allow_outside: bool) -> TetMesh:
-    """Return the mesh of a body's table, made from a shape or read from a file."""
-    files = ["file", *arguments_of(read_mesh, "path")[0]]
-    shapes = {key: arguments_of(function) for key, function in MESHES.items()}
-    mesh = table.table("mesh", list(dict.fromkeys(["shape", *files, *(key for known, _ in shapes.values() for key in known)])))
-    if ("shape" in mesh) == ("file" in mesh):
-        raise mesh.error("", "must have either a shape or a file")
-    if "file" in mesh:
-        mesh = table.table("mesh", files)
-        path = _mesh_path(mesh, allow_outside)
-        if "fix_orientation" in mesh:
-            with mesh.located_errors():
-                checks.flag(mesh.values["fix_orientation"], "fix_orientation")
-        return mesh.make(read_mesh, keys=files[1:], path=path)
-    shape = _kind(mesh, MESHES)
-    known, required = shapes[shape]
-    mesh = table.table("mesh", ["shape", *known], required)
-    return mesh.make(MESHES[shape], "box_mesh: ", f"{shape}_mesh: ", keys=known)
-
-
-def _mesh_path(mesh: Table, allow_outside: bool) -> Path:
-    """Return the mesh file's path. Without allow_outside it must lie in the scene file's folder, with links resolved."""
-    name = mesh.values["file"]
-    if not isinstance(name, str) or not name or "\0" in name:
-        raise mesh.error("file", f"must be a file's name, not {value_text(name)}")
-    folder = mesh.file.parent
-    path = folder / name
-    if allow_outside:
-        return path
-    remedy = "--allow-outside (allow_outside=True) lifts this"
-    if path.suffix.lower() not in STANDALONE:
-        raise mesh.error("file", f"must be one of {', '.join(STANDALONE)}, since other formats can name further files; {remedy}")
-    pair = [path.with_suffix(ending) for ending in (".node", ".ele")] if path.suffix.lower() in (".node", ".ele") else [path]
-    try:
-        inside = all(one.resolve().is_relative_to(folder.resolve()) for one in pair)
-    except (OSError, RuntimeError) as error:  # such as circular links
-        raise mesh.error("file", f"cannot be resolved: {getattr(error, 'strerror', None) or error}") from None
-    if Path(name).is_absolute() or ".." in Path(name).parts or not inside:
-        raise mesh.error("file", f"must lie inside the scene file's folder, without '..' or a link out of it; {remedy}")
-    return path
-
-
-def _kind(table: Table, kinds: dict) -> str:
-    """Return the value of `shape`, one of the kinds."""
-    if "shape" not in table:
-        raise table.error("shape", "is missing")
-    with table.located_errors():
-        return checks.choice(table.values["shape"], "shape", tuple(kinds))
-
-
 def selection(table: Table, key: str):
     """Return ids, or a function of points (n,3) that returns a bool mask (n,) and also works on another mesh."""
     value = table.values[key]
@@ -267,7 +222,7 @@ def selection(table: Table, key: str):
 def _add_obstacle(scene: Scene, name: str, obstacles: Table) -> None:
     others = arguments_of(Scene.add_obstacle, "name")[0]
     known = list(dict.fromkeys([*others, *(key for shape in SHAPES.values() for key in arguments_of(shape)[0])]))
-    kind = _kind(obstacles.table(name, known), SHAPES)
+    kind = kind_of(obstacles.table(name, known), SHAPES)
     keys, required = arguments_of(SHAPES[kind])
     table = obstacles.table(name, [key for key in known if key in keys or key in others], required)
     made = {"shape": table.make(SHAPES[kind], f"{SHAPES[kind].word}: ", keys=keys), "name": name}

@@ -22,10 +22,12 @@ from taisoft.scene.key_frames import NodePath, ShapePath
 from taisoft.scene.loads import Cavity, LoadPath, NodalForce, Pressure, Traction
 from taisoft.scene.material import Material
 from taisoft.scene.obstacles import Obstacle
+from taisoft.scene.rigid import RigidBody
 from taisoft.scene.scene import Scene
 from taisoft.scene.tables import key_path, key_text, quote
 from taisoft.scene.toml import NONE_TEXT, SCENE_KEYS, SHAPES, SURFACE_KEYS
 from taisoft.scene.toml_connections import connection_tables
+from taisoft.scene.toml_rigid import rigid_table
 
 MAX_LINE = 100  # maximum number of characters of numbers in a line
 FOREIGN_PATH = "rotates along a path made for {}, which a file cannot store: pass the ts.KeyFrames themselves"
@@ -80,7 +82,8 @@ def _keeps_regions(scene: Scene, mesh: TetMesh) -> bool:
 def _document(scene: Scene, solver: dict, stem: str, meshes: dict[str, TetMesh]) -> dict:
     """Return the file's tables. Meshes that need a file are added to `meshes`, file name -> mesh."""
     materials: dict[Material, str] = {}
-    for body in scene.bodies:
+    elastic = [body for body in scene.bodies if not isinstance(body, RigidBody)]
+    for body in elastic:
         for material in body.composition.materials.values():
             materials.setdefault(material, f"material{len(materials)}")
     order = [one.name for one in scene.colliders]
@@ -95,7 +98,11 @@ def _document(scene: Scene, solver: dict, stem: str, meshes: dict[str, TetMesh])
         "collision": _fields(scene.collision),
         "solver": _solver(solver),
         "materials": {name: _fields(material) for material, name in materials.items()},
-        "bodies": {body.name: _body(body, materials, stem, meshes) for body in scene.bodies},
+        "bodies": {body.name: _body(body, materials, stem, meshes) for body in elastic},
+        "rigid_bodies": {
+            body.name: rigid_table(body, lambda mesh: _mesh_table(mesh, stem, meshes), _fields, _load)
+            for body in scene.rigid_bodies
+        },
         "obstacles": {obstacle.name: _obstacle(obstacle) for obstacle in scene.obstacles},
         "contacts": contacts,
         **connection_tables(scene, _ids, _fields),
@@ -118,15 +125,20 @@ def _solver(solver: dict) -> dict:
     return {key: NONE_TEXT if value is None else value for key, value in plain.items()}
 
 
-def _body(body: Body, materials: dict[Material, str], stem: str, meshes: dict[str, TetMesh]) -> dict:
-    name = next((name for name, mesh in meshes.items() if mesh is body.mesh), None)
-    if body.mesh.recipe is None and name is None:
+def _mesh_table(mesh: TetMesh, stem: str, meshes: dict[str, TetMesh]) -> dict:
+    """Return the table of a mesh: its recipe, or its file, which is added to `meshes`."""
+    name = next((name for name, known in meshes.items() if known is mesh), None)
+    if mesh.recipe is None and name is None:
         name = f"{stem}_mesh{len(meshes)}.msh"
-        meshes[name] = body.mesh
+        meshes[name] = mesh
+    return {"file": name} if name else mesh.recipe
+
+
+def _body(body: Body, materials: dict[Material, str], stem: str, meshes: dict[str, TetMesh]) -> dict:
     composition = body.composition
     names = {body.mesh.region_names.get(key, str(key)): materials[one] for key, one in composition.materials.items()}
     table = {"materials": names} if composition.has_regions else {"material": materials[composition.first]}
-    table |= {"mesh": {"file": name} if name else body.mesh.recipe} | composition.by_tet
+    table |= {"mesh": _mesh_table(body.mesh, stem, meshes)} | composition.by_tet
     table |= {
         key: getattr(body, key) for key in ("position", "velocity", "order", "quadrature_degree", "collision", "dilatation")
     }

@@ -1,0 +1,277 @@
+"""Rigid bodies: a surface carried by one stiff linear tet, whose four nodes have the body's mass, centre and moments of inertia.
+
+Four equal point masses at c + S^(1/2) t_a, with S the covariance of the body's volume about its centre c and t_a the corners
+(1,1,1), (1,-1,-1), (-1,1,-1), (-1,-1,1), have sum t_a = 0 and sum t_a t_a^T = 4 I, hence the body's mass, centre and second
+moments. The lumped mass of a tet at these points is therefore exact for every affine motion, rigid ones among them. The vertices
+of the surface are embedded: affine functions of the four nodes. Elasticity keeps the tet nearly rigid.
+"""
+
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import scipy.sparse as sp
+
+from taisoft.attributes import thawed
+from taisoft.errors import SceneError
+from taisoft.mesh.nodes import embed
+from taisoft.mesh.solids import are_inside, distances
+from taisoft.mesh.surface_mesh import SurfaceMesh
+from taisoft.mesh.tet_mesh import TetMesh
+from taisoft.scene import checks
+from taisoft.scene.body import Body, Constraint
+from taisoft.scene.composition import Composition, compose
+from taisoft.scene.key_frames import KeyFrames
+from taisoft.scene.loads import NodalForce
+from taisoft.scene.material import Material
+from taisoft.scene.obstacles import checked_pose
+
+CORNERS = np.array([(1.0, 1.0, 1.0), (1.0, -1.0, -1.0), (-1.0, 1.0, -1.0), (-1.0, -1.0, 1.0)])  # t_a, a positive tet
+FRAME = len(CORNERS)  # nodes of the tet, which come before the vertices of the surface
+STRAIN = 1e-5  # largest strain by its own weight, by its spin and of the kinetic energy at the start, for which young is chosen
+STIFFER = 1e3  # times the stiffest soft body's young at least, whose contact pressures seldom exceed a tenth of it
+MIN_YOUNG = 1e6  # [Pa] of a body at rest without weight
+FLAT = 1e-9  # smallest over largest standard deviation of a volume that has a thickness
+PAIRS_AT_ONCE = 100_000  # of points and triangles; bounds the memory, about 1 kB each
+NO_LOADS = "a rigid body takes forces only: call body.add_force"
+
+
+class RigidBody(Body):
+    """A rigid body of a scene; made by `Scene.add_rigid_body`.
+
+    Its nodes are the four of its tet, then the vertices of its surface in the order given; `select_nodes` and all methods that
+    choose nodes count vertices from 0. shape: the mesh that was given, and surface: its `SurfaceMesh`. centre: (3,) [m] of mass at
+    rest. inertia: (3,3) [kg m^2] about it at rest. given_young: [Pa], None if it is chosen. start_twist: `Twist` at the start.
+    """
+
+    extent = "its size"
+    _own = ("centre", "inertia", "shape", "surface", "given_young", "start_twist")
+    _read_only = Body._read_only | frozenset(_own)
+    _instead = Body._instead | dict.fromkeys((*_own, "material", "young", "density"), "add another one by scene.add_rigid_body")
+
+    def __init__(
+        self,
+        name: str,
+        mesh: TetMesh | SurfaceMesh,
+        density: float,
+        position,
+        velocity,
+        angular_velocity,
+        friction: float,
+        restitution: float,
+        young: float | None,
+    ):
+        """The arguments of `Scene.add_rigid_body`."""
+        what = f"rigid body {name!r}"
+        self.shape, self.surface = mesh, checked_surface(mesh, what)
+        density = checks.number(density, f"{what}: density", above=0.0, unit="kg/m^3")
+        volume, self.centre, covariance = volume_moments(self.surface.vertices, self.surface.triangles)
+        deviations, axes = np.linalg.eigh(covariance)
+        if not deviations[0] > FLAT**2 * deviations[-1]:
+            raise SceneError(f"{what}: its surface encloses no volume in one direction: it must have a thickness")
+        root = axes @ np.diag(np.sqrt(deviations)) @ axes.T
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # a thin body has a thin tet
+            frame = TetMesh(self.centre + CORNERS @ root, np.arange(FRAME)[None])
+        self.inertia = density * volume * (np.trace(covariance) * np.eye(3) - covariance)
+        # of the material, over that of the tet: both have the same mass and the same energy of a strain
+        self._concentration = volume / float(frame.volumes.sum())
+        self.given_young = None if young is None else checks.number(young, f"{what}: young", above=0.0, unit="Pa")
+        made = self._material("st_venant_kirchhoff", self.given_young or MIN_YOUNG, density, friction, restitution)
+        super().__init__(name, frame, made, position, (0.0, 0.0, 0.0), 1, None, "proximity")
+        local = np.linalg.solve(root, (self.surface.vertices - self.centre).T).T
+        weights = sp.csr_matrix(0.25 * (1.0 + local @ CORNERS.T))
+        with thawed(self):
+            self.nodes = embed(self.nodes, self.surface.vertices, self.surface.triangles, weights)
+        linear = checks.array(velocity, f"{what}: velocity", ((3,),))
+        angular = checks.array(angular_velocity, f"{what}: angular_velocity", ((3,),))
+        self.velocity = linear + np.cross(angular, self.rest_positions - self.centre)
+        self.start_twist = Twist(linear, angular)
+        self._seal(RigidBody.__init__)
+
+    def _label(self) -> str:
+        return f"rigid body {self.name!r}"
+
+    def _material(self, law: str, young: float, density: float, friction: float, restitution: float) -> Material:
+        """Return the material of the tet. young, density: of the body."""
+        factor = self._concentration
+        return Material(law, factor * young, 0.0, factor * density, friction, restitution)
+
+    def stiffen(self, gravity: np.ndarray, soft: list[Body]) -> None:
+        """Choose the law and, unless it was given, young for a scene with this gravity (3,) [m/s^2] and these soft bodies."""
+        old = self.composition.first
+        law = soft[0].composition.laws[0] if soft else old.law  # each further law is compiled
+        young = self.young
+        if self.given_young is None:
+            size = float(np.ptp(self.surface.vertices, axis=0).max())
+            speed, spin = (float(np.linalg.norm(part)) for part in self.start_twist)
+            energies = float(np.linalg.norm(gravity)) * size, (spin * size) ** 2, speed**2
+            stiffest = max((float(np.max(body.young)) for body in soft), default=0.0)
+            young = max(self.density * max(energies) / STRAIN, STIFFER * stiffest, MIN_YOUNG)
+        made = self._material(law, young, self.density, old.friction, old.restitution)
+        with thawed(self):
+            self.composition = compose(self._label(), self.mesh, made)
+
+    @property
+    def young(self) -> float:
+        """Young's modulus [Pa] of the body, as if its volume were elastic; chosen by the Simulator unless it was given."""
+        return self.composition.first.young / self._concentration
+
+    @property
+    def density(self) -> float:
+        """Density [kg/m^3]."""
+        return self.composition.first.density / self._concentration
+
+    @property
+    def vertex_nodes(self) -> slice:
+        """Rows of its surface's vertices among its nodes."""
+        return slice(FRAME, self.n_nodes)
+
+    def pose(self, x: np.ndarray) -> "Pose":
+        """Return the pose of the body with nodes at x (n,3) [m], as `sim.pose` does."""
+        rest, x = self.mesh.vertices - self.centre, x[:FRAME]
+        centre = x.mean(axis=0)
+        u, _, vt = np.linalg.svd(_gradient(rest, x - centre))
+        return Pose(centre - self.centre - self.position, u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt)
+
+    def strain(self, x: np.ndarray) -> float:
+        """Return the largest relative change of a length in the body with nodes at x (n,3) [m]."""
+        x = x[:FRAME]
+        F = _gradient(self.mesh.vertices - self.centre, x - x.mean(axis=0))
+        return float(np.abs(np.linalg.svd(F, compute_uv=False) - 1.0).max())
+
+    def twist(self, x: np.ndarray, v: np.ndarray) -> "Twist":
+        """Return velocity and angular velocity of the body with nodes at x [m] and velocities v [m/s], (n,3) each: those of the
+        rigid motion that has the same momentum and angular momentum."""
+        x, v = x[:FRAME], v[:FRAME]
+        arms, velocity = x - x.mean(axis=0), v.mean(axis=0)
+        inertia = np.einsum("ai,ai->", arms, arms) * np.eye(3) - arms.T @ arms
+        return Twist(velocity, np.linalg.solve(inertia, np.cross(arms, v).sum(axis=0)))
+
+    def __repr__(self) -> str:
+        return f"RigidBody({self.name!r}, {len(self.surface.vertices)} vertices, {self.mass:.4g} kg)"
+
+    def select_nodes(self, where, what: str, repeats: bool = True) -> np.ndarray:
+        """Return the nodes (k,) of chosen vertices of its surface. where: as for `Body.fix`; None: the nodes of its tet."""
+        if where is None:
+            return np.arange(FRAME)
+        return FRAME + checks.selection(where, self.surface.vertices, what, "vertex", repeats=repeats)
+
+    def distance_outside(self, points: np.ndarray, heights: np.ndarray) -> np.ndarray:
+        """Return how far points (p,3) [m] lie outside of the surface at rest, over the body's size (p,)."""
+        corners, size = self.surface.vertices[self.surface.triangles], float(np.ptp(self.surface.vertices, axis=0).max())
+        outside = np.zeros(len(points))
+        for rows in np.array_split(np.arange(len(points)), max(1, len(points) * len(corners) // PAIRS_AT_ONCE)):
+            outside[rows] = np.where(are_inside(corners, points[rows]), 0.0, distances(corners, points[rows]) / size)
+        return outside
+
+    def fix(self, axes: str = "xyz", rotations: str | None = None) -> Constraint:
+        """Fix the body in some directions.
+
+        axes: the directions, such as "y" or "xz", that no point of it moves along; rotations: the axes that it then cannot turn
+        about, which are all that would move a point along `axes`; None for just these. Raises SceneError for other rotations.
+        """
+        self._check_open("fix")
+        what = f"{self._label()}: fix"
+        mask = checks.axes(axes, what)
+        held = "".join(axis for k, axis in enumerate("xyz") if np.delete(mask, k).any())
+        if rotations is not None and set(rotations) != set(held):
+            raise SceneError(
+                f"{what}: with axes {axes!r} the rotations must be {held!r}, not {rotations!r}: a point is held by "
+                "scene.attach with a stiffness, and the body then turns about it"
+            )
+        return self._add_constraint(Constraint(np.arange(FRAME), mask), what)
+
+    def move(self, path: Callable | KeyFrames, axes: str = "xyz") -> Constraint:
+        """Move the body along a prescribed path.
+
+        path: callable t [s] -> (translation (3,) [m], rotation (3,3) about the centre of mass), or None from the time of release;
+        it is called once here, for t = 0. Or `KeyFrames`, whose pivot is in start coordinates, by default the centre of mass.
+        axes: the prescribed directions. Raises SceneError if it is fixed or moved already, or the path is invalid.
+        """
+        self._check_open("move")
+        if not isinstance(path, KeyFrames) and callable(path):
+            path = PosePath(path, self.mesh.vertices - self.centre, f"{self._label()}: the path")
+        return super().move(None, path, axes)
+
+    def add_force(self, where, force) -> NodalForce:
+        """Apply a dead load to vertices: a total force, in equal parts, or one force per vertex.
+
+        where: as for `select_nodes`; None: the centre of mass. force: as for `Body.add_force`.
+        """
+        return super().add_force(where, force)
+
+    def _compose(self, composition: Composition) -> None:
+        if self._sealed:
+            raise SceneError(f"{self._label()}: its numbers follow from add_rigid_body: add another one")
+        self.composition = composition
+
+    def _refuse(self, *_, **__) -> None:
+        raise SceneError(f"{self._label()}: {NO_LOADS}")
+
+    add_traction = add_pressure = add_cavity = _refuse
+
+
+class Pose(NamedTuple):
+    """translation (3,) [m] of a rigid body's centre since the start; rotation (3,3) about the centre."""
+
+    translation: np.ndarray
+    rotation: np.ndarray
+
+
+class Twist(NamedTuple):
+    """velocity (3,) [m/s] of a rigid body's centre; angular_velocity (3,) [rad/s]."""
+
+    velocity: np.ndarray
+    angular_velocity: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class PosePath:
+    """The path of a pose as one for nodes: t [s] -> displacements (k,3) [m], or None once they are released."""
+
+    path: Callable  #: t [s] -> (translation (3,) [m], rotation (3,3)), or None
+    arms: np.ndarray  #: (k,3) [m], nodes at the start relative to the centre
+    what: str
+
+    def __call__(self, t: float) -> np.ndarray | None:
+        value = self.path(t)
+        if value is None:
+            return None
+        translation, rotation = checked_pose(value, t, self.what)
+        return self.arms @ rotation.T - self.arms + translation
+
+
+def _gradient(rest: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """Deformation gradient (3,3) of the affine map of points rest (4,3) to x (4,3), both relative to their mean."""
+    return np.linalg.solve(rest.T @ rest, rest.T @ x).T
+
+
+def checked_surface(mesh: TetMesh | SurfaceMesh, what: str) -> SurfaceMesh:
+    """Return the closed surface of a solid. Raises SceneError."""
+    if isinstance(mesh, TetMesh):
+        used, triangles = np.unique(mesh.surface, return_inverse=True)
+        return SurfaceMesh(mesh.vertices[used], triangles.reshape(-1, 3))
+    if not isinstance(mesh, SurfaceMesh):
+        raise SceneError(f"{what}: mesh must be a TetMesh or a SurfaceMesh, not {type(mesh).__name__}")
+    faults = mesh.faults()
+    if faults:
+        raise SceneError(f"{what}: its surface does not bound a solid: {faults[0]}")
+    return mesh
+
+
+def volume_moments(vertices: np.ndarray, triangles: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
+    """Volume [m^3], centre (3,) [m] and covariance (3,3) [m^2] about it of the solid in a closed surface, normals outward.
+
+    Each triangle (a, b, c) adds the tet (o, a, b, c), whose integral of x x^T is V/20 (a a^T + b b^T + c c^T + s s^T) about o,
+    with s = a + b + c.
+    """
+    origin = vertices.mean(axis=0)
+    x = vertices[triangles] - origin
+    volumes, total = np.linalg.det(x) / 6.0, x.sum(axis=1)
+    volume = volumes.sum()
+    centre = 0.25 * volumes @ total / volume
+    second = (np.einsum("t,tki,tkj->ij", volumes, x, x) + np.einsum("t,ti,tj->ij", volumes, total, total)) / (20.0 * volume)
+    return float(volume), origin + centre, second - np.outer(centre, centre)
