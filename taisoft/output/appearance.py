@@ -8,6 +8,7 @@ about the centre of its square and moves along its normal; it neither clips othe
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.sparse as sp
 
 from taisoft.errors import OutputError, SceneError
 from taisoft.output.camera import clip_polygon, start_positions
@@ -55,6 +56,30 @@ def subdivide(points: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np
     (a, b, c), (ab, bc, ca) = triangles.T, len(points) + edge.reshape(-1, 3).T
     cut = [np.stack(t, axis=1) for t in ((a, ab, ca), (b, bc, ab), (c, ca, bc), (ab, bc, ca))]
     return np.concatenate([points, points[pairs].mean(axis=1)]), np.concatenate(cut)
+
+
+class ShownBodies:
+    """What is shown of the bodies: the surface that touches, whose vertices are nodes, or a skin that only rides along.
+
+    surfaces: (rest (v,3) [m], triangles (t,3)) of each body; starts: (n_bodies + 1,) its first shown vertex.
+    """
+
+    def __init__(self, scene):
+        riding = [body.skin if body.skin is not None and not body.skin.contact else None for body in scene.bodies]
+        self.surfaces = [
+            (body.rest_positions, body.nodes.surface) if skin is None else (skin.surface.vertices, skin.surface.triangles)
+            for body, skin in zip(scene.bodies, riding)
+        ]
+        self.starts = np.cumsum([0, *(len(rest) for rest, _ in self.surfaces)])
+        self.matrix: sp.csr_matrix | None = None  # (shown vertices, nodes); None: they are the same
+        if any(riding):
+            parts = zip(scene.bodies, riding)
+            own = [sp.identity(body.n_nodes) if skin is None else skin.weights for body, skin in parts]
+            self.matrix = sp.block_diag(own, format="csr")
+
+    def of(self, values: np.ndarray) -> np.ndarray:
+        """Return values (n_nodes, ...) of the bodies' nodes at their shown vertices."""
+        return values if self.matrix is None else self.matrix @ values
 
 
 @dataclass(frozen=True, eq=False)

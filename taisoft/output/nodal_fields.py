@@ -27,6 +27,8 @@ class NodalMean:
         rows, columns = np.concatenate(rows), np.concatenate(columns)
         weights = volumes[columns] / np.bincount(rows, volumes[columns], n)[rows]
         self._mean = sp.csr_matrix((weights, (rows, columns)), shape=(n, m))
+        if any(body.nodes.embedded is not None for body in bodies):
+            self._mean = sp.block_diag([_spread(body) for body in bodies], format="csr") @ self._mean
 
     def __call__(self, values: np.ndarray) -> np.ndarray:
         """Average values (m, ...) of all tets of all bodies to the nodes (n, ...).
@@ -41,6 +43,14 @@ class NodalMean:
             total = self._mean @ finite.astype(np.float64)
             mean = (self._mean @ np.where(finite[:, None], flat, 0.0)) / np.where(total > 0.0, total, 1.0)[:, None]
         return mean.reshape(-1, *np.shape(values)[1:])
+
+
+def _spread(body) -> sp.csr_matrix:
+    """Matrix (n, n) that keeps values of the nodes of tets, and gives embedded vertices what these have around them."""
+    embedded, own = body.nodes.embedded, sp.identity(body.nodes.n_elastic, format="csr")
+    if embedded is None:
+        return own
+    return sp.hstack([sp.vstack([own, embedded]), sp.csr_matrix((body.n_nodes, embedded.shape[0]))], format="csr")
 
 
 def von_mises(sigma: np.ndarray) -> np.ndarray:

@@ -27,6 +27,7 @@ from taisoft.output.appearance import (
 )
 from taisoft.output.camera import MAX_WIDENING, Camera, start_positions
 from taisoft.scene.obstacles import HalfSpace, MeshObstacle
+from taisoft.scene.rigid import RigidBody
 
 ROOT, VIEW = "/World", "/View"
 STRESS, IMPULSE, ERROR = "vonMisesStress", "contactImpulse", "estimatedError"  # primvars
@@ -59,12 +60,13 @@ def prim_names(names: list[str]) -> list[str]:
 class Track:
     """A prim with time-varying points and primvars.
 
-    gprim: the defined prim; nodes: indices of its points in arrays over the nodes of all bodies; primvars: names. Paths are
-    built once, since building them at every frame would cost as much as setting the values.
+    gprim: the defined prim; nodes: indices of its points in arrays over the nodes of all bodies; primvars: names; weights: (v,k)
+    of those nodes, if its points are sums of them. Paths are built once, since building them at every frame would cost as much
+    as setting the values.
     """
 
-    def __init__(self, gprim, nodes: np.ndarray | slice = slice(None), primvars: tuple[str, ...] = ()):
-        self._nodes = nodes
+    def __init__(self, gprim, nodes: np.ndarray | slice = slice(None), primvars: tuple[str, ...] = (), weights=None):
+        self._nodes, self._weights = nodes, weights
         self._points, self._extent = gprim.GetPointsAttr().GetPath(), gprim.GetExtentAttr().GetPath()
         self._primvars = [(name, gprim.GetPath().AppendProperty(f"primvars:{name}")) for name in primvars]
 
@@ -72,12 +74,16 @@ class Track:
         """Return (path, value) of each attribute. points: (n,3) float32 [m]; fields: primvars by name, (n,) or (n,3) float32."""
         from pxr import Vt
 
-        x = points[self._nodes]
+        x = self._own(points)
         found = [(self._points, Vt.Vec3fArray.FromNumpy(x)), (self._extent, Vt.Vec3fArray.FromNumpy(_extent(x)))]
         for name, path in self._primvars:
-            values = fields[name][self._nodes]
+            values = self._own(fields[name])
             found.append((path, (Vt.FloatArray if values.ndim == 1 else Vt.Vec3fArray).FromNumpy(values)))
         return found
+
+    def _own(self, values: np.ndarray) -> np.ndarray:
+        own = values[self._nodes]
+        return own if self._weights is None else (self._weights @ own).astype(np.float32)
 
 
 class ViewTrack:
@@ -214,28 +220,35 @@ def _define_body(stage, body, legal_name: str, srgb: np.ndarray, first: int, tou
     """Define a body's surface, tets and primvars. first: index of its first node among the nodes of all bodies."""
     from pxr import Sdf, UsdGeom, Vt
 
-    nodes, local = compact_surface(body.nodes.surface)
+    skin = body.skin if body.skin is not None and not body.skin.contact else None
+    nodes, local = compact_surface(body.nodes.surface if skin is None else skin.surface.triangles)
     path, surface, paint = _define_surface(stage, body.name, legal_name, srgb, local)
-    tets = UsdGeom.TetMesh.Define(stage, f"{path}/tets")
-    tets.CreateTetVertexIndicesAttr(Vt.Vec4iArray.FromNumpy(np.ascontiguousarray(body.nodes.tets, dtype=np.int32)))
-    faces = np.ascontiguousarray(body.nodes.surface, dtype=np.int32)
-    tets.CreateSurfaceFaceVertexIndicesAttr(Vt.Vec3iArray.FromNumpy(faces))
-    tets.CreatePurposeAttr(UsdGeom.Tokens.guide)
+    shown = [surface]
+    if not isinstance(body, RigidBody):
+        tets = UsdGeom.TetMesh.Define(stage, f"{path}/tets")
+        tets.CreateTetVertexIndicesAttr(Vt.Vec4iArray.FromNumpy(np.ascontiguousarray(body.nodes.tets, dtype=np.int32)))
+        faces = np.ascontiguousarray(body.nodes.boundary, dtype=np.int32)
+        tets.CreateSurfaceFaceVertexIndicesAttr(Vt.Vec3iArray.FromNumpy(faces))
+        tets.CreatePurposeAttr(UsdGeom.Tokens.guide)
+        shown.append(tets)
 
     def define_primvar(gprim, name: str, kind, meaning: str) -> None:
         primvar = UsdGeom.PrimvarsAPI(gprim).CreatePrimvar(name, kind, UsdGeom.Tokens.vertex)
         primvar.GetAttr().SetDocumentation(meaning)
 
     scalars, vectors = Sdf.ValueTypeNames.FloatArray, Sdf.ValueTypeNames.Vector3fArray
-    for gprim in (surface, tets):
+    for gprim in shown:
         gprim.CreatePointsAttr()
         gprim.CreateExtentAttr()
         paint(gprim)
         define_primvar(gprim, STRESS, scalars, "von Mises equivalent of the mean Cauchy stress at the node [Pa]")
         if errors:
             define_primvar(gprim, ERROR, scalars, "estimated error of the node's position [m], 0 where unknown")
+    touching = touching and skin is None
     if touching:
         define_primvar(surface, IMPULSE, vectors, "impulse of the contacts of the last step on the node [N s]")
     all_nodes = slice(first, first + body.n_nodes)
     primvars = (STRESS, ERROR) if errors else (STRESS,)
-    return [Track(surface, first + nodes, (*primvars, IMPULSE) if touching else primvars), Track(tets, all_nodes, primvars)]
+    own = (*primvars, IMPULSE) if touching else primvars
+    track = Track(surface, first + nodes, own) if skin is None else Track(surface, all_nodes, own, skin.weights[nodes])
+    return [track, *(Track(tets, all_nodes, primvars) for tets in shown[1:])]

@@ -20,13 +20,14 @@ from taisoft.scene.composition import Composition, compose
 from taisoft.scene.key_frames import KeyFrames, NodePath
 from taisoft.scene.loads import Cavity, NodalForce, Pressure, Traction, value_or_path
 from taisoft.scene.material import Material
+from taisoft.scene.skins import Skin, embed
 
 NEARLY_INCOMPRESSIBLE = 0.49  # Poisson's ratio above which linear tets lock, so that they bend far too little
 DILATATIONS = ("local", "mean")  # of each tet's quadrature points, or averaged over patches of tets, or a quadratic tet
 QUADRATURE_DEGREES = {1: (1,), 2: (2, 4)}  # by element order: degrees of polynomials integrated exactly, the default first
 # other data depend on these
 _SHAPE = ("name", "mesh", "order", "quadrature_degree", "dilatation", "nodes", "rest_positions", "n_nodes")
-_READ_ONLY = (*_SHAPE, "composition", "mass", "loads")
+_READ_ONLY = (*_SHAPE, "composition", "mass", "loads", "skin")
 USE_A_COPY = "change a copy made by scene.snapshot() and make a new Simulator of it"
 _SET_FORCE = f"call sim.set_force(body, index, value) for an existing one; otherwise {USE_A_COPY}"
 _SET_TRACTION = f"call sim.set_traction(body, index, value) for an existing one; otherwise {USE_A_COPY}"
@@ -64,7 +65,8 @@ class Body(Guarded):
     the tets have, a float, or (m,) where it may differ from tet to tet; setting one replaces the material's. position: (3,)
     [m]; nodes start at rest_positions + position. velocity: (3,) or (n,3) [m/s], initial. order: 1 or 2, of the elements'
     shape functions; quadrature_degree: degree of polynomials integrated exactly. dilatation: one of DILATATIONS. nodes:
-    `Nodes`, the mesh's vertices and for order 2 its mid-edge nodes. constraints, tractions, forces, pressures, cavities: lists
+    `Nodes`, the mesh's vertices, for order 2 its mid-edge nodes, and the vertices of a skin that is touched; methods choose among
+    those of tets only. skin: `Skin` or None, see `embed`. constraints, tractions, forces, pressures, cavities: lists
     of `Constraint`, `Traction`, `NodalForce`, `Pressure`, `Cavity`; items can be removed, but only methods add them.
     collision: one of CONTACT_MODES. Only material, its numbers, position, velocity and collision can be assigned; each is
     validated. `warn_locking` and `warn_bending` warn if tets of order 1 are far too stiff; `Scene.add_body` calls both.
@@ -75,6 +77,7 @@ class Body(Guarded):
         "contact_mode": "set body.collision",
         "composition": "set body.material",
         "mass": "set body.density",
+        "skin": "call body.embed",
         "loads": "call body.add_force, body.add_traction or body.add_pressure",
     }
     _contents = {
@@ -131,6 +134,7 @@ class Body(Guarded):
         self.forces: list[NodalForce] = []
         self.pressures: list[Pressure] = []
         self.cavities: list[Cavity] = []
+        self.skin: Skin | None = None
         self._seal(Body.__init__)
 
     def _label(self) -> str:
@@ -143,6 +147,8 @@ class Body(Guarded):
         return checks.array(value, f"{self._label()}: velocity", ((3,), (self.n_nodes, 3)))
 
     def _check_collision(self, value) -> str:
+        if value == "distance_field" and self.__dict__.get("nodes") is not None and self.nodes.embedded is not None:
+            raise SceneError(f"{self._label()}: collision: a skin that is touched has no distance field")
         return checks.choice(value, f"{self._label()}: collision", CONTACT_MODES)
 
     position = checks.attribute("position", _check_position, "Initial translation (3,) [m].")
@@ -233,9 +239,20 @@ class Body(Guarded):
         """Return how far points (p,3) [m] lie outside of the body at rest, given that in heights of the nearest tet (p,)."""
         return heights
 
+    @property
+    def selectable(self) -> slice:
+        """Rows of the nodes that methods choose among: those of tets."""
+        return slice(0, self.nodes.n_elastic)
+
     def select_nodes(self, where, what: str, repeats: bool = True) -> np.ndarray:
-        """Return the ids (k,) of chosen nodes of tets. where: as for `fix`; what: start of messages. Raises SceneError."""
-        return checks.selection(where, self.rest_positions[: self.nodes.n_elastic], what, "node", repeats=repeats)
+        """Return the chosen nodes (k,). where: as for `fix`, ids counted from the first selectable one; what: start of messages.
+
+        Raises SceneError.
+        """
+        rows = self.selectable
+        return rows.start + checks.selection(where, self.rest_positions[rows], what, "node", repeats=repeats)
+
+    embed = embed
 
     def fix(self, where, axes: str = "xyz") -> Constraint:
         """Fix nodes at their start positions.

@@ -177,6 +177,8 @@ def attach(
         raise SceneError(f"{what}: {a!r} is an obstacle: give the body first")
     if isinstance(body, RigidBody) and stiffness is None:
         raise SceneError(f"{what}: {a!r} is rigid: attach the other body's nodes to it, or give a stiffness")
+    if where is None:
+        raise SceneError(f"{what}: no node is chosen")
     nodes = body.select_nodes(where, what)
     if b == a:
         raise SceneError(f"{what}: body {a!r} cannot be attached to itself")
@@ -225,7 +227,8 @@ def check_exact(scene: "Scene") -> None:
         if body.dilatation != "local":
             raise SceneError(f"{what}: nodes of body {one.a!r} cannot be attached exactly, since its dilatation is a mean")
         for damping in ("mass_damping", "stiffness_damping"):  # a force on one body's node acts on the other's
-            if len({getattr(scene.body(name).composition.first, damping) for name in one.owners}) > 1:
+            elastic = [owner for name in one.owners if not isinstance(owner := scene.body(name), RigidBody)]
+            if len({getattr(owner.composition.first, damping) for owner in elastic}) > 1:
                 raise SceneError(f"{what}: bodies {one.a!r} and {one.b!r} must have the same {damping}")
 
 
@@ -275,7 +278,8 @@ def _check_outside(outside: np.ndarray, label: Callable[[int], str], body: Body,
     k = int(np.argmax(outside))
     if outside[k] > reach:
         raise SceneError(
-            f"{label(k)} lies outside of body {body.name!r}, by {outside[k]:.2g} times {body.extent}: at most {reach:g} is allowed"
+            f"{label(k)} lies outside of body {body.name!r}, by {outside[k]:.2g} times {body.extent}: at most {reach:g} is "
+            "allowed"
         )
 
 

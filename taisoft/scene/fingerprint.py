@@ -51,11 +51,9 @@ def _body_parts(body: Body) -> dict[str, list]:
     """Return the values that define a body, by the part's name in messages."""
     laws = [material.law for material in body.composition.materials.values()]
     return {
-        "mesh": [
-            body.mesh.vertices,
-            body.mesh.tets,
-            *([body.rest_positions, body.nodes.surface] if body.nodes.embedded is not None else []),
-        ],
+        "mesh": [body.mesh.vertices, body.mesh.tets],
+        "surface": [body.rest_positions[body.nodes.n_elastic :], body.nodes.surface] if body.nodes.embedded is not None else [],
+        "skin": [] if body.skin is None else [body.skin.surface.vertices, body.skin.surface.triangles, body.skin.contact],
         "regions": [body.mesh.regions, list(body.composition.materials)] if body.composition.has_regions else [],
         "order, quadrature, dilatation, law or collision": [
             body.order,

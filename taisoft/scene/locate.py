@@ -20,8 +20,8 @@ def locate(body: "Body", points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np
     """Find points (p,3) [m], in the coordinates of body.rest_positions, in a body at rest.
 
     Returns nodes (p, 4 or 10), weights of the same shape, and (p,) how far each lies outside the body, in heights of its tet, or
-    in sizes of a rigid body; 0 inside. The weights of a point outside extrapolate from the tet in whose heights it is nearest. They sum to 1 and reproduce
-    the point, so that they follow every affine motion exactly.
+    in sizes of a rigid body; 0 inside. The weights of a point outside extrapolate from the tet in whose heights it is nearest.
+    They sum to 1 and reproduce the point, so that they follow every affine motion exactly.
     """
     corners = body.mesh.vertices[body.mesh.tets]
     inverse = np.linalg.inv((corners[:, 1:] - corners[:, :1]).transpose(0, 2, 1))

@@ -214,9 +214,12 @@ def scene_numbers(scene: Scene) -> Numbers:
     for body in scene.bodies:
         for region, material in body.composition.materials.items():
             own = "" if region is None else f"region {body.mesh.region_text(region)}: "
+            chosen = ("law", "young", "stiffness_damping") if isinstance(body, RigidBody) else ("law",)  # by the Simulator
             for name, value in dataclasses.asdict(material).items():
-                if name != "law":
+                if name not in chosen:
                     numbers[f"body {body.name!r}: {own}{name}"] = value
+        if isinstance(body, RigidBody):
+            numbers[f"body {body.name!r}: given young"] = body.given_young
         for name, values in body.composition.by_tet.items():
             numbers[f"body {body.name!r}: {name} by tet"] = values
         for kind, loads in LOADS.items():

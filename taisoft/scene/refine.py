@@ -18,7 +18,6 @@ from taisoft.errors import SceneError
 from taisoft.mesh.nodes import make_nodes
 from taisoft.mesh.tet_mesh import TetMesh
 from taisoft.mesh.topology import distinct_edges
-from taisoft.scene import checks
 from taisoft.scene.body import Body, Constraint
 from taisoft.scene.connections import Attachment
 from taisoft.scene.key_frames import KeyFrames, NodePath
@@ -61,7 +60,7 @@ def _with_bodies(scene: Scene, made: list[tuple[Body, np.ndarray]], finer: float
             list.append(copied.attachments, replace(one, reach=finer * one.reach))
             continue
         where = _chosen(scene.body(one.a), one, parents)
-        nodes = checks.selection(where, new.rest_positions, f"attachment {one.name!r}", "node")
+        nodes = new.select_nodes(where, f"attachment {one.name!r}")
         share = len(one.nodes) / len(nodes)
         stiffness = None if one.stiffness is None else share * one.stiffness
         changed = {"stiffness": stiffness, "damping": share * one.damping, "reach": finer * one.reach}
@@ -70,11 +69,11 @@ def _with_bodies(scene: Scene, made: list[tuple[Body, np.ndarray]], finer: float
 
 
 def _refined(old: Body) -> tuple[Body, np.ndarray]:
-    split = old.nodes if old.order == 2 else make_nodes(old.mesh, 2)
+    split = make_nodes(old.mesh, 2)
     regions = None if old.mesh.regions is None else np.repeat(old.mesh.regions, PARTS)
     mesh = TetMesh(split.positions, split.tets, regions=regions, region_names=old.mesh.region_names)
     edges, _ = distinct_edges(mesh.tets if old.order == 2 else old.mesh.tets)
-    parents_of_nodes = np.concatenate([_own_parents(old.n_nodes), edges])
+    parents_of_nodes = np.concatenate([_own_parents(old.nodes.n_elastic), edges])
     new = _on_mesh(old, mesh, old.order, parents_of_nodes)
     # Row of the new surface -> triangle of the old one: split.surface lists the four parts of each triangle in sequence.
     rows = {tuple(sorted(t)): k // 4 for k, t in enumerate(split.surface.tolist())}
@@ -113,6 +112,8 @@ def _on_mesh(old: Body, mesh: TetMesh, order: int, parents: np.ndarray) -> Body:
     copies = mesh.n_tets // old.mesh.n_tets
     numbers = {name: np.repeat(values, copies) for name, values in old.composition.by_tet.items()}
     new = Body(old.name, mesh, old.material, old.position, velocity, order, degree, old.collision, old.dilatation, **numbers)
+    if old.skin is not None:
+        new.embed(old.skin.surface, old.skin.contact)
     for constraint in old.constraints:
         axes = "".join(axis for axis, held in zip("xyz", constraint.axes) if held)
         where = _chosen(old, constraint, parents)
@@ -124,7 +125,7 @@ def _on_mesh(old: Body, mesh: TetMesh, order: int, parents: np.ndarray) -> Body:
         if (3,) == (force.path_shape if force.value is None else force.value.shape):  # a total force
             new.add_force(_chosen(old, force, parents), _load_of(force))
             continue
-        if force.nodes.max() >= new.n_nodes or not (parents[force.nodes] == force.nodes[:, None]).all():
+        if force.nodes.max() >= new.nodes.n_elastic or not (parents[force.nodes] == force.nodes[:, None]).all():
             raise SceneError(f"body {old.name!r}: linear tets have no mid-edge nodes for its forces")
         new.add_force(force.nodes, _load_of(force))
     return new
@@ -139,7 +140,7 @@ def _chosen(old: Body, item: Constraint | NodalForce | Attachment, parents: np.n
     """Return the selection of new nodes: the function that chose the old ones, or ids (k,)."""
     if item.where is not None:
         return item.where
-    selected = np.zeros(old.n_nodes, dtype=bool)
+    selected = np.zeros(old.nodes.n_elastic, dtype=bool)
     selected[item.nodes] = True
     chosen = selected[parents].all(axis=1)
     inner = chosen & (parents[:, 0] != parents[:, 1])

@@ -16,7 +16,7 @@ import scipy.sparse as sp
 
 from taisoft.attributes import thawed
 from taisoft.errors import SceneError
-from taisoft.mesh.nodes import embed
+from taisoft.mesh import nodes as mesh_nodes
 from taisoft.mesh.solids import are_inside, distances
 from taisoft.mesh.surface_mesh import SurfaceMesh
 from taisoft.mesh.tet_mesh import TetMesh
@@ -35,15 +35,15 @@ STIFFER = 1e3  # times the stiffest soft body's young at least, whose contact pr
 MIN_YOUNG = 1e6  # [Pa] of a body at rest without weight
 FLAT = 1e-9  # smallest over largest standard deviation of a volume that has a thickness
 PAIRS_AT_ONCE = 100_000  # of points and triangles; bounds the memory, about 1 kB each
-NO_LOADS = "a rigid body takes forces only: call body.add_force"
+NO_LOADS = "a rigid body takes forces only, by add_force, and its surface is that of its mesh"
 
 
 class RigidBody(Body):
     """A rigid body of a scene; made by `Scene.add_rigid_body`.
 
     Its nodes are the four of its tet, then the vertices of its surface in the order given; `select_nodes` and all methods that
-    choose nodes count vertices from 0. shape: the mesh that was given, and surface: its `SurfaceMesh`. centre: (3,) [m] of mass at
-    rest. inertia: (3,3) [kg m^2] about it at rest. given_young: [Pa], None if it is chosen. start_twist: `Twist` at the start.
+    choose nodes count vertices from 0. shape: the mesh that was given; surface: its `SurfaceMesh`. centre: (3,) [m] of mass at
+    rest; inertia: (3,3) [kg m^2] about it. given_young: [Pa], None if it is chosen. start_twist: `Twist` at the start.
     """
 
     extent = "its size"
@@ -84,7 +84,7 @@ class RigidBody(Body):
         local = np.linalg.solve(root, (self.surface.vertices - self.centre).T).T
         weights = sp.csr_matrix(0.25 * (1.0 + local @ CORNERS.T))
         with thawed(self):
-            self.nodes = embed(self.nodes, self.surface.vertices, self.surface.triangles, weights)
+            self.nodes = mesh_nodes.embed(self.nodes, self.surface.vertices, self.surface.triangles, weights)
         linear = checks.array(velocity, f"{what}: velocity", ((3,),))
         angular = checks.array(angular_velocity, f"{what}: angular_velocity", ((3,),))
         self.velocity = linear + np.cross(angular, self.rest_positions - self.centre)
@@ -94,13 +94,17 @@ class RigidBody(Body):
     def _label(self) -> str:
         return f"rigid body {self.name!r}"
 
-    def _material(self, law: str, young: float, density: float, friction: float, restitution: float) -> Material:
-        """Return the material of the tet. young, density: of the body."""
+    def _material(self, law: str, young: float, density: float, friction: float, restitution: float, damping=0.0) -> Material:
+        """Return the material of the tet. young, density: of the body; damping: of its stiffness [s]."""
         factor = self._concentration
-        return Material(law, factor * young, 0.0, factor * density, friction, restitution)
+        return Material(law, factor * young, 0.0, factor * density, friction, restitution, 0.0, damping)
 
-    def stiffen(self, gravity: np.ndarray, soft: list[Body]) -> None:
-        """Choose the law and, unless it was given, young for a scene with this gravity (3,) [m/s^2] and these soft bodies."""
+    def stiffen(self, gravity: np.ndarray, soft: list[Body], attached: list[Body]) -> None:
+        """Choose the law, the stiffness damping and, unless it was given, young for a scene.
+
+        gravity: (3,) [m/s^2]. soft: the soft bodies; attached: those with nodes attached to this one exactly, whose stiffness
+        damping must be its own, since forces on these nodes act on its nodes. It damps no rigid motion.
+        """
         old = self.composition.first
         law = soft[0].composition.laws[0] if soft else old.law  # each further law is compiled
         young = self.young
@@ -110,7 +114,8 @@ class RigidBody(Body):
             energies = float(np.linalg.norm(gravity)) * size, (spin * size) ** 2, speed**2
             stiffest = max((float(np.max(body.young)) for body in soft), default=0.0)
             young = max(self.density * max(energies) / STRAIN, STIFFER * stiffest, MIN_YOUNG)
-        made = self._material(law, young, self.density, old.friction, old.restitution)
+        damping = max((body.composition.first.stiffness_damping for body in attached), default=0.0)
+        made = self._material(law, young, self.density, old.friction, old.restitution, damping)
         with thawed(self):
             self.composition = compose(self._label(), self.mesh, made)
 
@@ -125,7 +130,7 @@ class RigidBody(Body):
         return self.composition.first.density / self._concentration
 
     @property
-    def vertex_nodes(self) -> slice:
+    def selectable(self) -> slice:
         """Rows of its surface's vertices among its nodes."""
         return slice(FRAME, self.n_nodes)
 
@@ -155,9 +160,7 @@ class RigidBody(Body):
 
     def select_nodes(self, where, what: str, repeats: bool = True) -> np.ndarray:
         """Return the nodes (k,) of chosen vertices of its surface. where: as for `Body.fix`; None: the nodes of its tet."""
-        if where is None:
-            return np.arange(FRAME)
-        return FRAME + checks.selection(where, self.surface.vertices, what, "vertex", repeats=repeats)
+        return np.arange(FRAME) if where is None else super().select_nodes(where, what, repeats)
 
     def distance_outside(self, points: np.ndarray, heights: np.ndarray) -> np.ndarray:
         """Return how far points (p,3) [m] lie outside of the surface at rest, over the body's size (p,)."""
@@ -211,7 +214,7 @@ class RigidBody(Body):
     def _refuse(self, *_, **__) -> None:
         raise SceneError(f"{self._label()}: {NO_LOADS}")
 
-    add_traction = add_pressure = add_cavity = _refuse
+    add_traction = add_pressure = add_cavity = embed = _refuse
 
 
 class Pose(NamedTuple):

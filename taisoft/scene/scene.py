@@ -123,7 +123,8 @@ class Scene(Guarded):
             copied.bodies, copied._start = [copy.copy(body) for body in self.bodies], start
         soft = [body for body in copied.bodies if not isinstance(body, RigidBody)]
         for body in copied.rigid_bodies:
-            body.stiffen(copied.gravity, soft)
+            attached = [copied.body(one.a) for one in copied.exact_attachments if one.b == body.name]
+            body.stiffen(copied.gravity, soft, attached)
         return copied
 
     @property

@@ -9,6 +9,7 @@
     [[bodies.NAME.fix]]       nodes, axes                   [[bodies.NAME.move]]   nodes, path (KeyFrames), axes
     [[bodies.NAME.traction]]  triangles, traction [Pa]      [[bodies.NAME.force]]  nodes, force [N], or their KeyFrames
     [[bodies.NAME.pressure]]  triangles, pressure [Pa]      [[bodies.NAME.cavity]] triangles, pressure or volume, name
+    [bodies.NAME.skin]        surface (below), contact
     [rigid_bodies.NAME]       mesh (below, or a surface), and the arguments of Scene.add_rigid_body
     [[rigid_bodies.NAME.fix]] axes, rotations               [[rigid_bodies.NAME.move]] path (KeyFrames), axes
     [[rigid_bodies.NAME.force]] nodes (vertices; without them the centre of mass), force [N], or its KeyFrames
@@ -43,7 +44,7 @@ from taisoft.scene.obstacles import Box, Capsule, HalfSpace, MeshObstacle, Spher
 from taisoft.scene.scene import Scene
 from taisoft.scene.tables import Table, arguments_of, check_values, value_text
 from taisoft.scene.toml_connections import add_connections
-from taisoft.scene.toml_meshes import kind_of, mesh_of
+from taisoft.scene.toml_meshes import kind_of, mesh_of, surface_of
 from taisoft.scene.toml_rigid import add_rigid_body
 
 SHAPES = {"half_space": HalfSpace, "sphere": Sphere, "box": Box, "capsule": Capsule, "mesh": MeshObstacle}
@@ -114,10 +115,14 @@ def _read(tables: Table, allow_outside: bool) -> tuple[Scene, dict]:
     known, _ = arguments_of(Scene.add_body, "name")
     meshes: dict[str, TetMesh] = {}  # bodies with equal mesh tables share one mesh
     for name in bodies.known:
-        table = bodies.table(name, [*known, *METHODS, "materials"], ["mesh"])
+        table = bodies.table(name, [*known, *METHODS, "materials", "skin"], ["mesh"])
         mesh_text = str(table.values["mesh"])
         meshes[mesh_text] = meshes.get(mesh_text) or mesh_of(table, allow_outside)
-        _add_body(scene, name, table, materials, meshes[mesh_text])
+        body = _add_body(scene, name, table, materials, meshes[mesh_text])
+        if "skin" in table:
+            skin = table.table("skin", ["surface", "contact"], ["surface"])
+            surface = surface_of(skin, "surface", allow_outside)
+            skin.make(body.embed, f"body {name!r}: embed: ", keys=["contact"], surface=surface)
     for name in rigid.known:
         add_rigid_body(scene, name, rigid, selection, allow_outside)
     obstacles = tables.named("obstacles")
@@ -153,7 +158,7 @@ def _parsed(file: Path) -> dict:
     return tables
 
 
-def _add_body(scene: Scene, name: str, table: Table, materials: dict[str, Material], mesh: TetMesh) -> None:
+def _add_body(scene: Scene, name: str, table: Table, materials: dict[str, Material], mesh: TetMesh) -> Body:
     if "material" in table and "materials" in table:
         raise table.error("", "must have either a material or materials, one for each region")
     if "materials" not in table:
@@ -175,6 +180,7 @@ def _add_body(scene: Scene, name: str, table: Table, materials: dict[str, Materi
                     extra[argument] = one.made(argument, KeyFrames, "key frames: ")
             others = [k for k in known if k not in (items, *extra)]
             one.make(getattr(body, method.__name__), f"body {name!r}: {method.__name__}: ", keys=others, **extra)
+    return body
 
 
 def _material(table: Table, key: str, materials: dict[str, Material]) -> Material:

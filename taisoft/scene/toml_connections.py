@@ -58,7 +58,8 @@ def connection_tables(scene: Scene, ids: Callable, fields: Callable) -> dict:
         force = float(one.value) if one.path is None else fields(one.path.frames)
         tendons[one.name] = {"points": [_pair(point) for point in one.points], "force": force}
     for one in scene.attachments:
-        nodes = ids(one.nodes, scene.body(one.a).n_nodes)
+        rows = scene.body(one.a).selectable
+        nodes = ids(one.nodes - rows.start, rows.stop - rows.start)
         springs_of = {} if one.stiffness is None else {"stiffness": one.stiffness, "damping": one.damping}
         attachments[one.name] = {"a": one.a, "nodes": nodes, "b": one.b} | springs_of
     return {"springs": springs, "tendons": tendons, "attachments": attachments}

@@ -5,6 +5,7 @@ from collections.abc import Callable
 import numpy as np
 
 from taisoft.errors import SceneError
+from taisoft.mesh.surface_mesh import SurfaceMesh
 from taisoft.mesh.tet_mesh import TetMesh
 from taisoft.scene.key_frames import KeyFrames, NodePath
 from taisoft.scene.rigid import FRAME, RigidBody
@@ -33,13 +34,17 @@ def add_rigid_body(scene: Scene, name: str, bodies: Table, selection: Callable, 
             one.make(getattr(body, method.__name__), f"rigid body {name!r}: {method.__name__}: ", keys=others, **extra)
 
 
+def surface_table(surface: SurfaceMesh) -> dict:
+    """Return the table of a surface."""
+    return {"vertices": surface.vertices, "triangles": surface.triangles}
+
+
 def rigid_table(body: RigidBody, file_of: Callable[[TetMesh], dict], fields: Callable, load: Callable) -> dict:
     """Return the table of a rigid body. file_of: mesh -> its table; fields, load: of records, as the file's writer stores them.
 
     Raises SceneError for what a file cannot store.
     """
-    shape = body.shape
-    table = {"mesh": file_of(shape) if isinstance(shape, TetMesh) else {"vertices": shape.vertices, "triangles": shape.triangles}}
+    table = {"mesh": file_of(body.shape) if isinstance(body.shape, TetMesh) else surface_table(body.shape)}
     linear, angular = body.start_twist
     first = body.composition.first
     table |= {"density": body.density, "position": body.position, "velocity": linear, "angular_velocity": angular}

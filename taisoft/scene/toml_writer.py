@@ -27,7 +27,7 @@ from taisoft.scene.scene import Scene
 from taisoft.scene.tables import key_path, key_text, quote
 from taisoft.scene.toml import NONE_TEXT, SCENE_KEYS, SHAPES, SURFACE_KEYS
 from taisoft.scene.toml_connections import connection_tables
-from taisoft.scene.toml_rigid import rigid_table
+from taisoft.scene.toml_rigid import rigid_table, surface_table
 
 MAX_LINE = 100  # maximum number of characters of numbers in a line
 FOREIGN_PATH = "rotates along a path made for {}, which a file cannot store: pass the ts.KeyFrames themselves"
@@ -142,9 +142,13 @@ def _body(body: Body, materials: dict[Material, str], stem: str, meshes: dict[st
     table |= {
         key: getattr(body, key) for key in ("position", "velocity", "order", "quadrature_degree", "collision", "dilatation")
     }
+    if body.velocity.ndim == 2:
+        table["velocity"] = body.velocity[: body.nodes.n_elastic]
+    if body.skin is not None:
+        table["skin"] = {"surface": surface_table(body.skin.surface), "contact": body.skin.contact}
     table |= {key: [] for key in ("fix", "move", "traction", "force", "pressure", "cavity")}
     for c in body.constraints:
-        entry = {"nodes": _ids(c.nodes, body.n_nodes), "axes": "".join(np.array(list("xyz"))[c.axes])}
+        entry = {"nodes": _ids(c.nodes, body.nodes.n_elastic), "axes": "".join(np.array(list("xyz"))[c.axes])}
         if c.path is None:
             table["fix"].append(entry)
         elif isinstance(c.path, NodePath):
@@ -162,7 +166,7 @@ def _body(body: Body, materials: dict[Material, str], stem: str, meshes: dict[st
         entry = {"name": cavity.name, "triangles": _ids(cavity.triangles, len(body.mesh.surface))}
         table["cavity"].append(entry | {cavity.given: _load(body, cavity)})
     for load in body.forces:
-        table["force"].append({"nodes": _ids(load.nodes, body.n_nodes), "force": _load(body, load)})
+        table["force"].append({"nodes": _ids(load.nodes, body.nodes.n_elastic), "force": _load(body, load)})
     return table
 
 

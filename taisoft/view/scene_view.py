@@ -14,7 +14,7 @@ import numpy as np
 
 from taisoft.errors import OutputError
 from taisoft.mesh.topology import linked_groups, triangle_edges
-from taisoft.output.appearance import OBSTACLE_COLOUR, ObstacleSurface, body_colour, obstacle_surfaces, subdivide
+from taisoft.output.appearance import OBSTACLE_COLOUR, ObstacleSurface, ShownBodies, body_colour, obstacle_surfaces, subdivide
 from taisoft.output.camera import MAX_WIDENING, Camera, start_positions
 from taisoft.scene.loads import value_at
 from taisoft.scene.obstacles import HalfSpace
@@ -69,11 +69,13 @@ class Surfaces:
     """
 
     def __init__(self, scene):
-        self._bodies = [_BodySurface(body, body_colour(k)) for k, body in enumerate(scene.bodies)]
-        self._starts = np.cumsum([0] + [body.n_nodes for body in scene.bodies[:-1]])  # of each body's nodes
+        self._shown = ShownBodies(scene)
+        surfaces = zip(scene.bodies, self._shown.surfaces)
+        self._bodies = [_BodySurface(body, *surface, body_colour(k)) for k, (body, surface) in enumerate(surfaces)]
+        self._starts = self._shown.starts[:-1]
         self._obstacles = [_RigidSurface(surface) for surface in obstacle_surfaces(scene)]
         nodes = [np.where(body.nodes >= 0, body.nodes + start, -1) for body, start in zip(self._bodies, self._starts)]
-        self._nodes = np.concatenate(nodes)  # of the bodies' drawn vertices, numbered over all bodies; -1 for markers
+        self._nodes = np.concatenate(nodes)  # shown vertices of the drawn ones; -1 for markers
         self.with_markers = True  # of fixed nodes
         parts = [*self._bodies, *self._obstacles]
         firsts = np.cumsum([0] + [len(part.colours) for part in parts])  # drawn vertex of each part
@@ -92,12 +94,12 @@ class Surfaces:
         """Return colours (n,3) of all drawn vertices, given colours (n_nodes,3) of the bodies' nodes."""
         all_colours = self.colours.copy()
         drawn = np.flatnonzero(self._nodes >= 0)
-        all_colours[drawn] = colours[self._nodes[drawn]]
+        all_colours[drawn] = np.clip(self._shown.of(colours), 0.0, 1.0)[self._nodes[drawn]]
         return all_colours
 
     def of_bodies(self, sim) -> tuple[np.ndarray, np.ndarray]:
         """Return positions [m] and unit normals of the bodies' drawn vertices in sim's present state, each float64 (n,3)."""
-        x = np.split(sim.positions(), self._starts[1:])
+        x = np.split(self._shown.of(sim.positions()), self._starts[1:])
         return _concatenated([body.vertices(own, self.with_markers) for body, own in zip(self._bodies, x)])
 
     def with_obstacles(self, bodies: tuple[np.ndarray, np.ndarray], t: float, eye: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -121,7 +123,9 @@ class Layers:
                 raise OutputError(f"layer '{name}' is unknown: it must be one of {', '.join(LAYERS)}")
         self.shown = {name: name in names for name in LAYERS}
         starts = np.cumsum([0] + [body.n_nodes for body in scene.bodies])
-        self._edges = np.concatenate([triangle_edges(np.asarray(b.nodes.surface))[0] + n for b, n in zip(scene.bodies, starts)])
+        self._shown = ShownBodies(scene)
+        surfaces = zip(self._shown.surfaces, self._shown.starts)
+        self._edges = np.concatenate([triangle_edges(triangles)[0] + n for (_, triangles), n in surfaces])
         self.n_segments = len(self._edges) + MAX_MARK_LINES
         self._size = float(np.linalg.norm(np.ptp(start_positions(scene), axis=0)))
         self.peak = 0.0
@@ -143,7 +147,7 @@ class Layers:
                 marks.append((_arrows(x[corners].mean(axis=1), arrow, camera), TRACTION_COLOUR))
         marks = [(camera.nearer(ends, IN_FRONT), colour) for ends, colour in marks]
         if self.shown["wires"]:  # last, since lines beyond the renderer's limit are dropped from the end
-            marks.append((camera.nearer(x[self._edges].reshape(-1, 3), ON_SURFACE), WIRE_COLOUR))
+            marks.append((camera.nearer(self._shown.of(x)[self._edges].reshape(-1, 3), ON_SURFACE), WIRE_COLOUR))
         ends = [np.empty((0, 3)), *(part for part, _ in marks)]
         return np.concatenate(ends), np.concatenate([np.empty((0, 3)), *(np.tile(c, (len(part), 1)) for part, c in marks)])
 
@@ -165,12 +169,12 @@ def _concatenated(parts: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarra
 
 
 class _BodySurface:
-    def __init__(self, body, colour: np.ndarray):
-        surface, rest = np.asarray(body.nodes.surface), np.asarray(body.rest_positions)
+    def __init__(self, body, rest: np.ndarray, surface: np.ndarray, colour: np.ndarray):
         self._nodes, self._corners = smoothing_groups(rest, surface)
         edges = rest[surface] - rest[np.roll(surface, 1, axis=1)]
         self._radius = MARKER_SIZE * float(np.linalg.norm(edges, axis=2).mean())
-        self._marked = _fixed_surface_nodes(body, surface)
+        is_node = body.skin is None or body.skin.contact
+        self._marked = _fixed_surface_nodes(body, surface) if is_node else np.empty(0, dtype=np.int64)
         self._ball, ball_triangles = _coarse_ball()
         counts = len(self._nodes), len(self._ball) * len(self._marked)
         starts = len(self._nodes) + len(self._ball) * np.arange(len(self._marked))

@@ -1,0 +1,528 @@
+"""Rigid bodies: moments, motion against Euler's equations, contacts, constraints, attachments, refusals, files, checkpoints."""
+
+import numpy as np
+import pytest
+import scipy.integrate
+from command import write
+
+import taisoft as ts
+from taisoft.mesh.solids import shell_tets
+from taisoft.output.nodal_fields import NodalMean
+from taisoft.scene import rigid
+from taisoft.scene.plan import make_plan
+from taisoft.scene.refine import refined, with_order
+from taisoft.stability import modes
+
+G = 9.81
+SIZE = (1.0, 0.6, 0.3)
+GROUND = ts.HalfSpace(point=(0, 0, 0), normal=(0, 1, 0))
+CLOSED_WALLS = ts.box_mesh(cells=(2, 2, 2), size=(1, 1, 1))
+
+
+def surface_of(mesh: ts.TetMesh) -> ts.SurfaceMesh:
+    used, triangles = np.unique(mesh.surface, return_inverse=True)
+    return ts.SurfaceMesh(mesh.vertices[used], triangles.reshape(-1, 3))
+
+
+def box(size=SIZE, cells=(1, 1, 1)) -> ts.TetMesh:
+    return ts.box_mesh(cells=cells, size=size)
+
+
+def a_rotation(seed: int = 0) -> np.ndarray:
+    q, _ = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))
+    return q * np.sign(np.linalg.det(q))
+
+
+# --- moments -----------------------------------------------------------------------------------------------------------
+
+
+def test_moments_of_a_turned_box_are_those_of_the_closed_form():
+    R, shift = a_rotation(), np.array([3.0, -2.0, 5.0])
+    mesh = box()
+    turned = ts.TetMesh(mesh.vertices @ R.T + shift, mesh.tets)
+    volume, centre, covariance = rigid.volume_moments(turned.vertices, turned.surface)
+    assert volume == pytest.approx(np.prod(SIZE), rel=1e-13)
+    assert np.allclose(centre, shift, atol=1e-13)
+    assert np.allclose(covariance, R @ np.diag(np.square(SIZE)) @ R.T / 12.0, atol=1e-14)
+
+
+def test_moments_of_a_hollow_surface_agree_with_a_sum_over_tets():
+    mesh = ts.ball_mesh(radius=0.7, cells=4)
+    volume, centre, covariance = rigid.volume_moments(mesh.vertices, mesh.surface)
+    x = mesh.vertices[mesh.tets]
+    total = x.sum(axis=1)
+    second = np.einsum("t,tki,tkj->ij", mesh.volumes, x, x) + np.einsum("t,ti,tj->ij", mesh.volumes, total, total)
+    own = mesh.volumes @ total / 4.0 / mesh.volumes.sum()
+    assert volume == pytest.approx(mesh.volumes.sum(), rel=1e-12)
+    assert np.allclose(centre, own, atol=1e-14)
+    assert np.allclose(covariance, second / 20.0 / volume - np.outer(own, own), atol=1e-14)
+
+
+def test_four_equal_masses_have_the_mass_centre_and_inertia_of_the_body():
+    R = a_rotation(1)
+    mesh = box()
+    body = ts.Scene().add_rigid_body(ts.TetMesh(mesh.vertices @ R.T + 1.0, mesh.tets), density=700.0)
+    x, m = body.mesh.vertices - body.centre, np.full(4, 0.25 * body.mass)
+    assert body.mass == pytest.approx(700.0 * np.prod(SIZE), rel=1e-12)
+    assert np.allclose(m @ x, 0.0, atol=1e-12)
+    inertia = np.einsum("a,ai,ai->", m, x, x) * np.eye(3) - np.einsum("a,ai,aj->ij", m, x, x)
+    exact = body.mass / 12.0 * (np.sum(np.square(SIZE)) * np.eye(3) - np.diag(np.square(SIZE)))
+    assert np.allclose(inertia, R @ exact @ R.T, rtol=1e-12)
+    assert np.allclose(body.inertia, R @ exact @ R.T, rtol=1e-12)
+    embedded = body.nodes.embedded @ body.mesh.vertices
+    assert np.allclose(embedded, body.surface.vertices, atol=1e-13)
+
+
+def test_tets_and_their_surface_give_the_same_body():
+    scene = ts.Scene()
+    mesh = box(cells=(2, 1, 3))
+    a, b = scene.add_rigid_body(mesh), scene.add_rigid_body(surface_of(mesh))
+    assert np.array_equal(a.rest_positions, b.rest_positions) and np.array_equal(a.nodes.surface, b.nodes.surface)
+
+
+# --- motion ------------------------------------------------------------------------------------------------------------
+
+
+def euler_top(inertia: np.ndarray, spin: np.ndarray, seconds: float):
+    """Rotation and angular velocity in space as functions of time, of a torque-free body with principal moments."""
+    I = inertia
+
+    def rate(_, y):
+        w, R = y[:3], y[3:].reshape(3, 3)
+        turn = np.array([[0, -w[2], w[1]], [w[2], 0, -w[0]], [-w[1], w[0], 0]])
+        return np.concatenate([np.cross(I * w, w) / I, (R @ turn).ravel()])
+
+    start = np.concatenate([spin, np.eye(3).ravel()])
+    return scipy.integrate.solve_ivp(rate, (0, seconds), start, rtol=1e-11, atol=1e-12, dense_output=True).sol
+
+
+def test_a_top_spinning_about_its_middle_axis_follows_eulers_equations_over_ten_turns():
+    spin = 2 * np.pi * np.array([0.01, 1.0, 0.0])
+    scene = ts.Scene(gravity=(0, 0, 0))
+    body = scene.add_rigid_body(box(), density=500.0, name="top", angular_velocity=spin)
+    exact = euler_top(np.diag(body.inertia), spin, 10.0)
+    flipped = 0.0
+    with ts.Simulator(scene, dt=1 / 800, integrator="implicit_midpoint", precision="f64") as sim:
+        for _ in range(100):
+            sim.run(seconds=0.1)
+            y = exact(sim.time)
+            R, w = y[3:].reshape(3, 3), y[3:].reshape(3, 3) @ y[:3]
+            assert np.abs(sim.pose("top").rotation - R).max() < 0.005
+            assert np.linalg.norm(sim.twist("top").angular_velocity - w) < 0.005 * np.linalg.norm(spin)
+            assert sim.rigid_strain("top") < 1e-4
+            flipped = min(flipped, y[3:].reshape(3, 3)[1, 1])
+    assert flipped < -0.9  # the middle axis turns over
+
+
+@pytest.mark.parametrize("integrator", ["symplectic_euler", "velocity_verlet", "implicit_euler", "implicit_midpoint", "bdf2"])
+def test_a_thrown_body_falls_and_turns(integrator):
+    scene, spin = ts.Scene(), np.array([0.0, 2.0, 0.0])
+    scene.add_rigid_body(box(), name="box", position=(0, 1, 0), velocity=(1, 2, 0), angular_velocity=spin)
+    explicit = integrator in ("symplectic_euler", "velocity_verlet")
+    with ts.Simulator(scene, dt=1e-4 if explicit else 1e-3, integrator=integrator, precision="f64") as sim:
+        sim.run(seconds=0.5)
+        pose, twist = sim.pose("box"), sim.twist("box")
+        t = sim.time
+        assert np.allclose(pose.translation, [t, 2 * t - 0.5 * G * t**2, 0.0], atol=3e-3)
+        assert np.allclose(twist.velocity, [1.0, 2 - G * t, 0.0], atol=1e-2)
+        assert np.allclose(twist.angular_velocity, spin, atol=5e-3)
+        angle = 2.0 * t
+        turned = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
+        assert np.allclose(pose.rotation, turned, atol=3e-3)
+        assert sim.rigid_strain("box") < 1e-4
+        x = sim.positions("box")[4:]
+        body = sim.scene.body("box")
+        placed = (body.surface.vertices - body.centre) @ pose.rotation.T + body.centre + body.position + pose.translation
+        assert np.abs(x - placed).max() < 1e-4
+
+
+def test_pose_and_twist_are_exact_for_a_rigid_motion():
+    body = ts.Scene().add_rigid_body(box(), position=(1, 2, 3))
+    R, shift, w, v = a_rotation(2), np.array([0.3, -1.0, 2.0]), np.array([1.0, -2.0, 0.5]), np.array([3.0, 0.0, 1.0])
+    arms = (body.rest_positions - body.centre) @ R.T
+    x = arms + body.centre + body.position + shift
+    pose = body.pose(x)
+    assert np.allclose(pose.translation, shift, atol=1e-12) and np.allclose(pose.rotation, R, atol=1e-12)
+    twist = body.twist(x, v + np.cross(w, arms))
+    assert np.allclose(twist.velocity, v, atol=1e-12) and np.allclose(twist.angular_velocity, w, atol=1e-12)
+    assert body.strain(x) < 1e-12
+    assert body.strain(body.centre + 1.01 * (x - body.centre)) == pytest.approx(0.01, rel=1e-9)
+
+
+# --- contacts ----------------------------------------------------------------------------------------------------------
+
+ANGLE = np.arctan(0.5)  # 26.565 degrees
+
+
+@pytest.mark.parametrize("friction", [0.49, 0.51])
+def test_a_cube_slides_down_or_sticks_on_an_incline(friction):
+    scene = ts.Scene(gravity=(G * np.sin(ANGLE), -G * np.cos(ANGLE), 0))
+    scene.add_rigid_body(CLOSED_WALLS, name="cube", position=(0, 0.5, 0), friction=friction)
+    scene.add_obstacle(GROUND, friction=friction)
+    with ts.Simulator(scene, dt=1 / 120, integrator="implicit_euler", precision="f64") as sim:
+        result = sim.run(seconds=1.0)
+        assert result.status == "ok"
+        v, t = sim.twist("cube").velocity[0], sim.time
+        expected = G * (np.sin(ANGLE) - friction * np.cos(ANGLE)) * t if friction < 0.5 else 0.0
+        assert v == pytest.approx(expected, abs=0.002 * G * np.sin(ANGLE) * t + 1e-3)
+
+
+def test_forces_on_a_mat_and_torque_of_an_eccentric_support():
+    scene = ts.Scene()
+    scene.add_body(ts.box_mesh(cells=(6, 2, 6), size=(2, 0.4, 2)), ts.Material(young=1e5, mass_damping=5.0), position=(0, 0.2, 0))
+    scene.add_rigid_body(ts.box_mesh(cells=(2, 2, 2), size=(0.7, 0.7, 0.7)), density=500, name="cube", position=(0, 0.75, 0))
+    scene.add_obstacle(GROUND)
+    with ts.Simulator(scene, dt=1 / 60, integrator="implicit_euler", precision="f64") as sim:
+        assert sim.run(seconds=2.0).status == "ok"
+        weight = sim.scene.body("cube").mass * G
+        assert sim.contact_force("cube")[1] == pytest.approx(weight, rel=0.01)
+        assert np.abs(sim.contact_torque("cube")).max() < 1e-3 * weight
+        assert sim.contact_torque("obstacle0")[1] == pytest.approx(0.0, abs=1e-3 * weight)
+        assert sim.rigid_strain("cube") < 1e-4
+
+
+def test_contact_torque_changes_the_angular_momentum():
+    scene = ts.Scene()
+    scene.add_rigid_body(box(), name="box", position=(0, 0.45, 0))
+    scene.add_obstacle(ts.Box(center=(0.3, -0.2, 0), half_extents=(0.2, 0.2, 1.0)))
+    with ts.Simulator(scene, dt=1e-3, integrator="implicit_euler", precision="f64") as sim:
+        touched = False
+        for _ in range(250):
+            before = sim.twist("box").angular_velocity[2]
+            sim.step()
+            change = (sim.twist("box").angular_velocity[2] - before) / sim.dt
+            torque = sim.contact_torque("box")[2]
+            inertia = sim.scene.body("box").inertia[2, 2]
+            assert inertia * change == pytest.approx(torque, abs=0.02 * inertia * 50.0)
+            touched |= abs(torque) > 0.1 * inertia
+        assert touched
+
+
+def test_ten_stacked_cubes_stand():
+    scene = ts.Scene()
+    for k in range(10):
+        scene.add_rigid_body(CLOSED_WALLS, name=f"cube{k}", position=(0, 0.5 + k, 0))
+    scene.add_obstacle(GROUND)
+    with ts.Simulator(scene, dt=1 / 120, integrator="implicit_euler") as sim:
+        assert sim.run(seconds=1.0).status == "ok"
+        assert max(float(np.linalg.norm(sim.pose(f"cube{k}").translation)) for k in range(10)) < 0.02
+        assert max(sim.rigid_strain(f"cube{k}") for k in range(10)) < 1e-4
+
+
+def test_two_thrown_bodies_keep_their_momentum_in_an_impact():
+    scene = ts.Scene(gravity=(0, 0, 0))
+    scene.add_rigid_body(CLOSED_WALLS, name="a", velocity=(1, 0, 0))
+    scene.add_rigid_body(CLOSED_WALLS, density=300.0, name="b", position=(1.1, 0.3, 0.2))
+    bodies = scene.bodies
+    with ts.Simulator(scene, dt=1 / 200, integrator="bdf2", precision="f64") as sim:
+        before = bodies[0].mass * np.array([1.0, 0, 0])
+        result = sim.run(seconds=0.5)
+        after = sum(b.mass * sim.twist(b.name).velocity for b in bodies)
+        assert result.status == "ok"
+        assert np.allclose(after, before, atol=1e-6 * np.linalg.norm(before))
+        assert sim.twist("b").velocity[0] > 0.3
+
+
+def test_explicit_steps_carry_a_rigid_body_on_the_ground():
+    scene = ts.Scene()
+    scene.add_rigid_body(box(), name="box", position=(0, 0.301, 0))
+    scene.add_obstacle(GROUND)
+    limit = ts.Simulator(scene.snapshot(), dt=1e-5, integrator="symplectic_euler", allow_unstable=True)
+    with limit:
+        dt = 0.5 * limit.stable_dt
+    with ts.Simulator(scene, dt=dt, integrator="symplectic_euler", precision="f64") as sim:
+        result = sim.run(seconds=0.3)
+        assert result.status == "ok"
+        assert abs(sim.pose("box").translation[1]) < 5e-3 and sim.rigid_strain("box") < 1e-3
+
+
+def test_a_hollow_body_is_not_overlapped_by_what_its_frame_alone_meets():
+    """The nodes of the inertia tet lie outside of a ring's material; only the surface counts."""
+    angle = np.linspace(0, 2 * np.pi, 16, endpoint=False)
+    ring = np.stack([np.cos(angle), 0 * angle, np.sin(angle)], axis=1)
+    profile = [(0.8, -0.1), (1.0, -0.1), (1.0, 0.1), (0.8, 0.1)]
+    vertices = np.concatenate([ring * r + np.array([0, y, 0]) for r, y in profile])
+    quads = [
+        (16 * p + k, 16 * p + (k + 1) % 16, 16 * ((p + 1) % 4) + (k + 1) % 16, 16 * ((p + 1) % 4) + k)
+        for p in range(4)
+        for k in range(16)
+    ]
+    triangles = np.array([t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))])
+    ring_mesh = ts.SurfaceMesh(vertices, triangles)
+    ring_mesh = ring_mesh if ring_mesh.volume > 0 else ts.SurfaceMesh(vertices, triangles[:, ::-1])
+    scene = ts.Scene(gravity=(0, 0, 0))
+    scene.add_rigid_body(ring_mesh, name="ring")
+    scene.add_body(ts.ball_mesh(radius=0.3, cells=2), ts.Material(), name="ball")
+    with ts.Simulator(scene, dt=1 / 100, integrator="implicit_euler") as sim:
+        assert sim.overlaps() == []
+        assert sim.run(seconds=0.05).status == "ok"
+
+
+def test_crossing_surfaces_without_a_vertex_inside_are_an_overlap():
+    scene = ts.Scene()
+    scene.allow_initial_overlap = True
+    scene.add_rigid_body(box((2.0, 0.3, 0.3)), name="a")
+    scene.add_rigid_body(box((0.2, 0.2, 2.0)), name="b")
+    with ts.Simulator(scene, dt=1 / 100, integrator="implicit_euler") as sim:
+        assert [(one.name_a, one.name_b) for one in sim.overlaps()] == [("a", "b")]
+
+
+def test_shell_tets_are_positive_and_thin():
+    mesh = surface_of(CLOSED_WALLS)
+    points, tets = shell_tets(mesh.vertices, mesh.triangles, 1.0)
+    x = points[tets]
+    volumes = np.linalg.det(x[:, 1:] - x[:, :1])
+    assert (volumes > 0.0).all() and np.abs(points).max() <= 0.5
+
+
+# --- constraints, loads, attachments -----------------------------------------------------------------------------------
+
+
+def test_a_fixed_body_stays_and_a_sliding_one_moves_along_one_axis_only():
+    scene = ts.Scene(gravity=(1.0, -G, 2.0))
+    scene.add_rigid_body(box(), name="fixed").fix()
+    scene.add_rigid_body(box(), name="slider", position=(0, 3, 0)).fix(axes="yz", rotations="xyz")
+    scene.contact_forces = False
+    with ts.Simulator(scene, dt=1 / 200, integrator="implicit_midpoint", precision="f64") as sim:
+        sim.run(seconds=1.0)
+        assert np.abs(sim.pose("fixed").translation).max() < 1e-15
+        pose = sim.pose("slider")
+        assert np.allclose(pose.translation, [0.5 * sim.time**2, 0, 0], atol=1e-6)
+        assert np.allclose(pose.rotation, np.eye(3), atol=1e-6)
+        weight = sim.scene.body("fixed").mass * np.array([1.0, -G, 2.0])
+        assert np.allclose(sim.reactions("fixed").sum(axis=0), -weight, rtol=1e-9)
+
+
+def test_planar_motion_turns_about_one_axis():
+    scene = ts.Scene(gravity=(0, 0, -1.0))
+    scene.add_rigid_body(box(), name="disc", angular_velocity=(0, 0, 1.0)).fix("z", "xy")
+    with ts.Simulator(scene, dt=1 / 200, integrator="implicit_midpoint", precision="f64") as sim:
+        sim.run(seconds=1.0)
+        assert sim.pose("disc").translation[2] == 0.0
+        assert sim.twist("disc").angular_velocity == pytest.approx([0, 0, 1.0], abs=1e-4)
+
+
+def spin_path(t: float):
+    return np.array([0.1 * t, 0, 0]), np.array([[np.cos(t), 0, np.sin(t)], [0, 1, 0], [-np.sin(t), 0, np.cos(t)]])
+
+
+@pytest.mark.parametrize("path", [spin_path, ts.KeyFrames([0, 2], [(0, 0, 0), (0.2, 0, 0)], [(0, 0, 0), (0, 2.0, 0)])])
+def test_a_moved_body_follows_its_path_and_pushes(path):
+    scene = ts.Scene(gravity=(0, 0, 0))
+    scene.add_rigid_body(box(), name="tool").move(path)
+    scene.add_rigid_body(ts.box_mesh(cells=(1, 1, 1), size=(0.2, 0.2, 0.2)), name="small", position=(0.61, 0, 0))
+    with ts.Simulator(scene, dt=1 / 200, integrator="implicit_euler", precision="f64") as sim:
+        result = sim.run(seconds=0.5)
+        assert result.status == "ok"
+        translation, rotation = spin_path(sim.time)
+        pose = sim.pose("tool")
+        assert np.allclose(pose.translation, translation, atol=1e-9) and np.allclose(pose.rotation, rotation, atol=1e-9)
+        assert np.linalg.norm(sim.twist("small").velocity) > 0.1
+
+
+def test_forces_act_at_the_centre_or_at_vertices():
+    scene = ts.Scene(gravity=(0, 0, 0))
+    central, pushed = (scene.add_rigid_body(box(), name=name, position=(0, 3 * k, 0)) for k, name in enumerate(("a", "b")))
+    central.add_force(None, (10.0, 0, 0))
+    top = pushed.surface.vertices[:, 1] > 0
+    pushed.add_force(top, (10.0, 0, 0))
+    scene.contact_forces = False
+    with ts.Simulator(scene, dt=1e-3, integrator="implicit_midpoint", precision="f64") as sim:
+        sim.run(seconds=0.02)
+        t = sim.time
+        for name in "ab":
+            assert sim.twist(name).velocity[0] == pytest.approx(10.0 / central.mass * t, rel=1e-3)
+        assert np.abs(sim.twist("a").angular_velocity).max() < 1e-9
+        arm = 0.5 * SIZE[1]
+        assert sim.twist("b").angular_velocity[2] == pytest.approx(-10.0 * arm / central.inertia[2, 2] * t, rel=1e-2)
+
+
+def test_a_soft_bar_hangs_from_a_rigid_block():
+    scene = ts.Scene()
+    scene.add_rigid_body(box((0.4, 0.2, 0.4)), name="block", position=(0, 1.1, 0)).fix()
+    rubber = ts.Material(young=1e6, mass_damping=20.0, stiffness_damping=1e-3)
+    bar = scene.add_body(ts.box_mesh(cells=(2, 6, 2), size=(0.2, 1.0, 0.2)), rubber, name="bar", position=(0, 0.5, 0))
+    scene.attach("bar", lambda X: X[:, 1] > 0.499, "block", name="joint")
+    with ts.Simulator(scene, dt=1 / 100, integrator="implicit_euler", precision="f64") as sim:
+        assert sim.run(seconds=2.0).status == "ok"
+        block = sim.reactions("block").sum(axis=0)[1]
+        total = (bar.mass + sim.scene.body("block").mass) * G
+        assert block == pytest.approx(total, rel=1e-4)
+
+
+def test_a_pendulum_of_two_bodies_joined_by_a_spring_attachment_turns():
+    scene = ts.Scene()
+    scene.add_rigid_body(box((0.2, 0.2, 0.2)), name="anchor", position=(0, 1.0, 0)).fix()
+    scene.add_rigid_body(box((0.8, 0.1, 0.1)), name="rod", position=(0.5, 1.0, 0))
+    ends = scene.body("rod").surface.vertices[:, 0] < -0.39
+    scene.attach("rod", ends, "anchor", stiffness=1e6, damping=1e2)
+    scene.contact_forces = False
+    with ts.Simulator(scene, dt=1 / 1000, integrator="implicit_midpoint", precision="f64") as sim:
+        start = sim.energies().total
+        sim.run(seconds=0.2)
+        assert np.isfinite(start) and sim.rigid_strain("rod") < 1e-4
+        assert sim.joint_force("attachment0").shape == (4, 3)
+    loose = scene.snapshot()
+    assert loose.body("rod").selectable == slice(4, 12)
+
+
+# --- scene, plan, refusals ---------------------------------------------------------------------------------------------
+
+
+def test_the_stiffness_follows_the_scene_unless_it_is_given():
+    scene = ts.Scene()
+    scene.add_rigid_body(box(), name="a")
+    scene.add_rigid_body(box(), name="b", young=3e8)
+    scene.add_body(ts.box_mesh(cells=(1, 1, 1), size=(1, 1, 1)), ts.Material(law="corotational", young=1e8), name="soft")
+    copied = scene.snapshot()
+    assert copied.body("a").young == pytest.approx(1e3 * 1e8) and copied.body("b").young == pytest.approx(3e8)
+    assert copied.body("a").composition.laws == ("corotational",)
+    light = ts.Scene()
+    light.add_rigid_body(box(), name="a")
+    assert light.snapshot().body("a").young == pytest.approx(1000.0 * G * 1.0 / 1e-5, rel=1e-9)
+
+
+def test_a_scene_without_rigid_bodies_plans_none():
+    scene = ts.Scene()
+    scene.add_body(box(), ts.Material())
+    plan = make_plan(scene, False, False)
+    assert not plan.on["rigid_bodies"] and not plan.on["dependent_nodes"]
+    scene.add_rigid_body(box(), name="tool", position=(0, 2, 0))
+    plan = make_plan(scene, False, False)
+    assert plan.on["rigid_bodies"] and plan.why("rigid_bodies") == "tool" and plan.on["dependent_nodes"]
+
+
+def test_the_frame_vibrates_as_stiffly_as_the_material():
+    scene = ts.Scene()
+    scene.add_rigid_body(box(), young=1e7, density=1000.0)
+    frequencies = modes(scene, 12).frequencies
+    assert (frequencies[:6] == 0.0).all()
+    wave = np.sqrt(1e7 / 1000.0)
+    assert 0.1 * wave < frequencies[6] < 2.0 * wave / SIZE[2]
+
+
+def test_nodal_means_reach_the_surface():
+    scene = ts.Scene()
+    body = scene.add_rigid_body(box())
+    mean = NodalMean([body])(np.array([3.0]))
+    assert np.allclose(mean, 3.0)
+
+
+def test_refinement_and_order_leave_rigid_bodies_alone():
+    scene = ts.Scene()
+    scene.add_rigid_body(box(), name="tool")
+    scene.add_body(box(), ts.Material(), name="soft", position=(0, 2, 0))
+    for changed in (refined(scene), with_order(scene, 2)):
+        assert isinstance(changed.body("tool"), rigid.RigidBody) and changed.body("tool").n_nodes == scene.body("tool").n_nodes
+        assert changed.body("soft").n_nodes > scene.body("soft").n_nodes
+
+
+OPEN = ts.SurfaceMesh(np.eye(3), np.array([[0, 1, 2]]))
+INWARD = ts.SurfaceMesh(surface_of(box()).vertices, surface_of(box()).triangles[:, ::-1])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"mesh": 3}, "rigid body 'r': mesh must be a TetMesh or a SurfaceMesh, not int"),
+        ({"mesh": OPEN}, "rigid body 'r': its surface does not bound a solid: 1 hole"),
+        ({"mesh": INWARD}, "rigid body 'r': its surface does not bound a solid: all normals point inward"),
+        ({"density": 0.0}, "rigid body 'r': density must be greater than 0 kg/m^3"),
+        ({"young": -1.0}, "rigid body 'r': young must be greater than 0 Pa"),
+        ({"velocity": (1, 2)}, "rigid body 'r': velocity must have shape (3,)"),
+        ({"angular_velocity": (1, 2, np.inf)}, "rigid body 'r': angular_velocity: entry [2] is inf"),
+        ({"friction": -1.0}, "friction must be at least 0"),
+    ],
+)
+def test_bad_arguments_are_refused(arguments, message):
+    scene = ts.Scene()
+    with pytest.raises(ts.SceneError, match=".*") as caught:
+        scene.add_rigid_body(**({"mesh": box(), "name": "r"} | arguments))
+    assert message in str(caught.value) and scene.bodies == []
+
+
+def test_what_a_rigid_body_cannot_do_is_refused():
+    scene = ts.Scene()
+    body = scene.add_rigid_body(box(), name="r")
+    scene.add_body(box(), ts.Material(), name="soft", position=(0, 2, 0))
+    for call in (body.add_traction, body.add_pressure, body.add_cavity, body.embed):
+        with pytest.raises(ts.SceneError, match="takes forces only"):
+            call([0], 1.0)
+    with pytest.raises(ts.SceneError, match="rotations must be 'xz', not 'x'"):
+        body.fix("y", "x")
+    with pytest.raises(ts.SceneError, match="rigid: attach the other body's nodes to it"):
+        scene.attach("r", [0], "soft")
+    with pytest.raises(ts.SceneError, match="vertex|node 8 does not exist"):
+        body.add_force([8], (1, 0, 0))
+    for name in ("material", "young", "density", "centre"):
+        with pytest.raises(ts.SceneError, match=name):
+            setattr(body, name, 1.0)
+    with pytest.raises(ts.SceneError, match="lies outside of body 'r', by .* times its size"):
+        scene.add_spring(("r", (0, 5, 0)), ("soft", (0, 0, 0)), stiffness=1.0)
+    with ts.Simulator(scene, dt=1 / 100, integrator="implicit_euler") as sim:
+        with pytest.raises(ts.SceneError, match="rigid body 'r': its numbers cannot change"):
+            sim.set_material("r", young=1e5)
+        with pytest.raises(ts.SceneError, match="body 'soft' is not rigid"):
+            sim.pose("soft")
+
+
+# --- files -------------------------------------------------------------------------------------------------------------
+
+
+def test_a_checkpoint_continues_bitwise(tmp_path):
+    scene = ts.Scene()
+    scene.add_rigid_body(box(), name="tool", position=(0, 0.6, 0), angular_velocity=(0, 1, 2))
+    scene.add_obstacle(GROUND)
+    with ts.Simulator(scene, dt=1 / 200, integrator="bdf2") as sim:
+        sim.run(seconds=0.4)
+        sim.save_checkpoint(tmp_path / "c.npz")
+        sim.run(seconds=0.1)
+        expected, force = sim.positions(), sim.contact_force("tool")
+    with ts.Simulator.load_checkpoint(tmp_path / "c.npz", scene.snapshot()) as sim:
+        sim.run(seconds=0.1)
+        assert np.array_equal(sim.positions(), expected) and np.array_equal(sim.contact_force("tool"), force)
+
+
+SCENE = """
+[rigid_bodies.palm]
+mesh = { shape = "box", cells = [1, 1, 1], size = [1, 0.6, 0.3] }
+density = 700
+angular_velocity = [0, 1, 0]
+
+[[rigid_bodies.palm.fix]]
+axes = "y"
+
+[[rigid_bodies.palm.force]]
+force = { times = [0, 1], translations = [[0, 0, 0], [1, 0, 0]] }
+
+[[rigid_bodies.palm.force]]
+nodes = [0, 3]
+force = [0, 0, 1]
+
+[rigid_bodies.tetrahedron]
+mesh = { vertices = [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], triangles = [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]] }
+position = [0, 3, 0]
+young = 1e8
+"""
+
+
+def test_scene_files_hold_rigid_bodies(tmp_path):
+    scene, _ = ts.read_scene(write(tmp_path / "a.toml", SCENE))
+    palm, other = scene.bodies
+    assert palm.mass == pytest.approx(700 * np.prod(SIZE)) and len(palm.forces) == 2 and other.given_young == 1e8
+    assert (palm.forces[0].nodes == np.arange(4)).all() and palm.forces[1].nodes.tolist() == [4, 7]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("density = 700", "density = -1", "rigid_bodies.palm.density must be greater than 0"),
+        ('axes = "y"', 'axes = "q"', "axes"),
+        ("[0, 3]\nforce", "[0, 9]\nforce", "does not exist"),
+        ("[1, 2, 3]] }", "[1, 2, 4]] }", "triangle 3: vertex 4 does not exist"),
+    ],
+)
+def test_faults_in_scene_files_are_located(tmp_path, old, new, message):
+    with pytest.raises((ts.SceneError, ts.MeshError), match="rigid_bodies") as caught:
+        ts.read_scene(write(tmp_path / "a.toml", SCENE.replace(old, new)))
+    assert message in str(caught.value)
