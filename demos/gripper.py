@@ -1,6 +1,6 @@
 """A gripper with two soft fingers, closed by tendons, lifts a cube from the ground and holds it.
 
-A palm of 0.16 x 0.02 x 0.05 m follows key frames; two fingers of 0.02 x 0.12 x 0.04 m, of 60 quadratic tets each, are attached to
+A rigid palm of 0.16 x 0.02 x 0.05 m follows key frames; two fingers of 0.02 x 0.12 x 0.04 m, of 60 quadratic tets each, are attached to
 it exactly. A tendon runs down the inner face of each finger; its tension grows to 5 N within 0.4 s and bends the finger against
 a cube of 19 g. Then the palm rises by 0.1 m.
 
@@ -26,13 +26,12 @@ INNER, LOW = 0.03, 0.015  # distance of a finger's inner face from the middle, a
 def build(friction: float = FRICTION) -> ts.Scene:
     """The open gripper above the cube. friction: of everything."""
     scene = ts.Scene()
-    shared = {"poisson": 0.3, "density": 1000.0, "mass_damping": 5.0, "friction": friction}
-    soft, stiff = ts.Material(young=YOUNG, **shared), ts.Material(young=1e8, **shared)
+    soft = ts.Material(young=YOUNG, poisson=0.3, density=1000.0, mass_damping=5.0, friction=friction)
     light = ts.Material(young=1e6, poisson=0.3, density=DENSITY, friction=friction)
     top = LOW + FINGER[1]
-    palm = scene.add_body(ts.box_mesh((4, 1, 1), PALM), stiff, name="palm", position=(0.0, top + PALM[1] / 2, 0.0), order=2)
+    palm = scene.add_rigid_body(ts.box_mesh((4, 1, 1), PALM), name="palm", position=(0.0, top + PALM[1] / 2, 0.0), friction=friction)
     lift = ts.KeyFrames((0.0, GRIPPED, LIFTED), translations=[(0, 0, 0), (0, 0, 0), (0, HEIGHT, 0)], smooth=True)
-    palm.move(lambda X: np.ones(len(X), dtype=bool), lift)
+    palm.move(lift)
     closing = ts.KeyFrames((0.0, GRIPPED), values=(0.0, PULL), smooth=True)
     for name, side in (("left", -1.0), ("right", 1.0)):
         mesh = ts.box_mesh((1, 6, 2), FINGER)

@@ -40,7 +40,8 @@ def test_reasons():
         "mass_damping": (True, "material of beam, tower"),
         "stiffness_damping": (False, "every stiffness_damping is 0"),
         "springs": (False, "no spring, tendon or attachment by springs"),
-        "dependent_nodes": (False, "no node is attached exactly"),
+        "dependent_nodes": (False, "no node is attached exactly, and no surface embedded"),
+        "rigid_bodies": (False, "every body is elastic"),
         "spring_damping": (False, "no spring or attachment is damped"),
         "assembled_stiffness": (False, "explicit steps need forces only"),
         "past_states": (False, "a one-step integrator"),
@@ -66,6 +67,7 @@ def test_every_feature_can_be_on_and_off():
     full.body("beam").add_pressure([4], 1.0)
     full.body("beam").collision, full.contact_forces = "distance_field", True
     full.add_body(cube((9, 0, 0)), rubber(), dilatation="mean")
+    full.add_rigid_body(cube((19, 0, 0)))
     on = make_plan(full, explicit=False, multistep=True, self_collision=True).on
     laws = {name for name in on if name.startswith("law:")}
     assert {name for name in on if not on[name]} < laws and {name for name in off if off[name]} < laws
