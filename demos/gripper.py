@@ -1,8 +1,8 @@
 """A gripper with two soft fingers, closed by tendons, lifts a cube from the ground and holds it.
 
-A rigid palm of 0.16 x 0.02 x 0.05 m follows key frames; two fingers of 0.02 x 0.12 x 0.04 m, of 60 quadratic tets each, are attached to
-it exactly. A tendon runs down the inner face of each finger; its tension grows to 5 N within 0.4 s and bends the finger against
-a cube of 19 g. Then the palm rises by 0.1 m.
+A rigid palm of 0.16 x 0.02 x 0.05 m follows key frames; two fingers of 0.02 x 0.12 x 0.04 m, of 60 quadratic tets each, are
+attached to it exactly. A tendon runs down the inner face of each finger; its tension grows to 5 N within 0.4 s and bends the
+finger against a cube of 19 g. Then the palm rises by 0.1 m.
 
 `check` asserts that the cube was lifted, that friction carries its weight, and the joints the fingers and the cube; in statics a
 finger must bend as a beam whose tendon pulls beside its middle.
@@ -29,7 +29,8 @@ def build(friction: float = FRICTION) -> ts.Scene:
     soft = ts.Material(young=YOUNG, poisson=0.3, density=1000.0, mass_damping=5.0, friction=friction)
     light = ts.Material(young=1e6, poisson=0.3, density=DENSITY, friction=friction)
     top = LOW + FINGER[1]
-    palm = scene.add_rigid_body(ts.box_mesh((4, 1, 1), PALM), name="palm", position=(0.0, top + PALM[1] / 2, 0.0), friction=friction)
+    place = (0.0, top + PALM[1] / 2, 0.0)
+    palm = scene.add_rigid_body(ts.box_mesh((4, 1, 1), PALM), name="palm", position=place, friction=friction)
     lift = ts.KeyFrames((0.0, GRIPPED, LIFTED), translations=[(0, 0, 0), (0, 0, 0), (0, HEIGHT, 0)], smooth=True)
     palm.move(lift)
     closing = ts.KeyFrames((0.0, GRIPPED), values=(0.0, PULL), smooth=True)

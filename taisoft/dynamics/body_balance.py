@@ -114,7 +114,11 @@ class RoundingFloor:
             for group in m.groups:
                 g[group.first : group.last] *= steepest if group.order == 2 else 1.0
         largest = float(np.abs(download([m.state.x])[0]).max())
-        strain = self.eps + np.finfo(np.float64).eps * largest * g  # rounding of F, and of the f64 positions it is computed from
+        eps = np.full((len(g), 1), self.eps)  # of stress
+        for group in m.groups:
+            if group.rigid:
+                eps[group.first : group.last] = np.finfo(np.float64).eps
+        strain = eps + np.finfo(np.float64).eps * largest * g  # rounding of F, and of the f64 positions it is computed from
         squares = (stiffness * volume * g * strain) ** 2
         self.force = float(np.sqrt(squares.sum()))
         self.force_by_body = np.sqrt(np.bincount(body, squares.sum(axis=1)))

@@ -82,43 +82,43 @@ def gradient_at(m: ti.template(), g: ti.template(), E, M, q, real: ti.template()
 
 
 @ti.func
-def rest_gradients_of_F(m: ti.template(), b):
-    """Dm^-1 of the tets of block b in the precision in which F is formed, which is f64 if a mesh has slivers."""
-    return rest_gradients(m, b, m.strain_real)
+def rest_gradients_of_F(m: ti.template(), g: ti.template(), b):
+    """Dm^-1 of the tets of block b in the precision in which F is formed: f64 if a mesh has slivers, and in rigid bodies."""
+    return rest_gradients(m, b, g.strain_real)
 
 
 @ti.func
 def position_differences(m: ti.template(), g: ti.template(), b):
     """`differences` of the positions in the precision in which F is formed."""
-    return differences(m, g, m.state.x, b, m.strain_real)
+    return differences(m, g, m.state.x, b, g.strain_real)
 
 
 @ti.func
-def deformation_gradient(m: ti.template(), g: ti.template(), X, N, q):
-    """F at quadrature point q, rounded to `m.real`. X: `position_differences`; N: `rest_gradients_of_F`."""
-    if ti.static(m.strain_real == m.real):
-        return gradient_at(m, g, X, N, q, m.real)
+def deformation_gradient(m: ti.template(), g: ti.template(), X, N, q, real: ti.template()):
+    """F at quadrature point q, rounded to `real`. X: `position_differences`; N: `rest_gradients_of_F`."""
+    if ti.static(g.strain_real == real):
+        return gradient_at(m, g, X, N, q, real)
     else:
-        F = gradient_at(m, g, X, N, q, m.strain_real)
-        return [ti.cast(F[k], m.real) for k in ti.static(range(9))]
+        F = gradient_at(m, g, X, N, q, g.strain_real)
+        return [ti.cast(F[k], real) for k in ti.static(range(9))]
 
 
 @ti.func
 def zero_forces(m: ti.template(), g: ti.template()):
     """Zero-initialised accumulator for `add_forces`."""
-    return [broadcast(ti.cast(0.0, m.real), m.lanes) for k in ti.static(range(3 * (g.n_nodes - 1)))]
+    return [broadcast(ti.cast(0.0, g.real), m.lanes) for k in ti.static(range(3 * (g.n_nodes - 1)))]
 
 
 @ti.func
 def add_forces(m: ti.template(), g: ti.template(), S: ti.template(), P, M, q):
     """Add the contribution of stress P at quadrature point q to S, forces per volume: entry 3 (a - 1) + i, nodes a >= 1."""
-    w = weight_at(m, g, q, m.real)
+    w = weight_at(m, g, q, g.real)
     H = [w * dot(P[3 * i : 3 * i + 3], M[3 * c : 3 * c + 3]) for c in ti.static(range(3)) for i in ti.static(range(3))]
     if ti.static(g.order == 1):
         for k in ti.static(range(9)):
             S[k] += H[k]
     else:
-        C = derivatives_at(m, g, q, m.real)
+        C = derivatives_at(m, g, q, g.real)
         for a in ti.static(range(9)):
             for i in ti.static(range(3)):
                 S[3 * a + i] += H[i] * C[3 * a] + H[3 + i] * C[3 * a + 1] + H[6 + i] * C[3 * a + 2]
@@ -140,18 +140,18 @@ def store_lanes(m: ti.template(), out: ti.template(), at, values):
 @ti.func
 def store_forces(m: ti.template(), g: ti.template(), b, S):
     """Write the nodal forces -V S [N] of block b to `State.element_force`, lane by lane, which LLVM vectorises."""
-    V = -volumes(m, b, m.real)
+    V = -volumes(m, b, g.real)
     # the mask shows the compiler that no index overflows, so that it vectorises over lanes
     base = (m.state.element_force_at + g.force_at + (b - g.first) * (3 * g.n_nodes * m.lanes)) & m.state.element_force_mask
     for i in ti.static(range(3)):
-        total = broadcast(ti.cast(0.0, m.real), m.lanes)
+        total = broadcast(ti.cast(0.0, g.real), m.lanes)
         for a in ti.static(range(1, g.n_nodes)):
             f = V * S[3 * a - 3 + i]
             total += f
             for q in ti.static(range(m.lanes)):
-                m.state.element_force[base + ((3 * a + i) * m.lanes + q)] = f[q]
+                m.state.element_force[base + ((3 * a + i) * m.lanes + q)] = ti.cast(f[q], m.real)
         for q in ti.static(range(m.lanes)):
-            m.state.element_force[base + (i * m.lanes + q)] = -total[q]
+            m.state.element_force[base + (i * m.lanes + q)] = ti.cast(-total[q], m.real)
 
 
 @ti.func

@@ -131,11 +131,11 @@ def element_dilatation(m: ti.template(), g: ti.template(), b):
 @ti.func
 def element_rate(m: ti.template(), g: ti.template(), b, u: ti.template()):
     """Set the content of the tets of block b to their volumes times the mean changes of dilatation along the nodal field u."""
-    X, N = position_differences(m, g, b), rest_gradients_of_F(m, b)
+    X, N = position_differences(m, g, b), rest_gradients_of_F(m, g, b)
     U, M = differences(m, g, u, b, m.real), rest_gradients(m, b, m.real)
     total = broadcast(ti.cast(0.0, m.real), m.lanes)
     for q in range(g.n_points):
-        F = deformation_gradient(m, g, X, N, q)
+        F = deformation_gradient(m, g, X, N, q, m.real)
         dF = gradient_at(m, g, U, M, q, m.real)
         G = g.law.dilatation_gradient(F)
         total += weight_at(m, g, q, m.real) * ddot(G, dF)

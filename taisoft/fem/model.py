@@ -25,6 +25,7 @@ from taisoft.fem.pressure import PressureTable, build_pressures
 from taisoft.fem.state import State, build_state
 from taisoft.fem.terms import terms_of
 from taisoft.ranges import owners
+from taisoft.scene.rigid import RigidBody
 from taisoft.scene.scene import Body, Scene
 
 # Least quadrature points and CPU threads for parallel loops; below, one serial kernel runs. With two threads, parallel loops took
@@ -46,12 +47,15 @@ class Group:
     n_nodes: int  # of an element
     n_points: int
     mean_dilatation: bool
+    rigid: bool  # of rigid bodies, whose strains are as small as the rounding of f32
     first: Count  # first block
     last: Count  # one past the last block
     nodes_at: Count  # offset in Model.nodes
     force_at: Count  # offset in State.element_force
     matrix_at: Count  # offset in the assembly buffer
     points_at: Count  # first row in Model.points
+    real: Any = None  # Taichi type of stress
+    strain_real: Any = None  # Taichi type in which the deformation gradient is formed
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,13 +159,13 @@ def _layout(scene: Scene, lanes: int) -> tuple[Layout, tuple[Group, ...]]:
     parts: dict[tuple, list[np.ndarray]] = {}  # tets of one body and one law, by their kind
     for k, b in enumerate(bodies):
         for law in b.composition.laws:
-            kind = b.order, b.quadrature_degree, laws.index(law), b.dilatation == "mean"
+            kind = b.order, b.quadrature_degree, laws.index(law), b.dilatation == "mean", isinstance(b, RigidBody)
             parts.setdefault(kind, []).append(tet_start[k] + b.composition.tets_of_law(law))
     n_points = {degree: len(reference.quadrature(degree).weights) for _, degree, *_ in parts}
     tet_of_lane = []
     groups, block, nodes_at, force_at, matrix_at = [], 0, 0, 0, 0
     for kind in sorted(parts):
-        order, degree, law, mean = kind
+        order, degree, law, *switches = kind
         first = block
         for tets in parts[kind]:
             padded = -(-len(tets) // lanes) * lanes
@@ -170,7 +174,7 @@ def _layout(scene: Scene, lanes: int) -> tuple[Layout, tuple[Group, ...]]:
         n_nodes, count = len(reference.unit_mass(order)), (block - first) * lanes
         points_at = sum(n for other, n in n_points.items() if 1 < other < degree)  # order 1 has degree 1 and no table
         offsets = first, block, nodes_at, force_at, matrix_at, points_at
-        groups.append(Group(LAWS[laws[law]], order, n_nodes, n_points[degree], mean, *offsets))
+        groups.append(Group(LAWS[laws[law]], order, n_nodes, n_points[degree], *switches, *offsets))
         nodes_at += count * n_nodes
         force_at += count * n_nodes * 3
         matrix_at += (block - first) * MATRIX_BLOCKS[order] * 9
@@ -265,6 +269,8 @@ def build_model(scene: Scene, runtime: Runtime, arena: FieldArena, on: dict[str,
     serial = runtime.arch == "cpu" and (work < PARALLEL_FROM or threads() < PARALLEL_THREADS)
     chunks = 1 if serial else CHUNKS[runtime.arch]
     strain_real = ti.f64 if real == ti.f32 and _worst_condition(nodes, Dm_inv, layout) > ILL_CONDITIONED else real
+    types = {True: (ti.f64, ti.f64), False: (real, strain_real)}
+    groups = tuple(replace(g, **dict(zip(("real", "strain_real"), types[g.rigid]))) for g in groups)
     damped = on["mass_damping"] or on["stiffness_damping"]
     n_bodies = len(scene.bodies)
     node_body = owners(np.diff(layout.node_start)).astype(np.int32)

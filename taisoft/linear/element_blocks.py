@@ -52,7 +52,7 @@ def pair_terms(rules: list[Quadrature]) -> tuple[np.ndarray, np.ndarray, np.ndar
 @ti.func
 def element_blocks(m: ti.template(), g: ti.template(), A: ti.template(), b, projected: ti.template()):
     """Write K_ab of the node pairs of block b of group g to A.element."""
-    X, N = position_differences(m, g, b), rest_gradients_of_F(m, b)
+    X, N = position_differences(m, g, b), rest_gradients_of_F(m, g, b)
     p = stress_constants(m, g, b, m.real)
     M = rest_gradients(m, b, m.real)
     V = volumes(m, b, m.real)
@@ -61,7 +61,7 @@ def element_blocks(m: ti.template(), g: ti.template(), A: ti.template(), b, proj
         for k in range(N_PAIRS * 9):
             store_lanes(m, A.element, base + k, broadcast(ti.cast(0.0, m.real), m.lanes))
     for q in range(g.n_points):
-        F = deformation_gradient(m, g, X, N, q)
+        F = deformation_gradient(m, g, X, N, q, m.real)
         at = base + (N_PAIRS * 9 if ti.static(g.order == 2) else 0)
         if ti.static(projected):
             S = prepare_projected(g.law, F, p)

@@ -102,11 +102,11 @@ def find_gradients(m: ti.template(), A: ti.template()):
 @ti.func
 def element_gradients(m: ti.template(), g: ti.template(), A: ti.template(), b):
     """Write the derivatives of V sum_q w_q theta(F_q) by the nodes of block b, three numbers each, to A.element."""
-    X, N = position_differences(m, g, b), rest_gradients_of_F(m, b)
+    X, N = position_differences(m, g, b), rest_gradients_of_F(m, g, b)
     M, V = rest_gradients(m, b, m.real), volumes(m, b, m.real)
     S = zero_forces(m, g)
     for q in range(g.n_points):
-        F = deformation_gradient(m, g, X, N, q)
+        F = deformation_gradient(m, g, X, N, q, m.real)
         G = g.law.dilatation_gradient(F)
         add_forces(m, g, S, G, M, q)
     base = (A.element_at + g.matrix_at + (b - g.first) * (MATRIX_BLOCKS[g.order] * 9)) & A.element_mask

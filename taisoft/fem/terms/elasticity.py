@@ -43,17 +43,17 @@ def element_force(m: ti.template(), g: ti.template(), damped: ti.template(), b):
 
     Returns the smallest J = det F over each tet's quadrature points.
     """
-    X, N = position_differences(m, g, b), rest_gradients_of_F(m, b)
-    M = rest_gradients(m, b, m.real)
-    p = stress_constants(m, g, b, m.real)
+    X, N = position_differences(m, g, b), rest_gradients_of_F(m, g, b)
+    M = rest_gradients(m, b, g.real)
+    p = stress_constants(m, g, b, g.real)
     S = zero_forces(m, g)
     lowest = broadcast(ti.cast(HUGE, m.real), m.lanes)
     if ti.static(damped):
-        V = differences(m, g, m.state.v, b, m.real)
-        c = broadcast(m.damping[m.block_body[b], 1], m.lanes)
+        V = differences(m, g, m.state.v, b, g.real)
+        c = broadcast(ti.cast(m.damping[m.block_body[b], 1], g.real), m.lanes)
         for q in range(g.n_points):
-            F = deformation_gradient(m, g, X, N, q)
-            dF = gradient_at(m, g, V, M, q, m.real)
+            F = deformation_gradient(m, g, X, N, q, g.real)
+            dF = gradient_at(m, g, V, M, q, g.real)
             K = prepare_projected(g.law, F, p)
             D = dpk1_projected(K, dF)
             P = g.law.pk1(F, p)
@@ -64,13 +64,13 @@ def element_force(m: ti.template(), g: ti.template(), damped: ti.template(), b):
                 add_forces(m, g, S, [Q[k] + r * G[k] for k in ti.static(range(9))], M, q)
             else:
                 add_forces(m, g, S, Q, M, q)
-            lowest = ti.min(lowest, determinant(F))
+            lowest = ti.min(lowest, ti.cast(determinant(F), m.real))
     else:
         for q in range(g.n_points):
-            F = deformation_gradient(m, g, X, N, q)
+            F = deformation_gradient(m, g, X, N, q, g.real)
             P = g.law.pk1(F, p)
             add_forces(m, g, S, P, M, q)
-            lowest = ti.min(lowest, determinant(F))
+            lowest = ti.min(lowest, ti.cast(determinant(F), m.real))
     store_forces(m, g, b, S)
     return lowest
 
@@ -202,13 +202,13 @@ def force_differential(m: ti.template(), dx: ti.template(), df: ti.template()):
     for g in ti.static(m.groups):
         ti.loop_config(serialize=m.serial)
         for b in range(g.first, g.last):
-            X, N = position_differences(m, g, b), rest_gradients_of_F(m, b)
+            X, N = position_differences(m, g, b), rest_gradients_of_F(m, g, b)
             dX = differences(m, g, dx, b, m.real)
             M = rest_gradients(m, b, m.real)
             p = stress_constants(m, g, b, m.real)
             S = zero_forces(m, g)
             for q in range(g.n_points):
-                F = deformation_gradient(m, g, X, N, q)
+                F = deformation_gradient(m, g, X, N, q, m.real)
                 dF = gradient_at(m, g, dX, M, q, m.real)
                 K = g.law.prepare(F, p)
                 dP = g.law.dpk1(F, K, dF)
