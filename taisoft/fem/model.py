@@ -281,7 +281,8 @@ def build_model(scene: Scene, runtime: Runtime, arena: FieldArena, on: dict[str,
     laws = law_table(scene, layout, on["elasticity_by_tet"])
     rules = tuple(reference.quadrature(d) for d in sorted({b.quadrature_degree for b in scene.bodies if b.order == 2}))
     table = _rule_table(rules) if rules else None
-    rest_lanes = lane_layout(Dm_inv.reshape(-1, 9), lanes).astype(npr if strain_real == real else np.float64)
+    rest_real = ti.f64 if on["rigid_bodies"] else strain_real
+    rest_lanes = lane_layout(Dm_inv.reshape(-1, 9), lanes).astype(npr if rest_real == real else np.float64)
     weight = mass = arena.field("mass", real, n_nodes, reference.lumped_masses(scene).astype(npr))
     if on["consistent_weight"]:
         weight = arena.field("gravity_mass", real, n_nodes, reference.gravity_masses(scene).astype(npr))
@@ -299,7 +300,7 @@ def build_model(scene: Scene, runtime: Runtime, arena: FieldArena, on: dict[str,
         nodes=arena.field("nodes", ti.i32, len(flat_nodes), flat_nodes.astype(np.int32)),
         rules=rules,
         points=arena.field("points", ti.f64, (len(table), 28), table) if rules else None,
-        Dm_inv=arena.field("Dm_inv", strain_real, (n_blocks, 9, lanes), rest_lanes),
+        Dm_inv=arena.field("Dm_inv", rest_real, (n_blocks, 9, lanes), rest_lanes),
         volume=arena.field("volume", real, (n_blocks, lanes), volume.reshape(n_blocks, lanes).astype(npr)),
         block_body=arena.field("block_body", ti.i32, n_blocks, block_body),
         law_constants=arena.field("law_constants", ti.f64, laws.shape, laws),

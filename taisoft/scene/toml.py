@@ -111,7 +111,7 @@ def _read(tables: Table, allow_outside: bool) -> tuple[Scene, dict]:
     materials = {name: parent.made(name, Material, "material: ") for name in parent.known}
     bodies, rigid = tables.named("bodies"), tables.named("rigid_bodies")
     if not bodies.known and not rigid.known:
-        raise tables.error("bodies", "must hold a table [bodies.NAME], or rigid_bodies a table [rigid_bodies.NAME]")
+        raise tables.error("bodies", "must hold a table [bodies.NAME]" if "bodies" in tables else "is missing")
     known, _ = arguments_of(Scene.add_body, "name")
     meshes: dict[str, TetMesh] = {}  # bodies with equal mesh tables share one mesh
     for name in bodies.known:
