@@ -11,6 +11,7 @@ from taisoft.dynamics.dynamics import Dynamics
 from taisoft.errors import SceneError, SimulationError, no_memory
 from taisoft.estimation.first_choice import settings_for
 from taisoft.fem.laws import LAWS
+from taisoft.output.vtu import write_vtu
 from taisoft.records import StepReport
 from taisoft.scene.scene import Scene
 from taisoft.settings import NAMES, Settings, check_count, check_settings, plan_of
@@ -220,11 +221,12 @@ class Simulator(Guarded):
         """Return the arguments, besides the scene, that make a simulator with the present settings."""
         return dataclasses.asdict(self.settings) | {"dt": self.dt}
 
-    # --- checkpoints and resources --------------------------------------------------------------------------------------
+    # --- files and resources --------------------------------------------------------------------------------------------
 
     save_checkpoint = checkpoint.save_checkpoint
     load_checkpoint = classmethod(checkpoint.load_checkpoint)
     from_checkpoint = classmethod(checkpoint.from_checkpoint)
+    write_vtu = write_vtu
 
     def close(self) -> None:
         """Release memory and runtime; a closed simulator cannot be used."""

@@ -41,7 +41,11 @@ ORDER = (
     ("dynamics.schemes",),
     ("settings",),
     ("dynamics",),
-    ("simulator", "queries", "changes", "energy_check", "frames", "running", "static", "checkpoint", "estimation"),
+    ("output.camera", "output.nodal_fields"),
+    (
+        *("simulator", "queries", "changes", "energy_check", "frames", "running", "static", "checkpoint", "estimation"),
+        "output.vtu",  # a method of Simulator
+    ),
     ("output", "view"),
     ("study",),
     ("cli",),

@@ -27,12 +27,11 @@ import numpy as np
 from taisoft.errors import OutputError
 from taisoft.files import part_path, publish, replacing
 from taisoft.output.files import make_folder, output_errors
-from taisoft.output.nodal_fields import NodalMean, contact_impulses, von_mises
+from taisoft.output.nodal_fields import UNKNOWN_ERROR, NodalMean, contact_impulses, von_mises
 from taisoft.output.usd_scene import ERROR, IMPULSE, ROOT, STRESS, TRANSLATE, scene_layer
 
 SCENE_NAME = "scene.usdc"
 CHUNKS_NAME = "chunks"
-UNKNOWN_ERROR = -1.0  # of points whose error is unknown
 TIME_VARYING = {"points", "extent", TRANSLATE, *(f"primvars:{name}" for name in (STRESS, IMPULSE, ERROR))}  # attributes
 
 
