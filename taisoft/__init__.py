@@ -19,6 +19,7 @@ _MODULES = {  # public name -> the module that defines it
     "ball_mesh": "taisoft.mesh.shapes",
     "read_mesh": "taisoft.mesh.files",
     "write_mesh": "taisoft.mesh.files",
+    "read_usd": "taisoft.mesh.usd",
     "SurfaceMesh": "taisoft.mesh.surface_mesh",
     "read_surface": "taisoft.mesh.surface_mesh",
     "tetrahedralize": "taisoft.mesh.surface_mesh",

@@ -145,7 +145,7 @@ def _parser() -> argparse.ArgumentParser:
 
     _add_run(add)
     option = add("scene", ("files", "scene"), "write a scene, or a starting scene for a mesh, as a .toml file").add_argument
-    _add_scene_name(option, "a .toml or .py file, or a mesh (.msh, .vtu, .vtk, .mesh, .node) that falls on the ground")
+    _add_scene_name(option, "a .toml or .py file, or a mesh (.msh, .vtu, .vtk, .mesh, .node, USD) that falls on the ground")
     option("--out", metavar="FILE", required=True, help="the .toml file; its meshes are written beside it")
     option("--overwrite", action="store_true", help="replace existing files")
 
@@ -153,7 +153,7 @@ def _parser() -> argparse.ArgumentParser:
     add("list", ("scene_file", "list_demos"), "the demos, one line each")
 
     option = add("info", ("files", "info"), "report a mesh file's counts, size, quality and problems").add_argument
-    option("mesh", metavar="MESH", help="tetrahedra in any format that meshio reads, or a surface")
+    option("mesh", metavar="MESH", help="tetrahedra in any format that meshio reads, a surface, or a USD stage")
 
     option = add("tetrahedralize", ("files", "fill"), "fill a surface with tets (extra 'mesh')").add_argument
     option("surface", metavar="SURFACE", help="an .obj, .stl, .ply or .off file of triangles")

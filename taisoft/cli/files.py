@@ -16,6 +16,7 @@ from taisoft.mesh.quality import edge_lengths, mean_ratio
 from taisoft.mesh.surface_mesh import FORMATS, SurfaceMesh, read_surface, tetrahedralize
 from taisoft.mesh.tet_mesh import TetMesh
 from taisoft.mesh.topology import connected_pieces
+from taisoft.mesh.usd import USD_FORMATS, read_usd
 from taisoft.scene.material import Material
 from taisoft.scene.obstacles import HalfSpace
 from taisoft.scene.scene import Scene
@@ -37,11 +38,15 @@ def info(arguments: Namespace) -> int:
     """Print counts, size, likely unit, quality and problems. Raises MeshError if the file is not a mesh."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # they are listed as problems below
-        if Path(arguments.mesh).suffix.lower() in FORMATS:
-            lines = _describe_surface(read_surface(arguments.mesh))
+        ending = Path(arguments.mesh).suffix.lower()
+        if ending in FORMATS:
+            found = {arguments.mesh: _describe_surface(read_surface(arguments.mesh))}
+        elif ending in USD_FORMATS:
+            found = {f"{arguments.mesh}: {name}": describe(mesh) for name, mesh in read_usd(arguments.mesh).items()}
         else:
-            lines = describe(read_mesh(arguments.mesh))
-    _print_lines(arguments.mesh, lines)
+            found = {arguments.mesh: describe(read_mesh(arguments.mesh))}
+    for title, lines in found.items():
+        _print_lines(title, lines)
     return 0
 
 
@@ -66,7 +71,9 @@ def scene(arguments: Namespace) -> int:
     path = Path(arguments.scene)
     with printed_warnings():
         if path.suffix.lower() in MESH_SUFFIXES:
-            made, solver = _drop_scene(read_mesh(path), path.stem)
+            made, solver = _drop_scene({path.stem: read_mesh(path)})
+        elif path.suffix.lower() in USD_FORMATS:
+            made, solver = _drop_scene(read_usd(path))
         else:
             made, solver = load_scene(arguments.scene, arguments.allow_outside)
     for written in write_scene(arguments.out, made, solver, arguments.overwrite):
@@ -160,14 +167,18 @@ def _print_lines(title, lines: list[tuple[str, str]]) -> None:
         print(f"  {name:<10} {text}")
 
 
-def _drop_scene(mesh: TetMesh, name: str) -> tuple[Scene, dict]:
-    """Return a scene in which the mesh, of rubber with stiffness scaled to its size, falls on the ground; and its solver dict."""
+def _drop_scene(meshes: dict[str, TetMesh]) -> tuple[Scene, dict]:
+    """Return a scene in which meshes, of rubber with stiffness scaled to their size, fall on the ground; and its solver dict.
+
+    meshes: by name, as they stand to each other.
+    """
     made = Scene(gravity=(0.0, -9.81, 0.0))
-    low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
-    height = float((high - low)[1])
+    low = min(float(mesh.vertices[:, 1].min()) for mesh in meshes.values())
+    height = max(float(mesh.vertices[:, 1].max()) for mesh in meshes.values()) - low
     young = float(f"{RELATIVE_STIFFNESS * DENSITY * 9.81 * height:.0e}")  # one digit
     rubber = Material(young=young, poisson=0.4, density=DENSITY, friction=0.5)
-    made.add_body(mesh, rubber, name="body" if name == GROUND else name, position=(0.0, DROP * height - float(low[1]), 0.0))
+    for name, mesh in meshes.items():
+        made.add_body(mesh, rubber, name="body" if name == GROUND else name, position=(0.0, DROP * height - low, 0.0))
     made.add_obstacle(HalfSpace((0.0, 0.0, 0.0), (0.0, 1.0, 0.0)), name=GROUND, friction=0.5)
     fall = math.sqrt(2.0 * DROP * height / 9.81)  # [s]
     fps = 50.0 if fall > 0.05 else float(np.ceil(2.5 / fall))

@@ -156,11 +156,11 @@ def read_surface(path, weld: float = 0.0) -> SurfaceMesh:
     # Split each polygon as a fan around its first corner.
     fans = [nodes[:, [0, k, k + 1]] for nodes in polygons for k in range(1, nodes.shape[1] - 1)]
     triangles = np.concatenate([np.empty((0, 3), dtype=np.int64), *fans])
-    return _clean(SurfaceMesh(points, triangles, name), float(weld))
+    return clean_surface(SurfaceMesh(points, triangles, name), float(weld))
 
 
-def _clean(surface: SurfaceMesh, weld: float) -> SurfaceMesh:
-    """Return the welded surface without degenerate and duplicate triangles; issue its warnings."""
+def clean_surface(surface: SurfaceMesh, weld: float) -> SurfaceMesh:
+    """Return the surface, welded [m], without degenerate and duplicate triangles; issue its warnings, at the caller's caller."""
     name, points, triangles = surface.source, surface.vertices, surface.triangles
     notes = []
     labels = merge_labels(points, weld)
