@@ -23,6 +23,7 @@ _MODULES = {  # public name -> the module that defines it
     "SurfaceMesh": "taisoft.mesh.surface_mesh",
     "read_surface": "taisoft.mesh.surface_mesh",
     "tetrahedralize": "taisoft.mesh.surface_mesh",
+    "place": "taisoft.mesh.placing",
     "Material": "taisoft.scene.scene",
     "Body": "taisoft.scene.scene",
     "Scene": "taisoft.scene.scene",

@@ -146,6 +146,7 @@ def _parser() -> argparse.ArgumentParser:
     _add_run(add)
     option = add("scene", ("files", "scene"), "write a scene, or a starting scene for a mesh, as a .toml file").add_argument
     _add_scene_name(option, "a .toml or .py file, or a mesh (.msh, .vtu, .vtk, .mesh, .node, USD) that falls on the ground")
+    _add_placement(option, "instead of falling from above the ground")
     option("--out", metavar="FILE", required=True, help="the .toml file; its meshes are written beside it")
     option("--overwrite", action="store_true", help="replace existing files")
 
@@ -157,10 +158,11 @@ def _parser() -> argparse.ArgumentParser:
 
     option = add("tetrahedralize", ("files", "fill"), "fill a surface with tets (extra 'mesh')").add_argument
     option("surface", metavar="SURFACE", help="an .obj, .stl, .ply or .off file of triangles")
+    _add_placement(option)
     option("--out", metavar="MESH", required=True, help="the mesh file: .msh, .vtk, .vtu or .mesh")
     option("--edge-length", type=float, metavar="L", help="of the tets [m] (default: a twentieth of the diagonal)")
     option("--envelope", type=float, metavar="E", help="how far the surface may move [m] (default: L / 10)")
-    option("--weld", type=float, default=0.0, metavar="D", help="merge vertices at most this far apart [m]")
+    option("--weld", type=float, default=0.0, metavar="D", help="merge vertices at most this far apart, in the file's unit")
     option("--overwrite", action="store_true", help="replace MESH if it exists")
 
     add("doctor", ("doctor", "doctor"), "report what this machine offers, and how to get what is missing")
@@ -219,6 +221,15 @@ def _add_run(add) -> None:
     option("--plots", metavar="NAME,...", help="plots over time: energies, residuals, iterations, contacts, step_time, error")
     option("--caption", action="store_true", help="write scene, frame, time and energies on pictures")
     option("--no-frames", action="store_true", help="write no pictures")
+
+
+def _add_placement(option, instead: str = "(default: the mesh stays)") -> None:
+    """Add the options that place a mesh, in the order in which they are applied; those that are not given are None."""
+    option("--up", choices=("x", "y", "z"), help="axis of the file that points up (default y)")
+    option("--scale", type=float, metavar="S", help="factor, such as 0.001 for millimetres (default 1)")
+    angles = "angles [deg] about x, then y, then z, after --up (default 0 0 0)"
+    option("--rotate", type=float, nargs=3, metavar=("RX", "RY", "RZ"), help=angles)
+    option("--at", type=float, nargs=3, metavar=("X", "Y", "Z"), help=f"where the middle of its underside goes [m] {instead}")
 
 
 def _add_study(add) -> None:
