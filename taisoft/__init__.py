@@ -11,6 +11,9 @@ if os.name == "posix" and "HOME" not in os.environ:
     os.environ["HOME"] = _home if os.path.isabs(_home) else "/tmp"
 
 os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")  # else Taichi prints a banner on standard output when imported
+os.environ.setdefault(
+    "TI_ENABLE_PYBUF", "0"
+)  # else a line in a notebook's cell; kernels that print do so without the buffer, too
 
 _MODULES = {  # public name -> the module that defines it
     "TetMesh": "taisoft.mesh.tet_mesh",
@@ -38,6 +41,8 @@ _MODULES = {  # public name -> the module that defines it
     "write_scene": "taisoft.scene.toml_writer",
     "CollisionSettings": "taisoft.scene.collision",
     "Simulator": "taisoft.simulator",
+    "Film": "taisoft.view.notebook",
+    "InteractiveView": "taisoft.view.interactive",
     "solve_static": "taisoft.static",
     "modes": "taisoft.stability",
     "evaluate_law": "taisoft.fem.laws.evaluate",

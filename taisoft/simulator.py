@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 from taisoft import changes, checkpoint, queries, running
 from taisoft.attributes import Guarded, SimulationAttributeError, thawed
 from taisoft.backend import runtime
+from taisoft.display import drawn, simulator_text
 from taisoft.dynamics.dynamics import Dynamics
 from taisoft.errors import SceneError, SimulationError, no_memory
 from taisoft.estimation.first_choice import settings_for
@@ -134,6 +135,7 @@ class Simulator(Guarded):
 
     # --- results: queries.py ------------------------------------------------------------------------------------------
 
+    is_open = property(queries.is_open)
     time = property(queries.time)
     step_count = property(queries.step_count)
     positions = queries.positions
@@ -159,6 +161,7 @@ class Simulator(Guarded):
     nodal_errors = queries.nodal_errors
     draggable = property(queries.draggable)
     dragged = property(queries.dragged)
+    picture = queries.picture
     compile_seconds = property(queries.compile_seconds)
     field_bytes = property(queries.field_bytes)
     buffer_growths = property(queries.buffer_growths)
@@ -239,6 +242,11 @@ class Simulator(Guarded):
 
     def __exit__(self, *exception) -> None:
         self.close()
+
+    __repr__ = simulator_text
+
+    def _repr_html_(self) -> str | None:
+        return drawn("simulator_html", self)
 
     def _host(self) -> Dynamics:
         """Return the dynamics for data on the host alone. Raises SimulationError after `close`."""

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from taisoft.attributes import MeshAttributeError, guarded_record
+from taisoft.display import short_repr
 from taisoft.errors import MeshError
 from taisoft.mesh.tet_mesh import TetMesh
 from taisoft.mesh.topology import EDGES, distinct_edges
@@ -48,6 +49,8 @@ class Nodes:
     surface: np.ndarray
     surface_tets: np.ndarray
     tets: np.ndarray
+
+    __repr__ = short_repr
 
     def __post_init__(self):
         for array in (self.positions, self.elements, self.surface, self.surface_tets, self.tets):
