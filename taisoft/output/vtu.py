@@ -16,8 +16,8 @@ VTK numbers the edges of a quadratic tet (01, 12, 20, 03, 13, 23), taisoft (01, 
 | kinetic, elastic, gravity, loads | file | energies [J] |
 | body NAME | file | number of the body called NAME |
 
-Points are float64, what is derived from them float32. Arrays are compressed by zlib and encoded in base64. meshio writes such
-files too, but without data of the file, so without the time.
+Points are float64, what is derived from them float32. Arrays are compressed by zlib, where that helps, and encoded in base64.
+meshio writes such files too, but without data of the file, so without the time.
 """
 
 import base64
@@ -44,6 +44,7 @@ SYMMETRIC = ([0, 1, 2, 0, 1, 0], [0, 1, 2, 1, 2, 2])  # rows and columns of a te
 TYPES = {"float64": "Float64", "float32": "Float32", "int64": "Int64", "int32": "Int32", "uint8": "UInt8"}
 BLOCK = 2**20  # bytes that are compressed at a time
 COMPRESSION = 1  # zlib's level; higher ones take several times as long for a few percent of such numbers
+SAMPLE, WORTHWHILE = 2**14, 0.7  # a block is compressed if its first SAMPLE bytes shrink to this fraction, else stored as it is
 
 
 def write_vtu(self: "Simulator", path) -> None:
@@ -62,7 +63,7 @@ def write_vtu(self: "Simulator", path) -> None:
 
 
 class Grid:
-    """The cells of a scene, which do not change; `encoded` adds a state. scene: read once."""
+    """The cells of a scene, which are encoded once; `encoded` adds a state. scene: read once."""
 
     def __init__(self, scene):
         self._names, self._start = [body.name for body in scene.bodies], start_positions(scene)
@@ -76,14 +77,15 @@ class Grid:
             region.append(np.zeros(len(elements)) if one.mesh.regions is None else one.mesh.regions)
             first += one.n_nodes
         sizes = np.concatenate(sizes)
-        self._cells = {
+        cells = {
             "connectivity": np.concatenate(connectivity).astype(np.int64),
             "offsets": np.cumsum(sizes, dtype=np.int64),
             "types": np.where(sizes == 4, CELL_TYPES[4], CELL_TYPES[10]).astype(np.uint8),
         }
-        self._cell_data = {"body": np.concatenate(body).astype(np.int32)}
+        self._cells = [_array(name, values) for name, values in cells.items()]
+        self._cell_data = [_array("body", np.concatenate(body).astype(np.int32))]
         if any(one.mesh.regions is not None for one in scene.bodies):
-            self._cell_data["region"] = np.concatenate(region).astype(np.int32)
+            self._cell_data.append(_array("region", np.concatenate(region).astype(np.int32)))
 
     def encoded(self, sim: "Simulator", errors: bool = False) -> bytes:
         """Return the file's bytes for sim's present state. errors: whether it runs with error=True."""
@@ -100,11 +102,11 @@ class Grid:
         parts = [
             *("<FieldData>", *(_number(name, value) for name, value in of_file.items()), "</FieldData>"),
             f'<Piece NumberOfPoints="{len(x)}" NumberOfCells="{len(sigma)}">',
-            _section("Points", {"Points": x}),
-            _section("Cells", self._cells),
-            _section("PointData", {name: values.astype(np.float32) for name, values in points.items()}),
-            _section("CellData", self._cell_data | {name: values.astype(np.float32) for name, values in cells.items()}),
-            "</Piece>",
+            *("<Points>", _array("Points", x), "</Points>"),
+            *("<Cells>", *self._cells, "</Cells>"),
+            *("<PointData>", *(_array(name, values.astype(np.float32)) for name, values in points.items()), "</PointData>"),
+            *("<CellData>", *self._cell_data, *(_array(name, values.astype(np.float32)) for name, values in cells.items())),
+            *("</CellData>", "</Piece>"),
         ]
         return vtk_file("UnstructuredGrid", parts, 'header_type="UInt64" compressor="vtkZLibDataCompressor"')
 
@@ -113,10 +115,6 @@ def vtk_file(kind: str, parts: list[str], attributes: str = "") -> bytes:
     """Return a VTK XML file of a kind, such as UnstructuredGrid, made of parts."""
     head = f'<VTKFile type="{kind}" version="1.0" byte_order="LittleEndian" {attributes}>'
     return "\n".join(['<?xml version="1.0" encoding="utf-8"?>', head, f"<{kind}>", *parts, f"</{kind}>", "</VTKFile>\n"]).encode()
-
-
-def _section(name: str, arrays: dict[str, np.ndarray]) -> str:
-    return "\n".join([f"<{name}>", *(_array(key, values) for key, values in arrays.items()), f"</{name}>"])
 
 
 def _number(name: str, value: float | int) -> str:
@@ -129,8 +127,14 @@ def _array(name: str, values: np.ndarray) -> str:
     """Return an array (n,) or (n,k) with VTK's header: number of blocks, size of each and of the last, compressed sizes."""
     data = np.ascontiguousarray(values, dtype=values.dtype.newbyteorder("<")).tobytes()
     blocks = [data[k : k + BLOCK] for k in range(0, len(data), BLOCK)]
-    packed = [zlib.compress(block, COMPRESSION) for block in blocks]
+    packed = [zlib.compress(block, _level(block)) for block in blocks]
     header = np.array([len(blocks), BLOCK, len(blocks[-1]), *map(len, packed)], dtype="<u8").tobytes()
     text = (base64.b64encode(header) + base64.b64encode(b"".join(packed))).decode()
     components = f' NumberOfComponents="{values.shape[1]}"' if values.ndim == 2 else ""
     return f'<DataArray type="{TYPES[values.dtype.name]}" Name={quoteattr(name)}{components} format="binary">{text}</DataArray>'
+
+
+def _level(block: bytes) -> int:
+    """Return zlib's level for a block: most digits of positions and stresses are random, and compressing them only takes time."""
+    sample = block[:SAMPLE]
+    return COMPRESSION if len(zlib.compress(sample, COMPRESSION)) < WORTHWHILE * len(sample) else 0
