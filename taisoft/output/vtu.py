@@ -44,7 +44,7 @@ SYMMETRIC = ([0, 1, 2, 0, 1, 0], [0, 1, 2, 1, 2, 2])  # rows and columns of a te
 TYPES = {"float64": "Float64", "float32": "Float32", "int64": "Int64", "int32": "Int32", "uint8": "UInt8"}
 BLOCK = 2**20  # bytes that are compressed at a time
 COMPRESSION = 1  # zlib's level; higher ones take several times as long for a few percent of such numbers
-SAMPLE, WORTHWHILE = 2**14, 0.7  # a block is compressed if its first SAMPLE bytes shrink to this fraction, else stored as it is
+SAMPLE, WORTHWHILE = 2**14, 0.5  # a block is compressed if its first SAMPLE bytes shrink to this fraction, else stored as it is
 
 
 def write_vtu(self: "Simulator", path) -> None:
