@@ -11,9 +11,7 @@ if os.name == "posix" and "HOME" not in os.environ:
     os.environ["HOME"] = _home if os.path.isabs(_home) else "/tmp"
 
 os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")  # else Taichi prints a banner on standard output when imported
-os.environ.setdefault(
-    "TI_ENABLE_PYBUF", "0"
-)  # else a line in a notebook's cell; kernels that print do so without the buffer, too
+os.environ.setdefault("TI_ENABLE_PYBUF", "0")  # else Taichi writes a line into a notebook's cell
 
 _MODULES = {  # public name -> the module that defines it
     "TetMesh": "taisoft.mesh.tet_mesh",
