@@ -262,3 +262,10 @@ def test_a_full_disk_is_reported(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("taisoft.output.frame_files.write_bytes", full)
     assert run(path, "--out", out, *OPTIONS) == 3
     assert "No space left" in capsys.readouterr().err
+
+
+def test_estimated_errors_are_data_of_the_points(tmp_path):
+    out = tmp_path / "out"
+    assert run(write(tmp_path / "scene.py", BEAM), "--out", out, "--vtu", "--error", "--no-usd", "--no-frames") == 0
+    first, last = (meshio.read(out / "vtu" / f"{k:05d}.vtu").point_data["estimated_error"] for k in (0, 3))
+    assert (first <= 0).all() and last.max() > 0 and len(last) == len(ts.box_mesh((4, 1, 1), (4, 2, 2)).vertices)
