@@ -21,6 +21,11 @@ if TYPE_CHECKING:
     from taisoft.simulator import Simulator
 
 
+def is_open(self: "Simulator") -> bool:
+    """Whether the simulator can be used, as it can until `close`."""
+    return self._dynamics is not None and self._dynamics.is_open
+
+
 def time(self: "Simulator") -> float:
     """Simulated time [s]."""
     return self._host().state.time
@@ -287,6 +292,18 @@ def buffer_growths(self: "Simulator") -> dict[str, int]:
     """How often each buffer of contact detection grew since the start; buffers that never grew are left out."""
     detection = self._dynamics.detection
     return {name: n for name, n in detection.counts.growths.items() if n} if detection is not None else {}
+
+
+def picture(self: "Simulator", size: tuple[int, int] = (1280, 720), colour: str = "stress") -> np.ndarray:
+    """Return a picture of the present state, uint8 (height, width, 3), first row on top.
+
+    size: width and height in pixels; colour: of the bodies, by "stress" (von Mises), "stretch" or "speed", on a scale up to the
+    state's 99 % quantile, "error" in a run with error=True, or "body". The camera frames the bodies at the start, and steps back
+    if one would leave the picture. Needs no display. Raises OutputError for another size or colour.
+    """
+    from taisoft.view.offscreen import Offscreen  # compiles kernels at the first picture
+
+    return Offscreen(self.scene, size, colour=colour).image(self)
 
 
 # --- arguments --------------------------------------------------------------------------------------------------------

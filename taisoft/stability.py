@@ -10,6 +10,7 @@ import numpy as np
 import scipy.sparse as sp
 import scipy.sparse.linalg as spl
 
+from taisoft.display import short_repr
 from taisoft.errors import SceneError
 from taisoft.fem import reference
 from taisoft.fem.dependents import dependent_table
@@ -238,6 +239,8 @@ class Modes(NamedTuple):
 
     frequencies: np.ndarray
     shapes: np.ndarray
+
+    __repr__ = short_repr
 
 
 def modes(scene: Scene, k: int, mass: str = "lumped") -> Modes:

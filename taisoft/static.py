@@ -7,6 +7,7 @@ import numpy as np
 
 from taisoft.backend.arrays import FieldArena, upload
 from taisoft.backend.runtime import Runtime, open_kind, open_runtime
+from taisoft.display import short_repr
 from taisoft.dynamics.contact_newton import solve
 from taisoft.dynamics.dirichlet import DirichletConditions
 from taisoft.dynamics.no_contacts import NoContacts
@@ -46,6 +47,8 @@ class StaticResult:
     _positions: np.ndarray
     _reactions: np.ndarray
     _pressures: dict[str, float]
+
+    __repr__ = short_repr
 
     def positions(self, name: str | None = None) -> np.ndarray:
         """Positions (n_nodes, 3) [m] of a body, or of all bodies concatenated."""

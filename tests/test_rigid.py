@@ -1,5 +1,6 @@
 """Rigid bodies: moments, motion against Euler's equations, contacts, constraints, attachments, refusals, files, checkpoints."""
 
+import meshio
 import numpy as np
 import pytest
 import scipy.integrate
@@ -7,6 +8,7 @@ from command import write
 
 import taisoft as ts
 from taisoft.mesh.solids import shell_tets
+from taisoft.output.frame_files import body_arrays
 from taisoft.output.nodal_fields import NodalMean
 from taisoft.scene import rigid
 from taisoft.scene.plan import make_plan
@@ -481,6 +483,22 @@ def test_a_checkpoint_continues_bitwise(tmp_path):
     with ts.Simulator.load_checkpoint(tmp_path / "c.npz", scene.snapshot()) as sim:
         sim.run(seconds=0.1)
         assert np.array_equal(sim.positions(), expected) and np.array_equal(sim.contact_force("tool"), force)
+
+
+def test_files_of_frames_hold_the_surface(tmp_path):
+    scene = ts.Scene()
+    scene.add_rigid_body(box(), name="tool")
+    scene.add_body(box(cells=(2, 2, 2)), ts.Material(), name="soft", position=(0, 3, 0))
+    with ts.Simulator(scene, dt=1 / 100) as sim:
+        sim.step()
+        sim.write_vtu(tmp_path / "a.vtu")
+        mesh = meshio.read(tmp_path / "a.vtu")
+        assert np.array_equal(mesh.points, sim.positions())
+        n_tets = scene.bodies[1].mesh.n_tets
+        assert [(block.type, len(block.data)) for block in mesh.cells] == [("triangle", 12), ("tetra", n_tets)]
+        arrays = body_arrays(scene)
+        assert arrays["first_tet"].tolist() == [0, 0, n_tets] and arrays["first_triangle"][1] == 12
+        assert sim.picture((64, 48)).shape == (48, 64, 3)
 
 
 SCENE = """

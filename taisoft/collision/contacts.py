@@ -22,6 +22,7 @@ from taisoft.backend.arrays import Count, FieldArena
 from taisoft.backend.runtime import kernel
 from taisoft.collision.candidates import Parts
 from taisoft.collision.surface import cell_of, dvec, ivec
+from taisoft.display import short_repr
 
 # kinds of contacts; their two ids are: vertex and triangle; edge and edge (3 triangle + local edge); vertex and collider;
 # triangle and collider; a passage (`passages`)
@@ -67,6 +68,8 @@ class Contacts:
     restitution: np.ndarray  #: (k,) of the pair
     found: int  #: contacts before the reduction
     unmapped: int  #: triangles whose tet is inverted, so that a distance field could not be used
+
+    __repr__ = short_repr
 
     def __len__(self) -> int:
         return len(self.gap)

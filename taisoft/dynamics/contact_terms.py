@@ -237,8 +237,6 @@ def save_diagonal(m: ti.template(), A: ti.template(), k: ti.template(), subset: 
         for a in ti.static(range(3)):
             # an entry can be negative if tets are strongly compressed
             d = ti.max(ti.abs(ti.cast(A.diagonal[i][5 * a], ti.f64)), ti.cast(m.mass[i], ti.f64))
-            if ti.static(m.has_rigid):  # its nodes move together, however stiff it is
-                d = ti.cast(m.mass[i], ti.f64) if m.rigid_node[i] == 1 else d
             p.inverse_mass[i][a] = ti.cast(m.free[i][a], ti.f64) / d
 
 

@@ -100,7 +100,6 @@ class Model:
     loads: Any  # (n_nodes) 3-vectors [N], or None: tractions and forces
     amplitudes: Any  # f64, or None: present values of the loads that are one number, see `fem.loads.scalar_loads`
     pressure: PressureTable | None
-    rigid_node: Any  # (n_nodes) i32, or None: 1 for nodes of the tets of rigid bodies
     node_body: Any  # (n_nodes) i32; None unless damping needs it
     damping: Any  # (n_bodies, 2), or None: mass damping [1/s], stiffness damping [s]
     consistent: bool  # mass_matrix is used
@@ -117,11 +116,6 @@ class Model:
     def has_dependents(self) -> bool:
         """Whether nodes are attached exactly."""
         return self.dependents is not None
-
-    @property
-    def has_rigid(self) -> bool:
-        """Whether there are rigid bodies."""
-        return self.rigid_node is not None
 
     @property
     def has_springs(self) -> bool:
@@ -322,7 +316,6 @@ def build_model(scene: Scene, runtime: Runtime, arena: FieldArena, on: dict[str,
         loads=arena.vectors("loads", real, n_nodes, scene_loads.at(0.0).astype(npr)) if on["loads"] else None,
         amplitudes=arena.field("amplitudes", ti.f64, n_amplitudes, scene_loads.amplitudes([0.0])[0]) if n_amplitudes else None,
         pressure=None,
-        rigid_node=arena.field("rigid_node", ti.i32, n_nodes, _rigid_nodes(scene)) if on["rigid_bodies"] else None,
         node_body=arena.field("node_body", ti.i32, n_nodes, node_body) if damped else None,
         damping=arena.field("damping", real, (n_bodies, 2), damping_table(scene).astype(npr)) if damped else None,
         consistent=on["consistent_mass"],
@@ -342,12 +335,6 @@ def build_model(scene: Scene, runtime: Runtime, arena: FieldArena, on: dict[str,
     if on["pressure"]:
         model = replace(model, pressure=build_pressures(scene, layout.node_start, arena, graph))
     return model, layout
-
-
-def _rigid_nodes(scene: Scene) -> np.ndarray:
-    """1 for nodes of the tets of rigid bodies (n_nodes,)."""
-    parts = [np.arange(b.n_nodes) < (b.nodes.n_elastic if isinstance(b, RigidBody) else 0) for b in scene.bodies]
-    return np.concatenate(parts).astype(np.int32)
 
 
 def _build_mass_matrix(scene: Scene, model: Model, arena: FieldArena, graph: NodeGraph) -> MassMatrix:

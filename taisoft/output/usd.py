@@ -18,7 +18,6 @@ An obstacle is `/World/<name>` with `surface` and `material`; its points change 
 whose square lies entirely within others is left out. `/View` holds a camera and lights (`usd_scene.py`).
 """
 
-import re
 from contextlib import suppress
 from pathlib import Path
 
@@ -27,13 +26,13 @@ import numpy as np
 from taisoft.dynamics.contact_record import nodal_impulses
 from taisoft.errors import OutputError
 from taisoft.files import part_path, publish, replacing
+from taisoft.mesh.usd_content import usd_message
 from taisoft.output.files import make_folder, output_errors
-from taisoft.output.nodal_fields import NodalMean, von_mises
+from taisoft.output.nodal_fields import UNKNOWN_ERROR, NodalMean, von_mises
 from taisoft.output.usd_scene import ERROR, IMPULSE, ROOT, STRESS, TRANSLATE, scene_layer
 
 SCENE_NAME = "scene.usdc"
 CHUNKS_NAME = "chunks"
-UNKNOWN_ERROR = -1.0  # of points whose error is unknown
 TIME_VARYING = {"points", "extent", TRANSLATE, *(f"primvars:{name}" for name in (STRESS, IMPULSE, ERROR))}  # attributes
 
 
@@ -242,7 +241,7 @@ def _opened(path: Path):
     try:
         return Sdf.Layer.OpenAsAnonymous(str(path))
     except Exception as error:
-        raise OutputError(f"{path} cannot be read: {_last_line(error)}") from None
+        raise OutputError(f"{path} cannot be read: {usd_message(error)}") from None
 
 
 def _structure(layer) -> list[str]:
@@ -258,7 +257,7 @@ def _write_checked(path: Path, layer, write) -> None:
             return
         reason = "USD gives no reason"
     except Exception as error:
-        reason = _last_line(error)
+        reason = usd_message(error)
     n_bytes = sum(np.asarray(layer.QueryTimeSample(*sample)).nbytes for sample in _samples(layer))
     raise OutputError(f"cannot write {path} ({n_bytes} bytes of new frames): {reason}")
 
@@ -269,9 +268,3 @@ def _remove_chunks(chunks: Path) -> None:
             path.unlink()
         if not any(chunks.iterdir()):
             chunks.rmdir()
-
-
-def _last_line(error: Exception) -> str:
-    """Return the message of a USD error, whose text is a list of source locations, each with a quoted message."""
-    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-    return re.sub(r"^Error in '.*' at line \d+ in file \S+ : '(.*)'$", r"\1", lines[-1]) if lines else type(error).__name__

@@ -17,6 +17,7 @@ from dataclasses import replace
 import numpy as np
 
 from taisoft.mesh.topology import opposite_half_edges
+from taisoft.mesh.usd_content import NAME
 from taisoft.output.appearance import (
     OBSTACLE_COLOUR,
     ObstacleSurface,
@@ -175,7 +176,7 @@ def _define_surface(stage, name: str, legal_name: str, srgb: np.ndarray, triangl
     path = f"{ROOT}/{legal_name}"
     prim = UsdGeom.Xform.Define(stage, path).GetPrim()
     prim.SetDisplayName(name)
-    prim.SetCustomDataByKey("taisoft:name", name)
+    prim.SetCustomDataByKey(NAME, name)
 
     colour = Gf.Vec3f(*linear_rgb(srgb).tolist())
     material = UsdShade.Material.Define(stage, f"{path}/material")
@@ -237,9 +238,11 @@ def _define_body(stage, body, legal_name: str, srgb: np.ndarray, first: int, tou
         primvar.GetAttr().SetDocumentation(meaning)
 
     scalars, vectors = Sdf.ValueTypeNames.FloatArray, Sdf.ValueTypeNames.Vector3fArray
-    for gprim in shown:
-        gprim.CreatePointsAttr()
-        gprim.CreateExtentAttr()
+    start = (body.rest_positions + body.position).astype(np.float32)  # readers find the rest shape in the default value
+    own = start[nodes] if skin is None else (skin.surface.vertices[nodes] + body.position).astype(np.float32)
+    for gprim, x in zip(shown, (own, start)):
+        gprim.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(x)))
+        gprim.CreateExtentAttr(Vt.Vec3fArray.FromNumpy(_extent(x)))
         paint(gprim)
         define_primvar(gprim, STRESS, scalars, "von Mises equivalent of the mean Cauchy stress at the node [Pa]")
         if errors:

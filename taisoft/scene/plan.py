@@ -37,6 +37,9 @@ class Plan:
 
     entries: list[dict] = field(default_factory=list)
 
+    def __repr__(self) -> str:
+        return f"Plan(on: {', '.join(name for name, is_on in self.on.items() if is_on) or 'nothing'})"
+
     @property
     def on(self) -> dict[str, bool]:
         """Map each feature to whether it is modelled."""

@@ -11,6 +11,7 @@ from collections.abc import Callable, Mapping
 import numpy as np
 
 from taisoft.attributes import Guarded, thawed
+from taisoft.display import drawn
 from taisoft.errors import SceneError
 from taisoft.mesh.surface_mesh import SurfaceMesh
 from taisoft.mesh.tet_mesh import TetMesh
@@ -111,6 +112,9 @@ class Scene(Guarded):
         if self.obstacles:
             names += f", obstacles={[obstacle.name for obstacle in self.obstacles]}"
         return f"Scene(gravity={tuple(self.gravity.tolist())}, {names})"
+
+    def _repr_html_(self) -> str | None:
+        return drawn("scene_html", self)
 
     def snapshot(self, start: "Scene | None" = None) -> "Scene":
         """Return an independent, unfrozen copy of the scene and its bodies; meshes are shared.

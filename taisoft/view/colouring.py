@@ -41,6 +41,13 @@ EDGE_DARKENING = 0.22
 BACKGROUND_TOP, BACKGROUND_BOTTOM = np.array([0.95, 0.955, 0.96]), np.array([0.80, 0.81, 0.82])  # sRGB
 
 
+def checked_colour(kind: str) -> str:
+    """Return the name of a colouring. Raises OutputError unless it is one of UNITS."""
+    if kind not in UNITS:
+        raise OutputError(f"colour {kind!r} is unknown: it must be one of {', '.join(UNITS)}")
+    return kind
+
+
 class Colouring:
     """Unshaded colours of the drawn vertices of `Surfaces`, by one of UNITS. Raises OutputError for another name."""
 
@@ -51,9 +58,7 @@ class Colouring:
 
     def choose(self, kind: str) -> None:
         """Colour by another quantity, with a scale of its own."""
-        if kind not in UNITS:
-            raise OutputError(f"colour '{kind}' is unknown: it must be one of {', '.join(UNITS)}")
-        self.kind = kind
+        self.kind = checked_colour(kind)
         self._peak = self.span = 0.0
 
     @property
