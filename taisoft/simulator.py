@@ -173,6 +173,7 @@ class Simulator(Guarded):
     set_force = changes.set_force
     set_traction = changes.set_traction
     set_tension = changes.set_tension
+    set_length = changes.set_length
     set_pressure = changes.set_pressure
     set_cavity = changes.set_cavity
     drag = changes.drag

@@ -173,14 +173,17 @@ def stable_dt(scene: Scene, verlet: bool) -> float:
 def spring_rates(scene: Scene) -> tuple[float, float]:
     """Upper bounds of the largest omega^2 [1/s^2] and damping rate [1/s] that springs alone give the nodes at the start.
 
-    Each acts as if it had its stiffness, or its tension over its length if that is larger, in all directions.
+    Each acts as if it had its stiffness, or its tension over its length if that is larger, in all directions. Each segment of
+    an elastic tendon has its stiffness times the number of segments, a bound wherever the points are.
     """
     table = spring_table(scene)
     if table is None:
         return 0.0, 0.0
     length = np.linalg.norm(table.vectors(_start_positions(scene)), axis=1)
-    given = table.given(SceneLoads(scene).amplitudes([0.0])[0])
-    largest = np.maximum(table.stiffness, given / np.where(given > 0.0, length, 1.0))
+    amplitudes = SceneLoads(scene).amplitudes([0.0])[0]
+    tension = table.stretching(length, amplitudes) + table.given(amplitudes)
+    stiffness = table.stiffness * np.diff(table.line_start)[table.line]
+    largest = np.maximum(stiffness, tension / np.where(tension > 0.0, length, 1.0))
     scaled = sp.csr_matrix((table.weight / np.sqrt(reference.lumped_masses(scene)[table.node]), table.node, table.start))
     return tuple(_largest_eigenvalue(scaled, weights) for weights in (largest, table.damping))
 
@@ -206,11 +209,9 @@ def spring_stiffness(scene: Scene) -> sp.csr_matrix:
     """Stiffness matrix (3n, 3n) of a scene's springs, tendons and attachments at the start [N/m]."""
     table = spring_table(scene)
     e = table.vectors(_start_positions(scene))
-    given = table.given(SceneLoads(scene).amplitudes([0.0])[0])
-    blocks = table.stiffness_blocks(e, given)
-    rows = sp.csr_matrix((table.weight, table.node, table.start), shape=(len(e), len(_start_positions(scene))))
-    C = sp.kron(rows, sp.identity(3), format="csr")
-    return (C.T @ sp.block_diag(blocks, format="csr") @ C).tocsr()
+    amplitudes = SceneLoads(scene).amplitudes([0.0])[0]
+    C = sp.kron(table.rows, sp.identity(3), format="csr")
+    return (C.T @ table.stiffness_matrix(e, amplitudes) @ C).tocsr()
 
 
 def _stable_dt_of(omega: float, mass_damping: float, damping_rate: float, verlet: bool) -> float:
@@ -241,12 +242,15 @@ class Modes(NamedTuple):
 def modes(scene: Scene, k: int, mass: str = "lumped") -> Modes:
     """The lowest k eigenfrequencies [Hz] and shapes of a scene at rest, with its constraints; rigid motions count as 0 Hz.
 
-    mass: "lumped" or "consistent". Raises SceneError for an invalid k or mass.
+    mass: "lumped" or "consistent". Springs and tendons act as they do at the start: an elastic tendon that is slack there does
+    not. Raises SceneError for an invalid k or mass, and for an inextensible tendon, whose tension there is unknown.
     """
     if mass not in ("lumped", "consistent"):
         raise SceneError(f"mass '{mass}' is unknown: it must be 'lumped' or 'consistent'")
     if not scene.bodies:
         raise SceneError("the scene holds no body")
+    for tendon in [one for one in scene.tendons if one.is_inextensible]:
+        raise SceneError(f"modes: tendon {tendon.name!r} has a given length, but no stiffness: give it one")
     free = np.concatenate([~constrained_axes(b, prescribed=True) for b in scene.bodies]).reshape(-1)
     dependents = dependent_table(scene)
     T = sp.identity(len(free), format="csr") if dependents is None else sp.kron(dependents.matrix, sp.identity(3), format="csr")

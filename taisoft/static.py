@@ -9,11 +9,11 @@ from taisoft.backend.arrays import FieldArena, upload
 from taisoft.backend.runtime import Runtime, open_kind, open_runtime
 from taisoft.dynamics.contact_newton import solve
 from taisoft.dynamics.dirichlet import DirichletConditions
+from taisoft.dynamics.multipliers import Multipliers, solve_with_multipliers
 from taisoft.dynamics.no_contacts import NoContacts
 from taisoft.dynamics.results import StageResult
 from taisoft.dynamics.simulation_state import SimulationState
 from taisoft.dynamics.stage_system import Stage, StageSystem
-from taisoft.dynamics.volumes import Volumes, solve_with_volumes
 from taisoft.errors import SceneError, SimulationError
 from taisoft.fem.measure import measure
 from taisoft.fem.model import Layout, build_model
@@ -139,18 +139,21 @@ class StaticSolver:
             plan.on | dict.fromkeys(("mass_damping", "stiffness_damping", "spring_damping", "consistent_mass"), False),
         )
         self.simulation = SimulationState(scene, runtime, arena, model, layout, DirichletConditions(scene, layout))
-        self.volumes, self.time = None, time
-        if len(self.simulation.loads.given_volumes):
-            self.simulation.set_cavity_pressures(np.zeros(len(self.simulation.loads.given_volumes)))
-            self.volumes = Volumes(self.simulation)
+        self.multipliers, self.time = None, time
+        if len(self.simulation.loads.multipliers):
+            self.multipliers = Multipliers(self.simulation)
+            self.simulation.set_multipliers(self.multipliers.static_start())
         prescribed = self.simulation.dirichlet.prescribed_nodes
-        self.solver = StageSystem(model, arena, runtime.eps, prescribed, NoContacts(), volumes=self.volumes)
+        self.solver = StageSystem(model, arena, runtime.eps, prescribed, NoContacts(), multipliers=self.multipliers)
         self.tolerance = tolerance
         self.target = self.simulation.next_target(time)
         self.simulation.upload_constraints()
         self.gravity = np.array(scene.gravity, dtype=np.float64)
         self.simulation.set_load_time(time)
-        self.loads = [(field, field.to_numpy()) for field in (model.loads, model.amplitudes) if field is not None]
+        self.loads = [(field, 0.0, field.to_numpy()) for field in (model.loads, model.amplitudes) if field is not None]
+        if self.simulation.springs is not None and model.amplitudes is not None:
+            full = model.amplitudes.to_numpy()
+            self.loads[-1] = model.amplitudes, self.simulation.springs.rest_amplitudes(len(full), layout.rest), full
 
     def solve(self) -> StaticResult:
         """Apply the full load in one step; if that fails, use load steps that halve on failure and grow by half on success."""
@@ -179,16 +182,16 @@ class StaticSolver:
         """Solve with a fraction of the load, starting at x."""
         m, w = self.simulation.model, self.solver.work
         start = [(m.gravity, fraction * self.gravity[None]), (w.x_hat, x), (m.state.x, x), (m.state.v, np.zeros_like(x))]
-        start += [(field, fraction * full) for field, full in self.loads]
+        start += [(field, rest + fraction * (full - rest)) for field, rest, full in self.loads]
         if self.target is not None:
             rest = self.simulation.layout.rest[self.simulation.dirichlet.prescribed_nodes]
             axes = self.simulation.dirichlet.prescribed_axes()
             start += [(w.targets, rest + fraction * (self.target - rest)), (w.prescribed_axes, axes)]
         upload(start)
-        if self.volumes is not None:
-            self.volumes.begin(self.time, fraction)
+        if self.multipliers is not None:
+            self.multipliers.begin(self.time, fraction)
         stage = Stage(0.0, 1.0, 1.0, tolerance, max_newton=max_newton)
-        result = solve_with_volumes(self.solver, stage, partial(solve, self.solver, stage))
+        result = solve_with_multipliers(self.solver, stage, partial(solve, self.solver, stage))
         self.newton += result.newton_iterations
         self.linear += result.linear_iterations
         self.multigrid += result.multigrid_solves
@@ -196,7 +199,7 @@ class StaticSolver:
 
     def _residual(self, result: StageResult) -> float:
         """The residual of the result; 0 without load and constraint forces, where it would be rounding over rounding."""
-        loaded = self.gravity.any() or any(full.any() for _, full in self.loads) or self.volumes is not None
+        loaded = self.gravity.any() or any(full.any() for *_, full in self.loads) or self.multipliers is not None
         only_rounding = not loaded and np.linalg.norm(self.solver.held_residual()) <= self.solver.rounding.force
         return 0.0 if only_rounding and result.converged else result.residual
 

@@ -14,10 +14,9 @@ from taisoft.backend.arrays import FieldArena
 from taisoft.backend.runtime import kernel
 from taisoft.errors import SceneError
 from taisoft.fem import reference
-from taisoft.fem.springs import spring_table
 from taisoft.fem.terms.elasticity import elastic_forces
 from taisoft.scene.checks import nearest
-from taisoft.scene.connections import Attachment
+from taisoft.scene.connection_records import Attachment
 
 if TYPE_CHECKING:
     from taisoft.dynamics.dynamics import Dynamics
@@ -45,9 +44,9 @@ def joint_force(dynamics: "Dynamics", name: str) -> float | np.ndarray:
     if isinstance(one, Attachment) and one.stiffness is None:
         return _exact(dynamics, one)
     x, v = state.state()
-    table, is_attachment = spring_table(scene), isinstance(one, Attachment)
-    loads = state.loads.amplitudes([state.time])[0]
-    forces = (table.pulls if is_attachment else table.tensions)(x, v.astype(np.float64), loads)[table.elements[name]]
+    table, is_attachment = state.springs, isinstance(one, Attachment)
+    amplitudes = state.amplitudes(state.time)
+    forces = (table.pulls if is_attachment else table.tensions)(x, v.astype(np.float64), amplitudes)[table.elements[name]]
     return forces if is_attachment else float(forces[0])
 
 

@@ -68,6 +68,6 @@ def model_graph(model: "Model") -> tuple[NodeGraph, np.ndarray, np.ndarray | Non
         patch, node = patch_nodes(model)
         patches = node[np.stack(patch_pairs(patch), axis=1)]
     if model.springs is not None:
-        others.append(springs.node_pairs(*download([model.springs.start, model.springs.node])))
+        others.append(springs.node_pairs(model.springs))
     graph = node_graph(np.concatenate([ends, patches, *others]), model.n_nodes)
     return replace(graph, pair=graph.pair[: len(entries) + len(patches)]), entries, factors

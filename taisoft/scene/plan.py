@@ -15,7 +15,7 @@ from taisoft.errors import SceneError
 from taisoft.scene import checks
 from taisoft.scene.body import Body, check_volume
 from taisoft.scene.collision import has_sharp_edges
-from taisoft.scene.connections import check_tension
+from taisoft.scene.connections import check_tendon
 from taisoft.scene.material import LAWS
 from taisoft.scene.obstacles import Box, MeshObstacle
 from taisoft.scene.scene import Scene
@@ -186,14 +186,17 @@ def change_load(body: Body, kind: str, index: int, value) -> None:
         getattr(body, LOADS[kind])[index] = new
 
 
-def change_tension(scene: Scene, name: str, value) -> None:
-    """Set the tension [N] of a tendon; it replaces a path. Raises SceneError."""
-    names = [tendon.name for tendon in scene.tendons]
+def change_tendon(scene: Scene, given: str, name: str, value) -> None:
+    """Set the tension [N] or the length [m] of a tendon; it replaces a path. given: which of the two. Raises SceneError."""
+    names, calls = [tendon.name for tendon in scene.tendons], {"force": "set_tension", "length": "set_length"}
     if name not in names:
-        raise SceneError(f"set_tension: no tendon is called {name!r}{checks.nearest(str(name), names)}")
-    index, what = names.index(name), f"tendon {name!r}: force"
-    new = replace(scene.tendons[index], value=checks.array(value, what, ((),)), path=None, path_shape=None)
-    check_tension(new.value, what)
+        raise SceneError(f"{calls[given]}: no tendon is called {name!r}{checks.nearest(str(name), names)}")
+    index, what = names.index(name), f"tendon {name!r}"
+    old = scene.tendons[index]
+    if old.given != given:
+        raise SceneError(f"{calls[given]}: {what} has a given {old.given}: call {calls[old.given]}")
+    new = replace(old, value=checks.array(value, f"{what}: {given}", ((),)), path=None, path_shape=None)
+    check_tendon(new, new.value, what)
     with thawed(scene):
         scene.tendons[index] = new
 
@@ -216,7 +219,7 @@ def scene_numbers(scene: Scene) -> Numbers:
             for i, load in enumerate(getattr(body, loads)):
                 if load.path is None:
                     numbers[f"body {body.name!r}: {kind} {i}"] = load.value if load.value.ndim == 2 else load.value.tolist()
-    numbers |= {f"tendon {one.name!r}: force": float(one.value) for one in scene.tendons if one.path is None}
+    numbers |= {f"tendon {one.name!r}: {one.given}": float(one.value) for one in scene.tendons if one.path is None}
     for names, (friction, restitution) in scene.contact_pairs.items():
         pair = " and ".join(repr(name) for name in sorted(names))
         numbers |= {f"contact of {pair}: friction": friction, f"contact of {pair}: restitution": restitution}

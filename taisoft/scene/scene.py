@@ -16,17 +16,8 @@ from taisoft.mesh.tet_mesh import TetMesh
 from taisoft.scene import checks
 from taisoft.scene.body import USE_A_COPY, Body
 from taisoft.scene.collision import CollisionSettings
-from taisoft.scene.connections import (
-    Attachment,
-    Connection,
-    Spring,
-    Tendon,
-    add_spring,
-    add_tendon,
-    attach,
-    attached_pairs,
-    check_connections,
-)
+from taisoft.scene.connection_records import Attachment, Connection, Spring, Tendon
+from taisoft.scene.connections import add_spring, add_tendon, attach, attached_pairs, check_connections
 from taisoft.scene.loads import Cavity
 from taisoft.scene.material import Material
 from taisoft.scene.obstacles import Obstacle, Shape, surface_numbers
@@ -55,7 +46,7 @@ class Scene(Guarded):
         "gravity": "call sim.set_gravity(gravity)",
         "set_contact": "call sim.set_contact(name_a, name_b, friction=...)",
         "contact_pairs": "call sim.set_contact(name_a, name_b, friction=...)",
-        **dict.fromkeys(("tendons", "add_tendon"), "call sim.set_tension(name, force)"),
+        **dict.fromkeys(("tendons", "add_tendon"), "call sim.set_tension(name, force) or sim.set_length(name, length)"),
     }
 
     def __init__(self, gravity=(0.0, -9.81, 0.0)):
