@@ -64,7 +64,7 @@ def joint_force(self: "Simulator", name: str) -> float | np.ndarray:
 def cavity_volume(self: "Simulator", name: str) -> float:
     """Return the present volume [m^3] of a cavity. Raises SceneError if there is none of this name."""
     state = self._open().state
-    return state.cavity_form(name).volume_and_gradient(state.state()[0])[0]
+    return state.cavity_form(name).value_and_gradient(state.state()[0])[0]
 
 
 def cavity_pressure(self: "Simulator", name: str) -> float:

@@ -18,6 +18,7 @@ from taisoft.errors import SceneError, SimulationError
 from taisoft.fem.measure import measure
 from taisoft.fem.model import Layout, build_model
 from taisoft.fem.pressure import cavity_form
+from taisoft.fem.springs import SpringTable
 from taisoft.fem.state import ELASTIC, N_INVERTED
 from taisoft.scene import checks
 from taisoft.scene.plan import make_plan
@@ -46,6 +47,8 @@ class StaticResult:
     _positions: np.ndarray
     _reactions: np.ndarray
     _pressures: dict[str, float]
+    _springs: SpringTable | None
+    _amplitudes: np.ndarray
 
     def positions(self, name: str | None = None) -> np.ndarray:
         """Positions (n_nodes, 3) [m] of a body, or of all bodies concatenated."""
@@ -57,12 +60,20 @@ class StaticResult:
 
     def cavity_volume(self, name: str) -> float:
         """Volume [m^3] of a cavity."""
-        return cavity_form(self._scene, name).volume_and_gradient(self._positions)[0]
+        return cavity_form(self._scene, name).value_and_gradient(self._positions)[0]
 
     def cavity_pressure(self, name: str) -> float:
         """Pressure [Pa] in a cavity."""
         self._scene.cavity(name)
         return self._pressures[name]
+
+    def tension(self, name: str) -> float:
+        """Tension [N] of a spring or tendon; negative: it pushes. Raises SceneError."""
+        names = [one.name for one in (*self._scene.springs, *self._scene.tendons)]
+        if name not in names:
+            raise SceneError(f"tension: no spring or tendon is called {name!r}{checks.nearest(str(name), names)}")
+        state = self._positions, np.zeros_like(self._positions), self._amplitudes
+        return float(self._springs.tensions(*state)[self._springs.elements[name]][0])
 
     def _rows(self, name: str | None) -> slice:
         if name is None:
@@ -225,4 +236,6 @@ class StaticSolver:
             _positions=simulation.model.state.x.to_numpy(),
             _reactions=self.solver.held_residual(),
             _pressures=simulation.cavity_pressures_by_name(self.time),
+            _springs=simulation.springs,
+            _amplitudes=simulation.amplitudes(self.time),
         )

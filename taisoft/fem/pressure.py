@@ -116,7 +116,7 @@ class CavityForm:
         self._rows = place.reshape(-1, 3)
         self.nodes = self.nodes + first_node
 
-    def volume_and_gradient(self, x: np.ndarray) -> tuple[float, np.ndarray]:
+    def value_and_gradient(self, x: np.ndarray) -> tuple[float, np.ndarray]:
         """V [m^3], and dV/dx (k, 3) [m^2] at its nodes. x: (n_nodes, 3) [m] of the scene."""
         own = x[self.nodes] - x[self.nodes[0]]
         i, b, c = (own[rows] for rows in self._rows.T)
