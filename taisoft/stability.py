@@ -12,8 +12,9 @@ import scipy.sparse.linalg as spl
 
 from taisoft.errors import SceneError
 from taisoft.fem import reference
-from taisoft.fem.dependents import dependent_table
+from taisoft.fem.dependents import DependentTable, dependent_table
 from taisoft.fem.loads import SceneLoads
+from taisoft.fem.spring_table import SpringTable
 from taisoft.fem.springs import spring_table
 from taisoft.scene.scene import Body, Scene
 
@@ -85,10 +86,13 @@ def _patch_stiffness(body: Body, divergence: np.ndarray, dof: np.ndarray) -> sp.
     return D.T @ sp.diags(reference.patch_moduli(body, patch) / np.bincount(patch, body.mesh.volumes)) @ D
 
 
-def constrained_axes(body: Body, prescribed: bool) -> np.ndarray:
-    """Constrained axes (n, 3), bool: the fixed ones, and if `prescribed` those that follow a path too."""
+def constrained_axes(body: Body, prescribed: bool, scene: Scene | None = None) -> np.ndarray:
+    """Constrained axes (n, 3), bool: the fixed ones, and if `prescribed` those that follow a path too.
+
+    scene: of which exact attachments to obstacles count as well.
+    """
     constrained = np.zeros((body.n_nodes, 3), dtype=bool)
-    for c in body.constraints:
+    for c in body.constraints if scene is None else scene.constraints(body):
         if prescribed or c.path is None:
             constrained[np.ix_(c.nodes, np.flatnonzero(c.axes))] = True
     return constrained
@@ -157,8 +161,8 @@ def stable_dt(scene: Scene, verlet: bool) -> float:
     """
     limit = np.inf
     connected = {owner for one in scene.connections for owner in one.owners}
-    square, rate = spring_rates(scene) if connected else (0.0, 0.0)
     dependents = dependent_table(scene)
+    square, rate = spring_rates(scene, dependents) if connected else (0.0, 0.0)
     growth = 1.0 if dependents is None else dependents.growth
     for body in scene.bodies:
         omega, material, own_square, own_rate = highest_frequency(body), body.composition.first, 0.0, 0.0
@@ -170,21 +174,22 @@ def stable_dt(scene: Scene, verlet: bool) -> float:
     return float(limit)
 
 
-def spring_rates(scene: Scene) -> tuple[float, float]:
+def spring_rates(scene: Scene, dependents: DependentTable | None) -> tuple[float, float]:
     """Upper bounds of the largest omega^2 [1/s^2] and damping rate [1/s] that springs alone give the nodes at the start.
 
     Each acts as if it had its stiffness, or its tension over its length if that is larger, in all directions. Each segment of
     an elastic tendon has its stiffness times the number of segments, a bound wherever the points are.
     """
-    table = spring_table(scene)
+    table = spring_table(scene, dependents)
     if table is None:
         return 0.0, 0.0
-    length = np.linalg.norm(table.vectors(_start_positions(scene)), axis=1)
-    amplitudes = SceneLoads(scene).amplitudes([0.0])[0]
+    amplitudes = SceneLoads(scene, table).amplitudes([0.0])[0]
+    length = np.linalg.norm(table.vectors(_start_positions(scene), amplitudes), axis=1)
     tension = table.stretching(length, amplitudes) + table.given(amplitudes)
     stiffness = table.stiffness * np.diff(table.line_start)[table.line]
     largest = np.maximum(stiffness, tension / np.where(tension > 0.0, length, 1.0))
-    scaled = sp.csr_matrix((table.weight / np.sqrt(reference.lumped_masses(scene)[table.node]), table.node, table.start))
+    masses = reference.lumped_masses(scene, dependents)
+    scaled = sp.csr_matrix((table.weight / np.sqrt(masses[table.node]), table.node, table.start))
     return tuple(_largest_eigenvalue(scaled, weights) for weights in (largest, table.damping))
 
 
@@ -205,11 +210,10 @@ def _largest_eigenvalue(rows: sp.csr_matrix, weights: np.ndarray) -> float:
     return LANCZOS_MARGIN**2 * float(top[0])
 
 
-def spring_stiffness(scene: Scene) -> sp.csr_matrix:
+def spring_stiffness(scene: Scene, table: SpringTable) -> sp.csr_matrix:
     """Stiffness matrix (3n, 3n) of a scene's springs, tendons and attachments at the start [N/m]."""
-    table = spring_table(scene)
-    e = table.vectors(_start_positions(scene))
-    amplitudes = SceneLoads(scene).amplitudes([0.0])[0]
+    amplitudes = SceneLoads(scene, table).amplitudes([0.0])[0]
+    e = table.vectors(_start_positions(scene), amplitudes)
     C = sp.kron(table.rows, sp.identity(3), format="csr")
     return (C.T @ table.stiffness_matrix(e, amplitudes) @ C).tocsr()
 
@@ -251,7 +255,7 @@ def modes(scene: Scene, k: int, mass: str = "lumped") -> Modes:
         raise SceneError("the scene holds no body")
     for tendon in [one for one in scene.tendons if one.is_inextensible]:
         raise SceneError(f"modes: tendon {tendon.name!r} has a given length, but no stiffness: give it one")
-    free = np.concatenate([~constrained_axes(b, prescribed=True) for b in scene.bodies]).reshape(-1)
+    free = np.concatenate([~constrained_axes(b, prescribed=True, scene=scene) for b in scene.bodies]).reshape(-1)
     dependents = dependent_table(scene)
     T = sp.identity(len(free), format="csr") if dependents is None else sp.kron(dependents.matrix, sp.identity(3), format="csr")
     if dependents is not None:
@@ -260,10 +264,11 @@ def modes(scene: Scene, k: int, mass: str = "lumped") -> Modes:
     if isinstance(k, bool) or not isinstance(k, (int, np.integer)) or not 1 <= k <= n_free:
         raise SceneError(f"k = {k!r}: it must be a whole number from 1 to the {n_free} free axes of the scene")
     K = sp.block_diag([hooke_stiffness(b) for b in scene.bodies], format="csr")
-    K = K if spring_table(scene) is None else K + spring_stiffness(scene)
+    table = spring_table(scene, dependents)
+    K = K if table is None else K + spring_stiffness(scene, table)
     K = (T.T @ K @ T)[free][:, free]
     if mass == "lumped":
-        M = sp.diags(np.repeat(reference.lumped_masses(scene), 3)[free], format="csc")
+        M = sp.diags(np.repeat(reference.lumped_masses(scene, dependents), 3)[free], format="csc")
     else:
         scalar = sp.block_diag([reference.consistent_mass(b) for b in scene.bodies])
         M = (T.T @ sp.kron(scalar, sp.identity(3), format="csr") @ T)[free][:, free]

@@ -18,7 +18,7 @@ from taisoft.errors import SceneError, SimulationError
 from taisoft.fem.measure import measure
 from taisoft.fem.model import Layout, build_model
 from taisoft.fem.pressure import cavity_form
-from taisoft.fem.springs import SpringTable
+from taisoft.fem.spring_table import SpringTable
 from taisoft.fem.state import ELASTIC, N_INVERTED
 from taisoft.scene import checks
 from taisoft.scene.plan import make_plan

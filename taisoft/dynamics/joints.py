@@ -42,7 +42,10 @@ def joint_force(dynamics: "Dynamics", name: str) -> float | np.ndarray:
         raise SceneError(f"joint_force: no spring, tendon or attachment is called {name!r}{nearest(str(name), names)}")
     one = scene.connections[names.index(name)]
     if isinstance(one, Attachment) and one.stiffness is None:
-        return _exact(dynamics, one)
+        nodes = state.layout.node_start[scene.bodies.index(scene.body(one.a))] + one.nodes
+        if one not in scene.dependent_attachments:
+            return dynamics.stepper.reactions()[nodes]
+        return _exact(dynamics, one, nodes)
     x, v = state.state()
     table, is_attachment = state.springs, isinstance(one, Attachment)
     amplitudes = state.amplitudes(state.time)
@@ -50,10 +53,9 @@ def joint_force(dynamics: "Dynamics", name: str) -> float | np.ndarray:
     return forces if is_attachment else float(forces[0])
 
 
-def _exact(dynamics: "Dynamics", one: Attachment) -> np.ndarray:
+def _exact(dynamics: "Dynamics", one: Attachment, nodes: np.ndarray) -> np.ndarray:
     state, model, arena = dynamics.state, dynamics.model, FieldArena()
     body = dynamics.scene.body(one.a)
-    nodes = state.layout.node_start[dynamics.scene.bodies.index(body)] + one.nodes
     state.set_load_time(state.time)
     elastic_forces(model)
     try:

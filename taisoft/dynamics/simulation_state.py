@@ -7,13 +7,13 @@ import numpy as np
 from taisoft.backend.arrays import FieldArena, download, upload
 from taisoft.backend.runtime import Runtime
 from taisoft.dynamics.dirichlet import DirichletConditions
-from taisoft.fem.dependents import DependentTable, dependent_table
+from taisoft.fem.dependents import DependentTable
 from taisoft.fem.loads import SceneLoads
 from taisoft.fem.mean_dilatation import patch_moduli
 from taisoft.fem.model import Layout, Model, damping_table, law_table, upload_mass_matrix
 from taisoft.fem.pressure import CavityForm, cavity_form, pressures_of
 from taisoft.fem.reference import gravity_masses, lumped_masses
-from taisoft.fem.springs import SpringTable, spring_table
+from taisoft.fem.spring_table import SpringTable
 from taisoft.scene.loads import Cavity
 from taisoft.scene.scene import Scene
 
@@ -36,14 +36,19 @@ class SimulationState:
     releases: int = 0  # number of releases of prescribed nodes; each invalidates the steppers' history
     drag: tuple[np.ndarray, np.ndarray] | None = None  # nodes (k,) and forces (k, 3) [N] of a drag spring
     _loads: SceneLoads | None = None  # None: not computed, or outdated
-    dependents: DependentTable | None = None
-    springs: SpringTable | None = None
     load_time: float | None = None  # of the loads on the device; None: several, or outdated
     multipliers: np.ndarray | None = None  # (k,) Lagrange multipliers [Pa] or [N], see `SceneLoads.multipliers`; None: none
     _cavity_forms: dict[str, CavityForm] = field(default_factory=dict)  # those built so far, by name
 
-    def __post_init__(self):
-        self.dependents, self.springs = dependent_table(self.scene), spring_table(self.scene)
+    @property
+    def dependents(self) -> DependentTable | None:
+        """The nodes that are attached exactly; None if there are none."""
+        return self.layout.dependents
+
+    @property
+    def springs(self) -> SpringTable | None:
+        """The elements of springs, tendons and attachments; None if there are none."""
+        return self.layout.springs
 
     def state(self) -> tuple[np.ndarray, np.ndarray]:
         """Return positions and velocities of all nodes, in their stored precision."""
@@ -104,18 +109,18 @@ class SimulationState:
         if m.damping is not None:
             numbers.append((m.damping, damping_table(self.scene)))
         if density:
-            numbers.append((m.mass, lumped_masses(self.scene)))
+            numbers.append((m.mass, lumped_masses(self.scene, self.dependents)))
             if m.gravity_mass is not m.mass:
-                numbers.append((m.gravity_mass, gravity_masses(self.scene)))
+                numbers.append((m.gravity_mass, gravity_masses(self.scene, self.dependents)))
         upload(numbers)
         if density and m.consistent:
-            upload_mass_matrix(self.scene, m.mass_matrix)
+            upload_mass_matrix(self.scene, self.dependents, m.mass_matrix)
 
     @property
     def loads(self) -> SceneLoads:
         """The scene's loads with their present values."""
         if self._loads is None:
-            self._loads = SceneLoads(self.scene)
+            self._loads = SceneLoads(self.scene, self.springs)
         return self._loads
 
     def upload_loads(self) -> None:

@@ -31,6 +31,7 @@ def is_smooth(scene: Scene, touches: bool) -> bool:
     prescribed = any(one.path is not None for one in (*constraints, *scene.loads))
     damped = any(material.mass_damping or material.stiffness_damping for material in materials)
     damped = damped or any(one.damping for one in scene.connections)
+    prescribed = prescribed or any(scene.moves(one) for one in scene.connections)
     slackens = any(tendon.given == "length" for tendon in scene.tendons)
     return not (prescribed or damped or touches or slackens)
 

@@ -87,7 +87,7 @@ class Dependents:
 
 def dependent_table(scene: Scene) -> DependentTable | None:
     """The dependent nodes of a scene; None if it has none. Raises SceneError for nodes that depend on themselves."""
-    exact = scene.exact_attachments
+    exact = scene.dependent_attachments
     if not exact:
         return None
     starts = scene.first_nodes

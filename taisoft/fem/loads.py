@@ -4,7 +4,7 @@ w_a is the reference area at node a for a traction, the fraction of the lumped m
 Numbers, such as pressures, which force terms turn into nodal forces at the present x, are the model's `amplitudes`.
 """
 
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -14,6 +14,9 @@ from taisoft.fem.pressure import pressures_of
 from taisoft.scene.connection_records import Tendon
 from taisoft.scene.loads import NodalForce, ScalarLoad, Traction, value_at
 from taisoft.scene.scene import Body, Scene
+
+if TYPE_CHECKING:
+    from taisoft.fem.spring_table import SpringTable
 
 FOLLOWS = ScalarLoad(np.zeros(()))  # a pressure or a tension that is a Lagrange multiplier, which steppers find
 
@@ -43,7 +46,8 @@ class SceneLoads:
     fluid in a given volume, and of a tendon whose given length follows a path.
     """
 
-    def __init__(self, scene: Scene):
+    def __init__(self, scene: Scene, springs: "SpringTable | None" = None):
+        """springs: the scene's table; only its ends on obstacles that move matter."""
         starts = np.cumsum([0, *(body.n_nodes for body in scene.bodies)])
         self._constant, self._paths = np.zeros((starts[-1], 3)), []
         for body, start in zip(scene.bodies, starts):
@@ -55,7 +59,7 @@ class SceneLoads:
                     else:
                         self._paths.append(_Path(f"body {body.name!r}: {kind} {k}", load, start + nodes, weights))
         self.nodes = np.unique(np.concatenate([np.zeros(0, dtype=np.int64), *(path.nodes for path in self._paths)]))
-        self._scalars = scalar_loads(scene)
+        self._scalars, self._moving = scalar_loads(scene), None if springs is None else springs.moving
         self.multipliers = np.array([n for n, (_, load) in enumerate(self._scalars) if load is FOLLOWS], dtype=np.int64)
         others = [load for _, load in pressures_of(scene) if not load.has_potential]
         winches = [tendon for tendon in scene.tendons if tendon.is_inextensible and tendon.path is not None]
@@ -63,13 +67,13 @@ class SceneLoads:
 
     @property
     def n_amplitudes(self) -> int:
-        """Number of loads that are one number."""
-        return len(self._scalars)
+        """Number of loads that are one number, and of numbers that place the ends of springs on obstacles that move."""
+        return len(self._scalars) + (0 if self._moving is None else self._moving.n_amplitudes)
 
     @property
     def amplitudes_vary(self) -> bool:
         """Whether any of these follows a path."""
-        return any(load.path is not None for _, load in self._scalars)
+        return self._moving is not None or any(load.path is not None for _, load in self._scalars)
 
     @property
     def vary(self) -> bool:
@@ -77,8 +81,10 @@ class SceneLoads:
         return bool(self._paths) or self.amplitudes_vary
 
     def amplitudes(self, times: np.ndarray | list[float]) -> np.ndarray:
-        """Values (r, n_amplitudes) at the times (r,) [s], in the order of `scalar_loads`. Raises SimulationError."""
+        """Values (r, n_amplitudes) at the times (r,) [s]: of `scalar_loads`, then of `MovingEnds`. Raises SimulationError."""
         rows = [[number_at(load, float(t), name) for name, load in self._scalars] for t in times]
+        if self._moving is not None:
+            rows = [[*row, *self._moving.amplitudes(float(t))] for row, t in zip(rows, times)]
         return np.array(rows).reshape(len(times), self.n_amplitudes)
 
     def at(self, t: float) -> np.ndarray:

@@ -116,6 +116,9 @@ class CavityForm:
         self._rows = place.reshape(-1, 3)
         self.nodes = self.nodes + first_node
 
+    def set_amplitudes(self, amplitudes: np.ndarray) -> None:
+        """Do nothing: the volume depends on nodes alone."""
+
     def value_and_gradient(self, x: np.ndarray) -> tuple[float, np.ndarray]:
         """V [m^3], and dV/dx (k, 3) [m^2] at its nodes. x: (n_nodes, 3) [m] of the scene."""
         own = x[self.nodes] - x[self.nodes[0]]

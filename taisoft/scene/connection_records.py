@@ -103,13 +103,13 @@ class Tendon:
 @guarded_record("attachment", _ADD_ANOTHER)
 @dataclass(frozen=True, eq=False)
 class Attachment:
-    """Nodes of a body, each kept where it lies in another body at the start, or pulled there by a spring of rest length 0."""
+    """Nodes of a body, each kept where it lies in a body or obstacle, or pulled there by a spring of rest length 0."""
 
     name: str
     a: str
     nodes: np.ndarray  #: (k,) int64 node ids of body a
     b: str  #: name of a body or obstacle
-    stiffness: float | None  #: [N/m] of each node's spring; None: it moves with body b exactly
+    stiffness: float | None  #: [N/m] of each node's spring; None: it moves with b exactly
     damping: float = 0.0  #: [N s/m] of each node
     where: Callable | None = None  #: as in `Constraint`
     reach: float = MAX_OUTSIDE  #: heights of a tet by which the nodes may lie outside body b

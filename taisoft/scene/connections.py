@@ -1,20 +1,22 @@
-"""Springs, tendons and attachments: forces between points of bodies, and between these and obstacles at rest.
+"""Springs, tendons and attachments: forces between points of bodies, and between these and obstacles.
 
 A point of a body is given by its rest position, in the coordinates of body.rest_positions, or as a node; a point of an obstacle
-by its position. Each function here whose first argument is `self` is a method of `Scene`, whose class body lists them.
+by its position at the start. Each function whose first argument is `self` is a method of `Scene`, whose class body lists them.
 """
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from taisoft.errors import SceneError
 from taisoft.scene import checks
-from taisoft.scene.body import Body
+from taisoft.scene.body import Body, Constraint
 from taisoft.scene.connection_records import MAX_OUTSIDE, Attachment, Point, Spring, Tendon
 from taisoft.scene.loads import value_or_path
 from taisoft.scene.locate import locate
+from taisoft.scene.obstacles import Obstacle
 
 if TYPE_CHECKING:
     from taisoft.scene.scene import Scene
@@ -27,10 +29,10 @@ def add_spring(
 ) -> Spring:
     """Connect two points by a spring and return it.
 
-    a, b: each (name, point): the name of a body and the point's rest position (3,) [m] or a node id; or the name of an obstacle
-    at rest and a position. stiffness [N/m]; rest_length [m], by default the points' distance at the start; damping [N s/m], of
-    the rate of its length, or, of a spring of rest length 0, in all directions. name: unique; "spring0" and so on by default.
-    Raises SceneError.
+    a, b: each (name, point): the name of a body and the point's rest position (3,) [m] or a node id; or the name of an obstacle,
+    with which the point moves, and its position at the start. stiffness [N/m]; rest_length [m], by default the points' distance
+    at the start; damping [N s/m], of the rate of its length, or, of a spring of rest length 0, in all directions. name: unique;
+    "spring0" and so on by default. Raises SceneError.
     """
     self._check_open("add_spring")
     name = _free_name(self, name, "spring")
@@ -82,12 +84,13 @@ def add_tendon(
 def attach(
     self: "Scene", a: str, where, b: str, stiffness: float | None = None, damping: float = 0.0, name: str | None = None
 ) -> Attachment:
-    """Attach nodes of a body to where they lie in another body, or to an obstacle at rest; return the attachment.
+    """Attach nodes of a body to where they lie in another body, or to an obstacle; return the attachment.
 
     a: name of the body; where: its nodes, as for `Body.fix`; b: name of another body, or of an obstacle. The chosen nodes must
-    lie in or on body b at the start, or outside by at most a tenth of the height of a tet. stiffness: None, they move with body b
-    exactly; else [N/m] of a spring of rest length 0 for each node, whose damping [N s/m] is given too. Bodies that are attached
-    exactly do not collide with each other. name: unique; "attachment0" and so on by default. Raises SceneError.
+    lie in or on body b at the start, or outside by at most a tenth of the height of a tet; anywhere if b is an obstacle.
+    stiffness: None, they move with b exactly; else [N/m] of a spring of rest length 0 for each node, whose damping [N s/m] is
+    given too. Bodies and obstacles that are attached exactly do not collide with each other. name: unique; "attachment0" and so
+    on by default. Raises SceneError.
     """
     self._check_open("attach")
     name = _free_name(self, name, "attachment")
@@ -104,8 +107,6 @@ def attach(
     damping = checks.number(damping, f"{what}: damping", minimum=0.0, unit="N s/m")
     if stiffness is None and damping > 0.0:
         raise SceneError(f"{what}: damping is that of springs: give a stiffness, too")
-    if stiffness is None and not isinstance(owner, Body):
-        raise SceneError(f"{what}: {b!r} is an obstacle: fix the nodes by body.fix instead, or give a stiffness")
     attachment = Attachment(name, body.name, nodes, owner.name, stiffness, damping, where if callable(where) else None)
     if isinstance(owner, Body):
         locate_nodes(self, attachment)
@@ -140,11 +141,32 @@ def check_exact(scene: "Scene") -> None:
             if both := sorted(others & set(one.nodes.tolist())):
                 raise SceneError(f"{what}: node {both[0]} of body {one.a!r} is {rule}")
         own |= set(one.nodes.tolist())
+        if one not in scene.dependent_attachments:
+            continue
         if body.dilatation != "local":
             raise SceneError(f"{what}: nodes of body {one.a!r} cannot be attached exactly, since its dilatation is a mean")
         for damping in ("mass_damping", "stiffness_damping"):  # a force on one body's node acts on the other's
             if len({getattr(scene.body(name).composition.first, damping) for name in one.owners}) > 1:
                 raise SceneError(f"{what}: bodies {one.a!r} and {one.b!r} must have the same {damping}")
+
+
+@dataclass(frozen=True, eq=False)
+class CarriedPath:
+    """Motion of nodes with an obstacle: t [s] -> displacement (k,3) [m]."""
+
+    obstacle: Obstacle
+    starts: np.ndarray  #: (k,3) [m], start positions
+
+    def __call__(self, t: float) -> np.ndarray:
+        return self.obstacle.points_at(t, self.obstacle.undisplaced(0.0, self.starts)) - self.starts
+
+
+def constraint_of(scene: "Scene", attachment: Attachment) -> Constraint:
+    """The constraint of nodes that are attached to an obstacle exactly."""
+    body, obstacle = scene.body(attachment.a), scene.obstacle(attachment.b)
+    starts = body.rest_positions[attachment.nodes] + body.position
+    path = None if obstacle.path is None else CarriedPath(obstacle, starts)
+    return Constraint(attachment.nodes, np.ones(3, dtype=bool), path, attachment.where)
 
 
 def attached_pairs(scene: "Scene") -> np.ndarray:
@@ -220,13 +242,11 @@ def _check_inside(owner, position: np.ndarray, what: str) -> None:
 
 
 def _owner(scene: "Scene", name: str, what: str):
-    """Return a body, or an obstacle at rest. Raises SceneError."""
+    """Return a body or an obstacle. Raises SceneError."""
     try:
         owner = scene.collider(name)
     except SceneError as error:
         raise SceneError(f"{what}: {str(error).removeprefix('scene: ')}") from None
-    if not isinstance(owner, Body) and owner.path is not None:
-        raise SceneError(f"{what}: obstacle {name!r} moves; only bodies and obstacles at rest can be connected")
     return owner
 
 

@@ -293,3 +293,9 @@ class Obstacle:
         translation, rotation = self.pose(t)
         pivot = self.shape.pivot
         return (points - pivot) @ rotation.T + pivot + translation
+
+    def undisplaced(self, t: float, points: np.ndarray) -> np.ndarray:
+        """Return the points (n,3) [m] of the undisplaced shape that are at these positions at time t [s]."""
+        translation, rotation = self.pose(t)
+        pivot = self.shape.pivot
+        return (points - pivot - translation) @ rotation + pivot

@@ -90,13 +90,15 @@ def make_plan(scene: Scene, explicit: bool, multistep: bool, self_collision: boo
     plan.add("loads", loaded or draggable, why, "no traction and no force")
     add_if_any("pressure", lambda b: b.pressures or b.cavities, "on", "no surface is under pressure")
     varied = [b.name for b in scene.bodies if any(load.path for load in b.loads)] + [t.name for t in scene.tendons if t.path]
+    varied += [one.name for one in scene.connections if scene.moves(one) and one.name not in varied]
     plan.add("load_paths", varied, f"on {_shorten(varied)}", "every load is constant")
-    add_if_any("fixed_nodes", lambda b: any(c.path is None for c in b.constraints), "on", "no node is fixed")
-    add_if_any("moving_nodes", lambda b: any(c.path is not None for c in b.constraints), "paths on", "no node follows a path")
+    fixes, moves = ((lambda b, m=m: any((c.path is not None) == m for c in scene.constraints(b))) for m in (False, True))
+    add_if_any("fixed_nodes", fixes, "on", "no node is fixed")
+    add_if_any("moving_nodes", moves, "paths on", "no node follows a path")
     for damping in ("mass_damping", "stiffness_damping"):
         add_if_any(damping, lambda b, d=damping: getattr(b.composition.first, d) > 0, "material of", f"every {damping} is 0")
-    exact = [one.name for one in scene.exact_attachments]
-    connected = [one.name for one in scene.connections if one.name not in exact]
+    exact = [one.name for one in scene.dependent_attachments]
+    connected = [one.name for one in scene.connections if one not in scene.exact_attachments]
     plan.add("springs", connected, _shorten(connected), "no spring, tendon or attachment by springs")
     plan.add("dependent_nodes", exact, _shorten(exact), "no node is attached exactly")
     damped = [one.name for one in scene.connections if one.damping > 0.0]

@@ -69,7 +69,7 @@ class Surfaces:
     """
 
     def __init__(self, scene):
-        self._bodies = [_BodySurface(body, body_colour(k)) for k, body in enumerate(scene.bodies)]
+        self._bodies = [_BodySurface(body, body_colour(k), scene.constraints(body)) for k, body in enumerate(scene.bodies)]
         self._starts = np.cumsum([0] + [body.n_nodes for body in scene.bodies[:-1]])  # of each body's nodes
         self._obstacles = [_RigidSurface(surface) for surface in obstacle_surfaces(scene)]
         nodes = [np.where(body.nodes >= 0, body.nodes + start, -1) for body, start in zip(self._bodies, self._starts)]
@@ -165,12 +165,12 @@ def _concatenated(parts: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarra
 
 
 class _BodySurface:
-    def __init__(self, body, colour: np.ndarray):
+    def __init__(self, body, colour: np.ndarray, constraints: list):
         surface, rest = np.asarray(body.nodes.surface), np.asarray(body.rest_positions)
         self._nodes, self._corners = smoothing_groups(rest, surface)
         edges = rest[surface] - rest[np.roll(surface, 1, axis=1)]
         self._radius = MARKER_SIZE * float(np.linalg.norm(edges, axis=2).mean())
-        self._marked = _fixed_surface_nodes(body, surface)
+        self._marked = _fixed_surface_nodes(constraints, surface)
         self._ball, ball_triangles = _coarse_ball()
         counts = len(self._nodes), len(self._ball) * len(self._marked)
         starts = len(self._nodes) + len(self._ball) * np.arange(len(self._marked))
@@ -250,8 +250,8 @@ def _unit(vectors: np.ndarray) -> np.ndarray:
     return vectors / np.where(length > 0, length, 1.0)
 
 
-def _fixed_surface_nodes(body, surface: np.ndarray) -> np.ndarray:
-    fixed = [constraint.nodes for constraint in body.constraints if constraint.path is None]
+def _fixed_surface_nodes(constraints: list, surface: np.ndarray) -> np.ndarray:
+    fixed = [constraint.nodes for constraint in constraints if constraint.path is None]
     if not fixed:
         return np.empty(0, dtype=np.int64)
     nodes = np.intersect1d(np.concatenate(fixed), surface)

@@ -1,8 +1,8 @@
 """Springs, tendons and attachments: node j gets -c_j (T + damping) e / |e| of each element; psi = sum k (l - L)^2 / 2 + T_0 l.
 
-`fem.springs` defines the elements and their lines. Before forces are gathered, `prepare` computes for each line its elements'
-directions and pulls from x and v; given tensions, which Newton's method may change without moving nodes, act when forces are
-gathered. Blocks of the stiffness are
+`fem.spring_table` defines the elements and their lines. Before forces are gathered, `prepare` computes for each line its
+elements' directions and pulls from x and v; given tensions, which Newton's method may change without moving nodes, act when
+forces are gathered. Blocks of the stiffness are
     c_i c_j (k d d'^T + [same element] t (I - d d^T)),   d = e / |e|,   t = T / |e|,
 d' of any element of the line, or k I for an element of rest length 0. At |e| = 0 the direction of an element that has a rest
 length is undefined: it does not pull there.
@@ -10,7 +10,7 @@ length is undefined: it does not pull there.
 
 import taichi as ti
 
-from taisoft.fem.springs import LENGTH, MULTIPLIER, PLAIN
+from taisoft.fem.spring_table import LENGTH, MULTIPLIER, PLAIN
 
 SWITCH, LOAD, ACCELERATION, STIFFNESS, PREPARED = "springs", False, False, True, True
 TINY = 1e-30  # [m]; avoids a division by 0, and is no smaller since literals may be f32
@@ -26,6 +26,10 @@ def count(m: ti.template()):
 def _vector(m: ti.template(), s):
     """e of element s [m]."""
     e = m.springs.offset[s]
+    if ti.static(m.springs.has_moving):
+        at = m.springs.moving[s]
+        if at >= 0:
+            e = ti.Vector([m.amplitudes[at], m.amplitudes[at + 1], m.amplitudes[at + 2]], ti.f64)
     for k in range(m.springs.start[s], m.springs.start[s + 1]):
         e += m.springs.weight[k] * m.state.x[m.springs.node[k]]
     return e
@@ -81,6 +85,11 @@ def prepare(m: ti.template(), line):
             pull = m.springs.numbers[s, 0] * e
         if ti.static(m.spring_damping):
             rate = ti.Vector([0.0, 0.0, 0.0], ti.f64)
+            if ti.static(m.springs.has_moving):
+                at = m.springs.moving[s]
+                if at >= 0:
+                    at += m.springs.rate_after
+                    rate = ti.Vector([m.amplitudes[at], m.amplitudes[at + 1], m.amplitudes[at + 2]], ti.f64)
             for k in range(m.springs.start[s], m.springs.start[s + 1]):
                 rate += m.springs.weight[k] * ti.cast(m.state.v[m.springs.node[k]], ti.f64)
             if not _is_isotropic(m, s):
