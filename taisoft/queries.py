@@ -52,9 +52,9 @@ def joint_force(self: "Simulator", name: str) -> float | np.ndarray:
     """Return the force of a connection in the present state [N].
 
     Of a spring its tension, with damping, negative if it pushes; of a tendon its tension; of an attachment the forces (k,3) on
-    the attached nodes. Of exactly attached ones it is what balances their own tets, loads, weight and mean acceleration in the
-    last step, without damping, and without contacts and springs at these nodes, which act on the other body at once. Raises
-    SceneError.
+    the attached nodes. Of exactly attached ones it is the constraint force: what balances their mean acceleration in the last
+    step with their own tets, damping, loads, weight, springs and contacts, see `dynamics.joints`. The last step is not in
+    checkpoints: until the next one, acceleration and contacts count as 0. Raises SceneError.
     """
     from taisoft.dynamics.joints import joint_force as of_dynamics
 

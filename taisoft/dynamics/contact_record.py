@@ -28,6 +28,15 @@ def sum_impulses(contacts: Contacts, scene: Scene) -> np.ndarray:
     return total
 
 
+def nodal_impulses(impulse: np.ndarray, nodes: np.ndarray, weights: np.ndarray, n_nodes: int) -> np.ndarray:
+    """Distribute impulses (k,3) [N s] to the nodes of both sides (k, 2 w) by their weights, with opposite signs: (n_nodes,3)."""
+    signs = np.repeat([1.0, -1.0], weights.shape[1] // 2)
+    parts, used, total = (signs * weights)[:, :, None] * impulse[:, None], nodes >= 0, np.zeros((n_nodes, 3))
+    for axis in range(3):
+        total[:, axis] = np.bincount(nodes[used], parts[used][:, axis], n_nodes)
+    return total
+
+
 def _sides(node: np.ndarray, weight: np.ndarray, arity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return nodes and weights (n, 2 k) of a problem's contacts, k of each side, as the record stores them.
 

@@ -1,6 +1,7 @@
 """Simulation state shared by all steppers: model, constraints, loads and time."""
 
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 
@@ -14,6 +15,7 @@ from taisoft.fem.model import Layout, Model, damping_table, law_table, upload_ma
 from taisoft.fem.pressure import CavityForm, cavity_form, pressures_of
 from taisoft.fem.reference import gravity_masses, lumped_masses
 from taisoft.fem.spring_table import SpringTable
+from taisoft.fem.springs import own_spring_table
 from taisoft.scene.loads import Cavity
 from taisoft.scene.scene import Scene
 
@@ -49,6 +51,11 @@ class SimulationState:
     def springs(self) -> SpringTable | None:
         """The elements of springs, tendons and attachments; None if there are none."""
         return self.layout.springs
+
+    @cached_property
+    def own_springs(self) -> SpringTable | None:
+        """The same at the nodes where they end, even if these depend on others."""
+        return self.springs if self.dependents is None else own_spring_table(self.scene)
 
     def state(self) -> tuple[np.ndarray, np.ndarray]:
         """Return positions and velocities of all nodes, in their stored precision."""

@@ -331,7 +331,7 @@ def build_model(scene: Scene, runtime: Runtime, arena: FieldArena, on: dict[str,
     if on["consistent_mass"]:
         model = replace(model, mass_matrix=_build_mass_matrix(scene, dependents, model, arena, graph))
     if on["pressure"]:
-        model = replace(model, pressure=build_pressures(scene, layout.node_start, arena, graph))
+        model = replace(model, pressure=build_pressures(scene, layout.node_start, arena, graph, dependents))
     return model, layout
 
 

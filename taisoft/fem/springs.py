@@ -59,6 +59,17 @@ class Springs:
 
 def spring_table(scene: Scene, dependents: DependentTable | None = None) -> SpringTable | None:
     """The elements of a scene; None if it has none. dependents: the scene's table, if it is known already."""
+    made = _collect(scene)
+    return None if made is None else made.table(dependents or dependent_table(scene))
+
+
+def own_spring_table(scene: Scene) -> SpringTable | None:
+    """The elements of a scene at the nodes where they end, even if these depend on others; None if it has none."""
+    made = _collect(scene)
+    return None if made is None else made.table(None)
+
+
+def _collect(scene: Scene) -> "_Builder | None":
     if not scene.has_springs:
         return None
     made, slots = _Builder(scene), tendon_slots(scene)
@@ -76,7 +87,7 @@ def spring_table(scene: Scene, dependents: DependentTable | None = None) -> Spri
     for attachment in [one for one in scene.attachments if one.stiffness is not None]:
         lines = [[one] for one in made.attached(attachment)]
         made.add(attachment.name, lines, PLAIN, attachment.stiffness, damping=attachment.damping)
-    return made.table(dependents or dependent_table(scene))
+    return made
 
 
 def _kind(tendon: Tendon) -> int:

@@ -12,6 +12,8 @@ mean is first-order accurate.
 import numpy as np
 import scipy.sparse as sp
 
+from taisoft.dynamics.contact_record import nodal_impulses
+
 
 class NodalMean:
     """Mean over the tets at each node, weighted by rest volumes, for bodies of either order. bodies: in the order added."""
@@ -55,10 +57,4 @@ def contact_impulses(contacts, n_nodes: int) -> np.ndarray:
     contacts: a record from `Simulator.contacts`. Each impulse is distributed to the nodes that it acted on in the solver, by
     their weights, with its sign on side a and the opposite on side b, so that sums over a body are those of its contacts.
     """
-    signs = np.repeat([1.0, -1.0], contacts.weights.shape[1] // 2)
-    parts = (signs * contacts.weights)[:, :, None] * contacts.impulse[:, None]  # (k,6 or more,3)
-    used = contacts.nodes >= 0
-    total = np.zeros((n_nodes, 3))
-    for axis in range(3):
-        total[:, axis] = np.bincount(contacts.nodes[used], parts[used][:, axis], n_nodes)
-    return total
+    return nodal_impulses(contacts.impulse, contacts.nodes, contacts.weights, n_nodes)
