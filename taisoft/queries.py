@@ -61,6 +61,13 @@ def joint_force(self: "Simulator", name: str) -> float | np.ndarray:
     return of_dynamics(self._open(), name)
 
 
+def tensions(self: "Simulator") -> dict[str, float]:
+    """Return the tensions [N] of all springs and tendons in the present state by name, as `joint_force` gives them one by one."""
+    from taisoft.dynamics.joints import tensions as of_dynamics
+
+    return of_dynamics(self._open())
+
+
 def cavity_volume(self: "Simulator", name: str) -> float:
     """Return the present volume [m^3] of a cavity. Raises SceneError if there is none of this name."""
     state = self._open().state

@@ -140,6 +140,7 @@ class Simulator(Guarded):
     energies = queries.energies
     reactions = queries.reactions
     joint_force = queries.joint_force
+    tensions = queries.tensions
     cavity_volume = queries.cavity_volume
     cavity_pressure = queries.cavity_pressure
     stress = queries.stress

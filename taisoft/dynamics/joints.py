@@ -56,6 +56,17 @@ def joint_force(dynamics: "Dynamics", name: str) -> float | np.ndarray:
     return forces if is_attachment else float(forces[0])
 
 
+def tensions(dynamics: "Dynamics") -> dict[str, float]:
+    """Return the tensions [N] of all springs and tendons, by name."""
+    state, scene = dynamics.state, dynamics.scene
+    names = [one.name for one in (*scene.springs, *scene.tendons)]
+    if not names:
+        return {}
+    x, v = state.state()
+    found = state.springs.tensions(x, v.astype(np.float64), state.amplitudes(state.time))
+    return {name: float(found[state.springs.elements[name].start]) for name in names}
+
+
 def _dependent_forces(dynamics: "Dynamics") -> np.ndarray:
     """The forces F (d,3) [N] on all dependent nodes."""
     state, model, arena = dynamics.state, dynamics.model, FieldArena()
