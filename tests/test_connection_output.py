@@ -94,9 +94,9 @@ def test_pictures_show_connections_and_pressures():
         drawing = Offscreen(scene, (64, 36))
         drawing.image(sim)
         kept = drawing.kept(sim.time + 1.0)
-        assert kept["tension"] == pytest.approx(9e3)
-        drawing.resume(kept | {"tension": 5.0})
-        assert drawing.layers.connections.peak == 5.0
+        assert kept["tension"] == pytest.approx(9e3) and kept["pressure"] == 2e3
+        drawing.resume(kept | {"tension": 5.0, "pressure": 6.0})
+        assert (drawing.layers.connections.peak, drawing.layers.pressures.peak) == (5.0, 6.0)
         drawing.close()
 
 

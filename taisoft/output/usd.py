@@ -97,7 +97,7 @@ class UsdWriter:
 
         moved = [(track, surface.at(sim.time).astype(np.float32)) for track, surface in self._moving]  # first, since it may raise
         x = sim.positions()
-        curves = self._curves.samples(sim, x)
+        curves = [] if self._curves is None else self._curves.samples(sim, x)
         if self._chunk is None:
             self._chunk = Sdf.Layer.CreateAnonymous(".usdc")
             self._chunk.TransferContent(self._template)

@@ -2,7 +2,7 @@
 
 Springs and tendons are drawn as bands, coloured from low to high by the size of their tension relative to the recent maximum, and
 attached nodes as crosses; attachments by springs have a line from each node to its place, too. Arrows show pressures: they point
-along the force, with lengths relative to the largest pressure.
+along the force, with lengths relative to the recent maximum of pressures.
 """
 
 import numpy as np
@@ -19,7 +19,7 @@ CROSS = 0.008  # of the scene's size
 # Longest arrow, of the scene's size, and of the middle extent of the pressed surface, so that it fits a channel; head of an arrow
 PRESSURE_ARROW, IN_CHANNEL, HEAD = 0.07, 0.4, 0.3
 MAX_SEGMENTS, MAX_CROSSES, MAX_ARROWS = 400, 150, 40  # segments in all; crosses of an attachment; arrows of a pressure
-DECAY = 0.99  # factor on the running maximum of tensions per picture
+DECAY = 0.99  # factor on the running maxima per picture
 
 
 class ConnectionLayer:
@@ -56,11 +56,11 @@ class ConnectionLayer:
 
 
 class PressureLayer:
-    """Arrows of pressures and of the fluid in cavities."""
+    """Arrows of pressures and of the fluid in cavities. peak: recent maximum of pressures [Pa], which scales them."""
 
     def __init__(self, scene, size: float):
         """size: of the scene [m]."""
-        starts = scene.first_nodes
+        starts, self.peak = scene.first_nodes, 0.0
         self._surfaces = []  # load, its key, nodes (k,3) of some triangles, and the longest arrow [m]
         for body in scene.bodies:
             keyed = [(load, (body.name, index)) for index, load in enumerate(body.pressures)]
@@ -73,14 +73,14 @@ class PressureLayer:
     def lines(self, sim, x: np.ndarray, camera: Camera) -> list[tuple[np.ndarray, np.ndarray]]:
         """Return ends (2k,3) [m] and the colour of the arrows. x: (n_nodes,3) [m]."""
         pressures = [self._pressure(sim, load, key) for load, key, *_ in self._surfaces]
-        largest, found = max(map(abs, pressures), default=0.0), []
+        self.peak, found = max([DECAY * self.peak, *map(abs, pressures)]), []
         for pressure, (*_, corners, longest) in zip(pressures, self._surfaces):
             if pressure == 0.0:
                 continue
             a, b, c = (x[corners[:, k]] for k in range(3))
             normal = np.cross(b - a, c - a)
             normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), np.finfo(float).tiny)
-            arrow = -longest * pressure / largest * normal
+            arrow = -longest * pressure / self.peak * normal
             # a push ends at the surface, a pull begins there
             tips = (a + b + c) / 3.0 + (arrow if pressure < 0.0 else 0.0)
             found.append((arrows(tips, arrow, camera), PRESSURE_COLOUR))

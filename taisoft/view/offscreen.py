@@ -60,9 +60,11 @@ class Offscreen(SceneView):
         self.colouring.resume(*kept.get("scale", self.colouring.scale))
         self.layers.peak = float(kept.get("impulse", 0.0))
         self.layers.connections.peak = float(kept.get("tension", 0.0))
+        self.layers.pressures.peak = float(kept.get("pressure", 0.0))
 
     def _present(self) -> dict:
-        peaks = {"impulse": self.layers.peak, "tension": self.layers.connections.peak}
+        layers = self.layers
+        peaks = {"impulse": layers.peak, "tension": layers.connections.peak, "pressure": layers.pressures.peak}
         return {"camera": self.camera.distance, "scale": list(self.colouring.scale)} | peaks
 
     def image(self, sim) -> np.ndarray:

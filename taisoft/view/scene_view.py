@@ -127,7 +127,7 @@ class Layers:
         self.n_segments = len(self._edges) + MAX_MARK_LINES
         self._size = float(np.linalg.norm(np.ptp(start_positions(scene), axis=0)))
         self.peak = 0.0
-        self.connections, self._pressures = ConnectionLayer(scene, self._size), PressureLayer(scene, self._size)
+        self.connections, self.pressures = ConnectionLayer(scene, self._size), PressureLayer(scene, self._size)
         self._loaded = [  # per traction, nodes (k,3) of the triangles that get an arrow
             body.mesh.surface[t.triangles[:: -(-len(t.triangles) // MAX_ARROWS)]] + n
             for body, n in zip(scene.bodies, starts)
@@ -144,7 +144,7 @@ class Layers:
             for corners, traction in zip(self._loaded, tractions):
                 arrow = ARROW * self._size / longest * traction
                 marks.append((arrows(x[corners].mean(axis=1), arrow, camera), TRACTION_COLOUR))
-        for name, layer in (("pressures", self._pressures), ("connections", self.connections)):
+        for name, layer in (("pressures", self.pressures), ("connections", self.connections)):
             marks += layer.lines(sim, x, camera) if self.shown[name] else []
         marks = [(camera.nearer(ends, IN_FRONT), colour) for ends, colour in marks]
         if self.shown["wires"]:  # last, since lines beyond the renderer's limit are dropped from the end
