@@ -60,19 +60,26 @@ def joint_force(self: "Simulator", name: str) -> float | np.ndarray:
     """Return the force of a connection in the present state [N].
 
     Of a spring its tension, with damping, negative if it pushes; of a tendon its tension; of an attachment the forces (k,3) on
-    the attached nodes. Of exactly attached ones it is what balances their own tets, loads, weight and mean acceleration in the
-    last step, without damping, and without contacts and springs at these nodes, which act on the other body at once. Raises
-    SceneError.
+    the attached nodes. Of exactly attached ones it is the constraint force: what balances their mean acceleration in the last
+    step with their own tets, damping, loads, weight, springs and contacts, see `dynamics.joints`. The last step is not in
+    checkpoints: until the next one, acceleration and contacts count as 0. Raises SceneError.
     """
     from taisoft.dynamics.joints import joint_force as of_dynamics
 
     return of_dynamics(self._open(), name)
 
 
+def tensions(self: "Simulator") -> dict[str, float]:
+    """Return the tensions [N] of all springs and tendons in the present state by name, as `joint_force` gives them one by one."""
+    from taisoft.dynamics.joints import tensions as of_dynamics
+
+    return of_dynamics(self._open())
+
+
 def cavity_volume(self: "Simulator", name: str) -> float:
     """Return the present volume [m^3] of a cavity. Raises SceneError if there is none of this name."""
     state = self._open().state
-    return state.cavity_form(name).volume_and_gradient(state.state()[0])[0]
+    return state.cavity_form(name).value_and_gradient(state.state()[0])[0]
 
 
 def cavity_pressure(self: "Simulator", name: str) -> float:

@@ -143,6 +143,7 @@ class Simulator(Guarded):
     energies = queries.energies
     reactions = queries.reactions
     joint_force = queries.joint_force
+    tensions = queries.tensions
     cavity_volume = queries.cavity_volume
     cavity_pressure = queries.cavity_pressure
     stress = queries.stress
@@ -181,6 +182,7 @@ class Simulator(Guarded):
     set_force = changes.set_force
     set_traction = changes.set_traction
     set_tension = changes.set_tension
+    set_length = changes.set_length
     set_pressure = changes.set_pressure
     set_cavity = changes.set_cavity
     drag = changes.drag

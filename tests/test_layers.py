@@ -31,7 +31,7 @@ ORDER = (
     ("fem.state", "fem.math3", "fem.node_graph"),
     (
         *("fem.laws", "fem.lanes", "fem.dependents", "fem.reference", "fem.loads", "fem.springs", "fem.pressure"),
-        "fem.mean_dilatation",
+        *("fem.mean_dilatation", "fem.spring_table"),
     ),
     ("fem.terms",),
     ("fem.model", "fem.pattern"),
@@ -44,6 +44,8 @@ ORDER = (
     ("output.camera", "output.nodal_fields"),
     ("output.appearance", "view.shading"),
     ("view.colouring", "view.raster"),
+    ("output.connection_lines",),
+    ("view.connection_layer",),
     ("view.scene_view", "view.shadow"),
     (
         *("simulator", "queries", "changes", "energy_check", "frames", "running", "static", "checkpoint", "estimation"),

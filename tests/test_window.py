@@ -117,7 +117,7 @@ def test_lines_of_layers():
     loaded = 2 * 2 * 2  # triangles of the end
     counts = {"wires": 3 * faces // 2, "contacts": 2, "tractions": 3 * loaded, "fixed_nodes": 0}
     for name, count in counts.items():
-        layers.shown = {other: other == name for other in counts}
+        layers.shown = {other: other == name for other in layers.shown}
         ends, colours = layers.lines(sim, camera)
         assert len(ends) == len(colours) == 2 * count <= 2 * layers.n_segments
         if name == "wires":

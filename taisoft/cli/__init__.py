@@ -216,7 +216,7 @@ def _add_run(add) -> None:
     option("--error-mesh", choices=("refined", "order"), help="also by one on another mesh; implies --error")
     colours = ("body", "stress", "stretch", "speed", "error")
     option("--colour", choices=colours, default="body", help="colouring of bodies in pictures and the window")
-    layers = "what they show besides bodies: wires, contacts, tractions, fixed_nodes, or none"
+    layers = "what they show besides bodies: wires, contacts, tractions, pressures, connections, fixed_nodes, or none"
     option("--layers", metavar="NAME,...", help=layers)
     option("--plots", metavar="NAME,...", help="plots over time: energies, residuals, iterations, contacts, step_time, error")
     option("--caption", action="store_true", help="write scene, frame, time and energies on pictures")

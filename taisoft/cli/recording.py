@@ -14,6 +14,7 @@ from taisoft.estimation.forecast import describe_error
 from taisoft.frames import dt_sentence
 from taisoft.output.files import RESULT_FILES, RESULT_FOLDERS, CheckpointWriter, OutputFolder
 from taisoft.output.frame_files import NPZ_NAME, VTU_NAME, NpzWriter, VtuWriter, cut_pvd
+from taisoft.output.frame_table import FrameTable
 from taisoft.output.frames import FRAMES_NAME, FrameWriter, ffmpeg_command, find_ffmpeg, picture_numbers, write_video
 from taisoft.output.report import body_records, write_report
 from taisoft.output.usd import UsdWriter
@@ -171,6 +172,10 @@ class Recording:
             usd = UsdWriter(folder, sim.scene, **numbers)
             observers.members.append(usd)
             self._checkpoints.before.append(usd.flush)
+        if FrameTable.needed(sim.scene):
+            table = FrameTable(folder, sim.scene, self._first or 0)
+            observers.members.append(table)
+            self._checkpoints.before.append(table.flush)
         if self._first is not None:
             cut_pvd(folder, self._first)
             self._folder.clear(self._first)

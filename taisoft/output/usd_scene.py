@@ -1,4 +1,5 @@
-"""OpenUSD layer of a scene without its frames: bodies and obstacles under `/World`, camera and lights under `/View`.
+"""OpenUSD layer of a scene without its frames: bodies, obstacles, springs and tendons under `/World`, camera and lights
+under `/View`.
 
 Solids are single-sided, half-spaces included, so that a viewer with back-face culling can look into a bin. For viewers without
 culling, half-spaces that face away from the camera at the start, and so hide the bodies, have purpose guide, which viewers show
@@ -27,6 +28,7 @@ from taisoft.output.appearance import (
     obstacle_surfaces,
 )
 from taisoft.output.camera import MAX_WIDENING, Camera, start_positions
+from taisoft.output.usd_curves import Curves
 from taisoft.scene.obstacles import HalfSpace, MeshObstacle
 from taisoft.scene.rigid import RigidBody
 
@@ -132,11 +134,11 @@ class ViewTrack:
         self.camera = replace(self.camera, distance=float(f"{distance:.12g}"))
 
 
-def scene_layer(scene, fps: float, touching: bool, errors: bool) -> tuple[list[Track], list, ViewTrack, object]:
+def scene_layer(scene, fps: float, touching: bool, errors: bool) -> tuple[list[Track], list, Curves | None, ViewTrack, object]:
     """Build a layer with everything that does not change, and the tracks that get values with the frames.
 
     touching: whether there can be contacts; errors: whether errors are estimated. Returns the tracks of the bodies, (track,
-    surface) of each obstacle that follows a path, the camera's track and the layer.
+    surface) of each obstacle that follows a path, the curves of springs and tendons or None, the camera's track and the layer.
     """
     from pxr import Sdf, Usd, UsdGeom
 
@@ -150,15 +152,17 @@ def scene_layer(scene, fps: float, touching: bool, errors: bool) -> tuple[list[T
     stage.SetTimeCodesPerSecond(fps)
     stage.SetFramesPerSecond(fps)
     stage.SetDefaultPrim(UsdGeom.Xform.Define(stage, ROOT).GetPrim())
-    legal = prim_names([one.name for one in (*scene.bodies, *scene.obstacles)])
+    legal = prim_names([one.name for one in (*scene.colliders, *scene.springs, *scene.tendons)])
     tracks, first = [], 0
     for k, (body, name) in enumerate(zip(scene.bodies, legal)):
         tracks += _define_body(stage, body, name, body_colour(k), first, touching, errors)
         first += body.n_nodes
     view = ViewTrack(stage, scene)
-    surfaces = [s for s in zip(obstacle_surfaces(scene), legal[len(scene.bodies) :]) if len(s[0].triangles)]
+    n_bodies, n_colliders = len(scene.bodies), len(scene.colliders)
+    surfaces = [s for s in zip(obstacle_surfaces(scene), legal[n_bodies:n_colliders]) if len(s[0].triangles)]
     moving = [(_define_obstacle(stage, surface, name, view.camera.position), surface) for surface, name in surfaces]
-    return tracks, [one for one in moving if one[1].obstacle.path is not None], view, layer
+    curves = Curves(stage, ROOT, scene, legal[n_colliders:]) if scene.springs or scene.tendons else None
+    return tracks, [one for one in moving if one[1].obstacle.path is not None], curves, view, layer
 
 
 def _extent(points: np.ndarray) -> np.ndarray:

@@ -289,6 +289,12 @@ class Obstacle:
         pivot = self.shape.pivot
         return (points - pivot) @ rotation.T + pivot + translation
 
+    def undisplaced(self, t: float, points: np.ndarray) -> np.ndarray:
+        """Return the points (n,3) [m] of the undisplaced shape that are at these positions at time t [s]."""
+        translation, rotation = self.pose(t)
+        pivot = self.shape.pivot
+        return (points - pivot - translation) @ rotation + pivot
+
 
 def checked_pose(value, t: float, what: str) -> tuple[np.ndarray, np.ndarray]:
     """Return the translation (3,) and rotation (3,3) that a path gave at t [s]. what: start of messages. Raises SceneError."""

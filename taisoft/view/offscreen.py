@@ -70,9 +70,13 @@ class Offscreen(SceneView):
             self.camera = replace(self.camera, distance=float(kept["camera"]))
         self.colouring.resume(*kept.get("scale", self.colouring.scale))
         self.layers.peak = float(kept.get("impulse", 0.0))
+        self.layers.connections.peak = float(kept.get("tension", 0.0))
+        self.layers.pressures.peak = float(kept.get("pressure", 0.0))
 
     def _present(self) -> dict:
-        return {"camera": self.camera.distance, "scale": list(self.colouring.scale), "impulse": self.layers.peak}
+        layers = self.layers
+        peaks = {"impulse": layers.peak, "tension": layers.connections.peak, "pressure": layers.pressures.peak}
+        return {"camera": self.camera.distance, "scale": list(self.colouring.scale)} | peaks
 
     def image(self, sim) -> np.ndarray:
         """Return a picture of sim's present state, uint8 (height, width, 3), first row on top.

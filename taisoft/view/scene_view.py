@@ -5,9 +5,9 @@ bent by less than CREASE at rest. Its normal is the area-weighted mean over that
 keeps its edges, in every deformed state. A second-order face is drawn as four flat triangles between its six nodes.
 Obstacles are drawn with back-face culling, so that a bin's walls show only their inner sides.
 
-Lines are wireframes of the bodies' surfaces, contacts with normals and impulses, and arrows of tractions. They are moved along
-their rays towards the eye, so that they cover the same pixels: wireframes just enough to lie in front of their own surface,
-contacts and arrows so far that nothing hides them.
+Lines are wireframes of the bodies' surfaces, contacts with normals and impulses, arrows of tractions and pressures, and
+connections. They are moved along their rays towards the eye, so that they cover the same pixels: wireframes just enough to lie in
+front of their own surface, all others so far that nothing hides them.
 """
 
 import numpy as np
@@ -19,17 +19,19 @@ from taisoft.output.camera import MAX_WIDENING, Camera, start_positions
 from taisoft.scene.loads import value_at
 from taisoft.scene.obstacles import HalfSpace
 from taisoft.view.colouring import Colouring, lit_colours
+from taisoft.view.connection_layer import ConnectionLayer, PressureLayer, arrows
 
 CREASE = 35.0  # [deg] between the normals of neighbouring triangles at rest
 MARKER_COLOUR = np.array([0.20, 0.22, 0.26])  # sRGB
 MARKER_SIZE = 0.16  # radius in units of the mean edge length of the body's surface
 MAX_MARKERS = 500  # per body; of more fixed nodes, evenly selected ones are shown
 
-LAYERS = ("wires", "contacts", "tractions", "fixed_nodes")
-IN_WINDOW, IN_PICTURES = ("tractions", "fixed_nodes"), ("fixed_nodes",)  # shown by default
+LAYERS = ("wires", "contacts", "tractions", "pressures", "connections", "fixed_nodes")
+IN_PICTURES = ("pressures", "connections", "fixed_nodes")  # shown by default
+IN_WINDOW = ("tractions", *IN_PICTURES)
 MAX_MARK_LINES = 4000  # largest number of lines of contacts and arrows, besides the wires
 ON_SURFACE, IN_FRONT = 0.996, 0.1  # fractions of the distance from the eye
-NORMAL, IMPULSE, ARROW, HEAD = 0.04, 0.15, 0.10, 0.3  # lengths relative to the scene's size; HEAD relative to its arrow
+NORMAL, IMPULSE, ARROW = 0.04, 0.15, 0.10  # lengths relative to the scene's size
 MAX_ARROWS = 60  # of one traction
 DECAY = 0.99  # factor on the running maximum of impulses per picture
 WIRE_COLOUR, NORMAL_COLOUR = np.array([0.12, 0.14, 0.18]), np.array([0.10, 0.55, 0.25])  # sRGB
@@ -71,7 +73,9 @@ class Surfaces:
     def __init__(self, scene):
         self._shown = ShownBodies(scene)
         surfaces = zip(scene.bodies, self._shown.surfaces)
-        self._bodies = [_BodySurface(body, *surface, body_colour(k)) for k, (body, surface) in enumerate(surfaces)]
+        self._bodies = [
+            _BodySurface(body, *surface, body_colour(k), scene.constraints(body)) for k, (body, surface) in enumerate(surfaces)
+        ]
         self._starts = self._shown.starts[:-1]
         self._obstacles = [_RigidSurface(surface) for surface in obstacle_surfaces(scene)]
         nodes = [np.where(body.nodes >= 0, body.nodes + start, -1) for body, start in zip(self._bodies, self._starts)]
@@ -129,6 +133,7 @@ class Layers:
         self.n_segments = len(self._edges) + MAX_MARK_LINES
         self._size = float(np.linalg.norm(np.ptp(start_positions(scene), axis=0)))
         self.peak = 0.0
+        self.connections, self.pressures = ConnectionLayer(scene, self._size), PressureLayer(scene, self._size)
         self._loaded = [  # per traction, nodes (k,3) of the triangles that get an arrow
             body.mesh.surface[t.triangles[:: -(-len(t.triangles) // MAX_ARROWS)]] + n
             for body, n in zip(scene.bodies, starts)
@@ -144,12 +149,15 @@ class Layers:
             longest = max((float(np.linalg.norm(t)) for t in tractions), default=0.0) or 1.0
             for corners, traction in zip(self._loaded, tractions):
                 arrow = ARROW * self._size / longest * traction
-                marks.append((_arrows(x[corners].mean(axis=1), arrow, camera), TRACTION_COLOUR))
+                marks.append((arrows(x[corners].mean(axis=1), arrow, camera), TRACTION_COLOUR))
+        for name, layer in (("pressures", self.pressures), ("connections", self.connections)):
+            marks += layer.lines(sim, x, camera) if self.shown[name] else []
         marks = [(camera.nearer(ends, IN_FRONT), colour) for ends, colour in marks]
         if self.shown["wires"]:  # last, since lines beyond the renderer's limit are dropped from the end
             marks.append((camera.nearer(self._shown.of(x)[self._edges].reshape(-1, 3), ON_SURFACE), WIRE_COLOUR))
         ends = [np.empty((0, 3)), *(part for part, _ in marks)]
-        return np.concatenate(ends), np.concatenate([np.empty((0, 3)), *(np.tile(c, (len(part), 1)) for part, c in marks)])
+        colours = [np.empty((0, 3)), *(np.broadcast_to(colour, part.shape) for part, colour in marks)]
+        return np.concatenate(ends), np.concatenate(colours)
 
     def _contact_lines(self, sim) -> list[tuple[np.ndarray, np.ndarray]]:
         """Return lines of normals with a fixed length, and of impulses relative to the recent maximum."""
@@ -169,12 +177,12 @@ def _concatenated(parts: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarra
 
 
 class _BodySurface:
-    def __init__(self, body, rest: np.ndarray, surface: np.ndarray, colour: np.ndarray):
+    def __init__(self, body, rest: np.ndarray, surface: np.ndarray, colour: np.ndarray, constraints: list):
         self._nodes, self._corners = smoothing_groups(rest, surface)
         edges = rest[surface] - rest[np.roll(surface, 1, axis=1)]
         self._radius = MARKER_SIZE * float(np.linalg.norm(edges, axis=2).mean())
         is_node = body.skin is None or body.skin.contact
-        self._marked = _fixed_surface_nodes(body, surface) if is_node else np.empty(0, dtype=np.int64)
+        self._marked = _fixed_surface_nodes(constraints, surface) if is_node else np.empty(0, dtype=np.int64)
         self._ball, ball_triangles = _coarse_ball()
         counts = len(self._nodes), len(self._ball) * len(self._marked)
         starts = len(self._nodes) + len(self._ball) * np.arange(len(self._marked))
@@ -254,8 +262,8 @@ def _unit(vectors: np.ndarray) -> np.ndarray:
     return vectors / np.where(length > 0, length, 1.0)
 
 
-def _fixed_surface_nodes(body, surface: np.ndarray) -> np.ndarray:
-    fixed = [constraint.nodes for constraint in body.constraints if constraint.path is None]
+def _fixed_surface_nodes(constraints: list, surface: np.ndarray) -> np.ndarray:
+    fixed = [constraint.nodes for constraint in constraints if constraint.path is None]
     if not fixed:
         return np.empty(0, dtype=np.int64)
     nodes = np.intersect1d(np.concatenate(fixed), surface)
@@ -277,11 +285,3 @@ def _coarse_ball() -> tuple[np.ndarray, np.ndarray]:
 def _segments(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Return the ends (2k,3) of lines from a (k,3) to b (k,3)."""
     return np.stack([a, b], axis=1).reshape(-1, 3)
-
-
-def _arrows(tips: np.ndarray, arrow: np.ndarray, camera: Camera) -> np.ndarray:
-    """Return the lines of arrows (3,) that end at tips (k,3): a shaft and two head strokes in the picture's plane."""
-    side = np.cross(arrow, camera.forward)
-    return np.concatenate(
-        [_segments(tips - arrow, tips)] + [_segments(tips - HEAD * (arrow + s * 0.5 * side), tips) for s in (-1.0, 1.0)]
-    )
