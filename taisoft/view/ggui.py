@@ -101,12 +101,19 @@ class VertexBuffer:
 class Canvas:
     """The process's one Taichi window, on the screen or only in memory, which draws the scene's surfaces.
 
-    size: (width, height) in pixels; visible: on the screen; n_segments: largest number of lines; line_width: in pixels.
+    size: (width, height) in pixels; visible: on the screen; n_segments: largest number of lines; line_width: in pixels; decals:
+    triangles (t,3) of a second mesh, which is drawn on the first one.
     Raises OutputError, before anything is opened, if a Vulkan driver or a display is missing or a window is open already.
     """
 
     def __init__(
-        self, surfaces: Surfaces, size: tuple[int, int], visible: bool, n_segments: int = 0, line_width: float = LINE_WIDTH
+        self,
+        surfaces: Surfaces,
+        size: tuple[int, int],
+        visible: bool,
+        n_segments: int = 0,
+        line_width: float = LINE_WIDTH,
+        decals: np.ndarray | None = None,
     ):
         missing = (visible and display_missing()) or vulkan_missing()
         if missing:
@@ -122,6 +129,11 @@ class Canvas:
         self._vertices = VertexBuffer(len(surfaces.colours))
         self._vertices.normals[:] = 0.0, 1.0, 0.0  # no effect: the colours are lit already
         self._indices = np.ascontiguousarray(surfaces.triangles.ravel(), dtype=np.int32)
+        self._decals = self._decal_indices = None
+        if decals is not None and len(decals):
+            self._decals = VertexBuffer(int(decals.max()) + 1)
+            self._decals.normals[:] = 0.0, 1.0, 0.0
+            self._decal_indices = np.ascontiguousarray(decals.ravel(), dtype=np.int32)
         self._ends = VertexBuffer(2 * n_segments)
         self._flat_boxes: VertexBuffer | None = None  # like `_flat_lines` drawn over the picture; made at the first `draw_over`
         self._flat_lines: VertexBuffer | None = None
@@ -136,10 +148,19 @@ class Canvas:
             self.close()
             raise OutputError(f"cannot open a window: Taichi says: {error}") from error
 
-    def draw(self, x: np.ndarray, colours: np.ndarray, camera: Camera, background: tuple, lines: tuple) -> None:
+    def draw(
+        self,
+        x: np.ndarray,
+        colours: np.ndarray,
+        camera: Camera,
+        background: tuple,
+        lines: tuple,
+        decals: tuple[np.ndarray, np.ndarray] | None = None,
+    ) -> None:
         """Draw the surfaces with vertices x [m] and lit colours, (n,3) each; background: RGB in [0, 1].
 
-        lines: ends (2k,3) [m] and colours (2k,3), of which the first n_segments lines are drawn.
+        lines: ends (2k,3) [m] and colours (2k,3), of which the first n_segments lines are drawn; decals: x and colours of that
+        mesh, if it is drawn.
         """
         # relative to the target, since single precision is too coarse for a scene far from the origin
         self._vertices.x[:], self._vertices.colours[:] = x - camera.target, colours
@@ -153,14 +174,22 @@ class Canvas:
         self._canvas.set_background_color(background)
         self._scene.set_camera(eye)
         self._scene.ambient_light((1.0, 1.0, 1.0))  # the colours are lit already
-        vertices, indices = self._vertices.info, get_field_info(self._indices)  # two-sided, with vertex colours
-        self._scene.scene.mesh(vertices, True, indices, GREY, True, len(self._indices), 0, len(self._vertices), 0, False)
+        self._draw_mesh(self._vertices, self._indices)
+        if decals is not None:
+            self._decals.x[:], self._decals.colours[:] = decals[0] - camera.target, decals[1]
+            self._draw_mesh(self._decals, self._decal_indices)
         ends, line_colours = lines
         n = min(len(ends), len(self._ends))
         if n > 0:
             self._ends.x[:n], self._ends.colours[:n] = ends[:n] - camera.target, line_colours[:n]
             self._scene.scene.lines(self._ends.info, get_field_info(None), True, GREY, self._line_width, n, 0, n, 0)
         self._canvas.scene(self._scene)
+
+    def _draw_mesh(self, vertices: VertexBuffer, indices: np.ndarray) -> None:
+        """Draw triangles two-sided, with vertex colours."""
+        self._scene.scene.mesh(
+            vertices.info, True, get_field_info(indices), GREY, True, len(indices), 0, len(vertices), 0, False
+        )
 
     def draw_over(
         self, boxes: np.ndarray, ends: np.ndarray, colours: np.ndarray, capacity: tuple[int, int], box_colour: tuple
