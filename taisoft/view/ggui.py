@@ -101,8 +101,8 @@ class VertexBuffer:
 class Canvas:
     """The process's one Taichi window, on the screen or only in memory, which draws the scene's surfaces.
 
-    size: (width, height) in pixels; visible: on the screen; n_segments: largest number of lines; line_width: in pixels; decals:
-    triangles (t,3) of a second mesh, which is drawn on the first one.
+    size: (width, height) in pixels; visible: on the screen; n_segments: largest number of lines; line_width: in pixels;
+    n_decals: largest numbers of vertices and triangles of what is drawn on the surfaces.
     Raises OutputError, before anything is opened, if a Vulkan driver or a display is missing or a window is open already.
     """
 
@@ -113,7 +113,7 @@ class Canvas:
         visible: bool,
         n_segments: int = 0,
         line_width: float = LINE_WIDTH,
-        decals: np.ndarray | None = None,
+        n_decals: tuple[int, int] = (0, 0),
     ):
         missing = (visible and display_missing()) or vulkan_missing()
         if missing:
@@ -126,14 +126,12 @@ class Canvas:
         self._runtime = open_runtime(arch, precision, owner="a window")
         _holder.append("a window")
         self._surfaces, self._line_width = surfaces, line_width
-        self._vertices = VertexBuffer(len(surfaces.colours))
+        self._n = len(surfaces.colours)  # drawn vertices of the surfaces; those of decals follow in the same mesh
+        self._vertices = VertexBuffer(self._n + n_decals[0])
         self._vertices.normals[:] = 0.0, 1.0, 0.0  # no effect: the colours are lit already
-        self._indices = np.ascontiguousarray(surfaces.triangles.ravel(), dtype=np.int32)
-        self._decals = self._decal_indices = None
-        if decals is not None and len(decals):
-            self._decals = VertexBuffer(int(decals.max()) + 1)
-            self._decals.normals[:] = 0.0, 1.0, 0.0
-            self._decal_indices = np.ascontiguousarray(decals.ravel(), dtype=np.int32)
+        self._indices = np.zeros((len(surfaces.triangles) + n_decals[1], 3), dtype=np.int32)
+        self._indices[: len(surfaces.triangles)] = surfaces.triangles
+        self._decals = self._indices[len(surfaces.triangles) :]  # unused triangles have no area
         self._ends = VertexBuffer(2 * n_segments)
         self._flat_boxes: VertexBuffer | None = None  # like `_flat_lines` drawn over the picture; made at the first `draw_over`
         self._flat_lines: VertexBuffer | None = None
@@ -155,15 +153,20 @@ class Canvas:
         camera: Camera,
         background: tuple,
         lines: tuple,
-        decals: tuple[np.ndarray, np.ndarray] | None = None,
+        decals: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None,
     ) -> None:
         """Draw the surfaces with vertices x [m] and lit colours, (n,3) each; background: RGB in [0, 1].
 
-        lines: ends (2k,3) [m] and colours (2k,3), of which the first n_segments lines are drawn; decals: x and colours of that
-        mesh, if it is drawn.
+        lines: ends (2k,3) [m] and colours (2k,3), of which the first n_segments lines are drawn; decals: x, colours and
+        triangles (t,3) of what is drawn on the surfaces.
         """
         # relative to the target, since single precision is too coarse for a scene far from the origin
-        self._vertices.x[:], self._vertices.colours[:] = x - camera.target, colours
+        self._vertices.x[: self._n], self._vertices.colours[: self._n] = x - camera.target, colours
+        self._decals[:] = 0
+        if decals is not None:
+            rows = slice(self._n, self._n + len(decals[0]))
+            self._vertices.x[rows], self._vertices.colours[rows] = decals[0] - camera.target, decals[1]
+            self._decals[: len(decals[2])] = self._n + decals[2]
         eye = ti.ui.Camera()
         eye.position(*(camera.position - camera.target))
         eye.lookat(0.0, 0.0, 0.0)
@@ -174,22 +177,14 @@ class Canvas:
         self._canvas.set_background_color(background)
         self._scene.set_camera(eye)
         self._scene.ambient_light((1.0, 1.0, 1.0))  # the colours are lit already
-        self._draw_mesh(self._vertices, self._indices)
-        if decals is not None:
-            self._decals.x[:], self._decals.colours[:] = decals[0] - camera.target, decals[1]
-            self._draw_mesh(self._decals, self._decal_indices)
+        vertices, indices = self._vertices.info, get_field_info(self._indices.reshape(-1))  # two-sided, with vertex colours
+        self._scene.scene.mesh(vertices, True, indices, GREY, True, self._indices.size, 0, len(self._vertices), 0, False)
         ends, line_colours = lines
         n = min(len(ends), len(self._ends))
         if n > 0:
             self._ends.x[:n], self._ends.colours[:n] = ends[:n] - camera.target, line_colours[:n]
             self._scene.scene.lines(self._ends.info, get_field_info(None), True, GREY, self._line_width, n, 0, n, 0)
         self._canvas.scene(self._scene)
-
-    def _draw_mesh(self, vertices: VertexBuffer, indices: np.ndarray) -> None:
-        """Draw triangles two-sided, with vertex colours."""
-        self._scene.scene.mesh(
-            vertices.info, True, get_field_info(indices), GREY, True, len(indices), 0, len(vertices), 0, False
-        )
 
     def draw_over(
         self, boxes: np.ndarray, ends: np.ndarray, colours: np.ndarray, capacity: tuple[int, int], box_colour: tuple

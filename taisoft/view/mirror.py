@@ -99,7 +99,7 @@ def describe_state(sim, layers: set[str], history: History | None) -> dict:
 class MirrorSimulation:
     """The latest state of a simulation, with those attributes of `Simulator` that pictures need.
 
-    nodal_values: (n_nodes,) of the quantity `nodal_kind`; None until they are known.
+    nodal_values: (n_nodes,) of the quantity `nodal_kind`; history: with the arrays of `History`; both None until they are known.
     """
 
     def __init__(self, description: dict, n_nodes: int):
@@ -109,7 +109,7 @@ class MirrorSimulation:
         ends = np.cumsum([0] + [body.n_nodes for body in self.scene.bodies])
         self._rows = {body.name: slice(*pair) for body, pair in zip(self.scene.bodies, zip(ends, ends[1:]))}
         self._x = np.zeros((n_nodes, 3))
-        self.history = SimpleNamespace(**{name: getattr(History(), name) for name in ("times", "low", "high", "last", "begin")})
+        self.history: SimpleNamespace | None = None
         self.nodal_kind, self.nodal_values = "body", None
 
     def take(self, state: dict, x: np.ndarray, values: np.ndarray) -> None:

@@ -68,13 +68,18 @@ class Screen(SceneView):
         self._note = ""  # about pictures and camera
         self._messages: list[str] = []  # those shown
         self._shadow_mesh = ShadowMesh(sim.scene, self.surfaces)
-        decals = self._shadow_mesh.triangles
-        self._canvas = Canvas(self.surfaces, SIZE, visible=True, n_segments=self.layers.n_segments + 1, decals=decals)
+        n_segments, n_decals = self.layers.n_segments + 1, self._shadow_mesh.size
+        self._canvas = Canvas(self.surfaces, SIZE, visible=True, n_segments=n_segments, n_decals=n_decals)
 
     @property
     def closed(self) -> bool:
         """Whether the user has closed the window, or `close` was called."""
         return self._close_requested or self._canvas.window is None or not self._canvas.window.running
+
+    @property
+    def dragging(self) -> bool:
+        """Whether the mouse drags a body or the view."""
+        return bool(self._mode)
 
     def close(self) -> None:
         """Destroy the window; a second call does nothing."""
@@ -94,7 +99,7 @@ class Screen(SceneView):
         shadows = self._shadow_mesh.draw(x, sim.time, self.camera) if self.layers.shown["shadows"] else None
         self._canvas.draw(x, colours, self.camera, tuple(BACKGROUND_TOP), (ends, line_colours), shadows)
         self._take_picture(size)
-        if not self._plots_hidden:
+        if sim.history is not None and not self._plots_hidden:
             self._overlay.draw(self._canvas, window.get_gui(), size)
         # lines above the sliders must be constant in number: a transient line would move the sliders under the cursor
         with window.get_gui().sub_window("taisoft", *self._panel_rectangle) as gui:

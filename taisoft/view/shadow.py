@@ -24,7 +24,8 @@ class ShadowMap:
     """Shadows on a half-space.
 
     vertices: its range of drawn ones; origin (3,) [m] and axes (3,3), the third its normal: frame of the map; darkness: (v, u),
-    fraction of light that is missing; low (2,) [m]: coordinates of its corner; texel (2,): size of a texel [m].
+    fraction of light that is missing; low (2,) [m]: coordinates of its corner; texel (2,): size of a texel [m]; square (k,2) [m]:
+    the half-space's drawn vertices in the frame.
     """
 
     vertices: slice
@@ -33,6 +34,7 @@ class ShadowMap:
     darkness: np.ndarray
     low: np.ndarray
     texel: np.ndarray
+    square: np.ndarray
 
 
 class Shadows:
@@ -68,8 +70,8 @@ class Shadows:
                 found.append(ShadowMap(vertices, boundary[0], axes, *drawn))
         return found
 
-    def _map(self, x: np.ndarray, origin, axes, boundary) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-        """Return a map (v, u), the coordinates (2,) of its corner and the size (2,) of a texel [m]; None without a shadow."""
+    def _map(self, x: np.ndarray, origin, axes, boundary) -> tuple[np.ndarray, ...] | None:
+        """Return the last four fields of a `ShadowMap`; None without a shadow."""
         height = (x - origin) @ axes[2] / (axes[2] @ UP)
         shadow = (x - origin) @ axes[:2].T - height[:, None] * (axes[:2] @ UP)
         drawn = shadow[np.isfinite(shadow).all(axis=1)]
@@ -88,7 +90,7 @@ class Shadows:
             depth = np.exp(np.clip(height / (FADE * self._size), 0.0, 50.0))
         points = np.column_stack([(shadow - low) / texel, depth])
         darkness = STRENGTH * self._raster.inverse_depths(points, self._surfaces.body_triangles)
-        return blurred(darkness, sigma / texel[::-1]), low, texel
+        return blurred(darkness, sigma / texel[::-1]), low, texel, square
 
 
 def _frame(boundary: np.ndarray) -> np.ndarray | None:

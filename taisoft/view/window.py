@@ -142,7 +142,8 @@ class WindowProcess:
         try:
             self._link.send(state)
         except LinkClosed:
-            self._lose()
+            while self._read(0.0):  # it may have been closed by its user
+                pass
 
     def close(self) -> None:
         """Close the window and wait for its process; a second call does nothing."""

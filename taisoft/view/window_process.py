@@ -16,7 +16,7 @@ from taisoft.view.screen import Screen
 
 MAX_UNANSWERED = 64  # requests; later commands wait, so that a long step lets no queue grow
 IDLE_SHARE = 1.0  # time without drawing over that of drawing: with software Vulkan, drawing takes cores from the simulation
-SLOWEST = 1.0 / 25.0  # pause that this may add up to [s]
+SLOWEST = 1.0 / 25.0  # time between two pictures above which there is no such pause [s]
 
 
 class View:
@@ -39,10 +39,12 @@ class View:
             begin = time.perf_counter()
             self._screen.draw(self._sim, self._state, begin - self._came)
             self._send()
-            drawn = time.perf_counter() - begin
-            pause = max(self._interval - drawn, min(IDLE_SHARE * drawn, SLOWEST - drawn))
-            self._receive(max(0.0, pause))
-            time.sleep(max(0.0, begin + drawn + pause - time.perf_counter()))
+            end = time.perf_counter()
+            idle = 0.0 if self._screen.dragging else IDLE_SHARE * (end - begin)
+            end = max(begin + self._interval, min(end + idle, begin + SLOWEST))
+            while not self._ended and (left := end - time.perf_counter()) > 0.0:
+                self._receive(left)
+            self._receive(0.0)
         if not self._ended:
             timing = self._screen.timing
             self._link.send({"closed": True, "pictures": list(timing.pictures), "latencies": list(timing.latencies)})

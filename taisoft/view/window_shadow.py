@@ -4,47 +4,58 @@ The renderer of the window interpolates colours between vertices only, so that t
 """
 
 import numpy as np
+from scipy.spatial import ConvexHull
 
 from taisoft.output.appearance import OBSTACLE_COLOUR
-from taisoft.output.camera import Camera
+from taisoft.output.camera import UP, Camera
 from taisoft.scene.obstacles import HalfSpace
 from taisoft.view.colouring import lit_colours
-from taisoft.view.shadow import TEXELS, Shadows
+from taisoft.view.shadow import MIN_SLOPE, TEXELS, Shadows
 
 EVERY = 2  # texels between two vertices along each axis
+FAINT = 1e-3  # darkness below which nothing is drawn
 LIFT = 0.9995  # fraction of the distance from the eye, so that the mesh lies on the ground
 
 
 class ShadowMesh:
-    """Meshes of the shadows on the half-spaces of a scene. triangles: int32 (t,3), of the meshes of all of them."""
+    """Meshes of the shadows on the half-spaces of a scene. size: their largest numbers of vertices and triangles."""
 
     def __init__(self, scene, surfaces):
         self._shadows = Shadows(scene, surfaces)
-        n_maps = sum(isinstance(o.shape, HalfSpace) for o in scene.obstacles)
+        grounds = [o for o in scene.obstacles if isinstance(o.shape, HalfSpace)]
+        n_maps = sum(o.path is not None or o.shape.normal @ UP >= MIN_SLOPE for o in grounds)
         side = TEXELS // EVERY
-        self._coordinates = EVERY * np.arange(side) + 0.5 * EVERY  # in texels
+        centres = EVERY * np.arange(side) + 0.5 * EVERY
+        v, u = np.meshgrid(centres, centres, indexing="ij")
+        self._texels = np.column_stack([u.ravel(), v.ravel()])
         corner = (np.arange(side - 1)[:, None] * side + np.arange(side - 1)).reshape(-1, 1)
-        quads = np.concatenate([corner + [0, 1, side], corner + [1, side + 1, side]])
-        self._n_of_map = side * side
-        self.triangles = np.concatenate([np.empty((0, 3), np.int32), *(quads + k * side * side for k in range(n_maps))])
-        self._x = np.zeros((n_maps * side * side, 3))
-        self._colours = np.zeros_like(self._x)
+        self._triangles = np.concatenate([corner + [0, 1, side], corner + [1, side + 1, side]])
+        self.size = (n_maps * side * side, n_maps * len(self._triangles))
 
-    def draw(self, x: np.ndarray, t: float, camera: Camera) -> tuple[np.ndarray, np.ndarray] | None:
-        """Return positions [m] and lit colours (n,3) of the meshes, or None without a shadow.
+    def draw(self, x: np.ndarray, t: float, camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+        """Return positions [m] and lit colours (n,3) of the meshes and their triangles (t,3), or None without a shadow.
 
         x: (n,3) drawn vertices of `Surfaces`; t: time [s].
         """
-        found = [one for one in self._shadows.maps(x, t) if (camera.position - one.origin) @ one.axes[2] > 0.0]
-        self._x[:] = camera.target  # unused triangles have no area
-        for k, one in enumerate(found):
-            rows = slice(k * self._n_of_map, (k + 1) * self._n_of_map)
-            v, u = np.meshgrid(self._coordinates, self._coordinates, indexing="ij")
-            plane = np.column_stack([u.ravel(), v.ravel()]) * one.texel + one.low
-            points = one.origin + plane @ one.axes[:2]
-            darkness = one.darkness.reshape(len(u), EVERY, len(u), EVERY).mean(axis=(1, 3))
-            normals, base = np.tile(one.axes[2], (len(points), 1)), np.tile(OBSTACLE_COLOUR, (len(points), 1))
-            lit = lit_colours(points, normals, base, camera)
-            self._x[rows] = camera.nearer(points, LIFT)
-            self._colours[rows] = lit * (1.0 - darkness.reshape(-1, 1))
-        return (self._x, self._colours) if found else None
+        points, colours, triangles = [], [], []
+        for one in self._shadows.maps(x, t):
+            if (camera.position - one.origin) @ one.axes[2] <= 0.0:
+                continue
+            own = one.origin + _inside(one.square, self._texels * one.texel + one.low) @ one.axes[:2]
+            side = TEXELS // EVERY
+            darkness = one.darkness.reshape(side, EVERY, side, EVERY).mean(axis=(1, 3)).reshape(-1, 1)
+            triangles.append(self._triangles[darkness[self._triangles, 0].max(axis=1) > FAINT] + len(points) * len(own))
+            normals, base = np.tile(one.axes[2], (len(own), 1)), np.tile(OBSTACLE_COLOUR, (len(own), 1))
+            colours.append(lit_colours(own, normals, base, camera) * (1.0 - darkness))
+            points.append(camera.nearer(own, LIFT))
+        if not points:
+            return None
+        return np.concatenate(points), np.concatenate(colours), np.concatenate(triangles)
+
+
+def _inside(polygon: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Move points (n,2) that lie outside a convex polygon, given by points (k,2) in it, onto its border."""
+    for a, b, offset in ConvexHull(polygon).equations:
+        beyond = np.maximum(points @ (a, b) + offset, 0.0)
+        points = points - np.outer(beyond, (a, b))
+    return points
