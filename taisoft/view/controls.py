@@ -39,7 +39,7 @@ class Controls:
         self._exponents = {what: dict.fromkeys(self._initial[what], 0.0) for what in DECADES}
         self._pairs = touching_pairs(sim)
         self._frictions: list[float] | None = None  # of the pairs; None if unknown
-        self._grip: tuple | None = None  # body, nodes and weights of the present drag
+        self._held: tuple | None = None  # body, nodes and weights of the present drag
 
     def values(self) -> dict:
         """Return the present values, as plain data for the panel."""
@@ -114,22 +114,22 @@ class Controls:
 
     # --- drag ---------------------------------------------------------------------------------------------------------
 
-    def grip(self, body: str, nodes, weights) -> None:
+    def begin_drag(self, body: str, nodes, weights) -> None:
         """Begin a drag at these nodes (k,) of a body, weighted by (k,), which `drag` moves."""
         own = self._sim.scene.body(body)
         rest = np.asarray(own.rest_positions)
-        self._grip = (body, np.asarray(nodes), np.asarray(weights), np.linalg.norm(np.ptp(rest, axis=0)))
+        self._held = (body, np.asarray(nodes), np.asarray(weights), np.linalg.norm(np.ptp(rest, axis=0)))
 
     def drag(self, target, strength: float) -> None:
         """Drag towards target (3,) [m]. strength: force over the body's weight, for a displacement as long as its diagonal."""
-        if self._grip is None:
+        if self._held is None:
             return
-        body, nodes, weights, diagonal = self._grip
+        body, nodes, weights, diagonal = self._held
         self._sim.drag(body, nodes, weights, target, strength * self._sim.scene.body(body).mass * EARTH / diagonal)
 
     def release(self) -> None:
         """End the drag."""
-        self._grip = None
+        self._held = None
         self._sim.release()
 
     # --- solver -------------------------------------------------------------------------------------------------------

@@ -1,7 +1,7 @@
 """The drawn squares of half-spaces, which stay below the bodies.
 
 A half-space is drawn as a square around the place where the bodies start. When their bounding box comes near its border, the
-square moves along, and grows if they spread, so that bodies never lie beside the drawn ground. It depends on the present positions
+square moves along, and grows if they spread, so that bodies never lie beside the drawn ground. It depends on present positions
 alone. A square that is cut off at other half-spaces only moves along them: the bottom of a groove along the groove, that of a bin
 not at all.
 """

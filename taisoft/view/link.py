@@ -1,6 +1,6 @@
 """The link between a simulation and the process that shows it: small messages over a socket, node data in shared memory.
 
-A message is a dict of plain data and NumPy arrays, in bytes a header in JSON followed by the arrays. Nothing is pickled. Positions
+A message is a dict of plain data and arrays, in bytes a header in JSON followed by the arrays; nothing is pickled. Positions
 and values at the nodes, which may be large, lie in memory that both processes map. The writer fills it only after the reader has
 confirmed the previous message, so sending never waits for the reader.
 """

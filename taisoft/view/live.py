@@ -10,6 +10,7 @@ import math
 import time
 import warnings
 from contextlib import contextmanager
+from functools import partial
 
 from taisoft.errors import SceneError, SimulationError, TaisoftError
 from taisoft.records import StepReport
@@ -76,7 +77,7 @@ class LiveRun:
     def _seconds_to_wait(self) -> float:
         if self.paused:
             return IDLE
-        if math.isinf(self.speed) or not self._compiled:
+        if math.isinf(self.speed):
             return 0.0
         return min(IDLE, max(0.0, (self.sim.dt - self._due()) / self.speed))
 
@@ -135,7 +136,7 @@ class LiveRun:
             if own is not None:
                 own(*arguments)
             else:
-                self.guarded(lambda call=getattr(self._controls, name), given=arguments: call(*given))
+                self.guarded(partial(getattr(self._controls, name), *arguments))
             if name == "drag":
                 self._drag_request = number
 
@@ -174,6 +175,7 @@ class LiveRun:
         """Switch the solver; the note is shown while that compiles."""
         self.note = f"compiling {integrator}, for some seconds"
         self._publish(PATIENCE)
+        self._changed = True
         try:
             self.note = self._controls.rebuild(integrator, contact_solver)
         except TaisoftError as error:

@@ -1,6 +1,6 @@
 """The panel of the live window: texts, buttons and sliders, which become commands for the simulation's process.
 
-GGUI identifies a slider by the part of its label after ###, so the part before shows the value in its unit. The number in a slider
+GGUI identifies a slider by the part of its label after ###, so the part before shows the value in its unit. The number in that
 of dt, Young's modulus and density is the decimal logarithm of that value. The simulation answers a change with its next state;
 until then a slider keeps the value that was set.
 """

@@ -216,7 +216,7 @@ class Screen(SceneView):
                 self._widest = 0.0  # a camera that moves back would move the drag's target
                 drag = self._drag = MouseDrag(sim, hit)
                 self._panel.chosen = drag.body
-                self._requests.add("grip", drag.body, drag.nodes, drag.weights, key="grip")
+                self._requests.add("begin_drag", drag.body, drag.nodes, drag.weights, key="begin_drag")
                 self._requests.add("drag", drag.target.tolist(), self._panel.strength, key="drag")
                 return "drag"
         return "turn"

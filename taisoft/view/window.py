@@ -39,7 +39,7 @@ class WindowProcess:
     """A window in a child process that shows a simulation.
 
     sim: a Simulator; controls: whether the window changes it, or only shows it; colour, layers, plots: those shown initially;
-    fps: of the window's pictures, at most; child: command of the process.
+    fps: of the window's pictures, at most; child: command of the process, if not CHILD.
     Raises OutputError if a display or a Vulkan driver is missing or the window does not open.
     """
 
@@ -51,7 +51,7 @@ class WindowProcess:
         layers: tuple[str, ...] = IN_WINDOW,
         plots: tuple[str, ...] = (),
         fps: float = FPS,
-        child: tuple[str, ...] = CHILD,
+        child: tuple[str, ...] | None = None,
     ):
         missing = display_missing() or vulkan_missing()
         if missing:
@@ -63,7 +63,7 @@ class WindowProcess:
         self._requests: list[tuple[int, list]] = []  # not yet returned
         self.closed = False
         self._link, other = Link.pair(n_nodes)
-        self._process: subprocess.Popen | None = _spawn(child, other.fileno(), self._link.nodes.descriptor)
+        self._process: subprocess.Popen | None = _spawn(child or CHILD, other.fileno(), self._link.nodes.descriptor)
         other.close()
         description = describe_scene(scene) | {"n_nodes": n_nodes, "fps": fps, "colour": colour}
         description |= {"layers": list(layers), "plots": list(plots)}

@@ -29,7 +29,7 @@ class View:
         self._interval = 1.0 / description["fps"]
         self._state: dict = {}
         self._came = 0.0  # when the state came
-        self._told: tuple | None = None  # last message but for commands
+        self._confirmed: tuple | None = None  # the last message but for commands
         self._ended = False
 
     def run(self) -> None:
@@ -69,13 +69,13 @@ class View:
         """Send commands, and confirm the state, if there is anything new."""
         screen = self._screen
         layers = [name for name, shown in screen.layers.shown.items() if shown]
-        told = (self._state["number"], screen.colouring.kind, layers, bool(screen.plots.visible()))
+        shown = (self._state["number"], screen.colouring.kind, layers, bool(screen.plots.visible()))
         waits = self._requests.number - self._state["answered"] >= MAX_UNANSWERED
         commands = [] if waits else self._requests.take()
-        if commands or told != self._told:
+        if commands or shown != self._confirmed:
             names = ("confirmed", "colour", "layers", "plots")
-            self._link.send(dict(zip(names, told)) | {"number": self._requests.number, "commands": commands})
-            self._told = told
+            self._link.send(dict(zip(names, shown)) | {"number": self._requests.number, "commands": commands})
+            self._confirmed = shown
 
 
 def main(socket: int, memory: int) -> None:
