@@ -79,9 +79,9 @@ class Desktop:
         found = [line.split() for line in text[: text.rfind("\n") + 1].splitlines() if line.startswith(key)]
         return found[-1] if found else []
 
-    def drag(self, start, way, hold=0.0):
-        """Press the left button at start, move it in parts, hold it [s]; it stays pressed."""
-        self.tool("xdotool", "mousemove", *map(str, start), "mousedown", "1")
+    def drag(self, start, way, hold=0.0, button=1):
+        """Press a button, by default the left one, at start, move it in parts, hold it [s]; it stays pressed."""
+        self.tool("xdotool", "mousemove", *map(str, start), "mousedown", str(button))
         time.sleep(0.2)
         for _ in range(5):
             time.sleep(0.1)

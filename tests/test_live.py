@@ -1,6 +1,6 @@
 """A simulation that follows the clock and the window's commands, without a window:
 
-* it never runs faster than asked, makes up little of what it misses, and says how slow it is; batches are no longer than a picture;
+* it never runs faster than asked, makes up little of what it misses, and says how slow it is; batches are short;
 * commands are carried out between steps, and a state says which drag a step has used; a failure pauses, a warning is shown;
 * without a drag the states are those of `run`, bit by bit.
 """

@@ -58,8 +58,9 @@ with PrintingSimulator(beam_scene(), dt={dt}, integrator={integrator!r}, draggab
     print("ended", sim.settings.integrator, sim.step_count, np.isfinite(sim.energies().total))
 print("closed")
 """
-SLIDERS = {"dt": 228, "gravity": 251, "young": 274}  # pixels from the top, with one body
-SOLVER, INTEGRATOR, USE = 411, 434, 457  # with a legend: the solver section, its integrator button, and its apply button
+SLIDERS = {"dt": 285, "gravity": 308, "young": 331}  # pixels from the top, with one body
+SOLVER, INTEGRATOR, USE = 491, 514, 537  # with a legend: the solver section, its integrator button, and its apply button
+RIGHT = 430  # of the panel
 TIP = (965, 350)  # initial pixel of the beam's end
 
 
@@ -183,26 +184,40 @@ def test_keys_and_mouse(opened, tmp_path):
         before = steps(desktop)
         press(desktop, key, lambda at=before: steps(desktop) == at + 1, f"single step {k}")
     screen = desktop.picture()
-    mask = body_mask(screen[:, 400:])  # right of the panel
+    mask = body_mask(screen[:, RIGHT:])  # right of the panel
     assert mask.mean() > 0.05, "the beam is visible"
-    assert (screen[60:200, 30:300] > 200).any(), "the panel's text is visible"
+    assert (screen[60:160, 30:300] > 200).any(), "the panel's text is visible"
     desktop.tool("xdotool", "key", "v")
-    desktop.wait_for(lambda: np.abs(desktop.picture()[:, 400:].astype(int) - screen[:, 400:]).max() > 60, "change of colours")
+    desktop.wait_for(lambda: np.abs(desktop.picture()[:, RIGHT:].astype(int) - screen[:, RIGHT:]).max() > 60, "change of colours")
 
     def turn():
-        desktop.drag((900, 650), (-150, 50), 0.3)
+        desktop.drag((1000, 650), (-150, 50), 0.3)
         desktop.tool("xdotool", "mouseup", "1")
 
-    desktop.repeat(turn, lambda: np.mean(body_mask(desktop.picture()[:, 400:]) != mask) > 0.02, "turned view")
+    desktop.repeat(turn, lambda: np.mean(body_mask(desktop.picture()[:, RIGHT:]) != mask) > 0.02, "turned view")
     assert is_paused(desktop)
     plain = desktop.picture()
     desktop.tool("xdotool", "key", "w")
-    desktop.wait_for(lambda: np.mean((plain[:, 400:] > desktop.picture()[:, 400:].astype(int) + 40).any(axis=2)) > 0.003, "wires")
-    press(desktop, "p", lambda: len(list(tmp_path.glob("out/window-1/*.png"))) > 1, "recorded pictures")
+    desktop.wait_for(
+        lambda: np.mean((plain[:, RIGHT:] > desktop.picture()[:, RIGHT:].astype(int) + 40).any(axis=2)) > 0.003, "wires"
+    )
+    press(desktop, "i", lambda: (tmp_path / "out/window-1.png").is_file(), "picture")
+    press(desktop, "p", lambda: len(list(tmp_path.glob("out/window-2/*.png"))) > 1, "recorded pictures")
     desktop.tool("xdotool", "key", "p")
-    assert struct.unpack(">II", (tmp_path / "out/window-1/00000.png").read_bytes()[16:24]) == (1280, 720)
+    assert struct.unpack(">II", (tmp_path / "out/window-2/00000.png").read_bytes()[16:24]) == (1280, 720)
     press(desktop, "g", lambda: n_plots(desktop) == 4, "plots")
+    view = desktop.picture()[400:, RIGHT:1000]
+    desktop.drag((1150, 100), (-100, 50), 0.3)
+    desktop.wait_for(lambda: n_plots(desktop) == 0, "view without plots while it is turned over them")
+    assert np.mean(body_mask(desktop.picture()[400:, RIGHT:1000]) != body_mask(view)) > 0.01, "the view turned"
+    desktop.tool("xdotool", "mouseup", "1")
+    desktop.wait_for(lambda: n_plots(desktop) == 4, "plots again")
     press(desktop, "g", lambda: n_plots(desktop) == 0, "no plots")
+    far = body_mask(desktop.picture()[:, RIGHT:]).mean()
+    desktop.drag((1000, 650), (0, -150), 0.3, button=3)
+    desktop.tool("xdotool", "mouseup", "3")
+    desktop.wait_for(lambda: body_mask(desktop.picture()[:, RIGHT:]).mean() < 0.6 * far, "distant beam")
+    press(desktop, "h", lambda: body_mask(desktop.picture()[:, RIGHT:]).mean() > 0.8 * far, "framed beam")
     press(desktop, "r", lambda: desktop.printed().count("reset") == 1, "restart")
     press(desktop, "space", lambda: not is_paused(desktop), "resumed run")
     choose_the_next_integrator(desktop)
@@ -210,7 +225,7 @@ def test_keys_and_mouse(opened, tmp_path):
         desktop.tool("xdotool", "search", "--name", "taisoft", "windowsize", str(width), str(height))
         before = steps(desktop)
         desktop.wait_for(lambda at=before: steps(desktop) > at + 2, f"steps in a window of {width} x {height}")
-    desktop.wait_for(lambda: body_mask(desktop.picture()[:, 400:]).mean() > 0.03, "beam in a resized window")
+    desktop.wait_for(lambda: body_mask(desktop.picture()[:, RIGHT:]).mean() > 0.03, "beam in a resized window")
     quit_window(desktop)
     assert desktop.last("ended")[1] == "bdf2" and desktop.last("ended")[3] == "True"
 
@@ -277,4 +292,16 @@ def test_dragging_and_sliders(opened):
     desktop.repeat(lambda: click(desktop, 60, SLIDERS["dt"]), lambda: numbers(desktop)[3] < 0.5 * stiff[3], "shorter steps")
     assert numbers(desktop)[-1] == compiled, "nothing is compiled"
     desktop.drag((640, 650), (0, -20))  # closed while a button is pressed
+    quit_window(desktop)
+
+
+@needs_vulkan
+def test_the_view_turns_during_a_step(opened):
+    desktop = opened(step=4.0)
+    before = steps(desktop)
+    desktop.wait_for(lambda: steps(desktop) > before, "beginning of a step")
+    begun, mask = steps(desktop), body_mask(desktop.picture()[:, RIGHT:])
+    desktop.drag((1000, 650), (-150, 50), 0.2)
+    assert np.mean(body_mask(desktop.picture()[:, RIGHT:]) != mask) > 0.02, "turned view"
+    assert steps(desktop) == begun, "during the same step"
     quit_window(desktop)

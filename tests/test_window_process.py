@@ -140,9 +140,7 @@ def test_a_lost_window_is_an_error(simulator, monkeypatch):
 def test_a_run_goes_on_without_a_lost_window(simulator, monkeypatch):
     monkeypatch.setattr("taisoft.view.window.CHILD", program(OPEN + "link.receive(None); sys.exit(3)"))
     window = LiveWindow(simulator, Plots(simulator))
-    with pytest.warns(
-        UserWarning, match="the window is lost: its process ended with exit status 3; the run continues without it"
-    ):
+    with pytest.warns(UserWarning, match="is lost: its process ended with exit status 3; the run continues without it"):
         for index in range(100):
             window.frame(simulator, index)
             if window.closed:
