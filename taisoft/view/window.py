@@ -40,7 +40,8 @@ class WindowProcess:
 
     sim: a Simulator; controls: whether the window changes it, or only shows it; colour, layers, plots: those shown initially;
     fps: of the window's pictures, at most; child: command of the process, if not CHILD.
-    Raises OutputError if a display or a Vulkan driver is missing or the window does not open.
+    closed: whether it is; timing: once its user has closed it, times of its pictures and latencies of drags, see
+    `taisoft.view.timing`. Raises OutputError if a display or a Vulkan driver is missing or the window does not open.
     """
 
     def __init__(
@@ -61,7 +62,7 @@ class WindowProcess:
         self._values, self._colour, self._layers, self._wants_plots = NodalValues(scene.bodies), colour, set(layers), bool(plots)
         self._sent = self._confirmed = self._answered = 0  # numbers of states, and of the last request
         self._requests: list[tuple[int, list]] = []  # not yet returned
-        self.closed = False
+        self.closed, self.timing = False, {}
         self._link, other = Link.pair(n_nodes)
         self._process: subprocess.Popen | None = _spawn(child or CHILD, other.fileno(), self._link.nodes.descriptor)
         other.close()
@@ -114,7 +115,7 @@ class WindowProcess:
         if message is None:
             return False
         if "closed" in message:
-            self.closed = True
+            self.closed, self.timing = True, message
             return False
         self._confirmed = message["confirmed"]
         self._colour, self._layers, self._wants_plots = message["colour"], set(message["layers"]), message["plots"]
