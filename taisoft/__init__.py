@@ -36,6 +36,7 @@ _MODULES = {  # public name -> the module that defines it
     "write_scene": "taisoft.scene.toml_writer",
     "CollisionSettings": "taisoft.scene.collision",
     "Simulator": "taisoft.simulator",
+    "show": "taisoft.view.window",
     "solve_static": "taisoft.static",
     "modes": "taisoft.stability",
     "evaluate_law": "taisoft.fem.laws.evaluate",
