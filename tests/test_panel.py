@@ -145,7 +145,7 @@ def test_a_drag_needs_its_beginning():
         controls.drag([0.0, 5.0, 0.0], 10.0)
         sim.step()
         force, highest = controls.values()["drag"]
-        assert 0.0 < force <= highest and sim.dragged.stiffness == pytest.approx(10.0 * 1000.0 * 9.81 / np.sqrt(3.0))
+        assert 0.0 < force <= 1.000001 * highest and sim.dragged.stiffness == pytest.approx(10.0 * 1000.0 * 9.81 / np.sqrt(3.0))
         controls.release()
         assert sim.dragged is None and controls.values()["drag"] is None
 
