@@ -4,6 +4,7 @@ The result holds: tets; dt [s]; alone, the speed of a run without a window; spee
 longest_step, median and largest wall time of its steps [s]; intervals, times between its pictures [s]; latencies of the drag [s].
 """
 
+import itertools
 import subprocess
 import sys
 import time
@@ -18,13 +19,13 @@ from taisoft.output.camera import Camera
 from taisoft.view.live import LiveRun
 from taisoft.view.picking import pick
 from taisoft.view.plots import Plots
-from taisoft.view.screen import PANEL, SIZE
+from taisoft.view.screen import MESSAGES, PANEL, SIZE
 from taisoft.view.window import WindowProcess
 
 LONGEST = 60.0  # wall time of the run in the window [s]
 DRAGS, PAUSE, PIXELS = 250, 0.02, 4  # movements of the mouse, time between two [s], size
 AWAIT = 1.0  # for keys and the last pictures [s]
-SIDES = np.linspace(0.2, 0.8, 25)  # of the window, where a body is looked for
+SIDES = np.linspace(0.2, 0.8, 37)  # of the window, where a body is looked for
 
 
 class Recorder(Plots):
@@ -54,13 +55,17 @@ def press(key: str, run: LiveRun) -> None:
 
 
 def grip(sim: ts.Simulator) -> tuple[int, int]:
-    """Return the pixel of a body, right of the panel, in the view after framing; the one nearest to the middle of those."""
+    """Return a pixel in the middle of what is visible of a body in the view after framing, beside the panels."""
     camera = Camera.framing(sim.positions(), SIZE)
-    cursors = [(x, y) for x in SIDES for y in SIDES if x > PANEL[0] + PANEL[2] and pick(sim, camera, (x, y), SIZE) is not None]
-    if not cursors:
-        raise ts.SimulationError("no body is visible right of the panel")
-    nearest = min(cursors, key=lambda at: np.linalg.norm(np.array(at) - np.mean(cursors, axis=0)))
-    return round(nearest[0] * SIZE[0]), round((1.0 - nearest[1]) * SIZE[1])
+    hits: dict[int, list[tuple[float, float]]] = {}  # cursors by body
+    for x, y in itertools.product(SIDES, SIDES):
+        if x > PANEL[0] + PANEL[2] and y > 1.0 - MESSAGES[1] and (hit := pick(sim, camera, (x, y), SIZE)) is not None:
+            hits.setdefault(hit.body, []).append((x, y))
+    if not hits:
+        raise ts.SimulationError("no body is visible beside the panels")
+    own = np.array(max(hits.values(), key=len))
+    x, y = own[np.argmin(np.linalg.norm(own - own.mean(axis=0), axis=1))]
+    return round(x * SIZE[0]), round((1.0 - y) * SIZE[1])
 
 
 def mouse(at: tuple[int, int]) -> subprocess.Popen:
