@@ -17,6 +17,7 @@ from taisoft.records import StepReport
 from taisoft.running import timed_advance
 from taisoft.view.controls import Controls
 from taisoft.view.plots import Plots
+from taisoft.view.timing import Note
 
 BATCH = 1.0 / 60.0  # longest wall time of a batch of explicit steps [s]
 ARREARS = 0.05  # of simulated time at unit speed that a simulation makes up [s]
@@ -32,12 +33,12 @@ class LiveRun:
     """Drives sim by the clock and by the window's commands.
 
     window: a `WindowProcess`, or what has its `receive`, `publish` and `closed`; speed: simulated over wall time, infinite for as
-    fast as possible. problem: why the run paused; note: the last action or warning; each a sentence or empty.
+    fast as possible. note: about the start; problem: why the run paused, a sentence or empty.
     """
 
     def __init__(self, sim, window, plots: Plots, paused: bool = False, speed: float = 1.0, note: str = ""):
-        self.sim, self.paused, self.speed, self.note = sim, paused, speed, note
-        self.problem = ""
+        self.sim, self.paused, self.speed = sim, paused, speed
+        self.problem, self._note = "", Note(note)
         self._window, self._plots, self._controls = window, plots, Controls(sim)
         self._last_speed = 1.0  # before it was unbound
         self._compiled = False  # True after a step, since that compiles everything
@@ -107,7 +108,7 @@ class LiveRun:
         self._measured["cost"] = self._measured["cost"] or seconds / (report.steps * self.sim.dt)
         self._plots.take(report, seconds)
         if report.problems:
-            self.note = report.problems[-1]
+            self._note.set(report.problems[-1])
 
     def _start_measuring(self) -> None:
         self._mark = (time.perf_counter(), self.sim.time, self.sim.step_count)
@@ -173,13 +174,13 @@ class LiveRun:
 
     def _on_rebuild(self, integrator: str, contact_solver: str) -> None:
         """Switch the solver; the note is shown while that compiles."""
-        self.note = f"compiling {integrator}, for some seconds"
+        self._note.set(f"compiling {integrator}, for some seconds")
         self._publish(PATIENCE)
         self._changed = True
         try:
-            self.note = self._controls.rebuild(integrator, contact_solver)
+            self._note.set(self._controls.rebuild(integrator, contact_solver))
         except TaisoftError as error:
-            self.note = str(error)
+            self._note.set(str(error))
             return
         self._compiled, self.problem = False, ""
         self._measured["cost"] = 0.0
@@ -199,7 +200,7 @@ class LiveRun:
         before = warnings.showwarning
 
         def show(message, *arguments, **named) -> None:
-            self.note = f"warning: {message}"
+            self._note.set(f"warning: {message}")
             before(message, *arguments, **named)
 
         warnings.showwarning = show
@@ -229,7 +230,7 @@ class LiveRun:
             "paused": self.paused,
             "asked_speed": None if math.isinf(self.speed) else self.speed,
             "status": self._status(),
-            "messages": [text for text in (self.problem, self.note) if text],
+            "messages": [*([self.problem] if self.problem else []), *self._note.shown],
             "drag_done": self._drag_done,
             **self._measured,
         }

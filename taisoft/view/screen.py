@@ -21,7 +21,7 @@ from taisoft.view.panel import Panel, Requests, wrapped
 from taisoft.view.picking import MouseDrag, pick
 from taisoft.view.plots import ENERGIES, PlotChoice
 from taisoft.view.scene_view import IN_FRONT, SceneView
-from taisoft.view.timing import Timing
+from taisoft.view.timing import Note, Timing
 from taisoft.view.window_shadow import ShadowMesh
 
 SIZE = (1280, 720)
@@ -65,7 +65,7 @@ class Screen(SceneView):
         self._folder: Path | None = None  # of pictures while recording
         self._frames = 0
         self._screenshot = False  # requested
-        self._note = ""  # about pictures and camera
+        self._note = Note()  # about pictures and camera
         self._messages: list[str] = []  # those shown
         self._shadow_mesh = ShadowMesh(sim.scene, self.surfaces)
         n_segments, n_decals = self.layers.n_segments + 1, self._shadow_mesh.size
@@ -118,7 +118,7 @@ class Screen(SceneView):
         """Show what the simulation and this window have to say, in a sub-window that is there only then."""
         late = age > LONG and not state.get("paused")
         long_step = [f"the present step has taken {age:.0f} s so far"] if late else []
-        self._messages = [*state["messages"], *([self._note] if self._note else []), *long_step]
+        self._messages = [*state["messages"], *self._note.shown, *long_step]
         if self._messages:
             with gui.sub_window("messages", *MESSAGES) as page:
                 for line in self._messages:
@@ -177,7 +177,7 @@ class Screen(SceneView):
             self._frame(sim, size)
         if "follow" in pressed:
             self._follows, self._centre, self._widest = not self._follows, None, 0.0
-            self._note = "the camera follows the bodies" if self._follows else "the camera stays"
+            self._note.set("the camera follows the bodies" if self._follows else "the camera stays")
         self._screenshot |= "screenshot" in pressed
         if "record" in pressed:
             self._toggle_recording()
@@ -235,23 +235,25 @@ class Screen(SceneView):
                 path = _free_path(".png")
                 make_folder(OUT)
                 write_bytes(path, png_bytes(picture))
-                self._note = f"written: {path}"
+                self._note.set(f"written: {path}")
             if self._folder is not None:
                 write_bytes(self._folder / f"{self._frames:05d}.png", png_bytes(picture))
                 self._frames += 1
-                self._note = f"recording: {self._frames} pictures in {self._folder}"
+                self._note.set(f"recording: {self._frames} pictures in {self._folder}")
         except OutputError as error:
-            self._folder, self._note = None, str(error)
+            self._folder = None
+            self._note.set(str(error))
         self._screenshot = False
 
     def _toggle_recording(self) -> None:
         if self._folder is not None:
-            self._folder, self._note = None, f"recorded {self._frames} pictures in {self._folder}"
+            self._note.set(f"recorded {self._frames} pictures in {self._folder}")
+            self._folder = None
             return
         try:
             self._folder, self._frames = make_folder(_free_path("")), 0
         except OutputError as error:
-            self._note = str(error)
+            self._note.set(str(error))
 
 
 def _free_path(suffix: str) -> Path:

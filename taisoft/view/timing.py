@@ -8,8 +8,25 @@ import time
 from collections import deque
 from statistics import median
 
+NOTE_SECONDS = 10.0  # for which a note is shown
 KEPT = 20000  # pictures and drags
 RECENT = 20  # of them, for the panel
+
+
+class Note:
+    """A sentence about the last action, shown for NOTE_SECONDS."""
+
+    def __init__(self, text: str = ""):
+        self.set(text)
+
+    def set(self, text: str) -> None:
+        """Replace the sentence; an empty one shows nothing."""
+        self._text, self._since = text, time.perf_counter()
+
+    @property
+    def shown(self) -> list[str]:
+        """The sentence, or nothing once its time is over."""
+        return [self._text] if self._text and time.perf_counter() - self._since < NOTE_SECONDS else []
 
 
 class Timing:
