@@ -24,6 +24,7 @@ from taisoft.view.window import WindowProcess
 
 LONGEST = 60.0  # wall time of the run in the window [s]
 DRAGS, PAUSE, PIXELS = 250, 0.02, 4  # movements of the mouse, time between two [s], size
+SEARCH = ("search", "--sync", "--name", "taisoft")
 AWAIT = 1.0  # for keys and the last pictures [s]
 SIDES = np.linspace(0.2, 0.8, 37)  # of the window, where a body is looked for
 
@@ -69,8 +70,8 @@ def grip(sim: ts.Simulator) -> tuple[int, int]:
 
 
 def mouse(at: tuple[int, int]) -> subprocess.Popen:
-    """Drag to and fro from a pixel."""
-    words: list = ["mousemove", *at, "sleep", 0.3, "mousedown", 1, "sleep", 0.3]
+    """Drag a body of a simulation that pauses to and fro from a pixel, and let it run."""
+    words: list = ["mousemove", *at, "sleep", 0.3, "mousedown", 1, "sleep", 0.3, "key", "space"]
     for k in range(DRAGS):
         way = PIXELS if k // 10 % 2 == 0 else -PIXELS
         words += ["mousemove_relative", "--", way, -way, "sleep", PAUSE]
@@ -92,13 +93,15 @@ def main(name: str) -> None:
         recorder = Recorder(sim)
         window = WindowProcess(sim, controls=True)
         try:
+            subprocess.run(["xdotool", *SEARCH, "windowmove", "0", "0", "windowfocus"], check=True, stdout=subprocess.DEVNULL)
             run = LiveRun(sim, window, recorder)
             run.turn()
             begin = time.perf_counter()
             while sim.time < seconds and time.perf_counter() < begin + LONGEST:
                 run.turn()
             speed, steps, end = sim.time / (time.perf_counter() - begin), recorder.steps[1:], time.perf_counter()
-            press("h", run)
+            for key in ("space", "h"):  # bodies that move would be framed otherwise when they are gripped
+                press(key, run)
             moving = mouse(grip(sim))
             while moving.poll() is None:
                 run.turn()

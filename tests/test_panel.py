@@ -77,7 +77,7 @@ def test_sliders_become_commands_and_keep_their_values():
         gui = Gui({"gravity": 3.0, "young": 6.0, "dt": -3.0, "friction": 0.9})
         panel.draw(gui, state_of(controls), False)
         assert gui.labels["young"] == "E 1e+05 Pa" and gui.labels["density"] == "rho 1000 kg/m3"
-        assert gui.labels["gravity"] == "g 9.81 m/s2" and gui.labels["friction"] == "friction 0.20-0.50"
+        assert gui.labels["gravity"] == "g 9.81 m/s2" and gui.labels["friction"] == "mu 0.20-0.50"
         commands = {command[0]: command[1:] for command in requests.take()}
         assert commands["set_gravity"] == [3.0] and commands["set_dt"] == [pytest.approx(1e-3)]
         assert commands["set_number"] == ["young", ["a", "b", "c"], pytest.approx(1.0)]
@@ -90,7 +90,7 @@ def test_sliders_become_commands_and_keep_their_values():
         gui = Gui()
         panel.draw(gui, state_of(controls, answered=1), False)
         assert gui.labels["gravity"] == "g 3 m/s2" and gui.labels["young"] == "E 1e+06 Pa" and requests.take() == []
-        assert gui.labels["friction"] == "friction 0.90" and gui.labels["dt"] == "dt 0.001 s"
+        assert gui.labels["friction"] == "mu 0.90" and gui.labels["dt"] == "dt 0.001 s"
         assert sim.dt == pytest.approx(1e-3) and sim.scene.gravity.tolist() == [0.0, -3.0, 0.0]
         assert all(np.allclose(body.young, 1e6) for body in sim.scene.bodies)
 

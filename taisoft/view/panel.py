@@ -154,7 +154,7 @@ class Panel:
         """Declare a slider that sets the friction of all pairs; it shows the largest one."""
         low, high = f"{min(frictions):.2f}", f"{max(frictions):.2f}"
         present = self._present("friction", max(frictions))
-        label = f"friction {low if low == high else f'{low}-{high}'}"
+        label = f"mu {low if low == high else f'{low}-{high}'}"
         new = self._moved(gui, "friction", label, present, (0.0, max(MAX_FRICTION, present)))
         if new is not None:
             self._requests.add("set_friction", None, new, key="friction")
