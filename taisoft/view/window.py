@@ -6,6 +6,7 @@ computed. The simulation stays in the caller's process, whatever its scene holds
 ends with its caller, however that ends.
 """
 
+import math
 import os
 import signal
 import subprocess
@@ -20,6 +21,7 @@ import taisoft
 from taisoft.errors import OutputError
 from taisoft.frames import dt_sentence, fit_dt
 from taisoft.records import RunReport
+from taisoft.view.annotations import REFRESH
 from taisoft.view.colouring import NodalValues
 from taisoft.view.controls import touching_pairs
 from taisoft.view.ggui import display_missing, vulkan_missing
@@ -61,6 +63,7 @@ class WindowProcess:
         n_nodes = sum(body.n_nodes for body in scene.bodies)
         self._values, self._colour, self._layers, self._wants_plots = NodalValues(scene.bodies), colour, set(layers), bool(plots)
         self._sent = self._confirmed = self._answered = 0  # numbers of states, and of the last request
+        self._history_sent = -math.inf  # wall time
         self._requests: list[tuple[int, list]] = []  # not yet returned
         self.closed, self.timing = False, {}
         self._link, other = Link.pair(n_nodes)
@@ -134,7 +137,10 @@ class WindowProcess:
             self._read(left)
         if not self.ready or self.closed:
             return
-        state = describe_state(sim, self._layers, plots.history if self._wants_plots else None)
+        now, history = time.perf_counter(), None
+        if self._wants_plots and now - self._history_sent >= REFRESH:
+            history, self._history_sent = plots.history, now
+        state = describe_state(sim, self._layers, history)
         self._link.nodes.x[:] = sim.positions()
         if self._colour != "body":
             self._link.nodes.values[:] = self._values(self._colour, sim)
