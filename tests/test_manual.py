@@ -159,7 +159,7 @@ def test_the_page_lists_the_options_of_the_command():
 
 
 def test_the_page_lists_the_keys_of_the_window():
-    rows = re.findall(r"^\| (.*?) +\| (.*?) +\|", section("cli.md", "The live window"), re.MULTILINE)[1:]
+    rows = re.findall(r"^\| (.*?) +\| (.*?) +\|", section("cli.md", "The live window"), re.MULTILINE)[2:]
     assert rows == [*MOUSE, *((key.label, key.text) for key in KEYS)]
     names = [name for key in KEYS for name in key.names]
     assert len(set(names)) == len(names), "each key has one action"
