@@ -45,7 +45,7 @@ ORDER = (
     ("output.appearance", "view.shading"),
     ("view.colouring", "view.raster"),
     ("output.connection_lines",),
-    ("view.connection_layer",),
+    ("view.connection_layer", "view.ground"),
     ("view.scene_view", "view.shadow"),
     (
         *("simulator", "queries", "changes", "energy_check", "frames", "running", "static", "checkpoint", "estimation"),

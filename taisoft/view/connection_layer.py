@@ -22,59 +22,86 @@ MAX_SEGMENTS, MAX_CROSSES, MAX_ARROWS = 400, 150, 40  # segments in all; crosses
 DECAY = 0.99  # factor on the running maxima per picture
 
 
-class ConnectionLayer:
-    """Lines of connections. peak: recent maximum of tensions [N], which scales their colours."""
+class ConnectionMarks:
+    """What is drawn of the connections and pressures of a scene, and their present values.
+
+    attached: (k,) attached nodes; pressed: nodes (k,3) of some triangles under each pressure, and its longest arrow [m].
+    """
 
     def __init__(self, scene, size: float):
         """size: of the scene [m]."""
-        exact = scene.exact_attachments
-        self._lines, self._size, self.peak = None, size, 0.0
+        exact, starts = scene.exact_attachments, scene.first_nodes
+        self._lines = None
         if scene.has_springs:
             self._lines = ConnectionLines(scene, [one for one in scene.connections if one not in exact])
             ends, line = self._lines.segments
             step = -(-len(ends) // MAX_SEGMENTS)
             self._ends, self._line = ends[::step], line[::step]
-        starts, self._attached = scene.first_nodes, np.zeros(0, dtype=np.int64)
         chosen = [starts[one.a] + one.nodes[:: -(-len(one.nodes) // MAX_CROSSES)] for one in scene.attachments]
-        self._attached = np.concatenate([self._attached, *chosen])
+        self.attached = np.concatenate([np.zeros(0, dtype=np.int64), *chosen])
+        self._loads, self.pressed = [], []
+        for body in scene.bodies:
+            keyed = [(load, (body.name, index)) for index, load in enumerate(body.pressures)]
+            for load, key in [*keyed, *((load, load.name) for load in body.cavities)]:
+                corners = body.mesh.surface[load.triangles]
+                extent = np.sort(np.ptp(body.mesh.vertices[np.unique(corners)], axis=0))[1]
+                self._loads.append((load, key))
+                longest = min(PRESSURE_ARROW * size, IN_CHANNEL * float(extent))
+                self.pressed.append((corners[:: -(-len(corners) // MAX_ARROWS)] + starts[body.name], longest))
+
+    def segments(self, sim) -> tuple[np.ndarray, np.ndarray] | None:
+        """Return ends (k,2,3) [m] and tensions (k,) [N] of springs, tendons and attachments by springs; None without any."""
+        if self._lines is None:
+            return None
+        return self._lines.points(sim.positions(), sim.time)[self._ends], self._lines.tensions(sim)[self._line]
+
+    def pressures(self, sim) -> list[float]:
+        """Return the present pressures [Pa], in the order of `pressed`; those of cavities may be found by the simulation."""
+        found = []
+        for load, key in self._loads:
+            if isinstance(load, Cavity):
+                found.append(float(sim.cavity_pressure(key)))
+                continue
+            present = sim.scene.body(key[0]).pressures[key[1]]
+            found.append(float(present.value if present.path is None else present.path(sim.time)))
+        return found
+
+
+class ConnectionLayer:
+    """Lines of connections. marks: `ConnectionMarks`; size: of the scene [m]; peak: recent maximum of tensions [N], which scales
+    their colours."""
+
+    def __init__(self, marks, size: float):
+        self._marks, self._size, self.peak = marks, size, 0.0
 
     def lines(self, sim, x: np.ndarray, camera: Camera) -> list[tuple[np.ndarray, np.ndarray]]:
         """Return ends (2k,3) [m] and colours, one or (2k,3), of parts of the layer. x: (n_nodes,3) [m]."""
-        found = []
-        if self._lines is not None:
-            tension = np.abs(self._lines.tensions(sim))
+        found, segments = [], self._marks.segments(sim)
+        if segments is not None:
+            ends, tension = segments[0], np.abs(segments[1])
             self.peak = max(DECAY * self.peak, float(tension.max(initial=0.0)))
-            colours = colours_of(tension[self._line] / self.peak if self.peak > 0.0 else np.zeros(len(self._line)))
-            ends = self._lines.points(x, sim.time)[self._ends]
+            colours = colours_of(tension / self.peak if self.peak > 0.0 else np.zeros(len(tension)))
             found.append((_bands(ends, camera), np.repeat(np.tile(colours, (len(BAND), 1)), 2, axis=0)))
-        if len(self._attached):
+        if len(self._marks.attached):
             right, up, _ = CROSS * self._size * camera.axes
-            places = x[self._attached]
+            places = x[self._marks.attached]
             strokes = [np.stack([places - s, places + s], axis=1).reshape(-1, 3) for s in (right + up, right - up)]
             found.append((np.concatenate(strokes), ATTACHED_COLOUR))
         return found
 
 
 class PressureLayer:
-    """Arrows of pressures and of the fluid in cavities. peak: recent maximum of pressures [Pa], which scales them."""
+    """Arrows of pressures and of the fluid in cavities. marks: `ConnectionMarks`; peak: recent maximum of pressures [Pa], which
+    scales them."""
 
-    def __init__(self, scene, size: float):
-        """size: of the scene [m]."""
-        starts, self.peak = scene.first_nodes, 0.0
-        self._surfaces = []  # load, its key, nodes (k,3) of some triangles, and the longest arrow [m]
-        for body in scene.bodies:
-            keyed = [(load, (body.name, index)) for index, load in enumerate(body.pressures)]
-            for load, key in [*keyed, *((load, load.name) for load in body.cavities)]:
-                corners = body.mesh.surface[load.triangles]
-                extent = np.sort(np.ptp(body.mesh.vertices[np.unique(corners)], axis=0))[1]
-                chosen = corners[:: -(-len(corners) // MAX_ARROWS)] + starts[body.name]
-                self._surfaces.append((load, key, chosen, min(PRESSURE_ARROW * size, IN_CHANNEL * float(extent))))
+    def __init__(self, marks):
+        self._marks, self.peak = marks, 0.0
 
     def lines(self, sim, x: np.ndarray, camera: Camera) -> list[tuple[np.ndarray, np.ndarray]]:
         """Return ends (2k,3) [m] and the colour of the arrows. x: (n_nodes,3) [m]."""
-        pressures = [self._pressure(sim, load, key) for load, key, *_ in self._surfaces]
+        pressures = self._marks.pressures(sim)
         self.peak, found = max([DECAY * self.peak, *map(abs, pressures)]), []
-        for pressure, (*_, corners, longest) in zip(pressures, self._surfaces):
+        for pressure, (corners, longest) in zip(pressures, self._marks.pressed):
             if pressure == 0.0:
                 continue
             a, b, c = (x[corners[:, k]] for k in range(3))
@@ -85,15 +112,6 @@ class PressureLayer:
             tips = (a + b + c) / 3.0 + (arrow if pressure < 0.0 else 0.0)
             found.append((arrows(tips, arrow, camera), PRESSURE_COLOUR))
         return found
-
-    @staticmethod
-    def _pressure(sim, load, key) -> float:
-        """The present pressure [Pa]; cavities are those of the simulation, whose pressure may be found by it."""
-        if isinstance(load, Cavity):
-            return sim.cavity_pressure(key)
-        name, index = key
-        present = sim.scene.body(name).pressures[index]
-        return float(present.value if present.path is None else present.path(sim.time))
 
 
 def _bands(ends: np.ndarray, camera: Camera) -> np.ndarray:

@@ -36,8 +36,8 @@ def checked_size(size) -> tuple[int, int]:
 class Offscreen(SceneView):
     """Draws a scene's bodies and obstacles as pictures.
 
-    scene, size, camera, colour, layers: as for `SceneView`. The kernels run in the open runtime, or in one of arch cpu that is
-    claimed only while a picture is drawn. Raises OutputError.
+    scene, size, camera, colour, layers, marks: as for `SceneView`. The kernels run in the open runtime, or in one of arch cpu
+    that is claimed only while a picture is drawn. Raises OutputError.
     """
 
     def __init__(
@@ -47,9 +47,10 @@ class Offscreen(SceneView):
         camera: Camera | None = None,
         colour: str = "body",
         layers: tuple[str, ...] = IN_PICTURES,
+        marks=None,
     ):
         self.size = checked_size(size)
-        super().__init__(scene, self.size, camera, colour, layers)
+        super().__init__(scene, self.size, camera, colour, layers, marks=marks)
         self._samples = (self.size[0] * SAMPLES, self.size[1] * SAMPLES)
         self._background = background(self.size)
         self._raster = Raster(self._samples)

@@ -10,6 +10,8 @@ connections. They are moved along their rays towards the eye, so that they cover
 front of their own surface, all others so far that nothing hides them.
 """
 
+from collections.abc import Callable
+
 import numpy as np
 
 from taisoft.errors import OutputError
@@ -19,7 +21,8 @@ from taisoft.output.camera import MAX_WIDENING, Camera, start_positions
 from taisoft.scene.loads import value_at
 from taisoft.scene.obstacles import HalfSpace
 from taisoft.view.colouring import Colouring, lit_colours
-from taisoft.view.connection_layer import ConnectionLayer, PressureLayer, arrows
+from taisoft.view.connection_layer import ConnectionLayer, ConnectionMarks, PressureLayer, arrows
+from taisoft.view.ground import Square
 
 CREASE = 35.0  # [deg] between the normals of neighbouring triangles at rest
 MARKER_COLOUR = np.array([0.20, 0.22, 0.26])  # sRGB
@@ -30,6 +33,7 @@ LAYERS = ("wires", "contacts", "tractions", "pressures", "connections", "fixed_n
 IN_PICTURES = ("pressures", "connections", "fixed_nodes")  # shown by default
 IN_WINDOW = ("tractions", *IN_PICTURES)
 MAX_MARK_LINES = 4000  # largest number of lines of contacts and arrows, besides the wires
+MAX_CONTACTS = MAX_MARK_LINES // 4  # of which lines are drawn
 ON_SURFACE, IN_FRONT = 0.996, 0.1  # fractions of the distance from the eye
 NORMAL, IMPULSE, ARROW = 0.04, 0.15, 0.10  # lengths relative to the scene's size
 MAX_ARROWS = 60  # of one traction
@@ -43,15 +47,24 @@ class SceneView:
 
     scene: read once; size: (width, height) in pixels; camera: fixed if given, else it frames all bodies at the start and moves
     back, never nearer, when a body would leave the picture; colour: of the bodies, one of UNITS; layers: names of visible
-    LAYERS. Raises OutputError for unknown names.
+    LAYERS; values: as for `Colouring`; marks: as for `Layers`. Raises OutputError for unknown names.
     """
 
-    def __init__(self, scene, size: tuple[int, int], camera: Camera | None, colour: str, layers: tuple[str, ...]):
+    def __init__(
+        self,
+        scene,
+        size: tuple[int, int],
+        camera: Camera | None,
+        colour: str,
+        layers: tuple[str, ...],
+        values: Callable | None = None,
+        marks=None,
+    ):
         self.camera = camera or Camera.framing(start_positions(scene), size)
         self._widest = 0.0 if camera else MAX_WIDENING * self.camera.distance  # largest automatic distance [m]; 0: fixed camera
         self.surfaces = Surfaces(scene)
-        self.layers = Layers(scene, layers)
-        self.colouring = Colouring(scene, self.surfaces, colour)
+        self.layers = Layers(scene, layers, marks)
+        self.colouring = Colouring(scene, self.surfaces, colour, values)
 
     def _drawn(self, sim, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray, tuple[np.ndarray, np.ndarray]]:
         """Move the camera back if needed; return vertices and lit colours (n,3), and the lines of the layers."""
@@ -77,7 +90,8 @@ class Surfaces:
             _BodySurface(body, *surface, body_colour(k), scene.constraints(body)) for k, (body, surface) in enumerate(surfaces)
         ]
         self._starts = self._shown.starts[:-1]
-        self._obstacles = [_RigidSurface(surface) for surface in obstacle_surfaces(scene)]
+        fixed = [o.shape for o in scene.obstacles if isinstance(o.shape, HalfSpace) and o.path is None]
+        self._obstacles = [_RigidSurface(surface, fixed) for surface in obstacle_surfaces(scene)]
         nodes = [np.where(body.nodes >= 0, body.nodes + start, -1) for body, start in zip(self._bodies, self._starts)]
         self._nodes = np.concatenate(nodes)  # shown vertices of the drawn ones; -1 for markers
         self.with_markers = True  # of fixed nodes
@@ -88,11 +102,14 @@ class Surfaces:
         self.n_of_bodies = int(firsts[len(self._bodies)])  # drawn vertices of bodies, which come first
         self.body_triangles = np.concatenate([part.own_triangles + n for part, n in zip(self._bodies, firsts)]).astype(np.int32)
         ranges = [slice(*ends) for ends in zip(firsts[len(self._bodies) :], firsts[len(self._bodies) + 1 :])]
-        self._half_spaces = [(at, part.surface) for at, part in zip(ranges, self._obstacles) if part.is_half_space]
+        self._half_spaces = [(at, part) for at, part in zip(ranges, self._obstacles) if part.is_half_space]
 
-    def half_spaces(self, t: float) -> list[tuple[slice, np.ndarray]]:
-        """Return, for every half-space, its range of drawn vertices and the vertices (k,3) [m] of its square at time t [s]."""
-        return [(at, surface.at(t)) for at, surface in self._half_spaces]
+    def half_spaces(self, x: np.ndarray, t: float) -> list[tuple[slice, np.ndarray]]:
+        """Return, for every half-space, its range of drawn vertices and the vertices (k,3) [m] of its square.
+
+        x: (n,3) [m], of which the first are the bodies' drawn vertices; t: time [s].
+        """
+        return [(at, part.at(t, x[: self.n_of_bodies])) for at, part in self._half_spaces]
 
     def coloured(self, colours: np.ndarray) -> np.ndarray:
         """Return colours (n,3) of all drawn vertices, given colours (n_nodes,3) of the bodies' nodes."""
@@ -111,17 +128,18 @@ class Surfaces:
 
         t: time [s]; eye: position (3,) [m], for culling. Raises OutputError if the path of an obstacle fails.
         """
-        return _concatenated([bodies, *(obstacle.vertices(t, eye) for obstacle in self._obstacles)])
+        return _concatenated([bodies, *(obstacle.vertices(t, bodies[0], eye) for obstacle in self._obstacles)])
 
 
 class Layers:
     """Optional layers beside the surfaces.
 
     shown: name -> whether it is visible, initially those in `names`; n_segments: largest number of lines that `lines` returns;
-    peak: recent maximum of impulses [N s], which scales their lines. Raises OutputError for an unknown name.
+    peak: recent maximum of impulses [N s], which scales their lines; marks: `ConnectionMarks`, by default of the scene. Raises
+    OutputError for an unknown name.
     """
 
-    def __init__(self, scene, names: tuple[str, ...] = IN_WINDOW):
+    def __init__(self, scene, names: tuple[str, ...] = IN_WINDOW, marks=None):
         for name in names:
             if name not in LAYERS:
                 raise OutputError(f"layer '{name}' is unknown: it must be one of {', '.join(LAYERS)}")
@@ -131,9 +149,9 @@ class Layers:
         surfaces = zip(self._shown.surfaces, self._shown.starts)
         self._edges = np.concatenate([triangle_edges(triangles)[0] + n for (_, triangles), n in surfaces])
         self.n_segments = len(self._edges) + MAX_MARK_LINES
-        self._size = float(np.linalg.norm(np.ptp(start_positions(scene), axis=0)))
-        self.peak = 0.0
-        self.connections, self.pressures = ConnectionLayer(scene, self._size), PressureLayer(scene, self._size)
+        self._size, self.peak = scene_size(scene), 0.0
+        marks = marks or ConnectionMarks(scene, self._size)
+        self.connections, self.pressures = ConnectionLayer(marks, self._size), PressureLayer(marks)
         self._loaded = [  # per traction, nodes (k,3) of the triangles that get an arrow
             body.mesh.surface[t.triangles[:: -(-len(t.triangles) // MAX_ARROWS)]] + n
             for body, n in zip(scene.bodies, starts)
@@ -162,7 +180,7 @@ class Layers:
     def _contact_lines(self, sim) -> list[tuple[np.ndarray, np.ndarray]]:
         """Return lines of normals with a fixed length, and of impulses relative to the recent maximum."""
         found = sim.contacts()
-        k = slice(0, MAX_MARK_LINES // 4)
+        k = slice(0, MAX_CONTACTS)
         point, normal, impulse = found.point[k], found.normal[k], found.impulse[k]
         self.peak = max(DECAY * self.peak, float(np.linalg.norm(impulse, axis=1).max(initial=0.0)))
         relative = impulse / self.peak if self.peak > 0.0 else 0.0 * impulse
@@ -170,6 +188,11 @@ class Layers:
             (_segments(point, point + NORMAL * self._size * normal), NORMAL_COLOUR),
             (_segments(point, point + IMPULSE * self._size * relative), IMPULSE_COLOUR),
         ]
+
+
+def scene_size(scene) -> float:
+    """Return the diagonal of the bodies' bounding box at the start [m]."""
+    return float(np.linalg.norm(np.ptp(start_positions(scene), axis=0)))
 
 
 def _concatenated(parts: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
@@ -199,16 +222,24 @@ class _BodySurface:
 
 
 class _RigidSurface:
-    """Surface of an obstacle. Triangles share no vertices, so that each can be culled."""
+    """Surface of an obstacle. Triangles share no vertices, so that each can be culled. fixed: half-spaces that do not move."""
 
-    def __init__(self, surface: ObstacleSurface):
-        self.surface, self.is_half_space = surface, isinstance(surface.obstacle.shape, HalfSpace)
+    def __init__(self, surface: ObstacleSurface, fixed: list[HalfSpace]):
+        shape = surface.obstacle.shape
+        self._surface, self.is_half_space = surface, isinstance(shape, HalfSpace)
+        self._square: Square | None = None
+        if self.is_half_space and surface.obstacle.path is None:
+            self._square = Square(shape, surface.vertices, [other for other in fixed if other is not shape])
         self._nodes, self._corners = smoothing_groups(surface.vertices, surface.triangles)
         self.triangles = np.arange(self._corners.size).reshape(-1, 3)
         self.colours = np.tile(OBSTACLE_COLOUR, (self._corners.size, 1))
 
-    def vertices(self, t: float, eye: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        x = self.surface.at(t)[self._nodes]
+    def at(self, t: float, bodies: np.ndarray) -> np.ndarray:
+        """Return the vertices (n,3) [m] at time t [s], with bodies at (m,3) [m]."""
+        return self._surface.at(t) if self._square is None else self._square.below(bodies)
+
+    def vertices(self, t: float, bodies: np.ndarray, eye: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        x = self.at(t, bodies)[self._nodes]
         corners, normals = x[self._corners], vertex_normals(x, self._corners)[self._corners]
         a, b, c = np.moveaxis(corners, 1, 0)
         back_facing = np.einsum("ti,ti->t", np.cross(b - a, c - a), eye - a) <= 0
