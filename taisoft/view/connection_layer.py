@@ -9,7 +9,7 @@ import numpy as np
 
 from taisoft.output.camera import Camera
 from taisoft.output.connection_lines import ConnectionLines
-from taisoft.scene.loads import Cavity
+from taisoft.scene.loads import Cavity, value_at
 from taisoft.view.colouring import colours_of
 
 ATTACHED_COLOUR, PRESSURE_COLOUR = np.array([0.93, 0.50, 0.08]), np.array([0.90, 0.10, 0.55])  # sRGB
@@ -92,8 +92,7 @@ class PressureLayer:
         if isinstance(load, Cavity):
             return sim.cavity_pressure(key)
         name, index = key
-        present = sim.scene.body(name).pressures[index]
-        return float(present.value if present.path is None else present.path(sim.time))
+        return float(value_at(sim.scene.body(name).pressures[index], sim.time, f"body {name!r}: pressure {index}"))
 
 
 def _bands(ends: np.ndarray, camera: Camera) -> np.ndarray:
