@@ -218,14 +218,20 @@ class Multipliers:
         negative = any(one.negative for one in found)
         change = None if negative else self._change(G, y, z, self.effective[chosen] - self.values[chosen], penalty)
         if change is not None:
-            y = y + np.einsum("k,kn->n", change, z)
-            self.slope_change = -float(self._changed @ products(G, y[None])[:, 0])
+            factors, changed = change
+            y = y + np.einsum("k,kn->n", factors, z)
+            self.slope_change = -float(changed @ products(G, y[None])[:, 0])
         w.y.host[...] = y.reshape(-1, 3)
         converged = change is not None and all(one.converged for one in found)
         return pcg.LinearResult(sum(one.iterations for one in found), converged, negative)
 
-    def _change(self, G: np.ndarray, y: np.ndarray, z: np.ndarray, shift: np.ndarray, penalty: np.ndarray) -> np.ndarray | None:
-        """Change the chosen multipliers to reach c = 0 to first order; return the factors s of z. None: singular, no change."""
+    def _change(
+        self, G: np.ndarray, y: np.ndarray, z: np.ndarray, shift: np.ndarray, penalty: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray] | None:
+        """Change the candidates to reach c = 0 to first order. None: singular, no change.
+
+        Return the factors s of z, and the changes of the residual's multipliers.
+        """
         chosen, before = self._candidates, self.effective
         solved = solve_active(
             products(G, z),
@@ -241,8 +247,7 @@ class Multipliers:
         factors, values = solved
         self.values = self.values.copy()
         self.values[chosen] = values
-        self._changed = (self.effective - before)[chosen]
-        return factors
+        return factors, (self.effective - before)[chosen]
 
     def correct(self, system: "StageSystem") -> tuple[int, bool]:
         """Change the multipliers, and v along with them, to reach the volumes and lengths to first order.
@@ -260,7 +265,7 @@ class Multipliers:
         change = self._change(G, np.zeros(G.shape[1]), np.array(z), zero, zero)
         if change is None:
             return n, False
-        upload([(m.state.v, m.state.v.to_numpy() + np.einsum("k,kn->n", change, np.array(z)).reshape(-1, 3))])
+        upload([(m.state.v, m.state.v.to_numpy() + np.einsum("k,kn->n", change[0], np.array(z)).reshape(-1, 3))])
         self.upload(self.values)
         return n, True
 

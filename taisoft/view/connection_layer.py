@@ -9,7 +9,7 @@ import numpy as np
 
 from taisoft.output.camera import Camera
 from taisoft.output.connection_lines import ConnectionLines
-from taisoft.scene.loads import Cavity
+from taisoft.scene.loads import Cavity, value_at
 from taisoft.view.colouring import colours_of
 
 ATTACHED_COLOUR, PRESSURE_COLOUR = np.array([0.93, 0.50, 0.08]), np.array([0.90, 0.10, 0.55])  # sRGB
@@ -62,8 +62,8 @@ class ConnectionMarks:
             if isinstance(load, Cavity):
                 found.append(float(sim.cavity_pressure(key)))
                 continue
-            present = sim.scene.body(key[0]).pressures[key[1]]
-            found.append(float(present.value if present.path is None else present.path(sim.time)))
+            name, index = key
+            found.append(float(value_at(sim.scene.body(name).pressures[index], sim.time, f"body {name!r}: pressure {index}")))
         return found
 
 
