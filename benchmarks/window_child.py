@@ -5,15 +5,16 @@ longest_step, median and largest wall time of its steps [s]; intervals, times be
 """
 
 import itertools
+import json
 import subprocess
 import sys
 import time
+import warnings
 from statistics import median
 
 import numpy as np
 
 import taisoft as ts
-from benchmarks.runner import print_result, without_warnings
 from taisoft.cli.scene_file import load_scene
 from taisoft.output.camera import Camera
 from taisoft.view.live import LiveRun
@@ -78,8 +79,8 @@ def mouse(at: tuple[int, int]) -> subprocess.Popen:
     return subprocess.Popen(["xdotool", *map(str, words), "mouseup", "1"])
 
 
-def main(name: str) -> None:
-    """Measure and print."""
+def measure(name: str) -> dict:
+    """Return the results of a demo."""
     scene, settings = load_scene(name)
     seconds, fps = settings.pop("seconds", 1.0), settings.pop("fps", 60.0)
     with ts.Simulator(scene, draggable=True, **settings) as sim:
@@ -109,20 +110,18 @@ def main(name: str) -> None:
         finally:
             window.close()
     pictures = [t for t in window.timing["pictures"] if begin <= t <= end]
-    print_result(
-        {
-            "tets": sum(len(body.mesh.tets) for body in sim.scene.bodies),
-            "dt": sim.dt,
-            "alone": report.sim_seconds / report.wall_seconds,
-            "speed": speed,
-            "step": median(steps),
-            "longest_step": max(steps),
-            "intervals": np.diff(pictures).tolist(),
-            "latencies": window.timing["latencies"],
-        }
-    )
+    return {
+        "tets": sum(len(body.mesh.tets) for body in sim.scene.bodies),
+        "dt": sim.dt,
+        "alone": report.sim_seconds / report.wall_seconds,
+        "speed": speed,
+        "step": median(steps),
+        "longest_step": max(steps),
+        "intervals": np.diff(pictures).tolist(),
+        "latencies": window.timing["latencies"],
+    }
 
 
 if __name__ == "__main__":
-    with without_warnings():
-        main(sys.argv[1])
+    warnings.simplefilter("ignore", UserWarning)
+    print("result: " + json.dumps(measure(sys.argv[1])), flush=True)

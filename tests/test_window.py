@@ -244,9 +244,8 @@ def n_plots(desktop):
 def choose_the_next_integrator(desktop):
     """Open the solver section of the panel and choose bdf2, which follows implicit_euler; the run continues."""
     desktop.repeat(lambda: hold(desktop, 32, SOLVER), lambda: bright(desktop, INTEGRATOR), "section of the solver")
-    for height in (INTEGRATOR, USE):
-        hold(desktop, 60, height)
-    desktop.wait_for(lambda: desktop.last("rebuilt"), "other integrator")
+    desktop.repeat(lambda: hold(desktop, 60, INTEGRATOR), lambda: bright(desktop, USE), "button that applies the choice")
+    desktop.repeat(lambda: hold(desktop, 60, USE), lambda: desktop.last("rebuilt"), "other integrator")
     _, name, count, same = desktop.last("rebuilt")
     assert name == "bdf2" and same == "same"
     desktop.wait_for(lambda: steps(desktop) > int(count) + 2, "steps after the rebuild")
