@@ -18,6 +18,7 @@ from taisoft.errors import OutputError
 from taisoft.fem.reference import inverse_rest_edges
 from taisoft.output.camera import Camera
 from taisoft.output.nodal_fields import NodalMean, von_mises
+from taisoft.scene.rigid import RigidBody
 
 UNITS = {"body": "", "stress": "Pa", "stretch": "", "speed": "m/s", "error": "m"}
 TITLES = {
@@ -46,6 +47,7 @@ class Colouring:
 
     def __init__(self, scene, surfaces, kind: str = "body"):
         self._bodies, self._surfaces = scene.bodies, surfaces
+        self._rigid = np.concatenate([np.full(body.n_nodes, isinstance(body, RigidBody)) for body in scene.bodies])
         self._has_errors = kind == "error"
         self.choose(kind)
 
@@ -78,7 +80,7 @@ class Colouring:
     def values(self, sim) -> np.ndarray:
         """Return the quantity at the nodes of all bodies (n_nodes,) in sim's present state."""
         if self.kind == "stress":
-            return von_mises(self._mean(sim.stress()))
+            return np.where(self._rigid, np.nan, von_mises(self._mean(sim.stress())))  # a rigid body's tet is not its material
         if self.kind == "error":
             return sim.nodal_errors()
         return self._mean(self._stretches(sim)) if self.kind == "stretch" else np.linalg.norm(sim.velocities(), axis=1)
