@@ -450,6 +450,39 @@ def test_the_frame_vibrates_as_stiffly_as_the_material():
     assert 0.1 * wave < frequencies[6] < 2.0 * wave / SIZE[2]
 
 
+def a_plate_on_a_shaft() -> ts.Scene:
+    """A rigid plate below a soft shaft of hardly any mass, clamped at its upper end."""
+    scene = ts.Scene()
+    shaft = ts.Material(young=1e7, density=1e-3, poisson=0.0)
+    scene.add_rigid_body(box((1.0, 0.1, 1.0)), name="plate", position=(0, -0.05, 0))
+    bar = scene.add_body(box((0.1, 1.0, 0.1), (1, 6, 1)), shaft, name="shaft", position=(0, 0.5, 0), order=2)
+    bar.fix(lambda X: X[:, 1] > 0.499)
+    scene.attach("shaft", lambda X: X[:, 1] < -0.499, "plate")
+    return scene
+
+
+@pytest.mark.parametrize("mass", ["lumped", "consistent"])
+def test_modes_of_a_plate_on_a_shaft(mass):
+    scene = a_plate_on_a_shaft()
+    plate = scene.body("plate")
+    frequencies = modes(scene, 6, mass).frequencies
+    bending = np.sqrt(3 * 1e7 * 0.1**4 / 12 / plate.mass) / (2 * np.pi)  # of a tip mass, above that of one with rotary inertia
+    axial = np.sqrt(1e7 * 0.01 / plate.mass) / (2 * np.pi)
+    torsion = np.sqrt(0.5e7 * 0.1406 * 0.1**4 / plate.inertia[1, 1]) / (2 * np.pi)
+    assert 0.5 * bending < frequencies[0] < bending
+    assert frequencies[2] == pytest.approx(torsion, rel=0.1) and frequencies[5] == pytest.approx(axial, rel=0.02)
+
+
+def test_a_rigid_plate_in_statics_is_as_stiff_as_in_steps():
+    scene = a_plate_on_a_shaft()
+    scene.body("plate").add_force(None, (0, -1e4, 0))
+    result = ts.solve_static(scene)
+    plate = scene.body("plate")
+    assert result.converged and plate.strain(result.positions("plate")) < 1e-5
+    load = plate.mass * G + 1e4
+    assert plate.pose(result.positions("plate")).translation[1] == pytest.approx(-load / (1e7 * 0.01), rel=0.05)
+
+
 def test_nodal_means_reach_the_surface():
     scene = ts.Scene()
     body = scene.add_rigid_body(box())
