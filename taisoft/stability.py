@@ -17,6 +17,7 @@ from taisoft.fem.dependents import DependentTable, dependent_table
 from taisoft.fem.loads import SceneLoads
 from taisoft.fem.spring_table import SpringTable
 from taisoft.fem.springs import spring_table
+from taisoft.scene.rigid import RigidBody
 from taisoft.scene.scene import Body, Scene
 
 MAX_WEIGHT_STRAIN = 0.5  # strain of a body under its own weight above which its scale is questioned
@@ -260,6 +261,7 @@ def modes(scene: Scene, k: int, mass: str = "lumped") -> Modes:
         raise SceneError("the scene holds no body")
     for tendon in [one for one in scene.tendons if one.is_inextensible]:
         raise SceneError(f"modes: tendon {tendon.name!r} has a given length, but no stiffness: give it one")
+    scene = scene.snapshot()  # in which rigid bodies are as stiff as the others ask for
     free = np.concatenate([~constrained_axes(b, prescribed=True, scene=scene) for b in scene.bodies]).reshape(-1)
     dependents = dependent_table(scene)
     T = sp.identity(len(free), format="csr") if dependents is None else sp.kron(dependents.matrix, sp.identity(3), format="csr")
@@ -277,20 +279,30 @@ def modes(scene: Scene, k: int, mass: str = "lumped") -> Modes:
     else:
         scalar = sp.block_diag([reference.consistent_mass(b) for b in scene.bodies])
         M = (T.T @ sp.kron(scalar, sp.identity(3), format="csr") @ T)[free][:, free]
+    noise = _eigenvalue_noise(
+        K, M, np.concatenate([np.full(3 * b.n_nodes, isinstance(b, RigidBody)) for b in scene.bodies])[free]
+    )
     if n_free <= max(200, 2 * k):
         values, vectors = _dense_modes(K, M, k)
     else:
         # shift slightly below 0, so that the matrix of free bodies (K singular) can be factorised too
-        shift = -1e-6 * K.diagonal().max() / M.diagonal().max()
+        shift = -1e3 * noise
         start = np.random.default_rng(0).normal(size=n_free)
         values, vectors = spl.eigsh(K.tocsc(), k=int(k), M=M.tocsc(), sigma=shift, which="LM", v0=start)
     order = np.argsort(values)
     shapes = np.zeros((int(k), free.size))
     shapes[:, free] = vectors[:, order].T
     shapes = shapes @ T.T
-    noise = 1e-9 * K.diagonal().max() / M.diagonal().max()  # eigenvalues of rigid motions are rounding errors of either sign
     eigenvalues = np.where(np.abs(values[order]) < noise, 0.0, values[order])
     return Modes(np.sqrt(np.maximum(eigenvalues, 0.0)) / (2.0 * np.pi), shapes.reshape(int(k), -1, 3))
+
+
+def _eigenvalue_noise(K, M, rigid: np.ndarray) -> float:
+    """Eigenvalue [1/s^2] up to which one counts as rounding error of a rigid motion. rigid: (n,) axes of rigid bodies, which are
+    so stiff that a bound for them like that of the others would hide slow modes."""
+    stiffness, mass = K.diagonal(), M.diagonal()
+    soft = 1e-9 * stiffness[~rigid].max(initial=0.0) / mass.max()
+    return max(soft, 1e-13 * (stiffness[rigid] / mass[rigid]).max(initial=0.0))
 
 
 def _dense_modes(K, M, k: int) -> tuple[np.ndarray, np.ndarray]:

@@ -95,6 +95,7 @@ def solve_static(
     is in use. A solve that does not converge returns converged=False.
     """
     _check(scene, tolerance)
+    scene = scene.snapshot()  # in which rigid bodies are as stiff as the others ask for
     time = checks.number(time, "time")
     kind = open_kind()
     arch = kind[0] if kind is not None and kind[1] == precision else arch

@@ -10,10 +10,15 @@ import taisoft as ts
 from taisoft.mesh.solids import shell_tets
 from taisoft.output.frame_files import body_arrays
 from taisoft.output.nodal_fields import NodalMean
+from taisoft.output.usd import UsdWriter
+from taisoft.output.usd_scene import IMPULSE
 from taisoft.scene import rigid
+from taisoft.scene.fingerprint import scene_digest
 from taisoft.scene.plan import make_plan
 from taisoft.scene.refine import refined, with_order
 from taisoft.stability import modes
+from taisoft.view.colouring import Colouring
+from taisoft.view.scene_view import Surfaces
 
 G = 9.81
 SIZE = (1.0, 0.6, 0.3)
@@ -225,6 +230,33 @@ def test_two_thrown_bodies_keep_their_momentum_in_an_impact():
         assert sim.twist("b").velocity[0] > 0.3
 
 
+@pytest.mark.parametrize("restitution", [0.5, 1.0])
+def test_a_body_at_rest_is_stiff_enough_for_what_hits_it(restitution):
+    scene = ts.Scene(gravity=(0, 0, 0))
+    small = ts.box_mesh(cells=(2, 2, 2), size=(0.1, 0.1, 0.1))
+    scene.add_rigid_body(small, name="a", velocity=(5, 0, 0), restitution=restitution, friction=0.0)
+    scene.add_rigid_body(small, name="b", position=(0.11, 0, 0), density=3000.0, friction=0.0)
+    with ts.Simulator(scene, dt=1 / 240, integrator="implicit_euler", precision="f64") as sim:
+        assert sim.run(seconds=0.05).status == "ok"
+        impulse = (1 + restitution) * 0.75 * 5.0  # of Newton's law, over the mass of a
+        assert sim.twist("a").velocity[0] == pytest.approx(5.0 - impulse, abs=0.02)
+        assert sim.twist("b").velocity[0] == pytest.approx(impulse / 3.0, abs=0.02)
+
+
+def test_a_spring_joins_two_weightless_bodies():
+    scene = ts.Scene(gravity=(0, 0, 0))
+    cube = box((0.2, 0.2, 0.2))
+    a = scene.add_rigid_body(cube, name="a")
+    b = scene.add_rigid_body(cube, name="b", position=(1, 0, 0), density=3000.0)
+    scene.add_spring(("a", (0.1, 0, 0)), ("b", (-0.1, 0, 0)), stiffness=1e4, rest_length=0.7)
+    scene.contact_forces = False
+    frequency = np.sqrt(1e4 * (1 / a.mass + 1 / b.mass))
+    with ts.Simulator(scene, dt=1 / 2000, integrator="implicit_midpoint", precision="f64") as sim:
+        sim.run(seconds=0.05)
+        closer = sim.pose("a").translation[0] - sim.pose("b").translation[0]
+        assert closer == pytest.approx(0.1 * (1 - np.cos(frequency * sim.time)), rel=2e-3)
+
+
 def test_explicit_steps_carry_a_rigid_body_on_the_ground():
     scene = ts.Scene()
     scene.add_rigid_body(box(), name="box", position=(0, 0.301, 0))
@@ -384,6 +416,23 @@ def test_the_stiffness_follows_the_scene_unless_it_is_given():
     assert light.snapshot().body("a").young == pytest.approx(1000.0 * G * 1.0 / 1e-5, rel=1e-9)
 
 
+def test_the_fastest_body_counts_for_all_and_weightless_bodies_are_as_stiff_as_heavy_ones():
+    scene = ts.Scene(gravity=(0, 0, 0))
+    scene.add_rigid_body(box(), name="a")
+    assert scene.snapshot().body("a").young == pytest.approx(1000.0 * G * 1.0 / 1e-5, rel=1e-9)
+    scene.add_body(box(), ts.Material(young=1e4), velocity=(0, 20, 0), position=(0, 5, 0))
+    assert scene.snapshot().body("a").young == pytest.approx(1000.0 * 20.0**2 / 1e-5, rel=1e-9)
+
+
+def test_a_velocity_is_set_without_spin():
+    body = ts.Scene().add_rigid_body(box(), name="r", velocity=(0, 1, 0), angular_velocity=(0, 0, 2), density=777.7)
+    assert body.density == 777.7 and body.start_twist.angular_velocity.tolist() == [0, 0, 2]
+    with pytest.raises(ts.SceneError, match="can only be set to"):
+        body.velocity = np.zeros((12, 3))
+    body.velocity = (3, 0, 0)
+    assert body.start_twist.velocity.tolist() == [3, 0, 0] and body.start_twist.angular_velocity.tolist() == [0, 0, 0]
+
+
 def test_a_scene_without_rigid_bodies_plans_none():
     scene = ts.Scene()
     scene.add_body(box(), ts.Material())
@@ -403,6 +452,39 @@ def test_the_frame_vibrates_as_stiffly_as_the_material():
     assert 0.1 * wave < frequencies[6] < 2.0 * wave / SIZE[2]
 
 
+def a_plate_on_a_shaft() -> ts.Scene:
+    """A rigid plate below a soft shaft of hardly any mass, clamped at its upper end."""
+    scene = ts.Scene()
+    shaft = ts.Material(young=1e7, density=1e-3, poisson=0.0)
+    scene.add_rigid_body(box((1.0, 0.1, 1.0)), name="plate", position=(0, -0.05, 0))
+    bar = scene.add_body(box((0.1, 1.0, 0.1), (1, 6, 1)), shaft, name="shaft", position=(0, 0.5, 0), order=2)
+    bar.fix(lambda X: X[:, 1] > 0.499)
+    scene.attach("shaft", lambda X: X[:, 1] < -0.499, "plate")
+    return scene
+
+
+@pytest.mark.parametrize("mass", ["lumped", "consistent"])
+def test_modes_of_a_plate_on_a_shaft(mass):
+    scene = a_plate_on_a_shaft()
+    plate = scene.body("plate")
+    frequencies = modes(scene, 6, mass).frequencies
+    bending = np.sqrt(3 * 1e7 * 0.1**4 / 12 / plate.mass) / (2 * np.pi)  # of a tip mass, above that of one with rotary inertia
+    axial = np.sqrt(1e7 * 0.01 / plate.mass) / (2 * np.pi)
+    torsion = np.sqrt(0.5e7 * 0.1406 * 0.1**4 / plate.inertia[1, 1]) / (2 * np.pi)
+    assert 0.5 * bending < frequencies[0] < bending
+    assert frequencies[2] == pytest.approx(torsion, rel=0.1) and frequencies[5] == pytest.approx(axial, rel=0.02)
+
+
+def test_a_rigid_plate_in_statics_is_as_stiff_as_in_steps():
+    scene = a_plate_on_a_shaft()
+    scene.body("plate").add_force(None, (0, -1e4, 0))
+    result = ts.solve_static(scene)
+    plate = scene.body("plate")
+    assert result.converged and plate.strain(result.positions("plate")) < 1e-5
+    load = plate.mass * G + 1e4
+    assert plate.pose(result.positions("plate")).translation[1] == pytest.approx(-load / (1e7 * 0.01), rel=0.05)
+
+
 def test_nodal_means_reach_the_surface():
     scene = ts.Scene()
     body = scene.add_rigid_body(box())
@@ -417,6 +499,37 @@ def test_refinement_and_order_leave_rigid_bodies_alone():
     for changed in (refined(scene), with_order(scene, 2)):
         assert isinstance(changed.body("tool"), rigid.RigidBody) and changed.body("tool").n_nodes == scene.body("tool").n_nodes
         assert changed.body("soft").n_nodes > scene.body("soft").n_nodes
+
+
+def a_block_on_a_soft_cube() -> ts.Scene:
+    scene = ts.Scene()
+    scene.add_rigid_body(box((0.5, 0.2, 0.5)), name="block", position=(0, 1.101, 0))
+    soft = ts.box_mesh(cells=(2, 2, 2), size=(1, 1, 1))
+    scene.add_body(soft, ts.Material(young=1e5), name="soft", position=(0, 0.5, 0)).fix(lambda X: X[:, 1] < -0.4)
+    return scene
+
+
+def test_errors_of_another_mesh_are_estimated_beside_rigid_bodies():
+    with ts.Simulator(a_block_on_a_soft_cube(), dt=1 / 100, integrator="implicit_euler", precision="f64") as sim:
+        estimate = sim.run(seconds=0.1, error=True, error_mesh="refined").error_estimate
+        assert 0.0 < estimate.space < 1.0 and set(estimate.bodies) == {"block", "soft"}
+
+
+def test_stress_is_unknown_in_rigid_bodies_and_impulses_are_left_out_of_their_usd(tmp_path):
+    from pxr import Usd, UsdGeom
+
+    with ts.Simulator(a_block_on_a_soft_cube(), dt=1 / 100, integrator="implicit_euler") as sim:
+        sim.run(seconds=0.05)
+        unknown = np.isnan(Colouring(sim.scene, Surfaces(sim.scene), "stress").values(sim))
+        n = sim.scene.body("block").n_nodes
+        assert unknown[:n].all() and not unknown[n:].any()
+        writer = UsdWriter(tmp_path, sim.scene, 60.0)
+        writer.frame(sim, 0)
+        writer.close()
+    stage = Usd.Stage.Open(str(tmp_path / "scene.usdc"))
+    for name, expected in (("soft", True), ("block", False)):
+        primvars = UsdGeom.PrimvarsAPI(stage.GetPrimAtPath(f"/World/{name}/surface"))
+        assert primvars.HasPrimvar(IMPULSE) is expected
 
 
 OPEN = ts.SurfaceMesh(np.eye(3), np.array([[0, 1, 2]]))
@@ -447,11 +560,16 @@ def test_what_a_rigid_body_cannot_do_is_refused():
     scene = ts.Scene()
     body = scene.add_rigid_body(box(), name="r")
     scene.add_body(box(), ts.Material(), name="soft", position=(0, 2, 0))
-    for call in (body.add_traction, body.add_pressure, body.add_cavity, body.embed):
+    for call in (body.add_traction, body.add_pressure, body.add_cavity, body.embed, body.enclosed_volume):
         with pytest.raises(ts.SceneError, match="takes forces only"):
             call([0], 1.0)
-    with pytest.raises(ts.SceneError, match="rotations must be 'xz', not 'x'"):
-        body.fix("y", "x")
+    for rotations in ("x", "xxz", 3):
+        with pytest.raises(ts.SceneError, match=f"rotations must be 'xz', not {rotations!r}"):
+            body.fix("y", rotations)
+    with pytest.raises(ts.SceneError, match="an embedded surface has no distance field"):
+        body.collision = "distance_field"
+    with pytest.raises(ts.SceneError, match=r"^rigid body 'r': the path's translation at t = 0 must have shape"):
+        body.move(lambda t: (1.0, np.eye(3)))
     with pytest.raises(ts.SceneError, match="rigid: attach the other body's nodes to it"):
         scene.attach("r", [0], "soft")
     with pytest.raises(ts.SceneError, match="vertex|node 8 does not exist"):
@@ -529,6 +647,35 @@ def test_scene_files_hold_rigid_bodies(tmp_path):
     palm, other = scene.bodies
     assert palm.mass == pytest.approx(700 * np.prod(SIZE)) and len(palm.forces) == 2 and other.given_young == 1e8
     assert (palm.forces[0].nodes == np.arange(4)).all() and palm.forces[1].nodes.tolist() == [4, 7]
+
+
+def test_written_scenes_read_back_the_same(tmp_path):
+    scene = ts.Scene()
+    spinning = scene.add_rigid_body(box(), name="b", density=0.7, velocity=(0.1, 0, 0), angular_velocity=(0.1, 0.2, 0.3))
+    spinning.add_force([1, 2], np.ones((2, 3)))
+    soft = scene.add_body(box(), ts.Material(), name="soft", position=(0, 2, 0))
+    soft.embed(surface_of(box((0.5, 0.3, 0.2))), contact=True)
+    moved = scene.add_rigid_body(surface_of(box()), name="a", position=(0, 4, 0), young=0.7e8)
+    moved.fix("y")
+    moved.move(ts.KeyFrames([0, 1], [(0, 0, 0), (0.2, 0, 0)]), "xz")
+    slow = scene.add_rigid_body(box(), name="slow", position=(0, 6, 0), angular_velocity=(1, 0, 0))
+    slow.velocity = (0, 1, 0)
+    ts.write_scene(tmp_path / "a.toml", scene)
+    again, _ = ts.read_scene(tmp_path / "a.toml")
+    assert [body.name for body in again.bodies] == ["b", "soft", "a", "slow"]
+    assert scene_digest(again) == scene_digest(scene)
+    turned = ts.Scene()
+    late = turned.add_rigid_body(box(), name="late")
+    late.move(ts.KeyFrames([0, 1], rotations=[(0, 0, 0), (0, 1, 0)]))
+    late.position = (1, 0, 0)
+    with pytest.raises(ts.SceneError, match="rigid body 'late': its position was set after its path"):
+        ts.write_scene(tmp_path / "b.toml", turned)
+
+
+def test_a_body_order_must_name_each_body(tmp_path):
+    for names in ('["palm"]', '["palm", "palm"]', "3"):
+        with pytest.raises(ts.SceneError, match="body_order must list each name"):
+            ts.read_scene(write(tmp_path / "a.toml", f"body_order = {names}\n{SCENE}"))
 
 
 @pytest.mark.parametrize(

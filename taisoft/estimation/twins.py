@@ -14,6 +14,7 @@ from taisoft.dynamics.implicit import DEFAULT_TOLERANCE
 from taisoft.errors import SimulationError, no_memory
 from taisoft.estimation.comparison import shared_nodes
 from taisoft.scene.refine import refined, with_order
+from taisoft.scene.rigid import RigidBody
 from taisoft.scene.scene import Body, Scene
 from taisoft.stability import constrained_axes, stable_dt
 
@@ -85,8 +86,8 @@ def tighter(sim: "Simulator") -> Twin | None:
 def on_mesh(sim: "Simulator", mesh: str | Scene) -> tuple[Twin, list[float | None]]:
     """A twin on another mesh: "refined", "order" (the other order of elements) or the scene itself on another mesh.
 
-    Also return its mesh widths over those of the run, one a body, None where the order differs. Raises SceneError or
-    SimulationError if the twin cannot be made, does not start as the run does, or cannot show a body's error.
+    Also return its mesh widths over those of the run, one a body, None where the order differs and of rigid bodies. Raises
+    SceneError or SimulationError if the twin cannot be made, does not start as the run does, or cannot show a body's error.
     """
     scene = other_mesh(sim, mesh)
     ratios = [_width_ratio(*bodies) for bodies in zip(sim.scene.bodies, scene.bodies)]
@@ -108,8 +109,9 @@ def on_mesh(sim: "Simulator", mesh: str | Scene) -> tuple[Twin, list[float | Non
 
 
 def _width_ratio(own: Body, other: Body) -> float | None:
-    """Mesh width of a body of a twin over that of the run; None if the orders differ. SimulationError if it is near 1."""
-    if own.order != other.order:
+    """Mesh width of a body of a twin over that of the run; None if the orders differ, or the body is rigid. SimulationError if it
+    is near 1."""
+    if own.order != other.order or isinstance(own, RigidBody):
         return None
     ratio = (own.mesh.n_tets / other.mesh.n_tets) ** (1.0 / 3.0)
     if max(ratio, 1.0 / ratio) < MIN_WIDTH_RATIO:

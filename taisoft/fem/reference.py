@@ -21,6 +21,7 @@ import scipy.sparse as sp
 from taisoft.fem.dependents import DependentTable, dependent_table
 from taisoft.mesh import aggregates
 from taisoft.mesh.topology import EDGES
+from taisoft.scene.rigid import RigidBody
 from taisoft.scene.scene import Body, Scene
 
 HRZ_FRACTIONS = {1: (1 / 4, 0.0), 2: (1 / 36, 4 / 27)}  # fraction of a tet's mass at a corner, at a mid-edge node
@@ -133,7 +134,9 @@ def unit_mass(order: int) -> np.ndarray:
 
 
 def consistent_mass(body: Body) -> sp.csr_matrix:
-    """Consistent mass matrix (n,n), the same for each axis: int rho N_a N_b dV [kg]."""
+    """Consistent mass matrix (n,n), the same for each axis: int rho N_a N_b dV [kg]; of a rigid body its four point masses."""
+    if isinstance(body, RigidBody):
+        return sp.diags(lumped_mass(body), format="csr")
     elements = body.nodes.elements
     values = (body.composition.number("density") * body.mesh.volumes)[:, None, None] * unit_mass(body.order)
     rows, columns = np.broadcast_arrays(elements[:, :, None], elements[:, None, :])

@@ -148,7 +148,7 @@ class Body(Guarded):
 
     def _check_collision(self, value) -> str:
         if value == "distance_field" and self.__dict__.get("nodes") is not None and self.nodes.embedded is not None:
-            raise SceneError(f"{self._label()}: collision: a skin that is touched has no distance field")
+            raise SceneError(f"{self._label()}: collision: an embedded surface has no distance field")
         return checks.choice(value, f"{self._label()}: collision", CONTACT_MODES)
 
     position = checks.attribute("position", _check_position, "Initial translation (3,) [m].")

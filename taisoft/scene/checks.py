@@ -68,6 +68,8 @@ def path_value(path: Callable, t: float, what: str, quantity: str, shapes: tuple
     """
     try:
         value = path(t)
+    except SceneError:  # of a path that names itself
+        raise
     except Exception as error:  # a user's function may raise anything
         raise SceneError(f"{what}: the path failed at t = {t:g}: {reason(error)}") from error
     return None if value is None else array(value, f"{what}: the path's {quantity} at t = {t:g}", shapes)

@@ -32,9 +32,10 @@ CORNERS = np.array([(1.0, 1.0, 1.0), (1.0, -1.0, -1.0), (-1.0, 1.0, -1.0), (-1.0
 FRAME = len(CORNERS)  # nodes of the tet, which come before the vertices of the surface
 STRAIN = 1e-5  # largest strain by its own weight, by its spin and of the kinetic energy at the start, for which young is chosen
 STIFFER = 1e3  # times the stiffest soft body's young at least, whose contact pressures seldom exceed a tenth of it
-MIN_YOUNG = 1e6  # [Pa] of a body at rest without weight
+LEAST_GRAVITY = 9.81  # [m/s^2] for which young is chosen where there is less, for the sake of other forces
 FLAT = 1e-9  # smallest over largest standard deviation of a volume that has a thickness
 PAIRS_AT_ONCE = 100_000  # of points and triangles; bounds the memory, about 1 kB each
+ADD_ANOTHER = "add another one by scene.add_rigid_body"
 NO_LOADS = "a rigid body takes forces only, by add_force, and its surface is that of its mesh"
 
 
@@ -43,13 +44,13 @@ class RigidBody(Body):
 
     Its nodes are the four of its tet, then the vertices of its surface in the order given; `select_nodes` and all methods that
     choose nodes count vertices from 0. shape: the mesh that was given; surface: its `SurfaceMesh`. centre: (3,) [m] of mass at
-    rest; inertia: (3,3) [kg m^2] about it. given_young: [Pa], None if it is chosen. start_twist: `Twist` at the start.
+    rest; inertia: (3,3) [kg m^2] about it. given_young: [Pa], None if it is chosen.
     """
 
     extent = "its size"
-    _own = ("centre", "inertia", "shape", "surface", "given_young", "start_twist")
+    _own = ("centre", "inertia", "shape", "surface", "given_young")
     _read_only = Body._read_only | frozenset(_own)
-    _instead = Body._instead | dict.fromkeys((*_own, "material", "young", "density"), "add another one by scene.add_rigid_body")
+    _instead = Body._instead | dict.fromkeys((*_own, "material", "young", "density", "start_twist"), ADD_ANOTHER)
 
     def __init__(
         self,
@@ -66,7 +67,7 @@ class RigidBody(Body):
         """The arguments of `Scene.add_rigid_body`."""
         what = f"rigid body {name!r}"
         self.shape, self.surface = mesh, checked_surface(mesh, what)
-        density = checks.number(density, f"{what}: density", above=0.0, unit="kg/m^3")
+        self._density = checks.number(density, f"{what}: density", above=0.0, unit="kg/m^3")
         volume, self.centre, covariance = volume_moments(self.surface.vertices, self.surface.triangles)
         deviations, axes = np.linalg.eigh(covariance)
         if not deviations[0] > FLAT**2 * deviations[-1]:
@@ -75,59 +76,80 @@ class RigidBody(Body):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # a thin body has a thin tet
             frame = TetMesh(self.centre + CORNERS @ root, np.arange(FRAME)[None])
-        self.inertia = density * volume * (np.trace(covariance) * np.eye(3) - covariance)
+        self.inertia = self._density * volume * (np.trace(covariance) * np.eye(3) - covariance)
         # of the material, over that of the tet: both have the same mass and the same energy of a strain
         self._concentration = volume / float(frame.volumes.sum())
         self.given_young = None if young is None else checks.number(young, f"{what}: young", above=0.0, unit="Pa")
-        made = self._material("st_venant_kirchhoff", self.given_young or MIN_YOUNG, density, friction, restitution)
+        self._young = self.given_young or self._young_for(LEAST_GRAVITY, 0.0)
+        made = self._material("st_venant_kirchhoff", friction, restitution)
         super().__init__(name, frame, made, position, (0.0, 0.0, 0.0), 1, None, "proximity")
         local = np.linalg.solve(root, (self.surface.vertices - self.centre).T).T
         weights = sp.csr_matrix(0.25 * (1.0 + local @ CORNERS.T))
         with thawed(self):
             self.nodes = mesh_nodes.embed(self.nodes, self.surface.vertices, self.surface.triangles, weights)
-        linear = checks.array(velocity, f"{what}: velocity", ((3,),))
-        angular = checks.array(angular_velocity, f"{what}: angular_velocity", ((3,),))
-        self.velocity = linear + np.cross(angular, self.rest_positions - self.centre)
-        self.start_twist = Twist(linear, angular)
+        given = {"velocity": velocity, "angular_velocity": angular_velocity}
+        linear, spin = (checks.array(value, f"{what}: {key}", ((3,),)) for key, value in given.items())
+        self._given_twist = Twist(linear, spin)
+        self.velocity = self._velocities(linear, spin) if spin.any() else linear
         self._seal(RigidBody.__init__)
 
     def _label(self) -> str:
         return f"rigid body {self.name!r}"
 
-    def _material(self, law: str, young: float, density: float, friction: float, restitution: float, damping=0.0) -> Material:
-        """Return the material of the tet. young, density: of the body; damping: of its stiffness [s]."""
-        factor = self._concentration
-        return Material(law, factor * young, 0.0, factor * density, friction, restitution, 0.0, damping)
+    def _check_velocity(self, value) -> np.ndarray:
+        velocity = super()._check_velocity(value)
+        if velocity.ndim == 2 and not np.array_equal(velocity, self._velocities(*self._given_twist)):
+            raise SceneError(f"{self._label()}: velocity can only be set to (3,), without spin: else {ADD_ANOTHER}")
+        return velocity
 
-    def stiffen(self, gravity: np.ndarray, soft: list[Body], attached: list[Body]) -> None:
+    velocity = checks.attribute("velocity", _check_velocity, "Initial velocity [m/s]: (3,) without spin, else (n,3).")
+
+    def _velocities(self, linear: np.ndarray, angular: np.ndarray) -> np.ndarray:
+        return linear + np.cross(angular, self.rest_positions - self.centre)
+
+    def _material(self, law: str, friction: float, restitution: float, damping: float = 0.0) -> Material:
+        """Return the material of the tet. damping: of its stiffness [s]."""
+        factor = self._concentration
+        return Material(law, factor * self._young, 0.0, factor * self._density, friction, restitution, 0.0, damping)
+
+    def _young_for(self, gravity: float, speed: float) -> float:
+        """Young's modulus [Pa] with which weight by `gravity` [m/s^2] and impacts at `speed` [m/s] strain the body little."""
+        size = float(np.ptp(self.surface.vertices, axis=0).max())
+        return self._density * max(gravity * size, speed**2) / STRAIN
+
+    def stiffen(self, gravity: np.ndarray, bodies: list[Body], attached: list[Body]) -> None:
         """Choose the law, the stiffness damping and, unless it was given, young for a scene.
 
-        gravity: (3,) [m/s^2]. soft: the soft bodies; attached: those with nodes attached to this one exactly, whose stiffness
-        damping must be its own, since forces on these nodes act on its nodes. It damps no rigid motion.
+        gravity: (3,) [m/s^2]. bodies: all of the scene, of which each may hit this one; attached: those with nodes attached to
+        this one exactly, whose stiffness damping must be its own, since forces on these nodes act on its nodes. It damps no
+        rigid motion.
         """
-        old = self.composition.first
+        old, soft = self.composition.first, [body for body in bodies if not isinstance(body, RigidBody)]
         law = soft[0].composition.laws[0] if soft else old.law  # each further law is compiled
-        young = self.young
-        if self.given_young is None:
-            size = float(np.ptp(self.surface.vertices, axis=0).max())
-            speed, spin = (float(np.linalg.norm(part)) for part in self.start_twist)
-            energies = float(np.linalg.norm(gravity)) * size, (spin * size) ** 2, speed**2
-            stiffest = max((float(np.max(body.young)) for body in soft), default=0.0)
-            young = max(self.density * max(energies) / STRAIN, STIFFER * stiffest, MIN_YOUNG)
         damping = max((body.composition.first.stiffness_damping for body in attached), default=0.0)
-        made = self._material(law, young, self.density, old.friction, old.restitution, damping)
         with thawed(self):
+            if self.given_young is None:
+                speed = max(float(np.linalg.norm(np.atleast_2d(body.velocity), axis=1).max()) for body in bodies)
+                stiffest = max((float(np.max(body.young)) for body in soft), default=0.0)
+                needed = self._young_for(max(float(np.linalg.norm(gravity)), LEAST_GRAVITY), speed)
+                self._young = max(needed, STIFFER * stiffest)
+            made = self._material(law, old.friction, old.restitution, damping)
             self.composition = compose(self._label(), self.mesh, made)
 
     @property
     def young(self) -> float:
         """Young's modulus [Pa] of the body, as if its volume were elastic; chosen by the Simulator unless it was given."""
-        return self.composition.first.young / self._concentration
+        return self._young
 
     @property
     def density(self) -> float:
         """Density [kg/m^3]."""
-        return self.composition.first.density / self._concentration
+        return self._density
+
+    @property
+    def start_twist(self) -> "Twist":
+        """Velocity [m/s] and angular velocity [rad/s] at the start."""
+        return self._given_twist if self.velocity.ndim == 2 else Twist(self.velocity, np.zeros(3))
 
     @property
     def selectable(self) -> slice:
@@ -180,7 +202,7 @@ class RigidBody(Body):
         what = f"{self._label()}: fix"
         mask = checks.axes(axes, what)
         held = "".join(axis for k, axis in enumerate("xyz") if np.delete(mask, k).any())
-        if rotations is not None and set(rotations) != set(held):
+        if rotations is not None and (not isinstance(rotations, str) or sorted(rotations) != list(held)):
             raise SceneError(
                 f"{what}: with axes {axes!r} the rotations must be {held!r}, not {rotations!r}: a point is held by "
                 "scene.attach with a stiffness, and the body then turns about it"
@@ -214,7 +236,7 @@ class RigidBody(Body):
     def _refuse(self, *_, **__) -> None:
         raise SceneError(f"{self._label()}: {NO_LOADS}")
 
-    add_traction = add_pressure = add_cavity = embed = _refuse
+    add_traction = add_pressure = add_cavity = enclosed_volume = embed = _refuse
 
 
 class Pose(NamedTuple):

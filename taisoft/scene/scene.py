@@ -116,10 +116,9 @@ class Scene(Guarded):
         copied = copy.copy(self)
         with thawed(copied):
             copied.bodies, copied._start = [copy.copy(body) for body in self.bodies], start
-        soft = [body for body in copied.bodies if not isinstance(body, RigidBody)]
         for body in copied.rigid_bodies:
             attached = [copied.body(one.a) for one in copied.exact_attachments if one.b == body.name]
-            body.stiffen(copied.gravity, soft, attached)
+            body.stiffen(copied.gravity, copied.bodies, attached)
         return copied
 
     @property
@@ -246,8 +245,8 @@ class Scene(Guarded):
 
         mesh: its shape at rest, a closed surface or tets, of which only the surface counts. density: [kg/m^3]. name: unique;
         "rigid0" and so on by default. position: (3,) [m], initial translation. velocity: (3,) [m/s] of its centre;
-        angular_velocity: (3,) [rad/s]. young: [Pa], how stiff it is; by default so stiff that its weight, its spin, its speed at
-        the start and soft bodies strain it by far less than 1e-4, see `sim.rigid_strain`. Raises SceneError.
+        angular_velocity: (3,) [rad/s]. young: [Pa], how stiff it is; by default so stiff that its weight, its spin, impacts at
+        the largest speed at the start and soft bodies hardly strain it, see `sim.rigid_strain`. Raises SceneError.
         """
         self._check_open("add_rigid_body")
         name = self._free_name(name, "rigid")

@@ -1,6 +1,7 @@
 """Read a scene file in TOML: return a Scene and its `solver` dict. Files hold data only; nothing in them is executed.
 
     gravity, allow_initial_overlap, contact_forces
+    body_order                names of bodies and rigid bodies, in which nodes are numbered; by default bodies come first
     [collision]               CollisionSettings
     [solver]                  arguments of Simulator, seconds, fps; "none" for Python's None
     [materials.NAME]          Material
@@ -60,6 +61,7 @@ ON_TRIANGLES = ("traction", "pressure", "cavity")  # methods that choose surface
 SCENE_KEYS = ("gravity", "allow_initial_overlap", "contact_forces")  # attributes of a Scene at top level
 TOP_KEYS = [
     *SCENE_KEYS,
+    "body_order",
     "collision",
     "solver",
     "materials",
@@ -125,6 +127,11 @@ def _read(tables: Table, allow_outside: bool) -> tuple[Scene, dict]:
             skin.make(body.embed, f"body {name!r}: embed: ", keys=["contact"], surface=surface)
     for name in rigid.known:
         add_rigid_body(scene, name, rigid, selection, allow_outside)
+    if "body_order" in tables:
+        order = tables.values["body_order"]
+        if not isinstance(order, list) or sorted(map(str, order)) != sorted([*bodies.known, *rigid.known]):
+            raise tables.error("body_order", "must list each name of bodies and rigid_bodies once")
+        scene.bodies.sort(key=lambda body: order.index(body.name))
     obstacles = tables.named("obstacles")
     for name in obstacles.known:
         _add_obstacle(scene, name, obstacles)

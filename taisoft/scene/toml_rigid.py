@@ -55,7 +55,10 @@ def rigid_table(body: RigidBody, file_of: Callable[[TetMesh], dict], fields: Cal
         axes = {"axes": "".join(np.array(list("xyz"))[c.axes])}
         if c.path is None:
             table["fix"].append(axes)
-        elif isinstance(c.path, NodePath) and np.array_equal(c.path.starts, body.mesh.vertices + body.position):
+        elif isinstance(c.path, NodePath):
+            own = np.array_equal(c.path.starts, body.mesh.vertices + body.position)
+            if not own and c.path.frames.rotations is not None:  # without rotations the start does not matter
+                raise SceneError(f"rigid body {body.name!r}: its position was set after its path with rotations: move it again")
             table["move"].append(axes | {"path": fields(c.path.frames)})
         else:
             raise SceneError(f"rigid body {body.name!r}: moves along a function, which a file cannot store: use ts.KeyFrames")

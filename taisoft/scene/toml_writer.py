@@ -93,8 +93,10 @@ def _document(scene: Scene, solver: dict, stem: str, meshes: dict[str, TetMesh])
         names = [order[pair[0]], order[pair[-1]]]
         numbers = zip(SURFACE_KEYS, scene.contact_pairs[frozenset(names)])
         contacts.append({"between": names} | {key: value for key, value in numbers if value is not None})
+    read = [body.name for body in (*elastic, *scene.rigid_bodies)]  # in the order in which `read_scene` adds them
     return {
         **{key: getattr(scene, key) for key in SCENE_KEYS},
+        **({"body_order": order[: len(read)]} if read != order[: len(read)] else {}),
         "collision": _fields(scene.collision),
         "solver": _solver(solver),
         "materials": {name: _fields(material) for material, name in materials.items()},

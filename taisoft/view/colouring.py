@@ -19,6 +19,7 @@ from taisoft.errors import OutputError
 from taisoft.fem.reference import inverse_rest_edges
 from taisoft.output.camera import Camera
 from taisoft.output.nodal_fields import NodalMean, von_mises
+from taisoft.scene.rigid import RigidBody
 
 UNITS = {"body": "", "stress": "Pa", "stretch": "", "speed": "m/s", "error": "m"}
 TITLES = {
@@ -54,11 +55,12 @@ class NodalValues:
 
     def __init__(self, bodies):
         self._bodies = bodies
+        self._rigid = np.concatenate([np.full(body.n_nodes, isinstance(body, RigidBody)) for body in bodies])
 
     def __call__(self, kind: str, sim) -> np.ndarray:
         """Return the quantity, one of UNITS but "body", at all nodes (n_nodes,) in sim's present state."""
         if kind == "stress":
-            return von_mises(self._mean(sim.stress()))
+            return np.where(self._rigid, np.nan, von_mises(self._mean(sim.stress())))  # a rigid body's tet is not its material
         if kind == "error":
             return sim.nodal_errors()
         return self._mean(self._stretches(sim)) if kind == "stretch" else np.linalg.norm(sim.velocities(), axis=1)
