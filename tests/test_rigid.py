@@ -17,8 +17,7 @@ from taisoft.scene.fingerprint import scene_digest
 from taisoft.scene.plan import make_plan
 from taisoft.scene.refine import refined, with_order
 from taisoft.stability import modes
-from taisoft.view.colouring import Colouring
-from taisoft.view.scene_view import Surfaces
+from taisoft.view.colouring import NodalValues
 
 G = 9.81
 SIZE = (1.0, 0.6, 0.3)
@@ -520,7 +519,7 @@ def test_stress_is_unknown_in_rigid_bodies_and_impulses_are_left_out_of_their_us
 
     with ts.Simulator(a_block_on_a_soft_cube(), dt=1 / 100, integrator="implicit_euler") as sim:
         sim.run(seconds=0.05)
-        unknown = np.isnan(Colouring(sim.scene, Surfaces(sim.scene), "stress").values(sim))
+        unknown = np.isnan(NodalValues(sim.scene.bodies)("stress", sim))
         n = sim.scene.body("block").n_nodes
         assert unknown[:n].all() and not unknown[n:].any()
         writer = UsdWriter(tmp_path, sim.scene, 60.0)
