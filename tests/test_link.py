@@ -102,7 +102,8 @@ def test_a_mirror_is_drawn_like_the_simulation():
 
 def test_only_what_is_shown_travels():
     sim = FakeSimulator(moving_scene())
-    assert {"contacts", "tractions", "history"}.isdisjoint(describe_state(sim, set(), None))
+    state = describe_state(sim, set(), None)
+    assert {"contacts", "history"}.isdisjoint(state) and state["tractions"] == []
     history = History()
     history.start(sim)
     state = decode(encode(describe_state(sim, {"tractions"}, history) | {"colour": "body"}))
@@ -110,3 +111,12 @@ def test_only_what_is_shown_travels():
     mirror.take(state, sim.positions(), np.zeros(0))
     assert np.array_equal(mirror.history.high, history.high, equal_nan=True) and mirror.nodal_values is None
     assert state["tractions"][0].tolist() == [0.0, 0.0, 50.0]
+
+
+def test_a_path_that_fails_is_an_output_error():
+    sim = FakeSimulator(moving_scene())
+    sim.scene.add_obstacle(ts.Sphere((9, 0, 0), 0.1), name="late", path=lambda t: ((1.0 / (1.0 - t), 0, 0), np.eye(3)))
+    describe_state(sim, set(), None)
+    sim.time = 1.0
+    with pytest.raises(ts.OutputError, match="the window cannot show the scene: obstacle 'late': the path must give"):
+        describe_state(sim, set(), None)
