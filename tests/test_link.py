@@ -109,7 +109,8 @@ def test_a_mirror_is_drawn_like_the_simulation():
 
 def test_only_what_is_shown_travels():
     sim = FakeSimulator(moving_scene())
-    assert {"contacts", "tractions", "history"}.isdisjoint(describe_state(sim, marks_of(sim.scene), set(), None))
+    state = describe_state(sim, marks_of(sim.scene), set(), None)
+    assert {"contacts", "history"}.isdisjoint(state) and state["tractions"] == []
     history = History()
     history.start(sim)
     state = decode(encode(describe_state(sim, marks_of(sim.scene), {"tractions"}, history) | {"colour": "body"}))
@@ -142,3 +143,12 @@ def test_connections_pressures_skins_and_rigid_bodies_travel():
         seen = Offscreen(mirror.scene, (320, 180), layers=layers, marks=mirror.marks).image(mirror)
         without = Offscreen(mirror.scene, (320, 180), layers=("wires",), marks=mirror.marks).image(mirror)
         assert np.array_equal(own, seen) and not np.array_equal(seen, without)
+
+
+def test_a_path_that_fails_is_an_output_error():
+    sim = FakeSimulator(moving_scene())
+    sim.scene.add_obstacle(ts.Sphere((9, 0, 0), 0.1), name="late", path=lambda t: ((1.0 / (1.0 - t), 0, 0), np.eye(3)))
+    describe_state(sim, marks_of(sim.scene), set(), None)
+    sim.time = 1.0
+    with pytest.raises(ts.OutputError, match="the window cannot show the scene: obstacle 'late': the path must give"):
+        describe_state(sim, marks_of(sim.scene), set(), None)

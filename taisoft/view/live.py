@@ -12,7 +12,7 @@ import warnings
 from contextlib import contextmanager
 from functools import partial
 
-from taisoft.errors import SceneError, SimulationError, TaisoftError
+from taisoft.errors import SimulationError, TaisoftError
 from taisoft.records import StepReport
 from taisoft.running import timed_advance
 from taisoft.view.controls import Controls
@@ -216,11 +216,7 @@ class LiveRun:
         due = self._changed or time.perf_counter() - self._published > REPEAT
         if not due or not (self._window.ready or patience):
             return
-        try:
-            self._window.publish(self.sim, self._plots, self.panel_state(), patience)
-        except SceneError as error:  # a path fails
-            self.problem, self.paused = str(error), True
-            return
+        self._window.publish(self.sim, self._plots, self.panel_state(), patience)
         self._published, self._changed = time.perf_counter(), False
 
     def panel_state(self) -> dict:

@@ -11,6 +11,7 @@ from types import SimpleNamespace
 import numpy as np
 import scipy.sparse as sp
 
+from taisoft.errors import OutputError, SceneError, SimulationError
 from taisoft.records import Energies
 from taisoft.scene.loads import value_at
 from taisoft.scene.obstacles import Box, Capsule, HalfSpace, MeshObstacle, Obstacle, Sphere
@@ -100,25 +101,32 @@ class MirrorScene:
 def describe_state(sim, marks: ConnectionMarks, layers: set[str], history: History | None) -> dict:
     """Return what the view needs of sim's present state besides positions and nodal values.
 
-    marks: as for `describe_scene`; layers: those that are visible; history: for plots, if they are. Raises SceneError or
-    SimulationError if a path fails.
+    marks: as for `describe_scene`; layers: those that are visible; history: for plots, if they are. Raises OutputError if a path
+    fails.
     """
+    try:
+        poses = {o.name: o.pose(sim.time) for o in sim.scene.obstacles if o.path is not None}
+        loads = [(t, body.name) for body in sim.scene.bodies for t in body.tractions if "tractions" in layers]
+        tractions = [value_at(t, sim.time, name) for t, name in loads]
+        segments = marks.segments(sim) if "connections" in layers else None
+        pressures = marks.pressures(sim) if "pressures" in layers else []
+    except (SceneError, SimulationError) as error:
+        raise OutputError(f"the window cannot show the scene: {error}") from error
     energies = sim.energies()
     state = {
         "time": sim.time,
         "step_count": sim.step_count,
         "energies": [float(getattr(energies, name)) for name in ENERGIES],
-        "poses": {o.name: o.pose(sim.time) for o in sim.scene.obstacles if o.path is not None},
+        "poses": poses,
+        "tractions": tractions,
     }
-    if "tractions" in layers:
-        state["tractions"] = [value_at(t, sim.time, body.name) for body in sim.scene.bodies for t in body.tractions]
     if "contacts" in layers:
         found, k = sim.contacts(), slice(0, MAX_CONTACTS)
         state["contacts"] = {name: getattr(found, name)[k] for name in ("point", "normal", "impulse")}
-    if "connections" in layers and (segments := marks.segments(sim)) is not None:
+    if segments is not None:
         state["segments"] = dict(zip(("ends", "tensions"), segments))
     if "pressures" in layers:
-        state["pressures"] = marks.pressures(sim)
+        state["pressures"] = pressures
     if history is not None:
         state["history"] = {name: getattr(history, name) for name in ("times", "low", "high", "last", "begin")}
     return state
@@ -169,7 +177,7 @@ class MirrorSimulation:
         self._energies, self._x = Energies(*state["energies"]), x.copy()
         self.scene.poses.update(state["poses"])
         tractions = [t for body in self.scene.bodies for t in body.tractions]
-        for traction, value in zip(tractions, state.get("tractions", ())):
+        for traction, value in zip(tractions, state["tractions"]):
             traction.value = value
         self._contacts = state.get("contacts")
         self.marks.take(state)

@@ -132,7 +132,7 @@ class WindowProcess:
         """Send sim's present state, unless the window does not take the previous one within a time [s].
 
         shown: what else the window shows, see `LiveRun.panel_state`.
-        Raises SceneError if a path fails, OutputError as `receive`.
+        Raises OutputError as `receive`, and if a path fails.
         """
         end = time.perf_counter() + patience
         while not self.ready and not self.closed and (left := end - time.perf_counter()) > 0.0:
