@@ -14,6 +14,7 @@ from taisoft.scene import rigid
 from taisoft.scene.fingerprint import scene_digest
 from taisoft.scene.plan import make_plan
 from taisoft.scene.refine import refined, with_order
+from taisoft.settings import plan_of
 from taisoft.stability import modes
 from taisoft.view.colouring import Colouring
 from taisoft.view.scene_view import Surfaces
@@ -599,6 +600,29 @@ def test_a_checkpoint_continues_bitwise(tmp_path):
     with ts.Simulator.load_checkpoint(tmp_path / "c.npz", scene.snapshot()) as sim:
         sim.run(seconds=0.1)
         assert np.array_equal(sim.positions(), expected) and np.array_equal(sim.contact_force("tool"), force)
+
+
+@pytest.mark.parametrize("given", ["the scene", "a copy of the scene"])
+def test_a_checkpoint_beside_soft_bodies_continues_bitwise_with_changed_numbers(tmp_path, given):
+    scene = a_block_on_a_soft_cube()
+    with ts.Simulator(scene, dt=1 / 200, integrator="bdf2") as sim:
+        young = sim.scene.body("block").young
+        sim.run(seconds=0.05)
+        sim.set_material("soft", young=1e7)
+        sim.set_gravity((0, -30.0, 0))
+        sim.run(seconds=0.05)
+        sim.save_checkpoint(tmp_path / "c.npz")
+        sim.run(seconds=0.05)
+        expected = sim.positions()
+    with ts.Simulator.load_checkpoint(tmp_path / "c.npz", scene if given == "the scene" else scene.snapshot()) as sim:
+        assert sim.scene.body("block").young == young
+        sim.run(seconds=0.05)
+        assert np.array_equal(sim.positions(), expected)
+
+
+def test_the_plan_names_the_laws_that_are_used():
+    plan = plan_of(a_block_on_a_soft_cube(), "bdf2", False, False)
+    assert plan.on["law:stable_neo_hookean"] and not plan.on["law:st_venant_kirchhoff"]
 
 
 SCENE = """
