@@ -31,7 +31,7 @@ figures: $(READY)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev,peers]'
 	$(BIN)/taisoft bench figures
 
-# Runs every example of the manual, then builds it; any warning is an error.
+# Runs every example of the manual, then builds it, which runs its notebooks; any warning is an error.
 docs: $(DOCS_READY)
 	$(BIN)/python -m pytest -q -p no:cacheprovider -p no:warnings docs
 	$(BIN)/sphinx-build -q -n -W --keep-going docs out/docs

@@ -34,6 +34,7 @@ WRITES = {
     "report": ("folder",),
     "startup": ("json",),
     "pictures": ("json",),
+    "window": ("json",),
 }
 OPTIONS = {"json": ("--out", ".json"), "png": ("--plot", ".png"), "folder": ("--out", "")}
 NO_QUICK = ("references",)

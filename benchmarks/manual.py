@@ -17,6 +17,7 @@ from statistics import median
 from taisoft.errors import OutputError
 from taisoft.files import write_bytes
 from taisoft.output.tables import markdown
+from taisoft.view.keys import KEYS, MOUSE
 
 from .document import RESULTS, table
 from .error import Row as ErrorRow
@@ -34,6 +35,7 @@ from .runner import make_parser
 from .tolerance import Fixed
 from .tolerance import Row as ToleranceRow
 from .tolerance import row_table as tolerance_table
+from .window import window_table
 from .works.table import compare_table
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
@@ -233,6 +235,18 @@ def tolerance(results: Path) -> str:
     return tolerance_table(rows) + measured_on(numbers)
 
 
+def window(results: Path) -> str:
+    """Speed, pictures per second and latency of drags in the live window."""
+    numbers = newest(results, "window")
+    return window_table(numbers["rows"]) + measured_on(numbers)
+
+
+def window_keys(_results: Path) -> str:
+    """Keys and mouse buttons of the live window, from its own table."""
+    rows = [*MOUSE, *((key.label, key.text) for key in KEYS)]
+    return markdown(("key or button", "action"), rows, left=(0, 1))
+
+
 TABLES: dict[str, Callable[[Path], str]] = {  # by marker
     "order_errors": order_errors,
     "order_times": order_times,
@@ -246,6 +260,8 @@ TABLES: dict[str, Callable[[Path], str]] = {  # by marker
     "tolerance": tolerance,
     "crossings": crossings,
     "pictures": pictures,
+    "window": window,
+    "window_keys": window_keys,
 }
 
 

@@ -11,7 +11,7 @@ import sys
 import time
 import warnings
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -170,12 +170,18 @@ class Stopwatch:
 # --- processes ----------------------------------------------------------------------------------------------------------
 
 
-def run_python(what: str, *arguments: str | int | Path, folder: Path = HERE, cache: Path | None = None) -> list[str]:
+def run_python(
+    what: str,
+    *arguments: str | int | Path,
+    folder: Path = HERE,
+    cache: Path | None = None,
+    environment: Mapping[str, str] = os.environ,
+) -> list[str]:
     """The output lines of a Python process with the version in `folder`. Raises SimulationError with its last line on failure."""
     paths = {"PYTHONPATH": os.pathsep.join(filter(None, (str(folder), os.environ.get("PYTHONPATH"))))}
     done = subprocess.run(
         [sys.executable, *map(str, arguments)],
-        env=os.environ | paths | ({} if cache is None else {"XDG_CACHE_HOME": str(cache)}),
+        env=dict(environment) | paths | ({} if cache is None else {"XDG_CACHE_HOME": str(cache)}),
         stdin=subprocess.DEVNULL,
         capture_output=True,
         text=True,

@@ -1,5 +1,6 @@
 """Sphinx settings of the manual. `make docs` builds it into out/docs."""
 
+import logging
 import re
 import shutil
 from pathlib import Path
@@ -15,7 +16,13 @@ author = "the taisoft authors"
 copyright = "the taisoft authors, MIT license"
 version = release = taisoft.__version__
 
-extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.mathjax"]
+extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.mathjax"]  # myst_nb reads Markdown, too, by myst_parser
+nb_execution_mode = "force"
+nb_execution_raise_on_error = True
+nb_execution_in_temp = True
+nb_execution_timeout = 120  # of a cell [s]
+logging.getLogger("traitlets").setLevel(logging.WARNING)  # else nbclient announces each notebook
+nb_output_stderr = "remove"  # what kernels are compiled depends on the cache on disk
 myst_enable_extensions = ["dollarmath", "colon_fence", "deflist"]
 myst_heading_anchors = 3
 html_theme = "furo"

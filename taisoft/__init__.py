@@ -11,6 +11,7 @@ if os.name == "posix" and "HOME" not in os.environ:
     os.environ["HOME"] = _home if os.path.isabs(_home) else "/tmp"
 
 os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")  # else Taichi prints a banner on standard output when imported
+os.environ.setdefault("TI_ENABLE_PYBUF", "0")  # else Taichi writes a line into a notebook's cell
 
 _MODULES = {  # public name -> the module that defines it
     "TetMesh": "taisoft.mesh.tet_mesh",
@@ -19,9 +20,11 @@ _MODULES = {  # public name -> the module that defines it
     "ball_mesh": "taisoft.mesh.shapes",
     "read_mesh": "taisoft.mesh.files",
     "write_mesh": "taisoft.mesh.files",
+    "read_usd": "taisoft.mesh.usd",
     "SurfaceMesh": "taisoft.mesh.surface_mesh",
     "read_surface": "taisoft.mesh.surface_mesh",
     "tetrahedralize": "taisoft.mesh.surface_mesh",
+    "place": "taisoft.mesh.placing",
     "Material": "taisoft.scene.scene",
     "Body": "taisoft.scene.scene",
     "Scene": "taisoft.scene.scene",
@@ -36,6 +39,9 @@ _MODULES = {  # public name -> the module that defines it
     "write_scene": "taisoft.scene.toml_writer",
     "CollisionSettings": "taisoft.scene.collision",
     "Simulator": "taisoft.simulator",
+    "Film": "taisoft.view.notebook",
+    "InteractiveView": "taisoft.view.interactive",
+    "show": "taisoft.view.window",
     "solve_static": "taisoft.static",
     "modes": "taisoft.stability",
     "evaluate_law": "taisoft.fem.laws.evaluate",

@@ -7,7 +7,7 @@ from taisoft.attributes import thawed
 from taisoft.errors import SceneError, SimulationError
 from taisoft.queries import body_index, check_rows, nodes_of
 from taisoft.scene.connections import check_exact
-from taisoft.scene.plan import CHANGEABLE, change_load, change_material, change_tension
+from taisoft.scene.plan import CHANGEABLE, change_load, change_material, change_tendon
 from taisoft.settings import FIXED, NAMES, check_dt
 
 if TYPE_CHECKING:
@@ -20,7 +20,9 @@ INSTEAD = {  # what to do instead of assigning to an attribute that a simulator 
     **{name: f"call sim.rebuild({name}=...)" for name in NAMES if name not in FIXED},
     **dict.fromkeys(("force", "forces"), "call sim.set_force(body, index, value)"),
     **dict.fromkeys(("traction", "tractions"), "call sim.set_traction(body, index, value)"),
-    **dict.fromkeys(("tension", "tendons"), "call sim.set_tension(name, force)"),
+    "tension": "call sim.set_tension(name, force)",
+    "tendons": "call sim.set_tension(name, force) or sim.set_length(name, length)",
+    "length": "call sim.set_length(name, length)",
     **dict.fromkeys(("pressure", "pressures"), "call sim.set_pressure(body, index, value)"),
     **dict.fromkeys(("time", "step_count"), "call sim.reset() to go back to the start"),
     **dict.fromkeys(("arch", "precision"), "make a new Simulator"),
@@ -148,9 +150,24 @@ def set_traction(self: "Simulator", body: str, index: int, value) -> None:
 
 
 def set_tension(self: "Simulator", name: str, value: float) -> None:
-    """Change the tension [N] of a tendon, from the next step on; it replaces a path. `stable_dt` stays. Raises SceneError."""
-    dynamics = self._open()
-    change_tension(self.scene, name, value)
+    """Change the tension [N] of a tendon of given force, from the next step on; it replaces a path. `stable_dt` stays.
+
+    Raises SceneError.
+    """
+    _set_tendon(self, "force", name, value)
+
+
+def set_length(self: "Simulator", name: str, value: float) -> None:
+    """Change the length at rest [m] of a tendon of given length, from the next step on; it replaces a path.
+
+    Raises SceneError.
+    """
+    _set_tendon(self, "length", name, value)
+
+
+def _set_tendon(sim: "Simulator", given: str, name: str, value: float) -> None:
+    dynamics = sim._open()
+    change_tendon(sim.scene, given, name, value)
     dynamics.loads_changed()
 
 

@@ -24,7 +24,7 @@ from taisoft.errors import SceneError, SimulationError
 from taisoft.files import replacing
 from taisoft.nested import join_arrays, part_arrays
 from taisoft.scene.fingerprint import FEATURES, digest, run_time_numbers, scene_fingerprint
-from taisoft.scene.plan import LOADS, Numbers, change_load, change_tension, first_difference, scene_numbers
+from taisoft.scene.plan import LOADS, Numbers, change_load, change_tendon, first_difference, scene_numbers
 from taisoft.scene.rigid import RigidBody
 from taisoft.scene.scene import Material, Scene
 from taisoft.settings import NAMES, plan_of
@@ -137,7 +137,7 @@ def restore_numbers(saved: Checkpoint, scene: Scene) -> None:
         for i, tendon in enumerate(scene.tendons):
             value = saved.state["loads"]["tendons"][str(i)]
             if value is not None:
-                change_tension(scene, tendon.name, value)
+                change_tendon(scene, tendon.given, tendon.name, value)
 
 
 def load_values(scene: Scene) -> dict:

@@ -21,6 +21,11 @@ if TYPE_CHECKING:
     from taisoft.simulator import Simulator
 
 
+def is_open(self: "Simulator") -> bool:
+    """Whether the simulator can be used, as it can until `close`."""
+    return self._dynamics is not None and self._dynamics.is_open
+
+
 def time(self: "Simulator") -> float:
     """Simulated time [s]."""
     return self._host().state.time
@@ -55,19 +60,26 @@ def joint_force(self: "Simulator", name: str) -> float | np.ndarray:
     """Return the force of a connection in the present state [N].
 
     Of a spring its tension, with damping, negative if it pushes; of a tendon its tension; of an attachment the forces (k,3) on
-    the attached nodes. Of exactly attached ones it is what balances their own tets, loads, weight and mean acceleration in the
-    last step, without damping, and without contacts and springs at these nodes, which act on the other body at once. Raises
-    SceneError.
+    the attached nodes. Of exactly attached ones it is the constraint force: what balances their mean acceleration in the last
+    step with their own tets, damping, loads, weight, springs and contacts, see `dynamics.joints`. The last step is not in
+    checkpoints: until the next one, acceleration and contacts count as 0. Raises SceneError.
     """
     from taisoft.dynamics.joints import joint_force as of_dynamics
 
     return of_dynamics(self._open(), name)
 
 
+def tensions(self: "Simulator") -> dict[str, float]:
+    """Return the tensions [N] of all springs and tendons in the present state by name, as `joint_force` gives them one by one."""
+    from taisoft.dynamics.joints import tensions as of_dynamics
+
+    return of_dynamics(self._open())
+
+
 def cavity_volume(self: "Simulator", name: str) -> float:
     """Return the present volume [m^3] of a cavity. Raises SceneError if there is none of this name."""
     state = self._open().state
-    return state.cavity_form(name).volume_and_gradient(state.state()[0])[0]
+    return state.cavity_form(name).value_and_gradient(state.state()[0])[0]
 
 
 def cavity_pressure(self: "Simulator", name: str) -> float:
@@ -287,6 +299,18 @@ def buffer_growths(self: "Simulator") -> dict[str, int]:
     """How often each buffer of contact detection grew since the start; buffers that never grew are left out."""
     detection = self._dynamics.detection
     return {name: n for name, n in detection.counts.growths.items() if n} if detection is not None else {}
+
+
+def picture(self: "Simulator", size: tuple[int, int] = (1280, 720), colour: str = "stress") -> np.ndarray:
+    """Return a picture of the present state, uint8 (height, width, 3), first row on top.
+
+    size: width and height in pixels; colour: of the bodies, by "stress" (von Mises), "stretch" or "speed", on a scale up to the
+    state's 99 % quantile, "error" in a run with error=True, or "body". The camera frames the bodies at the start, and steps back
+    if one would leave the picture. Needs no display. Raises OutputError for another size or colour.
+    """
+    from taisoft.view.offscreen import Offscreen  # compiles kernels at the first picture
+
+    return Offscreen(self.scene, size, colour=colour).image(self)
 
 
 # --- arguments --------------------------------------------------------------------------------------------------------

@@ -2,6 +2,8 @@
 
 from dataclasses import dataclass, field
 
+from taisoft.display import PROBLEMS_SHOWN, run_html
+
 
 @dataclass
 class Energies:
@@ -45,6 +47,15 @@ class StepReport:
     converged: bool = True  #: residuals are within their tolerances
     problems: list[str] = field(default_factory=list)  #: sentences
 
+    def __repr__(self) -> str:
+        counts = {"Newton iterations": self.newton_iterations, "substeps": self.substeps - 1 and self.substeps}
+        counts |= {"contacts": self.n_contacts, "inverted tets": self.n_inverted}
+        texts = [f"{n} {name}" for name, n in counts.items() if n]
+        texts += [f"residual {self.residual:.2g}"] if self.residual else []
+        texts += [f"min J {self.min_volume_ratio:.4g}", f"kinetic {self.kinetic:.4g} J", f"elastic {self.elastic:.4g} J"]
+        end = "" if self.converged else ", not converged"
+        return f"StepReport(t = {self.time:.6g} s: {', '.join(texts)}{end})"
+
 
 ERROR_KINDS = ("time", "space", "solver")  # fields of the following records
 
@@ -85,6 +96,10 @@ class ErrorEstimate:
         """Sum of the errors that are known; None without the error in time."""
         return None if self.time is None else self.time + (self.space or 0.0) + (self.solver or 0.0)
 
+    def __repr__(self) -> str:
+        known = [f"{kind} {getattr(self, kind):.2g}" for kind in ERROR_KINDS if getattr(self, kind) is not None]
+        return f"ErrorEstimate({', '.join(known) or 'nothing known'}; relative to an excursion of {self.excursion:.4g} m)"
+
 
 @dataclass
 class RunReport:
@@ -102,3 +117,17 @@ class RunReport:
     dt_requested: float | None = None  #: that the simulator had, where the run changed it to fit the frames [s]
     pilot_seconds: float = 0.0  #: wall time of the pilots of a run with a tolerance, without compile time [s]
     error_estimate: ErrorEstimate | None = None  #: of a run with error=True or a tolerance
+
+    def __repr__(self) -> str:
+        """One line, and the first problems."""
+        steps = f"{self.steps} steps" + (f" of {self.dt:.6g} s" if self.dt is not None else "")
+        walls = f"{self.wall_seconds:.2f} s of wall time, {self.compile_seconds:.2f} s to compile"
+        early = ", ended early" if self.interrupted else ""
+        lines = [f"RunReport: {self.status}{early}, {self.sim_seconds:.6g} s in {steps}, {walls}"]
+        lines += [f"  {text}" for text in self.problems[:PROBLEMS_SHOWN]]
+        lines += [f"  and {len(self.problems) - PROBLEMS_SHOWN} more problems"] if len(self.problems) > PROBLEMS_SHOWN else []
+        lines += [f"  {self.error_estimate!r}"] if self.error_estimate is not None else []
+        return "\n".join(lines)
+
+    def _repr_html_(self) -> str:
+        return run_html(self)

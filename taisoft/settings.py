@@ -14,7 +14,8 @@ from taisoft.scene.plan import Plan, make_plan
 from taisoft.scene.scene import Scene
 
 IMPLICIT_CONTACT = ("augmented_lagrangian",)
-VOLUMES = ("implicit_euler", "bdf2")  # integrators that can keep the volume of a cavity: others fix the forces before the end
+# Integrators that can keep the volume of a cavity or the length of a tendon: others fix the forces before the end of a step
+WITH_MULTIPLIERS = ("implicit_euler", "bdf2")
 CONTACT_SOLVERS = ("auto", *EXPLICIT_CONTACT, *IMPLICIT_CONTACT)
 
 
@@ -64,7 +65,7 @@ def check_settings(scene: Scene, **given) -> Settings:
     _check_name("integrator", settings.integrator, INTEGRATORS)
     _check_name("contact_solver", settings.contact_solver, CONTACT_SOLVERS)
     _check_contact_solver(settings, scene.pushes(settings.self_collision))
-    _check_volumes(settings, scene)
+    _check_multipliers(settings, scene)
     return settings
 
 
@@ -105,12 +106,21 @@ def _check_name(name: str, value: str, known: tuple[str, ...]) -> None:
         raise SimulationError(f"{name} {value!r} is unknown{hint}: it must be one of {', '.join(known)}")
 
 
-def _check_volumes(settings: Settings, scene: Scene) -> None:
-    """Raise SimulationError unless the integrator can keep given volumes of cavities."""
-    given = [cavity.name for body in scene.bodies for cavity in body.cavities if cavity.given == "volume"]
-    if given and (settings.integrator not in VOLUMES or settings.tolerance is not None):
-        instead = " or ".join(VOLUMES)
-        raise SimulationError(f"cavity {given[0]!r} of given volume needs integrator {instead}, without a tolerance of the run")
+def kept_by_multipliers(scene: Scene) -> list[str]:
+    """Describe what only integrators in WITH_MULTIPLIERS keep: given volumes of cavities, and lengths of inextensible tendons."""
+    cavities = [cavity for body in scene.bodies for cavity in body.cavities if cavity.given == "volume"]
+    tendons = [tendon for tendon in scene.tendons if tendon.is_inextensible]
+    return [f"cavity {one.name!r} of given volume" for one in cavities] + [
+        f"tendon {one.name!r} of given length without a stiffness" for one in tendons
+    ]
+
+
+def _check_multipliers(settings: Settings, scene: Scene) -> None:
+    """Raise SimulationError unless the integrator can keep given volumes and lengths."""
+    given = kept_by_multipliers(scene)
+    if given and (settings.integrator not in WITH_MULTIPLIERS or settings.tolerance is not None):
+        instead = " or ".join(WITH_MULTIPLIERS)
+        raise SimulationError(f"{given[0]} needs integrator {instead}, without a tolerance of the run")
 
 
 def _check_contact_solver(settings: Settings, touching: bool) -> None:

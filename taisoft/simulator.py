@@ -7,10 +7,12 @@ from typing import TYPE_CHECKING
 from taisoft import changes, checkpoint, queries, running
 from taisoft.attributes import Guarded, SimulationAttributeError, thawed
 from taisoft.backend import runtime
+from taisoft.display import drawn, simulator_text
 from taisoft.dynamics.dynamics import Dynamics
 from taisoft.errors import SceneError, SimulationError, no_memory
 from taisoft.estimation.first_choice import settings_for
 from taisoft.fem.laws import LAWS
+from taisoft.output.vtu import write_vtu
 from taisoft.records import StepReport
 from taisoft.scene.scene import Scene
 from taisoft.settings import NAMES, Settings, check_count, check_settings, plan_of
@@ -133,6 +135,7 @@ class Simulator(Guarded):
 
     # --- results: queries.py ------------------------------------------------------------------------------------------
 
+    is_open = property(queries.is_open)
     time = property(queries.time)
     step_count = property(queries.step_count)
     positions = queries.positions
@@ -140,6 +143,7 @@ class Simulator(Guarded):
     energies = queries.energies
     reactions = queries.reactions
     joint_force = queries.joint_force
+    tensions = queries.tensions
     cavity_volume = queries.cavity_volume
     cavity_pressure = queries.cavity_pressure
     stress = queries.stress
@@ -162,6 +166,7 @@ class Simulator(Guarded):
     nodal_errors = queries.nodal_errors
     draggable = property(queries.draggable)
     dragged = property(queries.dragged)
+    picture = queries.picture
     compile_seconds = property(queries.compile_seconds)
     field_bytes = property(queries.field_bytes)
     buffer_growths = property(queries.buffer_growths)
@@ -177,6 +182,7 @@ class Simulator(Guarded):
     set_force = changes.set_force
     set_traction = changes.set_traction
     set_tension = changes.set_tension
+    set_length = changes.set_length
     set_pressure = changes.set_pressure
     set_cavity = changes.set_cavity
     drag = changes.drag
@@ -224,11 +230,12 @@ class Simulator(Guarded):
         """Return the arguments, besides the scene, that make a simulator with the present settings."""
         return dataclasses.asdict(self.settings) | {"dt": self.dt}
 
-    # --- checkpoints and resources --------------------------------------------------------------------------------------
+    # --- files and resources --------------------------------------------------------------------------------------------
 
     save_checkpoint = checkpoint.save_checkpoint
     load_checkpoint = classmethod(checkpoint.load_checkpoint)
     from_checkpoint = classmethod(checkpoint.from_checkpoint)
+    write_vtu = write_vtu
 
     def close(self) -> None:
         """Release memory and runtime; a closed simulator cannot be used."""
@@ -241,6 +248,11 @@ class Simulator(Guarded):
 
     def __exit__(self, *exception) -> None:
         self.close()
+
+    __repr__ = simulator_text
+
+    def _repr_html_(self) -> str | None:
+        return drawn("simulator_html", self)
 
     def _host(self) -> Dynamics:
         """Return the dynamics for data on the host alone. Raises SimulationError after `close`."""

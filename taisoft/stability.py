@@ -10,10 +10,12 @@ import numpy as np
 import scipy.sparse as sp
 import scipy.sparse.linalg as spl
 
+from taisoft.display import short_repr
 from taisoft.errors import SceneError
 from taisoft.fem import reference
-from taisoft.fem.dependents import dependent_table
+from taisoft.fem.dependents import DependentTable, dependent_table
 from taisoft.fem.loads import SceneLoads
+from taisoft.fem.spring_table import SpringTable
 from taisoft.fem.springs import spring_table
 from taisoft.scene.rigid import RigidBody
 from taisoft.scene.scene import Body, Scene
@@ -86,10 +88,13 @@ def _patch_stiffness(body: Body, divergence: np.ndarray, dof: np.ndarray) -> sp.
     return D.T @ sp.diags(reference.patch_moduli(body, patch) / np.bincount(patch, body.mesh.volumes)) @ D
 
 
-def constrained_axes(body: Body, prescribed: bool) -> np.ndarray:
-    """Constrained axes (n, 3), bool: the fixed ones, and if `prescribed` those that follow a path too."""
+def constrained_axes(body: Body, prescribed: bool, scene: Scene | None = None) -> np.ndarray:
+    """Constrained axes (n, 3), bool: the fixed ones, and if `prescribed` those that follow a path too.
+
+    scene: of which exact attachments to obstacles count as well.
+    """
     constrained = np.zeros((body.n_nodes, 3), dtype=bool)
-    for c in body.constraints:
+    for c in body.constraints if scene is None else scene.constraints(body):
         if prescribed or c.path is None:
             constrained[np.ix_(c.nodes, np.flatnonzero(c.axes))] = True
     return constrained
@@ -159,8 +164,8 @@ def stable_dt(scene: Scene, verlet: bool) -> float:
     """
     limit = np.inf
     connected = {owner for one in scene.connections for owner in one.owners}
-    square, rate = spring_rates(scene) if connected else (0.0, 0.0)
     dependents = dependent_table(scene)
+    square, rate = spring_rates(scene, dependents) if connected else (0.0, 0.0)
     elastic = np.concatenate([np.arange(body.n_nodes) < body.nodes.n_elastic for body in scene.bodies])
     growth = 1.0 if dependents is None else dependents.growth(elastic)
     for body in scene.bodies:
@@ -173,18 +178,22 @@ def stable_dt(scene: Scene, verlet: bool) -> float:
     return float(limit)
 
 
-def spring_rates(scene: Scene) -> tuple[float, float]:
+def spring_rates(scene: Scene, dependents: DependentTable | None) -> tuple[float, float]:
     """Upper bounds of the largest omega^2 [1/s^2] and damping rate [1/s] that springs alone give the nodes at the start.
 
-    Each acts as if it had its stiffness, or its tension over its length if that is larger, in all directions.
+    Each acts as if it had its stiffness, or its tension over its length if that is larger, in all directions. Each segment of
+    an elastic tendon has its stiffness times the number of segments, a bound wherever the points are.
     """
-    table = spring_table(scene)
+    table = spring_table(scene, dependents)
     if table is None:
         return 0.0, 0.0
-    length = np.linalg.norm(table.vectors(_start_positions(scene)), axis=1)
-    given = table.given(SceneLoads(scene).amplitudes([0.0])[0])
-    largest = np.maximum(table.stiffness, given / np.where(given > 0.0, length, 1.0))
-    scaled = sp.csr_matrix((table.weight / np.sqrt(reference.lumped_masses(scene)[table.node]), table.node, table.start))
+    amplitudes = SceneLoads(scene, table).amplitudes([0.0])[0]
+    length = np.linalg.norm(table.vectors(_start_positions(scene), amplitudes), axis=1)
+    tension = table.stretching(length, amplitudes) + table.given(amplitudes)
+    stiffness = table.stiffness * np.diff(table.line_start)[table.line]
+    largest = np.maximum(stiffness, tension / np.where(tension > 0.0, length, 1.0))
+    masses = reference.lumped_masses(scene, dependents)
+    scaled = sp.csr_matrix((table.weight / np.sqrt(masses[table.node]), table.node, table.start))
     return tuple(_largest_eigenvalue(scaled, weights) for weights in (largest, table.damping))
 
 
@@ -205,15 +214,12 @@ def _largest_eigenvalue(rows: sp.csr_matrix, weights: np.ndarray) -> float:
     return LANCZOS_MARGIN**2 * float(top[0])
 
 
-def spring_stiffness(scene: Scene) -> sp.csr_matrix:
+def spring_stiffness(scene: Scene, table: SpringTable) -> sp.csr_matrix:
     """Stiffness matrix (3n, 3n) of a scene's springs, tendons and attachments at the start [N/m]."""
-    table = spring_table(scene)
-    e = table.vectors(_start_positions(scene))
-    given = table.given(SceneLoads(scene).amplitudes([0.0])[0])
-    blocks = table.stiffness_blocks(e, given)
-    rows = sp.csr_matrix((table.weight, table.node, table.start), shape=(len(e), len(_start_positions(scene))))
-    C = sp.kron(rows, sp.identity(3), format="csr")
-    return (C.T @ sp.block_diag(blocks, format="csr") @ C).tocsr()
+    amplitudes = SceneLoads(scene, table).amplitudes([0.0])[0]
+    e = table.vectors(_start_positions(scene), amplitudes)
+    C = sp.kron(table.rows, sp.identity(3), format="csr")
+    return (C.T @ table.stiffness_matrix(e, amplitudes) @ C).tocsr()
 
 
 def _stable_dt_of(omega: float, mass_damping: float, damping_rate: float, verlet: bool) -> float:
@@ -240,18 +246,23 @@ class Modes(NamedTuple):
     frequencies: np.ndarray
     shapes: np.ndarray
 
+    __repr__ = short_repr
+
 
 def modes(scene: Scene, k: int, mass: str = "lumped") -> Modes:
     """The lowest k eigenfrequencies [Hz] and shapes of a scene at rest, with its constraints; rigid motions count as 0 Hz.
 
-    mass: "lumped" or "consistent". Raises SceneError for an invalid k or mass.
+    mass: "lumped" or "consistent". Springs and tendons act as they do at the start: an elastic tendon that is slack there does
+    not. Raises SceneError for an invalid k or mass, and for an inextensible tendon, whose tension there is unknown.
     """
     if mass not in ("lumped", "consistent"):
         raise SceneError(f"mass '{mass}' is unknown: it must be 'lumped' or 'consistent'")
     if not scene.bodies:
         raise SceneError("the scene holds no body")
+    for tendon in [one for one in scene.tendons if one.is_inextensible]:
+        raise SceneError(f"modes: tendon {tendon.name!r} has a given length, but no stiffness: give it one")
     scene = scene.snapshot()  # in which rigid bodies are as stiff as the others ask for
-    free = np.concatenate([~constrained_axes(b, prescribed=True) for b in scene.bodies]).reshape(-1)
+    free = np.concatenate([~constrained_axes(b, prescribed=True, scene=scene) for b in scene.bodies]).reshape(-1)
     dependents = dependent_table(scene)
     T = sp.identity(len(free), format="csr") if dependents is None else sp.kron(dependents.matrix, sp.identity(3), format="csr")
     if dependents is not None:
@@ -260,10 +271,11 @@ def modes(scene: Scene, k: int, mass: str = "lumped") -> Modes:
     if isinstance(k, bool) or not isinstance(k, (int, np.integer)) or not 1 <= k <= n_free:
         raise SceneError(f"k = {k!r}: it must be a whole number from 1 to the {n_free} free axes of the scene")
     K = sp.block_diag([hooke_stiffness(b) for b in scene.bodies], format="csr")
-    K = K if spring_table(scene) is None else K + spring_stiffness(scene)
+    table = spring_table(scene, dependents)
+    K = K if table is None else K + spring_stiffness(scene, table)
     K = (T.T @ K @ T)[free][:, free]
     if mass == "lumped":
-        M = sp.diags(np.repeat(reference.lumped_masses(scene), 3)[free], format="csc")
+        M = sp.diags(np.repeat(reference.lumped_masses(scene, dependents), 3)[free], format="csc")
     else:
         scalar = sp.block_diag([reference.consistent_mass(b) for b in scene.bodies])
         M = (T.T @ sp.kron(scalar, sp.identity(3), format="csr") @ T)[free][:, free]

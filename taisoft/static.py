@@ -7,17 +7,19 @@ import numpy as np
 
 from taisoft.backend.arrays import FieldArena, upload
 from taisoft.backend.runtime import Runtime, open_kind, open_runtime
+from taisoft.display import short_repr
 from taisoft.dynamics.contact_newton import solve
 from taisoft.dynamics.dirichlet import DirichletConditions
+from taisoft.dynamics.multipliers import Multipliers, solve_with_multipliers
 from taisoft.dynamics.no_contacts import NoContacts
 from taisoft.dynamics.results import StageResult
 from taisoft.dynamics.simulation_state import SimulationState
 from taisoft.dynamics.stage_system import Stage, StageSystem
-from taisoft.dynamics.volumes import Volumes, solve_with_volumes
 from taisoft.errors import SceneError, SimulationError
 from taisoft.fem.measure import measure
 from taisoft.fem.model import Layout, build_model
 from taisoft.fem.pressure import cavity_form
+from taisoft.fem.spring_table import SpringTable
 from taisoft.fem.state import ELASTIC, N_INVERTED
 from taisoft.scene import checks
 from taisoft.scene.plan import make_plan
@@ -46,6 +48,10 @@ class StaticResult:
     _positions: np.ndarray
     _reactions: np.ndarray
     _pressures: dict[str, float]
+    _springs: SpringTable | None
+    _amplitudes: np.ndarray
+
+    __repr__ = short_repr
 
     def positions(self, name: str | None = None) -> np.ndarray:
         """Positions (n_nodes, 3) [m] of a body, or of all bodies concatenated."""
@@ -57,12 +63,20 @@ class StaticResult:
 
     def cavity_volume(self, name: str) -> float:
         """Volume [m^3] of a cavity."""
-        return cavity_form(self._scene, name).volume_and_gradient(self._positions)[0]
+        return cavity_form(self._scene, name).value_and_gradient(self._positions)[0]
 
     def cavity_pressure(self, name: str) -> float:
         """Pressure [Pa] in a cavity."""
         self._scene.cavity(name)
         return self._pressures[name]
+
+    def tension(self, name: str) -> float:
+        """Tension [N] of a spring or tendon; negative: it pushes. Raises SceneError."""
+        names = [one.name for one in (*self._scene.springs, *self._scene.tendons)]
+        if name not in names:
+            raise SceneError(f"tension: no spring or tendon is called {name!r}{checks.nearest(str(name), names)}")
+        state = self._positions, np.zeros_like(self._positions), self._amplitudes
+        return float(self._springs.tensions(*state)[self._springs.elements[name]][0])
 
     def _rows(self, name: str | None) -> slice:
         if name is None:
@@ -140,18 +154,21 @@ class StaticSolver:
             plan.on | dict.fromkeys(("mass_damping", "stiffness_damping", "spring_damping", "consistent_mass"), False),
         )
         self.simulation = SimulationState(scene, runtime, arena, model, layout, DirichletConditions(scene, layout))
-        self.volumes, self.time = None, time
-        if len(self.simulation.loads.given_volumes):
-            self.simulation.set_cavity_pressures(np.zeros(len(self.simulation.loads.given_volumes)))
-            self.volumes = Volumes(self.simulation)
+        self.multipliers, self.time = None, time
+        if len(self.simulation.loads.multipliers):
+            self.multipliers = Multipliers(self.simulation)
+            self.simulation.set_multipliers(self.multipliers.static_start())
         prescribed = self.simulation.dirichlet.prescribed_nodes
-        self.solver = StageSystem(model, arena, runtime.eps, prescribed, NoContacts(), volumes=self.volumes)
+        self.solver = StageSystem(model, arena, runtime.eps, prescribed, NoContacts(), multipliers=self.multipliers)
         self.tolerance = tolerance
         self.target = self.simulation.next_target(time)
         self.simulation.upload_constraints()
         self.gravity = np.array(scene.gravity, dtype=np.float64)
         self.simulation.set_load_time(time)
-        self.loads = [(field, field.to_numpy()) for field in (model.loads, model.amplitudes) if field is not None]
+        self.loads = [(field, 0.0, field.to_numpy()) for field in (model.loads, model.amplitudes) if field is not None]
+        if self.simulation.springs is not None and model.amplitudes is not None:
+            full = model.amplitudes.to_numpy()
+            self.loads[-1] = model.amplitudes, self.simulation.springs.rest_amplitudes(len(full), layout.rest), full
 
     def solve(self) -> StaticResult:
         """Apply the full load in one step; if that fails, use load steps that halve on failure and grow by half on success."""
@@ -180,16 +197,16 @@ class StaticSolver:
         """Solve with a fraction of the load, starting at x."""
         m, w = self.simulation.model, self.solver.work
         start = [(m.gravity, fraction * self.gravity[None]), (w.x_hat, x), (m.state.x, x), (m.state.v, np.zeros_like(x))]
-        start += [(field, fraction * full) for field, full in self.loads]
+        start += [(field, rest + fraction * (full - rest)) for field, rest, full in self.loads]
         if self.target is not None:
             rest = self.simulation.layout.rest[self.simulation.dirichlet.prescribed_nodes]
             axes = self.simulation.dirichlet.prescribed_axes()
             start += [(w.targets, rest + fraction * (self.target - rest)), (w.prescribed_axes, axes)]
         upload(start)
-        if self.volumes is not None:
-            self.volumes.begin(self.time, fraction)
+        if self.multipliers is not None:
+            self.multipliers.begin(self.time, fraction)
         stage = Stage(0.0, 1.0, 1.0, tolerance, max_newton=max_newton)
-        result = solve_with_volumes(self.solver, stage, partial(solve, self.solver, stage))
+        result = solve_with_multipliers(self.solver, stage, partial(solve, self.solver, stage))
         self.newton += result.newton_iterations
         self.linear += result.linear_iterations
         self.multigrid += result.multigrid_solves
@@ -197,7 +214,7 @@ class StaticSolver:
 
     def _residual(self, result: StageResult) -> float:
         """The residual of the result; 0 without load and constraint forces, where it would be rounding over rounding."""
-        loaded = self.gravity.any() or any(full.any() for _, full in self.loads) or self.volumes is not None
+        loaded = self.gravity.any() or any(full.any() for *_, full in self.loads) or self.multipliers is not None
         only_rounding = not loaded and np.linalg.norm(self.solver.held_residual()) <= self.solver.rounding.force
         return 0.0 if only_rounding and result.converged else result.residual
 
@@ -223,4 +240,6 @@ class StaticSolver:
             _positions=simulation.model.state.x.to_numpy(),
             _reactions=self.solver.held_residual(),
             _pressures=simulation.cavity_pressures_by_name(self.time),
+            _springs=simulation.springs,
+            _amplitudes=simulation.amplitudes(self.time),
         )

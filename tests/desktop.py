@@ -1,7 +1,5 @@
 """A virtual display for tests of windows."""
 
-import os
-import shutil
 import subprocess
 import sys
 import time
@@ -9,8 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.virtual_display import VirtualDisplay, missing_tools
+
 ROOT = Path(__file__).resolve().parents[1]
-TOOLS = [tool for tool in ("Xvfb", "xdotool", "import") if shutil.which(tool) is None]  # what is missing
+TOOLS = missing_tools("import")
 
 
 class Desktop:
@@ -18,20 +18,15 @@ class Desktop:
 
     def __init__(self, folder, code):
         self.folder = folder
-        read, write = os.pipe()
-        command = ["Xvfb", "-displayfd", str(write), "-screen", "0", "1280x760x24"]
-        self.server = subprocess.Popen(command, pass_fds=[write], stderr=subprocess.DEVNULL)
-        os.close(write)
-        with os.fdopen(read) as pipe:
-            self.environment = os.environ | {"DISPLAY": f":{pipe.readline().strip()}"}
+        self.display = VirtualDisplay()
         self.log = folder / "log"
         with open(self.log, "w") as log:
             self.child = subprocess.Popen(
-                [sys.executable, "-c", code], cwd=ROOT, env=self.environment, stdout=log, stderr=subprocess.STDOUT
+                [sys.executable, "-c", code], cwd=ROOT, env=self.display.environment, stdout=log, stderr=subprocess.STDOUT
             )
 
     def tool(self, *arguments):
-        subprocess.run(arguments, env=self.environment, capture_output=True, timeout=30, check=True)
+        self.display.tool(*arguments)
 
     def wait_for(self, condition, what):
         end = time.monotonic() + 60
@@ -79,9 +74,9 @@ class Desktop:
         found = [line.split() for line in text[: text.rfind("\n") + 1].splitlines() if line.startswith(key)]
         return found[-1] if found else []
 
-    def drag(self, start, way, hold=0.0):
-        """Press the left button at start, move it in parts, hold it [s]; it stays pressed."""
-        self.tool("xdotool", "mousemove", *map(str, start), "mousedown", "1")
+    def drag(self, start, way, hold=0.0, button=1):
+        """Press a button, by default the left one, at start, move it in parts, hold it [s]; it stays pressed."""
+        self.tool("xdotool", "mousemove", *map(str, start), "mousedown", str(button))
         time.sleep(0.2)
         for _ in range(5):
             time.sleep(0.1)
@@ -89,6 +84,6 @@ class Desktop:
         time.sleep(hold)
 
     def close(self):
-        for process in (self.child, self.server):
-            process.kill()
-            process.wait()
+        self.child.kill()
+        self.child.wait()
+        self.display.close()

@@ -28,7 +28,10 @@ def shape_row(body, point: np.ndarray) -> np.ndarray:
 
 
 class OracleSprings:
-    """Elements (row (n,), offset (3,), stiffness, rest length, damping, tension) of all connections of a scene, by name."""
+    """Elements (row (n,), offset (3,), stiffness, rest length, damping, tension) of all connections of a scene, by name.
+
+    elastic: of each elastic tendon (rows, offsets) of its segments, stiffness and length.
+    """
 
     def __init__(self, scene):
         self.scene, self.elements = scene, {}
@@ -41,8 +44,13 @@ class OracleSprings:
                 length = np.linalg.norm(self.start(*ends[0]) - self.start(*ends[1]))
                 length = 0.0 if length < 1e-12 else length
             self.elements[one.name] = [self.between(*ends, one.stiffness, length, one.damping, 0.0)]
+        self.elastic = {}
         for one in scene.tendons:
             tension, ends = float(one.value), [self.point(p.owner, p.position) for p in one.points]
+            if one.stiffness is not None:
+                segments = [(p[0] - q[0], p[1] - q[1]) for p, q in zip(ends, ends[1:])]
+                self.elastic[one.name] = (segments, one.stiffness, float(one.value))
+                continue
             self.elements[one.name] = [self.between(p, q, 0.0, 0.0, 0.0, tension) for p, q in zip(ends, ends[1:])]
         for one in scene.attachments:
             a = scene.body(one.a)
@@ -86,7 +94,13 @@ class OracleSprings:
             else:
                 l = np.sqrt(e @ e)
                 total += 0.5 * k * (l - length) ** 2 + tension * l
-        return total
+        return total + sum(0.5 * self.tension(name, x) ** 2 / k for name, (_, k, _) in self.elastic.items())
+
+    def tension(self, name: str, x):
+        """Tension [N] of an elastic tendon; x may be complex."""
+        segments, k, length = self.elastic[name]
+        stretch = sum(np.sqrt(e @ e) for e in (row @ x + offset for row, offset in segments)) - length
+        return k * stretch if np.real(stretch) > 0.0 else 0.0 * stretch
 
     def force(self, x, v=None) -> np.ndarray:
         """Forces (n,3) [N], with damping if there are velocities; x may be complex."""
@@ -98,6 +112,10 @@ class OracleSprings:
             else:
                 l = np.sqrt(e @ e)
                 f -= np.outer(row, (k * (l - length) + tension + c * (rate @ e) / l) * e / l)
+        for name, (segments, *_) in self.elastic.items():
+            for row, offset in segments:
+                e = row @ x + offset
+                f -= self.tension(name, x) * np.outer(row, e / np.sqrt(e @ e))
         return f
 
     def stiffness(self, x) -> np.ndarray:

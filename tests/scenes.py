@@ -164,8 +164,8 @@ def connected_scene(order: int = 1, damping: float = 0.0, gravity=(0.0, 0.0, 0.0
     """Two bodies, the second away from the origin and partly inside the first, with connections of every kind.
 
     There are a compressed and a stretched spring, one between points of one tet, one between bodies at one place, a tendon that
-    passes each body twice and, if anchored, two obstacles in sequence, and an attachment of each kind. damping: of the springs
-    and attachments [N s/m].
+    passes each body twice and, if anchored, two obstacles in sequence, an elastic one along the same points and a slack one, and
+    an attachment of each kind. damping: of the springs and attachments [N s/m].
     """
     scene = ts.Scene(gravity=gravity)
     scene.contact_forces = False
@@ -185,6 +185,8 @@ def connected_scene(order: int = 1, damping: float = 0.0, gravity=(0.0, 0.0, 0.0
         line = [*line[:2], ("pin", (0.1, 2.8, 0.0)), ("wall", (0.0, -9.0, 1.0)), *line[2:]]
         scene.attach("a", [0, 2], "pin", 150.0, damping, name="to an obstacle")
     scene.add_tendon(line, 40.0, name="line")
+    scene.add_tendon(line, length=16.0 if anchored else 1.5, stiffness=30.0, name="elastic")
+    scene.add_tendon(line[-2:], length=3.0, stiffness=1e3, name="slack")
     scene.attach("b", [0, 1, 2, 3], "a", 120.0, damping, name="to a body")
     return scene
 

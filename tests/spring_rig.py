@@ -5,7 +5,7 @@ import taichi as ti
 
 from taisoft.backend.runtime import kernel
 from taisoft.fem.terms import springs
-from taisoft.fem.terms.elasticity import elastic_forces
+from taisoft.fem.terms.elasticity import elastic_forces, prepare_terms
 from taisoft.linear import block_csr
 
 
@@ -39,6 +39,7 @@ def assembled(rig, x, beta: float, projected: bool) -> np.ndarray:
 @kernel
 def add_stiffness(m: ti.template(), A: ti.template(), beta: ti.f64, projected: ti.i32):
     """The springs' part of `to_system`."""
+    prepare_terms(m)
     ti.loop_config(serialize=True)
     for i in range(m.n_nodes):
         springs.add_stiffness(m, A, i, beta, projected)

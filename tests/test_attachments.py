@@ -368,7 +368,6 @@ def test_refusals():
             change(scene)
             scene.check()
 
-    refused("'ground' is an obstacle: fix the nodes by body.fix instead", lambda s: s.attach("part0", [0], "ground"))
     refused("damping is that of springs: give a stiffness, too", lambda s: s.attach("part0", [35], "part1", damping=1.0))
     refused("body 'part0' cannot be attached to itself", lambda s: s.attach("part0", [0], "part0"))
     refused("no body or obstacle is called 'part3'", lambda s: s.attach("part0", [0], "part3"))

@@ -169,11 +169,11 @@ def test_pressures_of_undone_substeps_are_not_kept(monkeypatch):
     """Where a step is cut, fails near its end, and is taken whole again, its start has the pressure from before."""
     monkeypatch.setattr(implicit, "MAX_NEWTON", 4)
     scene = balloon(1, volume=lambda t: BALL * (1.0 + t if t < 0.0199 else 30.0), name="water")
-    found, keep = [], SimulationState.set_cavity_pressures
+    found, keep = [], SimulationState.set_multipliers
     with ts.Simulator(scene, dt=0.01) as sim:
         assert sim.step().converged
         before = sim.cavity_pressure("water")
-        monkeypatch.setattr(SimulationState, "set_cavity_pressures", lambda own, p: (found.append(float(p[0])), keep(own, p)))
+        monkeypatch.setattr(SimulationState, "set_multipliers", lambda own, p: (found.append(float(p[0])), keep(own, p)))
         report = sim.step()
         assert not report.converged and report.substeps == 1
         assert any(p != before for p in found) and sim.cavity_pressure("water") == before
@@ -193,7 +193,7 @@ def test_slopes_of_pressures_are_not_kept(monkeypatch):
     runtime, arena = open_runtime("cpu", "f64", "test"), FieldArena()
     try:
         solver = StaticSolver(scene, runtime, arena, 1e-6, 0.0)
-        volumes, system = solver.volumes, solver.solver
+        volumes, system = solver.multipliers, solver.solver
         direction = volumes.direction
 
         def record(*arguments):
@@ -209,7 +209,7 @@ def test_slopes_of_pressures_are_not_kept(monkeypatch):
         volumes.slope_change = 1.0
         monkeypatch.setattr(np.linalg, "solve", lambda A, b: np.full_like(b, np.nan))
         volumes.direction(system, 1e-3)
-        assert changes[-1] == 0.0 and (volumes.pressures == solver.simulation.cavity_pressures).all()
+        assert changes[-1] == 0.0 and (volumes.values == solver.simulation.multipliers).all()
         solver.solver.release()
     finally:
         arena.release()

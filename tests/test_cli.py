@@ -173,7 +173,13 @@ def test_info_shows_counts_and_measures(tmp_path, capsys):
     ts.write_mesh(path, ts.box_mesh((2, 1, 1), (2, 1, 1)))
     assert main(["info", str(path)]) == 0
     shown = capsys.readouterr().out
-    for part in ("12 vertices, 10 tets, 20 surface triangles, 1 piece", "size (2, 1, 1)", "volume     2\n", "metres"):
+    for part in (
+        "12 vertices, 10 tets, 20 surface triangles, 1 piece",
+        "x 2 (-1 to 1), y 1 (-0.5 to 0.5), z 1 (-0.5 to 0.5)",
+        "y is taken for up",
+        "volume     2\n",
+        "metres",
+    ):
         assert part in shown
     assert "mean ratio 0.8" in shown and "problems   none" in shown
 

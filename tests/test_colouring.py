@@ -30,7 +30,7 @@ def test_stretch(order):
     turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
     x = sim.positions()
     sim.positions = lambda name=None: x * (1.3, 0.9, 0.9) @ turn
-    assert np.allclose(colouring.values(sim), 1.3)
+    assert np.allclose(colouring.values("stretch", sim), 1.3)
     colouring.base(sim)
     assert colouring.low == 1.0 and colouring.span == pytest.approx(0.5)
     assert colouring.legend()[0][0].strip() == "1.5" and np.array_equal(colouring.legend()[0][1], COLOURS[-1])

@@ -20,7 +20,7 @@ FILES = sorted(path for path in PACKAGE.rglob("*.py"))
 
 # Modules and packages under taisoft/, left to right; those of one group may import one another, except the pairs in FORBIDDEN.
 ORDER = (
-    ("errors", "records", "files", "nested", "ranges", "machine", "compile_message"),
+    ("errors", "records", "files", "nested", "ranges", "machine", "compile_message", "display"),
     ("attributes",),
     ("backend.private",),
     ("backend.tracing", "backend.arrays"),
@@ -31,7 +31,7 @@ ORDER = (
     ("fem.state", "fem.math3", "fem.node_graph"),
     (
         *("fem.laws", "fem.lanes", "fem.dependents", "fem.reference", "fem.loads", "fem.springs", "fem.pressure"),
-        "fem.mean_dilatation",
+        *("fem.mean_dilatation", "fem.spring_table"),
     ),
     ("fem.terms",),
     ("fem.model", "fem.pattern"),
@@ -41,7 +41,16 @@ ORDER = (
     ("dynamics.schemes",),
     ("settings",),
     ("dynamics",),
-    ("simulator", "queries", "changes", "energy_check", "frames", "running", "static", "checkpoint", "estimation"),
+    ("output.camera", "output.nodal_fields"),
+    ("output.appearance", "view.shading"),
+    ("view.colouring", "view.raster"),
+    ("output.connection_lines",),
+    ("view.connection_layer", "view.ground"),
+    ("view.scene_view", "view.shadow"),
+    (
+        *("simulator", "queries", "changes", "energy_check", "frames", "running", "static", "checkpoint", "estimation"),
+        *("output.vtu", "view.offscreen"),  # for methods of Simulator
+    ),
     ("output", "view"),
     ("study",),
     ("cli",),
@@ -51,7 +60,7 @@ LEVEL = {name: level for level, group in enumerate(ORDER) for name in group}
 ALLOWED_CALLS = {(file, call) for file in ("structure.py", "tracing.py") for call in ("compile", "exec")}  # of functions' source
 FORBIDDEN = {("mesh", "scene"), ("collision", "contact"), ("contact", "collision")}  # (importer, imported) within a group
 
-WITHOUT_TAICHI = {"errors", "records", "files", "nested", "ranges", "machine", "compile_message", "attributes", "mesh", "scene"}
+WITHOUT_TAICHI = {*ORDER[0], "attributes", "mesh", "scene"}
 FAULTY = {"ti.svd", "ti.sym_eig", "ti.polar_decompose"}
 FORBIDDEN_CALLS = {"eval", "exec", "compile", "__import__", "os.system", "os.popen", "yaml.load"} | FAULTY
 FORBIDDEN_MODULES = {"pickle", "cPickle", "dill", "shelve", "marshal", "yaml"}

@@ -23,6 +23,7 @@ from taisoft.contact import SOLVERS
 from taisoft.dynamics.schemes import INTEGRATORS
 from taisoft.fem.laws import LAWS
 from taisoft.settings import IMPLICIT_CONTACT, Settings
+from taisoft.view.keys import KEYS, MOUSE
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
@@ -30,7 +31,6 @@ PAGES = sorted(path for path in DOCS.rglob("*.md") if "results" not in path.rela
 TESTED = {"python", "toml", "sh", "console"}  # kinds of blocks that docs/conftest.py runs or checks
 UNTESTED = {"text", "{toctree}", "{literalinclude}", "{eval-rst}"}  # kinds of blocks that are not examples
 READERS_FILES = {"my_scene.py", "drop.py", "taisoft/fem/laws/modified_svk.py"}  # written by the reader
-KEYS = {" ": "Space", "Escape": "Escape", "Right": "right arrow"}  # names on the page
 each_page = pytest.mark.parametrize("page", PAGES, ids=lambda path: str(path.relative_to(DOCS)))
 DOCUMENTS = [*PAGES, ROOT / "README.md", ROOT / "CONTRIBUTING.md"]
 each_document = pytest.mark.parametrize("path", DOCUMENTS, ids=lambda path: path.name)
@@ -159,8 +159,7 @@ def test_the_page_lists_the_options_of_the_command():
 
 
 def test_the_page_lists_the_keys_of_the_window():
-    from taisoft.view.window import KEYS as keys
-
-    rows = re.findall(r"^\| (.*?) \|", section("cli.md", "The live window"), re.MULTILINE)[2:]
-    documented = {key for row in rows if "button" not in row for key in row.split(", ")}
-    assert documented == {KEYS.get(key, key.upper()) for key in keys}
+    rows = re.findall(r"^\| (.*?) +\| (.*?) +\|", section("cli.md", "The live window"), re.MULTILINE)[2:]
+    assert rows == [*MOUSE, *((key.label, key.text) for key in KEYS)]
+    names = [name for key in KEYS for name in key.names]
+    assert len(set(names)) == len(names), "each key has one action"

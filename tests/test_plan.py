@@ -75,7 +75,7 @@ def test_every_feature_can_be_on_and_off():
 
 def test_connections_are_named():
     entries = {e["feature"]: (e["on"], e["why"]) for e in make_plan(connected_scene(damping=2.0), True, False).entries}
-    assert entries["springs"] == (True, "pushes, pulls, within a tet and 4 more")
+    assert entries["springs"] == (True, "pushes, pulls, within a tet and 6 more")
     assert entries["spring_damping"] == (True, "pushes, pulls, at one place and 2 more")
 
 

@@ -30,11 +30,7 @@ from taisoft.fem.reference import gravity_masses, lumped_masses, mass_matrix
 from taisoft.scene.fingerprint import scene_digest
 from taisoft.scene.refine import refined, with_order
 from taisoft.stability import hooke_differential, hooke_stiffness, stable_dt
-from taisoft.view.colouring import Colouring
-from taisoft.view.controls import Panel
-from taisoft.view.plots import Plots
-from taisoft.view.scene_view import Layers
-from taisoft.view.window import Loop
+from taisoft.view.controls import Controls
 
 MESH = halved(cube(cells=(3, 1, 1)))
 GRID = ts.box_mesh((20, 5, 2), (4, 1, 1))
@@ -243,32 +239,12 @@ def test_a_body_of_one_material_can_get_regions_where_others_have_them():
         assert set(sim.scene.body("late").young) == {1e5, 3e5} and sim.step().converged
 
 
-class StubGui:
-    """A panel in which sliders move to the values in `moves`, by the part of their label after ###."""
-
-    def __init__(self, **moves):
-        self.moves, self.labels = moves, []
-
-    def slider_float(self, label, value, _low, _high):
-        self.labels.append(label)
-        return self.moves.get(label.split("###")[1], value)
-
-    def button(self, _label):
-        return False
-
-    def checkbox(self, _label, value):
-        return value
-
-    def text(self, *_, **__):
-        return None
-
-
 def test_the_windows_slider_scales_the_numbers_of_all_tets():
     with ts.Simulator(beam({"left": rubber(), 7: rubber(young=3e5)}), dt=1e-3) as sim:
-        panel = Panel(sim, Loop(sim, 60.0, True), Colouring(sim.scene, [], "body"), Layers(sim.scene), Plots(sim))
-        gui = StubGui(young=1.0)  # a decade
-        panel.draw(gui)
-        assert "E 1e+05 to 3e+05 Pa###young" in gui.labels
+        controls = Controls(sim)
+        assert controls.values()["young"] == [(1e5, 3e5, 0.0)]
+        controls.set_number("young", ["beam"], 1.0)  # a decade
+        assert controls.values()["young"] == [(pytest.approx(1e6), pytest.approx(3e6), 1.0)]
         assert sim.scene.bodies[0].young == pytest.approx(np.where(MESH.regions == 3, 1e6, 3e6))
 
 

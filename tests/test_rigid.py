@@ -1,5 +1,6 @@
 """Rigid bodies: moments, motion against Euler's equations, contacts, constraints, attachments, refusals, files, checkpoints."""
 
+import meshio
 import numpy as np
 import pytest
 import scipy.integrate
@@ -7,6 +8,7 @@ from command import write
 
 import taisoft as ts
 from taisoft.mesh.solids import shell_tets
+from taisoft.output.frame_files import body_arrays
 from taisoft.output.nodal_fields import NodalMean
 from taisoft.output.usd import UsdWriter
 from taisoft.output.usd_scene import IMPULSE
@@ -16,8 +18,7 @@ from taisoft.scene.plan import make_plan
 from taisoft.scene.refine import refined, with_order
 from taisoft.settings import plan_of
 from taisoft.stability import modes
-from taisoft.view.colouring import Colouring
-from taisoft.view.scene_view import Surfaces
+from taisoft.view.colouring import NodalValues
 
 G = 9.81
 SIZE = (1.0, 0.6, 0.3)
@@ -518,7 +519,7 @@ def test_stress_is_unknown_in_rigid_bodies_and_impulses_are_left_out_of_their_us
 
     with ts.Simulator(a_block_on_a_soft_cube(), dt=1 / 100, integrator="implicit_euler") as sim:
         sim.run(seconds=0.05)
-        unknown = np.isnan(Colouring(sim.scene, Surfaces(sim.scene), "stress").values(sim))
+        unknown = np.isnan(NodalValues(sim.scene.bodies)("stress", sim))
         n = sim.scene.body("block").n_nodes
         assert unknown[:n].all() and not unknown[n:].any()
         writer = UsdWriter(tmp_path, sim.scene, 60.0)
@@ -622,6 +623,22 @@ def test_a_checkpoint_beside_soft_bodies_continues_bitwise_with_changed_numbers(
 def test_the_plan_names_the_laws_that_are_used():
     plan = plan_of(a_block_on_a_soft_cube(), "bdf2", False, False)
     assert plan.on["law:stable_neo_hookean"] and not plan.on["law:st_venant_kirchhoff"]
+
+
+def test_files_of_frames_hold_the_surface(tmp_path):
+    scene = ts.Scene()
+    scene.add_rigid_body(box(), name="tool")
+    scene.add_body(box(cells=(2, 2, 2)), ts.Material(), name="soft", position=(0, 3, 0))
+    with ts.Simulator(scene, dt=1 / 100) as sim:
+        sim.step()
+        sim.write_vtu(tmp_path / "a.vtu")
+        mesh = meshio.read(tmp_path / "a.vtu")
+        assert np.array_equal(mesh.points, sim.positions())
+        n_tets = scene.bodies[1].mesh.n_tets
+        assert [(block.type, len(block.data)) for block in mesh.cells] == [("triangle", 12), ("tetra", n_tets)]
+        arrays = body_arrays(scene)
+        assert arrays["first_tet"].tolist() == [0, 0, n_tets] and arrays["first_triangle"][1] == 12
+        assert sim.picture((64, 48)).shape == (48, 64, 3)
 
 
 SCENE = """

@@ -176,7 +176,7 @@ def test_scenes_that_a_file_cannot_store_are_refused(tmp_path):
         ts.write_scene(path, scene)
     body.constraints.clear()
     tendon = scene.add_tendon([("a", 0), ("a", 5)], lambda t: 1.0, name="line")
-    with pytest.raises(ts.SceneError, match="tendon 'line': pulls along a function, which a file cannot store: use ts.KeyFrames"):
+    with pytest.raises(ts.SceneError, match="tendon 'line': its force is a function, which a file cannot store: use ts.Key"):
         ts.write_scene(path, scene)
     scene.tendons.remove(tendon)
     scene.add_body(TURNED, ts.Material(), name="\ud800")

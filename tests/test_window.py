@@ -1,11 +1,12 @@
 """The live window, partly on a virtual display:
 
 * the cursor picks the nearest surface; the drag patch around it has weights of sum 1;
-* wires, contacts and arrows have the right places; a solver slower than real time does not delay pictures;
-* keys pause, step, restart, colour and quit; dragging beside bodies turns the view, dragging a body moves it;
-* choosing another integrator continues the run with it; plots can be shown;
+* wires, contacts and arrows have the right places;
+* keys pause, step, restart, colour, frame and quit; dragging beside bodies turns the view, dragging a body moves it;
+* choosing another integrator continues the run with it; plots can be shown, and a drag over them turns the view;
 * sliders change the run at once without compiling; a stiffer body lowers dt of explicit steps;
-* pictures are recorded; the window can be resized, made tiny, and closed in the middle of a drag.
+* pictures are written and recorded; the window can be resized, made tiny, and closed in the middle of a drag;
+* while a step takes long, the view turns.
 """
 
 import struct
@@ -17,13 +18,11 @@ from fake_simulator import FakeSimulator, beam_scene
 from test_view import body_mask, needs_vulkan
 
 from taisoft.output.camera import Camera
-from taisoft.records import StepReport
-from taisoft.view.controls import MouseDrag, nearest_hit, pick
+from taisoft.view.picking import MouseDrag, nearest_hit, pick
 from taisoft.view.scene_view import Layers
-from taisoft.view.window import Loop
 
 WATCH = """
-import os, sys
+import os, sys, time
 sys.path[:0] = [{root!r} + "/tests", {root!r}]
 os.chdir({folder!r})
 from fake_simulator import beam_scene
@@ -35,7 +34,9 @@ from taisoft.view.window import show
 
 class PrintingSimulator(ts.Simulator):
     def advance(self, n):
+        begin = time.perf_counter()
         report = super().advance(n)
+        time.sleep(max(0.0, begin + {step} - time.perf_counter()))
         x, body = self.positions()[-14], self.scene.bodies[0]
         numbers = self.dt, body.material.young, -self.scene.gravity[1], compile_clock()
         print("step", self.step_count, *x.round(4), *numbers, flush=True)
@@ -53,12 +54,13 @@ class PrintingSimulator(ts.Simulator):
 
 
 with PrintingSimulator(beam_scene(), dt={dt}, integrator={integrator!r}, draggable=True) as sim:
-    show(sim)
+    show(sim, fps=None)
     print("ended", sim.settings.integrator, sim.step_count, np.isfinite(sim.energies().total))
 print("closed")
 """
-SLIDERS = {"dt": 228, "gravity": 251, "young": 274}  # pixels from the top, with one body
-SOLVER, INTEGRATOR, USE = 411, 434, 457  # with a legend: the solver section, its integrator button, and its apply button
+SLIDERS = {"dt": 285, "gravity": 308, "young": 331}  # pixels from the top, with one body
+SOLVER, INTEGRATOR, USE = 491, 514, 537  # with a legend: the solver section, its integrator button, and its apply button
+RIGHT = 430  # of the panel
 TIP = (965, 350)  # initial pixel of the beam's end
 
 
@@ -81,8 +83,7 @@ def test_ray_hits_the_nearest_triangle():
 def test_cursor_picks_and_drags_a_body(order):
     scene = beam_scene(("one", "two"), order=order)
     sim, camera, size = FakeSimulator(scene), Camera.framing(np.array([[-2.0, -1, -1], [2, 2, 1]])), (1600, 900)
-    sim.time, calls = 1.0, []
-    sim.drag = lambda *arguments: calls.append(arguments)
+    sim.time = 1.0
     centres = sim.positions("two")[scene.bodies[1].nodes.surface].mean(axis=1)
     point = centres[np.argmin(np.linalg.norm(centres - camera.position, axis=1))]  # of a visible triangle
     across, down, _ = camera.project(point[None], size)[0]
@@ -90,20 +91,21 @@ def test_cursor_picks_and_drags_a_body(order):
     hit = pick(sim, camera, cursor, size)
     assert scene.bodies[hit.body].name == "two" and np.allclose(hit.point, point) and np.allclose(hit.weights, 1 / 3)
     drag = MouseDrag(sim, hit)
-    assert drag.weights.sum() == pytest.approx(1.0) and len(drag.nodes) >= 3
-    drag.drag(sim, camera, cursor, size, 10.0)
-    name, nodes, weights, target, stiffness = calls[0]
-    assert name == "two" and np.allclose(target, weights @ sim.positions("two")[nodes]), "without motion there is no force"
-    assert stiffness == pytest.approx(10 * 4000 * 9.81 / np.sqrt(18))
-    drag.drag(sim, camera, (cursor[0], cursor[1] + 0.1), size, 10.0)
-    moved = calls[1][3] - target
+    assert drag.body == "two" and drag.weights.sum() == pytest.approx(1.0) and len(drag.nodes) >= 3
+    target = drag.target
+    assert np.allclose(target, drag.weights @ sim.positions("two")[drag.nodes]), "without motion there is no force"
+    drag.move(camera, cursor, size)
+    assert np.allclose(drag.target, target)
+    assert drag.move(camera, (cursor[0], cursor[1] + 0.1), size)
+    assert not drag.move(camera, (cursor[0], cursor[1] + 0.1), size)
+    moved = drag.target - target
     assert moved @ camera.axes[0] == pytest.approx(0, abs=1e-9) and moved @ camera.forward == pytest.approx(0, abs=1e-9)
     assert moved @ camera.axes[1] > 0
     assert np.allclose(drag.line(sim), [point, point + moved])
     assert pick(sim, camera, (0.01, 0.99), size) is None
 
 
-# --- layers and the loop ---
+# --- layers ---
 
 
 def test_lines_of_layers():
@@ -117,7 +119,7 @@ def test_lines_of_layers():
     loaded = 2 * 2 * 2  # triangles of the end
     counts = {"wires": 3 * faces // 2, "contacts": 2, "tractions": 3 * loaded, "fixed_nodes": 0}
     for name, count in counts.items():
-        layers.shown = {other: other == name for other in counts}
+        layers.shown = {other: other == name for other in layers.shown}
         ends, colours = layers.lines(sim, camera)
         assert len(ends) == len(colours) == 2 * count <= 2 * layers.n_segments
         if name == "wires":
@@ -131,78 +133,6 @@ def test_lines_of_layers():
             assert np.allclose(np.cross(c - a, contacts.impulse[0]), 0, atol=1e-12)
 
 
-class Clock:
-    """A simulator whose steps take a given time of its own clock."""
-
-    def __init__(self, dt, seconds_per_step):
-        self.dt, self.seconds_per_step, self.now, self.step_count, self.calls = dt, seconds_per_step, 0.0, 0, []
-        self.compile_seconds = 0.0
-
-    def advance(self, n):
-        self.calls.append(n)
-        self.step_count += n
-        self.now += n * self.seconds_per_step
-        return StepReport(time=self.step_count * self.dt, steps=n)
-
-
-@pytest.mark.parametrize(
-    "dt, seconds_per_step, steps_per_picture, slowdown",
-    [
-        (1 / 60, 0.001, 1.0, 0.0),
-        (1 / 600, 0.0001, 10.0, 0.0),
-        (0.05, 0.001, 1 / 3, 0.0),
-        (1e-4, 1e-3, 17.0, 10.0),
-        (1 / 60, 0.5, 1.0, 30.0),
-    ],
-)
-def test_slow_solver_does_not_delay_pictures(monkeypatch, dt, seconds_per_step, steps_per_picture, slowdown):
-    sim = Clock(dt, seconds_per_step)
-    monkeypatch.setattr("time.perf_counter", lambda: sim.now)
-    loop = Loop(sim, 60.0, False)
-    for k in range(120):
-        start = sim.now
-        loop.advance()
-        if k > 60:
-            assert sim.now - start < max(1.05 / 60, 1.01 * seconds_per_step)
-        sim.now = max(sim.now, start + 1 / 60)
-        loop.speed()
-        if k == 59:
-            half = sim.step_count
-    assert (sim.step_count - half) / 60 == pytest.approx(steps_per_picture, rel=0.1)
-    status = loop.lines()[0]
-    assert status == "running" if slowdown == 0 else f"needs {slowdown:.1f} times real time" in status
-
-
-def test_rebuild_starts_after_a_picture_announced_it():
-    sim = Clock(1 / 60, 1e-3)
-    loop, built = Loop(sim, 60.0, False), []
-    for _ in range(5):
-        loop.advance()
-    count, results = sim.step_count, [False, True]
-    assert count > 0 and loop.lines() == ["running"]
-
-    def build():
-        built.append(sim.step_count)
-        return results.pop(0)
-
-    for succeeds in (False, True):
-        loop.request_rebuild(build, "it is built")
-        loop.react(set())
-        loop.advance()
-        assert loop.lines()[1] == "it is built" and len(built) == int(succeeds) and sim.step_count == count
-        loop.react(set())
-        assert len(built) == 1 + int(succeeds)
-        assert (loop.lines()[0] == "compiling the next step, for some seconds") == succeeds
-        if not succeeds:
-            loop.advance()
-            count = sim.step_count
-    for _ in range(2):
-        loop.advance()
-        assert sim.step_count == count, "pictures that announce the compilation come first"
-    loop.advance()
-    assert sim.step_count > count and loop.lines()[0] == "running"
-
-
 # --- the window ---
 
 
@@ -212,11 +142,11 @@ def opened(tmp_path):
         pytest.skip(f"a virtual display needs {', '.join(TOOLS)} (Debian: xvfb, xdotool, imagemagick)")
     made = []
 
-    def start(dt=1 / 60, integrator="implicit_euler"):
-        code = WATCH.format(root=str(ROOT), folder=str(tmp_path), dt=dt, integrator=integrator)
+    def start(dt=1 / 60, integrator="implicit_euler", step=0.0):
+        code = WATCH.format(root=str(ROOT), folder=str(tmp_path), dt=dt, integrator=integrator, step=step)
         desktop = Desktop(tmp_path, code)
         made.append(desktop)
-        desktop.wait_for(lambda: steps(desktop) >= 3, "running simulation")
+        desktop.wait_for(lambda: steps(desktop) >= 2, "running simulation")
         desktop.tool("xdotool", "search", "--sync", "--name", "taisoft", "windowmove", "0", "0", "windowfocus")
         return desktop
 
@@ -254,26 +184,43 @@ def test_keys_and_mouse(opened, tmp_path):
         before = steps(desktop)
         press(desktop, key, lambda at=before: steps(desktop) == at + 1, f"single step {k}")
     screen = desktop.picture()
-    mask = body_mask(screen[:, 400:])  # right of the panel
+    mask = body_mask(screen[:, RIGHT:])  # right of the panel
     assert mask.mean() > 0.05, "the beam is visible"
-    assert (screen[60:200, 30:300] > 200).any(), "the panel's text is visible"
+    assert (screen[60:160, 30:300] > 200).any(), "the panel's text is visible"
     desktop.tool("xdotool", "key", "v")
-    desktop.wait_for(lambda: np.abs(desktop.picture()[:, 400:].astype(int) - screen[:, 400:]).max() > 60, "change of colours")
+    desktop.wait_for(lambda: np.abs(desktop.picture()[:, RIGHT:].astype(int) - screen[:, RIGHT:]).max() > 60, "change of colours")
 
     def turn():
-        desktop.drag((900, 650), (-150, 50), 0.3)
+        desktop.drag((1000, 650), (-150, 50), 0.3)
         desktop.tool("xdotool", "mouseup", "1")
 
-    desktop.repeat(turn, lambda: np.mean(body_mask(desktop.picture()[:, 400:]) != mask) > 0.02, "turned view")
+    desktop.repeat(turn, lambda: np.mean(body_mask(desktop.picture()[:, RIGHT:]) != mask) > 0.02, "turned view")
     assert is_paused(desktop)
     plain = desktop.picture()
     desktop.tool("xdotool", "key", "w")
-    desktop.wait_for(lambda: np.mean((plain[:, 400:] > desktop.picture()[:, 400:].astype(int) + 40).any(axis=2)) > 0.003, "wires")
-    press(desktop, "p", lambda: len(list(tmp_path.glob("out/window-1/*.png"))) > 1, "recorded pictures")
+    desktop.wait_for(
+        lambda: np.mean((plain[:, RIGHT:] > desktop.picture()[:, RIGHT:].astype(int) + 40).any(axis=2)) > 0.003, "wires"
+    )
+    press(desktop, "i", lambda: (tmp_path / "out/window-1.png").is_file(), "picture")
+    press(desktop, "p", lambda: len(list(tmp_path.glob("out/window-2/*.png"))) > 1, "recorded pictures")
     desktop.tool("xdotool", "key", "p")
-    assert struct.unpack(">II", (tmp_path / "out/window-1/00000.png").read_bytes()[16:24]) == (1280, 720)
+    assert struct.unpack(">II", (tmp_path / "out/window-2/00000.png").read_bytes()[16:24]) == (1280, 720)
     press(desktop, "g", lambda: n_plots(desktop) == 4, "plots")
+    view = desktop.picture()[400:, RIGHT:1000]
+    desktop.drag((1150, 100), (-100, 50), 0.3)
+    desktop.wait_for(lambda: n_plots(desktop) == 0, "view without plots while it is turned over them")
+    assert np.mean(body_mask(desktop.picture()[400:, RIGHT:1000]) != body_mask(view)) > 0.01, "the view turned"
+    desktop.tool("xdotool", "mouseup", "1")
+    desktop.wait_for(lambda: n_plots(desktop) == 4, "plots again")
     press(desktop, "g", lambda: n_plots(desktop) == 0, "no plots")
+    near = body_mask(desktop.picture()[:, RIGHT:]).mean()
+
+    def zoom_out():
+        desktop.drag((1000, 400), (0, 200), 0.3, button=3)
+        desktop.tool("xdotool", "mouseup", "3")
+
+    desktop.repeat(zoom_out, lambda: body_mask(desktop.picture()[:, RIGHT:]).mean() < 0.1 * near, "distant beam")
+    press(desktop, "h", lambda: body_mask(desktop.picture()[:, RIGHT:]).mean() > 0.25 * near, "framed beam")
     press(desktop, "r", lambda: desktop.printed().count("reset") == 1, "restart")
     press(desktop, "space", lambda: not is_paused(desktop), "resumed run")
     choose_the_next_integrator(desktop)
@@ -281,7 +228,7 @@ def test_keys_and_mouse(opened, tmp_path):
         desktop.tool("xdotool", "search", "--name", "taisoft", "windowsize", str(width), str(height))
         before = steps(desktop)
         desktop.wait_for(lambda at=before: steps(desktop) > at + 2, f"steps in a window of {width} x {height}")
-    desktop.wait_for(lambda: body_mask(desktop.picture()[:, 400:]).mean() > 0.03, "beam in a resized window")
+    desktop.wait_for(lambda: body_mask(desktop.picture()[:, RIGHT:]).mean() > 0.03, "beam in a resized window")
     quit_window(desktop)
     assert desktop.last("ended")[1] == "bdf2" and desktop.last("ended")[3] == "True"
 
@@ -297,9 +244,8 @@ def n_plots(desktop):
 def choose_the_next_integrator(desktop):
     """Open the solver section of the panel and choose bdf2, which follows implicit_euler; the run continues."""
     desktop.repeat(lambda: hold(desktop, 32, SOLVER), lambda: bright(desktop, INTEGRATOR), "section of the solver")
-    for height in (INTEGRATOR, USE):
-        hold(desktop, 60, height)
-    desktop.wait_for(lambda: desktop.last("rebuilt"), "other integrator")
+    desktop.repeat(lambda: hold(desktop, 60, INTEGRATOR), lambda: bright(desktop, USE), "button that applies the choice")
+    desktop.repeat(lambda: hold(desktop, 60, USE), lambda: desktop.last("rebuilt"), "other integrator")
     _, name, count, same = desktop.last("rebuilt")
     assert name == "bdf2" and same == "same"
     desktop.wait_for(lambda: steps(desktop) > int(count) + 2, "steps after the rebuild")
@@ -342,10 +288,22 @@ def test_dragging_and_sliders(opened):
     desktop.repeat(drag, lambda: numbers(desktop)[1] > before[1] + 0.3, "dragged beam")
     desktop.tool("xdotool", "mouseup", "1")
     desktop.wait_for(lambda: numbers(desktop)[1] < before[1] + 0.2, "beam that springs back")
-    desktop.repeat(lambda: click(desktop, 225, SLIDERS["young"]), lambda: numbers(desktop)[4] > 2e6, "stiffer beam")
+    desktop.repeat(lambda: click(desktop, 262, SLIDERS["young"]), lambda: numbers(desktop)[4] > 2e6, "stiffer beam")
     stiff = numbers(desktop)
     assert stiff[3] < 4e-3, "below the explicit limit"
     desktop.repeat(lambda: click(desktop, 60, SLIDERS["dt"]), lambda: numbers(desktop)[3] < 0.5 * stiff[3], "shorter steps")
     assert numbers(desktop)[-1] == compiled, "nothing is compiled"
     desktop.drag((640, 650), (0, -20))  # closed while a button is pressed
+    quit_window(desktop)
+
+
+@needs_vulkan
+def test_the_view_turns_during_a_step(opened):
+    desktop = opened(step=4.0)
+    before = steps(desktop)
+    desktop.wait_for(lambda: steps(desktop) > before, "beginning of a step")
+    begun, mask = steps(desktop), body_mask(desktop.picture()[:, RIGHT:])
+    desktop.drag((1000, 650), (-150, 50), 0.2)
+    assert np.mean(body_mask(desktop.picture()[:, RIGHT:]) != mask) > 0.02, "turned view"
+    assert steps(desktop) == begun, "during the same step"
     quit_window(desktop)

@@ -145,7 +145,8 @@ def _parser() -> argparse.ArgumentParser:
 
     _add_run(add)
     option = add("scene", ("files", "scene"), "write a scene, or a starting scene for a mesh, as a .toml file").add_argument
-    _add_scene_name(option, "a .toml or .py file, or a mesh (.msh, .vtu, .vtk, .mesh, .node) that falls on the ground")
+    _add_scene_name(option, "a .toml or .py file, or a mesh (.msh, .vtu, .vtk, .mesh, .node, USD) that falls on the ground")
+    _add_placement(option, "instead of falling from above the ground")
     option("--out", metavar="FILE", required=True, help="the .toml file; its meshes are written beside it")
     option("--overwrite", action="store_true", help="replace existing files")
 
@@ -153,14 +154,15 @@ def _parser() -> argparse.ArgumentParser:
     add("list", ("scene_file", "list_demos"), "the demos, one line each")
 
     option = add("info", ("files", "info"), "report a mesh file's counts, size, quality and problems").add_argument
-    option("mesh", metavar="MESH", help="tetrahedra in any format that meshio reads, or a surface")
+    option("mesh", metavar="MESH", help="tetrahedra in any format that meshio reads, a surface, or a USD stage")
 
     option = add("tetrahedralize", ("files", "fill"), "fill a surface with tets (extra 'mesh')").add_argument
     option("surface", metavar="SURFACE", help="an .obj, .stl, .ply or .off file of triangles")
+    _add_placement(option)
     option("--out", metavar="MESH", required=True, help="the mesh file: .msh, .vtk, .vtu or .mesh")
     option("--edge-length", type=float, metavar="L", help="of the tets [m] (default: a twentieth of the diagonal)")
     option("--envelope", type=float, metavar="E", help="how far the surface may move [m] (default: L / 10)")
-    option("--weld", type=float, default=0.0, metavar="D", help="merge vertices at most this far apart [m]")
+    option("--weld", type=float, default=0.0, metavar="D", help="merge vertices at most this far apart, in the file's unit")
     option("--overwrite", action="store_true", help="replace MESH if it exists")
 
     add("doctor", ("doctor", "doctor"), "report what this machine offers, and how to get what is missing")
@@ -207,16 +209,27 @@ def _add_run(add) -> None:
     every = "write DIR/checkpoint.npz every T of simulated time [s], not only at the end"
     option("--checkpoint-every", type=float, metavar="T", help=every)
     option("--video", action="store_true", help="also make video.mp4 from the pictures with ffmpeg (extra 'video')")
+    option("--vtu", action="store_true", help="also write every frame as a .vtu file, and scene.pvd, which ParaView opens")
+    option("--npz", action="store_true", help="also write the nodes of every frame as a .npz file")
     option("--no-usd", action="store_true", help="write no scene.usdc")
     option("--error", action="store_true", help="estimate the error by runs with other steps and tolerances beside this one")
     option("--error-mesh", choices=("refined", "order"), help="also by one on another mesh; implies --error")
     colours = ("body", "stress", "stretch", "speed", "error")
     option("--colour", choices=colours, default="body", help="colouring of bodies in pictures and the window")
-    layers = "what they show besides bodies: wires, contacts, tractions, fixed_nodes, or none"
+    layers = "what they show besides bodies: wires, contacts, tractions, pressures, connections, fixed_nodes, or none"
     option("--layers", metavar="NAME,...", help=layers)
     option("--plots", metavar="NAME,...", help="plots over time: energies, residuals, iterations, contacts, step_time, error")
     option("--caption", action="store_true", help="write scene, frame, time and energies on pictures")
     option("--no-frames", action="store_true", help="write no pictures")
+
+
+def _add_placement(option, instead: str = "(default: the mesh stays)") -> None:
+    """Add the options that place a mesh, in the order in which they are applied; those that are not given are None."""
+    option("--up", choices=("x", "y", "z"), help="axis of the file that points up (default y)")
+    option("--scale", type=float, metavar="S", help="factor, such as 0.001 for millimetres (default 1)")
+    angles = "angles [deg] about x, then y, then z, after --up (default 0 0 0)"
+    option("--rotate", type=float, nargs=3, metavar=("RX", "RY", "RZ"), help=angles)
+    option("--at", type=float, nargs=3, metavar=("X", "Y", "Z"), help=f"where the middle of its underside goes [m] {instead}")
 
 
 def _add_study(add) -> None:

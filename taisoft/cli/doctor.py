@@ -17,7 +17,8 @@ from taisoft import __version__
 
 REQUIRED = ("taichi", "numpy", "scipy", "meshio", "usd-core", "networkx", "rich")
 # package -> the extra that installs it; only benchmarks use other programs, only studies use a cluster
-OPTIONAL = {"mujoco": "peers", "pybullet": "peers", "newton": "peers", "matplotlib": "plot", "distributed": "cluster"}
+OPTIONAL = {"mujoco": "peers", "pybullet": "peers", "newton": "peers"}
+OPTIONAL |= {"matplotlib": "plot", "viser": "notebook", "distributed": "cluster"}
 VULKAN_PROBE = "from taichi._lib import core; print('vulkan', core.with_vulkan())"
 PROBE_SECONDS = 60.0  # loading Taichi from a cold disk takes several seconds
 

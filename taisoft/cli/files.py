@@ -10,12 +10,14 @@ import numpy as np
 
 from taisoft.cli import Signals, printed_warnings
 from taisoft.cli.scene_file import load_scene
-from taisoft.errors import OutputError
+from taisoft.errors import OutputError, SceneError
 from taisoft.mesh.files import WRITERS, check_ending, read_mesh, write_mesh
+from taisoft.mesh.placing import place, underside
 from taisoft.mesh.quality import edge_lengths, mean_ratio
 from taisoft.mesh.surface_mesh import FORMATS, SurfaceMesh, read_surface, tetrahedralize
 from taisoft.mesh.tet_mesh import TetMesh
 from taisoft.mesh.topology import connected_pieces
+from taisoft.mesh.usd import USD_FORMATS, read_usd
 from taisoft.scene.material import Material
 from taisoft.scene.obstacles import HalfSpace
 from taisoft.scene.scene import Scene
@@ -30,6 +32,7 @@ DENSITY = 1000.0  # [kg/m^3]
 GROUND = "ground"
 MAX_REGIONS = 20  # listed by name
 MAX_CAVITIES = 5  # listed by volume
+PLACEMENT = ("up", "scale", "rotate")  # options and arguments of `place`, without at
 MESH_SUFFIXES = (*WRITERS, ".node", ".ele")
 
 
@@ -37,11 +40,15 @@ def info(arguments: Namespace) -> int:
     """Print counts, size, likely unit, quality and problems. Raises MeshError if the file is not a mesh."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # they are listed as problems below
-        if Path(arguments.mesh).suffix.lower() in FORMATS:
-            lines = _describe_surface(read_surface(arguments.mesh))
+        ending = Path(arguments.mesh).suffix.lower()
+        if ending in FORMATS:
+            found = {arguments.mesh: _describe_surface(read_surface(arguments.mesh))}
+        elif ending in USD_FORMATS:
+            found = {f"{arguments.mesh}: {name}": describe(mesh) for name, mesh in read_usd(arguments.mesh).items()}
         else:
-            lines = describe(read_mesh(arguments.mesh))
-    _print_lines(arguments.mesh, lines)
+            found = {arguments.mesh: describe(read_mesh(arguments.mesh))}
+    for title, lines in found.items():
+        _print_lines(title, lines)
     return 0
 
 
@@ -54,7 +61,7 @@ def fill(arguments: Namespace) -> int:
     if not out.parent.is_dir():
         raise OutputError(f"{out}: there is no folder {out.parent}")
     with Signals(), printed_warnings():
-        surface = read_surface(arguments.surface, weld=arguments.weld)
+        surface = place(read_surface(arguments.surface, weld=arguments.weld), **_given(arguments, *PLACEMENT, "at"))
         mesh = tetrahedralize(surface, arguments.edge_length, arguments.envelope)
         write_mesh(out, mesh)
     _print_lines(out, describe(mesh))
@@ -65,13 +72,23 @@ def scene(arguments: Namespace) -> int:
     """Write the scene file and the files it needs, and print their names. Raises SceneError if no file can hold the scene."""
     path = Path(arguments.scene)
     with printed_warnings():
-        if path.suffix.lower() in MESH_SUFFIXES:
-            made, solver = _drop_scene(read_mesh(path), path.stem)
+        placed = _given(arguments, *PLACEMENT)
+        if path.suffix.lower() in (*MESH_SUFFIXES, *USD_FORMATS):
+            meshes = read_usd(path) if path.suffix.lower() in USD_FORMATS else {path.stem: read_mesh(path)}
+            made, solver = _drop_scene({name: place(mesh, **placed) for name, mesh in meshes.items()}, arguments.at)
+        elif placed or arguments.at is not None:
+            options = ", ".join(f"--{name}" for name in (*PLACEMENT, "at"))
+            raise SceneError(f"{arguments.scene}: {options} place a mesh, and this is a scene")
         else:
             made, solver = load_scene(arguments.scene, arguments.allow_outside)
     for written in write_scene(arguments.out, made, solver, arguments.overwrite):
         print(written)
     return 0
+
+
+def _given(arguments: Namespace, *names: str) -> dict:
+    """Return the options of these names that are given."""
+    return {name: getattr(arguments, name) for name in names if getattr(arguments, name) is not None}
 
 
 def describe(mesh: TetMesh) -> list[tuple[str, str]]:
@@ -131,15 +148,17 @@ def _pieces(number: int) -> str:
 
 
 def _size_lines(counts: str, vertices: np.ndarray) -> list[tuple[str, str]]:
-    """Return counts, bounding box, and a guess of the unit; taisoft itself reads every file as metres."""
+    """Return counts, extent along each axis, and a guess of the unit; taisoft itself reads every file as metres, y up."""
     low, high = vertices.min(axis=0), vertices.max(axis=0)
-    box, longest = [_triple(values) for values in (low, high, high - low)], float((high - low).max())
+    extents = [f"{axis} {h - l:.5g} ({l:.5g} to {h:.5g})" for axis, l, h in zip("xyz", low, high)]
+    longest = float((high - low).max())
     unit = f"metres, probably (longest side {longest:.4g} m)"
     if longest > MILLIMETRES_ABOVE:
-        unit = f"read as metres, the longest side is {longest:.4g} m; probably millimetres: scale by 0.001"
+        unit = f"read as metres, the longest side is {longest:.4g} m; probably millimetres: --scale 0.001"
     elif longest < TINY_BELOW:
         unit = f"read as metres, the longest side is {longest:.4g} m; very small: is the file scaled?"
-    return [("counts", counts), ("box", f"{box[0]} to {box[1]}, size {box[2]}"), ("unit", unit)]
+    up = "y is taken for up; tetrahedralize and scene have --up, --scale, --rotate and --at"
+    return [("counts", counts), ("extent", ", ".join(extents)), ("axes", up), ("unit", unit)]
 
 
 def _edge_line(lengths: np.ndarray) -> tuple[str, str]:
@@ -160,14 +179,20 @@ def _print_lines(title, lines: list[tuple[str, str]]) -> None:
         print(f"  {name:<10} {text}")
 
 
-def _drop_scene(mesh: TetMesh, name: str) -> tuple[Scene, dict]:
-    """Return a scene in which the mesh, of rubber with stiffness scaled to its size, falls on the ground; and its solver dict."""
+def _drop_scene(meshes: dict[str, TetMesh], at: list[float] | None) -> tuple[Scene, dict]:
+    """Return a scene in which meshes, of rubber with stiffness scaled to their size, fall on the ground; and its solver dict.
+
+    meshes: by name, as they stand to each other. at: (3,) [m], where the middle of their underside starts; None: above the
+    ground.
+    """
     made = Scene(gravity=(0.0, -9.81, 0.0))
-    low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
-    height = float((high - low)[1])
+    vertices = np.concatenate([mesh.vertices for mesh in meshes.values()])
+    height = float(np.ptp(vertices[:, 1]))
+    position = (0.0, DROP * height - vertices[:, 1].min(), 0.0) if at is None else at - underside(vertices)
     young = float(f"{RELATIVE_STIFFNESS * DENSITY * 9.81 * height:.0e}")  # one digit
     rubber = Material(young=young, poisson=0.4, density=DENSITY, friction=0.5)
-    made.add_body(mesh, rubber, name="body" if name == GROUND else name, position=(0.0, DROP * height - float(low[1]), 0.0))
+    for name, mesh in meshes.items():
+        made.add_body(mesh, rubber, name="body" if name == GROUND else name, position=position)
     made.add_obstacle(HalfSpace((0.0, 0.0, 0.0), (0.0, 1.0, 0.0)), name=GROUND, friction=0.5)
     fall = math.sqrt(2.0 * DROP * height / 9.81)  # [s]
     fps = 50.0 if fall > 0.05 else float(np.ceil(2.5 / fall))

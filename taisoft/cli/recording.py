@@ -12,7 +12,9 @@ from pathlib import Path
 from taisoft.errors import OutputError, SceneError
 from taisoft.estimation.forecast import describe_error
 from taisoft.frames import dt_sentence
-from taisoft.output.files import RESULT_FILES, CheckpointWriter, OutputFolder
+from taisoft.output.files import RESULT_FILES, RESULT_FOLDERS, CheckpointWriter, OutputFolder
+from taisoft.output.frame_files import NPZ_NAME, VTU_NAME, NpzWriter, VtuWriter, cut_pvd
+from taisoft.output.frame_table import FrameTable
 from taisoft.output.frames import FRAMES_NAME, FrameWriter, ffmpeg_command, find_ffmpeg, picture_numbers, write_video
 from taisoft.output.report import body_records, write_report
 from taisoft.output.usd import UsdWriter
@@ -32,12 +34,15 @@ MOST = 0.5  # fraction of a run's wall time above which the summary says what pi
 class DisplayOptions:
     """colour: as in `Offscreen`; layers: names, or None for the defaults; plots: names; caption: the scene's name, or None.
 
-    window, pictures, usd: whether there is a window, and what is written to the folder; errors: whether they are estimated.
+    window, pictures, usd, vtu, npz: whether there is a window, and what is written to the folder; errors: whether they are
+    estimated.
     """
 
     window: bool
     pictures: bool
     usd: bool
+    vtu: bool
+    npz: bool
     colour: str
     layers: tuple[str, ...] | None
     plots: tuple[str, ...]
@@ -65,6 +70,9 @@ def display_options(arguments: Namespace, has_window: bool) -> DisplayOptions:
     for option, given in requested.items():
         if given and not pictures:
             raise SceneError(f"--{option} needs --out, the folder to write to, and pictures, so it excludes --no-frames")
+    for option, given in {"vtu": arguments.vtu, "npz": arguments.npz}.items():
+        if given and arguments.out is None:
+            raise SceneError(f"--{option} needs --out, the folder to write to")
     if pictures and (plots or arguments.caption) and text_missing():
         raise SceneError(f"{'--plots' if plots else '--caption'}: {text_missing()}")
     caption = Path(arguments.scene).stem if arguments.caption else None
@@ -72,7 +80,8 @@ def display_options(arguments: Namespace, has_window: bool) -> DisplayOptions:
     for option, given in {"colour": arguments.colour == "error", "plots": "error" in plots}.items():
         if given and not errors:
             raise SceneError(f"--{option} error needs --error")
-    return DisplayOptions(has_window, pictures, not arguments.no_usd, arguments.colour, layers, plots, caption, errors)
+    files = pictures, not arguments.no_usd, arguments.vtu, arguments.npz
+    return DisplayOptions(has_window, *files, arguments.colour, layers, plots, caption, errors)
 
 
 def _names(option: str, text: str | None, known) -> tuple[str, ...] | None:
@@ -135,7 +144,7 @@ class Observers:
 
 
 class Recording:
-    """Results of a run in one folder: report.json, steps.csv, checkpoint.npz and, if requested, frames/ and scene.usdc.
+    """Results of a run in one folder: report.json, steps.csv, checkpoint.npz and, if requested, pictures, USD, .vtu and .npz.
 
     resumed: for a resumed run, the `checkpoint`, its `time` [s] and the first `frame`; earlier results in the folder are
     continued. every: simulated time between two checkpoints [s]; None for one at the end. notes: those of the checkpoint of
@@ -152,9 +161,9 @@ class Recording:
         self._checkpoints = CheckpointWriter(self._folder.path, every, None if resumed is None else resumed["checkpoint"])
 
     def add_writers(self, observers: Observers, sim, fps: float | None, shown: DisplayOptions, plots: Plots | None) -> None:
-        """Add the writers of frames, USD and checkpoints to the observers.
+        """Add the writers of pictures, USD, .vtu, .npz and checkpoints to the observers.
 
-        A resumed run that does not match the earlier USD file is refused before anything is removed.
+        A resumed run that does not match the earlier files is refused before anything is removed.
         """
         folder = self._folder.path
         if shown.usd:
@@ -163,8 +172,17 @@ class Recording:
             usd = UsdWriter(folder, sim.scene, **numbers)
             observers.members.append(usd)
             self._checkpoints.before.append(usd.flush)
+        if FrameTable.needed(sim.scene):
+            table = FrameTable(folder, sim.scene, self._first or 0)
+            observers.members.append(table)
+            self._checkpoints.before.append(table.flush)
         if self._first is not None:
+            cut_pvd(folder, self._first)
             self._folder.clear(self._first)
+        if shown.vtu:
+            observers.members.append(VtuWriter(folder, sim.scene, self._first or 0, shown.errors))
+        if shown.npz:
+            observers.members.append(NpzWriter(folder, sim.scene))
         drawing = annotate = None
         if shown.pictures:
             drawing = Offscreen(sim.scene, colour=shown.colour, layers=shown.in_pictures)
@@ -211,11 +229,12 @@ class Recording:
         self._folder.discard_stale()
 
     def files(self) -> list[str]:
-        """Return the contents of the folder: one text per file and one for all pictures."""
+        """Return the contents of the folder: one text per file, and one for each folder of frames."""
         paths = [path for path in (self.path / name for name in RESULT_FILES) if path.is_file()]
         found = [f"{path} ({_size([path])})" for path in paths]
-        if pictures := list((self.path / FRAMES_NAME).glob("*.png")):
-            found.append(f"{self.path / FRAMES_NAME}/ ({len(pictures)} pictures, {_size(pictures)})")
+        for name, what in ((FRAMES_NAME, "pictures"), (VTU_NAME, "files"), (NPZ_NAME, "files")):
+            if files := list((self.path / name).glob(RESULT_FOLDERS[name])):
+                found.append(f"{self.path / name}/ ({len(files)} {what}, {_size(files)})")
         return found
 
     def close(self) -> None:

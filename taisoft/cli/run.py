@@ -219,7 +219,7 @@ def _show_window(sim: Simulator, settings: RunSettings, shown: DisplayOptions) -
     """Show the live window until it is closed."""
     from taisoft.view.window import show
 
-    show(sim, fps=settings.fps or 1.0 / sim.dt, colour=shown.colour, layers=shown.in_window, plots=shown.plots)
+    show(sim, fps=settings.fps, colour=shown.colour, layers=shown.in_window, plots=shown.plots)
     print_state(sim)
     return 0
 
@@ -240,7 +240,7 @@ def _run(sim, settings: RunSettings, arguments, signals, warned: list[str], save
         if shown.window:
             from taisoft.view.window import LiveWindow
 
-            observers.members.append(LiveWindow(sim.scene, plots, colour=shown.colour, layers=shown.in_window))
+            observers.members.append(LiveWindow(sim, plots, colour=shown.colour, layers=shown.in_window))
         if recording is not None:
             recording.add_writers(observers, sim, settings.fps, shown, plots)
         observers.members.append(Progress(settings.seconds, label=Path(arguments.scene).stem))

@@ -22,6 +22,7 @@ from taisoft.backend.arrays import Count, FieldArena
 from taisoft.backend.runtime import kernel
 from taisoft.collision.candidates import Parts
 from taisoft.collision.surface import cell_of, dvec, ivec
+from taisoft.display import short_repr
 
 # kinds of contacts; their two ids are: vertex and triangle; edge and edge (3 triangle + local edge); vertex and collider;
 # triangle and collider; a passage (`passages`)
@@ -67,6 +68,8 @@ class Contacts:
     restitution: np.ndarray  #: (k,) of the pair
     found: int  #: contacts before the reduction
     unmapped: int  #: triangles whose tet is inverted, so that a distance field could not be used
+
+    __repr__ = short_repr
 
     def __len__(self) -> int:
         return len(self.gap)
@@ -150,15 +153,17 @@ def gather_contacts(
             integers[i, q] = out.body[at][q]
 
 
-def gather(out: ContactFields, index: Any, n: int) -> tuple[np.ndarray, np.ndarray]:
+def gather(out: ContactFields, index: Any, n: int, ordered: bool = True) -> tuple[np.ndarray, np.ndarray]:
     """Download the contacts at the buffer indices index[:n], in order of colliders and feature: an order independent of threads
-    and chunks, so that a solver meets the same one in the next step.
+    and chunks, so that a solver meets the same one in the next step. ordered: False, in that of `index`.
 
     Returns (n,13) point, normal, weights (6) and gap; (n,11) colliders (2), feature (3), nodes (6).
     """
     floats, integers = np.zeros((n, 13)), np.zeros((n, 11), dtype=np.int32)
     if n:
         gather_contacts(out, index, n, floats, integers)
+    if not ordered:
+        return floats, integers
     order = np.lexsort(integers[:, 4::-1].T)
     return floats[order], integers[order]
 

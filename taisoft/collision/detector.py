@@ -246,11 +246,18 @@ class Detection:
     def contacts(self) -> Contacts:
         """Return the contacts of the last search, with impulses 0."""
         floats, integers = gather(self.buffer.data, self._reduction.kept, self._reduction.count[LEFT])
-        nodes, none = integers[:, 5:], np.zeros((len(floats), 3))
-        nodes = np.where(nodes >= 0, np.append(self.topology.node, -1)[nodes], -1)
-        weights = np.where(nodes >= 0, floats[:, 6:12], 0.0)
+        none, (nodes, weights) = np.zeros((len(floats), 3)), self._sides(floats, integers)
         geometry = (x.copy() for x in (floats[:, :3], floats[:, 3:6], floats[:, 12]))
         return self.record(*geometry, none, integers[:, :2], integers[:, 2:5], nodes, weights)
+
+    def _sides(self, floats: np.ndarray, integers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Nodes and weights (k,6) of contacts, three of each side, from rows of the buffer; -1 where there is none."""
+        nodes = np.where(integers[:, 5:] >= 0, np.append(self.topology.node, -1)[integers[:, 5:]], -1)
+        return nodes, np.where(nodes >= 0, floats[:, 6:12], 0.0)
+
+    def sides(self, n: int) -> tuple[np.ndarray, np.ndarray]:
+        """Nodes and weights (n,6) of the first n kept contacts of the last search, before dependent ones are replaced."""
+        return self._sides(*gather(self.buffer.data, self._reduction.kept, n, ordered=False))
 
     def record(self, point, normal, gap, impulse, body, feature, nodes, weights) -> Contacts:
         """Return a record of contact arrays (k, ...), with collider names, friction and restitution. body: (k,2) colliders."""

@@ -72,6 +72,8 @@ def find_overlaps(detection: "Detection") -> list[Overlap]:
         owner, origin, rotation = download([detection.shapes.body, detection.shapes.origin, detection.shapes.rotation])
         for a, k in np.ndindex(n_bodies, len(owner)):
             b, frame = int(owner[k]), (origin[k], rotation[3 * k : 3 * k + 3])
+            if attached[a, b]:
+                continue
             if isinstance(colliders[b].shape, HalfSpace):
                 update_depth(a, b, -float((solids[a].vertices - frame[0]).dot(frame[1][:, 1]).min()))
             elif isinstance(colliders[b].shape, (Sphere, Capsule)):  # boxes are handled as solids

@@ -13,6 +13,7 @@ from taisoft.contact import SOLVERS, augmented_lagrangian
 from taisoft.contact.colouring import colour_greedy, matrix_graph, store
 from taisoft.contact.problem import ContactProblem, build_matrix_problem, fill_matrix_problem
 from taisoft.contact.solve import solve
+from taisoft.display import short_repr
 from taisoft.errors import SceneError
 from taisoft.scene.checks import array, choice, number
 
@@ -35,6 +36,8 @@ class ContactSolution:
     residual_history: list[float]
     iterations: int
     converged: bool
+
+    __repr__ = short_repr
 
 
 def solve_contact_problem(

@@ -29,7 +29,7 @@ from taisoft.dynamics.contact_measures import (
     Crossing,
 )
 from taisoft.dynamics.contact_paths import ContactPaths
-from taisoft.dynamics.contact_record import read_rows, record_contacts, sum_impulses, sum_moments, write_rows
+from taisoft.dynamics.contact_record import distribute, read_rows, record_contacts, sum_impulses, sum_moments, write_rows
 from taisoft.dynamics.impact import Rebounds
 from taisoft.dynamics.simulation_state import SimulationState
 from taisoft.errors import SimulationError
@@ -80,6 +80,7 @@ class ContactStep:
         self._impulse_sum: np.ndarray | None = None  # (n_colliders, 6) over the last step's substeps, if several: see `_impulses`
         self._step_dt = 0.0  # of the last step [s]
         self._impulse_fraction = 1.0
+        self._own_sides: tuple[np.ndarray, np.ndarray] | None = None  # nodes of contacts before dependent ones were replaced
         self.had_impact = False  # whether surfaces met in the last step
         self.dropped = 0  # triangles of the last step under an inverted tet, for which a distance field gives no contacts
 
@@ -202,6 +203,7 @@ class ContactStep:
         keep_impulses(p)
         warm = dt / self._last_time if self._last_time > 0.0 else 0.0
         fill(p, m, d.surface, d.shapes, self.numbers, d.buffer.data, d.kept, n, dt, warm)
+        self._own_sides = d.sides(n) if m.has_dependents else None
         if n or self._indexed:  # an empty index needs no update
             index_nodes(p)
             self._indexed = n > 0
@@ -258,6 +260,16 @@ class ContactStep:
         """Return the mean contact force [N] on a collider over the last step, and its moment about the origin [N m], (6,)."""
         total = self._impulses() if self._impulse_sum is None else self._impulse_sum
         return total[collider] / self._step_dt if self._step_dt > 0.0 else np.zeros(6)
+
+    def own_forces(self) -> np.ndarray:
+        """Return the contact forces of the last substep on the nodes that touch, dependent ones too, (n_nodes, 3) [N].
+
+        Known only in scenes with dependent nodes, and not after a checkpoint was loaded; else 0.
+        """
+        n, found = self.simulation.model.n_nodes, self.contacts()
+        if self._own_sides is None or len(self._own_sides[0]) != len(found) or self._last_time == 0.0:
+            return np.zeros((n, 3))
+        return distribute(found.impulse, *self._own_sides, n) * self._impulse_fraction / self._last_time
 
     def penetrates_deeper(self, time: float, dt: float, before: float) -> bool:
         """Return whether a substep of dt that ends at a time leaves a new or deeper penetration.

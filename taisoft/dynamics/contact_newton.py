@@ -199,8 +199,8 @@ def solve(system: StageSystem, stage: Stage) -> StageResult:
     """
     fresh = system.begin(stage)
     if system.n_contacts == 0:
-        # elimination knows no constraint of all nodes of a cavity
-        newton = Newton(system, stage, eliminate=eliminate if system.volumes is None else None)
+        # elimination knows no constraint of all nodes of a cavity or a tendon
+        newton = Newton(system, stage, eliminate=eliminate if system.multipliers is None else None)
         if stage.linearised:
             return newton.solve_once()
         r, scale, _ = choose_start(system, *system.evaluate())

@@ -36,7 +36,8 @@ class ContactPaths:
         self._names: set[str] = set()  # and their names
         self._n_unchanged = 0  # checks in a row that found no pairs but those held already
         self._held = self._held_before = NO_PASSAGES
-        n, group = connected_components(attached_pairs(detection.scene))
+        n_bodies = len(detection.scene.bodies)
+        n, group = connected_components(attached_pairs(detection.scene)[:n_bodies, :n_bodies])
         self._attached = [np.flatnonzero(group == k) for k in range(n) if (group == k).sum() > 1]  # move as one if held back
         detection.prepare_paths()
         self._arena = FieldArena()

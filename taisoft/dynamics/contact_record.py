@@ -49,12 +49,15 @@ def nodal_impulses(contacts: Contacts, n_nodes: int) -> np.ndarray:
     contacts: a record from `Simulator.contacts`. Each impulse is distributed to the nodes that it acted on in the solver, by
     their weights, with its sign on side a and the opposite on side b, so that sums over a body are those of its contacts.
     """
-    signs = np.repeat([1.0, -1.0], contacts.weights.shape[1] // 2)
-    parts = (signs * contacts.weights)[:, :, None] * contacts.impulse[:, None]  # (k,6 or more,3)
-    used = contacts.nodes >= 0
-    total = np.zeros((n_nodes, 3))
+    return distribute(contacts.impulse, contacts.nodes, contacts.weights, n_nodes)
+
+
+def distribute(impulse: np.ndarray, nodes: np.ndarray, weights: np.ndarray, n_nodes: int) -> np.ndarray:
+    """Distribute impulses (k,3) [N s] to the nodes of both sides (k, 2 w) by their weights, with opposite signs: (n_nodes,3)."""
+    signs = np.repeat([1.0, -1.0], weights.shape[1] // 2)
+    parts, used, total = (signs * weights)[:, :, None] * impulse[:, None], nodes >= 0, np.zeros((n_nodes, 3))
     for axis in range(3):
-        total[:, axis] = np.bincount(contacts.nodes[used], parts[used][:, axis], n_nodes)
+        total[:, axis] = np.bincount(nodes[used], parts[used][:, axis], n_nodes)
     return total
 
 

@@ -33,7 +33,7 @@ class DirichletConditions:
         self._groups: list[_Group] = []
         n_prescribed = 0
         for k, body in enumerate(scene.bodies):
-            for c in body.constraints:
+            for c in scene.constraints(body):
                 rows = c.nodes + layout.node_start[k]
                 if c.path is None:
                     self._fixed[np.ix_(rows, np.flatnonzero(c.axes))] = True

@@ -17,13 +17,13 @@ from taisoft.dynamics.contact import TOLERANCE, ContactStep
 from taisoft.dynamics.contact_newton import solve
 from taisoft.dynamics.elimination import solve_on
 from taisoft.dynamics.impact import solve_bouncing
+from taisoft.dynamics.multipliers import Multipliers, solve_with_multipliers
 from taisoft.dynamics.no_contacts import NoContacts
 from taisoft.dynamics.results import StageResult, StepResult, count_all
 from taisoft.dynamics.schemes import SCHEMES, Scheme
 from taisoft.dynamics.simulation_state import SimulationState
 from taisoft.dynamics.stage_system import Stage, StageSystem
 from taisoft.dynamics.substepping import Substepping
-from taisoft.dynamics.volumes import Volumes, solve_with_volumes
 from taisoft.errors import SimulationError
 from taisoft.fem.dependents import place_all
 from taisoft.settings import Settings
@@ -107,8 +107,8 @@ class ImplicitStepper:
             arena.vectors("x_before", ti.f64, m.n_nodes) if self.scheme.before else None,
         )
         prescribed = simulation.dirichlet.prescribed_nodes
-        self._volumes = Volumes(simulation) if len(simulation.loads.given_volumes) else None
-        self.solver = StageSystem(m, arena, simulation.runtime.eps, prescribed, contact, self.history.x_now, self._volumes)
+        self._multipliers = Multipliers(simulation) if len(simulation.loads.multipliers) else None
+        self.solver = StageSystem(m, arena, simulation.runtime.eps, prescribed, contact, self.history.x_now, self._multipliers)
         self.tolerance = settings.newton_tolerance or DEFAULT_TOLERANCE[settings.precision]
         self.contact_tolerance = settings.contact_tolerance or TOLERANCE[settings.precision]
         self.linear_tolerance = settings.linear_tolerance
@@ -116,7 +116,7 @@ class ImplicitStepper:
         self._balance = balance if balance.n_pieces > 1 else None
         self._substepping = Substepping(self)
         self._saved_start = None, [], contact.flight, False, None  # see `save_start`
-        self._start_pressures = None  # in the cavities of given volume, at the start of the last substep
+        self._start_multipliers = None  # at the start of the last substep
         self.forget()
 
     def forget(self) -> None:
@@ -182,8 +182,8 @@ class ImplicitStepper:
             )
         if self.contact.paths.held_back:
             step.problems.append(self.contact.paths.held_back)
-        if self._volumes is not None:
-            step.problems += self._volumes.problems()
+        if self._multipliers is not None:
+            step.problems += self._multipliers.problems()
         if name:
             step.problems.append(f"forces on {name} are unbalanced by {worst:.2g} of their size, beside larger forces elsewhere")
         return step
@@ -198,27 +198,27 @@ class ImplicitStepper:
         state = None if self.contact.idle else self.simulation.state()
         simulation, contact = self.simulation, self.contact
         flight, none_cross = contact.flight.copy(), contact.paths.none_cross
-        self._saved_start = state, simulation.dirichlet.released(), flight, none_cross, simulation.cavity_pressures
+        self._saved_start = state, simulation.dirichlet.released(), flight, none_cross, simulation.multipliers
 
     def return_to_start(self, already_undone: bool = False) -> None:
         """Restore the step's start, without history. already_undone: whether the only substep so far has been undone."""
-        state, released, flight, none_crossed, pressures = self._saved_start
+        state, released, flight, none_crossed, multipliers = self._saved_start
         if state is None and not already_undone:
             restore(self.simulation.model, self.history)
             state = self.simulation.state()
-            self._saved_start = state, released, flight, none_crossed, pressures
-        self._restore_state(state, released, pressures)
+            self._saved_start = state, released, flight, none_crossed, multipliers
+        self._restore_state(state, released, multipliers)
         self._n_previous = 0
         self.contact.return_to_start(none_crossed)
         self.contact.flight[:] = flight
 
     def _restore_state(
-        self, state: tuple[np.ndarray, np.ndarray] | None, released: list[bool], pressures: np.ndarray | None
+        self, state: tuple[np.ndarray, np.ndarray] | None, released: list[bool], multipliers: np.ndarray | None
     ) -> None:
-        """Restore a state, if not None, the released groups and the pressures (k,) [Pa] in cavities of given volume, if any."""
+        """Restore a state, if not None, the released groups and the Lagrange multipliers (k,), if any."""
         simulation = self.simulation
-        if pressures is not None:
-            simulation.set_cavity_pressures(pressures)
+        if multipliers is not None:
+            simulation.set_multipliers(multipliers)
         if state is not None:
             simulation.set_state(*state)
         if simulation.dirichlet.released() != released:
@@ -231,9 +231,9 @@ class ImplicitStepper:
 
     def retry_substep(self, time: float, dt: float, start: np.ndarray) -> StageResult:
         """Repeat the restored substep with other contacts. start: (n_nodes, 3) [m/s] velocities reached before."""
-        past, self._n_previous, pressures = self._n_previous, 0, self._start_pressures
+        past, self._n_previous, multipliers = self._n_previous, 0, self._start_multipliers
         result = self.take_substep(time, dt, start)
-        self._n_previous, self._start_pressures = min(self._n_previous, past), pressures
+        self._n_previous, self._start_multipliers = min(self._n_previous, past), multipliers
         return result
 
     def break_history(self) -> None:
@@ -243,7 +243,7 @@ class ImplicitStepper:
     def undo_substep(self, released: list[bool], discard_impulses: bool) -> None:
         """Restore the start of the last substep and the groups released then, for another length of it."""
         self.restore_start()
-        self._restore_state(None, released, self._start_pressures)
+        self._restore_state(None, released, self._start_multipliers)
         self._n_previous = 0
         # BDF2 detects impacts by the contacts without impulse in the last step
         self.contact.reset_substep(discard_impulses or self.scheme.before > 0.0)
@@ -251,7 +251,7 @@ class ImplicitStepper:
     def take_substep(self, time: float, dt: float, start: np.ndarray | None = None) -> StageResult:
         """Take a substep of dt from a time with the contacts of one search. start: (n_nodes, 3) [m/s] first iterate of v."""
         simulation, m, h, w = self.simulation, self.simulation.model, self.history, self.solver.work
-        releases, self._start_pressures = simulation.releases, simulation.cavity_pressures
+        releases, self._start_multipliers = simulation.releases, simulation.multipliers
         target = simulation.next_target(time + dt)
         if simulation.releases != releases or dt != self._dt:
             self._n_previous = 0
@@ -272,8 +272,8 @@ class ImplicitStepper:
                 prescribed.append((w.prescribed_acceleration, accelerations))
             upload(prescribed)
         simulation.set_load_time(time + (0.5 if scheme.midpoint else 1.0) * dt)
-        if self._volumes is not None:
-            self._volumes.begin(time + dt)
+        if self._multipliers is not None:
+            self._multipliers.begin(time + dt)
         self._beta = scheme.beta_over_dt * dt
         self.contact.set_impulse_fraction(scheme.beta_over_dt)
         self.solver.assemble_damper()
@@ -336,7 +336,7 @@ class ImplicitStepper:
             # prescribed nodes change their velocity once a step, not twice within the midpoint's half step
             0.5 if scheme.midpoint else 1.0,
         )
-        return solve_with_volumes(self.solver, stage, partial(solve_bouncing if bounces else solve, self.solver, stage))
+        return solve_with_multipliers(self.solver, stage, partial(solve_bouncing if bounces else solve, self.solver, stage))
 
     def compile_hard_steps(self) -> None:
         """Compile the kernels that only hard steps need, by running them on the current stage; its state is then invalid."""

@@ -91,7 +91,7 @@ class Newton:
         """Return whether |r| is small enough for the present multipliers."""
         target = self._target()
         if not self.has_contacts or self.stage.keeps_multipliers:
-            return (self.r <= target or self.rounding) and self.system.volumes_hold
+            return (self.r <= target or self.rounding) and self.system.multipliers_hold
         laws_hold = self.system.contact_residual <= self.stage.contact_tolerance
         # in an impact whose laws hold, only the momenta remain to be balanced
         inner = (FINER if self.multipliers >= self.stage.extrapolate_after else 1.0) * self.stage.inner_tolerance * self.scale
@@ -180,7 +180,7 @@ class Newton:
         else:
             wanted, safeguard = 0.9 * (self.r / self.previous) ** 2, 0.9 * self.forcing**2
             self.forcing = min(self.max_forcing, max(wanted, safeguard if safeguard > 0.1 else 0.0))
-        # the last solve need not go far below Newton's tolerance; |r| may be below it while volumes of cavities do not hold
+        # the last solve need not go far below Newton's tolerance; |r| may be below it while given volumes and lengths do not hold
         tolerance = max(self.forcing, 0.1 * target / self.r if self.r > target else 0.1, 1e-12)
         # if rounding of stiff stress hides the rigid motion in |r|, only a tight solve gets that motion right
         return min(tolerance, self.stage.tolerance) if self.floor > target else tolerance

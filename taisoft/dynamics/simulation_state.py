@@ -1,18 +1,21 @@
 """Simulation state shared by all steppers: model, constraints, loads and time."""
 
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 
 from taisoft.backend.arrays import FieldArena, download, upload
 from taisoft.backend.runtime import Runtime
 from taisoft.dynamics.dirichlet import DirichletConditions
-from taisoft.fem.dependents import DependentTable, dependent_table
+from taisoft.fem.dependents import DependentTable
 from taisoft.fem.loads import SceneLoads
 from taisoft.fem.mean_dilatation import patch_moduli
 from taisoft.fem.model import Layout, Model, damping_table, law_table, upload_mass_matrix
 from taisoft.fem.pressure import CavityForm, cavity_form, pressures_of
 from taisoft.fem.reference import gravity_masses, lumped_masses
+from taisoft.fem.spring_table import SpringTable
+from taisoft.fem.springs import own_spring_table
 from taisoft.scene.loads import Cavity
 from taisoft.scene.scene import Scene
 
@@ -35,13 +38,24 @@ class SimulationState:
     releases: int = 0  # number of releases of prescribed nodes; each invalidates the steppers' history
     drag: tuple[np.ndarray, np.ndarray] | None = None  # nodes (k,) and forces (k, 3) [N] of a drag spring
     _loads: SceneLoads | None = None  # None: not computed, or outdated
-    dependents: DependentTable | None = None
     load_time: float | None = None  # of the loads on the device; None: several, or outdated
-    cavity_pressures: np.ndarray | None = None  # (k,) [Pa] in the cavities of given volume; None without such cavities
+    multipliers: np.ndarray | None = None  # (k,) Lagrange multipliers [Pa] or [N], see `SceneLoads.multipliers`; None: none
     _cavity_forms: dict[str, CavityForm] = field(default_factory=dict)  # those built so far, by name
 
-    def __post_init__(self):
-        self.dependents = dependent_table(self.scene)
+    @property
+    def dependents(self) -> DependentTable | None:
+        """The nodes that are attached exactly; None if there are none."""
+        return self.layout.dependents
+
+    @property
+    def springs(self) -> SpringTable | None:
+        """The elements of springs, tendons and attachments; None if there are none."""
+        return self.layout.springs
+
+    @cached_property
+    def own_springs(self) -> SpringTable | None:
+        """The same at the nodes where they end, even if these depend on others."""
+        return self.springs if self.dependents is None else own_spring_table(self.scene)
 
     def state(self) -> tuple[np.ndarray, np.ndarray]:
         """Return positions and velocities of all nodes, in their stored precision."""
@@ -60,7 +74,7 @@ class SimulationState:
         """Return the state for a checkpoint; see `taisoft/checkpoint.py`."""
         x, v = self.state()
         own = {"time": self.time, "step_count": self.step_count, "released": self.dirichlet.released(), "x": x, "v": v}
-        return own if self.cavity_pressures is None else own | {"cavity_pressures": self.cavity_pressures}
+        return own if self.multipliers is None else own | {"multipliers": self.multipliers}
 
     def restore(self, kept: dict) -> None:
         """Restore a `snapshot`, also one of another instance of the same scene."""
@@ -68,8 +82,8 @@ class SimulationState:
         self.upload_constraints()
         self.set_state(kept["x"], kept["v"])
         self.time, self.step_count = float(kept["time"]), int(kept["step_count"])
-        if self.cavity_pressures is not None:
-            self.set_cavity_pressures(kept["cavity_pressures"])
+        if self.multipliers is not None:
+            self.set_multipliers(kept["multipliers"])
         self.set_load_time(self.time)
 
     def restart(self) -> None:
@@ -78,8 +92,8 @@ class SimulationState:
         self.upload_constraints()
         self.set_state(self.layout.rest, self._rest_velocities())  # compiles it before a step may need it
         self.time, self.step_count = 0.0, 0
-        if len(self.loads.given_volumes):
-            self.set_cavity_pressures(np.zeros(len(self.loads.given_volumes)))
+        if len(self.loads.multipliers):
+            self.set_multipliers(np.zeros(len(self.loads.multipliers)))
         self.set_load_time(0.0)
 
     def prescribed_moves(self, t: float) -> tuple[np.ndarray, np.ndarray] | None:
@@ -116,18 +130,18 @@ class SimulationState:
         if m.damping is not None:
             numbers.append((m.damping, damping_table(self.scene)))
         if density:
-            numbers.append((m.mass, lumped_masses(self.scene)))
+            numbers.append((m.mass, lumped_masses(self.scene, self.dependents)))
             if m.gravity_mass is not m.mass:
-                numbers.append((m.gravity_mass, gravity_masses(self.scene)))
+                numbers.append((m.gravity_mass, gravity_masses(self.scene, self.dependents)))
         upload(numbers)
         if density and m.consistent:
-            upload_mass_matrix(self.scene, m.mass_matrix)
+            upload_mass_matrix(self.scene, self.dependents, m.mass_matrix)
 
     @property
     def loads(self) -> SceneLoads:
         """The scene's loads with their present values."""
         if self._loads is None:
-            self._loads = SceneLoads(self.scene)
+            self._loads = SceneLoads(self.scene, self.springs)
         return self._loads
 
     def upload_loads(self) -> None:
@@ -135,9 +149,9 @@ class SimulationState:
         self._loads = self.load_time = None
         self.set_load_time(self.time)
 
-    def set_cavity_pressures(self, pressures: np.ndarray) -> None:
-        """Set the pressures (k,) [Pa] in the cavities of given volume; `set_load_time` uploads them."""
-        self.cavity_pressures, self.load_time = np.array(pressures), None
+    def set_multipliers(self, values: np.ndarray) -> None:
+        """Set the Lagrange multipliers (k,) [Pa] or [N]; `set_load_time` uploads them."""
+        self.multipliers, self.load_time = np.array(values), None
 
     def set_drag(self, drag: tuple[np.ndarray, np.ndarray] | None) -> None:
         """Set nodes and forces of a drag spring, or None, and upload the loads of the present time."""
@@ -162,10 +176,10 @@ class SimulationState:
         self.load_time = time
 
     def amplitudes(self, time: float) -> np.ndarray:
-        """Return the loads that are one number at a time [s], with the present pressures in cavities of given volume."""
+        """Return the loads that are one number at a time [s], with the present Lagrange multipliers."""
         amplitudes = self.loads.amplitudes([time])[0]
-        if self.cavity_pressures is not None:
-            amplitudes[self.loads.given_volumes] = self.cavity_pressures
+        if self.multipliers is not None:
+            amplitudes[self.loads.multipliers] = self.multipliers
         return amplitudes
 
     def cavity_pressures_by_name(self, time: float) -> dict[str, float]:

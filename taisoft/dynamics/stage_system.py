@@ -51,8 +51,8 @@ from taisoft.linear.block_csr import BlockCsr
 
 if TYPE_CHECKING:
     from taisoft.dynamics.contact import ContactStep
+    from taisoft.dynamics.multipliers import Multipliers
     from taisoft.dynamics.no_contacts import NoContacts
-    from taisoft.dynamics.volumes import Volumes
 
 
 VOLUME_PASSES = 2  # corrections of the first iterate, each of which leaves errors of second order
@@ -94,13 +94,13 @@ class StageSystem:
         prescribed: np.ndarray,
         contact: "ContactStep | NoContacts",
         x_start: Any = None,
-        volumes: "Volumes | None" = None,
+        multipliers: "Multipliers | None" = None,
     ):
         """prescribed: nodes that follow a path. x_start: (n_nodes) 3-vectors f64, positions at the start of the step.
 
-        volumes: the cavities of given volume, if there are any.
+        multipliers: of cavities of given volume and inextensible tendons, if there are any.
         """
-        self.model, self.contact, self.x_start, self.volumes = model, contact, x_start, volumes
+        self.model, self.contact, self.x_start, self.multipliers = model, contact, x_start, multipliers
         self.matrix: BlockCsr = block_csr.build_block_csr(model, arena)
         self.damper = block_csr.sibling(self.matrix, model, arena, "damping") if model.stiffness_damping else None
         n, k = model.n_nodes, len(prescribed)
@@ -192,13 +192,13 @@ class StageSystem:
     def slopes(self) -> tuple[float, float]:
         """(r.y at the start of the step, r.y at its end); negative: descent."""
         scalars = self.model.state.scalars
-        start = scalars[START_SLOPE] + (self.volumes.slope_change if self.volumes is not None else 0.0)
+        start = scalars[START_SLOPE] + (self.multipliers.slope_change if self.multipliers is not None else 0.0)
         return start, scalars[END_SLOPE]
 
     @property
-    def volumes_hold(self) -> bool:
-        """Whether all cavities have the volume that is given, or are not the concern of the present solve."""
-        return self.volumes is None or not self.volumes.penalised or self.volumes.hold
+    def multipliers_hold(self) -> bool:
+        """Whether cavities and tendons have the given volumes and lengths, or are not the concern of the present solve."""
+        return self.multipliers is None or not self.multipliers.penalised or self.multipliers.hold
 
     def begin(self, stage: Stage) -> bool:
         """Begin a stage at its first iterate; with contacts, form the matrix, which the r-factors depend on.
@@ -245,8 +245,8 @@ class StageSystem:
         m, w, k, stage = self.model, self.work, self._k, self.stage
         if mode is not None:
             move(m, w, k, self.kind, mode, step_length, stage.c, stage.beta)
-            if self.volumes is not None:
-                self.volumes.measure()
+            if self.multipliers is not None:
+                self.multipliers.measure()
         if k.any:
             update_impulses(m, k, int(new_multipliers), stage.beta, self.r_scale)
         form_residual(m, w, self.matrix, k, self.kind, stage.beta, self.norms)
@@ -357,11 +357,11 @@ class StageSystem:
         """Form the matrix of c and beta at the present positions, for the rows of a subset."""
         self.n_formed += 1
         block_csr.assemble(self.model, self.matrix, subset, projected)
-        if self.volumes is not None:
-            self.volumes.upload(self.volumes.pressures)
+        if self.multipliers is not None:
+            self.multipliers.upload(self.multipliers.values)
         block_csr.to_system(self.model, self.matrix, self.damper or self.matrix, subset, int(projected), c, beta)
-        if self.volumes is not None and self.volumes.penalised:
-            self.volumes.upload(self.volumes.effective)
+        if self.multipliers is not None and self.multipliers.penalised:
+            self.multipliers.upload(self.multipliers.effective)
 
     def form_matrix_and_factors(self, projected: bool = False) -> None:
         """Form the matrix and the contacts' r-factors, which stay fixed during the stage."""
@@ -371,8 +371,8 @@ class StageSystem:
     def direction(self, tolerance: float) -> pcg.LinearResult:
         """Solve for y of pcg from -r."""
         restricted = self.work.pcg.subset.restricted
-        if self.volumes is not None and self.volumes.penalised and not restricted:
-            return self.volumes.direction(self, tolerance)
+        if self.multipliers is not None and self.multipliers.penalised and not restricted:
+            return self.multipliers.direction(self, tolerance)
         return self.solve_linear(tolerance)
 
     def solve_linear(self, tolerance: float) -> pcg.LinearResult:

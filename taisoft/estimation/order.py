@@ -22,13 +22,18 @@ def nominal_order(integrator: str, scene: Scene, touches: bool) -> int:
 
 
 def is_smooth(scene: Scene, touches: bool) -> bool:
-    """Whether second-order methods keep their order: not with contacts, velocity-dependent forces, or paths, which may jump."""
+    """Whether second-order methods keep their order.
+
+    They do not with contacts, tendons that may slacken, velocity-dependent forces, or paths, which may jump.
+    """
     materials = [body.composition.first for body in scene.bodies]
     constraints = [constraint for body in scene.bodies for constraint in body.constraints]
     prescribed = any(one.path is not None for one in (*constraints, *scene.loads))
     damped = any(material.mass_damping or material.stiffness_damping for material in materials)
     damped = damped or any(one.damping for one in scene.connections)
-    return not (prescribed or damped or touches)
+    prescribed = prescribed or any(scene.moves(one) for one in scene.connections)
+    slackens = any(tendon.given == "length" for tendon in scene.tendons)
+    return not (prescribed or damped or touches or slackens)
 
 
 def error_over_difference(ratio: float, order: float) -> float:

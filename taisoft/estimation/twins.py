@@ -127,7 +127,7 @@ def _check_free(scene: Scene, shared: np.ndarray) -> None:
     first = 0
     for body in scene.bodies:
         own = shared[(shared >= first) & (shared < first + body.n_nodes)] - first
-        if constrained_axes(body, prescribed=True)[own].all():
+        if constrained_axes(body, prescribed=True, scene=scene)[own].all():
             raise SimulationError(f"error_mesh: body {body.name!r}: all nodes of both meshes that coincide are constrained")
         first += body.n_nodes
 

@@ -33,6 +33,7 @@ class DependentTable:
     start: np.ndarray  # (d + 1) first weight of each
     master: np.ndarray  # (s,) independent nodes
     weight: np.ndarray  # (s,)
+    chained: sp.csr_matrix | None = None  # (d, d) weights of those that depend on dependent nodes; None: unknown
 
     @cached_property
     def rows(self) -> sp.csr_matrix:
@@ -91,7 +92,7 @@ class Dependents:
 
 def dependent_table(scene: Scene) -> DependentTable | None:
     """The dependent nodes of a scene; None if it has none. Raises SceneError for nodes that depend on themselves."""
-    exact, embedding = scene.exact_attachments, [body for body in scene.bodies if body.nodes.embedded is not None]
+    exact, embedding = scene.dependent_attachments, [body for body in scene.bodies if body.nodes.embedded is not None]
     if not exact and not embedding:
         return None
     starts = scene.first_nodes
@@ -122,7 +123,8 @@ def dependent_table(scene: Scene) -> DependentTable | None:
         _refuse_cycle(scene, (total @ on_dependent).tocsr(), starts)
     total.sort_indices()
     own = total[node]
-    return DependentTable(n, node, own.indptr.astype(np.int64), own.indices.astype(np.int64), own.data)
+    chained = direct[node][:, node].tocsr()
+    return DependentTable(n, node, own.indptr.astype(np.int64), own.indices.astype(np.int64), own.data, chained)
 
 
 def _refuse_cycle(scene: Scene, chained: sp.csr_matrix, starts: dict[str, int]) -> None:
@@ -199,6 +201,18 @@ def force_with_dependents(m: ti.template(), term: ti.template(), i):
         for e in range(m.dependents.of_start[i], m.dependents.of_start[i + 1]):
             f += ti.cast(m.dependents.of_weight[e], m.real) * term.force(m, m.dependents.of_node[e])
     return f
+
+
+def master_pairs(table: DependentTable, ends: np.ndarray) -> np.ndarray:
+    """Pairs (e,2), i < j, of independent nodes that pairs (k,2) of nodes couple if some of them are dependent."""
+    dependent = np.zeros(table.n_nodes, dtype=bool)
+    dependent[table.node] = True
+    rows = ends[dependent[ends].any(axis=1)]
+    own, weights = zip(*(_padded(table, dependent, rows[:, side], table.most_masters) for side in (0, 1)))
+    nodes, used = np.concatenate(own, axis=1), np.concatenate(weights, axis=1) != 0.0
+    i, j = np.triu_indices(nodes.shape[1], 1)
+    pairs = np.sort(np.stack([nodes[:, i], nodes[:, j]], axis=2)[used[:, i] & used[:, j]], axis=1)
+    return np.unique(pairs[pairs[:, 0] < pairs[:, 1]], axis=0)
 
 
 def expanded_pairs(table: DependentTable, ends: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -4,18 +4,21 @@ w_a is the reference area at node a for a traction, the fraction of the lumped m
 Numbers, such as pressures, which force terms turn into nodal forces at the present x, are the model's `amplitudes`.
 """
 
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from taisoft.errors import SimulationError
 from taisoft.fem import reference
 from taisoft.fem.pressure import pressures_of
-from taisoft.scene.connections import Tendon
+from taisoft.scene.connection_records import Tendon
 from taisoft.scene.loads import NodalForce, ScalarLoad, Traction, value_at
 from taisoft.scene.scene import Body, Scene
 
-FOLLOWS = ScalarLoad(np.zeros(()))  # the pressure in a cavity of given volume, which steppers find
+if TYPE_CHECKING:
+    from taisoft.fem.spring_table import SpringTable
+
+FOLLOWS = ScalarLoad(np.zeros(()))  # a pressure or a tension that is a Lagrange multiplier, which steppers find
 
 
 class _Path(NamedTuple):
@@ -37,12 +40,14 @@ class _Path(NamedTuple):
 class SceneLoads:
     """The loads of a scene with its present values.
 
-    nodes: those whose loads follow a path, ascending. given_volumes: amplitudes that are the pressures in cavities of given
-    volume. has_potential: whether energies count the work of all constant loads: not
-    that of a pressure on an open surface, which depends on the path of its border, and of the fluid in a given volume.
+    nodes: those whose loads follow a path, ascending. multipliers: amplitudes that are Lagrange multipliers, the pressures in
+    cavities of given volume and the tensions of inextensible tendons. has_potential: whether energies count the work of all
+    loads but those along a path: not that of a pressure on an open surface, which depends on the path of its border, of the
+    fluid in a given volume, and of a tendon whose given length follows a path.
     """
 
-    def __init__(self, scene: Scene):
+    def __init__(self, scene: Scene, springs: "SpringTable | None" = None):
+        """springs: the scene's table; only its ends on obstacles that move matter."""
         starts = np.cumsum([0, *(body.n_nodes for body in scene.bodies)])
         self._constant, self._paths = np.zeros((starts[-1], 3)), []
         for body, start in zip(scene.bodies, starts):
@@ -54,20 +59,21 @@ class SceneLoads:
                     else:
                         self._paths.append(_Path(f"body {body.name!r}: {kind} {k}", load, start + nodes, weights))
         self.nodes = np.unique(np.concatenate([np.zeros(0, dtype=np.int64), *(path.nodes for path in self._paths)]))
-        self._scalars = scalar_loads(scene)
-        self.given_volumes = np.array([n for n, (_, load) in enumerate(self._scalars) if load is FOLLOWS], dtype=np.int64)
+        self._scalars, self._moving = scalar_loads(scene), None if springs is None else springs.moving
+        self.multipliers = np.array([n for n, (_, load) in enumerate(self._scalars) if load is FOLLOWS], dtype=np.int64)
         others = [load for _, load in pressures_of(scene) if not load.has_potential]
-        self.has_potential = not any(load.path is not None or load.value.any() for load in others)
+        winches = [tendon for tendon in scene.tendons if tendon.is_inextensible and tendon.path is not None]
+        self.has_potential = not (winches or any(load.path is not None or load.value.any() for load in others))
 
     @property
     def n_amplitudes(self) -> int:
-        """Number of loads that are one number."""
-        return len(self._scalars)
+        """Number of loads that are one number, and of numbers that place the ends of springs on obstacles that move."""
+        return len(self._scalars) + (0 if self._moving is None else self._moving.n_amplitudes)
 
     @property
     def amplitudes_vary(self) -> bool:
         """Whether any of these follows a path."""
-        return any(load.path is not None for _, load in self._scalars)
+        return self._moving is not None or any(load.path is not None for _, load in self._scalars)
 
     @property
     def vary(self) -> bool:
@@ -75,8 +81,10 @@ class SceneLoads:
         return bool(self._paths) or self.amplitudes_vary
 
     def amplitudes(self, times: np.ndarray | list[float]) -> np.ndarray:
-        """Values (r, n_amplitudes) at the times (r,) [s], in the order of `scalar_loads`. Raises SimulationError."""
-        rows = [[_number_at(load, float(t), name) for name, load in self._scalars] for t in times]
+        """Values (r, n_amplitudes) at the times (r,) [s]: of `scalar_loads`, then of `MovingEnds`. Raises SimulationError."""
+        rows = [[number_at(load, float(t), name) for name, load in self._scalars] for t in times]
+        if self._moving is not None:
+            rows = [[*row, *self._moving.amplitudes(float(t))] for row, t in zip(rows, times)]
         return np.array(rows).reshape(len(times), self.n_amplitudes)
 
     def at(self, t: float) -> np.ndarray:
@@ -94,25 +102,28 @@ class SceneLoads:
         return rows
 
 
-def _number_at(load: ScalarLoad | Tendon, t: float, what: str) -> float:
+def number_at(load: ScalarLoad | Tendon, t: float, what: str) -> float:
+    """Value of a load at t [s]. what: start of messages. Raises SimulationError for one that is not allowed."""
     value = float(value_at(load, t, what))
-    if isinstance(load, Tendon) and value < 0.0:
-        raise SimulationError(f"{what}: its path gave {value:g} N at t = {t:g} s: a tendon cannot push")
+    if isinstance(load, Tendon) and not load.allows(value):
+        unit, rule = ("N", "a tendon cannot push") if load.given == "force" else ("m", "a length must be above 0")
+        raise SimulationError(f"{what}: its path gave {value:g} {unit} at t = {t:g} s: {rule}")
     return value
 
 
-def scalar_loads(scene: Scene) -> list[tuple[str, Tendon]]:
+def scalar_loads(scene: Scene) -> list[tuple[str, ScalarLoad | Tendon]]:
     """The loads of a scene that are one number, each with its name in messages, in the order of the model's `amplitudes`."""
     found: list[tuple[str, ScalarLoad | Tendon]] = []
     for body in scene.bodies:
         found += [(f"body {body.name!r}: pressure {k}", load) for k, load in enumerate(body.pressures)]
         found += [(f"cavity {cavity.name!r}", FOLLOWS if cavity.given == "volume" else cavity) for cavity in body.cavities]
-    return found + [(f"tendon {tendon.name!r}", tendon) for tendon in scene.tendons]
+    return found + [(f"tendon {one.name!r}", FOLLOWS if one.is_inextensible else one) for one in scene.tendons]
 
 
-def tension_slots(scene: Scene) -> dict[str, int]:
-    """The place of each tendon's tension among the model's `amplitudes`, by the tendon's name."""
-    return {load.name: k for k, (_, load) in enumerate(scalar_loads(scene)) if isinstance(load, Tendon)}
+def tendon_slots(scene: Scene) -> dict[str, int]:
+    """The place of each tendon's tension, or length at rest if it is elastic, among the model's `amplitudes`, by name."""
+    first = len(scalar_loads(scene)) - len(scene.tendons)
+    return {tendon.name: first + k for k, tendon in enumerate(scene.tendons)}
 
 
 def _weights(body: Body, load: Traction | NodalForce) -> tuple[np.ndarray, np.ndarray]:

@@ -79,8 +79,8 @@ def measure(m: ti.template()):
             m.state.scalars[k] = total
         if ti.static(m.has_springs):
             elastic, potential = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64)
-            for s in range(m.springs.n):
-                elastic += springs.elastic_energy(m, s)
-                potential += springs.load_energy(m, s)
+            for line in range(m.springs.n_lines):
+                elastic += springs.elastic_energy(m, line)
+                potential += springs.load_energy(m, line)
             m.state.scalars[ELASTIC] = m.state.scalars[ELASTIC] + elastic
             m.state.scalars[LOADS] = m.state.scalars[LOADS] + potential

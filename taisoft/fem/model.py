@@ -15,13 +15,14 @@ import taichi as ti
 from taisoft.backend.arrays import Count, FieldArena, download, upload
 from taisoft.backend.runtime import Runtime, threads
 from taisoft.fem import reference, springs
-from taisoft.fem.dependents import build_dependents, dependent_table
+from taisoft.fem.dependents import DependentTable, build_dependents, dependent_table
 from taisoft.fem.laws import LAWS
 from taisoft.fem.loads import SceneLoads
 from taisoft.fem.mean_dilatation import MeanDilatation, build_mean_dilatation
 from taisoft.fem.node_graph import NodeGraph
 from taisoft.fem.pattern import MATRIX_BLOCKS, model_graph
 from taisoft.fem.pressure import PressureTable, build_pressures
+from taisoft.fem.spring_table import SpringTable
 from taisoft.fem.state import State, build_state
 from taisoft.fem.terms import terms_of
 from taisoft.ranges import owners
@@ -135,7 +136,7 @@ class Model:
 
 @dataclass(frozen=True)
 class Layout:
-    """Host-side index ranges of bodies and tets in the model."""
+    """Host-side index ranges of bodies and tets in the model, and the tables of its connections."""
 
     node_start: np.ndarray  # (n_bodies + 1)
     tet_start: np.ndarray  # (n_bodies + 1), among the tets of all bodies
@@ -143,6 +144,8 @@ class Layout:
     lane_of_tet: np.ndarray  # (n_tets,) its lane, counted through all blocks
     rest: np.ndarray  # (n_nodes, 3) rest positions in the scene [m]
     lanes: int
+    dependents: DependentTable | None
+    springs: SpringTable | None
 
     def nodes(self, body: int) -> slice:
         """Rows of a body's nodes."""
@@ -182,7 +185,9 @@ def _layout(scene: Scene, lanes: int) -> tuple[Layout, tuple[Group, ...]]:
     node_start = np.concatenate([[0], np.cumsum([b.n_nodes for b in bodies])])
     tet_of_lane = np.concatenate(tet_of_lane)
     lane_of_tet = np.unique(tet_of_lane, return_index=True)[1]
-    return Layout(node_start, tet_start, tet_of_lane, lane_of_tet, rest, lanes), tuple(groups)
+    dependents = dependent_table(scene)
+    tables = dependents, springs.spring_table(scene, dependents)
+    return Layout(node_start, tet_start, tet_of_lane, lane_of_tet, rest, lanes, *tables), tuple(groups)
 
 
 def _rule_table(rules: tuple[reference.Quadrature, ...]) -> np.ndarray:
@@ -276,17 +281,17 @@ def build_model(scene: Scene, runtime: Runtime, arena: FieldArena, on: dict[str,
     node_body = owners(np.diff(layout.node_start)).astype(np.int32)
     velocity = np.concatenate([np.broadcast_to(b.velocity, b.rest_positions.shape) for b in scene.bodies])
     flat_nodes = np.concatenate([lane_layout(own, lanes).reshape(-1) for own in nodes])
-    scene_loads = SceneLoads(scene)
+    dependents, table = layout.dependents, layout.springs
+    scene_loads = SceneLoads(scene, table)
     n_amplitudes = scene_loads.n_amplitudes
     laws = law_table(scene, layout, on["elasticity_by_tet"])
     rules = tuple(reference.quadrature(d) for d in sorted({b.quadrature_degree for b in scene.bodies if b.order == 2}))
-    table = _rule_table(rules) if rules else None
+    points = _rule_table(rules) if rules else None
     rest_real = ti.f64 if on["rigid_bodies"] else strain_real
     rest_lanes = lane_layout(Dm_inv.reshape(-1, 9), lanes).astype(npr if rest_real == real else np.float64)
-    weight = mass = arena.field("mass", real, n_nodes, reference.lumped_masses(scene).astype(npr))
+    weight = mass = arena.field("mass", real, n_nodes, reference.lumped_masses(scene, dependents).astype(npr))
     if on["consistent_weight"]:
-        weight = arena.field("gravity_mass", real, n_nodes, reference.gravity_masses(scene).astype(npr))
-    dependents = dependent_table(scene)
+        weight = arena.field("gravity_mass", real, n_nodes, reference.gravity_masses(scene, dependents).astype(npr))
     model = Model(
         real=real,
         strain_real=strain_real,
@@ -299,7 +304,7 @@ def build_model(scene: Scene, runtime: Runtime, arena: FieldArena, on: dict[str,
         state=build_state(arena, runtime, layout.rest, velocity, 3 * len(flat_nodes), chunks),
         nodes=arena.field("nodes", ti.i32, len(flat_nodes), flat_nodes.astype(np.int32)),
         rules=rules,
-        points=arena.field("points", ti.f64, (len(table), 28), table) if rules else None,
+        points=arena.field("points", ti.f64, (len(points), 28), points) if rules else None,
         Dm_inv=arena.field("Dm_inv", rest_real, (n_blocks, 9, lanes), rest_lanes),
         volume=arena.field("volume", real, (n_blocks, lanes), volume.reshape(n_blocks, lanes).astype(npr)),
         block_body=arena.field("block_body", ti.i32, n_blocks, block_body),
@@ -312,7 +317,7 @@ def build_model(scene: Scene, runtime: Runtime, arena: FieldArena, on: dict[str,
         free=arena.vectors("free", real, n_nodes, np.ones((n_nodes, 3), dtype=npr)),
         gravity=arena.vectors("gravity", real, 1, np.asarray(scene.gravity, dtype=npr)[None]),
         dependents=build_dependents(dependents, arena) if dependents is not None else None,
-        springs=springs.build_springs(scene, arena, n_nodes, on["assembled_stiffness"]) if on["springs"] else None,
+        springs=springs.build_springs(table, arena, on["assembled_stiffness"]) if on["springs"] else None,
         loads=arena.vectors("loads", real, n_nodes, scene_loads.at(0.0).astype(npr)) if on["loads"] else None,
         amplitudes=arena.field("amplitudes", ti.f64, n_amplitudes, scene_loads.amplitudes([0.0])[0]) if n_amplitudes else None,
         pressure=None,
@@ -331,26 +336,28 @@ def build_model(scene: Scene, runtime: Runtime, arena: FieldArena, on: dict[str,
     needs_graph = on["consistent_mass"] or (on["pressure"] and on["assembled_stiffness"])
     graph = model_graph(model)[0] if needs_graph else None
     if on["consistent_mass"]:
-        model = replace(model, mass_matrix=_build_mass_matrix(scene, model, arena, graph))
+        model = replace(model, mass_matrix=_build_mass_matrix(scene, dependents, model, arena, graph))
     if on["pressure"]:
-        model = replace(model, pressure=build_pressures(scene, layout.node_start, arena, graph))
+        model = replace(model, pressure=build_pressures(scene, layout.node_start, arena, graph, dependents))
     return model, layout
 
 
-def _build_mass_matrix(scene: Scene, model: Model, arena: FieldArena, graph: NodeGraph) -> MassMatrix:
+def _build_mass_matrix(
+    scene: Scene, dependents: DependentTable | None, model: Model, arena: FieldArena, graph: NodeGraph
+) -> MassMatrix:
     mass = MassMatrix(
         row_start=arena.field("mass_row_start", ti.i32, model.n_nodes + 1, graph.row_start.astype(np.int32)),
         column=arena.field("mass_column", ti.i32, len(graph.column), graph.column.astype(np.int32)),
         value=arena.field("mass_value", model.real, len(graph.column)),
         diagonal=arena.field("mass_diagonal", model.real, model.n_nodes),
     )
-    upload_mass_matrix(scene, mass)
+    upload_mass_matrix(scene, dependents, mass)
     return mass
 
 
-def upload_mass_matrix(scene: Scene, mass: MassMatrix) -> None:
+def upload_mass_matrix(scene: Scene, dependents: DependentTable | None, mass: MassMatrix) -> None:
     """Fill the device matrix from the bodies' densities."""
-    M = reference.mass_matrix(scene)
+    M = reference.mass_matrix(scene, dependents)
     start, column = download([mass.row_start, mass.column])
     rows = owners(np.diff(start))
     upload([(mass.value, np.asarray(M[rows, column]).reshape(-1)), (mass.diagonal, M.diagonal())])

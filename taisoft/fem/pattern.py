@@ -8,7 +8,7 @@ import numpy as np
 
 from taisoft.backend.arrays import download
 from taisoft.fem import springs
-from taisoft.fem.dependents import expanded_pairs, table_of
+from taisoft.fem.dependents import expanded_pairs, master_pairs, table_of
 from taisoft.fem.node_graph import PAIRS, NodeGraph, node_graph
 
 if TYPE_CHECKING:
@@ -60,14 +60,15 @@ def model_graph(model: "Model") -> tuple[NodeGraph, np.ndarray, np.ndarray | Non
         entries.append((base * lanes + (lane % lanes)[:, None]).reshape(-1))
     ends, entries, factors, others = np.concatenate(ends), np.concatenate(entries), None, []
     if model.dependents is not None:
-        others.append(ends)
-        ends, rows, factors = expanded_pairs(table_of(model.dependents, model.n_nodes), ends)
+        table = table_of(model.dependents, model.n_nodes)
+        others += [ends, master_pairs(table, ends)]
+        ends, rows, factors = expanded_pairs(table, ends)
         entries = entries[rows]
     patches = np.zeros((0, 2), dtype=np.int64)
     if model.mean_dilatation:
         patch, node = patch_nodes(model)
         patches = node[np.stack(patch_pairs(patch), axis=1)]
     if model.springs is not None:
-        others.append(springs.node_pairs(*download([model.springs.start, model.springs.node])))
+        others.append(springs.node_pairs(model.springs))
     graph = node_graph(np.concatenate([ends, patches, *others]), model.n_nodes)
     return replace(graph, pair=graph.pair[: len(entries) + len(patches)]), entries, factors

@@ -18,7 +18,9 @@ import numpy as np
 import taichi as ti
 
 from taisoft.backend.arrays import FieldArena
+from taisoft.fem.dependents import DependentTable
 from taisoft.fem.node_graph import NodeGraph
+from taisoft.ranges import entries_of
 from taisoft.scene.body import Body
 from taisoft.scene.loads import Cavity, Pressure
 from taisoft.scene.scene import Scene
@@ -33,9 +35,9 @@ class PressureTable:
     force_start: Any  # (n_nodes + 1) i32: first force term of each node
     force_nodes: Any  # 3-vectors i32: b, c, and the index of p in Model.amplitudes
     force_weight: Any  # f64: w_ibc
-    stiffness_start: Any  # (n_nodes + 1) i32; None in explicit steps, as the next two
-    stiffness_nodes: Any  # 3-vectors i32: entry (i, j) of the matrix, c, and the index of p
-    stiffness_weight: Any  # f64: u_ijc
+    stiffness_start: Any  # (n_nodes + 1) i32: by row of the matrix; None in explicit steps, as the next two
+    stiffness_nodes: Any  # 4-vectors i32: entry of the matrix, -1 on the diagonal, c, the index of p, and i
+    stiffness_weight: Any  # f64: u_ijc, times the weights of the independent nodes of row and column in i and j
     has_potential: Any  # i32, of each pressure: 1 if energies count its work
     force: Any  # (n_nodes) 3-vectors f64 [N]: scratch of explicit steps, else None
 
@@ -116,7 +118,10 @@ class CavityForm:
         self._rows = place.reshape(-1, 3)
         self.nodes = self.nodes + first_node
 
-    def volume_and_gradient(self, x: np.ndarray) -> tuple[float, np.ndarray]:
+    def set_amplitudes(self, amplitudes: np.ndarray) -> None:
+        """Do nothing: the volume depends on nodes alone."""
+
+    def value_and_gradient(self, x: np.ndarray) -> tuple[float, np.ndarray]:
         """V [m^3], and dV/dx (k, 3) [m^2] at its nodes. x: (n_nodes, 3) [m] of the scene."""
         own = x[self.nodes] - x[self.nodes[0]]
         i, b, c = (own[rows] for rows in self._rows.T)
@@ -145,15 +150,30 @@ def all_terms(scene: Scene, node_start: np.ndarray, terms) -> tuple[np.ndarray, 
     return rows[order], w[order]
 
 
-def build_pressures(scene: Scene, node_start: np.ndarray, arena: FieldArena, graph: NodeGraph | None) -> PressureTable:
+def independent_rows(rows: np.ndarray, weights: np.ndarray, dependents: DependentTable) -> tuple[np.ndarray, np.ndarray]:
+    """Replace i and j in rows (k,5) of (i, j, c, index of p, i) by the nodes that they depend on, and weight by their weights."""
+    T = dependents.matrix
+    for side in (0, 1):
+        counts = np.diff(T.indptr)[rows[:, side]]
+        entries = entries_of(T.indptr, rows[:, side])
+        rows, weights = np.repeat(rows, counts, axis=0), np.repeat(weights, counts) * T.data[entries]
+        rows[:, side] = T.indices[entries]
+    order = np.argsort(rows[:, 0], kind="stable")
+    return rows[order], weights[order]
+
+
+def build_pressures(
+    scene: Scene, node_start: np.ndarray, arena: FieldArena, graph: NodeGraph | None, dependents: DependentTable | None
+) -> PressureTable:
     """Fill the table. node_start: first node of each body, then their number; graph: of the matrix, None in explicit steps."""
     n_nodes = int(node_start[-1])
 
     def table(name: str, rows: np.ndarray, weights: np.ndarray) -> dict:
         start = np.concatenate([[0], np.cumsum(np.bincount(rows[:, 0], minlength=n_nodes))])
+        width = rows.shape[1] - 1
         return {
             f"{name}_start": arena.field(f"pressure_{name}_start", ti.i32, n_nodes + 1, start),
-            f"{name}_nodes": arena.vectors(f"pressure_{name}_nodes", ti.i32, len(rows), rows[:, 1:]),
+            f"{name}_nodes": arena.vectors(f"pressure_{name}_nodes", ti.i32, len(rows), rows[:, 1:], n=width),
             f"{name}_weight": arena.field(f"pressure_{name}_weight", ti.f64, len(rows), weights),
         }
 
@@ -162,7 +182,10 @@ def build_pressures(scene: Scene, node_start: np.ndarray, arena: FieldArena, gra
         arrays |= dict.fromkeys(("stiffness_start", "stiffness_nodes", "stiffness_weight"))
     else:
         rows, weights = all_terms(scene, node_start, stiffness_terms)
-        rows[:, 1] = graph.entries(rows[:, 0], rows[:, 1])
+        rows = np.column_stack([rows, rows[:, 0]])
+        if dependents is not None:
+            rows, weights = independent_rows(rows, weights, dependents)
+        rows[:, 1] = np.where(rows[:, 0] == rows[:, 1], -1, graph.entries(rows[:, 0], rows[:, 1]))
         arrays |= table("stiffness", rows, weights)
     closed = np.array([pressure.has_potential for _, pressure in pressures_of(scene)])
     arrays["has_potential"] = arena.field("pressure_has_potential", ti.i32, len(closed), closed)

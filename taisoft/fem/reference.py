@@ -18,7 +18,7 @@ from itertools import permutations
 import numpy as np
 import scipy.sparse as sp
 
-from taisoft.fem.dependents import dependent_table
+from taisoft.fem.dependents import DependentTable, dependent_table
 from taisoft.mesh import aggregates
 from taisoft.mesh.topology import EDGES
 from taisoft.scene.rigid import RigidBody
@@ -143,22 +143,22 @@ def consistent_mass(body: Body) -> sp.csr_matrix:
     return sp.csr_matrix((values.reshape(-1), (rows.reshape(-1), columns.reshape(-1))), shape=(body.n_nodes,) * 2)
 
 
-def lumped_masses(scene: Scene) -> np.ndarray:
-    """Lumped masses (n_nodes,) [kg], bodies in order."""
-    masses, table = np.concatenate([lumped_mass(b) for b in scene.bodies]), dependent_table(scene)
+def lumped_masses(scene: Scene, dependents: DependentTable | None = None) -> np.ndarray:
+    """Lumped masses (n_nodes,) [kg], bodies in order. dependents: the scene's table, here and below, if it is known already."""
+    masses, table = np.concatenate([lumped_mass(b) for b in scene.bodies]), dependents or dependent_table(scene)
     return masses if table is None else table.lump(masses)
 
 
-def gravity_masses(scene: Scene) -> np.ndarray:
+def gravity_masses(scene: Scene, dependents: DependentTable | None = None) -> np.ndarray:
     """Masses used for weight, int rho N_a dV, (n_nodes,) [kg]."""
-    masses, table = np.concatenate([gravity_mass(b) for b in scene.bodies]), dependent_table(scene)
+    masses, table = np.concatenate([gravity_mass(b) for b in scene.bodies]), dependents or dependent_table(scene)
     return masses if table is None else table.matrix.T @ masses
 
 
-def mass_matrix(scene: Scene) -> sp.csr_matrix:
+def mass_matrix(scene: Scene, dependents: DependentTable | None = None) -> sp.csr_matrix:
     """Mass matrix of implicit steps (n_nodes, n_nodes) [kg]: consistent for bodies of order 2, else lumped."""
     parts = [consistent_mass(b) if b.order == 2 else sp.diags(lumped_mass(b)) for b in scene.bodies]
-    M, table = sp.block_diag(parts, format="csr"), dependent_table(scene)
+    M, table = sp.block_diag(parts, format="csr"), dependents or dependent_table(scene)
     return M if table is None else (table.matrix.T @ M @ table.matrix).tocsr()
 
 

@@ -1,11 +1,4 @@
-"""Springs, tendons and attachments of a scene as one kind of element, in arrays for kernels and in NumPy.
-
-An element stretches the vector e = sum_j c_j x_j + g between two points, where c are the weights of the one minus those of the
-other, and g the position of a point of an obstacle. With its length l = |e| it pulls with the tension
-    T = k (l - L) + T_0,
-k the stiffness, L the rest length, T_0 the tension of a tendon, one element for each of its segments; plus c_d e.e' / l of its
-damping c_d. An attachment has an element of rest length 0 for each node. Force of node j: -c_j T e / l.
-"""
+"""Springs, tendons and attachments: the elements of a scene, see `spring_table`, and what kernels derive from them."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -15,78 +8,17 @@ import scipy.sparse as sp
 import taichi as ti
 
 from taisoft.backend.arrays import Count, FieldArena, download, upload
-from taisoft.fem.dependents import dependent_table
-from taisoft.fem.loads import tension_slots
+from taisoft.fem.dependents import DependentTable, dependent_table
+from taisoft.fem.loads import scalar_loads, tendon_slots
 from taisoft.fem.node_graph import NodeGraph
-from taisoft.ranges import owners
+from taisoft.fem.spring_table import LENGTH, MULTIPLIER, PLAIN, TENSION, MovingEnds, SpringTable
 from taisoft.scene.body import Body
-from taisoft.scene.connections import Attachment, Point, coincide, locate_nodes, start_of
+from taisoft.scene.connection_records import Attachment, Point, Tendon
+from taisoft.scene.connections import coincide, locate_nodes, start_of
 from taisoft.scene.locate import locate
 from taisoft.scene.scene import Scene
 
-
-@dataclass(frozen=True, eq=False)
-class SpringTable:
-    """All elements of a scene, e of them with s entries in all."""
-
-    start: np.ndarray  # (e + 1) first entry of each
-    node: np.ndarray  # (s,) of all nodes of the scene, distinct within an element, ascending
-    weight: np.ndarray  # (s,) c_j
-    offset: np.ndarray  # (e,3) g [m]
-    stiffness: np.ndarray  # (e,) k [N/m]
-    rest_length: np.ndarray  # (e,) L [m]
-    damping: np.ndarray  # (e,) c_d [N s/m]
-    slot: np.ndarray  # (e,) amplitude that is T_0, -1: none
-    elements: dict[str, slice]  # of each connection, by name
-
-    @property
-    def element(self) -> np.ndarray:
-        """Element (s,) of each entry."""
-        return owners(np.diff(self.start))
-
-    def vectors(self, x: np.ndarray) -> np.ndarray:
-        """e (e,3) [m] of node positions (n,3), or its rate of velocities if the offsets are left out."""
-        return self.rates(x) + self.offset
-
-    def rates(self, v: np.ndarray) -> np.ndarray:
-        """sum_j c_j v_j (e,3)."""
-        return np.add.reduceat(self.weight[:, None] * v[self.node], self.start[:-1], axis=0)
-
-    def given(self, amplitudes: np.ndarray) -> np.ndarray:
-        """T_0 (e,) [N]; amplitudes: of all loads, see `fem.loads`."""
-        return np.append(amplitudes, 0.0)[self.slot]
-
-    def tensions(self, x: np.ndarray, v: np.ndarray, amplitudes: np.ndarray) -> np.ndarray:
-        """Tension (e,) [N] with damping; negative: it pushes."""
-        length, d = _length_and_direction(self.vectors(x))
-        return (
-            self.stiffness * (length - self.rest_length) + self.given(amplitudes) + self.damping * (self.rates(v) * d).sum(axis=1)
-        )
-
-    def pulls(self, x: np.ndarray, v: np.ndarray, amplitudes: np.ndarray) -> np.ndarray:
-        """Force (e,3) [N] of each element on its first point."""
-        d, rate = _length_and_direction(self.vectors(x))[1], self.rates(v)
-        across = rate - (rate * d).sum(axis=1)[:, None] * d
-        damped = np.where(self.is_isotropic, self.damping, 0.0)
-        return -(self.tensions(x, v, amplitudes)[:, None] * d + damped[:, None] * across)
-
-    def stiffness_blocks(self, e: np.ndarray, given: np.ndarray) -> np.ndarray:
-        """S (e,3,3) [N/m] of stretched vectors (e,3) and given tensions (e,)."""
-        length, d = _length_and_direction(e)
-        t = self.stiffness + (given - self.stiffness * self.rest_length) / np.where(length > 0.0, length, np.inf)
-        t = np.where(self.is_isotropic, self.stiffness, t)[:, None, None]
-        return t * np.eye(3) + (self.stiffness[:, None, None] - t) * d[:, :, None] * d[:, None, :]
-
-    @property
-    def is_isotropic(self) -> np.ndarray:
-        """Whether (e,) an element has no rest length and no given tension: it then pulls by k e, and damps in all directions."""
-        return (self.rest_length == 0.0) & (self.slot < 0)
-
-
-def _length_and_direction(e: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """l (k,) and d (k,3) of vectors (k,3); d is 0 where l is."""
-    length = np.linalg.norm(e, axis=1)
-    return length, e / np.where(length > 0.0, length, 1.0)[:, None]
+NOWHERE = (np.zeros(3), None)  # the part of an offset that an end on a body has
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,50 +26,86 @@ class Springs:
     """A `SpringTable` on the device, with what kernels derive from it."""
 
     n: Count
+    n_lines: Count
+    line_start: Any  # (n_lines + 1) i32
+    line: Any  # (n) i32
     start: Any  # (n + 1) i32
     node: Any  # (s) i32
     weight: Any  # (s) f64
     element: Any  # (s) i32 of each entry
     offset: Any  # (n) 3-vectors f64
+    moving: Any  # (n) i32: first of the three amplitudes that are the offset, -1 if it does not move; or None
+    rate_after: Count  # amplitudes from an offset that moves to its rate
     numbers: Any  # (n, 3) f64: k, L, c_d
+    kind: Any  # (n) i32
     slot: Any  # (n) i32
     node_start: Any  # (n_nodes + 1) i32: first of each node in node_entry
     node_entry: Any  # (s) i32: entries of each node
+    coupled: Any  # (n, 2) i32
     pair_start: Any  # (s) i32: first of each entry in pair_at
-    pair_at: Any  # i32: for each pair of entries of an element, its block in the stiffness matrix, -1 on the diagonal; or None
-    pull: Any  # (n) 3-vectors f64 [N]: scratch, force along e
-    has_tendons: bool
+    pair_at: Any  # i32: for each pair of coupled entries, its block in the stiffness matrix, -1 on the diagonal; or None
+    pull: Any  # (n) 3-vectors f64 [N]: scratch, force along e without given tension
+    direction: Any  # (n) 3-vectors f64: scratch
+    length: Any  # (n) f64 [m]: scratch
+    elastic: Any  # (n_lines) f64 [N]: scratch, k (l - L)
+    has_tensions: bool  # given ones
+    has_lengths: bool  # given ones, of elastic tendons
+
+    @property
+    def has_moving(self) -> bool:
+        """Whether ends move with obstacles."""
+        return self.moving is not None
 
 
-def spring_table(scene: Scene) -> SpringTable | None:
-    """The elements of a scene; None if it has none."""
-    made, slots = _Builder(scene), tension_slots(scene)
+def spring_table(scene: Scene, dependents: DependentTable | None = None) -> SpringTable | None:
+    """The elements of a scene; None if it has none. dependents: the scene's table, if it is known already."""
+    made = _collect(scene)
+    return None if made is None else made.table(dependents or dependent_table(scene))
+
+
+def own_spring_table(scene: Scene) -> SpringTable | None:
+    """The elements of a scene at the nodes where they end, even if these depend on others; None if it has none."""
+    made = _collect(scene)
+    return None if made is None else made.table(None)
+
+
+def _collect(scene: Scene) -> "_Builder | None":
+    if not scene.has_springs:
+        return None
+    made, slots = _Builder(scene), tendon_slots(scene)
     for spring in scene.springs:
         length = spring.rest_length
         if length is None:
             a, b = (start_of(scene, point) for point in spring.points)
             length = 0.0 if coincide(scene, *spring.points) else float(np.linalg.norm(a - b))
-        made.add(spring.name, [made.between(*spring.points)], spring.stiffness, length, spring.damping, -1)
+        made.add(spring.name, [[made.between(*spring.points)]], PLAIN, spring.stiffness, length, spring.damping)
     for tendon in scene.tendons:
-        segments = [made.between(p, q) for p, q in zip(tendon.points, tendon.points[1:])]
-        made.add(tendon.name, segments, 0.0, 0.0, 0.0, slots[tendon.name])
+        segments, kind = [made.between(p, q) for p, q in zip(tendon.points, tendon.points[1:])], _kind(tendon)
+        if kind == TENSION:  # segments between two obstacles move nothing
+            segments = [one for one in segments if len(one[0])]
+        made.add(tendon.name, [segments], kind, tendon.stiffness or 0.0, slot=slots[tendon.name])
     for attachment in [one for one in scene.attachments if one.stiffness is not None]:
-        made.add(attachment.name, made.attached(attachment), attachment.stiffness, 0.0, attachment.damping, -1)
-    return made.table() if made.elements else None
+        lines = [[one] for one in made.attached(attachment)]
+        made.add(attachment.name, lines, PLAIN, attachment.stiffness, damping=attachment.damping)
+    return made
+
+
+def _kind(tendon: Tendon) -> int:
+    return LENGTH if tendon.is_elastic else MULTIPLIER if tendon.is_inextensible else TENSION
 
 
 class _Builder:
-    """Collects elements; one is (nodes, weights, offset (3,))."""
+    """Collects elements; one is (nodes, weights, points (2,3) of obstacles, obstacles or None of the two ends)."""
 
     def __init__(self, scene: Scene):
         self.scene, self.elements = scene, {}
         self._starts = scene.first_nodes
-        self._entries, self._numbers = [], []
+        self._entries, self._numbers, self._n_lines = [], [], 0
 
     def between(self, p: Point, q: Point):
         """The element between two points."""
-        (nodes_p, weights_p, at_p), (nodes_q, weights_q, at_q) = self._side(p), self._side(q)
-        return np.concatenate([nodes_p, nodes_q]), np.concatenate([weights_p, -weights_q]), at_p - at_q
+        (nodes_p, weights_p, *at_p), (nodes_q, weights_q, *at_q) = self._side(p), self._side(q)
+        return np.concatenate([nodes_p, nodes_q]), np.concatenate([weights_p, -weights_q]), at_p, at_q
 
     def attached(self, attachment: Attachment) -> list:
         """The elements of an attachment."""
@@ -146,28 +114,39 @@ class _Builder:
         if isinstance(b, Body):
             nodes, weights = locate_nodes(self.scene, attachment)
             nodes = nodes + self._starts[b.name]
-            return [(np.append(i, j), np.append(1.0, -w), np.zeros(3)) for i, j, w in zip(own, nodes, weights)]
+            return [(np.append(i, j), np.append(1.0, -w), NOWHERE, NOWHERE) for i, j, w in zip(own, nodes, weights)]
         places = a.rest_positions[attachment.nodes] + a.position
-        return [(np.array([i]), np.ones(1), -place) for i, place in zip(own, places)]
+        return [(np.array([i]), np.ones(1), NOWHERE, (place, b)) for i, place in zip(own, places)]
 
     def _side(self, point: Point):
         owner = self.scene.collider(point.owner)
         if not isinstance(owner, Body):
-            return np.zeros(0, dtype=np.int64), np.zeros(0), point.position
+            return np.zeros(0, dtype=np.int64), np.zeros(0), point.position, owner
         nodes, weights, _ = locate(owner, point.position[None])
-        return self._starts[owner.name] + nodes[0], weights[0], np.zeros(3)
+        return self._starts[owner.name] + nodes[0], weights[0], *NOWHERE
 
-    def add(self, name: str, elements: list, *numbers: float) -> None:
-        """Add the elements of a connection, which have the same numbers."""
-        elements, first = [one for one in elements if len(one[0])], len(self._entries)  # not those between two obstacles
-        self.elements[name] = slice(first, first + len(elements))
-        self._entries += elements
-        self._numbers += [numbers] * len(elements)
+    def add(
+        self,
+        name: str,
+        lines: list[list],
+        kind: int,
+        stiffness: float,
+        rest_length: float = 0.0,
+        damping: float = 0.0,
+        slot: int = -1,
+    ) -> None:
+        """Add the lines of a connection, which have the same numbers."""
+        first = len(self._entries)
+        for line in lines:
+            self._entries += line
+            self._numbers += [(self._n_lines, kind, slot, stiffness, rest_length, damping)] * len(line)
+            self._n_lines += 1
+        self.elements[name] = slice(first, len(self._entries))
 
-    def table(self) -> SpringTable:
+    def table(self, dependents: DependentTable | None) -> SpringTable:
         """All elements, without nodes of weight 0."""
-        nodes, weights, dependents = [], [], dependent_table(self.scene)
-        for own, c, _ in self._entries:
+        nodes, weights = [], []
+        for own, c, *_ in self._entries:
             if dependents is not None:
                 row = sp.csr_matrix((c, (np.zeros(len(own), dtype=int), own)), shape=(1, dependents.n_nodes)) @ dependents.matrix
                 own, c = row.indices, row.data
@@ -175,55 +154,96 @@ class _Builder:
             total = np.bincount(place, c)
             nodes.append(distinct[total != 0.0])
             weights.append(total[total != 0.0])
-        stiffness, length, damping, slot = (np.array(column) for column in zip(*self._numbers))
+        line, kind, slot, stiffness, length, damping = (np.array(column) for column in zip(*self._numbers))
         return SpringTable(
-            np.cumsum([0, *map(len, nodes)]),
-            np.concatenate(nodes),
-            np.concatenate(weights),
-            np.array([offset for _, _, offset in self._entries]),
-            stiffness,
-            length,
-            damping,
-            slot,
-            self.elements,
+            n_nodes=sum(body.n_nodes for body in self.scene.bodies),
+            start=np.cumsum([0, *map(len, nodes)]),
+            node=np.concatenate(nodes),
+            weight=np.concatenate(weights),
+            offset=np.array([p - q for _, _, (p, _), (q, _) in self._entries]),
+            line=line,
+            kind=kind,
+            stiffness=stiffness,
+            rest_length=length,
+            damping=damping,
+            slot=slot,
+            elements=self.elements,
+            moving=self._moving(bool(damping.any())),
         )
 
+    def _moving(self, damped: bool) -> MovingEnds | None:
+        ends = [(sign, n, *end) for n, (_, _, *both) in enumerate(self._entries) for sign, end in zip((1.0, -1.0), both)]
+        moves = [owner is not None and owner.path is not None for *_, owner in ends]
+        if not any(moves):
+            return None
+        element = np.unique([n for (_, n, *_), move in zip(ends, moves) if move])
+        fixed, found = np.zeros((len(element), 3)), {}
+        for (sign, n, place, owner), move in zip(ends, moves):
+            at = int(np.searchsorted(element, n))
+            if move:
+                found.setdefault(owner.name, (owner, [], [], []))
+                for values, value in zip(found[owner.name][1:], (at, sign, place)):
+                    values.append(value)
+            elif at < len(element) and element[at] == n:
+                fixed[at] += sign * place
+        grouped = [
+            (owner, np.array(places), np.array(signs), owner.undisplaced(0.0, np.array(points)))
+            for owner, places, signs, points in found.values()
+        ]
+        return MovingEnds(len(scalar_loads(self.scene)), damped, element, fixed, grouped)
 
-def node_pairs(start: np.ndarray, node: np.ndarray) -> np.ndarray:
-    """Pairs (k,2) of nodes that share an element, the lower first. start, node: as in `SpringTable`."""
-    pairs = [np.stack(np.triu_indices(n, 1), axis=1) + first for first, n in zip(start, np.diff(start))]
-    return node[np.concatenate(pairs)].astype(np.int64)
+
+def node_pairs(springs: Springs) -> np.ndarray:
+    """Pairs (k,2) of nodes that stiffness couples, the lower first."""
+    node, coupled = (a.astype(np.int64) for a in download([springs.node, springs.coupled]))
+    groups = [np.unique(node[first:last]) for first, last in np.unique(coupled, axis=0)]
+    return np.concatenate([own[np.stack(np.triu_indices(len(own), 1), axis=1)] for own in groups])
 
 
-def build_springs(scene: Scene, arena: FieldArena, n_nodes: int, assembled: bool) -> Springs:
+def build_springs(table: SpringTable, arena: FieldArena, assembled: bool) -> Springs:
     """Copy a scene's elements to the device. assembled: there will be a stiffness matrix, see `set_pair_entries`."""
-    table = spring_table(scene)
-    by_node = np.argsort(table.node, kind="stable")
-    counts, numbers = np.diff(table.start), np.stack([table.stiffness, table.rest_length, table.damping], axis=1)
+    by_node, coupled, n = np.argsort(table.node, kind="stable"), table.coupled, len(table.offset)
+    counts = np.diff(coupled, axis=1).reshape(-1)[table.element]  # of the entries that each entry is coupled with
+    numbers = np.stack([table.stiffness, table.rest_length, table.damping], axis=1)
+    n_lines, moving, n_moving = len(table.line_start) - 1, np.full(n, -1), 0
+    if table.moving is not None:
+        n_moving = len(table.moving.element)
+        moving[table.moving.element] = table.moving.first + 3 * np.arange(n_moving)
     return Springs(
-        n=len(table.offset),
+        n=n,
+        n_lines=n_lines,
+        line_start=_ids(arena, "spring_line_start", table.line_start),
+        line=_ids(arena, "spring_line", table.line),
         start=_ids(arena, "spring_start", table.start),
         node=_ids(arena, "spring_node", table.node),
         weight=arena.field("spring_weight", ti.f64, len(table.weight), table.weight),
         element=_ids(arena, "spring_element", table.element),
-        offset=arena.vectors("spring_offset", ti.f64, len(table.offset), table.offset),
-        numbers=arena.field("spring_numbers", ti.f64, (len(table.offset), 3), numbers),
+        offset=arena.vectors("spring_offset", ti.f64, n, table.offset),
+        moving=_ids(arena, "spring_moving", moving) if n_moving else None,
+        rate_after=3 * n_moving,
+        numbers=arena.field("spring_numbers", ti.f64, (n, 3), numbers),
+        kind=_ids(arena, "spring_kind", table.kind),
         slot=_ids(arena, "spring_slot", table.slot),
-        node_start=_ids(arena, "spring_node_start", np.cumsum([0, *np.bincount(table.node, minlength=n_nodes)])),
+        node_start=_ids(arena, "spring_node_start", np.cumsum([0, *np.bincount(table.node, minlength=table.n_nodes)])),
         node_entry=_ids(arena, "spring_node_entry", by_node),
-        pair_start=_ids(arena, "spring_pair_start", np.cumsum([0, *np.repeat(counts, counts)])[:-1]),
-        pair_at=arena.field("spring_pair_at", ti.i32, int((counts**2).sum())) if assembled else None,
-        pull=arena.vectors("spring_pull", ti.f64, len(table.offset)),
-        has_tendons=bool((table.slot >= 0).any()),
+        coupled=arena.field("spring_coupled", ti.i32, coupled.shape, coupled.astype(np.int32)),
+        pair_start=_ids(arena, "spring_pair_start", np.cumsum([0, *counts])[:-1]),
+        pair_at=arena.field("spring_pair_at", ti.i32, int(counts.sum())) if assembled else None,
+        pull=arena.vectors("spring_pull", ti.f64, n),
+        direction=arena.vectors("spring_direction", ti.f64, n),
+        length=arena.field("spring_length", ti.f64, n),
+        elastic=arena.field("spring_elastic", ti.f64, n_lines),
+        has_tensions=bool(np.isin(table.kind, (TENSION, MULTIPLIER)).any()),
+        has_lengths=bool((table.kind == LENGTH).any()),
     )
 
 
 def set_pair_entries(springs: Springs, graph: NodeGraph) -> None:
     """Set `pair_at` for a matrix with this pattern."""
-    start, node = (a.astype(np.int64) for a in download([springs.start, springs.node]))
-    groups = [node[first:last] for first, last in zip(start, start[1:])]
-    rows = np.concatenate([np.repeat(own, len(own)) for own in groups])
-    columns = np.concatenate([np.tile(own, len(own)) for own in groups])
+    node, element, coupled = (a.astype(np.int64) for a in download([springs.node, springs.element, springs.coupled]))
+    ranges = coupled[element]
+    rows = np.repeat(node, np.diff(ranges, axis=1).reshape(-1))
+    columns = np.concatenate([node[first:last] for first, last in ranges])
     upload([(springs.pair_at, np.where(rows == columns, -1, graph.entries(rows, columns)))])
 
 

@@ -21,6 +21,7 @@ from taisoft.fem.node_graph import BLOCKS, EDGES, block_of, count_of, edge_of, n
 from taisoft.fem.pattern import MATRIX_BLOCKS, model_graph
 from taisoft.fem.springs import set_pair_entries
 from taisoft.fem.terms import rayleigh_damping
+from taisoft.fem.terms.elasticity import prepare_terms
 from taisoft.linear.element_blocks import element_blocks, pair_terms
 from taisoft.linear.patch_terms import PatchTerms, add_patches, build_patch_terms, find_gradients
 
@@ -165,6 +166,7 @@ def to_system(
     a, b: mass and stiffness damping of the row's body; K_d: values of the matrix `damper`; K_t: stiffness of the terms that have
     STIFFNESS, without their negative part if projected.
     """
+    prepare_terms(m)
     ti.loop_config(serialize=m.serial)
     for j in range(n_nodes_of(m, subset)):
         i = node_of(subset, j)

@@ -13,6 +13,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from taisoft.attributes import MeshAttributeError, guarded_record
+from taisoft.display import short_repr
 from taisoft.errors import MeshError
 from taisoft.mesh.tet_mesh import TetMesh
 from taisoft.mesh.topology import EDGES, distinct_edges
@@ -53,6 +54,8 @@ class Nodes:
     tets: np.ndarray
     surface: np.ndarray
     embedded: sp.csr_matrix | None = None
+
+    __repr__ = short_repr
 
     def __post_init__(self):
         for array in (self.positions, self.elements, self.boundary, self.boundary_tets, self.tets, self.surface):

@@ -132,8 +132,15 @@ def run_child(folder: str, task: str, *arguments: str, seconds: float | None = N
 
 
 def main(task: str, *arguments: str) -> None:
-    """Run a task in the child process: "read" a file by meshio, or "mesh" the surface in surface.npz by fTetWild."""
-    np.savez("result.npz", **{"read": _read, "mesh": _mesh}[task](*arguments))
+    """Run a task in the child process: "read" a file by meshio, "usd": read a stage, or "mesh" surface.npz by fTetWild."""
+    np.savez("result.npz", **{"read": _read, "usd": _read_usd, "mesh": _mesh}[task](*arguments))
+
+
+def _read_usd(path: str, seconds: str) -> dict[str, np.ndarray]:
+    from taisoft.mesh.usd_content import read_stage
+
+    _limit_resources(MEMORY + MEMORY_PER_BYTE * Path(path).stat().st_size, int(float(seconds)) + 1)
+    return read_stage(path)
 
 
 def _mesh() -> dict[str, np.ndarray]:

@@ -100,6 +100,13 @@ class SurfaceMesh:
         used, corner = np.unique(self.triangles, return_inverse=True)
         return int(connected_pieces(corner.reshape(-1, 3), len(used))[0])
 
+    @property
+    def n_holes(self) -> int:
+        """Number of connected rims, whose edges belong to one triangle."""
+        edges, counts, _ = triangle_edges(self.triangles)
+        rims, end = np.unique(edges[counts == 1], return_inverse=True)
+        return int(linked_groups(*end.reshape(-1, 2).T, len(rims))[0]) if len(rims) else 0
+
     def faults(self) -> list[str]:
         """Return what keeps the surface from bounding a solid, one sentence with a remedy for each fault."""
         edges, counts, net_direction = triangle_edges(self.triangles)
@@ -107,10 +114,8 @@ class SurfaceMesh:
         mismatched = edges[(counts == 2) & (net_direction != 0)]
         found = []
         if len(single):
-            rims, end = np.unique(single, return_inverse=True)
-            holes = linked_groups(*end.reshape(-1, 2).T, len(rims))[0]
             found.append(
-                f"{holes} {'hole' if holes == 1 else 'holes'}: {len(single)} edges belong to one triangle, the first is "
+                f"{_holes_text(self.n_holes)}: {len(single)} edges belong to one triangle, the first is "
                 f"{_edge_text(single)}; fill holes in a modelling program, or read with a larger weld if they are cracks"
             )
         if len(crowded):
@@ -124,6 +129,10 @@ class SurfaceMesh:
                 f"{_edge_text(mismatched)}; make the normals consistent"
             )
         return [INWARD] if not found and self.volume < 0.0 else found
+
+
+def _holes_text(n: int) -> str:
+    return f"{n} {'hole' if n == 1 else 'holes'}"
 
 
 def _edge_text(edges: np.ndarray) -> str:
@@ -156,11 +165,11 @@ def read_surface(path, weld: float = 0.0) -> SurfaceMesh:
     # Split each polygon as a fan around its first corner.
     fans = [nodes[:, [0, k, k + 1]] for nodes in polygons for k in range(1, nodes.shape[1] - 1)]
     triangles = np.concatenate([np.empty((0, 3), dtype=np.int64), *fans])
-    return _clean(SurfaceMesh(points, triangles, name), float(weld))
+    return clean_surface(SurfaceMesh(points, triangles, name), float(weld))
 
 
-def _clean(surface: SurfaceMesh, weld: float) -> SurfaceMesh:
-    """Return the welded surface without degenerate and duplicate triangles; issue its warnings."""
+def clean_surface(surface: SurfaceMesh, weld: float) -> SurfaceMesh:
+    """Return the surface, welded [m], without degenerate and duplicate triangles; issue its warnings, at the caller's caller."""
     name, points, triangles = surface.source, surface.vertices, surface.triangles
     notes = []
     labels = merge_labels(points, weld)
@@ -248,8 +257,8 @@ def tetrahedralize(surface: SurfaceMesh, edge_length: float | None = None, envel
     """Return a tetrahedral mesh of the volume enclosed by a surface.
 
     edge_length: approximate edge length of the tets [m]; None for a twentieth of the diagonal. envelope: largest distance [m]
-    of the new surface from the old one; None for a tenth of edge_length. Warns of the surface's faults. Raises MeshError if the
-    extra `mesh` is missing, nothing is enclosed, or the mesher fails.
+    of the new surface from the old one; None for a tenth of edge_length. Warns of the surface's faults, and of the volume with
+    holes closed. Raises MeshError if the extra `mesh` is missing, nothing is enclosed, or the mesher fails.
     """
     if not isinstance(surface, SurfaceMesh):
         raise MeshError(f"tetrahedralize needs a SurfaceMesh (see read_surface), not {type(surface).__name__}")
@@ -277,6 +286,9 @@ def tetrahedralize(surface: SurfaceMesh, edge_length: float | None = None, envel
             f"{name}: the tets fill {mesh.volumes.sum():.4g} m^3 of {abs(surface.volume):.4g}, a larger difference than an "
             f"envelope of {envelope:.3g} m allows: use a smaller edge_length"
         )
+    if holes := surface.n_holes:
+        text = f"{_holes_text(holes)} {'was' if holes == 1 else 'were'} closed, and the tets fill {mesh.volumes.sum():.4g} m^3"
+        warnings.warn(f"{name}: {text}", UserWarning, stacklevel=2)
     return mesh
 
 

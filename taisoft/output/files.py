@@ -18,11 +18,16 @@ from taisoft.files import link_file, part_path
 
 LOCK_NAME = "taisoft.lock"
 CHECKPOINT_NAME, PREVIOUS_NAME = "checkpoint.npz", "checkpoint.previous.npz"
-RESULT_FILES = ("report.json", "steps.csv", "scene.usdc", CHECKPOINT_NAME, PREVIOUS_NAME, "video.mp4")
-REPORT_FILES = ("report.json", "steps.csv")  # removed at once: beside the results of another run they would be wrong
+PVD_NAME, BODIES_NAME = "scene.pvd", "npz/bodies.npz"
+RESULT_FILES = (
+    *("report.json", "steps.csv", "frames.csv", "scene.usdc", PVD_NAME, BODIES_NAME),
+    *(CHECKPOINT_NAME, PREVIOUS_NAME, "video.mp4"),
+)
+REPORT_FILES = ("report.json", "steps.csv", PVD_NAME)  # removed at once: beside another run's results they would be wrong
 # Left by a killed writer: see `taisoft.files.part_path`; USD adds temporary files with a suffix of its own
 TEMPORARY = re.compile(r"\.\d+-\d+\.part$|\.usdc\.\d+-\d+\.[A-Za-z0-9]{6}$")
-RESULT_FOLDERS = {"frames": "[0-9]*.png", "chunks": "points_*.usdc"}  # folder -> pattern of a run's files in it
+# folder -> pattern of a run's files in it, one for each frame or chunk of frames
+RESULT_FOLDERS = {"frames": "[0-9]*.png", "chunks": "points_*.usdc", "vtu": "[0-9]*.vtu", "npz": "[0-9]*.npz"}
 
 
 @contextmanager
@@ -59,7 +64,7 @@ class OutputFolder:
     """A run's folder: created or reused, checked, and locked until `close`.
 
     path: created if absent; an empty folder, or one without a run's files, is accepted. overwrite: accept a folder that holds
-    results: report.json, steps.csv, frames and chunks are removed at once, every other file when its successor is complete.
+    results: REPORT_FILES and RESULT_FOLDERS are removed at once, every other file when its successor is complete.
     first: number of the first frame of a resumed run; results are accepted, earlier frames stay, `clear` removes later ones
     and report.json, and other files are only replaced. Raises OutputError if the folder cannot be written, another process
     writes to it, or it holds results without overwrite.

@@ -12,6 +12,8 @@ mean is first-order accurate.
 import numpy as np
 import scipy.sparse as sp
 
+UNKNOWN_ERROR = -1.0  # in files, of nodes whose error is unknown
+
 
 class NodalMean:
     """Mean over the tets at each node, weighted by rest volumes, for bodies of either order. bodies: in the order added."""

@@ -15,10 +15,10 @@ Both carry `primvars:vonMisesStress` [Pa]. If there can be contacts, the surface
 impulse of the last step before the frame on each point. `nodal_fields.py` defines both. A run with error=True adds
 `primvars:estimatedError` [m], `Simulator.nodal_errors`, -1 where unknown.
 An obstacle is `/World/<name>` with `surface` and `material`; its points change over time if it follows a path. A half-space
-whose square lies entirely within others is left out. `/View` holds a camera and lights (`usd_scene.py`).
+whose square lies entirely within others is left out. A spring or a tendon is `/World/<name>`, see `usd_curves.py`. `/View` holds
+a camera and lights (`usd_scene.py`).
 """
 
-import re
 from contextlib import suppress
 from pathlib import Path
 
@@ -27,18 +27,19 @@ import numpy as np
 from taisoft.dynamics.contact_record import nodal_impulses
 from taisoft.errors import OutputError
 from taisoft.files import part_path, publish, replacing
+from taisoft.mesh.usd_content import usd_message
 from taisoft.output.files import make_folder, output_errors
-from taisoft.output.nodal_fields import NodalMean, von_mises
+from taisoft.output.nodal_fields import UNKNOWN_ERROR, NodalMean, von_mises
+from taisoft.output.usd_curves import TENSION
 from taisoft.output.usd_scene import ERROR, IMPULSE, ROOT, STRESS, TRANSLATE, scene_layer
 
 SCENE_NAME = "scene.usdc"
 CHUNKS_NAME = "chunks"
-UNKNOWN_ERROR = -1.0  # of points whose error is unknown
-TIME_VARYING = {"points", "extent", TRANSLATE, *(f"primvars:{name}" for name in (STRESS, IMPULSE, ERROR))}  # attributes
+TIME_VARYING = {"points", "extent", TRANSLATE, *(f"primvars:{name}" for name in (STRESS, IMPULSE, ERROR, TENSION))}  # attributes
 
 
 class UsdWriter:
-    """Observer that writes the scene's bodies and obstacles over time to folder/scene.usdc.
+    """Observer that writes the scene's bodies, obstacles, springs and tendons over time to folder/scene.usdc.
 
     folder: the run's folder; scene: its meshes and names are read at construction; fps: frames per second of simulated time
     [1/s]; chunk_frames: frames per chunk, the most that are lost if the process is killed; self_collision: the simulator's
@@ -65,7 +66,7 @@ class UsdWriter:
         self.chunks = make_folder(Path(folder) / CHUNKS_NAME)
         self.chunk_frames = chunk_frames
         self._touching, self._errors = scene.pushes(self_collision), errors
-        self._tracks, self._moving, self._view, self._template = scene_layer(scene, fps, self._touching, errors)
+        self._tracks, self._moving, self._curves, self._view, self._template = scene_layer(scene, fps, self._touching, errors)
         self._mean = NodalMean(scene.bodies)
         self._joined = _Joined(self.path, self._template)
         self._chunk = None
@@ -95,10 +96,11 @@ class UsdWriter:
         from pxr import Gf, Sdf
 
         moved = [(track, surface.at(sim.time).astype(np.float32)) for track, surface in self._moving]  # first, since it may raise
+        x = sim.positions()
+        curves = [] if self._curves is None else self._curves.samples(sim, x)
         if self._chunk is None:
             self._chunk = Sdf.Layer.CreateAnonymous(".usdc")
             self._chunk.TransferContent(self._template)
-        x = sim.positions()
         points, fields = x.astype(np.float32), {STRESS: von_mises(self._mean(sim.stress())).astype(np.float32)}
         if self._touching:
             fields[IMPULSE] = nodal_impulses(sim.contacts(), len(x)).astype(np.float32)
@@ -109,6 +111,7 @@ class UsdWriter:
             samples += track.samples(points, fields)
         for track, corners in moved:
             samples += track.samples(corners, {})
+        samples += curves
         for path, value in samples:
             self._chunk.SetTimeSample(path, float(index), value)
         self._frames.append(index)
@@ -242,7 +245,7 @@ def _opened(path: Path):
     try:
         return Sdf.Layer.OpenAsAnonymous(str(path))
     except Exception as error:
-        raise OutputError(f"{path} cannot be read: {_last_line(error)}") from None
+        raise OutputError(f"{path} cannot be read: {usd_message(error)}") from None
 
 
 def _structure(layer) -> list[str]:
@@ -258,7 +261,7 @@ def _write_checked(path: Path, layer, write) -> None:
             return
         reason = "USD gives no reason"
     except Exception as error:
-        reason = _last_line(error)
+        reason = usd_message(error)
     n_bytes = sum(np.asarray(layer.QueryTimeSample(*sample)).nbytes for sample in _samples(layer))
     raise OutputError(f"cannot write {path} ({n_bytes} bytes of new frames): {reason}")
 
@@ -269,9 +272,3 @@ def _remove_chunks(chunks: Path) -> None:
             path.unlink()
         if not any(chunks.iterdir()):
             chunks.rmdir()
-
-
-def _last_line(error: Exception) -> str:
-    """Return the message of a USD error, whose text is a list of source locations, each with a quoted message."""
-    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-    return re.sub(r"^Error in '.*' at line \d+ in file \S+ : '(.*)'$", r"\1", lines[-1]) if lines else type(error).__name__

@@ -1,4 +1,5 @@
-"""OpenUSD layer of a scene without its frames: bodies and obstacles under `/World`, camera and lights under `/View`.
+"""OpenUSD layer of a scene without its frames: bodies, obstacles, springs and tendons under `/World`, camera and lights
+under `/View`.
 
 Solids are single-sided, half-spaces included, so that a viewer with back-face culling can look into a bin. For viewers without
 culling, half-spaces that face away from the camera at the start, and so hide the bodies, have purpose guide, which viewers show
@@ -17,6 +18,7 @@ from dataclasses import replace
 import numpy as np
 
 from taisoft.mesh.topology import opposite_half_edges
+from taisoft.mesh.usd_content import NAME
 from taisoft.output.appearance import (
     OBSTACLE_COLOUR,
     ObstacleSurface,
@@ -26,6 +28,7 @@ from taisoft.output.appearance import (
     obstacle_surfaces,
 )
 from taisoft.output.camera import MAX_WIDENING, Camera, start_positions
+from taisoft.output.usd_curves import Curves
 from taisoft.scene.obstacles import HalfSpace, MeshObstacle
 from taisoft.scene.rigid import RigidBody
 
@@ -131,11 +134,11 @@ class ViewTrack:
         self.camera = replace(self.camera, distance=float(f"{distance:.12g}"))
 
 
-def scene_layer(scene, fps: float, touching: bool, errors: bool) -> tuple[list[Track], list, ViewTrack, object]:
+def scene_layer(scene, fps: float, touching: bool, errors: bool) -> tuple[list[Track], list, Curves | None, ViewTrack, object]:
     """Build a layer with everything that does not change, and the tracks that get values with the frames.
 
     touching: whether there can be contacts; errors: whether errors are estimated. Returns the tracks of the bodies, (track,
-    surface) of each obstacle that follows a path, the camera's track and the layer.
+    surface) of each obstacle that follows a path, the curves of springs and tendons or None, the camera's track and the layer.
     """
     from pxr import Sdf, Usd, UsdGeom
 
@@ -149,15 +152,17 @@ def scene_layer(scene, fps: float, touching: bool, errors: bool) -> tuple[list[T
     stage.SetTimeCodesPerSecond(fps)
     stage.SetFramesPerSecond(fps)
     stage.SetDefaultPrim(UsdGeom.Xform.Define(stage, ROOT).GetPrim())
-    legal = prim_names([one.name for one in (*scene.bodies, *scene.obstacles)])
+    legal = prim_names([one.name for one in (*scene.colliders, *scene.springs, *scene.tendons)])
     tracks, first = [], 0
     for k, (body, name) in enumerate(zip(scene.bodies, legal)):
         tracks += _define_body(stage, body, name, body_colour(k), first, touching, errors)
         first += body.n_nodes
     view = ViewTrack(stage, scene)
-    surfaces = [s for s in zip(obstacle_surfaces(scene), legal[len(scene.bodies) :]) if len(s[0].triangles)]
+    n_bodies, n_colliders = len(scene.bodies), len(scene.colliders)
+    surfaces = [s for s in zip(obstacle_surfaces(scene), legal[n_bodies:n_colliders]) if len(s[0].triangles)]
     moving = [(_define_obstacle(stage, surface, name, view.camera.position), surface) for surface, name in surfaces]
-    return tracks, [one for one in moving if one[1].obstacle.path is not None], view, layer
+    curves = Curves(stage, ROOT, scene, legal[n_colliders:]) if scene.springs or scene.tendons else None
+    return tracks, [one for one in moving if one[1].obstacle.path is not None], curves, view, layer
 
 
 def _extent(points: np.ndarray) -> np.ndarray:
@@ -175,7 +180,7 @@ def _define_surface(stage, name: str, legal_name: str, srgb: np.ndarray, triangl
     path = f"{ROOT}/{legal_name}"
     prim = UsdGeom.Xform.Define(stage, path).GetPrim()
     prim.SetDisplayName(name)
-    prim.SetCustomDataByKey("taisoft:name", name)
+    prim.SetCustomDataByKey(NAME, name)
 
     colour = Gf.Vec3f(*linear_rgb(srgb).tolist())
     material = UsdShade.Material.Define(stage, f"{path}/material")
@@ -237,9 +242,11 @@ def _define_body(stage, body, legal_name: str, srgb: np.ndarray, first: int, tou
         primvar.GetAttr().SetDocumentation(meaning)
 
     scalars, vectors = Sdf.ValueTypeNames.FloatArray, Sdf.ValueTypeNames.Vector3fArray
-    for gprim in shown:
-        gprim.CreatePointsAttr()
-        gprim.CreateExtentAttr()
+    start = (body.rest_positions + body.position).astype(np.float32)  # readers find the rest shape in the default value
+    own = start[nodes] if skin is None else (skin.surface.vertices[nodes] + body.position).astype(np.float32)
+    for gprim, x in zip(shown, (own, start)):
+        gprim.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(x)))
+        gprim.CreateExtentAttr(Vt.Vec3fArray.FromNumpy(_extent(x)))
         paint(gprim)
         define_primvar(gprim, STRESS, scalars, "von Mises equivalent of the mean Cauchy stress at the node [Pa]")
         if errors:

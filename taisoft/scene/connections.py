@@ -1,115 +1,28 @@
-"""Springs, tendons and attachments: forces between points of bodies, and between these and obstacles at rest.
+"""Springs, tendons and attachments: forces between points of bodies, and between these and obstacles.
 
 A point of a body is given by its rest position, in the coordinates of body.rest_positions, or as a node; a point of an obstacle
-by its position. Each function here that takes a scene is a method of `Scene`, whose class body lists them.
+by its position at the start. Each function whose first argument is `self` is a method of `Scene`, whose class body lists them.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from taisoft.attributes import guarded_record
 from taisoft.errors import SceneError
 from taisoft.scene import checks
-from taisoft.scene.body import Body
+from taisoft.scene.body import Body, Constraint
+from taisoft.scene.connection_records import MAX_OUTSIDE, Attachment, Point, Spring, Tendon
 from taisoft.scene.loads import value_or_path
 from taisoft.scene.locate import locate
+from taisoft.scene.obstacles import Obstacle
 from taisoft.scene.rigid import RigidBody
 
 if TYPE_CHECKING:
     from taisoft.scene.scene import Scene
 
-MAX_OUTSIDE = 0.1  # heights of a tet by which a point may lie outside a body: curved surfaces do not meet exactly
 SAME = 1e-9  # of the largest coordinate of their bodies: points that are closer coincide
-_ADD_ANOTHER = "remove it from its list and add another one before the Simulator is made"
-
-
-@guarded_record("point", _ADD_ANOTHER)
-@dataclass(frozen=True, eq=False)
-class Point:
-    """A point of a body or of an obstacle."""
-
-    owner: str  #: name of the body or obstacle
-    position: np.ndarray  #: (3,) [m], of a body at rest, of an obstacle in the scene
-
-    def __post_init__(self):
-        checks.store(self, position=self.position)
-
-
-@guarded_record("spring", _ADD_ANOTHER)
-@dataclass(frozen=True, eq=False)
-class Spring:
-    """A spring between two points, which pulls with stiffness times its extension, plus damping times its rate."""
-
-    name: str
-    points: tuple[Point, Point]
-    stiffness: float  #: [N/m]
-    rest_length: float | None  #: [m]; None: the distance of the points at the start
-    damping: float  #: [N s/m]
-
-    @property
-    def owners(self) -> list[str]:
-        """Names of the bodies and obstacles of its points."""
-        return [point.owner for point in self.points]
-
-
-@guarded_record("tendon", "call sim.set_tension(name, force) in a simulation")
-@dataclass(frozen=True, eq=False)
-class Tendon:
-    """A line through points, along which it slides without friction, under a given tension."""
-
-    name: str
-    points: tuple[Point, ...]
-    value: np.ndarray | None  #: () tension [N]; None if it follows a path
-    path: Callable | None = None  #: t [s] -> tension [N]
-    path_shape: tuple[int, ...] | None = None  #: of all values along the path
-    kind: ClassVar[str] = "force"
-
-    def __post_init__(self):
-        checks.store(self, value=self.value)
-
-    @property
-    def shapes(self) -> tuple[tuple[int, ...], ...]:
-        """Shapes that its values may have."""
-        return ((),)
-
-    @property
-    def damping(self) -> float:
-        """[N s/m]"""
-        return 0.0
-
-    @property
-    def owners(self) -> list[str]:
-        """Names of the bodies and obstacles of its points."""
-        return [point.owner for point in self.points]
-
-
-@guarded_record("attachment", _ADD_ANOTHER)
-@dataclass(frozen=True, eq=False)
-class Attachment:
-    """Nodes of a body, each kept where it lies in another body at the start, or pulled there by a spring of rest length 0."""
-
-    name: str
-    a: str
-    nodes: np.ndarray  #: (k,) int64 node ids of body a
-    b: str  #: name of a body or obstacle
-    stiffness: float | None  #: [N/m] of each node's spring; None: it moves with body b exactly
-    damping: float = 0.0  #: [N s/m] of each node
-    where: Callable | None = None  #: as in `Constraint`
-    reach: float = MAX_OUTSIDE  #: heights of a tet by which the nodes may lie outside body b
-
-    def __post_init__(self):
-        checks.store(self, nodes=self.nodes)
-
-    @property
-    def owners(self) -> list[str]:
-        """Names of its body, and of what that is attached to."""
-        return [self.a, self.b]
-
-
-Connection = Spring | Tendon | Attachment
 
 
 def add_spring(
@@ -117,10 +30,10 @@ def add_spring(
 ) -> Spring:
     """Connect two points by a spring and return it.
 
-    a, b: each (name, point): the name of a body and the point's rest position (3,) [m] or a node id; or the name of an obstacle
-    at rest and a position. stiffness [N/m]; rest_length [m], by default the points' distance at the start; damping [N s/m], of
-    the rate of its length, or, of a spring of rest length 0, in all directions. name: unique; "spring0" and so on by default.
-    Raises SceneError.
+    a, b: each (name, point): the name of a body and the point's rest position (3,) [m] or a node id; or the name of an obstacle,
+    with which the point moves, and its position at the start. stiffness [N/m]; rest_length [m], by default the points' distance
+    at the start; damping [N s/m], of the rate of its length, or, of a spring of rest length 0, in all directions. name: unique;
+    "spring0" and so on by default. Raises SceneError.
     """
     self._check_open("add_spring")
     name = _free_name(self, name, "spring")
@@ -138,12 +51,16 @@ def add_spring(
     return spring
 
 
-def add_tendon(self: "Scene", points, force, name: str | None = None) -> Tendon:
-    """Lead a tendon through points, which it pulls together with a given tension, and return it.
+def add_tendon(
+    self: "Scene", points, force=None, name: str | None = None, *, length=None, stiffness: float | None = None
+) -> Tendon:
+    """Lead a tendon through points, along which it slides without friction and which it pulls together, and return it.
 
-    points: at least two, each as in `add_spring`, consecutive ones distinct. force: the tension [N], not negative, or its path:
-    callable t [s] -> tension, called once here for t = 0, or `KeyFrames` with values. name: unique; "tendon0" and so on by
-    default. Raises SceneError.
+    points: at least two, each as in `add_spring`, consecutive ones distinct. Either force: its tension [N], not negative; or
+    length: its whole length at rest [m], above 0. Both may be a path: callable t [s] -> value, called once here for t = 0, or
+    `KeyFrames` with values. stiffness [N/m], of one of given length: its tension is stiffness times its extension, 0 where it
+    is slack. Without a stiffness it is inextensible: its tension is that which keeps it from being longer. name: unique;
+    "tendon0" and so on by default. Raises SceneError.
     """
     self._check_open("add_tendon")
     name = _free_name(self, name, "tendon")
@@ -153,8 +70,14 @@ def add_tendon(self: "Scene", points, force, name: str | None = None) -> Tendon:
     made = tuple(_point(self, end, f"{what}: point {k}") for k, end in enumerate(points))
     _check_any_body(self, made, what)
     _check_distinct(self, made, what)
-    tendon = Tendon(name, made, **value_or_path(force, what, "force", ((),)))
-    check_tension(tendon.path(0.0) if tendon.value is None else tendon.value, f"{what}: force")
+    given = _what_is_given(what, force, length)
+    if stiffness is not None:
+        if given == "force":
+            raise SceneError(f"{what}: stiffness is that of a tendon of given length: give a length instead of a force")
+        stiffness = checks.number(stiffness, f"{what}: stiffness", above=0.0, unit="N/m")
+    load = value_or_path(force if given == "force" else length, what, given, ((),))
+    tendon = Tendon(name, made, **load, given=given, stiffness=stiffness)
+    check_tendon(tendon, tendon.path(0.0) if tendon.value is None else tendon.value, what)
     list.append(self.tendons, tendon)
     return tendon
 
@@ -162,12 +85,13 @@ def add_tendon(self: "Scene", points, force, name: str | None = None) -> Tendon:
 def attach(
     self: "Scene", a: str, where, b: str, stiffness: float | None = None, damping: float = 0.0, name: str | None = None
 ) -> Attachment:
-    """Attach nodes of a body to where they lie in another body, or to an obstacle at rest; return the attachment.
+    """Attach nodes of a body to where they lie in another body, or to an obstacle; return the attachment.
 
     a: name of the body; where: its nodes, as for `Body.fix`; b: name of another body, or of an obstacle. The chosen nodes must
-    lie in or on body b at the start, or outside by at most a tenth of the height of a tet. stiffness: None, they move with body b
-    exactly; else [N/m] of a spring of rest length 0 for each node, whose damping [N s/m] is given too. Bodies that are attached
-    exactly do not collide with each other. name: unique; "attachment0" and so on by default. Raises SceneError.
+    lie in or on body b at the start, or outside by at most a tenth of the height of a tet; anywhere if b is an obstacle.
+    stiffness: None, they move with b exactly; else [N/m] of a spring of rest length 0 for each node, whose damping [N s/m] is
+    given too. Bodies and obstacles that are attached exactly do not collide with each other. name: unique; "attachment0" and so
+    on by default. Raises SceneError.
     """
     self._check_open("attach")
     name = _free_name(self, name, "attachment")
@@ -188,8 +112,6 @@ def attach(
     damping = checks.number(damping, f"{what}: damping", minimum=0.0, unit="N s/m")
     if stiffness is None and damping > 0.0:
         raise SceneError(f"{what}: damping is that of springs: give a stiffness, too")
-    if stiffness is None and not isinstance(owner, Body):
-        raise SceneError(f"{what}: {b!r} is an obstacle: fix the nodes by body.fix instead, or give a stiffness")
     attachment = Attachment(name, body.name, nodes, owner.name, stiffness, damping, where if callable(where) else None)
     if isinstance(owner, Body):
         locate_nodes(self, attachment)
@@ -224,12 +146,33 @@ def check_exact(scene: "Scene") -> None:
             if both := sorted(others & set(one.nodes.tolist())):
                 raise SceneError(f"{what}: node {both[0]} of body {one.a!r} is {rule}")
         own |= set(one.nodes.tolist())
+        if one not in scene.dependent_attachments:
+            continue
         if body.dilatation != "local":
             raise SceneError(f"{what}: nodes of body {one.a!r} cannot be attached exactly, since its dilatation is a mean")
         for damping in ("mass_damping", "stiffness_damping"):  # a force on one body's node acts on the other's
             elastic = [owner for name in one.owners if not isinstance(owner := scene.body(name), RigidBody)]
             if len({getattr(owner.composition.first, damping) for owner in elastic}) > 1:
                 raise SceneError(f"{what}: bodies {one.a!r} and {one.b!r} must have the same {damping}")
+
+
+@dataclass(frozen=True, eq=False)
+class CarriedPath:
+    """Motion of nodes with an obstacle: t [s] -> displacement (k,3) [m]."""
+
+    obstacle: Obstacle
+    starts: np.ndarray  #: (k,3) [m], start positions
+
+    def __call__(self, t: float) -> np.ndarray:
+        return self.obstacle.points_at(t, self.obstacle.undisplaced(0.0, self.starts)) - self.starts
+
+
+def constraint_of(scene: "Scene", attachment: Attachment) -> Constraint:
+    """The constraint of nodes that are attached to an obstacle exactly."""
+    body, obstacle = scene.body(attachment.a), scene.obstacle(attachment.b)
+    starts = body.rest_positions[attachment.nodes] + body.position
+    path = None if obstacle.path is None else CarriedPath(obstacle, starts)
+    return Constraint(attachment.nodes, np.ones(3, dtype=bool), path, attachment.where)
 
 
 def attached_pairs(scene: "Scene") -> np.ndarray:
@@ -242,10 +185,12 @@ def attached_pairs(scene: "Scene") -> np.ndarray:
     return pairs
 
 
-def check_tension(value: float, what: str) -> None:
-    """Raise SceneError if a tension [N] is negative."""
-    if value < 0.0:
-        raise SceneError(f"{what} must be at least 0 N, not {float(value):g}: a tendon cannot push")
+def check_tendon(tendon: Tendon, value: float, what: str) -> None:
+    """Raise SceneError for a negative tension [N] or a length [m] that is not above 0, whichever is given."""
+    if not tendon.allows(value):
+        rule = "above 0 m" if tendon.given == "length" else "at least 0 N"
+        why = "" if tendon.given == "length" else ": a tendon cannot push"
+        raise SceneError(f"{what}: {tendon.given} must be {rule}, not {float(value):g}{why}")
 
 
 def start_of(scene: "Scene", point: Point) -> np.ndarray:
@@ -303,13 +248,11 @@ def _check_inside(owner, position: np.ndarray, what: str) -> None:
 
 
 def _owner(scene: "Scene", name: str, what: str):
-    """Return a body, or an obstacle at rest. Raises SceneError."""
+    """Return a body or an obstacle. Raises SceneError."""
     try:
         owner = scene.collider(name)
     except SceneError as error:
         raise SceneError(f"{what}: {str(error).removeprefix('scene: ')}") from None
-    if not isinstance(owner, Body) and owner.path is not None:
-        raise SceneError(f"{what}: obstacle {name!r} moves; only bodies and obstacles at rest can be connected")
     return owner
 
 
@@ -317,6 +260,13 @@ def _check_distinct(scene: "Scene", points: tuple[Point, ...], what: str) -> Non
     for k, (p, q) in enumerate(zip(points, points[1:])):
         if coincide(scene, p, q):
             raise SceneError(f"{what}: points {k} and {k + 1} coincide")
+
+
+def _what_is_given(what: str, force, length) -> str:
+    """Return which of a tendon's two is given. Raises SceneError if both are or neither is."""
+    if (force is None) == (length is None):
+        raise SceneError(f"{what}: give either a force or a length")
+    return "force" if length is None else "length"
 
 
 def _check_any_body(scene: "Scene", points: tuple[Point, ...], what: str) -> None:

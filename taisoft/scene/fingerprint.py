@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 
 from taisoft.scene.body import Body
-from taisoft.scene.connections import Attachment, Connection, Tendon
+from taisoft.scene.connection_records import Attachment, Connection, Tendon
 from taisoft.scene.key_frames import NodePath, ShapePath
 from taisoft.scene.loads import LoadPath
 from taisoft.scene.rigid import RigidBody
@@ -76,11 +76,13 @@ def _body_parts(body: Body) -> dict[str, list]:
 
 
 def _connection_parts(one: Connection) -> list:
-    """Return the values that define a connection; the tension of a tendon is one of the numbers that may change."""
+    """Return the values that define a connection; the tension or length of a tendon is one of the numbers that may change."""
     if isinstance(one, Attachment):
         return [one.a, one.nodes, one.b, one.stiffness, one.damping]
     points = [part for point in one.points for part in (point.owner, point.position)]
-    return points + (_path_parts(one.path) if isinstance(one, Tendon) else [one.stiffness, one.rest_length, one.damping])
+    if isinstance(one, Tendon):
+        return [*points, one.given, one.stiffness, *_path_parts(one.path)]
+    return [*points, one.stiffness, one.rest_length, one.damping]
 
 
 def _path_parts(path: Callable | None) -> list:

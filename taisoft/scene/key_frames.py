@@ -11,6 +11,7 @@ import numpy as np
 import scipy
 
 from taisoft.attributes import guarded_record
+from taisoft.display import short_repr
 from taisoft.errors import SceneError
 from taisoft.scene import checks
 
@@ -35,6 +36,8 @@ class KeyFrames:
     smooth: bool = False  #: at rest at every key: a fraction s of the time between two keys covers s^2 (3 - 2 s) of the distance
     release: bool = False  #: prescribed nodes are released at the last time
     values: np.ndarray | None = None  #: (k,) of a load that is one number, in its unit; excludes all but times and smooth
+
+    __repr__ = short_repr
 
     def __post_init__(self):
         what = "key frames"

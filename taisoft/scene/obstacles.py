@@ -12,6 +12,7 @@ from typing import ClassVar
 import numpy as np
 
 from taisoft.attributes import guarded_record
+from taisoft.display import short_repr
 from taisoft.errors import MeshError, SceneError, reason, value_text
 from taisoft.mesh.shapes import box_mesh
 from taisoft.mesh.topology import normals_and_heights, opposite_half_edges
@@ -164,6 +165,7 @@ class MeshObstacle(Shape):
     triangles: np.ndarray  #: (t,3) int64
     kind: ClassVar[int] = 4
     word: ClassVar[str] = "mesh obstacle"
+    __repr__ = short_repr
 
     def __post_init__(self):
         vertices = checks.array(self.vertices, "mesh obstacle: vertices", ((max(checks.length(self.vertices), 3), 3),))
@@ -286,6 +288,12 @@ class Obstacle:
         translation, rotation = self.pose(t)
         pivot = self.shape.pivot
         return (points - pivot) @ rotation.T + pivot + translation
+
+    def undisplaced(self, t: float, points: np.ndarray) -> np.ndarray:
+        """Return the points (n,3) [m] of the undisplaced shape that are at these positions at time t [s]."""
+        translation, rotation = self.pose(t)
+        pivot = self.shape.pivot
+        return (points - pivot - translation) @ rotation + pivot
 
 
 def checked_pose(value, t: float, what: str) -> tuple[np.ndarray, np.ndarray]:

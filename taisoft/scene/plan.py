@@ -15,7 +15,7 @@ from taisoft.errors import SceneError
 from taisoft.scene import checks
 from taisoft.scene.body import Body, check_volume
 from taisoft.scene.collision import has_sharp_edges
-from taisoft.scene.connections import check_tension
+from taisoft.scene.connections import check_tendon
 from taisoft.scene.material import LAWS
 from taisoft.scene.obstacles import Box, MeshObstacle
 from taisoft.scene.rigid import RigidBody
@@ -36,6 +36,9 @@ class Plan:
     """Enabled and disabled features. entries: dicts {"feature", "on", "why"} in a fixed order."""
 
     entries: list[dict] = field(default_factory=list)
+
+    def __repr__(self) -> str:
+        return f"Plan(on: {', '.join(name for name, is_on in self.on.items() if is_on) or 'nothing'})"
 
     @property
     def on(self) -> dict[str, bool]:
@@ -91,13 +94,15 @@ def make_plan(scene: Scene, explicit: bool, multistep: bool, self_collision: boo
     plan.add("loads", loaded or draggable, why, "no traction and no force")
     add_if_any("pressure", lambda b: b.pressures or b.cavities, "on", "no surface is under pressure")
     varied = [b.name for b in scene.bodies if any(load.path for load in b.loads)] + [t.name for t in scene.tendons if t.path]
+    varied += [one.name for one in scene.connections if scene.moves(one) and one.name not in varied]
     plan.add("load_paths", varied, f"on {_shorten(varied)}", "every load is constant")
-    add_if_any("fixed_nodes", lambda b: any(c.path is None for c in b.constraints), "on", "no node is fixed")
-    add_if_any("moving_nodes", lambda b: any(c.path is not None for c in b.constraints), "paths on", "no node follows a path")
+    fixes, moves = ((lambda b, m=m: any((c.path is not None) == m for c in scene.constraints(b))) for m in (False, True))
+    add_if_any("fixed_nodes", fixes, "on", "no node is fixed")
+    add_if_any("moving_nodes", moves, "paths on", "no node follows a path")
     for damping in ("mass_damping", "stiffness_damping"):
         add_if_any(damping, lambda b, d=damping: getattr(b.composition.first, d) > 0, "material of", f"every {damping} is 0")
-    exact = [one.name for one in scene.exact_attachments]
-    connected = [one.name for one in scene.connections if one.name not in exact]
+    exact = [one.name for one in scene.dependent_attachments]
+    connected = [one.name for one in scene.connections if one not in scene.exact_attachments]
     plan.add("springs", connected, _shorten(connected), "no spring, tendon or attachment by springs")
     embedded = [body.name for body in scene.bodies if body.nodes.embedded is not None]
     why_not = "no node is attached exactly, and no surface embedded"
@@ -193,14 +198,17 @@ def change_load(body: Body, kind: str, index: int, value) -> None:
         getattr(body, LOADS[kind])[index] = new
 
 
-def change_tension(scene: Scene, name: str, value) -> None:
-    """Set the tension [N] of a tendon; it replaces a path. Raises SceneError."""
-    names = [tendon.name for tendon in scene.tendons]
+def change_tendon(scene: Scene, given: str, name: str, value) -> None:
+    """Set the tension [N] or the length [m] of a tendon; it replaces a path. given: which of the two. Raises SceneError."""
+    names, calls = [tendon.name for tendon in scene.tendons], {"force": "set_tension", "length": "set_length"}
     if name not in names:
-        raise SceneError(f"set_tension: no tendon is called {name!r}{checks.nearest(str(name), names)}")
-    index, what = names.index(name), f"tendon {name!r}: force"
-    new = replace(scene.tendons[index], value=checks.array(value, what, ((),)), path=None, path_shape=None)
-    check_tension(new.value, what)
+        raise SceneError(f"{calls[given]}: no tendon is called {name!r}{checks.nearest(str(name), names)}")
+    index, what = names.index(name), f"tendon {name!r}"
+    old = scene.tendons[index]
+    if old.given != given:
+        raise SceneError(f"{calls[given]}: {what} has a given {old.given}: call {calls[old.given]}")
+    new = replace(old, value=checks.array(value, f"{what}: {given}", ((),)), path=None, path_shape=None)
+    check_tendon(new, new.value, what)
     with thawed(scene):
         scene.tendons[index] = new
 
@@ -226,7 +234,7 @@ def scene_numbers(scene: Scene) -> Numbers:
             for i, load in enumerate(getattr(body, loads)):
                 if load.path is None:
                     numbers[f"body {body.name!r}: {kind} {i}"] = load.value if load.value.ndim == 2 else load.value.tolist()
-    numbers |= {f"tendon {one.name!r}: force": float(one.value) for one in scene.tendons if one.path is None}
+    numbers |= {f"tendon {one.name!r}: {one.given}": float(one.value) for one in scene.tendons if one.path is None}
     for names, (friction, restitution) in scene.contact_pairs.items():
         pair = " and ".join(repr(name) for name in sorted(names))
         numbers |= {f"contact of {pair}: friction": friction, f"contact of {pair}: restitution": restitution}

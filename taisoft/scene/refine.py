@@ -19,7 +19,7 @@ from taisoft.mesh.nodes import make_nodes
 from taisoft.mesh.tet_mesh import TetMesh
 from taisoft.mesh.topology import distinct_edges
 from taisoft.scene.body import Body, Constraint
-from taisoft.scene.connections import Attachment
+from taisoft.scene.connection_records import Attachment
 from taisoft.scene.key_frames import KeyFrames, NodePath
 from taisoft.scene.loads import Cavity, LoadPath, NodalForce, Pressure, Traction
 from taisoft.scene.rigid import RigidBody

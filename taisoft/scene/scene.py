@@ -11,23 +11,15 @@ from collections.abc import Callable, Mapping
 import numpy as np
 
 from taisoft.attributes import Guarded, thawed
+from taisoft.display import drawn
 from taisoft.errors import SceneError
 from taisoft.mesh.surface_mesh import SurfaceMesh
 from taisoft.mesh.tet_mesh import TetMesh
 from taisoft.scene import checks
-from taisoft.scene.body import USE_A_COPY, Body
+from taisoft.scene.body import USE_A_COPY, Body, Constraint
 from taisoft.scene.collision import CollisionSettings
-from taisoft.scene.connections import (
-    Attachment,
-    Connection,
-    Spring,
-    Tendon,
-    add_spring,
-    add_tendon,
-    attach,
-    attached_pairs,
-    check_connections,
-)
+from taisoft.scene.connection_records import Attachment, Connection, Spring, Tendon
+from taisoft.scene.connections import add_spring, add_tendon, attach, attached_pairs, check_connections, constraint_of
 from taisoft.scene.loads import Cavity
 from taisoft.scene.material import Material
 from taisoft.scene.obstacles import Obstacle, Shape, surface_numbers
@@ -57,7 +49,7 @@ class Scene(Guarded):
         "gravity": "call sim.set_gravity(gravity)",
         "set_contact": "call sim.set_contact(name_a, name_b, friction=...)",
         "contact_pairs": "call sim.set_contact(name_a, name_b, friction=...)",
-        **dict.fromkeys(("tendons", "add_tendon"), "call sim.set_tension(name, force)"),
+        **dict.fromkeys(("tendons", "add_tendon"), "call sim.set_tension(name, force) or sim.set_length(name, length)"),
     }
 
     def __init__(self, gravity=(0.0, -9.81, 0.0)):
@@ -112,6 +104,9 @@ class Scene(Guarded):
             names += f", obstacles={[obstacle.name for obstacle in self.obstacles]}"
         return f"Scene(gravity={tuple(self.gravity.tolist())}, {names})"
 
+    def _repr_html_(self) -> str | None:
+        return drawn("scene_html", self)
+
     def snapshot(self, start: "Scene | None" = None) -> "Scene":
         """Return an independent, unfrozen copy of the scene and its bodies; meshes are shared.
 
@@ -154,6 +149,26 @@ class Scene(Guarded):
     def first_nodes(self) -> dict[str, int]:
         """The first node of each body, by its name, where nodes are counted through all bodies."""
         return dict(zip((body.name for body in self.bodies), np.cumsum([0, *(body.n_nodes for body in self.bodies)]).tolist()))
+
+    @property
+    def has_springs(self) -> bool:
+        """Whether there are springs, tendons, or attachments by springs."""
+        return bool(self.springs or self.tendons) or any(one.stiffness is not None for one in self.attachments)
+
+    def moves(self, connection: Connection) -> bool:
+        """Whether a connection has an end on an obstacle that moves along a path."""
+        return any(one.name in connection.owners and one.path is not None for one in self.obstacles)
+
+    def constraints(self, body: Body) -> list[Constraint]:
+        """A body's constraints, and those of its nodes that are attached to obstacles exactly."""
+        held = [one for one in self.exact_attachments if one.a == body.name and one not in self.dependent_attachments]
+        return [*body.constraints, *(constraint_of(self, one) for one in held)]
+
+    @property
+    def dependent_attachments(self) -> list[Attachment]:
+        """The exact ones to other bodies."""
+        bodies = {body.name for body in self.bodies}
+        return [one for one in self.exact_attachments if one.b in bodies]
 
     @property
     def exact_attachments(self) -> list[Attachment]:

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 
 from taisoft.errors import SceneError
-from taisoft.scene.connections import Point
+from taisoft.scene.connection_records import Point
 from taisoft.scene.key_frames import KeyFrames
 from taisoft.scene.loads import LoadPath
 from taisoft.scene.scene import Scene
@@ -22,8 +22,9 @@ def add_connections(scene: Scene, tables: Table, selection: Callable) -> None:
             extra = {key: _points(table, key) if key == "points" else _point(table, key, at) for key, at in points.items()}
             if kind == "attachments":
                 extra |= {"where": selection(table, "nodes")}
-            elif isinstance(table.values.get("force"), dict):  # a tension that varies
-                extra["force"] = table.made("force", KeyFrames, "key frames: ")
+            else:  # a tension or a length may vary
+                varied = [key for key in ("force", "length") if isinstance(table.values.get(key), dict)]
+                extra |= {key: table.made(key, KeyFrames, "key frames: ") for key in varied}
             keys = [key for key in known if key not in (*extra, "nodes")]
             table.make(method, f"{item} {name!r}: ", f"scene: {item} ", keys=keys, name=name, **extra)
 
@@ -54,9 +55,10 @@ def connection_tables(scene: Scene, ids: Callable, fields: Callable) -> dict:
             springs[one.name]["rest_length"] = one.rest_length
     for one in scene.tendons:
         if one.path is not None and not isinstance(one.path, LoadPath):
-            raise SceneError(f"tendon {one.name!r}: pulls along a function, which a file cannot store: use ts.KeyFrames")
-        force = float(one.value) if one.path is None else fields(one.path.frames)
-        tendons[one.name] = {"points": [_pair(point) for point in one.points], "force": force}
+            raise SceneError(f"tendon {one.name!r}: its {one.given} is a function, which a file cannot store: use ts.KeyFrames")
+        given = {one.given: float(one.value) if one.path is None else fields(one.path.frames)}
+        stiffness = {} if one.stiffness is None else {"stiffness": one.stiffness}
+        tendons[one.name] = {"points": [_pair(point) for point in one.points]} | given | stiffness
     for one in scene.attachments:
         rows = scene.body(one.a).selectable
         nodes = ids(one.nodes - rows.start, rows.stop - rows.start)

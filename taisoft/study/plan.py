@@ -16,7 +16,7 @@ from taisoft.dynamics.schemes import EXPLICIT, INTEGRATORS
 from taisoft.errors import SceneError, TaisoftError
 from taisoft.estimation.order import nominal_order
 from taisoft.scene.scene import Scene
-from taisoft.settings import VOLUMES, check_settings
+from taisoft.settings import WITH_MULTIPLIERS, check_settings, kept_by_multipliers
 from taisoft.stability import stable_dt
 from taisoft.study import AXES, DEFAULTS, Setting, mesh_name
 
@@ -204,12 +204,12 @@ class Planner:
 
     def _integrator(self, scene: Scene, mesh: tuple, kind: str, target: float) -> str:
         requested = self._request["reference_integrator"]
-        given = [cavity.name for body in scene.bodies for cavity in body.cavities if cavity.given == "volume"]
+        given = kept_by_multipliers(scene)
         if requested is not None:
             if requested not in INTEGRATORS:
                 raise SceneError(f"--reference-integrator {requested}: it must be one of {', '.join(INTEGRATORS)}")
-            if given and requested not in VOLUMES:
-                rule = f"cavity {given[0]!r} of given volume needs {' or '.join(VOLUMES)}"
+            if given and requested not in WITH_MULTIPLIERS:
+                rule = f"{given[0]} needs {' or '.join(WITH_MULTIPLIERS)}"
                 raise SceneError(f"--reference-integrator {requested}: {rule}")
             if not kind or (kind == "explicit") == (requested in EXPLICIT):
                 return requested

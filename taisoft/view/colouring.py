@@ -10,6 +10,7 @@ silhouettes. The lamps move with the camera, so that every view is lit alike.
 """
 
 import math
+from collections.abc import Callable
 from functools import cached_property
 
 import numpy as np
@@ -42,20 +43,60 @@ EDGE_DARKENING = 0.22
 BACKGROUND_TOP, BACKGROUND_BOTTOM = np.array([0.95, 0.955, 0.96]), np.array([0.80, 0.81, 0.82])  # sRGB
 
 
-class Colouring:
-    """Unshaded colours of the drawn vertices of `Surfaces`, by one of UNITS. Raises OutputError for another name."""
+def checked_colour(kind: str) -> str:
+    """Return the name of a colouring. Raises OutputError unless it is one of UNITS."""
+    if kind not in UNITS:
+        raise OutputError(f"colour {kind!r} is unknown: it must be one of {', '.join(UNITS)}")
+    return kind
 
-    def __init__(self, scene, surfaces, kind: str = "body"):
-        self._bodies, self._surfaces = scene.bodies, surfaces
-        self._rigid = np.concatenate([np.full(body.n_nodes, isinstance(body, RigidBody)) for body in scene.bodies])
+
+class NodalValues:
+    """A quantity at the nodes of all bodies. bodies: of the scene, in the order added."""
+
+    def __init__(self, bodies):
+        self._bodies = bodies
+        self._rigid = np.concatenate([np.full(body.n_nodes, isinstance(body, RigidBody)) for body in bodies])
+
+    def __call__(self, kind: str, sim) -> np.ndarray:
+        """Return the quantity, one of UNITS but "body", at all nodes (n_nodes,) in sim's present state."""
+        if kind == "stress":
+            return np.where(self._rigid, np.nan, von_mises(self._mean(sim.stress())))  # a rigid body's tet is not its material
+        if kind == "error":
+            return sim.nodal_errors()
+        return self._mean(self._stretches(sim)) if kind == "stretch" else np.linalg.norm(sim.velocities(), axis=1)
+
+    @cached_property
+    def _mean(self) -> NodalMean:
+        return NodalMean(self._bodies)
+
+    @cached_property
+    def _Dm_inv(self) -> list[np.ndarray]:
+        return [inverse_rest_edges(b.mesh.vertices, b.mesh.tets)[0] for b in self._bodies]
+
+    def _stretches(self, sim) -> np.ndarray:
+        """Return the largest principal stretch of every tet (m,); for quadratic tets that of the linear tet of the corners."""
+        parts = []
+        for body, Dm_inv in zip(self._bodies, self._Dm_inv):
+            corner = sim.positions(body.name)[body.mesh.tets]
+            F = (corner[:, 1:] - corner[:, :1]).transpose(0, 2, 1) @ Dm_inv
+            parts.append(np.sqrt(np.linalg.eigvalsh(F.transpose(0, 2, 1) @ F)[:, 2]))
+        return np.concatenate(parts)
+
+
+class Colouring:
+    """Unshaded colours of the drawn vertices of `Surfaces`, by one of UNITS. Raises OutputError for another name.
+
+    values: called with the quantity and sim, returns it at all nodes (n_nodes,), or None as long as it is not known.
+    """
+
+    def __init__(self, scene, surfaces, kind: str = "body", values: Callable | None = None):
+        self._surfaces, self.values = surfaces, values or NodalValues(scene.bodies)
         self._has_errors = kind == "error"
         self.choose(kind)
 
     def choose(self, kind: str) -> None:
         """Colour by another quantity, with a scale of its own."""
-        if kind not in UNITS:
-            raise OutputError(f"colour '{kind}' is unknown: it must be one of {', '.join(UNITS)}")
-        self.kind = kind
+        self.kind = checked_colour(kind)
         self._peak = self.span = 0.0
 
     @property
@@ -77,19 +118,12 @@ class Colouring:
         """Lower end of the scale."""
         return 1.0 if self.kind == "stretch" else 0.0
 
-    def values(self, sim) -> np.ndarray:
-        """Return the quantity at the nodes of all bodies (n_nodes,) in sim's present state."""
-        if self.kind == "stress":
-            return np.where(self._rigid, np.nan, von_mises(self._mean(sim.stress())))  # a rigid body's tet is not its material
-        if self.kind == "error":
-            return sim.nodal_errors()
-        return self._mean(self._stretches(sim)) if self.kind == "stretch" else np.linalg.norm(sim.velocities(), axis=1)
-
     def base(self, sim) -> np.ndarray:
         """Return unshaded colours (n,3) of all drawn vertices, sRGB."""
-        if self.kind == "body":
+        values = None if self.kind == "body" else self.values(self.kind, sim)
+        if values is None:
             return self._surfaces.colours
-        above = self.values(sim) - self.low
+        above = values - self.low
         finite = above[np.isfinite(above)]
         value = float(np.quantile(finite, QUANTILE)) if len(finite) else 0.0
         self._peak = max(value, DECAY * self._peak, MIN_SPAN[self.kind])
@@ -106,23 +140,6 @@ class Colouring:
         fractions = np.linspace(1.0, 0.0, 3)
         texts = [f"{self.low + fraction * self.span:10.4g} {UNITS[self.kind]}" for fraction in fractions]
         return list(zip(texts, colours_of(fractions)))
-
-    @cached_property
-    def _mean(self) -> NodalMean:
-        return NodalMean(self._bodies)
-
-    @cached_property
-    def _Dm_inv(self) -> list[np.ndarray]:
-        return [inverse_rest_edges(b.mesh.vertices, b.mesh.tets)[0] for b in self._bodies]
-
-    def _stretches(self, sim) -> np.ndarray:
-        """Return the largest principal stretch of every tet (m,); for quadratic tets that of the linear tet of the corners."""
-        parts = []
-        for body, Dm_inv in zip(self._bodies, self._Dm_inv):
-            corner = sim.positions(body.name)[body.mesh.tets]
-            F = (corner[:, 1:] - corner[:, :1]).transpose(0, 2, 1) @ Dm_inv
-            parts.append(np.sqrt(np.linalg.eigvalsh(F.transpose(0, 2, 1) @ F)[:, 2]))
-        return np.concatenate(parts)
 
 
 def following(names: tuple[str, ...], name: str) -> str:

@@ -101,12 +101,19 @@ class VertexBuffer:
 class Canvas:
     """The process's one Taichi window, on the screen or only in memory, which draws the scene's surfaces.
 
-    size: (width, height) in pixels; visible: on the screen; n_segments: largest number of lines; line_width: in pixels.
+    size: (width, height) in pixels; visible: on the screen; n_segments: largest number of lines; line_width: in pixels;
+    n_decals: largest numbers of vertices and triangles of what is drawn on the surfaces.
     Raises OutputError, before anything is opened, if a Vulkan driver or a display is missing or a window is open already.
     """
 
     def __init__(
-        self, surfaces: Surfaces, size: tuple[int, int], visible: bool, n_segments: int = 0, line_width: float = LINE_WIDTH
+        self,
+        surfaces: Surfaces,
+        size: tuple[int, int],
+        visible: bool,
+        n_segments: int = 0,
+        line_width: float = LINE_WIDTH,
+        n_decals: tuple[int, int] = (0, 0),
     ):
         missing = (visible and display_missing()) or vulkan_missing()
         if missing:
@@ -119,9 +126,12 @@ class Canvas:
         self._runtime = open_runtime(arch, precision, owner="a window")
         _holder.append("a window")
         self._surfaces, self._line_width = surfaces, line_width
-        self._vertices = VertexBuffer(len(surfaces.colours))
+        self._n = len(surfaces.colours)  # drawn vertices of the surfaces; those of decals follow in the same mesh
+        self._vertices = VertexBuffer(self._n + n_decals[0])
         self._vertices.normals[:] = 0.0, 1.0, 0.0  # no effect: the colours are lit already
-        self._indices = np.ascontiguousarray(surfaces.triangles.ravel(), dtype=np.int32)
+        self._indices = np.zeros((len(surfaces.triangles) + n_decals[1], 3), dtype=np.int32)
+        self._indices[: len(surfaces.triangles)] = surfaces.triangles
+        self._decals = self._indices[len(surfaces.triangles) :]  # unused triangles have no area
         self._ends = VertexBuffer(2 * n_segments)
         self._flat_boxes: VertexBuffer | None = None  # like `_flat_lines` drawn over the picture; made at the first `draw_over`
         self._flat_lines: VertexBuffer | None = None
@@ -136,13 +146,27 @@ class Canvas:
             self.close()
             raise OutputError(f"cannot open a window: Taichi says: {error}") from error
 
-    def draw(self, x: np.ndarray, colours: np.ndarray, camera: Camera, background: tuple, lines: tuple) -> None:
+    def draw(
+        self,
+        x: np.ndarray,
+        colours: np.ndarray,
+        camera: Camera,
+        background: tuple,
+        lines: tuple,
+        decals: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None,
+    ) -> None:
         """Draw the surfaces with vertices x [m] and lit colours, (n,3) each; background: RGB in [0, 1].
 
-        lines: ends (2k,3) [m] and colours (2k,3), of which the first n_segments lines are drawn.
+        lines: ends (2k,3) [m] and colours (2k,3), of which the first n_segments lines are drawn; decals: x, colours and
+        triangles (t,3) of what is drawn on the surfaces.
         """
         # relative to the target, since single precision is too coarse for a scene far from the origin
-        self._vertices.x[:], self._vertices.colours[:] = x - camera.target, colours
+        self._vertices.x[: self._n], self._vertices.colours[: self._n] = x - camera.target, colours
+        self._decals[:] = 0
+        if decals is not None:
+            rows = slice(self._n, self._n + len(decals[0]))
+            self._vertices.x[rows], self._vertices.colours[rows] = decals[0] - camera.target, decals[1]
+            self._decals[: len(decals[2])] = self._n + decals[2]
         eye = ti.ui.Camera()
         eye.position(*(camera.position - camera.target))
         eye.lookat(0.0, 0.0, 0.0)
@@ -153,8 +177,8 @@ class Canvas:
         self._canvas.set_background_color(background)
         self._scene.set_camera(eye)
         self._scene.ambient_light((1.0, 1.0, 1.0))  # the colours are lit already
-        vertices, indices = self._vertices.info, get_field_info(self._indices)  # two-sided, with vertex colours
-        self._scene.scene.mesh(vertices, True, indices, GREY, True, len(self._indices), 0, len(self._vertices), 0, False)
+        vertices, indices = self._vertices.info, get_field_info(self._indices.reshape(-1))  # two-sided, with vertex colours
+        self._scene.scene.mesh(vertices, True, indices, GREY, True, self._indices.size, 0, len(self._vertices), 0, False)
         ends, line_colours = lines
         n = min(len(ends), len(self._ends))
         if n > 0:

@@ -3,12 +3,13 @@
 Surfaces, lines as bands, and shadows on half-spaces are drawn with four samples per pixel.
 """
 
+import operator
 from dataclasses import replace
 
 import numpy as np
 
 from taisoft.backend.runtime import open_kind, open_runtime
-from taisoft.errors import OutputError
+from taisoft.errors import OutputError, value_text
 from taisoft.output.camera import Camera
 from taisoft.view.colouring import background
 from taisoft.view.raster import Raster
@@ -17,14 +18,26 @@ from taisoft.view.shading import SAMPLES
 from taisoft.view.shadow import Shadows
 
 SIZE = (1280, 720)
+MAX_SIDE = 16384  # pixels
 LINE_WIDTH = 1.25  # pixels
+
+
+def checked_size(size) -> tuple[int, int]:
+    """Return width and height [pixels]. Raises OutputError unless they are two whole numbers from 1 to MAX_SIDE."""
+    try:
+        width, height = (operator.index(side) for side in size)
+    except (TypeError, ValueError):
+        raise OutputError(f"the size of a picture must be two whole numbers, width and height, not {value_text(size)}") from None
+    if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE):
+        raise OutputError(f"a picture of {width} x {height} pixels cannot be drawn: both must be 1 to {MAX_SIDE}")
+    return width, height
 
 
 class Offscreen(SceneView):
     """Draws a scene's bodies and obstacles as pictures.
 
-    scene, size, camera, colour, layers: as for `SceneView`. The kernels run in the open runtime, or in one of arch cpu that is
-    claimed only while a picture is drawn. Raises OutputError.
+    scene, size, camera, colour, layers, marks: as for `SceneView`. The kernels run in the open runtime, or in one of arch cpu
+    that is claimed only while a picture is drawn. Raises OutputError.
     """
 
     def __init__(
@@ -34,11 +47,10 @@ class Offscreen(SceneView):
         camera: Camera | None = None,
         colour: str = "body",
         layers: tuple[str, ...] = IN_PICTURES,
+        marks=None,
     ):
-        if min(size) < 1:
-            raise OutputError(f"a picture of {size[0]} x {size[1]} pixels cannot be drawn: both must be at least 1")
-        super().__init__(scene, size, camera, colour, layers)
-        self.size = (int(size[0]), int(size[1]))
+        self.size = checked_size(size)
+        super().__init__(scene, self.size, camera, colour, layers, marks=marks)
         self._samples = (self.size[0] * SAMPLES, self.size[1] * SAMPLES)
         self._background = background(self.size)
         self._raster = Raster(self._samples)
@@ -59,9 +71,13 @@ class Offscreen(SceneView):
             self.camera = replace(self.camera, distance=float(kept["camera"]))
         self.colouring.resume(*kept.get("scale", self.colouring.scale))
         self.layers.peak = float(kept.get("impulse", 0.0))
+        self.layers.connections.peak = float(kept.get("tension", 0.0))
+        self.layers.pressures.peak = float(kept.get("pressure", 0.0))
 
     def _present(self) -> dict:
-        return {"camera": self.camera.distance, "scale": list(self.colouring.scale), "impulse": self.layers.peak}
+        layers = self.layers
+        peaks = {"impulse": layers.peak, "tension": layers.connections.peak, "pressure": layers.pressures.peak}
+        return {"camera": self.camera.distance, "scale": list(self.colouring.scale)} | peaks
 
     def image(self, sim) -> np.ndarray:
         """Return a picture of sim's present state, uint8 (height, width, 3), first row on top.

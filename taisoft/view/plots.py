@@ -196,27 +196,28 @@ class Curves:
     times: tuple[float, float]
 
 
-class Plots:
-    """History of a simulation, and which plots of it are shown (`shown`: name -> whether it is).
+class PlotChoice:
+    """Which plots of a history are available and shown.
 
-    sim: a Simulator; names: of the plots shown initially; errors: whether the run estimates errors. Raises SceneError for an
-    unknown name or a plot of quantities that sim does not simulate.
+    history: a `History`, or what has its arrays; enabled: which of the `needs` of series are met; shown: name -> whether it is.
     """
 
-    def __init__(self, sim, names: tuple[str, ...] = (), errors: bool = False):
-        self._sim, self._errors, self.history = sim, errors, History()
-        for name in names:
-            if name not in PLOTS:
-                raise SceneError(f"plot '{name}' is unknown{nearest(name, PLOTS)}; there are {', '.join(PLOTS)}")
-            if name not in self.available():
-                raise SceneError(f"plot '{name}' is not available: {self._why_unavailable(name)}")
+    def __init__(self, history, enabled: dict[str, bool], names: tuple[str, ...] = ()):
+        self.history, self._enabled = history, enabled
         self.shown = {name: name in names for name in PLOTS}
         self._last_shown = tuple(names)
-        self.history.start(sim)
+
+    def enabled(self) -> dict[str, bool]:
+        """Return which `needs` of series are met now."""
+        return self._enabled
+
+    def set_enabled(self, enabled: dict[str, bool]) -> None:
+        """Set which `needs` of series are met from now on."""
+        self._enabled = enabled
 
     def available(self) -> dict[str, Plot]:
         """Return the plots that have simulated quantities now, each with the curves of these."""
-        enabled = {"": True, "implicit": not self._sim.settings.explicit, "contact": self._touching, "error": self._errors}
+        enabled = {"": True} | self.enabled()
         kept = {name: tuple(s for s in plot.series if enabled[s.needs]) for name, plot in PLOTS.items()}
         return {name: replace(PLOTS[name], series=series) for name, series in kept.items() if series}
 
@@ -232,6 +233,32 @@ class Plots:
         self._last_shown = tuple(visible) or self._last_shown
         self.shown = {name: name in chosen for name in PLOTS}
 
+    def curves(self, name: str) -> "Curves":
+        """Return the present drawing of a plot."""
+        return curves_of(self.available()[name], self.history)
+
+
+class Plots(PlotChoice):
+    """History of a simulation, and which plots of it are shown.
+
+    sim: a Simulator; names: of the plots shown initially; errors: whether the run estimates errors. Raises SceneError for an
+    unknown name or a plot of quantities that sim does not simulate.
+    """
+
+    def __init__(self, sim, names: tuple[str, ...] = (), errors: bool = False):
+        self._sim, self._errors = sim, errors
+        super().__init__(History(), {}, names)
+        for name in names:
+            if name not in PLOTS:
+                raise SceneError(f"plot '{name}' is unknown{nearest(name, PLOTS)}; there are {', '.join(PLOTS)}")
+            if name not in self.available():
+                raise SceneError(f"plot '{name}' is not available: {self._why_unavailable(name)}")
+        self.history.start(sim)
+
+    def enabled(self) -> dict[str, bool]:
+        """Return which `needs` of series the simulator meets now."""
+        return {"implicit": not self._sim.settings.explicit, "contact": self._touching, "error": self._errors}
+
     def take(self, report: StepReport, seconds: float) -> None:
         """Record a step report; seconds: its wall time [s]. For `on_step` of a run."""
         if report.time < self.history.times[-1]:  # the simulation was reset
@@ -243,10 +270,6 @@ class Plots:
     def restart(self) -> None:
         """Clear the history."""
         self.history.start(self._sim)
-
-    def curves(self, name: str) -> Curves:
-        """Return the present drawing of a plot."""
-        return curves_of(self.available()[name], self.history)
 
     @property
     def _touching(self) -> bool:

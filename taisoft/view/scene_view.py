@@ -5,10 +5,12 @@ bent by less than CREASE at rest. Its normal is the area-weighted mean over that
 keeps its edges, in every deformed state. A second-order face is drawn as four flat triangles between its six nodes.
 Obstacles are drawn with back-face culling, so that a bin's walls show only their inner sides.
 
-Lines are wireframes of the bodies' surfaces, contacts with normals and impulses, and arrows of tractions. They are moved along
-their rays towards the eye, so that they cover the same pixels: wireframes just enough to lie in front of their own surface,
-contacts and arrows so far that nothing hides them.
+Lines are wireframes of the bodies' surfaces, contacts with normals and impulses, arrows of tractions and pressures, and
+connections. They are moved along their rays towards the eye, so that they cover the same pixels: wireframes just enough to lie in
+front of their own surface, all others so far that nothing hides them.
 """
+
+from collections.abc import Callable
 
 import numpy as np
 
@@ -19,17 +21,21 @@ from taisoft.output.camera import MAX_WIDENING, Camera, start_positions
 from taisoft.scene.loads import value_at
 from taisoft.scene.obstacles import HalfSpace
 from taisoft.view.colouring import Colouring, lit_colours
+from taisoft.view.connection_layer import ConnectionLayer, ConnectionMarks, PressureLayer, arrows
+from taisoft.view.ground import Square
 
 CREASE = 35.0  # [deg] between the normals of neighbouring triangles at rest
 MARKER_COLOUR = np.array([0.20, 0.22, 0.26])  # sRGB
 MARKER_SIZE = 0.16  # radius in units of the mean edge length of the body's surface
 MAX_MARKERS = 500  # per body; of more fixed nodes, evenly selected ones are shown
 
-LAYERS = ("wires", "contacts", "tractions", "fixed_nodes")
-IN_WINDOW, IN_PICTURES = ("tractions", "fixed_nodes"), ("fixed_nodes",)  # shown by default
+LAYERS = ("wires", "contacts", "tractions", "pressures", "connections", "fixed_nodes")
+IN_PICTURES = ("pressures", "connections", "fixed_nodes")  # shown by default
+IN_WINDOW = ("tractions", *IN_PICTURES)
 MAX_MARK_LINES = 4000  # largest number of lines of contacts and arrows, besides the wires
+MAX_CONTACTS = MAX_MARK_LINES // 4  # of which lines are drawn
 ON_SURFACE, IN_FRONT = 0.996, 0.1  # fractions of the distance from the eye
-NORMAL, IMPULSE, ARROW, HEAD = 0.04, 0.15, 0.10, 0.3  # lengths relative to the scene's size; HEAD relative to its arrow
+NORMAL, IMPULSE, ARROW = 0.04, 0.15, 0.10  # lengths relative to the scene's size
 MAX_ARROWS = 60  # of one traction
 DECAY = 0.99  # factor on the running maximum of impulses per picture
 WIRE_COLOUR, NORMAL_COLOUR = np.array([0.12, 0.14, 0.18]), np.array([0.10, 0.55, 0.25])  # sRGB
@@ -41,15 +47,24 @@ class SceneView:
 
     scene: read once; size: (width, height) in pixels; camera: fixed if given, else it frames all bodies at the start and moves
     back, never nearer, when a body would leave the picture; colour: of the bodies, one of UNITS; layers: names of visible
-    LAYERS. Raises OutputError for unknown names.
+    LAYERS; values: as for `Colouring`; marks: as for `Layers`. Raises OutputError for unknown names.
     """
 
-    def __init__(self, scene, size: tuple[int, int], camera: Camera | None, colour: str, layers: tuple[str, ...]):
+    def __init__(
+        self,
+        scene,
+        size: tuple[int, int],
+        camera: Camera | None,
+        colour: str,
+        layers: tuple[str, ...],
+        values: Callable | None = None,
+        marks=None,
+    ):
         self.camera = camera or Camera.framing(start_positions(scene), size)
         self._widest = 0.0 if camera else MAX_WIDENING * self.camera.distance  # largest automatic distance [m]; 0: fixed camera
         self.surfaces = Surfaces(scene)
-        self.layers = Layers(scene, layers)
-        self.colouring = Colouring(scene, self.surfaces, colour)
+        self.layers = Layers(scene, layers, marks)
+        self.colouring = Colouring(scene, self.surfaces, colour, values)
 
     def _drawn(self, sim, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray, tuple[np.ndarray, np.ndarray]]:
         """Move the camera back if needed; return vertices and lit colours (n,3), and the lines of the layers."""
@@ -71,9 +86,12 @@ class Surfaces:
     def __init__(self, scene):
         self._shown = ShownBodies(scene)
         surfaces = zip(scene.bodies, self._shown.surfaces)
-        self._bodies = [_BodySurface(body, *surface, body_colour(k)) for k, (body, surface) in enumerate(surfaces)]
+        self._bodies = [
+            _BodySurface(body, *surface, body_colour(k), scene.constraints(body)) for k, (body, surface) in enumerate(surfaces)
+        ]
         self._starts = self._shown.starts[:-1]
-        self._obstacles = [_RigidSurface(surface) for surface in obstacle_surfaces(scene)]
+        fixed = [o.shape for o in scene.obstacles if isinstance(o.shape, HalfSpace) and o.path is None]
+        self._obstacles = [_RigidSurface(surface, fixed) for surface in obstacle_surfaces(scene)]
         nodes = [np.where(body.nodes >= 0, body.nodes + start, -1) for body, start in zip(self._bodies, self._starts)]
         self._nodes = np.concatenate(nodes)  # shown vertices of the drawn ones; -1 for markers
         self.with_markers = True  # of fixed nodes
@@ -84,11 +102,14 @@ class Surfaces:
         self.n_of_bodies = int(firsts[len(self._bodies)])  # drawn vertices of bodies, which come first
         self.body_triangles = np.concatenate([part.own_triangles + n for part, n in zip(self._bodies, firsts)]).astype(np.int32)
         ranges = [slice(*ends) for ends in zip(firsts[len(self._bodies) :], firsts[len(self._bodies) + 1 :])]
-        self._half_spaces = [(at, part.surface) for at, part in zip(ranges, self._obstacles) if part.is_half_space]
+        self._half_spaces = [(at, part) for at, part in zip(ranges, self._obstacles) if part.is_half_space]
 
-    def half_spaces(self, t: float) -> list[tuple[slice, np.ndarray]]:
-        """Return, for every half-space, its range of drawn vertices and the vertices (k,3) [m] of its square at time t [s]."""
-        return [(at, surface.at(t)) for at, surface in self._half_spaces]
+    def half_spaces(self, x: np.ndarray, t: float) -> list[tuple[slice, np.ndarray]]:
+        """Return, for every half-space, its range of drawn vertices and the vertices (k,3) [m] of its square.
+
+        x: (n,3) [m], of which the first are the bodies' drawn vertices; t: time [s].
+        """
+        return [(at, part.at(t, x[: self.n_of_bodies])) for at, part in self._half_spaces]
 
     def coloured(self, colours: np.ndarray) -> np.ndarray:
         """Return colours (n,3) of all drawn vertices, given colours (n_nodes,3) of the bodies' nodes."""
@@ -107,17 +128,18 @@ class Surfaces:
 
         t: time [s]; eye: position (3,) [m], for culling. Raises OutputError if the path of an obstacle fails.
         """
-        return _concatenated([bodies, *(obstacle.vertices(t, eye) for obstacle in self._obstacles)])
+        return _concatenated([bodies, *(obstacle.vertices(t, bodies[0], eye) for obstacle in self._obstacles)])
 
 
 class Layers:
     """Optional layers beside the surfaces.
 
     shown: name -> whether it is visible, initially those in `names`; n_segments: largest number of lines that `lines` returns;
-    peak: recent maximum of impulses [N s], which scales their lines. Raises OutputError for an unknown name.
+    peak: recent maximum of impulses [N s], which scales their lines; marks: `ConnectionMarks`, by default of the scene. Raises
+    OutputError for an unknown name.
     """
 
-    def __init__(self, scene, names: tuple[str, ...] = IN_WINDOW):
+    def __init__(self, scene, names: tuple[str, ...] = IN_WINDOW, marks=None):
         for name in names:
             if name not in LAYERS:
                 raise OutputError(f"layer '{name}' is unknown: it must be one of {', '.join(LAYERS)}")
@@ -127,8 +149,9 @@ class Layers:
         surfaces = zip(self._shown.surfaces, self._shown.starts)
         self._edges = np.concatenate([triangle_edges(triangles)[0] + n for (_, triangles), n in surfaces])
         self.n_segments = len(self._edges) + MAX_MARK_LINES
-        self._size = float(np.linalg.norm(np.ptp(start_positions(scene), axis=0)))
-        self.peak = 0.0
+        self._size, self.peak = scene_size(scene), 0.0
+        marks = marks or ConnectionMarks(scene, self._size)
+        self.connections, self.pressures = ConnectionLayer(marks, self._size), PressureLayer(marks)
         self._loaded = [  # per traction, nodes (k,3) of the triangles that get an arrow
             body.mesh.surface[t.triangles[:: -(-len(t.triangles) // MAX_ARROWS)]] + n
             for body, n in zip(scene.bodies, starts)
@@ -144,17 +167,20 @@ class Layers:
             longest = max((float(np.linalg.norm(t)) for t in tractions), default=0.0) or 1.0
             for corners, traction in zip(self._loaded, tractions):
                 arrow = ARROW * self._size / longest * traction
-                marks.append((_arrows(x[corners].mean(axis=1), arrow, camera), TRACTION_COLOUR))
+                marks.append((arrows(x[corners].mean(axis=1), arrow, camera), TRACTION_COLOUR))
+        for name, layer in (("pressures", self.pressures), ("connections", self.connections)):
+            marks += layer.lines(sim, x, camera) if self.shown[name] else []
         marks = [(camera.nearer(ends, IN_FRONT), colour) for ends, colour in marks]
         if self.shown["wires"]:  # last, since lines beyond the renderer's limit are dropped from the end
             marks.append((camera.nearer(self._shown.of(x)[self._edges].reshape(-1, 3), ON_SURFACE), WIRE_COLOUR))
         ends = [np.empty((0, 3)), *(part for part, _ in marks)]
-        return np.concatenate(ends), np.concatenate([np.empty((0, 3)), *(np.tile(c, (len(part), 1)) for part, c in marks)])
+        colours = [np.empty((0, 3)), *(np.broadcast_to(colour, part.shape) for part, colour in marks)]
+        return np.concatenate(ends), np.concatenate(colours)
 
     def _contact_lines(self, sim) -> list[tuple[np.ndarray, np.ndarray]]:
         """Return lines of normals with a fixed length, and of impulses relative to the recent maximum."""
         found = sim.contacts()
-        k = slice(0, MAX_MARK_LINES // 4)
+        k = slice(0, MAX_CONTACTS)
         point, normal, impulse = found.point[k], found.normal[k], found.impulse[k]
         self.peak = max(DECAY * self.peak, float(np.linalg.norm(impulse, axis=1).max(initial=0.0)))
         relative = impulse / self.peak if self.peak > 0.0 else 0.0 * impulse
@@ -164,17 +190,22 @@ class Layers:
         ]
 
 
+def scene_size(scene) -> float:
+    """Return the diagonal of the bodies' bounding box at the start [m]."""
+    return float(np.linalg.norm(np.ptp(start_positions(scene), axis=0)))
+
+
 def _concatenated(parts: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
     return np.concatenate([x for x, _ in parts]), np.concatenate([n for _, n in parts])
 
 
 class _BodySurface:
-    def __init__(self, body, rest: np.ndarray, surface: np.ndarray, colour: np.ndarray):
+    def __init__(self, body, rest: np.ndarray, surface: np.ndarray, colour: np.ndarray, constraints: list):
         self._nodes, self._corners = smoothing_groups(rest, surface)
         edges = rest[surface] - rest[np.roll(surface, 1, axis=1)]
         self._radius = MARKER_SIZE * float(np.linalg.norm(edges, axis=2).mean())
         is_node = body.skin is None or body.skin.contact
-        self._marked = _fixed_surface_nodes(body, surface) if is_node else np.empty(0, dtype=np.int64)
+        self._marked = _fixed_surface_nodes(constraints, surface) if is_node else np.empty(0, dtype=np.int64)
         self._ball, ball_triangles = _coarse_ball()
         counts = len(self._nodes), len(self._ball) * len(self._marked)
         starts = len(self._nodes) + len(self._ball) * np.arange(len(self._marked))
@@ -191,16 +222,24 @@ class _BodySurface:
 
 
 class _RigidSurface:
-    """Surface of an obstacle. Triangles share no vertices, so that each can be culled."""
+    """Surface of an obstacle. Triangles share no vertices, so that each can be culled. fixed: half-spaces that do not move."""
 
-    def __init__(self, surface: ObstacleSurface):
-        self.surface, self.is_half_space = surface, isinstance(surface.obstacle.shape, HalfSpace)
+    def __init__(self, surface: ObstacleSurface, fixed: list[HalfSpace]):
+        shape = surface.obstacle.shape
+        self._surface, self.is_half_space = surface, isinstance(shape, HalfSpace)
+        self._square: Square | None = None
+        if self.is_half_space and surface.obstacle.path is None:
+            self._square = Square(shape, surface.vertices, [other for other in fixed if other is not shape])
         self._nodes, self._corners = smoothing_groups(surface.vertices, surface.triangles)
         self.triangles = np.arange(self._corners.size).reshape(-1, 3)
         self.colours = np.tile(OBSTACLE_COLOUR, (self._corners.size, 1))
 
-    def vertices(self, t: float, eye: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        x = self.surface.at(t)[self._nodes]
+    def at(self, t: float, bodies: np.ndarray) -> np.ndarray:
+        """Return the vertices (n,3) [m] at time t [s], with bodies at (m,3) [m]."""
+        return self._surface.at(t) if self._square is None else self._square.below(bodies)
+
+    def vertices(self, t: float, bodies: np.ndarray, eye: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        x = self.at(t, bodies)[self._nodes]
         corners, normals = x[self._corners], vertex_normals(x, self._corners)[self._corners]
         a, b, c = np.moveaxis(corners, 1, 0)
         back_facing = np.einsum("ti,ti->t", np.cross(b - a, c - a), eye - a) <= 0
@@ -254,8 +293,8 @@ def _unit(vectors: np.ndarray) -> np.ndarray:
     return vectors / np.where(length > 0, length, 1.0)
 
 
-def _fixed_surface_nodes(body, surface: np.ndarray) -> np.ndarray:
-    fixed = [constraint.nodes for constraint in body.constraints if constraint.path is None]
+def _fixed_surface_nodes(constraints: list, surface: np.ndarray) -> np.ndarray:
+    fixed = [constraint.nodes for constraint in constraints if constraint.path is None]
     if not fixed:
         return np.empty(0, dtype=np.int64)
     nodes = np.intersect1d(np.concatenate(fixed), surface)
@@ -277,11 +316,3 @@ def _coarse_ball() -> tuple[np.ndarray, np.ndarray]:
 def _segments(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Return the ends (2k,3) of lines from a (k,3) to b (k,3)."""
     return np.stack([a, b], axis=1).reshape(-1, 3)
-
-
-def _arrows(tips: np.ndarray, arrow: np.ndarray, camera: Camera) -> np.ndarray:
-    """Return the lines of arrows (3,) that end at tips (k,3): a shaft and two head strokes in the picture's plane."""
-    side = np.cross(arrow, camera.forward)
-    return np.concatenate(
-        [_segments(tips - arrow, tips)] + [_segments(tips - HEAD * (arrow + s * 0.5 * side), tips) for s in (-1.0, 1.0)]
-    )

@@ -5,6 +5,8 @@ exp(-height / FADE), so that a shadow is darkest where a body touches. The map i
 that its texels are small. Obstacles cast no shadow, and receive none unless they are half-spaces.
 """
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from taisoft.output.camera import UP, start_positions
@@ -15,6 +17,24 @@ SOFTNESS, FADE = 0.025, 0.4  # standard deviation of the blur; height: in diagon
 STRENGTH = 0.5  # fraction of the ground's light that a body in contact takes away
 MIN_SLOPE = 0.3  # smallest component along UP of the normal of a half-space that gets shadows
 REACH = 2.0  # standard deviations of the blur on either side
+
+
+@dataclass(frozen=True)
+class ShadowMap:
+    """Shadows on a half-space.
+
+    vertices: its range of drawn ones; origin (3,) [m] and axes (3,3), the third its normal: frame of the map; darkness: (v, u),
+    fraction of light that is missing; low (2,) [m]: coordinates of its corner; texel (2,): size of a texel [m]; square (k,2) [m]:
+    the half-space's drawn vertices in the frame.
+    """
+
+    vertices: slice
+    origin: np.ndarray
+    axes: np.ndarray
+    darkness: np.ndarray
+    low: np.ndarray
+    texel: np.ndarray
+    square: np.ndarray
 
 
 class Shadows:
@@ -32,21 +52,26 @@ class Shadows:
         """
         at = np.zeros((len(x), 3))
         at[:, 2] = -1.0
-        maps = []
-        for vertices, boundary in self._surfaces.half_spaces(t):
-            origin, axes = boundary[0], _frame(boundary)
+        maps = self.maps(x, t)
+        for k, one in enumerate(maps):
+            at[one.vertices, :2] = ((x[one.vertices] - one.origin) @ one.axes[:2].T - one.low) / one.texel
+            at[one.vertices, 2] = k
+        return np.array([one.darkness for one in maps]) if maps else np.zeros((1, 2, 2)), at
+
+    def maps(self, x: np.ndarray, t: float) -> list["ShadowMap"]:
+        """Return the maps of all half-spaces with shadows, as for `draw`."""
+        found = []
+        for vertices, boundary in self._surfaces.half_spaces(x, t):
+            axes = _frame(boundary)
             if axes is None or axes[2] @ UP < MIN_SLOPE:
                 continue
-            found = self._map(x[: self._surfaces.n_of_bodies], origin, axes, boundary)
-            if found is not None:
-                darkness, low, texel = found
-                at[vertices, :2] = ((x[vertices] - origin) @ axes[:2].T - low) / texel
-                at[vertices, 2] = len(maps)
-                maps.append(darkness)
-        return np.array(maps) if maps else np.zeros((1, 2, 2)), at
+            drawn = self._map(x[: self._surfaces.n_of_bodies], boundary[0], axes, boundary)
+            if drawn is not None:
+                found.append(ShadowMap(vertices, boundary[0], axes, *drawn))
+        return found
 
-    def _map(self, x: np.ndarray, origin, axes, boundary) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-        """Return a map (v, u), the coordinates (2,) of its corner and the size (2,) of a texel [m]; None without a shadow."""
+    def _map(self, x: np.ndarray, origin, axes, boundary) -> tuple[np.ndarray, ...] | None:
+        """Return the last four fields of a `ShadowMap`; None without a shadow."""
         height = (x - origin) @ axes[2] / (axes[2] @ UP)
         shadow = (x - origin) @ axes[:2].T - height[:, None] * (axes[:2] @ UP)
         drawn = shadow[np.isfinite(shadow).all(axis=1)]
@@ -65,7 +90,7 @@ class Shadows:
             depth = np.exp(np.clip(height / (FADE * self._size), 0.0, 50.0))
         points = np.column_stack([(shadow - low) / texel, depth])
         darkness = STRENGTH * self._raster.inverse_depths(points, self._surfaces.body_triangles)
-        return blurred(darkness, sigma / texel[::-1]), low, texel
+        return blurred(darkness, sigma / texel[::-1]), low, texel, square
 
 
 def _frame(boundary: np.ndarray) -> np.ndarray | None:

@@ -1,342 +1,252 @@
-"""The live window: shows a running simulation, with mouse, keys and a panel to view and change it.
+"""The live window, seen from the simulation: a process that shows it, and the calls that open one.
 
-The left button drags the body under the cursor, and orbits elsewhere or with Ctrl; the right one zooms, the middle one pans.
-Space: pause or continue. S or right arrow: one step. R: back to the initial state. V: other colours. W, C, T, F: wires, contacts,
-tractions, fixed nodes. G: plots over time. P: record pictures. Escape or the close button: quit. Sliders and buttons are in the
-panel, see `taisoft.view.controls`.
-
-Each picture advances simulated time by 1/fps [s]. Steps stop once they have taken that much wall time, and the remaining
-simulated time is dropped. So the picture stays fluid while the simulation falls behind real time.
+The window runs in a process of its own, `taisoft.view.window_process`, so that it draws and answers the mouse while a step is
+computed. The simulation stays in the caller's process, whatever its scene holds, and only states and commands travel
+(`taisoft.view.link`). So any arch and precision can be shown, a crash of the window does not end the simulation, and the window
+ends with its caller, however that ends.
 """
 
-import itertools
+import math
+import os
+import signal
+import subprocess
+import sys
 import time
-from collections.abc import Callable
+import warnings
+from contextlib import suppress
 from pathlib import Path
+from typing import NoReturn
 
-import numpy as np
-import taichi as ti
+import taisoft
+from taisoft.errors import OutputError
+from taisoft.frames import dt_sentence, fit_dt
+from taisoft.records import RunReport
+from taisoft.view.annotations import REFRESH
+from taisoft.view.colouring import NodalValues
+from taisoft.view.connection_layer import ConnectionMarks
+from taisoft.view.controls import touching_pairs
+from taisoft.view.ggui import display_missing, vulkan_missing
+from taisoft.view.link import Link, LinkClosed
+from taisoft.view.live import LiveRun
+from taisoft.view.mirror import describe_scene, describe_state
+from taisoft.view.plots import PLOTS, Plots
+from taisoft.view.scene_view import IN_WINDOW, scene_size
 
-from taisoft.errors import OutputError, SimulationError, TaisoftError
-from taisoft.files import write_bytes
-from taisoft.output.files import make_folder
-from taisoft.output.frames import png_bytes
-from taisoft.records import StepReport
-from taisoft.running import timed_advance
-from taisoft.view.annotations import PlotOverlay
-from taisoft.view.colouring import BACKGROUND_TOP
-from taisoft.view.controls import MouseDrag, Panel, pick
-from taisoft.view.ggui import Canvas
-from taisoft.view.plots import ENERGIES, Plots
-from taisoft.view.scene_view import IN_FRONT, IN_WINDOW, SceneView
-
-SIZE = (1280, 720)
-PANEL = (0.012, 0.02, 0.27, 0.94)  # left, top, width, height as fractions of the window's initial size
-SHORT_PANEL = (0.012, 0.02, 0.27, 0.24)  # of a window without sliders
-ORBIT = 240.0  # angle for a drag over the whole window [deg]
-ZOOM = 16.0  # factor on the distance for a drag over the whole window
-DRAG_COLOUR = np.array([0.85, 0.10, 0.35])  # sRGB
-SPEED_WINDOW = 0.5  # wall time over which steps/s is averaged [s]
-FIRST_PICTURES = 2  # before the first step, which compiles for seconds; GGUI shows no panel at first
-SLOW = 1.1  # wall time over simulated time above which the panel reports a slow solver
-OUT = Path("out")
-KEYS = {ti.ui.SPACE: "pause", "s": "step", ti.ui.RIGHT: "step", "r": "reset", "p": "record", "v": "colour", ti.ui.ESCAPE: "close"}
-KEYS |= {"w": "wires", "c": "contacts", "t": "tractions", "f": "fixed_nodes", "g": "plots"}
+START_SECONDS = 60.0  # in which the window must open
+END_SECONDS = 5.0  # in which it must close
+FPS = 60.0
+CHILD = (sys.executable, "-P", "-m", "taisoft.view.window_process")
 
 
-class LiveWindow(SceneView):
-    """A window that shows a scene; also an observer, with `frame` and `close`, for `Simulator.run`.
+class WindowProcess:
+    """A window in a child process that shows a simulation.
 
-    scene, colour, layers: as for `SceneView`; the user may change colours and layers, and move the camera, which then follows the
-    bodies no more. tall: make room for sliders in the panel; plots: those that can be shown. `pressed` holds the actions, values
-    of KEYS, requested by keys up to the last draw. Raises OutputError, before anything is opened, if a display or a Vulkan driver
-    is missing or the process has a window already.
+    sim: a Simulator; controls: whether the window changes it, or only shows it; colour, layers, plots: those shown initially;
+    fps: of the window's pictures, at most; child: command of the process, if not CHILD.
+    closed: whether it is; timing: once its user has closed it, times of its pictures and latencies of drags, see
+    `taisoft.view.timing`. Raises OutputError if a display or a Vulkan driver is missing or the window does not open.
     """
 
-    def __init__(self, scene, plots: Plots, tall: bool = False, colour: str = "body", layers: tuple[str, ...] = IN_WINDOW):
-        super().__init__(scene, SIZE, None, colour, layers)
-        self._overlay = PlotOverlay(plots, SIZE)
-        self._canvas = Canvas(self.surfaces, SIZE, visible=True, n_segments=self.layers.n_segments + 1)
-        self._panel_rectangle = PANEL if tall else SHORT_PANEL
-        # GGUI positions the panel once, by the window's size at that time, and does not report where the user moves it
-        self._panel_pixels = tuple(f * n for f, n in zip(self._panel_rectangle, (*SIZE, *SIZE)))
-        self._cursor: tuple[float, float] | None = None  # at the last picture
-        self._mode = ""  # of the present mouse drag: "turn", "zoom", "shift", "drag", or "panel", which GGUI handles
-        self._recorded_size: tuple[int, int] | None = None  # of the last recorded picture
-        self._close_requested = False
-        self.drag: MouseDrag | None = None
-        self.pressed: set[str] = set()
+    def __init__(
+        self,
+        sim,
+        controls: bool = False,
+        colour: str = "body",
+        layers: tuple[str, ...] = IN_WINDOW,
+        plots: tuple[str, ...] = (),
+        fps: float = FPS,
+        child: tuple[str, ...] | None = None,
+    ):
+        missing = display_missing() or vulkan_missing()
+        if missing:
+            raise OutputError(f"cannot open a window: {missing}")
+        scene = sim.scene
+        n_nodes = sum(body.n_nodes for body in scene.bodies)
+        self._values, self._colour, self._layers, self._wants_plots = NodalValues(scene.bodies), colour, set(layers), bool(plots)
+        self._sent = self._confirmed = self._answered = 0  # numbers of states, and of the last request
+        self._history_sent = -math.inf  # wall time
+        self._requests: list[tuple[int, list]] = []  # not yet returned
+        self.closed, self.timing = False, {}
+        self._link, other = Link.pair(n_nodes)
+        self._process: subprocess.Popen | None = _spawn(child or CHILD, other.fileno(), self._link.nodes.descriptor)
+        other.close()
+        self._marks = ConnectionMarks(scene, scene_size(scene))
+        description = describe_scene(scene, self._marks) | {"n_nodes": n_nodes, "fps": fps, "colour": colour}
+        description |= {"layers": list(layers), "plots": list(plots)}
+        description |= {"controls": controls, "pairs": touching_pairs(sim) if controls else []}
+        try:
+            self._open(description)
+        except BaseException:
+            self.close()
+            raise
+
+    def _open(self, description: dict) -> None:
+        """Send the scene and wait until the window is open. Raises OutputError."""
+        try:
+            self._link.send(description)
+            answer = self._link.receive(START_SECONDS)
+        except LinkClosed:
+            raise OutputError(f"cannot open a window: {self._how_it_ended()}") from None
+        if answer is None:
+            raise OutputError(f"cannot open a window: its process does not answer within {START_SECONDS:g} s")
+        if "error" in answer:
+            raise OutputError(answer["error"])
+
+    @property
+    def ready(self) -> bool:
+        """Whether the window has taken the last state."""
+        return self._confirmed >= self._sent
+
+    def receive(self, timeout: float = 0.0) -> list[tuple[int, list]]:
+        """Return the requests since the last call, each a number and its commands; wait up to a time [s] for the first message.
+
+        Raises OutputError if the window's process has ended otherwise than by being closed.
+        """
+        while self._read(timeout):
+            timeout = 0.0
+        found, self._requests = self._requests, []
+        if found:
+            self._answered = found[-1][0]
+        return found
+
+    def _read(self, timeout: float) -> bool:
+        """Read the next message; return whether there was one."""
+        if self.closed:
+            return False
+        try:
+            message = self._link.receive(timeout)
+        except LinkClosed:
+            self._lose()
+        if message is None:
+            return False
+        if "closed" in message:
+            self.closed, self.timing = True, message
+            return False
+        self._confirmed = message["confirmed"]
+        self._colour, self._layers, self._wants_plots = message["colour"], set(message["layers"]), message["plots"]
+        if message["commands"]:
+            self._requests.append((message["number"], message["commands"]))
+        return True
+
+    def publish(self, sim, plots: Plots, shown: dict, patience: float = 0.0) -> None:
+        """Send sim's present state, unless the window does not take the previous one within a time [s].
+
+        shown: what else the window shows, see `LiveRun.panel_state`.
+        Raises SceneError if a path fails, OutputError as `receive`.
+        """
+        end = time.perf_counter() + patience
+        while not self.ready and not self.closed and (left := end - time.perf_counter()) > 0.0:
+            self._read(left)
+        if not self.ready or self.closed:
+            return
+        now, history = time.perf_counter(), None
+        if self._wants_plots and now - self._history_sent >= REFRESH:
+            history, self._history_sent = plots.history, now
+        state = describe_state(sim, self._marks, self._layers, history)
+        self._link.nodes.x[:] = sim.positions()
+        if self._colour != "body":
+            self._link.nodes.values[:] = self._values(self._colour, sim)
+        self._sent += 1
+        state |= {"enabled": plots.enabled(), "number": self._sent, "answered": self._answered, "colour": self._colour} | shown
+        try:
+            self._link.send(state)
+        except LinkClosed:
+            while self._read(0.0):  # it may have been closed by its user
+                pass
+
+    def close(self) -> None:
+        """Close the window and wait for its process; a second call does nothing."""
+        if self._process is None:
+            return
+        self.closed = True
+        with suppress(LinkClosed):
+            self._link.send({"end": True})
+        self._link.close()
+        try:
+            self._process.wait(END_SECONDS)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        self._process = None
+
+    def _lose(self) -> NoReturn:
+        self.closed = True
+        raise OutputError(f"the window is lost: {self._how_it_ended()}")
+
+    def _how_it_ended(self) -> str:
+        try:
+            status = self._process.wait(END_SECONDS)
+        except subprocess.TimeoutExpired:
+            return "its process does not answer"
+        how = f"by signal {signal.Signals(-status).name}" if status < 0 else f"with exit status {status}"
+        return f"its process ended {how}"
+
+
+def _spawn(child: tuple[str, ...], *descriptors: int) -> subprocess.Popen:
+    """Start the window's process with this version of taisoft; a session of its own shields it from the terminal's Ctrl-C."""
+    folder = str(Path(taisoft.__file__).resolve().parents[1])
+    paths = {"PYTHONPATH": os.pathsep.join(filter(None, (folder, os.environ.get("PYTHONPATH"))))}
+    command = [*child, *map(str, descriptors)]
+    return subprocess.Popen(
+        command, env=os.environ | paths, pass_fds=descriptors, stdin=subprocess.DEVNULL, start_new_session=True
+    )
+
+
+class LiveWindow:
+    """A window that shows a run: an observer, with `frame` and `close`, for `Simulator.run`; see `WindowProcess`.
+
+    A window that is closed or lost does not end the run; the latter is a warning.
+    """
+
+    def __init__(self, sim, plots: Plots, colour: str = "body", layers: tuple[str, ...] = IN_WINDOW):
+        shown = {"colour": colour, "layers": layers, "plots": tuple(name for name in PLOTS if plots.shown[name])}
+        self._plots, self._window = plots, WindowProcess(sim, **shown)
 
     @property
     def closed(self) -> bool:
-        """Whether the user has closed the window, or `close` was called."""
-        return self._close_requested or self._canvas.window is None or not self._canvas.window.running
-
-    def draw(self, sim, lines: list[str], panel: Panel | None = None, record=None) -> None:
-        """Draw sim's present state with a panel of text lines, show it, and process keys and mouse.
-
-        panel: sliders and buttons below the lines; record: called with the picture, uint8 (height, width, 3), without the panel.
-        """
-        window = self._canvas.window
-        size = window.get_window_shape()
-        x, colours, (ends, line_colours) = self._drawn(sim, size)
-        if self.drag is not None:
-            dragged = self.camera.nearer(self.drag.line(sim), IN_FRONT)
-            ends = np.concatenate([dragged, ends])
-            line_colours = np.concatenate([np.tile(DRAG_COLOUR, (2, 1)), line_colours])
-        self._canvas.draw(x, colours, self.camera, tuple(BACKGROUND_TOP), (ends, line_colours))
-        # GGUI shows an empty window after a picture was taken of it at another size than the present one
-        if record is not None or self._recorded_size not in (None, size):
-            picture = self._canvas.pixels(0, 0, *size)  # before the panel is declared, which would else be in the picture
-            self._recorded_size = size
-            if record is not None:
-                record(picture)
-        self._overlay.draw(self._canvas, window.get_gui(), size)
-        # lines above the sliders must be constant in number: a transient line would move the sliders under the cursor
-        with window.get_gui().sub_window("taisoft", *self._panel_rectangle) as gui:
-            for line in lines:
-                gui.text(line)
-            if panel is not None:
-                panel.draw(gui)
-        window.show()
-        self._read_keys()
-        self._read_mouse(sim, panel)
+        """Whether the window is closed."""
+        return self._window.closed
 
     def frame(self, sim, index: int) -> None:
-        """Show a frame of a run; does nothing once closed."""
-        if not self.closed:
-            self.draw(sim, [f"frame {index}", *state_lines(sim)])
+        """Show a frame of a run if the window has shown the previous one."""
+        try:
+            self._window.receive()
+            self._window.publish(sim, self._plots, {"status": f"frame {index}", "messages": []})
+        except OutputError as error:
+            warnings.warn(f"{error}; the run continues without it", UserWarning, stacklevel=2)
 
     def close(self) -> None:
-        """Destroy the window; a second call does nothing."""
-        self._canvas.close()
-
-    def _read_keys(self) -> None:
-        events = self._canvas.window.get_events(ti.ui.PRESS)
-        self.pressed = {KEYS[event.key] for event in events if event.key in KEYS}
-        for name in self.pressed & set(self.layers.shown):
-            self.layers.shown[name] = not self.layers.shown[name]
-        if "plots" in self.pressed:
-            self._overlay.plots.toggle()
-        if "colour" in self.pressed:
-            self.colouring.choose_next()
-        self._close_requested |= "close" in self.pressed
-
-    def _read_mouse(self, sim, panel: Panel | None) -> None:
-        window = self._canvas.window
-        size = window.get_window_shape()
-        button = next((b for b in (ti.ui.LMB, ti.ui.RMB, ti.ui.MMB) if window.is_pressed(b)), None)
-        cursor = window.get_cursor_pos()  # from the lower left corner, in [0, 1]
-        if button is None or min(size) < 1:  # a window of zero size has no cursor
-            if self.drag is not None:
-                self.drag = None
-                sim.release()
-            self._mode = ""
-        elif not self._mode:
-            self._mode = self._begin_drag(sim, panel, button, cursor, size)
-        else:
-            self._move_camera(cursor[0] - self._cursor[0], cursor[1] - self._cursor[1], size)
-        if self.drag is not None:
-            self.drag.drag(sim, self.camera, cursor, size, panel.strength)
-        self._cursor = cursor
-
-    def _begin_drag(self, sim, panel: Panel | None, button, cursor, size) -> str:
-        """Start a mouse drag at the cursor and return its mode."""
-        left, top, width, height = self._panel_pixels
-        x, y = cursor[0] * size[0], (1.0 - cursor[1]) * size[1]
-        if left <= x <= left + width and top <= y <= top + height or self._overlay.contains(x, y):
-            return "panel"
-        if button != ti.ui.LMB:
-            return "zoom" if button == ti.ui.RMB else "shift"
-        if panel is not None and panel.strength > 0.0 and not self._canvas.window.is_pressed(ti.ui.CTRL):
-            hit = pick(sim, self.camera, cursor, size)
-            if hit is not None:
-                self._widest = 0.0  # a camera that moves back would move the drag's target
-                self.drag = MouseDrag(sim, hit)
-                panel.chosen = self.drag.body
-                return "drag"
-        return "turn"
-
-    def _move_camera(self, right: float, up: float, size) -> None:
-        """Move the camera by a displacement of the cursor."""
-        if self._mode in ("turn", "zoom", "shift"):
-            self._widest = 0.0
-        if self._mode == "turn":
-            self.camera = self.camera.orbit(-ORBIT * right, -ORBIT * up)
-        elif self._mode == "zoom":
-            self.camera = self.camera.zoom(ZOOM**-up)
-        elif self._mode == "shift":
-            self.camera = self.camera.pan(-right * size[0] / size[1], -up)
-
-
-class Loop:
-    """Drives sim at fps pictures per second.
-
-    problem: why the run paused; note: the last action; each a sentence or empty. folder: of the pictures while recording, else
-    None; plots: records the steps.
-    """
-
-    def __init__(self, sim, fps: float, paused: bool, plots: Plots | None = None):
-        self.sim, self.fps, self.paused, self._plots = sim, fps, paused, plots
-        self.problem = self.note = ""
-        self.folder: Path | None = None
-        self._rebuild: Callable[[], bool] | None = None  # requested; called once a picture has shown the note
-        self._note_shown = False
-        self._frames = 0
-        self._speed = 0.0  # [steps/s]
-        self._start()
-
-    def _start(self) -> None:
-        """Begin with a simulator that has not compiled its steps."""
-        self._compiled = False  # True after a step, since that compiles everything
-        self._wait = FIRST_PICTURES  # pictures before the next step
-        self._time_due = 0.0  # simulated time that steps still have to cover [s]
-        self._cost = 0.0  # wall time over simulated time of the steps
-        self._spent = [0.0, 0.0]  # wall and simulated time of the steps since the mark [s]
-        self._mark = (time.perf_counter(), self.sim.step_count)  # start of the present speed measurement
-
-    def request_rebuild(self, build: Callable[[], bool], note: str) -> None:
-        """Call build once a picture has shown the note. build: rebuilds the simulator and returns whether it succeeded."""
-        self._rebuild, self._note_shown, self.note = build, False, note
-
-    def react(self, pressed: set[str]) -> None:
-        """Carry out the actions of keys and buttons."""
-        if self._rebuild is not None and self._note_shown:
-            build, self._rebuild = self._rebuild, None
-            if build():
-                self._start()
-                self.problem = ""
-        self._note_shown = self._rebuild is not None
-        if "pause" in pressed:
-            self.paused = not self.paused
-            self.problem = ""
-        if "reset" in pressed:
-            self.sim.reset()
-            if self._plots is not None:
-                self._plots.restart()
-            self.problem = ""
-            self._mark = (time.perf_counter(), self.sim.step_count)
-        if "step" in pressed:
-            self.paused = True
-            self.guarded(lambda: self._advance(1))
-        if "record" in pressed:
-            self._toggle_recording()
-
-    def advance(self) -> None:
-        """Advance by one picture's simulated time, or less if that takes more wall time than a picture has."""
-        if self._wait > 0 or self._rebuild is not None:
-            self._wait -= 1
-            return
-        self._time_due += 1.0 / self.fps
-        end = time.perf_counter() + 1.0 / self.fps
-        while self._time_due >= self.sim.dt * (1.0 - 1e-9) and not self.paused:
-            before = self.sim.step_count
-            n = int(self._time_due / self.sim.dt + 1e-9)
-            if self._cost > 0.0:  # in one launch, no more explicit steps than a picture has time for
-                n = min(n, int((end - time.perf_counter()) / (self._cost * self.sim.dt) + 0.5))
-            self.guarded(lambda n=n: self._advance(max(1, n)))
-            self._time_due -= (self.sim.step_count - before) * self.sim.dt
-            if time.perf_counter() >= end:
-                self._time_due = min(self._time_due, 0.0)
-
-    def _advance(self, n: int) -> None:
-        self._wait = 0
-        timed_advance(self.sim, n, self._after_step)
-        self._compiled = True
-
-    def _after_step(self, report: StepReport, seconds: float) -> None:
-        self._spent[0] += seconds
-        self._spent[1] += report.steps * self.sim.dt
-        if self._plots is not None:
-            self._plots.take(report, seconds)
-
-    def guarded(self, call) -> bool:
-        """Call a function and return whether it succeeded. If it raises a TaisoftError, pause and set `problem`."""
-        try:
-            call()
-        except TaisoftError as error:
-            self.problem = f"failed: {error}" if isinstance(error, SimulationError) else str(error)
-            self.paused = True
-            return False
-        return True
-
-    def speed(self) -> str:
-        """Return the steps per second as text."""
-        now, steps = time.perf_counter(), self.sim.step_count
-        elapsed = now - self._mark[0]
-        if elapsed >= SPEED_WINDOW:
-            self._speed = (steps - self._mark[1]) / elapsed
-            self._mark = (now, steps)
-            if self._spent[1] > 0.0:
-                self._cost = self._spent[0] / self._spent[1]
-            self._spent = [0.0, 0.0]
-        return f"speed    {self._speed:10.1f} steps/s"
-
-    def lines(self) -> list[str]:
-        """Return the status of the run, and the note if there is one."""
-        slow = self._cost > SLOW and not self.paused
-        status = f"running; the solver needs {self._cost:.1f} times real time" if slow else "running"
-        if not self._compiled:
-            status = "compiling the next step, for some seconds"
-        return [self.problem or ("paused" if self.paused else status), *([self.note] if self.note else [])]
-
-    def record(self, picture: np.ndarray) -> None:
-        """Write a picture, uint8 (height, width, 3), as the next one in the folder."""
-        try:
-            write_bytes(self.folder / f"{self._frames:05d}.png", png_bytes(picture))
-        except OutputError as error:
-            self.folder, self.note = None, str(error)
-            return
-        self._frames += 1
-        self.note = f"recording: {self._frames} pictures in {self.folder}"
-
-    def _toggle_recording(self) -> None:
-        if self.folder is not None:
-            self.folder, self.note = None, f"recorded {self._frames} pictures in {self.folder}"
-            return
-        folder = next(path for n in itertools.count(1) if not (path := OUT / f"window-{n}").exists())
-        try:
-            self.folder, self._frames = make_folder(folder), 0
-        except OutputError as error:
-            self.note = str(error)
+        """Close the window; a second call does nothing."""
+        self._window.close()
 
 
 def show(
     sim,
-    fps: float = 60.0,
+    fps: float | None = 60.0,
     paused: bool = False,
     colour: str = "body",
     layers: tuple[str, ...] = IN_WINDOW,
     plots: tuple[str, ...] = (),
+    speed: float = 1.0,
 ) -> None:
-    """Run a simulation in a window until it is closed.
+    """Run a simulation in a window until it is closed, following the clock.
 
-    sim: an open Simulator, advanced by 1/fps [s] of simulated time per picture, never faster than real time; if made with
-    draggable=True, its bodies can be dragged with the mouse. A failed step pauses the run and the reason is shown; R restarts.
-    colour, layers, plots: initial ones. Raises OutputError, before anything is opened, if a display or a Vulkan driver is missing
-    or the process has a window already; SceneError for a plot of a quantity that is not simulated.
+    sim: an open Simulator; if made with draggable=True, its bodies can be dragged with the mouse. fps: dt is lowered to a divisor
+    of 1/fps as by `run`, so that without a drag the states are those of `run`, bit by bit; None keeps dt. speed: simulated over
+    wall time, `math.inf` for as fast as possible. A failed step pauses the run and the reason is shown; R restarts. colour,
+    layers, plots: initial ones. Raises OutputError, before anything is opened, if a display or a Vulkan driver is missing, and
+    if the window's process is lost; SceneError for a plot of a quantity that is not simulated.
     """
-    if not fps > 0:
+    if fps is not None and not fps > 0:
         raise OutputError(f"the window's fps is {fps}; it must be positive")
-    history = Plots(sim, plots)
-    window = LiveWindow(sim.scene, history, tall=True, colour=colour, layers=layers)
+    if not speed > 0:
+        raise OutputError(f"the window's speed is {speed}; it must be positive")
+    history, report = Plots(sim, plots), RunReport()
+    window = WindowProcess(sim, controls=True, colour=colour, layers=layers, plots=plots)
     try:
-        loop = Loop(sim, fps, paused, history)
-        panel = Panel(sim, loop, window.colouring, window.layers, history)
-        while not window.closed:
-            started = time.perf_counter()
-            window.draw(sim, [*state_lines(sim), loop.speed()], panel, loop.record if loop.folder is not None else None)
-            loop.react(window.pressed | panel.pressed)
-            if not loop.paused:
-                loop.advance()
-            time.sleep(max(0.0, 1.0 / fps - (time.perf_counter() - started)))
+        fit_dt(sim, fps, report)
+        LiveRun(sim, window, history, paused, speed, dt_sentence(report)).run()
     finally:
         window.close()
         if sim.dragged is not None:
             sim.release()
-
-
-def state_lines(sim) -> list[str]:
-    """Return time and energies of sim as lines of text."""
-    energies = sim.energies()
-    return [f"time     {sim.time:10.4f} s", *(f"{name:8} {getattr(energies, name):10.4g} J" for name in ENERGIES)]

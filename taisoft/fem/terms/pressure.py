@@ -63,15 +63,20 @@ def energy(m: ti.template(), i):
 @ti.func
 def add_stiffness(m: ti.template(), A: ti.template(), i, beta, projected):
     """Add node i's row of beta^2 times the symmetric part of -df/dx to A."""
-    x = m.state.x[i]
     if projected == 0:
         for k in range(m.pressure.stiffness_start[i], m.pressure.stiffness_start[i + 1]):
             nodes = m.pressure.stiffness_nodes[k]
             p = beta * beta * m.pressure.stiffness_weight[k] * m.amplitudes[nodes[2]]
-            a = ti.cast(p * (m.state.x[nodes[1]] - x), m.real)
+            a = ti.cast(p * (m.state.x[nodes[1]] - m.state.x[nodes[3]]), m.real)
             zero = ti.cast(0.0, m.real)
             cross = ti.Vector([zero, a[2], -a[1], zero, -a[2], zero, a[0], zero, a[1], -a[0], zero, zero])  # [a]x by columns
-            A.value[nodes[0]] = A.value[nodes[0]] + cross
+            if ti.static(m.has_dependents):
+                if nodes[0] < 0:
+                    A.diagonal[i] = A.diagonal[i] + cross
+                else:
+                    A.value[nodes[0]] = A.value[nodes[0]] + cross
+            else:
+                A.value[nodes[0]] = A.value[nodes[0]] + cross
 
 
 @kernel

@@ -1,11 +1,16 @@
-"""Springs, tendons and attachments: node j gets -c_j (T + damping) e / l of each element, psi = sum k (l - L)^2 / 2 + T_0 l.
+"""Springs, tendons and attachments: node j gets -c_j (T + damping) e / |e| of each element; psi = sum k (l - L)^2 / 2 + T_0 l.
 
-`fem.springs` defines the elements. Before forces are gathered, `prepare` computes the pull of each element from x and v. Blocks
-of the stiffness are c_i c_j S, S = t I + (k - t) d d^T with d = e / l and t = T / l, or k I for an element of rest length 0. At
-l = 0 the direction of an element that has a rest length is undefined: it does not pull there.
+`fem.spring_table` defines the elements and their lines. Before forces are gathered, `prepare` computes for each line its
+elements' directions and pulls from x and v; given tensions, which Newton's method may change without moving nodes, act when
+forces are gathered. Blocks of the stiffness are
+    c_i c_j (k d d'^T + [same element] t (I - d d^T)),   d = e / |e|,   t = T / |e|,
+d' of any element of the line, or k I for an element of rest length 0. At |e| = 0 the direction of an element that has a rest
+length is undefined: it does not pull there.
 """
 
 import taichi as ti
+
+from taisoft.fem.spring_table import LENGTH, MULTIPLIER, PLAIN
 
 SWITCH, LOAD, ACCELERATION, STIFFNESS, PREPARED = "springs", False, False, True, True
 TINY = 1e-30  # [m]; avoids a division by 0, and is no smaller since literals may be f32
@@ -13,14 +18,18 @@ TINY = 1e-30  # [m]; avoids a division by 0, and is no smaller since literals ma
 
 @ti.func
 def count(m: ti.template()):
-    """Number of elements."""
-    return m.springs.n
+    """Number of lines."""
+    return m.springs.n_lines
 
 
 @ti.func
 def _vector(m: ti.template(), s):
     """e of element s [m]."""
     e = m.springs.offset[s]
+    if ti.static(m.springs.has_moving):
+        at = m.springs.moving[s]
+        if at >= 0:
+            e = ti.Vector([m.amplitudes[at], m.amplitudes[at + 1], m.amplitudes[at + 2]], ti.f64)
     for k in range(m.springs.start[s], m.springs.start[s + 1]):
         e += m.springs.weight[k] * m.state.x[m.springs.node[k]]
     return e
@@ -30,44 +39,63 @@ def _vector(m: ti.template(), s):
 def _given_tension(m: ti.template(), s):
     """T_0 of element s [N]."""
     tension = ti.cast(0.0, ti.f64)
-    if ti.static(m.springs.has_tendons):
-        slot = m.springs.slot[s]
-        if slot >= 0:
-            tension = m.amplitudes[slot]
+    if ti.static(m.springs.has_tensions):
+        if m.springs.slot[s] >= 0 and m.springs.kind[s] != LENGTH:
+            tension = m.amplitudes[m.springs.slot[s]]
     return tension
 
 
 @ti.func
+def _stretching(m: ti.template(), s, length):
+    """k (l - L) [N] of a line with first element s and length l."""
+    stretch = length - m.springs.numbers[s, 1]
+    if ti.static(m.springs.has_lengths):
+        if m.springs.kind[s] == LENGTH:
+            stretch = ti.max(length - m.amplitudes[m.springs.slot[s]], 0.0)
+    return m.springs.numbers[s, 0] * stretch
+
+
+@ti.func
 def _is_isotropic(m: ti.template(), s):
-    """Whether element s has neither a rest length nor a given tension."""
-    return m.springs.numbers[s, 1] == 0.0 and m.springs.slot[s] < 0
+    """Whether element s has neither a rest length nor an amplitude."""
+    return m.springs.numbers[s, 1] == 0.0 and m.springs.kind[s] == PLAIN
 
 
 @ti.func
-def _tension_over_length(m: ti.template(), s, length):
-    """t = T / l of element s [N/m]."""
-    k = m.springs.numbers[s, 0]
-    t = k
-    if not _is_isotropic(m, s) and length > TINY:
-        t += (_given_tension(m, s) - k * m.springs.numbers[s, 1]) / length
-    return t
+def _length(m: ti.template(), line):
+    """l of a line [m]."""
+    total = ti.cast(0.0, ti.f64)
+    for s in range(m.springs.line_start[line], m.springs.line_start[line + 1]):
+        total += _vector(m, s).norm()
+    return total
 
 
 @ti.func
-def prepare(m: ti.template(), s):
-    """Compute the pull of element s from the present x and v."""
-    e = _vector(m, s)
-    length = e.norm()
-    pull = _tension_over_length(m, s, length) * e
-    if ti.static(m.spring_damping):
-        rate = ti.Vector([0.0, 0.0, 0.0], ti.f64)
-        for k in range(m.springs.start[s], m.springs.start[s + 1]):
-            rate += m.springs.weight[k] * ti.cast(m.state.v[m.springs.node[k]], ti.f64)
-        if not _is_isotropic(m, s):
-            d = e / ti.max(length, TINY)
-            rate = rate.dot(d) * d
-        pull += m.springs.numbers[s, 2] * rate
-    m.springs.pull[s] = pull
+def prepare(m: ti.template(), line):
+    """Compute directions, tension and pulls of a line from the present x and v."""
+    first = m.springs.line_start[line]
+    elastic = _stretching(m, first, _length(m, line))
+    m.springs.elastic[line] = elastic
+    for s in range(first, m.springs.line_start[line + 1]):
+        e = _vector(m, s)
+        length = e.norm()
+        d = e / ti.max(length, TINY)
+        pull = elastic * d
+        if _is_isotropic(m, s):
+            pull = m.springs.numbers[s, 0] * e
+        if ti.static(m.spring_damping):
+            rate = ti.Vector([0.0, 0.0, 0.0], ti.f64)
+            if ti.static(m.springs.has_moving):
+                at = m.springs.moving[s]
+                if at >= 0:
+                    at += m.springs.rate_after
+                    rate = ti.Vector([m.amplitudes[at], m.amplitudes[at + 1], m.amplitudes[at + 2]], ti.f64)
+            for k in range(m.springs.start[s], m.springs.start[s + 1]):
+                rate += m.springs.weight[k] * ti.cast(m.state.v[m.springs.node[k]], ti.f64)
+            if not _is_isotropic(m, s):
+                rate = rate.dot(d) * d
+            pull += m.springs.numbers[s, 2] * rate
+        m.springs.direction[s], m.springs.length[s], m.springs.pull[s] = d, length, pull
 
 
 @ti.func
@@ -76,36 +104,45 @@ def force(m: ti.template(), i):
     f = ti.Vector([0.0, 0.0, 0.0], ti.f64)
     for q in range(m.springs.node_start[i], m.springs.node_start[i + 1]):
         k = m.springs.node_entry[q]
-        f -= m.springs.weight[k] * m.springs.pull[m.springs.element[k]]
+        s = m.springs.element[k]
+        pull = m.springs.pull[s]
+        if ti.static(m.springs.has_tensions):
+            pull += _given_tension(m, s) * m.springs.direction[s]
+        f -= m.springs.weight[k] * pull
     return ti.cast(f, m.real)
 
 
 @ti.func
-def elastic_energy(m: ti.template(), s):
-    """Energy of the stretch of element s [J]."""
-    stretch = _vector(m, s).norm() - m.springs.numbers[s, 1]
-    return 0.5 * m.springs.numbers[s, 0] * stretch * stretch
+def elastic_energy(m: ti.template(), line):
+    """Energy of the stretch of a line [J]."""
+    s, energy = m.springs.line_start[line], ti.cast(0.0, ti.f64)
+    if m.springs.numbers[s, 0] > 0.0:
+        tension = _stretching(m, s, _length(m, line))
+        energy = 0.5 * tension * tension / m.springs.numbers[s, 0]
+    return energy
 
 
 @ti.func
-def load_energy(m: ti.template(), s):
-    """Potential of the given tension of element s [J]."""
-    return _given_tension(m, s) * _vector(m, s).norm()
+def load_energy(m: ti.template(), line):
+    """Potential of the given tension of a line [J]; a multiplier does no work at constant length."""
+    s, energy = m.springs.line_start[line], ti.cast(0.0, ti.f64)
+    if m.springs.kind[s] != MULTIPLIER:
+        energy = _given_tension(m, s) * _length(m, line)
+    return energy
 
 
 @ti.func
 def add_stiffness(m: ti.template(), A: ti.template(), i, beta, projected):
-    """Add row i of beta^2 K and of beta times the damping to A. projected: without the negative part of K."""
+    """Add row i of beta^2 K and of beta times the damping to A, after `prepare`. projected: without the negative part of K."""
     for q in range(m.springs.node_start[i], m.springs.node_start[i + 1]):
         k = m.springs.node_entry[q]
         s = m.springs.element[k]
-        e = _vector(m, s)
-        length = e.norm()
-        d = e / ti.max(length, TINY)
-        t = _tension_over_length(m, s, length)
-        along = m.springs.numbers[s, 0]
+        d, length, elastic = m.springs.direction[s], m.springs.length[s], m.springs.elastic[m.springs.line[s]]
+        along, t = m.springs.numbers[s, 0], (elastic + _given_tension(m, s)) / ti.max(length, TINY)
+        if m.springs.kind[s] == LENGTH and elastic == 0.0:
+            along = 0.0
         if _is_isotropic(m, s) or length <= TINY:
-            along = t
+            t = along
         elif projected != 0:
             t = ti.max(t, 0.0)
         across, along = beta * beta * t, beta * beta * along
@@ -113,14 +150,19 @@ def add_stiffness(m: ti.template(), A: ti.template(), i, beta, projected):
             along += beta * m.springs.numbers[s, 2]
             if _is_isotropic(m, s):
                 across += beta * m.springs.numbers[s, 2]
-        first = m.springs.start[s]
-        for other in range(first, m.springs.start[s + 1]):
+        first = m.springs.coupled[s, 0]
+        for other in range(first, m.springs.coupled[s, 1]):
             at = m.springs.pair_at[m.springs.pair_start[k] + other - first]
             scale = m.springs.weight[k] * m.springs.weight[other]
+            with_self = 1.0 if m.springs.element[other] == s else 0.0
+            across_other = with_self * across
+            along_other = m.springs.direction[m.springs.element[other]]
             for r in ti.static(range(3)):
                 for c in ti.static(range(3)):
-                    block = scale * ((along - across) * d[r] * d[c] + (across if ti.static(r == c) else 0.0))
+                    block = along * d[r] * along_other[c] - across_other * d[r] * d[c]
+                    if ti.static(r == c):
+                        block += across_other
                     if at < 0:
-                        A.diagonal[i][4 * c + r] += ti.cast(block, m.real)
+                        A.diagonal[i][4 * c + r] += ti.cast(scale * block, m.real)
                     else:
-                        A.value[at][4 * c + r] += ti.cast(block, m.real)
+                        A.value[at][4 * c + r] += ti.cast(scale * block, m.real)

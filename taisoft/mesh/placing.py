@@ -1,0 +1,71 @@
+"""Place a mesh from a modelling program: its up axis, its unit, its direction and where it stands.
+
+In this order: the file's up axis turns to y, the mesh is scaled, turned about x, then y, then z, and moved.
+"""
+
+import warnings
+
+import numpy as np
+
+from taisoft.errors import MeshError, value_text
+from taisoft.mesh.surface_mesh import SurfaceMesh
+from taisoft.mesh.tet_mesh import TetMesh
+
+TO_Y_UP = {  # up axis -> rotation (3,3) that turns it to y by 90 degrees about another axis
+    "x": np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]),
+    "y": np.eye(3),
+    "z": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]),
+}
+
+
+def place(mesh: TetMesh | SurfaceMesh, up: str = "y", scale: float = 1.0, rotate=(0.0, 0.0, 0.0), at=None):
+    """Return a copy of a mesh or a surface, placed, with its regions.
+
+    up: axis of the given vertices that points up, "x", "y" or "z"; "z" turns (x, y, z) to (x, z, -y), "x" to (-y, x, z). scale:
+    factor, such as 0.001 for a file in millimetres. rotate: (3,) angles [deg] about x, then y, then z, through the origin. at:
+    (3,) [m], where the middle of the bounding box's underside goes; None: the mesh stays. Raises MeshError.
+    """
+    if not isinstance(mesh, (TetMesh, SurfaceMesh)):
+        raise MeshError(f"place needs a TetMesh or a SurfaceMesh, not {type(mesh).__name__}")
+    vertices = mesh.vertices @ placement(up, scale, rotate).T
+    if at is not None:
+        vertices = vertices + (_vector("at", at) - underside(vertices))
+    if isinstance(mesh, SurfaceMesh):
+        return SurfaceMesh(vertices, mesh.triangles, mesh.source, list(mesh.warnings))
+    with warnings.catch_warnings(record=True) as found:
+        warnings.simplefilter("always")
+        placed = TetMesh(vertices, mesh.tets, regions=mesh.regions, region_names=dict(mesh.region_names), source=mesh.source)
+    for warning, text in zip(found, placed.warnings):  # one for each
+        if text not in mesh.warnings:
+            warnings.warn(warning.message, stacklevel=2)
+    return placed
+
+
+def placement(up: str, scale: float, rotate) -> np.ndarray:
+    """Return the matrix (3,3) of `place`. Raises MeshError."""
+    from scipy.spatial.transform import Rotation
+
+    if up not in TO_Y_UP:
+        raise MeshError(f"place: up must be one of {', '.join(TO_Y_UP)}, not {value_text(up)}")
+    if isinstance(scale, bool) or not isinstance(scale, (int, float, np.number)) or not 0.0 < scale < np.inf:
+        raise MeshError(f"place: scale must be a number above 0, not {value_text(scale)}")
+    turn = Rotation.from_euler("xyz", _vector("rotate", rotate), degrees=True).as_matrix()  # about fixed axes
+    whole = np.round(turn)
+    turn = np.where(np.abs(turn - whole) < 1e-15, whole, turn)  # quarter turns are exact
+    return scale * (turn @ TO_Y_UP[up])
+
+
+def underside(vertices: np.ndarray) -> np.ndarray:
+    """Return the middle of the lower side of the bounding box of vertices (n,3), (3,)."""
+    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    return np.array([0.5 * (low[0] + high[0]), low[1], 0.5 * (low[2] + high[2])])
+
+
+def _vector(name: str, value) -> np.ndarray:
+    try:
+        vector = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        vector = np.empty(0)
+    if vector.shape != (3,) or not np.isfinite(vector).all():
+        raise MeshError(f"place: {name} must be three finite numbers, not {value_text(value)}")
+    return vector

@@ -1,0 +1,57 @@
+"""`frames.csv`: tensions of springs and tendons [N], and volumes [m^3] and pressures [Pa] of cavities, a row per frame."""
+
+import csv
+import io
+from pathlib import Path
+
+from taisoft.files import write_bytes
+
+TABLE_NAME = "frames.csv"
+
+
+class FrameTable:
+    """Observer that writes folder/frames.csv, whole at each `flush` and at the end.
+
+    folder: the run's folder; scene: with springs, tendons or cavities; first: number of the first frame of a resumed run, before
+    which rows of the folder's table are kept. Raises OutputError.
+    """
+
+    def __init__(self, folder: str | Path, scene, first: int = 0):
+        self.path = Path(folder) / TABLE_NAME
+        tensions = [f"tension of {one.name} [N]" for one in (*scene.springs, *scene.tendons)]
+        self._cavities = [cavity.name for body in scene.bodies for cavity in body.cavities]
+        of_cavities = [text for name in self._cavities for text in (f"volume of {name} [m^3]", f"pressure of {name} [Pa]")]
+        self._header = ["frame", "time", *tensions, *of_cavities]
+        self._rows = _rows_before(self.path, self._header, first) if first else []
+
+    @staticmethod
+    def needed(scene) -> bool:
+        """Whether a scene has what the table holds."""
+        return bool(scene.springs or scene.tendons or any(body.cavities for body in scene.bodies))
+
+    def frame(self, sim, index: int) -> None:
+        """Add sim's present state as frame `index`."""
+        values = list(sim.tensions().values())
+        for name in self._cavities:
+            values += [sim.cavity_volume(name), sim.cavity_pressure(name)]
+        self._rows.append([index, sim.time, *values])
+
+    def flush(self) -> None:
+        """Write the rows so far. Raises OutputError."""
+        text = io.StringIO(newline="")
+        csv.writer(text).writerows([self._header, *self._rows])
+        write_bytes(self.path, text.getvalue().encode())
+
+    def close(self) -> None:
+        """Write the table. Raises OutputError."""
+        self.flush()
+
+
+def _rows_before(path: Path, header: list[str], first: int) -> list[list[str]]:
+    """Rows of an earlier table before frame `first`; none if there is no such file with these columns."""
+    try:
+        with open(path, newline="", encoding="utf-8") as file:
+            found, *rows = csv.reader(file)
+        return [row for row in rows if int(row[0]) < first] if found == header else []
+    except (OSError, ValueError, IndexError, csv.Error):
+        return []

@@ -1,0 +1,126 @@
+"""Records of springs, tendons and attachments, which `connections` makes.
+
+A point of a body is given by its rest position, in the coordinates of body.rest_positions; one of an obstacle by its position at
+the start.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from taisoft.attributes import guarded_record
+from taisoft.scene import checks
+
+MAX_OUTSIDE = 0.1  # heights of a tet by which a point may lie outside a body: curved surfaces do not meet exactly
+_ADD_ANOTHER = "remove it from its list and add another one before the Simulator is made"
+
+
+@guarded_record("point", _ADD_ANOTHER)
+@dataclass(frozen=True, eq=False)
+class Point:
+    """A point of a body or of an obstacle."""
+
+    owner: str  #: name of the body or obstacle
+    position: np.ndarray  #: (3,) [m], of a body at rest, of an obstacle in the scene
+
+    def __post_init__(self):
+        checks.store(self, position=self.position)
+
+
+@guarded_record("spring", _ADD_ANOTHER)
+@dataclass(frozen=True, eq=False)
+class Spring:
+    """A spring between two points, which pulls with stiffness times its extension, plus damping times its rate."""
+
+    name: str
+    points: tuple[Point, Point]
+    stiffness: float  #: [N/m]
+    rest_length: float | None  #: [m]; None: the distance of the points at the start
+    damping: float  #: [N s/m]
+
+    @property
+    def owners(self) -> list[str]:
+        """Names of the bodies and obstacles of its points."""
+        return [point.owner for point in self.points]
+
+
+@guarded_record("tendon", "call sim.set_tension(name, force) or sim.set_length(name, length) in a simulation")
+@dataclass(frozen=True, eq=False)
+class Tendon:
+    """A line through points, along which it slides without friction, of given tension or of given length at rest.
+
+    It only pulls. One of given length is slack where its points are closer. Its tension is otherwise its stiffness times its
+    extension or, without a stiffness, that which keeps its length.
+    """
+
+    name: str
+    points: tuple[Point, ...]
+    value: np.ndarray | None  #: () tension [N] or length [m]; None if it follows a path
+    path: Callable | None = None  #: t [s] -> such a value
+    path_shape: tuple[int, ...] | None = None  #: of all values along the path
+    given: str = "force"  #: "force" or "length": what its value is
+    stiffness: float | None = None  #: [N/m] of one of given length; None: inextensible
+
+    def __post_init__(self):
+        checks.store(self, value=self.value)
+
+    @property
+    def kind(self) -> str:
+        """What its value is."""
+        return self.given
+
+    def allows(self, value: float) -> bool:
+        """Whether a tension [N] or a length [m], whichever is given, may have this value."""
+        return value >= 0.0 if self.given == "force" else value > 0.0
+
+    @property
+    def is_elastic(self) -> bool:
+        """Whether its tension follows from its extension."""
+        return self.given == "length" and self.stiffness is not None
+
+    @property
+    def is_inextensible(self) -> bool:
+        """Whether its tension is a Lagrange multiplier, which keeps its length."""
+        return self.given == "length" and self.stiffness is None
+
+    @property
+    def shapes(self) -> tuple[tuple[int, ...], ...]:
+        """Shapes that its values may have."""
+        return ((),)
+
+    @property
+    def damping(self) -> float:
+        """[N s/m]"""
+        return 0.0
+
+    @property
+    def owners(self) -> list[str]:
+        """Names of the bodies and obstacles of its points."""
+        return [point.owner for point in self.points]
+
+
+@guarded_record("attachment", _ADD_ANOTHER)
+@dataclass(frozen=True, eq=False)
+class Attachment:
+    """Nodes of a body, each kept where it lies in a body or obstacle, or pulled there by a spring of rest length 0."""
+
+    name: str
+    a: str
+    nodes: np.ndarray  #: (k,) int64 node ids of body a
+    b: str  #: name of a body or obstacle
+    stiffness: float | None  #: [N/m] of each node's spring; None: it moves with b exactly
+    damping: float = 0.0  #: [N s/m] of each node
+    where: Callable | None = None  #: as in `Constraint`
+    reach: float = MAX_OUTSIDE  #: heights of a tet by which the nodes may lie outside body b
+
+    def __post_init__(self):
+        checks.store(self, nodes=self.nodes)
+
+    @property
+    def owners(self) -> list[str]:
+        """Names of its body, and of what that is attached to."""
+        return [self.a, self.b]
+
+
+Connection = Spring | Tendon | Attachment

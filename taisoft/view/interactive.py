@@ -1,0 +1,127 @@
+"""An interactive view of a run: bodies and obstacles in 3-D, to be turned and played in a notebook or in a static page.
+
+Drawn in the browser by viser (extra `notebook`), whose recorder and player it uses. The server that records a scene listens only
+on this machine and only while a page is made. A page holds viewer (0.8 MB) and frames.
+"""
+
+import contextlib
+import math
+from collections.abc import Iterator
+from importlib.util import find_spec
+
+import numpy as np
+import rich
+
+from taisoft.errors import OutputError
+from taisoft.output.appearance import OBSTACLE_COLOUR, compact_surface, linear_rgb, obstacle_surfaces
+from taisoft.output.camera import Camera, start_positions
+from taisoft.scene.obstacles import HalfSpace
+from taisoft.view.colouring import Colouring, checked_colour
+from taisoft.view.notebook import framed, write_page
+from taisoft.view.scene_view import Surfaces
+
+HEIGHT = 420  # of the view in a notebook [pixels]
+MISSING = "an interactive view needs the package viser: pip install 'taisoft[notebook]'"
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """Suppress what viser prints, by rich, about a server that nobody has to visit."""
+    console = rich.get_console()
+    before, console.quiet = console.quiet, True
+    try:
+        yield
+    finally:
+        console.quiet = before
+
+
+class InteractiveView:
+    """Bodies and obstacles over time, in 3-D.
+
+    `sim.run(seconds, on_frame=view)` adds a frame each; `view(sim)` adds the present state. colour: as for `Simulator.picture`,
+    on a scale that grows. All frames are of one scene. Raises OutputError for another colour, or without the extra `notebook`.
+    """
+
+    def __init__(self, colour: str = "stress"):
+        if find_spec("viser") is None:
+            raise OutputError(MISSING)
+        self.colour = checked_colour(colour)
+        self.times: list[float] = []  #: of the frames [s]
+        self._frames: list[tuple[np.ndarray, np.ndarray]] = []  # vertices and colours of bodies
+        self._scene = None
+
+    def __call__(self, sim, _index: int = 0, _report=None) -> None:
+        """Add sim's present state. Raises OutputError if it has another scene than the first frame."""
+        if self._scene is None:
+            self._scene, self._surfaces = sim.scene, Surfaces(sim.scene)
+            self._used, self._faces = compact_surface(self._surfaces.body_triangles)
+            self._colouring = Colouring(sim.scene, self._surfaces, self.colour)
+        if sim.scene is not self._scene:
+            raise OutputError("an interactive view shows one scene: make another one for another simulator")
+        x, colours = self._surfaces.of_bodies(sim)[0], linear_rgb(self._colouring.base(sim))
+        self._frames.append((x[self._used].astype(np.float32), np.round(255 * colours[self._used]).astype(np.uint8)))
+        self.times.append(sim.time)
+
+    def __len__(self) -> int:
+        return len(self.times)
+
+    def __repr__(self) -> str:
+        return f"InteractiveView({len(self)} frames" + (
+            f", t = {self.times[0]:.6g} to {self.times[-1]:.6g} s)" if self.times else ")"
+        )
+
+    def as_html(self) -> str:
+        """Return a page with the view, which any browser shows without a network. Raises OutputError if there is no frame."""
+        if not self._frames:
+            raise OutputError("the view holds no frame: pass it to sim.run(seconds, on_frame=view)")
+        import viser
+
+        with _quiet():
+            server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
+            try:
+                return self._recorded(server).as_html()
+            finally:
+                server.stop()
+
+    def save(self, path) -> None:
+        """Write a page with the view. Raises OutputError."""
+        write_page(path, self.as_html())
+
+    def _repr_html_(self) -> str | None:
+        return framed(self.as_html(), HEIGHT) if self._frames else None
+
+    def _recorded(self, server):
+        """Put the frames on a server; return viser's recording of them.
+
+        Frames are meshes of their own, of which one is visible at a time: viser changes vertices in place, but no colours.
+        """
+        import trimesh
+
+        camera = Camera.framing(start_positions(self._scene))
+        server.scene.set_up_direction("+y")
+        server.initial_camera.position, server.initial_camera.look_at = tuple(camera.position), tuple(camera.target)
+        server.initial_camera.fov = math.radians(camera.fov)
+        recording = server.get_scene_serializer()
+        meshes = [trimesh.Trimesh(x, self._faces, vertex_colors=colours, process=False) for x, colours in self._frames]
+        frames = [server.scene.add_mesh_trimesh(f"/frames/{k}", mesh, visible=k == 0) for k, mesh in enumerate(meshes)]
+        moving = self._add_obstacles(server)
+        for k in range(1, len(frames)):
+            recording.insert_sleep(self.times[k] - self.times[k - 1])
+            frames[k].visible, frames[k - 1].visible = True, False
+            for surface, handle in moving:
+                handle.vertices = surface.at(self.times[k]).astype(np.float32)
+        return recording
+
+    def _add_obstacles(self, server) -> list[tuple]:
+        """Put the obstacles on a server at the first frame's time; return surface and handle of those that follow a path."""
+        grey = tuple(np.round(255 * OBSTACLE_COLOUR).astype(int).tolist())
+        moving = []
+        for number, surface in enumerate(obstacle_surfaces(self._scene)):
+            if len(surface.triangles) == 0:
+                continue
+            x, faces = surface.at(self.times[0]).astype(np.float32), surface.triangles.astype(np.uint32)
+            side = "front" if isinstance(surface.obstacle.shape, HalfSpace) else "double"  # walls do not hide what they hold
+            handle = server.scene.add_mesh_simple(f"/obstacles/{number}", x, faces, color=grey, flat_shading=True, side=side)
+            if surface.obstacle.path is not None:
+                moving.append((surface, handle))
+        return moving

@@ -1,0 +1,113 @@
+"""The link between a simulation and the process that shows it: small messages over a socket, node data in shared memory.
+
+A message is a dict of plain data and arrays, in bytes a header in JSON followed by the arrays; nothing is pickled. Positions
+and values at the nodes, which may be large, lie in memory that both processes map. The writer fills it only after the reader has
+confirmed the previous message, so sending never waits for the reader.
+"""
+
+import json
+import mmap
+import os
+import tempfile
+from multiprocessing import Pipe
+from multiprocessing.connection import Connection
+
+import numpy as np
+
+HEADER = 4  # bytes of the length of the header
+
+
+class LinkClosed(Exception):
+    """The other process has ended or closed its end."""
+
+
+def encode(message: dict) -> bytes:
+    """Return a message as bytes; arrays may be nested in its dicts and lists."""
+    arrays: list[bytes] = []
+
+    def plain(value):
+        if isinstance(value, np.generic):
+            return value.item()
+        if not isinstance(value, np.ndarray):
+            raise TypeError(f"a message cannot hold a {type(value).__name__}")
+        arrays.append(np.ascontiguousarray(value).tobytes())
+        return {"ndarray": len(arrays[-1]), "dtype": value.dtype.str, "shape": value.shape}
+
+    header = json.dumps(message, default=plain).encode()
+    return b"".join([len(header).to_bytes(HEADER, "little"), header, *arrays])
+
+
+def decode(data: bytes) -> dict:
+    """Return the message of `encode`, with its arrays in the order of the header."""
+    at = HEADER + int.from_bytes(data[:HEADER], "little")
+
+    def array(value: dict):
+        nonlocal at
+        if "ndarray" not in value:
+            return value
+        begin, at = at, at + value["ndarray"]
+        return np.frombuffer(data[begin:at], dtype=value["dtype"]).reshape(value["shape"])
+
+    return json.loads(data[HEADER:at], object_hook=array)
+
+
+class SharedNodes:
+    """Positions x (n,3) [m] and values (n,) at all nodes, in memory that is shared through a file descriptor."""
+
+    def __init__(self, n_nodes: int, descriptor: int | None = None):
+        size = max(1, n_nodes) * 4 * 8
+        if descriptor is None:
+            descriptor = _anonymous_file()
+            os.ftruncate(descriptor, size)
+        self.descriptor, self._memory = descriptor, mmap.mmap(descriptor, size)
+        data = np.frombuffer(self._memory, dtype=np.float64)
+        self.x, self.values = data[: 3 * n_nodes].reshape(n_nodes, 3), data[3 * n_nodes : 4 * n_nodes]
+
+    def close(self) -> None:
+        """Close the descriptor; the memory goes with its last array."""
+        os.close(self.descriptor)
+
+
+def _anonymous_file() -> int:
+    """Return the descriptor of a file without a name, in memory where the system offers that."""
+    if hasattr(os, "memfd_create"):
+        return os.memfd_create("taisoft")
+    with tempfile.TemporaryFile() as file:
+        return os.dup(file.fileno())
+
+
+class Link:
+    """One end of the link. connection: to the other process; nodes: the shared memory."""
+
+    def __init__(self, connection: Connection, nodes: SharedNodes):
+        self._connection, self.nodes = connection, nodes
+
+    @classmethod
+    def pair(cls, n_nodes: int) -> tuple["Link", Connection]:
+        """Return one end, and the connection of the other one."""
+        own, other = Pipe()
+        return cls(own, SharedNodes(n_nodes)), other
+
+    def send(self, message: dict) -> None:
+        """Send a message. Raises LinkClosed."""
+        try:
+            self._connection.send_bytes(encode(message))
+        except OSError as error:
+            raise LinkClosed from error
+
+    def receive(self, timeout: float | None = 0.0) -> dict | None:
+        """Do as `receive`."""
+        return receive(self._connection, timeout)
+
+    def close(self) -> None:
+        """Close this end."""
+        self._connection.close()
+        self.nodes.close()
+
+
+def receive(connection: Connection, timeout: float | None) -> dict | None:
+    """Return the next message, or None if there is none within the time [s]; None waits for one. Raises LinkClosed."""
+    try:
+        return decode(connection.recv_bytes()) if connection.poll(timeout) else None
+    except (EOFError, OSError) as error:
+        raise LinkClosed from error

@@ -1,0 +1,196 @@
+"""What the view knows of a simulation in another process: its scene as plain data, and its latest state.
+
+`describe_scene` lists what is drawn and picked of a scene, without its paths, which are functions; the state then brings the
+poses of moving obstacles, the tractions along paths, connections and pressures. `MirrorScene` and `MirrorSimulation` have the
+attributes of `Scene` and `Simulator` that pictures need, so that both are drawn alike.
+"""
+
+from dataclasses import fields
+from types import SimpleNamespace
+
+import numpy as np
+import scipy.sparse as sp
+
+from taisoft.records import Energies
+from taisoft.scene.loads import value_at
+from taisoft.scene.obstacles import Box, Capsule, HalfSpace, MeshObstacle, Obstacle, Sphere
+from taisoft.view.connection_layer import ConnectionMarks
+from taisoft.view.plots import ENERGIES, History
+from taisoft.view.scene_view import MAX_CONTACTS
+
+SHAPES = {shape.__name__: shape for shape in (HalfSpace, Sphere, Box, Capsule, MeshObstacle)}
+
+
+def describe_scene(scene, marks: ConnectionMarks) -> dict:
+    """Return what the view needs of a scene, as plain data for `MirrorScene`. marks: of its connections and pressures."""
+    return {
+        "attached": marks.attached,
+        "pressed": [{"corners": corners, "longest": longest} for corners, longest in marks.pressed],
+        "bodies": [
+            {
+                "name": body.name,
+                "position": np.asarray(body.position),
+                "rest_positions": np.asarray(body.rest_positions),
+                "surface": np.asarray(body.nodes.surface),
+                "corners": np.asarray(body.mesh.surface),
+                "skin": None if body.skin is None or body.skin.contact else _describe_skin(body.skin),
+                "fixed": [c.nodes for c in scene.constraints(body) if c.path is None],
+                "loaded": [t.triangles for t in body.tractions],
+            }
+            for body in scene.bodies
+        ],
+        "obstacles": [
+            {
+                "name": o.name,
+                "shape": type(o.shape).__name__,
+                "fields": {field.name: getattr(o.shape, field.name) for field in fields(o.shape)},
+                "pose": None if o.path is None else o.pose(0.0),
+            }
+            for o in scene.obstacles
+        ],
+    }
+
+
+def _describe_skin(skin) -> dict:
+    weights, surface = skin.weights, skin.surface
+    parts = {name: getattr(weights, name) for name in ("data", "indices", "indptr")}
+    return parts | {"n": weights.shape[1], "vertices": surface.vertices, "triangles": surface.triangles}
+
+
+def _mirror_skin(skin: dict) -> SimpleNamespace:
+    weights = sp.csr_matrix((skin["data"], skin["indices"], skin["indptr"]), shape=(len(skin["vertices"]), skin["n"]))
+    surface = SimpleNamespace(vertices=skin["vertices"], triangles=skin["triangles"])
+    return SimpleNamespace(contact=False, surface=surface, weights=weights)
+
+
+class MirrorScene:
+    """A scene from its description: `bodies` with what is drawn of them, and `obstacles`, whose paths give the latest poses."""
+
+    def __init__(self, description: dict):
+        self.bodies = [
+            SimpleNamespace(
+                name=b["name"],
+                position=b["position"],
+                rest_positions=b["rest_positions"],
+                n_nodes=len(b["rest_positions"]),
+                nodes=SimpleNamespace(surface=b["surface"]),
+                mesh=SimpleNamespace(surface=b["corners"]),
+                skin=b["skin"] and _mirror_skin(b["skin"]),
+                constraints=[SimpleNamespace(path=None, nodes=nodes) for nodes in b["fixed"]],
+                tractions=[SimpleNamespace(path=None, triangles=t, value=np.zeros(3)) for t in b["loaded"]],
+            )
+            for b in description["bodies"]
+        ]
+        self.poses = {o["name"]: o["pose"] for o in description["obstacles"] if o["pose"] is not None}
+        self.obstacles = [
+            Obstacle(
+                SHAPES[o["shape"]](**o["fields"]),
+                o["name"],
+                path=(lambda _, name=o["name"]: self.poses[name]) if o["name"] in self.poses else None,
+            )
+            for o in description["obstacles"]
+        ]
+
+    @staticmethod
+    def constraints(body: SimpleNamespace) -> list:
+        """Return the constraints of a body that are drawn."""
+        return body.constraints
+
+
+def describe_state(sim, marks: ConnectionMarks, layers: set[str], history: History | None) -> dict:
+    """Return what the view needs of sim's present state besides positions and nodal values.
+
+    marks: as for `describe_scene`; layers: those that are visible; history: for plots, if they are. Raises SceneError or
+    SimulationError if a path fails.
+    """
+    energies = sim.energies()
+    state = {
+        "time": sim.time,
+        "step_count": sim.step_count,
+        "energies": [float(getattr(energies, name)) for name in ENERGIES],
+        "poses": {o.name: o.pose(sim.time) for o in sim.scene.obstacles if o.path is not None},
+    }
+    if "tractions" in layers:
+        state["tractions"] = [value_at(t, sim.time, body.name) for body in sim.scene.bodies for t in body.tractions]
+    if "contacts" in layers:
+        found, k = sim.contacts(), slice(0, MAX_CONTACTS)
+        state["contacts"] = {name: getattr(found, name)[k] for name in ("point", "normal", "impulse")}
+    if "connections" in layers and (segments := marks.segments(sim)) is not None:
+        state["segments"] = dict(zip(("ends", "tensions"), segments))
+    if "pressures" in layers:
+        state["pressures"] = marks.pressures(sim)
+    if history is not None:
+        state["history"] = {name: getattr(history, name) for name in ("times", "low", "high", "last", "begin")}
+    return state
+
+
+class MirrorMarks:
+    """The `ConnectionMarks` of a simulation in another process, with the values of its latest state."""
+
+    def __init__(self, description: dict):
+        self.attached = description["attached"]
+        self.pressed = [(one["corners"], one["longest"]) for one in description["pressed"]]
+        self._segments, self._pressures = None, [0.0] * len(self.pressed)
+
+    def take(self, state: dict) -> None:
+        """Take over a state."""
+        found = state.get("segments")
+        self._segments = found and (found["ends"], found["tensions"])
+        self._pressures = state.get("pressures", self._pressures)
+
+    def segments(self, _sim) -> tuple[np.ndarray, np.ndarray] | None:
+        """Return ends (k,2,3) [m] and tensions (k,) [N] of the connections drawn as lines; None without any."""
+        return self._segments
+
+    def pressures(self, _sim) -> list[float]:
+        """Return the pressures [Pa], in the order of `pressed`."""
+        return self._pressures
+
+
+class MirrorSimulation:
+    """The latest state of a simulation, with those attributes of `Simulator` that pictures need.
+
+    nodal_values: (n_nodes,) of the quantity `nodal_kind`; history: with the arrays of `History`; both None until they are known.
+    """
+
+    def __init__(self, description: dict, n_nodes: int):
+        self.scene, self.marks = MirrorScene(description), MirrorMarks(description)
+        self.time, self.step_count = 0.0, 0
+        self._energies, self._contacts = Energies(0.0, 0.0, 0.0), None
+        ends = np.cumsum([0] + [body.n_nodes for body in self.scene.bodies])
+        self._rows = {body.name: slice(*pair) for body, pair in zip(self.scene.bodies, zip(ends, ends[1:]))}
+        self._x = np.zeros((n_nodes, 3))
+        self.history: SimpleNamespace | None = None
+        self.nodal_kind, self.nodal_values = "body", None
+
+    def take(self, state: dict, x: np.ndarray, values: np.ndarray) -> None:
+        """Take over a state; x (n,3) and values (n,) are copied."""
+        self.time, self.step_count = state["time"], state["step_count"]
+        self._energies, self._x = Energies(*state["energies"]), x.copy()
+        self.scene.poses.update(state["poses"])
+        tractions = [t for body in self.scene.bodies for t in body.tractions]
+        for traction, value in zip(tractions, state.get("tractions", ())):
+            traction.value = value
+        self._contacts = state.get("contacts")
+        self.marks.take(state)
+        if "history" in state:
+            self.history = SimpleNamespace(**state["history"])
+        self.nodal_kind = state["colour"]
+        self.nodal_values = None if self.nodal_kind == "body" else values.copy()
+
+    def positions(self, body: str | None = None) -> np.ndarray:
+        """Return node positions (n,3) [m] of a body, or of all."""
+        return self._x if body is None else self._x[self._rows[body]]
+
+    def energies(self) -> Energies:
+        """Return the energies [J]."""
+        return self._energies
+
+    def contacts(self) -> SimpleNamespace:
+        """Return the contacts' point, normal and impulse, (k,3) each."""
+        none = dict.fromkeys(("point", "normal", "impulse"), np.empty((0, 3)))
+        return SimpleNamespace(**(self._contacts or none))
+
+    def values_of(self, kind: str, _sim=None) -> np.ndarray | None:
+        """Return the quantity at the nodes (n_nodes,), or None until the simulation has sent it."""
+        return self.nodal_values if kind == self.nodal_kind else None

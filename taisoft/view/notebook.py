@@ -1,0 +1,164 @@
+"""What notebooks show of scenes and simulators, and `Film`, a player of pictures. HTML that needs no network."""
+
+import base64
+import html
+import json
+from pathlib import Path
+
+from taisoft.display import caption
+from taisoft.errors import OutputError
+from taisoft.files import write_bytes
+from taisoft.output.camera import start_positions
+from taisoft.output.frames import FRAMES_NAME, png_bytes
+from taisoft.view.colouring import TITLES, UNITS, checked_colour
+from taisoft.view.offscreen import Offscreen, checked_size
+
+SIZE = (640, 360)  # of pictures in notebooks [pixels]
+COMPRESSION = 6  # of their PNGs, which notebooks store
+MAX_NODES = 200_000  # of a scene or a simulator that is drawn when it is displayed
+
+
+class AtStart:
+    """What a picture needs of a simulator, of a scene at its start, without one."""
+
+    time = 0.0
+
+    def __init__(self, scene):
+        self.scene = scene
+
+    def positions(self):
+        """Positions of the nodes of all bodies at the start (n,3) [m]."""
+        return start_positions(self.scene)
+
+
+def scene_html(scene) -> str | None:
+    """Return a picture of a scene at its start, and its repr; None without bodies or above MAX_NODES."""
+    return _html(AtStart(scene), "body", scene) if scene.bodies else None
+
+
+def simulator_html(sim) -> str | None:
+    """Return a picture of a simulator's state, coloured by stress, and its repr; None if it is closed, or above MAX_NODES."""
+    return _html(sim, "stress", sim) if sim.is_open else None
+
+
+def _html(sim, colour: str, thing) -> str | None:
+    if sum(body.n_nodes for body in sim.scene.bodies) > MAX_NODES:
+        return None
+    drawing = Offscreen(sim.scene, SIZE, colour=colour)
+    png, (kind, _, span) = png_bytes(drawing.image(sim), COMPRESSION), drawing.colouring.scale
+    scale = f"; {TITLES[kind]}, red: {span:g} {UNITS[kind]} or more" if kind != "body" else ""
+    return f'<img src="{_data_url(png)}" width="{SIZE[0]}" height="{SIZE[1]}"/>{caption(repr(thing) + scale)}'
+
+
+def _data_url(png: bytes) -> str:
+    return f"data:image/png;base64,{base64.b64encode(png).decode()}"
+
+
+def framed(page: str, height: int) -> str:
+    """Return a page of HTML in a frame of its own, so that its scripts and styles touch nothing else. height: [pixels]."""
+    return f'<iframe srcdoc="{html.escape(page)}" width="100%" height="{height}" style="border: none"></iframe>'
+
+
+def write_page(path, page: str) -> None:
+    """Write a page of HTML, atomically. Raises OutputError for a name without .html, or if it cannot be written."""
+    file = Path(path)
+    if file.suffix.lower() != ".html":
+        raise OutputError(f"{file}: the name of a page must end in .html")
+    write_bytes(file, page.encode())
+
+
+class Film:
+    """Pictures of a run, and a player for them in notebooks and static pages.
+
+    `sim.run(seconds, on_frame=film)` adds a picture a frame; `film(sim)` adds one of the present state. size: width and height in
+    pixels; colour: as for `Simulator.picture`, on one scale for all pictures. Raises OutputError for another size or colour.
+    """
+
+    def __init__(self, size: tuple[int, int] = SIZE, colour: str = "stress"):
+        self.size, self.colour = checked_size(size), checked_colour(colour)
+        self.times: list[float] = []  #: of the pictures [s]
+        self.pngs: list[bytes] = []  #: the pictures
+        self._drawing: Offscreen | None = None
+        self._scene = None
+
+    @classmethod
+    def read(cls, folder, fps: float | None = None) -> "Film":
+        """Return the film of the pictures that `taisoft run --out` wrote to a folder.
+
+        fps: frames per simulated second [1/s]; None for that of its report.json. Raises OutputError if there are no pictures.
+        """
+        folder, film = Path(folder), cls()
+        paths = sorted(path for path in (folder / FRAMES_NAME).glob("*.png") if path.stem.isdecimal())
+        if not paths:
+            raise OutputError(f"{folder / FRAMES_NAME}: there are no pictures of a run")
+        try:
+            if fps is None:
+                settings = json.loads((folder / "report.json").read_text(encoding="utf-8"))["settings"]
+                fps = settings["fps"] or 1.0 / settings["dt"]
+            film.pngs = [path.read_bytes() for path in paths]
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise OutputError(f"{folder}: the run cannot be read: {error}") from None
+        film.times = [int(path.stem) / fps for path in paths]
+        return film
+
+    def __call__(self, sim, _index: int = 0, _report=None) -> None:
+        """Add a picture of sim's present state."""
+        if self._scene is not sim.scene:
+            self._drawing, self._scene = Offscreen(sim.scene, self.size, colour=self.colour), sim.scene
+        self.pngs.append(png_bytes(self._drawing.image(sim), COMPRESSION))
+        self.times.append(sim.time)
+
+    def __len__(self) -> int:
+        return len(self.pngs)
+
+    def __repr__(self) -> str:
+        return f"Film({len(self)} pictures" + (f", t = {self.times[0]:.6g} to {self.times[-1]:.6g} s)" if self.times else ")")
+
+    def as_html(self) -> str:
+        """Return a page with the player. Raises OutputError if there is no picture."""
+        if not self.pngs:
+            raise OutputError("the film holds no picture: pass it to sim.run(seconds, on_frame=film)")
+        numbers = {"times": self.times, "pictures": [_data_url(png) for png in self.pngs]}
+        return PLAYER.replace("DATA", json.dumps(numbers))
+
+    def save(self, path) -> None:
+        """Write a page with the player, which any browser shows without a network. Raises OutputError."""
+        write_page(path, self.as_html())
+
+    def _repr_html_(self) -> str | None:
+        return framed(self.as_html(), self.size[1] + 60) if self.pngs else None
+
+
+PLAYER = """<!DOCTYPE html>
+<html><head><meta charset="utf-8"><style>
+body { margin: 0; font: 13px monospace; } img { display: block; max-width: 100%; }
+div { display: flex; gap: 8px; align-items: center; padding: 4px; max-width: 640px; } input { flex: 1; }
+</style></head><body><img id="picture" alt="frame of the film">
+<div><button id="play" aria-label="play or pause">&#9654;</button>
+<input id="at" type="range" min="0" value="0"><span id="time"></span></div>
+<script>
+const film = DATA, n = film.pictures.length, last = film.times[n - 1], get = id => document.getElementById(id);
+const picture = get("picture"), play = get("play"), at = get("at"), time = get("time");
+let start = null;  // time of the clock at which the film's first picture was due [ms], null while it stands
+at.max = n - 1;
+function show(k) { at.value = k; picture.src = film.pictures[k]; time.textContent = film.times[k].toFixed(3) + " s"; }
+function stop() { start = null; play.textContent = "\\u25b6"; }
+function step(now) {
+  if (start === null) return;
+  const t = film.times[0] + (now - start) / 1000;
+  let k = 0;
+  while (k < n - 1 && film.times[k + 1] <= t) k++;
+  show(k);
+  if (t > last) stop(); else requestAnimationFrame(step);
+}
+play.onclick = () => {
+  if (start !== null) return stop();
+  const k = +at.value === n - 1 ? 0 : +at.value;
+  start = performance.now() - 1000 * (film.times[k] - film.times[0]);
+  play.textContent = "||";
+  requestAnimationFrame(step);
+};
+at.oninput = () => { stop(); show(+at.value); };
+show(0);
+</script></body></html>
+"""

@@ -1,0 +1,105 @@
+"""Dragging a body with the mouse: the point under the cursor, and the spring's end that follows the cursor.
+
+A drag acts on a patch of nodes around the nearest surface triangle on the cursor's ray, rather than on the triangle. So its force
+is spread over enough mass for a stiff spring, and does not crush the tets at the point. The patch is measured at rest, so that it
+does not grow while the body is stretched.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from taisoft.output.camera import Camera
+
+PATCH = 0.1  # radius in units of the diagonal of the body's bounding box at rest
+MIN_NODES = 4  # with fewer nodes in the patch, only the triangle's corners are dragged
+
+
+@dataclass(frozen=True)
+class Hit:
+    """A point (3,) [m] on a body's surface, in the triangle of nodes (3,) with barycentric weights (3,)."""
+
+    body: int
+    nodes: np.ndarray
+    weights: np.ndarray
+    point: np.ndarray
+
+
+def nearest_hit(origin: np.ndarray, direction: np.ndarray, x: np.ndarray, triangles: np.ndarray) -> tuple[int, np.ndarray] | None:
+    """Return the first triangle hit by a ray from origin, and the point's barycentric weights (3,); None if there is no hit.
+
+    triangles: (t,3); x: their vertices (n,3). Triangles are hit from both sides. Source: Moeller and Trumbore 1997.
+    """
+    a, b, c = (x[triangles[:, k]] for k in range(3))
+    e, f = b - a, c - a
+    p = np.cross(direction, f)
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        inverse = 1.0 / np.einsum("ti,ti->t", e, p)
+        s = origin - a
+        u = np.einsum("ti,ti->t", s, p) * inverse
+        q = np.cross(s, e)
+        v = q @ direction * inverse
+        t_ray = np.einsum("ti,ti->t", f, q) * inverse
+        is_hit = (u >= 0) & (v >= 0) & (u + v <= 1) & (t_ray > 0) & np.isfinite(t_ray)
+    if not is_hit.any():
+        return None
+    t = int(np.argmin(np.where(is_hit, t_ray, np.inf)))
+    return t, np.array([1 - u[t] - v[t], u[t], v[t]])
+
+
+def pick(sim, camera: Camera, cursor: tuple[float, float], size: tuple[int, int]) -> Hit | None:
+    """Return the point of a body under the cursor, or None.
+
+    cursor: in [0, 1] from the window's lower left corner; size: (width, height) of the window.
+    """
+    direction, best, distance = camera.ray(cursor, size), None, np.inf
+    for k, body in enumerate(sim.scene.bodies):
+        x, surface = sim.positions(body.name), np.asarray(body.nodes.surface)
+        found = nearest_hit(camera.position, direction, x, surface)
+        if found is None:
+            continue
+        point = found[1] @ x[surface[found[0]]]
+        depth = float(np.linalg.norm(point - camera.position))
+        if depth < distance:
+            best, distance = Hit(k, surface[found[0]], found[1], point), depth
+    return best
+
+
+class MouseDrag:
+    """A mouse drag of a hit point towards the cursor, in the plane through the point that is parallel to the picture.
+
+    body: its name; nodes (k,) with weights (k,) of sum 1: what is dragged; target: where the cursor holds it (3,) [m].
+    """
+
+    def __init__(self, sim, hit: Hit):
+        body = sim.scene.bodies[hit.body]
+        self.body = body.name
+        rest = np.asarray(body.rest_positions)
+        diagonal = float(np.linalg.norm(rest.max(axis=0) - rest.min(axis=0)))
+        self.nodes, self.weights = _patch(rest, hit, PATCH * diagonal)
+        self._plane = hit.point
+        self._offset = self._point(sim) - hit.point
+        self.target = hit.point + self._offset
+
+    def move(self, camera: Camera, cursor: tuple[float, float], size: tuple[int, int]) -> bool:
+        """Move the target with the cursor; return whether it changed."""
+        before, ray, forward = self.target, camera.ray(cursor, size), camera.forward
+        on_plane = camera.position + ray * ((self._plane - camera.position) @ forward / (ray @ forward))
+        self.target = on_plane + self._offset
+        return not np.array_equal(before, self.target)
+
+    def line(self, sim) -> np.ndarray:
+        """Return the line from the dragged point to the cursor's, (2,3) [m]."""
+        return np.array([self._point(sim), self.target]) - self._offset
+
+    def _point(self, sim) -> np.ndarray:
+        return self.weights @ sim.positions(self.body)[self.nodes]
+
+
+def _patch(rest: np.ndarray, hit: Hit, radius: float) -> tuple[np.ndarray, np.ndarray]:
+    distance = np.linalg.norm(rest - hit.weights @ rest[hit.nodes], axis=1) / radius
+    nodes = np.flatnonzero(distance < 1.0)
+    if len(nodes) < MIN_NODES:
+        return hit.nodes, hit.weights
+    weights = (1.0 - distance[nodes] ** 2) ** 2
+    return nodes, weights / weights.sum()

@@ -1,0 +1,277 @@
+"""The live window on the screen: draws the latest state, and turns keys and mouse into actions and commands."""
+
+import itertools
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import taichi as ti
+
+from taisoft.errors import OutputError
+from taisoft.files import write_bytes
+from taisoft.output.camera import MAX_WIDENING, Camera
+from taisoft.output.files import make_folder
+from taisoft.output.frames import png_bytes
+from taisoft.view.annotations import PlotOverlay
+from taisoft.view.colouring import BACKGROUND_TOP
+from taisoft.view.ggui import Canvas
+from taisoft.view.keys import ACTIONS
+from taisoft.view.mirror import MirrorSimulation
+from taisoft.view.panel import Panel, Requests, wrapped
+from taisoft.view.picking import MouseDrag, pick
+from taisoft.view.plots import ENERGIES, PlotChoice
+from taisoft.view.scene_view import IN_FRONT, SceneView
+from taisoft.view.timing import Note, Timing
+from taisoft.view.window_shadow import ShadowMesh
+
+SIZE = (1280, 720)
+PANEL = (0.012, 0.02, 0.31, 0.96)  # left, top, width, height as fractions of the window's initial size
+SHORT_PANEL = (0.012, 0.02, 0.31, 0.22)  # of a window without controls
+MESSAGES = (0.334, 0.87, 0.4, 0.11)
+ORBIT = 240.0  # angle for a drag over the whole window [deg]
+ZOOM = 16.0  # factor on the distance for a drag over the whole window
+DRAG_COLOUR = np.array([0.85, 0.10, 0.35])  # sRGB
+LONG = 1.0  # wall time of a step after which the panel says so [s]
+OUT = Path("out")
+FOR_SIMULATION = {"pause", "step", "reset", "faster", "slower", "unbound"}  # actions that the simulation carries out
+
+
+class Screen(SceneView):
+    """The window. The user may change colours and layers and move the camera, which then follows the bodies no more.
+
+    sim: the latest state; description: what `WindowProcess` sends. requests: gets commands, if the window has controls; plots:
+    those that can be shown; timing: of pictures and drags. Raises OutputError, before anything is opened, if a display or a
+    Vulkan driver is missing or a name is unknown.
+    """
+
+    def __init__(self, sim: MirrorSimulation, description: dict, requests: Requests):
+        super().__init__(sim.scene, SIZE, None, description["colour"], tuple(description["layers"]), sim.values_of, sim.marks)
+        self.plots = PlotChoice(sim.history, {"implicit": True, "contact": True, "error": True}, tuple(description["plots"]))
+        self.timing = Timing()
+        self.layers.shown["shadows"] = True
+        self._requests, self._overlay = requests, PlotOverlay(self.plots, SIZE)
+        self._panel: Panel | None = None
+        if description["controls"]:
+            names = [body.name for body in sim.scene.bodies]
+            self._panel = Panel(names, description["pairs"], self.colouring, self.layers, self.plots, requests)
+        self._panel_rectangle = PANEL if self._panel is not None else SHORT_PANEL
+        self._cursor: tuple[float, float] | None = None  # at the last picture
+        self._mode = ""  # of the present mouse drag: "turn", "zoom", "shift", "drag", or "panel", which GGUI handles
+        self._plots_hidden = False  # while a drag that began over them turns the view
+        self._follows, self._centre = False, None  # whether the camera follows the bodies; their last centre
+        self._picture_size: tuple[int, int] | None = None  # of the last picture taken of the window
+        self._close_requested = False
+        self._drag: MouseDrag | None = None
+        self._folder: Path | None = None  # of pictures while recording
+        self._frames = 0
+        self._screenshot = False  # requested
+        self._note = Note()  # about pictures and camera
+        self._messages: list[str] = []  # those shown
+        self._shadow_mesh = ShadowMesh(sim.scene, self.surfaces)
+        n_segments, n_decals = self.layers.n_segments + 1, self._shadow_mesh.size
+        self._canvas = Canvas(self.surfaces, SIZE, visible=True, n_segments=n_segments, n_decals=n_decals)
+
+    @property
+    def closed(self) -> bool:
+        """Whether the user has closed the window, or `close` was called."""
+        return self._close_requested or self._canvas.window is None or not self._canvas.window.running
+
+    @property
+    def dragging(self) -> bool:
+        """Whether the mouse drags a body or the view."""
+        return bool(self._mode)
+
+    def close(self) -> None:
+        """Destroy the window; a second call does nothing."""
+        self._canvas.close()
+
+    def draw(self, sim: MirrorSimulation, state: dict, age: float) -> None:
+        """Draw a state, show it, and process keys and mouse. age: wall time since it came [s]."""
+        window = self._canvas.window
+        size = window.get_window_shape()
+        self.plots.history = sim.history
+        self._follow(sim)
+        x, colours, (ends, line_colours) = self._drawn(sim, size)
+        if self._drag is not None:
+            dragged = self.camera.nearer(self._drag.line(sim), IN_FRONT)
+            ends = np.concatenate([dragged, ends])
+            line_colours = np.concatenate([np.tile(DRAG_COLOUR, (2, 1)), line_colours])
+        shadows = self._shadow_mesh.draw(x, sim.time, self.camera) if self.layers.shown["shadows"] else None
+        self._canvas.draw(x, colours, self.camera, tuple(BACKGROUND_TOP), (ends, line_colours), shadows)
+        self._take_picture(size)
+        if sim.history is not None and not self._plots_hidden:
+            self._overlay.draw(self._canvas, window.get_gui(), size)
+        # lines above the sliders must be constant in number: a transient line would move the sliders under the cursor
+        with window.get_gui().sub_window("taisoft", *self._panel_rectangle) as gui:
+            for line in [state["status"], *state_lines(sim), *self.timing.lines(state)]:
+                gui.text(line)
+            if self._panel is not None:
+                self._panel.draw(gui, state, self._folder is not None)
+        self._show_messages(window.get_gui(), state, age)
+        window.show()
+        self.timing.shown(state)
+        self._read_keys(sim, size)
+        self._read_mouse(sim, size)
+        self.timing.polled()
+
+    def _show_messages(self, gui, state: dict, age: float) -> None:
+        """Show what the simulation and this window have to say, in a sub-window that is there only then."""
+        late = age > LONG and not state.get("paused")
+        long_step = [f"the present step has taken {age:.0f} s so far"] if late else []
+        self._messages = [*state["messages"], *self._note.shown, *long_step]
+        if self._messages:
+            with gui.sub_window("messages", *MESSAGES) as page:
+                for line in self._messages:
+                    wrapped(page, line)
+
+    # --- camera -------------------------------------------------------------------------------------------------------
+
+    def _follow(self, sim: MirrorSimulation) -> None:
+        """Move the camera's target with the mean position of the nodes, but not while a body is dragged."""
+        x = sim.positions()
+        x = x[np.isfinite(x).all(axis=1)]
+        if not self._follows or self._drag is not None or len(x) == 0:
+            self._centre = None
+            return
+        centre = x.mean(axis=0)
+        if self._centre is not None:
+            self.camera = replace(self.camera, target=self.camera.target + centre - self._centre)
+        self._centre = centre
+
+    def _frame(self, sim: MirrorSimulation, size: tuple[int, int]) -> None:
+        """Frame the bodies from the present direction; from then on the camera moves back again if they would leave."""
+        x = sim.positions()
+        x = x[np.isfinite(x).all(axis=1)]
+        if len(x):
+            self.camera = Camera.framing(x, size, azimuth=self.camera.azimuth, elevation=self.camera.elevation)
+            self._widest = MAX_WIDENING * self.camera.distance
+
+    def _move_camera(self, right: float, up: float, size) -> None:
+        """Move the camera by a displacement of the cursor."""
+        if self._mode in ("turn", "zoom", "shift"):
+            self._widest = 0.0
+        if self._mode == "turn":
+            self.camera = self.camera.orbit(-ORBIT * right, -ORBIT * up)
+        elif self._mode == "zoom":
+            self.camera = self.camera.zoom(ZOOM**-up)
+        elif self._mode == "shift":
+            self.camera = self.camera.pan(-right * size[0] / size[1], -up)
+
+    # --- keys and mouse -----------------------------------------------------------------------------------------------
+
+    def _read_keys(self, sim: MirrorSimulation, size) -> None:
+        events = self._canvas.window.get_events(ti.ui.PRESS)
+        pressed = {ACTIONS[event.key] for event in events if event.key in ACTIONS}
+        self._close_requested |= "close" in pressed
+        if self._panel is not None:
+            pressed |= self._panel.pressed
+            for action in sorted(pressed & FOR_SIMULATION):
+                self._requests.add(action)
+        for name in pressed & set(self.layers.shown):
+            self.layers.shown[name] = not self.layers.shown[name]
+        if "plots" in pressed:
+            self.plots.toggle()
+        if "colour" in pressed:
+            self.colouring.choose_next()
+        if "frame" in pressed:
+            self._frame(sim, size)
+        if "follow" in pressed:
+            self._follows, self._centre, self._widest = not self._follows, None, 0.0
+            self._note.set("the camera follows the bodies" if self._follows else "the camera stays")
+        self._screenshot |= "screenshot" in pressed
+        if "record" in pressed:
+            self._toggle_recording()
+
+    def _read_mouse(self, sim: MirrorSimulation, size) -> None:
+        window = self._canvas.window
+        button = next((b for b in (ti.ui.LMB, ti.ui.RMB, ti.ui.MMB) if window.is_pressed(b)), None)
+        cursor = window.get_cursor_pos()  # from the lower left corner, in [0, 1]
+        if button is None or min(size) < 1:  # a window of zero size has no cursor
+            if self._drag is not None:
+                self._drag = None
+                self._requests.add("release")
+            self._mode, self._plots_hidden = "", False
+        elif not self._mode:
+            self._mode = self._begin_drag(sim, button, cursor, size)
+        else:
+            self._move_camera(cursor[0] - self._cursor[0], cursor[1] - self._cursor[1], size)
+        if self._drag is not None and self._drag.move(self.camera, cursor, size):
+            self._requests.add("drag", self._drag.target.tolist(), self._panel.strength, key="drag")
+            self.timing.dragged(self._requests.next_number)
+        self._cursor = cursor
+
+    def _begin_drag(self, sim: MirrorSimulation, button, cursor, size) -> str:
+        """Start a mouse drag at the cursor and return its mode. Over plots it moves the view, and hides them meanwhile."""
+        x, y = cursor[0] * size[0], (1.0 - cursor[1]) * size[1]
+        rectangles = [self._panel_rectangle, *([MESSAGES] if self._messages else [])]
+        if any(_contains(rectangle, x, y) for rectangle in rectangles):
+            return "panel"
+        self._plots_hidden = self._overlay.contains(x, y)
+        if button != ti.ui.LMB:
+            return "zoom" if button == ti.ui.RMB else "shift"
+        can_drag = self._panel is not None and self._panel.strength > 0.0 and not self._plots_hidden
+        if can_drag and not self._canvas.window.is_pressed(ti.ui.CTRL):
+            hit = pick(sim, self.camera, cursor, size)
+            if hit is not None:
+                self._widest = 0.0  # a camera that moves back would move the drag's target
+                drag = self._drag = MouseDrag(sim, hit)
+                self._panel.chosen = drag.body
+                self._requests.add("begin_drag", drag.body, drag.nodes, drag.weights, key="begin_drag")
+                self._requests.add("drag", drag.target.tolist(), self._panel.strength, key="drag")
+                return "drag"
+        return "turn"
+
+    # --- pictures -----------------------------------------------------------------------------------------------------
+
+    def _take_picture(self, size: tuple[int, int]) -> None:
+        """Write the drawn picture if that is requested, before the panel is declared, which would else be in it."""
+        # GGUI shows an empty window after a picture was taken of it at another size than the present one
+        if not (self._screenshot or self._folder is not None) and self._picture_size in (None, size):
+            return
+        picture = self._canvas.pixels(0, 0, *size)
+        self._picture_size = size
+        try:
+            if self._screenshot:
+                path = _free_path(".png")
+                make_folder(OUT)
+                write_bytes(path, png_bytes(picture))
+                self._note.set(f"written: {path}")
+            if self._folder is not None:
+                write_bytes(self._folder / f"{self._frames:05d}.png", png_bytes(picture))
+                self._frames += 1
+                self._note.set(f"recording: {self._frames} pictures in {self._folder}")
+        except OutputError as error:
+            self._folder = None
+            self._note.set(str(error))
+        self._screenshot = False
+
+    def _toggle_recording(self) -> None:
+        if self._folder is not None:
+            self._note.set(f"recorded {self._frames} pictures in {self._folder}")
+            self._folder = None
+            return
+        try:
+            self._folder, self._frames = make_folder(_free_path("")), 0
+        except OutputError as error:
+            self._note.set(str(error))
+
+
+def _free_path(suffix: str) -> Path:
+    """Return the first path in OUT that neither a picture nor a folder of pictures has."""
+    names = (OUT / f"window-{n}" for n in itertools.count(1))
+    return next(path for path in names if not path.exists() and not path.with_suffix(".png").exists()).with_suffix(suffix)
+
+
+def _contains(rectangle: tuple[float, float, float, float], x: float, y: float) -> bool:
+    """Return whether a pixel lies in a sub-window.
+
+    GGUI positions it once, by the window's size at that time, and does not report where the user moves it.
+    """
+    left, top, width, height = (f * n for f, n in zip(rectangle, (*SIZE, *SIZE)))
+    return left <= x <= left + width and top <= y <= top + height
+
+
+def state_lines(sim) -> list[str]:
+    """Return time and energies of sim as lines of text."""
+    energies = sim.energies()
+    return [f"time     {sim.time:10.4f} s", *(f"{name:8} {getattr(energies, name):10.4g} J" for name in ENERGIES)]

@@ -1,0 +1,73 @@
+"""Times of the live window: pictures per second, and how long a movement of the mouse takes to show its effect on a body.
+
+The latency of a drag is the wall time from the last look at the mouse that did not see the movement, so an upper bound, until a
+picture is shown of a state whose step has used it.
+"""
+
+import time
+from collections import deque
+from statistics import median
+
+NOTE_SECONDS = 10.0  # for which a note is shown
+KEPT = 20000  # pictures and drags
+RECENT = 20  # of them, for the panel
+
+
+class Note:
+    """A sentence about the last action, shown for NOTE_SECONDS."""
+
+    def __init__(self, text: str = ""):
+        self.set(text)
+
+    def set(self, text: str) -> None:
+        """Replace the sentence; an empty one shows nothing."""
+        self._text, self._since = text, time.perf_counter()
+
+    @property
+    def shown(self) -> list[str]:
+        """The sentence, or nothing once its time is over."""
+        return [self._text] if self._text and time.perf_counter() - self._since < NOTE_SECONDS else []
+
+
+class Timing:
+    """Times of pictures [s] and latencies of drags [s] of a window."""
+
+    def __init__(self) -> None:
+        self.pictures: deque[float] = deque(maxlen=KEPT)
+        self.latencies: deque[float] = deque(maxlen=KEPT)
+        self._polled = time.perf_counter()  # the last look at the mouse
+        self._dragged: dict[int, float] = {}  # by request, when its movement may have begun
+
+    def polled(self) -> None:
+        """Note that the mouse was looked at."""
+        self._polled = time.perf_counter()
+
+    def dragged(self, request: int) -> None:
+        """Note that the mouse has moved since the last look, which a request will tell the simulation."""
+        self._dragged.setdefault(request, self._polled)
+
+    def shown(self, state: dict) -> None:
+        """Note that a picture of a state is shown."""
+        now = time.perf_counter()
+        self.pictures.append(now)
+        for request in [r for r in self._dragged if r <= state.get("drag_done", 0)]:
+            self.latencies.append(now - self._dragged.pop(request))
+
+    @staticmethod
+    def _recent(times: deque[float]) -> list[float]:
+        return [times[k] for k in range(-min(RECENT, len(times)), 0)]
+
+    def pictures_per_second(self) -> float:
+        """Return the rate of the recent pictures."""
+        recent = self._recent(self.pictures)
+        return (len(recent) - 1) / (recent[-1] - recent[0]) if len(recent) > 1 else 0.0
+
+    def lines(self, state: dict) -> list[str]:
+        """Return the speeds of the simulation and of the window as lines of text."""
+        recent = self._recent(self.latencies)
+        drag = f", drag after {1e3 * median(recent):.0f} ms" if recent else ""
+        pictures = f"view     {self.pictures_per_second():10.0f} pictures/s{drag}"
+        if "speed" not in state:
+            return [pictures]
+        asked = "" if state["asked_speed"] in (1.0, None) else f" (asked: {state['asked_speed']:g})"
+        return [f"speed    {state['speed']:10.2f} x real time{asked}, {state['steps_per_second']:.3g} steps/s", pictures]

@@ -1,0 +1,102 @@
+"""The process of the live window: `python -m taisoft.view.window_process SOCKET MEMORY`, two descriptors that it inherits.
+
+It gets a description of the scene, then states, and sends what the window shows and which commands the user has given. It ends
+when the window is closed, when it is told to, and when the other process ends.
+"""
+
+import sys
+import time
+from multiprocessing.connection import Connection
+
+from taisoft.errors import TaisoftError
+from taisoft.view.link import Link, LinkClosed, SharedNodes, receive
+from taisoft.view.mirror import MirrorSimulation
+from taisoft.view.panel import Requests
+from taisoft.view.screen import Screen
+
+MAX_UNANSWERED = 64  # requests; later commands wait, so that a long step lets no queue grow
+IDLE_SHARE = 1.0  # time without drawing over that of drawing: with software Vulkan, drawing takes cores from the simulation
+SLOWEST = 1.0 / 25.0  # time between two pictures above which there is no such pause [s]
+
+
+class View:
+    """The window with the state that it shows. link: to the simulation, with the description that came over it."""
+
+    def __init__(self, link: Link, description: dict):
+        self._link, self._sim = link, MirrorSimulation(description, description["n_nodes"])
+        self._requests = Requests()
+        self._screen = Screen(self._sim, description, self._requests)
+        self._interval = 1.0 / description["fps"]
+        self._state: dict = {}
+        self._came = 0.0  # when the state came
+        self._confirmed: tuple | None = None  # the last message but for commands
+        self._ended = False
+
+    def run(self) -> None:
+        """Draw until the window is closed or the simulation ends it."""
+        self._receive(None)
+        while not self._ended and not self._screen.closed:
+            begin = time.perf_counter()
+            self._screen.draw(self._sim, self._state, begin - self._came)
+            self._send()
+            end = time.perf_counter()
+            idle = 0.0 if self._screen.dragging else IDLE_SHARE * (end - begin)
+            end = max(begin + self._interval, min(end + idle, begin + SLOWEST))
+            while not self._ended and (left := end - time.perf_counter()) > 0.0:
+                self._receive(left)
+            self._receive(0.0)
+        if not self._ended:
+            timing = self._screen.timing
+            self._link.send({"closed": True, "pictures": list(timing.pictures), "latencies": list(timing.latencies)})
+
+    def close(self) -> None:
+        """Close the window."""
+        self._screen.close()
+
+    def _receive(self, timeout: float | None) -> None:
+        """Take over all states that have come; wait up to a time [s] for the first."""
+        while not self._ended and (message := self._link.receive(timeout)) is not None:
+            timeout = 0.0
+            if "end" in message:
+                self._ended = True
+                return
+            self._state, self._came = message, time.perf_counter()
+            self._sim.take(message, self._link.nodes.x, self._link.nodes.values)
+            self._screen.plots.set_enabled(message["enabled"])
+            self._send()  # at once, so that the simulation may send the next one
+
+    def _send(self) -> None:
+        """Send commands, and confirm the state, if there is anything new."""
+        screen = self._screen
+        layers = [name for name, shown in screen.layers.shown.items() if shown]
+        shown = (self._state["number"], screen.colouring.kind, layers, bool(screen.plots.visible()))
+        waits = self._requests.number - self._state["answered"] >= MAX_UNANSWERED
+        commands = [] if waits else self._requests.take()
+        if commands or shown != self._confirmed:
+            names = ("confirmed", "colour", "layers", "plots")
+            self._link.send(dict(zip(names, shown)) | {"number": self._requests.number, "commands": commands})
+            self._confirmed = shown
+
+
+def main(socket: int, memory: int) -> None:
+    """Show the simulation at the other end of the link."""
+    connection = Connection(socket)
+    try:
+        description = receive(connection, None)
+        link = Link(connection, SharedNodes(description["n_nodes"], memory))
+        try:
+            view = View(link, description)
+        except TaisoftError as error:
+            link.send({"error": str(error)})
+            return
+        try:
+            link.send({"open": True})
+            view.run()
+        finally:
+            view.close()
+    except LinkClosed:
+        pass  # the simulation's process has ended
+
+
+if __name__ == "__main__":
+    main(*map(int, sys.argv[1:]))
