@@ -25,13 +25,14 @@ from taisoft.files import replacing
 from taisoft.nested import join_arrays, part_arrays
 from taisoft.scene.fingerprint import FEATURES, digest, run_time_numbers, scene_fingerprint
 from taisoft.scene.plan import LOADS, Numbers, change_load, change_tendon, first_difference, scene_numbers
+from taisoft.scene.rigid import RigidBody
 from taisoft.scene.scene import Material, Scene
 from taisoft.settings import NAMES, plan_of
 
 if TYPE_CHECKING:
     from taisoft.simulator import Simulator
 
-KIND, FORMAT = "taisoft checkpoint", 12  # increment FORMAT with every change of a file's content
+KIND, FORMAT = "taisoft checkpoint", 13  # increment FORMAT with every change of a file's content
 PARTS = ("settings", "numbers", "start", "fingerprint", "state", "notes")  # of the header, each a table
 
 
@@ -119,6 +120,8 @@ def restore_numbers(saved: Checkpoint, scene: Scene) -> None:
     with thawed(scene, *scene.bodies):
         scene.gravity = saved.numbers["gravity"]
         for body, kept in zip(scene.bodies, saved.numbers["materials"]):
+            if isinstance(body, RigidBody):  # its numbers are those of the start
+                continue
             materials = [Material(**material) for material in kept["materials"]]
             by_region = dict(zip(body.composition.materials, materials, strict=True))
             body.material = by_region if body.composition.has_regions else materials[0]

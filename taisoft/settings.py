@@ -70,8 +70,8 @@ def check_settings(scene: Scene, **given) -> Settings:
 
 
 def plan_of(scene: Scene, integrator: str, self_collision: bool, draggable: bool) -> Plan:
-    """Return the plan of a scene under an integrator."""
-    return make_plan(scene, integrator in EXPLICIT, is_multistep(integrator), self_collision, draggable)
+    """Return the plan of a scene under an integrator, with the laws and the damping that its rigid bodies take on in a run."""
+    return make_plan(scene.snapshot(), integrator in EXPLICIT, is_multistep(integrator), self_collision, draggable)
 
 
 def contact_solvers(integrator: str) -> tuple[str, ...]:

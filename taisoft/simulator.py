@@ -70,7 +70,7 @@ class Simulator(Guarded):
         changes.check_stability(self, self.settings.dt)
         for text in scale_warnings(scene):
             warnings.warn(text, UserWarning, stacklevel=2)
-        self.plan = plan_of(self._start_scene.snapshot(), self.settings.integrator, self_collision, draggable)
+        self.plan = plan_of(self._start_scene, self.settings.integrator, self_collision, draggable)
         laws = {law for body in scene.bodies for law in body.composition.laws}
         self._may_soften = any(LAWS[law].SOFTENS_BELOW for law in laws)  # until a warning says so
         self._compiled_before = self._compile_reported = runtime.compile_clock()

@@ -11,6 +11,7 @@ from taisoft.scene.body import Body
 from taisoft.scene.connection_records import Attachment, Connection, Tendon
 from taisoft.scene.key_frames import NodePath, ShapePath
 from taisoft.scene.loads import LoadPath
+from taisoft.scene.rigid import RigidBody
 from taisoft.scene.scene import Scene
 
 FEATURES = "the features that it needs"  # last entry of a fingerprint: of the plan, which follows from the parts and numbers
@@ -49,7 +50,8 @@ def scene_digest(scene: Scene) -> str:
 
 def _body_parts(body: Body) -> dict[str, list]:
     """Return the values that define a body, by the part's name in messages."""
-    laws = [material.law for material in body.composition.materials.values()]
+    rigid = isinstance(body, RigidBody)  # its law and its stiffness are chosen by the Simulator
+    laws = [] if rigid else [material.law for material in body.composition.materials.values()]
     return {
         "mesh": [body.mesh.vertices, body.mesh.tets],
         "surface": [body.rest_positions[body.nodes.n_elastic :], body.nodes.surface] if body.nodes.embedded is not None else [],
@@ -101,6 +103,9 @@ def run_time_numbers(scene: Scene) -> dict:
 
 def _materials(body: Body) -> dict:
     """Return a body's materials, in the order of its regions, and its numbers by tet."""
+    if isinstance(body, RigidBody):
+        first = body.composition.first
+        return {"density": body.density, "friction": first.friction, "restitution": first.restitution, "young": body.given_young}
     materials = [dataclasses.asdict(material) for material in body.composition.materials.values()]
     return {"materials": materials, "by_tet": body.composition.by_tet}
 

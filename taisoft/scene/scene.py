@@ -116,9 +116,10 @@ class Scene(Guarded):
         copied = copy.copy(self)
         with thawed(copied):
             copied.bodies, copied._start = [copy.copy(body) for body in self.bodies], start
+        begun = start or self.start
         for body in copied.rigid_bodies:
-            attached = [copied.body(one.a) for one in copied.exact_attachments if one.b == body.name]
-            body.stiffen(copied.gravity, copied.bodies, attached)
+            attached = [begun.body(one.a) for one in begun.exact_attachments if one.b == body.name]
+            body.stiffen(begun.gravity, begun.bodies, attached)
         return copied
 
     @property
