@@ -555,6 +555,18 @@ def test_bad_arguments_are_refused(arguments, message):
     assert message in str(caught.value) and scene.bodies == []
 
 
+def test_ends_of_connections_are_vertices_counted_from_0():
+    scene = ts.Scene()
+    body = scene.add_rigid_body(box(), name="r")
+    scene.add_body(box(), ts.Material(), name="soft", position=(0, 2, 0))
+    spring = scene.add_spring(("r", 7), ("soft", 0), stiffness=1.0)
+    assert np.array_equal(spring.points[0].position, body.surface.vertices[7])
+    with pytest.raises(ts.SceneError, match="a: the node must be"):
+        scene.add_spring(("r", 8), ("soft", 0), stiffness=1.0)
+    with pytest.raises(ts.SceneError, match="node 0 of body 'r' lies outside of body 'soft'"):
+        scene.attach("r", [0], "soft", stiffness=1.0)
+
+
 def test_what_a_rigid_body_cannot_do_is_refused():
     scene = ts.Scene()
     body = scene.add_rigid_body(box(), name="r")

@@ -206,7 +206,7 @@ def locate_nodes(scene: "Scene", attachment: Attachment) -> tuple[np.ndarray, np
     nodes, weights, outside = locate(b, points)
 
     def label(k: int) -> str:
-        return f"attachment {attachment.name!r}: node {attachment.nodes[k]} of body {a.name!r}"
+        return f"attachment {attachment.name!r}: node {attachment.nodes[k] - a.selectable.start} of body {a.name!r}"
 
     _check_outside(outside, label, b, attachment.reach)
     return nodes, weights
@@ -235,7 +235,8 @@ def _point(scene: "Scene", end, what: str) -> Point:
     owner = _owner(scene, end[0], what)
     is_node = isinstance(end[1], (int, np.integer)) and not isinstance(end[1], bool)
     if is_node and isinstance(owner, Body):
-        node = checks.whole(end[1], f"{what}: the node", range(owner.n_nodes))
+        rows = owner.selectable
+        node = rows.start + checks.whole(end[1], f"{what}: the node", range(rows.stop - rows.start))
         return Point(owner.name, owner.rest_positions[node].copy())
     position = checks.array(end[1], f"{what}: the point", ((3,),))
     _check_inside(owner, position, f"{what}: the point")
