@@ -38,10 +38,12 @@ DEMOS = {
 
 def key(scene: ts.Scene, integrator: str, **solver) -> tuple:
     """The properties of a scene that kernels are compiled for."""
+    scene = scene.snapshot()  # in which the laws of rigid bodies are chosen
     on = {name for name, is_on in plan_of(scene, integrator, solver.get("self_collision", False), False).on.items() if is_on}
     if integrator not in EXPLICIT:
         on -= {"fixed_nodes", "load_paths"}  # a mask, and forces that the host sets
-    groups = sorted({(b.order, b.quadrature_degree, law) for b in scene.bodies for law in b.composition.laws})
+    rigid = {body.name for body in scene.rigid_bodies}
+    groups = sorted({(b.order, b.quadrature_degree, law, b.name in rigid) for b in scene.bodies for law in b.composition.laws})
     analytic = any(not isinstance(o.shape, MeshObstacle) for o in scene.obstacles)
     surfaces = [o.shape.surface() for o in scene.obstacles]
     counts = [len(b.nodes.surface) for b in scene.bodies] + [len(s[1]) for s in surfaces if s is not None]
@@ -50,7 +52,7 @@ def key(scene: ts.Scene, integrator: str, **solver) -> tuple:
         integrator,
         tuple(sorted(on)),
         tuple(groups),
-        any(is_thin(b) for b in scene.bodies),
+        any(is_thin(b) for b in scene.bodies if b.name not in rigid),
         touches and analytic,
         touches and len(counts) > 1,
         touches and sum(counts) >= SERIAL_BELOW,
@@ -135,13 +137,15 @@ def test_scenes_have_the_features_of_their_structure(structure):
         ("loaded", "loads"),
         ("pressed", "pressure"),
         ("tied", "springs"),
-        ("attached", "dependent_nodes"),
+        ("rigid", "rigid_bodies"),
         ("mean_dilatation", "mean_dilatation"),
         ("by_tet", "elasticity_by_tet"),
         ("mass_damping", "mass_damping"),
         ("stiffness_damping", "stiffness_damping"),
     ):
         assert on[feature] == getattr(structure, name), feature
+    assert on["dependent_nodes"] == (structure.attached or structure.rigid or structure.skinned)
+    assert (scene.bodies[-1].skin is not None) == structure.skinned
     assert [b.order for b in scene.bodies] == list(structure.orders) and on[f"law:{structure.law}"]
     assert [o.name for o in scene.obstacles] == list(structure.obstacles)
     assert is_thin(scene.bodies[0]) == structure.thin

@@ -19,6 +19,7 @@ from taisoft.backend.runtime import n_compiled
 from taisoft.dynamics.schemes import EXPLICIT
 from taisoft.errors import SimulationError
 from taisoft.mesh.shapes import box_mesh, sheet_mesh
+from taisoft.mesh.surface_mesh import SurfaceMesh
 from taisoft.scene.key_frames import KeyFrames
 from taisoft.scene.material import LAWS
 from taisoft.scene.obstacles import Box, HalfSpace, MeshObstacle
@@ -100,9 +101,9 @@ class Structure:
     """Features that kernels are compiled for. obstacles: "half-space", "box" or "mesh"; orders: element order of each body.
 
     fixed, prescribed: some nodes are fixed, or follow a path; loaded: forces on nodes; pressed: a surface is under pressure;
-    tied: a tendon pulls; attached: the second body to the first, exactly; by_tet: elasticity by tet; thin: tets so flat that
-    strains are computed in f64; fine: a surface of more than 1,500 triangles, searched by parallel loops; double: a simulation in
-    f64 unless --precision is given.
+    tied: a tendon pulls; attached: the second body to the first, exactly; rigid: the first body; skinned: the last body has a
+    skin that is touched; by_tet: elasticity by tet; thin: tets so flat that strains are computed in f64; fine: a surface of more
+    than 1,500 triangles, searched by parallel loops; double: a simulation in f64 unless --precision is given.
     """
 
     integrator: str
@@ -115,6 +116,8 @@ class Structure:
     pressed: bool = False
     tied: bool = False
     attached: bool = False
+    rigid: bool = False
+    skinned: bool = False
     by_tet: bool = False
     mean_dilatation: bool = False
     mass_damping: bool = False
@@ -175,9 +178,13 @@ def structures() -> Iterator[Structure]:
     yield Structure("implicit_euler", fixed=True, pressed=True)
     yield Structure("implicit_euler", fixed=True, mean_dilatation=True)
     finger = {"orders": (2,), "fixed": True, "pressed": True, "by_tet": True}
-    gripper = {"orders": (2, 2, 1), "obstacles": PLANE, "prescribed": True, "tied": True, "attached": True}
+    gripper = {"orders": (1, 2, 1), "rigid": True, "obstacles": PLANE, "prescribed": True, "tied": True, "attached": True}
     for features in (finger, gripper):
         yield Structure("implicit_euler", **features, mass_damping=True, double=True)
+    yield Structure("implicit_euler", rigid=True, law=LAWS[0], obstacles=PLANE)
+    yield Structure("implicit_euler", orders=PAIR, rigid=True, obstacles=PLANE)
+    seesaw = {"orders": (1, 2), "obstacles": PLANE, "rigid": True, "skinned": True, "fine": True}
+    yield Structure("implicit_euler", **seesaw, stiffness_damping=True)
     yield Structure("implicit_euler", obstacles=PLANE, fine=True)
     yield Structure("implicit_euler", obstacles=PLANE_AND_BOX, fine=True)
     yield Structure("implicit_euler", obstacles=BOX, thin=True, fine=True, mass_damping=True)
@@ -208,11 +215,17 @@ def build(structure: Structure) -> Scene:
         height = float(np.ptp(mesh.vertices[:, 1]))
         position, speed = (0.0, bottom + 0.5 * height, 0.0), SPEED if k > 0 or not structure.fixed else 0.0
         given = {"order": order, "dilatation": "mean" if structure.mean_dilatation else "local", "velocity": (0.0, -speed, 0.0)}
-        scene.add_body(mesh, soft, name=f"body {k}", position=position, **given)
+        if structure.rigid and k == 0:
+            scene.add_rigid_body(mesh, name="body 0", position=position, velocity=given["velocity"])
+        else:
+            scene.add_body(mesh, soft, name=f"body {k}", position=position, **given)
         mesh, bottom = box_mesh((2, 2, 2), (UPPER, UPPER, UPPER)), bottom + height
         bottom += 0.0 if structure.attached and k == 0 else gap  # attached nodes lie in triangles: most depend on 6 nodes
     if structure.by_tet:
         scene.bodies[0].young = np.full(scene.bodies[0].mesh.n_tets, soft.young)
+    if structure.skinned:
+        inner = box_mesh((1, 1, 1), (0.9 * UPPER, 0.85 * UPPER, 0.8 * UPPER))  # whose vertices lie in no face of a tet
+        scene.bodies[-1].embed(SurfaceMesh(inner.vertices, inner.surface), contact=True)
     _add_conditions(scene.bodies[0], structure)
     _add_connections(scene, structure)
     for name in structure.obstacles:
@@ -221,7 +234,11 @@ def build(structure: Structure) -> Scene:
 
 
 def _add_conditions(body, structure: Structure) -> None:
-    """Fix, prescribe and load nodes on the body's sides."""
+    """Fix, prescribe and load nodes on the body's sides, or a whole rigid body."""
+    if structure.rigid:
+        if structure.prescribed:
+            body.move(KeyFrames([0.0, 1.0], [(0.0, 0.0, 0.0), (0.1 * SIZE, 0.0, 0.0)], release=True))
+        return
     side = float(np.abs(body.rest_positions[:, 0]).max()) - 1e-6
     if structure.fixed:
         body.fix(lambda X: X[:, 0] < -side)

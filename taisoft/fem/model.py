@@ -215,12 +215,13 @@ def _packed_tets(scene: Scene, layout: Layout, groups: tuple[Group, ...], lanes:
     return nodes, Dm_inv[layout.tet_of_lane], volume
 
 
-def _worst_condition(nodes, Dm_inv: np.ndarray, layout: Layout) -> float:
-    """The largest |Dm| |Dm^-1| of a tet in the Frobenius norm: the amplification of rounding in F = Ds Dm^-1."""
-    corners = np.concatenate([own[:, :4] for own in nodes])
-    x = layout.rest[corners]
-    squares = ((x[:, 1:] - x[:, :1]) ** 2).sum(axis=(1, 2)) * (Dm_inv**2).sum(axis=(1, 2))
-    return float(np.sqrt(squares.max()))
+def _worst_condition(nodes, Dm_inv: np.ndarray, layout: Layout, groups: tuple[Group, ...]) -> float:
+    """The largest |Dm| |Dm^-1| of a tet in the Frobenius norm: the amplification of rounding in F = Ds Dm^-1; 0 if all are
+    rigid, whose F is formed in f64 anyway."""
+    elastic = np.repeat([not g.rigid for g in groups], [len(own) for own in nodes])
+    x = layout.rest[np.concatenate([own[:, :4] for own in nodes])[elastic]]
+    squares = ((x[:, 1:] - x[:, :1]) ** 2).sum(axis=(1, 2)) * (Dm_inv[elastic] ** 2).sum(axis=(1, 2))
+    return float(np.sqrt(squares.max(initial=0.0)))
 
 
 def _gather_table(nodes, groups: tuple[Group, ...], real: np.ndarray, n_nodes: int, lanes: int):
@@ -273,7 +274,7 @@ def build_model(scene: Scene, runtime: Runtime, arena: FieldArena, on: dict[str,
     work = sum((g.last - g.first) * lanes * g.n_points for g in groups)
     serial = runtime.arch == "cpu" and (work < PARALLEL_FROM or threads() < PARALLEL_THREADS)
     chunks = 1 if serial else CHUNKS[runtime.arch]
-    strain_real = ti.f64 if real == ti.f32 and _worst_condition(nodes, Dm_inv, layout) > ILL_CONDITIONED else real
+    strain_real = ti.f64 if real == ti.f32 and _worst_condition(nodes, Dm_inv, layout, groups) > ILL_CONDITIONED else real
     types = {True: (ti.f64, ti.f64), False: (real, strain_real)}
     groups = tuple(replace(g, **dict(zip(("real", "strain_real"), types[g.rigid]))) for g in groups)
     damped = on["mass_damping"] or on["stiffness_damping"]
