@@ -95,6 +95,26 @@ def test_sliders_become_commands_and_keep_their_values():
         assert all(np.allclose(body.young, 1e6) for body in sim.scene.bodies)
 
 
+def test_rigid_bodies_have_no_sliders_of_material():
+    scene = ts.Scene()
+    scene.contact_forces = False
+    for k, name in enumerate("ab"):
+        scene.add_rigid_body(ts.box_mesh((1, 1, 1), (1, 1, 1)), name=name, position=(2 * k, 0, 0))
+    scene.add_body(ts.box_mesh((2, 2, 2), (1, 1, 1)), ts.Material(young=1e5), name="c", position=(4, 0, 0))
+    with ts.Simulator(scene, dt=0.01) as sim:
+        controls, (panel, requests) = Controls(sim), panel_of(sim)
+        gui = Gui({"young": 6.0})
+        panel.draw(gui, state_of(controls), False)
+        assert gui.labels["young"] == "E 1e+05 Pa"
+        ((name, *arguments),) = requests.take()
+        assert (name, arguments) == ("set_number", ["young", ["c"], pytest.approx(1.0)])
+        getattr(controls, name)(*arguments)
+        assert sim.scene.body("c").young == pytest.approx(1e6)
+        gui = Gui(presses=("which",))  # from all bodies to the first one
+        panel.draw(gui, state_of(controls), False)
+        assert "young" not in gui.labels and "density" not in gui.labels
+
+
 def test_every_pair_shows_its_friction():
     with three_cubes() as sim:
         controls, (panel, requests) = Controls(sim), panel_of(sim)

@@ -11,6 +11,7 @@ import numpy as np
 from taisoft.dynamics.drag_spring import EARTH
 from taisoft.dynamics.schemes import EXPLICIT
 from taisoft.errors import SimulationError
+from taisoft.scene.rigid import RigidBody
 from taisoft.settings import contact_solvers
 from taisoft.stability import stable_dt
 
@@ -35,7 +36,9 @@ class Controls:
         self._g = float(np.linalg.norm(g))
         self._max_g = MAX_GRAVITY * (self._g or EARTH)
         self._g_direction = g / self._g if self._g else np.array([0.0, -1.0, 0.0])
-        self._initial = {what: {body.name: getattr(body, what) for body in scene.bodies} for what in DECADES}
+        elastic = [body for body in scene.bodies if not isinstance(body, RigidBody)]
+        self._names = [body.name for body in scene.bodies]
+        self._initial = {what: {body.name: getattr(body, what) for body in elastic} for what in DECADES}
         self._exponents = {what: dict.fromkeys(self._initial[what], 0.0) for what in DECADES}
         self._pairs = touching_pairs(sim)
         self._frictions: list[float] | None = None  # of the pairs; None if unknown
@@ -52,7 +55,7 @@ class Controls:
             "dt_ends": self._dt_ends(),
             "gravity": self._g,
             "max_gravity": self._max_g,
-            **{what: [self._range(what, name) for name in own] for what, own in self._initial.items()},
+            **{what: [self._range(what, name) for name in self._names] for what in DECADES},
             "friction": self._frictions,
             "draggable": sim.draggable,
             "drag": None if drag is None else (float(np.linalg.norm(drag.force)), float(drag.max_force)),
@@ -60,8 +63,10 @@ class Controls:
             "contact_solver": settings.contact_solver,
         }
 
-    def _range(self, what: str, name: str) -> tuple[float, float, float]:
-        """Return the least and the largest value of a number of a body, and the exponent of its factor."""
+    def _range(self, what: str, name: str) -> tuple[float, float, float] | None:
+        """Return the least and the largest value of a number of a body, and the exponent of its factor; None if it is rigid."""
+        if name not in self._initial[what]:
+            return None
         exponent = self._exponents[what][name]
         present = self._initial[what][name] * 10.0**exponent
         return float(np.min(present)), float(np.max(present)), exponent
@@ -88,7 +93,7 @@ class Controls:
         self._g = size
 
     def set_number(self, what: str, names: list[str], exponent: float) -> None:
-        """Multiply the initial young or density of bodies by a power of ten.
+        """Multiply the initial young or density of elastic bodies by a power of ten.
 
         An explicit dt is lowered if it would not be stable; the requested one is restored as soon as it is.
         """

@@ -137,17 +137,22 @@ class Panel:
         """Declare sliders of Young's modulus and density, of the chosen body or of all."""
         if len(self._bodies) > 1 and gui.button(("all bodies" if self._all_bodies else self.chosen) + "###which"):
             self._all_bodies = not self._all_bodies
+        shown = [self.chosen, *(self._bodies if self._all_bodies else ())]
         for what, decades in DECADES.items():
-            low, high, exponent = values[what][self._bodies.index(self.chosen)]
+            ranges = dict(zip(self._bodies, values[what]))
+            known = [name for name in shown if ranges[name] is not None]  # rigid bodies have none
+            if not known:
+                continue
+            low, high, exponent = ranges[known[0]]
             text = f"{low:.4g}" if f"{low:.4g}" == f"{high:.4g}" else f"{low:.3g} to {high:.3g}"
             initial = math.log10(high) - exponent
-            name = f"{what} of {self.chosen}"
+            name = f"{what} of {known[0]}"
             present = self._present(name, math.log10(high))
             label, ends = f"{TITLE[what]} {text} {UNIT[what]}", (initial - decades, initial + decades)
             new = gui.slider_float(f"{label}###{what}", present, *ends)
             if changed(new, present):
                 self._set[name] = (new, self._requests.next_number)
-                names = self._bodies if self._all_bodies else [self.chosen]
+                names = [one for one in self._bodies if one in known]
                 self._requests.add("set_number", what, names, new - initial, key=name)
 
     def _all_frictions(self, gui, frictions: list[float]) -> None:
