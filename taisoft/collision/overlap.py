@@ -35,7 +35,7 @@ from taisoft.mesh.solids import (
 )
 from taisoft.scene.body import Body
 from taisoft.scene.connections import attached_pairs
-from taisoft.scene.locate import locate
+from taisoft.scene.locate import locate, weight_matrix
 from taisoft.scene.obstacles import Capsule, HalfSpace, Obstacle, Sphere
 from taisoft.scene.scene import Scene
 
@@ -165,8 +165,7 @@ class Containment:
                 find = self._inner_tets if colliders[k].nodes.embedded is None else self._inner_of_embedded
                 nodes, weights, rooms = find(colliders[k], slice(first, last))
                 best, nodes = nodes, nodes + self._layout.node_start[k]
-                starts = np.arange(len(nodes) + 1) * nodes.shape[1]
-                inner.append(sp.csr_matrix((weights.reshape(-1), nodes.reshape(-1), starts), shape=(len(nodes), n_nodes)))
+                inner.append(weight_matrix(nodes, weights, n_nodes))
             else:
                 self._part[first:last] = connected_parts(own)
                 best, depths, rooms = inner_depths(self._rest, own, self._part[first:last])
@@ -205,10 +204,7 @@ class Containment:
         own, x = body.nodes.surface, body.rest_positions
         self._part[rows] = connected_parts(own)
         best, depths, rooms = inner_depths(x, own, self._part[rows])
-        corners = x[own[best]]
-        normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-        nodes, weights, _ = locate(body, corners.mean(axis=1) - depths[:, None] * normal)
+        nodes, weights, _ = locate(body, _behind(x[own[best]], depths))
         return nodes, weights, rooms
 
     def find(self, surface: Surface, x_nodes, shapes: AnalyticObstacles) -> list[Inside]:
@@ -241,9 +237,7 @@ class Containment:
         if len(self._triangles):
             corners = x[self._topology.triangle[self._triangles]]
             if not np.array_equal(corners, self._corners):  # most obstacles are static
-                normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-                normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-                self._corners, self._inner_points = corners, corners.mean(axis=1) - self._inner_depth[:, None] * normal
+                self._corners, self._inner_points = corners, _behind(corners, self._inner_depth)
             points.append(self._inner_points)
         if frames is not None:
             points.append(frames[0][[i for i, _, _ in self._round]])
@@ -267,6 +261,13 @@ class Containment:
             return Inside(own, b, distance, float(self._room[k]))
         self._separations[k, b] = point, vertices.copy(), distance
         return None
+
+
+def _behind(corners: np.ndarray, depths: np.ndarray) -> np.ndarray:
+    """Points (n,3) [m] at depths (n,) [m] behind the centroids of triangles (n,3,3) [m]."""
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    return corners.mean(axis=1) - depths[:, None] * normal
 
 
 def _round_depths(shape: Sphere | Capsule, points: np.ndarray) -> np.ndarray:

@@ -65,7 +65,7 @@ class ShownBodies:
     """
 
     def __init__(self, scene):
-        riding = [body.skin if body.skin is not None and not body.skin.contact else None for body in scene.bodies]
+        riding = [body.riding_skin for body in scene.bodies]
         self.surfaces = [
             (body.rest_positions, body.nodes.surface) if skin is None else (skin.surface.vertices, skin.surface.triangles)
             for body, skin in zip(scene.bodies, riding)

@@ -225,7 +225,7 @@ def _define_body(stage, body, legal_name: str, srgb: np.ndarray, first: int, tou
     """Define a body's surface, tets and primvars. first: index of its first node among the nodes of all bodies."""
     from pxr import Sdf, UsdGeom, Vt
 
-    skin = body.skin if body.skin is not None and not body.skin.contact else None
+    skin = body.riding_skin
     nodes, local = compact_surface(body.nodes.surface if skin is None else skin.surface.triangles)
     path, surface, paint = _define_surface(stage, body.name, legal_name, srgb, local)
     shown = [surface]

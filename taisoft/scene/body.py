@@ -254,6 +254,11 @@ class Body(Guarded):
 
     embed = embed
 
+    @property
+    def riding_skin(self) -> Skin | None:
+        """Its skin if that is shown but not touched."""
+        return self.skin if self.skin is not None and not self.skin.contact else None
+
     def fix(self, where, axes: str = "xyz") -> Constraint:
         """Fix nodes at their start positions.
 

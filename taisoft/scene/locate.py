@@ -4,6 +4,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy
+import scipy.sparse as sp
 
 from taisoft.mesh.nodes import shape_functions
 
@@ -35,6 +36,12 @@ def locate(body: "Body", points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np
     barycentric[np.abs(barycentric) < WEIGHTLESS] = 0.0
     outside = body.distance_outside(points, np.maximum(-barycentric.min(axis=1), 0.0))
     return body.nodes.elements[tet], shape_functions(body.order, barycentric), outside
+
+
+def weight_matrix(nodes: np.ndarray, weights: np.ndarray, n_nodes: int) -> sp.csr_matrix:
+    """Return the matrix (p, n_nodes) of points that are sums of nodes (p,k) with weights (p,k)."""
+    starts = np.arange(len(nodes) + 1) * nodes.shape[1]
+    return sp.csr_matrix((weights.reshape(-1), nodes.reshape(-1), starts), shape=(len(nodes), n_nodes))
 
 
 def _deepest(corners: np.ndarray, inverse: np.ndarray, points: np.ndarray, tried: np.ndarray) -> np.ndarray:

@@ -14,7 +14,7 @@ from taisoft.errors import SceneError
 from taisoft.mesh import nodes as mesh_nodes
 from taisoft.mesh.surface_mesh import SurfaceMesh
 from taisoft.scene import checks
-from taisoft.scene.locate import locate
+from taisoft.scene.locate import locate, weight_matrix
 
 if TYPE_CHECKING:
     from taisoft.scene.body import Body
@@ -57,8 +57,7 @@ def embed(self: "Body", surface: SurfaceMesh, contact: bool = False) -> Skin:
             f"{what}: vertex {far} lies outside of the body, by {outside[far]:.2g} times {self.extent}: at most {MAX_OUTSIDE:g} "
             "is allowed"
         )
-    starts = np.arange(len(nodes) + 1) * nodes.shape[1]
-    matrix = sp.csr_matrix((weights.reshape(-1), nodes.reshape(-1), starts), shape=(len(nodes), self.n_nodes))
+    matrix = weight_matrix(nodes, weights, self.n_nodes)
     matrix.eliminate_zeros()
     with thawed(self):
         self.skin = Skin(surface, contact, matrix)

@@ -46,6 +46,7 @@ from taisoft.scene.scene import Scene
 from taisoft.scene.tables import Table, arguments_of, check_values, value_text
 from taisoft.scene.toml_connections import add_connections
 from taisoft.scene.toml_meshes import kind_of, mesh_of, surface_of
+from taisoft.scene.toml_methods import call_methods
 from taisoft.scene.toml_rigid import add_rigid_body
 
 SHAPES = {"half_space": HalfSpace, "sphere": Sphere, "box": Box, "capsule": Capsule, "mesh": MeshObstacle}
@@ -175,18 +176,7 @@ def _add_body(scene: Scene, name: str, table: Table, materials: dict[str, Materi
         material = {_region(mesh, key): _material(regions, key, materials) for key in regions.known}
     keys, _ = arguments_of(Scene.add_body, "name", "mesh", "material")
     body = table.make(scene.add_body, f"body {name!r}: ", "scene: ", keys=keys, mesh=mesh, material=material, name=name)
-    for key, method in METHODS.items():  # the argument `where` is called nodes or triangles in the file
-        items = "triangles" if key in ON_TRIANGLES else "nodes"
-        known, required = ([items if k == "where" else k for k in keys] for keys in arguments_of(method))
-        for one in table.listed(key, known, required):
-            extra = {"where": selection(one, items)}
-            if "path" in known:
-                extra["path"] = one.made("path", KeyFrames, "key frames: ")
-            for argument in (key, "pressure", "volume"):
-                if argument in known and isinstance(one.values.get(argument), dict):  # a load that varies
-                    extra[argument] = one.made(argument, KeyFrames, "key frames: ")
-            others = [k for k in known if k not in (items, *extra)]
-            one.make(getattr(body, method.__name__), f"body {name!r}: {method.__name__}: ", keys=others, **extra)
+    call_methods(body, table, f"body {name!r}", METHODS, lambda key: "triangles" if key in ON_TRIANGLES else "nodes", selection)
     return body
 
 

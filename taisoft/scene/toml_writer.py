@@ -18,7 +18,7 @@ from taisoft.mesh.files import write_mesh
 from taisoft.mesh.tet_mesh import TetMesh
 from taisoft.scene.body import Body
 from taisoft.scene.checks import SOLVER_CHECKS, check_solver, nearest
-from taisoft.scene.key_frames import NodePath, ShapePath
+from taisoft.scene.key_frames import ShapePath
 from taisoft.scene.loads import Cavity, LoadPath, NodalForce, Pressure, Traction
 from taisoft.scene.material import Material
 from taisoft.scene.obstacles import Obstacle
@@ -27,6 +27,7 @@ from taisoft.scene.scene import Scene
 from taisoft.scene.tables import key_path, key_text, quote
 from taisoft.scene.toml import NONE_TEXT, SCENE_KEYS, SHAPES, SURFACE_KEYS
 from taisoft.scene.toml_connections import connection_tables
+from taisoft.scene.toml_methods import constraint_tables
 from taisoft.scene.toml_rigid import rigid_table, surface_table
 
 MAX_LINE = 100  # maximum number of characters of numbers in a line
@@ -148,18 +149,10 @@ def _body(body: Body, materials: dict[Material, str], stem: str, meshes: dict[st
         table["velocity"] = body.velocity[: body.nodes.n_elastic]
     if body.skin is not None:
         table["skin"] = {"surface": surface_table(body.skin.surface), "contact": body.skin.contact}
-    table |= {key: [] for key in ("fix", "move", "traction", "force", "pressure", "cavity")}
-    for c in body.constraints:
-        entry = {"nodes": _ids(c.nodes, body.nodes.n_elastic), "axes": "".join(np.array(list("xyz"))[c.axes])}
-        if c.path is None:
-            table["fix"].append(entry)
-        elif isinstance(c.path, NodePath):
-            own = np.array_equal(c.path.starts, body.rest_positions[c.nodes] + body.position)
-            if not own and c.path.frames.rotations is not None:  # without rotations the start does not matter
-                raise SceneError(f"body {body.name!r}: {FOREIGN_PATH.format('nodes that start elsewhere')}")
-            table["move"].append(entry | {"path": _fields(c.path.frames)})
-        else:
-            raise SceneError(f"body {body.name!r}: moves along a function, which a file cannot store: use ts.KeyFrames")
+    foreign = FOREIGN_PATH.format("nodes that start elsewhere")
+    chosen = lambda c: {"nodes": _ids(c.nodes, body.nodes.n_elastic)}  # noqa: E731
+    table |= constraint_tables(body, f"body {body.name!r}", chosen, foreign, _fields)
+    table |= {key: [] for key in ("traction", "force", "pressure", "cavity")}
     for load in body.tractions:
         table["traction"].append({"triangles": _ids(load.triangles, len(body.mesh.surface)), "traction": _load(body, load)})
     for load in body.pressures:

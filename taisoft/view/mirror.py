@@ -34,7 +34,7 @@ def describe_scene(scene, marks: ConnectionMarks) -> dict:
                 "rest_positions": np.asarray(body.rest_positions),
                 "surface": np.asarray(body.nodes.surface),
                 "corners": np.asarray(body.mesh.surface),
-                "skin": None if body.skin is None or body.skin.contact else _describe_skin(body.skin),
+                "skin": body.riding_skin and _describe_skin(body.riding_skin),
                 "fixed": [c.nodes for c in scene.constraints(body) if c.path is None],
                 "loaded": [t.triangles for t in body.tractions],
             }
@@ -61,7 +61,7 @@ def _describe_skin(skin) -> dict:
 def _mirror_skin(skin: dict) -> SimpleNamespace:
     weights = sp.csr_matrix((skin["data"], skin["indices"], skin["indptr"]), shape=(len(skin["vertices"]), skin["n"]))
     surface = SimpleNamespace(vertices=skin["vertices"], triangles=skin["triangles"])
-    return SimpleNamespace(contact=False, surface=surface, weights=weights)
+    return SimpleNamespace(surface=surface, weights=weights)
 
 
 class MirrorScene:
@@ -76,7 +76,7 @@ class MirrorScene:
                 n_nodes=len(b["rest_positions"]),
                 nodes=SimpleNamespace(surface=b["surface"]),
                 mesh=SimpleNamespace(surface=b["corners"]),
-                skin=b["skin"] and _mirror_skin(b["skin"]),
+                riding_skin=b["skin"] and _mirror_skin(b["skin"]),
                 constraints=[SimpleNamespace(path=None, nodes=nodes) for nodes in b["fixed"]],
                 tractions=[SimpleNamespace(path=None, triangles=t, value=np.zeros(3)) for t in b["loaded"]],
             )

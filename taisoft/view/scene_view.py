@@ -204,8 +204,7 @@ class _BodySurface:
         self._nodes, self._corners = smoothing_groups(rest, surface)
         edges = rest[surface] - rest[np.roll(surface, 1, axis=1)]
         self._radius = MARKER_SIZE * float(np.linalg.norm(edges, axis=2).mean())
-        is_node = body.skin is None or body.skin.contact
-        self._marked = _fixed_surface_nodes(constraints, surface) if is_node else np.empty(0, dtype=np.int64)
+        self._marked = _fixed_surface_nodes(constraints, surface) if body.riding_skin is None else np.empty(0, dtype=np.int64)
         self._ball, ball_triangles = _coarse_ball()
         counts = len(self._nodes), len(self._ball) * len(self._marked)
         starts = len(self._nodes) + len(self._ball) * np.arange(len(self._marked))

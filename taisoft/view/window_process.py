@@ -1,7 +1,7 @@
 """The process of the live window: `python -m taisoft.view.window_process SOCKET MEMORY`, two descriptors that it inherits.
 
 It gets a description of the scene, then states, and sends what the window shows and which commands the user has given. It ends
-when the window is closed, when it is told to, and when the other process ends.
+when the window is closed, when the other process asks for it, and when that process ends.
 """
 
 import sys
