@@ -13,7 +13,7 @@ from functools import partial
 import numpy as np
 import pytest
 from rotations import rotation
-from scenes import dynamics, set_state
+from scenes import dynamics, set_state, use_threads
 
 import taisoft as ts
 from taisoft.dynamics import contact_newton, implicit
@@ -22,7 +22,6 @@ from taisoft.dynamics.dynamics import Dynamics
 from taisoft.dynamics.newton import Newton
 from taisoft.dynamics.schemes import SCHEMES
 from taisoft.dynamics.stage_system import Stage, StageSystem
-from taisoft.fem import model
 from taisoft.linear import pcg
 
 DT = 0.004  # [s]: nothing passes through anything on the way, so that steps depend smoothly on rounding
@@ -164,8 +163,7 @@ def test_problems_near_the_rounding_floor_extrapolate_at_once(made, monkeypatch,
 
 def test_parallel_loops_find_the_same_step(made, monkeypatch):
     x, _ = steps(made)
-    monkeypatch.setattr(model, "PARALLEL_FROM", 0)
-    monkeypatch.setattr(model, "PARALLEL_THREADS", 1)
+    use_threads(monkeypatch)
     with dynamics(cubes(), **SETTINGS) as parallel:
         assert not parallel.model.serial
         other, reports = steps(parallel)

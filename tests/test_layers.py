@@ -27,8 +27,9 @@ ORDER = (
     ("backend.structure",),
     ("backend.launching",),
     ("backend.runtime",),
+    ("backend.parallel",),
     ("mesh", "scene"),
-    ("fem.state", "fem.math3", "fem.node_graph"),
+    ("fem.state", "fem.math3", "fem.node_graph", "fem.chunks"),
     (
         *("fem.laws", "fem.lanes", "fem.dependents", "fem.reference", "fem.loads", "fem.springs", "fem.pressure"),
         *("fem.mean_dilatation", "fem.spring_table"),

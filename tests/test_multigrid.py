@@ -21,9 +21,11 @@ from scenes import built, cube, rubber
 import taisoft as ts
 from taisoft.backend import runtime
 from taisoft.dynamics import linear_solver
+from taisoft.fem.node_graph import EVERYTHING
 from taisoft.linear import block_csr, host_pcg, multigrid, pcg
 from taisoft.linear.aggregation import MODES, prolongation, rigid_modes
 from taisoft.linear.multigrid import Multigrid
+from taisoft.linear.pcg_work import build_pcg
 from taisoft.mesh.aggregates import aggregate
 
 
@@ -160,9 +162,10 @@ def test_the_smoothed_prolongation_keeps_the_motions_without_energy(several_leve
 
 def assembled(made, shift: float = 0.0) -> tuple:
     """Matrix and work of a scene at rest, and its matrix and hierarchy on the host; shift [N/m] is added to the matrix."""
-    A, w, m = block_csr.build_block_csr(made.model, made.arena), pcg.build_pcg(made.model, made.arena), made.model
+    m, A = made.model, block_csr.build_block_csr(made.model, made.arena)
+    w = build_pcg(m, made.arena, A)
     m.free.from_numpy(~made.oracle.fixed)
-    block_csr.assemble(m, A, pcg.EVERYTHING, True)
+    block_csr.assemble(m, A, EVERYTHING, True)
     A.diagonal.host[:, [0, 5, 10]] += shift
     free = ~made.oracle.fixed
     f = free.reshape(-1)

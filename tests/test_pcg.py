@@ -1,11 +1,15 @@
-"""Conjugate gradients, serial and parallel, in both precisions, on stiffness plus inertia of compressed bodies of either order:
+"""Conjugate gradients in both precisions, on stiffness plus inertia of compressed bodies of either order; block-Jacobi, and
+Gauss-Seidel over the whole system and over chunks, on one thread and on several:
 
 * the solution is SciPy's on the free axes and exactly 0 on the others, whatever the right-hand side there;
 * a looser tolerance stops earlier, the iteration limit holds, and a zero right-hand side takes no iteration;
 * negative curvature is reported, and the iterate before it is finite and a descent direction;
 * nearly singular diagonal blocks do not spoil the solution;
-* the parallel solver's result is the same in every run.
+* with chunks the result is the same on any number of threads, in every run, and takes about as many iterations as without,
+  whether blocks couple chunks of one parity or not.
 """
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,16 +17,27 @@ import scipy.sparse as sp
 import scipy.sparse.linalg as spl
 from scenes import built, mixed_scene
 
-from taisoft.linear import block_csr, pcg
+from taisoft.backend.arrays import FieldArena
+from taisoft.linear import block_csr, pcg, pcg_work
+from taisoft.linear.pcg_work import build_pcg
 
-METHODS = ("serial", "parallel")
+METHODS = ("whole", "chunks", "chunks, threads", "crossed", "crossed, threads", "jacobi")
 
 
 @pytest.fixture(scope="module", params=["f64", "f32"])
 def rig(request):
     with built(mixed_scene(order="both"), request.param) as made:
         made.matrix = block_csr.build_block_csr(made.model, made.arena)
-        made.work = pcg.build_pcg(made.model, made.arena)
+        made.work = build_pcg(made.model, made.arena, made.matrix)
+        one_thread, ways = replace(made.parallel, serial=True, spread=1), {}
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(pcg_work, "MIN_SHIFT", 0)
+            for name, chunks in (("chunks", 3), ("crossed", 6)):
+                patch.setattr(pcg_work, "CHUNKS", chunks)
+                ways[name] = one_thread, build_pcg(one_thread, FieldArena(), made.matrix)
+                assert ways[name][1].n_chunks == chunks and ways[name][1].crossed == (name == "crossed")
+        ways |= {f"{name}, threads": (made.parallel, work) for name, (_, work) in ways.items()}
+        made.ways = ways | {"whole": (made.model, made.work), "jacobi": (replace(made.parallel, on_cpu=False), made.work)}
         rng = np.random.default_rng(1)
         x = made.oracle.rest * [0.8, 1.1, 0.9] + 0.05 * rng.standard_normal(made.oracle.rest.shape)
         made.stiffness = made.oracle.stiffness(x, projected=True)
@@ -30,7 +45,6 @@ def rig(request):
         made.free[3] = False
         made.model.free.from_numpy(made.free.astype(made.machine.np_real))
         made.rhs = rng.standard_normal(x.shape).astype(made.machine.np_real)
-        made.work.rhs.from_numpy(made.rhs)
         yield made
 
 
@@ -45,10 +59,12 @@ def fill(rig, dense: np.ndarray) -> sp.csr_matrix:
     return block_csr.to_scipy(rig.model, rig.matrix)
 
 
-def solve(rig, method: str, tolerance: float, limit: int = 1000):
-    rig.work.y.fill(np.nan)
-    result = pcg.solve(rig.model if method == "serial" else rig.parallel, rig.matrix, rig.work, tolerance, limit)
-    return result, rig.work.y.to_numpy().astype(np.float64)
+def solve(rig, method: str, tolerance: float, limit: int = 1000, rhs: np.ndarray | None = None):
+    model, work = rig.ways[method]
+    work.rhs.from_numpy(rig.rhs if rhs is None else rhs)
+    work.y.fill(np.nan)
+    result = pcg.solve(model, rig.matrix, work, tolerance, limit)
+    return result, work.y.to_numpy().astype(np.float64)
 
 
 @pytest.fixture
@@ -83,15 +99,21 @@ def test_the_tolerance_and_the_iteration_limit_stop_the_solver(rig, system, meth
 
 
 def test_gauss_seidel_takes_fewer_iterations(rig, system):
-    serial, parallel = (solve(rig, method, 1e-5)[0].iterations for method in METHODS)
-    assert serial < 0.8 * parallel
+    whole, chunks, crossed, jacobi = (solve(rig, m, 1e-5)[0].iterations for m in ("whole", "chunks", "crossed", "jacobi"))
+    assert whole < 0.8 * jacobi and chunks < 1.15 * whole and crossed < 0.9 * jacobi
+
+
+@pytest.mark.parametrize("method", ["chunks", "crossed"])
+def test_any_number_of_threads_gives_the_same_bits(rig, system, method):
+    first = solve(rig, method, 1e-5)
+    for _ in range(5):
+        again = solve(rig, f"{method}, threads", 1e-5)
+        assert again[0] == first[0] and np.array_equal(again[1], first[1])
 
 
 @pytest.mark.parametrize("method", METHODS)
 def test_a_zero_right_hand_side_takes_no_iteration(rig, system, method):
-    rig.work.rhs.from_numpy(np.where(rig.free, 0.0, 1.0).astype(rig.machine.np_real))
-    result, y = solve(rig, method, 1e-6)
-    rig.work.rhs.from_numpy(rig.rhs)
+    result, y = solve(rig, method, 1e-6, rhs=np.where(rig.free, 0.0, 1.0).astype(rig.machine.np_real))
     assert result.converged and result.iterations == 0 and not y.any()
 
 
@@ -126,10 +148,3 @@ def test_nearly_singular_blocks_do_not_spoil_the_solution(rig, method):
     result, y = solve(rig, method, 1e-6)
     assert result.converged and not result.negative
     assert np.abs(y.reshape(-1) - exact).max() < 1e-2 * np.abs(exact).max()
-
-
-def test_the_parallel_solver_is_reproducible(rig, system):
-    first = solve(rig, "parallel", 1e-5)
-    for _ in range(5):
-        again = solve(rig, "parallel", 1e-5)
-        assert again[0] == first[0] and np.array_equal(again[1], first[1])

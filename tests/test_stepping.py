@@ -16,7 +16,7 @@ import pytest
 import scipy.sparse as sp
 from following import DT, follow, simulator
 from oracle import Oracle
-from scenes import driven_scene, dynamics, mixed_scene, rows_of
+from scenes import driven_scene, dynamics, mixed_scene, rows_of, use_threads
 from scipy.linalg import block_diag
 
 import taisoft as ts
@@ -129,8 +129,7 @@ def test_bdf2_restarts_after_a_change_of_dt_or_state(implicit, change):
 
 @pytest.mark.parametrize("integrator", [*EXPLICIT, "implicit_euler"])
 def test_parallel_kernels_match_the_oracle(integrator, monkeypatch):
-    monkeypatch.setattr("taisoft.fem.model.PARALLEL_FROM", 0)
-    monkeypatch.setattr("taisoft.fem.model.PARALLEL_THREADS", 0)
+    use_threads(monkeypatch)
     settings = TIGHT if integrator == "implicit_euler" else {}
     with simulator(driven_scene(mass_damping=3.0, order=2), integrator, **settings) as sim:
         assert sim.field_bytes["partial"] > 8 * N_COLUMNS  # several threads add up partial sums

@@ -100,7 +100,7 @@ def open_runtime(arch: str, precision: str, owner: str = "a simulator") -> Runti
     return _open[-1]
 
 
-def _cache_folder() -> str:
+def cache_folder() -> str:
     """A writable folder for compiled kernels; Taichi would end the process if its own were not writable."""
     for folder in cache_folders():
         path = folder / "kernels"
@@ -120,7 +120,7 @@ def _initialise(arch: str, precision: str) -> None:
         os.getcwd()
     except FileNotFoundError:
         raise SimulationError("the working folder no longer exists: change to one that does") from None
-    folder = _cache_folder()
+    folder = cache_folder()
     available = address_space()
     if arch == "cpu" and available is not None and available < CPU_POOL_BYTES:
         shortage = f"{format_bytes(CPU_POOL_BYTES)} are needed at once, available: {format_bytes(available)}"

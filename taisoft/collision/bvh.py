@@ -24,7 +24,8 @@ from taisoft.backend.arrays import Count, FieldArena
 from taisoft.backend.runtime import Runtime, kernel
 from taisoft.collision.candidates import WHOLE, Buffer, Candidates, entries, is_candidate, sort_row, sum_parts
 from taisoft.collision.colliders import Topology
-from taisoft.collision.surface import ACTIVE, Surface, dvec, integers, list_near, part_first
+from taisoft.collision.surface import ACTIVE, Surface, dvec, integers, list_near
+from taisoft.fem.chunks import part_first
 from taisoft.ranges import expand
 
 LEAVES = {"cpu": 64, "cuda": 8}  # triangles per chunk: the fastest of 4 to 256 on the CPU, small on CUDA for enough threads

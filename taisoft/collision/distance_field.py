@@ -19,7 +19,8 @@ from taisoft.collision.candidates import WHOLE, sum_parts
 from taisoft.collision.contacts import write_point_contact
 from taisoft.collision.deepest_point import MIN_EXTRA_DEPTH, deepest_point, is_surface_minimum
 from taisoft.collision.features import choose, closest_on_triangle, corner, in_normal_cone, moved, unit, vertices_of
-from taisoft.collision.surface import ACTIVE, dvec, ivec, list_near, part_first, sum_pairs
+from taisoft.collision.surface import ACTIVE, dvec, ivec, list_near, sum_pairs
+from taisoft.fem.chunks import part_first
 from taisoft.mesh.sdf import SdfGrid
 from taisoft.scene.body import Body
 

@@ -24,8 +24,9 @@ from taisoft.collision.features import (
     mark_sharp_edges,
     unit,
 )
-from taisoft.collision.surface import ACTIVE, INSIDE_BITS, dvec, ivec, list_near, part_first, sum_pairs
+from taisoft.collision.surface import ACTIVE, INSIDE_BITS, dvec, ivec, list_near, sum_pairs
 from taisoft.collision.vertex_face import max_self_depth, vertex_contacts
+from taisoft.fem.chunks import part_first
 
 # Penetrating edges have shifted along each other and may cross beyond an end, by at most MAX_MISS depths and MAX_OVERHANG lengths
 # of the edge; the surfaces are elsewhere farther out

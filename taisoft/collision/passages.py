@@ -25,7 +25,8 @@ from taisoft.collision.candidates import WHOLE, sum_parts
 from taisoft.collision.contacts import FACE_FACE, write_contact
 from taisoft.collision.features import unit
 from taisoft.collision.separation import at_weights, clearly_apart, free_until, nearest_of, unit_row
-from taisoft.collision.surface import ACTIVE, dvec, ivec, list_near, part_first
+from taisoft.collision.surface import ACTIVE, dvec, ivec, list_near
+from taisoft.fem.chunks import part_first
 
 # kinds of passages, by two ids: two triangles; a row of `adjacent`; a triangle and a sphere or capsule; a vertex and a half-space
 NEAR, ADJACENT, ROUND, FLAT = range(4)

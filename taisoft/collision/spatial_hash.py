@@ -16,7 +16,8 @@ import taichi as ti
 from taisoft.backend.arrays import Count, FieldArena
 from taisoft.backend.runtime import kernel
 from taisoft.collision.candidates import Buffer, Candidates, entries, sort_row, sum_parts
-from taisoft.collision.surface import ACTIVE, Surface, cell_of, ivec, may_touch, part_first
+from taisoft.collision.surface import ACTIVE, Surface, cell_of, ivec, may_touch
+from taisoft.fem.chunks import part_first
 
 LARGE = 512  # cells above which a triangle counts as large
 COUNTABLE = 2.0**50  # cells from the origin beyond which f64 cannot distinguish neighbouring cells

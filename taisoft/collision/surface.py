@@ -15,13 +15,12 @@ import taichi as ti
 from taisoft.backend.arrays import Count, FieldArena
 from taisoft.backend.runtime import Runtime, kernel
 from taisoft.collision.colliders import Topology
+from taisoft.fem.chunks import SPREAD, part_first
 
 SERIAL_BELOW = 1500  # triangles below which one thread is faster than starting the others (about 50 us a loop)
 # The same for loops with little work per iteration: boxes, tree refit, sharp edges, reduction. Measured with two cores: equal at
 # 21,000 triangles; at 105,000 the search is 1.3 times as fast on both cores.
 SERIAL_CHEAP_BELOW = 30000
-# Taichi gives each CPU thread at least 512 iterations of a loop: each chunk takes that many, and only the first does the work
-SPREAD = {"cpu": 512, "cuda": 1}
 CHUNKS = {"cpu": 64, "cuda": 4096}  # chunks of a list that are processed in parallel, each with its own part of a buffer
 NONFINITE, ACTIVE, PAIRS = 0, 1, 2  # indices into Surface.count
 INSIDE_BITS = 31  # of Surface.inside; one vertex is almost never inside two colliders with the same bit
@@ -135,12 +134,6 @@ def integers(arena: FieldArena, name: str, data: np.ndarray):
     data = np.asarray(data)
     data = (data if len(data) else np.zeros((1, *data.shape[1:]))).astype(np.int32)
     return arena.field(name, ti.i32, data.shape, data)
-
-
-@ti.func
-def part_first(c, n, parts: ti.template()):
-    """Return the start of part c of a list of n entries divided into equal parts."""
-    return c * (n // parts) + ti.min(c, n % parts)
 
 
 @ti.func

@@ -87,7 +87,7 @@ class ContactStep:
     def _allocate(self, capacity: int) -> None:
         arena, m = FieldArena(), self.simulation.model
         masters = 1 if self.simulation.dependents is None else self.simulation.dependents.most_masters
-        self.problem = build_node_problem(arena, capacity, m.n_nodes, m.serial, masters)  # of the last step begun
+        self.problem = build_node_problem(arena, capacity, m.n_nodes, m.on_cpu, masters)  # of the last step begun
         self._arena.release()
         self._arena, self._last_time, self._indexed = arena, 0.0, False
 

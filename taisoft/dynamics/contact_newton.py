@@ -46,7 +46,7 @@ class FrictionalResult:
 
 def solve_linear(system: StageSystem, problem: Stage, r: float, scale: float) -> FrictionalResult:
     """Solve a linearised stage from (|r|, scale); on one thread in one launch."""
-    if not system.model.serial or PUBLIC:  # public Taichi takes no more than 64 arguments
+    if not system.model.on_cpu or PUBLIC:  # public Taichi takes no more than 64 arguments
         newton = Newton(system, problem)
         result = newton.run(r, scale, fresh=True)
         return FrictionalResult(newton.newton, newton.linear, newton.multipliers, newton.negative, result.converged, newton.r)

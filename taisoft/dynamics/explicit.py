@@ -273,13 +273,18 @@ def drift_parallel(m: ti.template(), s: ti.template(), row: ti.i32, dt64: ti.f64
 
 
 @kernel
-def nodes_parallel(m: ti.template(), s: ti.template(), row: ti.i32, dt64: ti.f64):
-    """Run the part of a sub-step after the element loop. scalars: STEPS_DONE, MOST_INVERTED, FAILED."""
+def nodes_parallel(m: ti.template(), s: ti.template(), row: ti.i32, dt64: ti.f64, drift: ti.i32):
+    """Run the part of a sub-step after the element loop. scalars: STEPS_DONE, MOST_INVERTED, FAILED.
+
+    drift: 1 to begin the next sub-step of Verlet, which `drift_parallel` would do in a loop of its own.
+    """
     for i in range(m.n_nodes):
         dt = ti.cast(dt64, m.real)
         v = ti.Vector([0.0, 0.0, 0.0], m.real)
         if ti.static(s.verlet):
             v = verlet_kick(m, s, i, dt)
+            if drift == 1:
+                verlet_drift(m, s, i, dt, verlet_half(m, s, i, dt))
         else:
             v = euler_node(m, i, dt)
         if nonfinite(ti.cast(v[0] + v[1] + v[2], ti.f64)):

@@ -249,11 +249,12 @@ class ExplicitStepper:
             explicit.elements_parallel(m)
             explicit.restart_parallel(m, s)
         explicit.begin_parallel(m)
+        special = bool(s.n_prescribed or s.n_held or s.has_varied_loads)
         for row in range(n):
-            if s.verlet or s.n_prescribed or s.n_held or s.has_varied_loads:
+            if special or (s.verlet and row == 0):
                 explicit.drift_parallel(m, s, row, dt)
             explicit.elements_parallel(m)
-            explicit.nodes_parallel(m, s, row, dt)
+            explicit.nodes_parallel(m, s, row, dt, int(s.verlet and not special and row < n - 1))
 
     @property
     def field_bytes(self) -> dict[str, int]:

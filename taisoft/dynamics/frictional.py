@@ -26,8 +26,9 @@ from taisoft.contact.problem import RESIDUAL
 from taisoft.contact.prox import dvec
 from taisoft.dynamics.contact_terms import PAST, open_disk, set_multiplier, sum_residual, update_contact
 from taisoft.dynamics.linearised import contact_slope, move_node_along, node_residual, node_slope, step_length
-from taisoft.linear.pcg import NEGATIVE, iterate_serial, start_serial
-from taisoft.linear.pcg import RUNNING as PCG_RUNNING
+from taisoft.linear.pcg_gauss_seidel import iterate_serial, start_serial
+from taisoft.linear.pcg_work import NEGATIVE
+from taisoft.linear.pcg_work import RUNNING as PCG_RUNNING
 
 R_SCALE, MIN_R_SCALE, MAX_R_SCALE, MANY_STEPS = 1.0, 0.3, 100.0, 5  # R over the r-factors: start, bounds; steps that halve it
 LAW_INCREASE, STEADY = 1.2, 4.0  # times the previous laws' residual: above it R is halved, if larger than STEADY
@@ -169,7 +170,7 @@ def _advance(m: ti.template(), s: ti.template(), A: ti.template(), k: ti.templat
     """Move to zero slope, as `linearised.advance`."""
     slope, curvature = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64)
     for i in range(m.n_nodes):
-        slope_i, curvature_i = node_slope(m, s, A, k, i)
+        slope_i, curvature_i = node_slope(m, s, A, k, 0, i)
         slope += slope_i
         curvature += curvature_i
     linear_slope = slope

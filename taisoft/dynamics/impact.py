@@ -33,11 +33,11 @@ from taisoft.contact.problem import ContactProblem, to_world
 from taisoft.contact.prox import dvec
 from taisoft.contact.restitution import find_rebounds
 from taisoft.dynamics.simulation_state import SimulationState
+from taisoft.fem.chunks import part_first, total
 from taisoft.fem.lanes import mass_times
 from taisoft.fem.state import OTHER_SUM, SUM
 from taisoft.fem.terms import rayleigh_damping
 from taisoft.linear.block_csr import block_times
-from taisoft.linear.pcg import total
 
 if TYPE_CHECKING:
     from taisoft.dynamics.results import StageResult
@@ -104,14 +104,15 @@ def measure_impact(m: ti.template(), s: ti.template(), k: ti.template(), tau: ti
     for i in range(m.n_nodes):
         s.change[i] = (m.state.x[i] - k.x_linear[i]) / tau
     ti.loop_config(serialize=m.serial)
-    for chunk in range(m.chunks):
-        size = (m.n_nodes + m.chunks - 1) // m.chunks
-        slope, curvature = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64)
-        for i in range(chunk * size, ti.min(m.n_nodes, (chunk + 1) * size)):
-            d = mass_times(m, i, s.change)
-            slope += d.dot(ti.cast(s.v_hat[i], ti.f64))
-            curvature += d.dot(s.change[i])
-        m.state.partial[chunk, SUM], m.state.partial[chunk, OTHER_SUM] = slope, curvature
+    for task in range(m.chunks * m.spread):
+        if task % m.spread == 0:
+            chunk = task // m.spread
+            slope, curvature = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64)
+            for i in range(part_first(chunk, m.n_nodes, m.chunks), part_first(chunk + 1, m.n_nodes, m.chunks)):
+                d = mass_times(m, i, s.change)
+                slope += d.dot(ti.cast(s.v_hat[i], ti.f64))
+                curvature += d.dot(s.change[i])
+            m.state.partial[chunk, SUM], m.state.partial[chunk, OTHER_SUM] = slope, curvature
     ti.loop_config(serialize=True)
     for _ in range(1):
         slope = total(m, SUM)

@@ -27,6 +27,7 @@ from taisoft.fem.node_graph import EVERYTHING
 from taisoft.linear import block_csr, host_pcg, pcg, volume_pcg
 from taisoft.linear.aggregation import rigid_modes
 from taisoft.linear.multigrid import Multigrid, block_rows
+from taisoft.linear.pcg_work import LinearResult
 
 if TYPE_CHECKING:
     from taisoft.dynamics.stage_system import StageSystem
@@ -94,7 +95,7 @@ class LinearSolver:
         if len(kept["x"]):
             self._built = float(kept["c"]), float(kept["beta"]), np.array(kept["x"]), np.array(kept["free"], dtype=bool)
 
-    def solve(self, system: "StageSystem", tolerance: float) -> pcg.LinearResult:
+    def solve(self, system: "StageSystem", tolerance: float) -> LinearResult:
         """Solve for y of pcg from its rhs. system: of a stage without contacts, on all nodes, whose matrix is formed."""
         m, w, done = self.model, system.work.pcg, 0
         if m.free.host is None:  # CUDA
@@ -117,7 +118,7 @@ class LinearSolver:
             found = self._solve_plain(system, tolerance, pcg.iteration_limit(m))
         return replace(found, iterations=done + found.iterations)
 
-    def _solve_pcg(self, system: "StageSystem", tolerance: float, digits: float) -> pcg.LinearResult:
+    def _solve_pcg(self, system: "StageSystem", tolerance: float, digits: float) -> LinearResult:
         """Solve without multigrid, or stop where it has become worth building: it is then active."""
         worth = ITERATIONS * self._ratio
         most = math.ceil(worth + BUILD - self.savings)
@@ -130,7 +131,7 @@ class LinearSolver:
             self.pcg_rate *= UNFINISHED
         return found
 
-    def _solve_plain(self, system: "StageSystem", tolerance: float, most: int) -> pcg.LinearResult:
+    def _solve_plain(self, system: "StageSystem", tolerance: float, most: int) -> LinearResult:
         """Solve by `volume_pcg` or `pcg`."""
         m, A, w = self.model, system.matrix, system.work.pcg
         if self.volumes(A) is None:
@@ -142,7 +143,7 @@ class LinearSolver:
         """Return the system of `volume_pcg` for matrices like A if it is to be used."""
         m = self.model
         if self._use_volumes is None:
-            self._use_volumes = m.mean_dilatation and m.serial and volume_pcg.is_nearly_incompressible(m)
+            self._use_volumes = m.mean_dilatation and m.on_cpu and volume_pcg.is_nearly_incompressible(m)
             if self._use_volumes and self._volumes is None:
                 self._volumes = volume_pcg.build_volume_system(m, A, self._arena)
                 self._use_volumes = self._volumes is not None
@@ -154,7 +155,7 @@ class LinearSolver:
             volume_pcg.prepare_volumes(self.model, system.matrix, system.work.pcg, self._volumes, system.stage.beta**2)
             self._prepared = system.n_formed
 
-    def _solve_multigrid(self, system: "StageSystem", tolerance: float, digits: float) -> pcg.LinearResult | None:
+    def _solve_multigrid(self, system: "StageSystem", tolerance: float, digits: float) -> LinearResult | None:
         """Solve with the hierarchy, or with a new one if there is none or it is out of date; None if that fails too."""
         m, w, free, wasted = self.model, system.work.pcg, self.model.free.host > 0.0, 0
         if self._built is not None and np.array_equal(self._built[3], free):
@@ -177,7 +178,7 @@ class LinearSolver:
         self.rate = found.iterations / digits
         return self._account(replace(found, iterations=wasted + found.iterations), digits)
 
-    def _account(self, found: pcg.LinearResult, digits: float) -> pcg.LinearResult:
+    def _account(self, found: LinearResult, digits: float) -> LinearResult:
         """Add what a solve by multigrid saved, as far as it went on."""
         if found.converged:
             self.savings = min(self.savings + self.pcg_rate * digits - self._ratio * found.iterations, float(BUILD))

@@ -19,9 +19,10 @@ from taisoft.dynamics.contact_terms import (
     update_contact,
 )
 from taisoft.dynamics.stage import place_node
+from taisoft.fem.chunks import part_first, total
 from taisoft.fem.state import OTHER_SUM, STEP_LENGTH, SUM
 from taisoft.linear.block_csr import block_times, partial_row_times
-from taisoft.linear.pcg import dot64, total
+from taisoft.linear.pcg_work import dot64
 
 ROOT, TRIES, LONGEST = 0.05, 40, 1e3  # tolerance over the initial slope; maximum trial lengths; longest step length
 
@@ -90,10 +91,10 @@ def step_length(k: ti.template(), linear_slope, curvature, start, r_scale):
 
 
 @ti.func
-def node_slope(m: ti.template(), s: ti.template(), A: ti.template(), k: ti.template(), i):
+def node_slope(m: ti.template(), s: ti.template(), A: ti.template(), k: ti.template(), chunk, i):
     """Return (r.y, y.A y) of node i; store its row of A y, and base = x."""
     y = s.pcg.y[i]
-    q = block_times(k.coupling.base[i], y) + partial_row_times(m, A, A.row_start[i], A.row_start[i + 1], s.pcg.y)
+    q = block_times(k.coupling.base[i], y) + partial_row_times(m, A, chunk, A.row_start[i], A.row_start[i + 1], s.pcg.y)
     s.pcg.q[i] = q
     s.base[i] = m.state.x[i]
     return dot64(m.free[i] * s.residual[i], y), dot64(y, q)
@@ -146,14 +147,15 @@ def advance(
     """
     p, w = ti.static((k.problem, k.work))
     ti.loop_config(serialize=m.serial)
-    for chunk in range(m.chunks):
-        size = (m.n_nodes + m.chunks - 1) // m.chunks
-        slope, curvature = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64)
-        for i in range(chunk * size, ti.min(m.n_nodes, (chunk + 1) * size)):
-            slope_i, curvature_i = node_slope(m, s, A, k, i)
-            slope += slope_i
-            curvature += curvature_i
-        m.state.partial[chunk, SUM], m.state.partial[chunk, OTHER_SUM] = slope, curvature
+    for task in range(m.chunks * m.spread):
+        if task % m.spread == 0:
+            chunk = task // m.spread
+            slope, curvature = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64)
+            for i in range(part_first(chunk, m.n_nodes, m.chunks), part_first(chunk + 1, m.n_nodes, m.chunks)):
+                slope_i, curvature_i = node_slope(m, s, A, k, chunk, i)
+                slope += slope_i
+                curvature += curvature_i
+            m.state.partial[chunk, SUM], m.state.partial[chunk, OTHER_SUM] = slope, curvature
     ti.loop_config(serialize=p.serial)
     for c in range(p.count[0]):
         contact_slope(s, k, c, beta)
@@ -174,12 +176,13 @@ def advance(
     for _ in range(1):
         sum_residual(k)
     ti.loop_config(serialize=m.serial)
-    for chunk in range(m.chunks):
-        size = (m.n_nodes + m.chunks - 1) // m.chunks
-        square = ti.cast(0.0, ti.f64)
-        for i in range(chunk * size, ti.min(m.n_nodes, (chunk + 1) * size)):
-            square += node_residual(m, s, k, i)
-        m.state.partial[chunk, SUM] = square
+    for task in range(m.chunks * m.spread):
+        if task % m.spread == 0:
+            chunk = task // m.spread
+            square = ti.cast(0.0, ti.f64)
+            for i in range(part_first(chunk, m.n_nodes, m.chunks), part_first(chunk + 1, m.n_nodes, m.chunks)):
+                square += node_residual(m, s, k, i)
+            m.state.partial[chunk, SUM] = square
     ti.loop_config(serialize=True)
     for _ in range(1):
         norms[0] = total(m, SUM)

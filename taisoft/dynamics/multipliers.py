@@ -28,6 +28,7 @@ from taisoft.fem.loads import number_at
 from taisoft.fem.spring_table import LengthForm
 from taisoft.linear import host_pcg, pcg
 from taisoft.linear.bordered import block_inverse, products, solve_active
+from taisoft.linear.pcg_work import LinearResult
 from taisoft.scene.connection_records import Tendon
 from taisoft.scene.loads import Cavity
 
@@ -181,7 +182,7 @@ class Multipliers:
             rows = np.stack([self._simulation.dependents.matrix.T @ row for row in rows])
         return (rows * m.free.to_numpy()).reshape(len(rows), -1)
 
-    def direction(self, system: "StageSystem", tolerance: float) -> pcg.LinearResult:
+    def direction(self, system: "StageSystem", tolerance: float) -> LinearResult:
         """Solve the bordered system for y of pcg, and change the multipliers.
 
         Where it is singular, or A indefinite even when projected, y is y_0 and they stay; where A is not finite, y is 0.
@@ -196,13 +197,13 @@ class Multipliers:
         again = self._solve_bordered(system, tolerance)
         return replace(again, iterations=solution.iterations + again.iterations, negative=False)
 
-    def _solve_bordered(self, system: "StageSystem", tolerance: float) -> pcg.LinearResult:
+    def _solve_bordered(self, system: "StageSystem", tolerance: float) -> LinearResult:
         m, w, A, chosen = system.model, system.work.pcg, system.matrix, self._candidates
         G, right, penalty = self._rows(system.stage.beta, chosen), w.rhs.host.copy(), self._penalty[chosen]
         inverse = block_inverse(A.diagonal.to_numpy(), m.free.to_numpy())
         if inverse is None:
             w.y.host[...] = 0.0
-            return pcg.LinearResult(0, False, False)
+            return LinearResult(0, False, False)
 
         def precondition(r: np.ndarray) -> np.ndarray:
             return np.einsum("nrc,nc->nr", inverse, r.reshape(-1, 3)).reshape(-1)
@@ -223,7 +224,7 @@ class Multipliers:
             self.slope_change = -float(changed @ products(G, y[None])[:, 0])
         w.y.host[...] = y.reshape(-1, 3)
         converged = change is not None and all(one.converged for one in found)
-        return pcg.LinearResult(sum(one.iterations for one in found), converged, negative)
+        return LinearResult(sum(one.iterations for one in found), converged, negative)
 
     def _change(
         self, G: np.ndarray, y: np.ndarray, z: np.ndarray, shift: np.ndarray, penalty: np.ndarray

@@ -25,7 +25,7 @@ from taisoft.dynamics.frictional import FINER, MAX_MULTIPLIERS, PAST, PROGRESS, 
 from taisoft.dynamics.results import StageResult, relative
 from taisoft.dynamics.stage import AGAIN, ELASTIC_STAGE, IMPACT, LINEARISED, STEP
 from taisoft.dynamics.stage_system import Stage, StageSystem
-from taisoft.linear.pcg import LinearResult
+from taisoft.linear.pcg_work import LinearResult
 
 LINEAR_LIMIT = 0.01  # relative true residual above which a linearly implicit step has failed
 MAX_FORCING, INCREASE_FORCING = 0.1, 3e-2  # CG's maximum tolerance, and that after a step that increased |r|

@@ -17,6 +17,7 @@ from taisoft.backend.arrays import Count, FieldArena, download, upload
 from taisoft.backend.runtime import kernel
 from taisoft.dynamics.contact_terms import impulse_on_node
 from taisoft.dynamics.impact import impact_residual
+from taisoft.fem.chunks import part_first, total
 from taisoft.fem.dependents import force_with_dependents
 from taisoft.fem.lanes import mass_times
 from taisoft.fem.model import Model
@@ -25,7 +26,7 @@ from taisoft.fem.pattern import patch_nodes
 from taisoft.fem.state import END_SLOPE, N_NORMS, OTHER_SUM, START_SLOPE, SUM
 from taisoft.fem.terms import elasticity, rayleigh_damping
 from taisoft.linear.block_csr import BlockCsr, row_times
-from taisoft.linear.pcg import PcgWork, dot64, total
+from taisoft.linear.pcg_work import PcgWork, dot64
 from taisoft.ranges import entries_of, owners
 
 STAY, STEP, AGAIN = range(3)  # modes of `move`: stay, full step, another length of the same step
@@ -97,7 +98,7 @@ def set_change(m: ti.template(), w: ti.template(), i, c, beta):
 
 
 @ti.func
-def residual_parts(m: ti.template(), w: ti.template(), i, beta):
+def residual_parts(m: ti.template(), w: ti.template(), chunk, i, beta):
     """Return (r, inertia and mass damping, internal forces, loads) of node i without contacts; uses `change`."""
     zero = ti.Vector([0.0, 0.0, 0.0], m.real)
     internal, loads, damping = zero, zero, zero
@@ -107,7 +108,7 @@ def residual_parts(m: ti.template(), w: ti.template(), i, beta):
         else:
             internal += force_with_dependents(m, term, i)
     if ti.static(m.stiffness_damping):
-        damping += rayleigh_damping.stiffness_force(m, i, row_times(m, w.damper, i, m.state.v))
+        damping += rayleigh_damping.stiffness_force(m, i, row_times(m, w.damper, chunk, i, m.state.v))
     inertia = ti.cast(mass_times(m, i, w.change), m.real)
     return inertia - ti.cast(beta, m.real) * (internal + loads + damping), inertia, internal, loads
 
@@ -165,22 +166,23 @@ def move(
     mode: STAY; STEP: base = x, then step_length y, y of s.pcg; AGAIN: base + step_length y. scalars: START_SLOPE of a STEP.
     """
     ti.loop_config(serialize=m.serial)
-    for chunk in range(m.chunks):
-        n = n_nodes_of(m, s.pcg.subset)
-        size = (n + m.chunks - 1) // m.chunks
-        slope = ti.cast(0.0, ti.f64)
-        for at in range(chunk * size, ti.min(n, (chunk + 1) * size)):
-            i = node_of(s.pcg.subset, at)
-            if mode == STEP:
-                slope += dot64(m.free[i] * s.residual[i], s.pcg.y[i])
-                s.base[i] = m.state.x[i]
-            if mode != STAY:
-                place_node(m, s, i, step_length, beta)
-            if ti.static(k.any):
-                k.displacement[i] = m.state.x[i] - k.x_start[i]
-            if ti.static(kind == ELASTIC_STAGE):
-                set_change(m, s, i, c, beta)
-        m.state.partial[chunk, OTHER_SUM] = slope
+    for task in range(m.chunks * m.spread):
+        if task % m.spread == 0:
+            chunk = task // m.spread
+            n = n_nodes_of(m, s.pcg.subset)
+            slope = ti.cast(0.0, ti.f64)
+            for at in range(part_first(chunk, n, m.chunks), part_first(chunk + 1, n, m.chunks)):
+                i = node_of(s.pcg.subset, at)
+                if mode == STEP:
+                    slope += dot64(m.free[i] * s.residual[i], s.pcg.y[i])
+                    s.base[i] = m.state.x[i]
+                if mode != STAY:
+                    place_node(m, s, i, step_length, beta)
+                if ti.static(k.any):
+                    k.displacement[i] = m.state.x[i] - k.x_start[i]
+                if ti.static(kind == ELASTIC_STAGE):
+                    set_change(m, s, i, c, beta)
+            m.state.partial[chunk, OTHER_SUM] = slope
     if ti.static(kind == ELASTIC_STAGE):
         elasticity.sum_elements(m, s.pcg.subset)
     ti.loop_config(serialize=True)
@@ -206,33 +208,34 @@ def form_residual(
     scalars: END_SLOPE.
     """
     ti.loop_config(serialize=m.serial)
-    for chunk in range(m.chunks):
-        n = n_nodes_of(m, s.pcg.subset)
-        size = (n + m.chunks - 1) // m.chunks
-        sums, slope = ti.Vector([0.0, 0.0, 0.0, 0.0, 0.0], ti.f64), ti.cast(0.0, ti.f64)
-        for at in range(chunk * size, ti.min(n, (chunk + 1) * size)):
-            i = node_of(s.pcg.subset, at)
-            free = m.free[i]
-            zero = ti.Vector([0.0, 0.0, 0.0], m.real)
-            r, inertia, f, external = zero, zero, zero, zero
-            if ti.static(kind == IMPACT):
-                r = impact_residual(m, A, k, i, beta)
-            elif ti.static(kind == LINEARISED):
-                r = k.residual_linear[i]
-            else:
-                r, inertia, f, external = residual_parts(m, s, i, beta)
-            if ti.static(k.any):
-                r -= ti.cast(impulse_on_node(k, i), m.real)
-            if ti.static(m.has_dependents):  # whose forces act on other nodes
-                if m.dependents.number[i] >= 0:
-                    r = zero
-            s.residual[i] = r
-            s.pcg.rhs[i] = -free * r
-            sums += squares(r, inertia, f, external, free)
-            slope += dot64(free * r, s.pcg.y[i])
-        for j in ti.static(range(N_NORMS)):
-            m.state.partial[chunk, j] = sums[j]
-        m.state.partial[chunk, SUM] = slope
+    for task in range(m.chunks * m.spread):
+        if task % m.spread == 0:
+            chunk = task // m.spread
+            n = n_nodes_of(m, s.pcg.subset)
+            sums, slope = ti.Vector([0.0, 0.0, 0.0, 0.0, 0.0], ti.f64), ti.cast(0.0, ti.f64)
+            for at in range(part_first(chunk, n, m.chunks), part_first(chunk + 1, n, m.chunks)):
+                i = node_of(s.pcg.subset, at)
+                free = m.free[i]
+                zero = ti.Vector([0.0, 0.0, 0.0], m.real)
+                r, inertia, f, external = zero, zero, zero, zero
+                if ti.static(kind == IMPACT):
+                    r = impact_residual(m, A, k, i, beta)
+                elif ti.static(kind == LINEARISED):
+                    r = k.residual_linear[i]
+                else:
+                    r, inertia, f, external = residual_parts(m, s, chunk, i, beta)
+                if ti.static(k.any):
+                    r -= ti.cast(impulse_on_node(k, i), m.real)
+                if ti.static(m.has_dependents):  # whose forces act on other nodes
+                    if m.dependents.number[i] >= 0:
+                        r = zero
+                s.residual[i] = r
+                s.pcg.rhs[i] = -free * r
+                sums += squares(r, inertia, f, external, free)
+                slope += dot64(free * r, s.pcg.y[i])
+            for j in ti.static(range(N_NORMS)):
+                m.state.partial[chunk, j] = sums[j]
+            m.state.partial[chunk, SUM] = slope
     ti.loop_config(serialize=True)  # outside of any loop, the sum would become a parallel loop of its own, 50 us and more
     for _ in range(1):
         for j in ti.static(range(N_NORMS) if kind == ELASTIC_STAGE else (0, 4)):

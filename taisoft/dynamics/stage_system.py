@@ -48,6 +48,7 @@ from taisoft.fem.node_graph import EVERYTHING, Subset
 from taisoft.fem.state import END_SLOPE, START_SLOPE, STEP_LENGTH
 from taisoft.linear import block_csr, pcg, volume_pcg
 from taisoft.linear.block_csr import BlockCsr
+from taisoft.linear.pcg_work import LinearResult, build_pcg
 
 if TYPE_CHECKING:
     from taisoft.dynamics.contact import ContactStep
@@ -116,7 +117,7 @@ class StageSystem:
             n_prescribed=k,
             change=arena.vectors("change", ti.f64, n),
             damper=self.damper,
-            pcg=pcg.build_pcg(model, arena),
+            pcg=build_pcg(model, arena, self.matrix),
         )
         self.rounding = RoundingFloor(model, eps)
         self.linear_solver = LinearSolver(model)
@@ -368,14 +369,14 @@ class StageSystem:
         self.form_matrix(projected)
         find_factors(self._k.problem)
 
-    def direction(self, tolerance: float) -> pcg.LinearResult:
+    def direction(self, tolerance: float) -> LinearResult:
         """Solve for y of pcg from -r."""
         restricted = self.work.pcg.subset.restricted
         if self.multipliers is not None and self.multipliers.penalised and not restricted:
             return self.multipliers.direction(self, tolerance)
         return self.solve_linear(tolerance)
 
-    def solve_linear(self, tolerance: float) -> pcg.LinearResult:
+    def solve_linear(self, tolerance: float) -> LinearResult:
         """Solve for y of pcg from its right side."""
         m, w = self.model, self.work
         if not self._k.any and not w.pcg.subset.restricted:

@@ -3,6 +3,7 @@
 import taichi as ti
 
 from taisoft.backend.runtime import kernel
+from taisoft.fem.chunks import block_first, part_first
 from taisoft.fem.lanes import broadcast, mass_times
 from taisoft.fem.mean_dilatation import find_dilatations
 from taisoft.fem.state import ELASTIC, FIRST_SOFTENED, GRAVITY, KINETIC, LOADS, MIN_J, N_INVERTED
@@ -37,35 +38,35 @@ def measure(m: ti.template()):
     """
     find_dilatations(m)
     ti.loop_config(serialize=m.serial)
-    for c in range(m.chunks):
-        energy = broadcast(ti.cast(0.0, ti.f64), m.lanes)
-        lowest = broadcast(ti.cast(HUGE, ti.f64), m.lanes)
-        inverted = broadcast(ti.cast(0, ti.i32), m.lanes)
-        no_tets = broadcast(ti.cast(NO_TET, ti.i32), m.lanes)
-        softened = no_tets
-        blocks_per_chunk = (m.n_blocks + m.chunks - 1) // m.chunks
-        for g in ti.static(m.groups):
-            for b in range(ti.max(g.first, c * blocks_per_chunk), ti.min(g.last, (c + 1) * blocks_per_chunk)):
-                psi, J, soft = elasticity.element_energy(m, g, b)
-                energy += psi
-                lowest = ti.min(lowest, J)
-                inverted += elasticity.count_inverted(m, b, J)
-                tets = ti.Vector([b * m.lanes + q for q in ti.static(range(m.lanes))])
-                softened = ti.min(softened, ti.select(soft == 1, tets, no_tets))
-        m.state.partial[c, ELASTIC] = _lane_sum(energy)
-        m.state.partial[c, MIN_J] = _lane_min(lowest)
-        m.state.partial[c, N_INVERTED] = ti.cast(_lane_sum(inverted), ti.f64)
-        kinetic, weight, loads = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64)
-        nodes_per_chunk = (m.n_nodes + m.chunks - 1) // m.chunks
-        for i in range(c * nodes_per_chunk, ti.min(m.n_nodes, (c + 1) * nodes_per_chunk)):
-            kinetic += 0.5 * ti.cast(m.state.v[i], ti.f64).dot(mass_times(m, i, m.state.v))
-            weight += gravity.energy(m, i)
-            if ti.static(m.loaded):
-                loads += dead_loads.energy(m, i)
-            if ti.static(m.has_pressure):
-                loads += pressure.energy(m, i)
-        m.state.partial[c, KINETIC], m.state.partial[c, GRAVITY], m.state.partial[c, LOADS] = kinetic, weight, loads
-        m.state.partial[c, FIRST_SOFTENED] = ti.cast(_lane_min(softened), ti.f64)
+    for task in range(m.chunks * m.spread):
+        if task % m.spread == 0:
+            c = task // m.spread
+            energy = broadcast(ti.cast(0.0, ti.f64), m.lanes)
+            lowest = broadcast(ti.cast(HUGE, ti.f64), m.lanes)
+            inverted = broadcast(ti.cast(0, ti.i32), m.lanes)
+            no_tets = broadcast(ti.cast(NO_TET, ti.i32), m.lanes)
+            softened = no_tets
+            for g in ti.static(m.groups):
+                for b in range(block_first(g, c, m.chunks), block_first(g, c + 1, m.chunks)):
+                    psi, J, soft = elasticity.element_energy(m, g, b)
+                    energy += psi
+                    lowest = ti.min(lowest, J)
+                    inverted += elasticity.count_inverted(m, b, J)
+                    tets = ti.Vector([b * m.lanes + q for q in ti.static(range(m.lanes))])
+                    softened = ti.min(softened, ti.select(soft == 1, tets, no_tets))
+            m.state.partial[c, ELASTIC] = _lane_sum(energy)
+            m.state.partial[c, MIN_J] = _lane_min(lowest)
+            m.state.partial[c, N_INVERTED] = ti.cast(_lane_sum(inverted), ti.f64)
+            kinetic, weight, loads = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64)
+            for i in range(part_first(c, m.n_nodes, m.chunks), part_first(c + 1, m.n_nodes, m.chunks)):
+                kinetic += 0.5 * ti.cast(m.state.v[i], ti.f64).dot(mass_times(m, i, m.state.v))
+                weight += gravity.energy(m, i)
+                if ti.static(m.loaded):
+                    loads += dead_loads.energy(m, i)
+                if ti.static(m.has_pressure):
+                    loads += pressure.energy(m, i)
+            m.state.partial[c, KINETIC], m.state.partial[c, GRAVITY], m.state.partial[c, LOADS] = kinetic, weight, loads
+            m.state.partial[c, FIRST_SOFTENED] = ti.cast(_lane_min(softened), ti.f64)
     ti.loop_config(serialize=True)
     for _ in range(1):
         for k in ti.static(SCALARS):

@@ -12,9 +12,11 @@ from typing import Any
 import numpy as np
 import taichi as ti
 
+from taisoft.backend import parallel
 from taisoft.backend.arrays import Count, FieldArena, download, upload
-from taisoft.backend.runtime import Runtime, threads
+from taisoft.backend.runtime import Runtime
 from taisoft.fem import reference, springs
+from taisoft.fem.chunks import SPREAD
 from taisoft.fem.dependents import DependentTable, build_dependents, dependent_table
 from taisoft.fem.laws import LAWS
 from taisoft.fem.loads import SceneLoads
@@ -29,11 +31,10 @@ from taisoft.ranges import owners
 from taisoft.scene.rigid import RigidBody
 from taisoft.scene.scene import Body, Scene
 
-# Least quadrature points and CPU threads for parallel loops; below, one serial kernel runs. With two threads, parallel loops took
-# 3.4 times as long (213,000 tets, `taisoft bench scaling`)
-PARALLEL_FROM, PARALLEL_THREADS = 100_000, 8
-# Partial sums of a parallel loop. On the CPU, Taichi gives a thread at least 128 iterations of a short loop
-CHUNKS = {"cpu": 1024, "cuda": 4096}
+# Quadrature points from which loops on the CPU are divided into chunks; below, one thread is faster on every machine
+CHUNKED_FROM = 20_000
+LOOP_SECONDS = 3e-9  # of one thread per quadrature point, in the loops with least work
+CHUNKS = {"cpu": 32, "cuda": 4096}
 # |Dm| |Dm^-1| above which F is formed in f64: in f32 its rounding error, 6e-8 times this number, would be a strain above 6e-6.
 # Regular tets have 3, those of a sheet whose cells are 30 times as wide as thick about 60
 ILL_CONDITIONED = 100.0
@@ -77,6 +78,7 @@ class Model:
     strain_real: Any  # Taichi type in which the deformation gradient is formed
     lanes: int
     serial: bool  # loops run on one thread
+    on_cpu: bool
     n_nodes: Count
     n_blocks: Count
     groups: tuple  # of Group
@@ -111,7 +113,8 @@ class Model:
     mean_dilatation: bool  # of some group
     mean: MeanDilatation | None
     elasticity_by_tet: bool  # law_constants may differ between the tets of a body
-    chunks: int  # parts of a loop, each with its own partial sums
+    chunks: int  # of a loop, each with its own partial sums
+    spread: int  # iterations of a loop per chunk, see `fem.chunks`
 
     @property
     def has_dependents(self) -> bool:
@@ -272,8 +275,8 @@ def build_model(scene: Scene, runtime: Runtime, arena: FieldArena, on: dict[str,
     start, entry = _gather_table(nodes, groups, volume > 0, n_nodes, lanes)
     block_body = (np.searchsorted(layout.tet_start, layout.tet_of_lane[::lanes], side="right") - 1).astype(np.int32)
     work = sum((g.last - g.first) * lanes * g.n_points for g in groups)
-    serial = runtime.arch == "cpu" and (work < PARALLEL_FROM or threads() < PARALLEL_THREADS)
-    chunks = 1 if serial else CHUNKS[runtime.arch]
+    chunks = 1 if runtime.arch == "cpu" and work < CHUNKED_FROM else CHUNKS[runtime.arch]
+    serial = runtime.arch == "cpu" and (chunks == 1 or not parallel.pays(work * LOOP_SECONDS))
     strain_real = ti.f64 if real == ti.f32 and _worst_condition(nodes, Dm_inv, layout, groups) > ILL_CONDITIONED else real
     types = {True: (ti.f64, ti.f64), False: (real, strain_real)}
     groups = tuple(replace(g, **dict(zip(("real", "strain_real"), types[g.rigid]))) for g in groups)
@@ -298,6 +301,7 @@ def build_model(scene: Scene, runtime: Runtime, arena: FieldArena, on: dict[str,
         strain_real=strain_real,
         lanes=lanes,
         serial=serial,
+        on_cpu=runtime.arch == "cpu",
         n_nodes=n_nodes,
         n_blocks=n_blocks,
         groups=groups,
@@ -333,6 +337,7 @@ def build_model(scene: Scene, runtime: Runtime, arena: FieldArena, on: dict[str,
         mean=build_mean_dilatation(scene, layout, arena) if on["mean_dilatation"] else None,
         elasticity_by_tet=on["elasticity_by_tet"],
         chunks=chunks,
+        spread=1 if serial else SPREAD[runtime.arch],
     )
     needs_graph = on["consistent_mass"] or (on["pressure"] and on["assembled_stiffness"])
     graph = model_graph(model)[0] if needs_graph else None

@@ -16,6 +16,7 @@ import taichi as ti
 from taisoft.backend.arrays import Count, FieldArena, download
 from taisoft.backend.runtime import kernel
 from taisoft.errors import SimulationError
+from taisoft.fem.chunks import part_first
 from taisoft.fem.model import Model
 from taisoft.fem.node_graph import BLOCKS, EDGES, block_of, count_of, edge_of, n_nodes_of, node_of
 from taisoft.fem.pattern import MATRIX_BLOCKS, model_graph
@@ -28,6 +29,7 @@ from taisoft.linear.patch_terms import PatchTerms, add_patches, build_patch_term
 # A block is a 12-vector, column by column, each padded with a zero: entry (r, c) is at 4 c + r. All entries share one address,
 # and a column times a number is one SIMD instruction.
 BLOCK = 12
+ROW_SUM_STEP, ROW_SUM_MASK = 4, 31  # entries of `row_sum` per chunk, so that threads write to different cache lines
 SINGULAR = 1e-12  # of the product of its diagonal: a block with a smaller determinant counts as singular
 
 
@@ -41,7 +43,7 @@ class BlockCsr:
     column: Any  # (2 n_edges) i32, ascending in each row, without the diagonal
     value: Any  # (2 n_edges) 12-vectors: blocks off the diagonal
     diagonal: Any  # (n_nodes) 12-vectors
-    row_sum: Any  # (1) 4-vector: written but not read, see `keep_padding_lane`
+    row_sum: Any  # 4-vectors: written but not read, see `keep_padding_lane`
     element: Any  # K_ab of each tet, per block of tets (pair, entry, lane): a `Lanes` buffer
     element_at: Count  # its start, in vectors of lanes
     element_mask: int  # bit mask of an index into it, in vectors of lanes
@@ -91,7 +93,7 @@ def build_block_csr(model: Model, arena: FieldArena, prefix: str = "stiffness") 
         row_upper=copied("row_upper", graph.row_upper),
         column=copied("column", graph.column),
         **_values(model, arena, prefix, n_edges),
-        row_sum=arena.vectors(f"{prefix}_row_sum", model.real, 1, n=4),
+        row_sum=arena.vectors(f"{prefix}_row_sum", model.real, ROW_SUM_STEP * (ROW_SUM_MASK + 1), n=4),
         element=element.memory,
         element_at=element.at // model.lanes,
         element_mask=element.mask // model.lanes,
@@ -234,48 +236,51 @@ def definite_inverse(m: ti.template(), D, free):
 
 
 @ti.func
-def keep_padding_lane(m: ti.template(), A: ti.template(), y):
+def keep_padding_lane(m: ti.template(), A: ti.template(), c, y):
     """Store a row's sum so that the compiler keeps its unused fourth entry and adds four numbers in one SIMD operation, not two.
 
     Conjugate gradient iterations then take 0.75 of the time if the matrix fits into the cache, 0.9 if it does not.
     """
-    if ti.static(m.serial):
-        A.row_sum[0] = y
+    if ti.static(m.on_cpu):
+        A.row_sum[ROW_SUM_STEP * (c & ROW_SUM_MASK)] = y
 
 
 @ti.func
-def partial_row_times(m: ti.template(), A: ti.template(), first, last, x: ti.template()):
-    """Sum of blocks first <= k < last (of one row) times x at their columns."""
+def partial_row_times(m: ti.template(), A: ti.template(), c, first, last, x: ti.template()):
+    """Sum of blocks first <= k < last (of one row) times x at their columns, within chunk c of a loop."""
     y = ti.Vector([0.0, 0.0, 0.0, 0.0], m.real)
     for k in range(first, last):
         y += padded_times(A.value[k], x[A.column[k]])
-    keep_padding_lane(m, A, y)
+    keep_padding_lane(m, A, c, y)
     return ti.Vector([y[0], y[1], y[2]])
 
 
 @ti.func
-def partial_row_times_backward(m: ti.template(), A: ti.template(), first, last, x: ti.template()):
+def partial_row_times_backward(m: ti.template(), A: ti.template(), c, first, last, x: ti.template()):
     """The same sum in reverse order: a backward sweep then uses the most recently computed entries of x last."""
     y = ti.Vector([0.0, 0.0, 0.0, 0.0], m.real)
     for n in range(last - first):
         k = last - 1 - n
         y += padded_times(A.value[k], x[A.column[k]])
-    keep_padding_lane(m, A, y)
+    keep_padding_lane(m, A, c, y)
     return ti.Vector([y[0], y[1], y[2]])
 
 
 @ti.func
-def row_times(m: ti.template(), A: ti.template(), i, x: ti.template()):
-    """(A x)_i."""
-    return block_times(A.diagonal[i], x[i]) + partial_row_times(m, A, A.row_start[i], A.row_start[i + 1], x)
+def row_times(m: ti.template(), A: ti.template(), c, i, x: ti.template()):
+    """(A x)_i, within chunk c of a loop."""
+    return block_times(A.diagonal[i], x[i]) + partial_row_times(m, A, c, A.row_start[i], A.row_start[i + 1], x)
 
 
 @kernel
 def multiply(m: ti.template(), A: ti.template(), x: ti.template(), y: ti.template()):
     """y = A x, (n_nodes) 3-vectors."""
     ti.loop_config(serialize=m.serial)
-    for i in range(m.n_nodes):
-        y[i] = row_times(m, A, i, x)
+    for task in range(m.chunks * m.spread):
+        if task % m.spread == 0:
+            c = task // m.spread
+            for i in range(part_first(c, m.n_nodes, m.chunks), part_first(c + 1, m.n_nodes, m.chunks)):
+                y[i] = row_times(m, A, c, i, x)
 
 
 def packed(blocks: np.ndarray) -> np.ndarray:

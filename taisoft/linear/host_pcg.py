@@ -12,7 +12,7 @@ import numpy as np
 from taisoft.fem.model import Model
 from taisoft.linear import block_csr
 from taisoft.linear.block_csr import BlockCsr
-from taisoft.linear.pcg import MAX_NEGATIVE_STEP, LinearResult, PcgWork
+from taisoft.linear.pcg_work import MAX_NEGATIVE_STEP, LinearResult, PcgWork
 
 
 def solve(

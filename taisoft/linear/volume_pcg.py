@@ -23,7 +23,8 @@ from taisoft.fem.mean_dilatation import find_dilatations
 from taisoft.fem.model import Model
 from taisoft.linear.block_csr import BlockCsr, block_times, definite_inverse, row_times
 from taisoft.linear.patch_terms import patch_stiffness
-from taisoft.linear.pcg import (
+from taisoft.linear.pcg import batch_of
+from taisoft.linear.pcg_work import (
     CONVERGED,
     COUNT,
     MAX_NEGATIVE_STEP,
@@ -35,7 +36,6 @@ from taisoft.linear.pcg import (
     STEP,
     LinearResult,
     PcgWork,
-    batch_of,
     dot64,
 )
 
@@ -276,7 +276,7 @@ def iterate_with_volumes(
                 for i in range(m.n_nodes):
                     w.p[i] = w.z[i] + ratio * w.p[i]
                 for i in range(m.n_nodes):
-                    q = m.free[i] * row_times(m, A, i, w.p)
+                    q = m.free[i] * row_times(m, A, 0, i, w.p)
                     w.q[i] = q
                     curvature += dot64(w.p[i], q)
                 if not curvature > 0.0:

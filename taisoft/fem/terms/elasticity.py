@@ -9,6 +9,7 @@ Simulation" (University of Copenhagen), at every quadrature point, with two corr
 import taichi as ti
 
 from taisoft.backend.runtime import kernel
+from taisoft.fem.chunks import block_first
 from taisoft.fem.dependents import place, place_all
 from taisoft.fem.lanes import (
     add_forces,
@@ -30,7 +31,7 @@ from taisoft.fem.laws import dpk1_projected, prepare_projected
 from taisoft.fem.math3 import determinant, matmul_nt, matmul_tn
 from taisoft.fem.mean_dilatation import find_dilatations, find_rates, find_serially, patch_energy, patch_values, stress_constants
 from taisoft.fem.node_graph import BLOCKS, EVERYTHING, block_of, count_of
-from taisoft.fem.state import FAILED, INVERTED_NOW, LOWEST_J
+from taisoft.fem.state import FAILED, INVERTED_NOW, LOWEST_J, OTHER_SUM, SUM
 
 SWITCH, LOAD, ACCELERATION, STIFFNESS, PREPARED = None, False, False, False, False
 HUGE = 1e30  # above any volume ratio
@@ -90,16 +91,22 @@ def count_inverted(m: ti.template(), b, J):
 
 
 @ti.func
-def record_volumes(m: ti.template(), b, J):
-    """Update the scalars LOWEST_J and INVERTED_NOW by block b; set FAILED if a tet has exploded."""
-    bad = count_inverted(m, b, J)
-    low, count = J[0], bad[0]
-    for q in ti.static(range(1, m.lanes)):
-        low, count = ti.min(low, J[q]), count + bad[q]
+def record_volumes(m: ti.template(), J, bad):
+    """Update the scalars LOWEST_J and INVERTED_NOW by lanes of J and of inverted tets; set FAILED if a tet has exploded."""
+    low, count = lowest_and_count(m, J, bad)
     ti.atomic_min(m.state.scalars[LOWEST_J], ti.cast(low, ti.f64))
     ti.atomic_add(m.state.scalars[INVERTED_NOW], ti.cast(count, ti.f64))
     if not low > -EXPLODED:
         m.state.scalars[FAILED] = 1.0
+
+
+@ti.func
+def lowest_and_count(m: ti.template(), J, bad):
+    """Smallest J and sum of `bad` over the lanes."""
+    low, count = J[0], bad[0]
+    for q in ti.static(range(1, m.lanes)):
+        low, count = ti.min(low, J[q]), count + bad[q]
+    return low, count
 
 
 @ti.func
@@ -131,11 +138,40 @@ def sum_elements_with_damping(m: ti.template()):
     find_dilatations(m)
     if ti.static(m.stiffness_damping):
         find_rates(m, m.state.v)
-    for g in ti.static(m.groups):
+    if ti.static(m.on_cpu):
         ti.loop_config(serialize=m.serial)
-        for b in range(g.first, g.last):
-            record_volumes(m, b, element_force(m, g, m.stiffness_damping, b))
+        for task in range(m.chunks * m.spread):
+            if task % m.spread == 0:
+                J, bad = sum_chunk(m, task // m.spread)
+                low, count = lowest_and_count(m, J, bad)
+                m.state.partial[task // m.spread, SUM] = ti.cast(low, ti.f64)
+                m.state.partial[task // m.spread, OTHER_SUM] = ti.cast(count, ti.f64)
+        ti.loop_config(serialize=True)
+        for c in range(m.chunks):
+            low = m.state.partial[c, SUM]
+            m.state.scalars[LOWEST_J] = ti.min(m.state.scalars[LOWEST_J], low)
+            m.state.scalars[INVERTED_NOW] = m.state.scalars[INVERTED_NOW] + m.state.partial[c, OTHER_SUM]
+            if not low > -EXPLODED:
+                m.state.scalars[FAILED] = 1.0
+    else:
+        for g in ti.static(m.groups):
+            for b in range(g.first, g.last):
+                J = element_force(m, g, m.stiffness_damping, b)
+                record_volumes(m, J, count_inverted(m, b, J))
     prepare_terms(m)
+
+
+@ti.func
+def sum_chunk(m: ti.template(), c):
+    """Run `element_force` over the blocks of chunk c. Return the smallest J and the number of inverted tets, per lane."""
+    lowest = broadcast(ti.cast(HUGE, m.real), m.lanes)
+    inverted = broadcast(ti.cast(0, ti.i32), m.lanes)
+    for g in ti.static(m.groups):
+        for b in range(block_first(g, c, m.chunks), block_first(g, c + 1, m.chunks)):
+            J = element_force(m, g, m.stiffness_damping, b)
+            lowest = ti.min(lowest, J)
+            inverted += count_inverted(m, b, J)
+    return lowest, inverted
 
 
 @ti.func
@@ -147,11 +183,10 @@ def sum_elements_serially(m: ti.template()):
         for k in range(m.dependents.n):
             place(m, k)
     find_serially(m)
-    for g in ti.static(m.groups):
-        for b in range(g.first, g.last):
-            J = element_force(m, g, m.stiffness_damping, b)
-            lowest = ti.min(lowest, J)
-            inverted += count_inverted(m, b, J)
+    for c in range(m.chunks):
+        J, bad = sum_chunk(m, c)
+        lowest = ti.min(lowest, J)
+        inverted += bad
     for term in ti.static(m.terms):
         if ti.static(term.PREPARED):
             for k in range(term.count(m)):

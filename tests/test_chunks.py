@@ -1,0 +1,131 @@
+"""Loops over chunks, and the choice between one thread and several:
+
+* every integrator gives the same bits on one thread and on several, with and without contacts, damping and mean dilatation; the
+  chunks themselves change only rounding;
+* the chunks of a list are disjoint, in order and cover it;
+* the gain by threads is measured once, kept, and measured again where the file is unusable.
+"""
+
+import json
+
+import numpy as np
+import pytest
+import taichi as ti
+from scenes import driven_scene, mixed_scene, use_threads
+
+import taisoft as ts
+from taisoft.backend import parallel
+from taisoft.backend.runtime import kernel, open_runtime, threads
+from taisoft.fem.chunks import part_first
+
+
+def pile() -> ts.Scene:
+    scene = ts.Scene()
+    rubber = ts.Material(young=3e4, stiffness_damping=1e-3)
+    mesh = ts.box_mesh(cells=(3, 3, 3), size=(0.3, 0.3, 0.3))
+    for k in range(2):
+        scene.add_body(mesh, rubber, position=(0.07 * k, 0.16 + 0.31 * k, 0.02 * k), velocity=(0, -1, 0), name=f"cube {k}")
+    scene.add_obstacle(ts.HalfSpace((0, 0, 0), (0, 1, 0)), name="ground")
+    return scene
+
+
+def soft_in_shape() -> ts.Scene:
+    scene = ts.Scene()
+    mesh = ts.box_mesh(cells=(4, 2, 2), size=(4, 1, 1))
+    body = scene.add_body(mesh, ts.Material(young=1e5, poisson=0.49), dilatation="mean", name="beam")
+    body.fix(lambda X: X[:, 0] < -1.99)
+    return scene
+
+
+SCENES = {"driven": lambda: driven_scene(mass_damping=3.0, order=2), "mixed": mixed_scene, "pile": pile, "mean": soft_in_shape}
+
+
+CASES = (
+    ("driven", "velocity_verlet", "f32"),
+    ("driven", "implicit_midpoint", "f64"),
+    ("mixed", "bdf2", "f64"),
+    ("mixed", "linearly_implicit_euler", "f32"),
+    ("mean", "implicit_euler", "f64"),
+    ("pile", "symplectic_euler", "f64"),
+    ("pile", "bdf2", "f32"),
+)
+STEPS = 6
+
+
+def run(scene: ts.Scene, integrator: str, precision: str) -> tuple:
+    """State, energies and counts of each step."""
+    explicit = integrator in ("symplectic_euler", "velocity_verlet")
+    with ts.Simulator(scene, dt=1e-4 if explicit else 5e-3, integrator=integrator, precision=precision) as sim:
+        counts = []
+        while sim.step_count < STEPS:
+            report = sim.advance(STEPS - sim.step_count) if explicit else sim.step()
+            counts.append((report.newton_iterations, report.linear_iterations, report.min_volume_ratio))
+        return sim.positions(), sim.velocities(), sim.energies(), counts
+
+
+@pytest.mark.parametrize(("name", "integrator", "precision"), CASES)
+def test_any_number_of_threads_gives_the_same_bits(name, integrator, precision, monkeypatch):
+    whole = run(SCENES[name](), integrator, precision)
+    use_threads(monkeypatch, several=False)
+    one = run(SCENES[name](), integrator, precision)
+    use_threads(monkeypatch)
+    several = run(SCENES[name](), integrator, precision)
+    assert all(np.array_equal(a, b) for a, b in zip(one[:2], several[:2]))
+    assert one[2:] == several[2:]
+    tolerance = 1e-5 if precision == "f32" else 1e-6  # [m]: those of Newton's method and of f32 strains
+    assert np.abs(one[0] - whole[0]).max() < tolerance
+
+
+@kernel
+def write_parts(out: ti.types.ndarray(), n: ti.i32, chunks: ti.template()):
+    """First entry of each chunk, and the number of entries."""
+    for c in range(chunks + 1):
+        out[c] = part_first(c, n, chunks)
+
+
+@pytest.mark.parametrize("n", [0, 1, 6, 7, 8, 1000])
+def test_chunks_cover_a_list_in_order(n):
+    runtime, first = open_runtime("cpu", "f32"), np.zeros(8, dtype=np.int32)
+    try:
+        write_parts(first, n, 7)
+    finally:
+        runtime.close()
+    sizes = np.diff(first)
+    assert first[0] == 0 and first[-1] == n and sizes.min() >= 0 and sizes.max() - sizes.min() <= 1
+
+
+@pytest.fixture
+def cache(tmp_path, monkeypatch):
+    """The file of the measurements, in a folder of its own."""
+    monkeypatch.setattr(parallel, "cache_folder", lambda: str(tmp_path))
+    parallel.gain.cache_clear()
+    runtime = open_runtime("cpu", "f32")
+    yield tmp_path / parallel.FILE
+    runtime.close()
+    parallel.gain.cache_clear()
+
+
+def test_the_gain_is_measured_once_and_kept(cache):
+    measured = parallel.gain()
+    assert 0.0 < measured.wake < 0.1 and 0.0 < measured.speedup < 4 * threads()
+    stored = json.loads(cache.read_text())
+    assert list(stored) == [f"{parallel.processor()}, {threads()} threads"]
+    cache.write_text(json.dumps({name: one | {"wake": 12.5} for name, one in stored.items()}))
+    assert parallel.gain() == measured
+    parallel.gain.cache_clear()
+    assert parallel.gain().wake == 12.5
+
+
+@pytest.mark.parametrize("content", ["", "{", "[]", '{"a": 1}', '{"a": {"wake": "b", "speedup": 1}}'])
+def test_an_unusable_file_is_replaced(cache, content):
+    cache.write_text(content)
+    measured = parallel.gain()
+    assert list(json.loads(cache.read_text()).values()) == [{"wake": measured.wake, "speedup": measured.speedup}]
+
+
+def test_short_loops_run_on_one_thread():
+    two = parallel.Gain(wake=5e-5, speedup=2.0)
+    assert 1e-4 < two.shortest_loop < 2e-4
+    assert parallel.Gain(wake=5e-5, speedup=4.0).shortest_loop < two.shortest_loop
+    for speedup in (0.5, 1.0):  # more cores are visible than may be used
+        assert parallel.Gain(wake=5e-5, speedup=speedup).shortest_loop == float("inf")
