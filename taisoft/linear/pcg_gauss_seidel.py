@@ -44,7 +44,7 @@ EVEN, ODD = range(2)  # parities of chunks
 def _chunk(m: ti.template(), k: ti.template(), w: ti.template(), c):
     """Return the first place of chunk c in the list of the system's nodes, and one past its last."""
     first, last = 0, n_nodes_of(m, w.subset)
-    if ti.static(w.is_divided(m, k)):
+    if ti.static(w.is_divided(k)):
         first, last = c << w.chunk_shift, ti.min(last, (c + 1) << w.chunk_shift)
     return first, last
 
@@ -71,13 +71,13 @@ def _times_other(m: ti.template(), A: ti.template(), w: ti.template(), c, first,
 def _times_below(m: ti.template(), A: ti.template(), k: ti.template(), w: ti.template(), c, i, x: ti.template()):
     """(L x)_i."""
     begin = A.row_start[i]
-    if ti.static(w.is_divided(m, k)):
+    if ti.static(w.is_divided(k)):
         if ti.static(w.crossed):
             begin = w.own_begin[i]
         elif c % 2 == EVEN:
             begin = w.own_begin[i]
     y = partial_row_times(m, A, c, begin, A.row_upper[i], x)
-    if ti.static(w.is_divided(m, k)):
+    if ti.static(w.is_divided(k)):
         if c % 2 == ODD:
             if ti.static(w.crossed):
                 y += _times_other(m, A, w, c, A.row_start[i], begin, EVEN, x)
@@ -91,13 +91,13 @@ def _times_below(m: ti.template(), A: ti.template(), k: ti.template(), w: ti.tem
 def _times_above(m: ti.template(), A: ti.template(), k: ti.template(), w: ti.template(), c, i, x: ti.template()):
     """(L^T x)_i."""
     end = A.row_start[i + 1]
-    if ti.static(w.is_divided(m, k)):
+    if ti.static(w.is_divided(k)):
         if ti.static(w.crossed):
             end = w.own_end[i]
         elif c % 2 == ODD:
             end = w.own_end[i]
     y = partial_row_times_backward(m, A, c, A.row_upper[i], end, x)
-    if ti.static(w.is_divided(m, k)):
+    if ti.static(w.is_divided(k)):
         if c % 2 == EVEN:
             if ti.static(w.crossed):
                 y += _times_other(m, A, w, c, end, A.row_start[i + 1], ODD, x)
@@ -152,7 +152,7 @@ def _sweep_forward(m: ti.template(), A: ti.template(), k: ti.template(), w: ti.t
         i = node_of(w.subset, at)
         p, t = w.p[i], w.z[i]
         rest = t - block_times(w.mirror[i], p) - _times_below(m, A, k, w, c, i, w.q)
-        if ti.static(w.crossed and w.is_divided(m, k)):
+        if ti.static(w.crossed and w.is_divided(k)):
             rest += _times_other(m, A, w, c, A.row_start[i], w.own_begin[i], c % 2, w.p)
             rest += _times_other(m, A, w, c, w.own_end[i], A.row_start[i + 1], c % 2, w.p)
         if ti.static(k.width > 0):
@@ -203,10 +203,10 @@ def _negative_step(rz, curvature):
 
 
 @ti.func
-def _n_chunks(m: ti.template(), k: ti.template(), w: ti.template()):
+def _n_chunks(k: ti.template(), w: ti.template()):
     """Number of chunks."""
     n = 1
-    if ti.static(w.is_divided(m, k)):
+    if ti.static(w.is_divided(k)):
         n = w.n_chunks
     return n
 
@@ -230,7 +230,7 @@ def _in_order(w: ti.template(), step):
 def _sum(m: ti.template(), k: ti.template(), w: ti.template(), column: ti.template()):
     """Sum of the chunks' partial sums, in a fixed order."""
     s = ti.cast(0.0, ti.f64)
-    for c in range(_n_chunks(m, k, w)):
+    for c in range(_n_chunks(k, w)):
         s += m.state.partial[c, column]
     return s
 
@@ -252,7 +252,7 @@ def iterate_kernel(
 def start_serial(m: ti.template(), A: ti.template(), k: ti.template(), w: ti.template(), same_matrix):
     """Begin a solve from y = 0, inside a serial loop."""
     clear_products(m, k)
-    for step in range(_n_chunks(m, k, w)):
+    for step in range(_n_chunks(k, w)):
         c = _in_order(w, step)
         m.state.partial[c, SUM] = _start_chunk(m, A, k, w, c, same_matrix)
     rz = _sum(m, k, w, SUM)
@@ -264,7 +264,7 @@ def start_serial(m: ti.template(), A: ti.template(), k: ti.template(), w: ti.tem
 def iterate_serial(m: ti.template(), A: ti.template(), k: ti.template(), w: ti.template(), n, tolerance):
     """Run up to n iterations from the present state, inside a serial loop. Return their number and the status."""
     rz, beta, status, count = w.state[RZ], w.state[STEP], ti.cast(RUNNING, ti.i32), 0
-    limit, n_chunks = tolerance * tolerance * w.state[RZ_START], _n_chunks(m, k, w)
+    limit, n_chunks = tolerance * tolerance * w.state[RZ_START], _n_chunks(k, w)
     if rz <= limit:
         status = CONVERGED
     while count < n and status == RUNNING:

@@ -37,13 +37,13 @@ class PcgWork:
     n_chunks: Count = 1  # of `pcg_gauss_seidel`
     chunk_shift: Count = 30  # a chunk has 2^chunk_shift nodes
     crossed: bool = False  # whether blocks couple different chunks of one parity
-    own_begin: Any = None  # (n_nodes) i32: first entry of each row within its chunk; only with several chunks
+    own_begin: Any = None  # (n_nodes) i32: first entry of each row within its chunk; None without chunks
     own_end: Any = None  # (n_nodes) i32: one past the last
     subset: Subset = EVERYTHING  # nodes that form the system
 
-    def is_divided(self, m: Model, coupling: Coupling) -> bool:
+    def is_divided(self, coupling: Coupling) -> bool:
         """Whether Gauss-Seidel sweeps over chunks of the system's nodes."""
-        return m.chunks > 1 and coupling.width == 0 and not self.subset.restricted
+        return self.own_begin is not None and coupling.width == 0 and not self.subset.restricted
 
 
 @dataclass(frozen=True)
