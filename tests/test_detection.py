@@ -118,6 +118,8 @@ def test_one_thread_and_many_find_the_same(monkeypatch, serial_cheap):
         one = made.find_contacts(DT)
         contacts = one.contacts()
         monkeypatch.setattr(surface, "SERIAL_BELOW", 0)
+        monkeypatch.setattr(surface, "CHEAP_SECONDS", 0.0)
+        monkeypatch.setattr("taisoft.backend.parallel.pays", lambda seconds: seconds > 0.0)
         many = Detection(made.scene, made.model, made.state.layout, made.runtime, serial=None if serial_cheap else False)
         assert many.surface.serial_cheap == serial_cheap
         many.find(0.0, DT)

@@ -12,15 +12,15 @@ from typing import Any
 import numpy as np
 import taichi as ti
 
+from taisoft.backend import parallel
 from taisoft.backend.arrays import Count, FieldArena
 from taisoft.backend.runtime import Runtime, kernel
 from taisoft.collision.colliders import Topology
 from taisoft.fem.chunks import SPREAD, part_first
 
 SERIAL_BELOW = 1500  # triangles below which one thread is faster than starting the others (about 50 us a loop)
-# The same for loops with little work per iteration: boxes, tree refit, sharp edges, reduction. Measured with two cores: equal at
-# 21,000 triangles; at 105,000 the search is 1.3 times as fast on both cores.
-SERIAL_CHEAP_BELOW = 30000
+# Of one thread per triangle: in the loops over nearby pairs, and in cheap loops (boxes, tree refit, sharp edges, reduction)
+TRIANGLE_SECONDS, CHEAP_SECONDS = 5e-7, 5e-9
 CHUNKS = {"cpu": 64, "cuda": 4096}  # chunks of a list that are processed in parallel, each with its own part of a buffer
 NONFINITE, ACTIVE, PAIRS = 0, 1, 2  # indices into Surface.count
 INSIDE_BITS = 31  # of Surface.inside; one vertex is almost never inside two colliders with the same bit
@@ -91,14 +91,16 @@ def build_surface(
     """Allocate and fill the fields.
 
     rest: (v,3) [m]; properties: soft, self_on, mode, thickness and edge, (n_bodies,) each, and attached, (n_bodies, n_bodies)
-    bool, if any are. serial: None decides by size.
+    bool, if any are. serial: None decides by size, and by what threads gain.
     """
     t, bodies, attached = topology, len(properties["soft"]), properties.get("attached")
     n, v = len(t.triangle), len(t.node)
-    serial_cheap = serial
+    on_cpu = runtime.arch == "cpu"
+    if serial is None and on_cpu and n < SERIAL_BELOW:
+        serial = True
+    chunks, serial_cheap = 1 if serial else CHUNKS[runtime.arch], serial
     if serial is None:
-        serial, serial_cheap = (runtime.arch == "cpu" and n < limit for limit in (SERIAL_BELOW, SERIAL_CHEAP_BELOW))
-    chunks = 1 if serial else CHUNKS[runtime.arch]
+        serial, serial_cheap = (on_cpu and not parallel.pays(n * seconds) for seconds in (TRIANGLE_SECONDS, CHEAP_SECONDS))
     tables = {name: getattr(t, name) for name in ("triangle", "body", "node", "neighbour", "owns")}
     tables |= {name: getattr(t, name) for name in ("ring_start", "ring", "around_start", "around")}
     tables |= {name: properties[name] for name in ("soft", "self_on")} | {"first_of": t.first}
