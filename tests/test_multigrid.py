@@ -14,8 +14,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import scipy.linalg as sl
 import scipy.sparse as sp
 import scipy.sparse.linalg as spl
+import taichi as ti
+from lanes import opened
 from scenes import built, cube, rubber
 
 import taisoft as ts
@@ -64,6 +67,13 @@ def random_matrix(seed: int = 3) -> tuple[sp.bsr_matrix, np.ndarray, np.ndarray]
 
 
 @pytest.fixture
+def f64():
+    """Taichi in that precision."""
+    with opened("f64"):
+        yield
+
+
+@pytest.fixture
 def several_levels(monkeypatch):
     """Coarsen small matrices too."""
     monkeypatch.setattr(multigrid, "SMALL", 40)
@@ -74,7 +84,9 @@ def dense_cycle(cycle: Multigrid, k: int, A: np.ndarray, r: np.ndarray) -> np.nd
     """The formula of `multigrid`, with the coarse matrices formed here."""
     if k == len(cycle.levels):
         return np.linalg.solve(A, r)
-    P, S = cycle.levels[k].prolongation.toarray(), cycle.levels[k].smoother.toarray()
+    level = cycle.levels[k]
+    n, d, P = level.matrix.n_rows, level.matrix.rows, level.prolongation.to_scipy().toarray()
+    S = sl.block_diag(*level.smoother.to_numpy().reshape(n, d, -1)[:, :, :d].swapaxes(1, 2))
     coarse = P.T @ A @ P
     coarse += np.diag(np.diag(coarse) == 0.0)  # unused unknowns
     x = S @ r
@@ -82,9 +94,9 @@ def dense_cycle(cycle: Multigrid, k: int, A: np.ndarray, r: np.ndarray) -> np.nd
     return x + S @ (r - A @ x)
 
 
-def test_a_cycle_equals_the_dense_reference(several_levels):
+def test_a_cycle_equals_the_dense_reference(several_levels, f64):
     A, modes, free = random_matrix()
-    cycle, r = Multigrid(A, modes), np.random.default_rng(4).standard_normal(free.shape) * free
+    cycle, r = Multigrid(A, modes, ti.f64), np.random.default_rng(4).standard_normal(free.shape) * free
     expected = dense_cycle(cycle, 0, A.toarray(), r.reshape(-1))
     found = cycle.apply(r.reshape(-1))
     assert len(cycle.levels) >= 2 and cycle.n_bytes > A.data.nbytes
@@ -92,9 +104,9 @@ def test_a_cycle_equals_the_dense_reference(several_levels):
     assert not found[~free.reshape(-1)].any() and np.abs(found[free.reshape(-1)]).min() > 0.0
 
 
-def test_a_cycle_is_symmetric_and_positive_definite(several_levels):
+def test_a_cycle_is_symmetric_and_positive_definite(several_levels, f64):
     A, modes, free = random_matrix()
-    cycle, f = Multigrid(A, modes), free.reshape(-1)
+    cycle, f = Multigrid(A, modes, ti.f64), free.reshape(-1)
     M = np.array([cycle.apply(e) for e in np.eye(len(f))[f]])[:, f]
     assert np.abs(M - M.T).max() < 1e-12 * np.abs(M).max()
     assert np.linalg.eigvalsh(0.5 * (M + M.T)).min() > 0.0
@@ -102,16 +114,16 @@ def test_a_cycle_is_symmetric_and_positive_definite(several_levels):
     assert 0.0 < convergence.min() and convergence.max() < 1.0 + 1e-9
 
 
-def test_a_narrow_band_is_solved_exactly():
+def test_a_narrow_band_is_solved_exactly(f64):
     A, modes, free = random_matrix()
-    cycle, b = Multigrid(A, modes), np.random.default_rng(5).standard_normal(free.size)
+    cycle, b = Multigrid(A, modes, ti.f64), np.random.default_rng(5).standard_normal(free.size)
     assert not cycle.levels and np.abs(A @ cycle.apply(b) - b).max() < 1e-8
 
 
-def test_an_indefinite_matrix_is_refused():
+def test_an_indefinite_matrix_is_refused(f64):
     A, modes, _ = random_matrix()
     with pytest.raises(np.linalg.LinAlgError):
-        Multigrid((A - 200.0 * sp.identity(A.shape[0])).tobsr((3, 3)), modes)
+        Multigrid((A - 200.0 * sp.identity(A.shape[0])).tobsr((3, 3)), modes, ti.f64)
 
 
 def test_aggregates_cover_the_included_nodes_and_are_connected():
@@ -144,14 +156,14 @@ def test_rigid_motions_are_prolonged_exactly():
     assert np.allclose(turned, scale * modes[:, :, 5])
 
 
-def test_the_smoothed_prolongation_keeps_the_motions_without_energy(several_levels):
+def test_the_smoothed_prolongation_keeps_the_motions_without_energy(several_levels, f64):
     with built(held_box(), "f64") as made:
         K = made.oracle.stiffness(made.oracle.rest, projected=True)
     n = len(made.oracle.rest)
     A = (sp.csr_matrix(K) + 1e-6 * sp.identity(3 * n)).tobsr((3, 3))
     A.sort_indices()
     modes = rigid_modes(made.oracle.rest, np.ones((n, 3), dtype=bool))
-    P = Multigrid(A, modes).levels[0].prolongation.toarray()
+    P = Multigrid(A, modes, ti.f64).levels[0].prolongation.to_scipy().toarray()
     for mode in modes.reshape(-1, MODES).T:
         nearest = P @ np.linalg.lstsq(P, mode, rcond=None)[0]
         assert np.linalg.norm(nearest - mode) < 1e-8 * np.linalg.norm(mode)
@@ -180,7 +192,7 @@ def assembled(made, shift: float = 0.0) -> tuple:
 def test_the_solution_is_scipys(several_levels, precision):
     with built(held_box(), precision) as made:
         A, w, matrix, free = assembled(made, shift=100.0)
-        cycle = Multigrid(matrix, rigid_modes(made.oracle.rest, free))
+        cycle = Multigrid(matrix, rigid_modes(made.oracle.rest, free), made.model.real)
         tolerance = {"f64": 1e-12, "f32": 1e-6}[precision]
         result = host_pcg.solve(made.model, A, w, tolerance, 200, cycle.apply)
         y = w.y.to_numpy().astype(np.float64).reshape(-1)
@@ -195,7 +207,7 @@ def test_the_solution_is_scipys(several_levels, precision):
 def test_negative_curvature_is_reported():
     with built(held_box(), "f64") as made:
         A, w, matrix, free = assembled(made)
-        cycle = Multigrid(matrix, rigid_modes(made.oracle.rest, free))
+        cycle = Multigrid(matrix, rigid_modes(made.oracle.rest, free), made.model.real)
         A.diagonal.host[:, [0, 5, 10]] -= 3e4
         result = host_pcg.solve(made.model, A, w, 1e-8, 200, cycle.apply)
         assert result.negative and not result.converged
@@ -209,7 +221,7 @@ def test_iterations_hardly_grow_with_the_mesh(monkeypatch):
     for cells in ((6, 3, 3), (12, 6, 6), (24, 12, 12)):
         with built(held_box(cells), "f64") as made:
             A, w, matrix, free = assembled(made)
-            cycle = Multigrid(matrix, rigid_modes(made.oracle.rest, free))
+            cycle = Multigrid(matrix, rigid_modes(made.oracle.rest, free), made.model.real)
             counts.append(host_pcg.solve(made.model, A, w, 1e-8, 200, cycle.apply).iterations)
             plain.append(pcg.solve(made.model, A, w, 1e-8, 2000).iterations)
     assert plain[-1] > 2.5 * plain[0] and counts[-1] < 35 and counts[-1] < 1.5 * counts[1]

@@ -32,9 +32,9 @@ from taisoft.linear.pcg_work import LinearResult
 if TYPE_CHECKING:
     from taisoft.dynamics.stage_system import StageSystem
 
-# Durations in iterations of `pcg`, measured on one core: a multigrid iteration takes RATIO, by precision, plus OVERHEAD over the
-# number of nodes; building takes BUILD. A solve by multigrid is expected to take ITERATIONS, before the first one.
-RATIO, OVERHEAD, BUILD, ITERATIONS = {ti.f32: 9.0, ti.f64: 5.0}, 10_000, 300, 10
+# Durations in iterations of `pcg`, measured on one core and on two: a multigrid iteration takes RATIO plus OVERHEAD over the number
+# of nodes, by precision; building takes BUILD. A solve by multigrid is expected to take ITERATIONS, before the first one.
+RATIO, OVERHEAD, BUILD, ITERATIONS = {ti.f32: 2.0, ti.f64: 1.5}, {ti.f32: 40_000, ti.f64: 28_000}, 300, 10
 GROWTH, SLACK = 2.0, 10  # a solve that takes more than GROWTH times the first iterations + SLACK requires a new hierarchy
 LONGEST = 300  # iterations of a solve with a new hierarchy
 PERIOD = 128  # solves by multigrid between trials of pcg
@@ -51,7 +51,7 @@ class LinearSolver:
         self._arena, self._volumes = FieldArena(), None  # of `volume_pcg`, built on first use
         self._use_volumes: bool | None = None  # None: to be decided
         self._prepared = -1  # `StageSystem.n_formed` of the matrix it was prepared for
-        self._ratio = RATIO[model.real] + OVERHEAD / model.n_nodes  # duration of an iteration of multigrid over one of pcg
+        self._ratio = RATIO[model.real] + OVERHEAD[model.real] / model.n_nodes  # duration of an iteration of multigrid over one of pcg
         self.forget()
 
     def forget(self) -> None:
@@ -195,4 +195,4 @@ class LinearSolver:
         row = block_rows(matrix)
         matrix.data *= free[row][:, :, None] & free[matrix.indices][:, None, :]
         matrix.data[matrix.indices == row] += np.eye(3) * ~free[:, :, None]
-        self._hierarchy, self._built = Multigrid(matrix, rigid_modes(x, free)), (c, beta, x, free)
+        self._hierarchy, self._built = Multigrid(matrix, rigid_modes(x, free), m.real), (c, beta, x, free)

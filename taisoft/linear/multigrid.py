@@ -1,4 +1,4 @@
-"""Smoothed aggregation multigrid: a symmetric V-cycle as preconditioner of conjugate gradients, on the host in f64.
+"""Smoothed aggregation multigrid: a symmetric V-cycle as preconditioner of conjugate gradients.
 
 Level: A, its smoother S = omega D^-1 with the diagonal blocks D of A, and the prolongation P = (I - omega_P D^-1 A) T of the
 next level, where T makes each aggregate a rigid body (`aggregation`) and the next level's matrix is P^T A P. A cycle adds, for a
@@ -6,7 +6,8 @@ residual r,
     x = S r,   x += P coarse(P^T (r - A x)),   x += S (r - A x).
 With omega below 2 over the largest eigenvalue of D^-1 A, that is symmetric and positive definite if A is. The number of
 iterations hardly depends on the size of the mesh. The coarsest level is solved by a banded Cholesky factorisation; a slender
-bar's matrix has a narrow band, so it may be the first level.
+bar's matrix has a narrow band, so it may be the first level. Levels are built on the host in f64; a cycle runs in kernels in the
+model's precision, but for the coarsest level.
 Source: Vanek, Mandel and Brezina, "Algebraic multigrid by smoothed aggregation for second and fourth order elliptic problems",
 Computing 56, 1996.
 Weakness: nearly incompressible materials, whose stiff volumes the smoother cannot separate, still take many iterations.
@@ -19,7 +20,9 @@ import scipy.linalg as sl
 import scipy.sparse as sp
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
+from taisoft.backend.arrays import FieldArena
 from taisoft.linear.aggregation import MODES, prolongation
+from taisoft.linear.block_rows import LANES, CycleLevel, ascend, descend, padded, upload_matrix
 from taisoft.mesh.aggregates import aggregate
 from taisoft.ranges import owners
 
@@ -32,10 +35,10 @@ SHIFT = 1e-12  # of its diagonal, added to the coarsest matrix: rounding must no
 
 @dataclass(frozen=True, eq=False)
 class Level:
-    """One level above the coarsest: block matrices."""
+    """One level above the coarsest, on the host."""
 
     matrix: sp.bsr_matrix
-    smoother: sp.bsr_matrix  # S, block diagonal
+    smoother: np.ndarray  # (n, d, d) blocks of S
     prolongation: sp.bsr_matrix
     restriction: sp.bsr_matrix  # its transpose
 
@@ -55,34 +58,70 @@ class BandedCholesky:
 
 
 class Multigrid:
-    """Preconditioner of a symmetric positive definite matrix."""
+    """Preconditioner of a symmetric positive definite matrix. Taichi must run on the CPU, in precision `real`."""
 
-    def __init__(self, matrix: sp.bsr_matrix, modes: np.ndarray):
+    def __init__(self, matrix: sp.bsr_matrix, modes: np.ndarray, real):
         """matrix: with sorted square blocks (d, d) and all diagonal ones; modes: (n, d, 6), 0 on rows that are the identity's.
 
         Raises numpy.linalg.LinAlgError if the matrix is not positive definite, as far as the factorisations show.
         """
-        self.levels: list[Level] = []
+        self._arena = FieldArena()
+        self.levels: list[CycleLevel] = []
+        host = []
         while (found := _factorise(matrix)) is None:
             level, matrix, modes = _coarsen(matrix, modes)
-            self.levels.append(level)
+            host.append(level)
         self.coarsest = found
+        if host:
+            self._upload(host, real)
+
+    def _upload(self, host: list[Level], real) -> None:
+        """Make the levels on the device."""
+        arena, levels = self._arena, len(host)
+        lanes = [LANES[level.matrix.blocksize[0]] for level in host] + [LANES[MODES]]
+        sizes = [level.prolongation.shape[0] // level.prolongation.blocksize[0] for level in host]
+        sizes.append(host[-1].prolongation.shape[1] // MODES)
+        vectors = [
+            [arena.vectors(f"multigrid_{name}_{k}", real, n, n=width) for name in ("r", "x", "other")[: 3 if k < levels else 2]]
+            for k, (n, width) in enumerate(zip(sizes, lanes))
+        ]
+        for k, level in enumerate(host):
+            r, x, other = vectors[k]
+            below = vectors[k + 1]
+            smoother = padded(level.smoother, lanes[k])
+            self.levels.append(
+                CycleLevel(
+                    matrix=upload_matrix(level.matrix, arena, f"multigrid_matrix_{k}", real),
+                    smoother=arena.vectors(f"multigrid_smoother_{k}", real, len(smoother), smoother, n=smoother.shape[1]),
+                    prolongation=upload_matrix(level.prolongation, arena, f"multigrid_prolongation_{k}", real),
+                    restriction=upload_matrix(level.restriction, arena, f"multigrid_restriction_{k}", real),
+                    r=r,
+                    x=x,
+                    other=other,
+                    next_r=below[0],
+                    next_x=below[-1],  # after its own cycle
+                )
+            )
 
     @property
     def n_bytes(self) -> int:
         """Memory of all levels."""
-        matrices = [m for k in self.levels for m in (k.matrix, k.smoother, k.prolongation, k.restriction)]
-        return self.coarsest.factor.nbytes + sum(m.data.nbytes + m.indices.nbytes + m.indptr.nbytes for m in matrices)
+        return self.coarsest.factor.nbytes + sum(self._arena.bytes.values())
 
-    def apply(self, r: np.ndarray, level: int = 0) -> np.ndarray:
+    def apply(self, r: np.ndarray) -> np.ndarray:
         """One V-cycle on a residual (n unknowns)."""
-        if level == len(self.levels):
+        if not self.levels:
             return self.coarsest.solve(r)
-        here = self.levels[level]
-        x = here.smoother @ r
-        x += here.prolongation @ self.apply(here.restriction @ (r - here.matrix @ x), level + 1)
-        x += here.smoother @ (r - here.matrix @ x)
-        return x
+        first, last = self.levels[0], self.levels[-1]
+        rows = first.matrix.rows
+        first.r.host[:, :rows] = r.reshape(-1, rows)
+        for level in self.levels:
+            descend(level)
+        b = last.next_r.host[:, :MODES].astype(np.float64).reshape(-1)
+        last.next_x.host[:, :MODES] = self.coarsest.solve(b).reshape(-1, MODES)
+        for level in reversed(self.levels):
+            ascend(level)
+        return first.other.host[:, :rows].astype(np.float64).reshape(-1)
 
 
 def block_rows(A: sp.bsr_matrix) -> np.ndarray:
@@ -130,8 +169,7 @@ def _coarsen(A: sp.bsr_matrix, modes: np.ndarray) -> tuple[Level, sp.bsr_matrix,
     diagonal = np.flatnonzero(coarse.indices == block_rows(coarse))
     node, mode = np.nonzero(unused)
     coarse.data[diagonal[node], mode, mode] = 1.0
-    smoother = sp.bsr_matrix(((SMOOTHER / largest) * inverse, own[:-1], own), shape=A.shape)
-    return Level(A, smoother, P, transposed), coarse, coarse_modes
+    return Level(A, (SMOOTHER / largest) * inverse, P, transposed), coarse, coarse_modes
 
 
 def _largest_eigenvalue(A: sp.bsr_matrix, inverse: sp.bsr_matrix, included: np.ndarray) -> float:
