@@ -165,15 +165,17 @@ def test_stiffness_by_finite_differences_of_the_forces(rig, squeezed):
 
 
 def test_pattern_is_the_node_graph(rig):
-    """Ascending columns without the diagonal, a block for each pair of a tet's nodes."""
+    """Half-rows left and right of the diagonal with ascending columns, a block for each pair of a tet's nodes."""
     edges = set()
     for tets, *_ in rig.oracle.parts:
         for tet in tets:
             edges |= {(int(a), int(b)) for a in tet for b in tet if a != b}
     start, column = rig.matrix.row_start.to_numpy(), rig.matrix.column.to_numpy()
-    rows = [list(column[start[i] : start[i + 1]]) for i in range(rig.model.n_nodes)]
-    assert {(i, int(j)) for i, row in enumerate(rows) for j in row} == edges
+    n = rig.model.n_nodes
+    rows = [list(column[start[i] : start[i + 1]]) for i in range(2 * n)]
+    assert {(i % n, int(j)) for i, row in enumerate(rows) for j in row} == edges
     assert all(row == sorted(set(row)) for row in rows) and 2 * rig.matrix.n_edges == len(edges)
+    assert all(j < i if i < n else j > i - n for i, row in enumerate(rows) for j in row)
 
 
 @pytest.mark.parametrize("rig", ["f32"], indirect=True)  # each law's own projection is tested in f64 with the laws

@@ -170,7 +170,7 @@ def test_lists_of_a_subset(rig):
         count = part.count.to_numpy()
         assert part.node.to_numpy()[: count[NODES]].tolist() == rig.nodes.tolist()
         start, column = A.row_start.to_numpy(), A.column.to_numpy()
-        row = np.repeat(np.arange(m.n_nodes), np.diff(start))
+        row = np.repeat(np.arange(2 * m.n_nodes), np.diff(start)) % m.n_nodes
         ends = np.sort(np.stack([row[A.edge_upper.to_numpy()], column[A.edge_upper.to_numpy()]], axis=1), axis=1)
         touched = np.flatnonzero(np.isin(ends, rig.nodes).any(axis=1))
         assert 0 < len(touched) < A.n_edges and part.edge.to_numpy()[: count[EDGES]].tolist() == touched.tolist()
@@ -217,7 +217,7 @@ def test_restricted_kernels_compute_the_rows_of_the_whole_mesh(rig, threads):
     residual, value, diagonal, y, norms = evaluate(rig, model, rig.nodes)
     n, some = rig.model.n_nodes, np.isin(np.arange(rig.model.n_nodes), rig.nodes)
     start, column = rig.system.matrix.row_start.to_numpy(), rig.system.matrix.column.to_numpy()
-    row = np.repeat(np.arange(n), np.diff(start))
+    row = np.repeat(np.arange(2 * n), np.diff(start)) % n
     for restricted, full in ((residual, whole[0]), (diagonal, whole[2])):
         assert np.array_equal(restricted[some], full[some], equal_nan=True) and np.isnan(restricted[~some]).all()
     assert np.array_equal(value[some[row]], whole[1][some[row]], equal_nan=True)

@@ -52,7 +52,7 @@ def fill(rig, dense: np.ndarray) -> sp.csr_matrix:
     """Upload a matrix with the node graph's pattern; returns it as stored, rounded."""
     blocks = dense.reshape(rig.model.n_nodes, 3, rig.model.n_nodes, 3).transpose(0, 2, 1, 3)
     start, column = rig.matrix.row_start.to_numpy(), rig.matrix.column.to_numpy()
-    row = np.repeat(np.arange(rig.model.n_nodes), np.diff(start))
+    row = np.repeat(np.arange(2 * rig.model.n_nodes), np.diff(start)) % rig.model.n_nodes
     own = np.arange(rig.model.n_nodes)
     rig.matrix.value.from_numpy(block_csr.packed(blocks[row, column]).astype(rig.machine.np_real))
     rig.matrix.diagonal.from_numpy(block_csr.packed(blocks[own, own]).astype(rig.machine.np_real))

@@ -43,7 +43,7 @@ def damping_of(m: ti.template(), damper: ti.template(), mass: ti.template(), sti
     ti.loop_config(serialize=True)
     for i in range(m.n_nodes):
         mass[i] = rayleigh_damping.mass_force(m, i, m.state.v[i])
-        stiffness[i] = rayleigh_damping.stiffness_force(m, i, row_times(m, damper, i, m.state.v))
+        stiffness[i] = rayleigh_damping.stiffness_force(m, i, row_times(m, damper, 0, i, m.state.v))
 
 
 @pytest.fixture(scope="module", params=[1, 2])

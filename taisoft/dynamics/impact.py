@@ -62,11 +62,13 @@ def impact_residual(m: ti.template(), A: ti.template(), k: ti.template(), i, tau
     if ti.static(m.consistent):
         mass = m.mass_matrix.diagonal[i]
     r = ti.Vector([0.0, 0.0, 0.0], m.real)
-    for at in range(A.row_start[i], A.row_start[i + 1]):
-        j = A.column[at]
-        r += block_times(A.value[at], ti.cast((m.state.x[j] - k.x_linear[j]) / tau - velocity_jump, m.real))
-        if ti.static(m.consistent):
-            mass += m.mass_matrix.value[at]
+    for half in range(2):
+        row = i + half * m.n_nodes
+        for at in range(A.row_start[row], A.row_start[row + 1]):
+            j = A.column[at]
+            r += block_times(A.value[at], ti.cast((m.state.x[j] - k.x_linear[j]) / tau - velocity_jump, m.real))
+            if ti.static(m.consistent):
+                mass += m.mass_matrix.value[at]
     return r + inertia * mass * ti.cast(velocity_jump, m.real)
 
 

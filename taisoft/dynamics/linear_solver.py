@@ -32,8 +32,8 @@ from taisoft.linear.pcg_work import LinearResult
 if TYPE_CHECKING:
     from taisoft.dynamics.stage_system import StageSystem
 
-# Durations in iterations of `pcg`, measured on one core and on two: a multigrid iteration takes RATIO plus OVERHEAD over the number
-# of nodes, by precision; building takes BUILD. A solve by multigrid is expected to take ITERATIONS, before the first one.
+# Durations in iterations of `pcg`, measured on one core and on two: a multigrid iteration takes RATIO plus OVERHEAD over the
+# number of nodes, by precision; building takes BUILD. A solve by multigrid is expected to take ITERATIONS, before the first one.
 RATIO, OVERHEAD, BUILD, ITERATIONS = {ti.f32: 2.0, ti.f64: 1.5}, {ti.f32: 40_000, ti.f64: 28_000}, 300, 10
 GROWTH, SLACK = 2.0, 10  # a solve that takes more than GROWTH times the first iterations + SLACK requires a new hierarchy
 LONGEST = 300  # iterations of a solve with a new hierarchy
@@ -51,7 +51,8 @@ class LinearSolver:
         self._arena, self._volumes = FieldArena(), None  # of `volume_pcg`, built on first use
         self._use_volumes: bool | None = None  # None: to be decided
         self._prepared = -1  # `StageSystem.n_formed` of the matrix it was prepared for
-        self._ratio = RATIO[model.real] + OVERHEAD[model.real] / model.n_nodes  # duration of an iteration of multigrid over one of pcg
+        # Duration of an iteration of multigrid over one of pcg
+        self._ratio = RATIO[model.real] + OVERHEAD[model.real] / model.n_nodes
         self.forget()
 
     def forget(self) -> None:

@@ -21,7 +21,7 @@ from taisoft.dynamics.contact_terms import (
 from taisoft.dynamics.stage import place_node
 from taisoft.fem.chunks import part_first, total
 from taisoft.fem.state import OTHER_SUM, STEP_LENGTH, SUM
-from taisoft.linear.block_csr import block_times, partial_row_times
+from taisoft.linear.block_csr import block_times, off_diagonal_times
 from taisoft.linear.pcg_work import dot64
 
 ROOT, TRIES, LONGEST = 0.05, 40, 1e3  # tolerance over the initial slope; maximum trial lengths; longest step length
@@ -94,7 +94,7 @@ def step_length(k: ti.template(), linear_slope, curvature, start, r_scale):
 def node_slope(m: ti.template(), s: ti.template(), A: ti.template(), k: ti.template(), chunk, i):
     """Return (r.y, y.A y) of node i; store its row of A y, and base = x."""
     y = s.pcg.y[i]
-    q = block_times(k.coupling.base[i], y) + partial_row_times(m, A, chunk, A.row_start[i], A.row_start[i + 1], s.pcg.y)
+    q = block_times(k.coupling.base[i], y) + off_diagonal_times(m, A, chunk, i, s.pcg.y)
     s.pcg.q[i] = q
     s.base[i] = m.state.x[i]
     return dot64(m.free[i] * s.residual[i], y), dot64(y, q)

@@ -21,7 +21,7 @@ from taisoft.fem.chunks import part_first, total
 from taisoft.fem.dependents import force_with_dependents
 from taisoft.fem.lanes import mass_times
 from taisoft.fem.model import Model
-from taisoft.fem.node_graph import BLOCKS, EDGES, NODES, Subset, n_nodes_of, node_of
+from taisoft.fem.node_graph import BLOCKS, EDGES, NODES, Subset, n_nodes_of, node_of, whole_rows
 from taisoft.fem.pattern import patch_nodes
 from taisoft.fem.state import END_SLOPE, N_NORMS, OTHER_SUM, START_SLOPE, SUM
 from taisoft.fem.terms import elasticity, rayleigh_damping
@@ -258,9 +258,11 @@ class SubsetLists:
 
     def __init__(self, m: Model, A: BlockCsr):
         self._groups = m.groups
-        self.start, self.column, upper, lower = download([A.row_start, A.column, A.edge_upper, A.edge_lower])
-        self._edge = np.zeros(2 * A.n_edges, dtype=np.int32)  # of each entry of the matrix
-        self._edge[upper] = self._edge[lower] = np.arange(A.n_edges)
+        half_start, column, upper, lower = download([A.row_start, A.column, A.edge_upper, A.edge_lower])
+        self.start, order = whole_rows(half_start)
+        edge = np.zeros(2 * A.n_edges, dtype=np.int32)  # of each entry of the matrix
+        edge[upper] = edge[lower] = np.arange(A.n_edges)
+        self.column, self._edge = column[order], edge[order]
         self._tet_start, entry = download([m.gather_start, m.gather_entry])
         self._block = np.zeros(len(entry), dtype=np.int32)  # of each tet at each node
         for g in m.groups:

@@ -160,8 +160,10 @@ def mass_times(m: ti.template(), i, u: ti.template()):
     s = ti.Vector([0.0, 0.0, 0.0], ti.f64)
     if ti.static(m.consistent):
         s = ti.cast(m.mass_matrix.diagonal[i], ti.f64) * ti.cast(u[i], ti.f64)
-        for k in range(m.mass_matrix.row_start[i], m.mass_matrix.row_start[i + 1]):
-            s += ti.cast(m.mass_matrix.value[k], ti.f64) * ti.cast(u[m.mass_matrix.column[k]], ti.f64)
+        for half in range(2):
+            row = i + half * m.n_nodes
+            for k in range(m.mass_matrix.row_start[row], m.mass_matrix.row_start[row + 1]):
+                s += ti.cast(m.mass_matrix.value[k], ti.f64) * ti.cast(u[m.mass_matrix.column[k]], ti.f64)
     else:
         s = ti.cast(m.mass[i], ti.f64) * ti.cast(u[i], ti.f64)
     return s

@@ -64,8 +64,8 @@ class Group:
 class MassMatrix:
     """Symmetric mass matrix [kg] with the stiffness pattern and one number per node pair, the same for each axis."""
 
-    row_start: Any  # (n_nodes + 1) i32
-    column: Any  # (2 n_pairs) i32, ascending in each row, no diagonal
+    row_start: Any  # (2 n_nodes + 1) i32: half-rows as in `node_graph.NodeGraph`
+    column: Any  # (2 n_pairs) i32
     value: Any  # (2 n_pairs)
     diagonal: Any  # (n_nodes)
 
@@ -352,7 +352,7 @@ def _build_mass_matrix(
     scene: Scene, dependents: DependentTable | None, model: Model, arena: FieldArena, graph: NodeGraph
 ) -> MassMatrix:
     mass = MassMatrix(
-        row_start=arena.field("mass_row_start", ti.i32, model.n_nodes + 1, graph.row_start.astype(np.int32)),
+        row_start=arena.field("mass_row_start", ti.i32, 2 * model.n_nodes + 1, graph.row_start.astype(np.int32)),
         column=arena.field("mass_column", ti.i32, len(graph.column), graph.column.astype(np.int32)),
         value=arena.field("mass_value", model.real, len(graph.column)),
         diagonal=arena.field("mass_diagonal", model.real, model.n_nodes),
@@ -365,7 +365,7 @@ def upload_mass_matrix(scene: Scene, dependents: DependentTable | None, mass: Ma
     """Fill the device matrix from the bodies' densities."""
     M = reference.mass_matrix(scene, dependents)
     start, column = download([mass.row_start, mass.column])
-    rows = owners(np.diff(start))
+    rows = owners(np.diff(start)) % (len(start) // 2)
     upload([(mass.value, np.asarray(M[rows, column]).reshape(-1)), (mass.diagonal, M.diagonal())])
 
 

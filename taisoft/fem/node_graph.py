@@ -20,11 +20,14 @@ PAIRS = {1: topology.EDGES, 2: (*topology.EDGES, *product(range(4), range(4, 10)
 
 @dataclass(frozen=True)
 class NodeGraph:
-    """Node pairs i < j, and the same as CSR rows: columns ascend within a row, without the diagonal."""
+    """Node pairs i < j, and the same as CSR half-rows: row i left of the diagonal is half-row i, right of it n_nodes + i.
+
+    Columns ascend within a half-row. A Gauss-Seidel sweep reads one kind alone: twice as fast as from whole rows, if they do not
+    fit into the caches.
+    """
 
     ends: np.ndarray  # (n_pairs, 2)
-    row_start: np.ndarray  # (n_nodes + 1)
-    row_upper: np.ndarray  # (n_nodes) first entry of a row right of the diagonal
+    row_start: np.ndarray  # (2 n_nodes + 1) of half-rows
     column: np.ndarray  # (2 n_pairs)
     upper: np.ndarray  # (n_pairs) index of (i, j) in column
     lower: np.ndarray  # (n_pairs) index of (j, i) in column
@@ -32,28 +35,36 @@ class NodeGraph:
 
     def entries(self, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
         """Return the index in `column` of each (row, column), of pairs in the graph."""
-        n = np.int64(len(self.row_start) - 1)
-        return np.searchsorted(owners(np.diff(self.row_start)) * n + self.column, rows * n + columns)
+        n = np.int64(len(self.row_start) // 2)
+        half_rows = rows + n * (columns > rows)
+        return np.searchsorted(owners(np.diff(self.row_start)) * n + self.column, half_rows * n + columns)
 
 
 def node_graph(pairs: np.ndarray, n_nodes: int) -> NodeGraph:
     """Build the graph of node pairs (k, 2), i < j; pairs may repeat."""
     key, pair = np.unique(pairs[:, 0] * np.int64(n_nodes) + pairs[:, 1], return_inverse=True)
     i, j = key // n_nodes, key % n_nodes
-    rows, columns = np.concatenate([i, j]), np.concatenate([j, i])
+    rows, columns = np.concatenate([n_nodes + i, j]), np.concatenate([j, i])
     order = np.lexsort((columns, rows))
     position = np.empty_like(order)
     position[order] = np.arange(len(order))
-    start = np.concatenate([[0], np.cumsum(np.bincount(rows, minlength=n_nodes))])
+    start = np.concatenate([[0], np.cumsum(np.bincount(rows, minlength=2 * n_nodes))])
     return NodeGraph(
         ends=np.stack([i, j], axis=1),
         row_start=start,
-        row_upper=start[:-1] + np.bincount(j, minlength=n_nodes),
         column=columns[order],
         upper=position[: len(key)],
         lower=position[len(key) :],
         pair=pair.reshape(-1),
     )
+
+
+def whole_rows(row_start: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the starts (n + 1) of whole rows and the order of their entries, ascending by column, from those of half-rows."""
+    n = len(row_start) // 2
+    row = owners(np.diff(row_start)) % n
+    start = np.concatenate([[0], np.cumsum(np.bincount(row, minlength=n))])
+    return start, np.argsort(row, kind="stable")  # left halves come first
 
 
 NODES, EDGES, BLOCKS = range(3)  # indices into `count`; from BLOCKS on: start of each group's blocks, then the total

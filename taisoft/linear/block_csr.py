@@ -18,7 +18,7 @@ from taisoft.backend.runtime import kernel
 from taisoft.errors import SimulationError
 from taisoft.fem.chunks import part_first
 from taisoft.fem.model import Model
-from taisoft.fem.node_graph import BLOCKS, EDGES, block_of, count_of, edge_of, n_nodes_of, node_of
+from taisoft.fem.node_graph import BLOCKS, EDGES, block_of, count_of, edge_of, n_nodes_of, node_of, whole_rows
 from taisoft.fem.pattern import MATRIX_BLOCKS, model_graph
 from taisoft.fem.springs import set_pair_entries
 from taisoft.fem.terms import rayleigh_damping
@@ -29,7 +29,7 @@ from taisoft.linear.patch_terms import PatchTerms, add_patches, build_patch_term
 # A block is a 12-vector, column by column, each padded with a zero: entry (r, c) is at 4 c + r. All entries share one address,
 # and a column times a number is one SIMD instruction.
 BLOCK = 12
-ROW_SUM_STEP, ROW_SUM_MASK = 4, 31  # entries of `row_sum` per chunk, so that threads write to different cache lines
+ROW_SUM_STEP = 4  # entries of `row_sum` per chunk, so that threads write to different cache lines
 SINGULAR = 1e-12  # of the product of its diagonal: a block with a smaller determinant counts as singular
 
 
@@ -38,12 +38,12 @@ class BlockCsr:
     """A symmetric matrix of 3x3 blocks with the model's node graph as pattern."""
 
     n_edges: Count
-    row_start: Any  # (n_nodes + 1) i32
-    row_upper: Any  # (n_nodes) i32: first entry of a row right of the diagonal
-    column: Any  # (2 n_edges) i32, ascending in each row, without the diagonal
+    row_start: Any  # (2 n_nodes + 1) i32: of half-rows left of the diagonal, then right of it, see `node_graph.NodeGraph`
+    column: Any  # (2 n_edges) i32, ascending in each half-row
     value: Any  # (2 n_edges) 12-vectors: blocks off the diagonal
     diagonal: Any  # (n_nodes) 12-vectors
     row_sum: Any  # 4-vectors: written but not read, see `keep_padding_lane`
+    row_sum_mask: int  # of the chunks that write to it
     element: Any  # K_ab of each tet, per block of tets (pair, entry, lane): a `Lanes` buffer
     element_at: Count  # its start, in vectors of lanes
     element_mask: int  # bit mask of an index into it, in vectors of lanes
@@ -86,14 +86,15 @@ def build_block_csr(model: Model, arena: FieldArena, prefix: str = "stiffness") 
     if model.mean_dilatation:
         rules["patches"] = build_patch_terms(model, arena, prefix, of_patches, n_edges)
     size = sum((g.last - g.first) * MATRIX_BLOCKS[g.order] * 9 for g in model.groups)
+    chunks = model.chunks if model.on_cpu else 1  # a power of two
     element = arena.lanes(f"{prefix}_element", model.real, size * model.lanes)
     return BlockCsr(
         n_edges=n_edges,
         row_start=copied("row_start", graph.row_start),
-        row_upper=copied("row_upper", graph.row_upper),
         column=copied("column", graph.column),
         **_values(model, arena, prefix, n_edges),
-        row_sum=arena.vectors(f"{prefix}_row_sum", model.real, ROW_SUM_STEP * (ROW_SUM_MASK + 1), n=4),
+        row_sum=arena.vectors(f"{prefix}_row_sum", model.real, ROW_SUM_STEP * (chunks - 1) + 1, n=4),
+        row_sum_mask=chunks - 1,
         element=element.memory,
         element_at=element.at // model.lanes,
         element_mask=element.mask // model.lanes,
@@ -133,8 +134,10 @@ def assemble(m: ti.template(), A: ti.template(), subset: ti.template(), projecte
     for j in range(n_nodes_of(m, subset)):
         i = node_of(subset, j)
         s = ti.Vector([0.0 for _ in ti.static(range(BLOCK))], m.real)
-        for k in range(A.row_start[i], A.row_start[i + 1]):
-            s -= A.value[k]
+        for half in range(2):
+            row = i + half * m.n_nodes
+            for k in range(A.row_start[row], A.row_start[row + 1]):
+                s -= A.value[k]
         A.diagonal[i] = s
 
 
@@ -179,13 +182,15 @@ def to_system(
         mass = m.mass[i]
         if ti.static(m.consistent):
             mass = m.mass_matrix.diagonal[i]
-        for at in range(A.row_start[i], A.row_start[i + 1]):
-            A.value[at] = k * A.value[at]
-            if ti.static(m.stiffness_damping):
-                A.value[at] += damping * damper.value[at]
-            if ti.static(m.consistent):
-                for r in ti.static(range(3)):
-                    A.value[at][5 * r] += inertia * m.mass_matrix.value[at]
+        for half in range(2):
+            row = i + half * m.n_nodes
+            for at in range(A.row_start[row], A.row_start[row + 1]):
+                A.value[at] = k * A.value[at]
+                if ti.static(m.stiffness_damping):
+                    A.value[at] += damping * damper.value[at]
+                if ti.static(m.consistent):
+                    for r in ti.static(range(3)):
+                        A.value[at][5 * r] += inertia * m.mass_matrix.value[at]
         d = k * A.diagonal[i]
         if ti.static(m.stiffness_damping):
             d += damping * damper.diagonal[i]
@@ -242,7 +247,7 @@ def keep_padding_lane(m: ti.template(), A: ti.template(), c, y):
     Conjugate gradient iterations then take 0.75 of the time if the matrix fits into the cache, 0.9 if it does not.
     """
     if ti.static(m.on_cpu):
-        A.row_sum[ROW_SUM_STEP * (c & ROW_SUM_MASK)] = y
+        A.row_sum[ROW_SUM_STEP * (c & A.row_sum_mask)] = y
 
 
 @ti.func
@@ -267,9 +272,21 @@ def partial_row_times_backward(m: ti.template(), A: ti.template(), c, first, las
 
 
 @ti.func
+def off_diagonal_times(m: ti.template(), A: ti.template(), c, i, x: ti.template()):
+    """((A - D) x)_i, D the diagonal blocks, within chunk c of a loop."""
+    y = ti.Vector([0.0, 0.0, 0.0, 0.0], m.real)
+    for half in range(2):
+        row = i + half * m.n_nodes
+        for k in range(A.row_start[row], A.row_start[row + 1]):
+            y += padded_times(A.value[k], x[A.column[k]])
+    keep_padding_lane(m, A, c, y)
+    return ti.Vector([y[0], y[1], y[2]])
+
+
+@ti.func
 def row_times(m: ti.template(), A: ti.template(), c, i, x: ti.template()):
     """(A x)_i, within chunk c of a loop."""
-    return block_times(A.diagonal[i], x[i]) + partial_row_times(m, A, c, A.row_start[i], A.row_start[i + 1], x)
+    return block_times(A.diagonal[i], x[i]) + off_diagonal_times(m, A, c, i, x)
 
 
 @kernel
@@ -298,7 +315,8 @@ def unpacked(blocks: np.ndarray) -> np.ndarray:
 def to_bsr(m: Model, A: BlockCsr) -> sp.bsr_matrix:
     """Copy the matrix to the host, blocks (3, 3) float64 in ascending columns."""
     start, column, value, diagonal = download([A.row_start, A.column, A.value, A.diagonal])
-    start, off, diagonal = start.astype(np.int64), unpacked(value), unpacked(diagonal)
+    start, order = whole_rows(start)
+    column, off, diagonal = column[order], unpacked(value[order]), unpacked(diagonal)
     shape = (3 * m.n_nodes, 3 * m.n_nodes)
     rows = np.arange(m.n_nodes)
     return sp.bsr_matrix((off, column, start), shape=shape) + sp.bsr_matrix(

@@ -70,37 +70,38 @@ def _times_other(m: ti.template(), A: ti.template(), w: ti.template(), c, first,
 @ti.func
 def _times_below(m: ti.template(), A: ti.template(), k: ti.template(), w: ti.template(), c, i, x: ti.template()):
     """(L x)_i."""
-    begin = A.row_start[i]
+    begin, row = A.row_start[i], i + m.n_nodes
     if ti.static(w.is_divided(k)):
         if ti.static(w.crossed):
             begin = w.own_begin[i]
         elif c % 2 == EVEN:
             begin = w.own_begin[i]
-    y = partial_row_times(m, A, c, begin, A.row_upper[i], x)
+    y = partial_row_times(m, A, c, begin, A.row_start[i + 1], x)
     if ti.static(w.is_divided(k)):
         if c % 2 == ODD:
             if ti.static(w.crossed):
                 y += _times_other(m, A, w, c, A.row_start[i], begin, EVEN, x)
-                y += _times_other(m, A, w, c, w.own_end[i], A.row_start[i + 1], EVEN, x)
+                y += _times_other(m, A, w, c, w.own_end[i], A.row_start[row + 1], EVEN, x)
             else:
-                y += partial_row_times(m, A, c, w.own_end[i], A.row_start[i + 1], x)
+                y += partial_row_times(m, A, c, w.own_end[i], A.row_start[row + 1], x)
     return y
 
 
 @ti.func
 def _times_above(m: ti.template(), A: ti.template(), k: ti.template(), w: ti.template(), c, i, x: ti.template()):
     """(L^T x)_i."""
-    end = A.row_start[i + 1]
+    row = i + m.n_nodes
+    end = A.row_start[row + 1]
     if ti.static(w.is_divided(k)):
         if ti.static(w.crossed):
             end = w.own_end[i]
         elif c % 2 == ODD:
             end = w.own_end[i]
-    y = partial_row_times_backward(m, A, c, A.row_upper[i], end, x)
+    y = partial_row_times_backward(m, A, c, A.row_start[row], end, x)
     if ti.static(w.is_divided(k)):
         if c % 2 == EVEN:
             if ti.static(w.crossed):
-                y += _times_other(m, A, w, c, end, A.row_start[i + 1], ODD, x)
+                y += _times_other(m, A, w, c, end, A.row_start[row + 1], ODD, x)
                 y += _times_other(m, A, w, c, A.row_start[i], w.own_begin[i], ODD, x)
             else:
                 y += partial_row_times(m, A, c, A.row_start[i], w.own_begin[i], x)
@@ -154,7 +155,7 @@ def _sweep_forward(m: ti.template(), A: ti.template(), k: ti.template(), w: ti.t
         rest = t - block_times(w.mirror[i], p) - _times_below(m, A, k, w, c, i, w.q)
         if ti.static(w.crossed and w.is_divided(k)):
             rest += _times_other(m, A, w, c, A.row_start[i], w.own_begin[i], c % 2, w.p)
-            rest += _times_other(m, A, w, c, w.own_end[i], A.row_start[i + 1], c % 2, w.p)
+            rest += _times_other(m, A, w, c, w.own_end[i], A.row_start[i + m.n_nodes + 1], c % 2, w.p)
         if ti.static(k.width > 0):
             rest -= gather_products(m, k, i)
         s = block_times(w.inverse[i], rest)

@@ -6,7 +6,7 @@ from taisoft.backend.runtime import kernel
 from taisoft.fem.chunks import total
 from taisoft.fem.node_graph import n_nodes_of, node_of
 from taisoft.fem.state import OTHER_SUM, SUM
-from taisoft.linear.block_csr import block_times, partial_row_times
+from taisoft.linear.block_csr import block_times, off_diagonal_times
 from taisoft.linear.coupling import form_product, gather_products
 from taisoft.linear.pcg_work import (
     CONVERGED,
@@ -62,7 +62,7 @@ def iterate_jacobi(m: ti.template(), A: ti.template(), k: ti.template(), w: ti.t
         if w.state[STATUS] == RUNNING:
             for at in range(_chunk_start(m, w, c), _chunk_start(m, w, c + 1)):
                 i = node_of(w.subset, at)
-                product = partial_row_times(m, A, 0, A.row_start[i], A.row_start[i + 1], w.p)
+                product = off_diagonal_times(m, A, 0, i, w.p)
                 if ti.static(k.width > 0):
                     product += block_times(k.base[i], w.p[i]) + gather_products(m, k, i)
                 else:

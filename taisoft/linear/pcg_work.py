@@ -37,8 +37,8 @@ class PcgWork:
     n_chunks: Count = 1  # of `pcg_gauss_seidel`
     chunk_shift: Count = 30  # a chunk has 2^chunk_shift nodes
     crossed: bool = False  # whether blocks couple different chunks of one parity
-    own_begin: Any = None  # (n_nodes) i32: first entry of each row within its chunk; None without chunks
-    own_end: Any = None  # (n_nodes) i32: one past the last
+    own_begin: Any = None  # (n_nodes) i32: first entry within its chunk of each left half-row; None without chunks
+    own_end: Any = None  # (n_nodes) i32: one past the last of each right half-row
     subset: Subset = EVERYTHING  # nodes that form the system
 
     def is_divided(self, coupling: Coupling) -> bool:
@@ -72,10 +72,11 @@ def _divide(model: Model, arena: FieldArena, matrix: BlockCsr) -> dict[str, Any]
     """Divide the rows into chunks of a power of two, whose parity a kernel finds at little cost."""
     shift = max(MIN_SHIFT, ((model.n_nodes - 1) // CHUNKS).bit_length())
     start, column = download([matrix.row_start, matrix.column])
-    row = owners(np.diff(start))
+    n = model.n_nodes
+    row = owners(np.diff(start)) % n
     apart = (column >> shift) - (row >> shift)
-    begin = start[:-1] + np.bincount(row[apart < 0], minlength=model.n_nodes)
-    end = start[1:] - np.bincount(row[apart > 0], minlength=model.n_nodes)
+    begin = start[:n] + np.bincount(row[apart < 0], minlength=n)
+    end = start[n + 1 :] - np.bincount(row[apart > 0], minlength=n)
     return {
         "n_chunks": -(-model.n_nodes // 2**shift),
         "chunk_shift": shift,
