@@ -1,14 +1,15 @@
-"""Scaling: time, memory and bytes per second of each kind of step from 1,000 to 200,000 tets.
+"""Scaling: time, memory and bytes per second of each kind of step from 1,000 to a million tets.
 
 taisoft bench scaling [--quick] [--sizes LIST] [--kind NAME] [--arch cpu|cuda] [--out FILE.json] [--plot FILE.png]
 
 Explicit and implicit steps of a beam, searches for contacts in a pile of cubes, explicit and implicit steps of two cubes in
-contact; on CUDA also with a million tets. Each kind and size runs in its own process, which makes its peak memory measurable. A
-time is the median over samples without compilation; spread is the interquartile range over the median. Exponents of time, set-up
-and memory over the tets are fitted in the logarithms; 1 is proportional, searches and sweeps over contacts grow with the surface,
-the power 2/3 of the tets. Bytes moved are a lower bound: each array that a loop uses counts once if read and once if written
-(benchmarks/scaling_bytes.py). They are compared with the best copy of 256 MB on as many threads. Exit status: 0, or 1 if
-something could not be measured. A full run takes about ten minutes on two cores.
+contact; those of the beam with a million tets, too. Where several threads are used, the same on one. Each kind and size runs in
+its own process, which makes its peak memory measurable. A time is the median over samples without compilation; spread is the
+interquartile range over the median. Exponents of time, set-up and memory over the tets are fitted in the logarithms; 1 is
+proportional, searches and sweeps over contacts grow with the surface, the power 2/3 of the tets. Bytes moved are a lower bound:
+each array that a loop uses counts once if read and once if written (benchmarks/scaling_bytes.py). They are compared with the
+best copy of 256 MB on as many threads. Exit status: 0, or 1 if something could not be measured. A full run takes about fifteen
+minutes on two cores.
 """
 
 import argparse
@@ -24,9 +25,10 @@ from taisoft.output.tables import percent, require_matplotlib, save, spread_of, 
 from .document import again_text, begin, earlier_numbers, exponent, plain, table
 from .runner import make_parser, parse_options, parse_result, print_result, progress, run_python
 from .scaling_bytes import GROUPS, Copy, copy_rate, measure_copy
-from .scaling_runs import EXPLICIT, KINDS, ON_ONE, PRECISION, Row, measure
+from .scaling_runs import KINDS, ON_ONE, PRECISION, Row, measure
 
-SIZES, QUICK_SIZES, CUDA_SIZE = (1_000, 4_000, 16_000, 64_000, 200_000), (500, 2_000), 1_000_000
+SIZES, QUICK_SIZES, LARGEST = (1_000, 4_000, 16_000, 64_000, 276_000), (500, 2_000), 1_000_000
+LARGEST_OF = ("explicit", "implicit", "stiff implicit")  # kinds measured with it
 COPY = "copy"
 COLOURS = ("#0072b2", "#56b4e9", "#d55e00", "#009e73", "#cc79a7", "#e69f00")
 PANEL = (4.6, 3.6)  # inches
@@ -52,15 +54,33 @@ def run_child(job: str, arch: str) -> list | dict | str:
 
 
 def measure_all(kinds: list[str], sizes: list[int], arch: str) -> Iterator[Row]:
-    """A row per kind and size, also for failures. ON_ONE runs only for sizes that used several threads."""
-    several: set[int] = set()
+    """A row per kind and size, also for failures; on one thread only where several were used before."""
+    several: dict[str, list[int]] = {}
     for kind in kinds:
-        for size in sizes if kind != ON_ONE else sorted(several):
+        one = kind.endswith(ON_ONE)
+        for size in several.get(kind.removesuffix(ON_ONE), []) if one else sizes:
+            if size == LARGEST and kind.removesuffix(ON_ONE) not in LARGEST_OF:
+                continue
             found = run_child(f"{kind}:{size}", arch)
             row = Row(kind, arch, tets=size, failure=found) if isinstance(found, str) else Row(**found)
-            if kind == EXPLICIT and row.threads > 1 and arch == "cpu":
-                several.add(size)
+            if row.threads > 1 and arch == "cpu":
+                several.setdefault(kind, []).append(size)
             yield row
+
+
+def gain_table(rows: Sequence[Row]) -> str:
+    """Speed of all threads over one; empty if no work was measured on both."""
+    on_one = {(row.kind, row.tets): row for row in measured(rows)}
+    both = [(row, on_one[place]) for row in measured(rows) if (place := (row.kind + ON_ONE, row.tets)) in on_one]
+    columns = (
+        ("<work", "{[0].kind}"),
+        ("tets", "{[0].tets:,}"),
+        ("threads", "{[0].threads}"),
+        ("ms", lambda pair: f"{1e3 * pair[0].timing.median:.4g}"),
+        ("on one [ms]", lambda pair: f"{1e3 * pair[1].timing.median:.4g}"),
+        ("gain", lambda pair: f"{pair[1].timing.median / pair[0].timing.median:.2f}"),
+    )
+    return table(both, columns)
 
 
 # --- tables -------------------------------------------------------------------------------------------------------------
@@ -198,7 +218,7 @@ def draw(rows: Sequence[Row], copies: Sequence[Copy], path: Path) -> None:
     )
     figure, axes = pyplot.subplots(1, 3, figsize=(3 * PANEL[0], PANEL[1] + 0.4), layout="constrained")
     for axis, (title, value) in zip(axes, panels):
-        for kind, colour in zip(KINDS, COLOURS, strict=True):
+        for kind, colour in zip((kind for kind in KINDS if not kind.endswith(ON_ONE)), COLOURS, strict=True):
             own = sorted((row for row in rows if row.kind == kind), key=lambda row: row.tets)
             if not own:
                 continue
@@ -243,15 +263,17 @@ def main(argv=None) -> int:
     if options.child:
         answer(options.child, options.arch)
         return 0
-    sizes = options.sizes or list(QUICK_SIZES if options.quick else (*SIZES, *((CUDA_SIZE,) if options.arch == "cuda" else ())))
+    sizes = options.sizes or list(QUICK_SIZES if options.quick else (*SIZES, LARGEST))
     document, numbers = begin("Scaling", options.arch, PRECISION)
     copies = run_child(COPY, options.arch)
     if isinstance(copies, str):
         raise SimulationError(copies)
     copies = [Copy(**copy) for copy in copies]
-    rows = list(measure_all([options.kind] if options.kind else list(KINDS), sizes, options.arch))
+    kinds = [kind for kind in KINDS if options.kind in (None, kind, kind.removesuffix(ON_ONE))]
+    rows = list(measure_all(kinds, sizes, options.arch))
     found = growths(rows)
     document.add("## Time\n\n" + time_table(rows))
+    document.add("## Threads\n\n" + gain_table(rows))
     document.add("## Phases\n\n" + phase_table(rows))
     document.add("## Memory\n\n" + memory_table(rows))
     document.add("## Bytes moved\n\n" + copy_table(copies) + "\n\n" + rate_table(rows, copies))

@@ -1,19 +1,19 @@
 """Measurements of `scaling.py`: one kind of work on one mesh.
 
 explicit:   velocity Verlet of a clamped beam that falls, stable neo-Hookean, at most 0.9 of the largest stable step.
-explicit, one thread: the same on one thread, for meshes on which taisoft uses all.
-implicit:   BDF2 of that beam, steps of 10 ms.
+implicit:   BDF2 of that beam, steps of 10 ms; stiff implicit: with a hundred times its Young's modulus.
 search:     a search for contacts by proximity among 27 cubes at rest that touch, the pile of `collision.py`.
 explicit contact, implicit contact: two cubes on the ground, the upper one off centre and slightly penetrating: symplectic
             Euler and Gauss-Seidel at 0.9 of the largest stable step, implicit Euler and the augmented Lagrangian at 10 ms.
 
-All in f32. Steps are timed first as a whole, then repeated from the same start with a stopwatch on their parts, which adds a
-small overhead. The first steps, which compile and grow buffers, are left out.
+Explicit, implicit and search also on one thread, where taisoft uses all. All in f32. Steps are timed first as a whole, then
+repeated from the same start with a stopwatch on their parts, which adds a small overhead. The first steps, which compile and
+grow buffers, are left out.
 """
 
 from collections.abc import Callable
 from contextlib import closing
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from time import perf_counter
 
@@ -46,7 +46,8 @@ SAMPLES, ROUNDS = 7, 15  # of explicit steps without contacts; of searches
 WARM, ENOUGH_SECONDS, MIN_TIMED, MAX_TIMED = 3, 3.0, 3, 20  # steps before, and steps that are timed one by one: time and number
 COUNTS = {"newton": "newton_iterations", "linear": "linear_iterations", "sweeps": "contact_iterations", "contacts": "n_contacts"}
 PRECISION = "f32"
-EXPLICIT, ON_ONE = "explicit", "explicit, one thread"
+ON_ONE = ", one thread"  # follows the name of a kind
+STIFF = 1e8  # [Pa]
 
 
 @dataclass
@@ -99,6 +100,13 @@ def beam(size: int) -> Scene:
     return beam_scene((4 * n, n, n), "SNH")
 
 
+def stiff_beam(size: int) -> Scene:
+    """The same, a hundred times as stiff."""
+    scene = beam(size)
+    scene.bodies[0].material = replace(scene.bodies[0].material, young=STIFF)
+    return scene
+
+
 def cubes_on_ground(size: int) -> Scene:
     """Two cubes on each other on the ground."""
     scene = two_cubes(max(1, round((size / 10) ** (1 / 3))), "proximity")
@@ -124,10 +132,14 @@ def _open(row: Row, build: Callable[[int], Scene], size: int, integrator: str, d
 # --- kinds of work ----------------------------------------------------------------------------------------------------
 
 
-def explicit_on_one(row: Row, size: int) -> None:
-    """Explicit steps on one thread for any mesh size."""
-    with patched(parallel, "pays", lambda seconds: False):
-        explicit(row, size)
+def on_one_thread(run: Callable[[Row, int], None]) -> Callable[[Row, int], None]:
+    """A kind of work on one thread for any mesh size."""
+
+    def on_one(row: Row, size: int) -> None:
+        with patched(parallel, "pays", lambda seconds: False):
+            run(row, size)
+
+    return on_one
 
 
 def explicit(row: Row, size: int) -> None:
@@ -258,11 +270,11 @@ def search(row: Row, size: int) -> None:
             row.moved = floor_bytes(("boxes", broad), found) + found["contacts"] * counts.found / rig.detection.buffer.capacity
 
 
+_THREADED = {"explicit": explicit, "implicit": partial(implicit, beam, "bdf2"), "search": search}
 KINDS: dict[str, Callable[[Row, int], None]] = {
-    EXPLICIT: explicit,
-    ON_ONE: explicit_on_one,
-    "implicit": partial(implicit, beam, "bdf2"),
-    "search": search,
+    **_THREADED,
+    **{name + ON_ONE: on_one_thread(run) for name, run in _THREADED.items()},
+    "stiff implicit": partial(implicit, stiff_beam, "bdf2"),
     "explicit contact": explicit_contact,
     "implicit contact": partial(implicit, cubes_on_ground, "implicit_euler"),
 }
