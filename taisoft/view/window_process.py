@@ -6,10 +6,9 @@ when the window is closed, when the other process asks for it, and when that pro
 
 import sys
 import time
-from multiprocessing.connection import Connection
 
-from taisoft.errors import TaisoftError
-from taisoft.view.link import Link, LinkClosed, SharedNodes, receive
+from taisoft.view.child_process import serve
+from taisoft.view.link import Link
 from taisoft.view.mirror import MirrorSimulation
 from taisoft.view.panel import Requests
 from taisoft.view.screen import Screen
@@ -33,7 +32,13 @@ class View:
         self._ended = False
 
     def run(self) -> None:
-        """Draw until the window is closed or the simulation ends it."""
+        """Draw until the window is closed or the simulation ends it; then close the window."""
+        try:
+            self._draw()
+        finally:
+            self._screen.close()
+
+    def _draw(self) -> None:
         self._receive(None)
         while not self._ended and not self._screen.closed:
             begin = time.perf_counter()
@@ -49,10 +54,6 @@ class View:
             timing = self._screen.timing
             self._link.send({"closed": True, "pictures": list(timing.pictures), "latencies": list(timing.latencies)})
 
-    def close(self) -> None:
-        """Close the window."""
-        self._screen.close()
-
     def _receive(self, timeout: float | None) -> None:
         """Take over all states that have come; wait up to a time [s] for the first."""
         while not self._ended and (message := self._link.receive(timeout)) is not None:
@@ -61,7 +62,7 @@ class View:
                 self._ended = True
                 return
             self._state, self._came = message, time.perf_counter()
-            self._sim.take(message, self._link.nodes.x, self._link.nodes.values)
+            self._sim.take(message, self._link.nodes.x[0], self._link.nodes.values[0])
             self._screen.plots.set_enabled(message["enabled"])
             self._send()  # at once, so that the simulation may send the next one
 
@@ -78,25 +79,5 @@ class View:
             self._confirmed = shown
 
 
-def main(socket: int, memory: int) -> None:
-    """Show the simulation at the other end of the link."""
-    connection = Connection(socket)
-    try:
-        description = receive(connection, None)
-        link = Link(connection, SharedNodes(description["n_nodes"], memory))
-        try:
-            view = View(link, description)
-        except TaisoftError as error:
-            link.send({"error": str(error)})
-            return
-        try:
-            link.send({"open": True})
-            view.run()
-        finally:
-            view.close()
-    except LinkClosed:
-        pass  # the simulation's process has ended
-
-
 if __name__ == "__main__":
-    main(*map(int, sys.argv[1:]))
+    serve(View, *map(int, sys.argv[1:]))
