@@ -26,7 +26,7 @@ from taisoft.view.scene_view import IN_PICTURES, scene_size
 SLOTS = 8  # states that wait to be drawn, besides the pictures that wait to be written
 MIN_PICTURES = 30  # fewer take less time than it takes to start a process
 CHILD = python_module("taisoft.view.picture_process")
-FAILURE = "pictures cannot be drawn"
+FAILURE = "the drawing of pictures failed"
 
 
 @dataclass(frozen=True)
