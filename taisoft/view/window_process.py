@@ -15,6 +15,7 @@ from taisoft.view.screen import Screen
 
 MAX_UNANSWERED = 64  # requests; later commands wait, so that a long step lets no queue grow
 IDLE_SHARE = 1.0  # time without drawing over that of drawing: with software Vulkan, drawing takes cores from the simulation
+ANSWER = 1.0 / 40.0  # time for which a picture may wait for the step that uses a drag, or as long as the last one took [s]
 SLOWEST = 1.0 / 25.0  # time between two pictures above which there is no such pause [s]
 
 
@@ -44,15 +45,22 @@ class View:
             begin = time.perf_counter()
             self._screen.draw(self._sim, self._state, begin - self._came)
             self._send()
-            end = time.perf_counter()
-            idle = 0.0 if self._screen.dragging else IDLE_SHARE * (end - begin)
-            end = max(begin + self._interval, min(end + idle, begin + SLOWEST))
-            while not self._ended and (left := end - time.perf_counter()) > 0.0:
-                self._receive(left)
-            self._receive(0.0)
+            self._wait(begin, time.perf_counter())
         if not self._ended:
             timing = self._screen.timing
             self._link.send({"closed": True, "pictures": list(timing.pictures), "latencies": list(timing.latencies)})
+
+    def _wait(self, begin: float, end: float) -> None:
+        """Take over states until the next picture is due; begin, end: of the last one [s]."""
+        idle = 0.0 if self._screen.dragging else IDLE_SHARE * (end - begin)
+        due = max(begin + self._interval, min(end + idle, begin + SLOWEST))
+        while not self._ended and (left := due - time.perf_counter()) > 0.0:
+            self._receive(left)
+        # a drag that has no effect in the next picture has to wait for the one after it
+        limit = max(ANSWER, end - begin)
+        while not self._ended and (left := self._screen.timing.seconds_to_answer(limit)) > 0.0:
+            self._receive(left)
+        self._receive(0.0)
 
     def _receive(self, timeout: float | None) -> None:
         """Take over all states that have come; wait up to a time [s] for the first."""
@@ -63,6 +71,7 @@ class View:
                 return
             self._state, self._came = message, time.perf_counter()
             self._sim.take(message, self._link.nodes.x[0], self._link.nodes.values[0])
+            self._screen.timing.came(message)
             self._screen.plots.set_enabled(message["enabled"])
             self._send()  # at once, so that the simulation may send the next one
 
