@@ -55,7 +55,7 @@ class Timing:
             self._answer_time, self._asked = time.perf_counter() - self._asked[1], None
 
     def seconds_to_answer(self, limit: float) -> float:
-        """Return for how long to wait for a step that uses a drag [s]: 0 without a drag, or if the last one took beyond the limit."""
+        """Return for how long to wait for a step that uses a drag [s]: 0 without one, or if the last one exceeded the limit."""
         if self._asked is None or self._answer_time > limit:
             return 0.0
         return max(0.0, self._asked[1] + limit - time.perf_counter())
