@@ -4,8 +4,10 @@ taisoft bench pictures [--quick] [--out FILE.json]
 
 A scene of about 20,000 triangles, a ball and a cube on the ground, drawn by the kernels and by the rasteriser in NumPy of earlier
 versions, in turn in one process, and the coding of its picture as PNG. Each is the median of rounds, with the range. Then runs of
-demos without pictures and with 60, in turn: wall times, the part in which the simulation waits for a picture, and their ratio.
-CPU times are those of all threads of the process; a busy machine changes them less. Kernels are compiled before.
+demos without pictures, with 60 that are drawn in a process of their own, and with 60 drawn between the steps, in turn: wall times
+until all pictures are written, the part in which the simulation is kept by pictures, and ratios to the run without. CPU times are
+those of all threads of the simulating process; a busy machine changes them less. Kernels are compiled, and the process of the
+pictures is started, before.
 Exit status: 0, or 1 if pictures are less than eight times as cheap as NumPy's.
 """
 
@@ -20,17 +22,18 @@ import numpy as np
 
 import taisoft as ts
 from taisoft.cli.scene_file import load_scene
-from taisoft.output.frames import FrameWriter, png_bytes
+from taisoft.output.frames import png_bytes
 from taisoft.output.tables import markdown
 from taisoft.view.colouring import background
 from taisoft.view.offscreen import Offscreen
+from taisoft.view.pictures import PictureOptions, PictureProcess, picture_writer
 from taisoft.view.shading import N_ATTRIBUTES, SAMPLES
 
 from .document import Limit, begin, check_out
 from .numpy_raster import averaged, rasterise
 from .runner import make_parser, progress
 
-ROUNDS, QUICK_ROUNDS = 15, 3
+ROUNDS, RUN_ROUNDS, QUICK_ROUNDS = 15, 5, 3
 BALL, CUBE = 32, 24  # cells
 PICTURES = 60
 DEMOS = {"cube_on_box": 3.0, "cube_pile": 1.0, "incline": 2.0, "sheet_on_box": 1.0, "twisting_bar": 2.0}  # simulated [s]
@@ -85,35 +88,41 @@ def by_clock(times: list[dict[str, float]]) -> dict[str, list[float]]:
 
 
 def measure_run(name: str, seconds: float, n_rounds: int) -> dict:
-    """Times of a demo's run for each round, after one that compiles, without pictures and with them."""
+    """Times of a demo's run for each round, after one that compiles, without pictures, and with them drawn in both places."""
     scene, settings = load_scene(name)
     settings = {key: value for key, value in settings.items() if key not in ("seconds", "fps")}
-    rounds: dict[bool, list[dict[str, float]]] = {False: [], True: []}
+    rounds: dict[str, list[dict[str, float]]] = {"without": [], "with": [], "between": []}
     with ts.Simulator(scene, **settings) as sim:
         for turn in range(n_rounds + 1):
-            for pictures, own in rounds.items():
+            for where, own in rounds.items():
                 sim.reset()
-                drawing: list[float] = []
-                one = timed(lambda pictures=pictures, drawing=drawing: run(sim, seconds, drawing if pictures else None))
+                one = timed_run(sim, seconds, where)
                 if turn:
-                    own.append(one | {"drawing": sum(drawing)})
-    return {"without": by_clock(rounds[False]), "with": by_clock(rounds[True])}
+                    own.append(one)
+    return {where: by_clock(own) for where, own in rounds.items()}
 
 
-def run(sim: ts.Simulator, seconds: float, drawing: list[float] | None) -> None:
-    """Run until all pictures are written.
-
-    drawing: gets the wall time of each call of `FrameWriter.frame` [s]; None: no pictures.
-    """
-    if drawing is None:
-        sim.run(seconds, fps=PICTURES / seconds)
-        return
-    with tempfile.TemporaryDirectory() as folder, closing(FrameWriter(folder, Offscreen(sim.scene))) as writer:
+def timed_run(sim: ts.Simulator, seconds: float, where: str) -> dict[str, float]:
+    """Wall and CPU seconds of a run until all pictures are written, and wall seconds for which pictures keep the simulation."""
+    if where == "without":
+        return timed(lambda: sim.run(seconds, fps=PICTURES / seconds)) | {"drawing": 0.0}
+    drawing: list[float] = []
+    with tempfile.TemporaryDirectory() as folder:
+        path, options = Path(folder), PictureOptions()
+        writer = PictureProcess(path, sim, options) if where == "with" else picture_writer(path, sim.scene, options, None)
 
         def on_frame(sim, index, _report) -> None:
             drawing.append(timed(lambda: writer.frame(sim, index))["wall"])
 
-        sim.run(seconds, on_frame, fps=PICTURES / seconds)
+        def run() -> None:
+            sim.run(seconds, on_frame, fps=PICTURES / seconds)
+            drawing.append(timed(writer.flush)["wall"])
+
+        with closing(writer):
+            writer.frame(sim, 0)
+            writer.flush()
+            one = timed(run)
+    return one | {"drawing": sum(drawing)}
 
 
 def picture_table(found: dict) -> str:
@@ -130,15 +139,23 @@ def run_table(found: dict[str, dict]) -> str:
     """Times of runs."""
     rows = []
     for name, one in found.items():
-        walls = [one["without"]["wall"], one["with"]["wall"], one["with"]["drawing"], one["without"]["cpu"], one["with"]["cpu"]]
-        rows.append((name, *(f"{np.median(wall):.2f}" for wall in walls), f"{ratio(one['with'], one['without']):.2f}"))
-    headings = "without [s]", "with [s]", "of it waiting [s]", "CPU without [s]", "CPU with [s]", "ratio"
-    return markdown((f"{PICTURES} pictures", *headings), rows, left=(0,))
+        walls = [one["without"]["wall"], one["with"]["wall"], one["with"]["drawing"]]
+        walls_and_ratios = [*(f"{np.median(wall):.2f}" for wall in walls), spread(one, "with"), spread(one, "between")]
+        cpu = [*(np.median(one[where]["cpu"]) for where in ("without", "with")), ratio(one["with"], one["without"], "cpu")]
+        rows.append((name, *walls_and_ratios, *(f"{value:.2f}" for value in cpu)))
+    headings = ("without [s]", "with [s]", "of it kept [s]", "ratio", "drawn between steps", "CPU without [s]", "CPU with [s]")
+    return markdown((f"{PICTURES} pictures", *headings, "CPU ratio"), rows, left=(0,))
 
 
-def ratio(a: dict, b: dict) -> float:
-    """Median over rounds of the wall time of a over that of b."""
-    return float(np.median(np.array(a["wall"]) / np.array(b["wall"])))
+def spread(one: dict, where: str) -> str:
+    """Median and range over rounds of the wall time with pictures over that without."""
+    ratios = np.array(one[where]["wall"]) / np.array(one["without"]["wall"])
+    return f"{np.median(ratios):.2f} ({ratios.min():.2f} to {ratios.max():.2f})"
+
+
+def ratio(a: dict, b: dict, clock: str = "wall") -> float:
+    """Median over rounds of a's time over that of b."""
+    return float(np.median(np.array(a[clock]) / np.array(b[clock])))
 
 
 def main(argv=None) -> int:
@@ -156,7 +173,7 @@ def main(argv=None) -> int:
     runs = {}
     for name, seconds in list(DEMOS.items())[: 1 if options.quick else None]:
         progress(name)
-        runs[name] = measure_run(name, seconds / 10 if options.quick else seconds, 1 if options.quick else QUICK_ROUNDS)
+        runs[name] = measure_run(name, seconds / 10 if options.quick else seconds, 1 if options.quick else RUN_ROUNDS)
     document.add(f"## Runs\n\n{run_table(runs)}")
     limits = (
         [] if options.quick else [Limit("times as cheap as NumPy", ratio(one["NumPy"], one["kernels"]), CHEAPER, at_least=True)]

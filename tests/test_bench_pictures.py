@@ -32,7 +32,8 @@ def test_a_quick_run(tmp_path, capsys):
     assert page.strip() in capsys.readouterr().out and "## Limits" not in page
     assert "| kernels" in page and "| PNG" in page and "| cube_on_box" in page
     (run,) = numbers["runs"].values()
-    assert 0 < run["with"]["drawing"][0] < run["with"]["wall"][0] and run["without"]["cpu"][0] > 0
+    for where in ("with", "between"):
+        assert 0 < run[where]["drawing"][0] < run[where]["wall"][0] and run["without"]["cpu"][0] > 0
     assert len(numbers["picture"]["kernels"]["wall"]) == pictures.QUICK_ROUNDS and numbers["picture"]["bytes"] > 1000
 
 
@@ -46,10 +47,12 @@ def test_tables_and_exit_status(faster, status, monkeypatch, capsys):
     one = {"triangles": 100, "first": 1.0, "bytes": 5000, "NumPy": both(0.1 * faster, 0.2 * faster, 0.3 * faster)}
     one |= {"kernels": both(0.1, 0.2, 0.3), "PNG": both(0.05, 0.05, 0.05)}
     run = {"without": both(1.0, 2.0, 3.0), "with": both(1.5, 2.4, 3.3) | {"drawing": [0.1, 0.2, 0.3]}}
+    run["between"] = both(2.0, 4.0, 9.0)
     monkeypatch.setattr(pictures, "measure_picture", lambda quick: one)
     monkeypatch.setattr(pictures, "measure_run", lambda *arguments: run)
     assert pictures.main([]) == status
     page = re.sub(" +", " ", capsys.readouterr().out)
     assert f"| kernels | 200.0 | 100.0 to 300.0 | 200.0 | {faster:.1f} |" in page
-    assert page.count("| 2.00 | 2.40 | 0.20 | 2.00 | 2.40 | 1.20 |") == len(pictures.DEMOS)
+    row = "| 2.00 | 2.40 | 0.20 | 1.20 (1.10 to 1.50) | 2.00 (2.00 to 3.00) | 2.00 | 2.40 | 1.20 |"
+    assert page.count(row) == len(pictures.DEMOS)
     assert ("NOT met" in page) == bool(status)

@@ -18,6 +18,7 @@ from command import BEAM, LED, ROOT, SHORT_OUTPUT, child, report, run, write
 
 from taisoft.cli import main, recording
 from taisoft.errors import OutputError
+from taisoft.view import pictures
 
 # --- runs -------------------------------------------------------------------------------------------------------------
 
@@ -87,13 +88,13 @@ def test_a_scene_may_import_its_neighbour(tmp_path):
 
 
 def test_a_picture_that_cannot_be_written_ends_the_run(beam, tmp_path, monkeypatch, capsys):
-    class FullDisk(recording.FrameWriter):
+    class FullDisk(pictures.FrameWriter):
         def frame(self, sim, index):
             if index == 2:
                 raise OutputError("cannot write frames/00002.png (9 bytes): No space left on device")
             super().frame(sim, index)
 
-    monkeypatch.setattr(recording, "FrameWriter", FullDisk)
+    monkeypatch.setattr(pictures, "FrameWriter", FullDisk)
     out = tmp_path / "out"
     assert run(beam, "--out", out) == 3
     assert "taisoft: cannot write frames/00002.png" in capsys.readouterr().err

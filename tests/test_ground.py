@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import taisoft as ts
-from taisoft.view.ground import MARGIN, Square
+from taisoft.view.ground import MARGIN, Square, finite_points
 
 FLOOR, CORNERS = ts.HalfSpace((0, 0, 0), (0, 1, 0)), np.array([(x, 0.0, z) for x in (-2.0, 2.0) for z in (-2.0, 2.0)])
 WALL, SLOPE = ts.HalfSpace((-2, 0, 0), (1, 0, 0)), ts.HalfSpace((0, 0, 0), (1, 1, 0))
@@ -23,9 +23,9 @@ def extent(square):
 def test_bodies_inside_move_nothing():
     square = Square(FLOOR, CORNERS, [])
     assert square.below(cloud((0.5, 1, -0.5))) is CORNERS
-    assert square.below(np.full((3, 3), np.nan)) is CORNERS, "a state that is not finite"
+    assert square.below(finite_points(np.full((3, 3), np.nan))) is CORNERS, "a state that is not finite"
     with_one_bad = np.vstack([cloud((0.0, 1, 0)), [np.inf, 0, 0]])
-    assert square.below(with_one_bad) is CORNERS
+    assert square.below(finite_points(with_one_bad)) is CORNERS
 
 
 @pytest.mark.parametrize("place", [(7.0, 1.0, 0.0), (-30.0, 5.0, 12.0)])

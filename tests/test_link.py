@@ -44,10 +44,11 @@ def test_messages_keep_their_data():
 
 
 def test_both_ends():
-    link, other = Link.pair(5)
-    nodes = SharedNodes(5, os.dup(link.nodes.descriptor))
-    link.nodes.x[:], link.nodes.values[:] = np.arange(15.0).reshape(5, 3), np.arange(5.0)
-    assert np.array_equal(nodes.x, np.arange(15.0).reshape(5, 3)) and np.array_equal(nodes.values, np.arange(5.0))
+    link, other = Link.pair(5, slots=2)
+    nodes = SharedNodes(5, 2, os.dup(link.nodes.descriptor))
+    link.nodes.x[1], link.nodes.values[0] = np.arange(15.0).reshape(5, 3), np.arange(5.0)
+    assert np.array_equal(nodes.x[1], np.arange(15.0).reshape(5, 3)) and np.array_equal(nodes.values[0], np.arange(5.0))
+    assert not nodes.x[0].any() and not nodes.values[1].any()
     assert link.receive() is None
     far = Link(other, nodes)
     far.send({"commands": [["pause"]]})
@@ -150,5 +151,5 @@ def test_a_path_that_fails_is_an_output_error():
     sim.scene.add_obstacle(ts.Sphere((9, 0, 0), 0.1), name="late", path=lambda t: ((1.0 / (1.0 - t), 0, 0), np.eye(3)))
     describe_state(sim, marks_of(sim.scene), set(), None)
     sim.time = 1.0
-    with pytest.raises(ts.OutputError, match="the window cannot show the scene: obstacle 'late': the path must give"):
+    with pytest.raises(ts.OutputError, match="the scene cannot be shown: obstacle 'late': the path must give"):
         describe_state(sim, marks_of(sim.scene), set(), None)

@@ -180,6 +180,28 @@ def test_commands_are_carried_out_between_steps(live):
     assert sim.step_count == 0 and not run.paused
 
 
+def test_no_state_is_sent_between_a_drag_and_its_step(live):
+    """The window would draw it while the step takes place. A simulation that pauses sends it, and a slow one goes on sending."""
+    sim = Clock(dt=0.05, seconds_per_step=1e-3)
+    run, window = live(sim)
+    while sim.step_count < 5:
+        run.turn()
+    count, window.requests = len(window.states), {5: [["begin_drag", "beam", [0], [1.0]], ["drag", [1.0, 2.0, 3.0], 10.0]]}
+    while sim.step_count < 6:
+        run.turn()
+    assert [(state["step_count"], state["drag_done"]) for state in window.states[count:]] == [(6, 5)]
+    run.speed = 1.0 / 16.0
+    count, window.requests = len(window.states), {6: [["drag", [1.0, 2.0, 4.0], 10.0]]}
+    while sim.step_count < 7:
+        run.turn()
+    own = [(state["step_count"], state["drag_done"]) for state in window.states[count:]]
+    assert own[-1] == (7, 6) and set(own[:-1]) == {(6, 5)}, "every 0.2 s meanwhile"
+    window.requests = {7: [["pause"], ["drag", [1.0, 2.0, 5.0], 10.0]]}
+    count = len(window.states)
+    run.turn()
+    assert [state["step_count"] for state in window.states[count:]] == [7] and run.paused
+
+
 def test_failures_pause_and_warnings_are_shown(live):
     sim = Clock()
     run, window = live(sim)

@@ -170,6 +170,27 @@ def test_a_drag_needs_its_beginning():
         assert sim.dragged is None and controls.values()["drag"] is None
 
 
+def test_a_picture_waits_for_a_step_that_usually_comes_in_time(monkeypatch):
+    """The answers to four drags take 5, 30, 15 and 10 ms, and nothing but drags is waited for."""
+    now = [0.0]
+    monkeypatch.setattr("time.perf_counter", lambda: now[0])
+    timing, waits = Timing(), []
+    for k, answer in enumerate((0.005, 0.030, 0.015, 0.010)):
+        begin = now[0] = 0.1 * k
+        assert timing.seconds_to_answer(0.02) == 0.0
+        timing.dragged(k)
+        now[0] += 0.001
+        waits.append(timing.seconds_to_answer(0.02))
+        timing.dragged(k + 100)  # which the same step uses
+        timing.came({"drag_done": k - 1})
+        now[0] = begin + answer
+        timing.came({"drag_done": k + 100})
+    assert waits == pytest.approx([0.019, 0.019, 0.0, 0.019]), "not after the answer that took too long"
+    timing.dragged(200)
+    now[0] += 0.5
+    assert timing.seconds_to_answer(0.02) == 0.0, "nor for a simulation that pauses"
+
+
 def test_latency_counts_from_the_last_look_that_saw_nothing(monkeypatch):
     now = [0.0]
     monkeypatch.setattr("time.perf_counter", lambda: now[0])
@@ -183,6 +204,7 @@ def test_latency_counts_from_the_last_look_that_saw_nothing(monkeypatch):
         timing.polled()
     assert list(timing.latencies) == [pytest.approx(0.02 * (8 - 4))]
     assert timing.pictures_per_second() == pytest.approx(50.0)
+    assert timing.seconds_to_answer(1.0) == pytest.approx(0.9), "the state has not come"
     state = {"speed": 0.5, "asked_speed": 2.0, "steps_per_second": 30.0}
     assert timing.lines(state)[0].split() == "speed 0.50 x real time (asked: 2), 30 steps/s".split()
     assert "drag after 80 ms" in timing.lines({})[0] and len(timing.lines({})) == 1

@@ -4,7 +4,7 @@
   obstacles do not;
 * tets, polygons, transforms, handedness, units and the up axis of other stages are understood; closed surfaces are filled;
 * a broken stage, of whatever kind, gives one sentence that names the file, within seconds;
-* `taisoft info` and `taisoft scene` accept a stage.
+* `taisoft info` and `taisoft scene` accept a stage, and a scene file takes one mesh of it, but no stage that names other files.
 """
 
 import random
@@ -262,3 +262,78 @@ def test_commands_accept_a_stage(tmp_path, capsys):
     upper, lower = (scene.body(name) for name in ("upper", "lower"))
     start = [body.rest_positions + body.position for body in (upper, lower)]
     assert start[1][:, 1].min() == pytest.approx(0.25 * 4.0) and np.allclose(start[0] - start[1], (0, 3, 0), atol=1e-6)
+
+
+# --- scene files ------------------------------------------------------------------------------------------------------
+
+BODY = '[bodies.part]\nmaterial = {{ young = 1e5 }}\nmesh = {{ file = "two.usda"{more} }}\n'
+
+
+@pytest.fixture
+def two(tmp_path):
+    """A folder with a stage of two bodies of tets and an open surface."""
+    stage = new_stage(tmp_path / "two.usda")
+    UsdGeom.Xform.Define(stage, "/World/upper")
+    add_tets(stage, "/World/upper/tets").AddTranslateOp().Set(Gf.Vec3d(0, 3, 0))
+    add_tets(stage, "/World/lower")
+    add_surface(stage, "/World/lid", CUBE, QUADS[1:])
+    stage.Save()
+    return tmp_path
+
+
+def read_scene(folder, more="", **options):
+    (folder / "scene.toml").write_text(BODY.format(more=more))
+    return ts.read_scene(folder / "scene.toml", **options)[0].bodies[0].mesh
+
+
+@pytest.mark.parametrize("prim", ["tets", "/World/upper/tets", "/World/upper", "lower", "/World/lower"])
+def test_a_scene_file_takes_a_mesh_of_a_stage(two, prim):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # of the surface that is not taken
+        mesh = read_scene(two, f', prim = "{prim}"')
+    high = 0.0 if "lower" in prim else 3.0
+    assert np.array_equal(mesh.vertices, MESH.vertices.astype(np.float32) + (0.0, high, 0.0)) and np.array_equal(
+        mesh.tets, MESH.tets
+    )
+
+
+def test_the_only_mesh_of_a_stage_needs_no_name(tmp_path):
+    stage = new_stage(tmp_path / "two.usda")
+    add_tets(stage)
+    stage.Save()
+    assert read_scene(tmp_path).n_tets == MESH.n_tets
+
+
+@pytest.mark.parametrize(
+    "more, message",
+    [
+        ("", "bodies.part.mesh.prim is missing: {stage} holds tets, lower"),
+        (', prim = "lid"', "bodies.part.mesh.prim 'lid' fits none: {stage} holds tets, lower"),
+        (', prim = "/World"', "bodies.part.mesh.prim '/World' fits several: {stage} holds tets, lower"),
+        (', prim = ""', "bodies.part.mesh.prim '' fits none: {stage} holds tets, lower"),
+        (", prim = 3", "bodies.part.mesh.prim must be the name or the path of a mesh in the stage, not 3"),
+        (", fix_orientation = true", "bodies.part.mesh.fix_orientation is not known; there are file, prim, edge_length"),
+    ],
+)
+def test_a_scene_file_must_name_a_mesh_of_the_stage(two, more, message):
+    with pytest.raises(TaisoftError) as caught:
+        read_scene(two, more)
+    assert str(caught.value) == f"{two / 'scene.toml'}: {message.format(stage=two / 'two.usda')}"
+
+
+@pytest.mark.parametrize("kind", ["references", "subLayers", "payload", "clips"])
+def test_a_stage_of_a_scene_file_names_no_other_files(two, kind):
+    """Unless that is allowed."""
+    (two / "two.usda").rename(two / "other.usda")
+    arcs = {
+        "references": 'over "World" (references = @other.usda@</World>) {}',
+        "payload": 'over "World" (payload = @other.usda@</World>) {}',
+        "clips": 'over "World" (clips = { dictionary default = { asset[] assetPaths = [@other.usda@] } }) {}',
+        "subLayers": "",
+    }
+    head = "(subLayers = [@other.usda@])" if kind == "subLayers" else ""
+    (two / "two.usda").write_text(f"#usda 1.0\n{head}\n{arcs[kind]}\n")
+    with pytest.raises(TaisoftError, match=r"not a readable USD stage \(it names a further file, 'other.usda'\)$"):
+        read_scene(two, ', prim = "lower"')
+    if kind != "clips":
+        assert read_scene(two, ', prim = "lower"', allow_outside=True).n_tets == MESH.n_tets

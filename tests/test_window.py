@@ -1,6 +1,6 @@
 """The live window, partly on a virtual display:
 
-* the cursor picks the nearest surface; the drag patch around it has weights of sum 1;
+* the cursor picks the nearest surface that is drawn, skins too; the drag patch around it has weights of sum 1;
 * wires, contacts and arrows have the right places;
 * keys pause, step, restart, colour, frame and quit; dragging beside bodies turns the view, dragging a body moves it;
 * choosing another integrator continues the run with it; plots can be shown, and a drag over them turns the view;
@@ -14,12 +14,15 @@ import struct
 import numpy as np
 import pytest
 from desktop import ROOT, TOOLS, Desktop
-from fake_simulator import FakeSimulator, beam_scene
+from fake_simulator import RUBBER, FakeSimulator, beam_scene
 from test_view import body_mask, needs_vulkan
 
+import taisoft as ts
 from taisoft.output.camera import Camera
+from taisoft.view.connection_layer import ConnectionMarks
+from taisoft.view.mirror import MirrorSimulation, describe_scene, describe_state
 from taisoft.view.picking import MouseDrag, nearest_hit, pick
-from taisoft.view.scene_view import Layers
+from taisoft.view.scene_view import Layers, scene_size
 
 WATCH = """
 import os, sys, time
@@ -103,6 +106,33 @@ def test_cursor_picks_and_drags_a_body(order):
     assert moved @ camera.axes[1] > 0
     assert np.allclose(drag.line(sim), [point, point + moved])
     assert pick(sim, camera, (0.01, 0.99), size) is None
+
+
+@pytest.mark.parametrize("order", [1, 2])
+@pytest.mark.parametrize("cells, size", [(2, 1.0), (12, 1.0), (1, 0.8)])  # the tets of the last one do not hold all of the skin
+def test_cursor_picks_and_drags_a_skin(order, cells, size):
+    """Of a ball in a cube of tets, deformed, as the mirror in the window's process sees it."""
+    scene, ball = ts.Scene(), ts.ball_mesh(0.45, 4)
+    body = scene.add_body(ts.box_mesh((cells,) * 3, (size,) * 3), RUBBER, name="cube", position=(3, 0, 0), order=order)
+    used, triangles = np.unique(ball.surface, return_inverse=True)
+    skin = body.embed(ts.SurfaceMesh(ball.vertices[used], triangles.reshape(-1, 3)))
+    real, marks, window = FakeSimulator(scene), ConnectionMarks(scene, scene_size(scene)), (900, 900)
+    real.time = 1.0
+    sim, camera = MirrorSimulation(describe_scene(scene, marks), body.n_nodes), Camera.framing(real.positions())
+    sim.take(describe_state(real, marks, set(), None) | {"colour": "body"}, real.positions(), np.zeros(body.n_nodes))
+    x = real.positions()
+    centres = (skin.weights @ x)[skin.surface.triangles].mean(axis=1)
+    point = centres[np.argmin(np.linalg.norm(centres - camera.position, axis=1))]
+    across, down, _ = camera.project(point[None], window)[0]
+    hit = pick(sim, camera, (across / window[0], 1 - down / window[1]), window)
+    assert np.allclose(hit.point, point) and np.allclose(hit.weights @ x[hit.nodes], point) and len(hit.nodes) > 3
+    drag = MouseDrag(sim, hit)
+    assert drag.weights.sum() == pytest.approx(1.0) and (drag.weights > 0.0).all()
+    assert np.linalg.norm(drag.weights @ body.rest_positions[drag.nodes] - hit.weights @ body.rest_positions[hit.nodes]) < 0.2
+    assert np.allclose(drag.line(sim)[0], point), "the line begins at the point under the cursor"
+    inside = 0.98 * x + 0.02 * x.mean(axis=0)
+    across, down, _ = camera.project(inside[[np.argmax(inside @ camera.axes[0])]], window)[0]
+    assert pick(sim, camera, (across / window[0], 1 - down / window[1]), window) is None, "only a corner of the tets is there"
 
 
 # --- layers ---

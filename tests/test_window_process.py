@@ -28,7 +28,7 @@ from multiprocessing.connection import Connection
 from taisoft.view.link import Link, LinkClosed, SharedNodes, receive
 connection = Connection(int(sys.argv[1]))
 description = receive(connection, None)
-link = Link(connection, SharedNodes(description["n_nodes"], int(sys.argv[2])))
+link = Link(connection, SharedNodes(description["n_nodes"], description["slots"], int(sys.argv[2])))
 request = {"number": 0, "commands": [], "confirmed": 0, "colour": "body", "layers": [], "plots": False}
 """
 OPEN = START + "link.send({'open': True})\n"
@@ -66,11 +66,11 @@ def test_states_go_out_when_the_last_one_is_confirmed(simulator, tmp_path):
     code = f"""{OPEN}
 import numpy as np
 link.receive(None)
-first = link.nodes.x.copy()
+first = link.nodes.x[0].copy()
 time.sleep(0.5)
 link.send(request | {{"confirmed": 1, "colour": "speed", "layers": ["contacts"], "number": 4, "commands": [["pause"]]}})
 state = link.receive(None)
-np.savez({str(tmp_path / "saved.npz")!r}, first=first, x=link.nodes.x, values=link.nodes.values, answered=state["answered"],
+np.savez({str(tmp_path / "saved.npz")!r}, first=first, x=link.nodes.x[0], values=link.nodes.values[0], answered=state["answered"],
          contacts=state["contacts"]["point"], time=state["time"])
 link.send({{"closed": True}})
 """
@@ -155,13 +155,9 @@ def test_a_window_ends_with_the_process_of_the_simulation(tmp_path):
     """Here the real window's program waits for its first state, so it needs no display; the parent is killed."""
     parent = f"""
 import os, sys, time
-from taisoft.view.link import Link
-from taisoft.view.window import _spawn
-link, other = Link.pair(3)
-child = _spawn((sys.executable, "-c", {OPEN + "link.receive(None)"!r}), other.fileno(), link.nodes.descriptor)
-other.close()
-link.send({{"n_nodes": 3}})
-assert link.receive(30.0) == {{"open": True}}
+from taisoft.view.child_process import ChildProcess
+child = ChildProcess((sys.executable, "-c", {OPEN + "link.receive(None)"!r}), {{}}, "no window", n_nodes=3)
+assert child.link.receive(30.0) == {{"open": True}}
 print(child.pid, flush=True)
 time.sleep(60)
 """

@@ -20,8 +20,8 @@ from taisoft.output.report import body_records, write_report
 from taisoft.output.usd import UsdWriter
 from taisoft.records import RunReport
 from taisoft.scene.checks import nearest
-from taisoft.view.annotations import Annotations, text_missing
-from taisoft.view.offscreen import Offscreen
+from taisoft.view.annotations import text_missing
+from taisoft.view.pictures import PictureOptions, PictureProcess, open_pictures
 from taisoft.view.plots import PLOTS, Plots
 from taisoft.view.scene_view import IN_PICTURES, IN_WINDOW, LAYERS
 
@@ -123,7 +123,7 @@ class Observers:
                 self.guard(member.frame, sim, index)
             seconds = time.perf_counter() - start - (sim.compile_seconds - compiled)
             self.seconds += seconds
-            self.picture_seconds += seconds if isinstance(member, FrameWriter) else 0.0
+            self.picture_seconds += seconds if isinstance(member, (FrameWriter, PictureProcess)) else 0.0
 
     def close(self) -> None:
         """Close all members, last first, even if some fail."""
@@ -160,8 +160,10 @@ class Recording:
         self.path, self._resumed, self._notes = Path(path), resumed, notes or {}
         self._checkpoints = CheckpointWriter(self._folder.path, every, None if resumed is None else resumed["checkpoint"])
 
-    def add_writers(self, observers: Observers, sim, fps: float | None, shown: DisplayOptions, plots: Plots | None) -> None:
-        """Add the writers of pictures, USD, .vtu, .npz and checkpoints to the observers.
+    def add_writers(
+        self, observers: Observers, sim, fps: float | None, seconds: float, shown: DisplayOptions, plots: Plots | None
+    ) -> None:
+        """Add the writers of pictures, USD, .vtu, .npz and checkpoints to the observers of a run that ends at `seconds`.
 
         A resumed run that does not match the earlier files is refused before anything is removed.
         """
@@ -183,20 +185,22 @@ class Recording:
             observers.members.append(VtuWriter(folder, sim.scene, self._first or 0, shown.errors))
         if shown.npz:
             observers.members.append(NpzWriter(folder, sim.scene))
-        drawing = annotate = None
+        pictures = None
         if shown.pictures:
-            drawing = Offscreen(sim.scene, colour=shown.colour, layers=shown.in_pictures)
-            drawing.resume(self._notes)
-            no_bar = shown.colour != "body" and text_missing()
-            if no_bar:
-                print(f"taisoft: pictures have no colour bar: {no_bar}", file=sys.stderr)
-            elif shown.plots or shown.caption is not None or shown.colour != "body":
-                annotate = Annotations(plots if shown.plots else None, shown.caption, drawing.colouring).draw
-            pictures = FrameWriter(folder, drawing, annotate)
+            n_pictures = round((seconds - (0.0 if self._resumed is None else self._resumed["time"])) * (fps or 1.0 / sim.dt))
+            pictures = open_pictures(folder, sim, self._picture_options(shown), plots, n_pictures)
             observers.members.append(pictures)
             self._checkpoints.before.append(pictures.flush)
-        self._checkpoints.notes = lambda: {"fps": fps} | (drawing.kept(sim.time) if drawing else {})
+        self._checkpoints.notes = lambda: {"fps": fps} | (pictures.kept(sim.time) if pictures else {})
         observers.members.append(self._checkpoints)
+
+    def _picture_options(self, shown: DisplayOptions) -> PictureOptions:
+        has_scale = shown.colour != "body"
+        no_bar = has_scale and text_missing()
+        if no_bar:
+            print(f"taisoft: pictures have no colour bar: {no_bar}", file=sys.stderr)
+        texts = {"plots": shown.plots, "caption": shown.caption, "bar": has_scale and not no_bar}
+        return PictureOptions(colour=shown.colour, layers=shown.in_pictures, kept=self._notes, **texts)
 
     def checkpoint(self, sim) -> None:
         """Write checkpoint.npz. Raises OutputError."""

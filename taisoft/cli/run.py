@@ -242,7 +242,7 @@ def _run(sim, settings: RunSettings, arguments, signals, warned: list[str], save
 
             observers.members.append(LiveWindow(sim, plots, colour=shown.colour, layers=shown.in_window))
         if recording is not None:
-            recording.add_writers(observers, sim, settings.fps, shown, plots)
+            recording.add_writers(observers, sim, settings.fps, settings.seconds, shown, plots)
         observers.members.append(Progress(settings.seconds, label=Path(arguments.scene).stem))
         if sim.settings.tolerance is not None and resumed is None:
             print("pilots   choose integrator and dt", flush=True)

@@ -7,6 +7,7 @@ memory. Arrays pass in .npz files, without pickle. The child imports neither Tai
 
 import builtins
 import contextlib
+import functools
 import io
 import os
 import re
@@ -132,15 +133,15 @@ def run_child(folder: str, task: str, *arguments: str, seconds: float | None = N
 
 
 def main(task: str, *arguments: str) -> None:
-    """Run a task in the child process: "read" a file by meshio, "usd": read a stage, or "mesh" surface.npz by fTetWild."""
-    np.savez("result.npz", **{"read": _read, "usd": _read_usd, "mesh": _mesh}[task](*arguments))
+    """Run a task in the child process: "read" a file by meshio, "usd" or "lone_usd": a stage, "mesh" surface.npz by fTetWild."""
+    np.savez("result.npz", **TASKS[task](*arguments))
 
 
-def _read_usd(path: str, seconds: str) -> dict[str, np.ndarray]:
+def _read_usd(path: str, seconds: str, alone: bool = False) -> dict[str, np.ndarray]:
     from taisoft.mesh.usd_content import read_stage
 
     _limit_resources(MEMORY + MEMORY_PER_BYTE * Path(path).stat().st_size, int(float(seconds)) + 1)
-    return read_stage(path)
+    return read_stage(path, alone)
 
 
 def _mesh() -> dict[str, np.ndarray]:
@@ -258,6 +259,8 @@ def _open_bounded(file, mode: str = "r", buffering: int = -1, encoding: str | No
     stream = _BoundedFile(io.FileIO(file))
     return stream if "b" in mode else io.TextIOWrapper(stream, encoding=encoding or "utf-8", **options)
 
+
+TASKS = {"read": _read, "usd": _read_usd, "lone_usd": functools.partial(_read_usd, alone=True), "mesh": _mesh}
 
 if __name__ == "__main__":
     main(*sys.argv[1:])

@@ -5,16 +5,34 @@ The stage is read in a child process (`usd_content.py` says what is taken), sinc
 
 import tempfile
 import warnings
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from taisoft.errors import MeshError
+from taisoft.errors import MeshError, listed, value_text
 from taisoft.mesh.safe_reading import SECONDS, SECONDS_PER_BYTE, WALL_FACTOR, read_content, run_child
 from taisoft.mesh.surface_mesh import SurfaceMesh, clean_surface, tetrahedralize
 from taisoft.mesh.tet_mesh import TetMesh
 
 USD_FORMATS = (".usd", ".usda", ".usdc", ".usdz")
+
+
+@dataclass(frozen=True)
+class _Prim:
+    """Tets or a closed surface of a stage. path: in the stage; source: file and name, for messages."""
+
+    path: str
+    source: str
+    points: np.ndarray
+    tets: np.ndarray | None
+    surface: SurfaceMesh | None
+
+    def mesh(self, edge_length: float | None) -> TetMesh:
+        """Return the mesh; a surface is filled with tets."""
+        if self.surface is not None:
+            return tetrahedralize(self.surface, edge_length)
+        return _tet_mesh(self.source, self.points, self.tets)
 
 
 def read_usd(path, edge_length: float | None = None) -> dict[str, TetMesh]:
@@ -25,35 +43,64 @@ def read_usd(path, edge_length: float | None = None) -> dict[str, TetMesh]:
     number where it occurs twice. A stage that taisoft wrote gives its bodies at their start, quadratic ones cut into linear
     tets. Raises MeshError.
     """
+    file, prims, notes = _read_prims(path, "read_usd", alone=False)
+    _warn(file, notes)
+    return {name: prim.mesh(edge_length) for name, prim in prims.items()}
+
+
+def read_usd_prim(path, prim: str | None = None, edge_length: float | None = None, alone: bool = False) -> TetMesh:
+    """Return one of the meshes that `read_usd` returns; the others are not filled with tets.
+
+    prim: its name there, or the path of its prim or of one above it; None for the only one. alone: refuse a stage that names
+    further files. Raises MeshError.
+    """
+    file, prims, notes = _read_prims(path, "read_usd_prim", alone)
+    if prim is not None and not isinstance(prim, str):
+        raise MeshError(f"prim must be the name or the path of a mesh in the stage, not {value_text(prim)}")
+    above = f"{prim}/" if prim and prim.startswith("/") else None
+    fitting = [name for name, one in prims.items() if prim in (None, name, one.path) or (above and one.path.startswith(above))]
+    if len(fitting) != 1:
+        which = "is missing" if prim is None else f"{prim!r} fits {'several' if fitting else 'none'}"
+        raise MeshError(f"prim {which}: {file} holds {listed(list(prims))}")
+    one = prims[fitting[0]]
+    _warn(file, [note for note in notes if note.startswith(f"{one.path} ")])
+    return one.mesh(edge_length)
+
+
+def _read_prims(path, what: str, alone: bool) -> tuple[Path, dict[str, _Prim], list[str]]:
+    """Return the file, its meshes by name, and notes about what is left out. Raises MeshError, if there are none too."""
     try:
         file = Path(path)
     except TypeError as error:
-        raise MeshError(f"read_usd: path must be a file's name, not {path!r}") from error
+        raise MeshError(f"{what}: path must be a file's name, not {path!r}") from error
     if file.suffix.lower() not in USD_FORMATS:
         raise MeshError(f"{file}: a USD stage is read from {', '.join(USD_FORMATS)}, not from {file.suffix or 'no ending'}")
     seconds = SECONDS + SECONDS_PER_BYTE * len(read_content(file))
+    task = "lone_usd" if alone else "usd"
     with tempfile.TemporaryDirectory(prefix="taisoft-") as folder:
         try:
-            found = run_child(folder, "usd", str(file.absolute()), str(seconds), seconds=WALL_FACTOR * seconds)
+            found = run_child(folder, task, str(file.absolute()), str(seconds), seconds=WALL_FACTOR * seconds)
         except MeshError as error:
             raise MeshError(f"{file}: not a readable USD stage ({error})") from None
-    notes, meshes = found["notes"].tolist(), {}
-    for k, prim_name in enumerate(found["names"].tolist()):
-        points, cells, name = found[f"points{k}"], found[f"cells{k}"], _free(prim_name, meshes)
-        source = f"{file}: {prim_name}"
-        if cells.shape[1] == 4:
-            meshes[name] = _tet_mesh(source, points, cells)
-            continue
-        surface = clean_surface(SurfaceMesh(points, cells, source), 0.0)
-        if surface.closed:
-            meshes[name] = tetrahedralize(surface, edge_length)
-        else:
-            notes.append(f"{prim_name} is open, so it bounds no solid, and is left out")
-    for text in notes:
-        warnings.warn(f"{file}: {text}", UserWarning, stacklevel=2)
-    if not meshes:
+    prims: dict[str, _Prim] = {}
+    notes = found["notes"].tolist()
+    for k, (name, prim_path) in enumerate(zip(found["names"].tolist(), found["paths"].tolist())):
+        points, cells, source, surface = found[f"points{k}"], found[f"cells{k}"], f"{file}: {name}", None
+        if cells.shape[1] == 3:
+            surface = clean_surface(SurfaceMesh(points, cells, source), 0.0)
+            if not surface.closed:
+                notes.append(f"{name} is open, so it bounds no solid, and is left out")
+                continue
+        prims[_free(name, prims)] = _Prim(prim_path, source, points, cells if surface is None else None, surface)
+    if not prims:
+        _warn(file, notes)
         raise MeshError(f"{file}: the stage holds no tets and no closed surface")
-    return meshes
+    return file, prims, notes
+
+
+def _warn(file: Path, notes: list[str]) -> None:
+    for text in notes:
+        warnings.warn(f"{file}: {text}", UserWarning, stacklevel=3)
 
 
 def _free(name: str, taken) -> str:

@@ -22,14 +22,17 @@ def usd_message(error: Exception) -> str:
     return re.sub(r"^Error in '.*' at line \d+ in file \S+ : '(.*)'$", r"\1", lines[-1]) if lines else type(error).__name__
 
 
-def read_stage(path: str) -> dict[str, np.ndarray]:
-    """Return the meshes of a stage: points0 (n,3), cells0 (m,4) tets or (m,3) triangles, and so on, their names, and notes.
+def read_stage(path: str, alone: bool = False) -> dict[str, np.ndarray]:
+    """Return the meshes of a stage: points0 (n,3), cells0 (m,4) tets or (m,3) triangles, and so on, names, paths, and notes.
 
-    Exits with one line if the stage cannot be read or a mesh is inconsistent.
+    alone: refuse a stage that names further files, without opening these. Exits with one line if the stage cannot be read or a
+    mesh is inconsistent.
     """
     try:
-        from pxr import Usd, UsdGeom
+        from pxr import Usd, UsdGeom, UsdUtils
 
+        if alone and any(others := UsdUtils.ExtractExternalReferences(path)):
+            sys.exit(f"it names a further file, {next(other[0] for other in others if other)!r}")
         stage = Usd.Stage.Open(path)
         broken = stage.GetCompositionErrors()
         if broken:
@@ -40,8 +43,9 @@ def read_stage(path: str) -> dict[str, np.ndarray]:
         turn = Y_UP_FROM_Z_UP if UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.z else None
     except Exception as error:
         sys.exit(_why_unreadable(error))
-    arrays = {"names": np.array([name for name, *_ in found], dtype=str), "notes": np.array(notes, dtype=str)}
-    for k, (_, points, cells) in enumerate(found):
+    texts = {"names": [name for name, *_ in found], "paths": [prim_path for _, prim_path, *_ in found], "notes": notes}
+    arrays = {key: np.array(lines, dtype=str) for key, lines in texts.items()}
+    for k, (_, _, points, cells) in enumerate(found):
         points = points if turn is None else points @ turn
         arrays |= {f"points{k}": to_metres * points, f"cells{k}": cells}
     return arrays
@@ -55,8 +59,8 @@ def _why_unreadable(error: Exception) -> str:
     return "it is damaged, or of another format" if message.startswith("Failed to open layer") else message
 
 
-def _meshes(stage, Usd, UsdGeom) -> tuple[list[tuple[str, np.ndarray, np.ndarray]], list[str]]:
-    """Return name, points and cells of each mesh, and notes about what is left out."""
+def _meshes(stage, Usd, UsdGeom) -> tuple[list[tuple[str, str, np.ndarray, np.ndarray]], list[str]]:
+    """Return name, path, points and cells of each mesh, and notes about what is left out."""
     transforms = UsdGeom.XformCache(Usd.TimeCode.EarliestTime())
     found, notes, bodies, obstacles = [], [], set(), []
     prims = [prim for prim in Usd.PrimRange(stage.GetPseudoRoot(), Usd.TraverseInstanceProxies()) if prim.IsA(UsdGeom.PointBased)]
@@ -86,7 +90,7 @@ def _meshes(stage, Usd, UsdGeom) -> tuple[list[tuple[str, np.ndarray, np.ndarray
         left_handed = UsdGeom.Gprim(prim).GetOrientationAttr().Get() == UsdGeom.Tokens.leftHanded
         if left_handed != (np.linalg.det(matrix[:3, :3]) < 0.0):
             cells = cells[:, [0, 2, 1, *range(3, cells.shape[1])]]
-        found.append((name or prim.GetName(), points, cells))
+        found.append((name or prim.GetName(), str(prim.GetPath()), points, cells))
     if obstacles:
         notes.append(f"obstacles are left out: {', '.join(obstacles)}")
     return found, notes

@@ -58,6 +58,10 @@ class FrameWriter:
         self._waiting.join()
         self._raise()
 
+    def kept(self, time: float) -> dict:
+        """Return what pictures from time [s] on depend on, as `Offscreen.kept`."""
+        return self.renderer.kept(time)
+
     def close(self) -> None:
         """Write the pictures that wait, and close the renderer; a second call does nothing. Raises OutputError."""
         if self._thread.is_alive():

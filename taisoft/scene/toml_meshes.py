@@ -1,11 +1,13 @@
 """Make the meshes of a scene file: from a shape with the arguments of its function, from a file, or from its own numbers."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 from taisoft.mesh.files import WRITERS, read_mesh
 from taisoft.mesh.shapes import ball_mesh, box_mesh, sheet_mesh
 from taisoft.mesh.surface_mesh import FORMATS, SurfaceMesh, read_surface
 from taisoft.mesh.tet_mesh import TetMesh
+from taisoft.mesh.usd import USD_FORMATS, read_usd_prim
 from taisoft.scene import checks
 from taisoft.scene.tables import Table, arguments_of, value_text
 
@@ -15,22 +17,36 @@ STANDALONE = (*WRITERS, ".node", ".ele")  # formats whose files reference no oth
 
 def mesh_of(table: Table, allow_outside: bool) -> TetMesh:
     """Return the mesh of a body's table, made from a shape or read from a file."""
-    files = ["file", *arguments_of(read_mesh, "path")[0]]
     shapes = {key: arguments_of(function) for key, function in MESHES.items()}
-    mesh = table.table("mesh", list(dict.fromkeys(["shape", *files, *(key for known, _ in shapes.values() for key in known)])))
+    of_shapes = [key for known, _ in shapes.values() for key in known]
+    mesh = table.table("mesh", list(dict.fromkeys(["shape", *_keys_of(read_mesh), *_keys_of(read_usd_prim), *of_shapes])))
     if ("shape" in mesh) == ("file" in mesh):
         raise mesh.error("", "must have either a shape or a file")
     if "file" in mesh:
-        mesh = table.table("mesh", files)
-        path = _mesh_path(mesh, allow_outside, STANDALONE)
-        if "fix_orientation" in mesh:
-            with mesh.located_errors():
-                checks.flag(mesh.values["fix_orientation"], "fix_orientation")
-        return mesh.make(read_mesh, keys=files[1:], path=path)
+        return _read(table, mesh, allow_outside)
     shape = kind_of(mesh, MESHES)
     known, required = shapes[shape]
     mesh = table.table("mesh", ["shape", *known], required)
     return mesh.make(MESHES[shape], "box_mesh: ", f"{shape}_mesh: ", keys=known)
+
+
+def _keys_of(reader: Callable) -> list[str]:
+    """Return the keys of a mesh that a function reads from a file."""
+    return ["file", *arguments_of(reader, "path", "alone")[0]]
+
+
+def _read(table: Table, mesh: Table, allow_outside: bool) -> TetMesh:
+    """Return the mesh of a body's table, read from a mesh file or a USD stage."""
+    if Path(str(mesh.values["file"])).suffix.lower() in USD_FORMATS:
+        mesh = table.table("mesh", _keys_of(read_usd_prim))
+        path = _mesh_path(mesh, allow_outside, USD_FORMATS)
+        return mesh.make(read_usd_prim, keys=mesh.known[1:], path=path, alone=not allow_outside)
+    mesh = table.table("mesh", _keys_of(read_mesh))
+    path = _mesh_path(mesh, allow_outside, STANDALONE)
+    if "fix_orientation" in mesh:
+        with mesh.located_errors():
+            checks.flag(mesh.values["fix_orientation"], "fix_orientation")
+    return mesh.make(read_mesh, keys=mesh.known[1:], path=path)
 
 
 def solid_of(table: Table, allow_outside: bool) -> TetMesh | SurfaceMesh:
@@ -55,7 +71,7 @@ def surface_of(table: Table, key: str, allow_outside: bool) -> SurfaceMesh:
 def _mesh_path(mesh: Table, allow_outside: bool, formats: tuple[str, ...]) -> Path:
     """Return the mesh file's path. Without allow_outside it must lie in the scene file's folder, with links resolved.
 
-    formats: endings of files that name no others.
+    formats: endings of files that name no others, or whose reader refuses those that do.
     """
     name = mesh.values["file"]
     if not isinstance(name, str) or not name or "\0" in name:

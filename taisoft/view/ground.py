@@ -14,6 +14,11 @@ MARGIN = 0.15  # least distance of the bodies from the border, in units of the s
 PARALLEL = 1e-6  # normals whose sine is below this do not cut each other off
 
 
+def finite_points(x: np.ndarray) -> np.ndarray:
+    """Return those of the points (n,3) whose coordinates are all finite."""
+    return x[np.isfinite(x).all(axis=1)]
+
+
 class Square:
     """The square of a half-space that does not move. vertices: (n,3) [m], around the start; others: half-spaces beside it."""
 
@@ -21,8 +26,8 @@ class Square:
         self._start, self._directions = vertices, _free_directions(shape, others) if len(vertices) else []
 
     def below(self, x: np.ndarray) -> np.ndarray:
-        """Return the vertices (n,3) [m] for bodies at x (m,3) [m]; the start's own while these are well inside."""
-        x, square = x[np.isfinite(x).all(axis=1)], self._start
+        """Return the vertices (n,3) [m] for bodies at x (m,3) [m], all finite; the start's own while these are well inside."""
+        square = self._start
         for direction in self._directions if len(x) else ():
             own, along = self._start @ direction, x @ direction
             low, high = own.min(), own.max()

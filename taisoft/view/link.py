@@ -1,8 +1,8 @@
 """The link between a simulation and the process that shows it: small messages over a socket, node data in shared memory.
 
 A message is a dict of plain data and arrays, in bytes a header in JSON followed by the arrays; nothing is pickled. Positions
-and values at the nodes, which may be large, lie in memory that both processes map. The writer fills it only after the reader has
-confirmed the previous message, so sending never waits for the reader.
+and values at the nodes, which may be large, lie in memory that both processes map, in one or several slots. The writer fills a
+slot only after the reader has confirmed the message about its previous content, so sending rarely waits for the reader.
 """
 
 import json
@@ -52,16 +52,16 @@ def decode(data: bytes) -> dict:
 
 
 class SharedNodes:
-    """Positions x (n,3) [m] and values (n,) at all nodes, in memory that is shared through a file descriptor."""
+    """Positions x (slots,n,3) [m] and values (slots,n) at all nodes, in memory that is shared through a file descriptor."""
 
-    def __init__(self, n_nodes: int, descriptor: int | None = None):
-        size = max(1, n_nodes) * 4 * 8
+    def __init__(self, n_nodes: int, slots: int = 1, descriptor: int | None = None):
+        size = max(1, n_nodes) * slots * 4 * 8
         if descriptor is None:
             descriptor = _anonymous_file()
             os.ftruncate(descriptor, size)
         self.descriptor, self._memory = descriptor, mmap.mmap(descriptor, size)
-        data = np.frombuffer(self._memory, dtype=np.float64)
-        self.x, self.values = data[: 3 * n_nodes].reshape(n_nodes, 3), data[3 * n_nodes : 4 * n_nodes]
+        parts = np.frombuffer(self._memory, np.float64, 4 * slots * n_nodes).reshape(4, slots, n_nodes)
+        self.x, self.values = parts[:3].reshape(slots, n_nodes, 3), parts[3]
 
     def close(self) -> None:
         """Close the descriptor; the memory goes with its last array."""
@@ -83,10 +83,11 @@ class Link:
         self._connection, self.nodes = connection, nodes
 
     @classmethod
-    def pair(cls, n_nodes: int) -> tuple["Link", Connection]:
-        """Return one end, and the connection of the other one."""
+    def pair(cls, n_nodes: int, slots: int = 1) -> tuple["Link", Connection]:
+        """Return one end, and the connection of the other one. Raises OSError, for instance without memory."""
+        nodes = SharedNodes(n_nodes, slots)
         own, other = Pipe()
-        return cls(own, SharedNodes(n_nodes)), other
+        return cls(own, nodes), other
 
     def send(self, message: dict) -> None:
         """Send a message. Raises LinkClosed."""

@@ -212,8 +212,14 @@ class LiveRun:
     # --- state --------------------------------------------------------------------------------------------------------
 
     def _publish(self, patience: float = 0.0) -> None:
-        """Publish the state if it changed and the window has taken the previous one; patience: how long to wait for that [s]."""
-        due = self._changed or time.perf_counter() - self._published > REPEAT
+        """Publish the state if it changed and the window has taken the previous one; patience: how long to wait for that [s].
+
+        While a drag waits for a step, the next state is that after the step.
+        """
+        age = time.perf_counter() - self._published
+        # the window would be drawing an earlier state when a step has used its drag
+        awaited = not self.paused and self._drag_request > self._drag_done
+        due = age > REPEAT or (self._changed and not awaited)
         if not due or not (self._window.ready or patience):
             return
         self._window.publish(self.sim, self._plots, self.panel_state(), patience)

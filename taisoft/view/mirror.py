@@ -111,7 +111,7 @@ def describe_state(sim, marks: ConnectionMarks, layers: set[str], history: Histo
         segments = marks.segments(sim) if "connections" in layers else None
         pressures = marks.pressures(sim) if "pressures" in layers else []
     except (SceneError, SimulationError) as error:
-        raise OutputError(f"the window cannot show the scene: {error}") from error
+        raise OutputError(f"the scene cannot be shown: {error}") from error
     energies = sim.energies()
     state = {
         "time": sim.time,

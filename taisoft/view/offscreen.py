@@ -4,6 +4,7 @@ Surfaces, lines as bands, and shadows on half-spaces are drawn with four samples
 """
 
 import operator
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -36,8 +37,8 @@ def checked_size(size) -> tuple[int, int]:
 class Offscreen(SceneView):
     """Draws a scene's bodies and obstacles as pictures.
 
-    scene, size, camera, colour, layers, marks: as for `SceneView`. The kernels run in the open runtime, or in one of arch cpu
-    that is claimed only while a picture is drawn. Raises OutputError.
+    scene, size, camera, colour, layers, values, marks: as for `SceneView`. The kernels run in the open runtime, or in one of
+    arch cpu that is claimed only while a picture is drawn. Raises OutputError.
     """
 
     def __init__(
@@ -47,10 +48,11 @@ class Offscreen(SceneView):
         camera: Camera | None = None,
         colour: str = "body",
         layers: tuple[str, ...] = IN_PICTURES,
+        values: Callable | None = None,
         marks=None,
     ):
         self.size = checked_size(size)
-        super().__init__(scene, self.size, camera, colour, layers, marks=marks)
+        super().__init__(scene, self.size, camera, colour, layers, values, marks)
         self._samples = (self.size[0] * SAMPLES, self.size[1] * SAMPLES)
         self._background = background(self.size)
         self._raster = Raster(self._samples)
@@ -58,10 +60,10 @@ class Offscreen(SceneView):
         self._drawn_at: float | None = None  # time of the latest picture [s]
         self._before: dict = {}  # what was kept before it
 
-    def kept(self, time: float) -> dict:
+    def kept(self, time: float | None = None) -> dict:
         """Return, as plain data, what pictures from time [s] on depend on: distance of the camera [m], scales, recent maxima.
 
-        A picture already drawn at that time does not count, since a resumed run draws it again.
+        A picture already drawn at that time does not count, since a resumed run draws it again; without a time all do.
         """
         return self._before if time == self._drawn_at else self._present()
 

@@ -1,7 +1,9 @@
 """Dragging a body with the mouse: the point under the cursor, and the spring's end that follows the cursor.
 
-A drag acts on a patch of nodes around the nearest surface triangle on the cursor's ray, rather than on the triangle. So its force
-is spread over enough mass for a stiff spring, and does not crush the tets at the point. The patch is measured at rest, so that it
+What is drawn is picked: the body's surface, or the skin that rides in its tets, whose points are sums of the tets' nodes.
+
+A drag acts on a patch of nodes around the nearest point on the cursor's ray, rather than on the triangle hit. So its force is
+spread over enough mass for a stiff spring, and does not crush the tets at the point. The patch is measured at rest, so that it
 does not grow while the body is stretched.
 """
 
@@ -12,12 +14,15 @@ import numpy as np
 from taisoft.output.camera import Camera
 
 PATCH = 0.1  # radius in units of the diagonal of the body's bounding box at rest
-MIN_NODES = 4  # with fewer nodes in the patch, only the triangle's corners are dragged
+MIN_NODES = 4  # with fewer nodes in the patch, only those that carry the point are dragged
 
 
 @dataclass(frozen=True)
 class Hit:
-    """A point (3,) [m] on a body's surface, in the triangle of nodes (3,) with barycentric weights (3,)."""
+    """A point (3,) [m] on what is drawn of a body: the sum of nodes (k,), by weights (k,) of sum 1.
+
+    Those are a triangle's corners with barycentric weights, or, below a skin, the nodes of the tets that carry the corners.
+    """
 
     body: int
     nodes: np.ndarray
@@ -54,15 +59,26 @@ def pick(sim, camera: Camera, cursor: tuple[float, float], size: tuple[int, int]
     """
     direction, best, distance = camera.ray(cursor, size), None, np.inf
     for k, body in enumerate(sim.scene.bodies):
-        x, surface = sim.positions(body.name), np.asarray(body.nodes.surface)
-        found = nearest_hit(camera.position, direction, x, surface)
+        skin, x = body.riding_skin, sim.positions(body.name)
+        shown, triangles = (x, body.nodes.surface) if skin is None else (skin.weights @ x, skin.surface.triangles)
+        found = nearest_hit(camera.position, direction, shown, np.asarray(triangles))
         if found is None:
             continue
-        point = found[1] @ x[surface[found[0]]]
+        corners, weights = triangles[found[0]], found[1]
+        point = weights @ shown[corners]
         depth = float(np.linalg.norm(point - camera.position))
         if depth < distance:
-            best, distance = Hit(k, surface[found[0]], found[1], point), depth
+            best, distance = Hit(k, *_carriers(skin, corners, weights), point), depth
     return best
+
+
+def _carriers(skin, corners: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return nodes (k,) and weights (k,) of a point, given by those of a drawn triangle's corners; skin: None without one."""
+    if skin is None:
+        return corners, weights
+    of_nodes = weights @ skin.weights[corners].toarray()
+    nodes = np.flatnonzero(of_nodes)
+    return nodes, of_nodes[nodes]
 
 
 class MouseDrag:
@@ -99,7 +115,8 @@ class MouseDrag:
 def _patch(rest: np.ndarray, hit: Hit, radius: float) -> tuple[np.ndarray, np.ndarray]:
     distance = np.linalg.norm(rest - hit.weights @ rest[hit.nodes], axis=1) / radius
     nodes = np.flatnonzero(distance < 1.0)
-    if len(nodes) < MIN_NODES:
-        return hit.nodes, hit.weights
-    weights = (1.0 - distance[nodes] ** 2) ** 2
+    if len(nodes) >= MIN_NODES:
+        weights = (1.0 - distance[nodes] ** 2) ** 2
+    else:  # weights of a skin's point outside of its tet, or in one of second order, may be negative
+        nodes, weights = hit.nodes[hit.weights > 0.0], hit.weights[hit.weights > 0.0]
     return nodes, weights / weights.sum()

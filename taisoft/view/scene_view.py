@@ -22,7 +22,7 @@ from taisoft.scene.loads import value_at
 from taisoft.scene.obstacles import HalfSpace
 from taisoft.view.colouring import Colouring, lit_colours
 from taisoft.view.connection_layer import ConnectionLayer, ConnectionMarks, PressureLayer, arrows
-from taisoft.view.ground import Square
+from taisoft.view.ground import Square, finite_points
 
 CREASE = 35.0  # [deg] between the normals of neighbouring triangles at rest
 MARKER_COLOUR = np.array([0.20, 0.22, 0.26])  # sRGB
@@ -89,11 +89,12 @@ class Surfaces:
         self._bodies = [
             _BodySurface(body, *surface, body_colour(k), scene.constraints(body)) for k, (body, surface) in enumerate(surfaces)
         ]
-        self._starts = self._shown.starts[:-1]
         fixed = [o.shape for o in scene.obstacles if isinstance(o.shape, HalfSpace) and o.path is None]
         self._obstacles = [_RigidSurface(surface, fixed) for surface in obstacle_surfaces(scene)]
-        nodes = [np.where(body.nodes >= 0, body.nodes + start, -1) for body, start in zip(self._bodies, self._starts)]
-        self._nodes = np.concatenate(nodes)  # shown vertices of the drawn ones; -1 for markers
+        nodes = [body.nodes + start for body, start in zip(self._bodies, self._shown.starts)]
+        self._nodes = np.concatenate(nodes)  # shown vertices of the drawn ones, or at whose place they are
+        self._markers = np.flatnonzero(np.concatenate([body.is_marker for body in self._bodies]))
+        self._balls, self._radii = (np.concatenate([getattr(b, name) for b in self._bodies]) for name in ("balls", "radii"))
         self.with_markers = True  # of fixed nodes
         parts = [*self._bodies, *self._obstacles]
         firsts = np.cumsum([0] + [len(part.colours) for part in parts])  # drawn vertex of each part
@@ -109,26 +110,32 @@ class Surfaces:
 
         x: (n,3) [m], of which the first are the bodies' drawn vertices; t: time [s].
         """
-        return [(at, part.at(t, x[: self.n_of_bodies])) for at, part in self._half_spaces]
+        bodies = finite_points(x[: self.n_of_bodies])
+        return [(at, part.at(t, bodies)) for at, part in self._half_spaces]
 
     def coloured(self, colours: np.ndarray) -> np.ndarray:
         """Return colours (n,3) of all drawn vertices, given colours (n_nodes,3) of the bodies' nodes."""
         all_colours = self.colours.copy()
-        drawn = np.flatnonzero(self._nodes >= 0)
-        all_colours[drawn] = np.clip(self._shown.of(colours), 0.0, 1.0)[self._nodes[drawn]]
+        all_colours[: self.n_of_bodies] = np.clip(self._shown.of(colours), 0.0, 1.0)[self._nodes]
+        all_colours[self._markers] = self.colours[self._markers]
         return all_colours
 
     def of_bodies(self, sim) -> tuple[np.ndarray, np.ndarray]:
         """Return positions [m] and unit normals of the bodies' drawn vertices in sim's present state, each float64 (n,3)."""
-        x = np.split(self._shown.of(sim.positions()), self._starts[1:])
-        return _concatenated([body.vertices(own, self.with_markers) for body, own in zip(self._bodies, x)])
+        x = self._shown.of(sim.positions())[self._nodes]
+        normals = vertex_normals(x, self.body_triangles)
+        x[self._markers] += self.with_markers * self._radii[:, None] * self._balls
+        normals[self._markers] = self._balls
+        return x, normals
 
     def with_obstacles(self, bodies: tuple[np.ndarray, np.ndarray], t: float, eye: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return positions and normals of all drawn vertices: those from `of_bodies`, then the obstacles'.
 
         t: time [s]; eye: position (3,) [m], for culling. Raises OutputError if the path of an obstacle fails.
         """
-        return _concatenated([bodies, *(obstacle.vertices(t, bodies[0], eye) for obstacle in self._obstacles)])
+        finite = finite_points(bodies[0]) if self._obstacles else bodies[0]
+        parts = [bodies, *(obstacle.vertices(t, finite, eye) for obstacle in self._obstacles)]
+        return np.concatenate([x for x, _ in parts]), np.concatenate([n for _, n in parts])
 
 
 class Layers:
@@ -195,29 +202,26 @@ def scene_size(scene) -> float:
     return float(np.linalg.norm(np.ptp(start_positions(scene), axis=0)))
 
 
-def _concatenated(parts: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
-    return np.concatenate([x for x, _ in parts]), np.concatenate([n for _, n in parts])
-
-
 class _BodySurface:
-    def __init__(self, body, rest: np.ndarray, surface: np.ndarray, colour: np.ndarray, constraints: list):
-        self._nodes, self._corners = smoothing_groups(rest, surface)
-        edges = rest[surface] - rest[np.roll(surface, 1, axis=1)]
-        self._radius = MARKER_SIZE * float(np.linalg.norm(edges, axis=2).mean())
-        self._marked = _fixed_surface_nodes(constraints, surface) if body.riding_skin is None else np.empty(0, dtype=np.int64)
-        self._ball, ball_triangles = _coarse_ball()
-        counts = len(self._nodes), len(self._ball) * len(self._marked)
-        starts = len(self._nodes) + len(self._ball) * np.arange(len(self._marked))
-        markers = (starts[:, None, None] + ball_triangles).reshape(-1, 3)
-        self.own_triangles, self.triangles = self._corners, np.concatenate([self._corners, markers])
-        self.colours = np.repeat([colour, MARKER_COLOUR], counts, axis=0)
-        self.nodes = np.concatenate([self._nodes, np.full(counts[1], -1)])  # of each drawn vertex; -1 for markers
+    """Topology of a body's drawn surface, with balls as markers of fixed nodes.
 
-    def vertices(self, x: np.ndarray, with_markers: bool) -> tuple[np.ndarray, np.ndarray]:
-        drawn = x[self._nodes]
-        markers = (x[self._marked][:, None] + with_markers * self._radius * self._ball).reshape(-1, 3)
-        normals = np.tile(self._ball, (len(self._marked), 1))
-        return np.concatenate([drawn, markers]), np.concatenate([vertex_normals(drawn, self._corners), normals])
+    triangles, and own_triangles without markers, of drawn vertices; nodes: of each drawn vertex, for a marker that in its middle;
+    is_marker; balls (m,3), radii (m,): offsets of the markers' vertices, as unit vectors, and their lengths [m]; colours.
+    """
+
+    def __init__(self, body, rest: np.ndarray, surface: np.ndarray, colour: np.ndarray, constraints: list):
+        nodes, corners = smoothing_groups(rest, surface)
+        edges = rest[surface] - rest[np.roll(surface, 1, axis=1)]
+        marked = _fixed_surface_nodes(constraints, surface) if body.riding_skin is None else np.empty(0, dtype=np.int64)
+        ball, ball_triangles = _coarse_ball()
+        counts = len(nodes), len(ball) * len(marked)
+        starts = len(nodes) + len(ball) * np.arange(len(marked))
+        markers = (starts[:, None, None] + ball_triangles).reshape(-1, 3)
+        self.own_triangles, self.triangles = corners, np.concatenate([corners, markers])
+        self.colours = np.repeat([colour, MARKER_COLOUR], counts, axis=0)
+        self.nodes, self.is_marker = np.concatenate([nodes, np.repeat(marked, len(ball))]), np.repeat([False, True], counts)
+        self.balls = np.tile(ball, (len(marked), 1))
+        self.radii = np.full(counts[1], MARKER_SIZE * float(np.linalg.norm(edges, axis=2).mean()))
 
 
 class _RigidSurface:
@@ -230,15 +234,21 @@ class _RigidSurface:
         if self.is_half_space and surface.obstacle.path is None:
             self._square = Square(shape, surface.vertices, [other for other in fixed if other is not shape])
         self._nodes, self._corners = smoothing_groups(surface.vertices, surface.triangles)
+        self._drawn: tuple | None = None  # the last vertices and eye, and what was drawn for them
         self.triangles = np.arange(self._corners.size).reshape(-1, 3)
         self.colours = np.tile(OBSTACLE_COLOUR, (self._corners.size, 1))
 
     def at(self, t: float, bodies: np.ndarray) -> np.ndarray:
-        """Return the vertices (n,3) [m] at time t [s], with bodies at (m,3) [m]."""
+        """Return the vertices (n,3) [m] at time t [s], with bodies at (m,3) [m], all finite."""
         return self._surface.at(t) if self._square is None else self._square.below(bodies)
 
     def vertices(self, t: float, bodies: np.ndarray, eye: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        x = self.at(t, bodies)[self._nodes]
+        x = self.at(t, bodies)
+        if self._drawn is None or not (np.array_equal(x, self._drawn[0]) and np.array_equal(eye, self._drawn[1])):
+            self._drawn = x, eye, self._culled(x[self._nodes], eye)
+        return self._drawn[2]
+
+    def _culled(self, x: np.ndarray, eye: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         corners, normals = x[self._corners], vertex_normals(x, self._corners)[self._corners]
         a, b, c = np.moveaxis(corners, 1, 0)
         back_facing = np.einsum("ti,ti->t", np.cross(b - a, c - a), eye - a) <= 0

@@ -7,35 +7,29 @@ ends with its caller, however that ends.
 """
 
 import math
-import os
-import signal
-import subprocess
-import sys
 import time
 import warnings
-from contextlib import suppress
-from pathlib import Path
 from typing import NoReturn
 
-import taisoft
 from taisoft.errors import OutputError
 from taisoft.frames import dt_sentence, fit_dt
 from taisoft.records import RunReport
 from taisoft.view.annotations import REFRESH
+from taisoft.view.child_process import ChildProcess, python_module
 from taisoft.view.colouring import NodalValues
 from taisoft.view.connection_layer import ConnectionMarks
 from taisoft.view.controls import touching_pairs
 from taisoft.view.ggui import display_missing, vulkan_missing
-from taisoft.view.link import Link, LinkClosed
+from taisoft.view.link import LinkClosed
 from taisoft.view.live import LiveRun
 from taisoft.view.mirror import describe_scene, describe_state
 from taisoft.view.plots import PLOTS, Plots
 from taisoft.view.scene_view import IN_WINDOW, scene_size
 
+FAILURE = "cannot open a window"
 START_SECONDS = 60.0  # in which the window must open
-END_SECONDS = 5.0  # in which it must close
 FPS = 60.0
-CHILD = (sys.executable, "-P", "-m", "taisoft.view.window_process")
+CHILD = python_module("taisoft.view.window_process")
 
 
 class WindowProcess:
@@ -59,7 +53,7 @@ class WindowProcess:
     ):
         missing = display_missing() or vulkan_missing()
         if missing:
-            raise OutputError(f"cannot open a window: {missing}")
+            raise OutputError(f"{FAILURE}: {missing}")
         scene = sim.scene
         n_nodes = sum(body.n_nodes for body in scene.bodies)
         self._values, self._colour, self._layers, self._wants_plots = NodalValues(scene.bodies), colour, set(layers), bool(plots)
@@ -67,28 +61,26 @@ class WindowProcess:
         self._history_sent = -math.inf  # wall time
         self._requests: list[tuple[int, list]] = []  # not yet returned
         self.closed, self.timing = False, {}
-        self._link, other = Link.pair(n_nodes)
-        self._process: subprocess.Popen | None = _spawn(child or CHILD, other.fileno(), self._link.nodes.descriptor)
-        other.close()
         self._marks = ConnectionMarks(scene, scene_size(scene))
-        description = describe_scene(scene, self._marks) | {"n_nodes": n_nodes, "fps": fps, "colour": colour}
+        description = describe_scene(scene, self._marks) | {"fps": fps, "colour": colour}
         description |= {"layers": list(layers), "plots": list(plots)}
         description |= {"controls": controls, "pairs": touching_pairs(sim) if controls else []}
+        self._child = ChildProcess(child or CHILD, description, FAILURE, n_nodes)
+        self._link = self._child.link
         try:
-            self._open(description)
+            self._wait_until_open()
         except BaseException:
             self.close()
             raise
 
-    def _open(self, description: dict) -> None:
-        """Send the scene and wait until the window is open. Raises OutputError."""
+    def _wait_until_open(self) -> None:
+        """Wait until the window is open. Raises OutputError."""
         try:
-            self._link.send(description)
             answer = self._link.receive(START_SECONDS)
         except LinkClosed:
-            raise OutputError(f"cannot open a window: {self._how_it_ended()}") from None
+            raise OutputError(f"{FAILURE}: {self._child.how_it_ended()}") from None
         if answer is None:
-            raise OutputError(f"cannot open a window: its process does not answer within {START_SECONDS:g} s")
+            raise OutputError(f"{FAILURE}: its process does not answer within {START_SECONDS:g} s")
         if "error" in answer:
             raise OutputError(answer["error"])
 
@@ -143,9 +135,9 @@ class WindowProcess:
         if self._wants_plots and now - self._history_sent >= REFRESH:
             history, self._history_sent = plots.history, now
         state = describe_state(sim, self._marks, self._layers, history)
-        self._link.nodes.x[:] = sim.positions()
+        self._link.nodes.x[0] = sim.positions()
         if self._colour != "body":
-            self._link.nodes.values[:] = self._values(self._colour, sim)
+            self._link.nodes.values[0] = self._values(self._colour, sim)
         self._sent += 1
         state |= {"enabled": plots.enabled(), "number": self._sent, "answered": self._answered, "colour": self._colour} | shown
         try:
@@ -156,40 +148,12 @@ class WindowProcess:
 
     def close(self) -> None:
         """Close the window and wait for its process; a second call does nothing."""
-        if self._process is None:
-            return
         self.closed = True
-        with suppress(LinkClosed):
-            self._link.send({"end": True})
-        self._link.close()
-        try:
-            self._process.wait(END_SECONDS)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
-        self._process = None
+        self._child.close()
 
     def _lose(self) -> NoReturn:
         self.closed = True
-        raise OutputError(f"the window is lost: {self._how_it_ended()}")
-
-    def _how_it_ended(self) -> str:
-        try:
-            status = self._process.wait(END_SECONDS)
-        except subprocess.TimeoutExpired:
-            return "its process does not answer"
-        how = f"by signal {signal.Signals(-status).name}" if status < 0 else f"with exit status {status}"
-        return f"its process ended {how}"
-
-
-def _spawn(child: tuple[str, ...], *descriptors: int) -> subprocess.Popen:
-    """Start the window's process with this version of taisoft; a session of its own shields it from the terminal's Ctrl-C."""
-    folder = str(Path(taisoft.__file__).resolve().parents[1])
-    paths = {"PYTHONPATH": os.pathsep.join(filter(None, (folder, os.environ.get("PYTHONPATH"))))}
-    command = [*child, *map(str, descriptors)]
-    return subprocess.Popen(
-        command, env=os.environ | paths, pass_fds=descriptors, stdin=subprocess.DEVNULL, start_new_session=True
-    )
+        raise OutputError(f"the window is lost: {self._child.how_it_ended()}")
 
 
 class LiveWindow:

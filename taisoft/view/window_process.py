@@ -6,16 +6,16 @@ when the window is closed, when the other process asks for it, and when that pro
 
 import sys
 import time
-from multiprocessing.connection import Connection
 
-from taisoft.errors import TaisoftError
-from taisoft.view.link import Link, LinkClosed, SharedNodes, receive
+from taisoft.view.child_process import serve
+from taisoft.view.link import Link
 from taisoft.view.mirror import MirrorSimulation
 from taisoft.view.panel import Requests
 from taisoft.view.screen import Screen
 
 MAX_UNANSWERED = 64  # requests; later commands wait, so that a long step lets no queue grow
 IDLE_SHARE = 1.0  # time without drawing over that of drawing: with software Vulkan, drawing takes cores from the simulation
+ANSWER = 1.0 / 40.0  # time for which a picture may wait for the step that uses a drag, or as long as the last one took [s]
 SLOWEST = 1.0 / 25.0  # time between two pictures above which there is no such pause [s]
 
 
@@ -33,25 +33,34 @@ class View:
         self._ended = False
 
     def run(self) -> None:
-        """Draw until the window is closed or the simulation ends it."""
+        """Draw until the window is closed or the simulation ends it; then close the window."""
+        try:
+            self._draw()
+        finally:
+            self._screen.close()
+
+    def _draw(self) -> None:
         self._receive(None)
         while not self._ended and not self._screen.closed:
             begin = time.perf_counter()
             self._screen.draw(self._sim, self._state, begin - self._came)
             self._send()
-            end = time.perf_counter()
-            idle = 0.0 if self._screen.dragging else IDLE_SHARE * (end - begin)
-            end = max(begin + self._interval, min(end + idle, begin + SLOWEST))
-            while not self._ended and (left := end - time.perf_counter()) > 0.0:
-                self._receive(left)
-            self._receive(0.0)
+            self._wait(begin, time.perf_counter())
         if not self._ended:
             timing = self._screen.timing
             self._link.send({"closed": True, "pictures": list(timing.pictures), "latencies": list(timing.latencies)})
 
-    def close(self) -> None:
-        """Close the window."""
-        self._screen.close()
+    def _wait(self, begin: float, end: float) -> None:
+        """Take over states until the next picture is due; begin, end: of the last one [s]."""
+        idle = 0.0 if self._screen.dragging else IDLE_SHARE * (end - begin)
+        due = max(begin + self._interval, min(end + idle, begin + SLOWEST))
+        while not self._ended and (left := due - time.perf_counter()) > 0.0:
+            self._receive(left)
+        # a drag that has no effect in the next picture has to wait for the one after it
+        limit = max(ANSWER, end - begin)
+        while not self._ended and (left := self._screen.timing.seconds_to_answer(limit)) > 0.0:
+            self._receive(left)
+        self._receive(0.0)
 
     def _receive(self, timeout: float | None) -> None:
         """Take over all states that have come; wait up to a time [s] for the first."""
@@ -61,7 +70,8 @@ class View:
                 self._ended = True
                 return
             self._state, self._came = message, time.perf_counter()
-            self._sim.take(message, self._link.nodes.x, self._link.nodes.values)
+            self._sim.take(message, self._link.nodes.x[0], self._link.nodes.values[0])
+            self._screen.timing.came(message)
             self._screen.plots.set_enabled(message["enabled"])
             self._send()  # at once, so that the simulation may send the next one
 
@@ -78,25 +88,5 @@ class View:
             self._confirmed = shown
 
 
-def main(socket: int, memory: int) -> None:
-    """Show the simulation at the other end of the link."""
-    connection = Connection(socket)
-    try:
-        description = receive(connection, None)
-        link = Link(connection, SharedNodes(description["n_nodes"], memory))
-        try:
-            view = View(link, description)
-        except TaisoftError as error:
-            link.send({"error": str(error)})
-            return
-        try:
-            link.send({"open": True})
-            view.run()
-        finally:
-            view.close()
-    except LinkClosed:
-        pass  # the simulation's process has ended
-
-
 if __name__ == "__main__":
-    main(*map(int, sys.argv[1:]))
+    serve(View, *map(int, sys.argv[1:]))

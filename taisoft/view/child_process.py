@@ -1,0 +1,106 @@
+"""A process beside the simulation that shows or draws it: both ends of its life.
+
+The caller starts `python -m MODULE SOCKET MEMORY`, two descriptors that the process inherits. So a script that starts one needs
+no `if __name__ == "__main__"`, and nothing but what travels over the link (`taisoft.view.link`) is shared. The process ends when
+it is asked to, and when its caller ends, however that ends.
+"""
+
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
+from contextlib import suppress
+from multiprocessing.connection import Connection
+from pathlib import Path
+
+import taisoft
+from taisoft.errors import OutputError, TaisoftError, no_memory
+from taisoft.view.link import Link, LinkClosed, SharedNodes, receive
+
+END_SECONDS = 5.0  # in which a process must end
+
+
+def python_module(name: str) -> tuple[str, ...]:
+    """Return the command that runs a module."""
+    return sys.executable, "-P", "-m", name
+
+
+class ChildProcess:
+    """A process at the other end of a link.
+
+    command: to which the descriptors are appended; description: sent first; it gets `n_nodes`, of all bodies, and `slots` for
+    their data; failure: what cannot be done without the process, for messages. link: this end of the link. Raises OutputError if
+    the process cannot be started.
+    """
+
+    def __init__(self, command: tuple[str, ...], description: dict, failure: str, n_nodes: int, slots: int = 1):
+        self._process: subprocess.Popen | None = None
+        try:
+            self.link, other = Link.pair(n_nodes, slots)
+        except OSError as error:
+            raise OutputError(f"{failure}: no memory can be shared with its process: {error.strerror or error}") from error
+        try:
+            self._process = _start(command, other.fileno(), self.link.nodes.descriptor)
+        except OSError as error:
+            self.link.close()
+            raise OutputError(f"{failure}: its process cannot be started: {error.strerror or error}") from error
+        finally:
+            other.close()
+        with suppress(LinkClosed):  # the next call that reads says why
+            self.link.send(description | {"n_nodes": n_nodes, "slots": slots})
+
+    @property
+    def pid(self) -> int | None:
+        """Number of the process, None once it is closed."""
+        return None if self._process is None else self._process.pid
+
+    def how_it_ended(self) -> str:
+        """Return, after the link was found closed, how the process ended, as a sentence."""
+        try:
+            status = self._process.wait(END_SECONDS)
+        except subprocess.TimeoutExpired:
+            return "its process does not answer"
+        how = f"by signal {signal.Signals(-status).name}" if status < 0 else f"with exit status {status}"
+        return f"its process ended {how}"
+
+    def close(self) -> None:
+        """Ask the process to end and wait for that; a second call does nothing."""
+        process, self._process = self._process, None
+        if process is None:
+            return
+        with suppress(LinkClosed):
+            self.link.send({"end": True})
+        self.link.close()
+        try:
+            process.wait(END_SECONDS)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+
+
+def _start(command: tuple[str, ...], *descriptors: int) -> subprocess.Popen:
+    """Start a process with this version of taisoft; a session of its own shields it from the terminal's Ctrl-C."""
+    folder = str(Path(taisoft.__file__).resolve().parents[1])
+    paths = {"PYTHONPATH": os.pathsep.join(filter(None, (folder, os.environ.get("PYTHONPATH"))))}
+    full = [*command, *map(str, descriptors)]
+    return subprocess.Popen(full, env=os.environ | paths, pass_fds=descriptors, stdin=subprocess.DEVNULL, start_new_session=True)
+
+
+def serve(make: Callable[[Link, dict], object], socket: int, memory: int) -> None:
+    """Run what `make` returns for the link and the caller's description, an object with `run()`, until it or the caller ends.
+
+    An error of `make` is sent as `error`; else `open` is. socket, memory: the descriptors.
+    """
+    connection = Connection(socket)
+    with suppress(LinkClosed):
+        description = receive(connection, None)
+        link = Link(connection, SharedNodes(description["n_nodes"], description["slots"], memory))
+        try:
+            served = make(link, description)
+        except (TaisoftError, MemoryError) as error:
+            error = no_memory("a scene to show", error) if isinstance(error, MemoryError) else error
+            link.send({"error": str(error)})
+            return
+        link.send({"open": True})
+        served.run()

@@ -1,0 +1,67 @@
+"""The process that draws a run's pictures: `python -m taisoft.view.picture_process SOCKET MEMORY`, see `taisoft.view.pictures`.
+
+It gets a description of the scene, then states, which it draws, codes and writes in their order. It says when a state is drawn,
+and on request when all pictures are written. When its caller ends without a request, the pictures that wait are dropped.
+"""
+
+import os
+import sys
+from dataclasses import fields
+from pathlib import Path
+
+from taisoft.compile_message import silenced
+from taisoft.errors import TaisoftError, no_memory, reason
+from taisoft.view.child_process import serve
+from taisoft.view.link import Link, LinkClosed
+from taisoft.view.mirror import MirrorSimulation
+from taisoft.view.pictures import FAILURE, PictureOptions, picture_writer
+from taisoft.view.plots import PlotChoice
+
+
+class Drawing:
+    """Draws the states that come over a link. description: of the scene and the pictures. Raises OutputError."""
+
+    def __init__(self, link: Link, description: dict):
+        self._link, self._caller = link, description["caller"]
+        self._sim = MirrorSimulation(description, description["n_nodes"])
+        options = PictureOptions(**{one.name: description[one.name] for one in fields(PictureOptions)})
+        self._plots = PlotChoice(None, description["enabled"], tuple(options.plots)) if options.plots else None
+        drawn = {"values": self._sim.values_of, "marks": self._sim.marks}
+        self._writer = picture_writer(Path(description["folder"]), self._sim.scene, options, self._plots, **drawn)
+
+    def run(self) -> None:
+        """Draw until the caller asks for the end or ends. The error that ends it before is sent."""
+        try:
+            with silenced():
+                while "end" not in (message := self._link.receive(None)):
+                    if os.getppid() != self._caller:  # its pictures in the folder may be another run's by now
+                        return
+                    self._take(message)
+        except LinkClosed:
+            raise
+        except TaisoftError as error:
+            self._link.send({"error": str(error)})
+        except MemoryError as error:
+            self._link.send({"error": f"{FAILURE}: {no_memory('a picture', error)}"})
+        except Exception as error:
+            self._link.send({"error": f"{FAILURE}: {reason(error)}"})
+            raise
+
+    def _take(self, message: dict) -> None:
+        """Draw a state, or wait until all pictures are written."""
+        if "flush" in message:
+            self._writer.flush()
+            self._link.send({"flushed": True})
+            return
+        nodes, slot = self._link.nodes, message["slot"]
+        self._sim.take(message, nodes.x[slot], nodes.values[slot])
+        if self._plots is not None:
+            self._plots.history = self._sim.history
+            self._plots.set_enabled(message["enabled"])
+        self._writer.frame(self._sim, message["index"])
+        drawing = self._writer.renderer
+        self._link.send({"drawn": self._sim.time, "kept": [drawing.kept(self._sim.time), drawing.kept()]})
+
+
+if __name__ == "__main__":
+    serve(Drawing, *map(int, sys.argv[1:]))

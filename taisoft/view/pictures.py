@@ -1,0 +1,170 @@
+"""Pictures of a run: drawn in a process of their own where that saves time, else between the steps.
+
+In `taisoft.view.picture_process` drawing, coding and writing overlap with the next steps. The simulation then only hands over its
+state, over the link of the live window, and waits only if SLOTS states are not drawn yet. Both ways write the same bytes.
+"""
+
+import os
+import threading
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+from taisoft.errors import OutputError
+from taisoft.machine import usable_cores
+from taisoft.output.files import make_folder
+from taisoft.output.frames import FRAMES_NAME, FrameWriter
+from taisoft.view.annotations import Annotations
+from taisoft.view.child_process import ChildProcess, python_module
+from taisoft.view.colouring import NodalValues
+from taisoft.view.connection_layer import ConnectionMarks
+from taisoft.view.link import LinkClosed
+from taisoft.view.mirror import describe_scene, describe_state
+from taisoft.view.offscreen import SIZE, Offscreen
+from taisoft.view.plots import PlotChoice, Plots
+from taisoft.view.scene_view import IN_PICTURES, scene_size
+
+SLOTS = 8  # states that wait to be drawn, besides the pictures that wait to be written
+MIN_PICTURES = 30  # fewer take less time than it takes to start a process
+CHILD = python_module("taisoft.view.picture_process")
+FAILURE = "the drawing of pictures failed"
+
+
+@dataclass(frozen=True)
+class PictureOptions:
+    """What pictures show, as plain data.
+
+    size: width and height [pixels]; colour, layers: as for `Offscreen`; plots: names of those drawn; caption: the scene's name,
+    or None for no caption; bar: whether there is a colour bar, for a colour other than "body"; kept: what an earlier run kept.
+    """
+
+    size: tuple[int, int] = SIZE
+    colour: str = "body"
+    layers: tuple[str, ...] = IN_PICTURES
+    plots: tuple[str, ...] = ()
+    caption: str | None = None
+    bar: bool = False
+    kept: dict = field(default_factory=dict)
+
+
+def picture_writer(folder: Path, scene, options: PictureOptions, plots: PlotChoice | None, **drawn) -> FrameWriter:
+    """Return a `FrameWriter` that draws in this process.
+
+    plots: history of options.plots; drawn: values and marks, as for `Offscreen`. Raises OutputError.
+    """
+    drawing = Offscreen(scene, options.size, colour=options.colour, layers=tuple(options.layers), **drawn)
+    drawing.resume(options.kept)
+    annotate = None
+    if options.plots or options.caption is not None or options.bar:
+        annotate = Annotations(plots if options.plots else None, options.caption, drawing.colouring if options.bar else None).draw
+    return FrameWriter(folder, drawing, annotate)
+
+
+def open_pictures(
+    folder: Path, sim, options: PictureOptions, plots: Plots | None, n_pictures: int
+) -> "FrameWriter | PictureProcess":
+    """Return an observer that writes about n_pictures of sim; with a single core, or few pictures, it draws in this process.
+
+    Both have `frame`, `flush`, `close` and `kept`. Raises OutputError.
+    """
+    if n_pictures < MIN_PICTURES or len(usable_cores()) < 2:
+        return picture_writer(folder, sim.scene, options, plots)
+    return PictureProcess(folder, sim, options, plots)
+
+
+class PictureProcess:
+    """Observer that writes folder/frames/<index>.png in another process.
+
+    plots: history of options.plots; child: command of the process, if not CHILD. What fails in the other process, and its end,
+    raises OutputError at the next `frame`, `flush` or `close`; later pictures are not written. Raises OutputError.
+    """
+
+    def __init__(
+        self, folder: str | Path, sim, options: PictureOptions, plots: Plots | None = None, child: tuple[str, ...] | None = None
+    ):
+        self.folder, scene = make_folder(Path(folder) / FRAMES_NAME).absolute(), sim.scene
+        self._options, self._layers, self._values = options, set(options.layers), NodalValues(scene.bodies)
+        self._plots = plots if options.plots else None
+        self._marks = ConnectionMarks(scene, scene_size(scene))
+        self._sent = self._drawn = 0  # numbers of states
+        self._flushed, self._error = True, None
+        self._drawn_at, self._kept = None, [options.kept, options.kept]  # time of the last picture [s]; before it, and after it
+        description = describe_scene(scene, self._marks) | asdict(options) | {"folder": str(self.folder.parent)}
+        description |= {"caller": os.getpid(), "enabled": self._plots.enabled() if self._plots else {}}
+        n_nodes = sum(body.n_nodes for body in scene.bodies)
+        self._child: ChildProcess | None = ChildProcess(child or CHILD, description, FAILURE, n_nodes, SLOTS)
+
+    @property
+    def pid(self) -> int | None:
+        """Number of the other process, None after `close`."""
+        return self._child and self._child.pid
+
+    def frame(self, sim, index: int) -> None:
+        """Hand over sim's present state, to be drawn as picture number index. Raises OutputError, also if a path fails."""
+        if self._child is None:
+            raise OutputError(f"picture {index} cannot be written to {self.folder}: its writer is closed")
+        self._raise()
+        while self._read(0.0):
+            pass
+        while self._sent - self._drawn >= SLOTS:
+            self._read(None)
+        nodes, slot = self._child.link.nodes, self._sent % SLOTS
+        state = describe_state(sim, self._marks, self._layers, self._plots and self._plots.history)
+        nodes.x[slot] = sim.positions()
+        if self._options.colour != "body":
+            nodes.values[slot] = self._values(self._options.colour, sim)
+        state |= {"slot": slot, "index": index, "colour": self._options.colour}
+        if self._plots is not None:
+            state["enabled"] = self._plots.enabled()
+        self._sent += 1
+        self._send(state)
+
+    def flush(self) -> None:
+        """Wait until all pictures are written. Raises OutputError."""
+        self._raise()
+        if self._child is not None:
+            self._flushed = False
+            self._send({"flush": True})
+            while not self._flushed:
+                self._read(None)
+
+    def kept(self, time: float) -> dict:
+        """Return, after a flush, what pictures from time [s] on depend on, as `Offscreen.kept`."""
+        return self._kept[0 if time == self._drawn_at else 1]
+
+    def close(self) -> None:
+        """Write the pictures that wait, and end the process; a second call does nothing. Raises OutputError."""
+        if self._child is None:
+            return
+        try:
+            self.flush()
+        finally:
+            child, self._child = self._child, None
+            threading.Thread(target=child.close, name="end of pictures").start()  # which takes a fifth of a second
+
+    def _send(self, message: dict) -> None:
+        try:
+            self._child.link.send(message)
+        except LinkClosed:
+            while self._read(None):  # the process may have said why it ended
+                pass
+
+    def _read(self, timeout: float | None) -> bool:
+        """Read the next message and return whether there was one; wait up to a time [s], or without limit for None."""
+        try:
+            message = self._child.link.receive(timeout)
+        except LinkClosed:
+            message = {"error": f"{FAILURE}: {self._child.how_it_ended()}"}
+        if message is None:
+            return False
+        if "error" in message:
+            self._error = OutputError(message["error"])
+            raise self._error
+        if "drawn" in message:
+            self._drawn += 1
+            self._drawn_at, self._kept = message["drawn"], message["kept"]
+        self._flushed |= "flushed" in message
+        return True
+
+    def _raise(self) -> None:
+        if self._error is not None:
+            raise self._error
