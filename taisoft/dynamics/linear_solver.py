@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 # Durations in iterations of `pcg`, measured on one core and on two: a multigrid iteration takes RATIO plus OVERHEAD over the
 # number of nodes, by precision; building takes BUILD. A solve by multigrid is expected to take ITERATIONS, before the first one.
-RATIO, OVERHEAD, BUILD, ITERATIONS = {ti.f32: 2.0, ti.f64: 1.5}, {ti.f32: 40_000, ti.f64: 28_000}, 300, 10
+RATIO, OVERHEAD, BUILD, ITERATIONS = {ti.f32: 3.5, ti.f64: 3.2}, {ti.f32: 25_000, ti.f64: 20_000}, 450, 10
 GROWTH, SLACK = 2.0, 10  # a solve that takes more than GROWTH times the first iterations + SLACK requires a new hierarchy
 LONGEST = 300  # iterations of a solve with a new hierarchy
 PERIOD = 128  # solves by multigrid between trials of pcg
