@@ -147,6 +147,7 @@ def _parser() -> argparse.ArgumentParser:
     option = add("scene", ("files", "scene"), "write a scene, or a starting scene for a mesh, as a .toml file").add_argument
     _add_scene_name(option, "a .toml or .py file, or a mesh (.msh, .vtu, .vtk, .mesh, .node, USD) that falls on the ground")
     _add_placement(option, "instead of falling from above the ground")
+    option("--order", type=int, choices=(1, 2), help="of the tets of a mesh, 1 or 2; 2 bends correctly (default 1)")
     option("--out", metavar="FILE", required=True, help="the .toml file; its meshes are written beside it")
     option("--overwrite", action="store_true", help="replace existing files")
 

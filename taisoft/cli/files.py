@@ -75,10 +75,13 @@ def scene(arguments: Namespace) -> int:
         placed = _given(arguments, *PLACEMENT)
         if path.suffix.lower() in (*MESH_SUFFIXES, *USD_FORMATS):
             meshes = read_usd(path) if path.suffix.lower() in USD_FORMATS else {path.stem: read_mesh(path)}
-            made, solver = _drop_scene({name: place(mesh, **placed) for name, mesh in meshes.items()}, arguments.at)
+            placed_meshes = {name: place(mesh, **placed) for name, mesh in meshes.items()}
+            made, solver = _drop_scene(placed_meshes, arguments.at, arguments.order or 1)
         elif placed or arguments.at is not None:
             options = ", ".join(f"--{name}" for name in (*PLACEMENT, "at"))
             raise SceneError(f"{arguments.scene}: {options} place a mesh, and this is a scene")
+        elif arguments.order is not None:
+            raise SceneError(f"{arguments.scene}: --order is for a mesh, and this is a scene with its own")
         else:
             made, solver = load_scene(arguments.scene, arguments.allow_outside)
     for written in write_scene(arguments.out, made, solver, arguments.overwrite):
@@ -179,11 +182,11 @@ def _print_lines(title, lines: list[tuple[str, str]]) -> None:
         print(f"  {name:<10} {text}")
 
 
-def _drop_scene(meshes: dict[str, TetMesh], at: list[float] | None) -> tuple[Scene, dict]:
+def _drop_scene(meshes: dict[str, TetMesh], at: list[float] | None, order: int) -> tuple[Scene, dict]:
     """Return a scene in which meshes, of rubber with stiffness scaled to their size, fall on the ground; and its solver dict.
 
     meshes: by name, as they stand to each other. at: (3,) [m], where the middle of their underside starts; None: above the
-    ground.
+    ground. order: of the elements.
     """
     made = Scene(gravity=(0.0, -9.81, 0.0))
     vertices = np.concatenate([mesh.vertices for mesh in meshes.values()])
@@ -192,7 +195,7 @@ def _drop_scene(meshes: dict[str, TetMesh], at: list[float] | None) -> tuple[Sce
     young = float(f"{RELATIVE_STIFFNESS * DENSITY * 9.81 * height:.0e}")  # one digit
     rubber = Material(young=young, poisson=0.4, density=DENSITY, friction=0.5)
     for name, mesh in meshes.items():
-        made.add_body(mesh, rubber, name="body" if name == GROUND else name, position=position)
+        made.add_body(mesh, rubber, name="body" if name == GROUND else name, position=position, order=order)
     made.add_obstacle(HalfSpace((0.0, 0.0, 0.0), (0.0, 1.0, 0.0)), name=GROUND, friction=0.5)
     fall = math.sqrt(2.0 * DROP * height / 9.81)  # [s]
     fps = 50.0 if fall > 0.05 else float(np.ceil(2.5 / fall))
