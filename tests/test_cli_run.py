@@ -80,6 +80,30 @@ def test_warnings_are_printed_once_and_reported(tmp_path, capsys):
     assert report(out)["problems"][0].startswith("warning: body 'beam': poisson = 0.495")
 
 
+def test_the_summary_names_notes_and_warnings(tmp_path, capsys):
+    """Problems first; an ok run has none."""
+    path = write(tmp_path / "stiff.py", BEAM.replace("young=1e5", "young=1e5, poisson=0.495"))
+    assert run(path, "--set", "solver.dt=0.004", "--set", "solver.fps=none", "--seconds", "0.001") == 0
+    shown = capsys.readouterr().out
+    assert "\nwarning  body 'beam': poisson = 0.495" in shown and "\nnote     0.001 s are less than half a step" in shown
+    assert "problem" not in shown and shown.index("\nwarning") < shown.index("\nnote")
+
+
+def test_the_plan_is_short_unless_verbose(beam, capsys):
+    assert run(beam, "--seconds", "0.01") == 0
+    short = capsys.readouterr().out
+    assert "\nleft out" not in short and "plan     law:stable_neo_hookean, " in short and "used by" not in short
+    assert run(beam, "--seconds", "0.01", "--verbose") == 0
+    assert re.search(r"law:stable_neo_hookean +used by beam\n", full := capsys.readouterr().out) and "\nleft out law:" in full
+
+
+def test_a_run_with_twins_says_what_they_cost(beam, capsys):
+    assert run(beam, "--seconds", "0.05", "--error-mesh", "refined") == 0
+    shown = capsys.readouterr().out
+    assert "\ntwins    follow the run, the one on the refined mesh for some 10 to 40 times its work" in shown
+    assert re.search(r"; plus \d+\.\d\d s of twins for the error and ", shown)
+
+
 def test_a_scene_may_import_its_neighbour(tmp_path):
     write(tmp_path / "beam_parts_of_this_test.py", BEAM)
     path = write(tmp_path / "scene.py", "from beam_parts_of_this_test import build, solver\n")

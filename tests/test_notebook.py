@@ -80,7 +80,7 @@ def test_a_report_lists_its_first_problems():
     lines = repr(report).splitlines()
     assert lines[0].startswith("RunReport: degraded, ended early, 0 s in 0 steps")
     assert lines[1:7] == [*(f"  problem {k}" for k in range(5)), "  and 2 more problems"]
-    assert lines[7] == "  ErrorEstimate(time 0.012; relative to an excursion of 2 m)" and len(lines) == 8
+    assert lines[7] == "  ErrorEstimate(time 1.2 %; relative to an excursion of 2 m)" and len(lines) == 8
     assert "4 substeps, 3 contacts" in repr(report.step_reports[0]) and repr(report.step_reports[0]).endswith("not converged)")
 
 

@@ -222,6 +222,7 @@ def _add_run(add) -> None:
     option("--plots", metavar="NAME,...", help="plots over time: energies, residuals, iterations, contacts, step_time, error")
     option("--caption", action="store_true", help="write scene, frame, time and energies on pictures")
     option("--no-frames", action="store_true", help="write no pictures")
+    option("--verbose", action="store_true", help="print why each feature of the plan is on, and which are left out")
 
 
 def _add_placement(option, instead: str = "(default: the mesh stays)") -> None:

@@ -27,6 +27,7 @@ from taisoft.view.scene_view import IN_PICTURES, IN_WINDOW, LAYERS
 
 WIDTH = 118  # of the terminal
 PROBLEMS_SHOWN = 5
+KINDS = ("problem", "warning", "note")  # of entries of RunReport.problems, the most important first
 MOST = 0.5  # fraction of a run's wall time above which the summary says what pictures cost
 
 
@@ -247,9 +248,12 @@ def _size(paths: list[Path]) -> str:
     return f"{n_bytes / 1e6:.1f} MB" if n_bytes >= 1e5 else f"{n_bytes / 1e3:.1f} kB"
 
 
-def print_plan(sim) -> None:
-    """Print which features the scene needs, and why; report.json also says why the others are left out."""
+def print_plan(sim, verbose: bool) -> None:
+    """Print which features the scene needs; verbose: why, and which are left out, which report.json says too."""
     on = [entry for entry in sim.plan.entries if entry["on"]]
+    if not verbose:
+        _print_lines("plan", [", ".join(entry["feature"] for entry in on)])
+        return
     off = [entry["feature"] for entry in sim.plan.entries if not entry["on"]]
     width = max((len(entry["feature"]) for entry in on), default=0)
     _print_lines("plan", [f"{entry['feature']:<{width}}  {entry['why']}" for entry in on])
@@ -270,16 +274,19 @@ def print_summary(result: RunReport, sim, observers: Observers, recording: Recor
     early = ", ended early by a signal" if result.interrupted else ""
     _print_lines("status", [f"{result.status}{early}{changed and '; ' + changed}"])
     problems = [problem for problem in result.problems if not (changed and problem.startswith(f"note: {changed}"))]
-    for problem in problems[:PROBLEMS_SHOWN]:
-        _print_lines("problem", [problem])
-    if len(problems) > PROBLEMS_SHOWN:
-        _print_lines("", [f"and {len(problems) - PROBLEMS_SHOWN} more problems"])
+    entries = sorted((_named(problem) for problem in problems), key=lambda entry: KINDS.index(entry[0]))
+    for kind, text in entries[:PROBLEMS_SHOWN]:
+        _print_lines(kind, [text])
+    if len(entries) > PROBLEMS_SHOWN:
+        _print_lines("", [f"and {len(entries) - PROBLEMS_SHOWN} more"])
     if result.error_estimate is not None:
         _print_lines("error", describe_error(result.error_estimate, result.wall_seconds - observers.seconds))
     print_state(sim)
     output, compiling = f"{observers.seconds:.2f} s of it for output", f"{result.compile_seconds:.2f} s to compile"
     pilots = f"{result.pilot_seconds:.2f} s of pilots and " if result.pilot_seconds else ""
-    _print_lines("wall", [f"{result.wall_seconds:.2f} s, {output}; plus {pilots}{compiling}"])
+    twins = result.error_estimate.wall_seconds if result.error_estimate is not None else 0.0
+    twins_text = f"{twins:.2f} s of twins for the error and " if twins else ""
+    _print_lines("wall", [f"{result.wall_seconds:.2f} s, {output}; plus {pilots}{twins_text}{compiling}"])
     if observers.picture_seconds > MOST * result.wall_seconds:
         share = f"{observers.picture_seconds:.2f} s of it, {observers.picture_seconds / result.wall_seconds:.0%}, for pictures"
         _print_lines("", [f"{share}: a lower --fps draws fewer, --no-frames none"])
@@ -291,6 +298,12 @@ def print_summary(result: RunReport, sim, observers: Observers, recording: Recor
             _print_lines("substeps", [f"{len(divided)} steps were divided, into at most {max(divided)} substeps"])
     if recording is not None:
         _print_lines("files", recording.files())
+
+
+def _named(problem: str) -> tuple[str, str]:
+    """Return the kind of an entry of `RunReport.problems`, and its text."""
+    kind, colon, text = problem.partition(": ")
+    return (kind, text) if colon and kind in KINDS else (KINDS[0], problem)
 
 
 def _print_lines(name: str, texts: list[str]) -> None:

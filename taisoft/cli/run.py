@@ -37,6 +37,11 @@ from taisoft.view.ggui import display_missing, vulkan_missing
 from taisoft.view.plots import Plots
 
 RUN_KEYS = ("seconds", "fps")  # arguments of Simulator.run that a `solver` dict may hold too
+TWINS = {  # by --error-mesh
+    None: "for two to three times its work",
+    "refined": "the one on the refined mesh for some 10 to 40 times its work: see docs/errors.md",
+    "order": "one of them with the other order of elements",
+}
 MAY_CHANGE = ("dt", "arch")  # arguments of Simulator that may change when a run is resumed
 
 
@@ -87,7 +92,7 @@ def run(arguments: Namespace) -> int:
             sim = _resumed(saved, scene, settings)
         with sim:
             check_modelled(shown, sim)
-            print_plan(sim)
+            print_plan(sim, arguments.verbose)
             if interactive:
                 return _show_window(sim, settings, shown)
             _check_time_left(sim, settings, arguments)
@@ -244,6 +249,8 @@ def _run(sim, settings: RunSettings, arguments, signals, warned: list[str], save
         if recording is not None:
             recording.add_writers(observers, sim, settings.fps, shown, plots)
         observers.members.append(Progress(settings.seconds, label=Path(arguments.scene).stem))
+        if shown.errors:
+            print(f"twins    follow the run, {TWINS[arguments.error_mesh]}", flush=True)
         if sim.settings.tolerance is not None and resumed is None:
             print("pilots   choose integrator and dt", flush=True)
         result = sim.run(
