@@ -106,9 +106,7 @@ class RunReport:
     """Result of a run."""
 
     status: str = "ok"  #: "ok", "degraded" or "failed"
-    problems: list[str] = field(
-        default_factory=list
-    )  #: sentences; those that begin with "note:" or "warning:" keep it "ok"
+    problems: list[str] = field(default_factory=list)  #: sentences; those that begin with "note:" or "warning:" keep it "ok"
     steps: int = 0  #: steps of dt taken
     sim_seconds: float = 0.0  #: simulated time [s]
     wall_seconds: float = 0.0  #: without compile time [s]

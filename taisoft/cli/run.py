@@ -25,6 +25,7 @@ from taisoft.cli.recording import (
     print_summary,
 )
 from taisoft.cli.scene_file import OF_SCENE, load_scene, refuse_unknown
+from taisoft.cli.units import warn_millimetres
 from taisoft.errors import SceneError, SimulationError
 from taisoft.frames import check_length, first_frame
 from taisoft.output.files import check_free, read_last_good
@@ -68,6 +69,7 @@ def run(arguments: Namespace) -> int:
     _check_working_folder()
     with Signals() as signals, printed_warnings() as warned:
         scene, solver = load_scene(arguments.scene, arguments.allow_outside)
+        warn_millimetres({body.name: body.mesh for body in scene.bodies})
         _check_checkpoint_interval(arguments)
         shown = display_options(arguments, has_window=not arguments.headless and _window_is_possible())
         interactive = shown.window and arguments.out is None and arguments.seconds is None
