@@ -19,9 +19,10 @@ from taisoft.output.frames import FRAMES_NAME, FrameWriter, ffmpeg_command, find
 from taisoft.output.report import body_records, write_report
 from taisoft.output.usd import UsdWriter
 from taisoft.records import RunReport
+from taisoft.scene import checks
 from taisoft.scene.checks import nearest
 from taisoft.view.annotations import Annotations, text_missing
-from taisoft.view.offscreen import Offscreen
+from taisoft.view.offscreen import SIZE, Offscreen, checked_size
 from taisoft.view.plots import PLOTS, Plots
 from taisoft.view.scene_view import IN_PICTURES, IN_WINDOW, LAYERS
 
@@ -35,6 +36,7 @@ MOST = 0.5  # fraction of a run's wall time above which the summary says what pi
 class DisplayOptions:
     """colour: as in `Offscreen`; layers: names, or None for the defaults; plots: names; caption: the scene's name, or None.
 
+    size: of pictures [pixels]; slow: film time over simulated time.
     window, pictures, usd, vtu, npz: whether there is a window, and what is written to the folder; errors: whether they are
     estimated.
     """
@@ -49,6 +51,8 @@ class DisplayOptions:
     plots: tuple[str, ...]
     caption: str | None
     errors: bool
+    size: tuple[int, int] = SIZE
+    slow: float = 1.0
 
     @property
     def in_pictures(self) -> tuple[str, ...]:
@@ -65,7 +69,7 @@ def display_options(arguments: Namespace, has_window: bool) -> DisplayOptions:
     """Return the requested display options. Raises SceneError for unknown names and for options that nothing would show."""
     pictures = arguments.out is not None and not arguments.no_frames
     layers, plots = _names("layers", arguments.layers, LAYERS), _names("plots", arguments.plots, PLOTS) or ()
-    requested = {"video": arguments.video, "caption": arguments.caption}
+    requested = {"video": arguments.video, "caption": arguments.caption, "size": arguments.size is not None}
     if not has_window:
         requested |= {"layers": layers is not None, "plots": bool(plots)}
     for option, given in requested.items():
@@ -81,8 +85,23 @@ def display_options(arguments: Namespace, has_window: bool) -> DisplayOptions:
     for option, given in {"colour": arguments.colour == "error", "plots": "error" in plots}.items():
         if given and not errors:
             raise SceneError(f"--{option} error needs --error")
+    if arguments.slow is not None and not arguments.video:
+        raise SceneError("--slow is the speed of the film, so it needs --video")
+    size = SIZE if arguments.size is None else _size_of(arguments.size)
+    slow = checks.number(1.0 if arguments.slow is None else arguments.slow, "--slow", above=0.0)
     files = pictures, not arguments.no_usd, arguments.vtu, arguments.npz
-    return DisplayOptions(has_window, *files, arguments.colour, layers, plots, caption, errors)
+    return DisplayOptions(has_window, *files, arguments.colour, layers, plots, caption, errors, size, slow)
+
+
+def _size_of(text: str) -> tuple[int, int]:
+    """Return width and height [pixels] of a text such as 640x360. Raises SceneError."""
+    width, x, height = text.partition("x")
+    if not (x and width.isdecimal() and height.isdecimal()):
+        raise SceneError(f"--size {text}: write width and height in pixels, such as 640x360")
+    try:
+        return checked_size((int(width), int(height)))
+    except OutputError as error:
+        raise SceneError(f"--size {text}: {error}") from None
 
 
 def _names(option: str, text: str | None, known) -> tuple[str, ...] | None:
@@ -186,7 +205,7 @@ class Recording:
             observers.members.append(NpzWriter(folder, sim.scene))
         drawing = annotate = None
         if shown.pictures:
-            drawing = Offscreen(sim.scene, colour=shown.colour, layers=shown.in_pictures)
+            drawing = Offscreen(sim.scene, shown.size, colour=shown.colour, layers=shown.in_pictures)
             drawing.resume(self._notes)
             no_bar = shown.colour != "body" and text_missing()
             if no_bar:

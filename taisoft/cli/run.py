@@ -277,7 +277,7 @@ def _run(sim, settings: RunSettings, arguments, signals, warned: list[str], save
         if recording is not None:
             reported = observers.guard(recording.report, result, sim, settings.as_dict())
             video = arguments.video and not signals.requested()
-            video_written = not video or observers.guard(recording.video, settings.fps or 1.0 / sim.dt)
+            video_written = not video or observers.guard(recording.video, (settings.fps or 1.0 / sim.dt) / shown.slow)
             _report_failed_output(result, observers, signals)
             if reported and not video_written:
                 observers.guard(recording.report, result, sim, settings.as_dict())  # again, with the video's errors

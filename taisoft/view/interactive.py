@@ -14,7 +14,7 @@ import rich
 
 from taisoft.errors import OutputError
 from taisoft.output.appearance import OBSTACLE_COLOUR, compact_surface, linear_rgb, obstacle_surfaces
-from taisoft.output.camera import Camera, start_positions
+from taisoft.output.camera import Camera, framed_points
 from taisoft.scene.obstacles import HalfSpace
 from taisoft.view.colouring import Colouring, checked_colour
 from taisoft.view.notebook import framed, write_page
@@ -97,7 +97,7 @@ class InteractiveView:
         """
         import trimesh
 
-        camera = Camera.framing(start_positions(self._scene))
+        camera = Camera.framing(framed_points(self._scene))
         server.scene.set_up_direction("+y")
         server.initial_camera.position, server.initial_camera.look_at = tuple(camera.position), tuple(camera.target)
         server.initial_camera.fov = math.radians(camera.fov)
