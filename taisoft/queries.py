@@ -180,7 +180,8 @@ def detect_contacts(self: "Simulator") -> "Contacts":
 def contacts(self: "Simulator") -> "Contacts":
     """Return the contacts of the last step, with gaps at its start [m] and the impulses it applied [N s].
 
-    After a step that was cut into substeps, those of the last substep. Empty before the first step and if nothing can touch.
+    After a step that was cut into substeps, those of the last substep: then impulse / duration is the force of a contact, and
+    impulse / dt is not; `contact_force` is a mean over the whole step. Empty before the first step and if nothing can touch.
     """
     dynamics = self._open()
     if dynamics.contact is not None:
@@ -190,9 +191,20 @@ def contacts(self: "Simulator") -> "Contacts":
     return no_contacts()
 
 
-def contact_force(self: "Simulator", name: str) -> np.ndarray:
-    """Return the total contact force (3,) on a body or an obstacle in the last step [N]."""
-    return _contact_force_and_moment(self, name)[:3]
+def contact_force(self: "Simulator", name: str, other: str | None = None) -> np.ndarray:
+    """Return the contact force (3,) on a body or an obstacle [N]: from all others, or from `other`, a body or an obstacle.
+
+    It is the mean over the last step, also where that was cut into substeps. Raises SceneError for unknown names.
+    """
+    if other is None:
+        return _contact_force_and_moment(self, name)[:3]
+    contact, scene = self._open().contact, self.scene
+    for one in (name, other):
+        scene.surface_of(one)
+    if name == other:
+        raise SceneError(f"contact_force: {name!r} exerts no net force on itself: name another body or obstacle")
+    names = [c.name for c in scene.colliders]
+    return np.zeros(3) if contact is None else contact.pair_force(names.index(name), names.index(other))
 
 
 def contact_torque(self: "Simulator", name: str) -> np.ndarray:
