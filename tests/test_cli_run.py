@@ -255,3 +255,12 @@ def test_home_is_not_set(beam):
     command = [sys.executable, "-m", "taisoft", "run", str(beam), "--headless"]
     done = subprocess.run(command, env=environment, capture_output=True, text=True)
     assert done.returncode == 0 and "status   ok" in done.stdout, done.stderr
+
+
+def test_a_layer_of_fixed_nodes_says_why_it_shows_nothing(beam, tmp_path, capsys):
+    path = write(tmp_path / "led.py", LED.replace("{body}", "return 0, 0, 0").replace("body.fix(lambda X: X[:, 0] < -1.99)", ""))
+    show = ("--seconds", "0.01", "--layers", "fixed_nodes", "--no-usd", "--out")
+    assert run(path, *show, tmp_path / "led") == 0
+    assert "--layers fixed_nodes: no node is fixed; nodes that follow a path have no balls" in capsys.readouterr().err
+    assert run(beam, *show, tmp_path / "beam") == 0
+    assert "no node is fixed" not in capsys.readouterr().err

@@ -29,6 +29,7 @@ from taisoft.view.scene_view import IN_PICTURES, IN_WINDOW, LAYERS
 WIDTH = 118  # of the terminal
 PROBLEMS_SHOWN = 5
 KINDS = ("problem", "warning", "note")  # of entries of RunReport.problems, the most important first
+NO_BALLS = "; nodes that follow a path have no balls, since it may release them"
 MOST = 0.5  # fraction of a run's wall time above which the summary says what pictures cost
 
 
@@ -121,6 +122,8 @@ def check_modelled(shown: DisplayOptions, sim) -> None:
     if "contacts" in (shown.layers or ()) and not sim.plan.on["contact_forces"]:
         raise SceneError(f"--layers contacts: contact forces are not modelled ({sim.plan.why('contact_forces')})")
     Plots(sim, shown.plots, shown.errors)
+    if "fixed_nodes" in (shown.layers or ()) and not sim.plan.on["fixed_nodes"]:
+        print(f"taisoft: --layers fixed_nodes: no node is fixed{NO_BALLS * sim.plan.on['moving_nodes']}", file=sys.stderr)
 
 
 class Observers:

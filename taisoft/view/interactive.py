@@ -86,7 +86,8 @@ class InteractiveView:
                 page = self._recorded(server).as_html()
             finally:
                 server.stop()
-        return page.replace("</body>", f"{self._scale_html()}</body>", 1)
+        before, end, after = page.rpartition("</body>")  # scripts before it may hold such a text, too
+        return before + self._scale_html() + end + after
 
     def _scale_html(self) -> str:
         """Return a line over the view that says what red means in the last frame, and whether earlier ones had another scale."""
