@@ -92,6 +92,9 @@ def test_size_and_slowness_are_options(beam, tmp_path, capsys):
         ("--video --slow 0", "--slow must be greater than 0"),
         ("--size 640", "--size 640: write width and height in pixels, such as 640x360"),
         ("--size 0x5", "both must be 1 to 16384"),
+        ("--view 0 90", "--view: the elevation must be from -89 to 89 degrees, not 90"),
+        ("--view nan 0", "--view: azimuth must be"),
+        ("--view 0 10 --no-frames", "--view needs --out"),
         ("--size 64x36 --no-frames", "--size needs --out"),
     ],
 )

@@ -212,6 +212,8 @@ def _add_run(add) -> None:
     option("--video", action="store_true", help="also make video.mp4 from the pictures with ffmpeg (extra 'video')")
     option("--slow", type=float, metavar="FACTOR", help="film time over simulated time of video.mp4 (default 1)")
     option("--size", metavar="WIDTHxHEIGHT", help="of the pictures in pixels (default 1280x720)")
+    directions = "direction of the pictures [deg]: about y from +z towards +x, and above the horizon (default 32 20)"
+    option("--view", type=float, nargs=2, metavar=("AZIMUTH", "ELEVATION"), help=directions)
     option("--vtu", action="store_true", help="also write every frame as a .vtu file, and scene.pvd, which ParaView opens")
     option("--npz", action="store_true", help="also write the nodes of every frame as a .npz file")
     option("--no-usd", action="store_true", help="write no scene.usdc")

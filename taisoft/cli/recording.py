@@ -12,6 +12,7 @@ from pathlib import Path
 from taisoft.errors import OutputError, SceneError
 from taisoft.estimation.forecast import describe_error
 from taisoft.frames import dt_sentence
+from taisoft.output.camera import MAX_ELEVATION
 from taisoft.output.files import RESULT_FILES, RESULT_FOLDERS, CheckpointWriter, OutputFolder
 from taisoft.output.frame_files import NPZ_NAME, VTU_NAME, NpzWriter, VtuWriter, cut_pvd
 from taisoft.output.frame_table import FrameTable
@@ -37,7 +38,7 @@ MOST = 0.5  # fraction of a run's wall time above which the summary says what pi
 class DisplayOptions:
     """colour: as in `Offscreen`; layers: names, or None for the defaults; plots: names; caption: the scene's name, or None.
 
-    size: of pictures [pixels]; slow: film time over simulated time.
+    size: of pictures [pixels]; slow: film time over simulated time; view: azimuth and elevation of the camera [deg], or None.
     window, pictures, usd, vtu, npz: whether there is a window, and what is written to the folder; errors: whether they are
     estimated.
     """
@@ -54,6 +55,7 @@ class DisplayOptions:
     errors: bool
     size: tuple[int, int] = SIZE
     slow: float = 1.0
+    view: tuple[float, float] | None = None
 
     @property
     def in_pictures(self) -> tuple[str, ...]:
@@ -70,7 +72,8 @@ def display_options(arguments: Namespace, has_window: bool) -> DisplayOptions:
     """Return the requested display options. Raises SceneError for unknown names and for options that nothing would show."""
     pictures = arguments.out is not None and not arguments.no_frames
     layers, plots = _names("layers", arguments.layers, LAYERS), _names("plots", arguments.plots, PLOTS) or ()
-    requested = {"video": arguments.video, "caption": arguments.caption, "size": arguments.size is not None}
+    requested = {"video": arguments.video, "caption": arguments.caption}
+    requested |= {"size": arguments.size is not None, "view": arguments.view is not None}
     if not has_window:
         requested |= {"layers": layers is not None, "plots": bool(plots)}
     for option, given in requested.items():
@@ -91,7 +94,20 @@ def display_options(arguments: Namespace, has_window: bool) -> DisplayOptions:
     size = SIZE if arguments.size is None else _size_of(arguments.size)
     slow = checks.number(1.0 if arguments.slow is None else arguments.slow, "--slow", above=0.0)
     files = pictures, not arguments.no_usd, arguments.vtu, arguments.npz
-    return DisplayOptions(has_window, *files, arguments.colour, layers, plots, caption, errors, size, slow)
+    return DisplayOptions(
+        has_window, *files, arguments.colour, layers, plots, caption, errors, size, slow, _view_of(arguments.view)
+    )
+
+
+def _view_of(angles: list[float] | None) -> tuple[float, float] | None:
+    """Return azimuth and elevation [deg]. Raises SceneError if they are not finite, or the view is from straight above."""
+    if angles is None:
+        return None
+    azimuth = checks.number(angles[0], "--view: azimuth")
+    elevation = checks.number(angles[1], "--view: elevation")
+    if abs(elevation) > MAX_ELEVATION:
+        raise SceneError(f"--view: the elevation must be from -{MAX_ELEVATION:g} to {MAX_ELEVATION:g} degrees, not {elevation:g}")
+    return azimuth, elevation
 
 
 def _size_of(text: str) -> tuple[int, int]:
@@ -209,6 +225,8 @@ class Recording:
         drawing = annotate = None
         if shown.pictures:
             drawing = Offscreen(sim.scene, shown.size, colour=shown.colour, layers=shown.in_pictures)
+            if shown.view is not None:
+                drawing.look_from(sim.scene, *shown.view)
             drawing.resume(self._notes)
             no_bar = shown.colour != "body" and text_missing()
             if no_bar:

@@ -10,7 +10,7 @@ import numpy as np
 
 from taisoft.backend.runtime import open_kind, open_runtime
 from taisoft.errors import OutputError, value_text
-from taisoft.output.camera import Camera
+from taisoft.output.camera import MAX_WIDENING, Camera, framed_points
 from taisoft.view.colouring import background
 from taisoft.view.raster import Raster
 from taisoft.view.scene_view import IN_PICTURES, SceneView
@@ -57,6 +57,11 @@ class Offscreen(SceneView):
         self._shadows = Shadows(scene, self.surfaces)
         self._drawn_at: float | None = None  # time of the latest picture [s]
         self._before: dict = {}  # what was kept before it
+
+    def look_from(self, scene, azimuth: float, elevation: float) -> None:
+        """Frame the scene's start from another direction [deg], as of `Camera`; the camera moves back as before."""
+        self.camera = Camera.framing(framed_points(scene), self.size, azimuth=azimuth, elevation=elevation)
+        self._widest = MAX_WIDENING * self.camera.distance
 
     def kept(self, time: float) -> dict:
         """Return, as plain data, what pictures from time [s] on depend on: distance of the camera [m], scales, recent maxima.
