@@ -188,7 +188,8 @@ def test_examples_of_readme_and_manual_run(tmp_path):
     assert run(write(tmp_path / "my_scene.py", scene), "--seconds", "0.1") == 0  # kernels are already compiled
     path = write(tmp_path / "contacts.py", contacts)
     done = subprocess.run([sys.executable, path], env=environment, capture_output=True, text=True, check=True)
-    assert re.search(r"^52 0\.0 \[ *\S+ -\S+ +\S+\]$", done.stdout, re.MULTILINE)  # the ground is pressed down
+    # the ground is pressed down, and presses the beam up
+    assert re.search(r"^52 0\.0 \[ *\S+ -\S+ +\S+\] \[ *-?\S+ +\d\S+ +-?\S+\]$", done.stdout, re.MULTILINE)
 
 
 # --- signals ----------------------------------------------------------------------------------------------------------

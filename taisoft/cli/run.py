@@ -14,17 +14,9 @@ from pathlib import Path
 
 from taisoft.checkpoint import Checkpoint
 from taisoft.cli import EXIT_FAILED, EXIT_OUTPUT, EXIT_SIGNAL, Signals, parse_scalar, printed_warnings
-from taisoft.cli.recording import (
-    DisplayOptions,
-    Observers,
-    Recording,
-    check_modelled,
-    display_options,
-    print_plan,
-    print_state,
-    print_summary,
-)
+from taisoft.cli.recording import DisplayOptions, Observers, Recording, check_modelled, display_options
 from taisoft.cli.scene_file import OF_SCENE, load_scene, refuse_unknown
+from taisoft.cli.summary import print_plan, print_state, print_summary
 from taisoft.cli.units import warn_millimetres
 from taisoft.errors import SceneError, SimulationError
 from taisoft.frames import check_length, first_frame
