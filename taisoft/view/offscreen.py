@@ -58,11 +58,6 @@ class Offscreen(SceneView):
         self._drawn_at: float | None = None  # time of the latest picture [s]
         self._before: dict = {}  # what was kept before it
 
-    def look_from(self, scene, azimuth: float, elevation: float) -> None:
-        """Frame the scene's start from another direction [deg], as of `Camera`; the camera moves back as before."""
-        self.camera = Camera.framing(framed_points(scene), self.size, azimuth=azimuth, elevation=elevation)
-        self._widest = MAX_WIDENING * self.camera.distance
-
     def kept(self, time: float) -> dict:
         """Return, as plain data, what pictures from time [s] on depend on: distance of the camera [m], scales, recent maxima.
 
@@ -103,6 +98,11 @@ class Offscreen(SceneView):
         finally:
             runtime.close()
         return picture
+
+    def look_from(self, scene, azimuth: float, elevation: float) -> None:
+        """Frame the scene's start from another direction [deg], as of `Camera`; the camera moves back as before."""
+        self.camera = Camera.framing(framed_points(scene), self.size, azimuth=azimuth, elevation=elevation)
+        self._widest = MAX_WIDENING * self.camera.distance
 
     def _triangles(self, x: np.ndarray, attributes: np.ndarray, lines: tuple) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return projected points, triangles and attributes: clipped surfaces, then lines as bands."""
