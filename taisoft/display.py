@@ -20,6 +20,7 @@ CHART = (420, 130)  # width and height of the chart of energies [pixels]
 CHART_POINTS = 400  # of a curve
 CURVES = (("kinetic", "#2f6fb0"), ("elastic", "#c8662b"), ("gravity", "#3d8b52"), ("loads", "#8465ad"))  # energies and colours
 PROBLEMS_SHOWN = 5
+LEAST = 1e-6  # smaller fractions are shown as "below" it
 
 
 def short_repr(self) -> str:
@@ -35,6 +36,13 @@ def _short(value) -> str:
     if isinstance(value, (list, dict)) and len(value) > MAX_ENTRIES:
         return f"{type(value).__name__} of {len(value)}"
     return f"{value:.6g}" if isinstance(value, float) else repr(value)
+
+
+def percent(value: float) -> str:
+    """Return a fraction in percent, with two digits and without the sign."""
+    if value >= 1.0:
+        return f"{100.0 * value:.0f}"
+    return f"{100.0 * value:.2g}" if value >= LEAST else f"< {100.0 * LEAST:.2g}" if value > 0.0 else "0"
 
 
 def simulator_text(self) -> str:

@@ -144,8 +144,9 @@ def error_so_far(self: "Simulator") -> ErrorEstimate | None:
 def nodal_errors(self: "Simulator", body: str | None = None) -> np.ndarray:
     """Return estimated errors of the node positions (n_nodes,) [m] during a run with error=True; body: as for `positions`.
 
-    They are those of the last comparison with the twins, in time, of the solvers and, with error_mesh, in space, added; NaN
-    where none is known, as before the first comparison. Raises SimulationError outside such a run.
+    They are those of the last comparison with the twins, in time, of the solvers and, with error_mesh, in space, added:
+    without sign, and often twice the true error. NaN where a part is unknown, as before the first comparison, or in space at
+    nodes that the other mesh lacks; `np.nanmax` leaves those out. Raises SimulationError outside such a run.
     """
     if self._estimator is None:
         raise SimulationError("errors are estimated only during sim.run(..., error=True): ask for them in on_frame or on_step")
@@ -179,7 +180,8 @@ def detect_contacts(self: "Simulator") -> "Contacts":
 def contacts(self: "Simulator") -> "Contacts":
     """Return the contacts of the last step, with gaps at its start [m] and the impulses it applied [N s].
 
-    After a step that was cut into substeps, those of the last substep. Empty before the first step and if nothing can touch.
+    After a step that was cut into substeps, those of the last substep: then impulse / duration is the force of a contact, and
+    impulse / dt is not; `contact_force` is a mean over the whole step. Empty before the first step and if nothing can touch.
     """
     dynamics = self._open()
     if dynamics.contact is not None:
@@ -189,9 +191,20 @@ def contacts(self: "Simulator") -> "Contacts":
     return no_contacts()
 
 
-def contact_force(self: "Simulator", name: str) -> np.ndarray:
-    """Return the total contact force (3,) on a body or an obstacle in the last step [N]."""
-    return _contact_force_and_moment(self, name)[:3]
+def contact_force(self: "Simulator", name: str, other: str | None = None) -> np.ndarray:
+    """Return the contact force (3,) on a body or an obstacle [N]: from all others, or from `other`, a body or an obstacle.
+
+    It is the mean over the last step, also where that was cut into substeps. Raises SceneError for unknown names.
+    """
+    if other is None:
+        return _contact_force_and_moment(self, name)[:3]
+    contact, scene = self._open().contact, self.scene
+    for one in (name, other):
+        scene.surface_of(one)
+    if name == other:
+        raise SceneError(f"contact_force: {name!r} exerts no net force on itself: name another body or obstacle")
+    names = [c.name for c in scene.colliders]
+    return np.zeros(3) if contact is None else contact.pair_force(names.index(name), names.index(other))
 
 
 def contact_torque(self: "Simulator", name: str) -> np.ndarray:

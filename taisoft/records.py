@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, field
 
-from taisoft.display import PROBLEMS_SHOWN, run_html
+from taisoft.display import PROBLEMS_SHOWN, percent, run_html
 
 
 @dataclass
@@ -97,7 +97,7 @@ class ErrorEstimate:
         return None if self.time is None else self.time + (self.space or 0.0) + (self.solver or 0.0)
 
     def __repr__(self) -> str:
-        known = [f"{kind} {getattr(self, kind):.2g}" for kind in ERROR_KINDS if getattr(self, kind) is not None]
+        known = [f"{kind} {percent(getattr(self, kind))} %" for kind in ERROR_KINDS if getattr(self, kind) is not None]
         return f"ErrorEstimate({', '.join(known) or 'nothing known'}; relative to an excursion of {self.excursion:.4g} m)"
 
 
@@ -106,7 +106,7 @@ class RunReport:
     """Result of a run."""
 
     status: str = "ok"  #: "ok", "degraded" or "failed"
-    problems: list[str] = field(default_factory=list)  #: why it is not "ok", in sentences; notes begin with "note:"
+    problems: list[str] = field(default_factory=list)  #: sentences; those that begin with "note:" or "warning:" keep it "ok"
     steps: int = 0  #: steps of dt taken
     sim_seconds: float = 0.0  #: simulated time [s]
     wall_seconds: float = 0.0  #: without compile time [s]

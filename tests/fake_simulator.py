@@ -27,7 +27,7 @@ class FakeSimulator:
 
     def __init__(self, scene, dt=1 / 60, announce=False):
         self.scene, self.dt, self.announce = scene, dt, announce
-        self.time, self.step_count = 0.0, 0
+        self.time, self.step_count, self.compile_seconds = 0.0, 0, 0.0
         self._along = {b.name: b.mesh.vertices[b.mesh.tets, 0].mean(axis=1) for b in scene.bodies}
 
     def positions(self, name=None):

@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
+import taisoft as ts
 from benchmarks.numpy_raster import rasterise
-from taisoft.output.camera import BORDER, FILL, Camera
+from taisoft.output.camera import BORDER, FILL, MAX_FALL, Camera, framed_points, start_positions
 from taisoft.view.raster import MAX_COORDINATE
 
 SIZE = (320, 180)
@@ -19,6 +20,42 @@ def test_framing_shows_all_points(azimuth, elevation):
     fill = np.abs(2 * projected[:, :2] / SIZE - 1).max(axis=0)  # of the picture's width and height
     assert fill.max() == pytest.approx(FILL)
     assert np.allclose(camera.project(camera.target[None], SIZE), [[160, 90, camera.distance]])
+
+
+def falling_cube(height: float, gravity=(0, -9.81, 0)) -> ts.Scene:
+    """A cube of 1 m whose underside is at this height above the ground, y = 0."""
+    scene = ts.Scene(gravity=gravity)
+    scene.add_body(ts.box_mesh((1, 1, 1), (1, 1, 1)), ts.Material(), name="cube", position=(0, height + 0.5, 0))
+    scene.add_obstacle(ts.HalfSpace((0, 0, 0), (0, 1, 0)), name="ground")
+    return scene
+
+
+def test_the_first_picture_shows_the_ground_below_a_falling_body():
+    scene = falling_cube(2.0)
+    points = framed_points(scene)
+    assert points[:, 1].min() == pytest.approx(0.0) and points[:, 1].max() == pytest.approx(3.0) and len(points) == 16
+    camera = Camera.framing(points, SIZE)
+    down = camera.project(points, SIZE)[:, 1]
+    assert down.min() > 0.15 * SIZE[1] and down.max() < 0.85 * SIZE[1]
+    assert camera.target[1] == pytest.approx(1.5)
+    tilted = ts.Scene(gravity=(0, -9.81, 0))
+    tilted.add_body(ts.box_mesh((1, 1, 1), (1, 1, 1)), ts.Material(), position=(0, 3, 0))
+    tilted.add_obstacle(ts.HalfSpace((0, 0, 0), (1, 1, 0)))
+    landed = framed_points(tilted)[8:]
+    assert (landed @ [1, 1, 0]).min() == pytest.approx(0.0) and np.allclose(landed[:, 0], framed_points(tilted)[:8, 0])
+
+
+def test_a_fall_is_framed_only_where_it_is_known():
+    """Not of bodies that something holds, without gravity, beside walls, on or below the ground, or beyond MAX_FALL."""
+    fixed, attached, wall = falling_cube(2.0), falling_cube(2.0), ts.Scene(gravity=(0, -9.81, 0))
+    fixed.bodies[0].fix([0])
+    attached.add_spring(("cube", 0), ("ground", (0, 0, 0)), 10.0)
+    wall.add_body(ts.box_mesh((1, 1, 1), (1, 1, 1)), ts.Material(), position=(3, 0, 0))
+    wall.add_obstacle(ts.HalfSpace((0, 0, 0), (1, 0, 0)))
+    for scene in (fixed, attached, wall, falling_cube(2.0, (0, 0, 0)), falling_cube(0.0), falling_cube(2.0, (0, 9.81, 0))):
+        assert np.array_equal(framed_points(scene), start_positions(scene))
+    far = framed_points(falling_cube(1000.0))
+    assert np.ptp(far[:, 1]) == pytest.approx(1 + MAX_FALL * 3**0.5)
 
 
 def test_projection_is_that_of_a_pinhole_camera():

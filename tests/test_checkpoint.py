@@ -143,6 +143,7 @@ def test_continuing_with_contacts(tmp_path, integrator, precision, settings):
         sim.set_contact("cube", "floor", friction=0.1)
         sim.save_checkpoint(path)
         contacts, force, reactions = sim.contacts(), sim.contact_force("floor"), sim.reactions()
+        pair_force = sim.contact_force("cube", "floor")
         expected = follow(sim, after)
     assert contacts.impulse.any() and set(contacts.body_b) == {"plate", "floor", "ball"} and expected[-1][3].n_contacts
     restart_taichi()
@@ -154,6 +155,7 @@ def test_continuing_with_contacts(tmp_path, integrator, precision, settings):
         found = loaded.contacts()
         for name in ("point", "normal", "gap", "impulse", "nodes", "weights"):
             assert np.array_equal(getattr(found, name), getattr(contacts, name)), name
+        assert found.duration == contacts.duration and np.array_equal(loaded.contact_force("cube", "floor"), pair_force)
         assert np.array_equal(loaded.contact_force("floor"), force) and np.array_equal(loaded.reactions(), reactions)
         assert_same(follow(loaded, after), expected)
     assert_state_matters(path, scene, {"stepper/contact/rows/r": lambda r: 0 * r}, expected[:3])
@@ -269,7 +271,7 @@ def test_other_formats_are_refused_with_their_version(saved, tmp_path, version, 
         return np.frombuffer(json.dumps(header).encode(), dtype=np.uint8)
 
     text = refusal(changed(saved, tmp_path / "changed.npz", "header", change))
-    assert f"written by taisoft {version} in format {format_version}, and taisoft" in text and "reads format 13" in text
+    assert f"written by taisoft {version} in format {format_version}, and taisoft" in text and "reads format 14" in text
 
 
 def set_read_only(scene, name: str, value):

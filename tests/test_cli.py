@@ -8,6 +8,7 @@
 import os
 import subprocess
 import sys
+import tomllib
 from argparse import Namespace
 
 import pytest
@@ -210,12 +211,18 @@ def test_doctor_lists_what_is_installed_and_missing(monkeypatch, capsys):
 
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    declared = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    for package, extra in doctor.OPTIONAL.items():
+        assert any(requirement.startswith(package) for requirement in declared[extra])
+    assert set(declared) - set(doctor.OPTIONAL.values()) == {"docs", "dev"}
     monkeypatch.setattr(doctor, "OPTIONAL", {"surely-not-installed": "mesh"})
+    monkeypatch.setattr(doctor, "KERNEL", "no-kernel")
     assert main(["doctor"]) == 0
     shown = capsys.readouterr().out
     for part in ("taichi 1.7.4", "arch cpu   yes", "arch cuda", "vulkan", "display    no"):
         assert part in shown
     assert "surely-not-installed missing: pip install 'taisoft[mesh]'" in shown
+    assert "no-kernel missing: pip install jupyterlab nbconvert" in shown
 
 
 def test_bench_passes_its_arguments_on(tmp_path, monkeypatch, capsys):

@@ -81,6 +81,30 @@ def test_warnings_are_printed_once_and_reported(tmp_path, capsys):
     assert report(out)["problems"][0].startswith("warning: body 'beam': poisson = 0.495")
 
 
+def test_the_summary_names_notes_and_warnings(tmp_path, capsys):
+    """Problems first; an ok run has none."""
+    path = write(tmp_path / "stiff.py", BEAM.replace("young=1e5", "young=1e5, poisson=0.495"))
+    assert run(path, "--set", "solver.dt=0.004", "--set", "solver.fps=none", "--seconds", "0.001") == 0
+    shown = capsys.readouterr().out
+    assert "\nwarning  body 'beam': poisson = 0.495" in shown and "\nnote     0.001 s are less than half a step" in shown
+    assert "problem" not in shown and shown.index("\nwarning") < shown.index("\nnote")
+
+
+def test_the_plan_is_short_unless_verbose(beam, capsys):
+    assert run(beam, "--seconds", "0.01") == 0
+    short = capsys.readouterr().out
+    assert "\nleft out" not in short and "plan     law:stable_neo_hookean, " in short and "used by" not in short
+    assert run(beam, "--seconds", "0.01", "--verbose") == 0
+    assert re.search(r"law:stable_neo_hookean +used by beam\n", full := capsys.readouterr().out) and "\nleft out law:" in full
+
+
+def test_a_run_with_twins_says_what_they_cost(beam, capsys):
+    assert run(beam, "--seconds", "0.05", "--error-mesh", "refined") == 0
+    shown = capsys.readouterr().out
+    assert "\ntwins    follow the run, the one on the refined mesh for some 10 to 40 times its work" in shown
+    assert re.search(r"; plus \d+\.\d\d s of twins for the error and ", shown)
+
+
 def test_a_scene_may_import_its_neighbour(tmp_path):
     write(tmp_path / "beam_parts_of_this_test.py", BEAM)
     path = write(tmp_path / "scene.py", "from beam_parts_of_this_test import build, solver\n")
@@ -165,7 +189,8 @@ def test_examples_of_readme_and_manual_run(tmp_path):
     assert run(write(tmp_path / "my_scene.py", scene), "--seconds", "0.1") == 0  # kernels are already compiled
     path = write(tmp_path / "contacts.py", contacts)
     done = subprocess.run([sys.executable, path], env=environment, capture_output=True, text=True, check=True)
-    assert re.search(r"^52 0\.0 \[ *\S+ -\S+ +\S+\]$", done.stdout, re.MULTILINE)  # the ground is pressed down
+    # the ground is pressed down, and presses the beam up
+    assert re.search(r"^52 0\.0 \[ *\S+ -\S+ +\S+\] \[ *-?\S+ +\d\S+ +-?\S+\]$", done.stdout, re.MULTILINE)
 
 
 # --- signals ----------------------------------------------------------------------------------------------------------
@@ -232,3 +257,12 @@ def test_home_is_not_set(beam):
     command = [sys.executable, "-m", "taisoft", "run", str(beam), "--headless"]
     done = subprocess.run(command, env=environment, capture_output=True, text=True)
     assert done.returncode == 0 and "status   ok" in done.stdout, done.stderr
+
+
+def test_a_layer_of_fixed_nodes_says_why_it_shows_nothing(beam, tmp_path, capsys):
+    path = write(tmp_path / "led.py", LED.replace("{body}", "return 0, 0, 0").replace("body.fix(lambda X: X[:, 0] < -1.99)", ""))
+    show = ("--seconds", "0.01", "--layers", "fixed_nodes", "--no-usd", "--out")
+    assert run(path, *show, tmp_path / "led") == 0
+    assert "--layers fixed_nodes: no node is fixed; nodes that follow a path have no balls" in capsys.readouterr().err
+    assert run(beam, *show, tmp_path / "beam") == 0
+    assert "no node is fixed" not in capsys.readouterr().err

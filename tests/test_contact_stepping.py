@@ -282,3 +282,38 @@ def test_contact_solvers_of_explicit_steps_agree(integrator):
             found[method] = sim.velocities()
     for method in EXPLICIT_CONTACT[1:]:
         assert np.abs(found[method] - found["gauss_seidel"]).max() < 1e-6
+
+
+# --- forces of pairs -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("integrator", ["implicit_euler", "velocity_verlet"])
+def test_forces_of_pairs_add_up_to_those_of_bodies(integrator):
+    """A cube falls on one that lies on the ground; the first implicit step is cut into substeps."""
+    fallen, speed = ts.Scene(gravity=GRAVITY), -30 if integrator in IMPLICIT else -4
+    rubber = ts.Material(young=1e5, density=1000.0, friction=0.5)
+    for name, height, velocity in (("low", 0.5, (0, 0, 0)), ("high", 1.52, (0.5, speed, 0))):
+        fallen.add_body(ts.box_mesh((2, 2, 2), (1, 1, 1)), rubber, name=name, position=(0, height, 0), velocity=velocity)
+    fallen.add_obstacle(ts.HalfSpace((0, 0, 0), (0, 1, 0)), name="ground", friction=0.5)
+    dt, cut, whole = (5e-4 if integrator in EXPLICIT else 0.02), 0, 0
+    with ts.Simulator(fallen, dt=dt, integrator=integrator, precision="f64") as sim:
+        for _ in range(3 if integrator in IMPLICIT else 40):
+            report = sim.step()
+            pairs = {pair: sim.contact_force(*pair) for pair in (("low", "high"), ("low", "ground"), ("high", "ground"))}
+            size = 1e-12 + 1e-9 * max(np.abs(force).max() for force in pairs.values())
+            assert np.abs(pairs["low", "high"] + pairs["low", "ground"] - sim.contact_force("low")).max() < size
+            assert np.array_equal(sim.contact_force("high", "low"), -pairs["low", "high"]) and not pairs["high", "ground"].any()
+            assert np.abs(sim.contact_force("ground", "low") - sim.contact_force("ground")).max() < size
+            found = sim.contacts()
+            if report.substeps > 1:
+                cut += pairs["low", "high"].any() and found.duration < dt
+            elif found.impulse.any():
+                between = (found.body_a == "low") & (found.body_b == "high")
+                mean = found.impulse[between].sum(axis=0) / found.duration
+                assert found.duration == dt and np.abs(mean - pairs["low", "high"]).max() < size
+                whole += between.any()
+        assert (cut > 0) == (integrator in IMPLICIT) and whole > 0
+        with pytest.raises(ts.SceneError, match="no net force on itself"):
+            sim.contact_force("low", "low")
+        with pytest.raises(ts.SceneError, match="nothing"):
+            sim.contact_force("low", "nothing")

@@ -12,6 +12,7 @@ import pytest
 from fake_simulator import FakeSimulator, beam_scene
 
 import taisoft as ts
+from taisoft.output.camera import framed_points
 from taisoft.view.connection_layer import ConnectionMarks
 from taisoft.view.link import Link, LinkClosed, SharedNodes, decode, encode, receive
 from taisoft.view.mirror import MirrorSimulation, describe_scene, describe_state
@@ -144,6 +145,18 @@ def test_connections_pressures_skins_and_rigid_bodies_travel():
         seen = Offscreen(mirror.scene, (320, 180), layers=layers, marks=mirror.marks).image(mirror)
         without = Offscreen(mirror.scene, (320, 180), layers=("wires",), marks=mirror.marks).image(mirror)
         assert np.array_equal(own, seen) and not np.array_equal(seen, without)
+
+
+def test_both_frame_the_same_fall():
+    """Of one body; the others are held, prescribed or connected."""
+    scene = beam_scene(("held", "moved", "one", "two", "three"))
+    for name in ("moved", "one", "two", "three"):
+        scene.body(name).constraints.clear()
+    scene.body("moved").move([0], lambda t: (0, t, 0))
+    scene.add_spring(("one", 0), ("two", 0), 1.0)
+    scene.add_obstacle(ts.HalfSpace((0, -2, 0), (0, 1, 0)))
+    seen = framed_points(MirrorSimulation(decode(encode(describe_scene(scene, marks_of(scene)))), 0).scene)
+    assert len(seen) == 6 * scene.bodies[0].n_nodes and np.array_equal(seen, framed_points(scene))
 
 
 def test_a_path_that_fails_is_an_output_error():

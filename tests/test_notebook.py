@@ -80,7 +80,7 @@ def test_a_report_lists_its_first_problems():
     lines = repr(report).splitlines()
     assert lines[0].startswith("RunReport: degraded, ended early, 0 s in 0 steps")
     assert lines[1:7] == [*(f"  problem {k}" for k in range(5)), "  and 2 more problems"]
-    assert lines[7] == "  ErrorEstimate(time 0.012; relative to an excursion of 2 m)" and len(lines) == 8
+    assert lines[7] == "  ErrorEstimate(time 1.2 %; relative to an excursion of 2 m)" and len(lines) == 8
     assert "4 substeps, 3 contacts" in repr(report.step_reports[0]) and repr(report.step_reports[0]).endswith("not converged)")
 
 
@@ -196,7 +196,8 @@ def test_a_film_holds_a_picture_a_frame(ran, tmp_path):
     assert repr(film) == "Film(7 pictures, t = 0 to 0.2 s)"
     page = film.as_html()
     data = json.loads(re.search(r"const film = (\{.*?\}),", page)[1])
-    assert data["times"] == film.times
+    assert data["times"] == film.times and data["scales"] == film.scales and len(film.scales) == 7
+    assert re.fullmatch(r"(von Mises stress|speed), red: \S+ (Pa|m/s) or more", film.scales[-1]) and "film.scales[k]" in page
     found = [pixels(base64.b64decode(url.split(",")[1])) for url in data["pictures"]]
     assert all(picture.shape == (54, 96, 3) for picture in found) and not np.array_equal(found[0], found[-1])
     assert [png_bytes(picture, 6) for picture in found] == film.pngs
@@ -211,6 +212,7 @@ def test_a_film_of_a_run_on_disk(tmp_path):
     film = ts.Film.read(out)
     assert film.times == [0.0, *(k / 30 for k in (1, 2, 3))]
     assert film.pngs == [(out / "frames" / f"{k:05d}.png").read_bytes() for k in range(4)]
+    assert film.scales == [""] * 4 and ts.Film(colour="body").scales == []
     (out / "report.json").unlink()
     assert ts.Film.read(out, fps=10).times == [0.0, 0.1, 0.2, 0.3]
     with pytest.raises(OutputError, match="the run cannot be read"):
@@ -245,6 +247,7 @@ def test_an_interactive_view_makes_a_page(tmp_path, capfd):
     assert repr(view) == "InteractiveView(5 frames, t = 0 to 0.4 s)"
     view.save(tmp_path / "view.html")
     page = (tmp_path / "view.html").read_text()
+    assert re.search(r">von Mises stress, red: \d+ Pa or more(, at the end)?</div></body>", page)
     assert recorded(page)["durationSeconds"] == pytest.approx(0.4)
     kinds = [message["type"] for _, message in recorded(page)["messages"]]
     assert kinds.count("GlbMessage") == 5 and kinds.count("MeshMessage") == 2

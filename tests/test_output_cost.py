@@ -12,7 +12,8 @@ from command import BEAM, child, write
 from test_running import StandIn
 from test_view import PROLOGUE, needs_vulkan, run_child
 
-from taisoft.cli.recording import Observers, print_summary
+from taisoft.cli.recording import Observers
+from taisoft.cli.summary import print_summary
 from taisoft.output.frames import FrameWriter
 from taisoft.records import Energies
 from taisoft.running import run

@@ -197,6 +197,17 @@ def test_progress_is_lines_in_a_file(clock):
     assert stream.getvalue() == "beam: 1.500 of 10 s, 10 steps/s, 0:34 left\n"
 
 
+def test_progress_leaves_compiling_out(clock):
+    """Of 6 s until the line, 3 s went into compiling."""
+    stream = io.StringIO()
+    sim, bar = FakeSimulator(beam_scene()), Progress(10.0, "beam", stream)
+    for index in range(4):
+        bar.frame(sim, index)
+        sim.time, sim.step_count, sim.compile_seconds = sim.time + 0.5, sim.step_count + 20, 3.0
+    bar.close()
+    assert stream.getvalue() == "beam: 1.500 of 10 s, 20 steps/s, 0:17 left\n"
+
+
 def test_progress_is_a_bar_on_a_terminal(clock):
     stream = Terminal()
     advance(Progress(10.0, "beam", stream))

@@ -13,7 +13,7 @@ import warnings
 import meshio
 import numpy as np
 import pytest
-from command import BEAM, write
+from command import BEAM, run, write
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -155,7 +155,7 @@ def test_closed_holes_are_reported_with_the_volume(tmp_path, capsys):
     assert main(["tetrahedralize", str(path), "--out", str(tmp_path / "ball.msh"), "--edge-length", "0.4"]) == 0
     error = capsys.readouterr().err
     volume = ts.read_mesh(tmp_path / "ball.msh").volumes.sum()
-    assert f"{path}: 2 holes were closed, and the tets fill {volume:.4g} m^3" in error
+    assert f"{path}: 2 holes were closed, and the tets fill {volume:.4g} m^3; the closing surface may be rough" in error
     assert volume == pytest.approx(ball.volumes.sum(), rel=0.05)
 
 
@@ -169,3 +169,22 @@ def test_info_names_the_axes(tmp_path, capsys):
         shown = capsys.readouterr().out
         assert "extent     x 1 (9.5 to 10.5), y 2 (19 to 21), z 6 (27 to 33)" in shown
         assert "axes       y is taken for up" in shown
+
+
+def test_millimetres_are_suspected_from_the_first_command_to_the_last(tmp_path, capsys):
+    """A part of 60 mm that is read as 60 m: info's next command corrects it, scene and run warn; a large shape is meant so."""
+    path = surface_file(tmp_path / "part.obj", 10 * TOWER.vertices, TOWER.surface)
+    assert main(["info", str(path)]) == 0
+    assert f"next       fill it with tets: taisoft tetrahedralize {path} --scale 0.001 --out part.msh" in capsys.readouterr().out
+    ts.write_mesh(tmp_path / "part.msh", ts.TetMesh(10 * TOWER.vertices, TOWER.tets))
+    warning = "taisoft: warning: mesh of 'part': its longest side is 60 m; was its file in millimetres?"
+    assert main(["scene", str(tmp_path / "part.msh"), "--out", str(tmp_path / "part.toml")]) == 0
+    assert warning in capsys.readouterr().err
+    assert run(tmp_path / "part.toml", "--seconds", "0.001") == 0
+    assert warning in capsys.readouterr().err
+    small = ["--out", str(tmp_path / "small.toml"), "--scale", "0.001"]
+    assert main(["scene", str(tmp_path / "part.msh"), *small]) == 0
+    assert "millimetres" not in capsys.readouterr().err
+    write(tmp_path / "beam.py", BEAM.replace("(4, 2, 2)", "(40, 20, 20)").replace("-1.99", "-19.9"))
+    assert run(tmp_path / "beam.py", "--seconds", "0.001") == 0
+    assert "millimetres" not in capsys.readouterr().err

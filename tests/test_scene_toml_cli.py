@@ -62,3 +62,18 @@ def test_the_scene_file_of_the_manual_is_valid(tmp_path):
     assert len(blocks) == 1
     scene, solver = read(tmp_path, blocks[0])
     assert scene.bodies and scene.obstacles and solver
+
+
+def test_the_order_of_a_scene_for_a_mesh(tmp_path, capsys):
+    """--order sets it, a scene of its own refuses it, and an order edited in the file needs no other edit."""
+    ts.write_mesh(tmp_path / "a.msh", ts.box_mesh((2, 1, 1), (2, 1, 1)))
+    out = tmp_path / "a.toml"
+    assert main(["scene", str(tmp_path / "a.msh"), "--out", str(out)]) == 0
+    assert "quadrature_degree" not in out.read_text() and ts.read_scene(out)[0].bodies[0].order == 1
+    write(out, out.read_text().replace("order = 1", "order = 2"))
+    assert ts.read_scene(out)[0].bodies[0].quadrature_degree == 2
+    assert main(["scene", str(tmp_path / "a.msh"), "--out", str(out), "--overwrite", "--order", "2"]) == 0
+    assert ts.read_scene(out)[0].bodies[0].order == 2
+    capsys.readouterr()
+    assert main(["scene", str(out), "--out", str(tmp_path / "b.toml"), "--order", "2"]) == 2
+    assert "--order is for a mesh" in capsys.readouterr().err

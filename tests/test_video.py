@@ -72,3 +72,32 @@ def test_run_writes_a_video(beam, tmp_path):
     assert run(beam, "--video") == 2 and run(beam, "--video", "--out", out, "--no-frames") == 2 and not out.exists()
     assert run(beam, "--video", "--out", out, "--no-usd") == 0
     assert (out / VIDEO_NAME).stat().st_size > 1000
+
+
+@needs_ffmpeg
+def test_size_and_slowness_are_options(beam, tmp_path, capsys):
+    """Three frames at 30 per second, four times as slow."""
+    imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg")
+    out = tmp_path / "out"
+    assert run(beam, "--video", "--out", out, "--no-usd", "--slow", "4", "--size", "64x36") == 0
+    n, seconds = imageio_ffmpeg.count_frames_and_secs(str(out / VIDEO_NAME))
+    assert n == 4 and seconds == pytest.approx(4 * 4 / 30, abs=0.02)
+    assert next(imageio_ffmpeg.read_frames(str(out / VIDEO_NAME)))["size"] == (64, 36)
+
+
+@pytest.mark.parametrize(
+    "options, message",
+    [
+        ("--slow 2", "--slow is the speed of the film, so it needs --video"),
+        ("--video --slow 0", "--slow must be greater than 0"),
+        ("--size 640", "--size 640: write width and height in pixels, such as 640x360"),
+        ("--size 0x5", "both must be 1 to 16384"),
+        ("--view 0 90", "--view: the elevation must be from -89 to 89 degrees, not 90"),
+        ("--view nan 0", "--view: azimuth must be"),
+        ("--view 0 10 --no-frames", "--view needs --out"),
+        ("--size 64x36 --no-frames", "--size needs --out"),
+    ],
+)
+def test_bad_sizes_and_speeds_are_refused(beam, tmp_path, capsys, options, message):
+    assert run(beam, "--out", tmp_path / "out", *options.split()) == 2
+    assert message in capsys.readouterr().err and not (tmp_path / "out").exists()

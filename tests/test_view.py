@@ -18,7 +18,7 @@ from fake_simulator import FakeSimulator, beam_scene
 import taisoft as ts
 from taisoft.backend.runtime import open_kind, open_runtime
 from taisoft.errors import OutputError, SimulationError
-from taisoft.output.camera import Camera
+from taisoft.output.camera import Camera, start_positions
 from taisoft.view.ggui import Canvas, vulkan_missing, window_holder
 from taisoft.view.offscreen import Offscreen
 from taisoft.view.scene_view import MARKER_COLOUR, Surfaces, smoothing_groups, vertex_normals
@@ -278,3 +278,17 @@ def test_pictures_do_not_change_a_run():
                     drawing.image(sim)
             states.append((sim.positions(), sim.velocities()))
     assert all(np.array_equal(a, b) for a, b in zip(*states))
+
+
+def test_the_direction_of_pictures_is_free():
+    """From +x the beam, 4 m long along x, shows its end; the camera still moves back from it."""
+    scene = beam_scene()
+    drawing = Offscreen(scene, SIZE)
+    drawing.look_from(scene, 90.0, 0.0)
+    points = start_positions(scene)
+    assert np.allclose(drawing.camera.forward, (-1, 0, 0)) and np.ptp(drawing.camera.project(points, SIZE)[:, 0]) < 0.5 * SIZE[0]
+    before = drawing.camera.distance
+    sim = FakeSimulator(scene)
+    sim.positions = lambda name=None: 3.0 * points
+    drawing.image(sim)
+    assert drawing.camera.distance > 2.0 * before and np.allclose(drawing.camera.forward, (-1, 0, 0))

@@ -147,6 +147,7 @@ def _parser() -> argparse.ArgumentParser:
     option = add("scene", ("files", "scene"), "write a scene, or a starting scene for a mesh, as a .toml file").add_argument
     _add_scene_name(option, "a .toml or .py file, or a mesh (.msh, .vtu, .vtk, .mesh, .node, USD) that falls on the ground")
     _add_placement(option, "instead of falling from above the ground")
+    option("--order", type=int, choices=(1, 2), help="of the tets of a mesh, 1 or 2; 2 bends correctly (default 1)")
     option("--out", metavar="FILE", required=True, help="the .toml file; its meshes are written beside it")
     option("--overwrite", action="store_true", help="replace existing files")
 
@@ -209,6 +210,10 @@ def _add_run(add) -> None:
     every = "write DIR/checkpoint.npz every T of simulated time [s], not only at the end"
     option("--checkpoint-every", type=float, metavar="T", help=every)
     option("--video", action="store_true", help="also make video.mp4 from the pictures with ffmpeg (extra 'video')")
+    option("--slow", type=float, metavar="FACTOR", help="film time over simulated time of video.mp4 (default 1)")
+    option("--size", metavar="WIDTHxHEIGHT", help="of the pictures in pixels (default 1280x720)")
+    directions = "direction of the pictures [deg]: about y from +z towards +x, and above the horizon (default 32 20)"
+    option("--view", type=float, nargs=2, metavar=("AZIMUTH", "ELEVATION"), help=directions)
     option("--vtu", action="store_true", help="also write every frame as a .vtu file, and scene.pvd, which ParaView opens")
     option("--npz", action="store_true", help="also write the nodes of every frame as a .npz file")
     option("--no-usd", action="store_true", help="write no scene.usdc")
@@ -221,6 +226,7 @@ def _add_run(add) -> None:
     option("--plots", metavar="NAME,...", help="plots over time: energies, residuals, iterations, contacts, step_time, error")
     option("--caption", action="store_true", help="write scene, frame, time and energies on pictures")
     option("--no-frames", action="store_true", help="write no pictures")
+    option("--verbose", action="store_true", help="print why each feature of the plan is on, and which are left out")
 
 
 def _add_placement(option, instead: str = "(default: the mesh stays)") -> None:

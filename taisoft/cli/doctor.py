@@ -17,8 +17,9 @@ from taisoft import __version__
 
 REQUIRED = ("taichi", "numpy", "scipy", "meshio", "usd-core", "networkx", "rich")
 # package -> the extra that installs it; only benchmarks use other programs, only studies use a cluster
-OPTIONAL = {"mujoco": "peers", "pybullet": "peers", "newton": "peers"}
-OPTIONAL |= {"matplotlib": "plot", "viser": "notebook", "distributed": "cluster"}
+OPTIONAL = {"wildmeshing": "mesh", "imageio-ffmpeg": "video", "matplotlib": "plot", "pillow": "plot", "viser": "notebook"}
+OPTIONAL |= {"distributed": "cluster", "mujoco": "peers", "pybullet": "peers", "newton": "peers"}
+KERNEL = "ipykernel"  # of Jupyter, which no extra installs
 VULKAN_PROBE = "from taichi._lib import core; print('vulkan', core.with_vulkan())"
 PROBE_SECONDS = 60.0  # loading Taichi from a cold disk takes several seconds
 
@@ -30,6 +31,7 @@ def doctor(_: Namespace) -> int:
         ("machine", f"{platform.platform()}, {os.cpu_count()} cores"),
         ("packages", ", ".join(f"{name} {_version(name)}" for name in REQUIRED)),
         *(("optional", f"{name} {_version(name, extra)}") for name, extra in OPTIONAL.items()),
+        ("optional", f"{KERNEL} {_version(KERNEL, others='jupyterlab nbconvert')}"),
         ("arch cpu", "yes"),
         ("arch cuda", cuda()),
         ("vulkan", vulkan()),
@@ -40,11 +42,12 @@ def doctor(_: Namespace) -> int:
     return 0
 
 
-def _version(package: str, extra: str = "") -> str:
+def _version(package: str, extra: str = "", others: str = "") -> str:
+    """Return a package's version, or how to install it: by an extra, by other packages, or by itself."""
     try:
         return metadata.version(package)
     except metadata.PackageNotFoundError:
-        return "missing: pip install " + (f"'taisoft[{extra}]'" if extra else package)
+        return "missing: pip install " + (f"'taisoft[{extra}]'" if extra else others or package)
 
 
 def cuda() -> str:

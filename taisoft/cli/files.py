@@ -10,6 +10,7 @@ import numpy as np
 
 from taisoft.cli import Signals, printed_warnings
 from taisoft.cli.scene_file import load_scene
+from taisoft.cli.units import MILLIMETRE, MILLIMETRES_ABOVE, longest_side, warn_millimetres
 from taisoft.errors import OutputError, SceneError
 from taisoft.mesh.files import WRITERS, check_ending, read_mesh, write_mesh
 from taisoft.mesh.placing import place, underside
@@ -24,7 +25,6 @@ from taisoft.scene.scene import Scene
 from taisoft.scene.toml_writer import write_scene
 
 POOR_QUALITY = 0.1  # mean ratio below which a tet stiffens its surroundings and slows the solver noticeably
-MILLIMETRES_ABOVE = 20.0  # longest side in file units: soft bodies of more than 20 m are rare, parts of 20 mm are not
 TINY_BELOW = 1e-3  # soft bodies under 1 mm are rare
 DROP = 0.25  # over the body's height
 RELATIVE_STIFFNESS = 100.0  # Young's modulus over the pressure under the body: it sags by about 1 %
@@ -75,10 +75,14 @@ def scene(arguments: Namespace) -> int:
         placed = _given(arguments, *PLACEMENT)
         if path.suffix.lower() in (*MESH_SUFFIXES, *USD_FORMATS):
             meshes = read_usd(path) if path.suffix.lower() in USD_FORMATS else {path.stem: read_mesh(path)}
-            made, solver = _drop_scene({name: place(mesh, **placed) for name, mesh in meshes.items()}, arguments.at)
+            placed_meshes = {name: place(mesh, **placed) for name, mesh in meshes.items()}
+            warn_millimetres(placed_meshes)
+            made, solver = _drop_scene(placed_meshes, arguments.at, arguments.order or 1)
         elif placed or arguments.at is not None:
             options = ", ".join(f"--{name}" for name in (*PLACEMENT, "at"))
             raise SceneError(f"{arguments.scene}: {options} place a mesh, and this is a scene")
+        elif arguments.order is not None:
+            raise SceneError(f"{arguments.scene}: --order is for a mesh, and this is a scene with its own")
         else:
             made, solver = load_scene(arguments.scene, arguments.allow_outside)
     for written in write_scene(arguments.out, made, solver, arguments.overwrite):
@@ -114,7 +118,8 @@ def _describe_surface(surface: SurfaceMesh) -> list[tuple[str, str]]:
     a, b, c = np.moveaxis(surface.vertices[surface.triangles], 1, 0)
     lengths = np.concatenate([np.linalg.norm(p - q, axis=1) for p, q in ((a, b), (b, c), (c, a))])
     counts = f"{len(surface.vertices)} vertices, {len(surface.triangles)} triangles, {_pieces(surface.n_pieces)}; no tets"
-    command = shlex.join([surface.source, "--out", f"{Path(surface.source).stem}.msh"])
+    scale = MILLIMETRE.split() if longest_side(surface.vertices) > MILLIMETRES_ABOVE else []
+    command = shlex.join([surface.source, *scale, "--out", f"{Path(surface.source).stem}.msh"])
     return [
         *_size_lines(counts, surface.vertices),
         ("area", f"{surface.area:.6g}"),
@@ -151,10 +156,10 @@ def _size_lines(counts: str, vertices: np.ndarray) -> list[tuple[str, str]]:
     """Return counts, extent along each axis, and a guess of the unit; taisoft itself reads every file as metres, y up."""
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     extents = [f"{axis} {h - l:.5g} ({l:.5g} to {h:.5g})" for axis, l, h in zip("xyz", low, high)]
-    longest = float((high - low).max())
+    longest = longest_side(vertices)
     unit = f"metres, probably (longest side {longest:.4g} m)"
     if longest > MILLIMETRES_ABOVE:
-        unit = f"read as metres, the longest side is {longest:.4g} m; probably millimetres: --scale 0.001"
+        unit = f"read as metres, the longest side is {longest:.4g} m; probably millimetres: {MILLIMETRE}"
     elif longest < TINY_BELOW:
         unit = f"read as metres, the longest side is {longest:.4g} m; very small: is the file scaled?"
     up = "y is taken for up; tetrahedralize and scene have --up, --scale, --rotate and --at"
@@ -179,11 +184,11 @@ def _print_lines(title, lines: list[tuple[str, str]]) -> None:
         print(f"  {name:<10} {text}")
 
 
-def _drop_scene(meshes: dict[str, TetMesh], at: list[float] | None) -> tuple[Scene, dict]:
+def _drop_scene(meshes: dict[str, TetMesh], at: list[float] | None, order: int) -> tuple[Scene, dict]:
     """Return a scene in which meshes, of rubber with stiffness scaled to their size, fall on the ground; and its solver dict.
 
     meshes: by name, as they stand to each other. at: (3,) [m], where the middle of their underside starts; None: above the
-    ground.
+    ground. order: of the elements.
     """
     made = Scene(gravity=(0.0, -9.81, 0.0))
     vertices = np.concatenate([mesh.vertices for mesh in meshes.values()])
@@ -192,7 +197,7 @@ def _drop_scene(meshes: dict[str, TetMesh], at: list[float] | None) -> tuple[Sce
     young = float(f"{RELATIVE_STIFFNESS * DENSITY * 9.81 * height:.0e}")  # one digit
     rubber = Material(young=young, poisson=0.4, density=DENSITY, friction=0.5)
     for name, mesh in meshes.items():
-        made.add_body(mesh, rubber, name="body" if name == GROUND else name, position=position)
+        made.add_body(mesh, rubber, name="body" if name == GROUND else name, position=position, order=order)
     made.add_obstacle(HalfSpace((0.0, 0.0, 0.0), (0.0, 1.0, 0.0)), name=GROUND, friction=0.5)
     fall = math.sqrt(2.0 * DROP * height / 9.81)  # [s]
     fps = 50.0 if fall > 0.05 else float(np.ceil(2.5 / fall))

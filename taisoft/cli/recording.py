@@ -1,8 +1,7 @@
-"""What `taisoft run` shows and writes: display options, observers of the frames, the folder of the results, the terminal."""
+"""What `taisoft run` shows and writes: display options, observers of the frames, the folder of the results."""
 
 import shlex
 import sys
-import textwrap
 import time
 from argparse import Namespace
 from contextlib import ExitStack
@@ -10,8 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from taisoft.errors import OutputError, SceneError
-from taisoft.estimation.forecast import describe_error
-from taisoft.frames import dt_sentence
+from taisoft.output.camera import MAX_ELEVATION
 from taisoft.output.files import RESULT_FILES, RESULT_FOLDERS, CheckpointWriter, OutputFolder
 from taisoft.output.frame_files import NPZ_NAME, VTU_NAME, NpzWriter, VtuWriter, cut_pvd
 from taisoft.output.frame_table import FrameTable
@@ -19,21 +17,22 @@ from taisoft.output.frames import FRAMES_NAME, FrameWriter, ffmpeg_command, find
 from taisoft.output.report import body_records, write_report
 from taisoft.output.usd import UsdWriter
 from taisoft.records import RunReport
+from taisoft.scene import checks
 from taisoft.scene.checks import nearest
 from taisoft.view.annotations import text_missing
+from taisoft.view.offscreen import SIZE, checked_size
 from taisoft.view.pictures import PictureOptions, PictureProcess, open_pictures
 from taisoft.view.plots import PLOTS, Plots
 from taisoft.view.scene_view import IN_PICTURES, IN_WINDOW, LAYERS
 
-WIDTH = 118  # of the terminal
-PROBLEMS_SHOWN = 5
-MOST = 0.5  # fraction of a run's wall time above which the summary says what pictures cost
+NO_BALLS = "; nodes that follow a path have no balls, since it may release them"
 
 
 @dataclass(frozen=True)
 class DisplayOptions:
     """colour: as in `Offscreen`; layers: names, or None for the defaults; plots: names; caption: the scene's name, or None.
 
+    size: of pictures [pixels]; slow: film time over simulated time; view: azimuth and elevation of the camera [deg], or None.
     window, pictures, usd, vtu, npz: whether there is a window, and what is written to the folder; errors: whether they are
     estimated.
     """
@@ -48,6 +47,9 @@ class DisplayOptions:
     plots: tuple[str, ...]
     caption: str | None
     errors: bool
+    size: tuple[int, int] = SIZE
+    slow: float = 1.0
+    view: tuple[float, float] | None = None
 
     @property
     def in_pictures(self) -> tuple[str, ...]:
@@ -65,6 +67,7 @@ def display_options(arguments: Namespace, has_window: bool) -> DisplayOptions:
     pictures = arguments.out is not None and not arguments.no_frames
     layers, plots = _names("layers", arguments.layers, LAYERS), _names("plots", arguments.plots, PLOTS) or ()
     requested = {"video": arguments.video, "caption": arguments.caption}
+    requested |= {"size": arguments.size is not None, "view": arguments.view is not None}
     if not has_window:
         requested |= {"layers": layers is not None, "plots": bool(plots)}
     for option, given in requested.items():
@@ -80,8 +83,36 @@ def display_options(arguments: Namespace, has_window: bool) -> DisplayOptions:
     for option, given in {"colour": arguments.colour == "error", "plots": "error" in plots}.items():
         if given and not errors:
             raise SceneError(f"--{option} error needs --error")
+    if arguments.slow is not None and not arguments.video:
+        raise SceneError("--slow is the speed of the film, so it needs --video")
+    size = SIZE if arguments.size is None else _size_of(arguments.size)
+    slow = checks.number(1.0 if arguments.slow is None else arguments.slow, "--slow", above=0.0)
     files = pictures, not arguments.no_usd, arguments.vtu, arguments.npz
-    return DisplayOptions(has_window, *files, arguments.colour, layers, plots, caption, errors)
+    return DisplayOptions(
+        has_window, *files, arguments.colour, layers, plots, caption, errors, size, slow, _view_of(arguments.view)
+    )
+
+
+def _view_of(angles: list[float] | None) -> tuple[float, float] | None:
+    """Return azimuth and elevation [deg]. Raises SceneError if they are not finite, or the view is from straight above."""
+    if angles is None:
+        return None
+    azimuth = checks.number(angles[0], "--view: azimuth")
+    elevation = checks.number(angles[1], "--view: elevation")
+    if abs(elevation) > MAX_ELEVATION:
+        raise SceneError(f"--view: the elevation must be from -{MAX_ELEVATION:g} to {MAX_ELEVATION:g} degrees, not {elevation:g}")
+    return azimuth, elevation
+
+
+def _size_of(text: str) -> tuple[int, int]:
+    """Return width and height [pixels] of a text such as 640x360. Raises SceneError."""
+    width, x, height = text.partition("x")
+    if not (x and width.isdecimal() and height.isdecimal()):
+        raise SceneError(f"--size {text}: write width and height in pixels, such as 640x360")
+    try:
+        return checked_size((int(width), int(height)))
+    except OutputError as error:
+        raise SceneError(f"--size {text}: {error}") from None
 
 
 def _names(option: str, text: str | None, known) -> tuple[str, ...] | None:
@@ -101,6 +132,8 @@ def check_modelled(shown: DisplayOptions, sim) -> None:
     if "contacts" in (shown.layers or ()) and not sim.plan.on["contact_forces"]:
         raise SceneError(f"--layers contacts: contact forces are not modelled ({sim.plan.why('contact_forces')})")
     Plots(sim, shown.plots, shown.errors)
+    if "fixed_nodes" in (shown.layers or ()) and not sim.plan.on["fixed_nodes"]:
+        print(f"taisoft: --layers fixed_nodes: no node is fixed{NO_BALLS * sim.plan.on['moving_nodes']}", file=sys.stderr)
 
 
 class Observers:
@@ -200,7 +233,8 @@ class Recording:
         if no_bar:
             print(f"taisoft: pictures have no colour bar: {no_bar}", file=sys.stderr)
         texts = {"plots": shown.plots, "caption": shown.caption, "bar": has_scale and not no_bar}
-        return PictureOptions(colour=shown.colour, layers=shown.in_pictures, kept=self._notes, **texts)
+        frame = {"size": shown.size, "view": shown.view}
+        return PictureOptions(colour=shown.colour, layers=shown.in_pictures, kept=self._notes, **frame, **texts)
 
     def checkpoint(self, sim) -> None:
         """Write checkpoint.npz. Raises OutputError."""
@@ -249,56 +283,3 @@ class Recording:
 def _size(paths: list[Path]) -> str:
     n_bytes = sum(path.stat().st_size for path in paths)
     return f"{n_bytes / 1e6:.1f} MB" if n_bytes >= 1e5 else f"{n_bytes / 1e3:.1f} kB"
-
-
-def print_plan(sim) -> None:
-    """Print which features the scene needs, and why; report.json also says why the others are left out."""
-    on = [entry for entry in sim.plan.entries if entry["on"]]
-    off = [entry["feature"] for entry in sim.plan.entries if not entry["on"]]
-    width = max((len(entry["feature"]) for entry in on), default=0)
-    _print_lines("plan", [f"{entry['feature']:<{width}}  {entry['why']}" for entry in on])
-    _print_lines("left out", [", ".join(off) or "nothing"])
-
-
-def print_state(sim) -> None:
-    """Print time and energies of the simulator's current state."""
-    _print_lines("time", [f"{sim.time:.6g} s simulated in {sim.step_count} steps of {sim.dt:.6g} s"])
-    e = sim.energies()
-    _print_lines("energy", [f"kinetic {e.kinetic:.6g} J, elastic {e.elastic:.6g} J, gravity {e.gravity:.6g} J"])
-
-
-def print_summary(result: RunReport, sim, observers: Observers, recording: Recording | None) -> None:
-    """Print status and a changed dt, problems, time, smallest volume ratio, energies, files."""
-    print()
-    changed = dt_sentence(result)
-    early = ", ended early by a signal" if result.interrupted else ""
-    _print_lines("status", [f"{result.status}{early}{changed and '; ' + changed}"])
-    problems = [problem for problem in result.problems if not (changed and problem.startswith(f"note: {changed}"))]
-    for problem in problems[:PROBLEMS_SHOWN]:
-        _print_lines("problem", [problem])
-    if len(problems) > PROBLEMS_SHOWN:
-        _print_lines("", [f"and {len(problems) - PROBLEMS_SHOWN} more problems"])
-    if result.error_estimate is not None:
-        _print_lines("error", describe_error(result.error_estimate, result.wall_seconds - observers.seconds))
-    print_state(sim)
-    output, compiling = f"{observers.seconds:.2f} s of it for output", f"{result.compile_seconds:.2f} s to compile"
-    pilots = f"{result.pilot_seconds:.2f} s of pilots and " if result.pilot_seconds else ""
-    _print_lines("wall", [f"{result.wall_seconds:.2f} s, {output}; plus {pilots}{compiling}"])
-    if observers.picture_seconds > MOST * result.wall_seconds:
-        share = f"{observers.picture_seconds:.2f} s of it, {observers.picture_seconds / result.wall_seconds:.0%}, for pictures"
-        _print_lines("", [f"{share}: a lower --fps draws fewer, --no-frames none"])
-    if result.step_reports:
-        worst = min(result.step_reports, key=lambda report: report.min_volume_ratio)
-        _print_lines("min J", [f"{worst.min_volume_ratio:.4g} at {worst.time:.4g} s, {worst.n_inverted} tets inverted"])
-        divided = [report.substeps for report in result.step_reports if report.substeps > 1]
-        if divided:
-            _print_lines("substeps", [f"{len(divided)} steps were divided, into at most {max(divided)} substeps"])
-    if recording is not None:
-        _print_lines("files", recording.files())
-
-
-def _print_lines(name: str, texts: list[str]) -> None:
-    """Print texts in a column, the first one beside the name."""
-    for index, text in enumerate(texts):
-        first = f"{'' if index else name:<9}"
-        print(textwrap.fill(text, WIDTH, initial_indent=first, subsequent_indent=" " * 9, break_long_words=False))

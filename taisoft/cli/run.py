@@ -14,17 +14,10 @@ from pathlib import Path
 
 from taisoft.checkpoint import Checkpoint
 from taisoft.cli import EXIT_FAILED, EXIT_OUTPUT, EXIT_SIGNAL, Signals, parse_scalar, printed_warnings
-from taisoft.cli.recording import (
-    DisplayOptions,
-    Observers,
-    Recording,
-    check_modelled,
-    display_options,
-    print_plan,
-    print_state,
-    print_summary,
-)
+from taisoft.cli.recording import DisplayOptions, Observers, Recording, check_modelled, display_options
 from taisoft.cli.scene_file import OF_SCENE, load_scene, refuse_unknown
+from taisoft.cli.summary import print_plan, print_state, print_summary
+from taisoft.cli.units import warn_millimetres
 from taisoft.errors import SceneError, SimulationError
 from taisoft.frames import check_length, first_frame
 from taisoft.output.files import check_free, read_last_good
@@ -37,6 +30,11 @@ from taisoft.view.ggui import display_missing, vulkan_missing
 from taisoft.view.plots import Plots
 
 RUN_KEYS = ("seconds", "fps")  # arguments of Simulator.run that a `solver` dict may hold too
+TWINS = {  # by --error-mesh
+    None: "for two to three times its work",
+    "refined": "the one on the refined mesh for some 10 to 40 times its work: see docs/errors.md",
+    "order": "one of them with the other order of elements",
+}
 MAY_CHANGE = ("dt", "arch")  # arguments of Simulator that may change when a run is resumed
 
 
@@ -63,6 +61,7 @@ def run(arguments: Namespace) -> int:
     _check_working_folder()
     with Signals() as signals, printed_warnings() as warned:
         scene, solver = load_scene(arguments.scene, arguments.allow_outside)
+        warn_millimetres({body.name: body.mesh for body in scene.bodies})
         _check_checkpoint_interval(arguments)
         shown = display_options(arguments, has_window=not arguments.headless and _window_is_possible())
         interactive = shown.window and arguments.out is None and arguments.seconds is None
@@ -87,7 +86,7 @@ def run(arguments: Namespace) -> int:
             sim = _resumed(saved, scene, settings)
         with sim:
             check_modelled(shown, sim)
-            print_plan(sim)
+            print_plan(sim, arguments.verbose)
             if interactive:
                 return _show_window(sim, settings, shown)
             _check_time_left(sim, settings, arguments)
@@ -244,6 +243,8 @@ def _run(sim, settings: RunSettings, arguments, signals, warned: list[str], save
         if recording is not None:
             recording.add_writers(observers, sim, settings.fps, settings.seconds, shown, plots)
         observers.members.append(Progress(settings.seconds, label=Path(arguments.scene).stem))
+        if shown.errors:
+            print(f"twins    follow the run, {TWINS[arguments.error_mesh]}", flush=True)
         if sim.settings.tolerance is not None and resumed is None:
             print("pilots   choose integrator and dt", flush=True)
         result = sim.run(
@@ -268,7 +269,7 @@ def _run(sim, settings: RunSettings, arguments, signals, warned: list[str], save
         if recording is not None:
             reported = observers.guard(recording.report, result, sim, settings.as_dict())
             video = arguments.video and not signals.requested()
-            video_written = not video or observers.guard(recording.video, settings.fps or 1.0 / sim.dt)
+            video_written = not video or observers.guard(recording.video, (settings.fps or 1.0 / sim.dt) / shown.slow)
             _report_failed_output(result, observers, signals)
             if reported and not video_written:
                 observers.guard(recording.report, result, sim, settings.as_dict())  # again, with the video's errors

@@ -52,12 +52,18 @@ class ContactFields:
 
 @dataclass(frozen=True, eq=False)
 class Contacts:
-    """Contacts on the host, all arrays (k, ...) and in an order that does not depend on threads."""
+    """Contacts on the host, all arrays (k, ...) and in an order that does not depend on threads.
+
+    An attribute of a record from `sim.contacts()` holds for the last step, or for its last substep if it was cut into several.
+    point, normal, gap: geometry at the start of that step; impulse: of normal force and friction together; impulse / duration is
+    the force. kind: what meets, a vertex and a triangle, two edges, a vertex or a triangle and a distance field or obstacle, or
+    two triangles that would pass through each other. Contacts that are near each other are merged into one: there were `found`.
+    """
 
     point: np.ndarray  #: (k,3) midway between the two surface points [m]
     normal: np.ndarray  #: (k,3) unit vectors from b to a
     gap: np.ndarray  #: (k,) [m], negative for a penetration
-    impulse: np.ndarray  #: (k,3) on a [N s]; b gets the opposite
+    impulse: np.ndarray  #: (k,3) on a [N s], with friction; b gets the opposite
     body_a: np.ndarray  #: (k,) names
     body_b: np.ndarray  #: (k,) names; an obstacle is always b
     nodes: np.ndarray  #: (k,6) three of each side, numbered over all bodies, -1 where there is none; more with exact attachments
@@ -68,6 +74,7 @@ class Contacts:
     restitution: np.ndarray  #: (k,) of the pair
     found: int  #: contacts before the reduction
     unmapped: int  #: triangles whose tet is inverted, so that a distance field could not be used
+    duration: float = 0.0  #: in which the impulses acted [s]: the step, or its last substep; 0 without a step
 
     __repr__ = short_repr
 

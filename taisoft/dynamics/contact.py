@@ -3,6 +3,8 @@
 The search at the end of each step also serves the next one, and measures how deep bodies penetrate each other.
 """
 
+from dataclasses import replace
+
 import numpy as np
 
 from taisoft.backend.arrays import FieldArena, download
@@ -29,7 +31,16 @@ from taisoft.dynamics.contact_measures import (
     Crossing,
 )
 from taisoft.dynamics.contact_paths import ContactPaths
-from taisoft.dynamics.contact_record import distribute, read_rows, record_contacts, sum_impulses, sum_moments, write_rows
+from taisoft.dynamics.contact_record import (
+    Pairs,
+    distribute,
+    read_rows,
+    record_contacts,
+    sum_impulses,
+    sum_moments,
+    sum_pairs,
+    write_rows,
+)
 from taisoft.dynamics.impact import Rebounds
 from taisoft.dynamics.simulation_state import SimulationState
 from taisoft.errors import SimulationError
@@ -78,6 +89,7 @@ class ContactStep:
         self.penetration = 0.0  # at the end of the last step [m],
         self.relative_penetration = 0.0  # and over the finer side's mean surface edge
         self._impulse_sum: np.ndarray | None = None  # (n_colliders, 6) over the last step's substeps, if several: see `_impulses`
+        self._pair_sum: Pairs | None = None  # likewise, of pairs
         self._step_dt = 0.0  # of the last step [s]
         self._impulse_fraction = 1.0
         self._own_sides: tuple[np.ndarray, np.ndarray] | None = None  # nodes of contacts before dependent ones were replaced
@@ -110,7 +122,8 @@ class ContactStep:
         self._searched = self._measured_end = None
         self.problem.count[0] = 0
         self._last_time = self.penetration = self.relative_penetration = self._step_dt = 0.0
-        self._impulse_sum, self.last_crossing = None, Crossing()
+        self._impulse_sum = self._pair_sum = None
+        self.last_crossing = Crossing()
         self.flight[:] = 0.0
         self.paths.return_to_start(none_crossed)
         self.crossing = 0.0 if none_crossed else None
@@ -126,6 +139,8 @@ class ContactStep:
             "share": self._impulse_fraction,
             "span": self._step_dt,
             "sum": self._impulse_sum,
+            "pairs": None if self._pair_sum is None else self._pair_sum[0],
+            "pair_sum": None if self._pair_sum is None else self._pair_sum[1],
             "penetration": self.penetration,
             "relative_penetration": self.relative_penetration,
             "met": self.had_impact,
@@ -142,6 +157,7 @@ class ContactStep:
         write_rows(self.problem, kept["rows"])
         self._last_time, self._impulse_fraction, self._step_dt = (float(kept[name]) for name in ("last_time", "share", "span"))
         self._impulse_sum, self.penetration = kept["sum"], float(kept["penetration"])
+        self._pair_sum = None if kept["pairs"] is None else (kept["pairs"], kept["pair_sum"])
         self.relative_penetration = float(kept["relative_penetration"])
         self.had_impact, self.dropped = bool(kept["met"]), int(kept["dropped"])
         self.flight[:] = kept["flight"]
@@ -235,7 +251,8 @@ class ContactStep:
 
     def start_step(self, dt: float) -> None:
         """Begin a step of dt."""
-        self._substep_fraction, self._step_dt, self.dropped, self._impulse_sum = 1.0, dt, 0, None
+        self._substep_fraction, self._step_dt, self.dropped = 1.0, dt, 0
+        self._impulse_sum = self._pair_sum = None
         self.paths.start_step()
 
     def start_substep(self, dt: float) -> None:
@@ -248,18 +265,28 @@ class ContactStep:
         if not self.paths.none_cross:
             self.paths.exempt_crossing()
         if self._substep_fraction < 1.0:
-            impulses = self._impulses()
+            contacts = self.contacts()
+            impulses = self._impulses(contacts)
             self._impulse_sum = impulses + (0.0 if self._impulse_sum is None else self._impulse_sum)
+            self._pair_sum = sum_pairs(contacts, self.simulation.scene, self._pair_sum)
 
-    def _impulses(self) -> np.ndarray:
+    def _impulses(self, contacts: Contacts) -> np.ndarray:
         """Impulses [N s] and their moments about the origin [N m s] on the colliders in the last substep, (n_colliders, 6)."""
-        contacts, scene, x = self.contacts(), self.simulation.scene, self.simulation.state()[0]
+        scene, x = self.simulation.scene, self.simulation.state()[0]
         return np.hstack([sum_impulses(contacts, scene), sum_moments(contacts, scene, x)])
 
     def force_and_moment(self, collider: int) -> np.ndarray:
         """Return the mean contact force [N] on a collider over the last step, and its moment about the origin [N m], (6,)."""
-        total = self._impulses() if self._impulse_sum is None else self._impulse_sum
+        total = self._impulses(self.contacts()) if self._impulse_sum is None else self._impulse_sum
         return total[collider] / self._step_dt if self._step_dt > 0.0 else np.zeros(6)
+
+    def pair_force(self, collider: int, other: int) -> np.ndarray:
+        """Return the mean contact force (3,) [N] on a collider from another one over the last step."""
+        found = sum_pairs(self.contacts(), self.simulation.scene) if self._pair_sum is None else self._pair_sum
+        own = (found[0] == sorted((collider, other))).all(axis=1)
+        if self._step_dt == 0.0 or not own.any():
+            return np.zeros(3)
+        return (1.0 if collider < other else -1.0) * found[1][own][0] / self._step_dt
 
     def own_forces(self) -> np.ndarray:
         """Return the contact forces of the last substep on the nodes that touch, dependent ones too, (n_nodes, 3) [N].
@@ -351,8 +378,9 @@ class ContactStep:
         return self.measures.describe_fast_closing(dt, self._searched_dt, substeps)
 
     def contacts(self) -> Contacts:
-        """Return the contacts of the last step with their impulses."""
-        return record_contacts(self.detection, self.problem, self._impulse_fraction)
+        """Return the contacts of the last substep with their impulses."""
+        found = record_contacts(self.detection, self.problem, self._impulse_fraction)
+        return replace(found, duration=self._last_time / self._impulse_fraction)
 
     @property
     def field_bytes(self) -> dict[str, int]:

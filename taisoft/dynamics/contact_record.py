@@ -28,6 +28,26 @@ def sum_impulses(contacts: Contacts, scene: Scene) -> np.ndarray:
     return total
 
 
+Pairs = tuple[np.ndarray, np.ndarray]  # colliders (k,2), the lower index first, and impulses (k,3) on the first [N s]
+
+
+def sum_pairs(contacts: Contacts, scene: Scene, before: Pairs | None = None) -> Pairs:
+    """Return each pair of colliders that touch, and the impulse that the first gets from the second.
+
+    before: pairs and impulses to be added.
+    """
+    place = {one.name: k for k, one in enumerate(scene.colliders)}
+    names = zip(contacts.body_a, contacts.body_b)
+    pairs = np.array([(place[a], place[b]) for a, b in names], dtype=np.int64).reshape(-1, 2)
+    impulses = contacts.impulse
+    if before is not None:
+        pairs, impulses = np.concatenate([before[0], pairs]), np.concatenate([before[1], impulses])
+    unique, pair = np.unique(pairs, axis=0, return_inverse=True)
+    total = np.zeros((len(unique), 3))
+    np.add.at(total, pair.reshape(-1), impulses)
+    return unique, total
+
+
 def sum_moments(contacts: Contacts, scene: Scene, x: np.ndarray) -> np.ndarray:
     """Return the moment of the given contacts' impulses on each collider about the origin, (n_colliders, 3) [N m s].
 

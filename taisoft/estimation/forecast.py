@@ -7,11 +7,11 @@ no forecast.
 
 import math
 
+from taisoft.display import LEAST, percent
 from taisoft.estimation.order import MESH_ORDER
 from taisoft.records import ERROR_KINDS, ErrorEstimate
 
 MESH_WORK = 4  # exponent of the work in 1 / h
-LEAST = 1e-6  # smaller errors are shown as "below" it
 
 
 def describe_error(estimate: ErrorEstimate, wall_seconds: float) -> list[str]:
@@ -52,10 +52,3 @@ def work_for(estimate: ErrorEstimate, target: float) -> float:
     shares = [(estimate.time, 1.0 / (estimate.order or 1.0)), (estimate.space, MESH_WORK / MESH_ORDER)]
     known = [(error, exponent) for error, exponent in shares if error]
     return math.prod(max(1.0, len(known) * error / target) ** exponent for error, exponent in known)
-
-
-def percent(value: float) -> str:
-    """A fraction in percent, with two digits."""
-    if value >= 1.0:
-        return f"{100.0 * value:.0f}"
-    return f"{100.0 * value:.2g}" if value >= LEAST else f"< {100.0 * LEAST:.2g}" if value > 0.0 else "0"

@@ -116,7 +116,8 @@ class SurfaceMesh:
         if len(single):
             found.append(
                 f"{_holes_text(self.n_holes)}: {len(single)} edges belong to one triangle, the first is "
-                f"{_edge_text(single)}; fill holes in a modelling program, or read with a larger weld if they are cracks"
+                f"{_edge_text(single)}; tetrahedralize closes holes, but roughly: fill them "
+                "beforehand for a clean surface, or read with a larger weld if they are cracks"
             )
         if len(crowded):
             found.append(
@@ -257,8 +258,9 @@ def tetrahedralize(surface: SurfaceMesh, edge_length: float | None = None, envel
     """Return a tetrahedral mesh of the volume enclosed by a surface.
 
     edge_length: approximate edge length of the tets [m]; None for a twentieth of the diagonal. envelope: largest distance [m]
-    of the new surface from the old one; None for a tenth of edge_length. Warns of the surface's faults, and of the volume with
-    holes closed. Raises MeshError if the extra `mesh` is missing, nothing is enclosed, or the mesher fails.
+    of the new surface from the old one, except where holes are closed; None for a tenth of edge_length. Warns of the surface's
+    faults, and of the volume with holes closed. Raises MeshError if the extra `mesh` is missing, nothing is enclosed, or the
+    mesher fails.
     """
     if not isinstance(surface, SurfaceMesh):
         raise MeshError(f"tetrahedralize needs a SurfaceMesh (see read_surface), not {type(surface).__name__}")
@@ -288,6 +290,7 @@ def tetrahedralize(surface: SurfaceMesh, edge_length: float | None = None, envel
         )
     if holes := surface.n_holes:
         text = f"{_holes_text(holes)} {'was' if holes == 1 else 'were'} closed, and the tets fill {mesh.volumes.sum():.4g} m^3"
+        text += "; the closing surface may be rough and bulge beyond the envelope"
         warnings.warn(f"{name}: {text}", UserWarning, stacklevel=2)
     return mesh
 

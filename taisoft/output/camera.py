@@ -6,11 +6,15 @@ from functools import cached_property
 
 import numpy as np
 
+from taisoft.scene.obstacles import HalfSpace
+
 UP = np.array([0.0, 1.0, 0.0])
 MAX_ELEVATION = 89.0  # [deg]; at 90 "up" is undefined
 FILL = 0.62  # fraction of the picture's width or height, whichever is reached first, that the bodies fill at the start
 BORDER = 0.06  # fraction of the picture, both sides together, kept free when the camera moves back from moving bodies
+MAX_FALL = 3.0  # the part of a body's fall that is framed at the start, over the diagonal of all bodies
 MAX_WIDENING = 4.0  # largest distance over the first one; a body that flies away finally leaves the picture
+LEAST_SLOPE = 0.1  # cosine between a ground's normal and the vertical; a steeper half-space is a wall
 GUARD_BAND = 50.0  # half-size of the clipping region in half-sizes of the picture; triangles that cross it are cut
 NEAR, FAR = 0.02, 50.0  # clipping planes in units of the distance to the target
 
@@ -18,6 +22,29 @@ NEAR, FAR = 0.02, 50.0  # clipping planes in units of the distance to the target
 def start_positions(scene) -> np.ndarray:
     """Return the initial positions of the nodes of all bodies, (n,3) [m]."""
     return np.concatenate([body.rest_positions + body.position for body in scene.bodies])
+
+
+def framed_points(scene) -> np.ndarray:
+    """Return what a picture shows from the start on, (n,3) [m]: all nodes, and those of bodies that fall once they have landed.
+
+    A body falls if it has no constraint and no connection; it lands on the first half-space at rest below it.
+    """
+    starts, connected = start_positions(scene), {name for one in scene.connections for name in one.owners}
+    longest = MAX_FALL * float(np.linalg.norm(np.ptp(starts, axis=0)))
+    falling = [body for body in scene.bodies if not scene.constraints(body) and body.name not in connected]
+    return np.concatenate([starts, *(_landed(scene, body.rest_positions + body.position, longest) for body in falling)])
+
+
+def _landed(scene, x: np.ndarray, longest: float) -> np.ndarray:
+    """Return points (n,3) [m] after a fall along gravity of at most `longest` [m]; none if there is no ground below."""
+    strength, depths = float(np.linalg.norm(scene.gravity)), []
+    for shape in (o.shape for o in scene.obstacles if isinstance(o.shape, HalfSpace) and o.path is None):
+        steepness = -float(shape.normal @ scene.gravity) / strength if strength > 0.0 else 0.0
+        if steepness > LEAST_SLOPE:
+            depths.append(float(((x - shape.point) @ shape.normal).min()) / steepness)
+    if not depths or min(depths) <= 0.0:
+        return np.empty((0, 3))
+    return x + min(*depths, longest) / strength * np.asarray(scene.gravity)
 
 
 def clip_polygon(polygon: np.ndarray, k: int = 0) -> np.ndarray:

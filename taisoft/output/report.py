@@ -160,17 +160,17 @@ class Progress:
         self.seconds, self.label = seconds, label
         self.stream = sys.stderr if stream is None else stream
         self._started: float | None = None  # wall time of the first frame; construction and compilation come before
-        self._first_time = self._last_line = 0.0
+        self._first_time = self._last_line = self._compiled = 0.0
         self._first_step = 0
         self._bar = _bar(seconds, label, self.stream) if self.stream.isatty() else None
 
     def frame(self, sim, index: int) -> None:
-        """Show sim.time and the speed since the first frame."""
+        """Show sim.time, and the speed since the first frame without compiling, which does not go on."""
         now = time.perf_counter()
         if self._started is None:
             self._started, self._first_time, self._first_step = now, sim.time, sim.step_count
-            self._last_line = now
-        text = self._speed(sim, now - self._started)
+            self._last_line, self._compiled = now, sim.compile_seconds
+        text = self._speed(sim, now - self._started - (sim.compile_seconds - self._compiled))
         if self._bar is not None:
             self._bar.update(self._bar.task_ids[0], completed=min(sim.time, self.seconds), note=text)
         elif now - self._last_line >= LINE_EVERY:

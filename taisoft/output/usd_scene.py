@@ -27,7 +27,7 @@ from taisoft.output.appearance import (
     linear_rgb,
     obstacle_surfaces,
 )
-from taisoft.output.camera import MAX_WIDENING, Camera, start_positions
+from taisoft.output.camera import MAX_WIDENING, Camera, framed_points
 from taisoft.output.usd_curves import Curves
 from taisoft.scene.obstacles import HalfSpace, MeshObstacle
 from taisoft.scene.rigid import RigidBody
@@ -98,7 +98,7 @@ class ViewTrack:
     def __init__(self, stage, scene):
         from pxr import Gf, UsdGeom, UsdLux
 
-        self.camera = Camera.framing(start_positions(scene), PICTURE)
+        self.camera = Camera.framing(framed_points(scene), PICTURE)
         self._widest = MAX_WIDENING * self.camera.distance
         UsdGeom.Xform.Define(stage, VIEW)
 

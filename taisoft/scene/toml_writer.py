@@ -16,7 +16,7 @@ from taisoft.errors import OutputError, SceneError
 from taisoft.files import write_bytes
 from taisoft.mesh.files import write_mesh
 from taisoft.mesh.tet_mesh import TetMesh
-from taisoft.scene.body import Body
+from taisoft.scene.body import QUADRATURE_DEGREES, Body
 from taisoft.scene.checks import SOLVER_CHECKS, check_solver, nearest
 from taisoft.scene.key_frames import ShapePath
 from taisoft.scene.loads import Cavity, LoadPath, NodalForce, Pressure, Traction
@@ -142,9 +142,9 @@ def _body(body: Body, materials: dict[Material, str], stem: str, meshes: dict[st
     names = {body.mesh.region_names.get(key, str(key)): materials[one] for key, one in composition.materials.items()}
     table = {"materials": names} if composition.has_regions else {"material": materials[composition.first]}
     table |= {"mesh": _mesh_table(body.mesh, stem, meshes)} | composition.by_tet
-    table |= {
-        key: getattr(body, key) for key in ("position", "velocity", "order", "quadrature_degree", "collision", "dilatation")
-    }
+    table |= {key: getattr(body, key) for key in ("position", "velocity", "order", "collision", "dilatation")}
+    if body.quadrature_degree != QUADRATURE_DEGREES[body.order][0]:  # the default stays away, so that order can be edited
+        table["quadrature_degree"] = body.quadrature_degree
     if body.velocity.ndim == 2:
         table["velocity"] = body.velocity[: body.nodes.n_elastic]
     if body.skin is not None:

@@ -133,6 +133,11 @@ class Colouring:
         colours[np.isnan(above)] = UNKNOWN
         return self._surfaces.coloured(colours)
 
+    @property
+    def scale_text(self) -> str:
+        """The quantity and what red means, as in "speed, red: 2 m/s or more"; empty for the bodies' own colours."""
+        return "" if self.kind == "body" else f"{TITLES[self.kind]}, red: {self.low + self.span:g} {UNITS[self.kind]} or more"
+
     def legend(self) -> list[tuple[str, np.ndarray]]:
         """Return lines of text from high to low, each with its colour (3,); none for the bodies' own colours."""
         if self.kind == "body" or self.span == 0.0:

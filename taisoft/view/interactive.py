@@ -5,6 +5,7 @@ on this machine and only while a page is made. A page holds viewer (0.8 MB) and 
 """
 
 import contextlib
+import html
 import math
 from collections.abc import Iterator
 from importlib.util import find_spec
@@ -14,13 +15,14 @@ import rich
 
 from taisoft.errors import OutputError
 from taisoft.output.appearance import OBSTACLE_COLOUR, compact_surface, linear_rgb, obstacle_surfaces
-from taisoft.output.camera import Camera, start_positions
+from taisoft.output.camera import Camera, framed_points
 from taisoft.scene.obstacles import HalfSpace
 from taisoft.view.colouring import Colouring, checked_colour
 from taisoft.view.notebook import framed, write_page
 from taisoft.view.scene_view import Surfaces
 
 HEIGHT = 420  # of the view in a notebook [pixels]
+SCALE_STYLE = "position: fixed; left: 8px; bottom: 8px; font: 13px monospace; pointer-events: none; z-index: 1000"
 MISSING = "an interactive view needs the package viser: pip install 'taisoft[notebook]'"
 
 
@@ -47,6 +49,7 @@ class InteractiveView:
             raise OutputError(MISSING)
         self.colour = checked_colour(colour)
         self.times: list[float] = []  #: of the frames [s]
+        self.scales: list[str] = []  #: what red means in each of them, empty for own colours
         self._frames: list[tuple[np.ndarray, np.ndarray]] = []  # vertices and colours of bodies
         self._scene = None
 
@@ -60,6 +63,7 @@ class InteractiveView:
             raise OutputError("an interactive view shows one scene: make another one for another simulator")
         x, colours = self._surfaces.of_bodies(sim)[0], linear_rgb(self._colouring.base(sim))
         self._frames.append((x[self._used].astype(np.float32), np.round(255 * colours[self._used]).astype(np.uint8)))
+        self.scales.append(self._colouring.scale_text)
         self.times.append(sim.time)
 
     def __len__(self) -> int:
@@ -79,9 +83,16 @@ class InteractiveView:
         with _quiet():
             server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
             try:
-                return self._recorded(server).as_html()
+                page = self._recorded(server).as_html()
             finally:
                 server.stop()
+        before, end, after = page.rpartition("</body>")  # scripts before it may hold such a text, too
+        return before + self._scale_html() + end + after
+
+    def _scale_html(self) -> str:
+        """Return a line over the view that says what red means in the last frame, and whether earlier ones had another scale."""
+        text = self.scales[-1] + (", at the end" if len(set(self.scales)) > 1 else "")
+        return f'<div style="{SCALE_STYLE}">{html.escape(text)}</div>' if text else ""
 
     def save(self, path) -> None:
         """Write a page with the view. Raises OutputError."""
@@ -97,7 +108,7 @@ class InteractiveView:
         """
         import trimesh
 
-        camera = Camera.framing(start_positions(self._scene))
+        camera = Camera.framing(framed_points(self._scene))
         server.scene.set_up_direction("+y")
         server.initial_camera.position, server.initial_camera.look_at = tuple(camera.position), tuple(camera.target)
         server.initial_camera.fov = math.radians(camera.fov)

@@ -25,6 +25,8 @@ SHAPES = {shape.__name__: shape for shape in (HalfSpace, Sphere, Box, Capsule, M
 def describe_scene(scene, marks: ConnectionMarks) -> dict:
     """Return what the view needs of a scene, as plain data for `MirrorScene`. marks: of its connections and pressures."""
     return {
+        "gravity": np.asarray(scene.gravity),
+        "connected": [list(one.owners) for one in scene.connections],
         "attached": marks.attached,
         "pressed": [{"corners": corners, "longest": longest} for corners, longest in marks.pressed],
         "bodies": [
@@ -36,6 +38,7 @@ def describe_scene(scene, marks: ConnectionMarks) -> dict:
                 "corners": np.asarray(body.mesh.surface),
                 "skin": body.riding_skin and _describe_skin(body.riding_skin),
                 "fixed": [c.nodes for c in scene.constraints(body) if c.path is None],
+                "prescribed": [c.nodes for c in scene.constraints(body) if c.path is not None],
                 "loaded": [t.triangles for t in body.tractions],
             }
             for body in scene.bodies
@@ -64,6 +67,10 @@ def _mirror_skin(skin: dict) -> SimpleNamespace:
     return SimpleNamespace(surface=surface, weights=weights)
 
 
+def _not_known(_t: float) -> None:
+    """The path of prescribed nodes, which stays in the other process."""
+
+
 class MirrorScene:
     """A scene from its description: `bodies` with what is drawn of them, and `obstacles`, whose paths give the latest poses."""
 
@@ -77,11 +84,17 @@ class MirrorScene:
                 nodes=SimpleNamespace(surface=b["surface"]),
                 mesh=SimpleNamespace(surface=b["corners"]),
                 riding_skin=b["skin"] and _mirror_skin(b["skin"]),
-                constraints=[SimpleNamespace(path=None, nodes=nodes) for nodes in b["fixed"]],
+                constraints=[
+                    SimpleNamespace(path=path, nodes=nodes)
+                    for path, key in ((None, "fixed"), (_not_known, "prescribed"))
+                    for nodes in b[key]
+                ],
                 tractions=[SimpleNamespace(path=None, triangles=t, value=np.zeros(3)) for t in b["loaded"]],
             )
             for b in description["bodies"]
         ]
+        self.gravity = description["gravity"]
+        self.connections = [SimpleNamespace(owners=owners) for owners in description["connected"]]
         self.poses = {o["name"]: o["pose"] for o in description["obstacles"] if o["pose"] is not None}
         self.obstacles = [
             Obstacle(
@@ -94,7 +107,7 @@ class MirrorScene:
 
     @staticmethod
     def constraints(body: SimpleNamespace) -> list:
-        """Return the constraints of a body that are drawn."""
+        """Return the constraints of a body."""
         return body.constraints
 
 

@@ -10,7 +10,7 @@ from taisoft.errors import OutputError
 from taisoft.files import write_bytes
 from taisoft.output.camera import start_positions
 from taisoft.output.frames import FRAMES_NAME, png_bytes
-from taisoft.view.colouring import TITLES, UNITS, checked_colour
+from taisoft.view.colouring import checked_colour
 from taisoft.view.offscreen import Offscreen, checked_size
 
 SIZE = (640, 360)  # of pictures in notebooks [pixels]
@@ -45,8 +45,8 @@ def _html(sim, colour: str, thing) -> str | None:
     if sum(body.n_nodes for body in sim.scene.bodies) > MAX_NODES:
         return None
     drawing = Offscreen(sim.scene, SIZE, colour=colour)
-    png, (kind, _, span) = png_bytes(drawing.image(sim), COMPRESSION), drawing.colouring.scale
-    scale = f"; {TITLES[kind]}, red: {span:g} {UNITS[kind]} or more" if kind != "body" else ""
+    png = png_bytes(drawing.image(sim), COMPRESSION)
+    scale = f"; {drawing.colouring.scale_text}" if colour != "body" else ""
     return f'<img src="{_data_url(png)}" width="{SIZE[0]}" height="{SIZE[1]}"/>{caption(repr(thing) + scale)}'
 
 
@@ -78,6 +78,7 @@ class Film:
         self.size, self.colour = checked_size(size), checked_colour(colour)
         self.times: list[float] = []  #: of the pictures [s]
         self.pngs: list[bytes] = []  #: the pictures
+        self.scales: list[str] = []  #: what red means in each of them, empty for own colours and pictures from a disk
         self._drawing: Offscreen | None = None
         self._scene = None
 
@@ -98,7 +99,7 @@ class Film:
             film.pngs = [path.read_bytes() for path in paths]
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise OutputError(f"{folder}: the run cannot be read: {error}") from None
-        film.times = [int(path.stem) / fps for path in paths]
+        film.times, film.scales = [int(path.stem) / fps for path in paths], [""] * len(paths)
         return film
 
     def __call__(self, sim, _index: int = 0, _report=None) -> None:
@@ -106,6 +107,7 @@ class Film:
         if self._scene is not sim.scene:
             self._drawing, self._scene = Offscreen(sim.scene, self.size, colour=self.colour), sim.scene
         self.pngs.append(png_bytes(self._drawing.image(sim), COMPRESSION))
+        self.scales.append(self._drawing.colouring.scale_text)
         self.times.append(sim.time)
 
     def __len__(self) -> int:
@@ -118,7 +120,7 @@ class Film:
         """Return a page with the player. Raises OutputError if there is no picture."""
         if not self.pngs:
             raise OutputError("the film holds no picture: pass it to sim.run(seconds, on_frame=film)")
-        numbers = {"times": self.times, "pictures": [_data_url(png) for png in self.pngs]}
+        numbers = {"times": self.times, "scales": self.scales, "pictures": [_data_url(png) for png in self.pngs]}
         return PLAYER.replace("DATA", json.dumps(numbers))
 
     def save(self, path) -> None:
@@ -126,7 +128,7 @@ class Film:
         write_page(path, self.as_html())
 
     def _repr_html_(self) -> str | None:
-        return framed(self.as_html(), self.size[1] + 60) if self.pngs else None
+        return framed(self.as_html(), self.size[1] + 84) if self.pngs else None
 
 
 PLAYER = """<!DOCTYPE html>
@@ -135,13 +137,18 @@ body { margin: 0; font: 13px monospace; } img { display: block; max-width: 100%;
 div { display: flex; gap: 8px; align-items: center; padding: 4px; max-width: 640px; } input { flex: 1; }
 </style></head><body><img id="picture" alt="frame of the film">
 <div><button id="play" aria-label="play or pause">&#9654;</button>
-<input id="at" type="range" min="0" value="0"><span id="time"></span></div>
+<input id="at" type="range" min="0" value="0"><span id="time"></span></div><div id="scale"></div>
 <script>
 const film = DATA, n = film.pictures.length, last = film.times[n - 1], get = id => document.getElementById(id);
-const picture = get("picture"), play = get("play"), at = get("at"), time = get("time");
+const picture = get("picture"), play = get("play"), at = get("at"), time = get("time"), scale = get("scale");
 let start = null;  // time of the clock at which the film's first picture was due [ms], null while it stands
 at.max = n - 1;
-function show(k) { at.value = k; picture.src = film.pictures[k]; time.textContent = film.times[k].toFixed(3) + " s"; }
+function show(k) {
+  at.value = k;
+  picture.src = film.pictures[k];
+  time.textContent = film.times[k].toFixed(3) + " s";
+  scale.textContent = film.scales[k];
+}
 function stop() { start = null; play.textContent = "\\u25b6"; }
 function step(now) {
   if (start === null) return;

@@ -11,7 +11,7 @@ import numpy as np
 
 from taisoft.backend.runtime import open_kind, open_runtime
 from taisoft.errors import OutputError, value_text
-from taisoft.output.camera import Camera
+from taisoft.output.camera import MAX_WIDENING, Camera, framed_points
 from taisoft.view.colouring import background
 from taisoft.view.raster import Raster
 from taisoft.view.scene_view import IN_PICTURES, SceneView
@@ -100,6 +100,11 @@ class Offscreen(SceneView):
         finally:
             runtime.close()
         return picture
+
+    def look_from(self, scene, azimuth: float, elevation: float) -> None:
+        """Frame the scene's start from another direction [deg], as of `Camera`; the camera moves back as before."""
+        self.camera = Camera.framing(framed_points(scene), self.size, azimuth=azimuth, elevation=elevation)
+        self._widest = MAX_WIDENING * self.camera.distance
 
     def _triangles(self, x: np.ndarray, attributes: np.ndarray, lines: tuple) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return projected points, triangles and attributes: clipped surfaces, then lines as bands."""

@@ -34,7 +34,8 @@ class PictureOptions:
     """What pictures show, as plain data.
 
     size: width and height [pixels]; colour, layers: as for `Offscreen`; plots: names of those drawn; caption: the scene's name,
-    or None for no caption; bar: whether there is a colour bar, for a colour other than "body"; kept: what an earlier run kept.
+    or None for no caption; bar: whether there is a colour bar, for a colour other than "body"; kept: what an earlier run kept;
+    view: azimuth and elevation [deg], None for those of `Camera`.
     """
 
     size: tuple[int, int] = SIZE
@@ -44,6 +45,7 @@ class PictureOptions:
     caption: str | None = None
     bar: bool = False
     kept: dict = field(default_factory=dict)
+    view: tuple[float, float] | None = None
 
 
 def picture_writer(folder: Path, scene, options: PictureOptions, plots: PlotChoice | None, **drawn) -> FrameWriter:
@@ -52,6 +54,8 @@ def picture_writer(folder: Path, scene, options: PictureOptions, plots: PlotChoi
     plots: history of options.plots; drawn: values and marks, as for `Offscreen`. Raises OutputError.
     """
     drawing = Offscreen(scene, options.size, colour=options.colour, layers=tuple(options.layers), **drawn)
+    if options.view is not None:
+        drawing.look_from(scene, *options.view)
     drawing.resume(options.kept)
     annotate = None
     if options.plots or options.caption is not None or options.bar:

@@ -17,7 +17,7 @@ import numpy as np
 from taisoft.errors import OutputError
 from taisoft.mesh.topology import linked_groups, triangle_edges
 from taisoft.output.appearance import OBSTACLE_COLOUR, ObstacleSurface, ShownBodies, body_colour, obstacle_surfaces, subdivide
-from taisoft.output.camera import MAX_WIDENING, Camera, start_positions
+from taisoft.output.camera import MAX_WIDENING, Camera, framed_points, start_positions
 from taisoft.scene.loads import value_at
 from taisoft.scene.obstacles import HalfSpace
 from taisoft.view.colouring import Colouring, lit_colours
@@ -45,9 +45,9 @@ IMPULSE_COLOUR, TRACTION_COLOUR = np.array([0.85, 0.12, 0.12]), np.array([0.55, 
 class SceneView:
     """A scene as it is drawn: its surfaces, their colours, its layers, and a camera.
 
-    scene: read once; size: (width, height) in pixels; camera: fixed if given, else it frames all bodies at the start and moves
-    back, never nearer, when a body would leave the picture; colour: of the bodies, one of UNITS; layers: names of visible
-    LAYERS; values: as for `Colouring`; marks: as for `Layers`. Raises OutputError for unknown names.
+    scene: read once; size: (width, height) in pixels; camera: fixed if given, else it frames all bodies at the start, and where
+    they fall on a ground, and moves back, never nearer, when a body would leave the picture; colour: of the bodies, one of UNITS;
+    layers: names of visible LAYERS; values: as for `Colouring`; marks: as for `Layers`. Raises OutputError for unknown names.
     """
 
     def __init__(
@@ -60,7 +60,7 @@ class SceneView:
         values: Callable | None = None,
         marks=None,
     ):
-        self.camera = camera or Camera.framing(start_positions(scene), size)
+        self.camera = camera or Camera.framing(framed_points(scene), size)
         self._widest = 0.0 if camera else MAX_WIDENING * self.camera.distance  # largest automatic distance [m]; 0: fixed camera
         self.surfaces = Surfaces(scene)
         self.layers = Layers(scene, layers, marks)
