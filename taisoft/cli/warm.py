@@ -192,7 +192,7 @@ def structures() -> Iterator[Structure]:
     yield Structure("implicit_euler", **seesaw, stiffness_damping=True)
     yield Structure("implicit_euler", LAWS[1], obstacles=BOX)
     yield Structure("implicit_euler", orders=(2,), obstacles=PLANE, fixed=True, mass_damping=True, self_collision=True)
-    yield Structure("bdf2", orders=PAIR)
+    yield Structure("velocity_verlet", orders=PAIR)
     yield Structure("implicit_euler", obstacles=PLANE, fine=True)
     yield Structure("implicit_euler", obstacles=PLANE_AND_BOX, fine=True)
     yield Structure("implicit_euler", obstacles=BOX, thin=True, fine=True, mass_damping=True)
