@@ -1,7 +1,7 @@
 """The momentum of bodies, and the impulse law:
 
 * a body that moves uniformly has mass times velocity, for either order and rigid bodies, in explicit and implicit steps;
-* contact forces minus weight, times dt, add up to the change of momentum, also of steps that are cut into substeps.
+* contact forces minus weight, times dt, are the change of momentum of each step.
 """
 
 import numpy as np
@@ -36,9 +36,7 @@ def test_impulse_law(integrator, dt):
     body = scene.add_body(mesh, ts.Material(young=1e5), name="block", position=(0, 0.08, 0), velocity=(0.5, -3.0, 0.0))
     scene.add_obstacle(GROUND, name="ground")
     with ts.Simulator(scene, dt=dt, integrator=integrator, precision="f64") as sim:
-        result = sim.run(0.05, lambda sim, *_: rows.append((sim.momentum("block"), sim.contact_force("block"))), fps=None)
-        substeps = max(report.substeps for report in result.step_reports)
-    assert (substeps > 1) == (integrator == "implicit_euler")
+        sim.run(0.05, lambda sim, *_: rows.append((sim.momentum("block"), sim.contact_force("block"))), fps=None)
     momentum, force = np.array(rows).transpose(1, 0, 2)
     change, impulse = np.diff(momentum, axis=0), dt * (force[1:] + body.mass * scene.gravity)
     assert np.abs(change).max() > 0.1 * np.abs(momentum).max()
