@@ -22,7 +22,8 @@ ASSETS = Path(__file__).resolve().parent
 GAP = 4  # white pixels between two moments
 MAX_BYTES = 200_000  # of a picture; the repository keeps them
 
-# demo: moments [s], size of each picture, camera (target [m], distance [m], azimuth, elevation [deg]), colouring if not by body
+# demo: moments [s], size of each picture, camera (target [m], distance [m], azimuth, elevation [deg]), colouring if not by body,
+# layers if not those of pictures
 STRIPS = {
     "bunny_ears": ((0.0, 0.9, 1.1, 1.3, 2.0), (260, 360), ((0.1, 1.05, 0.0), 5.6, 32.0, 8.0)),
     "hanging_cloth": ((0.0, 0.2, 0.4, 0.7, 4.0), (260, 230), ((0.0, -0.45, -0.1), 3.2, 40.0, 16.0)),
@@ -40,6 +41,10 @@ STRIPS = {
     "gripper": ((0.0, 0.4, 1.6), (330, 260), ((0.0, 0.1, 0.0), 0.75, 15.0, 6.0)),
     "seesaw": ((0.0, 0.1, 0.2, 0.4, 0.6), (330, 260), ((0.05, 0.6, 0.0), 5.2, 12.0, 8.0)),
     "inflated_finger": ((0.0, 0.5, 1.0, 4.0), (330, 200), ((0.2, -0.02, 0.0), 0.75, 12.0, 8.0), "stress"),
+    "drop_test": ((0.0, 0.145, 0.16, 0.175, 0.24), (220, 300), ((0.0, 0.13, 0.0), 0.7, 28.0, 8.0), "stress"),
+    "foot_on_ground": ((0.0, 0.2, 0.5, 0.8, 1.2), (300, 220), ((0.0, 0.06, 0.0), 0.55, 20.0, 8.0), "stress", ()),
+    "thin_cloth": ((0.0, 0.1, 0.2, 0.3, 2.0), (280, 260), ((0.0, 0.22, 0.0), 0.75, 35.0, 8.0)),
+    "two_jellies": ((0.0, 0.05, 0.0666667, 0.1, 0.15), (300, 200), ((0.03, 0.0, 0.0), 0.5, 15.0, 14.0)),
     "layered_beam": ((0.0, 0.5, 3.0), (440, 130), ((1.2, -0.05, 0.0), 2.0, 0.0, 4.0), "stress"),
     "twisting_bar": ((0.0, 0.75, 1.5, 4.0), (330, 200), ((0.0, 0.0, 0.0), 6.6, 32.0, 20.0)),
 }
@@ -78,13 +83,15 @@ def film(
     return np.concatenate([part for picture in pictures for part in (gap, picture)][1:], axis=1), result
 
 
-def strip(scene_file: Path, moments: tuple, size: tuple[int, int], view: tuple, colour: str = "body") -> np.ndarray:
+def strip(
+    scene_file: Path, moments: tuple, size: tuple[int, int], view: tuple, colour: str = "body", layers=IN_PICTURES
+) -> np.ndarray:
     """The pictures of a scene at some times, uint8 (height, width, 3); its run ends with the last."""
     module = load_module(scene_file)
     settings = {name: value for name, value in module.solver.items() if name != "seconds"}
     fps = settings.pop("fps")
     with ts.Simulator(module.build(), **settings) as sim:
-        picture, result = film(sim, moments, size, view, moments[-1], fps, colour=colour)
+        picture, result = film(sim, moments, size, view, moments[-1], fps, layers, colour=colour)
     if result.status != "ok":
         raise SystemExit(f"{scene_file}: the run is {result.status}: {'; '.join(result.problems)}")
     return picture

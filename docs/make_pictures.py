@@ -1,9 +1,11 @@
-"""Draws the pictures of the tutorials: `python docs/make_pictures.py [NAME ...]` writes docs/pictures/NAME.png."""
+"""Draws pictures and plots of the manual: `python docs/make_pictures.py [NAME ...]` writes docs/pictures/NAME.png."""
 
 import sys
 from pathlib import Path
 
+import matplotlib.backends.backend_agg
 import numpy as np
+from matplotlib.figure import Figure
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / "assets")]
@@ -11,6 +13,7 @@ sys.path[:0] = [str(ROOT), str(ROOT / "assets")]
 from make_gallery import film  # noqa: E402
 
 import taisoft as ts  # noqa: E402
+from taisoft.cli.scene_file import load_shipped  # noqa: E402
 from taisoft.files import write_bytes  # noqa: E402
 from taisoft.output.frames import SMALLEST, png_bytes  # noqa: E402
 
@@ -56,7 +59,56 @@ def strip(scene, dt, moments, fps, size, view, colour="stress") -> np.ndarray:
     return picture
 
 
-PICTURES = {"drop": drop, "ring": ring, "identify": identify}
+def simulator(demo) -> ts.Simulator:
+    """A simulator of a demo's scene."""
+    return ts.Simulator(demo.build(), **{name: value for name, value in demo.solver.items() if name not in ("seconds", "fps")})
+
+
+def drawn(figure: Figure) -> np.ndarray:
+    """The pixels of a figure, uint8 (height, width, 3)."""
+    canvas = matplotlib.backends.backend_agg.FigureCanvasAgg(figure)
+    canvas.draw()
+    return np.asarray(canvas.buffer_rgba())[..., :3].copy()
+
+
+def drop_force() -> np.ndarray:
+    demo = load_shipped("demos", "drop_test")
+    with simulator(demo) as sim:
+        t, force, momentum = demo.record(sim)
+        first, last, speed = demo.impact(t, force, momentum)
+    shown, fine = slice(first - 20, last + 40), np.linspace(-0.1, 1.3, 2000) * demo.CONTACT
+    figure = Figure((7.0, 3.2), dpi=100, layout="constrained")
+    axes = figure.subplots()
+    axes.plot(1e3 * (t - t[first])[shown], force[shown], color="tab:blue", label="sim.contact_force")
+    axes.plot(1e3 * fine, demo.closed_form(fine, speed), "--", color="black", linewidth=1, label="closed form")
+    axes.set(xlabel="time since the impact [ms]", ylabel="contact force [N]", xlim=1e3 * fine[[0, -1]])
+    axes.legend()
+    return drawn(figure)
+
+
+def foot_forces() -> np.ndarray:
+    demo = load_shipped("demos", "foot_on_ground")
+    rows = []
+    with simulator(demo) as sim:
+        sim.run(demo.solver["seconds"], lambda sim, index, report: rows.append((sim.time, *sim.contact_force("sole"))), fps=None)
+        contacts, dt = sim.contacts(), sim.dt
+    t, friction, normal, _ = np.array(rows).T
+    figure = Figure((8.0, 3.2), dpi=100, layout="constrained")
+    over_time, ground = figure.subplots(1, 2, width_ratios=(1.3, 1.0))
+    over_time.plot(t, normal, label="normal force")
+    over_time.plot(t, friction, label="friction")
+    over_time.plot(t, demo.FRICTION * normal, ":", color="gray", label="its limit")
+    over_time.set(xlabel="time [s]", ylabel="force on the sole [N]")
+    over_time.legend()
+    pressed = (contacts.impulse * contacts.normal).sum(axis=1) / dt
+    x, z = 1e3 * contacts.point[:, 0], 1e3 * contacts.point[:, 2]
+    dots = ground.scatter(x, z, 120, pressed, cmap="viridis", edgecolor="gray")
+    ground.set(xlabel="x [mm]", ylabel="z [mm]", aspect="equal", title="contacts at the end")
+    figure.colorbar(dots, label="normal force [N]")
+    return drawn(figure)
+
+
+PICTURES = {"drop": drop, "ring": ring, "identify": identify, "drop_force": drop_force, "foot_forces": foot_forces}
 
 
 def main(names: list[str]) -> None:

@@ -8,7 +8,7 @@ from taisoft.backend import runtime
 from taisoft.backend.arrays import upload
 from taisoft.dynamics.drag_spring import Drag
 from taisoft.errors import SceneError, SimulationError
-from taisoft.fem.reference import gravity_mass
+from taisoft.fem.reference import gravity_mass, lumped_mass
 from taisoft.fem.terms import elasticity
 from taisoft.records import Energies, ErrorEstimate
 from taisoft.scene.body import Body
@@ -44,6 +44,13 @@ def positions(self: "Simulator", body: str | None = None) -> np.ndarray:
 def velocities(self: "Simulator", body: str | None = None) -> np.ndarray:
     """Return a float64 copy of the node velocities (n_nodes, 3) [m/s]; body: as for `positions`."""
     return self._open().state.state()[1][nodes_of(self, body)].astype(np.float64)
+
+
+def momentum(self: "Simulator", body: str | None = None) -> np.ndarray:
+    """Return the momentum (3,) of a body [N s]; without a name, of all bodies. Raises SceneError."""
+    mass = lumped_mass if self.settings.explicit else gravity_mass  # row sums of the mass matrix of the steps
+    bodies = self.scene.bodies if body is None else [self.scene.body(body)]
+    return sum((mass(one) @ self.velocities(one.name) for one in bodies), np.zeros(3))
 
 
 def energies(self: "Simulator") -> Energies:

@@ -140,6 +140,7 @@ class Simulator(Guarded):
     step_count = property(queries.step_count)
     positions = queries.positions
     velocities = queries.velocities
+    momentum = queries.momentum
     energies = queries.energies
     reactions = queries.reactions
     joint_force = queries.joint_force

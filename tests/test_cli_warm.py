@@ -70,7 +70,10 @@ def is_thin(body) -> bool:
 
 @pytest.fixture(scope="module")
 def covered() -> set:
-    return {key(build(one), one.integrator, precision="f64" if one.double else "f32") for one in structures()}
+    return {
+        key(build(one), one.integrator, precision="f64" if one.double else "f32", self_collision=one.self_collision)
+        for one in structures()
+    }
 
 
 @pytest.mark.parametrize("name", shipped_files("demos"))

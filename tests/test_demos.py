@@ -22,7 +22,7 @@ from taisoft.simulator import Simulator
 
 DEMOS = shipped_files("demos")
 LINE = 100  # maximum number of characters, for `taisoft list`
-NEVER_CROSS = ("sheet_and_cube", "sheet_on_box")
+NEVER_CROSS = ("sheet_and_cube", "sheet_on_box", "two_jellies")
 
 
 def stiffer(sim: Simulator) -> None:

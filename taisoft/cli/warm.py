@@ -64,7 +64,8 @@ def simulate(structure: "Structure", precision: str) -> None:
     """Take a few steps, and compute what a run with --out writes."""
     implicit = structure.integrator not in EXPLICIT
     dt, count = STEPS[not implicit]
-    with ts.Simulator(build(structure), dt=dt, integrator=structure.integrator, precision=precision) as sim:
+    settings = {"integrator": structure.integrator, "self_collision": structure.self_collision, "precision": precision}
+    with ts.Simulator(build(structure), dt=dt, **settings) as sim:
         while sim.step_count < count:
             sim.advance(count - sim.step_count)
         if implicit:
@@ -103,7 +104,8 @@ class Structure:
     fixed, prescribed: some nodes are fixed, or follow a path; loaded: forces on nodes; pressed: a surface is under pressure;
     tied: a tendon pulls; attached: the second body to the first, exactly; rigid: the first body; skinned: the last body has a
     skin that is touched; by_tet: elasticity by tet; thin: tets so flat that strains are computed in f64; fine: a surface of more
-    than 1,500 triangles, searched by parallel loops; double: a simulation in f64 unless --precision is given.
+    than 1,500 triangles, searched by parallel loops; double: a simulation in f64 unless --precision is given; self_collision:
+    bodies touch themselves.
     """
 
     integrator: str
@@ -125,6 +127,7 @@ class Structure:
     thin: bool = False
     fine: bool = False
     double: bool = False
+    self_collision: bool = False
     contacts: bool = True  # whether contact forces are modelled
 
     def __str__(self) -> str:
@@ -183,8 +186,13 @@ def structures() -> Iterator[Structure]:
         yield Structure("implicit_euler", **features, mass_damping=True, double=True)
     yield Structure("implicit_euler", rigid=True, law=LAWS[0], obstacles=PLANE)
     yield Structure("implicit_euler", orders=PAIR, rigid=True, obstacles=PLANE)
+    foot = {"orders": PAIR, "rigid": True, "obstacles": PLANE, "prescribed": True, "loaded": True, "attached": True}
+    yield Structure("implicit_euler", **foot, mass_damping=True)
     seesaw = {"orders": (1, 2), "obstacles": PLANE, "rigid": True, "skinned": True, "fine": True}
     yield Structure("implicit_euler", **seesaw, stiffness_damping=True)
+    yield Structure("implicit_euler", LAWS[1], obstacles=BOX)
+    yield Structure("implicit_euler", orders=(2,), obstacles=PLANE, fixed=True, mass_damping=True, self_collision=True)
+    yield Structure("velocity_verlet", orders=PAIR)
     yield Structure("implicit_euler", obstacles=PLANE, fine=True)
     yield Structure("implicit_euler", obstacles=PLANE_AND_BOX, fine=True)
     yield Structure("implicit_euler", obstacles=BOX, thin=True, fine=True, mass_damping=True)
@@ -238,6 +246,8 @@ def _add_conditions(body, structure: Structure) -> None:
     if structure.rigid:
         if structure.prescribed:
             body.move(KeyFrames([0.0, 1.0], [(0.0, 0.0, 0.0), (0.1 * SIZE, 0.0, 0.0)], release=True))
+        if structure.loaded:
+            body.add_force(None, (0.0, -1.0, 0.0))
         return
     side = float(np.abs(body.rest_positions[:, 0]).max()) - 1e-6
     if structure.fixed:
