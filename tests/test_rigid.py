@@ -256,6 +256,53 @@ def test_a_spring_joins_two_weightless_bodies():
         assert closer == pytest.approx(0.1 * (1 - np.cos(frequency * sim.time)), rel=2e-3)
 
 
+def drop(integrator: str, dt: float, mesh: ts.TetMesh, restitution: float = 0.0, height: float = 0.2):
+    """Largest upward speed after the impact, over that of the impact, and the root of the rise over the fall."""
+    scene = ts.Scene()
+    scene.add_rigid_body(mesh, name="body", position=(0, height - mesh.vertices[:, 1].min(), 0), restitution=restitution)
+    scene.add_obstacle(GROUND, restitution=restitution)
+    fallen, speed = np.sqrt(2.0 * height / G), np.sqrt(2.0 * height * G)
+    seconds = fallen * (1.1 + restitution)
+    with ts.Simulator(scene, dt=dt, integrator=integrator, precision="f64") as sim:
+        heights, speeds = [], []
+        for _ in range(round(seconds / dt)):
+            sim.step()
+            heights.append(sim.pose("body").translation[1])
+            speeds.append(sim.twist("body").velocity[1])
+        assert sim.rigid_strain("body") < 1e-4
+    lowest = int(np.argmin(speeds))
+    assert min(speeds) < -0.9 * speed  # it hit the ground
+    rise = np.max(heights[lowest + 2 :]) - np.min(heights[lowest:])
+    return max(speeds[lowest:]) / speed, np.sqrt(max(rise, 0.0) / height)
+
+
+CUBE = ts.box_mesh(cells=(1, 1, 1), size=(0.5, 0.5, 0.5))
+INTEGRATORS_WITH_CONTACTS = ("symplectic_euler", "velocity_verlet", "linearly_implicit_euler", "implicit_euler", "bdf2")
+
+
+@pytest.mark.parametrize("dt", [1 / 120, 1 / 480, 1 / 2000])
+@pytest.mark.parametrize("integrator", INTEGRATORS_WITH_CONTACTS)
+def test_without_restitution_a_body_does_not_rebound(integrator, dt):
+    assert drop(integrator, dt, CUBE)[0] < 0.01
+
+
+def turned_box(size: tuple, angle: float) -> ts.TetMesh:
+    mesh, c, s = box(size), np.cos(angle), np.sin(angle)
+    return ts.TetMesh(mesh.vertices @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]]), mesh.tets)
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS_WITH_CONTACTS)
+@pytest.mark.parametrize("mesh", [ts.ball_mesh(radius=0.25, cells=2), turned_box((1.0, 0.1, 0.3), 0.3), box((0.05, 1.0, 0.05))])
+def test_other_shapes_do_not_rebound_either(integrator, mesh):
+    assert drop(integrator, 1 / 480, mesh)[0] < 0.01
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS_WITH_CONTACTS)
+@pytest.mark.parametrize("restitution", [0.5, 0.8])
+def test_a_body_rises_to_the_square_of_the_restitution(integrator, restitution):
+    assert drop(integrator, 1 / 480, CUBE, restitution)[1] == pytest.approx(restitution, abs=0.02)
+
+
 def test_explicit_steps_carry_a_rigid_body_on_the_ground():
     scene = ts.Scene()
     scene.add_rigid_body(box(), name="box", position=(0, 0.301, 0))

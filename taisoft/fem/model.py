@@ -22,6 +22,7 @@ from taisoft.fem.mean_dilatation import MeanDilatation, build_mean_dilatation
 from taisoft.fem.node_graph import NodeGraph
 from taisoft.fem.pattern import MATRIX_BLOCKS, model_graph
 from taisoft.fem.pressure import PressureTable, build_pressures
+from taisoft.fem.rigid_tets import RigidTets, build_rigid_tets
 from taisoft.fem.spring_table import SpringTable
 from taisoft.fem.state import State, build_state
 from taisoft.fem.terms import terms_of
@@ -101,6 +102,7 @@ class Model:
     loads: Any  # (n_nodes) 3-vectors [N], or None: tractions and forces
     amplitudes: Any  # f64, or None: present values of the loads that are one number, see `fem.loads.scalar_loads`
     pressure: PressureTable | None
+    rigid_tets: RigidTets | None  # to be damped
     node_body: Any  # (n_nodes) i32; None unless damping needs it
     damping: Any  # (n_bodies, 2), or None: mass damping [1/s], stiffness damping [s]
     consistent: bool  # mass_matrix is used
@@ -293,6 +295,7 @@ def build_model(scene: Scene, runtime: Runtime, arena: FieldArena, on: dict[str,
     weight = mass = arena.field("mass", real, n_nodes, reference.lumped_masses(scene, dependents).astype(npr))
     if on["consistent_weight"]:
         weight = arena.field("gravity_mass", real, n_nodes, reference.gravity_masses(scene, dependents).astype(npr))
+    rigid_tets = build_rigid_tets(scene, layout.node_start, dependents, arena) if on["rigid_damping"] else None
     model = Model(
         real=real,
         strain_real=strain_real,
@@ -301,7 +304,7 @@ def build_model(scene: Scene, runtime: Runtime, arena: FieldArena, on: dict[str,
         n_nodes=n_nodes,
         n_blocks=n_blocks,
         groups=groups,
-        terms=terms_of(on),
+        terms=terms_of(on | {"rigid_damping": rigid_tets is not None}),
         state=build_state(arena, runtime, layout.rest, velocity, 3 * len(flat_nodes), chunks),
         nodes=arena.field("nodes", ti.i32, len(flat_nodes), flat_nodes.astype(np.int32)),
         rules=rules,
@@ -322,6 +325,7 @@ def build_model(scene: Scene, runtime: Runtime, arena: FieldArena, on: dict[str,
         loads=arena.vectors("loads", real, n_nodes, scene_loads.at(0.0).astype(npr)) if on["loads"] else None,
         amplitudes=arena.field("amplitudes", ti.f64, n_amplitudes, scene_loads.amplitudes([0.0])[0]) if n_amplitudes else None,
         pressure=None,
+        rigid_tets=rigid_tets,
         node_body=arena.field("node_body", ti.i32, n_nodes, node_body) if damped else None,
         damping=arena.field("damping", real, (n_bodies, 2), damping_table(scene).astype(npr)) if damped else None,
         consistent=on["consistent_mass"],

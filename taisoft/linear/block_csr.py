@@ -16,10 +16,10 @@ import taichi as ti
 from taisoft.backend.arrays import Count, FieldArena, download
 from taisoft.backend.runtime import kernel
 from taisoft.errors import SimulationError
+from taisoft.fem import rigid_tets, springs
 from taisoft.fem.model import Model
 from taisoft.fem.node_graph import BLOCKS, EDGES, block_of, count_of, edge_of, n_nodes_of, node_of
 from taisoft.fem.pattern import MATRIX_BLOCKS, model_graph
-from taisoft.fem.springs import set_pair_entries
 from taisoft.fem.terms import rayleigh_damping
 from taisoft.fem.terms.elasticity import prepare_terms
 from taisoft.linear.element_blocks import element_blocks, pair_terms
@@ -68,7 +68,9 @@ def build_block_csr(model: Model, arena: FieldArena, prefix: str = "stiffness") 
         raise SimulationError(f"{int(model.volume.shape[0]) * model.lanes} tets are too many to assemble a stiffness matrix")
     n_edges, rules = len(graph.ends), {}
     if model.springs is not None:
-        set_pair_entries(model.springs, graph)
+        springs.set_pair_entries(model.springs, graph)
+    if model.rigid_tets is not None:
+        rigid_tets.set_pair_entries(model.rigid_tets, graph)
 
     def copied(name: str, data: np.ndarray, dtype=ti.i32):
         return arena.field(f"{prefix}_{name}", dtype, data.shape, data)

@@ -109,6 +109,12 @@ def make_plan(scene: Scene, explicit: bool, multistep: bool, self_collision: boo
     plan.add("dependent_nodes", exact or embedded, _shorten(exact + embedded), why_not)
     rigid = [body.name for body in scene.rigid_bodies]
     plan.add("rigid_bodies", rigid, _shorten(rigid), "every body is elastic")
+    plan.add(
+        "rigid_damping",
+        rigid and not explicit and scene.pushes(self_collision),
+        f"implicit steps damp the strains that impacts leave in {_shorten(rigid)}",
+        "no impact strains a rigid body" if not (rigid and explicit) else "explicit steps keep rigid bodies rigid",
+    )
     damped = [one.name for one in scene.connections if one.damping > 0.0]
     plan.add("spring_damping", damped, _shorten(damped), "no spring or attachment is damped")
     plan.add("assembled_stiffness", not explicit, "implicit steps solve linear systems", "explicit steps need forces only")

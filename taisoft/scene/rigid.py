@@ -142,6 +142,12 @@ class RigidBody(Body):
         return self._young
 
     @property
+    def lowest_frequency(self) -> float:
+        """Lowest angular frequency [rad/s] of a strain of the body: that along its longest axis."""
+        arms = self.mesh.vertices - self.centre
+        return float(np.sqrt(self._young / self._density / np.linalg.eigvalsh(arms.T @ arms / FRAME)[-1]))
+
+    @property
     def density(self) -> float:
         """Density [kg/m^3]."""
         return self._density

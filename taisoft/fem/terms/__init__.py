@@ -15,9 +15,9 @@ integrators treat them differently: `rayleigh_damping` holds their rates and for
 over a step and is therefore applied as a dead load (`dynamics.drag_spring`).
 """
 
-from taisoft.fem.terms import dead_loads, elasticity, gravity, pressure, springs
+from taisoft.fem.terms import dead_loads, elasticity, gravity, pressure, rigid_damping, springs
 
-TERMS = (elasticity, springs, gravity, dead_loads, pressure)
+TERMS = (elasticity, springs, rigid_damping, gravity, dead_loads, pressure)
 
 
 def terms_of(on: dict[str, bool]) -> tuple:
