@@ -102,7 +102,7 @@ class Model:
     loads: Any  # (n_nodes) 3-vectors [N], or None: tractions and forces
     amplitudes: Any  # f64, or None: present values of the loads that are one number, see `fem.loads.scalar_loads`
     pressure: PressureTable | None
-    rigid_tets: RigidTets | None  # to be damped
+    rigid_tets: RigidTets | None  # to be damped, or moved as rigid bodies
     node_body: Any  # (n_nodes) i32; None unless damping needs it
     damping: Any  # (n_bodies, 2), or None: mass damping [1/s], stiffness damping [s]
     consistent: bool  # mass_matrix is used
@@ -129,6 +129,11 @@ class Model:
     def depends_on_velocity(self) -> bool:
         """Whether forces other than mass damping depend on velocities."""
         return self.stiffness_damping or self.spring_damping
+
+    @property
+    def has_rigid_tets(self) -> bool:
+        """Whether rigid bodies are damped or moved apart from others."""
+        return self.rigid_tets is not None
 
     @property
     def has_pressure(self) -> bool:
@@ -295,7 +300,9 @@ def build_model(scene: Scene, runtime: Runtime, arena: FieldArena, on: dict[str,
     weight = mass = arena.field("mass", real, n_nodes, reference.lumped_masses(scene, dependents).astype(npr))
     if on["consistent_weight"]:
         weight = arena.field("gravity_mass", real, n_nodes, reference.gravity_masses(scene, dependents).astype(npr))
-    rigid_tets = build_rigid_tets(scene, layout.node_start, dependents, arena) if on["rigid_damping"] else None
+    rigid_tets = None
+    if on["rigid_damping"] or on["rigid_motion"]:
+        rigid_tets = build_rigid_tets(scene, layout.node_start, dependents, arena)
     model = Model(
         real=real,
         strain_real=strain_real,
@@ -304,7 +311,7 @@ def build_model(scene: Scene, runtime: Runtime, arena: FieldArena, on: dict[str,
         n_nodes=n_nodes,
         n_blocks=n_blocks,
         groups=groups,
-        terms=terms_of(on | {"rigid_damping": rigid_tets is not None}),
+        terms=terms_of(on | {"rigid_damping": on["rigid_damping"] and rigid_tets is not None}),
         state=build_state(arena, runtime, layout.rest, velocity, 3 * len(flat_nodes), chunks),
         nodes=arena.field("nodes", ti.i32, len(flat_nodes), flat_nodes.astype(np.int32)),
         rules=rules,

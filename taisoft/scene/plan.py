@@ -113,8 +113,10 @@ def make_plan(scene: Scene, explicit: bool, multistep: bool, self_collision: boo
         "rigid_damping",
         rigid and not explicit and scene.pushes(self_collision),
         f"implicit steps damp the strains that impacts leave in {_shorten(rigid)}",
-        "no impact strains a rigid body" if not (rigid and explicit) else "explicit steps keep rigid bodies rigid",
+        "explicit steps store no strain" if rigid and explicit else "no impact strains a rigid body",
     )
+    why_not = "implicit steps keep rigid bodies rigid by elasticity" if rigid else "every body is elastic"
+    plan.add("rigid_motion", rigid and explicit, f"explicit steps move {_shorten(rigid)} as rigid bodies", why_not)
     damped = [one.name for one in scene.connections if one.damping > 0.0]
     plan.add("spring_damping", damped, _shorten(damped), "no spring or attachment is damped")
     plan.add("assembled_stiffness", not explicit, "implicit steps solve linear systems", "explicit steps need forces only")
