@@ -159,9 +159,9 @@ def _verlet_matrix(z: float, alpha: float, beta: float) -> np.ndarray:
 def stable_dt(scene: Scene, verlet: bool) -> float:
     """Largest stable step [s] of an explicit integrator about the rest shape; infinite if nothing can vibrate.
 
-    Rigid bodies have no frequency of their own. It is 2/omega_max without damping, else the dt at which an eigenvalue of the step matrix leaves the unit disk. Springs add
-    their own largest omega^2 and damping rate to those of the bodies that they connect, and nodes attached exactly multiply omega
-    by `DependentTable.growth`, which are upper bounds.
+    It is 2/omega_max without damping, else the dt at which an eigenvalue of the step matrix leaves the unit disk. Rigid bodies
+    have no omega of their own. Springs add their own largest omega^2 and damping rate to those of the bodies that they connect,
+    and nodes attached exactly multiply omega by `DependentTable.growth`, which are upper bounds.
     """
     limit = np.inf
     connected = {owner for one in scene.connections for owner in one.owners}

@@ -1,17 +1,17 @@
 """Contact problems of explicit steps with rigid bodies: W = J Z Z^T J^T, Z the motions that impulses cause, scaled by M^-1/2.
 
 A node of a soft body moves alone, by M_i^-1 of its impulse. The nodes of a rigid body move together: with B (12, 6) its rigid
-motions at x_n, those of its free axes, Z is B (B^T M B)^-1/2. W is assembled on the host as a matrix for the solvers of `contact`.
+motions at x_n, those of its free axes, Z is B (B^T M B)^-1/2. W is assembled on the host, for the solvers of `contact`.
 Weakness: the assembly, a product of sparse matrices, takes longer than the solve of a few contacts.
 """
 
 import numpy as np
 import scipy.sparse as sp
 
-from taisoft.backend.arrays import FieldArena, download, upload
-from taisoft.contact.colouring import colour_greedy, matrix_graph, store
-from taisoft.contact.problem import ContactProblem, build_matrix_problem, fill_field, fill_matrix_problem
-from taisoft.contact.solve import SolveResult, solve
+from taisoft.backend.arrays import download, upload
+from taisoft.contact.matrix_contacts import MatrixContacts, jacobian
+from taisoft.contact.problem import ContactProblem
+from taisoft.contact.solve import SolveResult
 from taisoft.fem.model import Model
 from taisoft.scene.rigid import FRAME
 
@@ -24,26 +24,21 @@ class RigidContacts:
     def __init__(self, model: Model):
         self._model = model
         self._node = model.rigid_tets.node.to_numpy().astype(np.int64).reshape(-1, FRAME)
-        self._arena, self._problem = FieldArena(), None
+        self._contacts = MatrixContacts(model.serial)
 
     def solve(self, p: ContactProblem, method: str, tolerance: float, max_sweeps: int) -> SolveResult:
         """Replace the impulses of a problem over nodes, whose b is set, by the solution."""
         k = int(p.count[0])
-        W = self.delassus(p)
-        self._allocate(p, k, len(W.indices))
-        q, (b, r, friction) = self._problem, download([p.b, p.r, p.friction], k)
-        fill_matrix_problem(q, W, b.reshape(-1), friction)
-        fill_field(q.r, r)
-        if method == "coloured_gauss_seidel":
-            store(q, colour_greedy(matrix_graph(W)))
-        result = solve(q, method, tolerance, max_sweeps)
+        b, r, friction = download([p.b, p.r, p.friction], k)
         impulses = p.r.to_numpy()
-        impulses[:k] = q.r.to_numpy(k)
+        impulses[:k], result = self._contacts.solve(
+            self.delassus(p), b.reshape(-1), friction, r, method, tolerance, max_sweeps
+        )
         upload([(p.r, impulses)])
         return result
 
-    def delassus(self, p: ContactProblem) -> sp.bsr_matrix:
-        """W (3k, 3k) of the present contacts, blocks (3, 3)."""
+    def delassus(self, p: ContactProblem) -> sp.csr_matrix:
+        """W (3k, 3k) of the present contacts."""
         J = jacobian(p)
         mass, free, x = download([self._model.mass, self._model.free, self._model.state.x])
         scale = free / np.sqrt(mass.astype(np.float64))[:, None]
@@ -55,39 +50,16 @@ class RigidContacts:
         )
         B = sp.csr_matrix((B.reshape(-1), (rows.reshape(-1), columns.reshape(-1))), shape=(J.shape[1], MOTIONS * len(self._node)))
         Z = sp.hstack([J @ sp.diags(scale.reshape(-1)), J @ B]).tocsr()
-        W = (Z @ Z.T).tobsr((3, 3))
-        W.sort_indices()
-        return W
-
-    def _allocate(self, p: ContactProblem, k: int, blocks: int) -> None:
-        """Have a matrix problem for k contacts and so many blocks, with room to grow."""
-        q = self._problem
-        if q is None or q.capacity < k or q.column.shape[0] < blocks:
-            arena = FieldArena()
-            self._problem = build_matrix_problem(arena, 2 * k, 2 * blocks, p.serial)
-            self.release()
-            self._arena = arena
+        return (Z @ Z.T).tocsr()
 
     @property
     def field_bytes(self) -> dict[str, int]:
         """Bytes by name."""
-        return self._arena.bytes
+        return self._contacts.field_bytes
 
     def release(self) -> None:
         """Free the fields."""
-        self._arena.release()
-
-
-def jacobian(p: ContactProblem) -> sp.csr_matrix:
-    """J (3k, 3 n_nodes): velocities in the frames of the contacts from those of nodes."""
-    k = int(p.count[0])
-    node, arity, weight, normal, tangent = download([p.node, p.arity, p.weight, p.normal, p.tangent], k)
-    frame = np.stack([normal, tangent, np.cross(normal, tangent)], axis=1)
-    contact, place = np.nonzero(np.arange(node.shape[1]) < arity[:, None])
-    values = weight[contact, place][:, None, None] * frame[contact]
-    rows = np.broadcast_to((3 * contact[:, None] + np.arange(3))[:, :, None], values.shape)
-    columns = np.broadcast_to((3 * node[contact, place].astype(np.int64)[:, None] + np.arange(3))[:, None, :], values.shape)
-    return sp.csr_matrix((values.reshape(-1), (rows.reshape(-1), columns.reshape(-1))), shape=(3 * k, 3 * p.n_nodes))
+        self._contacts.release()
 
 
 def rigid_motions(mass: np.ndarray, free: np.ndarray, x: np.ndarray) -> np.ndarray:
