@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from taisoft.dynamics.stage_system import StageSystem
 
 LARGEST = 4_000_000  # unknowns times rows of W
-SWEEPS, OUTER = 100, 30  # of Gauss-Seidel, then outer iterations of the augmented Lagrangian
+SWEEPS, OUTER = 1000, 30  # of Gauss-Seidel, then outer iterations of the augmented Lagrangian
 
 
 class DirectSolver:
@@ -47,7 +47,7 @@ class DirectSolver:
         if not 0 < 9 * int(p.count[0]) * len(self._rows) <= LARGEST:
             return False
         if self._formed != system.n_formed:
-            self._formed = system.n_formed
+            self._formed, self._factor = -1, None
             self._free = (system.model.free.to_numpy()[self._rows] > 0.0).reshape(-1)
             self._factor = self._factorise(k, self._free)
             if self._factor is not None:
@@ -55,6 +55,7 @@ class DirectSolver:
                 self._J = (jacobian(p)[:, columns] @ sp.diags(self._free.astype(np.float64))).tocsr()
                 self._lifted = self._factor.solve(self._J.T.toarray())
                 self._W = sp.csr_matrix(self._J @ self._lifted)
+            self._formed = system.n_formed
         return self._factor is not None
 
     def set_factors(self, stage_contacts: "StageContacts") -> None:
