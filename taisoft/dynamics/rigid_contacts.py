@@ -31,9 +31,7 @@ class RigidContacts:
         k = int(p.count[0])
         b, r, friction = download([p.b, p.r, p.friction], k)
         impulses = p.r.to_numpy()
-        impulses[:k], result = self._contacts.solve(
-            self.delassus(p), b.reshape(-1), friction, r, method, tolerance, max_sweeps
-        )
+        impulses[:k], result = self._contacts.solve(self.delassus(p), b.reshape(-1), friction, r, method, tolerance, max_sweeps)
         upload([(p.r, impulses)])
         return result
 

@@ -3,9 +3,9 @@
 A sub-step first moves the nodes of a tet as if they were free, to x_n + dt v. Their momentum and their angular momentum L about
 their centre of mass are those that the body has. From them follow the velocity v_c and, with the moments of inertia I of the
 nodes, the spin: w = I(x_n)^-1 L, then w_m = I(R(w dt/2) x_n)^-1 L in the middle of the step. The body moves by v_c dt and turns
-by w_m dt, both exactly, and its nodes get the velocity of the rigid motion with the same momenta. That is the midpoint rule for the
-rotation: of second order, with momentum and angular momentum kept to rounding. (Krysl and Endres, "Explicit Newmark/Verlet
-algorithm for time integration of the rotational dynamics of rigid bodies", Int. J. Numer. Meth. Engng. 62, 2005.)
+by w_m dt, both exactly, and its nodes get the velocity of the rigid motion with the same momenta. That is the midpoint rule for
+the rotation: of second order, with momentum and angular momentum kept to rounding (Krysl and Endres, "Explicit Newmark/Verlet
+algorithm for time integration of the rotational dynamics of rigid bodies", Int. J. Numer. Meth. Engng. 62, 2005).
 A body turns about an axis only if its nodes are free in both directions across it.
 """
 

@@ -28,7 +28,7 @@ from taisoft.dynamics.contact_terms import (
     save_diagonal,
     update_impulses,
 )
-from taisoft.dynamics.direct import DirectSolver
+from taisoft.dynamics.direct import DirectSolver, can_solve_directly
 from taisoft.dynamics.linear_solver import LinearSolver
 from taisoft.dynamics.linearised import LONGEST, advance, begin_linearised, end_linearised
 from taisoft.dynamics.stage import (
@@ -122,8 +122,7 @@ class StageSystem:
         )
         self.rounding = RoundingFloor(model, eps)
         self.linear_solver = LinearSolver(model)
-        can_solve = model.has_rigid_tets and multipliers is None and model.free.host is not None
-        self._direct = DirectSolver(self) if can_solve else None
+        self._direct = DirectSolver(self) if multipliers is None and can_solve_directly(model) else None
         self.kind = ELASTIC_STAGE
         self.scale = 0.0  # that |r| is relative to, at its last evaluation
         self.r_scale = 1.0  # R over the r-factors

@@ -292,9 +292,9 @@ def unpacked(blocks: np.ndarray) -> np.ndarray:
     return blocks.reshape(-1, 3, 4)[:, :, :3].swapaxes(1, 2).astype(np.float64)
 
 
-def to_bsr(m: Model, A: BlockCsr) -> sp.bsr_matrix:
-    """Copy the matrix to the host, blocks (3, 3) float64 in ascending columns."""
-    start, column, value, diagonal = download([A.row_start, A.column, A.value, A.diagonal])
+def to_bsr(m: Model, A: BlockCsr, diagonal: Any = None) -> sp.bsr_matrix:
+    """Copy the matrix to the host, blocks (3, 3) float64 in ascending columns. diagonal: field of diagonal blocks; None: A's."""
+    start, column, value, diagonal = download([A.row_start, A.column, A.value, A.diagonal if diagonal is None else diagonal])
     start, off, diagonal = start.astype(np.int64), unpacked(value), unpacked(diagonal)
     shape = (3 * m.n_nodes, 3 * m.n_nodes)
     rows = np.arange(m.n_nodes)
