@@ -181,7 +181,8 @@ def structures() -> Iterator[Structure]:
     gripper = {"orders": (1, 2, 1), "rigid": True, "obstacles": PLANE, "prescribed": True, "tied": True, "attached": True}
     for features in (finger, gripper):
         yield Structure("implicit_euler", **features, mass_damping=True, double=True)
-    yield Structure("implicit_euler", rigid=True, law=LAWS[0], obstacles=PLANE)
+    for integrator in ("implicit_euler", "symplectic_euler"):
+        yield Structure(integrator, rigid=True, law=LAWS[0], obstacles=PLANE)
     yield Structure("implicit_euler", orders=PAIR, rigid=True, obstacles=PLANE)
     seesaw = {"orders": (1, 2), "obstacles": PLANE, "rigid": True, "skinned": True, "fine": True}
     yield Structure("implicit_euler", **seesaw, stiffness_damping=True)

@@ -4,9 +4,12 @@ import numpy as np
 import scipy.sparse as sp
 
 from taisoft.backend.arrays import FieldArena, download
+from taisoft.contact import augmented_lagrangian
 from taisoft.contact.colouring import colour_greedy, matrix_graph, store
 from taisoft.contact.problem import ContactProblem, build_matrix_problem, fill_field, fill_matrix_problem
 from taisoft.contact.solve import SolveResult, solve
+
+OUTER = 30  # maximum iterations of the augmented Lagrangian
 
 
 class MatrixContacts:
@@ -19,7 +22,7 @@ class MatrixContacts:
     def solve(
         self, W: sp.csr_matrix, b: np.ndarray, friction: np.ndarray, r: np.ndarray, method: str, tolerance: float, sweeps: int
     ) -> tuple[np.ndarray, SolveResult]:
-        """Return impulses (k,3), from the start r (k,3), and the result.
+        """Return impulses (k,3), from the start r (k,3), and the result; use an augmented Lagrangian if sweeps do not suffice.
 
         W: (3k,3k); b: (3k,); friction: (k,); method, tolerance, sweeps: as in `contact.solve.solve`.
         """
@@ -35,7 +38,11 @@ class MatrixContacts:
         if method == "coloured_gauss_seidel":
             store(p, colour_greedy(matrix_graph(W)))
         result = solve(p, method, tolerance, sweeps)
-        return p.r.to_numpy(k), result
+        r = p.r.to_numpy(k)
+        if not result.converged:
+            r, history = augmented_lagrangian.solve(W.tocsr(), b, friction, r, tolerance, OUTER)
+            result = SolveResult(result.iterations + len(history) - 1, history[-1], history[-1] <= tolerance)
+        return r, result
 
     @property
     def field_bytes(self) -> dict[str, int]:

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 LARGEST_W = 4_000_000  # numbers in W
 WORK = 20_000_000  # maximum rows of W times numbers in the band of A: about 20 ms
-SWEEPS, OUTER = 1000, 30  # of Gauss-Seidel, then outer iterations of the augmented Lagrangian
+SWEEPS = 1000  # of Gauss-Seidel, before the augmented Lagrangian
 
 
 def can_solve_directly(m: Model) -> bool:
@@ -90,16 +90,12 @@ class DirectSolver:
         b = self._start_velocities(k, beta) - self._lifted.T @ residual
         friction, r = download([p.friction, p.r], n)
         r, found = self._contacts.solve(self._W, b, friction, r, "gauss_seidel", tolerance, SWEEPS)
-        iterations, converged = found.iterations, found.converged
-        if not converged:
-            r, history = augmented_lagrangian.solve(self._W, b, friction, r, tolerance, OUTER)
-            iterations, converged = iterations + len(history) - 1, history[-1] <= tolerance
         change = self._factor.solve(J.T @ r.reshape(-1) - residual)
         x, base, impulses = m.state.x.to_numpy(), k.x_linear.to_numpy(), p.r.to_numpy()
         x[self._nodes] = base[self._nodes] + beta * change.reshape(-1, 3)
         impulses[:n] = r
         upload([(m.state.x, x), (p.r, impulses)])
-        return iterations, converged, float(np.linalg.norm(self._matrix @ change + residual - J.T @ r.reshape(-1)))
+        return found.iterations, found.converged, float(np.linalg.norm(self._matrix @ change + residual - J.T @ r.reshape(-1)))
 
     def _start_velocities(self, k: "StageContacts", beta: float) -> np.ndarray:
         """u_0 (3k,), see `contact_terms.stage_velocity_of`."""
