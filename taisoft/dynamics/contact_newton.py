@@ -37,7 +37,7 @@ NEAR_FLOOR = 4.0  # times the floor of |r|: below it, |r| may be mostly rigid mo
 
 @dataclass(frozen=True)
 class FrictionalResult:
-    """Result of solving a linearised stage. negative: its matrix is indefinite."""
+    """Result of solving a linearised stage. negative: its matrix is indefinite; direct: only x and the impulses are set."""
 
     solves: int
     linear: int
@@ -45,6 +45,7 @@ class FrictionalResult:
     negative: bool
     converged: bool
     r: float
+    direct: bool = False
 
 
 def solve_linear(system: StageSystem, problem: Stage, r: float, scale: float) -> FrictionalResult:
@@ -55,7 +56,7 @@ def solve_linear(system: StageSystem, problem: Stage, r: float, scale: float) ->
         return FrictionalResult(1, 0, 0, True, False, r)
     if found is not None:
         iterations, converged, r = found
-        return FrictionalResult(1, 0, iterations, False, converged, r)
+        return FrictionalResult(1, 0, iterations, False, converged, r, direct=True)
     if not system.model.serial or PUBLIC:  # public Taichi takes no more than 64 arguments
         newton = Newton(system, problem)
         result = newton.run(r, scale, fresh=True)
@@ -231,7 +232,9 @@ def solve_linearised(system: StageSystem, stage: Stage) -> StageResult:
             break
         r, scale = system.end_linearised(accept=False)
         system.form_matrix(projected=True)
-    if system.model.has_dependents:  # linearised steps move only the nodes that they depend on
+    if found.direct:
+        system.end_linearised()
+    elif system.model.has_dependents:  # linearised steps move only the nodes that they depend on
         place_dependents(system.model)
     at_floor = found.r <= system.rounding.stage_floor(stage.c, stage.beta)
     return StageResult(

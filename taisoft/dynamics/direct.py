@@ -63,8 +63,7 @@ class DirectSolver:
             self._factor = self._factorise(stage_contacts)
             if self._factor is not None and rows * self._factor.factor.size <= WORK:
                 self._J = (jacobian(stage_contacts.problem)[:, self._columns] @ sp.diags(self._free)).tocsr()
-                self._lifted = self._factor.solve(self._J.T.toarray())
-                self._W = sp.csr_matrix(self._J @ self._lifted)
+                self._W = sp.csr_matrix(self._J @ self._factor.solve(self._J.T.toarray()))
             self._formed = self._system.n_formed
         return self._factor is not None and rows * self._factor.factor.size <= WORK
 
@@ -87,7 +86,7 @@ class DirectSolver:
         m, k = self._system.model, stage_contacts
         p, n = k.problem, int(k.problem.count[0])
         J, residual = self._J, self._free * download([k.residual_linear])[0].astype(np.float64)[self._nodes].reshape(-1)
-        b = self._start_velocities(k, beta) - self._lifted.T @ residual
+        b = self._start_velocities(k, beta) - J @ self._factor.solve(residual)
         friction, r = download([p.friction, p.r], n)
         r, found = self._contacts.solve(self._W, b, friction, r, "gauss_seidel", tolerance, SWEEPS)
         change = self._factor.solve(J.T @ r.reshape(-1) - residual)

@@ -10,9 +10,9 @@ A term is a module with
                       beta^2 K to the matrix A of implicit steps, and beta times its damping; elasticity's blocks are assembled
                       by `linear.block_csr` itself
     PREPARED          whether forces need prepare(m, k) for k < count(m), after every change of x or v and before `force`
-and is listed in TERMS, which explicit steps, Newton's method, statics and reports iterate over. Other dampers have no
-potential, and integrators treat them differently: `rayleigh_damping` holds their rates and forces. The drag spring of the window is constant
-over a step and is therefore applied as a dead load (`dynamics.drag_spring`).
+and is listed in TERMS, which explicit steps, Newton's method, statics and reports iterate over. Dampers have no potential, and
+integrators treat them differently: `rayleigh_damping` holds their rates and forces, and `rigid_damping` is a term of implicit
+steps. The drag spring of the window is constant over a step and is therefore applied as a dead load (`dynamics.drag_spring`).
 """
 
 from taisoft.fem.terms import dead_loads, elasticity, gravity, pressure, rigid_damping, springs
