@@ -21,6 +21,7 @@ from taisoft.scene.rigid import RigidBody
 from taisoft.scene.scene import Body, Scene
 
 MAX_WEIGHT_STRAIN = 0.5  # strain of a body under its own weight above which its scale is questioned
+SMALL = 1e-3  # of the frequency and damping rate of connections: a frequency that does not change the limit these set
 LANCZOS_MARGIN = 1.005  # Lanczos approaches the highest frequency from below; its tolerance is half this margin
 
 
@@ -158,9 +159,9 @@ def _verlet_matrix(z: float, alpha: float, beta: float) -> np.ndarray:
 def stable_dt(scene: Scene, verlet: bool) -> float:
     """Largest stable step [s] of an explicit integrator about the rest shape; infinite if nothing can vibrate.
 
-    It is 2/omega_max without damping, else the dt at which an eigenvalue of the step matrix leaves the unit disk. Springs add
-    their own largest omega^2 and damping rate to those of the bodies that they connect, and nodes attached exactly multiply omega
-    by `DependentTable.growth`, which are upper bounds.
+    It is 2/omega_max without damping, else the dt at which an eigenvalue of the step matrix leaves the unit disk. Rigid bodies
+    have no omega of their own. Springs add their own largest omega^2 and damping rate to those of the bodies that they connect,
+    and nodes attached exactly multiply omega by `DependentTable.growth`, which are upper bounds.
     """
     limit = np.inf
     connected = {owner for one in scene.connections for owner in one.owners}
@@ -169,7 +170,11 @@ def stable_dt(scene: Scene, verlet: bool) -> float:
     elastic = np.concatenate([np.arange(body.n_nodes) < body.nodes.n_elastic for body in scene.bodies])
     growth = 1.0 if dependents is None else dependents.growth(elastic)
     for body in scene.bodies:
-        omega, material, own_square, own_rate = highest_frequency(body), body.composition.first, 0.0, 0.0
+        material, own_square, own_rate = body.composition.first, 0.0, 0.0
+        if isinstance(body, RigidBody):  # explicit steps move it as one
+            omega = SMALL * (np.sqrt(square) + rate) if body.name in connected else 0.0
+        else:
+            omega = highest_frequency(body)
         if omega > 0.0:
             if body.name in connected:
                 omega, own_square, own_rate = growth * omega, square, rate

@@ -32,7 +32,7 @@ ORDER = (
     ("fem.state", "fem.math3", "fem.node_graph", "fem.chunks"),
     (
         *("fem.laws", "fem.lanes", "fem.dependents", "fem.reference", "fem.loads", "fem.springs", "fem.pressure"),
-        *("fem.mean_dilatation", "fem.spring_table"),
+        *("fem.mean_dilatation", "fem.spring_table", "fem.rigid_tets"),
     ),
     ("fem.terms",),
     ("fem.model", "fem.pattern"),

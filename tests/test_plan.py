@@ -42,6 +42,8 @@ def test_reasons():
         "springs": (False, "no spring, tendon or attachment by springs"),
         "dependent_nodes": (False, "no node is attached exactly, and no surface embedded"),
         "rigid_bodies": (False, "every body is elastic"),
+        "rigid_damping": (False, "no impact strains a rigid body"),
+        "rigid_motion": (False, "every body is elastic"),
         "spring_damping": (False, "no spring or attachment is damped"),
         "assembled_stiffness": (False, "explicit steps need forces only"),
         "past_states": (False, "a one-step integrator"),
@@ -70,6 +72,7 @@ def test_every_feature_can_be_on_and_off():
     full.add_rigid_body(cube((19, 0, 0)))
     on = make_plan(full, explicit=False, multistep=True, self_collision=True).on
     laws = {name for name in on if name.startswith("law:")}
+    on["rigid_motion"] |= make_plan(full, explicit=True, multistep=False).on["rigid_motion"]
     assert {name for name in on if not on[name]} < laws and {name for name in off if off[name]} < laws
 
 

@@ -7,6 +7,7 @@ import scipy.integrate
 from command import write
 
 import taisoft as ts
+from taisoft.fem.reference import lumped_mass
 from taisoft.mesh.solids import shell_tets
 from taisoft.output.frame_files import body_arrays
 from taisoft.output.nodal_fields import NodalMean
@@ -256,17 +257,136 @@ def test_a_spring_joins_two_weightless_bodies():
         assert closer == pytest.approx(0.1 * (1 - np.cos(frequency * sim.time)), rel=2e-3)
 
 
+def drop(integrator: str, dt: float, mesh: ts.TetMesh, restitution: float = 0.0, height: float = 0.2):
+    """Largest upward speed after the impact, over that of the impact, and the root of the rise over the fall."""
+    scene = ts.Scene()
+    scene.add_rigid_body(mesh, name="body", position=(0, height - mesh.vertices[:, 1].min(), 0), restitution=restitution)
+    scene.add_obstacle(GROUND, restitution=restitution)
+    fallen, speed = np.sqrt(2.0 * height / G), np.sqrt(2.0 * height * G)
+    seconds = fallen * (1.1 + restitution)
+    with ts.Simulator(scene, dt=dt, integrator=integrator, precision="f64") as sim:
+        heights, speeds = [], []
+        for _ in range(round(seconds / dt)):
+            sim.step()
+            heights.append(sim.pose("body").translation[1])
+            speeds.append(sim.twist("body").velocity[1])
+        assert sim.rigid_strain("body") < 1e-4
+    lowest = int(np.argmin(speeds))
+    assert min(speeds) < -0.9 * speed  # it hit the ground
+    rise = np.max(heights[lowest + 2 :]) - np.min(heights[lowest:])
+    return max(speeds[lowest:]) / speed, np.sqrt(max(rise, 0.0) / height)
+
+
+CUBE = ts.box_mesh(cells=(1, 1, 1), size=(0.5, 0.5, 0.5))
+INTEGRATORS_WITH_CONTACTS = ("symplectic_euler", "velocity_verlet", "linearly_implicit_euler", "implicit_euler", "bdf2")
+
+
+@pytest.mark.parametrize("dt", [1 / 120, 1 / 480, 1 / 2000])
+@pytest.mark.parametrize("integrator", INTEGRATORS_WITH_CONTACTS)
+def test_without_restitution_a_body_does_not_rebound(integrator, dt):
+    assert drop(integrator, dt, CUBE)[0] < 0.01
+
+
+def turned_box(size: tuple, angle: float) -> ts.TetMesh:
+    mesh, c, s = box(size), np.cos(angle), np.sin(angle)
+    return ts.TetMesh(mesh.vertices @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]]), mesh.tets)
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS_WITH_CONTACTS)
+@pytest.mark.parametrize("mesh", [ts.ball_mesh(radius=0.25, cells=2), turned_box((1.0, 0.1, 0.3), 0.3), box((0.05, 1.0, 0.05))])
+def test_other_shapes_do_not_rebound_either(integrator, mesh):
+    assert drop(integrator, 1 / 480, mesh)[0] < 0.01
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS_WITH_CONTACTS)
+@pytest.mark.parametrize("restitution", [0.5, 0.8])
+def test_a_body_rises_to_the_square_of_the_restitution(integrator, restitution):
+    assert drop(integrator, 1 / 480, CUBE, restitution)[1] == pytest.approx(restitution, abs=0.02)
+
+
 def test_explicit_steps_carry_a_rigid_body_on_the_ground():
     scene = ts.Scene()
     scene.add_rigid_body(box(), name="box", position=(0, 0.301, 0))
     scene.add_obstacle(GROUND)
-    limit = ts.Simulator(scene.snapshot(), dt=1e-5, integrator="symplectic_euler", allow_unstable=True)
-    with limit:
-        dt = 0.5 * limit.stable_dt
-    with ts.Simulator(scene, dt=dt, integrator="symplectic_euler", precision="f64") as sim:
+    with ts.Simulator(scene, dt=1 / 240, integrator="symplectic_euler", precision="f64") as sim:
+        assert sim.stable_dt == np.inf
         result = sim.run(seconds=0.3)
         assert result.status == "ok"
-        assert abs(sim.pose("box").translation[1]) < 5e-3 and sim.rigid_strain("box") < 1e-3
+        assert abs(sim.pose("box").translation[1]) < 5e-3 and sim.rigid_strain("box") < 1e-12
+
+
+@pytest.mark.parametrize("integrator", ["symplectic_euler", "velocity_verlet"])
+def test_explicit_steps_keep_the_angular_momentum_and_the_spin_of_a_top(integrator):
+    spin = 2 * np.pi * np.array([0.01, 1.0, 0.0])
+    scene = ts.Scene(gravity=(0, 0, 0))
+    body = scene.add_rigid_body(box(), density=500.0, name="top", angular_velocity=spin)
+    exact = euler_top(np.diag(body.inertia), spin, 5.0)
+    momentum, energy, flipped = body.inertia @ spin, 0.5 * spin @ body.inertia @ spin, 0.0
+    with ts.Simulator(scene, dt=1 / 800, integrator=integrator, precision="f64") as sim:
+        for _ in range(50):
+            sim.run(seconds=0.1)
+            y = exact(sim.time)
+            R, w = sim.pose("top").rotation, sim.twist("top").angular_velocity
+            assert np.abs(R - y[3:].reshape(3, 3)).max() < 0.02
+            assert np.allclose(R @ body.inertia @ R.T @ w, momentum, atol=1e-9 * np.linalg.norm(momentum))
+            assert 0.5 * w @ R @ body.inertia @ R.T @ w == pytest.approx(energy, rel=1e-4)
+            assert sim.rigid_strain("top") < 1e-12
+            flipped = min(flipped, R[1, 1])
+    assert flipped < -0.9
+
+
+def test_springs_between_rigid_bodies_limit_explicit_steps():
+    scene = ts.Scene(gravity=(0, 0, 0))
+    a, b = (scene.add_rigid_body(CUBE, name=name, position=(k, 0, 0)) for k, name in enumerate("ab"))
+    scene.add_spring(("a", (0.25, 0, 0)), ("b", (-0.25, 0, 0)), stiffness=1e5, rest_length=0.5)
+    scene.contact_forces = False
+    reduced = a.mass * b.mass / (a.mass + b.mass)
+    with ts.Simulator(scene, dt=1e-4, integrator="velocity_verlet", precision="f64") as sim:
+        assert 0.3 * 2.0 / np.sqrt(1e5 / reduced) < sim.stable_dt < 2.0 / np.sqrt(1e5 / reduced)
+
+
+@pytest.mark.parametrize("integrator", ["symplectic_euler", "velocity_verlet"])
+@pytest.mark.parametrize("axes", ["y", "xy", "xz"])
+def test_explicit_steps_keep_fixed_axes(integrator, axes):
+    scene = ts.Scene(gravity=(1.0, -2.0, 3.0))
+    scene.add_rigid_body(box(), name="body", angular_velocity=(0, 1.0, 0) if axes == "y" else (0, 0, 0)).fix(axes)
+    scene.contact_forces = False
+    with ts.Simulator(scene, dt=1e-3, integrator=integrator, precision="f64") as sim:
+        sim.run(seconds=0.5)
+        pose, twist, t = sim.pose("body"), sim.twist("body"), sim.time
+        free = np.array([axis not in axes for axis in "xyz"])
+        assert np.allclose(pose.translation, free * 0.5 * np.array([1.0, -2.0, 3.0]) * t**2, atol=3e-3)
+        assert np.abs(pose.translation[~free]).max() < 1e-12
+        assert twist.angular_velocity == pytest.approx([0, 1.0 if axes == "y" else 0.0, 0], abs=1e-9)
+        assert sim.rigid_strain("body") < 1e-12
+        weight = sim.scene.body("body").mass * np.array([1.0, -2.0, 3.0])
+        assert np.allclose(sim.reactions("body").sum(axis=0), -weight * ~free, atol=1e-6 * np.abs(weight).max())
+
+
+@pytest.mark.parametrize("integrator", ["symplectic_euler", "velocity_verlet"])
+def test_explicit_impacts_keep_momentum_and_angular_momentum(integrator):
+    scene = ts.Scene(gravity=(0, 0, 0))
+    scene.add_rigid_body(CUBE, name="a", velocity=(2, 0, 0), restitution=0.5)
+    scene.add_rigid_body(CUBE, density=300.0, name="b", position=(0.6, 0.2, 0.1))
+    scene.add_body(CUBE, ts.Material(young=1e5), name="soft", position=(1.2, 0, 0))
+    momentum = scene.bodies[0].mass * np.array([2.0, 0, 0])
+    with ts.Simulator(scene, dt=5e-4, integrator=integrator, precision="f64", contact_tolerance=1e-4) as sim:
+        masses = np.concatenate([np.full(body.n_nodes, 0.0) for body in sim.scene.bodies])
+        for body, first in zip(sim.scene.bodies, np.cumsum([0] + [body.n_nodes for body in sim.scene.bodies])):
+            own = np.full(4, 0.25 * body.mass) if body in sim.scene.rigid_bodies else lumped_mass(body)
+            masses[first : first + len(own)] = own
+
+        def total():
+            x, v = sim.positions(), sim.velocities()
+            return masses @ v, masses @ np.cross(x, v)
+
+        start = total()
+        assert sim.run(seconds=0.4).status == "ok"
+        end = total()
+        assert np.allclose(start[0], momentum, rtol=1e-9)
+        for before, after in zip(start, end):
+            assert np.allclose(before, after, atol=5e-4 * np.linalg.norm(momentum))  # friction acts across the gap
+        assert np.linalg.norm(sim.twist("b").angular_velocity) > 0.1 and np.abs(sim.velocities("soft")).max() > 0.1
 
 
 def test_a_hollow_body_is_not_overlapped_by_what_its_frame_alone_meets():

@@ -184,7 +184,8 @@ def structures() -> Iterator[Structure]:
     gripper = {"orders": (1, 2, 1), "rigid": True, "obstacles": PLANE, "prescribed": True, "tied": True, "attached": True}
     for features in (finger, gripper):
         yield Structure("implicit_euler", **features, mass_damping=True, double=True)
-    yield Structure("implicit_euler", rigid=True, law=LAWS[0], obstacles=PLANE)
+    for integrator in ("implicit_euler", "symplectic_euler"):
+        yield Structure(integrator, rigid=True, law=LAWS[0], obstacles=PLANE)
     yield Structure("implicit_euler", orders=PAIR, rigid=True, obstacles=PLANE)
     foot = {"orders": PAIR, "rigid": True, "obstacles": PLANE, "prescribed": True, "loaded": True, "attached": True}
     yield Structure("implicit_euler", **foot, mass_damping=True)

@@ -27,6 +27,7 @@ VANISHING = 1e-9  # a contact with smaller weights alone is rounding: its sides 
 # Of the contact offset: in an implicit step a smaller gap opens to it at once, before surfaces that turn can cross. In the far
 # shorter explicit steps that would be a hop.
 LEAST_GAP = 0.1
+STILL = 0.002  # of the contact offset: surfaces that approach less in a step are at rest
 SELF_CONTACT = 5.0  # factor of contact offset and correction rate in contacts of a body with itself: folds turn as they meet
 
 
@@ -301,14 +302,21 @@ def gap_minus_target(
 
 
 @kernel
-def has_impact(p: ti.template(), dt: ti.f64, contact_offset: ti.f64) -> ti.i32:
-    """Return 1 if a contact without impulse in the previous step closes within a step of dt, else 0."""
+def has_impact(p: ti.template(), rigid: ti.types.ndarray(), dt: ti.f64, contact_offset: ti.f64) -> ti.i32:
+    """Return 1 if a contact without impulse in the previous step closes within a step of dt, else 0.
+
+    rigid: (n_colliders) i32, 1 for rigid bodies. The gap to one may have closed to the contact offset in the previous step, which
+    stops the body in this one: an impulse then does not tell that the impact is over, only the approach does.
+    """
     found = 0
     ti.loop_config(serialize=True)
     for _ in range(1):
         for c in range(p.count[0]):
             closes = p.gap[c] - contact_offset_of(p, c, contact_offset) + dt * p.approach[c] < 0.0
-            if p.r[c][0] == 0.0 and p.approach[c] < 0.0 and closes:
+            stops = p.r[c][0] == 0.0 and p.approach[c] < 0.0
+            if rigid[p.body[c][0]] + rigid[p.body[c][1]] > 0:
+                stops = stops or dt * p.approach[c] < -STILL * contact_offset
+            if stops and closes:
                 found = 1
     return found
 

@@ -44,6 +44,7 @@ from taisoft.dynamics.contact_record import (
 from taisoft.dynamics.impact import Rebounds
 from taisoft.dynamics.simulation_state import SimulationState
 from taisoft.errors import SimulationError
+from taisoft.scene.rigid import RigidBody
 
 CONTACT_OFFSET = 2e-3  # of the finest body's mean surface edge: gap to keep, so that motion in curves seldom needs a repetition
 PENETRATION_CORRECTION = {True: 0.05, False: 0.2}  # fraction of a penetration that an explicit (True) or implicit step corrects
@@ -93,6 +94,7 @@ class ContactStep:
         self._step_dt = 0.0  # of the last step [s]
         self._impulse_fraction = 1.0
         self._own_sides: tuple[np.ndarray, np.ndarray] | None = None  # nodes of contacts before dependent ones were replaced
+        self._rigid = np.array([isinstance(one, RigidBody) for one in scene.colliders], dtype=np.int32)
         self.had_impact = False  # whether surfaces met in the last step
         self.dropped = 0  # triangles of the last step under an inverted tet, for which a distance field gives no contacts
 
@@ -234,7 +236,7 @@ class ContactStep:
 
     def detect_impact(self, dt: float) -> bool:
         """Return, and set `had_impact` to, whether surfaces without impulse so far meet in the step of dt that has begun."""
-        self.had_impact = bool(has_impact(self.problem, dt, self.contact_offset))
+        self.had_impact = bool(has_impact(self.problem, self._rigid, dt, self.contact_offset))
         return self.had_impact
 
     def detect_rebounds(self, dt: float) -> bool:

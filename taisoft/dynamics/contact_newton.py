@@ -10,6 +10,8 @@ leaves a residual on few nodes, these are solved separately first (`elimination`
 import math
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from taisoft.backend.launching import PUBLIC
 from taisoft.dynamics.elimination import eliminate
 from taisoft.dynamics.frictional import INDEFINITE, LINEAR, MAX_MULTIPLIERS, MULTIPLIERS, NORM, ROUNDING, SOLVED, STATUS
@@ -29,12 +31,13 @@ MULTIPLIER_FRACTION = 0.3  # of the required |r|, ends the steps under one multi
 LINEARISED_SOLVES, LINEARISED_FORCING = 400, 0.1  # maximum linear solves of a linearised stage, and their tolerance
 STALLED, STALLED_SOLVES = 0.9, 3  # fraction of |r| left by a stalling step; factor on SOLVES after that
 FALLBACK_STEPS = 6  # steps on the nonlinear stage
+DIRECT_FRACTION = 0.3  # of the tolerances: to what direct solves reduce the laws' residual, which |r| contains
 NEAR_FLOOR = 4.0  # times the floor of |r|: below it, |r| may be mostly rigid motion
 
 
 @dataclass(frozen=True)
 class FrictionalResult:
-    """Result of solving a linearised stage. negative: its matrix is indefinite."""
+    """Result of solving a linearised stage. negative: its matrix is indefinite; direct: only x and the impulses are set."""
 
     solves: int
     linear: int
@@ -42,10 +45,18 @@ class FrictionalResult:
     negative: bool
     converged: bool
     r: float
+    direct: bool = False
 
 
 def solve_linear(system: StageSystem, problem: Stage, r: float, scale: float) -> FrictionalResult:
-    """Solve a linearised stage from (|r|, scale); on one thread in one launch."""
+    """Solve a linearised stage from (|r|, scale): directly where that applies, else on one thread in one launch."""
+    try:
+        found = system.solve_directly(DIRECT_FRACTION * min(problem.contact_tolerance, problem.tolerance))
+    except np.linalg.LinAlgError:
+        return FrictionalResult(1, 0, 0, True, False, r)
+    if found is not None:
+        iterations, converged, r = found
+        return FrictionalResult(1, 0, iterations, False, converged, r, direct=True)
     if not system.model.on_cpu or PUBLIC:  # public Taichi takes no more than 64 arguments
         newton = Newton(system, problem)
         result = newton.run(r, scale, fresh=True)
@@ -221,7 +232,9 @@ def solve_linearised(system: StageSystem, stage: Stage) -> StageResult:
             break
         r, scale = system.end_linearised(accept=False)
         system.form_matrix(projected=True)
-    if system.model.has_dependents:  # linearised steps move only the nodes that they depend on
+    if found.direct:
+        system.end_linearised()
+    elif system.model.has_dependents:  # linearised steps move only the nodes that they depend on
         place_dependents(system.model)
     at_floor = found.r <= system.rounding.stage_floor(stage.c, stage.beta)
     return StageResult(

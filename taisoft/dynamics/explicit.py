@@ -10,6 +10,7 @@ A small mesh runs all its sub-steps in one serial kernel; a large one takes two 
 import taichi as ti
 
 from taisoft.backend.runtime import kernel
+from taisoft.dynamics.rigid_motion import project_all, project_velocities, turn_all, turn_drifted
 from taisoft.fem.dependents import force_with_dependents, place, place_all
 from taisoft.fem.lanes import broadcast
 from taisoft.fem.state import FAILED, INVERTED_NOW, LOWEST_J, MOST_INVERTED, STEPS_DONE
@@ -188,6 +189,9 @@ def advance_serial(m: ti.template(), s: ti.template(), n: ti.i32, dt64: ti.f64, 
             if ti.static(s.verlet):
                 for i in range(m.n_nodes):
                     verlet_drift(m, s, i, dt, verlet_half(m, s, i, dt))
+                if ti.static(m.has_rigid_tets):
+                    for k in range(m.rigid_tets.n):
+                        turn_drifted(m, s, k, dt)
                 if ti.static(s.has_prescribed):
                     prescribe(m, s, done, dt64)
             if ti.static(s.has_varied_loads):
@@ -200,6 +204,12 @@ def advance_serial(m: ti.template(), s: ti.template(), n: ti.i32, dt64: ti.f64, 
                     total += verlet_kick(m, s, i, dt)
                 else:
                     total += euler_node(m, i, dt)
+            if ti.static(m.has_rigid_tets):
+                for k in range(m.rigid_tets.n):
+                    if ti.static(s.verlet):
+                        project_velocities(m, k)
+                    else:
+                        turn_drifted(m, s, k, dt)
             if ti.static(s.has_prescribed):
                 prescribe(m, s, done, dt64)
             if ti.static(s.has_held):
@@ -262,6 +272,7 @@ def drift_parallel(m: ti.template(), s: ti.template(), row: ti.i32, dt64: ti.f64
         for i in range(m.n_nodes):
             dt = ti.cast(dt64, m.real)
             verlet_drift(m, s, i, dt, verlet_half(m, s, i, dt))
+        turn_all(m, s, dt64)
         if ti.static(s.has_prescribed):
             ti.loop_config(serialize=True)
             for _ in range(1):
@@ -289,6 +300,10 @@ def nodes_parallel(m: ti.template(), s: ti.template(), row: ti.i32, dt64: ti.f64
             v = euler_node(m, i, dt)
         if nonfinite(ti.cast(v[0] + v[1] + v[2], ti.f64)):
             m.state.scalars[FAILED] = 1.0
+    if ti.static(s.verlet):
+        project_all(m)
+    else:
+        turn_all(m, s, dt64)
     if ti.static(s.has_prescribed):
         ti.loop_config(serialize=True)
         for _ in range(1):

@@ -24,6 +24,7 @@ from taisoft.dynamics.explicit import (
     verlet_half,
     verlet_kick,
 )
+from taisoft.dynamics.rigid_motion import project_all, turn_all
 from taisoft.fem.dependents import place_all
 from taisoft.fem.state import FAILED, INVERTED_NOW, MOST_INVERTED
 from taisoft.fem.terms import elasticity
@@ -58,6 +59,7 @@ def predict(m: ti.template(), s: ti.template(), dt64: ti.f64):
             m.state.v[i] = verlet_half(m, s, i, dt)
         else:
             m.state.v[i] = euler_velocity(m, i, dt)
+    project_all(m)
     if ti.static(s.has_prescribed):
         ti.loop_config(serialize=True)
         for _ in range(1):
@@ -126,6 +128,7 @@ def move(m: ti.template(), s: ti.template(), p: ti.template(), dt64: ti.f64, has
         else:
             m.state.v[i] = v
             m.state.x[i] = m.state.x[i] + ti.cast(dt * v, ti.f64)
+    turn_all(m, s, dt64)
     if ti.static(s.has_prescribed):
         ti.loop_config(serialize=True)
         for _ in range(1):
@@ -146,6 +149,7 @@ def finish_verlet(m: ti.template(), s: ti.template(), p: ti.template(), dt64: ti
         v = verlet_kick(m, s, i, ti.cast(dt64, m.real))
         if nonfinite(ti.cast(v[0] + v[1] + v[2], ti.f64)):
             m.state.scalars[FAILED] = 1.0
+    project_all(m)
     if ti.static(s.has_prescribed):
         ti.loop_config(serialize=True)
         for _ in range(1):

@@ -15,6 +15,7 @@ from taisoft.dynamics.contact import TOLERANCE, ContactStep
 from taisoft.dynamics.explicit_contact import find_acceleration, finish_verlet, keep_state, move, predict, set_free_velocities
 from taisoft.dynamics.explicit_stepper import ExplicitStepper
 from taisoft.dynamics.results import StepResult
+from taisoft.dynamics.rigid_contacts import RigidContacts
 from taisoft.dynamics.simulation_state import SimulationState
 from taisoft.dynamics.substepping import MAX_PASSAGES
 from taisoft.errors import SimulationError
@@ -45,6 +46,7 @@ class ContactExplicitStepper(ExplicitStepper):
         m, arena = simulation.model, simulation.arena
         self._good = GoodState(arena.vectors("x_good", ti.f64, m.n_nodes), arena.vectors("v_good", m.real, m.n_nodes))
         self.contact_tolerance = settings.contact_tolerance or TOLERANCE[settings.precision]
+        self._rigid = RigidContacts(m) if m.has_rigid_tets else None
 
     def forget(self) -> None:
         """Discard the search and impulses, after the state was set."""
@@ -165,10 +167,13 @@ class ContactExplicitStepper(ExplicitStepper):
         if n:
             p = contact.problem
             set_free_velocities(m, s, p, dt, *contact.gap_targets)
-            find_factors(p)
-            if self.method == "coloured_gauss_seidel":
-                colour_contacts(p)
-            result = solve(p, self.method, self.contact_tolerance, MAX_SWEEPS)
+            if self._rigid is not None:
+                result = self._rigid.solve(p, self.method, self.contact_tolerance, MAX_SWEEPS)
+            else:
+                find_factors(p)
+                if self.method == "coloured_gauss_seidel":
+                    colour_contacts(p)
+                result = solve(p, self.method, self.contact_tolerance, MAX_SWEEPS)
         move(m, s, contact.problem, dt, int(n > 0))
         if s.verlet:
             self.simulation.set_load_time(time + dt)
@@ -176,3 +181,14 @@ class ContactExplicitStepper(ExplicitStepper):
         if m.state.scalars[FAILED] != 0.0:
             raise SimulationError(f"step {step}: {self._describe_fault()}")
         return result
+
+    @property
+    def field_bytes(self) -> dict[str, int]:
+        """Bytes by name of the contact problem of rigid bodies."""
+        return super().field_bytes | (self._rigid.field_bytes if self._rigid else {})
+
+    def release(self) -> None:
+        """Free its memory."""
+        super().release()
+        if self._rigid:
+            self._rigid.release()

@@ -249,7 +249,7 @@ class ExplicitStepper:
             explicit.elements_parallel(m)
             explicit.restart_parallel(m, s)
         explicit.begin_parallel(m)
-        special = bool(s.n_prescribed or s.n_held or s.has_varied_loads)
+        special = bool(s.n_prescribed or s.n_held or s.has_varied_loads or m.has_rigid_tets)
         for row in range(n):
             if special or (s.verlet and row == 0):
                 explicit.drift_parallel(m, s, row, dt)

@@ -26,6 +26,7 @@ from taisoft.dynamics.stage_system import Stage, StageSystem
 from taisoft.dynamics.substepping import Substepping
 from taisoft.errors import SimulationError
 from taisoft.fem.dependents import place_all
+from taisoft.fem.rigid_tets import begin_rigid_stage
 from taisoft.settings import Settings
 
 MAX_NEWTON, MAX_NEWTON_WITH_CONTACTS = 50, 25  # a step that needs more is cut in substeps, or reported as not converged
@@ -305,6 +306,8 @@ class ImplicitStepper:
         begin_step(
             self.simulation.model, self.solver.work, self.history, multistep, scheme.now, scheme.before, still, extrapolation
         )
+        if self.simulation.model.rigid_tets is not None:
+            begin_rigid_stage(self.simulation.model, self.history, multistep, scheme.now, scheme.before, self._beta)
 
     def _solve_balanced(self, scheme: Scheme, dt: float, bounces: bool) -> StageResult:
         """Solve the stage, and again to a tighter tolerance if the forces on a piece are unbalanced."""

@@ -8,6 +8,7 @@ with contacts those of the augmented Lagrangian, see `contact_terms`. c = 1 for 
 displacement). K is unprojected.
 """
 
+import contextlib
 import math
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
@@ -27,6 +28,7 @@ from taisoft.dynamics.contact_terms import (
     save_diagonal,
     update_impulses,
 )
+from taisoft.dynamics.direct import DirectSolver, can_solve_directly
 from taisoft.dynamics.linear_solver import LinearSolver
 from taisoft.dynamics.linearised import LONGEST, advance, begin_linearised, end_linearised
 from taisoft.dynamics.stage import (
@@ -121,6 +123,7 @@ class StageSystem:
         )
         self.rounding = RoundingFloor(model, eps)
         self.linear_solver = LinearSolver(model)
+        self._direct = DirectSolver(self) if multipliers is None and can_solve_directly(model) else None
         self.kind = ELASTIC_STAGE
         self.scale = 0.0  # that |r| is relative to, at its last evaluation
         self.r_scale = 1.0  # R over the r-factors
@@ -139,12 +142,15 @@ class StageSystem:
     def field_bytes(self) -> dict[str, int]:
         """Bytes by name of the fields allocated for contacts, elimination and multigrid."""
         lists = self._lists.field_bytes if self._lists else {}
-        return self._contact_arena.bytes | lists | self.linear_solver.field_bytes
+        direct = self._direct.field_bytes if self._direct else {}
+        return self._contact_arena.bytes | lists | self.linear_solver.field_bytes | direct
 
     def release(self) -> None:
         """Free their memory."""
         self._contact_arena.release()
         self.linear_solver.free()
+        if self._direct:
+            self._direct.release()
         if self._lists:
             self._lists.release()
 
@@ -328,6 +334,16 @@ class StageSystem:
         self._same_matrix = bool(loop[frictional.SAME_MATRIX])
         return loop
 
+    def solve_directly(self, tolerance: float) -> tuple[int, bool, float] | None:
+        """Move a linearised stage to the solution of its frictional problem, see `direct`; None if that does not apply.
+
+        tolerance: of the laws' residual. Returns (iterations, converged, |r|); raises numpy.linalg.LinAlgError if the matrix is
+        indefinite.
+        """
+        if self._direct is None or not self._direct.prepare(self._k):
+            return None
+        return self._direct.solve(self._k, self.stage.beta, tolerance)
+
     def end_linearised(self, accept: bool = True) -> tuple[float, float]:
         """Restore nonlinear elastic forces; return (|r|, scale). y is then the velocity change since linearisation, base its x.
 
@@ -368,6 +384,9 @@ class StageSystem:
         """Form the matrix and the contacts' r-factors, which stay fixed during the stage."""
         self.form_matrix(projected)
         find_factors(self._k.problem)
+        if self._direct is not None:
+            with contextlib.suppress(np.linalg.LinAlgError):  # the solve will project the matrix
+                self._direct.set_factors(self._k)
 
     def direction(self, tolerance: float) -> LinearResult:
         """Solve for y of pcg from -r."""

@@ -24,6 +24,7 @@ from taisoft.fem.mean_dilatation import MeanDilatation, build_mean_dilatation
 from taisoft.fem.node_graph import NodeGraph
 from taisoft.fem.pattern import MATRIX_BLOCKS, model_graph
 from taisoft.fem.pressure import PressureTable, build_pressures
+from taisoft.fem.rigid_tets import RigidTets, build_rigid_tets
 from taisoft.fem.spring_table import SpringTable
 from taisoft.fem.state import State, build_state
 from taisoft.fem.terms import terms_of
@@ -103,6 +104,7 @@ class Model:
     loads: Any  # (n_nodes) 3-vectors [N], or None: tractions and forces
     amplitudes: Any  # f64, or None: present values of the loads that are one number, see `fem.loads.scalar_loads`
     pressure: PressureTable | None
+    rigid_tets: RigidTets | None  # to be damped, or moved as rigid bodies
     node_body: Any  # (n_nodes) i32; None unless damping needs it
     damping: Any  # (n_bodies, 2), or None: mass damping [1/s], stiffness damping [s]
     consistent: bool  # mass_matrix is used
@@ -130,6 +132,11 @@ class Model:
     def depends_on_velocity(self) -> bool:
         """Whether forces other than mass damping depend on velocities."""
         return self.stiffness_damping or self.spring_damping
+
+    @property
+    def has_rigid_tets(self) -> bool:
+        """Whether rigid bodies are damped or moved apart from others."""
+        return self.rigid_tets is not None
 
     @property
     def has_pressure(self) -> bool:
@@ -296,6 +303,9 @@ def build_model(scene: Scene, runtime: Runtime, arena: FieldArena, on: dict[str,
     weight = mass = arena.field("mass", real, n_nodes, reference.lumped_masses(scene, dependents).astype(npr))
     if on["consistent_weight"]:
         weight = arena.field("gravity_mass", real, n_nodes, reference.gravity_masses(scene, dependents).astype(npr))
+    rigid_tets = None
+    if on["rigid_damping"] or on["rigid_motion"]:
+        rigid_tets = build_rigid_tets(scene, layout.node_start, dependents, arena)
     model = Model(
         real=real,
         strain_real=strain_real,
@@ -305,7 +315,7 @@ def build_model(scene: Scene, runtime: Runtime, arena: FieldArena, on: dict[str,
         n_nodes=n_nodes,
         n_blocks=n_blocks,
         groups=groups,
-        terms=terms_of(on),
+        terms=terms_of(on | {"rigid_damping": on["rigid_damping"] and rigid_tets is not None}),
         state=build_state(arena, runtime, layout.rest, velocity, 3 * len(flat_nodes), chunks),
         nodes=arena.field("nodes", ti.i32, len(flat_nodes), flat_nodes.astype(np.int32)),
         rules=rules,
@@ -326,6 +336,7 @@ def build_model(scene: Scene, runtime: Runtime, arena: FieldArena, on: dict[str,
         loads=arena.vectors("loads", real, n_nodes, scene_loads.at(0.0).astype(npr)) if on["loads"] else None,
         amplitudes=arena.field("amplitudes", ti.f64, n_amplitudes, scene_loads.amplitudes([0.0])[0]) if n_amplitudes else None,
         pressure=None,
+        rigid_tets=rigid_tets,
         node_body=arena.field("node_body", ti.i32, n_nodes, node_body) if damped else None,
         damping=arena.field("damping", real, (n_bodies, 2), damping_table(scene).astype(npr)) if damped else None,
         consistent=on["consistent_mass"],

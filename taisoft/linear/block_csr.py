@@ -16,11 +16,11 @@ import taichi as ti
 from taisoft.backend.arrays import Count, FieldArena, download
 from taisoft.backend.runtime import kernel
 from taisoft.errors import SimulationError
+from taisoft.fem import rigid_tets, springs
 from taisoft.fem.chunks import part_first
 from taisoft.fem.model import Model
 from taisoft.fem.node_graph import BLOCKS, EDGES, block_of, count_of, edge_of, n_nodes_of, node_of, whole_rows
 from taisoft.fem.pattern import MATRIX_BLOCKS, model_graph
-from taisoft.fem.springs import set_pair_entries
 from taisoft.fem.terms import rayleigh_damping
 from taisoft.fem.terms.elasticity import prepare_terms
 from taisoft.linear.element_blocks import element_blocks, pair_terms
@@ -70,7 +70,9 @@ def build_block_csr(model: Model, arena: FieldArena, prefix: str = "stiffness") 
         raise SimulationError(f"{int(model.volume.shape[0]) * model.lanes} tets are too many to assemble a stiffness matrix")
     n_edges, rules = len(graph.ends), {}
     if model.springs is not None:
-        set_pair_entries(model.springs, graph)
+        springs.set_pair_entries(model.springs, graph)
+    if model.rigid_tets is not None:
+        rigid_tets.set_pair_entries(model.rigid_tets, graph)
 
     def copied(name: str, data: np.ndarray, dtype=ti.i32):
         return arena.field(f"{prefix}_{name}", dtype, data.shape, data)
@@ -312,9 +314,9 @@ def unpacked(blocks: np.ndarray) -> np.ndarray:
     return blocks.reshape(-1, 3, 4)[:, :, :3].swapaxes(1, 2).astype(np.float64)
 
 
-def to_bsr(m: Model, A: BlockCsr) -> sp.bsr_matrix:
-    """Copy the matrix to the host, blocks (3, 3) float64 in ascending columns."""
-    start, column, value, diagonal = download([A.row_start, A.column, A.value, A.diagonal])
+def to_bsr(m: Model, A: BlockCsr, diagonal: Any = None) -> sp.bsr_matrix:
+    """Copy the matrix to the host, blocks (3, 3) float64 in ascending columns. diagonal: field of diagonal blocks; None: A's."""
+    start, column, value, diagonal = download([A.row_start, A.column, A.value, A.diagonal if diagonal is None else diagonal])
     start, order = whole_rows(start)
     column, off, diagonal = column[order], unpacked(value[order]), unpacked(diagonal)
     shape = (3 * m.n_nodes, 3 * m.n_nodes)

@@ -68,7 +68,7 @@ class Multigrid:
         self._arena = FieldArena()
         self.levels: list[CycleLevel] = []
         host = []
-        while (found := _factorise(matrix)) is None:
+        while (found := factorise(matrix)) is None:
             level, matrix, modes = _coarsen(matrix, modes)
             host.append(level)
         self.coarsest = found
@@ -129,7 +129,7 @@ def block_rows(A: sp.bsr_matrix) -> np.ndarray:
     return owners(np.diff(A.indptr))
 
 
-def _factorise(A: sp.bsr_matrix) -> BandedCholesky | None:
+def factorise(A: sp.bsr_matrix) -> BandedCholesky | None:
     """Factorise A if its band is narrow or A is small; otherwise return None."""
     n, d = len(A.indptr) - 1, A.blocksize[0]
     pattern = sp.csr_matrix((np.ones(len(A.indices), dtype=np.int8), A.indices, A.indptr), shape=(n, n))

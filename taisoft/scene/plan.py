@@ -109,6 +109,14 @@ def make_plan(scene: Scene, explicit: bool, multistep: bool, self_collision: boo
     plan.add("dependent_nodes", exact or embedded, _shorten(exact + embedded), why_not)
     rigid = [body.name for body in scene.rigid_bodies]
     plan.add("rigid_bodies", rigid, _shorten(rigid), "every body is elastic")
+    plan.add(
+        "rigid_damping",
+        rigid and not explicit and scene.pushes(self_collision),
+        f"implicit steps damp the strains that impacts leave in {_shorten(rigid)}",
+        "explicit steps store no strain" if rigid and explicit else "no impact strains a rigid body",
+    )
+    why_not = "implicit steps keep rigid bodies rigid by elasticity" if rigid else "every body is elastic"
+    plan.add("rigid_motion", rigid and explicit, f"explicit steps move {_shorten(rigid)} as rigid bodies", why_not)
     damped = [one.name for one in scene.connections if one.damping > 0.0]
     plan.add("spring_damping", damped, _shorten(damped), "no spring or attachment is damped")
     plan.add("assembled_stiffness", not explicit, "implicit steps solve linear systems", "explicit steps need forces only")

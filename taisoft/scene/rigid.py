@@ -3,7 +3,8 @@
 Four equal point masses at c + S^(1/2) t_a, with S the covariance of the body's volume about its centre c and t_a the corners
 (1,1,1), (1,-1,-1), (-1,1,-1), (-1,-1,1), have sum t_a = 0 and sum t_a t_a^T = 4 I, hence the body's mass, centre and second
 moments. The lumped mass of a tet at these points is therefore exact for every affine motion, rigid ones among them. The vertices
-of the surface are embedded: affine functions of the four nodes. Elasticity keeps the tet nearly rigid.
+of the surface are embedded: affine functions of the four nodes. In implicit steps elasticity keeps the tet nearly
+rigid; explicit steps move it as rigid.
 """
 
 import warnings
@@ -140,6 +141,12 @@ class RigidBody(Body):
     def young(self) -> float:
         """Young's modulus [Pa] of the body, as if its volume were elastic; chosen by the Simulator unless it was given."""
         return self._young
+
+    @property
+    def lowest_frequency(self) -> float:
+        """Lowest angular frequency [rad/s] of a strain of the body: that along its longest axis."""
+        arms = self.mesh.vertices - self.centre
+        return float(np.sqrt(self._young / self._density / np.linalg.eigvalsh(arms.T @ arms / FRAME)[-1]))
 
     @property
     def density(self) -> float:

@@ -11,13 +11,13 @@ A term is a module with
                       by `linear.block_csr` itself
     PREPARED          whether forces need prepare(m, k) for k < count(m), after every change of x or v and before `force`
 and is listed in TERMS, which explicit steps, Newton's method, statics and reports iterate over. Dampers have no potential, and
-integrators treat them differently: `rayleigh_damping` holds their rates and forces. The drag spring of the window is constant
-over a step and is therefore applied as a dead load (`dynamics.drag_spring`).
+integrators treat them differently: `rayleigh_damping` holds their rates and forces, and `rigid_damping` is a term of implicit
+steps. The drag spring of the window is constant over a step and is therefore applied as a dead load (`dynamics.drag_spring`).
 """
 
-from taisoft.fem.terms import dead_loads, elasticity, gravity, pressure, springs
+from taisoft.fem.terms import dead_loads, elasticity, gravity, pressure, rigid_damping, springs
 
-TERMS = (elasticity, springs, gravity, dead_loads, pressure)
+TERMS = (elasticity, springs, rigid_damping, gravity, dead_loads, pressure)
 
 
 def terms_of(on: dict[str, bool]) -> tuple:
