@@ -2,8 +2,8 @@
 
 A round opens, runs and closes every integrator of both programs once, so that a slow minute of the machine affects all; ratios
 are formed per round. A time is that of a whole run without compilation: MuJoCo in batches of 10 ms, taisoft in the largest
-batches of sim.advance. The first round also records the tip. On meshes of fewer than some 40,000
-tets taisoft uses one CPU thread, as MuJoCo does.
+batches of sim.advance. The first round also records the tip. On meshes as small as these taisoft uses one CPU
+thread, as MuJoCo does.
 """
 
 import math

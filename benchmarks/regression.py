@@ -10,8 +10,8 @@ doubled, a solver that needs more iterations. A number counts as the same within
     memory      0.1 % of the bytes of all fields
     status      the same
 
-since CPU runs are bitwise reproducible on one machine with the same number of threads, while another processor or compiler rounds
-differently and may change iteration counts by one. A number better than stored counts as changed too: --update prints the
+since CPU runs are bitwise reproducible on one machine, while another processor or compiler rounds differently and may change
+iteration counts by one. A number better than stored counts as changed too: --update prints the
 differences and stores the new numbers. It also computes and stores references that are not formulas.
 
 Times are shown but not compared. Their unit is 100 products of a sparse matrix (20,000 rows of 27) with a vector, on one thread

@@ -53,13 +53,16 @@ def run_child(job: str, arch: str) -> list | dict | str:
     return [found for line in lines if (found := parse_result(line)) is not None][-1]
 
 
-def measure_all(kinds: list[str], sizes: list[int], arch: str) -> Iterator[Row]:
-    """A row per kind and size, also for failures; on one thread only where several were used before."""
+def measure_all(kinds: list[str], sizes: list[int], arch: str, chosen: bool = True) -> Iterator[Row]:
+    """A row per kind and size, also for failures; on one thread only where several were used before.
+
+    chosen: whether the user named the sizes; else only some kinds are measured with LARGEST.
+    """
     several: dict[str, list[int]] = {}
     for kind in kinds:
         one = kind.endswith(ON_ONE)
         for size in several.get(kind.removesuffix(ON_ONE), []) if one else sizes:
-            if size == LARGEST and kind.removesuffix(ON_ONE) not in LARGEST_OF:
+            if size == LARGEST and not chosen and kind.removesuffix(ON_ONE) not in LARGEST_OF:
                 continue
             found = run_child(f"{kind}:{size}", arch)
             row = Row(kind, arch, tets=size, failure=found) if isinstance(found, str) else Row(**found)
@@ -270,7 +273,7 @@ def main(argv=None) -> int:
         raise SimulationError(copies)
     copies = [Copy(**copy) for copy in copies]
     kinds = [kind for kind in KINDS if options.kind in (None, kind, kind.removesuffix(ON_ONE))]
-    rows = list(measure_all(kinds, sizes, options.arch))
+    rows = list(measure_all(kinds, sizes, options.arch, options.sizes is not None))
     found = growths(rows)
     document.add("## Time\n\n" + time_table(rows))
     document.add("## Threads\n\n" + gain_table(rows))

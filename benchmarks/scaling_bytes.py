@@ -23,6 +23,7 @@ from .runner import repeated
 ELEMENTS = ("x", "nodes", "Dm_inv", "volume", "block_body")
 GATHER = ("element_force", "gather_start", "gather_entry", "mass", "free")
 PCG = ("pcg_y", "pcg_r", "pcg_z", "pcg_p", "pcg_q")
+MATRIX = ("stiffness_value", "stiffness_column", "stiffness_row_start")
 EDGES = tuple(f"stiffness_{name}" for name in ("element", "edge_start", "edge_entry", "edge_upper", "edge_lower"))
 PROBLEM = tuple(f"problem_{name}" for name in ("node", "arity", "weight", "normal", "tangent", "b", "friction", "factor", "r"))
 LOOPS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {  # reads, writes
@@ -36,7 +37,7 @@ LOOPS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {  # reads, writes
     "blocks": (ELEMENTS, ("stiffness_element",)),
     "edges": (EDGES, ("stiffness_value",)),
     "system": (("stiffness_value", "mass"), ("stiffness_value", "stiffness_diagonal")),
-    "iteration": ((*(f"stiffness_{name}" for name in ("value", "column", "row_start", "diagonal")), "pcg_inverse", *PCG), PCG),
+    "iteration": ((*MATRIX, "pcg_inverse", "pcg_block", "pcg_mirror", *PCG), PCG),
     # a search: boxes of triangles, and those of a tree or the cells of a grid
     "boxes": (("surface_triangle", "surface_x", "surface_move"), ("surface_lo", "surface_hi", "surface_normal", "surface_area")),
     "tree": (("surface_lo", "surface_hi", "bvh_link"), ("bvh_lo", "bvh_hi")),

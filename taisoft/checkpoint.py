@@ -5,8 +5,8 @@ Simulator's settings, the numbers that may change at run time (present and initi
 digest of each part of the scene. Each class saves its state between steps by `snapshot` and restores it by `restore`; an
 array's name is its path in there, joined by slashes. Meshes, constraints, where loads act, and paths are not in the file:
 they come from the scene passed at loading. Its digests must equal those of the saved scene, and its numbers those at the
-start, since other numbers would be ignored. With the same machine, versions and number of threads, a run continues bitwise as
-if it had not been interrupted.
+start, since other numbers would be ignored. With the same machine and versions, a run continues bitwise as if it had not been
+interrupted.
 """
 
 import dataclasses

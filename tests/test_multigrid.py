@@ -236,6 +236,19 @@ def test_statics_of_a_slender_bar():
     assert result.linear_iterations < 200 * result.iterations
 
 
+def test_statics_with_an_exact_attachment(several_levels, monkeypatch):
+    """The rows of attached nodes are empty: their diagonal blocks must be there all the same."""
+    scene = held_box(cells=(10, 4, 4))
+    scene.add_body(ts.box_mesh((2, 2, 2), (0.5, 0.5, 0.5)), rubber(), name="knob", position=(1.25, 0.0, 0.0))
+    scene.attach("knob", lambda X: X[:, 0] < -0.249, "box")
+    plain = ts.solve_static(scene, tolerance=1e-8)
+    monkeypatch.setattr(linear_solver, "BUILD", -(10**9))
+    result = ts.solve_static(scene, tolerance=1e-8)
+    assert result.converged and result.multigrid_solves > 0 and not plain.multigrid_solves
+    x, expected = (np.concatenate([one.positions(name) for name in ("box", "knob")]) for one in (result, plain))
+    assert np.abs(x - expected).max() < 1e-6
+
+
 def without_multigrid(monkeypatch):
     monkeypatch.setattr(linear_solver, "BUILD", 10**9)
 
@@ -300,3 +313,6 @@ def test_sums_do_not_depend_on_the_number_of_threads():
     """The operator @ on dense vectors calls BLAS, which splits sums among threads."""
     tree = ast.parse(Path(host_pcg.__file__).read_text())
     assert not [node.lineno for node in ast.walk(tree) if isinstance(node, ast.MatMult) or getattr(node, "attr", "") == "dot"]
+    assert "np.linalg.norm" not in Path(multigrid.__file__).read_text()
+    v = np.random.default_rng(7).standard_normal(20_000)
+    assert host_pcg.norm(v) == pytest.approx(np.linalg.norm(v), rel=1e-14)

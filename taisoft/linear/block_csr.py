@@ -19,12 +19,13 @@ from taisoft.errors import SimulationError
 from taisoft.fem import rigid_tets, springs
 from taisoft.fem.chunks import part_first
 from taisoft.fem.model import Model
-from taisoft.fem.node_graph import BLOCKS, EDGES, block_of, count_of, edge_of, n_nodes_of, node_of, whole_rows
+from taisoft.fem.node_graph import BLOCKS, EDGES, block_of, count_of, edge_of, n_nodes_of, node_of
 from taisoft.fem.pattern import MATRIX_BLOCKS, model_graph
 from taisoft.fem.terms import rayleigh_damping
 from taisoft.fem.terms.elasticity import prepare_terms
 from taisoft.linear.element_blocks import element_blocks, pair_terms
 from taisoft.linear.patch_terms import PatchTerms, add_patches, build_patch_terms, find_gradients
+from taisoft.ranges import owners
 
 # A block is a 12-vector, column by column, each padded with a zero: entry (r, c) is at 4 c + r. All entries share one address,
 # and a column times a number is one SIMD instruction.
@@ -315,15 +316,16 @@ def unpacked(blocks: np.ndarray) -> np.ndarray:
 
 
 def to_bsr(m: Model, A: BlockCsr, diagonal: Any = None) -> sp.bsr_matrix:
-    """Copy the matrix to the host, blocks (3, 3) float64 in ascending columns. diagonal: field of diagonal blocks; None: A's."""
+    """Copy the matrix to the host, blocks (3, 3) float64 in ascending columns, with all diagonal ones.
+
+    diagonal: field of diagonal blocks; None: A's.
+    """
     start, column, value, diagonal = download([A.row_start, A.column, A.value, A.diagonal if diagonal is None else diagonal])
-    start, order = whole_rows(start)
-    column, off, diagonal = column[order], unpacked(value[order]), unpacked(diagonal)
-    shape = (3 * m.n_nodes, 3 * m.n_nodes)
-    rows = np.arange(m.n_nodes)
-    return sp.bsr_matrix((off, column, start), shape=shape) + sp.bsr_matrix(
-        (diagonal, rows, np.arange(m.n_nodes + 1)), shape=shape
-    )
+    own = np.arange(m.n_nodes)
+    row, column = np.concatenate([owners(np.diff(start)) % m.n_nodes, own]), np.concatenate([column, own])
+    order = np.lexsort((column, row))  # SciPy's sum would leave out blocks that are 0
+    blocks, whole = np.concatenate([unpacked(value), unpacked(diagonal)]), np.concatenate([[0], np.cumsum(np.bincount(row))])
+    return sp.bsr_matrix((blocks[order], column[order], whole), shape=(3 * m.n_nodes, 3 * m.n_nodes))
 
 
 def to_scipy(m: Model, A: BlockCsr) -> sp.csr_matrix:

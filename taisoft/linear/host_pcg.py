@@ -5,6 +5,7 @@ maximum number of iterations. In f32 a direction is rounded before its product, 
 Weakness: on the CPU only, whose arrays the host can access.
 """
 
+import math
 from collections.abc import Callable
 
 import numpy as np
@@ -66,3 +67,8 @@ def solve(
 def inner_product(a: np.ndarray, b: np.ndarray) -> float:
     """a.b, without BLAS, which would start threads for these few numbers and sum in an order that depends on their number."""
     return float(np.einsum("n,n->", a, b))
+
+
+def norm(a: np.ndarray) -> float:
+    """|a|, likewise."""
+    return math.sqrt(inner_product(a, a))

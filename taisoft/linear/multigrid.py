@@ -23,6 +23,7 @@ from scipy.sparse.csgraph import reverse_cuthill_mckee
 from taisoft.backend.arrays import FieldArena
 from taisoft.linear.aggregation import MODES, prolongation
 from taisoft.linear.block_rows import LANES, CycleLevel, ascend, descend, padded, upload_matrix
+from taisoft.linear.host_pcg import norm
 from taisoft.mesh.aggregates import aggregate
 from taisoft.ranges import owners
 
@@ -69,7 +70,10 @@ class Multigrid:
         self.levels: list[CycleLevel] = []
         host = []
         while (found := factorise(matrix)) is None:
+            unknowns = matrix.shape[0]
             level, matrix, modes = _coarsen(matrix, modes)
+            if matrix.shape[0] >= unknowns:
+                raise np.linalg.LinAlgError("the aggregates are single nodes")
             host.append(level)
         self.coarsest = found
         if host:
@@ -177,7 +181,7 @@ def _largest_eigenvalue(A: sp.bsr_matrix, inverse: sp.bsr_matrix, included: np.n
     v = np.random.default_rng(1).standard_normal(A.shape[0]) * np.repeat(included, A.blocksize[0])
     growth = 1.0
     for _ in range(POWER_STEPS):
-        v /= np.linalg.norm(v)
+        v /= norm(v)
         v = inverse @ (A @ v)
-        growth = float(np.linalg.norm(v))
+        growth = norm(v)
     return growth

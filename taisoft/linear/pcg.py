@@ -19,6 +19,7 @@ from taisoft.linear.pcg_jacobi import iterate_jacobi, start_jacobi
 from taisoft.linear.pcg_work import CONVERGED, COUNT, NEGATIVE, RUNNING, STATUS, LinearResult, PcgWork
 
 SERIAL_WORK = 40_000_000  # block products per launch: about 0.2 s, so that Ctrl-C takes effect
+SHARED_FROM = 4  # chunks that several threads share: of fewer, one or two have work at a time
 JACOBI_BATCH = 8  # iterations between residual checks
 
 
@@ -46,7 +47,7 @@ def solve(
     while True:
         if not m.on_cpu:
             _take_jacobi_batch(m, A, w, tolerance, min(JACOBI_BATCH, max_iterations - done), coupling, same_matrix, done == 0)
-        elif m.serial or not w.is_divided(coupling):
+        elif m.serial or not w.is_divided(coupling) or w.n_chunks < SHARED_FROM:
             begin = 0 if done else 1 + same_matrix
             iterate_kernel(m, A, coupling, w, min(batch_of(m, A), max_iterations - done), tolerance, begin)
         else:

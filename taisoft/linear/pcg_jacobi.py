@@ -3,7 +3,7 @@
 import taichi as ti
 
 from taisoft.backend.runtime import kernel
-from taisoft.fem.chunks import total
+from taisoft.fem.chunks import part_first, total
 from taisoft.fem.node_graph import n_nodes_of, node_of
 from taisoft.fem.state import OTHER_SUM, SUM
 from taisoft.linear.block_csr import block_times, off_diagonal_times
@@ -25,10 +25,9 @@ from taisoft.linear.pcg_work import (
 
 
 @ti.func
-def _chunk_start(m: ti.template(), w: ti.template(), c):
-    """First node of chunk c in the list of the system's nodes."""
-    n = n_nodes_of(m, w.subset)
-    return ti.min(n, c * ((n + m.chunks - 1) // m.chunks))
+def _first(m: ti.template(), w: ti.template(), c):
+    """First place of chunk c in the list of the system's nodes."""
+    return part_first(c, n_nodes_of(m, w.subset), m.chunks)
 
 
 @kernel
@@ -36,7 +35,7 @@ def start_jacobi(m: ti.template(), A: ti.template(), k: ti.template(), w: ti.tem
     """Set the diagonal and its inverse B, y = 0, r = rhs, z = p = B r."""
     for c in range(m.chunks):
         s = ti.cast(0.0, ti.f64)
-        for at in range(_chunk_start(m, w, c), _chunk_start(m, w, c + 1)):
+        for at in range(_first(m, w, c), _first(m, w, c + 1)):
             i = node_of(w.subset, at)
             precondition(m, A, k, w, i, same_matrix)
             r = m.free[i] * w.rhs[i]
@@ -60,7 +59,9 @@ def iterate_jacobi(m: ti.template(), A: ti.template(), k: ti.template(), w: ti.t
     for c in range(m.chunks):
         s = ti.cast(0.0, ti.f64)
         if w.state[STATUS] == RUNNING:
-            for at in range(_chunk_start(m, w, c), _chunk_start(m, w, c + 1)):
+            for at in range(
+                part_first(c, n_nodes_of(m, w.subset), m.chunks), part_first(c + 1, n_nodes_of(m, w.subset), m.chunks)
+            ):
                 i = node_of(w.subset, at)
                 product = off_diagonal_times(m, A, 0, i, w.p)
                 if ti.static(k.width > 0):
@@ -87,7 +88,9 @@ def iterate_jacobi(m: ti.template(), A: ti.template(), k: ti.template(), w: ti.t
         s = ti.cast(0.0, ti.f64)
         if w.state[STATUS] == RUNNING:
             a = ti.cast(w.state[STEP], m.real)
-            for at in range(_chunk_start(m, w, c), _chunk_start(m, w, c + 1)):
+            for at in range(
+                part_first(c, n_nodes_of(m, w.subset), m.chunks), part_first(c + 1, n_nodes_of(m, w.subset), m.chunks)
+            ):
                 i = node_of(w.subset, at)
                 w.y[i] = w.y[i] + a * w.p[i]
                 r = w.r[i] - a * w.q[i]

@@ -268,7 +268,7 @@ def iterate_with_volumes(
                 ratio = ti.cast(rz / w.state[RZ], m.real)
             if rz <= tolerance * tolerance * w.state[RZ_START]:
                 status = CONVERGED
-            elif count == n:
+            elif count >= n:
                 status = PAUSED
             else:
                 w.state[RZ] = rz
