@@ -214,11 +214,13 @@ class Rig:
         return self.machine.eps
 
 
-def use_threads(monkeypatch, several: bool = True) -> None:
-    """Divide loops over any mesh into chunks, and run them on several threads, or on one."""
+def use_threads(monkeypatch, several: bool = True) -> list[bool]:
+    """Divide loops over any mesh into chunks, and run them on several threads, or on one; the answers given are returned."""
+    answers: list[bool] = []
     monkeypatch.setattr("taisoft.fem.model.CHUNKED_FROM", 0)
     monkeypatch.setattr("taisoft.linear.pcg_work.MIN_SHIFT", 2)
-    monkeypatch.setattr("taisoft.backend.parallel.pays", lambda seconds: several)
+    monkeypatch.setattr("taisoft.backend.parallel.pays", lambda seconds: answers.append(several) or several)
+    return answers
 
 
 @contextmanager
