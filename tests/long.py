@@ -6,6 +6,7 @@ integrator, a second scene, or a coarser case of the same problem.
 
 LONG = {
     "test_arch": ("[cpu-",),
+    "test_chunks": ("[mixed-linearly_implicit_euler", "[driven-implicit_midpoint"),
     "test_fuzz": ("[10000-",),
     "test_determinism": ("[cube_implicit]", "[cubes_"),
     "test_faults": ("test_failing_calls[others]", "test_kills_while_files_are_replaced[100]", "test_kills_during_runs[20]"),
