@@ -177,3 +177,12 @@ def gather(m: ti.template(), i):
         e = (m.state.element_force_at + m.gather_entry[k]) & m.state.element_force_mask
         f += ti.Vector([m.state.element_force[e], m.state.element_force[e + m.lanes], m.state.element_force[e + 2 * m.lanes]])
     return f
+
+
+@ti.func
+def add_entry(m: ti.template(), A: ti.template(), i, at, place: ti.template(), value):
+    """Add a number at one place of block `at` of a matrix, or of the diagonal block of row i if at is negative."""
+    if at < 0:
+        A.diagonal[i][place] += ti.cast(value, m.real)
+    else:
+        A.value[at][place] += ti.cast(value, m.real)

@@ -23,6 +23,7 @@ from taisoft.fem.node_graph import BLOCKS, EDGES, block_of, count_of, edge_of, n
 from taisoft.fem.pattern import MATRIX_BLOCKS, model_graph
 from taisoft.fem.terms import rayleigh_damping
 from taisoft.fem.terms.elasticity import prepare_terms
+from taisoft.linear.block_rows import padded
 from taisoft.linear.element_blocks import element_blocks, pair_terms
 from taisoft.linear.patch_terms import PatchTerms, add_patches, build_patch_terms, find_gradients
 from taisoft.ranges import owners
@@ -305,9 +306,7 @@ def multiply(m: ti.template(), A: ti.template(), x: ti.template(), y: ti.templat
 
 def packed(blocks: np.ndarray) -> np.ndarray:
     """Convert blocks (k, 3, 3) to the stored form (k, 12)."""
-    padded = np.zeros((len(blocks), 3, 4), dtype=blocks.dtype)
-    padded[:, :, :3] = blocks.swapaxes(1, 2)
-    return padded.reshape(-1, BLOCK)
+    return padded(blocks, BLOCK // 3)
 
 
 def unpacked(blocks: np.ndarray) -> np.ndarray:

@@ -10,6 +10,7 @@ The part with E - E_hat may be indefinite, and is left out of a projected matrix
 
 import taichi as ti
 
+from taisoft.fem.lanes import add_entry
 from taisoft.fem.rigid_tets import gradient_of, green_strain
 from taisoft.scene.rigid import FRAME
 
@@ -73,7 +74,4 @@ def add_stiffness(m: ti.template(), A: ti.template(), i, beta, projected):
                     block = 0.5 * (own.dot(g) * B[r, c] + Fb[r] * Fa[c])
                     if ti.static(r == c):
                         block += geometric
-                    if entry < 0:
-                        A.diagonal[i][4 * c + r] += ti.cast(viscosity * block, m.real)
-                    else:
-                        A.value[entry][4 * c + r] += ti.cast(viscosity * block, m.real)
+                    add_entry(m, A, i, entry, 4 * c + r, viscosity * block)

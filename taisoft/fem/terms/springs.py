@@ -10,6 +10,7 @@ length is undefined: it does not pull there.
 
 import taichi as ti
 
+from taisoft.fem.lanes import add_entry
 from taisoft.fem.spring_table import LENGTH, MULTIPLIER, PLAIN
 
 SWITCH, LOAD, ACCELERATION, STIFFNESS, PREPARED = "springs", False, False, True, True
@@ -162,7 +163,4 @@ def add_stiffness(m: ti.template(), A: ti.template(), i, beta, projected):
                     block = along * d[r] * along_other[c] - across_other * d[r] * d[c]
                     if ti.static(r == c):
                         block += across_other
-                    if at < 0:
-                        A.diagonal[i][4 * c + r] += ti.cast(scale * block, m.real)
-                    else:
-                        A.value[at][4 * c + r] += ti.cast(scale * block, m.real)
+                    add_entry(m, A, i, at, 4 * c + r, scale * block)
