@@ -14,7 +14,6 @@ import taisoft as ts
 from taisoft.backend.arrays import FieldArena
 from taisoft.backend.runtime import Runtime
 from taisoft.dynamics.dynamics import Dynamics
-from taisoft.fem.chunks import SPREAD
 from taisoft.fem.model import Layout, Model, build_model
 from taisoft.scene.plan import make_plan
 from taisoft.settings import check_settings, plan_of
@@ -232,9 +231,7 @@ def built(scene: ts.Scene, precision: str, chunks: int = 7, arch: str = "cpu") -
             on = make_plan(scene, explicit=False, multistep=False).on
             model, layout = build_model(scene, machine, arena, on)
             partial = arena.field("partial_parallel", ti.f64, (chunks, model.state.partial.shape[1]))
-            parallel = replace(
-                model, serial=False, chunks=chunks, spread=SPREAD[arch], state=replace(model.state, partial=partial)
-            )
+            parallel = replace(model, serial=False, chunks=chunks, state=replace(model.state, partial=partial))
             yield Rig(scene, machine, arena, model, parallel, layout, Oracle(scene))
         finally:
             arena.release()

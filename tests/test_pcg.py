@@ -29,7 +29,7 @@ def rig(request):
     with built(mixed_scene(order="both"), request.param) as made:
         made.matrix = block_csr.build_block_csr(made.model, made.arena)
         made.work = build_pcg(made.model, made.arena, made.matrix)
-        one_thread, ways = replace(made.parallel, serial=True, spread=1), {}
+        one_thread, ways = replace(made.parallel, serial=True), {}
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(pcg_work, "MIN_SHIFT", 0)
             for name, chunks in (("chunks", 3), ("crossed", 6)):

@@ -116,7 +116,11 @@ class Model:
     mean: MeanDilatation | None
     elasticity_by_tet: bool  # law_constants may differ between the tets of a body
     chunks: int  # of a loop, each with its own partial sums
-    spread: int  # iterations of a loop per chunk, see `fem.chunks`
+
+    @property
+    def spread(self) -> int:
+        """Iterations of a loop per chunk, see `fem.chunks`."""
+        return 1 if self.serial else SPREAD["cpu" if self.on_cpu else "cuda"]
 
     @property
     def has_dependents(self) -> bool:
@@ -348,7 +352,6 @@ def build_model(scene: Scene, runtime: Runtime, arena: FieldArena, on: dict[str,
         mean=build_mean_dilatation(scene, layout, arena) if on["mean_dilatation"] else None,
         elasticity_by_tet=on["elasticity_by_tet"],
         chunks=chunks,
-        spread=1 if serial else SPREAD[runtime.arch],
     )
     needs_graph = on["consistent_mass"] or (on["pressure"] and on["assembled_stiffness"])
     graph = model_graph(model)[0] if needs_graph else None
