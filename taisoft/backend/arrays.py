@@ -20,6 +20,7 @@ from typing import Annotated, Any, ClassVar
 import numpy as np
 import taichi as ti
 
+from taisoft.backend import device_memory
 from taisoft.backend.private import impl
 from taisoft.errors import SimulationError
 from taisoft.machine import available_memory, format_bytes
@@ -57,8 +58,8 @@ class Array:
         if on_host:
             self.host = np.empty(self.full_shape, dtype=DTYPES[dtype])
             self.host.fill(0)  # touch the pages, so that later checks of available memory count them
-        else:  # as scalars, because Taichi never frees arrays of vectors
-            self.device = ti.ndarray(dtype, (math.prod(self.full_shape),))
+        else:  # as scalars, because Taichi never frees arrays of vectors; at least one, because CUDA has no empty arrays
+            self.device = ti.ndarray(dtype, (max(math.prod(self.full_shape), 1),))
 
     @property
     def full_shape(self) -> tuple[int, ...]:
@@ -74,8 +75,11 @@ class Array:
         """Return a copy of the array, or of its first `rows` rows."""
         if self.host is not None:
             return (self.host if rows is None else self.host[:rows]).copy()
-        data = self.device.to_numpy().reshape(self.full_shape)
-        return data if rows is None else data[:rows].copy()
+        shape = self.full_shape if rows is None else (min(rows, self.shape[0]), *self.full_shape[1:])
+        data = np.empty(shape, dtype=DTYPES[self.dtype])
+        if data.size:
+            device_memory.read(self.device, data)
+        return data
 
     def check(self, data: np.ndarray) -> None:
         """Raise ValueError unless data has the array's shape."""
@@ -87,8 +91,8 @@ class Array:
         self.check(data)
         if self.host is not None:
             np.copyto(self.host, data, casting="unsafe")
-        else:
-            self.device.from_numpy(np.ascontiguousarray(data, dtype=DTYPES[self.dtype]).reshape(-1))
+        elif data.size:
+            device_memory.write(self.device, np.ascontiguousarray(data, dtype=DTYPES[self.dtype]))
 
     def fill(self, value: float) -> None:
         """Set every number to value."""

@@ -7,7 +7,7 @@ rebuilt around those arguments, so the kernel's source reads as if it had receiv
 A record may contain records and tuples of records. Only the fields named by a kernel and the functions it calls are passed.
 
 A launch through Taichi looks up the type of every argument. A launch here whose records are known only sets numbers and
-addresses in a context that is created once. This relies on Taichi 1.7.4: see `tracing`.
+addresses in a context, which on the CPU is created once. This relies on Taichi 1.7.4: see `tracing`.
 """
 
 import dataclasses
@@ -55,29 +55,45 @@ class Compiled:
         program = self._program = impl.get_runtime().prog
         self._data = program.compile_kernel(program.config(), program.get_device_caps(), self._cpp)
 
-    def context(self, arguments: tuple) -> Any:
-        """Create a launch context that holds the records among the arguments; `launch` sets the other arguments."""
+    def bind(self, arguments: tuple) -> Any:
+        """What launches with these records need: a context that holds the records, or what to put into one, or None.
+
+        A context that holds Taichi's own arrays can be launched only once: of those, each launch creates one.
+        """
         if self._public is not None:
             return None
+        bound = [
+            (slot + k, leaf)
+            for slot, index in self._leaves
+            for k, leaf in enumerate(leaves_of(arguments[index], self.structures[index]))
+        ]
+        if ti.cfg.arch == ti.cuda:
+            return [(slot, leaf.device.arr if isinstance(leaf, Array) else operator.index(leaf)) for slot, leaf in bound]
         context = self._cpp.make_launch_context()
-        for slot, index in self._leaves:
-            for k, leaf in enumerate(leaves_of(arguments[index], self.structures[index])):
-                if not isinstance(leaf, Array):
-                    context.set_arg_int((slot + k,), operator.index(leaf))
-                elif leaf.host is not None:
-                    host = leaf.host
-                    entries = host.size // max(leaf.n, 1)  # as the kernel counts them, for index checks in debug mode
-                    context.set_arg_external_array_with_shape((slot + k,), host.ctypes.data, host.nbytes, (entries,), 0)
-                else:
-                    context.set_arg_ndarray((slot + k,), leaf.device.arr)
+        for slot, leaf in bound:
+            if isinstance(leaf, Array):
+                host = leaf.host
+                entries = host.size // max(leaf.n, 1)  # as the kernel counts them, for index checks in debug mode
+                context.set_arg_external_array_with_shape((slot,), host.ctypes.data, host.nbytes, (entries,), 0)
+            else:
+                context.set_arg_int((slot,), operator.index(leaf))
         return context
 
-    def launch(self, context: Any, arguments: tuple) -> Any:
-        """Launch and return the kernel's result. context: from `context`; None to create one for this launch."""
+    def _context_of(self, bound: list[tuple[int, Any]]) -> Any:
+        """Create a context that holds Taichi's arrays and numbers."""
+        context = self._cpp.make_launch_context()
+        for slot, value in bound:
+            if type(value) is int:
+                context.set_arg_int((slot,), value)
+            else:
+                context.set_arg_ndarray((slot,), value)
+        return context
+
+    def launch(self, bound: Any, arguments: tuple) -> Any:
+        """Launch and return the kernel's result. bound: from `bind` of these arguments."""
         if self._public is not None:
             return self._launch_public(arguments)
-        if context is None:
-            context = self.context(arguments)
+        context = self._context_of(bound) if isinstance(bound, list) else bound
         for index, slot, kind in self._setters:
             value = arguments[index]
             if kind == REAL:
@@ -152,7 +168,7 @@ class Kernels:
     def forget(self) -> None:
         """Drop everything compiled: Taichi has been re-initialised."""
         self._compiled: dict[tuple, Compiled] = {}
-        self._ready: dict[tuple, tuple] = {}  # key of the arguments -> compiled kernel, context, `_references`
+        self._ready: dict[tuple, tuple] = {}  # key of the arguments -> compiled kernel, what `bind` returned, `_references`
 
     @property
     def n_compiled(self) -> int:
@@ -187,9 +203,7 @@ class Kernels:
             examples = [a if k in self._arrays else None for k, a in enumerate(arguments)]
             self._compiled[kind] = Compiled(self._function, self._names, self._annotations, structures, examples)
         compiled, key = self._compiled[kind], self._key(arguments)
-        # a context that holds Taichi's own arrays can be launched only once
-        context = compiled.context(arguments) if ti.cfg.arch != ti.cuda else None
-        self._ready[key] = compiled, context, self._references(key, arguments)
+        self._ready[key] = compiled, compiled.bind(arguments), self._references(key, arguments)
         return self._ready[key]
 
     def _names_for(self, arguments: tuple) -> set[str]:

@@ -183,8 +183,8 @@ def kernel(function: Callable | None = None, *, cse: bool = True) -> Callable:
             return ready[0].launch(ready[1], arguments)
         start, compiler, before = time.perf_counter(), _compiler_clock(), kernels.n_compiled
         with _common_subexpressions(cse):
-            compiled, context, _ = kernels.prepare(arguments)
-            result = compiled.launch(context, arguments)  # loads the code at the first launch
+            compiled, bound, _ = kernels.prepare(arguments)
+            result = compiled.launch(bound, arguments)  # loads the code at the first launch
         if kernels.n_compiled > before:
             ti.sync()
             seconds = time.perf_counter() - start

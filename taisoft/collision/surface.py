@@ -38,6 +38,7 @@ class Surface:
     n_bodies: Count  # colliders, including those without faces
     serial: bool  # whether one thread runs all loops
     serial_cheap: bool  # whether one thread runs the cheap loops
+    on_cpu: bool
     chunks: int
     spread: int  # loop iterations per chunk, see SPREAD
     cheap_spread: int  # the same for cheap loops
@@ -119,6 +120,7 @@ def build_surface(
         n_bodies=bodies,
         serial=serial,
         serial_cheap=serial_cheap,
+        on_cpu=on_cpu,
         chunks=chunks,
         spread=1 if serial else SPREAD[runtime.arch],
         cheap_spread=1 if serial_cheap else SPREAD[runtime.arch],
@@ -229,6 +231,22 @@ def _box_triangles(s: ti.template(), margin):
 @ti.func
 def _box_bodies(s: ti.template()):
     """Compute the boxes of the colliders."""
+    if ti.static(s.on_cpu):
+        _box_each_body(s)
+    else:
+        for b in range(s.n_bodies):
+            s.body_lo[b], s.body_hi[b] = dvec(ti.math.inf), dvec(-ti.math.inf)
+        for t in range(s.n_triangles):
+            b = s.body[t]
+            for a in ti.static(range(3)):
+                if s.lo[t][a] < s.body_lo[b][a]:  # few are, and atomics on one address wait for each other
+                    ti.atomic_min(s.body_lo[b][a], s.lo[t][a])
+                if s.hi[t][a] > s.body_hi[b][a]:
+                    ti.atomic_max(s.body_hi[b][a], s.hi[t][a])
+
+
+@ti.func
+def _box_each_body(s: ti.template()):
     ti.loop_config(serialize=s.serial_cheap)
     for task in range(s.n_bodies * s.cheap_spread):
         if task % s.cheap_spread == 0:
@@ -287,20 +305,46 @@ def _can_have_partner(s: ti.template(), t, first, last):
 @ti.func
 def _list_active(s: ti.template()):
     """List the triangles that can have a partner, in ascending order."""
+    if ti.static(s.on_cpu):
+        _list_and_compact(s)
+    else:
+        for c in range(s.chunks):
+            s.part[c] = _list_active_of(s, c, 0, 0)
+        ti.loop_config(serialize=True)
+        for _ in range(1):
+            total = 0
+            for c in range(s.chunks):
+                n = s.part[c]
+                s.part[c] = total
+                total += n
+            s.count[ACTIVE] = total
+        for c in range(s.chunks):
+            _list_active_of(s, c, s.part[c], 1)
+
+
+@ti.func
+def _list_active_of(s: ti.template(), c, first, write):
+    """Count the triangles of chunk c that can have a partner; with `write` 1, also list them from s.active[first]."""
+    near, n, n_near, own = c * s.n_bodies, 0, 0, -1
+    for t in range(part_first(c, s.n_triangles, s.chunks), part_first(c + 1, s.n_triangles, s.chunks)):
+        if s.body[t] != own:
+            own = s.body[t]
+            n_near = list_near(s, c, own)
+        if _can_have_partner(s, t, near, near + n_near) == 1:
+            if write == 1:
+                s.active[first + n] = t
+            n += 1
+    return n
+
+
+@ti.func
+def _list_and_compact(s: ti.template()):
+    """List the triangles of each chunk, then move the lists together, which takes less time than to test them twice."""
     ti.loop_config(serialize=s.serial_cheap)
     for task in range(s.chunks * s.cheap_spread):
         if task % s.cheap_spread == 0:
             c = task // s.cheap_spread
-            first, near = part_first(c, s.n_triangles, s.chunks), c * s.n_bodies
-            n, n_near, own = 0, 0, -1
-            for t in range(first, part_first(c + 1, s.n_triangles, s.chunks)):
-                if s.body[t] != own:
-                    own = s.body[t]
-                    n_near = list_near(s, c, own)
-                if _can_have_partner(s, t, near, near + n_near) == 1:
-                    s.active[first + n] = t
-                    n += 1
-            s.part[c] = n
+            s.part[c] = _list_active_of(s, c, part_first(c, s.n_triangles, s.chunks), 1)
     ti.loop_config(serialize=True)
     for _ in range(1):
         total = 0

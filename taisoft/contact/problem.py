@@ -20,11 +20,13 @@ import taichi as ti
 from taisoft.backend.arrays import Count, FieldArena, upload
 from taisoft.backend.runtime import kernel
 from taisoft.contact.prox import dvec, prox, scaled
+from taisoft.fem.chunks import part_first
 
 NODES = 6  # maximum nodes of a contact, three on each side
 RESIDUAL, BEST, STEP, SWEEPS, CHECKS, AGE, MOMENTUM, WEIGHT, VERDICT = range(9)  # in `state`, see `solve`
 HISTORY = 1024  # residuals kept per launch
 CHUNKS = 256  # partial sums over the contacts, so that a sum does not depend on threads
+SCAN = 1024  # parts of a parallel prefix sum over the nodes
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,6 +35,7 @@ class ContactProblem:
 
     capacity: Count
     serial: bool  # whether loops run on one thread
+    on_cpu: bool
     matrix: bool  # whether W is given as a matrix
     count: Any  # (2) i32: contacts, colours
     friction: Any  # f64
@@ -67,6 +70,7 @@ class ContactProblem:
     w: Any = None  # (n_nodes) 3-vectors [m/s]: M^-1 J^T r
     entry_start: Any = None  # (n_nodes + 1) i32: contacts of each node
     entry: Any = None  # i32: width * contact + index of the node in it
+    scan: Any = None  # (SCAN) i32, on CUDA: scratch of their prefix sums
     # of detected contacts, see `build`
     body: Any = None  # 2-vectors i32: colliders
     feature: Any = None  # 3-vectors i32
@@ -92,6 +96,7 @@ def build_node_problem(arena: FieldArena, capacity: int, n_nodes: int, serial: b
     return ContactProblem(
         n,
         serial,
+        ti.cfg.arch != ti.cuda,
         False,
         n_nodes=n_nodes,
         width=width,
@@ -107,6 +112,7 @@ def build_node_problem(arena: FieldArena, capacity: int, n_nodes: int, serial: b
         **_fields(arena, "inverse_mass w", ti.f64, n_nodes, 3),
         **_fields(arena, "entry_start", ti.i32, n_nodes + 1),
         **_fields(arena, "entry", ti.i32, width * n),
+        **({} if ti.cfg.arch != ti.cuda else _fields(arena, "scan", ti.i32, SCAN)),
         **_fields(arena, "slot", ti.i32, n_slots),
     )
 
@@ -116,6 +122,7 @@ def build_matrix_problem(arena: FieldArena, n: int, n_blocks: int, serial: bool)
     return ContactProblem(
         n,
         serial,
+        ti.cfg.arch != ti.cuda,
         True,
         **_solver_fields(arena, n),
         **_fields(arena, "row_start", ti.i32, n + 1),
@@ -294,6 +301,52 @@ def find_factors(p: ti.template()):
 @kernel
 def index_nodes(p: ti.template()):
     """List the contacts of each node, in ascending order."""
+    if ti.static(p.on_cpu):
+        _index_serially(p)
+    else:
+        _index_in_parallel(p)
+
+
+@ti.func
+def _index_in_parallel(p: ti.template()):
+    """`index_nodes` as top-level loops for many threads: counts, their prefix sums, entries in any order, sorted by node."""
+    for i in range(p.n_nodes + 1):
+        p.entry_start[i] = 0
+    for c in range(p.count[0]):
+        for k in range(p.arity[c]):
+            ti.atomic_add(p.entry_start[p.node[c, k]], 1)
+    for part in range(SCAN):
+        total = 0
+        for i in range(part_first(part, p.n_nodes + 1, SCAN), part_first(part + 1, p.n_nodes + 1, SCAN)):
+            total += p.entry_start[i]
+        p.scan[part] = total
+    ti.loop_config(serialize=True)
+    for _ in range(1):
+        total = 0
+        for part in range(SCAN):
+            n = p.scan[part]
+            p.scan[part] = total
+            total += n
+    for part in range(SCAN):
+        total = p.scan[part]
+        for i in range(part_first(part, p.n_nodes + 1, SCAN), part_first(part + 1, p.n_nodes + 1, SCAN)):
+            total += p.entry_start[i]
+            p.entry_start[i] = total
+    for c in range(p.count[0]):
+        for k in range(p.arity[c]):
+            p.entry[ti.atomic_sub(p.entry_start[p.node[c, k]], 1) - 1] = p.width * c + k
+    for i in range(p.n_nodes):
+        first = p.entry_start[i]
+        for j in range(first + 1, p.entry_start[i + 1]):
+            entry, at = p.entry[j], j
+            while at > first and p.entry[at - 1] > entry:
+                p.entry[at] = p.entry[at - 1]
+                at -= 1
+            p.entry[at] = entry
+
+
+@ti.func
+def _index_serially(p: ti.template()):
     ti.loop_config(serialize=True)
     for _ in range(1):
         for i in range(p.n_nodes + 1):

@@ -150,16 +150,18 @@ def find_displacement(
         displacement[i] = m.state.x[i] - x_start[i]
     ti.loop_config(serialize=True)
     for _ in range(1):
-        largest = ti.cast(0.0, ti.f64)
-        for k in range(s.n_verts):
-            if s.node[k] >= 0:
-                d, searched = displacement[s.node[k]], s.move[k]
-                square = searched.dot(searched)
-                along = ti.cast(0.0, ti.f64)
-                if square > 0.0:
-                    along = ti.min(ti.max(d.dot(searched) / square, 0.0), 1.0)
-                largest = ti.max(largest, (d - along * searched).norm())
-        deviation[0] = largest
+        deviation[0] = 0.0
+    ti.loop_config(serialize=m.on_cpu)
+    for k in range(s.n_verts):
+        if s.node[k] >= 0:
+            d, searched = displacement[s.node[k]], s.move[k]
+            square = searched.dot(searched)
+            along = ti.cast(0.0, ti.f64)
+            if square > 0.0:
+                along = ti.min(ti.max(d.dot(searched) / square, 0.0), 1.0)
+            length = (d - along * searched).norm()
+            if length > deviation[0]:  # few do, and atomics on one address wait for each other
+                ti.atomic_max(deviation[0], length)
 
 
 def next_length(ratio: Callable[[float], float], remaining: float, length: float, longest: float, may_grow: bool) -> float:

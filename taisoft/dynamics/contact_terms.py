@@ -17,6 +17,7 @@ from taisoft.backend.runtime import kernel
 from taisoft.contact.build import LEAST_GAP, contact_offset_of, gap_minus_target
 from taisoft.contact.problem import RESIDUAL, ContactProblem, residual_of
 from taisoft.contact.prox import dvec, into_disk, prox, scaled
+from taisoft.fem.chunks import THREADS, block_total, share
 from taisoft.fem.model import Model
 from taisoft.fem.node_graph import n_nodes_of, node_of
 from taisoft.linear.block_csr import BLOCK
@@ -192,8 +193,8 @@ def impulse_on_node(k: ti.template(), i):
 
 
 @ti.func
-def sum_residual(k: ti.template()):
-    """Compute the residual of the laws over all contacts.
+def sum_residual(k: ti.template(), t, threads: ti.template()):
+    """Compute the residual of the laws over all contacts, by all threads t of a block.
 
     It is relative to all impulses, so that a light contact beside heavy ones could let its gap close. The largest part of its
     target, or of the contact offset if that is less, by which a gap ends short is therefore a residual, too: MAX_MISSED
@@ -201,11 +202,15 @@ def sum_residual(k: ti.template()):
     """
     p, w = ti.static((k.problem, k.work))
     sums, worst = ti.Vector([0.0, 0.0], ti.f64), ti.cast(0.0, ti.f64)
-    for c in range(p.count[0]):
-        one = w.prox_residual[c]
+    for j in range(share(t, p.count[0], threads)):
+        one = w.prox_residual[t + j * threads]
         sums += ti.Vector([one[0], one[1]], ti.f64)
         worst = ti.max(worst, one[2])
-    p.state[RESIDUAL] = ti.max(residual_of(sums), worst)
+    for j in ti.static(range(2)):
+        sums[j] = block_total(sums[j], t, threads, False)
+    worst = block_total(worst, t, threads, True)
+    if t == 0:
+        p.state[RESIDUAL] = ti.max(residual_of(sums), worst)
 
 
 @kernel
@@ -221,9 +226,14 @@ def update_impulses(m: ti.template(), k: ti.template(), new_multipliers: ti.i32,
         if new_multipliers == 1:
             set_multiplier(k, n)
         update_contact(m, k, n, beta, r_scale)
-    ti.loop_config(serialize=True)
-    for _ in range(1):
-        sum_residual(k)
+    if ti.static(p.on_cpu):
+        ti.loop_config(serialize=True)
+        for _ in range(1):
+            sum_residual(k, 0, 1)
+    else:
+        ti.loop_config(block_dim=THREADS)
+        for t in range(THREADS):
+            sum_residual(k, t, THREADS)
 
 
 @kernel

@@ -125,6 +125,17 @@ def prescribe_positions(m: ti.template(), s: ti.template(), row):
 
 
 @ti.func
+def prescribe_all(m: ti.template(), s: ti.template(), row, dt):
+    """`prescribe`, as top-level loops of a kernel: on the CPU on one thread, since several would take longer to start."""
+    if ti.static(m.on_cpu):
+        ti.loop_config(serialize=True)
+        for _ in range(1):
+            prescribe(m, s, row, dt)
+    else:
+        prescribe(m, s, row, dt)
+
+
+@ti.func
 def save_prescribed_positions(m: ti.template(), s: ti.template()):
     for k in range(s.n_prescribed):
         s.before[k] = m.state.x[s.prescribed_nodes[k]]
@@ -263,20 +274,16 @@ def restart_parallel(m: ti.template(), s: ti.template()):
 def drift_parallel(m: ti.template(), s: ti.template(), row: ti.i32, dt64: ti.f64):
     """Run the part of a sub-step before the element loop."""
     if ti.static(s.has_held):
-        for k in range(s.n_held):
-            s.held_velocity[k] = m.state.v[s.held[k]]
+        save_held_velocities(m, s)
     if ti.static(s.has_prescribed):
-        for k in range(s.n_prescribed):
-            s.before[k] = m.state.x[s.prescribed_nodes[k]]
+        save_prescribed_positions(m, s)
     if ti.static(s.verlet):
         for i in range(m.n_nodes):
             dt = ti.cast(dt64, m.real)
             verlet_drift(m, s, i, dt, verlet_half(m, s, i, dt))
         turn_all(m, s, dt64)
         if ti.static(s.has_prescribed):
-            ti.loop_config(serialize=True)
-            for _ in range(1):
-                prescribe(m, s, row, dt64)
+            prescribe_all(m, s, row, dt64)
     if ti.static(s.has_varied_loads):
         ti.loop_config(serialize=True)
         for _ in range(1):
@@ -305,20 +312,20 @@ def nodes_parallel(m: ti.template(), s: ti.template(), row: ti.i32, dt64: ti.f64
     else:
         turn_all(m, s, dt64)
     if ti.static(s.has_prescribed):
-        ti.loop_config(serialize=True)
-        for _ in range(1):
-            prescribe(m, s, row, dt64)
+        prescribe_all(m, s, row, dt64)
     place_all(m)
-    if ti.static(s.has_held):
-        ti.loop_config(serialize=True)
-        for _ in range(1):
-            compute_reactions(m, s, ti.cast(dt64, m.real))
     ti.loop_config(serialize=True)
     for _ in range(1):
         m.state.scalars[MOST_INVERTED] = ti.max(m.state.scalars[MOST_INVERTED], m.state.scalars[INVERTED_NOW])
         m.state.scalars[INVERTED_NOW] = 0.0
         if m.state.scalars[FAILED] == 0.0:
             m.state.scalars[STEPS_DONE] = m.state.scalars[STEPS_DONE] + 1.0
+
+
+@kernel
+def react_parallel(m: ti.template(), s: ti.template(), dt64: ti.f64):
+    """Compute the reactions of the last sub-step of a batch."""
+    compute_reactions(m, s, ti.cast(dt64, m.real))
 
 
 @kernel

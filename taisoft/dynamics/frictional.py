@@ -158,7 +158,7 @@ def _update_residual(m: ti.template(), s: ti.template(), k: ti.template(), beta,
     """Compute impulses, blocks and the laws' residual at the present x; return |r| on the free axes."""
     for c in range(k.problem.count[0]):
         update_contact(m, k, c, beta, r_scale)
-    sum_residual(k)
+    sum_residual(k, 0, 1)
     square = ti.cast(0.0, ti.f64)
     for i in range(m.n_nodes):
         square += node_residual(m, s, k, i)
@@ -176,7 +176,7 @@ def _advance(m: ti.template(), s: ti.template(), A: ti.template(), k: ti.templat
     linear_slope = slope
     for c in range(k.problem.count[0]):
         linear_slope += contact_slope(s, k, c, beta)
-    a = step_length(k, linear_slope, curvature, slope, r_scale)
+    a = step_length(k, linear_slope, curvature, slope, r_scale, 0, 1)
     for i in range(m.n_nodes):
         move_node_along(m, s, k, i, a, beta)
 

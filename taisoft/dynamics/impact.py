@@ -33,7 +33,7 @@ from taisoft.contact.problem import ContactProblem, to_world
 from taisoft.contact.prox import dvec
 from taisoft.contact.restitution import find_rebounds
 from taisoft.dynamics.simulation_state import SimulationState
-from taisoft.fem.chunks import part_first, total
+from taisoft.fem.chunks import chunk_entry, chunk_size, fold, total
 from taisoft.fem.lanes import mass_times
 from taisoft.fem.state import OTHER_SUM, SUM
 from taisoft.fem.terms import rayleigh_damping
@@ -110,11 +110,13 @@ def measure_impact(m: ti.template(), s: ti.template(), k: ti.template(), tau: ti
         if task % m.spread == 0:
             chunk = task // m.spread
             slope, curvature = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64)
-            for i in range(part_first(chunk, m.n_nodes, m.chunks), part_first(chunk + 1, m.n_nodes, m.chunks)):
+            for j in range(chunk_size(m, chunk, m.n_nodes)):
+                i = chunk_entry(m, chunk, j, m.n_nodes)
                 d = mass_times(m, i, s.change)
                 slope += d.dot(ti.cast(s.v_hat[i], ti.f64))
                 curvature += d.dot(s.change[i])
             m.state.partial[chunk, SUM], m.state.partial[chunk, OTHER_SUM] = slope, curvature
+    fold(m, SUM, OTHER_SUM, ())
     ti.loop_config(serialize=True)
     for _ in range(1):
         slope = total(m, SUM)

@@ -19,7 +19,7 @@ from taisoft.dynamics.contact_terms import (
     update_contact,
 )
 from taisoft.dynamics.stage import place_node
-from taisoft.fem.chunks import part_first, total
+from taisoft.fem.chunks import THREADS, block_total, chunk_entry, chunk_size, fold, share, total
 from taisoft.fem.state import OTHER_SUM, STEP_LENGTH, SUM
 from taisoft.linear.block_csr import block_times, off_diagonal_times
 from taisoft.linear.pcg_work import dot64
@@ -58,21 +58,27 @@ def end_linearised(m: ti.template(), s: ti.template(), k: ti.template(), accept:
 
 
 @ti.func
-def _slope(k: ti.template(), linear_slope, curvature, a, r_scale):
-    """Return the slope of the augmented Lagrangian at step length a. linear_slope: e.r_lin."""
+def _slope(k: ti.template(), linear_slope, curvature, a, r_scale, t, threads: ti.template()):
+    """Return the slope of the augmented Lagrangian at step length a, by all threads t of a block. linear_slope: e.r_lin."""
     p, w = ti.static((k.problem, k.work))
     slope = linear_slope + a * curvature
-    for c in range(p.count[0]):
+    if t > 0:
+        slope = 0.0
+    for j in range(share(t, p.count[0], threads)):
+        c = t + j * threads
         z = unprojected_impulse(k, c, w.velocity[c] + a * w.rate[c], r_scale)
         slope -= w.rate[c].dot(projected_impulse(k, c, z))
-    return slope
+    return block_total(slope, t, threads, False)
 
 
 @ti.func
-def step_length(k: ti.template(), linear_slope, curvature, start, r_scale):
-    """Return the root of the slope by the Illinois method; the slope increases if the matrix is positive definite."""
+def step_length(k: ti.template(), linear_slope, curvature, start, r_scale, t, threads: ti.template()):
+    """Return the root of the slope by the Illinois method; the slope increases if the matrix is positive definite.
+
+    All threads t of a block call it, with the same numbers.
+    """
     a, low, at_low, high, at_high = 1.0, 0.0, start, -1.0, 0.0
-    slope = _slope(k, linear_slope, curvature, a, r_scale)
+    slope = _slope(k, linear_slope, curvature, a, r_scale, t, threads)
     tries = 0
     while ti.abs(slope) > ROOT * ti.abs(start) and tries < TRIES and a < LONGEST:
         if slope > 0.0:
@@ -85,9 +91,26 @@ def step_length(k: ti.template(), linear_slope, curvature, start, r_scale):
             a *= 2.0
         else:
             a = low + (high - low) * ti.min(ti.max(at_low / (at_low - at_high), 0.01), 0.99)
-        slope = _slope(k, linear_slope, curvature, a, r_scale)
+        slope = _slope(k, linear_slope, curvature, a, r_scale, t, threads)
         tries += 1
     return a
+
+
+@ti.func
+def _find_step_length(m: ti.template(), k: ti.template(), r_scale, t, threads: ti.template()):
+    """Set STEP_LENGTH, by all threads t of a block, from the sums over the nodes and the contacts' rates."""
+    p, w = ti.static((k.problem, k.work))
+    start = total(m, SUM)
+    linear_slope = start
+    if t > 0:
+        linear_slope = 0.0
+    for j in range(share(t, p.count[0], threads)):
+        c = t + j * threads
+        linear_slope += w.rate[c].dot(p.r[c])
+    linear_slope = block_total(linear_slope, t, threads, False)
+    length = step_length(k, linear_slope, total(m, OTHER_SUM), start, r_scale, t, threads)
+    if t == 0:
+        m.state.scalars[STEP_LENGTH] = length
 
 
 @ti.func
@@ -151,38 +174,47 @@ def advance(
         if task % m.spread == 0:
             chunk = task // m.spread
             slope, curvature = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64)
-            for i in range(part_first(chunk, m.n_nodes, m.chunks), part_first(chunk + 1, m.n_nodes, m.chunks)):
+            for j in range(chunk_size(m, chunk, m.n_nodes)):
+                i = chunk_entry(m, chunk, j, m.n_nodes)
                 slope_i, curvature_i = node_slope(m, s, A, k, chunk, i)
                 slope += slope_i
                 curvature += curvature_i
             m.state.partial[chunk, SUM], m.state.partial[chunk, OTHER_SUM] = slope, curvature
+    fold(m, SUM, OTHER_SUM, ())
     ti.loop_config(serialize=p.serial)
     for c in range(p.count[0]):
         contact_slope(s, k, c, beta)
-    ti.loop_config(serialize=True)
-    for _ in range(1):
-        start = total(m, SUM)
-        linear_slope = start
-        for c in range(p.count[0]):
-            linear_slope += w.rate[c].dot(p.r[c])
-        m.state.scalars[STEP_LENGTH] = step_length(k, linear_slope, total(m, OTHER_SUM), start, r_scale)
+    if ti.static(m.on_cpu):
+        ti.loop_config(serialize=True)
+        for _ in range(1):
+            _find_step_length(m, k, r_scale, 0, 1)
+    else:
+        ti.loop_config(block_dim=THREADS)
+        for t in range(THREADS):
+            _find_step_length(m, k, r_scale, t, THREADS)
     ti.loop_config(serialize=m.serial)
     for i in range(m.n_nodes):
         move_node_along(m, s, k, i, m.state.scalars[STEP_LENGTH], beta)
     ti.loop_config(serialize=p.serial)
     for c in range(p.count[0]):
         update_contact(m, k, c, beta, r_scale)
-    ti.loop_config(serialize=True)
-    for _ in range(1):
-        sum_residual(k)
+    if ti.static(m.on_cpu):
+        ti.loop_config(serialize=True)
+        for _ in range(1):
+            sum_residual(k, 0, 1)
+    else:
+        ti.loop_config(block_dim=THREADS)
+        for t in range(THREADS):
+            sum_residual(k, t, THREADS)
     ti.loop_config(serialize=m.serial)
     for task in range(m.chunks * m.spread):
         if task % m.spread == 0:
             chunk = task // m.spread
             square = ti.cast(0.0, ti.f64)
-            for i in range(part_first(chunk, m.n_nodes, m.chunks), part_first(chunk + 1, m.n_nodes, m.chunks)):
-                square += node_residual(m, s, k, i)
+            for j in range(chunk_size(m, chunk, m.n_nodes)):
+                square += node_residual(m, s, k, chunk_entry(m, chunk, j, m.n_nodes))
             m.state.partial[chunk, SUM] = square
+    fold(m, SUM, SUM, ())
     ti.loop_config(serialize=True)
     for _ in range(1):
         norms[0] = total(m, SUM)

@@ -17,7 +17,7 @@ from taisoft.backend.arrays import Count, FieldArena, download, upload
 from taisoft.backend.runtime import kernel
 from taisoft.dynamics.contact_terms import impulse_on_node
 from taisoft.dynamics.impact import impact_residual
-from taisoft.fem.chunks import part_first, total
+from taisoft.fem.chunks import chunk_entry, chunk_size, fold, total
 from taisoft.fem.dependents import force_with_dependents
 from taisoft.fem.lanes import mass_times
 from taisoft.fem.model import Model
@@ -171,8 +171,8 @@ def move(
             chunk = task // m.spread
             n = n_nodes_of(m, s.pcg.subset)
             slope = ti.cast(0.0, ti.f64)
-            for at in range(part_first(chunk, n, m.chunks), part_first(chunk + 1, n, m.chunks)):
-                i = node_of(s.pcg.subset, at)
+            for at in range(chunk_size(m, chunk, n)):
+                i = node_of(s.pcg.subset, chunk_entry(m, chunk, at, n))
                 if mode == STEP:
                     slope += dot64(m.free[i] * s.residual[i], s.pcg.y[i])
                     s.base[i] = m.state.x[i]
@@ -183,6 +183,7 @@ def move(
                 if ti.static(kind == ELASTIC_STAGE):
                     set_change(m, s, i, c, beta)
             m.state.partial[chunk, OTHER_SUM] = slope
+    fold(m, OTHER_SUM, OTHER_SUM, ())
     if ti.static(kind == ELASTIC_STAGE):
         elasticity.sum_elements(m, s.pcg.subset)
     ti.loop_config(serialize=True)
@@ -213,8 +214,8 @@ def form_residual(
             chunk = task // m.spread
             n = n_nodes_of(m, s.pcg.subset)
             sums, slope = ti.Vector([0.0, 0.0, 0.0, 0.0, 0.0], ti.f64), ti.cast(0.0, ti.f64)
-            for at in range(part_first(chunk, n, m.chunks), part_first(chunk + 1, n, m.chunks)):
-                i = node_of(s.pcg.subset, at)
+            for at in range(chunk_size(m, chunk, n)):
+                i = node_of(s.pcg.subset, chunk_entry(m, chunk, at, n))
                 free = m.free[i]
                 zero = ti.Vector([0.0, 0.0, 0.0], m.real)
                 r, inertia, f, external = zero, zero, zero, zero
@@ -236,6 +237,7 @@ def form_residual(
             for j in ti.static(range(N_NORMS)):
                 m.state.partial[chunk, j] = sums[j]
             m.state.partial[chunk, SUM] = slope
+    fold(m, 0, SUM, ())
     ti.loop_config(serialize=True)  # outside of any loop, the sum would become a parallel loop of its own, 50 us and more
     for _ in range(1):
         for j in ti.static(range(N_NORMS) if kind == ELASTIC_STAGE else (0, 4)):

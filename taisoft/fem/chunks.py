@@ -1,12 +1,16 @@
 """Loops in chunks: each runs serially and has its own partial sums, so that results do not depend on threads.
 
-The number of chunks follows from the size of a scene alone. On the CPU one thread runs them in turn, or several share them.
+The number of chunks follows from the size of a scene alone. On the CPU one thread runs them in turn, or several share them, and
+a chunk has consecutive entries. On CUDA a chunk is a thread and takes every CHUNKS-th entry, so that threads that run side by
+side read memory side by side; there `fold` adds the partial sums in two stages, since one thread would take long.
 """
 
 import taichi as ti
 
 # Taichi gives each CPU thread at least 512 iterations of a loop: each chunk takes that many, and only the first does the work
 SPREAD = {"cpu": 512, "cuda": 1}
+FOLDED = 256  # partial sums that `fold` leaves on CUDA
+THREADS = 256  # CUDA threads that share a loop with sums which each of them needs
 
 
 @ti.func
@@ -22,9 +26,77 @@ def block_first(g: ti.template(), c, chunks: ti.template()):
 
 
 @ti.func
+def chunk_size(m: ti.template(), c, n):
+    """Return how many of n entries chunk c of the model's loops has."""
+    count = (n - c + m.chunks - 1) // m.chunks
+    if ti.static(m.on_cpu):
+        count = part_first(c + 1, n, m.chunks) - part_first(c, n, m.chunks)
+    return count
+
+
+@ti.func
+def chunk_entry(m: ti.template(), c, k, n):
+    """Return the index of the k-th of these entries."""
+    at = c + k * m.chunks
+    if ti.static(m.on_cpu):
+        at = part_first(c, n, m.chunks) + k
+    return at
+
+
+@ti.func
+def fold(m: ti.template(), first: ti.template(), last: ti.template(), least: ti.template()):
+    """Prepare `total` of columns first to last, as a top-level loop of a kernel: nothing on the CPU.
+
+    least: columns (tuple) whose least entry is wanted, not the sum.
+    """
+    if ti.static(not m.on_cpu):
+        for k in range(m.sums):
+            for column in ti.static(range(first, last + 1)):
+                s = m.state.partial[k, column]
+                for j in range(1, (m.chunks - k + FOLDED - 1) // FOLDED):
+                    entry = m.state.partial[k + FOLDED * j, column]
+                    if ti.static(column in least):
+                        s = ti.min(s, entry)
+                    else:
+                        s += entry
+                m.state.partial[k, column] = s
+
+
+@ti.func
 def total(m: ti.template(), column: ti.template()):
-    """Sum of a column of the model's partial sums, in a fixed order."""
+    """Sum of a column of the model's partial sums, in a fixed order, after `fold`."""
     s = ti.cast(0.0, ti.f64)
-    for c in range(m.chunks):
+    for c in range(m.sums):
         s += m.state.partial[c, column]
     return s
+
+
+@ti.func
+def share(t, n, threads: ti.template()):
+    """Return how many of n entries thread t takes: t, t + threads and so on."""
+    return (n - t + threads - 1) // threads
+
+
+@ti.func
+def block_total(value, t, threads: ti.template(), largest: ti.template()):
+    """Sum of the f64 values of all threads t of a block, in a fixed order, or with `largest` the largest value.
+
+    All threads must call it together. It is the value itself if there is one thread.
+    """
+    result = value
+    if ti.static(threads > 1):
+        shared = ti.simt.block.SharedArray((threads,), ti.f64)
+        shared[t] = value
+        ti.simt.block.sync()
+        half = threads // 2
+        while half > 0:
+            if t < half:
+                if ti.static(largest):
+                    shared[t] = ti.max(shared[t], shared[t + half])
+                else:
+                    shared[t] = shared[t] + shared[t + half]
+            ti.simt.block.sync()
+            half //= 2
+        result = shared[0]
+        ti.simt.block.sync()
+    return result

@@ -3,7 +3,7 @@
 import taichi as ti
 
 from taisoft.backend.runtime import kernel
-from taisoft.fem.chunks import block_first, part_first
+from taisoft.fem.chunks import chunk_entry, chunk_size, fold
 from taisoft.fem.lanes import broadcast, mass_times
 from taisoft.fem.mean_dilatation import find_dilatations
 from taisoft.fem.state import ELASTIC, FIRST_SOFTENED, GRAVITY, KINETIC, LOADS, MIN_J, N_INVERTED
@@ -12,6 +12,8 @@ from taisoft.fem.terms.elasticity import HUGE
 
 NO_TET = 2**31 - 1  # above any tet index
 SCALARS = (ELASTIC, MIN_J, N_INVERTED, KINETIC, GRAVITY, LOADS, FIRST_SOFTENED)
+FIRST, LAST = min(SCALARS), max(SCALARS)
+LEAST = (MIN_J, FIRST_SOFTENED)  # of the partial values of these the least counts, of the others the sum
 
 
 @ti.func
@@ -47,7 +49,8 @@ def measure(m: ti.template()):
             no_tets = broadcast(ti.cast(NO_TET, ti.i32), m.lanes)
             softened = no_tets
             for g in ti.static(m.groups):
-                for b in range(block_first(g, c, m.chunks), block_first(g, c + 1, m.chunks)):
+                for k in range(chunk_size(m, c, g.last - g.first)):
+                    b = g.first + chunk_entry(m, c, k, g.last - g.first)
                     psi, J, soft = elasticity.element_energy(m, g, b)
                     energy += psi
                     lowest = ti.min(lowest, J)
@@ -58,7 +61,8 @@ def measure(m: ti.template()):
             m.state.partial[c, MIN_J] = _lane_min(lowest)
             m.state.partial[c, N_INVERTED] = ti.cast(_lane_sum(inverted), ti.f64)
             kinetic, weight, loads = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64)
-            for i in range(part_first(c, m.n_nodes, m.chunks), part_first(c + 1, m.n_nodes, m.chunks)):
+            for k in range(chunk_size(m, c, m.n_nodes)):
+                i = chunk_entry(m, c, k, m.n_nodes)
                 kinetic += 0.5 * ti.cast(m.state.v[i], ti.f64).dot(mass_times(m, i, m.state.v))
                 weight += gravity.energy(m, i)
                 if ti.static(m.loaded):
@@ -67,13 +71,14 @@ def measure(m: ti.template()):
                     loads += pressure.energy(m, i)
             m.state.partial[c, KINETIC], m.state.partial[c, GRAVITY], m.state.partial[c, LOADS] = kinetic, weight, loads
             m.state.partial[c, FIRST_SOFTENED] = ti.cast(_lane_min(softened), ti.f64)
+    fold(m, FIRST, LAST, LEAST)
     ti.loop_config(serialize=True)
     for _ in range(1):
         for k in ti.static(SCALARS):
             total = m.state.partial[0, k]
-            for c in range(1, m.chunks):
+            for c in range(1, m.sums):
                 value = m.state.partial[c, k]
-                if ti.static(k == MIN_J or k == FIRST_SOFTENED):
+                if ti.static(k in LEAST):
                     total = ti.min(total, value)
                 else:
                     total += value

@@ -16,7 +16,7 @@ from taisoft.backend import parallel
 from taisoft.backend.arrays import Count, FieldArena, download, upload
 from taisoft.backend.runtime import Runtime
 from taisoft.fem import reference, springs
-from taisoft.fem.chunks import SPREAD
+from taisoft.fem.chunks import FOLDED, SPREAD
 from taisoft.fem.dependents import DependentTable, build_dependents, dependent_table
 from taisoft.fem.laws import LAWS
 from taisoft.fem.loads import SceneLoads
@@ -35,7 +35,7 @@ from taisoft.scene.scene import Body, Scene
 # Quadrature points from which loops on the CPU are divided into chunks; below, one thread is faster on every machine
 CHUNKED_FROM = 20_000
 LOOP_SECONDS = 3e-9  # of one thread per quadrature point, in the loops with least work
-CHUNKS = {"cpu": 32, "cuda": 4096}
+CHUNKS = {"cpu": 32, "cuda": 65_536}
 # |Dm| |Dm^-1| above which F is formed in f64: in f32 its rounding error, 6e-8 times this number, would be a strain above 6e-6.
 # Regular tets have 3, those of a sheet whose cells are 30 times as wide as thick about 60
 ILL_CONDITIONED = 100.0
@@ -121,6 +121,11 @@ class Model:
     def spread(self) -> int:
         """Iterations of a loop per chunk, see `fem.chunks`."""
         return 1 if self.serial else SPREAD["cpu" if self.on_cpu else "cuda"]
+
+    @property
+    def sums(self) -> int:
+        """Partial sums that `fem.chunks.total` adds."""
+        return self.chunks if self.on_cpu else min(self.chunks, FOLDED)
 
     @property
     def has_dependents(self) -> bool:

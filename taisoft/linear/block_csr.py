@@ -17,7 +17,7 @@ from taisoft.backend.arrays import Count, FieldArena, download
 from taisoft.backend.runtime import kernel
 from taisoft.errors import SimulationError
 from taisoft.fem import rigid_tets, springs
-from taisoft.fem.chunks import part_first
+from taisoft.fem.chunks import chunk_entry, chunk_size
 from taisoft.fem.model import Model
 from taisoft.fem.node_graph import BLOCKS, EDGES, block_of, count_of, edge_of, n_nodes_of, node_of
 from taisoft.fem.pattern import MATRIX_BLOCKS, model_graph
@@ -300,7 +300,8 @@ def multiply(m: ti.template(), A: ti.template(), x: ti.template(), y: ti.templat
     for task in range(m.chunks * m.spread):
         if task % m.spread == 0:
             c = task // m.spread
-            for i in range(part_first(c, m.n_nodes, m.chunks), part_first(c + 1, m.n_nodes, m.chunks)):
+            for k in range(chunk_size(m, c, m.n_nodes)):
+                i = chunk_entry(m, c, k, m.n_nodes)
                 y[i] = row_times(m, A, c, i, x)
 
 

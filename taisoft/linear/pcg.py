@@ -55,7 +55,8 @@ def solve(
                 start_parallel(m, A, coupling, w, tolerance, int(same_matrix))
             if max_iterations > 0 and w.state[STATUS] == RUNNING:
                 iterate_parallel(m, A, coupling, w, tolerance)
-        done, status = int(w.state[COUNT]), int(w.state[STATUS])
+        state = w.state.to_numpy()
+        done, status = int(state[COUNT]), int(state[STATUS])
         if status != RUNNING or done >= max_iterations:
             return LinearResult(done, status == CONVERGED, status == NEGATIVE)
 

@@ -3,7 +3,7 @@
 import taichi as ti
 
 from taisoft.backend.runtime import kernel
-from taisoft.fem.chunks import part_first, total
+from taisoft.fem.chunks import chunk_entry, chunk_size, fold, total
 from taisoft.fem.node_graph import n_nodes_of, node_of
 from taisoft.fem.state import OTHER_SUM, SUM
 from taisoft.linear.block_csr import block_times, off_diagonal_times
@@ -24,19 +24,14 @@ from taisoft.linear.pcg_work import (
 )
 
 
-@ti.func
-def _first(m: ti.template(), w: ti.template(), c):
-    """First place of chunk c in the list of the system's nodes."""
-    return part_first(c, n_nodes_of(m, w.subset), m.chunks)
-
-
 @kernel
 def start_jacobi(m: ti.template(), A: ti.template(), k: ti.template(), w: ti.template(), same_matrix: ti.i32):
     """Set the diagonal and its inverse B, y = 0, r = rhs, z = p = B r."""
     for c in range(m.chunks):
         s = ti.cast(0.0, ti.f64)
-        for at in range(_first(m, w, c), _first(m, w, c + 1)):
-            i = node_of(w.subset, at)
+        n = n_nodes_of(m, w.subset)
+        for at in range(chunk_size(m, c, n)):
+            i = node_of(w.subset, chunk_entry(m, c, at, n))
             precondition(m, A, k, w, i, same_matrix)
             r = m.free[i] * w.rhs[i]
             z = block_times(w.inverse[i], r)
@@ -44,6 +39,7 @@ def start_jacobi(m: ti.template(), A: ti.template(), k: ti.template(), w: ti.tem
             w.r[i], w.z[i], w.p[i] = r, z, z
             s += dot64(r, z)
         m.state.partial[c, SUM] = s
+    fold(m, SUM, SUM, ())
     ti.loop_config(serialize=True)
     for _ in range(1):
         rz = total(m, SUM)
@@ -59,10 +55,9 @@ def iterate_jacobi(m: ti.template(), A: ti.template(), k: ti.template(), w: ti.t
     for c in range(m.chunks):
         s = ti.cast(0.0, ti.f64)
         if w.state[STATUS] == RUNNING:
-            for at in range(
-                part_first(c, n_nodes_of(m, w.subset), m.chunks), part_first(c + 1, n_nodes_of(m, w.subset), m.chunks)
-            ):
-                i = node_of(w.subset, at)
+            n = n_nodes_of(m, w.subset)
+            for at in range(chunk_size(m, c, n)):
+                i = node_of(w.subset, chunk_entry(m, c, at, n))
                 product = off_diagonal_times(m, A, 0, i, w.p)
                 if ti.static(k.width > 0):
                     product += block_times(k.base[i], w.p[i]) + gather_products(m, k, i)
@@ -72,6 +67,7 @@ def iterate_jacobi(m: ti.template(), A: ti.template(), k: ti.template(), w: ti.t
                 w.q[i] = q
                 s += dot64(w.p[i], q)
         m.state.partial[c, SUM] = s
+    fold(m, SUM, SUM, ())
     ti.loop_config(serialize=True)
     for _ in range(1):
         if w.state[STATUS] == RUNNING:
@@ -88,16 +84,16 @@ def iterate_jacobi(m: ti.template(), A: ti.template(), k: ti.template(), w: ti.t
         s = ti.cast(0.0, ti.f64)
         if w.state[STATUS] == RUNNING:
             a = ti.cast(w.state[STEP], m.real)
-            for at in range(
-                part_first(c, n_nodes_of(m, w.subset), m.chunks), part_first(c + 1, n_nodes_of(m, w.subset), m.chunks)
-            ):
-                i = node_of(w.subset, at)
+            n = n_nodes_of(m, w.subset)
+            for at in range(chunk_size(m, c, n)):
+                i = node_of(w.subset, chunk_entry(m, c, at, n))
                 w.y[i] = w.y[i] + a * w.p[i]
                 r = w.r[i] - a * w.q[i]
                 z = block_times(w.inverse[i], r)
                 w.r[i], w.z[i] = r, z
                 s += dot64(r, z)
         m.state.partial[c, OTHER_SUM] = s
+    fold(m, OTHER_SUM, OTHER_SUM, ())
     ti.loop_config(serialize=True)
     for _ in range(1):
         if w.state[STATUS] == RUNNING:
@@ -107,12 +103,14 @@ def iterate_jacobi(m: ti.template(), A: ti.template(), k: ti.template(), w: ti.t
             w.state[COUNT] = w.state[COUNT] + 1.0
             if rz <= tolerance * tolerance * w.state[RZ_START]:
                 w.state[STATUS] = CONVERGED
-    for at in range(n_nodes_of(m, w.subset)):
-        i = node_of(w.subset, at)
-        if w.state[STATUS] == RUNNING:
-            w.p[i] = w.z[i] + ti.cast(w.state[STEP], m.real) * w.p[i]
-        elif w.state[STATUS] == NEGATIVE_PENDING:
-            w.y[i] = w.y[i] + ti.cast(w.state[STEP], m.real) * w.p[i]
+    for c in range(m.chunks):  # a loop over the nodes would take a launch more, since their number is only known on the device
+        n = n_nodes_of(m, w.subset)
+        for at in range(chunk_size(m, c, n)):
+            i = node_of(w.subset, chunk_entry(m, c, at, n))
+            if w.state[STATUS] == RUNNING:
+                w.p[i] = w.z[i] + ti.cast(w.state[STEP], m.real) * w.p[i]
+            elif w.state[STATUS] == NEGATIVE_PENDING:
+                w.y[i] = w.y[i] + ti.cast(w.state[STEP], m.real) * w.p[i]
     ti.loop_config(serialize=True)
     for _ in range(1):
         if w.state[STATUS] == NEGATIVE_PENDING:

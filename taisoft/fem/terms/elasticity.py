@@ -92,10 +92,15 @@ def count_inverted(m: ti.template(), b, J):
 
 @ti.func
 def record_volumes(m: ti.template(), J, bad):
-    """Update the scalars LOWEST_J and INVERTED_NOW by lanes of J and of inverted tets; set FAILED if a tet has exploded."""
+    """Update the scalars LOWEST_J and INVERTED_NOW by lanes of J and of inverted tets; set FAILED if a tet has exploded.
+
+    Most tets change neither, and atomics on one address wait for each other.
+    """
     low, count = lowest_and_count(m, J, bad)
-    ti.atomic_min(m.state.scalars[LOWEST_J], ti.cast(low, ti.f64))
-    ti.atomic_add(m.state.scalars[INVERTED_NOW], ti.cast(count, ti.f64))
+    if ti.cast(low, ti.f64) < m.state.scalars[LOWEST_J]:
+        ti.atomic_min(m.state.scalars[LOWEST_J], ti.cast(low, ti.f64))
+    if count > 0:
+        ti.atomic_add(m.state.scalars[INVERTED_NOW], ti.cast(count, ti.f64))
     if not low > -EXPLODED:
         m.state.scalars[FAILED] = 1.0
 
