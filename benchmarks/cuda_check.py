@@ -21,9 +21,11 @@ from collections import Counter
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
 
 from taisoft.files import write_bytes
+from taisoft.machine import usable_cores
 from taisoft.output.files import make_folder
 from taisoft.output.report import json_text
 
@@ -34,6 +36,7 @@ from .runner import RESULT, make_parser, parse_result
 ROOT = Path(__file__).resolve().parent.parent
 BUDGET = 470.0  # seconds for all parts: ten less than eight minutes
 LAST_LINES = 15  # of a failed process's output
+TESTS, RESULTS = "tests/test_arch.py", "PASSED|FAILED|ERROR|SKIPPED|XFAIL"
 
 
 @dataclass(frozen=True)
@@ -60,7 +63,8 @@ class Outcome:
 def make_parts(arch: str, quick: bool) -> list[Part]:
     """All parts, the most important first."""
     child = (sys.executable, "-m", "taisoft", "bench", "cuda_check", "--arch", arch, *(("--quick",) if quick else ()), "--job")
-    pytest = (sys.executable, "-m", "pytest", "-v", "--tb=short", "-p", "no:cacheprovider", "-m", "cuda", "tests/test_arch.py")
+    side_by_side = ("-n", str(min(8, len(usable_cores())))) if find_spec("xdist") else ()  # most of their time is compilation
+    pytest = (sys.executable, "-m", "pytest", "-v", "--tb=short", "-p", "no:cacheprovider", *side_by_side, "-m", "cuda", TESTS)
     return [
         Part("tests", "Tests marked cuda", pytest, 150.0),
         *(Part(name, title, (*child, name), seconds) for name, (title, seconds, _) in JOBS.items()),
@@ -103,9 +107,10 @@ def run_part(part: Part, limit: float) -> Outcome:
 
 
 def parse_test(line: str) -> dict | None:
-    """The test and its result in a line of `pytest -v`, None in any other line."""
-    match = re.match(r"\S+?::(.+) (PASSED|FAILED|ERROR|SKIPPED|XFAIL)\b", line)
-    return {"test": match[1], "result": match[2].lower()} if match else None
+    """The test and its result in a line of `pytest -v`, with or without xdist, None in any other line."""
+    match = re.match(rf"\S+?::(?P<test>.+) (?P<result>{RESULTS})\b", line)
+    match = match or re.match(rf"\[gw\d+\] \[ *\d+%\] (?P<result>{RESULTS}) \S+?::(?P<test>.+?) *$", line)
+    return {"test": match["test"], "result": match["result"].lower()} if match else None
 
 
 def gpu_name() -> str:
@@ -179,6 +184,7 @@ COLUMNS: dict[str, tuple] = {
     "sizes": (
         ("tets", cell("tets", ",")),
         ("<integrator", cell("integrator")),
+        ("<arch", cell("arch")),
         ("step [ms]", or_failure(cell("step_ms", ".3g"))),
         ("ns/tet", lambda one: "" if "failure" in one else f"{1e6 * one['step_ms'] / one['tets']:.3g}"),
         ("Newton/CG", lambda one: "" if "failure" in one else f"{one['newton']}/{one['linear']}"),

@@ -9,6 +9,7 @@ import numpy as np
 import taisoft as ts
 from taisoft import changes
 from taisoft.backend.runtime import open_runtime
+from taisoft.dynamics.schemes import EXPLICIT
 from taisoft.errors import TaisoftError
 from taisoft.scene.scene import Scene
 from taisoft.study.measure import advance, warm_up
@@ -28,6 +29,7 @@ TIMED_STEPS, IMPLICIT_STEPS = 200, 3
 SMALL = 4  # cells across the small beam; its stable step is scaled to larger ones
 PLATES, QUICK_PLATES = (8, 32, 64, 128, 192), (4,)
 SIZES, QUICK_SIZES = (37, 58), (6,)  # cells across a beam of 20 n^3 tets: 1.0 and 3.9 million
+CUBES, QUICK_CUBES = 100_000, 640  # tets, about
 RERUNS = 3
 
 
@@ -84,14 +86,20 @@ def sweeps(arch: str, quick: bool) -> Iterator[dict]:
 
 
 def sizes(arch: str, quick: bool) -> Iterator[dict]:
-    """Explicit and implicit steps of large beams."""
+    """Explicit and implicit steps of large beams, and steps with contacts on `arch` and on the CPU of the same machine."""
     with ts.Simulator(beam_scene((4 * SMALL, SMALL, SMALL), "SNH"), dt=1e-6, integrator="velocity_verlet", arch=arch) as sim:
         limit = sim.stable_dt
     scenes = {n: beam_scene((4 * n, n, n), "SNH") for n in (QUICK_SIZES if quick else SIZES)}
     for integrator in ("velocity_verlet", "bdf2"):
         for n, scene in scenes.items():
             dt = 0.01 if integrator == "bdf2" else 0.8 * MARGIN * limit * SMALL / n
-            yield {"tets": 20 * n**3, "integrator": integrator} | _timed_size(scene, integrator, dt, arch)
+            yield {"tets": 20 * n**3, "integrator": integrator, "arch": arch} | _timed_size(scene, integrator, dt, arch)
+    for integrator, dt in (("implicit_euler", 0.005), ("symplectic_euler", 1e-4)):
+        for where in dict.fromkeys((arch, "cpu")):
+            scene = cubes_on_ground(QUICK_CUBES if quick else CUBES)
+            tets = sum(body.mesh.n_tets for body in scene.bodies)
+            named = {"tets": tets, "integrator": f"{integrator}, contacts", "arch": where}
+            yield named | _timed_size(scene, integrator, dt, where)
 
 
 def _timed_size(scene: Scene, integrator: str, dt: float, arch: str) -> dict:
@@ -103,7 +111,7 @@ def _timed_size(scene: Scene, integrator: str, dt: float, arch: str) -> dict:
         with sim:
             build = perf_counter() - start - sim.compile_seconds
             warm_up(sim)
-            timed_run = advance(sim, TIMED_STEPS if integrator == "velocity_verlet" else IMPLICIT_STEPS)
+            timed_run = advance(sim, TIMED_STEPS if integrator in EXPLICIT else IMPLICIT_STEPS)
             return {
                 "step_ms": 1e3 * timed_run.seconds / timed_run.steps,
                 "steps": timed_run.steps,

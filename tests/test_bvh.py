@@ -7,8 +7,11 @@ random, swept, sent far away and made not finite.
 * with k = 6 the candidates are those by brute force and by spatial hash, serial in f64 and parallel in f32;
 * with k = 14 and 18 they are a proper subset that contains every pair within the margin;
 * the chunk size does not change them;
+* boxes and active triangles found by many threads, as on CUDA, are those of one;
 * small buffers grow to the same result, or raise an error with the size needed and the limit.
 """
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -16,6 +19,7 @@ from surfaces import brute_pairs, pairs_of, place, sheet, soup, surface_of
 
 from taisoft.collision.bvh import DIRECTIONS, Bvh, build_trees
 from taisoft.collision.spatial_hash import SpatialHash
+from taisoft.collision.surface import ACTIVE, NONFINITE, update_boxes
 from taisoft.errors import SimulationError
 
 EMPTY = (np.zeros((3, 3)), np.zeros((0, 3), dtype=int))
@@ -133,6 +137,22 @@ def test_chunk_size_does_not_change_the_candidates(rig):
         tree = Bvh(rig.surface, rig.topology, rig.x0, rig.margin, rig.machine, arena, leaves=leaves)
         assert np.array_equal(pairs_of(tree.find()), expected)
         tree.release()
+
+
+def test_boxes_and_active_triangles_by_many_threads(rig):
+    rng, s = np.random.default_rng(10), rig.surface
+    n_active = set()
+    for kind in range(10):
+        scatter(rng, rig, kind)
+        made = []
+        for surface in (s, replace(s, on_cpu=False)):
+            update_boxes(surface, rig.margin)
+            boxes = [f.to_numpy() for f in (s.lo, s.hi, s.body_lo, s.body_hi)]
+            made.append((*boxes, s.active.to_numpy()[: s.count[ACTIVE]], s.count[NONFINITE]))
+        assert all(np.array_equal(a, b) for a, b in zip(*made))
+        assert (made[0][-1] > 0) == (kind % 5 == 3)
+        n_active.add(len(made[0][-2]))
+    assert len(n_active) > 5
 
 
 def test_refit_by_levels(rig):

@@ -2,23 +2,25 @@
 
 * every integrator gives the same bits on one thread and on several, with and without contacts, damping and mean dilatation; the
   chunks themselves change only rounding;
-* the chunks of a list are disjoint, in order and cover it;
+* the chunks of a list are disjoint, in order and cover it; sums and least values by chunks are those of the list;
 * the gain by threads is measured once, kept unless other programs may have hidden it, and measured again where the file is
   unusable.
 """
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import taichi as ti
-from scenes import driven_scene, mixed_scene, use_threads
+from scenes import built, driven_scene, mixed_scene, use_threads
 
 import taisoft as ts
 from taisoft.backend import parallel
+from taisoft.backend.arrays import FieldArena
 from taisoft.backend.runtime import kernel, open_runtime, threads
-from taisoft.fem.chunks import part_first
-from taisoft.fem.state import N_COLUMNS
+from taisoft.fem.chunks import FOLDED, chunk_entry, chunk_size, fold, part_first, total
+from taisoft.fem.state import N_COLUMNS, OTHER_SUM, SUM
 
 
 def pile() -> ts.Scene:
@@ -95,6 +97,39 @@ def test_chunks_cover_a_list_in_order(n):
         runtime.close()
     sizes = np.diff(first)
     assert first[0] == 0 and first[-1] == n and sizes.min() >= 0 and sizes.max() - sizes.min() <= 1
+
+
+@kernel
+def sum_entries(m: ti.template(), values: ti.types.ndarray(), out: ti.types.ndarray()):
+    """Sum and least of the values by chunks, and how often each was taken."""
+    for c in range(m.chunks):
+        s, least = ti.cast(0.0, ti.f64), ti.cast(1e9, ti.f64)
+        for k in range(chunk_size(m, c, values.shape[0])):
+            i = chunk_entry(m, c, k, values.shape[0])
+            s += values[i]
+            least = ti.min(least, values[i])
+            out[2 + i] += 1.0
+        m.state.partial[c, SUM], m.state.partial[c, OTHER_SUM] = s, least
+    fold(m, SUM, OTHER_SUM, (OTHER_SUM,))
+    ti.loop_config(serialize=True)
+    for _ in range(1):
+        out[0], out[1] = total(m, SUM), m.state.partial[0, OTHER_SUM]
+        for c in range(1, m.sums):
+            out[1] = ti.min(out[1], m.state.partial[c, OTHER_SUM])
+
+
+@pytest.mark.parametrize(("on_cpu", "chunks"), [(True, 32), (False, 8), (False, 4 * FOLDED)])
+@pytest.mark.parametrize("n", [0, 1, 100, 9999])
+def test_sums_over_chunks(on_cpu, chunks, n):
+    """Also as on CUDA, where a chunk takes every so-many-th entry and the partial sums are folded."""
+    with built(mixed_scene(), "f64") as rig:
+        arena = FieldArena()
+        partial = arena.field("partial", ti.f64, (chunks, N_COLUMNS))
+        model = replace(rig.model, on_cpu=on_cpu, chunks=chunks, state=replace(rig.model.state, partial=partial))
+        values, out = np.random.default_rng(n).integers(-99, 99, n).astype(np.float64), np.zeros(n + 2)
+        sum_entries(model, values, out)
+        assert out[0] == values.sum() and out[1] == values.min(initial=1e9) and (out[2:] == 1.0).all()
+        arena.release()
 
 
 @pytest.fixture

@@ -4,8 +4,11 @@
 * contacts of a matrix are adjacent if either block between them is not zero;
 * colourings give adjacent contacts different colours, number them without gaps and use at most degree + 1;
 * random colourings depend on the seed alone; the kernels colour first-fit in the order of priorities, on any number of threads;
-* groups hold every contact once, by colour.
+* groups hold every contact once, by colour;
+* the index of each node's contacts made for many threads, as on CUDA, is the serial one.
 """
+
+from dataclasses import replace
 
 import contact_oracle as oracle
 import networkx as nx
@@ -150,3 +153,22 @@ def test_groups():
     colour = np.array([1, 0, 2, 1, 0, 1])
     order, start = groups(colour)
     assert order.tolist() == [1, 4, 0, 3, 5, 2] and start.tolist() == [0, 2, 5, 6]
+
+
+@pytest.mark.parametrize("n", [0, 1, 300])
+def test_index_for_many_threads(problems, n):
+    for p in problems:
+        if n:
+            fill(p, oracle.random_contacts(9, n, N_NODES))
+        p.count[0] = n
+        problem.index_nodes(p)
+        start, entry = p.entry_start.to_numpy(), p.entry.to_numpy()
+        arena = FieldArena()
+        scan = arena.field("scan", p.count.dtype, problem.SCAN)
+        p.entry_start.fill(-1)
+        p.entry.fill(-1)
+        problem.index_nodes(replace(p, on_cpu=False, scan=scan))
+        assert np.array_equal(p.entry_start.to_numpy(), start)
+        assert np.array_equal(p.entry.to_numpy()[: start[-1]], entry[: start[-1]])
+        assert start[-1] == p.arity.to_numpy()[:n].sum()
+        arena.release()

@@ -128,6 +128,8 @@ def test_tables(name):
 def test_lines_of_pytest_are_parsed():
     line = "tests/test_arch.py::test_operator[cuda-f32] PASSED                  [ 10%]"
     assert parse_test(line) == {"test": "test_operator[cuda-f32]", "result": "passed"}
+    line = "[gw3] [ 40%] PASSED tests/test_arch.py::test_steps_with_contacts[cuda-bdf2 auto] "
+    assert parse_test(line) == {"test": "test_steps_with_contacts[cuda-bdf2 auto]", "result": "passed"}
     assert parse_test("tests/test_arch.py::test_a[cuda-b c] FAILED") == {"test": "test_a[cuda-b c]", "result": "failed"}
     assert parse_test("collected 15 items") is None and parse_test("FAILED tests/test_arch.py::test_a - AssertionError") is None
 

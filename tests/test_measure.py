@@ -86,7 +86,7 @@ def test_explicit_frames_and_implicit_steps_are_measured_once(integrator):
 def model_of(law: str, tets: int, damped: bool = False) -> SimpleNamespace:
     """The attributes of a model that determine the time of its sub-steps."""
     group = SimpleNamespace(law=LAWS[law], first=0, last=tets // 4, n_points=1)
-    return SimpleNamespace(groups=(group,), lanes=4, stiffness_damping=damped)
+    return SimpleNamespace(groups=(group,), lanes=4, stiffness_damping=damped, on_cpu=True)
 
 
 def test_sub_steps_per_launch_follow_from_the_launch_time():

@@ -21,6 +21,7 @@ from taisoft.fem.chunks import SPREAD, part_first
 SERIAL_BELOW = 1500  # triangles below which one thread is faster than starting the others (about 50 us a loop)
 # Of one thread per triangle: in the loops over nearby pairs, and in cheap loops (boxes, tree refit, sharp edges, reduction)
 TRIANGLE_SECONDS, CHEAP_SECONDS = 5e-7, 5e-9
+NOT_FINITE = 0x7FF  # exponent bits of infinite f64 numbers and of those that are no numbers
 CHUNKS = {"cpu": 64, "cuda": 4096}  # chunks of a list that are processed in parallel, each with its own part of a buffer
 NONFINITE, ACTIVE, PAIRS = 0, 1, 2  # indices into Surface.count
 INSIDE_BITS = 31  # of Surface.inside; one vertex is almost never inside two colliders with the same bit
@@ -201,6 +202,12 @@ def _move_soft(
 
 
 @ti.func
+def _exponent(value):
+    """Exponent bits of an f64. (CUDA's compiler takes 0 times a number for 0, also if it is not finite.)"""
+    return ti.cast((ti.bit_cast(value, ti.i64) >> 52) & NOT_FINITE, ti.i32)
+
+
+@ti.func
 def _box_triangles(s: ti.template(), margin):
     """Compute boxes, normals and areas of the triangles, and count the non-finite ones."""
     s.count[NONFINITE] = 0
@@ -214,13 +221,9 @@ def _box_triangles(s: ti.template(), margin):
         length = n.norm()
         s.area[t] = length
         s.normal[t] = ti.select(length > 0.0, n / length, 0.0)
-        finite = 1
-        for q in ti.static(range(3)):  # 0 times a non-finite number is nan
-            zero = 0.0 * a[q] + 0.0 * b[q] + 0.0 * c[q] + 0.0 * a1[q] + 0.0 * b1[q] + 0.0 * c1[q]
-            if not zero == 0.0:
-                finite = 0
+        total = a + b + c + a1 + b1 + c1  # not finite if any is not, or if some are beyond 1e307
         lo, hi = dvec(ti.math.inf), dvec(-ti.math.inf)
-        if finite == 1:
+        if ti.max(_exponent(total[0]), _exponent(total[1]), _exponent(total[2])) < NOT_FINITE:
             lo = ti.min(a, b, c, a1, b1, c1) - half
             hi = ti.max(a, b, c, a1, b1, c1) + half
         else:
@@ -310,16 +313,13 @@ def _list_active(s: ti.template()):
     else:
         for c in range(s.chunks):
             s.part[c] = _list_active_of(s, c, 0, 0)
-        ti.loop_config(serialize=True)
-        for _ in range(1):
-            total = 0
-            for c in range(s.chunks):
-                n = s.part[c]
-                s.part[c] = total
-                total += n
-            s.count[ACTIVE] = total
         for c in range(s.chunks):
-            _list_active_of(s, c, s.part[c], 1)
+            first = 0  # many threads that sum take less time than one that stores prefix sums
+            for k in range(c):
+                first += s.part[k]
+            n = _list_active_of(s, c, first, 1)
+            if c == s.chunks - 1:
+                s.count[ACTIVE] = first + n
 
 
 @ti.func

@@ -320,15 +320,10 @@ def _index_in_parallel(p: ti.template()):
         for i in range(part_first(part, p.n_nodes + 1, SCAN), part_first(part + 1, p.n_nodes + 1, SCAN)):
             total += p.entry_start[i]
         p.scan[part] = total
-    ti.loop_config(serialize=True)
-    for _ in range(1):
-        total = 0
-        for part in range(SCAN):
-            n = p.scan[part]
-            p.scan[part] = total
-            total += n
     for part in range(SCAN):
-        total = p.scan[part]
+        total = 0  # many threads that sum take less time than one that stores prefix sums
+        for k in range(part):
+            total += p.scan[k]
         for i in range(part_first(part, p.n_nodes + 1, SCAN), part_first(part + 1, p.n_nodes + 1, SCAN)):
             total += p.entry_start[i]
             p.entry_start[i] = total

@@ -9,7 +9,7 @@ import taichi as ti
 
 # Taichi gives each CPU thread at least 512 iterations of a loop: each chunk takes that many, and only the first does the work
 SPREAD = {"cpu": 512, "cuda": 1}
-FOLDED = 256  # partial sums that `fold` leaves on CUDA
+FOLDED = 512  # partial sums that `fold` leaves on CUDA; of more chunks than these, a multiple
 THREADS = 256  # CUDA threads that share a loop with sums which each of them needs
 
 
@@ -53,8 +53,8 @@ def fold(m: ti.template(), first: ti.template(), last: ti.template(), least: ti.
         for k in range(m.sums):
             for column in ti.static(range(first, last + 1)):
                 s = m.state.partial[k, column]
-                for j in range(1, (m.chunks - k + FOLDED - 1) // FOLDED):
-                    entry = m.state.partial[k + FOLDED * j, column]
+                for j in range(1, ti.static(m.chunks // m.sums)):  # a constant number, so that loads overlap
+                    entry = m.state.partial[k + m.sums * j, column]
                     if ti.static(column in least):
                         s = ti.min(s, entry)
                     else:

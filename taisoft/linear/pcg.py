@@ -16,7 +16,7 @@ from taisoft.linear.block_csr import BlockCsr
 from taisoft.linear.coupling import NO_COUPLING
 from taisoft.linear.pcg_gauss_seidel import iterate_kernel, iterate_parallel, start_parallel
 from taisoft.linear.pcg_jacobi import iterate_jacobi, start_jacobi
-from taisoft.linear.pcg_work import CONVERGED, COUNT, NEGATIVE, RUNNING, STATUS, LinearResult, PcgWork
+from taisoft.linear.pcg_work import CONVERGED, COUNT, NEGATIVE, NEGATIVE_PENDING, RUNNING, STATUS, LinearResult, PcgWork
 
 SERIAL_WORK = 40_000_000  # block products per launch: about 0.2 s, so that Ctrl-C takes effect
 SHARED_FROM = 4  # chunks that several threads share: of fewer, one or two have work at a time
@@ -58,7 +58,7 @@ def solve(
         state = w.state.to_numpy()
         done, status = int(state[COUNT]), int(state[STATUS])
         if status != RUNNING or done >= max_iterations:
-            return LinearResult(done, status == CONVERGED, status == NEGATIVE)
+            return LinearResult(done, status == CONVERGED, status in (NEGATIVE, NEGATIVE_PENDING))
 
 
 def _take_jacobi_batch(m, A, w, tolerance: float, n: int, coupling, same_matrix: bool, first: bool) -> None:

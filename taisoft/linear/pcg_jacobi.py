@@ -48,10 +48,14 @@ def start_jacobi(m: ti.template(), A: ti.template(), k: ti.template(), w: ti.tem
 
 @kernel
 def iterate_jacobi(m: ti.template(), A: ti.template(), k: ti.template(), w: ti.template(), tolerance: ti.f64):
-    """Run one iteration, or nothing if the status is not RUNNING."""
+    """Run one iteration, or nothing if the status is not RUNNING.
+
+    The status becomes NEGATIVE_PENDING with the last change of y, and NEGATIVE only in the next iteration.
+    """
     if ti.static(k.width > 0):
-        for c in range(k.count[0]):
-            form_product(m, k, c, w.p)
+        for c in range(m.chunks):  # as below, fewer launches than loops whose length is only known on the device
+            for j in range(chunk_size(m, c, k.count[0])):
+                form_product(m, k, chunk_entry(m, c, j, k.count[0]), w.p)
     for c in range(m.chunks):
         s = ti.cast(0.0, ti.f64)
         if w.state[STATUS] == RUNNING:
@@ -70,6 +74,8 @@ def iterate_jacobi(m: ti.template(), A: ti.template(), k: ti.template(), w: ti.t
     fold(m, SUM, SUM, ())
     ti.loop_config(serialize=True)
     for _ in range(1):
+        if w.state[STATUS] == NEGATIVE_PENDING:  # of the iteration before
+            w.state[STATUS] = NEGATIVE
         if w.state[STATUS] == RUNNING:
             curvature = total(m, SUM)
             if w.state[RZ] <= tolerance * tolerance * w.state[RZ_START]:
@@ -103,7 +109,7 @@ def iterate_jacobi(m: ti.template(), A: ti.template(), k: ti.template(), w: ti.t
             w.state[COUNT] = w.state[COUNT] + 1.0
             if rz <= tolerance * tolerance * w.state[RZ_START]:
                 w.state[STATUS] = CONVERGED
-    for c in range(m.chunks):  # a loop over the nodes would take a launch more, since their number is only known on the device
+    for c in range(m.chunks):
         n = n_nodes_of(m, w.subset)
         for at in range(chunk_size(m, c, n)):
             i = node_of(w.subset, chunk_entry(m, c, at, n))
@@ -111,7 +117,3 @@ def iterate_jacobi(m: ti.template(), A: ti.template(), k: ti.template(), w: ti.t
                 w.p[i] = w.z[i] + ti.cast(w.state[STEP], m.real) * w.p[i]
             elif w.state[STATUS] == NEGATIVE_PENDING:
                 w.y[i] = w.y[i] + ti.cast(w.state[STEP], m.real) * w.p[i]
-    ti.loop_config(serialize=True)
-    for _ in range(1):
-        if w.state[STATUS] == NEGATIVE_PENDING:
-            w.state[STATUS] = NEGATIVE
