@@ -152,7 +152,7 @@ def test_boxes_and_active_triangles_by_many_threads(rig):
         assert all(np.array_equal(a, b) for a, b in zip(*made))
         assert (made[0][-1] > 0) == (kind % 5 == 3)
         n_active.add(len(made[0][-2]))
-    assert len(n_active) > 5
+    assert len(n_active) > 2
 
 
 def test_refit_by_levels(rig):
