@@ -1,11 +1,11 @@
-"""First look at a GPU: tests, works, solvers, sizes and repeatability on one page, in under eight minutes.
+"""First look at a GPU: tests, sizes, repeatability, works and solvers on one page, in under eight minutes.
 
 taisoft bench cuda_check [--arch cuda|cpu] [--budget SECONDS] [--quick] [--part NAME] [--out DIR]
 
 Each part runs in its own process with a time limit and prints every number at once, so that results before a failure remain on
 the page; the next part starts in any case. DIR/cuda-check.md and .json are rewritten after every part. Parts: tests marked
-`cuda`; the works W1 to W4 on GPU and CPU; coloured against serial Gauss-Seidel; steps of one and four million tets; differences
-between reruns. Compilation is timed separately. Exit status: 0, or 1 if a part failed or did not end. benchmarks/cuda_check.sh
+`cuda`; steps of one and four million tets, and with contacts; differences between reruns; the works W1 to W4 on GPU and CPU;
+coloured against serial Gauss-Seidel. Compilation is timed separately. Exit status: 0, or 1 if a part failed or did not end. benchmarks/cuda_check.sh
 installs the requirements from wheels first.
 """
 
@@ -212,7 +212,8 @@ def write_page(folder: Path, head: str, numbers: dict, outcomes: list[Outcome], 
     if waiting:
         parts.append("Not yet run: " + ", ".join(part.name for part in waiting) + ".")
     write_bytes(folder / "cuda-check.md", ("\n\n".join(parts) + "\n").encode())
-    write_bytes(folder / "cuda-check.json", json_text(numbers | {"parts": [asdict(o) for o in outcomes]}).encode())
+    parts = [asdict(o) | {"part": o.part.name, "title": o.part.title} for o in outcomes]
+    write_bytes(folder / "cuda-check.json", json_text(numbers | {"parts": parts}).encode())
 
 
 def check(parts: list[Part], budget: float, folder: Path, arch: str) -> list[Outcome]:

@@ -19,6 +19,7 @@ from taisoft.files import write_bytes
 from taisoft.output.tables import markdown
 from taisoft.view.keys import KEYS, MOUSE
 
+from .cuda_check import TABLES as GPU_TABLES
 from .document import RESULTS, table
 from .error import Row as ErrorRow
 from .error import row_table
@@ -247,6 +248,14 @@ def window_keys(_results: Path) -> str:
     return markdown(("key or button", "action"), rows, left=(0, 1))
 
 
+def gpu(results: Path) -> str:
+    """Sizes, works and sweeps on a GPU, as far as they were measured."""
+    numbers = newest(results, "cuda_check")
+    found = {part["part"]: part["found"] for part in numbers["parts"]}
+    tables = [GPU_TABLES[name](found[name]) for name in ("sizes", "works", "sweeps", "reruns") if found.get(name)]
+    return "\n\n".join(tables) + measured_on(numbers, numbers["gpu"])
+
+
 TABLES: dict[str, Callable[[Path], str]] = {  # by marker
     "order_errors": order_errors,
     "order_times": order_times,
@@ -262,6 +271,7 @@ TABLES: dict[str, Callable[[Path], str]] = {  # by marker
     "pictures": pictures,
     "window": window,
     "window_keys": window_keys,
+    "gpu": gpu,
 }
 
 
