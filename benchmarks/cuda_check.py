@@ -5,8 +5,8 @@ taisoft bench cuda_check [--arch cuda|cpu] [--budget SECONDS] [--quick] [--part 
 Each part runs in its own process with a time limit and prints every number at once, so that results before a failure remain on
 the page; the next part starts in any case. DIR/cuda-check.md and .json are rewritten after every part. Parts: tests marked
 `cuda`; steps of one and four million tets, and with contacts; differences between reruns; the works W1 to W4 on GPU and CPU;
-coloured against serial Gauss-Seidel. Compilation is timed separately. Exit status: 0, or 1 if a part failed or did not end. benchmarks/cuda_check.sh
-installs the requirements from wheels first.
+coloured against serial Gauss-Seidel. Compilation is timed separately. Exit status: 0, or 1 if a part failed or did not end.
+benchmarks/cuda_check.sh installs the requirements from wheels first.
 """
 
 import argparse
