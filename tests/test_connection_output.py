@@ -3,7 +3,7 @@
 * polylines go through the points of springs and tendons, also on obstacles that move, and have their tensions;
 * pictures show them in the colours of their tensions, crosses at attached nodes, and arrows of pressures, and only where asked;
 * USD holds a BasisCurves for each spring and tendon with its points and tension in every frame, and passes the validators;
-* `frames.csv` has tensions, volumes and pressures in every frame, and is continued by a resumed run.
+* `frames.csv` has tensions, volumes, pressures and poses in every frame, and is continued by a resumed run.
 """
 
 import csv
@@ -184,6 +184,29 @@ def test_a_table_of_frames(tmp_path):
     assert len((out / "frames.csv").read_text().splitlines()) == 4
     assert run(path, "--out", out, "--resume", out / "checkpoint.npz", *options) == 0
     assert (out / "frames.csv").read_bytes() == (whole / "frames.csv").read_bytes()
+
+
+def test_poses_of_rigid_bodies(tmp_path):
+    """A box that turns by half a turn and falls."""
+    scene = ts.Scene(gravity=(0, -2, 0))
+    mesh = ts.box_mesh((1, 1, 1), (1, 0.6, 0.3), (0, 0, 0.1))
+    spin = {"angular_velocity": (0, 0, -2 * np.pi), "velocity": (1, 0, 0)}
+    scene.add_rigid_body(mesh, density=1000.0, name="box", position=(0, 5, 0), **spin)
+    table = FrameTable(tmp_path, scene)
+    with ts.Simulator(scene, dt=0.0025, integrator="implicit_midpoint", precision="f64") as sim:
+        for index in range(3):
+            table.frame(sim, index)
+            for _ in range(100 if index < 1 else 60):
+                sim.step()
+    table.close()
+    rows = list(csv.DictReader(open(tmp_path / "frames.csv", newline="")))
+    names = [f"{axis} of box [m]" for axis in "xyz"] + [f"q{part} of box" for part in "wxyz"]
+    assert list(rows[0]) == ["frame", "time", *names]
+    for row, t in zip(rows, (0.0, 0.25, 0.4)):
+        angle = (2 * np.pi * t + np.pi) % (2 * np.pi) - np.pi
+        expected = [t, 5 - t**2, 0.1, np.cos(angle / 2), 0, 0, -np.sin(angle / 2)]
+        assert float(row["time"]) == pytest.approx(t)
+        assert [float(row[name]) for name in names] == pytest.approx(expected, abs=5e-3)
 
 
 def test_scenes_without_have_no_table():

@@ -1,18 +1,23 @@
-"""`frames.csv`: tensions of springs and tendons [N], and volumes [m^3] and pressures [Pa] of cavities, a row per frame."""
+"""`frames.csv`, a row per frame: tensions of springs and tendons [N], volumes [m^3] and pressures [Pa] of cavities, and poses of
+rigid bodies: the centre of mass [m] and the rotation from the mesh's axes as a unit quaternion with w >= 0.
+"""
 
 import csv
 import io
 from pathlib import Path
 
+from scipy.spatial.transform import Rotation
+
 from taisoft.files import write_bytes
 
 TABLE_NAME = "frames.csv"
+POSE = (*((axis, " [m]") for axis in "xyz"), *((f"q{part}", "") for part in "wxyz"))  # columns and units
 
 
 class FrameTable:
     """Observer that writes folder/frames.csv, whole at each `flush` and at the end.
 
-    folder: the run's folder; scene: with springs, tendons or cavities; first: number of the first frame of a resumed run, before
+    folder: the run's folder; scene: one that `needed` is true of; first: number of the first frame of a resumed run, before
     which rows of the folder's table are kept. Raises OutputError.
     """
 
@@ -21,19 +26,25 @@ class FrameTable:
         tensions = [f"tension of {one.name} [N]" for one in (*scene.springs, *scene.tendons)]
         self._cavities = [cavity.name for body in scene.bodies for cavity in body.cavities]
         of_cavities = [text for name in self._cavities for text in (f"volume of {name} [m^3]", f"pressure of {name} [Pa]")]
-        self._header = ["frame", "time", *tensions, *of_cavities]
+        self._rigid_bodies = list(scene.rigid_bodies)
+        poses = [f"{column} of {body.name}{unit}" for body in self._rigid_bodies for column, unit in POSE]
+        self._header = ["frame", "time", *tensions, *of_cavities, *poses]
         self._rows = _rows_before(self.path, self._header, first) if first else []
 
     @staticmethod
     def needed(scene) -> bool:
         """Whether a scene has what the table holds."""
-        return bool(scene.springs or scene.tendons or any(body.cavities for body in scene.bodies))
+        return bool(scene.springs or scene.tendons or scene.rigid_bodies or any(body.cavities for body in scene.bodies))
 
     def frame(self, sim, index: int) -> None:
         """Add sim's present state as frame `index`."""
         values = list(sim.tensions().values())
         for name in self._cavities:
             values += [sim.cavity_volume(name), sim.cavity_pressure(name)]
+        for body in self._rigid_bodies:
+            translation, rotation = sim.pose(body.name)
+            x, y, z, w = Rotation.from_matrix(rotation).as_quat(canonical=True).tolist()
+            values += [*(body.centre + body.position + translation).tolist(), w, x, y, z]
         self._rows.append([index, sim.time, *values])
 
     def flush(self) -> None:
