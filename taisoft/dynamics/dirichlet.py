@@ -10,6 +10,8 @@ from taisoft.scene import checks
 from taisoft.scene.body import Constraint
 from taisoft.scene.scene import Scene
 
+ROUNDING = 1e-9  # of a time: a step that ends this near a release still follows the path
+
 
 @dataclass
 class _Group:
@@ -79,8 +81,9 @@ class DirichletConditions:
         return axes
 
     def targets(self, times: np.ndarray) -> tuple[np.ndarray, bool]:
-        """Return positions of the prescribed nodes at the times (k,) [s], up to the first release.
+        """Return positions of the prescribed nodes at the times (k,) [s], the ends of steps, up to the first release.
 
+        A step that ends at the moment of a release follows the path to there: it is the next one that is free.
         Returns (r, n_prescribed, 3) [m] with r <= k, and whether a group is released at times[r]. If r = 0, those groups are
         then marked as released, and the call must be repeated.
         """
@@ -91,6 +94,8 @@ class DirichletConditions:
                 if g.released:
                     continue
                 displacement = self._displacement(g, float(t))
+                if displacement is None:
+                    displacement = self._displacement(g, float(t) * (1.0 - ROUNDING))
                 if displacement is None:
                     releasing.append(g)
                     continue
