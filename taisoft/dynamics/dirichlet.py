@@ -93,9 +93,7 @@ class DirichletConditions:
             for g in self._groups:
                 if g.released:
                     continue
-                displacement = self._displacement(g, float(t))
-                if displacement is None:
-                    displacement = self._displacement(g, float(t) * (1.0 - ROUNDING))
+                displacement = self._displacement_by(g, float(t))
                 if displacement is None:
                     releasing.append(g)
                     continue
@@ -111,7 +109,7 @@ class DirichletConditions:
         """Return positions (n_prescribed, 3) of the prescribed nodes at a time [m], nan on axes free or released by then."""
         target_positions = np.full((self.n_prescribed, 3), np.nan)
         for g in self._groups:
-            displacement = None if g.released else self._displacement(g, t)
+            displacement = None if g.released else self._displacement_by(g, t)
             if displacement is not None:
                 target_positions[g.rows] = np.where(g.constraint.axes, self._rest[g.nodes] + displacement, np.nan)
         return target_positions
@@ -135,6 +133,11 @@ class DirichletConditions:
                     )
                 total[g.rows] += weight / dt**2 * displacement
         return total
+
+    def _displacement_by(self, group: _Group, t: float) -> np.ndarray | None:
+        """Return a path's displacement at the end t [s] of a step; at the moment of a release, the last one before."""
+        displacement = self._displacement(group, t)
+        return self._displacement(group, t * (1.0 - ROUNDING)) if displacement is None else displacement
 
     @staticmethod
     def _displacement(group: _Group, t: float) -> np.ndarray | None:

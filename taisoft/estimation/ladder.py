@@ -79,8 +79,8 @@ class Ladder:
         """Expect the error of the only pilot also from its hardest part, run with a slightly smaller step."""
         if part.report.status == "failed":
             self.error = None
-        elif self.error:  # errors of smooth motion add up over the run
-            self._expect(self.pilots[0], part, 1.0 if self.sudden else self.frames.count / self.frames.part)
+        elif self.error:  # errors of smooth motion add up as changes of its velocities do
+            self._expect(self.pilots[0], part, 1.0 if self.sudden else self.pilots[0].parts)
 
     def replace_first(self, pilot: Pilot) -> None:
         """Replace the first pilot, explicit, by one with a slightly smaller step, and expect its error."""

@@ -37,7 +37,8 @@ class Pilot:
 
     frames: numbers (k,) of the recorded ones; positions: of the recorded nodes at these (k,n,3) [m]; variations: (n,) sums of the
     changes, from frame to frame, of what velocities change in a frame; jump: the largest such change of velocity [m/s]; end: the
-    simulation's state at the end; hardest: the first frame of the hardest part, and the state there; warned: texts of warnings.
+    simulation's state at the end; hardest: the first frame of the hardest part, and the state there; parts: changes of velocities
+    in all parts over those in the hardest one; warned: texts of warnings.
     """
 
     integrator: str
@@ -49,6 +50,7 @@ class Pilot:
     report: RunReport = field(default_factory=RunReport)
     end: dict = field(default_factory=dict)
     hardest: tuple[int, dict] = (0, {})
+    parts: float = 1.0
     warned: list[str] = field(default_factory=list)
 
     def counts_per_step(self) -> list[float]:
@@ -74,12 +76,13 @@ class Recorder:
     """
 
     def __init__(self, pilot: Pilot, frames: "Frames", stride: Fraction, first: int = 0, keeps: bool = False):
-        self._pilot, self._frames, self._stride, self._first, self._keeps = pilot, frames, stride, first, keeps
+        self._pilot, self._frames, self._first, self._keeps = pilot, frames, first, keeps
+        self._stride = stride if stride.denominator > 1 else int(stride)
         self._index: int | None = None  # of the first frame
         self._velocities = self._jump = None
         self._part: tuple[int, dict] = (0, {})  # the present one, as Pilot.hardest
         self._changes: np.ndarray | float = 0.0  # (n,) of velocities in it
-        self._most = -1.0  # of these changes in a part
+        self._most, self._sum = -1.0, 0.0  # of these changes in a part, and of the largest ones in all parts
 
     def frame(self, sim: "Simulator", index: int, _report) -> None:
         """Record a frame, unless it lies between those of `frames`, or is the last one and not whole."""
@@ -87,25 +90,39 @@ class Recorder:
         number, pilot, frames = self._first + (index - self._index) * self._stride, self._pilot, self._frames
         if number.denominator != 1 or number > frames.count:
             return
-        x, v = (field[frames.nodes].astype(np.float64) for field in sim._dynamics.state.state())
-        before, self._velocities = self._velocities, v
-        if before is not None:
-            previous, self._jump = self._jump, v - before
-            pilot.jump = max(pilot.jump, float(np.linalg.norm(self._jump, axis=1).max()))
-            change = np.linalg.norm(self._jump if previous is None else self._jump - previous, axis=1)
-            self._changes = self._changes + change
-            if previous is not None:
-                pilot.variations = pilot.variations + change
+        number, state = int(number), sim._dynamics.state
         if frames.is_recorded(number):
-            pilot.frames.append(int(number))
-            pilot.positions.append(x)
+            x, v = state.state()
+            pilot.frames.append(number)
+            pilot.positions.append(x[frames.nodes].astype(np.float64))
+        else:
+            v = state.velocities()
+        self._add_velocities(v[frames.nodes].astype(np.float64))
         if self._keeps and (number % frames.part == 0 or number == frames.count):
-            self._end_part(sim, int(number))
+            self._end_part(sim, number)
+
+    def _add_velocities(self, v: np.ndarray) -> None:
+        """Add the changes of velocities (n,3) [m/s] since the last frame."""
+        before, self._velocities = self._velocities, v
+        if before is None:
+            return
+        previous, self._jump = self._jump, v - before
+        jump, pilot = _lengths(self._jump), self._pilot
+        pilot.jump = max(pilot.jump, float(jump.max()))
+        if previous is None:
+            self._changes = self._changes + jump
+            return
+        change = _lengths(self._jump - previous)
+        self._changes, pilot.variations = self._changes + change, pilot.variations + change
 
     def _end_part(self, sim: "Simulator", number: int) -> None:
         """End a part of the run, and begin the next one at a frame."""
-        if self._part[1] and (most := float(np.max(self._changes))) > self._most:
-            self._most, self._pilot.hardest = most, self._part
+        if self._part[1]:
+            changes = float(np.max(self._changes))
+            self._sum += changes
+            if changes > self._most:
+                self._most, self._pilot.hardest = changes, self._part
+            self._pilot.parts = self._sum / self._most if self._most > 0.0 else 1.0
         if number < self._frames.count:
             self._part, self._changes = (number, sim._dynamics.snapshot()), 0.0
 
@@ -120,7 +137,7 @@ class Frames:
 
     seconds: float
     length: float
-    nodes: np.ndarray
+    nodes: slice
     bodies: np.ndarray
     negligible: float
 
@@ -183,7 +200,7 @@ def make_frames(sim: "Simulator", length: float, seconds: float) -> Frames:
     """The frames of a run of `length` [s], one after every `seconds` [s]."""
     sizes = [body.n_nodes for body in sim.scene.bodies]
     bodies = owners(sizes)
-    nodes = np.arange(0, len(bodies), -(-len(bodies) // MAX_NODES))
+    nodes = slice(None, None, -(-len(bodies) // MAX_NODES))
     size = float(np.ptp(sim.positions(), axis=0).max())
     return Frames(seconds, length, nodes, bodies[nodes], NEGLIGIBLE[sim.settings.precision] * size)
 
@@ -192,3 +209,8 @@ def distances(pilot: Pilot, other: Pilot) -> np.ndarray:
     """Distances of two pilots' nodes at their common frames (k,n) [m]."""
     common = [frame for frame in pilot.frames if frame in set(other.frames)]
     return np.linalg.norm(pilot.at(common) - other.at(common), axis=2)
+
+
+def _lengths(vectors: np.ndarray) -> np.ndarray:
+    """Lengths (n,) of vectors (n,3)."""
+    return np.sqrt(np.einsum("ij,ij->i", vectors, vectors))
