@@ -25,7 +25,7 @@ from taisoft.errors import SimulationError, no_memory
 from taisoft.estimation.costs import explicit_step, implicit_step
 from taisoft.estimation.first_choice import EXPLICIT, IMPLICIT, stable_steps
 from taisoft.estimation.ladder import LEAST_REACH, Ladder
-from taisoft.estimation.order import nominal_order
+from taisoft.estimation.order import nominal_order, releases
 from taisoft.estimation.pilots import Pilot, Recorder, RunFunction, distances, make_frames
 from taisoft.estimation.vibrations import ERROR as VIBRATIONS
 from taisoft.estimation.vibrations import are_passed_over
@@ -112,7 +112,7 @@ class Chooser:
         self._tolerance = SAFETY * sim.settings.tolerance
         self._parts = 1 if fps is None else max(1, math.ceil(LEAST_FRAMES / (seconds * fps)))  # of a frame of the run
         self._frames = make_frames(sim, seconds, seconds / MOST_FRAMES if fps is None else 1.0 / (fps * self._parts))
-        self._sudden = sim.touches or _releases(sim.scene)
+        self._sudden = sim.touches or releases(sim.scene)
         self._last_failure: tuple[float, str] | None = None  # of the last pilot, if it failed: when [s], and why
         self.compile_seconds = 0.0  # of the pilots [s]
         self.ladder = self._ladder()
@@ -297,9 +297,3 @@ class Chooser:
         touched = any(report.n_contacts for report in self.ladder.pilots[-1].report.step_reports)
         dt = self._frames.seconds / float(run.per_frame)
         return touched and run.integrator == IMPLICIT and are_passed_over(self._sim.scene, dt)
-
-
-def _releases(scene: Scene) -> bool:
-    """Whether a path may release its nodes, which changes forces suddenly."""
-    paths = [c.path for body in scene.bodies for c in body.constraints if c.path is not None]
-    return any(getattr(getattr(path, "frames", path), "release", True) for path in paths)
