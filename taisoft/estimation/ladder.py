@@ -59,7 +59,7 @@ class Ladder:
         if pilot.report.status == "failed":
             return
         if self.pilots:
-            self.pilots[-1].end = {}  # it will not be the run
+            self.pilots[-1].end, self.pilots[-1].hardest = {}, (0, {})  # it will not be the run
         self.pilots.append(pilot)
         if len(self.pilots) < 2:
             return

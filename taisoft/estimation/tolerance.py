@@ -183,7 +183,6 @@ class Chooser:
                 ladder.confirm(self._pilot(slightly_more, whole=pilot))
                 if ladder.meets(self._tolerance):
                     return least
-            pilot.hardest = (0, {})
         if ratio <= SMALLER:
             per_frame = slightly_more
             ladder.replace_first(self._pilot(per_frame))
@@ -210,6 +209,8 @@ class Chooser:
         self.compile_seconds += report.compile_seconds
         if report.interrupted:
             raise KeyboardInterrupt
+        if whole is not None:  # whether a part fails does not count
+            return pilot
         self._last_failure = (report.sim_seconds, report.problems[-1]) if report.status == "failed" else None
         if before and self._last_failure and abs(report.sim_seconds - before[0]) <= self._frames.seconds:
             raise SimulationError(report.problems[-1])
