@@ -75,6 +75,15 @@ def test_release():
     assert dirichlet.constrained()[8].all() and len(dirichlet.targets(times)[0]) == 2
 
 
+@pytest.mark.parametrize("steps", [3, 7, 10, 24, 1000])
+def test_a_step_that_ends_with_the_path_follows_it_to_there(steps):
+    """Whatever the rounding of the step's end: nodes are not released a step early."""
+    dirichlet, rest = made(([0, 1], "xyz", lambda t: (t, 0.0, 0.0) if t < 0.3 else None))
+    times = 0.3 / steps * np.arange(1, steps + 2)
+    rows, releasing = dirichlet.targets(times)
+    assert len(rows) == steps and releasing and rows[-1, 0] == pytest.approx(rest[8] + [0.3, 0, 0], abs=1e-8)
+
+
 SHAPES = [(1, 2), np.zeros((3, 3)), np.zeros((2, 2)), 1.0]
 FINITE = [(0, np.nan, 0), np.full((2, 3), np.inf)]
 NUMBERS = ["up", ("1", "2", "3"), (None, 0, 0), (True, False, True)]

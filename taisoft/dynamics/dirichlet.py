@@ -10,6 +10,8 @@ from taisoft.scene import checks
 from taisoft.scene.body import Constraint
 from taisoft.scene.scene import Scene
 
+ROUNDING = 1e-9  # of a time: a step that ends this near a release still follows the path
+
 
 @dataclass
 class _Group:
@@ -79,8 +81,9 @@ class DirichletConditions:
         return axes
 
     def targets(self, times: np.ndarray) -> tuple[np.ndarray, bool]:
-        """Return positions of the prescribed nodes at the times (k,) [s], up to the first release.
+        """Return positions of the prescribed nodes at the times (k,) [s], the ends of steps, up to the first release.
 
+        A step that ends at the moment of a release follows the path to there: it is the next one that is free.
         Returns (r, n_prescribed, 3) [m] with r <= k, and whether a group is released at times[r]. If r = 0, those groups are
         then marked as released, and the call must be repeated.
         """
@@ -90,7 +93,7 @@ class DirichletConditions:
             for g in self._groups:
                 if g.released:
                     continue
-                displacement = self._displacement(g, float(t))
+                displacement = self._displacement_by(g, float(t))
                 if displacement is None:
                     releasing.append(g)
                     continue
@@ -106,7 +109,7 @@ class DirichletConditions:
         """Return positions (n_prescribed, 3) of the prescribed nodes at a time [m], nan on axes free or released by then."""
         target_positions = np.full((self.n_prescribed, 3), np.nan)
         for g in self._groups:
-            displacement = None if g.released else self._displacement(g, t)
+            displacement = None if g.released else self._displacement_by(g, t)
             if displacement is not None:
                 target_positions[g.rows] = np.where(g.constraint.axes, self._rest[g.nodes] + displacement, np.nan)
         return target_positions
@@ -130,6 +133,11 @@ class DirichletConditions:
                     )
                 total[g.rows] += weight / dt**2 * displacement
         return total
+
+    def _displacement_by(self, group: _Group, t: float) -> np.ndarray | None:
+        """Return a path's displacement at the end t [s] of a step; at the moment of a release, the last one before."""
+        displacement = self._displacement(group, t)
+        return self._displacement(group, t * (1.0 - ROUNDING)) if displacement is None else displacement
 
     @staticmethod
     def _displacement(group: _Group, t: float) -> np.ndarray | None:

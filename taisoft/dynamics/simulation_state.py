@@ -62,6 +62,10 @@ class SimulationState:
         x, v = download([self.model.state.x, self.model.state.v])
         return x, v
 
+    def velocities(self) -> np.ndarray:
+        """Return the velocities of all nodes, in their stored precision."""
+        return self.model.state.v.to_numpy()
+
     def set_state(self, x: np.ndarray, v: np.ndarray) -> None:
         """Set positions [m] and velocities [m/s] of all nodes, (n_nodes, 3); those of dependent nodes follow from the others'."""
         if self.dependents is not None:

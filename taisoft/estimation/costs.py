@@ -6,8 +6,8 @@ explicit and implicit steps compete.
 
 from taisoft.scene.scene import Scene
 
-EXPLICIT_STEP, CONTACT_STEP, BODY_CONTACTS = 5.0, 250.0, 100.0  # [us] of an explicit step, its contacts, more with each body
-PATH_STEP = 90.0  # [us] of a prescribed path, or a moving obstacle, in an explicit step
+EXPLICIT_STEP, CONTACT_STEP, BODY_CONTACTS = 5.0, 250.0, 100.0  # [us] of an explicit step; of contacts, more with each body
+PATH_STEP = 90.0  # [us] of a prescribed path, or a moving obstacle, in a step
 EXPLICIT_TET, QUADRATIC = 0.025, 4.0  # [us] of a linear tet in an explicit step; a quadratic one costs as many
 IMPLICIT_STEP, NEWTON, NEWTON_TET = 150.0, 40.0, 0.15  # [us] of a step and of an iteration
 LINEAR, LINEAR_TET, MULTIPLIERS = 12.0, 0.008, 150.0  # [us] of an iteration of conjugate gradients and of a multiplier update
@@ -21,8 +21,12 @@ def elements(scene: Scene) -> float:
 
 def explicit_step(scene: Scene, touches: bool) -> float:
     """Cost of an explicit step [us]."""
-    paths = sum(c.path is not None for body in scene.bodies for c in body.constraints)
-    cost = EXPLICIT_STEP + EXPLICIT_TET * elements(scene) + PATH_STEP * paths
+    return EXPLICIT_STEP + EXPLICIT_TET * elements(scene) + surroundings(scene, touches)
+
+
+def surroundings(scene: Scene, touches: bool) -> float:
+    """Cost of the search for contacts and of paths, in a step of either kind [us]."""
+    cost = PATH_STEP * sum(c.path is not None for body in scene.bodies for c in body.constraints)
     if touches:
         cost += CONTACT_STEP + BODY_CONTACTS * (len(scene.bodies) - 1)
         cost += PATH_STEP * sum(obstacle.path is not None for obstacle in scene.obstacles)
@@ -34,4 +38,4 @@ def implicit_step(scene: Scene, touches: bool, counts: list[float] | None = None
     newton, linear, multipliers = counts or LEAST[touches]
     m = elements(scene)
     step = IMPLICIT_STEP + newton * (NEWTON + NEWTON_TET * m) + linear * (LINEAR + LINEAR_TET * m)
-    return step + multipliers * MULTIPLIERS
+    return step + multipliers * MULTIPLIERS + surroundings(scene, touches)

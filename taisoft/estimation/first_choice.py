@@ -12,7 +12,7 @@ from taisoft.stability import stable_dt
 EXPLICIT, IMPLICIT = "velocity_verlet", "bdf2"
 STABLE_FRACTION = 0.9  # of the stable step
 LIKELY_FRAME = 1 / 60  # [s]; runs have their own
-SOLVER_FRACTION, LOOSEST_SOLVER = 0.05, 1e-4  # tolerances of Newton's method and contacts: over the tolerance, and at most
+SOLVERS = {"newton_tolerance": (0.05, 1e-4), "contact_tolerance": (0.1, 5e-4)}  # over the tolerance, and at most
 TIGHTEST = {"f32": 1e-4, "f64": 1e-7}  # tolerances above the errors of rounding
 
 
@@ -32,9 +32,8 @@ def settings_for(scene: Scene, settings: Settings) -> tuple[Settings, float | No
         given = settings.contact_solver
         raise SimulationError(f"contact_solver {given!r}: with a tolerance it must be 'auto', since run() chooses the integrator")
     found, limit = {}, None
-    loosest = min(LOOSEST_SOLVER, SOLVER_FRACTION * settings.tolerance)
-    for name in ("newton_tolerance", "contact_tolerance"):
-        value = getattr(settings, name)
+    for name, (fraction, most) in SOLVERS.items():
+        value, loosest = getattr(settings, name), min(most, fraction * settings.tolerance)
         if value is None:
             found[name] = loosest
         elif value > loosest * (1.0 + 1e-9):

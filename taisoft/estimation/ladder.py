@@ -1,11 +1,14 @@
 """Pilots from coarse to fine, and the error of the finest: from its distance to the one before, by the observed order.
 
-The first two explicit pilots take nearly the same steps. Their distance, and what the velocities of the second one show, give
-the expected error. It may be wrong by a factor of ten.
+The first explicit pilot, which has the largest stable steps, is alone. What its velocities show, and its distance to a slightly
+smaller step in its hardest part, give the expected error. Impacts and releases make it unsure: unless it is far below the
+tolerance, a second pilot takes slightly smaller steps all the way. It may still be wrong by a factor of ten.
 
 Velocity Verlet solves x'' = a + dt^2/12 x'''' up to dt^4 (Hairer, Lubich, Wanner, "Geometric Numerical Integration", 2006,
 IX.9). A motion of frequency w thus lags by the phase (w dt)^2/24 w t, which is dt^2/24 times the total variation of its
 acceleration. An impact may be late by dt.
+
+Weak: one pilot does not show small errors that grow exponentially.
 """
 
 import math
@@ -17,7 +20,7 @@ from taisoft.estimation.first_choice import EXPLICIT, IMPLICIT
 from taisoft.estimation.order import MIN_ORDER, error_over_difference, observed_order
 from taisoft.estimation.pilots import Frames, Pilot, distances
 
-REACH = 8  # steps of a run over those of the last pilot, at most
+REACH = {EXPLICIT: 2, IMPLICIT: 8}  # steps of a run over those of the last pilot, at most
 LEAST_REACH = 1.5  # the same, at least, where the run is not the last pilot: a smaller ratio would amplify chance
 FEWEST = {EXPLICIT: 2, IMPLICIT: 3}  # pilots that show an error: coarse implicit steps may agree and be wrong
 MAX_PILOTS = 8
@@ -25,22 +28,26 @@ MAX_DEGRADED = 2  # pilots that meet the tolerance but are degraded, and are lef
 MAX_STALLED = 2  # pilots in succession whose differences have not become smaller: the paths diverge
 COARSE = 2  # implicit pilots with fewer steps a frame do not count as stalled
 DISPERSION, IMPACT = 3.0, 1.25  # factors on the errors that velocities show
+UNSURE = 8.0  # a tolerance over the largest error that one explicit pilot of sudden motion may be expected to have
 
 
 @dataclass
 class Ladder:
     """Pilots of one integrator.
 
-    sudden: whether velocities may jump; error: of the last pilot, over the excursion, None if unknown; order: observed, else
-    None; tried: pilots, with failed ones; differences: root mean squares of the distances between successive pilots [m].
+    sudden: whether velocities may jump; nominal: order of the integrator in the scene; error: of the last pilot, over the
+    excursion, None if unknown; order: observed, else None; tried: pilots, with failed ones; differences: root mean squares of the
+    distances between successive pilots, each with half the step of the one before [m].
     """
 
     integrator: str
     sudden: bool
+    nominal: int
     frames: Frames
     pilots: list[Pilot] = field(default_factory=list)
     error: float | None = None
     order: float | None = None
+    unsure: float = 1.0  # factor by which `error` must be below a tolerance
     stalled: int = 0  # see MAX_STALLED
     degraded: int = 0  # see MAX_DEGRADED
     tried: int = 0
@@ -52,33 +59,56 @@ class Ladder:
         if pilot.report.status == "failed":
             return
         if self.pilots:
-            self.pilots[-1].end = {}  # it will not be the run
+            self.pilots[-1].end, self.pilots[-1].hardest = {}, (0, {})  # it will not be the run
         self.pilots.append(pilot)
         if len(self.pilots) < 2:
             return
         before, excursion = self.pilots[-2], self.excursion(pilot)
         apart, ratio = distances(pilot, before), float(pilot.per_frame / before.per_frame)
-        self.differences.append(float(np.sqrt(np.mean(apart**2))))
-        self.order = self._observed_order() if ratio == 2.0 else None
+        self.differences = [*self.differences, float(np.sqrt(np.mean(apart**2)))] if ratio == 2.0 else []
+        self.order, self.unsure = self._observed_order() if ratio == 2.0 else None, 1.0
         self.error = float(apart.max()) * self.error_over_difference(ratio) / excursion if excursion else 0.0
+
+    def expect(self) -> None:
+        """Expect the error of the only pilot, explicit, from its velocities alone."""
+        pilot, self.unsure = self.pilots[0], UNSURE if self.sudden else 1.0
+        excursion = self.excursion(pilot)
+        self.error = self._expected_error(pilot, excursion) if excursion else 0.0
+
+    def confirm(self, part: Pilot) -> None:
+        """Expect the error of the only pilot also from its hardest part, run with a slightly smaller step."""
+        if part.report.status == "failed":
+            self.error = None
+        elif self.error:  # errors of smooth motion add up as changes of its velocities do
+            self._expect(self.pilots[0], part, 1.0 if self.sudden else self.pilots[0].parts)
 
     def replace_first(self, pilot: Pilot) -> None:
         """Replace the first pilot, explicit, by one with a slightly smaller step, and expect its error."""
         self.tried += 1
         if pilot.report.status == "failed":
             return
-        before, self.pilots, excursion = self.pilots, [pilot], self.excursion(pilot)
+        before, self.pilots, self.unsure = self.pilots, [pilot], 1.0
+        if before:
+            self._expect(pilot, before[0])
+        elif self.excursion(pilot) == 0.0:
+            self.error = 0.0
+
+    def _expect(self, pilot: Pilot, other: Pilot, factor: float = 1.0) -> None:
+        """Expect the error of a pilot from its velocities, and from its distance to another one times a factor."""
+        excursion, steps = self.excursion(pilot), sorted((pilot.per_frame, other.per_frame))
         if excursion == 0.0:
             self.error = 0.0
-        elif before:
-            ratio = float(pilot.per_frame / before[0].per_frame)
-            apart = float(distances(pilot, before[0]).max()) / excursion
-            self.error = max(self._expected_error(pilot, excursion), apart * error_over_difference(ratio, 2.0))
+            return
+        apart = factor * float(distances(pilot, other).max()) / excursion
+        self.error = max(self._expected_error(pilot, excursion), apart * error_over_difference(float(steps[1] / steps[0]), 2.0))
 
     @property
     def assumed_order(self) -> float:
-        """The observed order; where it was not observed the smallest, and 1 where two pilots could not show it."""
-        return self.order or (MIN_ORDER if len(self.differences) > 1 else 1.0)
+        """The observed order; where it was not observed the smallest, and where two pilots could not show it the nominal one.
+
+        Implicit pilots may be too coarse for that: their order is then 1.
+        """
+        return self.order or (MIN_ORDER if len(self.differences) > 1 else self.nominal if self.integrator == EXPLICIT else 1.0)
 
     def error_over_difference(self, ratio: float) -> float:
         """Error of a run over its distance to one with steps larger by a ratio."""
@@ -97,7 +127,7 @@ class Ladder:
         stalled = near > self.frames.negligible and near >= max(self.differences[-3:-1]) * 0.5**MIN_ORDER
         counts = self.integrator == EXPLICIT or self.pilots[-1].per_frame >= COARSE
         self.stalled = self.stalled + 1 if stalled and counts else 0
-        return observed_order(near, far, 2.0)
+        return observed_order(near, far, 1.0 if self.sudden else 2.0)  # impacts may seem to be of higher order by chance
 
     def _expected_error(self, pilot: Pilot, excursion: float) -> float:
         """Error of an explicit pilot, over the excursion, from its velocities; see above."""
@@ -116,17 +146,35 @@ class Ladder:
         """Whether no further pilot makes sense."""
         return self.tried >= MAX_PILOTS or self.diverges
 
+    def steps_over_last(self, tolerance: float) -> float:
+        """Steps that a tolerance needs over those of the only pilot, explicit, from its error."""
+        return 1.0 if self.error is None else (self.error / tolerance) ** (1.0 / self.nominal)
+
+    def meets(self, tolerance: float) -> bool:
+        """Whether the last pilot is likely to meet a tolerance."""
+        return self.error is not None and self.error * self.unsure <= tolerance
+
     def steps_needed(self, tolerance: float) -> int | None:
         """Steps of the run in the time of a frame, if the pilots show how many; None if they do not yet."""
         if not self.pilots or self.error is None:
             return None
-        last, few = self.pilots[-1].per_frame, len(self.pilots) < FEWEST[self.integrator]
-        if self.error <= tolerance and (not few or self.integrator == EXPLICIT):
+        last = self.pilots[-1].per_frame
+        if self.meets(tolerance) and (not self.are_few or self.integrator == EXPLICIT):
             if self.pilots[-1].report.status == "degraded" and self.degraded < MAX_DEGRADED:
                 self.degraded += 1
                 return None
             return math.ceil(last)
-        if few:
+        if self.are_few:
             return None
-        steps = float(last) * max(LEAST_REACH, (self.error / tolerance) ** (1.0 / self.assumed_order))
-        return math.ceil(steps) if steps <= REACH * last else None
+        steps = self.likely_steps(tolerance)
+        return math.ceil(steps) if steps <= REACH[self.integrator] * last else None
+
+    @property
+    def are_few(self) -> bool:
+        """Whether there are too few pilots to show an error."""
+        return len(self.pilots) < FEWEST[self.integrator]
+
+    def likely_steps(self, tolerance: float) -> float:
+        """Steps of a run in the time of a frame that the last pilot does not meet the tolerance of, however many."""
+        ratio = max(LEAST_REACH, (self.error / tolerance) ** (1.0 / self.assumed_order))
+        return float(self.pilots[-1].per_frame) * ratio

@@ -36,6 +36,12 @@ def is_smooth(scene: Scene, touches: bool) -> bool:
     return not (prescribed or damped or touches or slackens)
 
 
+def releases(scene: Scene) -> bool:
+    """Whether a path may release its nodes, which changes forces suddenly."""
+    paths = [c.path for body in scene.bodies for c in body.constraints if c.path is not None]
+    return any(getattr(getattr(path, "frames", path), "release", True) for path in paths)
+
+
 def error_over_difference(ratio: float, order: float) -> float:
     """Error of a run over its difference to another one. ratio: the other's step, or mesh width, over the run's."""
     return 1.0 / abs(ratio**order - 1.0)

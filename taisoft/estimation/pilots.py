@@ -1,7 +1,8 @@
 """Pilots: runs of a whole simulation with trial steps, whose differences show which steps meet a tolerance.
 
 A pilot takes steps of the run's own simulator, which afterwards is in the state that it had before. Pilots are compared at
-common frames, at some of their nodes, so that their paths take little memory.
+common frames, at some of their nodes, so that their paths take little memory. A pilot keeps the state before its hardest part,
+the one in which velocities change most from frame to frame: other steps are compared with it there for a small part of the cost.
 """
 
 import math
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
 NEGLIGIBLE = {"f32": 1e-6, "f64": 1e-12}  # excursions, over the size of the scene, that are rounding
 ROUNDING = 1e-6  # part of a frame that a run's length may lack of a whole one
 MAX_FRAMES = 48  # at which paths are recorded
+PARTS = 16  # of a run, about; a pilot knows which is the hardest
 MAX_NODES = 4096  # whose paths are recorded, evenly spread
 COUNTS = ("newton_iterations", "linear_iterations", "contact_iterations")
 
@@ -35,7 +37,8 @@ class Pilot:
 
     frames: numbers (k,) of the recorded ones; positions: of the recorded nodes at these (k,n,3) [m]; variations: (n,) sums of the
     changes, from frame to frame, of what velocities change in a frame; jump: the largest such change of velocity [m/s]; end: the
-    simulation's state at the end; warned: texts of its warnings.
+    simulation's state at the end; hardest: the first frame of the hardest part, and the state there; parts: changes of velocities
+    in all parts over those in the hardest one; warned: texts of warnings.
     """
 
     integrator: str
@@ -46,6 +49,8 @@ class Pilot:
     jump: float = 0.0
     report: RunReport = field(default_factory=RunReport)
     end: dict = field(default_factory=dict)
+    hardest: tuple[int, dict] = (0, {})
+    parts: float = 1.0
     warned: list[str] = field(default_factory=list)
 
     def counts_per_step(self) -> list[float]:
@@ -64,28 +69,62 @@ class Pilot:
 
 
 class Recorder:
-    """Records a pilot at its frames; pass `frame` to a run as on_frame. stride: time between these, in frames of `frames`."""
+    """Records a pilot at its frames; pass `frame` to a run as on_frame.
 
-    def __init__(self, pilot: Pilot, frames: "Frames", stride: Fraction):
-        self._pilot, self._frames, self._stride, self._first = pilot, frames, stride, None
+    stride: time between these, in frames of `frames`; first: the one at which it begins; keeps: whether to keep the state before
+    the hardest part.
+    """
+
+    def __init__(self, pilot: Pilot, frames: "Frames", stride: Fraction, first: int = 0, keeps: bool = False):
+        self._pilot, self._frames, self._first, self._keeps = pilot, frames, first, keeps
+        self._stride = stride if stride.denominator > 1 else int(stride)
+        self._index: int | None = None  # of the first frame
         self._velocities = self._jump = None
+        self._part: tuple[int, dict] = (0, {})  # the present one, as Pilot.hardest
+        self._changes: np.ndarray | float = 0.0  # (n,) of velocities in it
+        self._most, self._sum = -1.0, 0.0  # of these changes in a part, and of the largest ones in all parts
 
     def frame(self, sim: "Simulator", index: int, _report) -> None:
         """Record a frame, unless it lies between those of `frames`, or is the last one and not whole."""
-        self._first = index if self._first is None else self._first
-        number, pilot = (index - self._first) * self._stride, self._pilot
-        if number.denominator != 1 or number > self._frames.count:
+        self._index = index if self._index is None else self._index
+        number, pilot, frames = self._first + (index - self._index) * self._stride, self._pilot, self._frames
+        if number.denominator != 1 or number > frames.count:
             return
-        x, v = (field[self._frames.nodes].astype(np.float64) for field in sim._dynamics.state.state())
+        number, state = int(number), sim._dynamics.state
+        if frames.is_recorded(number):
+            x, v = state.state()
+            pilot.frames.append(number)
+            pilot.positions.append(x[frames.nodes].astype(np.float64))
+        else:
+            v = state.velocities()
+        self._add_velocities(v[frames.nodes].astype(np.float64))
+        if self._keeps and (number % frames.part == 0 or number == frames.count):
+            self._end_part(sim, number)
+
+    def _add_velocities(self, v: np.ndarray) -> None:
+        """Add the changes of velocities (n,3) [m/s] since the last frame."""
         before, self._velocities = self._velocities, v
-        if before is not None:
-            previous, self._jump = self._jump, v - before
-            pilot.jump = max(pilot.jump, float(np.linalg.norm(self._jump, axis=1).max()))
-            if previous is not None:
-                pilot.variations = pilot.variations + np.linalg.norm(self._jump - previous, axis=1)
-        if self._frames.is_recorded(number):
-            pilot.frames.append(int(number))
-            pilot.positions.append(x)
+        if before is None:
+            return
+        previous, self._jump = self._jump, v - before
+        jump, pilot = _lengths(self._jump), self._pilot
+        pilot.jump = max(pilot.jump, float(jump.max()))
+        if previous is None:
+            self._changes = self._changes + jump
+            return
+        change = _lengths(self._jump - previous)
+        self._changes, pilot.variations = self._changes + change, pilot.variations + change
+
+    def _end_part(self, sim: "Simulator", number: int) -> None:
+        """End a part of the run, and begin the next one at a frame."""
+        if self._part[1]:
+            changes = float(np.max(self._changes))
+            self._sum += changes
+            if changes > self._most:
+                self._most, self._pilot.hardest = changes, self._part
+            self._pilot.parts = self._sum / self._most if self._most > 0.0 else 1.0
+        if number < self._frames.count:
+            self._part, self._changes = (number, sim._dynamics.snapshot()), 0.0
 
 
 @dataclass(frozen=True)
@@ -98,7 +137,7 @@ class Frames:
 
     seconds: float
     length: float
-    nodes: np.ndarray
+    nodes: slice
     bodies: np.ndarray
     negligible: float
 
@@ -109,19 +148,45 @@ class Frames:
 
     def is_recorded(self, frame: int) -> bool:
         """Whether pilots record a frame, counted from 0 at the start: at most about MAX_FRAMES, and the last one."""
-        return frame % -(-self.count // MAX_FRAMES) == 0 or frame == self.count
+        return frame % self._between == 0 or frame == self.count
 
-    def pilot(self, sim: "Simulator", per_frame: Fraction, stop: Callable[[], bool] | None, run: RunFunction) -> Pilot:
-        """Run a pilot of `per_frame` steps a frame; its report has the status "failed" if it fails. Restores sim's state."""
+    @property
+    def _between(self) -> int:
+        """Frames from one that is recorded to the next."""
+        return -(-self.count // MAX_FRAMES)
+
+    @property
+    def part(self) -> int:
+        """Frames of a part of the run; the last part may have fewer."""
+        return self._between * -(-self.count // (self._between * PARTS))
+
+    def pilot(
+        self,
+        sim: "Simulator",
+        per_frame: Fraction,
+        stop: Callable[[], bool] | None,
+        run: RunFunction,
+        whole: Pilot | None = None,
+        keeps: bool = False,
+    ) -> Pilot:
+        """Run a pilot of `per_frame` steps a frame; its report has the status "failed" if it fails. Restores sim's state.
+
+        whole: another pilot, whose hardest part alone is to be run; keeps: whether it keeps the state before its own.
+        """
         pilot = Pilot(sim.settings.integrator, per_frame)
         kept, may_soften = sim._dynamics.snapshot(), sim._may_soften
-        stride = math.ceil(1 / per_frame)
+        stride, first = math.ceil(1 / per_frame), 0
         length = self.length if stride == 1 else self.count // stride * stride * self.seconds
+        if whole is not None:
+            first, state = whole.hardest
+            length = min(self.part, self.count - first) * self.seconds
         try:
+            if whole is not None:
+                sim._dynamics.restore(state)
             with warnings.catch_warnings(record=True) as caught:
                 warnings.simplefilter("always")  # they are those of the run only if the pilot is
                 sim.dt = self.seconds / float(per_frame)
-                recorder = Recorder(pilot, self, Fraction(stride))
+                recorder = Recorder(pilot, self, Fraction(stride), first, keeps)
                 pilot.report = run(sim, length, recorder.frame, 1.0 / (self.seconds * stride), stop)
             pilot.end = sim._dynamics.snapshot()
             pilot.warned = list(dict.fromkeys(str(one.message) for one in caught if issubclass(one.category, UserWarning)))
@@ -135,7 +200,7 @@ def make_frames(sim: "Simulator", length: float, seconds: float) -> Frames:
     """The frames of a run of `length` [s], one after every `seconds` [s]."""
     sizes = [body.n_nodes for body in sim.scene.bodies]
     bodies = owners(sizes)
-    nodes = np.arange(0, len(bodies), -(-len(bodies) // MAX_NODES))
+    nodes = slice(None, None, -(-len(bodies) // MAX_NODES))
     size = float(np.ptp(sim.positions(), axis=0).max())
     return Frames(seconds, length, nodes, bodies[nodes], NEGLIGIBLE[sim.settings.precision] * size)
 
@@ -144,3 +209,8 @@ def distances(pilot: Pilot, other: Pilot) -> np.ndarray:
     """Distances of two pilots' nodes at their common frames (k,n) [m]."""
     common = [frame for frame in pilot.frames if frame in set(other.frames)]
     return np.linalg.norm(pilot.at(common) - other.at(common), axis=2)
+
+
+def _lengths(vectors: np.ndarray) -> np.ndarray:
+    """Lengths (n,) of vectors (n,3)."""
+    return np.sqrt(np.einsum("ij,ij->i", vectors, vectors))

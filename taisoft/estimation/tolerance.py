@@ -2,15 +2,16 @@
 
 Implicit pilots are a ladder (`ladder`), each with half the step of the one before, that ends where the run needs at most eight
 times as many steps as the last pilot. How many follows from the difference of the last two and its observed order. Explicit steps
-cannot be coarser than stable. Their first pilot has the largest stable step, and a second one with a slightly smaller step must
-agree with it; if it does not, or not well enough, a ladder follows. A pilot that meets the tolerance is the run, which is
-repeated only if frames or steps are observed, or an estimate by twins is asked for.
+cannot be coarser than stable. Their first pilot has the largest stable step. Its velocities, and its hardest part repeated with a
+slightly smaller step, show whether it is enough; if that is not sure a second pilot takes the smaller step all the way, and
+otherwise a ladder follows. A pilot that meets the tolerance is the run, which is repeated only if frames or steps are observed,
+or an estimate by twins is asked for.
 
 Which kind of steps a run takes follows from counts (`costs`). Explicit steps are accepted at once where they cost less than
 implicit ones could. Among implicit methods BDF2 is used: it is of second order, has contacts, and damps what its steps cannot
 resolve.
 
-Weak: pilots do not show what is faster than all of them. Where their paths diverge, no step meets the tolerance.
+Weak: pilots do not show what is faster than all of them (`vibrations`). Where their paths diverge, no step meets the tolerance.
 """
 
 import math
@@ -23,8 +24,11 @@ from typing import TYPE_CHECKING
 from taisoft.errors import SimulationError, no_memory
 from taisoft.estimation.costs import explicit_step, implicit_step
 from taisoft.estimation.first_choice import EXPLICIT, IMPLICIT, stable_steps
-from taisoft.estimation.ladder import Ladder
+from taisoft.estimation.ladder import LEAST_REACH, Ladder
+from taisoft.estimation.order import nominal_order, releases
 from taisoft.estimation.pilots import Pilot, Recorder, RunFunction, distances, make_frames
+from taisoft.estimation.vibrations import ERROR as VIBRATIONS
+from taisoft.estimation.vibrations import are_passed_over
 from taisoft.records import BodyError, ErrorEstimate, RunReport
 from taisoft.scene.scene import Scene
 from taisoft.stability import stable_dt
@@ -33,7 +37,8 @@ if TYPE_CHECKING:
     from taisoft.simulator import Simulator
 
 SAFETY = 0.8  # part of the tolerance that a predicted error may take
-SECOND_PILOT = Fraction(5, 4)  # steps of the second explicit pilot over those of the first
+SMALLER = Fraction(5, 4)  # steps of a slightly smaller size over those of the first explicit pilot
+MOST = 4.0  # steps of the second explicit pilot over those of the first, at most
 LARGEST_STEP = 4  # frames in a step of the first implicit pilot
 LEAST_STEPS = 8  # of a pilot
 LEAST_FRAMES, MOST_FRAMES = 16, 64  # at which pilots are compared where a run has few, or every step is one
@@ -107,13 +112,15 @@ class Chooser:
         self._tolerance = SAFETY * sim.settings.tolerance
         self._parts = 1 if fps is None else max(1, math.ceil(LEAST_FRAMES / (seconds * fps)))  # of a frame of the run
         self._frames = make_frames(sim, seconds, seconds / MOST_FRAMES if fps is None else 1.0 / (fps * self._parts))
-        self._sudden = sim.touches or _releases(sim.scene)
+        self._sudden = sim.touches or releases(sim.scene)
         self._last_failure: tuple[float, str] | None = None  # of the last pilot, if it failed: when [s], and why
         self.compile_seconds = 0.0  # of the pilots [s]
         self.ladder = self._ladder()
 
     def _ladder(self) -> Ladder:
-        return Ladder(self._sim.settings.integrator, self._sudden, self._frames)
+        sim = self._sim
+        integrator = sim.settings.integrator
+        return Ladder(integrator, self._sudden, nominal_order(integrator, sim.scene, sim.touches), self._frames)
 
     # --- choosing -----------------------------------------------------------------------------------------------------
 
@@ -156,7 +163,8 @@ class Chooser:
             self.ladder.add(self._pilot(per_frame))
             steps, pilots = self.ladder.steps_needed(self._tolerance), self.ladder.pilots
             cost = implicit_step(sim.scene, sim.touches, pilots[-1].counts_per_step() if pilots else None)
-            if (steps or 2 * per_frame) * cost > explicit:
+            likely = 2 * per_frame if self.ladder.are_few else self.ladder.likely_steps(self._tolerance)
+            if (steps or likely) * cost > explicit:
                 return None
             if steps is not None or self.ladder.is_over:
                 return steps or self._last_steps()
@@ -165,15 +173,28 @@ class Chooser:
     def _by_explicit_pilots(self, least: int) -> int:
         """Explicit steps in the time of a frame."""
         self._use(EXPLICIT, self._frames.seconds / least)
-        self.ladder.add(self._pilot(Fraction(least)))
-        per_frame = Fraction(math.ceil(SECOND_PILOT * least))
-        self.ladder.replace_first(self._pilot(per_frame))
+        slightly_more, ladder, ratio = Fraction(math.ceil(SMALLER * least)), self.ladder, 1.0
+        pilot = self._pilot(Fraction(least), keeps=True)
+        ladder.add(pilot)
+        if ladder.pilots:
+            ladder.expect()
+            ratio = ladder.steps_over_last(self._tolerance)
+            if ladder.meets(self._tolerance) and pilot.report.status == "ok":
+                ladder.confirm(self._pilot(slightly_more, whole=pilot))
+                if ladder.meets(self._tolerance):
+                    return least
+        if ratio <= SMALLER:
+            per_frame = slightly_more
+            ladder.replace_first(self._pilot(per_frame))
+        else:
+            per_frame = Fraction(math.ceil(least * (2.0 if ladder.nominal == 1 else min(MOST, max(LEAST_REACH, ratio)))))
+            ladder.add(self._pilot(per_frame))
         while True:
-            steps = self.ladder.steps_needed(self._tolerance)
-            if steps is not None or self.ladder.is_over:
+            steps = ladder.steps_needed(self._tolerance)
+            if steps is not None or ladder.is_over:
                 return steps or self._last_steps()
             per_frame *= 2
-            self.ladder.add(self._pilot(per_frame))
+            ladder.add(self._pilot(per_frame))
 
     def _last_steps(self) -> int:
         """Steps of the last pilot that did not fail. Raises SimulationError if all did."""
@@ -181,13 +202,15 @@ class Chooser:
             raise SimulationError(f"every pilot failed, the last one because of {self._last_failure[1]}")
         return math.ceil(self.ladder.pilots[-1].per_frame)
 
-    def _pilot(self, per_frame: Fraction) -> Pilot:
-        """Run a pilot. Raises SimulationError if it fails when the one before failed: smaller steps do not help."""
-        pilot = self._frames.pilot(self._sim, per_frame, self._stop, self._run_steps)
+    def _pilot(self, per_frame: Fraction, whole: Pilot | None = None, keeps: bool = False) -> Pilot:
+        """Run a pilot, see `Frames.pilot`. Raises SimulationError if it and the one before fail: smaller steps do not help."""
+        pilot = self._frames.pilot(self._sim, per_frame, self._stop, self._run_steps, whole, keeps)
         report, before = pilot.report, self._last_failure
         self.compile_seconds += report.compile_seconds
         if report.interrupted:
             raise KeyboardInterrupt
+        if whole is not None:  # whether a part fails does not count
+            return pilot
         self._last_failure = (report.sim_seconds, report.problems[-1]) if report.status == "failed" else None
         if before and self._last_failure and abs(report.sim_seconds - before[0]) <= self._frames.seconds:
             raise SimulationError(report.problems[-1])
@@ -255,7 +278,7 @@ class Chooser:
             made.time = ladder.error
             if len(ladder.pilots) == 1:
                 made.notes.append(
-                    "the error in time is expected from two pilots and velocities, and may be wrong by a factor of ten"
+                    "the error in time is expected from velocities and nearly equal steps, and may be wrong by a factor of ten"
                 )
         else:
             made.order, ratio = ladder.order, float(run.per_frame / coarser[-1].per_frame)
@@ -263,10 +286,15 @@ class Chooser:
             for k, body in enumerate(made.bodies.values()):
                 body.time = float(errors[self._frames.bodies == k].max(initial=0.0))
             made.time = float(errors.max())
+        if made.time and self._passes_over_vibrations(run):
+            made.time = max(made.time, VIBRATIONS)
+            made.notes.append(
+                f"the steps pass over vibrations of bodies in contact, whose friction may change the motion by "
+                f"{100.0 * VIBRATIONS:.2g} %"
+            )
         return made
 
-
-def _releases(scene: Scene) -> bool:
-    """Whether a path may release its nodes, which changes forces suddenly."""
-    paths = [c.path for body in scene.bodies for c in body.constraints if c.path is not None]
-    return any(getattr(getattr(path, "frames", path), "release", True) for path in paths)
+    def _passes_over_vibrations(self, run: Pilot) -> bool:
+        touched = any(report.n_contacts for report in self.ladder.pilots[-1].report.step_reports)
+        dt = self._frames.seconds / float(run.per_frame)
+        return touched and run.integrator == IMPLICIT and are_passed_over(self._sim.scene, dt)
