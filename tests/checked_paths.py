@@ -13,7 +13,7 @@ from taisoft.backend.arrays import FieldArena
 from taisoft.collision.analytic import NO_SHAPES, build_analytic, place_analytic
 from taisoft.collision.bvh import Bvh
 from taisoft.collision.candidates import Buffer, entries
-from taisoft.collision.passages import SEARCHED, TO_STATE
+from taisoft.collision.near_list import SEARCHED, TO_STATE
 from taisoft.collision.path_check import PathCheck
 from taisoft.scene.obstacles import Obstacle
 

@@ -20,8 +20,9 @@ from taisoft.collision.distance_field import DistanceFields, build_fields, find_
 from taisoft.collision.edge_edge import find_proximity
 from taisoft.collision.features import BY_EDGES, BY_FACES, BY_FIELD
 from taisoft.collision.intersections import Intersections, find_crossings
+from taisoft.collision.near_list import STILL
 from taisoft.collision.overlap import Containment, Inside
-from taisoft.collision.passages import STILL, append_passages
+from taisoft.collision.passages import append_passages
 from taisoft.collision.path_check import NO_PASSAGES, PathCheck
 from taisoft.collision.spatial_hash import SpatialHash
 from taisoft.collision.surface import ACTIVE, NONFINITE, PAIRS, build_surface, move_obstacles, update_surface
