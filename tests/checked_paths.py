@@ -23,14 +23,14 @@ REACH, FLOOR = 0.1, 2e-4  # [m]; ipctk may call a step colliding that comes with
 class Checked:
     """A surface with trees and the check of its paths."""
 
-    def __init__(self, made, obstacles, capacity):
+    def __init__(self, made, obstacles, capacity, k_dop):
         self.made, s, arena = made, made.surface, made.arena
         s.node.from_numpy(np.arange(len(made.x), dtype=np.int32))  # a node for each vertex
         first = len(made.soft) - len(obstacles)
         self._placed = [(first + k, o) for k, o in enumerate(obstacles)]
         self.shapes = build_analytic(self._placed, arena) if obstacles else NO_SHAPES
         has_pairs = first > 1 or made.self_on.any()
-        self.tree = Bvh(s, made.topology, made.x, made.margin, made.machine, arena) if has_pairs else None
+        self.tree = Bvh(s, made.topology, made.x, made.margin, made.machine, arena, k_dop) if has_pairs else None
         self.row = Buffer("row", entries, s.chunks, None, s.chunks, arena)
         self.state = arena.vectors("state", ti.f64, len(made.x))
         self._arenas = []
@@ -63,13 +63,13 @@ class Checked:
 
 @contextmanager
 def checked(
-    parts, obstacles=(), reach: float = REACH, capacity: int | None = None, self_on: bool = True, **options
+    parts, obstacles=(), reach: float = REACH, capacity: int | None = None, self_on: bool = True, k_dop: int = 6, **options
 ) -> Iterator[Checked]:
     """Soft surfaces, each checked against itself too, and obstacles without triangles."""
     soft = np.arange(len(parts) + len(obstacles)) < len(parts)
     nothing = [(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64)) for _ in obstacles]
     with surface_of([*parts, *nothing], soft=soft, self_on=soft & self_on, margin=reach, **options) as made:
-        one = Checked(made, obstacles, capacity)
+        one = Checked(made, obstacles, capacity, k_dop)
         yield one
         one.release()
 

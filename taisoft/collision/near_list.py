@@ -4,7 +4,8 @@ The broad phase makes it from the boxes of a search: around the straight paths o
 side. It serves for later paths as long as no pair that is not listed can touch on them. The two triangles of such a pair were
 farther apart than the reach along some axis, wherever their corners were on the listed paths. So they still are apart where
 their corners have left those paths by vectors that differ by less than the reach along every axis: motion that bodies have in
-common does not count. Every collider has a box of these vectors, and those of two colliders that may touch are compared.
+common does not count. On a straight path it suffices that they do at both ends. Every collider has a box of these vectors at
+either end, and those of two colliders that may touch are compared.
 
 Only *active* triangles count, whose present boxes meet that of another collider: other triangles cannot touch anything, provided
 that the present paths do not leave the boxes of the present search.
@@ -34,7 +35,7 @@ class PathFields:
     listed_x: Any  # (n_verts) vectors: positions and searched displacements when the near pairs were listed
     listed_move: Any
     can_touch: Any  # (n_verts) i32: 1 for vertices of active triangles
-    left_lo: Any  # (n_bodies) vectors: boxes of how far those have left the listed paths
+    left_lo: Any  # (2 n_bodies) vectors: boxes of the vectors by which those have left the listed paths at the start and the end
     left_hi: Any
     left: Any  # (2) i32: 1 if paths leave what was searched (UNCOVERED), or if the list is of no use for them (OUTDATED)
     lo: Any  # (2 n_triangles) vectors: boxes of active triangles at the start and the end, grown by half the floor; else empty
@@ -101,21 +102,23 @@ def _compare_with_listed(s: ti.template(), g: ti.template(), limit):
     for task in range(s.n_bodies * s.cheap_spread):
         if task % s.cheap_spread == 0:
             b = task // s.cheap_spread
-            lo, hi = dvec(ti.math.inf), dvec(-ti.math.inf)
+            lo0, hi0, lo1, hi1 = dvec(ti.math.inf), dvec(-ti.math.inf), dvec(ti.math.inf), dvec(-ti.math.inf)
             for i in range(g.first_vertex[b], g.first_vertex[b + 1]):
                 if g.can_touch[i] == 1:
                     now = s.x[i] - g.listed_x[i]
                     first, last = _leaving(now, g.listed_move[i]), _leaving(now + g.path[i], g.listed_move[i])
-                    lo, hi = ti.min(lo, first, last), ti.max(hi, first, last)
-            g.left_lo[b], g.left_hi[b] = lo, hi
+                    lo0, hi0, lo1, hi1 = ti.min(lo0, first), ti.max(hi0, first), ti.min(lo1, last), ti.max(hi1, last)
+            g.left_lo[2 * b], g.left_hi[2 * b], g.left_lo[2 * b + 1], g.left_hi[2 * b + 1] = lo0, hi0, lo1, hi1
     ti.loop_config(serialize=s.serial_cheap)
     for task in range(s.n_bodies * s.cheap_spread):
         if task % s.cheap_spread == 0:
             a = task // s.cheap_spread
             for b in range(a, s.n_bodies):
                 if may_meet(s, a, b) == 1:
-                    if ti.max(g.left_hi[a] - g.left_lo[b], g.left_hi[b] - g.left_lo[a]).max() > limit:
-                        g.left[OUTDATED] = 1
+                    for end in range(2):
+                        first, second = 2 * a + end, 2 * b + end
+                        if (ti.max(g.left_hi[first] - g.left_lo[second], g.left_hi[second] - g.left_lo[first]) > limit).any():
+                            g.left[OUTDATED] = 1
 
 
 @ti.func

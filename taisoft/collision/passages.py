@@ -4,8 +4,7 @@ The paths lead from the positions of the last search to given ones, obstacles in
 free if its two triangles certainly keep a small distance, and else a passage, with the part of the step until which they do. If
 no pair is a passage, surfaces that did not cross at the start do not cross on the way nor at the end.
 
-Pairs come from three lists. Triangles without a common vertex: those whose boxes overlap, listed by the broad phase and used
-until a vertex has left the boxes that were searched, so that bodies at rest are listed once. Triangles with a common vertex touch
+Pairs come from three lists. Triangles without a common vertex: those of `near_list`. Triangles with a common vertex touch
 there for ever: of each, the edge opposite that vertex must not pass the other triangle, of triangles with a common edge the
 opposite corners and the sides between them (`adjacent_rows`); that list is made once. Half-spaces, spheres and capsules: every
 vertex and triangle of the soft bodies. Boxes have triangles.

@@ -65,7 +65,7 @@ class PathCheck:
         self._topology, self._shape_body = topology, shapes.body.to_numpy() if shapes.any else np.zeros(0, dtype=np.int64)
         self._rows = rows = adjacent_rows(topology.triangle[np.asarray(self_on, dtype=bool)[topology.body]])
         triangle_ends = 2 * max(s.n_triangles, 1)
-        lengths = dict.fromkeys(("path", "listed_x", "listed_move"), n) | dict.fromkeys(("left_lo", "left_hi"), s.n_bodies)
+        lengths = dict.fromkeys(("path", "listed_x", "listed_move"), n) | dict.fromkeys(("left_lo", "left_hi"), 2 * s.n_bodies)
         lengths |= dict.fromkeys(("lo", "hi"), triangle_ends)
         self.fields = PathFields(
             **{name: arena.vectors(f"path_{name}", ti.f64, length) for name, length in lengths.items()},
