@@ -177,8 +177,8 @@ def test_an_earlier_list_finds_what_a_fresh_one_and_all_pairs_do(name):
 @pytest.mark.parametrize("k_dop", [6, 18])
 @pytest.mark.parametrize("name", SURFACES)
 def test_an_old_list_misses_nothing_however_bodies_move(name, k_dop):
-    """Steps near a collision follow each other with a random common motion, small to large motions of each vertex, and often one half
-    of the surface glides along the other."""
+    """Steps near a collision follow each other with a random common motion and small to large motions of each vertex; often one
+    half of the surface glides along the other."""
     cases, judge = starts(name, 60, 4)
     rng, outcomes, drifts = np.random.default_rng(5), [], []
     with checked(SURFACES[name][1], k_dop=k_dop) as one:
