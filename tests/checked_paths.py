@@ -40,7 +40,8 @@ class Checked:
         """Another check of the same surface, with its own lists."""
         made, arena = self.made, FieldArena()
         self._arenas.append(arena)
-        return PathCheck(made.surface, made.topology, self.shapes, made.self_on, made.margin, FLOOR, arena, capacity)
+        self_on, has_pairs = made.self_on, self.tree is not None
+        return PathCheck(made.surface, made.topology, self.shapes, self_on, has_pairs, made.margin, FLOOR, arena, capacity)
 
     def search(self, x: np.ndarray, move: np.ndarray, time: float = 0.0, dt: float = 1.0) -> None:
         """Place vertices (v,3) [m], their displacements [m], and the obstacles."""

@@ -296,7 +296,7 @@ class Detection:
         """Allocate what the check of paths needs."""
         settings = self.scene.collision
         limits = settings.initial_capacity, settings.max_capacity
-        options = self._self_on, self.reach, self.floor, self._arena, *limits
+        options = self._self_on, self._has_pairs, self.reach, self.floor, self._arena, *limits
         self._paths = PathCheck(self.surface, self.topology, self.shapes, *options)
 
     def passages(self, mode: int) -> tuple[np.ndarray, np.ndarray] | None:

@@ -32,8 +32,9 @@ class PathFields:
     """Fields of the check, for kernels. Vectors are 3-vectors f64 [m]."""
 
     path: Any  # (n_verts) vectors: displacements to be checked
-    listed_x: Any  # (n_verts) vectors: positions and searched displacements when the near pairs were listed
-    listed_move: Any
+    listed_x: Any  # (n_verts) vectors: positions and searched displacements when the near pairs were listed; 1 if n_listed is 0,
+    listed_move: Any  # as are the fields of triangles
+    n_listed: Count  # triangles that may be in near pairs: all, or none
     can_touch: Any  # (n_verts) i32: 1 for vertices of active triangles
     left_lo: Any  # (2 n_bodies) vectors: boxes of the vectors by which those have left the listed paths at the start and the end
     left_hi: Any
@@ -79,7 +80,7 @@ def _leaving(r, move):
 def _box_ends(s: ti.template(), g: ti.template(), floor):
     """Set the boxes and heights of active triangles at both ends of their paths, and mark their vertices."""
     ti.loop_config(serialize=s.serial_cheap)
-    for t in range(s.n_triangles):
+    for t in range(g.n_listed):
         for end in ti.static(range(2)):
             g.lo[2 * t + end], g.hi[2 * t + end] = dvec(ti.math.inf), dvec(-ti.math.inf)
     ti.loop_config(serialize=s.serial_cheap)

@@ -52,24 +52,27 @@ class PathCheck:
         topology: Topology,
         shapes: AnalyticObstacles,
         self_on: np.ndarray,
+        has_pairs: bool,
         reach: float,
         floor: float,
         arena: FieldArena,
         capacity: int | None = None,
         max_capacity: int | None = None,
     ):
-        """self_on: (n_bodies,) whether a collider is checked against itself. capacity, max_capacity: of the lists, None for the
-        default."""
+        """self_on: (n_bodies,) whether a collider is checked against itself. has_pairs: whether any triangles may touch.
+        capacity, max_capacity: of the lists, None for the default."""
         self.surface, self.shapes, self.limit, self.floor = surface, shapes, IN_BOXES * reach, floor
         s, n = surface, max(surface.n_verts, 1)
         self._topology, self._shape_body = topology, shapes.body.to_numpy() if shapes.any else np.zeros(0, dtype=np.int64)
         self._rows = rows = adjacent_rows(topology.triangle[np.asarray(self_on, dtype=bool)[topology.body]])
-        triangle_ends = 2 * max(s.n_triangles, 1)
-        lengths = dict.fromkeys(("path", "listed_x", "listed_move"), n) | dict.fromkeys(("left_lo", "left_hi"), 2 * s.n_bodies)
-        lengths |= dict.fromkeys(("lo", "hi"), triangle_ends)
+        n_listed = s.n_triangles if has_pairs else 0
+        triangle_ends = max(2 * n_listed, 1)
+        lengths = {"path": n} | dict.fromkeys(("listed_x", "listed_move"), n if has_pairs else 1)
+        lengths |= dict.fromkeys(("left_lo", "left_hi"), 2 * s.n_bodies) | dict.fromkeys(("lo", "hi"), triangle_ends)
         self.fields = PathFields(
             **{name: arena.vectors(f"path_{name}", ti.f64, length) for name, length in lengths.items()},
             **{name: arena.field(f"path_{name}", ti.f64, triangle_ends) for name in ("low", "high")},
+            n_listed=n_listed,
             can_touch=arena.field("path_can_touch", ti.i32, n),
             left=arena.field("path_left", ti.i32, 2),
             exempt=arena.field("path_exempt", ti.i32, s.n_bodies**2),
@@ -77,7 +80,7 @@ class PathCheck:
             adjacent=integers(arena, "path_adjacent", rows.reshape(-1, 6)),
             n_adjacent=len(rows),
         )
-        limits = capacity or 4 * s.n_triangles + 64, max_capacity
+        limits = capacity or (4 * n_listed + 64 if has_pairs else 1), max_capacity
         self.near = Buffer("near_pairs", near_pairs, *limits, s.chunks, arena)
         self.passages = Buffer("passages", passage_fields, 64 * s.chunks, max_capacity, s.chunks, arena)
         self._is_listed = False
