@@ -184,8 +184,8 @@ S4.add_limit("shape error at the end, over L", 1e-2, PROPOSED)
 S4.add_limit("inverted tets at the end", 0.0, PROPOSED)
 S4.add_shortfall(
     "the arms, squeezed to half their room, turn two or three tets inside out, which recover when the planes open",
-    "a law that stiffens where a tet is squeezed to a twentieth of its volume; shorter steps arrive at the same snap, and a bound "
-    "that keeps volumes positive could only hold the jack back",
+    "a law that stiffens where a tet is squeezed to a twentieth of its volume; shorter steps arrive at the same snap, and a "
+    "bound that keeps volumes positive could only hold the jack back",
 )
 
 CASES = (S1, S2, S3, S4)
