@@ -13,7 +13,7 @@ from taisoft.backend.arrays import FieldArena
 from taisoft.collision.analytic import NO_SHAPES, build_analytic, place_analytic
 from taisoft.collision.bvh import Bvh
 from taisoft.collision.candidates import Buffer, entries
-from taisoft.collision.passages import SEARCHED, TO_STATE
+from taisoft.collision.near_list import SEARCHED, TO_STATE
 from taisoft.collision.path_check import PathCheck
 from taisoft.scene.obstacles import Obstacle
 
@@ -23,14 +23,14 @@ REACH, FLOOR = 0.1, 2e-4  # [m]; ipctk may call a step colliding that comes with
 class Checked:
     """A surface with trees and the check of its paths."""
 
-    def __init__(self, made, obstacles, capacity):
+    def __init__(self, made, obstacles, capacity, k_dop):
         self.made, s, arena = made, made.surface, made.arena
         s.node.from_numpy(np.arange(len(made.x), dtype=np.int32))  # a node for each vertex
         first = len(made.soft) - len(obstacles)
         self._placed = [(first + k, o) for k, o in enumerate(obstacles)]
         self.shapes = build_analytic(self._placed, arena) if obstacles else NO_SHAPES
         has_pairs = first > 1 or made.self_on.any()
-        self.tree = Bvh(s, made.topology, made.x, made.margin, made.machine, arena) if has_pairs else None
+        self.tree = Bvh(s, made.topology, made.x, made.margin, made.machine, arena, k_dop) if has_pairs else None
         self.row = Buffer("row", entries, s.chunks, None, s.chunks, arena)
         self.state = arena.vectors("state", ti.f64, len(made.x))
         self._arenas = []
@@ -40,7 +40,8 @@ class Checked:
         """Another check of the same surface, with its own lists."""
         made, arena = self.made, FieldArena()
         self._arenas.append(arena)
-        return PathCheck(made.surface, made.topology, self.shapes, made.self_on, made.margin, FLOOR, arena, capacity)
+        self_on, has_pairs = made.self_on, self.tree is not None
+        return PathCheck(made.surface, made.topology, self.shapes, self_on, has_pairs, made.margin, FLOOR, arena, capacity)
 
     def search(self, x: np.ndarray, move: np.ndarray, time: float = 0.0, dt: float = 1.0) -> None:
         """Place vertices (v,3) [m], their displacements [m], and the obstacles."""
@@ -63,13 +64,13 @@ class Checked:
 
 @contextmanager
 def checked(
-    parts, obstacles=(), reach: float = REACH, capacity: int | None = None, self_on: bool = True, **options
+    parts, obstacles=(), reach: float = REACH, capacity: int | None = None, self_on: bool = True, k_dop: int = 6, **options
 ) -> Iterator[Checked]:
     """Soft surfaces, each checked against itself too, and obstacles without triangles."""
     soft = np.arange(len(parts) + len(obstacles)) < len(parts)
     nothing = [(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64)) for _ in obstacles]
     with surface_of([*parts, *nothing], soft=soft, self_on=soft & self_on, margin=reach, **options) as made:
-        one = Checked(made, obstacles, capacity)
+        one = Checked(made, obstacles, capacity, k_dop)
         yield one
         one.release()
 

@@ -17,7 +17,8 @@ from scenes import dynamics, rows_of, set_state
 
 import taisoft as ts
 from taisoft.backend.arrays import FieldArena
-from taisoft.collision.passages import ADJACENT, FLAT, N_FEATURES, N_KINDS, NEAR, ROUND, SEARCHED
+from taisoft.collision.near_list import SEARCHED
+from taisoft.collision.passages import ADJACENT, FLAT, N_FEATURES, N_KINDS, NEAR, ROUND
 from taisoft.collision.path_check import adjacent_rows
 
 ipctk = pytest.importorskip("ipctk")

@@ -43,12 +43,13 @@ def free(X: array, P: array, radius: ti.f64, floor: ti.f64, are_apart: ti.i32, o
 
 
 @kernel
-def clear(X: array, P: array, floor: ti.f64, out: array):
+def plane(X: array, P: array, floor: ti.f64, first: ti.i32, out: array):
     for i in range(X.shape[0]):
         x, p = rows(X, i), rows(P, i)
-        corners = [row_of(x, k) for k in ti.static(range(6))]
-        moves = [row_of(p, k) for k in ti.static(range(6))]
-        out[i] = separation.clearly_apart(*corners, *moves, floor)
+        y = x + p
+        start = [row_of(x, k) - row_of(x, 3) for k in ti.static((0, 1, 2, 4, 5))]
+        end = [row_of(y, k) - row_of(y, 3) for k in ti.static((0, 1, 2, 4, 5))]
+        out[i] = separation.separating_plane(*start, *end, floor, first)
 
 
 @pytest.fixture(scope="module", params=["f64", "f32"], autouse=True)
@@ -126,11 +127,14 @@ def test_free_motions_are_free(speed):
 @pytest.mark.parametrize("speed", [0.0, 0.3, 2.0])
 def test_what_simple_tests_call_clear_is_free(speed):
     x, p = apart(1500, np.random.default_rng(6), speed)
-    out, floor = np.zeros(len(x)), 1e-2
-    clear(x, p, floor, out)
-    free = free_until(x, p, floor=floor)
-    assert 300 < out.sum() < len(x) and (free[out == 1.0] == 1.0).all()
-    for y, q in zip(x[out == 1.0], p[out == 1.0]):
+    found, floor = np.zeros((separation.N_PLANES, len(x))), 1e-2
+    for first in range(separation.N_PLANES):
+        plane(x, p, floor, first, found[first])
+    clear = found[0] >= 0.0
+    assert ((found >= 0.0) == clear).all()  # whatever is tried first
+    used = [np.sum(found[k] == k) for k in range(separation.N_PLANES)]
+    assert min(used) > 0 and 300 < clear.sum() < len(x) and (free_until(x, p, floor=floor)[clear] == 1.0).all()
+    for y, q in zip(x[clear], p[clear]):
         assert min(distance(y + t * q) for t in (0.0, 0.5, 1.0)) >= floor * (1.0 - 1e-9)
 
 

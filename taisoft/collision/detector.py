@@ -20,8 +20,9 @@ from taisoft.collision.distance_field import DistanceFields, build_fields, find_
 from taisoft.collision.edge_edge import find_proximity
 from taisoft.collision.features import BY_EDGES, BY_FACES, BY_FIELD
 from taisoft.collision.intersections import Intersections, find_crossings
+from taisoft.collision.near_list import STILL
 from taisoft.collision.overlap import Containment, Inside
-from taisoft.collision.passages import STILL, append_passages
+from taisoft.collision.passages import append_passages
 from taisoft.collision.path_check import NO_PASSAGES, PathCheck
 from taisoft.collision.spatial_hash import SpatialHash
 from taisoft.collision.surface import ACTIVE, NONFINITE, PAIRS, build_surface, move_obstacles, update_surface
@@ -295,7 +296,7 @@ class Detection:
         """Allocate what the check of paths needs."""
         settings = self.scene.collision
         limits = settings.initial_capacity, settings.max_capacity
-        options = self._self_on, self.reach, self.floor, self._arena, *limits
+        options = self._self_on, self._has_pairs, self.reach, self.floor, self._arena, *limits
         self._paths = PathCheck(self.surface, self.topology, self.shapes, *options)
 
     def passages(self, mode: int) -> tuple[np.ndarray, np.ndarray] | None:

@@ -4,8 +4,7 @@ The paths lead from the positions of the last search to given ones, obstacles in
 free if its two triangles certainly keep a small distance, and else a passage, with the part of the step until which they do. If
 no pair is a passage, surfaces that did not cross at the start do not cross on the way nor at the end.
 
-Pairs come from three lists. Triangles without a common vertex: those whose boxes overlap, listed by the broad phase and used
-until a vertex has left the boxes that were searched, so that bodies at rest are listed once. Triangles with a common vertex touch
+Pairs come from three lists. Triangles without a common vertex: those of `near_list`. Triangles with a common vertex touch
 there for ever: of each, the edge opposite that vertex must not pass the other triangle, of triangles with a common edge the
 opposite corners and the sides between them (`adjacent_rows`); that list is made once. Half-spaces, spheres and capsules: every
 vertex and triangle of the soft bodies. Boxes have triangles.
@@ -18,35 +17,22 @@ from typing import Any
 
 import taichi as ti
 
-from taisoft.backend.arrays import Count, FieldArena
+from taisoft.backend.arrays import FieldArena
 from taisoft.backend.runtime import kernel
 from taisoft.collision.analytic import CAPSULE, HALF_SPACE, SPHERE, rotation_rows
-from taisoft.collision.candidates import WHOLE, sum_parts
+from taisoft.collision.candidates import sum_parts
 from taisoft.collision.contacts import FACE_FACE, write_contact
 from taisoft.collision.features import unit
-from taisoft.collision.separation import at_weights, clearly_apart, free_until, nearest_of, unit_row
-from taisoft.collision.surface import ACTIVE, dvec, ivec, list_near
+from taisoft.collision.near_list import OUTDATED, STILL, UNCOVERED, boxes_or_planes_separate, prepare_paths
+from taisoft.collision.separation import at_weights, free_until, nearest_of, separating_plane, unit_row
+from taisoft.collision.surface import dvec, ivec
 from taisoft.fem.chunks import part_first
 
 # kinds of passages, by two ids: two triangles; a row of `adjacent`; a triangle and a sphere or capsule; a vertex and a half-space
 NEAR, ADJACENT, ROUND, FLAT = range(4)
 N_KINDS, N_FEATURES = 4, 16  # factors in ids of contacts
-SEARCHED, TO_STATE, STILL = range(3)  # which paths are checked
 
 corners = ti.types.matrix(6, 3, ti.f64)
-
-
-@dataclass(frozen=True, eq=False)
-class PathFields:
-    """Fields of the check, for kernels."""
-
-    path: Any  # (n_verts) 3-vectors f64: displacements to be checked [m]
-    listed_x: Any  # (n_verts) 3-vectors f64: positions and searched displacements when the near pairs were listed [m]
-    listed_move: Any
-    has_left: Any  # (1) i32: 1 if a vertex is too far from those paths
-    exempt: Any  # (n_bodies^2) i32: 1 for pairs of colliders that cross already
-    adjacent: Any  # (n_adjacent, 6) i32: vertices of two triangles
-    n_adjacent: Count
 
 
 @ti.func
@@ -90,30 +76,42 @@ def _vertex(s: ti.template(), g: ti.template(), kind, a, b, k):
 
 
 @ti.func
+def _corner(s: ti.template(), o: ti.template(), g: ti.template(), kind, a, b, k, moves: ti.template()):
+    """Corner k of a pair and its displacement along the given field, (3,) each [m]."""
+    i = _vertex(s, g, kind, a, b, k)
+    now, move = dvec(0.0), dvec(0.0)
+    if i >= 0:
+        now, move = s.x[i], moves[i]
+    elif ti.static(o.any):
+        side = ti.select(k == 3, ti.cast(-1.0, ti.f64), ti.cast(1.0, ti.f64))
+        now = _axis_end(o, b, side, 0)
+        move = _axis_end(o, b, side, 1) - now
+    return now, move
+
+
+@ti.func
 def _rows(s: ti.template(), o: ti.template(), g: ti.template(), kind, a, b, moves: ti.template()):
     """Corners (6,3) of a pair and their displacements (6,3) along the given field [m]."""
     x, p = corners(0.0), corners(0.0)
     for k in ti.static(range(6)):
-        i = _vertex(s, g, kind, a, b, k)
-        now, move = dvec(0.0), dvec(0.0)
-        if i >= 0:
-            now, move = s.x[i], moves[i]
-        elif ti.static(o.any):
-            side = ti.select(k == 3, ti.cast(-1.0, ti.f64), ti.cast(1.0, ti.f64))
-            now = _axis_end(o, b, side, 0)
-            move = _axis_end(o, b, side, 1) - now
+        now, move = _corner(s, o, g, kind, a, b, k, moves)
         for q in ti.static(range(3)):
             x[k, q], p[k, q] = now[q], move[q]
     return x, p
 
 
 @ti.func
-def _clearly_apart(s: ti.template(), g: ti.template(), kind, a, b, floor):
-    """Whether simple tests show that two triangles stay farther apart than `floor` [m], see `clearly_apart`."""
-    i, j, k = _vertex(s, g, kind, a, b, 0), _vertex(s, g, kind, a, b, 1), _vertex(s, g, kind, a, b, 2)
-    l, m, n = _vertex(s, g, kind, a, b, 3), _vertex(s, g, kind, a, b, 4), _vertex(s, g, kind, a, b, 5)
-    p, q, r, u, v, w = g.path[i], g.path[j], g.path[k], g.path[l], g.path[m], g.path[n]
-    return clearly_apart(s.x[i], s.x[j], s.x[k], s.x[l], s.x[m], s.x[n], p, q, r, u, v, w, floor)
+def _separating_plane(s: ti.template(), o: ti.template(), g: ti.template(), kind, a, b, need, first):
+    """Number of a plane that keeps a pair at least `need` [m] apart, see `separating_plane`."""
+    d0, d = _corner(s, o, g, kind, a, b, 3, g.path)
+    x0, p = _corner(s, o, g, kind, a, b, 0, g.path)
+    x1, q = _corner(s, o, g, kind, a, b, 1, g.path)
+    x2, r = _corner(s, o, g, kind, a, b, 2, g.path)
+    x4, u = _corner(s, o, g, kind, a, b, 4, g.path)
+    x5, v = _corner(s, o, g, kind, a, b, 5, g.path)
+    a0, b0, c0, e0, f0 = x0 - d0, x1 - d0, x2 - d0, x4 - d0, x5 - d0
+    a1, b1, c1, e1, f1 = a0 + (p - d), b0 + (q - d), c0 + (r - d), e0 + (u - d), f0 + (v - d)
+    return separating_plane(a0, b0, c0, e0, f0, a1, b1, c1, e1, f1, need, first)
 
 
 @ti.func
@@ -127,29 +125,6 @@ def _height(o: ti.template(), k, p, at_end):
 def _body_of(s: ti.template(), i):
     """Collider of vertex i."""
     return s.body[s.ring[s.ring_start[i]]]
-
-
-@ti.func
-def _set_paths(s: ti.template(), x: ti.template(), g: ti.template(), mode, limit):
-    """Set the paths, see `check_paths`, and whether they leave the listed ones by more than `limit` [m]."""
-    g.has_left[0] = 0
-    ti.loop_config(serialize=s.serial_cheap)
-    for i in range(s.n_verts):
-        path = s.move[i]
-        if mode == STILL:
-            path = dvec(0.0)
-        elif mode == TO_STATE and s.node[i] >= 0:
-            path = x[s.node[i]] - s.x[i]
-        g.path[i] = path
-        d = g.listed_move[i]
-        square = d.dot(d)
-        for end in range(2):
-            r = s.x[i] + ti.cast(end, ti.f64) * path - g.listed_x[i]
-            along = ti.cast(0.0, ti.f64)
-            if square > 0.0:
-                along = ti.min(ti.max(r.dot(d) / square, 0.0), 1.0)
-            if not (r - along * d).norm() <= limit:  # also if it is not a number
-                g.has_left[0] = 1
 
 
 @ti.func
@@ -171,20 +146,21 @@ def check_paths(
     out: ti.template(),
     mode: ti.i32,
     limit: ti.f64,
+    listed_limit: ti.f64,
     floor: ti.f64,
 ):
     """Find the passages on the paths to the positions x (n_nodes) [m] (TO_STATE), on the searched ones (SEARCHED), or where
     surfaces are already, half-spaces left out (STILL).
 
-    near: listed pairs. limit [m]: of the deviation from the listed paths; beyond it, nothing is checked. floor [m]: to be kept.
+    near: listed pairs. limit, listed_limit [m]: see `prepare_paths`; beyond them, nothing is checked. floor [m]: to be kept.
     """
-    _set_paths(s, x, g, mode, limit)
+    prepare_paths(s, x, g, mode, limit, listed_limit, floor)
     ti.loop_config(serialize=s.serial)
     for task in range(s.chunks * s.spread):
         if task % s.spread == 0:
             c = task // s.spread
             at, last = c * out.part, (c + 1) * out.part
-            if g.has_left[0] == 0:
+            if g.left[UNCOVERED] == 0 and g.left[OUTDATED] == 0:
                 if ti.static(o.any):
                     for i in range(part_first(c, s.n_verts, s.chunks), part_first(c + 1, s.n_verts, s.chunks)):
                         for k in range(o.count):
@@ -199,10 +175,13 @@ def check_paths(
                     n_round = o.count * (part_first(c + 1, s.n_triangles, s.chunks) - part_first(c, s.n_triangles, s.chunks))
                 n_adjacent = part_first(c + 1, g.n_adjacent, s.chunks) - part_first(c, g.n_adjacent, s.chunks)
                 for e in range(n_near + n_adjacent + n_round):
-                    kind, a, b, checked = NEAR, 0, 0, True
+                    kind, a, b, checked, plane = NEAR, 0, 0, True, 0
                     if e < n_near:
-                        a, b = near.data[c * near.part + e][0], near.data[c * near.part + e][1]
-                        checked = g.exempt[s.body[a] * s.n_bodies + s.body[b]] == 0
+                        listed = near.data[c * near.part + e]
+                        a, b, plane = listed[0], listed[1], listed[2]
+                        checked = boxes_or_planes_separate(s, g, a, b) == 0
+                        if checked:
+                            checked = g.exempt[s.body[a] * s.n_bodies + s.body[b]] == 0
                     elif e < n_near + n_adjacent:
                         kind, a = ADJACENT, part_first(c, g.n_adjacent, s.chunks) + e - n_near
                         checked = g.exempt[_body_of(s, g.adjacent[a, 0]) * (s.n_bodies + 1)] == 0
@@ -212,57 +191,21 @@ def check_paths(
                         checked = (o.kind[b] == SPHERE or o.kind[b] == CAPSULE) and s.soft[s.body[a]] == 1
                         if checked:
                             checked = g.exempt[s.body[a] * s.n_bodies + o.body[b]] == 0
-                    if checked and kind != ROUND:
-                        checked = not _clearly_apart(s, g, kind, a, b, floor)
+                    radius = _radius(o, kind, b)
+                    if checked:
+                        found = _separating_plane(s, o, g, kind, a, b, floor + radius, plane)
+                        checked = found < 0
+                        if e < n_near and found >= 0 and found != plane:
+                            near.data[c * near.part + e][2] = found
                     if checked:
                         y, p = _rows(s, o, g, kind, a, b, g.path)
-                        time, features = free_until(y, p, _radius(o, kind, b), floor, mode != STILL)
+                        time, features = free_until(y, p, radius, floor, mode != STILL)
                         if time < 1.0:
                             at = _write_passage(out.data, at, last, kind, a, b, features, time)
             out.used[c] = at - c * out.part
     ti.loop_config(serialize=True)
     for _ in range(1):
         sum_parts(out)
-
-
-@kernel
-def list_near_pairs(
-    s: ti.template(), g: ti.template(), near: ti.template(), row: ti.template(), padding: ti.f64, out: ti.template()
-):
-    """List the pairs of triangles without a common vertex whose boxes overlap, and store the paths that were searched.
-
-    near, row, padding: as in the last search.
-    """
-    ti.loop_config(serialize=s.serial_cheap)
-    for i in range(s.n_verts):
-        g.listed_x[i], g.listed_move[i] = s.x[i], s.move[i]
-    ti.loop_config(serialize=s.serial)
-    for task in range(s.chunks * s.spread):
-        if task % s.spread == 0:
-            c = task // s.spread
-            at, last, begin, own, n_near, max_row = c * out.part, (c + 1) * out.part, c * row.part, -1, 0, 0
-            for j in range(part_first(c, s.count[ACTIVE], s.chunks), part_first(c + 1, s.count[ACTIVE], s.chunks)):
-                t = s.active[j]
-                if s.body[t] != own:
-                    own = s.body[t]
-                    n_near = list_near(s, c, own)
-                lo, hi = near.bounds(s, t, WHOLE, padding)
-                for k in range(n_near):
-                    other = s.near[c * s.n_bodies + k]
-                    if other >= own:  # each pair is found once, by its first triangle
-                        n = near.list_triangles(s, other, t, WHOLE, lo, hi, row.data, begin, begin + row.part)
-                        max_row = ti.max(max_row, n)
-                        if n <= row.part:
-                            for e in range(begin, begin + n):
-                                if row.data[e] > t:
-                                    if at < last:
-                                        out.data[at] = ti.Vector([t, row.data[e]], ti.i32)
-                                    at += 1
-            out.used[c], row.used[c] = at - c * out.part, max_row
-    ti.loop_config(serialize=True)
-    for _ in range(1):
-        sum_parts(out)
-        sum_parts(row)
 
 
 @kernel(cse=False)
@@ -312,11 +255,6 @@ def append_passages(
     ti.loop_config(serialize=True)
     for _ in range(1):
         sum_parts(out)
-
-
-def near_pairs(arena: FieldArena, capacity: int) -> Any:
-    """Allocate a field of pairs of triangles."""
-    return arena.vectors("near_pair", ti.i32, capacity, n=2)
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,20 +5,11 @@ import taichi as ti
 
 from taisoft.backend.arrays import FieldArena, download
 from taisoft.collision.analytic import AnalyticObstacles
+from taisoft.collision.bvh import Trees
 from taisoft.collision.candidates import TOTAL, Buffer
 from taisoft.collision.colliders import Topology
-from taisoft.collision.passages import (
-    ADJACENT,
-    FLAT,
-    N_KINDS,
-    NEAR,
-    ROUND,
-    PathFields,
-    check_paths,
-    list_near_pairs,
-    near_pairs,
-    passage_fields,
-)
+from taisoft.collision.near_list import OUTDATED, UNCOVERED, PathFields, list_near_pairs, near_pairs
+from taisoft.collision.passages import ADJACENT, FLAT, N_KINDS, NEAR, ROUND, check_paths, passage_fields
 from taisoft.collision.surface import Surface, integers
 from taisoft.ranges import expand
 
@@ -61,27 +52,35 @@ class PathCheck:
         topology: Topology,
         shapes: AnalyticObstacles,
         self_on: np.ndarray,
+        has_pairs: bool,
         reach: float,
         floor: float,
         arena: FieldArena,
         capacity: int | None = None,
         max_capacity: int | None = None,
     ):
-        """self_on: (n_bodies,) whether a collider is checked against itself. capacity, max_capacity: of the lists, None for the
-        default."""
+        """self_on: (n_bodies,) whether a collider is checked against itself. has_pairs: whether any triangles may touch.
+        capacity, max_capacity: of the lists, None for the default."""
         self.surface, self.shapes, self.limit, self.floor = surface, shapes, IN_BOXES * reach, floor
         s, n = surface, max(surface.n_verts, 1)
         self._topology, self._shape_body = topology, shapes.body.to_numpy() if shapes.any else np.zeros(0, dtype=np.int64)
         self._rows = rows = adjacent_rows(topology.triangle[np.asarray(self_on, dtype=bool)[topology.body]])
-        vectors = (arena.vectors(f"path_{name}", ti.f64, n) for name in ("displacement", "listed_x", "listed_move"))
+        n_listed = s.n_triangles if has_pairs else 0
+        triangle_ends = max(2 * n_listed, 1)
+        lengths = {"path": n} | dict.fromkeys(("listed_x", "listed_move"), n if has_pairs else 1)
+        lengths |= dict.fromkeys(("left_lo", "left_hi"), 2 * s.n_bodies) | dict.fromkeys(("lo", "hi"), triangle_ends)
         self.fields = PathFields(
-            *vectors,
-            arena.field("path_left", ti.i32, 1),
-            arena.field("path_exempt", ti.i32, s.n_bodies**2),
-            integers(arena, "path_adjacent", rows.reshape(-1, 6)),
-            len(rows),
+            **{name: arena.vectors(f"path_{name}", ti.f64, length) for name, length in lengths.items()},
+            **{name: arena.field(f"path_{name}", ti.f64, triangle_ends) for name in ("low", "high")},
+            n_listed=n_listed,
+            can_touch=arena.field("path_can_touch", ti.i32, n),
+            left=arena.field("path_left", ti.i32, 2),
+            exempt=arena.field("path_exempt", ti.i32, s.n_bodies**2),
+            first_vertex=integers(arena, "path_first_vertex", topology.vertex_first),
+            adjacent=integers(arena, "path_adjacent", rows.reshape(-1, 6)),
+            n_adjacent=len(rows),
         )
-        limits = capacity or 4 * s.n_triangles + 64, max_capacity
+        limits = capacity or (4 * n_listed + 64 if has_pairs else 1), max_capacity
         self.near = Buffer("near_pairs", near_pairs, *limits, s.chunks, arena)
         self.passages = Buffer("passages", passage_fields, 64 * s.chunks, max_capacity, s.chunks, arena)
         self._is_listed = False
@@ -139,6 +138,11 @@ class PathCheck:
                 break
         self._is_listed = True
 
+    def _listed_limit(self, broad) -> float:
+        """How far vertices may leave the listed paths along an axis, beside others [m]: less where unlisted triangles may be
+        apart along other directions only."""
+        return 2.0 * self.limit / (np.sqrt(3.0) if isinstance(broad, Trees) and broad.slabs > 3 else 1.0)
+
     def find(self, x, broad, row: Buffer | None, mode: int) -> tuple[np.ndarray, np.ndarray] | None:
         """Return the passages (k,4), ordered, and the parts (k,) of the step until which they are apart; None if the paths leave
         what the last search has covered.
@@ -146,17 +150,18 @@ class PathCheck:
         x: field of the nodes' positions [m]; mode: which paths, see `check_paths`. broad, row: result of the last broad phase and
         buffer of its rows, or None.
         """
-        s, listed_now = self.surface, False
+        s, is_new, covers = self.surface, False, broad is not None
         while True:
-            if not self._is_listed and broad is not None:
+            if not self._is_listed and covers:
                 self._list(broad, row)
-                listed_now = True
-            limit = self.limit if broad is not None else np.inf
-            check_paths(s, x, self.shapes, self.fields, self.near.parts, self.passages.parts, mode, limit, self.floor)
-            if self.fields.has_left[0]:
+                is_new = True
+            limit, listed_limit = self.limit if covers else np.inf, np.inf if is_new or not covers else self._listed_limit(broad)
+            lists = self.near.parts, self.passages.parts
+            check_paths(s, x, self.shapes, self.fields, *lists, mode, limit, listed_limit, self.floor)
+            if self.fields.left[UNCOVERED]:
+                return None
+            if self.fields.left[OUTDATED]:
                 self._is_listed = False
-                if listed_now:
-                    return None
             elif not self.passages.grow_if_full():
                 break
         return self._read()

@@ -22,6 +22,7 @@ from taisoft.collision.surface import dvec
 MAX_ADVANCES = 64
 LEAST, ROUNDING = 1e-3, 1e-12  # of the floor, and of the largest coordinate: distance below which triangles touch
 BELOW_LEAST = 0.999  # of it: what was certified to keep that distance does not touch
+N_PLANES, BY_MIDDLES = 15, 1  # of `separating_plane`
 PROGRESS = 2e-3  # of the remaining motion: an advance below it ends the search
 
 
@@ -89,7 +90,26 @@ def _kept_until(y, q, n, need):
 
 
 @ti.func
-def _moving_plane_separates(x, p, need, are_edges):
+def _moving_plane_separates(a0, b0, c0, e0, f0, a1, b1, c1, e1, f1, need):
+    """Whether points a, b and c stay at least `need` [m] from the plane through the origin, e and f, on one side; all (3,), at
+    the start and at the end of a straight motion."""
+    found, n0, n1, n2 = False, e0.cross(f0), 0.5 * (e0.cross(f1) + e1.cross(f0)), e1.cross(f1)
+    if n0.dot(n1) > 0.0 and n0.dot(n2) > 0.0:
+        longest = ti.max(n0.norm(), n1.norm(), n2.norm())
+        low0, high0 = _extent(a0, b0, c0, n0)
+        low3, high3 = _extent(a1, b1, c1, n2)
+        # inner Bernstein coefficients of the three heights
+        ha1, ha2 = a1.dot(n0) + 2.0 * a0.dot(n1), 2.0 * a1.dot(n1) + a0.dot(n2)
+        hb1, hb2 = b1.dot(n0) + 2.0 * b0.dot(n1), 2.0 * b1.dot(n1) + b0.dot(n2)
+        hc1, hc2 = c1.dot(n0) + 2.0 * c0.dot(n1), 2.0 * c1.dot(n1) + c0.dot(n2)
+        lowest = ti.min(low0, low3, ti.min(ha1, ha2, hb1, hb2, hc1, hc2) / 3.0)
+        highest = ti.max(high0, high3, ti.max(ha1, ha2, hb1, hb2, hc1, hc2) / 3.0)
+        found = lowest >= need * longest or highest <= -need * longest
+    return found
+
+
+@ti.func
+def _any_moving_plane_separates(x, p, need, are_edges):
     """Whether the plane of one of the triangles, moving with it, stays at least `need` [m] from all corners of the other; or, for
     two edges, the plane through one of them and parallel to the other from that one."""
     found, side = False, 0
@@ -99,21 +119,13 @@ def _moving_plane_separates(x, p, need, are_edges):
         base, other = ti.select(side == 0, 3, 0), ti.select(side == 0, 0, 3)
         a, b, c = row_of(x, base), row_of(x, base + 1), row_of(x, base + 2)
         a1, b1, c1 = a + row_of(p, base), b + row_of(p, base + 1), c + row_of(p, base + 2)
-        e, f, e1, f1 = b - a, c - a, b1 - a1, c1 - a1
+        f, f1 = c - a, c1 - a1
         if are_edges:
             f = row_of(x, 4) - row_of(x, 3)
             f1 = f + row_of(p, 4) - row_of(p, 3)
-        n0, n1, n2 = e.cross(f), 0.5 * (e.cross(f1) + e1.cross(f)), e1.cross(f1)
-        if n0.dot(n1) > 0.0 and n0.dot(n2) > 0.0:
-            longest = ti.max(n0.norm(), n1.norm(), n2.norm())
-            lowest, highest = ti.cast(ti.math.inf, ti.f64), ti.cast(-ti.math.inf, ti.f64)
-            for k in range(3):
-                d0 = row_of(x, other + k) - a
-                d1 = row_of(x, other + k) + row_of(p, other + k) - a1
-                h0, h3 = d0.dot(n0), d1.dot(n2)
-                h1, h2 = (d1.dot(n0) + 2.0 * d0.dot(n1)) / 3.0, (2.0 * d1.dot(n1) + d0.dot(n2)) / 3.0
-                lowest, highest = ti.min(lowest, h0, h1, h2, h3), ti.max(highest, h0, h1, h2, h3)
-            found = lowest >= need * longest or highest <= -need * longest
+        d, e, g = row_of(x, other), row_of(x, other + 1), row_of(x, other + 2)
+        d1, e1, g1 = d + row_of(p, other) - a1, e + row_of(p, other + 1) - a1, g + row_of(p, other + 2) - a1
+        found = _moving_plane_separates(d - a, e - a, g - a, b - a, f, d1, e1, g1, b1 - a1, f1, need)
         side += 1
         if not are_edges and side == 2:
             side = 3
@@ -162,7 +174,7 @@ def free_until(x, p, radius, floor, are_apart):
             size = (need + radius) * middle.norm()
             if _separation(y, middle) >= size and _separation(y + q, middle) >= size and size > 0.0:
                 part = 1.0
-            elif _moving_plane_separates(y, q, need + radius, k >= 6):
+            elif _any_moving_plane_separates(y, q, need + radius, k >= 6):
                 part = 1.0
             else:
                 _, offset = closest_features(y)
@@ -193,37 +205,73 @@ def free_until(x, p, radius, floor, are_apart):
 
 
 @ti.func
-def _least_height(a, b, c, base, n):
-    """Least height of three points over a base point along n (3,)."""
-    return ti.min((a - base).dot(n), (b - base).dot(n), (c - base).dot(n))
+def _extent(a, b, c, n):
+    """Least and largest height of three points over the origin along n (3,)."""
+    p, q, r = a.dot(n), b.dot(n), c.dot(n)
+    return ti.min(p, q, r), ti.max(p, q, r)
 
 
 @ti.func
-def _plane_separates(a0, b0, c0, a1, b1, c1, d0, e0, f0, d1, e1, f1, n, floor):
-    """Whether points a, b and c stay farther than `floor` beyond points d, e and f along n (3,), from 0 to 1."""
-    need = floor * n.norm()
-    first = _least_height(a0, b0, c0, d0, n) + _least_height(-d0, -e0, -f0, -d0, n)
-    last = _least_height(a1, b1, c1, d1, n) + _least_height(-d1, -e1, -f1, -d1, n)
-    return need > 0.0 and first >= need and last >= need
+def _axis_separates(a0, b0, c0, e0, f0, a1, b1, c1, e1, f1, need):
+    """Whether a plane across a coordinate axis does, see `_plane_separates`."""
+    zero = dvec(0.0)
+    low_a0, high_a0, low_e0, high_e0 = ti.min(a0, b0, c0), ti.max(a0, b0, c0), ti.min(zero, e0, f0), ti.max(zero, e0, f0)
+    low_a1, high_a1, low_e1, high_e1 = ti.min(a1, b1, c1), ti.max(a1, b1, c1), ti.min(zero, e1, f1), ti.max(zero, e1, f1)
+    above, below = ti.min(low_a0 - high_e0, low_a1 - high_e1), ti.min(low_e0 - high_a0, low_e1 - high_a1)
+    return ti.max(above, below).max() >= need
 
 
 @ti.func
-def clearly_apart(a0, b0, c0, d0, e0, f0, p, q, r, u, v, w, floor):
-    """Whether boxes around the paths of triangles abc and def, their planes or the one between their middles show that they stay
-    farther apart than `floor` [m]: most do, and planes at rest suffice for what slides on each other. All (3,): corners at first,
-    and their displacements [m]."""
-    a1, b1, c1, d1, e1, f1 = a0 + p, b0 + q, c0 + r, d0 + u, e0 + v, f0 + w
-    low, high = ti.min(a0, b0, c0, a1, b1, c1) - floor, ti.max(a0, b0, c0, a1, b1, c1) + floor
-    clear = (low > ti.max(d0, e0, f0, d1, e1, f1)).any() or (high < ti.min(d0, e0, f0, d1, e1, f1)).any()
-    side = 0
-    while side < 5 and not clear:
-        axis = (a0 + b0 + c0) - (d0 + e0 + f0)
-        if side == 1 or side == 2:
-            axis = (e0 - d0).cross(f0 - d0)
-        elif side > 2:
-            axis = (b0 - a0).cross(c0 - a0)
-        if side == 2 or side == 4:
-            axis = -axis
-        clear = _plane_separates(a0, b0, c0, a1, b1, c1, d0, e0, f0, d1, e1, f1, axis, floor)
-        side += 1
-    return clear
+def _plane_separates(a0, b0, c0, e0, f0, a1, b1, c1, e1, f1, n, need):
+    """Whether a plane at rest across n (3,) keeps points a, b and c at least `need` [m] from the origin, e and f; all (3,), at
+    the start and at the end of a straight motion."""
+    low_a0, high_a0 = _extent(a0, b0, c0, n)
+    low_a1, high_a1 = _extent(a1, b1, c1, n)
+    low_e0, high_e0 = _extent(dvec(0.0), e0, f0, n)
+    low_e1, high_e1 = _extent(dvec(0.0), e1, f1, n)
+    size = need * n.norm()
+    above, below = ti.min(low_a0 - high_e0, low_a1 - high_e1), ti.min(low_e0 - high_a0, low_e1 - high_a1)
+    return size > 0.0 and ti.max(above, below) >= size
+
+
+@ti.func
+def _edge(k, a, b, c):
+    """Edge k of a triangle."""
+    return ti.select(k == 0, b - a, ti.select(k == 1, c - b, a - c))
+
+
+@ti.func
+def separating_plane(a0, b0, c0, e0, f0, a1, b1, c1, e1, f1, need, first):
+    """Number of a plane that keeps triangles abc and def at least `need` [m] apart on straight paths, -1 if none of a few that
+    are cheap to test does. All (3,): corners at the start and at the end, relative to corner d.
+
+    0: across an axis; 1: between their middles; 2, 3: that of def, of abc, at the start; 4, 5: the same, moving along; 6 to 14:
+    along an edge of each at the start, numbered as in `nearest_of`. first: the number to be tried first, since one plane mostly
+    serves for many steps; whether there is one does not depend on it.
+    """
+    found, k = -1, 0
+    while k < N_PLANES and found < 0:
+        plane = ti.select(k == 0, first, ti.select(k > first, k, k - 1))
+        separates = False
+        if plane == 0:
+            separates = _axis_separates(a0, b0, c0, e0, f0, a1, b1, c1, e1, f1, need)
+        elif plane < 4 or plane > 5:
+            n = (a0 + b0 + c0) - (e0 + f0)
+            if plane == 2:
+                n = e0.cross(f0)
+            elif plane == 3:
+                n = (b0 - a0).cross(c0 - a0)
+            elif plane > 5:
+                n = _edge((plane - 6) // 3, a0, b0, c0).cross(_edge(plane % 3, dvec(0.0), e0, f0))
+            separates = _plane_separates(a0, b0, c0, e0, f0, a1, b1, c1, e1, f1, n, need)
+        else:
+            p0, q0, r0, u0, v0 = a0, b0, c0, e0, f0
+            p1, q1, r1, u1, v1 = a1, b1, c1, e1, f1
+            if plane == 5:
+                p0, q0, r0, u0, v0 = -a0, e0 - a0, f0 - a0, b0 - a0, c0 - a0
+                p1, q1, r1, u1, v1 = -a1, e1 - a1, f1 - a1, b1 - a1, c1 - a1
+            separates = _moving_plane_separates(p0, q0, r0, u0, v0, p1, q1, r1, u1, v1, need)
+        if separates:
+            found = plane
+        k += 1
+    return found

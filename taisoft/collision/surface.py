@@ -261,19 +261,25 @@ def _box_each_body(s: ti.template()):
 
 
 @ti.func
+def may_meet(s: ti.template(), a, b):
+    """1 if colliders a and b may touch and their boxes overlap, or if a is b and is tested against itself."""
+    accepted = 0
+    if a == b:
+        accepted = s.self_on[a]
+    elif s.soft[a] | s.soft[b]:
+        accepted = int((s.body_lo[a] <= s.body_hi[b]).all()) & int((s.body_lo[b] <= s.body_hi[a]).all())
+    if ti.static(s.has_attached):
+        accepted &= 1 - s.attached[a * s.n_bodies + b]
+    return accepted
+
+
+@ti.func
 def list_near(s: ti.template(), c, own):
-    """List, ascending from s.near[c * n_bodies], the colliders that collider `own` may touch and whose boxes overlap its own,
-    including itself if it is tested against itself. Return their number."""
+    """List, ascending from s.near[c * n_bodies], the colliders that collider `own` may meet, including itself if it is tested
+    against itself. Return their number."""
     n = 0
     for b in range(s.n_bodies):
-        accepted = 0
-        if b == own:
-            accepted = s.self_on[own]
-        elif s.soft[own] | s.soft[b]:
-            accepted = int((s.body_lo[own] <= s.body_hi[b]).all()) & int((s.body_lo[b] <= s.body_hi[own]).all())
-        if ti.static(s.has_attached):
-            accepted &= 1 - s.attached[own * s.n_bodies + b]
-        if accepted == 1:
+        if may_meet(s, own, b) == 1:
             s.near[c * s.n_bodies + n] = b
             n += 1
     return n

@@ -13,7 +13,8 @@ from scipy.sparse.csgraph import connected_components
 from taisoft.backend.arrays import FieldArena, download
 from taisoft.collision.contacts import FACE_FACE
 from taisoft.collision.detector import Detection
-from taisoft.collision.passages import N_FEATURES, N_KINDS, SEARCHED, TO_STATE
+from taisoft.collision.near_list import SEARCHED, TO_STATE
+from taisoft.collision.passages import N_FEATURES, N_KINDS
 from taisoft.collision.path_check import NO_PASSAGES
 from taisoft.contact.problem import ContactProblem
 from taisoft.dynamics.contact_measures import find_displacement

@@ -1,0 +1,204 @@
+"""The list of near pairs for the check of paths (`passages`): triangles without a common vertex whose boxes overlap.
+
+The broad phase makes it from the boxes of a search: around the straight paths of that search, grown by half the reach on every
+side. It serves for later paths as long as no pair that is not listed can touch on them. The two triangles of such a pair were
+farther apart than the reach along some axis, wherever their corners were on the listed paths. So they still are apart where
+their corners have left those paths by vectors that differ by less than the reach along every axis: motion that bodies have in
+common does not count. On a straight path it suffices that they do at both ends. Every collider has a box of these vectors at
+either end, and those of two colliders that may touch are compared.
+
+Only *active* triangles count, whose present boxes meet that of another collider: other triangles cannot touch anything, provided
+that the present paths do not leave the boxes of the present search.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import taichi as ti
+
+from taisoft.backend.arrays import Count, FieldArena
+from taisoft.backend.runtime import kernel
+from taisoft.collision.candidates import WHOLE, sum_parts
+from taisoft.collision.separation import BY_MIDDLES
+from taisoft.collision.surface import ACTIVE, dvec, list_near, may_meet
+from taisoft.fem.chunks import part_first
+
+SEARCHED, TO_STATE, STILL = range(3)  # which paths are checked
+UNCOVERED, OUTDATED = range(2)  # indices into PathFields.left
+
+
+@dataclass(frozen=True, eq=False)
+class PathFields:
+    """Fields of the check, for kernels. Vectors are 3-vectors f64 [m]."""
+
+    path: Any  # (n_verts) vectors: displacements to be checked
+    listed_x: Any  # (n_verts) vectors: positions and searched displacements when the near pairs were listed; 1 if n_listed is 0,
+    listed_move: Any  # as are the fields of triangles
+    n_listed: Count  # triangles that may be in near pairs: all, or none
+    can_touch: Any  # (n_verts) i32: 1 for vertices of active triangles
+    left_lo: Any  # (2 n_bodies) vectors: boxes of the vectors by which those have left the listed paths at the start and the end
+    left_hi: Any
+    left: Any  # (2) i32: 1 if paths leave what was searched (UNCOVERED), or if the list is of no use for them (OUTDATED)
+    lo: Any  # (2 n_triangles) vectors: boxes of active triangles at the start and the end, grown by half the floor; else empty
+    hi: Any
+    low: Any  # (2 n_triangles) f64: ranges of their heights along their first normals [m], likewise, grown by the floor
+    high: Any
+    exempt: Any  # (n_bodies^2) i32: 1 for pairs of colliders that cross already
+    first_vertex: Any  # (n_bodies + 1) i32: first vertex of each collider
+    adjacent: Any  # (n_adjacent, 6) i32: vertices of two triangles
+    n_adjacent: Count
+
+
+@ti.func
+def _set_paths(s: ti.template(), x: ti.template(), g: ti.template(), mode, limit):
+    """Set the paths, and whether they leave the searched ones by more than `limit` [m]."""
+    for k in ti.static(range(2)):
+        g.left[k] = 0
+    ti.loop_config(serialize=s.serial_cheap)
+    for i in range(s.n_verts):
+        g.can_touch[i] = 0
+        path = s.move[i]
+        if mode == STILL:
+            path = dvec(0.0)
+        elif mode == TO_STATE and s.node[i] >= 0:
+            path = x[s.node[i]] - s.x[i]
+            if not _leaving(path, s.move[i]).norm() <= limit:  # also if it is not a number
+                g.left[UNCOVERED] = 1
+        g.path[i] = path
+
+
+@ti.func
+def _leaving(r, move):
+    """Vector (3,) by which a point r (3,) has left the way from the origin along a displacement [m]."""
+    square, along = move.dot(move), ti.cast(0.0, ti.f64)
+    if square > 0.0:
+        along = ti.min(ti.max(r.dot(move) / square, 0.0), 1.0)
+    return r - along * move
+
+
+@ti.func
+def _box_ends(s: ti.template(), g: ti.template(), floor):
+    """Set the boxes and heights of active triangles at both ends of their paths, and mark their vertices."""
+    ti.loop_config(serialize=s.serial_cheap)
+    for t in range(g.n_listed):
+        for end in ti.static(range(2)):
+            g.lo[2 * t + end], g.hi[2 * t + end] = dvec(ti.math.inf), dvec(-ti.math.inf)
+    ti.loop_config(serialize=s.serial_cheap)
+    for e in range(s.count[ACTIVE]):
+        t = s.active[e]
+        n, i, j, k = s.normal[t], s.triangle[t, 0], s.triangle[t, 1], s.triangle[t, 2]
+        for v in ti.static((i, j, k)):
+            g.can_touch[v] = 1
+        for end in ti.static(range(2)):
+            a, b, c = s.x[i] + end * g.path[i], s.x[j] + end * g.path[j], s.x[k] + end * g.path[k]
+            p, q, r = a.dot(n), b.dot(n), c.dot(n)
+            g.lo[2 * t + end], g.hi[2 * t + end] = ti.min(a, b, c) - 0.5 * floor, ti.max(a, b, c) + 0.5 * floor
+            g.low[2 * t + end], g.high[2 * t + end] = ti.min(p, q, r) - floor, ti.max(p, q, r) + floor
+
+
+@ti.func
+def _compare_with_listed(s: ti.template(), g: ti.template(), limit):
+    """Set whether vectors by which two colliders have left the listed paths differ by more than `limit` [m] along an axis."""
+    ti.loop_config(serialize=s.serial_cheap)
+    for task in range(s.n_bodies * s.cheap_spread):
+        if task % s.cheap_spread == 0:
+            b = task // s.cheap_spread
+            lo0, hi0, lo1, hi1 = dvec(ti.math.inf), dvec(-ti.math.inf), dvec(ti.math.inf), dvec(-ti.math.inf)
+            for i in range(g.first_vertex[b], g.first_vertex[b + 1]):
+                if g.can_touch[i] == 1:
+                    now = s.x[i] - g.listed_x[i]
+                    first, last = _leaving(now, g.listed_move[i]), _leaving(now + g.path[i], g.listed_move[i])
+                    lo0, hi0, lo1, hi1 = ti.min(lo0, first), ti.max(hi0, first), ti.min(lo1, last), ti.max(hi1, last)
+            g.left_lo[2 * b], g.left_hi[2 * b], g.left_lo[2 * b + 1], g.left_hi[2 * b + 1] = lo0, hi0, lo1, hi1
+    ti.loop_config(serialize=s.serial_cheap)
+    for task in range(s.n_bodies * s.cheap_spread):
+        if task % s.cheap_spread == 0:
+            a = task // s.cheap_spread
+            for b in range(a, s.n_bodies):
+                if may_meet(s, a, b) == 1:
+                    for end in range(2):
+                        first, second = 2 * a + end, 2 * b + end
+                        if (ti.max(g.left_hi[first] - g.left_lo[second], g.left_hi[second] - g.left_lo[first]) > limit).any():
+                            g.left[OUTDATED] = 1
+
+
+@ti.func
+def prepare_paths(s: ti.template(), x: ti.template(), g: ti.template(), mode, limit, listed_limit, floor):
+    """Set the paths of a mode, see `passages.check_paths`, what is computed once for each triangle and vertex, and `left`.
+
+    limit [m]: of how far vertices may leave the searched paths; listed_limit [m]: of how far they may leave the listed ones along
+    an axis, beside others.
+    """
+    _set_paths(s, x, g, mode, limit)
+    _box_ends(s, g, floor)
+    _compare_with_listed(s, g, listed_limit)
+
+
+@ti.func
+def _is_beyond(s: ti.template(), g: ti.template(), own, other):
+    """1 if all corners of triangle `other` are above or below `own` at both ends, along the first normal of `own`."""
+    n, above, below = s.normal[own], 1, 1
+    for k in ti.static(range(3)):
+        i = s.triangle[other, k]
+        now = s.x[i].dot(n)
+        then = now + g.path[i].dot(n)
+        above &= int(now > g.high[2 * own]) & int(then > g.high[2 * own + 1])
+        below &= int(now < g.low[2 * own]) & int(then < g.low[2 * own + 1])
+    return above | below
+
+
+@ti.func
+def boxes_or_planes_separate(s: ti.template(), g: ti.template(), t, u):
+    """1 if a plane across an axis, or that of one of the two triangles at first, separates them at both ends of their paths."""
+    first, second = 2 * t, 2 * u
+    above = int(g.lo[first] > g.hi[second]) & int(g.lo[first + 1] > g.hi[second + 1])
+    below = int(g.lo[second] > g.hi[first]) & int(g.lo[second + 1] > g.hi[first + 1])
+    apart = int((above | below).any())
+    if apart == 0:
+        apart = _is_beyond(s, g, t, u) | _is_beyond(s, g, u, t)  # either alone is hard to predict
+    return apart
+
+
+@kernel
+def list_near_pairs(
+    s: ti.template(), g: ti.template(), near: ti.template(), row: ti.template(), padding: ti.f64, out: ti.template()
+):
+    """List the near pairs, and store the paths that were searched.
+
+    near, row, padding: as in the last search.
+    """
+    ti.loop_config(serialize=s.serial_cheap)
+    for i in range(s.n_verts):
+        g.listed_x[i], g.listed_move[i] = s.x[i], s.move[i]
+    ti.loop_config(serialize=s.serial)
+    for task in range(s.chunks * s.spread):
+        if task % s.spread == 0:
+            c = task // s.spread
+            at, last, begin, own, n_near, max_row = c * out.part, (c + 1) * out.part, c * row.part, -1, 0, 0
+            for j in range(part_first(c, s.count[ACTIVE], s.chunks), part_first(c + 1, s.count[ACTIVE], s.chunks)):
+                t = s.active[j]
+                if s.body[t] != own:
+                    own = s.body[t]
+                    n_near = list_near(s, c, own)
+                lo, hi = near.bounds(s, t, WHOLE, padding)
+                for k in range(n_near):
+                    other = s.near[c * s.n_bodies + k]
+                    if other >= own:  # each pair is found once, by its first triangle
+                        n = near.list_triangles(s, other, t, WHOLE, lo, hi, row.data, begin, begin + row.part)
+                        max_row = ti.max(max_row, n)
+                        if n <= row.part:
+                            for e in range(begin, begin + n):
+                                if row.data[e] > t:
+                                    if at < last:
+                                        out.data[at] = ti.Vector([t, row.data[e], BY_MIDDLES], ti.i32)
+                                    at += 1
+            out.used[c], row.used[c] = at - c * out.part, max_row
+    ti.loop_config(serialize=True)
+    for _ in range(1):
+        sum_parts(out)
+        sum_parts(row)
+
+
+def near_pairs(arena: FieldArena, capacity: int) -> Any:
+    """Allocate a field of pairs of triangles, each with the number of the plane that last separated it."""
+    return arena.vectors("near_pair", ti.i32, capacity, n=3)
