@@ -16,7 +16,7 @@ from taisoft.backend import parallel
 from taisoft.backend.arrays import Count, FieldArena, download, upload
 from taisoft.backend.runtime import Runtime
 from taisoft.fem import reference, springs
-from taisoft.fem.chunks import SPREAD
+from taisoft.fem.chunks import SPREAD, SweepOrder
 from taisoft.fem.dependents import DependentTable, build_dependents, dependent_table
 from taisoft.fem.laws import LAWS
 from taisoft.fem.loads import SceneLoads
@@ -121,6 +121,11 @@ class Model:
     def spread(self) -> int:
         """Iterations of a loop per chunk, see `fem.chunks`."""
         return 1 if self.serial else SPREAD["cpu" if self.on_cpu else "cuda"]
+
+    @property
+    def sweep(self) -> SweepOrder:
+        """Order of a Gauss-Seidel sweep, which is divided in scenes whose loops are, on the CPU."""
+        return SweepOrder.of(self.n_nodes) if self.on_cpu and self.chunks > 1 else SweepOrder()
 
     @property
     def has_dependents(self) -> bool:
