@@ -217,7 +217,8 @@ def use_threads(monkeypatch, several: bool = True) -> list[bool]:
     """Divide loops over any mesh into chunks, and run them on several threads, or on one; the answers given are returned."""
     answers: list[bool] = []
     monkeypatch.setattr("taisoft.fem.model.CHUNKED_FROM", 0)
-    monkeypatch.setattr("taisoft.linear.pcg_work.MIN_SHIFT", 2)
+    monkeypatch.setattr("taisoft.fem.chunks.MIN_SHIFT", 2)
+    monkeypatch.setattr("taisoft.dynamics.stage_system.SHARED_FROM", 0)
     monkeypatch.setattr("taisoft.backend.parallel.pays", lambda seconds: answers.append(several) or several)
     return answers
 

@@ -175,7 +175,7 @@ def test_the_smoothed_prolongation_keeps_the_motions_without_energy(several_leve
 def assembled(made, shift: float = 0.0) -> tuple:
     """Matrix and work of a scene at rest, and its matrix and hierarchy on the host; shift [N/m] is added to the matrix."""
     m, A = made.model, block_csr.build_block_csr(made.model, made.arena)
-    w = build_pcg(m, made.arena, A)
+    w = build_pcg(m, made.arena)
     m.free.from_numpy(~made.oracle.fixed)
     block_csr.assemble(m, A, EVERYTHING, True)
     A.diagonal.host[:, [0, 5, 10]] += shift

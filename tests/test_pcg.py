@@ -18,7 +18,7 @@ import scipy.sparse.linalg as spl
 from scenes import built, mixed_scene
 
 from taisoft.backend.arrays import FieldArena
-from taisoft.linear import block_csr, pcg, pcg_work
+from taisoft.linear import block_csr, pcg
 from taisoft.linear.pcg_work import build_pcg
 
 METHODS = ("whole", "chunks", "chunks, threads", "crossed", "crossed, threads", "jacobi")
@@ -28,16 +28,18 @@ METHODS = ("whole", "chunks", "chunks, threads", "crossed", "crossed, threads", 
 def rig(request):
     with built(mixed_scene(order="both"), request.param) as made:
         made.matrix = block_csr.build_block_csr(made.model, made.arena)
-        made.work = build_pcg(made.model, made.arena, made.matrix)
+        made.work = build_pcg(made.model, made.arena)
         one_thread, ways = replace(made.parallel, serial=True), {}
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(pcg_work, "MIN_SHIFT", 0)
+            patch.setattr("taisoft.fem.chunks.MIN_SHIFT", 0)
             for name, chunks in (("chunks", 3), ("crossed", 6)):
-                patch.setattr(pcg_work, "CHUNKS", chunks)
-                ways[name] = one_thread, build_pcg(one_thread, FieldArena(), made.matrix)
-                assert ways[name][1].n_chunks == chunks and ways[name][1].crossed == (name == "crossed")
-        ways |= {f"{name}, threads": (made.parallel, work) for name, (_, work) in ways.items()}
-        made.ways = ways | {"whole": (made.model, made.work), "jacobi": (replace(made.parallel, on_cpu=False), made.work)}
+                patch.setattr("taisoft.fem.chunks.SWEEP_CHUNKS", chunks)
+                matrix, work = block_csr.build_block_csr(one_thread, FieldArena()), build_pcg(one_thread, FieldArena())
+                assert work.n_chunks == chunks and matrix.crossed == (name == "crossed")
+                ways[name] = one_thread, matrix, work
+        ways |= {f"{name}, threads": (made.parallel, *way) for name, (_, *way) in ways.items()}
+        jacobi = replace(made.parallel, on_cpu=False)
+        made.ways = ways | {name: (m, made.matrix, made.work) for name, m in (("whole", made.model), ("jacobi", jacobi))}
         rng = np.random.default_rng(1)
         x = made.oracle.rest * [0.8, 1.1, 0.9] + 0.05 * rng.standard_normal(made.oracle.rest.shape)
         made.stiffness = made.oracle.stiffness(x, projected=True)
@@ -51,19 +53,22 @@ def rig(request):
 def fill(rig, dense: np.ndarray) -> sp.csr_matrix:
     """Upload a matrix with the node graph's pattern; returns it as stored, rounded."""
     blocks = dense.reshape(rig.model.n_nodes, 3, rig.model.n_nodes, 3).transpose(0, 2, 1, 3)
-    start, column = rig.matrix.row_start.to_numpy(), rig.matrix.column.to_numpy()
-    row = np.repeat(np.arange(2 * rig.model.n_nodes), np.diff(start)) % rig.model.n_nodes
-    own = np.arange(rig.model.n_nodes)
-    rig.matrix.value.from_numpy(block_csr.packed(blocks[row, column]).astype(rig.machine.np_real))
-    rig.matrix.diagonal.from_numpy(block_csr.packed(blocks[own, own]).astype(rig.machine.np_real))
-    return block_csr.to_scipy(rig.model, rig.matrix)
+    own, stored = np.arange(rig.model.n_nodes), []
+    for matrix in (rig.matrix, rig.ways["chunks"][1], rig.ways["crossed"][1]):
+        start, column = matrix.row_start.to_numpy(), matrix.column.to_numpy()
+        row = np.repeat(np.arange(2 * rig.model.n_nodes), np.diff(start)) % rig.model.n_nodes
+        matrix.value.from_numpy(block_csr.packed(blocks[row, column]).astype(rig.machine.np_real))
+        matrix.diagonal.from_numpy(block_csr.packed(blocks[own, own]).astype(rig.machine.np_real))
+        stored.append(block_csr.to_scipy(rig.model, matrix))
+    assert all((one != stored[0]).nnz == 0 for one in stored)
+    return stored[0]
 
 
 def solve(rig, method: str, tolerance: float, limit: int = 1000, rhs: np.ndarray | None = None):
-    model, work = rig.ways[method]
+    model, matrix, work = rig.ways[method]
     work.rhs.from_numpy(rig.rhs if rhs is None else rhs)
     work.y.fill(np.nan)
-    result = pcg.solve(model, rig.matrix, work, tolerance, limit)
+    result = pcg.solve(model, matrix, work, tolerance, limit)
     return result, work.y.to_numpy().astype(np.float64)
 
 

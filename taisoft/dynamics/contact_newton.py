@@ -49,7 +49,8 @@ class FrictionalResult:
 
 
 def solve_linear(system: StageSystem, problem: Stage, r: float, scale: float) -> FrictionalResult:
-    """Solve a linearised stage from (|r|, scale): directly where that applies, else on one thread in one launch."""
+    """Solve a linearised stage from (|r|, scale): directly where that applies, else on one thread in one launch, or from the host
+    where threads share linear solves."""
     try:
         found = system.solve_directly(DIRECT_FRACTION * min(problem.contact_tolerance, problem.tolerance))
     except np.linalg.LinAlgError:
@@ -57,7 +58,7 @@ def solve_linear(system: StageSystem, problem: Stage, r: float, scale: float) ->
     if found is not None:
         iterations, converged, r = found
         return FrictionalResult(1, 0, iterations, False, converged, r, direct=True)
-    if not system.model.on_cpu or PUBLIC:  # public Taichi takes no more than 64 arguments
+    if system.shares_solves or PUBLIC:  # public Taichi takes no more than 64 arguments
         newton = Newton(system, problem)
         result = newton.run(r, scale, fresh=True)
         return FrictionalResult(newton.newton, newton.linear, newton.multipliers, newton.negative, result.converged, newton.r)

@@ -250,8 +250,13 @@ def save_diagonal(m: ti.template(), A: ti.template(), k: ti.template(), subset: 
             p.inverse_mass[i][a] = ti.cast(m.free[i][a], ti.f64) / d
 
 
-def build_stage_contacts(arena: FieldArena, model: Model, problem: ContactProblem, x_start: Any) -> StageContacts:
-    """Allocate storage for the contacts of `problem`. x_start: (n_nodes) 3-vectors f64, filled by the caller."""
+def build_stage_contacts(
+    arena: FieldArena, model: Model, problem: ContactProblem, x_start: Any, shared: bool = False
+) -> StageContacts:
+    """Allocate storage for the contacts of `problem`. x_start: (n_nodes) 3-vectors f64, filled by the caller.
+
+    shared: as for `build_coupling`.
+    """
     p, n, real = problem, model.n_nodes, model.real
     work = ContactStageWork(
         arena.vectors("multiplier", ti.f64, p.capacity),
@@ -274,6 +279,7 @@ def build_stage_contacts(arena: FieldArena, model: Model, problem: ContactProble
         real,
         n,
         p.node,
+        shared,
         count=p.count,
         arity=p.arity,
         weight=p.weight,

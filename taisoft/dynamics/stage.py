@@ -259,7 +259,7 @@ class SubsetLists:
     """Edges and blocks at each node of a model, on the host, and storage for a subset."""
 
     def __init__(self, m: Model, A: BlockCsr):
-        self._groups = m.groups
+        self._groups, self._sweep = m.groups, m.sweep
         half_start, column, upper, lower = download([A.row_start, A.column, A.edge_upper, A.edge_lower])
         self.start, order = whole_rows(half_start)
         edge = np.zeros(2 * A.n_edges, dtype=np.int32)  # of each entry of the matrix
@@ -285,6 +285,7 @@ class SubsetLists:
         blocks = np.unique(self._block[entries_of(self._tet_start, nodes)])
         count = np.zeros(s.count.shape, dtype=np.int32)
         count[[NODES, EDGES]] = len(nodes), len(edges)
+        nodes = nodes[np.argsort(self._sweep.rank(nodes))]
         count[BLOCKS:] = np.searchsorted(blocks, [g.first for g in groups] + [groups[-1].last])
         rows = [(field, np.resize(data, field.shape)) for field, data in ((s.node, nodes), (s.edge, edges), (s.block, blocks))]
         upload([(s.count, count), *rows])

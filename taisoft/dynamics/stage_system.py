@@ -51,6 +51,7 @@ from taisoft.fem.state import END_SLOPE, START_SLOPE, STEP_LENGTH
 from taisoft.linear import block_csr, pcg, volume_pcg
 from taisoft.linear.block_csr import BlockCsr
 from taisoft.linear.pcg_work import LinearResult, build_pcg
+from taisoft.linear.sweep_order import find_last
 
 if TYPE_CHECKING:
     from taisoft.dynamics.contact import ContactStep
@@ -58,6 +59,9 @@ if TYPE_CHECKING:
     from taisoft.dynamics.no_contacts import NoContacts
 
 
+# Nodes from which threads share linear solves with contacts, and nodes per contact. Two cubes on two threads: no gain at 16,000
+# nodes, a quarter of the step at 60,000. Contacts themselves stay on one thread: piles with 2 to 3 nodes per contact lose time
+SHARED_FROM, NODES_PER_CONTACT = 25_000, 8
 VOLUME_PASSES = 2  # corrections of the first iterate, each of which leaves errors of second order
 
 
@@ -119,7 +123,7 @@ class StageSystem:
             n_prescribed=k,
             change=arena.vectors("change", ti.f64, n),
             damper=self.damper,
-            pcg=build_pcg(model, arena, self.matrix),
+            pcg=build_pcg(model, arena),
         )
         self.rounding = RoundingFloor(model, eps)
         self.linear_solver = LinearSolver(model)
@@ -173,8 +177,8 @@ class StageSystem:
     def _allocate_contacts(self) -> None:
         """Allocate storage for the contacts of this step."""
         if self._stage_contacts is None or self._stage_contacts.problem is not self.contact.problem:
-            arena = FieldArena()
-            self._stage_contacts = build_stage_contacts(arena, self.model, self.contact.problem, self.x_start)
+            arena, shared = FieldArena(), self.work.pcg.divided and self.model.n_nodes >= SHARED_FROM
+            self._stage_contacts = build_stage_contacts(arena, self.model, self.contact.problem, self.x_start, shared)
             self._contact_arena.release()
             self._contact_arena = arena
 
@@ -184,6 +188,12 @@ class StageSystem:
     def n_contacts(self) -> int:
         """Contacts of the present stage."""
         return int(self._k.problem.count[0]) if self._k.any else 0
+
+    @property
+    def shares_solves(self) -> bool:
+        """Whether several threads may share linear solves of the present stage."""
+        few = NODES_PER_CONTACT * self.n_contacts <= self.model.n_nodes
+        return not self.model.on_cpu or (few and self.work.pcg.is_shared(self._k.coupling))
 
     @property
     def is_static(self) -> bool:
@@ -242,6 +252,8 @@ class StageSystem:
         self._k, impact = self._stage_contacts, kind == IMPACT
         targets = np.array(self.contact.gap_targets)
         begin_contacts(self.work, self._k, impact, stage.beta, stage.dt, targets, stage.contact_tolerance)
+        if self.work.pcg.has_last(self._k.coupling):
+            find_last(self.model, self.matrix, self._k.coupling, self.work.pcg)
         self.form_matrix_and_factors(projected=impact)
 
     def evaluate(self, mode: int | None = STAY, step_length: float = 1.0, new_multipliers: bool = False) -> tuple[float, float]:

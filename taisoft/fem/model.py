@@ -16,7 +16,7 @@ from taisoft.backend import parallel
 from taisoft.backend.arrays import Count, FieldArena, download, upload
 from taisoft.backend.runtime import Runtime
 from taisoft.fem import reference, springs
-from taisoft.fem.chunks import FOLDED, SPREAD
+from taisoft.fem.chunks import FOLDED, SPREAD, SweepOrder
 from taisoft.fem.dependents import DependentTable, build_dependents, dependent_table
 from taisoft.fem.laws import LAWS
 from taisoft.fem.loads import SceneLoads
@@ -126,6 +126,11 @@ class Model:
     def sums(self) -> int:
         """Partial sums that `fem.chunks.total` adds."""
         return self.chunks if self.on_cpu else min(self.chunks, FOLDED)
+
+    @property
+    def sweep(self) -> SweepOrder:
+        """Order of a Gauss-Seidel sweep, which is divided in scenes whose loops are, on the CPU."""
+        return SweepOrder.of(self.n_nodes) if self.on_cpu and self.chunks > 1 else SweepOrder()
 
     @property
     def has_dependents(self) -> bool:

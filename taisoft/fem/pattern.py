@@ -70,5 +70,5 @@ def model_graph(model: "Model") -> tuple[NodeGraph, np.ndarray, np.ndarray | Non
         patches = node[np.stack(patch_pairs(patch), axis=1)]
     if model.springs is not None:
         others.append(springs.node_pairs(model.springs))
-    graph = node_graph(np.concatenate([ends, patches, *others]), model.n_nodes)
+    graph = node_graph(np.concatenate([ends, patches, *others]), model.n_nodes, model.sweep)
     return replace(graph, pair=graph.pair[: len(entries) + len(patches)]), entries, factors

@@ -40,8 +40,8 @@ class BlockCsr:
     """A symmetric matrix of 3x3 blocks with the model's node graph as pattern."""
 
     n_edges: Count
-    row_start: Any  # (2 n_nodes + 1) i32: of half-rows left of the diagonal, then right of it, see `node_graph.NodeGraph`
-    column: Any  # (2 n_edges) i32, ascending in each half-row
+    row_start: Any  # (2 n_nodes + 1) i32: of half-rows before the diagonal, then after it, see `node_graph.NodeGraph`
+    column: Any  # (2 n_edges) i32
     value: Any  # (2 n_edges) 12-vectors: blocks off the diagonal
     diagonal: Any  # (n_nodes) 12-vectors
     row_sum: Any  # 4-vectors: written but not read, see `keep_padding_lane`
@@ -56,8 +56,14 @@ class BlockCsr:
     term_start: Any = None  # this and the next two only for quadratic tets, see `element_blocks.pair_terms`
     term_pair: Any = None
     term_factor: Any = None
+    apart_start: Any = None  # (2 n_nodes) i32, see `node_graph.NodeGraph`
     edge_factor: Any = None  # (entries, 2), see `fem.dependents.expanded_pairs`; only with dependent nodes
     patches: PatchTerms | None = None  # of mean dilatation
+
+    @property
+    def crossed(self) -> bool:
+        """Whether blocks couple different chunks of one parity of a sweep."""
+        return self.apart_start is not None
 
     @property
     def is_expanded(self) -> bool:
@@ -83,6 +89,8 @@ def build_block_csr(model: Model, arena: FieldArena, prefix: str = "stiffness") 
         start, pairs, factors = pair_terms(model.rules)
         rules["term_start"], rules["term_pair"] = copied("term_start", start), copied("term_pair", pairs)
         rules["term_factor"] = copied("term_factor", factors, model.real)
+    if graph.apart_start is not None:
+        rules["apart_start"] = copied("apart_start", graph.apart_start)
     of_tets, of_patches = graph.pair[: len(base)], graph.pair[len(base) :]
     by_edge = np.argsort(of_tets, kind="stable")
     if shares is not None:

@@ -32,14 +32,23 @@ class Coupling:
     term: Any = None  # (capacity * width) i32
     term_weight: Any = None  # (capacity * width): the node's weight in the term
     product: Any = None  # (capacity) 4-vectors: D J x of each term, the last entry 0
+    place: Any = None  # (n_nodes) i32: PLAIN, BESIDE or IS_LAST of `sweep_order`; this and the next two None if not shared
+    last: Any = None  # (n_nodes) i32: the last nodes, ascending
+    n_last: Any = None  # (1) i32: their number
 
 
 NO_COUPLING = Coupling(0)
 
 
-def build_coupling(arena, real, n_nodes: int, node, **fields) -> Coupling:
-    """Build terms over existing fields of nodes, weights and blocks (all up to `base`), which the caller fills."""
+def build_coupling(arena, real, n_nodes: int, node, shared: bool = False, **fields) -> Coupling:
+    """Build terms over existing fields of nodes, weights and blocks (all up to `base`), which the caller fills.
+
+    shared: whether threads share chunks of a sweep; `sweep_order.find_last` must then follow every change of the terms' nodes.
+    """
     capacity, width = node.shape
+    if shared:
+        fields |= {name: arena.field(f"coupling_{name}", ti.i32, n_nodes) for name in ("place", "last")}
+        fields["n_last"] = arena.field("coupling_n_last", ti.i32, 1)
     return Coupling(
         width,
         node=node,

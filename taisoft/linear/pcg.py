@@ -47,7 +47,7 @@ def solve(
     while True:
         if not m.on_cpu:
             _take_jacobi_batch(m, A, w, tolerance, min(JACOBI_BATCH, max_iterations - done), coupling, same_matrix, done == 0)
-        elif m.serial or not w.is_divided(coupling) or w.n_chunks < SHARED_FROM:
+        elif m.serial or not w.is_shared(coupling) or w.n_chunks < SHARED_FROM:
             begin = 0 if done else 1 + same_matrix
             iterate_kernel(m, A, coupling, w, min(batch_of(m, A), max_iterations - done), tolerance, begin)
         else:

@@ -4,11 +4,13 @@ With A = L + D + L^T + E, P positive definite (equal to D where D is), and the p
 vectors stored are s = (P + L)^-1 r and t = (P + L)^T p. Since A p = (P + L) p + t - (2 P - D) p + E p, an iteration consists of
 one backward and one forward sweep:
     p = (P + L)^-T t,   q = (P + L)^-1 A p = p + (P + L)^-1 (t - (2 P - D) p + E p),   p.Ap = t.q,   r.z = s.P s.
-Small systems and those with coupling terms, which belong to L, are swept as a whole on one thread, and E = 0. Else the nodes are
-divided by number into chunks, of which a sweep passes the even ones and then the odd ones: chunks of one parity do not depend on
-each other, if blocks between them are in E. Meshes are mostly numbered in layers, which leaves E empty. One thread runs the
-chunks in turn within one launch, or several threads share them, with the same result. With the terms in E, contacts of two cubes
-took two to three times as many iterations.
+Small systems are swept as a whole on one thread, and E = 0. In large ones the nodes are divided by number into chunks, of which
+a sweep passes the even ones and then the odd ones: chunks of one parity do not depend on each other, if blocks between them are
+in E. Meshes are mostly numbered in layers, which leaves E empty. One thread runs the chunks in turn within one launch, or several
+threads share them, with the same result.
+Coupling terms belong to L. With the terms in E, contacts of two cubes took two to three times as many iterations. So that chunks
+of one parity do not depend on each other through them, a sweep passes some nodes after all chunks, see `sweep_order`. Where terms
+are not prepared for that, one thread sweeps all chunks, and E = 0.
 Source: Eisenstat, "Efficient Implementation of a Class of Preconditioned Conjugate Gradient Methods", SIAM J. Sci. Stat.
 Comput. 2(1), 1981.
 """
@@ -16,9 +18,9 @@ Comput. 2(1), 1981.
 import taichi as ti
 
 from taisoft.backend.runtime import kernel
-from taisoft.fem.node_graph import n_nodes_of, node_of
+from taisoft.fem.node_graph import node_of
 from taisoft.fem.state import OTHER_SUM, SUM
-from taisoft.linear.block_csr import block_times, keep_padding_lane, padded_times, partial_row_times, partial_row_times_backward
+from taisoft.linear.block_csr import block_times
 from taisoft.linear.coupling import add_products, clear_products, gather_products
 from taisoft.linear.pcg_work import (
     CONVERGED,
@@ -34,89 +36,33 @@ from taisoft.linear.pcg_work import (
     dot64,
     precondition,
 )
-
-EVEN, ODD = range(2)  # parities of chunks
+from taisoft.linear.sweep_order import (
+    EVEN,
+    ODD,
+    chunk_range,
+    clear_last,
+    is_later,
+    node_at,
+    times_above,
+    times_apart,
+    times_below,
+    times_last_above,
+)
 
 # --- one chunk --------------------------------------------------------------------------------------------------------
 
 
 @ti.func
-def _chunk(m: ti.template(), k: ti.template(), w: ti.template(), c):
-    """Return the first place of chunk c in the list of the system's nodes, and one past its last."""
-    first, last = 0, n_nodes_of(m, w.subset)
-    if ti.static(w.is_divided(k)):
-        first, last = c << w.chunk_shift, ti.min(last, (c + 1) << w.chunk_shift)
-    return first, last
-
-
-@ti.func
-def _parity(w: ti.template(), node):
-    """Parity of the chunk of a node."""
-    return (node >> w.chunk_shift) & 1
-
-
-@ti.func
-def _times_other(m: ti.template(), A: ti.template(), w: ti.template(), c, first, last, parity, x: ti.template()):
-    """Sum of the blocks first <= k < last times x at their columns, those in chunks of this parity."""
-    y = ti.Vector([0.0, 0.0, 0.0, 0.0], m.real)
-    for at in range(first, last):
-        j = A.column[at]
-        if _parity(w, j) == parity:
-            y += padded_times(A.value[at], x[j])
-    keep_padding_lane(m, A, c, y)
-    return ti.Vector([y[0], y[1], y[2]])
-
-
-@ti.func
-def _times_below(m: ti.template(), A: ti.template(), k: ti.template(), w: ti.template(), c, i, x: ti.template()):
-    """(L x)_i."""
-    begin, row = A.row_start[i], i + m.n_nodes
-    if ti.static(w.is_divided(k)):
-        if ti.static(w.crossed):
-            begin = w.own_begin[i]
-        elif c % 2 == EVEN:
-            begin = w.own_begin[i]
-    y = partial_row_times(m, A, c, begin, A.row_start[i + 1], x)
-    if ti.static(w.is_divided(k)):
-        if c % 2 == ODD:
-            if ti.static(w.crossed):
-                y += _times_other(m, A, w, c, A.row_start[i], begin, EVEN, x)
-                y += _times_other(m, A, w, c, w.own_end[i], A.row_start[row + 1], EVEN, x)
-            else:
-                y += partial_row_times(m, A, c, w.own_end[i], A.row_start[row + 1], x)
-    return y
-
-
-@ti.func
-def _times_above(m: ti.template(), A: ti.template(), k: ti.template(), w: ti.template(), c, i, x: ti.template()):
-    """(L^T x)_i."""
-    row = i + m.n_nodes
-    end = A.row_start[row + 1]
-    if ti.static(w.is_divided(k)):
-        if ti.static(w.crossed):
-            end = w.own_end[i]
-        elif c % 2 == ODD:
-            end = w.own_end[i]
-    y = partial_row_times_backward(m, A, c, A.row_start[row], end, x)
-    if ti.static(w.is_divided(k)):
-        if c % 2 == EVEN:
-            if ti.static(w.crossed):
-                y += _times_other(m, A, w, c, end, A.row_start[row + 1], ODD, x)
-                y += _times_other(m, A, w, c, A.row_start[i], w.own_begin[i], ODD, x)
-            else:
-                y += partial_row_times(m, A, c, A.row_start[i], w.own_begin[i], x)
-    return y
-
-
-@ti.func
-def _start_chunk(m: ti.template(), A: ti.template(), k: ti.template(), w: ti.template(), c, same_matrix):
+def _start_chunk(m: ti.template(), A: ti.template(), k: ti.template(), w: ti.template(), c, same_matrix, last: ti.template()):
     """Set the diagonal and P, y = 0, s = (P + L)^-1 rhs, t = P s. Return r.z."""
     rz = ti.cast(0.0, ti.f64)
-    first, last = _chunk(m, k, w, c)
-    for at in range(first, last):
-        i = node_of(w.subset, at)
+    first, end = chunk_range(m, k, w, c, last)
+    for at in range(first, end):
+        i = node_at(k, w, at, last)
+        if is_later(k, w, i, last):
+            continue
         precondition(m, A, k, w, i, same_matrix)
-        below = _times_below(m, A, k, w, c, i, w.r)
+        below = times_below(m, A, k, w, c, i, w.r, last)
         if ti.static(k.width > 0):
             below += gather_products(m, k, i)
         s = block_times(w.inverse[i], w.rhs[i] - below)
@@ -129,33 +75,38 @@ def _start_chunk(m: ti.template(), A: ti.template(), k: ti.template(), w: ti.tem
 
 
 @ti.func
-def _sweep_backward(m: ti.template(), A: ti.template(), k: ti.template(), w: ti.template(), c, beta):
+def _sweep_backward(m: ti.template(), A: ti.template(), k: ti.template(), w: ti.template(), c, beta, last: ti.template()):
     """Set t = P s + beta t and p = (P + L)^-T t, with P s of the last update in w.q."""
-    first, last = _chunk(m, k, w, c)
-    for reverse in range(last - first):
-        i = node_of(w.subset, last - 1 - reverse)
+    first, end = chunk_range(m, k, w, c, last)
+    for reverse in range(end - first):
+        i = node_at(k, w, end - 1 - reverse, last)
+        if is_later(k, w, i, last):
+            continue
         t = w.q[i] + ti.cast(beta, m.real) * w.z[i]
         w.z[i] = t
-        above = _times_above(m, A, k, w, c, i, w.p)
+        above = times_above(m, A, k, w, c, i, w.p, last)
         if ti.static(k.width > 0):
             above += gather_products(m, k, i)
+        if ti.static(w.has_last(k) and not last):
+            above += times_last_above(m, A, k, w, i, w.p)
         p = block_times(w.inverse[i], t - above)
         w.p[i] = p
         add_products(m, k, i, p)
 
 
 @ti.func
-def _sweep_forward(m: ti.template(), A: ti.template(), k: ti.template(), w: ti.template(), c):
+def _sweep_forward(m: ti.template(), A: ti.template(), k: ti.template(), w: ti.template(), c, last: ti.template()):
     """Set w.q = (P + L)^-1 (t - (2 P - D) p + E p). Return p.Ap."""
     curvature = ti.cast(0.0, ti.f64)
-    first, last = _chunk(m, k, w, c)
-    for at in range(first, last):
-        i = node_of(w.subset, at)
+    first, end = chunk_range(m, k, w, c, last)
+    for at in range(first, end):
+        i = node_at(k, w, at, last)
+        if is_later(k, w, i, last):
+            continue
         p, t = w.p[i], w.z[i]
-        rest = t - block_times(w.mirror[i], p) - _times_below(m, A, k, w, c, i, w.q)
-        if ti.static(w.crossed and w.is_divided(k)):
-            rest += _times_other(m, A, w, c, A.row_start[i], w.own_begin[i], c % 2, w.p)
-            rest += _times_other(m, A, w, c, w.own_end[i], A.row_start[i + m.n_nodes + 1], c % 2, w.p)
+        rest = t - block_times(w.mirror[i], p) - times_below(m, A, k, w, c, i, w.q, last)
+        if ti.static(A.crossed and w.is_shared(k) and not last):
+            rest += times_apart(m, A, k, w, c, i, w.p)
         if ti.static(k.width > 0):
             rest -= gather_products(m, k, i)
         s = block_times(w.inverse[i], rest)
@@ -169,8 +120,8 @@ def _sweep_forward(m: ti.template(), A: ti.template(), k: ti.template(), w: ti.t
 def _update(m: ti.template(), k: ti.template(), w: ti.template(), c, step):
     """Take a step along p. Return r.z."""
     rz = ti.cast(0.0, ti.f64)
-    first, last = _chunk(m, k, w, c)
-    for at in range(first, last):
+    first, end = chunk_range(m, k, w, c, False)
+    for at in range(first, end):
         i = node_of(w.subset, at)
         p = w.p[i]
         w.y[i] = w.y[i] + step * p
@@ -185,8 +136,8 @@ def _update(m: ti.template(), k: ti.template(), w: ti.template(), c, step):
 @ti.func
 def _add_direction(m: ti.template(), k: ti.template(), w: ti.template(), c, length):
     """y += length p."""
-    first, last = _chunk(m, k, w, c)
-    for at in range(first, last):
+    first, end = chunk_range(m, k, w, c, False)
+    for at in range(first, end):
         i = node_of(w.subset, at)
         w.y[i] = w.y[i] + length * w.p[i]
 
@@ -204,10 +155,10 @@ def _negative_step(rz, curvature):
 
 
 @ti.func
-def _n_chunks(k: ti.template(), w: ti.template()):
+def _n_chunks(w: ti.template()):
     """Number of chunks."""
     n = 1
-    if ti.static(w.is_divided(k)):
+    if ti.static(w.in_chunks):
         n = w.n_chunks
     return n
 
@@ -228,10 +179,10 @@ def _in_order(w: ti.template(), step):
 
 
 @ti.func
-def _sum(m: ti.template(), k: ti.template(), w: ti.template(), column: ti.template()):
+def _sum(m: ti.template(), w: ti.template(), column: ti.template()):
     """Sum of the chunks' partial sums, in a fixed order."""
     s = ti.cast(0.0, ti.f64)
-    for c in range(_n_chunks(k, w)):
+    for c in range(_n_chunks(w)):
         s += m.state.partial[c, column]
     return s
 
@@ -253,10 +204,13 @@ def iterate_kernel(
 def start_serial(m: ti.template(), A: ti.template(), k: ti.template(), w: ti.template(), same_matrix):
     """Begin a solve from y = 0, inside a serial loop."""
     clear_products(m, k)
-    for step in range(_n_chunks(k, w)):
+    clear_last(m, k, w, w.r)
+    for step in range(_n_chunks(w)):
         c = _in_order(w, step)
-        m.state.partial[c, SUM] = _start_chunk(m, A, k, w, c, same_matrix)
-    rz = _sum(m, k, w, SUM)
+        m.state.partial[c, SUM] = _start_chunk(m, A, k, w, c, same_matrix, False)
+    rz = _sum(m, w, SUM)
+    if ti.static(w.has_last(k)):
+        rz += _start_chunk(m, A, k, w, 0, same_matrix, True)
     w.state[RZ], w.state[RZ_START], w.state[STEP] = rz, rz, 0.0
     w.state[COUNT], w.state[STATUS] = 0.0, RUNNING
 
@@ -265,18 +219,23 @@ def start_serial(m: ti.template(), A: ti.template(), k: ti.template(), w: ti.tem
 def iterate_serial(m: ti.template(), A: ti.template(), k: ti.template(), w: ti.template(), n, tolerance):
     """Run up to n iterations from the present state, inside a serial loop. Return their number and the status."""
     rz, beta, status, count = w.state[RZ], w.state[STEP], ti.cast(RUNNING, ti.i32), 0
-    limit, n_chunks = tolerance * tolerance * w.state[RZ_START], _n_chunks(k, w)
+    limit, n_chunks = tolerance * tolerance * w.state[RZ_START], _n_chunks(w)
     if rz <= limit:
         status = CONVERGED
     while count < n and status == RUNNING:
         clear_products(m, k)
+        if ti.static(w.has_last(k)):
+            _sweep_backward(m, A, k, w, 0, beta, True)
         for step in range(n_chunks):
-            _sweep_backward(m, A, k, w, _in_order(w, n_chunks - 1 - step), beta)
+            _sweep_backward(m, A, k, w, _in_order(w, n_chunks - 1 - step), beta, False)
         clear_products(m, k)
+        clear_last(m, k, w, w.q)
         for step in range(n_chunks):
             c = _in_order(w, step)
-            m.state.partial[c, SUM] = _sweep_forward(m, A, k, w, c)
-        curvature = _sum(m, k, w, SUM)
+            m.state.partial[c, SUM] = _sweep_forward(m, A, k, w, c, False)
+        curvature = _sum(m, w, SUM)
+        if ti.static(w.has_last(k)):
+            curvature += _sweep_forward(m, A, k, w, 0, True)
         if not curvature > 0.0:
             status = NEGATIVE
             for c in range(n_chunks):
@@ -284,7 +243,7 @@ def iterate_serial(m: ti.template(), A: ti.template(), k: ti.template(), w: ti.t
         else:
             for c in range(n_chunks):
                 m.state.partial[c, OTHER_SUM] = _update(m, k, w, c, ti.cast(rz / curvature, m.real))
-            next_rz = _sum(m, k, w, OTHER_SUM)
+            next_rz = _sum(m, w, OTHER_SUM)
             beta = next_rz / rz
             rz = next_rz
             count += 1
@@ -302,14 +261,21 @@ def start_parallel(
     m: ti.template(), A: ti.template(), k: ti.template(), w: ti.template(), tolerance: ti.f64, same_matrix: ti.i32
 ):
     """Begin a solve of a divided system from y = 0."""
+    if ti.static(w.has_last(k)):
+        ti.loop_config(serialize=True)
+        for _ in range(1):
+            clear_products(m, k)
+            clear_last(m, k, w, w.r)
     for parity in ti.static((EVEN, ODD)):
         for task in range(_n_of_parity(w, parity) * m.spread):
             if task % m.spread == 0:
                 c = 2 * (task // m.spread) + parity
-                m.state.partial[c, SUM] = _start_chunk(m, A, k, w, c, same_matrix)
+                m.state.partial[c, SUM] = _start_chunk(m, A, k, w, c, same_matrix, False)
     ti.loop_config(serialize=True)
     for _ in range(1):
-        rz = _sum(m, k, w, SUM)
+        rz = _sum(m, w, SUM)
+        if ti.static(w.has_last(k)):
+            rz += _start_chunk(m, A, k, w, 0, same_matrix, True)
         w.state[RZ], w.state[RZ_START], w.state[STEP], w.state[COUNT] = rz, rz, 0.0, 0.0
         w.state[STATUS] = CONVERGED if rz <= tolerance * tolerance * rz else RUNNING
 
@@ -317,18 +283,30 @@ def start_parallel(
 @kernel
 def iterate_parallel(m: ti.template(), A: ti.template(), k: ti.template(), w: ti.template(), tolerance: ti.f64):
     """Run one iteration."""
+    if ti.static(w.has_last(k)):
+        ti.loop_config(serialize=True)
+        for _ in range(1):
+            clear_products(m, k)
+            _sweep_backward(m, A, k, w, 0, w.state[STEP], True)
     for parity in ti.static((ODD, EVEN)):
         for task in range(_n_of_parity(w, parity) * m.spread):
             if task % m.spread == 0:
-                _sweep_backward(m, A, k, w, 2 * (task // m.spread) + parity, w.state[STEP])
+                _sweep_backward(m, A, k, w, 2 * (task // m.spread) + parity, w.state[STEP], False)
+    if ti.static(w.has_last(k)):
+        ti.loop_config(serialize=True)
+        for _ in range(1):
+            clear_products(m, k)
+            clear_last(m, k, w, w.q)
     for parity in ti.static((EVEN, ODD)):
         for task in range(_n_of_parity(w, parity) * m.spread):
             if task % m.spread == 0:
                 c = 2 * (task // m.spread) + parity
-                m.state.partial[c, SUM] = _sweep_forward(m, A, k, w, c)
+                m.state.partial[c, SUM] = _sweep_forward(m, A, k, w, c, False)
     ti.loop_config(serialize=True)
     for _ in range(1):
-        curvature = _sum(m, k, w, SUM)
+        curvature = _sum(m, w, SUM)
+        if ti.static(w.has_last(k)):
+            curvature += _sweep_forward(m, A, k, w, 0, True)
         if not curvature > 0.0:
             w.state[STATUS], w.state[STEP] = NEGATIVE_PENDING, _negative_step(w.state[RZ], curvature)
         else:
@@ -343,7 +321,7 @@ def iterate_parallel(m: ti.template(), A: ti.template(), k: ti.template(), w: ti
     ti.loop_config(serialize=True)
     for _ in range(1):
         if w.state[STATUS] == RUNNING:
-            rz = _sum(m, k, w, OTHER_SUM)
+            rz = _sum(m, w, OTHER_SUM)
             w.state[STEP] = rz / w.state[RZ]
             w.state[RZ], w.state[COUNT] = rz, w.state[COUNT] + 1.0
             if rz <= tolerance * tolerance * w.state[RZ_START]:

@@ -3,20 +3,17 @@
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
 import taichi as ti
 
-from taisoft.backend.arrays import Count, FieldArena, download
+from taisoft.backend.arrays import Count, FieldArena
+from taisoft.fem.chunks import WHOLE
 from taisoft.fem.model import Model
 from taisoft.fem.node_graph import EVERYTHING, Subset
-from taisoft.linear.block_csr import BLOCK, BlockCsr, definite_inverse
+from taisoft.linear.block_csr import BLOCK, definite_inverse
 from taisoft.linear.coupling import Coupling, has_terms, prepare_terms
-from taisoft.ranges import owners
 
 RZ, RZ_START, STEP, COUNT, STATUS = range(5)  # indices into `state`
 RUNNING, CONVERGED, NEGATIVE, NEGATIVE_PENDING = range(4)  # NEGATIVE_PENDING: found in the present iteration
-# Of Gauss-Seidel: most chunks, and 2^this is the least number of their nodes, since rows that couple chunks cost more
-CHUNKS, MIN_SHIFT = 16, 11
 MAX_NEGATIVE_STEP = 10.0  # multiple of a direction of negative curvature; the caller's line search continues from there
 
 
@@ -35,15 +32,22 @@ class PcgWork:
     block: Any = None  # (n_nodes) 12-vectors: P; Gauss-Seidel only
     mirror: Any = None  # (n_nodes) 12-vectors: 2 P - D; Gauss-Seidel only
     n_chunks: Count = 1  # of `pcg_gauss_seidel`
-    chunk_shift: Count = 30  # a chunk has 2^chunk_shift nodes
-    crossed: bool = False  # whether blocks couple different chunks of one parity
-    own_begin: Any = None  # (n_nodes) i32: first entry within its chunk of each left half-row; None without chunks
-    own_end: Any = None  # (n_nodes) i32: one past the last of each right half-row
+    chunk_shift: Count = WHOLE  # a chunk has 2^chunk_shift nodes
+    divided: bool = False  # whether the half-rows of matrices are those of a divided sweep
     subset: Subset = EVERYTHING  # nodes that form the system
 
-    def is_divided(self, coupling: Coupling) -> bool:
-        """Whether Gauss-Seidel sweeps over chunks of the system's nodes."""
-        return self.own_begin is not None and coupling.width == 0 and not self.subset.restricted
+    @property
+    def in_chunks(self) -> bool:
+        """Whether Gauss-Seidel passes the system's nodes chunk by chunk."""
+        return self.divided and not self.subset.restricted
+
+    def is_shared(self, coupling: Coupling) -> bool:
+        """Whether several threads may share the chunks of one parity."""
+        return self.in_chunks and (coupling.width == 0 or coupling.place is not None)
+
+    def has_last(self, coupling: Coupling) -> bool:
+        """Whether some nodes are passed after all chunks, see `sweep_order`."""
+        return self.is_shared(coupling) and coupling.width > 0
 
 
 @dataclass(frozen=True)
@@ -56,34 +60,16 @@ class LinearResult:
     multigrid: bool = False  # whether multigrid was the preconditioner
 
 
-def build_pcg(model: Model, arena: FieldArena, matrix: BlockCsr) -> PcgWork:
+def build_pcg(model: Model, arena: FieldArena) -> PcgWork:
     """Allocate the vectors of a solve."""
 
     def allocate(*names: str, n: int = 3) -> dict[str, Any]:
         return {name: arena.vectors(f"pcg_{name}", model.real, model.n_nodes, n=n) for name in names}
 
     blocks = ("inverse", "block", "mirror") if model.on_cpu else ("inverse",)
-    state, divided = arena.field("pcg_state", ti.f64, 5), model.chunks > 1 and model.on_cpu
-    chunks = _divide(model, arena, matrix) if divided else {}
+    state, shift = arena.field("pcg_state", ti.f64, 5), model.sweep.shift
+    chunks = {"n_chunks": -(-model.n_nodes // 2**shift), "chunk_shift": shift, "divided": shift < WHOLE}
     return PcgWork(**allocate("rhs", "y", "r", "z", "p", "q"), **allocate(*blocks, n=BLOCK), state=state, **chunks)
-
-
-def _divide(model: Model, arena: FieldArena, matrix: BlockCsr) -> dict[str, Any]:
-    """Divide the rows into chunks of a power of two, whose parity a kernel finds at little cost."""
-    shift = max(MIN_SHIFT, ((model.n_nodes - 1) // CHUNKS).bit_length())
-    start, column = download([matrix.row_start, matrix.column])
-    n = model.n_nodes
-    row = owners(np.diff(start)) % n
-    apart = (column >> shift) - (row >> shift)
-    begin = start[:n] + np.bincount(row[apart < 0], minlength=n)
-    end = start[n + 1 :] - np.bincount(row[apart > 0], minlength=n)
-    return {
-        "n_chunks": -(-model.n_nodes // 2**shift),
-        "chunk_shift": shift,
-        "crossed": bool(((apart != 0) & (apart % 2 == 0)).any()),
-        "own_begin": arena.field("pcg_own_begin", ti.i32, model.n_nodes, begin.astype(np.int32)),
-        "own_end": arena.field("pcg_own_end", ti.i32, model.n_nodes, end.astype(np.int32)),
-    }
 
 
 @ti.func
