@@ -2,6 +2,7 @@
 
 * every integrator gives the same bits on one thread and on several, with and without contacts, damping and mean dilatation; the
   chunks themselves change only rounding;
+* reactions of explicit steps are those of one thread, whatever the number of sub-steps in a batch;
 * the chunks of a list are disjoint, in order and cover it; sums and least values by chunks are those of the list;
 * the gain by threads is measured once, kept unless other programs may have hidden it, and measured again where the file is
   unusable.
@@ -79,6 +80,27 @@ def test_any_number_of_threads_gives_the_same_bits(name, integrator, precision, 
     assert [made[4] for made in (whole, one, several)] == [False, True, True] and asked == [True]
     tolerance = 1e-5 if precision == "f32" else 1e-6  # [m]: those of Newton's method and of f32 strains
     assert np.abs(one[0] - whole[0]).max() < tolerance
+
+
+@pytest.mark.parametrize("integrator", ["symplectic_euler", "velocity_verlet"])
+@pytest.mark.parametrize("damping", [0.0, 0.01])
+def test_reactions_of_sub_steps_on_all_cores(integrator, damping, monkeypatch):
+    """Only the last sub-step of a batch computes them, and batches may have one."""
+    scene = ts.Scene()
+    rubber = ts.Material(young=1e5, mass_damping=100.0 * damping, stiffness_damping=damping)
+    scene.add_body(ts.box_mesh((3, 1, 1), (0.3, 0.1, 0.1)), rubber).fix(lambda X: X[:, 0] < -0.14)
+    found = []
+    for several in (None, False, True):
+        if several is not None:
+            use_threads(monkeypatch, several)
+        with ts.Simulator(scene, dt=1e-4, integrator=integrator, precision="f64") as sim:
+            for n in (1, 1, 7, 2):
+                sim.advance(n)
+                found.append((sim.reactions(), sim.positions(), sim.velocities()))
+            assert sim.step_count == 11 and np.abs(sim.reactions()).max() > 1e-2  # [N]
+    for whole, one, many in zip(found[:4], found[4:8], found[8:]):
+        assert all(np.array_equal(a, b) for a, b in zip(one, many))
+        assert all(np.abs(a - b).max() < 1e-9 * np.abs(a).max() for a, b in zip(whole, one))
 
 
 @kernel

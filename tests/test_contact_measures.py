@@ -5,16 +5,19 @@
   explicit steps with that dt stop it;
 * a half-space stops bodies of any speed, and every vertex that moves below it has a contact;
 * a vertex above the rim of a body that mirrors its own has a contact, whatever the rounding;
-* substeps are as long as allowed, at most twice as long as the last one, and fill the step.
+* substeps are as long as allowed, at most twice as long as the last one, and fill the step;
+* the distance of the surface from the searched paths is that by NumPy, by one thread and by many.
 """
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 import taisoft as ts
-from taisoft.dynamics.contact_measures import next_length
+from taisoft.dynamics import contact_paths
+from taisoft.dynamics.contact_measures import find_displacement, next_length
 from taisoft.dynamics.contact_paths import ContactPaths
 
 THICK = 0.01  # [m] of the sheet
@@ -189,3 +192,27 @@ def test_length_of_the_next_substep():
     assert next_length(lambda h: 8.0 * h, 0.8, 0.1, 1.0, True) == pytest.approx(0.1)
     far = next_length(lambda h: 40.0 * h if h > 0.1 else 0.0, 0.8, 0.1, 1.0, True)
     assert far == pytest.approx(0.025)
+
+
+def test_distance_from_the_searched_paths(monkeypatch):
+    found = []
+
+    def compare(m, s, x_start, displacement, deviation):
+        moved, node, searched = m.state.x.to_numpy() - x_start.to_numpy(), s.node.to_numpy(), s.move.to_numpy()
+        soft = node >= 0
+        moved, searched = moved[node[soft]], searched[soft]
+        square = (searched * searched).sum(axis=1)
+        along = (moved * searched).sum(axis=1) / np.where(square > 0.0, square, 1.0)
+        expected = np.linalg.norm(moved - np.clip(along, 0.0, 1.0)[:, None] * searched, axis=1).max()
+        for model in (replace(m, on_cpu=False, serial=False), m):
+            deviation[0] = -1.0
+            find_displacement(model, s, x_start, displacement, deviation)
+            assert deviation[0] == pytest.approx(expected, rel=1e-9, abs=1e-15)
+        found.append(expected)
+
+    monkeypatch.setattr(contact_paths, "find_displacement", compare)
+    with ts.Simulator(scene(), dt=1 / 60, integrator="implicit_euler", precision="f64") as sim:
+        shoot(sim, 3.0)
+        for _ in range(3):
+            sim.step()
+    assert max(found) > 1e-6  # [m]

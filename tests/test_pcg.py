@@ -132,6 +132,9 @@ def test_negative_curvature_is_reported(rig, method, shift):
     result, y = solve(rig, method, 1e-6)
     assert result.negative and not result.converged
     assert np.isfinite(y).all() and np.sum(y * rig.rhs) >= 0.0
+    for after in (1, 2, 8):  # the limit falls into the iteration that finds it, or a later one of its batch
+        again, same = solve(rig, method, 1e-6, limit=result.iterations + after)
+        assert again == result and np.array_equal(same, y)
 
 
 @pytest.mark.parametrize("method", METHODS)

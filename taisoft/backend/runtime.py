@@ -2,7 +2,8 @@
 
 Taichi's state belongs to the process, so only one (arch, precision) is open at a time. `cfg_optimization=False` works around
 a miscompilation in Taichi 1.7.4 (`A = f(A)` on a local matrix), and also compiles faster. `fast_math=False` preserves NaN
-comparisons and the order of sums, at no loss of speed.
+comparisons and the order of sums, at no loss of speed. On CUDA the compiler still rounds a b + c once, takes 0 a + c for c even
+if a is not finite, and divides f32 numbers with an error of up to two units in the last place.
 """
 
 import contextlib

@@ -203,7 +203,7 @@ def _move_soft(
 
 @ti.func
 def _exponent(value):
-    """Exponent bits of an f64. (CUDA's compiler takes 0 times a number for 0, also if it is not finite.)"""
+    """Exponent bits of an f64. They tell whether it is finite; 0 times it would not on CUDA, see `backend.runtime`."""
     return ti.cast((ti.bit_cast(value, ti.i64) >> 52) & NOT_FINITE, ti.i32)
 
 

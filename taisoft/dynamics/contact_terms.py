@@ -213,6 +213,19 @@ def sum_residual(k: ti.template(), t, threads: ti.template()):
         p.state[RESIDUAL] = ti.max(residual_of(sums), worst)
 
 
+@ti.func
+def find_residual(k: ti.template()):
+    """`sum_residual` as a top-level loop of a kernel: on the CPU on one thread, on CUDA by those of a block."""
+    if ti.static(k.problem.on_cpu):
+        ti.loop_config(serialize=True)
+        for _ in range(1):
+            sum_residual(k, 0, 1)
+    else:
+        ti.loop_config(block_dim=THREADS)
+        for t in range(THREADS):
+            sum_residual(k, t, THREADS)
+
+
 @kernel
 def update_impulses(m: ti.template(), k: ti.template(), new_multipliers: ti.i32, beta: ti.f64, r_scale: ti.f64):
     """Compute impulses and matrix blocks of all contacts at the present x, and the residual of their laws.
@@ -226,14 +239,7 @@ def update_impulses(m: ti.template(), k: ti.template(), new_multipliers: ti.i32,
         if new_multipliers == 1:
             set_multiplier(k, n)
         update_contact(m, k, n, beta, r_scale)
-    if ti.static(p.on_cpu):
-        ti.loop_config(serialize=True)
-        for _ in range(1):
-            sum_residual(k, 0, 1)
-    else:
-        ti.loop_config(block_dim=THREADS)
-        for t in range(THREADS):
-            sum_residual(k, t, THREADS)
+    find_residual(k)
 
 
 @kernel

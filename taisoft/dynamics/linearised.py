@@ -11,10 +11,10 @@ import taichi as ti
 from taisoft.backend.runtime import kernel
 from taisoft.contact.prox import dvec
 from taisoft.dynamics.contact_terms import (
+    find_residual,
     impulse_on_node,
     projected_impulse,
     stage_velocity_of,
-    sum_residual,
     unprojected_impulse,
     update_contact,
 )
@@ -198,14 +198,7 @@ def advance(
     ti.loop_config(serialize=p.serial)
     for c in range(p.count[0]):
         update_contact(m, k, c, beta, r_scale)
-    if ti.static(m.on_cpu):
-        ti.loop_config(serialize=True)
-        for _ in range(1):
-            sum_residual(k, 0, 1)
-    else:
-        ti.loop_config(block_dim=THREADS)
-        for t in range(THREADS):
-            sum_residual(k, t, THREADS)
+    find_residual(k)
     ti.loop_config(serialize=m.serial)
     for task in range(m.chunks * m.spread):
         if task % m.spread == 0:
