@@ -216,11 +216,11 @@ def write_page(folder: Path, head: str, numbers: dict, outcomes: list[Outcome], 
     write_bytes(folder / "cuda-check.json", json_text(numbers | {"parts": parts}).encode())
 
 
-def check(parts: list[Part], budget: float, folder: Path, arch: str) -> list[Outcome]:
+def check(parts: list[Part], budget: float, folder: Path, arch: str, quick: bool = False) -> list[Outcome]:
     """Run the parts within `budget` seconds, writing the page after each. Raises OutputError."""
     gpu = gpu_name()
     text, numbers = header("GPU check", f"arch {arch}", gpu, packages=("taichi", "numpy", "scipy", "meshio"))
-    numbers |= {"arch": arch, "gpu": gpu}
+    numbers |= {"arch": arch, "quick": quick, "gpu": gpu}
     end, outcomes = time.monotonic() + budget, []
     for k, part in enumerate(parts):
         later = sum(other.seconds for other in parts[k + 1 :])
@@ -249,7 +249,7 @@ def main(argv=None) -> int:
         run_job(options.job, options.arch, options.quick)
         return 0
     parts = [part for part in make_parts(options.arch, options.quick) if options.part is None or part.name in options.part]
-    outcomes = check(parts, options.budget, make_folder(options.out), options.arch)
+    outcomes = check(parts, options.budget, make_folder(options.out), options.arch, options.quick)
     print((options.out / "cuda-check.md").read_text())
     return 0 if all(outcome.ended == "ok" for outcome in outcomes) else 1
 
