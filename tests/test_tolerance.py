@@ -416,6 +416,17 @@ def test_impacts_count_as_of_first_order(sudden):
     assert ladder.error == pytest.approx(expected, rel=0.01) and ladder.order == pytest.approx(1.0 if sudden else 2.0)
 
 
+@pytest.mark.parametrize("sudden", [False, True])
+def test_a_slightly_smaller_step_shows_the_error(sudden):
+    """Of paths that err by the step or, of smooth motion, by its square."""
+    frames, order = Frames(1.0, 20.0, slice(None), np.zeros(1, dtype=int), 0.0), 1 if sudden else 2
+    ladder = Ladder("velocity_verlet", sudden, order, frames)
+    for steps, add in ((4, ladder.add), (5, ladder.replace_first)):
+        path = np.linspace(0.0, 1.0, 21)[:, None, None] * (1.0 + steps**-order, 0.0, 0.0)
+        add(Pilot("velocity_verlet", Fraction(steps), list(range(21)), list(path)))
+    assert ladder.error == pytest.approx(5.0**-order / (1.0 + 5.0**-order))
+
+
 @pytest.mark.parametrize("friction, tolerance, status", [(0.3, 0.1, "ok"), (0.3, 0.01, "degraded"), (0.0, 0.01, "ok")])
 def test_implicit_steps_pass_over_vibrations_of_contacts(friction, tolerance, status):
     """A cube on a slope, whose vibration of 158 Hz the steps do not follow."""

@@ -100,7 +100,13 @@ class Ladder:
             self.error = 0.0
             return
         apart = factor * float(distances(pilot, other).max()) / excursion
-        self.error = max(self._expected_error(pilot, excursion), apart * error_over_difference(float(steps[1] / steps[0]), 2.0))
+        shown = apart * error_over_difference(float(steps[1] / steps[0]), self.most_order)
+        self.error = max(self._expected_error(pilot, excursion), shown)
+
+    @property
+    def most_order(self) -> float:
+        """The largest order that differences may show: impacts may seem to be of a higher one than the first by chance."""
+        return 1.0 if self.sudden else 2.0
 
     @property
     def assumed_order(self) -> float:
@@ -127,7 +133,7 @@ class Ladder:
         stalled = near > self.frames.negligible and near >= max(self.differences[-3:-1]) * 0.5**MIN_ORDER
         counts = self.integrator == EXPLICIT or self.pilots[-1].per_frame >= COARSE
         self.stalled = self.stalled + 1 if stalled and counts else 0
-        return observed_order(near, far, 1.0 if self.sudden else 2.0)  # impacts may seem to be of higher order by chance
+        return observed_order(near, far, self.most_order)
 
     def _expected_error(self, pilot: Pilot, excursion: float) -> float:
         """Error of an explicit pilot, over the excursion, from its velocities; see above."""
