@@ -427,16 +427,33 @@ def test_a_slightly_smaller_step_shows_the_error(sudden):
     assert ladder.error == pytest.approx(5.0**-order / (1.0 + 5.0**-order))
 
 
-@pytest.mark.parametrize("friction, tolerance, status", [(0.3, 0.1, "ok"), (0.3, 0.01, "degraded"), (0.0, 0.01, "ok")])
-def test_implicit_steps_pass_over_vibrations_of_contacts(friction, tolerance, status):
-    """A cube on a slope, whose vibration of 158 Hz the steps do not follow."""
+def slope(friction: float, of_pair: float | None = None) -> ts.Scene:
+    """A cube on a slope, whose vibration of 158 Hz implicit steps do not follow."""
     scene = incline()
     scene.bodies[0].material = rubber(young=1e6, friction=friction)
-    with ts.Simulator(scene, tolerance=tolerance) as sim:
-        result = sim.run(0.5)
+    if of_pair is not None:
+        scene.set_contact(scene.bodies[0].name, scene.obstacles[0].name, friction=of_pair)
+    return scene
+
+
+@pytest.mark.parametrize(
+    "frictions, tolerance, status, error",
+    [
+        ((0.3,), 0.1, "ok", False),
+        ((0.3,), 0.01, "degraded", False),
+        ((0.3,), 0.01, "degraded", True),
+        ((0.0,), 0.01, "ok", False),
+        ((0.3, 0.0), 0.01, "ok", False),
+        ((0.0, 0.3), 0.01, "degraded", False),
+    ],
+)
+def test_implicit_steps_pass_over_vibrations_of_contacts(frictions, tolerance, status, error):
+    """Where there is friction, of the materials or of the pair, and whether pilots or twins estimate the error."""
+    with ts.Simulator(slope(*frictions), tolerance=tolerance) as sim:
+        result = sim.run(0.5, error=error)
         assert sim.settings.integrator == "bdf2"
     noted = any("pass over vibrations" in note for note in result.error_estimate.notes)
-    assert result.status == status and noted == (friction > 0.0)
+    assert result.status == status and noted == (frictions[-1] > 0.0)
     assert (result.error_estimate.time == 0.012) == noted
 
 
