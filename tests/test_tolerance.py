@@ -2,7 +2,8 @@
 
 * the true error of beams and of an impact meets tolerances of 10, 1 and 0.1 %, and the estimate is near it;
 * integrator and dt are chosen by counts, so reruns are equal bitwise; stiff scenes take implicit steps;
-* one explicit pilot is the run where its velocities and its hardest part show that it is enough; impacts need more;
+* one explicit pilot is the run where its velocities and its hardest part show that it is enough; impacts need more, as do
+  functions of time, which may jump;
 * implicit steps of bodies that touch with friction have an error of 1.2 % at least, since they pass over vibrations;
 * pilots leave the state as it was, observers see the run alone, and a repeated run equals the pilot that it repeats;
 * where paths diverge, where pilots fail or are interrupted, the report says so;
@@ -23,6 +24,7 @@ from taisoft.cli import EXIT_BAD_INPUT
 from taisoft.errors import SimulationError
 from taisoft.estimation.comparison import distance, largest_excursion
 from taisoft.estimation.ladder import Ladder
+from taisoft.estimation.order import may_jump
 from taisoft.estimation.pilots import Frames, Pilot, make_frames
 from taisoft.running import run_steps
 
@@ -414,6 +416,28 @@ def test_impacts_count_as_of_first_order(sudden):
         ladder.add(Pilot("velocity_verlet", Fraction(steps), list(range(21)), list(path)))
     expected = (1 / 8**2 - 1 / 16**2) * (1.0 if sudden else 1 / 3)
     assert ladder.error == pytest.approx(expected, rel=0.01) and ladder.order == pytest.approx(1.0 if sudden else 2.0)
+
+
+def pushed(path) -> ts.Scene:
+    """The beam, which a force of up to 20 kN pushes along a path."""
+    scene = beam()
+    scene.bodies[0].add_force(lambda X: X[:, 0] > 1.99, path)
+    scene.gravity = (0.0, 0.0, 0.0)
+    return scene
+
+
+def test_functions_of_time_may_jump():
+    """Steps see a force up to a step late that sets in between them: an error of first order."""
+
+    def build() -> ts.Scene:
+        return pushed(lambda t: (0.0, 2e4 if t > 0.2013 else 0.0, 0.0))
+
+    assert may_jump(build())
+    assert not may_jump(pushed((0.0, 2e4, 0.0)))
+    assert not may_jump(pushed(ts.KeyFrames((0.0, 0.1), [(0.0, 0.0, 0.0), (0.0, 2e4, 0.0)])))
+    with ts.Simulator(build(), tolerance=0.01) as sim:
+        estimate = sim.run(0.7).error_estimate.time
+    assert true_error(build, sim, 0.7) < estimate <= 0.01
 
 
 @pytest.mark.parametrize("sudden", [False, True])

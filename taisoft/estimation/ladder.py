@@ -35,9 +35,9 @@ UNSURE = 8.0  # a tolerance over the largest error that one explicit pilot of su
 class Ladder:
     """Pilots of one integrator.
 
-    sudden: whether velocities may jump; nominal: order of the integrator in the scene; error: of the last pilot, over the
-    excursion, None if unknown; order: observed, else None; tried: pilots, with failed ones; differences: root mean squares of the
-    distances between successive pilots, each with half the step of the one before [m].
+    sudden: whether velocities or forces may jump; nominal: order of the integrator in the scene; error: of the last pilot, over
+    the excursion, None if unknown; order: observed, else None; tried: pilots, with failed ones; differences: root mean squares of
+    the distances between successive pilots, each with half the step of the one before [m].
     """
 
     integrator: str

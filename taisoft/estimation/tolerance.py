@@ -25,7 +25,7 @@ from taisoft.errors import SimulationError, no_memory
 from taisoft.estimation.costs import explicit_step, implicit_step
 from taisoft.estimation.first_choice import EXPLICIT, IMPLICIT, stable_steps
 from taisoft.estimation.ladder import LEAST_REACH, Ladder
-from taisoft.estimation.order import nominal_order, releases
+from taisoft.estimation.order import may_jump, nominal_order
 from taisoft.estimation.pilots import Pilot, Recorder, RunFunction, distances, make_frames
 from taisoft.estimation.vibrations import add_vibrations
 from taisoft.records import BodyError, ErrorEstimate, RunReport
@@ -111,7 +111,7 @@ class Chooser:
         self._tolerance = SAFETY * sim.settings.tolerance
         self._parts = 1 if fps is None else max(1, math.ceil(LEAST_FRAMES / (seconds * fps)))  # of a frame of the run
         self._frames = make_frames(sim, seconds, seconds / MOST_FRAMES if fps is None else 1.0 / (fps * self._parts))
-        self._sudden = sim.touches or releases(sim.scene)
+        self._sudden = sim.touches or may_jump(sim.scene)
         self._last_failure: tuple[float, str] | None = None  # of the last pilot, if it failed: when [s], and why
         self.compile_seconds = 0.0  # of the pilots [s]
         self.ladder = self._ladder()
