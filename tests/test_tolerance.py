@@ -63,6 +63,13 @@ def true_error(build, sim: ts.Simulator, seconds: float) -> float:
     return distance(*paths, largest_excursion(paths[1])).max
 
 
+def creeping() -> ts.Scene:
+    """The beam, damped so strongly that it creeps."""
+    scene = beam()
+    scene.bodies[0].material = rubber(young=1e6, mass_damping=40.0)
+    return scene
+
+
 def dropped_damped() -> ts.Scene:
     """The cube on the ground, strongly damped."""
     scene = dropped()
@@ -74,7 +81,7 @@ def dropped_damped() -> ts.Scene:
 
 
 @pytest.mark.parametrize("tolerance", [0.1, 0.01, 0.001])
-@pytest.mark.parametrize("build", [beam, stiff, dropped])
+@pytest.mark.parametrize("build", [beam, stiff, dropped, creeping])
 def test_the_true_error_meets_the_tolerance(build, tolerance):
     with ts.Simulator(build(), tolerance=tolerance) as sim:
         result = sim.run(0.5)

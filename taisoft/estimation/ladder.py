@@ -79,8 +79,17 @@ class Ladder:
         """Expect the error of the only pilot also from its hardest part, run with a slightly smaller step."""
         if part.report.status == "failed":
             self.error = None
-        elif self.error:  # errors of smooth motion add up as changes of its velocities do
-            self._expect(self.pilots[0], part, 1.0 if self.sudden else self.pilots[0].parts)
+        elif self.error:
+            self._expect(self.pilots[0], part, self._parts())
+
+    def _parts(self) -> float:
+        """Error of the only pilot over that of its hardest part: of smooth motion errors add up as changes of its velocities do.
+
+        Of damped motion they add up with time, as its velocities themselves are wrong.
+        """
+        if self.sudden:
+            return 1.0
+        return self.pilots[0].parts if self.nominal > 1 else self.frames.count / self.frames.part
 
     def replace_first(self, pilot: Pilot) -> None:
         """Replace the first pilot, explicit, by one with a slightly smaller step, and expect its error."""
@@ -100,13 +109,8 @@ class Ladder:
             self.error = 0.0
             return
         apart = factor * float(distances(pilot, other).max()) / excursion
-        shown = apart * error_over_difference(float(steps[1] / steps[0]), self.most_order)
+        shown = apart * error_over_difference(float(steps[1] / steps[0]), self.nominal)
         self.error = max(self._expected_error(pilot, excursion), shown)
-
-    @property
-    def most_order(self) -> float:
-        """The largest order that differences may show: impacts may seem to be of a higher one than the first by chance."""
-        return 1.0 if self.sudden else 2.0
 
     @property
     def assumed_order(self) -> float:
@@ -133,7 +137,7 @@ class Ladder:
         stalled = near > self.frames.negligible and near >= max(self.differences[-3:-1]) * 0.5**MIN_ORDER
         counts = self.integrator == EXPLICIT or self.pilots[-1].per_frame >= COARSE
         self.stalled = self.stalled + 1 if stalled and counts else 0
-        return observed_order(near, far, self.most_order)
+        return observed_order(near, far, 1.0 if self.sudden else 2.0)  # impacts may seem to be of higher order by chance
 
     def _expected_error(self, pilot: Pilot, excursion: float) -> float:
         """Error of an explicit pilot, over the excursion, from its velocities; see above."""
