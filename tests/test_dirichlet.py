@@ -3,6 +3,7 @@
 * fixed and prescribed axes are constrained, those of a released group are not; a reset prescribes it again;
 * targets are the rest positions plus the path's displacement, one for all nodes or one for each;
 * targets end before the first release; the next call, at that time, releases the group and continues;
+* a step that ends with a path follows it to there, its accelerations too;
 * paths that fail or give invalid values are refused with the body's name and the time.
 """
 
@@ -82,6 +83,15 @@ def test_a_step_that_ends_with_the_path_follows_it_to_there(steps):
     times = 0.3 / steps * np.arange(1, steps + 2)
     rows, releasing = dirichlet.targets(times)
     assert len(rows) == steps and releasing and rows[-1, 0] == pytest.approx(rest[8] + [0.3, 0, 0], abs=1e-8)
+
+
+@pytest.mark.parametrize("middle", [False, True])
+@pytest.mark.parametrize("steps", [3, 10, 1000])
+def test_accelerations_of_a_step_that_ends_with_the_path(steps, middle):
+    """They are those of the path until then."""
+    dirichlet, _ = made(([0, 1], "xyz", lambda t: (t * t, 0.0, 0.0) if t < 0.3 else None))
+    dt = 0.3 / steps
+    assert dirichlet.accelerations(0.3 - dt, dt, middle) == pytest.approx(np.tile((2.0, 0.0, 0.0), (2, 1)), abs=1e-6)
 
 
 SHAPES = [(1, 2), np.zeros((3, 3)), np.zeros((2, 2)), 1.0]

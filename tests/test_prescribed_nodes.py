@@ -2,7 +2,7 @@
 
 * a body that starts with the velocity of its prescribed end moves rigidly, from the first step on and after `set_state`;
 * second-order integrators stay second order, with elements of either order;
-* a path that returns a displacement after None within a step is refused.
+* a path that returns a displacement after None within a step is refused; one that ends with a step is followed to there.
 """
 
 import numpy as np
@@ -33,6 +33,18 @@ def test_a_displacement_after_a_release_is_refused():
     with ts.Simulator(scene, dt=0.01, integrator="implicit_euler", precision="f64") as sim:
         with pytest.raises(ts.SimulationError, match="body 'beam': moved nodes: the path gave None at t = 0.005,"):
             sim.step()
+
+
+@pytest.mark.parametrize("integrator", IMPLICIT)
+def test_a_step_ends_with_a_release(integrator):
+    """The ends are where the path ends, and the bars, which it moves at their own velocity, fly on."""
+    path = ts.KeyFrames((0.0, 3e-4), [(0.0, 0.0, 0.0), 3e-4 * VELOCITY], release=True)
+    with ts.Simulator(moving_bars(path), 1e-4, integrator, precision="f64", **TIGHT) as sim:
+        start = sim.positions()
+        for _ in range(5):
+            sim.step()
+        assert sim.positions() == pytest.approx(start + 5e-4 * VELOCITY, abs=1e-9)
+        assert np.abs(sim.velocities() - VELOCITY).max() < 1e-6
 
 
 @pytest.mark.parametrize("integrator", ["velocity_verlet", *IMPLICIT])

@@ -2,7 +2,8 @@
 
 * the true error of beams and of an impact meets tolerances of 10, 1 and 0.1 %, and the estimate is near it;
 * integrator and dt are chosen by counts, so reruns are equal bitwise; stiff scenes take implicit steps;
-* one explicit pilot is the run where its velocities and its hardest part show that it is enough; impacts need more;
+* one explicit pilot is the run where its velocities and its hardest part show that it is enough; impacts need more, as do
+  functions of time, which may jump;
 * implicit steps of bodies that touch with friction have an error of 1.2 % at least, since they pass over vibrations;
 * pilots leave the state as it was, observers see the run alone, and a repeated run equals the pilot that it repeats;
 * where paths diverge, where pilots fail or are interrupted, the report says so;
@@ -23,6 +24,7 @@ from taisoft.cli import EXIT_BAD_INPUT
 from taisoft.errors import SimulationError
 from taisoft.estimation.comparison import distance, largest_excursion
 from taisoft.estimation.ladder import Ladder
+from taisoft.estimation.order import may_jump
 from taisoft.estimation.pilots import Frames, Pilot, make_frames
 from taisoft.running import run_steps
 
@@ -61,6 +63,13 @@ def true_error(build, sim: ts.Simulator, seconds: float) -> float:
     return distance(*paths, largest_excursion(paths[1])).max
 
 
+def creeping() -> ts.Scene:
+    """The beam, damped so strongly that it creeps."""
+    scene = beam()
+    scene.bodies[0].material = rubber(young=1e6, mass_damping=40.0)
+    return scene
+
+
 def dropped_damped() -> ts.Scene:
     """The cube on the ground, strongly damped."""
     scene = dropped()
@@ -72,7 +81,7 @@ def dropped_damped() -> ts.Scene:
 
 
 @pytest.mark.parametrize("tolerance", [0.1, 0.01, 0.001])
-@pytest.mark.parametrize("build", [beam, stiff, dropped])
+@pytest.mark.parametrize("build", [beam, stiff, dropped, creeping])
 def test_the_true_error_meets_the_tolerance(build, tolerance):
     with ts.Simulator(build(), tolerance=tolerance) as sim:
         result = sim.run(0.5)
@@ -416,16 +425,66 @@ def test_impacts_count_as_of_first_order(sudden):
     assert ladder.error == pytest.approx(expected, rel=0.01) and ladder.order == pytest.approx(1.0 if sudden else 2.0)
 
 
-@pytest.mark.parametrize("friction, tolerance, status", [(0.3, 0.1, "ok"), (0.3, 0.01, "degraded"), (0.0, 0.01, "ok")])
-def test_implicit_steps_pass_over_vibrations_of_contacts(friction, tolerance, status):
-    """A cube on a slope, whose vibration of 158 Hz the steps do not follow."""
+def pushed(path) -> ts.Scene:
+    """The beam, which a force of up to 20 kN pushes along a path."""
+    scene = beam()
+    scene.bodies[0].add_force(lambda X: X[:, 0] > 1.99, path)
+    scene.gravity = (0.0, 0.0, 0.0)
+    return scene
+
+
+def test_functions_of_time_may_jump():
+    """Steps see a force up to a step late that sets in between them: an error of first order."""
+
+    def build() -> ts.Scene:
+        return pushed(lambda t: (0.0, 2e4 if t > 0.2013 else 0.0, 0.0))
+
+    assert may_jump(build())
+    assert not may_jump(pushed((0.0, 2e4, 0.0)))
+    assert not may_jump(pushed(ts.KeyFrames((0.0, 0.1), [(0.0, 0.0, 0.0), (0.0, 2e4, 0.0)])))
+    with ts.Simulator(build(), tolerance=0.01) as sim:
+        estimate = sim.run(0.7).error_estimate.time
+    assert true_error(build, sim, 0.7) < estimate <= 0.01
+
+
+@pytest.mark.parametrize("sudden", [False, True])
+def test_a_slightly_smaller_step_shows_the_error(sudden):
+    """Of paths that err by the step or, of smooth motion, by its square."""
+    frames, order = Frames(1.0, 20.0, slice(None), np.zeros(1, dtype=int), 0.0), 1 if sudden else 2
+    ladder = Ladder("velocity_verlet", sudden, order, frames)
+    for steps, add in ((4, ladder.add), (5, ladder.replace_first)):
+        path = np.linspace(0.0, 1.0, 21)[:, None, None] * (1.0 + steps**-order, 0.0, 0.0)
+        add(Pilot("velocity_verlet", Fraction(steps), list(range(21)), list(path)))
+    assert ladder.error == pytest.approx(5.0**-order / (1.0 + 5.0**-order))
+
+
+def slope(friction: float, of_pair: float | None = None) -> ts.Scene:
+    """A cube on a slope, whose vibration of 158 Hz implicit steps do not follow."""
     scene = incline()
     scene.bodies[0].material = rubber(young=1e6, friction=friction)
-    with ts.Simulator(scene, tolerance=tolerance) as sim:
-        result = sim.run(0.5)
+    if of_pair is not None:
+        scene.set_contact(scene.bodies[0].name, scene.obstacles[0].name, friction=of_pair)
+    return scene
+
+
+@pytest.mark.parametrize(
+    "frictions, tolerance, status, error",
+    [
+        ((0.3,), 0.1, "ok", False),
+        ((0.3,), 0.01, "degraded", False),
+        ((0.3,), 0.01, "degraded", True),
+        ((0.0,), 0.01, "ok", False),
+        ((0.3, 0.0), 0.01, "ok", False),
+        ((0.0, 0.3), 0.01, "degraded", False),
+    ],
+)
+def test_implicit_steps_pass_over_vibrations_of_contacts(frictions, tolerance, status, error):
+    """Where there is friction, of the materials or of the pair, and whether pilots or twins estimate the error."""
+    with ts.Simulator(slope(*frictions), tolerance=tolerance) as sim:
+        result = sim.run(0.5, error=error)
         assert sim.settings.integrator == "bdf2"
     noted = any("pass over vibrations" in note for note in result.error_estimate.notes)
-    assert result.status == status and noted == (friction > 0.0)
+    assert result.status == status and noted == (frictions[-1] > 0.0)
     assert (result.error_estimate.time == 0.012) == noted
 
 

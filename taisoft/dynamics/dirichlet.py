@@ -124,14 +124,17 @@ class DirichletConditions:
         for g in self._groups:
             if g.released:
                 continue
+            length = dt
+            if self._displacement(g, start + dt) is None:  # released as the step ends
+                length = (start + dt) * (1.0 - ROUNDING) - start
             for fraction, weight in zip(fractions, weights):
-                displacement = self._displacement(g, start + fraction * dt)
+                displacement = self._displacement(g, start + fraction * length)
                 if displacement is None:
                     raise SimulationError(
-                        f"body '{g.name}': moved nodes: the path gave None at t = {start + fraction * dt:g}, "
+                        f"body '{g.name}': moved nodes: the path gave None at t = {start + fraction * length:g}, "
                         "but a displacement later: released nodes stay free"
                     )
-                total[g.rows] += weight / dt**2 * displacement
+                total[g.rows] += weight / length**2 * displacement
         return total
 
     def _displacement_by(self, group: _Group, t: float) -> np.ndarray | None:

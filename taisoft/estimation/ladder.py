@@ -35,9 +35,9 @@ UNSURE = 8.0  # a tolerance over the largest error that one explicit pilot of su
 class Ladder:
     """Pilots of one integrator.
 
-    sudden: whether velocities may jump; nominal: order of the integrator in the scene; error: of the last pilot, over the
-    excursion, None if unknown; order: observed, else None; tried: pilots, with failed ones; differences: root mean squares of the
-    distances between successive pilots, each with half the step of the one before [m].
+    sudden: whether velocities or forces may jump; nominal: order of the integrator in the scene; error: of the last pilot, over
+    the excursion, None if unknown; order: observed, else None; tried: pilots, with failed ones; differences: root mean squares of
+    the distances between successive pilots, each with half the step of the one before [m].
     """
 
     integrator: str
@@ -79,8 +79,17 @@ class Ladder:
         """Expect the error of the only pilot also from its hardest part, run with a slightly smaller step."""
         if part.report.status == "failed":
             self.error = None
-        elif self.error:  # errors of smooth motion add up as changes of its velocities do
-            self._expect(self.pilots[0], part, 1.0 if self.sudden else self.pilots[0].parts)
+        elif self.error:
+            self._expect(self.pilots[0], part, self._parts())
+
+    def _parts(self) -> float:
+        """Error of the only pilot over that of its hardest part: of smooth motion errors add up as changes of its velocities do.
+
+        Of damped motion they add up with time, as its velocities themselves are wrong.
+        """
+        if self.sudden:
+            return 1.0
+        return self.pilots[0].parts if self.nominal > 1 else self.frames.count / self.frames.part
 
     def replace_first(self, pilot: Pilot) -> None:
         """Replace the first pilot, explicit, by one with a slightly smaller step, and expect its error."""
@@ -100,7 +109,8 @@ class Ladder:
             self.error = 0.0
             return
         apart = factor * float(distances(pilot, other).max()) / excursion
-        self.error = max(self._expected_error(pilot, excursion), apart * error_over_difference(float(steps[1] / steps[0]), 2.0))
+        shown = apart * error_over_difference(float(steps[1] / steps[0]), self.nominal)
+        self.error = max(self._expected_error(pilot, excursion), shown)
 
     @property
     def assumed_order(self) -> float:

@@ -10,6 +10,8 @@ import math
 import numpy as np
 
 from taisoft.dynamics.schemes import SECOND_ORDER
+from taisoft.scene.key_frames import NodePath
+from taisoft.scene.loads import LoadPath
 from taisoft.scene.scene import Scene
 
 MESH_ORDER = 2  # of positions in the mesh width; corners and contacts keep quadratic tets near it too
@@ -36,10 +38,11 @@ def is_smooth(scene: Scene, touches: bool) -> bool:
     return not (prescribed or damped or touches or slackens)
 
 
-def releases(scene: Scene) -> bool:
-    """Whether a path may release its nodes, which changes forces suddenly."""
-    paths = [c.path for body in scene.bodies for c in body.constraints if c.path is not None]
-    return any(getattr(getattr(path, "frames", path), "release", True) for path in paths)
+def may_jump(scene: Scene) -> bool:
+    """Whether forces may change suddenly: with nodes that are released, and with functions of time, but not with key frames."""
+    constraints = [constraint for body in scene.bodies for constraint in body.constraints]
+    paths = [one.path for one in (*constraints, *scene.loads) if one.path is not None]
+    return any(not isinstance(path, (NodePath, LoadPath)) or path.frames.release for path in paths)
 
 
 def error_over_difference(ratio: float, order: float) -> float:

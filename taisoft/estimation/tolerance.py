@@ -25,10 +25,9 @@ from taisoft.errors import SimulationError, no_memory
 from taisoft.estimation.costs import explicit_step, implicit_step
 from taisoft.estimation.first_choice import EXPLICIT, IMPLICIT, stable_steps
 from taisoft.estimation.ladder import LEAST_REACH, Ladder
-from taisoft.estimation.order import nominal_order, releases
+from taisoft.estimation.order import may_jump, nominal_order
 from taisoft.estimation.pilots import Pilot, Recorder, RunFunction, distances, make_frames
-from taisoft.estimation.vibrations import ERROR as VIBRATIONS
-from taisoft.estimation.vibrations import are_passed_over
+from taisoft.estimation.vibrations import add_vibrations
 from taisoft.records import BodyError, ErrorEstimate, RunReport
 from taisoft.scene.scene import Scene
 from taisoft.stability import stable_dt
@@ -112,7 +111,7 @@ class Chooser:
         self._tolerance = SAFETY * sim.settings.tolerance
         self._parts = 1 if fps is None else max(1, math.ceil(LEAST_FRAMES / (seconds * fps)))  # of a frame of the run
         self._frames = make_frames(sim, seconds, seconds / MOST_FRAMES if fps is None else 1.0 / (fps * self._parts))
-        self._sudden = sim.touches or releases(sim.scene)
+        self._sudden = sim.touches or may_jump(sim.scene)
         self._last_failure: tuple[float, str] | None = None  # of the last pilot, if it failed: when [s], and why
         self.compile_seconds = 0.0  # of the pilots [s]
         self.ladder = self._ladder()
@@ -239,6 +238,7 @@ class Chooser:
         sim._may_soften = sim._may_soften and not pilot.warned
         self.compile_seconds -= pilot.report.compile_seconds
         pilot.report.error_estimate = self.estimate(pilot)
+        self._add_vibrations(pilot.report.error_estimate, pilot)
         return pilot.report
 
     def run(self, steps: int, on_frame=None, **observers) -> RunReport:
@@ -261,6 +261,7 @@ class Chooser:
         if report.error_estimate is None or (report.error_estimate.time is None and estimate.time is not None):
             estimate.solver = report.error_estimate and report.error_estimate.solver
             report.error_estimate = estimate
+        self._add_vibrations(report.error_estimate, made)
         return report
 
     def estimate(self, run: Pilot) -> ErrorEstimate:
@@ -286,15 +287,10 @@ class Chooser:
             for k, body in enumerate(made.bodies.values()):
                 body.time = float(errors[self._frames.bodies == k].max(initial=0.0))
             made.time = float(errors.max())
-        if made.time and self._passes_over_vibrations(run):
-            made.time = max(made.time, VIBRATIONS)
-            made.notes.append(
-                f"the steps pass over vibrations of bodies in contact, whose friction may change the motion by "
-                f"{100.0 * VIBRATIONS:.2g} %"
-            )
         return made
 
-    def _passes_over_vibrations(self, run: Pilot) -> bool:
+    def _add_vibrations(self, estimate: ErrorEstimate, run: Pilot) -> None:
+        """Add to an estimate, of pilots or twins, what implicit steps of bodies that touch do not show."""
         touched = any(report.n_contacts for report in self.ladder.pilots[-1].report.step_reports)
-        dt = self._frames.seconds / float(run.per_frame)
-        return touched and run.integrator == IMPLICIT and are_passed_over(self._sim.scene, dt)
+        if touched and run.integrator == IMPLICIT:
+            add_vibrations(estimate, self._sim.scene, self._frames.seconds / float(run.per_frame))
