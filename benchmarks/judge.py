@@ -1,10 +1,10 @@
 """Crossing surfaces of a simulator's present state, judged by ipctk rather than by taisoft's own search.
 
 Judged are the surfaces of bodies, and of obstacles that have triangles, against each other and, with self-collision, against
-themselves. Surfaces cross where an edge pierces a triangle with which it shares no vertex; ipctk says whether any does, and exact
-determinants, which. Half-spaces, spheres and capsules have
-no triangles: a body crosses them where a triangle comes closer than zero. A surface that lies wholly inside another one has
-crossed it before, and counts too.
+themselves; not those of bodies attached to each other exactly, which share nodes and do not collide. Surfaces cross where an
+edge pierces a triangle with which it shares no vertex; ipctk says whether any does, and exact determinants, which. Half-spaces,
+spheres and capsules have no triangles: a body crosses them where a triangle comes closer than zero. A surface that lies wholly
+inside another one has crossed it before, and counts too.
 
 Weakness: only states are judged, so a body that passes another one completely within one step is not noticed; nor is one that
 sinks into another so symmetrically that edges only meet edges and planes.
@@ -140,6 +140,7 @@ class Judge:
         self._owner = np.repeat(np.arange(len(triangles)), [len(t) for t in triangles])
         self._of = [np.flatnonzero(self._owner == k) for k in range(len(triangles))]
         self._n_soft = len(bodies)
+        self._attached = {frozenset((one.a, one.b)) for one in sim.scene.exact_attachments}
         x, faces = self.vertices(), np.asfortranarray(self.triangles.astype(np.int32))
         self._mesh = ipctk.CollisionMesh(np.asfortranarray(x), ipctk.edges(faces), faces)
         self._components = [self._one_of_each_component(own) for own in self._of]
@@ -158,6 +159,10 @@ class Judge:
         half = np.sort(t[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
         closed = (np.unique(half, axis=0, return_counts=True)[1] == 2).all()
         return bool(closed and np.linalg.det(x[t] - x[t[0, 0]]).sum() > 0.0)
+
+    def _are_attached(self, a: str, b: str) -> bool:
+        """Whether two bodies, or a body and an obstacle, are attached to each other exactly."""
+        return frozenset((a, b)) in self._attached
 
     def vertices(self) -> np.ndarray:
         """The (v,3) vertices of all judged surfaces now [m]."""
@@ -181,7 +186,8 @@ class Judge:
             distances = self._shape_distances(x, obstacle) + ROUNDING * np.abs(x).max()
             found.depth = max(found.depth, -float(distances.min()))
             for k in range(self._n_soft):
-                if inside := int((distances[self._of[k]] < 0.0).sum()):
+                inside = int((distances[self._of[k]] < 0.0).sum())
+                if inside and not self._are_attached(self._names[k], obstacle.name):
                     found.names[self._names[k], obstacle.name] += inside
         if not found.names:
             found.names = self._enclosed(x)
@@ -194,7 +200,7 @@ class Judge:
         high = np.array([hi[own].max(axis=0) for own in self._of])
         pairs = [np.empty((0, 2), dtype=np.int64)]
         for a, b in close_pairs(low, high):
-            if a < self._n_soft:
+            if a < self._n_soft and not self._are_attached(self._names[a], self._names[b]):
                 p, q = (o[((lo[o] <= high[c]) & (hi[o] >= low[c])).all(axis=1)] for o, c in ((self._of[a], b), (self._of[b], a)))
                 both = np.concatenate([p, q])
                 near = close_pairs(lo[both], hi[both])
@@ -214,7 +220,8 @@ class Judge:
             corners = x[self.triangles[self._of[k]]]
             lo, hi = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))
             for j, name, part in points:
-                if j != k and min(j, k) < self._n_soft and (part > lo).all() and (part < hi).all():
+                may_touch = j != k and min(j, k) < self._n_soft and not self._are_attached(name, self._names[k])
+                if may_touch and (part > lo).all() and (part < hi).all():
                     found[name, self._names[k]] += winding_number(part[0], corners) > 0.5
         return +found
 

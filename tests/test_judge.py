@@ -4,7 +4,8 @@
   crosses where the edge opposite it pierces the other triangle;
 * the pairs are those of all pairs in random crumpled bodies, and the least distance that of brute force;
 * distances from half-spaces, spheres and capsules are those of sampled points;
-* a surface wholly inside another one counts, and so do shapes inside a body; obstacles may cross each other.
+* a surface wholly inside another one counts, and so do shapes inside a body; obstacles may cross each other;
+* what is attached to each other exactly may cross, and nothing else.
 """
 
 from fractions import Fraction
@@ -193,3 +194,17 @@ def test_moving_obstacles_are_judged_where_they_are():
     scene.add_obstacle(ts.Sphere((0, 2, 0), 0.5), name="ball", path=lambda t: (np.array([0.0, -t, 0.0]), np.eye(3)))
     assert [judging.Judge(standing(scene, time=t), False).crossings() > 0 for t in (0.0, 0.09, 0.11)] == [False, False, True]
     assert set(judging.Judge(standing(scene, time=0.45), False).find().names) == {("cube 0", "ground"), ("cube 0", "ball")}
+
+
+def test_attached_bodies_may_cross():
+    """The second cube overlaps the first, to which it can be attached at a common face, and the third one."""
+    scene = scene_of((0, 0, 0), (1, 0, 0), (1.3, 0.9, 0.1))
+    for attached in (False, True):
+        if attached:
+            scene.attach("cube 1", lambda x: x[:, 0] < -0.49, "cube 0")
+        x = scene.body("cube 1").rest_positions + np.array([0.9, 0.05, 0.02])
+        names = judging.Judge(standing(scene, {"cube 1": x}), False).find().names
+        assert set(names) == {("cube 1", "cube 2")} | (set() if attached else {("cube 0", "cube 1")})
+        small = 0.1 * scene.body("cube 1").rest_positions
+        names = judging.Judge(standing(scene, {"cube 1": small}), False).find().names
+        assert set(names) == (set() if attached else {("cube 1", "cube 0")})
