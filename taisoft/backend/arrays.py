@@ -35,6 +35,11 @@ OWN_MASK = 2**30 - 1  # index mask of a separate field, and its largest number o
 Count = Annotated[int, "run time"]
 
 
+def on_cuda() -> bool:
+    """Whether Taichi runs on a GPU, so that arrays are Taichi's own."""
+    return ti.cfg.arch == ti.cuda
+
+
 def index_mask(n: int, extents: tuple[int, ...]) -> int:
     """Mask of the first index of an array of n-vectors with these other extents, so that 31 bits can index all its numbers.
 
@@ -250,7 +255,7 @@ class FieldArena:
         shape = (shape,) if isinstance(shape, int) else tuple(shape)
         numbers = max(n, 1) * math.prod(shape[1:])
         needed = self._checked_bytes(name, dtype, shape[0] * numbers, index_mask(n, shape[1:]) * numbers)
-        on_host = ti.cfg.arch != ti.cuda
+        on_host = not on_cuda()
         try:
             array = Array(dtype, shape, n, on_host)
         except (MemoryError, RuntimeError):  # RuntimeError has the text of Taichi's C++ layer
@@ -268,7 +273,7 @@ class FieldArena:
         if count > max_count:
             raise SimulationError(f"array '{name}' needs {count} numbers, more than the {max_count} that fit")
         needed = count * np.dtype(DTYPES[dtype]).itemsize
-        free = available_memory() if ti.cfg.arch != ti.cuda and needed > SMALL else None
+        free = None if on_cuda() or needed <= SMALL else available_memory()
         if free is not None and needed > free:
             raise SimulationError(self._memory_message(name, needed, free))
         return needed

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 import taichi as ti
 
-from taisoft.backend.arrays import DTYPES, Array
+from taisoft.backend.arrays import DTYPES, Array, on_cuda
 from taisoft.backend.private import AutodiffMode, Kernel, impl, ndarray_type, primitive_types, template
 from taisoft.backend.structure import COUNT, generate, holders, leaf_structures, leaves_of, names_in, names_of_types, structure_of
 from taisoft.backend.tracing import FAST_TRACING
@@ -67,7 +67,7 @@ class Compiled:
             for slot, index in self._leaves
             for k, leaf in enumerate(leaves_of(arguments[index], self.structures[index]))
         ]
-        if ti.cfg.arch == ti.cuda:
+        if on_cuda():
             return [(slot, leaf.device.arr if isinstance(leaf, Array) else operator.index(leaf)) for slot, leaf in bound]
         context = self._cpp.make_launch_context()
         for slot, leaf in bound:

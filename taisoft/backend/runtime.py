@@ -19,7 +19,7 @@ import taichi as ti
 
 from taisoft import compile_message
 from taisoft.backend import tracing  # noqa: F401  tracing: before any function is decorated
-from taisoft.backend.arrays import LanePool
+from taisoft.backend.arrays import LanePool, on_cuda
 from taisoft.backend.launching import Kernels
 from taisoft.backend.private import impl
 from taisoft.errors import SimulationError
@@ -148,7 +148,7 @@ def _initialise(arch: str, precision: str) -> None:
         kernels.forget()
     LanePool.current = LanePool(PRECISIONS[precision]) if arch == "cpu" else None
     _totals["compile"] += time.perf_counter() - clock
-    actual = "cuda" if ti.cfg.arch == ti.cuda else "cpu"
+    actual = "cuda" if on_cuda() else "cpu"
     if actual != arch:
         raise SimulationError(f"arch '{arch}' is not available on this machine (Taichi fell back to '{actual}')")
 

@@ -17,7 +17,7 @@ import numpy as np
 import scipy.sparse as sp
 import taichi as ti
 
-from taisoft.backend.arrays import Count, FieldArena, upload
+from taisoft.backend.arrays import Count, FieldArena, on_cuda, upload
 from taisoft.backend.runtime import kernel
 from taisoft.contact.prox import dvec, prox, scaled
 from taisoft.fem.chunks import part_first
@@ -96,7 +96,7 @@ def build_node_problem(arena: FieldArena, capacity: int, n_nodes: int, serial: b
     return ContactProblem(
         n,
         serial,
-        ti.cfg.arch != ti.cuda,
+        not on_cuda(),
         False,
         n_nodes=n_nodes,
         width=width,
@@ -112,7 +112,7 @@ def build_node_problem(arena: FieldArena, capacity: int, n_nodes: int, serial: b
         **_fields(arena, "inverse_mass w", ti.f64, n_nodes, 3),
         **_fields(arena, "entry_start", ti.i32, n_nodes + 1),
         **_fields(arena, "entry", ti.i32, width * n),
-        **({} if ti.cfg.arch != ti.cuda else _fields(arena, "scan", ti.i32, SCAN)),
+        **(_fields(arena, "scan", ti.i32, SCAN) if on_cuda() else {}),
         **_fields(arena, "slot", ti.i32, n_slots),
     )
 
@@ -122,7 +122,7 @@ def build_matrix_problem(arena: FieldArena, n: int, n_blocks: int, serial: bool)
     return ContactProblem(
         n,
         serial,
-        ti.cfg.arch != ti.cuda,
+        not on_cuda(),
         True,
         **_solver_fields(arena, n),
         **_fields(arena, "row_start", ti.i32, n + 1),
