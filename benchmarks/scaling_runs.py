@@ -6,9 +6,9 @@ search:     a search for contacts by proximity among 27 cubes at rest that touch
 explicit contact, implicit contact: two cubes on the ground, the upper one off centre and slightly penetrating: symplectic
             Euler and Gauss-Seidel at 0.9 of the largest stable step, implicit Euler and the augmented Lagrangian at 10 ms.
 
-Explicit, implicit and search also on one thread, where taisoft uses all. All in f32. Steps are timed first as a whole, then
-repeated from the same start with a stopwatch on their parts, which adds a small overhead. The first steps, which compile and
-grow buffers, are left out.
+Explicit, implicit, search and implicit contact also on one thread, where taisoft uses all. All in f32. Steps are timed first as a
+whole, then repeated from the same start with a stopwatch on their parts, which adds a small overhead. The first steps, which
+compile and grow buffers, are left out.
 """
 
 from collections.abc import Callable
@@ -270,11 +270,13 @@ def search(row: Row, size: int) -> None:
             row.moved = floor_bytes(("boxes", broad), found) + found["contacts"] * counts.found / rig.detection.buffer.capacity
 
 
+_implicit_contact = partial(implicit, cubes_on_ground, "implicit_euler")
 _THREADED = {"explicit": explicit, "implicit": partial(implicit, beam, "bdf2"), "search": search}
 KINDS: dict[str, Callable[[Row, int], None]] = {
     **_THREADED,
     **{name + ON_ONE: on_one_thread(run) for name, run in _THREADED.items()},
     "stiff implicit": partial(implicit, stiff_beam, "bdf2"),
     "explicit contact": explicit_contact,
-    "implicit contact": partial(implicit, cubes_on_ground, "implicit_euler"),
+    "implicit contact": _implicit_contact,
+    "implicit contact" + ON_ONE: on_one_thread(_implicit_contact),
 }

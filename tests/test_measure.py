@@ -83,10 +83,10 @@ def test_explicit_frames_and_implicit_steps_are_measured_once(integrator):
         assert (report.kinetic, report.elastic, report.gravity) == pytest.approx(expected)
 
 
-def model_of(law: str, tets: int, damped: bool = False) -> SimpleNamespace:
+def model_of(law: str, tets: int, damped: bool = False, chunks: int = 1) -> SimpleNamespace:
     """The attributes of a model that determine the time of its sub-steps."""
     group = SimpleNamespace(law=LAWS[law], first=0, last=tets // 4, n_points=1)
-    return SimpleNamespace(groups=(group,), lanes=4, stiffness_damping=damped, on_cpu=True)
+    return SimpleNamespace(groups=(group,), lanes=4, stiffness_damping=damped, on_cpu=True, chunks=chunks)
 
 
 def test_sub_steps_per_launch_follow_from_the_launch_time():
@@ -94,5 +94,6 @@ def test_sub_steps_per_launch_follow_from_the_launch_time():
     assert largest_batch(model_of(SNH, LARGE)) >= 84  # a frame of the benchmark
     assert largest_batch(model_of(COR, LARGE)) < largest_batch(model_of(SVK, LARGE))
     assert largest_batch(model_of(SNH, 10**8)) == 1
+    assert largest_batch(model_of(SNH, 10**6, chunks=32)) >= 10  # the measurement that ends a batch is a tenth of it at most
     # a damped quadrature point takes at least 436 ns
     assert largest_batch(model_of(SNH, LARGE, damped=True)) <= LAUNCH_SECONDS / (436e-9 * LARGE)

@@ -16,6 +16,9 @@ from taisoft.fem.state import LOWEST_J, MOST_INVERTED, STEPS_DONE
 from taisoft.settings import Settings
 
 LAUNCH_SECONDS = 0.1  # rough maximum of one launch, so that Ctrl-C takes effect
+# The same of a batch, on one thread, in scenes whose loops are divided: on several threads each sub-step has launches of its own,
+# and the measurement that ends a batch takes almost as long as a sub-step
+CHUNKED_BATCH_SECONDS = 0.4
 GPU_SPEEDUP = 30  # of a large mesh over one CPU thread, roughly
 DAMPING_POINT_SECONDS = 800e-9  # added by stiffness damping to a law's POINT_SECONDS: it projects the stiffness of each point
 MAX_BATCH = 4096
@@ -79,7 +82,8 @@ def largest_batch(m: Model) -> int:
     """
     damping = DAMPING_POINT_SECONDS if m.stiffness_damping else 0.0
     seconds = sum((g.last - g.first) * m.lanes * g.n_points * (g.law.POINT_SECONDS + damping) for g in m.groups)
-    return max(1, min(MAX_BATCH, int(LAUNCH_SECONDS / seconds * (1 if m.on_cpu else GPU_SPEEDUP))))
+    longest = LAUNCH_SECONDS * GPU_SPEEDUP if not m.on_cpu else CHUNKED_BATCH_SECONDS if m.chunks > 1 else LAUNCH_SECONDS
+    return max(1, min(MAX_BATCH, int(longest / seconds)))
 
 
 class ExplicitStepper:

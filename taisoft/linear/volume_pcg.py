@@ -223,6 +223,7 @@ def precondition(m: ti.template(), w: ti.template(), s: ti.template()):
 def save_volumes(m: ti.template(), s: ti.template()):
     """Save the dilatations at x for `restore_volumes`."""
     find_dilatations(m)
+    ti.loop_config(serialize=m.serial)
     for p in range(s.n_patches):
         s.target[p] = m.mean.dilatation[p]
 
