@@ -42,6 +42,7 @@ from .runner import Stopwatch, clock, patched, repeated, timed
 from .scaling_bytes import floor_bytes, group_bytes
 
 DT, TINY_DT = 0.01, 1e-6  # [s] of implicit steps; of explicit ones until their limit is known
+MIN_STEPS = 25  # of a sample of explicit steps: frames of large meshes are a hundred steps and more apart
 SAMPLES, ROUNDS = 7, 15  # of explicit steps without contacts; of searches
 WARM, ENOUGH_SECONDS, MIN_TIMED, MAX_TIMED = 3, 3.0, 3, 20  # steps before, and steps that are timed one by one: time and number
 COUNTS = {"newton": "newton_iterations", "linear": "linear_iterations", "sweeps": "contact_iterations", "contacts": "n_contacts"}
@@ -147,7 +148,7 @@ def explicit(row: Row, size: int) -> None:
     with _open(row, beam, size, "velocity_verlet", None) as sim:
         warm_up(sim)
         a_few = advance(sim, 10).seconds / 10
-        steps = max(1, min(MAX_STEPS, round(SAMPLE_SECONDS / a_few)))
+        steps = max(MIN_STEPS, min(MAX_STEPS, round(SAMPLE_SECONDS / a_few)))
         sim.dt = min(sim.dt, LONGEST_FALL / steps)
         _element_seconds(sim, steps)  # compiles
         fractions = []
