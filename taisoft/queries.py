@@ -11,13 +11,10 @@ from taisoft.errors import SceneError, SimulationError
 from taisoft.fem.reference import gravity_mass, lumped_mass
 from taisoft.fem.terms import elasticity
 from taisoft.records import Energies, ErrorEstimate
-from taisoft.scene.body import Body
 from taisoft.scene.rigid import Pose, RigidBody, Twist
 from taisoft.stability import stable_dt as largest_stable_dt
 
 if TYPE_CHECKING:
-    from taisoft.collision.contacts import Contacts
-    from taisoft.collision.overlap import Overlap
     from taisoft.simulator import Simulator
 
 
@@ -160,79 +157,6 @@ def nodal_errors(self: "Simulator", body: str | None = None) -> np.ndarray:
     return self._estimator.nodal_errors()[nodes_of(self, body)]
 
 
-# --- contacts ---------------------------------------------------------------------------------------------------------
-
-
-def touches(self: "Simulator") -> bool:
-    """Whether contact forces are simulated."""
-    return self.plan.on["contact_forces"]
-
-
-def contact_limit(self: "Simulator", a: str, b: str) -> float:
-    """Penetration [m] of colliders a and b above which a step counts as deep. Requires contact forces (`touches`)."""
-    names = [c.name for c in self.scene.colliders]
-    return self._host().contact.measures.deep_from(names.index(a), names.index(b))
-
-
-def detect_contacts(self: "Simulator") -> "Contacts":
-    """Detect the contacts of the present state swept by dt v, with impulses 0, without taking a step.
-
-    `Scene.collision` and each body's `collision` choose the method; the plan lists which one each body and obstacle gets.
-    Memory and kernels are made at the first call. Raises MeshError if a distance field cannot be made, SimulationError
-    if positions or velocities are not finite or a buffer would grow beyond `max_capacity`.
-    """
-    return self._open().find_contacts(self.dt).contacts()
-
-
-def contacts(self: "Simulator") -> "Contacts":
-    """Return the contacts of the last step, with gaps at its start [m] and the impulses it applied [N s].
-
-    After a step that was cut into substeps, those of the last substep: then impulse / duration is the force of a contact, and
-    impulse / dt is not; `contact_force` is a mean over the whole step. Empty before the first step and if nothing can touch.
-    """
-    dynamics = self._open()
-    if dynamics.contact is not None:
-        return dynamics.contact.contacts()
-    from taisoft.collision.contacts import no_contacts
-
-    return no_contacts()
-
-
-def contact_force(self: "Simulator", name: str, other: str | None = None) -> np.ndarray:
-    """Return the contact force (3,) on a body or an obstacle [N]: from all others, or from `other`, a body or an obstacle.
-
-    It is the mean over the last step, also where that was cut into substeps. Raises SceneError for unknown names.
-    """
-    if other is None:
-        return _contact_force_and_moment(self, name)[:3]
-    contact, scene = self._open().contact, self.scene
-    for one in (name, other):
-        scene.surface_of(one)
-    if name == other:
-        raise SceneError(f"contact_force: {name!r} exerts no net force on itself: name another body or obstacle")
-    names = [c.name for c in scene.colliders]
-    return np.zeros(3) if contact is None else contact.pair_force(names.index(name), names.index(other))
-
-
-def contact_torque(self: "Simulator", name: str) -> np.ndarray:
-    """Return the torque (3,) of the contact forces on a body about its centre of mass, on an obstacle about its pivot, of the
-    last step [N m]."""
-    total, one = _contact_force_and_moment(self, name), self.scene.collider(name)
-    if isinstance(one, Body):
-        nodes, (x, _) = nodes_of(self, name), self._host().state.state()
-        centre = np.average(x[nodes], axis=0, weights=gravity_mass(one))
-    else:
-        centre = one.shape.pivot + one.pose(self.time)[0]
-    return total[3:] - np.cross(centre, total[:3])
-
-
-def _contact_force_and_moment(sim: "Simulator", name: str) -> np.ndarray:
-    """Force [N] on a collider and its moment about the origin [N m], (6,)."""
-    contact, scene = sim._open().contact, sim.scene
-    scene.surface_of(name)
-    return np.zeros(6) if contact is None else contact.force_and_moment([c.name for c in scene.colliders].index(name))
-
-
 # --- rigid bodies -----------------------------------------------------------------------------------------------------
 
 
@@ -259,36 +183,6 @@ def _rigid(sim: "Simulator", name: str) -> RigidBody:
     if not isinstance(body, RigidBody):
         raise SceneError(f"body {name!r} is not rigid: its motion is that of its nodes, see positions and velocities")
     return body
-
-
-def deepest_overlap(self: "Simulator") -> "Overlap | None":
-    """Return the deepest overlapping pair in the present state and its depth [m], or None if nothing overlaps.
-
-    Slow: unlike `StepReport.max_penetration` it checks all pairs, whether or not their surfaces meet. The depth is the
-    largest over the vertices, nodes, tet centres and triangle-tet cuts of either that lie inside the other. In a sphere or
-    a capsule it is the radius minus the body's distance from the centre or axis.
-    """
-    return next(iter(self.overlaps()), None)
-
-
-def overlaps(self: "Simulator") -> "list[Overlap]":
-    """Return all overlapping pairs in the present state, deepest relative to the smaller one's size first."""
-    from taisoft.collision.overlap import find_overlaps
-
-    return find_overlaps(self._open().find_contacts(0.0))
-
-
-def intersecting_triangles(self: "Simulator") -> list[tuple[str, int, str, int]]:
-    """Return the pairs of surface triangles that intersect in the present state: name and triangle of each, each pair once.
-
-    Triangles are rows of `body.nodes.surface`, or of an obstacle's surface. Pairs within one body are included only with
-    self_collision; triangles that share a vertex are left out.
-    """
-    detection = self._open().find_contacts(0.0)
-    first, colliders = detection.topology.first, self.scene.colliders
-    pairs = detection.intersections()
-    owner = np.searchsorted(first, pairs, side="right") - 1
-    return [(colliders[a].name, int(t - first[a]), colliders[b].name, int(u - first[b])) for (t, u), (a, b) in zip(pairs, owner)]
 
 
 # --- dragging and resources -------------------------------------------------------------------------------------------

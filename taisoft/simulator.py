@@ -4,7 +4,7 @@ import dataclasses
 import warnings
 from typing import TYPE_CHECKING
 
-from taisoft import changes, checkpoint, queries, running
+from taisoft import changes, checkpoint, contact_queries, queries, running
 from taisoft.attributes import Guarded, SimulationAttributeError, thawed
 from taisoft.backend import runtime
 from taisoft.display import drawn, simulator_text
@@ -133,7 +133,7 @@ class Simulator(Guarded):
         before, self._compile_reported = self._compile_reported, runtime.compile_clock()
         return self._compile_reported - before
 
-    # --- results: queries.py ------------------------------------------------------------------------------------------
+    # --- results: queries.py, contact_queries.py ---------------------------------------------------------------------
 
     is_open = property(queries.is_open)
     time = property(queries.time)
@@ -151,18 +151,18 @@ class Simulator(Guarded):
     elastic_forces = queries.elastic_forces
     force_differential = queries.force_differential
     stable_dt = property(queries.stable_dt)
-    touches = property(queries.touches)
-    contact_limit = queries.contact_limit
-    detect_contacts = queries.detect_contacts
-    contacts = queries.contacts
-    contact_force = queries.contact_force
-    contact_torque = queries.contact_torque
+    touches = property(contact_queries.touches)
+    contact_limit = contact_queries.contact_limit
+    detect_contacts = contact_queries.detect_contacts
+    contacts = contact_queries.contacts
+    contact_force = contact_queries.contact_force
+    contact_torque = contact_queries.contact_torque
     pose = queries.pose
     twist = queries.twist
     rigid_strain = queries.rigid_strain
-    deepest_overlap = queries.deepest_overlap
-    overlaps = queries.overlaps
-    intersecting_triangles = queries.intersecting_triangles
+    deepest_overlap = contact_queries.deepest_overlap
+    overlaps = contact_queries.overlaps
+    intersecting_triangles = contact_queries.intersecting_triangles
     error_so_far = property(queries.error_so_far)
     nodal_errors = queries.nodal_errors
     draggable = property(queries.draggable)

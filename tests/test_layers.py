@@ -50,7 +50,8 @@ ORDER = (
     ("view.connection_layer", "view.ground"),
     ("view.scene_view", "view.shadow"),
     (
-        *("simulator", "queries", "changes", "energy_check", "frames", "running", "static", "checkpoint", "estimation"),
+        *("simulator", "queries", "contact_queries", "changes", "energy_check", "frames", "running", "static"),
+        *("checkpoint", "estimation"),
         *("output.vtu", "view.offscreen"),  # for methods of Simulator
     ),
     ("output", "view"),
