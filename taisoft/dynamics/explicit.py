@@ -174,6 +174,51 @@ def save_held_velocities(m: ti.template(), s: ti.template()):
         s.held_velocity[k] = m.state.v[s.held[k]]
 
 
+@ti.func
+def begin_substep(m: ti.template(), s: ti.template(), done, n, dt64):
+    """Run the part of a sub-step before the element loop, serially."""
+    dt = ti.cast(dt64, m.real)
+    if ti.static(s.has_held):
+        if done == n - 1:
+            save_held_velocities(m, s)
+    if ti.static(s.has_prescribed):
+        save_prescribed_positions(m, s)
+    if ti.static(s.verlet):
+        for i in range(m.n_nodes):
+            verlet_drift(m, s, i, dt, verlet_half(m, s, i, dt))
+        if ti.static(m.has_rigid_tets):
+            for k in range(m.rigid_tets.n):
+                turn_drifted(m, s, k, dt)
+        if ti.static(s.has_prescribed):
+            prescribe(m, s, done, dt64)
+    if ti.static(s.has_varied_loads):
+        set_loads(m, s, done)
+
+
+@ti.func
+def end_substep(m: ti.template(), s: ti.template(), done, n, dt64):
+    """Run the part of a sub-step after the element loop, serially. Return the sum of the velocities."""
+    dt = ti.cast(dt64, m.real)
+    total = ti.Vector([0.0, 0.0, 0.0], m.real)
+    for i in range(m.n_nodes):
+        if ti.static(s.verlet):
+            total += verlet_kick(m, s, i, dt)
+        else:
+            total += euler_node(m, i, dt)
+    if ti.static(m.has_rigid_tets):
+        for k in range(m.rigid_tets.n):
+            if ti.static(s.verlet):
+                project_velocities(m, k)
+            else:
+                turn_drifted(m, s, k, dt)
+    if ti.static(s.has_prescribed):
+        prescribe(m, s, done, dt64)
+    if ti.static(s.has_held):
+        if done == n - 1:
+            compute_reactions(m, s, dt)
+    return total
+
+
 @kernel
 def advance_serial(m: ti.template(), s: ti.template(), n: ti.i32, dt64: ti.f64, restart: ti.i32):
     """Take n sub-steps of dt on one thread. scalars: STEPS_DONE, LOWEST_J, MOST_INVERTED.
@@ -182,59 +227,33 @@ def advance_serial(m: ti.template(), s: ti.template(), n: ti.i32, dt64: ti.f64, 
     """
     ti.loop_config(serialize=True)
     for _ in range(1):
-        dt = ti.cast(dt64, m.real)
         done, running = 0, True
         lowest_by_lane = broadcast(ti.cast(HUGE, m.real), m.lanes)
         min_J, max_inverted = ti.cast(HUGE, m.real), 0
+        starting = False
         if ti.static(s.verlet):
-            if restart != 0:
-                elasticity.sum_elements_serially(m)
-                for i in range(m.n_nodes):
-                    s.acceleration[i] = acceleration(m, i)
-        while done < n and running:
-            if ti.static(s.has_held):
-                if done == n - 1:
-                    save_held_velocities(m, s)
-            if ti.static(s.has_prescribed):
-                save_prescribed_positions(m, s)
-            if ti.static(s.verlet):
-                for i in range(m.n_nodes):
-                    verlet_drift(m, s, i, dt, verlet_half(m, s, i, dt))
-                if ti.static(m.has_rigid_tets):
-                    for k in range(m.rigid_tets.n):
-                        turn_drifted(m, s, k, dt)
-                if ti.static(s.has_prescribed):
-                    prescribe(m, s, done, dt64)
-            if ti.static(s.has_varied_loads):
-                set_loads(m, s, done)
+            starting = restart != 0
+        while starting or (done < n and running):
+            if not starting:
+                begin_substep(m, s, done, n, dt64)
             lowest_now, inverted = elasticity.sum_elements_serially(m)
-            lowest_by_lane = ti.min(lowest_by_lane, lowest_now)
-            total = ti.Vector([0.0, 0.0, 0.0], m.real)
-            for i in range(m.n_nodes):
+            if starting:  # forces alone, in the loop of the sub-steps: another copy of them takes long to compile
                 if ti.static(s.verlet):
-                    total += verlet_kick(m, s, i, dt)
-                else:
-                    total += euler_node(m, i, dt)
-            if ti.static(m.has_rigid_tets):
-                for k in range(m.rigid_tets.n):
-                    if ti.static(s.verlet):
-                        project_velocities(m, k)
-                    else:
-                        turn_drifted(m, s, k, dt)
-            if ti.static(s.has_prescribed):
-                prescribe(m, s, done, dt64)
-            if ti.static(s.has_held):
-                if done == n - 1:
-                    compute_reactions(m, s, dt)
-            count = 0
-            for q in ti.static(range(m.lanes)):
-                count += inverted[q]
-            max_inverted = ti.max(max_inverted, count)
-            min_J = lowest_by_lane[0]
-            for q in ti.static(range(1, m.lanes)):
-                min_J = ti.min(min_J, lowest_by_lane[q])
-            running = min_J > -EXPLODED and not nonfinite(ti.cast(total[0] + total[1] + total[2], ti.f64))
-            done += 1
+                    for i in range(m.n_nodes):
+                        s.acceleration[i] = acceleration(m, i)
+                starting = False
+            else:
+                lowest_by_lane = ti.min(lowest_by_lane, lowest_now)
+                total = end_substep(m, s, done, n, dt64)
+                count = 0
+                for q in ti.static(range(m.lanes)):
+                    count += inverted[q]
+                max_inverted = ti.max(max_inverted, count)
+                min_J = lowest_by_lane[0]
+                for q in ti.static(range(1, m.lanes)):
+                    min_J = ti.min(min_J, lowest_by_lane[q])
+                running = min_J > -EXPLODED and not nonfinite(ti.cast(total[0] + total[1] + total[2], ti.f64))
+                done += 1
         if ti.static(m.has_dependents):
             for k in range(m.dependents.n):
                 place(m, k)
@@ -258,14 +277,15 @@ def set_numbers(out: ti.template(), numbers: ti.types.ndarray()):
 
 
 @kernel
-def elements_parallel(m: ti.template()):
-    """Run the element loop of a sub-step in parallel. scalars: LOWEST_J, INVERTED_NOW, FAILED."""
+def run_elements(m: ti.template()):
+    """Run the element loop of a sub-step. scalars: LOWEST_J, INVERTED_NOW, FAILED."""
     elasticity.sum_elements_with_damping(m)
 
 
 @kernel
-def restart_parallel(m: ti.template(), s: ti.template()):
-    """Compute Verlet's acceleration from the elements' forces."""
+def find_acceleration(m: ti.template(), s: ti.template()):
+    """Compute Verlet's acceleration of the present state, after `run_elements`."""
+    ti.loop_config(serialize=m.serial)
     for i in range(m.n_nodes):
         s.acceleration[i] = acceleration(m, i)
 

@@ -12,7 +12,6 @@ from taisoft.contact.problem import impulse_on, to_frame
 from taisoft.contact.prox import dvec
 from taisoft.contact.restitution import explicit_opening
 from taisoft.dynamics.explicit import (
-    acceleration,
     compute_reactions,
     euler_velocity,
     nonfinite,
@@ -142,8 +141,7 @@ def move(m: ti.template(), s: ti.template(), p: ti.template(), dt64: ti.f64, has
 
 @kernel
 def finish_verlet(m: ti.template(), s: ti.template(), p: ti.template(), dt64: ti.f64, has_contacts: ti.i32):
-    """Compute forces at the new positions and apply the second half kick; scalars as in `predict` and `move`."""
-    elasticity.sum_elements_with_damping(m)
+    """Apply the second half kick by the forces at the new positions, after `run_elements`; scalars as in `predict` and `move`."""
     ti.loop_config(serialize=m.serial)
     for i in range(m.n_nodes):
         v = verlet_kick(m, s, i, ti.cast(dt64, m.real))
@@ -158,12 +156,3 @@ def finish_verlet(m: ti.template(), s: ti.template(), p: ti.template(), dt64: ti
     ti.loop_config(serialize=True)
     for _ in range(1):
         close_substep(m, s, p, dt64, has_contacts)
-
-
-@kernel
-def find_acceleration(m: ti.template(), s: ti.template()):
-    """Compute Verlet's acceleration of the present state."""
-    elasticity.sum_elements_with_damping(m)
-    ti.loop_config(serialize=m.serial)
-    for i in range(m.n_nodes):
-        s.acceleration[i] = acceleration(m, i)

@@ -12,7 +12,7 @@ from taisoft.contact.problem import find_factors
 from taisoft.contact.solve import SolveResult, solve
 from taisoft.dynamics import explicit
 from taisoft.dynamics.contact import TOLERANCE, ContactStep
-from taisoft.dynamics.explicit_contact import find_acceleration, finish_verlet, keep_state, move, predict, set_free_velocities
+from taisoft.dynamics.explicit_contact import finish_verlet, keep_state, move, predict, set_free_velocities
 from taisoft.dynamics.explicit_stepper import ExplicitStepper
 from taisoft.dynamics.results import StepResult
 from taisoft.dynamics.rigid_contacts import RigidContacts
@@ -159,7 +159,8 @@ class ContactExplicitStepper(ExplicitStepper):
         m, s, contact = self.simulation.model, self.work, self.contact
         self.simulation.set_load_time(time)
         if s.verlet and self.acceleration_stale:
-            find_acceleration(m, s)
+            explicit.run_elements(m)
+            explicit.find_acceleration(m, s)
         self.acceleration_stale = False
         n = contact.begin(time, dt)
         predict(m, s, dt)
@@ -177,6 +178,7 @@ class ContactExplicitStepper(ExplicitStepper):
         move(m, s, contact.problem, dt, int(n > 0))
         if s.verlet:
             self.simulation.set_load_time(time + dt)
+            explicit.run_elements(m)
             finish_verlet(m, s, contact.problem, dt, int(n > 0))
         if m.state.scalars[FAILED] != 0.0:
             raise SimulationError(f"step {step}: {self._describe_fault()}")

@@ -251,8 +251,8 @@ class ExplicitStepper:
     def _launch_parallel(self, n: int, dt: float) -> None:
         m, s = self.simulation.model, self.work
         if s.verlet and self.acceleration_stale:
-            explicit.elements_parallel(m)
-            explicit.restart_parallel(m, s)
+            explicit.run_elements(m)
+            explicit.find_acceleration(m, s)
         explicit.begin_parallel(m)
         special = bool(s.n_prescribed or s.has_varied_loads or m.has_rigid_tets)
 
@@ -263,7 +263,7 @@ class ExplicitStepper:
         for row in range(n):
             if begins_alone(row):
                 explicit.drift_parallel(m, s, row, dt)
-            explicit.elements_parallel(m)
+            explicit.run_elements(m)
             explicit.nodes_parallel(m, s, row, dt, int(s.verlet and row < n - 1 and not begins_alone(row + 1)))
         if s.n_held:
             explicit.react_parallel(m, s, dt)
