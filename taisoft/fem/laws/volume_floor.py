@@ -1,12 +1,11 @@
 """A law with a volume floor: it stiffens where a tet is squeezed below a fraction delta of its rest volume.
 
-psi = psi_law + kappa/3 d^3,   d = max(0, delta - J),   kappa = (lambda + 2 mu) / delta^2.
-The term is nothing above J = delta, twice continuously differentiable there, and smooth and growing through J = 0. The laws are
-finite at J = 0, so large enough pressures turn their tets inside out. At J = 0 the term adds the volumetric stress lambda + 2 mu,
-the stiffness of a bar that cannot widen, which is about as much as the laws resist there; at J = -delta four times as much.
-The form is taisoft's own: a penalty, not a barrier, so inverted tets are valid and recover, and large enough pressures invert
-them still. Weak: a flat tet whose sides are as long as at rest is sqrt(1 + 2/delta) times as fast as at rest, which explicit
-steps must resolve, see `stability`.
+psi = psi_law + kappa/3 (d^3 - e^3),   d = max(0, delta - J),   e = max(0, -J),   kappa = (lambda + 2 mu) / delta^2,
+twice continuously differentiable in J: nothing from J = delta on, a volumetric stress of lambda + 2 mu at J = 0, and the constant
+stiffness 2 (lambda + 2 mu) / delta below, which e bounds. All laws are finite at J = 0, so large enough pressures turn their tets
+inside out. lambda + 2 mu is the stiffness of a bar that cannot widen, about as much as the laws resist a flat tet.
+The form is taisoft's own: a penalty, not a barrier. Inverted tets are valid and recover, and larger pressures invert tets still.
+Weak: a flat tet whose sides have their lengths at rest vibrates sqrt(1 + 2/delta) times as fast as at rest, see `stability`.
 """
 
 from dataclasses import dataclass
@@ -33,16 +32,16 @@ def of_law(p):
 
 @arithmetic
 def energy(J, p):
-    """kappa/3 d^3 [Pa]."""
-    d = ti.max(p[4] - J, 0.0)
-    return p[5] * d * d * d / 3.0
+    """kappa/3 (d^3 - e^3) [Pa]."""
+    d, e = ti.max(p[4] - J, 0.0), ti.max(-J, 0.0)
+    return p[5] * (d * d * d - e * e * e) / 3.0
 
 
 @arithmetic
 def derivatives(J, p):
     """First and second derivative of `energy` by J [Pa]."""
-    d = ti.max(p[4] - J, 0.0)
-    return -p[5] * d * d, 2.0 * p[5] * d
+    d, e = ti.max(p[4] - J, 0.0), ti.max(-J, 0.0)
+    return -p[5] * (d * d - e * e), 2.0 * p[5] * (d - e)
 
 
 @arithmetic
@@ -111,7 +110,7 @@ class VolumeFloor:
 
     @property
     def POINT_SECONDS(self) -> float:
-        """Of the law; the term adds a few nanoseconds."""
+        """Of the law: the term adds little."""
         return self.law.POINT_SECONDS
 
     @ti.func
