@@ -56,7 +56,8 @@ def add_stress(P, F, p):
 def prepared(F, p):
     """What `prepare` adds at the end."""
     w, k = derivatives(determinant(F), p)
-    return [*cofactor(F), w, k]
+    G = cofactor(F)
+    return G + [w, k]
 
 
 @arithmetic
