@@ -1,7 +1,7 @@
 """Linear vibration about the rest shape: Hooke stiffness, highest frequency, stable steps, eigenmodes. NumPy and SciPy.
 
 All three laws linearise to Hooke's law at F = I, so they share one stiffness: sigma = 2 mu eps + lambda tr(eps) I. With mean
-dilatation tr(eps) is averaged over patches.
+dilatation tr(eps) is averaged over patches. Explicit steps also resolve what a volume floor adds to flat tets.
 """
 
 from typing import NamedTuple
@@ -122,6 +122,15 @@ def highest_frequency(body: Body) -> float:
     return LANCZOS_MARGIN * float(np.sqrt(top[0]))
 
 
+def _explicit_frequency(body: Body) -> float:
+    """omega [rad/s] that explicit steps of a body must resolve: its highest, times sqrt(1 + 2/delta) with a volume floor delta.
+
+    The floor adds 2/delta times lambda + 2 mu to a flat tet whose sides have their lengths at rest, see `laws.volume_floor`.
+    """
+    floors = [material.volume_floor for material in body.composition.materials.values() if material.volume_floor > 0.0]
+    return highest_frequency(body) * (float(np.sqrt(1.0 + 2.0 / min(floors))) if floors else 1.0)
+
+
 def scale_warnings(scene: Scene) -> list[str]:
     """One warning for each body whose own weight would crush it, such as a mesh in millimetres read as metres."""
     warnings = []
@@ -135,7 +144,7 @@ def scale_warnings(scene: Scene) -> list[str]:
             warnings.append(
                 f"body '{body.name}': {size:.4g} m long and {mass:.3g} kg, its own weight strains it by about {strain:.2g}; "
                 f"a wave crosses it in {crossing:.2g} s, explicit steps must stay below "
-                f"{2.0 / highest_frequency(body):.2g} s: is the mesh in metres and young in pascals?"
+                f"{2.0 / _explicit_frequency(body):.2g} s: is the mesh in metres and young in pascals?"
             )
     return warnings
 
@@ -159,9 +168,9 @@ def _verlet_matrix(z: float, alpha: float, beta: float) -> np.ndarray:
 def stable_dt(scene: Scene, verlet: bool) -> float:
     """Largest stable step [s] of an explicit integrator about the rest shape; infinite if nothing can vibrate.
 
-    It is 2/omega_max without damping, else the dt at which an eigenvalue of the step matrix leaves the unit disk. Rigid bodies
-    have no omega of their own. Springs add their own largest omega^2 and damping rate to those of the bodies that they connect,
-    and nodes attached exactly multiply omega by `DependentTable.growth`, which are upper bounds.
+    It is 2/omega without damping, omega from `_explicit_frequency`, else the dt at which an eigenvalue of the step matrix leaves
+    the unit disk. Rigid bodies have no omega of their own. Springs add their own largest omega^2 and damping rate to those of
+    the bodies that they connect, and nodes attached exactly multiply omega by `DependentTable.growth`, which are upper bounds.
     """
     limit = np.inf
     connected = {owner for one in scene.connections for owner in one.owners}
@@ -174,7 +183,7 @@ def stable_dt(scene: Scene, verlet: bool) -> float:
         if isinstance(body, RigidBody):  # explicit steps move it as one
             omega = SMALL * (np.sqrt(square) + rate) if body.name in connected else 0.0
         else:
-            omega = highest_frequency(body)
+            omega = _explicit_frequency(body)
         if omega > 0.0:
             if body.name in connected:
                 omega, own_square, own_rate = growth * omega, square, rate

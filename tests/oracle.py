@@ -108,7 +108,7 @@ class Oracle:
         total = 0.0
         for part in self.parts:
             m = part.material
-            total += part.weights @ psi(m.law, self.gradients(x, part), m.young, m.poisson)
+            total += part.weights @ psi(m.law, self.gradients(x, part), m.young, m.poisson, m.volume_floor)
         return total
 
     def force(self, x):
@@ -116,7 +116,7 @@ class Oracle:
         f = np.zeros((self.n, 3))
         for part in self.parts:
             m = part.material
-            P = pk1(m.law, self.gradients(x, part), m.young, m.poisson)
+            P = pk1(m.law, self.gradients(x, part), m.young, m.poisson, m.volume_floor)
             np.subtract.at(f, part.nodes, np.einsum("e,eij,eaj->eai", part.weights, P, part.gradients))
         return f
 
@@ -125,7 +125,7 @@ class Oracle:
         K = np.zeros((3 * self.n, 3 * self.n))
         for part in self.parts:
             m, g = part.material, part.gradients
-            H = hessian(m.law, self.gradients(x, part), m.young, m.poisson, projected).reshape(-1, 3, 3, 3, 3)
+            H = hessian(m.law, self.gradients(x, part), m.young, m.poisson, projected, m.volume_floor).reshape(-1, 3, 3, 3, 3)
             Hg = np.einsum("e,eijkl,ebl->eijbk", part.weights, H, g)
             blocks = np.einsum("eaj,eijbk->eaibk", g, Hg).reshape(len(g), 3 * g.shape[1], -1)
             blocks = blocks.reshape(-1, part.points, *blocks.shape[1:]).sum(axis=1)

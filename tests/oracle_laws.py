@@ -45,9 +45,29 @@ def rotation(F):
     return U @ transposed(V)
 
 
-def psi(law: str, F, young: float, poisson: float):
-    """Energy density (k,) [Pa], 0 at rest, of F (k,3,3)."""
+def floor_energy(F, young: float, poisson: float, floor: float):
+    """Energy density (k,) [Pa] that a volume floor adds: the integral of its stress from J = floor down, in two pieces."""
     mu, lam = lame(young, poisson)
+    J, M = np.linalg.det(F), lam + 2 * mu
+    x = J / floor
+    inside, below = floor / 3 * (1 - x) ** 3, floor * (1 / 3 - x + x**2)
+    return M * np.where(x >= 1, 0.0, np.where(x > 0, inside, below))
+
+
+def floor_stress(F, young: float, poisson: float, floor: float):
+    """The stress (k,3,3) [Pa] that a volume floor adds; F may be complex."""
+    mu, lam = lame(young, poisson)
+    G = cofactor(F)
+    x = np.sum(F[..., 0] * G[..., 0], axis=-1)[..., None, None] / floor
+    slope = np.where(x.real >= 1, 0.0, np.where(x.real > 0, -((1 - x) ** 2), 2 * x - 1))
+    return (lam + 2 * mu) * slope * G
+
+
+def psi(law: str, F, young: float, poisson: float, floor: float = 0.0):
+    """Energy density (k,) [Pa], 0 at rest, of F (k,3,3). floor: the volume floor; 0 for none."""
+    mu, lam = lame(young, poisson)
+    if floor:
+        return psi(law, F, young, poisson) + floor_energy(F, young, poisson, floor)
     if law == "st_venant_kirchhoff":
         E = (transposed(F) @ F - np.eye(3)) / 2
         return mu * np.sum(E * E, axis=(-2, -1)) + lam / 2 * trace(E) ** 2
@@ -67,9 +87,11 @@ def _neo_hookean(mu: float, lam: float) -> tuple[float, float, float]:
     return m, l, 1 + m / l - m / (4 * l)
 
 
-def pk1(law: str, F, young: float, poisson: float):
+def pk1(law: str, F, young: float, poisson: float, floor: float = 0.0):
     """First Piola-Kirchhoff stress (k,3,3) [Pa]; F may be complex but for the corotational law."""
     mu, lam = lame(young, poisson)
+    if floor:
+        return pk1(law, F, young, poisson) + floor_stress(F, young, poisson, floor)
     if law == "st_venant_kirchhoff":
         E = (transposed(F) @ F - np.eye(3)) / 2
         return F @ (2 * mu * E + lam * trace(E)[..., None, None] * np.eye(3))
@@ -83,10 +105,12 @@ def pk1(law: str, F, young: float, poisson: float):
     return m * (1 - 1 / (Ic + 1)) * F + l * (J - alpha) * G
 
 
-def dpk1(law: str, F, D, young: float, poisson: float):
+def dpk1(law: str, F, D, young: float, poisson: float, floor: float = 0.0):
     """Change of the stress along D (k,3,3) [Pa]."""
+    h = 1e-30  # a complex step has no cancellation
+    if floor:
+        return dpk1(law, F, D, young, poisson) + floor_stress(F + 1j * h * D, young, poisson, floor).imag / h
     if law != "corotational":
-        h = 1e-30  # a complex step has no cancellation
         return pk1(law, F + 1j * h * D, young, poisson).imag / h
     mu, lam = lame(young, poisson)
     U, s, V = signed_svd(F)
@@ -98,9 +122,9 @@ def dpk1(law: str, F, D, young: float, poisson: float):
     return 2 * mu * D + (lam * t - 2 * mu) * (U @ W @ transposed(V)) + lam * trace(X)[..., None, None] * R
 
 
-def hessian(law: str, F, young: float, poisson: float, projected: bool = False):
+def hessian(law: str, F, young: float, poisson: float, projected: bool = False, floor: float = 0.0):
     """Second derivative (k,9,9) [Pa] of psi over F's entries row by row; projected: negative eigenvalues become 0."""
-    columns = [dpk1(law, F, np.broadcast_to(D, F.shape), young, poisson).reshape(-1, 9) for D in UNIT]
+    columns = [dpk1(law, F, np.broadcast_to(D, F.shape), young, poisson, floor).reshape(-1, 9) for D in UNIT]
     H = np.stack(columns, axis=-1)
     if not projected:
         return H

@@ -90,18 +90,20 @@ def mixed_scene(
     order: int | str = 1,
     degrees: tuple[int, int] = (2, 4),
     by_tet: bool = False,
+    volume_floor: float = 0.0,
 ) -> ts.Scene:
     """Four bodies whose order is not that of the laws, of 10, 5, 6 and 5 tets: none fills its last lanes.
 
     Each has another material, and is held and loaded in another way; the first and the third are damped. They do not touch.
     order: 1, 2, or "both": 2, 1, 2, 1. degrees: of the quadrature of the first and the third body, if they are quadratic.
-    by_tet: the first has two regions with different laws and numbers, the second and third have numbers by tet.
+    by_tet: the first has two regions with different laws and numbers, the second and third have numbers by tet. volume_floor: of
+    the first body, or its first region, and of the second.
     """
     orders = (2, 1, 2, 1) if order == "both" else (order,) * 4
     scene = ts.Scene(gravity=(0.3, -9.81, 0.7))
     scene.contact_forces = False
     damping = {"mass_damping": mass_damping, "stiffness_damping": stiffness_damping}
-    material, numbers = rubber(laws[0], **damping), [{}] * 2
+    material, numbers = rubber(laws[0], volume_floor=volume_floor, **damping), [{}] * 2
     mesh = cube(cells=(2, 1, 1))
     if by_tet:
         mesh = halved(mesh)
@@ -110,7 +112,7 @@ def mixed_scene(
     beam = scene.add_body(mesh, material, name="beam", position=(0.5, 0, 0), **element(orders[0], degrees[0]))
     beam.fix(lambda X: X[:, 0] < -0.49)
     beam.add_traction(lambda X: X[:, 0] > 0.49, (300.0, 2000.0, -500.0))
-    softer = rubber(laws[1], young=7e4, poisson=0.2)
+    softer = rubber(laws[1], young=7e4, poisson=0.2, volume_floor=volume_floor)
     block = scene.add_body(cube((3, 0, 0)), softer, name="block", velocity=(0.5, 0, -0.3), **element(orders[1]), **numbers[0])
     block.fix([0, 1], axes="x")
     block.fix([1, 2], axes="yz")

@@ -1,6 +1,7 @@
 """The elastic operator of four bodies, two linear and two quadratic, whose tets do not fill the last lanes.
 
-In f64 serial kernels, with two laws and the finer quadrature, also with laws and numbers that differ between the tets of a body;
+In f64 serial kernels, with two laws and the finer quadrature, also with laws and numbers that differ between the tets of a body,
+among them a volume floor;
 in f32 parallel kernels, with one law and the coarser quadrature.
 
 * energies, volume ratios, forces and their differential are the oracle's;
@@ -32,7 +33,7 @@ def rig(request):
     double = request.param == "f64" or by_tet
     laws, degree = ((SNH, SVK, SNH, SVK), 4) if double else ((SNH,) * 4, 2)
     damping = {"mass_damping": 0.4, "stiffness_damping": 3e-3}
-    scene = mixed_scene(laws, **damping, order="both", degrees=(degree, degree), by_tet=by_tet)
+    scene = mixed_scene(laws, **damping, order="both", degrees=(degree, degree), by_tet=by_tet, volume_floor=0.5 * by_tet)
     with built(scene, "f64" if double else "f32") as made:
         made.model = made.model if double else made.parallel
         made.force, made.dx, made.product = made.vectors("force"), made.vectors("dx"), made.vectors("product")

@@ -28,6 +28,7 @@ def test_reasons():
         "law:corotational": (True, "used by tower"),
         "law:stable_neo_hookean": (True, "used by beam"),
         "elasticity_by_tet": (False, "every body has one young and one poisson"),
+        "volume_floor": (False, "every volume_floor is 0"),
         "mean_dilatation": (False, "every body has local dilatation"),
         "quadratic_tets": (False, "every body is of order 1"),
         "consistent_weight": (False, "on linear tets it is the lumped mass"),
@@ -68,7 +69,7 @@ def test_every_feature_can_be_on_and_off():
     full.body("beam").add_force([4], lambda t: (t, 0, 0))
     full.body("beam").add_pressure([4], 1.0)
     full.body("beam").collision, full.contact_forces = "distance_field", True
-    full.add_body(cube((9, 0, 0)), rubber(), dilatation="mean")
+    full.add_body(cube((9, 0, 0)), rubber(volume_floor=0.1), dilatation="mean")
     full.add_rigid_body(cube((19, 0, 0)))
     on = make_plan(full, explicit=False, multistep=True, self_collision=True).on
     laws = {name for name in on if name.startswith("law:")}

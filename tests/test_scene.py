@@ -76,6 +76,7 @@ def test_near_incompressibility_is_warned_of_for_linear_tets():
         ("mass_damping", [-1e-9, np.nan, "0"]),
         ("stiffness_damping", [-1e-9, np.inf]),
         ("poisson", [np.nan, "0.3", None]),
+        ("volume_floor", [-0.1, 1e-4, 1.0, np.nan, "0.1", None]),
     ],
 )
 def test_invalid_material_numbers_are_refused(field, values):

@@ -34,7 +34,7 @@ def everything() -> ts.Scene:
     scene = ts.Scene(gravity=(0.1, -9.81, -0.0))
     scene.collision = ts.CollisionSettings("bvh", margin=1e-3, k_dop=14, field_cells=40, max_capacity=1000)
     scene.allow_initial_overlap, scene.contact_forces = True, False
-    rubber, foam = ts.Material(young=1 / 3), ts.Material("corotational", 1e22, -0.3, 1e-7, 0.1, 0.2, 0.3, 0.4)
+    rubber, foam = ts.Material(young=1 / 3), ts.Material("corotational", 1e22, -0.3, 1e-7, 0.1, 0.2, 0.3, 0.4, 0.05)
     frames = ts.KeyFrames((0, 1 / 3), [(0, 0, 0), (0.1, 0, 0)], [(0, 0, 0), (0, 1e-3, 7)], (1, 2, 3), smooth=True, release=True)
     a = scene.add_body(TURNED, rubber, name="a", position=(0.1, 0.2, 1e-300), order=2, quadrature_degree=4, collision="proximity")
     a.move([3, 1, 2], frames, axes="zy")
@@ -131,6 +131,7 @@ def test_random_numbers_and_names_are_read_back(tmp_path, values):
         restitution=draw(floats(0, 1)),
         mass_damping=loss,
         stiffness_damping=draw(floats(0, 1e38)),
+        volume_floor=draw(st.just(0.0) | floats(1e-3, 1, exclude_max=True)),
     )
     name, other = draw(st.lists(names, min_size=2, max_size=2, unique=True))
     body = scene.add_body(TURNED, material, name=name, position=draw(vectors), velocity=draw(vectors))

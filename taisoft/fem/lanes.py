@@ -7,6 +7,7 @@ For order 1, c_a are the unit vectors, one point suffices, and F = Ds Dm^-1.
 
 import taichi as ti
 
+from taisoft.fem.laws import n_constants
 from taisoft.fem.math3 import ddot, dot, matmul_tn
 
 
@@ -37,15 +38,16 @@ def volumes(m: ti.template(), b, real: ti.template()):
 
 
 @ti.func
-def law_constants(m: ti.template(), b, real: ti.template()):
-    """The four law constants of the tets of block b [Pa and pure numbers]: their own, or those of their body in every lane."""
+def law_constants(m: ti.template(), g: ti.template(), b, real: ti.template()):
+    """Law constants of the tets of block b of group g [Pa and pure numbers]: their own, or those of their body in every lane."""
     if ti.static(m.elasticity_by_tet):
         return [
-            ti.Vector([ti.cast(m.law_constants[b, k, q], real) for q in ti.static(range(m.lanes))]) for k in ti.static(range(4))
+            ti.Vector([ti.cast(m.law_constants[b, k, q], real) for q in ti.static(range(m.lanes))])
+            for k in ti.static(range(n_constants(g.law)))
         ]
     else:
         body = m.block_body[b]
-        return [broadcast(ti.cast(m.law_constants[body, k], real), m.lanes) for k in ti.static(range(4))]
+        return [broadcast(ti.cast(m.law_constants[body, k], real), m.lanes) for k in ti.static(range(n_constants(g.law)))]
 
 
 @ti.func

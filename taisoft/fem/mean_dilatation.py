@@ -99,8 +99,8 @@ def patch_energy(m: ti.template(), b):
 
 @ti.func
 def stress_constants(m: ti.template(), g: ti.template(), b, real: ti.template()):
-    """`law_constants`, with the pressure of mean dilatation as the fifth if group g has it."""
-    p = law_constants(m, b, real)
+    """`law_constants`, with the pressure of mean dilatation at the end if group g has it."""
+    p = law_constants(m, g, b, real)
     if ti.static(g.mean_dilatation):
         return p + [patch_values(m, b, m.mean.dilatation, real)]
     else:

@@ -18,7 +18,7 @@ from taisoft.backend.runtime import Runtime
 from taisoft.fem import reference, springs
 from taisoft.fem.chunks import FOLDED, SPREAD, SweepOrder
 from taisoft.fem.dependents import DependentTable, build_dependents, dependent_table
-from taisoft.fem.laws import LAWS
+from taisoft.fem.laws import LAWS, law_of, volume_floor
 from taisoft.fem.loads import SceneLoads
 from taisoft.fem.mean_dilatation import MeanDilatation, build_mean_dilatation
 from taisoft.fem.node_graph import NodeGraph
@@ -45,7 +45,7 @@ ILL_CONDITIONED = 100.0
 class Group:
     """Blocks of one element type and law, and the offsets of their data in the flat arrays."""
 
-    law: Any  # module of taisoft.fem.laws
+    law: Any  # module of taisoft.fem.laws, or VolumeFloor of one
     order: int
     n_nodes: int  # of an element
     n_points: int
@@ -91,7 +91,7 @@ class Model:
     Dm_inv: Any  # (n_blocks, 9, lanes) [1/m]
     volume: Any  # (n_blocks, lanes) [m^3]
     block_body: Any  # (n_blocks) i32
-    law_constants: Any  # (n_bodies, 4), or (n_blocks, 4, lanes) if elasticity_by_tet
+    law_constants: Any  # (n_bodies, 4), or (n_blocks, 4, lanes) if elasticity_by_tet; 6 numbers if some body has a volume floor
     gather_start: Any  # (n_nodes + 1) i32: first entry of each node in gather_entry
     gather_entry: Any  # i32: base index into State.element_force of each node of each tet
     mass: Any  # (n_nodes) lumped mass [kg]
@@ -186,13 +186,14 @@ def _layout(scene: Scene, lanes: int) -> tuple[Layout, tuple[Group, ...]]:
     parts: dict[tuple, list[np.ndarray]] = {}  # tets of one body and one law, by their kind
     for k, b in enumerate(bodies):
         for law in b.composition.laws:
-            kind = b.order, b.quadrature_degree, laws.index(law), b.dilatation == "mean", isinstance(b, RigidBody)
+            floor, mean, rigid = b.composition.has_volume_floor, b.dilatation == "mean", isinstance(b, RigidBody)
+            kind = b.order, b.quadrature_degree, laws.index(law), floor, mean, rigid
             parts.setdefault(kind, []).append(tet_start[k] + b.composition.tets_of_law(law))
     n_points = {degree: len(reference.quadrature(degree).weights) for _, degree, *_ in parts}
     tet_of_lane = []
     groups, block, nodes_at, force_at, matrix_at = [], 0, 0, 0, 0
     for kind in sorted(parts):
-        order, degree, law, *switches = kind
+        order, degree, law, floor, *switches = kind
         first = block
         for tets in parts[kind]:
             padded = -(-len(tets) // lanes) * lanes
@@ -201,7 +202,7 @@ def _layout(scene: Scene, lanes: int) -> tuple[Layout, tuple[Group, ...]]:
         n_nodes, count = len(reference.unit_mass(order)), (block - first) * lanes
         points_at = sum(n for other, n in n_points.items() if 1 < other < degree)  # order 1 has degree 1 and no table
         offsets = first, block, nodes_at, force_at, matrix_at, points_at
-        groups.append(Group(LAWS[laws[law]], order, n_nodes, n_points[degree], *switches, *offsets))
+        groups.append(Group(law_of(laws[law], floor), order, n_nodes, n_points[degree], *switches, *offsets))
         nodes_at += count * n_nodes
         force_at += count * n_nodes * 3
         matrix_at += (block - first) * MATRIX_BLOCKS[order] * 9
@@ -273,12 +274,24 @@ def _local_lame(body: Body) -> tuple:
     return (mu, 0.0 * lam) if body.dilatation == "mean" else (mu, lam)
 
 
+def _floor_constants(body: Body) -> tuple:
+    """Constants of the volume floor, each a number or one for each tet; under mean dilatation, too, with lambda."""
+    return volume_floor.constants(body.composition.number("volume_floor"), *body.composition.lame)
+
+
 def law_table(scene: Scene, layout: Layout, by_tet: bool) -> np.ndarray:
-    """Law constants (n_bodies, 4), or (n_blocks, 4, lanes) if they may differ between the tets of a body."""
+    """Law constants (n_bodies, 4), or (n_blocks, 4, lanes) if they may differ between the tets of a body.
+
+    If some body has a volume floor, its two constants follow: 6 instead of 4.
+    """
+    has_floor = any(b.composition.has_volume_floor for b in scene.bodies)
     if not by_tet:
-        return np.array([LAWS[b.composition.first.law].constants(*_local_lame(b)) for b in scene.bodies])
-    table = np.zeros((len(layout.lane_of_tet), 4))
+        table = np.array([LAWS[b.composition.first.law].constants(*_local_lame(b)) for b in scene.bodies])
+        return np.column_stack([table, [_floor_constants(b) for b in scene.bodies]]) if has_floor else table
+    table = np.zeros((len(layout.lane_of_tet), 6 if has_floor else 4))
     for k, body in enumerate(scene.bodies):
+        for c, values in enumerate(_floor_constants(body) if has_floor else ()):
+            table[layout.tets(k), 4 + c] = values
         mu, lam = (np.broadcast_to(x, body.mesh.n_tets) for x in _local_lame(body))
         for law in body.composition.laws:
             tets = body.composition.tets_of_law(law)

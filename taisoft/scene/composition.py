@@ -54,12 +54,17 @@ class Composition:
         return np.searchsorted(list(self.materials), self.mesh.regions)
 
     def number(self, name: str) -> float | np.ndarray:
-        """Return one of BY_TET: a float if one holds for all tets by design, else (m,)."""
+        """Return one of BY_TET, or `volume_floor`: a float if one holds for all tets by design, else (m,)."""
         if name in self.by_tet or not self.has_regions:
             return self.by_tet.get(name, getattr(self.first, name))
         values = np.array([getattr(material, name) for material in self.materials.values()])[self._row]
         values.flags.writeable = False
         return values
+
+    @property
+    def has_volume_floor(self) -> bool:
+        """Whether some tets stiffen against inversion."""
+        return any(material.volume_floor > 0.0 for material in self.materials.values())
 
     @property
     def lame(self) -> tuple[float | np.ndarray, float | np.ndarray]:

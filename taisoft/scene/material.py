@@ -8,6 +8,7 @@ from taisoft.attributes import guarded_record
 from taisoft.errors import SceneError
 from taisoft.scene import checks
 
+MIN_VOLUME_FLOOR = 1e-3  # smaller ones are the rounding of J = det F in f32
 LAWS = ("st_venant_kirchhoff", "corotational", "stable_neo_hookean")
 
 
@@ -24,6 +25,7 @@ class Material:
     restitution: float = 0.0  #: ratio of the normal speeds after and before an impact, 0 to 1
     mass_damping: float = 0.0  #: [1/s], >= 0
     stiffness_damping: float = 0.0  #: [s], >= 0
+    volume_floor: float = 0.0  #: J = det F below which the law stiffens against inversion, 0.001 to 1; 0 for none
 
     def __post_init__(self):
         checks.choice(self.law, "material: law", LAWS)
@@ -35,11 +37,15 @@ class Material:
             "restitution": {"minimum": 0.0, "maximum": 1.0},
             "mass_damping": {"minimum": 0.0, "unit": "1/s"},
             "stiffness_damping": {"minimum": 0.0, "unit": "s"},
+            "volume_floor": {},
         }
         numbers = {k: checks.number(getattr(self, k), f"material: {k}", **limit) for k, limit in limits.items()}
         checks.store(self, **numbers)
         if not -1.0 < self.poisson < 0.5:
             raise SceneError(f"material: poisson must lie in the open interval (-1, 0.5), not {self.poisson:g}")
+        if self.volume_floor != 0.0 and not MIN_VOLUME_FLOOR <= self.volume_floor < 1.0:
+            rule = f"must be 0, for none, or at least {MIN_VOLUME_FLOOR:g} and below 1"
+            raise SceneError(f"material: volume_floor {rule}, not {self.volume_floor:g}")
 
     @property
     def mu(self) -> float:

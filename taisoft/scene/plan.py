@@ -74,6 +74,7 @@ def make_plan(scene: Scene, explicit: bool, multistep: bool, self_collision: boo
         "young or poisson may differ between the tets of",
         "every body has one young and one poisson",
     )
+    add_if_any("volume_floor", lambda b: b.composition.has_volume_floor, "material of", "every volume_floor is 0")
     add_if_any("mean_dilatation", lambda b: b.dilatation == "mean", "requested for", "every body has local dilatation")
     quadratic = [b.name for b in scene.bodies if b.order == 2]
     add_if_any("quadratic_tets", lambda b: b.order == 2, "bodies of order 2:", "every body is of order 1")

@@ -18,13 +18,26 @@ Source: Smith, de Goes, Kim, "Analytic Eigensystems for Isotropic Distortion Ene
 modes; the 3x3 block is clamped numerically.
 """
 
+from typing import Any
+
 import taichi as ti
 
 from taisoft.backend.tracing import arithmetic
 from taisoft.fem.laws import corotational, st_venant_kirchhoff, stable_neo_hookean
+from taisoft.fem.laws.volume_floor import VolumeFloor
 from taisoft.fem.math3 import clamp_symmetric, matmul, matmul_nt, matmul_tn, signed_svd
 
 LAWS = {law.NAME: law for law in (st_venant_kirchhoff, corotational, stable_neo_hookean)}
+
+
+def law_of(name: str, volume_floor: bool) -> Any:
+    """The law of a name, with a volume floor or without one."""
+    return VolumeFloor(LAWS[name]) if volume_floor else LAWS[name]
+
+
+def n_constants(law: Any) -> int:
+    """Number of the constants p of a law, without the pressure of mean dilatation."""
+    return 6 if isinstance(law, VolumeFloor) else 4
 
 
 @ti.func

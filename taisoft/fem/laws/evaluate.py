@@ -8,7 +8,8 @@ import taichi as ti
 
 from taisoft.backend.runtime import kernel, open_kind, open_runtime
 from taisoft.errors import SceneError
-from taisoft.fem.laws import LAWS, dpk1_projected, prepare_projected
+from taisoft.fem.laws import dpk1_projected, law_of, n_constants, prepare_projected
+from taisoft.fem.laws.volume_floor import constants as floor_constants
 from taisoft.scene.scene import Material
 
 ARRAY = ti.types.ndarray()
@@ -30,7 +31,7 @@ def _store(out: ti.template(), b, A, lanes: ti.template()):
 def _evaluate(law: ti.template(), lanes: ti.template(), F: ARRAY, p: ARRAY, psi: ARRAY, P: ARRAY):
     for b in range(F.shape[0]):
         G = _load(F, b, lanes)
-        c = [ti.Vector([p[k] for q in ti.static(range(lanes))]) for k in ti.static(range(4))]
+        c = [ti.Vector([p[k] for q in ti.static(range(lanes))]) for k in ti.static(range(n_constants(law)))]
         energy = law.psi(G, c)
         stress = law.pk1(G, c)
         _store(P, b, stress, lanes)
@@ -43,7 +44,7 @@ def _differential(law: ti.template(), projected: ti.template(), lanes: ti.templa
     for b in range(F.shape[0]):
         G = _load(F, b, lanes)
         H = _load(D, b, lanes)
-        c = [ti.Vector([p[k] for q in ti.static(range(lanes))]) for k in ti.static(range(4))]
+        c = [ti.Vector([p[k] for q in ti.static(range(lanes))]) for k in ti.static(range(n_constants(law)))]
         if ti.static(projected):
             S = prepare_projected(law, G, c)
             T = dpk1_projected(S, H)
@@ -54,16 +55,17 @@ def _differential(law: ti.template(), projected: ti.template(), lanes: ti.templa
             _store(P, b, T, lanes)
 
 
-def _checked(law: str, F: np.ndarray, young: float, poisson: float):
-    material = Material(law=law, young=young, poisson=poisson, density=1.0)
+def _checked(law: str, F: np.ndarray, young: float, poisson: float, floor: float):
+    material = Material(law=law, young=young, poisson=poisson, density=1.0, volume_floor=floor)
     F = np.asarray(F, dtype=np.float64)
     if F.ndim != 3 or F.shape[1:] != (3, 3) or len(F) == 0:
         raise SceneError(f"F has shape {F.shape}: it must be (k, 3, 3) with k at least 1")
     bad = np.flatnonzero(~np.isfinite(F).all(axis=(1, 2)))
     if len(bad):
         raise SceneError(f"F[{bad[0]}] is not finite")
-    law_module = LAWS[material.law]
-    return law_module, F, np.array(law_module.constants(material.mu, material.lam))
+    made = law_of(material.law, material.volume_floor > 0.0)
+    p = (law_of(law, False).constants(material.mu, material.lam), floor_constants(floor, material.mu, material.lam))
+    return made, F, np.concatenate(p)
 
 
 @contextmanager
@@ -90,12 +92,15 @@ def _from_lanes(data: np.ndarray, k: int) -> np.ndarray:
     return data.transpose(0, 2, 1).reshape(-1, 3, 3)[:k]
 
 
-def evaluate_law(law: str, F: np.ndarray, young: float, poisson: float) -> tuple[np.ndarray, np.ndarray]:
+def evaluate_law(
+    law: str, F: np.ndarray, young: float, poisson: float, volume_floor: float = 0.0
+) -> tuple[np.ndarray, np.ndarray]:
     """Energy density psi (k,) [Pa], 0 at F = I, and first Piola-Kirchhoff stress P (k,3,3) [Pa], in float64.
 
-    F: (k,3,3) deformation gradients; young [Pa]; poisson in (-1, 0.5). Raises SceneError on a bad law, number or shape.
+    F: (k,3,3) deformation gradients; law, young [Pa], poisson, volume_floor: of a `Material`. Raises SceneError on a bad law,
+    number or shape.
     """
-    law_module, F, p = _checked(law, F, young, poisson)
+    law_module, F, p = _checked(law, F, young, poisson, volume_floor)
     with _double_precision() as lanes:
         lane_F = _to_lanes(F, lanes)
         P, psi = np.empty_like(lane_F), np.empty((len(lane_F), lanes))
@@ -104,10 +109,10 @@ def evaluate_law(law: str, F: np.ndarray, young: float, poisson: float) -> tuple
 
 
 def evaluate_differential(
-    law: str, F: np.ndarray, dF: np.ndarray, young: float, poisson: float, projected: bool = False
+    law: str, F: np.ndarray, dF: np.ndarray, young: float, poisson: float, projected: bool = False, volume_floor: float = 0.0
 ) -> np.ndarray:
     """Stress differential dP (k,3,3) [Pa] along dF (k,3,3), in float64; projected: use the positive semi-definite part."""
-    law_module, F, p = _checked(law, F, young, poisson)
+    law_module, F, p = _checked(law, F, young, poisson, volume_floor)
     with _double_precision() as lanes:
         lane_F, D = _to_lanes(F, lanes), _to_lanes(np.array(np.broadcast_to(dF, F.shape), dtype=np.float64), lanes)
         P = np.empty_like(lane_F)

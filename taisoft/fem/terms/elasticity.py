@@ -208,7 +208,7 @@ def element_energy(m: ti.template(), g: ti.template(), b):
     """
     X = differences(m, g, m.state.x, b, ti.f64)
     M = rest_gradients(m, b, ti.f64)
-    p = law_constants(m, b, ti.f64)
+    p = law_constants(m, g, b, ti.f64)
     V = volumes(m, b, ti.f64)
     energy = broadcast(ti.cast(0.0, ti.f64), m.lanes)
     if ti.static(g.mean_dilatation):
