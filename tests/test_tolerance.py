@@ -182,7 +182,7 @@ def test_reruns_are_equal(build):
 def test_before_the_first_run_steps_are_likely_ones():
     with ts.Simulator(beam(), tolerance=0.01) as sim:
         assert sim.settings.integrator == "velocity_verlet" and sim.dt <= 0.9 * sim.stable_dt
-        assert sim.settings.newton_tolerance == 1e-4
+        assert sim.settings.newton_tolerance == 5e-4
         sim.step()
     with ts.Simulator(stiff(), tolerance=1e-3, newton_tolerance=1e-6) as sim:
         assert sim.settings.integrator == "bdf2" and sim.dt == 1 / 60
@@ -204,7 +204,7 @@ def test_frames_of_any_rate_lie_at_steps(build, fps):
 
 
 def test_bad_tolerances_are_refused():
-    with pytest.raises(SimulationError, match="newton_tolerance = 0.01: with tolerance = 0.01 it must be at most 0.0001"):
+    with pytest.raises(SimulationError, match="newton_tolerance = 0.01: with tolerance = 0.01 it must be at most 0.0005"):
         ts.Simulator(stiff(), tolerance=0.01, newton_tolerance=0.01)
     for tolerance, message in ((0.0, "tolerance must be"), (1.0, "tolerance must be"), (1e-5, "or precision='f64'")):
         with pytest.raises(SimulationError, match=message):
@@ -397,7 +397,7 @@ def test_one_explicit_pilot_is_the_run_of_smooth_motion(monkeypatch):
 
 def test_a_pilot_of_an_impact_must_be_far_below_the_tolerance(monkeypatch):
     assert 1.0 < steps_taken(bar_impact, 0.1, 0.12, monkeypatch, fps=1000) < 1.2
-    assert steps_taken(bar_impact, 0.01, 0.12, monkeypatch, fps=1000) > 1.5
+    assert steps_taken(bar_impact, 0.01, 0.12, monkeypatch, fps=1000) >= 1.5
 
 
 def test_the_hardest_part_is_that_of_the_impact():
