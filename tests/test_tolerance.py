@@ -497,6 +497,7 @@ def test_nearly_equal_steps_do_not_judge_chance():
     assert sudden.second_steps(16, 0.49) == (20, True) and sudden.second_steps(16, 0.51) == (32, False)
     assert sudden.second_steps(2, 0.99) == (3, True)
     assert smooth.second_steps(16, 1.2) == (20, True) and smooth.second_steps(16, 1.3) == (32, False)
+    assert sudden.second_steps(16, 3.0) == (48, False) and sudden.second_steps(16, 30.0) == (64, False)
 
 
 def test_an_implicit_pilot_ends_when_explicit_steps_are_cheaper(monkeypatch):
