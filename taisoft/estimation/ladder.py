@@ -195,8 +195,7 @@ class Ladder:
         largest = float(more / least - 1) / CHANCE if self.sudden else float(SMALLER)
         if ratio <= largest or not self.pilots:
             return more, True
-        lowest = 2.0 if self.nominal == 1 else LEAST_REACH
-        return Fraction(math.ceil(least * min(MOST, max(lowest, ratio)))), False
+        return Fraction(math.ceil(least * (2.0 if self.nominal == 1 else min(MOST, max(LEAST_REACH, ratio))))), False
 
     def meets(self, tolerance: float) -> bool:
         """Whether the last pilot is likely to meet a tolerance."""
