@@ -4,7 +4,6 @@ A run is a group and a name. Its record has the number of judged states and of t
 depth, the least distance of states that do not cross, and how the run ended.
 """
 
-import hashlib
 import sys
 import time
 import warnings
@@ -27,6 +26,7 @@ from .crossing_heaps import folded_strip, make_heap
 from .hard_cases import CASES
 from .hard_cases.case import REFUSED, Session
 from .hard_runs import find
+from .runner import files_digest
 
 CHILD = (sys.executable, "-m", "taisoft", "bench", "crossings", "--child")
 DEMOS, HARD, HEAPS, JITTERED = GROUPS = ("demos", "hard", "heaps", "jittered")
@@ -215,11 +215,9 @@ def answer(request: dict) -> dict:
 
 def sources() -> str:
     """A digest of the files that define the runs."""
-    total, here = hashlib.sha256(), Path(__file__).parent
+    here = Path(__file__).parent
     paths = [*here.glob("crossing*.py"), *here.glob("judge.py"), *here.glob("hard_cases/*.py"), *shipped_files("demos").values()]
-    for path in sorted(paths):
-        total.update(path.name.encode() + path.read_bytes())
-    return total.hexdigest()
+    return files_digest(paths)
 
 
 def carry_out_all(

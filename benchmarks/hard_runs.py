@@ -4,7 +4,6 @@ A variant is solved if it ended as required and met every limit. It is in one co
 an ok end that is not allowed or that misses a limit on the answer.
 """
 
-import hashlib
 import sys
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
@@ -19,6 +18,7 @@ from taisoft.study.workers import LocalPlace, carry_out
 
 from .hard_cases import CASES
 from .hard_cases.case import DEGRADED, END, FINER, OK, REFUSED, STOPPED, Case, Session, Variant, Verdict, judge
+from .runner import files_digest
 
 CHILD = (sys.executable, "-m", "taisoft", "bench", "hard", "--child")
 ANSWERED = (OK, DEGRADED)  # ends of complete runs
@@ -132,11 +132,8 @@ def answer(request: dict) -> dict:
 
 def sources() -> str:
     """A digest of the files that define the cases."""
-    total = hashlib.sha256()
     here = Path(__file__).parent
-    for path in sorted([*here.glob("hard_cases/*.py"), *here.glob("reference_cases/*.py")]):
-        total.update(path.name.encode() + path.read_bytes())
-    return total.hexdigest()
+    return files_digest([*here.glob("hard_cases/*.py"), *here.glob("reference_cases/*.py")])
 
 
 @dataclass

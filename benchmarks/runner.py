@@ -4,6 +4,7 @@ Times exclude compilation. Alternatives are timed in turn, so that a slow moment
 """
 
 import argparse
+import hashlib
 import json
 import os
 import subprocess
@@ -75,6 +76,14 @@ def parse_options(parser: argparse.ArgumentParser, argv: list[str] | None, drawn
 def progress(text: str) -> None:
     """Print progress on stderr."""
     print(text, file=sys.stderr, flush=True)
+
+
+def files_digest(paths: Iterable[Path]) -> str:
+    """A digest of the names and contents of files, in the order of their paths."""
+    total = hashlib.sha256()
+    for path in sorted(paths):
+        total.update(path.name.encode() + path.read_bytes())
+    return total.hexdigest()
 
 
 # --- times --------------------------------------------------------------------------------------------------------------

@@ -1,18 +1,21 @@
 """Wished against obtained errors, and what they cost: the scenes of `taisoft bench error`, run to a tolerance.
 
-taisoft bench tolerance [--scene NAME ...] [--quick] [--out [FILE.json]]
+taisoft bench tolerance [--scene NAME ...] [--wish PERCENT ...] [--quick] [--out [FILE.json]]
 
 Each scene runs with tolerances of 10, 1 and 0.1 % (`Simulator(tolerance=)`), and with a grid of fixed settings: all integrators
-at 1 to 64 steps a frame, explicit ones at up to 8 times their least. Errors are distances at the frames, over the largest
+at 1 to 64 steps a frame, explicit ones at up to 8 times their least, as long as they are not slower than settings that meet all
+tolerances. Errors are distances at the frames, over the largest
 excursion, to a run in double precision with small steps: 128 a frame, explicit ones 32 times the least, with tolerances of 1e-9,
 and 1e-8 of the contact laws. Implicit and explicit steps have a reference each, since quadratic elements have another mass matrix
 in explicit steps and impacts another law. A reference's own error is its distance to a run with half as many steps.
-Seconds are from the call of Simulator to the end of the run, with pilots, without compiling: medians of repeated runs. With
-frames: where an observer gets them, as in `taisoft run`, so that a pilot is not the run. Best: the fastest fixed setting that
-meets the tolerance. Exit status: 0, or 1 if a limit is not met.
+References and errors of fixed steps are kept in the user's cache until scenes or code change (`stored_runs`).
+Seconds are from the call of Simulator to the end of the run, with pilots, without compiling: medians of repeated runs, in turns
+with the best fixed setting. With frames: where an observer gets them, as in `taisoft run`, so that a pilot is not the run. Best:
+the fastest fixed setting that meets the tolerance. Exit status: 0, or 1 if a limit is not met.
 """
 
 import argparse
+import dataclasses
 import math
 import statistics
 import sys
@@ -31,12 +34,13 @@ from .document import Limit, begin, table
 from .error import EXACT, EXPLICIT_FPS
 from .error_cases import CASES, Case
 from .runner import add_named_out, make_parser, named_out, progress, without_warnings
+from .stored_runs import StoredRuns
 
 TOLERANCES = (0.1, 0.01, 0.001)
 STEPS = (1, 2, 4, 8, 16, 32, 64)  # of implicit integrators, a frame
 FINER = (1, 2, 4, 8)  # steps of explicit integrators over their least
 TRUTH = {False: 128, True: 32}  # steps a frame of the reference, explicit ones over their least; key: explicit
-REPEATS, SHORT, LONG = 3, 1.0, 10.0  # runs of up to SHORT [s] are repeated; a grid goes no further after one of LONG [s]
+REPEATS, SHORT, LONG = 5, 1.0, 10.0  # runs of up to SHORT [s] are repeated; a grid goes no further after one of LONG [s]
 ENOUGH, SLOWEST, MEDIAN = 11 / 12, 2.0, 1.3  # of the scenes that meet a tolerance; times over the best fixed setting
 QUICK = ("hanging beam", "incline")
 
@@ -85,13 +89,13 @@ def fps_of(case: Case) -> float:
 
 
 class Scene:
-    """The references of a scene, and its frame. least: explicit steps a frame."""
+    """The references of a scene, and its frame. least: explicit steps a frame; stored: runs before this one."""
 
-    def __init__(self, case: Case):
-        self.case, self.frame = case, 1.0 / fps_of(case)
+    def __init__(self, case: Case, stored: StoredRuns):
+        self.case, self.frame, self._stored = case, 1.0 / fps_of(case), stored
         with ts.Simulator(case.build(), dt=1e-9, integrator="velocity_verlet") as sim:
             self.least, self.touches = stable_steps(sim.stable_dt, self.frame), sim.touches
-        self._truths: dict[bool, tuple[np.ndarray, float]] = {}
+        self._truths: dict[bool, np.ndarray] = {}
 
     def path(self, integrator: str, steps: int, **settings) -> np.ndarray:
         """Positions (k,n,3) [m] at the frames."""
@@ -100,55 +104,85 @@ class Scene:
             sim.run(self.case.seconds, on_frame=lambda sim, *_: found.append(sim.positions()), fps=1.0 / self.frame)
         return np.array(found)
 
-    def truth(self, explicit: bool) -> tuple[np.ndarray, float]:
-        """Path of the reference, and its own error."""
+    def truth(self, explicit: bool) -> np.ndarray:
+        """Path of the reference."""
         if explicit not in self._truths:
-            integrator = "velocity_verlet" if explicit else "bdf2" if self.touches else "implicit_midpoint"
-            exact = {} if explicit else {"newton_tolerance": EXACT["newton_tolerance"]}
-            exact |= {"contact_tolerance": EXACT["contact_tolerance"]} if self.touches else {}
-            steps = TRUTH[explicit] * (self.least if explicit else 1)
-            fine, coarse = (self.path(integrator, steps // k, precision="f64", **exact) for k in (1, 2))
-            self._truths[explicit] = fine, distance(coarse, fine, largest_excursion(fine)).max
+            self._truths[explicit] = self._reference(explicit, 1)
         return self._truths[explicit]
 
-    def error(self, integrator: str, path: np.ndarray) -> float:
-        """True error of a path (k,n,3) [m]."""
-        truth, _ = self.truth(integrator in EXPLICIT)
-        k = min(len(path), len(truth))  # a failed run is shorter
-        return distance(path[:k], truth[:k], largest_excursion(truth)).max if len(path) == len(truth) else math.inf
+    def own_error(self, explicit: bool) -> float:
+        """Error of the reference."""
 
-    def timed(self, on_frame=None, **settings) -> tuple[float, ts.RunReport, ts.Simulator]:
-        """Median seconds of the set-up and a run, without compiling; the last report, and its closed simulator."""
-        seconds = []
-        while not seconds or (seconds[0] < SHORT and len(seconds) < REPEATS):
-            start = time.perf_counter()
-            with ts.Simulator(self.case.build(), **settings) as sim:
-                report = sim.run(self.case.seconds, fps=1.0 / self.frame, on_frame=on_frame)
-                seconds.append(time.perf_counter() - start - sim.compile_seconds)
-        return statistics.median(seconds), report, sim
+        def find() -> np.ndarray:
+            truth = self.truth(explicit)
+            return np.array(distance(self._reference(explicit, 2), truth, largest_excursion(truth)).max)
+
+        return float(self._stored.get([self.case.name, "own error", explicit, TRUTH[explicit]], find))
+
+    def _reference(self, explicit: bool, larger: int) -> np.ndarray:
+        """Path of the reference, or with steps larger by a factor."""
+        integrator = "velocity_verlet" if explicit else "bdf2" if self.touches else "implicit_midpoint"
+        settings = {"precision": "f64"} if explicit else {"precision": "f64", "newton_tolerance": EXACT["newton_tolerance"]}
+        settings |= {"contact_tolerance": EXACT["contact_tolerance"]} if self.touches else {}
+        steps = TRUTH[explicit] * (self.least if explicit else 1) // larger
+        request = [self.case.name, "path", integrator, steps, settings]
+        return self._stored.get(request, lambda: self.path(integrator, steps, **settings))
+
+    def error(self, integrator: str, steps: int, **settings) -> float:
+        """True error of a run with fixed steps; infinite if it fails."""
+
+        def find() -> np.ndarray:
+            path, truth = self.path(integrator, steps, **settings), self.truth(explicit)
+            whole = len(path) == len(truth)  # a failed run is shorter
+            return np.array(distance(path, truth, largest_excursion(truth)).max if whole else math.inf)
+
+        explicit = integrator in EXPLICIT
+        return float(self._stored.get([self.case.name, "error", integrator, steps, settings, TRUTH[explicit]], find))
+
+    def timed(self, *settings: dict) -> tuple[list[float], list[ts.RunReport], ts.Simulator]:
+        """Median seconds of set-up and run with each of several settings, in turns, without compiling; their last reports, and
+        the closed simulator of the last one. Settings may have `on_frame`."""
+        seconds: list[list[float]] = []
+        while not seconds or (sum(seconds[0]) < SHORT and len(seconds) < REPEATS):
+            found = [self._run(**one) for one in settings]
+            seconds.append([one[0] for one in found])
+        return [statistics.median(one) for one in zip(*seconds)], [one[1] for one in found], found[-1][2]
+
+    def _run(self, on_frame=None, **settings) -> tuple[float, ts.RunReport, ts.Simulator]:
+        """Seconds of set-up and a run, its report, and its closed simulator."""
+        scene, start = self.case.build(), time.perf_counter()
+        with ts.Simulator(scene, **settings) as sim:
+            report = sim.run(self.case.seconds, fps=1.0 / self.frame, on_frame=on_frame)
+            return time.perf_counter() - start - sim.compile_seconds, report, sim
 
     def grid(self) -> list[Fixed]:
-        """All fixed settings; an integrator goes no further after a long run."""
-        found = []
+        """All fixed settings; an integrator goes no further after a long run, or one slower than what meets all tolerances."""
+        found: list[Fixed] = []
         for integrator in (*EXPLICIT, *IMPLICIT):
             explicit = integrator in EXPLICIT
             if self.touches and not takes_contacts(integrator):
                 continue
             for steps in [k * self.least for k in FINER] if explicit else STEPS:
-                seconds, report, _ = self.timed(dt=self.frame / steps, integrator=integrator)
+                (seconds,), (report,), _ = self.timed(self.fixed(integrator, steps))
                 if report.status != "failed":
-                    found.append(Fixed(integrator, steps, self.error(integrator, self.path(integrator, steps)), seconds))
-                if seconds > LONG:
+                    found.append(Fixed(integrator, steps, self.error(integrator, steps), seconds))
+                if seconds > min((one.seconds for one in found if one.error <= min(TOLERANCES)), default=LONG):
                     break
         return found
 
+    def fixed(self, integrator: str, steps: int) -> dict:
+        """Settings of a run with fixed steps."""
+        return {"dt": self.frame / steps, "integrator": integrator}
+
     def row(self, tolerance: float, grid: list[Fixed]) -> Row:
         """A run to a tolerance."""
-        seconds, report, sim = self.timed(tolerance=tolerance)
-        integrator, steps = sim.settings.integrator, round(self.frame / sim.dt)
+        enough = [one for one in grid if one.error <= tolerance]
+        best = min(enough, key=lambda one: one.seconds) if enough else None
+        alternatives = [{"tolerance": tolerance, "on_frame": lambda *_: None}, {"tolerance": tolerance}]
+        fixed = [self.fixed(best.integrator, best.steps)] if best else []
+        seconds, reports, sim = self.timed(*fixed, *alternatives)
+        integrator, steps, report = sim.settings.integrator, round(self.frame / sim.dt), reports[-1]
         tolerances = {name: getattr(sim.settings, name) for name in ("newton_tolerance", "contact_tolerance")}
-        path = self.path(integrator, steps, **tolerances) if report.status != "failed" else np.empty((0, 0, 3))
-        enough = [fixed for fixed in grid if fixed.error <= tolerance]
         return Row(
             name=self.case.name,
             tolerance=tolerance,
@@ -156,12 +190,12 @@ class Scene:
             steps=steps,
             status=report.status,
             estimated=report.error_estimate.time if report.error_estimate else None,
-            true=self.error(integrator, path),
-            own=self.truth(integrator in EXPLICIT)[1],
-            seconds=seconds,
-            observed=self.timed(on_frame=lambda *_: None, tolerance=tolerance)[0],
+            true=self.error(integrator, steps, **tolerances) if report.status != "failed" else math.inf,
+            own=self.own_error(integrator in EXPLICIT),
+            seconds=seconds[-1],
+            observed=seconds[-2],
             pilots=report.pilot_seconds,
-            best=min(enough, key=lambda fixed: fixed.seconds) if enough else None,
+            best=dataclasses.replace(best, seconds=seconds[0]) if best else None,
         )
 
 
@@ -206,6 +240,8 @@ def parser() -> argparse.ArgumentParser:
     made = make_parser("tolerance", __doc__)
     names = [case.name for case in CASES]
     made.add_argument("--scene", nargs="+", choices=names, metavar="NAME", help=f"only these: {', '.join(names)}")
+    wishes = [f"{100.0 * one:g}" for one in TOLERANCES]
+    made.add_argument("--wish", nargs="+", choices=wishes, metavar="PERCENT", help=f"only these: {', '.join(wishes)}")
     made.add_argument("--quick", action="store_true", help=f"only {' and '.join(QUICK)}")
     add_named_out(made)
     return made
@@ -218,14 +254,22 @@ def main(argv: list[str] | None = None) -> int:
     options.out = named_out(options, "tolerance")
     document, numbers = begin("Runs to a tolerance", "cpu", "f32")
     names = options.scene or (QUICK if options.quick else [case.name for case in CASES])
-    rows, grids, start = [], {}, time.perf_counter()
+    wishes = [one for one in TOLERANCES if not options.wish or f"{100.0 * one:g}" in options.wish]
+    rows, grids, stored, start = [], {}, StoredRuns(), time.perf_counter()
+
+    def say(what: str) -> None:
+        progress(f"{case.name}: {what}, {time.perf_counter() - start:.0f} s")
+
     for case in CASES:
         if case.name in names:
-            progress(f"{case.name}, {time.perf_counter() - start:.0f} s")
             with without_warnings():
-                scene = Scene(case)
+                scene = Scene(case, stored)
+                own = [scene.own_error(explicit) for explicit in (True, False)]
+                say(f"references with errors of {percent(own[0])} and {percent(own[1])} %")
                 grids[case.name] = scene.grid()
-                rows += [scene.row(tolerance, grids[case.name]) for tolerance in TOLERANCES]
+                say(f"{len(grids[case.name])} fixed settings")
+                rows += [scene.row(tolerance, grids[case.name]) for tolerance in wishes]
+                say("runs to a tolerance")
     document.add(row_table(rows))
     return document.finish(options, numbers | {"precision": "f32", "rows": rows, "grids": grids}, find_limits(rows))
 

@@ -1,16 +1,22 @@
 """The benchmark of tolerances:
 
 * times are compared with the fastest fixed setting that meets the tolerance, where there is one;
-* the command measures a scene, and writes its rows and its grid.
+* the command measures a scene, and writes its rows and its grid;
+* references and errors of fixed settings are kept from one run of it to the next, until the code changes.
 """
 
 import json
 import math
 
-from benchmarks import tolerance
+import numpy as np
+import pytest
+
+from benchmarks import stored_runs, tolerance
 from benchmarks.document import Limit
 from benchmarks.error_cases import CASES
+from benchmarks.stored_runs import StoredRuns
 from benchmarks.tolerance import Fixed, Row, find_limits, fps_of, row_table
+from taisoft.dynamics.schemes import EXPLICIT, IMPLICIT
 
 
 def row(tolerance=0.01, true=1e-3, best=1.0, **more) -> Row:
@@ -46,9 +52,29 @@ def test_frames_of_every_scene_are_whole():
 def test_the_command_measures_a_scene(tmp_path, capsys, monkeypatch):
     out = tmp_path / "tolerance.json"
     monkeypatch.setattr(tolerance, "STEPS", (1, 2))
+    monkeypatch.setattr(tolerance, "StoredRuns", lambda: StoredRuns(tmp_path / "stored"))
     tolerance.main(["--scene", "hanging beam", "--out", str(out)])  # 1 where it is slower than its limit
     found = json.loads(out.read_text())
-    assert len(found["grids"]["hanging beam"]) == 2 * 4 + 4 * 2
+    grid = found["grids"]["hanging beam"]
+    assert {one["integrator"] for one in grid} == {*EXPLICIT, *IMPLICIT} and len(grid) <= 2 * 4 + 4 * 2
     assert [one["tolerance"] for one in found["rows"]] == [0.1, 0.01, 0.001]
     assert all(one["true"] <= one["tolerance"] and one["own"] < 1e-4 for one in found["rows"])
     assert "| hanging beam " in capsys.readouterr().out
+    monkeypatch.setattr(tolerance.Scene, "path", lambda *_, **__: pytest.fail("a run was not kept"))
+    tolerance.main(["--scene", "hanging beam", "--wish", "1", "--out", str(out)])
+    again = json.loads(out.read_text())["rows"]
+    assert [(one["tolerance"], one["true"]) for one in again] == [(0.01, found["rows"][1]["true"])]
+
+
+def test_arrays_are_stored_until_the_code_changes(tmp_path, monkeypatch):
+    def get(value: float, request: int = 1) -> float:
+        return float(StoredRuns(tmp_path).get(["request", request], lambda: np.array(value)))
+
+    assert [get(1.0), get(2.0), get(3.0, request=2)] == [1.0, 1.0, 3.0]
+    for file in tmp_path.iterdir():
+        file.write_bytes(b"damaged")
+    assert [get(4.0), get(5.0)] == [4.0, 4.0]
+    monkeypatch.setattr(stored_runs, "code_digest", lambda _: "other")
+    assert get(6.0) == 6.0
+    (tmp_path / "file").touch()
+    assert float(StoredRuns(tmp_path / "file").get([], lambda: np.array(7.0))) == 7.0

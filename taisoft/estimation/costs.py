@@ -4,7 +4,12 @@ Its times are those of one core (`taisoft bench scaling`, `taisoft bench toleran
 explicit and implicit steps compete.
 """
 
+from collections.abc import Callable
+
+from taisoft.records import StepReport
 from taisoft.scene.scene import Scene
+
+COUNTS = ("newton_iterations", "linear_iterations", "contact_iterations")  # of which `implicit_step` knows the costs
 
 EXPLICIT_STEP, CONTACT_STEP, BODY_CONTACTS = 5.0, 250.0, 100.0  # [us] of an explicit step; of contacts, more with each body
 PATH_STEP = 90.0  # [us] of a prescribed path, or a moving obstacle, in a step
@@ -39,3 +44,26 @@ def implicit_step(scene: Scene, touches: bool, counts: list[float] | None = None
     m = elements(scene)
     step = IMPLICIT_STEP + newton * (NEWTON + NEWTON_TET * m) + linear * (LINEAR + LINEAR_TET * m)
     return step + multipliers * MULTIPLIERS + surroundings(scene, touches)
+
+
+class Budget:
+    """Stops a pilot of implicit steps whose cost exceeds a limit [us]. Pass `add` to its run as on_step, and `stop`.
+
+    given: what stops the pilot besides, None if nothing does.
+    """
+
+    def __init__(self, scene: Scene, touches: bool, limit: float, given: Callable[[], bool] | None):
+        self._scene, self._touches, self._left, self._given = scene, touches, limit, given
+
+    @property
+    def is_spent(self) -> bool:
+        """Whether the limit was exceeded."""
+        return self._left < 0.0
+
+    def add(self, report: StepReport, _seconds: float) -> None:
+        """Count a step."""
+        self._left -= implicit_step(self._scene, self._touches, [getattr(report, name) for name in COUNTS])
+
+    def stop(self) -> bool:
+        """Whether the pilot stops before its next step."""
+        return self.is_spent or (self._given is not None and self._given())

@@ -11,8 +11,11 @@ acceleration. An impact may be late by dt.
 Weak: one pilot does not show small errors that grow exponentially.
 """
 
+import itertools
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, field
+from fractions import Fraction
 
 import numpy as np
 
@@ -20,24 +23,30 @@ from taisoft.estimation.first_choice import EXPLICIT, IMPLICIT
 from taisoft.estimation.order import MIN_ORDER, error_over_difference, observed_order
 from taisoft.estimation.pilots import Frames, Pilot, distances
 
+SAFETY = 0.8  # part of the tolerance that an error may take, unless it is likely to be less
 REACH = {EXPLICIT: 2, IMPLICIT: 8}  # steps of a run over those of the last pilot, at most
 LEAST_REACH = 1.5  # the same, at least, where the run is not the last pilot: a smaller ratio would amplify chance
-FEWEST = {EXPLICIT: 2, IMPLICIT: 3}  # pilots that show an error: coarse implicit steps may agree and be wrong
+FEWEST = {EXPLICIT: 2, IMPLICIT: 3}  # pilots that show an error: fewer coarse implicit steps may agree and be wrong
+SMALLER = Fraction(5, 4)  # steps of a slightly smaller size over those of the first explicit pilot
+CHANCE = 0.5  # part of an expected error of sudden motion that may be chance
+MOST = 4.0  # steps of the second explicit pilot over those of the first, at most
+LARGEST_STEP = 4  # frames in a step of the first implicit pilot
+LEAST_STEPS = 8  # of an implicit pilot
 MAX_PILOTS = 8
 MAX_DEGRADED = 2  # pilots that meet the tolerance but are degraded, and are left for a finer one
 MAX_STALLED = 2  # pilots in succession whose differences have not become smaller: the paths diverge
 COARSE = 2  # implicit pilots with fewer steps a frame do not count as stalled
 DISPERSION, IMPACT = 3.0, 1.25  # factors on the errors that velocities show
-UNSURE = 8.0  # a tolerance over the largest error that one explicit pilot of sudden motion may be expected to have
+UNSURE = 8.0  # a tolerance over the largest error that fewer pilots, or one explicit one of sudden motion, may seem to have
 
 
 @dataclass
 class Ladder:
     """Pilots of one integrator.
 
-    sudden: whether velocities or forces may jump; nominal: order of the integrator in the scene; error: of the last pilot, over
-    the excursion, None if unknown; order: observed, else None; tried: pilots, with failed ones; differences: root mean squares of
-    the distances between successive pilots, each with half the step of the one before [m].
+    sudden: whether velocities or forces may jump; nominal: order of the integrator in the scene; pilots: from coarse to fine;
+    error: of the last one, over the excursion, None if unknown; order: observed, else None; tried: pilots, with failed ones;
+    differences: root mean squares of the distances between successive pilots, each with half the step of the one before [m].
     """
 
     integrator: str
@@ -54,24 +63,40 @@ class Ladder:
     differences: list[float] = field(default_factory=list)
 
     def add(self, pilot: Pilot) -> None:
-        """Add a pilot with a smaller step than the last one, and estimate its error. Those that fail are left out."""
+        """Add a pilot, and estimate the error of the one with the smallest steps. Those that fail are left out."""
         self.tried += 1
         if pilot.report.status == "failed":
             return
-        if self.pilots:
-            self.pilots[-1].end, self.pilots[-1].hardest = {}, (0, {})  # it will not be the run
-        self.pilots.append(pilot)
+        self.pilots = sorted([*self.pilots, pilot], key=lambda one: one.per_frame)
+        for one in self.pilots[:-1]:
+            one.end, one.hardest = {}, (0, {})  # it will not be the run
         if len(self.pilots) < 2:
             return
-        before, excursion = self.pilots[-2], self.excursion(pilot)
-        apart, ratio = distances(pilot, before), float(pilot.per_frame / before.per_frame)
-        self.differences = [*self.differences, float(np.sqrt(np.mean(apart**2)))] if ratio == 2.0 else []
-        self.order, self.unsure = self._observed_order() if ratio == 2.0 else None, 1.0
-        self.error = float(apart.max()) * self.error_over_difference(ratio) / excursion if excursion else 0.0
+        before, last = self.pilots[-2:]
+        excursion, ratio = self.excursion(last), float(last.per_frame / before.per_frame)
+        self.differences = self._last_differences()
+        self.order = self._observed_order()
+        self.unsure = UNSURE / SAFETY if self.are_few else self._measured
+        apart = float(distances(last, before).max())
+        self.error = apart * self.error_over_difference(ratio) / excursion if excursion else 0.0
+
+    @property
+    def _measured(self) -> float:
+        """`unsure` of a measured error: of sudden motion it is assumed to fall as slowly as it may."""
+        return 1.0 if self.sudden else 1.0 / SAFETY
+
+    def _last_differences(self) -> list[float]:
+        """The last `differences`, at most as many as are needed."""
+        found: list[float] = []
+        for before, pilot in reversed(list(itertools.pairwise(self.pilots[-4:]))):
+            if pilot.per_frame != 2 * before.per_frame:
+                break
+            found.insert(0, float(np.sqrt(np.mean(distances(pilot, before) ** 2))))
+        return found
 
     def expect(self) -> None:
         """Expect the error of the only pilot, explicit, from its velocities alone."""
-        pilot, self.unsure = self.pilots[0], UNSURE if self.sudden else 1.0
+        pilot, self.unsure = self.pilots[0], (UNSURE if self.sudden else 1.0) / SAFETY
         excursion = self.excursion(pilot)
         self.error = self._expected_error(pilot, excursion) if excursion else 0.0
 
@@ -96,7 +121,7 @@ class Ladder:
         self.tried += 1
         if pilot.report.status == "failed":
             return
-        before, self.pilots, self.unsure = self.pilots, [pilot], 1.0
+        before, self.pilots, self.unsure = self.pilots, [pilot], self._measured
         if before:
             self._expect(pilot, before[0])
         elif self.excursion(pilot) == 0.0:
@@ -158,7 +183,19 @@ class Ladder:
 
     def steps_over_last(self, tolerance: float) -> float:
         """Steps that a tolerance needs over those of the only pilot, explicit, from its error."""
-        return 1.0 if self.error is None else (self.error / tolerance) ** (1.0 / self.nominal)
+        return 1.0 if self.error is None else (self.error / (SAFETY * tolerance)) ** (1.0 / self.nominal)
+
+    def second_steps(self, least: int, ratio: float) -> tuple[Fraction, bool]:
+        """Steps in the time of a frame of the second explicit pilot, and whether it is nearly equal to the first and replaces it.
+
+        least: steps of the first; ratio: `steps_over_last` of it, from its velocities alone. Of sudden motion part of the error
+        may be chance, which the comparison of nearly equal steps amplifies.
+        """
+        more = slightly_more(least)
+        largest = float(more / least - 1) / CHANCE if self.sudden else float(SMALLER)
+        if ratio <= largest or not self.pilots:
+            return more, True
+        return Fraction(math.ceil(least * (2.0 if self.nominal == 1 else min(MOST, max(LEAST_REACH, ratio))))), False
 
     def meets(self, tolerance: float) -> bool:
         """Whether the last pilot is likely to meet a tolerance."""
@@ -169,7 +206,7 @@ class Ladder:
         if not self.pilots or self.error is None:
             return None
         last = self.pilots[-1].per_frame
-        if self.meets(tolerance) and (not self.are_few or self.integrator == EXPLICIT):
+        if self.meets(tolerance):
             if self.pilots[-1].report.status == "degraded" and self.degraded < MAX_DEGRADED:
                 self.degraded += 1
                 return None
@@ -186,5 +223,32 @@ class Ladder:
 
     def likely_steps(self, tolerance: float) -> float:
         """Steps of a run in the time of a frame that the last pilot does not meet the tolerance of, however many."""
-        ratio = max(LEAST_REACH, (self.error / tolerance) ** (1.0 / self.assumed_order))
+        ratio = max(LEAST_REACH, (self.error / (SAFETY * tolerance)) ** (1.0 / self.assumed_order))
         return float(self.pilots[-1].per_frame) * ratio
+
+
+def slightly_more(least: int) -> Fraction:
+    """Steps of a slightly smaller size, in the time of a frame."""
+    return Fraction(math.ceil(SMALLER * least))
+
+
+def implicit_sizes(count: int) -> Iterator[Fraction]:
+    """Steps in the time of a frame of implicit pilots of a run of `count` frames, in the order in which they are run.
+
+    Runs have at least a step a frame. The second pilot has one, since it may already be far better than it must be. Otherwise the
+    one between it and the first is made up for, to show the order.
+    """
+    largest = LARGEST_STEP
+    while largest > 1 and count < LEAST_STEPS * largest:
+        largest //= 2
+    first = Fraction(1, largest)
+    while first * count < LEAST_STEPS:
+        first *= 2
+    yield first
+    finest = max(Fraction(1), 2 * first)
+    yield finest
+    if 4 * first == finest:
+        yield 2 * first
+    while True:
+        finest *= 2
+        yield finest

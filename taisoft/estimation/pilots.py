@@ -10,13 +10,15 @@ import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from fractions import Fraction
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from taisoft.estimation.comparison import largest_excursion
+from taisoft.estimation.costs import COUNTS
 from taisoft.ranges import owners
-from taisoft.records import RunReport
+from taisoft.records import RunReport, StepReport
 
 if TYPE_CHECKING:
     from taisoft.simulator import Simulator
@@ -25,10 +27,11 @@ NEGLIGIBLE = {"f32": 1e-6, "f64": 1e-12}  # excursions, over the size of the sce
 ROUNDING = 1e-6  # part of a frame that a run's length may lack of a whole one
 MAX_FRAMES = 48  # at which paths are recorded
 PARTS = 16  # of a run, about; a pilot knows which is the hardest
+BLOCK = 16  # frames whose velocities are held until their changes are added
 MAX_NODES = 4096  # whose paths are recorded, evenly spread
-COUNTS = ("newton_iterations", "linear_iterations", "contact_iterations")
 
 RunFunction = Callable[..., RunReport]  # as `running.run_steps`
+StepCallback = Callable[[StepReport, float], None]  # its on_step
 
 
 @dataclass
@@ -58,6 +61,11 @@ class Pilot:
         reports = self.report.step_reports
         return [sum(getattr(one, name) for one in reports) / max(1, self.report.steps) for name in COUNTS]
 
+    @property
+    def touches(self) -> bool:
+        """Whether anything touches in a step."""
+        return any(report.n_contacts for report in self.report.step_reports)
+
     def at(self, frames: list[int]) -> np.ndarray:
         """Positions at some of the frames (k,n,3) [m]."""
         return np.array([self.positions[self.frames.index(k)] for k in frames])
@@ -79,7 +87,8 @@ class Recorder:
         self._pilot, self._frames, self._first, self._keeps = pilot, frames, first, keeps
         self._stride = stride if stride.denominator > 1 else int(stride)
         self._index: int | None = None  # of the first frame
-        self._velocities = self._jump = None
+        self._velocities: list[np.ndarray] = []  # since the frame up to which changes are added, with that one
+        self._jump: np.ndarray | None = None  # the change of velocities there
         self._part: tuple[int, dict] = (0, {})  # the present one, as Pilot.hardest
         self._changes: np.ndarray | float = 0.0  # (n,) of velocities in it
         self._most, self._sum = -1.0, 0.0  # of these changes in a part, and of the largest ones in all parts
@@ -97,23 +106,28 @@ class Recorder:
             pilot.positions.append(x[frames.nodes].astype(np.float64))
         else:
             v = state.velocities()
-        self._add_velocities(v[frames.nodes].astype(np.float64))
-        if self._keeps and (number % frames.part == 0 or number == frames.count):
+        self._velocities.append(v[frames.nodes])
+        ends = self._keeps and (number % frames.part == 0 or number == frames.count)
+        if ends or len(self._velocities) > BLOCK:
+            self.add_changes()
+        if ends:
             self._end_part(sim, number)
 
-    def _add_velocities(self, v: np.ndarray) -> None:
-        """Add the changes of velocities (n,3) [m/s] since the last frame."""
-        before, self._velocities = self._velocities, v
-        if before is None:
+    def add_changes(self) -> None:
+        """Add the changes of the velocities that were recorded since the last call."""
+        pilot, velocities = self._pilot, np.array(self._velocities, np.float64)
+        if len(velocities) < 2:
             return
-        previous, self._jump = self._jump, v - before
-        jump, pilot = _lengths(self._jump), self._pilot
-        pilot.jump = max(pilot.jump, float(jump.max()))
-        if previous is None:
-            self._changes = self._changes + jump
-            return
-        change = _lengths(self._jump - previous)
+        jumps = np.diff(velocities, axis=0)
+        lengths = _lengths(jumps)
+        pilot.jump = max(pilot.jump, float(lengths.max()))
+        if self._jump is None:
+            self._changes = self._changes + lengths[0]
+        else:
+            jumps = np.concatenate([self._jump[None], jumps])
+        change = _lengths(np.diff(jumps, axis=0)).sum(axis=0)
         self._changes, pilot.variations = self._changes + change, pilot.variations + change
+        self._velocities, self._jump = self._velocities[-1:], jumps[-1]
 
     def _end_part(self, sim: "Simulator", number: int) -> None:
         """End a part of the run, and begin the next one at a frame."""
@@ -141,7 +155,7 @@ class Frames:
     bodies: np.ndarray
     negligible: float
 
-    @property
+    @cached_property
     def count(self) -> int:
         """Number of whole frames after the start."""
         return max(1, math.floor(self.length / self.seconds + ROUNDING))
@@ -150,12 +164,12 @@ class Frames:
         """Whether pilots record a frame, counted from 0 at the start: at most about MAX_FRAMES, and the last one."""
         return frame % self._between == 0 or frame == self.count
 
-    @property
+    @cached_property
     def _between(self) -> int:
         """Frames from one that is recorded to the next."""
         return -(-self.count // MAX_FRAMES)
 
-    @property
+    @cached_property
     def part(self) -> int:
         """Frames of a part of the run; the last part may have fewer."""
         return self._between * -(-self.count // (self._between * PARTS))
@@ -168,10 +182,12 @@ class Frames:
         run: RunFunction,
         whole: Pilot | None = None,
         keeps: bool = False,
+        on_step: StepCallback | None = None,
     ) -> Pilot:
         """Run a pilot of `per_frame` steps a frame; its report has the status "failed" if it fails. Restores sim's state.
 
-        whole: another pilot, whose hardest part alone is to be run; keeps: whether it keeps the state before its own.
+        whole: another pilot, whose hardest part alone is to be run; keeps: whether it keeps the state before its own;
+        stop, on_step: as for `run`.
         """
         pilot = Pilot(sim.settings.integrator, per_frame)
         kept, may_soften = sim._dynamics.snapshot(), sim._may_soften
@@ -187,7 +203,8 @@ class Frames:
                 warnings.simplefilter("always")  # they are those of the run only if the pilot is
                 sim.dt = self.seconds / float(per_frame)
                 recorder = Recorder(pilot, self, Fraction(stride), first, keeps)
-                pilot.report = run(sim, length, recorder.frame, 1.0 / (self.seconds * stride), stop)
+                pilot.report = run(sim, length, recorder.frame, 1.0 / (self.seconds * stride), stop, on_step=on_step)
+                recorder.add_changes()
             pilot.end = sim._dynamics.snapshot()
             pilot.warned = list(dict.fromkeys(str(one.message) for one in caught if issubclass(one.category, UserWarning)))
         finally:
@@ -212,5 +229,5 @@ def distances(pilot: Pilot, other: Pilot) -> np.ndarray:
 
 
 def _lengths(vectors: np.ndarray) -> np.ndarray:
-    """Lengths (n,) of vectors (n,3)."""
-    return np.sqrt(np.einsum("ij,ij->i", vectors, vectors))
+    """Lengths (k,n) of vectors (k,n,3)."""
+    return np.sqrt(np.einsum("kij,kij->ki", vectors, vectors))

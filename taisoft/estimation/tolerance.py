@@ -1,15 +1,15 @@
 """Runs to a tolerance: pilots (`pilots`) choose integrator and dt, and give the error of the run.
 
 Implicit pilots are a ladder (`ladder`), each with half the step of the one before, that ends where the run needs at most eight
-times as many steps as the last pilot. How many follows from the difference of the last two and its observed order. Explicit steps
-cannot be coarser than stable. Their first pilot has the largest stable step. Its velocities, and its hardest part repeated with a
-slightly smaller step, show whether it is enough; if that is not sure a second pilot takes the smaller step all the way, and
-otherwise a ladder follows. A pilot that meets the tolerance is the run, which is repeated only if frames or steps are observed,
-or an estimate by twins is asked for.
+times as many steps as the last pilot. How many follows from the difference of the last two and its observed order. The second
+pilot skips one, and is the run if it seems far better than it must be. Explicit steps cannot be coarser than stable. Their first
+pilot has the largest stable step. Its velocities, and its hardest part repeated with a slightly smaller step, show whether it is
+enough; if that is not sure a second pilot takes a smaller step all the way, and otherwise a ladder follows. A pilot that meets
+the tolerance is the run, which is repeated only if frames or steps are observed, or an estimate by twins is asked for.
 
 Which kind of steps a run takes follows from counts (`costs`). Explicit steps are accepted at once where they cost less than
-implicit ones could. Among implicit methods BDF2 is used: it is of second order, has contacts, and damps what its steps cannot
-resolve.
+implicit ones could, and an implicit pilot ends when it has cost more than explicit steps would. Among implicit methods BDF2 is
+used: it is of second order, has contacts, and damps what its steps cannot resolve.
 
 Weak: pilots do not show what is faster than all of them (`vibrations`). Where their paths diverge, no step meets the tolerance.
 """
@@ -22,12 +22,13 @@ from fractions import Fraction
 from typing import TYPE_CHECKING
 
 from taisoft.errors import SimulationError, no_memory
-from taisoft.estimation.costs import explicit_step, implicit_step
+from taisoft.estimation.costs import Budget, explicit_step, implicit_step
 from taisoft.estimation.first_choice import EXPLICIT, IMPLICIT, stable_steps
-from taisoft.estimation.ladder import LEAST_REACH, Ladder
+from taisoft.estimation.ladder import Ladder, implicit_sizes, slightly_more
 from taisoft.estimation.order import may_jump, nominal_order
 from taisoft.estimation.pilots import Pilot, Recorder, RunFunction, distances, make_frames
-from taisoft.estimation.vibrations import add_vibrations
+from taisoft.estimation.vibrations import ERROR as VIBRATIONS
+from taisoft.estimation.vibrations import add_vibrations, are_passed_over
 from taisoft.records import BodyError, ErrorEstimate, RunReport
 from taisoft.scene.scene import Scene
 from taisoft.stability import stable_dt
@@ -35,11 +36,7 @@ from taisoft.stability import stable_dt
 if TYPE_CHECKING:
     from taisoft.simulator import Simulator
 
-SAFETY = 0.8  # part of the tolerance that a predicted error may take
-SMALLER = Fraction(5, 4)  # steps of a slightly smaller size over those of the first explicit pilot
-MOST = 4.0  # steps of the second explicit pilot over those of the first, at most
-LARGEST_STEP = 4  # frames in a step of the first implicit pilot
-LEAST_STEPS = 8  # of a pilot
+DEARER = 4.0  # cost of explicit steps, over that of implicit ones that cannot meet the tolerance, at most
 LEAST_FRAMES, MOST_FRAMES = 16, 64  # at which pilots are compared where a run has few, or every step is one
 
 
@@ -108,7 +105,7 @@ class Chooser:
 
     def __init__(self, sim: "Simulator", run: RunFunction, seconds: float, fps: float | None, stop: Callable[[], bool] | None):
         self._sim, self._run_steps, self._seconds, self._fps, self._stop = sim, run, seconds, fps, stop
-        self._tolerance = SAFETY * sim.settings.tolerance
+        self._tolerance = sim.settings.tolerance
         self._parts = 1 if fps is None else max(1, math.ceil(LEAST_FRAMES / (seconds * fps)))  # of a frame of the run
         self._frames = make_frames(sim, seconds, seconds / MOST_FRAMES if fps is None else 1.0 / (fps * self._parts))
         self._sudden = sim.touches or may_jump(sim.scene)
@@ -150,44 +147,53 @@ class Chooser:
 
     def _by_implicit_pilots(self, explicit: float) -> int | None:
         """Steps in the time of a frame; None if explicit ones, at a cost of `explicit` [us] a frame, are cheaper."""
-        sim, count = self._sim, self._frames.count
         self._use(IMPLICIT, self._frames.seconds)
-        largest = LARGEST_STEP
-        while largest > 1 and count < LEAST_STEPS * largest:
-            largest //= 2
-        per_frame = Fraction(1, largest)
-        while per_frame * count < LEAST_STEPS:
-            per_frame *= 2
+        sim, ladder, sizes = self._sim, self.ladder, implicit_sizes(self._frames.count)
         while True:
-            self.ladder.add(self._pilot(per_frame))
-            steps, pilots = self.ladder.steps_needed(self._tolerance), self.ladder.pilots
-            cost = implicit_step(sim.scene, sim.touches, pilots[-1].counts_per_step() if pilots else None)
-            likely = 2 * per_frame if self.ladder.are_few else self.ladder.likely_steps(self._tolerance)
-            if (steps or likely) * cost > explicit:
+            per_frame = next(sizes)
+            steps = float(per_frame) * self._frames.count
+            budget = Budget(sim.scene, sim.touches, explicit * steps / max(1.0, float(per_frame)), self._stop)
+            pilot = self._pilot(per_frame, budget=budget)
+            if budget.is_spent:
                 return None
-            if steps is not None or self.ladder.is_over:
-                return steps or self._last_steps()
-            per_frame *= 2
+            ladder.add(pilot)
+            needed = ladder.steps_needed(self._tolerance)
+            if self._passes_over_vibrations():
+                if explicit <= DEARER * implicit_step(sim.scene, sim.touches):
+                    return None
+                needed = needed or (self._last_steps() if ladder.pilots[-1].per_frame >= 1 else None)
+            last = ladder.pilots[-1] if ladder.pilots else None
+            cost = implicit_step(sim.scene, sim.touches, last and last.counts_per_step())
+            likely = max(1, per_frame) if ladder.are_few else ladder.likely_steps(self._tolerance)
+            if (needed or likely) * cost > explicit:
+                return None
+            if needed is not None or ladder.is_over:
+                return needed or self._last_steps()
+
+    def _passes_over_vibrations(self) -> bool:
+        """Whether steps of the last pilot cannot meet the tolerance: they pass over vibrations of bodies that touch in it."""
+        last = self.ladder.pilots[-1] if self.ladder.pilots and self._tolerance < VIBRATIONS else None
+        return bool(last and last.touches) and are_passed_over(self._sim.scene, self._dt(max(Fraction(1), last.per_frame)))
+
+    def _dt(self, per_frame: Fraction | int) -> float:
+        """Step [s] of so many in the time of a frame."""
+        return self._frames.seconds / float(per_frame)
 
     def _by_explicit_pilots(self, least: int) -> int:
         """Explicit steps in the time of a frame."""
-        self._use(EXPLICIT, self._frames.seconds / least)
-        slightly_more, ladder, ratio = Fraction(math.ceil(SMALLER * least)), self.ladder, 1.0
+        self._use(EXPLICIT, self._dt(least))
+        ladder, ratio = self.ladder, 1.0
         pilot = self._pilot(Fraction(least), keeps=True)
         ladder.add(pilot)
         if ladder.pilots:
             ladder.expect()
             ratio = ladder.steps_over_last(self._tolerance)
             if ladder.meets(self._tolerance) and pilot.report.status == "ok":
-                ladder.confirm(self._pilot(slightly_more, whole=pilot))
+                ladder.confirm(self._pilot(slightly_more(least), whole=pilot))
                 if ladder.meets(self._tolerance):
                     return least
-        if ratio <= SMALLER:
-            per_frame = slightly_more
-            ladder.replace_first(self._pilot(per_frame))
-        else:
-            per_frame = Fraction(math.ceil(least * (2.0 if ladder.nominal == 1 else min(MOST, max(LEAST_REACH, ratio)))))
-            ladder.add(self._pilot(per_frame))
+        per_frame, replaces = ladder.second_steps(least, ratio)
+        (ladder.replace_first if replaces else ladder.add)(self._pilot(per_frame))
         while True:
             steps = ladder.steps_needed(self._tolerance)
             if steps is not None or ladder.is_over:
@@ -201,14 +207,19 @@ class Chooser:
             raise SimulationError(f"every pilot failed, the last one because of {self._last_failure[1]}")
         return math.ceil(self.ladder.pilots[-1].per_frame)
 
-    def _pilot(self, per_frame: Fraction, whole: Pilot | None = None, keeps: bool = False) -> Pilot:
-        """Run a pilot, see `Frames.pilot`. Raises SimulationError if it and the one before fail: smaller steps do not help."""
-        pilot = self._frames.pilot(self._sim, per_frame, self._stop, self._run_steps, whole, keeps)
+    def _pilot(self, per_frame: Fraction, whole: Pilot | None = None, keeps: bool = False, budget: Budget | None = None) -> Pilot:
+        """Run a pilot, see `Frames.pilot`. budget: what may stop it, besides an interrupt.
+
+        Raises SimulationError if it and the one before fail: smaller steps do not help.
+        """
+        stop, on_step = (self._stop, None) if budget is None else (budget.stop, budget.add)
+        pilot = self._frames.pilot(self._sim, per_frame, stop, self._run_steps, whole, keeps, on_step)
         report, before = pilot.report, self._last_failure
         self.compile_seconds += report.compile_seconds
-        if report.interrupted:
+        spent = budget is not None and budget.is_spent
+        if report.interrupted and not spent:
             raise KeyboardInterrupt
-        if whole is not None:  # whether a part fails does not count
+        if whole is not None or spent:  # whether a part fails does not count
             return pilot
         self._last_failure = (report.sim_seconds, report.problems[-1]) if report.status == "failed" else None
         if before and self._last_failure and abs(report.sim_seconds - before[0]) <= self._frames.seconds:
@@ -217,11 +228,11 @@ class Chooser:
 
     def describe(self, steps: int) -> str:
         """What was chosen, in a sentence."""
-        chosen = f"{self._sim.settings.integrator}, dt = {self._frames.seconds / steps:.4g} s"
+        chosen = f"{self._sim.settings.integrator}, dt = {self._dt(steps):.4g} s"
         return f"for a tolerance of {100.0 * self._sim.settings.tolerance:.3g} %: {chosen}, by pilots with {self._pilot_steps()}"
 
     def _pilot_steps(self) -> str:
-        return ", ".join(f"dt = {self._frames.seconds / float(p.per_frame):.4g} s" for p in self.ladder.pilots)
+        return ", ".join(f"dt = {self._dt(p.per_frame):.4g} s" for p in self.ladder.pilots)
 
     # --- the run --------------------------------------------------------------------------------------------------------
 
@@ -252,7 +263,7 @@ class Chooser:
             if on_frame is not None:
                 on_frame(sim, index, report)
 
-        sim.dt = self._frames.seconds / steps
+        sim.dt = self._dt(steps)
         before = sim._host().changes
         report = self._run_steps(sim, self._seconds, frame, self._fps, self._stop, **observers)
         estimate = self.estimate(made)
@@ -291,6 +302,5 @@ class Chooser:
 
     def _add_vibrations(self, estimate: ErrorEstimate, run: Pilot) -> None:
         """Add to an estimate, of pilots or twins, what implicit steps of bodies that touch do not show."""
-        touched = any(report.n_contacts for report in self.ladder.pilots[-1].report.step_reports)
-        if touched and run.integrator == IMPLICIT:
-            add_vibrations(estimate, self._sim.scene, self._frames.seconds / float(run.per_frame))
+        if self.ladder.pilots[-1].touches and run.integrator == IMPLICIT:
+            add_vibrations(estimate, self._sim.scene, self._dt(run.per_frame))

@@ -42,12 +42,17 @@ def _has_friction(scene: Scene, body: Body) -> bool:
     return any(scene.contact_numbers(body.name, other)[0] > 0.0 for other in others)
 
 
+def are_passed_over(scene: Scene, dt: float) -> bool:
+    """Whether implicit steps of dt [s] pass over vibrations of bodies, if these touch."""
+    return RESOLVED * dt > shortest_period(scene)
+
+
 def add_vibrations(estimate: ErrorEstimate, scene: Scene, dt: float) -> None:
     """Raise the error in time of touching bodies to ERROR if implicit steps of dt [s] pass over their vibrations.
 
     An unknown error, or none at all, stays as it is.
     """
-    if estimate.time and RESOLVED * dt > shortest_period(scene):
+    if estimate.time and are_passed_over(scene, dt):
         estimate.time = max(estimate.time, ERROR)
         estimate.notes.append(
             f"the steps pass over vibrations of bodies in contact, on which friction acts: the error in time is taken to be "

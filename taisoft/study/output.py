@@ -50,13 +50,17 @@ MAX_ERROR_RATIO = 100.0  # of the smallest error to a reference's own, above whi
 OUTSIDE = 1e9  # beyond every axis
 
 
-def code_digest() -> str:
-    """Return a digest of the files of taisoft that results depend on and of the versions of taisoft, Taichi and NumPy."""
+def code_digest(besides: Iterable[str] = ()) -> str:
+    """Return a digest of the files of taisoft that results depend on and of the versions of taisoft, Taichi and NumPy.
+
+    besides: further folders of the package that the results do not depend on.
+    """
+    ignored = {*NOT_COMPUTING, *besides}
     found = versions("taichi", "numpy")
     total = hashlib.sha256(f"{__version__} {found['taichi']} {found['numpy']}".encode())
     for path in sorted(PACKAGE.rglob("*.py")):
         name = path.relative_to(PACKAGE).as_posix()
-        if name in COMPUTING or name.split("/")[0] not in NOT_COMPUTING:
+        if name in COMPUTING or name.split("/")[0] not in ignored:
             total.update(name.encode() + path.read_bytes())
     return total.hexdigest()
 
