@@ -166,26 +166,23 @@ def hint_of(t, u):
 
 
 @ti.func
-def _boxes_separate(g: ti.template(), t, u):
-    """1 if a plane across an axis separates two triangles at both ends of their paths."""
-    first, second = 2 * t, 2 * u
-    above = int(g.lo[first] > g.hi[second]) & int(g.lo[first + 1] > g.hi[second + 1])
-    below = int(g.lo[second] > g.hi[first]) & int(g.lo[second + 1] > g.hi[first + 1])
-    return int((above | below).any())
-
-
-@ti.func
 def list_unseparated(s: ti.template(), g: ti.template(), near: ti.template(), c):
     """List, in the last components of the first entries of part c, the entries whose triangles are not separated by a plane
     across an axis, nor by the first plane of either. Return their number.
 
-    No branch depends on a pair: which pairs are separated is hard to predict, and mispredicted branches would take longest.
+    No branch depends on whether a pair is separated: that is hard to predict, and mispredicted branches would take longest.
     """
-    begin, n = c * near.part, 0
+    begin, n, own = c * near.part, 0, -1
+    lo0, hi0, lo1, hi1 = dvec(0.0), dvec(0.0), dvec(0.0), dvec(0.0)
     for e in range(near.used[c]):
         t, u = near.data[begin + e][0], near.data[begin + e][1]
         near.data[begin + n][2] = e
-        n += 1 - _boxes_separate(g, t, u)
+        if t != own:  # pairs are ordered by their first triangle
+            own = t
+            lo0, hi0, lo1, hi1 = g.lo[2 * t], g.hi[2 * t], g.lo[2 * t + 1], g.hi[2 * t + 1]
+        above = int(lo0 > g.hi[2 * u]) & int(lo1 > g.hi[2 * u + 1])
+        below = int(g.lo[2 * u] > hi0) & int(g.lo[2 * u + 1] > hi1)
+        n += 1 - int((above | below).any())
     for side in range(2):
         size = n
         n = 0
