@@ -28,6 +28,10 @@ MAX_SUBSTEPS = 256  # per step
 MAX_CLOSING_RATIO = 2.0  # maximum closing ratio after a substep: its speed was not known when the step was cut
 MAX_SEARCHES = 3  # along a substep's actual path, if it left the expected one
 MAX_PASSAGES = 8  # repetitions of a substep with the pairs that would have passed through each other
+MAX_FAILED = 2  # attempts at a substep that did not converge, after which it is halved if something still passes
+# After a substep was undone, the next ones are no longer than it until one takes at most EASY Newton iterations, or PATIENCE were
+# kept: attempts at a length that is too long cost many times a short substep
+EASY, PATIENCE = 10, 4
 MAX_UNDONE = 16  # per step, for reasons other than speed: each costs a few solves
 WORSENING = 1.1  # growth of an existing penetration that counts as a new one
 RETRIES = 4  # maximum number of equal substeps after non-convergence; only shorter substeps are halved for that
@@ -99,6 +103,7 @@ class Substepping:
         shortest, longest = (1.0 - 1e-6) * dt / MAX_SUBSTEPS, dt / substeps
         results, remaining, length, undo_budget = [], dt, longest, MAX_UNDONE
         undone, n_unconverged = [], 0  # of the current substep
+        patience = 0  # substeps for which the length must not grow
         self._measure_start(start, dt)
         while True:
             time = start + (dt - remaining)
@@ -107,7 +112,7 @@ class Substepping:
                 remaining,
                 length,
                 longest,
-                bool(results) and not undone,
+                bool(results) and not undone and patience == 0,
             )
             if length < shortest:
                 if not contact.paths.none_cross:
@@ -117,7 +122,7 @@ class Substepping:
             relative_penetration, last = contact.relative_penetration, length > remaining - shortest
             released = stepper.simulation.dirichlet.released()
             may_cut = undo_budget > 0 and length >= 2.0 * shortest
-            result, fault = self._take_substep(time, length)
+            result, fault = self._take_substep(time, length, may_cut)
             if fault == Fault.FAST and length < 2.0 * shortest:
                 self._refuse_fast_closing(dt)
             if fault == Fault.CROSSED and not may_cut:
@@ -140,6 +145,7 @@ class Substepping:
             contact.end_substep()
             contact.count_flight(length, stepper.dissipative)
             results.append(count_all(result, undone))
+            patience = PATIENCE if undone else 0 if result.newton_iterations <= EASY else max(patience - 1, 0)
             if last:
                 return results
             remaining, undone, n_unconverged = remaining - length, [], 0
@@ -170,10 +176,11 @@ class Substepping:
         number = self._stepper.simulation.step_count + 1
         raise SimulationError(f"step {number}: {self._contact.describe_fast_closing(dt, MAX_SUBSTEPS)}")
 
-    def _take_substep(self, time: float, dt: float) -> tuple[StageResult, Fault | None]:
+    def _take_substep(self, time: float, dt: float, may_cut: bool) -> tuple[StageResult, Fault | None]:
         """Take a substep of dt from a time, and repeat it while its path has new contacts. Leave its end as the state."""
         contact, stepper, before = self._contact, self._stepper, self._contact.relative_penetration
         simulation, start, result = stepper.simulation, stepper.history.x_now, stepper.take_substep(time, dt)
+        n_failed = 0
         for tries in range(MAX_PASSAGES + 1):
             as_searched = not contact.paths.left_searched(start)
             passes = as_searched and contact.paths.find()
@@ -186,7 +193,9 @@ class Substepping:
                 passes = contact.paths.find(as_searched=True)
                 # contacts unknown so far matter only if something could have crossed
                 new = contact.search_along_path(time, dt) if passes else new and not contact.paths.none_cross
-            if not (new or passes) or tries >= (MAX_PASSAGES if passes else MAX_SEARCHES) or (passes and contact.paths.is_stuck):
+            n_failed += not (result.converged or stepper.is_linear)
+            hopeless = passes and (contact.paths.is_stuck or (may_cut and n_failed >= MAX_FAILED))
+            if not (new or passes) or tries >= (MAX_PASSAGES if passes else MAX_SEARCHES) or hopeless:
                 simulation.set_state(*state)
                 if passes:
                     return result, Fault.CROSSED
