@@ -29,9 +29,6 @@ MAX_CLOSING_RATIO = 2.0  # maximum closing ratio after a substep: its speed was 
 MAX_SEARCHES = 3  # along a substep's actual path, if it left the expected one
 MAX_PASSAGES = 8  # repetitions of a substep with the pairs that would have passed through each other
 MAX_FAILED = 2  # attempts at a substep that did not converge, after which it is halved if something still passes
-# After a substep was undone, the next ones are no longer than it until one takes at most EASY Newton iterations, or PATIENCE were
-# kept: attempts at a length that is too long cost many times a short substep
-EASY, PATIENCE = 10, 4
 MAX_UNDONE = 16  # per step, for reasons other than speed: each costs a few solves
 WORSENING = 1.1  # growth of an existing penetration that counts as a new one
 RETRIES = 4  # maximum number of equal substeps after non-convergence; only shorter substeps are halved for that
@@ -103,7 +100,6 @@ class Substepping:
         shortest, longest = (1.0 - 1e-6) * dt / MAX_SUBSTEPS, dt / substeps
         results, remaining, length, undo_budget = [], dt, longest, MAX_UNDONE
         undone, n_unconverged = [], 0  # of the current substep
-        patience = 0  # substeps for which the length must not grow
         self._measure_start(start, dt)
         while True:
             time = start + (dt - remaining)
@@ -112,7 +108,7 @@ class Substepping:
                 remaining,
                 length,
                 longest,
-                bool(results) and not undone and patience == 0,
+                bool(results) and not undone,
             )
             if length < shortest:
                 if not contact.paths.none_cross:
@@ -145,7 +141,6 @@ class Substepping:
             contact.end_substep()
             contact.count_flight(length, stepper.dissipative)
             results.append(count_all(result, undone))
-            patience = PATIENCE if undone else 0 if result.newton_iterations <= EASY else max(patience - 1, 0)
             if last:
                 return results
             remaining, undone, n_unconverged = remaining - length, [], 0
