@@ -49,7 +49,7 @@ def plane(X: array, P: array, floor: ti.f64, first: ti.i32, out: array):
         y = x + p
         start = [row_of(x, k) - row_of(x, 3) for k in ti.static((0, 1, 2, 4, 5))]
         end = [row_of(y, k) - row_of(y, 3) for k in ti.static((0, 1, 2, 4, 5))]
-        out[i] = separation.separating_plane(*start, *end, floor, first)
+        out[i] = separation.separating_plane(*start, *end, floor, first, 0)
 
 
 @pytest.fixture(scope="module", params=["f64", "f32"], autouse=True)

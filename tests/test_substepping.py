@@ -6,7 +6,8 @@
 * a substep that met unknown contacts is repeated with them;
 * a substep that ends in deep penetration, leaves the searched path, or whose contacts do not settle, is undone and halved, at
   most MAX_UNDONE times a step;
-* a substep in which something passes through something is repeated, then halved, then held back and reported;
+* a substep in which something passes through something is repeated, then halved, then held back and reported; it is halved
+  sooner if its equations cannot be solved;
 * bodies that close too fast for the shortest substep raise an error; after an error the state is that before the step.
 """
 
@@ -14,7 +15,7 @@ import numpy as np
 import pytest
 
 from taisoft.dynamics.results import StageResult
-from taisoft.dynamics.substepping import MAX_PASSAGES, MAX_SEARCHES, MAX_SUBSTEPS, MAX_UNDONE, Substepping
+from taisoft.dynamics.substepping import MAX_FAILED, MAX_PASSAGES, MAX_SEARCHES, MAX_SUBSTEPS, MAX_UNDONE, Substepping
 from taisoft.errors import SimulationError
 
 DT = 0.1  # [s]
@@ -235,6 +236,14 @@ def test_passages_are_searched_again_and_then_halve_a_substep(stepper):
     whole = [dt for _, dt in stepper.taken if dt == DT]
     assert covers_step(stepper) and len(stepper.kept) == 2 and len(whole) == MAX_PASSAGES + 1
     assert not stepper.held_back and result.converged
+
+
+def test_unconverged_passages_halve_a_substep_sooner(stepper):
+    stepper.converges = lambda time, dt: dt <= DT / 2
+    stepper.passes = lambda time, dt: dt > DT / 2
+    result = Substepping(stepper).step(0.0, DT)
+    whole = [dt for _, dt in stepper.taken if dt == DT]
+    assert covers_step(stepper) and len(stepper.kept) == 2 and len(whole) == MAX_FAILED < MAX_PASSAGES and result.converged
 
 
 def test_passages_end_with_the_repetition_that_has_none(stepper):

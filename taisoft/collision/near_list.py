@@ -19,11 +19,11 @@ import taichi as ti
 from taisoft.backend.arrays import Count, FieldArena
 from taisoft.backend.runtime import kernel
 from taisoft.collision.candidates import WHOLE, sum_parts
-from taisoft.collision.separation import BY_MIDDLES
-from taisoft.collision.surface import ACTIVE, dvec, list_near, may_meet
+from taisoft.collision.surface import ACTIVE, dvec, ivec, list_near, may_meet
 from taisoft.fem.chunks import part_first
 
 SEARCHED, TO_STATE, STILL = range(3)  # which paths are checked
+HINTS = 16  # planes stored per triangle
 UNCOVERED, OUTDATED = range(2)  # indices into PathFields.left
 
 
@@ -35,14 +35,15 @@ class PathFields:
     listed_x: Any  # (n_verts) vectors: positions and searched displacements when the near pairs were listed; 1 if n_listed is 0,
     listed_move: Any  # as are the fields of triangles
     n_listed: Count  # triangles that may be in near pairs: all, or none
-    can_touch: Any  # (n_verts) i32: 1 for vertices of active triangles
+    can_touch: Any  # (n_verts) i32: 1 for vertices of active triangles; between checks 0
     left_lo: Any  # (2 n_bodies) vectors: boxes of the vectors by which those have left the listed paths at the start and the end
     left_hi: Any
     left: Any  # (2) i32: 1 if paths leave what was searched (UNCOVERED), or if the list is of no use for them (OUTDATED)
-    lo: Any  # (2 n_triangles) vectors: boxes of active triangles at the start and the end, grown by half the floor; else empty
-    hi: Any
+    lo: Any  # (2 n_triangles) vectors: boxes of active triangles at the start and the end, grown by half the floor; else, and
+    hi: Any  # between checks, the first component of lo is infinite, so that they overlap nothing
     low: Any  # (2 n_triangles) f64: ranges of their heights along their first normals [m], likewise, grown by the floor
     high: Any
+    plane: Any  # (HINTS n_triangles) i32: of pairs of triangles, the plane that last separated them, see `hint_of`
     exempt: Any  # (n_bodies^2) i32: 1 for pairs of colliders that cross already
     first_vertex: Any  # (n_bodies + 1) i32: first vertex of each collider
     adjacent: Any  # (n_adjacent, 6) i32: vertices of two triangles
@@ -56,14 +57,15 @@ def _set_paths(s: ti.template(), x: ti.template(), g: ti.template(), mode, limit
         g.left[k] = 0
     ti.loop_config(serialize=s.serial_cheap)
     for i in range(s.n_verts):
-        g.can_touch[i] = 0
         path = s.move[i]
         if mode == STILL:
             path = dvec(0.0)
         elif mode == TO_STATE and s.node[i] >= 0:
             path = x[s.node[i]] - s.x[i]
-            if not _leaving(path, s.move[i]).norm() <= limit:  # also if it is not a number
-                g.left[UNCOVERED] = 1
+            change = path - s.move[i]
+            if not change.dot(change) <= limit * limit:  # cheaper, and mostly enough; also if it is not a number
+                if not _leaving(path, s.move[i]).norm() <= limit:
+                    g.left[UNCOVERED] = 1
         g.path[i] = path
 
 
@@ -80,20 +82,30 @@ def _leaving(r, move):
 def _box_ends(s: ti.template(), g: ti.template(), floor):
     """Set the boxes and heights of active triangles at both ends of their paths, and mark their vertices."""
     ti.loop_config(serialize=s.serial_cheap)
-    for t in range(g.n_listed):
-        for end in ti.static(range(2)):
-            g.lo[2 * t + end], g.hi[2 * t + end] = dvec(ti.math.inf), dvec(-ti.math.inf)
-    ti.loop_config(serialize=s.serial_cheap)
     for e in range(s.count[ACTIVE]):
         t = s.active[e]
         n, i, j, k = s.normal[t], s.triangle[t, 0], s.triangle[t, 1], s.triangle[t, 2]
         for v in ti.static((i, j, k)):
             g.can_touch[v] = 1
+        a0, b0, c0 = s.x[i], s.x[j], s.x[k]
+        a1, b1, c1 = a0 + g.path[i], b0 + g.path[j], c0 + g.path[k]
         for end in ti.static(range(2)):
-            a, b, c = s.x[i] + end * g.path[i], s.x[j] + end * g.path[j], s.x[k] + end * g.path[k]
+            a, b, c = ti.static(((a0, b0, c0), (a1, b1, c1))[end])
             p, q, r = a.dot(n), b.dot(n), c.dot(n)
             g.lo[2 * t + end], g.hi[2 * t + end] = ti.min(a, b, c) - 0.5 * floor, ti.max(a, b, c) + 0.5 * floor
             g.low[2 * t + end], g.high[2 * t + end] = ti.min(p, q, r) - floor, ti.max(p, q, r) + floor
+
+
+@ti.func
+def clear_ends(s: ti.template(), g: ti.template()):
+    """Empty the boxes of active triangles and unmark their vertices: no others were set."""
+    ti.loop_config(serialize=s.serial_cheap)
+    for e in range(s.count[ACTIVE]):
+        t = s.active[e]
+        for k in ti.static(range(3)):
+            g.can_touch[s.triangle[t, k]] = 0
+        for end in ti.static(range(2)):
+            g.lo[2 * t + end][0] = ti.math.inf
 
 
 @ti.func
@@ -148,15 +160,38 @@ def _is_beyond(s: ti.template(), g: ti.template(), own, other):
 
 
 @ti.func
-def boxes_or_planes_separate(s: ti.template(), g: ti.template(), t, u):
-    """1 if a plane across an axis, or that of one of the two triangles at first, separates them at both ends of their paths."""
-    first, second = 2 * t, 2 * u
-    above = int(g.lo[first] > g.hi[second]) & int(g.lo[first + 1] > g.hi[second + 1])
-    below = int(g.lo[second] > g.hi[first]) & int(g.lo[second + 1] > g.hi[first + 1])
-    apart = int((above | below).any())
-    if apart == 0:
-        apart = _is_beyond(s, g, t, u) | _is_beyond(s, g, u, t)  # either alone is hard to predict
-    return apart
+def hint_of(t, u):
+    """Index of the plane stored for a pair of triangles; several pairs may share it, since it is only tried first."""
+    return HINTS * t + u % HINTS
+
+
+@ti.func
+def list_unseparated(s: ti.template(), g: ti.template(), near: ti.template(), c):
+    """List, in the last components of the first entries of part c, the entries whose triangles are not separated by a plane
+    across an axis, nor by the first plane of either. Return their number.
+
+    No branch depends on whether a pair is separated: that is hard to predict, and mispredicted branches would take longest.
+    """
+    begin, n, own = c * near.part, 0, -1
+    lo0, hi0, lo1, hi1 = dvec(0.0), dvec(0.0), dvec(0.0), dvec(0.0)
+    for e in range(near.used[c]):
+        t, u = near.data[begin + e][0], near.data[begin + e][1]
+        near.data[begin + n][2] = e
+        if t != own:  # pairs are ordered by their first triangle
+            own = t
+            lo0, hi0, lo1, hi1 = g.lo[2 * t], g.hi[2 * t], g.lo[2 * t + 1], g.hi[2 * t + 1]
+        above = int(lo0 > g.hi[2 * u]) & int(lo1 > g.hi[2 * u + 1])
+        below = int(g.lo[2 * u] > hi0) & int(g.lo[2 * u + 1] > hi1)
+        n += 1 - int((above | below).any())
+    for side in range(2):
+        size = n
+        n = 0
+        for k in range(size):
+            e = near.data[begin + k][2]
+            t, u = near.data[begin + e][0], near.data[begin + e][1]
+            near.data[begin + n][2] = e
+            n += 1 - _is_beyond(s, g, ti.select(side == 0, t, u), ti.select(side == 0, u, t))
+    return n
 
 
 @kernel
@@ -190,7 +225,7 @@ def list_near_pairs(
                             for e in range(begin, begin + n):
                                 if row.data[e] > t:
                                     if at < last:
-                                        out.data[at] = ti.Vector([t, row.data[e], BY_MIDDLES], ti.i32)
+                                        out.data[at] = ivec(t, row.data[e], 0)
                                     at += 1
             out.used[c], row.used[c] = at - c * out.part, max_row
     ti.loop_config(serialize=True)
@@ -200,5 +235,5 @@ def list_near_pairs(
 
 
 def near_pairs(arena: FieldArena, capacity: int) -> Any:
-    """Allocate a field of pairs of triangles, each with the number of the plane that last separated it."""
-    return arena.vectors("near_pair", ti.i32, capacity, n=3)
+    """Allocate a field of pairs of triangles, and of a component that is free between checks."""
+    return arena.vectors("near_pair", ti.i32, capacity)

@@ -23,7 +23,7 @@ from taisoft.collision.analytic import CAPSULE, HALF_SPACE, SPHERE, rotation_row
 from taisoft.collision.candidates import sum_parts
 from taisoft.collision.contacts import FACE_FACE, write_contact
 from taisoft.collision.features import unit
-from taisoft.collision.near_list import OUTDATED, STILL, UNCOVERED, boxes_or_planes_separate, prepare_paths
+from taisoft.collision.near_list import OUTDATED, STILL, UNCOVERED, clear_ends, hint_of, list_unseparated, prepare_paths
 from taisoft.collision.separation import at_weights, free_until, nearest_of, separating_plane, unit_row
 from taisoft.collision.surface import dvec, ivec
 from taisoft.fem.chunks import part_first
@@ -111,14 +111,20 @@ def _separating_plane(s: ti.template(), o: ti.template(), g: ti.template(), kind
     x5, v = _corner(s, o, g, kind, a, b, 5, g.path)
     a0, b0, c0, e0, f0 = x0 - d0, x1 - d0, x2 - d0, x4 - d0, x5 - d0
     a1, b1, c1, e1, f1 = a0 + (p - d), b0 + (q - d), c0 + (r - d), e0 + (u - d), f0 + (v - d)
-    return separating_plane(a0, b0, c0, e0, f0, a1, b1, c1, e1, f1, need, first)
+    return separating_plane(a0, b0, c0, e0, f0, a1, b1, c1, e1, f1, need, first, int(kind == NEAR))
 
 
 @ti.func
-def _height(o: ti.template(), k, p, at_end):
-    """Height [m] of point p over half-space k."""
+def _plane(o: ti.template(), k, at_end):
+    """A point (3,) [m] and the normal (3,) of half-space k now, or at the end of the step."""
     x, R = _pose(o, k, at_end)
-    return (R.transpose() @ (p - x))[1]
+    return x, R @ dvec(0.0, 1.0, 0.0)
+
+
+@ti.func
+def _lowest(s: ti.template(), b, x, n):
+    """Height [m] of the box of collider b, around its searched paths, over a plane."""
+    return ti.min((s.body_lo[b] - x) * n, (s.body_hi[b] - x) * n).sum()
 
 
 @ti.func
@@ -134,6 +140,26 @@ def _write_passage(out: ti.template(), at, last, kind, a, b, features, time):
         out.pair[at] = ti.Vector([kind, a, b, features], ti.i32)
         out.time[at] = time
     return at + 1
+
+
+@ti.func
+def _write_half_space_passages(
+    s: ti.template(), o: ti.template(), g: ti.template(), k, c, limit, floor, out: ti.template(), start, last
+):
+    """Write the passages of the vertices of chunk c through half-space k; limit, floor [m]: as in `check_paths`. Return the new
+    count."""
+    at, first, end = start, part_first(c, s.n_verts, s.chunks), part_first(c + 1, s.n_verts, s.chunks)
+    x0, n0 = _plane(o, k, 0)
+    x1, n1 = _plane(o, k, 1)
+    for b in range(s.n_bodies):
+        # without a limit, paths may leave the boxes, and there may be none
+        if s.soft[b] == 1 and (limit == ti.math.inf or _lowest(s, b, x1, n1) < floor):
+            for i in range(ti.max(g.first_vertex[b], first), ti.min(g.first_vertex[b + 1], end)):
+                now, then = (s.x[i] - x0).dot(n0), (s.x[i] + g.path[i] - x1).dot(n1)
+                need = ti.min(floor, ti.select(now > 0.0, 0.5 * now, now))  # no deeper than before
+                if then < need:
+                    at = _write_passage(out, at, last, FLAT, i, k, 0, (now - need) / (now - then))
+    return at
 
 
 @kernel(cse=False)
@@ -161,27 +187,22 @@ def check_paths(
             c = task // s.spread
             at, last = c * out.part, (c + 1) * out.part
             if g.left[UNCOVERED] == 0 and g.left[OUTDATED] == 0:
+                n_round, n_near = 0, list_unseparated(s, g, near, c)
                 if ti.static(o.any):
-                    for i in range(part_first(c, s.n_verts, s.chunks), part_first(c + 1, s.n_verts, s.chunks)):
-                        for k in range(o.count):
-                            if o.kind[k] == HALF_SPACE and s.node[i] >= 0:
-                                if mode != STILL:
-                                    now, then = _height(o, k, s.x[i], 0), _height(o, k, s.x[i] + g.path[i], 1)
-                                    need = ti.min(floor, ti.select(now > 0.0, 0.5 * now, now))  # no deeper than before
-                                    if then < need:
-                                        at = _write_passage(out.data, at, last, FLAT, i, k, 0, (now - need) / (now - then))
-                n_round, n_near = 0, near.used[c]
-                if ti.static(o.any):
-                    n_round = o.count * (part_first(c + 1, s.n_triangles, s.chunks) - part_first(c, s.n_triangles, s.chunks))
+                    n_triangles = part_first(c + 1, s.n_triangles, s.chunks) - part_first(c, s.n_triangles, s.chunks)
+                    for k in range(o.count):
+                        if o.kind[k] == SPHERE or o.kind[k] == CAPSULE:
+                            n_round = o.count * n_triangles
+                        elif o.kind[k] == HALF_SPACE and mode != STILL:
+                            at = _write_half_space_passages(s, o, g, k, c, limit, floor, out.data, at, last)
                 n_adjacent = part_first(c + 1, g.n_adjacent, s.chunks) - part_first(c, g.n_adjacent, s.chunks)
                 for e in range(n_near + n_adjacent + n_round):
                     kind, a, b, checked, plane = NEAR, 0, 0, True, 0
                     if e < n_near:
-                        listed = near.data[c * near.part + e]
-                        a, b, plane = listed[0], listed[1], listed[2]
-                        checked = boxes_or_planes_separate(s, g, a, b) == 0
-                        if checked:
-                            checked = g.exempt[s.body[a] * s.n_bodies + s.body[b]] == 0
+                        pair = near.data[c * near.part + near.data[c * near.part + e][2]]
+                        a, b = pair[0], pair[1]
+                        plane = g.plane[hint_of(a, b)]
+                        checked = g.exempt[s.body[a] * s.n_bodies + s.body[b]] == 0
                     elif e < n_near + n_adjacent:
                         kind, a = ADJACENT, part_first(c, g.n_adjacent, s.chunks) + e - n_near
                         checked = g.exempt[_body_of(s, g.adjacent[a, 0]) * (s.n_bodies + 1)] == 0
@@ -196,13 +217,14 @@ def check_paths(
                         found = _separating_plane(s, o, g, kind, a, b, floor + radius, plane)
                         checked = found < 0
                         if e < n_near and found >= 0 and found != plane:
-                            near.data[c * near.part + e][2] = found
+                            g.plane[hint_of(a, b)] = found
                     if checked:
                         y, p = _rows(s, o, g, kind, a, b, g.path)
                         time, features = free_until(y, p, radius, floor, mode != STILL)
                         if time < 1.0:
                             at = _write_passage(out.data, at, last, kind, a, b, features, time)
             out.used[c] = at - c * out.part
+    clear_ends(s, g)
     ti.loop_config(serialize=True)
     for _ in range(1):
         sum_parts(out)
@@ -232,8 +254,8 @@ def append_passages(
                     body_b = o.body[b]
             if kind == FLAT:
                 if ti.static(o.any):
-                    origin, R = _pose(o, b, 0)
-                    n, point = R @ dvec(0.0, 1.0, 0.0), s.x[a]
+                    origin, normal = _plane(o, b, 0)
+                    n, point = normal, s.x[a]
                     gap = (point - origin).dot(n)
             else:
                 corner = ivec([_vertex(s, g, kind, a, b, k) for k in ti.static(range(3))])

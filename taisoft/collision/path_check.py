@@ -8,7 +8,7 @@ from taisoft.collision.analytic import AnalyticObstacles
 from taisoft.collision.bvh import Trees
 from taisoft.collision.candidates import TOTAL, Buffer
 from taisoft.collision.colliders import Topology
-from taisoft.collision.near_list import OUTDATED, UNCOVERED, PathFields, list_near_pairs, near_pairs
+from taisoft.collision.near_list import HINTS, OUTDATED, UNCOVERED, PathFields, list_near_pairs, near_pairs
 from taisoft.collision.passages import ADJACENT, FLAT, N_KINDS, NEAR, ROUND, check_paths, passage_fields
 from taisoft.collision.surface import Surface, integers
 from taisoft.ranges import expand
@@ -68,13 +68,15 @@ class PathCheck:
         n_listed = s.n_triangles if has_pairs else 0
         triangle_ends = max(2 * n_listed, 1)
         lengths = {"path": n} | dict.fromkeys(("listed_x", "listed_move"), n if has_pairs else 1)
-        lengths |= dict.fromkeys(("left_lo", "left_hi"), 2 * s.n_bodies) | dict.fromkeys(("lo", "hi"), triangle_ends)
+        lengths |= dict.fromkeys(("left_lo", "left_hi"), 2 * s.n_bodies) | {"hi": triangle_ends}
         self.fields = PathFields(
             **{name: arena.vectors(f"path_{name}", ti.f64, length) for name, length in lengths.items()},
+            lo=arena.vectors("path_lo", ti.f64, triangle_ends, np.full((triangle_ends, 3), np.inf)),
             **{name: arena.field(f"path_{name}", ti.f64, triangle_ends) for name in ("low", "high")},
             n_listed=n_listed,
             can_touch=arena.field("path_can_touch", ti.i32, n),
             left=arena.field("path_left", ti.i32, 2),
+            plane=arena.field("path_plane", ti.i32, max(HINTS * n_listed, 1)),
             exempt=arena.field("path_exempt", ti.i32, s.n_bodies**2),
             first_vertex=integers(arena, "path_first_vertex", topology.vertex_first),
             adjacent=integers(arena, "path_adjacent", rows.reshape(-1, 6)),

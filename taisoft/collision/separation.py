@@ -22,7 +22,7 @@ from taisoft.collision.surface import dvec
 MAX_ADVANCES = 64
 LEAST, ROUNDING = 1e-3, 1e-12  # of the floor, and of the largest coordinate: distance below which triangles touch
 BELOW_LEAST = 0.999  # of it: what was certified to keep that distance does not touch
-N_PLANES, BY_MIDDLES = 15, 1  # of `separating_plane`
+N_PLANES = 15  # of `separating_plane`
 PROGRESS = 2e-3  # of the remaining motion: an advance below it ends the search
 
 
@@ -241,19 +241,21 @@ def _edge(k, a, b, c):
 
 
 @ti.func
-def separating_plane(a0, b0, c0, e0, f0, a1, b1, c1, e1, f1, need, first):
+def separating_plane(a0, b0, c0, e0, f0, a1, b1, c1, e1, f1, need, first, tried):
     """Number of a plane that keeps triangles abc and def at least `need` [m] apart on straight paths, -1 if none of a few that
     are cheap to test does. All (3,): corners at the start and at the end, relative to corner d.
 
     0: across an axis; 1: between their middles; 2, 3: that of def, of abc, at the start; 4, 5: the same, moving along; 6 to 14:
     along an edge of each at the start, numbered as in `nearest_of`. first: the number to be tried first, since one plane mostly
-    serves for many steps; whether there is one does not depend on it.
+    serves for many steps; whether there is one does not depend on it. tried: 1 to skip 0, 2 and 3, which are then known to fail.
     """
     found, k = -1, 0
     while k < N_PLANES and found < 0:
         plane = ti.select(k == 0, first, ti.select(k > first, k, k - 1))
         separates = False
-        if plane == 0:
+        if tried == 1 and (plane == 0 or plane == 2 or plane == 3):
+            pass
+        elif plane == 0:
             separates = _axis_separates(a0, b0, c0, e0, f0, a1, b1, c1, e1, f1, need)
         elif plane < 4 or plane > 5:
             n = (a0 + b0 + c0) - (e0 + f0)

@@ -28,6 +28,7 @@ MAX_SUBSTEPS = 256  # per step
 MAX_CLOSING_RATIO = 2.0  # maximum closing ratio after a substep: its speed was not known when the step was cut
 MAX_SEARCHES = 3  # along a substep's actual path, if it left the expected one
 MAX_PASSAGES = 8  # repetitions of a substep with the pairs that would have passed through each other
+MAX_FAILED = 2  # attempts at a substep that did not converge, after which it is halved if something still passes
 MAX_UNDONE = 16  # per step, for reasons other than speed: each costs a few solves
 WORSENING = 1.1  # growth of an existing penetration that counts as a new one
 RETRIES = 4  # maximum number of equal substeps after non-convergence; only shorter substeps are halved for that
@@ -117,7 +118,7 @@ class Substepping:
             relative_penetration, last = contact.relative_penetration, length > remaining - shortest
             released = stepper.simulation.dirichlet.released()
             may_cut = undo_budget > 0 and length >= 2.0 * shortest
-            result, fault = self._take_substep(time, length)
+            result, fault = self._take_substep(time, length, may_cut)
             if fault == Fault.FAST and length < 2.0 * shortest:
                 self._refuse_fast_closing(dt)
             if fault == Fault.CROSSED and not may_cut:
@@ -170,10 +171,11 @@ class Substepping:
         number = self._stepper.simulation.step_count + 1
         raise SimulationError(f"step {number}: {self._contact.describe_fast_closing(dt, MAX_SUBSTEPS)}")
 
-    def _take_substep(self, time: float, dt: float) -> tuple[StageResult, Fault | None]:
+    def _take_substep(self, time: float, dt: float, may_cut: bool) -> tuple[StageResult, Fault | None]:
         """Take a substep of dt from a time, and repeat it while its path has new contacts. Leave its end as the state."""
         contact, stepper, before = self._contact, self._stepper, self._contact.relative_penetration
         simulation, start, result = stepper.simulation, stepper.history.x_now, stepper.take_substep(time, dt)
+        n_failed = 0
         for tries in range(MAX_PASSAGES + 1):
             as_searched = not contact.paths.left_searched(start)
             passes = as_searched and contact.paths.find()
@@ -186,7 +188,9 @@ class Substepping:
                 passes = contact.paths.find(as_searched=True)
                 # contacts unknown so far matter only if something could have crossed
                 new = contact.search_along_path(time, dt) if passes else new and not contact.paths.none_cross
-            if not (new or passes) or tries >= (MAX_PASSAGES if passes else MAX_SEARCHES) or (passes and contact.paths.is_stuck):
+            n_failed += not (result.converged or stepper.is_linear)
+            hopeless = passes and (contact.paths.is_stuck or (may_cut and n_failed >= MAX_FAILED))
+            if not (new or passes) or tries >= (MAX_PASSAGES if passes else MAX_SEARCHES) or hopeless:
                 simulation.set_state(*state)
                 if passes:
                     return result, Fault.CROSSED
