@@ -25,16 +25,20 @@ SMALL = 1e-3  # of the frequency and damping rate of connections: a frequency th
 LANCZOS_MARGIN = 1.005  # Lanczos approaches the highest frequency from below; its tolerance is half this margin
 
 
-def hooke_differential(body: Body):
-    """Return v -> K v of one body at rest, matrix-free: a function (n,3) -> (n,3) [N per unit of v]."""
+def hooke_differential(body: Body, with_floor: bool = False):
+    """Return v -> K v of one body at rest, matrix-free: a function (n,3) -> (n,3) [N per unit of v].
+
+    with_floor: add what a volume floor delta adds to flat tets whose sides have their lengths at rest: at most 2/delta times the
+    stiffness of each, with its own dilatation, see `laws.volume_floor`.
+    """
     nodes, (mu, lam) = body.nodes.elements, body.composition.lame
     gradients, volumes = reference.shape_gradients(body)
+    added, is_mean = _floor_stiffness(body) if with_floor else 0.0, body.dilatation == "mean"
+    mu, lam = mu * (1.0 + added), lam * (added if is_mean else 1.0 + added)
     if body.composition.elastic_by_tet:  # one row for each quadrature point
         mu, lam = (np.repeat(np.broadcast_to(x, len(nodes)), volumes.shape[1])[:, None] for x in (mu, lam))
         mu = mu[:, :, None]
-    average = None
-    if body.dilatation == "mean":
-        lam, average = _patch_average(body, volumes)
+    patch_lam, average = _patch_average(body, volumes) if is_mean else (None, None)
     rows = gradients.swapaxes(2, 3)  # (m, p, 3, nodes of a tet): d/dX_j of v at each point; SciPy sums this layout fastest
     columns = np.broadcast_to(nodes[:, None, None, :], rows.shape)
     starts = np.arange(0, rows.size + 1, nodes.shape[1])
@@ -45,10 +49,18 @@ def hooke_differential(body: Body):
         H = (gradient @ v).reshape(-1, 3, 3)
         P = mu * (H + H.transpose(0, 2, 1))
         theta = H[:, 0, 0] + H[:, 1, 1] + H[:, 2, 2]
-        P[:, (0, 1, 2), (0, 1, 2)] += lam * (theta if average is None else average(theta))[:, None]
+        P[:, (0, 1, 2), (0, 1, 2)] += lam * theta[:, None]
+        if is_mean:
+            P[:, (0, 1, 2), (0, 1, 2)] += patch_lam * average(theta)[:, None]
         return divergence @ (weight * P).reshape(-1, 3)
 
     return apply
+
+
+def _floor_stiffness(body: Body) -> np.ndarray:
+    """2/delta of a body's tets with a volume floor delta, 0 of those without one: one number, or (m,)."""
+    floor = np.asarray(body.composition.number("volume_floor"))
+    return np.where(floor > 0.0, 2.0 / np.where(floor > 0.0, floor, 1.0), 0.0)
 
 
 def _patch_average(body: Body, volumes: np.ndarray):
@@ -102,14 +114,17 @@ def constrained_axes(body: Body, prescribed: bool, scene: Scene | None = None) -
 
 
 def highest_frequency(body: Body) -> float:
-    """omega_max [rad/s] of a body at rest with lumped mass, by Lanczos; overestimated by a fraction of a percent."""
+    """omega_max [rad/s] that explicit steps of a body must resolve, by Lanczos; overestimated by a fraction of a percent.
+
+    It is that at rest with lumped mass. A volume floor stiffens its tets by what it adds to flat ones, see `hooke_differential`.
+    """
     mass = reference.lumped_mass(body)
     free = ~constrained_axes(body, prescribed=False)  # a path may release its nodes
     free[body.nodes.n_elastic :] = False
     scale = np.where(free, 1.0 / np.sqrt(np.where(free, mass[:, None], 1.0)), 0.0)
     if not free.any():
         return 0.0
-    apply = hooke_differential(body)
+    apply = hooke_differential(body, with_floor=True)
     size = scale.size
     operator = spl.LinearOperator(
         (size, size), matvec=lambda y: (scale * apply(scale * y.reshape(-1, 3))).reshape(-1), dtype=np.float64
@@ -120,15 +135,6 @@ def highest_frequency(body: Body) -> float:
         return LANCZOS_MARGIN * float(np.sqrt(np.linalg.eigvalsh(0.5 * (dense + dense.T))[-1]))
     top = spl.eigsh(operator, k=1, which="LA", tol=0.5 * (LANCZOS_MARGIN - 1.0), v0=start, return_eigenvectors=False)
     return LANCZOS_MARGIN * float(np.sqrt(top[0]))
-
-
-def _explicit_frequency(body: Body) -> float:
-    """omega [rad/s] that explicit steps of a body must resolve: its highest, times sqrt(1 + 2/delta) with a volume floor delta.
-
-    The floor adds 2/delta times lambda + 2 mu to a flat tet whose sides have their lengths at rest, see `laws.volume_floor`.
-    """
-    floors = [material.volume_floor for material in body.composition.materials.values() if material.volume_floor > 0.0]
-    return highest_frequency(body) * (float(np.sqrt(1.0 + 2.0 / min(floors))) if floors else 1.0)
 
 
 def scale_warnings(scene: Scene) -> list[str]:
@@ -144,7 +150,7 @@ def scale_warnings(scene: Scene) -> list[str]:
             warnings.append(
                 f"body '{body.name}': {size:.4g} m long and {mass:.3g} kg, its own weight strains it by about {strain:.2g}; "
                 f"a wave crosses it in {crossing:.2g} s, explicit steps must stay below "
-                f"{2.0 / _explicit_frequency(body):.2g} s: is the mesh in metres and young in pascals?"
+                f"{2.0 / highest_frequency(body):.2g} s: is the mesh in metres and young in pascals?"
             )
     return warnings
 
@@ -168,8 +174,8 @@ def _verlet_matrix(z: float, alpha: float, beta: float) -> np.ndarray:
 def stable_dt(scene: Scene, verlet: bool) -> float:
     """Largest stable step [s] of an explicit integrator about the rest shape; infinite if nothing can vibrate.
 
-    It is 2/omega without damping, omega from `_explicit_frequency`, else the dt at which an eigenvalue of the step matrix leaves
-    the unit disk. Rigid bodies have no omega of their own. Springs add their own largest omega^2 and damping rate to those of
+    It is 2/omega_max without damping, else the dt at which an eigenvalue of the step matrix leaves the unit disk; omega_max from
+    `highest_frequency`. Rigid bodies have none of their own. Springs add their own largest omega^2 and damping rate to those of
     the bodies that they connect, and nodes attached exactly multiply omega by `DependentTable.growth`, which are upper bounds.
     """
     limit = np.inf
@@ -183,7 +189,7 @@ def stable_dt(scene: Scene, verlet: bool) -> float:
         if isinstance(body, RigidBody):  # explicit steps move it as one
             omega = SMALL * (np.sqrt(square) + rate) if body.name in connected else 0.0
         else:
-            omega = _explicit_frequency(body)
+            omega = highest_frequency(body)
         if omega > 0.0:
             if body.name in connected:
                 omega, own_square, own_rate = growth * omega, square, rate

@@ -5,7 +5,7 @@
 * from J = floor on they are the law's own, bit for bit; the second derivative has no jump at J = floor and J = 0;
 * with mean dilatation, in both orders, it adds the same energy, of which force and tangent are derivatives;
 * a column under a load that turns the law inside out stands at the volume that the formula gives; a squeezed block keeps its
-  tets, in implicit steps, and in explicit ones below `stable_dt`, which counts the floor;
+  tets, in implicit steps, and in explicit ones below `stable_dt`, which counts the floor, also with mean dilatation, by region;
 * explicit and implicit steps, with damping, are the oracle's; changed numbers and resumed runs work; regions may differ in it;
 * a scene without it has no number for it, and a body without it in a scene with one moves as alone, bit for bit.
 
@@ -18,13 +18,15 @@ import pytest
 from following import follow, simulator
 from matrices import MATRICES, rotations, stretched
 from scenes import COR, SNH, SVK, cube, halved, mixed_scene, rubber
+from scipy.sparse.linalg import LinearOperator, eigsh
 
 import taisoft as ts
 from taisoft.dynamics.schemes import EXPLICIT
 from taisoft.errors import SimulationError
 from taisoft.fem.laws import LAWS
 from taisoft.fem.laws.evaluate import evaluate_differential
-from taisoft.fem.reference import shape_gradients
+from taisoft.fem.reference import lumped_mass, shape_gradients
+from taisoft.stability import stable_dt
 
 YOUNG, POISSON, FLOOR = 3e5, 0.35, 0.08
 each_law = pytest.mark.parametrize("law", LAWS)
@@ -156,9 +158,11 @@ def lowest(scene: ts.Scene, **settings) -> tuple[float, int]:
 
 @pytest.mark.parametrize("precision", ["f32", "f64"])
 def test_a_squeezed_block_keeps_its_tets(precision):
-    J, inverted = lowest(squeezed_block(0.0), dt=0.05, precision=precision)
+    with pytest.warns(UserWarning, match=f"{SVK} softens: tets may collapse or invert"):
+        J, inverted = lowest(squeezed_block(0.0), dt=0.05, precision=precision)
     assert J < -0.5 and inverted > 10
-    J, inverted = lowest(squeezed_block(0.1), dt=0.05, precision=precision)
+    with pytest.warns(UserWarning, match=f"{SVK} softens: tets may collapse to below their volume_floor of 0.1"):
+        J, inverted = lowest(squeezed_block(0.1), dt=0.05, precision=precision)
     assert 0.0 < J < 0.1 and inverted == 0
 
 
@@ -244,6 +248,41 @@ def test_explicit_steps_resolve_the_floor():
     assert 0.0 < J < 0.1 and inverted == 0
     with pytest.raises(SimulationError), pytest.warns(UserWarning, match="stab"):
         lowest(scene, dt=0.9 * limits[0.0], allow_unstable=True, **settings)
+
+
+@pytest.mark.parametrize("dilatation", ["local", "mean"])
+@pytest.mark.parametrize("order", [1, 2])
+def test_stable_dt_counts_flat_tets(order, dilatation):
+    """Flat tets of a skewed mesh whose sides have their lengths at rest vibrate a little slower than `stable_dt` allows."""
+    scene, mesh = ts.Scene(gravity=(0, 0, 0)), ts.box_mesh((2, 2, 2), (1, 1, 1))
+    skewed = ts.TetMesh(mesh.vertices + 0.08 * np.random.default_rng(0).standard_normal(mesh.vertices.shape), mesh.tets)
+    body = scene.add_body(skewed, rubber(SNH, poisson=0.49, volume_floor=0.05), order=order, dilatation=dilatation)
+    rest, scale = body.rest_positions, 1.0 / np.sqrt(lumped_mass(body))[:, None]
+    with ts.Simulator(scene, dt=1e-6, integrator="symplectic_euler", precision="f64") as sim:
+
+        def scaled(v: np.ndarray) -> np.ndarray:
+            return -(scale * sim.force_differential(scale * v.reshape(-1, 3))).reshape(-1)
+
+        squares = []
+        for n in np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 0], [1, 1, 1], [1, -1, 1]]):
+            sim.set_state(positions=rest - 0.995 * np.outer(rest @ n, n) / (n @ n))
+            operator = LinearOperator((rest.size, rest.size), matvec=scaled, dtype=np.float64)
+            squares.append(eigsh(operator, k=1, which="LA", tol=1e-3, v0=np.ones(rest.size), return_eigenvectors=False)[0])
+        assert 0.6 < sim.stable_dt / (2.0 / np.sqrt(max(squares))) < 1.0
+
+
+def test_stable_dt_counts_the_floor_of_each_region():
+    """A floor in a soft region of a stiff body shortens it less than in the stiff one."""
+
+    def limit(soft: float, stiff: float) -> float:
+        scene = ts.Scene()
+        materials = {"left": rubber(SNH, young=1e3, volume_floor=soft), 7: rubber(SNH, young=1e6, volume_floor=stiff)}
+        scene.add_body(halved(cube(cells=(2, 1, 1))), materials)
+        return stable_dt(scene, verlet=False)
+
+    assert limit(0.05, 0.0) == pytest.approx(limit(0.0, 0.0), rel=0.02)
+    assert limit(0.0, 0.05) == pytest.approx(limit(0.0, 0.0) / np.sqrt(41.0), rel=0.02)
+    assert limit(0.1, 0.1) == pytest.approx(limit(0.0, 0.0) / np.sqrt(21.0), rel=1e-3)
 
 
 @pytest.mark.parametrize("integrator, damping, tolerance", [("velocity_verlet", 1e-4, 1e-10), ("implicit_euler", 4e-3, 1e-8)])

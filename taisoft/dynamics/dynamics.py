@@ -240,9 +240,11 @@ class Dynamics:
         k = int(np.searchsorted(layout.tet_start, at, side="right")) - 1
         body, tet = self.scene.bodies[k], at - layout.tet_start[k]
         law = LAWS[body.composition.law_of_tet(tet)]
+        floor = np.broadcast_to(body.composition.number("volume_floor"), body.mesh.n_tets)[tet]
+        collapse = f"collapse to below their volume_floor of {floor:g}" if floor > 0.0 else "collapse or invert, and stay so"
         return (
             f"step {self.state.step_count}: tet {tet} of body '{body.name}' is compressed below {law.SOFTENS_BELOW} of its "
-            f"length, where {law.NAME} softens: tets may collapse or invert, and stay so"
+            f"length, where {law.NAME} softens: tets may {collapse}"
         )
 
     def find_contacts(self, dt: float) -> "Detection":
