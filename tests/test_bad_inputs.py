@@ -269,11 +269,11 @@ def test_suspicious_input_is_reported(tmp_path):
 
 
 def assert_far_body_bends_alike(out, files, sizes):
-    """The same cube 1e6 m away bends alike, up to the digits lost to the distance."""
+    """The same cube 1e6 m away bends alike, up to the tolerance of Newton's method in single precision."""
     x = read_checkpoint(out / "checkpoint.npz").state["simulation"]["x"]
     starts = dict(zip(sizes, np.cumsum([0, *sizes.values()])))
     moves = [x[starts[name] : starts[name] + SIZE] - files[name][0] for name in ("near", "far")]
-    assert 1e-4 < np.abs(moves[0]).max() < 0.05 and np.abs(moves[0] - moves[1]).max() < 1e-5 * np.abs(moves[0]).max()
+    assert 1e-4 < np.abs(moves[0]).max() < 0.05 and np.abs(moves[0] - moves[1]).max() < 1e-4 * np.abs(moves[0]).max()
 
 
 def assert_prims_have_names(path, names):
