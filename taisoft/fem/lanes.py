@@ -24,14 +24,6 @@ def rest_gradients(m: ti.template(), b, real: ti.template()):
 
 
 @ti.func
-def rest_gradient(m: ti.template(), b, a):
-    """Gradient of the shape function of corner a + 1, row a of Dm^-1, of the tets of block b (three lane entries) [1/m]."""
-    return [
-        ti.Vector([ti.cast(m.Dm_inv[b, 3 * a + c, q], m.real) for q in ti.static(range(m.lanes))]) for c in ti.static(range(3))
-    ]
-
-
-@ti.func
 def volumes(m: ti.template(), b, real: ti.template()):
     """Rest volumes of the tets of block b [m^3]; 0 in padding lanes."""
     return ti.Vector([ti.cast(m.volume[b, q], real) for q in ti.static(range(m.lanes))])

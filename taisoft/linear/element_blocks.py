@@ -13,7 +13,6 @@ from taisoft.fem.lanes import (
     deformation_gradient,
     load_lanes,
     position_differences,
-    rest_gradient,
     rest_gradients,
     rest_gradients_of_F,
     store_lanes,
@@ -25,7 +24,7 @@ from taisoft.fem.node_graph import PAIRS
 from taisoft.fem.pattern import MATRIX_BLOCKS
 from taisoft.fem.reference import Quadrature, shape_derivatives
 
-N_PAIRS, N_CORNER_PAIRS = len(PAIRS[2]), len(PAIRS[1])
+N_PAIRS = len(PAIRS[2])
 
 
 def pair_terms(rules: list[Quadrature]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -69,7 +68,7 @@ def element_blocks(m: ti.template(), g: ti.template(), A: ti.template(), b, proj
             projected_blocks(m, A, at, S, M, V)
         else:
             S = g.law.prepare(F, p)
-            exact_blocks(m, A, g.law, b, at, F, S, V)
+            exact_blocks(m, A, g.law, at, F, S, M, V)
         if ti.static(g.order == 2):
             scatter_terms(m, A, base, at, g.points_at + q)
 
@@ -88,19 +87,23 @@ def scatter_terms(m: ti.template(), A: ti.template(), base, at, row):
 
 
 @ti.func
-def exact_blocks(m: ti.template(), A: ti.template(), law: ti.template(), b, base, F, S, V):
-    """Write K_ab of the corner pairs by the law's closed form, from `base` on, one after the other: unrolled, they take long to
-    compile."""
-    g = [rest_gradient(m, b, a) for a in ti.static(range(3))]  # of corners 1, 2, 3; those of all four add up to 0
-    for n in range(N_CORNER_PAIRS):
-        from_0 = n < 3  # as in `topology.EDGES`: 01, 02, 03, 12, 13, 23
-        first, second = ti.select(from_0, 0, n // 5), ti.select(from_0, n, ti.min(2, n - 2))
-        row = rest_gradient(m, b, first)
-        ga = [ti.select(from_0, -(g[0][c] + g[1][c] + g[2][c]), row[c]) for c in ti.static(range(3))]
-        K = law.block(F, S, ga, rest_gradient(m, b, second))  # its rows are the force at the second corner
-        for i in ti.static(range(3)):
-            for k in ti.static(range(3)):
-                store_lanes(m, A.element, base + (9 * n + 3 * k + i), V * K[3 * i + k])
+def exact_blocks(m: ti.template(), A: ti.template(), law: ti.template(), base, F, S, M, V):
+    """Write K_ab of the corner pairs by the law's closed form, from `base` on.
+
+    The gradients g of corners 1, 2, 3 are the rows of M; K_0b is minus the sum over a of K_ab.
+    """
+    g = [[M[3 * a], M[3 * a + 1], M[3 * a + 2]] for a in ti.static(range(3))]
+    K11, K22, K33 = law.block(F, S, g[0], g[0]), law.block(F, S, g[1], g[1]), law.block(F, S, g[2], g[2])
+    # the rows of law.block(ga, gb) are the force at b: its transpose is K_ab
+    K21, K31, K32 = law.block(F, S, g[0], g[1]), law.block(F, S, g[0], g[2]), law.block(F, S, g[1], g[2])
+    for i in ti.static(range(3)):
+        for k in ti.static(range(3)):
+            store_lanes(m, A.element, base + (3 * i + k), -V * (K11[3 * i + k] + K21[3 * i + k] + K31[3 * i + k]))
+            store_lanes(m, A.element, base + (9 * 1 + 3 * i + k), -V * (K21[3 * k + i] + K22[3 * i + k] + K32[3 * i + k]))
+            store_lanes(m, A.element, base + (9 * 2 + 3 * i + k), -V * (K31[3 * k + i] + K32[3 * k + i] + K33[3 * i + k]))
+            store_lanes(m, A.element, base + (9 * 3 + 3 * i + k), V * K21[3 * k + i])
+            store_lanes(m, A.element, base + (9 * 4 + 3 * i + k), V * K31[3 * k + i])
+            store_lanes(m, A.element, base + (9 * 5 + 3 * i + k), V * K32[3 * k + i])
 
 
 @ti.func
