@@ -245,13 +245,8 @@ def advance_serial(m: ti.template(), s: ti.template(), n: ti.i32, dt64: ti.f64, 
             else:
                 lowest_by_lane = ti.min(lowest_by_lane, lowest_now)
                 total = end_substep(m, s, done, n, dt64)
-                count = 0
-                for q in ti.static(range(m.lanes)):
-                    count += inverted[q]
-                max_inverted = ti.max(max_inverted, count)
-                min_J = lowest_by_lane[0]
-                for q in ti.static(range(1, m.lanes)):
-                    min_J = ti.min(min_J, lowest_by_lane[q])
+                low, count = elasticity.lowest_and_count(m, lowest_by_lane, inverted)
+                min_J, max_inverted = low, ti.max(max_inverted, count)
                 running = min_J > -EXPLODED and not nonfinite(ti.cast(total[0] + total[1] + total[2], ti.f64))
                 done += 1
         if ti.static(m.has_dependents):
