@@ -14,7 +14,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import taichi as ti
-from scenes import built, driven_scene, mixed_scene, use_threads
+from scenes import SNH, SVK, built, driven_scene, mixed_scene, use_threads
 
 import taisoft as ts
 from taisoft.backend import parallel
@@ -42,7 +42,12 @@ def soft_in_shape() -> ts.Scene:
     return scene
 
 
-SCENES = {"driven": lambda: driven_scene(mass_damping=3.0, order=2), "mixed": mixed_scene, "pile": pile, "mean": soft_in_shape}
+SCENES = {
+    "driven": lambda: driven_scene(mass_damping=3.0, order=2),
+    "mixed": lambda: mixed_scene((SNH, SVK, SNH, SVK)),
+    "pile": pile,
+    "mean": soft_in_shape,
+}
 
 
 CASES = (

@@ -12,7 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scenes import built, dynamics, mixed_scene, rubber, set_state
+from scenes import SNH, built, dynamics, mixed_scene, rubber, set_state
 
 import taisoft as ts
 from taisoft.dynamics import contact_newton
@@ -150,7 +150,7 @@ def test_steps_with_and_without_eliminations_agree(monkeypatch, ground):
 
 @pytest.fixture(scope="module", params=["f64", "f32"])
 def rig(request):
-    with built(mixed_scene(order="both"), request.param) as made:
+    with built(mixed_scene((SNH,) * 4, order="both", degrees=(2, 2)), request.param) as made:
         m, rng = made.model, np.random.default_rng(4)
         made.system = StageSystem(m, made.arena, made.machine.eps, np.zeros(0, dtype=int), NoContacts())
         free = rng.random((m.n_nodes, 3)) < 0.9
