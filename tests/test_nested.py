@@ -14,7 +14,7 @@ from hypothesis.extra import numpy as hnp
 
 from taisoft.nested import join_arrays, part_arrays
 
-# libraries in the process may have made the processor flush subnormal numbers to zero
+# where a kernel has run, the processor flushes subnormal numbers to zero
 floats = st.floats(allow_nan=False, allow_subnormal=False)
 leaves = st.none() | st.booleans() | st.integers() | floats | st.text() | hnp.arrays(float, st.integers(0, 3))
 keys = st.text(max_size=3) | st.sampled_from(["x", "#0", "0", "a/b", "body 'a': young"])
