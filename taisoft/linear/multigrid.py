@@ -78,6 +78,14 @@ class Multigrid:
         self.coarsest = found
         if host:
             self._upload(host, real)
+            self.right, self.solution = self.levels[0].r, self.levels[0].other  # of `cycle`, rows padded to lanes
+            self._coarsest_right, self._coarsest_solution = self.levels[-1].next_r, self.levels[-1].next_x
+        else:
+            n, lanes = matrix.shape[0] // matrix.blocksize[0], LANES[matrix.blocksize[0]]
+            self.right, self.solution = (self._arena.vectors(f"multigrid_{name}", real, n, n=lanes) for name in ("r", "x"))
+            self._coarsest_right, self._coarsest_solution = self.right, self.solution
+        self._coarsest_rows = matrix.blocksize[0]
+        self._rows = (host[0].matrix if host else matrix).blocksize[0]
 
     def _upload(self, host: list[Level], real) -> None:
         """Make the levels on the device."""
@@ -112,20 +120,21 @@ class Multigrid:
         """Memory of all levels."""
         return self.coarsest.factor.nbytes + sum(self._arena.bytes.values())
 
-    def apply(self, r: np.ndarray) -> np.ndarray:
-        """One V-cycle on a residual (n unknowns)."""
-        if not self.levels:
-            return self.coarsest.solve(r)
-        first, last = self.levels[0], self.levels[-1]
-        rows = first.matrix.rows
-        first.r.host[:, :rows] = r.reshape(-1, rows)
+    def cycle(self) -> None:
+        """One V-cycle on the residual in `right`."""
         for level in self.levels:
             descend(level)
-        b = last.next_r.host[:, :MODES].astype(np.float64).reshape(-1)
-        last.next_x.host[:, :MODES] = self.coarsest.solve(b).reshape(-1, MODES)
+        rows = self._coarsest_rows
+        b = self._coarsest_right.host[:, :rows].astype(np.float64).reshape(-1)
+        self._coarsest_solution.host[:, :rows] = self.coarsest.solve(b).reshape(-1, rows)
         for level in reversed(self.levels):
             ascend(level)
-        return first.other.host[:, :rows].astype(np.float64).reshape(-1)
+
+    def apply(self, r: np.ndarray) -> np.ndarray:
+        """One V-cycle on a residual (n unknowns)."""
+        self.right.host[:, : self._rows] = r.reshape(-1, self._rows)
+        self.cycle()
+        return self.solution.host[:, : self._rows].astype(np.float64).reshape(-1)
 
 
 def block_rows(A: sp.bsr_matrix) -> np.ndarray:
