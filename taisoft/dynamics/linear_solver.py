@@ -24,9 +24,9 @@ import taichi as ti
 from taisoft.backend.arrays import FieldArena, upload
 from taisoft.fem.model import Model
 from taisoft.fem.node_graph import EVERYTHING
-from taisoft.linear import block_csr, host_pcg, pcg, volume_pcg
-from taisoft.linear.aggregation import rigid_modes
-from taisoft.linear.multigrid import Multigrid, block_rows
+from taisoft.linear import block_csr, pcg, volume_pcg
+from taisoft.linear.hierarchy import ExactPreconditioner, build_hierarchy
+from taisoft.linear.pcg_multigrid import CoarseCorrection
 from taisoft.linear.pcg_work import LinearResult
 
 if TYPE_CHECKING:
@@ -80,7 +80,7 @@ class LinearSolver:
 
     def release(self) -> None:
         """Discard the hierarchy; the next solve by multigrid builds a new one."""
-        self._hierarchy: Multigrid | None = None
+        self._hierarchy: ExactPreconditioner | CoarseCorrection | None = None
         self._built: tuple | None = None  # (c, beta, x, free) of the last build
 
     def snapshot(self) -> dict:
@@ -163,7 +163,7 @@ class LinearSolver:
             if self._hierarchy is None:
                 self._build(system, *self._built)
             most = math.ceil(GROWTH * self.rate * digits) + SLACK
-            found = host_pcg.solve(m, system.matrix, w, tolerance, most, self._hierarchy.apply)
+            found = self._hierarchy.solve(m, system.matrix, w, tolerance, most)
             if found.converged or found.negative:
                 return self._account(found, digits)
             wasted = found.iterations
@@ -173,7 +173,7 @@ class LinearSolver:
             self._build(system, system.stage.c, system.stage.beta, m.state.x.to_numpy(), free)
         except np.linalg.LinAlgError:
             return None
-        found = host_pcg.solve(m, system.matrix, w, tolerance, LONGEST, self._hierarchy.apply)
+        found = self._hierarchy.solve(m, system.matrix, w, tolerance, LONGEST)
         if not (found.converged or found.negative):
             return None
         self.rate = found.iterations / digits
@@ -191,9 +191,7 @@ class LinearSolver:
         present = [(array, array.to_numpy()) for array in (m.state.x, A.value, A.diagonal)]
         m.state.x.from_numpy(x)
         system.form(EVERYTHING, True, c, beta)
-        matrix = block_csr.to_bsr(m, A)
-        upload(present)
-        row = block_rows(matrix)
-        matrix.data *= free[row][:, :, None] & free[matrix.indices][:, None, :]
-        matrix.data[matrix.indices == row] += np.eye(3) * ~free[:, :, None]
-        self._hierarchy, self._built = Multigrid(matrix, rigid_modes(x, free), m.real), (c, beta, x, free)
+        try:
+            self._hierarchy, self._built = build_hierarchy(m, A, x, free), (c, beta, x, free)
+        finally:
+            upload(present)

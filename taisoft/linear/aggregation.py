@@ -28,9 +28,9 @@ def rigid_modes(x: np.ndarray, free: np.ndarray) -> np.ndarray:
 
 
 def aggregate_modes(modes: np.ndarray, aggregates: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return blocks (n, d, 6) of an orthonormal basis of each aggregate's modes, the coarse modes, and the unused coarse unknowns.
+    """Return an orthonormal basis (n, d, 6) of each aggregate's modes, the coarse modes and the unused coarse unknowns.
 
-    modes: (n, d, 6); aggregates: (n), -1 for nodes without rows. The blocks times the coarse modes (n_coarse, 6, 6) are the modes.
+    modes: (n, d, 6); aggregates: (n), -1 for nodes without rows. The basis times the coarse modes (n_coarse, 6, 6) is modes.
     Unused (n_coarse, 6) bool, with columns of 0: rotations that move no node of an aggregate, or move it as others do.
     """
     n, d, _ = modes.shape

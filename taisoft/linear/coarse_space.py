@@ -32,13 +32,14 @@ class CoarsePattern:
 
 
 def find_pattern(m: Model, A: BlockCsr, start: np.ndarray, column: np.ndarray, free: np.ndarray) -> CoarsePattern:
-    """Aggregate the nodes with a free axis. start (n_nodes + 1), column: rows of A with their diagonals; free: (n_nodes, 3) bool."""
+    """Aggregate the nodes with a free axis, of free (n_nodes, 3) bool. start (n_nodes + 1), column: A's rows with diagonals."""
     own = aggregate(start, column, free.any(axis=1))
     n_coarse, n = int(own.max()) + 1, m.n_nodes
     half = A.row_start.host[: n + 1]
     row, near = owners(np.diff(half)), own[A.column.host[: half[n]]]
     used = (near >= 0) & (own[row] >= 0)
-    keys = np.unique(row[used] * np.int64(n_coarse) + near[used])
+    keys = np.sort(row[used] * np.int64(n_coarse) + near[used])
+    keys = keys[np.diff(keys, prepend=-1) > 0]
     return CoarsePattern(own, n_coarse, keys // n_coarse, keys % n_coarse)
 
 
@@ -80,23 +81,20 @@ def build_coarse_space(
     transposed = allocate_matrix(
         arena, "multigrid_transposed", m.real, (MODES, 3), column[by_column], row[by_column], (n_coarse, n)
     )
-    slots, slot = np.unique(pattern.aggregate[row] * np.int64(n_coarse) + column, return_inverse=True)
+    slot = pattern.aggregate[row] * np.int64(n_coarse) + column
+    by_slot = np.argsort(slot, kind="stable")
+    first = np.flatnonzero(np.diff(slot[by_slot], prepend=-1))
+    slots = slot[by_slot][first]
     temporary = FieldArena()
 
     def ints(name: str, data: np.ndarray):
         return temporary.field(f"multigrid_{name}", ti.i32, len(data), data)
 
-    def grouped(name: str, group: np.ndarray, n_groups: int, items: np.ndarray) -> dict[str, Any]:
-        """CSR rows of the items of each group."""
-        start = np.concatenate([[0], np.cumsum(np.bincount(group, minlength=n_groups))])
-        return {
-            f"{name}_start": ints(f"{name}_start", start),
-            "node" if name == "node" else f"{name}_block": ints(name, items[np.argsort(group, kind="stable")]),
-        }
-
     place = np.empty(len(row), dtype=np.int64)
     place[by_column] = np.arange(len(row))
-    included = np.flatnonzero(pattern.aggregate >= 0)
+    nodes = np.argsort(pattern.aggregate, kind="stable")
+    nodes = nodes[np.count_nonzero(pattern.aggregate < 0) :]
+    of_aggregate = np.bincount(pattern.aggregate[nodes], minlength=n_coarse)
     work = GalerkinWork(
         n_slots=len(slots),
         n_coarse=n_coarse,
@@ -105,8 +103,10 @@ def build_coarse_space(
         row=ints("row", row),
         column=ints("column", column),
         place=ints("place", place),
-        **grouped("slot", slot, len(slots), np.arange(len(row))),
-        **grouped("node", pattern.aggregate[included], n_coarse, included),
+        slot_start=ints("slot_start", np.append(first, len(slot))),
+        slot_block=ints("slot_block", by_slot),
+        node_start=ints("node_start", np.concatenate([[0], np.cumsum(of_aggregate)])),
+        node=ints("node", nodes),
         lower=temporary.vectors("multigrid_lower", ti.f64, len(slots), n=MODES**2),
         diagonal=temporary.vectors("multigrid_diagonal", ti.f64, n_coarse, n=MODES**2),
     )
@@ -118,16 +118,16 @@ def build_coarse_space(
 
 def _coarse_matrix(lower: np.ndarray, diagonal: np.ndarray, slots: np.ndarray, unused: np.ndarray) -> sp.bsr_matrix:
     """T^T A T from the arrays of `GalerkinWork`, 1 on the diagonal of unused unknowns. slots: of each block of lower."""
-    n = len(diagonal)
-    own, (i, j) = np.arange(n), np.divmod(slots, n)
-    blocks = np.concatenate(
-        [a.reshape(-1, MODES, MODES) for a in (lower, diagonal)] + [lower.reshape(-1, MODES, MODES).swapaxes(1, 2)]
-    )
-    keys = np.concatenate([slots, own * (n + 1), j * n + i])
-    order = np.argsort(keys, kind="stable")
-    first = np.flatnonzero(np.diff(keys[order], prepend=-1))
-    rows, columns = np.divmod(keys[order][first], n)
-    data = np.add.reduceat(blocks[order], first, axis=0)
+    n, size = len(diagonal), (-1, MODES, MODES)
+    i, j = np.divmod(slots, n)
+    own, mirrored = np.arange(n) * (n + 1), j * n + i
+    keys = np.sort(np.concatenate([slots, own, mirrored]))
+    keys = keys[np.diff(keys, prepend=-1) > 0]
+    data = np.zeros((len(keys), MODES, MODES))
+    data[np.searchsorted(keys, slots)] = lower.reshape(size)
+    data[np.searchsorted(keys, mirrored)] += lower.reshape(size).swapaxes(1, 2)
+    data[np.searchsorted(keys, own)] += diagonal.reshape(size)
+    rows, columns = np.divmod(keys, n)
     node, mode = np.nonzero(unused)
     data[np.flatnonzero(rows == columns)[node], mode, mode] = 1.0
     start = np.concatenate([[0], np.cumsum(np.bincount(rows, minlength=n))])

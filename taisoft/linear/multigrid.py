@@ -142,18 +142,29 @@ def block_rows(A: sp.bsr_matrix) -> np.ndarray:
     return owners(np.diff(A.indptr))
 
 
-def factorise(A: sp.bsr_matrix) -> BandedCholesky | None:
-    """Factorise A if its band is narrow or A is small; otherwise return None."""
-    n, d = len(A.indptr) - 1, A.blocksize[0]
-    pattern = sp.csr_matrix((np.ones(len(A.indices), dtype=np.int8), A.indices, A.indptr), shape=(n, n))
+def narrow_order(start: np.ndarray, column: np.ndarray, d: int) -> tuple[np.ndarray, np.ndarray, int] | None:
+    """Order (n) in which a matrix of (d, d) blocks has a narrow band, each node's place (n) in it, and that band.
+
+    None if the band is not narrow and the matrix not small. start (n + 1), column: block rows, with all diagonal blocks.
+    """
+    n = len(start) - 1
+    pattern = sp.csr_matrix((np.ones(len(column), dtype=np.int8), column, start), shape=(n, n))
     order = reverse_cuthill_mckee(pattern, symmetric_mode=True)
     place = np.empty(n, dtype=np.int64)
     place[order] = np.arange(n)
-    i, j = place[block_rows(A)], place[A.indices]
-    band = (int(np.abs(i - j).max()) + 1) * d - 1
+    band = (int(np.abs(place[owners(np.diff(start))] - place[column]).max()) + 1) * d - 1
     if n * d > SMALL and (band > NARROW or (band + 1) * n * d > LARGEST_BAND):
         return None
-    axis = np.arange(d)
+    return order, place, band
+
+
+def factorise(A: sp.bsr_matrix) -> BandedCholesky | None:
+    """Factorise A if its band is narrow or A is small; otherwise return None."""
+    n, d = len(A.indptr) - 1, A.blocksize[0]
+    if (found := narrow_order(A.indptr, A.indices, d)) is None:
+        return None
+    order, place, band = found
+    i, j, axis = place[block_rows(A)], place[A.indices], np.arange(d)
     row, column = np.broadcast_arrays((i[:, None] * d + axis)[:, :, None], (j[:, None] * d + axis)[:, None, :])
     lower = row >= column
     banded = np.zeros((band + 1, n * d))

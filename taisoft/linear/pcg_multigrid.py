@@ -16,7 +16,6 @@ import taichi as ti
 from taisoft.backend.arrays import FieldArena
 from taisoft.backend.runtime import kernel
 from taisoft.fem.model import Model
-from taisoft.fem.node_graph import whole_rows
 from taisoft.fem.state import OTHER_SUM
 from taisoft.linear.aggregation import rigid_modes
 from taisoft.linear.block_csr import BlockCsr
@@ -30,19 +29,17 @@ from taisoft.linear.sweep_order import chunk_range
 
 
 class CoarseCorrection:
-    """B C B^T of a matrix whose aggregates are those of an earlier one, if that is given."""
+    """B C B^T of a matrix: the preconditioner without what belongs to the sweeps."""
 
-    def __init__(self, m: Model, A: BlockCsr, x: np.ndarray, free: np.ndarray):
-        """A: positive definite on the free axes; x: (n_nodes, 3) positions [m]; free: (n_nodes, 3) bool.
+    def __init__(self, m: Model, A: BlockCsr, start: np.ndarray, column: np.ndarray, x: np.ndarray, free: np.ndarray):
+        """A: positive definite on the free axes; start (n_nodes + 1), column: its rows, with their diagonals.
 
-        Raises numpy.linalg.LinAlgError if A is not positive definite, as far as the factorisations show.
+        x: (n_nodes, 3) positions [m]; free: (n_nodes, 3) bool. Raises numpy.linalg.LinAlgError if A is not positive definite,
+        as far as the factorisations show.
         """
         self._arena = FieldArena()
-        start, order = whole_rows(A.row_start.host)
-        own = np.arange(m.n_nodes)
-        column = np.insert(A.column.host[order], start[1:], own)
-        self.pattern = find_pattern(m, A, start + np.arange(m.n_nodes + 1), column, free)
-        self._space, coarse, modes = build_coarse_space(m, A, self.pattern, rigid_modes(x, free), self._arena)
+        pattern = find_pattern(m, A, start, column, free)
+        self._space, coarse, modes = build_coarse_space(m, A, pattern, rigid_modes(x, free), self._arena)
         self._cycle = Multigrid(coarse, modes, m.real)
 
     @property
