@@ -32,14 +32,24 @@ class ExactPreconditioner:
         return host_pcg.solve(m, A, w, tolerance, max_iterations, self.factor.solve)
 
 
+def rows_with_diagonals(m: Model, A: BlockCsr) -> tuple[np.ndarray, np.ndarray]:
+    """Return start (n_nodes + 1) and column of the rows of A, each with its diagonal last."""
+    start, order = whole_rows(A.row_start.host)
+    own = np.arange(m.n_nodes)
+    return start + np.arange(m.n_nodes + 1), np.insert(A.column.host[order], start[1:], own)
+
+
+def has_narrow_band(m: Model, A: BlockCsr) -> bool:
+    """Whether matrices with the pattern of A are factorised."""
+    return narrow_order(*rows_with_diagonals(m, A), 3) is not None
+
+
 def build_hierarchy(m: Model, A: BlockCsr, x: np.ndarray, free: np.ndarray) -> ExactPreconditioner | CoarseCorrection:
     """Build the preconditioner of A on the free axes (n_nodes, 3) bool. x: (n_nodes, 3) positions [m].
 
     Raises numpy.linalg.LinAlgError if A is not positive definite, as far as the factorisations show.
     """
-    start, order = whole_rows(A.row_start.host)
-    column = np.insert(A.column.host[order], start[1:], np.arange(m.n_nodes))
-    start = start + np.arange(m.n_nodes + 1)
+    start, column = rows_with_diagonals(m, A)
     if narrow_order(start, column, 3) is None:
         return CoarseCorrection(m, A, start, column, x, free)
     matrix = block_csr.to_bsr(m, A)
