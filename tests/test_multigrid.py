@@ -276,8 +276,12 @@ def test_steps_are_those_without_multigrid_also_after_a_release(monkeypatch, pre
     assert sum(r.linear_iterations for r in reports) < 0.5 * sum(r.linear_iterations for r in plain)
 
 
-@pytest.mark.parametrize("damping", [0.0, 1e-3])
-def test_steps_resume_bitwise(tmp_path, damping):
+@pytest.mark.parametrize(("damping", "wide"), [(0.0, False), (1e-3, False), (0.0, True)])
+def test_steps_resume_bitwise(tmp_path, monkeypatch, damping, wide):
+    """With a factorisation, and with multigrid as if the band were wide."""
+    if wide:
+        monkeypatch.setattr(multigrid, "SMALL", 40)
+        monkeypatch.setattr(multigrid, "NARROW", 0)
     scene = strip()
     scene.body("strip").material = rubber(young=1e9, stiffness_damping=damping)
     path = tmp_path / "checkpoint.npz"

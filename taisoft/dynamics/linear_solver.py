@@ -179,7 +179,8 @@ class LinearSolver:
             if self._hierarchy is None:
                 self._build(system, *self._built)
             most = math.ceil(GROWTH * self.rate * digits) + SLACK
-            found = self._hierarchy.solve(m, system.matrix, w, tolerance, most)
+            stiffness = (system.stage.beta / self._built[1]) ** 2
+            found = self._hierarchy.solve(m, system.matrix, w, tolerance, most, stiffness)
             if found.converged or found.negative:
                 return self._account(found, digits)
             wasted = found.iterations

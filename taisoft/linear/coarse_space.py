@@ -1,7 +1,8 @@
 """Rigid motions of aggregates of nodes as a coarse space for `pcg_multigrid`: its matrices, formed from one on the device.
 
 With A = L + D + L^T, L the half-rows before the diagonal in the order of a Gauss-Seidel sweep, and T the rigid modes of the
-aggregates (`aggregation`), these are B = L T and T^T A T = T^T B + (T^T B)^T + T^T D T. They are summed in f64.
+aggregates (`aggregation`), these are B = L T and T^T A T = T^T B + (T^T B)^T + T^T D T. They are summed in f64. Blocks E that
+sweeps leave out (`pcg_gauss_seidel`) belong to B, those before the diagonal and those after it.
 """
 
 from dataclasses import dataclass
@@ -18,7 +19,7 @@ from taisoft.linear.aggregation import MODES, aggregate_modes
 from taisoft.linear.block_csr import BlockCsr
 from taisoft.linear.block_rows import BlockRows, allocate_matrix
 from taisoft.mesh.aggregates import aggregate
-from taisoft.ranges import owners
+from taisoft.ranges import expand
 
 
 @dataclass(frozen=True)
@@ -35,8 +36,10 @@ def find_pattern(m: Model, A: BlockCsr, start: np.ndarray, column: np.ndarray, f
     """Aggregate the nodes with a free axis, of free (n_nodes, 3) bool. start (n_nodes + 1), column: A's rows with diagonals."""
     own = aggregate(start, column, free.any(axis=1))
     n_coarse, n = int(own.max()) + 1, m.n_nodes
-    half = A.row_start.host[: n + 1]
-    row, near = owners(np.diff(half)), own[A.column.host[: half[n]]]
+    first, last = A.row_start.host[:-1].copy(), A.row_start.host[1:]
+    first[n:] = last[n:] if A.apart_start is None else A.apart_start.host[n:]
+    half_row, entry = expand(first, last - first)
+    row, near = half_row % n, own[A.column.host[entry]]
     used = (near >= 0) & (own[row] >= 0)
     keys = np.sort(row[used] * np.int64(n_coarse) + near[used])
     keys = keys[np.diff(keys, prepend=-1) > 0]
@@ -172,11 +175,16 @@ def form_products(m: ti.template(), A: ti.template(), g: ti.template(), B: ti.te
                 j = A.column[entry]
                 if g.aggregate[j] == g.column[k]:
                     b = _add_block(b, A.value[entry], g.modes, j)
+            s = _add_product(s, b, g.modes, i)
+            if ti.static(A.crossed):
+                for entry in range(A.apart_start[i + m.n_nodes], A.row_start[i + m.n_nodes + 1]):
+                    j = A.column[entry]
+                    if g.aggregate[j] == g.column[k]:
+                        b = _add_block(b, A.value[entry], g.modes, j)
             for r in ti.static(range(3)):
                 for a in ti.static(range(MODES)):
                     B.value[k][B.lanes * a + r] = ti.cast(b[MODES * r + a], m.real)
                     Bt.value[g.place[k]][Bt.lanes * r + a] = ti.cast(b[MODES * r + a], m.real)
-            s = _add_product(s, b, g.modes, i)
         g.lower[slot] = s
     ti.loop_config(serialize=m.serial)
     for c in range(g.n_coarse):

@@ -27,8 +27,10 @@ class ExactPreconditioner:
         """Memory of the factor."""
         return self.factor.factor.nbytes
 
-    def solve(self, m: Model, A: BlockCsr, w: PcgWork, tolerance: float, max_iterations: int) -> LinearResult:
-        """Solve for w.y given w.rhs."""
+    def solve(
+        self, m: Model, A: BlockCsr, w: PcgWork, tolerance: float, max_iterations: int, stiffness: float = 1.0
+    ) -> LinearResult:
+        """Solve for w.y given w.rhs. stiffness has no effect: conjugate gradients do not depend on a factor."""
         return host_pcg.solve(m, A, w, tolerance, max_iterations, self.factor.solve)
 
 
