@@ -242,7 +242,7 @@ def test_statics_with_an_exact_attachment(several_levels, monkeypatch):
     scene.add_body(ts.box_mesh((2, 2, 2), (0.5, 0.5, 0.5)), rubber(), name="knob", position=(1.25, 0.0, 0.0))
     scene.attach("knob", lambda X: X[:, 0] < -0.249, "box")
     plain = ts.solve_static(scene, tolerance=1e-8)
-    monkeypatch.setattr(linear_solver, "BUILD", -(10**9))
+    monkeypatch.setattr(linear_solver, "BUILD", dict.fromkeys(linear_solver.BUILD, -(10**9)))
     result = ts.solve_static(scene, tolerance=1e-8)
     assert result.converged and result.multigrid_solves > 0 and not plain.multigrid_solves
     x, expected = (np.concatenate([one.positions(name) for name in ("box", "knob")]) for one in (result, plain))
@@ -250,13 +250,13 @@ def test_statics_with_an_exact_attachment(several_levels, monkeypatch):
 
 
 def without_multigrid(monkeypatch):
-    monkeypatch.setattr(linear_solver, "BUILD", 10**9)
+    monkeypatch.setattr(linear_solver, "BUILD", dict.fromkeys(linear_solver.BUILD, 10**9))
 
 
 @pytest.mark.parametrize("precision", ["f64", "f32"])
 def test_steps_are_those_without_multigrid_also_after_a_release(monkeypatch, precision):
     monkeypatch.setattr(linear_solver, "RATIO", dict.fromkeys(linear_solver.RATIO, 1.0))
-    monkeypatch.setattr(linear_solver, "BUILD", 50)
+    monkeypatch.setattr(linear_solver, "BUILD", dict.fromkeys(linear_solver.BUILD, 50))
 
     def run() -> tuple:
         scene = strip()
@@ -276,8 +276,12 @@ def test_steps_are_those_without_multigrid_also_after_a_release(monkeypatch, pre
     assert sum(r.linear_iterations for r in reports) < 0.5 * sum(r.linear_iterations for r in plain)
 
 
-@pytest.mark.parametrize("damping", [0.0, 1e-3])
-def test_steps_resume_bitwise(tmp_path, damping):
+@pytest.mark.parametrize(("damping", "wide"), [(0.0, False), (1e-3, False), (0.0, True)])
+def test_steps_resume_bitwise(tmp_path, monkeypatch, damping, wide):
+    """With a factorisation, and with multigrid as if the band were wide."""
+    if wide:
+        monkeypatch.setattr(multigrid, "SMALL", 40)
+        monkeypatch.setattr(multigrid, "NARROW", 0)
     scene = strip()
     scene.body("strip").material = rubber(young=1e9, stiffness_damping=damping)
     path = tmp_path / "checkpoint.npz"

@@ -1,7 +1,7 @@
 """Choose the preconditioner of a linear solve without contacts: that of `pcg`, or multigrid where that is faster.
 
 A solve starts with `pcg`. What its iterations take beyond an expected solve by multigrid is added up over the solves; when that
-would have paid for building the hierarchy, it is built, and the solve starts again with it. From then on all solves use it,
+is worth building the hierarchy, it is built, and the solve starts again with it. From then on all solves use it,
 until they have lost the same amount against the last solve by `pcg`, which then needs a multiple of the saving before multigrid
 is tried again. After PERIOD solves `pcg` is tried again anyway.
 
@@ -24,17 +24,21 @@ import taichi as ti
 from taisoft.backend.arrays import FieldArena, upload
 from taisoft.fem.model import Model
 from taisoft.fem.node_graph import EVERYTHING
-from taisoft.linear import block_csr, host_pcg, pcg, volume_pcg
-from taisoft.linear.aggregation import rigid_modes
-from taisoft.linear.multigrid import Multigrid, block_rows
+from taisoft.linear import block_csr, pcg, volume_pcg
+from taisoft.linear.hierarchy import ExactPreconditioner, build_hierarchy, has_narrow_band
+from taisoft.linear.pcg_multigrid import CoarseCorrection
 from taisoft.linear.pcg_work import LinearResult
 
 if TYPE_CHECKING:
     from taisoft.dynamics.stage_system import StageSystem
 
-# Durations in iterations of `pcg`, measured on one core and on two: a multigrid iteration takes RATIO plus OVERHEAD over the
-# number of nodes, by precision; building takes BUILD. A solve by multigrid is expected to take ITERATIONS, before the first one.
-RATIO, OVERHEAD, BUILD, ITERATIONS = {ti.f32: 3.5, ti.f64: 3.2}, {ti.f32: 25_000, ti.f64: 20_000}, 450, 10
+# Durations in iterations of `pcg`, measured on one core and two: an iteration with the hierarchy takes RATIO plus OVERHEAD over
+# the number of nodes, by (whether it is a factorisation, precision). It is built once it would have saved BUILD: what a
+# factorisation takes, but half of what multigrid takes, since most simulations that need it go on. A solve is expected to take
+# ITERATIONS, before the first one.
+RATIO = {(False, ti.f32): 2.2, (False, ti.f64): 2.4, (True, ti.f32): 3.5, (True, ti.f64): 3.2}
+OVERHEAD = {(False, ti.f32): 5_000, (False, ti.f64): 10_000, (True, ti.f32): 25_000, (True, ti.f64): 20_000}
+BUILD, ITERATIONS = {False: 90, True: 450}, 9
 GROWTH, SLACK = 2.0, 10  # a solve that takes more than GROWTH times the first iterations + SLACK requires a new hierarchy
 LONGEST = 300  # iterations of a solve with a new hierarchy
 PERIOD = 128  # solves by multigrid between trials of pcg
@@ -51,8 +55,7 @@ class LinearSolver:
         self._arena, self._volumes = FieldArena(), None  # of `volume_pcg`, built on first use
         self._use_volumes: bool | None = None  # None: to be decided
         self._prepared = -1  # `StageSystem.n_formed` of the matrix it was prepared for
-        # Duration of an iteration of multigrid over one of pcg
-        self._ratio = RATIO[model.real] + OVERHEAD[model.real] / model.n_nodes
+        self._exact: bool | None = None  # whether the hierarchy is a factorisation; None: not known yet
         self.forget()
 
     def forget(self) -> None:
@@ -78,9 +81,20 @@ class LinearSolver:
         self.release()
         self._arena.release()
 
+    @property
+    def _ratio(self) -> float:
+        """Duration of an iteration with the hierarchy over one of pcg."""
+        kind = self._exact, self.model.real
+        return RATIO[kind] + OVERHEAD[kind] / self.model.n_nodes
+
+    @property
+    def _build_cost(self) -> int:
+        """BUILD of this model."""
+        return BUILD[self._exact]
+
     def release(self) -> None:
         """Discard the hierarchy; the next solve by multigrid builds a new one."""
-        self._hierarchy: Multigrid | None = None
+        self._hierarchy: ExactPreconditioner | CoarseCorrection | None = None
         self._built: tuple | None = None  # (c, beta, x, free) of the last build
 
     def snapshot(self) -> dict:
@@ -101,6 +115,8 @@ class LinearSolver:
         m, w, done = self.model, system.work.pcg, 0
         if m.free.host is None:  # CUDA
             return pcg.solve(m, system.matrix, w, tolerance, pcg.iteration_limit(m))
+        if self._exact is None:
+            self._exact = has_narrow_band(m, system.matrix)
         digits = max(-math.log10(tolerance), 1.0)
         if not self.active:
             found = self._solve_pcg(system, tolerance, digits)
@@ -109,12 +125,12 @@ class LinearSolver:
             done = found.iterations
         found = self._solve_multigrid(system, tolerance, digits)
         self.uses += 1
-        if found is None or self.savings < -BUILD:
+        if found is None or self.savings < -self._build_cost:
             self.failures += 1
             self.release()
-            self.active, self.uses, self.savings = False, 0, -BUILD * float(RETRY**self.failures)
+            self.active, self.uses, self.savings = False, 0, -self._build_cost * float(RETRY**self.failures)
         elif self.uses >= PERIOD:
-            self.active, self.uses, self.savings = False, 0, 0.8 * BUILD
+            self.active, self.uses, self.savings = False, 0, 0.8 * self._build_cost
         if found is None:
             found = self._solve_plain(system, tolerance, pcg.iteration_limit(m))
         return replace(found, iterations=done + found.iterations)
@@ -122,7 +138,7 @@ class LinearSolver:
     def _solve_pcg(self, system: "StageSystem", tolerance: float, digits: float) -> LinearResult:
         """Solve without multigrid, or stop where it has become worth building: it is then active."""
         worth = ITERATIONS * self._ratio
-        most = math.ceil(worth + BUILD - self.savings)
+        most = math.ceil(worth + self._build_cost - self.savings)
         limit = pcg.iteration_limit(self.model)
         found = self._solve_plain(system, tolerance, min(most, limit))
         self.savings = max(self.savings + found.iterations - worth, min(self.savings, 0.0))
@@ -163,17 +179,18 @@ class LinearSolver:
             if self._hierarchy is None:
                 self._build(system, *self._built)
             most = math.ceil(GROWTH * self.rate * digits) + SLACK
-            found = host_pcg.solve(m, system.matrix, w, tolerance, most, self._hierarchy.apply)
+            stiffness = (system.stage.beta / self._built[1]) ** 2
+            found = self._hierarchy.solve(m, system.matrix, w, tolerance, most, stiffness)
             if found.converged or found.negative:
                 return self._account(found, digits)
             wasted = found.iterations
-            self.savings -= BUILD
+            self.savings -= self._build_cost
         self.release()
         try:
             self._build(system, system.stage.c, system.stage.beta, m.state.x.to_numpy(), free)
         except np.linalg.LinAlgError:
             return None
-        found = host_pcg.solve(m, system.matrix, w, tolerance, LONGEST, self._hierarchy.apply)
+        found = self._hierarchy.solve(m, system.matrix, w, tolerance, LONGEST)
         if not (found.converged or found.negative):
             return None
         self.rate = found.iterations / digits
@@ -182,7 +199,7 @@ class LinearSolver:
     def _account(self, found: LinearResult, digits: float) -> LinearResult:
         """Add what a solve by multigrid saved, as far as it went on."""
         if found.converged:
-            self.savings = min(self.savings + self.pcg_rate * digits - self._ratio * found.iterations, float(BUILD))
+            self.savings = min(self.savings + self.pcg_rate * digits - self._ratio * found.iterations, float(self._build_cost))
         return replace(found, multigrid=True)
 
     def _build(self, system: "StageSystem", c: float, beta: float, x: np.ndarray, free: np.ndarray) -> None:
@@ -191,9 +208,7 @@ class LinearSolver:
         present = [(array, array.to_numpy()) for array in (m.state.x, A.value, A.diagonal)]
         m.state.x.from_numpy(x)
         system.form(EVERYTHING, True, c, beta)
-        matrix = block_csr.to_bsr(m, A)
-        upload(present)
-        row = block_rows(matrix)
-        matrix.data *= free[row][:, :, None] & free[matrix.indices][:, None, :]
-        matrix.data[matrix.indices == row] += np.eye(3) * ~free[:, :, None]
-        self._hierarchy, self._built = Multigrid(matrix, rigid_modes(x, free), m.real), (c, beta, x, free)
+        try:
+            self._hierarchy, self._built = build_hierarchy(m, A, x, free), (c, beta, x, free)
+        finally:
+            upload(present)

@@ -27,11 +27,11 @@ def rigid_modes(x: np.ndarray, free: np.ndarray) -> np.ndarray:
     return modes * free[:, :, None]
 
 
-def prolongation(modes: np.ndarray, aggregates: np.ndarray) -> tuple[sp.bsr_matrix, np.ndarray, np.ndarray]:
-    """Return P, the coarse modes and the unused coarse unknowns (n_coarse, 6) bool, with P coarse_modes = modes.
+def aggregate_modes(modes: np.ndarray, aggregates: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return an orthonormal basis (n, d, 6) of each aggregate's modes, the coarse modes and the unused coarse unknowns.
 
-    modes: (n, d, 6); aggregates: (n), -1 for nodes without rows. P: blocks (d, 6) with orthonormal columns, but 0 for unused
-    unknowns: rotations that move no node of an aggregate, or move it as others do.
+    modes: (n, d, 6); aggregates: (n), -1 for nodes without rows. The basis times the coarse modes (n_coarse, 6, 6) is modes.
+    Unused (n_coarse, 6) bool, with columns of 0: rotations that move no node of an aggregate, or move it as others do.
     """
     n, d, _ = modes.shape
     node = np.flatnonzero(aggregates >= 0)
@@ -49,6 +49,14 @@ def prolongation(modes: np.ndarray, aggregates: np.ndarray) -> tuple[sp.bsr_matr
     basis, coarse = np.where(unused[:, None, :] | ~moved[:, :, None], 0.0, basis), np.where(unused[:, :, None], 0.0, coarse)
     blocks = np.zeros((n, d, MODES))
     blocks[order] = basis.reshape(n_coarse, -1, d, MODES)[owner, slot]
+    return blocks, coarse, unused
+
+
+def prolongation(modes: np.ndarray, aggregates: np.ndarray) -> tuple[sp.bsr_matrix, np.ndarray, np.ndarray]:
+    """Return the blocks of `aggregate_modes` as a matrix P, and its other results: P coarse_modes = modes."""
+    n, d, _ = modes.shape
+    blocks, coarse, unused = aggregate_modes(modes, aggregates)
     row_start = np.concatenate([[0], np.cumsum(aggregates >= 0)])
-    P = sp.bsr_matrix((blocks[node], aggregates[node], row_start), shape=(n * d, n_coarse * MODES))
+    included = aggregates >= 0
+    P = sp.bsr_matrix((blocks[included], aggregates[included], row_start), shape=(n * d, len(unused) * MODES))
     return P, coarse, unused

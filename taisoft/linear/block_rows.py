@@ -14,6 +14,7 @@ import taichi as ti
 from taisoft.backend import parallel
 from taisoft.backend.arrays import Count, FieldArena
 from taisoft.backend.runtime import kernel
+from taisoft.ranges import owners
 
 NUMBER_SECONDS = 2e-10  # of one thread per number of a matrix
 LANES = {3: 4, 6: 8}  # by the rows of a block
@@ -67,24 +68,36 @@ def padded(blocks: np.ndarray, lanes: int) -> np.ndarray:
 
 def upload_matrix(matrix: sp.bsr_matrix, arena: FieldArena, name: str, real) -> BlockRows:
     """Copy a matrix to the device."""
-    rows, columns = matrix.blocksize
-    lanes = LANES[rows]
+    n_rows, n_columns = (extent // size for extent, size in zip(matrix.shape, matrix.blocksize))
+    made = allocate_matrix(
+        arena, name, real, matrix.blocksize, owners(np.diff(matrix.indptr)), matrix.indices, (n_rows, n_columns)
+    )
+    made.value.from_numpy(padded(matrix.data, made.lanes))
+    return made
+
+
+def allocate_matrix(
+    arena: FieldArena, name: str, real, block: tuple[int, int], row: np.ndarray, column: np.ndarray, shape: tuple[int, int]
+) -> BlockRows:
+    """Allocate a matrix of zero blocks, row by row. row, column: of each block; shape: in blocks."""
+    (rows, columns), (n_rows, n_columns) = block, shape
+    lanes, start = LANES[rows], np.concatenate([[0], np.cumsum(np.bincount(row, minlength=n_rows))])
     return BlockRows(
         real=real,
-        n_rows=matrix.shape[0] // rows,
-        n_columns=matrix.shape[1] // columns,
+        n_rows=n_rows,
+        n_columns=n_columns,
         rows=rows,
         columns=columns,
         lanes=lanes,
-        serial=not parallel.pays(matrix.data.size * NUMBER_SECONDS),
-        start=arena.field(f"{name}_start", ti.i32, len(matrix.indptr), matrix.indptr),
-        column=arena.field(f"{name}_column", ti.i32, len(matrix.indices), matrix.indices),
-        value=arena.vectors(name, real, len(matrix.data), padded(matrix.data, lanes), n=lanes * columns),
+        serial=not parallel.pays(len(row) * rows * columns * NUMBER_SECONDS),
+        start=arena.field(f"{name}_start", ti.i32, len(start), start),
+        column=arena.field(f"{name}_column", ti.i32, len(column), column),
+        value=arena.vectors(name, real, len(row), n=lanes * columns),
     )
 
 
 @ti.func
-def _plus_block(y, V, X, lanes: ti.template(), columns: ti.template()):
+def plus_block(y, V, X, lanes: ti.template(), columns: ti.template()):
     """y + V X."""
     z = y
     for c in ti.static(range(columns)):
@@ -93,11 +106,11 @@ def _plus_block(y, V, X, lanes: ti.template(), columns: ti.template()):
 
 
 @ti.func
-def _row_times(B: ti.template(), i, x: ti.template()):
+def block_row_times(B: ti.template(), i, x: ti.template()):
     """(B x)_i."""
     z = ti.Vector.zero(B.real, B.lanes)
     for k in range(B.start[i], B.start[i + 1]):
-        z = _plus_block(z, B.value[k], x[B.column[k]], B.lanes, B.columns)
+        z = plus_block(z, B.value[k], x[B.column[k]], B.lanes, B.columns)
     return z
 
 
@@ -107,13 +120,13 @@ def descend(k: ti.template()):
     A, R = ti.static((k.matrix, k.restriction))
     ti.loop_config(serialize=A.serial)
     for i in range(A.n_rows):
-        k.x[i] = _plus_block(ti.Vector.zero(A.real, A.lanes), k.smoother[i], k.r[i], A.lanes, A.rows)
+        k.x[i] = plus_block(ti.Vector.zero(A.real, A.lanes), k.smoother[i], k.r[i], A.lanes, A.rows)
     ti.loop_config(serialize=A.serial)
     for i in range(A.n_rows):
-        k.other[i] = k.r[i] - _row_times(A, i, k.x)
+        k.other[i] = k.r[i] - block_row_times(A, i, k.x)
     ti.loop_config(serialize=R.serial)
     for i in range(R.n_rows):
-        k.next_r[i] = _row_times(R, i, k.other)
+        k.next_r[i] = block_row_times(R, i, k.other)
 
 
 @kernel
@@ -122,8 +135,8 @@ def ascend(k: ti.template()):
     A, P = ti.static((k.matrix, k.prolongation))
     ti.loop_config(serialize=P.serial)
     for i in range(P.n_rows):
-        k.x[i] = k.x[i] + _row_times(P, i, k.next_x)
+        k.x[i] = k.x[i] + block_row_times(P, i, k.next_x)
     ti.loop_config(serialize=A.serial)
     for i in range(A.n_rows):
-        d = k.r[i] - _row_times(A, i, k.x)
-        k.other[i] = _plus_block(k.x[i], k.smoother[i], d, A.lanes, A.rows)
+        d = k.r[i] - block_row_times(A, i, k.x)
+        k.other[i] = plus_block(k.x[i], k.smoother[i], d, A.lanes, A.rows)

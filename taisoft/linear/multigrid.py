@@ -78,6 +78,14 @@ class Multigrid:
         self.coarsest = found
         if host:
             self._upload(host, real)
+            self.right, self.solution = self.levels[0].r, self.levels[0].other  # of `cycle`, rows padded to lanes
+            self._coarsest_right, self._coarsest_solution = self.levels[-1].next_r, self.levels[-1].next_x
+        else:
+            n, lanes = matrix.shape[0] // matrix.blocksize[0], LANES[matrix.blocksize[0]]
+            self.right, self.solution = (self._arena.vectors(f"multigrid_{name}", real, n, n=lanes) for name in ("r", "x"))
+            self._coarsest_right, self._coarsest_solution = self.right, self.solution
+        self._coarsest_rows = matrix.blocksize[0]
+        self._rows = (host[0].matrix if host else matrix).blocksize[0]
 
     def _upload(self, host: list[Level], real) -> None:
         """Make the levels on the device."""
@@ -112,20 +120,21 @@ class Multigrid:
         """Memory of all levels."""
         return self.coarsest.factor.nbytes + sum(self._arena.bytes.values())
 
-    def apply(self, r: np.ndarray) -> np.ndarray:
-        """One V-cycle on a residual (n unknowns)."""
-        if not self.levels:
-            return self.coarsest.solve(r)
-        first, last = self.levels[0], self.levels[-1]
-        rows = first.matrix.rows
-        first.r.host[:, :rows] = r.reshape(-1, rows)
+    def cycle(self) -> None:
+        """One V-cycle on the residual in `right`."""
         for level in self.levels:
             descend(level)
-        b = last.next_r.host[:, :MODES].astype(np.float64).reshape(-1)
-        last.next_x.host[:, :MODES] = self.coarsest.solve(b).reshape(-1, MODES)
+        rows = self._coarsest_rows
+        b = self._coarsest_right.host[:, :rows].astype(np.float64).reshape(-1)
+        self._coarsest_solution.host[:, :rows] = self.coarsest.solve(b).reshape(-1, rows)
         for level in reversed(self.levels):
             ascend(level)
-        return first.other.host[:, :rows].astype(np.float64).reshape(-1)
+
+    def apply(self, r: np.ndarray) -> np.ndarray:
+        """One V-cycle on a residual (n unknowns)."""
+        self.right.host[:, : self._rows] = r.reshape(-1, self._rows)
+        self.cycle()
+        return self.solution.host[:, : self._rows].astype(np.float64).reshape(-1)
 
 
 def block_rows(A: sp.bsr_matrix) -> np.ndarray:
@@ -133,18 +142,29 @@ def block_rows(A: sp.bsr_matrix) -> np.ndarray:
     return owners(np.diff(A.indptr))
 
 
-def factorise(A: sp.bsr_matrix) -> BandedCholesky | None:
-    """Factorise A if its band is narrow or A is small; otherwise return None."""
-    n, d = len(A.indptr) - 1, A.blocksize[0]
-    pattern = sp.csr_matrix((np.ones(len(A.indices), dtype=np.int8), A.indices, A.indptr), shape=(n, n))
+def narrow_order(start: np.ndarray, column: np.ndarray, d: int) -> tuple[np.ndarray, np.ndarray, int] | None:
+    """Order (n) in which a matrix of (d, d) blocks has a narrow band, each node's place (n) in it, and that band.
+
+    None if the band is not narrow and the matrix not small. start (n + 1), column: block rows, with all diagonal blocks.
+    """
+    n = len(start) - 1
+    pattern = sp.csr_matrix((np.ones(len(column), dtype=np.int8), column, start), shape=(n, n))
     order = reverse_cuthill_mckee(pattern, symmetric_mode=True)
     place = np.empty(n, dtype=np.int64)
     place[order] = np.arange(n)
-    i, j = place[block_rows(A)], place[A.indices]
-    band = (int(np.abs(i - j).max()) + 1) * d - 1
+    band = (int(np.abs(place[owners(np.diff(start))] - place[column]).max()) + 1) * d - 1
     if n * d > SMALL and (band > NARROW or (band + 1) * n * d > LARGEST_BAND):
         return None
-    axis = np.arange(d)
+    return order, place, band
+
+
+def factorise(A: sp.bsr_matrix) -> BandedCholesky | None:
+    """Factorise A if its band is narrow or A is small; otherwise return None."""
+    n, d = len(A.indptr) - 1, A.blocksize[0]
+    if (found := narrow_order(A.indptr, A.indices, d)) is None:
+        return None
+    order, place, band = found
+    i, j, axis = place[block_rows(A)], place[A.indices], np.arange(d)
     row, column = np.broadcast_arrays((i[:, None] * d + axis)[:, :, None], (j[:, None] * d + axis)[:, None, :])
     lower = row >= column
     banded = np.zeros((band + 1, n * d))

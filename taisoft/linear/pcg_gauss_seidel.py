@@ -179,7 +179,7 @@ def _in_order(w: ti.template(), step):
 
 
 @ti.func
-def _sum(m: ti.template(), w: ti.template(), column: ti.template()):
+def sum_of_chunks(m: ti.template(), w: ti.template(), column: ti.template()):
     """Sum of the chunks' partial sums, in a fixed order."""
     s = ti.cast(0.0, ti.f64)
     for c in range(_n_chunks(w)):
@@ -208,7 +208,7 @@ def start_serial(m: ti.template(), A: ti.template(), k: ti.template(), w: ti.tem
     for step in range(_n_chunks(w)):
         c = _in_order(w, step)
         m.state.partial[c, SUM] = _start_chunk(m, A, k, w, c, same_matrix, False)
-    rz = _sum(m, w, SUM)
+    rz = sum_of_chunks(m, w, SUM)
     if ti.static(w.has_last(k)):
         rz += _start_chunk(m, A, k, w, 0, same_matrix, True)
     w.state[RZ], w.state[RZ_START], w.state[STEP] = rz, rz, 0.0
@@ -233,7 +233,7 @@ def iterate_serial(m: ti.template(), A: ti.template(), k: ti.template(), w: ti.t
         for step in range(n_chunks):
             c = _in_order(w, step)
             m.state.partial[c, SUM] = _sweep_forward(m, A, k, w, c, False)
-        curvature = _sum(m, w, SUM)
+        curvature = sum_of_chunks(m, w, SUM)
         if ti.static(w.has_last(k)):
             curvature += _sweep_forward(m, A, k, w, 0, True)
         if not curvature > 0.0:
@@ -243,7 +243,7 @@ def iterate_serial(m: ti.template(), A: ti.template(), k: ti.template(), w: ti.t
         else:
             for c in range(n_chunks):
                 m.state.partial[c, OTHER_SUM] = _update(m, k, w, c, ti.cast(rz / curvature, m.real))
-            next_rz = _sum(m, w, OTHER_SUM)
+            next_rz = sum_of_chunks(m, w, OTHER_SUM)
             beta = next_rz / rz
             rz = next_rz
             count += 1
@@ -253,7 +253,7 @@ def iterate_serial(m: ti.template(), A: ti.template(), k: ti.template(), w: ti.t
     return count, status
 
 
-# --- on several threads -----------------------------------------------------------------------------------------------
+# --- in loops that several threads may share ----------------------------------------------------------------------------
 
 
 @kernel
@@ -267,28 +267,36 @@ def start_parallel(
             clear_products(m, k)
             clear_last(m, k, w, w.r)
     for parity in ti.static((EVEN, ODD)):
+        ti.loop_config(serialize=m.serial)
         for task in range(_n_of_parity(w, parity) * m.spread):
             if task % m.spread == 0:
                 c = 2 * (task // m.spread) + parity
                 m.state.partial[c, SUM] = _start_chunk(m, A, k, w, c, same_matrix, False)
     ti.loop_config(serialize=True)
     for _ in range(1):
-        rz = _sum(m, w, SUM)
+        rz = sum_of_chunks(m, w, SUM)
         if ti.static(w.has_last(k)):
             rz += _start_chunk(m, A, k, w, 0, same_matrix, True)
-        w.state[RZ], w.state[RZ_START], w.state[STEP], w.state[COUNT] = rz, rz, 0.0, 0.0
-        w.state[STATUS] = CONVERGED if rz <= tolerance * tolerance * rz else RUNNING
+        begin_with(w, tolerance, rz)
 
 
-@kernel
-def iterate_parallel(m: ti.template(), A: ti.template(), k: ti.template(), w: ti.template(), tolerance: ti.f64):
-    """Run one iteration."""
+@ti.func
+def begin_with(w: ti.template(), tolerance, rz):
+    """Set the state before the first iteration."""
+    w.state[RZ], w.state[RZ_START], w.state[STEP], w.state[COUNT] = rz, rz, 0.0, 0.0
+    w.state[STATUS] = CONVERGED if rz <= tolerance * tolerance * rz else RUNNING
+
+
+@ti.func
+def take_step(m: ti.template(), A: ti.template(), k: ti.template(), w: ti.template()):
+    """Run both sweeps and take the step along p, in loops at the top level of a kernel. Partial sums: OTHER_SUM of s.P s."""
     if ti.static(w.has_last(k)):
         ti.loop_config(serialize=True)
         for _ in range(1):
             clear_products(m, k)
             _sweep_backward(m, A, k, w, 0, w.state[STEP], True)
     for parity in ti.static((ODD, EVEN)):
+        ti.loop_config(serialize=m.serial)
         for task in range(_n_of_parity(w, parity) * m.spread):
             if task % m.spread == 0:
                 _sweep_backward(m, A, k, w, 2 * (task // m.spread) + parity, w.state[STEP], False)
@@ -298,19 +306,21 @@ def iterate_parallel(m: ti.template(), A: ti.template(), k: ti.template(), w: ti
             clear_products(m, k)
             clear_last(m, k, w, w.q)
     for parity in ti.static((EVEN, ODD)):
+        ti.loop_config(serialize=m.serial)
         for task in range(_n_of_parity(w, parity) * m.spread):
             if task % m.spread == 0:
                 c = 2 * (task // m.spread) + parity
                 m.state.partial[c, SUM] = _sweep_forward(m, A, k, w, c, False)
     ti.loop_config(serialize=True)
     for _ in range(1):
-        curvature = _sum(m, w, SUM)
+        curvature = sum_of_chunks(m, w, SUM)
         if ti.static(w.has_last(k)):
             curvature += _sweep_forward(m, A, k, w, 0, True)
         if not curvature > 0.0:
             w.state[STATUS], w.state[STEP] = NEGATIVE_PENDING, _negative_step(w.state[RZ], curvature)
         else:
             w.state[STEP] = w.state[RZ] / curvature
+    ti.loop_config(serialize=m.serial)
     for task in range(w.n_chunks * m.spread):
         if task % m.spread == 0:
             c, step = task // m.spread, ti.cast(w.state[STEP], m.real)
@@ -318,13 +328,25 @@ def iterate_parallel(m: ti.template(), A: ti.template(), k: ti.template(), w: ti
                 m.state.partial[c, OTHER_SUM] = _update(m, k, w, c, step)
             else:
                 _add_direction(m, k, w, c, step)
+
+
+@ti.func
+def end_iteration(m: ti.template(), w: ti.template(), tolerance):
+    """Set the state after an iteration, from the partial sums of r.z."""
+    if w.state[STATUS] == RUNNING:
+        rz = sum_of_chunks(m, w, OTHER_SUM)
+        w.state[STEP] = rz / w.state[RZ]
+        w.state[RZ], w.state[COUNT] = rz, w.state[COUNT] + 1.0
+        if rz <= tolerance * tolerance * w.state[RZ_START]:
+            w.state[STATUS] = CONVERGED
+    else:
+        w.state[STATUS] = NEGATIVE
+
+
+@kernel
+def iterate_parallel(m: ti.template(), A: ti.template(), k: ti.template(), w: ti.template(), tolerance: ti.f64):
+    """Run one iteration."""
+    take_step(m, A, k, w)
     ti.loop_config(serialize=True)
     for _ in range(1):
-        if w.state[STATUS] == RUNNING:
-            rz = _sum(m, w, OTHER_SUM)
-            w.state[STEP] = rz / w.state[RZ]
-            w.state[RZ], w.state[COUNT] = rz, w.state[COUNT] + 1.0
-            if rz <= tolerance * tolerance * w.state[RZ_START]:
-                w.state[STATUS] = CONVERGED
-        else:
-            w.state[STATUS] = NEGATIVE
+        end_iteration(m, w, tolerance)

@@ -26,7 +26,7 @@ def aggregate(start: np.ndarray, column: np.ndarray, included: np.ndarray, prior
 
     n = len(included)
     if priority is None:
-        priority = np.random.default_rng(0).permutation(n) + 1
+        priority = np.random.default_rng(0).permutation(n).astype(np.int32) + 1
     root, open_nodes = np.zeros(n, dtype=bool), included.copy()
     while open_nodes.any():
         value = np.where(root, n + priority, np.where(open_nodes, priority, 0))
