@@ -16,6 +16,7 @@ PATH_STEP = 90.0  # [us] of a prescribed path, or a moving obstacle, in a step
 EXPLICIT_TET, QUADRATIC = 0.025, 4.0  # [us] of a linear tet in an explicit step; a quadratic one costs as many
 IMPLICIT_STEP, NEWTON, NEWTON_TET = 150.0, 40.0, 0.15  # [us] of a step and of an iteration
 LINEAR, LINEAR_TET, MULTIPLIERS = 12.0, 0.008, 150.0  # [us] of an iteration of conjugate gradients and of a multiplier update
+SHOWN = 1 / 3  # part of a pilot whose steps cost as much on average as all of its steps, or nearly
 LEAST = {False: (2.0, 4.0, 0.0), True: (2.5, 6.0, 4.0)}  # iterations of an implicit step, at least; key: whether bodies touch
 
 
@@ -47,22 +48,24 @@ def implicit_step(scene: Scene, touches: bool, counts: list[float] | None = None
 
 
 class Budget:
-    """Stops a pilot of implicit steps whose cost exceeds a limit [us]. Pass `add` to its run as on_step, and `stop`.
+    """Stops a pilot of implicit steps that cost more on average than a limit [us]. Pass `add` to its run as on_step, and `stop`.
 
-    given: what stops the pilot besides, None if nothing does.
+    steps: of the pilot; the limit holds from the part SHOWN of them on. given: what else stops the pilot, None if nothing does.
     """
 
-    def __init__(self, scene: Scene, touches: bool, limit: float, given: Callable[[], bool] | None):
-        self._scene, self._touches, self._left, self._given = scene, touches, limit, given
+    def __init__(self, scene: Scene, touches: bool, limit: float, steps: float, given: Callable[[], bool] | None):
+        self._scene, self._touches, self._limit, self._steps, self._given = scene, touches, limit, steps, given
+        self._cost, self._taken = 0.0, 0  # [us], steps
 
     @property
     def is_spent(self) -> bool:
         """Whether the limit was exceeded."""
-        return self._left < 0.0
+        return self._cost > self._limit * max(self._taken, SHOWN * self._steps)
 
     def add(self, report: StepReport, _seconds: float) -> None:
         """Count a step."""
-        self._left -= implicit_step(self._scene, self._touches, [getattr(report, name) for name in COUNTS])
+        self._cost += implicit_step(self._scene, self._touches, [getattr(report, name) for name in COUNTS])
+        self._taken += 1
 
     def stop(self) -> bool:
         """Whether the pilot stops before its next step."""

@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING
 from taisoft.errors import SimulationError, no_memory
 from taisoft.estimation.costs import Budget, explicit_step, implicit_step
 from taisoft.estimation.first_choice import EXPLICIT, IMPLICIT, stable_steps
-from taisoft.estimation.ladder import Ladder, implicit_sizes, slightly_more
+from taisoft.estimation.ladder import SKIPPED, Ladder, implicit_sizes, slightly_more
 from taisoft.estimation.order import may_jump, nominal_order
 from taisoft.estimation.pilots import Pilot, Recorder, RunFunction, distances, make_frames
 from taisoft.estimation.vibrations import ERROR as VIBRATIONS
@@ -152,7 +152,7 @@ class Chooser:
         while True:
             per_frame = next(sizes)
             steps = float(per_frame) * self._frames.count
-            budget = Budget(sim.scene, sim.touches, explicit * steps / max(1.0, float(per_frame)), self._stop)
+            budget = Budget(sim.scene, sim.touches, explicit / max(1.0, float(per_frame)), steps, self._stop)
             pilot = self._pilot(per_frame, budget=budget)
             if budget.is_spent:
                 return None
@@ -194,12 +194,15 @@ class Chooser:
                     return least
         per_frame, replaces = ladder.second_steps(least, ratio)
         (ladder.replace_first if replaces else ladder.add)(self._pilot(per_frame))
+        between = per_frame / 2 if per_frame == SKIPPED * least and ladder.nominal == 1 else None
         while True:
             steps = ladder.steps_needed(self._tolerance)
             if steps is not None or ladder.is_over:
                 return steps or self._last_steps()
-            per_frame *= 2
-            ladder.add(self._pilot(per_frame))
+            if between is None:
+                per_frame *= 2
+            ladder.add(self._pilot(between or per_frame))
+            between = None
 
     def _last_steps(self) -> int:
         """Steps of the last pilot that did not fail. Raises SimulationError if all did."""
