@@ -64,7 +64,7 @@ def euler_node(m: ti.template(), i, dt):
 
 @ti.func
 def keep_decays(m: ti.template(), s: ti.template(), dt):
-    """Compute `verlet_decay` of every node once, where it is kept: its exponential takes as long as the rest of a node."""
+    """Compute `verlet_decay` of every node once in a launch of many sub-steps: it takes as long as the rest of a node."""
     if ti.static(s.keeps_decays):
         for i in range(m.n_nodes):
             s.decay[i] = rayleigh_damping.mass_decay(m, i, 0.5 * dt)

@@ -14,7 +14,6 @@ from taisoft.contact.restitution import explicit_opening
 from taisoft.dynamics.explicit import (
     compute_reactions,
     euler_velocity,
-    keep_decays,
     nonfinite,
     prescribe_positions,
     prescribe_velocities,
@@ -49,7 +48,6 @@ def predict(m: ti.template(), s: ti.template(), dt64: ti.f64):
         elasticity.sum_elements_with_damping(m)
     ti.loop_config(serialize=True)
     for _ in range(1):
-        keep_decays(m, s, ti.cast(dt64, m.real))
         if ti.static(s.has_held):
             save_held_velocities(m, s)
         if ti.static(s.has_prescribed):

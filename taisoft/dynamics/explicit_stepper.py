@@ -95,6 +95,8 @@ def largest_batch(m: Model) -> int:
 class ExplicitStepper:
     """Take sub-steps of symplectic Euler or velocity Verlet."""
 
+    _in_batches = True  # whether a launch takes many sub-steps, on one thread
+
     def __init__(self, simulation: SimulationState, settings: Settings):
         self.simulation, verlet = simulation, settings.integrator == "velocity_verlet"
         m, arena, dirichlet = simulation.model, simulation.arena, simulation.dirichlet
@@ -119,7 +121,7 @@ class ExplicitStepper:
             n_held=n_held,
             acceleration=vectors("acceleration", m.n_nodes, needed=verlet),
             half_velocity=vectors("half_velocity", m.n_nodes, needed=verlet and m.depends_on_velocity),
-            decay=arena.field("mass_decay", m.real, m.n_nodes) if verlet and m.damped and m.serial else None,
+            decay=arena.field("mass_decay", m.real, m.n_nodes) if verlet and m.damped and m.serial and self._in_batches else None,
             prescribed_nodes=ids("prescribed_nodes", dirichlet.prescribed_nodes),
             prescribed_axes=vectors("prescribed_axes", n_prescribed, ti.i32, data=dirichlet.prescribed_axes()),
             targets=vectors("targets", self.rows * n_prescribed, ti.f64),

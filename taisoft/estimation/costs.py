@@ -4,8 +4,6 @@ Its times are those of one core (`taisoft bench scaling`, `taisoft bench toleran
 explicit and implicit steps compete.
 """
 
-from collections.abc import Callable
-
 from taisoft.records import StepReport
 from taisoft.scene.scene import Scene
 
@@ -47,26 +45,23 @@ def implicit_step(scene: Scene, touches: bool, counts: list[float] | None = None
     return step + multipliers * MULTIPLIERS + surroundings(scene, touches)
 
 
-class Budget:
-    """Stops a pilot of implicit steps that cost more on average than a limit [us]. Pass `add` to its run as on_step, and `stop`.
+class Spent(Exception):
+    """A `Budget` is spent."""
 
-    steps: of the pilot; the limit holds from the part SHOWN of them on. given: what else stops the pilot, None if nothing does.
+
+class Budget:
+    """Ends a pilot of implicit steps that cost more on average than a limit [us]. Pass `add` to its run as on_step.
+
+    steps: of the pilot; the limit holds from the part SHOWN of them on.
     """
 
-    def __init__(self, scene: Scene, touches: bool, limit: float, steps: float, given: Callable[[], bool] | None):
-        self._scene, self._touches, self._limit, self._steps, self._given = scene, touches, limit, steps, given
+    def __init__(self, scene: Scene, touches: bool, limit: float, steps: float):
+        self._scene, self._touches, self._limit, self._steps = scene, touches, limit, steps
         self._cost, self._taken = 0.0, 0  # [us], steps
 
-    @property
-    def is_spent(self) -> bool:
-        """Whether the limit was exceeded."""
-        return self._cost > self._limit * max(self._taken, SHOWN * self._steps)
-
     def add(self, report: StepReport, _seconds: float) -> None:
-        """Count a step."""
+        """Count a step. Raises Spent if the limit is exceeded."""
         self._cost += implicit_step(self._scene, self._touches, [getattr(report, name) for name in COUNTS])
         self._taken += 1
-
-    def stop(self) -> bool:
-        """Whether the pilot stops before its next step."""
-        return self.is_spent or (self._given is not None and self._given())
+        if self._cost > self._limit * max(self._taken, SHOWN * self._steps):
+            raise Spent

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 NEGLIGIBLE = {"f32": 1e-6, "f64": 1e-12}  # excursions, over the size of the scene, that are rounding
 ROUNDING = 1e-6  # part of a frame that a run's length may lack of a whole one
 MAX_FRAMES = 48  # at which paths are recorded
-PARTS = 16  # of a run, about; a pilot knows which is the hardest
+PARTS = 24  # of a run, about; a pilot knows which is the hardest
 BLOCK = 64  # frames whose velocities are held until their changes are added
 MAX_NODES = 4096  # whose paths are recorded, evenly spread
 
