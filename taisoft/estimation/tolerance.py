@@ -4,11 +4,11 @@ Implicit pilots are a ladder (`ladder`), each with half the step of the one befo
 times as many steps as the last pilot. How many follows from the difference of the last two and its observed order. The second
 pilot skips one, and is the run if it seems far better than it must be. Explicit steps cannot be coarser than stable. Their first
 pilot has the largest stable step. Its velocities, and its hardest part repeated with a slightly smaller step, show whether it is
-enough; if that is not sure a second pilot takes a smaller step all the way, and otherwise a ladder follows. A pilot that meets
-the tolerance is the run, which is repeated only if frames or steps are observed, or an estimate by twins is asked for.
+enough; if that is not sure a second pilot takes a smaller step all the way, and may skip one. Otherwise a ladder follows. A pilot
+that meets the tolerance is the run, which is repeated only if frames or steps are observed, or an estimate by twins is asked for.
 
 Which kind of steps a run takes follows from counts (`costs`). Explicit steps are accepted at once where they cost less than
-implicit ones could, and an implicit pilot ends when it has cost more than explicit steps would. Among implicit methods BDF2 is
+implicit ones could, and an implicit pilot ends when its steps cost more than explicit ones would. Among implicit methods BDF2 is
 used: it is of second order, has contacts, and damps what its steps cannot resolve.
 
 Weak: pilots do not show what is faster than all of them (`vibrations`). Where their paths diverge, no step meets the tolerance.
