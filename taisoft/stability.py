@@ -5,6 +5,7 @@ dilatation tr(eps) is averaged over patches. Explicit steps also resolve what a 
 """
 
 from typing import NamedTuple
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import scipy.sparse as sp
@@ -17,6 +18,7 @@ from taisoft.fem.dependents import DependentTable, dependent_table
 from taisoft.fem.loads import SceneLoads
 from taisoft.fem.spring_table import SpringTable
 from taisoft.fem.springs import spring_table
+from taisoft.scene.composition import Composition
 from taisoft.scene.rigid import RigidBody
 from taisoft.scene.scene import Body, Scene
 
@@ -113,14 +115,26 @@ def constrained_axes(body: Body, prescribed: bool, scene: Scene | None = None) -
     return constrained
 
 
+_frequencies: "WeakKeyDictionary[Composition, dict[tuple, float]]" = WeakKeyDictionary()  # compositions are immutable
+
+
 def highest_frequency(body: Body) -> float:
     """omega_max [rad/s] that explicit steps of a body must resolve, by Lanczos; overestimated by a fraction of a percent.
 
     It is that at rest with lumped mass. A volume floor stiffens its tets by what it adds to flat ones, see `hooke_differential`.
     """
-    mass = reference.lumped_mass(body)
     free = ~constrained_axes(body, prescribed=False)  # a path may release its nodes
     free[body.nodes.n_elastic :] = False
+    known = _frequencies.setdefault(body.composition, {})  # also asked for when a simulator's settings change
+    key = body.order, body.quadrature_degree, body.dilatation, free.tobytes()
+    if key not in known:
+        known[key] = _highest_frequency(body, free)
+    return known[key]
+
+
+def _highest_frequency(body: Body, free: np.ndarray) -> float:
+    """The same. free: (n,3) axes."""
+    mass = reference.lumped_mass(body)
     scale = np.where(free, 1.0 / np.sqrt(np.where(free, mass[:, None], 1.0)), 0.0)
     if not free.any():
         return 0.0

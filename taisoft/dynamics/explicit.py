@@ -63,11 +63,30 @@ def euler_node(m: ti.template(), i, dt):
 
 
 @ti.func
-def verlet_half(m: ti.template(), s: ti.template(), i, dt):
-    """Return the velocity after the first half kick."""
+def keep_decays(m: ti.template(), s: ti.template(), dt):
+    """Compute `verlet_decay` of every node once in a launch of many sub-steps: it takes as long as the rest of a node."""
+    if ti.static(s.keeps_decays):
+        for i in range(m.n_nodes):
+            s.decay[i] = rayleigh_damping.mass_decay(m, i, 0.5 * dt)
+
+
+@ti.func
+def verlet_decay(m: ti.template(), s: ti.template(), i, dt):
+    """Return the factor by which mass damping slows node i in half a sub-step of Verlet."""
+    decay = ti.cast(1.0, m.real)
+    if ti.static(s.keeps_decays):
+        decay = s.decay[i]
+    elif ti.static(m.damped):
+        decay = rayleigh_damping.mass_decay(m, i, 0.5 * dt)
+    return decay
+
+
+@ti.func
+def verlet_half(m: ti.template(), s: ti.template(), i, dt, decay):
+    """Return the velocity after the first half kick. decay: `verlet_decay` of node i."""
     v = m.state.v[i]
     if ti.static(m.damped):
-        v *= rayleigh_damping.mass_decay(m, i, 0.5 * dt)
+        v *= decay
     return v + 0.5 * dt * s.acceleration[i]
 
 
@@ -83,15 +102,15 @@ def verlet_drift(m: ti.template(), s: ti.template(), i, dt, half):
 
 
 @ti.func
-def verlet_kick(m: ti.template(), s: ti.template(), i, dt):
-    """Apply the second half kick and return v."""
+def verlet_kick(m: ti.template(), s: ti.template(), i, dt, decay):
+    """Apply the second half kick and return v. decay: as in `verlet_half`."""
     a = acceleration(m, i)
     half = m.state.v[i]
     if ti.static(m.depends_on_velocity):
         half = s.half_velocity[i]
     v = half + 0.5 * dt * a
     if ti.static(m.damped):
-        v *= rayleigh_damping.mass_decay(m, i, 0.5 * dt)
+        v *= decay
     s.acceleration[i] = a
     m.state.v[i] = v
     return v
@@ -174,9 +193,14 @@ def save_held_velocities(m: ti.template(), s: ti.template()):
         s.held_velocity[k] = m.state.v[s.held[k]]
 
 
+def begins_alone(m, s) -> bool:
+    """Whether sub-steps begin apart from the loop over nodes that ends the one before, because more happens there."""
+    return s.has_prescribed or s.has_varied_loads or m.has_rigid_tets
+
+
 @ti.func
-def begin_substep(m: ti.template(), s: ti.template(), done, n, dt64):
-    """Run the part of a sub-step before the element loop, serially."""
+def begin_substep(m: ti.template(), s: ti.template(), done, n, dt64, begun):
+    """Run the part of a sub-step before the element loop, serially. begun: 1 if the nodes have drifted already."""
     dt = ti.cast(dt64, m.real)
     if ti.static(s.has_held):
         if done == n - 1:
@@ -184,8 +208,9 @@ def begin_substep(m: ti.template(), s: ti.template(), done, n, dt64):
     if ti.static(s.has_prescribed):
         save_prescribed_positions(m, s)
     if ti.static(s.verlet):
-        for i in range(m.n_nodes):
-            verlet_drift(m, s, i, dt, verlet_half(m, s, i, dt))
+        if begun == 0:
+            for i in range(m.n_nodes):
+                verlet_drift(m, s, i, dt, verlet_half(m, s, i, dt, verlet_decay(m, s, i, dt)))
         if ti.static(m.has_rigid_tets):
             for k in range(m.rigid_tets.n):
                 turn_drifted(m, s, k, dt)
@@ -196,13 +221,20 @@ def begin_substep(m: ti.template(), s: ti.template(), done, n, dt64):
 
 
 @ti.func
-def end_substep(m: ti.template(), s: ti.template(), done, n, dt64):
-    """Run the part of a sub-step after the element loop, serially. Return the sum of the velocities."""
+def end_substep(m: ti.template(), s: ti.template(), done, n, dt64, drift):
+    """Run the part of a sub-step after the element loop, serially. Return the sum of the velocities.
+
+    drift: 1 to begin the next sub-step of Verlet, as in `nodes_parallel`.
+    """
     dt = ti.cast(dt64, m.real)
     total = ti.Vector([0.0, 0.0, 0.0], m.real)
     for i in range(m.n_nodes):
         if ti.static(s.verlet):
-            total += verlet_kick(m, s, i, dt)
+            decay = verlet_decay(m, s, i, dt)
+            total += verlet_kick(m, s, i, dt, decay)
+            if ti.static(not begins_alone(m, s)):
+                if drift == 1:
+                    verlet_drift(m, s, i, dt, verlet_half(m, s, i, dt, decay))
         else:
             total += euler_node(m, i, dt)
     if ti.static(m.has_rigid_tets):
@@ -227,15 +259,16 @@ def advance_serial(m: ti.template(), s: ti.template(), n: ti.i32, dt64: ti.f64, 
     """
     ti.loop_config(serialize=True)
     for _ in range(1):
-        done, running = 0, True
+        done, running, begun = 0, True, 0
         lowest_by_lane = broadcast(ti.cast(HUGE, m.real), m.lanes)
         min_J, max_inverted = ti.cast(HUGE, m.real), 0
         starting = False
         if ti.static(s.verlet):
             starting = restart != 0
+            keep_decays(m, s, ti.cast(dt64, m.real))
         while starting or (done < n and running):
             if not starting:
-                begin_substep(m, s, done, n, dt64)
+                begin_substep(m, s, done, n, dt64, begun)
             lowest_now, inverted = elasticity.sum_elements_serially(m)
             if starting:  # forces alone, in the loop of the sub-steps: another copy of them takes long to compile
                 if ti.static(s.verlet):
@@ -244,7 +277,12 @@ def advance_serial(m: ti.template(), s: ti.template(), n: ti.i32, dt64: ti.f64, 
                 starting = False
             else:
                 lowest_by_lane = ti.min(lowest_by_lane, lowest_now)
-                total = end_substep(m, s, done, n, dt64)
+                if ti.static(s.verlet and not begins_alone(m, s)):
+                    last = n - 1
+                    if ti.static(s.has_held):  # whose velocities before the last one are needed
+                        last = n - 2
+                    begun = 1 if done < last else 0
+                total = end_substep(m, s, done, n, dt64, begun)
                 low, count = elasticity.lowest_and_count(m, lowest_by_lane, inverted)
                 min_J, max_inverted = low, ti.max(max_inverted, count)
                 running = min_J > -EXPLODED and not nonfinite(ti.cast(total[0] + total[1] + total[2], ti.f64))
@@ -295,7 +333,7 @@ def drift_parallel(m: ti.template(), s: ti.template(), row: ti.i32, dt64: ti.f64
     if ti.static(s.verlet):
         for i in range(m.n_nodes):
             dt = ti.cast(dt64, m.real)
-            verlet_drift(m, s, i, dt, verlet_half(m, s, i, dt))
+            verlet_drift(m, s, i, dt, verlet_half(m, s, i, dt, verlet_decay(m, s, i, dt)))
         turn_all(m, s, dt64)
         if ti.static(s.has_prescribed):
             prescribe_all(m, s, row, dt64)
@@ -315,9 +353,10 @@ def nodes_parallel(m: ti.template(), s: ti.template(), row: ti.i32, dt64: ti.f64
         dt = ti.cast(dt64, m.real)
         v = ti.Vector([0.0, 0.0, 0.0], m.real)
         if ti.static(s.verlet):
-            v = verlet_kick(m, s, i, dt)
+            decay = verlet_decay(m, s, i, dt)
+            v = verlet_kick(m, s, i, dt, decay)
             if drift == 1:
-                verlet_drift(m, s, i, dt, verlet_half(m, s, i, dt))
+                verlet_drift(m, s, i, dt, verlet_half(m, s, i, dt, decay))
         else:
             v = euler_node(m, i, dt)
         if nonfinite(ti.cast(v[0] + v[1] + v[2], ti.f64)):

@@ -19,6 +19,7 @@ from taisoft.dynamics.explicit import (
     prescribe_velocities,
     save_held_velocities,
     save_prescribed_positions,
+    verlet_decay,
     verlet_drift,
     verlet_half,
     verlet_kick,
@@ -55,7 +56,7 @@ def predict(m: ti.template(), s: ti.template(), dt64: ti.f64):
     for i in range(m.n_nodes):
         dt = ti.cast(dt64, m.real)
         if ti.static(s.verlet):
-            m.state.v[i] = verlet_half(m, s, i, dt)
+            m.state.v[i] = verlet_half(m, s, i, dt, verlet_decay(m, s, i, dt))
         else:
             m.state.v[i] = euler_velocity(m, i, dt)
     project_all(m)
@@ -144,7 +145,8 @@ def finish_verlet(m: ti.template(), s: ti.template(), p: ti.template(), dt64: ti
     """Apply the second half kick by the forces at the new positions, after `run_elements`; scalars as in `predict` and `move`."""
     ti.loop_config(serialize=m.serial)
     for i in range(m.n_nodes):
-        v = verlet_kick(m, s, i, ti.cast(dt64, m.real))
+        dt = ti.cast(dt64, m.real)
+        v = verlet_kick(m, s, i, dt, verlet_decay(m, s, i, dt))
         if nonfinite(ti.cast(v[0] + v[1] + v[2], ti.f64)):
             m.state.scalars[FAILED] = 1.0
     project_all(m)

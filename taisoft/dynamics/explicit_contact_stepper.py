@@ -37,6 +37,8 @@ class GoodState:
 class ContactExplicitStepper(ExplicitStepper):
     """Take sub-steps of symplectic Euler or velocity Verlet with contacts."""
 
+    _in_batches = False
+
     def __init__(self, simulation: SimulationState, settings: Settings, contact: ContactStep):
         super().__init__(simulation, settings)
         self.contact, self.method = contact, settings.contact_solver

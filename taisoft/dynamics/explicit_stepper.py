@@ -36,6 +36,7 @@ class SubstepWork:
     n_held: Count
     acceleration: Any  # (n_nodes) 3-vectors, Verlet
     half_velocity: Any  # (n_nodes) 3-vectors, Verlet with forces that depend on v
+    decay: Any  # (n_nodes) factors of mass damping in half a sub-step: Verlet, on one thread
     prescribed_nodes: Any  # (n_prescribed) i32
     prescribed_axes: Any  # (n_prescribed) 3-vectors i32
     targets: Any  # (rows * n_prescribed) 3-vectors f64
@@ -48,6 +49,11 @@ class SubstepWork:
     held: Any  # (n_held) i32
     held_velocity: Any  # (n_held) 3-vectors
     reaction: Any  # (n_held) 3-vectors [N]
+
+    @property
+    def keeps_decays(self) -> bool:
+        """Whether the factors of mass damping are computed once in a launch."""
+        return self.decay is not None
 
     @property
     def has_prescribed(self) -> bool:
@@ -89,6 +95,8 @@ def largest_batch(m: Model) -> int:
 class ExplicitStepper:
     """Take sub-steps of symplectic Euler or velocity Verlet."""
 
+    _in_batches = True  # whether a launch takes many sub-steps, on one thread
+
     def __init__(self, simulation: SimulationState, settings: Settings):
         self.simulation, verlet = simulation, settings.integrator == "velocity_verlet"
         m, arena, dirichlet = simulation.model, simulation.arena, simulation.dirichlet
@@ -113,6 +121,7 @@ class ExplicitStepper:
             n_held=n_held,
             acceleration=vectors("acceleration", m.n_nodes, needed=verlet),
             half_velocity=vectors("half_velocity", m.n_nodes, needed=verlet and m.depends_on_velocity),
+            decay=arena.field("mass_decay", m.real, m.n_nodes) if verlet and m.damped and m.serial and self._in_batches else None,
             prescribed_nodes=ids("prescribed_nodes", dirichlet.prescribed_nodes),
             prescribed_axes=vectors("prescribed_axes", n_prescribed, ti.i32, data=dirichlet.prescribed_axes()),
             targets=vectors("targets", self.rows * n_prescribed, ti.f64),
@@ -254,7 +263,7 @@ class ExplicitStepper:
             explicit.run_elements(m)
             explicit.find_acceleration(m, s)
         explicit.begin_parallel(m)
-        special = bool(s.n_prescribed or s.has_varied_loads or m.has_rigid_tets)
+        special = explicit.begins_alone(m, s)
 
         def begins_alone(row: int) -> bool:  # not in the loop over nodes that ends the last sub-step
             last_held = s.n_held > 0 and row == n - 1  # the velocities before it are needed for the reactions

@@ -4,8 +4,6 @@ Its times are those of one core (`taisoft bench scaling`, `taisoft bench toleran
 explicit and implicit steps compete.
 """
 
-from collections.abc import Callable
-
 from taisoft.records import StepReport
 from taisoft.scene.scene import Scene
 
@@ -16,6 +14,7 @@ PATH_STEP = 90.0  # [us] of a prescribed path, or a moving obstacle, in a step
 EXPLICIT_TET, QUADRATIC = 0.025, 4.0  # [us] of a linear tet in an explicit step; a quadratic one costs as many
 IMPLICIT_STEP, NEWTON, NEWTON_TET = 150.0, 40.0, 0.15  # [us] of a step and of an iteration
 LINEAR, LINEAR_TET, MULTIPLIERS = 12.0, 0.008, 150.0  # [us] of an iteration of conjugate gradients and of a multiplier update
+SHOWN = 1 / 3  # part of a pilot whose steps cost as much on average as all of its steps, or nearly
 LEAST = {False: (2.0, 4.0, 0.0), True: (2.5, 6.0, 4.0)}  # iterations of an implicit step, at least; key: whether bodies touch
 
 
@@ -46,24 +45,23 @@ def implicit_step(scene: Scene, touches: bool, counts: list[float] | None = None
     return step + multipliers * MULTIPLIERS + surroundings(scene, touches)
 
 
-class Budget:
-    """Stops a pilot of implicit steps whose cost exceeds a limit [us]. Pass `add` to its run as on_step, and `stop`.
+class Spent(Exception):
+    """A `Budget` is spent."""
 
-    given: what stops the pilot besides, None if nothing does.
+
+class Budget:
+    """Ends a pilot of implicit steps that cost more on average than a limit [us]. Pass `add` to its run as on_step.
+
+    steps: of the pilot; the limit holds from the part SHOWN of them on.
     """
 
-    def __init__(self, scene: Scene, touches: bool, limit: float, given: Callable[[], bool] | None):
-        self._scene, self._touches, self._left, self._given = scene, touches, limit, given
-
-    @property
-    def is_spent(self) -> bool:
-        """Whether the limit was exceeded."""
-        return self._left < 0.0
+    def __init__(self, scene: Scene, touches: bool, limit: float, steps: float):
+        self._scene, self._touches, self._limit, self._steps = scene, touches, limit, steps
+        self._cost, self._taken = 0.0, 0  # [us], steps
 
     def add(self, report: StepReport, _seconds: float) -> None:
-        """Count a step."""
-        self._left -= implicit_step(self._scene, self._touches, [getattr(report, name) for name in COUNTS])
-
-    def stop(self) -> bool:
-        """Whether the pilot stops before its next step."""
-        return self.is_spent or (self._given is not None and self._given())
+        """Count a step. Raises Spent if the limit is exceeded."""
+        self._cost += implicit_step(self._scene, self._touches, [getattr(report, name) for name in COUNTS])
+        self._taken += 1
+        if self._cost > self._limit * max(self._taken, SHOWN * self._steps):
+            raise Spent

@@ -4,6 +4,11 @@ The first explicit pilot, which has the largest stable steps, is alone. What its
 smaller step in its hardest part, give the expected error. Impacts and releases make it unsure: unless it is far below the
 tolerance, a second pilot takes slightly smaller steps all the way. It may still be wrong by a factor of ten.
 
+Where errors fall with dt at least, and twice as many steps seem too few, the second pilot takes four times as many, and may be
+the run. Its distance to the first is almost the whole error of that one, and less by chance than one to a pilot with half as many
+steps. It errs by a third of it; at an order of only 1/2 by three times as much, where half as many steps err by 2.4 times
+as much as shown. If it is not the run, the pilot between them shows the order.
+
 Velocity Verlet solves x'' = a + dt^2/12 x'''' up to dt^4 (Hairer, Lubich, Wanner, "Geometric Numerical Integration", 2006,
 IX.9). A motion of frequency w thus lags by the phase (w dt)^2/24 w t, which is dt^2/24 times the total variation of its
 acceleration. An impact may be late by dt.
@@ -29,6 +34,7 @@ LEAST_REACH = 1.5  # the same, at least, where the run is not the last pilot: a 
 FEWEST = {EXPLICIT: 2, IMPLICIT: 3}  # pilots that show an error: fewer coarse implicit steps may agree and be wrong
 SMALLER = Fraction(5, 4)  # steps of a slightly smaller size over those of the first explicit pilot
 CHANCE = 0.5  # part of an expected error of sudden motion that may be chance
+SKIPPED = 4  # steps of the second explicit pilot over those of the first where it skips one of twice as many
 MOST = 4.0  # steps of the second explicit pilot over those of the first, at most
 LARGEST_STEP = 4  # frames in a step of the first implicit pilot
 LEAST_STEPS = 8  # of an implicit pilot
@@ -195,7 +201,9 @@ class Ladder:
         largest = float(more / least - 1) / CHANCE if self.sudden else float(SMALLER)
         if ratio <= largest or not self.pilots:
             return more, True
-        return Fraction(math.ceil(least * (2.0 if self.nominal == 1 else min(MOST, max(LEAST_REACH, ratio))))), False
+        if self.nominal == 1:
+            return Fraction(SKIPPED * least if ratio > 2.0 else 2 * least), False
+        return Fraction(math.ceil(least * min(MOST, max(LEAST_REACH, ratio)))), False
 
     def meets(self, tolerance: float) -> bool:
         """Whether the last pilot is likely to meet a tolerance."""

@@ -26,8 +26,8 @@ if TYPE_CHECKING:
 NEGLIGIBLE = {"f32": 1e-6, "f64": 1e-12}  # excursions, over the size of the scene, that are rounding
 ROUNDING = 1e-6  # part of a frame that a run's length may lack of a whole one
 MAX_FRAMES = 48  # at which paths are recorded
-PARTS = 16  # of a run, about; a pilot knows which is the hardest
-BLOCK = 16  # frames whose velocities are held until their changes are added
+PARTS = 24  # of a run, about; a pilot knows which is the hardest
+BLOCK = 64  # frames whose velocities are held until their changes are added
 MAX_NODES = 4096  # whose paths are recorded, evenly spread
 
 RunFunction = Callable[..., RunReport]  # as `running.run_steps`
@@ -88,6 +88,7 @@ class Recorder:
         self._stride = stride if stride.denominator > 1 else int(stride)
         self._index: int | None = None  # of the first frame
         self._velocities: list[np.ndarray] = []  # since the frame up to which changes are added, with that one
+        self._ends: list[tuple[int, int, dict]] = []  # of parts since then: changes before it, its frame, and the state there
         self._jump: np.ndarray | None = None  # the change of velocities there
         self._part: tuple[int, dict] = (0, {})  # the present one, as Pilot.hardest
         self._changes: np.ndarray | float = 0.0  # (n,) of velocities in it
@@ -107,11 +108,11 @@ class Recorder:
         else:
             v = state.velocities()
         self._velocities.append(v[frames.nodes])
-        ends = self._keeps and (number % frames.part == 0 or number == frames.count)
-        if ends or len(self._velocities) > BLOCK:
+        if self._keeps and (number % frames.part == 0 or number == frames.count):
+            kept = sim._dynamics.snapshot() if number < frames.count else {}
+            self._ends.append((len(self._velocities) - 1, number, kept))
+        if len(self._velocities) > BLOCK:
             self.add_changes()
-        if ends:
-            self._end_part(sim, number)
 
     def add_changes(self) -> None:
         """Add the changes of the velocities that were recorded since the last call."""
@@ -122,23 +123,28 @@ class Recorder:
         lengths = _lengths(jumps)
         pilot.jump = max(pilot.jump, float(lengths.max()))
         if self._jump is None:
-            self._changes = self._changes + lengths[0]
+            changes = np.concatenate([lengths[:1], _lengths(np.diff(jumps, axis=0))])
+            pilot.variations = changes[1:].sum(axis=0)
         else:
-            jumps = np.concatenate([self._jump[None], jumps])
-        change = _lengths(np.diff(jumps, axis=0)).sum(axis=0)
-        self._changes, pilot.variations = self._changes + change, pilot.variations + change
-        self._velocities, self._jump = self._velocities[-1:], jumps[-1]
+            changes = _lengths(np.diff(np.concatenate([self._jump[None], jumps]), axis=0))
+            pilot.variations = pilot.variations + changes.sum(axis=0)
+        begin = 0
+        for end, number, state in self._ends:
+            self._changes = self._changes + changes[begin:end].sum(axis=0)
+            self._end_part(number, state)
+            begin = end
+        self._changes = self._changes + changes[begin:].sum(axis=0)
+        self._velocities, self._ends, self._jump = self._velocities[-1:], [], jumps[-1]
 
-    def _end_part(self, sim: "Simulator", number: int) -> None:
-        """End a part of the run, and begin the next one at a frame."""
+    def _end_part(self, number: int, state: dict) -> None:
+        """End a part of the run, and begin the next one at a frame, with the state there; at the end of the run it is empty."""
         if self._part[1]:
             changes = float(np.max(self._changes))
             self._sum += changes
             if changes > self._most:
                 self._most, self._pilot.hardest = changes, self._part
             self._pilot.parts = self._sum / self._most if self._most > 0.0 else 1.0
-        if number < self._frames.count:
-            self._part, self._changes = (number, sim._dynamics.snapshot()), 0.0
+        self._part, self._changes = (number, state), 0.0
 
 
 @dataclass(frozen=True)
@@ -172,7 +178,7 @@ class Frames:
     @cached_property
     def part(self) -> int:
         """Frames of a part of the run; the last part may have fewer."""
-        return self._between * -(-self.count // (self._between * PARTS))
+        return self._between * max(1, round(self.count / (self._between * PARTS)))
 
     def pilot(
         self,

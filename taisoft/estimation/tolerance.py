@@ -4,11 +4,11 @@ Implicit pilots are a ladder (`ladder`), each with half the step of the one befo
 times as many steps as the last pilot. How many follows from the difference of the last two and its observed order. The second
 pilot skips one, and is the run if it seems far better than it must be. Explicit steps cannot be coarser than stable. Their first
 pilot has the largest stable step. Its velocities, and its hardest part repeated with a slightly smaller step, show whether it is
-enough; if that is not sure a second pilot takes a smaller step all the way, and otherwise a ladder follows. A pilot that meets
-the tolerance is the run, which is repeated only if frames or steps are observed, or an estimate by twins is asked for.
+enough; if that is not sure a second pilot takes a smaller step all the way, and may skip one. Otherwise a ladder follows. A pilot
+that meets the tolerance is the run, which is repeated only if frames or steps are observed, or an estimate by twins is asked for.
 
 Which kind of steps a run takes follows from counts (`costs`). Explicit steps are accepted at once where they cost less than
-implicit ones could, and an implicit pilot ends when it has cost more than explicit steps would. Among implicit methods BDF2 is
+implicit ones could, and an implicit pilot ends when its steps cost more than explicit ones would. Among implicit methods BDF2 is
 used: it is of second order, has contacts, and damps what its steps cannot resolve.
 
 Weak: pilots do not show what is faster than all of them (`vibrations`). Where their paths diverge, no step meets the tolerance.
@@ -22,11 +22,11 @@ from fractions import Fraction
 from typing import TYPE_CHECKING
 
 from taisoft.errors import SimulationError, no_memory
-from taisoft.estimation.costs import Budget, explicit_step, implicit_step
+from taisoft.estimation.costs import Budget, Spent, explicit_step, implicit_step
 from taisoft.estimation.first_choice import EXPLICIT, IMPLICIT, stable_steps
-from taisoft.estimation.ladder import Ladder, implicit_sizes, slightly_more
+from taisoft.estimation.ladder import SKIPPED, Ladder, implicit_sizes, slightly_more
 from taisoft.estimation.order import may_jump, nominal_order
-from taisoft.estimation.pilots import Pilot, Recorder, RunFunction, distances, make_frames
+from taisoft.estimation.pilots import Pilot, Recorder, RunFunction, StepCallback, distances, make_frames
 from taisoft.estimation.vibrations import ERROR as VIBRATIONS
 from taisoft.estimation.vibrations import add_vibrations, are_passed_over
 from taisoft.records import BodyError, ErrorEstimate, RunReport
@@ -152,11 +152,11 @@ class Chooser:
         while True:
             per_frame = next(sizes)
             steps = float(per_frame) * self._frames.count
-            budget = Budget(sim.scene, sim.touches, explicit * steps / max(1.0, float(per_frame)), self._stop)
-            pilot = self._pilot(per_frame, budget=budget)
-            if budget.is_spent:
+            budget = Budget(sim.scene, sim.touches, explicit / max(1.0, float(per_frame)), steps)
+            try:
+                ladder.add(self._pilot(per_frame, on_step=budget.add))
+            except Spent:
                 return None
-            ladder.add(pilot)
             needed = ladder.steps_needed(self._tolerance)
             if self._passes_over_vibrations():
                 if explicit <= DEARER * implicit_step(sim.scene, sim.touches):
@@ -194,12 +194,15 @@ class Chooser:
                     return least
         per_frame, replaces = ladder.second_steps(least, ratio)
         (ladder.replace_first if replaces else ladder.add)(self._pilot(per_frame))
+        between = per_frame / 2 if per_frame == SKIPPED * least and ladder.nominal == 1 else None
         while True:
             steps = ladder.steps_needed(self._tolerance)
             if steps is not None or ladder.is_over:
                 return steps or self._last_steps()
-            per_frame *= 2
-            ladder.add(self._pilot(per_frame))
+            if between is None:
+                per_frame *= 2
+            ladder.add(self._pilot(between or per_frame))
+            between = None
 
     def _last_steps(self) -> int:
         """Steps of the last pilot that did not fail. Raises SimulationError if all did."""
@@ -207,19 +210,19 @@ class Chooser:
             raise SimulationError(f"every pilot failed, the last one because of {self._last_failure[1]}")
         return math.ceil(self.ladder.pilots[-1].per_frame)
 
-    def _pilot(self, per_frame: Fraction, whole: Pilot | None = None, keeps: bool = False, budget: Budget | None = None) -> Pilot:
-        """Run a pilot, see `Frames.pilot`. budget: what may stop it, besides an interrupt.
+    def _pilot(
+        self, per_frame: Fraction, whole: Pilot | None = None, keeps: bool = False, on_step: StepCallback | None = None
+    ) -> Pilot:
+        """Run a pilot, see `Frames.pilot`.
 
         Raises SimulationError if it and the one before fail: smaller steps do not help.
         """
-        stop, on_step = (self._stop, None) if budget is None else (budget.stop, budget.add)
-        pilot = self._frames.pilot(self._sim, per_frame, stop, self._run_steps, whole, keeps, on_step)
+        pilot = self._frames.pilot(self._sim, per_frame, self._stop, self._run_steps, whole, keeps, on_step)
         report, before = pilot.report, self._last_failure
         self.compile_seconds += report.compile_seconds
-        spent = budget is not None and budget.is_spent
-        if report.interrupted and not spent:
+        if report.interrupted:
             raise KeyboardInterrupt
-        if whole is not None or spent:  # whether a part fails does not count
+        if whole is not None:  # whether a part fails does not count
             return pilot
         self._last_failure = (report.sim_seconds, report.problems[-1]) if report.status == "failed" else None
         if before and self._last_failure and abs(report.sim_seconds - before[0]) <= self._frames.seconds:
