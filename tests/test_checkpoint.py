@@ -271,7 +271,7 @@ def test_other_formats_are_refused_with_their_version(saved, tmp_path, version, 
         return np.frombuffer(json.dumps(header).encode(), dtype=np.uint8)
 
     text = refusal(changed(saved, tmp_path / "changed.npz", "header", change))
-    assert f"written by taisoft {version} in format {format_version}, and taisoft" in text and "reads format 14" in text
+    assert f"written by taisoft {version} in format {format_version}, and taisoft" in text and "reads format 15" in text
 
 
 def set_read_only(scene, name: str, value):

@@ -19,7 +19,14 @@ from lanes import opened
 from taisoft.backend.arrays import FieldArena
 from taisoft.contact.problem import build_node_problem, fill_field
 from taisoft.dynamics.contact_terms import PAST
-from taisoft.dynamics.frictional import MAX_EXTRAPOLATION, MAX_R_SCALE, MIN_R_SCALE, extrapolate_multipliers, next_scale
+from taisoft.dynamics.frictional import (
+    MAX_EXTRAPOLATION,
+    MAX_R_FRICTIONLESS,
+    MAX_R_SCALE,
+    MIN_R_SCALE,
+    extrapolate_multipliers,
+    next_scale,
+)
 
 K = 40
 
@@ -161,17 +168,21 @@ def test_an_extrapolation_whose_second_term_is_too_long_is_rejected(rig):
 
 
 @pytest.mark.parametrize(
-    "scale, residual, before, n_steps, expected",
+    "scale, residual, before, n_steps, frictionless, expected",
     [
-        (8.0, 1.3, 1.0, 1, 4.0),  # increased: softer,
-        (4.0, 1.3, 1.0, 1, 8.0),  # but not below STEADY
-        (8.0, 0.9, 1.0, 1, 16.0),  # hardly decreased after one step: stiffer,
-        (MAX_R_SCALE, 0.9, 1.0, 1, MAX_R_SCALE),
-        (8.0, 0.9, 1.0, 3, 8.0),  # after some: unchanged,
-        (2.0, 0.9, 1.0, 5, 1.0),  # after many: softer
-        (MIN_R_SCALE, 0.9, 1.0, 5, MIN_R_SCALE),
-        (8.0, 0.7, 1.0, 1, 8.0),  # decreased: unchanged
+        (8.0, 1.3, 1.0, 1, 0, 4.0),  # increased: softer,
+        (4.0, 1.3, 1.0, 1, 0, 8.0),  # but not below STEADY
+        (8.0, 0.9, 1.0, 1, 0, 16.0),  # hardly decreased after one step: stiffer,
+        (MAX_R_SCALE, 0.9, 1.0, 1, 0, MAX_R_SCALE),
+        (8.0, 0.9, 1.0, 3, 0, 8.0),  # after some: unchanged,
+        (2.0, 0.9, 1.0, 5, 0, 1.0),  # after many: softer
+        (MIN_R_SCALE, 0.9, 1.0, 5, 0, MIN_R_SCALE),
+        (8.0, 0.7, 1.0, 1, 0, 8.0),  # decreased: unchanged
+        (8.0, 1.3, 1.0, 1, 1, 16.0),  # without friction: stiffer while it does not decrease,
+        (8.0, 0.9, 1.0, 3, 1, 16.0),  # after some steps, too,
+        (8.0, 0.9, 1.0, 5, 1, 4.0),  # but softer after many
+        (MAX_R_FRICTIONLESS, 0.9, 1.0, 1, 1, MAX_R_FRICTIONLESS),
     ],
 )
-def test_the_scale_of_r_follows_the_residual_of_the_contact_laws(scale, residual, before, n_steps, expected):
-    assert next_scale(scale, residual, before, n_steps) == expected
+def test_the_scale_of_r_follows_the_residual_of_the_contact_laws(scale, residual, before, n_steps, frictionless, expected):
+    assert next_scale(scale, residual, before, n_steps, frictionless) == expected

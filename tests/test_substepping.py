@@ -7,7 +7,7 @@
 * a substep that ends in deep penetration, leaves the searched path, or whose contacts do not settle, is undone and halved, at
   most MAX_UNDONE times a step;
 * a substep in which something passes through something is repeated, then halved, then held back and reported; it is halved
-  sooner if its equations cannot be solved;
+  sooner if its equations cannot be solved, and the substeps and steps after it are tried longer ever more seldom while they fail;
 * bodies that close too fast for the shortest substep raise an error; after an error the state is that before the step.
 """
 
@@ -15,7 +15,16 @@ import numpy as np
 import pytest
 
 from taisoft.dynamics.results import StageResult
-from taisoft.dynamics.substepping import MAX_FAILED, MAX_PASSAGES, MAX_SEARCHES, MAX_SUBSTEPS, MAX_UNDONE, Substepping
+from taisoft.dynamics.substepping import (
+    MAX_FAILED,
+    MAX_PASSAGES,
+    MAX_PATIENCE,
+    MAX_SEARCHES,
+    MAX_SUBSTEPS,
+    MAX_UNDONE,
+    LengthLimit,
+    Substepping,
+)
 from taisoft.errors import SimulationError
 
 DT = 0.1  # [s]
@@ -244,6 +253,36 @@ def test_unconverged_passages_halve_a_substep_sooner(stepper):
     result = Substepping(stepper).step(0.0, DT)
     whole = [dt for _, dt in stepper.taken if dt == DT]
     assert covers_step(stepper) and len(stepper.kept) == 2 and len(whole) == MAX_FAILED < MAX_PASSAGES and result.converged
+
+
+def test_substeps_that_keep_passing_are_tried_ever_more_seldom(stepper):
+    stepper.passes = lambda time, dt: dt > DT / 16
+    stepper.is_stuck = True
+    substepping, undone = Substepping(stepper), []
+    for k in range(6):
+        stepper.x, stepper.taken, stepper.kept = k * DT, [], []
+        substepping.step(k * DT, DT)
+        undone.append(len({taken for taken in stepper.taken if taken[1] > DT / 16 * 1.001}))
+    assert undone[0] >= 4 and max(undone[2:]) <= 2 and sum(undone[2:]) >= 4 * 16 / MAX_PATIENCE / 2
+    stepper.passes = lambda time, dt: False
+    for k in range(6, 10):
+        stepper.x, stepper.kept = k * DT, []
+        substepping.step(k * DT, DT)
+    assert substepping.substeps == 1  # it has ended
+
+
+def test_length_limit_returns_from_its_snapshot():
+    limit, other = LengthLimit(), LengthLimit()
+    limit.undo(DT, again=False)
+    limit.undo(DT / 2, again=True)
+    assert limit.longest == DT / 4 and limit.patience == 2
+    limit.keep(DT)
+    limit.keep(DT)
+    assert limit.longest == DT / 2 and limit.is_trial
+    other.restore(limit.snapshot())
+    assert vars(other) == vars(limit)
+    limit.keep(DT)  # the longer one was kept: patience halves, and the limit reaches the step
+    assert vars(limit) == vars(LengthLimit())
 
 
 def test_passages_end_with_the_repetition_that_has_none(stepper):

@@ -23,7 +23,7 @@ from taisoft.dynamics.results import StageResult, StepResult, count_all
 from taisoft.dynamics.schemes import SCHEMES, Scheme
 from taisoft.dynamics.simulation_state import SimulationState
 from taisoft.dynamics.stage_system import Stage, StageSystem
-from taisoft.dynamics.substepping import Substepping
+from taisoft.dynamics.substepping import LengthLimit, Substepping
 from taisoft.errors import SimulationError
 from taisoft.fem.dependents import place_all
 from taisoft.fem.rigid_tets import begin_rigid_stage
@@ -122,7 +122,7 @@ class ImplicitStepper:
 
     def forget(self) -> None:
         """Discard the history, after the state was set."""
-        self._substepping.may_retry = True
+        self._substepping.may_retry, self._substepping.limit = True, LengthLimit()
         self._n_previous = 0  # previous states in the history
         self._beta = self._dt = 0.0  # of the last step
         self.contact.forget()
@@ -147,6 +147,7 @@ class ImplicitStepper:
             "beta": self._beta,
             "dt": self._dt,
             "recovers": self._substepping.may_retry,
+            "length_limit": self._substepping.limit.snapshot(),
             "x_now": x,
             "v_now": v,
             "contact": self.contact.snapshot(),
@@ -158,6 +159,7 @@ class ImplicitStepper:
         upload([(self.history.x_now, kept["x_now"]), (self.history.v_now, kept["v_now"])])
         self._n_previous, self._beta, self._dt = int(kept["past"]), float(kept["beta"]), float(kept["dt"])
         self._substepping.may_retry = bool(kept["recovers"])
+        self._substepping.limit.restore(kept["length_limit"])
         self.contact.restore(kept["contact"])
         self.solver.restore(kept["solver"])  # after the contacts, whose fields it uses
 

@@ -118,7 +118,7 @@ class Newton:
             system.extrapolate_multipliers(self.n_remembered)
             system.r_scale, self.n_remembered = R_EXTRAPOLATED, min(self.n_remembered + 1, PAST)
         else:
-            system.r_scale = next_scale(system.r_scale, law, self.law_residual, self.n_inner)
+            system.r_scale = next_scale(system.r_scale, law, self.law_residual, self.n_inner, int(system.frictionless))
         self.law_residual, self.multipliers, self.rounding = law, self.multipliers + 1, False
         self.r, self.scale = system.evaluate(None, new_multipliers=not extrapolating)
         self._begin_multiplier()

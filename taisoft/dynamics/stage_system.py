@@ -131,6 +131,7 @@ class StageSystem:
         self.kind = ELASTIC_STAGE
         self.scale = 0.0  # that |r| is relative to, at its last evaluation
         self.r_scale = 1.0  # R over the r-factors
+        self.frictionless = False  # whether no contact of the stage has friction
         self._contact_arena = FieldArena()
         self._stage_contacts: StageContacts | None = None  # storage for the contacts of this step
         self._k = NO_CONTACTS  # contacts of the present stage
@@ -252,6 +253,7 @@ class StageSystem:
         self._k, impact = self._stage_contacts, kind == IMPACT
         targets = np.array(self.contact.gap_targets)
         begin_contacts(self.work, self._k, impact, stage.beta, stage.dt, targets, stage.contact_tolerance)
+        self.frictionless = not download([self._k.problem.friction], self.n_contacts)[0].any()
         if self.work.pcg.has_last(self._k.coupling):
             find_last(self.model, self.matrix, self._k.coupling, self.work.pcg)
         self.form_matrix_and_factors(projected=impact)
@@ -320,7 +322,7 @@ class StageSystem:
 
     def solve_frictional(self, problem: Stage, r: float, floor: float) -> np.ndarray:
         """Run the loop of a linearised stage from |r|, in launches that Ctrl-C can interrupt between: see `frictional`."""
-        m, A, loop, limits = self.model, self.matrix, np.zeros(15), np.zeros(10)
+        m, A, loop, limits = self.model, self.matrix, np.zeros(15), np.zeros(11)
         loop[[frictional.NORM, frictional.SCALE, frictional.LAW_RESIDUAL, frictional.INNER_TARGET, frictional.SAME_MATRIX]] = (
             r,
             frictional.R_SCALE,
@@ -340,6 +342,7 @@ class StageSystem:
             pcg.batch_of(m, A),
             problem.extrapolate_after,
             problem.later_tolerance,
+            self.frictionless,
         )
         while loop[frictional.STATUS] == frictional.RUNNING:
             frictional.solve_frictional(m, self.work, A, self._k, problem.beta, limits, loop)

@@ -6,16 +6,19 @@ Before a substep: while contacts close fast, its length is limited by `contact_m
 that were found along its path, and with pairs that would have passed through each other (`contact_paths`). It is undone and
 halved if these repetitions did not help, if the motion was much faster than known when it was cut, if it left a new deep
 penetration or crossing, or, if it was short, when it did not converge. A short event, such as an impact or a snap, therefore
-takes short substeps only while it lasts.
+takes short substeps only while it lasts. How soon longer ones are tried again depends on how often they failed (`LengthLimit`).
 
 No substep is shorter than the step over MAX_SUBSTEPS. Where surfaces cross already, motion that closes too fast even for that is
 refused. A substep of minimum length, or after MAX_UNDONE others were undone, is kept and reported even if deep, unsettled or not
 converged; bodies that would still pass through something are held back.
 """
 
+import math
 from dataclasses import replace
 from enum import Enum, auto
 from typing import TYPE_CHECKING
+
+import numpy as np
 
 from taisoft.dynamics.contact_measures import DEEP_CROSSING, DEEP_PENETRATION, next_length
 from taisoft.dynamics.results import StageResult, count_all, merge
@@ -29,6 +32,7 @@ MAX_CLOSING_RATIO = 2.0  # maximum closing ratio after a substep: its speed was 
 MAX_SEARCHES = 3  # along a substep's actual path, if it left the expected one
 MAX_PASSAGES = 8  # repetitions of a substep with the pairs that would have passed through each other
 MAX_FAILED = 2  # attempts at a substep that did not converge, after which it is halved if something still passes
+MAX_PATIENCE = 8  # substeps kept before a longer one is tried
 MAX_UNDONE = 16  # per step, for reasons other than speed: each costs a few solves
 WORSENING = 1.1  # growth of an existing penetration that counts as a new one
 RETRIES = 4  # maximum number of equal substeps after non-convergence; only shorter substeps are halved for that
@@ -45,6 +49,44 @@ class Fault(Enum):
     UNCONVERGED = auto()  # it did not converge
 
 
+class LengthLimit:
+    """Longest substep that is tried, since one that is undone costs many times a short one.
+
+    After a substep was undone the next ones are no longer than half of it, until `patience` of them were kept; the limit then
+    doubles. Patience doubles with each substep that is undone and halves with each longer one that is kept. The limit persists
+    from step to step, up to the length of a step.
+    """
+
+    def __init__(self):
+        self.longest, self.patience, self.n_kept = math.inf, 1, 0  # [s]; substeps; substeps kept under this limit
+        self.is_trial = False  # whether the limit was doubled, and no substep has been kept since
+
+    def undo(self, length: float, again: bool) -> None:
+        """Count a substep that was undone, for half its length. again: whether the one before, at the same place, was too."""
+        self.patience = self.patience if again else min(2 * self.patience, MAX_PATIENCE)
+        self.longest, self.n_kept, self.is_trial = 0.5 * length, 0, False
+
+    def keep(self, dt: float) -> None:
+        """Count a substep that was kept in a step of dt."""
+        if self.longest == math.inf:
+            return
+        if self.is_trial:
+            self.patience = max(1, self.patience // 2)
+        self.n_kept, self.is_trial = self.n_kept + 1, False
+        if self.n_kept >= self.patience:
+            self.longest, self.n_kept, self.is_trial = 2.0 * self.longest, 0, True
+        if self.longest >= dt:
+            self.__init__()
+
+    def snapshot(self) -> np.ndarray:
+        """Return its state, (4,)."""
+        return np.array([self.longest, self.patience, self.n_kept, self.is_trial])
+
+    def restore(self, kept: np.ndarray) -> None:
+        """Restore a `snapshot`."""
+        self.longest, self.patience, self.n_kept, self.is_trial = float(kept[0]), int(kept[1]), int(kept[2]), bool(kept[3])
+
+
 class Substepping:
     """Wrap the plain steps of an implicit stepper: substeps, undoing and retries.
 
@@ -56,6 +98,7 @@ class Substepping:
         self._stepper, self._contact = stepper, stepper.contact
         self._deepest = self._most_crossed = 0.0  # over the finer side's mean surface edge: above it a penetration is new
         self.substeps = 1  # of the last step
+        self.limit = LengthLimit()
         self.may_retry = True  # whether shorter substeps may help; after they did not, False until a step converges
 
     def step(self, start: float, dt: float) -> StageResult:
@@ -98,16 +141,17 @@ class Substepping:
         """
         contact, stepper, may_retry = self._contact, self._stepper, self.may_retry and not self._stepper.is_linear
         shortest, longest = (1.0 - 1e-6) * dt / MAX_SUBSTEPS, dt / substeps
-        results, remaining, length, undo_budget = [], dt, longest, MAX_UNDONE
+        results, remaining, undo_budget = [], dt, MAX_UNDONE
         undone, n_unconverged = [], 0  # of the current substep
         self._measure_start(start, dt)
+        length = min(longest, self.limit.longest)
         while True:
             time = start + (dt - remaining)
             length = next_length(
                 lambda length, time=time: contact.measure_start(time, length)[1],
                 remaining,
                 length,
-                longest,
+                min(longest, self.limit.longest),
                 bool(results) and not undone,
             )
             if length < shortest:
@@ -133,6 +177,8 @@ class Substepping:
             if fault == Fault.FAST or (fault and may_cut):
                 undo_budget, n_unconverged = undo_budget - (fault != Fault.FAST), n_unconverged + (fault == Fault.UNCONVERGED)
                 undone.append(result)
+                if fault == Fault.CROSSED:
+                    self.limit.undo(length, again=len(undone) > 1)
                 stepper.undo_substep(released, discard_impulses=fault == Fault.UNCONVERGED)
                 contact.relative_penetration, length = relative_penetration, 0.5 * length
                 continue
@@ -141,6 +187,7 @@ class Substepping:
             contact.end_substep()
             contact.count_flight(length, stepper.dissipative)
             results.append(count_all(result, undone))
+            self.limit.keep(dt)
             if last:
                 return results
             remaining, undone, n_unconverged = remaining - length, [], 0
