@@ -282,6 +282,7 @@ def test_steps_resume_bitwise(tmp_path, monkeypatch, damping, wide):
     if wide:
         monkeypatch.setattr(multigrid, "SMALL", 40)
         monkeypatch.setattr(multigrid, "NARROW", 0)
+        monkeypatch.setitem(linear_solver.LOADING, False, 0)
     scene = strip()
     scene.body("strip").material = rubber(young=1e9, stiffness_damping=damping)
     path = tmp_path / "checkpoint.npz"
