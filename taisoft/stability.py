@@ -133,7 +133,7 @@ def highest_frequency(body: Body) -> float:
 
 
 def _highest_frequency(body: Body, free: np.ndarray) -> float:
-    """The same. free: (n,3) axes."""
+    """`highest_frequency` [rad/s], computed. free: (n,3) axes."""
     mass = reference.lumped_mass(body)
     scale = np.where(free, 1.0 / np.sqrt(np.where(free, mass[:, None], 1.0)), 0.0)
     if not free.any():

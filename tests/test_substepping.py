@@ -276,13 +276,46 @@ def test_length_limit_returns_from_its_snapshot():
     limit.undo(DT, again=False)
     limit.undo(DT / 2, again=True)
     assert limit.longest == DT / 4 and limit.patience == 2
-    limit.keep(DT)
-    limit.keep(DT)
+    limit.keep(DT / 4, DT)
+    limit.keep(DT / 4, DT)
     assert limit.longest == DT / 2 and limit.is_trial
     other.restore(limit.snapshot())
     assert vars(other) == vars(limit)
-    limit.keep(DT)  # the longer one was kept: patience halves, and the limit reaches the step
+    limit.keep(DT / 8, DT)  # for another reason: it tells nothing
+    assert vars(other) == vars(limit)
+    limit.keep(DT / 2, DT)  # the longer one was kept: patience halves, and a whole step is tried
+    assert limit.longest == DT and limit.is_trial and limit.patience == 1
+    limit.undo(DT, again=False)
+    assert limit.longest == DT / 2 and limit.patience == 2
+    for _ in range(2):
+        limit.keep(DT / 2, DT)
+    limit.keep(DT, DT)
     assert vars(limit) == vars(LengthLimit())
+
+
+def test_whole_steps_that_fail_are_tried_ever_more_seldom(stepper):
+    stepper.passes = lambda time, dt: dt > 0.6 * DT
+    substepping, whole = Substepping(stepper), []
+    for _ in range(12):
+        stepper.taken.clear()
+        substepping.step(stepper.x, DT)
+        whole.append(any(dt > 0.6 * DT for _, dt in stepper.taken))
+    assert whole[0] and sum(whole) < 6
+
+
+def test_no_substep_is_held_back_where_shorter_ones_pass(stepper):
+    """Passages end at a 128th of the step only: what takes all attempts of a step to find out is not forgotten in it."""
+    stepper.passes = lambda time, dt: dt > 1.01 * DT / 128
+    result = Substepping(stepper).step(0.0, DT)
+    assert covers_step(stepper) and result.converged and not stepper.held_back
+
+
+def test_a_limit_from_small_steps_does_not_refuse_large_ones(stepper):
+    substepping = Substepping(stepper)
+    stepper.passes = lambda time, dt: dt > 1e-3 * DT / 60
+    substepping.step(0.0, 1e-3 * DT)
+    stepper.passes, stepper.none_cross = lambda time, dt: False, False
+    assert substepping.limit.longest < DT / 256 and substepping.step(stepper.x, DT).converged
 
 
 def test_passages_end_with_the_repetition_that_has_none(stepper):

@@ -265,15 +265,15 @@ class ExplicitStepper:
         explicit.begin_parallel(m)
         special = explicit.begins_alone(m, s)
 
-        def begins_alone(row: int) -> bool:  # not in the loop over nodes that ends the last sub-step
+        def needs_drift(row: int) -> bool:  # not in the loop over nodes that ends the last sub-step
             last_held = s.n_held > 0 and row == n - 1  # the velocities before it are needed for the reactions
             return special or last_held or (s.verlet and row == 0)
 
         for row in range(n):
-            if begins_alone(row):
+            if needs_drift(row):
                 explicit.drift_parallel(m, s, row, dt)
             explicit.run_elements(m)
-            explicit.nodes_parallel(m, s, row, dt, int(s.verlet and row < n - 1 and not begins_alone(row + 1)))
+            explicit.nodes_parallel(m, s, row, dt, int(s.verlet and row < n - 1 and not needs_drift(row + 1)))
         if s.n_held:
             explicit.react_parallel(m, s, dt)
 

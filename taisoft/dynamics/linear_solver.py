@@ -176,8 +176,8 @@ class LinearSolver:
         """Solve with the hierarchy, or with a new one if there is none or it is out of date; None if that fails too."""
         m, w, free, wasted = self.model, system.work.pcg, self.model.free.host > 0.0, 0
         if self._built is not None and np.array_equal(self._built[3], free):
-            if self._hierarchy is None:
-                self._build(system, *self._built)
+            if self._hierarchy is None and not self._could_build(system, *self._built):
+                return None
             most = math.ceil(GROWTH * self.rate * digits) + SLACK
             stiffness = (system.stage.beta / self._built[1]) ** 2
             found = self._hierarchy.solve(m, system.matrix, w, tolerance, most, stiffness)
@@ -186,9 +186,7 @@ class LinearSolver:
             wasted = found.iterations
             self.savings -= self._build_cost
         self.release()
-        try:
-            self._build(system, system.stage.c, system.stage.beta, m.state.x.to_numpy(), free)
-        except np.linalg.LinAlgError:
+        if not self._could_build(system, system.stage.c, system.stage.beta, m.state.x.to_numpy(), free):
             return None
         found = self._hierarchy.solve(m, system.matrix, w, tolerance, LONGEST)
         if not (found.converged or found.negative):
@@ -201,6 +199,14 @@ class LinearSolver:
         if found.converged:
             self.savings = min(self.savings + self.pcg_rate * digits - self._ratio * found.iterations, self._build_cost)
         return replace(found, multigrid=True)
+
+    def _could_build(self, system: "StageSystem", c: float, beta: float, x: np.ndarray, free: np.ndarray) -> bool:
+        """`_build`; False if the matrix is not positive definite."""
+        try:
+            self._build(system, c, beta, x, free)
+        except np.linalg.LinAlgError:
+            return False
+        return True
 
     def _build(self, system: "StageSystem", c: float, beta: float, x: np.ndarray, free: np.ndarray) -> None:
         """Build the hierarchy from the projected matrix at positions x."""

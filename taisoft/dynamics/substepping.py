@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from taisoft.dynamics.contact_measures import DEEP_CROSSING, DEEP_PENETRATION, next_length
+from taisoft.dynamics.contact_measures import DEEP_CROSSING, DEEP_PENETRATION, ROUNDING, next_length
 from taisoft.dynamics.results import StageResult, count_all, merge
 from taisoft.errors import SimulationError
 
@@ -33,6 +33,7 @@ MAX_SEARCHES = 3  # along a substep's actual path, if it left the expected one
 MAX_PASSAGES = 8  # repetitions of a substep with the pairs that would have passed through each other
 MAX_FAILED = 2  # attempts at a substep that did not converge, after which it is halved if something still passes
 MAX_PATIENCE = 8  # substeps kept before a longer one is tried
+HALF_TRIED = 0.51  # of a doubled limit: a substep up to this long, which divides a step equally, does not try it
 MAX_UNDONE = 16  # per step, for reasons other than speed: each costs a few solves
 WORSENING = 1.1  # growth of an existing penetration that counts as a new one
 RETRIES = 4  # maximum number of equal substeps after non-convergence; only shorter substeps are halved for that
@@ -53,30 +54,32 @@ class LengthLimit:
     """Longest substep that is tried, since one that is undone costs many times a short one.
 
     After a substep was undone the next ones are no longer than half of it, until `patience` of them were kept; the limit then
-    doubles. Patience doubles with each substep that is undone and halves with each longer one that is kept. The limit persists
-    from step to step, up to the length of a step.
+    doubles. Patience doubles with each substep that is undone and halves when one as long as a doubled limit is kept. The limit
+    persists from step to step, until a substep that is a whole step is kept.
     """
 
     def __init__(self):
         self.longest, self.patience, self.n_kept = math.inf, 1, 0  # [s]; substeps; substeps kept under this limit
-        self.is_trial = False  # whether the limit was doubled, and no substep has been kept since
+        self.is_trial = False  # whether the limit was doubled, and no substep of that length has been kept since
 
     def undo(self, length: float, again: bool) -> None:
         """Count a substep that was undone, for half its length. again: whether the one before, at the same place, was too."""
         self.patience = self.patience if again else min(2 * self.patience, MAX_PATIENCE)
         self.longest, self.n_kept, self.is_trial = 0.5 * length, 0, False
 
-    def keep(self, dt: float) -> None:
-        """Count a substep that was kept in a step of dt."""
-        if self.longest == math.inf:
+    def keep(self, length: float, dt: float) -> None:
+        """Count a substep of a length that was kept in a step of dt."""
+        is_whole = length > (1.0 - ROUNDING) * dt
+        if self.longest == math.inf or (self.is_trial and length <= HALF_TRIED * self.longest and not is_whole):
+            return
+        if is_whole:
+            self.__init__()
             return
         if self.is_trial:
             self.patience = max(1, self.patience // 2)
         self.n_kept, self.is_trial = self.n_kept + 1, False
         if self.n_kept >= self.patience:
             self.longest, self.n_kept, self.is_trial = 2.0 * self.longest, 0, True
-        if self.longest >= dt:
-            self.__init__()
 
     def snapshot(self) -> np.ndarray:
         """Return its state, (4,)."""
@@ -142,17 +145,17 @@ class Substepping:
         contact, stepper, may_retry = self._contact, self._stepper, self.may_retry and not self._stepper.is_linear
         shortest, longest = (1.0 - 1e-6) * dt / MAX_SUBSTEPS, dt / substeps
         results, remaining, undo_budget = [], dt, MAX_UNDONE
-        undone, n_unconverged = [], 0  # of the current substep
+        undone, n_unconverged, n_crossed = [], 0, 0  # of the current substep
         self._measure_start(start, dt)
-        length = min(longest, self.limit.longest)
+        length = self._longest(longest, dt)
         while True:
             time = start + (dt - remaining)
             length = next_length(
                 lambda length, time=time: contact.measure_start(time, length)[1],
                 remaining,
                 length,
-                min(longest, self.limit.longest),
-                bool(results) and not undone,
+                self._longest(longest, dt),
+                bool(results) and not undone and undo_budget > 0,
             )
             if length < shortest:
                 if not contact.paths.none_cross:
@@ -165,7 +168,8 @@ class Substepping:
             result, fault = self._take_substep(time, length, may_cut)
             if fault == Fault.FAST and length < 2.0 * shortest:
                 self._refuse_fast_closing(dt)
-            if fault == Fault.CROSSED and not may_cut:
+            is_held_back = fault == Fault.CROSSED and not may_cut
+            if is_held_back:
                 contact.paths.hold_back(stepper.history.x_now)
                 stepper.break_history()
                 result, fault = replace(result, converged=False), None
@@ -178,7 +182,8 @@ class Substepping:
                 undo_budget, n_unconverged = undo_budget - (fault != Fault.FAST), n_unconverged + (fault == Fault.UNCONVERGED)
                 undone.append(result)
                 if fault == Fault.CROSSED:
-                    self.limit.undo(length, again=len(undone) > 1)
+                    self.limit.undo(length, again=n_crossed > 0)
+                    n_crossed += 1
                 stepper.undo_substep(released, discard_impulses=fault == Fault.UNCONVERGED)
                 contact.relative_penetration, length = relative_penetration, 0.5 * length
                 continue
@@ -187,10 +192,15 @@ class Substepping:
             contact.end_substep()
             contact.count_flight(length, stepper.dissipative)
             results.append(count_all(result, undone))
-            self.limit.keep(dt)
+            if not is_held_back:
+                self.limit.keep(length, dt)
             if last:
                 return results
-            remaining, undone, n_unconverged = remaining - length, [], 0
+            remaining, undone, n_unconverged, n_crossed = remaining - length, [], 0, 0
+
+    def _longest(self, longest: float, dt: float) -> float:
+        """The longest substep that is tried in a step of dt, up to a given length. The limit may stem from smaller steps."""
+        return min(longest, max(self.limit.longest, dt / MAX_SUBSTEPS))
 
     def _measure_start(self, start: float, dt: float) -> None:
         """Measure the start of a step; penetration that exists there needs no shorter substeps."""

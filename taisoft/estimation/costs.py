@@ -52,7 +52,7 @@ class Spent(Exception):
 class Budget:
     """Ends a pilot of implicit steps that cost more on average than a limit [us]. Pass `add` to its run as on_step.
 
-    steps: of the pilot; the limit holds from the part SHOWN of them on.
+    steps: of the pilot. They may cost the limit times their number, or times the part SHOWN of all of them if that is more.
     """
 
     def __init__(self, scene: Scene, touches: bool, limit: float, steps: float):

@@ -28,6 +28,7 @@ ROUNDING = 1e-6  # part of a frame that a run's length may lack of a whole one
 MAX_FRAMES = 48  # at which paths are recorded
 PARTS = 24  # of a run, about; a pilot knows which is the hardest
 BLOCK = 64  # frames whose velocities are held until their changes are added
+HELD_NODES = 100_000  # nodes of all states at ends of parts that are held until then: 5 to 10 MB
 MAX_NODES = 4096  # whose paths are recorded, evenly spread
 
 RunFunction = Callable[..., RunReport]  # as `running.run_steps`
@@ -107,11 +108,11 @@ class Recorder:
             pilot.positions.append(x[frames.nodes].astype(np.float64))
         else:
             v = state.velocities()
-        self._velocities.append(v[frames.nodes])
+        self._velocities.append(np.ascontiguousarray(v[frames.nodes]))  # a view would hold the velocities of all nodes
         if self._keeps and (number % frames.part == 0 or number == frames.count):
             kept = sim._dynamics.snapshot() if number < frames.count else {}
             self._ends.append((len(self._velocities) - 1, number, kept))
-        if len(self._velocities) > BLOCK:
+        if len(self._velocities) > BLOCK or len(self._ends) * len(v) > HELD_NODES:
             self.add_changes()
 
     def add_changes(self) -> None:

@@ -1,13 +1,12 @@
-"""Smoothed aggregation multigrid: a symmetric V-cycle as preconditioner of conjugate gradients.
+"""Smoothed aggregation multigrid: a symmetric V-cycle, here on the coarse space of `pcg_multigrid`.
 
 Level: A, its smoother S = omega D^-1 with the diagonal blocks D of A, and the prolongation P = (I - omega_P D^-1 A) T of the
 next level, where T makes each aggregate a rigid body (`aggregation`) and the next level's matrix is P^T A P. A cycle adds, for a
 residual r,
     x = S r,   x += P coarse(P^T (r - A x)),   x += S (r - A x).
 With omega below 2 over the largest eigenvalue of D^-1 A, that is symmetric and positive definite if A is. The number of
-iterations hardly depends on the size of the mesh. The coarsest level is solved by a banded Cholesky factorisation; a slender
-bar's matrix has a narrow band, so it may be the first level. Levels are built on the host in f64; a cycle runs in kernels in the
-model's precision, but for the coarsest level.
+iterations hardly depends on the size of the mesh. The coarsest level is solved by a banded Cholesky factorisation. Levels are
+built on the host in f64; a cycle runs in kernels in the model's precision, but for the coarsest level.
 Source: Vanek, Mandel and Brezina, "Algebraic multigrid by smoothed aggregation for second and fourth order elliptic problems",
 Computing 56, 1996.
 Weakness: nearly incompressible materials, whose stiff volumes the smoother cannot separate, still take many iterations.
