@@ -165,8 +165,8 @@ def test_a_factor_of_the_stiffness_does_not_matter():
         first, y = hierarchy.solve(made.model, A, w, 1e-8, 200), w.y.to_numpy()
         A.value.host[...] *= 16.0
         A.diagonal.host[...] *= 16.0
-        told = hierarchy.solve(made.model, A, w, 1e-8, 200, stiffness=16.0)
-        assert told == first and np.array_equal(16.0 * w.y.to_numpy(), y)
+        scaled = hierarchy.solve(made.model, A, w, 1e-8, 200, stiffness=16.0)
+        assert scaled == first and np.array_equal(16.0 * w.y.to_numpy(), y)
         assert hierarchy.solve(made.model, A, w, 1e-8, 200).iterations > first.iterations
 
 

@@ -72,21 +72,25 @@ class CoarseCorrection:
         return LinearResult(int(w.state[COUNT]), converged, status not in (RUNNING, CONVERGED))
 
 
-@kernel
-def restrict(space: ti.template(), w: ti.template(), right: ti.template()):
-    """right = B^T s."""
+@ti.func
+def _set_right(space: ti.template(), w: ti.template(), right: ti.template()):
+    """right = B^T s, in a loop at the top level of a kernel."""
     ti.loop_config(serialize=space.transposed.serial)
     for i in range(space.transposed.n_rows):
         right[i] = block_row_times(space.transposed, i, w.r)
+
+
+@kernel
+def restrict(space: ti.template(), w: ti.template(), right: ti.template()):
+    """right = B^T s."""
+    _set_right(space, w, right)
 
 
 @kernel
 def step_and_restrict(m: ti.template(), A: ti.template(), space: ti.template(), w: ti.template(), right: ti.template()):
     """Run both sweeps, take the step along p and set right = B^T s."""
     take_step(m, A, NO_COUPLING, w)
-    ti.loop_config(serialize=space.transposed.serial)
-    for i in range(space.transposed.n_rows):
-        right[i] = block_row_times(space.transposed, i, w.r)
+    _set_right(space, w, right)
 
 
 @ti.func
