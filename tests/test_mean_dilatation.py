@@ -11,6 +11,8 @@
 * a scene without it allocates and launches nothing for it.
 """
 
+import math
+
 import numpy as np
 import pytest
 import scipy.sparse.linalg as spl
@@ -327,6 +329,61 @@ def test_the_preconditioner_solves_the_system_in_few_iterations_whatever_lambda(
     assert max(iterations) < 1.2 * min(iterations) and plain > 5 * iterations[-1]
 
 
+@pytest.mark.parametrize("order", [1, 2])
+def test_steps_keep_the_volumes_to_second_order(order):
+    """A curved step ends at the dilatations that its direction leads to in first order, but for a small fraction of the second:
+    the patches are stiff, not rigid."""
+    scene, beta = ts.Scene(), 1 / 60
+    scene.add_body(ts.box_mesh((6, 2, 2), (4, 1, 1)), rubber(poisson=NEARLY), order=order, dilatation="mean").fix(
+        lambda X: X[:, 0] < -1.9
+    )
+    with dynamics(scene, dt=beta, precision="f64") as made:
+        made.stepper.advance(1, beta)
+        system, m = made.stepper.solver, made.model
+        s, w, free, x = system.linear_solver.volumes(system.matrix), system.work, m.free.to_numpy(), m.state.x.to_numpy()
+        spin = free * np.cross([0.0, 0.3, 0.4], x - [-2, 0, 0]) + free * 0.02 * np.sin(x[:, [1, 2, 0]])
+        system.form_matrix()
+        system.linear_solver.prepare(system)
+        gradient, entry = system.matrix.patches.gradient.to_numpy(), system.matrix.patches.entry.to_numpy()
+        node = np.repeat(np.arange(m.n_nodes), np.diff(system.matrix.patches.node_start.to_numpy()))
+        patch, volume = system.matrix.patches.patch.to_numpy()[entry], m.mean.volume.to_numpy()
+        errors = []
+        for length in (1.0, 0.5):
+            m.state.x.from_numpy(x)
+            system.evaluate()
+            theta, y = m.mean.dilatation.to_numpy(), length * spin
+            target = theta + beta * np.bincount(patch, (gradient[entry] * y[node]).sum(axis=1)) / volume
+            w.pcg.y.from_numpy(y)
+            assert system.step_with_volumes(math.inf) is not None
+            assert np.allclose(s.target.to_numpy(), target, rtol=0, atol=1e-12) and np.array_equal(w.base.to_numpy(), x)
+            moved = m.state.x.to_numpy()
+            assert np.allclose(m.state.v.to_numpy(), (moved - w.x_hat.to_numpy()) / beta)
+            assert np.array_equal(moved[free == 0], x[free == 0])
+            curved = m.mean.dilatation.to_numpy()
+            m.state.x.from_numpy(x + beta * y)
+            system.evaluate()
+            errors.append((np.abs(curved - target).max(), np.abs(m.mean.dilatation.to_numpy() - target).max()))
+        (curved, straight), (curved_half, straight_half) = errors
+        assert 3.5 < straight / straight_half < 4.5 and curved < 0.05 * straight and curved_half < 0.05 * straight_half
+        m.state.x.from_numpy(x)
+        system.evaluate()
+        assert system.step_with_volumes(0.0) is None and np.array_equal(m.state.x.to_numpy(), x)
+
+
+def test_nearly_incompressible_steps_take_few_newton_iterations():
+    iterations = {}
+    for poisson in (0.3, 0.49, NEARLY):
+        scene = ts.Scene()
+        scene.add_body(ts.box_mesh((11, 2, 2), (4, 1, 1)), rubber(poisson=poisson), dilatation="mean").fix(
+            lambda X: X[:, 0] < -1.9
+        )
+        with ts.Simulator(scene, dt=1 / 60, precision="f64") as sim:
+            reports = [sim.step() for _ in range(30)]
+        assert all(r.converged for r in reports)
+        iterations[poisson] = sum(r.newton_iterations for r in reports)
+    assert max(iterations.values()) <= 1.1 * iterations[0.3]
+
+
 def test_contacts_changed_materials_and_resumed_runs(tmp_path):
     def make() -> ts.Scene:
         scene = ts.Scene()
@@ -374,6 +431,9 @@ def test_resumed_runs_without_contacts_have_the_same_bits(tmp_path):
         assert np.array_equal(sim.positions(), end)
 
 
+VOLUME_KERNELS = {"prepare_volumes", "iterate_with_volumes", "save_volumes", "restore_volumes", "step_with_volumes"}
+
+
 @pytest.mark.parametrize("integrator", ["symplectic_euler", "implicit_euler"])
 def test_scenes_without_it_allocate_and_launch_nothing_for_it(integrator):
     used = {}
@@ -384,7 +444,7 @@ def test_scenes_without_it_allocate_and_launch_nothing_for_it(integrator):
             sim.step()
             fields = {name for name in sim.field_bytes if "patch" in name or name.startswith("volume_")}
         launched = {k for k, n in runtime.launches.items() if n > before.get(k, 0)}
-        used[kind] = fields, launched & {"prepare_volumes", "iterate_with_volumes", "save_volumes", "restore_volumes"}
+        used[kind] = fields, launched & VOLUME_KERNELS
         assert sim.plan.on["mean_dilatation"] is (kind == "mean")
     assert used["local"] == (set(), set()) and used["mean"][0] and bool(used["mean"][1]) == (integrator == "implicit_euler")
 

@@ -5,6 +5,7 @@ dilatation on 11x2x2, 16x3x3 and 22x4x4 cells; order 2 with local dilatation app
 24x8x8 cells. The rows of times compare steps of implicit Euler in f64, over one second of each beam's fall.
 """
 
+import statistics
 import time
 import warnings
 from functools import partial
@@ -39,15 +40,15 @@ def _error(cells: tuple[int, int, int], poisson: float, order: int, dilatation: 
 
 
 def _step(cells: tuple[int, int, int], poisson: float, order: int, dilatation: str, arch: str) -> float:
-    """Processor time of a step [s], the mean over a fall from rest, without the first steps, which may compile."""
+    """Processor time of a step [s], the median over a fall from rest, since some steps compile."""
     made, _ = _beam(cells, poisson, order, dilatation)
+    seconds = []
     with ts.Simulator(made, dt=DT, precision="f64", arch=arch) as sim:
-        for _ in range(3):
+        for _ in range(round(SECONDS / DT)):
+            start = time.thread_time()
             sim.step()
-        start, steps = time.thread_time(), round(SECONDS / DT)
-        for _ in range(steps):
-            sim.step()
-        return (time.thread_time() - start) / steps
+            seconds.append(time.thread_time() - start)
+    return statistics.median(seconds)
 
 
 def compute(cells: tuple[int, int, int], fine: bool, _reference: dict, arch: str):

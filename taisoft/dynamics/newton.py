@@ -31,6 +31,7 @@ LINEAR_LIMIT = 0.01  # relative true residual above which a linearly implicit st
 MAX_FORCING, INCREASE_FORCING = 0.1, 3e-2  # CG's maximum tolerance, and that after a step that increased |r|
 STATIC_FORCING = 1e-2  # maximum in statics, where a loose solve leaves a slender body stretched for the next step to correct
 REBUILD_RATIO = 0.2  # a step that leaves a larger fraction of |r| requires a new matrix,
+REBUILD_VOLUMES = 0.01  # with `step_with_volumes`, whose first matrix is that of the step's start and whose solves are longer
 MIN_USES = {False: 1, True: 3}  # minimum steps per matrix, without and with contacts; with them mostly the active contacts change
 ELIMINATION_RATIO = 0.1  # a step that leaves a larger fraction of |r| requires elimination
 DECREASE = 0.9  # with contacts, fraction of the smallest |r| so far below which a step is accepted without its slope
@@ -55,6 +56,7 @@ class Newton:
     def run(self, r: float, scale: float, fresh: bool) -> StageResult:
         """Solve from the present state, whose (|r|, scale) is given. fresh: whether the matrix is formed there."""
         system, n_uses = self.system, 0
+        rebuild_ratio = REBUILD_VOLUMES if system.keeps_volumes else REBUILD_RATIO
         self.r, self.scale, self.has_contacts = r, scale, system.n_contacts > 0
         self.law_residual = math.inf  # the laws' residual at the last multiplier update
         self._begin_multiplier()
@@ -65,7 +67,7 @@ class Newton:
                 continue
             if self.newton >= self.stage.max_newton:
                 break
-            if not fresh or (n_uses >= MIN_USES[self.has_contacts] and self.r > REBUILD_RATIO * self.previous):
+            if not fresh or (n_uses >= MIN_USES[self.has_contacts] and self.r > rebuild_ratio * self.previous):
                 if system.kind == ELASTIC_STAGE:
                     system.form_matrix()
                 fresh, n_uses = True, 0
@@ -237,6 +239,8 @@ def choose_start(system: StageSystem, r: float, scale: float) -> tuple[float, fl
 
 def search(system: StageSystem, acceptable: float) -> tuple[float, float, bool]:
     """Search the step length; return (|r|, scale, success). acceptable: |r| below which the slope is not checked."""
+    if (found := system.step_with_volumes(acceptable)) is not None:
+        return *found, True
     r, scale = system.evaluate(STEP)
     length, low, at_low, high, at_high = 1.0, 0.0, system.slopes[0], math.inf, math.inf
     slope = at_low

@@ -137,6 +137,7 @@ class StageSystem:
         self._k = NO_CONTACTS  # contacts of the present stage
         self._whole, self._restricted = self.work, None  # `work` for all nodes, and for a subset
         self._lists: SubsetLists | None = None
+        self._volumes: volume_pcg.VolumeSystem | None = None  # whose iterates keep the volumes of patches
         self._same_matrix = False  # whether the matrix is that of the last linear solve of this stage
         self.n_formed = 0  # times that the matrix was formed
         self.norms = np.zeros(5)  # result of `form_residual`
@@ -224,9 +225,10 @@ class StageSystem:
         Nearly incompressible bodies with mean dilatation get a first iterate that keeps their volumes, from the matrix at the
         start of the step. Return whether that is formed.
         """
-        m, start, volumes = self.model, self._whole, None
+        m, start, self._volumes = self.model, self._whole, None
         if stage.c > 0.0 and not stage.linearised and self.contact.n_contacts == 0:
-            volumes = self.linear_solver.volumes(self.matrix)
+            self._volumes = self.linear_solver.volumes(self.matrix)
+        volumes = self._volumes
         if volumes is not None:
             self.restrict(None)
             self.stage = stage
@@ -239,8 +241,14 @@ class StageSystem:
         self._begin(stage, ELASTIC_STAGE)
         return volumes is not None
 
+    @property
+    def keeps_volumes(self) -> bool:
+        """Whether steps go by `step_with_volumes`."""
+        return self._volumes is not None
+
     def begin_impact(self, stage: Stage) -> StageContacts:
         """Begin the impact before a step, and form the matrix."""
+        self._volumes = None
         self._begin(stage, IMPACT)
         return self._k
 
@@ -272,6 +280,23 @@ class StageSystem:
             update_impulses(m, k, int(new_multipliers), stage.beta, self.r_scale)
         form_residual(m, w, self.matrix, k, self.kind, stage.beta, self.norms)
         return self._norm_and_scale(stage.c, stage.beta)
+
+    def step_with_volumes(self, acceptable: float) -> tuple[float, float] | None:
+        """Step along y on a curve that keeps the volumes of nearly incompressible bodies to second order.
+
+        A straight step that rotates tets changes their volumes, and so |r|, by its square times lambda. Return (|r|, scale) if
+        |r| is below `acceptable`; otherwise None, at the state before.
+        """
+        m, w, volumes = self.model, self.work, self._volumes
+        if volumes is None or w.pcg.subset.restricted:
+            return None
+        self.linear_solver.prepare(self)  # multigrid may have solved
+        volume_pcg.step_with_volumes(m, self.matrix, volumes, w.base, w.pcg.y, w.x_hat, self.stage.beta)
+        found = self.evaluate(STAY)
+        if found[0] < acceptable:
+            return found
+        self.evaluate(AGAIN, 0.0)
+        return None
 
     def extrapolate_multipliers(self, n_remembered: int) -> None:
         """Extrapolate multipliers from the impulses and the last n_remembered updates; keep impulses and residual."""

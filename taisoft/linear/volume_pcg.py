@@ -228,9 +228,10 @@ def save_volumes(m: ti.template(), s: ti.template()):
         s.target[p] = m.mean.dilatation[p]
 
 
-@kernel
-def restore_volumes(m: ti.template(), s: ti.template(), x_hat: ti.template(), beta: ti.f64):
-    """Correct x, and v = (x - x_hat) / beta, to first order towards the saved dilatations, by the smallest change in D."""
+@ti.func
+def correct_volumes(m: ti.template(), s: ti.template(), x_hat: ti.template(), beta):
+    """Correct x, and v = (x - x_hat) / beta, to first order towards the target dilatations, by the smallest change in D, as
+    top-level loops of a kernel."""
     find_dilatations(m)
     ti.loop_config(serialize=True)
     for _ in range(1):
@@ -244,6 +245,41 @@ def restore_volumes(m: ti.template(), s: ti.template(), x_hat: ti.template(), be
             x = m.state.x[i] - change
             m.state.x[i] = x
             m.state.v[i] = ti.cast((x - x_hat[i]) / beta, m.real)
+
+
+@kernel
+def restore_volumes(m: ti.template(), s: ti.template(), x_hat: ti.template(), beta: ti.f64):
+    """Correct x and v towards the saved dilatations, see `correct_volumes`."""
+    correct_volumes(m, s, x_hat, beta)
+
+
+@kernel
+def step_with_volumes(
+    m: ti.template(),
+    A: ti.template(),
+    s: ti.template(),
+    base: ti.template(),
+    y: ti.template(),
+    x_hat: ti.template(),
+    beta: ti.f64,
+):
+    """Set base = x, take the step beta y, and correct it towards the dilatations that it leads to in first order.
+
+    m.mean.dilatation: those at x.
+    """
+    ti.loop_config(serialize=True)
+    for _ in range(1):
+        for p in range(s.n_patches):
+            s.rhs[p] = 0.0
+        for i in range(m.n_nodes):
+            step, x = y[i], m.state.x[i]
+            for n in range(s.node_start[i], s.node_start[i + 1]):
+                s.rhs[s.row[n]] = s.rhs[s.row[n]] + dot64(A.patches.gradient[A.patches.entry[n]], step)
+            base[i] = x
+            m.state.x[i] = x + beta * ti.cast(step, ti.f64)
+        for p in range(s.n_patches):
+            s.target[p] = m.mean.dilatation[p] + beta * s.rhs[s.place[p]] / m.mean.volume[p]
+    correct_volumes(m, s, x_hat, beta)
 
 
 @kernel
