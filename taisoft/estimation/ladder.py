@@ -7,10 +7,10 @@ tolerance, a second pilot takes slightly smaller steps all the way. It may still
 Where errors fall with dt at least, and twice as many steps seem too few, the second pilot takes four times as many, and may be
 the run. Its distance to the first is almost the whole error of that one, and less by chance than one to a pilot with half as many
 steps. It errs by a third of it; at an order of only 1/2 by three times as much, where half as many steps err by 2.4 times
-as much as shown. If it is not the run, the pilot between them shows the order.
+as much as shown. If it is not the run, the pilot between them may show the order, or else a finer one does.
 
-After impacts of bodies without damping explicit steps often show orders from 1.5 to 2, of which 1.5 counts. Orders above 2, which
-the integrator does not have, are chance and count as 1, and so do all others of sudden motion.
+After impacts of bodies without damping explicit steps often show orders from 1.5 to 2, of which 1.5 counts. Orders above 2,
+which the integrator does not have, are chance and count as 1. Any other sudden motion counts as of first order at most.
 
 Velocity Verlet solves x'' = a + dt^2/12 x'''' up to dt^4 (Hairer, Lubich, Wanner, "Geometric Numerical Integration", 2006,
 IX.9). A motion of frequency w thus lags by the phase (w dt)^2/24 w t, which is dt^2/24 times the total variation of its

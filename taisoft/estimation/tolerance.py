@@ -3,9 +3,10 @@
 Implicit pilots are a ladder (`ladder`), each with half the step of the one before, that ends where the run needs at most eight
 times as many steps as the last pilot. How many follows from the difference of the last two and its observed order. The second
 pilot skips one, and is the run if it seems far better than it must be. Explicit steps cannot be coarser than stable. Their first
-pilot has the largest stable step. Its velocities, and its hardest part repeated with a slightly smaller step, show whether it is
-enough; if that is not sure a second pilot takes a smaller step all the way, and may skip one. Otherwise a ladder follows. A pilot
-that meets the tolerance is the run, which is repeated only if frames or steps are observed, or an estimate by twins is asked for.
+pilot has the largest stable step. Its velocities, and its hardest part repeated with a slightly smaller step, or also the fastest
+one, show whether it is enough; if that is not sure a second pilot takes a smaller step all the way, and may skip one. Otherwise a
+ladder follows. A pilot that meets the tolerance is the run, which is repeated only if frames or steps are observed, or an
+estimate by twins is asked for.
 
 Which kind of steps a run takes follows from counts (`costs`). Explicit steps are accepted at once where they cost less than
 implicit ones could, and an implicit pilot ends when its steps cost more than explicit ones would. Among implicit methods BDF2 is
