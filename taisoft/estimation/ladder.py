@@ -9,8 +9,9 @@ the run. Its distance to the first is almost the whole error of that one, and le
 steps. It errs by a third of it; at an order of only 1/2 by three times as much, where half as many steps err by 2.4 times
 as much as shown. If it is not the run, the pilot between them may show the order, or else a finer one does.
 
-After impacts of bodies without damping explicit steps often show orders from 1.5 to 2, of which 1.5 counts. Orders above 2,
-which the integrator does not have, are chance and count as 1. Any other sudden motion counts as of first order at most.
+After impacts of bodies without damping explicit steps show orders from 1.2 to 2. At most 1.25 counts, as an error from pilots
+with h and 2 h is then too small by 1.4 at first order, and too large by 2.2 at second. Orders above 2, which the integrator does
+not have, are chance and count as 1. Any other sudden motion counts as of first order at most.
 
 Velocity Verlet solves x'' = a + dt^2/12 x'''' up to dt^4 (Hairer, Lubich, Wanner, "Geometric Numerical Integration", 2006,
 IX.9). A motion of frequency w thus lags by the phase (w dt)^2/24 w t, which is dt^2/24 times the total variation of its
@@ -47,7 +48,7 @@ MAX_STALLED = 2  # pilots in succession whose differences have not become smalle
 COARSE = 2  # implicit pilots with fewer steps a frame do not count as stalled
 DISPERSION, IMPACT = 3.0, 1.25  # factors on the errors that velocities show
 SMOOTH_ORDER = 2.0  # of the integrators; that of sudden motion is this, or higher, only by chance
-IMPACT_ORDER = 1.5  # highest of explicit steps after impacts: at orders from 1 to 2 the error is then within a factor of two
+IMPACT_ORDER, LIKELY_ORDER = 1.25, 1.5  # of explicit steps after impacts: highest that counts, and the one to plan with
 UNSURE = 8.0  # a tolerance over the largest error that fewer pilots, or one explicit one of sudden motion, may seem to have
 
 
@@ -153,13 +154,6 @@ class Ladder:
         return float(distances(pilot, other).max()) * error_over_difference(float(more / less), order)
 
     @property
-    def highest_order(self) -> float:
-        """Highest order that pilots are taken to show."""
-        if not self.sudden:
-            return SMOOTH_ORDER
-        return IMPACT_ORDER if self.impacts and self.integrator == EXPLICIT else 1.0
-
-    @property
     def assumed_order(self) -> float:
         """The observed order; where it was not observed the smallest, and where two pilots could not show it the nominal one.
 
@@ -190,7 +184,8 @@ class Ladder:
         order = observed_order(near, far, SMOOTH_ORDER, *ratios)
         if order is None or not self.sudden:
             return order
-        return min(order, self.highest_order if order < SMOOTH_ORDER else 1.0)
+        shows = self.impacts and self.integrator == EXPLICIT and order < SMOOTH_ORDER
+        return min(order, IMPACT_ORDER if shows else 1.0)
 
     def _expected_error(self, pilot: Pilot, excursion: float) -> float:
         """Error of an explicit pilot, over the excursion, from its velocities; see above."""
@@ -230,14 +225,14 @@ class Ladder:
     def next_steps(self, tolerance: float, finest: Fraction) -> Fraction:
         """Steps in the time of a frame of the next explicit pilot after the second. finest: the most that were tried.
 
-        If the second skipped a size, that one is made up for where it may show, by the highest order, that REACH is enough.
+        If the second skipped a size, that one is made up for where it may show, by the likely order, that REACH is enough.
         """
         if len(self.pilots) < 2 or self.pilots[-1].per_frame < finest or self.nominal > 1:
             return 2 * finest
         ratio = float(finest / self.pilots[-2].per_frame)
-        highest, over_difference = self.highest_order, self.error_over_difference(ratio)
-        least = self.error / over_difference * error_over_difference(ratio, highest)  # of errors
-        more = (least / (SAFETY * tolerance)) ** (1.0 / highest)
+        order = LIKELY_ORDER if self.impacts else 1.0
+        error = self.error / self.error_over_difference(ratio) * error_over_difference(ratio, order)
+        more = (error / (SAFETY * tolerance)) ** (1.0 / order)
         if ratio == SKIPPED and self.tried == 2 and more <= REACH[EXPLICIT]:
             return finest / 2
         return Fraction(math.ceil(finest * min(MOST, more))) if self.impacts and more > 2.0 else 2 * finest
