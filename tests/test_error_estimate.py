@@ -55,6 +55,10 @@ def test_orders_are_observed_within_their_bounds():
     assert observed_order(1.0, 4.0, 2.0) == pytest.approx(2.0)
     assert observed_order(1.0, 3.0, 2.0) == pytest.approx(math.log2(3.0))
     assert observed_order(1.0, 4.0, 1.0) == 1.0  # not above the nominal order
+    for order in (0.5, 1.0, 1.7):  # of runs with 2, 8 and 22 steps
+        errors = [steps**-order for steps in (2.0, 8.0, 22.0)]
+        fine, coarse = errors[1] - errors[2], errors[0] - errors[1]
+        assert observed_order(fine, coarse, 2.0, near=22 / 8, far=4.0) == pytest.approx(order)
     assert observed_order(1.0, 1.3, 2.0) is None and observed_order(0.0, 1.0, 2.0) is None
 
 

@@ -7,7 +7,11 @@ tolerance, a second pilot takes slightly smaller steps all the way. It may still
 Where errors fall with dt at least, and twice as many steps seem too few, the second pilot takes four times as many, and may be
 the run. Its distance to the first is almost the whole error of that one, and less by chance than one to a pilot with half as many
 steps. It errs by a third of it; at an order of only 1/2 by three times as much, where half as many steps err by 2.4 times
-as much as shown. If it is not the run, the pilot between them shows the order.
+as much as shown. If it is not the run, the pilot between them may show the order, or else a finer one does.
+
+After impacts of bodies without damping explicit steps show orders from 1.2 to 2. At most 1.25 counts, as an error from pilots
+with h and 2 h is then too small by 1.4 at first order, and too large by 2.2 at second. Orders above 2, which the integrator does
+not have, are chance and count as 1. Any other sudden motion counts as of first order at most.
 
 Velocity Verlet solves x'' = a + dt^2/12 x'''' up to dt^4 (Hairer, Lubich, Wanner, "Geometric Numerical Integration", 2006,
 IX.9). A motion of frequency w thus lags by the phase (w dt)^2/24 w t, which is dt^2/24 times the total variation of its
@@ -25,8 +29,8 @@ from fractions import Fraction
 import numpy as np
 
 from taisoft.estimation.first_choice import EXPLICIT, IMPLICIT
-from taisoft.estimation.order import MIN_ORDER, error_over_difference, observed_order
-from taisoft.estimation.pilots import Frames, Pilot, distances
+from taisoft.estimation.order import MIN_ORDER, difference_ratio, error_over_difference, observed_order
+from taisoft.estimation.pilots import FASTEST, HARDEST, Frames, Pilot, distances
 
 SAFETY = 0.8  # part of the tolerance that an error may take, unless it is likely to be less
 REACH = {EXPLICIT: 2, IMPLICIT: 8}  # steps of a run over those of the last pilot, at most
@@ -43,6 +47,8 @@ MAX_DEGRADED = 2  # pilots that meet the tolerance but are degraded, and are lef
 MAX_STALLED = 2  # pilots in succession whose differences have not become smaller: the paths diverge
 COARSE = 2  # implicit pilots with fewer steps a frame do not count as stalled
 DISPERSION, IMPACT = 3.0, 1.25  # factors on the errors that velocities show
+SMOOTH_ORDER = 2.0  # of the integrators; that of sudden motion is this, or higher, only by chance
+IMPACT_ORDER, LIKELY_ORDER = 1.25, 1.5  # of explicit steps after impacts: highest that counts, and the one to plan with
 UNSURE = 8.0  # a tolerance over the largest error that fewer pilots, or one explicit one of sudden motion, may seem to have
 
 
@@ -50,15 +56,16 @@ UNSURE = 8.0  # a tolerance over the largest error that fewer pilots, or one exp
 class Ladder:
     """Pilots of one integrator.
 
-    sudden: whether velocities or forces may jump; nominal: order of the integrator in the scene; pilots: from coarse to fine;
-    error: of the last one, over the excursion, None if unknown; order: observed, else None; tried: pilots, with failed ones;
-    differences: root mean squares of the distances between successive pilots, each with half the step of the one before [m].
+    sudden: whether velocities or forces may jump; nominal: order of the integrator in the scene; impacts: whether contacts alone
+    lower it; pilots: from coarse to fine; error: of the last one, over the excursion, None if unknown; order: observed, or None;
+    tried: pilots, with failed ones; differences: root mean squares of the distances between the last successive pilots [m].
     """
 
     integrator: str
     sudden: bool
     nominal: int
     frames: Frames
+    impacts: bool = False
     pilots: list[Pilot] = field(default_factory=list)
     error: float | None = None
     order: float | None = None
@@ -75,7 +82,7 @@ class Ladder:
             return
         self.pilots = sorted([*self.pilots, pilot], key=lambda one: one.per_frame)
         for one in self.pilots[:-1]:
-            one.end, one.hardest = {}, (0, {})  # it will not be the run
+            one.end, one.parts = {}, {}  # it will not be the run
         if len(self.pilots) < 2:
             return
         before, last = self.pilots[-2:]
@@ -88,17 +95,13 @@ class Ladder:
 
     @property
     def _measured(self) -> float:
-        """`unsure` of a measured error: of sudden motion it is assumed to fall as slowly as it may."""
-        return 1.0 if self.sudden else 1.0 / SAFETY
+        """`unsure` of a measured error: of sudden motion it is assumed to fall as slowly as it may, unless pilots show more."""
+        return 1.0 if self.sudden and (self.order or 1.0) <= 1.0 else 1.0 / SAFETY
 
     def _last_differences(self) -> list[float]:
-        """The last `differences`, at most as many as are needed."""
-        found: list[float] = []
-        for before, pilot in reversed(list(itertools.pairwise(self.pilots[-4:]))):
-            if pilot.per_frame != 2 * before.per_frame:
-                break
-            found.insert(0, float(np.sqrt(np.mean(distances(pilot, before) ** 2))))
-        return found
+        """The last `differences`, as many as are needed."""
+        pairs = itertools.pairwise(self.pilots[-4:])
+        return [float(np.sqrt(np.mean(distances(pilot, before) ** 2))) for before, pilot in pairs]
 
     def expect(self) -> None:
         """Expect the error of the only pilot, explicit, from its velocities alone."""
@@ -106,21 +109,31 @@ class Ladder:
         excursion = self.excursion(pilot)
         self.error = self._expected_error(pilot, excursion) if excursion else 0.0
 
-    def confirm(self, part: Pilot) -> None:
-        """Expect the error of the only pilot also from its hardest part, run with a slightly smaller step."""
-        if part.report.status == "failed":
+    @property
+    def is_damped(self) -> bool:
+        """Whether motion is smooth, but of first order: its velocities themselves are wrong."""
+        return self.nominal == 1 and not self.sudden
+
+    def confirm(self, hardest: Pilot, fastest: Pilot | None = None) -> None:
+        """Expect the error of the only pilot also from its hardest part, run with a slightly smaller step.
+
+        Of smooth motion errors add up as changes of its velocities do, and of damped motion with time. fastest: the fastest part
+        of damped motion, run with that step too. It shows the errors of damping, of first order, which add up as velocities do;
+        those of changes are then of second order, as without damping.
+        """
+        pilot = self.pilots[0]
+        if any(part is not None and part.report.status == "failed" for part in (hardest, fastest)):
             self.error = None
         elif self.error:
-            self._expect(self.pilots[0], part, self._parts())
-
-    def _parts(self) -> float:
-        """Error of the only pilot over that of its hardest part: of smooth motion errors add up as changes of its velocities do.
-
-        Of damped motion they add up with time, as its velocities themselves are wrong.
-        """
-        if self.sudden:
-            return 1.0
-        return self.pilots[0].parts if self.nominal > 1 else self.frames.count / self.frames.part
+            excursion = self.excursion(pilot)
+            if fastest is not None:
+                of_changes = self._shown(pilot, hardest, 2) * pilot.parts[HARDEST].times
+                shown = max(of_changes, self._shown(pilot, fastest, 1) * pilot.parts[FASTEST].times)
+            else:
+                times = 1.0 if self.sudden else pilot.parts[HARDEST].times
+                times = self.frames.count / self.frames.part if self.is_damped else times
+                shown = self._shown(pilot, hardest, self.nominal) * times
+            self.error = max(self._expected_error(pilot, excursion), shown / excursion)
 
     def replace_first(self, pilot: Pilot) -> None:
         """Replace the first pilot, explicit, by one with a slightly smaller step, and expect its error."""
@@ -128,20 +141,17 @@ class Ladder:
         if pilot.report.status == "failed":
             return
         before, self.pilots, self.unsure = self.pilots, [pilot], self._measured
-        if before:
-            self._expect(pilot, before[0])
-        elif self.excursion(pilot) == 0.0:
-            self.error = 0.0
-
-    def _expect(self, pilot: Pilot, other: Pilot, factor: float = 1.0) -> None:
-        """Expect the error of a pilot from its velocities, and from its distance to another one times a factor."""
-        excursion, steps = self.excursion(pilot), sorted((pilot.per_frame, other.per_frame))
+        excursion = self.excursion(pilot)
         if excursion == 0.0:
             self.error = 0.0
-            return
-        apart = factor * float(distances(pilot, other).max()) / excursion
-        shown = apart * error_over_difference(float(steps[1] / steps[0]), self.nominal)
-        self.error = max(self._expected_error(pilot, excursion), shown)
+        elif before:
+            self.error = max(self._expected_error(pilot, excursion), self._shown(pilot, before[0], self.nominal) / excursion)
+
+    @staticmethod
+    def _shown(pilot: Pilot, other: Pilot, order: int) -> float:
+        """Error of a pilot as its distance to another one shows it [m]."""
+        less, more = sorted((pilot.per_frame, other.per_frame))
+        return float(distances(pilot, other).max()) * error_over_difference(float(more / less), order)
 
     @property
     def assumed_order(self) -> float:
@@ -165,10 +175,17 @@ class Ladder:
         if len(self.differences) < 2:
             return None
         near, far = self.differences[-1], self.differences[-2]
-        stalled = near > self.frames.negligible and near >= max(self.differences[-3:-1]) * 0.5**MIN_ORDER
+        first, second, third = (float(pilot.per_frame) for pilot in self.pilots[-3:])
+        ratios = third / second, second / first
+        least = max(self.differences[-3:-1]) / difference_ratio(MIN_ORDER, *ratios)
+        stalled = near > self.frames.negligible and near >= least
         counts = self.integrator == EXPLICIT or self.pilots[-1].per_frame >= COARSE
         self.stalled = self.stalled + 1 if stalled and counts else 0
-        return observed_order(near, far, 1.0 if self.sudden else 2.0)  # impacts may seem to be of higher order by chance
+        order = observed_order(near, far, SMOOTH_ORDER, *ratios)
+        if order is None or not self.sudden:
+            return order
+        shows = self.impacts and self.integrator == EXPLICIT and order < SMOOTH_ORDER
+        return min(order, IMPACT_ORDER if shows else 1.0)
 
     def _expected_error(self, pilot: Pilot, excursion: float) -> float:
         """Error of an explicit pilot, over the excursion, from its velocities; see above."""
@@ -204,6 +221,21 @@ class Ladder:
         if self.nominal == 1:
             return Fraction(SKIPPED * least if ratio > 2.0 else 2 * least), False
         return Fraction(math.ceil(least * min(MOST, max(LEAST_REACH, ratio)))), False
+
+    def next_steps(self, tolerance: float, finest: Fraction) -> Fraction:
+        """Steps in the time of a frame of the next explicit pilot after the second. finest: the most that were tried.
+
+        If the second skipped a size, that one is made up for where it may show, by the likely order, that REACH is enough.
+        """
+        if len(self.pilots) < 2 or self.pilots[-1].per_frame < finest or self.nominal > 1:
+            return 2 * finest
+        ratio = float(finest / self.pilots[-2].per_frame)
+        order = LIKELY_ORDER if self.impacts else 1.0
+        error = self.error / self.error_over_difference(ratio) * error_over_difference(ratio, order)
+        more = (error / (SAFETY * tolerance)) ** (1.0 / order)
+        if ratio == SKIPPED and self.tried == 2 and more <= REACH[EXPLICIT]:
+            return finest / 2
+        return Fraction(math.ceil(finest * min(MOST, more))) if self.impacts and more > 2.0 else 2 * finest
 
     def meets(self, tolerance: float) -> bool:
         """Whether the last pilot is likely to meet a tolerance."""

@@ -1,11 +1,10 @@
 """Richardson extrapolation: the error of a run from its difference to runs with other steps or meshes, and their observed order.
 
 A method of order p errs by about C h^p in steps, or on meshes, of size h. Two runs with h and r h then differ by |r^p - 1| times
-the error of the first. Of three runs with h, 2 h and 4 h the successive differences have the ratio 2^p, which shows p.
+the error of the first. Of three runs with h, 2 h and 4 h the successive differences have the ratio 2^p, which shows p. With h,
+a h and a b h it is (b^p - 1) / (1 - a^-p), which grows with p too.
 Where the ratio is too small the runs are too coarse for an estimate, or their paths part, as after impacts.
 """
-
-import math
 
 import numpy as np
 
@@ -16,6 +15,7 @@ from taisoft.scene.scene import Scene
 
 MESH_ORDER = 2  # of positions in the mesh width; corners and contacts keep quadratic tets near it too
 MIN_ORDER = 0.4  # observed orders below it allow no extrapolation: the error would be over three times the difference
+BISECTIONS = 40  # that find an order
 
 
 def nominal_order(integrator: str, scene: Scene, touches: bool) -> int:
@@ -50,14 +50,23 @@ def error_over_difference(ratio: float, order: float) -> float:
     return 1.0 / abs(ratio**order - 1.0)
 
 
-def observed_order(fine: float, coarse: float, most: float) -> float | None:
-    """Order seen in the differences of runs with h and 2 h (fine), and with 2 h and 4 h (coarse).
+def difference_ratio(order: float, near: float, far: float) -> float:
+    """Ratio of the differences of runs with near h and near far h, and with h and near h."""
+    return (far**order - 1.0) / (1.0 - near**-order)
+
+
+def observed_order(fine: float, coarse: float, most: float, near: float = 2.0, far: float = 2.0) -> float | None:
+    """Order seen in the differences of runs with h and near h (fine), and with near h and near far h (coarse).
 
     most: the nominal order; a higher one may be chance. None if the order is below MIN_ORDER.
     """
-    if not coarse >= 2.0**MIN_ORDER * fine > 0.0:
+    if not coarse >= difference_ratio(MIN_ORDER, near, far) * fine > 0.0:
         return None
-    return min(most, math.log2(coarse / fine))
+    low, high = MIN_ORDER, most
+    for _ in range(BISECTIONS):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if difference_ratio(middle, near, far) * fine <= coarse else (low, middle)
+    return high
 
 
 def agreement(fine: np.ndarray, coarse: np.ndarray, negligible: float) -> int:

@@ -2,13 +2,14 @@
 
 A pilot takes steps of the run's own simulator, which afterwards is in the state that it had before. Pilots are compared at
 common frames, at some of their nodes, so that their paths take little memory. A pilot keeps the state before its hardest part,
-the one in which velocities change most from frame to frame: other steps are compared with it there for a small part of the cost.
+the one in which velocities change most from frame to frame, or also before its fastest one: other steps are compared with it
+there for a small part of the cost.
 """
 
 import math
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -30,9 +31,19 @@ PARTS = 24  # of a run, about; a pilot knows which is the hardest
 BLOCK = 64  # frames whose velocities are held until their changes are added
 HELD_NODES = 100_000  # nodes of all states at ends of parts that are held until then: 5 to 10 MB
 MAX_NODES = 4096  # whose paths are recorded, evenly spread
+HARDEST, FASTEST = "hardest", "fastest"  # parts: of the largest changes of velocities, and of the largest velocities
 
 RunFunction = Callable[..., RunReport]  # as `running.run_steps`
 StepCallback = Callable[[StepReport, float], None]  # its on_step
+
+
+@dataclass(frozen=True)
+class Part:
+    """A part of a pilot: its first frame, the state there, and the pilot's sum of what distinguishes the part over that in it."""
+
+    first: int
+    state: dict
+    times: float = 1.0
 
 
 @dataclass
@@ -41,8 +52,7 @@ class Pilot:
 
     frames: numbers (k,) of the recorded ones; positions: of the recorded nodes at these (k,n,3) [m]; variations: (n,) sums of the
     changes, from frame to frame, of what velocities change in a frame; jump: the largest such change of velocity [m/s]; end: the
-    simulation's state at the end; hardest: the first frame of the hardest part, and the state there; parts: changes of velocities
-    in all parts over those in the hardest one; warned: texts of warnings.
+    simulation's state at the end; parts: the hardest one, or also the fastest one; warned: texts of warnings.
     """
 
     integrator: str
@@ -53,8 +63,7 @@ class Pilot:
     jump: float = 0.0
     report: RunReport = field(default_factory=RunReport)
     end: dict = field(default_factory=dict)
-    hardest: tuple[int, dict] = (0, {})
-    parts: float = 1.0
+    parts: dict[str, Part] = field(default_factory=dict)
     warned: list[str] = field(default_factory=list)
 
     def counts_per_step(self) -> list[float]:
@@ -80,20 +89,20 @@ class Pilot:
 class Recorder:
     """Records a pilot at its frames; pass `frame` to a run as on_frame.
 
-    stride: time between these, in frames of `frames`; first: the one at which it begins; keeps: whether to keep the state before
-    the hardest part.
+    stride: time between these, in frames of `frames`; first: the one at which it begins; keeps: parts before which to keep the
+    state.
     """
 
-    def __init__(self, pilot: Pilot, frames: "Frames", stride: Fraction, first: int = 0, keeps: bool = False):
+    def __init__(self, pilot: Pilot, frames: "Frames", stride: Fraction, first: int = 0, keeps: tuple[str, ...] = ()):
         self._pilot, self._frames, self._first, self._keeps = pilot, frames, first, keeps
         self._stride = stride if stride.denominator > 1 else int(stride)
         self._index: int | None = None  # of the first frame
         self._velocities: list[np.ndarray] = []  # since the frame up to which changes are added, with that one
         self._ends: list[tuple[int, int, dict]] = []  # of parts since then: changes before it, its frame, and the state there
         self._jump: np.ndarray | None = None  # the change of velocities there
-        self._part: tuple[int, dict] = (0, {})  # the present one, as Pilot.hardest
-        self._changes: np.ndarray | float = 0.0  # (n,) of velocities in it
-        self._most, self._sum = -1.0, 0.0  # of these changes in a part, and of the largest ones in all parts
+        self._part: Part | None = None  # the present one
+        self._sums: dict[str, np.ndarray | float] = dict.fromkeys(keeps, 0.0)  # (n,) in it, of what distinguishes parts
+        self._most, self._total = dict.fromkeys(keeps, -1.0), dict.fromkeys(keeps, 0.0)  # of the largest ones: in a part, in all
 
     def frame(self, sim: "Simulator", index: int, _report) -> None:
         """Record a frame, unless it lies between those of `frames`, or is the last one and not whole."""
@@ -129,23 +138,30 @@ class Recorder:
         else:
             changes = _lengths(np.diff(np.concatenate([self._jump[None], jumps]), axis=0))
             pilot.variations = pilot.variations + changes.sum(axis=0)
-        begin = 0
-        for end, number, state in self._ends:
-            self._changes = self._changes + changes[begin:end].sum(axis=0)
-            self._end_part(number, state)
-            begin = end
-        self._changes = self._changes + changes[begin:].sum(axis=0)
+        self._add_to_parts({name: changes if name == HARDEST else _lengths(velocities[1:]) for name in self._keeps})
         self._velocities, self._ends, self._jump = self._velocities[-1:], [], jumps[-1]
+
+    def _add_to_parts(self, found: dict[str, np.ndarray]) -> None:
+        """Add what distinguishes parts (k,n) at the frames since the last call."""
+        begin = 0
+        for end, number, state in [*self._ends, (None, 0, {})]:
+            for name, one in found.items():
+                self._sums[name] = self._sums[name] + one[begin:end].sum(axis=0)
+            if end is not None:
+                self._end_part(number, state)
+                begin = end
 
     def _end_part(self, number: int, state: dict) -> None:
         """End a part of the run, and begin the next one at a frame, with the state there; at the end of the run it is empty."""
-        if self._part[1]:
-            changes = float(np.max(self._changes))
-            self._sum += changes
-            if changes > self._most:
-                self._most, self._pilot.hardest = changes, self._part
-            self._pilot.parts = self._sum / self._most if self._most > 0.0 else 1.0
-        self._part, self._changes = (number, state), 0.0
+        for name in self._keeps if self._part else ():
+            found = float(np.max(self._sums[name]))
+            self._total[name] += found
+            if found > self._most[name]:
+                self._most[name], self._pilot.parts[name] = found, self._part
+            times = self._total[name] / self._most[name] if self._most[name] > 0.0 else 1.0
+            self._pilot.parts[name] = replace(self._pilot.parts[name], times=times)
+        self._part = Part(number, state) if state else None
+        self._sums = dict.fromkeys(self._keeps, 0.0)
 
 
 @dataclass(frozen=True)
@@ -187,25 +203,25 @@ class Frames:
         per_frame: Fraction,
         stop: Callable[[], bool] | None,
         run: RunFunction,
-        whole: Pilot | None = None,
-        keeps: bool = False,
+        part: Part | None = None,
+        keeps: tuple[str, ...] = (),
         on_step: StepCallback | None = None,
     ) -> Pilot:
         """Run a pilot of `per_frame` steps a frame; its report has the status "failed" if it fails. Restores sim's state.
 
-        whole: another pilot, whose hardest part alone is to be run; keeps: whether it keeps the state before its own;
-        stop, on_step: as for `run`.
+        part: of another pilot, which alone is to be run; keeps: own parts before which to keep the state; stop, on_step: as for
+        `run`.
         """
         pilot = Pilot(sim.settings.integrator, per_frame)
         kept, may_soften = sim._dynamics.snapshot(), sim._may_soften
         stride, first = math.ceil(1 / per_frame), 0
         length = self.length if stride == 1 else self.count // stride * stride * self.seconds
-        if whole is not None:
-            first, state = whole.hardest
+        if part is not None:
+            first = part.first
             length = min(self.part, self.count - first) * self.seconds
         try:
-            if whole is not None:
-                sim._dynamics.restore(state)
+            if part is not None:
+                sim._dynamics.restore(part.state)
             with warnings.catch_warnings(record=True) as caught:
                 warnings.simplefilter("always")  # they are those of the run only if the pilot is
                 sim.dt = self.seconds / float(per_frame)

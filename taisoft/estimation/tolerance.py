@@ -3,9 +3,10 @@
 Implicit pilots are a ladder (`ladder`), each with half the step of the one before, that ends where the run needs at most eight
 times as many steps as the last pilot. How many follows from the difference of the last two and its observed order. The second
 pilot skips one, and is the run if it seems far better than it must be. Explicit steps cannot be coarser than stable. Their first
-pilot has the largest stable step. Its velocities, and its hardest part repeated with a slightly smaller step, show whether it is
-enough; if that is not sure a second pilot takes a smaller step all the way, and may skip one. Otherwise a ladder follows. A pilot
-that meets the tolerance is the run, which is repeated only if frames or steps are observed, or an estimate by twins is asked for.
+pilot has the largest stable step. Its velocities, and its hardest part repeated with a slightly smaller step, or also the fastest
+one, show whether it is enough; if that is not sure a second pilot takes a smaller step all the way, and may skip one. Otherwise a
+ladder follows. A pilot that meets the tolerance is the run, which is repeated only if frames or steps are observed, or an
+estimate by twins is asked for.
 
 Which kind of steps a run takes follows from counts (`costs`). Explicit steps are accepted at once where they cost less than
 implicit ones could, and an implicit pilot ends when its steps cost more than explicit ones would. Among implicit methods BDF2 is
@@ -24,9 +25,9 @@ from typing import TYPE_CHECKING
 from taisoft.errors import SimulationError, no_memory
 from taisoft.estimation.costs import Budget, Spent, explicit_step, implicit_step
 from taisoft.estimation.first_choice import EXPLICIT, IMPLICIT, stable_steps
-from taisoft.estimation.ladder import SKIPPED, Ladder, implicit_sizes, slightly_more
-from taisoft.estimation.order import may_jump, nominal_order
-from taisoft.estimation.pilots import Pilot, Recorder, RunFunction, StepCallback, distances, make_frames
+from taisoft.estimation.ladder import SMALLER, Ladder, implicit_sizes, slightly_more
+from taisoft.estimation.order import is_smooth, may_jump, nominal_order
+from taisoft.estimation.pilots import FASTEST, HARDEST, Part, Pilot, Recorder, RunFunction, StepCallback, distances, make_frames
 from taisoft.estimation.vibrations import ERROR as VIBRATIONS
 from taisoft.estimation.vibrations import add_vibrations, are_passed_over
 from taisoft.records import BodyError, ErrorEstimate, RunReport
@@ -37,6 +38,7 @@ if TYPE_CHECKING:
     from taisoft.simulator import Simulator
 
 DEARER = 4.0  # cost of explicit steps, over that of implicit ones that cannot meet the tolerance, at most
+TWO_PILOTS = float(1 + SMALLER)  # cost of explicit steps with their pilots, over that of the first one, at least
 LEAST_FRAMES, MOST_FRAMES = 16, 64  # at which pilots are compared where a run has few, or every step is one
 
 
@@ -116,7 +118,8 @@ class Chooser:
     def _ladder(self) -> Ladder:
         sim = self._sim
         integrator = sim.settings.integrator
-        return Ladder(integrator, self._sudden, nominal_order(integrator, sim.scene, sim.touches), self._frames)
+        impacts = sim.touches and not may_jump(sim.scene) and is_smooth(sim.scene, touches=False)
+        return Ladder(integrator, self._sudden, nominal_order(integrator, sim.scene, sim.touches), self._frames, impacts)
 
     # --- choosing -----------------------------------------------------------------------------------------------------
 
@@ -158,12 +161,12 @@ class Chooser:
             except Spent:
                 return None
             needed = ladder.steps_needed(self._tolerance)
-            if self._passes_over_vibrations():
-                if explicit <= DEARER * implicit_step(sim.scene, sim.touches):
-                    return None
-                needed = needed or (self._last_steps() if ladder.pilots[-1].per_frame >= 1 else None)
             last = ladder.pilots[-1] if ladder.pilots else None
             cost = implicit_step(sim.scene, sim.touches, last and last.counts_per_step())
+            if self._passes_over_vibrations() and last.per_frame >= 1 and len(ladder.pilots) > 1:
+                if self._is_worth(explicit, cost):
+                    return None
+                needed = needed or self._last_steps()
             likely = max(1, per_frame) if ladder.are_few else ladder.likely_steps(self._tolerance)
             if (needed or likely) * cost > explicit:
                 return None
@@ -175,6 +178,14 @@ class Chooser:
         last = self.ladder.pilots[-1] if self.ladder.pilots and self._tolerance < VIBRATIONS else None
         return bool(last and last.touches) and are_passed_over(self._sim.scene, self._dt(max(Fraction(1), last.per_frame)))
 
+    def _is_worth(self, explicit: float, cost: float) -> bool:
+        """Whether explicit steps, at a cost of `explicit` [us] a frame, and their pilots are worth it where implicit ones cannot
+        meet the tolerance: they are at most DEARER than these, of `cost` [us] each, would be without vibrations."""
+        if explicit > DEARER * implicit_step(self._sim.scene, self._sim.touches):
+            return False
+        steps = max(1.0, float(self.ladder.pilots[-1].per_frame) * self.ladder.steps_over_last(self._tolerance))
+        return TWO_PILOTS * explicit <= DEARER * steps * cost
+
     def _dt(self, per_frame: Fraction | int) -> float:
         """Step [s] of so many in the time of a frame."""
         return self._frames.seconds / float(per_frame)
@@ -183,26 +194,32 @@ class Chooser:
         """Explicit steps in the time of a frame."""
         self._use(EXPLICIT, self._dt(least))
         ladder, ratio = self.ladder, 1.0
-        pilot = self._pilot(Fraction(least), keeps=True)
+        pilot = self._pilot(Fraction(least), keeps=(HARDEST, FASTEST) if ladder.is_damped else (HARDEST,))
         ladder.add(pilot)
         if ladder.pilots:
             ladder.expect()
             ratio = ladder.steps_over_last(self._tolerance)
             if ladder.meets(self._tolerance) and pilot.report.status == "ok":
-                ladder.confirm(self._pilot(slightly_more(least), whole=pilot))
-                if ladder.meets(self._tolerance):
+                if self._is_confirmed(pilot):
                     return least
         per_frame, replaces = ladder.second_steps(least, ratio)
         (ladder.replace_first if replaces else ladder.add)(self._pilot(per_frame))
-        between = per_frame / 2 if per_frame == SKIPPED * least and ladder.nominal == 1 else None
         while True:
             steps = ladder.steps_needed(self._tolerance)
             if steps is not None or ladder.is_over:
                 return steps or self._last_steps()
-            if between is None:
-                per_frame *= 2
-            ladder.add(self._pilot(between or per_frame))
-            between = None
+            following = ladder.next_steps(self._tolerance, per_frame)
+            ladder.add(self._pilot(following))
+            per_frame = max(per_frame, following)
+
+    def _is_confirmed(self, pilot: Pilot) -> bool:
+        """Whether parts of the first explicit pilot, run with a slightly smaller step, show that it meets the tolerance."""
+        ladder, steps = self.ladder, slightly_more(int(pilot.per_frame))
+        hardest = self._pilot(steps, part=pilot.parts[HARDEST])
+        ladder.confirm(hardest)
+        if ladder.is_damped and not ladder.meets(self._tolerance):
+            ladder.confirm(hardest, self._pilot(steps, part=pilot.parts[FASTEST]))
+        return ladder.meets(self._tolerance)
 
     def _last_steps(self) -> int:
         """Steps of the last pilot that did not fail. Raises SimulationError if all did."""
@@ -211,18 +228,18 @@ class Chooser:
         return math.ceil(self.ladder.pilots[-1].per_frame)
 
     def _pilot(
-        self, per_frame: Fraction, whole: Pilot | None = None, keeps: bool = False, on_step: StepCallback | None = None
+        self, per_frame: Fraction, part: Part | None = None, keeps: tuple[str, ...] = (), on_step: StepCallback | None = None
     ) -> Pilot:
         """Run a pilot, see `Frames.pilot`.
 
         Raises SimulationError if it and the one before fail: smaller steps do not help.
         """
-        pilot = self._frames.pilot(self._sim, per_frame, self._stop, self._run_steps, whole, keeps, on_step)
+        pilot = self._frames.pilot(self._sim, per_frame, self._stop, self._run_steps, part, keeps, on_step)
         report, before = pilot.report, self._last_failure
         self.compile_seconds += report.compile_seconds
         if report.interrupted:
             raise KeyboardInterrupt
-        if whole is not None:  # whether a part fails does not count
+        if part is not None:  # whether a part fails does not count
             return pilot
         self._last_failure = (report.sim_seconds, report.problems[-1]) if report.status == "failed" else None
         if before and self._last_failure and abs(report.sim_seconds - before[0]) <= self._frames.seconds:
