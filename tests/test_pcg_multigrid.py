@@ -1,7 +1,7 @@
 """Conjugate gradients with multigrid in Gauss-Seidel's sweeps, and its coarse space:
 
 * the stored form of T, and T^T A T, are those of the dense matrices;
-* iterates are those of conjugate gradients with the dense V-cycle: relaxed forward sweep, coarse correction, backward sweep;
+* iterates are those of conjugate gradients with the dense V-cycle: forward sweep, coarse correction, backward sweep;
 * the solution is SciPy's, 0 on constrained axes; the limit of iterations holds and negative curvature is reported;
 * with chunks, also if blocks couple chunks of one parity, the bits are the same on one thread and on several;
 * the iterations hardly grow with the mesh, and a factor of the stiffness does not change them.
@@ -23,7 +23,7 @@ from taisoft.linear import block_csr, multigrid, pcg
 from taisoft.linear.aggregation import MODES, rigid_aggregates, rigid_modes
 from taisoft.linear.coarse_space import build_coarse_space
 from taisoft.linear.hierarchy import ExactPreconditioner, build_hierarchy, has_narrow_band, rows_with_diagonals
-from taisoft.linear.pcg_multigrid import OMEGA, CoarseCorrection
+from taisoft.linear.pcg_multigrid import CoarseCorrection
 from taisoft.linear.pcg_work import build_pcg
 from taisoft.mesh.aggregates import aggregate
 
@@ -81,7 +81,7 @@ def test_iterates_are_those_of_the_dense_cycle():
         T = as_dense(rigid_aggregates(x, free, own)[1], own)[f]
         C = np.array([hierarchy.cycle.apply(e) for e in np.eye(T.shape[1])])
         dense = matrix.toarray()
-        S = np.linalg.inv((diagonal_part(dense) / OMEGA + lower_part(dense))[np.ix_(f, f)])
+        S = np.linalg.inv((diagonal_part(dense) + lower_part(dense))[np.ix_(f, f)])
         K, one = dense[np.ix_(f, f)], np.eye(f.sum())
         M = S + S.T - S.T @ K @ S + (one - S.T @ K) @ T @ C @ T.T @ (one - K @ S)
         r = w.rhs.to_numpy().reshape(-1)[f]

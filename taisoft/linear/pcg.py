@@ -52,7 +52,7 @@ def solve(
             iterate_kernel(m, A, coupling, w, min(batch_of(m, A), max_iterations - done), tolerance, begin)
         else:
             if done == 0:
-                start_parallel(m, A, coupling, w, tolerance, int(same_matrix), 1.0)
+                start_parallel(m, A, coupling, w, tolerance, int(same_matrix))
             if max_iterations > 0 and w.state[STATUS] == RUNNING:
                 iterate_parallel(m, A, coupling, w, tolerance)
         state = w.state.to_numpy()

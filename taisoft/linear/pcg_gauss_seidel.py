@@ -53,9 +53,7 @@ from taisoft.linear.sweep_order import (
 
 
 @ti.func
-def _start_chunk(
-    m: ti.template(), A: ti.template(), k: ti.template(), w: ti.template(), c, same_matrix, omega, last: ti.template()
-):
+def _start_chunk(m: ti.template(), A: ti.template(), k: ti.template(), w: ti.template(), c, same_matrix, last: ti.template()):
     """Set the diagonal and P, y = 0, s = (P + L)^-1 rhs, t = P s. Return r.z."""
     rz = ti.cast(0.0, ti.f64)
     first, end = chunk_range(m, k, w, c, last)
@@ -63,7 +61,7 @@ def _start_chunk(
         i = node_at(k, w, at, last)
         if is_later(k, w, i, last):
             continue
-        precondition(m, A, k, w, i, same_matrix, omega)
+        precondition(m, A, k, w, i, same_matrix)
         below = times_below(m, A, k, w, c, i, w.r, last)
         if ti.static(k.width > 0):
             below += gather_products(m, k, i)
@@ -209,10 +207,10 @@ def start_serial(m: ti.template(), A: ti.template(), k: ti.template(), w: ti.tem
     clear_last(m, k, w, w.r)
     for step in range(_n_chunks(w)):
         c = _in_order(w, step)
-        m.state.partial[c, SUM] = _start_chunk(m, A, k, w, c, same_matrix, 1.0, False)
+        m.state.partial[c, SUM] = _start_chunk(m, A, k, w, c, same_matrix, False)
     rz = sum_of_chunks(m, w, SUM)
     if ti.static(w.has_last(k)):
-        rz += _start_chunk(m, A, k, w, 0, same_matrix, 1.0, True)
+        rz += _start_chunk(m, A, k, w, 0, same_matrix, True)
     w.state[RZ], w.state[RZ_START], w.state[STEP] = rz, rz, 0.0
     w.state[COUNT], w.state[STATUS] = 0.0, RUNNING
 
@@ -260,9 +258,9 @@ def iterate_serial(m: ti.template(), A: ti.template(), k: ti.template(), w: ti.t
 
 @kernel
 def start_parallel(
-    m: ti.template(), A: ti.template(), k: ti.template(), w: ti.template(), tolerance: ti.f64, same_matrix: ti.i32, omega: ti.f64
+    m: ti.template(), A: ti.template(), k: ti.template(), w: ti.template(), tolerance: ti.f64, same_matrix: ti.i32
 ):
-    """Begin a solve of a divided system from y = 0. omega: relaxation of the sweeps."""
+    """Begin a solve of a divided system from y = 0."""
     if ti.static(w.has_last(k)):
         ti.loop_config(serialize=True)
         for _ in range(1):
@@ -273,12 +271,12 @@ def start_parallel(
         for task in range(_n_of_parity(w, parity) * m.spread):
             if task % m.spread == 0:
                 c = 2 * (task // m.spread) + parity
-                m.state.partial[c, SUM] = _start_chunk(m, A, k, w, c, same_matrix, omega, False)
+                m.state.partial[c, SUM] = _start_chunk(m, A, k, w, c, same_matrix, False)
     ti.loop_config(serialize=True)
     for _ in range(1):
         rz = sum_of_chunks(m, w, SUM)
         if ti.static(w.has_last(k)):
-            rz += _start_chunk(m, A, k, w, 0, same_matrix, omega, True)
+            rz += _start_chunk(m, A, k, w, 0, same_matrix, True)
         begin_with(w, tolerance, rz)
 
 

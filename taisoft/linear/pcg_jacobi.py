@@ -32,7 +32,7 @@ def start_jacobi(m: ti.template(), A: ti.template(), k: ti.template(), w: ti.tem
         n = n_nodes_of(m, w.subset)
         for at in range(chunk_size(m, c, n)):
             i = node_of(w.subset, chunk_entry(m, c, at, n))
-            precondition(m, A, k, w, i, same_matrix, 1.0)
+            precondition(m, A, k, w, i, same_matrix)
             r = m.free[i] * w.rhs[i]
             z = block_times(w.inverse[i], r)
             w.y[i] = ti.Vector([0.0, 0.0, 0.0], m.real)

@@ -1,17 +1,15 @@
 """Conjugate gradients whose preconditioner is a multigrid V-cycle, for `pcg` on the CPU at little more memory.
 
-With the matrices of `pcg_gauss_seidel`, but P divided by the relaxation omega, S = (P / omega + L)^-1 is a sweep of successive
-over-relaxation. A V-cycle that starts with a forward sweep from 0, corrects by a coarse space T (`coarse_space`) and ends with a
-backward sweep is, for P = D and E = 0,
-    M^-1 = S^T ((2 / omega - 1) P + B C B^T) S,   B = (L + E + (1 - 1 / omega) P) T,
-since the residual after the forward sweep x = S r is -(L^T + (1 - 1 / omega) D) x, and A and the coarse correction c enter the
-backward sweep as minus the transpose of that matrix times c. Here C is a V-cycle of `multigrid` for T^T A T. So an iteration is
-one of `pcg_gauss_seidel` with P s replaced by
-    (2 / omega - 1) P s + B C B^T s,   s = S r.
-Both sweeps, the product A p and the residual cost the reading of A once, B C B^T once more: products with B take the half-rows of
-A, since B itself would hold as many numbers. M is positive definite for every B and 0 < omega < 2, also if C is that of an
-earlier matrix, and if A is not positive definite. If the time step has changed since, C is divided by the factor of the stiffness
-beta^2 K, which dominates where the coarse space matters.
+With the matrices of `pcg_gauss_seidel`, S = (P + L)^-1, and B = (L + E) T of a coarse space T (`coarse_space`), a V-cycle that
+starts with a forward sweep from 0, corrects by the coarse space and ends with a backward sweep is, for P = D and E = 0,
+    M^-1 = S^T (P + B C B^T) S,
+since the residual after the forward sweep x = S r is -L^T x, and A and the coarse correction c enter the backward sweep as
+-L c alone. Here C is a V-cycle of `multigrid` for T^T A T. So an iteration is one of `pcg_gauss_seidel` with P s replaced by
+    P s + B C B^T s,   s = S r.
+Both sweeps, the product A p and the residual cost the reading of A once, B C B^T costs it once more: B is not stored, since it
+would hold nearly as many numbers as L. M is positive definite for every B, also if C is that of an earlier matrix, and if A is
+not positive definite. If the time step has changed since, C is divided by the factor of the stiffness beta^2 K, which dominates
+where the coarse space matters.
 """
 
 import numpy as np
@@ -21,15 +19,13 @@ from taisoft.backend.arrays import FieldArena
 from taisoft.backend.runtime import kernel
 from taisoft.fem.model import Model
 from taisoft.fem.state import OTHER_SUM
-from taisoft.linear.block_csr import BlockCsr, block_times, partial_row_times
+from taisoft.linear.block_csr import BlockCsr, partial_row_times
 from taisoft.linear.coarse_space import build_coarse_space
 from taisoft.linear.coupling import NO_COUPLING
 from taisoft.linear.multigrid import Multigrid
 from taisoft.linear.pcg_gauss_seidel import begin_with, end_iteration, start_parallel, sum_of_chunks, take_step
 from taisoft.linear.pcg_work import CONVERGED, COUNT, NEGATIVE_PENDING, RUNNING, RZ, STATUS, LinearResult, PcgWork, dot64
 from taisoft.linear.sweep_order import chunk_range
-
-OMEGA = 1.2  # relaxation of the sweeps: 5 to 10 % fewer iterations than with 1; 1.1 to 1.4 take nearly as many
 
 
 class CoarseCorrection:
@@ -58,9 +54,8 @@ class CoarseCorrection:
         stiffness: factor of the stiffness in A over that in the matrix this was built from. If rounding keeps the
         preconditioner from being positive definite, the solve ends without convergence.
         """
-        space, cycle = self.space, self.cycle
-        scale = 1.0 / stiffness
-        start_parallel(m, A, NO_COUPLING, w, tolerance, 0, OMEGA)
+        space, cycle, scale = self.space, self.cycle, 1.0 / stiffness
+        start_parallel(m, A, NO_COUPLING, w, tolerance, 0)
         restrict(m, A, space, w, cycle.right)
         cycle.cycle()
         start_with_correction(m, A, space, w, cycle.solution, scale, tolerance)
@@ -87,12 +82,6 @@ def _times_half(m: ti.template(), A: ti.template(), c, i, half: ti.template(), x
 
 
 @ti.func
-def _diagonal_factor(m: ti.template()):
-    """1 - 1 / omega over 2 / omega - 1, which w.block has as a factor."""
-    return ti.cast((OMEGA - 1.0) / (2.0 - OMEGA), m.real)
-
-
-@ti.func
 def _set_right(m: ti.template(), A: ti.template(), space: ti.template(), w: ti.template(), right: ti.template()):
     """right = B^T s, in loops at the top level of a kernel; overwrites p."""
     ti.loop_config(serialize=m.serial)
@@ -101,7 +90,7 @@ def _set_right(m: ti.template(), A: ti.template(), space: ti.template(), w: ti.t
             c = task // m.spread
             first, end = chunk_range(m, NO_COUPLING, w, c, False)
             for i in range(first, end):
-                w.p[i] = m.free[i] * (_times_half(m, A, c, i, 1, w.r) + _diagonal_factor(m) * w.q[i])
+                w.p[i] = m.free[i] * _times_half(m, A, c, i, 1, w.r)
     ti.loop_config(serialize=m.serial)
     for k in range(space.n_coarse):
         force, moment = ti.Vector.zero(m.real, 3), ti.Vector.zero(m.real, 3)
@@ -132,9 +121,7 @@ def _correct_chunk(m: ti.template(), A: ti.template(), w: ti.template(), scale, 
     rz = ti.cast(0.0, ti.f64)
     first, end = chunk_range(m, NO_COUPLING, w, c, False)
     for i in range(first, end):
-        u = w.p[i]
-        change = _times_half(m, A, c, i, 0, w.p) + _diagonal_factor(m) * block_times(w.block[i], u)
-        t = w.q[i] + ti.cast(scale, m.real) * change
+        t = w.q[i] + ti.cast(scale, m.real) * _times_half(m, A, c, i, 0, w.p)
         w.q[i] = t
         rz += dot64(w.r[i], t)
     return rz

@@ -73,19 +73,18 @@ def build_pcg(model: Model, arena: FieldArena) -> PcgWork:
 
 
 @ti.func
-def precondition(m: ti.template(), A: ti.template(), k: ti.template(), w: ti.template(), i, same_matrix, omega):
-    """Set diagonal and preconditioner of node i, unless it has those of the last solve. omega: relaxation, of sweeps alone."""
+def precondition(m: ti.template(), A: ti.template(), k: ti.template(), w: ti.template(), i, same_matrix):
+    """Set diagonal and preconditioner of node i, unless it has those of the last solve."""
     changed = True
     if ti.static(k.width > 0):
         changed = same_matrix == 0 or has_terms(k, i)
         if changed:
             A.diagonal[i] = prepare_terms(m, k, i)
     if changed:
-        inverse, P = definite_inverse(m, A.diagonal[i], m.free[i])
-        w.inverse[i] = ti.cast(omega, m.real) * inverse
+        w.inverse[i], P = definite_inverse(m, A.diagonal[i], m.free[i])
         if ti.static(m.on_cpu):
-            w.block[i] = ti.cast(2.0 / omega - 1.0, m.real) * P
-            w.mirror[i] = ti.cast(2.0 / omega, m.real) * P - A.diagonal[i]
+            w.block[i] = P
+            w.mirror[i] = 2.0 * P - A.diagonal[i]
 
 
 @ti.func
