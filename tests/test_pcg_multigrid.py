@@ -1,6 +1,6 @@
 """Conjugate gradients with multigrid in Gauss-Seidel's sweeps, and its coarse space:
 
-* B and T^T A T are those of the dense matrices;
+* the stored form of T, and T^T A T, are those of the dense matrices;
 * iterates are those of conjugate gradients with the dense V-cycle: forward sweep, coarse correction, backward sweep;
 * the solution is SciPy's, 0 on constrained axes; the limit of iterations holds and negative curvature is reported;
 * with chunks, also if blocks couple chunks of one parity, the bits are the same on one thread and on several;
@@ -20,11 +20,12 @@ import taisoft as ts
 from taisoft.backend.arrays import FieldArena
 from taisoft.fem.node_graph import EVERYTHING
 from taisoft.linear import block_csr, multigrid, pcg
-from taisoft.linear.aggregation import MODES, prolongation, rigid_modes
-from taisoft.linear.coarse_space import build_coarse_space, find_pattern
+from taisoft.linear.aggregation import MODES, rigid_aggregates, rigid_modes
+from taisoft.linear.coarse_space import build_coarse_space
 from taisoft.linear.hierarchy import ExactPreconditioner, build_hierarchy, has_narrow_band, rows_with_diagonals
 from taisoft.linear.pcg_multigrid import CoarseCorrection
 from taisoft.linear.pcg_work import build_pcg
+from taisoft.mesh.aggregates import aggregate
 
 
 @pytest.fixture(autouse=True)
@@ -48,17 +49,25 @@ def diagonal_part(matrix: np.ndarray) -> np.ndarray:
 def test_the_products_are_those_of_dense_matrices():
     with built(held_box(), "f64") as made:
         A, _, matrix, free = assembled(made, shift=100.0)
-        x, m, arena = made.oracle.rest, made.model, FieldArena()
-        pattern = find_pattern(m, A, *rows_with_diagonals(m, A), free)
-        space, coarse, _ = build_coarse_space(m, A, pattern, rigid_modes(x, free), arena)
-        T, _, unused = prolongation(rigid_modes(x, free), pattern.aggregate)
-        dense, T, f = matrix.toarray(), T.toarray(), free.reshape(-1)
-        expected = lower_part(dense) @ T
-        assert np.abs(expected).max() > 1.0 and pattern.n_coarse > 4
-        product, transposed = space.product.to_scipy().toarray(), space.transposed.to_scipy().toarray()
-        assert np.abs(product - expected)[f].max() < 1e-12 * np.abs(expected).max() and np.array_equal(transposed, product.T)
+        x, m = made.oracle.rest, made.model
+        rows = rows_with_diagonals(m, A)
+        space, coarse, modes = build_coarse_space(m, A, *rows, x, free, FieldArena())
+        own = aggregate(*rows, free.any(axis=1))
+        arms, T, _, unused = rigid_aggregates(x, free, own)
+        assert np.array_equal(space.arm.host, arms) and np.array_equal(space.aggregate.host, own)
+        for c in range(space.n_coarse):
+            assert np.array_equal(space.node.host[space.start.host[c] : space.start.host[c + 1]], np.flatnonzero(own == c))
+        dense, T = matrix.toarray(), as_dense(T, own)
         expected = T.T @ dense @ T + np.diag(unused.reshape(-1) * 1.0)
-        assert np.abs(coarse.toarray() - expected).max() < 1e-12 * np.abs(expected).max()
+        assert np.abs(coarse.toarray() - expected).max() < 1e-12 * np.abs(expected).max() and space.n_coarse > 4
+        assert np.abs(T @ modes.reshape(-1, MODES) - rigid_modes(x, free).reshape(-1, MODES)).max() < 1e-14
+
+
+def as_dense(blocks: np.ndarray, own: np.ndarray) -> np.ndarray:
+    """T (3 n, 6 n_coarse) from the blocks (n, 3, 6) and the aggregate of each node."""
+    T = np.zeros((len(own), 3, own.max() + 1, MODES))
+    T[np.arange(len(own)), :, own] = blocks
+    return T.reshape(3 * len(own), -1)
 
 
 def test_iterates_are_those_of_the_dense_cycle():
@@ -68,9 +77,9 @@ def test_iterates_are_those_of_the_dense_cycle():
         m, f, x = made.model, free.reshape(-1), made.oracle.rest
         hierarchy = build_hierarchy(m, A, x, free)
         assert isinstance(hierarchy, CoarseCorrection) and hierarchy.cycle.levels
-        pattern = find_pattern(m, A, *rows_with_diagonals(m, A), free)
-        T = prolongation(rigid_modes(x, free), pattern.aggregate)[0].toarray()[f]
-        C = np.array([hierarchy.cycle.apply(e) for e in np.eye(MODES * pattern.n_coarse)])
+        own = aggregate(*rows_with_diagonals(m, A), free.any(axis=1))
+        T = as_dense(rigid_aggregates(x, free, own)[1], own)[f]
+        C = np.array([hierarchy.cycle.apply(e) for e in np.eye(T.shape[1])])
         dense = matrix.toarray()
         S = np.linalg.inv((diagonal_part(dense) + lower_part(dense))[np.ix_(f, f)])
         K, one = dense[np.ix_(f, f)], np.eye(f.sum())

@@ -36,9 +36,9 @@ if TYPE_CHECKING:
 # the number of nodes, by (whether it is a factorisation, precision). It is built once it would have saved BUILD: what a
 # factorisation takes, but half of what multigrid takes, since most simulations that need it go on. A solve is expected to take
 # ITERATIONS, before the first one. LOADING over the number of nodes is what kernels of multigrid take to load, about 0.2 s.
-RATIO = {(False, ti.f32): 2.2, (False, ti.f64): 2.4, (True, ti.f32): 3.5, (True, ti.f64): 3.2}
+RATIO = {(False, ti.f32): 2.6, (False, ti.f64): 2.6, (True, ti.f32): 3.5, (True, ti.f64): 3.2}
 OVERHEAD = {(False, ti.f32): 5_000, (False, ti.f64): 10_000, (True, ti.f32): 25_000, (True, ti.f64): 20_000}
-BUILD, LOADING, ITERATIONS = {False: 90, True: 450}, {False: 5_000_000, True: 0}, 9
+BUILD, LOADING, ITERATIONS = {False: 90, True: 450}, {False: 5_000_000, True: 0}, 8
 GROWTH, SLACK = 2.0, 10  # a solve that takes more than GROWTH times the first iterations + SLACK requires a new hierarchy
 LONGEST = 300  # iterations of a solve with a new hierarchy
 PERIOD = 128  # solves by multigrid between trials of pcg

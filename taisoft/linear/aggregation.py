@@ -13,18 +13,66 @@ import scipy.sparse as sp
 
 MODES = 6  # three translations, three linearised rotations
 DEPENDENT = 1e-8  # of an aggregate's modes: a smaller remainder of a mode depends on the previous ones
+NEARLY_DEPENDENT = 1e-4  # smallest eigenvalue of the cosines between independent motions
 
 
 def rigid_modes(x: np.ndarray, free: np.ndarray) -> np.ndarray:
     """Rigid-body modes (n, 3, 6) of positions x (n, 3) [m], 0 on constrained axes (free: (n, 3) bool), of order 1 at most."""
-    arm = x - x.mean(axis=0)
-    arm = arm / max(float(np.abs(arm).max()), 1e-300)
-    modes = np.zeros((len(x), 3, MODES))
+    return _motions((x - x.mean(axis=0)) / _extent(x)) * free[:, :, None]
+
+
+def _extent(x: np.ndarray) -> float:
+    """Largest distance of a coordinate from the mean."""
+    return max(float(np.abs(x - x.mean(axis=0)).max()), 1e-300)
+
+
+def _motions(arm: np.ndarray) -> np.ndarray:
+    """Translations and rotations (n, 3, 6) of points at `arm` (n, 3) from the centre."""
+    modes = np.zeros((len(arm), 3, MODES))
     modes[:, range(3), range(3)] = 1.0
     for k in range(3):  # e_k x arm
         i, j = (k + 1) % 3, (k + 2) % 3
         modes[:, j, 3 + k], modes[:, i, 3 + k] = arm[:, i], -arm[:, j]
-    return modes * free[:, :, None]
+    return modes
+
+
+def rigid_aggregates(
+    x: np.ndarray, free: np.ndarray, aggregates: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Make each aggregate of nodes rigid. Return the arms, the matrix, the coarse modes and the unused coarse unknowns.
+
+    x, free: as for `rigid_modes`; aggregates: (n), -1 for nodes without rows. Arms (n, 3) are those from the aggregate's centre,
+    over their root mean square; rows of the matrix are free (t + w x arm), with coarse unknowns t, w. It is 0 for nodes without
+    rows, times the coarse modes (n_coarse, 6, 6) it is `rigid_modes`. Unused (n_coarse, 6) bool, with columns of 0: axes that
+    are constrained everywhere, and rotations of aggregates whose motions are not independent, such as of nodes on a line.
+    """
+    node = np.flatnonzero(aggregates >= 0)
+    own, n_coarse = aggregates[node], int(aggregates.max()) + 1
+    size = np.bincount(own, minlength=n_coarse)
+
+    def means(of: np.ndarray) -> np.ndarray:
+        return np.stack([np.bincount(own, of[:, k], n_coarse) for k in range(of.shape[1])], axis=1) / size[:, None]
+
+    centre = means(x[node])
+    arm = x[node] - centre[own]
+    radius = np.sqrt(means(arm**2).sum(axis=1))
+    arm /= np.maximum(radius, 1e-300)[own, None]
+    blocks = _motions(arm) * free[node][:, :, None]
+    gram = means((blocks.swapaxes(1, 2) @ blocks).reshape(-1, MODES**2)).reshape(-1, MODES, MODES)
+    length = np.sqrt(np.diagonal(gram, axis1=1, axis2=2))
+    unused = length <= DEPENDENT
+    inverse = 1.0 / np.where(unused, 1.0, length)
+    cosines = gram * inverse[:, :, None] * inverse[:, None, :] + np.eye(MODES) * unused[:, :, None]
+    line = np.linalg.eigvalsh(cosines)[:, 0] <= NEARLY_DEPENDENT
+    arm[line[own]] = blocks[line[own], :, 3:] = 0.0
+    unused[line, 3:] = True
+    coarse = np.zeros((n_coarse, MODES, MODES))
+    coarse[:, :3] = _motions((centre - x.mean(axis=0)) / _extent(x))
+    coarse[:, range(3, MODES), range(3, MODES)] = radius[:, None] / _extent(x)
+    coarse[unused] = 0.0
+    arms, matrix = np.zeros((len(x), 3)), np.zeros((len(x), 3, MODES))
+    arms[node], matrix[node] = arm, blocks
+    return arms, matrix, coarse, unused
 
 
 def aggregate_modes(modes: np.ndarray, aggregates: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

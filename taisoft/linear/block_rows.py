@@ -114,13 +114,24 @@ def block_row_times(B: ti.template(), i, x: ti.template()):
     return z
 
 
+@ti.func
+def _smooth(k: ti.template(), A: ti.template(), factor, x: ti.template(), y: ti.template()):
+    """y = x + factor S (r - A x), in a loop at the top level of a kernel."""
+    ti.loop_config(serialize=A.serial)
+    for i in range(A.n_rows):
+        d = k.r[i] - block_row_times(A, i, x)
+        y[i] = x[i] + ti.cast(factor, A.real) * plus_block(ti.Vector.zero(A.real, A.lanes), k.smoother[i], d, A.lanes, A.rows)
+
+
 @kernel
-def descend(k: ti.template()):
-    """x = S r, and the next level's r = P^T (r - A x)."""
+def descend(k: ti.template(), first: ti.f64, second: ti.f64):
+    """x = both steps of the smoother from 0, and the next level's r = P^T (r - A x)."""
     A, R = ti.static((k.matrix, k.restriction))
     ti.loop_config(serialize=A.serial)
     for i in range(A.n_rows):
-        k.x[i] = plus_block(ti.Vector.zero(A.real, A.lanes), k.smoother[i], k.r[i], A.lanes, A.rows)
+        z = plus_block(ti.Vector.zero(A.real, A.lanes), k.smoother[i], k.r[i], A.lanes, A.rows)
+        k.other[i] = ti.cast(first, A.real) * z
+    _smooth(k, A, second, k.other, k.x)
     ti.loop_config(serialize=A.serial)
     for i in range(A.n_rows):
         k.other[i] = k.r[i] - block_row_times(A, i, k.x)
@@ -130,13 +141,11 @@ def descend(k: ti.template()):
 
 
 @kernel
-def ascend(k: ti.template()):
-    """x += P (the next level's x), and other = x + S (r - A x)."""
+def ascend(k: ti.template(), first: ti.f64, second: ti.f64):
+    """other = x + P (the next level's x), then both steps in reverse order."""
     A, P = ti.static((k.matrix, k.prolongation))
     ti.loop_config(serialize=P.serial)
     for i in range(P.n_rows):
-        k.x[i] = k.x[i] + block_row_times(P, i, k.next_x)
-    ti.loop_config(serialize=A.serial)
-    for i in range(A.n_rows):
-        d = k.r[i] - block_row_times(A, i, k.x)
-        k.other[i] = plus_block(k.x[i], k.smoother[i], d, A.lanes, A.rows)
+        k.other[i] = k.x[i] + block_row_times(P, i, k.next_x)
+    _smooth(k, A, second, k.other, k.x)
+    _smooth(k, A, first, k.x, k.other)

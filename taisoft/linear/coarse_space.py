@@ -1,8 +1,8 @@
-"""Rigid motions of aggregates of nodes as a coarse space for `pcg_multigrid`: its matrices, formed from one on the device.
+"""Rigid motions of aggregates of nodes as a coarse space for `pcg_multigrid`: T, and T^T A T formed from a matrix on the device.
 
-With A = L + D + L^T, L the half-rows before the diagonal in the order of a Gauss-Seidel sweep, and T the rigid modes of the
-aggregates (`aggregation`), these are B = L T and T^T A T = T^T B + (T^T B)^T + T^T D T. They are summed in f64. Blocks E that
-sweeps leave out (`pcg_gauss_seidel`) belong to B, those before the diagonal and those after it.
+A row of T has the six motions of its node's aggregate (`aggregation`), of which only the arm is stored. With A = L + D + L^T, L
+the half-rows before the diagonal, T^T A T = T^T B + (T^T B)^T + T^T D T, B = L T. It is summed in f64, block by block of B, which
+is not stored either.
 """
 
 from dataclasses import dataclass
@@ -15,35 +15,21 @@ import taichi as ti
 from taisoft.backend.arrays import Count, FieldArena
 from taisoft.backend.runtime import kernel
 from taisoft.fem.model import Model
-from taisoft.linear.aggregation import MODES, aggregate_modes
+from taisoft.linear.aggregation import MODES, rigid_aggregates
 from taisoft.linear.block_csr import BlockCsr
-from taisoft.linear.block_rows import BlockRows, allocate_matrix
 from taisoft.mesh.aggregates import aggregate
 from taisoft.ranges import expand
 
 
-@dataclass(frozen=True)
-class CoarsePattern:
-    """Aggregates of a matrix's nodes, and the blocks of B, row by row."""
+@dataclass(frozen=True, eq=False)
+class CoarseSpace:
+    """T: each aggregate of nodes moves as a rigid body."""
 
-    aggregate: np.ndarray  # (n_nodes), -1 for constrained nodes
-    n_coarse: int
-    row: np.ndarray  # (n_blocks) node of each block
-    column: np.ndarray  # (n_blocks) aggregate of each block
-
-
-def find_pattern(m: Model, A: BlockCsr, start: np.ndarray, column: np.ndarray, free: np.ndarray) -> CoarsePattern:
-    """Aggregate the nodes with a free axis, of free (n_nodes, 3) bool. start (n_nodes + 1), column: A's rows with diagonals."""
-    own = aggregate(start, column, free.any(axis=1))
-    n_coarse, n = int(own.max()) + 1, m.n_nodes
-    first, last = A.row_start.host[:-1].copy(), A.row_start.host[1:]
-    first[n:] = last[n:] if A.apart_start is None else A.apart_start.host[n:]
-    half_row, entry = expand(first, last - first)
-    row, near = half_row % n, own[A.column.host[entry]]
-    used = (near >= 0) & (own[row] >= 0)
-    keys = np.sort(row[used] * np.int64(n_coarse) + near[used])
-    keys = keys[np.diff(keys, prepend=-1) > 0]
-    return CoarsePattern(own, n_coarse, keys // n_coarse, keys % n_coarse)
+    n_coarse: Count
+    aggregate: Any  # (n_nodes) i32, -1 for constrained nodes
+    arm: Any  # (n_nodes) 3-vectors, see `aggregation.rigid_aggregates`
+    start: Any  # (n_coarse + 1) i32: rows of node
+    node: Any  # i32: nodes of each aggregate
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,72 +37,61 @@ class GalerkinWork:
     """Arrays of `form_products`. A slot is a pair of aggregates that blocks of B couple."""
 
     n_slots: Count
-    n_coarse: Count
-    aggregate: Any  # (n_nodes) i32
     modes: Any  # (3 n_nodes) 6-vectors: rows of T
-    row: Any  # (n_blocks) i32: node of each block of B
-    column: Any  # (n_blocks) i32: aggregate
-    place: Any  # (n_blocks) i32: index of its transpose
-    slot_start: Any  # (n_slots + 1) i32: rows of slot_block
-    slot_block: Any  # (n_blocks) i32
-    node_start: Any  # (n_coarse + 1) i32: rows of node
-    node: Any  # i32: nodes of each aggregate
+    slot_start: Any  # (n_slots + 1) i32: rows of row
+    slot_column: Any  # (n_slots) i32: aggregate of the column
+    row: Any  # i32: node of each block of B, by slot
     lower: Any  # (n_slots) 36-vectors: T^T B
     diagonal: Any  # (n_coarse) 36-vectors: T^T D T
 
 
-@dataclass(frozen=True, eq=False)
-class CoarseSpace:
-    """B and B^T of one matrix."""
-
-    product: BlockRows
-    transposed: BlockRows
-
-
 def build_coarse_space(
-    m: Model, A: BlockCsr, pattern: CoarsePattern, modes: np.ndarray, arena: FieldArena
+    m: Model, A: BlockCsr, start: np.ndarray, column: np.ndarray, x: np.ndarray, free: np.ndarray, arena: FieldArena
 ) -> tuple[CoarseSpace, sp.bsr_matrix, np.ndarray]:
-    """Return B, T^T A T and the coarse modes (n_coarse, 6, 6). modes: (n_nodes, 3, 6) rigid modes, 0 on constrained axes."""
-    blocks, coarse_modes, unused = aggregate_modes(modes, pattern.aggregate)
-    n, n_coarse, row, column = m.n_nodes, pattern.n_coarse, pattern.row, pattern.column
-    by_column = np.argsort(column, kind="stable")
-    product = allocate_matrix(arena, "multigrid_product", m.real, (3, MODES), row, column, (n, n_coarse))
-    transposed = allocate_matrix(
-        arena, "multigrid_transposed", m.real, (MODES, 3), column[by_column], row[by_column], (n_coarse, n)
+    """Return T, T^T A T and the coarse modes (n_coarse, 6, 6).
+
+    start (n_nodes + 1), column: A's rows with diagonals; x: (n_nodes, 3) positions [m]; free: (n_nodes, 3) bool.
+    """
+    own = aggregate(start, column, free.any(axis=1))
+    arms, matrix, modes, unused = rigid_aggregates(x, free, own)
+    n, n_coarse = m.n_nodes, len(modes)
+    nodes = np.argsort(own, kind="stable")[np.count_nonzero(own < 0) :]
+    node_start = np.concatenate([[0], np.cumsum(np.bincount(own[nodes], minlength=n_coarse))])
+    space = CoarseSpace(
+        n_coarse=n_coarse,
+        aggregate=arena.field("multigrid_aggregate", ti.i32, n, own),
+        arm=arena.vectors("multigrid_arm", m.real, n, arms),
+        start=arena.field("multigrid_start", ti.i32, n_coarse + 1, node_start),
+        node=arena.field("multigrid_node", ti.i32, len(nodes), nodes),
     )
-    slot = pattern.aggregate[row] * np.int64(n_coarse) + column
-    by_slot = np.argsort(slot, kind="stable")
-    first = np.flatnonzero(np.diff(slot[by_slot], prepend=-1))
-    slots = slot[by_slot][first]
-    temporary = FieldArena()
-
-    def ints(name: str, data: np.ndarray):
-        return temporary.field(f"multigrid_{name}", ti.i32, len(data), data)
-
-    place = np.empty(len(row), dtype=np.int64)
-    place[by_column] = np.arange(len(row))
-    nodes = np.argsort(pattern.aggregate, kind="stable")
-    nodes = nodes[np.count_nonzero(pattern.aggregate < 0) :]
-    of_aggregate = np.bincount(pattern.aggregate[nodes], minlength=n_coarse)
+    slots, row = _slots(A, own, n_coarse)
+    first = np.flatnonzero(np.diff(slots, prepend=-1))
+    temporary, slots = FieldArena(), slots[first]
     work = GalerkinWork(
         n_slots=len(slots),
-        n_coarse=n_coarse,
-        aggregate=ints("aggregate", pattern.aggregate),
-        modes=temporary.vectors("multigrid_modes", ti.f64, 3 * n, blocks.reshape(-1, MODES), n=MODES),
-        row=ints("row", row),
-        column=ints("column", column),
-        place=ints("place", place),
-        slot_start=ints("slot_start", np.append(first, len(slot))),
-        slot_block=ints("slot_block", by_slot),
-        node_start=ints("node_start", np.concatenate([[0], np.cumsum(of_aggregate)])),
-        node=ints("node", nodes),
+        modes=temporary.vectors("multigrid_modes", ti.f64, 3 * n, matrix.reshape(-1, MODES), n=MODES),
+        slot_start=temporary.field("multigrid_slot_start", ti.i32, len(slots) + 1, np.append(first, len(row))),
+        slot_column=temporary.field("multigrid_slot_column", ti.i32, len(slots), slots % n_coarse),
+        row=temporary.field("multigrid_row", ti.i32, len(row), row),
         lower=temporary.vectors("multigrid_lower", ti.f64, len(slots), n=MODES**2),
         diagonal=temporary.vectors("multigrid_diagonal", ti.f64, n_coarse, n=MODES**2),
     )
-    form_products(m, A, work, product, transposed)
+    form_products(m, A, space, work)
     coarse = _coarse_matrix(work.lower.host, work.diagonal.host, slots, unused)
     temporary.release()
-    return CoarseSpace(product, transposed), coarse, coarse_modes
+    return space, coarse, modes
+
+
+def _slots(A: BlockCsr, own: np.ndarray, n_coarse: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return slot (ascending) and row of each block of B. own: (n_nodes) aggregates."""
+    n, start = len(own), A.row_start.host[: len(own) + 1]
+    row, entry = expand(start[:-1], np.diff(start))
+    near = own[A.column.host[entry]]
+    used = (near >= 0) & (own[row] >= 0)
+    row, near = row[used], near[used]
+    keys = np.sort((own[row] * np.int64(n_coarse) + near) * n + row)
+    keys = keys[np.diff(keys, prepend=-1) > 0]
+    return keys // n, keys % n
 
 
 def _coarse_matrix(lower: np.ndarray, diagonal: np.ndarray, slots: np.ndarray, unused: np.ndarray) -> sp.bsr_matrix:
@@ -163,34 +138,24 @@ def _add_product(s, b, T: ti.template(), i):
 
 
 @kernel
-def form_products(m: ti.template(), A: ti.template(), g: ti.template(), B: ti.template(), Bt: ti.template()):
-    """Set the blocks of B and B^T, T^T B and T^T D T."""
+def form_products(m: ti.template(), A: ti.template(), t: ti.template(), g: ti.template()):
+    """Set T^T B and T^T D T."""
     ti.loop_config(serialize=m.serial)
     for slot in range(g.n_slots):
         s = ti.Vector([0.0 for _ in ti.static(range(MODES * MODES))], ti.f64)
         for at in range(g.slot_start[slot], g.slot_start[slot + 1]):
-            k = g.slot_block[at]
-            i, b = g.row[k], ti.Vector([0.0 for _ in ti.static(range(3 * MODES))], ti.f64)
+            i, b = g.row[at], ti.Vector([0.0 for _ in ti.static(range(3 * MODES))], ti.f64)
             for entry in range(A.row_start[i], A.row_start[i + 1]):
                 j = A.column[entry]
-                if g.aggregate[j] == g.column[k]:
+                if t.aggregate[j] == g.slot_column[slot]:
                     b = _add_block(b, A.value[entry], g.modes, j)
             s = _add_product(s, b, g.modes, i)
-            if ti.static(A.crossed):
-                for entry in range(A.apart_start[i + m.n_nodes], A.row_start[i + m.n_nodes + 1]):
-                    j = A.column[entry]
-                    if g.aggregate[j] == g.column[k]:
-                        b = _add_block(b, A.value[entry], g.modes, j)
-            for r in ti.static(range(3)):
-                for a in ti.static(range(MODES)):
-                    B.value[k][B.lanes * a + r] = ti.cast(b[MODES * r + a], m.real)
-                    Bt.value[g.place[k]][Bt.lanes * r + a] = ti.cast(b[MODES * r + a], m.real)
         g.lower[slot] = s
     ti.loop_config(serialize=m.serial)
-    for c in range(g.n_coarse):
+    for c in range(t.n_coarse):
         s = ti.Vector([0.0 for _ in ti.static(range(MODES * MODES))], ti.f64)
-        for at in range(g.node_start[c], g.node_start[c + 1]):
-            i = g.node[at]
+        for at in range(t.start[c], t.start[c + 1]):
+            i = t.node[at]
             b = _add_block(ti.Vector([0.0 for _ in ti.static(range(3 * MODES))], ti.f64), A.diagonal[i], g.modes, i)
             s = _add_product(s, b, g.modes, i)
         g.diagonal[c] = s
