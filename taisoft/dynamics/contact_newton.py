@@ -4,7 +4,8 @@ The problem on the fixed matrix needs no elements: `Newton` solves it inexactly 
 impulses. Its displacement is a direction for the nonlinear stage. A full step is accepted if |r| falls enough; else a line
 search uses the slope of the augmented Lagrangian with the new impulses as multipliers. An indefinite matrix is replaced by a
 projected one. If that makes no progress, a few steps minimise the nonlinear stage under multipliers instead. If a slow step
-leaves a residual on few nodes, these are solved separately first (`elimination`). A stage without progress ends early: a shorter substep costs less.
+leaves a residual on few nodes, these are solved separately first (`elimination`).
+A stage without progress ends early: a shorter substep costs less.
 """
 
 import math
