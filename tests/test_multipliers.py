@@ -168,7 +168,7 @@ def test_an_extrapolation_whose_second_term_is_too_long_is_rejected(rig):
 
 
 @pytest.mark.parametrize(
-    "scale, residual, before, n_steps, frictionless, expected",
+    "scale, residual, before, n_steps, frictionless, expected",  # the laws hold below a residual of 0.1
     [
         (8.0, 1.3, 1.0, 1, 0, 4.0),  # increased: softer,
         (4.0, 1.3, 1.0, 1, 0, 8.0),  # but not below STEADY
@@ -182,7 +182,10 @@ def test_an_extrapolation_whose_second_term_is_too_long_is_rejected(rig):
         (8.0, 0.9, 1.0, 3, 1, 16.0),  # after some steps, too,
         (8.0, 0.9, 1.0, 5, 1, 4.0),  # but softer after many
         (MAX_R_FRICTIONLESS, 0.9, 1.0, 1, 1, MAX_R_FRICTIONLESS),
+        (8.0, 0.09, 0.1, 1, 1, 2.0),  # and softer once the laws hold,
+        (2.0, 0.09, 0.1, 1, 1, 1.0),  # down to the first value,
+        (8.0, 0.09, 0.1, 1, 0, 16.0),  # which does not concern friction
     ],
 )
 def test_the_scale_of_r_follows_the_residual_of_the_contact_laws(scale, residual, before, n_steps, frictionless, expected):
-    assert next_scale(scale, residual, before, n_steps, frictionless) == expected
+    assert next_scale(scale, residual, before, n_steps, frictionless, MAX_R_FRICTIONLESS, 0.1) == expected

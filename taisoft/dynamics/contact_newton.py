@@ -5,6 +5,7 @@ impulses. Its displacement is a direction for the nonlinear stage. A full step i
 search uses the slope of the augmented Lagrangian with the new impulses as multipliers. An indefinite matrix is replaced by a
 projected one. If that makes no progress, a few steps minimise the nonlinear stage under multipliers instead. If a slow step
 leaves a residual on few nodes, these are solved separately first (`elimination`).
+A stage without progress ends early: a shorter substep costs less.
 """
 
 import math
@@ -14,7 +15,21 @@ import numpy as np
 
 from taisoft.backend.launching import PUBLIC
 from taisoft.dynamics.elimination import eliminate
-from taisoft.dynamics.frictional import INDEFINITE, LINEAR, MAX_MULTIPLIERS, MULTIPLIERS, NORM, ROUNDING, SOLVED, STATUS
+from taisoft.dynamics.frictional import (
+    INDEFINITE,
+    LINEAR,
+    MAX_MULTIPLIERS,
+    MAX_R_FRICTIONLESS,
+    MAX_R_STALLED,
+    MULTIPLIERS,
+    NORM,
+    R_SCALE,
+    R_STALLED,
+    ROUNDING,
+    SCALE,
+    SOLVED,
+    STATUS,
+)
 from taisoft.dynamics.frictional import SOLVES as SOLVES_DONE
 from taisoft.dynamics.newton import DECREASE, ELIMINATION_RATIO, Newton, choose_start, search
 from taisoft.dynamics.results import StageResult, relative
@@ -30,6 +45,7 @@ LAW_BALANCE = 0.03  # laws' residual over the required relative |r|; the next ma
 MULTIPLIER_FRACTION = 0.3  # of the required |r|, ends the steps under one multiplier: updates at a large |r| overshoot
 LINEARISED_SOLVES, LINEARISED_FORCING = 400, 0.1  # maximum linear solves of a linearised stage, and their tolerance
 STALLED, STALLED_SOLVES = 0.9, 3  # fraction of |r| left by a stalling step; factor on SOLVES after that
+MAX_SLOW = 6  # Newton iterations in a row that do not lower the smallest |r|; stages that converge have 3 at most, rarely 5
 FALLBACK_STEPS = 6  # steps on the nonlinear stage
 DIRECT_FRACTION = 0.3  # of the tolerances: to what direct solves reduce the laws' residual, which |r| contains
 NEAR_FLOOR = 4.0  # times the floor of |r|: below it, |r| may be mostly rigid motion
@@ -45,6 +61,7 @@ class FrictionalResult:
     negative: bool
     converged: bool
     r: float
+    r_scale: float = R_SCALE  # R over the r-factors at its end
     direct: bool = False
 
 
@@ -58,13 +75,18 @@ def solve_linear(system: StageSystem, problem: Stage, r: float, scale: float) ->
     if found is not None:
         iterations, converged, r = found
         return FrictionalResult(1, 0, iterations, False, converged, r, direct=True)
+    if problem.first_r_scale != system.r_scale:
+        r = system.set_r_scale(problem.first_r_scale)
     if system.shares_solves or PUBLIC:  # public Taichi takes no more than 64 arguments
         newton = Newton(system, problem)
         result = newton.run(r, scale, fresh=True)
-        return FrictionalResult(newton.newton, newton.linear, newton.multipliers, newton.negative, result.converged, newton.r)
+        counts = newton.newton, newton.linear, newton.multipliers
+        return FrictionalResult(*counts, newton.negative, result.converged, newton.r, newton.r_scale)
     loop = system.solve_frictional(problem, r, system.rounding.stage_floor(problem.c, problem.beta))
+    system.r_scale = R_SCALE
     counts = (int(loop[place]) for place in (SOLVES_DONE, LINEAR, MULTIPLIERS))
-    return FrictionalResult(*counts, loop[STATUS] == INDEFINITE, loop[STATUS] == SOLVED, float(loop[NORM]))
+    ended = loop[STATUS] == INDEFINITE, loop[STATUS] == SOLVED
+    return FrictionalResult(*counts, *ended, float(loop[NORM]), float(loop[SCALE]))
 
 
 class ContactNewton:
@@ -77,6 +99,7 @@ class ContactNewton:
         self.eliminated = 0.0  # Newton iterations on few nodes, times their fraction of all nodes
         self.rounding = self.tight = self.stalls = False
         self.has_direction = False  # y is a good first direction on the current matrix
+        self.first_r_scale, self.max_r_scale = R_SCALE, MAX_R_FRICTIONLESS  # of the next contact problem
 
     def run(self) -> StageResult:
         """Solve from the first iterate, where the matrix has been formed."""
@@ -85,7 +108,7 @@ class ContactNewton:
         if self.has_direction:  # the matrix of the first iterate is invalid
             system.form_matrix_and_factors()
             self.r, self.scale = system.evaluate(None)
-        lowest, stalled = self.r, 0
+        lowest, stalled, n_slow = self.r, 0, 0
         while not self._has_converged() and self.newton < stage.max_newton and math.isfinite(self.r):
             if self.newton > 0:
                 system.form_matrix()
@@ -111,9 +134,10 @@ class ContactNewton:
             self.stalls = stalled >= 2
             if moved and self.r > ELIMINATION_RATIO * previous and not self._has_converged():
                 self._eliminate()
+            n_slow = 0 if self._is_balanced or self.r < DECREASE * lowest else n_slow + 1
             lowest = min(lowest, self.r)
             self.rounding = self.r <= ROUNDING * self.floor and self.r > 0.5 * previous and self.tight
-            if not moved:
+            if not moved or n_slow >= MAX_SLOW:
                 break
         return StageResult(
             self.newton + round(self.eliminated),
@@ -166,7 +190,7 @@ class ContactNewton:
 
     def _solve_on_matrix(self) -> "FrictionalResult":
         """Solve the contact problem on the current matrix, to a fraction of the stage's residuals."""
-        system, stage = self.system, self.stage
+        system, stage, laws_stalled = self.system, self.stage, self.first_r_scale > R_SCALE
         system.linearise()
         target = max(REDUCTION * self.r, TOLERANCE_FRACTION * stage.tolerance * self.scale)
         tolerance = target / self.scale if self.scale > 0.0 else 0.0
@@ -181,14 +205,24 @@ class ContactNewton:
             tolerance=tolerance,
             contact_tolerance=max(LAW_REDUCTION * system.contact_residual, law_tolerance),
             multiplier_tolerance=0.0 if self.tight else MULTIPLIER_FRACTION * tolerance,
-            extrapolate_after=MAX_MULTIPLIERS if self.stalls else 0 if self.tight else stage.extrapolate_after,
+            extrapolate_after=MAX_MULTIPLIERS if self.stalls or laws_stalled else 0 if self.tight else stage.extrapolate_after,
             max_newton=STALLED_SOLVES * SOLVES if self.stalls else SOLVES,
             linear_tolerance=stage.linear_tolerance or (min(stage.tolerance, FORCING) if self.tight else FORCING),
             later_tolerance=0.0 if stage.linear_tolerance else LATER_FORCING,
+            first_r_scale=self.first_r_scale,
+            max_r_scale=self.max_r_scale,
         )
         result = solve_linear(system, problem, self._first_residual(), self.scale)
         self.linear, self.multipliers = self.linear + result.linear, self.multipliers + result.multipliers
+        if system.frictionless and not (result.negative or result.direct):
+            self._choose_r_scale(result, result.converged or system.contact_residual <= problem.contact_tolerance)
         return result
+
+    def _choose_r_scale(self, result: FrictionalResult, laws_hold: bool) -> None:
+        """Choose the first R of the next contact problem without friction. laws_hold: whether the laws held in the last one."""
+        self.first_r_scale = R_SCALE if laws_hold else max(R_STALLED, result.r_scale)
+        if not laws_hold:
+            self.max_r_scale = MAX_R_STALLED
 
     def _first_residual(self) -> float:
         """Return |r| at the start of a solve, of the stage just linearised."""

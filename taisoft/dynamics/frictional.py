@@ -10,7 +10,9 @@ its normal part: a fixed-point iteration lambda -> p. R stays while the laws' re
 multiplier that took one step, and halved after one that took many, or if that residual rose: with a large R each multiplier
 nearly solves the problem with frozen disks, and that iteration need not converge. Without friction there are no disks, and a
 large R only makes linear solves harder: R then doubles after a few steps, too, and up to MAX_R_FRICTIONLESS. Contacts on both
-sides of a fold around a spike need this: their impulses must grow far before the fold opens.
+sides of a fold around a spike need this: their impulses must grow far before the fold opens. Several such contacts at one node
+depend on each other but for a part in 1e7. The next problem of a stage therefore begins where the last one left the laws open.
+Once they hold, R falls.
 Source: Alart and Curnier 1991 for the laws as a prox; the loop is that of the method of multipliers.
 
 Most problems, and the impacts before a step, need few multipliers. If disks and normal impulses keep changing each other
@@ -34,6 +36,8 @@ from taisoft.linear.pcg_work import RUNNING as PCG_RUNNING
 
 R_SCALE, MIN_R_SCALE, MAX_R_SCALE, MANY_STEPS = 1.0, 0.3, 100.0, 5  # R over the r-factors: start, bounds; steps that halve it
 MAX_R_FRICTIONLESS = 1000.0  # the upper bound without friction
+R_STALLED, MAX_R_STALLED = 1000.0, 1e5  # smallest first value and upper bound without friction, where the laws stalled before
+EASED = 0.25  # factor on R without friction once the laws hold, so that the linear solves become easier
 LAW_INCREASE, STEADY = 1.2, 4.0  # times the previous laws' residual: above it R is halved, if larger than STEADY
 LAW_DECREASE = 0.8  # times the previous laws' residual: below it R stays
 MAX_MULTIPLIERS = 200
@@ -45,19 +49,21 @@ PARALLEL = 1e-12  # squared sine between two changes below which the older one i
 
 
 @ti.pyfunc
-def next_scale(scale, law, before, n_steps, frictionless):
+def next_scale(scale, law, before, n_steps, frictionless, max_r, law_tolerance):
     """Return R over the r-factors for new multipliers.
 
     law, before: residual of the laws now and at the last update; n_steps: steps since. A rising residual means that friction
     disks and normal impulses increase each other. frictionless: 1 if there are no disks, so that a large R only makes the linear
-    solves harder.
+    solves harder; max_r, law_tolerance: then the upper bound of R, and the residual below which the laws hold.
     """
     new = scale
-    if frictionless == 0 and law > LAW_INCREASE * before and scale > STEADY:
+    if frictionless == 1 and law <= law_tolerance:
+        new = ti.max(R_SCALE, EASED * scale)
+    elif frictionless == 0 and law > LAW_INCREASE * before and scale > STEADY:
         new = 0.5 * scale
     elif law > LAW_DECREASE * before:
         if n_steps <= 1 or (frictionless == 1 and n_steps < MANY_STEPS):
-            new = ti.min(MAX_R_FRICTIONLESS if frictionless == 1 else MAX_R_SCALE, 2.0 * scale)
+            new = ti.min(max_r if frictionless == 1 else MAX_R_SCALE, 2.0 * scale)
         elif n_steps >= MANY_STEPS:
             new = ti.max(MIN_R_SCALE, 0.5 * scale)
     return new
@@ -142,7 +148,7 @@ PROGRESS = 0.3  # fraction of |r| after a multiplier update to which the inner s
 RUNNING, SOLVED, FAILED, INDEFINITE = range(4)
 # indices into `limits`: |r| [N s] that ends the loop, that ends the steps under one multiplier, rounding floor; laws' residual
 # that ends the loop, tolerance of linear solves; maximum linear solves, CG iterations per solve and per launch; multipliers
-# before extrapolation; minimum tolerance of later solves; 1 if no contact has friction
+# before extrapolation; minimum tolerance of later solves; 1 if no contact has friction, upper bound of R then
 (
     TARGET,
     INNER_TOLERANCE,
@@ -155,7 +161,8 @@ RUNNING, SOLVED, FAILED, INDEFINITE = range(4)
     EXTRAPOLATE_AFTER,
     LATER_TOLERANCE,
     FRICTIONLESS,
-) = range(11)
+    MAX_R,
+) = range(12)
 
 
 @ti.func
@@ -196,7 +203,7 @@ def solve_frictional(
     limits: ti.types.ndarray(),
     loop: ti.types.ndarray(),
 ):
-    """Continue from the state in `loop` (15,); limits (11,)."""
+    """Continue from the state in `loop` (15,); limits (12,)."""
     (p,) = ti.static((k.problem,))
     ti.loop_config(serialize=True)
     for _ in range(1):
@@ -219,7 +226,8 @@ def solve_frictional(
                         extrapolate(k, ti.cast(loop[REMEMBERED], ti.i32))
                         scale, loop[REMEMBERED] = R_EXTRAPOLATED, ti.min(loop[REMEMBERED] + 1.0, PAST)
                     else:
-                        scale = next_scale(scale, law, previous_law, n_steps, ti.cast(limits[FRICTIONLESS], ti.i32))
+                        frictionless = ti.cast(limits[FRICTIONLESS], ti.i32)
+                        scale = next_scale(scale, law, previous_law, n_steps, frictionless, limits[MAX_R], limits[LAW_TOLERANCE])
                         for c in range(p.count[0]):
                             set_multiplier(k, c)
                     previous_law = law

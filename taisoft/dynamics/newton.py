@@ -76,7 +76,7 @@ class Newton:
             if not math.isfinite(self.r) or not (moved or n_uses > 1) or (self.is_linearised and self.negative):
                 break
             fresh = moved and not self._eliminate()
-        system.r_scale = R_SCALE  # initial value of the next solve
+        self.r_scale, system.r_scale = system.r_scale, R_SCALE  # initial value of the next solve
         return self._result(self._inner_done() and self._has_converged())
 
     def _begin_multiplier(self) -> None:
@@ -120,7 +120,8 @@ class Newton:
             system.extrapolate_multipliers(self.n_remembered)
             system.r_scale, self.n_remembered = R_EXTRAPOLATED, min(self.n_remembered + 1, PAST)
         else:
-            system.r_scale = next_scale(system.r_scale, law, self.law_residual, self.n_inner, int(system.frictionless))
+            bounds = self.stage.max_r_scale, self.stage.contact_tolerance
+            system.r_scale = next_scale(system.r_scale, law, self.law_residual, self.n_inner, int(system.frictionless), *bounds)
         self.law_residual, self.multipliers, self.rounding = law, self.multipliers + 1, False
         self.r, self.scale = system.evaluate(None, new_multipliers=not extrapolating)
         self._begin_multiplier()

@@ -83,6 +83,8 @@ class Stage:
     keeps_multipliers: bool = False  # do not update the multipliers
     extrapolate_after: int = frictional.EXTRAPOLATION_START  # multiplier updates
     later_tolerance: float = 0.0  # lower bound on linear_tolerance after the first solve
+    first_r_scale: float = frictional.R_SCALE  # R over the r-factors of a contact problem at its start,
+    max_r_scale: float = frictional.MAX_R_FRICTIONLESS  # and its upper bound without friction
 
     @property
     def inner_tolerance(self) -> float:
@@ -345,12 +347,17 @@ class StageSystem:
         """Whether the slope along y has a zero: it need not if the matrix is indefinite."""
         return self.model.state.scalars[STEP_LENGTH] < LONGEST
 
+    def set_r_scale(self, r_scale: float) -> float:
+        """Set R over the r-factors; return |r|."""
+        self.r_scale = r_scale
+        return self.evaluate(None)[0]
+
     def solve_frictional(self, problem: Stage, r: float, floor: float) -> np.ndarray:
         """Run the loop of a linearised stage from |r|, in launches that Ctrl-C can interrupt between: see `frictional`."""
-        m, A, loop, limits = self.model, self.matrix, np.zeros(15), np.zeros(11)
+        m, A, loop, limits = self.model, self.matrix, np.zeros(15), np.zeros(12)
         loop[[frictional.NORM, frictional.SCALE, frictional.LAW_RESIDUAL, frictional.INNER_TARGET, frictional.SAME_MATRIX]] = (
             r,
-            frictional.R_SCALE,
+            problem.first_r_scale,
             math.inf,
             frictional.PROGRESS * r,
             self._same_matrix,
@@ -368,6 +375,7 @@ class StageSystem:
             problem.extrapolate_after,
             problem.later_tolerance,
             self.frictionless,
+            problem.max_r_scale,
         )
         while loop[frictional.STATUS] == frictional.RUNNING:
             frictional.solve_frictional(m, self.work, A, self._k, problem.beta, limits, loop)
