@@ -17,8 +17,9 @@ import taisoft as ts
 from taisoft.backend.arrays import FieldArena
 from taisoft.backend.runtime import open_runtime
 from taisoft.cli.files import describe
-from taisoft.dynamics import implicit
+from taisoft.dynamics import implicit, newton
 from taisoft.dynamics.simulation_state import SimulationState
+from taisoft.dynamics.stage_system import StageSystem
 from taisoft.errors import SceneError, SimulationError
 from taisoft.fem.pressure import CavityForm
 from taisoft.scene.fingerprint import scene_digest
@@ -214,6 +215,31 @@ def test_slopes_of_pressures_are_not_kept(monkeypatch):
     finally:
         arena.release()
         runtime.close()
+
+
+def test_nearly_incompressible_bodies_keep_volumes(monkeypatch):
+    """With mean dilatation steps are curved; where they are rejected, straight ones have the same slopes as without."""
+
+    def run(curved) -> tuple[list, np.ndarray]:
+        monkeypatch.setattr(StageSystem, "step_with_volumes", curved)
+        scene, slopes = ts.Scene(gravity=(0.0, 0.0, 0.0)), []
+        body = scene.add_body(MESH, rubber(poisson=0.4999), name="ball", dilatation="mean")
+        hold_planes(body)
+        body.add_cavity(inside(MESH, 1.0), volume=lambda t: BALL * (1 + 2 * t), name="water")
+        with ts.Simulator(scene, dt=1 / 30, precision="f64") as sim:
+            for _ in range(3):
+                with monkeypatch.context() as patch:
+                    patch.setattr(newton, "search", lambda system, r: (search(system, r), slopes.append(system.slopes[0]))[0])
+                    assert sim.step().converged
+                assert sim.cavity_volume("water") == pytest.approx(BALL * (1 + 2 * sim.time), rel=KEPT)
+            return slopes, sim.positions()
+
+    search, plain, tried = newton.search, StageSystem.step_with_volumes, []
+    x = run(plain)[1]
+    rejected, x_rejected = run(lambda system, _: tried.append(plain(system, 0.0)))
+    slopes, x_straight = run(lambda system, _: None)
+    assert len(tried) == len(slopes) and rejected == pytest.approx(slopes, rel=1e-6) and rejected[0] < 0.0
+    assert np.abs(x_rejected - x_straight).max() < 1e-7 and np.abs(x - x_straight).max() < 1e-6
 
 
 def test_two_cavities():

@@ -21,6 +21,7 @@ from scenes import COR, SNH, SVK, cube, dynamics, halved, rubber, set_state
 
 import taisoft as ts
 from taisoft.backend import runtime
+from taisoft.dynamics import linear_solver
 from taisoft.dynamics.schemes import EXPLICIT
 from taisoft.errors import SimulationError
 from taisoft.fem.node_graph import EVERYTHING
@@ -428,6 +429,30 @@ def test_resumed_runs_without_contacts_have_the_same_bits(tmp_path):
     with ts.Simulator.load_checkpoint(tmp_path / "a.npz", make()) as sim:
         for _ in range(3):
             sim.step()
+        assert np.array_equal(sim.positions(), end)
+
+
+def test_resumed_runs_with_a_hierarchy_have_the_same_bits(tmp_path, monkeypatch):
+    """A hierarchy built at an earlier state leaves dilatations and gradients as they were."""
+
+    def make() -> ts.Scene:
+        scene = ts.Scene()
+        body = scene.add_body(ts.box_mesh((24, 2, 2), (12, 0.5, 0.5)), rubber(poisson=0.4999), dilatation="mean")
+        body.fix(lambda X: X[:, 0] < -5.9)
+        return scene
+
+    for name, value in (("BUILD", 50), ("LOADING", 0), ("RATIO", 0.1), ("OVERHEAD", 0)):  # multigrid always pays
+        monkeypatch.setattr(linear_solver, name, dict.fromkeys(getattr(linear_solver, name), value))
+    monkeypatch.setattr(linear_solver, "ITERATIONS", 0)
+    with ts.Simulator(make(), dt=1 / 30, precision="f64") as sim:
+        for _ in range(8):
+            report = sim.step()
+        assert report.converged and report.multigrid_solves > 0
+        sim.save_checkpoint(tmp_path / "a.npz")
+        counts = [sim.step().linear_iterations for _ in range(3)]
+        end = sim.positions()
+    with ts.Simulator.load_checkpoint(tmp_path / "a.npz", make()) as sim:
+        assert [sim.step().linear_iterations for _ in range(3)] == counts
         assert np.array_equal(sim.positions(), end)
 
 

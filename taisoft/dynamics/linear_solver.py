@@ -211,7 +211,8 @@ class LinearSolver:
     def _build(self, system: "StageSystem", c: float, beta: float, x: np.ndarray, free: np.ndarray) -> None:
         """Build the hierarchy from the projected matrix at positions x."""
         m, A = self.model, system.matrix
-        present = [(array, array.to_numpy()) for array in (m.state.x, A.value, A.diagonal)]
+        changed = [m.state.x, A.value, A.diagonal] + ([m.mean.dilatation, A.patches.gradient] if m.mean_dilatation else [])
+        present = [(array, array.to_numpy()) for array in changed]
         m.state.x.from_numpy(x)
         system.form(EVERYTHING, True, c, beta)
         try:

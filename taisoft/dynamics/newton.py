@@ -14,7 +14,7 @@ of rounding size, so the stage ends as converged and reports its actual residual
 
 The line search goes by the slope of the merit function along a step, since opening and closing contacts, and tets that invert,
 can increase |r| in one step and decrease it in the next. A step that ends on a steep rise is shortened by secants, one that ends
-on a steep descent is doubled.
+on a steep descent is doubled. Nearly incompressible bodies with mean dilatation first try a curved step (`step_with_volumes`).
 """
 
 import math
@@ -239,7 +239,10 @@ def choose_start(system: StageSystem, r: float, scale: float) -> tuple[float, fl
 
 
 def search(system: StageSystem, acceptable: float) -> tuple[float, float, bool]:
-    """Search the step length; return (|r|, scale, success). acceptable: |r| below which the slope is not checked."""
+    """Search the step length; return (|r|, scale, success). acceptable: |r| below which the slope is not checked.
+
+    The straight step is searched if there is no curved one, or if that leaves more than `acceptable`.
+    """
     if (found := system.step_with_volumes(acceptable)) is not None:
         return *found, True
     r, scale = system.evaluate(STEP)

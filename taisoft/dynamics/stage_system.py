@@ -234,6 +234,8 @@ class StageSystem:
         if volumes is not None:
             self.restrict(None)
             self.stage = stage
+            if self.multipliers is not None:
+                self.multipliers.measure()
             self.form_matrix()
             self.linear_solver.prepare(self)
             volume_pcg.save_volumes(m, volumes)
@@ -245,8 +247,8 @@ class StageSystem:
 
     @property
     def keeps_volumes(self) -> bool:
-        """Whether steps go by `step_with_volumes`."""
-        return self._volumes is not None
+        """Whether steps go by `step_with_volumes`: not those on a few nodes."""
+        return self._volumes is not None and not self.work.pcg.subset.restricted
 
     def begin_impact(self, stage: Stage) -> StageContacts:
         """Begin the impact before a step, and form the matrix."""
@@ -284,20 +286,22 @@ class StageSystem:
         return self._norm_and_scale(stage.c, stage.beta)
 
     def step_with_volumes(self, acceptable: float) -> tuple[float, float] | None:
-        """Step along y on a curve that keeps the volumes of nearly incompressible bodies to second order.
+        """Step along y on a curve to the volumes of nearly incompressible bodies that y leads to in first order.
 
         A straight step that rotates tets changes their volumes, and so |r|, by its square times lambda. Return (|r|, scale) if
         |r| is below `acceptable`; otherwise None, at the state before.
         """
-        m, w, volumes = self.model, self.work, self._volumes
-        if volumes is None or w.pcg.subset.restricted:
+        m, w = self.model, self.work
+        if not self.keeps_volumes:
             return None
         self.linear_solver.prepare(self)  # multigrid may have solved
-        volume_pcg.step_with_volumes(m, self.matrix, volumes, w.base, w.pcg.y, w.x_hat, self.stage.beta)
+        volume_pcg.step_with_volumes(m, self.matrix, self._volumes, w.base, w.pcg.y, w.x_hat, self.stage.beta)
         found = self.evaluate(STAY)
         if found[0] < acceptable:
             return found
         self.evaluate(AGAIN, 0.0)
+        if self.multipliers is not None:
+            self.multipliers.slope_change = 0.0  # the residual has the changed multipliers now
         return None
 
     def extrapolate_multipliers(self, n_remembered: int) -> None:

@@ -110,8 +110,8 @@ class Ladder:
         self.error = self._expected_error(pilot, excursion) if excursion else 0.0
 
     @property
-    def is_damped(self) -> bool:
-        """Whether motion is smooth, but of first order: its velocities themselves are wrong."""
+    def is_of_first_order(self) -> bool:
+        """Whether motion is smooth, but of first order, as with damping: its velocities themselves are wrong."""
         return self.nominal == 1 and not self.sudden
 
     def confirm(self, hardest: Pilot, fastest: Pilot | None = None) -> None:
@@ -131,7 +131,7 @@ class Ladder:
                 shown = max(of_changes, self._shown(pilot, fastest, 1) * pilot.parts[FASTEST].times)
             else:
                 times = 1.0 if self.sudden else pilot.parts[HARDEST].times
-                times = self.frames.count / self.frames.part if self.is_damped else times
+                times = self.frames.count / self.frames.part if self.is_of_first_order else times
                 shown = self._shown(pilot, hardest, self.nominal) * times
             self.error = max(self._expected_error(pilot, excursion), shown / excursion)
 
@@ -205,7 +205,7 @@ class Ladder:
         return self.tried >= MAX_PILOTS or self.diverges
 
     def steps_over_last(self, tolerance: float) -> float:
-        """Steps that a tolerance needs over those of the only pilot, explicit, from its error."""
+        """Steps that a tolerance needs over those of the last pilot, from its error, at the nominal order."""
         return 1.0 if self.error is None else (self.error / (SAFETY * tolerance)) ** (1.0 / self.nominal)
 
     def second_steps(self, least: int, ratio: float) -> tuple[Fraction, bool]:

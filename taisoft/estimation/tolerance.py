@@ -180,7 +180,8 @@ class Chooser:
 
     def _is_worth(self, explicit: float, cost: float) -> bool:
         """Whether explicit steps, at a cost of `explicit` [us] a frame, and their pilots are worth it where implicit ones cannot
-        meet the tolerance: they are at most DEARER than these, of `cost` [us] each, would be without vibrations."""
+        meet the tolerance: at most DEARER than the cheapest of these, one a frame, and with their pilots at most DEARER than
+        these, of `cost` [us] each, would be without vibrations."""
         if explicit > DEARER * implicit_step(self._sim.scene, self._sim.touches):
             return False
         steps = max(1.0, float(self.ladder.pilots[-1].per_frame) * self.ladder.steps_over_last(self._tolerance))
@@ -194,7 +195,7 @@ class Chooser:
         """Explicit steps in the time of a frame."""
         self._use(EXPLICIT, self._dt(least))
         ladder, ratio = self.ladder, 1.0
-        pilot = self._pilot(Fraction(least), keeps=(HARDEST, FASTEST) if ladder.is_damped else (HARDEST,))
+        pilot = self._pilot(Fraction(least), keeps=(HARDEST, FASTEST) if ladder.is_of_first_order else (HARDEST,))
         ladder.add(pilot)
         if ladder.pilots:
             ladder.expect()
@@ -217,7 +218,7 @@ class Chooser:
         ladder, steps = self.ladder, slightly_more(int(pilot.per_frame))
         hardest = self._pilot(steps, part=pilot.parts[HARDEST])
         ladder.confirm(hardest)
-        if ladder.is_damped and not ladder.meets(self._tolerance):
+        if ladder.is_of_first_order and ladder.error is not None and not ladder.meets(self._tolerance):
             ladder.confirm(hardest, self._pilot(steps, part=pilot.parts[FASTEST]))
         return ladder.meets(self._tolerance)
 

@@ -1,7 +1,7 @@
 """Rigid-body modes, and the prolongation that makes each aggregate of nodes a rigid body.
 
-Aggregates are those of `mesh.aggregates`. A coarse node has six unknowns, the coefficients of an orthonormal basis of its
-aggregate's rigid-body modes.
+Aggregates are those of `mesh.aggregates`. A coarse node has six unknowns: translation and rotation of its aggregate of mesh nodes
+about their mean, or the coefficients of an orthonormal basis of the rigid-body modes of its aggregate of coarse nodes.
 Source: Vanek, Mandel and Brezina, "Algebraic multigrid by smoothed aggregation for second and fourth order elliptic problems",
 Computing 56, 1996.
 Weakness: aggregates follow the mesh's edges, not the strength of their coupling, so flat elements are coarsened in every
@@ -64,8 +64,9 @@ def rigid_aggregates(
     inverse = 1.0 / np.where(unused, 1.0, length)
     cosines = gram * inverse[:, :, None] * inverse[:, None, :] + np.eye(MODES) * unused[:, :, None]
     line = np.linalg.eigvalsh(cosines)[:, 0] <= NEARLY_DEPENDENT
-    arm[line[own]] = blocks[line[own], :, 3:] = 0.0
     unused[line, 3:] = True
+    arm[line[own]] = 0.0
+    blocks[np.broadcast_to(unused[own][:, None, :], blocks.shape)] = 0.0
     coarse = np.zeros((n_coarse, MODES, MODES))
     coarse[:, :3] = _motions((centre - x.mean(axis=0)) / _extent(x))
     coarse[:, range(3, MODES), range(3, MODES)] = radius[:, None] / _extent(x)

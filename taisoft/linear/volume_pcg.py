@@ -57,7 +57,7 @@ class VolumeSystem:
     row: Any  # i32: row of S of each patch of each node
     column: Any  # 3-vectors: D^-1 G^T for that node and patch
     factor: Any  # (n_patches * width) f64: the band by columns, of S and then of its Cholesky factor
-    target: Any  # (n_patches) f64: dilatation of each patch at the start of a step
+    target: Any  # (n_patches) f64: dilatation of each patch that a correction leads to
     rhs: Any  # (n_patches) f64: right-hand side, then the solution
 
 
