@@ -14,7 +14,6 @@ import taichi as ti
 from taisoft.backend import parallel
 from taisoft.backend.arrays import Count, FieldArena
 from taisoft.backend.runtime import kernel
-from taisoft.ranges import owners
 
 NUMBER_SECONDS = 2e-10  # of one thread per number of a matrix
 LANES = {3: 4, 6: 8}  # by the rows of a block
@@ -68,32 +67,21 @@ def padded(blocks: np.ndarray, lanes: int) -> np.ndarray:
 
 def upload_matrix(matrix: sp.bsr_matrix, arena: FieldArena, name: str, real) -> BlockRows:
     """Copy a matrix to the device."""
-    n_rows, n_columns = (extent // size for extent, size in zip(matrix.shape, matrix.blocksize))
-    made = allocate_matrix(
-        arena, name, real, matrix.blocksize, owners(np.diff(matrix.indptr)), matrix.indices, (n_rows, n_columns)
+    (rows, columns), n_blocks = matrix.blocksize, len(matrix.indices)
+    made = BlockRows(
+        real=real,
+        n_rows=matrix.shape[0] // rows,
+        n_columns=matrix.shape[1] // columns,
+        rows=rows,
+        columns=columns,
+        lanes=LANES[rows],
+        serial=not parallel.pays(n_blocks * rows * columns * NUMBER_SECONDS),
+        start=arena.field(f"{name}_start", ti.i32, len(matrix.indptr), matrix.indptr),
+        column=arena.field(f"{name}_column", ti.i32, n_blocks, matrix.indices),
+        value=arena.vectors(name, real, n_blocks, n=LANES[rows] * columns),
     )
     made.value.from_numpy(padded(matrix.data, made.lanes))
     return made
-
-
-def allocate_matrix(
-    arena: FieldArena, name: str, real, block: tuple[int, int], row: np.ndarray, column: np.ndarray, shape: tuple[int, int]
-) -> BlockRows:
-    """Allocate a matrix of zero blocks, row by row. row, column: of each block; shape: in blocks."""
-    (rows, columns), (n_rows, n_columns) = block, shape
-    lanes, start = LANES[rows], np.concatenate([[0], np.cumsum(np.bincount(row, minlength=n_rows))])
-    return BlockRows(
-        real=real,
-        n_rows=n_rows,
-        n_columns=n_columns,
-        rows=rows,
-        columns=columns,
-        lanes=lanes,
-        serial=not parallel.pays(len(row) * rows * columns * NUMBER_SECONDS),
-        start=arena.field(f"{name}_start", ti.i32, len(start), start),
-        column=arena.field(f"{name}_column", ti.i32, len(column), column),
-        value=arena.vectors(name, real, len(row), n=lanes * columns),
-    )
 
 
 @ti.func
