@@ -58,13 +58,13 @@ class CoarseCorrection:
         start_parallel(m, A, NO_COUPLING, w, tolerance, 0)
         restrict(m, A, space, w, cycle.right)
         cycle.cycle()
-        start_with_correction(m, A, space, w, cycle.solution, scale, tolerance)
+        correct(m, A, space, w, cycle.solution, scale, tolerance, 1)
         while w.state[STATUS] == RUNNING and w.state[COUNT] < max_iterations and w.state[RZ] > 0.0:
             step_and_restrict(m, A, space, w, cycle.right)
             if w.state[STATUS] == NEGATIVE_PENDING:
                 break
             cycle.cycle()
-            correct(m, A, space, w, cycle.solution, scale, tolerance)
+            correct(m, A, space, w, cycle.solution, scale, tolerance, 0)
         status, rz = int(w.state[STATUS]), float(w.state[RZ])
         converged = status == CONVERGED and rz >= 0.0
         return LinearResult(int(w.state[COUNT]), converged, status not in (RUNNING, CONVERGED))
@@ -145,23 +145,6 @@ def _correct_chunks(m: ti.template(), A: ti.template(), space: ti.template(), w:
 
 
 @kernel
-def start_with_correction(
-    m: ti.template(),
-    A: ti.template(),
-    space: ti.template(),
-    w: ti.template(),
-    solution: ti.template(),
-    scale: ti.f64,
-    tolerance: ti.f64,
-):
-    """Add B solution to P s before the first iteration."""
-    _correct_chunks(m, A, space, w, solution, scale)
-    ti.loop_config(serialize=True)
-    for _ in range(1):
-        begin_with(w, tolerance, sum_of_chunks(m, w, OTHER_SUM))
-
-
-@kernel
 def correct(
     m: ti.template(),
     A: ti.template(),
@@ -170,9 +153,13 @@ def correct(
     solution: ti.template(),
     scale: ti.f64,
     tolerance: ti.f64,
+    begin: ti.i32,
 ):
-    """Add B solution to P s, and end the iteration."""
+    """Add B solution to P s, and end the iteration. begin: 1 before the first iteration, 0 at the end of one."""
     _correct_chunks(m, A, space, w, solution, scale)
     ti.loop_config(serialize=True)
     for _ in range(1):
-        end_iteration(m, w, tolerance)
+        if begin == 1:
+            begin_with(w, tolerance, sum_of_chunks(m, w, OTHER_SUM))
+        else:
+            end_iteration(m, w, tolerance)
