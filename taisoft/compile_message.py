@@ -35,11 +35,11 @@ def show(compiler: float, launch: float, n_compiled: int) -> None:
 def silenced() -> Iterator[None]:
     """Suppress the messages, for a caller that reports the kernels itself."""
     global _is_silent
-    _is_silent = True
+    before, _is_silent = _is_silent, True
     try:
         yield
     finally:
-        _is_silent = False
+        _is_silent = before
 
 
 def _write(line: str) -> None:

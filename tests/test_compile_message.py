@@ -56,6 +56,7 @@ def test_only_the_first_run_prints_the_message(terminal, tmp_path):
 def fresh(monkeypatch) -> None:
     """As in a process that has not printed the message yet."""
     monkeypatch.setattr(compile_message, "_last_line", None)
+    monkeypatch.setattr(compile_message, "_is_silent", False)
 
 
 def test_when_lines_are_printed(fresh, monkeypatch, capsys):
@@ -72,6 +73,8 @@ def test_when_lines_are_printed(fresh, monkeypatch, capsys):
 
 def test_silenced(fresh, capsys):
     with compile_message.silenced():
+        with compile_message.silenced():
+            pass
         compile_message.show(compiler=0.5, launch=0.6, n_compiled=1)
     assert capsys.readouterr().err == ""
     compile_message.show(compiler=0.5, launch=0.6, n_compiled=2)
