@@ -2,6 +2,7 @@
 
 * those that are held become contacts: the nearest points of their features at their time, the normal between these, and the gap
   of the same points now, against NumPy and ipctk;
+* those that pass in spite of that are taken where they come to lie, with the normal across their features, on their first side;
 * where nothing crosses, a contact of surfaces behind each other is none; passages and obstacles remain;
 * pairs of colliders that cross or lie inside each other are exempt until they do not, and no others.
 """
@@ -19,7 +20,7 @@ import taisoft as ts
 from taisoft.backend.arrays import FieldArena
 from taisoft.collision.near_list import SEARCHED
 from taisoft.collision.passages import ADJACENT, FLAT, N_FEATURES, N_KINDS, NEAR, ROUND
-from taisoft.collision.path_check import adjacent_rows
+from taisoft.collision.path_check import HeldPassages, adjacent_rows
 
 ipctk = pytest.importorskip("ipctk")
 from benchmarks.judge import axis_distance  # noqa: E402
@@ -58,6 +59,11 @@ def detected(scene: ts.Scene, precision: str = "f64"):
     with dynamics(scene, precision=precision, **SETTINGS) as made:
         yield Detected(made, arena.vectors("path", ti.f64, made.model.n_nodes))
     arena.release()
+
+
+def held(pairs: np.ndarray, times: np.ndarray, passed: int = 0) -> HeldPassages:
+    """Passages held at their times, all of which passed in spite of their contacts, or none did."""
+    return HeldPassages(pairs, times, np.full(len(pairs), passed, dtype=np.int32))
 
 
 def crowd() -> ts.Scene:
@@ -112,7 +118,7 @@ def test_held_passages_are_contacts(precision):
             move[rows_of(one.made, "box 1"), 1] -= 0.5
             move[rows_of(one.made, "box 0"), 1] -= 0.2
             one.search(start, move)
-            d.held = d.passages(SEARCHED)
+            d.held = held(*d.passages(SEARCHED))
             time = dict(zip(map(tuple, d.held[0].tolist()), d.held[1].tolist()))
             one.again()
             c = d.contacts()
@@ -147,6 +153,51 @@ def test_held_passages_are_contacts(precision):
     assert set(kinds) == {NEAR, ADJACENT, ROUND, FLAT} and min(kinds.values()) > 2
 
 
+def across(y: np.ndarray, f: int) -> np.ndarray:
+    """A vector across the triangle of features f of two triangles (6,3), or across both edges."""
+    if f < 6:
+        a, b, c = y[3:] if f < 3 else y[:3]
+        return np.cross(b - a, c - a)
+    i, j = (f - 6) // 3, (f - 6) % 3
+    return np.cross(y[(i + 1) % 3] - y[i], y[3 + (j + 1) % 3] - y[3 + j])
+
+
+def test_passages_that_pass_again_are_taken_at_the_end_of_their_path():
+    rng, kinds, n_passed_through = np.random.default_rng(1), set(), 0
+    with detected(crowd()) as one:
+        d, start = one.detection, one.made.state.state()[0]
+        t, node = d.topology.triangle, d.topology.node
+        rows = adjacent_rows(t)
+        move = rng.uniform(-0.3, 0.3, start.shape)
+        move[rows_of(one.made, "box 1"), 1] -= 0.5
+        one.search(start, move)
+        pairs, times = d.passages(SEARCHED)
+        found = []
+        for passed in (0, 1):
+            d.held = held(pairs, times, passed)
+            one.again()
+            c = d.contacts()
+            own = np.flatnonzero(c.kind == "face_face")
+            found.append({tuple(c.feature[k]): (c.weights[k], c.normal[k], c.gap[k], c.nodes[k]) for k in own})
+        for (kind, a, b, f), time in zip(pairs.tolist(), times):
+            key = N_KINDS * a + kind, N_FEATURES * b + f
+            (_, before, _, _), (w, n, gap, nodes) = found[0][key], found[1][key]
+            if kind not in (NEAR, ADJACENT) or (w == found[0][key][0]).all():
+                assert (n == before).all()
+                continue
+            i = node[np.concatenate([t[a], t[b]]) if kind == NEAR else rows[a]]
+            end, early = start[i] + move[i], start[i] + time * move[i]
+            sides = w[:3] @ (start + move)[nodes[:3]], w[3:] @ (start + move)[nodes[3:]]
+            offset = sides[0] - sides[1]
+            assert np.linalg.norm(np.cross(offset, n)) < 1e-12 and np.linalg.norm(n) == pytest.approx(1.0, abs=1e-12)
+            assert np.linalg.norm(np.cross(n, across(end, f))) < 1e-9 * np.linalg.norm(across(end, f))
+            assert (n @ across(end, f) > 0.0) == (before @ across(early, f) > 0.0)
+            assert gap == pytest.approx((w[:3] @ start[nodes[:3]] - w[3:] @ start[nodes[3:]]) @ n, abs=1e-12)
+            kinds.add((kind, f < 6))
+            n_passed_through += offset @ n < 0.0
+    assert kinds >= {(NEAR, True), (NEAR, False), (ADJACENT, False)} and n_passed_through > 3
+
+
 def test_where_nothing_crosses_nothing_is_behind():
     """A vertex behind a face, found by its distance alone, is then in front of another part of the surface."""
     scene = ts.Scene(gravity=(0, 0, 0))
@@ -161,7 +212,7 @@ def test_where_nothing_crosses_nothing_is_behind():
         behind = every.gap < -1e-4
         assert set(every.body_b[behind]) == {"box 1", "ground"}
         d.none_cross = True
-        d.held = np.array([(NEAR, 0, len(d.topology.triangle) - 1, 9)], dtype=np.int32), np.zeros(1)
+        d.held = held(np.array([(NEAR, 0, len(d.topology.triangle) - 1, 9)], dtype=np.int32), np.zeros(1))
         one.again()
         left = d.contacts()
         assert set(left.body_b[left.gap < -1e-4]) == {"ground"}

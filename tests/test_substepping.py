@@ -2,7 +2,7 @@
 
 * a step that converges is one substep; one that does not is retried in 2 and 4 substeps and then whole, and later steps are
   not retried until one converges;
-* substeps are as short as the closing rate requires, cover the step, and grow again after an event;
+* substeps are as short as the closing rate requires where surfaces cross already, cover the step, and grow again after an event;
 * a substep that met unknown contacts is repeated with them;
 * a substep that ends in deep penetration, leaves the searched path, or whose contacts do not settle, is undone and halved, at
   most MAX_UNDONE times a step;
@@ -191,6 +191,13 @@ def test_substeps_are_short_only_while_bodies_close_fast(stepper):
     assert covers_step(stepper) and substepping.substeps == len(lengths) > 5
     fast = [dt for time, dt in stepper.kept if 0.04 <= time < 0.06]
     assert max(fast) <= DT / 50 * 1.001 and lengths.max() > 3 * max(fast)
+
+
+def test_where_nothing_crosses_speed_cuts_nothing(stepper):
+    stepper.closing, stepper.none_cross = lambda time, dt: 50.0 * dt / DT, True
+    substepping = Substepping(stepper)
+    substepping.step(0.0, DT)
+    assert stepper.kept == [(0.0, DT)] and substepping.substeps == 1
 
 
 def test_closing_too_fast_for_the_shortest_substep_is_an_error(stepper):

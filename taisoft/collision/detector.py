@@ -112,7 +112,7 @@ class Detection:
         self._self_on, self.floor = properties["self_on"], FLOOR * float(self.edges[: len(bodies)].min())
         self._paths: PathCheck | None = None
         self.none_cross = False  # whether no surfaces are known to cross at the positions that are searched
-        self.held = NO_PASSAGES  # passages that every search adds as contacts, and their times
+        self.held = NO_PASSAGES  # that every search adds as contacts
         self._containment = Containment(scene, self.topology, layout, self._rest, self._analytic, self_collision)
         self._placed = False  # whether obstacles have been placed
         self._broad_result: Trees | Candidates | None = None  # broad-phase result of the last search
@@ -221,7 +221,7 @@ class Detection:
         if self.shapes.count:
             find_analytic(s, self.shapes, self.margin, out, append)
             append = 1
-        if len(self.held[0]):
+        if len(self.held.pairs):
             append_passages(s, self.shapes, self._paths.fields, *self.held, out, append)
 
     def _reduce(self) -> None:

@@ -24,7 +24,7 @@ from taisoft.collision.candidates import sum_parts
 from taisoft.collision.contacts import FACE_FACE, write_contact
 from taisoft.collision.features import unit
 from taisoft.collision.near_list import OUTDATED, STILL, UNCOVERED, clear_ends, hint_of, list_unseparated, prepare_paths
-from taisoft.collision.separation import at_weights, free_until, nearest_of, separating_plane, unit_row
+from taisoft.collision.separation import across, are_inner, at_weights, free_until, nearest_of, separating_plane, unit_row
 from taisoft.collision.surface import dvec, ivec
 from taisoft.fem.chunks import part_first
 
@@ -237,11 +237,16 @@ def append_passages(
     g: ti.template(),
     pairs: ti.types.ndarray(),
     times: ti.types.ndarray(),
+    passed: ti.types.ndarray(),
     out: ti.template(),
     append: ti.i32,
 ):
     """Append a contact for each passage (k,4) to the buffer of contacts: between its features at a time (k,) along the
-    searched paths. Their normal then holds them apart; the gap is that of the same points now."""
+    searched paths. Their normal then holds them apart; the gap is that of the same points now.
+
+    passed (k,): 1 for those that passed although they were contacts, since surfaces turned or slid. They are taken where they
+    come to lie at the end of the path, if these are inner points, with the normal across the features on the side of before.
+    """
     ti.loop_config(serialize=True)
     for c in range(out.chunks):
         at, last, r = c * out.part + append * out.used[c], (c + 1) * out.part, c
@@ -263,7 +268,13 @@ def append_passages(
                 x, p = _rows(s, o, g, kind, a, b, s.move)
                 y = x + times[r] * p  # stored: the compiler fails when an expression is indexed
                 u, v, offset = nearest_of(y, features)
-                n, point = unit(offset), at_weights(x, 0, u)
+                n = unit(offset)
+                if passed[r] == 1 and kind != ROUND:
+                    end, side = x + p, across(y, features).dot(n)
+                    u_end, v_end, _ = nearest_of(end, features)
+                    if side != 0.0 and are_inner(u_end, v_end, features):
+                        u, v, n = u_end, v_end, ti.math.sign(side) * unit(across(end, features))
+                point = at_weights(x, 0, u)
                 gap = (point - at_weights(x, 3, v)).dot(n) - _radius(o, kind, b)
                 if kind != ROUND:
                     body_b = _body_of(s, wall[0])

@@ -1,5 +1,7 @@
 """The check of a step's paths: lists of pairs, exempt colliders, and the passages found; see `passages`."""
 
+from typing import NamedTuple
+
 import numpy as np
 import taichi as ti
 
@@ -13,8 +15,23 @@ from taisoft.collision.passages import ADJACENT, FLAT, N_KINDS, NEAR, ROUND, che
 from taisoft.collision.surface import Surface, integers
 from taisoft.ranges import expand
 
-NO_PASSAGES = np.zeros((0, 4), dtype=np.int32), np.zeros(0)  # as `PathCheck.find` returns them
 IN_BOXES = 0.49  # of the reach: how far a vertex may leave its searched path and still be in the boxes, grown by half of it
+
+
+class HeldPassages(NamedTuple):
+    """Passages that a search adds as contacts, see `append_passages`."""
+
+    pairs: np.ndarray  # (k,4) i32: kind, two ids and the nearest features
+    times: np.ndarray  # (k,) parts of the searched path until which they are certainly apart
+    passed: np.ndarray  # (k,) i32: 1 where they passed although they were contacts
+
+    @classmethod
+    def at_start(cls, pairs: np.ndarray) -> "HeldPassages":
+        """Hold passages (k,4) where they are at the start of a step."""
+        return cls(pairs, np.zeros(len(pairs)), np.zeros(len(pairs), dtype=np.int32))
+
+
+NO_PASSAGES = HeldPassages.at_start(np.zeros((0, 4), dtype=np.int32))
 
 
 def adjacent_rows(triangle: np.ndarray) -> np.ndarray:
@@ -172,7 +189,7 @@ class PathCheck:
         """Return the passages found."""
         out = self.passages
         if out.count[TOTAL] == 0:
-            return NO_PASSAGES
+            return NO_PASSAGES[:2]
         pair, time, used = download([out.data.pair, out.data.time, out.used])
         filled = out.filled(used)
         pair, time = pair[filled], time[filled]

@@ -15,7 +15,7 @@ from taisoft.collision.contacts import FACE_FACE
 from taisoft.collision.detector import Detection
 from taisoft.collision.near_list import SEARCHED, TO_STATE
 from taisoft.collision.passages import N_FEATURES, N_KINDS
-from taisoft.collision.path_check import NO_PASSAGES
+from taisoft.collision.path_check import NO_PASSAGES, HeldPassages
 from taisoft.contact.problem import ContactProblem
 from taisoft.dynamics.contact_measures import find_displacement
 from taisoft.dynamics.simulation_state import SimulationState
@@ -68,12 +68,12 @@ class ContactPaths:
 
     def snapshot(self) -> dict:
         """Return the passages (k,4) that the next search adds as contacts, and whether no surfaces cross."""
-        return {"held": self._detection.held[0], "none_cross": self._detection.none_cross}
+        return {"held": self._detection.held.pairs, "none_cross": self._detection.none_cross}
 
     def restore(self, kept: dict) -> None:
         """Restore a `snapshot`."""
         self.return_to_start(bool(kept["none_cross"]))
-        self._detection.held = np.asarray(kept["held"], dtype=np.int32).reshape(-1, 4), np.zeros(len(kept["held"]))
+        self._detection.held = HeldPassages.at_start(np.asarray(kept["held"], dtype=np.int32).reshape(-1, 4))
 
     def begin(self) -> None:
         """Begin a substep."""
@@ -103,14 +103,16 @@ class ContactPaths:
 
     def _hold(self, pairs: np.ndarray, times: np.ndarray) -> None:
         """Hold passages and the parts of the step until which they are apart; those of the same features once."""
-        every = np.concatenate([self._held[0], pairs])
-        time = np.concatenate([self._held[1], times])
+        held, n_held = self._held, len(self._held.pairs)
+        every, time = np.concatenate([held.pairs, pairs]), np.concatenate([held.times, times])
+        passed = np.concatenate([held.passed, np.zeros(len(pairs), dtype=np.int32)])
         _, first, group = np.unique(self._detection.features_of(every), axis=0, return_index=True, return_inverse=True)
-        group, n_held = group.reshape(-1), len(self._held[0])
         earliest = np.full(len(first), np.inf)
-        np.minimum.at(earliest, group[n_held:], times)
+        np.minimum.at(earliest, group.reshape(-1)[n_held:], times)
         self._n_unchanged = self._n_unchanged + 1 if len(first) == n_held else 0
-        self._held = every[first], np.where(np.isfinite(earliest), earliest, time[first])
+        again = np.isfinite(earliest)
+        passed = np.where(again & (first < n_held), 1, passed[first]).astype(np.int32)
+        self._held = HeldPassages(every[first], np.where(again, earliest, time[first]), passed)
 
     def use_all(self) -> None:
         """Let the next search add all passages held, at their times along the searched paths."""
@@ -118,15 +120,14 @@ class ContactPaths:
 
     def use_active(self, problem: ContactProblem) -> None:
         """Let the next search add those that carry an impulse, at its positions."""
-        if len(self._held[0]) == 0:
+        if len(self._held.pairs) == 0:
             return
         feature, impulse = download([problem.feature, problem.r], problem.count[0])
         active = feature[(feature[:, 0] == FACE_FACE) & (impulse[:, 0] > 0.0)]
         one, other = active[:, 1], active[:, 2]
         keys = set(zip(*(x.tolist() for x in (one % N_KINDS, one // N_KINDS, other // N_FEATURES, other % N_FEATURES))))
-        pairs = self._held[0]
-        kept = np.array([tuple(pair) in keys for pair in pairs.tolist()], dtype=bool)
-        self._detection.held = pairs[kept], np.zeros(int(kept.sum()))
+        kept = np.array([tuple(pair) in keys for pair in self._held.pairs.tolist()], dtype=bool)
+        self._detection.held = HeldPassages.at_start(self._held.pairs[kept])
 
     def exempt_crossing(self) -> None:
         """Exempt the colliders that cross at the last search, and no others."""

@@ -1,12 +1,13 @@
 """Adaptive substepping of implicit steps: when a step is cut, and when cutting ends.
 
-A step that does not converge is repeated in equal substeps. With contacts, each is also short enough to miss no collision.
+A step that does not converge is repeated in equal substeps. With contacts, each must also miss no collision.
 
-Before a substep: while contacts close fast, its length is limited by `contact_measures`. After it: it is repeated with contacts
-that were found along its path, and with pairs that would have passed through each other (`contact_paths`). It is undone and
-halved if these repetitions did not help, if the motion was much faster than known when it was cut, if it left a new deep
-penetration or crossing, or, if it was short, when it did not converge. A short event, such as an impact or a snap, therefore
-takes short substeps only while it lasts. How soon longer ones are tried again depends on how often they failed (`LengthLimit`).
+Before a substep: where surfaces cross already and contacts close fast, its length is limited by `contact_measures`. After it:
+it is repeated with contacts that were found along its path, and with pairs that would have passed through each other
+(`contact_paths`). It is undone and halved if these repetitions did not help, if the motion was much faster than known when it was
+cut, if it left a new deep penetration or crossing, or, if it was short, when it did not converge. A short event, such as an
+impact or a snap, therefore takes short substeps only while it lasts. How soon longer ones are tried again depends on how often
+they failed (`LengthLimit`).
 
 No substep is shorter than the step over MAX_SUBSTEPS. Where surfaces cross already, motion that closes too fast even for that is
 refused. A substep of minimum length, or after MAX_UNDONE others were undone, is kept and reported even if deep, unsettled or not
@@ -151,7 +152,7 @@ class Substepping:
         while True:
             time = start + (dt - remaining)
             length = next_length(
-                lambda length, time=time: contact.measure_start(time, length)[1],
+                lambda length, time=time: self._closing_ratio(time, length),
                 remaining,
                 length,
                 self._longest(longest, dt),
@@ -201,6 +202,10 @@ class Substepping:
     def _longest(self, longest: float, dt: float) -> float:
         """The longest substep that is tried in a step of dt, up to a given length. The limit may stem from smaller steps."""
         return min(longest, max(self.limit.longest, dt / MAX_SUBSTEPS))
+
+    def _closing_ratio(self, time: float, length: float) -> float:
+        """Return the largest closing ratio of a substep; where nothing crosses 0, since the check of its path suffices."""
+        return 0.0 if self._contact.paths.none_cross else self._contact.measure_start(time, length)[1]
 
     def _measure_start(self, start: float, dt: float) -> None:
         """Measure the start of a step; penetration that exists there needs no shorter substeps."""
