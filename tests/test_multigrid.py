@@ -160,6 +160,18 @@ def test_rigid_motions_are_prolonged_exactly():
     assert np.allclose(turned, scale * modes[:, :, 5])
 
 
+def test_pairs_along_an_axis_keep_the_rotations_that_move_them():
+    """The one about the line of two nodes is a translation of both, whichever of the three it is."""
+    rng = np.random.default_rng(6)
+    x = rng.standard_normal((6, 3))
+    for axis in range(3):
+        x[2 * axis + 1] = x[2 * axis] + 0.3 * np.eye(3)[axis]
+    modes, owner = rigid_modes(x, np.ones((6, 3), dtype=bool)), np.array([0, 0, 1, 1, 2, 2])
+    P, coarse, unused = prolongation(modes, owner)
+    assert np.abs(P @ coarse.reshape(-1, MODES) - modes.reshape(-1, MODES)).max() < 1e-12
+    assert np.array_equal(unused, [np.arange(6) == 3 + axis for axis in range(3)])
+
+
 def test_aggregates_that_are_rigid_about_their_centres_have_the_same_motions():
     """A single node and a line have no rotations, neither have rows of constrained axes."""
     rng = np.random.default_rng(6)

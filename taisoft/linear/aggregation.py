@@ -91,14 +91,32 @@ def aggregate_modes(modes: np.ndarray, aggregates: np.ndarray) -> tuple[np.ndarr
     slot = np.arange(len(order)) - (np.cumsum(size) - size)[owner]
     stacked = np.zeros((n_coarse, max(int(size.max()), -(-MODES // d)), d, MODES))
     stacked[owner, slot] = modes[order]
-    basis, coarse = np.linalg.qr(stacked.reshape(n_coarse, -1, MODES))
-    length = np.sqrt((stacked**2).sum(axis=(1, 2, 3)))
-    unused = np.abs(np.diagonal(coarse, axis1=1, axis2=2)) <= DEPENDENT * length[:, None]
-    moved = stacked.reshape(n_coarse, -1, MODES).any(axis=2)  # rounding must not move the others
-    basis, coarse = np.where(unused[:, None, :] | ~moved[:, :, None], 0.0, basis), np.where(unused[:, :, None], 0.0, coarse)
+    basis, coarse, unused = _orthonormal(stacked.reshape(n_coarse, -1, MODES))
     blocks = np.zeros((n, d, MODES))
     blocks[order] = basis.reshape(n_coarse, -1, d, MODES)[owner, slot]
     return blocks, coarse, unused
+
+
+def _orthonormal(columns: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Orthonormal columns (g, r, 6) by Gram and Schmidt, done twice; the upper triangle that they are multiplied by to give
+    `columns`; and which are dependent on the ones before (g, 6), and 0.
+
+    A QR decomposition makes up a vector for a dependent column, which may be part of the next ones.
+    """
+    length = np.sqrt((columns**2).sum(axis=(1, 2)))
+    basis, triangle = np.zeros_like(columns), np.zeros((len(columns), MODES, MODES))
+    dependent = np.zeros((len(columns), MODES), dtype=bool)
+    for k in range(MODES):
+        rest = columns[:, :, k].copy()
+        for _ in range(2):
+            part = np.einsum("grk,gr->gk", basis[:, :, :k], rest)
+            rest -= np.einsum("grk,gk->gr", basis[:, :, :k], part)
+            triangle[:, :k, k] += part
+        size = np.linalg.norm(rest, axis=1)
+        dependent[:, k] = size <= DEPENDENT * length
+        triangle[:, k, k] = np.where(dependent[:, k], 0.0, size)
+        basis[:, :, k] = np.where(dependent[:, k, None], 0.0, rest / np.where(size > 0.0, size, 1.0)[:, None])
+    return basis, triangle, dependent
 
 
 def prolongation(modes: np.ndarray, aggregates: np.ndarray) -> tuple[sp.bsr_matrix, np.ndarray, np.ndarray]:
