@@ -31,6 +31,7 @@ from taisoft.fem.chunks import part_first
 # kinds of passages, by two ids: two triangles; a row of `adjacent`; a triangle and a sphere or capsule; a vertex and a half-space
 NEAR, ADJACENT, ROUND, FLAT = range(4)
 N_KINDS, N_FEATURES = 4, 16  # factors in ids of contacts
+FACING = 0.5  # least cosine between the shortest connection and the normal across the features: beside them, sides are unclear
 
 corners = ti.types.matrix(6, 3, ti.f64)
 
@@ -245,7 +246,8 @@ def append_passages(
     searched paths. Their normal then holds them apart; the gap is that of the same points now.
 
     passed (k,): 1 for those that passed although they were contacts, since surfaces turned or slid. They are taken where they
-    come to lie at the end of the path, if these are inner points, with the normal across the features on the side of before.
+    come to lie at the end of the path, with the normal across the features on the side of before: if these are inner points, and
+    it is clear which side that was.
     """
     ti.loop_config(serialize=True)
     for c in range(out.chunks):
@@ -270,10 +272,12 @@ def append_passages(
                 u, v, offset = nearest_of(y, features)
                 n = unit(offset)
                 if passed[r] == 1 and kind != ROUND:
-                    end, side = x + p, across(y, features).dot(n)
+                    end, before = x + p, unit(across(y, features))
+                    side = ti.select(before.dot(n) > 0.0, 1.0, -1.0)
+                    turned = side * unit(across(end, features))
                     u_end, v_end, _ = nearest_of(end, features)
-                    if side != 0.0 and are_inner(u_end, v_end, features):
-                        u, v, n = u_end, v_end, ti.math.sign(side) * unit(across(end, features))
+                    if side * before.dot(n) > FACING and turned.dot(n) > 0.0 and are_inner(u_end, v_end, features):
+                        u, v, n = u_end, v_end, turned
                 point = at_weights(x, 0, u)
                 gap = (point - at_weights(x, 3, v)).dot(n) - _radius(o, kind, b)
                 if kind != ROUND:
