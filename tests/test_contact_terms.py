@@ -1,7 +1,7 @@
 """Contact terms of an implicit stage, compared with NumPy, for contacts of all states between two bodies and with obstacles, in
 f64 and f32:
 
-* impulses, velocities and the residual of the contact laws follow their formulas; passages open at once;
+* impulses, velocities and the residual of the contact laws follow their formulas; those whose sides turn open at once;
 * the derivative of the impulses is minus the blocks of the matrix;
 * the factored J^T D J equals the dense one: above the diagonal, below it, whole, and on the diagonal;
 * conjugate gradients with it, serial and parallel, find the solution of a dense solver;
@@ -18,7 +18,6 @@ from scenes import built, cube, rubber
 
 import taisoft as ts
 from taisoft.backend.runtime import kernel
-from taisoft.collision.contacts import FACE_FACE, VERTEX_FACE
 from taisoft.contact.build import LEAST_GAP
 from taisoft.contact.problem import RESIDUAL, build_node_problem, fill_field, find_factors, index_nodes
 from taisoft.dynamics import contact_terms, linearised
@@ -35,7 +34,7 @@ from taisoft.linear.coupling import add_products, clear_products, form_product, 
 K, BETA, DT = 24, 0.002, 0.003  # contacts; [s]
 TOLERANCE = 1e-12  # of the contact laws: so small that missed gaps do not count
 GAP_TARGETS = 1e-3, 0.2, 0.02, 0.05  # contact offset [m], fractions corrected in a step, maximum speed of that [m/s]
-PASSAGE = np.arange(K) % 3 == 1  # contacts whose sides are apart, however negative their gap is
+TURNED = np.arange(K) % 3 == 1  # contacts whose sides are apart, however negative their gap is
 STIFFNESS = 5.0
 FIXED = [0, 7]  # nodes
 
@@ -93,9 +92,8 @@ def rig(request):
         friction = np.where(np.arange(K) % 7 == 0, 0.0, 0.5)
         gap = rng.uniform(-2, 3, K) * GAP_TARGETS[0]
         apart = np.tile([0, 1], (K, 1))  # self-contacts have other targets
-        feature = np.stack([np.where(PASSAGE, FACE_FACE, VERTEX_FACE), np.arange(K), np.arange(K)], axis=1)
-        fields = (p.arity, p.friction, p.gap, p.obstacle_displacement, p.body, p.feature)
-        for field, values in zip(fields, (arity, friction, gap, obstacle_displacement, apart, feature)):
+        fields = (p.arity, p.friction, p.gap, p.obstacle_displacement, p.body, p.turned)
+        for field, values in zip(fields, (arity, friction, gap, obstacle_displacement, apart, TURNED.astype(np.int32))):
             fill_field(field, values)
         p.count[0] = K
         index_nodes(p)
@@ -173,8 +171,8 @@ def targets(rig) -> np.ndarray:
     opening = np.minimum(slow * (contact_offset - above) + fast * (above - rig.gap), fastest * DT)
     assert 0 < (opening == fastest * DT).sum() < (rig.gap < contact_offset).sum()
     target = np.where(rig.gap >= contact_offset, contact_offset, rig.gap + opening)
-    assert (PASSAGE & (target < 0.0)).sum() > 1 and (~PASSAGE & (target < 0.0)).sum() > 1
-    return np.where(PASSAGE, np.maximum(target, LEAST_GAP * contact_offset), target)
+    assert (TURNED & (target < 0.0)).sum() > 1 and (~TURNED & (target < 0.0)).sum() > 1
+    return np.where(TURNED, np.maximum(target, LEAST_GAP * contact_offset), target)
 
 
 @pytest.fixture

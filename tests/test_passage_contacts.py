@@ -178,6 +178,8 @@ def test_passages_that_pass_again_are_taken_at_the_end_of_their_path():
             one.again()
             c = d.contacts()
             own = np.flatnonzero(c.kind == "face_face")
+            turned = d.buffer.data.turned.to_numpy()
+            assert turned.sum() == 0 if passed == 0 else 0 < turned.sum() < len(pairs)
             found.append({tuple(c.feature[k]): (c.weights[k], c.normal[k], c.gap[k], c.nodes[k]) for k in own})
         for (kind, a, b, f), time in zip(pairs.tolist(), times):
             key = N_KINDS * a + kind, N_FEATURES * b + f

@@ -254,7 +254,7 @@ def append_passages(
         at, last, r = c * out.part + append * out.used[c], (c + 1) * out.part, c
         while r < pairs.shape[0]:  # dealt out to the parts in turn
             kind, a, b, features = pairs[r, 0], pairs[r, 1], pairs[r, 2], pairs[r, 3]
-            corner, wall, n = ivec(a, -1, -1), ivec(-1), dvec(0.0)
+            corner, wall, n, is_turned = ivec(a, -1, -1), ivec(-1), dvec(0.0), 0
             u, v, point, gap, body_b = unit_row(0), dvec(0.0), dvec(0.0), ti.cast(0.0, ti.f64), 0
             if ti.static(o.any):
                 if kind == FLAT or kind == ROUND:
@@ -277,7 +277,7 @@ def append_passages(
                     turned = side * unit(across(end, features))
                     u_end, v_end, _ = nearest_of(end, features)
                     if side * before.dot(n) > FACING and turned.dot(n) > 0.0 and are_inner(u_end, v_end, features):
-                        u, v, n = u_end, v_end, turned
+                        u, v, n, is_turned = u_end, v_end, turned, 1
                 point = at_weights(x, 0, u)
                 gap = (point - at_weights(x, 3, v)).dot(n) - _radius(o, kind, b)
                 if kind != ROUND:
@@ -286,6 +286,8 @@ def append_passages(
                 feature = ivec(FACE_FACE, N_KINDS * a + kind, N_FEATURES * b + features)
                 body_a = _body_of(s, corner[0])
                 write_contact(out.data, at, last, body_a, body_b, feature, point, n, gap, corner, 1.0 * u, wall, 1.0 * v)
+                if at < last:
+                    out.data.turned[at] = is_turned
                 at += 1
             r += out.chunks
         out.used[c] = at - c * out.part

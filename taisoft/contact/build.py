@@ -252,7 +252,7 @@ def fill(
     for c in range(n):
         row = kept[c]
         normal, gap, point = found.normal[row], found.gap[row], found.point[row]
-        p.normal[c], p.gap[c], p.point[c] = normal, gap, point
+        p.normal[c], p.gap[c], p.point[c], p.turned[c] = normal, gap, point, found.turned[row]
         p.tangent[c], p.order[c] = tangent(normal), c
         p.body[c], p.feature[c] = found.body[row], found.feature[row]
         p.friction[c], p.restitution[c] = _pair_coefficients(q, p.body[c][0], p.body[c][1])

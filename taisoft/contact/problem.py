@@ -76,6 +76,7 @@ class ContactProblem:
     feature: Any = None  # 3-vectors i32
     point: Any = None  # 3-vectors [m]
     gap: Any = None  # f64 [m]
+    turned: Any = None  # i32: 1 if a negative gap is no penetration, but tells how far the sides turn in the step
     obstacle_displacement: Any = None  # 3-vectors: obstacle's displacement at the contact in the step [m]
     approach: Any = None  # f64: normal velocity at the start of the step, negative if surfaces approach [m/s]
     restitution: Any = None  # f64
@@ -104,7 +105,7 @@ def build_node_problem(arena: FieldArena, capacity: int, n_nodes: int, serial: b
         **_solver_fields(arena, n),
         **_fields(arena, "node", ti.i32, (n, width)),
         **_fields(arena, "weight", ti.f64, (n, width)),
-        **_fields(arena, "arity", ti.i32, n),
+        **_fields(arena, "arity turned", ti.i32, n),
         **_fields(arena, vectors, ti.f64, n, 3),
         **_fields(arena, "gap approach restitution min_velocity min_opening", ti.f64, n),
         **_fields(arena, "body", ti.i32, n, 2),

@@ -14,7 +14,6 @@ import taichi as ti
 
 from taisoft.backend.arrays import FieldArena
 from taisoft.backend.runtime import kernel
-from taisoft.collision.contacts import FACE_FACE
 from taisoft.contact.build import LEAST_GAP, contact_offset_of, gap_minus_target
 from taisoft.contact.problem import RESIDUAL, ContactProblem, residual_of
 from taisoft.contact.prox import dvec, into_disk, prox, scaled
@@ -102,7 +101,7 @@ def begin_contacts(
             least = ti.cast(LEAST_GAP, ti.f64)
             gap_to_target = gap_minus_target(p, c, dt, offset_target, fast, slow, fastest, p.min_opening[c], least)
             wanted = contact_offset_of(p, c, offset_target)
-            if p.feature[c][0] == FACE_FACE:  # its sides are apart: a negative gap tells how surfaces turn in the step
+            if p.turned[c] == 1:
                 gap_to_target = ti.min(gap_to_target, p.gap[c] - least * wanted)
             w.gap_minus_target[c] = gap_to_target - p.normal[c].dot(p.obstacle_displacement[c])
             target = p.gap[c] - gap_to_target
