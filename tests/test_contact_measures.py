@@ -1,6 +1,8 @@
 """A projectile fired at a thin sheet is stopped or refused, and never passes through:
 
-* steps with fast projectiles are cut into substeps, few while they are far away: after every step no triangles intersect;
+* after every step no triangles intersect; where paths are not checked, steps with fast projectiles are cut into substeps, few
+  while they are far away;
+* what flies past a corner is not deflected, however long the step;
 * a projectile too fast for that is refused with its speed, the sheet's thickness and a sufficient dt; the state is kept;
   explicit steps with that dt stop it;
 * a half-space stops bodies of any speed, and every vertex that moves below it has a contact;
@@ -80,16 +82,36 @@ def test_projectiles_are_stopped(sim, speed):
     assert sim.velocities("shot")[:, 1].mean() > -0.8 * speed
 
 
-def test_only_close_projectiles_take_substeps(sim):
-    """One up to the sheet, short ones for the impact, then longer ones again."""
+def test_only_close_projectiles_take_substeps_where_paths_are_not_checked(sim, monkeypatch):
+    """One up to the sheet, short ones for the impact, then longer ones again. Where paths are checked, speed cuts no step."""
     if sim.settings.explicit:
         pytest.skip("explicit steps have no substeps")
+    shoot(sim, 20.0)
+    assert [sim.step().substeps for _ in range(2)] == [1, 1]
+    monkeypatch.setattr(ContactPaths, "none_cross", property(lambda self: False))
+    sim.reset()
     shoot(sim, 20.0)
     substeps = [sim.step().substeps for _ in range(2)]
     assert 2 < max(substeps) < 20 < 20.0 * sim.dt / (0.5 * THICK)
     shoot(sim, 20.0)
     sim.set_state(positions=sim.positions("shot") + (0, 1.0, 0), body="shot")
     assert sim.step().substeps == 1
+
+
+@pytest.mark.parametrize("integrator", ["implicit_euler", "bdf2"])
+def test_what_flies_past_a_corner_is_not_deflected(integrator):
+    """A cube closes on another by more than their gap, but has moved aside by then. One that flies straight at it does hit."""
+    cube, rubber = ts.box_mesh((2, 2, 2), (0.2, 0.2, 0.2)), ts.Material(young=1e5, poisson=0.3)
+    for velocity, hits in (((9.0, 30.0, 0.0), False), ((-9.0, 30.0, 4.0), False), ((9.0, 2.0, 0.0), True)):
+        made = ts.Scene(gravity=(0, 0, 0))
+        made.add_body(cube, rubber, name="target")
+        made.add_body(cube, rubber, name="flyer", position=(-np.sign(velocity[0]) * 0.3, -0.05, 0.0), velocity=velocity)
+        with ts.Simulator(made, dt=1 / 60, integrator=integrator, precision="f64") as sim:
+            reports = [sim.step() for _ in range(3)]
+            assert hits or all(report.converged and report.substeps == 1 for report in reports)
+            speed = np.abs(sim.velocities("target").mean(axis=0)).max()
+            assert speed > 0.5 if hits else speed < 1e-9
+            assert np.allclose(sim.velocities("flyer").mean(axis=0), velocity, atol=1e-9) != hits
 
 
 def shoot_too_fast(sim) -> float:

@@ -200,6 +200,30 @@ def test_passages_that_pass_again_are_taken_at_the_end_of_their_path():
     assert kinds >= {(NEAR, True), (NEAR, False), (ADJACENT, False)} and n_passed_through > 3
 
 
+def test_edges_that_turn_past_parallel_keep_their_sides():
+    """An edge of a box sinks through one of another box, and turns from 0.3 to -0.2 rad about the vertical: the vector across
+    both turns over, but the side where they were apart remains."""
+    with detected(crowd()) as one:
+        d, x = one.detection, one.made.state.state()[0].copy()
+        t, node, move = d.topology.triangle, d.topology.node, np.zeros_like(x)
+        lower, upper = (int(np.flatnonzero(d.topology.body == body)[0]) for body in (0, 1))
+
+        def triangle(angle: float, height: float) -> list[np.ndarray]:
+            along = np.array([np.cos(angle), 0.0, np.sin(angle)])
+            return [-along + [0.0, height, 0.0], along + [0.0, height, 0.0], np.array([0.0, 1.0 + height, 0.5])]
+
+        x[node[t[lower]]] = [[-1.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.5]]
+        x[node[t[upper]]] = triangle(0.3, 0.1)
+        move[node[t[upper]]] = np.array(triangle(-0.2, -0.1)) - x[node[t[upper]]]
+        one.search(x, move)
+        for passed in (0, 1):
+            d.held = held(np.array([(NEAR, lower, upper, 6)], dtype=np.int32), np.array([0.45]), passed)
+            one.again()
+            c = d.contacts()
+            (k,) = np.flatnonzero(c.kind == "face_face")
+            assert np.allclose(c.normal[k], [0.0, -1.0, 0.0], atol=1e-9) and c.gap[k] == pytest.approx(0.1, abs=1e-9)
+
+
 def test_where_nothing_crosses_nothing_is_behind():
     """A vertex behind a face, found by its distance alone, is then in front of another part of the surface."""
     scene = ts.Scene(gravity=(0, 0, 0))

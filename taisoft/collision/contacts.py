@@ -2,7 +2,7 @@
 
 A contact has a side a and a side b, each a point on up to three nodes with weights that sum to 1; an obstacle is always b and
 has no nodes. The normal is a unit vector from b to a; the gap is the signed distance of the two points along it, negative in
-penetration. A feature identifies the pair of mesh features in contact, and persists while they stay in contact.
+penetration, or of a passage whose sides turn in the step. A feature identifies the pair of mesh features in contact, and persists while they stay in contact.
 
 The reduction merges contacts of one pair of bodies that are within a tolerance, with one normal (report, section 3.1.3). In the
 order of kind, feature and position in the buffer, a contact is kept unless an earlier kept one is within the tolerance: the
@@ -63,7 +63,7 @@ class Contacts:
 
     point: np.ndarray  #: (k,3) midway between the two surface points [m]
     normal: np.ndarray  #: (k,3) unit vectors from b to a
-    gap: np.ndarray  #: (k,) [m], negative for a penetration
+    gap: np.ndarray  #: (k,) [m], negative for a penetration; of "face_face" it tells how far the sides turn in the step
     impulse: np.ndarray  #: (k,3) on a [N s], with friction; b gets the opposite
     body_a: np.ndarray  #: (k,) names
     body_b: np.ndarray  #: (k,) names; an obstacle is always b

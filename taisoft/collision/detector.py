@@ -112,7 +112,7 @@ class Detection:
         self._self_on, self.floor = properties["self_on"], FLOOR * float(self.edges[: len(bodies)].min())
         self._paths: PathCheck | None = None
         self.none_cross = False  # whether no surfaces are known to cross at the positions that are searched
-        self.held = NO_PASSAGES  # that every search adds as contacts
+        self.held = NO_PASSAGES  # which every search adds as contacts
         self._containment = Containment(scene, self.topology, layout, self._rest, self._analytic, self_collision)
         self._placed = False  # whether obstacles have been placed
         self._broad_result: Trees | Candidates | None = None  # broad-phase result of the last search

@@ -5,7 +5,7 @@ keeps surfaces apart despite the error of linearising the motion. A gap above th
 slowly, but in implicit steps at once to LEAST_GAP of it; a true penetration opens within a few steps. Neither is faster than
 strains the softest body by one percent: bodies would fly apart otherwise. Contacts of a body with itself have SELF_CONTACT times
 the contact offset and are corrected SELF_CONTACT times as fast. Where the surfaces meet within the step, restitution raises the
-target (`restitution`). The impulse must satisfy
+target (`restitution`); where the sides turn, the caller does. The impulse must satisfy
     u_n = (gap - target)/dt + n.(v_a - v_b) >= 0,
 which counts motion once, since the gap is the one at the start of the step.
 """

@@ -204,9 +204,11 @@ class ContactStep:
         return d.counts.contacts
 
     def _find(self, *arguments, **named) -> None:
-        """Call `Detection.find`."""
+        """Call `Detection.find`; where nothing crosses, implicit steps drop what may never touch."""
         self.measures.forget()
         self.detection.find(*arguments, **named)
+        if self.paths.none_cross and not self._explicit and self.detection.counts.contacts:
+            self.measures.drop_uncertain()
 
     def begin(self, time: float, dt: float) -> int:
         """Fill the problem for a step of dt [s] from the state at a time, warm-started. Return its number of contacts."""

@@ -8,6 +8,9 @@ advancement: Mirtich 1996). A contact's ratio is the smaller of
     closing / (thickness / 2)   and   |relative motion| / max(gap, thickness / 2),
 and a step in which no contact's ratio exceeds 1 is short enough. Weakness: a surface that protrudes behind the nearest one is a
 separate contact only if its distance has a local minimum there.
+
+Where nothing crosses, implicit steps need no such limit, since what they miss is found along their paths: there `drop_uncertain`
+drops the contacts that it would be for, unless they close head-on.
 """
 
 import math
@@ -18,6 +21,7 @@ import numpy as np
 import taichi as ti
 
 from taisoft.backend.runtime import kernel
+from taisoft.collision.contacts import FACE_FACE
 from taisoft.collision.detector import Detection
 from taisoft.collision.intersections import CROSSED, CROSSING_DEPTH, CROSSINGS, DEPTH_OVER_EDGE
 from taisoft.collision.surface import dvec
@@ -62,6 +66,12 @@ class ContactMeasures:
             self._dt = dt
         return self._closing
 
+    def drop_uncertain(self) -> None:
+        """Drop the contacts of the last search that may never touch, where the check of paths finds those that would: a plane
+        across the nearest features also stops what flies past them."""
+        d = self.detection
+        d.counts.contacts = drop_uncertain(d.surface, d.shapes, d.buffer.data, d.kept, d.counts.contacts)
+
     def crossing(self) -> Crossing:
         """Measure crossing triangles and contained colliders."""
         crossings, edges = self.detection.crossings(), self.detection.edges
@@ -94,6 +104,43 @@ class ContactMeasures:
         )
 
 
+@ti.func
+def _relative_displacement(s: ti.template(), o: ti.template(), found: ti.template(), at):
+    """Displacement of side a relative to side b of the contact at a buffer index in the searched step, (3,) [m]."""
+    displacement = dvec(0.0)
+    if ti.static(o.any):
+        if found.nodes_b[at][0] < 0:
+            displacement -= obstacle_displacement_at(o, found.body[at][1], found.point[at])
+    for j in ti.static(range(3)):
+        if found.nodes_a[at][j] >= 0:
+            displacement += found.weights_a[at][j] * s.move[found.nodes_a[at][j]]
+        if found.nodes_b[at][j] >= 0:
+            displacement -= found.weights_b[at][j] * s.move[found.nodes_b[at][j]]
+    return displacement
+
+
+@kernel
+def drop_uncertain(s: ti.template(), o: ti.template(), found: ti.template(), kept: ti.template(), n: ti.i32) -> ti.i32:
+    """Leave out of kept[:n] the contacts whose sides close by more than MAX_CLOSING of the thinner one's thickness in the
+    searched step, and move aside by as much before they meet: they may never touch. Passages remain. Return the number left."""
+    left = 0
+    ti.loop_config(serialize=True)
+    for _ in range(1):
+        for c in range(n):
+            at = kept[c]
+            displacement, normal = _relative_displacement(s, o, found, at), found.normal[at]
+            closing = -displacement.dot(normal)
+            allowed = MAX_CLOSING * ti.min(s.thickness[found.body[at][0]], s.thickness[found.body[at][1]])
+            is_certain = found.feature[at][0] == FACE_FACE or closing <= allowed
+            if not is_certain:
+                until = ti.min(ti.max(found.gap[at], 0.0) / closing, 1.0)
+                is_certain = until * (displacement + closing * normal).norm() <= allowed
+            if is_certain:
+                kept[left] = at
+                left += 1
+    return left
+
+
 @kernel
 def measure_closing(
     s: ti.template(),
@@ -118,15 +165,7 @@ def measure_closing(
             depth = ti.max(depth, -found.gap[at])
             a, b = found.body[at][0], found.body[at][1]
             relative_penetration = ti.max(relative_penetration, -found.gap[at] / ti.min(s.edge[a], s.edge[b]))
-            displacement = dvec(0.0)
-            if ti.static(o.any):
-                if found.nodes_b[at][0] < 0:
-                    displacement -= obstacle_displacement_at(o, b, found.point[at])
-            for j in ti.static(range(3)):
-                if found.nodes_a[at][j] >= 0:
-                    displacement += found.weights_a[at][j] * s.move[found.nodes_a[at][j]]
-                if found.nodes_b[at][j] >= 0:
-                    displacement -= found.weights_b[at][j] * s.move[found.nodes_b[at][j]]
+            displacement = _relative_displacement(s, o, found, at)
             closing = -displacement.dot(found.normal[at])
             allowed = MAX_CLOSING * ti.min(s.thickness[a], s.thickness[b])
             if s.thickness[b] < ti.math.inf and closing > 0.0:

@@ -35,7 +35,7 @@ MAX_PASSAGES = 8  # repetitions of a substep with the pairs that would have pass
 MAX_FAILED = 1  # attempts at a substep that did not converge, after which it is halved if something still passes
 MAX_PATIENCE = 8  # substeps kept before a longer one is tried
 HALF_TRIED = 0.51  # of a doubled limit: a substep up to this long, which divides a step equally, does not try it
-MAX_UNDONE = 16  # per step, for reasons other than speed: each costs a few solves
+MAX_UNDONE = 16  # per step, for reasons other than speed and trials of a longer substep: each costs a few solves
 WORSENING = 1.1  # growth of an existing penetration that counts as a new one
 RETRIES = 4  # maximum number of equal substeps after non-convergence; only shorter substeps are halved for that
 MAX_UNCONVERGED = 2  # maximum consecutive halvings for that: if they do not help, more do not either
@@ -180,7 +180,9 @@ class Substepping:
                     result, may_retry and length < min(longest, dt / RETRIES) and n_unconverged < MAX_UNCONVERGED
                 )
             if fault == Fault.FAST or (fault and may_cut):
-                undo_budget, n_unconverged = undo_budget - (fault != Fault.FAST), n_unconverged + (fault == Fault.UNCONVERGED)
+                is_trial = fault == Fault.CROSSED and self.limit.is_trial
+                undo_budget -= not (fault == Fault.FAST or is_trial)
+                n_unconverged += fault == Fault.UNCONVERGED
                 undone.append(result)
                 if fault == Fault.CROSSED:
                     self.limit.undo(length, again=n_crossed > 0)
