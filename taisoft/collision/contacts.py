@@ -2,7 +2,8 @@
 
 A contact has a side a and a side b, each a point on up to three nodes with weights that sum to 1; an obstacle is always b and
 has no nodes. The normal is a unit vector from b to a; the gap is the signed distance of the two points along it, negative in
-penetration, or of a passage whose sides turn in the step. A feature identifies the pair of mesh features in contact, and persists while they stay in contact.
+penetration, or of a passage whose sides turn in the step. A feature identifies the pair of mesh features in contact, and
+persists while they stay in contact.
 
 The reduction merges contacts of one pair of bodies that are within a tolerance, with one normal (report, section 3.1.3). In the
 order of kind, feature and position in the buffer, a contact is kept unless an earlier kept one is within the tolerance: the
