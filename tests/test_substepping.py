@@ -310,6 +310,14 @@ def test_whole_steps_that_fail_are_tried_ever_more_seldom(stepper):
     assert whole[0] and sum(whole) < 6
 
 
+def test_trials_of_longer_substeps_use_up_no_budget(stepper):
+    """A step that needs more than a hundred substeps tries longer ones more often than MAX_UNDONE times."""
+    stepper.passes, stepper.is_stuck = lambda time, dt: dt > DT / 100, True
+    result = Substepping(stepper).step(0.0, DT)
+    assert len(stepper.taken) - len(stepper.kept) > MAX_UNDONE
+    assert covers_step(stepper) and not stepper.held_back and result.converged
+
+
 def test_no_substep_is_held_back_where_shorter_ones_pass(stepper):
     """Passages end at a 128th of the step only: what takes all attempts of a step to find out is not forgotten in it."""
     stepper.passes = lambda time, dt: dt > 1.01 * DT / 128
