@@ -64,8 +64,8 @@ def across(corners, k):
     if k < 3:
         e, f = row_of(corners, 4) - row_of(corners, 3), row_of(corners, 5) - row_of(corners, 3)
     elif k >= 6:
-        i, j = (k - 6) // 3, (k - 6) % 3
-        e, f = row_of(corners, (i + 1) % 3) - row_of(corners, i), row_of(corners, 3 + (j + 1) % 3) - row_of(corners, 3 + j)
+        e = _edge((k - 6) // 3, row_of(corners, 0), row_of(corners, 1), row_of(corners, 2))
+        f = _edge((k - 6) % 3, row_of(corners, 3), row_of(corners, 4), row_of(corners, 5))
     return e.cross(f)
 
 

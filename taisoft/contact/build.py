@@ -5,7 +5,8 @@ keeps surfaces apart despite the error of linearising the motion. A gap above th
 slowly, but in implicit steps at once to LEAST_GAP of it; a true penetration opens within a few steps. Neither is faster than
 strains the softest body by one percent: bodies would fly apart otherwise. Contacts of a body with itself have SELF_CONTACT times
 the contact offset and are corrected SELF_CONTACT times as fast. Where the surfaces meet within the step, restitution raises the
-target (`restitution`); where the sides turn, the caller does. The impulse must satisfy
+target (`restitution`). Sides that turn in an implicit step are apart: they open at once, however negative their gap is. The
+impulse must satisfy
     u_n = (gap - target)/dt + n.(v_a - v_b) >= 0,
 which counts motion once, since the gap is the one at the start of the step.
 """
@@ -298,6 +299,8 @@ def gap_minus_target(
         target = gap + ti.min(opening, max_speed * dt)
     if min_opening > 0.0:
         target = ti.max(target, gap + min_opening)
+    if least_gap > 0.0 and p.turned[c] == 1:
+        target = ti.max(target, least_gap * contact_offset)
     return gap - target
 
 

@@ -100,10 +100,8 @@ def begin_contacts(
             offset_target, fast, slow, fastest = gap_targets[0], gap_targets[1], gap_targets[2], gap_targets[3]
             least = ti.cast(LEAST_GAP, ti.f64)
             gap_to_target = gap_minus_target(p, c, dt, offset_target, fast, slow, fastest, p.min_opening[c], least)
-            wanted = contact_offset_of(p, c, offset_target)
-            if p.turned[c] == 1:
-                gap_to_target = ti.min(gap_to_target, p.gap[c] - least * wanted)
             w.gap_minus_target[c] = gap_to_target - p.normal[c].dot(p.obstacle_displacement[c])
+            wanted = contact_offset_of(p, c, offset_target)
             target = p.gap[c] - gap_to_target
             w.gap_weight[c] = 0.0
             if target > 0.0:

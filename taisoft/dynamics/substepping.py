@@ -17,6 +17,7 @@ converged; bodies that would still pass through something are held back.
 import math
 from dataclasses import replace
 from enum import Enum, auto
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -152,7 +153,7 @@ class Substepping:
         while True:
             time = start + (dt - remaining)
             length = next_length(
-                lambda length, time=time: self._closing_ratio(time, length),
+                partial(self._closing_ratio, time),
                 remaining,
                 length,
                 self._longest(longest, dt),
