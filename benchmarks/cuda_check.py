@@ -36,7 +36,7 @@ from .runner import RESULT, make_parser, parse_result
 ROOT = Path(__file__).resolve().parent.parent
 BUDGET = 470.0  # seconds for all parts: ten less than eight minutes
 LAST_LINES = 15  # of a failed process's output
-TESTS, RESULTS = "tests/test_arch.py", "PASSED|FAILED|ERROR|SKIPPED|XFAIL"
+TESTS, RESULTS = "tests/backend/test_arch.py", "PASSED|FAILED|ERROR|SKIPPED|XFAIL"
 
 
 @dataclass(frozen=True)

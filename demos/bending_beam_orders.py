@@ -7,7 +7,7 @@ beam that is converged in the mesh hangs 2.7095 m deep. Linear tets are too stif
 less deep than that, the second 4.9 %, the third 0.7 %.
 
 `check` compares with static solutions on these same meshes: by scikit-fem 12 for the linear tets, and for the quadratic
-ones by the dense NumPy solver of `tests/oracle.py`, with the same 4-point quadrature.
+ones by the dense NumPy solver of `tests/fem/oracle.py`, with the same 4-point quadrature.
 """
 
 import numpy as np

@@ -4,12 +4,12 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from command import BEAM, write
-from long import LONG, is_long
 from taichi._lib import core
 
 from taisoft import compile_message
 from taisoft.backend import runtime
+from tests.cli.command import BEAM, write
+from tests.long import LONG, is_long
 
 SHARED = Path(__file__).resolve().parents[1].parent / "shared"
 SLOW = (
@@ -38,12 +38,12 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Without the long ones. Slow files first, so that processes that share the files end at about the same time."""
-    long = [item for item in items if is_long(item.nodeid)]
+    long = [item for item in items if is_long(item.nodeid) or item.get_closest_marker("long")]
     if config.args == [str(config.rootpath / path) for path in config.getini("testpaths")] or config.args == ["tests"]:
         _refuse_parts_of_nothing(items)
     named = len(long) == len(items) and any("::" in name for name in config.args)  # what is named one by one is meant
     if not (named or config.getoption("--long")):
-        items[:] = [item for item in items if not is_long(item.nodeid)]
+        items[:] = [item for item in items if item not in long]
         config.hook.pytest_deselected(items=long)
     no_gpu = pytest.mark.skip(reason="this machine has no NVIDIA GPU")
     for item in items:
@@ -59,7 +59,7 @@ def _refuse_parts_of_nothing(items: list[pytest.Item]) -> None:
     for file in LONG:
         if not (Path(__file__).parent / f"{file}.py").is_file():
             raise pytest.UsageError(f"tests/long.py: there is no {file}.py")
-    collected = {item.path.stem for item in items}  # a file whose libraries are absent is skipped whole
+    collected = {item.nodeid.partition("::")[0].removeprefix("tests/").removesuffix(".py") for item in items}  # absent libraries
     for file, parts in LONG.items():
         for part in parts if file in collected else ():
             if not any(f"/{file}.py::" in name and part in name for name in names):

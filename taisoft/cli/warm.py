@@ -1,7 +1,7 @@
 """`taisoft warm`: compiles the kernels of common scenes in advance, so that later runs find them in the disk cache.
 
 Kernels depend on the fields of `Structure`, not on meshes or numbers, so a cube of 40 tets suffices for a body. The table
-contains every demo's structure, which `tests/test_cli_warm.py` checks.
+contains every demo's structure, which `tests/cli/test_cli_warm.py` checks.
 """
 
 import contextlib

@@ -1,0 +1,89 @@
+"""The message on stderr that kernels are being compiled:
+
+* a first run prints it once, on its own line, on a terminal (before the progress bar) and elsewhere; a second run does not;
+  kernels of another version in the cache change nothing;
+* loading a kernel prints nothing, however slow; long compiling prints a line every few seconds;
+* without stderr, or with a closed one, nothing happens.
+"""
+
+import io
+import os
+import pty
+import subprocess
+import sys
+
+import pytest
+
+from taisoft import compile_message
+from taisoft.compile_message import LINE_EVERY, MESSAGE
+from tests.cli.command import ROOT
+
+RUN = ("-m", "taisoft", "run", "hanging_beam", "--headless", "--no-frames", "--no-usd", "--seconds", "0.1")
+
+
+def stderr_of_run(terminal: bool, environment: dict) -> str:
+    if not terminal:
+        return subprocess.run([sys.executable, *RUN], env=environment, capture_output=True, text=True, check=True).stderr
+    ours, theirs = pty.openpty()
+    process = subprocess.Popen([sys.executable, *RUN], env=environment, stdin=theirs, stdout=theirs, stderr=theirs)
+    os.close(theirs)
+    parts = []
+    try:
+        while part := os.read(ours, 4096):
+            parts.append(part)
+    except OSError:  # end of a terminal on Linux
+        pass
+    finally:
+        os.close(ours)
+    assert process.wait() == 0
+    return b"".join(parts).decode()
+
+
+@pytest.mark.parametrize("terminal", [False, True])
+def test_only_the_first_run_prints_the_message(terminal, tmp_path):
+    kernels = tmp_path / "taisoft" / "kernels"
+    kernels.mkdir(parents=True)
+    (kernels / "Other.tic").touch()
+    environment = os.environ | {"XDG_CACHE_HOME": str(tmp_path), "PYTHONPATH": str(ROOT)}
+    first, second = (stderr_of_run(terminal, environment) for _ in range(2))
+    lines = [line.removeprefix("\x1b[2K") for line in first.splitlines()]  # a bar may have been drawn there before
+    assert [line for line in lines if "compiling" in line] == [MESSAGE]
+    assert "taisoft:" not in second
+    assert not terminal or "hanging_beam" in first  # the bar
+
+
+@pytest.fixture
+def fresh(monkeypatch) -> None:
+    """As in a process that has not printed the message yet."""
+    monkeypatch.setattr(compile_message, "_last_line", None)
+    monkeypatch.setattr(compile_message, "_is_silent", False)
+
+
+def test_when_lines_are_printed(fresh, monkeypatch, capsys):
+    clock = [0.0]
+    monkeypatch.setattr(compile_message.time, "perf_counter", lambda: clock[0])
+    compile_message.show(compiler=0.02, launch=0.1, n_compiled=1)  # loaded
+    compile_message.show(compiler=0.3, launch=2.0, n_compiled=2)  # loaded on a slow machine
+    assert capsys.readouterr().err == ""
+    for n, now in ((3, 0.0), (4, 0.9 * LINE_EVERY), (5, 1.1 * LINE_EVERY), (6, 1.2 * LINE_EVERY)):
+        clock[0] = now
+        compile_message.show(compiler=0.5, launch=0.6, n_compiled=n)
+    assert capsys.readouterr().err == f"{MESSAGE}\ntaisoft: 5 kernels so far\n"
+
+
+def test_silenced(fresh, capsys):
+    with compile_message.silenced():
+        with compile_message.silenced():
+            pass
+        compile_message.show(compiler=0.5, launch=0.6, n_compiled=1)
+    assert capsys.readouterr().err == ""
+    compile_message.show(compiler=0.5, launch=0.6, n_compiled=2)
+    assert capsys.readouterr().err == f"{MESSAGE}\n"
+
+
+@pytest.mark.parametrize("is_closed", [True, False])
+def test_no_stderr(is_closed, fresh, monkeypatch):
+    closed = io.StringIO()
+    closed.close()
+    monkeypatch.setattr(sys, "stderr", closed if is_closed else None)
+    compile_message.show(compiler=0.5, launch=0.6, n_compiled=1)

@@ -1,0 +1,209 @@
+"""Device arrays and their arena:
+
+* names are unique, sizes are counted in bytes, and arrays that are too large are refused before they are allocated;
+* uploads and downloads preserve all types and shapes, NaN and infinities too; downloads are copies;
+* data of a wrong shape is refused before anything is written;
+* lane buffers are disjoint ranges of one pooled field and are reused after release; larger ones share fields of their own;
+* released arrays take no memory, even where references remain.
+"""
+
+import gc
+
+import numpy as np
+import pytest
+import taichi as ti
+
+from taisoft.backend import runtime
+from taisoft.backend.arrays import DTYPES, ENTRIES, FieldArena, download, size_class, upload
+from taisoft.backend.runtime import kernel
+from taisoft.errors import SimulationError
+from tests.backend.lanes import opened
+
+SHAPES = [(7,), (5, 3), (4, 3, 2)]  # of scalars
+
+
+def test_arena_counts_bytes_and_refuses_duplicate_names_and_huge_arrays():
+    with opened("f64"):
+        arena = FieldArena()
+        x = arena.field("x", ti.f64, (3, 2), np.arange(6.0).reshape(3, 2))
+        v = arena.vectors("v", ti.f32, 5)
+        assert arena.bytes == {"x": 48, "v": 60}
+        assert np.array_equal(x.to_numpy(), np.arange(6.0).reshape(3, 2)) and not v.to_numpy().any()
+        with pytest.raises(ValueError, match="'x' is allocated twice"):
+            arena.field("x", ti.f64, 1)
+        with pytest.raises(SimulationError, match="array 'huge' needs 3000000000 numbers, more than the 1610612733 that fit"):
+            arena.vectors("huge", ti.f32, 10**9)
+        assert set(arena.bytes) == {"x", "v"}
+        arena.release()
+        assert not arena.bytes
+        arena.field("x", ti.f64, 2)  # the name is free again
+        arena.release()
+
+
+def test_arrays_beyond_the_available_memory_are_refused(monkeypatch):
+    with opened("f64"):
+        arena = FieldArena()
+        monkeypatch.setattr("taisoft.backend.arrays.available_memory", lambda: 2**21)
+        with pytest.raises(SimulationError, match="not enough memory for the array 'x': .* are needed, available: "):
+            arena.field("x", ti.f64, 2**19)
+        with pytest.raises(SimulationError, match="not enough memory for the array 'y'"):
+            arena.lanes("y", ti.f64, 2**19)
+        assert not arena.bytes
+
+
+@pytest.fixture(params=["f32", "f64"])
+def arrays(request):
+    """Scalar and vector fields of each type and shape."""
+    with opened(request.param):
+        arena = FieldArena()
+        made = [arena.field(f"{t} {s}", t, s) for t in DTYPES for s in SHAPES]
+        made += [arena.vectors(f"{t} of {n}", t, 9, n=n) for t in (ti.f32, ti.f64, ti.i32) for n in (2, 3, 12)]
+        yield made
+        arena.release()
+
+
+def random_data(arrays, seed: int) -> list[np.ndarray]:
+    rng, values = np.random.default_rng(seed), []
+    for array in arrays:
+        shape, kind = (*array.shape, array.n) if array.n else array.shape, np.dtype(DTYPES[array.dtype])
+        low, high = (0, 256) if kind == np.uint8 else (-(2**31), 2**31)
+        data = rng.integers(low, high, shape) if kind.kind in "iu" else rng.normal(size=shape) * 10.0 ** rng.integers(-30, 30)
+        values.append(data.astype(kind))
+    return values
+
+
+def same(found: list[np.ndarray], expected: list[np.ndarray]) -> bool:
+    return len(found) == len(expected) and all(
+        a.dtype == b.dtype and np.array_equal(a, b, equal_nan=a.dtype.kind == "f") for a, b in zip(found, expected)
+    )
+
+
+def test_upload_and_download_preserve_data(arrays):
+    data = random_data(arrays, 0)
+    for values in data:
+        if values.dtype.kind == "f":
+            values.flat[:3] = np.nan, np.inf, -0.0
+    upload(list(zip(arrays, data)))
+    assert same(download(arrays), data)
+    assert same(download(arrays[:5], 3), [values[:3] for values in data[:5]])
+    copied = arrays[0].to_numpy()
+    copied[:] = 0
+    assert same([arrays[0].to_numpy()], data[:1])
+
+
+def test_upload_rounds_to_the_type_of_the_field(arrays):
+    singles = [array for array in arrays if array.dtype == ti.f32 and array.shape == (9,)]
+    data = [np.random.default_rng(1).normal(size=(9, array.n)) for array in singles]
+    upload(list(zip(singles, data)))
+    assert same(download(singles), [values.astype(np.float32) for values in data])
+
+
+def test_data_of_a_wrong_shape_is_refused(arrays):
+    data = random_data(arrays, 3)
+    upload(list(zip(arrays, data)))
+    wrong = [np.zeros_like(values) for values in data]
+    wrong[-1] = wrong[-1][:, :-1]
+    with pytest.raises(ValueError, match=r"an array of shape \(9, 12\) cannot take one of shape \(9, 11\)"):
+        upload(list(zip(arrays, wrong)))
+    assert same(download(arrays), data)
+
+
+def test_single_entries_are_read_and_written_from_the_host(arrays):
+    vector = next(array for array in arrays if array.dtype == ti.f64 and array.n == 3)
+    vector[2] = 1.0, 2.0, 3.0
+    assert vector[2].tolist() == [1.0, 2.0, 3.0] and vector.to_numpy()[2].tolist() == [1.0, 2.0, 3.0]
+    scalar = next(array for array in arrays if array.dtype == ti.i32 and array.shape == (7,))
+    scalar.fill(4)
+    scalar[1] = 5
+    assert type(scalar[1]) is int and scalar.to_numpy().tolist() == [4, 5, 4, 4, 4, 4, 4]
+
+
+@kernel
+def write_lanes(out: ti.template(), at: ti.i32, count: ti.i32, value: ti.f64):
+    for k in range(at, at + count):
+        out[k] = value
+
+
+@kernel
+def sum_lanes(out: ti.template(), at: ti.i32, count: ti.i32) -> ti.f64:
+    total = ti.cast(0.0, ti.f64)
+    ti.loop_config(serialize=True)
+    for k in range(at, at + count):
+        total += ti.cast(out[k], ti.f64)
+    return total
+
+
+@pytest.mark.parametrize("precision, real", [("f32", ti.f32), ("f64", ti.f64)])
+def test_lane_buffers_are_disjoint_ranges_of_one_field(precision, real):
+    with opened(precision):
+        arenas = [FieldArena() for _ in range(3)]
+        buffers = [arena.lanes("forces", real, 100) for arena in arenas]
+        assert len({lanes.memory for lanes in buffers}) == 1
+        assert arenas[0].bytes == {"forces": 100 * (4 if real == ti.f32 else 8)}
+        for value, lanes in enumerate(buffers):
+            write_lanes(lanes.memory, lanes.at, lanes.count, float(value + 1))
+        for value, lanes in enumerate(buffers):
+            assert sum_lanes(lanes.memory, lanes.at, lanes.count) == 100.0 * (value + 1)
+        second = buffers[1].at
+        arenas[1].release()
+        del buffers[1], lanes
+        gc.collect()
+        assert arenas[1].lanes("others", real, 128).at == second  # rounded up to whole cache lines
+        for arena in arenas:
+            arena.release()
+
+
+def test_a_lane_buffer_larger_than_the_pool_has_its_own_field():
+    with opened("f32"):
+        arena = FieldArena()
+        large = arena.lanes("large", ti.f32, ENTRIES + 1)
+        small = arena.lanes("small", ti.f32, 10)
+        assert large.memory is not small.memory and large.at == 0 and large.mask > small.mask
+        write_lanes(large.memory, ENTRIES - 3, 4, 2.0)
+        assert sum_lanes(large.memory, 0, large.count) == 8.0
+        arena.release()
+
+
+def test_large_lane_buffers_share_fields(monkeypatch):
+    """Kernels compiled for one buffer serve the next. Concurrent buffers differ; a larger one replaces those that are idle."""
+    runtime._kind = None  # a new Taichi with an empty pool
+    with opened("f32"):
+        monkeypatch.setattr("taisoft.backend.arrays.ENTRIES", 0)
+        arenas = [FieldArena() for _ in range(3)]
+
+        def allocate(k: int, count: int):
+            memory = arenas[k].lanes("large", ti.f32, count).memory
+            write_lanes(memory, count - 4, 4, float(k + 1))
+            return memory
+
+        def release(k: int) -> None:
+            arenas[k].release()
+            gc.collect()
+
+        first = allocate(0, 1000)
+        before = runtime.n_compiled()
+        second = allocate(1, 1000)
+        assert second is not first and runtime.n_compiled() == before + 1
+        release(0)
+        assert allocate(2, 900) is first and runtime.n_compiled() == before + 1
+        for k in (1, 2):
+            release(k)
+        third = allocate(0, 5000)
+        assert third is not first and third is not second
+        release(0)
+        assert allocate(1, 1000) is third
+        release(1)
+
+
+def test_lane_buffers_are_at_most_a_quarter_larger_than_requested():
+    for count in [*range(1, 300), 2**24 + 1, 1_234_567_891]:
+        assert count <= size_class(count) <= max(1.25 * count, count + 1)
+    assert len({size_class(k) for k in range(1, 2**16)}) <= 4 * 17
+
+
+def test_released_arrays_are_empty_even_while_referenced():
+    with opened("f64"):
+        arena = FieldArena()
+        arrays = [arena.field("a", ti.f64, 1000), arena.vectors("b", ti.f32, 1000, n=2)]
+        arena.release()
+        assert [array.to_numpy().shape for array in arrays] == [(0,), (0, 2)] and arena.bytes == {}

@@ -1,0 +1,203 @@
+"""Kernels over records of arrays:
+
+* one compiled kernel serves all records of one structure, whatever their sizes; it is compiled anew for other types, extents but
+  the first, flags, optional arrays, constants that are not counts, and modules;
+* kernels can use nested records, tuples, properties, methods and arrays of several dimensions;
+* neither a record nor its arrays are kept alive by a launch;
+* the fast launch gives the same results and errors as Taichi's public one; after a new ti.init nothing old is launched.
+"""
+
+import gc
+import weakref
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pytest
+import taichi as ti
+
+from taisoft.backend import launching, runtime
+from taisoft.backend.arrays import Count, FieldArena, index_mask
+from taisoft.backend.runtime import kernel
+from taisoft.fem.laws import corotational, stable_neo_hookean
+from tests.backend.lanes import opened
+
+
+@pytest.fixture(params=[False, True], ids=["fast", "public"])
+def machine(request, monkeypatch):
+    """A runtime with the fast launch or Taichi's public one."""
+    monkeypatch.setattr(launching, "PUBLIC", request.param)
+    runtime._kind = None  # forget kernels compiled for the other launch
+    with opened("f64") as machine:
+        yield machine
+    runtime._kind = None
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """A part of a record."""
+
+    first: Count
+    weight: Any  # f64
+    power: int  # a compile-time constant
+
+
+@dataclass(frozen=True, eq=False)
+class Record:
+    """An argument of kernels."""
+
+    n: Count
+    x: Any  # 3-vectors
+    table: Any  # (n, 2, 3)
+    extra: Any  # f64, or None
+    parts: tuple
+    flag: bool
+    unused: Any = None
+
+    @property
+    def has_extra(self) -> bool:
+        """Whether the optional array is there."""
+        return self.extra is not None
+
+    @ti.func
+    def length(self, i):
+        """Length of vector i."""
+        return self.x[i].norm()
+
+
+def make(arena: FieldArena, n: int, flag: bool = True, extra: bool = False, power: int = 2, unused: Any = None) -> Record:
+    tag = len(arena.bytes)
+    x, table = np.arange(3.0 * n).reshape(n, 3), np.arange(6.0 * n).reshape(n, 2, 3)
+    parts = tuple(Part(k, arena.field(f"weight {k} {tag}", ti.f64, n, np.full(n, k + 1.0)), power) for k in range(2))
+    optional = arena.field(f"extra {tag}", ti.f64, n, np.full(n, 0.5)) if extra else None
+    x, table = arena.vectors(f"x {tag}", ti.f64, n, x), arena.field(f"table {tag}", ti.f64, (n, 2, 3), table)
+    return Record(n, x, table, optional, parts, flag, unused)
+
+
+@ti.func
+def weighted(p: ti.template(), i):
+    """The value of a part at i."""
+    return p.weight[i] ** p.power + p.first
+
+
+@kernel
+def evaluate(r: ti.template(), scale: ti.f64, out: ti.types.ndarray()) -> ti.f64:
+    last = ti.cast(0.0, ti.f64)
+    ti.loop_config(serialize=True)
+    for i in range(r.n):
+        value = r.length(i) + r.table[i, 1, 2]
+        for p in ti.static(r.parts):
+            value += weighted(p, i)
+        if ti.static(r.flag):
+            value *= scale
+        if ti.static(r.has_extra):
+            value += r.extra[i]
+        r.x[i][2] += 1.0
+        out[i] = value
+        last = value
+    return last
+
+
+def expected(r: Record, scale: float) -> np.ndarray:
+    """What `evaluate` should give."""
+    x, table = r.x.to_numpy(), r.table.to_numpy()
+    value = np.linalg.norm(x, axis=1) + table[:, 1, 2]
+    value += sum(p.weight.to_numpy() ** p.power + p.first for p in r.parts)
+    return (scale if r.flag else 1.0) * value + (0.0 if r.extra is None else 0.5)
+
+
+def check(r: Record, scale: float = 3.0) -> None:
+    out, values, x = np.zeros(r.n), expected(r, scale), r.x.to_numpy()
+    last = evaluate(r, scale, out)
+    assert out == pytest.approx(values, rel=1e-14) and last == out[-1]
+    assert np.array_equal(r.x.to_numpy(), x + (0.0, 0.0, 1.0))
+
+
+def test_records_of_all_sizes_share_one_kernel(machine):
+    arena, before = FieldArena(), runtime.n_compiled()
+    for n in (3, 1, 50):
+        record = make(arena, n)
+        check(record)
+        check(record, 0.5)
+    assert runtime.n_compiled() == before + 1
+    check(make(arena, 4, unused=("not used", "in the kernel")))
+    assert runtime.n_compiled() == before + 1
+    arena.release()
+
+
+def test_another_structure_is_compiled_anew(machine):
+    arena, before = FieldArena(), runtime.n_compiled()
+    for k, changes in enumerate(({}, {"flag": False}, {"extra": True}, {"power": 3}, {"extra": True, "power": 3})):
+        check(make(arena, 5, **changes))
+        assert runtime.n_compiled() == before + k + 1
+    arena.release()
+
+
+@kernel
+def combine(x: ti.template(), law: ti.template(), n: ti.template(), a: ti.f64, k: ti.i32, out: ti.types.ndarray()):
+    for i in range(out.shape[0]):
+        out[i] = a * x[i] + k + n + ti.static(law.SOFTENS_BELOW)
+
+
+def test_types_modules_and_constants_are_compiled_anew(machine):
+    arena, before = FieldArena(), runtime.n_compiled()
+    arrays = [arena.field(f"x{k}", ti.f64, 3 + k, np.arange(3.0 + k)) for k in range(2)]
+    single = arena.field("y", ti.f32, 4, np.arange(4.0))
+    for x in (*arrays, single):
+        for law in (corotational, stable_neo_hookean):
+            for n in (1, 2, 1.5):
+                out = np.zeros(3)
+                combine(x, law, n, 2.0, np.int64(-7), out)
+                assert out.tolist() == [2.0 * k - 7 + n + law.SOFTENS_BELOW for k in range(3)]
+    assert runtime.n_compiled() == before + 2 * 2 * 3
+    combine(single, corotational, 1, 1.0, 0, np.zeros(2, dtype=np.float32))  # another type of array
+    assert runtime.n_compiled() == before + 13
+    arena.release()
+
+
+def test_wrong_arguments_are_refused(machine):
+    arena = FieldArena()
+    x, out = arena.field("x", ti.f64, 5), np.zeros(4)
+    for _ in range(2):
+        combine(x, corotational, 0, 1.0, 1, out)
+    with pytest.raises(TypeError):
+        combine(x, corotational, 0, 1.0, 1.5, out)
+    with pytest.raises(TypeError):
+        combine(x, corotational, 0, "3.5", 1, out)
+    with pytest.raises(ValueError, match="contiguous"):
+        combine(x, corotational, 0, 1.0, 1, np.zeros(8)[::2])
+    for wrong in ((x, corotational, 0, 1.0, 1), (x, corotational, 0, 1.0, 1, out, out)):
+        with pytest.raises(TypeError, match="takes 6 arguments, not"):
+            combine(*wrong)
+    arena.release()
+
+
+def test_launches_keep_no_reference_to_a_record(machine):
+    arena = FieldArena()
+    record = make(arena, 4)
+    check(record)
+    references = [weakref.ref(thing) for thing in (record, record.x, record.parts[0].weight)]
+    ready = sum(len(known._ready) for known in runtime._all_kernels)
+    arena.release()
+    del record
+    gc.collect()
+    assert not any(reference() for reference in references)
+    if not launching.PUBLIC:
+        assert sum(len(known._ready) for known in runtime._all_kernels) < ready
+
+
+def test_a_new_taichi_compiles_anew():
+    for _ in range(2):
+        with opened("f64"):
+            arena, before = FieldArena(), runtime.n_compiled()
+            for _ in range(3):
+                check(make(arena, 4))
+            assert runtime.n_compiled() == before + 1
+            arena.release()
+        runtime._kind = None  # the next runtime initialises Taichi
+
+
+def test_index_masks_are_the_largest_that_31_bits_can_address():
+    for n, extents in ((0, ()), (2, ()), (3, ()), (12, ()), (0, (9, 4)), (3, (3,))):
+        numbers, mask = max(n, 1) * int(np.prod(extents, initial=1)), index_mask(n, extents)
+        assert (mask + 1) & mask == 0 and (mask + 1) * numbers <= 2**31 < 2 * (mask + 1) * numbers * 2

@@ -1,0 +1,125 @@
+"""The Taichi runtime of a process:
+
+* it has one arch and precision at a time; others are refused while it is open, with the name of its user;
+* after the last close any kind can be opened, and the same kind is not initialised again;
+* without CUDA, arch 'cuda' is refused, and the CPU still works;
+* launches are counted by kernel name, and a first launch counts as compile time; errors of a kernel name its file and line.
+"""
+
+import numpy as np
+import pytest
+import taichi as ti
+from taichi._lib import core
+
+from taisoft.backend import launching, runtime
+from taisoft.backend.arrays import FieldArena
+from taisoft.backend.runtime import kernel, open_runtime
+from taisoft.errors import SimulationError
+from tests.backend.lanes import opened
+
+
+@kernel
+def add_one(x: ti.template()):
+    for i in x:
+        x[i] = x[i] + 1.0
+
+
+def test_only_one_kind_is_open_at_a_time():
+    first = open_runtime("cpu", "f32", "the first one")
+    second = open_runtime("cpu", "f32", "the second one")
+    message = "is open with arch 'cpu' and precision 'f32', .*close it before requesting 'cpu' and 'f64'"
+    for holder, claim in (("the first one", first), ("the second one", second)):
+        with pytest.raises(SimulationError, match=f"{holder} {message}"):
+            open_runtime("cpu", "f64")
+        assert runtime.open_kind() == ("cpu", "f32") and ti.cfg.default_fp == ti.f32
+        claim.close()
+        claim.close()  # closing twice is allowed
+    assert runtime.open_kind() is None
+    with opened("f64") as machine:
+        assert runtime.open_kind() == ("cpu", "f64") and ti.cfg.default_fp == ti.f64
+        assert (machine.np_real, machine.eps) == (np.float64, np.finfo(np.float64).eps)
+
+
+def test_the_same_kind_is_not_initialised_again(monkeypatch):
+    with opened("f64"):
+        pass
+    monkeypatch.setattr(runtime, "_initialise", lambda *kind: pytest.fail(f"initialised again as {kind}"))
+    with opened("f64"), opened("f64"):
+        pass
+
+
+def test_an_initialisation_from_outside_is_replaced():
+    """By ti.init, with the optimisation that miscompiles."""
+    with opened("f32"):
+        pass
+    ti.init(arch=ti.cpu, default_fp=ti.f64, log_level=ti.ERROR)
+    with opened("f32"):
+        assert ti.cfg.default_fp == ti.f32 and not ti.cfg.cfg_optimization and not ti.cfg.fast_math
+
+
+@pytest.mark.skipif(core.with_cuda(), reason="this machine has CUDA")
+def test_cuda_is_refused_on_a_machine_without_it():
+    with pytest.raises(SimulationError, match="^arch 'cuda' is not available on this machine"):
+        open_runtime("cuda", "f32")
+    assert runtime.open_kind() is None
+    with opened("f32"):
+        assert ti.cfg.arch == ti.x64 or ti.cfg.arch == ti.arm64
+
+
+@pytest.mark.parametrize("kind, message", [(("opencl", "f32"), "arch 'opencl' is unknown"), (("cpu", "f16"), "'f16' is unknown")])
+def test_unknown_kinds_are_refused(kind, message):
+    with pytest.raises(SimulationError, match=message):
+        open_runtime(*kind)
+
+
+def test_launches_and_compile_time_are_counted():
+    with opened("f64"):
+        arena = FieldArena()
+        x, y = arena.field("x", ti.f64, 2), arena.field("y", ti.f64, 2)
+        before, clock = runtime.launches["add_one"], runtime.compile_clock()
+        add_one(x)
+        first = runtime.compile_clock()
+        assert first > clock
+        for _ in range(3):
+            add_one(x)
+        assert runtime.compile_clock() == first and runtime.launches["add_one"] == before + 4
+        compiled = runtime.n_compiled()
+        add_one(y)  # a field of the same type
+        assert runtime.compile_clock() == first and runtime.n_compiled() == compiled
+        assert x.to_numpy().tolist() == [4.0, 4.0] and y.to_numpy().tolist() == [1.0, 1.0]
+        arena.release()
+
+
+@kernel
+def faulty(x: ti.template()):
+    for i in x:
+        x[i] = unknown_name  # noqa: F821
+
+
+@kernel(cse=False)
+def sums(x: ti.template(), out: ti.types.ndarray()):
+    for i in range(3):
+        out[i] = (x[i] + 1.0) * (x[i] + 1.0)
+
+
+def test_a_kernel_without_cse_is_compiled_at_level_0(monkeypatch):
+    with opened("f64"):
+        arena, config, levels = FieldArena(), ti.lang.impl.get_runtime().prog.config(), []
+        x, out = arena.field("x", ti.f64, 3, np.arange(3.0)), np.zeros(3)
+        compiled = launching.Compiled
+        monkeypatch.setattr(launching, "Compiled", lambda *a: levels.append(config.opt_level) or compiled(*a))
+        for _ in range(2):
+            sums(x, out)
+            assert np.array_equal(out, [1.0, 4.0, 9.0]) and config.opt_level == 1
+        assert levels == [0]
+        arena.release()
+
+
+def test_errors_of_a_kernel_name_its_file_and_line():
+    """Taichi's excerpt of the source is left out."""
+    with opened("f64"):
+        arena = FieldArena()
+        x = arena.field("x", ti.f64, 2)
+        with pytest.raises(ti.TaichiNameError, match=r'File ".*test_runtime.py", line \d+, in faulty:(.|\n)*unknown_name'):
+            faulty(x)
+        arena.release()

@@ -1,0 +1,253 @@
+"""The command line, except for runs (see test_cli_run.py):
+
+* bad input: exit status 2, one sentence that names the cause, no traceback, no output file;
+* settings: options override --set, --set overrides the scene's solver dict, and contradictions are refused;
+* list, info, doctor and bench list what is available, without importing Taichi.
+"""
+
+import os
+import subprocess
+import sys
+import tomllib
+from argparse import Namespace
+
+import pytest
+
+import taisoft as ts
+from taisoft.cli import main, parse_scalar, scene_file
+from taisoft.cli.run import resolve
+from taisoft.errors import SceneError
+from tests.cli.command import BEAM, ROOT, child, run, write
+
+
+class FakeSimulator:
+    """The signature that settings are checked against."""
+
+    def __init__(self, scene, dt=1 / 60, arch="cpu", precision="f32", newton_tolerance=None):
+        pass
+
+
+# --- bad input --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "text, message",
+    [
+        ("def build(:\n    pass\n", "line 1: SyntaxError"),
+        ("import taisoft as ts\n", "no function build()"),
+        ("build = 3\n", "no function build()"),
+        ("def build():\n    return 3\n", "build() returned int, a Scene is needed"),
+        ("def build():\n    a = 1\n    return a / 0\n", "line 3: ZeroDivisionError: division by zero"),
+        ("import not_there_at_all\n", "line 1: ModuleNotFoundError"),
+        ("raise SystemExit(0)\n", "line 1: SystemExit: 0"),
+        (BEAM.replace("young=1e5", "young=-1"), "line 9: material: young must be greater than 0"),
+        (BEAM.replace("(4, 1, 1), (4, 2, 2)", "(4, 0, 1), (4, 2, 2)"), "line 9: "),
+        (BEAM.replace("solver = {", "solver = 3, {"), "solver must be a dict"),
+        (BEAM.replace('"dt"', '"dtt"'), "'dtt' (did you mean dt?)"),
+        (BEAM.replace("1 / 240", "0.0"), "dt must be greater than 0 s, not 0.0"),
+        (BEAM.replace("1 / 240", "0.5"), "above the estimated stability limit"),
+        (BEAM.replace("0.1", "-0.1"), "seconds must be greater than 0, not -0.1"),
+        (BEAM.replace("symplectic_euler", "simplectic_euler"), "did you mean 'symplectic_euler'?"),
+    ],
+)
+def test_bad_scene_files_are_refused(tmp_path, capsys, text, message):
+    path = write(tmp_path / "scene.py", text)
+    assert run(path, "--out", tmp_path / "out") == 2
+    error = capsys.readouterr().err
+    assert message in error and error.startswith("taisoft: ") and error.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    "arguments, message",
+    [
+        (["--set", "solver.dt=0"], "dt must be greater than 0 s, not 0"),
+        (["--set", "solver.newton_tolerence=1e-3"], "did you mean newton_tolerance?"),
+        (["--set", "solver.contact_solver=augmented_lagrangian"], "does not fit symplectic_euler: use 'auto' or "),
+        (["--set", "gravity=3"], "write solver.KEY=VALUE"),
+        (["--set", "solver.dt=1 ms"], "'1 ms' is not a number"),
+        (["--seconds", "0"], "seconds must be greater than 0, not 0.0"),
+        (["--seconds", "nan"], "seconds must be finite, not nan"),
+        (["--fps", "-30"], "fps must be greater than 0, not -30.0"),
+        (["--resume", "c.npz"], "c.npz: no such checkpoint"),
+        (["--checkpoint-every", "0"], "--checkpoint-every must be greater than 0 s, not 0"),
+        (["--precision", "f64", "--set", "solver.precision=f32"], "disagree"),
+    ],
+)
+def test_bad_settings_are_refused(beam, tmp_path, capsys, arguments, message):
+    assert run(beam, "--out", tmp_path / "out", *arguments) == 2
+    error = capsys.readouterr().err
+    assert message in error and error.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    "name, message",
+    [
+        ("not_there.py", "not_there.py: no such file"),
+        ("not_there.toml", "not_there.toml: no such file"),
+        ("no_such_demo", "neither a demo nor a .toml or .py file"),
+    ],
+)
+def test_unknown_scenes_are_refused(capsys, name, message):
+    assert run(name) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_the_closest_demo_is_suggested(tmp_path, monkeypatch, capsys):
+    (tmp_path / "demos").mkdir()
+    write(tmp_path / "demos" / "hanging_beam.py", BEAM)
+    monkeypatch.setattr(scene_file, "PACKAGE", tmp_path)
+    assert run("hanging_bem") == 2
+    assert "did you mean hanging_beam?" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("arguments", [[], ["run"], ["run", "a.py", "--arch", "tpu"]])
+def test_bad_usage_is_refused(arguments, capsys):
+    with pytest.raises(SystemExit) as caught:
+        main(arguments)
+    assert caught.value.code == 2
+    assert "usage: taisoft" in capsys.readouterr().err
+
+
+# --- settings ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "text, value",
+    [("0.01", 0.01), ("1", 1), ("true", True), ("bdf2", "bdf2"), ('"bdf2"', "bdf2"), ("none", None), ("1e-3", 1e-3)],
+)
+def test_scalars_keep_their_type(text, value):
+    parsed = parse_scalar(text, "solver.x=" + text)
+    assert parsed == value and type(parsed) is type(value)
+
+
+@pytest.mark.parametrize("text", ["", "[1]", "{a = 1}", "1\nb = 2", "1 2", "2020-01-01", "a-b", "__import__('os')"])
+def test_values_that_are_no_scalars_are_refused(text):
+    with pytest.raises(SceneError):
+        parse_scalar(text, "solver.x=" + text)
+
+
+def test_options_override_set_and_set_overrides_the_scene():
+    given = {"arch": None, "precision": "f64", "tolerance": None, "seconds": 2.0, "fps": None}
+    arguments = Namespace(**given, assignments=["solver.dt=0.5", "solver.fps=none"])
+    resolved = resolve({"dt": 0.1, "precision": "f32", "seconds": 1.0, "fps": 30}, arguments, FakeSimulator)
+    assert resolved.simulator == {"dt": 0.5, "precision": "f64"}
+    assert (resolved.seconds, resolved.fps) == (2.0, None)
+    expected = {"dt": 0.5, "arch": "cpu", "precision": "f64", "newton_tolerance": None, "seconds": 2.0, "fps": None}
+    assert resolved.as_dict() == expected
+
+
+# --- other commands ---------------------------------------------------------------------------------------------------
+
+
+def test_list_shows_first_lines_and_runs_nothing(tmp_path, monkeypatch, capsys):
+    (tmp_path / "demos").mkdir()
+    write(tmp_path / "demos" / "one.py", '"""The first.\n\nMore."""\nraise RuntimeError\n')
+    write(tmp_path / "demos" / "two.py", "raise RuntimeError\n")
+    write(tmp_path / "demos" / "_helper.py", "raise RuntimeError\n")
+    monkeypatch.setattr(scene_file, "PACKAGE", tmp_path)
+    assert main(["list"]) == 0
+    assert capsys.readouterr().out.splitlines() == ["one  The first.", "two"]
+
+
+@pytest.mark.parametrize("kind", ["wheel", "checkout"])
+def test_demos_are_found(tmp_path, monkeypatch, kind):
+    package = tmp_path / "taisoft"
+    folder = (package if kind == "wheel" else tmp_path) / "demos"
+    package.mkdir()
+    folder.mkdir()
+    write(folder / "one.py", BEAM)
+    monkeypatch.setattr(scene_file, "PACKAGE", package)
+    assert scene_file.find_scene("one") == folder / "one.py"
+
+
+def test_every_demo_has_a_description(capsys):
+    assert main(["list"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert "hanging_beam" in [line.split()[0] for line in lines]
+    assert all(len(line.split()) > 2 for line in lines)
+
+
+def test_info_shows_counts_and_measures(tmp_path, capsys):
+    path = tmp_path / "box.msh"
+    ts.write_mesh(path, ts.box_mesh((2, 1, 1), (2, 1, 1)))
+    assert main(["info", str(path)]) == 0
+    shown = capsys.readouterr().out
+    for part in (
+        "12 vertices, 10 tets, 20 surface triangles, 1 piece",
+        "x 2 (-1 to 1), y 1 (-0.5 to 0.5), z 1 (-0.5 to 0.5)",
+        "y is taken for up",
+        "volume     2\n",
+        "metres",
+    ):
+        assert part in shown
+    assert "mean ratio 0.8" in shown and "problems   none" in shown
+
+
+@pytest.mark.filterwarnings("ignore:.*nearly flat")
+@pytest.mark.parametrize(
+    "size, message", [((100, 50, 50), "probably millimetres"), ((1, 1, 1e-3), "problems   5 tets are nearly flat or needles")]
+)
+def test_info_shows_problems(tmp_path, capsys, size, message):
+    path = tmp_path / "part.msh"
+    ts.write_mesh(path, ts.box_mesh((1, 1, 1), size))
+    assert main(["info", str(path)]) == 0
+    assert message in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("content", [b"", b"\x00\x01random", None])
+def test_info_refuses_other_files(tmp_path, capsys, content):
+    path = tmp_path / "mesh.msh"
+    if content is not None:
+        path.write_bytes(content)
+    assert main(["info", str(path)]) == 2
+    error = capsys.readouterr().err
+    assert "mesh.msh" in error and error.count("\n") == 1
+
+
+def test_doctor_lists_what_is_installed_and_missing(monkeypatch, capsys):
+    from taisoft.cli import doctor
+
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    declared = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    for package, extra in doctor.OPTIONAL.items():
+        assert any(requirement.startswith(package) for requirement in declared[extra])
+    assert set(declared) - set(doctor.OPTIONAL.values()) == {"docs", "dev"}
+    monkeypatch.setattr(doctor, "OPTIONAL", {"surely-not-installed": "mesh"})
+    monkeypatch.setattr(doctor, "KERNEL", "no-kernel")
+    assert main(["doctor"]) == 0
+    shown = capsys.readouterr().out
+    for part in ("taichi 1.7.4", "arch cpu   yes", "arch cuda", "vulkan", "display    no"):
+        assert part in shown
+    assert "surely-not-installed missing: pip install 'taisoft[mesh]'" in shown
+    assert "no-kernel missing: pip install jupyterlab nbconvert" in shown
+
+
+def test_bench_passes_its_arguments_on(tmp_path, monkeypatch, capsys):
+    folder = tmp_path / "benchmarks"
+    folder.mkdir()
+    write(folder / "part.py", "FIVE = 5\n")
+    text = '"""Counts."""\nfrom .part import FIVE\n\n\ndef main(argv):\n    print(argv)\n    return FIVE\n'
+    write(folder / "counting.py", text)
+    monkeypatch.setattr(scene_file, "PACKAGE", tmp_path)
+    assert main(["bench", "counting", "--arch", "cpu", "x"]) == 5
+    assert capsys.readouterr().out == "['--arch', 'cpu', 'x']\n"
+    assert main(["bench"]) == 0
+    assert capsys.readouterr().out.splitlines()[1:] == ["counting  Counts."]
+    assert main(["bench", "countin"]) == 2
+    assert "did you mean counting?" in capsys.readouterr().err
+
+
+def test_list_imports_no_taichi(tmp_path):
+    code = "import sys, taisoft\nfrom taisoft.cli import main\nmain(['list'])\nassert 'taichi' not in sys.modules\n"
+    subprocess.run([sys.executable, "-c", code], check=True, env=os.environ | {"PYTHONPATH": str(ROOT)}, cwd=tmp_path)
+
+
+def test_a_closed_pipe_gives_no_traceback():
+    process = child("doctor")
+    process.stdout.close()
+    error = process.stderr.read()
+    assert process.wait(timeout=60) == 3
+    assert "Traceback" not in error and "Exception ignored" not in error

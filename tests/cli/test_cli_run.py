@@ -1,0 +1,268 @@
+"""`taisoft run`, from its first step on:
+
+* runs: exit status 0, and a report with every resolved setting; 1 if the run failed;
+* output that cannot be written: exit status 3, and the results are still reported;
+* signals: the first one saves and exits with 130 or 143; one before the run, or a second one, exits immediately;
+* README: its scene runs from the command line and from Python, and so does the contact example of the manual;
+* a machine without display, home or working folder: a run, or one message.
+"""
+
+import os
+import re
+import signal
+import subprocess
+import sys
+
+import pytest
+
+from taisoft.cli import main, recording
+from taisoft.errors import OutputError
+from taisoft.view import pictures
+from tests.cli.command import BEAM, LED, ROOT, SHORT_OUTPUT, child, report, run, write
+
+# --- runs -------------------------------------------------------------------------------------------------------------
+
+
+def test_a_run_writes_and_prints_its_results(beam, tmp_path, capsys):
+    out = tmp_path / "out"
+    assert run(beam, "--out", out, "--set", "solver.dt=0.004") == 0
+    record = report(out)
+    assert record["status"] == "ok" and record["sim_seconds"] == pytest.approx(0.1)
+    lowered = "dt lowered from 0.004 s to 0.0037037 s"
+    assert [problem for problem in record["problems"] if problem.startswith(f"note: {lowered}, so that 9 steps make a frame")]
+    assert record["dt_requested"] == 0.004 and record["dt"] == pytest.approx(1 / 270)
+    expected = {"integrator": "symplectic_euler", "fps": 30, "seconds": 0.1, "allow_unstable": False}
+    assert expected.items() <= record["settings"].items()
+    assert record["settings"]["dt"] == pytest.approx(1 / 270)  # the dt in use, not the requested one
+    assert record["plan"]
+    assert sorted(path.name for path in (out / "frames").iterdir()) == [f"{i:05d}.png" for i in range(4)]
+    assert len((out / "steps.csv").read_text().splitlines()) == 4 and (out / "scene.usdc").stat().st_size > 0
+    shown = capsys.readouterr().out
+    assert shown.count("dt lowered") == 1
+    for word in ("fixed_nodes", f"\n\nstatus   ok; {lowered}\n", "min J", "kinetic", "report.json", "(4 pictures"):
+        assert word in shown
+    assert len(shown.splitlines()) < 40  # one screen
+
+
+def test_results_are_replaced_only_on_request(beam, tmp_path, capsys):
+    out = tmp_path / "out"
+    assert run(beam, "--out", out) == 0
+    before = (out / "report.json").read_bytes()
+    assert run(beam, "--out", out) == 3
+    assert "already holds results" in capsys.readouterr().err
+    assert (out / "report.json").read_bytes() == before
+    assert run(beam, "--out", out, "--overwrite", *SHORT_OUTPUT) == 0
+    assert (out / "report.json").read_bytes() != before
+    assert not (out / "scene.usdc").exists()  # it was of the earlier run
+
+
+def test_without_out_nothing_is_written(beam, tmp_path, monkeypatch):
+    (tmp_path / "empty").mkdir()
+    monkeypatch.chdir(tmp_path / "empty")
+    assert run(beam) == 0
+    assert not list((tmp_path / "empty").iterdir())
+
+
+def test_a_failed_run_is_reported(tmp_path, capsys):
+    path = write(tmp_path / "led.py", LED.replace("{body}", "return (0, 0, 0) if t < 0.05 else (0, float('nan'), 0)"))
+    out = tmp_path / "out"
+    assert run(path, "--out", out, *SHORT_OUTPUT) == 1
+    record = report(out)
+    assert record["status"] == "failed" and 0.0 < record["sim_seconds"] < 0.1
+    assert record["problems"] and record["problems"][0] in capsys.readouterr().out.replace("\n         ", " ")
+
+
+def test_warnings_are_printed_once_and_reported(tmp_path, capsys):
+    path = write(tmp_path / "stiff.py", BEAM.replace("young=1e5", "young=1e5, poisson=0.495"))
+    out = tmp_path / "out"
+    assert run(path, "--out", out, *SHORT_OUTPUT) == 0
+    error = capsys.readouterr().err
+    assert error.count("taisoft: warning: body 'beam': poisson = 0.495") == 1
+    assert report(out)["problems"][0].startswith("warning: body 'beam': poisson = 0.495")
+
+
+def test_the_summary_names_notes_and_warnings(tmp_path, capsys):
+    """Problems first; an ok run has none."""
+    path = write(tmp_path / "stiff.py", BEAM.replace("young=1e5", "young=1e5, poisson=0.495"))
+    assert run(path, "--set", "solver.dt=0.004", "--set", "solver.fps=none", "--seconds", "0.001") == 0
+    shown = capsys.readouterr().out
+    assert "\nwarning  body 'beam': poisson = 0.495" in shown and "\nnote     0.001 s are less than half a step" in shown
+    assert "problem" not in shown and shown.index("\nwarning") < shown.index("\nnote")
+
+
+def test_the_plan_is_short_unless_verbose(beam, capsys):
+    assert run(beam, "--seconds", "0.01") == 0
+    short = capsys.readouterr().out
+    assert "\nleft out" not in short and "plan     law:stable_neo_hookean, " in short and "used by" not in short
+    assert run(beam, "--seconds", "0.01", "--verbose") == 0
+    assert re.search(r"law:stable_neo_hookean +used by beam\n", full := capsys.readouterr().out) and "\nleft out law:" in full
+
+
+def test_a_run_with_twins_says_what_they_cost(beam, capsys):
+    assert run(beam, "--seconds", "0.05", "--error-mesh", "refined") == 0
+    shown = capsys.readouterr().out
+    assert "\ntwins    follow the run, the one on the refined mesh for some 10 to 40 times its work" in shown
+    assert re.search(r"; plus \d+\.\d\d s of twins for the error and ", shown)
+
+
+def test_a_scene_may_import_its_neighbour(tmp_path):
+    write(tmp_path / "beam_parts_of_this_test.py", BEAM)
+    path = write(tmp_path / "scene.py", "from beam_parts_of_this_test import build, solver\n")
+    assert run(path) == 0
+
+
+def test_a_picture_that_cannot_be_written_ends_the_run(beam, tmp_path, monkeypatch, capsys):
+    class FullDisk(pictures.FrameWriter):
+        def frame(self, sim, index):
+            if index == 2:
+                raise OutputError("cannot write frames/00002.png (9 bytes): No space left on device")
+            super().frame(sim, index)
+
+    monkeypatch.setattr(pictures, "FrameWriter", FullDisk)
+    out = tmp_path / "out"
+    assert run(beam, "--out", out) == 3
+    assert "taisoft: cannot write frames/00002.png" in capsys.readouterr().err
+    record = report(out)
+    assert record["status"] == "degraded" and not record["interrupted"]
+    assert record["sim_seconds"] == pytest.approx(2 / 30)
+    assert any("frames/00002.png" in problem for problem in record["problems"])
+    assert (out / "scene.usdc").exists() and len(list((out / "frames").iterdir())) == 2
+
+
+def refuse(file: str):
+    """A function that raises because the disk is full."""
+
+    def raise_error(*_, **__):
+        raise OutputError(f"cannot write {file}: No space left on device")
+
+    return raise_error
+
+
+def test_a_report_that_cannot_be_written(beam, tmp_path, monkeypatch, capsys):
+    """Of a resumed run, and of one that replaces an earlier run: the earlier report is removed."""
+    out = tmp_path / "out"
+    assert run(beam, "--out", out, *SHORT_OUTPUT) == 0 and report(out)["status"] == "ok"
+    before = (out / "report.json").read_bytes()
+    capsys.readouterr()
+    monkeypatch.setattr(recording, "write_report", refuse("report.json"))
+    assert run(beam, "--out", out, "--resume", out / "checkpoint.npz", "--seconds", "0.2", *SHORT_OUTPUT) == 3
+    assert_degraded(capsys.readouterr(), "cannot write report.json")
+    assert not (out / "report.json").exists() and (out / "steps.csv").exists()
+    (out / "report.json").write_bytes(before)
+    assert run(beam, "--out", out, "--overwrite", *SHORT_OUTPUT) == 3
+    assert_degraded(capsys.readouterr(), "cannot write report.json")
+    assert not (out / "report.json").exists() and not (out / "steps.csv").exists()
+
+
+def test_a_video_that_cannot_be_written(beam, tmp_path, monkeypatch, capsys):
+    """The report, written before, is updated."""
+    out = tmp_path / "out"
+    monkeypatch.setattr(recording, "write_video", refuse("video.mp4"))
+    monkeypatch.setattr(recording, "find_ffmpeg", lambda: "ffmpeg")
+    assert run(beam, "--out", out, "--video", "--no-usd", "--seconds", "0.03") == 3
+    assert_degraded(capsys.readouterr(), "cannot write video.mp4")
+    assert report(out)["status"] == "degraded" and "cannot write video.mp4" in report(out)["problems"][-1]
+
+
+def assert_degraded(captured, *errors):
+    """Check for a degraded status in the summary, and a line on stderr for each output that failed."""
+    assert "status   degraded" in captured.out and not re.search(r"\bok\b", captured.out)
+    lines = captured.err.splitlines()
+    assert len(lines) == len(errors) and all(line.startswith(f"taisoft: {error}") for line, error in zip(lines, errors)), lines
+
+
+def test_without_display_there_is_no_window(beam, monkeypatch, capsys):
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    assert main(["run", str(beam)]) == 0
+    captured = capsys.readouterr()
+    assert "taisoft: running without a window: there is no display" in captured.err and "status   ok" in captured.out
+
+
+def test_examples_of_readme_and_manual_run(tmp_path):
+    scene, script = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
+    contacts = re.search(r"```python\n(.*?)```", (ROOT / "docs" / "contacts.md").read_text(), re.DOTALL)[1]
+    path = write(tmp_path / "script.py", scene + script.replace("seconds=2.0", "seconds=0.1"))
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    done = subprocess.run([sys.executable, path], env=environment, capture_output=True, text=True, check=True)
+    assert re.search(r"^ok \[-2\. ", done.stdout, re.MULTILINE)
+    assert run(write(tmp_path / "my_scene.py", scene), "--seconds", "0.1") == 0  # kernels are already compiled
+    path = write(tmp_path / "contacts.py", contacts)
+    done = subprocess.run([sys.executable, path], env=environment, capture_output=True, text=True, check=True)
+    # the ground is pressed down, and presses the beam up
+    assert re.search(r"^52 0\.0 \[ *\S+ -\S+ +\S+\] \[ *-?\S+ +\d\S+ +-?\S+\]$", done.stdout, re.MULTILINE)
+
+
+# --- signals ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_first_signal_saves_the_results(tmp_path, number, capfd):
+    raising = f"import signal; signal.raise_signal({int(number)}) if 0.05 < t < 0.0542 else None\n    return (0, 0, 0)"
+    path = write(tmp_path / "led.py", LED.replace("{body}", raising))
+    before = signal.getsignal(number)
+    assert run(path, "--out", tmp_path / "out", "--no-frames") == 128 + number
+    assert signal.getsignal(number) is before
+    record = report(tmp_path / "out")
+    assert record["interrupted"] and record["status"] == "degraded" and 0.0 < record["sim_seconds"] < 0.1
+    assert (tmp_path / "out" / "scene.usdc").exists()
+    captured = capfd.readouterr()
+    assert "ended early by a signal" in captured.out and "a second signal exits immediately" in captured.err
+
+
+def test_signal_before_the_run_writes_nothing(tmp_path, capsys):
+    text = BEAM.replace("    scene = ts.Scene()", "    import signal; signal.raise_signal(15)\n    scene = ts.Scene()")
+    assert run(write(tmp_path / "scene.py", text), "--out", tmp_path / "out") == 143
+    assert "nothing was written" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_second_signal_exits_immediately(tmp_path):
+    """The scene hangs inside a step after the first signal, so that only the second one can end the process."""
+    hanging = "import signal, time; t > 0.05 and (signal.raise_signal(2), time.sleep(60))\n    return (0, 0, 0)"
+    path = write(tmp_path / "led.py", LED.replace("{body}", hanging))
+    process = child("run", path, "--headless", "--out", tmp_path / "out", *SHORT_OUTPUT)
+    try:
+        for line in process.stderr:
+            if "a second signal exits immediately" in line:
+                break
+        process.send_signal(signal.SIGTERM)
+        process.communicate(timeout=50)  # of the 60 s that it would hang
+    finally:
+        process.kill()
+    assert process.returncode == 143
+    assert not (tmp_path / "out" / "report.json").exists()
+
+
+# --- environment ------------------------------------------------------------------------------------------------------
+
+
+def test_deleted_working_folder(beam, tmp_path):
+    (tmp_path / "gone").mkdir()
+    text = "import os, sys; os.rmdir(os.getcwd()); from taisoft.cli import main; sys.exit(main(sys.argv[1:]))"
+    done = subprocess.run(
+        [sys.executable, "-c", text, "run", beam, "--headless", "--out", tmp_path / "out"],
+        cwd=tmp_path / "gone",
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 2
+    assert done.stderr == "taisoft: the working folder cannot be used (No such file or directory): change to another one\n"
+    assert not (tmp_path / "out").exists()
+
+
+def test_home_is_not_set(beam):
+    environment = {name: value for name, value in os.environ.items() if name != "HOME"} | {"PYTHONPATH": str(ROOT)}
+    command = [sys.executable, "-m", "taisoft", "run", str(beam), "--headless"]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0 and "status   ok" in done.stdout, done.stderr
+
+
+def test_a_layer_of_fixed_nodes_says_why_it_shows_nothing(beam, tmp_path, capsys):
+    path = write(tmp_path / "led.py", LED.replace("{body}", "return 0, 0, 0").replace("body.fix(lambda X: X[:, 0] < -1.99)", ""))
+    show = ("--seconds", "0.01", "--layers", "fixed_nodes", "--no-usd", "--out")
+    assert run(path, *show, tmp_path / "led") == 0
+    assert "--layers fixed_nodes: no node is fixed; nodes that follow a path have no balls" in capsys.readouterr().err
+    assert run(beam, *show, tmp_path / "beam") == 0
+    assert "no node is fixed" not in capsys.readouterr().err

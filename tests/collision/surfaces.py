@@ -1,0 +1,128 @@
+"""Surfaces for the tests of the broad phases and of what follows them, and what NumPy says of them."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import SimpleNamespace
+
+import numpy as np
+
+from taisoft.backend.arrays import FieldArena
+from taisoft.collision.candidates import Candidates
+from taisoft.collision.colliders import make_topology
+from taisoft.collision.surface import build_surface, update_boxes
+from tests.backend.lanes import opened
+
+
+@contextmanager
+def surface_of(
+    parts: list[tuple[np.ndarray, np.ndarray]],
+    soft=None,
+    self_on=None,
+    move=None,
+    margin: float = 0.1,
+    precision: str = "f64",
+    serial: bool | None = None,
+) -> Iterator[SimpleNamespace]:
+    """The surface of colliders, each (vertices (v,3), triangles (t,3)), with boxes up to date: surface, topology, x, move,
+    margin, arena, machine. soft, self_on: (colliders,), all and none where None; move: (n_verts,3) [m], 0 where None."""
+    x = np.concatenate([vertices for vertices, _ in parts]).astype(np.float64)
+    topology = make_topology([(triangles, np.arange(len(vertices))) for vertices, triangles in parts])
+    soft = np.ones(len(parts), dtype=bool) if soft is None else np.asarray(soft)
+    self_on = np.zeros(len(parts), dtype=bool) if self_on is None else np.asarray(self_on)
+    move = np.zeros_like(x) if move is None else move
+    arena = FieldArena()
+    with opened(precision) as machine:
+        properties = {"soft": soft, "self_on": self_on, "mode": np.zeros(len(soft))}
+        properties |= dict.fromkeys(("thickness", "edge"), np.full(len(soft), np.inf))
+        surface = build_surface(topology, x, properties, machine, arena, serial)
+        made = SimpleNamespace(
+            surface=surface, topology=topology, soft=soft, self_on=self_on, margin=margin, arena=arena, machine=machine
+        )
+        place(made, x, move)
+        yield made
+    arena.release()
+
+
+def place(made: SimpleNamespace, x: np.ndarray, move: np.ndarray | None = None) -> None:
+    """Put the vertices somewhere and bring the boxes up to date."""
+    made.x, made.move = x, np.zeros_like(x) if move is None else move
+    made.surface.x.from_numpy(made.x)
+    made.surface.move.from_numpy(made.move)
+    update_boxes(made.surface, made.margin)
+
+
+def pairs_of(candidates: Candidates) -> np.ndarray:
+    """(k,2) pairs t < u, ascending; checks that rows hold both directions, ascending, each once."""
+    start, end, entry = (f.to_numpy() for f in (candidates.start, candidates.end, candidates.entry))
+    rows = [entry[a:b] for a, b in zip(start, end)]
+    assert all((np.diff(row) > 0).all() for row in rows)
+    both = np.stack([np.repeat(np.arange(len(rows)), [len(r) for r in rows]), np.concatenate([[], *rows])], axis=1).astype(int)
+    up, down = both[both[:, 0] < both[:, 1]], both[both[:, 0] > both[:, 1]][:, ::-1]
+    assert np.array_equal(up, down[np.lexsort((down[:, 1], down[:, 0]))]) and 2 * len(up) == len(both)
+    return up
+
+
+def brute_pairs(made: SimpleNamespace) -> np.ndarray:
+    """(k,2) pairs t < u, ascending, that may touch and whose swept, grown boxes overlap."""
+    t, body = made.topology.triangle, made.topology.body
+    ends = np.concatenate([made.x[t], (made.x + made.move)[t]], axis=1)
+    finite = np.isfinite(ends).all(axis=(1, 2))
+    lo, hi = ends.min(axis=1) - 0.5 * made.margin, ends.max(axis=1) + 0.5 * made.margin
+    lo[~finite], hi[~finite] = np.inf, -np.inf
+    meet = (lo[:, None] <= hi[None]).all(axis=2) & (lo[None] <= hi[:, None]).all(axis=2)
+    shared = (t[:, None, :, None] == t[None, :, None, :]).any(axis=(2, 3))
+    same = body[:, None] == body[None]
+    counts = np.where(same, made.self_on[body][:, None] & ~shared, made.soft[body][:, None] | made.soft[body][None])
+    return np.argwhere(np.triu(meet & counts, 1))
+
+
+def soup(rng: np.random.Generator, n: int, size: float = 0.3) -> tuple[np.ndarray, np.ndarray]:
+    """n triangles in a unit cube that share vertices at random, with needles and points among them."""
+    vertices = rng.random((n, 3))
+    triangles = rng.integers(0, n, (n, 3))
+    centre = rng.random((n, 3))
+    own = np.arange(3 * n).reshape(n, 3)
+    free = (centre[:, None] + size * (rng.random((n, 3, 3)) - 0.5)).reshape(-1, 3)
+    free[own[::7, 1]] = free[own[::7, 0]]  # needles
+    free[own[::11, 1]] = free[own[::11, 2]] = free[own[::11, 0]]  # points
+    used = rng.random(n) < 0.1  # a few large ones on common vertices
+    return np.concatenate([free, vertices]), np.where(used[:, None], 3 * n + triangles, own)
+
+
+def sheet(n: int, size: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
+    """A flat square of n x n cells in the xz-plane, two triangles each."""
+    i, j = np.meshgrid(np.arange(n + 1), np.arange(n + 1), indexing="ij")
+    vertices = np.stack([i.ravel(), 0 * i.ravel(), j.ravel()], axis=1) * (size / n)
+    a = (i[:-1, :-1] * (n + 1) + j[:-1, :-1]).ravel()
+    b, c, d = a + 1, a + n + 1, a + n + 2
+    return vertices, np.concatenate([np.stack([a, b, c], axis=1), np.stack([b, d, c], axis=1)])
+
+
+def folded(rng: np.random.Generator, n: int = 10) -> tuple[np.ndarray, np.ndarray]:
+    """A sheet bent by random waves, strong enough that it runs through itself here and there."""
+    vertices, triangles = sheet(n)
+    x = vertices.copy()
+    for _ in range(4):
+        k, direction = rng.uniform(-9.0, 9.0, 3), rng.standard_normal(3)
+        x += 0.2 * rng.uniform(0.5, 1.0) * np.sin(vertices @ k + rng.uniform(0, 6.3))[:, None] * direction
+    return x + 0.02 * rng.standard_normal(x.shape), triangles
+
+
+def separation(X: np.ndarray) -> np.ndarray:
+    """Largest gap (k,) between the shadows of two triangles X (k,6,3) on an axis, over all axes that can separate them,
+    degenerate ones too: the sign of the gap is exact for integers. Lengths are in units of the largest entry of each axis."""
+    a, b = X[:, :3], X[:, 3:]
+    ea, eb = np.roll(a, -1, axis=1) - a, np.roll(b, -1, axis=1) - b
+    w = a[:, :1] - b[:, :1]
+    edges = np.concatenate([ea, eb], axis=1)
+    normals = [np.cross(ea[:, :1], ea[:, 1:2]), np.cross(eb[:, :1], eb[:, 1:2])]
+    normals += [np.cross(ea[:, i : i + 1], eb) for i in range(3)]
+    normals = np.concatenate(normals, axis=1)
+    in_plane = [np.cross(normals, edges[:, i : i + 1]) for i in range(6)]
+    axes = np.concatenate([normals, *in_plane, edges, np.cross(edges, np.cross(w, edges)), w], axis=1)
+    shadow = np.einsum("inf,ikf->ikn", X, axes)
+    gap = np.maximum(
+        shadow[:, :, :3].min(axis=2) - shadow[:, :, 3:].max(axis=2), shadow[:, :, 3:].min(axis=2) - shadow[:, :, :3].max(axis=2)
+    )
+    length = np.abs(axes).max(axis=2)
+    return np.where(length > 0, gap / np.where(length > 0, length, 1), -np.inf).max(axis=1, initial=-np.inf)

@@ -1,0 +1,302 @@
+"""Passages in the contact detection:
+
+* those that are held become contacts: the nearest points of their features at their time, the normal between these, and the gap
+  of the same points now, against NumPy and ipctk;
+* those that pass in spite of that are taken where they come to lie, with the normal across their features, on their first side;
+* where nothing crosses, a contact of surfaces behind each other is none; passages and obstacles remain;
+* pairs of colliders that cross or lie inside each other are exempt until they do not, and no others.
+"""
+
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+import taichi as ti
+
+import taisoft as ts
+from taisoft.backend.arrays import FieldArena
+from taisoft.collision.near_list import SEARCHED
+from taisoft.collision.passages import ADJACENT, FLAT, N_FEATURES, N_KINDS, NEAR, ROUND
+from taisoft.collision.path_check import HeldPassages, adjacent_rows
+from tests.collision.detection_scenes import folded
+from tests.collision.rotations import rotation
+from tests.dynamics.scenes import dynamics, rows_of, set_state
+
+ipctk = pytest.importorskip("ipctk")
+from benchmarks.judge import axis_distance  # noqa: E402
+
+SETTINGS = {"dt": 1e-3, "integrator": "symplectic_euler", "allow_unstable": True, "self_collision": True}
+MATERIAL = ts.Material(young=1e3)
+
+
+class Detected:
+    """The detection of a scene, and searches along paths of its nodes."""
+
+    def __init__(self, made, path):
+        self.made, self._path = made, path
+        self.detection = made.find_contacts(0.0)
+
+    def search(self, x: np.ndarray, move: np.ndarray) -> None:
+        """Find contacts from nodes (n,3) [m] displaced by `move` [m], and obstacles from 0 to 1 s."""
+        set_state(self.made, x)
+        self._path.from_numpy(move)
+        self.again()
+
+    def again(self) -> None:
+        """Repeat the last search, with the passages held by now."""
+        self.detection.find(0.0, 1.0, None, self._path)
+
+    def meeting(self, mode: int = SEARCHED) -> set[frozenset[str]]:
+        """The names of colliders that would pass each other."""
+        names = [c.name for c in self.made.scene.colliders]
+        found = self.detection.colliders_of(self.detection.passages(mode)[0])
+        return {frozenset((names[a], names[b])) for a, b in found}
+
+
+@contextmanager
+def detected(scene: ts.Scene, precision: str = "f64"):
+    arena = FieldArena()
+    with dynamics(scene, precision=precision, **SETTINGS) as made:
+        yield Detected(made, arena.vectors("path", ti.f64, made.model.n_nodes))
+    arena.release()
+
+
+def held(pairs: np.ndarray, times: np.ndarray, passed: int = 0) -> HeldPassages:
+    """Passages held at their times, all of which passed in spite of their contacts, or none did."""
+    return HeldPassages(pairs, times, np.full(len(pairs), passed, dtype=np.int32))
+
+
+def crowd() -> ts.Scene:
+    """Two boxes turned at random above each other, on a ground that turns, beside a sphere and a capsule that move."""
+    scene = ts.Scene(gravity=(0, 0, 0))
+    for k, axis in enumerate(((1, 2, 3), (3, -1, 1))):
+        mesh = ts.box_mesh((2, 2, 2), (1.0, 1.0, 1.0))
+        mesh = ts.TetMesh(mesh.vertices @ rotation(axis, 0.7).T, mesh.tets)
+        scene.add_body(mesh, MATERIAL, name=f"box {k}", position=(0.0, 1.7 * k, 0.0))
+    scene.add_obstacle(ts.HalfSpace((0, -1.0, 0), (0, 1, 0)), path=lambda t: (np.zeros(3), rotation((0, 0, 1), 0.1 * t)))
+    scene.add_obstacle(ts.Sphere((1.4, 0, 0), 0.4), path=lambda t: ((-0.3 * t, 0, 0), np.eye(3)))
+    capsule = ts.Capsule((-1.3, 1.5, -0.5), (-1.3, 1.8, 0.5), 0.2)
+    scene.add_obstacle(capsule, path=lambda t: ((0.3 * t, 0, 0), rotation((0, 1, 0), 0.2 * t)))
+    return scene
+
+
+def distance_of(y: np.ndarray, f: int) -> float:
+    """Distance [m] of features f of the triangles in rows 0 to 2 and 3 to 5, by ipctk."""
+    if f < 6:
+        corners = y[3:] if f < 3 else y[:3]
+        if len(np.unique(corners, axis=0)) == 2:
+            ends = np.unique(corners, axis=0)
+            return float(np.sqrt(ipctk.point_edge_distance(y[f], *ends)))
+        return float(np.sqrt(ipctk.point_triangle_distance(y[f], *corners)))
+    i, j = (f - 6) // 3, (f - 6) % 3
+    return float(np.sqrt(ipctk.edge_edge_distance(y[i], y[(i + 1) % 3], y[3 + j], y[3 + (j + 1) % 3])))
+
+
+def axis_at(o, s: float) -> np.ndarray:
+    """The ends (2,3) of a capsule's axis, both the centre of a sphere, at a part of the straight path from 0 to 1 s [m]."""
+    ends = np.stack([o.shape.center] * 2 if isinstance(o.shape, ts.Sphere) else [o.shape.a, o.shape.b])
+    return (1.0 - s) * o.points_at(0.0, ends) + s * o.points_at(1.0, ends)
+
+
+def axis_point(o, p: np.ndarray, s: float) -> tuple[np.ndarray, np.ndarray]:
+    """The point of the axis nearest to p at a part of the path: where it is at first, and its displacement [m]."""
+    a, b = axis_at(o, s)
+    w = 0.0 if (a == b).all() else np.clip((p - a) @ (b - a) / ((b - a) @ (b - a)), 0.0, 1.0)
+    now, then = ((1.0 - w) * axis_at(o, at)[0] + w * axis_at(o, at)[1] for at in (0.0, 1.0))
+    return now, then - now
+
+
+@pytest.mark.parametrize("precision", ["f64", "f32"])
+def test_held_passages_are_contacts(precision):
+    kinds, rng = {}, np.random.default_rng(0)
+    with detected(crowd(), precision) as one:
+        d, scene, start = one.detection, one.made.scene, one.made.state.state()[0]
+        t, node = d.topology.triangle, d.topology.node
+        rows, n_soft = adjacent_rows(t), len(scene.bodies)
+        for noise in (0.15, 0.15, 0.5):
+            move = rng.uniform(-noise, noise, start.shape)
+            move[rows_of(one.made, "box 1"), 1] -= 0.5
+            move[rows_of(one.made, "box 0"), 1] -= 0.2
+            one.search(start, move)
+            d.held = held(*d.passages(SEARCHED))
+            time = dict(zip(map(tuple, d.held[0].tolist()), d.held[1].tolist()))
+            one.again()
+            c = d.contacts()
+            own = np.flatnonzero(c.kind == "face_face")
+            first, second = c.feature[own].T
+            keys = list(zip(first % N_KINDS, first // N_KINDS, second // N_FEATURES, second % N_FEATURES))
+            assert len(keys) == len(time) and set(keys) == set(time)
+            for k, (kind, a, b, f) in zip(own, keys):
+                s, nodes, w, n = time[kind, a, b, f], c.nodes[k], c.weights[k], c.normal[k]
+                x_a, move_a = w[:3] @ start[nodes[:3]], w[:3] @ move[nodes[:3]]
+                if kind in (NEAR, ADJACENT):
+                    i = node[np.concatenate([t[a], t[b]]) if kind == NEAR else rows[a]]
+                    x_b, move_b = w[3:] @ start[nodes[3:]], w[3:] @ move[nodes[3:]]
+                    radius, expected = 0.0, distance_of(start[i] + s * move[i], f)
+                    assert set(nodes[w > 0]) <= set(i)
+                else:
+                    o = scene.obstacles[d.colliders_of(np.array([(kind, a, b, f)]))[0, 1] - n_soft]
+                    x_b, move_b, radius, expected = o.shape.pivot, np.zeros(3), 0.0, 0.0
+                    if kind == ROUND:
+                        i, radius = node[t[a]], o.shape.radius
+                        x_b, move_b = axis_point(o, x_a + s * move_a, s)
+                        expected = axis_distance(*axis_at(o, s), np.asfortranarray(start[i] + s * move[i]))
+                    assert (nodes[3:] == -1).all() and c.body_b[k] == o.name
+                if kind != FLAT:
+                    offset = x_a + s * move_a - x_b - s * move_b
+                    assert np.linalg.norm(offset) == pytest.approx(expected, abs=1e-9)
+                    assert n == pytest.approx(offset / np.linalg.norm(offset), abs=1e-9 / expected)
+                else:
+                    assert n == pytest.approx([0.0, 1.0, 0.0], abs=1e-12)
+                assert c.gap[k] == pytest.approx((x_a - x_b) @ n - radius, abs=1e-9)
+                kinds[kind] = kinds.get(kind, 0) + 1
+    assert set(kinds) == {NEAR, ADJACENT, ROUND, FLAT} and min(kinds.values()) > 2
+
+
+def across(y: np.ndarray, f: int) -> np.ndarray:
+    """A vector across the triangle of features f of two triangles (6,3), or across both edges."""
+    if f < 6:
+        a, b, c = y[3:] if f < 3 else y[:3]
+        return np.cross(b - a, c - a)
+    i, j = (f - 6) // 3, (f - 6) % 3
+    return np.cross(y[(i + 1) % 3] - y[i], y[3 + (j + 1) % 3] - y[3 + j])
+
+
+def test_passages_that_pass_again_are_taken_at_the_end_of_their_path():
+    rng, kinds, n_passed_through = np.random.default_rng(1), set(), 0
+    with detected(crowd()) as one:
+        d, start = one.detection, one.made.state.state()[0]
+        t, node = d.topology.triangle, d.topology.node
+        rows = adjacent_rows(t)
+        move = rng.uniform(-0.3, 0.3, start.shape)
+        move[rows_of(one.made, "box 1"), 1] -= 0.5
+        one.search(start, move)
+        pairs, times = d.passages(SEARCHED)
+        found = []
+        for passed in (0, 1):
+            d.held = held(pairs, times, passed)
+            one.again()
+            c = d.contacts()
+            own = np.flatnonzero(c.kind == "face_face")
+            turned = d.buffer.data.turned.to_numpy()
+            assert turned.sum() == 0 if passed == 0 else 0 < turned.sum() < len(pairs)
+            found.append({tuple(c.feature[k]): (c.weights[k], c.normal[k], c.gap[k], c.nodes[k]) for k in own})
+        for (kind, a, b, f), time in zip(pairs.tolist(), times):
+            key = N_KINDS * a + kind, N_FEATURES * b + f
+            (_, before, _, _), (w, n, gap, nodes) = found[0][key], found[1][key]
+            if kind not in (NEAR, ADJACENT) or (w == found[0][key][0]).all():
+                assert (n == before).all()
+                continue
+            i = node[np.concatenate([t[a], t[b]]) if kind == NEAR else rows[a]]
+            end, early = start[i] + move[i], start[i] + time * move[i]
+            sides = w[:3] @ (start + move)[nodes[:3]], w[3:] @ (start + move)[nodes[3:]]
+            offset = sides[0] - sides[1]
+            assert np.linalg.norm(np.cross(offset, n)) < 1e-12 and np.linalg.norm(n) == pytest.approx(1.0, abs=1e-12)
+            assert np.linalg.norm(np.cross(n, across(end, f))) < 1e-9 * np.linalg.norm(across(end, f))
+            assert (n @ across(end, f) > 0.0) == (before @ across(early, f) > 0.0)
+            assert gap == pytest.approx((w[:3] @ start[nodes[:3]] - w[3:] @ start[nodes[3:]]) @ n, abs=1e-12)
+            kinds.add((kind, f < 6))
+            n_passed_through += offset @ n < 0.0
+    assert kinds >= {(NEAR, True), (NEAR, False), (ADJACENT, False)} and n_passed_through > 3
+
+
+def test_edges_that_turn_past_parallel_keep_their_sides():
+    """An edge of a box sinks through one of another box, and turns from 0.3 to -0.2 rad about the vertical: the vector across
+    both turns over, but the side where they were apart remains."""
+    with detected(crowd()) as one:
+        d, x = one.detection, one.made.state.state()[0].copy()
+        t, node, move = d.topology.triangle, d.topology.node, np.zeros_like(x)
+        lower, upper = (int(np.flatnonzero(d.topology.body == body)[0]) for body in (0, 1))
+
+        def triangle(angle: float, height: float) -> list[np.ndarray]:
+            along = np.array([np.cos(angle), 0.0, np.sin(angle)])
+            return [-along + [0.0, height, 0.0], along + [0.0, height, 0.0], np.array([0.0, 1.0 + height, 0.5])]
+
+        x[node[t[lower]]] = [[-1.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.5]]
+        x[node[t[upper]]] = triangle(0.3, 0.1)
+        move[node[t[upper]]] = np.array(triangle(-0.2, -0.1)) - x[node[t[upper]]]
+        one.search(x, move)
+        for passed in (0, 1):
+            d.held = held(np.array([(NEAR, lower, upper, 6)], dtype=np.int32), np.array([0.45]), passed)
+            one.again()
+            c = d.contacts()
+            (k,) = np.flatnonzero(c.kind == "face_face")
+            assert np.allclose(c.normal[k], [0.0, -1.0, 0.0], atol=1e-9) and c.gap[k] == pytest.approx(0.1, abs=1e-9)
+
+
+def test_where_nothing_crosses_nothing_is_behind():
+    """A vertex behind a face, found by its distance alone, is then in front of another part of the surface."""
+    scene = ts.Scene(gravity=(0, 0, 0))
+    scene.allow_initial_overlap = True
+    for k in range(2):
+        scene.add_body(ts.box_mesh((1, 1, 1), (1.0, 1.0, 1.0)), MATERIAL, name=f"box {k}", position=(0.2 * k, 0.98 * k, 0.1 * k))
+    scene.add_obstacle(ts.HalfSpace((0, -0.49, 0), (0, 1, 0)), name="ground")
+    with detected(scene) as one:
+        d, start = one.detection, one.made.state.state()[0]
+        one.search(start, np.zeros_like(start))
+        every = d.contacts()
+        behind = every.gap < -1e-4
+        assert set(every.body_b[behind]) == {"box 1", "ground"}
+        d.none_cross = True
+        d.held = held(np.array([(NEAR, 0, len(d.topology.triangle) - 1, 9)], dtype=np.int32), np.zeros(1))
+        one.again()
+        left = d.contacts()
+        assert set(left.body_b[left.gap < -1e-4]) == {"ground"}
+        assert (left.kind == "face_face").sum() == 1 and len(left) > 1
+
+
+@pytest.mark.parametrize("precision", ["f64", "f32"])
+def test_crossing_pairs_are_exempt_until_they_do_not_cross(precision):
+    """Two crossing boxes and a crossing sphere; a core inside a box; a box apart that moves into one of them; a ground."""
+    scene = ts.Scene(gravity=(0, 0, 0))
+    scene.allow_initial_overlap = True
+    box, x = ts.box_mesh((1, 1, 1), (1.0, 1.0, 1.0)), {"a": 0.0, "b": 0.9, "c": 2.1, "core": 0.01}
+    for name, at in x.items():
+        mesh = ts.box_mesh((1, 1, 1), (0.3, 0.3, 0.3)) if name == "core" else box
+        scene.add_body(mesh, MATERIAL, name=name, position=(at, 0.03 * at, 0.02 * at))
+    scene.add_obstacle(ts.Sphere((-0.6, 0, 0), 0.2), name="sphere")
+    scene.add_obstacle(ts.HalfSpace((0, -0.49, 0), (0, 1, 0)), name="ground")
+    crossing = {frozenset(pair) for pair in (("a", "b"), ("a", "sphere"))}
+    with detected(scene, precision) as one:
+        d, start = one.detection, one.made.state.state()[0]
+        rows = {name: rows_of(one.made, name) for name in x}
+        move = np.zeros_like(start)
+        move[rows["c"], 0], move[rows["core"], 0] = -0.5, -0.6
+        move[:, 1] = -0.05
+        move[rows["b"]] = (0.0, -0.05, 0.6)
+        one.search(start, move)
+        expected = {frozenset(pair) for pair in (("b", "c"), ("a", "ground"))}
+        assert one.meeting() >= expected | crossing | {frozenset(("a", "core"))}
+        assert d.exempt_crossing()
+        assert one.meeting() & (crossing | {frozenset(("a", "core"))}) == set() and one.meeting() >= expected
+        apart = start.copy()
+        apart[rows["b"], 0] += 0.15
+        one.search(apart, move)
+        assert d.exempt_crossing()
+        move[rows["b"], 0] = -0.2
+        one.search(apart, move)
+        assert frozenset(("a", "b")) in one.meeting() and frozenset(("a", "sphere")) not in one.meeting()
+        apart[rows["a"]] += (0.12, 0.1, 0.0)  # off the sphere and the ground
+        apart[rows["core"], 1] += 2.0
+        apart[rows["b"], 1] += 4.0
+        one.search(apart, 0.0 * move)
+        assert not d.exempt_crossing()
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning")
+def test_a_body_that_crosses_itself_is_exempt_with_itself():
+    scene = ts.Scene(gravity=(0, 0, 0))
+    scene.add_body(ts.sheet_mesh((16, 4), (2.0, 0.02, 1.0)), MATERIAL, name="sheet")
+    scene.add_body(ts.box_mesh((1, 1, 1), (0.3, 0.3, 0.3)), MATERIAL, name="box", position=(-0.5, 0.3, 0))
+    with detected(scene) as one:
+        d, start = one.detection, one.made.state.state()[0]
+        sheet, itself = rows_of(one.made, "sheet"), frozenset(("sheet",))
+        move = np.zeros_like(start)
+        move[rows_of(one.made, "box"), 1] = -0.3
+        for gap, crosses in ((-0.002, True), (0.004, False)):
+            x, far = start.copy(), None
+            x[sheet], far = folded(start[sheet], gap)
+            move[sheet] = -0.05 * far[:, None] * np.array([0.0, 1.0, 0.0])
+            one.search(x, move)
+            assert d.exempt_crossing() == crosses
+            assert one.meeting() == {frozenset(("sheet", "box"))} | (set() if crosses else {itself})

@@ -1,0 +1,275 @@
+"""Contact problems assembled from detected contacts, compared with NumPy:
+
+* nodes, signed weights, normals, right-handed frames, and friction and restitution of each pair, also after they change;
+* displacement of moving obstacles at a contact, and the approach speed;
+* gap minus target: far apart, within the contact offset, penetrating, rebounding;
+* warm start: the impulses of the last step where the same features touch again, scaled by the ratio of the steps.
+"""
+
+import numpy as np
+import pytest
+import taichi as ti
+
+import taisoft as ts
+from taisoft.backend.arrays import FieldArena
+from taisoft.backend.runtime import kernel, open_runtime
+from taisoft.contact.build import LEAST_GAP, SELF_CONTACT, _warm_impulse, gap_minus_target, keep_impulses
+from taisoft.contact.problem import build_node_problem, fill_field
+from taisoft.contact.restitution import explicit_opening
+from tests.collision.rotations import rotation
+from tests.dynamics.scenes import dynamics, set_state
+
+DT = 1e-3  # [s]
+SPIN = np.array([0.3, 2.0, -0.4])  # [rad/s]
+
+
+def turning(t: float):
+    """Rotation and translation."""
+    return np.array([0.5 * t, 0.0, 0.2 * t]), rotation(SPIN, np.linalg.norm(SPIN) * t)
+
+
+def rising(t: float):
+    """Translation and a slow rotation."""
+    return np.array([0.1 * t, 1.5 * t, 0.0]), rotation((1, 0, 0), 0.3 * t)
+
+
+def scene() -> ts.Scene:
+    """A block on a rotating box, a brick on the block, another brick on a rising mesh."""
+    made = ts.Scene()
+    soft = {"young": 1e5, "density": 1000.0}
+    made.add_body(
+        ts.box_mesh((2, 1, 2), (1.0, 0.5, 1.0)),
+        ts.Material(friction=0.4, restitution=0.2, **soft),
+        name="block",
+        position=(0, 0.2502, 0),
+        velocity=(0.2, -0.3, 0.1),
+    )
+    brick = ts.Material(friction=0.9, restitution=0.1, **soft)
+    mesh = ts.box_mesh((1, 1, 1), (0.3, 0.2, 0.35))
+    made.add_body(mesh, brick, name="brick", position=(0.13, 0.6004, 0.08), velocity=(0, -1, 0))
+    made.add_body(mesh, brick, name="other", position=(4.0, 0.1002, 0.03))
+    made.add_obstacle(ts.Box((0, -0.2, 0), (0.6, 0.2, 0.7)), name="table", friction=0.6, path=turning)
+    corners = [(3, 0, -1), (3, 0, 1), (5, 0, 1), (5, 0, -1)]
+    made.add_obstacle(ts.MeshObstacle(corners, [(0, 1, 2), (0, 2, 3)]), name="lift", friction=0.1, restitution=0.5, path=rising)
+    made.set_contact("block", "brick", friction=0.25)
+    return made
+
+
+@pytest.fixture(scope="module")
+def shared_dynamics():
+    with dynamics(scene(), dt=DT, integrator="symplectic_euler", precision="f64") as made:
+        yield made
+
+
+@pytest.fixture
+def begun(shared_dynamics):
+    """The dynamics after one step, with the contact problem of the next step; the number of its contacts."""
+    made = shared_dynamics
+    made.reset()
+    made.advance(1)
+    return made, made.contact.begin(made.state.time, DT)
+
+
+def rows(field, n: int) -> np.ndarray:
+    return field.to_numpy()[:n]
+
+
+def test_frames_and_pairs(begun):
+    made, n = begun
+    p, names = made.contact.problem, [c.name for c in made.scene.colliders]
+    normal, t1, body = rows(p.normal, n), rows(p.tangent, n), rows(p.body, n)
+    pairs = {tuple(names[k] for k in row) for row in body}
+    assert pairs == {("block", "brick"), ("block", "table"), ("other", "lift")} and n >= 12
+    for a, b in ((normal, t1), (t1, np.cross(normal, t1))):
+        assert np.abs(np.linalg.norm(a, axis=1) - 1).max() < 1e-14 and np.abs((a * b).sum(axis=1)).max() < 1e-14
+    expected = np.array([made.scene.contact_numbers(names[a], names[b]) for a, b in body])
+    assert np.allclose(rows(p.friction, n), expected[:, 0], rtol=1e-15) and len(set(expected[:, 0])) == 3
+    assert np.allclose(rows(p.restitution, n), expected[:, 1], rtol=1e-15) and len(set(expected[:, 1])) == 2
+    assert np.array_equal(rows(p.order, n), np.arange(n))
+
+
+def test_changed_friction_and_restitution(begun):
+    made, n = begun
+    p, before = made.contact.problem, made.scene.contact_numbers("block", "table")
+    made.scene.set_contact("table", "block", friction=0.05, restitution=0.9)
+    made.contact.numbers_changed()
+    made.contact.begin(made.state.time, DT)
+    on = (rows(p.body, n) == [0, 3]).all(axis=1)
+    friction, restitution = rows(p.friction, n), rows(p.restitution, n)
+    assert (friction[on] == 0.05).all() and (restitution[on] == 0.9).all()
+    assert 0 < on.sum() < n and (friction[~on] != 0.05).all()
+    made.scene.set_contact("block", "table", *before)
+    made.contact.numbers_changed()
+
+
+def test_nodes_and_weights(begun):
+    """The weighted nodes of each side give the two surface points of a contact."""
+    made, n = begun
+    p, x = made.contact.problem, made.state.state()[0]
+    node, weight, arity = rows(p.node, n), rows(p.weight, n), rows(p.arity, n)
+    used = np.arange(6) < arity[:, None]
+    assert (weight[used] != 0).all() and arity.min() >= 1 and all(len(set(r[u])) == u.sum() for r, u in zip(node, used))
+    start = np.cumsum([0] + [b.n_nodes for b in made.scene.bodies])
+    owner = np.searchsorted(start, node, side="right") - 1
+    body, half = rows(p.body, n), 0.5 * rows(p.gap, n)[:, None] * rows(p.normal, n)
+    for side, sign in ((0, 1.0), (1, -1.0)):
+        mine = used & (sign * weight > 0)
+        soft = body[:, side] < len(made.scene.bodies)
+        assert (owner[mine] == np.broadcast_to(body[:, side : side + 1], mine.shape)[mine]).all() and not mine[~soft].any()
+        weights = np.where(mine, np.abs(weight), 0.0)
+        assert np.abs(weights.sum(axis=1)[soft] - 1).max() < 1e-12
+        points = np.einsum("kj,kjx->kx", weights, x[np.where(mine, node, 0)])
+        assert np.abs(points - (rows(p.point, n) + sign * half))[soft].max() < 1e-9
+
+
+def test_obstacle_displacement_and_approach(begun):
+    """Displacement of the obstacle's contact point over the next step."""
+    made, n = begun
+    p, t = made.contact.problem, made.state.time
+    point = rows(p.point, n) - 0.5 * rows(p.gap, n)[:, None] * rows(p.normal, n)
+    expected = np.zeros((n, 3))
+    for k, obstacle in enumerate(made.scene.obstacles):
+        on = rows(p.body, n)[:, 1] == len(made.scene.bodies) + k
+        shift, turn = obstacle.pose(t)
+        material = (point[on] - obstacle.shape.pivot - shift) @ turn + obstacle.shape.pivot
+        expected[on] = obstacle.points_at(t + DT, material) - point[on]
+        assert on.sum() >= 2 and np.abs(expected[on]).max() > 1e-4
+    assert np.abs(rows(p.obstacle_displacement, n) - expected).max() < 1e-12
+    v = made.state.state()[1]
+    relative = np.einsum("kj,kjx->kx", rows(p.weight, n) * (np.arange(6) < rows(p.arity, n)[:, None]), v[rows(p.node, n)])
+    approach = ((relative - expected / DT) * rows(p.normal, n)).sum(axis=1)
+    assert np.abs(rows(p.approach, n) - approach).max() < 1e-9 and np.abs(approach).max() > 0.1
+
+
+def test_warm_start(begun):
+    """Half the step, half the impulses; none after the state was set."""
+    made, _ = begun
+    made.reset()
+    made.advance(1)
+    before, dt = made.contact.contacts(), 0.5 * DT
+    assert (np.linalg.norm(before.impulse, axis=1) > 0).sum() >= 8
+    n = made.contact.begin(made.state.time, dt)
+    p = made.contact.problem
+    key = {(a, b, tuple(ids)): k for k, (a, b, ids) in enumerate(zip(before.body_a, before.body_b, before.feature.tolist()))}
+    names, feature, r = [c.name for c in made.scene.colliders], rows(p.feature, n), rows(p.r, n)
+    frame = np.stack([rows(p.normal, n), rows(p.tangent, n), np.cross(rows(p.normal, n), rows(p.tangent, n))], axis=1)
+    met = 0
+    for c, (a, b) in enumerate(rows(p.body, n)):
+        k = key.get((names[a], names[b], tuple(feature[c, 1:])))
+        z = np.zeros(3) if k is None else 0.5 * frame[c] @ before.impulse[k]
+        expected = np.array([max(z[0], 0), *z[1:]])
+        tangential, bound = np.linalg.norm(expected[1:]), rows(p.friction, n)[c] * expected[0]
+        expected[1:] *= min(1.0, bound / tangential) if tangential > 0 else 1.0
+        assert np.abs(r[c] - expected).max() < 1e-12 * np.abs(before.impulse).max()
+        met += k is not None and bool(z.any())
+    assert met >= 8
+    set_state(made)
+    assert len(made.contact.contacts()) == 0
+    n = made.contact.begin(made.state.time, DT)
+    assert n and not rows(made.contact.problem.r, n).any()
+
+
+# --- target gaps and warm start of synthetic contacts -----------------------------------------------------------------
+
+
+@kernel
+def find_gaps_minus_targets(
+    f: ti.template(),
+    dt: ti.f64,
+    contact_offset: ti.f64,
+    fast: ti.f64,
+    slow: ti.f64,
+    fastest: ti.f64,
+    force: ti.f64,
+    before_impact: ti.f64,
+    out: ti.types.ndarray(),
+):
+    """force: velocity change by the forces of an explicit step [m/s]; before_impact: the fraction applied before the impact."""
+    for c in range(f.count[0]):
+        opening = explicit_opening(f, c, dt, contact_offset, f.approach[c] + force, before_impact)
+        out[c] = gap_minus_target(f, c, dt, contact_offset, fast, slow, fastest, opening, ti.cast(LEAST_GAP, ti.f64))
+
+
+@kernel
+def find_warm(f: ti.template(), out: ti.types.ndarray()):
+    for c in range(f.count[0]):
+        r = _warm_impulse(f, c)
+        for k in ti.static(range(3)):
+            out[c, k] = r[k]
+
+
+@pytest.fixture(scope="module")
+def problem():
+    runtime, arena = open_runtime("cpu", "f64", "a test"), FieldArena()
+    yield build_node_problem(arena, 64, 4, True)
+    arena.release()
+    runtime.close()
+
+
+@pytest.mark.parametrize("fast, slow", [(1.0, 0.02), (0.05, 0.005)])
+def test_gap_minus_target(problem, fast, slow):
+    h, dt, fastest = 2e-3, 0.01, 2.0
+    cases = [  # gap, restitution, approach, gap - target
+        (5 * h, 0.0, -9.0, 4 * h),  # may close down to the contact offset
+        (h, 0.0, -9.0, 0.0),
+        (0.25 * h, 0.0, -9.0, -slow * 0.75 * h),  # opens slowly
+        (0.0, 0.0, -9.0, -0.1 * h),  # to a tenth of the offset at once
+        (0.04 * h, 0.0, -9.0, -max(0.06 * h, slow * 0.96 * h)),
+        (-4 * h, 0.0, 0.0, -4 * h * fast - slow * h),  # a penetration opens faster
+        (5 * h, 0.5, -1.0, -0.5 * 1.0 * dt),  # meets within the step: rebounds at half the speed
+        (5 * h, 0.5, -0.7, 4 * h),  # does not meet
+        (5 * h, 0.5, 1.0, 4 * h),  # separates
+        (h, 1.0, -3.0, -3.0 * dt),
+        (-4 * h, 0.5, -1e-3, -4 * h * fast - slow * h),  # correcting the penetration opens faster than the rebound
+        (-4 * h, 0.5, -90.0, -45.0 * dt),
+        (-3.0 * fastest * dt / fast, 0.0, 0.0, -fastest * dt),  # maximum opening speed
+    ]
+    gap, restitution, approach, expected = np.array(cases).T
+    for field, values in ((problem.gap, gap), (problem.restitution, restitution), (problem.approach, approach)):
+        fill_field(field, values)
+    problem.count[0] = len(cases)
+    out = np.zeros(len(cases))
+    fill_field(problem.body, np.tile([0, 1], (len(cases), 1)))
+    find_gaps_minus_targets(problem, dt, h, fast, slow, fastest, 0.0, 0.0, out)
+    assert np.abs(out - expected).max() < 1e-15
+    # forces push together: the speed that they add is not restored
+    find_gaps_minus_targets(problem, dt, h, fast, slow, fastest, -0.2, 0.0, out)
+    less = np.where((restitution > 0) & (expected == -dt * restitution * np.abs(approach)), 0.2 * dt, 0.0)
+    later = np.array([k == 7 for k in range(len(cases))])  # these forces make it meet
+    assert np.abs(out - np.where(later, -(0.35 - 0.2) * dt, expected + less)).max() < 1e-15 and (less > 0).sum() == 3
+    # half of it acts before the impact, and rebounds too
+    find_gaps_minus_targets(problem, dt, h, fast, slow, fastest, -0.2, 0.5, out)
+    back = np.where(less > 0, (0.1 - 0.1 * restitution) * dt, 0.0)
+    assert np.abs(out - np.where(later, -(0.4 - 0.1) * dt, expected + back)).max() < 1e-15
+    fill_field(problem.body, np.ones((len(cases), 2), dtype=int))  # self-contact scales the numbers
+    find_gaps_minus_targets(problem, dt, h / SELF_CONTACT, fast / SELF_CONTACT, slow / SELF_CONTACT, fastest, 0.0, 0.0, out)
+    assert np.abs(out - expected).max() < 1e-15
+
+
+def test_warm_start_uses_the_nearest_contact_of_the_same_feature(problem):
+    """Some features occur more than once; the hash table is half full."""
+    rng, n, p = np.random.default_rng(0), 60, problem
+    feature = np.stack([rng.integers(0, 2, n), rng.integers(0, 6, n), rng.integers(0, 3, n)], axis=1)
+    point, impulse = rng.standard_normal((n, 3)), rng.standard_normal((n, 3))
+    normal = rng.standard_normal((n, 3))
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    t1 = np.cross(normal, rng.standard_normal((n, 3)))
+    t1 /= np.linalg.norm(t1, axis=1, keepdims=True)
+    for field, values in ((p.feature, feature), (p.point, point), (p.normal, normal), (p.tangent, t1), (p.r, impulse)):
+        fill_field(field, values)
+    p.count[0] = n
+    keep_impulses(p)
+    world_impulse = impulse[:, :1] * normal + impulse[:, 1:2] * t1 + impulse[:, 2:] * np.cross(normal, t1)
+    query = np.stack([rng.integers(0, 2, n), rng.integers(0, 7, n), rng.integers(0, 3, n)], axis=1)
+    at = rng.standard_normal((n, 3))
+    fill_field(p.feature, query)
+    fill_field(p.point, at)
+    out = np.zeros((n, 3))
+    find_warm(p, out)
+    several = 0
+    for c in range(n):
+        same = np.flatnonzero((feature == query[c]).all(axis=1))
+        several += len(same) > 1
+        expected = world_impulse[same[np.argmin(np.linalg.norm(point[same] - at[c], axis=1))]] if len(same) else np.zeros(3)
+        assert np.abs(out[c] - expected).max() < 1e-14
+    assert several > 10 and (~out.any(axis=1)).sum() > 3

@@ -1,0 +1,129 @@
+"""Damping of rigid bodies in implicit steps: its force against a formula, its blocks against differences, rigid motion."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pytest
+import taichi as ti
+
+import taisoft as ts
+from taisoft.backend.runtime import kernel
+from taisoft.fem.node_graph import EVERYTHING
+from taisoft.fem.rigid_tets import RELAXATION, begin_rigid_stage
+from taisoft.fem.terms import rigid_damping
+from taisoft.fem.terms.elasticity import elastic_forces
+from taisoft.linear import block_csr
+from tests.collision.rotations import rotation
+from tests.dynamics.scenes import built
+
+BETA, NOW, BEFORE = 0.01, 4.0 / 3.0, 1.0 / 3.0
+H = 1e-6  # [m]
+
+
+@dataclass(frozen=True, eq=False)
+class Past:
+    """Earlier positions, as in the history of an implicit stepper."""
+
+    x_now: Any
+    x_before: Any
+
+
+@kernel
+def force_of(m: ti.template(), out: ti.template()):
+    """The damping force on every node."""
+    ti.loop_config(serialize=True)
+    for i in range(m.n_nodes):
+        out[i] = rigid_damping.force(m, i)
+
+
+@pytest.fixture(scope="module")
+def rig():
+    scene = ts.Scene()
+    scene.add_rigid_body(ts.box_mesh((1, 1, 1), (1.0, 0.6, 0.3)), name="a", position=(0.3, 1.0, 0.0))
+    scene.add_body(ts.box_mesh((1, 1, 1), (1, 1, 1)), ts.Material(young=1e4), name="soft", position=(0, 3, 0))
+    scene.add_rigid_body(ts.box_mesh((1, 1, 1), (0.2, 0.2, 0.2)), name="b", position=(4.0, 1.0, 0.0))
+    with built(scene.snapshot(), "f64") as made:
+        rng = np.random.default_rng(2)
+        made.rest = made.model.state.x.to_numpy()
+        made.frames = [made.layout.node_start[k] + np.arange(4) for k in (0, 2)]
+        made.past = Past(made.vectors("x_now"), made.vectors("x_before"))
+        made.out = made.vectors("force")
+        made.states = [made.rest + 0.01 * rng.standard_normal(made.rest.shape) for _ in range(3)]
+        yield made
+
+
+def begin(rig, now: np.ndarray, before: np.ndarray) -> None:
+    rig.past.x_now.from_numpy(now)
+    rig.past.x_before.from_numpy(before)
+    begin_rigid_stage(rig.model, rig.past, True, NOW, BEFORE, BETA)
+
+
+def forces(rig, x: np.ndarray) -> np.ndarray:
+    rig.model.state.x.from_numpy(x)
+    elastic_forces(rig.model)
+    force_of(rig.model, rig.out)
+    return rig.out.to_numpy()
+
+
+def green(rest: np.ndarray, x: np.ndarray):
+    """F and E of the affine map of four points."""
+    F = np.linalg.solve((rest[1:] - rest[0]), (x[1:] - x[0])).T
+    return F, 0.5 * (F.T @ F - np.eye(3))
+
+
+def test_the_force_is_that_of_a_viscous_stress(rig):
+    x, now, before = rig.states
+    begin(rig, now, before)
+    f, expected = forces(rig, x), np.zeros_like(x)
+    for k, own in zip((0, 2), rig.frames):
+        body, rest = rig.scene.bodies[k], rig.rest[own]
+        F, E = green(rest, x[own])
+        rate = (E - NOW * green(rest, now[own])[1] + BEFORE * green(rest, before[own])[1]) / BETA
+        frequency = np.sqrt(body.young / body.density / np.linalg.eigvalsh(np.cov(rest.T, bias=True))[-1])
+        viscosity = RELAXATION / frequency * body.young * body.mass / body.density
+        gradients = np.linalg.inv(np.column_stack([np.ones(4), rest]))[1:].T
+        expected[own] = -viscosity * gradients @ (F @ rate).T
+    assert np.abs(f).max() > 1.0 and np.allclose(f, expected, atol=1e-9 * np.abs(f).max())
+
+
+def test_momentum_and_angular_momentum_stay(rig):
+    x, now, before = rig.states
+    begin(rig, now, before)
+    f = forces(rig, x)
+    assert np.abs(f.sum(axis=0)).max() < 1e-9 * np.abs(f).max()
+    assert np.abs(np.cross(x, f).sum(axis=0)).max() < 1e-9 * np.abs(f).max()
+
+
+def test_a_step_that_turns_bodies_has_no_resistance(rig):
+    x, R = rig.states[0], rotation((1.0, -2.0, 0.5), 0.7)
+    begin(rig, x @ R.T, x)
+    strained = np.abs(forces(rig, x @ (R @ R).T + 1.0)).max()
+    begin(rig, rig.states[1], x)
+    assert strained < 1e-9 * np.abs(forces(rig, x)).max()
+
+
+@pytest.mark.parametrize("projected", [False, True])
+def test_blocks_are_the_derivative_of_the_force(rig, projected):
+    x, now, before = rig.states
+    if projected:  # without the part of E - E_hat, which is 0 here
+        now = before = x
+    begin(rig, now, before)
+    m, matrices = rig.model, []
+    matrix = block_csr.build_block_csr(m, rig.arena, f"test_{projected}")
+    viscosity = m.rigid_tets.viscosity.to_numpy()
+    for factor in (1.0, 0.0):
+        m.rigid_tets.viscosity.from_numpy(factor * viscosity)
+        forces(rig, x)
+        block_csr.assemble(m, matrix, EVERYTHING, projected)
+        block_csr.to_system(m, matrix, matrix, EVERYTHING, int(projected), 1.0, BETA)
+        matrices.append(block_csr.to_scipy(m, matrix))
+    m.rigid_tets.viscosity.from_numpy(viscosity)
+    K = (matrices[0] - matrices[1]).toarray() / BETA**2
+    for own in rig.frames:
+        for node in own[:2]:
+            for axis in range(3):
+                step = np.zeros_like(x)
+                step[node, axis] = H
+                slope = -(forces(rig, x + step) - forces(rig, x - step)) / (2 * H)
+                assert np.allclose(K[:, 3 * node + axis].reshape(-1, 3)[own], slope[own], atol=1e-6 * np.abs(slope).max())

@@ -1,0 +1,396 @@
+"""How a run ends under faults of the machine:
+
+* a full or read-only disk, a folder that is moved away, a failing fsync, rename or write: exit status 3, a message with the
+  path of each lost output, no truncated file, no success message, and no earlier report;
+* a process killed while report and checkpoint are replaced leaves the old or the new ones; killed anywhere in a run, it leaves
+  complete files, and the next run cleans up;
+* a second writer, a jumping clock, another locale, no home, no cache: refused, or without effect.
+"""
+
+import json
+import os
+import random
+import re
+import resource
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pxr import Sdf, Usd
+
+import taisoft as ts
+from taisoft.checkpoint import read_checkpoint
+from taisoft.output.files import LOCK_NAME, OutputFolder
+from tests.cli.command import BEAM, ROOT, SHORT_OUTPUT, child, report, run, write
+from tests.output.png import decode
+
+RESULTS = {"report.json", "steps.csv", "checkpoint.npz", "scene.usdc", "frames"}
+
+
+def python(code: str, *arguments, **environment) -> subprocess.CompletedProcess:
+    """Run code in a child process; None removes a variable from its environment."""
+    given = os.environ | {"PYTHONPATH": str(ROOT)} | environment
+    given = {name: value for name, value in given.items() if value is not None}
+    command = [sys.executable, "-c", code, *map(str, arguments)]
+    return subprocess.run(command, env=given, capture_output=True, text=True, timeout=300, check=False)
+
+
+def error_lines(stderr: str) -> list[str]:
+    """The lines of stderr, except for the note on compiling."""
+    return [line for line in stderr.splitlines() if not line.startswith("taisoft: compiling")]
+
+
+def small_scene() -> ts.Scene:
+    scene = ts.Scene()
+    scene.add_body(ts.box_mesh((2, 1, 1), (2, 1, 1)), ts.Material(young=1e5), name="part")
+    return scene
+
+
+@pytest.fixture(scope="module")
+def shim(tmp_path_factory) -> Path:
+    """The library of failing calls."""
+    compiler = shutil.which("cc") or shutil.which("gcc")
+    if compiler is None or not sys.platform.startswith("linux"):
+        pytest.skip("there is no C compiler, or nothing can be preloaded here")
+    path = tmp_path_factory.mktemp("shim") / "failing_calls.so"
+    if re.search(r"[\s:]", str(path)):
+        pytest.skip("the loader preloads nothing from a folder with a blank or a colon in its name")
+    subprocess.run([compiler, "-shared", "-fPIC", "-o", path, ROOT / "tests" / "failing_calls.c", "-ldl"], check=True)
+    return path
+
+
+# --- disks ------------------------------------------------------------------------------------------------------------
+
+# All runs in one process, so that kernels are compiled once: (call that fails, part of the path where it fails)
+FAILING = """
+import contextlib, io, json, os, sys
+from taisoft.backend import runtime
+from taisoft.cli import main
+scene, base, shown = sys.argv[1], sys.argv[2], []
+for k, (call, name) in enumerate(json.loads(sys.argv[3])):
+    out, err = io.StringIO(), io.StringIO()
+    os.environ["FAIL_CALL"], os.environ["FAIL_NAME"] = call, name
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        status = main(["run", scene, "--headless", "--out", f"{base}/{k}", "--overwrite"])
+    os.environ["FAIL_NAME"], runtime._kind = "", None  # restarts Taichi, which finds its kernels in the cache
+    shown.append((status, out.getvalue(), err.getvalue()))
+print(json.dumps(shown))
+"""
+CALLS = {
+    "some": [("fsync", "report.json"), ("write", "00001.png|checkpoint.npz")],
+    "others": [
+        ("rename", "report.json"),
+        ("fsync", "scene.usdc"),
+        ("rename", "00001.png"),
+        ("write", "steps.csv"),
+        ("rename", "checkpoint.npz"),
+    ],
+}
+
+
+@pytest.mark.parametrize("which", CALLS)
+def test_failing_calls(beam, tmp_path, shim, which):
+    calls = CALLS[which]
+    for k in range(len(calls)):
+        (tmp_path / str(k)).mkdir()
+        (tmp_path / str(k) / "report.json").write_text("old")
+    done = python(FAILING, beam, tmp_path, json.dumps(calls), LD_PRELOAD=str(shim))
+    assert done.returncode == 0, done.stderr
+    for k, ((call, name), (status, out, err)) in enumerate(zip(calls, json.loads(done.stdout.splitlines()[-1]))):
+        folder = tmp_path / str(k)
+        reason = "No space left on device" if call == "write" else "Input/output error"
+        assert status == 3, (call, name, out, err)
+        failed, lines = name.split("|"), error_lines(err)
+        assert len(lines) == len(failed), err
+        for file, line in zip(failed, lines):
+            assert re.match(rf"taisoft: cannot write {re.escape(str(folder))}/\S*{file}\S*.*: {reason}", line), err
+        assert not list(folder.rglob("*.part")) and not list(folder.glob("*.lock"))
+        assert (
+            not any(list(folder.rglob(file)) for file in failed) and "status   degraded" in out and not re.search(r"\bok\b", out)
+        )
+        if name in ("report.json", "steps.csv"):
+            assert not (folder / "report.json").exists()  # not even the earlier one
+        else:
+            assert report(folder)["status"] == "degraded"
+        if "checkpoint.npz" not in failed:  # the state is saved, so that the run can continue elsewhere
+            read_checkpoint(folder / "checkpoint.npz")
+
+
+def mount_small_disk(folder: Path) -> bool:
+    """Mount a disk of 1 MB at the folder; return False where that is not allowed."""
+    command = ["mount", "-t", "tmpfs", "-o", "size=1m", "tmpfs", str(folder)]
+    return shutil.which("mount") is not None and subprocess.run(command, capture_output=True, check=False).returncode == 0
+
+
+@pytest.mark.parametrize("kind", ["tmpfs", "limit"])
+def test_full_disk(beam, tmp_path, capsys, kind):
+    """A disk filled by pictures, or a limit on file sizes: earlier files are complete, and the state can be saved elsewhere."""
+    disk, mounted = tmp_path / "disk", kind == "tmpfs"
+    disk.mkdir()
+    if mounted and not mount_small_disk(disk):
+        pytest.skip("nothing can be mounted here")
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    try:
+        if mounted:
+            (disk / "ballast").write_bytes(bytes(2**20 - 150_000))
+        else:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, limits[1]))
+        status = run(beam, "--out", disk / "out", "--seconds", "0.5")
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+        errors = capsys.readouterr().err
+        assert status == 3 and re.search(rf"taisoft: cannot write {re.escape(str(disk))}/out/\S+ \(\d+ bytes.*: .+", errors), (
+            errors
+        )
+        files = [path for path in (disk / "out").rglob("*") if path.is_file()]
+        assert not [path for path in files if path.suffix == ".part" or path.stat().st_size == 0]
+        lost = set(re.findall(rf"cannot write {re.escape(str(disk))}/out/(\w+\.\w+)", errors))
+        if "checkpoint.npz" not in lost:
+            read_checkpoint(disk / "out" / "checkpoint.npz")
+        if not lost & {"report.json", "steps.csv"}:
+            assert report(disk / "out")["status"] == "degraded"
+        assert not any((disk / "out" / name).exists() for name in lost)
+        with ts.Simulator(small_scene(), 0.01, "symplectic_euler") as sim:
+            sim.step()
+            if mounted:
+                (disk / "more").write_bytes(bytes(os.statvfs(disk).f_bavail * os.statvfs(disk).f_bsize))
+            else:
+                resource.setrlimit(resource.RLIMIT_FSIZE, (100, limits[1]))
+            with pytest.raises(ts.OutputError, match="checkpoint.npz: "):
+                sim.save_checkpoint(disk / "checkpoint.npz")
+            resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+            assert not (disk / "checkpoint.npz").exists()
+            sim.save_checkpoint(tmp_path / "elsewhere.npz")
+            assert np.array_equal(read_checkpoint(tmp_path / "elsewhere.npz").state["simulation"]["x"], sim.positions())
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+        if mounted:
+            subprocess.run(["umount", str(disk)], check=True)
+
+
+MOVED_AWAY = """
+    body.move(lambda X: X[:, 0] > 1.99, path)
+    return scene
+
+
+def path(t):
+    from pathlib import Path
+
+    out = Path(__file__).parent / "out"
+    if t > 0.05 and out.is_dir():
+        out.rename(out.with_name("moved"))
+        out.write_text("a file")
+    return (0, 0, 0)
+"""
+
+
+def test_output_folder_moved_away(tmp_path, capsys):
+    """During the run, in a way that also stops the superuser, and before it; earlier files stay complete."""
+    path, out = write(tmp_path / "scene.py", BEAM.replace("\n    return scene\n", MOVED_AWAY)), tmp_path / "out"
+    assert run(path, "--out", out, "--checkpoint-every", "0.03") == 3
+    captured = capsys.readouterr()
+    assert re.search(rf"taisoft: cannot write {re.escape(str(out))}/\S+.*: Not a directory", captured.err), captured.err
+    assert "status   degraded" in captured.out
+    kept = sorted(str(file.relative_to(tmp_path / "moved")) for file in (tmp_path / "moved").rglob("*.png"))
+    assert kept[:2] == ["frames/00000.png", "frames/00001.png"] and not (tmp_path / "moved" / "report.json").exists()
+    assert run(path, "--out", out / "new") == 3
+    captured = capsys.readouterr()
+    assert "cannot create the folder" in captured.err and "status" not in captured.out
+
+
+READ_ONLY = (
+    MOVED_AWAY[MOVED_AWAY.index("    body") : MOVED_AWAY.index("    from")]
+    + """
+    import os
+
+    if t > 0.05:
+        os.environ["FAIL_NAME"] = os.environ["LATER"]
+    return (0, 0, 0)
+"""
+)
+
+
+def test_disk_becomes_read_only(tmp_path, shim):
+    """During the run, as when the system remounts a disk after an error."""
+    path, out = write(tmp_path / "scene.py", BEAM.replace("    return scene\n", READ_ONLY)), tmp_path / "out"
+    code = "import sys; from taisoft.cli import main; sys.exit(main(sys.argv[1:]))"
+    arguments = ("run", path, "--headless", "--out", out, "--checkpoint-every", "0.03")
+    done = python(code, *arguments, LD_PRELOAD=str(shim), FAIL_CALL="change", LATER=f"{out}/")
+    assert done.returncode == 3 and "status   degraded" in done.stdout, done.stdout + done.stderr
+    lines = error_lines(done.stderr)
+    usd = r"\(\d+ bytes of new frames\): Unable to open .+ for write"  # gives no reason
+    start = f"taisoft: cannot write {out}/"
+    assert all(line.startswith(start) and re.search(rf"(: Read-only file system| {usd})$", line) for line in lines), lines
+    lost = [re.match(r"(?:\w+/)?([\w.]+)", line.removeprefix(start))[1] for line in lines]
+    assert set(lost) == {"00002.png", "points_00002.usdc", "checkpoint.previous.npz", "steps.csv"} and len(lost) == 4
+    assert [path.name for path in sorted((out / "frames").iterdir())] == ["00000.png", "00001.png"]
+    assert read_checkpoint(out / "checkpoint.npz").state["simulation"]["time"] == pytest.approx(1 / 30)
+    assert_complete(out)
+
+
+KILLED = """
+import json, os, random, signal, sys, time
+from pathlib import Path
+import numpy as np
+from tests.view.fake_simulator import beam_scene
+from taisoft.checkpoint import read_checkpoint, write_checkpoint
+from taisoft.errors import SimulationError
+from taisoft.output.files import CheckpointWriter, read_last_good
+from taisoft.output.report import write_report
+from taisoft.records import RunReport, StepReport
+
+folder, scene = Path(sys.argv[1]), beam_scene()
+
+class Saved:
+    time = 0.0
+    def save_checkpoint(self, path, notes):
+        write_checkpoint(path, {}, scene, {}, {"n": self.time, "x": np.full(20_000, self.time)}, notes)
+
+def replace(kill, begun):
+    sim, writer = Saved(), CheckpointWriter(folder, resumed=folder / "checkpoint.npz")
+    for k in range(1_000_000):
+        sim.time = 1000.0 * kill + k
+        writer.write(sim)
+        reports = [StepReport(time=0.01 * j) for j in range(k % 50)]
+        write_report(folder, RunReport(steps=k, step_reports=reports), arch="cpu", precision="f32", settings={}, plan=[])
+        if k == 0:
+            os.write(begun, b".")
+
+dice, seen = random.Random(2), set()
+Saved().save_checkpoint(folder / "checkpoint.npz", {})
+for kill in range(1, 1 + int(sys.argv[2])):
+    started, begun = os.pipe()
+    child = os.fork()
+    if child == 0:
+        replace(kill, begun)
+    os.read(started, 1)
+    time.sleep(dice.uniform(0.0, 0.05))
+    os.kill(child, signal.SIGKILL)
+    os.waitpid(child, 0)
+    for name in ("checkpoint.npz", "checkpoint.previous.npz"):
+        if (folder / name).exists():
+            state = read_checkpoint(folder / name).state
+            assert (state["x"] == state["n"]).all()
+    seen.add(read_checkpoint(folder / "checkpoint.npz").state["n"])
+    json.loads((folder / "report.json").read_text())
+    rows = (folder / "steps.csv").read_text()
+    assert rows.endswith("\\n") and len(set(row.count(",") for row in rows.splitlines())) == 1
+print(len(seen), len(list(folder.glob("*.part"))))
+"""
+
+
+@pytest.mark.parametrize("kills", [10, 100])
+def test_kills_while_files_are_replaced(tmp_path, kills):
+    done = python(KILLED, tmp_path, kills)
+    assert done.returncode == 0, done.stderr
+    assert int(done.stdout.split()[0]) == kills  # each child has written
+    OutputFolder(tmp_path, overwrite=True).close()
+    assert not list(tmp_path.glob("*.part"))
+
+
+def assert_complete(out: Path) -> None:
+    """Check every file with a final name, of a run that may have been killed."""
+    for picture in (out / "frames").glob("*.png"):
+        assert decode(picture.read_bytes()).ndim == 3
+    for path in (*(out / "chunks").glob("*.usdc"), *out.glob("*.usdc")):
+        stage = Usd.Stage.Open(str(path))
+        points = stage.GetAttributeAtPath("/World/beam/tets.points")
+        assert points.GetTimeSamples()
+        assert all(np.isfinite(np.array(points.Get(moment))).all() for moment in points.GetTimeSamples())
+    for path in out.glob("checkpoint*.npz"):
+        assert np.isfinite(read_checkpoint(path).state["simulation"]["x"]).all()
+    if (out / "report.json").exists():
+        assert report(out)["status"] == "ok" and (out / "steps.csv").exists()
+
+
+@pytest.mark.skipif(os.name != "posix", reason="there is no SIGKILL")
+@pytest.mark.parametrize("kills", [3, 20])
+def test_kills_during_runs(beam, tmp_path, kills):
+    """At random times over the run, each run after the one killed before; the last run is complete."""
+    out, dice, ended = tmp_path / "out", random.Random(kills), []
+    arguments = ("run", beam, "--headless", "--seconds", "0.2", "--out", out, "--overwrite", "--checkpoint-every", "0.03")
+    for kill in range(kills):
+        process = child(*arguments)
+        while not (out / LOCK_NAME).exists() or (out / LOCK_NAME).read_text() != f"{process.pid}\n":
+            assert process.poll() is None, process.communicate()
+            time.sleep(0.005)
+        time.sleep(1.5 * (kill + dice.random()) / kills)  # [s]
+        process.kill()
+        process.communicate()
+        ended.append(process.returncode)
+        assert_complete(out)
+    assert -signal.SIGKILL in ended and set(ended) <= {-signal.SIGKILL, 0}
+    assert run(*arguments[1:2], *arguments[3:]) == 0
+    assert_complete(out)
+    kept = {path.name for path in out.iterdir()}
+    assert RESULTS <= kept <= RESULTS | {"checkpoint.previous.npz"} and not list(tmp_path.rglob("*.part"))
+    assert sorted(path.name for path in (out / "frames").iterdir()) == [f"{k:05d}.png" for k in range(7)]
+
+
+# --- environment ------------------------------------------------------------------------------------------------------
+
+
+def test_a_second_writer_is_refused(beam, tmp_path, capsys):
+    with OutputFolder(tmp_path / "out"):
+        assert run(beam, "--out", tmp_path / "out", "--overwrite", *SHORT_OUTPUT) == 3
+        captured = capsys.readouterr()
+    assert f"process {os.getpid()} is writing to the output folder {tmp_path / 'out'}" in captured.err
+    assert "status" not in captured.out and not list((tmp_path / "out").iterdir())
+
+
+def german(folder: Path) -> dict[str, str]:
+    """Compile a locale with decimal commas in the folder; return its environment variables, or nothing where that fails."""
+    if shutil.which("localedef") is None:
+        return {}
+    command = ["localedef", "-i", "de_DE", "-f", "UTF-8", str(folder / "de_DE.UTF-8")]
+    if subprocess.run(command, capture_output=True, check=False).returncode:
+        return {}
+    return {"LOCPATH": str(folder), "LC_ALL": "de_DE.UTF-8", "LANG": "de_DE.UTF-8"}
+
+
+HOSTILE = """
+import locale, os, sys, tempfile, time
+locale.setlocale(locale.LC_ALL, "")
+moments = time.time(), time.time()
+print("point", locale.localeconv()["decimal_point"], "jump", abs(moments[0] - moments[1]))
+from taisoft.cli import main
+"""
+
+
+def test_hostile_environment(tmp_path, shim):
+    """A clock that jumps by days, a locale with decimal commas, no home folder, and caches that cannot be written."""
+    ts.write_mesh(tmp_path / "beam.msh", ts.box_mesh((4, 1, 1), (4.5, 1.25, 1)))
+    assert "-2.25" in (tmp_path / "beam.msh").read_text()  # decimal points in text
+    path = write(tmp_path / "beam.py", BEAM.replace("ts.box_mesh((4, 1, 1), (4, 2, 2))", 'ts.read_mesh(__file__[:-2] + "msh")'))
+    assert run(path, "--out", tmp_path / "plain") == 0
+    (tmp_path / "file").write_text("no folder")
+    commas = german(tmp_path)
+    environment = commas | {
+        "LD_PRELOAD": str(shim),
+        "JUMP": "100000",
+        "HOME": None,
+        "XDG_CACHE_HOME": str(tmp_path / "file" / "cache"),
+    }
+    arguments = ("run", path, "--headless", "--out", tmp_path / "hostile")
+    done = python(HOSTILE + "sys.exit(main(sys.argv[1:]))", *arguments, **environment)
+    assert done.returncode == 0 and "status   ok" in done.stdout, done.stderr
+    point, jump = re.match(r"point (.) jump (\S+)\n", done.stdout).groups()
+    assert float(jump) > 1e4 and point == ("," if commas else ".")
+    plain, hostile = ({f.relative_to(out): f for f in out.rglob("*.*")} for out in (tmp_path / "plain", tmp_path / "hostile"))
+    assert set(plain) == set(hostile) and len(plain) == 8
+    for name in plain:
+        if name.suffix in (".csv", ".png"):
+            assert plain[name].read_bytes() == hostile[name].read_bytes(), name
+    stages = [Sdf.Layer.OpenAsAnonymous(str(files[Path("scene.usdc")])).ExportToString() for files in (plain, hostile)]
+    assert stages[0] == stages[1] and "vonMisesStress" in stages[0]
+    found = report(tmp_path / "hostile")
+    assert 0.0 <= found["wall_seconds"] < 1e4 and 0.0 <= found["compile_seconds"] < 1e4  # the jump is longer
+    no_cache = HOSTILE + "tempfile.tempdir = os.devnull; sys.exit(main(sys.argv[1:]))"
+    done = python(no_cache, *arguments, "--overwrite", **environment)
+    assert done.returncode == 2 and "no folder for compiled kernels is writable: set XDG_CACHE_HOME" in done.stderr
+    if not commas:
+        pytest.skip("passed without decimal commas: no such locale can be compiled here")

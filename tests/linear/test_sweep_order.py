@@ -1,0 +1,162 @@
+"""Gauss-Seidel over chunks with coupling terms, whether blocks couple chunks of one parity or not:
+
+* in chunks that threads may share, the nodes of a term outside the first chunk of each parity are last, ascending, and their
+  neighbours are known;
+* every iteration is that of NumPy's conjugate gradients with the triangle of the stated order, which contains all terms;
+* the result is the same bits on one thread and on several, and exact.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import taichi as ti
+
+from taisoft.backend.arrays import FieldArena
+from taisoft.linear import block_csr, pcg
+from taisoft.linear.coupling import build_coupling
+from taisoft.linear.pcg_work import RZ, build_pcg
+from taisoft.linear.sweep_order import BESIDE, IS_LAST, find_last
+from tests.dynamics.scenes import built, mixed_scene
+
+N_TERMS, WIDTH, FIXED = 30, 6, [2, 9]
+CHUNKS = {"layered": 3, "crossed": 6}
+
+
+@pytest.fixture(scope="module", params=[(name, shared) for name in CHUNKS for shared in (True, False)], ids=str)
+def rig(request):
+    name, shared = request.param
+    with built(mixed_scene(order="both"), "f64") as made, pytest.MonkeyPatch.context() as patch:
+        patch.setattr("taisoft.fem.chunks.MIN_SHIFT", 0)
+        patch.setattr("taisoft.fem.chunks.SWEEP_CHUNKS", CHUNKS[name])
+        m, arena, rng = made.parallel, FieldArena(), np.random.default_rng(4)
+        made.order, made.shared, n = m.sweep, shared, m.n_nodes
+        made.matrix, made.work = block_csr.build_block_csr(m, arena), build_pcg(m, arena)
+        assert made.work.n_chunks == CHUNKS[name] and made.matrix.crossed == (name == "crossed")
+        free = np.ones((n, 3))
+        free[FIXED] = 0.0
+        m.free.from_numpy(free)
+        stiffness = made.oracle.stiffness(made.oracle.rest, projected=True) + 1e3 * np.eye(3 * n)
+        blocks = stiffness.reshape(n, 3, n, 3).transpose(0, 2, 1, 3)
+        start, column = made.matrix.row_start.to_numpy(), made.matrix.column.to_numpy()
+        row = np.repeat(np.arange(2 * n), np.diff(start)) % n
+        made.matrix.value.from_numpy(block_csr.packed(blocks[row, column]))
+        arity = rng.integers(1, WIDTH + 1, N_TERMS)
+        made.nodes = [np.sort(rng.choice(n // 2, k, replace=False)) * 2 for k in arity]  # no terms at odd nodes
+        weights, half = rng.uniform(-1, 1, (N_TERMS, WIDTH)), rng.standard_normal((N_TERMS, 3, 3))
+        D = 1e4 * half @ half.transpose(0, 2, 1)
+        active = np.arange(N_TERMS) % 7 != 0
+        made.coupling = upload_terms(made, arena, weights, D, active, block_csr.packed(blocks[np.arange(n), np.arange(n)]))
+        A = blocks.copy()
+        for c in np.flatnonzero(active):
+            own = made.nodes[c]
+            w = weights[c, : len(own)]
+            A[np.ix_(own, own)] += (w[:, None] * w)[:, :, None, None] * D[c]
+        made.A, made.free = A, free.reshape(-1) > 0.0
+        made.rhs = np.where(free > 0.0, rng.standard_normal((n, 3)), 0.0)
+        yield made
+
+
+def upload_terms(made, arena, weights, D, active, base):
+    m, node = made.parallel, np.zeros((N_TERMS, WIDTH), dtype=np.int32)
+    for c, own in enumerate(made.nodes):
+        node[c, : len(own)] = own
+    entries = sorted((int(i), WIDTH * c + j) for c, own in enumerate(made.nodes) for j, i in enumerate(own))
+    counts = np.bincount([i for i, _ in entries], minlength=m.n_nodes)
+
+    def field(name, dtype, values):
+        return arena.field(name, dtype, values.shape, values)
+
+    def vectors(name, values):
+        return arena.vectors(name, m.real, len(values), values, n=block_csr.BLOCK)
+
+    return build_coupling(
+        arena,
+        m.real,
+        m.n_nodes,
+        field("node", ti.i32, node),
+        made.shared,
+        count=field("count", ti.i32, np.array([N_TERMS], dtype=np.int32)),
+        arity=field("arity", ti.i32, np.array([len(own) for own in made.nodes], dtype=np.int32)),
+        weight=field("weight", ti.f64, weights),
+        entry_start=field("entry_start", ti.i32, np.concatenate([[0], np.cumsum(counts)]).astype(np.int32)),
+        entry=field("entry", ti.i32, np.array([e for _, e in entries], dtype=np.int32)),
+        block=vectors("block", block_csr.packed(D)),
+        active=field("active", ti.i32, active.astype(np.int32)),
+        base=vectors("base", base),
+    )
+
+
+def last_nodes(made) -> np.ndarray:
+    """Which nodes (n,) are last, by definition."""
+    last, shift = np.zeros(made.model.n_nodes, dtype=bool), made.order.shift
+    for own in made.nodes if made.shared else []:
+        for parity in (0, 1):
+            chunk = own >> shift
+            of_parity = own[chunk % 2 == parity]
+            if len(of_parity):
+                last[of_parity[(of_parity >> shift) > (of_parity >> shift).min()]] = True
+    return last
+
+
+def test_the_nodes_of_terms_in_several_chunks_are_last(rig):
+    if not rig.shared:
+        assert rig.coupling.place is None
+        return
+    find_last(rig.parallel, rig.matrix, rig.coupling, rig.work)
+    last, place = last_nodes(rig), rig.coupling.place.to_numpy()
+    n_last = int(rig.coupling.n_last.to_numpy()[0])
+    assert 0 < n_last < len(last) // 2
+    assert np.array_equal(place == IS_LAST, last) and np.array_equal(rig.coupling.last.to_numpy()[:n_last], np.flatnonzero(last))
+    start, column = rig.matrix.row_start.to_numpy(), rig.matrix.column.to_numpy()
+    row = np.repeat(np.arange(2 * len(last)), np.diff(start)) % len(last)
+    beside = np.bincount(row[last[column]], minlength=len(last)) > 0
+    assert np.array_equal(place == BESIDE, beside & ~last) and (place == BESIDE).any()
+
+
+def dense(blocks: np.ndarray) -> np.ndarray:
+    """Matrix of blocks (n, n, 3, 3)."""
+    return blocks.transpose(0, 2, 1, 3).reshape(3 * len(blocks), -1)
+
+
+def solve(made, serial: bool, tolerance: float, limit: int):
+    m, w = replace(made.parallel, serial=serial), made.work
+    if made.shared:
+        find_last(m, made.matrix, made.coupling, w)
+    w.rhs.from_numpy(made.rhs)
+    result = pcg.solve(m, made.matrix, w, tolerance, limit, made.coupling)
+    return result, w.y.to_numpy(), float(w.state.to_numpy()[RZ])
+
+
+def numpy_rz(made, n: int) -> list[float]:
+    """r.z at the start and after each of n iterations of NumPy's conjugate gradients."""
+    number, last = np.arange(made.model.n_nodes), last_nodes(made)
+    rank = np.where(last, number + (1 << 40), made.order.rank(number))
+    L = rank[:, None] > rank[None]
+    if made.shared:
+        L &= ~made.order.apart(number[:, None], number[None]) | last[:, None] | last[None]
+    masks = np.ones_like(L), L, np.eye(len(number))
+    full, lower, D = (dense(made.A * mask[:, :, None, None])[made.free][:, made.free] for mask in masks)
+    M = (D + lower) @ np.linalg.solve(D, (D + lower).T)
+    r, p, found = made.rhs.reshape(-1)[made.free], 0.0, []
+    for k in range(n + 1):
+        z = np.linalg.solve(M, r)
+        found.append(float(r @ z))
+        p = z + (found[k] / found[k - 1] if k else 0.0) * p
+        r = r - found[k] / (p @ full @ p) * (full @ p)
+    return found
+
+
+@pytest.mark.parametrize("serial", [True, False])
+def test_iterations_are_numpys(rig, serial):
+    expected = numpy_rz(rig, 6)
+    found = [solve(rig, serial, 0.0, n)[2] for n in range(1, 7)]
+    assert np.allclose(found, expected[1:], rtol=1e-8) and expected[6] < 0.1 * expected[0]
+
+
+def test_the_solution_is_exact_and_the_same_on_any_number_of_threads(rig):
+    full, exact = dense(rig.A), np.zeros(rig.free.size)
+    exact[rig.free] = np.linalg.solve(full[rig.free][:, rig.free], rig.rhs.reshape(-1)[rig.free])
+    one, several = (solve(rig, serial, 1e-10, 1000) for serial in (True, False))
+    assert one[0] == several[0] and np.array_equal(one[1], several[1]) and one[0].converged
+    assert np.abs(one[1].reshape(-1) - exact).max() < 1e-7 * np.abs(exact).max()

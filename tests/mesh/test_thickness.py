@@ -1,0 +1,196 @@
+"""Detection of meshes whose linear tets bend too stiffly, from geometry alone, and the warning when such a body is added:
+
+* found: sheets and bars of one layer, or of two layers of long cells, straight or curved, structured or not; not found: compact
+  or fine bodies, and bodies that are thin in less than half of their surface;
+* the result is invariant under rigid motions, scaling and reordering; thickness and layers are those of the grid;
+* the estimated stiffness agrees with statics;
+* the warning names the caller's line, and copies of a scene do not repeat it.
+"""
+
+import warnings
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import taisoft as ts
+from taisoft.mesh.thickness import coarse_bending, measure_thickness
+from taisoft.scene.refine import refined, with_order
+from tests.collision.rotations import rotation
+
+RUBBER = ts.Material()
+SHEET = ts.sheet_mesh((12, 12), (1.0, 0.02, 1.0))
+BAR = ts.box_mesh((12, 1, 1), (12.0, 1.0, 1.0))
+FINE = ts.box_mesh((12, 3, 3), (4.0, 1.0, 1.0))
+
+
+def curved(mesh: ts.TetMesh) -> ts.TetMesh:
+    """A sheet of length 1 rolled into three quarters of a tube."""
+    x, y, z = mesh.vertices.T
+    angle, radius = 1.5 * np.pi * x, y + 1.0 / (1.5 * np.pi)
+    return ts.TetMesh(np.stack([radius * np.sin(angle), radius * np.cos(angle), z], axis=1), mesh.tets)
+
+
+def joined(*meshes: ts.TetMesh) -> ts.TetMesh:
+    starts = np.cumsum([0, *(mesh.n_verts for mesh in meshes)])
+    tets = [mesh.tets + start for mesh, start in zip(meshes, starts)]
+    return ts.TetMesh(np.concatenate([mesh.vertices for mesh in meshes]), np.concatenate(tets))
+
+
+def irregular(mesh: ts.TetMesh) -> ts.TetMesh:
+    """A sheet whose vertices are moved in its plane by up to a quarter of a cell."""
+    moved = mesh.vertices.copy()
+    moved[:, [0, 2]] += np.random.default_rng(4).uniform(-0.25 / 12, 0.25 / 12, (len(moved), 2))
+    return ts.TetMesh(moved, mesh.tets)
+
+
+CUBES = joined(*(ts.box_mesh((1, 1, 1), (1.0, 1.0, 1.0), (1.5 * k, 0.0, 0.0)) for k in range(12)))
+UNEVEN = joined(ts.box_mesh((3, 3, 3), (3.0, 3.0, 3.0)), ts.box_mesh((6, 1, 1), (6.0, 0.5, 1.0), (5.0, 0.0, 0.0)))
+
+COARSE = {
+    "sheet": (SHEET, 1),
+    "irregular sheet": (irregular(SHEET), 1),
+    "tube": (curved(SHEET), 1),
+    "bar": (BAR, 1),
+    "kuhn": (ts.box_mesh((12, 1, 1), (12.0, 1.0, 1.0), pattern="six"), 1),
+    "fine along": (ts.box_mesh((40, 1, 1), (4, 1, 1)), 1),
+    "plate": (ts.box_mesh((4, 1, 4), (2.0, 0.5, 2.0)), 1),
+    "long cells": (ts.box_mesh((6, 2, 2), (12.0, 1.0, 1.0)), 2),
+    "wide bar": (ts.box_mesh((12, 1, 3), (12.0, 1.0, 3.0)), 1),
+    "two bars": (joined(BAR, curved(SHEET)), 1),
+}
+NOT_COARSE = {
+    "cell": ts.box_mesh((1, 1, 1), (1.0, 1.0, 1.0)),
+    "two cells": ts.box_mesh((2, 1, 1), (2.0, 1.0, 1.0)),
+    "fine": FINE,
+    "two layers": ts.box_mesh((20, 2, 2), (10.0, 1.0, 1.0)),
+    "fine sheet": ts.sheet_mesh((12, 4, 12), (1.0, 0.2, 1.0)),
+    "tet": ts.TetMesh([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], [[0, 1, 2, 3]]),
+    "cubes in a row": CUBES,
+    "coarse ball": ts.ball_mesh(1.0, 2),
+    "ball": ts.ball_mesh(1.0, 6),
+    "large cube and thin bar": UNEVEN,
+}
+
+
+@pytest.mark.parametrize("name", COARSE)
+def test_thin_meshes_of_few_layers_are_detected(name):
+    mesh, layers = COARSE[name]
+    found = coarse_bending(mesh)
+    assert found is not None and found.layers == pytest.approx(layers, rel=0.05) and found.stiffness >= 2.0
+
+
+@pytest.mark.parametrize("name", NOT_COARSE)
+def test_other_meshes_are_not_detected(name):
+    assert coarse_bending(NOT_COARSE[name]) is None
+
+
+def test_meshes_from_files(shared):
+    assert coarse_bending(ts.read_mesh(shared / "meshes" / "mat20x20.msh")).layers == pytest.approx(1.0)
+    assert coarse_bending(ts.read_mesh(shared / "meshes" / "bunny.msh")) is None
+
+
+@pytest.mark.parametrize("pattern", ["five", "six"])
+def test_thickness_and_layers_of_a_grid(pattern):
+    mesh = ts.box_mesh((5, 2, 3), (5.0, 1.0, 6.0), pattern=pattern)
+    thickness, layers = measure_thickness(mesh, np.arange(len(mesh.surface)))
+    corners = mesh.vertices[mesh.surface]
+    axis = np.ptp(corners, axis=1).argmin(axis=1)  # of the triangle's normal
+    assert thickness == pytest.approx(np.array([5.0, 1.0, 6.0])[axis])
+    assert layers == pytest.approx(np.array([5.0, 2.0, 3.0])[axis])
+
+
+def test_thickness_is_infinite_behind_many_tets():
+    mesh = ts.box_mesh((1, 40, 1), (1.0, 1.0, 1.0))
+    thickness, layers = measure_thickness(mesh, np.arange(len(mesh.surface)))
+    ends = np.ptp(mesh.vertices[mesh.surface][:, :, 1], axis=1) == 0.0
+    assert np.isinf(thickness[ends]).all() and np.isinf(layers[ends]).all() and thickness[~ends] == pytest.approx(1.0)
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.sampled_from([SHEET, BAR, FINE, COARSE["tube"][0], COARSE["two bars"][0], CUBES]), st.integers(0, 2**32 - 1))
+def test_result_is_invariant_under_motion_scaling_and_reordering(mesh, seed):
+    rng = np.random.default_rng(seed)
+    rotated = mesh.vertices @ rotation(rng.normal(size=3), rng.uniform(0, np.pi)).T
+    moved = 10.0 ** rng.uniform(-4, 4) * (rotated + rng.normal(size=3))
+    order, tets = rng.permutation(mesh.n_verts), rng.permutation(mesh.tets)
+    new_index = np.argsort(order)
+    corners = np.array([[0, 1, 2, 3], [1, 2, 0, 3], [3, 2, 1, 0], [2, 3, 0, 1]])[rng.integers(0, 4, mesh.n_tets)]
+    other = ts.TetMesh(moved[order], new_index[np.take_along_axis(tets, corners, axis=1)])
+    expected, found = coarse_bending(mesh), coarse_bending(other)
+    assert (expected is None) == (found is None)
+    if expected is not None:
+        assert found.stiffness == pytest.approx(expected.stiffness, rel=1e-6)
+        assert found.layers == pytest.approx(expected.layers, rel=1e-6)
+
+
+def test_estimated_stiffness_agrees_with_statics():
+    """Cantilevers, 10 m long and 1 m thick, against Timoshenko's beam."""
+    cases = {"1": (10, 1), "1 long": (4, 1), "1 six": (10, 1), "2": (20, 2), "2 long": (10, 2)}
+    young, poisson, force = 1e6, 0.3, 0.1
+    scene = ts.Scene(gravity=(0, 0, 0))
+    for name, (along, across) in cases.items():
+        mesh = ts.box_mesh((along, across, across), (10.0, 1.0, 1.0), pattern="six" if "six" in name else "five")
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            body = scene.add_body(mesh, ts.Material(young=young, poisson=poisson), name=name)
+        body.fix(lambda X: X[:, 0] < -4.999)
+        body.add_force(lambda X: X[:, 0] > 4.999, (0.0, -force, 0.0))
+    result = ts.solve_static(scene)
+    deflection = force * 10.0**3 / (3.0 * young / 12.0) + force * 10.0 / (5.0 / 6.0 * young / (2.0 + 2.0 * poisson))
+    for body in scene.bodies:
+        tip = body.rest_positions[:, 0] > 4.999
+        stiffness = -deflection / (result.positions(body.name) - body.rest_positions)[tip, 1].mean()
+        found = coarse_bending(body.mesh)
+        if found is None:
+            assert stiffness < 2.0, body.name
+        else:
+            assert 2.0 < stiffness and 0.6 < found.stiffness / stiffness < 1.4, (body.name, stiffness)
+    assert [body.name for body in scene.bodies if coarse_bending(body.mesh) is None] == ["2"]
+
+
+def warnings_of(call) -> list[warnings.WarningMessage]:
+    with warnings.catch_warnings(record=True) as found:
+        warnings.simplefilter("always")
+        call()
+    return found
+
+
+def test_adding_a_thin_body_warns_once_at_the_callers_line():
+    scene = ts.Scene()
+    found = warnings_of(lambda: scene.add_body(SHEET, RUBBER, name="mat"))
+    message = "body 'mat': about 1 linear tet lies through its thickness, and it bends about 30 times too stiffly: "
+    assert [str(warning.message) for warning in found] == [message + "order=2 bends correctly"] and found[0].filename == __file__
+    found = warnings_of(lambda: scene.add_body(ts.box_mesh((6, 2, 2), (12, 1, 1)), ts.Material(poisson=0.495), name="bar"))
+    assert [warning.filename for warning in found] == [__file__] * 2
+    assert "body 'bar': about 2 linear tets lie through its thickness" in str(found[1].message)
+    assert warnings_of(lambda: scene.add_body(SHEET, RUBBER, order=2)) == []
+    assert warnings_of(lambda: scene.add_body(FINE, RUBBER)) == []
+    assert (
+        warnings_of(scene.snapshot)
+        == warnings_of(lambda: refined(scene))
+        == warnings_of(lambda: with_order(with_order(scene, 2), 1))
+        == []
+    )
+    assert len(warnings_of(lambda: scene.add_body(SHEET, RUBBER))) == 1  # another body of the same mesh
+
+
+def test_scene_file_warns_once_per_body(tmp_path):
+    ts.write_mesh(tmp_path / "a.msh", SHEET)
+    body = "[bodies.{}]\nmaterial = {{}}\nmesh = {{ file = 'a.msh' }}\n"
+    (tmp_path / "scene.toml").write_text(body.format("one") + body.format("two"))
+    found = warnings_of(lambda: ts.read_scene(tmp_path / "scene.toml"))
+    assert [str(warning.message).split(":")[0] for warning in found] == ["body 'one'", "body 'two'"]
+    assert {warning.filename for warning in found} == {__file__}
+    (tmp_path / "scene.toml").write_text(body.format("one") + body.format("two") + "order = 3\n")
+    with pytest.warns(UserWarning, match="body 'one'"), pytest.raises(ts.SceneError, match="order"):
+        ts.read_scene(tmp_path / "scene.toml")
+
+
+def test_new_poissons_ratio_warns_at_the_callers_line():
+    scene = ts.Scene()
+    scene.add_body(FINE, RUBBER, name="bar")
+    with ts.Simulator(scene, dt=0.01, integrator="implicit_euler") as sim:
+        found = warnings_of(lambda: sim.set_material("bar", poisson=0.495))
+        assert [warning.filename for warning in found if "lock" in str(warning.message)] == [__file__]

@@ -1,0 +1,183 @@
+"""Reading scene files:
+
+* selectors select what they describe, boundary included; omitted entries have the defaults of Python;
+* each table is built once, however many tables a file has;
+* mesh files are found beside the scene file and must lie in its folder, links resolved, unless `allow_outside` is given;
+* a random edit of a file, and random text, is read or refused with SceneError or MeshError.
+"""
+
+import os
+import tomllib
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+import taisoft as ts
+from taisoft.scene.tables import Table
+from taisoft.scene.toml_writer import toml_of
+from tests.cli.command import write
+from tests.scene.toml_scenes import MESH, TEXT, TURNED, data, floats, read
+
+
+@pytest.mark.parametrize(
+    "nodes, expected",
+    [
+        ('"all"', list(range(12))),
+        ("[9, 3]", [9, 3]),
+        ("{ box = { min = [-1, -0.5, -9], max = [0, -0.5, 9] } }", [0, 1, 4, 5]),
+        ("{ half_space = { point = [0, 0, 0], normal = [1, 0, 0] } }", list(range(8))),
+        ("{ half_space = { point = [0.5, 0, 0], normal = [-7, 0, 0] } }", [8, 9, 10, 11]),
+    ],
+)
+def test_selectors_include_their_boundary(tmp_path, nodes, expected):
+    text = TEXT.replace('nodes = "all"', f"nodes = {nodes}")
+    body = read(tmp_path, text)[0].body("beam")
+    assert body.forces[0].nodes.tolist() == expected
+    assert body.constraints[0].nodes.tolist() == [0, 1, 2, 3] and body.constraints[0].axes.tolist() == [True, False, True]
+    below = body.mesh.vertices[body.mesh.surface].mean(axis=1)[:, 1] <= -0.49
+    assert body.tractions[0].triangles.tolist() == np.flatnonzero(below).tolist()
+
+
+def test_omitted_entries_have_the_defaults_of_python(tmp_path):
+    text = '[bodies.a]\nmaterial = {}\nmesh = { shape = "ball", radius = 1, cells = 4 }\n[obstacles.o]\nshape = "sphere"\n'
+    scene, solver = read(tmp_path, text + "center = [0, 5, 0]\nradius = 1\n")
+    expected = ts.Scene()
+    expected.add_body(ts.ball_mesh(1, 4), ts.Material(), name="a")
+    expected.add_obstacle(ts.Sphere((0, 5, 0), 1), name="o")
+    assert data(scene) == data(expected) and solver == {}
+
+
+def test_each_table_is_built_once(tmp_path, monkeypatch):
+    """So the time to read a file grows linearly with its number of materials."""
+    count, built = 2000, []
+
+    def counted(table, file, place, *arguments):
+        built.append(place)
+        init(table, file, place, *arguments)
+
+    init = Table.__init__
+    monkeypatch.setattr(Table, "__init__", counted)
+    text = "".join(f"[materials.m{i}]\nyoung = {i + 1}\n" for i in range(count))
+    text += "".join(f'[obstacles.o{i}]\nshape = "sphere"\ncenter = [0, {i}, 9]\nradius = 1\n' for i in range(50))
+    text += '[bodies.a]\nmaterial = "m1999"\nmesh = { shape = "ball", radius = 1, cells = 2 }\n'
+    scene, _ = read(tmp_path, text)
+    assert scene.body("a").material.young == 2000 and len(scene.obstacles) == 50
+    assert built.count("materials") == built.count("obstacles") == built.count("bodies") == 1
+    assert sum(place.startswith("materials.") for place in built) == count
+
+
+# --- mesh files --------------------------------------------------------------------------------------------------------
+
+
+def test_mesh_files_are_found_beside_the_scene_file(tmp_path, monkeypatch):
+    (tmp_path / "meshes").mkdir()
+    ts.write_mesh(tmp_path / "meshes" / "a.vtu", TURNED)
+    monkeypatch.chdir("/")
+    text = '\ufeff[bodies.a]\r\nmaterial = {}\r\nmesh = { file = "meshes/a.vtu", weld = 0, fix_orientation = true }\r\n'
+    assert np.array_equal(read(tmp_path, text)[0].body("a").rest_positions, TURNED.vertices)
+
+
+@pytest.mark.parametrize(
+    "name, message",
+    [
+        ("gone.msh", "gone.msh: there is no such file"),
+        ("", "must be a file's name, not ''"),
+        ("a\\u0000.msh", "must be a file's name"),
+        ("../out.msh", "must lie inside the scene file's folder, without '..'"),
+        ("in/../a.msh", "must lie inside the scene file's folder, without '..'"),
+        ("/etc/passwd", "must be one of"),
+        ("OUT/out.msh", "must lie inside"),
+        ("link.msh", "must lie inside"),
+        ("folder/out.msh", "must lie inside"),
+        ("pair.ele", "must lie inside"),
+        ("circle.msh", "bodies.a.mesh"),
+        ("a.xdmf", "other formats can name further files; --allow-outside (allow_outside=True) lifts this"),
+        ("secret.msh", "not a supported mesh"),
+    ],
+)
+def test_mesh_files_must_lie_in_the_folder_of_the_scene_file(tmp_path, name, message):
+    outside, inside = tmp_path / "out", tmp_path / "in"
+    outside.mkdir()
+    inside.mkdir()
+    ts.write_mesh(outside / "out.msh", TURNED)
+    ts.write_mesh(inside / "a.msh", TURNED)
+    (outside / "pair.node").write_text("secret")
+    (inside / "pair.ele").write_text("1 4 0\n1 1 2 3 4\n")
+    links = {"link.msh": outside / "out.msh", "folder": outside, "pair.node": outside / "pair.node", "circle.msh": "circle.msh"}
+    for link, target in links.items():
+        os.symlink(target, inside / link)
+    write(inside / "secret.msh", "passphrase")
+    text = MESH.format(name.replace("OUT", str(outside)))
+    with pytest.raises((ts.SceneError, ts.MeshError)) as caught:
+        read(inside, text)
+    assert message in str(caught.value) and str(caught.value).startswith(f"{inside / 'scene.toml'}: bodies.a.mesh")
+    assert "passphrase" not in str(caught.value) and "secret" not in str(caught.value).replace("secret.msh", "")
+    if "out.msh" in name or name == "link.msh":
+        name = name.replace("../out.msh", "../out/out.msh")
+        scene, _ = read(inside, MESH.format(name.replace("OUT", str(outside))), allow_outside=True)
+        assert np.array_equal(scene.body("a").rest_positions, TURNED.vertices)
+
+
+# --- random files ------------------------------------------------------------------------------------------------------
+
+
+def places(values, at=()):
+    """Paths of keys to all values of nested dicts and lists."""
+    yield at
+    items = values.items() if isinstance(values, dict) else enumerate(values) if isinstance(values, list) else ()
+    for key, value in items:
+        yield from places(value, (*at, key))
+
+
+PLACES = [place for place in places(tomllib.loads(TEXT)) if place]
+# no number that gives a large but valid mesh
+scalars = st.integers(-3, 3) | st.integers(2**40) | floats() | st.text(max_size=5) | st.booleans()
+scalars |= st.sampled_from(["1e5 Pa", "beam", "box", "all", "none", "rubber", "../a.msh", "__import__('os')"])
+junk = scalars | st.lists(scalars, max_size=4) | st.lists(st.lists(scalars, max_size=3), max_size=3)
+junk |= st.dictionaries(st.sampled_from(["shape", "file", "min", "box", "young", "a"]), scalars, max_size=2)
+
+
+def read_or_refused(tmp_path: Path, data: bytes) -> None:
+    path = tmp_path / "edited.toml"
+    path.write_bytes(data)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            scene, solver = ts.read_scene(path)
+        except (ts.SceneError, ts.MeshError) as error:
+            text = str(error)
+            assert text.startswith(str(path)) and text.count(str(path)) == 1 and "\n" not in text and len(text) < 1000
+        else:
+            assert isinstance(scene, ts.Scene) and isinstance(solver, dict)
+
+
+@settings(max_examples=200, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.sampled_from(PLACES), st.sampled_from(["replace", "remove", "rename"]), junk, st.text(max_size=8))
+def test_random_edits_are_read_or_refused(tmp_path, place, action, value, name):
+    tables = tomllib.loads(TEXT)
+    parent = tables
+    for key in place[:-1]:
+        parent = parent[key]
+    if action == "replace":
+        parent[place[-1]] = value
+    elif action == "remove" or isinstance(parent, list):
+        del parent[place[-1]]
+    else:
+        parent[name] = parent.pop(place[-1])
+    try:
+        text = toml_of(tables)
+    except (AttributeError, KeyError, TypeError):  # the writer cannot write a table in a list of other values
+        return
+    read_or_refused(tmp_path, text.encode())
+
+
+@settings(max_examples=200, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.integers(0, len(TEXT)), st.integers(0, 12), st.text('[]{}=".\n#,\x00é-', max_size=5).map(str.encode) | st.binary())
+def test_random_text_is_read_or_refused(tmp_path, start, length, inserted):
+    inserted = bytes(byte for byte in inserted if not 48 <= byte <= 57)  # digits could give a huge mesh
+    data = TEXT.encode()
+    read_or_refused(tmp_path, data[:start] + inserted + data[start + length :])

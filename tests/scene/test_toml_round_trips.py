@@ -1,0 +1,239 @@
+"""Writing scene files:
+
+* every demo, a scene with one of everything, and random numbers and names are read back bit for bit;
+* scenes that a file cannot store are refused, such as functions of time and rotations made for another start;
+* existing files are replaced only with overwrite=True.
+"""
+
+import inspect
+from fractions import Fraction
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+import taisoft as ts
+from taisoft.cli.run import RUN_KEYS
+from taisoft.cli.scene_file import load_module, shipped_files
+from taisoft.scene.checks import SOLVER_CHECKS
+from tests.cli.command import write
+from tests.scene.toml_scenes import TURNED, floats, there_and_back
+
+DEMOS = shipped_files("demos")
+
+
+@pytest.mark.parametrize("name", DEMOS)
+def test_demos_are_read_back(tmp_path, name):
+    demo = load_module(DEMOS[name])
+    there_and_back(tmp_path / f"{name}.toml", demo.build(), demo.solver)
+
+
+def everything() -> ts.Scene:
+    """A scene with one of everything that a file can hold."""
+    scene = ts.Scene(gravity=(0.1, -9.81, -0.0))
+    scene.collision = ts.CollisionSettings("bvh", margin=1e-3, k_dop=14, field_cells=40, max_capacity=1000)
+    scene.allow_initial_overlap, scene.contact_forces = True, False
+    rubber, foam = ts.Material(young=1 / 3), ts.Material("corotational", 1e22, -0.3, 1e-7, 0.1, 0.2, 0.3, 0.4, 0.05)
+    frames = ts.KeyFrames((0, 1 / 3), [(0, 0, 0), (0.1, 0, 0)], [(0, 0, 0), (0, 1e-3, 7)], (1, 2, 3), smooth=True, release=True)
+    a = scene.add_body(TURNED, rubber, name="a", position=(0.1, 0.2, 1e-300), order=2, quadrature_degree=4, collision="proximity")
+    a.move([3, 1, 2], frames, axes="zy")
+    a.fix([7, 5], axes="x")
+    a.add_traction(lambda c: c[:, 1] > 0.3, (1 / 7, 0, -0.0))
+    a.add_traction([4, 2], (0, 1, 0))
+    a.add_force(range(a.n_nodes), (0, 0, 1))
+    a.add_force([2, 1], [(0, 0, 1), (1 / 3, 0, 0)])
+    velocity = np.random.default_rng(0).standard_normal((12, 3))
+    scene.add_body(TURNED, foam, name='b "2"\n\\ü', velocity=velocity)
+    scene.add_body(ts.ball_mesh(0.3, 4, (1, 2, 3)), rubber, name="c.d", dilatation="mean")
+    scene.add_body(ts.sheet_mesh((3, 3), (1, 0.3, 1), pattern="six"), rubber, name="1")
+    lift = ts.KeyFrames((1,), [(0, 1 / 3, 0)])
+    scene.add_obstacle(ts.HalfSpace((0, 0, 0), (1, 2, 3)), name="ground", friction=0.1, restitution=0.9)
+    scene.add_obstacle(ts.Sphere((0, 0, 0), 1 / 3), path=lift)
+    turn = ts.KeyFrames((0, 1), rotations=[(0, 0, 0), (1, 2, 3)], pivot=(1, 1, 1))
+    scene.add_obstacle(ts.Box((0, 0, 0), (1, 1 / 3, 1)), path=turn)
+    scene.add_obstacle(ts.Capsule((0, 0, 0), (1 / 3, 0, 0), 2))
+    scene.add_obstacle(ts.MeshObstacle(TURNED.vertices, TURNED.surface))
+    scene.add_spring(("a", (0.1, 1 / 3, 0.2)), ("ground", (1 / 3, -0.0, 9)), 1 / 3, name="s.1")
+    scene.add_spring(("c.d", 3), ("1", (0.1, 0.01, -0.2)), 1e-20, rest_length=1 / 7, damping=0.1)
+    points = [("a", 12), ("ground", (0, 1 / 3, 0)), ("obstacle2", (0, 0, 1)), ('b "2"\n\\ü', 4)]
+    scene.add_tendon(points, 1 / 3, name='line "1"')
+    scene.add_tendon(points[::3], ts.KeyFrames((0, 1 / 3), values=(0.1, 5.0), smooth=True))
+    scene.attach("a", lambda X: X[:, 0] > 0, "ground", 1 / 3, 1e-3)
+    scene.attach("c.d", [4, 2], "obstacle2", 5.0, name="pins")
+    scene.attach('b "2"\n\\ü', [4, 2], "a", 1e9)
+    scene.set_contact("ground", "a", friction=0.3)
+    scene.set_contact("a", "a", restitution=0.3)
+    scene.set_contact("a", 'b "2"\n\\ü', 0.1, 0.2)
+    return scene
+
+
+EVERY_SETTING = {
+    "dt": 1 / 120,
+    "integrator": "bdf2",
+    "contact_solver": "auto",
+    "self_collision": True,
+    "precision": "f64",
+    "arch": "cpu",
+    "allow_unstable": False,
+    "draggable": True,
+    "newton_tolerance": 1e-5,
+    "linear_tolerance": None,
+    "contact_tolerance": 1e-3,
+    "tolerance": 0.01,
+    "seconds": 2,
+    "fps": None,
+}
+
+
+def test_a_scene_with_everything_is_read_back(tmp_path):
+    assert set(EVERY_SETTING) == set(SOLVER_CHECKS)
+    there_and_back(tmp_path / "all.toml", everything(), EVERY_SETTING)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["all.toml", "all_mesh0.msh"]  # shared by two bodies
+    text = (tmp_path / "all.toml").read_text()
+    again, solver = ts.read_scene(tmp_path / "all.toml")
+    ts.write_scene(tmp_path / "all.toml", again, solver, overwrite=True)
+    assert (tmp_path / "all.toml").read_text() == text
+
+
+def test_solver_settings_are_those_of_simulator_and_run():
+    names = set(inspect.signature(ts.Simulator).parameters) - {"scene"}
+    assert set(SOLVER_CHECKS) == names | set(RUN_KEYS)
+
+
+def test_numpy_numbers_are_written_as_plain_numbers(tmp_path):
+    scene = ts.Scene()
+    scene.add_body(TURNED, ts.Material())
+    solver = {"dt": np.float64(1 / 3), "seconds": np.int64(2), "self_collision": np.bool_(True), "fps": Fraction(1, 3)}
+    ts.write_scene(tmp_path / "a.toml", scene, solver)
+    assert ts.read_scene(tmp_path / "a.toml")[1] == {"dt": 1 / 3, "seconds": 2, "self_collision": True, "fps": 1 / 3}
+
+
+LARGEST = float(np.finfo(np.float32).max)
+numbers = floats(-LARGEST, LARGEST)
+vectors = st.tuples(*[floats(-1e30, 1e30)] * 3)
+positive = floats(min_value=float(np.finfo(np.float32).tiny), max_value=LARGEST)
+names = st.text(min_size=1, max_size=8).filter(str.strip)
+
+
+@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.data())
+def test_random_numbers_and_names_are_read_back(tmp_path, values):
+    draw = values.draw
+    scene = ts.Scene(gravity=draw(st.tuples(numbers, numbers, numbers)))
+    scene.collision = ts.CollisionSettings(cell_ratio=draw(positive), margin=draw(st.none() | floats(0, 1e9)))
+    loss = draw(floats(0, 1e38))
+    material = ts.Material(
+        young=draw(positive),
+        poisson=draw(floats(-1, 0.49, exclude_min=True)),
+        density=draw(positive),
+        friction=loss,
+        restitution=draw(floats(0, 1)),
+        mass_damping=loss,
+        stiffness_damping=draw(floats(0, 1e38)),
+        volume_floor=draw(st.just(0.0) | floats(1e-3, 1, exclude_max=True)),
+    )
+    name, other = draw(st.lists(names, min_size=2, max_size=2, unique=True))
+    body = scene.add_body(TURNED, material, name=name, position=draw(vectors), velocity=draw(vectors))
+    times = sorted(draw(st.lists(numbers.filter(lambda t: t > 0), min_size=1, max_size=4, unique=True)))
+    keys = [draw(vectors) for _ in times]
+    small = st.tuples(*[floats(-1e6, 1e6)] * 3)
+    turns = draw(st.none() | st.lists(small, min_size=len(times), max_size=len(times)))
+    frames = ts.KeyFrames(times, keys, turns, pivot=draw(st.none() | vectors), smooth=draw(st.booleans()))
+    ids = draw(st.lists(st.integers(0, 11), min_size=1, unique=True))
+    body.move(ids, frames, axes=draw(st.sampled_from(["x", "zy", "xyz"])))
+    body.add_force(ids, draw(st.lists(vectors, min_size=len(ids), max_size=len(ids)) | vectors))
+    normal = draw(vectors.filter(lambda v: max(map(abs, v)) > 0))
+    scene.add_obstacle(ts.HalfSpace(draw(vectors), normal), name=other)
+    scene.set_contact(name, other, friction=loss)
+    there_and_back(tmp_path / "random.toml", scene, {"dt": draw(positive), "fps": draw(st.none() | positive)})
+
+
+# --- refusals ----------------------------------------------------------------------------------------------------------
+
+
+def test_scenes_that_a_file_cannot_store_are_refused(tmp_path):
+    scene = ts.Scene()
+    path = tmp_path / "a.toml"
+    with pytest.raises(ts.SceneError, match="the scene holds no body"):
+        ts.write_scene(path, scene)
+    body = scene.add_body(TURNED, ts.Material(), name="a")
+    with pytest.raises(ts.SceneError, match=r"solver: no setting is called 'dtt' \(did you mean dt\?\)"):
+        ts.write_scene(path, scene, {"dtt": 1})
+    with pytest.raises(ts.SceneError, match="solver: dt must be a number, not '1'"):
+        ts.write_scene(path, scene, {"dt": "1"})
+    with pytest.raises(ts.SceneError, match=r"end in \.toml"):
+        ts.write_scene(tmp_path / "a.tml", scene)
+    with pytest.raises(ts.SceneError, match="needs a Scene, not dict"):
+        ts.write_scene(path, {})
+    with pytest.raises(ts.OutputError, match="cannot write .*: No such file"):
+        ts.write_scene(tmp_path / "gone" / "a.toml", scene)
+    obstacle = scene.add_obstacle(ts.Sphere((9, 9, 9), 1), name="s", path=lambda t: ((0, 0, 0), np.eye(3)))
+    with pytest.raises(ts.SceneError, match="obstacle 's': moves along a function, which a file cannot store: use ts.KeyFrames"):
+        ts.write_scene(path, scene)
+    scene.obstacles.remove(obstacle)
+    body.move([0], lambda t: (0, 0, 0))
+    with pytest.raises(ts.SceneError, match="body 'a': moves along a function, which a file cannot store: use ts.KeyFrames"):
+        ts.write_scene(path, scene)
+    body.constraints.clear()
+    tendon = scene.add_tendon([("a", 0), ("a", 5)], lambda t: 1.0, name="line")
+    with pytest.raises(ts.SceneError, match="tendon 'line': its force is a function, which a file cannot store: use ts.Key"):
+        ts.write_scene(path, scene)
+    scene.tendons.remove(tendon)
+    scene.add_body(TURNED, ts.Material(), name="\ud800")
+    with pytest.raises(ts.SceneError, match="not a character of Unicode"):
+        ts.write_scene(path, scene)
+    assert not list(tmp_path.iterdir())
+
+
+def test_existing_files_are_replaced_only_on_request(tmp_path):
+    scene = ts.Scene()
+    scene.add_body(TURNED, ts.Material(), name="a")
+    write(tmp_path / "a_mesh0.msh", "old")
+    with pytest.raises(ts.OutputError, match="a_mesh0.msh: the file exists"):
+        ts.write_scene(tmp_path / "a.toml", scene)
+    assert [path.name for path in tmp_path.iterdir()] == ["a_mesh0.msh"]
+    assert ts.write_scene(tmp_path / "a.toml", scene, overwrite=True) == [tmp_path / "a.toml", tmp_path / "a_mesh0.msh"]
+    with pytest.raises(ts.OutputError, match="a.toml: the file exists"):
+        ts.write_scene(tmp_path / "a.toml", scene)
+
+
+FRAMES = {"times": (0, 1), "translations": [(0, 0, 0), (0, 1, 0)]}
+ROTATIONS = FRAMES | {"rotations": [(0, 0, 0), (0, 0, 1)]}
+PIVOT = {"pivot": (1, 0, 0)}
+
+
+@pytest.mark.parametrize(
+    "frames, refused", [(FRAMES, False), (FRAMES | PIVOT, False), (ROTATIONS, False), (ROTATIONS | PIVOT, True)]
+)
+def test_a_path_shared_by_obstacles_keeps_its_motion_or_is_refused(tmp_path, frames, refused):
+    scene = ts.Scene()
+    scene.add_body(TURNED, ts.Material(), name="a")
+    first = scene.add_obstacle(ts.Box((9, 9, 9), (1, 1, 1)), path=ts.KeyFrames(**frames))
+    second = scene.add_obstacle(ts.Box((5, 9, 9), (1, 1, 1)), name="second", path=first.path)
+    if refused:
+        message = "obstacle 'second': rotates along a path made for a shape with another center, which a file cannot store"
+        with pytest.raises(ts.SceneError, match=message):
+            ts.write_scene(tmp_path / "a.toml", scene)
+        assert not list(tmp_path.iterdir())
+        return
+    ts.write_scene(tmp_path / "a.toml", scene)
+    again = ts.read_scene(tmp_path / "a.toml")[0].obstacle("second")
+    for t in (0, 0.3, 1):
+        assert all(np.array_equal(*pair) for pair in zip(again.path(t), second.path(t)))
+
+
+@pytest.mark.parametrize("frames, refused", [(FRAMES, False), (ROTATIONS, True)])
+def test_a_path_shared_by_nodes_keeps_its_motion_or_is_refused(tmp_path, frames, refused):
+    scene = ts.Scene()
+    body = scene.add_body(TURNED, ts.Material(), name="a")
+    path = body.move([0, 1], ts.KeyFrames(**frames)).path
+    body.move([2, 3], path)
+    if refused:
+        with pytest.raises(ts.SceneError, match="body 'a': rotates along a path made for nodes that start elsewhere, which a"):
+            ts.write_scene(tmp_path / "a.toml", scene)
+        assert not list(tmp_path.iterdir())
+        return
+    ts.write_scene(tmp_path / "a.toml", scene)
+    again = ts.read_scene(tmp_path / "a.toml")[0].body("a").constraints[1].path
+    assert all(np.array_equal(again(t), path(t)) for t in (0, 0.3, 1))

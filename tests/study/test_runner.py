@@ -1,0 +1,271 @@
+"""Runs of a study and their results, with an oscillator in place of the simulator:
+
+* errors fall with the integrator's order, and errors below the reference's own error are reported as unresolved;
+* runs that fail, crash or are left out stay in the table with the reason; without its reference a study has times but no errors;
+* finished runs are stored and reused, unless they are damaged or belong to other settings, scenes, code or machines;
+* the files agree with the records.
+"""
+
+import csv
+import io
+import json
+from dataclasses import asdict, replace
+
+import numpy as np
+import pytest
+
+from taisoft.errors import OutputError
+from taisoft.machine import versions
+from taisoft.study import Request, Setting, output
+from taisoft.study.accuracy import pack, unpack
+from taisoft.study.output import NoStore, Store, check_scene, write
+from taisoft.study.results import csv_of, text_of
+from taisoft.study.runner import Runner
+from tests.study.study_places import Pendulum
+
+DTS = (0.2, 0.1, 0.05)
+REQUEST = Request("pendulum", repeats=3)
+
+
+def plan(dts=DTS, integrators=("implicit_euler", "bdf2"), reference_dt=0.0125, **changes) -> dict:
+    settings = [asdict(Setting(dt, name)) for name in integrators for dt in dts]
+    refused = {"setting": asdict(Setting(0.4, "velocity_verlet")), "refused": "dt = 0.4 s is above the stability limit"}
+    steps = round(0.2 / reference_dt)
+    setting = asdict(Setting(reference_dt, "implicit_midpoint", precision="f64"))
+    reference = {"setting": setting, "kind": "", "order_in_time": 2, "steps": steps}
+    return {
+        "scenes": {"refine 0": "scene"},
+        "sources": {"scene.py": "text"},
+        "code": "code",
+        "fixed": {},
+        "frame": 0.2,
+        "frames": 20,
+        "seconds": 4.0,
+        "touching": False,
+        "names": ["mass"],
+        "cases": [refused, *({"setting": s, "refused": ""} for s in settings)],
+        "references": [reference],
+        "space": None,
+        "notes": [],
+    } | changes
+
+
+def run(place: Pendulum, store=None, request=REQUEST, machines=({"name": "here"},), requested=lambda: False, left=lambda: 1.0):
+    runner = Runner(request, [place], list(machines), requested, left, lambda line: None, store or NoStore(), planner=place)
+    return None if (planned := runner.plan()) is None else runner.run(planned)
+
+
+def rows_of(study, integrator: str) -> list:
+    return [row for row in study.rows if row.setting["integrator"] == integrator and row.in_time is not None]
+
+
+# --- errors -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("integrator, order", [("implicit_euler", 1), ("bdf2", 2)])
+def test_errors_fall_with_the_integrators_order(integrator, order):
+    study = run(Pendulum(plan()))
+    rows = rows_of(study, integrator)
+    for by in ("max", "rms"):
+        errors = [row.resolved_error(by) for row in rows]
+        orders = np.log2(np.divide(errors[:-1], errors[1:]))
+        assert np.allclose(orders, order, atol=0.15), orders
+    # the error at 4 s against the exact cos t, over the excursion of 2
+    place = Pendulum(plan())
+    task = {"setting": asdict(Setting(0.05, integrator)), "steps": 4, "frames": 20, "repeats": 0}
+    place.start({"action": "run", "task": task})
+    exact = abs(unpack(place.poll()["answer"]["path"])[-1, 1, 0] - np.cos(4.0)) / 2.0
+    assert rows[-1].in_time.max >= exact - 2 * study.references[0].own_error.max
+
+
+def test_estimated_error_of_the_reference_is_its_true_error():
+    reference = run(Pendulum(plan())).references[0]
+    exact = np.cos(np.arange(21) * 0.2)
+    true_error = np.abs(reference.path[:, 1, 0] - exact).max() / reference.excursion
+    assert reference.own_error.max == pytest.approx(true_error, rel=0.05)
+
+
+def test_errors_below_the_references_own_error_are_unresolved():
+    study = run(Pendulum(plan(dts=(0.2, 0.025))))
+    fine = rows_of(study, "bdf2")[1]
+    fine.in_time = replace(fine.in_time, max=0.5 * study.references[0].own_error.max)
+    assert fine.resolved_error("max") == study.references[0].own_error.max
+    assert f"< {study.references[0].own_error.max:.2g}" in text_of(study)
+
+
+def test_energy_drift_is_the_integrators():
+    study = run(Pendulum(plan()))
+    assert all(row.energy < 1e-12 for row in rows_of(study, "bdf2"))  # the trapezoidal rule conserves it
+    drift = [row.energy for row in rows_of(study, "implicit_euler")]
+    assert drift[0] > drift[1] > drift[2] > 0.05
+
+
+# --- the table --------------------------------------------------------------------------------------------------------
+
+
+def test_cheapest_setting_within_the_tolerance_is_reported():
+    study = run(Pendulum(plan()))
+    errors = {(row.setting["integrator"], row.setting["dt"]): row.resolved_error("max") for row in study.comparable_rows()}
+    assert errors["bdf2", 0.2] > 0.003 > errors["bdf2", 0.1]
+    study.request = replace(REQUEST, tolerance=0.003)
+    assert (study.cheapest().setting["integrator"], study.cheapest().setting["dt"]) == ("bdf2", 0.1)
+    assert "Cheapest within 0.003 (max error): bdf2, dt = 0.1 s, f32, 1.1 s" in text_of(study)
+    study.request = replace(REQUEST, tolerance=1e-9)
+    assert "No setting is within 1e-09 (max error); the nearest: bdf2, dt = 0.05 s" in text_of(study)
+    assert "are not resolved; --reference-dt" in text_of(study)
+
+
+def test_failed_and_crashed_runs_stay_with_their_reason():
+    study = run(Pendulum(plan(), failing={0.1: "step 7: not finite"}, crashing={0.05: "its process ended by signal SIGSEGV"}))
+    by_dt = {(row.setting["integrator"], row.setting["dt"]): row for row in study.rows}
+    assert (by_dt["bdf2", 0.1].status, by_dt["bdf2", 0.1].reason) == ("failed", "step 7: not finite")
+    assert by_dt["bdf2", 0.05].status == "failed" and "SIGSEGV" in by_dt["bdf2", 0.05].reason
+    assert by_dt["bdf2", 0.2].status == "ok" and by_dt["velocity_verlet", 0.4].status == "refused"
+    text = text_of(study)
+    assert all(reason in text for reason in ("step 7: not finite", "SIGSEGV", "above the stability limit"))
+    assert len(list(csv.DictReader(io.StringIO(csv_of(study))))) == len(study.rows) == 7
+
+
+@pytest.mark.parametrize("how", ["failing", "crashing"])
+def test_study_without_its_reference_has_times_but_no_errors(how):
+    study = run(Pendulum(plan(), **{how: {0.0125: "it is too small"}}))
+    assert not study.comparable_rows() and all(row.seconds for row in study.rows if row.status == "ok")
+    assert "it is too small; runs that need it have no error" in text_of(study)
+    assert "No setting has both a time and an error" in text_of(study)
+
+
+def test_refused_combinations_are_listed_as_a_product_if_they_form_one():
+    def refused(*settings) -> str:
+        cases = [{"setting": asdict(setting), "refused": "it does not fit"} for setting in settings]
+        made = plan()
+        return text_of(run(Pendulum(made | {"cases": [*made["cases"], *cases]})))
+
+    product = [Setting(dt, "bdf2", precision=p) for dt in (0.2, 0.1) for p in ("f32", "f64")]
+    assert "* bdf2, dt 0.2 | 0.1, precision f32 | f64: it does not fit" in refused(*product)
+    assert "* bdf2, dt = 0.2 s, f32; bdf2, dt = 0.2 s, f64; bdf2, dt = 0.1 s, f32: it does not fit" in refused(*product[:3])
+
+
+@pytest.mark.parametrize("stored, advice", [(True, "The same command continues it."), (False, "Without --out nothing is kept.")])
+def test_runs_beyond_the_budget_are_left_out(tmp_path, stored, advice):
+    place = Pendulum(plan())
+    # the budget is 3 runs; the first of the requests is planning
+    study = run(place, Store(tmp_path) if stored else None, left=lambda: 4.0 - len(place.requests))
+    left_out = [row for row in study.rows if row.status == "left out"]
+    assert left_out[0].reason == "the budget was spent while it ran"
+    assert len(left_out) > 1 and all(row.reason == "the budget was spent" for row in left_out[1:])
+    text = text_of(study)
+    assert f"Not complete: the budget was spent. {advice} Cut: implicit_euler, dt = 0.2 s, f32; if it takes longer than" in text
+
+
+# --- finished runs ----------------------------------------------------------------------------------------------------
+
+
+def test_finished_runs_are_reused(tmp_path):
+    first = run(Pendulum(plan()), Store(tmp_path))
+    place = Pendulum(plan())
+    again = run(place, Store(tmp_path))
+    assert [request["action"] for request in place.requests] == ["plan"]
+    assert text_of(again) == text_of(first)
+    assert not list(tmp_path.rglob("*.part"))
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"machines": [{"name": "there"}]},
+        {"request": replace(REQUEST, repeats=4)},
+        {"scenes": {"refine 0": "another scene"}},
+        {"code": "edited"},
+        {"sources": {"scene.py": "text", "helper.py": "text"}},
+    ],
+)
+def test_runs_of_other_machines_settings_scenes_and_code_are_not_reused(tmp_path, changes):
+    run(Pendulum(plan()), Store(tmp_path))
+    of_plan = {key: value for key, value in changes.items() if key in ("scenes", "sources", "code")}
+    place = Pendulum(plan(**of_plan))
+    run(place, Store(tmp_path), **{key: value for key, value in changes.items() if key not in of_plan})
+    assert len(place.requests) == 1 + (6 if "request" in changes else 8)  # more repeats do not repeat the references
+
+
+def test_order_of_machines_does_not_matter(tmp_path):
+    machines = [{"name": "here"}, {"name": "there"}]
+    run(Pendulum(plan()), Store(tmp_path), machines=machines)
+    place = Pendulum(plan())
+    run(place, Store(tmp_path), machines=machines[::-1])
+    assert [request["action"] for request in place.requests] == ["plan"]
+
+
+@pytest.mark.parametrize("damage", ["cut", "flipped", "other", "empty"])
+def test_damaged_records_are_reported_and_repeated(tmp_path, damage):
+    first = run(Pendulum(plan()), Store(tmp_path))
+    path = sorted((tmp_path / "runs").iterdir())[3]
+    text = path.read_text()
+    if damage == "flipped":
+        k = text.index("zlib_base64") + 40
+        path.write_text(text[:k] + ("A" if text[k] != "A" else "B") + text[k + 1 :])
+    else:
+        path.write_text({"cut": text[:-100], "other": json.dumps({"kind": "something"}), "empty": ""}[damage])
+    place, store = Pendulum(plan()), Store(tmp_path)
+    again = run(place, store)
+    assert len(place.requests) == 2
+    assert len(store.damaged) == 1 and f"{path} is damaged and its run is repeated: " in text_of(again)
+    assert [row.in_time for row in again.rows] == [row.in_time for row in first.rows]
+    assert Store(tmp_path).read(path.stem) is not None
+
+
+def test_interrupted_study_keeps_finished_runs(tmp_path):
+    place = Pendulum(plan())
+    study = run(place, Store(tmp_path), requested=lambda: len(place.requests) >= 5)
+    assert study.ended == "the study was interrupted" and len(list((tmp_path / "runs").iterdir())) == 3
+    assert run(Pendulum(plan()), requested=lambda: True) is None
+
+
+def test_packed_arrays_are_restored_bitwise():
+    values = np.random.default_rng(0).normal(size=(3, 4, 3)) * 10.0 ** np.arange(-300, 300, 200)
+    assert np.array_equal(unpack(json.loads(json.dumps(pack(values)))), values)
+    with pytest.raises(ValueError):
+        unpack({"shape": [1], "zlib_base64": "AAAA"})
+
+
+# --- files ------------------------------------------------------------------------------------------------------------
+
+
+def test_files_agree_with_the_records(tmp_path):
+    study = run(Pendulum(plan(), failing={0.1: "step 7"}))
+    assert write(study, tmp_path) == ""
+    assert (tmp_path / "study.md").read_text() == text_of(study)
+    record = json.loads((tmp_path / "study.json").read_text())
+    front = [row for row in record["rows"] if row["on_front"]]
+    assert [row["setting"] for row in front] == [row.setting for row in study.front()]
+    assert record["cheapest"] == study.cheapest().setting
+    table = list(csv.DictReader((tmp_path / "study.csv").open()))
+    for line, row in zip(table, study.rows):
+        assert (line["dt"], line["status"], line["reason"]) == (str(row.setting["dt"]), row.status, row.reason)
+        assert line["error_in_time_max"] == ("" if row.in_time is None else str(row.in_time.max))
+        assert line["seconds_per_simulated_second"] == ("" if not row.seconds else str(row.timing.median))
+    assert (tmp_path / "study.png").read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
+
+
+def test_plot_of_an_earlier_study_is_removed(tmp_path):
+    (tmp_path / "study.png").write_bytes(b"old")
+    note = write(run(Pendulum(plan(), failing={0.0125: "no"})), tmp_path)
+    assert "no setting has both a time and an error" in note and not (tmp_path / "study.png").exists()
+
+
+def test_folder_of_another_scenes_study_is_rejected(tmp_path):
+    check_scene(tmp_path, "scene")
+    write(run(Pendulum(plan())), tmp_path)
+    check_scene(tmp_path, "scene")
+    with pytest.raises(OutputError, match="holds a study of another scene .pendulum"):
+        check_scene(tmp_path, "another")
+    (tmp_path / "study.json").write_text("[]")
+    with pytest.raises(OutputError, match="holds a study.json not written by this version"):
+        check_scene(tmp_path, "scene")
+
+
+def test_code_digest_depends_on_package_versions(monkeypatch):
+    installed = output.code_digest()
+    assert output.code_digest() == installed
+    for changed in ({"taichi": "9.9"}, {"numpy": "9.9"}):
+        monkeypatch.setattr(output, "versions", lambda *names, changed=changed: versions(*names) | changed)
+        assert output.code_digest() != installed

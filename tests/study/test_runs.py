@@ -1,0 +1,194 @@
+"""Real runs of a study of small scenes, most of them in this process:
+
+* the measured order of convergence is the integrator's;
+* refined meshes are compared in space; energy and momentum are conserved in free flight;
+* a failed run is recorded with the reason; timed runs are pinned to separate cores.
+"""
+
+import os
+import sys
+from contextlib import nullcontext
+
+import numpy as np
+import pytest
+
+from taisoft.errors import SceneError
+from taisoft.machine import usable_cores
+from taisoft.simulator import Simulator
+from taisoft.study import Request, measure
+from taisoft.study.runner import Runner, tasks_of
+from taisoft.study.workers import LocalPlace, carry_out, local_places
+from tests.cli.command import write
+from tests.study.study_places import InProcess
+
+SCENE = '''"""A bar: fixed at one end, or in free flight."""
+import taisoft as ts
+
+solver = {"dt": 0.01, "integrator": "INTEGRATOR", "seconds": 0.4, "fps": 50}
+
+
+def build():
+    scene = ts.Scene()
+    bar = scene.add_body(ts.box_mesh((2, 1, 1), (2.0, 1.0, 1.0)), ts.Material(young=1e5), name="bar")
+    HOLD
+    return scene
+'''
+FIXED, FREE = "bar.fix(lambda X: X[:, 0] < -0.99)", "bar.velocity[:] = (1.0, 5.0, 0.0)"
+
+
+@pytest.fixture
+def reused_simulators(monkeypatch):
+    """Runs that differ in dt only reuse one simulator, since compiling takes most of the time."""
+    made: dict[tuple, Simulator] = {}
+
+    def reuse(scene, *, dt, **settings):
+        key = (scene.bodies[0].n_nodes, *settings.items())
+        if key not in made:
+            made[key] = Simulator(scene, dt=dt, **settings)
+        made[key].dt = dt
+        made[key].reset()
+        return nullcontext(made[key])
+
+    monkeypatch.setattr(measure, "Simulator", reuse)
+    yield
+    for sim in made.values():
+        sim.close()
+
+
+def study_of(tmp_path, hold: str = FIXED, **request):
+    path = write(tmp_path / "bar.py", SCENE.replace("HOLD", hold))
+    place = InProcess()
+    return run(place, Request(str(path), repeats=1, **request))
+
+
+def run(place: InProcess, request: Request):
+    runner = Runner(request, [place], [{"name": "here"}], lambda: False, lambda: 1.0, lambda _: None, planner=place)
+    return runner.run(runner.plan())
+
+
+@pytest.mark.parametrize(
+    "integrator, order",
+    [("velocity_verlet", 2), ("symplectic_euler", 1), ("implicit_euler", 1), ("bdf2", 2), ("implicit_midpoint", 2)],
+)
+def test_measured_order_of_convergence_is_the_integrators(tmp_path, reused_simulators, integrator, order):
+    axes = {"dt": [0.01, 0.005, 0.0025], "integrator": [integrator], "precision": ["f64"]}
+    study = study_of(tmp_path, axes=axes, reference_integrator="velocity_verlet")
+    rows = study.comparable_rows()
+    assert [row.setting["dt"] for row in rows] == axes["dt"] and study.references[0].setting["integrator"] == "velocity_verlet"
+    errors = np.array([row.in_time.rms for row in rows])
+    assert np.allclose(np.log2(errors[:-1] / errors[1:]), order, atol=0.25), errors
+    assert (errors > 10 * study.references[0].own_error.rms).all()  # errors are resolved
+    assert all(row.status == "ok" and row.unconverged == 0 and row.energy_kept for row in rows)
+
+
+def test_free_flight_has_no_error_on_either_mesh(tmp_path, reused_simulators):
+    axes = {"dt": [0.005], "integrator": ["velocity_verlet"], "precision": ["f64"], "refine": [0, 1]}
+    study = study_of(tmp_path, FREE, axes=axes, reference_refine=0)
+    coarse, fine = study.rows
+    assert fine.nodes > coarse.nodes and fine.tets == 8 * coarse.tets
+    for row in study.rows:  # nothing deforms, so both meshes fly exactly
+        assert row.in_time.max < 1e-9 and row.in_space.max < 1e-9 and row.energy < 1e-9 and row.momentum < 1e-9
+
+
+def test_failed_run_is_recorded_with_the_reason(tmp_path):
+    path = write(
+        tmp_path / "bar.py",
+        SCENE.replace("HOLD", "bar.move(lambda X: X[:, 0] < -0.99, path)")
+        + ("\n\ndef path(t):\n    return (0, 0, 0) if t < 0.2 else 1 / 0\n"),
+    )
+    place = InProcess()
+    request = Request(str(path), {"dt": [0.01], "integrator": ["velocity_verlet"], "precision": ["f64"]}, repeats=1)
+    study = run(place, request)
+    assert study.rows[0].status == "failed" and "ZeroDivisionError" in study.rows[0].reason
+    assert "ZeroDivisionError" in study.notes[0]
+
+
+@pytest.mark.parametrize(
+    "solver, message",
+    [
+        ('{"dtt": 0.1}', "solver dict: no setting is called 'dtt' (did you mean dt?)"),
+        ('{"dt": "a"}', "the scene's solver dict: dt must be a number, not 'a'"),
+    ],
+)
+def test_invalid_solver_dict_is_rejected(tmp_path, solver, message):
+    path = write(tmp_path / "bar.py", SCENE.replace("HOLD", FIXED) + f"\n\nsolver = {solver}\n")
+    with pytest.raises(SceneError) as error:
+        run(InProcess(), Request(str(path)))
+    assert message in str(error.value)
+
+
+def test_changed_import_or_refined_mesh_makes_another_run(tmp_path):
+    write(tmp_path / "module_of_a_study.py", "YOUNG = 1e5")
+    text = SCENE.replace("def build():", "def build(refine=0):\n    import module_of_a_study as numbers")
+    text = text.replace("1e5", "numbers.YOUNG")
+    length = write(tmp_path / "length.txt", "2")
+    text = text.replace("(2, 1, 1), (2.0", "(2, 1, 1), (float(open(LENGTH).read()) if refine else 2.0")
+    path = write(tmp_path / "bar.py", text.replace("HOLD", FIXED).replace("LENGTH", repr(str(length))))
+    axes = {"dt": [0.01], "integrator": ["velocity_verlet"], "refine": [0, 1]}
+    place = InProcess()
+    runner = Runner(Request(str(path), axes), [place], [{"name": "here"}], bool, lambda: 1.0, str, planner=place)
+    first = runner.plan()
+    assert set(first["scenes"]) == {"refine 0", "refine 1"} and set(first["sources"]) == {"bar.py", "module_of_a_study.py"}
+    assert runner.plan() == first
+
+    length.write_text("2.5")
+    other = runner.plan()
+    changed = [runner._key(first, task) != runner._key(other, task) for task in sum(tasks_of(first), [])]
+    assert changed == [bool(task.setting["refine"]) for task in sum(tasks_of(first), [])] and any(changed)
+
+    (tmp_path / "module_of_a_study.py").write_text("YOUNG = 1e6")
+    edited = runner.run(other)  # refused before anything is run
+    assert all("it was changed meanwhile" in row.reason for row in edited.rows)
+    third = runner.plan()
+    assert all(runner._key(other, task) != runner._key(third, task) for task in sum(tasks_of(other), []))
+
+
+# --- processes --------------------------------------------------------------------------------------------------------
+
+PINNED = '''"""A scene that fails with its cores in the message."""
+import os
+
+
+def build():
+    import taichi, threading
+    raise ValueError(f"cores {sorted(os.sched_getaffinity(0))}")
+'''
+
+
+def answers_of(requests: list, places: list) -> dict:
+    answers: dict = {}
+    assert carry_out(requests, places, answers.__setitem__, seconds_left=lambda: 1.0, stop_requested=lambda: False) == {}
+    return answers
+
+
+def request(path) -> dict:
+    return {"action": "plan", "scene": str(path), "allow_outside": False, "request": {}}
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="this system pins no process")
+def test_workers_are_pinned_to_separate_cores(tmp_path):
+    path = write(tmp_path / "pinned.py", PINNED)
+    cores = usable_cores()
+    number = min(2, len(cores))
+    places = local_places(number)
+    core_sets = [set(place.cores) for place in places]
+    assert len(core_sets) == number and len(set.union(*core_sets)) == sum(map(len, core_sets)) <= len(cores)
+    answers = answers_of([(str(k), request(path)) for k in range(number)], places)
+    reported = {answer["error"].partition("ValueError: ")[2] for answer in answers.values()}
+    assert reported == {f"cores {sorted(cores)}" for cores in core_sets}
+
+
+def test_process_that_exits_without_an_answer_is_reported(tmp_path):
+    path = write(tmp_path / "dead.py", "import os, sys\nprint('hello', file=sys.stderr, flush=True)\nos._exit(7)\n")
+    answers = answers_of([("a", request(path))], [LocalPlace(usable_cores())])
+    assert answers["a"] == {"crash": "its process ended with exit status 7 without an answer: hello"}
+
+
+def test_process_that_exits_without_reading_is_reported():
+    child = (sys.executable, "-c", "import os; os._exit(3)")
+    large = {"text": "x" * 1_000_000}  # more than a pipe holds
+    answers = answers_of([("a", large)], [LocalPlace(usable_cores(), child)])
+    assert answers["a"] == {"crash": "its process ended with exit status 3 without an answer"}
+    place = LocalPlace(usable_cores(), child)
+    place.start(large)
+    place.stop()

@@ -1,0 +1,302 @@
+"""A simulation that follows the clock and the window's commands, without a window:
+
+* it never runs faster than asked, makes up little of what it misses, and says how slow it is; batches are short;
+* commands are carried out between steps, and a state says which drag a step has used; a failure pauses, a warning is shown;
+* without a drag the states are those of `run`, bit by bit.
+"""
+
+import math
+import warnings
+
+import numpy as np
+import pytest
+
+import taisoft as ts
+from taisoft.errors import SimulationError
+from taisoft.records import StepReport
+from taisoft.scene.plan import Plan
+from taisoft.settings import Settings
+from taisoft.view.live import BATCH, LiveRun
+from taisoft.view.plots import Plots
+from tests.dynamics.scenes import rubber
+from tests.view.fake_simulator import FakeSimulator, beam_scene
+
+
+class Clock(FakeSimulator):
+    """A simulator whose steps take a given time of its own clock. calls: steps and commands in their order."""
+
+    draggable, dragged, compile_seconds, stable_dt = True, None, 0.0, 1.0
+
+    def __init__(self, dt=0.01, seconds_per_step=1e-3, integrator="symplectic_euler"):
+        super().__init__(beam_scene(), dt)
+        self.seconds_per_step, self.now, self.calls = seconds_per_step, 100.0, []
+        self.settings, self.plan = Settings(integrator=integrator), Plan()
+        self.plan.add("contact_forces", False, "", "one body")
+
+    def advance(self, n):
+        n = n if self.settings.explicit else 1
+        self.calls.append(("steps", n))
+        self.time, self.step_count, self.now = self.time + n * self.dt, self.step_count + n, self.now + n * self.seconds_per_step
+        return StepReport(time=self.time, steps=n)
+
+    def drag(self, body, nodes, weights, target, stiffness):
+        self.calls.append(("drag", body, tuple(target), stiffness))
+
+    def release(self):
+        self.calls.append("release")
+
+    def set_gravity(self, gravity):
+        self.calls.append(("gravity", gravity[1]))
+
+    def rebuild(self, **settings):
+        self.calls.append(("rebuild", settings["integrator"]))
+
+
+class Window:
+    """A window that gives requests by the simulator's step count; waiting takes time of its clock. states: what it has got."""
+
+    def __init__(self, sim, requests=(), steps=None, ready=True):
+        self.sim, self.requests, self.steps, self.ready, self.states, self.waits = sim, dict(requests), steps, ready, [], []
+
+    @property
+    def closed(self):
+        return self.steps is not None and self.sim.step_count >= self.steps
+
+    def receive(self, timeout):
+        due = [number for number in self.requests if self.sim.step_count >= number]
+        if due:
+            return [(number, self.requests.pop(number)) for number in due]
+        if hasattr(self.sim, "now"):
+            self.sim.now += timeout
+        self.waits.append(timeout)
+        return []
+
+    def publish(self, sim, plots, shown, patience=0.0):
+        self.states.append(shown | {"time": sim.time, "step_count": sim.step_count, "patience": patience})
+
+
+@pytest.fixture
+def live(monkeypatch):
+    """Make a run of a Clock simulator on its clock."""
+
+    def make(sim, requests=(), **options):
+        monkeypatch.setattr("time.perf_counter", lambda: sim.now)
+        window = Window(sim, requests)
+        return LiveRun(sim, window, Plots(sim), **options), window
+
+    return make
+
+
+# --- time ---
+
+
+@pytest.mark.parametrize("integrator", ["symplectic_euler", "implicit_euler"])
+@pytest.mark.parametrize("speed", [1.0, 0.25, 4.0])
+@pytest.mark.parametrize("dt, seconds_per_step", [(1 / 60, 1e-3), (1 / 600, 1e-4), (0.05, 1e-3)])
+def test_a_fast_simulation_follows_the_clock(live, dt, seconds_per_step, speed, integrator):
+    sim = Clock(dt, seconds_per_step, integrator)
+    run, window = live(sim, speed=speed)
+    begin = sim.now
+    while sim.now < begin + 5.0:
+        run.turn()
+        assert sim.time <= speed * (sim.now - begin) + 1e-9, "never ahead of the clock"
+    assert sim.time >= speed * (sim.now - begin) - 2 * dt - speed * 0.05
+    state = window.states[-1]
+    assert state["speed"] == pytest.approx(speed, rel=0.15) and state["status"] == "running"
+
+
+@pytest.mark.parametrize("integrator", ["symplectic_euler", "implicit_euler"])
+@pytest.mark.parametrize("dt, seconds_per_step, slowdown", [(1e-4, 1e-3, 10.0), (1 / 60, 0.5, 30.0)])
+def test_a_slow_simulation_says_so_and_makes_up_nothing(live, dt, seconds_per_step, slowdown, integrator):
+    sim = Clock(dt, seconds_per_step, integrator)
+    run, window = live(sim)
+    while sim.now < 110.0:
+        before = sim.now
+        run.turn()
+        assert sim.now - before <= max(1.1 * BATCH, 1.01 * seconds_per_step) + dt, "commands and states come in between"
+    assert f"needs {slowdown:.1f} times as long" in window.states[-1]["status"]
+    assert window.states[-1]["speed"] == pytest.approx(1.0 / slowdown, rel=0.1)
+    sim.seconds_per_step, time, now = 0.1 * dt, sim.time, sim.now  # now it could catch up
+    while sim.now < now + 3.0:
+        run.turn()
+    assert sim.time - time <= 3.0 + 0.05 + 3 * dt + seconds_per_step
+
+
+def test_as_fast_as_possible_and_the_keys_of_speed(live):
+    sim = Clock(0.01, 1e-4)
+    run, window = live(sim, {5: [["unbound"]], 20000: [["unbound"], ["faster"], ["faster"]], 30000: [["slower"]] * 9})
+    while sim.step_count < 20000:
+        run.turn()
+    assert window.states[-1]["asked_speed"] is None and window.states[-1]["speed"] == pytest.approx(100.0, rel=0.1)
+    assert max(n for _, n in sim.calls) <= BATCH / 1e-4 + 1
+    while sim.step_count < 30000:
+        run.turn()
+    assert window.states[-1]["asked_speed"] == 4.0 and window.states[-1]["speed"] == pytest.approx(4.0, rel=0.2)
+    run.turn()
+    run.turn()
+    assert window.states[-1]["asked_speed"] == 1 / 16, "the least"
+
+
+def test_nothing_is_sent_while_the_window_is_not_ready(live):
+    sim = Clock()
+    run, window = live(sim)
+    window.ready = False
+    run.turn()
+    while sim.step_count < 50:
+        run.turn()
+    assert [state["patience"] > 0.0 for state in window.states] == [True], "but the first, which compiling follows"
+    window.ready = True
+    run.turn()
+    assert window.states[-1]["step_count"] >= 50
+
+
+# --- commands ---
+
+
+def test_commands_are_carried_out_between_steps(live):
+    sim = Clock(integrator="implicit_euler")
+    nodes, weights = np.array([1, 2]), np.array([0.5, 0.5])
+    requests = {
+        3: [["begin_drag", "beam", nodes, weights], ["drag", [1.0, 2.0, 3.0], 10.0]],
+        6: [["release"], ["set_gravity", 1.5]],
+        8: [["pause"]],
+    }
+    run, window = live(sim, requests)
+    while sim.step_count < 8 or not run.paused:
+        run.turn()
+    stiffness = 10.0 * 4000.0 * 9.81 / np.sqrt(18.0)
+    expected = [*[("steps", 1)] * 3, ("drag", "beam", (1.0, 2.0, 3.0), pytest.approx(stiffness)), *[("steps", 1)] * 3]
+    assert sim.calls == [*expected, "release", ("gravity", -1.5), *[("steps", 1)] * 2]
+    assert {state["step_count"] for state in window.states if state["drag_done"] == 3} == {4, 5, 6, 7, 8}, "a step has used it"
+    time = sim.time
+    for _ in range(20):
+        run.turn()
+    assert sim.time == time and window.states[-1]["status"] == "paused" and max(window.waits) <= 0.25
+    window.requests = {0: [["step"], ["step"]]}
+    run.turn()
+    assert sim.step_count == 10 and run.paused
+    window.requests = {0: [["reset"], ["pause"]]}
+    run.turn()
+    assert sim.step_count == 0 and not run.paused
+
+
+def test_no_state_is_sent_between_a_drag_and_its_step(live):
+    """The window would draw it while the step takes place. A simulation that pauses sends it, and a slow one goes on sending."""
+    sim = Clock(dt=0.05, seconds_per_step=1e-3)
+    run, window = live(sim)
+    while sim.step_count < 5:
+        run.turn()
+    count, window.requests = len(window.states), {5: [["begin_drag", "beam", [0], [1.0]], ["drag", [1.0, 2.0, 3.0], 10.0]]}
+    while sim.step_count < 6:
+        run.turn()
+    assert [(state["step_count"], state["drag_done"]) for state in window.states[count:]] == [(6, 5)]
+    run.speed = 1.0 / 16.0
+    count, window.requests = len(window.states), {6: [["drag", [1.0, 2.0, 4.0], 10.0]]}
+    while sim.step_count < 7:
+        run.turn()
+    own = [(state["step_count"], state["drag_done"]) for state in window.states[count:]]
+    assert own[-1] == (7, 6) and set(own[:-1]) == {(6, 5)}, "every 0.2 s meanwhile"
+    window.requests = {7: [["pause"], ["drag", [1.0, 2.0, 5.0], 10.0]]}
+    count = len(window.states)
+    run.turn()
+    assert [state["step_count"] for state in window.states[count:]] == [7] and run.paused
+
+
+def test_failures_pause_and_warnings_are_shown(live):
+    sim = Clock()
+    run, window = live(sim)
+    advance, given = sim.advance, []
+
+    def warn(n):
+        warnings.warn("the body is soft", UserWarning, stacklevel=1)
+        return advance(n)
+
+    def fail(_n):
+        raise SimulationError("node 3 is not finite")
+
+    window.steps, sim.advance = 3, warn
+    with warnings.catch_warnings():
+        warnings.simplefilter("always")
+        warnings.showwarning = lambda message, *_, **__: given.append(str(message))
+        run.run()
+        assert warnings.showwarning("x") is None, "it is put back"
+    assert given[0] == "the body is soft" and window.states[-1]["messages"] == ["warning: the body is soft"]
+    sim.advance, window.steps = fail, None
+    while not run.paused:
+        run.turn()
+    run.turn()
+    assert window.states[-1]["messages"][0] == "failed: node 3 is not finite" and window.states[-1]["status"] == "paused"
+    sim.advance, window.requests = advance, {0: [["pause"]]}
+    count = sim.step_count
+    while sim.step_count < count + 3:
+        run.turn()
+    assert not run.paused and "failed" not in window.states[-1]["messages"][0]
+
+
+def test_the_problems_of_a_step_are_shown(live):
+    sim = Clock()
+    run, window = live(sim)
+    advance = sim.advance
+
+    def diverging(n):
+        report = advance(n)
+        report.problems = ["the step did not converge"]
+        return report
+
+    sim.advance = diverging
+    while sim.step_count < 2:
+        run.turn()
+    assert window.states[-1]["messages"] == ["the step did not converge"]
+
+
+def test_another_solver_is_announced_before_it_compiles(live):
+    sim = Clock()
+    run, window = live(sim, {3: [["rebuild", "bdf2", "auto"]]})
+    while ("rebuild", "bdf2") not in sim.calls:
+        run.turn()
+    assert window.states[-2]["messages"] == ["compiling bdf2, for some seconds"] and window.states[-2]["patience"] > 0.0
+    assert window.states[-1]["status"] == "compiling the next step, for some seconds"
+    assert window.states[-1]["messages"][-1].startswith("bdf2 is in use")
+
+    def refuse(**_settings):
+        raise SimulationError("that is impossible")
+
+    sim.rebuild, window.requests = refuse, {0: [["rebuild", "bdf2", "auto"]]}
+    run.turn()
+    assert run.panel_state()["messages"] == ["that is impossible"] and not run.paused
+
+
+# --- the same bits ---
+
+
+def falling(integrator, dt):
+    scene = ts.Scene()
+    scene.add_body(ts.box_mesh((2, 2, 2), (1, 1, 1)), rubber(), name="cube", position=(0, 0.51, 0), velocity=(0.3, -1.0, 0.1))
+    scene.add_obstacle(ts.HalfSpace((0, 0, 0), (0, 1, 0)), name="ground")
+    return scene, {"integrator": integrator, "dt": dt}
+
+
+@pytest.mark.parametrize("integrator, dt", [("implicit_euler", 0.008), ("symplectic_euler", 1e-3)])
+def test_without_a_drag_the_states_are_those_of_run(integrator, dt):
+    from taisoft.frames import fit_dt
+    from taisoft.records import RunReport
+
+    scene, settings = falling(integrator, dt)
+    with ts.Simulator(scene, **settings, draggable=True) as sim:
+        fit_dt(sim, 60.0, RunReport())
+        LiveRun(sim, Window(sim, steps=round(0.2 / sim.dt)), Plots(sim)).run()
+        n, found = sim.step_count, (sim.time, sim.positions(), sim.velocities())  # a last batch may exceed 0.2 s
+    with ts.Simulator(scene.snapshot(), **settings) as sim:
+        sim.run(0.2, fps=60)
+        assert sim.contacts().impulse.any() and sim.step_count <= n
+        while sim.step_count < n:
+            sim.step()
+        for own, other in zip(found, (sim.time, sim.positions(), sim.velocities())):
+            assert np.array_equal(own, other)
+
+
+def test_an_infinite_speed_is_a_speed(live):
+    run, window = live(Clock(), speed=math.inf)
+    for _ in range(3):
+        run.turn()
+    assert window.states[-1]["asked_speed"] is None

@@ -1,0 +1,315 @@
+"""What notebooks show:
+
+* reprs of records, scenes and simulators are short, whatever their size;
+* `Simulator.picture` returns what `taisoft run` draws; bad sizes and colours are refused;
+* scenes, simulators and results show HTML: a picture or a chart beside the repr; nothing to draw gives the repr alone;
+* a Film holds a picture a frame, and its page contains and plays them; pictures of `taisoft run` are read back;
+* an InteractiveView makes a page of its own, prints nothing, and says what is missing without viser;
+* Taichi prints nothing where standard output is a notebook's;
+* the notebooks of the manual are stored without outputs.
+"""
+
+import base64
+import json
+import re
+import subprocess
+import sys
+import zlib
+
+import numpy as np
+import pytest
+
+import taisoft as ts
+from taisoft.errors import OutputError
+from taisoft.output.frames import png_bytes
+from taisoft.records import BodyError
+from taisoft.view import interactive
+from taisoft.view.offscreen import Offscreen
+from tests.cli.command import BEAM, ROOT, run, write
+from tests.view.fake_simulator import FakeSimulator, beam_scene
+
+SIZE = (96, 54)
+
+
+@pytest.fixture(scope="module")
+def ran():
+    """A simulator, its result and the film of its run: a beam bends onto an obstacle's plane that it does not reach."""
+    scene = beam_scene(cells=(6, 2, 2))
+    scene.add_obstacle(ts.HalfSpace((0, -3, 0), (0, 1, 0)), name="ground")
+    film = ts.Film(SIZE)
+    with ts.Simulator(scene, dt=1 / 60) as sim:
+        result = sim.run(0.2, on_frame=film, fps=30)
+        yield sim, result, film
+
+
+def shown(thing) -> str | None:
+    """The HTML that a notebook displays."""
+    return thing._repr_html_()
+
+
+def pixels(png: bytes) -> np.ndarray:
+    """Decode a PNG as `png_bytes` writes it: RGB, rows filtered by their upper neighbour."""
+    width, height = int.from_bytes(png[16:20], "big"), int.from_bytes(png[20:24], "big")
+    at = png.index(b"IDAT")
+    data = zlib.decompress(png[at + 4 : at + 4 + int.from_bytes(png[at - 4 : at], "big")])
+    rows = np.frombuffer(data, dtype=np.uint8).reshape(height, 1 + 3 * width)[:, 1:]
+    return np.cumsum(rows, axis=0, dtype=np.uint8).reshape(height, width, 3)
+
+
+# --- texts ------------------------------------------------------------------------------------------------------------
+
+
+def test_reprs_of_a_run_are_short(ran):
+    sim, result, _ = ran
+    assert re.fullmatch(
+        r"RunReport: ok, 0\.2 s in 12 steps of 0\.0166667 s, \d+\.\d\d s of wall time, \d+\.\d\d s to compile", repr(result)
+    )
+    step = repr(result.step_reports[-1])
+    assert re.match(r"StepReport\(t = 0\.2 s: \d+ Newton iterations, residual .*, min J .*, kinetic .* J, elastic .* J\)$", step)
+    n = sim.scene.bodies[0].mesh.n_tets
+    expected = f"Simulator(1 body, {n} tets; implicit_euler, f32 on cpu; t = 0.2 s after 12 steps of 0.0166667 s)"
+    assert repr(sim) == expected
+    for record in (sim.scene, sim.scene.bodies[0], sim.energies(), sim.contacts(), sim.plan, sim.scene.bodies[0].nodes):
+        assert len(repr(record)) < 400 and "\n" not in repr(record), type(record)
+
+
+def test_a_report_lists_its_first_problems():
+    report = ts.RunReport(status="degraded", problems=[f"problem {k}" for k in range(7)], interrupted=True)
+    report.step_reports = [ts.StepReport(time=1.0, converged=False, n_contacts=3, substeps=4)] * 1000
+    report.error_estimate = ts.ErrorEstimate(time=0.0123, excursion=2.0, bodies={"a": BodyError(time=0.1)})
+    lines = repr(report).splitlines()
+    assert lines[0].startswith("RunReport: degraded, ended early, 0 s in 0 steps")
+    assert lines[1:7] == [*(f"  problem {k}" for k in range(5)), "  and 2 more problems"]
+    assert lines[7] == "  ErrorEstimate(time 1.2 %; relative to an excursion of 2 m)" and len(lines) == 8
+    assert "4 substeps, 3 contacts" in repr(report.step_reports[0]) and repr(report.step_reports[0]).endswith("not converged)")
+
+
+def test_records_of_arrays_show_their_shapes():
+    mesh = ts.box_mesh((3, 3, 3), (1, 1, 1))
+    obstacle = ts.MeshObstacle(mesh.vertices, mesh.surface)
+    assert repr(obstacle) == f"MeshObstacle(vertices=float64 (64, 3), triangles=int64 {mesh.surface.shape})"
+    frames = ts.KeyFrames(times=np.arange(50.0), values=np.zeros(50), smooth=True)
+    assert "times=float64 (50,)" in repr(frames) and "smooth=True" in repr(frames)
+    assert "times=[0.0, 1.0]" in repr(ts.KeyFrames(times=[0, 1], values=[2, 3]))
+    solution = ts.solve_contact_problem(np.eye(30), np.ones(30), np.ones(10))
+    assert repr(solution).startswith("ContactSolution(impulse=float64 (30,), residual=")
+
+
+# --- pictures ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("colour", ["stress", "speed", "stretch", "body"])
+def test_a_picture_is_that_of_the_renderer(ran, colour):
+    sim = ran[0]
+    picture = sim.picture(SIZE, colour)
+    assert picture.shape == (54, 96, 3) and picture.dtype == np.uint8
+    assert np.array_equal(picture, Offscreen(sim.scene, SIZE, colour=colour).image(sim))
+    assert np.array_equal(picture, sim.picture(SIZE, colour)) and len(np.unique(picture.reshape(-1, 3), axis=0)) > 50
+
+
+def test_pictures_are_of_stress_by_default(ran):
+    sim = ran[0]
+    assert np.array_equal(sim.picture(), sim.picture((1280, 720), "stress"))
+    assert not np.array_equal(sim.picture(SIZE), sim.picture(SIZE, "body"))
+
+
+@pytest.mark.parametrize(
+    "arguments, message",
+    [
+        ({"size": (0, 10)}, "a picture of 0 x 10 pixels cannot be drawn: both must be 1 to 16384"),
+        ({"size": (10, 10**9)}, "a picture of 10 x 1000000000 pixels cannot be drawn"),
+        ({"size": 5}, "the size of a picture must be two whole numbers, width and height, not 5"),
+        ({"size": (1.5, 2)}, r"must be two whole numbers, width and height, not \(1.5, 2\)"),
+        ({"colour": "rainbow"}, "colour 'rainbow' is unknown: it must be one of body, stress, stretch, speed, error"),
+    ],
+)
+def test_bad_sizes_and_colours_are_refused(ran, arguments, message):
+    with pytest.raises(OutputError, match=message):
+        ran[0].picture(**arguments)
+    with pytest.raises(OutputError, match=message):
+        ts.Film(**arguments)
+
+
+# --- HTML -------------------------------------------------------------------------------------------------------------
+
+
+def pictures_in(page: str) -> list[np.ndarray]:
+    return [pixels(base64.b64decode(text)) for text in re.findall(r'data:image/png;base64,([^"&]+)["&]', page)]
+
+
+def test_a_scene_shows_its_start():
+    page = beam_scene()._repr_html_()
+    (picture,) = pictures_in(page)
+    assert picture.shape == (360, 640, 3) and "Scene(gravity=(0.0, -9.81, 0.0), bodies=[&#x27;beam&#x27;])" in page
+    scene = beam_scene()
+    expected = Offscreen(scene, (640, 360)).image(FakeSimulator(scene))  # at t = 0
+    assert np.array_equal(picture, expected)
+
+
+def test_a_simulator_shows_its_state(ran):
+    sim = ran[0]
+    page = shown(sim)
+    assert np.array_equal(pictures_in(page)[0], sim.picture((640, 360)))
+    assert repr(sim) in page and re.search(r"von Mises stress, red: \d+ Pa or more", page)
+
+
+def test_nothing_to_draw_gives_the_repr_alone(monkeypatch):
+    scene = beam_scene()
+    with ts.Simulator(scene, dt=0.01) as sim:
+        pass
+    assert not sim.is_open and shown(sim) is None and repr(sim).endswith("; closed)")
+    assert ts.Scene()._repr_html_() is None
+    monkeypatch.setattr("taisoft.view.notebook.MAX_NODES", 10)
+    assert scene._repr_html_() is None
+
+
+def test_a_result_shows_numbers_problems_and_energies(ran):
+    page = ran[1]._repr_html_()
+    assert page.startswith("<div") and "<b>RunReport: ok, 0.2 s in 12 steps" in page
+    smallest = min(step.min_volume_ratio for step in ran[1].step_reports)
+    assert f"<td>smallest J</td><td>{smallest:.4g}</td>" in page
+    curves = re.findall(r'<polyline points="([^"]*)"', page)
+    assert len(curves) == 3 and ">kinetic</text>" in page and ">gravity</text>" in page and ">loads</text>" not in page
+    for curve in curves:
+        at = np.array([[float(n) for n in pair.split(",")] for pair in curve.split()])
+        assert (
+            len(at) == 12 and (np.diff(at[:, 0]) > 0).all() and at.min() >= 0 and at[:, 0].max() <= 420 and at[:, 1].max() <= 130
+        )
+    kinetic = np.array([step.kinetic for step in ran[1].step_reports])
+    drawn = -np.array([float(pair.split(",")[1]) for pair in curves[0].split()])
+    assert np.corrcoef(kinetic, drawn)[0, 1] > 0.999
+
+
+def test_a_result_without_steps_or_with_bad_numbers_has_no_chart():
+    assert "polyline" not in ts.RunReport(status="failed", problems=["<script>"])._repr_html_()
+    assert "&lt;script&gt;" in ts.RunReport(status="failed", problems=["<script>"])._repr_html_()
+    steps = [ts.StepReport(time=t, kinetic=float("nan") if t else 1.0) for t in (0.0, 1.0)]
+    assert "polyline" not in ts.RunReport(step_reports=steps)._repr_html_()
+
+
+# --- films ------------------------------------------------------------------------------------------------------------
+
+
+def test_a_film_holds_a_picture_a_frame(ran, tmp_path):
+    sim, _, film = ran
+    assert len(film) == 7 and np.allclose(film.times, np.arange(7) / 30)
+    assert repr(film) == "Film(7 pictures, t = 0 to 0.2 s)"
+    page = film.as_html()
+    data = json.loads(re.search(r"const film = (\{.*?\}),", page)[1])
+    assert data["times"] == film.times and data["scales"] == film.scales and len(film.scales) == 7
+    assert re.fullmatch(r"(von Mises stress|speed), red: \S+ (Pa|m/s) or more", film.scales[-1]) and "film.scales[k]" in page
+    found = [pixels(base64.b64decode(url.split(",")[1])) for url in data["pictures"]]
+    assert all(picture.shape == (54, 96, 3) for picture in found) and not np.array_equal(found[0], found[-1])
+    assert [png_bytes(picture, 6) for picture in found] == film.pngs
+    film.save(tmp_path / "film.html")
+    assert (tmp_path / "film.html").read_text() == page and "http" not in page
+    assert film._repr_html_().startswith('<iframe srcdoc="')
+
+
+def test_a_film_of_a_run_on_disk(tmp_path):
+    out = tmp_path / "out"
+    assert run(write(tmp_path / "scene.py", BEAM), "--out", out, "--no-usd") == 0
+    film = ts.Film.read(out)
+    assert film.times == [0.0, *(k / 30 for k in (1, 2, 3))]
+    assert film.pngs == [(out / "frames" / f"{k:05d}.png").read_bytes() for k in range(4)]
+    assert film.scales == [""] * 4 and ts.Film(colour="body").scales == []
+    (out / "report.json").unlink()
+    assert ts.Film.read(out, fps=10).times == [0.0, 0.1, 0.2, 0.3]
+    with pytest.raises(OutputError, match="the run cannot be read"):
+        ts.Film.read(out)
+    with pytest.raises(OutputError, match="there are no pictures of a run"):
+        ts.Film.read(tmp_path)
+
+
+def test_an_empty_film_and_a_bad_name_are_refused(ran, tmp_path):
+    with pytest.raises(OutputError, match="the film holds no picture"):
+        ts.Film().save(tmp_path / "a.html")
+    assert ts.Film()._repr_html_() is None
+    with pytest.raises(OutputError, match=r"a\.txt: the name of a page must end in \.html"):
+        ran[2].save(tmp_path / "a.txt")
+    with pytest.raises(OutputError, match="cannot write"):
+        ran[2].save(tmp_path / "none" / "a.html")
+
+
+# --- the interactive view ---------------------------------------------------------------------------------------------
+
+
+def test_an_interactive_view_makes_a_page(tmp_path, capfd):
+    pytest.importorskip("viser")
+    scene = beam_scene(("a", "b"), order=2)
+    scene.add_obstacle(ts.Sphere((0, -3, 0), 0.5), path=lambda t: ((t, 0, 0), np.eye(3)))
+    scene.add_obstacle(ts.HalfSpace((0, -4, 0), (0, 1, 0)))
+    view, sim = ts.InteractiveView(), FakeSimulator(scene)
+    assert view._repr_html_() is None
+    for k in range(5):
+        sim.time = k / 10
+        view(sim, k, None)
+    assert repr(view) == "InteractiveView(5 frames, t = 0 to 0.4 s)"
+    view.save(tmp_path / "view.html")
+    page = (tmp_path / "view.html").read_text()
+    assert re.search(r">von Mises stress, red: \d+ Pa or more(, at the end)?</div></body>", page)
+    assert recorded(page)["durationSeconds"] == pytest.approx(0.4)
+    kinds = [message["type"] for _, message in recorded(page)["messages"]]
+    assert kinds.count("GlbMessage") == 5 and kinds.count("MeshMessage") == 2
+    assert len(view.as_html()) == pytest.approx(len(page), rel=0.01)  # a second page, from another server
+    assert view._repr_html_().startswith('<iframe srcdoc="')
+    assert capfd.readouterr() == ("", "")
+    with pytest.raises(OutputError, match="an interactive view shows one scene"):
+        view(FakeSimulator(beam_scene()))
+
+
+def recorded(page: str) -> dict:
+    """What viser's recording in a page holds."""
+    import msgspec
+    import zstandard
+
+    data = base64.b64decode(re.search(r'__VISER_EMBED_DATA__="([^"]+)"', page)[1])
+    content = zstandard.ZstdDecompressor().decompress(data[8:], max_output_size=int.from_bytes(data[:8], "little"))
+    length = int.from_bytes(content[:8], "little")
+    return msgspec.msgpack.decode(content[8 : 8 + length])
+
+
+def test_an_interactive_view_without_frames_is_refused():
+    pytest.importorskip("viser")
+    with pytest.raises(OutputError, match="the view holds no frame"):
+        ts.InteractiveView().as_html()
+    with pytest.raises(OutputError, match="colour 'x' is unknown"):
+        ts.InteractiveView("x")
+
+
+def test_without_viser_the_message_says_what_to_install(monkeypatch):
+    monkeypatch.setattr(interactive, "find_spec", lambda name: None)
+    with pytest.raises(OutputError, match=r"needs the package viser: pip install 'taisoft\[notebook\]'"):
+        ts.InteractiveView()
+
+
+# --- Taichi, and the notebooks of the manual --------------------------------------------------------------------------
+
+IN_A_NOTEBOOK = """
+import io, sys
+sys.stdout = cell = io.StringIO()
+import taisoft as ts
+scene = ts.Scene()
+scene.add_body(ts.box_mesh((2, 1, 1), (2, 1, 1)), ts.Material(), order=2)
+with ts.Simulator(scene, dt=0.01) as simulator:
+    simulator.step()
+    simulator._repr_html_()
+assert cell.getvalue() == "", cell.getvalue()
+"""
+
+
+def test_taichi_prints_nothing_into_cells():
+    """There standard output is not the process's own; taisoft's line about compiling goes to stderr."""
+    done = subprocess.run([sys.executable, "-c", IN_A_NOTEBOOK], cwd=ROOT, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    others = [line for line in done.stderr.splitlines() if not line.startswith("taisoft: ")]
+    assert done.stdout == "" and others == []
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "docs" / "notebooks").glob("*.ipynb")), ids=lambda path: path.stem)
+def test_notebooks_are_stored_without_outputs(path):
+    notebook = json.load(open(path, encoding="utf-8"))
+    code = [cell for cell in notebook["cells"] if cell["cell_type"] == "code"]
+    assert len(code) > 4 and all(cell["outputs"] == [] and cell["execution_count"] is None for cell in code)
+    for cell in code:
+        compile("".join(cell["source"]), path.name, "exec")
