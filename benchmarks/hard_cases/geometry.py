@@ -78,18 +78,28 @@ def depth_in_knife(points: np.ndarray, x: float) -> float:
     return max(0.0, -float(outside.min()))
 
 
-def knives(session: Session) -> dict[str, float]:
-    """G2: a mat falls 0.02 m onto five knives."""
-    mesh, places = box((15, 1, 15), (0.6, 0.02, 0.6)), 0.1 * np.arange(-2, 3)
-    scene, body = one_body("mat", mesh, DOWN, (0, 0.03, 0), law=SNH, young=2e4, poisson=0.4, friction=0.0)
-    for k, x in enumerate(places):
+KNIVES = 0.1 * np.arange(-2, 3)  # [m] places of the knives along x
+
+
+def on_knives() -> ts.Scene:
+    """A mat of 0.6 m, 0.02 m above five knives."""
+    mesh = box((15, 1, 15), (0.6, 0.02, 0.6))
+    scene, _ = one_body("mat", mesh, DOWN, (0, 0.03, 0), law=SNH, young=2e4, poisson=0.4, friction=0.0)
+    for k, x in enumerate(KNIVES):
         scene.add_obstacle(knife(x), name=f"knife {k}", friction=0.0)
     scene.add_obstacle(ts.HalfSpace((0, -0.11, 0), (0, 1, 0)), name="plane", friction=0.0)
+    return scene
+
+
+def knives(session: Session) -> dict[str, float]:
+    """G2: a mat falls onto five knives."""
+    scene = on_knives()
+    surface = scene.bodies[0].mesh.surface
 
     def depth() -> float:
         x = sim.positions()
-        points = np.concatenate([x, x[body.mesh.surface].mean(axis=1)])
-        return max(depth_in_knife(points, place) for place in places)
+        points = np.concatenate([x, x[surface].mean(axis=1)])
+        return max(depth_in_knife(points, place) for place in KNIVES)
 
     with session.simulator(scene) as sim:
         cut, deepest = session.watch(sim, 400, lambda: len(sim.intersecting_triangles()), depth)

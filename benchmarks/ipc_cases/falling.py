@@ -36,6 +36,20 @@ def mat_on_knives(size: str) -> ts.Scene:
     return scene
 
 
+def needles(n_x: int, n_z: int, apart: float, top: float) -> ts.MeshObstacle:
+    """Upright needles, 1 m high and 1 cm wide at their foot; their tips are a grid about the y axis at the height `top` [m].
+
+    apart: distance of neighbours [m].
+    """
+    foot = 0.005 * np.array([(0.0, -1.0), (0.866, 0.5), (-0.866, 0.5)])
+    made = []
+    for x in apart * (np.arange(n_x) - 0.5 * (n_x - 1)):
+        for z in apart * (np.arange(n_z) - 0.5 * (n_z - 1)):
+            base = np.stack([x + foot[:, 0], np.full(3, top - 1.0), z + foot[:, 1]], axis=1)
+            made.append(hull(np.concatenate([[(x, top, z)], base])))
+    return joined(*made)
+
+
 def sphere_on_points(size: str) -> ts.Scene:
     """A ball of 1 m falls on the tips of 20 x 21 upright needles, 0.2 m apart.
 
@@ -44,14 +58,7 @@ def sphere_on_points(size: str) -> ts.Scene:
     unit = 0.2
     scene = ts.Scene()
     scene.add_body(placed(ball(size), 5.0 * unit), ts.Material(young=1e4, friction=0.0, **SOFT), name="ball")
-    top = -0.6
-    foot = 0.005 * np.array([(0.0, -1.0), (0.866, 0.5), (-0.866, 0.5)])
-    needles = []
-    for x in unit * (np.arange(20) - 9.5):
-        for z in unit * (np.arange(21) - 10.0):
-            base = np.stack([x + foot[:, 0], np.full(3, top - 1.0), z + foot[:, 1]], axis=1)
-            needles.append(hull(np.concatenate([[(x, top, z)], base])))
-    scene.add_obstacle(joined(*needles), "points", friction=0.0)
+    scene.add_obstacle(needles(20, 21, unit, -0.6), "points", friction=0.0)
     return scene
 
 

@@ -1,0 +1,81 @@
+"""The benchmark of same bits:
+
+* digests do not depend on the order of contacts, and any other bit changes them;
+* a changed bit is found, with the step, the part and the difference, and a failed, missing or new case is no success;
+* a file that is missing, damaged, foreign or of another kind of run is refused before anything runs;
+* a case ends after its steps, and is the same when it is run again.
+"""
+
+import gzip
+
+import numpy as np
+import pytest
+
+from benchmarks import bits
+from benchmarks.bits_cases import all_cases
+from taisoft.errors import SceneError
+from taisoft.study.accuracy import pack
+
+SETTINGS = {"steps": bits.STEPS, "quick": True, "case": ""}
+
+
+def record(error: str = "", last: float = 1.0, **changed) -> dict:
+    """A record of two steps. changed: parts of the second one."""
+    second = [changed.get(part, part) for part in bits.PARTS]
+    positions = pack(np.array([[0.0, 0.0, 0.0], [0.0, 0.0, last]]))
+    return bits.NOTHING | {"digests": [["a", "b", "c"], second], "positions": positions, "error": error}
+
+
+def test_digests_do_not_depend_on_the_order_of_contacts():
+    rng = np.random.default_rng(0)
+    x, v, points, impulses = rng.standard_normal((4, 9, 3))
+    first, order = bits.digests_of(x, v, points, impulses), rng.permutation(9)
+    assert bits.digests_of(x, v, points[order], impulses[order]) == first
+    impulses[3, 1] = np.nextafter(impulses[3, 1], 9.0)
+    x[8, 2] = np.nextafter(x[8, 2], 9.0)
+    assert [a == b for a, b in zip(bits.digests_of(x, v, points, impulses), first)] == [False, True, False]
+
+
+@pytest.mark.parametrize(
+    "new, old, text, status",
+    [
+        (record(), record(), "| same", 0),
+        (record(velocities="x", last=1.5), record(), "| differs from step 2 (velocities) |            0.5 |       0.5 |", 1),
+        (bits.NOTHING, record(), "| differs from step 1 (positions, velocities, contacts) |            nan |", 1),
+        (record("no"), record("no"), "* scene a, f32, 1: no\n", 1),
+        (record("no"), record(), "| differs in its error", 1),
+        (None, record(), "| only in FILE", 1),
+        (record(), None, "| not in FILE", 1),
+    ],
+)
+def test_what_differs_is_reported(capsys, new, old, text, status):
+    new, old = ({"scene a, f32, 1": one} if one else {} for one in (new, old))
+    assert bits.report(new, old) == status and text in capsys.readouterr().out
+
+
+def test_files_that_cannot_be_compared_are_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr(bits, "run_all", lambda cases: pytest.fail("a case ran"))
+    path = tmp_path / "bits.gz"
+    with pytest.raises(SceneError, match="cannot be read: No such file"):
+        bits.main(["--against", str(path)])
+    bits.write(path, SETTINGS, {"scene a, f32, 1": record()})
+    assert bits.read(path, SETTINGS | {"case": "scene"})["records"] == {"scene a, f32, 1": record()}
+    with pytest.raises(SceneError, match="holds another kind of run"):
+        bits.main(["--against", str(path)])
+    whole = path.read_bytes()
+    for damaged in (whole[:-9], whole[:40] + b"x" + whole[41:], b"no file of this kind", gzip.compress(b"{}")):
+        path.write_bytes(damaged)
+        with pytest.raises(SceneError, match="is damaged or not of|cannot be read"):
+            bits.main(["--quick", "--against", str(path)])
+    for arguments in ([], ["--write", "a", "--against", "b"], ["--write", "a", "--case", "none"]):
+        with pytest.raises(SystemExit, match="2"):
+            bits.main(arguments)
+
+
+def test_a_case_repeats_itself():
+    cases = all_cases()
+    assert len({case.key for case in cases}) == len(cases) and sum(case.quick for case in cases) == 8
+    case = next(case for case in cases if case.key == "scene resting cube, implicit, f32, 1")
+    first, second = (bits.run(case, 2) for _ in range(2))
+    assert first["error"] == "" and len(first["digests"]) == 2 and first["contacts"] > 0
+    assert bits.verdict(first, second) == bits.SAME
