@@ -21,10 +21,10 @@ demo: $(READY)
 test test-long: export OPENBLAS_NUM_THREADS := 1
 
 test: $(READY)
-	$(BIN)/python -m pytest -q -n auto --maxprocesses 8 --dist loadfile --no-loadscope-reorder
+	$(BIN)/python -m pytest -q -n auto --maxprocesses 8
 
 test-long: $(READY)
-	$(BIN)/python -m pytest -q -n auto --maxprocesses 8 --dist loadfile --no-loadscope-reorder --long
+	$(BIN)/python -m pytest -q -n auto --maxprocesses 8 --long
 
 # about three hours; the comparison needs the other programs
 figures: $(READY)

@@ -16,7 +16,7 @@ from sybil import Sybil
 from sybil.parsers.myst import CodeBlockParser, PythonCodeBlockParser
 
 import taisoft as ts
-from taisoft.cli import _parser
+from taisoft.cli import command_parser
 
 BIN = Path(sys.executable).parent
 
@@ -36,7 +36,7 @@ def run_shell(example) -> None:
 def check_commands(block: str) -> None:
     for line in block.splitlines():
         if line.startswith("taisoft "):
-            _parser().parse_args(shlex.split(line, comments=True)[1:])
+            command_parser().parse_args(shlex.split(line, comments=True)[1:])
 
 
 @pytest.fixture(scope="module")

@@ -53,10 +53,10 @@ def gain() -> Gain:
     known = _read(path)
     if name in known:
         return Gain(**known[name])
-    measured = _measure()
+    measured = measure()
     for _ in range(TRIALS - 1):
         if measured.speedup < KEPT_FROM:
-            measured = max(measured, _measure(), key=lambda one: one.speedup)
+            measured = max(measured, measure(), key=lambda one: one.speedup)
     if measured.speedup >= KEPT_FROM:
         with contextlib.suppress(OutputError):  # it is measured again in the next process
             write_bytes(path, json.dumps(_read(path) | {name: asdict(measured)}, indent=1).encode())
@@ -73,7 +73,7 @@ def _read(path: Path) -> dict[str, dict[str, float]]:
         return {}
 
 
-def _measure() -> Gain:
+def measure() -> Gain:
     out = Array(ti.f64, (TASKS,), 0, on_host=True)
     one, all_threads, idle = (functools.partial(_work, out, n, serial) for n, serial in ((WORK, True), (WORK, False), (0, False)))
     times = {run: [] for run in (one, all_threads, idle)}

@@ -153,6 +153,12 @@ def _initialise(arch: str, precision: str) -> None:
         raise SimulationError(f"arch '{arch}' is not available on this machine (Taichi fell back to '{actual}')")
 
 
+def forget() -> None:
+    """Let the next claim initialise Taichi anew, even for the same arch and precision: kernels compiled so far are then gone."""
+    global _kind
+    _kind = None
+
+
 def threads() -> int:
     """Number of threads of Taichi's parallel loops on the CPU."""
     return ti.cfg.cpu_max_num_threads

@@ -35,7 +35,7 @@ def main(argv: list[str] | None = None) -> int:
     other exception is a bug in taisoft and keeps its traceback. Only the requested command's module is imported, so that
     `doctor` also works on a broken installation.
     """
-    arguments = _parser().parse_args(argv)
+    arguments = command_parser().parse_args(argv)
     try:
         module, function = arguments.command
         return getattr(import_module(f"taisoft.cli.{module}"), function)(arguments)
@@ -132,7 +132,7 @@ def parse_scalar(text: str, assignment: str, option: str = "--set") -> float | i
     return table["value"]
 
 
-def _parser() -> argparse.ArgumentParser:
+def command_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="taisoft", description="Elastic soft bodies in Taichi.", allow_abbrev=False)
     parser.add_argument("--version", action="version", version=f"taisoft {__version__}")
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")

@@ -49,10 +49,10 @@ def study(arguments: Namespace) -> int:
             stack.enter_context(closing(FolderLock(folder)))
             runner.store = Store(folder)
         end = time.monotonic() + budget
-        return _report_study(runner.run(plan), arguments, signals)
+        return report_study(runner.run(plan), arguments, signals)
 
 
-def _report_study(results: Study, arguments: Namespace, signals: Signals) -> int:
+def report_study(results: Study, arguments: Namespace, signals: Signals) -> int:
     """Print and write the results; return the exit status."""
     print(text_of(results), end="")
     if arguments.out is not None:

@@ -172,11 +172,11 @@ def row_of(record: dict, reference: Reference | None) -> Row:
     energy, row.energy_kept = np.array(record["energies"], float).sum(axis=1), record["keeps_energy"]
     expected = energy[0] if row.energy_kept else reference.energy
     row.energy = _relative(np.abs(energy - expected).max(), reference.energy_scale)
-    row.momentum = _momentum_error(record, np.array(record["momentum"], float), reference)
+    row.momentum = momentum_error(record, np.array(record["momentum"], float), reference)
     return row
 
 
-def _momentum_error(record: dict, momentum: np.ndarray, reference: Reference) -> float | None:
+def momentum_error(record: dict, momentum: np.ndarray, reference: Reference) -> float | None:
     """Return the relative error of momentum (k,3) [kg m/s], or None if the scale is zero.
 
     It compares with the law of momentum if the bodies are free, else with the reference. The scale is the reference's largest

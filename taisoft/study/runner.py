@@ -88,7 +88,7 @@ class Runner:
         study = Study(self.request, plan, notes=list(plan["notes"]), machines=self.machines, workers=len(self.places))
         study.kept = isinstance(self.store, Store)
         references, settings = tasks_of(plan)
-        keys = [self._key(plan, task) for task in references + settings]
+        keys = [self.key(plan, task) for task in references + settings]
         tasks = dict(zip(keys, references + settings))
         records, failed, unfinished = self._carry_out(plan, tasks)
         study.ended = "; ".join(dict.fromkeys(BUDGET_SPENT if why == CUT_BY_BUDGET else why for why in unfinished.values()))
@@ -109,7 +109,7 @@ class Runner:
         shared = {key: plan[key] for key in ("fixed", "frame", "frames")}
         return {"setting": task.setting, "steps": task.steps, "repeats": repeats} | shared
 
-    def _key(self, plan: dict, task: Task) -> str:
+    def key(self, plan: dict, task: Task) -> str:
         machines = sorted(self.machines, key=lambda one: one["name"])  # a cluster lists them in any order
         hardware = [machines, len(self.places[0].cores)]
         scene = [plan["scenes"][mesh_name(task.setting)], plan["sources"]]
