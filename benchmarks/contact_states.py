@@ -14,16 +14,29 @@ import sys
 import time
 import warnings
 from collections.abc import Callable
+from contextlib import contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 
 import taisoft as ts
 
 try:
-    from taisoft.backend.runtime import compile_clock, launches
+    from taisoft.backend import runtime
 except ImportError:  # version 0.1
-    from taisoft.runtime import compile_clock, launches
+    from taisoft import runtime
+try:
+    from taisoft.backend.counters import counting
+except ImportError:  # an older version, which counts launches at all times
+
+    @contextmanager
+    def counting():
+        """The same context; its record is complete at the end."""
+        counts, before = SimpleNamespace(), runtime.launches.copy()
+        yield counts
+        counts.launches = runtime.launches - before
+
 
 ROOT = Path(ts.__file__).resolve().parents[1]
 MESHES = Path(__file__).resolve().parents[2] / "shared" / "meshes"
@@ -143,9 +156,9 @@ def can_build(name: str) -> bool:
 
 def timed(call: Callable) -> tuple:
     """The result of a call, and its seconds without compilation."""
-    begin, compiled = time.perf_counter(), compile_clock()
+    begin, compiled = time.perf_counter(), runtime.compile_clock()
     result = call()
-    return result, time.perf_counter() - begin - (compile_clock() - compiled)
+    return result, time.perf_counter() - begin - (runtime.compile_clock() - compiled)
 
 
 def take_steps(sim: ts.Simulator, steps: int) -> tuple[list[float], list]:
@@ -221,16 +234,17 @@ def solve(sim: ts.Simulator, kept: dict, dt: float, max_halves: int) -> tuple[di
     while True:
         world.restore(kept["world"])
         stepper.restore(fitting(kept["stepper"], stepper.snapshot()))
-        done, begin, compiled, before = [], time.perf_counter(), compile_clock(), launches.total()
-        for part in range(halves):
-            try:
-                done.append(take(world.time + part * dt / halves, dt / halves))
-            except ts.SimulationError:
-                done.append(None)
-            if done[-1] is None or not done[-1].converged:
-                break
-        seconds += time.perf_counter() - begin - (compile_clock() - compiled)
-        launched += launches.total() - before
+        done, begin, compiled = [], time.perf_counter(), runtime.compile_clock()
+        with counting() as counts:
+            for part in range(halves):
+                try:
+                    done.append(take(world.time + part * dt / halves, dt / halves))
+                except ts.SimulationError:
+                    done.append(None)
+                if done[-1] is None or not done[-1].converged:
+                    break
+        seconds += time.perf_counter() - begin - (runtime.compile_clock() - compiled)
+        launched += counts.launches.total()
         newton += sum(r.newton_iterations for r in done if r)
         linear += sum(r.linear_iterations for r in done if r)
         first = first or done[0]

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 import taisoft as ts
-from taisoft.backend.runtime import launches
+from taisoft.backend.counters import counting
 from taisoft.cli.scene_file import load_shipped
 from taisoft.collision.candidates import TOTAL
 from taisoft.collision.detector import Detection
@@ -139,13 +139,13 @@ def find_window(sim: ts.Simulator, cost: Cost) -> dict:
         passing.clear()
         with observed(lambda paths, found, *_: passing.append(sim.step_count) if found else None):
             sim.step()
-            before = launches.copy()
-            for _ in range(cost.steps):
-                listed = launches[LIST]
-                contacts.append(sim.step().n_contacts)
-                cost.relisting += launches[LIST] > listed
-                near.append(contact.detection._paths.near.count[TOTAL] if contact and contact.detection._has_pairs else 0)
-        cost.launches = {kernel: launches[kernel] - before[kernel] for kernel in KERNELS}
+            with counting() as counts:
+                for _ in range(cost.steps):
+                    listed = counts.launches[LIST]
+                    contacts.append(sim.step().n_contacts)
+                    cost.relisting += counts.launches[LIST] > listed
+                    near.append(contact.detection._paths.near.count[TOTAL] if contact and contact.detection._has_pairs else 0)
+        cost.launches = {kernel: counts.launches[kernel] for kernel in KERNELS}
         cost.near, cost.contacts, cost.passages = float(np.mean(near)), contacts[-1], len(set(passing))
         if contact is None or not passing and not held and min(contacts) > 0:
             break

@@ -154,6 +154,12 @@ def phase_table(rows: Sequence[Row]) -> str:
     return table(measured(rows), (*WORK, ("<fraction of each phase", fractions)))
 
 
+def call_table(rows: Sequence[Row]) -> str:
+    """Launches, what they are handed, and accesses by the host, of a step or a search."""
+    names = {name: None for row in measured(rows) for name in row.calls}
+    return table(measured(rows), (*WORK, *((name, f"{{.calls[{name}]:,.4g}}") for name in names)))
+
+
 def memory_table(rows: Sequence[Row]) -> str:
     """Bytes of the fields per tet by group, and the peak memory of the process."""
 
@@ -278,6 +284,7 @@ def main(argv=None) -> int:
     document.add("## Time\n\n" + time_table(rows))
     document.add("## Threads\n\n" + gain_table(rows))
     document.add("## Phases\n\n" + phase_table(rows))
+    document.add("## Launches and accesses by the host\n\n" + call_table(rows))
     document.add("## Memory\n\n" + memory_table(rows))
     document.add("## Bytes moved\n\n" + copy_table(copies) + "\n\n" + rate_table(rows, copies))
     document.add("## Exponents over the tets\n\n" + growth_table(found))

@@ -7,8 +7,8 @@ explicit contact, implicit contact: two cubes on the ground, the upper one off c
             Euler and Gauss-Seidel at 0.9 of the largest stable step, implicit Euler and the augmented Lagrangian at 10 ms.
 
 Explicit, implicit, search and implicit contact also on one thread, where taisoft uses all. All in f32. Steps are timed first as a
-whole, then repeated from the same start with a stopwatch on their parts, which adds a small overhead. The first steps, which
-compile and grow buffers, are left out.
+whole, then repeated from the same start with a stopwatch on their parts and with counters, which adds a small overhead. The first
+steps, which compile and grow buffers, are left out.
 """
 
 from collections.abc import Callable
@@ -22,6 +22,7 @@ import taichi as ti
 
 import taisoft as ts
 from taisoft.backend import parallel
+from taisoft.backend.counters import counting
 from taisoft.backend.runtime import compile_clock, kernel, open_runtime, threads
 from taisoft.dynamics import dynamics, stage_system
 from taisoft.fem.lanes import broadcast
@@ -53,9 +54,10 @@ STIFF = 1e8  # [Pa]
 
 @dataclass
 class Row:
-    """A kind of work on one mesh. samples: seconds of a step or a search; phases: median seconds per phase; counts: means; moved:
-    lower bound of the bytes moved; field_bytes: by group; base, peak: resident bytes before the scene was built, and at most;
-    setup_seconds: of building scene and simulator, without compilation."""
+    """A kind of work on one mesh. samples: seconds of a step or a search; phases: median seconds per phase; counts: means; calls:
+    launches, their arguments and accesses by the host, means; moved: lower bound of the bytes moved; field_bytes: by group; base,
+    peak: resident bytes before the scene was built, and at most; setup_seconds: of building scene and simulator, without
+    compilation."""
 
     kind: str
     arch: str
@@ -65,6 +67,7 @@ class Row:
     samples: list[float] = field(default_factory=list)
     phases: dict[str, float] = field(default_factory=dict)
     counts: dict[str, float] = field(default_factory=dict)
+    calls: dict[str, float] = field(default_factory=dict)
     moved: float = 0.0
     field_bytes: dict[str, int] = field(default_factory=dict)
     setup_seconds: float = 0.0
@@ -156,6 +159,10 @@ def explicit(row: Row, size: int) -> None:
             sim.reset()
             row.samples.append(advance(sim, steps).seconds / steps)
             fractions.append(min(1.0, _element_seconds(sim, steps) / row.samples[-1]))
+        sim.reset()
+        with counting() as counts:
+            advance(sim, steps)
+        row.calls = counts.totals(steps)
         elements = float(np.median(fractions)) * row.timing.median
         row.phases = {"elements": elements, "nodes": row.timing.median - elements}
         row.field_bytes = group_bytes(sim)
@@ -238,8 +245,9 @@ def _one_by_one(row: Row, sim: ts.Simulator, places: list[tuple[str, object, str
     row.counts = {name: float(np.mean([getattr(report, own) for report in reports])) for name, own in COUNTS.items()}
     _warm(sim)
     watch = Stopwatch()
-    with watch.on(places):
+    with watch.on(places), counting() as counts:
         parts = [watch.parts_of(sim.step) for _ in row.samples]
+    row.calls = counts.totals(len(parts))
     row.phases = {part: float(np.median([one.get(part, 0.0) for one in parts])) for part in {p: 0 for one in parts for p in one}}
     return watch
 
@@ -262,6 +270,9 @@ def search(row: Row, size: int) -> None:
             for _ in range(2):
                 rig.search()
             row.samples = repeated(rig.search, ROUNDS)
+            with counting() as counts:
+                rig.search()
+            row.calls = counts.totals()
             taken = [rig.phases() for _ in row.samples]
             row.phases = {name: float(np.median([one[name] for one in taken])) for name in taken[0]}
             counts, found = rig.detection.counts, rig.detection.field_bytes

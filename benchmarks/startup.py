@@ -5,13 +5,13 @@ taisoft bench startup [--quick] [--baseline FOLDER] [--out FILE.json]
 A beam of 540 tets in explicit steps, and a cube of 320 tets on a block in implicit steps with contacts, each to its tenth step:
 cold (a new process, an empty kernel cache), warm (a new process, the same cache), and warm with a new mesh size. In one process:
 the first simulator, a second one of the same structure, and one of another size. Also three static solves of the beam, nine that
-find Young's modulus from a sag, what changes of an open simulator cost, the kernels that sheets on a block compile from 224 to
-2,144 surface triangles (from 1,500 on, the search for contacts runs on all threads: other kernels), and the resident memory that
-twenty simulators leave behind, and four closed ones of a cube of 53,240 tets to which something refers. Times are wall and CPU
-seconds of whole processes, including Python's start; warm times are medians over rounds. --baseline: folder of another version,
-measured in turn with its own cache. The limits compare with it; those of warm processes and of kernel speed (a beam of 34,560
-tets, landing sheets) use the median of the ratio over rounds. It then takes about eight minutes. Exit status: 0, or 1 if a limit
-is not met or a process failed.
+find Young's modulus from a sag, what changes of an open simulator cost, the launches and accesses by the host of a step, the
+kernels that sheets on a block compile from 224 to 2,144 surface triangles (from 1,500 on, the search for contacts runs on all
+threads: other kernels), and the resident memory that twenty simulators leave behind, and four closed ones of a cube of 53,240
+tets to which something refers. Times are wall and CPU seconds of whole processes, including Python's start; warm times are
+medians over rounds. --baseline: folder of another version, measured in turn with its own cache. The limits compare with it; those
+of warm processes and of kernel speed (a beam of 34,560 tets, landing sheets) use the median of the ratio over rounds. It then
+takes about eight minutes. Exit status: 0, or 1 if a limit is not met or a process failed.
 """
 
 import json
@@ -52,6 +52,7 @@ TASKS = {
     "statics": ((3,), (3,)),
     "identify": ((3,), (3,)),
     "settings": ((4,), (4,)),
+    "calls": ((3, 4), (1, 2)),
     "surfaces": ((6, 7, 21, 22), (6, 7, 21, 22)),
     "keep": ((22, 4), (6, 2)),
 }
@@ -150,6 +151,16 @@ def settings_table(found: dict[str, dict]) -> str:
     return markdown(("cube with contacts, wall [ms]", *found), rows, left=(0,))
 
 
+def call_table(found: dict[str, dict]) -> str:
+    """Launches, what they are handed, and accesses by the host, of a step (unknown in old versions)."""
+    versions, rows = list(found.values()), []
+    for name in SCENES:
+        for what in versions[0]["calls"][name]:
+            numbers = [one["calls"].get(name, {}).get(what) for one in versions]
+            rows.append((f"{name}: {what}", *("unknown" if n is None else f"{n:,.4g}" for n in numbers)))
+    return markdown(("a step, mean", *found), rows, left=(0,))
+
+
 def speed_table(found: dict[str, dict]) -> str:
     """Kernel times, with the range over rounds."""
 
@@ -244,6 +255,7 @@ def main(argv=None) -> int:
         found = dict(zip(folders, measure(versions, options.quick)))
     document.add("## Waiting\n\n" + waiting_table(found))
     document.add("## Counts\n\n" + count_table(found))
+    document.add("## Launches and accesses by the host\n\n" + call_table(found))
     document.add("## Changes\n\n" + settings_table(found))
     document.add("## Speed\n\n" + speed_table(found))
     limits = [] if options.quick else find_limits(found["this version"], found.get("baseline"))

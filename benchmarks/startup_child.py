@@ -190,6 +190,24 @@ def settings(cells: int) -> dict:
     return found | {"a new Simulator": timed(lambda: ts.Simulator(build(cells), **arguments).close())["wall"]}
 
 
+def calls(*cells: int) -> dict:
+    """Means of what the tenth to twentieth step of a beam and a cube launch and access; empty if the version does not count."""
+    try:
+        from taisoft.backend.counters import counting
+    except ImportError:
+        return {}
+    found = {}
+    for name, n in zip(("beam", "cube"), cells):
+        build, arguments = SCENES[name]
+        with ts.Simulator(build(n), **arguments) as sim:
+            walk(sim, 10)
+            with counting() as counts:
+                for _ in range(10):
+                    sim.step()
+            found[name] = counts.totals(10)
+    return found
+
+
 def speed(cells: int, small: int, large: int) -> dict:
     """Median seconds of steps, energies and a force differential of a beam, and of searches and contact steps of two sheets."""
     steps = 20
@@ -237,6 +255,7 @@ TASKS = {
     "statics": statics,
     "identify": identify,
     "settings": settings,
+    "calls": calls,
     "speed": speed,
 }
 

@@ -16,7 +16,7 @@ import inspect
 import operator
 import weakref
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple, get_args
 
 import numpy as np
 import taichi as ti
@@ -28,6 +28,15 @@ from taisoft.backend.tracing import FAST_TRACING
 
 REAL, INTEGER, HOST_ARRAY = range(3)
 PUBLIC = not FAST_TRACING  # launch only through Taichi's public interface: 20 us or more a launch, at most 64 arguments
+
+
+class Signature(NamedTuple):
+    """What a launch hands over: the number of `Array`s, of the host's NumPy arrays, and of values returned to the host."""
+
+    kernel: str
+    arrays: int
+    host_arrays: int
+    returned: int
 
 
 class Compiled:
@@ -46,6 +55,10 @@ class Compiled:
             else:
                 self._leaves.append((len(dummies), index))
                 dummies += [_dummy(kind) for kind in leaf_structures(structure)]
+        arrays = sum(kind[0] != COUNT for s in structures if s is not None for kind in leaf_structures(s))
+        host_arrays = sum(example is not None for example in examples)
+        returned = function.__annotations__.get("return")  # several: a tuple[...]
+        self.signature = Signature(function.__name__, arrays, host_arrays, len(get_args(returned)) or int(returned is not None))
         self._public = ti.kernel(generated) if PUBLIC else None
         if PUBLIC:
             return
@@ -72,7 +85,7 @@ class Compiled:
         context = self._cpp.make_launch_context()
         for slot, leaf in bound:
             if isinstance(leaf, Array):
-                host = leaf.host
+                host = leaf.memory
                 entries = host.size // max(leaf.n, 1)  # as the kernel counts them, for index checks in debug mode
                 context.set_arg_external_array_with_shape((slot,), host.ctypes.data, host.nbytes, (entries,), 0)
             else:
@@ -121,9 +134,9 @@ class Compiled:
         for argument, structure in zip(arguments, self.structures):
             for leaf in [argument] if structure is None else leaves_of(argument, structure):
                 if isinstance(leaf, Array):
-                    if leaf.host is None and id(leaf) not in copies:
+                    if leaf.memory is None and id(leaf) not in copies:
                         copies[id(leaf)] = leaf, leaf.to_numpy()
-                    host = copies[id(leaf)][1] if leaf.host is None else leaf.host
+                    host = copies[id(leaf)][1] if leaf.memory is None else leaf.memory
                     leaf = host.reshape((-1, leaf.n) if leaf.n else -1)
                 flat.append(leaf)
         returned = self._public(*flat)

@@ -1,4 +1,4 @@
-"""Taichi's runtime: initialisation, arch, precision, flags, kernels and their launch counts. No other module calls `ti.init`.
+"""Taichi's runtime: initialisation, arch, precision, flags, kernels and their compile time. No other module calls `ti.init`.
 
 Taichi's state belongs to the process, so only one (arch, precision) is open at a time. `cfg_optimization=False` works around
 a miscompilation in Taichi 1.7.4 (`A = f(A)` on a local matrix), and also compiles faster. `fast_math=False` preserves NaN
@@ -11,7 +11,6 @@ import functools
 import io
 import os
 import time
-from collections import Counter
 from collections.abc import Callable, Iterator
 
 import numpy as np
@@ -31,7 +30,6 @@ ARCHS = {"cpu": ti.cpu, "cuda": ti.cuda}
 CPU_POOL_BYTES = 2**30  # address space that Taichi reserves at a time on the CPU
 KERNEL_CACHE_BYTES = 2**30  # of kernels on disk, above which Taichi removes the oldest; its default holds only about 450
 
-launches: Counter[str] = Counter()  # kernel name -> launches so far in this process
 _open: list["Runtime"] = []  # current claims on the runtime
 _kind: tuple[str, str] | None = None  # (arch, precision) that Taichi was initialised with
 _program = None  # Taichi's program object of that initialisation
@@ -170,7 +168,7 @@ def open_kind() -> tuple[str, str] | None:
 
 
 def kernel(function: Callable | None = None, *, cse: bool = True) -> Callable:
-    """`ti.kernel` that counts launches by name and counts the first launch per set of templates as compile time.
+    """`ti.kernel` that counts the first launch per set of templates as compile time; launches are counted by `counters`.
 
     cse: whether Taichi eliminates common subexpressions, which takes time quadratic in the size of the code. Code unrolled over
     the nodes of an element runs up to 2.5 times as fast with it. Long branching code, such as contact detection, runs no
@@ -184,7 +182,6 @@ def kernel(function: Callable | None = None, *, cse: bool = True) -> Callable:
     @functools.wraps(function)
     def launch(*arguments):
         check_program(_program)
-        launches[function.__name__] += 1
         ready = kernels.find(arguments)
         if ready is not None:
             return ready[0].launch(ready[1], arguments)

@@ -33,7 +33,7 @@ SWEEPS = 1000  # of Gauss-Seidel, before the augmented Lagrangian
 
 def can_solve_directly(m: Model) -> bool:
     """Whether all nodes are those of rigid bodies, or depend on them, and the host can access the model's arrays."""
-    if not m.has_rigid_tets or m.free.host is None:
+    if not m.has_rigid_tets or not m.on_cpu:
         return False
     return FRAME * m.rigid_tets.n + m.dependents.n == m.n_nodes
 

@@ -113,7 +113,7 @@ class LinearSolver:
     def solve(self, system: "StageSystem", tolerance: float) -> LinearResult:
         """Solve for y of pcg from its rhs. system: of a stage without contacts, on all nodes, whose matrix is formed."""
         m, w, done = self.model, system.work.pcg, 0
-        if m.free.host is None:  # CUDA
+        if not m.on_cpu:
             return pcg.solve(m, system.matrix, w, tolerance, pcg.iteration_limit(m))
         if self._exact is None:
             self._exact = has_narrow_band(m, system.matrix)

@@ -282,7 +282,7 @@ def solve_with_multipliers(system: "StageSystem", stage: "Stage", solve_stage: "
     multipliers = system.multipliers
     if multipliers is None:
         return solve_stage()
-    multipliers.penalised = system.contact.n_contacts == 0 and system.model.free.host is not None
+    multipliers.penalised = system.contact.n_contacts == 0 and system.model.on_cpu
     result, discarded, linear = solve_stage(), [], 0
     while not multipliers.penalised and result.converged and not multipliers.hold and len(discarded) < MAX_CORRECTIONS:
         iterations, corrected = multipliers.correct(system)

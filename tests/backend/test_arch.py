@@ -1,4 +1,4 @@
-"""Results on every arch; the marker `cuda` needs a GPU, and one variant of each test runs on the CPU:
+"""Results on every arch; the marker `cuda` needs a GPU, and one variant of each test runs on the CPU with --long:
 
 * energies, forces and the assembled stiffness agree with the NumPy oracle, in both precisions;
 * steps agree with the oracle; steps with contacts in f32 converge, and agree with those of the CPU in f64;
@@ -23,13 +23,13 @@ from tests.dynamics.following import follow, simulator
 from tests.dynamics.scenes import SNH, SVK, built, driven_scene, mixed_scene
 
 GPU = pytest.mark.cuda
-ARCHS = ["cpu", pytest.param("cuda", marks=GPU)]
+ARCHS = [pytest.param("cpu", marks=pytest.mark.long), pytest.param("cuda", marks=GPU)]
 STEPS = 20
 
 
 def on(*values: str) -> list:
     """Return parameters (arch, value): the first value on the CPU, all values on a GPU."""
-    return [("cpu", values[0]), *(pytest.param("cuda", value, marks=GPU) for value in values)]
+    return [pytest.param("cpu", values[0], marks=pytest.mark.long), *(pytest.param("cuda", value, marks=GPU) for value in values)]
 
 
 @pytest.mark.parametrize(("arch", "precision"), on("f32", "f64"))

@@ -43,21 +43,25 @@ def soft_in_shape() -> ts.Scene:
 
 
 SCENES = {
-    "driven": lambda: driven_scene(mass_damping=3.0, order=2),
+    "driven": lambda: driven_scene(mass_damping=3.0),
+    "driven of order 2": lambda: driven_scene(mass_damping=3.0, order=2),
     "mixed": lambda: mixed_scene((SNH, SVK, SNH, SVK)),
     "pile": pile,
     "mean": soft_in_shape,
 }
-
-
 CASES = (
-    ("driven", "velocity_verlet", "f32"),
-    ("driven", "implicit_midpoint", "f64"),
-    ("mixed", "bdf2", "f64"),
-    ("mixed", "linearly_implicit_euler", "f32"),
-    ("mean", "implicit_euler", "f64"),
-    ("pile", "symplectic_euler", "f64"),
-    ("pile", "bdf2", "f32"),
+    ("driven", "velocity_verlet", "f64"),
+    ("pile", "implicit_euler", "f64"),
+    *(
+        pytest.param(*case, marks=pytest.mark.long)
+        for case in (
+            ("driven of order 2", "implicit_midpoint", "f64"),
+            ("mixed", "bdf2", "f64"),
+            ("mixed", "linearly_implicit_euler", "f32"),
+            ("mean", "implicit_euler", "f64"),
+            ("pile", "symplectic_euler", "f64"),
+        )
+    ),
 )
 STEPS = 6
 
@@ -87,8 +91,9 @@ def test_any_number_of_threads_gives_the_same_bits(name, integrator, precision, 
     assert np.abs(one[0] - whole[0]).max() < tolerance
 
 
-@pytest.mark.parametrize("integrator", ["symplectic_euler", "velocity_verlet"])
-@pytest.mark.parametrize("damping", [0.0, 0.01])
+@pytest.mark.parametrize(
+    "integrator, damping", [("velocity_verlet", 0.01), pytest.param("symplectic_euler", 0.0, marks=pytest.mark.long)]
+)
 def test_reactions_of_sub_steps_on_all_cores(integrator, damping, monkeypatch):
     """Only the last sub-step of a batch computes them, and batches may have one."""
     scene = ts.Scene()
@@ -115,9 +120,9 @@ def write_parts(out: ti.types.ndarray(), n: ti.i32, chunks: ti.template()):
         out[c] = part_first(c, n, chunks)
 
 
-@pytest.mark.parametrize("n", [0, 1, 6, 7, 8, 1000])
+@pytest.mark.parametrize("n", [0, 6, 8, 1000])
 def test_chunks_cover_a_list_in_order(n):
-    runtime, first = open_runtime("cpu", "f32"), np.zeros(8, dtype=np.int32)
+    runtime, first = open_runtime("cpu", "f64"), np.zeros(8, dtype=np.int32)
     try:
         write_parts(first, n, 7)
     finally:
@@ -146,7 +151,7 @@ def sum_entries(m: ti.template(), values: ti.types.ndarray(), out: ti.types.ndar
 
 
 @pytest.mark.parametrize(("on_cpu", "chunks"), [(True, 32), (False, 8), (False, 4 * FOLDED)])
-@pytest.mark.parametrize("n", [0, 1, 100, 9999])
+@pytest.mark.parametrize("n", [0, 9999])
 def test_sums_over_chunks(on_cpu, chunks, n):
     """Also as on CUDA, where a chunk takes every so-many-th entry and the partial sums are folded."""
     with built(mixed_scene(), "f64") as rig:
@@ -164,14 +169,14 @@ def cache(tmp_path, monkeypatch):
     """The file of the measurements, in a folder of its own."""
     monkeypatch.setattr(parallel, "cache_folder", lambda: str(tmp_path))
     parallel.gain.cache_clear()
-    runtime = open_runtime("cpu", "f32")
+    runtime = open_runtime("cpu", "f64")
     yield tmp_path / parallel.FILE
     runtime.close()
     parallel.gain.cache_clear()
 
 
 def test_the_gain_is_measured_once_and_kept(cache, monkeypatch):
-    monkeypatch.setattr(parallel, "KEPT_FROM", 0.0)
+    monkeypatch.setattr(parallel, "measure", lambda: parallel.Gain(1e-5, 1.9))
     measured = parallel.gain()
     assert 0.0 < measured.wake < 0.1 and 0.0 < measured.speedup <= threads()
     stored = json.loads(cache.read_text())
@@ -184,7 +189,7 @@ def test_the_gain_is_measured_once_and_kept(cache, monkeypatch):
 
 @pytest.mark.parametrize("content", ["", "{", "[]", '{"a": 1}', '{"a": {"wake": "b", "speedup": 1}}', "stored"])
 def test_an_unusable_file_is_replaced(cache, content, monkeypatch):
-    monkeypatch.setattr(parallel, "KEPT_FROM", 0.0)
+    monkeypatch.setattr(parallel, "measure", lambda: parallel.Gain(1e-5, 1.9))
     if content == "stored":  # impossible numbers
         content = json.dumps({f"{parallel.processor()}, {threads()} threads": {"wake": 0.0, "speedup": 0.0}})
     cache.write_text(content)
@@ -193,7 +198,7 @@ def test_an_unusable_file_is_replaced(cache, content, monkeypatch):
 
 
 def test_a_gain_that_other_programs_may_hide_is_not_kept(cache, monkeypatch):
-    monkeypatch.setattr(parallel, "_measure", lambda: parallel.Gain(1e-4, 1.1))
+    monkeypatch.setattr(parallel, "measure", lambda: parallel.Gain(1e-4, 1.1))
     assert parallel.gain().speedup == 1.1 and not cache.exists()
 
 

@@ -43,13 +43,13 @@ def start(monkeypatch):
     def replace(failing: str = "") -> Driver:
         driver = Driver(failing)
         monkeypatch.setattr(device_memory.ctypes, "CDLL", lambda name: driver)
-        device_memory._driver.cache_clear()
+        device_memory.driver.cache_clear()
         return driver
 
-    runtime = open_runtime("cpu", "f32", "a test")
+    runtime = open_runtime("cpu", "f64", "a test")
     yield replace
     runtime.close()
-    device_memory._driver.cache_clear()
+    device_memory.driver.cache_clear()
 
 
 @pytest.mark.parametrize(("dtype", "shape", "n"), [(ti.f64, (5,), 3), (ti.i32, (4, 2), 0), (ti.f32, (0,), 3), (ti.u8, (1,), 0)])

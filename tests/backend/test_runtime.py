@@ -3,7 +3,7 @@
 * it has one arch and precision at a time; others are refused while it is open, with the name of its user;
 * after the last close any kind can be opened, and the same kind is not initialised again;
 * without CUDA, arch 'cuda' is refused, and the CPU still works;
-* launches are counted by kernel name, and a first launch counts as compile time; errors of a kernel name its file and line.
+* a first launch counts as compile time; errors of a kernel name its file and line.
 """
 
 import numpy as np
@@ -11,7 +11,7 @@ import pytest
 import taichi as ti
 from taichi._lib import core
 
-from taisoft.backend import launching, runtime
+from taisoft.backend import runtime
 from taisoft.backend.arrays import FieldArena
 from taisoft.backend.runtime import kernel, open_runtime
 from taisoft.errors import SimulationError
@@ -43,7 +43,7 @@ def test_only_one_kind_is_open_at_a_time():
 def test_the_same_kind_is_not_initialised_again(monkeypatch):
     with opened("f64"):
         pass
-    monkeypatch.setattr(runtime, "_initialise", lambda *kind: pytest.fail(f"initialised again as {kind}"))
+    monkeypatch.setattr(ti, "init", lambda **options: pytest.fail("initialised again"))
     with opened("f64"), opened("f64"):
         pass
 
@@ -72,17 +72,17 @@ def test_unknown_kinds_are_refused(kind, message):
         open_runtime(*kind)
 
 
-def test_launches_and_compile_time_are_counted():
+def test_compile_time_is_counted():
     with opened("f64"):
         arena = FieldArena()
         x, y = arena.field("x", ti.f64, 2), arena.field("y", ti.f64, 2)
-        before, clock = runtime.launches["add_one"], runtime.compile_clock()
+        clock = runtime.compile_clock()
         add_one(x)
         first = runtime.compile_clock()
         assert first > clock
         for _ in range(3):
             add_one(x)
-        assert runtime.compile_clock() == first and runtime.launches["add_one"] == before + 4
+        assert runtime.compile_clock() == first
         compiled = runtime.n_compiled()
         add_one(y)  # a field of the same type
         assert runtime.compile_clock() == first and runtime.n_compiled() == compiled
@@ -94,25 +94,6 @@ def test_launches_and_compile_time_are_counted():
 def faulty(x: ti.template()):
     for i in x:
         x[i] = unknown_name  # noqa: F821
-
-
-@kernel(cse=False)
-def sums(x: ti.template(), out: ti.types.ndarray()):
-    for i in range(3):
-        out[i] = (x[i] + 1.0) * (x[i] + 1.0)
-
-
-def test_a_kernel_without_cse_is_compiled_at_level_0(monkeypatch):
-    with opened("f64"):
-        arena, config, levels = FieldArena(), ti.lang.impl.get_runtime().prog.config(), []
-        x, out = arena.field("x", ti.f64, 3, np.arange(3.0)), np.zeros(3)
-        compiled = launching.Compiled
-        monkeypatch.setattr(launching, "Compiled", lambda *a: levels.append(config.opt_level) or compiled(*a))
-        for _ in range(2):
-            sums(x, out)
-            assert np.array_equal(out, [1.0, 4.0, 9.0]) and config.opt_level == 1
-        assert levels == [0]
-        arena.release()
 
 
 def test_errors_of_a_kernel_name_its_file_and_line():

@@ -1,22 +1,28 @@
-"""The package's structure, read from its source without running it:
+"""The source of the package and of its tests, read without running it. Each test lists every violation:
 
 * imports go one way, from right to left in ORDER, and collision and contact do not import each other;
 * only backend/runtime.py initialises Taichi, only backend/private.py imports its private modules, and meshes, scenes and records
   do not import Taichi at all;
 * nothing evaluates text, unpickles or starts a shell, and Taichi's faulty 3x3 decompositions are not used;
 * no file with kernels postpones its annotations, since Taichi cannot compile them;
-* no public name is also a module's name, since importing the module would replace it.
+* no public name is also a module's name, since importing the module would replace it;
+* former names do not return, and tests use no private names;
+* there is a test folder for every package, and no test file is longer than 400 lines.
 """
 
 import ast
+import io
+import re
+import tokenize
+from functools import cache
 from pathlib import Path
-
-import pytest
 
 import taisoft
 
 PACKAGE = Path(taisoft.__file__).parent
-FILES = sorted(path for path in PACKAGE.rglob("*.py"))
+FILES = sorted(PACKAGE.rglob("*.py"))
+TESTS = Path(__file__).parents[1]
+TEST_FILES = sorted(TESTS.rglob("*.py"))
 
 # Modules and packages under taisoft/, left to right; those of one group may import one another, except the pairs in FORBIDDEN.
 ORDER = (
@@ -27,6 +33,7 @@ ORDER = (
     ("backend.arrays",),
     ("backend.structure",),
     ("backend.launching",),
+    ("backend.counters",),
     ("backend.runtime",),
     ("backend.parallel",),
     ("mesh", "scene"),
@@ -67,6 +74,50 @@ WITHOUT_TAICHI = {*ORDER[0], "attributes", "mesh", "scene"}
 FAULTY = {"ti.svd", "ti.sym_eig", "ti.polar_decompose"}
 FORBIDDEN_CALLS = {"eval", "exec", "compile", "__import__", "os.system", "os.popen", "yaml.load"} | FAULTY
 FORBIDDEN_MODULES = {"pickle", "cPickle", "dill", "shelve", "marshal", "yaml"}
+FORMER = {  # former name -> the standard term of the field
+    "led": "prescribed",
+    "led_nodes": "prescribed_nodes",
+    "leads": "has_prescribed",
+    "let_go": "release",
+    "letting_go": "releasing",
+    "told": "message, report or warnings",
+    "told_warnings": "printed_warnings",
+    "tell_locking": "warn_locking",
+    "World": "SimulationState",
+    "Motion": "DirichletConditions",
+    "Pull": "DragSpring",
+    "Grip": "Drag",
+    "pullable": "draggable",
+    "pulled": "dragged",
+    "Stretch": "TimedRun",
+    "Strip": "PlotOverlay",
+    "Ask": "Request",
+    "Left": "Interrupted",
+    "Shown": "DisplayOptions",
+    "SUNK": "DEEP_PENETRATION",
+    "SANK": "NOTICEABLE_PENETRATION",
+    "sinking": "relative_penetration",
+    "HASTE": "MAX_CLOSING_RATIO",
+    "survey": "measure_closing",
+    "find_way": "find_displacement",
+    "way_out": "exit_direction",
+    "STANDOFF": "CONTACT_OFFSET",
+    "standoff": "contact_offset",
+    "short_of_goal": "gap_minus_target",
+    "carry": "obstacle_displacement",
+    "lag": "tangential_offset",
+    "misfit": "prox_residual",
+    "go_beyond": "_extrapolate",
+    "against": "_restart_test",
+    "obey": "_apply_verdict",
+    "sticks_out": "in_normal_cone",
+    "hit_by": "contact_mode",
+    "unfinite": "nonfinite",
+    "fence": "safe_reading",
+    "read_fenced": "read_by_meshio",
+    "scene_marks": "scene_fingerprint",
+    "MAX_PARTS": "MAX_SUBSTEPS",
+}
 
 
 def parts_of(path: Path) -> tuple[str, ...]:
@@ -80,11 +131,17 @@ def place_of(parts: tuple[str, ...]) -> str | None:
     return next((name for n in (2, 1) if (name := ".".join(parts[:n])) in LEVEL), None)
 
 
+@cache
+def tree(path: Path) -> ast.Module:
+    """A file's syntax tree."""
+    return ast.parse(path.read_text(encoding="utf-8"))
+
+
 def imports(path: Path) -> list[str]:
     """Absolute names of all modules that a file imports, at any depth of its code."""
     package = ["taisoft", *path.relative_to(PACKAGE).parent.parts]
     names = []
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    for node in ast.walk(tree(path)):
         if isinstance(node, ast.Import):
             names += [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
@@ -97,78 +154,126 @@ def imports(path: Path) -> list[str]:
 def calls(path: Path) -> list[tuple[str, int, ast.Call]]:
     """(dotted name, line, node) of every call in a file whose function is a plain dotted name."""
     found = []
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    for node in ast.walk(tree(path)):
         if isinstance(node, ast.Call):
             name = ast.unparse(node.func)
             found.append((name.replace("taichi.", "ti.", 1) if name.startswith("taichi.") else name, node.lineno, node))
     return found
 
 
-def each_file(test):
-    return pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(PACKAGE)))(test)
+def short(path: Path) -> str:
+    """A file's name below the package."""
+    return str(path.relative_to(PACKAGE))
 
 
-@each_file
-def test_imports_go_one_way(path):
-    if parts_of(path) in ((), ("backend",), ("fem",)):
-        return  # taisoft/__init__.py imports lazily, see below
-    own = place_of(parts_of(path))
-    assert own, f"taisoft/{'/'.join(parts_of(path))} is missing in ORDER"
-    for name in imports(path):
-        package, *parts = name.split(".")
-        other = place_of(tuple(parts)) if package == "taisoft" else None
-        if other is None or other == own:
+def test_imports_go_one_way():
+    found = []
+    for path in FILES:
+        if parts_of(path) in ((), ("backend",), ("fem",)):
+            continue  # taisoft/__init__.py imports lazily, see below
+        own = place_of(parts_of(path))
+        if own is None:
+            found.append(f"{short(path)} is missing in ORDER")
             continue
-        assert LEVEL[other] <= LEVEL[own], f"{path.name} imports taisoft.{other}, which is right of it in ORDER"
-        assert (own, other) not in FORBIDDEN, f"{path.name} imports taisoft.{other}"
+        for name in imports(path):
+            package, *parts = name.split(".")
+            other = place_of(tuple(parts)) if package == "taisoft" else None
+            if other is None or other == own:
+                continue
+            if LEVEL[other] > LEVEL[own]:
+                found.append(f"{short(path)} imports {name}, which is right of it in ORDER")
+            if (own, other) in FORBIDDEN:
+                found.append(f"{short(path)} imports {name}")
+    assert found == []
 
 
 def test_the_import_scan_finds_absolute_relative_and_nested_imports(tmp_path, monkeypatch):
     (tmp_path / "mesh").mkdir()
     path = tmp_path / "mesh" / "a.py"
     path.write_text("import taisoft.cli.run\nfrom . import b\nfrom ..scene import plan\ndef f():\n    from taisoft import view\n")
-    monkeypatch.setattr("tests.structure.test_layers.PACKAGE", tmp_path)
+    monkeypatch.setattr(f"{__name__}.PACKAGE", tmp_path)
     assert {"taisoft.cli.run", "taisoft.mesh.b", "taisoft.scene.plan", "taisoft.view"} <= set(imports(path))
 
 
-@each_file
-def test_taichi_is_used_only_where_allowed(path):
-    if parts_of(path)[:1] and parts_of(path)[0] in WITHOUT_TAICHI:
-        assert not [name for name in imports(path) if name.split(".")[0] == "taichi"]
-    if path != PACKAGE / "backend" / "private.py":
-        assert not [name for name in imports(path) if name.startswith("taichi.")], "use backend/private.py"
-    if path != PACKAGE / "backend" / "runtime.py":
-        assert not [line for name, line, _ in calls(path) if name == "ti.init"]
+def test_taichi_is_used_only_where_allowed():
+    found = []
+    for path in FILES:
+        if parts_of(path)[:1] and parts_of(path)[0] in WITHOUT_TAICHI:
+            found += [f"{short(path)} imports {name}" for name in imports(path) if name.split(".")[0] == "taichi"]
+        if path != PACKAGE / "backend" / "private.py":
+            found += [
+                f"{short(path)} imports {name}: use backend/private.py" for name in imports(path) if name.startswith("taichi.")
+            ]
+        if path != PACKAGE / "backend" / "runtime.py":
+            found += [f"{short(path)}, line {line}: ti.init" for name, line, _ in calls(path) if name == "ti.init"]
+    assert found == []
 
 
-@each_file
-def test_nothing_evaluates_text_unpickles_or_starts_a_shell(path):
-    modules = {name.split(".")[0] for name in imports(path)}
-    assert not modules & FORBIDDEN_MODULES
-    for name, line, node in calls(path):
-        assert name not in FORBIDDEN_CALLS or (path.name, name) in ALLOWED_CALLS, f"line {line} calls {name}"
-        for keyword in node.keywords:
-            is_false = isinstance(keyword.value, ast.Constant) and keyword.value.value is False
-            assert keyword.arg not in ("shell", "allow_pickle") or is_false, f"line {line}: {keyword.arg} is not False"
-        if name.startswith(("np.load", "numpy.load")):  # explicitly False
-            assert "allow_pickle" in [keyword.arg for keyword in node.keywords], f"line {line}: {name} without allow_pickle"
+def test_nothing_evaluates_text_unpickles_or_starts_a_shell():
+    found = []
+    for path in FILES:
+        found += [f"{short(path)} imports {name}" for name in imports(path) if name.split(".")[0] in FORBIDDEN_MODULES]
+        for name, line, node in calls(path):
+            place = f"{short(path)}, line {line}: {name}"
+            if name in FORBIDDEN_CALLS and (path.name, name) not in ALLOWED_CALLS:
+                found.append(place)
+            for keyword in node.keywords:
+                is_false = isinstance(keyword.value, ast.Constant) and keyword.value.value is False
+                if keyword.arg in ("shell", "allow_pickle") and not is_false:
+                    found.append(f"{place} with {keyword.arg}")
+            if name.startswith(("np.load", "numpy.load")) and "allow_pickle" not in [keyword.arg for keyword in node.keywords]:
+                found.append(f"{place} without allow_pickle=False")
+    assert found == []
 
 
-@each_file
-def test_kernel_files_do_not_postpone_annotations(path):
-    names = imports(path)
-    assert not ("taichi" in names and "__future__.annotations" in names)
+def test_kernel_files_do_not_postpone_annotations():
+    assert [short(path) for path in FILES if {"taichi", "__future__.annotations"} <= set(imports(path))] == []
 
 
-def test_the_package_imports_lazily():
-    assert imports(PACKAGE / "__init__.py") == ["os", "importlib", "importlib.import_module"]
-
-
-def test_no_public_name_is_a_module():
+def test_public_names():
+    assert imports(PACKAGE / "__init__.py") == ["os", "importlib", "importlib.import_module"], "the package imports lazily"
     modules = {path.stem for path in PACKAGE.glob("*.py")} | {path.name for path in PACKAGE.iterdir() if path.is_dir()}
     assert not modules & set(taisoft.__all__)
+    assert [name for name in taisoft.__all__ if getattr(taisoft, name) is None] == []
 
 
-@pytest.mark.parametrize("name", taisoft.__all__)
-def test_public_names_exist(name):
-    assert getattr(taisoft, name) is not None
+def identifiers(path: Path) -> set[str]:
+    """All names in a file's code, as Python's tokenizer finds them, and the name of the file: no comments, no strings."""
+    tokens = tokenize.generate_tokens(io.StringIO(path.read_text(encoding="utf-8")).readline)
+    return {token.string for token in tokens if token.type == tokenize.NAME} | {path.stem}
+
+
+def test_no_former_names(tmp_path):
+    found = [f"{short(path)}: {name}, use {FORMER[name]}" for path in FILES for name in identifiers(path) & set(FORMER)]
+    assert found == []
+    path = tmp_path / "fence.py"
+    path.write_text('def told(standoff):  # of a carry\n    """The goal is told."""\n    return f"{standoff} survey"\n')
+    assert {"told", "standoff", "fence"} <= identifiers(path) and not {"carry", "goal", "survey"} & identifiers(path)
+
+
+def test_tests_use_no_private_names():
+    """Neither imports nor attributes, but a class's own, and those of libraries that have no other name for them."""
+    allowed = {"_exit", "_replace", "_fields", "_actions", "_subparsers", "_group_actions"}
+    found = []
+    for path in TEST_FILES:
+        for node in ast.walk(tree(path)):
+            names = []
+            if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] in ("taisoft", "benchmarks"):
+                names = [alias.name for alias in node.names]
+            elif isinstance(node, ast.Attribute) and not (isinstance(node.value, ast.Name) and node.value.id in ("self", "cls")):
+                names = [node.attr]
+            found += [
+                f"{path.relative_to(TESTS)}, line {node.lineno}: {name}"
+                for name in names
+                if re.match(r"_(?!_)", name) and name not in allowed
+            ]
+    assert found == []
+
+
+def test_every_package_has_a_folder_of_tests_and_files_are_short():
+    packages = {path.name for path in PACKAGE.iterdir() if (path / "__init__.py").is_file()}
+    folders = {path.name for path in TESTS.iterdir() if path.is_dir()}
+    assert packages - folders == set()
+    lines = {str(path.relative_to(TESTS)): len(path.read_text(encoding="utf-8").splitlines()) for path in TEST_FILES}
+    assert {name: n for name, n in lines.items() if n > 400} == {}
+    assert {str(p.relative_to(TESTS)) for p in TESTS.glob("test_*.py")} == set(), "a test lies in the folder of its package"
