@@ -42,11 +42,6 @@ def test_a_box_fills_its_volume(cells, size, pattern):
     assert areas.sum() == pytest.approx(2 * (a * b + b * c + c * a))
 
 
-@pytest.mark.parametrize("cells, pattern, count", [((12, 3, 3), "five", 540), ((11, 2, 2), "five", 220), ((2, 3, 4), "six", 144)])
-def test_known_counts(cells, pattern, count):
-    assert box_mesh(cells, (4, 1, 1), pattern=pattern).n_tets == count
-
-
 def cell_tets(mesh, cells):
     """For every cell (i,j,k), its tets as sets of corners relative to the cell, such as (1,0,1)."""
     found: dict[tuple, list] = {}
@@ -85,8 +80,8 @@ def test_a_sheet_has_its_size_and_thickness_along_y():
         sheet_mesh((4, 3), (2.0, 1.6, 1.5))
 
 
-@pytest.mark.parametrize("cells", [2, 4, 8, 16])
-def test_a_ball_is_round_and_well_shaped(cells):
+@pytest.mark.parametrize("cells", [2, 4, 8])
+def test_a_ball_is_round_symmetric_and_well_shaped(cells):
     center = np.array([1.0, 2.0, -3.0])
     mesh = ball_mesh(0.7, cells, center)
     assert mesh.n_tets == 6 * cells**3 and mesh.warnings == []
@@ -96,27 +91,19 @@ def test_a_ball_is_round_and_well_shaped(cells):
     missing = 1.0 - mesh.volumes.sum() / (4.0 / 3.0 * np.pi * 0.7**3)
     assert 0 < missing < 1.2 / cells**2  # the volume between chords of length h and the sphere scales with h^2
     assert mean_ratio(edge_lengths(mesh.vertices, mesh.tets), mesh.volumes).min() > 0.68
-
-
-def test_a_ball_is_symmetric():
-    mesh = ball_mesh(1.0, 4)
-    points = {tuple(p) for p in np.round(mesh.vertices, 12) + 0.0}
+    points = {tuple(p) for p in np.round(mesh.vertices - center, 12) + 0.0}
     for axis in range(3):
-        mirrored = mesh.vertices.copy()
+        mirrored = mesh.vertices - center
         mirrored[:, axis] *= -1
         assert {tuple(p) for p in np.round(mirrored, 12) + 0.0} == points
-    assert (mesh.volumes[:, None] * mesh.vertices[mesh.tets].mean(axis=1)).sum(axis=0) == pytest.approx([0, 0, 0], abs=1e-12)
+    assert mesh.volumes @ mesh.vertices[mesh.tets].mean(axis=1) == pytest.approx(center * mesh.volumes.sum(), abs=1e-12)
 
 
 @pytest.mark.parametrize(
     "name, values, rule",
     [
-        (
-            "cells",
-            [(0, 1, 1), (1, -2, 1), (1, 1), (1.5, 1, 1), 3, "abc", (True, 1, 1), (1, 1, 1, 1), None],
-            "three positive integers",
-        ),
-        ("size", [(0, 1, 1), (1, -1, 1), (1, 1), (1, np.nan, 1), (1, np.inf, 1), "abc", ((1, 2), 3)], ""),
+        ("cells", [(0, 1, 1), (1, 1), (1.5, 1, 1), 3, "abc", (True, 1, 1), None], "three positive integers"),
+        ("size", [(0, 1, 1), (1, -1, 1), (1, 1), (1, np.nan, 1), "abc", ((1, 2), 3)], ""),
         ("pattern", ["four"], "'five' or 'six', not 'four'"),
         ("center", [(0, 0, np.nan)], "three finite numbers"),
     ],
@@ -127,19 +114,14 @@ def test_invalid_arguments_of_a_box_are_refused(name, values, rule):
             box_mesh(**({"cells": (1, 1, 1), "size": (1, 1, 1)} | {name: value}))
 
 
-@pytest.mark.parametrize(
-    "radius, cells, rule", [(0, 4, "radius"), (-1, 4, "radius"), (1, 3, "even"), (1, 0, "even"), (1, 2.0, "even")]
-)
-def test_invalid_arguments_of_a_ball_are_refused(radius, cells, rule):
-    with pytest.raises(MeshError, match=rule):
-        ball_mesh(radius, cells)
-
-
-@pytest.mark.parametrize("cells", [(1000, 1000, 1000), (10**9, 1, 1), (10**9, 10**9, 10**9), (10**30, 1, 1)])
-def test_a_too_large_mesh_is_refused_at_once(cells):
+def test_a_too_large_mesh_and_bad_balls_are_refused_at_once():
     start = time.process_time()
-    with pytest.raises(MeshError, match="tets"):
-        box_mesh(cells, (1, 1, 1))
-    with pytest.raises(MeshError, match="ball_mesh.*tets"):
-        ball_mesh(1.0, 2 * cells[0])
+    for cells in ((1000, 1000, 1000), (10**30, 1, 1)):
+        with pytest.raises(MeshError, match="tets"):
+            box_mesh(cells, (1, 1, 1))
+        with pytest.raises(MeshError, match="ball_mesh.*tets"):
+            ball_mesh(1.0, 2 * cells[0])
+    for radius, cells, rule in ((0, 4, "radius"), (1, 3, "even"), (1, 2.0, "even")):
+        with pytest.raises(MeshError, match=rule):
+            ball_mesh(radius, cells)
     assert time.process_time() - start < 1.0  # nothing of that size was built

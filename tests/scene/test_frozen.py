@@ -1,9 +1,11 @@
 """Which attributes may be assigned, and when:
 
 * assigning an unknown attribute of a scene, body, material, shape, obstacle, settings or simulator raises an error that suggests
-  the nearest name; assigning a read-only one raises an error with the call to use; reading and copying work as in plain classes;
-* a Simulator freezes its scene and its own copy: later changes to either, or to their bodies, are refused with the call to use;
-  a failed construction, statics and modes do not freeze the scene, and a second Simulator can be made from it;
+  the nearest name; assigning a read-only one raises an error with the call to use;
+* meshes, surfaces and nodes are immutable, and so are their copies and pickles;
+* a body's material, position, velocity and collision can be set, with the checks of `add_body`; lists grow by methods only;
+* a Simulator freezes its scene and its own copy: later changes to either are refused with the call to use; a failed
+  construction does not freeze the scene, and a second Simulator can be made from it;
 * snapshots, copies and pickles of a frozen scene can change, and the simulator's own set_ methods still work.
 """
 
@@ -14,8 +16,7 @@ import numpy as np
 import pytest
 
 import taisoft as ts
-from taisoft.dynamics import dynamics
-from taisoft.errors import SceneError, SimulationError
+from taisoft.errors import MeshError, SceneError, SimulationError
 from taisoft.scene.refine import with_order
 from tests.dynamics.scenes import cube, rubber
 
@@ -25,7 +26,7 @@ DT = 1e-4
 def loaded() -> ts.Scene:
     """A body with velocities, constraints and loads, a second body and an obstacle."""
     scene = ts.Scene()
-    scene.contact_forces = False  # for shorter compilation
+    scene.contact_forces = False
     body = scene.add_body(cube(), rubber(), name="block", velocity=np.zeros((8, 3)))
     body.fix([0])
     body.move([1], lambda t: (0, 0, 0))
@@ -40,71 +41,136 @@ def loaded() -> ts.Scene:
     return scene
 
 
+def copies(one) -> tuple:
+    return one, copy.copy(one), copy.deepcopy(one), pickle.loads(pickle.dumps(one))
+
+
 # --- unknown and read-only attributes ---------------------------------------------------------------------------------
+
+REMOVE = "remove it from its list and add another"
+ANOTHER = "add another body by scene.add_body"
 
 
 @pytest.mark.parametrize(
     "select, name, message",
     [
-        (lambda s: s, "gravty", "^scene has no attribute 'gravty'; did you mean 'gravity'[?]$"),
-        (lambda s: s, "zzz", "^scene has no attribute 'zzz'$"),
-        (lambda s: s, "_hidden", "^scene has no attribute '_hidden'$"),
-        (lambda s: s.body("block"), "materal", "^body 'block' has no attribute 'materal'; did you mean 'material'[?]$"),
-        (lambda s: s.body("block").material, "youngs", "^material has no attribute 'youngs'; did you mean 'young'[?]$"),
-        (lambda s: s.body("block").material, "young", "^material: young cannot change: .*sim.set_material.body, young=...."),
-        (lambda s: s.obstacle("ball"), "fricton", "^obstacle 'ball' has no attribute 'fricton'; did you mean 'friction'[?]$"),
-        (lambda s: s.obstacle("ball"), "friction", "^obstacle 'ball': friction cannot change: .*scene.set_contact"),
-        (lambda s: s.obstacle("ball").shape, "radios", "^sphere has no attribute 'radios'; did you mean 'radius'[?]$"),
-        (lambda s: s.obstacle("ball").shape, "radius", "^sphere: radius cannot change: make another shape"),
-        (lambda s: s.collision, "margn", "^collision settings has no attribute 'margn'; did you mean 'margin'[?]$"),
-        (lambda s: s.collision, "margin", "^collision settings: margin cannot change: .*CollisionSettings.margin=...."),
-        (lambda s: s.springs[0], "stifness", "^spring 'spring' has no attribute 'stifness'; did you mean 'stiffness'[?]$"),
-        (
-            lambda s: s.springs[0],
-            "stiffness",
-            "^spring 'spring': stiffness cannot change: remove it from its list and add another",
+        (lambda s: s, "gravty", "scene has no attribute 'gravty'; did you mean 'gravity'[?]$"),
+        (lambda s: s.body("block"), "materal", "body 'block' has no attribute 'materal'; did you mean 'material'[?]$"),
+        *(
+            (lambda s: s.body("block"), name, f"body 'block': {name} cannot be set: {ANOTHER}$")
+            for name in ("name", "mesh", "order", "quadrature_degree", "dilatation", "nodes", "rest_positions", "n_nodes")
         ),
-        (lambda s: s.springs[0].points[0], "position", "^point: position cannot change: remove it from its list and add another"),
-        (lambda s: s.tendons[0], "value", "^tendon 'line': value cannot change: call sim.set_tension.name, force."),
-        (lambda s: s.attachments[0], "nodes", "^attachment 'pins': nodes cannot change: remove it from its list and add another"),
-        (lambda s: s.body("block").forces[0], "value", "^force: value cannot change: call sim.set_force"),
-        (lambda s: s.body("block").tractions[0], "value", "^traction: value cannot change: call sim.set_traction"),
+        (lambda s: s.body("block"), "constraints", "body 'block': constraints cannot be set: call body.fix or body.move$"),
+        (lambda s: s.body("block"), "contact_mode", "body 'block': contact_mode cannot be set: set body.collision$"),
+        (lambda s: s.body("block").material, "young", "material: young cannot change: .*sim.set_material.body, young=...."),
+        (lambda s: s.obstacle("ball"), "friction", "obstacle 'ball': friction cannot change: .*scene.set_contact"),
+        (lambda s: s.obstacle("ball").shape, "radius", "sphere: radius cannot change: make another shape"),
+        (lambda s: s.collision, "margin", "collision settings: margin cannot change: .*CollisionSettings.margin=...."),
+        (lambda s: s.springs[0], "stiffness", f"spring 'spring': stiffness cannot change: {REMOVE}"),
+        (lambda s: s.body("block").forces[0], "value", "force: value cannot change: call sim.set_force"),
+        (lambda s: ts.KeyFrames([0], [(0, 0, 0)]), "colour", "key frames has no attribute 'colour'$"),
     ],
 )
-def test_unknown_and_read_only_attributes_of_a_scene_are_refused(select, name, message):
+def test_unknown_and_read_only_attributes_are_refused(select, name, message):
     target = select(loaded())
     before = dict(target.__dict__)
-    with pytest.raises(SceneError, match=message) as caught:
+    with pytest.raises(SceneError, match=f"^{message}") as caught:
         setattr(target, name, 1.0)
     assert isinstance(caught.value, AttributeError) and target.__dict__ == before
 
 
-def test_shapes_and_key_frames_refuse_unknown_attributes():
-    shapes = [
-        ts.HalfSpace((0, 0, 0), (0, 1, 0)),
-        ts.Sphere((0, 0, 0), 1),
-        ts.Box((0, 0, 0), (1, 1, 1)),
-        ts.Capsule((0, 0, 0), (1, 0, 0), 1),
-        ts.MeshObstacle(np.eye(3), [(0, 1, 2)]),
-        ts.KeyFrames([0], [(0, 0, 0)]),
-    ]
-    for shape in shapes:
-        with pytest.raises(SceneError, match="has no attribute 'colour'$"):
-            shape.colour = 1
+def test_meshes_are_immutable():
+    mesh = cube()
+    for made, names, instead in (
+        (mesh, ("vertices", "volumes", "n_tets"), "make a new mesh, such as ts.TetMesh[(]0.9 [*] mesh.vertices, mesh.tets[)]"),
+        (ts.SurfaceMesh(mesh.vertices, mesh.surface), ("triangles", "volume"), "make a new one, such as ts.SurfaceMesh"),
+        (loaded().bodies[0].nodes, ("positions",), "they follow from the mesh and the order; add another body"),
+    ):
+        for one in copies(made):
+            for name in names:
+                for change, values in ((setattr, [np.ones((4, 3))]), (delattr, [])):
+                    with pytest.raises(MeshError, match=f": {name} cannot change: {instead}") as caught:
+                        change(one, name, *values)
+                    assert isinstance(caught.value, AttributeError)
+            assert not any(value.flags.writeable for value in vars(one).values() if isinstance(value, np.ndarray))
+            with pytest.raises(MeshError, match="has no attribute 'foo'$"):
+                one.foo = 1
+    for change in (lambda: mesh.warnings.append("x"), lambda: mesh.recipe.update(shape="ball")):
+        with pytest.raises(MeshError, match="cannot change: make a new mesh"):
+            change()
 
 
-def test_reading_an_unknown_attribute_is_a_plain_attribute_error():
+# --- what can be assigned ---------------------------------------------------------------------------------------------
+
+
+def test_assignments_are_checked_as_by_add_body():
+    for name, value in (
+        ("material", "rubber"),
+        ("position", (0, np.nan, 0)),
+        ("velocity", np.zeros((3, 3))),
+        ("collision", "sdf"),
+    ):
+        body = loaded().bodies[0]
+        given, before = {"material": rubber(), name: value}, getattr(body, name)
+        with pytest.raises(SceneError) as added:
+            ts.Scene().add_body(cube(), **given, name="block")
+        with pytest.raises(SceneError) as set_later:
+            setattr(body, name, value)
+        assert str(set_later.value) == str(added.value) and getattr(body, name) is before
+
+
+def test_attributes_of_a_body_can_be_set():
+    body = loaded().bodies[0]
+    body.position, body.velocity, body.collision = [1, 2, 3], np.ones((8, 3)), "distance_field"
+    assert body.position.tolist() == [1, 2, 3] and body.position.dtype == float and body.velocity.shape == (8, 3)
+    with pytest.warns(UserWarning, match="body 'block': poisson = 0.495 is above 0.49") as caught:
+        body.material = rubber(poisson=0.495)
+    assert len(caught) == 1 and caught[0].filename == __file__ and body.material.poisson == 0.495
+
+
+def test_lists_grow_by_methods_only_and_items_can_be_removed():
     scene = loaded()
-    assert not hasattr(scene, "gravty") and getattr(scene, "gravty", 7) == 7 and hasattr(scene.bodies[0], "material")
-    with pytest.raises(AttributeError, match="object has no attribute 'gravty'"):
-        _ = scene.gravty
+    for one, name, call in (
+        (scene, "bodies", "scene.add_body"),
+        (scene, "obstacles", "scene.add_obstacle"),
+        (scene.bodies[0], "constraints", "body.fix or body.move"),
+        (scene.bodies[0], "forces", "body.add_force"),
+    ):
+        items = getattr(one, name)
+        before = list(items)
+        changes = {"append": ["foo"], "insert": [0, 1], "extend": [[1]], "__iadd__": [[1]], "__setitem__": [slice(None), []]}
+        for change, values in changes.items():
+            with pytest.raises(SceneError, match=f": {name} cannot be changed by hand: call {call}$"):
+                getattr(items, change)(*values)
+            assert list(items) == before
+        with pytest.raises(SceneError, match=f": {name} cannot be deleted: call {call}$"):
+            delattr(one, name)
+        assert items.pop() is before[-1] and getattr(one, name) == before[:-1]
 
-    class Mine(ts.Scene):
-        def __init__(self):
-            super().__init__()
-            self.colours = {}  # a subclass may add attributes
 
-    assert Mine().colours == {}
+def test_contact_pairs_are_set_by_set_contact_only():
+    scene = copy.copy(loaded())
+    for change in (
+        lambda s: s.contact_pairs.__setitem__("foo", ("foo", -3)),
+        lambda s: s.contact_pairs.update({1: 2}),
+        lambda s: s.contact_pairs.pop(frozenset(("block", "ball"))),
+        lambda s: setattr(s, "contact_pairs", {}),
+    ):
+        with pytest.raises(SceneError, match="^scene: contact_pairs cannot be .*: call scene.set_contact"):
+            change(scene)
+    assert scene.contact_pairs == {frozenset(("block", "ball")): (0.3, None)}
+
+
+def test_values_written_into_arrays_are_checked():
+    for array, words in (
+        (lambda s: s.gravity, "^scene: gravity: entry .0. is nan, not finite"),
+        (lambda s: s.bodies[0].position, "^body 'block': position: entry .0. is nan"),
+    ):
+        scene = loaded()
+        array(scene)[0] = np.nan
+        for use in (ts.Simulator, ts.solve_static):
+            with pytest.raises(SceneError, match=words):
+                use(scene)
 
 
 # --- a frozen scene ---------------------------------------------------------------------------------------------------
@@ -122,44 +188,19 @@ def frozen():
 CHANGES = {
     "gravity": (lambda s: setattr(s, "gravity", (0, 0, 0)), "call sim.set_gravity"),
     "collision": (lambda s: setattr(s, "collision", ts.CollisionSettings()), "scene.snapshot"),
-    "allow_initial_overlap": (lambda s: setattr(s, "allow_initial_overlap", True), "make a new Simulator"),
     "contact_forces": (lambda s: setattr(s, "contact_forces", True), "make a new Simulator"),
     "add_body": (lambda s: s.add_body(cube((0, 5, 0)), rubber()), "scene.snapshot"),
-    "add_obstacle": (lambda s: s.add_obstacle(ts.Sphere((0, -20, 0), 1)), "scene.snapshot"),
+    "bodies": (lambda s: s.bodies.pop(), "scene.snapshot"),
+    "velocity": (lambda s: setattr(s.body("block"), "velocity", np.zeros(3)), "call sim.set_state"),
     "set_contact": (lambda s: s.set_contact("block", "ball", friction=1), "call sim.set_contact"),
     "contact_pairs": (lambda s: s.contact_pairs.clear(), "call sim.set_contact"),
-    "bodies": (lambda s: s.bodies.pop(), "scene.snapshot"),
-    "obstacles": (lambda s: setattr(s, "obstacles", []), "scene.snapshot"),
-    "add_spring": (lambda s: s.add_spring(("block", 0), ("other", 1), 1.0), "scene.snapshot"),
     "add_tendon": (lambda s: s.add_tendon([("block", 0), ("other", 1)], 1.0), "call sim.set_tension"),
-    "attach": (lambda s: s.attach("block", [0], "ball", 1.0), "scene.snapshot"),
-    "springs": (lambda s: setattr(s, "springs", []), "scene.snapshot"),
-    "tendons": (lambda s: setattr(s, "tendons", []), "call sim.set_tension"),
-    "attachments": (lambda s: s.attachments.append(1), "scene.snapshot"),
     "material": (lambda s: setattr(s.body("block"), "material", rubber()), "call sim.set_material"),
-    "position": (lambda s: setattr(s.body("block"), "position", np.zeros(3)), "call sim.set_state"),
-    "velocity": (lambda s: setattr(s.body("block"), "velocity", np.zeros(3)), "call sim.set_state"),
-    "name": (lambda s: setattr(s.body("block"), "name", "b"), "scene.snapshot"),
     "fix": (lambda s: s.body("block").fix([3]), "scene.snapshot"),
-    "move": (lambda s: s.body("block").move([3], lambda t: (0, 0, 0)), "scene.snapshot"),
     "add_force": (lambda s: s.body("block").add_force([3], (0, 0, 0)), "call sim.set_force"),
-    "add_traction": (lambda s: s.body("block").add_traction([3], (0, 0, 0)), "call sim.set_traction"),
     "forces": (lambda s: s.body("block").forces.append(1), "call sim.set_force"),
-    "tractions": (lambda s: s.body("block").tractions.__setitem__(0, 1), "call sim.set_traction"),
-    "constraints": (lambda s: s.body("block").constraints.clear(), "scene.snapshot"),
-    "mesh": (lambda s: delattr(s.body("block"), "mesh"), "scene.snapshot"),
 }
-ALWAYS_REFUSED = {
-    "obstacles",
-    "contact_pairs",
-    "name",
-    "forces",
-    "tractions",
-    "mesh",
-    "springs",
-    "tendons",
-    "attachments",
-}  # not assignable before freezing either
+ALWAYS_REFUSED = {"contact_pairs", "forces"}  # before freezing, too
 
 
 @pytest.mark.parametrize("name", CHANGES)
@@ -174,40 +215,30 @@ def test_changes_to_a_frozen_scene_are_refused(frozen, name):
         assert [b.name for b in target.bodies] == ["block", "other"] and len(target.body("block").forces) == 1
     for copied in (before.snapshot(), scene.snapshot()):
         if name in ALWAYS_REFUSED:
-            with pytest.raises(SceneError, match=f"{name} cannot be (set|changed by hand|deleted): (call|add)"):
+            with pytest.raises(SceneError, match=f"{name} cannot be (set|changed by hand): (call|add)"):
                 change(copied)
         else:
             change(copied)
 
 
-def test_arrays_of_a_frozen_scene_are_read_only(frozen):
+def test_arrays_of_a_frozen_scene_and_of_records_are_read_only(frozen):
     scene, _, before = frozen
-    body = scene.body("block")
-    connections = scene.springs[0].points[0].position, scene.attachments[0].nodes
-    with pytest.raises(ValueError, match="read-only"):
-        scene.tendons[0].value[()] = 2.0
-    arrays = (
-        *connections,
-        scene.gravity,
-        body.position,
-        body.velocity,
-        body.forces[0].value,
-        body.tractions[0].value,
-        body.constraints[0].nodes,
-    )
-    for array in (*arrays, body.rest_positions, body.mesh.vertices):
-        with pytest.raises(ValueError, match="read-only"):
-            array[0] = 1
+    body, spring = scene.body("block"), scene.springs[0]
+    arrays = [scene.gravity, body.position, body.velocity, body.rest_positions, body.mesh.vertices, spring.points[0].position]
+    records = (*body.forces, *body.tractions, *body.constraints, *scene.attachments, *scene.tendons)
+    records += (ts.Box((0, 0, 0), (1, 1, 1)), *copies(ts.KeyFrames([0], [(0, 0, 0)], [(0, 0, 1)])))
+    for one in (*records, *copies(ts.MeshObstacle(np.eye(3), [(0, 1, 2)]))):
+        found = [value for value in vars(one).values() if isinstance(value, np.ndarray)]
+        assert found
+        arrays += found
+    assert not any(array.flags.writeable for array in arrays)
     before.snapshot().gravity[1] = 0.0
-
-
-def test_unknown_attributes_of_a_frozen_scene_are_still_reported_as_unknown(frozen):
-    with pytest.raises(SceneError, match="^scene has no attribute 'gravty'"):
-        frozen[0].gravty = 1
 
 
 def test_copies_of_a_frozen_scene_can_change(frozen):
     scene = frozen[0]
+    with pytest.raises(SceneError, match="^scene has no attribute 'gravty'"):  # unknown, not frozen
+        scene.gravty = 1
     picklable = scene.snapshot()
     del picklable.body("block").constraints[1:]  # its path is a lambda
     for copied in (scene.snapshot(), copy.copy(scene), copy.deepcopy(scene), pickle.loads(pickle.dumps(picklable))):
@@ -225,7 +256,9 @@ def test_copies_of_a_frozen_scene_can_change(frozen):
 def test_set_methods_change_the_simulators_copy_alone(frozen):
     scene, sim, _ = frozen
     sim.set_gravity((0, -1, 0))
-    sim.set_material("block", young=2e4)
+    with pytest.warns(UserWarning, match="body 'block': poisson = 0.495 is above 0.49") as caught:
+        sim.set_material("block", young=2e4, poisson=0.495)
+    assert caught[0].filename == __file__
     sim.set_contact("block", "ball", friction=0.1)
     sim.set_force("block", 0, (2, 0, 0))
     sim.set_tension("line", 3.0)
@@ -243,28 +276,16 @@ def test_set_methods_change_the_simulators_copy_alone(frozen):
         assert sim.scene.body("block").material.young == 2e4
         with pytest.raises(SceneError, match="cannot change any more"):
             sim.scene.gravity = (0, 0, 0)
-    with pytest.raises(ValueError, match="read-only"):
-        sim.scene.gravity[1] = 0.0
+    assert not sim.scene.gravity.flags.writeable
 
 
-def test_only_a_successful_construction_freezes(frozen, tmp_path, monkeypatch):
-    def fail(*_):
-        raise RuntimeError("construction failed")
-
+def test_only_a_successful_construction_freezes(frozen, tmp_path):
     scene = loaded()
     for settings in ({"integrator": "nope"}, {"dt": 1.0, "integrator": "symplectic_euler", "precision": "f64"}):
         with pytest.raises(SimulationError):
             ts.Simulator(scene, **settings)
-    with monkeypatch.context() as patch, pytest.raises(RuntimeError, match="construction failed"):
-        patch.setattr(dynamics, "make_stepper", fail)
-        ts.Simulator(scene, DT, "symplectic_euler", precision="f64")
-    held = ts.Scene()
-    held.add_body(cube(), rubber()).fix(lambda X: X[:, 0] < 0)
-    ts.solve_static(held)
-    ts.modes(held, 1)
-    for target in (scene, held):
-        target.gravity[1] = -1.0
-        target.bodies[0].fix([5])
+    scene.gravity[1] = -1.0
+    scene.bodies[0].fix([5])
     saved, first = tmp_path / "c.npz", frozen[1]
     first.save_checkpoint(saved)
     with ts.Simulator(frozen[0], DT, "symplectic_euler", precision="f64") as second:  # from a frozen scene
@@ -275,39 +296,17 @@ def test_only_a_successful_construction_freezes(frozen, tmp_path, monkeypatch):
         again.gravity = (0, 0, 0)
 
 
-@pytest.mark.parametrize(
-    "name, message",
-    [
-        ("dtt", "^simulator has no attribute 'dtt'; did you mean 'dt'[?]$"),
-        ("gravity", "^simulator has no attribute 'gravity': call sim.set_gravity.gravity.$"),
-        ("gravty", "^simulator has no attribute 'gravty'; did you mean 'gravity'[?] .call sim.set_gravity.gravity..$"),
-        ("young", "^simulator has no attribute 'young': call sim.set_material.body, young=....$"),
-        ("friction", "^simulator has no attribute 'friction': call sim.set_contact"),
-        ("integrator", "^simulator has no attribute 'integrator': call sim.rebuild.integrator=....$"),
-        ("tension", "^simulator has no attribute 'tension': call sim.set_tension.name, force.$"),
-        ("positions", "^simulator: positions is a method and cannot be set: call sim.set_state"),
-        ("step", "^simulator: step is a method and cannot be set$"),
-        ("time", "^simulator: time cannot be set: call sim.reset"),
-        ("stable_dt", "^simulator: stable_dt cannot be set: .*set sim.dt"),
-        ("compile_seconds", "^simulator: compile_seconds cannot be set: it is read-only$"),
-        ("scene", "^simulator: scene cannot be set: make a new Simulator"),
-        ("settings", "^simulator: settings cannot be set: call sim.rebuild"),
-        ("plan", "^simulator: plan cannot be set: it follows"),
-    ],
-)
-def test_unknown_and_read_only_attributes_of_a_simulator_are_refused(frozen, name, message):
+def test_unknown_and_read_only_attributes_of_a_simulator_are_refused(frozen):
     sim = frozen[1]
-    with pytest.raises(SimulationError, match=message) as caught:
-        setattr(sim, name, 1.0)
-    assert isinstance(caught.value, AttributeError)
+    for name, message in (
+        ("gravity", "simulator has no attribute 'gravity': call sim.set_gravity.gravity.$"),
+        ("gravty", "simulator has no attribute 'gravty'; did you mean 'gravity'[?] .call sim.set_gravity.gravity..$"),
+        ("positions", "simulator: positions is a method and cannot be set: call sim.set_state"),
+        ("time", "simulator: time cannot be set: call sim.reset"),
+    ):
+        with pytest.raises(SimulationError, match=f"^{message}") as caught:
+            setattr(sim, name, 1.0)
+        assert isinstance(caught.value, AttributeError)
     sim.dt = sim.dt
     with pytest.raises(SceneError, match="^settings: dt cannot change: call sim.rebuild.dt=....$"):
         sim.settings.dt = 1.0
-
-
-def test_a_method_may_be_replaced(frozen, monkeypatch):
-    sim = frozen[1]
-    with monkeypatch.context() as patch:
-        patch.setattr(sim, "step", lambda: "stepped")
-        assert sim.step() == "stepped"
-    assert sim.step.__func__ is ts.Simulator.step

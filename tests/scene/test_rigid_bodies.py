@@ -1,0 +1,259 @@
+"""Rigid bodies as parts of a scene:
+
+* mass, centre and inertia are those of the closed form, and those of the four equal masses that carry the body;
+* pose, twist and strain of a state; the velocity at the start; the stiffness follows from the scene;
+* ends of connections are vertices; refined scenes keep rigid bodies; the plan names them;
+* invalid arguments and what a rigid body cannot do are refused; scene files hold rigid bodies, and errors in them are located.
+"""
+
+import numpy as np
+import pytest
+
+import taisoft as ts
+from taisoft.scene.fingerprint import scene_digest
+from taisoft.scene.plan import make_plan
+from taisoft.scene.refine import refined
+from taisoft.scene.rigid import RigidBody, volume_moments
+from tests.cli.command import write
+from tests.collision.rotations import rotation
+
+G = 9.81
+SIZE = (1.0, 0.6, 0.3)
+R, SHIFT = rotation((1.0, -2.0, 0.5), 0.9), np.array([3.0, -2.0, 5.0])
+BOX = ts.box_mesh(cells=(1, 1, 1), size=SIZE)
+
+
+def surface_of(mesh: ts.TetMesh) -> ts.SurfaceMesh:
+    used, triangles = np.unique(mesh.surface, return_inverse=True)
+    return ts.SurfaceMesh(mesh.vertices[used], triangles.reshape(-1, 3))
+
+
+def with_soft(**numbers) -> ts.Scene:
+    """A rigid body "r" below a soft one."""
+    scene = ts.Scene()
+    scene.add_rigid_body(BOX, name="r", **numbers)
+    scene.add_body(BOX, ts.Material(), name="soft", position=(0, 2, 0))
+    return scene
+
+
+# --- moments and motion ------------------------------------------------------------------------------------------------
+
+
+def test_moments_are_those_of_the_solid():
+    turned = ts.TetMesh(BOX.vertices @ R.T + SHIFT, BOX.tets)
+    volume, centre, covariance = volume_moments(turned.vertices, turned.surface)
+    assert volume == pytest.approx(np.prod(SIZE), rel=1e-13) and np.allclose(centre, SHIFT, atol=1e-13)
+    assert np.allclose(covariance, R @ np.diag(np.square(SIZE)) @ R.T / 12.0, atol=1e-14)
+    ball = ts.ball_mesh(radius=0.7, cells=4)  # against a sum over tets
+    volume, centre, covariance = volume_moments(ball.vertices + 1.0, ball.surface)
+    x = ball.vertices[ball.tets] + 1.0
+    total = x.sum(axis=1)
+    second = np.einsum("t,tki,tkj->ij", ball.volumes, x, x) + np.einsum("t,ti,tj->ij", ball.volumes, total, total)
+    own = ball.volumes @ total / 4.0 / ball.volumes.sum()
+    assert volume == pytest.approx(ball.volumes.sum(), rel=1e-12) and np.allclose(centre, own, atol=1e-13)
+    assert np.allclose(covariance, second / 20.0 / volume - np.outer(own, own), atol=1e-13)
+
+
+def test_four_equal_masses_have_the_mass_centre_and_inertia_of_the_body():
+    scene = ts.Scene()
+    turned = ts.TetMesh(BOX.vertices @ R.T + 1.0, BOX.tets)
+    body, same = scene.add_rigid_body(turned, density=700.0), scene.add_rigid_body(surface_of(turned), density=700.0)
+    x, m = body.mesh.vertices - body.centre, np.full(4, 0.25 * body.mass)
+    assert body.mass == pytest.approx(700.0 * np.prod(SIZE), rel=1e-12) and np.allclose(m @ x, 0.0, atol=1e-12)
+    inertia = np.einsum("a,ai,ai->", m, x, x) * np.eye(3) - np.einsum("a,ai,aj->ij", m, x, x)
+    exact = R @ (body.mass / 12.0 * (np.sum(np.square(SIZE)) * np.eye(3) - np.diag(np.square(SIZE)))) @ R.T
+    assert np.allclose(inertia, exact, rtol=1e-12) and np.allclose(body.inertia, exact, rtol=1e-12)
+    assert np.allclose(body.nodes.embedded @ body.mesh.vertices, body.surface.vertices, atol=1e-13)
+    assert np.array_equal(body.rest_positions, same.rest_positions) and np.array_equal(body.nodes.surface, same.nodes.surface)
+
+
+def test_pose_twist_and_strain_of_a_rigid_motion():
+    body = ts.Scene().add_rigid_body(BOX, position=(1, 2, 3))
+    w, v = np.array([1.0, -2.0, 0.5]), np.array([3.0, 0.0, 1.0])
+    arms = (body.rest_positions - body.centre) @ R.T
+    x = arms + body.centre + body.position + SHIFT
+    pose, twist = body.pose(x), body.twist(x, v + np.cross(w, arms))
+    assert np.allclose(pose.translation, SHIFT, atol=1e-12) and np.allclose(pose.rotation, R, atol=1e-12)
+    assert np.allclose(twist.velocity, v, atol=1e-12) and np.allclose(twist.angular_velocity, w, atol=1e-12)
+    assert body.strain(x) < 1e-12
+    assert body.strain(body.centre + 1.01 * (x - body.centre)) == pytest.approx(0.01, rel=1e-9)
+
+
+def test_the_velocity_at_the_start():
+    body = ts.Scene().add_rigid_body(BOX, name="r", velocity=(0, 1, 0), angular_velocity=(0, 0, 2), density=777.7)
+    assert body.density == 777.7 and body.start_twist.angular_velocity.tolist() == [0, 0, 2]
+    arms = body.rest_positions - body.centre
+    assert np.allclose(body.velocity, np.array([0, 1, 0]) + np.cross((0, 0, 2), arms), atol=1e-14)
+    with pytest.raises(ts.SceneError, match="can only be set to"):
+        body.velocity = np.zeros((12, 3))
+    body.velocity = (3, 0, 0)
+    assert body.start_twist.velocity.tolist() == [3, 0, 0] and body.start_twist.angular_velocity.tolist() == [0, 0, 0]
+
+
+# --- in a scene --------------------------------------------------------------------------------------------------------
+
+
+def test_the_stiffness_follows_from_the_scene_unless_it_is_given():
+    scene = ts.Scene(gravity=(0, 0, 0))
+    scene.add_rigid_body(BOX, name="a")
+    scene.add_rigid_body(BOX, name="b", young=3e8)
+    own = 1000.0 * G * 1.0 / 1e-5  # its weight strains it by 1e-5, also in a scene without gravity
+    assert scene.snapshot().body("a").young == pytest.approx(own, rel=1e-9)
+    assert 0.3 < scene.body("b").lowest_frequency / (np.sqrt(3e8 / 1000.0) * np.pi) < 3.0
+    scene.gravity = (0, -2 * G, 0)
+    assert scene.snapshot().body("a").young == pytest.approx(2 * own, rel=1e-9)
+    fast = scene.add_body(BOX, ts.Material(young=1e4), velocity=(0, 200, 0), position=(0, 5, 0))
+    assert scene.snapshot().body("a").young == pytest.approx(1000.0 * 200.0**2 / 1e-5, rel=1e-9)
+    fast.material = ts.Material(law="corotational", young=1e10)
+    copied = scene.snapshot()
+    assert copied.body("a").young == pytest.approx(1e3 * 1e10) and copied.body("b").young == pytest.approx(3e8)
+    assert copied.body("a").composition.laws == ("corotational",)  # no second law is compiled
+
+
+def test_the_plan_names_rigid_bodies_and_refined_scenes_keep_them():
+    scene = with_soft()
+    plan = make_plan(scene, False, False)
+    assert plan.on["rigid_bodies"] and plan.why("rigid_bodies") == "r" and plan.on["dependent_nodes"]
+    assert plan.on["rigid_damping"] and not plan.on["rigid_motion"]
+    plan = make_plan(scene.snapshot(), True, False)
+    assert plan.on["rigid_motion"] and not plan.on["rigid_damping"]
+    assert plan.on["law:stable_neo_hookean"] and not plan.on["law:st_venant_kirchhoff"]
+    scene.contact_forces = False
+    assert not make_plan(scene, False, False).on["rigid_damping"]
+    finer = refined(scene)
+    assert isinstance(finer.body("r"), RigidBody) and finer.body("r").n_nodes == scene.body("r").n_nodes
+
+
+def test_ends_of_connections_are_vertices_counted_from_0():
+    scene = with_soft()
+    spring = scene.add_spring(("r", 7), ("soft", 0), stiffness=1.0)
+    assert np.array_equal(spring.points[0].position, scene.body("r").surface.vertices[7])
+    assert scene.body("r").selectable == slice(4, 12)
+    for call, message in (
+        (lambda: scene.add_spring(("r", 8), ("soft", 0), stiffness=1.0), "a: the node must be"),
+        (lambda: scene.attach("r", [0], "soft", stiffness=1.0), "node 0 of body 'r' lies outside of body 'soft'"),
+        (lambda: scene.attach("r", [0], "soft"), "rigid: attach the other body's nodes to it"),
+        (lambda: scene.add_spring(("r", (0, 5, 0)), ("soft", 0), 1.0), "lies outside of body 'r', by .* times its size"),
+    ):
+        with pytest.raises(ts.SceneError, match=message):
+            call()
+
+
+# --- refusals ----------------------------------------------------------------------------------------------------------
+
+SURFACE = surface_of(BOX)
+FLAT = ts.SurfaceMesh(SURFACE.vertices * (1, 1, 1e-12), SURFACE.triangles)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"mesh": 3}, "rigid body 'r': mesh must be a TetMesh or a SurfaceMesh, not int"),
+        (
+            {"mesh": ts.SurfaceMesh(np.eye(3), np.array([[0, 1, 2]]))},
+            "rigid body 'r': its surface does not bound a solid: 1 hole",
+        ),
+        ({"mesh": ts.SurfaceMesh(SURFACE.vertices, SURFACE.triangles[:, ::-1])}, "all normals point inward"),
+        ({"mesh": FLAT}, "encloses no volume in one direction|does not bound a solid"),
+        ({"density": 0.0}, "rigid body 'r': density must be greater than 0 kg/m^3"),
+        ({"young": -1.0}, "rigid body 'r': young must be greater than 0 Pa"),
+        ({"velocity": (1, 2)}, "rigid body 'r': velocity must have shape .3,."),
+        ({"angular_velocity": (1, 2, np.inf)}, "rigid body 'r': angular_velocity: entry .2. is inf"),
+        ({"friction": -1.0}, "friction must be at least 0"),
+    ],
+)
+def test_bad_arguments_are_refused(arguments, message):
+    scene = ts.Scene()
+    with pytest.raises(ts.SceneError, match=message.replace("^", r"\^")):
+        scene.add_rigid_body(**({"mesh": BOX, "name": "r"} | arguments))
+    assert scene.bodies == []
+
+
+def test_what_a_rigid_body_cannot_do_is_refused():
+    body = with_soft().body("r")
+    for call in (body.add_traction, body.add_pressure, body.add_cavity, body.embed, body.enclosed_volume):
+        with pytest.raises(ts.SceneError, match="takes forces only"):
+            call([0], 1.0)
+    for rotations in ("x", "xxz", 3):
+        with pytest.raises(ts.SceneError, match=f"rotations must be 'xz', not {rotations!r}"):
+            body.fix("y", rotations)
+    with pytest.raises(ts.SceneError, match="an embedded surface has no distance field"):
+        body.collision = "distance_field"
+    with pytest.raises(ts.SceneError, match=r"^rigid body 'r': the path's translation at t = 0 must have shape"):
+        body.move(lambda t: (1.0, np.eye(3)))
+    with pytest.raises(ts.SceneError, match="node 8 does not exist"):
+        body.add_force([8], (1, 0, 0))
+    for name in ("material", "young", "density", "centre"):
+        with pytest.raises(ts.SceneError, match=name):
+            setattr(body, name, 1.0)
+
+
+# --- files -------------------------------------------------------------------------------------------------------------
+
+SCENE = """
+[rigid_bodies.palm]
+mesh = { shape = "box", cells = [1, 1, 1], size = [1, 0.6, 0.3] }
+density = 700
+angular_velocity = [0, 1, 0]
+
+[[rigid_bodies.palm.fix]]
+axes = "y"
+
+[[rigid_bodies.palm.force]]
+force = { times = [0, 1], translations = [[0, 0, 0], [1, 0, 0]] }
+
+[[rigid_bodies.palm.force]]
+nodes = [0, 3]
+force = [0, 0, 1]
+
+[rigid_bodies.tetrahedron]
+mesh = { vertices = [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], triangles = [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]] }
+position = [0, 3, 0]
+young = 1e8
+"""
+
+
+def test_scene_files_hold_rigid_bodies(tmp_path):
+    palm, other = ts.read_scene(write(tmp_path / "a.toml", SCENE))[0].bodies
+    assert palm.mass == pytest.approx(700 * np.prod(SIZE)) and len(palm.forces) == 2 and other.given_young == 1e8
+    assert (palm.forces[0].nodes == np.arange(4)).all() and palm.forces[1].nodes.tolist() == [4, 7]
+    assert palm.constraints[0].axes.tolist() == [False, True, False]
+
+
+def test_written_scenes_read_back_the_same(tmp_path):
+    scene = ts.Scene()
+    spinning = scene.add_rigid_body(BOX, name="b", density=0.7, velocity=(0.1, 0, 0), angular_velocity=(0.1, 0.2, 0.3))
+    spinning.add_force([1, 2], np.ones((2, 3)))
+    spinning.add_force(None, (0, 1, 0))
+    soft = scene.add_body(BOX, ts.Material(), name="soft", position=(0, 2, 0))
+    soft.embed(surface_of(ts.box_mesh((1, 1, 1), (0.5, 0.3, 0.2))), contact=True)
+    moved = scene.add_rigid_body(SURFACE, name="a", position=(0, 4, 0), young=0.7e8, friction=0.3, restitution=0.6)
+    moved.fix("y")
+    moved.move(ts.KeyFrames([0, 1], [(0, 0, 0), (0.2, 0, 0)]), "xz")
+    scene.add_rigid_body(BOX, name="slow", position=(0, 6, 0), angular_velocity=(1, 0, 0)).velocity = (0, 1, 0)
+    ts.write_scene(tmp_path / "a.toml", scene)
+    again, _ = ts.read_scene(tmp_path / "a.toml")
+    assert [body.name for body in again.bodies] == ["b", "soft", "a", "slow"] and scene_digest(again) == scene_digest(scene)
+    turned = ts.Scene()
+    late = turned.add_rigid_body(BOX, name="late")
+    late.move(ts.KeyFrames([0, 1], rotations=[(0, 0, 0), (0, 1, 0)]))
+    late.position = (1, 0, 0)
+    with pytest.raises(ts.SceneError, match="rigid body 'late': its position was set after its path"):
+        ts.write_scene(tmp_path / "b.toml", turned)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("density = 700", "density = -1", "rigid_bodies.palm.density must be greater than 0"),
+        ('axes = "y"', 'axes = "q"', "axes"),
+        ("[0, 3]\nforce", "[0, 9]\nforce", "does not exist"),
+        ("[1, 2, 3]] }", "[1, 2, 4]] }", "triangle 3: vertex 4 does not exist"),
+        ("\n[rigid_bodies.palm]", '\nbody_order = ["palm"]\n[rigid_bodies.palm]', "body_order must list each name"),
+        ("\n[rigid_bodies.palm]", '\nbody_order = ["palm", "palm"]\n[rigid_bodies.palm]', "body_order must list each name"),
+    ],
+)
+def test_errors_in_scene_files_are_located(tmp_path, old, new, message):
+    with pytest.raises((ts.SceneError, ts.MeshError), match="rigid_bodies|body_order") as caught:
+        ts.read_scene(write(tmp_path / "a.toml", SCENE.replace(old, new)))
+    assert message in str(caught.value)
