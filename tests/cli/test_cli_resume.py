@@ -70,7 +70,9 @@ def test_two_parts_equal_one_run(single, tmp_path, capsys):
     assert f"resumed  from {out / 'checkpoint.npz'}, t = 0.1 s" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("options", [("--colour", "speed"), ("--layers", "contacts")], ids=" ".join)
+@pytest.mark.parametrize(
+    "options", [("--layers", "contacts"), pytest.param(("--colour", "speed"), marks=pytest.mark.long)], ids=" ".join
+)
 def test_two_parts_draw_the_pictures_of_one_run(tmp_path, options):
     """The scale of colours and that of impulses depend on earlier pictures; the cube lands before the first part ends."""
     out, single = tmp_path / "out", tmp_path / "single"

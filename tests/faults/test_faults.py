@@ -60,7 +60,7 @@ def shim(tmp_path_factory) -> Path:
     path = tmp_path_factory.mktemp("shim") / "failing_calls.so"
     if re.search(r"[\s:]", str(path)):
         pytest.skip("the loader preloads nothing from a folder with a blank or a colon in its name")
-    subprocess.run([compiler, "-shared", "-fPIC", "-o", path, ROOT / "tests" / "failing_calls.c", "-ldl"], check=True)
+    subprocess.run([compiler, "-shared", "-fPIC", "-o", path, ROOT / "tests" / "faults" / "failing_calls.c", "-ldl"], check=True)
     return path
 
 
@@ -77,7 +77,8 @@ for k, (call, name) in enumerate(json.loads(sys.argv[3])):
     os.environ["FAIL_CALL"], os.environ["FAIL_NAME"] = call, name
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
         status = main(["run", scene, "--headless", "--out", f"{base}/{k}", "--overwrite"])
-    os.environ["FAIL_NAME"], runtime._kind = "", None  # restarts Taichi, which finds its kernels in the cache
+    os.environ["FAIL_NAME"] = ""
+    runtime.forget()  # Taichi starts again, and finds its kernels in the cache
     shown.append((status, out.getvalue(), err.getvalue()))
 print(json.dumps(shown))
 """
@@ -93,7 +94,7 @@ CALLS = {
 }
 
 
-@pytest.mark.parametrize("which", CALLS)
+@pytest.mark.parametrize("which", ["some", pytest.param("others", marks=pytest.mark.long)])
 def test_failing_calls(beam, tmp_path, shim, which):
     calls = CALLS[which]
     for k in range(len(calls)):
@@ -127,7 +128,7 @@ def mount_small_disk(folder: Path) -> bool:
     return shutil.which("mount") is not None and subprocess.run(command, capture_output=True, check=False).returncode == 0
 
 
-@pytest.mark.parametrize("kind", ["tmpfs", "limit"])
+@pytest.mark.parametrize("kind", ["limit", pytest.param("tmpfs", marks=pytest.mark.long)])
 def test_full_disk(beam, tmp_path, capsys, kind):
     """A disk filled by pictures, or a limit on file sizes: earlier files are complete, and the state can be saved elsewhere."""
     disk, mounted = tmp_path / "disk", kind == "tmpfs"
@@ -283,7 +284,7 @@ print(len(seen), len(list(folder.glob("*.part"))))
 """
 
 
-@pytest.mark.parametrize("kills", [10, 100])
+@pytest.mark.parametrize("kills", [10, pytest.param(100, marks=pytest.mark.long)])
 def test_kills_while_files_are_replaced(tmp_path, kills):
     done = python(KILLED, tmp_path, kills)
     assert done.returncode == 0, done.stderr
@@ -308,7 +309,7 @@ def assert_complete(out: Path) -> None:
 
 
 @pytest.mark.skipif(os.name != "posix", reason="there is no SIGKILL")
-@pytest.mark.parametrize("kills", [3, 20])
+@pytest.mark.parametrize("kills", [2, pytest.param(20, marks=pytest.mark.long)])
 def test_kills_during_runs(beam, tmp_path, kills):
     """At random times over the run, each run after the one killed before; the last run is complete."""
     out, dice, ended = tmp_path / "out", random.Random(kills), []

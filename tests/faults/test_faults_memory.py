@@ -41,7 +41,10 @@ def build():
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="memory in use is read from /proc")
-@pytest.mark.parametrize("more, needed", [(3 * 10**8, "start Taichi: 1073741824 bytes"), (4 * 10**9, "the array '")])
+@pytest.mark.parametrize(
+    "more, needed",
+    [(4 * 10**9, "the array '"), pytest.param(3 * 10**8, "start Taichi: 1073741824 bytes", marks=pytest.mark.long)],
+)
 def test_too_little_memory(tmp_path, more, needed):
     done = python(LIMITED_MEMORY, more, write(tmp_path / "scene.py", LARGE_BUFFERS), tmp_path / "out")
     assert done.returncode == 2, done.stdout + done.stderr
@@ -62,8 +65,15 @@ def test_too_little_memory_for_the_fields(monkeypatch):
         assert sim.step().converged
 
 
-@pytest.mark.parametrize("integrator", ["symplectic_euler", "implicit_euler"])
-@pytest.mark.parametrize("others", ["nothing", "ground", "body"])
+@pytest.mark.parametrize(
+    "others, integrator",
+    [
+        ("nothing", "symplectic_euler"),
+        ("ground", "symplectic_euler"),
+        *(pytest.param(others, "implicit_euler", marks=pytest.mark.long) for others in ("nothing", "ground", "body")),
+        pytest.param("body", "symplectic_euler", marks=pytest.mark.long),
+    ],
+)
 def test_nan_during_a_run(tmp_path, monkeypatch, integrator, others):
     """A velocity becomes NaN after step 2; step 3 finds it before contact detection does. `body` is in contact from the start."""
     scene = small_scene()
@@ -117,6 +127,7 @@ def test_a_full_buffer_that_may_not_grow_stops_the_run():
     assert re.search(r"^step \d+: contacts: \d+ entries are needed .* max_capacity allows 65$", result.problems[-1])
 
 
+@pytest.mark.long
 def test_growing_buffers_do_not_change_the_result():
     (result, x, growths), (_, enough, none) = landed(64, None), landed(None, None)
     assert result.step_reports[-1].n_contacts > 65 and result.step_reports[0].n_contacts == 0

@@ -91,7 +91,7 @@ def solved() -> tuple[dict[tuple, Case], StaticResult]:
         cases[name, order, degree, cells] = Case(body, Elements(mesh, order))
         return cases[name, order, degree, cells]
 
-    for order, degree in ((1, None), (2, 2), (2, 4)):
+    for order, degree in ((1, None), (2, 2)):
         add("patch", order, degree, 2, irregular(), rubber()).prescribe_surface(lambda X: X @ (A - np.eye(3)).T + B)
         for cells in (4, 8) if order == 1 else (2, 4):
             mesh = ts.box_mesh((cells,) * 3, (1, 1, 1), (0.5, 0.5, 0.5))
@@ -108,7 +108,7 @@ def solved() -> tuple[dict[tuple, Case], StaticResult]:
     return cases, result
 
 
-@pytest.mark.parametrize("order, degree, inside", [(1, None, 1), (2, 2, 19), (2, 4, 19)])
+@pytest.mark.parametrize("order, degree, inside", [(1, None, 1), (2, 2, 19)])
 def test_patch(solved, order, degree, inside):
     case = solved[0]["patch", order, degree, 2]
     exact, prescribed = case.elements.X @ A.T + B, case.body.constraints[0].nodes
@@ -118,7 +118,7 @@ def test_patch(solved, order, degree, inside):
     assert np.abs(np.einsum("eai,eaj->eij", x[part.nodes], part.gradients) - A).max() < 1e-11
 
 
-@pytest.mark.parametrize("order, degree, cells, rate", [(1, None, 4, 1.9), (2, 2, 2, 2.8), (2, 4, 2, 2.8)])
+@pytest.mark.parametrize("order, degree, cells, rate", [(1, None, 4, 1.9), (2, 2, 2, 2.8)])
 def test_l2_error(solved, order, degree, cells, rate):
     cases, result = solved
     both = [cases["smooth", order, degree, n] for n in (cells, 2 * cells)]
@@ -126,10 +126,7 @@ def test_l2_error(solved, order, degree, cells, rate):
     assert coarse < 0.005 and np.log2(coarse / fine) > rate
 
 
-@pytest.mark.parametrize(
-    "order, degree, cells, error",
-    [(1, None, 11, -16.309), (2, 2, 4, -3.420), (2, 4, 4, -3.931), (2, 2, 11, -0.7235), (2, 4, 11, -0.7583)],
-)
+@pytest.mark.parametrize("order, degree, cells, error", [(1, None, 11, -16.309), (2, 2, 4, -3.420), (2, 2, 11, -0.7235)])
 def test_sag_of_a_beam(solved, order, degree, cells, error):
     """Errors [%] on the same mesh by the oracle's dense Newton."""
     case = solved[0]["beam", order, degree, cells]

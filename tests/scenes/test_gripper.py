@@ -8,6 +8,7 @@ from taisoft.cli.scene_file import load_shipped
 gripper = load_shipped("demos", "gripper")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("friction", "lifted"), [(0.8, gripper.HEIGHT), (0.1, 0.0)])
 def test_gripper(tmp_path, friction, lifted):
     settings = {key: value for key, value in gripper.solver.items() if key in ("integrator", "dt")}
