@@ -1,20 +1,18 @@
 """Short cases against their stored results in benchmarks/data/regression.json:
 
-* every case is stored and reproduces its error, iterations, memory and status;
 * a number that changes by more than its margin is reported, also if it improves; changes within the margin are not;
-* stored entries are read back unchanged, beside other cases and archs; damaged files are refused;
+* stored entries are read back, beside other cases and archs; damaged files are refused;
 * the benchmark prints differences, stores them with --update, and returns an exit status.
 """
 
 import json
 from dataclasses import replace
 
-import numpy as np
 import pytest
 
 from benchmarks import regression
 from benchmarks.regression import STORE, Entry, baseline, check, differences, load, make_entry, store
-from benchmarks.regression_cases import CASES, METHODS, Found, random_problem
+from benchmarks.regression_cases import CASES, Found
 from taisoft.errors import OutputError
 
 NAMES = [case.name for case in CASES]
@@ -22,19 +20,17 @@ ENTRY = Entry([1.0, -2.0], 0.01, {"newton": 100, "contacts": 9}, "ok", 1_000_000
 CASE = CASES[0]
 
 
-@pytest.mark.parametrize("case", CASES, ids=lambda case: f"{'quick' if case.quick else 'slow'}-{case.name}")
+@pytest.mark.long
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
 def test_results_are_as_stored(case):
+    """In turn with the precision of the case; a search is among the runs of test_all.py."""
     assert check(case, "cpu", load("cpu", STORE))[1] == []
 
 
-def test_every_case_is_stored_under_its_own_name():
-    assert len(set(NAMES)) == len(NAMES) and sum(case.quick for case in CASES) >= 3
+def test_every_case_is_stored():
     stored = load("cpu", STORE)
-    assert list(stored) == NAMES and all(entry.status == "ok" for entry in stored.values())
-    assert all(entry.error < 0.2 for entry in stored.values())
-
-
-# --- margins ----------------------------------------------------------------------------------------------------------
+    assert list(stored) == NAMES and len(set(NAMES)) == len(NAMES)
+    assert all(entry.status == "ok" and entry.error < 0.2 for entry in stored.values()) and 1e-4 < baseline() < 60.0
 
 
 @pytest.mark.parametrize(
@@ -45,57 +41,25 @@ def test_every_case_is_stored_under_its_own_name():
         ("error nan", {"error": float("nan")}),
         ("status 'degraded'", {"status": "degraded"}),
         ("field bytes 1002000", {"field_bytes": 1_002_000}),
-        ("field bytes 998000", {"field_bytes": 998_000}),
         ("newton 106", {"counts": {"newton": 106, "contacts": 9}}),
         ("newton 94", {"counts": {"newton": 94, "contacts": 9}}),
-        ("contacts 12", {"counts": {"newton": 100, "contacts": 12}}),
         ("contacts 0", {"counts": {"newton": 100}}),
         ("sweeps 3", {"counts": {"newton": 100, "contacts": 9, "sweeps": 3}}),
+        (None, {"error": 0.0104, "time": 99.0, "field_bytes": 1_000_500, "counts": {"newton": 105, "contacts": 11}}),
+        (None, {"error": 0.0096, "counts": {"newton": 95, "contacts": 7}}),
     ],
 )
-def test_a_change_beyond_the_margin_is_reported(start, changes):
+def test_changes_beyond_the_margin_are_reported(start, changes):
     found = differences(CASE, replace(ENTRY, **changes), ENTRY)
-    assert len(found) == 1 and found[0].startswith(f"{start}, stored ")
+    assert found == [] if start is None else len(found) == 1 and found[0].startswith(f"{start}, stored ")
 
 
-@pytest.mark.parametrize(
-    "changes",
-    [
-        {"error": 0.0104},
-        {"error": 0.0096},
-        {"time": 99.0},
-        {"field_bytes": 1_000_500},
-        {"counts": {"newton": 105, "contacts": 11}},
-        {"counts": {"newton": 95, "contacts": 7}},
-    ],
-    ids=str,
-)
-def test_a_change_within_the_margin_is_not_reported(changes):
-    assert differences(CASE, replace(ENTRY, **changes), ENTRY) == []
-
-
-def test_errors_below_the_slack_are_not_compared():
-    tiny = replace(ENTRY, error=1e-7)
-    assert differences(CASE, replace(tiny, error=0.9 * CASE.slack), tiny) == []
-    assert differences(CASE, replace(tiny, error=2.0 * CASE.slack), tiny) != []
-
-
-def test_errors_are_relative_to_the_largest_reference_value():
+def test_errors():
+    """Relative to the largest reference value; those below the slack are not compared."""
     entry = make_entry(Found([1.0, -1.9], {"newton": 3}, seconds=6.0), [1.0, -2.0], 2.0)
     assert entry.error == pytest.approx(0.05) and entry.time == 3.0 and entry.counts == {"newton": 3}
-
-
-def test_a_wrong_computation_is_reported(monkeypatch):
-    """The contact problem with a tenth more friction than in the stored one."""
-    case = next(c for c in CASES if c.name == "contact problem")
-    W, b, mu = random_problem()
-    monkeypatch.setattr("benchmarks.regression_cases.random_problem", lambda: (W, b, 1.1 * mu))
-    found = check(case, "cpu", load("cpu", STORE))[1]
-    assert any(text.startswith("error") for text in found)
-    assert np.linalg.eigvalsh(W)[0] > 0.1 and set(load("cpu", STORE)["contact problem"].counts) == set(METHODS)
-
-
-# --- the file ---------------------------------------------------------------------------------------------------------
+    tiny = replace(ENTRY, error=1e-7)
+    assert [differences(CASE, replace(tiny, error=k * CASE.slack), tiny) == [] for k in (0.9, 2.0)] == [True, False]
 
 
 def test_stored_entries_are_read_back(tmp_path):
@@ -111,32 +75,19 @@ def test_stored_entries_are_read_back(tmp_path):
     path.write_text(json.dumps(stored))
     store({}, "cpu", path)
     assert list(load("cpu", path)) == NAMES[:2]
-
-
-@pytest.mark.parametrize("text", ["{", "[]", '{"cpu": {"cases": {"a": {"error": 1}}}}'])
-def test_a_damaged_file_is_refused(text, tmp_path):
-    path = tmp_path / "stored.json"
-    path.write_text(text)
-    with pytest.raises(OutputError, match="stored.json"):
-        load("cpu", path)
-
-
-def test_the_baseline_takes_measurable_time():
-    assert 1e-4 < baseline() < 60.0
-
-
-# --- the benchmark ----------------------------------------------------------------------------------------------------
+    for text in ("{", "[]", '{"cpu": {"cases": {"a": {"error": 1}}}}'):
+        path.write_text(text)
+        with pytest.raises(OutputError, match="stored.json"):
+            load("cpu", path)
 
 
 def test_the_benchmark_prints_and_stores_differences(monkeypatch, tmp_path, capsys):
     newton = [100]
-    fake = replace(
-        CASE,
-        name="fake",
-        what="made up",
-        run=lambda arch: Found([1.0, -2.02], {"newton": newton[0]}, "ok", 1000, 1.0),
-        reference=lambda arch: [1.0, -2.0],
-    )
+
+    def run(arch):
+        return Found([1.0, -2.02], {"newton": newton[0]}, "ok", 1000, 1.0)
+
+    fake = replace(CASE, name="fake", what="made up", run=run, reference=lambda arch: [1.0, -2.0])
     monkeypatch.setattr(regression, "CASES", (fake,))
     monkeypatch.setattr(regression, "STORE", tmp_path / "stored.json")
     monkeypatch.setattr(regression, "baseline", lambda: 0.5)
@@ -148,7 +99,4 @@ def test_the_benchmark_prints_and_stores_differences(monkeypatch, tmp_path, caps
     assert regression.main([]) == 1
     printed = capsys.readouterr().out
     assert "CHANGED" in printed and "* fake: newton 120, stored 100 (made up)" in printed
-    assert regression.main(["--update", "--case", "fa"]) == 0 and "newton 120, stored 100" in capsys.readouterr().out
-    assert regression.main([]) == 0
-    with pytest.raises(SystemExit):
-        regression.main(["--case", "nothing"])
+    assert regression.main(["--update", "--case", "fa"]) == 0 and regression.main([]) == 0

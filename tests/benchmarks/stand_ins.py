@@ -1,0 +1,107 @@
+"""What takes the place of measurements and simulators in tests of benchmarks."""
+
+import json
+from collections.abc import Callable
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+
+from benchmarks import ipc_runs, startup
+from taisoft.dynamics.schemes import EXPLICIT
+from taisoft.records import StepReport
+
+TIME, SPACE, SOLVER = 1.0, 0.4, 1e-5  # of ModelSimulator's errors
+STABLE = 1e-3  # [s] its largest stable step
+
+
+class ModelSimulator:
+    """A simulator of errors that are known: at time t all nodes are at t (1 + e) along y from their start.
+
+    e is the sum of TIME dt, SPACE over the number of tets, and SOLVER in single precision; of explicit steps TIME dt^2.
+    """
+
+    def __init__(self, scene, dt=1.0 / 240, integrator="bdf2", precision="f32", tolerance=None, **more):
+        self.scene, self.dt, self.stable_dt, self.compile_seconds = scene, dt, STABLE, 0.0
+        self.touches, self.step_count = scene.pushes(False), 0
+        if tolerance is not None:
+            self.dt = 1.0 / 60 / 8
+        self.settings = SimpleNamespace(integrator=integrator, newton_tolerance=1e-4, contact_tolerance=1e-4, dt=self.dt)
+        tets = sum(body.mesh.n_tets for body in scene.bodies)
+        self._start = np.concatenate([body.rest_positions + body.position for body in scene.bodies])
+        self._space = SPACE / tets
+        self._error = TIME * self.dt ** (2 if integrator in EXPLICIT else 1) + self._space + SOLVER * (precision == "f32")
+        self.time, self._estimated = 0.0, tolerance
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *error):
+        pass
+
+    def reset(self):
+        self.time = 0.0
+
+    def positions(self):
+        return self._start + np.array([0.0, self.time * (1.0 + self._error), 0.0])
+
+    def step(self):
+        self.time += self.dt
+        return StepReport(self.time)
+
+    def run(self, seconds, on_frame=None, fps=60.0, error=False, error_mesh=None, on_step=None):
+        for k in range(round(seconds * fps) + 1):
+            self.time = k / fps
+            if on_frame is not None:
+                on_frame(self, k, StepReport(self.time))
+        estimate = {"time": TIME * self.dt, "space": self._space, "solver": SOLVER}
+        estimate = SimpleNamespace(**estimate, order=1.0, wall_seconds=3.0, notes=["a note"])
+        known = estimate if error or self._estimated else None
+        found = {"status": "ok", "steps": round(seconds / self.dt), "step_reports": [], "problems": [], "interrupted": False}
+        return SimpleNamespace(**found, wall_seconds=1.0, pilot_seconds=0.5, error_estimate=known)
+
+
+def answered(module) -> Callable:
+    """Instead of `carry_out`: requests are answered in this process, with what JSON leaves of the answers."""
+
+    def carry_out(requests, places, done, **_):
+        for key, request in requests:
+            done(key, json.loads(json.dumps(module.answer(request))))
+        return {}
+
+    return carry_out
+
+
+# --- made-up rows -----------------------------------------------------------------------------------------------------
+
+
+def startup_numbers(seconds: float, compiled: int) -> dict:
+    """Numbers of a version."""
+    times = {"wall": seconds, "cpu": seconds, "walls": [seconds] * 3, "compiled": compiled}
+    memory = {"start": 300.0, "end": 301.0, "times": 4}
+    one = {"cold": times, "warm": times, "warm, other size": times, "new files": [0, compiled], "memory": memory}
+    one["one process"] = {"first": times, "second": times, "other size": times}
+    return {
+        "beam": one,
+        "cube": one,
+        "statics": {str(k): times for k in range(3)},
+        "identify": times,
+        "settings": {"reset": 1e-3 * seconds},
+        "calls": {name: {"launches": 3.0} for name in ("beam", "cube", "sheet")},
+        "surfaces": {"224 triangles": 9, "284 triangles": compiled},
+        "keep": memory,
+        "speed": dict.fromkeys(startup.SLOWER, [1e-3, 1.1e-3, 2e-3]),
+    }
+
+
+def ipc_record(job=None, **more) -> ipc_runs.Record:
+    """Two steps of a scene."""
+    numbers: dict[str, Any] = {"nodes": 800, "tets": 1805, "wanted_steps": 625, "time": 0.08, "compile_seconds": 7.0}
+    numbers |= {"newton": [3, 4], "cg": [10, 30], "substeps": [1, 2], "seconds": [0.5, 0.25]}
+    record = ipc_runs.Record(job or ipc_runs.Job("twisted_mat", "small", 10.0), **numbers | more)
+    record.end()
+    return record
+
+
+WINDOW = {"demo": "cube_on_box", "tets": 1215, "dt": 0.01, "step": 0.002, "longest_step": 0.02, "alone": 3.0, "speed": 1.0}
+WINDOW |= {"intervals": [0.04, 0.04, 0.07], "latencies": [0.05, 0.06, 0.09]}

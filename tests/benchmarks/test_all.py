@@ -1,0 +1,321 @@
+"""Every benchmark runs at its smallest size: it prints its page, writes the same page and its numbers, and returns its status.
+
+Where a benchmark has no small form, one is made here. Stand-ins take the place of what takes minutes or needs other programs:
+
+* implicit steps with contacts, which take a minute to compile: contact and crossings take explicit ones, paths has none, ipc
+  shows made-up rows; so does startup, which starts a process for each of its times;
+* child processes, whose work is done in this process: crossings, hard, paths, pictures, scaling;
+* the simulators of error and tolerance, by one with known errors; MuJoCo in elasticity; the display of window.
+
+The long runs do without them. The others run in test_cuda_check.py, test_document.py (figures, manual), test_peers.py,
+test_report.py and tests/references.
+"""
+
+import importlib
+import json
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from dataclasses import replace as change
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+import taisoft as ts
+from benchmarks import (
+    collision,
+    collision_runs,
+    contact,
+    elasticity,
+    elasticity_runs,
+    hard_runs,
+    order,
+    path_runs,
+    paths,
+    pictures,
+    scaling,
+    startup,
+    tolerance,
+    window,
+)
+from benchmarks.collision_cases import REPORT
+from benchmarks.contact_runs import Solvers, contact_jacobian, make_residual, observe_problems, open_explicit, to_impulses
+from benchmarks.document import plain
+from benchmarks.order_cases import CASES as ORDER_CASES
+from benchmarks.order_cases import LINEAR, QUADRATIC
+from benchmarks.scaling_bytes import measure_copy
+from benchmarks.scaling_runs import measure
+from benchmarks.stored_runs import StoredRuns
+from taisoft.contact import SOLVERS
+from taisoft.dynamics.schemes import EXPLICIT, IMPLICIT
+from taisoft.view.pictures import picture_writer
+from tests.benchmarks import stand_ins
+from tests.benchmarks.stand_ins import SOLVER, SPACE, TIME, ModelSimulator, answered
+from tests.contact import contact_oracle as oracle
+
+CELLS = (12, 3, 3)
+
+
+def replace(patch: pytest.MonkeyPatch, module, **values) -> None:
+    """Set attributes of a module."""
+    for name, value in values.items():
+        patch.setattr(module, name, value)
+
+
+# --- small forms and their numbers --------------------------------------------------------------------------------------
+
+
+def collision_small(patch, folder):
+    replace(patch, collision, PILES=(1,), REPORT=REPORT[1:2], SHEET=REPORT[1], GEOMETRIES=("proximity",), TREES=("bvh 6",))
+    replace(patch, collision, CUBES=(2,), SWEPT=(2,), RATIOS=(1.0, 2.0), QUICK_FRAMES=2)
+    replace(patch, collision_runs, TREES=("bvh 6",))
+
+
+def collision_check(n):
+    for row in n["piles"] + n["scenes"]:
+        assert row["failure"] == "" and row["same"] and row["found"] >= row["contacts"] > 0 and min(row["whole"]) > 0
+    assert n["piles"][0]["tets"] == 162 and all(film["same"] for film in n["films"])
+    pairs = n["broad"][0]["pairs"]
+    assert pairs["spatial_hash"] == pairs["bvh 6"] == n["cells"][0]["pairs"]["spatial_hash"] > 0
+
+
+def contact_small(patch, folder):
+    replace(patch, contact, QUICK_FRAMES=2, QUICK_STEPS=3, QUICK_SIZES=(4,), QUICK_RUN_SECONDS=0.2)
+    replace(patch, contact, open_scene=contact.open_explicit)
+    patch.setattr(contact.contact_problems, "missing", lambda names: "they are not asked for")
+
+
+def contact_check(n):
+    (film,), (run,), (step,) = n["films"], n["runs"], n["steps"]
+    found = [one for own in film["outcomes"].values() for solver in own.values() for one in solver]
+    assert film["tets"] == 215 and len(found) == 2 * 4 * len(film["time"]) and all(one["residual"] <= 1e-4 for one in found)
+    assert step["solver"] == "gauss_seidel" and len(step["whole"]) == 3 and step["residual"] <= 1e-4
+    assert run["status"] == "ok" and 10 < len(run["seconds"]) < 48 and run["wall"] > sum(run["seconds"])
+    assert all(n["crossover"][0][how]["residual"] <= 1e-4 for how in ("serial", "coloured"))
+
+
+def crossings_small(patch, folder):
+    from benchmarks import crossing_runs, crossings  # need ipctk
+
+    demo = crossing_runs.load_module(crossing_runs.shipped_files("demos")["cube_on_box"])
+    settings = {"dt": 1 / 240, "integrator": "symplectic_euler", "seconds": 5 / 240, "fps": 240.0}
+    replace(patch, crossing_runs, load_module=lambda _: SimpleNamespace(build=demo.build, solver=settings))
+    replace(patch, crossing_runs, carry_out=answered(crossing_runs))
+    replace(patch, crossings, QUICK={"demos": ("cube_on_box",)})
+
+
+def elasticity_small(patch, folder):
+    def mujoco(cells, integrator, dt, seconds):
+        assert (cells, integrator, dt) in ((CELLS, "discrete", 0.01), (CELLS, "euler", 0.005))
+        return {"compile_seconds": 0.25, "error": 0.02, "error_unfolded": 0.01, "seconds_per_simulated_second": 4.0}
+
+    rows = (("taisoft", "velocity_verlet", 4), ("MuJoCo", "euler", 2))
+    costs, frames = elasticity.measure_costs, elasticity.measure_frames
+    replace(patch, elasticity, QUICK=elasticity.Extent((CELLS,), ("f32",), repeats=2, rounds=(2,), seconds=0.02))
+    replace(patch, elasticity, measure_costs=lambda *a: costs(*a, ("SNH",), ("velocity_verlet",)))
+    replace(patch, elasticity, measure_frames=lambda *a: frames(*a, ("velocity_verlet",)))
+    replace(patch, elasticity, make_rows=lambda *_: [elasticity_runs.Row(540, *one) for one in rows], run_mujoco=mujoco)
+    replace(patch, elasticity_runs, run_mujoco=mujoco)
+
+
+def elasticity_check(n):
+    (ours, theirs), (cost,), (frames,) = n["runs"], n["cost"], n["frames"]
+    assert ours["error"] < 1e-3 and ours["first_run"]["steps"] == 8 and len(ours["rounds"]) == 2 and not ours["failure"]
+    assert theirs["rounds"] == [[4.0], [4.0]] and theirs["build_seconds"] == [0.25, 0.25]
+    assert cost["tets"] == 540 and len(cost["samples"]) == len(frames["run"]) == len(frames["alone"]) == 2
+
+
+def error_small(patch, folder):
+    patch.setattr(ts, "Simulator", ModelSimulator)
+
+
+def error_check(n):
+    (beam,) = n["rows"]
+    dt, n_tets = 1 / 60, beam["tets"]
+    assert beam["steps"] == round(2.0 / dt) and beam["twins"] == 3.0 and beam["estimated"]["time"] == pytest.approx(TIME * dt)
+    true = {"time": TIME * dt * 15 / 16 + SOLVER, "space": SPACE / n_tets * 63 / 64, "solver": SOLVER}
+    for what, value in true.items():
+        assert beam["true"][what] == pytest.approx(value / (1.0 + SPACE / n_tets + TIME * dt / 16), rel=1e-6)
+
+
+def hard_small(patch, folder):
+    replace(patch, hard_runs, carry_out=answered(hard_runs))
+
+
+def ipc_small(patch, folder):
+    from benchmarks import ipc
+
+    replace(patch, ipc, run_child=stand_ins.ipc_record)
+
+
+def order_small(patch, folder):
+    """The coarsest mesh, for which another program gives -2.26757962869 m."""
+    replace(patch, order, CASES=[change(ORDER_CASES[0], meshes={LINEAR: ((11, 2, 2),), QUADRATIC: ()})])
+
+
+def order_check(n):
+    (row,) = n["rows"]
+    assert row["measured"] == [pytest.approx(-2.26757962869, rel=1e-6)] and row["error"] == pytest.approx(0.163094, rel=1e-4)
+    assert row["newton"] > 3 and row["linear"] > row["newton"] and row["field_bytes"] > 1e5
+
+
+def paths_small(patch, folder):
+    def here(what, name, arch, quick):
+        return path_runs.measure_cost(name, arch, 1, 4, 0.01)
+
+    replace(patch, paths, run_child=here, TABLES={"cost": (path_runs.BEAM,)})
+
+
+def paths_check(n):
+    """Where nothing can touch, the check has no launches and no fields, and changes nothing."""
+    (beam,) = n["cost"]
+    assert beam["same"] and set(beam["launches"].values()) == {0} and beam["field_bytes"] == 0 and len(beam["without"]) == 1
+
+
+def pictures_small(patch, folder):
+    replace(patch, pictures, DEMOS={"hanging_beam": 0.5}, PICTURES=2, QUICK_ROUNDS=1)
+    replace(patch, pictures, PictureProcess=lambda path, sim, options: picture_writer(path, sim.scene, options, None))
+
+
+def pictures_check(n):
+    run, one = n["runs"]["hanging_beam"], n["picture"]
+    for where in ("with", "between"):
+        assert 0 < run[where]["drawing"][0] < run[where]["wall"][0] and run["without"]["cpu"][0] > 0
+    assert len(one["kernels"]["wall"]) == len(one["NumPy"]["cpu"]) == 1 and one["bytes"] > 1000
+
+
+def scaling_small(patch, folder):
+    def here(job, arch):
+        kind, _, size = job.rpartition(":")
+        found = measure_copy(arch, 2**20) if job == scaling.COPY else measure(kind, int(size), arch)
+        return json.loads(json.dumps(plain(found)))
+
+    replace(patch, scaling, run_child=here)
+
+
+def scaling_check(n):
+    (row,) = n["rows"]
+    assert (row["tets"], row["nodes"], row["threads"]) == (20, 20, 1) and min(row["samples"]) > 0 and row["setup_seconds"] > 0
+    assert sum(row["phases"].values()) == pytest.approx(n["times"]["explicit, 20 tets"]["median"], rel=1e-6)
+    assert min(row["calls"].values()) >= 0 and sum(row["calls"].values()) > 0
+    assert row["moved"] > 0 and row["peak"] >= row["base"] > 0 and all(copy["rate"] > 0 for copy in n["copies"])
+
+
+def startup_small(patch, folder):
+    replace(patch, startup, measure=lambda versions, quick: [stand_ins.startup_numbers(0.5, 0)])
+
+
+def tolerance_small(patch, folder):
+    patch.setattr(ts, "Simulator", ModelSimulator)
+    replace(patch, tolerance, StoredRuns=lambda: StoredRuns(folder))
+
+
+def tolerance_check(n):
+    (row,), grid = n["rows"], n["grids"]["hanging beam"]
+    dt, finest, whole = 1 / 480, 1 / 60 / 128, 1.0 + SPACE / 160
+    assert row["true"] == pytest.approx((TIME * (dt - finest) + SOLVER) / (whole + TIME * finest), rel=1e-6)
+    assert row["own"] == pytest.approx(TIME * finest / (whole + TIME * finest), rel=1e-6)
+    enough = [one for one in grid if one["error"] <= 0.01]
+    assert {one["integrator"] for one in grid} == {*EXPLICIT, *IMPLICIT} and 0 < len(enough) < len(grid)
+    fastest = min(enough, key=lambda one: one["seconds"])
+    assert (row["best"]["integrator"], row["best"]["steps"]) == (fastest["integrator"], fastest["steps"])
+
+
+def window_small(patch, folder):
+    replace(patch, window, VirtualDisplay=lambda: SimpleNamespace(close=lambda: None))
+    replace(patch, window, measure=lambda name, display: stand_ins.WINDOW | {"demo": name})
+
+
+# --- the runs ---------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Small:
+    """A small run. shows: parts of its page, blanks squeezed; reduce: makes it small; check: of its numbers."""
+
+    arguments: tuple[str, ...]
+    shows: tuple[str, ...] = ()
+    reduce: Callable[[pytest.MonkeyPatch, Path], None] = lambda patch, folder: None
+    check: Callable[[dict], None] = lambda numbers: None
+
+
+QUICK = ("--quick",)
+BEAM = ("--scene", "hanging beam")
+RUNS = {  # f64 first: another precision makes Taichi forget all kernels
+    "order f64": Small(QUICK, ("| SNH | 1 | 1 | 11x2x2 | 220 | 108 | -2.26758 | 16.3 |",), order_small, order_check),
+    "collision": Small(QUICK, ("| pile 1 | proximity | 162 |", "(fig. 18)", "| yes |"), collision_small, collision_check),
+    "contact": Small(QUICK, ("| cube_on_box | 215 |", "| parallel |", "Left out: they are"), contact_small, contact_check),
+    "crossings": Small(
+        ("--what", "demos", "--quick"),
+        ("| cube_on_box | symplectic_euler, 1/240 s, f32 |", "**In all: 5 states judged, 0 cross**, in 0 of 1 runs"),
+        crossings_small,
+    ),
+    "elasticity": Small(QUICK, ("| MuJoCo |", "2.0000% | (1.0000%)", "cores, load"), elasticity_small, elasticity_check),
+    "error": Small(BEAM, ("| hanging beam | bdf2 | 160 |", "a note"), error_small, error_check),
+    "hard": Small(("--case", "G1", "--quick"), ("# Hard cases", "**1 of 1 variants are solved.**"), hard_small),
+    "ipc": Small(("--quick", "--scene", "twisted_mat"), ("| twisted mat | 800 | 1,805 | 0.04 | 0.08 of 25 (2) |",), ipc_small),
+    "paths": Small(("--what", "cost", "--quick"), ("## Cost", "| hanging_beam |", "| met |"), paths_small, paths_check),
+    "pictures": Small(QUICK, ("| kernels |", "| PNG |", "| hanging_beam |"), pictures_small, pictures_check),
+    "regression": Small(("--case", "search, two"), ("| search, two cubes | f32 |", "nothing has changed")),
+    "scaling": Small(
+        ("--sizes", "20", "--kind", "explicit"), ("| explicit | 20 | 1 |", "no earlier run"), scaling_small, scaling_check
+    ),
+    "startup": Small(QUICK, ("| beam, cold | 0.5 (0.5) |", "| cube: launches | 3 |", "over 4 simulators"), startup_small),
+    "tolerance": Small((*BEAM, "--wish", "1"), ("| hanging beam | 1 | bdf2 | 8 |",), tolerance_small, tolerance_check),
+    "window": Small(QUICK, ("| cube_on_box | 1,215 | 10 | 2 | 20 | 3.00 | 1.00 | 25 | 70 | 60 | 87 |",), window_small),
+}
+WHOLE = [f"{name}, whole" for name in RUNS if name != "window"]  # which needs a display
+
+
+@pytest.mark.filterwarnings("ignore:body")  # few tets through the thickness
+@pytest.mark.parametrize("name", [*RUNS, *(pytest.param(name, marks=pytest.mark.long) for name in WHOLE)])
+def test_a_benchmark_runs(name, monkeypatch, tmp_path, capsys):
+    small = RUNS[name] if name in RUNS else Small(RUNS[name.removesuffix(", whole")].arguments)
+    name = name.removesuffix(", whole").removesuffix(" f64")
+    if name in ("crossings", "ipc", "paths"):
+        pytest.importorskip("ipctk")
+    small.reduce(monkeypatch, tmp_path)
+    out = tmp_path / "new" / f"{name}.json"
+    written = () if name == "regression" else ("--out", str(out))
+    drawn = ("--plot", str(out.with_suffix(".png"))) if name in ("order", "scaling") else ()
+    status = importlib.import_module(f"benchmarks.{name}").main([*small.arguments, *written, *drawn])
+    page = printed = capsys.readouterr().out
+    if written:
+        page, numbers = out.with_suffix(".md").read_text(), json.loads(out.read_text())
+        assert page.strip() in printed and page.startswith("# ") and numbers["processor"] and numbers["date"]
+        small.check(numbers)
+    assert not drawn or out.with_suffix(".png").read_bytes()[:4] == b"\x89PNG"
+    squeezed = re.sub(" +", " ", page)
+    assert status == 0 and [part for part in small.shows if part not in squeezed] == []
+
+
+def to_numpy(p) -> oracle.NodeContacts:
+    k = int(p.count[0])
+    rows = {name: getattr(p, name).to_numpy()[:k] for name in ("node", "arity", "weight", "normal", "tangent", "friction")}
+    return oracle.NodeContacts(**rows, inverse_mass=p.inverse_mass.to_numpy(), b=p.b.to_numpy()[:k].ravel())
+
+
+def test_contact_problems_are_restored_and_residuals_are_the_oracles():
+    """In a simulator like that of contact, whose kernels are compiled."""
+    checked = []
+
+    def check(p):
+        before = {name: getattr(p, name).to_numpy() for name in ("r", "order", "b", "factor", "friction")}
+        found = Solvers(threads=False).outcomes(p, np.zeros((p.capacity, 3)), 2)
+        assert set(found) == set(SOLVERS) and all(len(o.seconds) == 2 and o.sweeps > 0 for o in found.values())
+        assert all(np.array_equal(getattr(p, name).to_numpy(), old) for name, old in before.items())
+        contacts, k = to_numpy(p), int(p.count[0])
+        assert np.allclose(contact_jacobian(p).toarray(), contacts.jacobian)
+        W, b, mu, judge = contacts.W, contacts.b, contacts.friction, make_residual(p)
+        exact = oracle.gauss_seidel(W, b, mu, 300)
+        for r in (exact, 0.9 * exact, np.random.default_rng(0).standard_normal((k, 3))):
+            assert judge(r) == pytest.approx(oracle.residual(W, b, mu, r), rel=1e-6, abs=1e-12)
+        checked.append(k)
+
+    with open_explicit("cube_on_box", "cpu") as sim:
+        to_impulses(sim)
+        with observe_problems(check):
+            report = sim.step()  # solves the problem itself after `check`
+    assert checked[-1] == report.n_contacts and report.contact_residual <= 1e-4

@@ -1,0 +1,181 @@
+"""What benchmarks share: pages, limits, options, stopwatches, stored runs, the collection of figures and the manual's tables:
+
+* a limit is met or not, nan never meets it, and a distance within the spread is marked; exponents and crossovers are exact;
+* times are compared with those of an earlier run of the same machine and extent, within both spreads;
+* output that cannot be written and unknown names are refused by every benchmark before anything is measured;
+* stored arrays are used until code or file change; `bench figures` runs every benchmark with files of its own;
+* the manual's tables are those of the newest full results, and a changed number is noticed.
+"""
+
+import importlib
+import json
+import math
+import shutil
+import subprocess
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from benchmarks import figures, manual, stored_runs
+from benchmarks.document import Limit, again_text, agrees, crossovers, exponent
+from benchmarks.manual import BLOCK, RESULTS, TABLES, filled, newest, pages
+from benchmarks.stored_runs import StoredRuns
+from taisoft.cli.scene_file import shipped_files
+from taisoft.errors import OutputError
+from taisoft.machine import summarise
+
+WRITING = (  # benchmarks with --out FILE.json; those without have no file of that name to refuse
+    "collision contact crossings elasticity error hard ipc order paths peers pictures scaling startup tolerance window"
+).split()
+TEXT = "before\n<!-- begin fake -->\nold\n<!-- end fake -->\nafter\n"
+
+
+def test_limits_are_met_or_not():
+    for limit, met, close in (
+        (Limit("a", 3.0, 3.0, at_least=True), True, False),
+        (Limit("a", 2.9, 3.0, 0.01, at_least=True), False, False),
+        (Limit("a", 2.9, 3.0, 0.1, at_least=True), False, True),
+        (Limit("a", 2.9, 3.0, 0.1), True, True),
+        (Limit("a", math.nan, 3.0), False, False),
+    ):
+        assert (limit.met, limit.close) == (met, close)
+        assert ("NOT met" in limit.row()[-1]) != met and ("within the spread" in limit.row()[-1]) == close
+
+
+def test_exponents_and_crossovers():
+    x = np.array([1.0, 3.0, 10.0, 50.0])
+    p, off = exponent(x, 7.0 * x**-0.5)
+    assert p == pytest.approx(-0.5, abs=1e-12) and off < 1e-12
+    p, off = exponent(x, x**2 * [1.0, 1.1, 1.0, 1.0])
+    assert 1.9 < p < 2.1 and 0.05 < off < 0.1
+    assert math.isnan(exponent([1, 1], [1.0, 2.0])[0]) and math.isnan(exponent([1, 2], [0.0, 1.0])[0])
+    tets = [100, 1000, 10000]
+    assert crossovers(tets, [2.0, 2.0, 2.0], [1.0, 1.0, 1.0]) == []
+    assert crossovers(tets, [2.0, 1.0, 1.0], [1.0, 2.0, 4.0]) == [pytest.approx(10**2.5)]
+    assert len(crossovers(tets, [2.0, 1.0, 2.0], [1.0, 2.0, 1.0])) == 2
+
+
+def test_times_are_compared_with_an_earlier_run():
+    one, two = ({"median": m, "spread": s} for m, s in ((1.0, 0.1), (1.25, 0.1)))
+    assert not agrees(one, two) and agrees(one, two | {"spread": 0.2})
+    here = {"processor": "a", "cores": 2, "arch": "cpu", "quick": False}
+    earlier = here | {"date": "2026-01-01", "times": {"step": {"median": 1.0, "spread": 0.02}}}
+
+    def text(seconds: float, **changes) -> str:
+        return again_text(earlier, {"step": summarise([seconds] * 3), "new": summarise([1.0])}, here | changes)
+
+    assert "1 of 1 times agree" in text(1.01) and "0 of 1 times agree" in text(2.0) and "2.00 |" in text(2.0)
+    assert "another quick" in text(1.0, quick=True) and "no earlier run" in again_text(None, {}, here)
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning")
+def test_bad_options_are_refused_before_measuring(tmp_path, capsys):
+    """By every benchmark; a page would be printed as soon as it begins."""
+    pytest.importorskip("ipctk")
+    (tmp_path / "file").touch()
+    wrong = []
+    for name in WRITING:
+        main = importlib.import_module(f"benchmarks.{name}").main
+        for path, message in ((tmp_path / "a.txt", "must end in .json"), (tmp_path / "file" / "a.json", "file has that")):
+            try:
+                main(["--out", str(path)])
+                wrong.append(f"{name} wrote {path}")
+            except OutputError as error:
+                wrong += [] if message in str(error) else [f"{name}: {error}"]
+    for name in set(WRITING) | {"references", "regression", "report", "cuda_check", "figures", "manual"}:
+        with pytest.raises(SystemExit):
+            importlib.import_module(f"benchmarks.{name}").main(["--nothing"])
+    with pytest.raises(OutputError, match=r"must end in \.png"):
+        importlib.import_module("benchmarks.order").main(["--plot", str(tmp_path / "a.txt")])
+    assert wrong == [] and capsys.readouterr().out == ""
+
+
+def test_arrays_are_stored_until_the_code_changes(tmp_path, monkeypatch):
+    def get(value: float, request: int = 1) -> float:
+        return float(StoredRuns(tmp_path).get(["request", request], lambda: np.array(value)))
+
+    assert [get(1.0), get(2.0), get(3.0, request=2)] == [1.0, 1.0, 3.0]
+    for file in tmp_path.iterdir():
+        file.write_bytes(b"damaged")
+    assert [get(4.0), get(5.0)] == [4.0, 4.0]
+    monkeypatch.setattr(stored_runs, "code_digest", lambda _: "other")
+    assert get(6.0) == 6.0
+    (tmp_path / "file").touch()
+    assert float(StoredRuns(tmp_path / "file").get([], lambda: np.array(7.0))) == 7.0
+
+
+def test_figures_come_from_every_benchmark(tmp_path, monkeypatch, capsys):
+    """Also after a failure."""
+    commands = []
+
+    def run(command, **_):
+        commands.append(command)
+        return SimpleNamespace(returncode=1 if "collision" in command else 0)
+
+    monkeypatch.setattr(subprocess, "run", run)
+    folders = ["--results", str(tmp_path), "--logs", str(tmp_path / "logs")]
+    assert figures.main(folders) == 1
+    assert [command[4] for command in commands] == list(figures.WRITES)
+    assert set(figures.WRITES) <= set(shipped_files("benchmarks"))
+    files = [part for command in commands for part in command if part.startswith(str(tmp_path))]
+    assert len(set(files)) == len(files) >= len(commands) and "| collision  |           1 |" in capsys.readouterr().out
+    commands.clear()
+    assert figures.main(["--quick", "--only", "references", "--only", "order", *folders]) == 0
+    assert ["--quick" in command for command in commands] == [False, True]  # the references have no small form
+    with pytest.raises(SystemExit):
+        figures.main(["--quick"])  # the manual is made from full results only
+
+
+def texts() -> list[str]:
+    return [page.read_text(encoding="utf-8") for page in pages()]
+
+
+def test_the_manual_agrees_with_the_results(capsys):
+    assert manual.main(["--check"]) == 0, "`taisoft bench manual` updates it"
+    assert sorted(name for text in texts() for _, name, _ in BLOCK.findall(text)) == sorted(TABLES)
+
+
+def test_a_changed_number_is_noticed(tmp_path):
+    shutil.copytree(RESULTS, tmp_path / "results")
+    path = next((tmp_path / "results").glob("order-*.json"))
+    numbers = json.loads(path.read_text())
+    row = next(r for r in numbers["rows"] if r["case"] == manual.HANGING and r["order"] == 2)
+    row["measured"][0] *= 1.001
+    path.write_text(json.dumps(numbers))
+    assert [filled(text, tmp_path / "results") != text for text in texts()].count(True) == 1
+
+
+def test_wrong_markers_are_refused():
+    for text, words in (
+        (TEXT.replace("fake", "nothing"), "'nothing' is unknown"),
+        (TEXT.replace("<!-- end fake -->\n", ""), "'fake' needs"),
+        (TEXT.replace("end fake", "end other"), "needs one begin and one end"),
+    ):
+        with pytest.raises(OutputError, match=words):
+            filled(text)
+
+
+def test_the_newest_full_results_are_used(tmp_path):
+    with pytest.raises(OutputError, match="no results of `taisoft bench order`"):
+        newest(tmp_path, "order")
+    for name, date, quick in (("a", "2026-01-02", False), ("b", "2026-01-01", False), ("c", "2026-01-03", True)):
+        (tmp_path / f"order-{name}.json").write_text(json.dumps({"date": date, "quick": quick, "name": name}))
+    assert newest(tmp_path, "order")["name"] == "a"
+    (tmp_path / "order-d.json").write_text("{")
+    with pytest.raises(OutputError, match="order-d.json"):
+        newest(tmp_path, "order")
+
+
+def test_marked_parts_of_pages_are_replaced(monkeypatch, tmp_path, capsys):
+    monkeypatch.setitem(TABLES, "fake", lambda results: "made")
+    monkeypatch.setattr(manual, "DOCS", tmp_path)
+    page = tmp_path / "page.md"
+    page.write_text("no table")
+    with pytest.raises(OutputError, match="no page with tables"):
+        manual.main([])
+    page.write_text(TEXT)
+    assert manual.main(["--check"]) == 1 and page.read_text() == TEXT
+    assert manual.main([]) == 0
+    assert page.read_text() == "before\n<!-- begin fake -->\n\nmade\n\n<!-- end fake -->\nafter\n"
+    assert manual.main(["--check"]) == 0 and "agrees with the results" in capsys.readouterr().out
