@@ -30,7 +30,7 @@ class Checked:
         self._placed = [(first + k, o) for k, o in enumerate(obstacles)]
         self.shapes = build_analytic(self._placed, arena) if obstacles else NO_SHAPES
         has_pairs = first > 1 or made.self_on.any()
-        self.tree = Bvh(s, made.topology, made.x, made.margin, made.machine, arena, k_dop) if has_pairs else None
+        self.tree = Bvh(s, made.topology, made.x, made.margin, made.runtime, arena, k_dop) if has_pairs else None
         self.row = Buffer("row", entries, s.chunks, None, s.chunks, arena)
         self.state = arena.vectors("state", ti.f64, len(made.x))
         self._arenas = []
@@ -64,12 +64,18 @@ class Checked:
 
 @contextmanager
 def checked(
-    parts, obstacles=(), reach: float = REACH, capacity: int | None = None, self_on: bool = True, k_dop: int = 6, **options
+    parts,
+    obstacles=(),
+    reach: float = REACH,
+    capacity: int | None = None,
+    self_on: bool = True,
+    k_dop: int = 6,
+    serial: bool = True,
 ) -> Iterator[Checked]:
     """Soft surfaces, each checked against itself too, and obstacles without triangles."""
     soft = np.arange(len(parts) + len(obstacles)) < len(parts)
     nothing = [(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64)) for _ in obstacles]
-    with surface_of([*parts, *nothing], soft=soft, self_on=soft & self_on, margin=reach, **options) as made:
+    with surface_of([*parts, *nothing], soft=soft, self_on=soft & self_on, margin=reach, serial=serial) as made:
         one = Checked(made, obstacles, capacity, k_dop)
         yield one
         one.release()

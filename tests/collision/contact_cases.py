@@ -47,17 +47,6 @@ class Case:
     field: bool = False
     where: tuple[tuple[float, float, float], ...] = ((0.0, 0.0, 0.0),)
 
-    def scene(self, collision: str = "proximity", place=(0.0, 0.0, 0.0)) -> ts.Scene:
-        """A scene of the two, "a" and "b"; both bodies are hit by `collision`, and gaps above P / 2 are of no interest."""
-        scene = ts.Scene(gravity=(0, 0, 0))
-        scene.collision = ts.CollisionSettings(margin=P / 2)
-        scene.add_body(self.a, ts.Material(), name="a", position=place, collision=collision)
-        if isinstance(self.b, ts.TetMesh):
-            scene.add_body(self.b, ts.Material(), name="b", collision=collision)
-        else:
-            scene.add_obstacle(self.b, name="b")
-        return scene
-
     def problems(self, point, normal, gap, place=(0.0, 0.0, 0.0)) -> list[str]:
         """What is wrong with the contacts point (k,3) [m], normal (k,3) and gap (k,) [m] of A at a place, and what is missing."""
         point, found = np.asarray(point) - place, []

@@ -1,6 +1,6 @@
 """Scenes for tests of the whole detection: bodies and obstacles of all kinds in light touch, and how two lists are compared."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
@@ -33,6 +33,14 @@ class Place:
     def path(self, pivot: np.ndarray):
         """An obstacle's path that takes it there."""
         return lambda t: (self.Q @ pivot + self.T - pivot, self.Q)
+
+
+def shifted(shape, by: np.ndarray):
+    """An obstacle's shape, moved (3,) [m]."""
+    if isinstance(shape, ts.MeshObstacle):
+        return ts.MeshObstacle(shape.vertices + by, shape.triangles)
+    places = {field.name for field in fields(shape)} & {"point", "center", "a", "b"}
+    return replace(shape, **{name: getattr(shape, name) + by for name in places})
 
 
 def jittered(mesh: ts.TetMesh, rng: np.random.Generator, by: float) -> ts.TetMesh:
@@ -109,34 +117,8 @@ def identical(c: Contacts, other: Contacts) -> bool:
     return all(np.array_equal(getattr(c, name), getattr(other, name)) for name in names)
 
 
-def sweeping(speed: list[float]) -> ts.Scene:
-    """Cubes of 0.5 m at 0.1 m over a block each; speed[0] [m/s]: at which the things below rise, where they are led.
-
-    over_block, over_field, over_ground: what is below stands still; over_box, over_mesh, over_led: it is led by a path.
-    """
-    scene = ts.Scene(gravity=(0, 0, 0))
-    scene.collision = ts.CollisionSettings(margin=0.01)
-    small, large = ts.box_mesh((1, 1, 1), (0.5, 0.5, 0.5), (0, 0.35, 0)), ts.box_mesh((1, 1, 1), (1.0, 0.8, 1.1), (0.07, -0.4, 0))
-    material = ts.Material(**SOFT)
-    names = ("block", "field", "box", "mesh", "led", "ground")
-    at = {name: np.array([5.0 * k, 0.0 if name == "ground" else 5.0, 0.0]) for k, name in enumerate(names)}
-    for name in names:
-        scene.add_body(small, material, name=f"over_{name}", position=at[name], collision="proximity")
-    for name, collision in (("block", "proximity"), ("field", "distance_field"), ("led", "proximity")):
-        below = scene.add_body(large, material, name=name, position=at[name], collision=collision)
-    below.move(lambda X: X[:, 0] < np.inf, lambda t: (0.0, speed[0] * t, 0.0))
-
-    def rising(t: float):
-        return np.array([0.0, speed[0] * t, 0.0]), np.eye(3)
-
-    scene.add_obstacle(ts.Box(at["box"] + (0.07, -0.4, 0), (0.5, 0.4, 0.55)), name="box", path=rising)
-    scene.add_obstacle(ts.MeshObstacle(large.vertices + at["mesh"], large.surface), name="mesh", path=rising)
-    scene.add_obstacle(ts.HalfSpace((0, 0, 0), (0, 1, 0)), name="ground")
-    return scene
-
-
 def sheets() -> ts.Scene:
-    """Bodies for self-collision, apart: a sheet of 2 m, its thickness below the margin; a thinner plate; a cube."""
+    """Bodies for self-collision, apart: a sheet of 2 m, its thickness below the margin; a thinner plate; a cube; a thin strip."""
     scene = ts.Scene(gravity=(0, 0, 0))
     scene.collision = ts.CollisionSettings(margin=0.03)
     for k, (name, mesh) in enumerate(
@@ -144,6 +126,7 @@ def sheets() -> ts.Scene:
             ("sheet", ts.sheet_mesh((16, 4), (2.0, 0.02, 1.0))),
             ("plate", ts.sheet_mesh((5, 5), (1.0, 0.004, 1.0), pattern="six")),
             ("cube", ts.box_mesh((3, 3, 3), (1.0, 1.0, 1.0))),
+            ("strip", ts.sheet_mesh((16, 2), (1.6, 0.005, 0.4))),
         )
     ):
         scene.add_body(mesh, ts.Material(**SOFT), name=name, position=(0, 3.0 * k, 0))

@@ -20,24 +20,22 @@ def surface_of(
     self_on=None,
     move=None,
     margin: float = 0.1,
-    precision: str = "f64",
     serial: bool | None = None,
 ) -> Iterator[SimpleNamespace]:
     """The surface of colliders, each (vertices (v,3), triangles (t,3)), with boxes up to date: surface, topology, x, move,
-    margin, arena, machine. soft, self_on: (colliders,), all and none where None; move: (n_verts,3) [m], 0 where None."""
+    margin, arena, runtime. soft, self_on: (colliders,), all and none where None; move: (n_verts,3) [m], 0 where None."""
     x = np.concatenate([vertices for vertices, _ in parts]).astype(np.float64)
     topology = make_topology([(triangles, np.arange(len(vertices))) for vertices, triangles in parts])
     soft = np.ones(len(parts), dtype=bool) if soft is None else np.asarray(soft)
     self_on = np.zeros(len(parts), dtype=bool) if self_on is None else np.asarray(self_on)
     move = np.zeros_like(x) if move is None else move
     arena = FieldArena()
-    with opened(precision) as machine:
+    with opened("f64") as runtime:
         properties = {"soft": soft, "self_on": self_on, "mode": np.zeros(len(soft))}
         properties |= dict.fromkeys(("thickness", "edge"), np.full(len(soft), np.inf))
-        surface = build_surface(topology, x, properties, machine, arena, serial)
-        made = SimpleNamespace(
-            surface=surface, topology=topology, soft=soft, self_on=self_on, margin=margin, arena=arena, machine=machine
-        )
+        surface = build_surface(topology, x, properties, runtime, arena, serial)
+        made = SimpleNamespace(surface=surface, topology=topology, soft=soft, self_on=self_on, margin=margin, arena=arena)
+        made.runtime = runtime
         place(made, x, move)
         yield made
     arena.release()
@@ -87,6 +85,38 @@ def soup(rng: np.random.Generator, n: int, size: float = 0.3) -> tuple[np.ndarra
     free[own[::11, 1]] = free[own[::11, 2]] = free[own[::11, 0]]  # points
     used = rng.random(n) < 0.1  # a few large ones on common vertices
     return np.concatenate([free, vertices]), np.where(used[:, None], 3 * n + triangles, own)
+
+
+EMPTY = (np.zeros((3, 3)), np.zeros((0, 3), dtype=int))
+SINGLE = (np.array([[0.4, 0.5, 0.5], [0.6, 0.5, 0.5], [0.5, 0.6, 0.7]]), np.array([[0, 1, 2]]))
+
+
+def colliders(rng: np.random.Generator) -> dict:
+    """Soft bodies: two triangle soups, a sheet, an empty mesh, one triangle. Obstacles: two sheets, an empty mesh."""
+    parts = [soup(rng, 110), soup(rng, 70, 0.1), sheet(4), EMPTY, SINGLE, sheet(3), sheet(2), EMPTY]
+    return {"parts": parts, "soft": np.arange(8) < 5, "self_on": np.isin(np.arange(8), (0, 2, 3))}
+
+
+def scatter(rng: np.random.Generator, made: SimpleNamespace, kind: int) -> None:
+    """Place the vertices about `made.x0`: by `kind % 5` at random, permuted, some far away, some not finite; move them at random.
+    Every third time, triangles that share no vertex shrink by a factor of up to 1000."""
+    x = made.x0 + 0.1 * rng.standard_normal(made.x0.shape)
+    if kind % 5 == 1:
+        x = rng.permutation(x)
+    move = rng.choice([0.0, 0.1, 0.5]) * rng.standard_normal(x.shape)
+    if kind % 5 == 2:
+        some = rng.random(len(x)) < 0.1
+        x[some] += 10.0 ** rng.uniform(2, 300, (some.sum(), 1)) * rng.standard_normal((some.sum(), 3))
+    if kind % 5 == 3:
+        bad = rng.integers(0, len(x), 9)
+        x[bad[:3]], x[bad[3:5]], move[bad[5:7]], move[bad[7:]] = np.nan, np.inf, np.nan, -np.inf
+    if kind % 3 == 1:
+        t = made.topology.triangle
+        own = t[np.bincount(t.ravel(), minlength=len(x))[t].max(axis=1) == 1]
+        with np.errstate(invalid="ignore"):
+            x[own] = x[own[:, :1]] + 10.0 ** rng.uniform(-3, 0, (len(own), 1, 1)) * (x[own] - x[own[:, :1]])
+    made.margin = float(rng.choice([0.0, 0.02, 0.2]))
+    place(made, x, move)
 
 
 def sheet(n: int, size: float = 1.0) -> tuple[np.ndarray, np.ndarray]:

@@ -1,73 +1,58 @@
-"""Passages of surfaces on straight paths, as `PathCheck` finds them:
+"""Passages of surfaces and obstacles on straight paths, as `PathCheck` finds them:
 
 * what must not pass each other among triangles with a common vertex is all pairs of their features without one;
 * no step is called free that ipctk's continuous detection calls colliding, of two bodies or a scroll with itself, and most that
   ipctk calls free are;
-* the list of near pairs does not matter: all pairs, a fresh list, or an earlier one, which is used while vertices stay in their
-  boxes or bodies move together, and however they move misses nothing that ipctk finds; paths that leave what was searched are
-  not judged.
+* an earlier list of near pairs serves while bodies move together, finds what a fresh one does, and misses nothing that ipctk
+  finds; paths that leave what was searched are not judged;
+* half-spaces that move and turn, against NumPy; spheres and capsules against sampled distances by ipctk;
+* an edge or corner has one name in all its triangles, and passages know their colliders.
 """
+
+import itertools
+from collections import Counter
 
 import numpy as np
 import pytest
 
 import taisoft as ts
-from taisoft.backend import runtime
-from taisoft.collision.passages import ADJACENT, NEAR
-from taisoft.collision.path_check import IN_BOXES, adjacent_rows
-from tests.collision.checked_paths import REACH, checked, obstacle, turned, waves
+from taisoft.backend.counters import counting
+from taisoft.collision.passages import ADJACENT, FLAT, NEAR, ROUND
+from taisoft.collision.path_check import adjacent_rows
+from tests.collision.checked_paths import FLOOR, REACH, checked, obstacle, turned, waves
+from tests.collision.rotations import rotation
 from tests.collision.surfaces import sheet
 
 ipctk = pytest.importorskip("ipctk")
-
+from benchmarks.judge import axis_distance  # noqa: E402
 
 # --- triangles with common vertices ---------------------------------------------------------------------------------
 
 
-def features(t: np.ndarray) -> list[frozenset]:
-    """Corners, edges and face of a triangle."""
-    i, j, k = (int(v) for v in t)
-    return [frozenset(f) for f in ((i,), (j,), (k,), (i, j), (j, k), (k, i), (i, j, k))]
-
-
-def fan(n: int) -> np.ndarray:
-    """A closed ring of n triangles around vertex 0."""
-    return np.array([[0, 1 + k, 1 + (k + 1) % n] for k in range(n)])
-
-
-def random_triangles(n: int, n_verts: int, seed: int) -> np.ndarray:
-    rng = np.random.default_rng(seed)
-    return np.array([rng.choice(n_verts, 3, replace=False) for _ in range(n)])
-
-
-MESHES = {
-    "ring of 3": fan(3),
-    "ring of 7": fan(7),
-    "open fan": fan(7)[:4],
-    "open sheet": sheet(3)[1],
-    "box": ts.box_mesh((2, 1, 1), (1.0, 1.0, 1.0)).surface,
-    "book": np.array([[0, 1, k] for k in range(2, 6)]),
-    "apart": np.arange(9).reshape(3, 3),
-    "random": random_triangles(30, 14, 0),
-}
-
-
-@pytest.mark.parametrize("name", MESHES)
-def test_rows_of_adjacent_triangles_are_all_pairs_of_their_features(name):
-    t = MESHES[name]
-    rows = [(frozenset(row[:3].tolist()), frozenset(row[3:].tolist())) for row in adjacent_rows(t)]
-    assert not any(one & other for one, other in rows)
-    neighbours = [(a, b) for k, a in enumerate(t) for b in t[:k] if set(a.tolist()) & set(b.tolist())]
-    unions = [frozenset(a.tolist() + b.tolist()) for a, b in neighbours]
-    assert all(any(one | other <= union for union in unions) for one, other in rows)
-    whole, count = [frozenset(a.tolist()) for a in t], 0
-    for a, b in neighbours:
-        for f in features(a):
-            for g in features(b):
-                if not f & g and not any(f | g <= one for one in whole):  # within one triangle, nothing can pass
-                    assert any((f <= p and g <= q) or (f <= q and g <= p) for p, q in rows)
-                    count += 1
-    assert (count > 0) == (len(rows) > 0) == (name != "apart")
+@pytest.mark.parametrize("name", ["sheet", "box", "book", "apart"])
+def test_rows_of_adjacent_triangles(name):
+    """Of two triangles with a common vertex each one's opposite edge and the other one; with a common edge, the opposite corners
+    and the sides between them."""
+    t = {"sheet": sheet(3)[1], "box": ts.box_mesh((2, 1, 1), (1.0, 1.0, 1.0)).surface, "apart": np.arange(9).reshape(3, 3)}
+    t = t | {"book": np.array([[0, 1, k] for k in range(2, 6)])}
+    t, expected = [frozenset(row) for row in t[name].tolist()], []
+    for a, b in itertools.combinations(t, 2):
+        common, (p, q) = a & b, (a - b, b - a)
+        if len(common) == 1:
+            expected += [frozenset((p, b)), frozenset((q, a))]
+        elif len(common) == 2:
+            r, s = (frozenset((v,)) for v in common)
+            expected += [
+                frozenset((p, q | common)),
+                frozenset((q, p | common)),
+                frozenset((p | r, q | s)),
+                frozenset((p | s, q | r)),
+            ]
+    found = [
+        frozenset((frozenset(row[:3]), frozenset(row[3:])))
+        for row in adjacent_rows(np.array([sorted(row) for row in t])).tolist()
+    ]
+    assert Counter(found) == Counter(expected)
 
 
 # --- against ipctk --------------------------------------------------------------------------------------------------
@@ -96,46 +81,46 @@ def scroll(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
 SURFACES = {"two": (two_sheets, [(sheet(5)[0], sheet(5)[1])] * 2), "scroll": (scroll, [(sheet(8)[0], sheet(8)[1])])}
 
 
+def is_free(judge, x: np.ndarray, then: np.ndarray, distance: float = 0.0) -> bool:
+    """Whether ipctk finds nothing nearer than a distance [m] on straight paths from x to `then`."""
+    return ipctk.is_step_collision_free(judge, np.asfortranarray(x), np.asfortranarray(then), min_distance=distance)
+
+
 def starts(name: str, n: int, seed: int):
-    """n random (x, move) that do not cross at first."""
-    rng, make, found = np.random.default_rng(seed), SURFACES[name][0], []
-    judge = collision_mesh(SURFACES[name][1])
+    """n random (x, move) that do not cross at first, and ipctk's mesh."""
+    rng, (make, parts), found = np.random.default_rng(seed), SURFACES[name], []
+    first = np.cumsum([0, *(len(v) for v, _ in parts)])
+    faces = np.concatenate([t + start for (_, t), start in zip(parts, first)]).astype(np.int32)
+    x = np.concatenate([v for v, _ in parts])
+    judge = ipctk.CollisionMesh(np.asfortranarray(x), ipctk.edges(faces), np.asfortranarray(faces))
     while len(found) < n:
         x, move = make(rng)
-        if ipctk.is_step_collision_free(judge, np.asfortranarray(x), np.asfortranarray(x + 1e-9), min_distance=1e-3):
+        if is_free(judge, x, x + 1e-9, 1e-3):
             found.append((x, move))
     return found, judge
 
 
-def collision_mesh(parts):
-    first = np.cumsum([0, *(len(v) for v, _ in parts)])
-    faces = np.concatenate([t + start for (_, t), start in zip(parts, first)]).astype(np.int32)
-    x = np.concatenate([v for v, _ in parts])
-    return ipctk.CollisionMesh(np.asfortranarray(x), ipctk.edges(faces), np.asfortranarray(faces))
-
-
-@pytest.mark.parametrize("precision, n", [("f64", 150), ("f32", 30)])
-@pytest.mark.parametrize("name", SURFACES)
-def test_no_step_is_called_free_that_collides(name, precision, n):
+@pytest.mark.parametrize("name, serial, n", [("two", True, 60), ("scroll", True, 60), ("two", False, 15)])
+def test_no_step_is_called_free_that_collides(name, serial, n):
     cases, judge = starts(name, n, 1)
     truth, called, kinds = [], [], set()
-    with checked(SURFACES[name][1], precision=precision, capacity=8, serial=False if precision == "f32" else None) as one:
+    with checked(SURFACES[name][1], capacity=8, serial=serial) as one:
         for x, move in cases:
             one.search(x, move)
             one.check.forget()
             pairs, times = one.find()
             assert ((times >= 0.0) & (times < 1.0)).all() and (np.lexsort(pairs.T[::-1]) == np.arange(len(pairs))).all()
-            truth.append(ipctk.is_step_collision_free(judge, np.asfortranarray(x), np.asfortranarray(x + move)))
+            truth.append(is_free(judge, x, x + move))
             called.append(len(pairs) == 0)
             kinds |= set(pairs[:, 0].tolist())
             if len(times) and times.min() > 0.0:  # until the first passage, nothing collides
                 early = x + times.min() * move
-                assert ipctk.is_step_collision_free(judge, np.asfortranarray(x), np.asfortranarray(early))
+                assert is_free(judge, x, early)
             to_state = one.find(x + move)
             assert np.array_equal(to_state[0][:, :3], pairs[:, :3]) and np.abs(to_state[1] - times).max(initial=0.0) < 1e-3
     truth, called = np.array(truth), np.array(called)
     assert not (called & ~truth).any()
-    assert min(truth.sum(), (~truth).sum()) > 0.2 * n and (called & truth).sum() >= 0.9 * truth.sum()
+    assert min(truth.sum(), (~truth).sum()) > 0.1 * n and (called & truth).sum() >= 0.85 * truth.sum()
     assert kinds == ({NEAR, ADJACENT} if name == "scroll" else {NEAR})
 
 
@@ -147,39 +132,11 @@ def same(one, other) -> bool:
     return np.array_equal(one[0][:, :3], other[0][:, :3]) and np.abs(one[1] - other[1]).max(initial=0.0) < 1e-9
 
 
-@pytest.mark.parametrize("name", SURFACES)
-def test_an_earlier_list_finds_what_a_fresh_one_and_all_pairs_do(name):
-    """Searches begin farther along the path, and their ends deviate by less than the boxes allow."""
-    cases, rng, found = starts(name, 12, 2)[0], np.random.default_rng(3), []
-    with checked(SURFACES[name][1]) as one:
-        for x, move in cases:
-            one.check.forget()
-            one.search(x, move)
-            one.find()
-            before = runtime.launches["list_near_pairs"]
-            for part in (0.0, 0.4):
-                noise = rng.standard_normal(x.shape)
-                noise *= 0.9 * IN_BOXES * REACH / np.linalg.norm(noise, axis=1).max()
-                begin, end = x + part * move, x + move + noise
-                one.search(begin, (1.0 - part) * move)
-                found.append((begin, end, one.find(end)))
-            assert runtime.launches["list_near_pairs"] == before
-            one.search(begin, end - begin)
-            assert same(one.find(check=one.another()), found[-1][2])
-            assert runtime.launches["list_near_pairs"] > before
-    with checked(SURFACES[name][1], reach=10.0) as one:
-        for begin, end, passages in found:
-            one.search(begin, end - begin)
-            assert same(one.find(), passages)
-    assert sum(len(pairs) > 0 for _, _, (pairs, _) in found) > 5
-
-
-@pytest.mark.parametrize("k_dop", [6, 18])
-@pytest.mark.parametrize("name", SURFACES)
+@pytest.mark.parametrize("name, k_dop", [("two", 18), ("scroll", 6)])
 def test_an_old_list_misses_nothing_however_bodies_move(name, k_dop):
     """Steps near a collision follow each other with a random common motion and small to large motions of each vertex; often one
     half of the surface glides along the other."""
-    cases, judge = starts(name, 60, 4)
+    cases, judge = starts(name, 25, 4)
     rng, outcomes, drifts = np.random.default_rng(5), [], []
     with checked(SURFACES[name][1], k_dop=k_dop) as one:
         for x, move in cases:
@@ -193,19 +150,19 @@ def test_an_old_list_misses_nothing_however_bodies_move(name, k_dop):
             for step in range(6):
                 begin = near + step * (drift + glides) + 0.1 * REACH * waves(x, rng, size)
                 path = drift + size * move
-                if not ipctk.is_step_collision_free(judge, *map(np.asfortranarray, (begin, begin + 1e-9)), min_distance=1e-3):
+                if not is_free(judge, begin, begin + 1e-9, 1e-3):
                     continue
                 one.search(begin, path)
-                before = runtime.launches["list_near_pairs"]
-                found = one.find()
-                is_old = step > 0 and runtime.launches["list_near_pairs"] == before
+                with counting() as counts:
+                    found = one.find()
+                is_old = step > 0 and counts.launches["list_near_pairs"] == 0
                 assert same(found, one.find(check=one.another()))
-                free = ipctk.is_step_collision_free(judge, *map(np.asfortranarray, (begin, begin + path)))
+                free = is_free(judge, begin, begin + path)
                 assert free or len(found[0])
                 outcomes.append((is_old, free))
                 drifts.append(is_old * step * np.linalg.norm(drift))
     count = {pair: outcomes.count(pair) for pair in ((True, True), (True, False), (False, True), (False, False))}
-    assert min(count.values()) >= 3 and max(drifts) > 20.0 * REACH
+    assert min(count.values()) >= 2 and max(drifts) > 20.0 * REACH
 
 
 def test_paths_that_leave_what_was_searched_are_not_judged():
@@ -213,9 +170,10 @@ def test_paths_that_leave_what_was_searched_are_not_judged():
     x = np.concatenate([v for v, _ in parts])
     move = np.zeros_like(x)
     move[9:, 0] = 0.3
-    limit, aside = IN_BOXES * REACH, np.zeros_like(x)
+    aside = np.zeros_like(x)
     aside[12] = (0.0, 0.6, 0.8)
     with checked(parts) as one:
+        limit = one.check.limit
         one.search(x, move)
         for along in (0.0, 0.5, 1.0):  # the whole searched path is covered
             assert one.find(x + along * move + 0.999 * limit * aside) is not None
@@ -223,23 +181,112 @@ def test_paths_that_leave_what_was_searched_are_not_judged():
             assert one.find(x + along * move + 1.001 * limit * aside) is None
         for beyond in (-1.01 * limit, 0.3 + 1.01 * limit):
             assert one.find(x + np.array([beyond, 0.0, 0.0]) * (move != 0.0).any(axis=1)[:, None]) is None
-        far = x.copy()
-        far[3, 1] = np.inf
-        assert one.find(far) is None
+        for value in (np.inf, np.nan):
+            far = x.copy()
+            far[3, 1] = value
+            assert one.find(far) is None
         assert len(one.find(x + move)[0]) == 0
-        before = runtime.launches["list_near_pairs"]
         one.search(x + 3.0 * limit * aside, 0.0 * move)  # a new search, from where the old list is useless
-        assert one.find() is not None and runtime.launches["list_near_pairs"] == before + 1
+        with counting() as counts:
+            assert one.find() is not None and counts.launches["list_near_pairs"] == 1
         assert one.find(x) is None
     with checked([parts[0]], [obstacle(ts.Sphere((0.5, 0.5, 0.5), 0.2))], self_on=False) as one:  # needs no list
         one.search(parts[0][0], np.zeros((9, 3)))
         assert len(one.find(parts[0][0] + [0.0, 5.0, 0.0])[0]) > 0
 
 
-def test_positions_that_are_not_numbers_are_not_judged():
-    x, t = sheet(2)
-    with checked([(x, t), (x + [0.0, 0.5, 0.0], t)]) as one:
-        one.search(np.concatenate([x, x + [0.0, 0.5, 0.0]]), np.zeros((18, 3)))
-        state = one.made.x.copy()
-        state[3, 1] = np.nan
-        assert one.find(state) is None
+# --- obstacles without triangles, and names --------------------------------------------------------------------------
+
+
+def paths(rng: np.random.Generator):
+    """A random pose at t = 1, from none at t = 0."""
+    shift, axis, angle = rng.uniform(-0.3, 0.3, 3), rng.standard_normal(3), rng.uniform(0.0, 1.0)
+    return lambda t: (t * shift, rotation(axis, t * angle))
+
+
+def test_half_spaces():
+    """Vertices must stay above, or get no deeper."""
+    rng, n_found = np.random.default_rng(4), 0
+    planes = [obstacle(ts.HalfSpace(rng.uniform(0, 1, 3), rng.standard_normal(3)), paths(rng)) for _ in range(8)]
+    v, t = sheet(4)
+    with checked([(v, t)], planes) as one:
+        for _ in range(5):
+            x, move = turned(v, rng, 3.0), rng.uniform(-0.2, 0.2, v.shape)
+            one.search(x, move)
+            pairs, times = one.find()
+            expected = {}
+            for k, o in enumerate(planes):
+                ends = [o.points_at(at, np.stack([o.shape.point, o.shape.point + o.shape.normal])) for at in (0.0, 1.0)]
+                now, then = (y @ (tip - p) - p @ (tip - p) for y, (p, tip) in zip((x, x + move), ends))
+                need = np.minimum(FLOOR, np.where(now > 0.0, 0.5 * now, now))
+                expected |= {(i, k): (now - need)[i] / (now - then)[i] for i in np.flatnonzero(then < need)}
+            flat = pairs[:, 0] == FLAT
+            assert {(a, b) for _, a, b, _ in pairs[flat].tolist()} == set(expected)
+            assert times[flat] == pytest.approx([expected[a, b] for _, a, b, _ in pairs[flat].tolist()], abs=1e-9)
+            n_found += flat.sum()
+    assert 100 < n_found < 5 * 8 * len(v)
+
+
+def between(ends, s: float) -> np.ndarray:
+    """Points on straight paths."""
+    return np.asfortranarray(ends[0] + s * (ends[1] - ends[0]))
+
+
+def axis_of(o) -> np.ndarray:
+    """The ends (2,3) of a capsule's axis at first, both the centre of a sphere [m]."""
+    shape = o.shape
+    return np.stack([shape.center, shape.center] if isinstance(shape, ts.Sphere) else [shape.a, shape.b])
+
+
+def test_spheres_and_capsules():
+    """A free triangle keeps off at all times sampled; another one does until the time given, and has come near then."""
+    rng = np.random.default_rng(5)
+    shapes = [ts.Sphere(c, r) for c, r in zip(rng.uniform(0.0, 1.0, (4, 3)), (0.05, 0.1, 0.15, 0.2))]
+    shapes += [ts.Capsule(a, a + 0.4 * d, 0.08) for a, d in zip(rng.uniform(0.0, 1.0, (6, 3)), rng.standard_normal((6, 3)))]
+    shapes, v, t = [obstacle(s, paths(rng)) for s in shapes], *sheet(3)
+    counts = {True: 0, False: 0}
+    with checked([(v, t)], shapes, self_on=False) as one:
+        for _ in range(5):
+            x = turned(v, rng, 3.0) + (0.0, 0.5, 0.0)
+            move = waves(x, rng, 0.1) + rng.uniform(-0.3, 0.3, 3)
+            one.search(x, move)
+            passages = {(a, b): time for (kind, a, b, _), time in zip(*(p.tolist() for p in one.find())) if kind == ROUND}
+            for i, k in np.ndindex(len(t), len(shapes)):
+                axes = [shapes[k].points_at(at, axis_of(shapes[k])) for at in (0.0, 1.0)]
+                corners = x[t[i]], x[t[i]] + move[t[i]]
+                until = passages.get((i, k), 1.0)
+                times = np.linspace(0.0, until, 9)
+                gaps = [axis_distance(*between(axes, s), between(corners, s)) - shapes[k].shape.radius for s in times]
+                if gaps[0] <= 0.0:
+                    assert until == 0.0
+                    continue
+                assert min(gaps) >= min(FLOOR, 0.5 * gaps[0]) * (1.0 - 1e-9) - 1e-12
+                if (i, k) in passages:
+                    assert gaps[-1] < 3.0 * FLOOR
+                counts[(i, k) in passages] += 1
+    assert counts[True] > 30 and counts[False] > 60
+
+
+def sides(row: np.ndarray, f: int) -> frozenset:
+    """The vertices of features f of two triangles in rows 0 to 2 and 3 to 5."""
+    i, j = (f - 6) // 3, (f - 6) % 3
+    one, other = (row[[f]], row[3:] if f < 3 else row[:3]) if f < 6 else (row[[i, (i + 1) % 3]], row[[3 + j, 3 + (j + 1) % 3]])
+    return frozenset((frozenset(one.tolist()), frozenset(other.tolist())))
+
+
+def test_an_edge_or_corner_has_one_name_in_all_its_triangles():
+    """Also within a body, whose passages list triangles a < b, so that either of two edges may come first."""
+    parts = [sheet(2), (sheet(2)[0] + [0.0, 0.5, 0.0], sheet(2)[1])]
+    with checked(parts, [obstacle(ts.Sphere((0.0, 0.0, 0.0), 1.0)), obstacle(ts.HalfSpace((0, 0, 0), (0, 1, 0)))]) as one:
+        t, n = one.made.topology.triangle, len(parts[0][1])
+        apart = [(a, b) for a in range(2 * n) for b in range(a + 1, 2 * n) if not set(t[a].tolist()) & set(t[b].tolist())]
+        rows = [(NEAR, a, b, f) for a, b in apart for f in range(15)]
+        meant = [sides(np.concatenate([t[a], t[b]]), f) for _, a, b, f in rows]
+        colliders = [[int(a >= n), int(b >= n)] for _, a, b, _ in rows] + [[0, 2]] * (3 * n) + [[0, 3]] * 9
+        rows += [(ROUND, a, 0, f) for a in range(n) for f in (0, 1, 2)]
+        meant += [frozenset((frozenset((int(t[a, f]),)), "sphere")) for _, a, _, f in rows[-3 * n :]]
+        rows += [(FLAT, i, 1, 0) for i in range(9)]
+        meant += [frozenset((frozenset((i,)), "plane")) for i in range(9)]
+        names = [tuple(name) for name in one.check.features(np.array(rows)).tolist()]
+        assert len(set(names)) == len(set(meant)) == len(set(zip(names, meant))) < 0.5 * len(rows)
+        assert one.check.colliders(np.array(rows)).tolist() == colliders

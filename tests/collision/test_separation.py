@@ -1,4 +1,4 @@
-"""How far triangles move apart from each other, in f64 also where the scene's precision is f32:
+"""How far triangles move and certainly stay apart from each other:
 
 * the nearest points of two triangles agree with ipctk's distances, also of edges and points;
 * random motions that are called free are so by ipctk's exact continuous detection, and most that ipctk calls free are;
@@ -14,7 +14,7 @@ import taichi as ti
 from taisoft.backend.runtime import kernel
 from taisoft.collision import separation
 from taisoft.collision.intersections import row_of
-from tests.backend.lanes import opened
+from tests.collision.rotations import rotation
 
 ipctk = pytest.importorskip("ipctk")
 array = ti.types.ndarray(dtype=ti.f64)
@@ -52,12 +52,6 @@ def plane(X: array, P: array, floor: ti.f64, first: ti.i32, out: array):
         out[i] = separation.separating_plane(*start, *end, floor, first, 0)
 
 
-@pytest.fixture(scope="module", params=["f64", "f32"], autouse=True)
-def runtime(request):
-    with opened(request.param) as made:
-        yield made
-
-
 def free_until(x: np.ndarray, p: np.ndarray, radius: float = 0.0, floor: float = 1e-6, are_apart: bool = True) -> np.ndarray:
     out = np.zeros(len(x))
     free(np.ascontiguousarray(x), np.ascontiguousarray(p), radius, floor, int(are_apart), out)
@@ -91,14 +85,16 @@ def apart(n: int, rng: np.random.Generator, speed: float = 1.0) -> tuple[np.ndar
     return x, speed * (rng.standard_normal((len(x), 2, 1, 3)) + 0.3 * rng.standard_normal((len(x), 2, 3, 3))).reshape(-1, 6, 3)
 
 
-@pytest.mark.parametrize("corners", ["triangles", "an edge", "a point", "two edges"])
+@pytest.mark.parametrize("corners", ["triangles", "parallel", "an edge", "a point", "two edges", "parallel edges"])
 def test_nearest_points(corners):
-    x, _ = apart(300, np.random.default_rng(0))
-    if corners != "triangles":
+    x, rng = apart(100, np.random.default_rng(0))[0], np.random.default_rng(1)
+    if corners.startswith("parallel"):
+        x[:, 3:] = x[:, :3] + 2.0 * rng.standard_normal((len(x), 1, 3)) + 1e-12 * rng.standard_normal((len(x), 3, 3))
+    if corners not in ("triangles", "parallel"):
         x[:, 2] = x[:, 1]
     if corners == "a point":
         x[:, 0] = x[:, 1]
-    if corners == "two edges":
+    if corners.endswith("edges"):
         x[:, 5] = x[:, 4]
     out = np.zeros((len(x), 9))
     nearest(x, out)
@@ -111,85 +107,67 @@ def test_nearest_points(corners):
 
 
 @pytest.mark.parametrize("speed", [0.3, 2.0])
-def test_free_motions_are_free(speed):
-    x, p = apart(1500, np.random.default_rng(1), speed)
+def test_free_motions_are_free_and_stopped_ones_near(speed):
+    x, p = apart(300, np.random.default_rng(1), speed)
     part = free_until(x, p)
     assert ((part >= 0.0) & (part <= 1.0)).all()
     truth = np.array([exactly_free(y, q) for y, q in zip(x, p)])
     called = part == 1.0
-    assert 100 < called.sum() < len(x) and 50 < (~truth).sum()
+    assert 20 < called.sum() < len(x) and 8 < (~truth).sum()
     assert not (called & ~truth).any()
     assert (called & truth).sum() > 0.99 * truth.sum()
-    for y, q, f in zip(x, p, free_until(x, p, floor=1e-3)):  # ipctk's own tolerance is 1e-6
-        assert exactly_free(y, f * q)
+    floor = 1e-3  # [m]; ipctk's own tolerance is 1e-6
+    part = free_until(x, p, floor=floor)
+    assert all(exactly_free(y, f * q) for y, q, f in zip(x, p, part))
+    stopped = part < 1.0
+    left = np.array([distance(y + f * q) for y, q, f in zip(x[stopped], p[stopped], part[stopped])])
+    first = np.array([distance(y) for y in x[stopped]])
+    assert (left >= np.minimum(floor, 0.5 * first) * (1.0 - 1e-9)).all()
+    assert np.median(left) < 1.5 * floor and np.quantile(left, 0.9) < 0.1  # unless the motion turns as it comes near
 
 
-@pytest.mark.parametrize("speed", [0.0, 0.3, 2.0])
+@pytest.mark.parametrize("speed", [0.3, 2.0])
 def test_what_simple_tests_call_clear_is_free(speed):
-    x, p = apart(1500, np.random.default_rng(6), speed)
+    x, p = apart(300, np.random.default_rng(6), speed)
     found, floor = np.zeros((separation.N_PLANES, len(x))), 1e-2
     for first in range(separation.N_PLANES):
         plane(x, p, floor, first, found[first])
     clear = found[0] >= 0.0
     assert ((found >= 0.0) == clear).all()  # whatever is tried first
     used = [np.sum(found[k] == k) for k in range(separation.N_PLANES)]
-    assert min(used) > 0 and 300 < clear.sum() < len(x) and (free_until(x, p, floor=floor)[clear] == 1.0).all()
+    assert min(used) > 0 and 60 < clear.sum() < len(x) and (free_until(x, p, floor=floor)[clear] == 1.0).all()
     for y, q in zip(x[clear], p[clear]):
         assert min(distance(y + t * q) for t in (0.0, 0.5, 1.0)) >= floor * (1.0 - 1e-9)
 
 
-def test_stopped_triangles_are_near():
-    """What is stopped has come close to the floor, unless the motion turns as it comes near."""
-    x, p = apart(1500, np.random.default_rng(2))
-    floor = 1e-3
-    part = free_until(x, p, floor=floor)
-    stopped = part < 1.0
-    left = np.array([distance(y + f * q) for y, q, f in zip(x[stopped], p[stopped], part[stopped])])
-    first = np.array([distance(y) for y in x[stopped]])
-    assert (left >= np.minimum(floor, 0.5 * first) * (1.0 - 1e-9)).all()
-    assert np.median(left) < 1.2 * floor and np.quantile(left, 0.9) < 0.05
+FLAT = np.array([[0.0, 0, 0], [1, 0, 0], [0, 0, 1]])
 
 
-def test_head_on_and_gliding():
-    a = np.array([[0.0, 0, 0], [1, 0, 0], [0, 0, 1]])
-    x = np.concatenate([a + [0.1, 0.01, 0.1], a])[None]
+def test_head_on_gliding_and_touching():
+    x = np.concatenate([FLAT + [0.1, 0.01, 0.1], FLAT])[None]
     down, along = np.zeros((1, 6, 3)), np.zeros((1, 6, 3))
     down[0, :3, 1], along[0, :3, 0] = -0.02, 0.5
     assert free_until(x, along, floor=1e-3) == 1.0
     assert free_until(x, down, floor=1e-3) == pytest.approx(0.45, rel=1e-9)
     assert free_until(x, 0.4 * down, floor=1e-3) == 1.0
     assert free_until(x, down, radius=0.005, floor=1e-3) == pytest.approx(0.2, rel=1e-9)
+    x[0, :3, 1] = 0.0  # the side on which they are is unknown
+    for move in (down, -down, 0.0 * down):
+        assert free_until(x, move) == 0.0
 
 
 def test_turning_together_is_free():
     rng = np.random.default_rng(3)
-    a = np.array([[0.0, 0, 0], [1, 0, 0], [0, 0, 1]])
-    x = np.stack([np.concatenate([a + [0.2, 1e-4, 0.1], a]) @ _turn(rng.uniform(0.0, 3.0), rng).T for _ in range(50)])
-    turned = np.stack([y @ _turn(0.5, rng).T for y in x])
+    together = np.concatenate([FLAT + [0.2, 1e-4, 0.1], FLAT])
+    x = np.stack([together @ rotation(rng.standard_normal(3), rng.uniform(0.0, 3.0)).T for _ in range(50)])
+    turned = np.stack([y @ rotation(rng.standard_normal(3), 0.5).T for y in x])
     assert (free_until(x, turned - x, floor=1e-5) == 1.0).all()
 
 
-def _turn(angle: float, rng: np.random.Generator) -> np.ndarray:
-    """Rotation (3,3) by an angle about a random axis."""
-    axis = rng.standard_normal(3)
-    k = np.cross(np.eye(3), axis / np.linalg.norm(axis))
-    return np.eye(3) + np.sin(angle) * k + (1.0 - np.cos(angle)) * k @ k
-
-
-def test_touching_triangles_are_not_free():
-    """The side on which they are is unknown."""
-    a = np.array([[0.0, 0, 0], [1, 0, 0], [0, 0, 1]])
-    x = np.concatenate([a + [0.1, 0.0, 0.1], a])[None]
-    up = np.zeros((1, 6, 3))
-    up[0, :3, 1] = 0.1
-    for move in (up, -up, 0.0 * up):
-        assert free_until(x, move) == 0.0
-
-
 def test_crossing_triangles_are_told_by_a_motion_of_nothing():
-    x = np.random.default_rng(5).standard_normal((500, 6, 3))
+    x = np.random.default_rng(5).standard_normal((200, 6, 3))
     crossing = np.array([distance(y) == 0.0 for y in x])
-    assert 20 < crossing.sum() < 480
+    assert 10 < crossing.sum() < 190
     assert np.array_equal(free_until(x, 0.0 * x, are_apart=False) < 1.0, crossing)
 
 
@@ -197,7 +175,7 @@ def test_frame_and_order_change_nothing():
     rng = np.random.default_rng(4)
     x, p = apart(300, rng)
     part = free_until(x, p)
-    R, shift, drift = _turn(2.0, rng), rng.standard_normal(3), rng.standard_normal(3)
+    R, shift, drift = rotation(rng.standard_normal(3), 2.0), rng.standard_normal(3), rng.standard_normal(3)
     assert np.allclose(free_until(x @ R.T + shift, p @ R.T + drift), part, atol=1e-6)
     order = [4, 3, 5, 1, 2, 0]
     assert np.allclose(free_until(x[:, order], p[:, order]), part, atol=1e-6)

@@ -92,11 +92,11 @@ class NodeContacts:
 
 
 def random_contacts(
-    seed: int, k: int, n_nodes: int, friction: float = 0.5, led: bool = False, spread: float = 0.2
+    seed: int, k: int, n_nodes: int, friction: float = 0.5, prescribed: bool = False, spread: float = 0.2
 ) -> NodeContacts:
     """k contacts between nodes of the lower and the upper half, up to three on either side.
 
-    led: some nodes are led along all axes, some along one. spread: of the normals about z.
+    prescribed: whether some nodes are prescribed along all axes, some along one. spread: of the normals about z.
     """
     rng = np.random.default_rng(seed)
     node, weight = np.zeros((k, NODES), dtype=np.int32), np.zeros((k, NODES))
@@ -113,7 +113,7 @@ def random_contacts(
     tangent = np.cross(normal, rng.normal(size=(k, 3)))
     tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
     inverse_mass = np.repeat(np.exp(rng.uniform(-1, 1, (n_nodes, 1))), 3, axis=1)
-    if led:
+    if prescribed:
         inverse_mass[: half // 2] = 0.0
         inverse_mass[half : half + half // 3, 0] = 0.0
     v = rng.normal(size=(n_nodes, 3))

@@ -14,12 +14,13 @@ class Rig:
     """One problem of each form, on one thread and on all, in one runtime."""
 
     def __init__(self):
-        self.runtime = open_runtime("cpu", "f32")  # contacts are f64 there too
+        self.runtime = open_runtime("cpu", "f64")
         self.arena, self._made = [], {}
 
     def close(self) -> None:
         for arena in self.arena:
             arena.release()
+        self.arena = []
         self.runtime.close()
 
     def _of(self, matrix: bool, serial: bool) -> problem.ContactProblem:

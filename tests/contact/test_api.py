@@ -1,11 +1,10 @@
-"""`solve_contact_problem`: its inputs, errors and runtime:
+"""`solve_contact_problem`: its inputs and errors:
 
-* dense and sparse matrices of any format, lists, and no contacts are accepted; duplicate entries are summed;
+* dense and sparse matrices of any format, lists, and no contacts are accepted; duplicate entries are summed; nothing is changed;
 * invalid input is refused;
 * contacts between immovable bodies get no impulse;
 * the history has the initial residual and that of every iteration; the iteration limit holds; convergence depends on the
-  residual alone;
-* results are float64, and the same in any open precision; an open runtime is reused and stays open.
+  residual alone.
 """
 
 import numpy as np
@@ -13,7 +12,6 @@ import pytest
 import scipy.sparse as sp
 
 import taisoft as ts
-from taisoft.backend import runtime
 from taisoft.contact.api import METHODS
 from tests.contact import contact_oracle as oracle
 
@@ -21,43 +19,25 @@ PROBLEM = oracle.random_contacts(0, 6, 12)
 W, B, MU = PROBLEM.W, PROBLEM.b, PROBLEM.friction
 
 
-@pytest.fixture(scope="module", autouse=True)
-def held():
-    """A runtime for the whole file, so that kernels are compiled once."""
-    opened = runtime.open_runtime("cpu", "f64", "the test")
-    yield
-    opened.close()
-
-
-@pytest.mark.parametrize(
-    "form", [np.asarray, np.ndarray.tolist, sp.csr_matrix, sp.csc_matrix, sp.coo_matrix, sp.csr_array, sp.bsr_matrix]
-)
-def test_formats_of_W(form):
-    before = ts.solve_contact_problem(W, B, MU).impulse
-    found = ts.solve_contact_problem(form(W), B.tolist(), MU.tolist())
-    assert found.converged and np.array_equal(found.impulse, before)
-    assert found.impulse.dtype == np.float64 and found.impulse.shape == (18,)
-
-
-def test_duplicate_entries_are_summed():
+def test_formats_of_W():
+    before, b, mu = ts.solve_contact_problem(W, B, MU).impulse, B.copy(), MU.copy()
+    for form in (np.ndarray.tolist, sp.csr_matrix, sp.coo_matrix, sp.csr_array, sp.bsr_matrix):
+        given = form(W)
+        found = ts.solve_contact_problem(given, b.tolist(), mu, "gauss_seidel")
+        assert found.converged and np.array_equal(found.impulse, before)
+        assert found.impulse.dtype == np.float64 and found.impulse.shape == (18,)
+        assert np.array_equal(given if form is np.ndarray.tolist else given.toarray(), W) and np.array_equal(mu, MU)
     whole = sp.coo_matrix(W)
     twice = sp.coo_matrix((np.tile(0.5 * whole.data, 2), (np.tile(whole.row, 2), np.tile(whole.col, 2))), shape=W.shape)
-    assert ts.solve_contact_problem(twice, B, MU).impulse == pytest.approx(ts.solve_contact_problem(W, B, MU).impulse)
-
-
-def test_inputs_are_not_changed():
-    copy = sp.csr_matrix(W)
-    data, b, mu = copy.data.copy(), B.copy(), MU.copy()
-    ts.solve_contact_problem(copy, b, mu, "auto")
-    assert np.array_equal(copy.data, data) and np.array_equal(b, B) and np.array_equal(mu, MU)
+    assert ts.solve_contact_problem(twice, B, MU).impulse == pytest.approx(before)
 
 
 @pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize("nothing", [np.zeros((0, 0)), sp.csr_matrix((0, 0)), []])
-def test_no_contacts(nothing, method):
-    found = ts.solve_contact_problem(nothing, [], [], method)
-    assert found.converged and found.impulse.shape == (0,) and found.residual == 0.0
-    assert found.iterations == 0 and found.residual_history == [0.0]
+def test_no_contacts(method):
+    for nothing in (np.zeros((0, 0)), sp.csr_matrix((0, 0)), []):
+        found = ts.solve_contact_problem(nothing, [], [], method)
+        assert found.converged and found.impulse.shape == (0,) and found.residual == 0.0
+        assert found.iterations == 0 and found.residual_history == [0.0]
 
 
 def changed(array: np.ndarray, at, value: float) -> np.ndarray:
@@ -70,23 +50,17 @@ def changed(array: np.ndarray, at, value: float) -> np.ndarray:
     "inputs, options, message",
     [
         ((W[:17, :17], B, MU), {}, "W has shape .17, 17.: it must be .3k, 3k., three rows per contact"),
-        ((W[:15], B, MU), {}, "W has shape .15, 18."),
         ((W * 1j, B, MU), {}, "W must hold real numbers, not complex128"),
-        ((W.astype(str), B, MU), {}, "W must hold real numbers"),
         ((changed(W, (4, 7), np.nan), B, MU), {}, r"W\[4, 7\] is nan, not finite"),
         ((sp.csr_matrix(changed(W, (4, 7), np.inf)), B, MU), {}, r"W\[4, 7\] is inf, not finite"),
         ((changed(W, (6, 6), -2.0), B, MU), {}, r"W\[6, 6\] is -2: .* cannot be negative"),
         ((W, B[:-1], MU), {}, r"b must have shape \(18,\), not \(17,\)"),
-        ((W, B.reshape(6, 3), MU), {}, r"b must have shape \(18,\), not \(6, 3\)"),
         ((W, changed(B, 3, np.inf), MU), {}, r"b: entry \[3\] is inf, not finite"),
         ((W, ["a"] * 18, MU), {}, "b must be numbers"),
         ((W, B, MU[:5]), {}, r"mu must have shape \(6,\), not \(5,\)"),
         ((W, B, changed(MU, 2, -0.1)), {}, r"mu\[2\] is -0.1: a coefficient of friction cannot be negative"),
-        ((W, B, changed(MU, 2, np.nan)), {}, r"mu: entry \[2\] is nan"),
         ((W, B, MU), {"method": "gauss_siedel"}, "method must be one of .* did you mean 'gauss_seidel'"),
         ((W, B, MU), {"tolerance": 0.0}, "tolerance must be greater than 0"),
-        ((W, B, MU), {"tolerance": np.nan}, "tolerance must be finite"),
-        ((W, B, MU), {"tolerance": "small"}, "tolerance must be a number"),
         ((W, B, MU), {"max_iterations": 0}, "max_iterations must be a whole number of at least 1, not 0"),
         ((W, B, MU), {"max_iterations": 2.5}, "max_iterations must be a whole number"),
         ((W, B, MU), {"max_iterations": True}, "max_iterations must be a whole number"),
@@ -128,47 +102,13 @@ def test_iteration_limit_and_history(method):
         assert not few.converged and few.iterations == 3
 
 
-def test_history_equals_that_of_shorter_solves():
+def test_histories_are_whole_and_do_not_depend_on_the_limit():
     made = oracle.random_contacts(2, 20, 40)
     found = ts.solve_contact_problem(made.W, made.b, made.friction, tolerance=1e-6)
     for n in (1, 5, found.iterations):
         part = ts.solve_contact_problem(made.W, made.b, made.friction, tolerance=1e-6, max_iterations=n)
         assert part.residual_history == found.residual_history[: n + 1]
         assert oracle.residual(made.W, made.b, made.friction, part.impulse) == pytest.approx(min(part.residual_history))
-
-
-def test_long_histories():
-    """More sweeps than one launch stores residuals of."""
-    made = oracle.random_contacts(3, 60, 40, friction=4.0, spread=1.5)
+    made = oracle.random_contacts(3, 60, 40, friction=4.0, spread=1.5)  # more sweeps than one launch stores residuals of
     found = ts.solve_contact_problem(made.W, made.b, made.friction, "jacobi", 1e-15, 2500)
     assert found.iterations == 2500 and len(found.residual_history) == 2501 and not found.converged
-
-
-def test_larger_problems_do_not_affect_later_ones():
-    """Fields are reused."""
-    small = ts.solve_contact_problem(W, B, MU, "jacobi").impulse
-    large = oracle.random_contacts(4, 90, 40)
-    assert ts.solve_contact_problem(large.W, large.b, large.friction, "auto").converged
-    assert np.array_equal(ts.solve_contact_problem(W, B, MU, "jacobi").impulse, small)
-
-
-def test_open_runtimes_do_not_matter(held):
-    """In f64, in f32, and without one: the same bits, and an open runtime stays open."""
-    made = oracle.random_contacts(5, 20, 40)
-    arguments = (made.W, made.b, made.friction)
-    found = [ts.solve_contact_problem(*arguments, tolerance=1e-12)]
-    assert runtime.open_kind() == ("cpu", "f64")
-    claims, runtime._open[:] = list(runtime._open), []
-    try:
-        found.append(ts.solve_contact_problem(*arguments, tolerance=1e-12))
-        assert runtime.open_kind() is None
-        single = runtime.open_runtime("cpu", "f32")
-        found.append(ts.solve_contact_problem(*arguments, tolerance=1e-12))
-        assert runtime.open_kind() == ("cpu", "f32")
-        single.close()
-        found.append(ts.solve_contact_problem(*arguments, tolerance=1e-12))
-    finally:
-        runtime.open_runtime("cpu", "f64").close()
-        runtime._open[:] = claims
-    assert found[0].converged and all(np.array_equal(f.impulse, found[0].impulse) for f in found[1:])
-    assert all(f.residual_history == found[0].residual_history for f in found[1:])
