@@ -81,44 +81,33 @@ def test_bad_settings_are_refused(beam, tmp_path, capsys, arguments, message):
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize(
-    "name, message",
-    [
+def test_unknown_scenes_and_bad_usage_are_refused(capsys):
+    for name, message in (
         ("not_there.py", "not_there.py: no such file"),
         ("not_there.toml", "not_there.toml: no such file"),
         ("no_such_demo", "neither a demo nor a .toml or .py file"),
         ("hanging_bem", "did you mean hanging_beam?"),
-    ],
-)
-def test_unknown_scenes_are_refused(capsys, name, message):
-    assert run(name) == 2
-    assert message in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("arguments", [[], ["run"], ["run", "a.py", "--arch", "tpu"]])
-def test_bad_usage_is_refused(arguments, capsys):
-    with pytest.raises(SystemExit) as caught:
-        main(arguments)
-    assert caught.value.code == 2
-    assert "usage: taisoft" in capsys.readouterr().err
+    ):
+        assert run(name) == 2
+        assert message in capsys.readouterr().err
+    for arguments in ([], ["run"], ["run", "a.py", "--arch", "tpu"]):
+        with pytest.raises(SystemExit) as caught:
+            main(arguments)
+        assert caught.value.code == 2
+        assert "usage: taisoft" in capsys.readouterr().err
 
 
 # --- settings ---------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    "text, value",
-    [("0.01", 0.01), ("1", 1), ("true", True), ("bdf2", "bdf2"), ('"bdf2"', "bdf2"), ("none", None), ("1e-3", 1e-3)],
-)
-def test_scalars_keep_their_type(text, value):
-    parsed = parse_scalar(text, "solver.x=" + text)
-    assert parsed == value and type(parsed) is type(value)
-
-
-@pytest.mark.parametrize("text", ["", "[1]", "{a = 1}", "1\nb = 2", "1 2", "2020-01-01", "a-b", "__import__('os')"])
-def test_values_that_are_no_scalars_are_refused(text):
-    with pytest.raises(SceneError):
-        parse_scalar(text, "solver.x=" + text)
+def test_scalars_keep_their_type():
+    given = [("0.01", 0.01), ("1", 1), ("true", True), ("bdf2", "bdf2"), ('"bdf2"', "bdf2"), ("none", None), ("1e-3", 1e-3)]
+    for text, value in given:
+        parsed = parse_scalar(text, "solver.x=" + text)
+        assert parsed == value and type(parsed) is type(value)
+    for text in ("", "[1]", "{a = 1}", "1\nb = 2", "1 2", "2020-01-01", "a-b", "__import__('os')"):
+        with pytest.raises(SceneError):
+            parse_scalar(text, "solver.x=" + text)
 
 
 def test_options_override_set_and_set_overrides_the_scene():
@@ -134,62 +123,43 @@ def test_options_override_set_and_set_overrides_the_scene():
 # --- other commands ---------------------------------------------------------------------------------------------------
 
 
-def test_list_shows_first_lines_and_runs_nothing(tmp_path, monkeypatch, capsys):
-    (tmp_path / "demos").mkdir()
-    write(tmp_path / "demos" / "one.py", '"""The first.\n\nMore."""\nraise RuntimeError\n')
-    write(tmp_path / "demos" / "two.py", "raise RuntimeError\n")
-    write(tmp_path / "demos" / "_helper.py", "raise RuntimeError\n")
-    monkeypatch.setattr(scene_file, "PACKAGE", tmp_path)
-    assert main(["list"]) == 0
-    assert capsys.readouterr().out.splitlines() == ["one  The first.", "two"]
-
-
 @pytest.mark.parametrize("kind", ["wheel", "checkout"])
-def test_demos_are_found(tmp_path, monkeypatch, kind):
+def test_list_shows_first_lines_and_runs_nothing(tmp_path, monkeypatch, capsys, kind):
     package = tmp_path / "taisoft"
     folder = (package if kind == "wheel" else tmp_path) / "demos"
-    package.mkdir()
-    folder.mkdir()
-    write(folder / "one.py", BEAM)
+    folder.mkdir(parents=True)
+    package.mkdir(exist_ok=True)
+    write(folder / "one.py", '"""The first.\n\nMore."""\nraise RuntimeError\n')
+    write(folder / "two.py", "raise RuntimeError\n")
+    write(folder / "_helper.py", "raise RuntimeError\n")
     monkeypatch.setattr(scene_file, "PACKAGE", package)
+    assert main(["list"]) == 0
+    assert capsys.readouterr().out.splitlines() == ["one  The first.", "two"]
     assert scene_file.find_scene("one") == folder / "one.py"
 
 
-def test_info_shows_counts_and_measures(tmp_path, capsys):
-    path = tmp_path / "box.msh"
-    ts.write_mesh(path, ts.box_mesh((2, 1, 1), (2, 1, 1)))
-    assert main(["info", str(path)]) == 0
-    shown = capsys.readouterr().out
-    for part in (
-        "12 vertices, 10 tets, 20 surface triangles, 1 piece",
-        "x 2 (-1 to 1), y 1 (-0.5 to 0.5), z 1 (-0.5 to 0.5)",
-        "y is taken for up",
-        "volume     2\n",
-        "metres",
-    ):
-        assert part in shown
-    assert "mean ratio 0.8" in shown and "problems   none" in shown
-
-
 @pytest.mark.filterwarnings("ignore:.*nearly flat")
-@pytest.mark.parametrize(
-    "size, message", [((100, 50, 50), "probably millimetres"), ((1, 1, 1e-3), "problems   5 tets are nearly flat or needles")]
-)
-def test_info_shows_problems(tmp_path, capsys, size, message):
+def test_info_shows_counts_measures_and_problems(tmp_path, capsys):
+    counts = "12 vertices, 10 tets, 20 surface triangles, 1 piece"
+    extents = "x 2 (-1 to 1), y 1 (-0.5 to 0.5), z 1 (-0.5 to 0.5)"
     path = tmp_path / "part.msh"
-    ts.write_mesh(path, ts.box_mesh((1, 1, 1), size))
-    assert main(["info", str(path)]) == 0
-    assert message in capsys.readouterr().out
-
-
-@pytest.mark.parametrize("content", [b"", b"\x00\x01random", None])
-def test_info_refuses_other_files(tmp_path, capsys, content):
-    path = tmp_path / "mesh.msh"
-    if content is not None:
-        path.write_bytes(content)
+    for cells, size, parts in (
+        (
+            (2, 1, 1),
+            (2, 1, 1),
+            (counts, extents, "y is taken for up", "volume     2\n", "metres", "mean ratio 0.8", "problems   none"),
+        ),
+        ((1, 1, 1), (100, 50, 50), ("probably millimetres",)),
+        ((1, 1, 1), (1, 1, 1e-3), ("problems   5 tets are nearly flat or needles",)),
+    ):
+        ts.write_mesh(path, ts.box_mesh(cells, size))
+        assert main(["info", str(path)]) == 0
+        shown = capsys.readouterr().out
+        assert [part for part in parts if part not in shown] == []
+    path.write_bytes(b"\x00\x01random")
     assert main(["info", str(path)]) == 2
     error = capsys.readouterr().err
-    assert "mesh.msh" in error and error.count("\n") == 1
+    assert "part.msh" in error and error.count("\n") == 1
 
 
 def test_doctor_lists_what_is_installed_and_missing(monkeypatch, capsys):
@@ -226,8 +196,8 @@ def test_bench_passes_its_arguments_on(tmp_path, monkeypatch, capsys):
     assert "did you mean counting?" in capsys.readouterr().err
 
 
-def test_list_imports_no_taichi(tmp_path):
-    code = "import sys, taisoft\nfrom taisoft.cli import main\nmain(['list'])\nassert 'taichi' not in sys.modules\n"
+def test_the_command_imports_no_taichi(tmp_path):
+    code = "import sys, taisoft.cli.study\nfrom taisoft.cli import main\nmain(['list'])\nassert 'taichi' not in sys.modules\n"
     subprocess.run([sys.executable, "-c", code], check=True, env=os.environ | {"PYTHONPATH": str(ROOT)}, cwd=tmp_path)
 
 

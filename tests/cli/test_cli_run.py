@@ -13,8 +13,10 @@ import signal
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 
+from taisoft.checkpoint import read_checkpoint
 from taisoft.cli import main, recording
 from taisoft.errors import OutputError
 from taisoft.view import pictures
@@ -42,11 +44,6 @@ def test_a_run_writes_and_prints_its_results(beam, tmp_path, capsys):
     for word in ("fixed_nodes", f"\n\nstatus   ok; {lowered}\n", "min J", "kinetic", "report.json", "(4 pictures"):
         assert word in shown
     assert len(shown.splitlines()) < 40  # one screen
-
-
-def test_results_are_replaced_only_on_request(beam, tmp_path, capsys):
-    out = tmp_path / "out"
-    assert run(beam, "--out", out) == 0
     before = (out / "report.json").read_bytes()
     assert run(beam, "--out", out) == 3
     assert "already holds results" in capsys.readouterr().err
@@ -56,46 +53,47 @@ def test_results_are_replaced_only_on_request(beam, tmp_path, capsys):
     assert not (out / "scene.usdc").exists()  # it was of the earlier run
 
 
-def test_without_out_nothing_is_written(beam, tmp_path, monkeypatch):
+def test_without_out_nothing_is_written(tmp_path, monkeypatch, capsys):
+    """The scene imports its neighbour, and the plan is short unless verbose."""
+    write(tmp_path / "beam_parts_of_this_test.py", BEAM)
+    path = write(tmp_path / "scene.py", "from beam_parts_of_this_test import build, solver\n")
     (tmp_path / "empty").mkdir()
     monkeypatch.chdir(tmp_path / "empty")
-    assert run(beam) == 0
+    assert run(path, "--seconds", "0.01") == 0
+    short = capsys.readouterr().out
+    assert "\nleft out" not in short and "plan     law:stable_neo_hookean, " in short and "used by" not in short
+    assert run(path, "--seconds", "0.01", "--verbose") == 0
+    assert re.search(r"law:stable_neo_hookean +used by beam\n", full := capsys.readouterr().out) and "\nleft out law:" in full
     assert not list((tmp_path / "empty").iterdir())
 
 
-def test_a_failed_run_is_reported(tmp_path, capsys):
-    path = write(tmp_path / "led.py", LED.replace("{body}", "return (0, 0, 0) if t < 0.05 else (0, float('nan'), 0)"))
+def test_options_that_need_a_folder(beam, capsys):
+    for option, *value in (["--vtu"], ["--npz"], ["--video"], ["--checkpoint-every", "0.1"]):
+        assert run(beam, option, *value) == 2
+        assert f"{option} needs --out" in capsys.readouterr().err
+
+
+def test_a_failed_run_is_reported_and_keeps_its_last_good_state(tmp_path, capsys):
+    path = write(tmp_path / "led.py", LED.replace("{body}", "return (0, -t, 0) if t < 0.05 else (0, float('nan'), 0)"))
     out = tmp_path / "out"
     assert run(path, "--out", out, *SHORT_OUTPUT) == 1
     record = report(out)
     assert record["status"] == "failed" and 0.0 < record["sim_seconds"] < 0.1
     assert record["problems"] and record["problems"][0] in capsys.readouterr().out.replace("\n         ", " ")
+    simulation = read_checkpoint(out / "checkpoint.npz").state["simulation"]
+    assert 0.0 < simulation["time"] < 0.05 and np.isfinite(simulation["x"]).all()
 
 
-def test_warnings_are_printed_once_and_reported(tmp_path, capsys):
-    path = write(tmp_path / "stiff.py", BEAM.replace("young=1e5", "young=1e5, poisson=0.495"))
-    out = tmp_path / "out"
-    assert run(path, "--out", out, *SHORT_OUTPUT) == 0
-    error = capsys.readouterr().err
+def test_notes_and_warnings_are_printed_and_reported(tmp_path, capsys):
+    """Warnings once as they come; in the summary problems first, of which an ok run has none."""
+    path, out = write(tmp_path / "stiff.py", BEAM.replace("young=1e5", "young=1e5, poisson=0.495")), tmp_path / "out"
+    short = ("--set", "solver.dt=0.004", "--set", "solver.fps=none", "--seconds", "0.001")
+    assert run(path, "--out", out, *SHORT_OUTPUT, *short) == 0
+    shown, error = capsys.readouterr()
     assert error.count("taisoft: warning: body 'beam': poisson = 0.495") == 1
     assert report(out)["problems"][0].startswith("warning: body 'beam': poisson = 0.495")
-
-
-def test_the_summary_names_notes_and_warnings(tmp_path, capsys):
-    """Problems first; an ok run has none."""
-    path = write(tmp_path / "stiff.py", BEAM.replace("young=1e5", "young=1e5, poisson=0.495"))
-    assert run(path, "--set", "solver.dt=0.004", "--set", "solver.fps=none", "--seconds", "0.001") == 0
-    shown = capsys.readouterr().out
     assert "\nwarning  body 'beam': poisson = 0.495" in shown and "\nnote     0.001 s are less than half a step" in shown
     assert "problem" not in shown and shown.index("\nwarning") < shown.index("\nnote")
-
-
-def test_the_plan_is_short_unless_verbose(beam, capsys):
-    assert run(beam, "--seconds", "0.01") == 0
-    short = capsys.readouterr().out
-    assert "\nleft out" not in short and "plan     law:stable_neo_hookean, " in short and "used by" not in short
-    assert run(beam, "--seconds", "0.01", "--verbose") == 0
-    assert re.search(r"law:stable_neo_hookean +used by beam\n", full := capsys.readouterr().out) and "\nleft out law:" in full
 
 
 def test_a_run_with_twins_says_what_they_cost(beam, capsys):
@@ -103,12 +101,6 @@ def test_a_run_with_twins_says_what_they_cost(beam, capsys):
     shown = capsys.readouterr().out
     assert "\ntwins    follow the run, the one on the refined mesh for some 10 to 40 times its work" in shown
     assert re.search(r"; plus \d+\.\d\d s of twins for the error and ", shown)
-
-
-def test_a_scene_may_import_its_neighbour(tmp_path):
-    write(tmp_path / "beam_parts_of_this_test.py", BEAM)
-    path = write(tmp_path / "scene.py", "from beam_parts_of_this_test import build, solver\n")
-    assert run(path) == 0
 
 
 def test_a_picture_that_cannot_be_written_ends_the_run(beam, tmp_path, monkeypatch, capsys):

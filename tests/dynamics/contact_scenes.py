@@ -1,4 +1,7 @@
-"""A scene for tests of steps with contacts: a cube on a belt, a load on a shelf, two bodies that fly; and its numbers."""
+"""A scene for tests of steps with contacts: a cube on a belt, a load on a shelf, two bodies that fly; and its numbers.
+
+Tests of implicit steps share its structure, and so its kernels: linear tets of `material`, a half-space, f64.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -12,11 +15,20 @@ SIDE = 0.1  # [m] of the cubes
 MASS = 1000.0 * SIDE**3  # [kg] of each
 GRAVITY = np.array([0.0, -9.81, 0.0])
 FRICTION = 0.5
-BELT = np.array([0.0, -0.1, 0.0])  # middle of the belt [m]
+
+
+def material(**numbers) -> ts.Material:
+    """A soft material with friction and mass damping, which is small by default."""
+    return ts.Material(**{"young": 1e5, "poisson": 0.3, "density": 1000.0, "friction": FRICTION, "mass_damping": 0.01, **numbers})
+
+
+def ground() -> ts.HalfSpace:
+    """The half-space below y = 0."""
+    return ts.HalfSpace((0, 0, 0), (0, 1, 0))
 
 
 def still(t: float) -> tuple[np.ndarray, np.ndarray]:
-    """A belt that stands."""
+    """A belt at rest."""
     return np.zeros(3), np.eye(3)
 
 
@@ -32,7 +44,7 @@ def turning(rate: float):
 
 @dataclass
 class Stage:
-    """Where the whole scene is, x -> Q x + T, and how the belt goes: t -> (translation, rotation about its middle)."""
+    """Place of the whole scene, x -> Q x + T, and motion of the belt: t -> (translation, rotation about the origin)."""
 
     Q: np.ndarray = field(default_factory=lambda: np.eye(3))
     T: np.ndarray = field(default_factory=lambda: np.zeros(3))
@@ -41,7 +53,7 @@ class Stage:
     def belt(self, t: float) -> tuple[np.ndarray, np.ndarray]:
         """The belt's path."""
         shift, turn = self.motion(t)
-        return self.Q @ (BELT + shift) + self.T - BELT, self.Q @ turn
+        return self.Q @ shift + self.T, self.Q @ turn
 
 
 def cube(cells: int, seed: int | None = None) -> ts.TetMesh:
@@ -53,21 +65,19 @@ def cube(cells: int, seed: int | None = None) -> ts.TetMesh:
 
 
 def scene(place: Stage) -> ts.Scene:
-    """cube on the belt at 0.1 m from its middle; load on shelf, which is held below; left and right, about to meet."""
+    """cube on the belt at 0.1 m from its axis; load on shelf, which is held below; left and right, about to meet."""
     made = ts.Scene(gravity=place.Q @ GRAVITY)
-    damped = ts.Material(young=1e5, poisson=0.3, density=1000.0, friction=FRICTION, mass_damping=4.0)
-    free = ts.Material(young=1e5, poisson=0.3, density=1000.0, friction=FRICTION)
-    gap = 3e-4
+    damped, gap = material(mass_damping=4.0), 3e-4
     bodies = [
         ("cube", cube(2), damped, (0.1, gap, 0.0), (0, 0, 0)),
-        ("shelf", ts.box_mesh((3, 1, 3), (0.3, 0.1, 0.3)), damped, (2.0, -0.05, 0.0), (0, 0, 0)),
-        ("load", cube(2), damped, (2.02, gap, 0.01), (0, 0, 0)),
-        ("left", cube(1, 1), free, (-4.0, 3.0, 0.0), (1.0, 0.2, 0.0)),
-        ("right", cube(1, 2), free, (-3.87, 3.03, 0.02), (-1.0, 0.0, 0.1)),
+        ("shelf", ts.box_mesh((3, 1, 3), (0.3, 0.1, 0.3)), damped, (2.0, 0.45, 0.0), (0, 0, 0)),
+        ("load", cube(2), damped, (2.02, 0.5 + gap, 0.01), (0, 0, 0)),
+        ("left", cube(1, 1), material(mass_damping=0.0), (-4.0, 3.0, 0.0), (1.0, 0.2, 0.0)),
+        ("right", cube(1, 2), material(mass_damping=0.0), (-3.87, 3.03, 0.02), (-1.0, 0.0, 0.1)),
     ]
-    for name, mesh, material, at, v in bodies:
-        body = made.add_body(mesh, material, name=name, position=at, velocity=v)
+    for name, mesh, rubber, at, v in bodies:
+        body = made.add_body(mesh, rubber, name=name, position=at, velocity=v)
         if name == "shelf":
             body.fix(lambda X: X[:, 1] < -0.04)
-    made.add_obstacle(ts.Box(BELT, (0.6, 0.1, 0.6)), name="belt", friction=FRICTION, path=place.belt)
+    made.add_obstacle(ground(), name="belt", friction=FRICTION, path=place.belt)
     return made

@@ -1,4 +1,4 @@
-"""Small scenes for tests of the core, and the machine's arrays of a scene without a simulator around them."""
+"""Small scenes for tests of the core, and the arrays of a scene without a simulator around them."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -126,15 +126,15 @@ def mixed_scene(
     return scene
 
 
-RELEASE = 0.0095  # [s] when the driven scene's first led nodes let go
+RELEASE = 0.0095  # [s] when the driven scene's first prescribed nodes are released
 
 
 def driven_scene(
     law: str = SNH, mass_damping: float = 0.0, stiffness_damping: float = 0.0, order: int | str = 1, connected: bool = False
 ) -> ts.Scene:
-    """A beam that is held, led and loaded in every way there is, and a flyer; vertices 8..11 are the beam's right end.
+    """A beam that is fixed, moved and loaded in every way there is, and a flyer; vertices 8..11 are the beam's right end.
 
-    Two nodes are led along x and y until they are released, one along z by a path of its own, and their other axes are
+    Two nodes are moved along x and y until they are released, one along z by a path of its own, and their other axes are
     free. damping: of the beam; the flyer has a third of its mass damping. order: 1, 2, or "both": 2 for the beam.
     connected: with springs and a tendon, within the beam and between the two.
     """
@@ -195,7 +195,7 @@ def connected_scene(order: int = 1, damping: float = 0.0, gravity=(0.0, 0.0, 0.0
 
 @dataclass
 class Rig:
-    """A scene in the machine, and what it should do. parallel: the model whose loops run on several threads."""
+    """A scene's arrays, and its oracle. parallel: the model whose loops run on several threads. machine: the runtime."""
 
     scene: ts.Scene
     machine: Runtime
@@ -216,7 +216,7 @@ class Rig:
 
 
 def use_threads(monkeypatch, several: bool = True) -> list[bool]:
-    """Divide loops over any mesh into chunks, and run them on several threads, or on one; the answers given are returned."""
+    """Divide loops over any mesh into chunks, and run them on several threads, or on one. Return the answers given."""
     answers: list[bool] = []
     monkeypatch.setattr("taisoft.fem.model.CHUNKED_FROM", 0)
     monkeypatch.setattr("taisoft.fem.chunks.MIN_SHIFT", 2)

@@ -76,7 +76,7 @@ def test_release():
     assert dirichlet.constrained()[8].all() and len(dirichlet.targets(times)[0]) == 2
 
 
-@pytest.mark.parametrize("steps", [3, 7, 10, 24, 1000])
+@pytest.mark.parametrize("steps", [3, 10, 1000])
 def test_a_step_that_ends_with_the_path_follows_it_to_there(steps):
     """Whatever the rounding of the step's end: nodes are not released a step early."""
     dirichlet, rest = made(([0, 1], "xyz", lambda t: (t, 0.0, 0.0) if t < 0.3 else None))
@@ -86,7 +86,7 @@ def test_a_step_that_ends_with_the_path_follows_it_to_there(steps):
 
 
 @pytest.mark.parametrize("middle", [False, True])
-@pytest.mark.parametrize("steps", [3, 10, 1000])
+@pytest.mark.parametrize("steps", [3, 1000])
 def test_accelerations_of_a_step_that_ends_with_the_path(steps, middle):
     """They are those of the path until then."""
     dirichlet, _ = made(([0, 1], "xyz", lambda t: (t * t, 0.0, 0.0) if t < 0.3 else None))
@@ -94,23 +94,28 @@ def test_accelerations_of_a_step_that_ends_with_the_path(steps, middle):
     assert dirichlet.accelerations(0.3 - dt, dt, middle) == pytest.approx(np.tile((2.0, 0.0, 0.0), (2, 1)), abs=1e-6)
 
 
-SHAPES = [(1, 2), np.zeros((3, 3)), np.zeros((2, 2)), 1.0]
-FINITE = [(0, np.nan, 0), np.full((2, 3), np.inf)]
-NUMBERS = ["up", ("1", "2", "3"), (None, 0, 0), (True, False, True)]
-GIVEN = "the path's displacement at t = 1.5"
-
-
 @pytest.mark.parametrize(
     "late, words",
-    [(lambda t, value=value: value, rf"{GIVEN} must have shape \(3,\) or \(2, 3\), not \(.*\)$") for value in SHAPES]
-    + [(lambda t, value=value: value, rf"{GIVEN}: entry \[.*\] is .*, not finite$") for value in FINITE]
-    + [(lambda t, value=value: value, rf"{GIVEN} must be numbers of shape \(3,\) or \(2, 3\), not .*") for value in NUMBERS]
-    + [(lambda t: (0, 1e39, 0), rf"{GIVEN}: entry \[1\] is 1e\+39, too large for a 32-bit float$")]
-    + [(lambda t: {}["a\n b"], r"the path failed at t = 1.5: KeyError: 'a.n b'$")]
-    + [(lambda t: float("x\n" * 999), "the path failed at t = 1.5: ValueError: could not convert .{1,90}$")],
+    [
+        (lambda t: np.zeros((3, 3)), r"'s displacement at t = 1.5 must have shape \(3,\) or \(2, 3\), not \(3, 3\)$"),
+        (lambda t: (0, np.nan, 0), r"'s displacement at t = 1.5: entry \[1\] is nan, not finite$"),
+        (lambda t: ("1", "2", "3"), r"'s displacement at t = 1.5 must be numbers of shape \(3,\) or \(2, 3\), not .*"),
+        (lambda t: (True, False, True), r"'s displacement at t = 1.5 must be numbers of shape \(3,\) or \(2, 3\), not .*"),
+        (lambda t: (0, 1e39, 0), r"'s displacement at t = 1.5: entry \[1\] is 1e\+39, too large for a 32-bit float$"),
+        (lambda t: {}["a\n b"], r" failed at t = 1.5: KeyError: 'a.n b'$"),
+        (lambda t: float("x\n" * 999), " failed at t = 1.5: ValueError: could not convert .{1,90}$"),
+    ],
 )
 def test_invalid_paths_are_refused(late, words):
     dirichlet, _ = made(([0, 1], "xyz", lambda t: (0, 0, 0) if t < 1 else late(t)))
     dirichlet.targets(np.array([0.5]))
-    with pytest.raises(ts.SimulationError, match=f"^body 'prescribed': moved nodes: {words}"):
+    with pytest.raises(ts.SimulationError, match=f"^body 'prescribed': moved nodes: the path{words}"):
         dirichlet.targets(np.array([1.5]))
+
+
+def test_a_displacement_after_a_release_is_refused():
+    """Also in a part of the step, where accelerations need the path."""
+    dirichlet, _ = made(([0, 1], "xyz", lambda t: None if 0.004 < t < 0.006 else (t, 0.0, 0.0)))
+    with pytest.raises(ts.SimulationError, match="body 'prescribed': moved nodes: the path gave None at t = 0.005,"):
+        dirichlet.targets(np.array([0.01]))
+        dirichlet.accelerations(0.0, 0.01, True)

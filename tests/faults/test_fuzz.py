@@ -15,6 +15,7 @@ import warnings
 import meshio
 import numpy as np
 import pytest
+from pxr import Usd, UsdGeom, Vt
 
 import taisoft as ts
 from taisoft.checkpoint import read_checkpoint, write_checkpoint
@@ -31,21 +32,8 @@ GMSH = {
     "ansys.msh": ("ansys", False),
 }
 OTHERS = "vtk vtu mesh meshb vol su2 xml dat bdf nas fem inp mdpa avs f3grid post ugrid node".split()
-PIECES = (
-    b"-1",
-    b"9",
-    b"nan",
-    b"1e400",
-    b" ",
-    b"\n",
-    b"$End",
-    b"\0",
-    b"\xff\xfe",
-    b"99999",
-    b"3000000",
-    b"\xff\xff\xff\x7f",
-    b"\0\0\0@",
-)
+TEXTS = (b"-1", b"9", b"nan", b"1e400", b" ", b"\n", b"$End", b"99999", b"3000000")
+PIECES = (*TEXTS, b"\0", b"\xff\xfe", b"\xff\xff\xff\x7f", b"\0\0\0@")
 SIZES = (0, -1, 10**5, 10**6, 10**7, 10**9, 2**31, 2**32 - 1, 2**63, 10**30)
 BASE_MEMORY, MEMORY_PER_BYTE = 5_000_000, 400  # bytes that a reader may allocate: for any file, and per byte of the file
 SECONDS = 20  # time limit of a reader
@@ -67,6 +55,12 @@ def samples(tmp_path_factory) -> dict[str, bytes]:
             meshio.write(folder / f"surface{ending}", triangles)
         meshio.write(folder / "text.ply", triangles, binary=False)
         meshio.write(folder / "binary.stl", triangles, binary=True)
+    for ending in ("usda", "usdc"):
+        stage = Usd.Stage.CreateNew(str(folder / f"stage.{ending}"))
+        prim = UsdGeom.TetMesh.Define(stage, "/tets")
+        prim.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(MESH.vertices.astype(np.float32)))
+        prim.CreateTetVertexIndicesAttr(Vt.Vec4iArray.FromNumpy(MESH.tets.astype(np.int32)))
+        stage.Save()
     write_checkpoint(folder / "a.npz", {}, beam_scene(), {}, {"x": np.arange(300.0), "n": 3}, {"fps": 30.0})
     # without cell counts, since changed ones may describe a valid but huge mesh
     (folder / "scene.toml").write_text(TEXT[: TEXT.index("[bodies.beam]")] + "[bodies.beam]\nmesh = { file = 'part.vtk' }\n")
@@ -79,6 +73,8 @@ def read(path) -> None:
         ts.read_scene(path)
     elif path.suffix == ".npz":
         read_checkpoint(path)
+    elif path.suffix in (".usda", ".usdc"):
+        ts.read_usd(path)
     elif path.suffix in FORMATS:
         read_surface(path)
     else:

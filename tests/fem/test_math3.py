@@ -1,4 +1,4 @@
-"""3x3 matrices over SIMD lanes, in f32 and f64, with one lane and with four:
+"""3x3 matrices over four SIMD lanes in f64; `test_single_precision` has one lane in f32:
 
 * products, cofactor and its differential, determinant and double contraction equal NumPy's;
 * the signed SVD reproduces F from two rotations and sorted values to a few roundings, and the last value is negative exactly
@@ -7,7 +7,6 @@
 """
 
 import numpy as np
-import pytest
 import taichi as ti
 
 from taisoft.backend.runtime import kernel
@@ -38,44 +37,19 @@ def decompositions(lanes: ti.template(), A: ti.types.ndarray(), B: ti.types.ndar
         store(out, b, 0, U + V + C + s, lanes)
 
 
-@pytest.fixture(scope="module", params=["f64", "f32"])
-def machine(request):
-    with opened(request.param) as runtime:
-        yield runtime
-
-
-def test_products_equal_those_of_numpy(machine):
-    rng = np.random.default_rng(1)
-    F, D = rng.standard_normal((2, 102, 3, 3))
-    F, D = (A.astype(machine.np_real).astype(np.float64) for A in (F, D))
-    G, h = oracle.cofactor(F), 1e-30
+def check_products(runtime, lanes: int) -> None:
+    """Products, cofactor and its differential, determinant and double contraction equal NumPy's."""
+    F, D = np.random.default_rng(1).standard_normal((2, 102, 3, 3)).astype(runtime.np_real).astype(np.float64)
+    h = 1e-30
     dG = oracle.cofactor(F + 1j * h * D).imag / h
-    matrices = [F @ D, F @ oracle.transposed(D), oracle.transposed(F) @ D, G, dG]
+    matrices = [F @ D, F @ oracle.transposed(D), oracle.transposed(F) @ D, oracle.cofactor(F), dG]
     scalars = [np.linalg.det(F), np.sum(F * D, axis=(1, 2))]
     expected = np.concatenate([M.reshape(-1, 9) for M in matrices] + [s[:, None] for s in scalars], axis=1)
-    for lanes in (4, 1):
-        A, B = packed(F, lanes, machine.np_real), packed(D, lanes, machine.np_real)
-        out = np.zeros((len(A), expected.shape[1], lanes), machine.np_real)
-        products(lanes, A, B, out)
-        # sums of at most 18 products of numbers of size up to 4
-        assert np.abs(unpacked(out, len(F)) - expected).max() < 50 * machine.eps
-
-
-@pytest.fixture(scope="module")
-def decomposed(machine):
-    """(kind, lanes) -> F, U, s, V, S, clamped S, where S is the symmetric part of F."""
-    results = {}
-    for lanes in (4, 1):
-        for kind, F in MATRICES.items():
-            F = F.astype(machine.np_real)
-            S = (F + oracle.transposed(F)) / 2
-            A = packed(F, lanes, machine.np_real)
-            out = np.zeros((len(A), 30, lanes), machine.np_real)
-            decompositions(lanes, A, packed(S, lanes, machine.np_real), out)
-            flat = unpacked(out, len(F))
-            U, V, C = (flat[:, k : k + 9].reshape(-1, 3, 3) for k in (0, 9, 18))
-            results[kind, lanes] = F.astype(np.float64), U, flat[:, 27:], V, S.astype(np.float64), C
-    return results
+    A, B = packed(F, lanes, runtime.np_real), packed(D, lanes, runtime.np_real)
+    out = np.zeros((len(A), expected.shape[1], lanes), runtime.np_real)
+    products(lanes, A, B, out)
+    # sums of at most 18 products of numbers of size up to 4
+    assert np.abs(unpacked(out, len(F)) - expected).max() < 50 * runtime.eps
 
 
 def largest(A) -> np.ndarray:
@@ -84,32 +58,33 @@ def largest(A) -> np.ndarray:
     return np.where(size > 0, size, 1.0)
 
 
-@pytest.mark.parametrize("kind", MATRICES)
-def test_signed_svd(machine, decomposed, kind):
-    for lanes in (4, 1):
-        F, U, s, V, _, _ = decomposed[kind, lanes]
-        size, eps = largest(F), 25 * machine.eps  # five sweeps of rotations, a few roundings each; 14 eps was observed
+def check_decompositions(runtime, lanes: int) -> None:
+    """The signed SVD and the clamped symmetric part of all kinds of matrices are those of NumPy."""
+    for kind, F in MATRICES.items():
+        F = F.astype(runtime.np_real)
+        S = (F + oracle.transposed(F)) / 2
+        A = packed(F, lanes, runtime.np_real)
+        out = np.zeros((len(A), 30, lanes), runtime.np_real)
+        decompositions(lanes, A, packed(S, lanes, runtime.np_real), out)
+        flat = unpacked(out, len(F))
+        U, V, C = (flat[:, k : k + 9].reshape(-1, 3, 3) for k in (0, 9, 18))
+        F, s, S = F.astype(np.float64), flat[:, 27:], S.astype(np.float64)
+        size, eps = largest(F), 25 * runtime.eps  # five sweeps of rotations, a few roundings each; 14 eps was observed
         for Q in (U, V):
-            assert np.abs(oracle.transposed(Q) @ Q - np.eye(3)).max() < eps
-            assert np.abs(np.linalg.det(Q) - 1).max() < eps
-        assert (np.abs(U @ (s[..., None] * oracle.transposed(V)) - F).max(axis=(1, 2)) / size).max() < eps
-        assert (np.abs(s - oracle.signed_svd(F)[1]).max(axis=1) / size).max() < eps
-        assert ((s[:, 1] - s[:, 0]) / size).max() < eps and ((np.abs(s[:, 2]) - s[:, 1]) / size).max() < eps
+            assert np.abs(oracle.transposed(Q) @ Q - np.eye(3)).max() < eps, kind
+            assert np.abs(np.linalg.det(Q) - 1).max() < eps, kind
+        assert (np.abs(U @ (s[..., None] * oracle.transposed(V)) - F).max(axis=(1, 2)) / size).max() < eps, kind
+        assert (np.abs(s - oracle.signed_svd(F)[1]).max(axis=1) / size).max() < eps, kind
+        assert ((s[:, 1] - s[:, 0]) / size).max() < eps and ((np.abs(s[:, 2]) - s[:, 1]) / size).max() < eps, kind
         clear = np.abs(np.linalg.det(F / size[:, None, None])) > eps
-        assert np.array_equal(s[clear, 2] < 0, np.linalg.det(F / size[:, None, None])[clear] < 0)
+        assert np.array_equal(s[clear, 2] < 0, np.linalg.det(F / size[:, None, None])[clear] < 0), kind
+        if kind != "huge":
+            w, Q = np.linalg.eigh(S)
+            expected = (Q * np.maximum(w, 0)[:, None, :]) @ oracle.transposed(Q)
+            assert (np.abs(C - expected).max(axis=(1, 2)) / largest(S)).max() < 40 * runtime.eps, kind
 
 
-def test_the_matrices_include_inverted_flat_isotropic_and_extremely_stretched_ones():
-    F = np.concatenate([A / largest(A)[:, None, None] for A in MATRICES.values()])
-    s = oracle.signed_svd(F)[1]
-    assert (s[:, 2] < -1e-3).sum() > 1000 and (np.abs(s[:, 2]) < 1e-14).sum() > 1000
-    assert (s[:, 0] - s[:, 2] < 1e-12).sum() > 400 and (s[:, 0] > 1e5 * s[:, 1]).sum() > 400
-
-
-@pytest.mark.parametrize("kind", [k for k in MATRICES if k != "huge"])
-def test_clamped_symmetric_matrix(machine, decomposed, kind):
-    for lanes in (4, 1):
-        *_, S, C = decomposed[kind, lanes]
-        w, Q = np.linalg.eigh(S)
-        expected = (Q * np.maximum(w, 0)[:, None, :]) @ oracle.transposed(Q)
-        assert (np.abs(C - expected).max(axis=(1, 2)) / largest(S)).max() < 40 * machine.eps
+def test_products_and_decompositions_equal_those_of_numpy():
+    with opened("f64") as runtime:
+        check_products(runtime, lanes=4)
+        check_decompositions(runtime, lanes=4)

@@ -6,8 +6,6 @@
 * the result is the same bits on one thread and on several, and exact.
 """
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import taichi as ti
@@ -18,21 +16,22 @@ from taisoft.linear.coupling import build_coupling
 from taisoft.linear.pcg_work import RZ, build_pcg
 from taisoft.linear.sweep_order import BESIDE, IS_LAST, find_last
 from tests.dynamics.scenes import built, mixed_scene
+from tests.linear.boxes import divided
 
 N_TERMS, WIDTH, FIXED = 30, 6, [2, 9]
-CHUNKS = {"layered": 3, "crossed": 6}
+SHIFTS = {"layered": 5, "crossed": 4}  # three chunks of 32 nodes, of which blocks couple neighbours alone, and six of 16
 
 
-@pytest.fixture(scope="module", params=[(name, shared) for name in CHUNKS for shared in (True, False)], ids=str)
+@pytest.fixture(scope="module", params=[("layered", False), ("crossed", True)], ids=str)
 def rig(request):
     name, shared = request.param
-    with built(mixed_scene(order="both"), "f64") as made, pytest.MonkeyPatch.context() as patch:
-        patch.setattr("taisoft.fem.chunks.MIN_SHIFT", 0)
-        patch.setattr("taisoft.fem.chunks.SWEEP_CHUNKS", CHUNKS[name])
-        m, arena, rng = made.parallel, FieldArena(), np.random.default_rng(4)
-        made.order, made.shared, n = m.sweep, shared, m.n_nodes
+    with built(mixed_scene(order="both"), "f64") as made:
+        arena, rng = FieldArena(), np.random.default_rng(4)
+        one, several = (divided(made.model, arena, SHIFTS[name], serial) for serial in (True, False))
+        m = several
+        made.models, made.order, made.shared, n = {True: one, False: several}, m.sweep, shared, m.n_nodes
         made.matrix, made.work = block_csr.build_block_csr(m, arena), build_pcg(m, arena)
-        assert made.work.n_chunks == CHUNKS[name] and made.matrix.crossed == (name == "crossed")
+        assert made.work.n_chunks == (3 if name == "layered" else 6) and made.matrix.crossed == (name == "crossed")
         free = np.ones((n, 3))
         free[FIXED] = 0.0
         m.free.from_numpy(free)
@@ -58,7 +57,7 @@ def rig(request):
 
 
 def upload_terms(made, arena, weights, D, active, base):
-    m, node = made.parallel, np.zeros((N_TERMS, WIDTH), dtype=np.int32)
+    m, node = made.model, np.zeros((N_TERMS, WIDTH), dtype=np.int32)
     for c, own in enumerate(made.nodes):
         node[c, : len(own)] = own
     entries = sorted((int(i), WIDTH * c + j) for c, own in enumerate(made.nodes) for j, i in enumerate(own))
@@ -103,7 +102,7 @@ def test_the_nodes_of_terms_in_several_chunks_are_last(rig):
     if not rig.shared:
         assert rig.coupling.place is None
         return
-    find_last(rig.parallel, rig.matrix, rig.coupling, rig.work)
+    find_last(rig.models[False], rig.matrix, rig.coupling, rig.work)
     last, place = last_nodes(rig), rig.coupling.place.to_numpy()
     n_last = int(rig.coupling.n_last.to_numpy()[0])
     assert 0 < n_last < len(last) // 2
@@ -120,7 +119,7 @@ def dense(blocks: np.ndarray) -> np.ndarray:
 
 
 def solve(made, serial: bool, tolerance: float, limit: int):
-    m, w = replace(made.parallel, serial=serial), made.work
+    m, w = made.models[serial], made.work
     if made.shared:
         find_last(m, made.matrix, made.coupling, w)
     w.rhs.from_numpy(made.rhs)

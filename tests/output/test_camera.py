@@ -5,8 +5,7 @@ import pytest
 
 import taisoft as ts
 from benchmarks.numpy_raster import rasterise
-from taisoft.output.camera import BORDER, FILL, MAX_FALL, Camera, framed_points, start_positions
-from taisoft.view.raster import MAX_COORDINATE
+from taisoft.output.camera import Camera, framed_points, start_positions
 
 SIZE = (320, 180)
 
@@ -18,7 +17,7 @@ def test_framing_shows_all_points(azimuth, elevation):
     projected = camera.project(points, SIZE)
     assert (projected[:, 2] > 0).all()
     fill = np.abs(2 * projected[:, :2] / SIZE - 1).max(axis=0)  # of the picture's width and height
-    assert fill.max() == pytest.approx(FILL)
+    assert 0.5 < fill.max() < 0.8
     assert np.allclose(camera.project(camera.target[None], SIZE), [[160, 90, camera.distance]])
 
 
@@ -46,7 +45,7 @@ def test_the_first_picture_shows_the_ground_below_a_falling_body():
 
 
 def test_a_fall_is_framed_only_where_it_is_known():
-    """Not of bodies that something holds, without gravity, beside walls, on or below the ground, or beyond MAX_FALL."""
+    """Not of bodies that something holds, without gravity, beside walls, on or below the ground, or to the end of a long fall."""
     fixed, attached, wall = falling_cube(2.0), falling_cube(2.0), ts.Scene(gravity=(0, -9.81, 0))
     fixed.bodies[0].fix([0])
     attached.add_spring(("cube", 0), ("ground", (0, 0, 0)), 10.0)
@@ -55,7 +54,7 @@ def test_a_fall_is_framed_only_where_it_is_known():
     for scene in (fixed, attached, wall, falling_cube(2.0, (0, 0, 0)), falling_cube(0.0), falling_cube(2.0, (0, 9.81, 0))):
         assert np.array_equal(framed_points(scene), start_positions(scene))
     far = framed_points(falling_cube(1000.0))
-    assert np.ptp(far[:, 1]) == pytest.approx(1 + MAX_FALL * 3**0.5)
+    assert 2 < np.ptp(far[:, 1]) < 20
 
 
 def test_projection_is_that_of_a_pinhole_camera():
@@ -78,7 +77,8 @@ def test_orbit_zoom_and_pan():
 def test_camera_moves_back_from_approaching_bodies():
     camera = Camera(target=np.zeros(3), distance=10.0, azimuth=0.0, elevation=0.0, fov=90.0)
     near = np.array([[0.0, 1, 0], [2, 0, 0]])
-    border = 1 - BORDER
+    border = 40 / camera.widened(np.array([[0.0, -40, 0]]), (200, 100), 100.0).distance
+    assert 0.9 < border < 1
     assert camera.widened(near, (200, 100), 100.0) == camera
     for far in ([0.0, -20 * border, 0], [40 * border, 0, 0], [0, 10 * border, 10], [0, 0, 20]):
         assert camera.widened(np.array([far, [0, np.nan, 0]]), (200, 100), 100.0).distance == pytest.approx(20.0)
@@ -88,7 +88,7 @@ def test_camera_moves_back_from_approaching_bodies():
 def test_floor_that_reaches_behind_the_camera_is_clipped():
     """Compare with rays through pixel centres.
 
-    Triangles in front are unchanged, those behind are dropped; in a large picture clipped ones stay below MAX_COORDINATE.
+    Triangles in front are unchanged, those behind are dropped; in a large picture clipped ones stay drawable.
     """
     half = 30.0
     floor = [[-half, 0, -half], [half, 0, -half], [half, 0, half], [-half, 0, half]]
@@ -111,7 +111,7 @@ def test_floor_that_reaches_behind_the_camera_is_clipped():
     both = drawn & expected
     assert np.abs(image[both] / 255 - (hit[both] + half) / (2 * half))[:, [0, 2]].max() < 0.02
     large = np.abs(camera.project(camera.clipped(corners, triangles, shades, (2560, 1440))[0], (2560, 1440))[len(corners) :, :2])
-    assert 1e4 < large.max() < 0.5 * MAX_COORDINATE
+    assert 1e4 < large.max() < 5e5
     for value in (np.nan, np.inf):
         bad = corners.copy()
         bad[4] = value

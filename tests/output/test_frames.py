@@ -1,44 +1,37 @@
-"""Image files, and the progress of a run:
+"""Pictures and videos of a run:
 
 * a PNG decodes to the same image, and frames are numbered with five digits;
-* pictures are written by a thread while the run goes on, at most WAITING wait, and all are there after a flush or a close;
+* pictures are written by a thread while the run goes on, a few wait, and all are there after a flush or a close;
 * a picture that cannot be written is an error at the next frame, flush or close, and no later one is written;
 * a closed writer refuses pictures; observers are all closed, and report what could not be written;
-* progress is a bar on a terminal and lines elsewhere, both with steps/s and the time left.
+* every picture is a frame of a video at the run's frame rate; without ffmpeg its command is printed; a failure leaves no file.
 """
 
-import io
-import re
-import subprocess
-import sys
+import shlex
 import threading
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from taisoft.cli.recording import Observers
+from taisoft.cli.recording import Observers, Recording
 from taisoft.errors import OutputError
-from taisoft.output import frames, report
-from taisoft.output.frames import FrameWriter, png_bytes
-from taisoft.output.report import Progress
+from taisoft.output import frames
+from taisoft.output.frames import VIDEO_NAME, FrameWriter, ffmpeg_command, find_ffmpeg, png_bytes, write_video
+from tests.cli.command import run
 from tests.output.png import decode
 from tests.view.fake_simulator import FakeSimulator, beam_scene
 
-ROOT = Path(__file__).resolve().parents[2]
+needs_ffmpeg = pytest.mark.skipif(find_ffmpeg() is None, reason="there is no ffmpeg")
 
 
 @pytest.mark.parametrize("shape", [(1, 1, 3), (7, 5, 3), (48, 64, 3)])
 def test_a_png_decodes_to_the_same_image(shape):
     image = np.random.default_rng(3).integers(0, 256, shape, dtype=np.uint8)
     assert np.array_equal(decode(png_bytes(image)), image)
-
-
-@pytest.mark.parametrize("image", [np.zeros((4, 4), np.uint8), np.zeros((4, 4, 3)), np.zeros((0, 4, 3), np.uint8)])
-def test_png_refuses_other_arrays(image):
-    with pytest.raises(ValueError, match="must be uint8"):
-        png_bytes(image)
+    for other in (image[..., 0], image.astype(float), image[:0]):
+        with pytest.raises(ValueError, match="must be uint8"):
+            png_bytes(other)
 
 
 class GreyRenderer:
@@ -53,19 +46,6 @@ class GreyRenderer:
         self.closed = True
 
 
-def test_frames_are_numbered_files(tmp_path):
-    renderer = GreyRenderer()
-    writer, sim = FrameWriter(tmp_path, renderer), FakeSimulator(beam_scene())
-    for index in range(3):
-        writer.frame(sim, index)
-        sim.step()
-    writer.close()
-    assert renderer.closed
-    files = sorted((tmp_path / "frames").iterdir())
-    assert [path.name for path in files] == ["00000.png", "00001.png", "00002.png"]
-    assert [decode(path.read_bytes())[0, 0, 0] for path in files] == [0, 1, 2]
-
-
 def writing(tmp_path, monkeypatch, write):
     """A writer whose files are written by `write(path, data)`."""
     monkeypatch.setattr(frames, "write_bytes", write)
@@ -73,35 +53,43 @@ def writing(tmp_path, monkeypatch, write):
 
 
 def test_pictures_wait_for_a_slow_disk(tmp_path, monkeypatch):
-    """WAITING pictures are taken while the disk is stuck with one; the next `frame` waits for it."""
-    stuck, written = threading.Event(), []
+    """A few pictures are taken while the disk is stuck with one; then `frame` waits for it. All of them are written in order."""
+    stuck, written, taken = threading.Event(), [], []
 
     def slow(path, data):
         assert stuck.wait(60)
         written.append((path.name, decode(data)[0, 0, 0]))
 
+    def record():
+        for index in range(100):
+            writer.frame(sim, index)
+            sim.step()
+            taken.append(index)
+
     writer, sim = writing(tmp_path, monkeypatch, slow)
-    for index in range(frames.WAITING + 1):
-        writer.frame(sim, index)
-        sim.step()
-    assert written == []
-    last = threading.Thread(target=writer.frame, args=(sim, frames.WAITING + 1))
-    last.start()
-    last.join(0.2)
-    assert last.is_alive() and written == []
+    recording = threading.Thread(target=record, daemon=True)
+    recording.start()
+    recording.join(0.5)
+    assert recording.is_alive() and 2 <= len(taken) < 50 and written == []
     stuck.set()
-    last.join(60)
+    recording.join(60)
     writer.flush()
-    assert written == [(f"{k:05d}.png", k) for k in range(frames.WAITING + 2)]
+    assert written == [(f"{k:05d}.png", k) for k in range(100)]
     writer.close()
     writer.close()
-    assert len(written) == frames.WAITING + 2
+    assert len(written) == 100
 
 
-@pytest.mark.parametrize("error", [OutputError("the disk is full"), MemoryError("a defect")])
-@pytest.mark.parametrize("moment", ["frame", "flush", "close"])
-def test_an_error_of_writing_is_raised_once_it_is_known(tmp_path, monkeypatch, error, moment):
-    written, message = [], "^the disk is full$" if isinstance(error, OutputError) else "00001.png: MemoryError: a defect$"
+@pytest.mark.parametrize(
+    "moment, error, message",
+    [
+        ("frame", OutputError("the disk is full"), "^the disk is full$"),
+        ("flush", MemoryError("a defect"), "00001.png: MemoryError: a defect$"),
+        ("close", OutputError("the disk is full"), "^the disk is full$"),
+    ],
+)
+def test_an_error_of_writing_is_raised_once_it_is_known(tmp_path, monkeypatch, moment, error, message):
+    written = []
 
     def failing(path, data):
         written.append(path.name)
@@ -127,6 +115,7 @@ def test_a_closed_writer_refuses_pictures(tmp_path):
     writer, sim = FrameWriter(tmp_path, GreyRenderer()), FakeSimulator(beam_scene())
     writer.frame(sim, 0)
     writer.close()
+    assert [path.name for path in (tmp_path / "frames").iterdir()] == ["00000.png"]
     with pytest.raises(OutputError, match=r"^picture 1 cannot be written to .*frames: its writer is closed$"):
         writer.frame(sim, 1)
     flushing = threading.Thread(target=writer.flush, daemon=True)
@@ -153,63 +142,81 @@ def test_observers_close_all_members_and_report_errors_of_writing(tmp_path, monk
     observers.close()
 
 
-def test_a_writer_that_is_not_closed_does_not_keep_the_process(tmp_path):
-    code = "import sys; sys.path[:0] = ['tests', '.']\nimport test_output_frames as t\nt.leave_open(sys.argv[1])"
-    done = subprocess.run(
-        [sys.executable, "-c", code, tmp_path], cwd=ROOT, timeout=60, capture_output=True, text=True, check=False
-    )
-    assert done.returncode == 0 and done.stdout == "left\n", done.stderr
-    assert all(path.suffix == ".png" and decode(path.read_bytes()).size for path in (tmp_path / "frames").glob("*.png"))
+# --- videos -----------------------------------------------------------------------------------------------------------
 
 
-def leave_open(folder):
-    writer, sim = FrameWriter(folder, GreyRenderer()), FakeSimulator(beam_scene())
-    for index in range(5):
-        writer.frame(sim, index)
-    print("left", flush=True)
+def write_pictures(folder, first=0, n=5, size=(48, 64)):
+    (folder / "frames").mkdir(parents=True)
+    for k in range(first, first + n):
+        picture = np.full((*size, 3), 40 * (k - first), dtype=np.uint8)
+        (folder / "frames" / f"{k:05d}.png").write_bytes(png_bytes(picture))
 
 
-class Terminal(io.StringIO):
-    def isatty(self):
-        return True
+@needs_ffmpeg
+@pytest.mark.parametrize("first, size, name", [(0, (48, 64), "a b"), (31, (47, 63), "50%d")])
+def test_every_picture_is_a_frame(first, size, name, tmp_path):
+    imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg")
+    folder = tmp_path / name
+    write_pictures(folder, first, size=size)
+    (folder / "frames" / "2a.png").write_bytes(b"not a picture of the run")
+    write_video(folder, 25.0)
+    n, seconds = imageio_ffmpeg.count_frames_and_secs(str(folder / VIDEO_NAME))
+    assert n == 5 and seconds == pytest.approx(0.2, abs=0.01)
+    assert [path.name for path in folder.iterdir() if path.is_file()] == [VIDEO_NAME]
 
 
-@pytest.fixture
-def clock(monkeypatch):
-    """Wall time that advances by 2 s per call."""
-    times = iter(range(0, 1000, 2))
-    monkeypatch.setattr(report.time, "perf_counter", lambda: float(next(times)))
+@needs_ffmpeg
+def test_failure_of_ffmpeg_is_reported(tmp_path):
+    write_pictures(tmp_path)
+    (tmp_path / "frames" / "00000.png").write_bytes(b"not a PNG")
+    with pytest.raises(OutputError, match="video.mp4 cannot be made: ffmpeg says: "):
+        write_video(tmp_path, 25.0)
+    assert not [path for path in tmp_path.iterdir() if path.is_file()]
 
 
-def advance(bar):
-    sim = FakeSimulator(beam_scene())
-    for index in range(6):
-        bar.frame(sim, index)
-        sim.time, sim.step_count = sim.time + 0.5, sim.step_count + 20
-    bar.close()
-    bar.close()
+def test_command_is_printed_without_ffmpeg(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(frames, "find_spec", lambda name: None)
+    monkeypatch.setattr(frames.shutil, "which", lambda name: None)
+    assert find_ffmpeg() is None
+    out = tmp_path / "out"
+    recording = Recording(str(out), overwrite=False)
+    recording.video(30.0)
+    assert not capsys.readouterr().err  # no pictures
+    write_pictures(out)
+    recording.video(30.0)
+    recording.close()
+    errors = capsys.readouterr().err
+    command = shlex.join(ffmpeg_command(out, 30.0))
+    assert "pip install 'taisoft[video]'" in errors and command in errors and "-framerate 30 " in command
+    with pytest.raises(OutputError, match="cannot be made without ffmpeg"):
+        write_video(out, 30.0)
 
 
-def test_progress_is_lines_in_a_file(clock):
-    stream = io.StringIO()
-    advance(Progress(10.0, "beam", stream))
-    # frames at 0, 2, ..., 10 s, each of 20 steps and 0.5 s simulated; a line at the first one after 5 s
-    assert stream.getvalue() == "beam: 1.500 of 10 s, 10 steps/s, 0:34 left\n"
+@needs_ffmpeg
+def test_a_run_makes_a_video(beam, tmp_path):
+    """Three frames at 30 per second, four times as slow."""
+    imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg")
+    out = tmp_path / "out"
+    assert run(beam, "--video", "--out", out, "--no-usd", "--slow", "4", "--size", "64x36") == 0
+    n, seconds = imageio_ffmpeg.count_frames_and_secs(str(out / VIDEO_NAME))
+    assert n == 4 and seconds == pytest.approx(4 * 4 / 30, abs=0.02)
+    assert next(imageio_ffmpeg.read_frames(str(out / VIDEO_NAME)))["size"] == (64, 36)
 
 
-def test_progress_leaves_compiling_out(clock):
-    """Of 6 s until the line, 3 s went into compiling."""
-    stream = io.StringIO()
-    sim, bar = FakeSimulator(beam_scene()), Progress(10.0, "beam", stream)
-    for index in range(4):
-        bar.frame(sim, index)
-        sim.time, sim.step_count, sim.compile_seconds = sim.time + 0.5, sim.step_count + 20, 3.0
-    bar.close()
-    assert stream.getvalue() == "beam: 1.500 of 10 s, 20 steps/s, 0:17 left\n"
-
-
-def test_progress_is_a_bar_on_a_terminal(clock):
-    stream = Terminal()
-    advance(Progress(10.0, "beam", stream))
-    text = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", stream.getvalue())
-    assert "10 steps/s" in text and "0:30 left" in text and "2.50 of 10 s" in text
+@pytest.mark.parametrize(
+    "options, message",
+    [
+        ("--video --no-frames", "--video"),
+        ("--slow 2", "--slow is the speed of the film, so it needs --video"),
+        ("--video --slow 0", "--slow must be greater than 0"),
+        ("--size 640", "--size 640: write width and height in pixels, such as 640x360"),
+        ("--size 0x5", "both must be 1 to 16384"),
+        ("--view 0 90", "--view: the elevation must be from -89 to 89 degrees, not 90"),
+        ("--view nan 0", "--view: azimuth must be"),
+        ("--view 0 10 --no-frames", "--view needs --out"),
+        ("--size 64x36 --no-frames", "--size needs --out"),
+    ],
+)
+def test_bad_sizes_and_speeds_are_refused(beam, tmp_path, capsys, options, message):
+    assert run(beam, "--out", tmp_path / "out", *options.split()) == 2
+    assert message in capsys.readouterr().err and not (tmp_path / "out").exists()

@@ -1,21 +1,34 @@
-"""report.json and steps.csv, read back:
+"""What a run reports:
 
 * report.json is JSON without NaN and holds the run's results, extremes over its steps, settings, plan, versions and machine;
-* steps.csv holds every field of every StepReport, also problems with commas, quotes and line breaks.
+* steps.csv holds every field of every StepReport, also problems with commas, quotes and line breaks;
+* progress is a bar on a terminal and lines elsewhere, both with steps/s and the time left, without the time of compiling;
+* compilation within an observer counts as compile time, not as output time, which is part of the run's wall time; the summary
+  says what pictures cost, and how to save it, if they take most of a run.
 """
 
 import csv
 import dataclasses
+import io
 import json
 import math
 import platform
+import re
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from taisoft.output.report import write_report
+from taisoft.cli.recording import Observers
+from taisoft.cli.summary import print_summary
+from taisoft.output import report
+from taisoft.output.frames import FrameWriter
+from taisoft.output.report import Progress, write_report
 from taisoft.records import RunReport, StepReport
+from taisoft.running import run
+from tests.simulator.test_running import StandIn
+from tests.view.fake_simulator import FakeSimulator, beam_scene
 
 
 def refuse_constant(name):
@@ -103,7 +116,71 @@ def test_the_step_table_holds_every_field_of_every_step(written):
                 assert float(row[field.name]) == value or (math.isnan(value) and row[field.name] == "nan")
 
 
-def test_a_run_without_steps_has_no_extremes(tmp_path):
-    write_report(tmp_path, RunReport(), arch="cpu", precision="f64", settings={}, plan=[])
-    assert json.loads((tmp_path / "report.json").read_text())["extremes"] == {}
-    assert (tmp_path / "steps.csv").read_text().count("\n") == 1
+# --- while it runs, and afterwards --------------------------------------------------------------------------------
+
+
+class Terminal(io.StringIO):
+    def isatty(self):
+        return True
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    """Wall time that advances by 2 s per call."""
+    times = iter(range(0, 1000, 2))
+    monkeypatch.setattr(report.time, "perf_counter", lambda: float(next(times)))
+
+
+def advance(bar, compiling=0.0):
+    sim = FakeSimulator(beam_scene())
+    for index in range(6):
+        bar.frame(sim, index)
+        sim.time, sim.step_count, sim.compile_seconds = sim.time + 0.5, sim.step_count + 20, compiling
+    bar.close()
+    bar.close()
+
+
+@pytest.mark.parametrize("compiling, line", [(0.0, "10 steps/s, 0:34 left"), (3.0, "20 steps/s, 0:17 left")])
+def test_progress_is_lines_in_a_file(clock, compiling, line):
+    """Frames at 0, 2, ..., 10 s, each of 20 steps and 0.5 s simulated; a line at the first one after 5 s."""
+    stream = io.StringIO()
+    advance(Progress(10.0, "beam", stream), compiling)
+    assert stream.getvalue() == f"beam: 1.500 of 10 s, {line}\n"
+
+
+def test_progress_is_a_bar_on_a_terminal(clock):
+    stream = Terminal()
+    advance(Progress(10.0, "beam", stream))
+    text = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", stream.getvalue())
+    assert "10 steps/s" in text and "0:30 left" in text and "2.50 of 10 s" in text
+
+
+class SlowWriter(FrameWriter):
+    """Spends 2 s of a clock per picture, 10 s more on compiling at the first one, and writes none."""
+
+    def __init__(self, clock):
+        self.clock = clock
+
+    def frame(self, sim, index):
+        self.clock[0] += 12.0 if index == 0 else 2.0
+        sim.compile_seconds += 10.0 if index == 0 else 0.0
+
+
+@pytest.mark.parametrize("step, most", [(0.1, True), (1.0, False)])
+def test_the_summary_says_when_pictures_take_most_of_a_run(step, most, monkeypatch, capsys):
+    """Three pictures of 2 s, 0.5 s a frame for another output, and 20 steps of 0.1 or 1 s."""
+    sim, now, observers = StandIn(explicit=False, dt=0.01), [0.0], Observers()
+
+    def pass_time(seconds):
+        now[0] += seconds
+
+    other = SimpleNamespace(frame=lambda sim, index: pass_time(0.5), close=lambda: None)
+    observers.members += [SlowWriter(now), other]
+    monkeypatch.setattr("time.perf_counter", lambda: now[0])
+    result = run(sim, 0.2, observers.on_frame, fps=10, on_step=lambda *_: pass_time(step))
+    assert observers.seconds == pytest.approx(7.5) and observers.picture_seconds == pytest.approx(6.0)
+    assert result.compile_seconds == pytest.approx(10.0) and result.wall_seconds == pytest.approx(7.5 + 20 * step)
+    print_summary(result, sim, observers, None)
+    shown = capsys.readouterr().out
+    assert f"{7.5 + 20 * step:.2f} s, 7.50 s of it for output; plus 10.00 s to compile" in shown
+    assert ("6.00 s of it, 63%, for pictures: a lower --fps draws fewer, --no-frames none" in shown) == most

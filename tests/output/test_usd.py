@@ -1,23 +1,17 @@
 """The USD export, read back with USD:
 
-* scene.usdc passes every validator of pxr.UsdValidation and holds the float32 positions of every frame, body and node, for linear
-  and quadratic elements;
+* scene.usdc passes every validator of pxr.UsdValidation and holds the float32 positions of every frame, body and node;
 * metres, y up, default prim, frame rate, frame range, extents, materials, and tetrahedra that USD finds not inverted;
 * von Mises stress at every point of every frame and, if contacts are possible, contact impulses, whose sums over a body are those
   of its contacts;
 * a camera that projects like the images' camera in every frame, and lights, both outside the default prim;
 * body names become valid, distinct prim names and are stored beside them;
-* after a kill at any time every file with a final name opens, at most the current chunk is lost, and an older scene.usdc is
-  intact; the chunks join to the file that the run would have written;
+* without its end a run has lost at most the current chunk, and an older scene.usdc is intact; the chunks join to the file that
+  the run would have written;
 * a full disk raises OutputError with the path and leaves no partial file.
 """
 
-import random
 import resource
-import subprocess
-import sys
-import time
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -32,7 +26,6 @@ from taisoft.output.usd_scene import prim_names
 from tests.output.usd_stage import check_frames, faults
 from tests.view.fake_simulator import FakeSimulator, beam_scene
 
-ROOT = Path(__file__).resolve().parents[2]
 NAMES = ("1 cube", "1_cube", "ü", "x" * 300, "material")
 
 
@@ -49,44 +42,49 @@ def export(folder, scene, n_frames, chunk_frames=10, close=True):
     return positions
 
 
-@pytest.fixture(scope="module", params=[1, 2], ids=["order1", "order2"])
-def exported(request, tmp_path_factory):
-    folder = tmp_path_factory.mktemp("usd")
-    scene = beam_scene(NAMES, order=request.param)
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory):
+    """The scene and the stage of 23 frames."""
+    folder, scene = tmp_path_factory.mktemp("usd"), beam_scene(NAMES)
     positions = export(folder, scene, 23)
-    return folder, scene, positions, Usd.Stage.Open(str(folder / "scene.usdc"))
-
-
-def test_all_validators_pass(exported):
-    assert faults(exported[3]) == []
-
-
-def test_one_file_with_every_frame(exported):
-    folder, _, positions, _ = exported
     assert [path.name for path in folder.iterdir()] == ["scene.usdc"]
     assert check_frames(folder / "scene.usdc", positions) == 23
+    return scene, Usd.Stage.Open(str(folder / "scene.usdc"))
 
 
-def test_stage_units_and_range(exported):
-    stage = exported[3]
-    assert UsdGeom.GetStageMetersPerUnit(stage) == 1.0
-    assert UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.y
+def test_the_stage_is_valid_and_has_units_and_a_range(exported):
+    stage = exported[1]
+    assert faults(stage) == []
+    assert UsdGeom.GetStageMetersPerUnit(stage) == 1.0 and UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.y
     assert stage.GetDefaultPrim().GetPath() == "/World"
     assert (stage.GetTimeCodesPerSecond(), stage.GetStartTimeCode(), stage.GetEndTimeCode()) == (30.0, 0.0, 22.0)
     assert stage.GetFramesPerSecond() == 30.0
 
 
-def test_the_surface_has_no_inner_vertex_and_a_colour(exported):
-    _, scene, _, stage = exported
+def canonical(triangle):
+    """The triangle's indices starting with the smallest: the same for equal orientations."""
+    k = int(np.argmin(triangle))
+    return tuple(int(i) for i in np.roll(triangle, -k))
+
+
+def test_tets_and_surface(exported):
+    """Tets are not inverted and not drawn; the surface has no inner vertex, and a colour."""
+    scene, stage = exported
+    body = scene.bodies[0]
     surface = UsdGeom.Mesh(stage.GetPrimAtPath("/World/_1_cube/surface"))
-    triangles = scene.bodies[0].nodes.surface
-    assert len(surface.GetPointsAttr().Get(0)) == len(np.unique(triangles)) < scene.bodies[0].n_nodes
+    assert len(surface.GetPointsAttr().Get(0)) == len(np.unique(body.nodes.surface)) < body.n_nodes
     assert surface.GetSubdivisionSchemeAttr().Get() == UsdGeom.Tokens.none
     assert set(surface.GetFaceVertexCountsAttr().Get()) == {3}
     material = UsdShade.MaterialBindingAPI(surface.GetPrim()).ComputeBoundMaterial()[0]
     shader = material.ComputeSurfaceSource()[0]
     assert shader.GetShaderId() == "UsdPreviewSurface"
     assert shader.GetInput("diffuseColor").Get() == surface.GetDisplayColorAttr().Get()[0]
+    tets = UsdGeom.TetMesh(stage.GetPrimAtPath("/World/_1_cube/tets"))
+    assert np.array_equal(np.array(tets.GetTetVertexIndicesAttr().Get()), body.nodes.tets)
+    assert len(UsdGeom.TetMesh.FindInvertedElements(tets, Usd.TimeCode(5))) == 0
+    faces = np.array(UsdGeom.TetMesh.ComputeSurfaceFaces(tets, Usd.TimeCode(5)))
+    assert sorted(map(canonical, faces)) == sorted(map(canonical, body.nodes.surface))
+    assert tets.ComputePurpose() == UsdGeom.Tokens.guide
 
 
 def primvar(stage, path, name, index):
@@ -97,7 +95,7 @@ def primvar(stage, path, name, index):
 
 
 def test_points_have_stress_and_nodal_impulses(exported):
-    _, scene, _, stage = exported
+    scene, stage = exported
     sim, mean = FakeSimulator(scene), NodalMean(scene.bodies)
     first = np.cumsum([0] + [body.n_nodes for body in scene.bodies])
     for index in (0, 1, 22):
@@ -160,7 +158,7 @@ def test_the_camera_projects_like_that_of_the_images(tmp_path):
 
 
 def test_lights_are_outside_the_default_prim_and_behind_the_camera(exported):
-    stage = exported[3]
+    stage = exported[1]
     lights = [prim for prim in stage.Traverse() if prim.HasAPI(UsdLux.LightAPI)]
     assert [prim.GetTypeName() for prim in lights] == ["DistantLight", "DomeLight"]
     assert not any(prim.GetPath().HasPrefix(stage.GetDefaultPrim().GetPath()) for prim in lights)
@@ -176,122 +174,40 @@ def test_lights_are_outside_the_default_prim_and_behind_the_camera(exported):
     assert towards @ right < -0.2 and towards @ up > 0.4 and towards @ backward > 0.4 and towards[1] > 0.7
 
 
-def test_tets_are_not_inverted_and_not_drawn(exported):
-    _, scene, _, stage = exported
-    tets = UsdGeom.TetMesh(stage.GetPrimAtPath("/World/_1_cube/tets"))
-    assert np.array_equal(np.array(tets.GetTetVertexIndicesAttr().Get()), scene.bodies[0].nodes.tets)
-    assert len(UsdGeom.TetMesh.FindInvertedElements(tets, Usd.TimeCode(5))) == 0
-    faces = np.array(UsdGeom.TetMesh.ComputeSurfaceFaces(tets, Usd.TimeCode(5)))
-    assert sorted(map(canonical, faces)) == sorted(map(canonical, scene.bodies[0].nodes.surface))
-    assert tets.ComputePurpose() == UsdGeom.Tokens.guide
-
-
-def canonical(triangle):
-    """The triangle's indices starting with the smallest: the same for equal orientations."""
-    k = int(np.argmin(triangle))
-    return tuple(int(i) for i in np.roll(triangle, -k))
-
-
-def test_body_names_are_stored_beside_prim_names(exported):
-    stage = exported[3]
-    prims = stage.GetPrimAtPath("/World").GetChildren()
-    assert [prim.GetDisplayName() for prim in prims] == list(NAMES)
-    assert [prim.GetCustomDataByKey("taisoft:name") for prim in prims] == list(NAMES)
-
-
-def test_prim_names_are_valid_and_distinct():
+def test_prim_names_are_valid_and_distinct(exported):
     names = ["a/b", "a b", "a_b", "a_b_1", "", "9", "ü", "é", "x" * 300, "x" * 299, "__", "body"]
     valid = prim_names(names)
     assert len(set(valid)) == len(names)
     assert all(Tf.IsValidIdentifier(name) and name.isascii() and len(name) < 80 for name in valid)
     assert prim_names(["beam", "cube"]) == ["beam", "cube"]
-
-
-def test_chunks_are_written_during_the_run(tmp_path):
-    positions = export(tmp_path, beam_scene(), 25, close=False)
-    chunks = sorted((tmp_path / "chunks").iterdir())
-    assert [path.name for path in chunks] == ["points_00000.usdc", "points_00010.usdc"]
-    assert not (tmp_path / "scene.usdc").exists()
-    assert [check_frames(path, positions, first) for path, first in zip(chunks, (0, 10))] == [10, 10]
-
-
-def test_a_run_without_frames_leaves_nothing(tmp_path):
-    export(tmp_path, beam_scene(), 0)
-    assert list(tmp_path.iterdir()) == []
+    prims = exported[1].GetPrimAtPath("/World").GetChildren()
+    assert [prim.GetDisplayName() for prim in prims] == list(NAMES)
+    assert [prim.GetCustomDataByKey("taisoft:name") for prim in prims] == list(NAMES)
 
 
 def test_joined_chunks_equal_the_finished_scene(tmp_path):
+    """Chunks are written during the run; the third body is quadratic."""
     scene = beam_scene(("one", "two"))
     scene.add_body(scene.bodies[0].mesh, scene.bodies[0].material, name="three", position=(0, -1.5, 0), order=2)
     export(tmp_path / "whole", scene, 20)
+    (tmp_path / "killed").mkdir()
+    (tmp_path / "killed" / "scene.usdc").write_text("of an earlier run")
     positions = export(tmp_path / "killed", scene, 27, close=False)
+    assert (tmp_path / "killed" / "scene.usdc").read_text() == "of an earlier run"
+    chunks = sorted((tmp_path / "killed" / "chunks").iterdir())
+    assert [path.name for path in chunks] == ["points_00000.usdc", "points_00010.usdc"]
+    assert [check_frames(path, positions, first) for path, first in zip(chunks, (0, 10))] == [10, 10]
     assert join_chunks(tmp_path / "killed") == tmp_path / "killed" / "scene.usdc"
     assert check_frames(tmp_path / "killed" / "scene.usdc", positions) == 20
-    texts = [Usd.Stage.Open(str(tmp_path / name / "scene.usdc")).ExportToString() for name in ("whole", "killed")]
-    # the text of a stage begins with its path
+    stages = [Usd.Stage.Open(str(tmp_path / name / "scene.usdc")) for name in ("whole", "killed")]
+    assert faults(stages[0]) == []
+    texts = [stage.ExportToString() for stage in stages]  # which begin with the file's path
     assert texts[0].replace("whole", "killed") == texts[1]
     assert not (tmp_path / "killed" / "chunks").exists()
     with pytest.raises(OutputError, match="holds no chunk"):
         join_chunks(tmp_path / "killed")
-
-
-CHILD = """
-import sys
-sys.path[:0] = ["tests", "."]
-from tests.view.fake_simulator import FakeSimulator, beam_scene
-from taisoft.output.usd import UsdWriter
-scene = beam_scene(("one", "two"), cells=(16, 4, 4))
-sim = FakeSimulator(scene)
-writer = UsdWriter(sys.argv[1], scene, fps=30.0)
-for index in range(int(sys.argv[2])):
-    sim.time = index / 30
-    writer.frame(sim, index)
-    print(index, flush=True)
-print("closing", flush=True)
-writer.close()
-"""
-N_KILLED_FRAMES = 150
-
-
-def test_killed_at_any_time_leaves_files_that_open(tmp_path):
-    scene = beam_scene(("one", "two"), cells=(16, 4, 4))
-    sim, positions = FakeSimulator(scene), []
-    for index in range(N_KILLED_FRAMES):
-        sim.time = index / 30
-        positions.append({body.name: sim.positions(body.name) for body in scene.bodies})
-    export(tmp_path / "old", scene, 3)
-    old = (tmp_path / "old" / "scene.usdc").read_bytes()
-    rng = random.Random(1)
-    n_printed = []
-    closing = [N_KILLED_FRAMES + 1] * 2  # with an earlier scene.usdc and without
-    for attempt, n_lines in enumerate([1, *closing, *rng.sample(range(2, N_KILLED_FRAMES), 3)]):
-        folder = tmp_path / str(attempt)
-        folder.mkdir()
-        before = old if attempt % 2 else None
-        if before:
-            (folder / "scene.usdc").write_bytes(before)
-        lines = run_and_kill(folder, n_lines, rng.uniform(0.0, 0.02))
-        n_printed.append(len(lines))
-        chunks = sorted((folder / "chunks").glob("*.usdc"))
-        found = (folder / "scene.usdc").read_bytes() if (folder / "scene.usdc").exists() else None
-        if found != before:
-            assert check_frames(folder / "scene.usdc", positions) == N_KILLED_FRAMES
-        else:
-            firsts = [int(path.stem[-5:]) for path in chunks]
-            kept = sum(check_frames(path, positions, first) for path, first in zip(chunks, firsts))
-            assert kept >= len([line for line in lines if line.isdigit()]) - 10
-    assert len(set(n_printed)) > 2, "all kills came at the same place"
-
-
-def run_and_kill(folder, n_lines, delay):
-    """Lines printed by the child, one per frame and one before closing; it is killed delay [s] after n_lines of them."""
-    child = subprocess.Popen(
-        [sys.executable, "-c", CHILD, str(folder), str(N_KILLED_FRAMES)], cwd=ROOT, stdout=subprocess.PIPE, text=True
-    )
-    lines = [child.stdout.readline().strip() for _ in range(n_lines)]
-    time.sleep(delay)
-    child.kill()
-    return [*lines, *child.communicate()[0].split()]
+    export(tmp_path / "none", scene, 0)
+    assert list((tmp_path / "none").iterdir()) == []
 
 
 def test_a_full_disk_is_an_error_and_leaves_no_partial_file(tmp_path):

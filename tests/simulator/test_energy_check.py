@@ -2,9 +2,7 @@
 
 * with given energies: a rise above a tenth of the energy of the motion counts, work of gravity and loads does not; prescribed
   motion, changes by the user and corrected overlaps restart the check; explicit steps may oscillate about the energy;
-* energy is created by steps near `stable_dt` in a strained state, and by linearly implicit steps of St. Venant-Kirchhoff bodies
-  under strong compression;
-* bodies that fall, bounce, swing, vibrate or are loaded create none, also in explicit bounces with restitution 1.
+* real bodies that vibrate and fly create none, but steps near `stable_dt` in a strained state do.
 """
 
 from types import SimpleNamespace
@@ -15,7 +13,8 @@ import pytest
 import taisoft as ts
 from taisoft.energy_check import EnergyCheck
 from taisoft.records import Energies, RunReport, StepReport
-from tests.dynamics.scenes import COR, SNH, SVK, cube, rubber
+from tests.dynamics.scenes import cube, rubber
+from tests.simulator.scenes import simulator
 
 
 class StandIn:
@@ -82,7 +81,7 @@ def test_messages_give_the_rise():
 
 @pytest.mark.parametrize(
     "integrator, allowed, too_large",
-    [("velocity_verlet", (90.0, 25.0), (105.0, 25.0)), ("symplectic_euler", (90.0, 60.0), (180.0, 60.0))],
+    [("velocity_verlet", (90.0, 25.0), (92.0, 25.0)), ("symplectic_euler", (90.0, 60.0), (180.0, 60.0))],
 )
 def test_explicit_steps_may_oscillate_about_the_energy(integrator, allowed, too_large):
     assert check(StandIn(integrator), step(*allowed)).status == "ok"
@@ -105,70 +104,14 @@ def test_initial_contacts_may_open_to_their_offset():
     assert check(StandIn(), step(100.0), step(130.0, n_contacts=4)).status == "degraded"
 
 
-def strained(law: str, integrator: str, stretch: float, dt: float | None, steps: int) -> RunReport:
-    scene = ts.Scene(gravity=(0, 0, 0))
-    scene.add_body(ts.box_mesh((4, 2, 2), (2, 1, 1)), ts.Material(law=law, young=1e6, poisson=0.3, density=1000.0), name="box")
-    with ts.Simulator(scene, 1e-4, integrator, precision="f64") as sim:
-        sim.dt = dt or 0.9 * sim.stable_dt
-        x = sim.positions()
-        x[:, 0] *= stretch
-        sim.set_state(positions=x)
-        return sim.run(steps * sim.dt, fps=None)
-
-
-@pytest.mark.filterwarnings("ignore:step")
-@pytest.mark.parametrize(
-    "law, integrator, stretch, dt, steps",
-    [(COR, "symplectic_euler", 0.95, None, 200), (SVK, "linearly_implicit_euler", 0.6, 0.08, 3)],
-)
-def test_unstable_steps_create_energy(law, integrator, stretch, dt, steps):
-    run = strained(law, integrator, stretch, dt, steps)
-    assert run.status == "degraded" and "energy was created" in run.problems[-1]
-
-
-@pytest.mark.parametrize("integrator", ["symplectic_euler", "velocity_verlet", "implicit_midpoint", "bdf2", "implicit_euler"])
-def test_swinging_and_vibrating_bodies_create_no_energy(integrator):
-    """A beam that falls about its fixed end under a traction, and a vibrating block that flies far away."""
-    scene = ts.Scene()
-    scene.contact_forces = False
-    beam = scene.add_body(cube(cells=(3, 1, 1), size=(2, 0.5, 0.5)), rubber(SNH), name="beam")
-    beam.fix(lambda x: x[:, 0] < -0.99)
-    beam.add_traction(lambda x: x[:, 0] > 0.99, (300.0, 900.0, -2000.0))
-    velocity = np.random.default_rng(0).standard_normal((8, 3))
-    scene.add_body(cube(), rubber(COR), name="block", position=(1e5, -1e5, 0), velocity=velocity)
-    with ts.Simulator(scene, 2e-3, integrator) as sim:
-        if sim.settings.explicit:
-            sim.dt = 0.9 * sim.stable_dt
-        run = sim.run(1.5)
-    assert run.status == "ok", run.problems
-
-
-@pytest.mark.parametrize(
-    "integrator, restitution", [("symplectic_euler", 1.0), ("symplectic_euler", 0.5), ("velocity_verlet", 1.0), ("bdf2", 1.0)]
-)
-def test_bounces_create_no_energy(integrator, restitution):
-    """Explicit steps at 0.7 of `stable_dt` once created 50 times the energy of the fall."""
-    scene, side = ts.Scene(), 0.1
-    material = ts.Material(law=SNH, young=1e6, poisson=0.3, density=1000.0, friction=0.0)
-    scene.add_body(ts.box_mesh((2, 2, 2), (side,) * 3), material, name="cube", position=(0, side, 0))
-    scene.add_obstacle(ts.HalfSpace((0, 0, 0), (0, 1, 0)), name="ground", friction=0.0, restitution=restitution)
-    with ts.Simulator(scene, 1e-4 if integrator[0] in "sv" else 5e-3, integrator, precision="f64") as sim:
-        if sim.settings.explicit:
-            sim.dt = 0.7 * sim.stable_dt
-        start = sim.energies()
-        run = sim.run(1.5)
-        weight = start.gravity / side  # of the centre's height
-    assert run.status == "ok", run.problems
-    energy = np.array([r.kinetic + r.elastic + r.gravity for r in run.step_reports]) - weight * side / 2
-    assert energy[-1] < 1.3 * weight * side / 2
-
-
-def test_a_body_squeezed_by_the_contact_offset_is_ok():
-    """It touches a plane on either side."""
-    scene = ts.Scene(gravity=(0, 0, 0))
-    scene.add_body(cube(size=(1, 1, 1)), rubber(), name="cube")
-    for k, y in enumerate((-0.5, 0.5)):
-        scene.add_obstacle(ts.HalfSpace((0, y, 0), (0, -np.sign(y), 0)), name=f"plane{k}")
-    with ts.Simulator(scene, 0.01) as sim:
-        run = sim.run(0.5)
-    assert run.status == "ok", run.problems
+@pytest.mark.parametrize("stretch, status", [(1.0, "ok"), (1.4, "degraded")])
+def test_real_runs(stretch, status):
+    """A beam that falls about its fixed end and a body in flight create no energy; a strained one in large steps does."""
+    with simulator("velocity_verlet") as sim:
+        sim.dt = 0.9 * sim.stable_dt
+        sim.set_gravity((0.0, -9.81 * (stretch == 1.0), 0.0))
+        x, first = sim.positions(), len(sim.positions("beam"))
+        x[first:, 0] = 4.0 + stretch * (x[first:, 0] - 4.0)
+        sim.set_state(positions=x, velocities=sim.velocities() * (stretch == 1.0))
+        run = sim.run(200 * sim.dt, fps=None)
+    assert run.status == status and ("energy was created" in " ".join(run.problems)) == (status == "degraded")

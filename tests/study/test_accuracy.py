@@ -1,15 +1,23 @@
-"""Errors between meshes: nodes are paired by initial position within each body; the accuracy of the finest mesh is estimated."""
+"""Errors and results of a study:
 
+* nodes of two meshes are paired by initial position within each body; the accuracy of the finest mesh is estimated;
+* the Pareto front of time against error, and the cheapest setting within a tolerance.
+"""
+
+import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from taisoft.errors import SimulationError
-from taisoft.estimation.comparison import Error, distance, shared_nodes
+from taisoft.estimation.comparison import Error, shared_nodes
 from taisoft.mesh.nodes import make_nodes
 from taisoft.mesh.shapes import box_mesh
-from taisoft.study.accuracy import Reference, _momentum_error, error_in_space, finest_own_error
+from taisoft.study.accuracy import Reference, error_in_space, finest_own_error, momentum_error
+from taisoft.study.results import cheapest, front, nearest
 
 COARSE = box_mesh((2, 1, 1), (2.0, 1.0, 1.0))
 FINE = make_nodes(COARSE, 2).positions
@@ -30,11 +38,8 @@ def test_nodes_are_paired_by_position_within_their_body():
     first, second = shared_nodes(start, [["a", n], ["b", n]], other, [["a", m], ["b", m]])
     assert np.array_equal(first, np.arange(2 * n)) and np.array_equal(start[first], other[second])
     assert (second[:n] < m).all() and (second[n:] >= m).all()
-
-
-def test_meshes_without_shared_nodes_are_rejected():
     with pytest.raises(SimulationError, match="body 'a': no node of one mesh"):
-        shared_nodes(COARSE.vertices + 0.1, [["a", COARSE.n_verts]], FINE, [["a", len(FINE)]])
+        shared_nodes(COARSE.vertices + 0.1, [["a", n]], FINE, [["a", m]])
 
 
 def test_error_in_space_uses_shared_nodes_and_the_finest_excursion():
@@ -59,16 +64,52 @@ def test_error_of_the_finest_mesh_is_a_third_of_the_distance_to_the_next():
     assert finest_own_error(finest, [far, near])[0].max == 0.5
 
 
-def test_distance_is_relative_to_the_scale():
-    path = np.zeros((2, 2, 3))
-    other = path.copy()
-    other[1, 0] = (3.0, 0.0, 4.0)
-    assert distance(path, other, 10.0) == Error(pytest.approx(0.25), 0.5)
-
-
 @pytest.mark.parametrize("start, change, scale", [(100.0, 2.0, 2.0), (100.0, 1e-12, 100.0), (0.0, 2.0, 2.0)])
 def test_momentum_error_is_relative_to_the_largest_change(start, change, scale):
     exact = reference(FINE, [["a", len(FINE)]], shift=1.0)
     exact.momentum = np.array([[start, 0, 0], [start + change, 0, 0]])
     inexact = exact.momentum + [[0, 0, 0], [0, 0.5, 0]]
-    assert _momentum_error({"momentum_rate": None}, inexact, exact) == pytest.approx(0.5 / scale)
+    assert momentum_error({"momentum_rate": None}, inexact, exact) == pytest.approx(0.5 / scale)
+
+
+# --- the Pareto front ------------------------------------------------------------------------------------------------
+
+few = st.integers(0, 4).map(float)  # points often coincide or share a coordinate
+points = st.lists(st.tuples(few, few) | st.tuples(st.floats(1e-9, 1e9), st.floats(1e-12, 10.0)), max_size=20)
+
+
+def dominates(a, b) -> bool:
+    """Whether a is not larger than b in either coordinate, and smaller in one."""
+    return a[0] <= b[0] and a[1] <= b[1] and a != b
+
+
+@given(points)
+def test_front_holds_exactly_the_undominated_points(candidates):
+    found = front(candidates)
+    assert len(found) == len(set(found))
+    for k, point in enumerate(candidates):
+        assert (k in found) == (not any(dominates(other, point) for other in candidates))
+    times, errors = [candidates[k][0] for k in found], [candidates[k][1] for k in found]
+    assert times == sorted(times) and errors == sorted(errors, reverse=True)
+
+
+@given(points, st.floats(0.0, 5.0))
+def test_cheapest_is_the_fastest_within_the_tolerance(candidates, tolerance):
+    found, accurate = cheapest(candidates, tolerance), [p for p in candidates if p[1] <= tolerance]
+    if not accurate:
+        assert found is None
+    else:
+        assert candidates[found] == min(accurate)
+
+
+@given(points)
+def test_nearest_has_the_smallest_error(candidates):
+    found = nearest(candidates)
+    assert (found is None) == (not candidates)
+    if candidates:
+        assert candidates[found] == min(candidates, key=lambda p: (p[1], p[0]))
+
+
+def test_points_with_nan_are_left_out():
+    candidates = [(math.nan, 0.0), (1.0, math.nan), (2.0, 0.5)]
+    assert front(candidates) == [2] and cheapest(candidates, 1.0) == 2 and front([]) == []

@@ -1,15 +1,13 @@
 """The command `taisoft study`:
 
-* invalid input is rejected with exit status 2 before any run; the command itself does not import Taichi;
+* invalid input is rejected with exit status 2 before any run;
 * an interrupted study exits within seconds with status 130; the same command continues it, also after a kill, and no child
   process outlives the command.
 """
 
 import json
-import os
 import signal
 import subprocess
-import sys
 import time
 from argparse import Namespace
 from pathlib import Path
@@ -23,7 +21,7 @@ from taisoft.cli.study import check_device
 from taisoft.errors import SceneError
 from taisoft.machine import usable_cores
 from taisoft.study import workers
-from tests.cli.command import BEAM, ROOT, child, write
+from tests.cli.command import BEAM, child, write
 from tests.study.study_places import wait_until_ended
 
 
@@ -54,12 +52,9 @@ def test_invalid_arguments_are_rejected(beam, tmp_path, capsys, arguments, messa
     assert not (tmp_path / "out").exists()
 
 
-def test_unknown_scene_is_rejected(capsys):
+def test_unknown_scenes_and_used_folders_are_refused(beam, tmp_path, capsys):
     assert study("no_such_demo") == 2
     assert "neither a demo nor a .toml or .py file" in capsys.readouterr().err
-
-
-def test_folder_with_results_of_a_run_is_not_overwritten(beam, tmp_path, capsys):
     (tmp_path / "report.json").write_text("{}")
     assert study(beam, "--out", tmp_path) == 3
     assert "already holds results (report.json)" in capsys.readouterr().err
@@ -70,11 +65,6 @@ def test_unreachable_scheduler_is_rejected(beam, capsys, monkeypatch):
     monkeypatch.setattr(workers, "CONNECT_SECONDS", 0.3)
     assert study(beam, "--scheduler", "tcp://127.0.0.1:9") == 2
     assert "no Dask scheduler answers there" in capsys.readouterr().err
-
-
-def test_command_does_not_import_taichi():
-    code = "import sys, taisoft.cli.study; sys.exit('taichi' in sys.modules)"
-    assert subprocess.run([sys.executable, "-c", code], env=os.environ | {"PYTHONPATH": str(ROOT)}).returncode == 0
 
 
 def test_workers_cannot_share_a_gpu():
@@ -88,13 +78,12 @@ def test_workers_cannot_share_a_gpu():
 
 
 @pytest.mark.parametrize(
-    "rows, ended, signal_number, status",
-    [(1, "", None, 0), (1, "", 2, 0), (1, "it was interrupted", 2, 130), (0, "", None, 1), (0, "the budget was spent", None, 1)],
+    "rows, ended, signal_number, status", [(1, "", 2, 0), (1, "it was interrupted", 2, 130), (0, "the budget was spent", None, 1)]
 )
 def test_exit_status(monkeypatch, rows, ended, signal_number, status):
     monkeypatch.setattr(study_command, "text_of", lambda study: "")
     study = SimpleNamespace(comparable_rows=lambda: [object()] * rows, ended=ended)
-    assert study_command._report_study(study, Namespace(out=None), SimpleNamespace(number=signal_number)) == status
+    assert study_command.report_study(study, Namespace(out=None), SimpleNamespace(number=signal_number)) == status
 
 
 # --- interrupted ------------------------------------------------------------------------------------------------------
@@ -105,48 +94,40 @@ def records(out: Path) -> dict[str, int]:
     return {path.name: path.stat().st_mtime_ns for path in (out / "runs").glob("*.json")} if out.exists() else {}
 
 
-def wait_until(condition, process) -> None:
-    deadline = time.monotonic() + 120
-    while not condition():
-        assert process.poll() is None, process.communicate()
-        assert time.monotonic() < deadline
-        time.sleep(0.05)
-
-
 def children_of(pid: int) -> list[int]:
     return [int(child_pid) for child_pid in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
 
 
 @pytest.mark.skipif(not Path("/proc").is_dir(), reason="there is no /proc to find children in")
-def test_interrupted_and_killed_studies_are_continued(tmp_path, capsys):
+@pytest.mark.long
+def test_interrupted_and_killed_studies_are_continued(tmp_path):
     out, path = tmp_path / "out", write(tmp_path / "beam.py", BEAM)
     arguments = (path, "--out", out, "--repeats", "1", "--dt", "0.00625,0.003125", "--integrator", "symplectic_euler")
 
-    process = child("study", *arguments)
-    wait_until(lambda: len(records(out)) >= 1, process)
+    def begin(condition) -> subprocess.Popen:
+        """A study that has reached a condition."""
+        process, deadline = child("study", *arguments), time.monotonic() + 120
+        while not condition(process):
+            assert process.poll() is None and time.monotonic() < deadline
+            time.sleep(0.05)
+        return process
+
+    process = begin(lambda process: records(out))
     process.send_signal(signal.SIGINT)
     printed, errors = process.communicate(timeout=120)
     assert process.returncode == 130 and "ending; runs that are finished are kept" in errors
     assert "Not complete: the study was interrupted. The same command continues it." in printed
     first = records(out)
     assert 1 <= len(first) < 4 and (out / "study.md").exists()
-
-    process = child("study", *arguments)
-    wait_until(lambda: len(records(out)) > len(first), process)
-    # there is no child between two runs: wait for the next one or for the end of the study
-    wait_until(lambda: children_of(process.pid) or len(records(out)) == 4, process)
+    process = begin(lambda process: len(records(out)) > len(first) and children_of(process.pid))
     running = children_of(process.pid)
     process.kill()
     process.communicate()
     wait_until_ended(running)
     second = records(out)
-
-    process = child("study", *arguments)
-    _, errors = process.communicate(timeout=200)
-    assert process.returncode == 0 and f"{len(second)} of them already done" in errors
-    last = records(out)
-    assert len(last) == 4 and all(last[name] == at for name, at in second.items()) and first.items() <= second.items()
+    _, errors = begin(lambda process: True).communicate(timeout=200)
+    assert f"{len(second)} of them already done" in errors and len(last := records(out)) == 4
+    assert second.items() <= last.items() and first.items() <= second.items()
     record = json.loads((out / "study.json").read_text())
     assert not record["ended"] and [row["status"] for row in record["rows"]] == ["ok", "ok"]
-    assert all(row["cores"] == usable_cores() and row["threads"] == len(row["cores"]) for row in record["rows"])
     assert not list(out.rglob("*.part"))

@@ -1,6 +1,6 @@
 """A study on a Dask cluster of two worker processes on loopback addresses of this machine:
 
-* workers run in separate processes on separate cores, and give the result of local runs;
+* workers run in separate processes on separate cores;
 * the run of a lost worker moves to another one; runs end with the study.
 """
 
@@ -13,12 +13,11 @@ from contextlib import ExitStack
 
 import pytest
 
-from tests.cli.command import BEAM, ROOT, write
+from tests.cli.command import ROOT, write
 from tests.study.study_places import wait_until_ended
 
 pytest.importorskip("distributed")
 
-from taisoft.cli import main
 from taisoft.machine import usable_cores
 from taisoft.study.workers import BUDGET_SPENT, CUT_BY_BUDGET, carry_out, cluster_places, connect
 
@@ -39,40 +38,18 @@ def dask(stack: ExitStack, *arguments) -> subprocess.Popen:
     return process
 
 
-@pytest.fixture
-def cluster(tmp_path):
-    """(address, worker processes) of a scheduler and two workers on 127.0.0.1."""
-    if len(usable_cores()) < 2:
-        pytest.skip("two workers need a core each")
+@pytest.mark.long
+@pytest.mark.skipif(len(usable_cores()) < 2, reason="two workers need a core each")
+def test_workers_use_separate_cores_and_may_be_lost(tmp_path):
+    pids, common = tmp_path / "pids", ("--nthreads", "1", "--no-nanny", "--no-dashboard", "--local-directory", tmp_path)
+    path = write(tmp_path / "slow.py", SLOW.format(file=str(pids)))
+    request = {"action": "plan", "scene": str(path), "allow_outside": False, "request": {}}
     with ExitStack() as stack:
         scheduler = dask(stack, "dask_scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard", "--no-show")
         address = next(m[1] for line in scheduler.stderr if (m := re.search(r"(tcp://127\.0\.0\.1:\d+)", line)))
-        common = ("--nthreads", "1", "--no-nanny", "--no-dashboard", "--local-directory", tmp_path)
-        workers = [dask(stack, "dask_worker", address, *common, "--host", "127.0.0.1") for _ in range(2)]
-        with connect(address) as client:
-            client.wait_for_workers(2, timeout=60)
-        yield address, workers
-
-
-def test_a_study_on_a_cluster_equals_a_local_one(cluster, tmp_path, capsys):
-    address, _ = cluster
-    path = write(tmp_path / "beam.py", BEAM)
-    arguments = ["--repeats", "1", "--dt", "0.00625,0.003125", "--integrator", "symplectic_euler"]
-    assert main(["study", str(path), "--out", str(tmp_path / "a"), "--scheduler", address, *arguments]) == 0
-    table = capsys.readouterr().out
-    assert "1 thread," in table and table.count("| ok ") == 2
-    assert main(["study", str(path), "--out", str(tmp_path / "b"), *arguments]) == 0
-    error_column = re.compile(r"^\|.*\| symplectic_euler \|[^|]*\|[^|]*\| *(\S+) \|", re.MULTILINE)
-    errors, local_errors = error_column.findall(table), error_column.findall(capsys.readouterr().out)
-    assert errors == local_errors and len(errors) == 2
-
-
-def test_workers_use_separate_cores_and_may_be_lost(cluster, tmp_path):
-    address, processes = cluster
-    pids = tmp_path / "pids"
-    path = write(tmp_path / "slow.py", SLOW.format(file=str(pids)))
-    request = {"action": "plan", "scene": str(path), "allow_outside": False, "request": {}}
-    with connect(address) as client:
+        processes = [dask(stack, "dask_worker", address, *common, "--host", "127.0.0.1") for _ in range(2)]
+        client = stack.enter_context(connect(address))
+        client.wait_for_workers(2, timeout=60)
         places, machines = cluster_places(client)
         assert len(places) == 2 and len(machines) == 1
         assert len(set(places[0].cores) | set(places[1].cores)) == len(places[0].cores) + len(places[1].cores)

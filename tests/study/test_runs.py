@@ -57,8 +57,7 @@ def reused_simulators(monkeypatch):
 
 def study_of(tmp_path, hold: str = FIXED, **request):
     path = write(tmp_path / "bar.py", SCENE.replace("HOLD", hold))
-    place = InProcess()
-    return run(place, Request(str(path), repeats=1, **request))
+    return run(InProcess(), Request(str(path), repeats=1, **request))
 
 
 def run(place: InProcess, request: Request):
@@ -66,21 +65,19 @@ def run(place: InProcess, request: Request):
     return runner.run(runner.plan())
 
 
-@pytest.mark.parametrize(
-    "integrator, order",
-    [("velocity_verlet", 2), ("symplectic_euler", 1), ("implicit_euler", 1), ("bdf2", 2), ("implicit_midpoint", 2)],
-)
-def test_measured_order_of_convergence_is_the_integrators(tmp_path, reused_simulators, integrator, order):
-    axes = {"dt": [0.01, 0.005, 0.0025], "integrator": [integrator], "precision": ["f64"]}
+def test_measured_order_of_convergence_is_the_integrators(tmp_path, reused_simulators):
+    """Of symplectic Euler, 1."""
+    axes = {"dt": [0.01, 0.005, 0.0025], "integrator": ["symplectic_euler"], "precision": ["f64"]}
     study = study_of(tmp_path, axes=axes, reference_integrator="velocity_verlet")
     rows = study.comparable_rows()
     assert [row.setting["dt"] for row in rows] == axes["dt"] and study.references[0].setting["integrator"] == "velocity_verlet"
     errors = np.array([row.in_time.rms for row in rows])
-    assert np.allclose(np.log2(errors[:-1] / errors[1:]), order, atol=0.25), errors
+    assert np.allclose(np.log2(errors[:-1] / errors[1:]), 1, atol=0.25), errors
     assert (errors > 10 * study.references[0].own_error.rms).all()  # errors are resolved
     assert all(row.status == "ok" and row.unconverged == 0 and row.energy_kept for row in rows)
 
 
+@pytest.mark.long
 def test_free_flight_has_no_error_on_either_mesh(tmp_path, reused_simulators):
     axes = {"dt": [0.005], "integrator": ["velocity_verlet"], "precision": ["f64"], "refine": [0, 1]}
     study = study_of(tmp_path, FREE, axes=axes, reference_refine=0)
@@ -90,15 +87,11 @@ def test_free_flight_has_no_error_on_either_mesh(tmp_path, reused_simulators):
         assert row.in_time.max < 1e-9 and row.in_space.max < 1e-9 and row.energy < 1e-9 and row.momentum < 1e-9
 
 
-def test_failed_run_is_recorded_with_the_reason(tmp_path):
-    path = write(
-        tmp_path / "bar.py",
-        SCENE.replace("HOLD", "bar.move(lambda X: X[:, 0] < -0.99, path)")
-        + ("\n\ndef path(t):\n    return (0, 0, 0) if t < 0.2 else 1 / 0\n"),
-    )
-    place = InProcess()
-    request = Request(str(path), {"dt": [0.01], "integrator": ["velocity_verlet"], "precision": ["f64"]}, repeats=1)
-    study = run(place, request)
+def test_a_failed_run_is_recorded_with_the_reason(tmp_path):
+    text = SCENE.replace("HOLD", "bar.move(lambda X: X[:, 0] < -0.99, path)")
+    path = write(tmp_path / "bar.py", text + "\n\ndef path(t):\n    return (0, 0, 0) if t < 0.2 else 1 / 0\n")
+    axes = {"dt": [0.01], "integrator": ["symplectic_euler"], "precision": ["f64"]}
+    study = run(InProcess(), Request(str(path), axes, repeats=1))
     assert study.rows[0].status == "failed" and "ZeroDivisionError" in study.rows[0].reason
     assert "ZeroDivisionError" in study.notes[0]
 
@@ -133,14 +126,14 @@ def test_changed_import_or_refined_mesh_makes_another_run(tmp_path):
 
     length.write_text("2.5")
     other = runner.plan()
-    changed = [runner._key(first, task) != runner._key(other, task) for task in sum(tasks_of(first), [])]
+    changed = [runner.key(first, task) != runner.key(other, task) for task in sum(tasks_of(first), [])]
     assert changed == [bool(task.setting["refine"]) for task in sum(tasks_of(first), [])] and any(changed)
 
     (tmp_path / "module_of_a_study.py").write_text("YOUNG = 1e6")
     edited = runner.run(other)  # refused before anything is run
     assert all("it was changed meanwhile" in row.reason for row in edited.rows)
     third = runner.plan()
-    assert all(runner._key(other, task) != runner._key(third, task) for task in sum(tasks_of(other), []))
+    assert all(runner.key(other, task) != runner.key(third, task) for task in sum(tasks_of(other), []))
 
 
 # --- processes --------------------------------------------------------------------------------------------------------
@@ -178,13 +171,11 @@ def test_workers_are_pinned_to_separate_cores(tmp_path):
     assert reported == {f"cores {sorted(cores)}" for cores in core_sets}
 
 
-def test_process_that_exits_without_an_answer_is_reported(tmp_path):
+def test_processes_that_exit_early_are_reported(tmp_path):
+    """Without an answer, and without reading the request."""
     path = write(tmp_path / "dead.py", "import os, sys\nprint('hello', file=sys.stderr, flush=True)\nos._exit(7)\n")
     answers = answers_of([("a", request(path))], [LocalPlace(usable_cores())])
     assert answers["a"] == {"crash": "its process ended with exit status 7 without an answer: hello"}
-
-
-def test_process_that_exits_without_reading_is_reported():
     child = (sys.executable, "-c", "import os; os._exit(3)")
     large = {"text": "x" * 1_000_000}  # more than a pipe holds
     answers = answers_of([("a", large)], [LocalPlace(usable_cores(), child)])

@@ -13,10 +13,11 @@ import pytest
 
 import taisoft as ts
 from taisoft.errors import SimulationError
-from taisoft.records import StepReport
+from taisoft.frames import fit_dt
+from taisoft.records import RunReport, StepReport
 from taisoft.scene.plan import Plan
 from taisoft.settings import Settings
-from taisoft.view.live import BATCH, LiveRun
+from taisoft.view.live import LiveRun
 from taisoft.view.plots import Plots
 from tests.dynamics.scenes import rubber
 from tests.view.fake_simulator import FakeSimulator, beam_scene
@@ -90,9 +91,15 @@ def live(monkeypatch):
 # --- time ---
 
 
-@pytest.mark.parametrize("integrator", ["symplectic_euler", "implicit_euler"])
-@pytest.mark.parametrize("speed", [1.0, 0.25, 4.0])
-@pytest.mark.parametrize("dt, seconds_per_step", [(1 / 60, 1e-3), (1 / 600, 1e-4), (0.05, 1e-3)])
+@pytest.mark.parametrize(
+    "dt, seconds_per_step, speed, integrator",
+    [
+        (1 / 60, 1e-3, 1.0, "symplectic_euler"),
+        (1 / 600, 1e-4, 4.0, "symplectic_euler"),
+        (1 / 600, 1e-4, 1.0, "implicit_euler"),
+        (0.05, 1e-3, 0.25, "implicit_euler"),
+    ],
+)
 def test_a_fast_simulation_follows_the_clock(live, dt, seconds_per_step, speed, integrator):
     sim = Clock(dt, seconds_per_step, integrator)
     run, window = live(sim, speed=speed)
@@ -105,15 +112,17 @@ def test_a_fast_simulation_follows_the_clock(live, dt, seconds_per_step, speed, 
     assert state["speed"] == pytest.approx(speed, rel=0.15) and state["status"] == "running"
 
 
-@pytest.mark.parametrize("integrator", ["symplectic_euler", "implicit_euler"])
-@pytest.mark.parametrize("dt, seconds_per_step, slowdown", [(1e-4, 1e-3, 10.0), (1 / 60, 0.5, 30.0)])
+@pytest.mark.parametrize(
+    "dt, seconds_per_step, slowdown, integrator",
+    [(1e-4, 1e-3, 10.0, "symplectic_euler"), (1e-4, 1e-3, 10.0, "implicit_euler"), (1 / 60, 0.5, 30.0, "implicit_euler")],
+)
 def test_a_slow_simulation_says_so_and_makes_up_nothing(live, dt, seconds_per_step, slowdown, integrator):
     sim = Clock(dt, seconds_per_step, integrator)
     run, window = live(sim)
     while sim.now < 110.0:
         before = sim.now
         run.turn()
-        assert sim.now - before <= max(1.1 * BATCH, 1.01 * seconds_per_step) + dt, "commands and states come in between"
+        assert sim.now - before <= max(0.02, 1.01 * seconds_per_step) + dt, "commands and states come in between"
     assert f"needs {slowdown:.1f} times as long" in window.states[-1]["status"]
     assert window.states[-1]["speed"] == pytest.approx(1.0 / slowdown, rel=0.1)
     sim.seconds_per_step, time, now = 0.1 * dt, sim.time, sim.now  # now it could catch up
@@ -128,13 +137,17 @@ def test_as_fast_as_possible_and_the_keys_of_speed(live):
     while sim.step_count < 20000:
         run.turn()
     assert window.states[-1]["asked_speed"] is None and window.states[-1]["speed"] == pytest.approx(100.0, rel=0.1)
-    assert max(n for _, n in sim.calls) <= BATCH / 1e-4 + 1
+    assert max(n for _, n in sim.calls) <= 200
     while sim.step_count < 30000:
         run.turn()
     assert window.states[-1]["asked_speed"] == 4.0 and window.states[-1]["speed"] == pytest.approx(4.0, rel=0.2)
     run.turn()
     run.turn()
     assert window.states[-1]["asked_speed"] == 1 / 16, "the least"
+    run, window = live(Clock(), speed=math.inf)
+    for _ in range(3):
+        run.turn()
+    assert window.states[-1]["asked_speed"] is None
 
 
 def test_nothing_is_sent_while_the_window_is_not_ready(live):
@@ -181,7 +194,7 @@ def test_commands_are_carried_out_between_steps(live):
 
 
 def test_no_state_is_sent_between_a_drag_and_its_step(live):
-    """The window would draw it while the step takes place. A simulation that pauses sends it, and a slow one goes on sending."""
+    """The window would draw it while the step takes place."""
     sim = Clock(dt=0.05, seconds_per_step=1e-3)
     run, window = live(sim)
     while sim.step_count < 5:
@@ -190,16 +203,6 @@ def test_no_state_is_sent_between_a_drag_and_its_step(live):
     while sim.step_count < 6:
         run.turn()
     assert [(state["step_count"], state["drag_done"]) for state in window.states[count:]] == [(6, 5)]
-    run.speed = 1.0 / 16.0
-    count, window.requests = len(window.states), {6: [["drag", [1.0, 2.0, 4.0], 10.0]]}
-    while sim.step_count < 7:
-        run.turn()
-    own = [(state["step_count"], state["drag_done"]) for state in window.states[count:]]
-    assert own[-1] == (7, 6) and set(own[:-1]) == {(6, 5)}, "every 0.2 s meanwhile"
-    window.requests = {7: [["pause"], ["drag", [1.0, 2.0, 5.0], 10.0]]}
-    count = len(window.states)
-    run.turn()
-    assert [state["step_count"] for state in window.states[count:]] == [7] and run.paused
 
 
 def test_failures_pause_and_warnings_are_shown(live):
@@ -211,6 +214,11 @@ def test_failures_pause_and_warnings_are_shown(live):
         warnings.warn("the body is soft", UserWarning, stacklevel=1)
         return advance(n)
 
+    def diverge(n):
+        report = advance(n)
+        report.problems = ["the step did not converge"]
+        return report
+
     def fail(_n):
         raise SimulationError("node 3 is not finite")
 
@@ -221,7 +229,11 @@ def test_failures_pause_and_warnings_are_shown(live):
         run.run()
         assert warnings.showwarning("x") is None, "it is put back"
     assert given[0] == "the body is soft" and window.states[-1]["messages"] == ["warning: the body is soft"]
-    sim.advance, window.steps = fail, None
+    sim.advance, window.steps, count = diverge, None, sim.step_count
+    while sim.step_count < count + 2:
+        run.turn()
+    assert window.states[-1]["messages"] == ["the step did not converge"]
+    sim.advance = fail
     while not run.paused:
         run.turn()
     run.turn()
@@ -231,22 +243,6 @@ def test_failures_pause_and_warnings_are_shown(live):
     while sim.step_count < count + 3:
         run.turn()
     assert not run.paused and "failed" not in window.states[-1]["messages"][0]
-
-
-def test_the_problems_of_a_step_are_shown(live):
-    sim = Clock()
-    run, window = live(sim)
-    advance = sim.advance
-
-    def diverging(n):
-        report = advance(n)
-        report.problems = ["the step did not converge"]
-        return report
-
-    sim.advance = diverging
-    while sim.step_count < 2:
-        run.turn()
-    assert window.states[-1]["messages"] == ["the step did not converge"]
 
 
 def test_another_solver_is_announced_before_it_compiles(live):
@@ -269,19 +265,13 @@ def test_another_solver_is_announced_before_it_compiles(live):
 # --- the same bits ---
 
 
-def falling(integrator, dt):
-    scene = ts.Scene()
+@pytest.mark.parametrize(
+    "integrator, dt", [("implicit_euler", 0.008), pytest.param("symplectic_euler", 1e-3, marks=pytest.mark.long)]
+)
+def test_without_a_drag_the_states_are_those_of_run(integrator, dt):
+    scene, settings = ts.Scene(), {"integrator": integrator, "dt": dt}
     scene.add_body(ts.box_mesh((2, 2, 2), (1, 1, 1)), rubber(), name="cube", position=(0, 0.51, 0), velocity=(0.3, -1.0, 0.1))
     scene.add_obstacle(ts.HalfSpace((0, 0, 0), (0, 1, 0)), name="ground")
-    return scene, {"integrator": integrator, "dt": dt}
-
-
-@pytest.mark.parametrize("integrator, dt", [("implicit_euler", 0.008), ("symplectic_euler", 1e-3)])
-def test_without_a_drag_the_states_are_those_of_run(integrator, dt):
-    from taisoft.frames import fit_dt
-    from taisoft.records import RunReport
-
-    scene, settings = falling(integrator, dt)
     with ts.Simulator(scene, **settings, draggable=True) as sim:
         fit_dt(sim, 60.0, RunReport())
         LiveRun(sim, Window(sim, steps=round(0.2 / sim.dt)), Plots(sim)).run()
@@ -293,10 +283,3 @@ def test_without_a_drag_the_states_are_those_of_run(integrator, dt):
             sim.step()
         for own, other in zip(found, (sim.time, sim.positions(), sim.velocities())):
             assert np.array_equal(own, other)
-
-
-def test_an_infinite_speed_is_a_speed(live):
-    run, window = live(Clock(), speed=math.inf)
-    for _ in range(3):
-        run.turn()
-    assert window.states[-1]["asked_speed"] is None

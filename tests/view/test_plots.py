@@ -1,21 +1,85 @@
-"""Plots over time:
+"""Plots over time, and text over pictures:
 
+* the history of a run takes constant memory and loses no peak: entries hold the lowest and highest value of equal runs of steps;
+  energies are changes since the start; quantities that are not modelled or not finite are NaN and hide no neighbour;
 * curves lie in the unit square, at heights given by the axis; gaps stay gaps; a logarithmic axis accepts zero;
 * only simulated quantities are available, and a refusal gives the reason; a key hides the plots and shows them again;
-* in the window plots do not overlap and lie inside it, as many as fit.
+* in the window plots do not overlap and lie inside it, as many as fit; on pictures they are at the right, and a caption is at the
+  bottom, with the colour bar; both scale with the picture, and without Pillow they are refused;
+* `taisoft run --plots --caption --layers` draws them, and refuses unknown names and what is not modelled.
 """
 
-from contextlib import contextmanager
+import math
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
-from taisoft.errors import SceneError
+from taisoft.errors import OutputError, SceneError
 from taisoft.records import Energies, StepReport
 from taisoft.scene.plan import Plan
-from taisoft.view.annotations import MAX_SEGMENTS, cells, drawing, write
-from taisoft.view.plots import CAPACITY, GRID_LINES, PLOTS, QUANTITIES, Plots, curves_of
+from taisoft.view import annotations
+from taisoft.view.annotations import Annotations, cells, drawing
+from taisoft.view.colouring import COLOURS, Colouring
+from taisoft.view.offscreen import Offscreen
+from taisoft.view.plots import PLOTS, QUANTITIES, History, Plots, curves_of
+from taisoft.view.scene_view import Surfaces
+from tests.cli.command import BEAM, run, write
+from tests.output.png import decode
+from tests.view.drawing import body_mask
+from tests.view.fake_simulator import FakeSimulator, beam_scene
+
+# --- history ---
+
+
+def started(capacity: int = 8, time: float = 0.0, kinetic: float = 0.0) -> History:
+    history = History(capacity)
+    history.start(SimpleNamespace(time=time, energies=lambda: Energies(kinetic, 1.0, 2.0)))
+    return history
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    st.lists(st.floats(-1e6, 1e6, allow_subnormal=False) | st.just(float("nan")), max_size=200), st.sampled_from([2, 4, 8, 10])
+)
+def test_entries_hold_the_extremes_of_their_steps(values, capacity):
+    history = started(capacity)
+    for k, value in enumerate(values):
+        history.take(StepReport(time=k + 1.0, kinetic=value, elastic=1.0, gravity=2.0, n_contacts=k), 0.001, False, True)
+    kinetic, steps = np.array([0.0, *values]), np.arange(len(values) + 1.0)
+    n = len(history.times)
+    length = 2 ** math.ceil(math.log2(len(kinetic) / n))
+    assert n <= capacity and (length == 1 or 2 * n > capacity)
+    for j in range(n):
+        covered = slice(j * length, (j + 1) * length)
+        finite = kinetic[covered][np.isfinite(kinetic[covered])]
+        low, high = history.low[j, 0], history.high[j, 0]
+        if len(finite):
+            assert (low, high) == (finite.min(), finite.max())
+        else:
+            assert np.isnan(low) and np.isnan(high)
+        assert history.times[j] == steps[covered][-1]
+    assert history.times[-1] == len(values)
+
+
+def test_energies_are_changes_and_unmodelled_quantities_are_nan():
+    history = started(kinetic=10.0, time=3.0)
+    energies = {"kinetic": 11.0, "elastic": 3.0, "gravity": -1.0}
+    solved = {"residual": 1e-5, "newton_iterations": 2, "linear_iterations": 30, "contact_residual": float("inf")}
+    report = StepReport(time=3.1, steps=4, contact_iterations=8, n_contacts=5, **energies, **solved)
+    expected = {"kinetic": 1.0, "elastic": 2.0, "gravity": -3.0, "total": 0.0, "step_time": 5.0}
+    implicit = {"newton_residual": 1e-5, "newton_iterations": 2, "linear_iterations": 30}
+    contact = {"contact_iterations": 2.0, "n_contacts": 5}
+    for explicit, touching in ((False, True), (True, True), (True, False), (False, False)):
+        history.take(report, 0.02, explicit, touching)
+        modelled = expected | (implicit if not explicit else {}) | (contact if touching else {})
+        assert {name: value for name, value in zip(QUANTITIES, history.last) if np.isfinite(value)} == pytest.approx(modelled)
+    assert history.begin == 3.0
+
+
+# --- curves ---
 
 
 class Stub:
@@ -41,19 +105,6 @@ def filled(n=1000, **kind):
     return plots
 
 
-class RecordingGui:
-    """A GGUI that records names and places of sub-windows."""
-
-    def __init__(self):
-        self.names, self.places = [], []
-
-    @contextmanager
-    def sub_window(self, name, *place):
-        self.names.append(name)
-        self.places.append(place)
-        yield SimpleNamespace(text=lambda line, color=None: None)
-
-
 def curves_with(series: dict, name: str):
     """Curves of a plot of the given values by quantity, at times 0, 1, ..."""
     n = len(next(iter(series.values())))
@@ -67,7 +118,7 @@ def curves_with(series: dict, name: str):
 def test_curves_have_the_heights_given_by_the_axis():
     curves = curves_with({"n_contacts": [0, 10, 37, np.nan, 20]}, "contacts")
     assert curves.ends == ("0", "40") and curves.times == (0.0, 4.0)
-    assert curves.grid == pytest.approx([0.25, 0.5, 0.75]) and len(curves.grid) <= GRID_LINES
+    assert curves.grid == pytest.approx([0.25, 0.5, 0.75])
     ((_, points),) = curves.lines
     known = points[~np.isnan(points[:, 1])]
     assert np.allclose(known, [(0, 0), (0.25, 0.25), (0.5, 0.925), (1, 0.5)])
@@ -113,8 +164,6 @@ def test_only_simulated_quantities_are_available():
         assert set(available) == {"energies", "step_time"} | set(expected)
         for name, names in expected.items():
             assert [s.name for s in available[name].series] == names
-    with pytest.raises(SceneError, match=r"not available: contact forces are not modelled \(one body\); there are energies"):
-        Plots(Stub(touching=False), ("contacts",))
     with pytest.raises(SceneError, match="not available: steps of velocity_verlet are explicit .* and contact forces"):
         Plots(Stub(True, False), ("residuals",))
     with pytest.raises(SceneError, match="plot 'energy' is unknown.*did you mean energies"):
@@ -145,22 +194,156 @@ def test_a_restart_clears_the_history():
     assert plots.history.times[-1] <= 0.1
 
 
-@pytest.mark.parametrize("kind", [{}, {"explicit": True, "touching": False}])
-@pytest.mark.parametrize("size", [(1280, 720), (800, 300), (300, 100)])
-def test_plots_lie_in_the_window_without_overlap(kind, size):
-    plots = filled(3 * CAPACITY // 2 - 1, **kind)
+# --- in the window ---
+
+
+@pytest.mark.parametrize("size, n_shown", [((1280, 720), None), ((800, 300), 2), ((300, 100), 0)])
+def test_plots_lie_in_the_window_without_overlap(size, n_shown):
+    plots = filled(400)
     shown = cells(plots, size)
-    assert len(shown) == (len(plots.visible()) if size == (1280, 720) else 2 if size[0] == 800 else 0)
+    assert len(shown) == (len(plots.visible()) if n_shown is None else n_shown)
     boxes, ends, colours = drawing(shown, size)
-    assert len(boxes) == len(shown) and len(ends) == len(colours) and len(ends) <= 2 * MAX_SEGMENTS
+    assert len(boxes) == len(shown) and len(ends) == len(colours)
     assert np.isfinite(ends).all() and (ends >= 0).all() and (ends <= 1).all() and (boxes >= 0).all() and (boxes <= 1).all()
-    gui = RecordingGui()
-    write(gui, shown, (1280, 720))  # the initial size of the window
-    assert len(set(gui.names)) == len(shown) and all(name.endswith(str(cell.text)) for name, cell in zip(gui.names, shown))
-    for cell, place in zip(shown, gui.places):
-        assert np.array(place) * (1280, 720, 1280, 720) == pytest.approx(cell.text)
     tops = [cell.box[1] for cell in shown]
     assert all(b >= a + cell.box[3] for a, b, cell in zip(tops, tops[1:], shown))
     for cell in shown:
         assert cell.text[0] + cell.text[2] == cell.box[0] and cell.contains(cell.box[0] + 1, cell.box[1] + 1)
         assert not cell.contains(cell.text[0] - 1, cell.box[1] + 1)
+
+
+# --- over pictures ---
+
+SIZE = (640, 360)
+
+
+def grey(size=SIZE):
+    return np.full((size[1], size[0], 3), 120, dtype=np.uint8)
+
+
+def bounds(picture, before):
+    """Return left, top, right, bottom of the differing pixels."""
+    rows, columns = np.nonzero((picture != before).any(axis=2))
+    return columns.min(), rows.min(), columns.max() + 1, rows.max() + 1
+
+
+def near(picture, colour, by=60):
+    return np.abs(picture.astype(int) - np.round(255 * np.array(colour))).max(axis=2) < by
+
+
+@pytest.mark.parametrize("size", [SIZE, (1280, 720), (300, 300)])
+def test_plots_are_at_the_right(size):
+    plots, sim, unit = filled(), FakeSimulator(beam_scene()), size[1] / 720
+    for names in (["contacts"], list(PLOTS)):
+        plots.shown = {name: name in names for name in PLOTS}
+        before = grey(size)
+        picture = Annotations(plots).draw(before, sim, 3)
+        assert (before == 120).all() and picture.shape == before.shape and picture.dtype == np.uint8
+        left, top, right, bottom = bounds(picture, before)
+        assert left >= size[0] - 317 * unit and right <= size[0] - 15 * unit and top >= 15 * unit
+        assert bottom <= (156 if len(names) == 1 else 705) * unit
+        part = picture[top:bottom, left:right]
+        assert (part > 230).all(axis=2).mean() > 0.25, "background"
+        for series in PLOTS[names[-1]].series:
+            assert near(part, series.colour).sum() > 30, series.name
+    plots.shown = dict.fromkeys(PLOTS, False)
+    assert np.array_equal(Annotations(plots).draw(grey(size), sim, 3), grey(size))
+
+
+def test_lines_show_their_values():
+    plots, sim = filled(300), FakeSimulator(beam_scene())
+    column, half = QUANTITIES.index("n_contacts"), len(plots.history.times) // 2
+    for part, value in ((slice(0, half), 1.0), (slice(half, None), 4.5)):
+        plots.history.low[part, column] = plots.history.high[part, column] = value
+    plots.shown = {name: name == "contacts" for name in PLOTS}
+    picture = Annotations(plots).draw(grey((1280, 720)), sim, 0)
+    rows, columns = np.nonzero(near(picture[30:140, 975:1255], PLOTS["contacts"].series[0].colour))
+    low, high = rows[columns < 100], rows[(columns > 180) & (rows > 8)]  # below the text of the last value, in the same colour
+    assert np.ptp(low) < 4 and np.ptp(high) < 4 and low.min() == pytest.approx(high.min() + 0.7 * 92, abs=2)
+
+
+def coloured_by_stress(sim):
+    colouring = Colouring(sim.scene, Surfaces(sim.scene), "stress")
+    colouring.base(sim)
+    return colouring
+
+
+def test_a_caption_is_at_the_bottom():
+    sim = FakeSimulator(beam_scene())
+    sim.time = 0.5
+    plain = Annotations(name="bücher").draw(grey(), sim, 7)
+    left, top, right, bottom = bounds(plain, grey())
+    assert left < 12 and 190 < right < 340 and 318 < top < 336 and bottom <= 355
+    coloured = Annotations(name="bücher", colouring=coloured_by_stress(sim)).draw(grey(), sim, 7)
+    scale = coloured[bounds(coloured, grey())[1] : top, :120]
+    assert body_mask(scale).mean() > 0.1 and scale.shape[0] > 20
+    assert np.array_equal(coloured[top + 1 :], plain[top + 1 :])
+    assert not np.array_equal(Annotations(name="bücher").draw(grey(), sim, 8), plain), "frame number"
+    picture = Offscreen(sim.scene, SIZE).image(sim)
+    both = Annotations(filled(), "beam").draw(picture, sim, 0)
+    assert np.array_equal(both[10:280, : SIZE[0] - 160], picture[10:280, : SIZE[0] - 160]), "the bodies stay visible"
+
+
+def test_a_colour_bar_follows_the_scale_and_fits_a_small_picture():
+    sim = FakeSimulator(beam_scene())
+    colouring = Colouring(sim.scene, Surfaces(sim.scene), "stress")
+    bar_alone = Annotations(colouring=colouring)
+    assert np.array_equal(bar_alone.draw(grey((1280, 720)), sim, 0), grey((1280, 720))), "no scale yet"
+    pictures = []
+    for sim.time in (0.0, 0.0, 9.0):
+        colouring.base(sim)
+        pictures.append(bar_alone.draw(grey((1280, 720)), sim, 0))
+    left, top, right, bottom = bounds(pictures[0], grey((1280, 720)))
+    assert 8 < left < 18 and 230 < right < 252 and 640 < top and bottom <= 704
+    bar = pictures[0][681, 16:236]
+    assert np.abs(bar[[0, 110, -1]] - 255 * COLOURS[[0, 2, -1]]).max() < 6
+    assert np.array_equal(pictures[0], pictures[1]) and not np.array_equal(pictures[1], pictures[2])
+    assert np.array_equal(pictures[2][681, 16:236], bar), "only the numbers differ"
+    for size in ((160, 90), (64, 36)):  # where the steps of the bar are narrower than a pixel
+        assert (bar_alone.draw(grey(size), sim, 7) != grey(size)).any()
+
+
+# --- command ---
+
+
+def test_a_run_draws_plots_and_captions(tmp_path):
+    path = write(tmp_path / "beam.py", BEAM)
+    options = ("--plots", "energies,step_time", "--caption", "--layers", "wires")
+    assert run(path, "--out", tmp_path / "out", "--no-usd", "--fps", 10, *options) == 0
+    first, last = (decode(file.read_bytes()) for file in sorted((tmp_path / "out" / "frames").iterdir()))
+    energies, step_time = last[30:140, 970:], last[170:280, 970:]
+    for series in PLOTS["energies"].series[:3]:
+        assert near(energies, series.colour).sum() > 40, series.name
+    assert near(step_time, PLOTS["step_time"].series[0].colour).sum() > 20
+    assert (last[650:710, 10:600] < 60).all(axis=2).sum() > 500, "caption"
+    dark = (last[200:500, 300:900] < 70).all(axis=2)
+    assert dark.sum() > 500 and body_mask(last).sum() > 20 * dark.sum() / 2, "wires"
+    assert not np.array_equal(first[650:710], last[650:710])
+
+
+@pytest.mark.parametrize(
+    "arguments, message",
+    [
+        (["--plots", "energies,"], "'' is not a valid name"),
+        (["--layers", "wires,contact"], "'contact' is not a valid name (did you mean contacts?)"),
+        (["--layers", "contacts"], "--layers contacts: contact forces are not modelled (one body, and nothing that it could"),
+        (["--plots", "contacts"], "plot 'contacts' is not available: contact forces are not modelled (one body, and nothing"),
+        (["--caption", "--no-frames"], "--caption needs --out, the folder to write to, and pictures, so it excludes --no-frames"),
+        (["--plots", "energies", "--no-frames"], "--plots needs --out"),
+        (["--layers", "none", "--no-frames"], "--layers needs --out"),
+    ],
+)
+def test_what_cannot_be_shown_is_refused(beam, tmp_path, capsys, arguments, message):
+    assert run(beam, "--out", tmp_path / "out", *arguments) == 2
+    error = capsys.readouterr().err
+    assert message in error and error.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_text_without_pillow_is_refused(beam, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(annotations, "find_spec", lambda name: None if name == "PIL" else 1)
+    with pytest.raises(OutputError, match=r"text in pictures needs Pillow: pip install 'taisoft\[plot\]'"):
+        Annotations(name="beam")
+    assert run(beam, "--out", tmp_path / "out", "--caption") == 2
+    assert "--caption: text in pictures needs Pillow" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()

@@ -1,6 +1,6 @@
-"""The rasteriser of pictures, against the one in NumPy and a plain loop:
+"""The rasteriser of pictures, against the one in NumPy:
 
-* coverage, order and colours of random, thin, tiny and huge triangles, in both precisions of the runtime and the same in both;
+* coverage, order and colours of random, thin, tiny and huge triangles;
 * neighbours leave no gap, samples are averaged, and the last of two triangles at one depth is in front;
 * triangles near the eye, without area, or with vertices that are not finite are skipped, and no triangles change nothing;
 * a shadow map darkens the triangles that have one, between its texels; too many triangles are refused.
@@ -13,36 +13,36 @@ from benchmarks.numpy_raster import averaged, rasterise
 from taisoft.backend.runtime import open_runtime
 from taisoft.errors import OutputError
 from taisoft.view import raster
-from taisoft.view.raster import MAX_COORDINATE, Raster
+from taisoft.view.raster import Raster
 from taisoft.view.shading import N_ATTRIBUTES, SAMPLES, TILE
 
 NEAR = 0.5
 SHAPE = (3 * TILE + 10, 4 * TILE + 6)  # samples; the last tiles are cut off
 
 
-@pytest.fixture(params=["f32", "f64"])
-def runtime(request):
-    runtime = open_runtime("cpu", request.param)
+@pytest.fixture
+def runtime():
+    runtime = open_runtime("cpu", "f32")
     yield runtime
     runtime.close()
 
 
-def drawn(points, triangles, colours, shape=SHAPE, near=NEAR, background=200, shadows=None, texels=None):
+def drawn(points, triangles, colours, shape=SHAPE, near=NEAR, shadows=None, texels=None):
     """The picture and 1/depth of the kernels."""
     made = Raster(shape[::-1])
     attributes = np.zeros((len(points), N_ATTRIBUTES))
     attributes[:, :3], attributes[:, 5] = colours, -1.0
     if texels is not None:
         attributes[:, 3:] = texels
-    picture = np.full((shape[0] // SAMPLES, shape[1] // SAMPLES, 3), background, np.uint8)
+    picture = np.full((shape[0] // SAMPLES, shape[1] // SAMPLES, 3), 200, np.uint8)
     made.draw(points, triangles, attributes, near, np.zeros((1, 2, 2)) if shadows is None else shadows, picture)
     return picture, made.inverse_depths(points, triangles, near)
 
 
-def expected(points, triangles, colours, shape=SHAPE, near=NEAR, background=200):
+def expected(points, triangles, colours):
     """The picture of NumPy, and the mask of covered samples."""
-    image = np.full((*shape, 3), background, np.uint8)
-    mask = rasterise(points, triangles, colours, near, image)
+    image = np.full((*SHAPE, 3), 200, np.uint8)
+    mask = rasterise(points, triangles, colours, NEAR, image)
     return averaged(image), mask
 
 
@@ -57,9 +57,8 @@ KINDS = {"small": (400, 6.0), "large": (60, 60.0), "tiny": (9000, 0.9), "huge": 
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("seed", [0, 1])
-def test_random_triangles_equal_those_of_numpy(runtime, kind, seed):
-    rng = np.random.default_rng(seed)
+def test_random_triangles_equal_those_of_numpy(runtime, kind):
+    rng = np.random.default_rng(0)
     points, triangles = scattered(rng, *KINDS[kind])
     flat = np.repeat(rng.uniform(0, 1, (len(triangles), 3)), 3, axis=0)  # one colour a triangle: only the order matters
     picture, inverse = drawn(points, triangles, flat)
@@ -134,7 +133,7 @@ def test_invisible_triangles_are_skipped(runtime):
     bad = [good.copy() for _ in range(9)]
     bad[0][1, 2], bad[1][2, 2] = NEAR, -1.0
     bad[2][0, 0], bad[3][1, 1], bad[4][2, 2] = np.nan, np.inf, np.nan
-    bad[5][0, 0] = 1.01 * MAX_COORDINATE
+    bad[5][0, 0] = 1e7
     bad[6][:] = good[0]
     bad[7][:, 0] -= 500.0
     bad[8][:, 2] = np.inf, np.nan, -np.inf
@@ -145,29 +144,8 @@ def test_invisible_triangles_are_skipped(runtime):
         assert all(np.array_equal(a, b) for a, b in zip(drawn(points, triangles, colours), alone))
     picture, inverse = drawn(points, np.arange(3, n).reshape(-1, 3), colours)
     assert (picture == 200).all() and (inverse == 0).all() and (alone[1] > 0).any()
-
-
-def test_no_triangles_change_nothing(runtime):
-    picture, inverse = drawn(np.zeros((0, 3)), np.zeros((0, 3), int), np.zeros((0, 3)))
-    assert (picture == 200).all() and (inverse == 0).all()
-
-
-@pytest.mark.parametrize("shape", [(2, 2), (2, 400), (66, 34)])
-def test_pictures_of_any_size(runtime, shape):
-    points = np.array([[-1e3, -1e3, 1], [3e3, -1e3, 1], [-1e3, 3e3, 1]])
-    picture, inverse = drawn(points, np.array([[0, 1, 2]]), np.ones((3, 3)), shape)
-    assert inverse.shape == shape and (inverse > 0).all() and (picture == 255).all()
-
-
-def test_pictures_are_the_same_bytes_in_every_run_and_precision():
-    points, triangles = scattered(np.random.default_rng(3), 3000, 9.0)
-    colours = np.random.default_rng(4).uniform(0, 1, points.shape)
-    found = []
-    for precision in ("f32", "f32", "f64"):
-        runtime = open_runtime("cpu", precision)
-        found.append(b"".join(part.tobytes() for part in drawn(points, triangles, colours)))
-        runtime.close()
-    assert found[0] == found[1] == found[2]
+    nothing = drawn(np.zeros((0, 3)), np.zeros((0, 3), int), np.zeros((0, 3)))
+    assert (nothing[0] == 200).all() and (nothing[1] == 0).all(), "no triangles change nothing"
 
 
 def test_a_raster_is_reused_for_other_triangles(runtime):
@@ -200,41 +178,3 @@ def test_too_many_triangles_are_refused(runtime, monkeypatch):
     monkeypatch.setattr(raster, "ORDINALS", 4)
     with pytest.raises(OutputError, match="cannot show 5 triangles: at most 4"):
         drawn(points, triangles, np.zeros((15, 3)))
-
-
-# --- the rasteriser in NumPy ---
-
-
-def plain_raster(projected, triangles, colours, near, shape):
-    """A picture in which each pixel shows the nearest triangle that contains its centre."""
-    image, nearest = np.zeros((*shape, 3)), np.zeros(shape)
-    for triangle in triangles:
-        p, depth = projected[triangle, :2], projected[triangle, 2]
-        if not (depth > near).all():
-            continue
-        matrix = np.vstack([p.T, np.ones(3)])
-        if abs(np.linalg.det(matrix)) < 1e-12:
-            continue
-        for i in range(shape[0]):
-            for j in range(shape[1]):
-                weights = np.linalg.solve(matrix, [j + 0.5, i + 0.5, 1.0])
-                inverse = weights @ (1.0 / depth)
-                if (weights >= 0).all() and inverse > nearest[i, j]:
-                    nearest[i, j] = inverse
-                    image[i, j] = (weights / depth) @ colours[triangle] / inverse
-    return image, nearest > 0
-
-
-@pytest.mark.parametrize("seed", [0, 1])
-def test_rasterised_picture_equals_a_plain_loop(seed):
-    rng = np.random.default_rng(seed)
-    shape = (24, 32)
-    projected = rng.uniform((-8, -8, 1), (40, 32, 5), (36, 3))  # partly outside the picture
-    projected[0, 2], projected[4, 2] = -1.0, np.nan
-    colours, triangles = rng.uniform(0, 1, (36, 3)), np.arange(36).reshape(12, 3)
-    expected, covered = plain_raster(projected, triangles, colours, 0.5, shape)
-    image = np.zeros((*shape, 3), np.uint8)
-    mask = rasterise(projected, triangles, colours, 0.5, image)
-    assert 100 < covered.sum() < covered.size
-    assert np.array_equal(mask, covered)
-    assert np.abs(image.astype(float) - 255 * expected).max() <= 0.51
