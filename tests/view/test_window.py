@@ -317,7 +317,11 @@ def numbers(desktop):
 
 
 def click(desktop, across, down):
-    desktop.tool("xdotool", "mousemove", str(across), str(down), "click", "1")
+    """For long enough to be noticed between slow pictures."""
+    desktop.tool("xdotool", "mousemove", str(across), str(down), "mousedown", "1")
+    desktop.pause(0.4)
+    desktop.tool("xdotool", "mouseup", "1")
+    desktop.pause(0.4)
 
 
 @needs_vulkan

@@ -1,0 +1,86 @@
+"""What tests of pictures and windows share: masks of pictures, scenes with everything that is drawn, and child processes."""
+
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+import taisoft as ts
+from taisoft.view.connection_layer import ConnectionMarks
+from taisoft.view.ggui import vulkan_missing
+from taisoft.view.scene_view import scene_size
+from tests.view.desktop import ROOT
+from tests.view.fake_simulator import beam_scene
+
+SIZE = (320, 180)
+needs_vulkan = pytest.mark.skipif(bool(vulkan_missing()), reason="no Vulkan driver: Debian package mesa-vulkan-drivers")
+
+PROLOGUE = """
+import sys
+sys.path[:0] = ["."]
+from tests.view.fake_simulator import FakeSimulator, beam_scene
+from taisoft.errors import OutputError
+from taisoft.view.offscreen import Offscreen
+scene = beam_scene()
+sim = FakeSimulator(scene, announce=True)
+"""
+
+
+def run_child(code, **variables):
+    """stdout and stderr of a child process that must succeed; variables: of its environment, None removes one."""
+    environment = {k: v for k, v in (os.environ | variables).items() if v is not None}
+    command = [sys.executable, "-c", code]
+    child = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=120, check=False)
+    assert child.returncode == 0, child.stderr
+    return child.stdout, child.stderr
+
+
+def program(code: str) -> tuple[str, ...]:
+    """The command of a process that stands in for a window or for the process of pictures."""
+    return sys.executable, "-c", code
+
+
+def is_alive(pid: int) -> bool:
+    try:
+        with open(f"/proc/{pid}/stat") as file:
+            return file.read().rpartition(")")[2].split()[0] != "Z"
+    except FileNotFoundError:
+        return False
+
+
+def body_mask(image):
+    """Coloured pixels: the background is grey."""
+    rgb = image.astype(int)
+    return rgb.max(axis=2) - rgb.min(axis=2) > 20
+
+
+def marks_of(scene) -> ConnectionMarks:
+    return ConnectionMarks(scene, scene_size(scene))
+
+
+def moving_scene() -> ts.Scene:
+    """Two beams, a load along a path, and obstacles of all shapes, of which two move along paths."""
+    scene = beam_scene(("one", "two"))
+    scene.bodies[0].add_traction(lambda c: c[:, 0] > 1.99, lambda t: (0.0, 20.0 * t, 50.0))
+    scene.add_obstacle(ts.HalfSpace((0, -3, 0), (0, 1, 0)), name="ground")
+    scene.add_obstacle(ts.Sphere((3, 0, 1), 0.4), name="ball", path=lambda t: ((0, t, 0), np.eye(3)))
+    scene.add_obstacle(ts.Capsule((3, 1, 0), (3, 2, 0), 0.2), name="rod")
+    scene.add_obstacle(ts.HalfSpace((-3, 0, 0), (1, 0, 0)), name="wall", path=lambda t: ((0.1 * t, 0, 0), np.eye(3)))
+    box = ts.box_mesh((1, 1, 1), (0.5, 0.5, 0.5))
+    scene.add_obstacle(ts.MeshObstacle(box.vertices + (0, 3, 0), box.surface), name="lid")
+    scene.add_obstacle(ts.Box((0, -1.5, 0), (0.4, 0.1, 0.4)), name="slab")
+    return scene
+
+
+def connected_scene() -> ts.Scene:
+    """A bar with a skin, under pressure, on a spring and a tendon, and attached to another bar by springs."""
+    scene = beam_scene(("one", "two"))
+    vertices = 0.2 * np.array([(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1.0)])
+    scene.body("one").embed(ts.SurfaceMesh(vertices, np.array([(0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3)])))
+    scene.body("two").add_pressure([0, 1, 2], lambda t: 50.0 + t)
+    scene.add_spring(("one", (0, 0, 0)), ("two", (0, 0, 0)), stiffness=10.0, rest_length=0.5)
+    scene.add_tendon([("one", (0.5, 0, 0)), ("two", (0.5, 0, 0)), ("two", (1, 0, 0))], 3.0)
+    scene.add_rigid_body(ts.box_mesh((1, 1, 1), (0.4, 0.4, 0.4)), name="rigid", position=(4, 0, 0)).fix()
+    return scene

@@ -1,0 +1,347 @@
+"""Pictures of scenes, drawn without a display, driver or window:
+
+* bodies move in them, and the camera follows, whatever precision is open; the direction of view is free;
+* layers have their colours, and are hidden by what is in front of them; fixed nodes are shown by default;
+* a line is drawn as a band of its width, clipped at the near plane, and left out if not finite;
+* bodies are coloured by stress, stretch or speed; the scale ends at 1, 2 or 5 times a power of ten, rises immediately, does not
+  flicker, falls when it is far too high, and continues in a resumed run; markers and obstacles keep their colours;
+* a process holds one window, which keeps the runtime from being initialised again and leaves no files; without a display or a
+  driver a window is refused.
+"""
+
+import json
+import sys
+
+import numpy as np
+import pytest
+
+import taisoft as ts
+from taisoft.backend.runtime import open_kind, open_runtime
+from taisoft.cli import recording
+from taisoft.errors import OutputError, SimulationError
+from taisoft.output.camera import Camera, start_positions
+from taisoft.view.colouring import COLOURS, Colouring, round_up
+from taisoft.view.ggui import Canvas, window_holder
+from taisoft.view.offscreen import Offscreen, stroke
+from taisoft.view.raster import Raster
+from taisoft.view.scene_view import IMPULSE_COLOUR, LAYERS, MARKER_COLOUR, NORMAL_COLOUR, TRACTION_COLOUR, WIRE_COLOUR, Surfaces
+from taisoft.view.window import show
+from tests.cli.command import BEAM, run, write
+from tests.output.png import decode
+from tests.view.drawing import PROLOGUE, SIZE, body_mask, needs_vulkan, run_child
+from tests.view.fake_simulator import FakeSimulator, beam_scene
+
+LARGE = (640, 360)
+
+
+# --- pictures ---
+
+
+def test_bent_beam_moves_down_in_the_picture():
+    scene = beam_scene()
+    sim, drawing = FakeSimulator(scene), Offscreen(scene, SIZE)
+    straight, again = drawing.image(sim), drawing.image(sim)
+    sim.time = 1.0
+    bent = drawing.image(sim)
+    assert straight.shape == (180, 320, 3) and straight.dtype == np.uint8
+    assert np.array_equal(straight, again)
+    before, after = body_mask(straight), body_mask(bent)
+    assert 0.05 < before.mean() < 0.5
+    assert np.argwhere(after)[:, 0].mean() > np.argwhere(before)[:, 0].mean() + 5  # rows count downward
+    assert (straight[0] > 235).all() and (straight[-1] > 195).all() and (straight[-1] < 215).all()  # lighter at the top
+    assert straight[before].max() > 150, "the body is lit"
+    drawing.close()
+    with pytest.raises(OutputError, match="^a picture cannot be drawn: its renderer is closed$"):
+        drawing.image(sim)
+
+
+def test_falling_body_stays_in_the_picture():
+    scene = beam_scene()
+    sim, drawing = FakeSimulator(scene), Offscreen(scene, SIZE)
+    first = drawing.camera.distance
+    drawing.image(sim)
+    assert drawing.camera.distance == first
+    sim.positions = lambda: scene.bodies[0].rest_positions - (0, 5, 0)
+    mask = body_mask(drawing.image(sim))
+    assert first < drawing.camera.distance < 4 * first
+    assert 170 <= np.flatnonzero(mask.any(axis=1)).max() <= 175, "complete, with a border of 3 % below"
+    away = Camera(target=np.array([0.0, 100.0, 0.0]), distance=5.0)
+    image = Offscreen(scene, SIZE, away).image(FakeSimulator(scene))
+    assert not body_mask(image).any() and image.std(axis=1).max() == 0, "the background alone"
+
+
+def test_the_direction_of_pictures_is_free():
+    """From +x the beam, 4 m long along x, shows its end; the camera still moves back from it."""
+    scene = beam_scene()
+    drawing = Offscreen(scene, SIZE)
+    drawing.look_from(scene, 90.0, 0.0)
+    points = start_positions(scene)
+    assert np.allclose(drawing.camera.forward, (-1, 0, 0)) and np.ptp(drawing.camera.project(points, SIZE)[:, 0]) < 0.5 * SIZE[0]
+    before = drawing.camera.distance
+    sim = FakeSimulator(scene)
+    sim.positions = lambda name=None: 3.0 * points
+    drawing.image(sim)
+    assert drawing.camera.distance > 2.0 * before and np.allclose(drawing.camera.forward, (-1, 0, 0))
+
+
+def test_pictures_leave_the_runtime_free():
+    """The same picture whatever precision is open, and none is claimed between pictures."""
+    scene, images = beam_scene(), []
+    drawing = Offscreen(scene, SIZE)
+    for precision in ("f64", "f32"):
+        runtime = open_runtime("cpu", precision)
+        images.append(drawing.image(FakeSimulator(scene)))
+        assert open_kind() == ("cpu", precision)
+        runtime.close()
+        assert open_kind() is None
+    images.append(drawing.image(FakeSimulator(scene)))
+    assert open_kind() is None and np.array_equal(images[0], images[1]) and np.array_equal(images[1], images[2])
+
+
+# --- layers ---
+
+LINES = {"wires": (WIRE_COLOUR,), "contacts": (NORMAL_COLOUR, IMPULSE_COLOUR), "tractions": (TRACTION_COLOUR,)}
+
+
+@pytest.fixture(scope="module")
+def pictured():
+    """A function that draws two bent beams, a load and two contacts with the given layers; a picture is drawn once."""
+    scene = beam_scene(("one", "two"), cells=(4, 2, 2))
+    scene.bodies[1].add_traction(lambda c: c[:, 1] > 0.49, (0, -50.0, 0))
+    sim, drawn = FakeSimulator(scene), {}
+    sim.time = 1.0
+    contacts = sim.contacts()
+    contacts.point = np.array([[-1.0, 0.8, 0.3], [1.0, 0.2, 0.5]])
+    contacts.normal = np.array([[0.0, 1, 0], [0.0, 0, 1]])
+    sim.contacts = lambda: contacts
+
+    def picture(*layers):
+        if layers not in drawn:
+            drawn[layers] = Offscreen(scene, LARGE, layers=layers).image(sim).astype(int)
+        return drawn[layers]
+
+    picture.scene, picture.sim = scene, sim
+    return picture
+
+
+def has_colour(image, colour):
+    return np.abs(image - 255 * np.asarray(colour)).max(axis=2) < 40
+
+
+@pytest.mark.parametrize("layers", [LAYERS, ("wires",), ("contacts", "tractions")])
+def test_lines_are_drawn_in_their_colours(pictured, layers):
+    drawn, plain = pictured(*layers), pictured(*(set(layers) & {"fixed_nodes"}))
+    assert 0.003 < (np.abs(drawn - plain).max(axis=2) > 20).mean() < 0.2
+    for name, colours in LINES.items():
+        for colour in colours:
+            assert (has_colour(drawn, colour).sum() > has_colour(plain, colour).sum() + 5) == (name in layers), name
+
+
+def test_hidden_lines_are_not_drawn(pictured):
+    plain, wired = pictured(), pictured("wires")
+    lines = np.abs(wired - plain).max(axis=2) > 20
+    inside = body_mask(plain)
+    outline = inside & ~np.all([np.roll(inside, by, axis) for axis in (0, 1) for by in (-2, 2)], axis=0)
+    assert (lines & ~inside & ~outline).sum() < 0.2 * lines.sum(), "wires are drawn on the bodies"
+    drawing = Offscreen(pictured.scene, LARGE, layers=("wires",))
+    ends, _ = drawing.layers.lines(pictured.sim, drawing.camera)
+    length = np.linalg.norm(np.diff(drawing.camera.project(ends, LARGE)[:, :2].reshape(-1, 2, 2), axis=1), axis=2).sum()
+    assert lines.sum() < 0.85 * 1.25 * length, "some of them are hidden"
+
+
+def test_fixed_nodes_are_the_only_default_layer(pictured):
+    default = Offscreen(pictured.scene, LARGE).image(pictured.sim)
+    assert np.array_equal(default, pictured("fixed_nodes"))
+    dark = (default < 60).all(axis=2)
+    assert dark.sum() > 50 and not (pictured() < 60).all(axis=2).any(), "fixed nodes are dark balls"
+    with pytest.raises(OutputError, match="layer 'wire' is unknown: it must be one of wires, contacts"):
+        Offscreen(pictured.scene, SIZE, layers=("wire",))
+
+
+def test_arrows_beyond_the_bodies_are_inside_the_image(pictured):
+    top = np.flatnonzero(body_mask(pictured()).any(axis=1)).min()
+    assert has_colour(pictured("tractions")[: top - 5], TRACTION_COLOUR).sum() > 20
+
+
+@pytest.mark.parametrize("angle", [0, 30, 90, 200])
+def test_a_band_has_its_width(angle):
+    u, v = 30.0 * np.cos(np.radians(angle)), 30.0 * np.sin(np.radians(angle))
+    ends = np.array([[40.0, 40, 2], [40 + u, 40 + v, 4], [5, 5, 1], [5, 5, 1]])
+    runtime = open_runtime("cpu", "f32")
+    mask = Raster((80, 80)).inverse_depths(*stroke(ends, 4.0), 0.1) > 0
+    runtime.close()
+    assert mask.sum() == pytest.approx(120, abs=15)
+    row, column = np.argwhere(mask).T + 0.5
+    assert (np.abs(((column - 40) * v - (row - 40) * u) / 30) <= 2.01).all(), "within half the width of the line"
+
+
+def test_lines_are_clipped_at_the_near_plane():
+    camera = Camera(target=np.zeros(3), distance=10.0, azimuth=0.0, elevation=0.0)
+    ahead, behind = np.array([0.0, 1, 0]), np.array([0.0, 1, 20])
+    ends = np.array([ahead, behind, behind, ahead, ahead, 2 * ahead, behind, behind + 1, ahead, [0, np.nan, 0]])
+    colours = np.repeat(np.arange(10) / 10, 3).reshape(-1, 3)
+    clipped, kept = camera.clipped_lines(ends, colours)
+    assert len(clipped) == len(kept) == 6
+    assert np.allclose(clipped[[0, 3]], ahead) and np.allclose(clipped[[1, 2]], (0, 1, 9.8), atol=1e-4)
+    assert np.array_equal(clipped[4:], ends[4:6]) and np.array_equal(kept[4:], colours[4:6])
+    assert np.allclose(kept[1], 0.049, atol=1e-5)
+
+
+# --- colours ---
+
+
+@pytest.mark.parametrize("order", [1, 2])
+def test_a_stretched_bar_has_its_stretch_at_every_node(order):
+    scene = beam_scene(order=order)
+    sim, colouring = FakeSimulator(scene), Colouring(scene, Surfaces(scene), "stretch")
+    turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    x = sim.positions()
+    sim.positions = lambda name=None: x * (1.3, 0.9, 0.9) @ turn
+    assert np.allclose(colouring.values("stretch", sim), 1.3)
+    colouring.base(sim)
+    assert colouring.low == 1.0 and colouring.span == pytest.approx(0.5)
+    assert colouring.legend()[0][0].strip() == "1.5" and np.array_equal(colouring.legend()[0][1], COLOURS[-1])
+
+
+def with_speed(sim, speed):
+    sim.velocities = lambda: np.full(sim.positions().shape, speed / np.sqrt(3))
+    return sim
+
+
+def test_the_scale_does_not_flicker():
+    scene = beam_scene()
+    sim, colouring, spans = FakeSimulator(scene), Colouring(scene, Surfaces(scene), "speed"), []
+    for value in [3.0, 2.1, 4.9, 5.1, 4.8, *[5.2, 4.9] * 50, *[0.3] * 2000]:
+        colouring.base(with_speed(sim, value))
+        spans.append(colouring.span)
+    assert spans[:4] == [5.0, 5.0, 5.0, 10.0] and set(spans[3:105]) == {10.0}
+    assert spans[-1] == 0.5 and (np.diff(spans[105:]) <= 0).all()
+    assert [round_up(v) for v in (1.0, 1.1, 2.3, 0.07, 5e4)] == [1.0, 2.0, 5.0, 0.1, 5e4]
+
+
+@pytest.mark.parametrize("after", [0.0, 0.01])
+def test_a_scale_continues_from_what_is_kept(after):
+    """A picture of the time at which it is kept is drawn again, so its step of the running maximum must not count twice."""
+    scene = beam_scene()
+    sim = FakeSimulator(scene)
+
+    def image(drawing, time, speed):
+        sim.time = time
+        drawing.image(with_speed(sim, speed))
+
+    first, other, later = (Offscreen(scene, (32, 18), colour=colour) for colour in ("speed", "stress", "speed"))
+    image(first, 0.0, 3.0)
+    image(first, 0.1, 0.1)
+    kept = json.loads(json.dumps(first.kept(0.1 + after)))  # plain data
+    later.resume(kept)
+    other.resume(kept)
+    assert other.colouring.scale == ("stress", 0.0, 0.0)
+    if after == 0.0:
+        image(later, 0.1, 0.1)
+    assert later.colouring.scale == first.colouring.scale and 2.9 < first.colouring.scale[1] < 3.0
+    assert later.camera.distance == first.camera.distance
+
+
+def test_bodies_alone_are_coloured_by_stress():
+    scene = beam_scene()
+    scene.add_obstacle(ts.HalfSpace((0, -3, 0), (0, 1, 0)))
+    surfaces, sim = Surfaces(scene), FakeSimulator(scene)
+    sim.time = 1.0
+    base = Colouring(scene, surfaces, "stress").base(sim)
+    kept = (base == surfaces.colours).all(axis=1)
+    marked = (surfaces.colours == MARKER_COLOUR).all(axis=1)
+    grey = surfaces.colours.max(axis=1) - surfaces.colours.min(axis=1) < 0.1
+    assert marked.any() and kept[marked | grey].all() and not kept[~(marked | grey)].any()
+    scene = beam_scene()
+    own, stress = (Offscreen(scene, (160, 90), colour=colour).image(sim).astype(int) for colour in ("body", "stress"))
+    assert 0.03 < (np.abs(own - stress).max(axis=2) > 30).mean() < 0.4
+    red = stress[..., 0] - stress[..., 2] > 60
+    assert red[:, 80:].any() and not red[:, :60].any(), "the stress of FakeSimulator grows along x"
+
+
+def test_colour_option(tmp_path, monkeypatch, capsys):
+    """With a colour bar at the lower left, or a line that says why there is none."""
+    scene, missing = write(tmp_path / "beam.py", BEAM), "text in pictures needs Pillow: pip install 'taisoft[plot]'"
+    pictures = []
+    for name, colour, reason in (("own", "body", ""), ("bar", "stress", ""), ("bare", "stress", missing)):
+        monkeypatch.setattr(recording, "text_missing", lambda reason=reason: reason)
+        assert run(scene, "--out", tmp_path / name, "--no-usd", "--colour", colour) == 0
+        assert (f"pictures have no colour bar: {missing}" in capsys.readouterr().err) == bool(reason)
+        pictures.append(decode((tmp_path / name / "frames" / "00003.png").read_bytes()).astype(int))
+    own, bar, bare = pictures
+    corner = np.s_[640:710, :250]
+    assert np.array_equal(own[corner], bare[corner]) and (np.abs(bar - bare)[corner].max(axis=2) > 60).mean() > 0.1
+    assert (np.abs(own - bare).max(axis=2) > 30).mean() > 0.03
+    with pytest.raises(SystemExit, match="2"):
+        run(scene, "--colour", "heat")
+
+
+# --- windows: missing drivers and displays, one of them at a time ---
+
+NO_VULKAN = {"VK_ICD_FILENAMES": "/nonexistent", "VK_DRIVER_FILES": "/nonexistent", "DISPLAY": None}
+
+
+def test_without_vulkan_and_display_pictures_are_drawn():
+    code = (
+        PROLOGUE
+        + """
+from taisoft.view.ggui import Canvas
+for _ in range(2):
+    drawing = Offscreen(scene, (64, 36))
+    print("drawn", drawing.image(sim).std() > 5)
+    drawing.close()
+try:
+    Canvas(drawing.surfaces, (64, 36), visible=False)
+except OutputError as error:
+    print(error)
+"""
+    )
+    out, err = run_child(code, **NO_VULKAN)
+    assert out.count("drawn True") == 2
+    assert "cannot open a window: there is no Vulkan driver" in out
+    assert [line for line in err.splitlines() if not line.startswith(("taisoft: compiling", "RHI Error"))] == []
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="DISPLAY names displays on Linux only")
+@pytest.mark.parametrize("display, reason", [("", "DISPLAY is not set"), (":4711", "':4711' does not answer")])
+def test_without_a_display_a_window_is_refused(display, reason, monkeypatch):
+    monkeypatch.setenv("DISPLAY", display)
+    with pytest.raises(OutputError, match=f"cannot open a window.*{reason}"):
+        show(FakeSimulator(beam_scene()))
+
+
+@needs_vulkan
+def test_windows_leave_no_files_behind(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    surfaces = Surfaces(beam_scene())
+
+    def draw():
+        canvas = Canvas(surfaces, SIZE, visible=False)
+        canvas.pixels(0, 0, *SIZE)
+        canvas.close()
+        return list(tmp_path.iterdir())
+
+    assert draw() == []
+    ini = tmp_path / "imgui.ini"
+    ini.write_text("[Window][mine]\n")
+    assert draw() == [ini] and "[Window][mine]" in ini.read_text()
+
+
+@needs_vulkan
+def test_one_window_per_process():
+    """Pictures are drawn all the same."""
+    scene = beam_scene()
+    first = Canvas(Surfaces(scene), SIZE, visible=False)
+    try:
+        assert window_holder() == "a window"
+        with pytest.raises(OutputError, match="a window holds the only one a process can have"):
+            Canvas(Surfaces(scene), SIZE, visible=False)
+        assert body_mask(Offscreen(scene, SIZE).image(FakeSimulator(scene))).mean() > 0.05
+        other = "f64" if open_kind()[1] == "f32" else "f32"
+        with pytest.raises(SimulationError, match="a window is open"):
+            open_runtime("cpu", other)
+    finally:
+        first.close()
+        first.close()
+    assert window_holder() == ""
+    Canvas(Surfaces(scene), SIZE, visible=False).close()

@@ -1,0 +1,282 @@
+"""What pictures are made of:
+
+* surfaces are split at sharp edges only, normals point outward, midside nodes are drawn, fixed nodes are marked;
+* the square of a half-space stays at its start while bodies are well inside, then moves along and grows, but not across a cut;
+* below a body the ground is darker, the more the lower the body; slopes and moving half-spaces have shadows, walls have none;
+* the cursor picks the nearest surface that is drawn, skins too; the drag patch around it has weights of sum 1;
+* wires, contacts and arrows have the right places.
+"""
+
+import numpy as np
+import pytest
+
+import taisoft as ts
+from taisoft.output.camera import Camera
+from taisoft.scene.key_frames import KeyFrames
+from taisoft.view.ground import Square, finite_points
+from taisoft.view.mirror import MirrorSimulation, describe_scene, describe_state
+from taisoft.view.offscreen import Offscreen
+from taisoft.view.picking import MouseDrag, nearest_hit, pick
+from taisoft.view.scene_view import MARKER_COLOUR, Layers, Surfaces, smoothing_groups, vertex_normals
+from taisoft.view.shadow import Shadows, blurred
+from tests.view.drawing import marks_of
+from tests.view.fake_simulator import RUBBER, FakeSimulator, beam_scene
+
+# --- surfaces ---
+
+
+def test_edges_of_a_box_are_sharp_and_a_ball_is_smooth():
+    mesh = ts.box_mesh((2, 3, 4), (1, 1, 1))
+    nodes, corners = smoothing_groups(mesh.vertices, mesh.surface)
+    assert np.array_equal(nodes[corners], mesh.surface)
+    assert len(nodes) == 2 * (3 * 4 + 4 * 5 + 3 * 5)  # sides share no vertices
+    normals = vertex_normals(mesh.vertices[nodes], corners)
+    assert np.allclose(np.abs(normals).max(axis=1), 1.0)
+    assert (np.einsum("ij,ij->i", normals, mesh.vertices[nodes]) > 0.4).all()
+    ball = ts.ball_mesh(2.0, 8)
+    nodes, corners = smoothing_groups(ball.vertices, ball.surface)
+    assert np.array_equal(np.sort(nodes), np.unique(ball.surface))  # no vertex is split
+    normals = vertex_normals(ball.vertices[nodes], corners)
+    assert (np.einsum("ij,ij->i", normals, ball.vertices[nodes]) > 2.0 * np.cos(np.radians(12))).all()
+
+
+@pytest.mark.parametrize("order", [1, 2])
+def test_drawn_surface_follows_the_body_and_marks_fixed_nodes(order):
+    scene = beam_scene(("one", "two"), order=order)
+    surfaces, sim = Surfaces(scene), FakeSimulator(scene)
+    x, normals = surfaces.of_bodies(sim)
+    sim.time = 1.0
+    moved, _ = surfaces.of_bodies(sim)
+    assert len(x) == len(normals) == len(surfaces.colours)
+    assert np.allclose(np.linalg.norm(normals, axis=1), 1.0)
+    assert surfaces.triangles.min() == 0 and surfaces.triangles.max() == len(x) - 1
+    assert (moved[:, 1] <= x[:, 1] + 1e-12).all() and (x[:, 1] - moved[:, 1]).max() > 1.0
+    assert len(np.unique(surfaces.colours, axis=0)) == 3  # two bodies and the markers
+    n_fixed = len(np.intersect1d(scene.bodies[0].constraints[0].nodes, scene.bodies[0].nodes.surface))
+    assert n_fixed == (2 * order + 1) ** 2  # the left end
+    assert (surfaces.colours == MARKER_COLOUR).all(axis=1).sum() == 2 * n_fixed * 66  # vertices of a marker
+    # vertex normals agree with the winding of triangles
+    a, b, c = (x[surfaces.triangles[:, k]] for k in range(3))
+    assert (np.einsum("ij,ij->i", np.cross(b - a, c - a), normals[surfaces.triangles].sum(axis=1)) > 0).all()
+
+
+# --- squares of half-spaces ---
+
+FLOOR, CORNERS = ts.HalfSpace((0, 0, 0), (0, 1, 0)), np.array([(x, 0.0, z) for x in (-2.0, 2.0) for z in (-2.0, 2.0)])
+WALL, SLOPE = ts.HalfSpace((-2, 0, 0), (1, 0, 0)), ts.HalfSpace((0, 0, 0), (1, 1, 0))
+BEHIND, CEILING = ts.HalfSpace((0, 0, -2), (0, 0, 1)), ts.HalfSpace((0, 9, 0), (0, -1, 0))
+
+
+def cloud(centre, half=0.5):
+    return np.array(centre) + half * np.array([(-1.0, 0, -1), (1, 0.3, 1), (1, 2, -1), (-1, 1, 1)])
+
+
+def extent(square):
+    return [(square[:, k].min(), square[:, k].max()) for k in (0, 2)]
+
+
+def test_bodies_inside_move_nothing():
+    square = Square(FLOOR, CORNERS, [])
+    assert square.below(cloud((0.5, 1, -0.5))) is CORNERS
+    assert square.below(finite_points(np.full((3, 3), np.nan))) is CORNERS, "a state that is not finite"
+    assert square.below(finite_points(np.vstack([cloud((0.0, 1, 0)), [np.inf, 0, 0]]))) is CORNERS
+
+
+@pytest.mark.parametrize("place, half", [((7.0, 1.0, 0.0), 0.5), ((-30.0, 5.0, 12.0), 0.5), ((0.0, 1.0, 0.0), 10.0)])
+def test_the_square_moves_along_and_grows(place, half):
+    square = Square(FLOOR, CORNERS, []).below(cloud(place, half))
+    assert (square[:, 1] == 0.0).all()
+    for (low, high), at in zip(extent(square), (place[0], place[2])):
+        gaps = (at - half - low, high - at - half)
+        assert min(gaps) > 0.2
+        assert high - low == pytest.approx(4.0) if half < 2.0 else gaps[0] == pytest.approx(gaps[1])
+        if abs(at) > 2.0 or half > 2.0:
+            assert min(gaps) < 1.0, "no farther than needed"
+
+
+@pytest.mark.parametrize(
+    "others, moves",
+    [([WALL], (False, True)), ([WALL, BEHIND], (False, False)), ([SLOPE], (False, True)), ([CEILING], (True, True))],
+)
+def test_cut_squares_move_along_the_cut(others, moves):
+    square = Square(FLOOR, CORNERS, others).below(cloud((9.0, 1.0, 9.0)))
+    assert [low != pytest.approx(-2.0) for low, _ in extent(square)] == list(moves)
+
+
+# --- shadows ---
+
+ABOVE = Camera(target=np.array([0.0, 0.0, 0.0]), distance=8.0, azimuth=0.0, elevation=15.0)
+
+
+def cube_above(height, normal=(0.0, 1.0, 0.0), path=None):
+    """A cube of 1 m above a half-space through the origin."""
+    scene = ts.Scene()
+    scene.add_body(ts.box_mesh((2, 2, 2), (1, 1, 1)), RUBBER, name="cube", position=(0, height + 0.5, 0))
+    scene.add_obstacle(ts.HalfSpace((0, 0, 0), normal), name="ground", path=path)
+    return scene
+
+
+def maps_of(scene, bad=None, t=0.0):
+    """Shadow maps and their texels; bad: vertices that are not finite."""
+    surfaces = Surfaces(scene)
+    x, _ = surfaces.with_obstacles(surfaces.of_bodies(FakeSimulator(scene)), t, np.array([0.0, 9.0, 9.0]))
+    if bad is not None:
+        x[bad] = np.nan
+    return Shadows(scene, surfaces).draw(x, t)
+
+
+def test_the_ground_is_darker_below_a_body():
+    scene, size = cube_above(0.7), (160, 120)
+    picture = Offscreen(scene, size, ABOVE).image(FakeSimulator(scene)).astype(int)
+    places = ABOVE.project(np.array([[0.0, 0.0, 0.3], [0.0, 0.0, 1.5], [1.5, 0.0, 0.3]]), size)[:, :2].astype(int)
+    below, before, beside = (picture[row, column] for column, row in places)
+    assert (below < 0.9 * beside).all() and np.ptp(below) < 12, "grey"
+    assert (beside > 150).all() and np.abs(before - beside).max() < 12
+
+
+def test_a_shadow_fades_exponentially_with_height():
+    first, second, third = (maps_of(cube_above(height))[0].max() for height in (0.0, 0.2, 0.5))
+    assert 1.0 > first > second > third > 0.05
+    assert np.log(first / third) == pytest.approx(2.5 * np.log(first / second), rel=0.1)
+
+
+def test_a_shadow_lies_below_its_body():
+    """The nodes of the ground's square lie where the map is zero, and the middle of the cube's shadow where it is dark."""
+    (shadow,), at = maps_of(cube_above(0.1))
+    ground = at[:, 2] == 0
+    assert ground.any() and (at[~ground, 2] == -1).all()
+    assert shadow[0].max() == shadow[-1].max() == shadow[:, 0].max() == shadow[:, -1].max() == 0.0
+    n = len(shadow)
+    assert shadow[n // 2 - 2 : n // 2 + 2, n // 2 - 2 : n // 2 + 2].min() > 0.9 * shadow.max()
+    assert np.allclose(at[ground].mean(axis=0)[:2], n / 2, atol=1e-6)
+
+
+@pytest.mark.parametrize("normal, has_shadow", [((1, 3, 0), True), ((1, 0, 0), False), ((0, -1, 0), False), ((0, 0.2, 1), False)])
+def test_slopes_have_shadows_and_walls_have_none(normal, has_shadow):
+    maps, at = maps_of(cube_above(1.0, normal))
+    assert (maps.max() > 0.05) == has_shadow and (at[:, 2].max() == 0) == has_shadow
+
+
+def test_a_moving_half_space_has_a_shadow():
+    scene = cube_above(0.5, path=KeyFrames([0.0, 1.0], [(0.0, 0.0, 0.0), (0.0, 0.2, 0.0)]))
+    assert maps_of(scene, t=1.0)[0].max() > 1.2 * maps_of(scene)[0].max()
+
+
+def test_nodes_that_are_not_finite_cast_no_shadow():
+    scene = cube_above(0.1)
+    some, _ = maps_of(scene, slice(0, 3))
+    assert np.isfinite(some).all() and 0.1 < some.max() <= 1.0
+    none, at = maps_of(scene, slice(0, Surfaces(scene).n_of_bodies))
+    assert none.max() == 0.0 and (at[:, 2] == -1).all()
+
+
+def test_a_blur_keeps_the_sum_and_spreads_by_its_deviation():
+    image = np.zeros((40, 60))
+    image[20, 30] = 1.0
+    smooth = blurred(image, (2.0, 4.0))
+    assert smooth.sum() == pytest.approx(1.0)
+    rows, columns = np.mgrid[:40, :60]
+    deviation = [np.sqrt((smooth * (axis - middle) ** 2).sum()) for axis, middle in ((rows, 20), (columns, 30))]
+    assert deviation == pytest.approx([2.0, 4.0], rel=0.15)  # cut off at two deviations
+
+
+# --- picking ---
+
+
+def test_ray_hits_the_nearest_triangle():
+    x = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 2], [1, 0, 2], [0, 1, 2]])
+    triangles = np.array([[3, 4, 5], [0, 2, 1]])
+    ray = np.array([0.0, 0, 1])
+    t, weights = nearest_hit(np.array([0.2, 0.3, -1]), ray, x, triangles)
+    assert t == 1 and np.allclose(weights @ x[triangles[t]], (0.2, 0.3, 0))
+    t, weights = nearest_hit(np.array([0.2, 0.3, 1]), ray, x, triangles)
+    assert t == 0 and np.allclose(weights, (0.5, 0.2, 0.3))
+    assert nearest_hit(np.array([0.2, 0.3, 3]), ray, x, triangles) is None
+    assert nearest_hit(np.array([0.9, 0.3, -1]), ray, x, triangles) is None
+
+
+def cursor_at(point, camera, size):
+    """The place of a point in a window, in units of its size from the lower left corner."""
+    across, down, _ = camera.project(point[None], size)[0]
+    return across / size[0], 1 - down / size[1]
+
+
+def centre_of_a_visible_triangle(x, triangles, camera):
+    centres = x[triangles].mean(axis=1)
+    return centres[np.argmin(np.linalg.norm(centres - camera.position, axis=1))]
+
+
+@pytest.mark.parametrize("order", [1, 2])
+def test_cursor_picks_and_drags_a_body(order):
+    scene = beam_scene(("one", "two"), order=order)
+    sim, camera, size = FakeSimulator(scene), Camera.framing(np.array([[-2.0, -1, -1], [2, 2, 1]])), (1600, 900)
+    sim.time = 1.0
+    point = centre_of_a_visible_triangle(sim.positions("two"), scene.bodies[1].nodes.surface, camera)
+    cursor = cursor_at(point, camera, size)
+    hit = pick(sim, camera, cursor, size)
+    assert scene.bodies[hit.body].name == "two" and np.allclose(hit.point, point) and np.allclose(hit.weights, 1 / 3)
+    drag = MouseDrag(sim, hit)
+    assert drag.body == "two" and drag.weights.sum() == pytest.approx(1.0) and len(drag.nodes) >= 3
+    target = drag.target
+    assert np.allclose(target, drag.weights @ sim.positions("two")[drag.nodes]), "without motion there is no force"
+    drag.move(camera, cursor, size)
+    assert np.allclose(drag.target, target)
+    assert drag.move(camera, (cursor[0], cursor[1] + 0.1), size)
+    assert not drag.move(camera, (cursor[0], cursor[1] + 0.1), size)
+    moved = drag.target - target
+    assert moved @ camera.axes[0] == pytest.approx(0, abs=1e-9) and moved @ camera.forward == pytest.approx(0, abs=1e-9)
+    assert moved @ camera.axes[1] > 0
+    assert np.allclose(drag.line(sim), [point, point + moved])
+    assert pick(sim, camera, (0.01, 0.99), size) is None
+
+
+@pytest.mark.parametrize("cells, size, order", [(12, 1.0, 1), (1, 0.8, 2)])  # the last one's tets do not hold all of the skin
+def test_cursor_picks_and_drags_a_skin(cells, size, order):
+    """Of a ball in a cube of tets, deformed, as the mirror in the window's process sees it."""
+    scene, ball = ts.Scene(), ts.ball_mesh(0.45, 4)
+    body = scene.add_body(ts.box_mesh((cells,) * 3, (size,) * 3), RUBBER, name="cube", position=(3, 0, 0), order=order)
+    used, triangles = np.unique(ball.surface, return_inverse=True)
+    skin = body.embed(ts.SurfaceMesh(ball.vertices[used], triangles.reshape(-1, 3)))
+    real, marks, window = FakeSimulator(scene), marks_of(scene), (900, 900)
+    real.time = 1.0
+    x = real.positions()
+    sim, camera = MirrorSimulation(describe_scene(scene, marks), body.n_nodes), Camera.framing(x)
+    sim.take(describe_state(real, marks, set(), None) | {"colour": "body"}, x, np.zeros(body.n_nodes))
+    point = centre_of_a_visible_triangle(skin.weights @ x, skin.surface.triangles, camera)
+    hit = pick(sim, camera, cursor_at(point, camera, window), window)
+    assert np.allclose(hit.point, point) and np.allclose(hit.weights @ x[hit.nodes], point) and len(hit.nodes) > 3
+    drag = MouseDrag(sim, hit)
+    assert drag.weights.sum() == pytest.approx(1.0) and (drag.weights > 0.0).all()
+    assert np.linalg.norm(drag.weights @ body.rest_positions[drag.nodes] - hit.weights @ body.rest_positions[hit.nodes]) < 0.2
+    assert np.allclose(drag.line(sim)[0], point), "the line begins at the point under the cursor"
+    inside = 0.98 * x + 0.02 * x.mean(axis=0)
+    corner = inside[np.argmax(inside @ camera.axes[0])]
+    assert pick(sim, camera, cursor_at(corner, camera, window), window) is None, "only a corner of the tets is there"
+
+
+# --- lines ---
+
+
+def test_lines_of_layers():
+    scene = beam_scene()
+    scene.bodies[0].add_traction(lambda c: c[:, 0] > 1.99, (0, 0, 50.0))
+    sim, layers, camera = FakeSimulator(scene), Layers(scene), Camera.framing(scene.bodies[0].rest_positions)
+    contacts = sim.contacts()
+    contacts.point, contacts.normal = np.array([[0.0, 1, 0]]), np.array([[0.0, 1, 0]])
+    sim.contacts = lambda: contacts
+    faces = len(scene.bodies[0].mesh.surface)
+    loaded = 2 * 2 * 2  # triangles of the end
+    counts = {"wires": 3 * faces // 2, "contacts": 2, "tractions": 3 * loaded, "fixed_nodes": 0}
+    for name, count in counts.items():
+        layers.shown = {other: other == name for other in layers.shown}
+        ends, colours = layers.lines(sim, camera)
+        assert len(ends) == len(colours) == 2 * count <= 2 * layers.n_segments
+        if name == "wires":
+            x, size = sim.positions(), (200, 100)
+            nodes, drawn = camera.project(x, size), camera.project(ends, size)
+            gaps = np.linalg.norm(drawn[:, None, :2] - nodes[None, :, :2], axis=2).min(axis=1)
+            assert gaps.max() < 1e-9, "wires end at nodes"
+        if name == "contacts":
+            a, b, _, c = (ends - camera.position) / 0.1 + camera.position
+            assert np.allclose(a, contacts.point) and np.allclose((b - a) / np.linalg.norm(b - a), contacts.normal)
+            assert np.allclose(np.cross(c - a, contacts.impulse[0]), 0, atol=1e-12)
