@@ -117,5 +117,6 @@ def test_suspicious_input_is_reported(tmp_path):
     starts = dict(zip(pieces, np.cumsum([0] + [body["nodes"] for body in found["bodies"]])))
     moves = [x[starts[name] : starts[name] + SIZE] - files[name][0] for name in ("near", "far")]
     assert 1e-4 < np.abs(moves[0]).max() < 0.05 and np.abs(moves[0] - moves[1]).max() < 1e-4 * np.abs(moves[0]).max()
-    prims = Usd.Stage.Open(str(tmp_path / "out" / "scene.usdc")).GetPrimAtPath("/World").GetChildren()
+    stage = Usd.Stage.Open(str(tmp_path / "out" / "scene.usdc"))
+    prims = stage.GetPrimAtPath("/World").GetChildren()
     assert sorted(prim.GetCustomDataByKey("taisoft:name") for prim in prims) == sorted(pieces)

@@ -126,7 +126,7 @@ def time_out(*_):
     raise ReaderTimeoutError(f"a reader took more than {SECONDS} s")
 
 
-@pytest.mark.parametrize("n, seed", [(100, 1), pytest.param(10_000, 2, marks=pytest.mark.long)])
+@pytest.mark.parametrize("n, seed", [(50, 1), pytest.param(10_000, 2, marks=pytest.mark.long)])
 def test_readers_survive_mutated_files(tmp_path, samples, n, seed):
     """After a failure tmp_path holds the file."""
     rng, names = random.Random(seed), sorted(samples)
