@@ -1,7 +1,7 @@
 """Checkpoint files:
 
 * one that is foreign, damaged, newer, too large or of another scene is refused in one sentence; no pickled object runs;
-* numbers are all restored, and compared with the initial ones, by name and value; key frames are compared, functions of time are not;
+* numbers are all restored, and compared with the initial ones by name; key frames are compared, functions of time are not;
 * a file is complete or absent.
 """
 

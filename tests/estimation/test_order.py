@@ -1,0 +1,175 @@
+"""Orders, distances of paths, forecasts and vibrations, as arithmetic:
+
+* observed orders and Richardson factors are exact for power laws; too small an order gives none; parting paths are noticed;
+* what lowers the order of a scene, and what may make it jump;
+* excursions, distances of paths and shared nodes of two meshes;
+* the forecast follows the orders, and the sentence gives its numbers;
+* vibrations of bodies that touch with friction, of which steps resolve a fiftieth, raise an error.
+"""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+
+import taisoft as ts
+from taisoft.errors import SimulationError
+from taisoft.estimation.comparison import distance, largest_excursion, shared_nodes
+from taisoft.estimation.forecast import describe_error, forecast, percent
+from taisoft.estimation.order import agreement, error_over_difference, may_jump, nominal_order, observed_order
+from taisoft.estimation.vibrations import add_vibrations, are_passed_over, shortest_period
+from taisoft.records import ErrorEstimate
+from taisoft.scene.refine import refined
+from tests.dynamics.scenes import cube, rubber
+from tests.estimation.stand_in import block
+
+
+@pytest.mark.parametrize("order", [0.5, 2.0])
+@pytest.mark.parametrize("ratio", [0.5, 3.0])
+def test_errors_of_a_power_law_are_exact(order, ratio):
+    one, other = 0.1**order, (0.1 * ratio) ** order
+    assert error_over_difference(ratio, order) * abs(other - one) == pytest.approx(one)
+
+
+def test_orders_are_observed_within_their_bounds():
+    assert observed_order(1.0, 4.0, 2.0) == pytest.approx(2.0)
+    assert observed_order(1.0, 3.0, 2.0) == pytest.approx(math.log2(3.0))
+    assert observed_order(1.0, 4.0, 1.0) == 1.0  # not above the nominal order
+    for order in (0.5, 1.7):  # of runs with 2, 8 and 22 steps
+        errors = [steps**-order for steps in (2.0, 8.0, 22.0)]
+        fine, coarse = errors[1] - errors[2], errors[0] - errors[1]
+        assert observed_order(fine, coarse, 2.0, near=22 / 8, far=4.0) == pytest.approx(order)
+    assert observed_order(1.0, 1.3, 2.0) is None and observed_order(0.0, 1.0, 2.0) is None
+
+
+def test_paths_agree_until_their_differences_show_no_order():
+    fine = np.array([1.0, 1.0, 1.0, 1e3, 1e3])
+    assert agreement(fine, 16.0 * fine, 0.0) == 5
+    assert agreement(fine, np.full(5, 16.0), 0.0) == 3
+    assert agreement(fine, fine, 0.0) == 0
+    assert agreement(fine, fine, 1e4) == 5  # negligible differences need no order
+
+
+def moved(path) -> ts.Scene:
+    scene = block()
+    scene.bodies[0].move([0], path)
+    return scene
+
+
+def pushed(path) -> ts.Scene:
+    scene = block()
+    scene.bodies[0].add_force([0], path)
+    return scene
+
+
+def tied(**numbers) -> ts.Scene:
+    """A block on a spring, or on a tendon of given length."""
+    scene = block()
+    scene.add_obstacle(ts.Sphere((0, 9, 0), 0.1), name="pin", path=numbers.pop("path", None))
+    if "length" in numbers:
+        scene.add_tendon([("block", 0), ("block", 1)], stiffness=1.0, **numbers)
+    else:
+        scene.add_spring(("block", 0), ("pin", (0, 9, 0)), 1.0, **numbers)
+    return scene
+
+
+STILL = ts.KeyFrames((0.0, 1.0), [(0, 0, 0), (0, 1, 0)])
+
+
+@pytest.mark.parametrize(
+    "scene, order",
+    [
+        (block(), 2),
+        (tied(), 2),
+        (block(mass_damping=1.0), 1),
+        (block(stiffness_damping=1.0), 1),
+        (moved(STILL), 1),
+        (pushed(STILL), 1),
+        (tied(damping=1.0), 1),
+        (tied(path=STILL), 1),
+        (tied(length=2.0), 1),
+    ],
+)
+def test_what_lowers_the_order(scene, order):
+    assert [nominal_order(name, scene, False) for name in ("bdf2", "velocity_verlet", "implicit_euler")] == [order, order, 1]
+    assert nominal_order("bdf2", scene, touches=True) == 1
+
+
+def test_functions_of_time_and_releases_may_jump():
+    release = ts.KeyFrames((0.0, 1.0), [(0, 0, 0), (0, 1, 0)], release=True)
+    smooth, sudden = (block(), pushed((0, 1, 0)), pushed(STILL), moved(STILL)), (moved(release), pushed(lambda t: (0, t, 0)))
+    assert not any(map(may_jump, smooth)) and all(map(may_jump, (*sudden, moved(lambda t: (0, t, 0)))))
+
+
+def test_distances_are_relative_to_the_largest_excursion():
+    path = np.zeros((3, 2, 3))
+    path[1, 0] = (3.0, 4.0, 0.0)
+    other = path.copy()
+    other[2, 1] = (0.0, 0.6, 0.8)
+    assert largest_excursion(path) == 5.0 and largest_excursion(path + 7.0) == pytest.approx(5.0)
+    error = distance(path, other, 5.0)
+    assert error.max == pytest.approx(0.2) and error.rms == pytest.approx(np.sqrt(1.0 / 6.0) / 5.0)
+
+
+def test_nodes_are_shared_body_by_body():
+    """Also where two bodies lie at one place."""
+    scene = block()
+    scene.add_body(cube(cells=(2, 1, 1)), rubber(), name="other")
+    finer = refined(scene)
+    starts = [np.concatenate([body.rest_positions for body in one.bodies]) for one in (scene, finer)]
+    sizes = [[(body.name, body.n_nodes) for body in one.bodies] for one in (scene, finer)]
+    own, theirs = shared_nodes(starts[0], sizes[0], starts[1], sizes[1])
+    assert own.tolist() == list(range(20)) and np.array_equal(starts[0][own], starts[1][theirs])
+    assert (theirs[:8] < sizes[1][0][1]).all() and (theirs[8:] >= sizes[1][0][1]).all()
+    starts[1][sizes[1][0][1] :] += 1e-6
+    with pytest.raises(SimulationError, match="body 'other': no node of one mesh is also in the other"):
+        shared_nodes(starts[0], sizes[0], starts[1], sizes[1])
+
+
+def test_forecasts_follow_the_orders():
+    only_time = ErrorEstimate(time=0.04, solver=0.0, order=2.0)
+    assert forecast(only_time, 3.0) == (pytest.approx(0.01), pytest.approx(6.0))
+    both = dataclasses.replace(only_time, time=0.02, space=0.02)
+    target, seconds = forecast(both, 1.0)
+    assert (target, seconds) == (pytest.approx(0.01), pytest.approx(4.0**0.5 * 4.0**2))
+    (sentence,) = describe_error(both, 1.0)
+    assert sentence == "about 4 % of the largest excursion (time 2, space 2, solver 0); 1 % would take about 32 s"
+    solver = dataclasses.replace(only_time, solver=0.005)
+    assert forecast(solver, 1.0) == (pytest.approx(0.01), pytest.approx(8.0**0.5))
+    assert forecast(dataclasses.replace(solver, solver=0.02), 1.0) is None  # steps would not help
+    (sentence,) = describe_error(ErrorEstimate(space=0.1, solver=0.001), 1.0)
+    assert sentence == "unknown in time; in percent of the largest excursion space 10, solver 0.1"
+    assert forecast(ErrorEstimate(), 1.0) is None and forecast(ErrorEstimate(time=0.0), 1.0) is None
+    assert [percent(value) for value in (0.0, 1e-9, 0.01234, 2.0)] == ["0", "< 0.0001", "1.2", "200"]
+
+
+def test_an_error_until_paths_part_is_described():
+    parted = ErrorEstimate(time_until_then=0.03, agree_until=1.25, spread_after={"a": 0.1, "b": 0.2}, notes=["a note"])
+    assert describe_error(parted, 1.0) == [
+        "about 3 % in time until t = 1.25 s, then unknown",
+        "afterwards the mean positions of bodies change by up to 20 % with the step",
+        "a note",
+    ]
+
+
+def test_vibrations_of_bodies_with_friction():
+    """A wave crosses the block, 1.1 m long, twice in a period. Friction of a pair replaces that of the materials."""
+    assert shortest_period(block(friction=0.3)) == np.inf  # nothing to rub against
+    scene = block(touching=True, young=4e5, friction=0.3)
+    period = 2 * 1.1 * np.sqrt(1000.0 / 4e5)
+    assert shortest_period(scene) == pytest.approx(period)
+    assert are_passed_over(scene, 1.01 * period / 50) and not are_passed_over(scene, 0.99 * period / 50)
+    scene.set_contact("block", "ground", friction=0.0)
+    assert shortest_period(scene) == np.inf
+    smooth = block(touching=True, young=4e5, friction=0.0)
+    assert shortest_period(smooth) == np.inf
+    smooth.set_contact("block", "ground", friction=0.2)
+    assert shortest_period(smooth) == pytest.approx(period)
+    small, large, unknown = (ErrorEstimate(time=time) for time in (0.001, 0.5, None))
+    for one in (small, large, unknown):
+        add_vibrations(one, smooth, period)
+    assert small.time > 0.001 and large.time == 0.5 and unknown.time is None and unknown.notes == []
+    assert f"at least {100 * small.time:.2g} %" in small.notes[0] and len(large.notes) == 1
+    add_vibrations(small := ErrorEstimate(time=0.001), smooth, 0.001 * period)
+    assert small.time == 0.001 and not small.notes
