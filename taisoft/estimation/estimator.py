@@ -130,6 +130,7 @@ class ErrorEstimator:
             return
         self._changed = self._change()
         if self._changed:
+            self._made = None  # an estimate read before the change
             return
         begin, compiled = time.perf_counter(), self._sim.compile_seconds
         with warnings.catch_warnings():

@@ -103,7 +103,6 @@ def test_errors_at_the_nodes_and_so_far():
     assert np.isnan(seen[13][0]).all()  # after a change
 
 
-@pytest.mark.xfail(strict=True, reason="`ErrorEstimator.compare` keeps the last estimate when it notices a change")
 def test_a_change_after_a_look_leaves_the_error_unknown():
     def look(sim, k, _report):
         assert sim.error_so_far is not None
