@@ -1,10 +1,11 @@
 """Faster tracing: cache what Taichi recomputes at each decoration and at each call of a function in a kernel.
 
-For every decorated function Taichi uses Python's source tools to find out whether it is defined in a class. It reads, wraps and
-splits a function's source at each of its calls in a kernel, and for every syntax node it formats a source excerpt for messages
-that are seldom needed. Together this takes longer than building the code. Without the excerpts, messages still name file, line
-and function. Purely arithmetic functions need no tracing at all: see `arithmetic`. This relies on Taichi 1.7.4, the version that
-taisoft requires; with any other, or with TAISOFT_PUBLIC_TAICHI set, Taichi is left unpatched, and results are the same.
+For every decorated function Taichi uses Python's source tools to find out whether it is defined in a class. It reads, wraps,
+splits and parses a function's source at each of its calls in a kernel, and for every syntax node it formats a source excerpt for
+messages that are seldom needed. Together this takes longer than building the code. Without the excerpts, messages still name the
+file, the function and the line of the statement. Purely arithmetic functions need no tracing at all: see `arithmetic`. This
+relies on Taichi 1.7.4, the version that taisoft requires; with any other, or with TAISOFT_PUBLIC_TAICHI set, Taichi is left
+unpatched, and results are the same.
 """
 
 import ast
@@ -13,18 +14,22 @@ import linecache
 import os
 import sys
 import textwrap
+from collections import defaultdict
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 import taichi as ti
 
-from taisoft.backend.private import ASTTransformerContext, Expr, impl, kernel_impl
+from taisoft.backend.private import ASTTransformer, ASTTransformerContext, Expr, expr, impl, kernel_impl, transform_tree
 
 FAST_TRACING = ti.__version__ == (1, 7, 4) and not os.environ.get("TAISOFT_PUBLIC_TAICHI")
 
 COMPARISONS = (ast.Lt, ast.LtE, ast.Gt, ast.GtE, ast.Eq, ast.NotEq)  # comparisons that Taichi's expressions support
 # Python's builtins that need the value of a number
 VALUE_BUILTINS = ("max", "min", "bool", "int", "float", "round", "any", "all", "sorted")
+
+_spare: dict[Callable, list[ast.Module]] = defaultdict(list)  # syntax trees of a function, apart from those that tracing is using
 
 
 def _inside_class(level_of_class_stackframe: int) -> bool:
@@ -53,10 +58,14 @@ def source_of(function: Callable) -> tuple[str, list[str], int, str]:
 def _tree_and_context(
     self, excluded_parameters=(), is_kernel=True, arg_features=None, args=None, ast_builder=None, is_real_function=False
 ):
-    """Replacement of Taichi's function of this name: a fresh syntax tree, which tracing modifies, and its context."""
+    """Replacement of Taichi's function of this name: a syntax tree, which tracing modifies, and its context."""
     file, lines, first, text = source_of(self.func)
-    tree = ast.parse(text)
-    tree.body[0].decorator_list = []
+    if _spare[self.func]:
+        tree = _spare[self.func].pop()
+    else:
+        tree = ast.parse(text)
+        tree.body[0].decorator_list = []
+        tree.nodes = list(ast.walk(tree))
     names = kernel_impl._get_global_vars(self.func)
     if is_kernel or is_real_function:
         for k in self.template_slot_locations:
@@ -74,6 +83,46 @@ def _tree_and_context(
         ast_builder=ast_builder,
         is_real_function=is_real_function,
     )
+
+
+def _traced(tree: ast.Module, context: ASTTransformerContext) -> Any:
+    """Trace a tree, then free it of what Taichi has put there, so that the next call of its function can have it."""
+    try:
+        return transform_tree(tree, context)
+    finally:
+        if not context.is_kernel:  # a kernel is traced only once
+            for node in tree.nodes:
+                node.__dict__.pop("ptr", None)
+                node.__dict__.pop("caller", None)
+            _spare[context.func.func].append(tree)
+
+
+_build_any = ASTTransformer.__call__
+
+
+def _build(self, context: ASTTransformerContext, node: ast.AST) -> Any:
+    """Build a syntax node. An expression gets the position of its statement, not one of its own."""
+    build = _BUILDERS.get(type(node))
+    return _build_any(self, context, node) if build is None else build(context, node)
+
+
+_BUILDERS = {
+    kind: build
+    for name in dir(ast)
+    if isinstance(kind := getattr(ast, name), type)
+    and issubclass(kind, ast.expr)
+    and (build := getattr(ASTTransformer, f"build_{name}", None)) is not None
+}
+
+
+@functools.cache
+def _integer_range(dtype: type) -> tuple[int, int]:
+    return np.iinfo(dtype).min, np.iinfo(dtype).max
+
+
+def _check_in_range(dtype: type, value: int) -> bool:
+    low, high = _integer_range(dtype)
+    return low <= value <= high
 
 
 def _position(context: ASTTransformerContext, node) -> str:
@@ -147,4 +196,7 @@ def arithmetic(function: Callable) -> Callable:
 if FAST_TRACING:
     kernel_impl._inside_class = _inside_class
     kernel_impl._get_tree_and_ctx = _tree_and_context
+    kernel_impl.transform_tree = _traced
+    ASTTransformer.__call__ = _build
+    expr._check_in_range = _check_in_range
     ASTTransformerContext.get_pos_info = _position

@@ -94,7 +94,7 @@ def _split(order: np.ndarray, start: np.ndarray, count: np.ndarray, centroid: np
 @ti.func
 def _project(b: ti.template(), x):
     """Project a vector onto the directions of the slabs."""
-    return ti.Vector([x[q] if q < 3 else x.dot(dvec(b.directions[q])) for q in ti.static(range(b.slabs))], ti.f64)
+    return ti.Vector([x[q] if ti.static(q < 3) else x.dot(dvec(b.directions[q])) for q in ti.static(range(b.slabs))], ti.f64)
 
 
 @dataclass(frozen=True, eq=False)

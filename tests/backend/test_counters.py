@@ -96,10 +96,10 @@ def test_what_device_only_refuses_changes_nothing(arena):
     before, x = watched(), arena.field("x", ti.f64, 2, np.ones(2))
     for message, access in REFUSED.items():
         with pytest.raises(ts.SimulationError, match=f"^{message}.*where only the device may work$"), device_only():
+            x.fill(1.0)  # by the device
             double(x)
             access(x)
         assert watched() == before and x.to_numpy().tolist() == [2.0, 2.0]
-        x.fill(1.0)
     with pytest.raises(ts.SimulationError, match="reads"), device_only():
         with pytest.raises(ts.SimulationError, match="reads"):
             x[0]
@@ -110,7 +110,7 @@ def test_a_second_simulator_compiles_nothing_and_a_refused_step_can_be_repeated(
     def take_step(refused: bool) -> np.ndarray:
         scene = ts.Scene()
         scene.add_body(cube(), rubber(SNH), name="box").fix([0])
-        with ts.Simulator(scene, dt=1e-3, integrator="implicit_euler", precision="f64") as sim:
+        with ts.Simulator(scene, dt=1e-3, integrator="symplectic_euler", precision="f64") as sim:
             if refused:
                 with pytest.raises(ts.SimulationError, match="where only the device may work"), device_only():
                     sim.step()
@@ -120,4 +120,4 @@ def test_a_second_simulator_compiles_nothing_and_a_refused_step_can_be_repeated(
     first = take_step(refused=True)
     with counting() as counts:
         assert np.array_equal(take_step(refused=False), first)
-    assert not counts.compiled and counts.launches["assemble"] > 0
+    assert not counts.compiled and counts.launches.total() > 0

@@ -12,8 +12,8 @@ import pytest
 import taichi as ti
 
 from taisoft.backend import arrays, device_memory
-from taisoft.backend.runtime import open_runtime
 from taisoft.errors import SimulationError
+from tests.backend.lanes import opened
 
 
 class Driver(SimpleNamespace):
@@ -46,9 +46,8 @@ def start(monkeypatch):
         device_memory.driver.cache_clear()
         return driver
 
-    runtime = open_runtime("cpu", "f64", "a test")
-    yield replace
-    runtime.close()
+    with opened("f64"):
+        yield replace
     device_memory.driver.cache_clear()
 
 

@@ -42,8 +42,7 @@ def test_only_one_kind_is_open_at_a_time():
 
 def test_the_same_kind_is_not_initialised_again(monkeypatch):
     with opened("f64"):
-        pass
-    monkeypatch.setattr(ti, "init", lambda **options: pytest.fail("initialised again"))
+        monkeypatch.setattr(ti, "init", lambda **options: pytest.fail("initialised again"))
     with opened("f64"), opened("f64"):
         pass
 
@@ -57,19 +56,16 @@ def test_an_initialisation_from_outside_is_replaced():
         assert ti.cfg.default_fp == ti.f32 and not ti.cfg.cfg_optimization and not ti.cfg.fast_math
 
 
-@pytest.mark.skipif(core.with_cuda(), reason="this machine has CUDA")
-def test_cuda_is_refused_on_a_machine_without_it():
-    with pytest.raises(SimulationError, match="^arch 'cuda' is not available on this machine"):
-        open_runtime("cuda", "f32")
-    assert runtime.open_kind() is None
+def test_unknown_and_absent_kinds_are_refused():
+    kinds = {("opencl", "f32"): "arch 'opencl' is unknown", ("cpu", "f16"): "precision 'f16' is unknown"}
+    if not core.with_cuda():
+        kinds["cuda", "f32"] = "^arch 'cuda' is not available on this machine"
+    for kind, message in kinds.items():
+        with pytest.raises(SimulationError, match=message):
+            open_runtime(*kind)
+        assert runtime.open_kind() is None
     with opened("f32"):
-        assert ti.cfg.arch == ti.x64 or ti.cfg.arch == ti.arm64
-
-
-@pytest.mark.parametrize("kind, message", [(("opencl", "f32"), "arch 'opencl' is unknown"), (("cpu", "f16"), "'f16' is unknown")])
-def test_unknown_kinds_are_refused(kind, message):
-    with pytest.raises(SimulationError, match=message):
-        open_runtime(*kind)
+        assert ti.cfg.arch in (ti.x64, ti.arm64)
 
 
 def test_compile_time_is_counted():

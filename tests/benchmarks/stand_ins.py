@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks import ipc_runs, startup
+from benchmarks import ipc_runs
 from taisoft.dynamics.schemes import EXPLICIT
 from taisoft.records import StepReport
 
@@ -70,28 +70,6 @@ def answered(module) -> Callable:
         return {}
 
     return carry_out
-
-
-# --- made-up rows -----------------------------------------------------------------------------------------------------
-
-
-def startup_numbers(seconds: float, compiled: int) -> dict:
-    """Numbers of a version."""
-    times = {"wall": seconds, "cpu": seconds, "walls": [seconds] * 3, "compiled": compiled}
-    memory = {"start": 300.0, "end": 301.0, "times": 4}
-    one = {"cold": times, "warm": times, "warm, other size": times, "new files": [0, compiled], "memory": memory}
-    one["one process"] = {"first": times, "second": times, "other size": times}
-    return {
-        "beam": one,
-        "cube": one,
-        "statics": {str(k): times for k in range(3)},
-        "identify": times,
-        "settings": {"reset": 1e-3 * seconds},
-        "calls": {name: {"launches": 3.0} for name in ("beam", "cube", "sheet")},
-        "surfaces": {"224 triangles": 9, "284 triangles": compiled},
-        "keep": memory,
-        "speed": dict.fromkeys(startup.SLOWER, [1e-3, 1.1e-3, 2e-3]),
-    }
 
 
 def ipc_record(job=None, **more) -> ipc_runs.Record:

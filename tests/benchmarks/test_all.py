@@ -3,12 +3,12 @@
 Where a benchmark has no small form, one is made here. Stand-ins take the place of what takes minutes or needs other programs:
 
 * implicit steps with contacts, which take a minute to compile: contact and crossings take explicit ones, paths has none, ipc
-  shows made-up rows; so does startup, which starts a process for each of its times;
+  shows made-up rows, and so does order;
 * child processes, whose work is done in this process: crossings, hard, paths, pictures, scaling;
 * the simulators of error and tolerance, by one with known errors; MuJoCo in elasticity; the display of window.
 
-The long runs do without them. The others run in test_cuda_check.py, test_document.py (figures, manual), test_peers.py,
-test_report.py and tests/references.
+The long runs do without them. The others run in test_cuda_check.py, test_document.py (figures, manual), test_peers.py and
+tests/references.
 """
 
 import importlib
@@ -16,11 +16,9 @@ import json
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
-from dataclasses import replace as change
 from pathlib import Path
 from types import SimpleNamespace
 
-import numpy as np
 import pytest
 
 import taisoft as ts
@@ -28,6 +26,7 @@ from benchmarks import (
     collision,
     collision_runs,
     contact,
+    contact_runs,
     elasticity,
     elasticity_runs,
     hard_runs,
@@ -36,24 +35,20 @@ from benchmarks import (
     paths,
     pictures,
     scaling,
-    startup,
     tolerance,
     window,
 )
 from benchmarks.collision_cases import REPORT
-from benchmarks.contact_runs import Solvers, contact_jacobian, make_residual, observe_problems, open_explicit, to_impulses
 from benchmarks.document import plain
-from benchmarks.order_cases import CASES as ORDER_CASES
-from benchmarks.order_cases import LINEAR, QUADRATIC
+from benchmarks.elasticity_steps import Cost, Frames
+from benchmarks.order_runs import Row as OrderRow
 from benchmarks.scaling_bytes import measure_copy
 from benchmarks.scaling_runs import measure
 from benchmarks.stored_runs import StoredRuns
-from taisoft.contact import SOLVERS
 from taisoft.dynamics.schemes import EXPLICIT, IMPLICIT
 from taisoft.view.pictures import picture_writer
 from tests.benchmarks import stand_ins
 from tests.benchmarks.stand_ins import SOLVER, SPACE, TIME, ModelSimulator, answered
-from tests.contact import contact_oracle as oracle
 
 CELLS = (12, 3, 3)
 
@@ -62,9 +57,6 @@ def replace(patch: pytest.MonkeyPatch, module, **values) -> None:
     """Set attributes of a module."""
     for name, value in values.items():
         patch.setattr(module, name, value)
-
-
-# --- small forms and their numbers --------------------------------------------------------------------------------------
 
 
 def collision_small(patch, folder):
@@ -84,13 +76,14 @@ def collision_check(n):
 def contact_small(patch, folder):
     replace(patch, contact, QUICK_FRAMES=2, QUICK_STEPS=3, QUICK_SIZES=(4,), QUICK_RUN_SECONDS=0.2)
     replace(patch, contact, open_scene=contact.open_explicit)
+    replace(patch, contact_runs, SOLVERS=("gauss_seidel",))
     patch.setattr(contact.contact_problems, "missing", lambda names: "they are not asked for")
 
 
 def contact_check(n):
     (film,), (run,), (step,) = n["films"], n["runs"], n["steps"]
     found = [one for own in film["outcomes"].values() for solver in own.values() for one in solver]
-    assert film["tets"] == 215 and len(found) == 2 * 4 * len(film["time"]) and all(one["residual"] <= 1e-4 for one in found)
+    assert film["tets"] == 215 and len(found) == 2 * len(film["time"]) and all(one["residual"] <= 1e-4 for one in found)
     assert step["solver"] == "gauss_seidel" and len(step["whole"]) == 3 and step["residual"] <= 1e-4
     assert run["status"] == "ok" and 10 < len(run["seconds"]) < 48 and run["wall"] > sum(run["seconds"])
     assert all(n["crossover"][0][how]["residual"] <= 1e-4 for how in ("serial", "coloured"))
@@ -107,24 +100,24 @@ def crossings_small(patch, folder):
 
 
 def elasticity_small(patch, folder):
+    """MuJoCo's numbers are made up, and so are those of steps."""
+
     def mujoco(cells, integrator, dt, seconds):
         assert (cells, integrator, dt) in ((CELLS, "discrete", 0.01), (CELLS, "euler", 0.005))
         return {"compile_seconds": 0.25, "error": 0.02, "error_unfolded": 0.01, "seconds_per_simulated_second": 4.0}
 
     rows = (("taisoft", "velocity_verlet", 4), ("MuJoCo", "euler", 2))
-    costs, frames = elasticity.measure_costs, elasticity.measure_frames
     replace(patch, elasticity, QUICK=elasticity.Extent((CELLS,), ("f32",), repeats=2, rounds=(2,), seconds=0.02))
-    replace(patch, elasticity, measure_costs=lambda *a: costs(*a, ("SNH",), ("velocity_verlet",)))
-    replace(patch, elasticity, measure_frames=lambda *a: frames(*a, ("velocity_verlet",)))
+    replace(patch, elasticity, measure_costs=lambda *_: [Cost(540, "SNH", "velocity_verlet", "f32", 0.5, [6e-6, 6e-6])])
+    replace(patch, elasticity, measure_frames=lambda *_: [[Frames(540, "velocity_verlet", 84, [11e-6], [10e-6])]])
     replace(patch, elasticity, make_rows=lambda *_: [elasticity_runs.Row(540, *one) for one in rows], run_mujoco=mujoco)
     replace(patch, elasticity_runs, run_mujoco=mujoco)
 
 
 def elasticity_check(n):
-    (ours, theirs), (cost,), (frames,) = n["runs"], n["cost"], n["frames"]
+    ours, theirs = n["runs"]
     assert ours["error"] < 1e-3 and ours["first_run"]["steps"] == 8 and len(ours["rounds"]) == 2 and not ours["failure"]
     assert theirs["rounds"] == [[4.0], [4.0]] and theirs["build_seconds"] == [0.25, 0.25]
-    assert cost["tets"] == 540 and len(cost["samples"]) == len(frames["run"]) == len(frames["alone"]) == 2
 
 
 def error_small(patch, folder):
@@ -151,14 +144,8 @@ def ipc_small(patch, folder):
 
 
 def order_small(patch, folder):
-    """The coarsest mesh, for which another program gives -2.26757962869 m."""
-    replace(patch, order, CASES=[change(ORDER_CASES[0], meshes={LINEAR: ((11, 2, 2),), QUADRATIC: ()})])
-
-
-def order_check(n):
-    (row,) = n["rows"]
-    assert row["measured"] == [pytest.approx(-2.26757962869, rel=1e-6)] and row["error"] == pytest.approx(0.163094, rel=1e-4)
-    assert row["newton"] > 3 and row["linear"] > row["newton"] and row["field_bytes"] > 1e5
+    row = OrderRow("hanging_beam", "SNH", 1, None, 1, (11, 2, 2), 220, 108, [-2.26758], 0.163, 5, 90, [0.5])
+    replace(patch, order, measure_case=lambda case, *_: ([row], case.reference))
 
 
 def paths_small(patch, folder):
@@ -203,10 +190,6 @@ def scaling_check(n):
     assert row["moved"] > 0 and row["peak"] >= row["base"] > 0 and all(copy["rate"] > 0 for copy in n["copies"])
 
 
-def startup_small(patch, folder):
-    replace(patch, startup, measure=lambda versions, quick: [stand_ins.startup_numbers(0.5, 0)])
-
-
 def tolerance_small(patch, folder):
     patch.setattr(ts, "Simulator", ModelSimulator)
     replace(patch, tolerance, StoredRuns=lambda: StoredRuns(folder))
@@ -228,9 +211,6 @@ def window_small(patch, folder):
     replace(patch, window, measure=lambda name, display: stand_ins.WINDOW | {"demo": name})
 
 
-# --- the runs ---------------------------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class Small:
     """A small run. shows: parts of its page, blanks squeezed; reduce: makes it small; check: of its numbers."""
@@ -243,8 +223,7 @@ class Small:
 
 QUICK = ("--quick",)
 BEAM = ("--scene", "hanging beam")
-RUNS = {  # f64 first: another precision makes Taichi forget all kernels
-    "order f64": Small(QUICK, ("| SNH | 1 | 1 | 11x2x2 | 220 | 108 | -2.26758 | 16.3 |",), order_small, order_check),
+RUNS = {
     "collision": Small(QUICK, ("| pile 1 | proximity | 162 |", "(fig. 18)", "| yes |"), collision_small, collision_check),
     "contact": Small(QUICK, ("| cube_on_box | 215 |", "| parallel |", "Left out: they are"), contact_small, contact_check),
     "crossings": Small(
@@ -256,24 +235,24 @@ RUNS = {  # f64 first: another precision makes Taichi forget all kernels
     "error": Small(BEAM, ("| hanging beam | bdf2 | 160 |", "a note"), error_small, error_check),
     "hard": Small(("--case", "G1", "--quick"), ("# Hard cases", "**1 of 1 variants are solved.**"), hard_small),
     "ipc": Small(("--quick", "--scene", "twisted_mat"), ("| twisted mat | 800 | 1,805 | 0.04 | 0.08 of 25 (2) |",), ipc_small),
+    "order": Small(QUICK, ("| SNH | 1 | 1 | 11x2x2 | 220 | 108 | -2.26758 | 16.3 |",), order_small),
     "paths": Small(("--what", "cost", "--quick"), ("## Cost", "| hanging_beam |", "| met |"), paths_small, paths_check),
     "pictures": Small(QUICK, ("| kernels |", "| PNG |", "| hanging_beam |"), pictures_small, pictures_check),
     "regression": Small(("--case", "search, two"), ("| search, two cubes | f32 |", "nothing has changed")),
     "scaling": Small(
         ("--sizes", "20", "--kind", "explicit"), ("| explicit | 20 | 1 |", "no earlier run"), scaling_small, scaling_check
     ),
-    "startup": Small(QUICK, ("| beam, cold | 0.5 (0.5) |", "| cube: launches | 3 |", "over 4 simulators"), startup_small),
     "tolerance": Small((*BEAM, "--wish", "1"), ("| hanging beam | 1 | bdf2 | 8 |",), tolerance_small, tolerance_check),
     "window": Small(QUICK, ("| cube_on_box | 1,215 | 10 | 2 | 20 | 3.00 | 1.00 | 25 | 70 | 60 | 87 |",), window_small),
 }
-WHOLE = [f"{name}, whole" for name in RUNS if name != "window"]  # which needs a display
+WHOLE = {"startup": Small(QUICK)} | {name: Small(run.arguments) for name, run in RUNS.items() if name != "window"}  # a display
 
 
 @pytest.mark.filterwarnings("ignore:body")  # few tets through the thickness
-@pytest.mark.parametrize("name", [*RUNS, *(pytest.param(name, marks=pytest.mark.long) for name in WHOLE)])
-def test_a_benchmark_runs(name, monkeypatch, tmp_path, capsys):
-    small = RUNS[name] if name in RUNS else Small(RUNS[name.removesuffix(", whole")].arguments)
-    name = name.removesuffix(", whole").removesuffix(" f64")
+@pytest.mark.parametrize(
+    "name, small", [*RUNS.items(), *(pytest.param(*one, marks=pytest.mark.long, id=f"{one[0]}-whole") for one in WHOLE.items())]
+)
+def test_a_benchmark_runs(name, small, monkeypatch, tmp_path, capsys):
     if name in ("crossings", "ipc", "paths"):
         pytest.importorskip("ipctk")
     small.reduce(monkeypatch, tmp_path)
@@ -289,33 +268,3 @@ def test_a_benchmark_runs(name, monkeypatch, tmp_path, capsys):
     assert not drawn or out.with_suffix(".png").read_bytes()[:4] == b"\x89PNG"
     squeezed = re.sub(" +", " ", page)
     assert status == 0 and [part for part in small.shows if part not in squeezed] == []
-
-
-def to_numpy(p) -> oracle.NodeContacts:
-    k = int(p.count[0])
-    rows = {name: getattr(p, name).to_numpy()[:k] for name in ("node", "arity", "weight", "normal", "tangent", "friction")}
-    return oracle.NodeContacts(**rows, inverse_mass=p.inverse_mass.to_numpy(), b=p.b.to_numpy()[:k].ravel())
-
-
-def test_contact_problems_are_restored_and_residuals_are_the_oracles():
-    """In a simulator like that of contact, whose kernels are compiled."""
-    checked = []
-
-    def check(p):
-        before = {name: getattr(p, name).to_numpy() for name in ("r", "order", "b", "factor", "friction")}
-        found = Solvers(threads=False).outcomes(p, np.zeros((p.capacity, 3)), 2)
-        assert set(found) == set(SOLVERS) and all(len(o.seconds) == 2 and o.sweeps > 0 for o in found.values())
-        assert all(np.array_equal(getattr(p, name).to_numpy(), old) for name, old in before.items())
-        contacts, k = to_numpy(p), int(p.count[0])
-        assert np.allclose(contact_jacobian(p).toarray(), contacts.jacobian)
-        W, b, mu, judge = contacts.W, contacts.b, contacts.friction, make_residual(p)
-        exact = oracle.gauss_seidel(W, b, mu, 300)
-        for r in (exact, 0.9 * exact, np.random.default_rng(0).standard_normal((k, 3))):
-            assert judge(r) == pytest.approx(oracle.residual(W, b, mu, r), rel=1e-6, abs=1e-12)
-        checked.append(k)
-
-    with open_explicit("cube_on_box", "cpu") as sim:
-        to_impulses(sim)
-        with observe_problems(check):
-            report = sim.step()  # solves the problem itself after `check`
-    assert checked[-1] == report.n_contacts and report.contact_residual <= 1e-4

@@ -4,22 +4,23 @@
 * times are compared with those of an earlier run of the same machine and extent, within both spreads;
 * output that cannot be written and unknown names are refused by every benchmark before anything is measured;
 * stored arrays are used until code or file change; `bench figures` runs every benchmark with files of its own;
+* the page of `bench report` shows the verdicts that follow from claims; a second run is compared with the first;
 * the manual's tables are those of the newest full results, and a changed number is noticed.
 """
 
 import importlib
 import json
 import math
-import shutil
 import subprocess
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from benchmarks import figures, manual, stored_runs
-from benchmarks.document import Limit, again_text, agrees, crossovers, exponent
-from benchmarks.manual import BLOCK, RESULTS, TABLES, filled, newest, pages
+from benchmarks import document, figures, manual, report, stored_runs
+from benchmarks.document import Limit, agrees, crossovers, exponent
+from benchmarks.manual import BLOCK, TABLES, filled, newest, pages
+from benchmarks.report_parts.page import AGREE, DISAGREE, MISSING, PARTLY, Claim, Part, small_png, verdict_of
 from benchmarks.stored_runs import StoredRuns
 from taisoft.cli.scene_file import shipped_files
 from taisoft.errors import OutputError
@@ -56,17 +57,9 @@ def test_exponents_and_crossovers():
     assert len(crossovers(tets, [2.0, 1.0, 2.0], [1.0, 2.0, 1.0])) == 2
 
 
-def test_times_are_compared_with_an_earlier_run():
+def test_times_agree_within_both_spreads():
     one, two = ({"median": m, "spread": s} for m, s in ((1.0, 0.1), (1.25, 0.1)))
     assert not agrees(one, two) and agrees(one, two | {"spread": 0.2})
-    here = {"processor": "a", "cores": 2, "arch": "cpu", "quick": False}
-    earlier = here | {"date": "2026-01-01", "times": {"step": {"median": 1.0, "spread": 0.02}}}
-
-    def text(seconds: float, **changes) -> str:
-        return again_text(earlier, {"step": summarise([seconds] * 3), "new": summarise([1.0])}, here | changes)
-
-    assert "1 of 1 times agree" in text(1.01) and "0 of 1 times agree" in text(2.0) and "2.00 |" in text(2.0)
-    assert "another quick" in text(1.0, quick=True) and "no earlier run" in again_text(None, {}, here)
 
 
 @pytest.mark.filterwarnings("ignore::UserWarning")
@@ -136,26 +129,6 @@ def test_the_manual_agrees_with_the_results(capsys):
     assert sorted(name for text in texts() for _, name, _ in BLOCK.findall(text)) == sorted(TABLES)
 
 
-def test_a_changed_number_is_noticed(tmp_path):
-    shutil.copytree(RESULTS, tmp_path / "results")
-    path = next((tmp_path / "results").glob("order-*.json"))
-    numbers = json.loads(path.read_text())
-    row = next(r for r in numbers["rows"] if r["case"] == manual.HANGING and r["order"] == 2)
-    row["measured"][0] *= 1.001
-    path.write_text(json.dumps(numbers))
-    assert [filled(text, tmp_path / "results") != text for text in texts()].count(True) == 1
-
-
-def test_wrong_markers_are_refused():
-    for text, words in (
-        (TEXT.replace("fake", "nothing"), "'nothing' is unknown"),
-        (TEXT.replace("<!-- end fake -->\n", ""), "'fake' needs"),
-        (TEXT.replace("end fake", "end other"), "needs one begin and one end"),
-    ):
-        with pytest.raises(OutputError, match=words):
-            filled(text)
-
-
 def test_the_newest_full_results_are_used(tmp_path):
     with pytest.raises(OutputError, match="no results of `taisoft bench order`"):
         newest(tmp_path, "order")
@@ -174,8 +147,43 @@ def test_marked_parts_of_pages_are_replaced(monkeypatch, tmp_path, capsys):
     page.write_text("no table")
     with pytest.raises(OutputError, match="no page with tables"):
         manual.main([])
+    for bad, words in (
+        (TEXT.replace("fake", "nothing"), "'nothing' is unknown"),
+        (TEXT.replace("end fake", "end"), "'fake' needs"),
+    ):
+        with pytest.raises(OutputError, match=words):
+            filled(bad)
     page.write_text(TEXT)
     assert manual.main(["--check"]) == 1 and page.read_text() == TEXT
     assert manual.main([]) == 0
     assert page.read_text() == "before\n<!-- begin fake -->\n\nmade\n\n<!-- end fake -->\nafter\n"
     assert manual.main(["--check"]) == 0 and "agrees with the results" in capsys.readouterr().out
+
+
+def test_the_report_has_its_results_and_is_compared_with_an_earlier_one(monkeypatch, tmp_path, capsys):
+    """A partial run writes only to a folder that is given; what cannot be measured sets the exit status."""
+    assert [verdict_of(x) for x in ([True, True], [True, False], [False], [])] == [AGREE, PARTLY, DISAGREE, MISSING]
+    seconds, picture, folder = [1.0], small_png(np.full((8, 12, 3), 200, dtype=np.uint8)), tmp_path / "page"
+
+    def fake(extent) -> Part:
+        claims = [Claim("it is so.", False, "it is not, by 3."), Claim("that too.", True, "it is.")]
+        times = {"a step": summarise([k * seconds[0] for k in (0.98, 1.0, 1.02)])}
+        return Part("bound", "A bound", "figure 99", "made up", claims, ["| a |"], {"b.png": picture}, times, ["no GPU."])
+
+    def page(*options: str) -> str:
+        assert report.main(["--out", str(folder), *options]) == 0
+        return (folder / "README.md").read_text()
+
+    monkeypatch.setattr(report, "PARTS", {"bound": fake})
+    monkeypatch.setattr(document, "RESULTS", tmp_path / "results")
+    text, parts = (
+        page(),
+        (f"**{PARTLY}**", "![b](b.png)", "**Disagree**: it is not, by 3.", "* A bound: no GPU.", "no earlier run"),
+    )
+    assert [part for part in parts if part not in text] == [] and (folder / "b.png").read_bytes() == picture
+    assert "1 of 1 times agree" in page()
+    seconds[0] = 2.0
+    assert "0 of 1 times agree" in page() and "another quick" in page("--quick")
+    assert report.main(["--quick"]) == 0 and not (tmp_path / "results").exists()
+    monkeypatch.setattr(report, "PARTS", {"bound": lambda extent: Part("bound", "", "", "", failure="no such thing")})
+    assert report.main(["--quick"]) == 1 and "no such thing" in capsys.readouterr().out

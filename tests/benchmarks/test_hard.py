@@ -2,7 +2,7 @@
 
 * the data are complete: every case of the catalogue, criteria, a required end with its reason;
 * a variant is solved if it ended as required and kept all limits; it is wrong if it hid a cause or its answer is off;
-* how a failed or degraded run ended, and why; a reference has smaller steps and double precision;
+* how a failed or degraded run ended, and why;
 * stored results are judged anew; what was not run counts as unsolved.
 """
 
@@ -12,17 +12,14 @@ from types import SimpleNamespace
 
 import pytest
 
-import taisoft as ts
-from benchmarks import hard, hard_runs, manual
+from benchmarks import hard, manual
 from benchmarks.document import RESULTS
 from benchmarks.hard_cases import CASES
 from benchmarks.hard_cases import case as hard_case
 from benchmarks.hard_cases.case import DEGRADED, INVERTED, OK, OVERLAP, PROPOSED, REFUSED, STOPPED, UNCONVERGED, Criterion, Must
 from benchmarks.hard_runs import COLUMNS, NOT_RUN, WRONG, Row, stored
 from benchmarks.hard_table import ASKED, SOLVED, tally
-from taisoft.errors import OutputError
 from taisoft.records import RunReport, StepReport
-from tests.benchmarks.stand_ins import SOLVER, TIME, ModelSimulator
 
 ANSWER, COST = Criterion("off by", 1.0, PROPOSED, note="a note"), Criterion("seconds", 1.0, PROPOSED, cost=True)
 RATE = Criterion("rate", 2.0, PROPOSED, at_least=True, of={"fast": True})
@@ -67,11 +64,9 @@ def test_data_are_complete(shared):
     [
         (PLAIN, OK, [], KEPT, OK, []),
         (PLAIN, DEGRADED, [UNCONVERGED], KEPT, DEGRADED, [UNCONVERGED]),  # although all limits are kept
-        (PLAIN, DEGRADED, [], KEPT, DEGRADED, ["degraded, must be ok"]),
         (PLAIN, STOPPED, [INVERTED], {}, STOPPED, ["stopped, must be ok", "off by", "seconds", "rate"]),
         (PLAIN, None, [], {}, NOT_RUN, [NOT_RUN]),
         (PLAIN, OK, [], OFF, WRONG, ["off by"]),
-        (PLAIN, OK, [], KEPT | {"rate": 1.9}, WRONG, ["rate"]),
         (PLAIN, OK, [], {"off by": math.nan, "seconds": None}, WRONG, ["off by", "seconds", "rate"]),
         (PLAIN, OK, [], SLOW, OK, ["seconds"]),  # its answer is right
         (PLAIN, OK, [UNCONVERGED], KEPT, WRONG, [UNCONVERGED]),  # hidden
@@ -80,7 +75,6 @@ def test_data_are_complete(shared):
         (INSIDE_OUT, DEGRADED, BOTH, KEPT, DEGRADED, [UNCONVERGED]),  # not explained by the start
         (ALWAYS, OK, [], KEPT, WRONG, ["ok, must be degraded by inverted tets"]),
         (REFUSES, STOPPED, [], KEPT, STOPPED, ["stopped, must be refused"]),
-        (STOPS, STOPPED, [INVERTED], KEPT, STOPPED, []),
         (STOPS, DEGRADED, [INVERTED], KEPT, DEGRADED, ["degraded, must be stopped"]),
     ],
 )
@@ -112,21 +106,6 @@ def test_end_and_causes_of_a_run(result, done, overlaps, status, causes):
     assert (record["status"], record["causes"], record["problems"]) == (status, causes, result.problems)
 
 
-def test_a_reference_has_smaller_steps_and_double_precision(monkeypatch):
-    def run(session, fast):
-        session.run_steps(session.simulator(scene), 40, every=10)
-        return {}
-
-    scene = ts.Scene()
-    scene.add_body(ts.box_mesh((1, 1, 1), (1.0, 1.0, 1.0)), ts.Material())
-    monkeypatch.setattr(ts, "Simulator", ModelSimulator)
-    case, variant = one_case(run)
-    own, finer = (hard_runs.run(case, variant, "cpu", n) for n in (1, 8))
-    row, without = Row(case, variant, own, finer), Row(case, variant, own, finer | {"status": STOPPED})
-    row.compare(), without.compare()
-    assert row.error == pytest.approx(4.0 * (TIME * 0.1 * 7 / 8 + SOLVER)) and without.error is None  # after 4 s
-
-
 def test_stored_results_are_judged_again(tmp_path):
     results = manual.newest(RESULTS, "hard")
     solved = next(row for row in results["rows"] if row["solved"])
@@ -140,8 +119,3 @@ def test_stored_results_are_judged_again(tmp_path):
     assert hard.main(["--judge", str(again)]) == (0 if all(not row.faults for row in stored(results)) else 1)
     same = json.loads(again.read_text())["rows"] == results["rows"] and again.with_suffix(".md").read_text() == page.read_text()
     assert same, f"`taisoft bench hard --judge {page.with_suffix('.json')}` updates it"
-    again.write_text("{")
-    with pytest.raises(OutputError, match="hard.json cannot be read"):
-        hard.main(["--judge", str(again)])
-    with pytest.raises(SystemExit):
-        hard.main(["--judge", str(again), "--quick"])

@@ -1,6 +1,6 @@
 """The scenes of incremental potential contact:
 
-* runs stop at their budget, at a crossing and by an error; records survive JSON, tables show what degrades a run;
+* runs stop at their budget, at a crossing and by an error; records survive JSON;
 * friction's work and creep are those of a count contact by contact, moving obstacles included.
 """
 
@@ -51,20 +51,12 @@ def test_runs_end_at_their_steps_budget_a_crossing_and_an_error(monkeypatch):
     assert (found.status, found.reason, found.steps) == (STOPPED, "too fast", 0) and ipc.failed(found)
 
 
-def test_records_and_tables():
+def test_records_survive_json_and_tell_what_degrades_a_run():
     for least in (math.inf, 1e-4):
         made = record(least_distance=least, creep=0.5, crossed=1, first_crossed=0.04)
         assert Record.read(json.loads(json_text(made.data()))) == made
         assert made.status == DEGRADED and made.reason == "1 step crossed"
-    worse = {"unconverged": 1, "inverted": 2, "least_distance": 1.25e-4, "creep": 0.125, "friction_work": -2.5, "cut": 1}
-    made = [record(), record(**worse)]
-    assert [one.status for one in made] == [OK, DEGRADED]
-    lines = [" ".join(line.split()) for line in ipc.scene_table(made).splitlines()]
-    start = "| twisted mat | 800 | 1,805 | 0.04 | 0.08 of 25 (2) | 3.5 | 20 | 1.5 | 0.375, 0.375, 0.5 | 7 |"
-    assert lines[2] == f"{start} - | 0 | 0 | 0 | 776 | ok |" and lines[3] == f"{start} 0.000125 | 0 | 1 | 2 | 776 | degraded |"
-    assert lines[-1] == "* twisted mat: degraded, 1 not converged; at most 2 inverted tets"
-    cells = [" ".join(line.split()) for line in ipc.friction_table(made).splitlines()]
-    assert cells[3] == "| twisted mat | 1e-04 | 0.08 of 25 (2) | 3.5 | 20 | 0.375, 0.375, 0.5 | 0.125 | -2.5 | 1 | 0 | degraded |"
+    assert record().status == OK and record(unconverged=1).status == DEGRADED
 
 
 @pytest.mark.parametrize("substeps", [1, 3])

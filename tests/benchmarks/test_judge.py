@@ -3,12 +3,11 @@
 * triangles that pierce each other cross, those that touch, share an edge or lie in one plane do not; a pair with a common vertex
   crosses where the edge opposite it pierces the other triangle;
 * the pairs are those of all pairs in random crumpled bodies, and the least distance that of brute force;
-* distances from half-spaces, spheres and capsules are those of sampled points;
+* distances of triangles are those of sampled points;
 * a surface wholly inside another one counts, and so do shapes inside a body; obstacles may cross each other;
 * what is attached to each other exactly may cross, and nothing else.
 """
 
-from fractions import Fraction
 from types import SimpleNamespace
 
 import numpy as np
@@ -49,9 +48,6 @@ def test_two_triangles():
     ):
         x = np.concatenate([FLAT, other])
         assert judging.pierces(x, a, b)[0] == judging.pierces(x, b, a)[0] == crosses
-
-
-def test_triangles_with_common_vertices():
     folded = np.concatenate([FLAT, [(0.3, 0.3, 0.5), (0.3, 0.3, -0.5)]])
     beside = np.concatenate([FLAT, folded[3:] - [2.0, 0.0, 0.0]])
     first, second = np.array([[0, 1, 2]]), np.array([[0, 3, 4]])
@@ -60,47 +56,24 @@ def test_triangles_with_common_vertices():
     assert judging.triangle_distance(beside, first[0], first[0]) == np.inf
 
 
-def test_orientation_is_exact():
-    """Points a rounding error off a plane, and in it, whose determinants in double precision have random signs."""
-    a, b, c = np.array([(0.1, 0.2, 0.3), (1.7, 0.3, 0.9), (0.4, 1.9, 0.2)])
-    weights = np.array([(0.5, 0.25, 0.25), (0.25, 0.5, 0.25), (0.125, 0.125, 0.75), (1.0, 0.0, 0.0)])
-    d = weights @ [a, b, c]
-    signs = judging.orientation(*(np.tile(one, (len(d), 1)) for one in (a, b, c)), d)
-    for sign, point in zip(signs, d):
-        rows = [[Fraction(float(p)) - Fraction(float(q)) for p, q in zip(one, point)] for one in (a, b, c)]
-        u, v, w = rows
-        det = sum(u[i] * (v[(i + 1) % 3] * w[(i + 2) % 3] - v[(i + 2) % 3] * w[(i + 1) % 3]) for i in range(3))
-        assert sign == (det > 0) - (det < 0)
-    assert signs[-1] == 0.0 and judging.orientation(*FLAT[:, None], np.array([[0.2, 0.2, -1e-300]]))[0] == 1.0
-
-
 def test_flush_and_aligned_cubes_touch_without_crossing():
-    for off, crosses in ((0.0, False), (1e-15, False), (-1e-9, True)):
-        for shift in ((0.0, 0.0), (0.5, 0.25), (0.3, 0.0)):
-            scene = scene_of((0, 0, 0), (shift[0], 1.0 + off, shift[1]), cells=2)
-            assert (judging.Judge(standing(scene), True).crossings() > 0) == (crosses and any(shift))
+    for off, shift, crosses in ((0.0, 0.0, False), (0.0, 0.5, False), (1e-15, 0.3, False), (-1e-9, 0.3, True)):
+        scene = scene_of((0, 0, 0), (shift, 1.0 + off, 0.5 * shift), cells=2)
+        assert (judging.Judge(standing(scene), True).crossings() > 0) == crosses
 
 
-def sampled(corners: np.ndarray, n: int = 60) -> np.ndarray:
-    """Points (m,3) spread over a triangle, edges included."""
-    i, j = (index.ravel() / n for index in np.meshgrid(np.arange(n + 1), np.arange(n + 1)))
-    inside = i + j <= 1.0
-    return corners[0] + i[inside, None] * (corners[1] - corners[0]) + j[inside, None] * (corners[2] - corners[0])
-
-
-def test_distances_of_triangles_and_axes_are_those_of_sampled_points():
+def test_distances_are_those_of_sampled_points():
+    """Of two triangles, and of a triangle and the axis of a capsule."""
     rng = np.random.default_rng(0)
+    weights = np.array([(i, j, 30 - i - j) for i in range(31) for j in range(31 - i)]) / 30
     for _ in range(20):
         x = rng.uniform(-1.0, 1.0, (6, 3)) + np.repeat([[0.0] * 3, [2.0, 0.0, 0.0]], 3, axis=0)
-        p, q = sampled(x[:3], 30), sampled(x[3:], 30)
-        brute = np.linalg.norm(p[:, None] - q[None], axis=2).min()
-        found = judging.triangle_distance(x, np.arange(3), np.arange(3, 6))
-        assert brute - 0.06 <= found <= brute + 1e-9
-        along = x[3] + np.linspace(0.0, 1.0, 200)[:, None] * (x[4] - x[3])
-        brute = np.linalg.norm(p[:, None] - along[None], axis=2).min()
-        assert brute - 0.06 <= judging.axis_distance(x[3], x[4], x[:3]) <= brute + 1e-9
-        brute = np.linalg.norm(p - x[3], axis=1).min()
-        assert brute - 0.06 <= judging.axis_distance(x[3], x[3], x[:3]) <= brute + 1e-9
+        for other, found in (
+            (weights @ x[3:], judging.triangle_distance(x, np.arange(3), np.arange(3, 6))),
+            (np.linspace(x[3], x[4], 200), judging.axis_distance(x[3], x[4], x[:3])),
+        ):
+            brute = np.linalg.norm((weights @ x[:3])[:, None] - other, axis=2).min()
+            assert brute - 0.06 <= found <= brute + 1e-9
     assert judging.axis_distance(THROUGH[0], THROUGH[1], FLAT) == 0.0
 
 
@@ -119,10 +92,9 @@ def edges_and_triangles(t: np.ndarray, pairs):
             yield from ((p[k - 1], p[k], q) for k in range(3) if p[k - 1] not in q and p[k] not in q)
 
 
-@pytest.mark.parametrize("self_collision", [True, False])
-def test_crossings_and_distances_are_those_of_all_pairs(self_collision):
+def test_crossings_and_distances_are_those_of_all_pairs():
     scene, crossed = scene_of((0, 0, 0), (0.0, 0.55, 0.1), (0.3, -0.6, 0.0), size=0.5), 0
-    for seed in range(3):
+    for seed, self_collision in ((0, True), (1, True), (1, False), (2, False)):
         sim = standing(scene, crumpled(scene, seed))
         judge = judging.Judge(sim, self_collision)
         x, t = judge.vertices(), judge.triangles
@@ -146,8 +118,6 @@ def test_names_and_bodies_inside_others():
     assert set(names) == {("cube 0", "cube 1")}
     apart = {"cube 1": scene.body("cube 1").rest_positions + [0.0, 5.0, 0.0]}
     assert judging.Judge(standing(scene, apart), False).find().names == {("small", "cube 2"): 1}
-    apart["small"] = scene.body("small").rest_positions + [9.0, 0.0, 0.0]
-    assert judging.Judge(standing(scene, apart), True).crossings() == 0
 
 
 def test_obstacles():
@@ -158,33 +128,17 @@ def test_obstacles():
     scene.add_obstacle(ts.Capsule((-1, 0.6, 1.2), (1, 0.6, 1.2), 0.5), name="bar")
     body = scene.body("cube 0").rest_positions
 
-    def judged(y: float, time: float = 0.0) -> judging.Judge:
-        return judging.Judge(standing(scene, {"cube 0": body + [0.0, y, 0.0]}, time), False)
+    def judged(y: float) -> judging.Judge:
+        return judging.Judge(standing(scene, {"cube 0": body + [0.0, y, 0.0]}), False)
 
     assert judged(0.6).crossings() == 0 and judged(0.6).least_distance(1.0) == pytest.approx(0.05)
     assert judged(0.65).least_distance(1.0) == pytest.approx(0.05)  # from the ball
     assert set(judged(0.72).find().names) == {("cube 0", "ball")}
     assert judged(0.72).least_distance(1.0) == pytest.approx(-0.02)
-    assert set(judged(0.53).find().names) == {("cube 0", "slab")}
     assert set(judged(0.4).find().names) == {("cube 0", "slab"), ("cube 0", "ground")}
-    inside = ts.Scene()
-    inside.add_body(ts.box_mesh((1, 1, 1), (1.0,) * 3), ts.Material(), name="cube")
+    inside = scene_of((0, 0, 0))
     inside.add_obstacle(ts.Sphere((0.1, 0, 0), 0.1), name="ball")
-    inside.add_obstacle(ts.Box((3.0, 0, 0), (1.0, 1.0, 1.0)), name="block")
-    assert judging.Judge(standing(inside), False).find().names == {("ball", "cube"): 1}
-    moved = {"cube": 0.5 * inside.body("cube").rest_positions + [3.1, 0.0, 0.0]}
-    assert judging.Judge(standing(inside, moved), False).find().names == {("cube", "block"): 1}
-
-
-def test_depths_and_moving_obstacles():
-    tip = np.array([[(0.3, 0.3, -1e-3), (0.2, 0.3, 1.0), (0.4, 0.3, 1.0)]])
-    assert judging.separation(FLAT[None], tip)[0] == judging.separation(tip, FLAT[None])[0] == pytest.approx(1e-3)
-    assert judging.separation(FLAT[None], THROUGH[None] + [0.0, 0.0, 1.1])[0] == 0.0
-    scene = scene_of((0, 0, 0), (0.2, 0.99, 0.3))
-    assert judging.Judge(standing(scene), False).find().depth == pytest.approx(0.01)
-    scene = scene_of((0, 0.6, 0))
-    scene.add_obstacle(ts.HalfSpace((0, 0, 0), (0, 1, 0)), name="ground", path=lambda t: (np.array([0.0, t, 0.0]), np.eye(3)))
-    assert [judging.Judge(standing(scene, time=t), False).crossings() > 0 for t in (0.0, 0.09, 0.11)] == [False, False, True]
+    assert judging.Judge(standing(inside), False).find().names == {("ball", "cube 0"): 1}
 
 
 def test_attached_bodies_may_cross():

@@ -11,7 +11,7 @@ from dataclasses import replace
 import pytest
 
 from benchmarks import regression
-from benchmarks.regression import STORE, Entry, baseline, check, differences, load, make_entry, store
+from benchmarks.regression import STORE, Entry, baseline, check, differences, load, store
 from benchmarks.regression_cases import CASES, Found
 from taisoft.errors import OutputError
 
@@ -42,23 +42,15 @@ def test_every_case_is_stored():
         ("status 'degraded'", {"status": "degraded"}),
         ("field bytes 1002000", {"field_bytes": 1_002_000}),
         ("newton 106", {"counts": {"newton": 106, "contacts": 9}}),
-        ("newton 94", {"counts": {"newton": 94, "contacts": 9}}),
         ("contacts 0", {"counts": {"newton": 100}}),
         ("sweeps 3", {"counts": {"newton": 100, "contacts": 9, "sweeps": 3}}),
         (None, {"error": 0.0104, "time": 99.0, "field_bytes": 1_000_500, "counts": {"newton": 105, "contacts": 11}}),
-        (None, {"error": 0.0096, "counts": {"newton": 95, "contacts": 7}}),
     ],
 )
 def test_changes_beyond_the_margin_are_reported(start, changes):
     found = differences(CASE, replace(ENTRY, **changes), ENTRY)
     assert found == [] if start is None else len(found) == 1 and found[0].startswith(f"{start}, stored ")
-
-
-def test_errors():
-    """Relative to the largest reference value; those below the slack are not compared."""
-    entry = make_entry(Found([1.0, -1.9], {"newton": 3}, seconds=6.0), [1.0, -2.0], 2.0)
-    assert entry.error == pytest.approx(0.05) and entry.time == 3.0 and entry.counts == {"newton": 3}
-    tiny = replace(ENTRY, error=1e-7)
+    tiny = replace(ENTRY, error=1e-7)  # errors below the slack are not compared
     assert [differences(CASE, replace(tiny, error=k * CASE.slack), tiny) == [] for k in (0.9, 2.0)] == [True, False]
 
 

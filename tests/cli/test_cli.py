@@ -19,85 +19,55 @@ from taisoft.cli.run import resolve
 from taisoft.errors import SceneError
 from tests.cli.command import BEAM, ROOT, child, run, write
 
-
-class FakeSimulator:
-    """The signature that settings are checked against."""
-
-    def __init__(self, scene, dt=1 / 60, arch="cpu", precision="f32", newton_tolerance=None):
-        pass
-
-
-# --- bad input --------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    "text, message",
-    [
-        ("def build(:\n    pass\n", "line 1: SyntaxError"),
-        ("import taisoft as ts\n", "no function build()"),
-        ("build = 3\n", "no function build()"),
-        ("def build():\n    return 3\n", "build() returned int, a Scene is needed"),
-        ("def build():\n    a = 1\n    return a / 0\n", "line 3: ZeroDivisionError: division by zero"),
-        ("import not_there_at_all\n", "line 1: ModuleNotFoundError"),
-        ("raise SystemExit(0)\n", "line 1: SystemExit: 0"),
-        (BEAM.replace("young=1e5", "young=-1"), "line 9: material: young must be greater than 0"),
-        (BEAM.replace("(4, 1, 1), (4, 2, 2)", "(4, 0, 1), (4, 2, 2)"), "line 9: "),
-        (BEAM.replace("solver = {", "solver = 3, {"), "solver must be a dict"),
-        (BEAM.replace('"dt"', '"dtt"'), "'dtt' (did you mean dt?)"),
-        (BEAM.replace("1 / 240", "0.0"), "dt must be greater than 0 s, not 0.0"),
-        (BEAM.replace("1 / 240", "0.5"), "above the estimated stability limit"),
-        (BEAM.replace("0.1", "-0.1"), "seconds must be greater than 0, not -0.1"),
-        (BEAM.replace("symplectic_euler", "simplectic_euler"), "did you mean 'symplectic_euler'?"),
-    ],
-)
-def test_bad_scene_files_are_refused(tmp_path, capsys, text, message):
-    path = write(tmp_path / "scene.py", text)
-    assert run(path, "--out", tmp_path / "out") == 2
-    error = capsys.readouterr().err
-    assert message in error and error.startswith("taisoft: ") and error.count("\n") == 1
-    assert not (tmp_path / "out").exists()
+BAD_SCENES = [
+    ("def build(:\n    pass\n", "line 1: SyntaxError"),
+    ("import taisoft as ts\n", "no function build()"),
+    ("def build():\n    return 3\n", "build() returned int, a Scene is needed"),
+    ("def build():\n    a = 1\n    return a / 0\n", "line 3: ZeroDivisionError: division by zero"),
+    ("import not_there_at_all\n", "line 1: ModuleNotFoundError"),
+    ("raise SystemExit(0)\n", "line 1: SystemExit: 0"),
+    (BEAM.replace("young=1e5", "young=-1"), "line 9: material: young must be greater than 0"),
+    (BEAM.replace("solver = {", "solver = 3, {"), "solver must be a dict"),
+    (BEAM.replace('"dt"', '"dtt"'), "'dtt' (did you mean dt?)"),
+    (BEAM.replace("1 / 240", "0.5"), "above the estimated stability limit"),
+    (BEAM.replace("0.1", "-0.1"), "seconds must be greater than 0, not -0.1"),
+]
+BAD_SETTINGS = [
+    (["--set", "solver.newton_tolerence=1e-3"], "did you mean newton_tolerance?"),
+    (["--set", "solver.contact_solver=augmented_lagrangian"], "does not fit symplectic_euler: use 'auto' or "),
+    (["--set", "gravity=3"], "write solver.KEY=VALUE"),
+    (["--set", "solver.dt=1 ms"], "'1 ms' is not a number"),
+    (["--seconds", "nan"], "seconds must be finite, not nan"),
+    (["--fps", "-30"], "fps must be greater than 0, not -30.0"),
+    (["--resume", "c.npz"], "c.npz: no such checkpoint"),
+    (["--checkpoint-every", "0"], "--checkpoint-every must be greater than 0 s, not 0"),
+    (["--precision", "f64", "--set", "solver.precision=f32"], "disagree"),
+]
 
 
-@pytest.mark.parametrize(
-    "arguments, message",
-    [
-        (["--set", "solver.dt=0"], "dt must be greater than 0 s, not 0"),
-        (["--set", "solver.newton_tolerence=1e-3"], "did you mean newton_tolerance?"),
-        (["--set", "solver.contact_solver=augmented_lagrangian"], "does not fit symplectic_euler: use 'auto' or "),
-        (["--set", "gravity=3"], "write solver.KEY=VALUE"),
-        (["--set", "solver.dt=1 ms"], "'1 ms' is not a number"),
-        (["--seconds", "0"], "seconds must be greater than 0, not 0.0"),
-        (["--seconds", "nan"], "seconds must be finite, not nan"),
-        (["--fps", "-30"], "fps must be greater than 0, not -30.0"),
-        (["--resume", "c.npz"], "c.npz: no such checkpoint"),
-        (["--checkpoint-every", "0"], "--checkpoint-every must be greater than 0 s, not 0"),
-        (["--precision", "f64", "--set", "solver.precision=f32"], "disagree"),
-    ],
-)
-def test_bad_settings_are_refused(beam, tmp_path, capsys, arguments, message):
-    assert run(beam, "--out", tmp_path / "out", *arguments) == 2
-    error = capsys.readouterr().err
-    assert message in error and error.count("\n") == 1
-    assert not (tmp_path / "out").exists()
+def test_bad_scene_files_and_settings_are_refused(tmp_path, capsys):
+    for text, arguments, message in [(text, [], rule) for text, rule in BAD_SCENES] + [(BEAM, *row) for row in BAD_SETTINGS]:
+        assert run(write(tmp_path / "scene.py", text), "--out", tmp_path / "out", *arguments) == 2
+        error = capsys.readouterr().err
+        assert message in error and error.startswith("taisoft: ") and error.count("\n") == 1
+        assert not (tmp_path / "out").exists()
+    path = tmp_path / "scene.py"
+    for option, *value in (["--vtu"], ["--npz"], ["--video"], ["--checkpoint-every", "0.1"]):
+        assert run(path, option, *value) == 2
+        assert f"{option} needs --out" in capsys.readouterr().err
 
 
 def test_unknown_scenes_and_bad_usage_are_refused(capsys):
     for name, message in (
-        ("not_there.py", "not_there.py: no such file"),
         ("not_there.toml", "not_there.toml: no such file"),
         ("no_such_demo", "neither a demo nor a .toml or .py file"),
         ("hanging_bem", "did you mean hanging_beam?"),
     ):
         assert run(name) == 2
         assert message in capsys.readouterr().err
-    for arguments in ([], ["run"], ["run", "a.py", "--arch", "tpu"]):
-        with pytest.raises(SystemExit) as caught:
-            main(arguments)
-        assert caught.value.code == 2
-        assert "usage: taisoft" in capsys.readouterr().err
-
-
-# --- settings ---------------------------------------------------------------------------------------------------------
+    with pytest.raises(SystemExit) as caught:
+        main(["run", "a.py", "--arch", "tpu"])
+    assert caught.value.code == 2 and "usage: taisoft" in capsys.readouterr().err
 
 
 def test_scalars_keep_their_type():
@@ -105,7 +75,7 @@ def test_scalars_keep_their_type():
     for text, value in given:
         parsed = parse_scalar(text, "solver.x=" + text)
         assert parsed == value and type(parsed) is type(value)
-    for text in ("", "[1]", "{a = 1}", "1\nb = 2", "1 2", "2020-01-01", "a-b", "__import__('os')"):
+    for text in ("", "[1]", "{a = 1}", "1\nb = 2", "2020-01-01", "a-b"):
         with pytest.raises(SceneError):
             parse_scalar(text, "solver.x=" + text)
 
@@ -113,14 +83,10 @@ def test_scalars_keep_their_type():
 def test_options_override_set_and_set_overrides_the_scene():
     given = {"arch": None, "precision": "f64", "tolerance": None, "seconds": 2.0, "fps": None}
     arguments = Namespace(**given, assignments=["solver.dt=0.5", "solver.fps=none"])
-    resolved = resolve({"dt": 0.1, "precision": "f32", "seconds": 1.0, "fps": 30}, arguments, FakeSimulator)
+    resolved = resolve({"dt": 0.1, "precision": "f32", "seconds": 1.0, "fps": 30}, arguments, ts.Simulator)
     assert resolved.simulator == {"dt": 0.5, "precision": "f64"}
-    assert (resolved.seconds, resolved.fps) == (2.0, None)
     expected = {"dt": 0.5, "arch": "cpu", "precision": "f64", "newton_tolerance": None, "seconds": 2.0, "fps": None}
-    assert resolved.as_dict() == expected
-
-
-# --- other commands ---------------------------------------------------------------------------------------------------
+    assert expected.items() <= resolved.as_dict().items() and (resolved.seconds, resolved.fps) == (2.0, None)
 
 
 @pytest.mark.parametrize("kind", ["wheel", "checkout"])
@@ -140,15 +106,10 @@ def test_list_shows_first_lines_and_runs_nothing(tmp_path, monkeypatch, capsys, 
 
 @pytest.mark.filterwarnings("ignore:.*nearly flat")
 def test_info_shows_counts_measures_and_problems(tmp_path, capsys):
-    counts = "12 vertices, 10 tets, 20 surface triangles, 1 piece"
-    extents = "x 2 (-1 to 1), y 1 (-0.5 to 0.5), z 1 (-0.5 to 0.5)"
     path = tmp_path / "part.msh"
+    counts, extents = "12 vertices, 10 tets, 20 surface triangles, 1 piece", "x 2 (-1 to 1), y 1 (-0.5 to 0.5), z 1 (-0.5 to 0.5)"
     for cells, size, parts in (
-        (
-            (2, 1, 1),
-            (2, 1, 1),
-            (counts, extents, "y is taken for up", "volume     2\n", "metres", "mean ratio 0.8", "problems   none"),
-        ),
+        ((2, 1, 1), (2, 1, 1), (counts, extents, "volume     2\n", "metres", "mean ratio 0.8", "problems   none")),
         ((1, 1, 1), (100, 50, 50), ("probably millimetres",)),
         ((1, 1, 1), (1, 1, 1e-3), ("problems   5 tets are nearly flat or needles",)),
     ):
@@ -196,14 +157,22 @@ def test_bench_passes_its_arguments_on(tmp_path, monkeypatch, capsys):
     assert "did you mean counting?" in capsys.readouterr().err
 
 
-def test_the_command_imports_no_taichi(tmp_path):
-    code = "import sys, taisoft.cli.study\nfrom taisoft.cli import main\nmain(['list'])\nassert 'taichi' not in sys.modules\n"
-    subprocess.run([sys.executable, "-c", code], check=True, env=os.environ | {"PYTHONPATH": str(ROOT)}, cwd=tmp_path)
-
-
 def test_a_closed_pipe_gives_no_traceback():
-    process = child("doctor")
+    process = child("list")
     process.stdout.close()
     error = process.stderr.read()
     assert process.wait(timeout=60) == 3
     assert "Traceback" not in error and "Exception ignored" not in error
+
+
+def test_the_command_imports_no_taichi_and_needs_a_working_folder(beam, tmp_path):
+    code = (
+        "import os, sys, taisoft.cli.study\nfrom taisoft.cli import main\nmain(['list'])\nassert 'taichi' not in sys.modules\n"
+        "os.rmdir(os.getcwd())\nsys.exit(main(sys.argv[1:]))"
+    )
+    (tmp_path / "gone").mkdir()
+    command = [sys.executable, "-c", code, "run", beam, "--headless", "--out", tmp_path / "out"]
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    done = subprocess.run(command, cwd=tmp_path / "gone", env=environment, capture_output=True, text=True)
+    assert done.returncode == 2 and not (tmp_path / "out").exists()
+    assert done.stderr == "taisoft: the working folder cannot be used (No such file or directory): change to another one\n"

@@ -89,13 +89,13 @@ def test_scenes_of_other_sizes_compile_nothing():
         assert solved.linear > 0.0 and not np.array_equal(made.state.state()[0], x) and n_compiled() == before
 
 
-@pytest.mark.parametrize("requested, simulated, static", [(None, "f32", "f64"), ("f32", "f32", "f32"), ("f64", "f64", "f64")])
-def test_precisions(requested, simulated, static, monkeypatch, capsys):
+def test_precisions(monkeypatch, capsys):
     structure, found = Structure("implicit_euler", fixed=True), []
-    monkeypatch.setattr(warm, "structures", lambda: [structure])
-    monkeypatch.setattr(warm, "static_structures", lambda: [structure])
-    monkeypatch.setattr(warm, "simulate", lambda structure, precision: found.append(precision))
-    monkeypatch.setattr(warm, "solve", lambda structure, precision: found.append(precision))
-    monkeypatch.setattr(warm, "draw", lambda structure, precision: found.append(precision))
-    assert main(["warm", *(["--precision", requested] if requested else [])]) == 0
-    assert found == [simulated, static, simulated] and f"statics in {static}" in capsys.readouterr().out
+    for name in ("structures", "static_structures"):
+        monkeypatch.setattr(warm, name, lambda: [structure])
+    for name in ("simulate", "solve", "draw"):
+        monkeypatch.setattr(warm, name, lambda structure, precision: found.append(precision))
+    for requested, simulated, static in ((None, "f32", "f64"), ("f32", "f32", "f32"), ("f64", "f64", "f64")):
+        found.clear()
+        assert main(["warm", *(["--precision", requested] if requested else [])]) == 0
+        assert found == [simulated, static, simulated] and f"statics in {static}" in capsys.readouterr().out

@@ -5,7 +5,7 @@ comes from above and overlaps B by P; normals point from B to A, so their y is p
 1 x 1 m and wedges one of 1 x 2 m, 3 m from the tip. A contact's point may lie anywhere between the two surfaces.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
@@ -30,6 +30,16 @@ class Line:
     start: tuple[float, float, float]
     stop: tuple[float, float, float]
 
+    def fits(self, point: np.ndarray, normal: np.ndarray, gap: np.ndarray, close: float) -> np.ndarray:
+        """(k,) whether contacts are of this line, with points to a distance [m]."""
+        way, n = np.subtract(self.stop, self.start), np.asarray(self.normal)
+        share = np.clip((point - self.start) @ way / max(way @ way, 1e-30), 0, 1)
+        off = point - self.start - share[:, None] * way
+        along = off @ n
+        near = (np.linalg.norm(off - along[:, None] * n, axis=1) <= close) & (np.abs(along) <= self.depth + close)
+        turned = np.abs(normal - n).max(axis=1, initial=0)
+        return near & (turned <= NORMAL) & (np.abs(gap + self.depth) <= DEPTH * self.depth)
+
 
 @dataclass(frozen=True)
 class Case:
@@ -47,40 +57,23 @@ class Case:
     field: bool = False
     where: tuple[tuple[float, float, float], ...] = ((0.0, 0.0, 0.0),)
 
-    def problems(self, point, normal, gap, place=(0.0, 0.0, 0.0)) -> list[str]:
-        """What is wrong with the contacts point (k,3) [m], normal (k,3) and gap (k,) [m] of A at a place, and what is missing."""
-        point, found = np.asarray(point) - place, []
-        size = np.ptp(self.a.vertices, axis=0).max()
-        fits = np.array([self._fits(line, point, normal, gap, size) for line in self.lines]).reshape(len(self.lines), -1)
-        allowed = fits.any(axis=0)
+    def problems(self, point: np.ndarray, normal: np.ndarray, gap: np.ndarray) -> list[str]:
+        """What is wrong with the contacts point (k,3) [m], normal (k,3) and gap (k,) [m] of A, and what is missing."""
+        size, allowed, found = np.ptp(self.a.vertices, axis=0).max(), np.zeros(len(point), dtype=bool), []
+        for line in self.lines:
+            fits = line.fits(point, normal, gap, POINT * size)
+            allowed |= fits
+            for end in dict.fromkeys((line.start, line.stop)):
+                if not (fits & replace(line, start=end, stop=end).fits(point, normal, gap, POINT * size)).any():
+                    found.append(f"no contact at {end} along {np.round(line.normal, 3)}")
         if self.area is not None:
-            (x0, x1), (z0, z1) = self.area
-            lo, hi = np.array([x0, -np.inf, z0]) - POINT * size, np.array([x1, np.inf, z1]) + POINT * size
-            level = self._fits(self.lines[0], point * UP + np.multiply(self.lines[0].start, (1, 0, 1)), normal, gap, size)
-            allowed |= level & ((point >= lo) & (point <= hi)).all(axis=1)
+            line, (lo, hi) = self.lines[0], np.array(self.area).T
+            level = line.fits(point * UP + np.multiply(line.start, (1, 0, 1)), normal, gap, POINT * size)
+            plan = point[:, [0, 2]]
+            allowed |= level & ((plan >= lo - POINT * size) & (plan <= hi + POINT * size)).all(axis=1)
         for k in np.flatnonzero(~allowed):
             found.append(f"contact at {np.round(point[k], 5)}, normal {np.round(normal[k], 5)}, gap {gap[k]:.6f} is none")
-        for line, here in zip(self.lines, fits):
-            for end in dict.fromkeys((line.start, line.stop)):
-                if not (here & (self._aside(point, end, end, line.normal)[0] <= POINT * size)).any():
-                    found.append(f"no contact at {end} along {np.round(line.normal, 3)}")
         return found
-
-    @staticmethod
-    def _aside(point: np.ndarray, start, stop, normal) -> tuple[np.ndarray, np.ndarray]:
-        """Distances (k,) of points from a line's points, across and along the normal [m]."""
-        start, way, normal = np.asarray(start), np.subtract(stop, start), np.asarray(normal)
-        share = np.clip((point - start) @ way / max(way @ way, 1e-30), 0, 1)
-        off = point - start - share[:, None] * way
-        along = off @ normal
-        return np.linalg.norm(off - along[:, None] * normal, axis=1), np.abs(along)
-
-    def _fits(self, line: Line, point: np.ndarray, normal: np.ndarray, gap: np.ndarray, size: float) -> np.ndarray:
-        """(k,) whether contacts are of a line."""
-        across, along = self._aside(point, line.start, line.stop, line.normal)
-        near = (across <= POINT * size) & (along <= line.depth + POINT * size)
-        turned = np.abs(np.asarray(normal) - line.normal).max(axis=1, initial=0)
-        return near & (turned <= NORMAL) & (np.abs(np.asarray(gap) + line.depth) <= DEPTH * line.depth)
 
 
 def fan(vertices, faces, inner) -> ts.TetMesh:
@@ -178,10 +171,11 @@ def cases() -> dict[str, Case]:
     aside = ts.TetMesh(cube.vertices + (0.5, 0, 0.5), cube.tets)
     shared = tuple(level(x, z, y=top) for x in (0, 0.5) for z in (0, 0.5))
     cliff = ts.box_mesh((1, 1, 1), (1.5, 1.5, 1.5), (0, 1.25 - P, 0))
+    slab = ts.box_mesh((1, 1, 1), (2.0, 0.5, 2.0), (0.0, 0.25 - P, 0.0), "six")
     pole = (level(0, 0, y=0.5),)
     made = (
         Case("spike_on_plane", spike(-P), ground, (tip,), field=True),
-        Case("wedge_on_plane", wedge(-P), ground, (ridge,), field=True),
+        Case("wedge_on_plane", wedge(-P), ts.Box((0, -1, 0), (3, 1, 3)), (ridge,), field=True),
         Case("sliding_spike", spike(-P), rest, (tip,), field=True, where=way),
         Case("sliding_spike_on_triangles", spike(-P), plane(), (tip,), where=way),
         Case("sliding_wedge", wedge(-P), rest, (ridge,), field=True, where=way),
@@ -198,6 +192,9 @@ def cases() -> dict[str, Case]:
         Case("ball_on_ball", lifted, ball, pole, field=True),
         Case("ball_on_sphere", lifted, ts.Sphere((0, 0, 0), 0.5), pole, field=True),
         Case("box_on_box_offset", aside, ts.box_mesh((1, 1, 1), (1, 1, 1)), shared, ((0, 0.5), (0, 0.5)), field=True),
+        Case("spike_on_capsule", spike(-P), ts.Capsule((-1, -0.2, 0), (1, -0.2, 0), 0.2), (tip,)),
+        Case("slab_on_sphere", slab, ts.Sphere((0.3, -0.4, -0.5), 0.4), (level(0.3, -0.5),)),
+        Case("slab_on_capsule", slab, ts.Capsule((-0.6, -0.5, 0.1), (0.4, -0.2, 0.2), 0.2), (level(0.4, 0.2),)),
         Case("box_on_box_obstacle", aside, ts.Box((0, 0, 0), (0.5, 0.5, 0.5)), shared, ((0, 0.5), (0, 0.5))),
     )
     return {case.name: case for case in made}

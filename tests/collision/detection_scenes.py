@@ -18,11 +18,6 @@ def simulator(scene: ts.Scene, precision: str = "f64", **settings) -> ts.Simulat
     return ts.Simulator(scene, dt=DT, integrator="symplectic_euler", precision=precision, allow_unstable=True, **settings)
 
 
-def pairs_of(c: Contacts) -> set[frozenset[str]]:
-    """The pairs of bodies that touch."""
-    return {frozenset(pair) for pair in zip(c.body_a, c.body_b)}
-
-
 @dataclass
 class Place:
     """Where a whole scene is: x -> Q x + T; paths of obstacles read it."""
@@ -43,12 +38,7 @@ def shifted(shape, by: np.ndarray):
     return replace(shape, **{name: getattr(shape, name) + by for name in places})
 
 
-def jittered(mesh: ts.TetMesh, rng: np.random.Generator, by: float) -> ts.TetMesh:
-    """A mesh whose vertices are off by up to that length [m], so that nothing is symmetric."""
-    return ts.TetMesh(mesh.vertices + rng.uniform(-by, by, mesh.vertices.shape), mesh.tets)
-
-
-def zoo(scale: float = 1.0, swapped: bool = False) -> tuple[ts.Scene, Place]:
+def zoo(scale: float = 1.0) -> tuple[ts.Scene, Place]:
     """Four bodies and five obstacles about 1 m in size, times scale, with contacts of every kind between them.
 
     block (hit by proximity) on a half-space; ball (by its field) and brick (order 2, an edge across one of the block's) on it;
@@ -70,13 +60,10 @@ def zoo(scale: float = 1.0, swapped: bool = False) -> tuple[ts.Scene, Place]:
         ("brick", ts.box_mesh((1, 1, 1), 2 * half), axes, brick, 2, "proximity"),
         ("egg", ts.ball_mesh(0.3, 4), np.eye(3), egg, 1, "distance_field"),
     ]
-    made = []
     for name, mesh, turn, at, order, collision in bodies:
-        mesh = jittered(mesh, rng, 0.004)
-        mesh = ts.TetMesh(scale * (mesh.vertices @ turn.T + at), mesh.tets)
-        made.append((mesh, ts.Material(young=SOFT["young"] * scale**2), name, order, collision))
-    for mesh, material, name, order, collision in made[::-1] if swapped else made:
-        scene.add_body(mesh, material, name=name, order=order, collision=collision)
+        vertices = mesh.vertices + rng.uniform(-0.004, 0.004, mesh.vertices.shape)  # so that nothing is symmetric
+        mesh = ts.TetMesh(scale * (vertices @ turn.T + at), mesh.tets)
+        scene.add_body(mesh, ts.Material(young=SOFT["young"] * scale**2), name=name, order=order, collision=collision)
     side = brick + axes @ (0.1, 0.05, half[2] + 0.1 - 0.012)
     way = 0.3 * axes @ (0.3, 1.0, 0.05)
     corners = [(-0.4, -0.4, 0.0), (0.4, -0.4, 0.02), (0.4, 0.4, -0.01), (-0.4, 0.4, 0.0), (0.03, 0.02, 0.0)]
@@ -121,14 +108,13 @@ def sheets() -> ts.Scene:
     """Bodies for self-collision, apart: a sheet of 2 m, its thickness below the margin; a thinner plate; a cube; a thin strip."""
     scene = ts.Scene(gravity=(0, 0, 0))
     scene.collision = ts.CollisionSettings(margin=0.03)
-    for k, (name, mesh) in enumerate(
-        (
-            ("sheet", ts.sheet_mesh((16, 4), (2.0, 0.02, 1.0))),
-            ("plate", ts.sheet_mesh((5, 5), (1.0, 0.004, 1.0), pattern="six")),
-            ("cube", ts.box_mesh((3, 3, 3), (1.0, 1.0, 1.0))),
-            ("strip", ts.sheet_mesh((16, 2), (1.6, 0.005, 0.4))),
-        )
-    ):
+    meshes = {
+        "sheet": ts.sheet_mesh((16, 4), (2.0, 0.02, 1.0)),
+        "plate": ts.sheet_mesh((5, 5), (1.0, 0.004, 1.0), pattern="six"),
+        "cube": ts.box_mesh((3, 3, 3), (1.0, 1.0, 1.0)),
+        "strip": ts.sheet_mesh((16, 2), (1.6, 0.005, 0.4)),
+    }
+    for k, (name, mesh) in enumerate(meshes.items()):
         scene.add_body(mesh, ts.Material(**SOFT), name=name, position=(0, 3.0 * k, 0))
     return scene
 

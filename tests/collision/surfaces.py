@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 
 from taisoft.backend.arrays import FieldArena
-from taisoft.collision.candidates import Candidates
+from taisoft.collision.candidates import EDGES, WHOLE, Candidates
 from taisoft.collision.colliders import make_topology
 from taisoft.collision.surface import build_surface, update_boxes
 from tests.backend.lanes import opened
@@ -60,18 +60,29 @@ def pairs_of(candidates: Candidates) -> np.ndarray:
     return up
 
 
-def brute_pairs(made: SimpleNamespace) -> np.ndarray:
-    """(k,2) pairs t < u, ascending, that may touch and whose swept, grown boxes overlap."""
+def near_pairs(made: SimpleNamespace, q: int = WHOLE) -> np.ndarray:
+    """(k,2) triangles t and u that may touch, ascending: the swept, grown boxes of t, or of its corner q < 3, and of u overlap.
+    q = EDGES: those that are to be tested for edges."""
     t, body = made.topology.triangle, made.topology.body
     ends = np.concatenate([made.x[t], (made.x + made.move)[t]], axis=1)
-    finite = np.isfinite(ends).all(axis=(1, 2))
-    lo, hi = ends.min(axis=1) - 0.5 * made.margin, ends.max(axis=1) + 0.5 * made.margin
-    lo[~finite], hi[~finite] = np.inf, -np.inf
-    meet = (lo[:, None] <= hi[None]).all(axis=2) & (lo[None] <= hi[:, None]).all(axis=2)
+    finite, own = np.isfinite(ends).all(axis=(1, 2)), ends if q > 2 else ends[:, [q, 3 + q]]
+    grown, meet = 0.5 * made.margin, finite[:, None] & finite
+    with np.errstate(invalid="ignore"):
+        meet &= (own.min(axis=1)[:, None] - grown <= ends.max(axis=1) + grown).all(axis=2)
+        meet &= (ends.min(axis=1) - grown <= own.max(axis=1)[:, None] + grown).all(axis=2)
     shared = (t[:, None, :, None] == t[None, :, None, :]).any(axis=(2, 3))
     same = body[:, None] == body[None]
-    counts = np.where(same, made.self_on[body][:, None] & ~shared, made.soft[body][:, None] | made.soft[body][None])
-    return np.argwhere(np.triu(meet & counts, 1))
+    meet &= np.where(same, made.self_on[body][:, None] & ~shared, made.soft[body][:, None] | made.soft[body][None])
+    if q == EDGES:
+        sharp = made.surface.sharp.to_numpy()
+        meet &= (sharp != 0) & (np.triu(np.ones_like(meet), 1) | (sharp & 7 == 0))
+    return np.argwhere(meet)
+
+
+def brute_pairs(made: SimpleNamespace) -> np.ndarray:
+    """(k,2) pairs t < u, ascending, that may touch and whose swept, grown boxes overlap."""
+    pairs = near_pairs(made)
+    return pairs[pairs[:, 0] < pairs[:, 1]]
 
 
 def soup(rng: np.random.Generator, n: int, size: float = 0.3) -> tuple[np.ndarray, np.ndarray]:
@@ -126,16 +137,6 @@ def sheet(n: int, size: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
     a = (i[:-1, :-1] * (n + 1) + j[:-1, :-1]).ravel()
     b, c, d = a + 1, a + n + 1, a + n + 2
     return vertices, np.concatenate([np.stack([a, b, c], axis=1), np.stack([b, d, c], axis=1)])
-
-
-def folded(rng: np.random.Generator, n: int = 10) -> tuple[np.ndarray, np.ndarray]:
-    """A sheet bent by random waves, strong enough that it runs through itself here and there."""
-    vertices, triangles = sheet(n)
-    x = vertices.copy()
-    for _ in range(4):
-        k, direction = rng.uniform(-9.0, 9.0, 3), rng.standard_normal(3)
-        x += 0.2 * rng.uniform(0.5, 1.0) * np.sin(vertices @ k + rng.uniform(0, 6.3))[:, None] * direction
-    return x + 0.02 * rng.standard_normal(x.shape), triangles
 
 
 def separation(X: np.ndarray) -> np.ndarray:

@@ -1,10 +1,8 @@
-"""Candidates of both broad phases, on one thread and on many, in random scenes: triangle soups, sheets, a collider without faces.
+"""Candidates of both broad phases, on all threads, in random scenes: triangle soups, sheets, a collider without faces.
 
 * trees of boxes, for any size of their chunks, and the spatial hash, for any cell, find the pairs of brute force, and so do the
   queries for what is near a corner, an edge or a triangle;
-* trees with more slabs drop only pairs that are apart; trees split along the longest extent;
-* active triangles are those whose box overlaps that of another collider;
-* the grid of the hash is periodic;
+* trees with more slabs drop only pairs that are apart; the grid of the hash is periodic; loops as on CUDA change nothing;
 * buffers grow to what is needed, or raise an error with the need and the limit.
 """
 
@@ -16,20 +14,20 @@ import taichi as ti
 
 from taisoft.backend.arrays import FieldArena
 from taisoft.backend.runtime import kernel
-from taisoft.collision.bvh import DIRECTIONS, Bvh, build_trees
+from taisoft.collision.bvh import DIRECTIONS, Bvh
 from taisoft.collision.candidates import EDGES, WHOLE, Buffer, entries
 from taisoft.collision.spatial_hash import N_LARGE, SpatialHash
-from taisoft.collision.surface import ACTIVE, NONFINITE, list_near, update_boxes
+from taisoft.collision.surface import list_near, update_boxes
 from taisoft.errors import SimulationError
-from tests.collision.surfaces import EMPTY, brute_pairs, colliders, pairs_of, place, scatter, soup, surface_of
+from tests.collision.surfaces import EMPTY, brute_pairs, colliders, near_pairs, pairs_of, place, scatter, soup, surface_of
 
 CAPACITY = 300  # entries per corner and collider
 
 
-@pytest.fixture(scope="module", params=[True, False], ids=["serial", "parallel"])
-def rig(request):
+@pytest.fixture(scope="module")
+def rig():
     rng, arenas = np.random.default_rng(1), []
-    with surface_of(**colliders(rng), serial=request.param) as made:
+    with surface_of(**colliders(rng), serial=False) as made:
 
         def arena() -> FieldArena:  # one for each broad phase, since names are unique in an arena
             arenas.append(FieldArena())
@@ -37,7 +35,7 @@ def rig(request):
 
         made.x0, made.new_arena, s = made.x, arena, made.surface
         made.new_tree = lambda **options: Bvh(s, made.topology, made.x0, made.margin, made.runtime, arena(), **options)
-        made.trees = {k: made.new_tree(k_dop=k, leaves=5) for k in (DIRECTIONS if s.serial else (6,))}
+        made.trees = {k: made.new_tree(k_dop=k, leaves=5) for k in DIRECTIONS}
         made.hash = SpatialHash(s, arena(), 0.1, np.ones(3), capacity=2**17)
         made.one_cell = SpatialHash(s, arena(), 0.1, np.zeros(3), capacity=2**17)
         yield made
@@ -52,7 +50,7 @@ def found(made, tree: Bvh) -> np.ndarray:
 
 def test_candidates_are_those_of_brute_force(rig):
     rng, total, large = np.random.default_rng(2), 0, 0
-    for kind in range(45 if rig.surface.serial else 20):
+    for kind in range(30):
         scatter(rng, rig, kind)
         expected, grid = brute_pairs(rig), (rig.hash, rig.one_cell)[kind // 5 % 2]
         total += len(expected)
@@ -63,38 +61,17 @@ def test_candidates_are_those_of_brute_force(rig):
     assert total > 10000 and large > 1
 
 
-def test_chunks_and_levels_do_not_change_the_candidates(rig):
-    """by_levels: as on CUDA, where a serial loop over the nodes above the chunks would be slow."""
+def test_chunks_levels_and_loops_as_on_cuda_change_nothing(rig):
     scatter(np.random.default_rng(5), rig, 0)
-    expected = brute_pairs(rig)
+    expected, s = brute_pairs(rig), rig.surface
     for leaves, by_levels in ((1, False), (10**6, False), (2, True)):
         tree = rig.new_tree(leaves=leaves)
         tree.by_levels = by_levels
         assert np.array_equal(found(rig, tree), expected)
         tree.release()
-
-
-def test_active_triangles(rig):
-    """Those whose box overlaps that of another collider; also by loops for many threads, as on CUDA."""
-    rng, s, n_active = np.random.default_rng(3), rig.surface, set()
-    body, soft, own = rig.topology.body, rig.soft, rig.topology.body[:, None] == np.arange(s.n_bodies)
-    for kind in range(10):
-        scatter(rng, rig, kind)
-        apart = np.repeat(0.6 * rng.standard_normal((s.n_bodies, 3)), np.diff(rig.topology.vertex_first), axis=0)
-        place(rig, rig.x + apart, rig.move)
-        lo, hi = s.lo.to_numpy(), s.hi.to_numpy()
-        body_lo = np.array([lo[rows].min(axis=0, initial=np.inf) for rows in own.T])
-        body_hi = np.array([hi[rows].max(axis=0, initial=-np.inf) for rows in own.T])
-        meets = (lo[:, None] <= body_hi).all(axis=2) & (body_lo <= hi[:, None]).all(axis=2) & (lo <= hi).all(axis=1)[:, None]
-        may_touch = np.where(own, rig.self_on[body][:, None], soft[body][:, None] | soft)
-        expected = np.flatnonzero((meets & may_touch).any(axis=1))
-        for surface in (s, replace(s, on_cpu=False)):
-            update_boxes(surface, rig.margin)
-            assert np.array_equal(s.active.to_numpy()[: s.count[ACTIVE]], expected)
-            assert np.array_equal(s.body_lo.to_numpy(), body_lo) and np.array_equal(s.body_hi.to_numpy(), body_hi)
-            assert (s.count[NONFINITE] > 0) == (kind % 5 == 3)
-        n_active.add(len(expected))
-    assert len(n_active) > 3 and min(n_active) < s.n_triangles
+    before = [f.to_numpy() for f in (s.body_lo, s.body_hi, s.active, s.count)]
+    update_boxes(replace(s, on_cpu=False), rig.margin)
+    assert all(np.array_equal(f.to_numpy(), b) for f, b in zip((s.body_lo, s.body_hi, s.active, s.count), before))
 
 
 @pytest.mark.parametrize("kind", ["tree", "hash"])
@@ -115,13 +92,6 @@ def test_small_buffers_grow_up_to_their_limit(rig, kind):
     broad.release()
 
 
-# --- on one thread only ----------------------------------------------------------------------------------------------
-
-
-SERIAL = pytest.mark.parametrize("rig", [True], ids=["serial"], indirect=True)
-
-
-@SERIAL
 def test_more_slabs_drop_only_separated_pairs(rig):
     rng = np.random.default_rng(3)
     w = np.concatenate([np.eye(3), (np.eye(3) + np.roll(np.eye(3), 1, axis=1)) / 2, rng.dirichlet(np.ones(3), 6)])
@@ -160,26 +130,6 @@ def list_all(
             count[t, b] = near.list_triangles(s, b, t, q, lo, hi, entry, begin, begin + capacity)
 
 
-def nearby(made, q: int, padding: float) -> np.ndarray:
-    """(k,2) by brute force, ascending: corners whose swept box, padded by `padding` [m], overlaps the boxes of the surface."""
-    t, body = made.topology.triangle, made.topology.body
-    lo, hi = made.surface.lo.to_numpy(), made.surface.hi.to_numpy()
-    finite = (lo <= hi).all(axis=1)
-    corners = t if q > 2 else t[:, [q]]
-    ends = np.concatenate([made.x[corners], (made.x + made.move)[corners]], axis=1)
-    with np.errstate(invalid="ignore"):
-        swept_lo, swept_hi = ends.min(axis=1) - padding, ends.max(axis=1) + padding
-    meet = (swept_lo[:, None] <= hi[None]).all(axis=2) & (lo[None] <= swept_hi[:, None]).all(axis=2) & finite[:, None] & finite
-    shared = (t[:, None, :, None] == t[None, :, None, :]).any(axis=(2, 3))
-    same = body[:, None] == body[None]
-    meet &= np.where(same, made.self_on[body][:, None] & ~shared, made.soft[body][:, None] | made.soft[body][None])
-    if q == EDGES:
-        sharp = made.surface.sharp.to_numpy()
-        meet &= (sharp != 0) & (np.triu(np.ones_like(meet), 1) | (sharp & 7 == 0))
-    return np.argwhere(meet)
-
-
-@SERIAL
 def test_queries_list_what_is_near(rig):
     """Entries beyond the capacity are counted and not written."""
     made, rng, s, arena = rig, np.random.default_rng(2), rig.surface, rig.new_arena()
@@ -202,7 +152,7 @@ def test_queries_list_what_is_near(rig):
     for kind in range(5):
         scatter(rng, made, kind)
         for q in (0, 1, 2, EDGES, WHOLE):
-            pairs = nearby(made, q, 0.5 * made.margin)
+            pairs = near_pairs(made, q)
             for source in (made.trees[6], made.hash):
                 assert np.array_equal(listed(source, q)[0], pairs)
             total += len(pairs)
@@ -213,7 +163,6 @@ def test_queries_list_what_is_near(rig):
         assert np.array_equal(counts, again) and len(part) == np.minimum(counts, 2).clip(0).sum() < len(whole)
 
 
-@SERIAL
 def test_the_grid_is_periodic(rig):
     """A body and its copy, with box faces on cell borders, whole periods apart in the same cells, and out of the grid's range."""
     x, t = soup(np.random.default_rng(6), 60)
@@ -239,27 +188,11 @@ def test_the_grid_is_periodic(rig):
         for far in (2.0**46, 2.0**49, 1e200):  # [m]; f64 no longer tells cells apart from 2^50 cells on
             check(*[x * max(1.0, far * 2.0**-46) + far] * 2)
         grid.release()
-
-
-# --- on the host -----------------------------------------------------------------------------------------------------
-
-
-def test_a_scene_without_triangles_has_no_candidates():
-    arenas = FieldArena(), FieldArena()
-    with surface_of([EMPTY, EMPTY], serial=True) as made:
-        tree = Bvh(made.surface, made.topology, made.x, 0.1, made.runtime, arenas[0])
-        for broad in (tree, SpatialHash(made.surface, arenas[1], 0.1, np.ones(3))):
+    with surface_of([EMPTY, EMPTY], serial=False) as made:
+        grid = SpatialHash(made.surface, rig.new_arena(), 0.1, np.ones(3))
+        for broad in (Bvh(made.surface, made.topology, made.x, 0.1, made.runtime, rig.new_arena()), grid):
             assert len(pairs_of(broad.find())) == 0
             broad.release()
-
-
-def test_trees_split_along_the_longest_extent():
-    x = np.zeros((64, 3))
-    x[:, 1] = np.random.default_rng(9).permutation(64)
-    t = build_trees(x, np.array([0, 64]), 8)
-    for node in t.chunk:  # a subtree of 8 leaves
-        below = t.link[node : node + 15]
-        assert np.ptp(x[-1 - below[below < 0], 1]) == 7
 
 
 def test_a_buffer_stops_at_its_limit():

@@ -1,6 +1,5 @@
 """How far triangles move and certainly stay apart from each other:
 
-* the nearest points of two triangles agree with ipctk's distances, also of edges and points;
 * random motions that are called free are so by ipctk's exact continuous detection, and most that ipctk calls free are;
 * the distance kept is the floor, or half of the first distance;
 * triangles that turn together, slide on each other or meet head on: free, free, and stopped just before;
@@ -24,16 +23,6 @@ matrix = ti.types.matrix(6, 3, ti.f64)
 @ti.func
 def rows(X: ti.template(), i):
     return matrix([X[i, k, q] for k in ti.static(range(6)) for q in ti.static(range(3))])
-
-
-@kernel
-def nearest(X: array, out: array):
-    for i in range(X.shape[0]):
-        corners = rows(X, i)
-        k, _ = separation.closest_features(corners)
-        a, b, d = separation.nearest_of(corners, k)
-        for k in ti.static(range(3)):
-            out[i, k], out[i, 3 + k], out[i, 6 + k] = a[k], b[k], d[k]
 
 
 @kernel
@@ -85,36 +74,20 @@ def apart(n: int, rng: np.random.Generator, speed: float = 1.0) -> tuple[np.ndar
     return x, speed * (rng.standard_normal((len(x), 2, 1, 3)) + 0.3 * rng.standard_normal((len(x), 2, 3, 3))).reshape(-1, 6, 3)
 
 
-@pytest.mark.parametrize("corners", ["triangles", "parallel", "an edge", "a point", "two edges", "parallel edges"])
-def test_nearest_points(corners):
-    x, rng = apart(100, np.random.default_rng(0))[0], np.random.default_rng(1)
-    if corners.startswith("parallel"):
-        x[:, 3:] = x[:, :3] + 2.0 * rng.standard_normal((len(x), 1, 3)) + 1e-12 * rng.standard_normal((len(x), 3, 3))
-    if corners not in ("triangles", "parallel"):
-        x[:, 2] = x[:, 1]
-    if corners == "a point":
-        x[:, 0] = x[:, 1]
-    if corners.endswith("edges"):
-        x[:, 5] = x[:, 4]
-    out = np.zeros((len(x), 9))
-    nearest(x, out)
-    a, b, d = out[:, :3], out[:, 3:6], out[:, 6:]
-    assert np.allclose(a.sum(axis=1), 1) and np.allclose(b.sum(axis=1), 1) and out[:, :6].min() > -1e-12
-    assert np.allclose(np.einsum("ik,ikq->iq", a, x[:, :3]) - np.einsum("ik,ikq->iq", b, x[:, 3:]), d, atol=1e-12)
-    expected = np.array([distance(y) for y in x])
-    kept = expected > 0.0
-    assert np.allclose(np.linalg.norm(d, axis=1)[kept], expected[kept], rtol=1e-9)
+@pytest.fixture(scope="module")
+def motions() -> tuple[np.ndarray, np.ndarray]:
+    """Pairs that start apart, and slow and fast displacements."""
+    rng = np.random.default_rng(1)
+    return tuple(map(np.concatenate, zip(apart(200, rng, 0.3), apart(200, rng, 2.0))))
 
 
-@pytest.mark.parametrize("speed", [0.3, 2.0])
-def test_free_motions_are_free_and_stopped_ones_near(speed):
-    x, p = apart(300, np.random.default_rng(1), speed)
+def test_free_motions_are_free_and_stopped_ones_near(motions):
+    x, p = motions
     part = free_until(x, p)
     assert ((part >= 0.0) & (part <= 1.0)).all()
     truth = np.array([exactly_free(y, q) for y, q in zip(x, p)])
     called = part == 1.0
-    assert 20 < called.sum() < len(x) and 8 < (~truth).sum()
-    assert not (called & ~truth).any()
+    assert not (called & ~truth).any() and (~truth).sum() > 20
     assert (called & truth).sum() > 0.99 * truth.sum()
     floor = 1e-3  # [m]; ipctk's own tolerance is 1e-6
     part = free_until(x, p, floor=floor)
@@ -126,16 +99,15 @@ def test_free_motions_are_free_and_stopped_ones_near(speed):
     assert np.median(left) < 1.5 * floor and np.quantile(left, 0.9) < 0.1  # unless the motion turns as it comes near
 
 
-@pytest.mark.parametrize("speed", [0.3, 2.0])
-def test_what_simple_tests_call_clear_is_free(speed):
-    x, p = apart(300, np.random.default_rng(6), speed)
-    found, floor = np.zeros((separation.N_PLANES, len(x))), 1e-2
+def test_what_simple_tests_call_clear_is_free(motions):
+    """Whatever plane is tried first."""
+    (x, p), floor = motions, 1e-2
+    found = np.zeros((separation.N_PLANES, len(x)))
     for first in range(separation.N_PLANES):
         plane(x, p, floor, first, found[first])
     clear = found[0] >= 0.0
-    assert ((found >= 0.0) == clear).all()  # whatever is tried first
-    used = [np.sum(found[k] == k) for k in range(separation.N_PLANES)]
-    assert min(used) > 0 and 60 < clear.sum() < len(x) and (free_until(x, p, floor=floor)[clear] == 1.0).all()
+    assert ((found >= 0.0) == clear).all() and 60 < clear.sum() < len(x)
+    assert all((found[k] == k).any() for k in range(separation.N_PLANES)) and (free_until(x, p, floor=floor)[clear] == 1.0).all()
     for y, q in zip(x[clear], p[clear]):
         assert min(distance(y + t * q) for t in (0.0, 0.5, 1.0)) >= floor * (1.0 - 1e-9)
 
@@ -164,16 +136,15 @@ def test_turning_together_is_free():
     assert (free_until(x, turned - x, floor=1e-5) == 1.0).all()
 
 
-def test_crossing_triangles_are_told_by_a_motion_of_nothing():
+def test_crossing_triangles_cannot_move():
     x = np.random.default_rng(5).standard_normal((200, 6, 3))
     crossing = np.array([distance(y) == 0.0 for y in x])
     assert 10 < crossing.sum() < 190
     assert np.array_equal(free_until(x, 0.0 * x, are_apart=False) < 1.0, crossing)
 
 
-def test_frame_and_order_change_nothing():
-    rng = np.random.default_rng(4)
-    x, p = apart(300, rng)
+def test_frame_and_order_change_nothing(motions):
+    (x, p), rng = motions, np.random.default_rng(4)
     part = free_until(x, p)
     R, shift, drift = rotation(rng.standard_normal(3), 2.0), rng.standard_normal(3), rng.standard_normal(3)
     assert np.allclose(free_until(x @ R.T + shift, p @ R.T + drift), part, atol=1e-6)

@@ -50,37 +50,31 @@ def run(function, X: np.ndarray, columns: int) -> np.ndarray:
     return out
 
 
-def point_sets(count: int, seed: int = 1) -> np.ndarray:
-    """(k,count,3): random ones, ones on a small integer grid, needles and collinear ones; sizes from 1e-6 to 1e6."""
-    rng = np.random.default_rng(seed)
-    scattered = rng.standard_normal((10000, count, 3))
-    grid = rng.integers(0, 3, (10000, count, 3)).astype(np.float64)
-    needle = scattered[:5000].copy()
+def point_sets() -> np.ndarray:
+    """(k,4,3): random ones, ones on a small integer grid, needles and collinear ones; sizes from 1e-6 to 1e6."""
+    rng = np.random.default_rng(1)
+    scattered = rng.standard_normal((10000, 4, 3))
+    needle, line = scattered[:5000].copy(), scattered[5000:].copy()
     needle[:, -1] = needle[:, -2] + 10.0 ** rng.uniform(-16, -2, (5000, 1)) * rng.standard_normal((5000, 3))
-    line = scattered[5000:10000].copy()
     line[:, -1] = line[:, -2] + rng.uniform(-2, 2, (5000, 1)) * (line[:, -2] - line[:, -3])
-    sets = np.concatenate([scattered, grid, needle, line])
+    sets = np.concatenate([scattered, rng.integers(0, 3, (10000, 4, 3)), needle, line])
     return sets * 10.0 ** rng.uniform(-6, 6, (len(sets), 1, 1))
 
 
-def size_of(X: np.ndarray) -> np.ndarray:
-    """Largest distance within each set, 1 where there is none."""
-    size = np.linalg.norm(X[:, :, None] - X[:, None], axis=3).max(axis=(1, 2))
-    return np.where(size > 0, size, 1.0)
-
-
 def test_closest_point_of_a_triangle():
-    X = point_sets(4)
+    X = point_sets()
+    size = np.linalg.norm(X[:, :, None] - X[:, None], axis=3).max(axis=(1, 2))
+    size[size == 0] = 1.0
     out = run(closest_points_on_triangles, X, 4)
     w, region = out[:, :3], out[:, 3].astype(int)
     assert w.min() >= 0 and np.abs(w.sum(axis=1) - 1).max() < 1e-15
     p, corners = X[:, 0], X[:, 1:]
     q = np.einsum("ik,ikd->id", w, corners)
     # no corner, hence no point of the triangle, lies beyond the plane through q normal to p - q
-    ahead = np.einsum("id,ikd->ik", p - q, corners - q[:, None]) / size_of(X)[:, None] ** 2
+    ahead = np.einsum("id,ikd->ik", p - q, corners - q[:, None]) / size[:, None] ** 2
     assert ahead.max() < 3e-8  # needles; regular triangles below
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-    regular = area > 1e-3 * size_of(X) ** 2
+    regular = area > 1e-3 * size**2
     assert regular.sum() > 15000 and ahead[regular].max() < 1e-12
     assert np.array_equal(region == 0, (w > 0).all(axis=1))
     for k in range(3):

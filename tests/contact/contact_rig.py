@@ -3,35 +3,27 @@
 import numpy as np
 
 from taisoft.backend.arrays import FieldArena
-from taisoft.backend.runtime import open_runtime
 from taisoft.contact import problem
 from tests.contact import contact_oracle as oracle
 
-CAPACITY, N_NODES, BLOCKS = 300, 40, 4096
+CAPACITY, N_NODES, BLOCKS = 700, 40, 4096
 
 
 class Rig:
-    """One problem of each form, on one thread and on all, in one runtime."""
+    """One problem of each form, on one thread and on all."""
 
     def __init__(self):
-        self.runtime = open_runtime("cpu", "f64")
-        self.arena, self._made = [], {}
+        self._arenas = [FieldArena() for _ in range(4)]
+        forms = {False: (problem.build_node_problem, N_NODES), True: (problem.build_matrix_problem, BLOCKS)}
+        kinds = [(matrix, serial) for matrix in forms for serial in (True, False)]
+        self._of = {(m, s): forms[m][0](arena, CAPACITY, forms[m][1], s) for arena, (m, s) in zip(self._arenas, kinds)}
 
     def close(self) -> None:
-        for arena in self.arena:
-            arena.release()
-        self.arena = []
-        self.runtime.close()
-
-    def _of(self, matrix: bool, serial: bool) -> problem.ContactProblem:
-        if (matrix, serial) not in self._made:
-            self.arena.append(FieldArena())
-            build = problem.build_matrix_problem if matrix else problem.build_node_problem
-            self._made[matrix, serial] = build(self.arena[-1], CAPACITY, BLOCKS if matrix else N_NODES, serial)
-        return self._made[matrix, serial]
+        while self._arenas:
+            self._arenas.pop().release()
 
     def nodes(self, contacts: oracle.NodeContacts, serial: bool = True) -> problem.ContactProblem:
-        p, k = self._of(False, serial), len(contacts.arity)
+        p, k = self._of[False, serial], len(contacts.arity)
         for name in ("node", "arity", "weight", "normal", "tangent", "friction", "inverse_mass", "b"):
             values = getattr(contacts, name)
             problem.fill_field(getattr(p, name), values.reshape(k, 3) if name == "b" else values)
@@ -43,7 +35,7 @@ class Rig:
         return p
 
     def matrix(self, W, b: np.ndarray, mu: np.ndarray, serial: bool = True) -> problem.ContactProblem:
-        p = self._of(True, serial)
+        p = self._of[True, serial]
         p.r.fill(0.0)
         problem.fill_matrix_problem(p, W, b, mu)
         return p

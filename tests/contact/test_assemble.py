@@ -17,56 +17,35 @@ from taisoft.contact.build import gap_minus_target
 from taisoft.contact.problem import build_node_problem, fill_field
 from taisoft.contact.restitution import explicit_opening
 from tests.collision.rotations import rotation
+from tests.contact import contact_oracle as oracle
 from tests.dynamics.scenes import dynamics, set_state
 
 DT = 1e-3  # [s]
-SPIN = np.array([0.3, 2.0, -0.4])  # [rad/s]
-
-
-def turning(t: float):
-    """Rotation and translation."""
-    return np.array([0.5 * t, 0.0, 0.2 * t]), rotation(SPIN, np.linalg.norm(SPIN) * t)
-
-
-def rising(t: float):
-    """Translation and a slow rotation."""
-    return np.array([0.1 * t, 1.5 * t, 0.0]), rotation((1, 0, 0), 0.3 * t)
+LIFT = [(3, 0, -1), (3, 0, 1), (5, 0, 1), (5, 0, -1)]
 
 
 def scene() -> ts.Scene:
     """A block on a rotating box, a brick on the block, another brick on a rising mesh."""
-    made = ts.Scene()
-    soft = {"young": 1e5, "density": 1000.0}
-    made.add_body(
-        ts.box_mesh((2, 1, 2), (1.0, 0.5, 1.0)),
-        ts.Material(friction=0.4, restitution=0.2, **soft),
-        name="block",
-        position=(0, 0.2502, 0),
-        velocity=(0.2, -0.3, 0.1),
-    )
-    brick = ts.Material(friction=0.9, restitution=0.1, **soft)
+    made, soft = ts.Scene(), {"young": 1e5, "density": 1000.0}
+    block, brick = ts.Material(friction=0.4, restitution=0.2, **soft), ts.Material(friction=0.9, restitution=0.1, **soft)
     mesh = ts.box_mesh((1, 1, 1), (0.3, 0.2, 0.35))
+    under = ts.box_mesh((2, 1, 2), (1.0, 0.5, 1.0))
+    made.add_body(under, block, name="block", position=(0, 0.2502, 0), velocity=(0.2, -0.3, 0.1))
     made.add_body(mesh, brick, name="brick", position=(0.13, 0.6004, 0.08), velocity=(0, -1, 0))
     made.add_body(mesh, brick, name="other", position=(4.0, 0.1002, 0.03))
-    made.add_obstacle(ts.Box((0, -0.2, 0), (0.6, 0.2, 0.7)), name="table", friction=0.6, path=turning)
-    corners = [(3, 0, -1), (3, 0, 1), (5, 0, 1), (5, 0, -1)]
-    made.add_obstacle(ts.MeshObstacle(corners, [(0, 1, 2), (0, 2, 3)]), name="lift", friction=0.1, restitution=0.5, path=rising)
+    table, lift = ts.Box((0, -0.2, 0), (0.6, 0.2, 0.7)), ts.MeshObstacle(LIFT, [(0, 1, 2), (0, 2, 3)])
+    made.add_obstacle(table, name="table", friction=0.6, path=lambda t: ((0.5 * t, 0, 0.2 * t), rotation((0.3, 2, -0.4), 2 * t)))
+    rising = {"restitution": 0.5, "path": lambda t: ((0.1 * t, 1.5 * t, 0.0), rotation((1, 0, 0), 0.3 * t))}
+    made.add_obstacle(lift, name="lift", friction=0.1, **rising)
     made.set_contact("block", "brick", friction=0.25)
     return made
 
 
 @pytest.fixture(scope="module")
-def shared_dynamics():
-    with dynamics(scene(), dt=DT, integrator="symplectic_euler", precision="f64") as made:
-        yield made
-
-
-@pytest.fixture
-def begun(shared_dynamics):
+def begun():
     """The dynamics with the contact problem of a step; the number of its contacts."""
-    made = shared_dynamics
-    made.reset()
-    return made, made.contact.begin(made.state.time, DT)
+    with dynamics(scene(), dt=DT, integrator="symplectic_euler", precision="f64") as made:
+        yield made, made.contact.begin(made.state.time, DT)
 
 
 def rows(field, n: int) -> np.ndarray:
@@ -74,6 +53,7 @@ def rows(field, n: int) -> np.ndarray:
 
 
 def test_frames_and_pairs(begun):
+    """Also after friction and restitution of a pair change."""
     made, n = begun
     p, names = made.contact.problem, [c.name for c in made.scene.colliders]
     normal, t1, body = rows(p.normal, n), rows(p.tangent, n), rows(p.body, n)
@@ -81,22 +61,15 @@ def test_frames_and_pairs(begun):
     assert pairs == {("block", "brick"), ("block", "table"), ("other", "lift")} and n >= 12
     for a, b in ((normal, t1), (t1, np.cross(normal, t1))):
         assert np.abs(np.linalg.norm(a, axis=1) - 1).max() < 1e-14 and np.abs((a * b).sum(axis=1)).max() < 1e-14
-    expected = np.array([made.scene.contact_numbers(names[a], names[b]) for a, b in body])
-    assert np.allclose(rows(p.friction, n), expected[:, 0], rtol=1e-15) and len(set(expected[:, 0])) == 3
-    assert np.allclose(rows(p.restitution, n), expected[:, 1], rtol=1e-15) and len(set(expected[:, 1])) == 2
     assert np.array_equal(rows(p.order, n), np.arange(n))
-
-
-def test_changed_friction_and_restitution(begun):
-    made, n = begun
-    p, before = made.contact.problem, made.scene.contact_numbers("block", "table")
-    made.scene.set_contact("table", "block", friction=0.05, restitution=0.9)
-    made.contact.numbers_changed()
-    made.contact.begin(made.state.time, DT)
-    on = (rows(p.body, n) == [0, 3]).all(axis=1)
-    friction, restitution = rows(p.friction, n), rows(p.restitution, n)
-    assert (friction[on] == 0.05).all() and (restitution[on] == 0.9).all()
-    assert 0 < on.sum() < n and (friction[~on] != 0.05).all()
+    before = made.scene.contact_numbers("block", "table")
+    for numbers in (before, (0.05, 0.9)):
+        made.scene.set_contact("table", "block", *numbers)
+        made.contact.numbers_changed()
+        made.contact.begin(made.state.time, DT)
+        expected = np.array([made.scene.contact_numbers(names[a], names[b]) for a, b in body])
+        assert len(set(expected[:, 0])) == 3 and (expected[(body == [0, 3]).all(axis=1)] == numbers).all()
+        assert np.allclose(np.stack([rows(p.friction, n), rows(p.restitution, n)], axis=1), expected, rtol=1e-15)
     made.scene.set_contact("block", "table", *before)
     made.contact.numbers_changed()
 
@@ -104,20 +77,19 @@ def test_changed_friction_and_restitution(begun):
 def test_nodes_and_weights(begun):
     """The weighted nodes of each side give the two surface points of a contact."""
     made, n = begun
-    p, x = made.contact.problem, made.state.state()[0]
-    node, weight, arity = rows(p.node, n), rows(p.weight, n), rows(p.arity, n)
+    p, x, n_bodies = made.contact.problem, made.state.state()[0], len(made.scene.bodies)
+    weight, arity = rows(p.weight, n), rows(p.arity, n)
     used = np.arange(6) < arity[:, None]
+    node = np.where(used, rows(p.node, n), 0)
     assert (weight[used] != 0).all() and arity.min() >= 1 and all(len(set(r[u])) == u.sum() for r, u in zip(node, used))
-    start = np.cumsum([0] + [b.n_nodes for b in made.scene.bodies])
-    owner = np.searchsorted(start, node, side="right") - 1
+    owner = np.repeat(np.arange(n_bodies), [b.n_nodes for b in made.scene.bodies])[node]
     body, half = rows(p.body, n), 0.5 * rows(p.gap, n)[:, None] * rows(p.normal, n)
     for side, sign in ((0, 1.0), (1, -1.0)):
-        mine = used & (sign * weight > 0)
-        soft = body[:, side] < len(made.scene.bodies)
-        assert (owner[mine] == np.broadcast_to(body[:, side : side + 1], mine.shape)[mine]).all() and not mine[~soft].any()
+        mine, soft = used & (sign * weight > 0), body[:, side] < n_bodies
+        assert (owner == body[:, side : side + 1])[mine].all() and not mine[~soft].any()
         weights = np.where(mine, np.abs(weight), 0.0)
         assert np.abs(weights.sum(axis=1)[soft] - 1).max() < 1e-12
-        points = np.einsum("kj,kjx->kx", weights, x[np.where(mine, node, 0)])
+        points = np.einsum("kj,kjx->kx", weights, x[node])
         assert np.abs(points - (rows(p.point, n) + sign * half))[soft].max() < 1e-9
 
 
@@ -156,9 +128,7 @@ def test_warm_start(begun):
     for c, (own, at) in enumerate(zip(rows(p.feature, n), rows(p.point, n))):
         same = np.flatnonzero((feature == own).all(axis=1))
         z = 0.5 * frame[c] @ world[same[np.argmin(np.linalg.norm(point[same] - at, axis=1))]] if len(same) else np.zeros(3)
-        expected = np.array([max(z[0], 0), *z[1:]])
-        tangential, bound = np.linalg.norm(expected[1:]), rows(p.friction, n)[c] * expected[0]
-        expected[1:] *= min(1.0, bound / tangential) if tangential > 0 else 1.0
+        expected = oracle.project(z, rows(p.friction, n)[c])
         assert np.abs(rows(p.r, n)[c] - expected).max() < 1e-12
         met += len(same) > 1 and expected[0] > 0.0
     assert met >= 3
@@ -168,37 +138,18 @@ def test_warm_start(begun):
     assert n and not rows(p.r, n).any()
 
 
-# --- target gaps of synthetic contacts --------------------------------------------------------------------------------
-
-
 @kernel
-def find_gaps_minus_targets(
-    f: ti.template(),
-    dt: ti.f64,
-    contact_offset: ti.f64,
-    fast: ti.f64,
-    slow: ti.f64,
-    fastest: ti.f64,
-    force: ti.f64,
-    before_impact: ti.f64,
-    out: ti.types.ndarray(),
-):
-    """force: velocity change by the forces of an explicit step [m/s]; before_impact: the fraction applied before the impact."""
+def find_gaps_minus_targets(f: ti.template(), n: ti.types.ndarray(), out: ti.types.ndarray()):
+    """n: step, contact offset, fast, slow and fastest opening, velocity change by the forces of an explicit step, and the
+    fraction of it before the impact."""
     for c in range(f.count[0]):
-        opening = explicit_opening(f, c, dt, contact_offset, f.approach[c] + force, before_impact)
-        out[c] = gap_minus_target(f, c, dt, contact_offset, fast, slow, fastest, opening, ti.cast(0.1, ti.f64))
-
-
-@pytest.fixture(scope="module")
-def problem():
-    arena = FieldArena()
-    yield build_node_problem(arena, 64, 4, True)
-    arena.release()
+        opening = explicit_opening(f, c, n[0], n[1], f.approach[c] + n[5], n[6])
+        out[c] = gap_minus_target(f, c, n[0], n[1], n[2], n[3], n[4], opening, ti.cast(0.1, ti.f64))
 
 
 @pytest.mark.parametrize("fast, slow", [(1.0, 0.02), (0.05, 0.005)])
-def test_gap_minus_target(problem, fast, slow):
-    h, dt, fastest = 2e-3, 0.01, 2.0
+def test_gap_minus_target(fast, slow):
+    h, dt, fastest, arena = 2e-3, 0.01, 2.0, FieldArena()
     cases = [  # gap, restitution, approach, gap - target
         (5 * h, 0.0, -9.0, 4 * h),  # may close down to the contact offset
         (h, 0.0, -9.0, 0.0),
@@ -215,31 +166,31 @@ def test_gap_minus_target(problem, fast, slow):
         (-3.0 * fastest * dt / fast, 0.0, 0.0, -fastest * dt),  # maximum opening speed
     ]
     gap, restitution, approach, expected = np.array(cases).T
+    problem, n = build_node_problem(arena, 64, 4, True), len(cases)
     for field, values in ((problem.gap, gap), (problem.restitution, restitution), (problem.approach, approach)):
         fill_field(field, values)
-    problem.count[0] = len(cases)
-    out = np.zeros(len(cases))
-    fill_field(problem.body, np.tile([0, 1], (len(cases), 1)))
-    find_gaps_minus_targets(problem, dt, h, fast, slow, fastest, 0.0, 0.0, out)
-    assert np.abs(out - expected).max() < 1e-15
-    # forces push together: the speed that they add is not restored
-    find_gaps_minus_targets(problem, dt, h, fast, slow, fastest, -0.2, 0.0, out)
+    problem.count[0] = n
+
+    def found(h=h, fast=fast, slow=slow, force=0.0, before=0.0, turned=0, body=(0, 1)) -> np.ndarray:
+        out = np.zeros(n)
+        fill_field(problem.body, np.tile(body, (n, 1)))
+        fill_field(problem.turned, np.full(n, turned))
+        find_gaps_minus_targets(problem, np.array([dt, h, fast, slow, fastest, force, before]), out)
+        return out
+
+    assert np.abs(found() - expected).max() < 1e-15
+    # forces push together: the speed that they add is not restored; the eighth contact meets now
     less = np.where((restitution > 0) & (expected == -dt * restitution * np.abs(approach)), 0.2 * dt, 0.0)
-    later = np.array([k == 7 for k in range(len(cases))])  # these forces make it meet
-    assert np.abs(out - np.where(later, -(0.35 - 0.2) * dt, expected + less)).max() < 1e-15 and (less > 0).sum() == 3
+    later = np.arange(n) == 7
+    assert np.abs(found(force=-0.2) - np.where(later, -(0.35 - 0.2) * dt, expected + less)).max() < 1e-15
+    assert (less > 0).sum() == 3
     # half of it acts before the impact, and rebounds too
-    find_gaps_minus_targets(problem, dt, h, fast, slow, fastest, -0.2, 0.5, out)
     back = np.where(less > 0, (0.1 - 0.1 * restitution) * dt, 0.0)
-    assert np.abs(out - np.where(later, -(0.4 - 0.1) * dt, expected + back)).max() < 1e-15
+    assert np.abs(found(force=-0.2, before=0.5) - np.where(later, -(0.4 - 0.1) * dt, expected + back)).max() < 1e-15
     # sides that turn are apart: they open at once
-    fill_field(problem.turned, np.ones(len(cases), dtype=int))
-    find_gaps_minus_targets(problem, dt, h, fast, slow, fastest, 0.0, 0.0, out)
-    assert np.abs(out - np.minimum(expected, gap - 0.1 * h)).max() < 1e-15
-    fill_field(problem.turned, np.zeros(len(cases), dtype=int))
+    assert np.abs(found(turned=1) - np.minimum(expected, gap - 0.1 * h)).max() < 1e-15
     # self-contact scales the numbers
-    fill_field(problem.body, np.ones((len(cases), 2), dtype=int))
-    find_gaps_minus_targets(problem, dt, 1e-3 * h, fast, slow, fastest, 0.0, 0.0, out)
-    factor = (gap - out)[0] / (1e-3 * h)
+    factor = (gap - found(1e-3 * h, body=(1, 1)))[0] / (1e-3 * h)
     assert factor > 1.5
-    find_gaps_minus_targets(problem, dt, h / factor, fast / factor, slow / factor, fastest, 0.0, 0.0, out)
-    assert np.abs(out - expected).max() < 1e-13
+    assert np.abs(found(h / factor, fast / factor, slow / factor, body=(1, 1)) - expected).max() < 1e-13
+    arena.release()

@@ -83,42 +83,26 @@ def block_scene(ground: bool = False) -> ts.Scene:
     return scene
 
 
-def mixed_scene(
-    laws=(SNH, SVK, COR, SVK),
-    mass_damping: float = 0.0,
-    stiffness_damping: float = 0.0,
-    order: int | str = 1,
-    degrees: tuple[int, int] = (2, 4),
-    by_tet: bool = False,
-    volume_floor: float = 0.0,
-) -> ts.Scene:
+def mixed_scene(laws=(SNH, SVK, COR, SVK), mass_damping: float = 0.0, order: int | str = 1) -> ts.Scene:
     """Four bodies whose order is not that of the laws, of 10, 5, 6 and 5 tets: none fills its last lanes.
 
     Each has another material, and is held and loaded in another way; the first and the third are damped. They do not touch.
-    order: 1, 2, or "both": 2, 1, 2, 1. degrees: of the quadrature of the first and the third body, if they are quadratic.
-    by_tet: the first has two regions with different laws and numbers, the second and third have numbers by tet. volume_floor: of
-    the first body, or its first region, and of the second.
+    order: 1, 2, or "both": 2, 1, 2, 1.
     """
     orders = (2, 1, 2, 1) if order == "both" else (order,) * 4
     scene = ts.Scene(gravity=(0.3, -9.81, 0.7))
     scene.contact_forces = False
-    damping = {"mass_damping": mass_damping, "stiffness_damping": stiffness_damping}
-    material, numbers = rubber(laws[0], volume_floor=volume_floor, **damping), [{}] * 2
-    mesh = cube(cells=(2, 1, 1))
-    if by_tet:
-        mesh = halved(mesh)
-        material = {"left": material, 7: rubber(laws[1], young=4e4, poisson=0.1, density=1700.0, **damping)}
-        numbers = {"young": np.linspace(4e4, 1e5, 5), "poisson": np.linspace(0, 0.4, 5)}, {"density": np.linspace(5e2, 1e3, 6)}
-    beam = scene.add_body(mesh, material, name="beam", position=(0.5, 0, 0), **element(orders[0], degrees[0]))
+    damped, mesh = rubber(laws[0], mass_damping=mass_damping), cube(cells=(2, 1, 1))
+    beam = scene.add_body(mesh, damped, name="beam", position=(0.5, 0, 0), **element(orders[0], 2))
     beam.fix(lambda X: X[:, 0] < -0.49)
     beam.add_traction(lambda X: X[:, 0] > 0.49, (300.0, 2000.0, -500.0))
-    softer = rubber(laws[1], young=7e4, poisson=0.2, volume_floor=volume_floor)
-    block = scene.add_body(cube((3, 0, 0)), softer, name="block", velocity=(0.5, 0, -0.3), **element(orders[1]), **numbers[0])
+    softer = rubber(laws[1], young=7e4, poisson=0.2)
+    block = scene.add_body(cube((3, 0, 0)), softer, name="block", velocity=(0.5, 0, -0.3), **element(orders[1]))
     block.fix([0, 1], axes="x")
     block.fix([1, 2], axes="yz")
     block.add_force([5, 6, 7], (30.0, -10.0, 20.0))
-    lighter, mesh = rubber(laws[2], density=800.0, **damping), cube((6, 0, 0), pattern="six")
-    tower = scene.add_body(mesh, lighter, name="tower", **element(orders[2], degrees[1]), **numbers[1])
+    lighter, mesh = rubber(laws[2], density=800.0, mass_damping=mass_damping), cube((6, 0, 0), pattern="six")
+    tower = scene.add_body(mesh, lighter, name="tower", **element(orders[2], 4))
     tower.fix(lambda X: X[:, 1] < -0.44)
     mesh = cube((9, 0, 0))
     flying = {"velocity": spin(mesh, orders[3]), **element(orders[3])}
@@ -162,14 +146,14 @@ def driven_scene(
     return scene
 
 
-def connected_scene(order: int = 1, damping: float = 0.0, gravity=(0.0, 0.0, 0.0), anchored: bool = True) -> ts.Scene:
+def connected_scene(order: int = 1, damping: float = 0.0) -> ts.Scene:
     """Two bodies, the second away from the origin and partly inside the first, with connections of every kind.
 
     There are a compressed and a stretched spring, one between points of one tet, one between bodies at one place, a tendon that
-    passes each body twice and, if anchored, two obstacles in sequence, an elastic one along the same points and a slack one, and
-    an attachment of each kind. damping: of the springs and attachments [N s/m].
+    passes each body twice and two obstacles in sequence, an elastic one along the same points and a slack one, and an attachment
+    of each kind. damping: of the springs and attachments [N s/m].
     """
-    scene = ts.Scene(gravity=gravity)
+    scene = ts.Scene(gravity=(0, 0, 0))
     scene.contact_forces = False
     scene.add_body(cube(cells=(2, 1, 1)), rubber(), name="a", order=order)
     # its first four nodes lie inside a
@@ -182,12 +166,11 @@ def connected_scene(order: int = 1, damping: float = 0.0, gravity=(0.0, 0.0, 0.0
     scene.add_spring(("b", (0.6, 0.0, 0.1)), ("a", 3), 500.0, rest_length=0.2, damping=damping, name="pulls")
     scene.add_spring(("a", (0.02, 0.03, 0.01)), ("a", (0.05, -0.02, 0.04)), 200.0, rest_length=0.02, name="within a tet")
     scene.add_spring(("a", (0.45, 0.1, 0.2)), ("b", (0.4, 0.1, 0.1)), 250.0, damping=damping, name="at one place")
-    line = [("b", (0.7, 0.3, 0.1)), ("a", 1), ("a", (0.3, -0.3, -0.4)), ("b", 6)]
-    if anchored:
-        line = [*line[:2], ("pin", (0.1, 2.8, 0.0)), ("wall", (0.0, -9.0, 1.0)), *line[2:]]
-        scene.attach("a", [0, 2], "pin", 150.0, damping, name="to an obstacle")
+    pins = [("pin", (0.1, 2.8, 0.0)), ("wall", (0.0, -9.0, 1.0))]
+    line = [("b", (0.7, 0.3, 0.1)), ("a", 1), *pins, ("a", (0.3, -0.3, -0.4)), ("b", 6)]
+    scene.attach("a", [0, 2], "pin", 150.0, damping, name="to an obstacle")
     scene.add_tendon(line, 40.0, name="line")
-    scene.add_tendon(line, length=16.0 if anchored else 1.5, stiffness=30.0, name="elastic")
+    scene.add_tendon(line, length=16.0, stiffness=30.0, name="elastic")
     scene.add_tendon(line[-2:], length=3.0, stiffness=1e3, name="slack")
     scene.attach("b", [0, 1, 2, 3], "a", 120.0, damping, name="to a body")
     return scene

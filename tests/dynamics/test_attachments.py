@@ -1,9 +1,11 @@
-"""Exact attachments:
+"""Exact attachments, their forces, and attachments to obstacles:
 
 * a body cut in parts and attached at matching nodes equals the whole, with springs, pressure and loads at the joints: statics,
-  motion, reactions, contact; the assembled matrix is T^T K T;
-* attached bodies do not collide with each other, but with everything else;
-* chains that close are refused.
+  motion, also while joints are dragged, reactions, contact;
+* attached bodies do not collide with each other, but with everything else; chains that close are refused;
+* what one half of a body exerts on the other is minus what the other exerts on it, in motion, with loads at the joint;
+* the force carries a weight, also through a chain;
+* attachments to obstacles are fixed or moved nodes and have their reaction; the body does not touch its obstacle.
 """
 
 import numpy as np
@@ -13,15 +15,12 @@ from scipy.spatial import cKDTree
 import taisoft as ts
 from taisoft.dynamics.schemes import EXPLICIT, IMPLICIT
 from taisoft.fem.dependents import dependent_table
-from taisoft.fem.node_graph import EVERYTHING
-from taisoft.linear import block_csr
 from tests.dynamics.companion import LOOSE, add_companion, simulator
-from tests.dynamics.scenes import dynamics, rubber, set_state
+from tests.dynamics.scenes import rubber
 
 pytestmark = pytest.mark.filterwarnings("ignore:body")  # of long tets
 LENGTH, SIDE = 0.6, 0.1
 RUBBER = rubber(mass_damping=2.0)
-INTEGRATORS = [pytest.param("symplectic_euler", marks=pytest.mark.long), "velocity_verlet", *IMPLICIT]
 
 
 def step_of(integrator: str) -> float:
@@ -69,11 +68,8 @@ def distance(scene: ts.Scene, x: np.ndarray, whole: ts.Scene, y: np.ndarray) -> 
     return float(np.abs(of_parts(scene, x) - y[row]).max())
 
 
-# --- parts and the whole --------------------------------------------------------------------------------------------------
-
-
-def test_statics():
-    """A whole bar and one in three parts, as one scene."""
+def test_statics_of_parts_equals_the_whole():
+    """As one scene, without a companion, since statics has no damping and so kernels of its own."""
     scene, shift = ts.Scene(), np.array([0.0, 1.0, 0.0])
     scene.contact_forces = False
     for name, cells, x, position in (("whole", 6, 0.3, -shift), ("a", 2, 0.1, 0), ("b", 2, 0.3, 0), ("c", 2, 0.5, 0)):
@@ -84,20 +80,23 @@ def test_statics():
     scene.attach("a", lambda X: X[:, 0] > 0.1999, "b")
     scene.attach("c", lambda X: X[:, 0] < 0.4001, "b")
     found = ts.solve_static(scene, tolerance=1e-8)
-    parts = [scene.body(name) for name in "abc"]
-    x, rest = (np.concatenate(own) for own in zip(*((found.positions(b.name), b.rest_positions) for b in parts)))
-    apart, row = cKDTree(scene.body("whole").rest_positions).query(rest)
-    assert found.converged and apart.max() < 1e-12 and np.abs(x - rest).max() > 1e-3
+    x, rest = (np.concatenate(own) for own in zip(*((found.positions(n), scene.body(n).rest_positions) for n in "abc")))
+    _, row = cKDTree(scene.body("whole").rest_positions).query(rest)
+    assert found.converged and np.abs(x - rest).max() > 1e-3
     assert np.abs(x - found.positions("whole")[row] - shift).max() < 1e-6 * LENGTH
     weight = found.reactions("whole").sum(axis=0)
     assert found.reactions("a").sum(axis=0) == pytest.approx(weight, abs=1e-5 * weight[1]) and weight[1] > 50.0
 
 
-@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize("integrator", ["velocity_verlet", *IMPLICIT])
 def test_motion_and_reactions_of_parts_equal_the_whole(integrator):
+    """While the nodes of the last part at its joint are dragged, which depend on others or not."""
     found, turned = [], integrator in ("bdf2", "velocity_verlet")
     for scene in (bar(1), bar(3, turned)):
-        with simulator(scene, integrator, step_of(integrator)) as sim:
+        with simulator(scene, integrator, step_of(integrator), draggable=True) as sim:
+            last = parts_of(scene)[-1]
+            nodes = np.flatnonzero(np.abs(last.rest_positions[:, 0] - 0.4) < 1e-9)
+            sim.drag(last.name, nodes, np.arange(1.0, 10.0), (0.4, 0.1, 0.05), 200.0)
             report = sim.run(seconds=0.05)
             assert report.status == "ok", report.problems
             found.append((scene, sim.positions(), of_parts(scene, sim.reactions()).sum(axis=0)))
@@ -105,27 +104,6 @@ def test_motion_and_reactions_of_parts_equal_the_whole(integrator):
     assert np.abs(of_parts(whole, y) - whole.body("part0").rest_positions).max() > 0.008
     assert distance(cut, x, whole, y) < 1e-8 * LENGTH
     assert reaction == pytest.approx(expected, abs=1e-5 * np.abs(expected).max())
-
-
-def test_matrix_is_projected():
-    cut, apart = bar(3), bar(3)
-    del apart.attachments[:2]
-    table, matrices, rng = dependent_table(cut), [], np.random.default_rng(1)
-    for scene in (cut, apart):
-        with dynamics(scene, dt=0.01, integrator="implicit_euler", precision="f64") as made:
-            if not matrices:
-                x = made.state.state()[0]
-                x = table.matrix @ (x + 0.004 * rng.normal(size=x.shape))
-            set_state(made, x)
-            solver = made.stepper.solver
-            solver.form(EVERYTHING, False, 0.0, 1.0)
-            matrices.append(block_csr.to_scipy(made.model, solver.matrix).toarray())
-    T3, free = np.kron(table.matrix.toarray(), np.eye(3)), np.repeat(~np.isin(np.arange(len(x)), table.node), 3)
-    expected = (T3.T @ matrices[1] @ T3)[np.ix_(free, free)]
-    n = 3 * len(of_parts(cut, x))  # the rigid body is much stiffer
-    parts = free[:n].sum()
-    difference = np.abs(matrices[0][np.ix_(free, free)] - expected)[:parts, :parts]
-    assert difference.max() < 1e-12 * np.abs(expected[:parts, :parts]).max()
 
 
 def test_a_chain_that_closes_is_refused():
@@ -138,9 +116,6 @@ def test_a_chain_that_closes_is_refused():
         dependent_table(scene)
 
 
-# --- conservation ---------------------------------------------------------------------------------------------------------
-
-
 def hung(**damping) -> ts.Scene:
     """A cube below a plate, with nodes that do not match."""
     scene, material = ts.Scene(), rubber(**damping)
@@ -149,9 +124,6 @@ def hung(**damping) -> ts.Scene:
     scene.add_body(ts.box_mesh((2, 2, 2), (0.1, 0.1, 0.1)), material, name="load")
     scene.attach("load", lambda X: X[:, 1] > 0.049, "plate", name="joint")
     return scene
-
-
-# --- contacts -------------------------------------------------------------------------------------------------------------
 
 
 def standing(cut: bool) -> ts.Scene:
@@ -179,20 +151,16 @@ def test_contact_of_parts_equals_the_whole(integrator):
     assert distance(cut, x, whole, y) < 1e-7 * LENGTH
 
 
-@pytest.mark.parametrize(
-    "integrator, dt, damping, seconds",
-    [("implicit_euler", 0.01, 40.0, 0.4), pytest.param("velocity_verlet", 2e-4, 250.0, 0.06, marks=pytest.mark.long)],
-)
-def test_contacts_of_attached_nodes_count(integrator, dt, damping, seconds):
+def test_contacts_of_attached_nodes_count():
     """All nodes of the pad are attached, and the block stands on it."""
-    scene, material = ts.Scene(), rubber(young=2e5, mass_damping=damping, friction=0.5)
+    scene, material = ts.Scene(), rubber(young=2e5, mass_damping=40.0, friction=0.5)
     block = scene.add_body(ts.box_mesh((2, 2, 2), (0.1, 0.1, 0.1)), material, name="block", position=(0.0, 0.051, 0.0))
     pad = scene.add_body(ts.box_mesh((2, 1, 2), (0.06, 0.02, 0.06)), material, name="pad", position=(0.0, 0.01, 0.0))
     scene.attach("pad", np.arange(pad.n_nodes), "block", name="joint")
     scene.add_obstacle(ts.HalfSpace((0.0, -1e-4, 0.0), (0.0, 1.0, 0.0)), name="ground")
-    with simulator(add_companion(scene, attached=True), integrator, dt, **(LOOSE if integrator in IMPLICIT else {})) as sim:
+    with simulator(add_companion(scene, attached=True), "implicit_euler", 0.01, **LOOSE) as sim:
         assert sim.overlaps() == []
-        sim.run(seconds=seconds)
+        sim.run(seconds=0.4)
         contact, weight = sim.contact_force("pad"), 9.81 * (block.mass + pad.mass)
         assert contact[1] == pytest.approx(weight, rel=5e-2) and not sim.contact_force("block").any()
         expected = -contact + (0.0, 9.81 * pad.mass, 0.0)
@@ -218,3 +186,95 @@ def test_attached_bodies_do_not_touch_each_other():
         rest = np.concatenate([b.rest_positions + b.position for b in scene.bodies])
         assert report.status == "ok" and np.abs(sim.positions() - rest).max() < 1e-9
         assert not [pair for pair in sim.intersecting_triangles() if "core" in pair]
+
+
+def test_action_is_reaction():
+    """In motion, with a load, a pressure and a spring at the joint, too."""
+    found = []
+    for turned in (False, True):
+        scene = bar(2, turned, cells=4)
+        scene.body("part0").add_force(lambda X: X[:, 0] > 0.299, (0.0, 1.0, 2.0))
+        scene.body("part1").add_pressure(lambda c: (c[:, 1] > 0.0499) & (c[:, 0] < 0.4), 300.0)
+        scene.add_spring(("part1", (0.3, 0.05, 0.05)), ("part0", (0.1, 0.05, 0.05)), 200.0, rest_length=0.1, damping=3.0)
+        one = scene.attachments[0]
+        order = np.lexsort(np.round(scene.body(one.a).rest_positions[one.nodes], 9).T)
+        with simulator(scene, "implicit_euler", 2e-3) as sim:
+            forces = []
+            for _ in range(6):
+                assert sim.step().converged
+                forces.append(sim.joint_force("joint1")[order])
+            found.append(np.array(forces))
+    size = np.abs(found[0]).max()
+    assert size > 0.05 and np.abs(found[0] + found[1]).max() < 1e-7 * size
+
+
+@pytest.mark.parametrize("integrator, dt, damping", [("bdf2", 0.02, 20.0), ("velocity_verlet", 3e-4, 80.0)])
+def test_a_chain_carries_its_weight(integrator, dt, damping):
+    """The lowest of three hangs on nodes that depend on the uppermost."""
+    scene = hung(mass_damping=damping)
+    plate, cube = scene.bodies
+    plate.fix(lambda X: X[:, 1] > 0.049)
+    low = scene.add_body(ts.box_mesh((1, 1, 1), (0.05, 0.1, 0.05)), plate.material, name="low", position=(0.02, -0.09, 0.02))
+    scene.attach("low", lambda X: X[:, 1] > 0.0, "load", name="lower")
+    with simulator(add_companion(scene, attached=True), integrator, dt, **(LOOSE if integrator == "bdf2" else {})) as sim:
+        sim.run(seconds=16.0 / damping)
+        weights = [9.81 * low.mass, 9.81 * (low.mass + cube.mass)]
+        for name, weight in zip(("lower", "joint"), weights):
+            assert sim.joint_force(name).shape == (len(sim.scene.attachments[name == "lower"].nodes), 3)
+            assert sim.joint_force(name).sum(axis=0) == pytest.approx((0.0, weight, 0.0), abs=1e-3 * weight)
+
+
+BLOCK = ts.box_mesh((1, 1, 1), (0.3, 0.4, 0.4), (-0.1, 0, 0))
+HANDS = {
+    "box": ts.Box((-0.1, 0, 0), (0.15, 0.2, 0.2)),
+    "sphere": ts.Sphere((-0.1, 0, 0), 0.25),
+    "mesh": ts.MeshObstacle(BLOCK.vertices, BLOCK.surface),
+}
+
+
+TURN = ts.KeyFrames((0.0, 0.2), translations=[(0, 0, 0), (0.1, 0.2, 0)], rotations=[(0, 0, 0), (0.3, 0.0, 0.5)], smooth=True)
+
+
+def carried(exact: bool, contact: bool = False, hand=HANDS["box"]) -> ts.Scene:
+    """A bar whose end, inside the obstacle "hand", is attached to it, or moved along the same path."""
+    scene = ts.Scene()
+    scene.contact_forces = contact
+    bar = scene.add_body(ts.box_mesh((4, 1, 1), (1.0, 0.2, 0.2)), rubber(young=3e5), name="bar", position=(0.5, 0, 0))
+    scene.add_obstacle(hand, name="hand", path=TURN)
+
+    def end(X):
+        return X[:, 0] < -0.49
+
+    if exact:
+        scene.attach("bar", end, "hand", name="grip")
+    else:
+        X = bar.rest_positions[end(bar.rest_positions)] + bar.position
+        hand = scene.obstacle("hand")
+        bar.move(end, lambda t: hand.points_at(t, hand.undisplaced(0.0, X)) - X)
+    return add_companion(scene, attached=True)
+
+
+def test_an_attachment_to_an_obstacle_is_a_constraint():
+    found = []
+    for exact in (True, False):
+        with simulator(carried(exact), "implicit_euler", 5e-3) as sim:
+            for _ in range(8):
+                sim.step()
+            found.append((sim.positions(), sim.velocities(), sim.reactions()))
+            if exact:
+                force = sim.joint_force("grip")
+                nodes = np.flatnonzero(sim.scene.body("bar").rest_positions[:, 0] < -0.49)
+                assert np.array_equal(force, sim.reactions()[nodes]) and np.abs(force).max() > 1
+    assert all(np.array_equal(a, b) for a, b in zip(*found))
+
+
+@pytest.mark.parametrize("shape", HANDS)
+def test_attached_bodies_do_not_touch_their_obstacle(shape):
+    scene = carried(True, contact=True, hand=HANDS[shape])
+    scene.add_obstacle(ts.HalfSpace((0, -0.25, 0), (0, 1, 0)), name="ground")
+    with simulator(scene, "implicit_euler", 5e-3, **LOOSE) as sim:
+        for _ in range(6):
+            assert sim.step().n_contacts == 0
+        for _ in range(26):
+            report = sim.step()
+        assert report.converged and report.n_contacts > 0

@@ -3,7 +3,8 @@
 * impulses, velocities and the residual of the contact laws follow their formulas; those whose sides turn open at once;
 * the derivative of the impulses is minus the blocks of the matrix;
 * conjugate gradients with the factored J^T D J, serial and parallel, find the solution of a dense solver;
-* the r-factors follow from the matrix's diagonal; the residual contains -J^T p; a linearised stage is linear.
+* the r-factors follow from the matrix's diagonal; the residual contains -J^T p; a linearised stage is linear;
+* Anderson extrapolation of multipliers is that of least squares, also beside contacts that cannot move.
 """
 
 from types import SimpleNamespace
@@ -16,6 +17,7 @@ import taisoft as ts
 from taisoft.contact.problem import RESIDUAL, build_node_problem, fill_field, find_factors, index_nodes
 from taisoft.dynamics import contact_terms, linearised
 from taisoft.dynamics.contact_terms import NO_CONTACTS
+from taisoft.dynamics.frictional import extrapolate_multipliers
 from taisoft.dynamics.no_contacts import NoContacts
 from taisoft.dynamics.stage import AGAIN, ELASTIC_STAGE, STAY, STEP, form_residual, move
 from taisoft.dynamics.stage_system import StageSystem
@@ -54,8 +56,7 @@ def rig():
         for name in ("node", "weight", "normal", "tangent"):
             fill_field(getattr(p, name), getattr(contacts, name))
         obstacle_displacement = np.where((np.arange(K) % 5 == 0)[:, None], 1e-3 * rng.standard_normal((K, 3)), 0.0)
-        friction = np.where(np.arange(K) % 7 == 0, 0.0, 0.5)
-        gap = rng.uniform(-2, 3, K) * GAP_TARGETS[0]
+        friction, gap = np.where(np.arange(K) % 7 == 0, 0.0, 0.5), rng.uniform(-2, 3, K) * GAP_TARGETS[0]
         apart = np.tile([0, 1], (K, 1))  # self-contacts have other targets
         fields = (p.arity, p.friction, p.gap, p.obstacle_displacement, p.body, p.turned)
         for field, values in zip(fields, (arity, friction, gap, obstacle_displacement, apart, TURNED.astype(np.int32))):
@@ -70,16 +71,15 @@ def rig():
         sides = contacts.node, arity, contacts.weight, contacts.normal, contacts.tangent
         found = oracle.NodeContacts(*sides, np.zeros((m.n_nodes, 3)), np.zeros(3 * K), friction)
         start = made.oracle.rest
-        x_hat = start + 1e-4 * rng.standard_normal(start.shape)
-        x = start + 1e-3 * rng.standard_normal(start.shape)
+        x_hat, x = (start + size * rng.standard_normal(start.shape) for size in (1e-4, 1e-3))
         k.x_start.from_numpy(start)
         solver.work.x_hat.from_numpy(x_hat)
         contact_terms.begin_contacts(solver.work, k, False, BETA, DT, np.array(GAP_TARGETS), TOLERANCE)
         J = found.jacobian
         W = J @ np.diag(free.ravel() / np.diag(A)) @ J.T
-        rig = SimpleNamespace(made=made, m=m, p=p, k=k, solver=solver, work=solver.work, A=A, J=J, W=W, free=free)
+        rig = SimpleNamespace(m=m, p=p, k=k, solver=solver, work=solver.work, A=A, J=J, W=W, free=free)
         rig.start, rig.x_hat, rig.x, rig.gap, rig.friction = start, x_hat, x, gap, friction
-        rig.obstacle_displacement = obstacle_displacement
+        rig.obstacle_displacement, rig.model = obstacle_displacement, {"one": m, "all": made.parallel}.get
         rig.frame = np.stack([found.normal, found.tangent, np.cross(found.normal, found.tangent)], axis=1)
         yield rig
 
@@ -92,15 +92,13 @@ def impulses_at(rig, x: np.ndarray) -> np.ndarray:
     return rig.p.r.to_numpy()[:K]
 
 
-def evaluate(
-    rig, mode: int | None = STAY, term_weight: float = 1.0, multiply: bool = False, kind: int = ELASTIC_STAGE, m=None
-) -> np.ndarray:
+def evaluate(rig, mode: int | None = STAY, term_weight: float = 1.0, multiply: bool = False, m=None) -> np.ndarray:
     """The norms of the residual. mode: None keeps the state and the forces. m: the model, by default the one on one thread."""
     norms, s, m = np.zeros(5), rig.solver, m or rig.m
     if mode is not None:
-        move(m, rig.work, rig.k, kind, mode, term_weight, 1.0, BETA)
+        move(m, rig.work, rig.k, ELASTIC_STAGE, mode, term_weight, 1.0, BETA)
     contact_terms.update_impulses(m, rig.k, int(multiply), BETA, STIFFNESS)
-    form_residual(m, rig.work, s.matrix, rig.k, kind, BETA, norms)
+    form_residual(m, rig.work, s.matrix, rig.k, ELASTIC_STAGE, BETA, norms)
     return norms
 
 
@@ -120,8 +118,7 @@ def pressed(rig):
     """Set multipliers with open, sticking and slipping contacts at rig.x. Returns z (K,3), radii (K,), u (K,3)."""
     rng = np.random.default_rng(11)
     factor = oracle.factors(rig.W)
-    displacement = (rig.x - rig.start).ravel()
-    target_gap = targets(rig)
+    displacement, target_gap = (rig.x - rig.start).ravel(), targets(rig)
     obstacle_displacement_at = np.einsum("kij,kj->ki", rig.frame, rig.obstacle_displacement)
     u = (rig.J @ (rig.x - rig.x_hat).ravel() / BETA).reshape(K, 3) - obstacle_displacement_at / DT
     u[:, 0] = (rig.gap - target_gap + (rig.J @ displacement).reshape(K, 3)[:, 0] - obstacle_displacement_at[:, 0]) / BETA
@@ -177,42 +174,26 @@ def test_blocks_are_minus_the_derivative_of_the_impulses(rig, pressed):
     assert np.abs(np.einsum("kij,kj->ki", blocks, du) + dp).max() < 1e-6 * np.abs(dp).max()
 
 
-@pytest.fixture
-def dense(rig, pressed):
-    """J^T D J (3n,3n) of the present blocks."""
+@pytest.mark.parametrize("threads", ["one", "all"])
+def test_conjugate_gradients(rig, pressed, threads):
+    """They solve with J^T D J of the present blocks, which matters."""
+    m, work, J = rig.model(threads), rig.work.pcg, rig.J.reshape(K, 3, -1)
     impulses_at(rig, rig.x)
-    D, J = unpacked(rig.k.work.block.to_numpy()[:K]), rig.J.reshape(K, 3, -1)
     J = np.einsum("kij,kim->kjm", rig.frame, J)  # in world axes
-    return np.einsum("kim,kij,kjn->mn", J, D, J, optimize=True)
-
-
-@pytest.mark.parametrize("method", ["serial", "parallel"])
-def test_conjugate_gradients(rig, dense, method):
-    m, matrix, work = rig.m if method == "serial" else rig.made.parallel, rig.solver.matrix, rig.solver.work.pcg
-    rhs = np.random.default_rng(4).standard_normal(rig.x.shape)
+    dense = np.einsum("kim,kij,kjn->mn", J, unpacked(rig.k.work.block.to_numpy()[:K]), J, optimize=True)
+    rhs, on = np.random.default_rng(4).standard_normal(rig.x.shape), rig.free.ravel() > 0
     work.rhs.from_numpy(rig.free * rhs)
-    on = rig.free.ravel() > 0
-    whole = rig.A + dense
-    y = np.zeros(on.size)
-    y[on] = np.linalg.solve(whole[np.ix_(on, on)], rhs.ravel()[on])
-    tolerance = 1e-12
-    result = pcg.solve(m, matrix, work, tolerance, 2000, rig.k.coupling)
-    assert result.converged and np.abs(work.y.to_numpy().ravel() - y).max() < 1e3 * tolerance * np.abs(y).max()
-    without = np.linalg.solve(rig.A[np.ix_(on, on)], rhs.ravel()[on])
-    assert np.abs(without - y[on]).max() > 0.1 * np.abs(y).max()  # contacts matter
-    # other blocks of the same contacts with the same matrix: rows without contacts are already prepared
-    rig.k.work.block.from_numpy(3.0 * rig.k.work.block.to_numpy())
-    y[on] = np.linalg.solve((rig.A + 3.0 * dense)[np.ix_(on, on)], rhs.ravel()[on])
-    fresh = pcg.solve(m, matrix, work, tolerance, 2000, rig.k.coupling), work.y.to_numpy()
-    again = pcg.solve(m, matrix, work, tolerance, 2000, rig.k.coupling, same_matrix=True), work.y.to_numpy()
-    assert fresh[0] == again[0] and np.array_equal(fresh[1], again[1])
-    assert np.abs(again[1].ravel() - y).max() < 1e3 * tolerance * np.abs(y).max()
+    expected, without = (np.linalg.solve(A[np.ix_(on, on)], rhs.ravel()[on]) for A in (rig.A + dense, rig.A))
+    result = pcg.solve(m, rig.solver.matrix, work, 1e-12, 2000, rig.k.coupling)
+    y = work.y.to_numpy().ravel()
+    assert result.converged and np.abs(y[on] - expected).max() < 1e-9 * np.abs(expected).max() and not y[~on].any()
+    assert np.abs(without - expected).max() > 0.1 * np.abs(expected).max()
 
 
 @pytest.mark.parametrize("threads", ["one", "all"])
 def test_residual_of_a_stage(rig, pressed, threads):
     """The residual without contacts minus J^T p, after a full step, part of one, and a change of the multipliers only."""
-    m = rig.m if threads == "one" else rig.made.parallel
+    m = rig.model(threads)
     work, cg = rig.work, rig.solver.work.pcg
     rng = np.random.default_rng(6)
     y = 1e-2 * rng.standard_normal(rig.x.shape)
@@ -246,7 +227,7 @@ def test_residual_of_a_stage(rig, pressed, threads):
 @pytest.mark.parametrize("threads", ["one", "all"])
 def test_a_linearised_stage_is_linear(rig, threads):
     """It moves along y to where the slope vanishes; its impulses replace those of the linearisation point."""
-    m = rig.m if threads == "one" else rig.made.parallel
+    m = rig.model(threads)
     rng, work, cg = np.random.default_rng(7), rig.work, rig.solver.work.pcg
     m.state.x.from_numpy(rig.start)
     evaluate(rig, m=m)
@@ -289,3 +270,37 @@ def test_frictionless_blocks_act_only_along_the_normal(rig):
     normal = STIFFNESS * oracle.factors(rig.W)[:, :1, None] * n[:, :, None] * n[:, None, :]
     assert len(smooth) >= 2 and np.abs(blocks - normal)[smooth].max() < 1e-11 * np.abs(normal).max()
     rig.work.x_hat.from_numpy(rig.x_hat)
+
+
+def least_squares(factor: np.ndarray, multipliers: list[np.ndarray], impulses: list[np.ndarray]) -> np.ndarray:
+    """The next multipliers (K,3) from all previous ones and the impulses that they gave, by NumPy."""
+    weight = np.where(factor > 0.0, 1.0 / np.sqrt(np.where(factor > 0.0, factor, 1.0)), 0.0)
+    change = [p - x for x, p in zip(multipliers, impulses)]
+    steps = np.stack([(weight * (b - a)).ravel() for a, b in zip(change, change[1:])], axis=1)
+    t = np.linalg.lstsq(steps, (weight * change[-1]).ravel(), rcond=None)[0]
+    new = impulses[-1] - sum(s * (b - a) for s, a, b in zip(t, impulses, impulses[1:]))
+    new[:, 0] = np.maximum(new[:, 0], 0.0)
+    return new
+
+
+@pytest.mark.parametrize("max_history", [1, 2])
+def test_updates_of_multipliers_are_those_of_least_squares(rig, max_history):
+    rng, before, work = np.random.default_rng(max_history), rig.p.factor.to_numpy(), rig.k.work
+    factor = before.copy()
+    factor[:K:9] = 0.0  # contacts that cannot move
+    rig.p.factor.from_numpy(factor)
+    multipliers, impulses = [rng.standard_normal((K, 3))], []
+    fill_field(work.multiplier, multipliers[0])
+    for n in range(5):
+        impulses.append(rng.standard_normal((K, 3)))
+        fill_field(rig.p.r, impulses[-1])
+        history = min(n, max_history)
+        extrapolate_multipliers(rig.k, history)
+        multipliers.append(work.multiplier.to_numpy()[:K])
+        expected = impulses[-1] * (impulses[-1] > (0.0, -np.inf, -np.inf))
+        if history:
+            expected = least_squares(factor[:K, [0, 1, 1]], multipliers[-2 - history : -1], impulses[-1 - history :])
+        assert np.allclose(multipliers[-1], expected, rtol=1e-10, atol=1e-10)
+        assert (multipliers[-1][:, 0] == 0.0).any()  # some were clipped
+        assert np.allclose(work.radius.to_numpy()[:K], rig.friction * multipliers[-1][:, 0], rtol=1e-14)
+    rig.p.factor.from_numpy(before)

@@ -2,9 +2,14 @@
 
 * a step that does not converge, or ends too deep, is retried from its start with twice as many substeps, and prescribed nodes
   that it released are prescribed again; the result equals that many steps, and the report counts the iterations of all attempts;
-* where a step fails, the state is that before it;
-* an implicit substep that penetrates is searched again along its path;
-* a run may end at the end of a path.
+* where a step fails, the state is that before it.
+
+Substepping, with a fake stepper: a point whose position is the time.
+
+* a step that does not converge is retried in 2 and 4 substeps and then whole, and later steps are not until one converges;
+* a substep that met unknown contacts, or in which something passes through something, is repeated; one that ends deep, leaves the
+  searched path, or does not settle, is undone and halved, a bounded number of times; longer ones are tried ever more seldom;
+* what passes in spite of all is held back and reported.
 """
 
 from dataclasses import replace
@@ -15,102 +20,71 @@ import pytest
 import taisoft as ts
 from taisoft.dynamics import implicit
 from taisoft.dynamics.contact import ContactStep
+from taisoft.dynamics.results import StageResult
+from taisoft.dynamics.substepping import LengthLimit, Substepping
+from taisoft.errors import SimulationError
 from tests.dynamics.contact_scenes import ground, material
 
-DT, RELEASE, END = 0.02, 0.015, 0.08  # [s]
+DT, RELEASE = 0.02, 0.015  # [s]
+TIGHT = {"precision": "f64", "newton_tolerance": 1e-11, "contact_tolerance": 1e-10}
 
 
-def bar_scene() -> ts.Scene:
+def bar() -> ts.Scene:
     """A bar that is held at one end; the other is moved and released within the first step."""
     scene = ts.Scene()
-    bar = scene.add_body(ts.box_mesh((4, 1, 1), (0.4, 0.1, 0.1)), material(young=2e4), name="bar")
-    bar.fix(lambda X: X[:, 0] < -0.19)
-    bar.move(lambda X: X[:, 0] > 0.19, lambda t: (0.0, -2.0 * t, 0.0) if t < RELEASE else None)
+    body = scene.add_body(ts.box_mesh((4, 1, 1), (0.4, 0.1, 0.1)), material(young=2e4), name="bar")
+    body.fix(lambda X: X[:, 0] < -0.19)
+    body.move(lambda X: X[:, 0] > 0.19, lambda t: (0.0, -2.0 * t, 0.0) if t < RELEASE else None)
     return scene
 
 
-def circle(t: float):
-    """Pose of an obstacle out of reach [m]."""
-    if t > END + 1e-9:
-        raise ValueError("the path has ended")
-    return (np.sin(t), 0.0, 0.0), np.eye(3)
-
-
-def contact_scene() -> ts.Scene:
-    """A cube that is pressed on the ground until its upper side is released, and a ball out of reach."""
+def pressed() -> ts.Scene:
+    """A cube that is pressed on the ground until its upper side is released."""
     scene = ts.Scene()
-    cube = scene.add_body(ts.box_mesh((1, 1, 1), (0.2, 0.2, 0.2)), material(), name="cube", position=(0, 0.101, 0))
-    cube.move(lambda X: X[:, 1] > 0.09, lambda t: (0.0, -0.1 * t, 0.0) if t < RELEASE else None)
+    body = scene.add_body(ts.box_mesh((1, 1, 1), (0.2, 0.2, 0.2)), material(), name="cube", position=(0, 0.101, 0))
+    body.move(lambda X: X[:, 1] > 0.09, lambda t: (0.0, -0.1 * t, 0.0) if t < RELEASE else None)
     scene.add_obstacle(ground(), name="ground", friction=0.3)
-    scene.add_obstacle(ts.Sphere((0, 9, 0), 0.5), name="ball", path=circle)
     return scene
 
 
-@pytest.fixture(scope="module", params=["implicit_euler", "bdf2", "implicit_midpoint"])
-def bar_sim(request):
-    with ts.Simulator(bar_scene(), dt=DT, integrator=request.param, precision="f64", newton_tolerance=1e-10) as sim:
+@pytest.fixture(scope="module", params=["implicit_euler", "bdf2", "implicit_midpoint", "contacts"])
+def shared_sim(request):
+    contacts = request.param == "contacts"
+    integrator = "implicit_euler" if contacts else request.param
+    with ts.Simulator(pressed() if contacts else bar(), DT, integrator, **TIGHT) as sim:
         yield sim
 
 
 @pytest.fixture
-def bar(bar_sim):
-    bar_sim.dt = DT
-    bar_sim.reset()
-    return bar_sim
+def sim(shared_sim):
+    shared_sim.dt = DT
+    shared_sim.reset()
+    return shared_sim
 
 
-def by(*integrators: str):
-    """Run a test of the bar with these integrators only."""
-    return pytest.mark.parametrize("bar_sim", integrators, indirect=True)
+def by(*names: str):
+    """Run a test with these simulators only."""
+    return pytest.mark.parametrize("shared_sim", names, indirect=True)
 
 
-@pytest.fixture(scope="module")
-def contact_sim():
-    with ts.Simulator(contact_scene(), dt=DT, precision="f64", newton_tolerance=1e-11, contact_tolerance=1e-10) as sim:
-        yield sim
-
-
-@pytest.fixture
-def sim(contact_sim):
-    contact_sim.dt = DT
-    contact_sim.reset()
-    return contact_sim
-
-
-def halves(sim) -> tuple[list[ts.StepReport], np.ndarray, np.ndarray]:
-    """Reports, positions and velocities of two half steps from the start, which is restored."""
+def check_retry(sim, retry) -> None:
+    """retry: makes the first try bad. The step must equal two half ones, and count the iterations of both tries."""
     sim.dt = DT / 2
     reports = [sim.step() for _ in range(2)]
     x, v = sim.positions(), sim.velocities()
     sim.dt = DT
     sim.reset()
-    return reports, x, v
-
-
-def check_start(sim, x: np.ndarray, v: np.ndarray) -> None:
-    """A first step that failed left the state as it was, prescribed nodes too; the next step is that of a new simulator."""
-    assert np.array_equal(sim.positions(), x) and np.array_equal(sim.velocities(), v)
-    assert sim.time == 0.0 and sim.step_count == 0
-    sim.set_state(velocities=np.ones_like(v))  # 0 on axes that are still constrained
-    for body in sim.scene.bodies:
-        now = sim.velocities(body.name)
-        assert not any(now[np.ix_(c.nodes, np.flatnonzero(c.axes))].any() for c in body.constraints)
-    sim.set_state(velocities=v)
-    sim.step()
-    first = sim.positions()
+    reports.append(sim.step())
+    assert reports[-1].substeps == 1 and np.abs(sim.positions() - x).max() > 1e-6  # [m]
     sim.reset()
-    sim.step()
-    assert np.abs(sim.positions() - first).max() < 1e-9  # [m]
+    retry()
+    report = sim.step()
+    assert report.converged and report.substeps == 2 and sim.step_count == 1 and sim.time == DT
+    assert report.newton_iterations >= sum(one.newton_iterations for one in reports) - 1
+    assert np.abs(sim.positions() - x).max() < 1e-9 and np.abs(sim.velocities() - v).max() < 1e-7
 
 
-# --- steps that do not converge -----------------------------------------------------------------------------------------------
-
-
-def test_a_step_that_does_not_converge_is_cut_into_substeps(bar, monkeypatch):
-    reports, x, v = halves(bar)
-    whole = bar.step()
-    assert whole.substeps == 1 and np.abs(bar.positions() - x).max() > 1e-4  # [m]
-    bar.reset()
+def test_a_step_that_does_not_converge_is_cut_into_substeps(sim, monkeypatch):
     solve, results = implicit.solve, []
 
     def first_unconverged(system, stage):
@@ -119,37 +93,10 @@ def test_a_step_that_does_not_converge_is_cut_into_substeps(bar, monkeypatch):
         bad = {"converged": False, "unbalanced": (0.5, "body 'bar'")} if len(results) == 1 else {}
         return replace(results[-1], **bad)
 
-    monkeypatch.setattr(implicit, "solve", first_unconverged)
-    report = bar.step()
-    assert report.converged and report.substeps == 2 and bar.step_count == 1 and bar.time == DT
-    assert report.newton_iterations == sum(r.newton_iterations for r in (whole, *reports))
-    close = 1e-9 * np.abs(v).max()
-    assert np.abs(bar.positions() - x).max() < close * DT and np.abs(bar.velocities() - v).max() < close
+    check_retry(sim, lambda: monkeypatch.setattr(implicit, "solve", first_unconverged))
 
 
-@by("implicit_euler")
-@pytest.mark.parametrize("call, error", [(1, ts.SimulationError("no room")), (3, KeyboardInterrupt())])
-def test_a_failed_step_leaves_the_state_before_it(bar, monkeypatch, call, error):
-    """A failure in the first try, after the release, and Ctrl-C in the second substep of the second try."""
-    before, solve, calls = (bar.positions(), bar.velocities()), implicit.solve, []
-
-    def failing(system, stage):
-        calls.append(stage)
-        if len(calls) == call:
-            raise error
-        return replace(solve(system, stage), converged=False)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(implicit, "solve", failing)
-        with pytest.raises(type(error)):
-            bar.step()
-    check_start(bar, *before)
-
-
-# --- steps with contacts ------------------------------------------------------------------------------------------------------
-
-
-def patch_end(monkeypatch, events: dict, measure: str = "relative_penetration") -> list:
+def patch_end(patch, events: dict, measure: str = "relative_penetration") -> list:
     """Patch the measurement at the end of a substep. events: by number of the call, an exception, or a value of the measure."""
     calls, end = [], ContactStep.end
 
@@ -163,49 +110,236 @@ def patch_end(monkeypatch, events: dict, measure: str = "relative_penetration") 
             setattr(contact, measure, event)
         return depth
 
-    monkeypatch.setattr(ContactStep, "end", patched)
+    patch.setattr(ContactStep, "end", patched)
     return calls
 
 
+@by("contacts")
 @pytest.mark.parametrize("measure, depth", [("relative_penetration", 1.0), ("crossing", 3e-3)])
 def test_a_step_that_ends_too_deep_is_retried(sim, monkeypatch, measure, depth):
-    reports, x, v = halves(sim)
-    whole = sim.step()
-    assert np.abs(sim.positions() - x).max() > 1e-6 and sim.contact_force("ground")[1] < -1.0  # it presses
-    sim.reset()
-    calls = patch_end(monkeypatch, {1: depth}, measure)
-    report = sim.step()
-    assert calls == [(DT, DT), (DT / 2, DT / 2), (DT, DT)] and report.max_penetration < 1e-9
-    assert np.abs(sim.positions() - x).max() < 1e-8 and np.abs(sim.velocities() - v).max() < 1e-6
-    work = [r.newton_iterations for r in (report, whole, *reports)]
-    assert work[0] > max(work[1:])
-    assert report.converged and report.substeps == 2 and sim.step_count == 1 and sim.time == DT
+    calls = []
+    check_retry(sim, lambda: calls.append(patch_end(monkeypatch, {1: depth}, measure)))
+    assert calls == [[(DT, DT), (DT / 2, DT / 2), (DT, DT)]] and sim.contact_force("ground")[1] < 0.0
 
 
-def test_a_failed_retry_leaves_the_state_before_the_step(sim, monkeypatch):
-    before = sim.positions(), sim.velocities()
+@by("implicit_euler", "contacts")
+@pytest.mark.parametrize("call, error", [(1, ts.SimulationError("no room")), (3, KeyboardInterrupt())])
+def test_a_failed_step_leaves_the_state_before_it(sim, monkeypatch, call, error):
+    """In the first try, after the release, and Ctrl-C in the second substep of the second try; prescribed nodes, too."""
+    x, v, solve, calls = sim.positions(), sim.velocities(), implicit.solve, []
+
+    def failing(system, stage):
+        calls.append(stage)
+        if len(calls) == call:
+            raise error
+        return replace(solve(system, stage), converged=False)
+
     with monkeypatch.context() as patch:
-        patch_end(patch, {1: 1.0, 3: ts.SimulationError("no room")})
-        with pytest.raises(ts.SimulationError, match="no room"):
+        patch.setattr(implicit, "solve", failing)
+        with pytest.raises(type(error)):
             sim.step()
-    check_start(sim, *before)
-
-
-def test_a_penetrating_substep_is_searched_along_its_path(sim, monkeypatch):
-    """The search finds no other contacts, so the substep is kept."""
-    first = sim.step()
-    expected, searched, search = sim.positions(), [], ContactStep.search_along_path
+    assert np.array_equal(sim.positions(), x) and np.array_equal(sim.velocities(), v)
+    assert sim.time == 0.0 and sim.step_count == 0
+    sim.set_state(velocities=np.ones_like(v))  # 0 on axes that are still constrained
+    for body in sim.scene.bodies:
+        now = sim.velocities(body.name)
+        assert not any(now[np.ix_(c.nodes, np.flatnonzero(c.axes))].any() for c in body.constraints)
+    sim.set_state(velocities=v)
+    sim.step()
+    first = sim.positions()
     sim.reset()
-    monkeypatch.setattr(ContactStep, "penetrates_deeper", lambda contact, time, dt, before: True)
-    monkeypatch.setattr(ContactStep, "search_along_path", lambda contact, *at: searched.append((at, search(contact, *at))))
-    report = sim.step()
-    assert searched == [((0.0, DT), False)] and report.newton_iterations == first.newton_iterations
-    assert np.array_equal(sim.positions(), expected) and report.max_penetration == first.max_penetration
+    sim.step()
+    assert np.abs(sim.positions() - first).max() < 1e-9  # [m], as of a new simulator
 
 
-def test_a_path_that_ends_with_the_run(sim):
-    result = sim.run(END, fps=None)
-    assert (result.status, result.problems, result.steps) == ("ok", [], 4)
-    assert sim.deepest_overlap() is None and sim.intersecting_triangles() == []
-    with pytest.raises(ts.SimulationError, match="the path has ended"):
-        sim.detect_contacts()  # swept by a step beyond the path
+STEP = 0.1  # [s]
+
+
+def longer_than(length: float):
+    return lambda time, dt: dt > length
+
+
+class FakeStepper:
+    """Stepper, simulation state and contacts at once: x is the time reached. What is not defined does nothing and measures 0.
+
+    Tests set when something happens, as functions of a substep's start and length.
+    """
+
+    is_linear = none_cross = is_stuck = False
+    relative_penetration = crossing = x = 0.0
+    x_now, step_count = None, 4
+
+    def __init__(self):
+        self.contact = self.paths = self.simulation = self.dirichlet = self.history = self
+        self.taken, self.kept, self.held_back, self.retry_starts = [], [], [], []
+        self.converges = lambda time, dt: True
+        self.depth = self.left_path = self.has_new_contacts = self.passes = self.fails = lambda time, dt: 0.0
+
+    def __getattr__(self, name: str):
+        return lambda *args, **given: 0.0
+
+    def measure_start(self, time, dt):
+        return 0.0, 0.0
+
+    def closing_ratio_along_path(self):
+        return 10.0
+
+    def save_start(self):
+        self.saved = self.x
+
+    def return_to_start(self, already_undone=False):
+        self.x, self.kept = self.saved, []
+
+    def take_substep(self, time, dt):
+        assert time == pytest.approx(self.x)
+        self.start = self.x
+        self.set_state(time + dt, (time, dt))
+        self.taken.append((time, dt))
+        good = self.converges(time, dt) and not self.fails(time, dt)
+        return StageResult(3, 10, 1e-6 if good else 0.1, good, False)
+
+    def restore_start(self, *released, discard_impulses=False):
+        self.x = self.start
+        self.kept.pop()
+
+    undo_substep = restore_start
+
+    def retry_substep(self, time, dt, start):
+        self.retry_starts.append(start)
+        return self.take_substep(time, dt)
+
+    def state(self):
+        return self.x, self.kept[-1]
+
+    def set_state(self, x, last):
+        self.x = x
+        self.kept.append(last)
+
+    def left_searched(self, x_now):
+        return self.left_path(*self.kept[-1])
+
+    def find(self, as_searched=False):
+        return self.passes(*(self.searched if as_searched else self.kept[-1]))
+
+    def hold_back(self, x_start):
+        self.held_back.append(self.kept[-1])
+
+    def search_along_path(self, time, dt):
+        self.searched = time, dt
+        return self.has_new_contacts(time, dt)
+
+    def end(self, time, dt):
+        self.relative_penetration = self.depth(*self.kept[-1])
+
+
+@pytest.fixture
+def stepper():
+    return FakeStepper()
+
+
+def take(stepper: FakeStepper, substepping: Substepping | None = None) -> tuple[list[float], StageResult]:
+    """Take the next step. Return the lengths of its substeps, which must be contiguous and add up to the step, and its result."""
+    start, stepper.taken, stepper.kept = stepper.x, [], []
+    result = (substepping or Substepping(stepper)).step(start, STEP)
+    times, lengths = np.transpose(stepper.kept)
+    assert np.allclose(times - start, np.cumsum(lengths) - lengths) and np.isclose(lengths.sum(), STEP)
+    return lengths.tolist(), result
+
+
+def test_a_step_that_does_not_converge_is_retried_until_that_does_not_help(stepper):
+    substepping, stepper.converges = Substepping(stepper), lambda time, dt: dt <= 0.5 * STEP
+    lengths, result = take(stepper, substepping)
+    assert [dt for _, dt in stepper.taken] == pytest.approx([STEP, STEP / 2, STEP / 2]) and result.newton_iterations == 9
+    assert result.converged and substepping.may_retry and len(lengths) == substepping.substeps == 2
+    stepper.converges = longer_than(STEP)
+    lengths, result = take(stepper, substepping)
+    assert [dt for _, dt in stepper.taken] == pytest.approx([STEP, *[STEP / 2] * 2, *[STEP / 4] * 4, STEP])
+    assert substepping.substeps == 1 and not result.converged and not substepping.may_retry and lengths == [STEP]
+    take(stepper, substepping)
+    assert len(stepper.taken) == 1
+    stepper.converges = longer_than(0.0)
+    take(stepper, substepping)
+    assert substepping.may_retry
+    stepper.is_linear, stepper.converges = True, longer_than(STEP)  # linear steps are not retried
+    assert not take(stepper, substepping)[1].converged and len(stepper.taken) == 1
+
+
+@pytest.mark.parametrize(
+    "faults, length, attempts",
+    [
+        (["depth"], STEP / 8, 1),  # it ends deep
+        (["left_path"], STEP / 4, 1),  # it was faster than known when the step was cut
+        (["left_path", "has_new_contacts"], STEP / 2, 4),  # each path that is searched has unknown contacts
+        (["passes"], STEP / 2, 9),  # something passes through something whatever contacts are added,
+        (["passes", "fails"], STEP / 2, 1),  # which is not tried again with equations that cannot be solved
+    ],
+)
+def test_a_substep_with_a_fault_is_repeated_and_then_halved(stepper, faults, length, attempts):
+    for fault in faults:
+        setattr(stepper, fault, longer_than(length))
+    substepping = Substepping(stepper)
+    lengths, result = take(stepper, substepping)
+    assert max(lengths) == pytest.approx(length) and result.converged and not stepper.held_back
+    assert sum(dt == STEP for _, dt in stepper.taken) == attempts
+    assert result.newton_iterations == 3 * len(stepper.taken) and substepping.substeps == len(lengths)
+
+
+def test_the_number_of_undone_substeps_is_bounded(stepper):
+    stepper.depth = lambda time, dt: 1.0 + time  # always deeper
+    lengths, _ = take(stepper)
+    assert 0 < len(stepper.taken) - len(lengths) <= 20 and stepper.relative_penetration > 1.0
+
+
+@pytest.mark.parametrize("attempts, faults", [(2, ["left_path", "has_new_contacts"]), (4, ["passes"])])
+def test_a_substep_that_met_unknown_contacts_is_repeated_with_them(stepper, attempts, faults):
+    for fault in faults:
+        setattr(stepper, fault, lambda time, dt: len(stepper.taken) <= attempts)
+    lengths, result = take(stepper)
+    assert stepper.taken == [(0.0, STEP)] * (attempts + 1) and lengths == [STEP] and result.converged
+    assert stepper.retry_starts == [(0.0, STEP)] * attempts  # each starts from the result before
+    assert result.newton_iterations == 3 * (attempts + 1)
+
+
+def test_longer_substeps_are_tried_ever_more_seldom():
+    """The limit is half of a failed length, and doubles after as many substeps as its patience; a snapshot holds its state."""
+    limit, waits = LengthLimit(), []
+    limit.keep(0.5 * STEP, STEP)
+    assert limit.longest == np.inf
+    for _ in range(5):
+        limit.undo(0.8 * STEP, again=False)
+        waits.append(limit.patience)
+        for _ in range(limit.patience):
+            assert limit.longest == 0.4 * STEP
+            kept, limit = limit.snapshot(), LengthLimit()
+            limit.restore(kept)
+            assert np.array_equal(limit.snapshot(), kept)
+            limit.keep(0.4 * STEP, STEP)
+        assert limit.is_trial and limit.longest == 0.8 * STEP
+    assert waits == [2, 4, 8, 8, 8]
+    patience = limit.patience
+    limit.undo(0.8 * STEP, again=True)
+    for _ in range(patience + 1):  # the last is half of the trial's length, which shows nothing
+        limit.keep(0.4 * STEP, STEP)
+    assert limit.is_trial and limit.patience == patience
+    limit.keep(0.8 * STEP, STEP)
+    assert not limit.is_trial and limit.patience == patience // 2
+    limit.keep(STEP, STEP)
+    assert limit.longest == np.inf and limit.patience == 1
+
+
+def test_what_passes_in_spite_of_all_is_held_back_and_reported(stepper):
+    stepper.passes = lambda time, dt: True
+    _, result = take(stepper)
+    assert stepper.held_back == stepper.kept and not result.converged
+    assert len(stepper.taken) < 30 * len(stepper.kept)
+
+
+def test_an_error_in_a_retry_keeps_the_first_result(stepper):
+    def fails(time, dt):
+        if dt < STEP and time > 0.0:
+            raise SimulationError("not finite")
+        return False
+
+    stepper.converges = fails
+    lengths, result = take(stepper)
+    assert not result.converged and lengths == [STEP]

@@ -13,6 +13,7 @@ import numpy as np
 
 import taisoft as ts
 from taisoft import queries
+from taisoft.estimation.estimator import ErrorEstimator
 from taisoft.records import Energies, StepReport
 from taisoft.settings import Settings
 from tests.dynamics.scenes import cube, rubber
@@ -57,8 +58,6 @@ class StandIn:
         self._dynamics, self._estimator, self._may_soften = self, None, self.softens
         self.state = SimpleNamespace(state=lambda: (self.positions(), self.v), velocities=lambda: self.v)
 
-    # --- stepping
-
     def advance(self, n: int) -> StepReport:
         n, hits = (n if self.settings.explicit else 1), 0
         for _ in range(n):
@@ -69,10 +68,8 @@ class StandIn:
             self._may_soften = False
             warnings.warn("softens", UserWarning, stacklevel=2)
         count = 0 if self.settings.explicit else self.newton
-        converged = not self.unconverged(self)
-        return StepReport(
-            self.time, n, newton_iterations=count, linear_iterations=2 * count, n_contacts=hits, converged=converged
-        )
+        counts = {"newton_iterations": count, "linear_iterations": 2 * count, "n_contacts": hits}
+        return StepReport(self.time, n, **counts, converged=not self.unconverged(self))
 
     def _step(self, dt: float) -> int:
         d, x, v, below = self.damping, self.x, self.v, self.x[:, 1] < self.floor
@@ -94,8 +91,6 @@ class StandIn:
         force[below, 1] += FLOOR**2 * (self.floor - x[below, 1])
         return force
 
-    # --- results
-
     def positions(self, body=None) -> np.ndarray:
         return self.x + self.offset(self)
 
@@ -110,8 +105,6 @@ class StandIn:
 
     def overlaps(self) -> list:
         return []
-
-    # --- changes and copies
 
     def snapshot(self) -> dict:
         return {"x": self.x, "v": self.v, "past": self.past, "time": self.time, "step_count": self.step_count, "dt": self.dt}
@@ -138,8 +131,6 @@ class StandIn:
         return 0.0
 
     def _begin_estimate(self, steps, mesh):
-        from taisoft.estimation.estimator import ErrorEstimator
-
         self._estimator = ErrorEstimator(self, steps, mesh)
         return self._estimator
 

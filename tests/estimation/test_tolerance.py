@@ -1,7 +1,6 @@
 """Runs to a tolerance, mostly of stand-ins (`stand_in`):
 
-* the true error meets the tolerance, and the estimate is near it, of smooth motion, damped motion and impacts;
-* explicit or implicit steps are taken by counts; one pilot is enough where it shows so;
+* explicit or implicit steps are taken by counts; one pilot is enough where it shows so; the estimate meets the tolerance;
 * implicit steps of bodies that touch with friction have a larger error, since they pass over vibrations;
 * pilots leave the state as it was, observers see the run alone, and a repeated run equals the pilot that it repeats;
 * where paths diverge, where pilots fail or are interrupted, and after changes during the run, the report says so;
@@ -35,16 +34,12 @@ def soft(tolerance=0.01, kind=ELASTIC, **settings) -> StandIn:
     return kind(scene, **{"dt": 1 / 60, "integrator": VERLET, "tolerance": tolerance} | settings)
 
 
-def stiff(tolerance=0.01, kind=SLOW, touching=False, friction=0.0, **settings) -> StandIn:
+def stiff(tolerance=0.01, kind=SLOW, **settings) -> StandIn:
     """One whose scene would need very small explicit steps."""
-    scene = block(young=1e10, touching=touching, friction=friction)
-    return kind(scene, **{"dt": 1 / 60, "integrator": BDF2, "tolerance": tolerance} | settings)
+    return kind(block(young=1e10), **{"dt": 1 / 60, "integrator": BDF2, "tolerance": tolerance} | settings)
 
 
-# --- errors ---------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("seconds, fps", [(0.511, 60), (0.078, 60), (0.011, 60), (0.5, 4), (0.5, 1000), (0.2, None)])
+@pytest.mark.parametrize("seconds, fps", [(0.511, 60), (0.011, 60), (0.5, 4), (0.5, 1000), (0.2, None)])
 @pytest.mark.parametrize("make", [soft, stiff])
 def test_runs_and_frames_of_any_length(make, seconds, fps):
     """Frames lie at steps; a run has the same steps whether they are observed or not, and the same error."""
@@ -56,20 +51,6 @@ def test_runs_and_frames_of_any_length(make, seconds, fps):
     assert found[0] == found[1] and found[0][0] == "ok"
     assert sim.time == pytest.approx(seconds, abs=0.5 * sim.dt) and frames[0] == 0.0
     assert len(frames) == 1 + (result.steps if fps is None else np.ceil(seconds * fps - 1e-6))
-
-
-def test_paths_that_diverge_meet_no_tolerance():
-    """Nodes are kicked once, each time in another way."""
-
-    def kick(sim):
-        if sim.time < 0.09 <= sim.time + sim.dt:
-            sim.v = sim.v + np.sin(1e6 * sim.dt)
-
-    result = run(soft(0.01, motion(frequency=3.0, before_step=kick)), 0.3)
-    assert result.status == "degraded" and result.problems[-1].endswith("and the tolerance is 1 %")
-
-
-# --- choices ----------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -101,10 +82,8 @@ def test_which_pilots_choose_the_steps(make, kind, tolerance, pilots, per_frame,
     monkeypatch.setattr(Frames, "pilot", spied)
     result = run(make(tolerance, kind, integrator="implicit_midpoint"), 0.6)
     assert (" ".join(found), result.steps, result.status) == (pilots, 36 * per_frame, "ok")
-    assert (
-        result.problems[0].startswith(f"note: for a tolerance of {100 * tolerance:.3g} %: ")
-        and result.error_estimate.time <= tolerance
-    )
+    assert result.error_estimate.time <= tolerance
+    assert result.problems[0].startswith(f"note: for a tolerance of {100 * tolerance:.3g} %: ")
 
 
 @pytest.mark.parametrize(
@@ -130,8 +109,18 @@ def test_implicit_steps_pass_over_vibrations_of_contacts(friction, tolerance, er
     assert result.status == ("degraded" if noted and tolerance < e.time else "ok") and (e.time > 0.01) == noted
 
 
-def test_the_error_of_the_solvers_counts():
-    """Where twins estimate it."""
+def test_errors_above_the_tolerance_or_unknown_degrade_a_run():
+    """Paths diverge whose nodes are kicked once, each time in another way. The solvers' error counts where twins estimate it."""
+
+    def kick(sim):
+        if sim.time < 0.09 <= sim.time + sim.dt:
+            sim.v = sim.v + np.sin(1e6 * sim.dt)
+
+    result = run(soft(0.01, motion(frequency=3.0, before_step=kick)), 0.3)
+    assert result.status == "degraded" and result.problems[-1].endswith("and the tolerance is 1 %")
+    result = run(soft(), 0.3, on_frame=lambda sim, k, _: setattr(sim, "changes", 1) if k == 5 else None)
+    assert result.error_estimate.time is None and "changed during the run" in result.error_estimate.notes[0]
+    assert result.problems[-1] == "the error in time is unknown, and the tolerance is 1 %" and result.status == "degraded"
     kind = motion(frequency=3.0, offset=lambda sim: (42.0 * sim.settings.newton_tolerance * sim.time, 0.0, 0.0))
     result = run(stiff(0.01, kind, newton_tolerance=5e-4), 0.6, error=True)
     e = result.error_estimate
@@ -149,25 +138,14 @@ def test_bad_runs_are_refused_before_pilots():
     assert not counts
 
 
-# --- pilots -----------------------------------------------------------------------------------------------------------
-
-
 def test_an_interrupt_or_an_exception_during_the_pilots_leaves_the_start():
-    calls = []
-
-    def stop():
-        calls.append(1)
-        return len(calls) > 5
-
-    def breaks():
-        raise ZeroDivisionError
-
+    calls = iter(range(99))
     sim = stiff(integrator="implicit_midpoint", dt=0.01)
-    result = run(sim, 0.5, stop=stop)
+    result = run(sim, 0.5, stop=lambda: next(calls) >= 5)
     assert result.interrupted and result.status == "degraded" and result.steps == 0
     assert "interrupted during its pilots" in result.problems[0]
     with pytest.raises(ZeroDivisionError):
-        run(sim, 0.5, stop=breaks)
+        run(sim, 0.5, stop=lambda: 1 / 0)
     assert (sim.settings.integrator, sim.dt, sim.time, sim.step_count) == ("implicit_midpoint", 0.01, 0.0, 0)
     assert np.array_equal(sim.positions(), sim.rest)
 
@@ -194,16 +172,6 @@ def test_warnings_are_those_of_the_run(observed):
     assert len(given) == 1
 
 
-def test_a_change_during_the_run_leaves_the_error_unknown():
-    result = run(soft(), 0.3, on_frame=lambda sim, k, _: setattr(sim, "changes", 1) if k == 5 else None)
-    assert result.error_estimate.time is None and result.status == "degraded"
-    assert "changed during the run" in result.error_estimate.notes[0]
-    assert result.problems[-1] == "the error in time is unknown, and the tolerance is 1 %"
-
-
-# --- real runs --------------------------------------------------------------------------------------------------------
-
-
 def two(young=1e6) -> ts.Scene:
     """A beam of 2 x 1 x 1 m, clamped at its left end, and a body that is thrown."""
     scene = ts.Scene(gravity=(0.0, -9.8, 0.0))
@@ -217,7 +185,7 @@ def two(young=1e6) -> ts.Scene:
 @pytest.mark.parametrize("young, integrator", [(1e6, VERLET), (1e12, BDF2)])
 def test_a_real_run_meets_the_tolerance_and_resumes_without_pilots(young, integrator, tmp_path):
     """Its true error is that against a sixteenth of its steps; it is bitwise the same whether it is observed or not."""
-    path, ends, checkpoint = [], [], tmp_path / "c.npz"
+    path, ends, fine, checkpoint = [], [], [], tmp_path / "c.npz"
 
     def look(sim, k, _report):
         path.append(sim.positions())
@@ -230,20 +198,18 @@ def test_a_real_run_meets_the_tolerance_and_resumes_without_pilots(young, integr
             result = sim.run(0.2, on_frame=on_frame)
             ends.append(sim.positions())
         assert sim.settings.integrator == integrator and result.pilot_seconds > 0.0
-        e = result.error_estimate
     assert np.array_equal(*ends) and result.status == "ok"
     with ts.Simulator.load_checkpoint(checkpoint, two(young)) as sim:
         assert sim.settings.tolerance == 0.01 and sim.step_count > 0
         resumed = sim.run(0.2, resumed=True)
         assert resumed.pilot_seconds == 0.0 and resumed.error_estimate is None and "is not estimated" in resumed.problems[-1]
         assert np.array_equal(sim.positions(), ends[0])
-        fine = []
         sim.rebuild(tolerance=None)
         sim.reset()
         sim.dt = sim.dt / 16
         sim.run(0.2, on_frame=lambda sim, *_: fine.append(sim.positions()))
     true = np.linalg.norm(np.array(path) - fine, axis=2).max() / np.linalg.norm(np.array(fine) - fine[0], axis=2).max()
-    assert true <= 0.01 and 0.1 * true < e.time <= 0.01
+    assert true <= 0.01 and 0.1 * true < result.error_estimate.time <= 0.01
 
 
 def test_settings_change_by_rebuild():
@@ -256,38 +222,20 @@ def test_settings_change_by_rebuild():
             sim.rebuild(integrator="implicit_euler")
         sim.rebuild(tolerance=None, integrator="implicit_euler")
         assert sim.settings.newton_tolerance is None
-    with ts.Simulator(two(), dt=1 / 60, precision="f64") as sim:
-        result = sim.run(0.05)
-        assert sim.dt == 1 / 60 and result.pilot_seconds == 0.0 and result.error_estimate is None and not result.problems
-
-
-IN_F64 = BEAM.replace('"fps": 30', '"fps": 30, "precision": "f64"')
 
 
 def test_the_command_chooses_steps_and_estimates_errors(tmp_path, capsys):
-    scene, out, other = write(tmp_path / "beam.py", IN_F64), tmp_path / "out", tmp_path / "other"
+    scene, out = write(tmp_path / "beam.py", BEAM.replace('"fps": 30', '"fps": 30, "precision": "f64"')), tmp_path / "out"
     assert call(scene, "--tolerance", 0.01, "--out", out, *SHORT_OUTPUT) == 0
-    printed = capsys.readouterr().out
-    assert "for a tolerance of 1 %" in printed and "error    about " in printed
-    report = json.loads((out / "report.json").read_text())
-    assert report["settings"]["tolerance"] == 0.01 and report["settings"]["integrator"] in printed
-    assert report["error_estimate"]["time"] <= 0.01 and report["pilot_seconds"] > 0.0
+    printed, report = capsys.readouterr().out, json.loads((out / "report.json").read_text())
+    assert "for a tolerance of 1 %" in printed and "error    about " in printed and report["pilot_seconds"] > 0.0
+    assert report["settings"]["tolerance"] == 0.01 and report["error_estimate"]["time"] <= 0.01
     resumed = ("--resume", out / "checkpoint.npz", "--out", out, "--seconds", 0.2, *SHORT_OUTPUT)
     assert call(scene, *resumed) == 0 and "keeps the steps" in capsys.readouterr().out
-    assert call(scene, "--tolerance", 1, "--error", "--out", other, "--no-frames") == EXIT_BAD_INPUT
     for options, message in (
-        (("--tolerance", 2), "tolerance must be below 1"),
         (("--tolerance", 0.01, "--set", "solver.fps=none"), "needs frames at a rate"),
         ((*resumed, "--set", "solver.dt=0.001"), "its dt was chosen for a tolerance"),
         (("--colour", "error"), "needs --error"),
-        (("--plots", "error", "--out", other, "--no-usd"), "needs --error"),
         ((*resumed, "--error-mesh", "refined"), "excludes --resume"),
     ):
         assert call(scene, *options) == EXIT_BAD_INPUT and message in capsys.readouterr().err
-    assert call(scene, "--error", "--out", other, "--no-frames") == 0
-    assert json.loads((other / "report.json").read_text())["error_estimate"]["time"] > 0.0
-    from pxr import Usd
-
-    stage = Usd.Stage.Open(str(other / "scene.usdc"))
-    values = stage.GetPrimAtPath("/World/beam/tets").GetAttribute("primvars:estimatedError")
-    assert max(values.Get(0.0)) == -1.0 and min(values.Get(3.0)) >= 0.0 and max(values.Get(3.0)) > 0.0

@@ -11,26 +11,25 @@ import pytest
 
 import taisoft as ts
 from taisoft.errors import SimulationError
+from taisoft.estimation.estimator import Differences
 from taisoft.estimation.twins import larger_steps, on_mesh, other_mesh, smaller_steps, tighter
 from taisoft.running import run
+from taisoft.stability import stable_dt
 from tests.dynamics.scenes import cube, rubber
 from tests.estimation.stand_in import BDF2, VERLET, StandIn, block, motion
 
 FALLING = motion(frequency=0.0)
 
 
-def two_blocks(cells=(1, 1, 1), order=1, velocity=(0.0, 0.0, 0.0)) -> ts.Scene:
+def two_blocks(cells=(1, 1, 1), order=1) -> ts.Scene:
     """A block of five tets, and one of 40."""
     scene = block(cells=cells)
-    scene.add_body(cube(cells=(2, 2, 2)), rubber(), name="fine", position=(5, 0, 0), velocity=velocity, order=order)
+    scene.add_body(cube(cells=(2, 2, 2)), rubber(), name="fine", position=(5, 0, 0), order=order)
     return scene
 
 
 def estimate(sim: StandIn, seconds: float = 1.0, fps: float = 16, **arguments):
     return run(sim, seconds, fps=fps, error=True, **arguments).error_estimate
-
-
-# --- errors ---------------------------------------------------------------------------------------------------------
 
 
 def test_free_fall_in_steps_of_implicit_euler():
@@ -45,6 +44,14 @@ def test_free_fall_in_steps_of_implicit_euler():
     assert e.bodies["fine"].time == e.time and e.bodies["block"].solver == e.solver
     assert e.energies.gravity == pytest.approx(-10.0 * len(sim.rest) * 5.0 / 64) and e.energies.kinetic == 0.0
     assert len(kind.made) == 4 and all(twin.closed for twin in kind.made[1:]) and not sim.closed
+
+
+def test_the_largest_difference_of_each_body_up_to_a_time():
+    differences, x = Differences(np.array([0, 0, 1])), np.zeros((3, 3))
+    for apart in ([1.0, 3.0, 2.0], [2.0, 1.0, 5.0], [0.0, 4.0, 1.0]):
+        differences.add(x, x + np.outer(apart, (0.6, 0.0, 0.8)))
+    assert differences.largest() == pytest.approx([4.0, 5.0]) and differences.largest(2) == pytest.approx([3.0, 5.0])
+    assert differences.squares == pytest.approx([14 / 3, 10.0, 17 / 3]) and differences.map == pytest.approx([0.0, 4.0, 1.0])
 
 
 def test_few_or_unstable_steps_are_compared_with_half_the_step():
@@ -81,20 +88,22 @@ def test_errors_of_the_mesh():
         found = [body.space * e.excursion for body in e.bodies.values()]
         assert found == pytest.approx(errors, rel=1e-6) and e.space == max(body.space for body in e.bodies.values())
         assert e.twins[0] == f"mesh: {mesh}" and e.total == pytest.approx(e.time + e.space + e.solver)
+    sim = kind(two_blocks(), 0.8 * stable_dt(two_blocks(), verlet=True), VERLET)
+    twin = on_mesh(sim, "refined")[0]  # its steps are stable on its mesh
+    assert twin.steps > 1 and twin.steps * twin.sim.dt == pytest.approx(sim.dt)
+    assert twin.sim.dt < stable_dt(twin.sim.scene, verlet=True)
 
 
 def test_errors_at_the_nodes_and_so_far():
     """All kinds are added; in space they are known at the nodes that both meshes share."""
-    kind, seen = (
-        motion(width_error=0.1, offset=lambda sim: (0.5 * (sim.settings.newton_tolerance or 0.0) * sim.time, 0.0, 0.0)),
-        [],
-    )
+    seen = []
 
     def look(sim, k, _report):
         seen.append((sim.nodal_errors(), sim.error_so_far))
         if k == 12:
             sim.changes += 1
 
+    kind = motion(width_error=0.1, offset=lambda sim: (0.5 * (sim.settings.newton_tolerance or 0.0) * sim.time, 0.0, 0.0))
     run(kind(two_blocks((2, 2, 2)), newton_tolerance=1e-3), 1.0, look, 16, error=True, error_mesh="refined")
     assert np.isnan(seen[0][0]).all() and seen[0][1].time is None  # before the first comparison
     for errors, e in seen[2:12]:
@@ -103,25 +112,13 @@ def test_errors_at_the_nodes_and_so_far():
     assert np.isnan(seen[13][0]).all()  # after a change
 
 
-def test_a_change_after_a_look_leaves_the_error_unknown():
-    def look(sim, k, _report):
-        assert sim.error_so_far is not None
-        if k == 5:
-            sim.changes += 1
-
-    assert estimate(StandIn(block()), on_frame=look).time is None
-
-
 def test_frames_need_not_lie_at_common_steps():
-    """Six steps a frame, comparisons at multiples of four: those of the last common step of every frame."""
+    """Five steps a frame, comparisons at multiples of four: those of the last common step of every frame."""
     frames, sim = [], FALLING(block(), dt=1 / 60)
-    e = estimate(sim, 1.0, 10, on_frame=lambda sim, *_: frames.append(sim.step_count))
-    assert frames == list(range(0, 61, 6)) and e.order == pytest.approx(1.0) and not e.notes
-    assert e.time * e.excursion == pytest.approx(5.0 / 60)
+    e = estimate(sim, 55 / 60, 12, on_frame=lambda sim, *_: frames.append(sim.step_count))
+    assert frames == list(range(0, 56, 5)) and e.order == pytest.approx(1.0) and not e.notes
+    assert e.time * e.excursion == pytest.approx(5.0 / 60 * 52 / 60)
     assert estimate(sim, 3 / 60, 20).time is not None
-
-
-# --- unknown errors -------------------------------------------------------------------------------------------------
 
 
 def parting(sim) -> np.ndarray:
@@ -138,44 +135,37 @@ def test_paths_that_part_are_noticed():
     assert few.time is None and "with half the step some node is over 10%" in few.notes[0] and few.agree_until <= 0.5
 
 
-def fails_with(test) -> type[StandIn]:
-    def before_step(sim):
-        if test(sim) and sim.time > 0.5:
-            raise SimulationError("made to fail")
-
-    return motion(before_step=before_step)
-
-
 def test_failed_and_unconverged_twins():
+    def fails_with(test) -> type[StandIn]:
+        def before_step(sim):
+            if test(sim) and sim.time > 0.5:
+                raise SimulationError("made to fail")
+
+        return motion(before_step=before_step)
+
     e = estimate(fails_with(lambda sim: sim.dt > 1 / 50)(block()))
     assert e.time is None and e.solver is not None and "dt = 0.03125 s failed: made to fail" in e.notes[0]
-    tight = fails_with(lambda sim: sim.settings.newton_tolerance)
-    e = estimate(tight(block()))
-    assert (
-        e.time > 0.0
-        and e.solver is None
-        and e.notes == ["the error of solver is unknown: its twin (tolerances x 0.1) failed: made to fail"]
-    )
+    e = estimate(fails_with(lambda sim: sim.settings.newton_tolerance)(block()))
+    assert e.notes == ["the error of solver is unknown: its twin (tolerances x 0.1) failed: made to fail"]
+    assert e.time > 0.0 and e.solver is None
     e = estimate(motion(unconverged=lambda sim: bool(sim.settings.newton_tolerance))(block()))
     assert e.notes == ["of the twin with tolerances x 0.1, 64 of 64 steps did not converge"] and e.solver is not None
 
 
-def drag(sim) -> None:
-    sim.dragged = True
-
-
 @pytest.mark.parametrize(
-    "change, note",
-    [
-        (lambda sim: setattr(sim, "changes", 1), "changed meanwhile"),
-        (lambda sim: setattr(sim, "dt", 1 / 128), "changed meanwhile"),
-        (drag, "the run was dragged"),
-    ],
+    "name, value, note", [("changes", 1, "changed"), ("dt", 1 / 128, "changed"), ("dragged", True, "dragged")]
 )
+@pytest.mark.parametrize("looks", [False, True])
 @pytest.mark.parametrize("when", [5, 16])
-def test_changes_leave_the_error_unknown(change, note, when):
-    """Also after the last comparison."""
-    e = estimate(StandIn(block()), on_frame=lambda sim, k, _: change(sim) if k == when else None)
+def test_changes_leave_the_error_unknown(name, value, note, when, looks):
+    """Also after the last comparison, and after a look at the error."""
+
+    def change(sim, k, _report):
+        assert not looks or sim.error_so_far is not None
+        if k == when:
+            setattr(sim, name, value)
+
+    e = estimate(StandIn(block()), on_frame=change)
     assert e.time is e.total is None and note in e.notes[0]
 
 
@@ -188,7 +178,8 @@ def test_bodies_at_rest_and_short_runs_have_no_relative_error():
 
 
 def test_meshes_that_cannot_be_compared_are_refused():
-    sim, both = StandIn(two_blocks()), StandIn(two_blocks(order=2))
+    sim, both, faster = StandIn(two_blocks()), StandIn(two_blocks(order=2)), StandIn(two_blocks())
+    faster.v = faster.v + (0.0, 0.1, 0.0)  # not as in its scene
     held = two_blocks()
     held.body("block").fix(lambda X: X[:, 0] < 9.0)
     for bad, mesh, message in (
@@ -197,6 +188,7 @@ def test_meshes_that_cannot_be_compared_are_refused():
         (sim, two_blocks(), "body 'block' has 5 tets there and 5 in the run: the mesh widths must differ"),
         (sim, block(), "its bodies are block, and those of the run block, fine"),
         (StandIn(held), "refined", "body 'block': all nodes of both meshes that coincide are constrained"),
+        (faster, "refined", "the run must start there"),
     ):
         with pytest.raises(SimulationError, match=message):
             on_mesh(bad, mesh)
@@ -205,17 +197,8 @@ def test_meshes_that_cannot_be_compared_are_refused():
     with pytest.raises(SimulationError, match=r"the run must start there too: reset\(\)"):
         on_mesh(sim, "refined")
     assert sim.made[-1].closed
-    with pytest.raises(SimulationError, match="the run must start there"):
-        on_mesh(faster(), "refined")
     with pytest.raises(SimulationError, match="error_mesh needs error=True"):
         run(sim, 1.0, error_mesh="refined")
-
-
-def faster() -> StandIn:
-    """A stand-in whose nodes have another velocity than in its scene."""
-    sim = StandIn(two_blocks())
-    sim.v = sim.v + (0.0, 0.1, 0.0)
-    return sim
 
 
 def test_interrupted_and_broken_runs_release_their_twins():
@@ -231,42 +214,33 @@ def test_interrupted_and_broken_runs_release_their_twins():
     assert [one.closed for one in kind.made] == [False, True, True, True] * 2
 
 
-# --- real simulators ------------------------------------------------------------------------------------------------
-
-
-def beam() -> ts.Scene:
-    """A beam of 2 x 1 x 1 m, clamped at its left end."""
-    scene = ts.Scene(gravity=(0.0, -9.8, 0.0))
-    body = scene.add_body(ts.box_mesh((2, 1, 1), (2.0, 1.0, 1.0)), rubber(), name="beam")
-    body.fix(lambda X: X[:, 0] < -0.99)
-    return scene
-
-
 def test_a_real_run_goes_on_as_without_twins():
     """From a state in motion. Its error is of the right size, is known at the nodes during the run, and excludes another run."""
-    ends, seen, nested = [], [], []
+    ends, seen, refused = [], [], []
 
     def look(sim, k, _report):
         seen.append((sim.nodal_errors("beam"), sim.error_so_far))
         if k == 2:
-            with pytest.raises(SimulationError, match="during another one") as refused:
+            with pytest.raises(SimulationError, match="during another one") as nested:
                 sim.run(0.1, error=True)
-            nested.append(refused)
+            refused.append(nested)
 
-    with ts.Simulator(beam(), dt=1 / 120, precision="f64") as sim:
+    scene = ts.Scene(gravity=(0.0, -9.8, 0.0))
+    body = scene.add_body(ts.box_mesh((2, 1, 1), (2.0, 1.0, 1.0)), rubber(), name="beam")
+    fixed = body.rest_positions[:, 0] < -0.99
+    body.fix(fixed)
+    with ts.Simulator(scene, dt=1 / 120, precision="f64") as sim:
         for error in (False, True):
             sim.reset()
             sim.run(0.2)
             e = sim.run(0.6, fps=30, error=error, on_frame=look if error else None).error_estimate
             ends.append(sim.positions())
-        assert sim.error_so_far is None and nested
+        assert sim.error_so_far is None and refused
         with pytest.raises(SimulationError, match="only during"):
             sim.nodal_errors()
-        fixed = sim.scene.body("beam").rest_positions[:, 0] < -0.99
         sim.reset()
         space = sim.run(0.2, error=True, error_mesh="refined").error_estimate.space
-    assert np.array_equal(*ends)
+    assert np.array_equal(*ends) and 0.03 < space < 0.6
     errors, last = seen[-1]
     assert last.time == e.time and (errors[fixed] == 0.0).all() and 0.0 < errors[~fixed].min()
     assert errors.max() <= 1.01 * e.excursion * e.total and 0.005 < e.time < 0.5 and e.solver < 0.01
-    assert 0.03 < space < 0.6

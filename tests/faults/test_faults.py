@@ -25,7 +25,7 @@ import taisoft as ts
 from taisoft import simulator
 from taisoft.checkpoint import read_checkpoint
 from taisoft.output.files import CheckpointWriter, OutputFolder
-from tests.cli.command import BEAM, ROOT, report, run, write
+from tests.cli.command import BEAM, LED, ROOT, report, run, write
 from tests.output.png import decode
 
 
@@ -42,12 +42,6 @@ def error_lines(stderr: str) -> list[str]:
     return [line for line in stderr.splitlines() if not re.match(r"taisoft: (compiling|\d+ kernels so far)", line)]
 
 
-def small_scene() -> ts.Scene:
-    scene = ts.Scene()
-    scene.add_body(ts.box_mesh((2, 1, 1), (2, 1, 1)), ts.Material(young=1e5), name="part")
-    return scene
-
-
 @pytest.fixture(scope="module")
 def shim(tmp_path_factory) -> Path:
     """The library of failing calls."""
@@ -61,45 +55,37 @@ def shim(tmp_path_factory) -> Path:
     return path
 
 
-# --- disks ------------------------------------------------------------------------------------------------------------
-
-# All runs in one process, so that kernels are compiled once: (call that fails, part of the path where it fails)
+# All runs in one process, so that kernels are compiled once: [scene file, failing call, part of the path where it fails], ...
 FAILING = """
 import contextlib, io, json, os, sys
 from taisoft.backend import runtime
 from taisoft.cli import main
-scene, base, shown = sys.argv[1], sys.argv[2], []
-for k, (call, name) in enumerate(json.loads(sys.argv[3])):
-    out, err = io.StringIO(), io.StringIO()
-    os.environ["FAIL_CALL"], os.environ["FAIL_NAME"] = call, name
+shown = []
+for k, (scene, call, name) in enumerate(json.loads(sys.argv[2])):
+    out, err, folder = io.StringIO(), io.StringIO(), f"{sys.argv[1]}/{k}"
+    os.environ |= {"FAIL_CALL": call, "FAIL_NAME": name, "LATER": f"{folder}/"}
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
-        status = main(["run", scene, "--headless", "--out", f"{base}/{k}", "--overwrite"])
+        status = main(["run", scene, "--headless", "--out", folder, "--overwrite", "--checkpoint-every", "0.03"])
     os.environ["FAIL_NAME"] = ""
     runtime.forget()  # Taichi starts again, and finds its kernels in the cache
     shown.append((status, out.getvalue(), err.getvalue()))
 print(json.dumps(shown))
 """
-CALLS = {
-    "some": [("fsync", "report.json"), ("write", "00001.png|checkpoint.npz")],
-    "others": [
-        ("rename", "report.json"),
-        ("fsync", "scene.usdc"),
-        ("rename", "00001.png"),
-        ("write", "steps.csv"),
-        ("rename", "checkpoint.npz"),
-    ],
-}
+CALLS = [("fsync", "report.json"), ("write", "00001.png|checkpoint.npz"), ("rename", "steps.csv"), ("change", "")]
+READ_ONLY = LED.replace("{body}", 't > 0.05 and os.environ.update(FAIL_NAME=os.environ["LATER"])\n    return (0, 0, 0)')
 
 
-@pytest.mark.parametrize("which", ["some", pytest.param("others", marks=pytest.mark.long)])
-def test_failing_calls(beam, tmp_path, shim, which):
-    calls = CALLS[which]
-    for k in range(len(calls)):
+def test_failing_calls(beam, tmp_path, shim):
+    """The last disk becomes read-only during the run, as when the system remounts it after an error."""
+    path = write(tmp_path / "led.py", READ_ONLY.replace("import taisoft", "import os\n\nimport taisoft"))
+    for k in range(len(CALLS)):
         (tmp_path / str(k)).mkdir()
         (tmp_path / str(k) / "report.json").write_text("old")
-    done = python(FAILING, beam, tmp_path, json.dumps(calls), LD_PRELOAD=str(shim))
+    calls = json.dumps([(str(beam if name else path), call, name) for call, name in CALLS])
+    done = python(FAILING, tmp_path, calls, LD_PRELOAD=str(shim))
     assert done.returncode == 0, done.stderr
-    for k, ((call, name), (status, out, err)) in enumerate(zip(calls, json.loads(done.stdout.splitlines()[-1]))):
+    *runs, last = json.loads(done.stdout.splitlines()[-1])
+    for k, ((call, name), (status, out, err)) in enumerate(zip(CALLS, runs)):
         folder = tmp_path / str(k)
         reason = "No space left on device" if call == "write" else "Input/output error"
         assert status == 3, (call, name, out, err)
@@ -107,16 +93,31 @@ def test_failing_calls(beam, tmp_path, shim, which):
         assert len(lines) == len(failed), err
         for file, line in zip(failed, lines):
             assert re.match(rf"taisoft: cannot write {re.escape(str(folder))}/\S*{file}\S*.*: {reason}", line), err
+            assert not list(folder.rglob(file))
         assert not list(folder.rglob("*.part")) and not list(folder.glob("*.lock"))
-        assert (
-            not any(list(folder.rglob(file)) for file in failed) and "status   degraded" in out and not re.search(r"\bok\b", out)
-        )
+        assert "status   degraded" in out and not re.search(r"\bok\b", out)
         if name in ("report.json", "steps.csv"):
             assert not (folder / "report.json").exists()  # not even the earlier one
         else:
             assert report(folder)["status"] == "degraded"
         if "checkpoint.npz" not in failed:  # the state is saved, so that the run can continue elsewhere
             read_checkpoint(folder / "checkpoint.npz")
+    out, (status, shown, err) = tmp_path / str(len(runs)), last
+    assert status == 3 and "status   degraded" in shown, shown + err
+    start, usd = f"taisoft: cannot write {out}/", r"\(\d+ bytes of new frames\): Unable to open .+ for write"  # gives no reason
+    lines = error_lines(err)
+    assert all(line.startswith(start) and re.search(rf"(: Read-only file system| {usd})$", line) for line in lines), lines
+    lost = [re.match(r"(?:\w+/)?([\w.]+)", line.removeprefix(start))[1] for line in lines]
+    assert sorted(lost) == ["00002.png", "checkpoint.previous.npz", "points_00002.usdc", "steps.csv"]
+    assert [path.name for path in sorted((out / "frames").iterdir())] == ["00000.png", "00001.png"]
+    assert read_checkpoint(out / "checkpoint.npz").state["simulation"]["time"] == pytest.approx(1 / 30)
+    for picture in (out / "frames").glob("*.png"):
+        assert decode(picture.read_bytes()).ndim == 3
+    for path in (out / "chunks").glob("*.usdc"):
+        stage = Usd.Stage.Open(str(path))
+        points = stage.GetAttributeAtPath("/World/beam/tets.points")
+        assert points.GetTimeSamples()
+        assert all(np.isfinite(np.array(points.Get(moment))).all() for moment in points.GetTimeSamples())
 
 
 def test_full_disk(beam, tmp_path, capsys):
@@ -126,40 +127,31 @@ def test_full_disk(beam, tmp_path, capsys):
     try:
         resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, limits[1]))
         status = run(beam, "--out", disk / "out", "--seconds", "0.5")
-        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-        errors, start = capsys.readouterr().err, f"cannot write {re.escape(str(disk))}/out/"
-        assert status == 3 and re.search(rf"taisoft: {start}\S+ \(\d+ bytes.*: .+", errors), errors
-        files = [path for path in (disk / "out").rglob("*") if path.is_file()]
-        assert not [path for path in files if path.suffix == ".part" or path.stat().st_size == 0]
-        lost = set(re.findall(rf"{start}(\w+\.\w+)", errors))
-        if "checkpoint.npz" not in lost:
-            read_checkpoint(disk / "out" / "checkpoint.npz")
-        if not lost & {"report.json", "steps.csv"}:
-            assert report(disk / "out")["status"] == "degraded"
-        assert not any((disk / "out" / name).exists() for name in lost)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    errors, start = capsys.readouterr().err, f"cannot write {re.escape(str(disk))}/out/"
+    assert status == 3 and re.search(rf"taisoft: {start}\S+ \(\d+ bytes.*: .+", errors), errors
+    files = [path for path in (disk / "out").rglob("*") if path.is_file()]
+    assert not [path for path in files if path.suffix == ".part" or path.stat().st_size == 0]
+    lost = set(re.findall(rf"{start}(\w+\.\w+)", errors))
+    if "checkpoint.npz" not in lost:
+        read_checkpoint(disk / "out" / "checkpoint.npz")
+    if not lost & {"report.json", "steps.csv"}:
+        assert report(disk / "out")["status"] == "degraded"
+    assert not any((disk / "out" / name).exists() for name in lost)
 
 
-MOVED_AWAY = """
-    body.move(lambda X: X[:, 0] > 1.99, path)
-    return scene
-
-
-def path(t):
-    from pathlib import Path
-
-    out = Path(__file__).parent / "out"
+MOVED_AWAY = """out = Path(__file__).parent / "out"
     if t > 0.05 and out.is_dir():
         out.rename(out.with_name("moved"))
         out.write_text("a file")
-    return (0, 0, 0)
-"""
+    return (0, 0, 0)"""
 
 
 def test_output_folder_moved_away(tmp_path, capsys):
     """During the run, in a way that also stops the superuser, and before it; earlier files stay complete."""
-    path, out = write(tmp_path / "scene.py", BEAM.replace("\n    return scene\n", MOVED_AWAY)), tmp_path / "out"
+    text = LED.replace("{body}", MOVED_AWAY).replace("import taisoft", "from pathlib import Path\n\nimport taisoft")
+    path, out = write(tmp_path / "scene.py", text), tmp_path / "out"
     assert run(path, "--out", out, "--checkpoint-every", "0.03") == 3
     captured = capsys.readouterr()
     assert re.search(rf"taisoft: cannot write {re.escape(str(out))}/\S+.*: Not a directory", captured.err), captured.err
@@ -171,59 +163,13 @@ def test_output_folder_moved_away(tmp_path, capsys):
     assert "cannot create the folder" in captured.err and "status" not in captured.out
 
 
-def assert_complete(out: Path) -> None:
-    """Check every file with a final name, of a run that may have been killed."""
-    for picture in (out / "frames").glob("*.png"):
-        assert decode(picture.read_bytes()).ndim == 3
-    for path in (*(out / "chunks").glob("*.usdc"), *out.glob("*.usdc")):
-        stage = Usd.Stage.Open(str(path))
-        points = stage.GetAttributeAtPath("/World/beam/tets.points")
-        assert points.GetTimeSamples()
-        assert all(np.isfinite(np.array(points.Get(moment))).all() for moment in points.GetTimeSamples())
-    for path in out.glob("checkpoint*.npz"):
-        assert np.isfinite(read_checkpoint(path).state["simulation"]["x"]).all()
-    if (out / "report.json").exists():
-        assert report(out)["status"] == "ok" and (out / "steps.csv").exists()
-
-
-READ_ONLY = (
-    MOVED_AWAY[MOVED_AWAY.index("    body") : MOVED_AWAY.index("    from")]
-    + """
-    import os
-
-    if t > 0.05:
-        os.environ["FAIL_NAME"] = os.environ["LATER"]
-    return (0, 0, 0)
-"""
-)
-
-
-def test_disk_becomes_read_only(tmp_path, shim):
-    """During the run, as when the system remounts a disk after an error."""
-    path, out = write(tmp_path / "scene.py", BEAM.replace("    return scene\n", READ_ONLY)), tmp_path / "out"
-    code = "import sys; from taisoft.cli import main; sys.exit(main(sys.argv[1:]))"
-    arguments = ("run", path, "--headless", "--out", out, "--checkpoint-every", "0.03")
-    done = python(code, *arguments, LD_PRELOAD=str(shim), FAIL_CALL="change", LATER=f"{out}/")
-    assert done.returncode == 3 and "status   degraded" in done.stdout, done.stdout + done.stderr
-    lines = error_lines(done.stderr)
-    usd = r"\(\d+ bytes of new frames\): Unable to open .+ for write"  # gives no reason
-    start = f"taisoft: cannot write {out}/"
-    assert all(line.startswith(start) and re.search(rf"(: Read-only file system| {usd})$", line) for line in lines), lines
-    lost = [re.match(r"(?:\w+/)?([\w.]+)", line.removeprefix(start))[1] for line in lines]
-    assert set(lost) == {"00002.png", "points_00002.usdc", "checkpoint.previous.npz", "steps.csv"} and len(lost) == 4
-    assert [path.name for path in sorted((out / "frames").iterdir())] == ["00000.png", "00001.png"]
-    assert read_checkpoint(out / "checkpoint.npz").state["simulation"]["time"] == pytest.approx(1 / 30)
-    assert_complete(out)
-
-
 KILLED = """
 import json, os, random, signal, sys, time
 from pathlib import Path
 import numpy as np
 from tests.view.fake_simulator import beam_scene
 from taisoft.checkpoint import read_checkpoint, write_checkpoint
-from taisoft.errors import SimulationError
-from taisoft.output.files import CheckpointWriter, read_last_good
+from taisoft.output.files import CheckpointWriter
 from taisoft.output.report import write_report
 from taisoft.records import RunReport, StepReport
 
@@ -246,7 +192,7 @@ def replace(kill, begun):
 
 dice, seen = random.Random(2), set()
 Saved().save_checkpoint(folder / "checkpoint.npz", {})
-for kill in range(1, 1 + int(sys.argv[2])):
+for kill in range(1, 11):
     started, begun = os.pipe()
     child = os.fork()
     if child == 0:
@@ -255,35 +201,28 @@ for kill in range(1, 1 + int(sys.argv[2])):
     time.sleep(dice.uniform(0.0, 0.05))
     os.kill(child, signal.SIGKILL)
     os.waitpid(child, 0)
-    for name in ("checkpoint.npz", "checkpoint.previous.npz"):
-        if (folder / name).exists():
-            state = read_checkpoint(folder / name).state
-            assert (state["x"] == state["n"]).all()
+    for path in folder.glob("checkpoint*.npz"):
+        state = read_checkpoint(path).state
+        assert (state["x"] == state["n"]).all()
     seen.add(read_checkpoint(folder / "checkpoint.npz").state["n"])
     json.loads((folder / "report.json").read_text())
     rows = (folder / "steps.csv").read_text()
     assert rows.endswith("\\n") and len(set(row.count(",") for row in rows.splitlines())) == 1
-print(len(seen), len(list(folder.glob("*.part"))))
+assert len(seen) == 10  # each child has written
 """
 
 
 def test_kills_while_files_are_replaced(tmp_path):
-    done = python(KILLED, tmp_path, 10)
+    done = python(KILLED, tmp_path)
     assert done.returncode == 0, done.stderr
-    assert int(done.stdout.split()[0]) == 10  # each child has written
     OutputFolder(tmp_path, overwrite=True).close()
     assert not list(tmp_path.glob("*.part"))
 
 
-# --- environment ------------------------------------------------------------------------------------------------------
-
-
 def german(folder: Path) -> dict[str, str]:
     """Compile a locale with decimal commas in the folder; return its environment variables, or nothing where that fails."""
-    if shutil.which("localedef") is None:
-        return {}
     command = ["localedef", "-i", "de_DE", "-f", "UTF-8", str(folder / "de_DE.UTF-8")]
-    if subprocess.run(command, capture_output=True, check=False).returncode:
+    if shutil.which(command[0]) is None or subprocess.run(command, capture_output=True, check=False).returncode:
         return {}
     return {"LOCPATH": str(folder), "LC_ALL": "de_DE.UTF-8", "LANG": "de_DE.UTF-8"}
 
@@ -302,24 +241,20 @@ def test_hostile_environment(tmp_path, shim):
     ts.write_mesh(tmp_path / "beam.msh", ts.box_mesh((4, 1, 1), (4.5, 1.25, 1)))
     assert "-2.25" in (tmp_path / "beam.msh").read_text()  # decimal points in text
     path = write(tmp_path / "beam.py", BEAM.replace("ts.box_mesh((4, 1, 1), (4, 2, 2))", 'ts.read_mesh(__file__[:-2] + "msh")'))
-    assert run(path, "--out", tmp_path / "plain") == 0
+    assert run(path, "--out", tmp_path / "plain", "--no-frames") == 0
     (tmp_path / "file").write_text("no folder")
     commas = german(tmp_path)
-    environment = commas | {
-        "LD_PRELOAD": str(shim),
-        "JUMP": "100000",
-        "HOME": None,
-        "XDG_CACHE_HOME": str(tmp_path / "file" / "cache"),
-    }
-    arguments = ("run", path, "--headless", "--out", tmp_path / "hostile")
+    cache = {"HOME": None, "XDG_CACHE_HOME": str(tmp_path / "file" / "cache")}
+    environment = commas | cache | {"LD_PRELOAD": str(shim), "JUMP": "100000"}
+    arguments = ("run", path, "--headless", "--no-frames", "--out", tmp_path / "hostile")
     done = python(HOSTILE + "sys.exit(main(sys.argv[1:]))", *arguments, **environment)
     assert done.returncode == 0 and "status   ok" in done.stdout, done.stderr
     point, jump = re.match(r"point (.) jump (\S+)\n", done.stdout).groups()
     assert float(jump) > 1e4 and point == ("," if commas else ".")
     plain, hostile = ({f.relative_to(out): f for f in out.rglob("*.*")} for out in (tmp_path / "plain", tmp_path / "hostile"))
-    assert set(plain) == set(hostile) and len(plain) == 8
+    assert set(plain) == set(hostile) and len(plain) == 4
     for name in plain:
-        if name.suffix in (".csv", ".png"):
+        if name.suffix == ".csv":
             assert plain[name].read_bytes() == hostile[name].read_bytes(), name
     stages = [Sdf.Layer.OpenAsAnonymous(str(files[Path("scene.usdc")])).ExportToString() for files in (plain, hostile)]
     assert stages[0] == stages[1] and "vonMisesStress" in stages[0]
@@ -332,8 +267,6 @@ def test_hostile_environment(tmp_path, shim):
         pytest.skip("passed without decimal commas: no such locale can be compiled here")
 
 
-# --- memory and numbers ---------------------------------------------------------------------------------------------
-
 LIMITED_MEMORY = """
 import resource, sys
 import taisoft.cli.run
@@ -342,14 +275,7 @@ used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesi
 resource.setrlimit(resource.RLIMIT_AS, (used + int(sys.argv[1]),) * 2)
 sys.exit(taisoft.cli.main(["run", sys.argv[2], "--headless", "--out", sys.argv[3]]))
 """
-LARGE_BUFFERS = """
-import taisoft as ts
-
-
-def build():
-    scene = ts.Scene()
-    scene.add_body(ts.box_mesh((2, 1, 1), (2, 1, 1)), ts.Material(young=1e5), name="part")
-    scene.add_obstacle(ts.HalfSpace((0, -2, 0), (0, 1, 0)))
+LARGE_BUFFERS = """    scene.add_obstacle(ts.HalfSpace((0, -2, 0), (0, 1, 0)))
     scene.collision = ts.CollisionSettings(initial_capacity=100_000_000)
     return scene
 """
@@ -357,22 +283,20 @@ def build():
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="memory in use is read from /proc")
 def test_too_little_memory(tmp_path):
-    done = python(LIMITED_MEMORY, 4 * 10**9, write(tmp_path / "scene.py", LARGE_BUFFERS), tmp_path / "out")
+    path = write(tmp_path / "scene.py", BEAM.replace("    return scene\n", LARGE_BUFFERS))
+    done = python(LIMITED_MEMORY, 4 * 10**9, path, tmp_path / "out")
     assert done.returncode == 2, done.stdout + done.stderr
-    pattern = (
-        r"taisoft: .+/scene\.py: not enough memory for the array '.*: (\d+) bytes \(.*\) are needed.*, available: (\d+) bytes"
-    )
-    found = re.match(pattern, done.stderr)
+    needed = r"taisoft: .+/scene\.py: not enough memory for the array '.*: (\d+) bytes .* are needed.*, available: (\d+) bytes"
+    found = re.match(needed, done.stderr)
     assert found and int(found[1]) > int(found[2]) and done.stderr.count("\n") == 1, done.stderr
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize("ground", [False, True])
-def test_nan_during_a_run(tmp_path, monkeypatch, ground):
+def test_nan_during_a_run(tmp_path, monkeypatch):
     """A velocity becomes NaN after step 2; step 3 finds it, before contact detection does."""
-    scene = small_scene()
-    if ground:
-        scene.add_obstacle(ts.HalfSpace((0, -0.55, 0), (0, 1, 0)))
+    scene = ts.Scene()
+    scene.add_body(ts.box_mesh((2, 1, 1), (2, 1, 1)), ts.Material(young=1e5), name="part")
+    scene.add_obstacle(ts.HalfSpace((0, -0.55, 0), (0, 1, 0)))
     checkpoints, shown = CheckpointWriter(tmp_path, every=0.001), []
 
     class FaultyDynamics(simulator.Dynamics):

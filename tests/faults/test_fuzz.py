@@ -24,14 +24,8 @@ from tests.scene.toml_scenes import TEXT
 from tests.view.fake_simulator import beam_scene
 
 MESH = ts.box_mesh((2, 1, 1), (2, 1, 1), pattern="six")
-GMSH = {
-    "part.msh": "gmsh",
-    "text.msh": ("gmsh", False),
-    "old.msh": ("gmsh22", False),
-    "older.msh": "gmsh22",
-    "ansys.msh": ("ansys", False),
-}
-OTHERS = "vtk vtu mesh meshb vol su2 xml dat bdf nas fem inp mdpa avs f3grid post ugrid node".split()
+GMSH = {"part.msh": ("gmsh", True), "text.msh": ("gmsh", False), "old.msh": ("gmsh22", False), "ansys.msh": ("ansys", False)}
+OTHERS = "vtk vtu mesh meshb xml bdf inp avs node".split()
 TEXTS = (b"-1", b"9", b"nan", b"1e400", b" ", b"\n", b"$End", b"99999", b"3000000")
 PIECES = (*TEXTS, b"\0", b"\xff\xfe", b"\xff\xff\xff\x7f", b"\0\0\0@")
 SIZES = (0, -1, 10**5, 10**6, 10**7, 10**9, 2**31, 2**32 - 1, 2**63, 10**30)
@@ -45,8 +39,7 @@ def samples(tmp_path_factory) -> dict[str, bytes]:
     folder = tmp_path_factory.mktemp("samples")
     with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
         tets, triangles = (meshio.Mesh(MESH.vertices, [cells]) for cells in (("tetra", MESH.tets), ("triangle", MESH.surface)))
-        for name, kind in GMSH.items():
-            kind, binary = kind if isinstance(kind, tuple) else (kind, True)
+        for name, (kind, binary) in GMSH.items():
             meshio.write(folder / name, tets, file_format=kind, binary=binary)
         meshio.write(folder / "text.vtk", tets, binary=False)
         for ending in OTHERS:
@@ -126,21 +119,19 @@ def time_out(*_):
     raise ReaderTimeoutError(f"a reader took more than {SECONDS} s")
 
 
-@pytest.mark.parametrize("n, seed", [(50, 1), pytest.param(10_000, 2, marks=pytest.mark.long)])
-def test_readers_survive_mutated_files(tmp_path, samples, n, seed):
+def test_readers_survive_mutated_files(tmp_path, samples):
     """After a failure tmp_path holds the file."""
-    rng, names = random.Random(seed), sorted(samples)
+    rng = random.Random(1)
     before = signal.signal(signal.SIGALRM, time_out)
     (tmp_path / "file.ele").write_bytes(samples["part.ele"])
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            for name in names:  # unchanged files first, so that imports and caches do not count as a file's memory
-                (tmp_path / f"file.{name.rsplit('.', 1)[1]}").write_bytes(samples[name])
+            for name, data in sorted(samples.items()):
+                path = tmp_path / f"file.{name.rsplit('.', 1)[1]}"
+                path.write_bytes(data)  # unchanged at first, so that imports and caches do not count as a file's memory
                 with contextlib.suppress(ts.TaisoftError):  # meshio cannot read every file that it writes
-                    read(tmp_path / f"file.{name.rsplit('.', 1)[1]}")
-            for k in range(n):
-                name = names[k % len(names)] if k < 2 * len(names) else rng.choice(names)
-                check_reader(tmp_path / f"file.{name.rsplit('.', 1)[1]}", mutated(samples[name], rng))
+                    read(path)
+                check_reader(path, mutated(data, rng))
     finally:
         signal.signal(signal.SIGALRM, before)

@@ -75,10 +75,7 @@ class Oracle:
         self.v = np.where(~self._masks(), self.v, 0.0)
 
     def _masks(self):
-        mask = self.fixed.copy()
-        for _, prescribed, _ in self.prescribed:
-            mask |= prescribed
-        return mask
+        return np.any([self.fixed, *(prescribed for _, prescribed, _ in self.prescribed)], axis=0)
 
     def targets(self, t: float):
         """(positions, mask) of the led axes at a time; groups that let go are dropped, and the past with them."""
@@ -87,9 +84,7 @@ class Oracle:
         if len(still) < len(self.prescribed):
             self.prescribed, self.past, self.acceleration = still, [], None
         for nodes, prescribed, path in self.prescribed:
-            way = np.zeros((self.n, 3))
-            way[nodes] = path(t)
-            where = where + np.where(prescribed, way, 0.0)
+            where[nodes] += np.where(prescribed[nodes], path(t), 0.0)
             mask |= prescribed
         return where, mask
 
@@ -194,21 +189,19 @@ class Oracle:
 
     # --- implicit steps ---------------------------------------------------------------------------------------------
 
-    def prescribed_acceleration(self, dt: float, shares, weights):
-        """Second difference (n,3) of the led nodes' ways at shares of the step, over dt^2."""
-        total = np.zeros((self.n, 3))
-        for nodes, prescribed, path in self.prescribed:
-            way = np.zeros((self.n, 3))
-            way[nodes] = sum(w * np.asarray(path(self.time + share * dt)) for share, w in zip(shares, weights)) / dt**2
-            total += np.where(prescribed, way, 0.0)
-        return total
-
     def prescribed_v_hat(self, v_hat, way, prescribed, beta: float, dt: float, at_end: bool = False):
-        """v_hat with that of led axes such that (way - v_hat) / beta is their acceleration, where the mass couples nodes."""
+        """v_hat with that of led axes such that (way - v_hat) / beta is their acceleration, where the mass couples nodes.
+
+        The acceleration is a second difference of the ways at shares of the step.
+        """
         if np.count_nonzero(self.mass - np.diag(np.diag(self.mass))) == 0:
             return v_hat
-        rule = ((0, 1 / 3, 2 / 3, 1), (-9, 36, -45, 18)) if at_end else ((0, 0.5, 1), (4, -8, 4))
-        return np.where(prescribed, way - beta * self.prescribed_acceleration(dt, *rule), v_hat)
+        shares, weights = ((0, 1 / 3, 2 / 3, 1), (-9, 36, -45, 18)) if at_end else ((0, 0.5, 1), (4, -8, 4))
+        acceleration = np.zeros((self.n, 3))
+        for nodes, mask, path in self.prescribed:
+            second = sum(w * np.asarray(path(self.time + share * dt)) for share, w in zip(shares, weights)) / dt**2
+            acceleration[nodes] += np.where(mask[nodes], second, 0.0)
+        return np.where(prescribed, way - beta * acceleration, v_hat)
 
     def implicit_euler(self, dt: float, at_end: bool = False) -> None:
         """M (v1 - v0) = dt f(x0 + dt v1, v1)."""
@@ -279,16 +272,6 @@ class Oracle:
         self.past.append((x, v))
         self.time += dt
         self.reactions = np.where(self._masks(), self._residual, 0.0)
-
-    # --- statics ----------------------------------------------------------------------------------------------------
-
-    def static(self, time: float = 0.0, load_steps: int = 1):
-        """Positions (n,3) in equilibrium, the load and the way of the led nodes applied in equal parts, by dense Newton."""
-        goal, prescribed = self.targets(time)
-        free, x, load = ~(self.fixed | prescribed).reshape(-1), self.rest.copy(), self.applied()
-        for share in np.arange(1, load_steps + 1) / load_steps:
-            x = self.equilibrium(np.where(prescribed, self.rest + share * (goal - self.rest), x), share * load, free)
-        return x
 
     def equilibrium(self, x, load, free):
         """Positions (n,3) where dense Newton steps lead from x under a load (n,3) [N]; free: (3n,) bool."""

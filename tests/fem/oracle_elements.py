@@ -1,10 +1,9 @@
 """The finite elements once more, in NumPy and independent of the package: nodes, quadrature, shape functions, masses, loads.
 
-Shape functions are monomials times the inverse of the matrix of their values at a tet's nodes, in coordinates of its own
-size about its middle; masses and loads are their integrals.
+Shape functions are l_a, or l_a (2 l_a - 1) and 4 l_a l_b, in barycentric coordinates l; masses and loads are their integrals.
 """
 
-from itertools import combinations
+from itertools import permutations
 from typing import NamedTuple
 
 import numpy as np
@@ -12,28 +11,24 @@ import numpy as np
 EDGES = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))
 
 
-def _near_corners(a: float) -> list[tuple]:
-    """The four points whose barycentric coordinates are a three times."""
-    return [tuple(1 - 3 * a if k == near else a for k in range(4)) for near in range(4)]
+def _rule(*orbits: tuple[tuple, float]) -> tuple[np.ndarray, np.ndarray]:
+    """Barycentric points (k,4), all permutations of those given, and weights (k,) that add up to 1."""
+    points = [(point, w) for start, w in orbits for point in sorted(set(permutations(start)))]
+    return np.array([point for point, _ in points]), np.array([w for _, w in points])
 
 
-def _near_edges(a: float) -> list[tuple]:
-    """The six points whose barycentric coordinates are a twice and 1/2 - a twice."""
-    return [tuple(0.5 - a if k in pair else a for k in range(4)) for pair in combinations(range(4), 2)]
+def _near(a: float) -> tuple:
+    return a, a, a, 1 - 3 * a
 
 
-def _rule(*orbits: tuple[list, float]) -> tuple[np.ndarray, np.ndarray]:
-    """Barycentric points (k,4) and weights (k,) that add up to 1."""
-    return np.array([p for points, _ in orbits for p in points]), np.array([w for points, w in orbits for _ in points])
-
-
+MIDDLE = 0.0455037041256496
 RULES = {  # by the degree asked for
-    1: _rule(([(0.25,) * 4], 1.0)),
-    2: _rule((_near_corners(0.1381966011250105), 0.25)),  # (5 - sqrt 5) / 20
+    1: _rule((_near(0.25), 1.0)),
+    2: _rule((_near(0.1381966011250105), 0.25)),  # (5 - sqrt 5) / 20
     4: _rule(  # exact for degree 5
-        (_near_corners(0.3108859192633006), 0.1126879257180159),
-        (_near_corners(0.0927352503108912), 0.0734930431163619),
-        (_near_edges(0.0455037041256496), 0.0425460207770815),
+        (_near(0.3108859192633006), 0.1126879257180159),
+        (_near(0.0927352503108912), 0.0734930431163619),
+        ((MIDDLE, MIDDLE, 0.5 - MIDDLE, 0.5 - MIDDLE), 0.0425460207770815),
     ),
 }
 
@@ -59,20 +54,14 @@ def mesh_nodes(mesh, order: int) -> tuple[np.ndarray, np.ndarray]:
     return np.concatenate([mesh.vertices, (mesh.vertices[a] + mesh.vertices[b]) / 2]), np.c_[mesh.tets, middles]
 
 
-def _monomials(X: np.ndarray, order: int) -> np.ndarray:
-    """(..., 4 or 10) of X (...,3)."""
-    x, y, z = np.moveaxis(X, -1, 0)
-    one = np.ones_like(x)
-    return np.stack([one, x, y, z, x * x, y * y, z * z, x * y, x * z, y * z][: 4 if order == 1 else 10], axis=-1)
-
-
-def _monomial_gradients(X: np.ndarray, order: int) -> np.ndarray:
-    """(..., 4 or 10, 3) of X (...,3)."""
-    x, y, z = np.moveaxis(X, -1, 0)
-    o, one = np.zeros_like(x), np.ones_like(x)
-    rows = [(o, o, o), (one, o, o), (o, one, o), (o, o, one), (2 * x, o, o), (o, 2 * y, o), (o, o, 2 * z)]
-    rows += [(y, x, o), (z, o, x), (o, z, y)]
-    return np.stack([np.stack(row, axis=-1) for row in rows[: 4 if order == 1 else 10]], axis=-2)
+def _shapes(l: np.ndarray, order: int) -> tuple[np.ndarray, np.ndarray]:
+    """Shape functions (k,a) at barycentric points l (k,4), and their derivatives (k,a,4) by l."""
+    I, (a, b) = np.eye(4), np.transpose(EDGES)
+    if order == 1:
+        return l, np.broadcast_to(I, (len(l), 4, 4))
+    at_edges = 4 * (l[:, a, None] * I[b] + l[:, b, None] * I[a])
+    values = np.concatenate([l * (2 * l - 1), 4 * l[:, a] * l[:, b]], axis=1)
+    return values, np.concatenate([(4 * l - 1)[:, :, None] * I, at_edges], axis=1)
 
 
 class Elements:
@@ -81,18 +70,15 @@ class Elements:
     def __init__(self, mesh, order: int):
         self.order = order
         self.X, self.tets = mesh_nodes(mesh, order)
-        corners = self.X[self.tets[:, :4]]
-        self.volumes = np.abs(np.linalg.det(corners[:, 1:] - corners[:, :1])) / 6
-        self.middle, self.size = corners.mean(axis=1)[:, None], np.ptp(corners, axis=1).max()
-        self.coefficients = np.linalg.inv(_monomials((self.X[self.tets] - self.middle) / self.size, order))
+        self.corners = self.X[self.tets[:, :4]]
+        self.volumes = np.abs(np.linalg.det(self.corners[:, 1:] - self.corners[:, :1])) / 6
+        self.slopes = np.linalg.inv(np.insert(self.corners, 3, 1.0, axis=2))[:, :3]  # (m,3,4) of the barycentric coordinates
 
     def at(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Places (m,k,3), shape functions (m,k,a) and their gradients (m,k,a,3) at barycentric points (k,4)."""
-        places = points @ self.X[self.tets[:, :4]]
-        local = (places - self.middle) / self.size
-        N = np.einsum("ekc,eca->eka", _monomials(local, self.order), self.coefficients)
-        g = np.einsum("ekcj,eca->ekaj", _monomial_gradients(local, self.order), self.coefficients) / self.size
-        return places, N, g
+        N, slopes = _shapes(points, self.order)
+        g = np.einsum("kab,ejb->ekaj", slopes, self.slopes)
+        return points @ self.corners, np.broadcast_to(N, g.shape[:-1]), g
 
     def part(self, degree: int, material, start: int) -> Part:
         """What the forces need; the nodes count from `start` in the scene."""
@@ -103,7 +89,9 @@ class Elements:
 
     def consistent_mass(self, density) -> np.ndarray:
         """(n,n) integrals of density N_a N_b [kg]."""
-        return self._assembled(self._mass_blocks(density))
+        M = np.zeros((len(self.X), len(self.X)))
+        np.add.at(M, (self.tets[:, :, None], self.tets[:, None, :]), self._mass_blocks(density))
+        return M
 
     def lumped_mass(self, density) -> np.ndarray:
         """(n,) the diagonal of each tet's consistent mass, scaled to the tet's mass (Hinton, Rock, Zienkiewicz) [kg]."""
@@ -116,27 +104,17 @@ class Elements:
         N = self.at(points)[1]
         return np.einsum("e,k,eka,ekb->eab", density * self.volumes, weights, N, N)
 
-    def _assembled(self, blocks: np.ndarray) -> np.ndarray:
-        M = np.zeros((len(self.X), len(self.X)))
-        np.add.at(M, (self.tets[:, :, None], self.tets[:, None, :]), blocks)
-        return M
-
 
 def body_loads(body, X: np.ndarray, lumped: np.ndarray) -> np.ndarray:
     """Nodal forces (n,3) [N] of a body's tractions and forces.
 
-    Of a triangle's load, a linear one gives a third to each corner. A quadratic one gives it to its middles: the rule whose
-    points are the middles is exact for its shape functions, and each is 1 at its own node and 0 at the others.
+    A triangle's load goes in thirds to its corners, of a quadratic one to its middles: the rule whose points they are is exact.
     """
     f = np.zeros_like(X)
-    vertices = body.mesh.vertices
     for traction in body.tractions:
-        for triangle in body.mesh.surface[traction.triangles]:
-            a, b, c = vertices[triangle]
-            takers = triangle
-            if body.order == 2:
-                middles = [(a + b) / 2, (b + c) / 2, (c + a) / 2]
-                takers = [np.linalg.norm(X - middle, axis=1).argmin() for middle in middles]
+        for a, b, c in body.mesh.vertices[body.mesh.surface[traction.triangles]]:
+            places = (a, b, c) if body.order == 1 else ((a + b) / 2, (b + c) / 2, (c + a) / 2)
+            takers = [np.linalg.norm(X - place, axis=1).argmin() for place in places]
             f[takers] += traction.value * np.linalg.norm(np.cross(b - a, c - a)) / 2 / 3
     for force in body.forces:
         share = lumped[force.nodes, None] / lumped[force.nodes].sum()

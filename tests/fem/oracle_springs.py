@@ -3,67 +3,65 @@
 Points are found by trying every tet, stiffness by the complex step; nothing is shared with the package.
 """
 
+from itertools import pairwise
+
 import numpy as np
 
-EDGES = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))
+from tests.fem.oracle_elements import EDGES
 
 
 def shape_row(body, point: np.ndarray) -> np.ndarray:
     """Weights (n_nodes,) of a body's nodes that give a point (3,) of the body at rest."""
-    best, found = -np.inf, None
-    for tet in body.mesh.tets:
-        corners = np.column_stack([body.mesh.vertices[tet], np.ones(4)])
-        own = np.linalg.solve(corners.T, np.append(point, 1.0))
-        if own.min() > best:
-            best, found = own.min(), (tet, own)
-    (tet, own), row = found, np.zeros(body.n_nodes)
-    if body.order == 1:
-        row[tet] = own
-        return row
-    row[tet] = own * (2 * own - 1)
-    for a, b in EDGES:
+    corners = np.insert(body.mesh.vertices[body.mesh.tets], 3, 1.0, axis=2)
+    weights = np.linalg.solve(corners.swapaxes(1, 2), np.append(point, 1.0)[:, None])[..., 0]
+    best = weights.min(axis=1).argmax()
+    tet, own, row = body.mesh.tets[best], weights[best], np.zeros(body.n_nodes)
+    row[tet] = own if body.order == 1 else own * (2 * own - 1)
+    for a, b in EDGES if body.order == 2 else ():
         middle = body.mesh.vertices[tet[[a, b]]].mean(axis=0)
         row[np.argmin(np.linalg.norm(body.rest_positions - middle, axis=1))] += 4 * own[a] * own[b]
     return row
 
 
 class OracleSprings:
-    """Elements (row (n,), offset (3,), stiffness, rest length, damping, tension) of all connections of a scene, by name.
+    """All connections of a scene: elements e = row x + offset (m of them), in lines that share a tension.
 
-    elastic: of each elastic tendon (rows, offsets) of its segments, stiffness and length.
+    energy = sum k (l - L)^2 / 2 + T l over the lines, of length l; those that slacken have none of the first where l < L.
     """
 
     def __init__(self, scene):
-        self.scene, self.elements = scene, {}
+        self.scene, self.elements, self.line, numbers = scene, [], [], []
         self.first = dict(zip((b.name for b in scene.bodies), np.cumsum([0, *(b.n_nodes for b in scene.bodies)])))
         self.n = sum(body.n_nodes for body in scene.bodies)
-        for one in scene.springs:
-            ends = [self.point(p.owner, p.position) for p in one.points]
-            length = one.rest_length
+        rest = np.concatenate([body.rest_positions + body.position for body in scene.bodies])
+
+        def add(points, stiffness, length, damping=0.0, tension=0.0, slackens=False) -> None:
+            ends = [self.point(*point) for point in points]
+            made = [(p[0] - q[0], p[1] - q[1]) for p, q in pairwise(ends) if slackens or p[0].any() or q[0].any()]
+            self.elements += made
+            self.line += [len(numbers)] * len(made)
             if length is None:
-                length = np.linalg.norm(self.start(*ends[0]) - self.start(*ends[1]))
-                length = 0.0 if length < 1e-12 else length
-            self.elements[one.name] = [self.between(*ends, one.stiffness, length, one.damping, 0.0)]
-        self.elastic = {}
+                row, offset = self.elements[-1]
+                length = np.linalg.norm(row @ rest + offset).round(12)
+            numbers.append((stiffness, length, damping, tension, slackens))
+
+        for one in scene.springs:
+            add([(p.owner, p.position) for p in one.points], one.stiffness, one.rest_length, one.damping)
         for one in scene.tendons:
-            tension, ends = float(one.value), [self.point(p.owner, p.position) for p in one.points]
-            if one.stiffness is not None:
-                segments = [(p[0] - q[0], p[1] - q[1]) for p, q in zip(ends, ends[1:])]
-                self.elastic[one.name] = (segments, one.stiffness, float(one.value))
-                continue
-            self.elements[one.name] = [self.between(p, q, 0.0, 0.0, 0.0, tension) for p, q in zip(ends, ends[1:])]
+            given = (one.stiffness, float(one.value), 0.0, 0.0, True) if one.stiffness else (0.0, 0.0, 0.0, float(one.value))
+            add([(p.owner, p.position) for p in one.points], *given)
         for one in scene.attachments:
-            a = scene.body(one.a)
-            made = []
-            for node in one.nodes:
-                own = self.point(a.name, a.rest_positions[node])
-                place = a.rest_positions[node] + a.position
-                if one.b in self.first:
-                    place = place - scene.body(one.b).position
-                made.append(self.between(own, self.point(one.b, place), one.stiffness, 0.0, one.damping, 0.0))
-            self.elements[one.name] = made
+            a, b = scene.body(one.a), scene.body(one.b) if one.b in self.first else None
+            shift = a.position - (b.position if b else 0.0)
+            for place in a.rest_positions[one.nodes]:
+                add([(one.a, place), (one.b, place + shift)], one.stiffness, 0.0, one.damping)
+        self.rows, self.offsets = (np.array(part) for part in zip(*self.elements))
+        self.k, self.L, self.c, self.T, self.slackens = np.array(numbers).T
+        self.isotropic = ((self.L == 0) & (self.T == 0))[self.line]
+        self.of_line = np.eye(len(numbers))[self.line]
 
     def point(self, owner: str, position):
+        """The row (n,) and offset (3,) of a point."""
         row = np.zeros(self.n)
         if owner not in self.first:
             return row, np.array(position)
@@ -71,52 +69,27 @@ class OracleSprings:
         row[self.first[owner] : self.first[owner] + body.n_nodes] = shape_row(body, np.array(position))
         return row, np.zeros(3)
 
-    def start(self, row, offset):
-        rest = np.concatenate([body.rest_positions + body.position for body in self.scene.bodies])
-        return row @ rest + offset
-
-    @staticmethod
-    def between(p, q, *numbers):
-        return (p[0] - q[0], p[1] - q[1], *numbers)
-
-    @property
-    def all(self) -> list:
-        """Elements of all connections, without those between two obstacles, which move nothing."""
-        return [one for own in self.elements.values() for one in own if np.any(one[0])]
+    def _lines(self, x):
+        """Directions of the elements, and length and stretch of the lines; x may be complex."""
+        e = self.rows @ x + self.offsets
+        l = np.sqrt((e * e).sum(axis=1))
+        stretch = l @ self.of_line - self.L
+        return e / np.where(l == 0, 1.0, l)[:, None], l @ self.of_line, np.where(self.slackens * (stretch.real < 0), 0.0, stretch)
 
     def energy(self, x) -> float:
-        """sum k (l - L)^2 / 2 + T l [J]; x may be complex."""
-        total = 0.0
-        for row, offset, k, length, _, tension in self.all:
-            e = row @ x + offset
-            if length == 0.0 and tension == 0.0:
-                total += 0.5 * k * (e @ e)
-            else:
-                l = np.sqrt(e @ e)
-                total += 0.5 * k * (l - length) ** 2 + tension * l
-        return total + sum(0.5 * self.tension(name, x) ** 2 / k for name, (_, k, _) in self.elastic.items())
-
-    def tension(self, name: str, x):
-        """Tension [N] of an elastic tendon; x may be complex."""
-        segments, k, length = self.elastic[name]
-        stretch = sum(np.sqrt(e @ e) for e in (row @ x + offset for row, offset in segments)) - length
-        return k * stretch if np.real(stretch) > 0.0 else 0.0 * stretch
+        """[J]."""
+        _, length, stretch = self._lines(x)
+        return self.k @ stretch**2 / 2 + self.T @ length
 
     def force(self, x, v=None) -> np.ndarray:
         """Forces (n,3) [N], with damping if there are velocities; x may be complex."""
-        f = np.zeros((self.n, 3), dtype=x.dtype)
-        for row, offset, k, length, c, tension in self.all:
-            e, rate = row @ x + offset, np.zeros(3) if v is None else row @ v
-            if length == 0.0 and tension == 0.0:
-                f -= np.outer(row, k * e + c * rate)
-            else:
-                l = np.sqrt(e @ e)
-                f -= np.outer(row, (k * (l - length) + tension + c * (rate @ e) / l) * e / l)
-        for name, (segments, *_) in self.elastic.items():
-            for row, offset in segments:
-                e = row @ x + offset
-                f -= self.tension(name, x) * np.outer(row, e / np.sqrt(e @ e))
-        return f
+        d, _, stretch = self._lines(x)
+        pull = (self.k * stretch + self.T)[self.line, None] * d
+        if v is not None:
+            rate = self.rows @ v
+            along = np.where(self.isotropic[:, None], rate, (rate * d).sum(axis=1, keepdims=True) * d)
+            pull = pull + self.c[self.line, None] * along
+        return -self.rows.T @ pull
 
     def stiffness(self, x) -> np.ndarray:
         """-df/dx (3n,3n) [N/m] without damping, by the complex step."""

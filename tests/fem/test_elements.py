@@ -1,8 +1,11 @@
-"""Linear and quadratic tetrahedra on the host; `test_model` compares nodes and masses with the oracle:
+"""Linear and quadratic tetrahedra, and the device arrays of a scene with both, of several laws and numbers by tet:
 
 * shape functions sum to 1, are 1 at their own node and 0 at the others, and have the stated derivatives;
 * quadrature rules have positive weights, points inside, and integrate polynomials of their degree exactly;
-* gradients reproduce polynomials of the element's order, masses integrate their squares, tractions do their work.
+* gradients reproduce polynomials of the element's order, masses integrate their squares;
+* nodes keep the order of the bodies (`test_elasticity` has lanes, quadrature and gathering);
+* masses, also the consistent ones, and loads are those of the oracle and add up to the given totals; linear bodies alone have
+  lumped masses.
 """
 
 from itertools import product
@@ -13,9 +16,12 @@ import pytest
 
 import taisoft as ts
 from taisoft.fem import reference
+from taisoft.fem.loads import SceneLoads
 from taisoft.mesh.nodes import shape_functions
 from taisoft.mesh.topology import EDGES
-from tests.dynamics.scenes import cube, rubber
+from tests.dynamics.scenes import built, cube, driven_scene, mixed_scene, rubber
+from tests.fem.composition import composition
+from tests.fem.oracle import Oracle
 from tests.fem.oracle_elements import Elements
 
 ORDERS = (1, 2)
@@ -82,11 +88,47 @@ def test_polynomials_of_the_elements_order(order, degree):
     assert reference.gravity_mass(made) == pytest.approx(np.asarray(M.sum(axis=1)).ravel())
     lumped = reference.lumped_mass(made)
     assert lumped == pytest.approx(Elements(made.mesh, order).lumped_mass(1200.0)) and lumped.sum() == pytest.approx(1200 * 0.99)
-    face, t = np.arange(6), np.array([1.0, -2.0, 0.5])
-    f = np.outer(reference.triangle_areas(made, face), t)  # its work, by a rule of degree 3
-    X = made.mesh.vertices[made.mesh.surface[face]]
-    area = np.linalg.norm(np.cross(X[:, 1] - X[:, 0], X[:, 2] - X[:, 0]), axis=1) / 2
-    points = np.array([(1 / 3, 1 / 3, 1 / 3), (0.6, 0.2, 0.2), (0.2, 0.6, 0.2), (0.2, 0.2, 0.6)])
-    weights = np.array([-27, 25, 25, 25]) / 48
-    exact = np.einsum("e,p,epi,i->", area, weights, field(points @ X), t)
-    assert np.sum(f * u) == pytest.approx(exact, rel=1e-12)
+
+
+@pytest.fixture(scope="module")
+def rig():
+    with built(composition(1, 2), "f64") as rig:
+        yield rig
+
+
+def test_nodes_and_masses(rig):
+    counts, m = [43, 8, 8], rig.model
+    assert list(rig.layout.node_start) == list(np.cumsum([0, *counts])) and m.n_nodes == sum(counts)
+    assert np.array_equal(rig.layout.rest, rig.oracle.rest) and rig.layout.rest[0, 0] == 0.0  # position of the body included
+    lumped, M = rig.oracle.lumped[:, 0], rig.oracle.mass
+    assert m.mass.to_numpy() == pytest.approx(lumped) and reference.lumped_masses(rig.scene) == pytest.approx(lumped)
+    assert np.abs(reference.mass_matrix(rig.scene).toarray() - M).max() < 1e-13 * M.max()
+    weight = rig.oracle.consistent.sum(axis=1)
+    assert reference.gravity_masses(rig.scene) == pytest.approx(weight) and m.gravity_mass.to_numpy() == pytest.approx(weight)
+    assert [body.mass for body in rig.scene.bodies] == pytest.approx([part.sum() for part in np.split(lumped, [43, 51])])
+    start, column, stored = (getattr(m.mass_matrix, name).to_numpy() for name in ("row_start", "column", "value"))
+    on_device = np.diag(m.mass_matrix.diagonal.to_numpy())
+    on_device[np.repeat(np.arange(2 * m.n_nodes), np.diff(start)) % m.n_nodes, column] = stored
+    assert m.consistent and np.abs(on_device - M).max() < 1e-13 * M.max()
+
+
+def test_linear_bodies_have_lumped_masses():
+    with built(mixed_scene(), "f64") as rig:
+        assert rig.model.mass_matrix is None and not rig.model.consistent
+        assert rig.model.gravity_mass.to_numpy() == pytest.approx(rig.oracle.lumped[:, 0])
+
+
+@pytest.mark.parametrize("order", [1, 2])
+def test_loads_equal_the_oracle_and_add_up(order):
+    scene = mixed_scene(order=order)
+    oracle, total = Oracle(scene), SceneLoads(scene).at(0.0)
+    first, second, third, _ = oracle.starts[1:]
+    assert total == pytest.approx(oracle.loads) and not total[second:].any()
+    assert total[:first].sum(axis=0) == pytest.approx(0.9 * 1.1 * np.array([300, 2000, -500]))
+    assert total[first:second].sum(axis=0) == pytest.approx([30, -10, 20])
+    driven = driven_scene(order=order)
+    assert SceneLoads(driven).at(0.0) == pytest.approx(Oracle(driven).loads)
+    forces = np.random.default_rng(0).standard_normal((3, 3))  # one for each node
+    scene.body("tower").add_force([4, 2, 7], forces)
+    added = SceneLoads(scene).at(0.0) - total
+    assert np.abs(added[second + np.array([4, 2, 7])] - forces).max() < 1e-12 and np.count_nonzero(added) == 9

@@ -1,24 +1,26 @@
 """Forces of every term in a random state of linear and quadratic bodies, in f64:
 
 * they are minus the finite difference of the energies;
-* internal forces and closed pressures have no resultant force or moment, elastic ones on each body, and rotate with the state;
-  other loads do not depend on it;
-* dampers act by the rates of each body.
+* dampers act by the rates of each body;
+* forces and stiffness of nodes that depend on others, x = T q, act on those as T^T f and T^T K T.
 """
 
 import numpy as np
 import pytest
 import taichi as ti
 
+import taisoft as ts
 from taisoft.backend.runtime import kernel
+from taisoft.fem.dependents import dependent_table, force_with_dependents
 from taisoft.fem.measure import measure
 from taisoft.fem.model import damping_table
+from taisoft.fem.node_graph import EVERYTHING
 from taisoft.fem.state import ELASTIC, GRAVITY, LOADS
 from taisoft.fem.terms import TERMS, elasticity, gravity, rayleigh_damping, rigid_damping
 from taisoft.linear import block_csr
 from taisoft.linear.block_csr import row_times
-from tests.collision.rotations import rotation
-from tests.dynamics.scenes import built, driven_scene
+from tests.dynamics.scenes import built, cube, driven_scene, rubber
+from tests.fem.oracle_springs import shape_row
 
 POTENTIALS = tuple(term for term in TERMS if term is not rigid_damping)  # damps rigid bodies: tests/dynamics
 
@@ -29,17 +31,18 @@ def forces_of(m: ti.template(), terms: ti.template(), out: ti.types.ndarray()):
     for n, term in ti.static(enumerate(terms)):
         ti.loop_config(serialize=True)
         for i in range(m.n_nodes):
-            f = term.force(m, i)
+            f = force_with_dependents(m, term, i)
             for axis in ti.static(range(3)):
                 out[n, i, axis] = f[axis]
 
 
 @kernel
-def damping_of(m: ti.template(), damper: ti.template(), mass: ti.template(), stiffness: ti.template()):
-    """Forces of both dampers on every node."""
+def damping_of(m: ti.template(), damper: ti.template(), mass: ti.template(), stiffness: ti.template(), decayed: ti.template()):
+    """Forces of both dampers on every node, and its velocity after a decay of 0.1 s."""
     ti.loop_config(serialize=True)
     for i in range(m.n_nodes):
         mass[i] = rayleigh_damping.mass_force(m, i, m.state.v[i])
+        decayed[i] = rayleigh_damping.mass_decay(m, i, 0.1) * m.state.v[i]
         stiffness[i] = rayleigh_damping.stiffness_force(m, i, row_times(m, damper, 0, i, m.state.v))
 
 
@@ -59,9 +62,10 @@ def forces(rig, x: np.ndarray) -> dict:
     """The force (n,3) [N] of each term."""
     rig.model.state.x.from_numpy(x)
     elasticity.elastic_forces(rig.model)
-    out = np.zeros((len(POTENTIALS), *x.shape))
-    forces_of(rig.model, POTENTIALS, out)
-    return dict(zip(POTENTIALS, out))
+    terms = tuple(rig.model.terms)
+    out = np.zeros((len(terms), *x.shape))
+    forces_of(rig.model, terms, out)
+    return dict(zip(terms, out))
 
 
 def energies(rig, x: np.ndarray) -> np.ndarray:
@@ -86,25 +90,9 @@ def test_forces_are_minus_the_energy_gradient(rig):
         assert slopes[0] + slopes[2] == pytest.approx(sum(f.values()) - f[gravity], rel=1e-6, abs=1e-4)
 
 
-def test_rigid_motions_rotate_internal_forces(rig):
-    R = rotation((1.0, -2.0, 0.5), 0.7)
-    found, moved = forces(rig, rig.x), forces(rig, rig.x @ R.T + (0.3, -0.2, 0.1))
-    for term, f in found.items():
-        if term.LOAD and not term.STIFFNESS:
-            assert np.array_equal(moved[term], f)
-            continue
-        tolerance = 1e-10 * np.abs(f).max()
-        assert np.abs(moved[term] - f @ R.T).max() < tolerance
-        start = rig.start if term is elasticity else rig.start[[0, -1]]  # springs act between bodies
-        for first, last in zip(start[:-1], start[1:]):
-            force, x = f[first:last], rig.x[first:last]
-            assert np.abs(force.sum(axis=0)).max() < 100 * tolerance
-            assert np.abs(np.cross(x, force).sum(axis=0)).max() < 100 * tolerance
-
-
 def test_dampers_act_by_the_rates_of_each_body(rig):
     m, rng = rig.model, np.random.default_rng(7)
-    outs = [rig.vectors(f"term_{k}") for k in range(2)]
+    outs = [rig.vectors(f"term_{k}") for k in range(3)]
     matrix = block_csr.build_block_csr(m, rig.arena, "test_damper")
     for field in (matrix.value, matrix.diagonal):
         field.from_numpy(block_csr.packed(rng.standard_normal((*field.shape, 3, 3))))
@@ -113,8 +101,29 @@ def test_dampers_act_by_the_rates_of_each_body(rig):
     v = rng.standard_normal(rig.x.shape)
     m.state.v.from_numpy(v)
     damping_of(m, matrix, *outs)
-    mass, stiffness = (out.to_numpy() for out in outs)
+    mass, stiffness, decayed = (out.to_numpy() for out in outs)
     assert np.abs(mass + drag[:, None] * v).max() <= 1e-12 * np.abs(mass).max()
+    assert np.abs(decayed - np.exp(-0.1 * rates)[:, None] * v).max() < 1e-14 * np.abs(v).max()
     rates = np.where(np.arange(len(v)) < rig.start[1], 0.004, 0.0)[:, None]  # the flyer has none
     expected = -rates * (block_csr.to_scipy(m, matrix) @ v.reshape(-1)).reshape(-1, 3)
     assert np.abs(stiffness - expected).max() < 1e-12 * np.abs(expected).max()
+
+
+def test_forces_and_stiffness_of_dependent_nodes_act_on_the_others():
+    scene = ts.Scene()
+    bodies = [scene.add_body(cube(), rubber(), name=name, position=(0.7 * k, 0, 0)) for k, name in enumerate("ab")]
+    scene.attach("b", [0, 2], "a", name="joint")
+    T = np.eye(16)
+    for node in (8, 10):
+        T[node] = np.append(shape_row(bodies[0], bodies[1].rest_positions[node - 8] + (0.7, 0, 0)), np.zeros(8))
+    assert np.abs(dependent_table(scene).matrix.toarray() - T).max() < 1e-12
+    with built(scene, "f64") as rig:
+        q, own = rig.oracle.rest + 0.05 * np.random.default_rng(3).standard_normal((16, 3)), np.delete(np.arange(16), [8, 10])
+        f, wanted = forces(rig, q)[elasticity], T.T @ rig.oracle.force(T @ q)
+        assert np.abs(f - wanted)[own].max() < 1e-12 * np.abs(wanted).max()
+        matrix = block_csr.build_block_csr(rig.model, rig.arena)
+        block_csr.assemble(rig.model, matrix, EVERYTHING, False)
+        axes = (3 * own[:, None] + np.arange(3)).reshape(-1)
+        found, K = block_csr.to_scipy(rig.model, matrix).toarray(), rig.oracle.stiffness(T @ q)
+        wanted = np.kron(T, np.eye(3)).T @ K @ np.kron(T, np.eye(3))
+        assert np.abs(found - wanted)[np.ix_(axes, axes)].max() < 1e-12 * np.abs(wanted).max()

@@ -1,22 +1,22 @@
 """Gauss-Seidel over chunks with coupling terms, whether blocks couple chunks of one parity or not:
 
-* in chunks that threads may share, the nodes of a term outside the first chunk of each parity are last, ascending, and their
-  neighbours are known;
-* every iteration is that of NumPy's conjugate gradients with the triangle of the stated order, which contains all terms;
+* every iteration is that of NumPy's conjugate gradients with the triangle of the stated order, which contains all terms: in
+  chunks that threads may share, the nodes of a term outside the first chunk of each parity are last;
 * the result is the same bits on one thread and on several, and exact.
 """
 
 import numpy as np
 import pytest
+import scipy.sparse as sp
 import taichi as ti
 
 from taisoft.backend.arrays import FieldArena
 from taisoft.linear import block_csr, pcg
 from taisoft.linear.coupling import build_coupling
 from taisoft.linear.pcg_work import RZ, build_pcg
-from taisoft.linear.sweep_order import BESIDE, IS_LAST, find_last
+from taisoft.linear.sweep_order import find_last
 from tests.dynamics.scenes import built, mixed_scene
-from tests.linear.boxes import divided
+from tests.linear.boxes import divided, fill
 
 N_TERMS, WIDTH, FIXED = 30, 6, [2, 9]
 SHIFTS = {"layered": 5, "crossed": 4}  # three chunks of 32 nodes, of which blocks couple neighbours alone, and six of 16
@@ -27,32 +27,26 @@ def rig(request):
     name, shared = request.param
     with built(mixed_scene(order="both"), "f64") as made:
         arena, rng = FieldArena(), np.random.default_rng(4)
-        one, several = (divided(made.model, arena, SHIFTS[name], serial) for serial in (True, False))
-        m = several
-        made.models, made.order, made.shared, n = {True: one, False: several}, m.sweep, shared, m.n_nodes
+        made.models = {serial: divided(made.model, arena, SHIFTS[name], serial) for serial in (True, False)}
+        m = made.models[False]
+        made.order, made.shared, n = m.sweep, shared, m.n_nodes
         made.matrix, made.work = block_csr.build_block_csr(m, arena), build_pcg(m, arena)
         assert made.work.n_chunks == (3 if name == "layered" else 6) and made.matrix.crossed == (name == "crossed")
         free = np.ones((n, 3))
         free[FIXED] = 0.0
         m.free.from_numpy(free)
-        stiffness = made.oracle.stiffness(made.oracle.rest, projected=True) + 1e3 * np.eye(3 * n)
-        blocks = stiffness.reshape(n, 3, n, 3).transpose(0, 2, 1, 3)
-        start, column = made.matrix.row_start.to_numpy(), made.matrix.column.to_numpy()
-        row = np.repeat(np.arange(2 * n), np.diff(start)) % n
-        made.matrix.value.from_numpy(block_csr.packed(blocks[row, column]))
-        arity = rng.integers(1, WIDTH + 1, N_TERMS)
-        made.nodes = [np.sort(rng.choice(n // 2, k, replace=False)) * 2 for k in arity]  # no terms at odd nodes
+        K = made.oracle.stiffness(made.oracle.rest, projected=True) + 1e3 * np.eye(3 * n)
+        fill(m, made.matrix, sp.bsr_matrix(K, blocksize=(3, 3)))
+        made.nodes = [np.sort(rng.choice(n // 2, k, replace=False)) * 2 for k in rng.integers(1, WIDTH + 1, N_TERMS)]  # even
         weights, half = rng.uniform(-1, 1, (N_TERMS, WIDTH)), rng.standard_normal((N_TERMS, 3, 3))
-        D = 1e4 * half @ half.transpose(0, 2, 1)
-        active = np.arange(N_TERMS) % 7 != 0
-        made.coupling = upload_terms(made, arena, weights, D, active, block_csr.packed(blocks[np.arange(n), np.arange(n)]))
-        A = blocks.copy()
-        for c in np.flatnonzero(active):
-            own = made.nodes[c]
-            w = weights[c, : len(own)]
-            A[np.ix_(own, own)] += (w[:, None] * w)[:, :, None, None] * D[c]
-        made.A, made.free = A, free.reshape(-1) > 0.0
-        made.rhs = np.where(free > 0.0, rng.standard_normal((n, 3)), 0.0)
+        D, active = 1e4 * half @ half.transpose(0, 2, 1), np.arange(N_TERMS) % 7 != 0
+        made.A = K.reshape(n, 3, n, 3).transpose(0, 2, 1, 3).copy()
+        base = block_csr.packed(made.A[np.arange(n), np.arange(n)])
+        made.coupling = upload_terms(made, arena, weights, D, active, base)
+        for own, w, block in zip(*([part[k] for k in np.flatnonzero(active)] for part in (made.nodes, weights, D))):
+            w = w[: len(own)]
+            made.A[np.ix_(own, own)] += (w[:, None] * w)[:, :, None, None] * block
+        made.free, made.rhs = free.reshape(-1) > 0.0, np.where(free > 0.0, rng.standard_normal((n, 3)), 0.0)
         yield made
 
 
@@ -60,30 +54,15 @@ def upload_terms(made, arena, weights, D, active, base):
     m, node = made.model, np.zeros((N_TERMS, WIDTH), dtype=np.int32)
     for c, own in enumerate(made.nodes):
         node[c, : len(own)] = own
-    entries = sorted((int(i), WIDTH * c + j) for c, own in enumerate(made.nodes) for j, i in enumerate(own))
-    counts = np.bincount([i for i, _ in entries], minlength=m.n_nodes)
-
-    def field(name, dtype, values):
-        return arena.field(name, dtype, values.shape, values)
-
-    def vectors(name, values):
-        return arena.vectors(name, m.real, len(values), values, n=block_csr.BLOCK)
-
-    return build_coupling(
-        arena,
-        m.real,
-        m.n_nodes,
-        field("node", ti.i32, node),
-        made.shared,
-        count=field("count", ti.i32, np.array([N_TERMS], dtype=np.int32)),
-        arity=field("arity", ti.i32, np.array([len(own) for own in made.nodes], dtype=np.int32)),
-        weight=field("weight", ti.f64, weights),
-        entry_start=field("entry_start", ti.i32, np.concatenate([[0], np.cumsum(counts)]).astype(np.int32)),
-        entry=field("entry", ti.i32, np.array([e for _, e in entries], dtype=np.int32)),
-        block=vectors("block", block_csr.packed(D)),
-        active=field("active", ti.i32, active.astype(np.int32)),
-        base=vectors("base", base),
-    )
+    entries = np.array(sorted((i, WIDTH * c + j) for c, own in enumerate(made.nodes) for j, i in enumerate(own)))
+    start = np.searchsorted(entries[:, 0], np.arange(m.n_nodes + 1))
+    integers = {"count": [N_TERMS], "arity": [len(own) for own in made.nodes]}
+    integers |= {"entry_start": start, "entry": entries[:, 1], "active": active}
+    fields = {name: arena.field(name, ti.i32, np.shape(v), np.array(v, dtype=np.int32)) for name, v in integers.items()}
+    for name, v in (("block", block_csr.packed(D)), ("base", base)):
+        fields[name] = arena.vectors(name, m.real, len(v), v, n=block_csr.BLOCK)
+    fields["weight"] = arena.field("weight", ti.f64, weights.shape, weights)
+    return build_coupling(arena, m.real, m.n_nodes, arena.field("node", ti.i32, node.shape, node), made.shared, **fields)
 
 
 def last_nodes(made) -> np.ndarray:
@@ -96,21 +75,6 @@ def last_nodes(made) -> np.ndarray:
             if len(of_parity):
                 last[of_parity[(of_parity >> shift) > (of_parity >> shift).min()]] = True
     return last
-
-
-def test_the_nodes_of_terms_in_several_chunks_are_last(rig):
-    if not rig.shared:
-        assert rig.coupling.place is None
-        return
-    find_last(rig.models[False], rig.matrix, rig.coupling, rig.work)
-    last, place = last_nodes(rig), rig.coupling.place.to_numpy()
-    n_last = int(rig.coupling.n_last.to_numpy()[0])
-    assert 0 < n_last < len(last) // 2
-    assert np.array_equal(place == IS_LAST, last) and np.array_equal(rig.coupling.last.to_numpy()[:n_last], np.flatnonzero(last))
-    start, column = rig.matrix.row_start.to_numpy(), rig.matrix.column.to_numpy()
-    row = np.repeat(np.arange(2 * len(last)), np.diff(start)) % len(last)
-    beside = np.bincount(row[last[column]], minlength=len(last)) > 0
-    assert np.array_equal(place == BESIDE, beside & ~last) and (place == BESIDE).any()
 
 
 def dense(blocks: np.ndarray) -> np.ndarray:

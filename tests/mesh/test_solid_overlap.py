@@ -1,11 +1,5 @@
-"""Overlap of solids whose surfaces coincide, wholly or in part:
-
-* identical solids with the same or other tets, shifted by less and by more than the tolerance; shifted along themselves so that
-  four sides stay flush; half of another, its corner, its wall, its cavity: the depth is invariant under rigid motions and under
-  exchange of the two; a surface without tets (an obstacle) in place of either is found too;
-* flush faces, edges and corners, and a solid in a cavity, do not overlap;
-* solids joined at an edge only, and open surfaces;
-* depths of triangle-tet cuts agree with linear programming; distances of points, rays and segments agree with sampling.
+"""Overlap of solids whose surfaces coincide, wholly or in part: the depth is invariant under rigid motions and under exchange of
+the two; flush faces do not overlap; depths of cuts agree with linear programming, distances with sampling.
 """
 
 import numpy as np
@@ -78,18 +72,15 @@ def depths(a: str, b: str, shift) -> np.ndarray:
     """(motions, 6) [m]: both orders, with tets in both, in the first only, in the second only."""
     found = []
     for motion in MOTIONS:
-        row = []
         for filled in ((True, True), (True, False), (False, True)):
             one, other = solid(a, shift, motion, filled[0]), solid(b, (0, 0, 0), motion, filled[1])
-            row += [overlap_depth(one, other), overlap_depth(other, one)]
-        found.append(row)
-    return np.array(found)
+            found += [overlap_depth(one, other), overlap_depth(other, one)]
+    return np.reshape(found, (len(MOTIONS), 6))
 
 
 OVERLAPPING = [  # meshes, shift of the first [m], bounds of the depth [m]
     ("cube", "fine", (0, 0, 0), 0.5, 0.5),
     ("cube", "rotated", (0, 0, 0), 0.5, 0.5),
-    ("coarse", "coarse", (0, 0, 0), 0.4, 0.5),
     ("cube", "cube", (1e-5, 2e-5, -1e-5), 0.4999, 0.5),
     ("cube", "six", (0.5, 0, 0), 0.5, 0.5),
     ("coarse", "coarse", (1 - 1e-5, 0, 0), 1e-5, 1e-5),
@@ -100,7 +91,6 @@ OVERLAPPING = [  # meshes, shift of the first [m], bounds of the depth [m]
 ]
 TOUCHING = [
     ("cube", "fine", (0.3, 1, 0.2)),
-    ("coarse", "fine", (1, 1, 0.2)),
     ("coarse", "hollow", (0, 0, 0)),
     ("eighth", "hollow", (0.1, 0.2, -0.2)),
     ("tilted", "coarse", (0, 0.5 + np.sqrt(0.5), 0)),

@@ -1,10 +1,5 @@
-"""Surface meshes and tetrahedralization (other formats, encodings: test_mesh_files.py):
-
-* polygons are triangulated; equal vertices, or near ones on request, are welded;
-* invalid files and arrays raise a MeshError that names file, line or index, whatever the bytes; dropped triangles cause warnings;
-* holes, inner walls, flipped triangles and inverted surfaces are found and counted;
-* tets of a ball fill its volume with positive tets near the given edge length, at any place and scale, holes closed; the mesher's
-  failure, absence and interruption are reported, and it leaves no process or file behind.
+"""Surface meshes and tetrahedralization (other formats, encodings: test_mesh_files.py): polygons, welding, faults and invalid
+files; tets of a ball at any place and scale; the mesher's failure, absence and interruption are reported.
 """
 
 import signal
@@ -45,17 +40,15 @@ def test_obj(tmp_path):
     check_unit_cube(read_surface(path))
 
 
-OFF_HEADERS = ["OFF\n8 6 12\n", "OFF # a cube\n\n# counts\n8 6\n", "COFF 8 6 12\n", "OFF8 6 0\n", "\n#\nSTCNOFF\n8 6 0\n"]
-
-
-@pytest.mark.parametrize("header", OFF_HEADERS)
-def test_off(header, tmp_path):
+def test_off(tmp_path):
     """Quads, a polygon, colours, comments, and the headers of various programs."""
     path = tmp_path / "cube.off"
     lines = [f"{x} {y} {z} 255 0 0 255 # corner" for x, y, z in CUBE]
     lines += [f"4  {' '.join(map(str, quad))} 0.5 0.5 0.5" for quad in QUADS]
-    path.write_text(header + "\n\n".join(lines))
-    check_unit_cube(read_surface(path))
+    headers = ["OFF\n8 6 12\n", "OFF # a cube\n\n# counts\n8 6\n", "COFF 8 6 12\n", "OFF8 6 0\n", "\n#\nSTCNOFF\n8 6 0\n"]
+    for header in headers:
+        path.write_text(header + "\n\n".join(lines))
+        check_unit_cube(read_surface(path))
     path.write_text("OFF 5 1 0\n0 0 0\n2 0 0\n2 1 0\n1 2 0\n0 1 0\n5 0 1 2 3 4")
     surface = read_surface(path)
     assert surface.triangles.tolist() == [[0, 1, 2], [0, 2, 3], [0, 3, 4]] and surface.area == pytest.approx(3.0)
@@ -70,16 +63,10 @@ V = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
     [
         ("a.off", "# comment\n", "the file is empty"),
         ("a.off", "3 1 0\n" + POINTS, "line 1: not a supported surface: expected OFF, not '3'"),
-        ("a.off", "OFF\n3 -1 0\n", "line 2: expected the counts"),
         ("a.off", "OFF 3 1000000000 0\n" + POINTS, "line 1 declares 3 vertices and 1000000000 faces, but 3 lines follow"),
         ("a.off", "OFF 3 1 0\n0 0 0\n# x\n1 0\n0 1 0\n3 0 1 2\n", "line 4: expected three coordinates, not '1 0'"),
-        (
-            "a.off",
-            "OFF 3 1 0\n" + POINTS + "2 0 1\n",
-            "line 5: expected a number of at least 3 corners and as many vertices, not",
-        ),
+        ("a.off", "OFF 3 1 0\n" + POINTS + "2 0 1\n", "line 5: expected a number of at least 3 corners and as many"),
         ("a.off", "OFF 3 1 0\n" + POINTS + "3 0 1 3\n", r"line 5: vertex 3 does not exist \(3 vertices\)"),
-        ("a.off", "OFF 3 1 0\n" + POINTS + "3 0 1 -1\n", r"line 5: vertex -1 does not exist \(3 vertices\)"),
         ("a.off", "OFF 3 0 0\n" + POINTS, "no triangles found"),
         ("a.obj", "v 0 0\n", "line 1 cannot be read: 'v 0 0'"),
         ("a.obj", V.replace("1 0\n", "nan 0\n") + "f 1 2 3\n", "vertex 2 coordinate 1 is not finite"),
@@ -132,7 +119,6 @@ def test_dropped_triangles_cause_warnings(tmp_path):
     [
         (np.where(np.arange(3) == 1, np.nan, X), T, "vertex 0 coordinate 1 is not finite"),
         (X, T.astype(float), "triangles must be integers, not float64"),
-        (X, [], "no triangles found"),
         (X, [*T, (0, 1, len(X))], f"triangle {len(T)}: vertex {len(X)} does not exist \\({len(X)} vertices\\)"),
         (X, np.array([(0, 1, 2**63)], dtype=np.uint64), "triangle 0: vertex 9223372036854775808 does not exist"),
     ],
@@ -158,9 +144,6 @@ def test_faults():
     assert two.n_pieces == 2 and two.volume == pytest.approx(2 * VOLUME) and not two.faults()
 
 
-# --- tetrahedralization ------------------------------------------------------------------------------------------------
-
-
 def test_tets_fill_a_ball_that_is_inside_out():
     """Small, and far from the origin."""
     pytest.importorskip("wildmeshing")
@@ -172,16 +155,13 @@ def test_tets_fill_a_ball_that_is_inside_out():
     assert np.linalg.norm(mesh.vertices - shift, axis=1).max() < 0.53 * scale
 
 
-def test_bad_arguments_of_tetrahedralize_are_rejected():
-    for edge_length in (0.0, -1.0, 9.0, np.nan, "x", True):
+def test_bad_arguments_and_absence_and_failure_of_the_mesher_are_reported(monkeypatch):
+    surface = ts.SurfaceMesh(X, T, "ball.obj")
+    for edge_length in (0.0, 9.0, np.nan, "x", True):
         with pytest.raises(MeshError, match="ball.obj: edge_length must be a length above 0 and below the diagonal"):
-            ts.tetrahedralize(ts.SurfaceMesh(X, T, "ball.obj"), edge_length=edge_length)
+            ts.tetrahedralize(surface, edge_length=edge_length)
     with pytest.raises(MeshError, match="needs a SurfaceMesh"):
         ts.tetrahedralize(BALL)
-
-
-def test_absence_and_failure_of_the_mesher_are_reported(monkeypatch):
-    surface = ts.SurfaceMesh(X, T, "ball.obj")
     monkeypatch.setattr(surface_mesh, "find_spec", lambda name: None)
     with pytest.raises(MeshError, match=r"ball.obj: .* needs the package wildmeshing: pip install 'taisoft\[mesh\]'"):
         ts.tetrahedralize(surface)
@@ -200,23 +180,21 @@ def test_commands_lead_from_a_surface_to_a_scene(tmp_path, capsys):
     apart = next(k for k in range(1, len(T)) if not set(T[k]) & set(T[0]))
     meshio.write(surface, meshio.Mesh(1000 * X * (1, 1, 2), [("triangle", np.delete(T, [0, apart], axis=0))]))
     assert main(["info", str(surface)]) == 0
-    info = capsys.readouterr().out
-    assert f"{len(X)} vertices, {len(T) - 2} triangles, 1 piece; no tets" in info and "taisoft tetrahedralize" in info
+    assert f"{len(X)} vertices, {len(T) - 2} triangles, 1 piece; no tets" in capsys.readouterr().out
     options = "--up z --scale 0.001 --rotate 0 90 0 --at 0.5 -0.25 0 --edge-length 0.4".split()
-    for path, code in ((tmp_path / "ball.txt", 2), (tmp_path / "none" / "ball.msh", 3), (surface, 2)):
-        assert main(["tetrahedralize", str(surface), "--out", str(path), *options]) == code
-        assert len(capsys.readouterr().err.strip().splitlines()) == 1 and path.exists() == (path == surface)
-    assert main(["tetrahedralize", str(surface), "--out", str(out), *options]) == 0
-    shown, mesh = capsys.readouterr(), ts.read_mesh(out)
-    volume = mesh.volumes.sum()
-    assert volume == pytest.approx(2 * VOLUME, rel=0.08) and 50 < mesh.n_tets < 5000 and "surface triangles" in shown.out
-    assert f"2 holes were closed, and the tets fill {volume:.4g} m^3; the closing surface may be rough" in shown.err
+    for path, more, code, message in (
+        (tmp_path / "ball.txt", options, 2, "a mesh can be written as"),
+        (tmp_path / "a.msh", ["--scale", "0"], 2, "scale must be a number above 0, not 0.0"),
+        (out, options, 0, "2 holes were closed, and the tets fill"),
+        (out, options, 3, "--overwrite replaces it"),
+    ):
+        assert main(["tetrahedralize", str(surface), "--out", str(path), *more]) == code
+        error = capsys.readouterr().err
+        assert message in error and (code == 0 or error.count("\n") == 1) and path.exists() == (path == out)
+    mesh = ts.read_mesh(out)
+    assert mesh.volumes.sum() == pytest.approx(2 * VOLUME, rel=0.08) and 50 < mesh.n_tets < 5000
     assert np.allclose(mesh.vertices.min(axis=0), (0.0, -0.25, -0.5), atol=0.05)
     assert np.allclose(mesh.vertices.max(axis=0), (1.0, 1.75, 0.5), atol=0.05)
-    assert main(["tetrahedralize", str(surface), "--out", str(out), *options]) == 3
-    assert "--overwrite replaces it" in capsys.readouterr().err
-    assert main(["tetrahedralize", str(surface), "--out", str(tmp_path / "a.msh"), "--scale", "0"]) == 2
-    assert "scale must be a number above 0, not 0.0" in capsys.readouterr().err and not (tmp_path / "a.msh").exists()
     assert main(["scene", str(out), "--out", str(tmp_path / "ball.toml")]) == 0
     scene, solver = ts.read_scene(tmp_path / "ball.toml")
     body, height = scene.body("ball"), np.ptp(scene.body("ball").rest_positions[:, 1])
@@ -224,8 +202,7 @@ def test_commands_lead_from_a_surface_to_a_scene(tmp_path, capsys):
     assert 0.5 < body.material.young / (100 * 1000 * 9.81 * height) < 2 and solver == {"dt": 0.01, "seconds": 2.0, "fps": 50.0}
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, pytest.param(signal.SIGINT, marks=pytest.mark.long)])
-def test_signal_ends_the_mesher(number, tmp_path, monkeypatch):
+def test_a_signal_ends_the_mesher(tmp_path, monkeypatch):
     pytest.importorskip("wildmeshing")
     surface, folder = tmp_path / "ball.obj", tmp_path / "temporary"
     meshio.write(surface, meshio.Mesh(X, [("triangle", T)]))
@@ -235,8 +212,8 @@ def test_signal_ends_the_mesher(number, tmp_path, monkeypatch):
     deadline = time.monotonic() + 60
     while not list(folder.glob("taisoft-*/surface.npz")) and time.monotonic() < deadline:
         time.sleep(0.05)
-    time.sleep(0.5)
-    process.send_signal(number)
+    time.sleep(0.2)
+    process.send_signal(signal.SIGTERM)
     _, errors = process.communicate(timeout=60)
-    assert process.returncode == 128 + number and errors == "taisoft: ended by a signal; nothing was written\n"
+    assert process.returncode == 128 + signal.SIGTERM and errors == "taisoft: ended by a signal; nothing was written\n"
     assert not list(folder.iterdir()) and not (tmp_path / "ball.msh").exists()

@@ -1,11 +1,5 @@
-"""TetMesh:
-
-* the surface is closed, oriented outward and encloses the tets' volume; each triangle is a face of its tet;
-* every tet is positive; a fully inverted mesh is flipped with a warning, single inverted tets are rejected or flipped on request;
-* invalid coordinates and indices, tets without volume, duplicates, faces of three tets and unused vertices are rejected with
-  index and rule;
-* components are counted; edge and vertex joints, overlaps, coincident vertices and nearly flat tets cause warnings;
-* the mean ratio of a tet is 1 if it is regular, falls to 0 as it is flattened, and does not depend on size.
+"""TetMesh: a closed outward surface; inverted tets are rejected or flipped; invalid arrays are rejected with index and rule;
+doubtful meshes cause one warning; the mean ratio of a tet is 1 if it is regular and does not depend on size.
 """
 
 import numpy as np
@@ -19,6 +13,7 @@ from taisoft.mesh.topology import TET_FACES, merge_labels
 
 CORNER = np.array([(0.0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)])  # a positive tet
 REGULAR = np.array([(1.0, 1, 1), (-1, 1, -1), (1, -1, -1), (-1, -1, 1)])
+TWO_BELOW = np.vstack([CORNER, [(0.0, 0, -1), (1.0, 1, -2)]])
 ONE = np.array([(0, 1, 2, 3)])
 
 
@@ -52,12 +47,10 @@ def test_arrays_are_copies_and_read_only():
     mesh = TetMesh(vertices, tets)
     vertices[0], tets[0] = 99.0, 0
     assert mesh.vertices.max() < 99.0 and mesh.tets[0].any()
-    for array in (mesh.vertices, mesh.tets, mesh.surface, mesh.surface_tets, mesh.volumes):
-        with pytest.raises(ValueError, match="read-only"):
-            array[0] = 0
+    assert not any(a.flags.writeable for a in (mesh.vertices, mesh.tets, mesh.surface, mesh.surface_tets, mesh.volumes))
 
 
-def test_single_inverted_tets_are_rejected_or_flipped_on_request():
+def test_single_inverted_tets_are_rejected_or_flipped_on_request_and_mirrored_meshes_flipped():
     vertices, tets = box_arrays()
     upright = TetMesh(vertices, tets)
     tets[[7, 30]] = tets[[7, 30]][:, [1, 0, 2, 3]]
@@ -68,9 +61,6 @@ def test_single_inverted_tets_are_rejected_or_flipped_on_request():
     assert mesh.flipped.tolist() == [7, 30] and len(mesh.warnings) == 1
     assert np.linalg.det(mesh.vertices[mesh.tets][:, 1:] - mesh.vertices[mesh.tets][:, :1]).min() > 0
     assert np.allclose(mesh.volumes, upright.volumes)
-
-
-def test_mirrored_mesh_is_flipped_with_one_warning():
     vertices, tets = box_arrays()
     with pytest.warns(UserWarning, match="all 40 tets are inverted"):
         mesh = TetMesh(vertices * (-1, 1, 1), tets)
@@ -108,11 +98,7 @@ def changed(what: str, index, value):
         (CORNER, [(0, 1, 2, 1)], "tet 0 names a vertex twice"),
         (CORNER, [(0, 1, 2, 3), (1, 2, 0, 3)], "tets 0 and 1 have the same four vertices"),
         (np.vstack([CORNER, [(2.0, 2, 2)]]), ONE, "vertex 4 belongs to no tet"),
-        (
-            np.vstack([CORNER, [(0.0, 0, -1), (1.0, 1, -2)]]),
-            [(0, 1, 2, 3), (0, 2, 1, 4), (0, 2, 1, 5)],
-            r"face \(0, 1, 2\) is shared by 3 tets \(0, 1, 2\)",
-        ),
+        (TWO_BELOW, [(0, 1, 2, 3), (0, 2, 1, 4), (0, 2, 1, 5)], r"face \(0, 1, 2\) is shared by 3 tets \(0, 1, 2\)"),
         (np.empty((0, 3)), ONE, "the mesh has no vertices"),
         (CORNER, ONE[:, :3], r"tets must have shape \(m, 4\), not \(1, 3\)"),
         (CORNER, ONE.astype(float), "tets must be integers"),
@@ -133,16 +119,13 @@ def two_boxes(shift) -> TetMesh:
     return TetMesh(vertices[first], labels[np.vstack([box.tets, box.tets + box.n_verts])])
 
 
-def test_merge_labels_is_transitive_and_keeps_the_order():
+def test_merge_labels_is_transitive_and_keeps_the_order_and_components_are_counted():
     points = np.array([(3.0, 0, 0), (0, 0, 0), (0.9, 0, 0), (1.8, 0, 0), (0, 0, 0), (-0.0, 0, 0)])
     assert merge_labels(points, 0.0).tolist() == [0, 1, 2, 3, 1, 1]
     assert merge_labels(points, 1.0).tolist() == [0, 1, 1, 1, 1, 1]
-
-
-@pytest.mark.parametrize("shift, n_verts, n_components", [((5, 0, 0), 16, 2), ((1, 0, 0), 12, 1)])
-def test_components_are_counted(shift, n_verts, n_components):
-    mesh = two_boxes(shift)
-    assert mesh.n_verts == n_verts and mesh.n_components == n_components and mesh.warnings == []
+    for shift, n_verts, n_components in (((5, 0, 0), 16, 2), ((1, 0, 0), 12, 1)):
+        mesh = two_boxes(shift)
+        assert mesh.n_verts == n_verts and mesh.n_components == n_components and mesh.warnings == []
 
 
 @pytest.mark.parametrize(
@@ -150,10 +133,7 @@ def test_components_are_counted(shift, n_verts, n_components):
     [
         (lambda: two_boxes((1, 1, 0)), "joined at an edge only at 1 edges"),
         (lambda: two_boxes((1, 1, 1)), "joined at a vertex only at 1 vertices"),
-        (
-            lambda: TetMesh(np.vstack([CORNER, [(0.3, 0.3, 2.0)]]), [(0, 1, 2, 3), (0, 1, 2, 4)]),
-            "1 pairs of neighbouring tets overlap.*tets 0 and 1",
-        ),
+        (lambda: TetMesh([*CORNER, (0.3, 0.3, 2.0)], [(0, 1, 2, 3), (0, 1, 2, 4)]), "1 pairs of .* overlap.*tets 0 and 1"),
         (
             lambda: TetMesh(np.vstack([REGULAR, REGULAR + (9, 0, 0), REGULAR + (9, 0, 0)]), np.arange(12).reshape(3, 4)),
             "4 vertices coincide with another one, the first is vertex 8 on vertex 4",
@@ -166,18 +146,15 @@ def test_doubtful_meshes_cause_one_warning(make, message):
         assert len(make().warnings) == 1
 
 
-# --- quality ----------------------------------------------------------------------------------------------------------
-
-
 def quality(mesh: TetMesh) -> np.ndarray:
     return mean_ratio(edge_lengths(mesh.vertices, mesh.tets), mesh.volumes)
 
 
-@pytest.mark.parametrize("scale", [1e-5, 1.0, 1e5])
-def test_mean_ratio_of_a_regular_tet_and_of_a_corner(scale):
-    assert quality(TetMesh(scale * REGULAR, ONE)) == pytest.approx([1.0])
-    # volume 1/6, three edges of 1 and three of sqrt 2
-    assert quality(TetMesh(scale * CORNER, ONE)) == pytest.approx([12 * 0.5 ** (2 / 3) / 9])
+def test_mean_ratio_of_a_regular_tet_and_of_a_corner():
+    for scale in (1e-5, 1.0, 1e5):
+        assert quality(TetMesh(scale * REGULAR, ONE)) == pytest.approx([1.0])
+        # volume 1/6, three edges of 1 and three of sqrt 2
+        assert quality(TetMesh(scale * CORNER, ONE)) == pytest.approx([12 * 0.5 ** (2 / 3) / 9])
 
 
 def test_edges_are_ordered_by_their_vertices():

@@ -1,10 +1,5 @@
-"""Detection of meshes whose linear tets bend too stiffly, from geometry alone, and the warning when such a body is added:
-
-* found: sheets and bars of one layer, or of two layers of long cells, straight or curved, structured or not; not found: compact
-  or fine bodies, and bodies that are thin in less than half of their surface;
-* the result is invariant under rigid motions, scaling and reordering; thickness and layers are those of the grid;
-* the estimated stiffness agrees with measured factors;
-* the warning names the caller's line, and copies of a scene do not repeat it.
+"""Detection of meshes whose linear tets bend too stiffly, from geometry alone: sheets and bars of few layers, invariance under
+motion, scaling and reordering, agreement with measured factors; the warning when such a body is added.
 """
 
 import warnings
@@ -58,16 +53,11 @@ NOT_COARSE = {
 }
 
 
-@pytest.mark.parametrize("name", COARSE)
-def test_thin_meshes_of_few_layers_are_detected(name):
-    mesh, layers = COARSE[name]
-    found = coarse_bending(mesh)
-    assert found is not None and found.layers == pytest.approx(layers, rel=0.05) and found.stiffness >= 2.0
-
-
-@pytest.mark.parametrize("name", NOT_COARSE)
-def test_other_meshes_are_not_detected(name):
-    assert coarse_bending(NOT_COARSE[name]) is None
+def test_thin_meshes_of_few_layers_are_detected_and_others_not():
+    for mesh, layers in COARSE.values():
+        found = coarse_bending(mesh)
+        assert found is not None and found.layers == pytest.approx(layers, rel=0.05) and found.stiffness >= 2.0
+    assert [name for name, mesh in NOT_COARSE.items() if coarse_bending(mesh) is not None] == []
 
 
 @pytest.mark.parametrize("pattern", ["five", "six"])
@@ -80,7 +70,7 @@ def test_thickness_and_layers_of_a_grid(pattern):
     assert layers == pytest.approx(np.array([5.0, 2.0, 3.0])[axis])
 
 
-@settings(max_examples=12, deadline=None)
+@settings(max_examples=8, deadline=None)
 @given(st.sampled_from([SHEET, BAR, FINE, COARSE["tube"][0], COARSE["two bars"][0], CUBES]), st.integers(0, 2**32 - 1))
 def test_result_is_invariant_under_motion_scaling_and_reordering(mesh, seed):
     rng = np.random.default_rng(seed)
@@ -99,16 +89,14 @@ def test_result_is_invariant_under_motion_scaling_and_reordering(mesh, seed):
 
 # of cantilevers, 10 m long and 1 m thick: cells along and across, pattern; factor by which linear tets are too stiff in statics,
 # against Timoshenko's beam
-CANTILEVERS = {"1": (10, 1, "five", 2.82), "1 long": (4, 1, "five", 8.06), "1 six": (10, 1, "six", 4.57)}
-CANTILEVERS |= {"2": (20, 2, "five", 1.49), "2 long": (10, 2, "five", 2.36)}
+CANTILEVERS = [(10, 1, "five", 2.82), (4, 1, "five", 8.06), (10, 1, "six", 4.57), (20, 2, "five", 1.49), (10, 2, "five", 2.36)]
 
 
-@pytest.mark.parametrize("name", CANTILEVERS)
-def test_estimated_stiffness_agrees_with_the_measured_one(name):
-    along, across, pattern, stiffness = CANTILEVERS[name]
-    found = coarse_bending(ts.box_mesh((along, across, across), (10.0, 1.0, 1.0), pattern=pattern))
-    assert (found is None) == (stiffness < 2.0)
-    assert found is None or 0.6 < found.stiffness / stiffness < 1.4
+def test_estimated_stiffness_agrees_with_the_measured_one():
+    for along, across, pattern, stiffness in CANTILEVERS:
+        found = coarse_bending(ts.box_mesh((along, across, across), (10.0, 1.0, 1.0), pattern=pattern))
+        assert (found is None) == (stiffness < 2.0)
+        assert found is None or 0.6 < found.stiffness / stiffness < 1.4
 
 
 def warnings_of(call) -> list[warnings.WarningMessage]:
@@ -128,10 +116,6 @@ def test_adding_a_thin_body_warns_once_at_the_callers_line():
     assert "body 'bar': about 2 linear tets lie through its thickness" in str(found[1].message)
     assert warnings_of(lambda: scene.add_body(SHEET, RUBBER, order=2)) == []
     assert warnings_of(lambda: scene.add_body(FINE, RUBBER)) == []
-    assert (
-        warnings_of(scene.snapshot)
-        == warnings_of(lambda: refined(scene))
-        == warnings_of(lambda: with_order(with_order(scene, 2), 1))
-        == []
-    )
+    for copy in (scene.snapshot, lambda: refined(scene), lambda: with_order(with_order(scene, 2), 1)):
+        assert warnings_of(copy) == []
     assert len(warnings_of(lambda: scene.add_body(SHEET, RUBBER))) == 1  # another body of the same mesh

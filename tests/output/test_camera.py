@@ -112,10 +112,20 @@ def test_floor_that_reaches_behind_the_camera_is_clipped():
     assert np.abs(image[both] / 255 - (hit[both] + half) / (2 * half))[:, [0, 2]].max() < 0.02
     large = np.abs(camera.project(camera.clipped(corners, triangles, shades, (2560, 1440))[0], (2560, 1440))[len(corners) :, :2])
     assert 1e4 < large.max() < 5e5
-    for value in (np.nan, np.inf):
-        bad = corners.copy()
-        bad[4] = value
-        assert not (camera.clipped(bad, triangles, shades, SIZE)[1] == 4).any()
+    corners[4] = np.nan
+    assert not (camera.clipped(corners, triangles, shades, SIZE)[1] == 4).any()
+
+
+def test_lines_are_clipped_at_the_near_plane():
+    camera = Camera(target=np.zeros(3), distance=10.0, azimuth=0.0, elevation=0.0)
+    ahead, behind = np.array([0.0, 1, 0]), np.array([0.0, 1, 20])
+    ends = np.array([ahead, behind, behind, ahead, ahead, 2 * ahead, behind, behind + 1, ahead, [0, np.nan, 0]])
+    colours = np.repeat(np.arange(10) / 10, 3).reshape(-1, 3)
+    clipped, kept = camera.clipped_lines(ends, colours)
+    assert len(clipped) == len(kept) == 6
+    assert np.allclose(clipped[[0, 3]], ahead) and np.allclose(clipped[[1, 2]], (0, 1, 9.8), atol=1e-4)
+    assert np.array_equal(clipped[4:], ends[4:6]) and np.array_equal(kept[4:], colours[4:6])
+    assert np.allclose(kept[1], 0.049, atol=1e-5)
 
 
 def test_rays_invert_the_projection():

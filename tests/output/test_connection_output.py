@@ -1,25 +1,19 @@
-"""Connections and pressures in what a run writes:
+"""Connections, pressures and poses in what a run writes: polylines, pictures, curves of USD, and `frames.csv`."""
 
-* polylines go through the points of springs and tendons, also on moving obstacles, and have their tensions;
-* pictures show them in the colours of their tensions, crosses at attached nodes, and arrows of pressures, only where asked;
-* USD holds a BasisCurves for each spring and tendon with its points and tension in every frame, and passes the validators;
-* `frames.csv` has tensions, volumes, pressures and poses in every frame, and is continued by a resumed run.
-"""
-
-import contextlib
 import csv
-from dataclasses import dataclass
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from pxr import Usd, UsdGeom
 
 import taisoft as ts
+from taisoft.output.camera import Camera
 from taisoft.output.connection_lines import ConnectionLines
 from taisoft.output.frame_table import FrameTable
 from taisoft.output.usd import UsdWriter
 from taisoft.view.colouring import COLOURS
-from taisoft.view.connection_layer import ATTACHED_COLOUR, PRESSURE_COLOUR
+from taisoft.view.connection_layer import ATTACHED_COLOUR, PRESSURE_COLOUR, ConnectionMarks, PressureLayer
 from taisoft.view.offscreen import Offscreen
 from tests.collision.rotations import rotation
 from tests.dynamics.scenes import cube, rubber
@@ -72,52 +66,55 @@ def test_polylines_run_through_the_points(moved):
 def moved():
     """The scene, and a simulator of it after some steps; tests may take more."""
     scene = connected()
-    with ts.Simulator(scene, dt=5e-3) as sim:
+    with ts.Simulator(scene, dt=5e-3, integrator="symplectic_euler") as sim:
         for _ in range(8):
             sim.step()
         yield scene, sim
 
 
-def close_to(image: np.ndarray, colour) -> int:
-    return int((np.abs(image.astype(int) - 255 * np.asarray(colour)).max(axis=2) < 25).sum())
-
-
-def picture(sim, *layers) -> np.ndarray:
-    with contextlib.closing(Offscreen(sim.scene, (640, 360), **({"layers": layers} if layers else {}))) as drawing:
-        return drawing.image(sim)
-
-
 def test_pictures_show_connections_and_pressures(moved):
+    def close_to(image: np.ndarray, colour) -> int:
+        return int((np.abs(image.astype(int) - 255 * np.asarray(colour)).max(axis=2) < 25).sum())
+
     _, sim = moved
-    default = picture(sim)
-    plain, connections, pressures = (picture(sim, one) for one in ("fixed_nodes", "connections", "pressures"))
+    default, plain, connections, pressures = (
+        Offscreen(sim.scene, (640, 360), **layers).image(sim)
+        for layers in ({}, *({"layers": (name,)} for name in ("fixed_nodes", "connections", "pressures")))
+    )
     for colour in (COLOURS[-1], COLOURS[0], ATTACHED_COLOUR):
         assert min(close_to(default, colour), close_to(connections, colour)) > close_to(plain, colour) + 8
     assert min(close_to(default, PRESSURE_COLOUR), close_to(pressures, PRESSURE_COLOUR)) > close_to(plain, PRESSURE_COLOUR) + 8
-    with contextlib.closing(Offscreen(sim.scene, (64, 36))) as drawing:
-        drawing.image(sim)
-        kept = drawing.kept(sim.time + 1.0)
-        assert kept["tension"] == pytest.approx(9e3) and kept["pressure"] == 2e3
-        drawing.resume(kept | {"tension": 5.0, "pressure": 6.0})
-        assert (drawing.layers.connections.peak, drawing.layers.pressures.peak) == (5.0, 6.0)
+    drawing = Offscreen(sim.scene, (64, 36))
+    drawing.image(sim)
+    kept = drawing.kept(sim.time + 1.0)
+    assert kept["tension"] == pytest.approx(9e3) and kept["pressure"] == 2e3
+    drawing.resume(kept | {"tension": 5.0, "pressure": 6.0})
+    assert (drawing.layers.connections.peak, drawing.layers.pressures.peak) == (5.0, 6.0)
 
 
-@pytest.mark.parametrize("pressure", [3e3, -3e3])
-def test_arrows_point_along_the_force(pressure):
-    block = ts.box_mesh((3, 3, 3), (3, 3, 3))
+def hollow_scene() -> ts.Scene:
+    """A cube of 3 m with a cavity of 1 m, called water, and a pressure of 1 Pa on a side."""
+    block, scene = ts.box_mesh((3, 3, 3), (3, 3, 3)), ts.Scene()
     hollow = np.abs(block.vertices[block.tets].mean(axis=1)).max(axis=1) > 0.5
-    scene = ts.Scene(gravity=(0, 0, 0))
-    body = scene.add_body(ts.TetMesh(block.vertices, block.tets[hollow]), rubber(young=1e7), name="block")
-    body.add_cavity(lambda c: np.abs(c).max(axis=1) < 0.6, pressure=pressure, name="gas")
-    with ts.Simulator(scene, dt=1e-3) as sim:
-        drawing = Offscreen(scene, (64, 36), layers=("pressures",))
-        camera = drawing.camera
-        ends, _ = drawing.layers.lines(sim, camera)
-        ends = camera.position + (ends - camera.position) / 0.1  # they are drawn in front
-        shafts = np.abs(ends[: len(ends) // 3]).max(axis=1).reshape(-1, 2)  # start and tip, in the norm whose unit ball is a cube
-        assert len(shafts) >= 10 and ((shafts[:, 1] - shafts[:, 0]) * np.sign(pressure) > 0.05).all()
-        assert (shafts[:, 1] if pressure > 0 else shafts[:, 0]) == pytest.approx(np.full(len(shafts), 0.5), abs=1e-3)
-        drawing.close()
+    body = scene.add_body(ts.TetMesh(block.vertices, block.tets[hollow]), rubber(), name="block")
+    body.add_pressure(lambda c: c[:, 0] > 1.4, 1.0)
+    assert not FrameTable.needed(scene)
+    body.add_cavity(lambda c: np.abs(c).max(axis=1) < 0.6, pressure=2.0, name="water")
+    assert FrameTable.needed(scene)
+    return scene
+
+
+@pytest.mark.parametrize("pressure", [2.0, -2.0])
+def test_arrows_point_along_the_force(pressure):
+    """A push ends at the surface, a pull begins there; the longest belongs to the highest pressure."""
+    scene, camera = hollow_scene(), Camera(np.zeros(3), 10.0)
+    sim = SimpleNamespace(scene=scene, time=0.0, cavity_pressure={"water": pressure}.get)
+    found = PressureLayer(ConnectionMarks(scene, 3.0)).lines(sim, scene.bodies[0].rest_positions, camera)
+    shafts = [ends[: len(ends) // 3].reshape(-1, 2, 3) for ends, _ in found]  # of the side, then of the cavity
+    assert shafts[0][:, 1, 0] == pytest.approx(1.5) and np.allclose(shafts[0][:, 0] - shafts[0][:, 1], (0.105, 0, 0))
+    start, tip = np.abs(shafts[1]).max(axis=2).T  # in the norm whose unit ball is a cube
+    assert len(tip) >= 10 and (tip if pressure > 0 else start) == pytest.approx(0.5)
+    assert tip - start == pytest.approx(0.21 * np.sign(pressure))
 
 
 def test_usd_holds_curves(moved, tmp_path):
@@ -143,38 +140,19 @@ def test_usd_holds_curves(moved, tmp_path):
             assert tension.GetInterpolation() == "uniform" and list(tension.Get(index)) == [np.float32(tensions[name])]
 
 
-@dataclass
-class StandIn:
-    """A simulator of frame k, in which a box has moved and turned by three quarters of a turn about z."""
-
-    k: int
-
-    @property
-    def time(self):
-        return self.k / 20
-
-    def tensions(self):
-        return {"spring": 1.0 + self.k, "rope, long": 3.0}
-
-    def cavity_volume(self, name):
-        return {"water": 1.05}[name]
-
-    def cavity_pressure(self, name):
-        return {"water": 10.0 * self.k}[name]
-
-    def pose(self, name):
-        return np.array({"box": (0.5 * self.k, -1.0, 0.0)}[name]), rotation((0, 0, 1), 1.5 * np.pi)
+def stand_in(k: int) -> SimpleNamespace:
+    """A simulator in frame k, in which a box has moved and turned by three quarters of a turn about z."""
+    return SimpleNamespace(
+        time=k / 20,
+        tensions=lambda: {"spring": 1.0 + k, "rope, long": 3.0},
+        cavity_volume={"water": 1.05}.get,
+        cavity_pressure={"water": 10.0 * k}.get,
+        pose={"box": (np.array((0.5 * k, -1.0, 0.0)), rotation((0, 0, 1), 1.5 * np.pi))}.get,
+    )
 
 
 def test_a_table_of_frames(tmp_path):
-    scene = ts.Scene()
-    block = ts.box_mesh((3, 3, 3), (3, 3, 3))
-    hollow = np.abs(block.vertices[block.tets].mean(axis=1)).max(axis=1) > 0.5
-    body = scene.add_body(ts.TetMesh(block.vertices, block.tets[hollow]), rubber(), name="block")
-    body.add_pressure(lambda c: c[:, 0] > 1.4, 1.0)
-    assert not FrameTable.needed(scene)
-    body.add_cavity(lambda c: np.abs(c).max(axis=1) < 0.6, pressure=2.0, name="water")
-    assert FrameTable.needed(scene)
+    scene = hollow_scene()
     scene.add_spring(("block", 0), ("block", 7), 1.0, name="spring")
     scene.add_tendon([("block", 0), ("block", 7)], 3.0, name="rope, long")
     mesh = ts.box_mesh((1, 1, 1), (1, 0.6, 0.3), (0, 0, 0.1))
@@ -183,7 +161,7 @@ def test_a_table_of_frames(tmp_path):
     def write_frames(first: int, last: int) -> bytes:
         table = FrameTable(tmp_path, scene, first)
         for index in range(first, last):
-            table.frame(StandIn(index), index)
+            table.frame(stand_in(index), index)
         table.close()
         return (tmp_path / "frames.csv").read_bytes()
 

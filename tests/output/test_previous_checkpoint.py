@@ -36,39 +36,34 @@ def test_a_truncated_file_is_replaced_by_the_previous_one(two, fraction):
     assert read_last_good(path).state["time"] == 2.0
     data = path.read_bytes()
     path.write_bytes(data[: int(fraction * len(data))])
-    name, other = re.escape(str(path)), re.escape(str(previous))
-    message = rf"^{name} is (no checkpoint of taisoft, or )?damaged.*; resuming from the previous checkpoint instead, {other}$"
-    with pytest.warns(UserWarning, match=message):
+    with pytest.warns(UserWarning, match=f"damaged.*; resuming from the previous checkpoint instead, {re.escape(str(previous))}"):
         found = read_last_good(path)
     assert found.state["time"] == 1.0 and found.path == previous
     previous.write_bytes(b"x")
-    with pytest.raises(ts.SimulationError, match=rf"^{name} .*damaged.*; nor can the previous one be used: {other} is no"):
+    with pytest.raises(ts.SimulationError, match="damaged.*; nor can the previous one be used"):
         read_last_good(path)
     previous.unlink()
-    with pytest.raises(ts.SimulationError, match=rf"^{name} is .*damaged"):
+    with pytest.raises(ts.SimulationError, match="damaged"):
         read_last_good(path)
 
 
 def test_the_previous_checkpoint_is_of_the_same_run(two, monkeypatch):
     """Also on a file system without links. A run resumed from the previous checkpoint keeps it until there is another."""
 
-    def times():
-        return [read_checkpoint(two / name).state["time"] for name in (PREVIOUS_NAME, CHECKPOINT_NAME) if (two / name).exists()]
-
-    writer = CheckpointWriter(two)  # the folder holds checkpoints of another run
-    writer.write(FakeSimulator(3.0))
-    assert times() == [3.0]
-    writer.write(FakeSimulator(4.0))
-    assert times() == [3.0, 4.0]
-    CheckpointWriter(two, resumed=two / ".." / two.name / CHECKPOINT_NAME).write(FakeSimulator(5.0))
-    assert times() == [4.0, 5.0]
-    writer = CheckpointWriter(two, resumed=two / PREVIOUS_NAME)
-    writer.write(FakeSimulator(6.0))
-    assert times() == [4.0, 6.0]
+    def check(writer, time, expected):
+        writer.write(FakeSimulator(time))
+        found = [read_checkpoint(two / name).state["time"] for name in (PREVIOUS_NAME, CHECKPOINT_NAME) if (two / name).exists()]
+        assert found == expected
 
     def no_links(*_):
         raise PermissionError("no links here")
 
+    writer = CheckpointWriter(two)  # the folder holds checkpoints of another run
+    check(writer, 3.0, [3.0])
+    check(writer, 4.0, [3.0, 4.0])
+    check(CheckpointWriter(two, resumed=two / ".." / two.name / CHECKPOINT_NAME), 5.0, [4.0, 5.0])
+    writer = CheckpointWriter(two, resumed=two / PREVIOUS_NAME)
+    check(writer, 6.0, [4.0, 6.0])
     monkeypatch.setattr(os, "link", no_links)
-    writer.write(FakeSimulator(7.0))
-    assert times() == [6.0, 7.0] and sorted(os.listdir(two)) == [CHECKPOINT_NAME, PREVIOUS_NAME]
+    check(writer, 7.0, [6.0, 7.0])
+    assert sorted(os.listdir(two)) == [CHECKPOINT_NAME, PREVIOUS_NAME]

@@ -14,12 +14,13 @@ import pytest
 from benchmarks import references
 from benchmarks.reference_cases import CASES, PROBLEMS
 from benchmarks.reference_cases.record import Check, near, order, small, worst
-from taisoft.errors import OutputError, SimulationError
+from taisoft.errors import SimulationError
 
 OWN_KERNELS = (  # beginnings of the names of cases that take most of their time to compile, or a minute to run
     *("attached_parts-", "bar_impact-", "column_self_weight-", "cook_membrane_3d-", "hanging_beam_E1e6-", "incline_stick_slip-"),
     *("layered_beam-", "rigid_motion-"),
     *("locking-", "mid_traction_beam-", "newton_impact-", "patch_test-", "rigid_mat", "rigid_stack", "rigid_top-"),
+    *("stack_rest-", "hertz_ball-", "slide_to_stop-"),
     *("soft_sheet_self_weight-", "soft_soft_momentum-", "spin_block-SNH-4x3x2_implicit_midpoint", "tendon-", "thick_sphere-"),
     *("spring_mass-SNH-implicit_midpoint", "twist_bar_90deg-", "two_material_bar-", "oscillator_amplification-SVK-one_tet_bdf2"),
     *("beam_fall_semidiscrete-COR", "beam_fall_semidiscrete-SNH-11x2x2_bdf2", "beam_fall_semidiscrete-SNH-11x2x2_exact"),
@@ -71,7 +72,7 @@ def tables(shared, tmp_path, monkeypatch):
     return tmp_path
 
 
-def test_the_benchmark_prints_and_writes_its_results(tables, capsys):
+def test_the_benchmark_writes_its_results_and_fails_for_a_wrong_value(tables, capsys):
     out = tables / "rows.json"
     assert references.main(["--problem", "stress_table", "--out", str(out)]) == 0
     printed = capsys.readouterr().out.splitlines()
@@ -80,9 +81,6 @@ def test_the_benchmark_prints_and_writes_its_results(tables, capsys):
     assert len(rows) == len(printed) - 2 == 6 and {row["law"] for row in rows} == {"SNH", "COR", "SVK"}
     assert all(row["verdict"] == "pass" and row["error"] <= row["limit"] for row in rows)
     assert printed[-1].startswith("6 checks passed, 0 failed")
-
-
-def test_the_benchmark_fails_for_a_wrong_value(tables, capsys):
     path = tables / "stress_table.json"
     table = json.loads(path.read_text(encoding="utf-8"))
     table["value"][2]["SVK"]["P"][0][0] *= 1 + 1e-8
@@ -109,9 +107,3 @@ def test_a_case_that_cannot_be_computed_is_a_failed_row():
 
     rows = references.run(replace(CASES[0], compute=broken), {}, "cpu")
     assert [row.verdict for row in rows] == ["FAIL"] and "no solution" in rows[0].check.quantity
-
-
-def test_a_file_that_cannot_be_written_is_refused_before_the_run(tables, capsys):
-    with pytest.raises(OutputError, match="folder does not exist"):
-        references.main(["--problem", "stress_table", "--out", str(tables / "no" / "rows.json")])
-    assert capsys.readouterr().out == ""

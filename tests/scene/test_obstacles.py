@@ -1,11 +1,5 @@
-"""Obstacles and their shapes:
-
-* shapes keep their own copies, and invalid ones are refused by field;
-* a shape's frame is a rotation to its own axes, and frame, size and pivot describe its exact solid;
-* surfaces of solids are closed with outward normals, and mesh obstacles keep their vertices and triangles;
-* a path is evaluated once at construction and gives a rigid motion about the pivot at every time;
-* key frames: translations are linear, or smooth with zero velocity at the keys, and constant outside; rotations have a constant
-  rate, about one axis by the difference of the angles, else by the shortest path; they can release nodes at the last time.
+"""Obstacles and their shapes: frames, sizes, pivots and surfaces; rigid motions about the pivot of a path; key frames, linear or
+smooth, with rotations and release; invalid ones are refused.
 """
 
 import numpy as np
@@ -53,16 +47,15 @@ def test_a_shape_keeps_its_own_copy():
     assert np.any(mesh.surface()[0])
 
 
-@pytest.mark.parametrize("direction", [(1, 0, 0), (0, -3, 0), (0, 0, 1e-200), (1, 1, 1), (-1e30, 2e30, 0.5e30), (1e-9, 1, 0)])
-def test_frames_are_rotations(direction):
-    unit = np.array(direction) / np.abs(direction).max()
-    unit = unit / np.linalg.norm(unit)
-    plane = ts.HalfSpace((0, 0, 0), direction)
-    frames = [plane.frame(), ts.Capsule((0, 0, 0), direction, 1).frame()]
-    assert np.allclose(plane.normal, unit, rtol=0, atol=1e-15)
-    for frame, axis in zip(frames, (1, 0)):
-        assert np.allclose(frame.T @ frame, np.eye(3), atol=1e-14) and np.linalg.det(frame) == pytest.approx(1)
-        assert np.allclose(frame[:, axis], unit, atol=1e-15)
+def test_frames_are_rotations():
+    for direction in ((1, 0, 0), (0, -3, 0), (0, 0, 1e-200), (1, 1, 1), (-1e30, 2e30, 0.5e30), (1e-9, 1, 0)):
+        unit = np.array(direction) / np.abs(direction).max()
+        unit = unit / np.linalg.norm(unit)
+        plane = ts.HalfSpace((0, 0, 0), direction)
+        assert np.allclose(plane.normal, unit, rtol=0, atol=1e-15)
+        for frame, axis in ((plane.frame(), 1), (ts.Capsule((0, 0, 0), direction, 1).frame(), 0)):
+            assert np.allclose(frame.T @ frame, np.eye(3), atol=1e-14) and np.linalg.det(frame) == pytest.approx(1)
+            assert np.allclose(frame[:, axis], unit, atol=1e-15)
 
 
 def test_a_box_has_twelve_outward_triangles():
@@ -72,58 +65,41 @@ def test_a_box_has_twelve_outward_triangles():
     corners = np.indices((2, 2, 2)).reshape(3, -1).T * 2 - 1
     assert np.allclose(vertices, box.center + corners * box.half_extents)
     assert (opposite_half_edges(triangles) >= 0).all() and volume(vertices, triangles) == pytest.approx(8 * 0.03)
-    x = vertices[triangles]
-    normal = np.cross(x[:, 1] - x[:, 0], x[:, 2] - x[:, 0])
-    assert (np.einsum("tx,tx->t", normal, x.mean(axis=1) - box.center) > 0).all()
 
 
 @pytest.mark.parametrize(
     "make, message",
     [
         (lambda: ts.HalfSpace((0, 0, 0), (0, 0, 0)), "^half-space: normal must not be zero"),
-        (lambda: ts.HalfSpace((0, 0, 0), (0, np.nan, 0)), "^half-space: normal: .* not finite"),
         (lambda: ts.Sphere((0, np.inf, 0), 1), "^sphere: center: .* not finite"),
         (lambda: ts.Sphere((0, 0, 0), 0), "^sphere: radius must be greater than 0 m, not 0"),
         (lambda: ts.Box((0, 0, 0), (1, 0, 1)), r"^box: half_extents must be greater than 0 m, not \[1.0, 0.0, 1.0\]"),
         (lambda: ts.Capsule((0, 1, 0), (0, 1, 0), 1), "^capsule: a and b must not be the same point"),
-        (lambda: ts.Capsule((0, 1, 0), (0, 2, 0), 0), "^capsule: radius must be greater than 0 m"),
         (lambda: ts.MeshObstacle(TETRA[:, :2], FACES), r"^mesh obstacle: vertices must have shape \(4, 3\), not \(4, 2\)"),
-        (lambda: ts.MeshObstacle(TETRA * np.nan, FACES), r"^mesh obstacle: vertices: entry \[0, 0\] is nan"),
         (lambda: ts.MeshObstacle(TETRA, FACES[:, :2]), r"^mesh obstacle: triangles must be integers of shape \(t, 3\)"),
-        (lambda: ts.MeshObstacle(TETRA, []), "^mesh obstacle: triangles must be integers .* t > 0"),
         (lambda: ts.MeshObstacle(TETRA, FACES + 1), r"^mesh obstacle: triangle 1: vertex 4 does not exist \(4 vertices"),
         (lambda: ts.MeshObstacle(TETRA, [(0, 1, 2), (3, 1, 1)]), r"^mesh obstacle: triangle 1 \(3, 1, 1\) has no area"),
-        (
-            lambda: ts.MeshObstacle(TETRA, [(0, 1, 2), (0, 1, 3)]),
-            r"^mesh obstacle: triangles 0 and 1 traverse their edge \(0, 1\) in the same direction",
-        ),
-        (
-            lambda: ts.MeshObstacle([*TETRA, (1, 1, 1)], [(0, 1, 2), (1, 0, 3), (0, 1, 4)]),
-            r"^mesh obstacle: edge \(0, 1\) belongs to 3 triangles \(0, 1, 2\); an edge may have at most two",
-        ),
+        (lambda: ts.MeshObstacle(TETRA, [(0, 1, 2), (0, 1, 3)]), r"triangles 0 and 1 traverse their edge \(0, 1\) in the same"),
+        (lambda: ts.MeshObstacle([*TETRA, (1, 1, 1)], [(0, 1, 2), (1, 0, 3), (0, 1, 4)]), r"edge \(0, 1\) belongs to 3"),
+        (lambda: ts.Obstacle((0, 0, 0), "a"), "^obstacle 'a': shape must be a HalfSpace, Sphere, Box, Capsule or MeshOb"),
+        (lambda: ts.Obstacle(SHAPES[1], "a", friction=-0.1), "^obstacle 'a': friction must be at least 0, not -0.1"),
+        (lambda: ts.Obstacle(SHAPES[1], "a", restitution=1.5), "^obstacle 'a': restitution must be at least 0 and at most 1"),
     ],
 )
-def test_invalid_shapes_are_refused(make, message):
+def test_invalid_obstacles_are_refused(make, message):
     with pytest.raises(SceneError, match=message):
         make()
 
 
 def test_an_obstacle_rests_or_rotates_about_the_pivot_of_its_path():
-    ball, times = ts.Obstacle(SHAPES[1], "ball"), []
+    """A rotation rounded to f32 is accepted."""
+    ball = ts.Obstacle(SHAPES[1], "ball")
     assert np.array_equal(ball.points_at(1.0, TETRA), TETRA) and (ball.friction, ball.restitution, ball.path) == (0.5, 0.0, None)
-
-    def path(t):
-        times.append(t)
-        return (t, 0, 0), rotation((0, 0, 1), t)
-
-    box = ts.Box((0, 1, 0), (1, 2, 3))
-    door = ts.Obstacle(box, "door", path=path)
-    assert times == [0.0]
+    door = ts.Obstacle(SHAPES[2], "door", path=lambda t: ((t, 0, 0), rotation((0, 0, 1), t).astype(np.float32)))
+    assert door.pose(0.3)[1].dtype == np.float64
     quarter = np.pi / 2
     points = door.points_at(quarter, np.array([(0, 1, 0), (1, 1, 0), (0, 2, 5)], dtype=float))
-    assert np.allclose(points, [(quarter, 1, 0), (quarter, 2, 0), (quarter - 1, 1, 5)])
-    vertices, triangles = box.surface()
-    assert volume(door.points_at(0.7, vertices), triangles) == pytest.approx(48)
+    assert np.allclose(points, [(quarter, 1, 0), (quarter, 2, 0), (quarter - 1, 1, 5)], atol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -134,35 +110,13 @@ def test_an_obstacle_rests_or_rotates_about_the_pivot_of_its_path():
         (lambda t: ((0, 0), np.eye(3)), r"the path's translation at t = 0 must have shape \(3,\), not \(2,\)"),
         (lambda t: ((0, 0, 0), 1.00001 * np.eye(3)), "the path's rotation at t = 0 must be orthonormal to 1e-06"),
         (lambda t: ((0, 0, 0), np.diag([1, 1, -1])), "the path's rotation at t = 0 must be orthonormal"),
+        (lambda t: ((0, 0, 0), np.eye(3) * (1 + t)), "the path's rotation at t = 0.25 must be orthonormal"),
     ],
 )
 def test_invalid_paths_are_refused(path, message):
     with pytest.raises(SceneError, match=f"^obstacle 'door': {message}"):
-        ts.Obstacle(SHAPES[2], "door", path=path)
+        ts.Obstacle(SHAPES[2], "door", path=path).pose(0.25)
 
-
-def test_a_path_is_checked_at_every_time():
-    door = ts.Obstacle(SHAPES[2], "door", path=lambda t: ((0, 0, 0), np.eye(3) * (1 + t)))
-    with pytest.raises(SceneError, match="obstacle 'door': the path's rotation at t = 0.25 must be orthonormal"):
-        door.pose(0.25)
-    door = ts.Obstacle(SHAPES[2], "door", path=lambda t: ((0, 0, 0), rotation((1, 2, 3), t).astype(np.float32)))
-    assert door.pose(0.3)[1].dtype == np.float64  # a rotation rounded to f32 is accepted
-
-
-@pytest.mark.parametrize(
-    "options, message",
-    [
-        ({"shape": (0, 0, 0)}, "shape must be a HalfSpace, Sphere, Box, Capsule or MeshObstacle, not tuple"),
-        ({"friction": -0.1}, "friction must be at least 0, not -0.1"),
-        ({"restitution": 1.5}, "restitution must be at least 0 and at most 1, not 1.5"),
-    ],
-)
-def test_invalid_obstacles_are_refused(options, message):
-    with pytest.raises(SceneError, match=f"^obstacle 'ball': {message}"):
-        ts.Obstacle(**({"shape": SHAPES[1], "name": "ball"} | options))
-
-
-# --- key frames -------------------------------------------------------------------------------------------------------
 
 UP = [(0, 0, 0), (0, 2, 0), (0, 2, 4)]
 MESH = ts.box_mesh((1, 1, 1), (1, 1, 1))
@@ -173,48 +127,40 @@ def rotation_of(*vector) -> np.ndarray:
     return Rotation.from_rotvec(vector).as_matrix()
 
 
-@pytest.mark.parametrize("t, expected", [(-1, UP[0]), (1, UP[0]), (2, (0, 1, 0)), (3, UP[1]), (3.25, (0, 2, 1)), (9, UP[2])])
-def test_translations_are_linear_between_keys_and_constant_outside(t, expected):
-    """A single key is constant."""
-    single = ts.KeyFrames((2,), [(1, 2, 3)], [(0, 0, np.pi / 2)])
-    assert single(t)[0].tolist() == [1, 2, 3] and np.allclose(single(t)[1], rotation_of(0, 0, np.pi / 2), atol=1e-15)
-    translation, rotation = ts.KeyFrames((1, 3, 4), UP)(t)
-    assert np.allclose(translation, expected, rtol=0, atol=1e-15) and np.array_equal(rotation, np.eye(3))
-
-
-def test_smooth_key_frames_have_zero_velocity_at_keys():
-    frames, h = ts.KeyFrames((1, 3, 4), UP, smooth=True), 1e-6
+def test_translations_are_linear_or_smooth_between_keys_and_constant_outside():
+    """A single key is constant; smooth ones have zero velocity at the keys."""
+    single, linear = ts.KeyFrames((2,), [(1, 2, 3)], [(0, 0, np.pi / 2)]), ts.KeyFrames((1, 3, 4), UP)
+    for t, expected in ((-1, UP[0]), (1, UP[0]), (2, (0, 1, 0)), (3, UP[1]), (3.25, (0, 2, 1)), (9, UP[2])):
+        assert single(t)[0].tolist() == [1, 2, 3] and np.allclose(single(t)[1], rotation_of(0, 0, np.pi / 2), atol=1e-15)
+        assert np.allclose(linear(t)[0], expected, rtol=0, atol=1e-15) and np.array_equal(linear(t)[1], np.eye(3))
+    smooth, h = ts.KeyFrames((1, 3, 4), UP, smooth=True), 1e-6
     for t in (1, 3, 4):
-        assert np.abs(frames(t + h)[0] - frames(t - h)[0]).max() < 1e-10
-    assert np.allclose(frames(2)[0], (0, 1, 0)) and np.allclose(frames(1.5)[0], (0, 2 * (3 / 16 - 2 / 64), 0))
+        assert np.abs(smooth(t + h)[0] - smooth(t - h)[0]).max() < 1e-10
+    assert np.allclose(smooth(2)[0], (0, 1, 0)) and np.allclose(smooth(1.5)[0], (0, 2 * (3 / 16 - 2 / 64), 0))
 
 
-def test_full_turns_about_one_axis_are_kept():
+def test_rotations_keep_full_turns_about_one_axis_and_else_take_the_shortest_path():
     frames = ts.KeyFrames((0, 1, 2), rotations=[(0, 0, 0), (6 * np.pi, 0, 0), (-1, 0, 0)])
-    for t, angle in ((1 / 6, np.pi), (0.5, 3 * np.pi), (0.75, 4.5 * np.pi), (1.5, 3 * np.pi - 0.5), (2, -1)):
+    for t, angle in ((1 / 6, np.pi), (0.75, 4.5 * np.pi), (1.5, 3 * np.pi - 0.5), (2, -1)):
         assert np.allclose(frames(t)[1], rotation_of(angle, 0, 0), rtol=0, atol=1e-14)
-
-
-def test_rotations_about_different_axes_take_the_shortest_path():
     a, b = (0.1, 2.0, -0.3), (1.0, 0.2, 3.0)
-    frames = ts.KeyFrames((0, 1), rotations=[a, b])
     relative = Rotation.from_matrix(rotation_of(*a).T @ rotation_of(*b)).as_rotvec()
-    assert 1.0 < np.linalg.norm(relative) < np.pi
     for t in (0, 0.3, 1):
-        assert np.allclose(frames(t)[1], rotation_of(*a) @ rotation_of(*(t * relative)), rtol=0, atol=1e-14)
+        expected = rotation_of(*a) @ rotation_of(*(t * relative))
+        assert np.allclose(ts.KeyFrames((0, 1), rotations=[a, b])(t)[1], expected, rtol=0, atol=1e-14)
 
 
 @pytest.mark.parametrize("pivot, center", [((0.0, 0, 0), (0.0, 0, 0)), (None, (1.5, 0, 0))])
 def test_nodes_and_obstacles_rotate_about_the_pivot(pivot, center):
     """pivot None: the center of the nodes or the obstacle."""
-    frames = ts.KeyFrames((0, 1), [(0, 0, 0), (0, 0, 1)], [(0, 0, 0), (0, 0, np.pi)], pivot)
+    frames = ts.KeyFrames((0, 1), [(0, 0, 0), (0, 0, 1)], [(0, 0, 0), (0, 0, np.pi / 2)], pivot)
     body = ts.Scene().add_body(MESH, ts.Material(), position=(1.0, 0, 0))
     ids = [7, 5, 6, 4]  # vertices at x = 0.5
     body.move(ids, frames)
     nodes, ends = MESH.vertices[ids] + (1.0, 0, 0), np.array([(1.0, 0, 0), (2.0, 0, 0)])
     obstacle = ts.Scene().add_obstacle(ts.Capsule(*ends, 0.1), path=frames)
     for start, end in ((nodes, nodes + body.constraints[0].path(1.0)), (ends, obstacle.points_at(1.0, ends))):
-        assert np.allclose(end, (start - center) * (-1, -1, 1) + center + (0, 0, 1), rtol=0, atol=1e-14)
+        assert np.allclose(end, (start - center)[:, [1, 0, 2]] * (-1, 1, 1) + center + (0, 0, 1), rtol=0, atol=1e-14)
 
 
 def test_nodes_are_released_at_the_last_time():

@@ -1,8 +1,5 @@
-"""A scene on a finer mesh or with another order, `taisoft.scene.refine`:
-
-* every tet becomes eight of an eighth of its volume; old nodes come first, new ones halve an edge;
-* selection functions are applied again; ids select whole faces, and ambiguous ids are refused;
-* total tractions, total forces and velocities are kept; paths apply to the new nodes, too.
+"""A scene on a finer mesh or with another order: every tet becomes eight; selections, loads, velocities and paths apply to the
+new nodes, too; ambiguous ids are refused.
 """
 
 import numpy as np
@@ -58,8 +55,9 @@ def test_ids_fix_nodes_between_them_or_are_ambiguous():
         refined(scene)
 
 
-def test_total_loads_are_kept():
+def test_total_loads_and_velocities_are_kept():
     scene, old = one_body()
+    old.velocity = np.cross((0.0, 0.0, 3.0), old.rest_positions)
     top = old.mesh.vertices[old.mesh.surface].mean(axis=1)[:, 1] > 0.49
     old.add_traction(top, (1.0, -5.0, 2.0))
     old.add_force(lambda X: X[:, 0] > 0.99, (0.0, 3.0, 0.0))
@@ -71,13 +69,6 @@ def test_total_loads_are_kept():
         assert np.array_equal(new.forces[0].nodes, np.flatnonzero(new.rest_positions[:, 0] > 0.99))
         assert new.forces[0].value.tolist() == [0.0, 3.0, 0.0]
         assert new.forces[1].nodes.tolist() == [0, 3]
-
-
-def test_nodal_velocities_are_interpolated():
-    scene = ts.Scene()
-    mesh = ts.box_mesh((2, 1, 1), (2.0, 1.0, 1.0))
-    scene.add_body(mesh, RUBBER, velocity=np.cross((0.0, 0.0, 3.0), mesh.vertices))
-    for new in (refined(scene).bodies[0], with_order(scene, 2).bodies[0]):
         assert np.allclose(new.velocity, np.cross((0.0, 0.0, 3.0), new.rest_positions), atol=1e-12)
 
 
@@ -106,10 +97,3 @@ def test_a_path_with_a_displacement_per_node_is_refused():
     scene, old = one_body()
     old.move(where, lambda t: (t, 0.0, 0.0))
     assert refined(scene).bodies[0].constraints[0].path(2.0) == (2.0, 0.0, 0.0)
-
-
-def test_selected_mid_edge_nodes_are_refused_for_linear_tets():
-    scene, old = one_body(order=2)
-    old.fix([old.n_nodes - 1])
-    with pytest.raises(SceneError, match="mid-edge nodes are chosen, which linear tets do not have"):
-        with_order(scene, 1)

@@ -1,13 +1,5 @@
-"""Scenes, bodies and materials:
-
-* Lamé's parameters follow from Young's modulus and Poisson's ratio; invalid material numbers are refused, near
-  incompressibility is warned of, and a misspelt law gets a suggestion;
-* gravity, positions, velocities, loads and paths are finite numbers of the right shape; names are unique among bodies and
-  obstacles;
-* nodes and triangles are selected by ids, masks or functions; empty selections, unknown ids and other results are refused;
-* a node can be fixed twice, but a moved axis of a node has no other constraint;
-* friction and restitution of a pair are those set, or follow from the two; collision settings are checked; a body's contact mode
-  follows from its `collision`, and its sharp edges from its mesh.
+"""Scenes, bodies and materials: elastic constants, names, selections, constraints, friction and restitution of a pair, collision
+settings, sharp edges; whatever is invalid is refused and leaves no trace.
 """
 
 import warnings
@@ -20,7 +12,7 @@ from taisoft.errors import SceneError
 from taisoft.mesh.nodes import make_nodes
 from taisoft.mesh.shapes import ball_mesh, box_mesh, sheet_mesh
 from taisoft.scene.collision import CollisionSettings, has_sharp_edges, principal_extents
-from taisoft.scene.material import LAWS
+from taisoft.scene.fingerprint import scene_digest
 from taisoft.scene.obstacles import Box, HalfSpace, Sphere
 from taisoft.scene.scene import Material, Scene
 
@@ -30,34 +22,26 @@ GROUND = HalfSpace((0, 0, 0), (0, 1, 0))
 
 @pytest.fixture
 def scene() -> Scene:
-    return Scene()
-
-
-@pytest.fixture
-def body(scene):
-    return scene.add_body(MESH, Material(), name="beam")
+    """Two bodies and two obstacles with different friction and restitution."""
+    scene = Scene()
+    scene.add_body(MESH, Material(friction=0.4, restitution=0.1), name="a")
+    scene.add_body(MESH, Material(friction=0.9, restitution=0.3), name="b")
+    scene.add_obstacle(GROUND, name="ground", friction=0.1, restitution=0.2)
+    scene.add_obstacle(GROUND, name="ice", friction=0.0)
+    return scene
 
 
 def still(t):
     return (0.0, 0.0, 0.0)
 
 
-# --- materials --------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("poisson", [-0.5, 0.0, 0.3, 0.49])
+@pytest.mark.parametrize("poisson", [-0.5, 0.0, 0.49])
 def test_lame_parameters_satisfy_hookes_law(poisson):
     rubber = Material(young=2e6, poisson=poisson)
     # uniaxial stress: a strain of (1, -nu, -nu) e gives a stress of young e along the axis and none across it
     trace = 1.0 - 2.0 * poisson
     assert 2 * rubber.mu + rubber.lam * trace == pytest.approx(2e6)
     assert -2 * rubber.mu * poisson + rubber.lam * trace == pytest.approx(0.0, abs=1e-6)
-
-
-def test_a_material_holds_floats_and_a_law():
-    rubber = Material(young=1000000, density=np.float32(900.0))
-    assert type(rubber.young) is float and rubber.density == 900.0
-    assert {Material(law=law).law for law in LAWS} == set(LAWS)
 
 
 def test_near_incompressibility_is_warned_of_for_linear_tets():
@@ -72,155 +56,122 @@ def test_near_incompressibility_is_warned_of_for_linear_tets():
 @pytest.mark.parametrize(
     "field, rule, values",
     [
-        ("young", "be", [0, -1, np.nan, np.inf, "1e5 Pa", None, True, 1j, [1e5], 10**400]),
-        ("density", "be", [0, -1, np.nan, "1000"]),
-        ("friction", "be", [-0.1, np.inf]),
-        ("restitution", "be", [-0.1, 1.5, np.nan]),
-        ("mass_damping", "be", [-1e-9, "0"]),
-        ("stiffness_damping", "be", [-1e-9, np.inf]),
-        ("poisson", "be", [np.nan, "0.3", None]),
-        ("poisson", r"lie in the open interval \(-1, 0.5\), not", [0.5, -1, -1.5, 0.5000001]),
-        ("volume_floor", "be", [-0.1, 1e-4, 1.0, np.nan]),
-        ("law", "be one of .*did you mean 'corotational'", ["corotated"]),
-        ("law", "be one of .*did you mean 'stable_neo_hookean'", ["Neo_Hookean"]),
-        ("law", "be one of st_venant_kirchhoff, corotational, stable_neo_hookean, not", ["hooke", "", None]),
+        ("young", "must be", [0, -1, np.nan, np.inf, "1e5 Pa", None, True, 1j, [1e5], 10**400]),
+        ("young", "is .* too (large|small) for a 32-bit float", [1e300, 1e-60]),
+        ("density", "must be", [0, np.nan, "1000"]),
+        ("friction", "must be", [-0.1, np.inf]),
+        ("restitution", "must be", [-0.1, 1.5, np.nan]),
+        ("mass_damping", "must be", [-1e-9, "0"]),
+        ("stiffness_damping", "must be", [-1e-9, np.inf]),
+        ("poisson", r"must lie in the open interval \(-1, 0.5\), not", [0.5, -1]),
+        ("volume_floor", "must be", [-0.1, 1e-4, 1.0, np.nan]),
+        ("law", "must be one of .*did you mean 'corotational'", ["corotated"]),
+        ("law", "must be one of st_venant_kirchhoff, corotational, stable_neo_hookean, not", ["hooke", "", None]),
     ],
 )
 def test_invalid_materials_are_refused(field, rule, values):
     for value in values:
-        with pytest.raises(SceneError, match=f"^material: {field} must {rule}"):
+        with pytest.raises(SceneError, match=f"^material: {field} {rule}"):
             Material(**{field: value})
 
 
-# --- bodies and obstacles ---------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("gravity", [(0, -9.81), "down", (0, np.nan, 0), 9.81, None, ("0", "1", "2"), [[0, 1, 2]]])
-def test_gravity_must_be_three_finite_numbers(gravity, scene):
-    with pytest.raises(SceneError, match="^scene: gravity"):
-        Scene(gravity=gravity)
-    with pytest.raises(SceneError, match="^scene: gravity"):
-        scene.gravity = gravity
-    assert scene.gravity.tolist() == [0.0, -9.81, 0.0]
-
-
-def test_bodies_and_obstacles_are_found_by_name(scene, body):
+def test_bodies_and_obstacles_are_found_by_name(scene):
     other = scene.add_body(MESH, Material(), position=(1, 2, 3), velocity=np.ones((27, 3)))
-    assert scene.body("beam") is body and scene.body("body0") is other and scene.bodies == [body, other]
+    assert scene.body("body0") is other and [body.name for body in scene.bodies] == ["a", "b", "body0"]
     assert other.velocity.shape == (27, 3) and other.position.tolist() == [1, 2, 3]
     assert np.array_equal(other.rest_positions, MESH.vertices)  # position shifts the initial state only
-    with pytest.raises(SceneError, match="no obstacle is called 'ground'; the scene has none"):
-        scene.obstacle("ground")
-    ground = scene.add_obstacle(GROUND, name="ground", friction=0.3, restitution=0.2)
     ball = scene.add_obstacle(Sphere((0, 0, 0), 1))
-    assert scene.obstacle("ground") is ground and scene.obstacle("obstacle0") is ball
-    assert scene.obstacles == [ground, ball] and scene.colliders == [body, other, ground, ball]
-    assert (ground.shape, ground.friction, ground.restitution, ground.path) == (GROUND, 0.3, 0.2, None)
-    for call, name, message in (
-        (scene.body, "bean", "no body is called 'bean'; did you mean 'beam'"),
-        (scene.body, 7, "no body is called 7"),
-        (scene.body, "ground", "no body is called 'ground'; there are"),
-        (scene.obstacle, "grund", "no obstacle is called 'grund'; did you mean 'ground'"),
-    ):
-        with pytest.raises(SceneError, match=message):
-            call(name)
-    assert "obstacles=['ground', 'obstacle0']" in repr(scene) and "obstacles" not in repr(Scene())
+    assert scene.obstacle("obstacle0") is ball and scene.colliders == [*scene.bodies, *scene.obstacles]
+    ground = scene.obstacle("ground")
+    assert (ground.shape, ground.friction, ground.restitution, ground.path) == (GROUND, 0.1, 0.2, None)
+    assert "obstacles=['ground', 'ice', 'obstacle0']" in repr(scene)
+    with pytest.raises(SceneError, match="no obstacle is called 'ground'; the scene has none"):
+        Scene().obstacle("ground")
 
 
-def test_names_are_unique_and_default_ones_skip_used_ones(scene):
+def test_default_names_skip_used_ones():
+    scene = Scene()
     scene.add_body(MESH, Material(), name="body1")
     assert [scene.add_body(MESH, Material()).name for _ in range(2)] == ["body0", "body2"]
     scene.add_obstacle(GROUND, name="body3")
     assert scene.add_body(MESH, Material()).name == "body4"
-    scene.add_body(MESH, Material(), name="obstacle0")
-    assert scene.add_obstacle(GROUND).name == "obstacle1"
-    for call, name, message in (
-        (scene.add_obstacle, "body0", "obstacle name 'body0' is taken"),
-        (scene.add_obstacle, " ", "obstacle name must be a text"),
-        (lambda shape, name: scene.add_body(MESH, Material(), name), "body3", "body name 'body3' is taken"),
-    ):
-        with pytest.raises(SceneError, match=message):
-            call(GROUND, name=name)
 
 
-@pytest.mark.parametrize(
-    "options, rule",
-    [
-        ({"name": "beam"}, "body name 'beam' is taken"),
-        ({"name": "  "}, "body name must be a text that is not empty"),
-        ({"order": 3}, "order must be 1 or 2, not 3"),
-        ({"quadrature_degree": 2}, "quadrature_degree of order 1 must be 1, not 2"),
-        ({"order": 2, "quadrature_degree": 3}, "quadrature_degree of order 2 must be 2 or 4, not 3"),
-        ({"position": (0, np.nan, 0)}, r"position: entry \[1\] is nan, not finite"),
-        ({"velocity": np.zeros((26, 3))}, r"velocity must have shape \(3,\) or \(27, 3\), not \(26, 3\)"),
-        ({"mesh": MESH.vertices}, "mesh must be a TetMesh, not ndarray"),
-        ({"material": {"young": 1e6}}, "materials are given by region, but its mesh has no regions"),
-        ({"collision": "distance"}, "'b': collision must be one of auto, distance_field, proximity, not 'distance'; did you"),
-    ],
-)
-def test_invalid_bodies_are_refused_and_leave_no_trace(scene, body, options, rule):
-    with pytest.raises(SceneError, match=rule):
-        scene.add_body(**({"mesh": MESH, "material": Material(), "name": "b"} | options))
-    assert scene.bodies == [body]
+def add(**options):
+    return lambda s, b: s.add_body(**({"mesh": MESH, "material": Material(), "name": "c"} | options))
 
 
-# --- selections -------------------------------------------------------------------------------------------------------
+REFUSALS = [  # the call on a scene and its body "a", and the message
+    *(
+        (lambda s, b, g=g: setattr(s, "gravity", g), "^scene: gravity")
+        for g in ((0, -9.81), "down", (0, np.nan, 0), None, list("012"))
+    ),
+    (lambda s, b: Scene(gravity=(0, -9.81)), "^scene: gravity"),
+    (lambda s, b: s.body("aa"), "no body is called 'aa'; did you mean 'a'"),
+    (lambda s, b: s.body(7), "no body is called 7"),
+    (lambda s, b: s.obstacle("grund"), "no obstacle is called 'grund'; did you mean 'ground'"),
+    (lambda s, b: s.add_obstacle(GROUND, name="a"), "obstacle name 'a' is taken"),
+    (lambda s, b: s.add_obstacle(GROUND, name=" "), "obstacle name must be a text"),
+    (add(name="ice"), "body name 'ice' is taken"),
+    (add(name="  "), "body name must be a text that is not empty"),
+    (add(order=3), "order must be 1 or 2, not 3"),
+    (add(quadrature_degree=2), "quadrature_degree of order 1 must be 1, not 2"),
+    (add(order=2, quadrature_degree=3), "quadrature_degree of order 2 must be 2 or 4, not 3"),
+    (add(position=(0, np.nan, 0)), r"position: entry \[1\] is nan, not finite"),
+    (add(velocity=np.zeros((26, 3))), r"velocity must have shape \(3,\) or \(27, 3\), not \(26, 3\)"),
+    (add(mesh=MESH.vertices), "mesh must be a TetMesh, not ndarray"),
+    (add(material={"young": 1e6}), "materials are given by region, but its mesh has no regions"),
+    (add(collision="distance"), "'c': collision must be one of auto, distance_field, proximity, not 'distance'; did you"),
+    (lambda s, b: b.fix([-1]), "^body 'a': .*node -1 does not exist"),
+    (lambda s, b: b.move([3, 27], still), "^body 'a': .*node 27 does not exist"),
+    (lambda s, b: b.add_force([], (0, 0, 1)), "^body 'a': .*no node is chosen"),
+    (lambda s, b: b.fix(np.ones(26, dtype=bool)), r"a mask must have shape \(27,\), not \(26,\)"),
+    (lambda s, b: b.fix("left"), "list of integers"),
+    (lambda s, b: b.fix(lambda X: X[:, 0]), r"must return a bool mask of shape \(27,\), not float64"),
+    (lambda s, b: b.fix(lambda X: True), r"must return a bool mask of shape \(27,\), not bool of shape \(\)"),
+    (lambda s, b: b.fix(lambda X: X.missing), "the selection function failed: AttributeError"),
+    *((lambda s, b, axes=axes: b.fix([0], axes), "axes must be some of 'x', 'y', 'z'") for axes in ("", "xx", "w", None)),
+    (lambda s, b: b.move([0], still, axes="w"), "axes must be some of 'x', 'y', 'z'"),
+    (lambda s, b: b.move([1, 2], lambda t: None), "^body 'a': move: .*must give a displacement at t = 0, not None"),
+    (lambda s, b: b.move([1, 2], lambda t: (0, 0)), r"^body 'a': move: .*must have shape \(3,\) or \(2, 3\), not \(2,\)"),
+    (lambda s, b: b.move([1, 2], lambda t: 1 / t), "^body 'a': move: .*the path failed at t = 0: ZeroDivisionError"),
+    (lambda s, b: b.move([1, 2], (0, 0, 1)), "^body 'a': move: .*path must be a function of time"),
+    (lambda s, b: b.add_traction([48], (0, 1, 0)), "surface triangle 48 does not exist"),
+    (lambda s, b: b.add_traction([], (0, 1, 0)), "no surface triangle is chosen"),
+    *((lambda s, b, v=v: b.add_traction([0], v), "add_traction: traction") for v in ((0, 1), 5.0, (0, np.nan, 0), "up")),
+    *((lambda s, b, v=v: b.add_force([0], v), "add_force: force") for v in ((0, 1), 5.0, (0, np.nan, 0), "up")),
+    (lambda s, b: s.set_contact("a", "grond", friction=1), "^scene: .*no body or obstacle is called 'grond'; did you mean 'gro"),
+    (lambda s, b: s.contact_numbers("a", "grond"), "^scene: .*no body or obstacle is called 'grond'; did you mean 'ground'"),
+    (lambda s, b: s.set_contact("ground", "ice", friction=1), "^scene: .*'ground' and 'ice': one of the two must be a body"),
+    (lambda s, b: s.contact_numbers("ground", "ice"), "^scene: .*'ground' and 'ice': one of the two must be a body"),
+    (lambda s, b: s.set_contact("a", "b"), "^scene: .*'a' and 'b': give friction or restitution"),
+    (lambda s, b: s.set_contact("a", "b", friction=-1), "^scene: .*'a' and 'b': friction must be at least 0"),
+]
 
 
-def test_nodes_are_selected_by_ids_masks_and_functions(body):
-    left = MESH.vertices[:, 0] < -0.4
+@pytest.mark.parametrize("call, message", REFUSALS)
+def test_what_is_invalid_is_refused_and_leaves_no_trace(scene, call, message):
+    before = scene_digest(scene)
+    with pytest.raises(SceneError, match=message):
+        call(scene, scene.body("a"))
+    assert scene_digest(scene) == before and len(scene.bodies) == 2
+
+
+def test_nodes_and_triangles_are_selected_by_ids_masks_and_functions(scene):
+    body, left = scene.body("a"), MESH.vertices[:, 0] < -0.4
     expected = np.flatnonzero(left).tolist()
     for where in (expected, np.flatnonzero(left), left, lambda X: X[:, 0] < -0.4):
         assert body.fix(where).nodes.tolist() == expected
     assert body.fix([5, 3, 5]).nodes.tolist() == [5, 3]
     assert body.fix(4, axes="zx").axes.tolist() == [True, False, True]
     assert len(body.fix(lambda X: np.add(X, 1.0, out=X)[:, 0] > 1.4).nodes) == 9 and body.rest_positions.max() == 0.5  # a copy
+    load = body.add_traction(lambda c: c[:, 1] > 0.49, (0, 2000, 0))
+    assert load.triangles.tolist() == np.flatnonzero((MESH.vertices[MESH.surface][:, :, 1] > 0.49).all(axis=1)).tolist()
+    assert body.tractions == [load] and load.value.tolist() == [0, 2000, 0]
 
 
-@pytest.mark.parametrize(
-    "where, rule",
-    [
-        ([-1], "node -1 does not exist"),
-        ([3, 27], "node 27 does not exist"),
-        ([], "no node is chosen"),
-        (np.ones(26, dtype=bool), r"a mask must have shape \(27,\), not \(26,\)"),
-        ("left", "list of integers"),
-        ([[1], [2, 3]], "choose by node ids"),
-        (lambda X: X[:, 0], r"must return a bool mask of shape \(27,\), not float64"),
-        (lambda X: True, r"must return a bool mask of shape \(27,\), not bool of shape \(\)"),
-        (lambda X: X.missing, "the selection function failed: AttributeError"),
-    ],
-)
-def test_invalid_selections_are_refused(body, where, rule):
-    for call in (body.fix, lambda where: body.move(where, still), lambda where: body.add_force(where, (0, 0, 1))):
-        with pytest.raises(SceneError, match=f"^body 'beam': .*{rule}"):
-            call(where)
-    assert not body.constraints and not body.forces
-
-
-def test_invalid_axes_are_refused(body):
-    for axes in ("", "xx", "w", "XY", None, ["x"]):
-        for call in (body.fix, lambda where, axes: body.move(where, still, axes=axes)):
-            with pytest.raises(SceneError, match="axes must be some of 'x', 'y', 'z'"):
-                call([0], axes=axes)
-
-
-@pytest.mark.parametrize(
-    "path, rule",
-    [
-        (lambda t: None, "must give a displacement at t = 0, not None"),
-        (lambda t: (0, 0), r"must have shape \(3,\) or \(2, 3\), not \(2,\)"),
-        (lambda t: 1 / t, "the path failed at t = 0: ZeroDivisionError"),
-        ((0, 0, 1), "path must be a function of time"),
-    ],
-)
-def test_invalid_paths_are_refused(body, path, rule):
-    with pytest.raises(SceneError, match=f"^body 'beam': move: .*{rule}"):
-        body.move([1, 2], path)
-    assert not body.constraints
-
-
-def test_contradicting_constraints_are_refused(body):
+def test_contradicting_constraints_are_refused(scene):
+    body = scene.body("a")
     body.fix([0, 1])
     body.fix([1, 2], "y")  # node 1 again
     body.move([2], still, "x")  # another axis of a fixed node
@@ -236,41 +187,7 @@ def test_contradicting_constraints_are_refused(body):
     assert len(body.constraints) == 4
 
 
-def test_tractions_select_triangles_by_their_centroids(body):
-    load = body.add_traction(lambda c: c[:, 1] > 0.49, (0, 2000, 0))
-    x = MESH.vertices[MESH.surface[load.triangles]]
-    areas = 0.5 * np.linalg.norm(np.cross(x[:, 1] - x[:, 0], x[:, 2] - x[:, 0]), axis=1)
-    assert areas.sum() == pytest.approx(1.0) and load.value.tolist() == [0, 2000, 0]
-    assert body.tractions == [load] and body.add_traction([3, 1], (1, 0, 0)).triangles.tolist() == [3, 1]
-    for where, rule in (([48], "surface triangle 48 does not exist"), ([], "no surface triangle is chosen")):
-        with pytest.raises(SceneError, match=rule):
-            body.add_traction(where, (0, 1, 0))
-
-
-@pytest.mark.parametrize("value", [(0, 1), 5.0, (0, np.nan, 0), "up", None])
-def test_loads_must_be_three_finite_numbers(body, value):
-    with pytest.raises(SceneError, match="add_traction: traction"):
-        body.add_traction([0], value)
-    with pytest.raises(SceneError, match="add_force: force"):
-        body.add_force([0], value)
-    assert not body.tractions and not body.forces
-
-
-# --- contacts --------------------------------------------------------------------------------------------------------
-
-
-def contact_scene() -> Scene:
-    """Two bodies and two obstacles with different friction and restitution."""
-    scene = Scene()
-    scene.add_body(MESH, Material(friction=0.4, restitution=0.1), name="a")
-    scene.add_body(MESH, Material(friction=0.9, restitution=0.3), name="b")
-    scene.add_obstacle(GROUND, name="ground", friction=0.1, restitution=0.2)
-    scene.add_obstacle(GROUND, name="ice", friction=0.0)
-    return scene
-
-
-def test_contact_numbers_follow_from_both_colliders_or_are_set():
-    scene = contact_scene()
+def test_contact_numbers_follow_from_both_colliders_or_are_set(scene):
     assert scene.contact_numbers("a", "b") == pytest.approx((0.6, 0.3))
     assert scene.contact_numbers("ground", "a") == pytest.approx((0.2, 0.2))
     assert scene.contact_numbers("b", "ice") == (0.0, 0.3)
@@ -280,43 +197,22 @@ def test_contact_numbers_follow_from_both_colliders_or_are_set():
     scene.set_contact("a", "ground", friction=0.7)
     assert scene.contact_numbers("a", "ground") == scene.contact_numbers("ground", "a") == (0.7, 0.2)
     scene.set_contact("ground", "a", restitution=1)
-    assert scene.contact_numbers("a", "ground") == (0.7, 1.0)
     scene.set_contact("a", "a", friction=0, restitution=0.5)
-    assert scene.contact_numbers("a", "a") == (0.0, 0.5)
-    assert scene.contact_numbers("b", "ground") == pytest.approx((0.3, 0.3))
     assert scene.contact_pairs == {frozenset("a"): (0.0, 0.5), frozenset(("a", "ground")): (0.7, 1.0)}
 
 
-@pytest.mark.parametrize(
-    "names, numbers, rule",
-    [
-        (("a", "grond"), {"friction": 1}, "no body or obstacle is called 'grond'; did you mean 'ground'"),
-        (("ground", "ice"), {"friction": 1}, "'ground' and 'ice': one of the two must be a body"),
-        (("a", "b"), {}, "'a' and 'b': give friction or restitution"),
-        (("a", "b"), {"friction": -1}, "'a' and 'b': friction must be at least 0"),
-    ],
-)
-def test_invalid_pairs_are_refused(names, numbers, rule):
-    scene = contact_scene()
-    with pytest.raises(SceneError, match=f"^scene: .*{rule}"):
-        scene.set_contact(*names, **numbers)
-    assert not scene.contact_pairs
-    if numbers == {"friction": 1}:
-        with pytest.raises(SceneError, match=f"^scene: .*{rule}"):
-            scene.contact_numbers(*names)
-
-
-def test_a_snapshot_does_not_follow_later_changes():
-    scene = contact_scene()
+def test_a_snapshot_does_not_follow_later_changes(scene):
     scene.set_contact("a", "b", friction=0.7)
     scene.collision = CollisionSettings(k_dop=14)
     twin = scene.snapshot()
     scene.set_contact("a", "b", friction=0.1)
     scene.add_obstacle(Box((0, 0, 0), (1, 1, 1)))
     scene.collision = CollisionSettings()
-    assert twin.contact_numbers("a", "b") == (0.7, 0.3) and len(twin.obstacles) == 2
-    assert twin.collision.k_dop == 14
+    scene.body("a").collision = "distance_field"
+    assert twin.contact_numbers("a", "b") == (0.7, 0.3) and len(twin.obstacles) == 2 and twin.collision.k_dop == 14
     assert twin.body("a").collision == "auto" and twin.body("a").contact_mode == "proximity"
+    assert scene.body("a").contact_mode == "distance_field"
+    assert scene.add_body(MESH, Material(), collision="distance_field").contact_mode == "distance_field"
 
 
 @pytest.mark.parametrize(
@@ -335,15 +231,6 @@ def test_a_snapshot_does_not_follow_later_changes():
 def test_invalid_collision_settings_are_refused(options, rule):
     with pytest.raises(SceneError, match=f"^collision settings: {rule}"):
         CollisionSettings(**options)
-
-
-def test_the_contact_mode_follows_from_collision():
-    scene = Scene()
-    body = scene.add_body(MESH, Material(), name="beam")
-    assert body.collision == "auto" and body.contact_mode == scene.snapshot().body("beam").contact_mode == "proximity"
-    assert scene.add_body(MESH, Material(), collision="distance_field").contact_mode == "distance_field"
-    body.collision = "distance_field"
-    assert body.contact_mode == "distance_field"
 
 
 def test_edges_are_sharp_if_they_are_convex_by_more_than_60_degrees():

@@ -89,45 +89,20 @@ nodes = {{ half_space = {{ point = [-1.99, 0, 0], normal = [1, 0, 0] }} }}
 MESH = '[bodies.a]\nmaterial = {{}}\nmesh = {{ file = "{}" }}\n'
 
 
-def path_data(path):
-    """Of a path, its frames and where what it leads starts."""
-    frames = getattr(path, "frames", path)
-    names = ("times", "translations", "rotations", "pivot", "smooth", "release", "values")
-    said = {name: np.asarray(getattr(frames, name)).tobytes() for name in names} if path else None
-    return said and said | {name: getattr(path, name).tobytes() for name in ("starts", "center") if hasattr(path, name)}
+# of records, what a file does not hold: how a mesh was made, and selection functions
+NOT_STORED = ("source", "recipe", "warnings", "flipped", "where", "_given_twist")
 
 
-def points_data(connection) -> list:
-    """Names and positions of the points of a spring or tendon."""
-    return [(point.owner, point.position.tobytes()) for point in connection.points]
-
-
-def data(scene: ts.Scene) -> dict:
-    """What a scene says, as bytes and plain values that compare bit for bit."""
-    bodies = []
-    for b in scene.bodies:
-        arrays = (b.rest_positions, b.nodes.elements, b.mesh.tets, b.mesh.surface, b.position, b.velocity)
-        fixed = [(c.nodes.tolist(), c.axes.tolist()) for c in b.constraints if c.path is None]
-        moved = [(c.nodes.tolist(), c.axes.tolist(), path_data(c.path)) for c in b.constraints if c.path is not None]
-        chosen = [t.triangles.tolist() for t in (*b.tractions, *b.pressures)] + [f.nodes.tolist() for f in b.forces]
-        chosen += [(c.name, c.given, c.triangles.tolist()) for c in b.cavities]
-        values = [path_data(load.path) or (load.value.shape, load.value.tobytes()) for load in b.loads]
-        numbers = (b.name, b.order, b.quadrature_degree, b.dilatation, b.collision, b.material)
-        by_tet = {name: own.tobytes() for name, own in b.composition.by_tet.items()}
-        regions = b.mesh.regions if b.mesh.regions is None else (b.mesh.regions.tolist(), b.mesh.region_names)
-        bodies.append((numbers, [a.tobytes() for a in arrays], fixed, moved, chosen, values, by_tet, regions))
-    obstacles = []
-    for o in scene.obstacles:
-        fields = {name: np.asarray(value).tobytes() for name, value in vars(o.shape).items()}
-        obstacles.append((o.name, type(o.shape), fields, o.friction, o.restitution, path_data(o.path)))
-    connections = [
-        *((s.name, points_data(s), s.stiffness, s.rest_length, s.damping) for s in scene.springs),
-        *((t.name, points_data(t), path_data(t.path) or float(t.value)) for t in scene.tendons),
-        *((a.name, a.a, a.nodes.tolist(), a.b, a.stiffness, a.damping) for a in scene.attachments),
-    ]
-    own = (scene.gravity.tobytes(), scene.collision, scene.allow_initial_overlap, scene.contact_forces)
-    pairs = scene.contact_pairs
-    return {"bodies": bodies, "obstacles": obstacles, "own": own, "pairs": pairs, "connections": connections}
+def data(value):
+    """A scene, or a part of one, as bytes and plain values that compare bit for bit."""
+    if isinstance(value, np.ndarray):
+        return value.dtype.str, value.shape, value.tobytes()
+    if isinstance(value, dict):
+        return {str(key): data(own) for key, own in value.items() if key not in NOT_STORED}
+    if isinstance(value, (list, tuple)):
+        # a file holds what fixes nodes before what moves them
+        return [data(own) for own in sorted(value, key=lambda own: getattr(own, "path", None) is not None)]
+    return (type(value).__name__, data(vars(value))) if hasattr(value, "__dict__") else value
 
 
 def read(tmp_path: Path, text: str, **options) -> tuple[ts.Scene, dict]:

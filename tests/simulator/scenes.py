@@ -1,13 +1,11 @@
-"""Scenes that the tests of simulators share, and so their kernels; as a script, runs one of them in another process."""
-
-import sys
+"""Scenes that the tests of simulators share, and so their kernels."""
 
 import numpy as np
 
 import taisoft as ts
 from taisoft.dynamics.schemes import EXPLICIT
 from tests.dynamics.contact_scenes import SIDE, cube
-from tests.dynamics.scenes import SNH, SVK, driven_scene, rubber
+from tests.dynamics.scenes import SNH, SVK, rubber
 from tests.dynamics.scenes import cube as box
 
 DT = 0.002  # [s] of a pair
@@ -63,25 +61,3 @@ def follow(sim: ts.Simulator, steps: int) -> list:
         report = sim.step()
         found.append((sim.time, sim.positions(), sim.velocities(), report))
     return found
-
-
-def driven(steps: int) -> ts.Simulator:
-    """A simulator of the driven scene that took some steps."""
-    made = ts.Simulator(driven_scene(mass_damping=0.5, stiffness_damping=1e-4), 5e-4, "velocity_verlet", precision="f64")
-    follow(made, steps)
-    return made
-
-
-def runs(checkpoint: str) -> dict:
-    """Arrays of the driven scene that runs from its start, and of one that continues from a checkpoint."""
-    with driven(0) as sim:
-        whole = follow(sim, BEFORE + AFTER)
-    with ts.Simulator.load_checkpoint(checkpoint, driven_scene(mass_damping=0.5, stiffness_damping=1e-4)) as sim:
-        late = follow(sim, AFTER)
-    return {
-        f"{name}{k}": np.array([one[k] for one in found]) for name, found in (("whole", whole), ("late", late)) for k in range(3)
-    }
-
-
-if __name__ == "__main__":
-    np.savez(sys.argv[2], **runs(sys.argv[1]))

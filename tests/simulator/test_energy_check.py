@@ -5,30 +5,24 @@
 * real bodies that vibrate and fly create none, but steps near `stable_dt` in a strained state do.
 """
 
-from types import SimpleNamespace
-
-import numpy as np
 import pytest
 
-import taisoft as ts
+from taisoft.dynamics.schemes import EXPLICIT
 from taisoft.energy_check import EnergyCheck
 from taisoft.records import Energies, RunReport, StepReport
 from tests.dynamics.scenes import cube, rubber
 from tests.simulator.scenes import simulator
+from tests.simulator.test_running import StandIn as Counter
 
 
-class StandIn:
+class StandIn(Counter):
     """Simulator and Dynamics of a 1 m cube with 100 J of kinetic energy."""
 
     def __init__(self, integrator: str = "implicit_euler"):
-        self.settings = SimpleNamespace(explicit=integrator in ("symplectic_euler", "velocity_verlet"), integrator=integrator)
-        self.scene, self.dt, self.stable_dt, self.time = ts.Scene(), 0.5, 1.0, 0.0
+        super().__init__(integrator in EXPLICIT, dt=0.5)
+        self.settings.integrator = integrator
         self.scene.add_body(cube(), rubber(), name="cube")
         self.scene.gravity = (0, 0, 0)
-        self.is_driven, self.changes, self.contact = False, 0, SimpleNamespace(contact_offset=0.01)
-
-    def _host(self) -> "StandIn":
-        return self
 
     def energies(self) -> Energies:
         return Energies(100.0, 0.0, 0.0)
@@ -59,24 +53,17 @@ def step(kinetic: float, elastic: float = 0.0, gravity: float = 0.0, loads: floa
         ([step(10.0), step(100.0), step(120.0), step(5.0)], "degraded"),
         ([step(300.0, 0.0, -200.0)], "ok"),
         ([step(300.0, 0.0, 0.0, -200.0)], "ok"),
-        ([step(320.0, 0.0, -200.0)], "ok"),
         ([step(340.0, 0.0, -200.0)], "degraded"),
         ([step(100.0, gravity=20.0)], "degraded"),
         ([step(90.0), None, step(105.0)], "ok"),
-        ([step(130.0), None, step(100.0)], "degraded"),
-        ([step(np.nan)], "ok"),  # the run has failed
     ],
 )
 def test_rises_of_energy(steps, status):
     run = check(StandIn(), *steps)
     assert run.status == status and len(run.problems) == (status == "degraded")
     assert all("energy was created: it rose by" in text and "halve dt" in text for text in run.problems)
-
-
-def test_messages_give_the_rise():
     (text,) = check(StandIn(), step(1000.0), step(400.0)).problems
     assert "rose by 900 J from t = 0 s to 1 s, 9 times the energy of the motion" in text
-    assert "rose by 30 J from t = 0 s to 1 s, 30 % of" in check(StandIn(), step(130.0)).problems[0]
 
 
 @pytest.mark.parametrize(
@@ -89,17 +76,14 @@ def test_explicit_steps_may_oscillate_about_the_energy(integrator, allowed, too_
     assert check(StandIn(), step(*allowed)).status == "degraded"
 
 
-def test_driven_motion_and_corrected_overlaps_may_add_energy():
+def test_driven_motion_corrected_overlaps_and_initial_contacts_may_add_energy():
+    """Bodies that touch at the start may part to the contact offset; later contacts add nothing."""
     sim = StandIn()
     sim.is_driven = True
     assert check(sim, step(500.0)).status == "ok"
     sim.is_driven, sim.scene.allow_initial_overlap = False, True
     assert check(sim, step(500.0, max_penetration=0.1), step(505.0)).status == "ok"
     assert check(sim, step(500.0, max_penetration=0.1), step(600.0)).status == "degraded"
-
-
-def test_initial_contacts_may_open_to_their_offset():
-    """Which adds energy; later contacts may not."""
     assert check(StandIn(), step(130.0, n_contacts=4)).status == "ok"
     assert check(StandIn(), step(100.0), step(130.0, n_contacts=4)).status == "degraded"
 

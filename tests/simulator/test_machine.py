@@ -6,16 +6,13 @@ import pytest
 from taisoft.machine import machine, summarise, time_repeats, versions
 
 
-def test_statistics_of_repeated_timings():
+def test_statistics_of_repeated_timings_and_versions():
     t = summarise([4.0, 1.0, 2.0, 3.0, 5.0])
     assert (t.median, t.minimum, t.maximum, t.repeats) == (3.0, 1.0, 5.0, 5)
     assert t.spread == pytest.approx(2 / 3)
     with pytest.raises(ValueError, match="at least one repeat"):
         summarise([])
     assert time_repeats(lambda: sum(range(1000)), 3).minimum > 0
-
-
-def test_processor_cores_and_package_versions():
     assert machine()["processor"] and machine()["cores"] >= 1
     found = versions("numpy", "no-such-package")
     assert found["numpy"] == np.__version__ and found["no-such-package"] is None

@@ -1,13 +1,11 @@
 """Nested values and their arrays:
 
-* random ones come back through JSON and the flat dict, whatever their keys; every array has a name of its own;
-* an array that appears twice is kept once; a missing one is found.
+* random ones come back through JSON and the flat dict, whatever their keys.
 """
 
 import json
 
 import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
@@ -34,13 +32,3 @@ def test_random_values_come_back(value):
     arrays = {}
     text = json.dumps(part_arrays(value, arrays))
     assert same(join_arrays(json.loads(text), arrays), value)
-
-
-def test_names_of_arrays():
-    x, arrays = np.arange(3), {}
-    parted = part_arrays({"simulation": {"x": x, "0": np.ones(2)}, "a/b": [x, np.zeros(2)]}, arrays)
-    assert list(arrays) == ["simulation/x", "simulation/0", "#1/1"]
-    again = join_arrays(parted, arrays)
-    assert again["a/b"][0] is x and again["simulation"]["x"] is x
-    with pytest.raises(KeyError):
-        join_arrays(parted, {})

@@ -1,8 +1,7 @@
 """`run` with a stand-in whose steps cost nothing, and with two real simulators:
 
 * frames come at fps or after every step, frame 0 first, and the run ends at `seconds` to the nearest step;
-* dt is lowered once, to the next divisor of the frame time, or rounded to one within 1e-6 of it, and that is reported; a dt that
-  divides the frame time stays;
+* dt is lowered once to the next divisor of the frame time, or rounded to one within 1e-6 of it, and that is reported;
 * on_step gets the report of every implicit step and every explicit batch, with its wall time without compilation;
 * explicit batches are merged into one report per frame, with the extremes of their sub-steps; implicit steps have one each;
 * stop and Ctrl-C end a run as interrupted, at the last whole step; a failure ends it as failed; neither raises;
@@ -19,7 +18,7 @@ from taisoft.dynamics.stage_system import StageSystem
 from taisoft.frames import dt_sentence, first_frame
 from taisoft.records import Energies, StepReport
 from taisoft.running import run
-from tests.simulator.scenes import DT, simulator
+from tests.simulator.scenes import simulator
 
 BOTH = pytest.mark.parametrize("explicit", [True, False])
 
@@ -70,9 +69,6 @@ def frames(sim, seconds, fps=60, **arguments):
     return run(sim, seconds, on_frame, fps, **arguments), seen
 
 
-# --- frames and dt ----------------------------------------------------------------------------------------------------
-
-
 @BOTH
 def test_frames_come_at_fps(explicit):
     sim = StandIn(explicit, dt=0.01)
@@ -82,34 +78,20 @@ def test_frames_come_at_fps(explicit):
     assert result.status == "ok" and result.problems == [] and not result.interrupted
     assert result.steps == 30 and result.sim_seconds == pytest.approx(0.3)
     assert len(result.step_reports) == (3 if explicit else 30) and result.wall_seconds >= 0.0
-    result, seen = frames(sim, 0.1, fps=10)  # goes on
-    assert seen == [(0, 0.3, None), (1, 0.4, steps)] and result.steps == 10 and result.sim_seconds == pytest.approx(0.1)
     result, seen = frames(sim, 0.5, fps=10, resumed=True)  # counts from time 0
-    assert seen == [(4, 0.4, None), (5, 0.5, steps)] and result.steps == 10
+    assert seen == [(3, 0.3, None), (4, 0.4, steps), (5, 0.5, steps)] and result.steps == 20
     every = StandIn(explicit, dt=0.03)
     result, seen = frames(every, 0.1, fps=None)
     assert every.dt == 0.03 and [time for _, time, _ in seen] == [0.0, 0.03, 0.06, 0.09] and len(result.step_reports) == 3
 
 
-@pytest.mark.parametrize("seconds, steps", [(0.104, 10), (0.106, 11), (0.001, 1)])
-def test_a_run_ends_at_the_nearest_step(seconds, steps):
-    result, seen = frames(StandIn(True, dt=0.01), seconds, fps=20)
-    assert result.steps == steps and seen[-1][1] == pytest.approx(steps * 0.01)
-    note = ["note: 0.001 s are less than half a step: one step of 0.01 s is taken"] if seconds < 0.005 else []
-    assert result.problems == note
-
-
 @pytest.mark.parametrize(
     "dt, per_frame, change",
     [
-        (0.03, 1, "lowered from 0.03 s to 0.0166667 s"),
         (0.01, 2, "lowered from 0.01 s to 0.00833333 s"),
         (0.00833333, 2, "rounded from 0.00833333 s to 0.00833333333 s"),
-        (0.0083332, 3, "lowered from 0.0083332 s to 0.00555556 s"),
-        (0.01666667, 1, "rounded from 0.01666667 s to 0.0166666667 s"),
         (0.0166667, 1, "lowered from 0.0166667 s to 0.0166666667 s"),
         (1 / 120, 2, None),
-        (1 / 180, 3, None),
     ],
 )
 def test_dt_becomes_a_divisor_of_the_frame(dt, per_frame, change):
@@ -120,35 +102,26 @@ def test_dt_becomes_a_divisor_of_the_frame(dt, per_frame, change):
     assert (sim.dt == dt) == (change is None) and result.dt_requested == (None if change is None else dt)
     assert result.problems == ([] if change is None else [f"note: dt {change}, so that {per_frame} steps make a frame of 1/60 s"])
     assert dt_sentence(result) == ("" if change is None else f"dt {change}")
-
-
-def test_rounding_does_not_make_a_step_unstable():
-    """A dt that an explicit integrator would refuse is lowered instead; with allow_unstable it is rounded."""
-    for allowed, per_frame in ((False, 3), (True, 2)):
-        sim = StandIn(True, dt=0.00833333)
-        sim.settings.allow_unstable, sim.stable_dt = allowed, 0.00833333
+    if change is not None and change.startswith("rounded"):  # unless the integrator would refuse that as unstable
+        sim = StandIn(True, dt=dt)
+        sim.settings.allow_unstable, sim.stable_dt = False, dt
         frames(sim, 0.1)
-        assert sim.dt == pytest.approx(1 / 60 / per_frame, rel=1e-15)
-        assert first_frame(sim, 60) == 6
+        assert sim.dt == pytest.approx(1 / 180, rel=1e-15) and first_frame(sim, 60) == 6
 
 
-@pytest.mark.parametrize(
-    "arguments, message",
-    [
-        ((0.0,), "seconds must be greater than 0 s, not 0.0"),
-        (("1",), "seconds must be a number, not '1'"),
-        ((1e20,), "the run would never end"),
-        ((1.0, None, np.nan), "fps must be finite, not nan"),
-    ],
-)
-def test_bad_arguments_are_refused(arguments, message):
-    sim = StandIn(True)
-    with pytest.raises(ts.SimulationError, match=message):
-        run(sim, *arguments)
-    assert sim.step_count == 0
-
-
-# --- reports ----------------------------------------------------------------------------------------------------------
+def test_a_run_ends_at_the_nearest_step():
+    for seconds, steps in ((0.104, 10), (0.106, 11), (0.001, 1)):
+        result, seen = frames(StandIn(True, dt=0.01), seconds, fps=20)
+        assert result.steps == steps and seen[-1][1] == pytest.approx(steps * 0.01)
+    assert result.problems == ["note: 0.001 s are less than half a step: one step of 0.01 s is taken"]
+    bad = {
+        (0.0,): "seconds must be greater than 0 s",
+        (1e20,): "the run would never end",
+        (1.0, None, np.nan): "fps must be finite",
+    }
+    for arguments, message in bad.items():
+        with pytest.raises(ts.SimulationError, match=message):
+            run(StandIn(True), *arguments)
 
 
 def test_explicit_batches_are_merged():
@@ -164,9 +137,8 @@ def test_explicit_batches_are_merged():
     assert first.time == pytest.approx(0.1) and result.status == "degraded"
 
 
-@pytest.mark.parametrize(
-    "events, problem",
-    [
+def test_bad_steps_degrade_a_run():
+    for events, problem in (
         (
             {3: {"converged": False, "residual": 1e-3}, 5: {"converged": False, "residual": 2e-2}},
             "2 of 10 steps did not converge; the worst, at t = 0.05 s, reached a relative residual of 2.00e-02",
@@ -175,14 +147,11 @@ def test_explicit_batches_are_merged():
         ({4: {"dropped_contacts": 2}}, "in 1 of 10 reported steps contacts of inverted tets were unknown"),
         (
             {4: {"deep": 1, "max_penetration": 0.02, "crossings": 7}, 5: {"deep": 1, "max_penetration": 0.01}},
-            "in 2 of 10 reported steps bodies penetrate; the worst, at t = 0.04 s, by 0.02 m, with up to 7 crossing pairs of "
-            "triangles",
+            "in 2 of 10 reported steps bodies penetrate; the worst, at t = 0.04 s, by 0.02 m, with up to 7 crossing pairs of ",
         ),
-    ],
-)
-def test_bad_steps_degrade_a_run(events, problem):
-    result, _ = frames(StandIn(False, events=events), 0.1, fps=None)
-    assert result.status == "degraded" and result.problems == [problem]
+    ):
+        result, _ = frames(StandIn(False, events=events), 0.1, fps=None)
+        assert result.status == "degraded" and result.problems[0].startswith(problem) and len(result.problems) == 1
 
 
 @BOTH
@@ -204,11 +173,8 @@ def test_on_step_gets_every_report_and_its_time(explicit, monkeypatch):
     assert result.wall_seconds == pytest.approx(2.0 * len(steps))
 
 
-# --- ends -------------------------------------------------------------------------------------------------------------
-
-
 @BOTH
-def test_stop_interrupts_a_run(explicit):
+def test_stop_and_ctrl_c_interrupt_a_run(explicit):
     sim = StandIn(explicit)
     result, seen = frames(sim, 1.0, fps=10, stop=lambda: sim.step_count >= 23)
     assert (result.status, result.interrupted) == ("degraded", True)
@@ -217,50 +183,23 @@ def test_stop_interrupts_a_run(explicit):
     assert sum(report.steps for report in result.step_reports) == result.steps
     result, seen = frames(StandIn(explicit), 1.0, stop=lambda: True)
     assert result.interrupted and result.steps == 0 and result.step_reports == [] and len(seen) == 1
-
-
-@pytest.mark.parametrize("where", ["step", "frame"])
-def test_ctrl_c_interrupts_a_run(where):
-    sim = StandIn(False, events={8: KeyboardInterrupt()} if where == "step" else {})
-
-    def on_frame(s, index, report):
-        if where == "frame" and s.step_count == 7:
-            raise KeyboardInterrupt
-
-    result = run(sim, 1.0, on_frame, None)
-    assert (result.status, result.interrupted, result.steps) == ("degraded", True, 7)
-    assert len(result.step_reports) == 7
+    result = run(StandIn(explicit, events={8: KeyboardInterrupt()}, largest_batch=1), 1.0, fps=None)
+    assert (result.status, result.interrupted, result.steps, len(result.step_reports)) == ("degraded", True, 7, 7)
 
 
 @BOTH
-@pytest.mark.parametrize("error", [ts.SimulationError("step 8: body 'beam', vertex 3: gone"), MemoryError("gone")])
-def test_a_failed_step_ends_a_run(explicit, error):
-    sim = StandIn(explicit, events={8: error}, largest_batch=1)
-    result, seen = frames(sim, 1.0, fps=20)
-    assert result.status == "failed" and len(result.problems) == 1 and "gone" in result.problems[0]
-    assert ("memory" in result.problems[0]) == isinstance(error, MemoryError)
-    assert result.steps == 7 and [index for index, *_ in seen] == [0, 1]
-
-
-def test_errors_of_on_frame_are_raised():
-    def on_frame(s, index, report):
-        if index == 1:
-            raise ts.OutputError("the disk is full")
-
-    with pytest.raises(ts.OutputError, match="the disk is full"):
-        run(StandIn(True), 1.0, on_frame, 10)
+def test_a_failed_step_ends_a_run(explicit):
+    for error in (ts.SimulationError("step 8: body 'beam', vertex 3: gone"), MemoryError("gone")):
+        sim = StandIn(explicit, events={8: error}, largest_batch=1)
+        result, seen = frames(sim, 1.0, fps=20)
+        assert result.status == "failed" and len(result.problems) == 1 and "gone" in result.problems[0]
+        assert ("memory" in result.problems[0]) == isinstance(error, MemoryError)
+        assert result.steps == 7 and [index for index, *_ in seen] == [0, 1]
 
 
 @pytest.mark.parametrize(
     "end, status",
-    [
-        (None, "ok"),
-        (0.005, "ok"),
-        (0.02, "degraded"),
-        (KeyboardInterrupt(), "degraded"),
-        (ts.SimulationError("lost"), "failed"),
-        (MemoryError("lost"), "failed"),
-    ],
+    [(None, "ok"), (0.005, "ok"), (0.02, "degraded"), (KeyboardInterrupt(), "degraded"), (MemoryError("lost"), "failed")],
 )
 def test_the_final_overlap_sets_the_status(end, status):
     """end: the deepest overlap [m], or an exception of the overlap check."""
@@ -276,40 +215,30 @@ def test_the_final_overlap_sets_the_status(end, status):
     sim.overlaps = overlaps
     result = run(sim, 0.1)
     assert result.status == status and result.interrupted == isinstance(end, KeyboardInterrupt)
-    problem = {"ok": "", "degraded": "the run was interrupted" if result.interrupted else "'left' and 'right' overlap by 0.02 m"}
-    assert problem.get(status, "lost") in " ".join(result.problems)
+    said = {"ok": "", "degraded": "'left' and 'right' overlap by 0.02 m", "failed": "lost"}[status]
+    assert ("the run was interrupted" if result.interrupted else said) in " ".join(result.problems)
 
 
-@pytest.mark.parametrize("change", ["dt", "steps"])
-def test_a_run_that_on_frame_ends_at_another_time_is_degraded(change):
-    """on_frame changes dt or takes steps itself."""
+def test_on_frame_may_fail_or_change_the_end():
+    """Its errors are raised; a run that ends at another time, since on_frame takes steps, is degraded."""
 
     def on_frame(sim, index, report):
-        if index == 2 and change == "dt":
-            sim.dt = sim.dt / 4
-        elif index == 2:
+        if index == 2 and sim.settings.explicit:
+            raise ts.OutputError("the disk is full")
+        if index == 2:
             sim.advance(1)
             sim.advance(1)
 
+    with pytest.raises(ts.OutputError, match="the disk is full"):
+        run(StandIn(True), 1.0, on_frame, 10)
     result = run(StandIn(False, dt=1 / 60), 0.2, on_frame)
     assert result.status == "degraded" and any("instead of t = 0.2 s" in problem for problem in result.problems)
 
 
-# --- real simulators --------------------------------------------------------------------------------------------------
-
-
-@pytest.fixture(scope="module", params=["velocity_verlet", "implicit_euler"])
-def shared(request):
-    with simulator(request.param) as sim:
-        yield sim
-
-
-@pytest.fixture
-def sim(shared):
-    shared.dt = DT
-    shared.reset()
-    yield shared
-    shared.set_gravity((0.0, -9.81, 0.0))
+@pytest.fixture(params=["velocity_verlet", "implicit_euler"])
+def sim(request):
+    with simulator(request.param) as made:
+        yield made
 
 
 def test_a_run_takes_the_same_steps_as_step_by_step(sim):
@@ -323,7 +252,7 @@ def test_a_run_takes_the_same_steps_as_step_by_step(sim):
     assert np.array_equal(sim.positions(), x)
 
 
-@pytest.mark.parametrize("shared", ["implicit_euler"], indirect=True)
+@pytest.mark.parametrize("sim", ["implicit_euler"], indirect=True)
 def test_ctrl_c_within_a_step_abandons_it(sim, monkeypatch):
     """The next step starts from the last good state."""
     sim.advance(1)

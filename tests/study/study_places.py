@@ -1,8 +1,6 @@
-"""Places of a study without child processes: runs in this process, or of a fake program; and helpers for child processes."""
+"""Places of a study without child processes: runs in this process, or of a fake program."""
 
 import json
-import time
-from pathlib import Path
 
 import numpy as np
 
@@ -50,9 +48,8 @@ class Pendulum(InProcess):
         self._answer = {"crash": self.crashing[dt]} if dt in self.crashing else {"answer": self._record(request["task"])}
 
     def _record(self, task: dict) -> dict:
-        setting = task["setting"]
-        A = np.array([[0.0, 1.0], [-1.0, 0.0]])
-        h, eye = setting["dt"], np.eye(2)
+        setting, A, eye = task["setting"], np.array([[0.0, 1.0], [-1.0, 0.0]]), np.eye(2)
+        h = setting["dt"]
         euler = setting["integrator"] == "implicit_euler"
         step = np.linalg.inv(eye - h * A) if euler else np.linalg.solve(eye - h / 2 * A, eye + h / 2 * A)
         states = [np.array([1.0, 0.0])]
@@ -90,18 +87,3 @@ class Pendulum(InProcess):
             "momentum": momentum,
             "path": None if problem else pack(path),
         }
-
-
-def wait_until_ended(pids: list[int], seconds: float = 120.0) -> None:
-    """Wait until no process of these is running; fail after so many seconds."""
-    deadline = time.monotonic() + seconds
-    while any(map(_is_running, pids)):
-        assert time.monotonic() < deadline, "a run outlives its study"
-        time.sleep(0.05)
-
-
-def _is_running(pid: int) -> bool:
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
-    except (FileNotFoundError, ProcessLookupError):
-        return False

@@ -64,15 +64,13 @@ def test_error_of_the_finest_mesh_is_a_third_of_the_distance_to_the_next():
     assert finest_own_error(finest, [far, near])[0].max == 0.5
 
 
-@pytest.mark.parametrize("start, change, scale", [(100.0, 2.0, 2.0), (100.0, 1e-12, 100.0), (0.0, 2.0, 2.0)])
-def test_momentum_error_is_relative_to_the_largest_change(start, change, scale):
+def test_momentum_error_is_relative_to_the_largest_change():
     exact = reference(FINE, [["a", len(FINE)]], shift=1.0)
-    exact.momentum = np.array([[start, 0, 0], [start + change, 0, 0]])
-    inexact = exact.momentum + [[0, 0, 0], [0, 0.5, 0]]
-    assert momentum_error({"momentum_rate": None}, inexact, exact) == pytest.approx(0.5 / scale)
+    for start, change, scale in ((100.0, 2.0, 2.0), (100.0, 1e-12, 100.0), (0.0, 2.0, 2.0)):
+        exact.momentum = np.array([[start, 0, 0], [start + change, 0, 0]])
+        inexact = exact.momentum + [[0, 0, 0], [0, 0.5, 0]]
+        assert momentum_error({"momentum_rate": None}, inexact, exact) == pytest.approx(0.5 / scale)
 
-
-# --- the Pareto front ------------------------------------------------------------------------------------------------
 
 few = st.integers(0, 4).map(float)  # points often coincide or share a coordinate
 points = st.lists(st.tuples(few, few) | st.tuples(st.floats(1e-9, 1e9), st.floats(1e-12, 10.0)), max_size=20)
@@ -94,20 +92,13 @@ def test_front_holds_exactly_the_undominated_points(candidates):
 
 
 @given(points, st.floats(0.0, 5.0))
-def test_cheapest_is_the_fastest_within_the_tolerance(candidates, tolerance):
+def test_cheapest_is_the_fastest_within_the_tolerance_and_nearest_has_the_smallest_error(candidates, tolerance):
     found, accurate = cheapest(candidates, tolerance), [p for p in candidates if p[1] <= tolerance]
-    if not accurate:
-        assert found is None
-    else:
+    assert (found is None) == (not accurate) and (nearest(candidates) is None) == (not candidates)
+    if accurate:
         assert candidates[found] == min(accurate)
-
-
-@given(points)
-def test_nearest_has_the_smallest_error(candidates):
-    found = nearest(candidates)
-    assert (found is None) == (not candidates)
     if candidates:
-        assert candidates[found] == min(candidates, key=lambda p: (p[1], p[0]))
+        assert candidates[nearest(candidates)] == min(candidates, key=lambda p: (p[1], p[0]))
 
 
 def test_points_with_nan_are_left_out():

@@ -17,7 +17,6 @@ import pytest
 from taisoft.errors import OutputError
 from taisoft.machine import versions
 from taisoft.study import Request, Setting, output
-from taisoft.study.accuracy import pack, unpack
 from taisoft.study.output import NoStore, Store, check_scene, write
 from taisoft.study.results import csv_of, text_of
 from taisoft.study.runner import Runner
@@ -59,9 +58,6 @@ def rows_of(study, integrator: str) -> list:
     return [row for row in study.rows if row.setting["integrator"] == integrator and row.in_time is not None]
 
 
-# --- errors -----------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("integrator, order", [("implicit_euler", 1), ("bdf2", 2)])
 def test_errors_fall_with_the_integrators_order(integrator, order):
     """And the estimated error of the reference is its true error."""
@@ -69,32 +65,20 @@ def test_errors_fall_with_the_integrators_order(integrator, order):
     rows, reference = rows_of(study, integrator), study.references[0]
     for by in ("max", "rms"):
         errors = [row.resolved_error(by) for row in rows]
-        orders = np.log2(np.divide(errors[:-1], errors[1:]))
-        assert np.allclose(orders, order, atol=0.15), orders
+        assert np.allclose(np.log2(np.divide(errors[:-1], errors[1:])), order, atol=0.15), errors
     true_error = np.abs(reference.path[:, 1, 0] - np.cos(np.arange(21) * 0.2)).max() / reference.excursion
     assert reference.own_error.max == pytest.approx(true_error, rel=0.05)
-    place = Pendulum(plan())
-    place.start({"action": "run", "task": {"setting": asdict(Setting(0.05, integrator)), "steps": 4, "frames": 20, "repeats": 0}})
-    exact = abs(unpack(place.poll()["answer"]["path"])[-1, 1, 0] - np.cos(4.0)) / 2.0  # over the excursion of 2
-    assert rows[-1].in_time.max >= exact - 2 * reference.own_error.max
 
 
-def test_errors_below_the_references_own_error_are_unresolved():
+def test_errors_below_the_references_own_error_are_unresolved_and_energy_drifts():
     study = run(Pendulum(plan(dts=(0.2, 0.025))))
     fine = rows_of(study, "bdf2")[1]
     fine.in_time = replace(fine.in_time, max=0.5 * study.references[0].own_error.max)
     assert fine.resolved_error("max") == study.references[0].own_error.max
     assert f"< {study.references[0].own_error.max:.2g}" in text_of(study)
-
-
-def test_energy_drift_is_the_integrators():
-    study = run(Pendulum(plan()))
     assert all(row.energy < 1e-12 for row in rows_of(study, "bdf2"))  # the trapezoidal rule conserves it
     drift = [row.energy for row in rows_of(study, "implicit_euler")]
-    assert drift[0] > drift[1] > drift[2] > 0.05
-
-
-# --- the table --------------------------------------------------------------------------------------------------------
+    assert drift[0] > drift[1] > 0.02
 
 
 def test_cheapest_setting_within_the_tolerance_is_reported():
@@ -111,18 +95,17 @@ def test_cheapest_setting_within_the_tolerance_is_reported():
 
 def test_failed_and_crashed_runs_stay_with_their_reason():
     study = run(Pendulum(plan(), failing={0.1: "step 7: not finite"}, crashing={0.05: "its process ended by signal SIGSEGV"}))
-    by_dt = {(row.setting["integrator"], row.setting["dt"]): row for row in study.rows}
-    assert (by_dt["bdf2", 0.1].status, by_dt["bdf2", 0.1].reason) == ("failed", "step 7: not finite")
-    assert by_dt["bdf2", 0.05].status == "failed" and "SIGSEGV" in by_dt["bdf2", 0.05].reason
-    assert by_dt["bdf2", 0.2].status == "ok" and by_dt["velocity_verlet", 0.4].status == "refused"
+    by_dt = {(row.setting["integrator"], row.setting["dt"]): (row.status, row.reason) for row in study.rows}
+    assert by_dt["bdf2", 0.1] == ("failed", "step 7: not finite") and by_dt["bdf2", 0.2] == ("ok", "")
+    assert by_dt["bdf2", 0.05][0] == "failed" and "SIGSEGV" in by_dt["bdf2", 0.05][1]
+    assert by_dt["velocity_verlet", 0.4][0] == "refused"
     text = text_of(study)
     assert all(reason in text for reason in ("step 7: not finite", "SIGSEGV", "above the stability limit"))
     assert len(list(csv.DictReader(io.StringIO(csv_of(study))))) == len(study.rows) == 7
 
 
-@pytest.mark.parametrize("how", ["failing", "crashing"])
-def test_study_without_its_reference_has_times_but_no_errors(tmp_path, how):
-    study = run(Pendulum(plan(), **{how: {0.0125: "it is too small"}}))
+def test_study_without_its_reference_has_times_but_no_errors(tmp_path):
+    study = run(Pendulum(plan(), failing={0.0125: "it is too small"}))
     assert not study.comparable_rows() and all(row.seconds for row in study.rows if row.status == "ok")
     assert "it is too small; runs that need it have no error" in text_of(study)
     assert "No setting has both a time and an error" in text_of(study)
@@ -130,30 +113,15 @@ def test_study_without_its_reference_has_times_but_no_errors(tmp_path, how):
     assert "no setting has both a time and an error" in write(study, tmp_path) and not (tmp_path / "study.png").exists()
 
 
-def test_refused_combinations_are_listed_as_a_product_if_they_form_one():
-    def refused(*settings) -> str:
-        cases = [{"setting": asdict(setting), "refused": "it does not fit"} for setting in settings]
-        made = plan()
-        return text_of(run(Pendulum(made | {"cases": [*made["cases"], *cases]})))
-
-    product = [Setting(dt, "bdf2", precision=p) for dt in (0.2, 0.1) for p in ("f32", "f64")]
-    assert "* bdf2, dt 0.2 | 0.1, precision f32 | f64: it does not fit" in refused(*product)
-    assert "* bdf2, dt = 0.2 s, f32; bdf2, dt = 0.2 s, f64; bdf2, dt = 0.1 s, f32: it does not fit" in refused(*product[:3])
-
-
-@pytest.mark.parametrize("stored, advice", [(True, "The same command continues it."), (False, "Without --out nothing is kept.")])
-def test_runs_beyond_the_budget_are_left_out(tmp_path, stored, advice):
+def test_runs_beyond_the_budget_are_left_out(tmp_path):
     place = Pendulum(plan())
     # the budget is 3 runs; the first of the requests is planning
-    study = run(place, Store(tmp_path) if stored else None, left=lambda: 4.0 - len(place.requests))
+    study = run(place, Store(tmp_path), left=lambda: 4.0 - len(place.requests))
     left_out = [row for row in study.rows if row.status == "left out"]
     assert left_out[0].reason == "the budget was spent while it ran"
     assert len(left_out) > 1 and all(row.reason == "the budget was spent" for row in left_out[1:])
-    text = text_of(study)
-    assert f"Not complete: the budget was spent. {advice} Cut: implicit_euler, dt = 0.2 s, f32; if it takes longer than" in text
-
-
-# --- finished runs ----------------------------------------------------------------------------------------------------
+    cut = "The same command continues it. Cut: implicit_euler, dt = 0.2 s, f32; if it takes longer than"
+    assert f"Not complete: the budget was spent. {cut}" in text_of(study)
 
 
 def test_finished_runs_are_reused(tmp_path):
@@ -165,34 +133,30 @@ def test_finished_runs_are_reused(tmp_path):
     assert text_of(again).splitlines()[5:] == text_of(first).splitlines()[5:] and not list(tmp_path.rglob("*.part"))
 
 
-@pytest.mark.parametrize(
-    "changes",
-    [
-        {"machines": [{"name": "there"}]},
-        {"request": replace(REQUEST, repeats=4)},
-        {"scenes": {"refine 0": "another scene"}},
-        {"code": "edited"},
-        {"sources": {"scene.py": "text", "helper.py": "text"}},
-    ],
-)
-def test_runs_of_other_machines_settings_scenes_and_code_are_not_reused(tmp_path, changes):
-    run(Pendulum(plan()), Store(tmp_path))
-    of_plan = {key: value for key, value in changes.items() if key in ("scenes", "sources", "code")}
-    place = Pendulum(plan(**of_plan))
-    run(place, Store(tmp_path), **{key: value for key, value in changes.items() if key not in of_plan})
-    assert len(place.requests) == 1 + (6 if "request" in changes else 8)  # more repeats do not repeat the references
+def test_runs_of_other_machines_settings_scenes_and_code_are_not_reused(tmp_path):
+    for k, (of_plan, of_run) in enumerate(
+        (
+            ({}, {"machines": [{"name": "there"}]}),
+            ({}, {"request": replace(REQUEST, repeats=4)}),
+            ({"scenes": {"refine 0": "another scene"}}, {}),
+            ({"code": "edited"}, {}),
+            ({"sources": {"scene.py": "text", "helper.py": "text"}}, {}),
+        )
+    ):
+        folder, place = tmp_path / str(k), Pendulum(plan(**of_plan))
+        folder.mkdir()
+        run(Pendulum(plan()), Store(folder))
+        run(place, Store(folder), **of_run)
+        assert len(place.requests) == 1 + (6 if "request" in of_run else 8)  # more repeats do not repeat the references
 
 
-@pytest.mark.parametrize("damage", ["cut", "flipped", "other"])
+@pytest.mark.parametrize("damage", ["cut", "flipped"])
 def test_damaged_records_are_reported_and_repeated(tmp_path, damage):
     first = run(Pendulum(plan()), Store(tmp_path))
     path = sorted((tmp_path / "runs").iterdir())[3]
     text = path.read_text()
-    if damage == "flipped":
-        k = text.index("zlib_base64") + 40
-        path.write_text(text[:k] + ("A" if text[k] != "A" else "B") + text[k + 1 :])
-    else:
-        path.write_text({"cut": text[:-100], "other": json.dumps({"kind": "something"})}[damage])
+    k = text.index("zlib_base64") + 40
+    path.write_text(text[:-100] if damage == "cut" else text[:k] + ("A" if text[k] != "A" else "B") + text[k + 1 :])
     place, store = Pendulum(plan()), Store(tmp_path)
     again = run(place, store)
     assert len(place.requests) == 2
@@ -206,16 +170,6 @@ def test_interrupted_study_keeps_finished_runs(tmp_path):
     study = run(place, Store(tmp_path), requested=lambda: len(place.requests) >= 5)
     assert study.ended == "the study was interrupted" and len(list((tmp_path / "runs").iterdir())) == 3
     assert run(Pendulum(plan()), requested=lambda: True) is None
-
-
-def test_packed_arrays_are_restored_bitwise():
-    values = np.random.default_rng(0).normal(size=(3, 4, 3)) * 10.0 ** np.arange(-300, 300, 200)
-    assert np.array_equal(unpack(json.loads(json.dumps(pack(values)))), values)
-    with pytest.raises(ValueError):
-        unpack({"shape": [1], "zlib_base64": "AAAA"})
-
-
-# --- files ------------------------------------------------------------------------------------------------------------
 
 
 def test_files_agree_with_the_records(tmp_path):

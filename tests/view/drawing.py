@@ -11,21 +11,12 @@ import taisoft as ts
 from taisoft.view.connection_layer import ConnectionMarks
 from taisoft.view.ggui import vulkan_missing
 from taisoft.view.scene_view import scene_size
+from tests.dynamics.scenes import rubber
 from tests.view.desktop import ROOT
 from tests.view.fake_simulator import beam_scene
 
 SIZE = (320, 180)
 needs_vulkan = pytest.mark.skipif(bool(vulkan_missing()), reason="no Vulkan driver: Debian package mesa-vulkan-drivers")
-
-PROLOGUE = """
-import sys
-sys.path[:0] = ["."]
-from tests.view.fake_simulator import FakeSimulator, beam_scene
-from taisoft.errors import OutputError
-from taisoft.view.offscreen import Offscreen
-scene = beam_scene()
-sim = FakeSimulator(scene, announce=True)
-"""
 
 
 def run_child(code, **variables):
@@ -83,4 +74,14 @@ def connected_scene() -> ts.Scene:
     scene.add_spring(("one", (0, 0, 0)), ("two", (0, 0, 0)), stiffness=10.0, rest_length=0.5)
     scene.add_tendon([("one", (0.5, 0, 0)), ("two", (0.5, 0, 0)), ("two", (1, 0, 0))], 3.0)
     scene.add_rigid_body(ts.box_mesh((1, 1, 1), (0.4, 0.4, 0.4)), name="rigid", position=(4, 0, 0)).fix()
+    return scene
+
+
+def cubes_scene() -> ts.Scene:
+    """Three cubes above one another, the first close to the ground, with which it has a friction of its own."""
+    scene = ts.Scene()
+    for k, name in enumerate("abc"):
+        scene.add_body(ts.box_mesh((1, 1, 1), (1, 1, 1)), rubber(friction=0.5), name=name, position=(0, 2.0 * k, 0))
+    scene.add_obstacle(ts.HalfSpace((0, -0.51, 0), (0, 1, 0)), name="ground", friction=0.5)
+    scene.set_contact("a", "ground", friction=0.2)
     return scene

@@ -6,6 +6,8 @@ import numpy as np
 
 import taisoft as ts
 from taisoft.records import Energies, RunReport, StepReport
+from taisoft.scene.plan import Plan
+from taisoft.settings import Settings
 
 RUBBER = ts.Material(law="stable_neo_hookean", young=1e5, poisson=0.3, density=1000.0)
 
@@ -20,13 +22,16 @@ def beam_scene(names=("beam",), cells=(8, 2, 2), order=1):
 
 
 class FakeSimulator:
-    """Bends every body about its left end, more and more with time; announce prints each call for a parent process.
+    """Bends every body about its left end, more and more with time.
 
     Stress grows with time and along x, and each body's node 0 is pushed by the next one's, or by an obstacle.
     """
 
-    def __init__(self, scene, dt=1 / 60, announce=False):
-        self.scene, self.dt, self.announce = scene, dt, announce
+    settings, plan, draggable, dragged, stable_dt = Settings(), Plan(), False, None, 1.0
+    plan.add("contact_forces", False, "", "one body")
+
+    def __init__(self, scene, dt=1 / 60):
+        self.scene, self.dt = scene, dt
         self.time, self.step_count, self.compile_seconds = 0.0, 0, 0.0
         self._along = {b.name: b.mesh.vertices[b.mesh.tets, 0].mean(axis=1) for b in scene.bodies}
 
@@ -38,6 +43,9 @@ class FakeSimulator:
         bent = x.copy()
         bent[:, 1] -= 0.1 * np.sin(self.time) * (x[:, 0] - x[:, 0].min()) ** 2
         return bent
+
+    def velocities(self, name=None):
+        return np.sin(3.0 * self.positions(name) + self.time)
 
     def stress(self, name=None):
         if name is None:
@@ -55,27 +63,21 @@ class FakeSimulator:
         weights = np.where(nodes >= 0, (1.0, 0.0, 0.0, 0.75, 0.25, 0.0), 0.0)
         impulse = np.array([(self.time + 0.1 * j, 1.0 + j, -self.time) for j in range(k)])
         names_b = np.array([*names, "an obstacle"][1 : k + 1], dtype=object)
-        return SimpleNamespace(
-            nodes=nodes, weights=weights, impulse=impulse, body_a=np.array(names[:k], dtype=object), body_b=names_b
-        )
+        found = SimpleNamespace(nodes=nodes, weights=weights, impulse=impulse)
+        found.body_a, found.body_b = np.array(names[:k], dtype=object), names_b
+        found.point, found.normal = self.positions()[nodes[:, 0]], np.tile((0.0, 1.0, 0.0), (k, 1))
+        return found
 
     def energies(self):
         return Energies(kinetic=1.0 + self.time, elastic=2.0, gravity=-3.0)
 
     def step(self):
-        self._tell("step")
         self.time, self.step_count = self.time + self.dt, self.step_count + 1
         return StepReport(time=self.time)
 
     def run(self, seconds, on_frame=None, fps=60, stop=None):
-        self._tell("run")
         self.time, self.step_count = self.time + seconds, self.step_count + 1
         return RunReport(steps=1)
 
     def reset(self):
-        self._tell("reset")
         self.time, self.step_count = 0.0, 0
-
-    def _tell(self, what):
-        if self.announce:
-            print(what, flush=True)

@@ -1,28 +1,31 @@
-"""The window's panel and what it changes:
+"""The window's panel, keys and mouse become commands, which change the simulation between two steps, or move the view."""
 
-* sliders and buttons become commands, of which the last counts; a slider keeps its value until the simulation has answered;
-* labels show values in SI units, and the friction in use of every pair;
-* the commands change the simulation between two steps: a lighter body lowers an explicit dt, which returns with its weight.
-"""
-
+from contextlib import contextmanager
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import taichi as ti
 
 import taisoft as ts
+from taisoft.output.camera import Camera
 from taisoft.view.controls import Controls, touching_pairs
+from taisoft.view.mirror import MirrorSimulation, describe_scene, describe_state
 from taisoft.view.panel import Panel, Requests
-from taisoft.view.plots import PlotChoice
+from taisoft.view.plots import PlotChoice, Plots
+from taisoft.view.screen import SIZE, Screen
 from taisoft.view.timing import Timing
-from tests.dynamics.scenes import rubber
+from tests.output.png import decode
+from tests.view.drawing import connected_scene, cubes_scene, marks_of
+from tests.view.fake_simulator import FakeSimulator
 
 
 class Gui:
     """A panel in which sliders move to the values in `moves` and buttons in `presses` are pressed, by the part after ###."""
 
     def __init__(self, moves=None, presses=(), checks=()):
-        self.moves, self.presses, self.checks, self.labels, self.texts = moves or {}, presses, checks, {}, []
+        self.moves, self.presses, self.checks, self.labels = moves or {}, presses, checks, {}
 
     def slider_float(self, label, value, low, high):
         shown, _, name = label.partition("###")
@@ -37,127 +40,92 @@ class Gui:
         return not value if label in self.checks else value
 
     def text(self, line, **_):
-        self.texts.append(line)
-
-
-def three_cubes(**settings):
-    scene = ts.Scene()
-    for k, name in enumerate("abc"):
-        scene.add_body(ts.box_mesh((1, 1, 1), (1, 1, 1)), rubber(friction=0.5), name=name, position=(0, 2.0 * k, 0))
-    scene.add_obstacle(ts.HalfSpace((0, -1, 0), (0, 1, 0)), name="ground", friction=0.5)
-    scene.set_contact("a", "ground", friction=0.2)
-    return ts.Simulator(scene, draggable=True, **settings)
+        assert isinstance(line, str)
 
 
 @pytest.fixture
 def cubes():
-    with three_cubes(dt=0.01) as sim:
+    with ts.Simulator(cubes_scene(), dt=2e-3, integrator="symplectic_euler", draggable=True) as sim:
         yield sim
-
-
-def panel_of(sim):
-    colouring = SimpleNamespace(kind="body", legend=list, choose_next=lambda: None)
-    layers = SimpleNamespace(shown={"wires": False})
-    plots = PlotChoice(None, {"implicit": True, "contact": True, "error": False})
-    requests = Requests()
-    return Panel(["a", "b", "c"], touching_pairs(sim), colouring, layers, plots, requests), requests
 
 
 def state_of(controls, answered=0):
     return {"controls": controls.values(), "paused": False, "asked_speed": 1.0, "answered": answered}
 
 
-def test_later_commands_replace_earlier_ones_with_the_same_key():
-    requests = Requests()
-    assert requests.take() == [] and requests.number == 0
-    for command in (("pause",), ("drag", 1), ("pause",), ("drag", 2)):
-        requests.add(*command, key=command[0] if command[0] == "drag" else None)
-    assert requests.next_number == 1
-    assert requests.take() == [["pause"], ["pause"], ["drag", 2]] and requests.number == 1 and requests.take() == []
+@pytest.fixture
+def draw(cubes):
+    """A function that draws the panel with the moves and presses given, and returns the labels of sliders and the commands."""
+    colouring = SimpleNamespace(kind="body", legend=list, choose_next=lambda: None)
+    plots, requests = PlotChoice(None, {"implicit": True, "contact": True, "error": False}), Requests()
+    panel = Panel(["a", "b", "c"], touching_pairs(cubes), colouring, SimpleNamespace(shown={}), plots, requests)
+    controls = Controls(cubes)
+
+    def draw(moves=None, state=None, **more):
+        panel.draw(gui := Gui(moves, **more), state or state_of(controls), False)
+        return gui.labels, requests.take()
+
+    draw.panel, draw.controls = panel, controls
+    return draw
 
 
-def test_sliders_become_commands_and_keep_their_values(cubes):
-    sim = cubes
-    controls = Controls(sim)
-    panel, requests = panel_of(sim)
-    gui = Gui({"gravity": 3.0, "young": 6.0, "dt": -3.0, "friction": 0.9})
-    panel.draw(gui, state_of(controls), False)
-    assert gui.labels["young"] == "E 1e+05 Pa" and gui.labels["density"] == "rho 1000 kg/m3"
-    assert gui.labels["gravity"] == "g 9.81 m/s2" and gui.labels["friction"] == "mu 0.20-0.50"
-    commands = {command[0]: command[1:] for command in requests.take()}
-    assert commands["set_gravity"] == [3.0] and commands["set_dt"] == [pytest.approx(1e-3)]
-    assert commands["set_number"] == ["young", ["a", "b", "c"], pytest.approx(1.0)]
-    assert commands["set_friction"] == [None, 0.9]
-    gui = Gui()
-    panel.draw(gui, state_of(controls), False)
-    assert gui.labels["gravity"] == "g 3 m/s2" and requests.take() == [], "not yet answered"
-    for name, arguments in commands.items():
-        getattr(controls, name)(*arguments)
-    gui = Gui()
-    panel.draw(gui, state_of(controls, answered=1), False)
-    assert gui.labels["gravity"] == "g 3 m/s2" and gui.labels["young"] == "E 1e+06 Pa" and requests.take() == []
-    assert gui.labels["friction"] == "mu 0.90" and gui.labels["dt"] == "dt 0.001 s"
-    assert sim.dt == pytest.approx(1e-3) and sim.scene.gravity.tolist() == [0.0, -3.0, 0.0]
-    assert all(np.allclose(body.young, 1e6) for body in sim.scene.bodies)
+def test_sliders_become_commands_and_keep_their_values(draw, cubes):
+    labels, commands = draw({"gravity": 3.0, "young": 6.0, "dt": -3.0, "friction": 0.9})
+    assert labels["young"] == "E 1e+05 Pa" and labels["density"] == "rho 1000 kg/m3"
+    assert labels["gravity"] == "g 9.81 m/s2" and labels["friction"] == "mu 0.20-0.50"
+    assert commands[:2] == [["set_dt", pytest.approx(1e-3)], ["set_gravity", 3.0]]
+    assert commands[2:] == [["set_number", "young", ["a", "b", "c"], pytest.approx(1.0)], ["set_friction", None, 0.9]]
+    labels, none = draw()
+    assert labels["gravity"] == "g 3 m/s2" and none == [], "not yet answered"
+    for name, *arguments in commands:
+        getattr(draw.controls, name)(*arguments)
+    labels, none = draw(state=state_of(draw.controls, answered=1))
+    assert labels["gravity"] == "g 3 m/s2" and labels["young"] == "E 1e+06 Pa" and none == []
+    assert labels["friction"] == "mu 0.90" and labels["dt"] == "dt 0.001 s"
+    assert cubes.dt == pytest.approx(1e-3) and cubes.scene.gravity.tolist() == [0.0, -3.0, 0.0]
+    assert all(np.allclose(body.young, 1e6) for body in cubes.scene.bodies)
 
 
-def test_rigid_bodies_have_no_sliders_of_material():
-    scene = ts.Scene()
-    scene.contact_forces = False
-    for k, name in enumerate("ab"):
-        scene.add_rigid_body(ts.box_mesh((1, 1, 1), (1, 1, 1)), name=name, position=(2 * k, 0, 0))
-    scene.add_body(ts.box_mesh((2, 2, 2), (1, 1, 1)), ts.Material(young=1e5), name="c", position=(4, 0, 0))
-    with ts.Simulator(scene, dt=0.01) as sim:
-        controls, (panel, requests) = Controls(sim), panel_of(sim)
-        gui = Gui({"young": 6.0})
-        panel.draw(gui, state_of(controls), False)
-        assert gui.labels["young"] == "E 1e+05 Pa"
-        ((name, *arguments),) = requests.take()
-        assert (name, arguments) == ("set_number", ["young", ["c"], pytest.approx(1.0)])
-        getattr(controls, name)(*arguments)
-        assert sim.scene.body("c").young == pytest.approx(1e6)
-        gui = Gui(presses=("which",))  # from all bodies to the first one
-        panel.draw(gui, state_of(controls), False)
-        assert "young" not in gui.labels and "density" not in gui.labels
+def test_rigid_bodies_have_no_sliders_of_material(draw):
+    soft = (pytest.approx(1e5), pytest.approx(1e5), 0.0)
+    assert Controls(FakeSimulator(connected_scene())).values()["young"] == [soft, soft, None]
+    state = state_of(draw.controls)
+    state["controls"] |= {what: [None, *state["controls"][what][1:]] for what in ("young", "density")}  # as if a were one
+    labels, commands = draw({"young": 6.0}, state)
+    assert labels["young"] == "E 1e+05 Pa" and commands == [["set_number", "young", ["b", "c"], pytest.approx(1.0)]]
+    labels, _ = draw(state=state, presses=("which",))  # from all bodies to the first one
+    assert "young" not in labels and "density" not in labels
 
 
-def test_every_pair_shows_its_friction(cubes):
-    sim = cubes
-    controls, (panel, requests) = Controls(sim), panel_of(sim)
-    panel.draw(Gui(checks=["friction of pairs"]), state_of(controls), False)
-    gui = Gui({"friction 2": 0.8})
-    panel.draw(gui, state_of(controls), False)
-    shown = [gui.labels[f"friction {k}"] for k in range(6)]
+def test_every_pair_shows_its_friction(draw, cubes):
+    draw(checks=["friction of pairs"])
+    labels, ((name, *arguments),) = draw({"friction 2": 0.8})
+    shown = [labels[f"friction {k}"] for k in range(6)]
     assert shown == ["0.50 a, b", "0.50 a, c", "0.20 a, ground", "0.50 b, c", "0.50 b, ground", "0.50 c, ground"]
-    ((name, *arguments),) = requests.take()
-    getattr(controls, name)(*arguments)
-    assert sim.scene.contact_numbers("a", "ground")[0] == 0.8 and sim.scene.contact_numbers("b", "ground")[0] == 0.5
-    assert controls.values()["friction"] == [0.5, 0.5, 0.8, 0.5, 0.5, 0.5]
+    getattr(draw.controls, name)(*arguments)
+    assert cubes.scene.contact_numbers("a", "ground")[0] == 0.8 and cubes.scene.contact_numbers("b", "ground")[0] == 0.5
+    assert draw.controls.values()["friction"] == [0.5, 0.5, 0.8, 0.5, 0.5, 0.5]
 
 
-def test_buttons_and_the_choice_of_a_solver(cubes):
-    sim = cubes
-    controls, (panel, requests) = Controls(sim), panel_of(sim)
-    panel.draw(Gui(presses=("pause", "record"), checks=["solver"]), state_of(controls), False)
-    assert panel.pressed == {"pause", "record"} and panel.strength == 10.0
-    panel.draw(Gui(presses=("integrator",)), state_of(controls), False)
-    panel.draw(Gui(presses=("use",)), state_of(controls), False)
-    assert requests.take() == [["rebuild", "bdf2", "auto"]] and panel.pressed == set()
+def test_buttons_and_the_choice_of_a_solver(draw):
+    draw(presses=("pause", "record"), checks=["solver"])
+    assert draw.panel.pressed == {"pause", "record"} and draw.panel.strength == 10.0
+    draw(presses=("integrator",))
+    assert draw(presses=("use",))[1] == [["rebuild", "velocity_verlet", "auto"]] and draw.panel.pressed == set()
 
 
-def test_an_explicit_dt_follows_density():
-    with three_cubes(integrator="symplectic_euler", dt=2e-3) as sim:
-        controls, limit = Controls(sim), sim.stable_dt
-        assert limit > 2e-3
-        controls.set_dt(1.0)
-        largest = sim.dt
-        assert 0.8 * limit < largest < limit
-        controls.set_number("density", ["b"], -1.0)
-        assert sim.scene.body("b").mass == pytest.approx(100.0) and sim.dt == pytest.approx(largest / np.sqrt(10), rel=1e-3)
-        controls.set_number("density", ["b"], 0.0)
-        assert sim.dt == pytest.approx(largest)
-        with pytest.raises(ts.SimulationError):
-            controls.set_dt(-1.0)
+def test_an_explicit_dt_follows_density(cubes):
+    sim, controls, limit = cubes, Controls(cubes), cubes.stable_dt
+    assert limit > 2e-3
+    controls.set_dt(1.0)
+    largest = sim.dt
+    assert 0.8 * limit < largest < limit
+    controls.set_number("density", ["b"], -1.0)
+    assert sim.scene.body("b").mass == pytest.approx(100.0) and sim.dt == pytest.approx(largest / np.sqrt(10), rel=1e-3)
+    controls.set_number("density", ["b"], 0.0)
+    assert sim.dt == pytest.approx(largest)
+    with pytest.raises(ts.SimulationError):
+        controls.set_dt(-1.0)
 
 
 def test_a_drag_needs_its_beginning(cubes):
@@ -191,3 +159,140 @@ def test_latency_counts_from_the_last_look_that_saw_nothing(monkeypatch):
     state = {"speed": 0.5, "asked_speed": 2.0, "steps_per_second": 30.0}
     assert timing.lines(state)[0].split() == "speed 0.50 x real time (asked: 2), 30 steps/s".split()
     assert "drag after 80 ms" in timing.lines({})[0] and len(timing.lines({})) == 1
+
+
+class FakeCanvas(Gui):
+    """A canvas and its window, without a display. drawn: the camera of the last picture; has_plots: whether that shows plots."""
+
+    keys, buttons, cursor, running, has_plots = (), (), (0.9, 0.1), True, False
+
+    @property
+    def window(self):
+        return self
+
+    get_gui = show = lambda self: self
+
+    def get_window_shape(self):
+        return SIZE
+
+    @contextmanager
+    def sub_window(self, *_):
+        yield self
+
+    def get_events(self, _):
+        return [SimpleNamespace(key=key) for key in self.keys]
+
+    def is_pressed(self, button):
+        return button in self.buttons
+
+    def get_cursor_pos(self):
+        return self.cursor
+
+    def draw(self, x, colours, camera, background, lines, shadows):
+        self.drawn, self.has_plots = camera, False
+
+    def draw_over(self, *_):
+        self.has_plots = True
+
+    def pixels(self, left, top, right, bottom):
+        return np.full((bottom - top, right - left, 3), 90, np.uint8)
+
+
+@pytest.fixture
+def screen(cubes, monkeypatch, tmp_path):
+    """The window of the cubes, its canvas, and a function that draws with keys and buttons pressed and returns the commands."""
+    canvas, requests, marks, history = FakeCanvas(), Requests(), marks_of(cubes.scene), Plots(cubes).history
+    monkeypatch.setattr("taisoft.view.screen.Canvas", lambda *_, **__: canvas)
+    monkeypatch.chdir(tmp_path)
+    description = describe_scene(cubes.scene, marks)
+    mirror = MirrorSimulation(description, len(cubes.positions()))
+    mirror.take(describe_state(cubes, marks, set(), history) | {"colour": "body"}, cubes.positions(), np.zeros(0))
+    shown = {"colour": "body", "layers": ("fixed_nodes",), "plots": (), "controls": True, "pairs": touching_pairs(cubes)}
+    screen, state = Screen(mirror, description | shown, requests), state_of(Controls(cubes)) | {"status": "", "messages": []}
+
+    def act(keys=(), buttons=(), cursor=(0.9, 0.1)):
+        canvas.keys, canvas.buttons, canvas.cursor = keys, buttons, cursor
+        screen.draw(mirror, state, 0.0)
+        return requests.take()
+
+    return screen, canvas, act
+
+
+def test_keys(screen, tmp_path, cubes):
+    screen, canvas, act = screen
+    for key, action in {ti.ui.SPACE: "pause", "s": "step", ti.ui.RIGHT: "step", "r": "reset", ti.ui.UP: "faster"}.items():
+        assert act([key]) == [[action]]
+    assert act([ti.ui.DOWN, "x", "?"]) == [["slower"], ["unbound"]]
+    before = dict(screen.layers.shown)
+    act("wcfd")
+    changed = [name for name, shown in screen.layers.shown.items() if shown != before[name]]
+    assert sorted(changed) == ["contacts", "fixed_nodes", "shadows", "wires"]
+    act("v")
+    assert screen.colouring.kind == "stress"
+    act("g")
+    act()
+    assert canvas.has_plots and "energies" in screen.plots.visible()
+    act("i")
+    act("p")  # which also writes the picture that was asked for
+    for _ in range(2):
+        act()
+    act("p")
+    act()
+    assert decode((tmp_path / "out/window-1.png").read_bytes()).shape == (720, 1280, 3)
+    assert [path.name for path in sorted((tmp_path / "out/window-2").iterdir())] == ["00000.png", "00001.png", "00002.png"]
+    screen.camera = replace(screen.camera, target=np.ones(3), azimuth=70.0)
+    act("h")
+    expected = Camera.framing(cubes.positions(), SIZE, azimuth=70.0, elevation=screen.camera.elevation)
+    assert np.allclose(screen.camera.position, expected.position) and np.allclose(screen.camera.target, expected.target)
+    assert not screen.closed
+    act([ti.ui.ESCAPE])
+    assert screen.closed
+
+
+def test_the_mouse_moves_the_view(screen):
+    screen, canvas, act = screen
+    start = screen.camera
+
+    def drag(button, begin=(0.9, 0.1), by=(0.05, 0.1), **more):
+        """The camera after a drag from the place `begin`; it is put back."""
+        screen.camera = start
+        act(buttons=[button], cursor=begin, **more)
+        act(buttons=[button], cursor=(begin[0] + by[0], begin[1] + by[1]), **more)
+        assert screen.dragging
+        act()
+        assert not screen.dragging and canvas.drawn is screen.camera
+        return screen.camera
+
+    turned = drag(ti.ui.LMB)
+    assert turned.azimuth < start.azimuth - 5 and turned.elevation < start.elevation - 5, "the near side follows the cursor"
+    assert turned.distance == start.distance and np.array_equal(turned.target, start.target)
+    near, far = drag(ti.ui.RMB), drag(ti.ui.RMB, by=(0.0, -0.1))
+    assert near.distance < 0.9 * start.distance and near.distance * far.distance == pytest.approx(start.distance**2)
+    shifted = drag(ti.ui.MMB)
+    moved = shifted.project(start.target[None], SIZE)[0, :2] - start.project(start.target[None], SIZE)[0, :2]
+    assert moved == pytest.approx((0.05 * SIZE[0], -0.1 * SIZE[1])), "what is under the cursor stays under it"
+    assert drag(ti.ui.LMB, begin=(0.1, 0.5)) == start, "on the panel"
+    screen.plots.shown["energies"] = True  # in the upper right corner
+    act()
+    assert canvas.has_plots
+    act(buttons=[ti.ui.LMB], cursor=(0.95, 0.95))
+    act(buttons=[ti.ui.LMB], cursor=(0.94, 0.95))
+    act(buttons=[ti.ui.LMB], cursor=(0.94, 0.95))
+    assert not canvas.has_plots and screen.camera.azimuth != start.azimuth
+    act()
+    act()
+    assert canvas.has_plots
+
+
+def test_the_mouse_drags_a_body(screen, cubes):
+    screen, canvas, act = screen
+    x, camera = cubes.positions("b"), screen.camera
+    across, down, _ = camera.project(x.mean(axis=0)[None], SIZE)[0]
+    at = np.array([across / SIZE[0], 1 - down / SIZE[1]])
+    (name, body, nodes, weights), (second, target, strength) = act(buttons=[ti.ui.LMB], cursor=tuple(at))
+    assert (name, body, second, strength) == ("begin_drag", "b", "drag", 10.0)
+    assert np.allclose(weights @ x[nodes], target)
+    ((name, moved, _),) = act(buttons=[ti.ui.LMB], cursor=tuple(at + (0.0, 0.1)))
+    assert name == "drag" and (np.array(moved) - target) @ camera.axes[1] > 0.1 and screen.camera == camera
+    assert act() == [["release"]]
+    assert act(buttons=[ti.ui.LMB, ti.ui.CTRL], cursor=tuple(at)) == [] and screen.dragging, "with Ctrl the view turns"

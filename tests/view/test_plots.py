@@ -1,13 +1,4 @@
-"""Plots over time, and text over pictures:
-
-* the history of a run takes constant memory and loses no peak: entries hold the lowest and highest value of equal runs of steps;
-  energies are changes since the start; quantities that are not modelled or not finite are NaN and hide no neighbour;
-* curves lie in the unit square, at heights given by the axis; gaps stay gaps; a logarithmic axis accepts zero;
-* only simulated quantities are available, and a refusal gives the reason; a key hides the plots and shows them again;
-* in the window plots do not overlap and lie inside it, as many as fit; on pictures they are at the right, and a caption is at the
-  bottom, with the colour bar; both scale with the picture, and without Pillow they are refused;
-* `taisoft run --plots --caption --layers` draws them, and refuses unknown names and what is not modelled.
-"""
+"""Plots over time: history, curves in the unit square, their place in the window and on pictures; captions and colour bars."""
 
 import math
 from types import SimpleNamespace
@@ -17,21 +8,18 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from taisoft.errors import OutputError, SceneError
-from taisoft.records import Energies, StepReport
+from taisoft.errors import SceneError
+from taisoft.records import Energies, ErrorEstimate, StepReport
 from taisoft.scene.plan import Plan
 from taisoft.view import annotations
 from taisoft.view.annotations import Annotations, cells, drawing
 from taisoft.view.colouring import COLOURS, Colouring
-from taisoft.view.offscreen import Offscreen
 from taisoft.view.plots import PLOTS, QUANTITIES, History, Plots, curves_of
 from taisoft.view.scene_view import Surfaces
 from tests.cli.command import BEAM, run, write
 from tests.output.png import decode
 from tests.view.drawing import body_mask
 from tests.view.fake_simulator import FakeSimulator, beam_scene
-
-# --- history ---
 
 
 def started(capacity: int = 8, time: float = 0.0, kinetic: float = 0.0) -> History:
@@ -77,9 +65,11 @@ def test_energies_are_changes_and_unmodelled_quantities_are_nan():
         modelled = expected | (implicit if not explicit else {}) | (contact if touching else {})
         assert {name: value for name, value in zip(QUANTITIES, history.last) if np.isfinite(value)} == pytest.approx(modelled)
     assert history.begin == 3.0
-
-
-# --- curves ---
+    errors = ErrorEstimate(time=0.012, excursion=1.0, energies=Energies(0.1, 0.2, 0.3))
+    history.take(report, 0.02, True, False, errors)
+    assert history.last[QUANTITIES.index("time_error")] == pytest.approx(1.2)
+    assert history.low[-1, :4] == pytest.approx([0.9, 1.8, -3.3, -0.6]), "energies less their errors"
+    assert history.high[-1, :4] == pytest.approx([1.1, 2.2, -2.7, 0.6])
 
 
 class Stub:
@@ -95,7 +85,7 @@ class Stub:
         return Energies(0.0, 0.0, 0.0)
 
 
-def filled(n=1000, **kind):
+def filled(n=400, **kind):
     plots = Plots(Stub(**kind), tuple(Plots(Stub(**kind)).available()))
     rng = np.random.default_rng(0)
     for k in range(n):
@@ -105,7 +95,7 @@ def filled(n=1000, **kind):
     return plots
 
 
-def curves_with(series: dict, name: str):
+def curves_with(name: str, **series):
     """Curves of a plot of the given values by quantity, at times 0, 1, ..."""
     n = len(next(iter(series.values())))
     values = np.full((n, len(QUANTITIES)), np.nan)
@@ -116,32 +106,30 @@ def curves_with(series: dict, name: str):
 
 
 def test_curves_have_the_heights_given_by_the_axis():
-    curves = curves_with({"n_contacts": [0, 10, 37, np.nan, 20]}, "contacts")
+    curves = curves_with("contacts", n_contacts=[0, 10, 37, np.nan, 20])
     assert curves.ends == ("0", "40") and curves.times == (0.0, 4.0)
     assert curves.grid == pytest.approx([0.25, 0.5, 0.75])
     ((_, points),) = curves.lines
-    known = points[~np.isnan(points[:, 1])]
-    assert np.allclose(known, [(0, 0), (0.25, 0.25), (0.5, 0.925), (1, 0.5)])
-    assert np.isnan(points[3]).all(), "NaN is a gap"
+    assert np.allclose(points[[0, 1, 2, -1]], [(0, 0), (0.25, 0.25), (0.5, 0.925), (1, 0.5)])
+    assert np.isnan(points[3:-1]).all(), "NaN is a gap"
     assert curves.legend[0][1] == "20"
-    down = curves_with({"kinetic": [0.0, 5.0], "gravity": [0.0, -12.0]}, "energies")
+    down = curves_with("energies", kinetic=[0.0, 5.0], gravity=[0.0, -12.0])
     assert down.ends == ("-15 J", "5 J") and np.allclose(down.lines[2][1][-1], (1, 0.15))
     assert [value for _, value, _ in down.legend] == ["5 J", "-", "-12 J", "-"]
 
 
 def test_a_logarithmic_axis_accepts_zero():
-    curves = curves_with({"newton_residual": [0.0, 1e-6, 3e-5, 1e-3]}, "residuals")
+    curves = curves_with("residuals", newton_residual=[0.0, 1e-6, 3e-5, 1e-3])
     assert curves.ends == ("1e-06", "0.001")
     assert np.allclose(curves.lines[0][1][:, 1], [0, 0, (np.log10(3e-5) + 6) / 3, 1])
-    assert curves_with({"newton_residual": [0.0, 0.0]}, "residuals").ends == ("0.1", "1")
-    wide = curves_with({"newton_residual": [1e-300, 1.0, np.nan]}, "residuals")
+    assert curves_with("residuals", newton_residual=[0.0, 0.0]).ends == ("0.1", "1")
+    wide = curves_with("residuals", newton_residual=[1e-300, 1.0, np.nan])
     assert wide.ends == ("1e-12", "1") and wide.lines[0][1][0, 1] == 0.0
 
 
 @pytest.mark.parametrize("values", [[0.0], [0.0, 0.0], [np.nan, np.nan], [1e-320, 0.0], [1e300, -1e300], [-3.0]])
 def test_curves_of_extreme_values_stay_in_the_unit_square(values):
-    for name, quantity in (("energies", "total"), ("step_time", "step_time")):
-        curves = curves_with({quantity: values}, name)
+    for curves in (curves_with("energies", total=values), curves_with("step_time", step_time=values)):
         for _, points in curves.lines:
             inside = points[np.isfinite(points).all(axis=1)]
             assert (inside >= 0).all() and (inside <= 1).all()
@@ -149,21 +137,12 @@ def test_curves_of_extreme_values_stay_in_the_unit_square(values):
 
 
 def test_only_simulated_quantities_are_available():
-    series = {
-        (False, True): {
-            "residuals": ["Newton", "contacts"],
-            "iterations": ["Newton", "CG", "contacts"],
-            "contacts": ["contacts"],
-        },
-        (False, False): {"residuals": ["Newton"], "iterations": ["Newton", "CG"]},
-        (True, True): {"residuals": ["contacts"], "iterations": ["contacts"], "contacts": ["contacts"]},
-        (True, False): {},
-    }
-    for (explicit, touching), expected in series.items():
-        available = Plots(Stub(explicit, touching)).available()
-        assert set(available) == {"energies", "step_time"} | set(expected)
-        for name, names in expected.items():
-            assert [s.name for s in available[name].series] == names
+    newton, contact = {"residuals": ["Newton"], "iterations": ["Newton", "CG"]}, ["contacts"]
+    both = {"residuals": ["Newton", "contacts"], "iterations": ["Newton", "CG", "contacts"], "contacts": contact}
+    touched = {"residuals": contact, "iterations": contact, "contacts": contact}
+    for kind, expected in (((False, True), both), ((False, False), newton), ((True, True), touched), ((True, False), {})):
+        available = {name: [s.name for s in plot.series] for name, plot in Plots(Stub(*kind)).available().items()}
+        assert available.pop("step_time") == ["step"] and len(available.pop("energies")) == 4 and available == expected
     with pytest.raises(SceneError, match="not available: steps of velocity_verlet are explicit .* and contact forces"):
         Plots(Stub(True, False), ("residuals",))
     with pytest.raises(SceneError, match="plot 'energy' is unknown.*did you mean energies"):
@@ -186,7 +165,7 @@ def test_the_key_hides_and_shows_again():
 
 
 def test_a_restart_clears_the_history():
-    plots = filled(100)
+    plots = filled(20)
     plots.restart()
     assert plots.history.times.tolist() == [0.0]
     plots.take(StepReport(time=0.5), 0.01)
@@ -194,16 +173,11 @@ def test_a_restart_clears_the_history():
     assert plots.history.times[-1] <= 0.1
 
 
-# --- in the window ---
-
-
-@pytest.mark.parametrize("size, n_shown", [((1280, 720), None), ((800, 300), 2), ((300, 100), 0)])
+@pytest.mark.parametrize("size, n_shown", [((1280, 720), 5), ((800, 300), 2), ((300, 100), 0)])
 def test_plots_lie_in_the_window_without_overlap(size, n_shown):
-    plots = filled(400)
-    shown = cells(plots, size)
-    assert len(shown) == (len(plots.visible()) if n_shown is None else n_shown)
+    shown = cells(filled(), size)
     boxes, ends, colours = drawing(shown, size)
-    assert len(boxes) == len(shown) and len(ends) == len(colours)
+    assert len(boxes) == len(shown) == n_shown and len(ends) == len(colours)
     assert np.isfinite(ends).all() and (ends >= 0).all() and (ends <= 1).all() and (boxes >= 0).all() and (boxes <= 1).all()
     tops = [cell.box[1] for cell in shown]
     assert all(b >= a + cell.box[3] for a, b, cell in zip(tops, tops[1:], shown))
@@ -212,9 +186,7 @@ def test_plots_lie_in_the_window_without_overlap(size, n_shown):
         assert not cell.contains(cell.text[0] - 1, cell.box[1] + 1)
 
 
-# --- over pictures ---
-
-SIZE = (640, 360)
+SIZE, LARGE = (640, 360), (1280, 720)
 
 
 def grey(size=SIZE):
@@ -231,84 +203,59 @@ def near(picture, colour, by=60):
     return np.abs(picture.astype(int) - np.round(255 * np.array(colour))).max(axis=2) < by
 
 
-@pytest.mark.parametrize("size", [SIZE, (1280, 720), (300, 300)])
-def test_plots_are_at_the_right(size):
-    plots, sim, unit = filled(), FakeSimulator(beam_scene()), size[1] / 720
-    for names in (["contacts"], list(PLOTS)):
-        plots.shown = {name: name in names for name in PLOTS}
-        before = grey(size)
-        picture = Annotations(plots).draw(before, sim, 3)
-        assert (before == 120).all() and picture.shape == before.shape and picture.dtype == np.uint8
-        left, top, right, bottom = bounds(picture, before)
-        assert left >= size[0] - 317 * unit and right <= size[0] - 15 * unit and top >= 15 * unit
-        assert bottom <= (156 if len(names) == 1 else 705) * unit
-        part = picture[top:bottom, left:right]
-        assert (part > 230).all(axis=2).mean() > 0.25, "background"
-        for series in PLOTS[names[-1]].series:
-            assert near(part, series.colour).sum() > 30, series.name
-    plots.shown = dict.fromkeys(PLOTS, False)
-    assert np.array_equal(Annotations(plots).draw(grey(size), sim, 3), grey(size))
-
-
 def test_lines_show_their_values():
-    plots, sim = filled(300), FakeSimulator(beam_scene())
+    plots, sim = filled(), FakeSimulator(beam_scene())
     column, half = QUANTITIES.index("n_contacts"), len(plots.history.times) // 2
     for part, value in ((slice(0, half), 1.0), (slice(half, None), 4.5)):
         plots.history.low[part, column] = plots.history.high[part, column] = value
     plots.shown = {name: name == "contacts" for name in PLOTS}
-    picture = Annotations(plots).draw(grey((1280, 720)), sim, 0)
+    before = grey(LARGE)
+    picture = Annotations(plots).draw(before, sim, 0)
+    left, top, right, bottom = bounds(picture, before)
+    assert 963 <= left and right <= 1265 and 15 <= top and bottom <= 156 and (before == 120).all(), "on a copy, at the right"
     rows, columns = np.nonzero(near(picture[30:140, 975:1255], PLOTS["contacts"].series[0].colour))
     low, high = rows[columns < 100], rows[(columns > 180) & (rows > 8)]  # below the text of the last value, in the same colour
     assert np.ptp(low) < 4 and np.ptp(high) < 4 and low.min() == pytest.approx(high.min() + 0.7 * 92, abs=2)
 
 
-def coloured_by_stress(sim):
-    colouring = Colouring(sim.scene, Surfaces(sim.scene), "stress")
-    colouring.base(sim)
-    return colouring
-
-
-def test_a_caption_is_at_the_bottom():
+def test_a_caption_and_a_colour_bar_are_at_the_bottom():
     sim = FakeSimulator(beam_scene())
     sim.time = 0.5
+    colouring = Colouring(sim.scene, Surfaces(sim.scene), "stress")
+    colouring.base(sim)
     plain = Annotations(name="bücher").draw(grey(), sim, 7)
     left, top, right, bottom = bounds(plain, grey())
     assert left < 12 and 190 < right < 340 and 318 < top < 336 and bottom <= 355
-    coloured = Annotations(name="bücher", colouring=coloured_by_stress(sim)).draw(grey(), sim, 7)
+    coloured = Annotations(name="bücher", colouring=colouring).draw(grey(), sim, 7)
     scale = coloured[bounds(coloured, grey())[1] : top, :120]
     assert body_mask(scale).mean() > 0.1 and scale.shape[0] > 20
     assert np.array_equal(coloured[top + 1 :], plain[top + 1 :])
     assert not np.array_equal(Annotations(name="bücher").draw(grey(), sim, 8), plain), "frame number"
-    picture = Offscreen(sim.scene, SIZE).image(sim)
-    both = Annotations(filled(), "beam").draw(picture, sim, 0)
-    assert np.array_equal(both[10:280, : SIZE[0] - 160], picture[10:280, : SIZE[0] - 160]), "the bodies stay visible"
+    both = Annotations(filled(), "beam").draw(grey(), sim, 0)
+    assert (both[10:280, : SIZE[0] - 160] == 120).all(), "the bodies stay visible"
 
 
 def test_a_colour_bar_follows_the_scale_and_fits_a_small_picture():
     sim = FakeSimulator(beam_scene())
     colouring = Colouring(sim.scene, Surfaces(sim.scene), "stress")
-    bar_alone = Annotations(colouring=colouring)
-    assert np.array_equal(bar_alone.draw(grey((1280, 720)), sim, 0), grey((1280, 720))), "no scale yet"
-    pictures = []
+    bar_alone, pictures = Annotations(colouring=colouring), []
+    assert np.array_equal(bar_alone.draw(grey(LARGE), sim, 0), grey(LARGE)), "no scale yet"
     for sim.time in (0.0, 0.0, 9.0):
         colouring.base(sim)
-        pictures.append(bar_alone.draw(grey((1280, 720)), sim, 0))
-    left, top, right, bottom = bounds(pictures[0], grey((1280, 720)))
+        pictures.append(bar_alone.draw(grey(LARGE), sim, 0))
+    left, top, right, bottom = bounds(pictures[0], grey(LARGE))
     assert 8 < left < 18 and 230 < right < 252 and 640 < top and bottom <= 704
     bar = pictures[0][681, 16:236]
     assert np.abs(bar[[0, 110, -1]] - 255 * COLOURS[[0, 2, -1]]).max() < 6
     assert np.array_equal(pictures[0], pictures[1]) and not np.array_equal(pictures[1], pictures[2])
     assert np.array_equal(pictures[2][681, 16:236], bar), "only the numbers differ"
-    for size in ((160, 90), (64, 36)):  # where the steps of the bar are narrower than a pixel
-        assert (bar_alone.draw(grey(size), sim, 7) != grey(size)).any()
-
-
-# --- command ---
+    small = grey((64, 36))  # where the steps of the bar are narrower than a pixel
+    assert (bar_alone.draw(small, sim, 7) != small).any()
 
 
 def test_a_run_draws_plots_and_captions(tmp_path):
     path = write(tmp_path / "beam.py", BEAM)
-    options = ("--plots", "energies,step_time", "--caption", "--layers", "wires")
+    options = ("--plots", "energies,step_time", "--caption", "--layers", "wires", "--colour", "stress")
     assert run(path, "--out", tmp_path / "out", "--no-usd", "--fps", 10, *options) == 0
     first, last = (decode(file.read_bytes()) for file in sorted((tmp_path / "out" / "frames").iterdir()))
     energies, step_time = last[30:140, 970:], last[170:280, 970:]
@@ -316,6 +263,7 @@ def test_a_run_draws_plots_and_captions(tmp_path):
         assert near(energies, series.colour).sum() > 40, series.name
     assert (step_time > 225).all(axis=2).mean() > 0.25, "a second plot, whose curve depends on the load of the machine"
     assert (last[650:710, 10:600] < 60).all(axis=2).sum() > 500, "caption"
+    assert body_mask(last[580:660, :250]).mean() > 0.1, "colour bar"
     dark = (last[200:500, 300:900] < 70).all(axis=2)
     assert dark.sum() > 500 and body_mask(last).sum() > 20 * dark.sum() / 2, "wires"
     assert not np.array_equal(first[650:710], last[650:710])
@@ -327,23 +275,13 @@ def test_a_run_draws_plots_and_captions(tmp_path):
         (["--plots", "energies,"], "'' is not a valid name"),
         (["--layers", "wires,contact"], "'contact' is not a valid name (did you mean contacts?)"),
         (["--layers", "contacts"], "--layers contacts: contact forces are not modelled (one body, and nothing that it could"),
-        (["--plots", "contacts"], "plot 'contacts' is not available: contact forces are not modelled (one body, and nothing"),
-        (["--caption", "--no-frames"], "--caption needs --out, the folder to write to, and pictures, so it excludes --no-frames"),
-        (["--plots", "energies", "--no-frames"], "--plots needs --out"),
-        (["--layers", "none", "--no-frames"], "--layers needs --out"),
+        (["--caption"], "--caption: text in pictures needs Pillow: pip install 'taisoft[plot]'"),
     ],
 )
-def test_what_cannot_be_shown_is_refused(beam, tmp_path, capsys, arguments, message):
+def test_what_cannot_be_shown_is_refused(beam, tmp_path, capsys, monkeypatch, arguments, message):
+    if arguments == ["--caption"]:
+        monkeypatch.setattr(annotations, "find_spec", lambda name: None if name == "PIL" else 1)
     assert run(beam, "--out", tmp_path / "out", *arguments) == 2
     error = capsys.readouterr().err
     assert message in error and error.count("\n") == 1
-    assert not (tmp_path / "out").exists()
-
-
-def test_text_without_pillow_is_refused(beam, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(annotations, "find_spec", lambda name: None if name == "PIL" else 1)
-    with pytest.raises(OutputError, match=r"text in pictures needs Pillow: pip install 'taisoft\[plot\]'"):
-        Annotations(name="beam")
-    assert run(beam, "--out", tmp_path / "out", "--caption") == 2
-    assert "--caption: text in pictures needs Pillow" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()

@@ -1,11 +1,4 @@
-"""What pictures are made of:
-
-* surfaces are split at sharp edges only, normals point outward, midside nodes are drawn, fixed nodes are marked;
-* the square of a half-space stays at its start while bodies are well inside, then moves along and grows, but not across a cut;
-* below a body the ground is darker, the more the lower the body; slopes and moving half-spaces have shadows, walls have none;
-* the cursor picks the nearest surface that is drawn, skins too; the drag patch around it has weights of sum 1;
-* wires, contacts and arrows have the right places.
-"""
+"""What pictures are made of: surfaces, the squares of half-spaces, shadows, lines, and picking and dragging them."""
 
 import numpy as np
 import pytest
@@ -19,10 +12,9 @@ from taisoft.view.offscreen import Offscreen
 from taisoft.view.picking import MouseDrag, nearest_hit, pick
 from taisoft.view.scene_view import MARKER_COLOUR, Layers, Surfaces, smoothing_groups, vertex_normals
 from taisoft.view.shadow import Shadows, blurred
+from taisoft.view.window_shadow import ShadowMesh
 from tests.view.drawing import marks_of
 from tests.view.fake_simulator import RUBBER, FakeSimulator, beam_scene
-
-# --- surfaces ---
 
 
 def test_edges_of_a_box_are_sharp_and_a_ball_is_smooth():
@@ -48,19 +40,16 @@ def test_drawn_surface_follows_the_body_and_marks_fixed_nodes(order):
     sim.time = 1.0
     moved, _ = surfaces.of_bodies(sim)
     assert len(x) == len(normals) == len(surfaces.colours)
-    assert np.allclose(np.linalg.norm(normals, axis=1), 1.0)
     assert surfaces.triangles.min() == 0 and surfaces.triangles.max() == len(x) - 1
     assert (moved[:, 1] <= x[:, 1] + 1e-12).all() and (x[:, 1] - moved[:, 1]).max() > 1.0
     assert len(np.unique(surfaces.colours, axis=0)) == 3  # two bodies and the markers
-    n_fixed = len(np.intersect1d(scene.bodies[0].constraints[0].nodes, scene.bodies[0].nodes.surface))
-    assert n_fixed == (2 * order + 1) ** 2  # the left end
+    n_fixed = (2 * order + 1) ** 2  # nodes of the left end
     assert (surfaces.colours == MARKER_COLOUR).all(axis=1).sum() == 2 * n_fixed * 66  # vertices of a marker
-    # vertex normals agree with the winding of triangles
+    assert np.allclose(np.linalg.norm(normals, axis=1), 1.0)
     a, b, c = (x[surfaces.triangles[:, k]] for k in range(3))
-    assert (np.einsum("ij,ij->i", np.cross(b - a, c - a), normals[surfaces.triangles].sum(axis=1)) > 0).all()
+    winding = np.einsum("ij,ij->i", np.cross(b - a, c - a), normals[surfaces.triangles].sum(axis=1))
+    assert (winding > 0).all(), "normals point outward"
 
-
-# --- squares of half-spaces ---
 
 FLOOR, CORNERS = ts.HalfSpace((0, 0, 0), (0, 1, 0)), np.array([(x, 0.0, z) for x in (-2.0, 2.0) for z in (-2.0, 2.0)])
 WALL, SLOPE = ts.HalfSpace((-2, 0, 0), (1, 0, 0)), ts.HalfSpace((0, 0, 0), (1, 1, 0))
@@ -75,35 +64,32 @@ def extent(square):
     return [(square[:, k].min(), square[:, k].max()) for k in (0, 2)]
 
 
-def test_bodies_inside_move_nothing():
+def test_a_square_moves_along_with_the_bodies_and_grows():
     square = Square(FLOOR, CORNERS, [])
     assert square.below(cloud((0.5, 1, -0.5))) is CORNERS
     assert square.below(finite_points(np.full((3, 3), np.nan))) is CORNERS, "a state that is not finite"
     assert square.below(finite_points(np.vstack([cloud((0.0, 1, 0)), [np.inf, 0, 0]]))) is CORNERS
+    for place, half in (((7.0, 1.0, 0.0), 0.5), ((-30.0, 5.0, 12.0), 0.5), ((0.0, 1.0, 0.0), 10.0)):
+        moved = Square(FLOOR, CORNERS, []).below(cloud(place, half))
+        assert (moved[:, 1] == 0.0).all()
+        for (low, high), at in zip(extent(moved), (place[0], place[2])):
+            gaps = (at - half - low, high - at - half)
+            assert min(gaps) > 0.2
+            assert high - low == pytest.approx(4.0) if half < 2.0 else gaps[0] == pytest.approx(gaps[1])
+            if abs(at) > 2.0 or half > 2.0:
+                assert min(gaps) < 1.0, "no farther than needed"
 
 
-@pytest.mark.parametrize("place, half", [((7.0, 1.0, 0.0), 0.5), ((-30.0, 5.0, 12.0), 0.5), ((0.0, 1.0, 0.0), 10.0)])
-def test_the_square_moves_along_and_grows(place, half):
-    square = Square(FLOOR, CORNERS, []).below(cloud(place, half))
-    assert (square[:, 1] == 0.0).all()
-    for (low, high), at in zip(extent(square), (place[0], place[2])):
-        gaps = (at - half - low, high - at - half)
-        assert min(gaps) > 0.2
-        assert high - low == pytest.approx(4.0) if half < 2.0 else gaps[0] == pytest.approx(gaps[1])
-        if abs(at) > 2.0 or half > 2.0:
-            assert min(gaps) < 1.0, "no farther than needed"
+def test_cut_squares_move_along_the_cut():
+    for others, moves in (
+        ([WALL], [False, True]),
+        ([WALL, BEHIND], [False, False]),
+        ([SLOPE], [False, True]),
+        ([CEILING], [True] * 2),
+    ):
+        square = Square(FLOOR, CORNERS, others).below(cloud((9.0, 1.0, 9.0)))
+        assert [low != pytest.approx(-2.0) for low, _ in extent(square)] == moves
 
-
-@pytest.mark.parametrize(
-    "others, moves",
-    [([WALL], (False, True)), ([WALL, BEHIND], (False, False)), ([SLOPE], (False, True)), ([CEILING], (True, True))],
-)
-def test_cut_squares_move_along_the_cut(others, moves):
-    square = Square(FLOOR, CORNERS, others).below(cloud((9.0, 1.0, 9.0)))
-    assert [low != pytest.approx(-2.0) for low, _ in extent(square)] == list(moves)
-
-
-# --- shadows ---
 
 ABOVE = Camera(target=np.array([0.0, 0.0, 0.0]), distance=8.0, azimuth=0.0, elevation=15.0)
 
@@ -134,19 +120,15 @@ def test_the_ground_is_darker_below_a_body():
     assert (beside > 150).all() and np.abs(before - beside).max() < 12
 
 
-def test_a_shadow_fades_exponentially_with_height():
+def test_a_shadow_lies_below_its_body_and_fades_exponentially_with_height():
+    """The nodes of the ground's square lie where the map is zero, and the middle of the cube's shadow where it is dark."""
     first, second, third = (maps_of(cube_above(height))[0].max() for height in (0.0, 0.2, 0.5))
     assert 1.0 > first > second > third > 0.05
     assert np.log(first / third) == pytest.approx(2.5 * np.log(first / second), rel=0.1)
-
-
-def test_a_shadow_lies_below_its_body():
-    """The nodes of the ground's square lie where the map is zero, and the middle of the cube's shadow where it is dark."""
     (shadow,), at = maps_of(cube_above(0.1))
-    ground = at[:, 2] == 0
+    ground, n = at[:, 2] == 0, len(shadow)
     assert ground.any() and (at[~ground, 2] == -1).all()
     assert shadow[0].max() == shadow[-1].max() == shadow[:, 0].max() == shadow[:, -1].max() == 0.0
-    n = len(shadow)
     assert shadow[n // 2 - 2 : n // 2 + 2, n // 2 - 2 : n // 2 + 2].min() > 0.9 * shadow.max()
     assert np.allclose(at[ground].mean(axis=0)[:2], n / 2, atol=1e-6)
 
@@ -157,17 +139,28 @@ def test_slopes_have_shadows_and_walls_have_none(normal, has_shadow):
     assert (maps.max() > 0.05) == has_shadow and (at[:, 2].max() == 0) == has_shadow
 
 
-def test_a_moving_half_space_has_a_shadow():
-    scene = cube_above(0.5, path=KeyFrames([0.0, 1.0], [(0.0, 0.0, 0.0), (0.0, 0.2, 0.0)]))
-    assert maps_of(scene, t=1.0)[0].max() > 1.2 * maps_of(scene)[0].max()
-
-
-def test_nodes_that_are_not_finite_cast_no_shadow():
+def test_shadows_on_moving_half_spaces_and_of_nodes_that_are_not_finite():
+    lifted = cube_above(0.5, path=KeyFrames([0.0, 1.0], [(0.0, 0.0, 0.0), (0.0, 0.2, 0.0)]))
+    assert maps_of(lifted, t=1.0)[0].max() > 1.2 * maps_of(lifted)[0].max()
     scene = cube_above(0.1)
     some, _ = maps_of(scene, slice(0, 3))
     assert np.isfinite(some).all() and 0.1 < some.max() <= 1.0
     none, at = maps_of(scene, slice(0, Surfaces(scene).n_of_bodies))
     assert none.max() == 0.0 and (at[:, 2] == -1).all()
+
+
+def test_the_window_has_the_shadow_as_a_mesh_on_the_ground():
+    scene = cube_above(0.1)
+    surfaces = Surfaces(scene)
+    x, _ = surfaces.with_obstacles(surfaces.of_bodies(FakeSimulator(scene)), 0.0, ABOVE.position)
+    mesh = ShadowMesh(scene, surfaces)
+    points, colours, triangles = mesh.draw(x, 0.0, ABOVE)
+    assert len(points) == len(colours) == mesh.size[0] and len(triangles) <= mesh.size[1]
+    rays = points - ABOVE.position  # they lie a little nearer to the eye
+    on_ground = ABOVE.position - rays * (ABOVE.position[1] / rays[:, 1:2])
+    assert np.allclose(points, on_ground, atol=0.02) and (points[:, 1] > 0).all()
+    assert np.abs(on_ground[colours[:, 0].argmin()][[0, 2]]).max() < 0.5, "darkest below the cube"
+    assert colours[triangles].min() < 0.7 * colours[triangles].max()
 
 
 def test_a_blur_keeps_the_sum_and_spreads_by_its_deviation():
@@ -178,9 +171,6 @@ def test_a_blur_keeps_the_sum_and_spreads_by_its_deviation():
     rows, columns = np.mgrid[:40, :60]
     deviation = [np.sqrt((smooth * (axis - middle) ** 2).sum()) for axis, middle in ((rows, 20), (columns, 30))]
     assert deviation == pytest.approx([2.0, 4.0], rel=0.15)  # cut off at two deviations
-
-
-# --- picking ---
 
 
 def test_ray_hits_the_nearest_triangle():
@@ -211,22 +201,22 @@ def test_cursor_picks_and_drags_a_body(order):
     scene = beam_scene(("one", "two"), order=order)
     sim, camera, size = FakeSimulator(scene), Camera.framing(np.array([[-2.0, -1, -1], [2, 2, 1]])), (1600, 900)
     sim.time = 1.0
-    point = centre_of_a_visible_triangle(sim.positions("two"), scene.bodies[1].nodes.surface, camera)
+    x = sim.positions("two")
+    point = centre_of_a_visible_triangle(x, scene.bodies[1].nodes.surface, camera)
     cursor = cursor_at(point, camera, size)
     hit = pick(sim, camera, cursor, size)
     assert scene.bodies[hit.body].name == "two" and np.allclose(hit.point, point) and np.allclose(hit.weights, 1 / 3)
     drag = MouseDrag(sim, hit)
-    assert drag.body == "two" and drag.weights.sum() == pytest.approx(1.0) and len(drag.nodes) >= 3
     target = drag.target
-    assert np.allclose(target, drag.weights @ sim.positions("two")[drag.nodes]), "without motion there is no force"
+    assert drag.body == "two" and drag.weights.sum() == pytest.approx(1.0) and len(drag.nodes) >= 3
+    assert np.allclose(target, drag.weights @ x[drag.nodes]), "without motion there is no force"
     drag.move(camera, cursor, size)
     assert np.allclose(drag.target, target)
-    assert drag.move(camera, (cursor[0], cursor[1] + 0.1), size)
-    assert not drag.move(camera, (cursor[0], cursor[1] + 0.1), size)
-    moved = drag.target - target
-    assert moved @ camera.axes[0] == pytest.approx(0, abs=1e-9) and moved @ camera.forward == pytest.approx(0, abs=1e-9)
-    assert moved @ camera.axes[1] > 0
-    assert np.allclose(drag.line(sim), [point, point + moved])
+    up = (cursor[0], cursor[1] + 0.1)
+    assert drag.move(camera, up, size) and not drag.move(camera, up, size)
+    along = camera.axes @ (drag.target - target)
+    assert along[[0, 2]] == pytest.approx(0, abs=1e-9) and along[1] > 0
+    assert np.allclose(drag.line(sim), [point, point + drag.target - target])
     assert pick(sim, camera, (0.01, 0.99), size) is None
 
 
@@ -254,16 +244,11 @@ def test_cursor_picks_and_drags_a_skin(cells, size, order):
     assert pick(sim, camera, cursor_at(corner, camera, window), window) is None, "only a corner of the tets is there"
 
 
-# --- lines ---
-
-
 def test_lines_of_layers():
     scene = beam_scene()
     scene.bodies[0].add_traction(lambda c: c[:, 0] > 1.99, (0, 0, 50.0))
     sim, layers, camera = FakeSimulator(scene), Layers(scene), Camera.framing(scene.bodies[0].rest_positions)
     contacts = sim.contacts()
-    contacts.point, contacts.normal = np.array([[0.0, 1, 0]]), np.array([[0.0, 1, 0]])
-    sim.contacts = lambda: contacts
     faces = len(scene.bodies[0].mesh.surface)
     loaded = 2 * 2 * 2  # triangles of the end
     counts = {"wires": 3 * faces // 2, "contacts": 2, "tractions": 3 * loaded, "fixed_nodes": 0}
