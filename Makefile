@@ -33,7 +33,7 @@ figures: $(READY)
 
 # Runs every example of the manual, then builds it, which runs its notebooks; any warning is an error.
 docs: $(DOCS_READY)
-	$(BIN)/python -m pytest -q -p no:cacheprovider -p no:warnings docs
+	$(BIN)/python -m pytest -q -n auto --maxprocesses 8 --dist loadfile -p no:cacheprovider -p no:warnings docs
 	$(BIN)/sphinx-build -q -n -W --keep-going docs out/docs
 	@echo "Written to out/docs: open out/docs/index.html."
 

@@ -3,6 +3,7 @@
 * nodes, signed weights, normals, right-handed frames, and friction and restitution of each pair, also after they change;
 * displacement of moving obstacles at a contact, and the approach speed;
 * gap minus target: far apart, within the contact offset, penetrating, rebounding;
+* the speed at which contacts of an implicit step rebound, after energy lost in flight and the way that is left, by the formula;
 * warm start: the impulse of the nearest contact of the same feature in the last step, scaled by the ratio of the steps.
 """
 
@@ -15,7 +16,7 @@ from taisoft.backend.arrays import FieldArena
 from taisoft.backend.runtime import kernel
 from taisoft.contact.build import gap_minus_target
 from taisoft.contact.problem import build_node_problem, fill_field
-from taisoft.contact.restitution import explicit_opening
+from taisoft.contact.restitution import explicit_opening, find_rebounds
 from tests.collision.rotations import rotation
 from tests.contact import contact_oracle as oracle
 from tests.dynamics.scenes import dynamics, set_state
@@ -193,4 +194,37 @@ def test_gap_minus_target(fast, slow):
     factor = (gap - found(1e-3 * h, body=(1, 1)))[0] / (1e-3 * h)
     assert factor > 1.5
     assert np.abs(found(h / factor, fast / factor, slow / factor, body=(1, 1)) - expected).max() < 1e-13
+    arena.release()
+
+
+def test_rebounds_of_implicit_steps():
+    """w^2 = e^2 (u^2 + L + 2 a d) - 2 a d where surfaces meet within the step; bodies 0 and 1 have flown for 3 and 0 steps."""
+    h, dt, g, arena = 2e-3, 0.01, np.array([1.0, -9.0, 2.0]), FieldArena()
+    cases = [  # gap, restitution, approach, body a, body b, acceleration that closes the gap
+        (6 * h, 0.5, -2.0, 0, 1, 9.0),
+        (6 * h, 1.0, -2.0, 0, 1, 9.0),
+        (3 * h, 0.5, -2.0, 1, 0, 0.0),  # the lower one has flown
+        (0.5 * h, 0.5, -2.0, 0, 1, 9.0),  # within the contact offset
+        (3 * h, 0.1, -0.4, 0, 1, 9.0),  # too slow to rise above the surface
+        (20 * h, 0.5, -2.0, 0, 1, 9.0),  # does not meet
+        (6 * h, 0.0, -2.0, 0, 1, 9.0),
+        (h, 0.5, 2.0, 0, 1, 9.0),  # separates
+    ]
+    gap, e, u, a, b, closing = np.array(cases).T
+    problem, gravity, n = build_node_problem(arena, 64, 4, True), arena.vectors("gravity", ti.f64, 1, g[None]), len(cases)
+    normals = np.tile([0.0, 1.0, 0.0], (n, 1))
+    bodies = np.stack([a, b], axis=1).astype(np.int32)
+    for field, values in ((problem.gap, gap), (problem.restitution, e), (problem.approach, u), (problem.normal, normals)):
+        fill_field(field, values)
+    fill_field(problem.body, bodies)
+    problem.count[0] = n
+    count = find_rebounds(problem, gravity, np.array([3.0 * dt**2, 0.0]), dt, h)
+    d = np.maximum(0.0, gap - h)
+    speed = np.minimum(dt * closing - u, np.sqrt(u**2 + 3.0 * dt**2 * closing**2))
+    w = np.sqrt(np.maximum(0.0, e**2 * (speed**2 + 2 * closing * d) - 2 * closing * d))
+    rebounds = np.arange(n) < 4
+    assert count == 4 and (dt * (w - dt * 9.0) > 0.01 * h)[rebounds].all()
+    expected = np.where(rebounds, w, -np.maximum(d / dt, u))
+    assert rows(problem.min_velocity, n) == pytest.approx(expected, rel=1e-12)
+    assert rows(problem.min_opening, n) == pytest.approx(np.where(rebounds, dt * (w - dt * 9.0), 0.0), rel=1e-12)
     arena.release()

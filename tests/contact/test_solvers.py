@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 import taisoft as ts
 from benchmarks.contact_problems import YARDSTICK
 from taisoft.backend import runtime
-from taisoft.contact import SOLVERS
+from taisoft.contact import SOLVERS, augmented_lagrangian
 from taisoft.contact.api import METHODS
 from taisoft.contact.colouring import colour_contacts, colour_greedy, matrix_graph, store
 from taisoft.contact.solve import solve
@@ -184,6 +184,11 @@ def test_a_solution_needs_no_sweep(rig):
     p = rig.nodes(made)
     found = solve(p, "gauss_seidel", 1e-8, 50)
     assert found.converged and found.iterations == 0 and found.residual == 0.0 and not impulses(p).any()
+
+
+def test_factors_of_the_augmented_lagrangian_are_those_of_the_stiffest_direction():
+    W = sp.diags([2.0, 4.0, 8.0, 0.5, 5.0, 1.0, 0.0, 0.0, 0.0])
+    assert augmented_lagrangian.find_factors(W) == pytest.approx(np.array([[1 / 2, 1 / 8], [2, 1 / 5], [0, 0]]))
 
 
 @pytest.mark.parametrize("k", [15, 40])  # islands of 90 rows are solved as dense matrices, larger ones as sparse ones

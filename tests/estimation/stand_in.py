@@ -6,7 +6,6 @@ a mesh width, and c makes an error of the mesh. A stiff floor pushes nodes up. T
 """
 
 import dataclasses
-import warnings
 from types import SimpleNamespace
 
 import numpy as np
@@ -32,7 +31,7 @@ def block(touching: bool = False, young: float = 1e5, cells=(1, 1, 1), **materia
 
 
 class StandIn:
-    """Like `ts.Simulator(scene, ...)`. Class attributes are those of the motion: set them on a subclass, see `motion`.
+    """Like `ts.Simulator(scene, ...)`. Class attributes are those of the motion, see `motion`.
 
     frequency: w [rad/s]; damping: d [1/s]; width_error: c; floor: its height [m]; newton: iterations of a step;
     offset: (sim) -> what is added to positions [m]; before_step: (sim), called before each step; unconverged: (sim) -> whether.
@@ -43,7 +42,6 @@ class StandIn:
     offset, before_step, unconverged = (staticmethod(f) for f in (lambda sim: 0.0, lambda sim: None, lambda sim: False))
     dragged, is_driven, compile_seconds, contact = None, False, 0.0, SimpleNamespace(contact_offset=0.01)
     made: list["StandIn"] = []
-    softens = False  # whether the first steps warn that it does, once
 
     def __init__(self, scene, dt=1 / 64, integrator=EULER, precision="f64", **settings):
         self.scene, self.dt = scene, dt
@@ -55,7 +53,7 @@ class StandIn:
         self.x, self.v = self.rest.copy(), np.concatenate([np.broadcast_to(b.velocity, (b.n_nodes, 3)) for b in scene.bodies])
         self.time, self.step_count, self.changes, self.past, self.closed = 0.0, 0, 0, None, False
         self.made.append(self)
-        self._dynamics, self._estimator, self._may_soften = self, None, self.softens
+        self._dynamics, self._estimator, self._may_soften = self, None, False
         self.state = SimpleNamespace(state=lambda: (self.positions(), self.v), velocities=lambda: self.v)
 
     def advance(self, n: int) -> StepReport:
@@ -64,9 +62,6 @@ class StandIn:
             self.before_step(self)
             hits += self._step(self.dt)
             self.time, self.step_count = self.time + self.dt, self.step_count + 1
-        if self._may_soften:
-            self._may_soften = False
-            warnings.warn("softens", UserWarning, stacklevel=2)
         count = 0 if self.settings.explicit else self.newton
         counts = {"newton_iterations": count, "linear_iterations": 2 * count, "n_contacts": hits}
         return StepReport(self.time, n, **counts, converged=not self.unconverged(self))

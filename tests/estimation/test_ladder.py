@@ -1,12 +1,7 @@
-"""Pilots, the errors that they show, and what steps cost, as arithmetic:
-
-* a ladder gives the error and the order of its last pilot; impacts count as of low order; pilots that fail or stall are noticed;
-* one explicit pilot has an error by its velocities, and by parts of it run with a slightly smaller step;
-* pilots record frames, changes of velocities and their hardest part, and restore the state;
-* costs add up over tets, iterations, contacts and paths; a budget ends a pilot; a tolerance alone gives likely settings.
+"""Pilots, the errors that they show, and what steps cost, as arithmetic: a ladder gives the error and the order of its last
+pilot; one explicit pilot has an error by its velocities and by parts of it; pilots restore the state.
 """
 
-import contextlib
 from dataclasses import replace
 from fractions import Fraction
 
@@ -15,7 +10,7 @@ import pytest
 
 import taisoft as ts
 from taisoft.errors import SimulationError
-from taisoft.estimation.costs import Budget, Spent, explicit_step, implicit_step
+from taisoft.estimation.costs import explicit_step, implicit_step
 from taisoft.estimation.first_choice import settings_for, stable_steps
 from taisoft.estimation.ladder import Ladder
 from taisoft.estimation.pilots import FASTEST, HARDEST, Frames, Part, Pilot, distances, make_frames
@@ -178,18 +173,6 @@ def test_costs_add_up():
     base, more = ([implicit_step(scene, False, [n, 0, 0]) for scene in (block(), two)] for n in (1.0, 2.0))
     assert all(implicit_step(block(), False, [1.0, *np.eye(2)[k]]) > base[0] for k in (0, 1))
     assert more[1] - base[1] > more[0] - base[0] > 0.0
-
-
-@pytest.mark.parametrize("costs, taken", [([9.0] * 6, 6), ([11.0] * 6, 2), ([21.0] + [1.0] * 5, 1), ([19.0] + [1.0] * 5, 6)])
-def test_a_budget_is_spent_by_the_mean_cost_of_a_third_of_the_steps(costs, taken, monkeypatch):
-    """Of six steps that may cost 10 each."""
-    left = list(costs)
-    monkeypatch.setattr("taisoft.estimation.costs.implicit_step", lambda *_: left.pop(0))
-    budget = Budget(block(), False, 10.0, 6.0)
-    with contextlib.suppress(Spent):
-        for _ in costs:
-            budget.add(ts.StepReport(time=0.0), 0.0)
-    assert len(costs) - len(left) == taken
 
 
 def test_a_tolerance_gives_likely_settings():

@@ -1,10 +1,5 @@
-"""Orders, distances of paths, forecasts and vibrations, as arithmetic:
-
-* observed orders and Richardson factors are exact for power laws; too small an order gives none; parting paths are noticed;
-* what lowers the order of a scene, and what may make it jump;
-* excursions, distances of paths and shared nodes of two meshes;
-* the forecast follows the orders, and the sentence gives its numbers;
-* vibrations of bodies that touch with friction, of which steps resolve a fiftieth, raise an error.
+"""Orders, distances of paths, forecasts and vibrations, as arithmetic: orders and Richardson factors are exact for power laws;
+what lowers the order of a scene; the forecast follows the orders; vibrations that steps do not resolve raise an error.
 """
 
 from dataclasses import replace

@@ -1,9 +1,5 @@
-"""Error estimates by twins, mostly of stand-ins whose errors are known:
-
-* the errors in time, of the solvers and of the mesh are those of the motion; they are given by body, at nodes and so far;
-* twins have larger steps, or smaller ones where those would be unstable or few, tighter tolerances, or other meshes;
-* changes, failed twins, paths that part and bodies at rest leave an error unknown, and the estimate says why;
-* a run of a real simulator goes on as without twins, which are released at its end.
+"""Error estimates by twins, mostly of stand-ins whose errors are known: in time, of the solvers and of the mesh, by body, at
+nodes and so far; what leaves an error unknown is noted; a run of a real simulator goes on as without twins.
 """
 
 import numpy as np
@@ -201,29 +197,22 @@ def test_meshes_that_cannot_be_compared_are_refused():
         run(sim, 1.0, error_mesh="refined")
 
 
-def test_interrupted_and_broken_runs_release_their_twins():
-    def interrupt(sim, k, _report):
-        if k == 8:
-            raise KeyboardInterrupt
-
+def test_a_broken_run_releases_its_twins():
     kind = motion()
-    result = run(kind(block()), 1.0, interrupt, 16, error=True)
-    assert result.interrupted and result.error_estimate.time > 0.0
     with pytest.raises(ZeroDivisionError):
         run(kind(block()), 1.0, lambda *_: 1 / 0, 16, error=True)
-    assert [one.closed for one in kind.made] == [False, True, True, True] * 2
+    assert [one.closed for one in kind.made] == [False, True, True, True]
 
 
 def test_a_real_run_goes_on_as_without_twins():
     """From a state in motion. Its error is of the right size, is known at the nodes during the run, and excludes another run."""
-    ends, seen, refused = [], [], []
+    ends, seen = [], []
 
     def look(sim, k, _report):
         seen.append((sim.nodal_errors("beam"), sim.error_so_far))
         if k == 2:
-            with pytest.raises(SimulationError, match="during another one") as nested:
+            with pytest.raises(SimulationError, match="during another one"):
                 sim.run(0.1, error=True)
-            refused.append(nested)
 
     scene = ts.Scene(gravity=(0.0, -9.8, 0.0))
     body = scene.add_body(ts.box_mesh((2, 1, 1), (2.0, 1.0, 1.0)), rubber(), name="beam")
@@ -235,7 +224,7 @@ def test_a_real_run_goes_on_as_without_twins():
             sim.run(0.2)
             e = sim.run(0.6, fps=30, error=error, on_frame=look if error else None).error_estimate
             ends.append(sim.positions())
-        assert sim.error_so_far is None and refused
+        assert sim.error_so_far is None and len(seen) > 2
         with pytest.raises(SimulationError, match="only during"):
             sim.nodal_errors()
         sim.reset()

@@ -1,11 +1,5 @@
-"""Linear and quadratic tetrahedra, and the device arrays of a scene with both, of several laws and numbers by tet:
-
-* shape functions sum to 1, are 1 at their own node and 0 at the others, and have the stated derivatives;
-* quadrature rules have positive weights, points inside, and integrate polynomials of their degree exactly;
-* gradients reproduce polynomials of the element's order, masses integrate their squares;
-* nodes keep the order of the bodies (`test_elasticity` has lanes, quadrature and gathering);
-* masses, also the consistent ones, and loads are those of the oracle and add up to the given totals; linear bodies alone have
-  lumped masses.
+"""Linear and quadratic tetrahedra, and the device arrays of a scene with both: shape functions and their derivatives, quadrature,
+gradients, masses and loads are those of their definitions and of the oracle (`test_elasticity` has lanes and gathering).
 """
 
 from itertools import product
@@ -110,12 +104,6 @@ def test_nodes_and_masses(rig):
     on_device = np.diag(m.mass_matrix.diagonal.to_numpy())
     on_device[np.repeat(np.arange(2 * m.n_nodes), np.diff(start)) % m.n_nodes, column] = stored
     assert m.consistent and np.abs(on_device - M).max() < 1e-13 * M.max()
-
-
-def test_linear_bodies_have_lumped_masses():
-    with built(mixed_scene(), "f64") as rig:
-        assert rig.model.mass_matrix is None and not rig.model.consistent
-        assert rig.model.gravity_mass.to_numpy() == pytest.approx(rig.oracle.lumped[:, 0])
 
 
 @pytest.mark.parametrize("order", [1, 2])

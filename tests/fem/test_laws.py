@@ -1,10 +1,5 @@
-"""Material laws in f64, against NumPy and against themselves; one law also with a volume floor:
-
-* every law is available to scenes;
-* energy and stress vanish at rest, and Hooke's law holds for small strains down to 1e-9;
-* psi, P, dP and the projected dP equal the oracle's, also for inverted, flat, tiny and huge F, and are finite for every F;
-* P is the derivative of psi and dP that of P, by finite differences, and dP is symmetric;
-* `evaluate_law` takes any number of matrices, refuses invalid arguments, and leaves no runtime open.
+"""Material laws in f64, one also with a volume floor: psi, P, dP and the projected dP equal the oracle's and are finite for every
+F; Hooke's law holds for small strains; P and dP are derivatives by finite differences; `evaluate_law` refuses invalid arguments.
 """
 
 import numpy as np

@@ -1,12 +1,9 @@
-"""3x3 matrices over four SIMD lanes in f64; `test_single_precision` has one lane in f32:
-
-* products, cofactor and its differential, determinant and double contraction equal NumPy's;
-* the signed SVD reproduces F from two rotations and sorted values to a few roundings, and the last value is negative exactly
-  for inverted F; F is random, rank-deficient, zero, tiny, huge, extremely stretched, or has repeated values;
-* the clamped symmetric matrix is that of NumPy with negative eigenvalues set to 0.
+"""3x3 matrices: products, cofactor and its differential, determinant and double contraction, the signed SVD and the clamped
+symmetric matrix of all kinds of matrices are NumPy's to a few roundings; the last singular value has the sign of det F.
 """
 
 import numpy as np
+import pytest
 import taichi as ti
 
 from taisoft.backend.runtime import kernel
@@ -84,7 +81,9 @@ def check_decompositions(runtime, lanes: int) -> None:
             assert (np.abs(C - expected).max(axis=(1, 2)) / largest(S)).max() < 40 * runtime.eps, kind
 
 
-def test_products_and_decompositions_equal_those_of_numpy():
-    with opened("f64") as runtime:
-        check_products(runtime, lanes=4)
-        check_decompositions(runtime, lanes=4)
+@pytest.mark.parametrize("precision, lanes", [("f64", 4), ("f32", 1)])
+def test_products_and_decompositions_equal_those_of_numpy(precision, lanes):
+    """Over the lanes of the CPU, and one as on CUDA."""
+    with opened(precision) as runtime:
+        check_products(runtime, lanes)
+        check_decompositions(runtime, lanes)

@@ -1,15 +1,6 @@
-"""Bodies whose tets differ in law, Young's modulus, Poisson's ratio, density or volume floor.
-
-`test_elasticity` has forces and energies, `test_model` masses, tests/references bars and beams of two materials against closed
-forms, tests/mesh the readers. Here:
-
-* regions of one material change nothing: positions, stresses, masses, modes and the stable dt are the same bits;
-* stresses and warnings are those of the right tet;
-* numbers of a region, and by tet, can change during a run; refused changes leave everything;
-* refined scenes, other orders, scene files and checkpoints keep everything;
-* bad input is refused in one sentence that names the body, the region or tet, and the rule;
-* a squeezed block with a volume floor keeps its tets in explicit steps below `stable_dt`, which counts the floor, by region;
-  above it explodes; changed numbers scale it, the floor itself cannot change.
+"""Bodies whose tets differ in law, Young's modulus, Poisson's ratio, density or volume floor: stresses and warnings are those of
+the right tet; numbers change during a run, refused changes leave everything; refined scenes and files keep them; bad input is
+refused with body, region or tet; `stable_dt` counts a volume floor (forces: `test_elasticity`, masses: `test_elements`).
 """
 
 import numpy as np
@@ -78,8 +69,9 @@ def test_stresses_and_warnings_are_those_of_the_right_tets():
         sim.set_state(positions=x, body="beam")
         with pytest.warns(UserWarning, match=rf"tet \d+ of body 'beam' .* where {SVK} softens") as caught:
             sim.step()
-    first = next(str(w.message) for w in caught if "softens" in str(w.message))
-    assert MESH.regions[int(first.split("tet ")[1].split()[0])] == 7
+            sim.step()
+    (only,) = (str(w.message) for w in caught if "softens" in str(w.message))
+    assert MESH.regions[int(only.split("tet ")[1].split()[0])] == 7
 
 
 def after_two_steps(scene: ts.Scene, **change) -> np.ndarray:
@@ -130,14 +122,13 @@ def test_refused_changes_leave_everything_and_the_slider_scales_all_tets():
 
 def test_assignments_replace_the_material_or_its_numbers():
     body = beam(two_laws()).bodies[0]
-    assert body.material == {3: rubber(SVK), 7: rubber(SNH, young=3e5)} and repr(body).endswith(f"{SVK} and {SNH})")
+    assert body.material == {3: rubber(SVK), 7: rubber(SNH, young=3e5)}
     with pytest.raises(TypeError):
         body.material[7] = rubber()
     body.density = 500.0
     assert body.mass == pytest.approx(500 * 0.99) and set(body.density) == {500.0}
     body.material = rubber()
-    body.young = np.array(2e5)  # an array of one number is a number
-    assert (body.young, body.poisson, body.density) == (2e5, 0.3, 1000.0) and isinstance(body.young, float)
+    assert (body.young, body.poisson, body.density) == (1e5, 0.3, 1000.0)
     with pytest.raises(SceneError, match="mass cannot be set: set body.density"):
         body.mass = 3.0
 
@@ -150,54 +141,30 @@ def everything() -> ts.Scene:
     return scene
 
 
-@pytest.mark.parametrize("change", [refined, lambda scene: with_order(scene, 2)], ids=["refined", "order"])
-def test_refined_scenes_keep_everything(change):
+def test_refined_scenes_keep_everything():
     """Every part of a tet is what the tet was: masses, laws, and the static energy of a linear displacement."""
-    scene = everything()
-    new = change(scene)
-    for old, body in zip(scene.bodies, new.bodies):
-        assert body.mass == pytest.approx(old.mass) and body.composition.laws == old.composition.laws
-        K, old_K = hooke_stiffness(body), hooke_stiffness(old)
-        u, old_u = (b.rest_positions @ np.array([[0.1, 0.2, 0], [0, -0.3, 0.1], [0, 0, 0.2]]) for b in (body, old))
-        assert u.reshape(-1) @ K @ u.reshape(-1) == pytest.approx(old_u.reshape(-1) @ old_K @ old_u.reshape(-1))
-    assert new.bodies[0].mesh.region_names == {3: "left"} and np.ndim(new.bodies[1].poisson) == 0
+    scene, F = everything(), np.array([[0.1, 0.2, 0], [0, -0.3, 0.1], [0, 0, 0.2]])
+    for new in (refined(scene), with_order(scene, 2)):
+        for old, body in zip(scene.bodies, new.bodies):
+            assert body.mass == pytest.approx(old.mass) and body.composition.laws == old.composition.laws
+            u, old_u = ((b.rest_positions @ F).reshape(-1) for b in (body, old))
+            assert u @ hooke_stiffness(body) @ u == pytest.approx(old_u @ hooke_stiffness(old) @ old_u)
+        assert new.bodies[0].mesh.region_names == {3: "left"} and np.ndim(new.bodies[1].poisson) == 0
 
 
 def test_scene_files_and_digests_keep_everything(tmp_path):
-    one = rubber()
+    """All meshes are checked before the first is written."""
+    one, scene = rubber(), everything()
     scenes = [beam(one), beam({"left": one, 7: one}), beam(one, young=np.full(15, 1e5)), beam(one, density=np.full(15, 1e3))]
     assert len({scene_digest(scene) for scene in scenes}) == 4
-    there_and_back(tmp_path / "a.toml", everything(), {"dt": 0.01})
-    again = ts.read_scene(tmp_path / "a.toml")[0]
-    assert scene_digest(again) == scene_digest(everything()) and again.bodies[2].mesh.region_names == {3: "left", 7: "right"}
-    assert '[bodies.beam.materials]\nleft = "material0"\n7 = "material1"\n' in (tmp_path / "a.toml").read_text()
     numbers = beam({"3": rubber(), "08": rubber(young=3e5)}, mesh=named({3: "3", 7: "08"}))
-    there_and_back(tmp_path / "b.toml", numbers, {"dt": 0.01})
-
-
-def test_scene_files_need_a_region_that_their_meshes_can_hold(tmp_path):
-    """All meshes are checked before the first is written."""
+    for made in (scene, numbers):
+        there_and_back(tmp_path / "a.toml", made, {"dt": 0.01})
     zero = ts.TetMesh(MESH.vertices, MESH.tets, regions=0 * MESH.regions, region_names={0: "all"})
-    scene = everything()
     scene.add_body(zero, {"all": rubber()}, name="split", position=(0, 19, 0))
     with pytest.raises(SceneError, match="body 'split': its mesh has no region but 0, .*: use another number"):
         ts.write_scene(tmp_path / "b.toml", scene)
     assert not list(tmp_path.glob("b*"))
-
-
-def test_checkpoints_keep_everything(tmp_path):
-    path, E = tmp_path / "checkpoint.npz", np.linspace(1e5, 2e5, 5)
-    with explicit(everything(), dt=2e-5) as sim:
-        sim.set_material("beam", region=7, young=2e5)
-        sim.set_material("by tet", young=E)
-        sim.step()
-        sim.save_checkpoint(path)
-        sim.step()
-        wanted = sim.positions()
-    with ts.Simulator.load_checkpoint(path, everything()) as sim:
-        assert np.array_equal(sim.scene.body("by tet").young, E) and sim.scene.body("beam").material[7].young == 2e5
-        sim.step()
-        assert np.array_equal(sim.positions(), wanted)
 
 
 @pytest.mark.parametrize(
@@ -246,30 +213,11 @@ def test_regions_are_looked_up_by_name_or_number():
             MESH.region_id(key)
 
 
-# --- volume floors -----------------------------------------------------------------------------------------------------
-
-
-def squeezed_block(floor: float, squeeze: float = 0.95, **numbers) -> ts.Scene:
-    """A block in a box of which the lid comes down within a second, to a fraction of its height."""
+def test_a_floor_follows_changed_numbers_but_cannot_change():
     scene = ts.Scene(gravity=(0, 0, 0))
-    one = scene.add_body(ts.box_mesh((2, 2, 2), (1, 1, 1)), rubber(SNH, poisson=0.4, volume_floor=floor, **numbers), name="block")
-    one.fix(lambda X: X[:, 1] < -0.499)
-    one.fix(lambda X: (np.abs(X[:, [0, 2]]) > 0.499).any(axis=1) & (np.abs(X[:, 1]) < 0.499), axes="xz")
-    one.move(lambda X: X[:, 1] > 0.499, ts.KeyFrames([0, 1], [(0, 0, 0), (0, -squeeze, 0)]))
-    return scene
-
-
-def test_explicit_steps_resolve_the_floor():
-    """`stable_dt` is 1 / sqrt(1 + 2 / floor) of that of the law: below it a squeezed block keeps its tets, above it explodes."""
-    plain = stable_dt(squeezed_block(0.0), verlet=False)
-    assert plain / stable_dt(squeezed_block(0.1), verlet=False) == pytest.approx(np.sqrt(21.0), rel=1e-6)
-    scene = squeezed_block(0.1, squeeze=0.97, mass_damping=5.0)
-    settings = {"integrator": "symplectic_euler", "precision": "f64", "allow_unstable": True}
-    with pytest.warns(UserWarning, match="stab"), ts.Simulator(scene, dt=0.9 * plain, **settings) as sim:
-        assert sim.run(1.2).status == "failed"
-        sim.reset()
-        sim.dt = 0.9 * sim.stable_dt
-        assert 0.0 < min(report.min_volume_ratio for report in sim.run(1.2).step_reports) < 0.1
+    scene.add_body(cube(), rubber(SNH, poisson=0.4, volume_floor=0.1), name="block")
+    with explicit(scene) as sim:
+        sim.set_state(positions=sim.positions() * [1.0, 0.05, 1.0])
         before = sim.energies().elastic
         sim.set_material("block", young=5e4)
         assert sim.energies().elastic == pytest.approx(0.5 * before, rel=1e-12)

@@ -1,9 +1,5 @@
-"""Springs, tendons and attachments:
-
-* in random states forces with damping, energies, stiffness and damping matrices are those of `oracle_springs`, on linear and
-  quadratic tets; the projected stiffness has no negative part; an element without length does not pull
-  (`test_load_paths` has springs in motion);
-* `stable_dt` and the stiffness of linear vibration agree with dense algebra.
+"""Springs, tendons and attachments: forces, energies, stiffness and damping are those of `oracle_springs`, on tets of both
+orders; the projected stiffness has no negative part; `stable_dt` agrees with dense algebra (motion: `test_load_paths`).
 """
 
 import numpy as np

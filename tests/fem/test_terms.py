@@ -1,8 +1,5 @@
-"""Forces of every term in a random state of linear and quadratic bodies, in f64:
-
-* they are minus the finite difference of the energies;
-* dampers act by the rates of each body;
-* forces and stiffness of nodes that depend on others, x = T q, act on those as T^T f and T^T K T.
+"""Forces of every term in a random state of linear and quadratic bodies are minus the finite difference of the energies; dampers
+act by the rates of each body; forces and stiffness of dependent nodes, x = T q, act on the others as T^T f and T^T K T.
 """
 
 import numpy as np

@@ -1,8 +1,5 @@
-"""Aggregates of nodes and their motions, on the host:
-
-* aggregates cover the included nodes and are connected;
-* rigid motions lie in the range of the prolongation, also of aggregates that are rigid about their centres, of few nodes, of
-  nodes on a line and of constrained ones; its columns are orthonormal.
+"""Aggregates of nodes are connected and cover the included ones; rigid motions lie in the range of the prolongation, also of
+aggregates of few nodes, of nodes on a line and of constrained ones; its columns are orthonormal.
 """
 
 import numpy as np

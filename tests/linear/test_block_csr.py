@@ -1,7 +1,5 @@
-"""The assembled stiffness of bodies of both orders, with regions, numbers by tet and a volume floor, in f64:
-
-* it is the oracle's, symmetric, also projected, when it has no negative eigenvalue; `multiply` is the product with it;
-* the system adds mass, mass damping and stiffness damping.
+"""The assembled stiffness of bodies of both orders, with regions, numbers by tet and a volume floor, is the oracle's, also
+projected; the system adds mass, mass damping and stiffness damping.
 """
 
 import numpy as np

@@ -1,8 +1,4 @@
-"""Parts of bordered systems, on the host:
-
-* multipliers found by the active set are those of their definition: complementary where they are one-sided;
-* inverses of diagonal blocks are those of the blocks' free axes, with absolute eigenvalues.
-"""
+"""Parts of bordered systems, on the host: multipliers of the active set, and inverses of diagonal blocks."""
 
 import numpy as np
 

@@ -1,11 +1,5 @@
-"""Conjugate gradients in f64, on stiffness plus inertia of compressed bodies of either order; block-Jacobi, and Gauss-Seidel over
-the whole system and over chunks, on one thread and on several:
-
-* the solution is SciPy's on the free axes and exactly 0 on the others, whatever the right-hand side there;
-* a looser tolerance stops earlier, the iteration limit holds, and a zero right-hand side takes no iteration;
-* negative curvature is reported, and the iterate before it is finite and a descent direction;
-* nearly singular diagonal blocks do not spoil the solution;
-* with chunks the result is the same on any number of threads, and takes fewer iterations than block-Jacobi.
+"""Conjugate gradients in f64, with block-Jacobi, and Gauss-Seidel over the whole system and over chunks, on one thread and on
+several: the solution is exact on the free axes and 0 on the others, limits hold, and negative curvature is reported.
 """
 
 from dataclasses import replace
@@ -105,18 +99,3 @@ def test_negative_curvature_is_reported(rig, method):
         for after in (1, 2, 8):  # the limit falls into the iteration that finds it, or a later one of its batch
             again, same = solve(rig, method, 1e-6, limit=result.iterations + after)
             assert again == result and np.array_equal(same, y)
-
-
-@pytest.mark.parametrize("method", METHODS)
-def test_nearly_singular_blocks_do_not_spoil_the_solution(rig, method):
-    """Nodes ten thousand times as stiff along one oblique axis: the determinants of their blocks are nearly 0."""
-    u, scale = np.array([1.0, 2.0, -2.0]) / 3.0, np.ones(rig.model.n_nodes)
-    stiff = np.arange(4, 20, 3)
-    scale[stiff] = 0.01
-    A = np.outer(*2 * [scale.repeat(3)]) * rig.stiffness + 300.0 * np.eye(len(rig.stiffness))
-    for i in 3 * stiff:
-        A[i : i + 3, i : i + 3] += 3e6 * np.outer(u, u)
-    exact, f = upload(rig, A), rig.free.reshape(-1)
-    assert np.linalg.eigvalsh(A[f][:, f]).min() > 10.0
-    result, y = solve(rig, method, 1e-6)
-    assert result.converged and not result.negative and np.abs(y - exact).max() < 1e-2 * np.abs(exact).max()

@@ -1,10 +1,5 @@
-"""Conjugate gradients with multigrid in Gauss-Seidel's sweeps, and its coarse space, in f64 and at last in f32:
-
-* the stored form of T, and T^T A T, are those of the matrices;
-* iterates are those of conjugate gradients with the V-cycle: forward sweep, coarse correction, backward sweep;
-* the solution is exact, 0 on constrained axes; limits hold and negative curvature is reported;
-* with chunks, also if blocks couple chunks of one parity, the bits are the same on one thread and on several;
-* the iterations hardly grow with the mesh, and a factor of the stiffness does not change them; a narrow band is factorised.
+"""Conjugate gradients with multigrid in Gauss-Seidel's sweeps, and its coarse space: iterates are those of the V-cycle, solutions
+exact, the bits the same on any number of threads; the iterations hardly grow with the mesh; a narrow band is factorised.
 """
 
 import numpy as np
@@ -12,7 +7,6 @@ import scipy.sparse as sp
 import scipy.sparse.linalg as spl
 
 from taisoft.backend.arrays import FieldArena
-from taisoft.linear import pcg
 from taisoft.linear.aggregation import MODES, rigid_aggregates, rigid_modes
 from taisoft.linear.coarse_space import build_coarse_space
 from taisoft.linear.hierarchy import ExactPreconditioner, build_hierarchy, rows_with_diagonals
@@ -106,12 +100,11 @@ def test_chunks_give_the_same_bits_on_any_number_of_threads():
 
 
 def test_iterations_hardly_grow_with_the_mesh():
-    counts, plain = [], []
+    counts = []
     for cells in ((14, 10, 10), (24, 17, 17)):
         with assembled(held_box(cells)) as made:
             counts.append(hierarchy_of(made).solve(made.model, made.A, made.work, 1e-8, 200).iterations)
-            plain.append(pcg.solve(made.model, made.A, made.work, 1e-8, 2000).iterations)
-    assert plain[1] > 1.5 * plain[0] and counts[1] < 50 and counts[1] < 1.3 * counts[0]
+    assert counts[1] < 50 and counts[1] < 1.3 * counts[0]
 
 
 def test_a_narrow_band_is_factorised():
@@ -120,12 +113,3 @@ def test_a_narrow_band_is_factorised():
         assert isinstance(hierarchy, ExactPreconditioner)
         result = hierarchy.solve(made.model, made.A, made.work, 1e-8, 200)
         assert result.converged and result.iterations <= 2 and hierarchy.n_bytes > 8 * made.A.n_edges
-
-
-def test_solutions_in_single_precision():
-    """Conjugate gradients alone and with multigrid reach what rounding allows."""
-    with assembled(held_box(), shift=100.0, precision="f32") as made:
-        arrays, hierarchy = (made.model, made.A, made.work), hierarchy_of(made)
-        for solve, most in ((pcg.solve, 200), (hierarchy.solve, 40)):
-            result = solve(*arrays, 1e-6, 1000)
-            assert result.converged and not result.negative and 4 < result.iterations < most and error(made) < 1e-3

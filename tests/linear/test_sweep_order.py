@@ -1,8 +1,5 @@
-"""Gauss-Seidel over chunks with coupling terms, whether blocks couple chunks of one parity or not:
-
-* every iteration is that of NumPy's conjugate gradients with the triangle of the stated order, which contains all terms: in
-  chunks that threads may share, the nodes of a term outside the first chunk of each parity are last;
-* the result is the same bits on one thread and on several, and exact.
+"""Gauss-Seidel over chunks with coupling terms: iterations are NumPy's with the triangle of the stated order, in which the nodes
+of a term outside the first chunk of each parity are last, and the solution is exact and the same on any number of threads.
 """
 
 import numpy as np

@@ -1,14 +1,12 @@
 """Reading and writing of mesh files (random and mutated ones: faults/test_fuzz.py): written meshes are read back bitwise; every
 format and encoding gives the same mesh; second-order tets give their corners, and curved edges a warning; welding merges
-vertices. Broken files give one MeshError, which starts with the exact name, ends with the reader's cause, names line, byte or
-node of Gmsh's and TetGen's files, shows nothing of the content, and comes quickly.
+vertices. Broken files give one MeshError, which starts with the name and gives the line or node of Gmsh's and TetGen's files.
 """
 
 import contextlib
 import io
 import os
 import re
-import threading
 from pathlib import Path
 
 import meshio
@@ -27,7 +25,6 @@ MARK = b"\xef\xbb\xbf"
 TEXT = {"binary": False}
 GMSH2 = {"file_format": "gmsh22", **TEXT}  # read without a child process
 FORMATS = {  # ending, and options of meshio's writer
-    "gmsh 2": (".msh", GMSH2),
     "gmsh 4": (".msh", {"file_format": "gmsh", **TEXT}),
     "gmsh 4 binary": (".msh", {"file_format": "gmsh", "binary": True}),
     "ansys": (".msh", {"file_format": "ansys", **TEXT}),
@@ -99,7 +96,6 @@ def test_every_format_with_a_byte_order_mark_and_windows_line_ends(tmp_path, cap
 
 
 def test_utf16_text_is_refused_with_advice_except_xml(tmp_path):
-    """And a byte-order mark in binary data is data."""
     cells = [("triangle", MESH.surface), ("tetra", MESH.tets)]
     for codec in ("utf-16", "utf-16-le", "utf-16-be"):
         for name, own, options in (("part.msh", cells[1:], GMSH2), ("part.vtk", cells[1:], TEXT), ("part.obj", cells[:1], {})):
@@ -110,9 +106,6 @@ def test_utf16_text_is_refused_with_advice_except_xml(tmp_path):
     path = write_by_meshio(tmp_path / "part.vtu", cells[1:], **TEXT)
     path.write_bytes(path.read_bytes().decode().encode("utf-16"))
     assert same(read_mesh(path), 1e-12)
-    path = write_by_meshio(tmp_path / "a.stl", cells[:1], binary=True)
-    path.write_bytes(MARK + path.read_bytes()[len(MARK) :])
-    assert ts.read_surface(path).volume == pytest.approx(MESH.volumes.sum(), rel=1e-6)
 
 
 def test_gmsh_blocks_parametric_nodes_and_sparse_tags(tmp_path):
@@ -181,22 +174,16 @@ def test_corners_make_the_mesh_for_any_order_of_the_edges(tmp_path, options):
 
 
 def test_curved_edges_are_straightened_with_a_warning(tmp_path):
-    """A ball whose surface edges are bent onto the sphere."""
-    ball = ball_mesh(1.0, 4)
-    nodes = make_nodes(ball, 2)
-    edges = np.unique(np.sort(ball.surface[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1), axis=0)
-    points, middles = nodes.positions.copy(), np.setdiff1d(nodes.surface, ball.surface)
-    points[middles] /= np.linalg.norm(points[middles], axis=1, keepdims=True)
-    a, b = points[edges[:, 0]], points[edges[:, 1]]
-    deviation = (1 - 0.5 * np.linalg.norm(a + b, axis=1)) / np.linalg.norm(a - b, axis=1)
-    with pytest.warns(UserWarning, match="part.msh: .* curved"):
-        mesh = read_mesh(write_quadratic(tmp_path / "part.msh", points, nodes.elements[:, [0, 1, 2, 3, 4, 7, 5, 6, 8, 9]]))
-    assert np.array_equal(mesh.vertices, ball.vertices) and len(mesh.warnings) == 1
-    message = mesh.warnings[0]
-    assert message.startswith(f"{len(edges)} edges of second-order tets are curved")
-    assert f"the largest deviation is {deviation.max():.2g} of the edge's length, between vertices " in message
-    worst = [int(word) for word in message.split("between vertices ")[1].split(" of ")[0].split(" and ")]
-    assert deviation[(edges == worst).all(axis=1)] == pytest.approx(deviation.max())
+    points, (a, b, middle) = NODES.positions.copy(), NODES.elements[0, [0, 1, 4]]
+    edge = points[b] - points[a]
+    points[middle] += 0.1 * np.cross(edge, (0.3, 0.5, -0.7))
+    points[MESH.n_verts + (middle == MESH.n_verts)] += 1e-3
+    deviation = np.linalg.norm(points[middle] - (points[a] + points[b]) / 2) / np.linalg.norm(edge)
+    with pytest.warns(UserWarning, match="part.msh: 2 edges of second-order tets are curved") as caught:
+        mesh = read_mesh(write_quadratic(tmp_path / "part.msh", points))
+    assert same(mesh) and len(mesh.warnings) == len(caught) == 1
+    worst = f"largest deviation is {deviation:.2g} of the edge's length, between vertices {min(a, b)} and {max(a, b)} of "
+    assert worst in mesh.warnings[0]
 
 
 def test_nodes_off_the_edges_and_unknown_ones_are_rejected(tmp_path):
@@ -239,44 +226,24 @@ def refusal(read, path) -> str:
     return text.removeprefix(f"{path}: ")
 
 
-@pytest.mark.parametrize(
-    "name, content, message",
-    [
+def test_files_without_a_mesh_are_refused(tmp_path):
+    for name, content, message in (
         ("absent.msh", None, "there is no such file"),
         ("a.msh", MARK + b"\r\n", "the file is empty"),
         ("a.svg", b"x", "not a supported mesh (such files can only be written: svg)"),
         ("a.txt", b"hello", "not a supported mesh: the ending '.txt' is not known"),
         ("a.obj", OBJ.encode(), "no tetrahedra; 2 triangles found; make a volume mesh first"),
         ("a.off", OFF.encode(), "no tetrahedra; 2 faces found"),
-    ],
-)
-def test_files_without_a_mesh_are_refused(tmp_path, name, content, message):
-    if content is not None:
-        (tmp_path / name).write_bytes(content)
-    assert refusal(read_mesh, tmp_path / name).startswith(message)
-
-
-def test_surfaces_and_other_things_in_place_of_a_mesh(tmp_path):
-    triangles, n = [("triangle", MESH.surface)], len(MESH.surface)
-    for name, options in (("a.stl", TEXT), ("b.stl", {"binary": True}), ("a.ply", {"binary": True}), ("a.msh", GMSH2)):
-        path = write_by_meshio(tmp_path / name, triangles, **options)
-        assert re.match(f"no tetrahedra; {n} (triangles|faces) found; make a volume mesh", refusal(read_mesh, path))
+    ):
+        if content is not None:
+            (tmp_path / name).write_bytes(content)
+        assert refusal(read_mesh, tmp_path / name).startswith(message)
+    for name, options in (("a.stl", TEXT), ("a.ply", {"binary": True}), ("a.msh", GMSH2)):
+        path = write_by_meshio(tmp_path / name, [("triangle", MESH.surface)], **options)
+        assert re.match(f"no tetrahedra; {len(MESH.surface)} (triangles|faces) found", refusal(read_mesh, path))
     for path, message in ((tmp_path, "this is not a file"), (tmp_path / "\0.msh", "."), (3, "must be a file's name")):
         with pytest.raises(MeshError, match=message):
             read_mesh(path)
-
-
-def test_messages_give_the_exact_name_and_one_cause(tmp_path, monkeypatch):
-    """In a narrow terminal, with a folder name longer than its line; brackets are markup of a library."""
-    monkeypatch.setenv("COLUMNS", "20")
-    path = tmp_path / ("a folder with a [bold]long[/bold] name " * 5) / ":smile: [red]a[/blue].vtk"
-    path.parent.mkdir(parents=True)
-    path.write_text("passphrase\nof three lines\n\n")
-    scene = path.with_name("scene.toml")
-    scene.write_text(f"[bodies.a]\nmaterial = {{}}\nmesh = {{ file = '{path.name}' }}\n")
-    with pytest.raises(MeshError) as caught:
-        ts.read_scene(scene)
-    assert str(caught.value) == f"{scene}: bodies.a.mesh: {path}: not a supported mesh (Illegal VTK header)"
 
 
 def test_inverted_tets_are_refused_or_fixed(tmp_path):
@@ -300,6 +267,7 @@ def test_errors_of_gmsh_files_give_the_line_and_the_node(tmp_path):
         ([*lines[:inside], "11 1 x 3 4\n", *lines[inside + 1 :]], rf"line {inside + 1} \(\$Elements\): b'x' is not a number"),
         ([*lines[: inside - 4], "7 7 ", *lines[inside - 4 :]], r"line \d+ \(\$Elements\): 42 numbers should follow"),
         ([*lines[: first + 2], f"{number} 99 {' '.join(corners[1:])}\n", *lines[first + 3 :]], r"tet 2: node 99 .* \(12 nodes\)"),
+        ([*lines[: first - 2], "1 11 1 10\n", *lines[first - 1 :]], r"line \d+ \(\$Elements\): 11 elements were declared, but"),
         ([*lines[:nodes], lines[nodes + 1], *lines[nodes + 1 :]], "node 2 is given twice"),
         ([*lines[:-1], "7\n", lines[-1]], r"line \d+ \(\$Elements\): 1 numbers are left over"),
     ):
@@ -308,14 +276,11 @@ def test_errors_of_gmsh_files_give_the_line_and_the_node(tmp_path):
 
 
 @pytest.mark.parametrize("version, binary", [("gmsh", False), ("gmsh", True), ("gmsh22", False)])
-def test_cut_or_random_gmsh_files_never_give_a_partial_mesh(tmp_path, version, binary):
-    path, rng = write_by_meshio(tmp_path / "part.msh", TETS, file_format=version, binary=binary), np.random.default_rng(4)
+def test_cut_gmsh_files_never_give_a_partial_mesh(tmp_path, version, binary):
+    path = write_by_meshio(tmp_path / "part.msh", TETS, file_format=version, binary=binary)
     data = path.read_bytes().rstrip()
-    changed = [data[:length] for length in range(40, len(data) - 1, max(1, len(data) // 50))]  # shorter ones are for meshio
-    if binary:
-        changed += [data[: data.index(b"$Nodes") + 7] + rng.bytes(rng.integers(1, 400)) for _ in range(30)]
-    for content in changed:
-        path.write_bytes(content)
+    for length in range(40, len(data) - 1, max(1, len(data) // 50)):  # shorter ones are for meshio
+        path.write_bytes(data[:length])
         refusal(read_mesh, path)
 
 
@@ -334,26 +299,6 @@ def test_tetgen_files_count_from_one_and_must_be_consistent(tmp_path):
     ele.unlink()
     with pytest.raises(MeshError, match="t.ele: there is no such file; TetGen's files come in pairs"):
         read_mesh(node)
-    os.mkfifo(ele)  # nothing writes to it, so that opening it would block
-    unblock = threading.Timer(5.0, lambda: os.close(os.open(ele, os.O_WRONLY | os.O_NONBLOCK)))
-    unblock.start()
-    try:
-        with pytest.raises(MeshError, match="t.ele: this is not a file; TetGen's files come in pairs"):
-            read_mesh(node)
-    finally:
-        unblock.cancel()
-
-
-@pytest.mark.parametrize("ending, count", [(".msh", 10**15), (".ele", 10**30), (".vtk", 10**9)])
-def test_absurd_counts_are_refused_quickly(tmp_path, ending, count):
-    options = {"file_format": "gmsh", "binary": False} if ending == ".msh" else {}
-    path = write_by_meshio(tmp_path / f"part{ending}", TETS, **options)
-    data = path.read_bytes()
-    assert re.search(rb"\b1[02]\b", data)  # 12 vertices, 10 tets
-    path.write_bytes(re.sub(rb"\b1[02]\b", str(count).encode(), data, count=2))
-    start = os.times()
-    refusal(read_mesh, path)
-    assert sum(os.times()[:4]) - sum(start[:4]) < 5.0  # of this process and its children
 
 
 def test_more_data_than_the_file_can_hold(tmp_path):

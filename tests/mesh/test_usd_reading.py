@@ -130,47 +130,26 @@ FACE = (
 )
 
 
-@pytest.mark.parametrize(
-    "content, message",
-    [
+def test_broken_stages_give_one_sentence(tmp_path):
+    path = tmp_path / "a.usda"
+    for content, message in (
         ("", "the file is empty"),
         ('#usda 1.0\ndef Xform "a" {}\n', "the stage holds no tets and no closed surface"),
         (FACE.format([3], [0, 0, 7]), "part: triangle 0: vertex 7 does not exist"),
-    ],
-)
-def test_broken_stages_give_one_sentence(tmp_path, content, message):
-    path = tmp_path / "a.usda"
-    path.write_text(content)
-    with pytest.raises(MeshError) as error:
-        ts.read_usd(path)
-    text = str(error.value)
-    assert text.startswith(f"{path}: {message}") and "\n" not in text and text.count(str(path)) == 1
-
-
-@pytest.mark.parametrize(
-    "content, message",
-    [
+    ):
+        path.write_text(content)
+        with pytest.raises(MeshError) as error:
+            ts.read_usd(path)
+        text = str(error.value)
+        assert text.startswith(f"{path}: {message}") and "\n" not in text and text.count(str(path)) == 1
+    for content, message in (
         ("#usda 1.0\n\ndef Mesh {{{\n", "line 3 cannot be parsed"),
         ('#usda 1.0\ndef Xform "a" (references = @b.usda@) {}', "its part 'b.usda' cannot be opened"),
         (FACE.format([3, 4], [0, 0, 0]), "do not fit together"),
-    ],
-)
-def test_inconsistent_stages_end_the_reader_with_one_sentence(tmp_path, content, message):
-    (tmp_path / "a.usda").write_text(content)
-    with pytest.raises(SystemExit, match=message):
-        read_stage(str(tmp_path / "a.usda"))
-
-
-@pytest.fixture
-def two(tmp_path):
-    """A folder with a stage of two bodies of tets and an open surface."""
-    stage = new_stage(tmp_path / "two.usda")
-    UsdGeom.Xform.Define(stage, "/World/upper")
-    add_tets(stage, "/World/upper/tets").AddTranslateOp().Set(Gf.Vec3d(0, 3, 0))
-    add_tets(stage, "/World/lower")
-    add_surface(stage, "/World/lid", CUBE, QUADS[1:])
-    stage.Save()
-    return tmp_path
+    ):
+        path.write_text(content)
+        with pytest.raises(SystemExit, match=message):
+            read_stage(str(path))
 
 
 def read_scene(folder, more="", **options):
@@ -179,9 +158,16 @@ def read_scene(folder, more="", **options):
     return ts.read_scene(folder / "scene.toml", **options)[0].bodies[0].mesh
 
 
-def test_info_and_scene_files_take_a_stage(two, capsys):
-    """A mesh by its name or path."""
-    assert main(["info", str(two / "two.usda")]) == 0
+def test_info_and_scene_files_take_a_stage(tmp_path, capsys):
+    """With two bodies of tets and an open surface; a mesh by its name or path."""
+    path = tmp_path / "two.usda"
+    stage = new_stage(path)
+    UsdGeom.Xform.Define(stage, "/World/upper")
+    add_tets(stage, "/World/upper/tets").AddTranslateOp().Set(Gf.Vec3d(0, 3, 0))
+    add_tets(stage, "/World/lower")
+    add_surface(stage, "/World/lid", CUBE, QUADS[1:])
+    stage.Save()
+    assert main(["info", str(path)]) == 0
     shown = capsys.readouterr().out
     assert "two.usda: tets\n" in shown and "two.usda: lower\n" in shown and shown.count(f"{MESH.n_tets} tets") == 2
     for more, message in (
@@ -189,14 +175,14 @@ def test_info_and_scene_files_take_a_stage(two, capsys):
         (", fix_orientation = true", "mesh.fix_orientation is not known; there are file, prim, edge_length"),
     ):
         with pytest.raises(TaisoftError) as caught:
-            read_scene(two, more)
-        assert str(caught.value) == f"{two / 'scene.toml'}: bodies.part.{message.format(stage=two / 'two.usda')}"
+            read_scene(tmp_path, more)
+        assert str(caught.value) == f"{tmp_path / 'scene.toml'}: bodies.part.{message.format(stage=path)}"
     # it names no other files, unless that is allowed
-    (two / "two.usda").rename(two / "other.usda")
-    (two / "two.usda").write_text('#usda 1.0\n(\nmetersPerUnit = 1\n)\nover "World" (references = @other.usda@</World>) {}\n')
+    path.rename(tmp_path / "other.usda")
+    path.write_text('#usda 1.0\n(\nmetersPerUnit = 1\n)\nover "World" (references = @other.usda@</World>) {}\n')
     with pytest.raises(TaisoftError, match=r"not a readable USD stage \(it names a further file, 'other.usda'\)$"):
-        read_scene(two, ', prim = "lower"')
+        read_scene(tmp_path, ', prim = "lower"')
     with warnings.catch_warnings():
         warnings.simplefilter("error")  # of the surface that is not taken
-        mesh = read_scene(two, ', prim = "/World/upper"', allow_outside=True)
+        mesh = read_scene(tmp_path, ', prim = "/World/upper"', allow_outside=True)
     assert np.array_equal(mesh.vertices, MESH.vertices.astype(np.float32) + (0.0, 3.0, 0.0))

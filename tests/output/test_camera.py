@@ -21,56 +21,53 @@ def test_framing_shows_all_points(azimuth, elevation):
     assert np.allclose(camera.project(camera.target[None], SIZE), [[160, 90, camera.distance]])
 
 
-def falling_cube(height: float, gravity=(0, -9.81, 0)) -> ts.Scene:
-    """A cube of 1 m whose underside is at this height above the ground, y = 0."""
+def falling_cube(height: float, gravity=(0, -9.81, 0), normal=(0, 1, 0)) -> ts.Scene:
+    """A cube of 1 m whose underside is at this height above the ground, a half-space through the origin."""
     scene = ts.Scene(gravity=gravity)
     scene.add_body(ts.box_mesh((1, 1, 1), (1, 1, 1)), ts.Material(), name="cube", position=(0, height + 0.5, 0))
-    scene.add_obstacle(ts.HalfSpace((0, 0, 0), (0, 1, 0)), name="ground")
+    scene.add_obstacle(ts.HalfSpace((0, 0, 0), normal), name="ground")
     return scene
 
 
 def test_the_first_picture_shows_the_ground_below_a_falling_body():
-    scene = falling_cube(2.0)
-    points = framed_points(scene)
+    points = framed_points(falling_cube(2.0))
     assert points[:, 1].min() == pytest.approx(0.0) and points[:, 1].max() == pytest.approx(3.0) and len(points) == 16
     camera = Camera.framing(points, SIZE)
     down = camera.project(points, SIZE)[:, 1]
-    assert down.min() > 0.15 * SIZE[1] and down.max() < 0.85 * SIZE[1]
-    assert camera.target[1] == pytest.approx(1.5)
-    tilted = ts.Scene(gravity=(0, -9.81, 0))
-    tilted.add_body(ts.box_mesh((1, 1, 1), (1, 1, 1)), ts.Material(), position=(0, 3, 0))
-    tilted.add_obstacle(ts.HalfSpace((0, 0, 0), (1, 1, 0)))
+    assert down.min() > 0.15 * SIZE[1] and down.max() < 0.85 * SIZE[1] and camera.target[1] == pytest.approx(1.5)
+    tilted = falling_cube(2.0, normal=(1, 1, 0))
     landed = framed_points(tilted)[8:]
     assert (landed @ [1, 1, 0]).min() == pytest.approx(0.0) and np.allclose(landed[:, 0], framed_points(tilted)[:8, 0])
 
 
 def test_a_fall_is_framed_only_where_it_is_known():
     """Not of bodies that something holds, without gravity, beside walls, on or below the ground, or to the end of a long fall."""
-    fixed, attached, wall = falling_cube(2.0), falling_cube(2.0), ts.Scene(gravity=(0, -9.81, 0))
+    fixed, attached, wall = falling_cube(2.0), falling_cube(2.0), falling_cube(2.0, normal=(1, 0, 0))
     fixed.bodies[0].fix([0])
     attached.add_spring(("cube", 0), ("ground", (0, 0, 0)), 10.0)
-    wall.add_body(ts.box_mesh((1, 1, 1), (1, 1, 1)), ts.Material(), position=(3, 0, 0))
-    wall.add_obstacle(ts.HalfSpace((0, 0, 0), (1, 0, 0)))
     for scene in (fixed, attached, wall, falling_cube(2.0, (0, 0, 0)), falling_cube(0.0), falling_cube(2.0, (0, 9.81, 0))):
         assert np.array_equal(framed_points(scene), start_positions(scene))
-    far = framed_points(falling_cube(1000.0))
-    assert 2 < np.ptp(far[:, 1]) < 20
+    assert 2 < np.ptp(framed_points(falling_cube(1000.0))[:, 1]) < 20
 
 
 def test_projection_is_that_of_a_pinhole_camera():
+    """Which rays invert."""
     camera = Camera(target=np.zeros(3), distance=10.0, azimuth=0.0, elevation=0.0, fov=90.0)
     projected = camera.project(np.array([[1.0, 0, 0], [0, 2.0, 0], [0, 0, 5.0], [1.0, 0, 5.0]]), (200, 100))
     # half the height, 50 pixels, is 10 m at a depth of 10 m: 5 pixels per metre, 10 at 5 m; x right, y up, z towards the camera
     assert np.allclose(projected, [[105, 50, 10], [100, 40, 10], [100, 50, 5], [110, 50, 5]])
+    camera = Camera(target=np.array([1.0, 2, 3]), distance=4.0, azimuth=70.0, elevation=-30.0)
+    for point in np.random.default_rng(1).uniform(-1, 1, (20, 3)) + camera.target:
+        across, down, _ = camera.project(point[None], SIZE)[0]
+        ray = camera.ray((across / SIZE[0], 1 - down / SIZE[1]), SIZE)
+        assert np.allclose(np.cross(ray, point - camera.position), 0, atol=1e-12) and ray @ camera.forward > 0
 
 
 def test_orbit_zoom_and_pan():
     camera = Camera(target=np.zeros(3), distance=10.0, azimuth=350.0, elevation=80.0)
-    orbited = camera.orbit(20.0, 50.0)
+    orbited, panned = camera.orbit(20.0, 50.0), camera.pan(0.0, 0.25)  # up by a quarter of the picture's height
     assert orbited.azimuth == pytest.approx(10.0) and orbited.elevation == 89.0
-    assert np.linalg.norm(orbited.position - orbited.target) == pytest.approx(10.0)
-    assert camera.zoom(0.5).distance == 5.0
-    panned = camera.pan(0.0, 0.25)  # up by a quarter of the picture's height
+    assert np.linalg.norm(orbited.position - orbited.target) == pytest.approx(10.0) and camera.zoom(0.5).distance == 5.0
     assert panned.project(np.zeros((1, 3)), SIZE)[0, 1] == pytest.approx(90 + 45, abs=1e-9)
 
 
@@ -86,19 +83,15 @@ def test_camera_moves_back_from_approaching_bodies():
 
 
 def test_floor_that_reaches_behind_the_camera_is_clipped():
-    """Compare with rays through pixel centres.
-
-    Triangles in front are unchanged, those behind are dropped; in a large picture clipped ones stay drawable.
-    """
-    half = 30.0
+    """As rays through pixel centres say; triangles in front are unchanged, those behind are dropped."""
+    half, (width, height) = 30.0, SIZE
     floor = [[-half, 0, -half], [half, 0, -half], [half, 0, half], [-half, 0, half]]
     corners = np.array([*floor, [0, 1, -9], [1, 1, -9], [0, 2, -9], [0, 1, 9], [1, 1, 9], [0, 2, 9]])
     shades, triangles = (corners + half) / (2 * half), np.array([[0, 2, 1], [0, 3, 2], [4, 5, 6], [7, 8, 9]])
     camera = Camera(target=np.array([0.0, 0.5, 0.0]), distance=3.0, azimuth=20.0, elevation=10.0)
     x, cut, colours = camera.clipped(corners, triangles, shades, SIZE)
     assert not (cut == 7).any() and np.array_equal(x[: len(corners)], corners) and (cut == [4, 5, 6]).all(axis=1).sum() == 1
-    image, (width, height) = np.zeros((SIZE[1], SIZE[0], 3), dtype=np.uint8), SIZE
-    below = (cut != [4, 5, 6]).all(axis=1)
+    image, below = np.zeros((height, width, 3), dtype=np.uint8), (cut != [4, 5, 6]).all(axis=1)
     drawn = rasterise(camera.project(x, SIZE), cut[below], colours, camera.clipping[0], image)
     focal = height / 2 / np.tan(np.radians(camera.fov) / 2)
     v, u = np.mgrid[:height, :width] + 0.5
@@ -111,7 +104,7 @@ def test_floor_that_reaches_behind_the_camera_is_clipped():
     both = drawn & expected
     assert np.abs(image[both] / 255 - (hit[both] + half) / (2 * half))[:, [0, 2]].max() < 0.02
     large = np.abs(camera.project(camera.clipped(corners, triangles, shades, (2560, 1440))[0], (2560, 1440))[len(corners) :, :2])
-    assert 1e4 < large.max() < 5e5
+    assert 1e4 < large.max() < 5e5, "drawable in a large picture too"
     corners[4] = np.nan
     assert not (camera.clipped(corners, triangles, shades, SIZE)[1] == 4).any()
 
@@ -126,11 +119,3 @@ def test_lines_are_clipped_at_the_near_plane():
     assert np.allclose(clipped[[0, 3]], ahead) and np.allclose(clipped[[1, 2]], (0, 1, 9.8), atol=1e-4)
     assert np.array_equal(clipped[4:], ends[4:6]) and np.array_equal(kept[4:], colours[4:6])
     assert np.allclose(kept[1], 0.049, atol=1e-5)
-
-
-def test_rays_invert_the_projection():
-    camera = Camera(target=np.array([1.0, 2, 3]), distance=4.0, azimuth=70.0, elevation=-30.0)
-    for point in np.random.default_rng(1).uniform(-1, 1, (20, 3)) + camera.target:
-        across, down, _ = camera.project(point[None], SIZE)[0]
-        ray = camera.ray((across / SIZE[0], 1 - down / SIZE[1]), SIZE)
-        assert np.allclose(np.cross(ray, point - camera.position), 0, atol=1e-12) and ray @ camera.forward > 0

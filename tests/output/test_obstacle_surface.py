@@ -1,13 +1,4 @@
-"""Obstacles as triangles, in images and in USD:
-
-* surfaces of solids are closed, with outward normals and vertices on the boundary;
-* a half-space is a square below the bodies, clipped by other half-spaces, also if many meet in a point;
-* surfaces follow their paths, the square of a half-space only along its normal; a failing path raises OutputError and leaves
-  complete frames;
-* triangles that face away from the eye are not drawn;
-* in USD, obstacles have their positions in every frame, or once if they rest; walls between the camera and the bodies are guides,
-  and open meshes are double-sided.
-"""
+"""Obstacles as triangles, in pictures and in USD: closed solids, squares of half-spaces, paths, sides, guides."""
 
 import numpy as np
 import pytest
@@ -43,19 +34,17 @@ def make_scene(**obstacles) -> ts.Scene:
 
 def area_vectors(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     """Normals (t,3) of triangles, of the length of their area [m^2]."""
-    a, b, c = (vertices[triangles[:, k]] for k in range(3))
-    return np.cross(b - a, c - a) / 2
+    return np.cross(*np.moveaxis(np.diff(vertices[triangles], axis=1), 1, 0)) / 2
 
 
 def test_surfaces_of_solids_are_closed_outward_and_on_the_boundary():
     for name, (shape, volume) in SOLIDS.items():
         (surface,) = obstacle_surfaces(make_scene(solid=(shape, None)))
-        x, t = surface.vertices, surface.triangles
+        x, t, is_round = surface.vertices, surface.triangles, name in ("sphere", "capsule")
         assert (opposite_half_edges(t) >= 0).all() and len(np.unique(t)) == len(x)
-        a, b, c = (x[t[:, k]] - shape.pivot for k in range(3))
-        enclosed = np.einsum("ij,ij->", a, np.cross(b, c)) / 6
-        assert enclosed == pytest.approx(volume, rel=0.02 if name in ("sphere", "capsule") else 1e-12)
-        if name in ("sphere", "capsule"):
+        enclosed = np.linalg.det((x - shape.pivot)[t]).sum() / 6
+        assert enclosed == pytest.approx(volume, rel=0.02 if is_round else 1e-12)
+        if is_round:
             local = (x - shape.pivot) @ shape.frame()
             half = shape.size()[0] if name == "capsule" else 0.0
             local[:, 0] -= np.clip(local[:, 0], -half, half)
@@ -72,8 +61,8 @@ def test_half_spaces_are_squares_that_end_at_each_other():
         assert np.linalg.norm(area_vectors(surface.vertices, surface.triangles), axis=1).sum() == pytest.approx(1.4**2)
     angles = 2 * np.pi * np.arange(5) / 5  # of a funnel, whose planes pass through one point
     normals = np.stack([np.cos(angles), np.full(5, 0.5), np.sin(angles)], axis=1)
-    surfaces = obstacle_surfaces(make_scene(**{f"wall{k}": (ts.HalfSpace((3, 4, 0), n), None) for k, n in enumerate(normals)}))
-    for surface, n in zip(surfaces, normals):
+    funnel = {f"wall{k}": (ts.HalfSpace((3, 4, 0), n), None) for k, n in enumerate(normals)}
+    for surface, n in zip(obstacle_surfaces(make_scene(**funnel)), normals):
         x, area = surface.vertices - (3, 4, 0), area_vectors(surface.vertices, surface.triangles)
         assert (area @ n > 0).all() and np.linalg.norm(area, axis=1).sum() > 1.0
         assert np.abs(x @ n).max() < 1e-9 and (x @ normals.T).min() > -1e-7

@@ -12,8 +12,8 @@ from taisoft.output.files import CHECKPOINT_NAME, PREVIOUS_NAME, CheckpointWrite
 from tests.dynamics.scenes import block_scene
 
 
-class FakeSimulator:
-    """A stand-in for a simulator, with a time."""
+class Saved:
+    """The part of a simulator that is saved, with a time."""
 
     def __init__(self, time):
         self.time = time
@@ -26,7 +26,7 @@ class FakeSimulator:
 def two(tmp_path):
     """The folder of a run with two checkpoints."""
     for name, time in ((PREVIOUS_NAME, 1.0), (CHECKPOINT_NAME, 2.0)):
-        FakeSimulator(time).save_checkpoint(tmp_path / name)
+        Saved(time).save_checkpoint(tmp_path / name)
     return tmp_path
 
 
@@ -42,16 +42,13 @@ def test_a_truncated_file_is_replaced_by_the_previous_one(two, fraction):
     previous.write_bytes(b"x")
     with pytest.raises(ts.SimulationError, match="damaged.*; nor can the previous one be used"):
         read_last_good(path)
-    previous.unlink()
-    with pytest.raises(ts.SimulationError, match="damaged"):
-        read_last_good(path)
 
 
 def test_the_previous_checkpoint_is_of_the_same_run(two, monkeypatch):
     """Also on a file system without links. A run resumed from the previous checkpoint keeps it until there is another."""
 
     def check(writer, time, expected):
-        writer.write(FakeSimulator(time))
+        writer.write(Saved(time))
         found = [read_checkpoint(two / name).state["time"] for name in (PREVIOUS_NAME, CHECKPOINT_NAME) if (two / name).exists()]
         assert found == expected
 
@@ -62,8 +59,7 @@ def test_the_previous_checkpoint_is_of_the_same_run(two, monkeypatch):
     check(writer, 3.0, [3.0])
     check(writer, 4.0, [3.0, 4.0])
     check(CheckpointWriter(two, resumed=two / ".." / two.name / CHECKPOINT_NAME), 5.0, [4.0, 5.0])
-    writer = CheckpointWriter(two, resumed=two / PREVIOUS_NAME)
-    check(writer, 6.0, [4.0, 6.0])
+    check(writer := CheckpointWriter(two, resumed=two / PREVIOUS_NAME), 6.0, [4.0, 6.0])
     monkeypatch.setattr(os, "link", no_links)
     check(writer, 7.0, [6.0, 7.0])
     assert sorted(os.listdir(two)) == [CHECKPOINT_NAME, PREVIOUS_NAME]

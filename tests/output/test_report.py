@@ -1,4 +1,4 @@
-"""What a run reports: report.json (JSON without NaN), steps.csv, progress, and the summary with the cost of pictures."""
+"""What a run reports: report.json (JSON without NaN), steps.csv, and progress."""
 
 import csv
 import dataclasses
@@ -8,24 +8,14 @@ import math
 import platform
 import re
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from taisoft.cli.recording import Observers
-from taisoft.cli.summary import print_summary
 from taisoft.output import report
-from taisoft.output.frames import FrameWriter
 from taisoft.output.report import Progress, write_report
 from taisoft.records import RunReport, StepReport
-from taisoft.running import run
-from tests.simulator.test_running import StandIn
 from tests.view.fake_simulator import FakeSimulator, beam_scene
-
-
-def refuse_constant(name):
-    raise AssertionError(f"{name} is not JSON")
 
 
 @pytest.fixture
@@ -42,8 +32,19 @@ def written(tmp_path):
     settings["big"] = math.inf
     plan = [{"feature": "contact", "on": False, "why": "no obstacles"}]
     write_report(tmp_path, result, arch="cpu", precision="f32", settings=settings, plan=plan)
-    record = json.loads((tmp_path / "report.json").read_text(), parse_constant=refuse_constant)
+    record = json.loads((tmp_path / "report.json").read_text(), parse_constant=pytest.fail)
     return tmp_path, result, record
+
+
+def test_a_resumed_run_keeps_the_earlier_steps_up_to_its_checkpoint(written):
+    folder, result, _ = written
+    result.step_reports = [StepReport(time=0.25)]
+    write_report(folder, result, resumed={"checkpoint": "checkpoint.npz", "time": 0.2})
+    header, *rows = csv.reader(io.StringIO((folder / "steps.csv").read_text()))
+    assert [row[0] for row in rows] == ["0.1", "0.2", "0.25"] and 'slow, very; say "no"\nplease' in rows[1]
+    (folder / "steps.csv").write_text("no steps")
+    write_report(folder, result, resumed={"checkpoint": "checkpoint.npz", "time": 0.2})
+    assert len((folder / "steps.csv").read_text().splitlines()) == 2
 
 
 def test_the_report_holds_the_run(written):
@@ -78,7 +79,7 @@ def test_the_step_table_holds_every_field_of_every_step(written):
 
 @pytest.mark.parametrize(
     "terminal, compiling, shown",
-    [(False, 0.0, ["10 steps/s, 0:34 left"]), (False, 3.0, ["20 steps/s, 0:17 left"]), (True, 0.0, ["10 steps/s", "0:30 left"])],
+    [(False, 0.0, "10 steps/s, 0:34 left"), (False, 3.0, "20 steps/s, 0:17 left"), (True, 0.0, "10 steps/s, 0:30 left")],
 )
 def test_progress(terminal, compiling, shown, monkeypatch):
     """Frames at 0, 2, ..., 10 s, each of 20 steps and 0.5 s simulated; a line at the first one after 5 s."""
@@ -93,38 +94,8 @@ def test_progress(terminal, compiling, shown, monkeypatch):
     bar.close()
     bar.close()
     text = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", stream.getvalue())
-    if terminal:
-        assert all(part in text for part in (*shown, "2.50 of 10 s"))
-    else:
-        assert text == f"beam: 1.500 of 10 s, {shown[0]}\n"
-
-
-class SlowWriter(FrameWriter):
-    """Spends 2 s of a clock per picture, 10 s more on compiling at the first one, and writes none."""
-
-    def __init__(self, clock):
-        self.clock = clock
-
-    def frame(self, sim, index):
-        self.clock[0] += 12.0 if index == 0 else 2.0
-        sim.compile_seconds += 10.0 if index == 0 else 0.0
-
-
-@pytest.mark.parametrize("step, most", [(0.1, True), (1.0, False)])
-def test_the_summary_says_when_pictures_take_most_of_a_run(step, most, monkeypatch, capsys):
-    """Three pictures of 2 s, 0.5 s a frame for another output, and 20 steps of 0.1 or 1 s."""
-    sim, now, observers = StandIn(explicit=False, dt=0.01), [0.0], Observers()
-
-    def pass_time(seconds):
-        now[0] += seconds
-
-    other = SimpleNamespace(frame=lambda sim, index: pass_time(0.5), close=lambda: None)
-    observers.members += [SlowWriter(now), other]
-    monkeypatch.setattr("time.perf_counter", lambda: now[0])
-    result = run(sim, 0.2, observers.on_frame, fps=10, on_step=lambda *_: pass_time(step))
-    assert observers.seconds == pytest.approx(7.5) and observers.picture_seconds == pytest.approx(6.0)
-    assert result.compile_seconds == pytest.approx(10.0) and result.wall_seconds == pytest.approx(7.5 + 20 * step)
-    print_summary(result, sim, observers, None)
-    shown = capsys.readouterr().out
-    assert f"{7.5 + 20 * step:.2f} s, 7.50 s of it for output; plus 10.00 s to compile" in shown
-    assert ("6.00 s of it, 63%, for pictures: a lower --fps draws fewer, --no-frames none" in shown) == most
+    assert (
+        all(part in text for part in (*shown.split(", "), "2.50 of 10 s"))
+        if terminal
+        else text == f"beam: 1.500 of 10 s, {shown}\n"
+    )

@@ -1,6 +1,5 @@
 """Which attributes may be assigned, and when: unknown and read-only ones are refused with a hint; meshes and records are
-immutable; lists grow by methods only; a Simulator freezes its scene and its own copy, but no other copy; a failed
-construction freezes nothing.
+immutable; lists grow by methods only; a successfully made Simulator freezes its scene and its own copy, but no other copy.
 """
 
 import copy
@@ -44,9 +43,8 @@ REMOVE = "remove it from its list and add another"
 ANOTHER = "add another body by scene.add_body"
 
 
-@pytest.mark.parametrize(
-    "select, name, message",
-    [
+def test_unknown_and_read_only_attributes_are_refused():
+    for select, name, message in (
         (lambda s: s, "gravty", "scene has no attribute 'gravty'; did you mean 'gravity'[?]$"),
         (lambda s: s.body("block"), "materal", "body 'block' has no attribute 'materal'; did you mean 'material'[?]$"),
         *(
@@ -62,14 +60,12 @@ ANOTHER = "add another body by scene.add_body"
         (lambda s: s.springs[0], "stiffness", f"spring 'spring': stiffness cannot change: {REMOVE}"),
         (lambda s: s.body("block").forces[0], "value", "force: value cannot change: call sim.set_force"),
         (lambda s: ts.KeyFrames([0], [(0, 0, 0)]), "colour", "key frames has no attribute 'colour'$"),
-    ],
-)
-def test_unknown_and_read_only_attributes_are_refused(select, name, message):
-    target = select(loaded())
-    before = dict(target.__dict__)
-    with pytest.raises(SceneError, match=f"^{message}") as caught:
-        setattr(target, name, 1.0)
-    assert isinstance(caught.value, AttributeError) and target.__dict__ == before
+    ):
+        target = select(loaded())
+        before = dict(target.__dict__)
+        with pytest.raises(SceneError, match=f"^{message}") as caught:
+            setattr(target, name, 1.0)
+        assert isinstance(caught.value, AttributeError) and target.__dict__ == before
 
 
 def test_meshes_are_immutable():
@@ -80,10 +76,9 @@ def test_meshes_are_immutable():
         (loaded().bodies[0].nodes, "positions", "they follow from the mesh and the order; add another body"),
     ):
         for one in copies(made):
-            for change, values in ((setattr, [np.ones((4, 3))]), (delattr, [])):
-                with pytest.raises(MeshError, match=f": {name} cannot change: {instead}") as caught:
-                    change(one, name, *values)
-                assert isinstance(caught.value, AttributeError)
+            for change in (lambda o, n: setattr(o, n, np.ones((4, 3))), delattr):
+                with pytest.raises(MeshError, match=f": {name} cannot change: {instead}"):
+                    change(one, name)
             assert not any(value.flags.writeable for value in vars(one).values() if isinstance(value, np.ndarray))
             with pytest.raises(MeshError, match="has no attribute 'foo'$"):
                 one.foo = 1
@@ -93,16 +88,11 @@ def test_meshes_are_immutable():
 
 
 def test_assignments_are_checked_as_by_add_body():
-    for name, value in (
-        ("material", "rubber"),
-        ("position", (0, np.nan, 0)),
-        ("velocity", np.zeros((3, 3))),
-        ("collision", "sdf"),
-    ):
-        body = loaded().bodies[0]
-        given, before = {"material": rubber(), name: value}, getattr(body, name)
+    body = loaded().bodies[0]
+    for name, value in {"material": "", "position": (0, np.nan, 0), "velocity": np.eye(3), "collision": "sdf"}.items():
+        before = getattr(body, name)
         with pytest.raises(SceneError) as added:
-            ts.Scene().add_body(cube(), **given, name="block")
+            ts.Scene().add_body(cube(), **({"material": rubber(), name: value}), name="block")
         with pytest.raises(SceneError) as set_later:
             setattr(body, name, value)
         assert str(set_later.value) == str(added.value) and getattr(body, name) is before
@@ -115,39 +105,27 @@ def test_assignments_are_checked_as_by_add_body():
 
 def test_lists_grow_by_methods_only_and_items_can_be_removed():
     scene = loaded()
-    for one, name, call in (
-        (scene, "bodies", "scene.add_body"),
-        (scene, "obstacles", "scene.add_obstacle"),
-        (scene.bodies[0], "constraints", "body.fix or body.move"),
-        (scene.bodies[0], "forces", "body.add_force"),
-    ):
+    changes = {"append": ["foo"], "insert": [0, 1], "extend": [[1]], "__iadd__": [[1]], "__setitem__": [slice(None), []]}
+    for one, name, call in ((scene, "bodies", "scene.add_body"), (scene.bodies[0], "constraints", "body.fix or body.move")):
         items = getattr(one, name)
         before = list(items)
-        changes = {"append": ["foo"], "insert": [0, 1], "extend": [[1]], "__iadd__": [[1]], "__setitem__": [slice(None), []]}
         for change, values in changes.items():
             with pytest.raises(SceneError, match=f": {name} cannot be changed by hand: call {call}$"):
                 getattr(items, change)(*values)
         with pytest.raises(SceneError, match=f": {name} cannot be deleted: call {call}$"):
             delattr(one, name)
         assert items == before and items.pop() is before[-1] and getattr(one, name) == before[:-1]
-    for change in (
-        lambda: scene.contact_pairs.update({1: 2}),
-        lambda: scene.contact_pairs.pop(frozenset(("block", "ball"))),
-        lambda: setattr(scene, "contact_pairs", {}),
-    ):
+    for change in (lambda: scene.contact_pairs.update({1: 2}), lambda: setattr(scene, "contact_pairs", {})):
         with pytest.raises(SceneError, match="^scene: contact_pairs cannot be .*: call scene.set_contact"):
             change()
     assert scene.contact_pairs == {frozenset(("block", "ball")): (0.3, None)}
 
 
 def test_values_written_into_arrays_are_checked():
-    for array, words in (
-        (lambda s: s.gravity, "^scene: gravity: entry .0. is nan, not finite"),
-        (lambda s: s.bodies[0].position, "^body 'block': position: entry .0. is nan"),
-    ):
-        scene = loaded()
-        array(scene)[0] = np.nan
-        with pytest.raises(SceneError, match=words):
+    scene = loaded()
+    for array, words in ((scene.bodies[0].position, "body 'block': position"), (scene.gravity, "scene: gravity")):
+        array[0] = np.nan
+        with pytest.raises(SceneError, match=f"^{words}: entry .0. is nan, not finite"):
             ts.Simulator(scene)
 
 
@@ -195,7 +173,7 @@ def test_changes_to_a_frozen_scene_are_refused_and_to_its_copies_allowed(frozen,
 
 
 def test_arrays_of_a_frozen_scene_and_of_records_are_read_only(frozen):
-    scene, _, before = frozen
+    scene = frozen[0]
     body, spring = scene.body("block"), scene.springs[0]
     arrays = [scene.gravity, body.position, body.velocity, body.rest_positions, body.mesh.vertices, spring.points[0].position]
     records = (*body.forces, *body.tractions, *body.constraints, *scene.attachments, *scene.tendons)
@@ -205,8 +183,8 @@ def test_arrays_of_a_frozen_scene_and_of_records_are_read_only(frozen):
         assert found
         arrays += found
     assert not any(array.flags.writeable for array in arrays)
-    for copied in (before.snapshot(), scene.snapshot(), copy.deepcopy(scene)):
-        copied.gravity[1] = copied.body("block").velocity[0] = 0.0
+    copied = scene.snapshot()
+    copied.gravity[1] = copied.body("block").velocity[0] = 0.0
     assert scene.gravity[1] == -9.81
 
 
@@ -222,13 +200,11 @@ def test_set_methods_change_the_simulators_copy_alone(frozen):
     block = sim.scene.body("block")
     assert (sim.scene.gravity[1], block.material.young, block.forces[0].value[0], sim.scene.tendons[0].value) == (-1, 2e4, 2, 3.0)
     assert sim.scene.contact_numbers("block", "ball")[0] == 0.1 and scene_digest(scene) == scene_digest(before)
-    for call in (lambda: sim.set_gravity("down"), lambda: sim.set_material("block", young=1e13)):  # unstable at this dt
-        with pytest.raises((SceneError, SimulationError)):
-            call()
-        assert block.material.young == 2e4
-        with pytest.raises(SceneError, match="cannot change any more"):
-            sim.scene.gravity = (0, 0, 0)
-    assert not sim.scene.gravity.flags.writeable
+    with pytest.raises(SimulationError):
+        sim.set_material("block", young=1e13)  # unstable at this dt
+    assert block.material.young == 2e4 and not sim.scene.gravity.flags.writeable
+    with pytest.raises(SceneError, match="cannot change any more"):
+        sim.scene.gravity = (0, 0, 0)
 
 
 def test_only_a_successful_construction_freezes(frozen):
@@ -240,19 +216,3 @@ def test_only_a_successful_construction_freezes(frozen):
     scene.bodies[0].fix([5])
     with ts.Simulator(frozen[0], DT, "symplectic_euler", precision="f64") as second:  # from a frozen scene
         assert second.scene.gravity[1] == -9.81
-
-
-def test_unknown_and_read_only_attributes_of_a_simulator_are_refused(frozen):
-    sim = frozen[1]
-    for name, message in (
-        ("gravity", "simulator has no attribute 'gravity': call sim.set_gravity.gravity.$"),
-        ("gravty", "simulator has no attribute 'gravty'; did you mean 'gravity'[?] .call sim.set_gravity.gravity..$"),
-        ("positions", "simulator: positions is a method and cannot be set: call sim.set_state"),
-        ("time", "simulator: time cannot be set: call sim.reset"),
-    ):
-        with pytest.raises(SimulationError, match=f"^{message}") as caught:
-            setattr(sim, name, 1.0)
-        assert isinstance(caught.value, AttributeError)
-    sim.dt = sim.dt
-    with pytest.raises(SceneError, match="^settings: dt cannot change: call sim.rebuild.dt=....$"):
-        sim.settings.dt = 1.0

@@ -53,9 +53,8 @@ def test_near_incompressibility_is_warned_of_for_linear_tets():
         Scene().add_body(box_mesh((1, 1, 1), (1, 1, 1)), soft, order=2)
 
 
-@pytest.mark.parametrize(
-    "field, rule, values",
-    [
+def test_invalid_materials_are_refused():
+    for field, rule, values in (
         ("young", "must be", [0, -1, np.nan, np.inf, "1e5 Pa", None, True, 1j, [1e5], 10**400]),
         ("young", "is .* too (large|small) for a 32-bit float", [1e300, 1e-60]),
         ("density", "must be", [0, np.nan, "1000"]),
@@ -67,12 +66,10 @@ def test_near_incompressibility_is_warned_of_for_linear_tets():
         ("volume_floor", "must be", [-0.1, 1e-4, 1.0, np.nan]),
         ("law", "must be one of .*did you mean 'corotational'", ["corotated"]),
         ("law", "must be one of st_venant_kirchhoff, corotational, stable_neo_hookean, not", ["hooke", "", None]),
-    ],
-)
-def test_invalid_materials_are_refused(field, rule, values):
-    for value in values:
-        with pytest.raises(SceneError, match=f"^material: {field} {rule}"):
-            Material(**{field: value})
+    ):
+        for value in values:
+            with pytest.raises(SceneError, match=f"^material: {field} {rule}"):
+                Material(**{field: value})
 
 
 def test_bodies_and_obstacles_are_found_by_name(scene):
@@ -80,21 +77,13 @@ def test_bodies_and_obstacles_are_found_by_name(scene):
     assert scene.body("body0") is other and [body.name for body in scene.bodies] == ["a", "b", "body0"]
     assert other.velocity.shape == (27, 3) and other.position.tolist() == [1, 2, 3]
     assert np.array_equal(other.rest_positions, MESH.vertices)  # position shifts the initial state only
-    ball = scene.add_obstacle(Sphere((0, 0, 0), 1))
-    assert scene.obstacle("obstacle0") is ball and scene.colliders == [*scene.bodies, *scene.obstacles]
+    ball = scene.add_obstacle(Sphere((0, 0, 0), 1), name="body1")
+    assert scene.obstacle("body1") is ball and scene.add_obstacle(GROUND).name == "obstacle0"
+    assert scene.add_body(MESH, Material()).name == "body2" and scene.colliders == [*scene.bodies, *scene.obstacles]
     ground = scene.obstacle("ground")
     assert (ground.shape, ground.friction, ground.restitution, ground.path) == (GROUND, 0.1, 0.2, None)
-    assert "obstacles=['ground', 'ice', 'obstacle0']" in repr(scene)
     with pytest.raises(SceneError, match="no obstacle is called 'ground'; the scene has none"):
         Scene().obstacle("ground")
-
-
-def test_default_names_skip_used_ones():
-    scene = Scene()
-    scene.add_body(MESH, Material(), name="body1")
-    assert [scene.add_body(MESH, Material()).name for _ in range(2)] == ["body0", "body2"]
-    scene.add_obstacle(GROUND, name="body3")
-    assert scene.add_body(MESH, Material()).name == "body4"
 
 
 def add(**options):
@@ -102,22 +91,15 @@ def add(**options):
 
 
 REFUSALS = [  # the call on a scene and its body "a", and the message
-    *(
-        (lambda s, b, g=g: setattr(s, "gravity", g), "^scene: gravity")
-        for g in ((0, -9.81), "down", (0, np.nan, 0), None, list("012"))
-    ),
+    *((lambda s, b, g=g: setattr(s, "gravity", g), "^scene: gravity") for g in ((0, -9.81), "down", (0, np.nan, 0), None)),
     (lambda s, b: Scene(gravity=(0, -9.81)), "^scene: gravity"),
     (lambda s, b: s.body("aa"), "no body is called 'aa'; did you mean 'a'"),
-    (lambda s, b: s.body(7), "no body is called 7"),
     (lambda s, b: s.obstacle("grund"), "no obstacle is called 'grund'; did you mean 'ground'"),
     (lambda s, b: s.add_obstacle(GROUND, name="a"), "obstacle name 'a' is taken"),
     (lambda s, b: s.add_obstacle(GROUND, name=" "), "obstacle name must be a text"),
     (add(name="ice"), "body name 'ice' is taken"),
-    (add(name="  "), "body name must be a text that is not empty"),
     (add(order=3), "order must be 1 or 2, not 3"),
     (add(quadrature_degree=2), "quadrature_degree of order 1 must be 1, not 2"),
-    (add(order=2, quadrature_degree=3), "quadrature_degree of order 2 must be 2 or 4, not 3"),
-    (add(position=(0, np.nan, 0)), r"position: entry \[1\] is nan, not finite"),
     (add(velocity=np.zeros((26, 3))), r"velocity must have shape \(3,\) or \(27, 3\), not \(26, 3\)"),
     (add(mesh=MESH.vertices), "mesh must be a TetMesh, not ndarray"),
     (add(material={"young": 1e6}), "materials are given by region, but its mesh has no regions"),
@@ -128,10 +110,8 @@ REFUSALS = [  # the call on a scene and its body "a", and the message
     (lambda s, b: b.fix(np.ones(26, dtype=bool)), r"a mask must have shape \(27,\), not \(26,\)"),
     (lambda s, b: b.fix("left"), "list of integers"),
     (lambda s, b: b.fix(lambda X: X[:, 0]), r"must return a bool mask of shape \(27,\), not float64"),
-    (lambda s, b: b.fix(lambda X: True), r"must return a bool mask of shape \(27,\), not bool of shape \(\)"),
     (lambda s, b: b.fix(lambda X: X.missing), "the selection function failed: AttributeError"),
     *((lambda s, b, axes=axes: b.fix([0], axes), "axes must be some of 'x', 'y', 'z'") for axes in ("", "xx", "w", None)),
-    (lambda s, b: b.move([0], still, axes="w"), "axes must be some of 'x', 'y', 'z'"),
     (lambda s, b: b.move([1, 2], lambda t: None), "^body 'a': move: .*must give a displacement at t = 0, not None"),
     (lambda s, b: b.move([1, 2], lambda t: (0, 0)), r"^body 'a': move: .*must have shape \(3,\) or \(2, 3\), not \(2,\)"),
     (lambda s, b: b.move([1, 2], lambda t: 1 / t), "^body 'a': move: .*the path failed at t = 0: ZeroDivisionError"),
@@ -141,9 +121,7 @@ REFUSALS = [  # the call on a scene and its body "a", and the message
     *((lambda s, b, v=v: b.add_traction([0], v), "add_traction: traction") for v in ((0, 1), 5.0, (0, np.nan, 0), "up")),
     *((lambda s, b, v=v: b.add_force([0], v), "add_force: force") for v in ((0, 1), 5.0, (0, np.nan, 0), "up")),
     (lambda s, b: s.set_contact("a", "grond", friction=1), "^scene: .*no body or obstacle is called 'grond'; did you mean 'gro"),
-    (lambda s, b: s.contact_numbers("a", "grond"), "^scene: .*no body or obstacle is called 'grond'; did you mean 'ground'"),
     (lambda s, b: s.set_contact("ground", "ice", friction=1), "^scene: .*'ground' and 'ice': one of the two must be a body"),
-    (lambda s, b: s.contact_numbers("ground", "ice"), "^scene: .*'ground' and 'ice': one of the two must be a body"),
     (lambda s, b: s.set_contact("a", "b"), "^scene: .*'a' and 'b': give friction or restitution"),
     (lambda s, b: s.set_contact("a", "b", friction=-1), "^scene: .*'a' and 'b': friction must be at least 0"),
 ]
@@ -210,14 +188,11 @@ def test_a_snapshot_does_not_follow_later_changes(scene):
     scene.collision = CollisionSettings()
     scene.body("a").collision = "distance_field"
     assert twin.contact_numbers("a", "b") == (0.7, 0.3) and len(twin.obstacles) == 2 and twin.collision.k_dop == 14
-    assert twin.body("a").collision == "auto" and twin.body("a").contact_mode == "proximity"
-    assert scene.body("a").contact_mode == "distance_field"
-    assert scene.add_body(MESH, Material(), collision="distance_field").contact_mode == "distance_field"
+    assert twin.body("a").contact_mode == "proximity" and scene.body("a").contact_mode == "distance_field"
 
 
-@pytest.mark.parametrize(
-    "options, rule",
-    [
+def test_invalid_collision_settings_are_refused():
+    for options, rule in (
         ({"broad_phase": "hash"}, "broad_phase must be one of auto, spatial_hash, bvh, not 'hash'"),
         ({"cell_ratio": 0}, "cell_ratio must be greater than 0, not 0"),
         ({"margin": -1e-9}, "margin must be at least 0 m"),
@@ -226,11 +201,9 @@ def test_a_snapshot_does_not_follow_later_changes(scene):
         ({"initial_capacity": 63}, "initial_capacity must be a whole number from 64 to 2147483647, not 63"),
         ({"max_capacity": 2**31}, "max_capacity must be a whole number from 64"),
         ({"initial_capacity": 200, "max_capacity": 100}, "initial_capacity 200 must not exceed max_capacity 100"),
-    ],
-)
-def test_invalid_collision_settings_are_refused(options, rule):
-    with pytest.raises(SceneError, match=f"^collision settings: {rule}"):
-        CollisionSettings(**options)
+    ):
+        with pytest.raises(SceneError, match=f"^collision settings: {rule}"):
+            CollisionSettings(**options)
 
 
 def test_edges_are_sharp_if_they_are_convex_by_more_than_60_degrees():

@@ -1,4 +1,4 @@
-"""Writing scene files: demos, a scene with one of everything, and random numbers and names are read back bit for bit; what a
+"""Writing scene files: a scene with one of everything, and random numbers and names are read back bit for bit; what a
 file cannot store is refused; existing files are replaced only with overwrite=True.
 """
 
@@ -11,19 +11,12 @@ from hypothesis import strategies as st
 
 import taisoft as ts
 from taisoft.cli.run import RUN_KEYS
-from taisoft.cli.scene_file import load_module, shipped_files
 from taisoft.scene.checks import SOLVER_CHECKS
 from taisoft.scene.fingerprint import scene_digest
 from tests.cli.command import write
 from tests.scene.toml_scenes import TURNED, floats, there_and_back
 
 BALL = ts.SurfaceMesh(0.1 * np.array([(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)]), [(0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3)])
-
-
-@pytest.mark.parametrize("name", ["cube_on_box", "gripper", "twisting_bar"])
-def test_demos_are_read_back(tmp_path, name):
-    demo = load_module(shipped_files("demos")[name])
-    there_and_back(tmp_path / f"{name}.toml", demo.build(), demo.solver)
 
 
 def everything() -> ts.Scene:

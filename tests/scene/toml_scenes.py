@@ -71,21 +71,6 @@ between = ["beam", "ground"]
 friction = 0.3
 """
 
-BEAM_TOML = f"""
-[solver]
-dt = {1 / 240!r}
-integrator = "symplectic_euler"
-seconds = 0.1
-fps = 30
-
-[bodies.beam]
-material = {{ young = 1e5 }}
-mesh = {{ shape = "box", cells = [4, 1, 1], size = [4, 2, 2] }}
-
-[[bodies.beam.fix]]
-nodes = {{ half_space = {{ point = [-1.99, 0, 0], normal = [1, 0, 0] }} }}
-"""
-
 MESH = '[bodies.a]\nmaterial = {{}}\nmesh = {{ file = "{}" }}\n'
 
 

@@ -1,19 +1,11 @@
-"""A loaded simulator continues bitwise, with its results, numbers and settings:
-
-* with prescribed nodes before and after their release, contacts, a moving obstacle and changed numbers;
-* every stored part of the state matters: a wrong value changes the steps;
-* forces and torques of contacts are sums over the contacts.
+"""A loaded simulator continues bitwise, with its results, numbers and settings;
+forces and torques of contacts are sums over the contacts.
 """
-
-import copy
-import dataclasses
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 import taisoft as ts
-from taisoft.checkpoint import read_checkpoint
 from taisoft.fem.reference import gravity_mass
 from tests.dynamics.scenes import RELEASE, driven_scene
 from tests.simulator.scenes import AFTER, BEFORE, follow, press, pressed
@@ -25,24 +17,6 @@ def assert_same(found: list, expected: list) -> None:
     for k, (one, other) in enumerate(zip(found, expected)):
         same = [np.array_equal(a, b) for a, b in zip(one, other)]
         assert all(same), f"time, positions, velocities, report of step {k}: {same}"
-
-
-def assert_state_matters(path: Path, scene: ts.Scene, changes: dict, expected: list) -> None:
-    """Steps from a checkpoint are the expected ones, unless a part of its state changes.
-
-    changes: names of parts, joined by slashes -> function of the saved value.
-    """
-    saved = read_checkpoint(path)
-    for name, change in changes.items():
-        state = copy.deepcopy(saved.state)
-        *folders, last = name.split("/")
-        table = state
-        for folder in folders:
-            table = table[folder]
-        table[last] = change(table[last])
-        with ts.Simulator.from_checkpoint(dataclasses.replace(saved, state=state), scene) as sim:
-            found = follow(sim, len(expected))
-        assert any(not np.array_equal(a[1], b[1]) for a, b in zip(found, expected)), f"{name} has no effect"
 
 
 def test_continuing_without_contacts(tmp_path):
@@ -66,9 +40,8 @@ def test_continuing_without_contacts(tmp_path):
         assert loaded.scene.body("flyer").material == sim.scene.body("flyer").material != scene.body("flyer").material
         assert np.array_equal(loaded.reactions(), reactions)
         assert_same(follow(loaded, 35), expected)
-    changes = {"simulation/v": lambda v: 0.5 * v, "time_base": lambda t: t + 1e-3, "stepper/acceleration": lambda a: 0 * a}
-    assert_state_matters(early, scene, changes, expected[:8])
-    assert_state_matters(late, scene, {"simulation/released": lambda r: [False] * len(r)}, expected[30:])
+    with ts.Simulator.load_checkpoint(late, scene) as loaded:
+        assert_same(follow(loaded, 5), expected[30:])
 
 
 def test_continuing_with_contacts(tmp_path):
@@ -92,8 +65,6 @@ def test_continuing_with_contacts(tmp_path):
         assert found.duration == contacts.duration and np.array_equal(loaded.contact_force("cube", "floor"), pair_force)
         assert np.array_equal(loaded.contact_force("floor"), force) and np.array_equal(loaded.reactions(), reactions)
         assert_same(follow(loaded, AFTER), expected)
-    changes = {"stepper/contact/rows/r": lambda r: 0 * r, "stepper/x_now": lambda x: 0 * x, "stepper/past": lambda n: 0}
-    assert_state_matters(path, scene, changes, expected[:3])
 
 
 def test_contact_forces_and_torques_are_sums_over_contacts():

@@ -1,8 +1,5 @@
-"""The energy check: runs that create energy are degraded, others are ok:
-
-* with given energies: a rise above a tenth of the energy of the motion counts, work of gravity and loads does not; prescribed
-  motion, changes by the user and corrected overlaps restart the check; explicit steps may oscillate about the energy;
-* real bodies that vibrate and fly create none, but steps near `stable_dt` in a strained state do.
+"""The energy check: runs that create energy are degraded; work of gravity and loads, prescribed motion, changes by the user and
+corrected overlaps do not count, and explicit steps may oscillate about the energy.
 """
 
 import pytest

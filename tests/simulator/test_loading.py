@@ -1,9 +1,5 @@
-"""Loads, tensions and lengths that change while a simulator runs:
-
-* steps are bitwise those of a simulator whose scene had the loads from the start, also if they were 0;
-* loads survive a reset, a rebuild and a checkpoint, which needs the scene with the initial loads, also along paths;
-* a change of the density keeps total forces, also during a drag; the user's scene does not change;
-* missing loads, invalid indices and invalid values are refused, and nothing changes.
+"""Loads, tensions and lengths that change while a simulator runs act bitwise as loads from the start; they survive a reset, a
+rebuild and a checkpoint; a change of the density keeps total forces; invalid changes are refused.
 """
 
 import numpy as np

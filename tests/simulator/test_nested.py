@@ -1,7 +1,4 @@
-"""Nested values and their arrays:
-
-* random ones come back through JSON and the flat dict, whatever their keys.
-"""
+"""Nested values and their arrays come back through JSON and the flat dict, whatever their keys."""
 
 import json
 

@@ -1,10 +1,5 @@
-"""Settings of a simulator, and `rebuild` with others:
-
-* every argument is checked before a runtime is opened; the message names the argument and the rule;
-* a rebuilt simulator keeps state, time, steps, changed numbers and released nodes bit for bit, and its next step is that of a new
-  simulator with those settings and that state;
-* what is modelled, and what a checkpoint needs, follows from the scene at the start, whatever numbers changed;
-* settings that cannot be met are refused with a new simulator's message, and nothing changes.
+"""Settings of a simulator, and `rebuild` with others: bad ones are refused before a runtime is opened; a rebuilt simulator
+keeps its state bit for bit, and its next step is that of a new simulator; what is modelled follows from the scene at the start.
 """
 
 import dataclasses

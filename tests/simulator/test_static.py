@@ -1,9 +1,5 @@
-"""Statics:
-
-* the state is the oracle's equilibrium, with nodes on their path at the given time; reactions balance the weight and the loads;
-* a load that is too large for one solve is applied in steps; small strains take few Newton iterations;
-* without forces the residual is 0; if no equilibrium is found, converged is False and the residual is that of the whole load;
-* bodies that nothing holds and invalid arguments are rejected, and the runtime is closed.
+"""Statics: the state is the oracle's equilibrium; large loads are applied in steps; the residual is that of the whole load;
+bodies that nothing holds and invalid arguments are refused.
 """
 
 import numpy as np

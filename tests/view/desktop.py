@@ -14,7 +14,7 @@ TOOLS = missing_tools("import")
 
 
 class Desktop:
-    """A virtual display with one child process that opens a window; `say` waits for what the child prints."""
+    """A virtual display with one child process that opens a window."""
 
     def __init__(self, folder, code):
         self.folder = folder
@@ -28,27 +28,15 @@ class Desktop:
     def xdotool(self, *arguments):
         self.display.tool("xdotool", *arguments)
 
-    def wait_for(self, condition, what):
-        end = time.monotonic() + 60
+    def wait_for(self, condition, what, action=None):
+        """Until the condition holds; act every 3 s: a window does not see of the mouse what is over before its next picture."""
+        begin, n = time.monotonic(), 0
         while not condition():
-            assert time.monotonic() < end, f"no {what}: {self.log.read_text()}"
+            assert time.monotonic() < begin + 60, f"no {what}: {self.log.read_text()}"
+            if action is not None and n % 60 == 0:
+                action()
             time.sleep(0.05)
-
-    def repeat(self, action, condition, what):
-        """Act until the condition holds: a window does not see of the mouse what is over before its next picture."""
-        end = time.monotonic() + 60
-        while time.monotonic() < end:
-            action()
-            for _ in range(60):
-                if condition():
-                    return
-                time.sleep(0.05)
-        raise AssertionError(f"no {what}: {self.log.read_text()}")
-
-    def printed(self):
-        """Words of the child so far, of lines that are whole."""
-        text = self.log.read_text()
-        return text[: text.rfind("\n") + 1].split()
+            n += 1
 
     def picture(self):
         """The whole screen, uint8 (height, width, 3)."""
@@ -59,10 +47,9 @@ class Desktop:
         return np.frombuffer(pixels, np.uint8).reshape(height, width, 3)
 
     def last(self, key):
-        """The last whole line of the child that starts with key, as a list of words; empty without one."""
-        text = self.log.read_text()
-        found = [line.split() for line in text[: text.rfind("\n") + 1].splitlines() if line.startswith(key)]
-        return found[-1] if found else []
+        """Words of the last whole line of the child that starts with key."""
+        whole = self.log.read_text().rpartition("\n")[0].splitlines()
+        return next((line.split() for line in reversed(whole) if line.startswith(key)), [])
 
     def close(self):
         self.child.kill()

@@ -1,7 +1,5 @@
 """What tests of pictures and windows share: masks of pictures, scenes with everything that is drawn, and child processes."""
 
-import os
-import subprocess
 import sys
 
 import numpy as np
@@ -12,33 +10,15 @@ from taisoft.view.connection_layer import ConnectionMarks
 from taisoft.view.ggui import vulkan_missing
 from taisoft.view.scene_view import scene_size
 from tests.dynamics.scenes import rubber
-from tests.view.desktop import ROOT
 from tests.view.fake_simulator import beam_scene
 
 SIZE = (320, 180)
 needs_vulkan = pytest.mark.skipif(bool(vulkan_missing()), reason="no Vulkan driver: Debian package mesa-vulkan-drivers")
 
 
-def run_child(code, **variables):
-    """stdout and stderr of a child process that must succeed; variables: of its environment, None removes one."""
-    environment = {k: v for k, v in (os.environ | variables).items() if v is not None}
-    command = [sys.executable, "-c", code]
-    child = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=120, check=False)
-    assert child.returncode == 0, child.stderr
-    return child.stdout, child.stderr
-
-
 def program(code: str) -> tuple[str, ...]:
     """The command of a process that stands in for a window or for the process of pictures."""
     return sys.executable, "-c", code
-
-
-def is_alive(pid: int) -> bool:
-    try:
-        with open(f"/proc/{pid}/stat") as file:
-            return file.read().rpartition(")")[2].split()[0] != "Z"
-    except FileNotFoundError:
-        return False
 
 
 def body_mask(image):

@@ -1,6 +1,6 @@
 """The window's panel, keys and mouse become commands, which change the simulation between two steps, or move the view."""
 
-from contextlib import contextmanager
+from contextlib import nullcontext
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -55,7 +55,7 @@ def state_of(controls, answered=0):
 
 @pytest.fixture
 def draw(cubes):
-    """A function that draws the panel with the moves and presses given, and returns the labels of sliders and the commands."""
+    """A function that draws the panel with moves and presses, and returns the labels of sliders and the commands."""
     colouring = SimpleNamespace(kind="body", legend=list, choose_next=lambda: None)
     plots, requests = PlotChoice(None, {"implicit": True, "contact": True, "error": False}), Requests()
     panel = Panel(["a", "b", "c"], touching_pairs(cubes), colouring, SimpleNamespace(shown={}), plots, requests)
@@ -71,18 +71,19 @@ def draw(cubes):
 
 def test_sliders_become_commands_and_keep_their_values(draw, cubes):
     labels, commands = draw({"gravity": 3.0, "young": 6.0, "dt": -3.0, "friction": 0.9})
-    assert labels["young"] == "E 1e+05 Pa" and labels["density"] == "rho 1000 kg/m3"
-    assert labels["gravity"] == "g 9.81 m/s2" and labels["friction"] == "mu 0.20-0.50"
+    shown = {"young": "E 1e+05 Pa", "density": "rho 1000 kg/m3", "gravity": "g 9.81 m/s2", "friction": "mu 0.20-0.50"}
+    assert shown.items() <= labels.items()
     assert commands[:2] == [["set_dt", pytest.approx(1e-3)], ["set_gravity", 3.0]]
     assert commands[2:] == [["set_number", "young", ["a", "b", "c"], pytest.approx(1.0)], ["set_friction", None, 0.9]]
     labels, none = draw()
     assert labels["gravity"] == "g 3 m/s2" and none == [], "not yet answered"
     for name, *arguments in commands:
         getattr(draw.controls, name)(*arguments)
+    draw.controls.set_gravity(2.0)
     labels, none = draw(state=state_of(draw.controls, answered=1))
-    assert labels["gravity"] == "g 3 m/s2" and labels["young"] == "E 1e+06 Pa" and none == []
-    assert labels["friction"] == "mu 0.90" and labels["dt"] == "dt 0.001 s"
-    assert cubes.dt == pytest.approx(1e-3) and cubes.scene.gravity.tolist() == [0.0, -3.0, 0.0]
+    shown = {"gravity": "g 2 m/s2", "young": "E 1e+06 Pa", "friction": "mu 0.90", "dt": "dt 0.001 s"}
+    assert shown.items() <= labels.items() and none == []
+    assert cubes.dt == pytest.approx(1e-3) and cubes.scene.gravity.tolist() == [0.0, -2.0, 0.0]
     assert all(np.allclose(body.young, 1e6) for body in cubes.scene.bodies)
 
 
@@ -91,23 +92,19 @@ def test_rigid_bodies_have_no_sliders_of_material(draw):
     assert Controls(FakeSimulator(connected_scene())).values()["young"] == [soft, soft, None]
     state = state_of(draw.controls)
     state["controls"] |= {what: [None, *state["controls"][what][1:]] for what in ("young", "density")}  # as if a were one
-    labels, commands = draw({"young": 6.0}, state)
-    assert labels["young"] == "E 1e+05 Pa" and commands == [["set_number", "young", ["b", "c"], pytest.approx(1.0)]]
+    assert draw({"young": 6.0}, state)[1] == [["set_number", "young", ["b", "c"], pytest.approx(1.0)]]
     labels, _ = draw(state=state, presses=("which",))  # from all bodies to the first one
-    assert "young" not in labels and "density" not in labels
+    assert {"young", "density"}.isdisjoint(labels)
 
 
-def test_every_pair_shows_its_friction(draw, cubes):
+def test_every_pair_shows_its_friction_and_buttons_choose_a_solver(draw, cubes):
     draw(checks=["friction of pairs"])
     labels, ((name, *arguments),) = draw({"friction 2": 0.8})
     shown = [labels[f"friction {k}"] for k in range(6)]
     assert shown == ["0.50 a, b", "0.50 a, c", "0.20 a, ground", "0.50 b, c", "0.50 b, ground", "0.50 c, ground"]
     getattr(draw.controls, name)(*arguments)
-    assert cubes.scene.contact_numbers("a", "ground")[0] == 0.8 and cubes.scene.contact_numbers("b", "ground")[0] == 0.5
     assert draw.controls.values()["friction"] == [0.5, 0.5, 0.8, 0.5, 0.5, 0.5]
-
-
-def test_buttons_and_the_choice_of_a_solver(draw):
+    assert cubes.scene.contact_numbers("a", "ground")[0] == 0.8
     draw(presses=("pause", "record"), checks=["solver"])
     assert draw.panel.pressed == {"pause", "record"} and draw.panel.strength == 10.0
     draw(presses=("integrator",))
@@ -115,31 +112,28 @@ def test_buttons_and_the_choice_of_a_solver(draw):
 
 
 def test_an_explicit_dt_follows_density(cubes):
-    sim, controls, limit = cubes, Controls(cubes), cubes.stable_dt
-    assert limit > 2e-3
+    controls, limit = Controls(cubes), cubes.stable_dt
     controls.set_dt(1.0)
-    largest = sim.dt
+    largest = cubes.dt
     assert 0.8 * limit < largest < limit
     controls.set_number("density", ["b"], -1.0)
-    assert sim.scene.body("b").mass == pytest.approx(100.0) and sim.dt == pytest.approx(largest / np.sqrt(10), rel=1e-3)
+    assert cubes.scene.body("b").mass == pytest.approx(100.0) and cubes.dt == pytest.approx(largest / np.sqrt(10), rel=1e-3)
     controls.set_number("density", ["b"], 0.0)
-    assert sim.dt == pytest.approx(largest)
+    assert cubes.dt == pytest.approx(largest)
     with pytest.raises(ts.SimulationError):
         controls.set_dt(-1.0)
 
 
 def test_a_drag_needs_its_beginning(cubes):
-    sim = cubes
-    controls = Controls(sim)
+    controls = Controls(cubes)
     controls.drag([0.0, 5.0, 0.0], 10.0)
-    assert sim.dragged is None
+    assert cubes.dragged is None
     controls.begin_drag("b", np.array([0, 1]), np.array([0.5, 0.5]))
     controls.drag([0.0, 5.0, 0.0], 10.0)
-    sim.step()
-    force, highest = controls.values()["drag"]
-    assert 0.0 < force <= 1.000001 * highest and sim.dragged.stiffness == pytest.approx(10.0 * 1000.0 * 9.81 / np.sqrt(3.0))
+    assert controls.values()["drag"] == (0.0, cubes.dragged.max_force) and cubes.dragged.max_force > 0.0
+    assert cubes.dragged.stiffness == pytest.approx(10.0 * 1000.0 * 9.81 / np.sqrt(3.0))
     controls.release()
-    assert sim.dragged is None and controls.values()["drag"] is None
+    assert cubes.dragged is None and controls.values()["drag"] is None
 
 
 def test_latency_counts_from_the_last_look_that_saw_nothing(monkeypatch):
@@ -154,30 +148,24 @@ def test_latency_counts_from_the_last_look_that_saw_nothing(monkeypatch):
             timing.dragged(7)
         timing.polled()
     assert list(timing.latencies) == [pytest.approx(0.02 * (8 - 4))]
-    assert timing.pictures_per_second() == pytest.approx(50.0)
     assert timing.seconds_to_answer(1.0) == pytest.approx(0.9), "the state has not come"
-    state = {"speed": 0.5, "asked_speed": 2.0, "steps_per_second": 30.0}
-    assert timing.lines(state)[0].split() == "speed 0.50 x real time (asked: 2), 30 steps/s".split()
-    assert "drag after 80 ms" in timing.lines({})[0] and len(timing.lines({})) == 1
+    speed, pictures = timing.lines({"speed": 0.5, "asked_speed": 2.0, "steps_per_second": 30.0})
+    assert speed.split() == "speed 0.50 x real time (asked: 2), 30 steps/s".split()
+    assert pictures.split() == "view 50 pictures/s, drag after 80 ms".split() and timing.lines({}) == [pictures]
 
 
 class FakeCanvas(Gui):
     """A canvas and its window, without a display. drawn: the camera of the last picture; has_plots: whether that shows plots."""
 
     keys, buttons, cursor, running, has_plots = (), (), (0.9, 0.1), True, False
-
-    @property
-    def window(self):
-        return self
-
+    window = property(lambda self: self)
     get_gui = show = lambda self: self
 
     def get_window_shape(self):
         return SIZE
 
-    @contextmanager
     def sub_window(self, *_):
-        yield self
+        return nullcontext(self)
 
     def get_events(self, _):
         return [SimpleNamespace(key=key) for key in self.keys]
@@ -225,19 +213,14 @@ def test_keys(screen, tmp_path, cubes):
     assert act([ti.ui.DOWN, "x", "?"]) == [["slower"], ["unbound"]]
     before = dict(screen.layers.shown)
     act("wcfd")
-    changed = [name for name, shown in screen.layers.shown.items() if shown != before[name]]
-    assert sorted(changed) == ["contacts", "fixed_nodes", "shadows", "wires"]
+    assert {k for k in before if screen.layers.shown[k] != before[k]} == {"contacts", "fixed_nodes", "shadows", "wires"}
     act("v")
     assert screen.colouring.kind == "stress"
     act("g")
     act()
     assert canvas.has_plots and "energies" in screen.plots.visible()
-    act("i")
-    act("p")  # which also writes the picture that was asked for
-    for _ in range(2):
-        act()
-    act("p")
-    act()
+    for keys in ("i", "p", (), (), "p", ()):  # the first picture of "p" also writes the one that was asked for
+        act(keys)
     assert decode((tmp_path / "out/window-1.png").read_bytes()).shape == (720, 1280, 3)
     assert [path.name for path in sorted((tmp_path / "out/window-2").iterdir())] == ["00000.png", "00001.png", "00002.png"]
     screen.camera = replace(screen.camera, target=np.ones(3), azimuth=70.0)
@@ -253,11 +236,11 @@ def test_the_mouse_moves_the_view(screen):
     screen, canvas, act = screen
     start = screen.camera
 
-    def drag(button, begin=(0.9, 0.1), by=(0.05, 0.1), **more):
+    def drag(button, begin=(0.9, 0.1), by=(0.05, 0.1)):
         """The camera after a drag from the place `begin`; it is put back."""
         screen.camera = start
-        act(buttons=[button], cursor=begin, **more)
-        act(buttons=[button], cursor=(begin[0] + by[0], begin[1] + by[1]), **more)
+        act(buttons=[button], cursor=begin)
+        act(buttons=[button], cursor=(begin[0] + by[0], begin[1] + by[1]))
         assert screen.dragging
         act()
         assert not screen.dragging and canvas.drawn is screen.camera
@@ -268,31 +251,26 @@ def test_the_mouse_moves_the_view(screen):
     assert turned.distance == start.distance and np.array_equal(turned.target, start.target)
     near, far = drag(ti.ui.RMB), drag(ti.ui.RMB, by=(0.0, -0.1))
     assert near.distance < 0.9 * start.distance and near.distance * far.distance == pytest.approx(start.distance**2)
-    shifted = drag(ti.ui.MMB)
-    moved = shifted.project(start.target[None], SIZE)[0, :2] - start.project(start.target[None], SIZE)[0, :2]
+    moved = np.diff([camera.project(start.target[None], SIZE)[0, :2] for camera in (start, drag(ti.ui.MMB))], axis=0)[0]
     assert moved == pytest.approx((0.05 * SIZE[0], -0.1 * SIZE[1])), "what is under the cursor stays under it"
     assert drag(ti.ui.LMB, begin=(0.1, 0.5)) == start, "on the panel"
-    screen.plots.shown["energies"] = True  # in the upper right corner
-    act()
-    assert canvas.has_plots
-    act(buttons=[ti.ui.LMB], cursor=(0.95, 0.95))
-    act(buttons=[ti.ui.LMB], cursor=(0.94, 0.95))
-    act(buttons=[ti.ui.LMB], cursor=(0.94, 0.95))
-    assert not canvas.has_plots and screen.camera.azimuth != start.azimuth
-    act()
-    act()
-    assert canvas.has_plots
+    screen.plots.shown["energies"] = True  # in the upper right corner, hidden while the view turns
+    for buttons, across in (((), 0.9), ([ti.ui.LMB], 0.95), ([ti.ui.LMB], 0.94), ((), 0.94)):
+        act(buttons=buttons, cursor=(across, 0.95))
+        act(buttons=buttons, cursor=(across, 0.95))
+        assert canvas.has_plots == (not buttons)
+    assert screen.camera.azimuth != start.azimuth
 
 
 def test_the_mouse_drags_a_body(screen, cubes):
     screen, canvas, act = screen
     x, camera = cubes.positions("b"), screen.camera
     across, down, _ = camera.project(x.mean(axis=0)[None], SIZE)[0]
-    at = np.array([across / SIZE[0], 1 - down / SIZE[1]])
-    (name, body, nodes, weights), (second, target, strength) = act(buttons=[ti.ui.LMB], cursor=tuple(at))
+    at = (across / SIZE[0], 1 - down / SIZE[1])
+    (name, body, nodes, weights), (second, target, strength) = act(buttons=[ti.ui.LMB], cursor=at)
     assert (name, body, second, strength) == ("begin_drag", "b", "drag", 10.0)
     assert np.allclose(weights @ x[nodes], target)
-    ((name, moved, _),) = act(buttons=[ti.ui.LMB], cursor=tuple(at + (0.0, 0.1)))
+    ((name, moved, _),) = act(buttons=[ti.ui.LMB], cursor=(at[0], at[1] + 0.1))
     assert name == "drag" and (np.array(moved) - target) @ camera.axes[1] > 0.1 and screen.camera == camera
     assert act() == [["release"]]
-    assert act(buttons=[ti.ui.LMB, ti.ui.CTRL], cursor=tuple(at)) == [] and screen.dragging, "with Ctrl the view turns"
+    assert act(buttons=[ti.ui.LMB, ti.ui.CTRL], cursor=at) == [] and screen.dragging, "with Ctrl the view turns"

@@ -1,10 +1,6 @@
 """Pictures drawn in a process of their own: the link to it, the same bytes as those drawn between the steps, errors and ends."""
 
 import os
-import signal
-import subprocess
-import threading
-import time
 
 import numpy as np
 import pytest
@@ -12,7 +8,6 @@ import pytest
 import taisoft as ts
 from taisoft.errors import OutputError
 from taisoft.output.camera import framed_points
-from taisoft.output.frames import FrameWriter
 from taisoft.records import StepReport
 from taisoft.scene.plan import Plan
 from taisoft.view import link as links
@@ -21,9 +16,7 @@ from taisoft.view.link import Link, LinkClosed, SharedNodes, encode
 from taisoft.view.mirror import MirrorSimulation, describe_scene, describe_state
 from taisoft.view.pictures import MIN_PICTURES, SLOTS, PictureOptions, PictureProcess, open_pictures, picture_writer
 from taisoft.view.plots import History, Plots
-from tests.cli.command import BEAM, child, report, write
-from tests.output.png import decode
-from tests.view.drawing import connected_scene, is_alive, marks_of, moving_scene, program
+from tests.view.drawing import connected_scene, marks_of, moving_scene, program
 from tests.view.fake_simulator import FakeSimulator, beam_scene
 
 SIZE = (160, 90)
@@ -34,18 +27,12 @@ def sent(message):
 
 
 def test_messages_keep_their_data():
-    message = {
-        "text": "a 'name' of µm",
-        "number": 1.5e-3,
-        "nothing": None,
-        "list": [1, True, [np.arange(6.0).reshape(2, 3), np.zeros((0, 3))]],
-        "nested": {"ids": np.array([[1, 2], [3, 4]], dtype=np.int32).T, "nan": float("nan"), "size": np.float64(2.5)},
-    }
-    got = sent(message)
-    assert got["text"] == message["text"] and got["number"] == 1.5e-3 and got["nothing"] is None
-    assert got["list"][:2] == [1, True] and np.isnan(got["nested"]["nan"]) and got["nested"]["size"] == 2.5
-    arrays = (got["list"][2][0], got["list"][2][1], got["nested"]["ids"])
-    for array, expected in zip(arrays, (np.arange(6.0).reshape(2, 3), np.zeros((0, 3)), np.array([[1, 3], [2, 4]], np.int32))):
+    arrays = [np.arange(6.0).reshape(2, 3), np.zeros((0, 3)), np.array([[1, 2], [3, 4]], dtype=np.int32).T]
+    message = {"text": "a 'name' of µm", "number": 1.5e-3, "nothing": None, "list": [1, True]}
+    got = sent(message | {"arrays": arrays[:2], "nested": {"ids": arrays[2], "nan": float("nan"), "size": np.float64(2.5)}})
+    assert {name: got[name] for name in message} == message
+    assert np.isnan(got["nested"]["nan"]) and got["nested"]["size"] == 2.5
+    for array, expected in zip((*got["arrays"], got["nested"]["ids"]), arrays):
         assert array.dtype == expected.dtype and array.shape == expected.shape and np.array_equal(array, expected)
     with pytest.raises(TypeError, match="a message cannot hold a set"):
         encode({"names": {1, 2}})
@@ -53,12 +40,11 @@ def test_messages_keep_their_data():
 
 def test_both_ends():
     link, other = Link.pair(5, slots=2)
-    nodes = SharedNodes(5, 2, os.dup(link.nodes.descriptor))
+    far = Link(other, SharedNodes(5, 2, os.dup(link.nodes.descriptor)))
     link.nodes.x[1], link.nodes.values[0] = np.arange(15.0).reshape(5, 3), np.arange(5.0)
-    assert np.array_equal(nodes.x[1], np.arange(15.0).reshape(5, 3)) and np.array_equal(nodes.values[0], np.arange(5.0))
-    assert not nodes.x[0].any() and not nodes.values[1].any()
-    assert link.receive() is None
-    far = Link(other, nodes)
+    for name in ("x", "values"):
+        assert np.array_equal(getattr(far.nodes, name), getattr(link.nodes, name))
+    assert not far.nodes.x[0].any() and not far.nodes.values[1].any() and link.receive() is None
     link.send({"time": 1.0})
     assert links.receive(other, None) == {"time": 1.0}
     far.send({"commands": [["pause"]]})
@@ -71,31 +57,30 @@ def test_both_ends():
 
 
 def test_only_what_is_shown_travels():
-    sim = FakeSimulator(moving_scene())
-    marks, n = marks_of(sim.scene), len(sim.positions())
+    sim, history = FakeSimulator(moving_scene()), History()
+    marks, x = marks_of(sim.scene), sim.positions()
     state = describe_state(sim, marks, set(), None)
     assert {"contacts", "history"}.isdisjoint(state) and state["tractions"] == []
-    history = History()
     history.start(sim)
     state = sent(describe_state(sim, marks, {"tractions"}, history) | {"colour": "body"})
-    mirror = MirrorSimulation(sent(describe_scene(sim.scene, marks)), n)
-    mirror.take(state, sim.positions(), np.zeros(0))
-    assert np.array_equal(mirror.history.high, history.high, equal_nan=True) and mirror.nodal_values is None
     assert state["tractions"][0].tolist() == [0.0, 0.0, 50.0]
-    mirror.take(state | {"colour": "stress"}, sim.positions(), np.arange(float(n)))
-    assert mirror.values_of("speed") is None and mirror.values_of("stress")[-1] == n - 1
+    mirror = MirrorSimulation(sent(describe_scene(sim.scene, marks)), len(x))
+    mirror.take(state, x, np.zeros(0))
+    assert np.array_equal(mirror.history.high, history.high, equal_nan=True) and mirror.nodal_values is None
+    mirror.take(state | {"colour": "stress"}, x, np.arange(float(len(x))))
+    assert mirror.values_of("speed") is None and mirror.values_of("stress")[-1] == len(x) - 1
     assert np.array_equal(mirror.positions("two"), sim.positions("two")) and mirror.energies() == sim.energies()
     sim.scene.add_obstacle(ts.Sphere((9, 0, 0), 0.1), name="late", path=lambda t: ((1.0 / (1.0 - t), 0, 0), np.eye(3)))
     sim.time = 1.0
-    with pytest.raises(ts.OutputError, match="the scene cannot be shown: obstacle 'late': the path must give"):
+    with pytest.raises(OutputError, match="the scene cannot be shown: obstacle 'late': the path must give"):
         describe_state(sim, marks_of(sim.scene), set(), None)
 
 
 def test_both_frame_the_same_fall():
     """Of one body; the others are held, prescribed or connected."""
     scene = beam_scene(("held", "moved", "one", "two", "three"))
-    for name in ("moved", "one", "two", "three"):
-        scene.body(name).constraints.clear()
+    for body in scene.bodies[1:]:
+        body.constraints.clear()
     scene.body("moved").move([0], lambda t: (0, t, 0))
     scene.add_spring(("one", 0), ("two", 0), 1.0)
     scene.add_obstacle(ts.HalfSpace((0, -2, 0), (0, 1, 0)))
@@ -121,13 +106,15 @@ CASES = {
 
 @pytest.mark.parametrize("name", CASES)
 def test_both_ways_write_the_same_bytes(name, tmp_path):
+    """Also of more states than wait at once."""
     build, options = CASES[name]
-    sim = Shown(build())
+    sim, n = Shown(build()), SLOTS + 4
     plots = Plots(sim, options.plots)
     between = picture_writer(tmp_path / "between", sim.scene, options, plots)
     beside = PictureProcess(tmp_path / "beside", sim, options, plots)
-    for index in range(4):
-        sim.time = 0.3 * index
+    assert os.getsid(beside.pid) == beside.pid, "a session of its own: Ctrl-C goes to the run"
+    for index in range(n):
+        sim.time = 0.1 * index
         plots.take(StepReport(time=sim.time, kinetic=sim.time, n_contacts=index), 0.01)
         between.frame(sim, index)
         beside.frame(sim, index)
@@ -139,135 +126,50 @@ def test_both_ways_write_the_same_bytes(name, tmp_path):
     beside.close()
     beside.close()
     own, other = (sorted((tmp_path / where / "frames").iterdir()) for where in ("between", "beside"))
-    assert [path.name for path in own] == [path.name for path in other] == [f"{k:05d}.png" for k in range(4)]
+    assert [path.name for path in own] == [path.name for path in other] == [f"{k:05d}.png" for k in range(n)]
     assert [a.name for a, b in zip(own, other) if a.read_bytes() != b.read_bytes()] == []
-    assert len({path.read_bytes() for path in own}) == 4, "the pictures differ from each other"
+    assert len({path.read_bytes() for path in own}) == n, "the pictures differ from each other"
+    with pytest.raises(OutputError, match=r"^picture 1 cannot be written to .*frames: its writer is closed$"):
+        beside.frame(sim, 1)
 
 
-STAND_IN = """
-import sys, time
-from pathlib import Path
+FAILING = """
+import sys
 from taisoft.view.child_process import serve
-class Slow:
-    def __init__(self, link, description):
-        self.link, self.folder = link, Path(description["folder"])
-    def run(self):
-        while not (self.folder / "go").exists():
-            time.sleep(0.01)
-        while "end" not in (message := self.link.receive(None)):
-            if "flush" in message:
-                self.link.send({"flushed": True})
-            else:
-                x = self.link.nodes.x[message["slot"]].copy()
-                (self.folder / f"{message['index']}.bin").write_bytes(x.tobytes())
-                self.link.send({"drawn": message["time"], "kept": [{}, {}]})
-serve(Slow, *map(int, sys.argv[1:]))
+from taisoft.view.offscreen import Offscreen
+from taisoft.view.picture_process import Drawing
+image, left = Offscreen.image, [1, 2]
+def failing(self, sim):
+    if not left:
+        raise MemoryError("3 GB")
+    left.pop()
+    return image(self, sim)
+Offscreen.image = failing
+serve(Drawing, *map(int, sys.argv[1:]))
 """
 
 
-def test_the_simulation_waits_for_a_full_queue_only(tmp_path, monkeypatch):
-    """Few pictures, or a single core, need no process."""
-    sim, expected = FakeSimulator(beam_scene()), []
-    monkeypatch.setattr(pictures, "CHILD", program(STAND_IN))
-    for missing, cores, kind in ((1, 2, FrameWriter), (0, 1, FrameWriter), (0, 2, PictureProcess)):
-        monkeypatch.setattr(pictures, "usable_cores", lambda cores=cores: list(range(cores)))
-        writer = open_pictures(tmp_path, sim, PictureOptions(SIZE), None, MIN_PICTURES - missing)
-        assert type(writer) is kind
-        if kind is FrameWriter:
-            writer.close()
-
-    def frame(index):
-        sim.time = 0.1 * index
-        expected.append(sim.positions().tobytes())
-        writer.frame(sim, index)
-
-    for index in range(SLOTS):
-        frame(index)
-    last = threading.Thread(target=frame, args=(SLOTS,))
-    last.start()
-    last.join(0.2)
-    assert last.is_alive(), "one more than the queue holds waits"
-    (tmp_path / "go").touch()
-    last.join(60)
-    for index in range(SLOTS + 1, 3 * SLOTS):
-        frame(index)
-    writer.close()
-    assert [(tmp_path / f"{k}.bin").read_bytes() for k in range(3 * SLOTS)] == expected
-    with pytest.raises(OutputError, match=r"^picture 1 cannot be written to .*frames: its writer is closed$"):
-        writer.frame(sim, 1)
-
-
-def failing(error: str) -> tuple[str, ...]:
-    """The real process, whose third picture raises an error."""
-    return program(f"""
-import sys
-from taisoft.view import offscreen
-from taisoft.view.child_process import serve
-from taisoft.view.picture_process import Drawing
-image, count = offscreen.Offscreen.image, []
-def failing(self, sim):
-    count.append(1)
-    if len(count) == 3:
-        {error}
-    return image(self, sim)
-offscreen.Offscreen.image = failing
-serve(Drawing, *map(int, sys.argv[1:]))
-""")
-
-
-@pytest.mark.parametrize(
-    "moment, error, end",
-    [
-        ("frame", "raise MemoryError('3 GB')", "not enough memory for a picture: 3 GB; available: .*"),
-        ("flush", "import os; os._exit(7)", "its process ended with exit status 7"),
-    ],
-)
-def test_an_error_is_raised_once_it_is_known(moment, error, end, tmp_path):
-    message = f"^the drawing of pictures failed: {end}$"
+def test_an_error_is_raised_once_it_is_known(tmp_path):
+    """Of the real process, at its third picture."""
+    message = "^the drawing of pictures failed: not enough memory for a picture: 3 GB; available: .*$"
     sim = FakeSimulator(beam_scene())
-    writer = PictureProcess(tmp_path, sim, PictureOptions(SIZE), child=failing(error))
-    for index in range(4):
-        writer.frame(sim, index)
+    writer = PictureProcess(tmp_path, sim, PictureOptions(SIZE), child=program(FAILING))
     with pytest.raises(OutputError, match=message):
-        if moment == "flush":
-            writer.flush()
-        for index in range(4, 10_000):
+        for index in range(10_000):
             writer.frame(sim, index)
-    for use in (lambda: writer.frame(sim, 0), writer.close):
+    for use in (writer.flush, lambda: writer.frame(sim, 0), writer.close):
         with pytest.raises(OutputError, match=message):
             use()
     assert not (tmp_path / "frames/00003.png").exists()
 
 
-def test_a_process_that_does_not_start(tmp_path):
-    sim = FakeSimulator(beam_scene())
+def test_few_pictures_or_a_single_core_need_no_process(tmp_path, monkeypatch):
+    """And a process that cannot be started is an error."""
+    sim, absent = FakeSimulator(beam_scene()), (str(tmp_path / "absent"),)
+    monkeypatch.setattr(pictures, "CHILD", absent)
+    for missing, cores in ((1, 2), (0, 1)):
+        monkeypatch.setattr(pictures, "usable_cores", lambda cores=cores: list(range(cores)))
+        open_pictures(tmp_path, sim, PictureOptions(SIZE), None, MIN_PICTURES - missing).close()
+    monkeypatch.setattr(pictures, "usable_cores", lambda: [0, 1])
     with pytest.raises(OutputError, match="^the drawing of pictures failed: its process cannot be started: No such file"):
-        PictureProcess(tmp_path, sim, PictureOptions(SIZE), child=(str(tmp_path / "absent"),))
-
-
-def wait_for(condition) -> None:
-    end = time.monotonic() + 60
-    while not condition():
-        assert time.monotonic() < end
-        time.sleep(0.02)
-
-
-def test_an_interrupted_run_leaves_its_pictures_and_no_process(tmp_path):
-    """Ctrl-C goes to the terminal's whole group; the run then ends with all pictures so far."""
-    scene, out = write(tmp_path / "beam.py", BEAM.replace('"seconds": 0.1', '"seconds": 1000.0')), tmp_path / "out"
-    process = child("run", scene, "--headless", "--no-usd", "--out", out, start_new_session=True)
-    try:
-        wait_for(lambda: (out / "frames/00005.png").exists())
-        command = ["ps", "-o", "pid=", "--ppid", str(process.pid)]
-        (other,) = map(int, subprocess.run(command, capture_output=True, text=True, check=True).stdout.split())
-        os.killpg(process.pid, signal.SIGINT)
-        _, error = process.communicate(timeout=60)
-    finally:
-        process.kill()
-    wait_for(lambda: not is_alive(other))
-    written = sorted(path for path in (out / "frames").iterdir() if path.suffix == ".png")
-    assert all(decode(path.read_bytes()).shape == (720, 1280, 3) for path in written)
-    assert [path.name for path in written] == [f"{k:05d}.png" for k in range(len(written))]
-    assert process.returncode == 130, error
-    record = report(out)
-    assert record["interrupted"] and len(written) == 1 + int(record["sim_seconds"] * 30 + 1e-6)
+        open_pictures(tmp_path, sim, PictureOptions(SIZE), None, MIN_PICTURES)

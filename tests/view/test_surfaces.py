@@ -18,18 +18,15 @@ from tests.view.fake_simulator import RUBBER, FakeSimulator, beam_scene
 
 
 def test_edges_of_a_box_are_sharp_and_a_ball_is_smooth():
-    mesh = ts.box_mesh((2, 3, 4), (1, 1, 1))
-    nodes, corners = smoothing_groups(mesh.vertices, mesh.surface)
-    assert np.array_equal(nodes[corners], mesh.surface)
-    assert len(nodes) == 2 * (3 * 4 + 4 * 5 + 3 * 5)  # sides share no vertices
-    normals = vertex_normals(mesh.vertices[nodes], corners)
-    assert np.allclose(np.abs(normals).max(axis=1), 1.0)
-    assert (np.einsum("ij,ij->i", normals, mesh.vertices[nodes]) > 0.4).all()
-    ball = ts.ball_mesh(2.0, 8)
-    nodes, corners = smoothing_groups(ball.vertices, ball.surface)
-    assert np.array_equal(np.sort(nodes), np.unique(ball.surface))  # no vertex is split
-    normals = vertex_normals(ball.vertices[nodes], corners)
-    assert (np.einsum("ij,ij->i", normals, ball.vertices[nodes]) > 2.0 * np.cos(np.radians(12))).all()
+    box, ball = ts.box_mesh((2, 3, 4), (1, 1, 1)), ts.ball_mesh(2.0, 8)
+    for mesh, n, least in ((box, 2 * (3 * 4 + 4 * 5 + 3 * 5), 0.4), (ball, len(np.unique(ball.surface)), 1.95)):
+        nodes, corners = smoothing_groups(mesh.vertices, mesh.surface)
+        assert (
+            np.array_equal(nodes[corners], mesh.surface) and len(nodes) == n
+        )  # sides share no vertices, the ball's are not split
+        normals = vertex_normals(mesh.vertices[nodes], corners)
+        assert (np.einsum("ij,ij->i", normals, mesh.vertices[nodes]) > least).all()
+        assert mesh is ball or np.allclose(np.abs(normals).max(axis=1), 1.0)
 
 
 @pytest.mark.parametrize("order", [1, 2])
@@ -46,9 +43,9 @@ def test_drawn_surface_follows_the_body_and_marks_fixed_nodes(order):
     n_fixed = (2 * order + 1) ** 2  # nodes of the left end
     assert (surfaces.colours == MARKER_COLOUR).all(axis=1).sum() == 2 * n_fixed * 66  # vertices of a marker
     assert np.allclose(np.linalg.norm(normals, axis=1), 1.0)
-    a, b, c = (x[surfaces.triangles[:, k]] for k in range(3))
-    winding = np.einsum("ij,ij->i", np.cross(b - a, c - a), normals[surfaces.triangles].sum(axis=1))
-    assert (winding > 0).all(), "normals point outward"
+    a, b, c = np.moveaxis(x[surfaces.triangles], 1, 0)
+    outward = normals[surfaces.triangles].sum(axis=1)
+    assert (np.einsum("ij,ij->i", np.cross(b - a, c - a), outward) > 0).all()
 
 
 FLOOR, CORNERS = ts.HalfSpace((0, 0, 0), (0, 1, 0)), np.array([(x, 0.0, z) for x in (-2.0, 2.0) for z in (-2.0, 2.0)])
@@ -60,35 +57,28 @@ def cloud(centre, half=0.5):
     return np.array(centre) + half * np.array([(-1.0, 0, -1), (1, 0.3, 1), (1, 2, -1), (-1, 1, 1)])
 
 
-def extent(square):
-    return [(square[:, k].min(), square[:, k].max()) for k in (0, 2)]
-
-
 def test_a_square_moves_along_with_the_bodies_and_grows():
-    square = Square(FLOOR, CORNERS, [])
-    assert square.below(cloud((0.5, 1, -0.5))) is CORNERS
-    assert square.below(finite_points(np.full((3, 3), np.nan))) is CORNERS, "a state that is not finite"
-    assert square.below(finite_points(np.vstack([cloud((0.0, 1, 0)), [np.inf, 0, 0]]))) is CORNERS
+    """A cut one only along the cut."""
+
+    def extent(others, points):
+        square = Square(FLOOR, CORNERS, others).below(points)
+        assert (square[:, 1] == 0.0).all()
+        return np.stack([square.min(axis=0), square.max(axis=0)], axis=1)[[0, 2]].tolist()
+
+    for points in (cloud((0.5, 1, -0.5)), np.full((3, 3), np.nan), np.vstack([cloud((0.0, 1, 0)), [np.inf, 0, 0]])):
+        assert Square(FLOOR, CORNERS, []).below(finite_points(points)) is CORNERS
     for place, half in (((7.0, 1.0, 0.0), 0.5), ((-30.0, 5.0, 12.0), 0.5), ((0.0, 1.0, 0.0), 10.0)):
-        moved = Square(FLOOR, CORNERS, []).below(cloud(place, half))
-        assert (moved[:, 1] == 0.0).all()
-        for (low, high), at in zip(extent(moved), (place[0], place[2])):
+        for (low, high), at in zip(extent([], cloud(place, half)), (place[0], place[2])):
             gaps = (at - half - low, high - at - half)
-            assert min(gaps) > 0.2
+            assert min(gaps) > 0.2 and (min(gaps) < 1.0 or max(abs(at), half) <= 2.0), "no farther than needed"
             assert high - low == pytest.approx(4.0) if half < 2.0 else gaps[0] == pytest.approx(gaps[1])
-            if abs(at) > 2.0 or half > 2.0:
-                assert min(gaps) < 1.0, "no farther than needed"
-
-
-def test_cut_squares_move_along_the_cut():
     for others, moves in (
         ([WALL], [False, True]),
-        ([WALL, BEHIND], [False, False]),
+        ([WALL, BEHIND], [False] * 2),
         ([SLOPE], [False, True]),
         ([CEILING], [True] * 2),
     ):
-        square = Square(FLOOR, CORNERS, others).below(cloud((9.0, 1.0, 9.0)))
-        assert [low != pytest.approx(-2.0) for low, _ in extent(square)] == moves
+        assert [low != pytest.approx(-2.0) for low, _ in extent(others, cloud((9.0, 1.0, 9.0)))] == moves
 
 
 ABOVE = Camera(target=np.array([0.0, 0.0, 0.0]), distance=8.0, azimuth=0.0, elevation=15.0)
@@ -114,8 +104,8 @@ def maps_of(scene, bad=None, t=0.0):
 def test_the_ground_is_darker_below_a_body():
     scene, size = cube_above(0.7), (160, 120)
     picture = Offscreen(scene, size, ABOVE).image(FakeSimulator(scene)).astype(int)
-    places = ABOVE.project(np.array([[0.0, 0.0, 0.3], [0.0, 0.0, 1.5], [1.5, 0.0, 0.3]]), size)[:, :2].astype(int)
-    below, before, beside = (picture[row, column] for column, row in places)
+    columns, rows, _ = ABOVE.project(np.array([[0.0, 0.0, 0.3], [0.0, 0.0, 1.5], [1.5, 0.0, 0.3]]), size).astype(int).T
+    below, before, beside = picture[rows, columns]
     assert (below < 0.9 * beside).all() and np.ptp(below) < 12, "grey"
     assert (beside > 150).all() and np.abs(before - beside).max() < 12
 
@@ -133,16 +123,12 @@ def test_a_shadow_lies_below_its_body_and_fades_exponentially_with_height():
     assert np.allclose(at[ground].mean(axis=0)[:2], n / 2, atol=1e-6)
 
 
-@pytest.mark.parametrize("normal, has_shadow", [((1, 3, 0), True), ((1, 0, 0), False), ((0, -1, 0), False), ((0, 0.2, 1), False)])
-def test_slopes_have_shadows_and_walls_have_none(normal, has_shadow):
-    maps, at = maps_of(cube_above(1.0, normal))
-    assert (maps.max() > 0.05) == has_shadow and (at[:, 2].max() == 0) == has_shadow
-
-
-def test_shadows_on_moving_half_spaces_and_of_nodes_that_are_not_finite():
-    lifted = cube_above(0.5, path=KeyFrames([0.0, 1.0], [(0.0, 0.0, 0.0), (0.0, 0.2, 0.0)]))
+def test_shadows_on_slopes_and_moving_half_spaces_and_of_nodes_that_are_not_finite():
+    for normal, has_shadow in (((1, 3, 0), True), ((0, -1, 0), False), ((0, 0.2, 1), False)):  # walls have none
+        maps, at = maps_of(cube_above(1.0, normal))
+        assert (maps.max() > 0.05) == has_shadow and (at[:, 2].max() == 0) == has_shadow
+    lifted, scene = cube_above(0.5, path=KeyFrames([0.0, 1.0], [(0.0, 0.0, 0.0), (0.0, 0.2, 0.0)])), cube_above(0.1)
     assert maps_of(lifted, t=1.0)[0].max() > 1.2 * maps_of(lifted)[0].max()
-    scene = cube_above(0.1)
     some, _ = maps_of(scene, slice(0, 3))
     assert np.isfinite(some).all() and 0.1 < some.max() <= 1.0
     none, at = maps_of(scene, slice(0, Surfaces(scene).n_of_bodies))
@@ -164,51 +150,61 @@ def test_the_window_has_the_shadow_as_a_mesh_on_the_ground():
 
 
 def test_a_blur_keeps_the_sum_and_spreads_by_its_deviation():
-    image = np.zeros((40, 60))
-    image[20, 30] = 1.0
-    smooth = blurred(image, (2.0, 4.0))
+    smooth = blurred(np.pad(np.ones((1, 1)), ((20, 19), (30, 29))), (2.0, 4.0))
     assert smooth.sum() == pytest.approx(1.0)
-    rows, columns = np.mgrid[:40, :60]
-    deviation = [np.sqrt((smooth * (axis - middle) ** 2).sum()) for axis, middle in ((rows, 20), (columns, 30))]
+    deviation = [np.sqrt((smooth * (axis - middle) ** 2).sum()) for axis, middle in zip(np.mgrid[:40, :60], (20, 30))]
     assert deviation == pytest.approx([2.0, 4.0], rel=0.15)  # cut off at two deviations
 
 
 def test_ray_hits_the_nearest_triangle():
     x = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 2], [1, 0, 2], [0, 1, 2]])
-    triangles = np.array([[3, 4, 5], [0, 2, 1]])
-    ray = np.array([0.0, 0, 1])
-    t, weights = nearest_hit(np.array([0.2, 0.3, -1]), ray, x, triangles)
-    assert t == 1 and np.allclose(weights @ x[triangles[t]], (0.2, 0.3, 0))
-    t, weights = nearest_hit(np.array([0.2, 0.3, 1]), ray, x, triangles)
-    assert t == 0 and np.allclose(weights, (0.5, 0.2, 0.3))
-    assert nearest_hit(np.array([0.2, 0.3, 3]), ray, x, triangles) is None
-    assert nearest_hit(np.array([0.9, 0.3, -1]), ray, x, triangles) is None
+    triangles, ray = np.array([[3, 4, 5], [0, 2, 1]]), np.array([0.0, 0, 1])
+    for z, nearest in ((-1, 1), (1, 0)):
+        t, weights = nearest_hit(np.array([0.2, 0.3, z]), ray, x, triangles)
+        assert t == nearest and np.allclose(weights @ x[triangles[t]], (0.2, 0.3, 2 - 2 * t))
+    for beside in ([0.2, 0.3, 3], [0.9, 0.3, -1]):
+        assert nearest_hit(np.array(beside), ray, x, triangles) is None
 
 
-def cursor_at(point, camera, size):
-    """The place of a point in a window, in units of its size from the lower left corner."""
-    across, down, _ = camera.project(point[None], size)[0]
-    return across / size[0], 1 - down / size[1]
+TWO = (("one", "two"), (8, 2, 2))
 
 
-def centre_of_a_visible_triangle(x, triangles, camera):
-    centres = x[triangles].mean(axis=1)
-    return centres[np.argmin(np.linalg.norm(centres - camera.position, axis=1))]
+def ball_in_a_cube(cells, size, order):
+    """A skin in a cube of tets."""
+    scene, ball = ts.Scene(), ts.ball_mesh(0.45, 4)
+    body = scene.add_body(ts.box_mesh((cells,) * 3, (size,) * 3), RUBBER, name="two", position=(3, 0, 0), order=order)
+    used, triangles = np.unique(ball.surface, return_inverse=True)
+    body.embed(ts.SurfaceMesh(ball.vertices[used], triangles.reshape(-1, 3)))
+    return scene
 
 
-@pytest.mark.parametrize("order", [1, 2])
-def test_cursor_picks_and_drags_a_body(order):
-    scene = beam_scene(("one", "two"), order=order)
-    sim, camera, size = FakeSimulator(scene), Camera.framing(np.array([[-2.0, -1, -1], [2, 2, 1]])), (1600, 900)
-    sim.time = 1.0
-    x = sim.positions("two")
-    point = centre_of_a_visible_triangle(x, scene.bodies[1].nodes.surface, camera)
-    cursor = cursor_at(point, camera, size)
+@pytest.mark.parametrize(
+    "build, arguments",
+    [(beam_scene, (*TWO, 1)), (beam_scene, (*TWO, 2)), (ball_in_a_cube, (12, 1.0, 1)), (ball_in_a_cube, (1, 0.8, 2))],
+)  # the last one's tets do not hold all of the skin
+def test_cursor_picks_and_drags_a_body(build, arguments):
+    """Deformed, and as the mirror in the window's process sees it."""
+    scene, size = build(*arguments), (1600, 900)
+    real, marks, body = FakeSimulator(scene), marks_of(scene), scene.bodies[-1]
+    real.time, n = 1.0, sum(body.n_nodes for body in scene.bodies)
+    sim, camera, x = MirrorSimulation(describe_scene(scene, marks), n), Camera.framing(real.positions()), real.positions("two")
+    sim.take(describe_state(real, marks, set(), None) | {"colour": "body"}, real.positions(), np.zeros(n))
+    skin = body.riding_skin
+    shown, triangles = (x, body.nodes.surface) if skin is None else (skin.weights @ x, skin.surface.triangles)
+    centres = shown[triangles].mean(axis=1)
+    point = centres[np.argmin(np.linalg.norm(centres - camera.position, axis=1))]
+
+    def cursor_at(place):
+        across, down, _ = camera.project(place[None], size)[0]
+        return across / size[0], 1 - down / size[1]
+
+    cursor = cursor_at(point)
     hit = pick(sim, camera, cursor, size)
-    assert scene.bodies[hit.body].name == "two" and np.allclose(hit.point, point) and np.allclose(hit.weights, 1 / 3)
+    assert scene.bodies[hit.body] is body and np.allclose(hit.point, point) and np.allclose(hit.weights @ x[hit.nodes], point)
     drag = MouseDrag(sim, hit)
     target = drag.target
-    assert drag.body == "two" and drag.weights.sum() == pytest.approx(1.0) and len(drag.nodes) >= 3
+    assert drag.body == "two" and drag.weights.sum() == pytest.approx(1.0) and (drag.weights > 0.0).all() and len(drag.nodes) >= 3
+    assert np.linalg.norm(drag.weights @ body.rest_positions[drag.nodes] - hit.weights @ body.rest_positions[hit.nodes]) < 0.3
     assert np.allclose(target, drag.weights @ x[drag.nodes]), "without motion there is no force"
     drag.move(camera, cursor, size)
     assert np.allclose(drag.target, target)
@@ -216,52 +212,26 @@ def test_cursor_picks_and_drags_a_body(order):
     assert drag.move(camera, up, size) and not drag.move(camera, up, size)
     along = camera.axes @ (drag.target - target)
     assert along[[0, 2]] == pytest.approx(0, abs=1e-9) and along[1] > 0
-    assert np.allclose(drag.line(sim), [point, point + drag.target - target])
+    assert np.allclose(drag.line(sim), [point, point + drag.target - target]), "it begins at the point under the cursor"
     assert pick(sim, camera, (0.01, 0.99), size) is None
-
-
-@pytest.mark.parametrize("cells, size, order", [(12, 1.0, 1), (1, 0.8, 2)])  # the last one's tets do not hold all of the skin
-def test_cursor_picks_and_drags_a_skin(cells, size, order):
-    """Of a ball in a cube of tets, deformed, as the mirror in the window's process sees it."""
-    scene, ball = ts.Scene(), ts.ball_mesh(0.45, 4)
-    body = scene.add_body(ts.box_mesh((cells,) * 3, (size,) * 3), RUBBER, name="cube", position=(3, 0, 0), order=order)
-    used, triangles = np.unique(ball.surface, return_inverse=True)
-    skin = body.embed(ts.SurfaceMesh(ball.vertices[used], triangles.reshape(-1, 3)))
-    real, marks, window = FakeSimulator(scene), marks_of(scene), (900, 900)
-    real.time = 1.0
-    x = real.positions()
-    sim, camera = MirrorSimulation(describe_scene(scene, marks), body.n_nodes), Camera.framing(x)
-    sim.take(describe_state(real, marks, set(), None) | {"colour": "body"}, x, np.zeros(body.n_nodes))
-    point = centre_of_a_visible_triangle(skin.weights @ x, skin.surface.triangles, camera)
-    hit = pick(sim, camera, cursor_at(point, camera, window), window)
-    assert np.allclose(hit.point, point) and np.allclose(hit.weights @ x[hit.nodes], point) and len(hit.nodes) > 3
-    drag = MouseDrag(sim, hit)
-    assert drag.weights.sum() == pytest.approx(1.0) and (drag.weights > 0.0).all()
-    assert np.linalg.norm(drag.weights @ body.rest_positions[drag.nodes] - hit.weights @ body.rest_positions[hit.nodes]) < 0.2
-    assert np.allclose(drag.line(sim)[0], point), "the line begins at the point under the cursor"
     inside = 0.98 * x + 0.02 * x.mean(axis=0)
-    corner = inside[np.argmax(inside @ camera.axes[0])]
-    assert pick(sim, camera, cursor_at(corner, camera, window), window) is None, "only a corner of the tets is there"
+    corner = cursor_at(inside[np.argmax(inside @ camera.axes[0])])
+    assert skin is None or pick(sim, camera, corner, size) is None, "only a corner of the tets is there"
 
 
 def test_lines_of_layers():
     scene = beam_scene()
     scene.bodies[0].add_traction(lambda c: c[:, 0] > 1.99, (0, 0, 50.0))
     sim, layers, camera = FakeSimulator(scene), Layers(scene), Camera.framing(scene.bodies[0].rest_positions)
-    contacts = sim.contacts()
-    faces = len(scene.bodies[0].mesh.surface)
+    contacts, found = sim.contacts(), {}
     loaded = 2 * 2 * 2  # triangles of the end
-    counts = {"wires": 3 * faces // 2, "contacts": 2, "tractions": 3 * loaded, "fixed_nodes": 0}
+    counts = {"wires": 3 * len(scene.bodies[0].mesh.surface) // 2, "contacts": 2, "tractions": 3 * loaded, "fixed_nodes": 0}
     for name, count in counts.items():
         layers.shown = {other: other == name for other in layers.shown}
-        ends, colours = layers.lines(sim, camera)
-        assert len(ends) == len(colours) == 2 * count <= 2 * layers.n_segments
-        if name == "wires":
-            x, size = sim.positions(), (200, 100)
-            nodes, drawn = camera.project(x, size), camera.project(ends, size)
-            gaps = np.linalg.norm(drawn[:, None, :2] - nodes[None, :, :2], axis=2).min(axis=1)
-            assert gaps.max() < 1e-9, "wires end at nodes"
-        if name == "contacts":
-            a, b, _, c = (ends - camera.position) / 0.1 + camera.position
-            assert np.allclose(a, contacts.point) and np.allclose((b - a) / np.linalg.norm(b - a), contacts.normal)
-            assert np.allclose(np.cross(c - a, contacts.impulse[0]), 0, atol=1e-12)
+        found[name], colours = layers.lines(sim, camera)
+        assert len(found[name]) == len(colours) == 2 * count <= 2 * layers.n_segments
+    nodes, drawn = (camera.project(points, (200, 100))[:, :2] for points in (sim.positions(), found["wires"]))
+    assert np.linalg.norm(drawn[:, None] - nodes, axis=2).min(axis=1).max() < 1e-9, "wires end at nodes"
+    a, b, _, c = (found["contacts"] - camera.position) / 0.1 + camera.position
+    assert np.allclose(a, contacts.point) and np.allclose((b - a) / np.linalg.norm(b - a), contacts.normal)
+    assert np.allclose(np.cross(c - a, contacts.impulse[0]), 0, atol=1e-12)
