@@ -82,6 +82,7 @@ OVERLAPPING = [  # meshes, shift of the first [m], bounds of the depth [m]
     ("cube", "rotated", (0, 0, 0), 0.5, 0.5),
     ("cube", "cube", (1e-5, 2e-5, -1e-5), 0.4999, 0.5),
     ("cube", "six", (0.5, 0, 0), 0.5, 0.5),
+    ("coarse", "coarse", (1 - 1e-5, 0, 0), 1e-5, 1e-5),  # no vertex lies inside: only cuts show the depth
     ("cube", "cube", (0.9, 0, 0.9), 0.1, 0.1),
     ("eighth", "fine", (0.01, 0.02, 0.03), 0.4, 0.5),
     ("cube", "hollow", (1, 0, 0), 0.5, 0.5),
