@@ -182,7 +182,8 @@ def difference(new: dict | None, old: dict | None) -> tuple[float, float]:
     if x.shape != y.shape or not len(y):
         return math.nan, math.nan
     greatest = float(np.abs(x - y).max())
-    return greatest, greatest / float(np.linalg.norm(np.ptp(y, axis=0)))
+    size = float(np.linalg.norm(np.ptp(y, axis=0)))
+    return greatest, greatest / size if size else math.nan
 
 
 def report(new: dict[str, dict], old: dict[str, dict] | None) -> int:

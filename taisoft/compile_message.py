@@ -9,8 +9,8 @@ MESSAGE = "taisoft: compiling kernels for this kind of scene, once (about 20 s)"
 COMPILED_ABOVE = 0.1  # [s] in the compiler: loading a kernel from the cache on disk takes at most 0.03 s
 COMPILER_FRACTION = 0.5  # of a first launch: at least 0.7 when compiling, at most 0.2 when loading, on any machine
 LINE_EVERY = 5.0  # [s] between lines with the number of compiled kernels
-_last_line: float | None = None  # when the last line was written [s], None before the first
-_is_silent = False
+last_line: float | None = None  # when the last line was written [s], None before the first
+is_silent = False
 
 
 def show(compiler: float, launch: float, n_compiled: int) -> None:
@@ -18,28 +18,28 @@ def show(compiler: float, launch: float, n_compiled: int) -> None:
 
     compiler: time in the compiler [s]; launch: time of the whole launch [s]; n_compiled: kernels compiled so far.
     """
-    global _last_line
-    if _is_silent or compiler < COMPILED_ABOVE or compiler < COMPILER_FRACTION * launch:
+    global last_line
+    if is_silent or compiler < COMPILED_ABOVE or compiler < COMPILER_FRACTION * launch:
         return
     now = time.perf_counter()
-    if _last_line is None:
+    if last_line is None:
         _write(MESSAGE)
-    elif now - _last_line >= LINE_EVERY:
+    elif now - last_line >= LINE_EVERY:
         _write(f"taisoft: {n_compiled} kernels so far")
     else:
         return
-    _last_line = now
+    last_line = now
 
 
 @contextlib.contextmanager
 def silenced() -> Iterator[None]:
     """Suppress the messages, for a caller that reports the kernels itself."""
-    global _is_silent
-    before, _is_silent = _is_silent, True
+    global is_silent
+    before, is_silent = is_silent, True
     try:
         yield
     finally:
-        _is_silent = before
+        is_silent = before
 
 
 def _write(line: str) -> None:

@@ -46,12 +46,15 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         if item.get_closest_marker("cuda") and not core.with_cuda():
             item.add_marker(no_gpu)
     if not config.pluginmanager.hasplugin("randomly"):
-        items.sort(key=lambda item: (FOLDERS.index(item.path.parent.name), str(item.path), "f32" in item.name))
+        place = {name: k for k, name in enumerate(FOLDERS)}
+        items.sort(key=lambda item: (place.get(item.path.parent.name, len(place)), str(item.path), "f32" in item.name))
 
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config: pytest.Config, log):
-    """Whole files to each process; every second one takes them from the end of the list."""
+    """Whole files to each process; every second one takes them from the end of the list. Only if no other way is asked for."""
+    if config.option.dist != "load":
+        return None
     from xdist.scheduler import LoadFileScheduling
 
     class BothEnds(LoadFileScheduling):

@@ -152,8 +152,13 @@ def _initialise(arch: str, precision: str) -> None:
 
 
 def forget() -> None:
-    """Let the next claim initialise Taichi anew, even for the same arch and precision: kernels compiled so far are then gone."""
+    """Let the next claim initialise Taichi anew, even for the same arch and precision: kernels compiled so far are then gone.
+
+    Raises SimulationError if something is open.
+    """
     global _kind
+    if _open:
+        raise SimulationError(f"{_open[0].owner} is open: close it first")
     _kind = None
 
 

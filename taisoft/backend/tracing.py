@@ -101,7 +101,7 @@ _build_any = ASTTransformer.__call__
 
 
 def _build(self, context: ASTTransformerContext, node: ast.AST) -> Any:
-    """Build a syntax node. An expression gets the position of its statement, not one of its own."""
+    """Build a syntax node. What is part of a statement gets the statement's position, not one of its own."""
     build = _BUILDERS.get(type(node))
     return _build_any(self, context, node) if build is None else build(context, node)
 
@@ -110,7 +110,7 @@ _BUILDERS = {
     kind: build
     for name in dir(ast)
     if isinstance(kind := getattr(ast, name), type)
-    and issubclass(kind, ast.expr)
+    and not issubclass(kind, (ast.mod, ast.stmt))
     and (build := getattr(ASTTransformer, f"build_{name}", None)) is not None
 }
 

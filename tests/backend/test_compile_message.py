@@ -47,8 +47,8 @@ def test_only_the_first_run_prints_the_message(beam, tmp_path):
 @pytest.fixture
 def fresh(monkeypatch) -> None:
     """As in a process that has not printed the message yet."""
-    monkeypatch.setattr(compile_message, "_last_line", None)
-    monkeypatch.setattr(compile_message, "_is_silent", False)
+    monkeypatch.setattr(compile_message, "last_line", None)
+    monkeypatch.setattr(compile_message, "is_silent", False)
 
 
 def test_when_lines_are_printed(fresh, monkeypatch, capsys):
@@ -77,6 +77,6 @@ def test_no_stderr(fresh, monkeypatch):
     closed = io.StringIO()
     closed.close()
     for stderr in (closed, None):
-        monkeypatch.setattr(compile_message, "_last_line", None)
+        monkeypatch.setattr(compile_message, "last_line", None)
         monkeypatch.setattr(sys, "stderr", stderr)
         compile_message.show(compiler=0.5, launch=0.6, n_compiled=1)

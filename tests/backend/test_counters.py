@@ -63,7 +63,7 @@ def test_counts_are_exact_and_nest(arena):
         arrays.upload([(y, data), (x, data)])
         arrays.download([y])
         y.fill(0.0)
-        with pytest.raises(TypeError):
+        with pytest.raises(TypeError, match="double takes 1 arguments, not 2"):
             double(x, y)
     assert inner.launches == {"add": 2, "double": 1} and inner.arrays == {"add": 4, "double": 1} and not inner.accesses
     assert inner.host_arrays == inner.returned == {"add": 2, "double": 0} and inner.compiled == {"add": 1, "double": 1}

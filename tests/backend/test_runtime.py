@@ -3,19 +3,25 @@
 * it has one arch and precision at a time; others are refused while it is open, with the name of its user;
 * after the last close any kind can be opened, and the same kind is not initialised again;
 * without CUDA, arch 'cuda' is refused, and the CPU still works;
-* a first launch counts as compile time; errors of a kernel name its file and line.
+* a first launch counts as compile time; errors of a kernel name file, line and function;
+* contact problems have the same solution with any runtime open, which stays open.
 """
+
+import inspect
 
 import numpy as np
 import pytest
 import taichi as ti
 from taichi._lib import core
 
+import taisoft as ts
 from taisoft.backend import runtime
 from taisoft.backend.arrays import FieldArena
 from taisoft.backend.runtime import kernel, open_runtime
 from taisoft.errors import SimulationError
 from tests.backend.lanes import opened
+from tests.contact import contact_oracle as oracle
+from tests.contact.contact_rig import N_NODES
 
 
 @kernel
@@ -86,17 +92,45 @@ def test_compile_time_is_counted():
         arena.release()
 
 
+@ti.func
+def element(x: ti.template(), i: ti.template()):
+    return x[i]
+
+
 @kernel
-def faulty(x: ti.template()):
+def faulty(x: ti.template(), fails: ti.template()):
     for i in x:
-        x[i] = unknown_name  # noqa: F821
+        x[i] = element(x, i)
+        if ti.static(fails):
+            x[i] = element(x, "no index")
+        x[i] += element(x, i)
 
 
-def test_errors_of_a_kernel_name_its_file_and_line():
-    """Taichi's excerpt of the source is left out."""
+def test_errors_of_a_kernel_name_file_line_and_function():
+    """Taichi's excerpt of the source is left out. Another kernel can call the function afterwards."""
     with opened("f64"):
         arena = FieldArena()
-        x = arena.field("x", ti.f64, 2)
-        with pytest.raises(ti.TaichiNameError, match=r'File ".*test_runtime.py", line \d+, in faulty:(.|\n)*unknown_name'):
-            faulty(x)
+        x = arena.field("x", ti.f64, 2, np.array([1.0, 2.0]))
+        with pytest.raises(ti.TaichiCompilationError) as caught:
+            faulty(x, True)
+        line = inspect.getsourcelines(element)[1] + 2
+        assert f'File "{__file__}", line {line}, in element:' in str(caught.value)
+        faulty(x, False)
+        assert x.to_numpy().tolist() == [2.0, 4.0]
         arena.release()
+
+
+def test_contact_problems_are_solved_alike_in_any_open_runtime():
+    """In f64, in f32, and without one: the same bits, and an open runtime stays open."""
+    made, found = oracle.random_contacts(5, 20, N_NODES), []
+
+    def solve_once(kind) -> None:
+        found.append(ts.solve_contact_problem(made.W, made.b, made.friction, tolerance=1e-12))
+        assert runtime.open_kind() == kind
+
+    for precision in ("f64", "f32"):
+        with opened(precision):
+            solve_once(("cpu", precision))
+    solve_once(None)
+    assert all(f.converged and np.array_equal(f.impulse, found[0].impulse) for f in found)
+    assert all(f.residual_history == found[0].residual_history for f in found)

@@ -1,7 +1,7 @@
 """Fast tracing and launching give the same results as Taichi's own.
 
 * an explicit run, with --long also implicit ones with contacts, ends in the same bits with Taichi's public interface only
-  (TAISOFT_PUBLIC_TAICHI);
+  (TAISOFT_PUBLIC_TAICHI), and optimised as users have it, which the tests are not;
 * a function called several times in a kernel, within itself and with values of different types, is traced anew at each call;
 * arithmetic functions with static branches, lists and arguments used several times agree with NumPy;
 * arithmetic functions whose run-time branches or loops Python would evaluate while tracing are rejected.
@@ -38,7 +38,7 @@ with ts.Simulator(scene, dt=5e-3 if scene.obstacles else 1e-5, integrator=integr
 
 @pytest.mark.parametrize("integrator", ["symplectic_euler", pytest.param("implicit_euler", marks=pytest.mark.long)])
 def test_states_equal_those_of_taichis_public_interface(tmp_path, monkeypatch, integrator):
-    environment = os.environ | {"TAISOFT_PUBLIC_TAICHI": "1", "PYTHONPATH": str(ROOT)}
+    environment = os.environ | {"TAISOFT_PUBLIC_TAICHI": "1", "TI_ADVANCED_OPTIMIZATION": "1", "PYTHONPATH": str(ROOT)}
     command = [sys.executable, "-W", "ignore", "-c", SCRIPT, tmp_path / "public.npy", integrator]
     subprocess.run(command, env=environment, check=True)
     monkeypatch.setattr(sys, "argv", ["", tmp_path / "fast.npy", integrator])

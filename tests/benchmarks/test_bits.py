@@ -3,10 +3,12 @@
 * digests do not depend on the order of contacts, and any other bit changes them;
 * a changed bit is found, with the step, the part and the difference, and a failed, missing or new case is no success;
 * a file that is missing, damaged, foreign or of another kind of run is refused before anything runs;
+* what makes small scenes run on several threads is where the benchmark expects it;
 * a case ends after its steps, and is the same when it is run again.
 """
 
 import gzip
+from importlib import import_module
 
 import numpy as np
 import pytest
@@ -24,6 +26,10 @@ def record(error: str = "", last: float = 1.0, **changed) -> dict:
     second = [changed.get(part, part) for part in bits.PARTS]
     positions = pack(np.array([[0.0, 0.0, 0.0], [0.0, 0.0, last]]))
     return bits.NOTHING | {"digests": [["a", "b", "c"], second], "positions": positions, "error": error}
+
+
+def test_what_makes_loops_parallel_exists():
+    assert all(hasattr(import_module(f"taisoft.{module}"), name) for module, name, _ in bits.PARALLEL)
 
 
 def test_digests_do_not_depend_on_the_order_of_contacts():

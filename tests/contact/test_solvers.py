@@ -5,8 +5,7 @@
 * over nodes and as a matrix, r-factors, velocities, residuals and sweeps agree to rounding, and with NumPy, in any order of
   colours and on any number of threads; units, frames of the tangents and the order of contacts do not change the solution;
 * the best impulses of the history are returned; problems that are not finite do not converge; solutions need no sweep;
-* the augmented Lagrangian solves problems with redundant and slightly unsymmetric W, dense or sparse;
-* results are the same in any open precision; an open runtime is reused and stays open.
+* the augmented Lagrangian solves problems with redundant and slightly unsymmetric W, dense or sparse.
 """
 
 import json
@@ -19,12 +18,10 @@ from scipy.spatial.transform import Rotation
 
 import taisoft as ts
 from benchmarks.contact_problems import YARDSTICK
-from taisoft.backend import runtime
 from taisoft.contact import SOLVERS, augmented_lagrangian
 from taisoft.contact.api import METHODS
 from taisoft.contact.colouring import colour_contacts, colour_greedy, matrix_graph, store
 from taisoft.contact.solve import solve
-from tests.backend.lanes import opened
 from tests.contact import contact_oracle as oracle
 from tests.contact.contact_rig import N_NODES, impulses
 
@@ -201,21 +198,3 @@ def test_augmented_lagrangian_of_a_singular_matrix(k, skew):
     W, b, mu = double @ uneven @ double.T, double @ made.b, np.tile(made.friction, 2)
     found = ts.solve_contact_problem(sp.csr_matrix(W), b, mu, "augmented_lagrangian", 1e-10, 30)
     assert found.converged and oracle.residual(W, b, mu, found.impulse) <= 1.01e-10
-
-
-def test_open_runtimes_do_not_matter(rig, double_precision):
-    """In f64, in f32, and without one: the same bits, and an open runtime stays open. The last test: kernels are forgotten."""
-    made, found = oracle.random_contacts(5, 20, N_NODES), []
-
-    def solve_once(kind) -> None:
-        found.append(ts.solve_contact_problem(made.W, made.b, made.friction, tolerance=1e-12))
-        assert runtime.open_kind() == kind
-
-    solve_once(("cpu", "f64"))
-    rig.close()
-    double_precision.close()
-    solve_once(None)
-    with opened("f32"):
-        solve_once(("cpu", "f32"))
-    assert all(f.converged and np.array_equal(f.impulse, found[0].impulse) for f in found)
-    assert all(f.residual_history == found[0].residual_history for f in found)

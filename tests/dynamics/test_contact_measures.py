@@ -47,6 +47,8 @@ def shared_sim():
 
 @pytest.fixture
 def sim(shared_sim):
+    for name in ("target", "flyer"):
+        shared_sim.set_material(name, mass_damping=0.01)
     shared_sim.reset()
     return shared_sim
 

@@ -5,6 +5,7 @@ least values by chunks are those of the list.
 from dataclasses import replace
 
 import numpy as np
+import pytest
 import taichi as ti
 
 import taisoft as ts
@@ -15,11 +16,13 @@ from taisoft.fem.state import N_COLUMNS, OTHER_SUM, SUM
 from tests.dynamics.scenes import built, mixed_scene, use_threads
 
 
-def run_beam() -> tuple[list, list]:
-    """Vectors and numbers of steps of a damped beam whose loops are divided into chunks."""
+def run_beam(touches: bool) -> tuple[list, list]:
+    """Vectors and numbers of steps of a damped beam, alone or on the ground, whose loops are divided into chunks."""
     scene, vectors, numbers = ts.Scene(), [], []
     soft = ts.Material(young=1e5, poisson=0.45, mass_damping=1.0)
     scene.add_body(ts.box_mesh((4, 2, 2), (0.4, 0.1, 0.1)), soft).fix(lambda X: X[:, 0] < -0.19)
+    if touches:
+        scene.add_obstacle(ts.HalfSpace((0, -0.0501, 0), (0.1, 1, 0)))
     with ts.Simulator(scene, dt=5e-3, integrator="implicit_euler", precision="f64") as sim:
         for _ in range(4):
             report = sim.step()
@@ -29,11 +32,12 @@ def run_beam() -> tuple[list, list]:
     return vectors, numbers
 
 
-def test_any_number_of_threads_gives_the_same_bits(monkeypatch):
+@pytest.mark.parametrize("touches", [False, pytest.param(True, marks=pytest.mark.long)])
+def test_any_number_of_threads_gives_the_same_bits(monkeypatch, touches):
     use_threads(monkeypatch, several=False)
-    one = run_beam()
+    one = run_beam(touches)
     asked = use_threads(monkeypatch)
-    several = run_beam()
+    several = run_beam(touches)
     assert all(np.array_equal(a, b) for a, b in zip(one[0], several[0], strict=True)) and asked == [True]
     assert one[1] == several[1]
 

@@ -168,8 +168,9 @@ class Job:
             found = {"outcome": "survived", "test": failed[0] if failed else "", "seconds": round(seconds, 1)}
             if code is None:
                 return found | {"outcome": "timed out", "counts": self._pytest(arguments, self._seconds / 3)[0] is not None}
-            if code < 0:
-                return found | {"outcome": "crashed", "test": f"signal {-code}"}
+            if code < 0:  # counts only if the tests do not end so without the fault, and for a fault of their own
+                is_own = code != -signal.SIGKILL and (self._pytest(arguments, self._seconds)[0] or 0) >= 0
+                return found | {"outcome": "crashed" if is_own else "not run", "test": f"signal {-code}"}
             if code != 0 and (code > 2 or not failed):
                 return found | {"outcome": "not run", "test": f"pytest ended with {code}"}
             if code == 0 or self._passes(failed[0]):
@@ -236,7 +237,7 @@ def run_all(mutants: list[Mutant], tree: Path, file: Path, n_jobs: int, seconds:
                 with lock:
                     kept["results"][mutant.key] = mutant._asdict() | found
                     part = file.with_suffix(".part")
-                    part.write_text(json.dumps(kept, indent=1), encoding="utf-8")
+                    part.write_text(json.dumps(kept | {"tried": dict(kept["tried"])}, indent=1), encoding="utf-8")
                     part.replace(file)
 
     with tempfile.TemporaryDirectory(prefix="mutants-") as folder:

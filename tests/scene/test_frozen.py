@@ -188,8 +188,17 @@ def test_arrays_of_a_frozen_scene_and_of_records_are_read_only(frozen):
     assert scene.gravity[1] == -9.81
 
 
-def test_set_methods_change_the_simulators_copy_alone(frozen):
-    scene, sim, before = frozen
+@pytest.fixture
+def changed():
+    """As `frozen`, for a test that changes the simulator."""
+    scene = loaded()
+    before = copy.deepcopy(scene)
+    with ts.Simulator(scene, DT, "symplectic_euler", precision="f64") as sim:
+        yield scene, sim, before
+
+
+def test_set_methods_change_the_simulators_copy_alone(changed):
+    scene, sim, before = changed
     sim.set_gravity((0, -1, 0))
     with pytest.warns(UserWarning, match="body 'block': poisson = 0.495 is above 0.49") as caught:
         sim.set_material("block", young=2e4, poisson=0.495)

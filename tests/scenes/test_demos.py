@@ -1,7 +1,6 @@
-"""Every demo in the folder runs with status ok and passes its own check of the physics:
+"""Demos run with status ok and pass their own check of the physics: a few, and with --long every one in the folder:
 
 * the check fails if the material is 1 % stiffer than in the demo, or another number is off by as much;
-* those that compile many kernels of their own, or run for long, only with --long: the others are built, with what a run needs;
 * sheets in contact intersect nothing in any frame, according to ipctk;
 * the USD file has the positions of every frame and is valid;
 * the first line of a demo describes it in one sentence.

@@ -52,13 +52,21 @@ def path(sim, steps: int = 6) -> np.ndarray:
 
 
 @pytest.fixture(scope="module", params=DT)
-def sims(request):
+def shared_sims(request):
     """A simulator whose loads change, and the path of another that had the new loads from the start."""
     settings = {"dt": DT[request.param], "integrator": request.param, "precision": "f64", "draggable": True}
     with ts.Simulator(beam(NEXT), **settings) as reference:
         expected = path(reference)
     with ts.Simulator(beam(), **settings) as sim:
         yield sim, expected
+
+
+@pytest.fixture
+def sims(shared_sims):
+    sim, expected = shared_sims
+    change(sim, FIRST)
+    sim.reset()
+    return sim, expected
 
 
 def test_changed_loads_act_as_loads_from_the_start(sims):

@@ -166,10 +166,10 @@ def test_a_window_on_a_display(desktop):
         desktop.xdotool("mousemove", *YOUNG, "mousedown", 1, "sleep", 0.3, "mouseup", 1, "sleep", 0.2)
 
     desktop.wait_for(lambda: numbers()[0] >= 2, "running simulation")
-    desktop.xdotool("search", "--sync", "--name", "taisoft", "windowmove", 0, 0, "windowfocus")
+    desktop.xdotool("search", "--sync", "--name", "taisoft", "windowmove", 0, 0, "windowfocus", "--sync", "sleep", 0.5)
     compiled = numbers()[-1]
-    desktop.xdotool("key", "r", "sleep", 0.5, "key", "h", "sleep", 0.5)  # the camera has moved back from the bent beam
-    desktop.wait_for(lambda: desktop.log.read_text().count("step 1 ") == 2, "restart")
+    desktop.wait_for(lambda: desktop.log.read_text().count("step 1 ") > 1, "restart", lambda: desktop.xdotool("key", "r"))
+    desktop.xdotool("key", "h", "sleep", 0.5)  # the camera has moved back from the bent beam
     drag = ("mouseup", 1, "sleep", 0.3, "mousemove", *TIP, "sleep", 0.2, "mousedown", 1, "sleep", 0.5)
     drag += ("mousemove_relative", "--", 0, -120, "sleep", 0.2, "mousemove_relative", "--", 0, -130, "sleep", 0.3)
     desktop.wait_for(lambda: numbers()[1] > 0.3, "dragged beam", lambda: desktop.xdotool(*drag))
@@ -177,19 +177,19 @@ def test_a_window_on_a_display(desktop):
     desktop.wait_for(lambda: numbers()[1] < 0.2, "beam that springs back")
     desktop.wait_for(lambda: numbers()[2] > 2e6, "stiffer beam", click)
     assert numbers()[-1] == compiled, "nothing is compiled"
-    desktop.xdotool("key", "space")
-    desktop.wait_for(is_paused, "pause")
+    desktop.wait_for(is_paused, "pause", lambda: desktop.xdotool("key", "space"))
     screen = desktop.picture()
     assert body_mask(screen[:, RIGHT:]).mean() > 0.05, "the beam is visible"
     assert (screen[60:160, 30:300] > 200).any(), "the panel's text is visible"
-    desktop.xdotool("key", "g")
     boxes = np.s_[:720, 1030:1038]  # of text beside the plots
-    desktop.wait_for(lambda: (desktop.picture()[boxes] < 60).all(axis=2).mean() > 0.2, "plots")
+    plots = lambda: (desktop.picture()[boxes] < 60).all(axis=2).mean() > 0.2  # noqa: E731
+    desktop.wait_for(plots, "plots", lambda: desktop.xdotool("key", "g"))
     for width, height in ((1, 1), (1000, 700)):
         desktop.xdotool("search", "--name", "taisoft", "windowsize", width, height, "sleep", 0.3)
     before = numbers()[0]
-    desktop.xdotool("key", "s")
-    desktop.wait_for(lambda: numbers()[0] == before + 1, "single step in a window of another size")
+    step = "single step in a window of another size"
+    desktop.wait_for(lambda: numbers()[0] > before, step, lambda: desktop.xdotool("key", "s"))
+    assert is_paused()
     desktop.wait_for(lambda: body_mask(desktop.picture()[:, RIGHT:]).mean() > 0.03, "beam in it")
     desktop.xdotool("mousemove", 640, 650, "mousedown", 1, "key", "Escape")  # closed while a button is pressed
     assert desktop.child.wait(timeout=30) == 0 and desktop.last("closed")
