@@ -83,7 +83,8 @@ def data(value):
     if isinstance(value, np.ndarray):
         return value.dtype.str, value.shape, value.tobytes()
     if isinstance(value, dict):
-        return {str(key): data(own) for key, own in value.items() if key not in NOT_STORED}
+        pairs = ((sorted(key) if isinstance(key, frozenset) else key, own) for key, own in value.items())
+        return {str(key): data(own) for key, own in pairs if key not in NOT_STORED}
     if isinstance(value, (list, tuple)):
         # a file holds what fixes nodes before what moves them
         return [data(own) for own in sorted(value, key=lambda own: getattr(own, "path", None) is not None)]
