@@ -37,7 +37,7 @@ def terminal_of_run(scene: Path, environment: dict) -> str:
 
 
 def test_only_the_first_run_prints_the_message(beam, tmp_path):
-    environment = os.environ | {"XDG_CACHE_HOME": str(tmp_path), "PYTHONPATH": str(ROOT)}
+    environment = os.environ | {"XDG_CACHE_HOME": str(tmp_path), "PYTHONPATH": str(ROOT), "TI_ADVANCED_OPTIMIZATION": "1"}
     first, second = (terminal_of_run(beam, environment) for _ in range(2))
     lines = [line.removeprefix("\x1b[2K") for line in first.splitlines()]  # a bar may have been drawn there before
     assert [line for line in lines if "compiling" in line] == [MESSAGE]
