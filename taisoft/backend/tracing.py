@@ -60,12 +60,9 @@ def _tree_and_context(
 ):
     """Replacement of Taichi's function of this name: a syntax tree, which tracing modifies, and its context."""
     file, lines, first, text = source_of(self.func)
-    if _spare[self.func]:
-        tree = _spare[self.func].pop()
-    else:
-        tree = ast.parse(text)
-        tree.body[0].decorator_list = []
-        tree.nodes = list(ast.walk(tree))
+    spare = [] if is_kernel else _spare[self.func]  # a kernel is traced only once
+    tree = spare.pop() if spare else ast.parse(text)
+    tree.body[0].decorator_list = []
     names = kernel_impl._get_global_vars(self.func)
     if is_kernel or is_real_function:
         for k in self.template_slot_locations:
@@ -90,7 +87,8 @@ def _traced(tree: ast.Module, context: ASTTransformerContext) -> Any:
     try:
         return transform_tree(tree, context)
     finally:
-        if not context.is_kernel:  # a kernel is traced only once
+        if not context.is_kernel:
+            tree.nodes = getattr(tree, "nodes", None) or list(ast.walk(tree))
             for node in tree.nodes:
                 node.__dict__.pop("ptr", None)
                 node.__dict__.pop("caller", None)

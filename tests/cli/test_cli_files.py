@@ -6,11 +6,8 @@ import pytest
 
 import taisoft as ts
 from taisoft.cli import main
+from tests.mesh.test_surface_mesh import VOLUME, T, X
 
-BALL = ts.ball_mesh(0.5, 4)
-USED, CORNERS = np.unique(BALL.surface, return_inverse=True)
-X, T = BALL.vertices[USED], CORNERS.reshape(-1, 3)
-VOLUME = float(BALL.volumes.sum())
 TOWER = ts.box_mesh((1, 1, 3), (1, 2, 6), center=(10, 20, 30))  # 6 long along z
 
 

@@ -129,13 +129,16 @@ def test_values_written_into_arrays_are_checked():
             ts.Simulator(scene)
 
 
-@pytest.fixture(scope="module")
-def frozen():
+def freeze():
     """A frozen scene, its simulator, and a copy from before."""
     scene = loaded()
     before = copy.deepcopy(scene)
     with ts.Simulator(scene, DT, "symplectic_euler", precision="f64") as sim:
         yield scene, sim, before
+
+
+frozen = pytest.fixture(scope="module", name="frozen")(freeze)
+changed = pytest.fixture(name="changed")(freeze)  # for a test that changes the simulator
 
 
 CHANGES = {
@@ -186,15 +189,6 @@ def test_arrays_of_a_frozen_scene_and_of_records_are_read_only(frozen):
     copied = scene.snapshot()
     copied.gravity[1] = copied.body("block").velocity[0] = 0.0
     assert scene.gravity[1] == -9.81
-
-
-@pytest.fixture
-def changed():
-    """As `frozen`, for a test that changes the simulator."""
-    scene = loaded()
-    before = copy.deepcopy(scene)
-    with ts.Simulator(scene, DT, "symplectic_euler", precision="f64") as sim:
-        yield scene, sim, before
 
 
 def test_set_methods_change_the_simulators_copy_alone(changed):
