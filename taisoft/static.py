@@ -158,8 +158,7 @@ class StaticSolver:
         if len(self.simulation.loads.multipliers):
             self.multipliers = Multipliers(self.simulation)
             self.simulation.set_multipliers(self.multipliers.static_start())
-        prescribed = self.simulation.dirichlet.prescribed_nodes
-        self.solver = StageSystem(model, arena, runtime.eps, prescribed, NoContacts(), multipliers=self.multipliers)
+        self.solver = StageSystem(self.simulation, NoContacts(), multipliers=self.multipliers)
         self.tolerance = tolerance
         self.target = self.simulation.next_target(time)
         self.simulation.upload_constraints()

@@ -193,7 +193,7 @@ def relative_velocity(p: ti.template(), m: ti.template(), c, dt):
     """Velocity of side a relative to side b at contact c, at the present v [m/s]."""
     v = -p.obstacle_displacement[c] / dt
     for j in range(p.arity[c]):
-        v += p.weight[c, j] * ti.cast(m.state.v[p.node[c, j]], ti.f64)
+        v += p.weight[c, j] * m.state.v[p.node[c, j]]
     return v
 
 

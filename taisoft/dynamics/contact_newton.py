@@ -82,7 +82,7 @@ def solve_linear(system: StageSystem, problem: Stage, r: float, scale: float) ->
         result = newton.run(r, scale, fresh=True)
         counts = newton.newton, newton.linear, newton.multipliers
         return FrictionalResult(*counts, newton.negative, result.converged, newton.r, newton.r_scale)
-    loop = system.solve_frictional(problem, r, system.rounding.stage_floor(problem.c, problem.beta))
+    loop = system.solve_frictional(problem, r, system.floor)
     system.r_scale = R_SCALE
     counts = (int(loop[place]) for place in (SOLVES_DONE, LINEAR, MULTIPLIERS))
     ended = loop[STATUS] == INDEFINITE, loop[STATUS] == SOLVED
@@ -94,7 +94,6 @@ class ContactNewton:
 
     def __init__(self, system: StageSystem, stage: Stage):
         self.system, self.stage = system, stage
-        self.floor = system.rounding.stage_floor(stage.c, stage.beta)
         self.newton = self.linear = self.multipliers = 0
         self.eliminated = 0.0  # Newton iterations on few nodes, times their fraction of all nodes
         self.rounding = self.tight = self.stalls = False
@@ -104,12 +103,17 @@ class ContactNewton:
     def run(self) -> StageResult:
         """Solve from the first iterate, where the matrix has been formed."""
         system, stage = self.system, self.stage
-        self.r, self.scale, self.has_direction = choose_start(system, *system.evaluate(new_multipliers=True))
+        self.r, self.scale, self.has_direction = choose_start(system, *system.evaluate_start(new_multipliers=True))
         if self.has_direction:  # the matrix of the first iterate is invalid
             system.form_matrix_and_factors()
             self.r, self.scale = system.evaluate(None)
         lowest, stalled, n_slow = self.r, 0, 0
-        while not self._has_converged() and self.newton < stage.max_newton and math.isfinite(self.r):
+        while self.newton < stage.max_newton and math.isfinite(self.r):
+            if self._has_converged():
+                if system.balances_pieces():
+                    break
+                self.r, self.scale = system.evaluate(None)
+                lowest, self.rounding = self.r, False
             if self.newton > 0:
                 system.form_matrix()
             previous, law_residual = self.r, system.contact_residual
@@ -139,15 +143,22 @@ class ContactNewton:
             self.rounding = self.r <= ROUNDING * self.floor and self.r > 0.5 * previous and self.tight
             if not moved or n_slow >= MAX_SLOW:
                 break
+        converged = self._has_converged() and math.isfinite(self.r) and system.balances_pieces()
         return StageResult(
             self.newton + round(self.eliminated),
             round(self.linear),
             relative(self.r, self.scale),
-            self._has_converged() and math.isfinite(self.r),
+            converged,
             self.rounding or self.r <= self.floor,
             self.multipliers,
             system.contact_residual,
+            (0.0, "") if converged else system.least_balanced(),
         )
+
+    @property
+    def floor(self) -> float:
+        """Rounding floor of |r|."""
+        return self.system.floor
 
     def _fall_back(self) -> bool:
         """Take a few steps on the nonlinear stage from where it was linearised; return whether any step was taken."""
@@ -249,16 +260,21 @@ def solve(system: StageSystem, stage: Stage) -> StageResult:
         newton = Newton(system, stage, eliminate=eliminate if system.multipliers is None else None)
         if stage.linearised:
             return newton.solve_once()
-        r, scale, _ = choose_start(system, *system.evaluate())
-        return newton.run(r, scale, fresh)
-    return solve_linearised(system, stage) if stage.linearised else ContactNewton(system, stage).run()
+        r, scale, _ = choose_start(system, *system.evaluate_start())
+        result = newton.run(r, scale, fresh)
+    elif stage.linearised:
+        return solve_linearised(system, stage)
+    else:
+        result = ContactNewton(system, stage).run()
+    system.balance_rigid_motion()
+    return result
 
 
 def solve_linearised(system: StageSystem, stage: Stage) -> StageResult:
     """Solve the frictional problem alone, at the present state; on a projected matrix if its own is indefinite."""
     tolerance = stage.linear_tolerance or LINEARISED_FORCING
     problem, linear = replace(stage, max_newton=LINEARISED_SOLVES, linear_tolerance=tolerance), 0
-    r, scale = system.evaluate(new_multipliers=True)
+    r, scale = system.evaluate_start(new_multipliers=True)
     for projected in (False, True):
         system.linearise()
         found = solve_linear(system, problem, r, scale)
@@ -267,11 +283,12 @@ def solve_linearised(system: StageSystem, stage: Stage) -> StageResult:
             break
         r, scale = system.end_linearised(accept=False)
         system.form_matrix(projected=True)
+    system.balance_rigid_motion()
     if found.direct:
         system.end_linearised()
     elif system.model.has_dependents:  # linearised steps move only the nodes that they depend on
         place_dependents(system.model)
-    at_floor = found.r <= system.rounding.stage_floor(stage.c, stage.beta)
+    at_floor = found.r <= system.floor
     return StageResult(
         found.solves, linear, relative(found.r, scale), found.converged, at_floor, found.multipliers, system.contact_residual
     )

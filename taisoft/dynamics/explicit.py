@@ -48,7 +48,7 @@ def acceleration(m: ti.template(), i):
 def euler_velocity(m: ti.template(), i, dt):
     """Return the velocity of node i after an Euler step."""
     a = acceleration(m, i)
-    v = m.state.v[i] + dt * a
+    v = m.state.v[i] + dt * ti.cast(a, ti.f64)
     if ti.static(m.damped):
         v -= dt * rayleigh_damping.mass_rate(m, i) * m.state.v[i]
     return v
@@ -58,7 +58,7 @@ def euler_velocity(m: ti.template(), i, dt):
 def euler_node(m: ti.template(), i, dt):
     v = euler_velocity(m, i, dt)
     m.state.v[i] = v
-    m.state.x[i] = m.state.x[i] + ti.cast(dt * v, ti.f64)
+    m.state.x[i] = m.state.x[i] + dt * v
     return v
 
 
@@ -67,7 +67,7 @@ def keep_decays(m: ti.template(), s: ti.template(), dt):
     """Compute `verlet_decay` of every node once in a launch of many sub-steps: it takes as long as the rest of a node."""
     if ti.static(s.keeps_decays):
         for i in range(m.n_nodes):
-            s.decay[i] = rayleigh_damping.mass_decay(m, i, 0.5 * dt)
+            s.decay[i] = rayleigh_damping.mass_decay(m, i, ti.cast(0.5 * dt, m.real))
 
 
 @ti.func
@@ -77,7 +77,7 @@ def verlet_decay(m: ti.template(), s: ti.template(), i, dt):
     if ti.static(s.keeps_decays):
         decay = s.decay[i]
     elif ti.static(m.damped):
-        decay = rayleigh_damping.mass_decay(m, i, 0.5 * dt)
+        decay = rayleigh_damping.mass_decay(m, i, ti.cast(0.5 * dt, m.real))
     return decay
 
 
@@ -87,16 +87,16 @@ def verlet_half(m: ti.template(), s: ti.template(), i, dt, decay):
     v = m.state.v[i]
     if ti.static(m.damped):
         v *= decay
-    return v + 0.5 * dt * s.acceleration[i]
+    return v + 0.5 * dt * ti.cast(s.acceleration[i], ti.f64)
 
 
 @ti.func
 def verlet_drift(m: ti.template(), s: ti.template(), i, dt, half):
     """Drift by the mid-step velocity; if forces depend on v, then extrapolate it to their time."""
-    m.state.x[i] = m.state.x[i] + ti.cast(dt * half, ti.f64)
+    m.state.x[i] = m.state.x[i] + dt * half
     if ti.static(m.depends_on_velocity):
         s.half_velocity[i] = half
-        m.state.v[i] = half + 0.5 * dt * s.acceleration[i]
+        m.state.v[i] = half + 0.5 * dt * ti.cast(s.acceleration[i], ti.f64)
     else:
         m.state.v[i] = half
 
@@ -108,7 +108,7 @@ def verlet_kick(m: ti.template(), s: ti.template(), i, dt, decay):
     half = m.state.v[i]
     if ti.static(m.depends_on_velocity):
         half = s.half_velocity[i]
-    v = half + 0.5 * dt * a
+    v = half + 0.5 * dt * ti.cast(a, ti.f64)
     if ti.static(m.damped):
         v *= decay
     s.acceleration[i] = a
@@ -130,7 +130,7 @@ def prescribe_velocities(m: ti.template(), s: ti.template(), row, dt):
         i = s.prescribed_nodes[k]
         for a in ti.static(range(3)):
             if s.prescribed_axes[k][a] != 0:
-                m.state.v[i][a] = ti.cast((s.targets[row * s.n_prescribed + k][a] - s.before[k][a]) / dt, m.real)
+                m.state.v[i][a] = (s.targets[row * s.n_prescribed + k][a] - s.before[k][a]) / dt
 
 
 @ti.func
@@ -183,8 +183,9 @@ def compute_reactions(m: ti.template(), s: ti.template(), dt):
             v = m.state.v[i]
             if ti.static(not s.verlet):
                 v = s.held_velocity[k]
-            f += rayleigh_damping.mass_force(m, i, v)
-        s.reaction[k] = (1.0 - m.free[i]) * (mass * (m.state.v[i] - s.held_velocity[k]) / dt - f)
+            f += ti.cast(rayleigh_damping.mass_force(m, i, v), m.real)
+        change = (m.state.v[i] - s.held_velocity[k]) / dt
+        s.reaction[k] = (1.0 - m.free[i]) * (mass * ti.cast(change, m.real) - f)
 
 
 @ti.func
@@ -199,9 +200,8 @@ def begins_alone(m, s) -> bool:
 
 
 @ti.func
-def begin_substep(m: ti.template(), s: ti.template(), done, n, dt64, begun):
+def begin_substep(m: ti.template(), s: ti.template(), done, n, dt, begun):
     """Run the part of a sub-step before the element loop, serially. begun: 1 if the nodes have drifted already."""
-    dt = ti.cast(dt64, m.real)
     if ti.static(s.has_held):
         if done == n - 1:
             save_held_velocities(m, s)
@@ -215,19 +215,18 @@ def begin_substep(m: ti.template(), s: ti.template(), done, n, dt64, begun):
             for k in range(m.rigid_tets.n):
                 turn_drifted(m, s, k, dt)
         if ti.static(s.has_prescribed):
-            prescribe(m, s, done, dt64)
+            prescribe(m, s, done, dt)
     if ti.static(s.has_varied_loads):
         set_loads(m, s, done)
 
 
 @ti.func
-def end_substep(m: ti.template(), s: ti.template(), done, n, dt64, drift):
+def end_substep(m: ti.template(), s: ti.template(), done, n, dt, drift):
     """Run the part of a sub-step after the element loop, serially. Return the sum of the velocities.
 
     drift: 1 to begin the next sub-step of Verlet, as in `nodes_parallel`.
     """
-    dt = ti.cast(dt64, m.real)
-    total = ti.Vector([0.0, 0.0, 0.0], m.real)
+    total = ti.Vector([0.0, 0.0, 0.0], ti.f64)
     for i in range(m.n_nodes):
         if ti.static(s.verlet):
             decay = verlet_decay(m, s, i, dt)
@@ -244,7 +243,7 @@ def end_substep(m: ti.template(), s: ti.template(), done, n, dt64, drift):
             else:
                 turn_drifted(m, s, k, dt)
     if ti.static(s.has_prescribed):
-        prescribe(m, s, done, dt64)
+        prescribe(m, s, done, dt)
     if ti.static(s.has_held):
         if done == n - 1:
             compute_reactions(m, s, dt)
@@ -252,7 +251,7 @@ def end_substep(m: ti.template(), s: ti.template(), done, n, dt64, drift):
 
 
 @kernel
-def advance_serial(m: ti.template(), s: ti.template(), n: ti.i32, dt64: ti.f64, restart: ti.i32):
+def advance_serial(m: ti.template(), s: ti.template(), n: ti.i32, dt: ti.f64, restart: ti.i32):
     """Take n sub-steps of dt on one thread. scalars: STEPS_DONE, LOWEST_J, MOST_INVERTED.
 
     Stop after a sub-step with a non-finite velocity or an exploded tet. restart: recompute Verlet's stale acceleration.
@@ -265,10 +264,10 @@ def advance_serial(m: ti.template(), s: ti.template(), n: ti.i32, dt64: ti.f64, 
         starting = False
         if ti.static(s.verlet):
             starting = restart != 0
-            keep_decays(m, s, ti.cast(dt64, m.real))
+            keep_decays(m, s, dt)
         while starting or (done < n and running):
             if not starting:
-                begin_substep(m, s, done, n, dt64, begun)
+                begin_substep(m, s, done, n, dt, begun)
             lowest_now, inverted = elasticity.sum_elements_serially(m)
             if starting:  # forces alone, in the loop of the sub-steps: another copy of them takes long to compile
                 if ti.static(s.verlet):
@@ -282,10 +281,10 @@ def advance_serial(m: ti.template(), s: ti.template(), n: ti.i32, dt64: ti.f64, 
                     if ti.static(s.has_held):  # whose velocities before the last one are needed
                         last = n - 2
                     begun = 1 if done < last else 0
-                total = end_substep(m, s, done, n, dt64, begun)
+                total = end_substep(m, s, done, n, dt, begun)
                 low, count = elasticity.lowest_and_count(m, lowest_by_lane, inverted)
                 min_J, max_inverted = low, ti.max(max_inverted, count)
-                running = min_J > -EXPLODED and not nonfinite(ti.cast(total[0] + total[1] + total[2], ti.f64))
+                running = min_J > -EXPLODED and not nonfinite(total[0] + total[1] + total[2])
                 done += 1
         if ti.static(m.has_dependents):
             for k in range(m.dependents.n):
@@ -324,7 +323,7 @@ def find_acceleration(m: ti.template(), s: ti.template()):
 
 
 @kernel
-def drift_parallel(m: ti.template(), s: ti.template(), row: ti.i32, dt64: ti.f64):
+def drift_parallel(m: ti.template(), s: ti.template(), row: ti.i32, dt: ti.f64):
     """Run the part of a sub-step before the element loop."""
     if ti.static(s.has_held):
         save_held_velocities(m, s)
@@ -332,11 +331,10 @@ def drift_parallel(m: ti.template(), s: ti.template(), row: ti.i32, dt64: ti.f64
         save_prescribed_positions(m, s)
     if ti.static(s.verlet):
         for i in range(m.n_nodes):
-            dt = ti.cast(dt64, m.real)
             verlet_drift(m, s, i, dt, verlet_half(m, s, i, dt, verlet_decay(m, s, i, dt)))
-        turn_all(m, s, dt64)
+        turn_all(m, s, dt)
         if ti.static(s.has_prescribed):
-            prescribe_all(m, s, row, dt64)
+            prescribe_all(m, s, row, dt)
     if ti.static(s.has_varied_loads):
         ti.loop_config(serialize=True)
         for _ in range(1):
@@ -344,14 +342,13 @@ def drift_parallel(m: ti.template(), s: ti.template(), row: ti.i32, dt64: ti.f64
 
 
 @kernel
-def nodes_parallel(m: ti.template(), s: ti.template(), row: ti.i32, dt64: ti.f64, drift: ti.i32):
+def nodes_parallel(m: ti.template(), s: ti.template(), row: ti.i32, dt: ti.f64, drift: ti.i32):
     """Run the part of a sub-step after the element loop. scalars: STEPS_DONE, MOST_INVERTED, FAILED.
 
     drift: 1 to begin the next sub-step of Verlet, which `drift_parallel` would do in a loop of its own.
     """
     for i in range(m.n_nodes):
-        dt = ti.cast(dt64, m.real)
-        v = ti.Vector([0.0, 0.0, 0.0], m.real)
+        v = ti.Vector([0.0, 0.0, 0.0], ti.f64)
         if ti.static(s.verlet):
             decay = verlet_decay(m, s, i, dt)
             v = verlet_kick(m, s, i, dt, decay)
@@ -359,14 +356,14 @@ def nodes_parallel(m: ti.template(), s: ti.template(), row: ti.i32, dt64: ti.f64
                 verlet_drift(m, s, i, dt, verlet_half(m, s, i, dt, decay))
         else:
             v = euler_node(m, i, dt)
-        if nonfinite(ti.cast(v[0] + v[1] + v[2], ti.f64)):
+        if nonfinite(v[0] + v[1] + v[2]):
             m.state.scalars[FAILED] = 1.0
     if ti.static(s.verlet):
         project_all(m)
     else:
-        turn_all(m, s, dt64)
+        turn_all(m, s, dt)
     if ti.static(s.has_prescribed):
-        prescribe_all(m, s, row, dt64)
+        prescribe_all(m, s, row, dt)
     place_all(m)
     ti.loop_config(serialize=True)
     for _ in range(1):
@@ -377,9 +374,9 @@ def nodes_parallel(m: ti.template(), s: ti.template(), row: ti.i32, dt64: ti.f64
 
 
 @kernel
-def react_parallel(m: ti.template(), s: ti.template(), dt64: ti.f64):
+def react_parallel(m: ti.template(), s: ti.template(), dt: ti.f64):
     """Compute the reactions of the last sub-step of a batch."""
-    compute_reactions(m, s, ti.cast(dt64, m.real))
+    compute_reactions(m, s, dt)
 
 
 @kernel

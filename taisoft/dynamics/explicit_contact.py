@@ -39,7 +39,7 @@ def keep_state(m: ti.template(), g: ti.template()):
 
 
 @kernel
-def predict(m: ti.template(), s: ti.template(), dt64: ti.f64):
+def predict(m: ti.template(), s: ti.template(), dt: ti.f64):
     """Compute v* of every node. scalars: LOWEST_J, INVERTED_NOW.
 
     Verlet uses the stored acceleration; Euler computes the forces here.
@@ -54,7 +54,6 @@ def predict(m: ti.template(), s: ti.template(), dt64: ti.f64):
             save_prescribed_positions(m, s)
     ti.loop_config(serialize=m.serial)
     for i in range(m.n_nodes):
-        dt = ti.cast(dt64, m.real)
         if ti.static(s.verlet):
             m.state.v[i] = verlet_half(m, s, i, dt, verlet_decay(m, s, i, dt))
         else:
@@ -63,7 +62,7 @@ def predict(m: ti.template(), s: ti.template(), dt64: ti.f64):
     if ti.static(s.has_prescribed):
         ti.loop_config(serialize=True)
         for _ in range(1):
-            prescribe_velocities(m, s, 0, dt64)
+            prescribe_velocities(m, s, 0, dt)
 
 
 @kernel
@@ -91,44 +90,43 @@ def set_free_velocities(
 
 
 @ti.func
-def close_substep(m: ti.template(), s: ti.template(), p: ti.template(), dt64, has_contacts):
+def close_substep(m: ti.template(), s: ti.template(), p: ti.template(), dt, has_contacts):
     """Compute the reactions and update the counter MOST_INVERTED."""
     if ti.static(s.has_held):
-        compute_reactions(m, s, ti.cast(dt64, m.real))
-        subtract_contacts(m, s, p, dt64, has_contacts)
+        compute_reactions(m, s, dt)
+        subtract_contacts(m, s, p, dt, has_contacts)
     m.state.scalars[MOST_INVERTED] = ti.max(m.state.scalars[MOST_INVERTED], m.state.scalars[INVERTED_NOW])
     m.state.scalars[INVERTED_NOW] = 0.0
 
 
 @ti.func
-def subtract_contacts(m: ti.template(), s: ti.template(), p: ti.template(), dt64, has_contacts):
+def subtract_contacts(m: ti.template(), s: ti.template(), p: ti.template(), dt, has_contacts):
     """Subtract contact forces from the reactions of held nodes."""
     if has_contacts == 1:
         for k in range(s.n_held):
             i = s.held[k]
-            s.reaction[k] -= (1.0 - m.free[i]) * ti.cast(impulse_on(p, i) / dt64, m.real)
+            s.reaction[k] -= (1.0 - m.free[i]) * ti.cast(impulse_on(p, i) / dt, m.real)
 
 
 @kernel
-def move(m: ti.template(), s: ti.template(), p: ti.template(), dt64: ti.f64, has_contacts: ti.i32):
+def move(m: ti.template(), s: ti.template(), p: ti.template(), dt: ti.f64, has_contacts: ti.i32):
     """Apply impulses to v, then move x. has_contacts: 1 if there are contacts. scalars: FAILED.
 
     With Verlet `finish_verlet` follows.
     """
     ti.loop_config(serialize=m.serial)
     for i in range(m.n_nodes):
-        dt = ti.cast(dt64, m.real)
         v = m.state.v[i]
         if has_contacts == 1:
-            v += ti.cast(p.inverse_mass[i] * impulse_on(p, i), m.real)
-        if nonfinite(ti.cast(v[0] + v[1] + v[2], ti.f64)):
+            v += p.inverse_mass[i] * impulse_on(p, i)
+        if nonfinite(v[0] + v[1] + v[2]):
             m.state.scalars[FAILED] = 1.0
         if ti.static(s.verlet):
             verlet_drift(m, s, i, dt, v)
         else:
             m.state.v[i] = v
-            m.state.x[i] = m.state.x[i] + ti.cast(dt * v, ti.f64)
-    turn_all(m, s, dt64)
+            m.state.x[i] = m.state.x[i] + dt * v
+    turn_all(m, s, dt)
     if ti.static(s.has_prescribed):
         ti.loop_config(serialize=True)
         for _ in range(1):
@@ -137,24 +135,23 @@ def move(m: ti.template(), s: ti.template(), p: ti.template(), dt64: ti.f64, has
     ti.loop_config(serialize=True)
     for _ in range(1):
         if ti.static(not s.verlet):
-            close_substep(m, s, p, dt64, has_contacts)
+            close_substep(m, s, p, dt, has_contacts)
 
 
 @kernel
-def finish_verlet(m: ti.template(), s: ti.template(), p: ti.template(), dt64: ti.f64, has_contacts: ti.i32):
+def finish_verlet(m: ti.template(), s: ti.template(), p: ti.template(), dt: ti.f64, has_contacts: ti.i32):
     """Apply the second half kick by the forces at the new positions, after `run_elements`; scalars as in `predict` and `move`."""
     ti.loop_config(serialize=m.serial)
     for i in range(m.n_nodes):
-        dt = ti.cast(dt64, m.real)
         v = verlet_kick(m, s, i, dt, verlet_decay(m, s, i, dt))
-        if nonfinite(ti.cast(v[0] + v[1] + v[2], ti.f64)):
+        if nonfinite(v[0] + v[1] + v[2]):
             m.state.scalars[FAILED] = 1.0
     project_all(m)
     if ti.static(s.has_prescribed):
         ti.loop_config(serialize=True)
         for _ in range(1):
-            prescribe_velocities(m, s, 0, dt64)
+            prescribe_velocities(m, s, 0, dt)
     place_all(m)
     ti.loop_config(serialize=True)
     for _ in range(1):
-        close_substep(m, s, p, dt64, has_contacts)
+        close_substep(m, s, p, dt, has_contacts)

@@ -46,7 +46,7 @@ class ContactExplicitStepper(ExplicitStepper):
             self.method = "gauss_seidel" if settings.arch == "cpu" else "coloured_gauss_seidel"
         self.max_batch = min(self.max_batch, MAX_CONTACT_BATCH)
         m, arena = simulation.model, simulation.arena
-        self._good = GoodState(arena.vectors("x_good", ti.f64, m.n_nodes), arena.vectors("v_good", m.real, m.n_nodes))
+        self._good = GoodState(arena.vectors("x_good", ti.f64, m.n_nodes), arena.vectors("v_good", ti.f64, m.n_nodes))
         self.contact_tolerance = settings.contact_tolerance or TOLERANCE[settings.precision]
         self._rigid = RigidContacts(m) if m.has_rigid_tets else None
 

@@ -35,7 +35,7 @@ class SubstepWork:
     n_prescribed: Count
     n_held: Count
     acceleration: Any  # (n_nodes) 3-vectors, Verlet
-    half_velocity: Any  # (n_nodes) 3-vectors, Verlet with forces that depend on v
+    half_velocity: Any  # (n_nodes) 3-vectors f64, Verlet with forces that depend on v
     decay: Any  # (n_nodes) factors of mass damping in half a sub-step: Verlet, on one thread
     prescribed_nodes: Any  # (n_prescribed) i32
     prescribed_axes: Any  # (n_prescribed) 3-vectors i32
@@ -47,7 +47,7 @@ class SubstepWork:
     amplitude_rows: Any  # (rows * n_amplitudes) f64: their values in each sub-step
     before: Any  # (n_prescribed) 3-vectors f64: position before the sub-step
     held: Any  # (n_held) i32
-    held_velocity: Any  # (n_held) 3-vectors
+    held_velocity: Any  # (n_held) 3-vectors f64
     reaction: Any  # (n_held) 3-vectors [N]
 
     @property
@@ -120,7 +120,7 @@ class ExplicitStepper:
             n_prescribed=n_prescribed,
             n_held=n_held,
             acceleration=vectors("acceleration", m.n_nodes, needed=verlet),
-            half_velocity=vectors("half_velocity", m.n_nodes, needed=verlet and m.depends_on_velocity),
+            half_velocity=vectors("half_velocity", m.n_nodes, ti.f64, needed=verlet and m.depends_on_velocity),
             decay=arena.field("mass_decay", m.real, m.n_nodes) if verlet and m.damped and m.serial and self._in_batches else None,
             prescribed_nodes=ids("prescribed_nodes", dirichlet.prescribed_nodes),
             prescribed_axes=vectors("prescribed_axes", n_prescribed, ti.i32, data=dirichlet.prescribed_axes()),
@@ -132,7 +132,7 @@ class ExplicitStepper:
             amplitude_rows=arena.field("amplitude_rows", ti.f64, self.rows * n_amplitudes) if n_amplitudes else None,
             before=vectors("position_before", n_prescribed, ti.f64),
             held=ids("held", dirichlet.held),
-            held_velocity=vectors("held_velocity", n_held),
+            held_velocity=vectors("held_velocity", n_held, ti.f64),
             reaction=vectors("reaction", n_held),
         )
         self.acceleration_stale = True  # Verlet's acceleration does not match the present state

@@ -81,7 +81,7 @@ def begin_impact(m: ti.template(), s: ti.template(), k: ti.template(), tau: ti.f
     (p,) = ti.static((k.problem,))
     ti.loop_config(serialize=m.serial)
     for i in range(m.n_nodes):
-        m.state.x[i] = k.x_start[i] + tau * ti.cast(s.v_hat[i], ti.f64)
+        m.state.x[i] = k.x_start[i] + tau * s.v_hat[i]
         s.x_hat[i] = k.x_start[i]
         k.x_linear[i] = m.state.x[i]
     ti.loop_config(serialize=True)
@@ -113,7 +113,7 @@ def measure_impact(m: ti.template(), s: ti.template(), k: ti.template(), tau: ti
             for j in range(chunk_size(m, chunk, m.n_nodes)):
                 i = chunk_entry(m, chunk, j, m.n_nodes)
                 d = mass_times(m, i, s.change)
-                slope += d.dot(ti.cast(s.v_hat[i], ti.f64))
+                slope += d.dot(s.v_hat[i])
                 curvature += d.dot(s.change[i])
             m.state.partial[chunk, SUM], m.state.partial[chunk, OTHER_SUM] = slope, curvature
     fold(m, SUM, OTHER_SUM, ())
@@ -124,7 +124,7 @@ def measure_impact(m: ti.template(), s: ti.template(), k: ti.template(), tau: ti
             u_fixed = -(SPREAD / tau) * p.obstacle_displacement[c]
             for j in range(p.arity[c]):
                 i = p.node[c, j]
-                u_fixed += p.weight[c, j] * (1.0 - ti.cast(m.free[i], ti.f64)) * ti.cast(s.v_hat[i], ti.f64)
+                u_fixed += p.weight[c, j] * (1.0 - ti.cast(m.free[i], ti.f64)) * s.v_hat[i]
             slope += to_world(p, c, p.r[c]).dot(u_fixed)
             if p.min_opening[c] > 0.0:
                 slope -= 0.5 * p.r[c][0] * ti.max(0.0, p.min_velocity[c] + p.approach[c])
@@ -138,7 +138,7 @@ def apply_impact(m: ti.template(), s: ti.template(), k: ti.template(), fraction:
     ti.loop_config(serialize=m.serial)
     for i in range(m.n_nodes):
         m.state.x[i] = k.x_start[i]
-        s.v_hat[i] += ti.cast(fraction * s.change[i], m.real)
+        s.v_hat[i] += fraction * s.change[i]
     ti.loop_config(serialize=p.serial)
     for c in range(p.count[0]):
         struck = fraction * p.r[c]
@@ -152,7 +152,7 @@ def start_from(m: ti.template(), s: ti.template(), still: ti.f64):
     ti.loop_config(serialize=m.serial)
     for i in range(m.n_nodes):
         m.state.x[i] = s.x_hat[i]
-        m.state.v[i] = ti.cast(1.0 - still, m.real) * m.free[i] * s.v_hat[i]
+        m.state.v[i] = (1.0 - still) * m.free[i] * s.v_hat[i]
 
 
 @kernel

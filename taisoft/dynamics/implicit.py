@@ -12,13 +12,13 @@ import taichi as ti
 
 from taisoft.backend.arrays import download, upload
 from taisoft.backend.runtime import kernel
-from taisoft.dynamics.body_balance import LIMIT, BodyBalance
 from taisoft.dynamics.contact import TOLERANCE, ContactStep
 from taisoft.dynamics.contact_newton import solve
 from taisoft.dynamics.elimination import solve_on
 from taisoft.dynamics.impact import solve_bouncing
 from taisoft.dynamics.multipliers import Multipliers, solve_with_multipliers
 from taisoft.dynamics.no_contacts import NoContacts
+from taisoft.dynamics.pieces import LIMIT
 from taisoft.dynamics.results import StageResult, StepResult, count_all
 from taisoft.dynamics.schemes import SCHEMES, Scheme
 from taisoft.dynamics.simulation_state import SimulationState
@@ -61,8 +61,8 @@ def begin_step(
         w.v_hat[i] = h.v_now[i]
         if ti.static(multistep):
             w.x_hat[i] = now * h.x_now[i] - before * h.x_before[i]
-            w.v_hat[i] = ti.cast(now, m.real) * h.v_now[i] - ti.cast(before, m.real) * h.v_before[i]
-        v = ti.cast(1.0 - still, m.real) * h.v_now[i] + ti.cast(extrapolation, m.real) * (h.v_now[i] - h.v_before[i])
+            w.v_hat[i] = now * h.v_now[i] - before * h.v_before[i]
+        v = (1.0 - still) * h.v_now[i] + extrapolation * (h.v_now[i] - h.v_before[i])
         m.state.v[i] = m.free[i] * v
 
 
@@ -87,7 +87,7 @@ def restore(m: ti.template(), h: ti.template()):
 
 @dataclass(frozen=True, eq=False)
 class History:
-    """States n and n - 1, (n_nodes) 3-vectors; x_before only for multistep schemes."""
+    """States n and n - 1, (n_nodes) 3-vectors f64; x_before only for multistep schemes."""
 
     x_now: object
     v_now: object
@@ -103,18 +103,15 @@ class ImplicitStepper:
         m, arena = simulation.model, simulation.arena
         self.history = History(
             arena.vectors("x_now", ti.f64, m.n_nodes),
-            arena.vectors("v_now", m.real, m.n_nodes),
-            arena.vectors("v_before", m.real, m.n_nodes),
+            arena.vectors("v_now", ti.f64, m.n_nodes),
+            arena.vectors("v_before", ti.f64, m.n_nodes),
             arena.vectors("x_before", ti.f64, m.n_nodes) if self.scheme.before else None,
         )
-        prescribed = simulation.dirichlet.prescribed_nodes
         self._multipliers = Multipliers(simulation) if len(simulation.loads.multipliers) else None
-        self.solver = StageSystem(m, arena, simulation.runtime.eps, prescribed, contact, self.history.x_now, self._multipliers)
+        self.solver = StageSystem(simulation, contact, self.history.x_now, self._multipliers)
         self.tolerance = settings.newton_tolerance or DEFAULT_TOLERANCE[settings.precision]
         self.contact_tolerance = settings.contact_tolerance or TOLERANCE[settings.precision]
         self.linear_tolerance = settings.linear_tolerance
-        balance = BodyBalance(simulation.scene)
-        self._balance = balance if balance.n_pieces > 1 else None
         self._substepping = Substepping(self)
         self._saved_start = None, [], contact.flight, False, None  # see `save_start`
         self._start_multipliers = None  # at the start of the last substep
@@ -312,18 +309,17 @@ class ImplicitStepper:
             begin_rigid_stage(self.simulation.model, self.history, multistep, scheme.now, scheme.before, self._beta)
 
     def _solve_balanced(self, scheme: Scheme, dt: float, bounces: bool) -> StageResult:
-        """Solve the stage, and again to a tighter tolerance if the forces on a piece are unbalanced."""
-        result, linear = self._solve(scheme, dt, bounces, self.tolerance), scheme.one_iteration
-        if self._balance is None or not (result.converged and np.isfinite(result.residual)):
+        """Solve the stage; a linearised one again, to a tighter tolerance, if the forces on a piece as a whole are unbalanced."""
+        result, pieces = self._solve(scheme, dt, bounces, self.tolerance), self.solver.pieces
+        if not (scheme.one_iteration and pieces.several and result.converged and np.isfinite(result.residual)):
             return result
-        worst, name = self._balance.worst(self.solver, self._beta, linear)
+        worst, name = pieces.unbalanced_mean(self.solver, self._beta)
         if worst > LIMIT and not bounces:
-            if linear:  # linearised at the step's start
-                self.restore_start()
-                self._begin(scheme, 0.0)
+            self.restore_start()
+            self._begin(scheme, 0.0)
             tighter = self.tolerance * LIMIT / min(worst, 1.0) * TIGHTER
             result = count_all(self._solve(scheme, dt, bounces, tighter), [result])
-            worst, name = self._balance.worst(self.solver, self._beta, linear)
+            worst, name = pieces.unbalanced_mean(self.solver, self._beta)
         return replace(result, unbalanced=(worst, name)) if worst > LIMIT else result
 
     def _solve(self, scheme: Scheme, dt: float, bounces: bool, tolerance: float) -> StageResult:

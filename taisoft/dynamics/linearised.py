@@ -18,7 +18,7 @@ from taisoft.dynamics.contact_terms import (
     unprojected_impulse,
     update_contact,
 )
-from taisoft.dynamics.stage import place_node
+from taisoft.dynamics.stage import norm_weight, place_node
 from taisoft.fem.chunks import THREADS, block_total, chunk_entry, chunk_size, fold, share, total
 from taisoft.fem.state import OTHER_SUM, STEP_LENGTH, SUM
 from taisoft.linear.block_csr import block_times, off_diagonal_times
@@ -151,7 +151,7 @@ def node_residual(m: ti.template(), s: ti.template(), k: ti.template(), i):
     s.residual[i] = r
     free_residual = m.free[i] * r
     s.pcg.rhs[i] = -free_residual
-    return dot64(free_residual, free_residual)
+    return norm_weight(s, i) * dot64(free_residual, free_residual)
 
 
 @kernel

@@ -47,7 +47,6 @@ class Newton:
         """eliminate: as `elimination.eliminate`, called after slow steps; None: no elimination."""
         self.system, self.stage, self.eliminate = system, stage, eliminate
         self.is_linearised = system.kind == LINEARISED  # the caller then handles an indefinite matrix
-        self.floor = system.rounding.stage_floor(stage.c, stage.beta)
         self.max_forcing = MAX_FORCING if stage.c > 0.0 else STATIC_FORCING
         self.newton = self.linear = self.multigrid = self.multipliers = self.n_remembered = 0
         self.eliminated = 0.0  # Newton iterations on few nodes, times their fraction of all nodes
@@ -62,7 +61,11 @@ class Newton:
         self._begin_multiplier()
         while True:
             if self._inner_done():
-                if self._has_converged() or not self._update_multipliers():
+                if self._has_converged():
+                    if system.balances_pieces():
+                        break
+                    self._begin_again()
+                elif not self._update_multipliers():
                     break
                 continue
             if self.newton >= self.stage.max_newton:
@@ -77,7 +80,18 @@ class Newton:
                 break
             fresh = moved and not self._eliminate()
         self.r_scale, system.r_scale = system.r_scale, R_SCALE  # initial value of the next solve
-        return self._result(self._inner_done() and self._has_converged())
+        return self._result(self._inner_done() and self._has_converged() and system.balances_pieces())
+
+    def _begin_again(self) -> None:
+        """Go on from |r| in new weights, in which it has not converged."""
+        self.r, self.scale = self.system.evaluate(None)
+        self.rounding = False
+        self._begin_multiplier()
+
+    @property
+    def floor(self) -> float:
+        """Rounding floor of |r|."""
+        return self.system.floor
 
     def _begin_multiplier(self) -> None:
         """Set the target of |r| and reset the progress after a multiplier update."""
@@ -198,6 +212,7 @@ class Newton:
             self.rounding or r <= self.floor,
             self.multipliers,
             system.contact_residual,
+            unbalanced=(0.0, "") if converged else system.least_balanced(),
             multigrid_solves=self.multigrid,
         )
 
@@ -205,7 +220,7 @@ class Newton:
         """Take one full step without line search, of a linearised stage without contacts; it converges if the solve does."""
         system = self.system
         self.has_contacts, self.previous = False, 0.0
-        self.r, self.scale = system.evaluate()
+        self.r, self.scale = system.begin_linearised_step()
         solved = True
         if self.r > self.stage.tolerance * self.scale:
             # no later step corrects this solve
@@ -216,8 +231,10 @@ class Newton:
                 if not solution.negative:
                     break
             solved = solution.converged and system.linear_residual() <= LINEAR_LIMIT
-            self.r, self.scale = system.evaluate(STEP)
             self.newton = 1
+        else:
+            system.work.pcg.y.fill(0.0)
+        self.r, self.scale = system.take_linearised_step()
         return self._result(solved)
 
 

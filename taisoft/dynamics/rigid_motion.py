@@ -57,14 +57,14 @@ def _centre(m: ti.template(), k, v: ti.template(), dt):
         own = ti.cast(m.mass[i], ti.f64)
         mass += own
         c += own * _before(m, i, v, dt)
-        u += own * ti.cast(v[i], ti.f64)
+        u += own * v[i]
     return c / mass, u / mass
 
 
 @ti.func
 def _before(m: ti.template(), i, v: ti.template(), dt):
     """Position of node i before it moved for dt."""
-    return m.state.x[i] - ti.cast(dt * v[i], ti.f64)
+    return m.state.x[i] - dt * v[i]
 
 
 @ti.func
@@ -77,7 +77,7 @@ def _momenta(m: ti.template(), k, v: ti.template(), dt, c, w):
         own, arm = ti.cast(m.mass[i], ti.f64), _before(m, i, v, dt) - c
         r = _turned(arm, w)
         I += own * (r.dot(r) * ti.Matrix.identity(ti.f64, 3) - r.outer_product(r))
-        L += own * arm.cross(ti.cast(v[i], ti.f64))
+        L += own * arm.cross(v[i])
     return I, L
 
 
@@ -85,37 +85,36 @@ def _momenta(m: ti.template(), k, v: ti.template(), dt, c, w):
 def project_velocities(m: ti.template(), k):
     """Replace the velocities of tet k by those of the rigid motion with their momentum and angular momentum."""
     zero, free = ti.Vector([0.0, 0.0, 0.0], ti.f64), _free_axes(m, k)
-    none = ti.cast(0.0, m.real)
+    none = ti.cast(0.0, ti.f64)
     c, u = _centre(m, k, m.state.v, none)
     I, L = _momenta(m, k, m.state.v, none, c, zero)
     w = _spin(I, L, free)
     for a in range(FRAME):
         i = m.rigid_tets.node[FRAME * k + a]
         v = u + w.cross(m.state.x[i] - c)
-        m.state.v[i] = ti.cast(free * v + (1.0 - free) * ti.cast(m.state.v[i], ti.f64), m.real)
+        m.state.v[i] = free * v + (1.0 - free) * m.state.v[i]
 
 
 @ti.func
 def turn(m: ti.template(), k, v: ti.template(), dt):
     """Move tet k, whose nodes have moved by dt v, as a rigid body instead, and make v that of the rigid motion."""
     zero, free = ti.Vector([0.0, 0.0, 0.0], ti.f64), _free_axes(m, k)
-    time = ti.cast(dt, ti.f64)
     c, u = _centre(m, k, v, dt)
     I, L = _momenta(m, k, v, dt, c, zero)
-    I_middle, _L = _momenta(m, k, v, dt, c, 0.5 * time * _spin(I, L, free))
-    angle = time * _spin(I_middle, L, free)
+    I_middle, _L = _momenta(m, k, v, dt, c, 0.5 * dt * _spin(I, L, free))
+    angle = dt * _spin(I_middle, L, free)
     for a in range(FRAME):
         i = m.rigid_tets.node[FRAME * k + a]
-        x = c + time * u + _turned(_before(m, i, v, dt) - c, angle)
+        x = c + dt * u + _turned(_before(m, i, v, dt) - c, angle)
         m.state.x[i] = free * x + (1.0 - free) * m.state.x[i]
-    none = ti.cast(0.0, m.real)
+    none = ti.cast(0.0, ti.f64)
     end, _u = _centre(m, k, v, none)
     I_end, _L_end = _momenta(m, k, v, none, end, zero)
     w = _spin(I_end, L, free)
     for a in range(FRAME):
         i = m.rigid_tets.node[FRAME * k + a]
         own = u + w.cross(m.state.x[i] - end)
-        v[i] = ti.cast(free * own + (1.0 - free) * ti.cast(v[i], ti.f64), m.real)
+        v[i] = free * own + (1.0 - free) * v[i]
 
 
 @ti.func
@@ -124,7 +123,7 @@ def turn_all(m: ti.template(), s: ti.template(), dt):
     if ti.static(m.has_rigid_tets):
         ti.loop_config(serialize=m.serial)
         for k in range(m.rigid_tets.n):
-            turn_drifted(m, s, k, ti.cast(dt, m.real))
+            turn_drifted(m, s, k, dt)
 
 
 @ti.func

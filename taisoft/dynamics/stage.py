@@ -25,7 +25,7 @@ from taisoft.fem.node_graph import BLOCKS, EDGES, NODES, Subset, n_nodes_of, nod
 from taisoft.fem.pattern import patch_nodes
 from taisoft.fem.state import END_SLOPE, N_NORMS, OTHER_SUM, START_SLOPE, SUM
 from taisoft.fem.terms import elasticity, rayleigh_damping
-from taisoft.linear.block_csr import BlockCsr, row_times
+from taisoft.linear.block_csr import BlockCsr, stiffness_times
 from taisoft.linear.pcg_work import PcgWork, dot64
 from taisoft.ranges import entries_of, owners
 
@@ -38,7 +38,7 @@ class StageWork:
     """Fields of a stage; (n_nodes) 3-vectors."""
 
     x_hat: Any  # f64
-    v_hat: Any
+    v_hat: Any  # f64
     base: Any  # f64: x before the trial step
     residual: Any  # on all axes; on constrained ones, beta times the constraint force
     prescribed_nodes: Any  # (n_prescribed) i32
@@ -48,6 +48,7 @@ class StageWork:
     n_prescribed: Count
     change: Any  # f64: velocity change that the mass multiplies, see `set_change`
     damper: Any  # BlockCsr or None
+    pieces: Any  # PieceWork
     pcg: PcgWork  # right side -r; y, the change of v in a Newton step; subset, the nodes that move
 
     @property
@@ -58,7 +59,7 @@ class StageWork:
 
 @ti.func
 def stage_velocity(m: ti.template(), w: ti.template(), i, beta):
-    """Return (x - x_hat) / beta of node i in f64: an f32 velocity would make neighbours' positions differ by its rounding."""
+    """Return (x - x_hat) / beta of node i."""
     return (m.state.x[i] - w.x_hat[i]) / beta
 
 
@@ -72,7 +73,7 @@ def begin_stage(m: ti.template(), w: ti.template(), beta: ti.f64, prescribed_fra
     """
     ti.loop_config(serialize=m.serial)
     for i in range(m.n_nodes):
-        m.state.x[i] = w.x_hat[i] + beta * ti.cast(m.state.v[i], ti.f64)
+        m.state.x[i] = w.x_hat[i] + beta * m.state.v[i]
     if ti.static(w.has_prescribed):
         ti.loop_config(serialize=True)
         for k in range(w.n_prescribed):
@@ -81,34 +82,54 @@ def begin_stage(m: ti.template(), w: ti.template(), beta: ti.f64, prescribed_fra
                 if w.prescribed_axes[k][a] != 0:
                     v = (w.targets[k][a] - w.x_hat[i][a]) / beta
                     if ti.static(m.consistent):
-                        w.v_hat[i][a] = ti.cast(v - beta * w.prescribed_acceleration[k][a], m.real)
+                        w.v_hat[i][a] = v - beta * w.prescribed_acceleration[k][a]
                     else:
-                        w.v_hat[i][a] = ti.cast(v - prescribed_fraction * (v - ti.cast(w.v_hat[i][a], ti.f64)), m.real)
-                    m.state.v[i][a] = ti.cast(v, m.real)
+                        w.v_hat[i][a] = v - prescribed_fraction * (v - w.v_hat[i][a])
+                    m.state.v[i][a] = v
                     m.state.x[i][a] = w.targets[k][a]
 
 
 @ti.func
 def set_change(m: ti.template(), w: ti.template(), i, c, beta):
     """Set c (v - v_hat), plus beta a v with mass damping, for node i."""
-    change = c * (stage_velocity(m, w, i, beta) - ti.cast(w.v_hat[i], ti.f64))
+    change = c * (stage_velocity(m, w, i, beta) - w.v_hat[i])
     if ti.static(m.damped):
         change += beta * ti.cast(rayleigh_damping.mass_rate(m, i), ti.f64) * ti.cast(m.state.v[i], ti.f64)
     w.change[i] = change
 
 
 @ti.func
-def residual_parts(m: ti.template(), w: ti.template(), chunk, i, beta):
-    """Return (r, inertia and mass damping, internal forces, loads) of node i without contacts; uses `change`."""
-    zero = ti.Vector([0.0, 0.0, 0.0], m.real)
-    internal, loads, damping = zero, zero, zero
+def loads_on(m: ti.template(), i):
+    """Applied loads on node i [N]."""
+    f = ti.Vector([0.0, 0.0, 0.0], m.real)
     for term in ti.static(m.terms):
         if ti.static(term.LOAD):
-            loads += force_with_dependents(m, term, i)
-        else:
-            internal += force_with_dependents(m, term, i)
+            f += force_with_dependents(m, term, i)
+    return f
+
+
+@ti.func
+def internal_on(m: ti.template(), i):
+    """All other forces on node i but those of damping [N]."""
+    f = ti.Vector([0.0, 0.0, 0.0], m.real)
+    for term in ti.static(m.terms):
+        if ti.static(not term.LOAD):
+            f += force_with_dependents(m, term, i)
+    return f
+
+
+@ti.func
+def damping_force(m: ti.template(), w: ti.template(), chunk, i, v: ti.template()):
+    """Force of stiffness damping on node i at velocities v [N], within a chunk of a loop."""
+    return rayleigh_damping.stiffness_force(m, i, stiffness_times(m, w.damper, chunk, i, v))
+
+
+@ti.func
+def residual_parts(m: ti.template(), w: ti.template(), chunk, i, beta):
+    """Return (r, inertia and mass damping, internal forces, loads) of node i without contacts; uses `change`."""
+    internal, loads, damping = internal_on(m, i), loads_on(m, i), ti.Vector([0.0, 0.0, 0.0], m.real)
     if ti.static(m.stiffness_damping):
-        damping += rayleigh_damping.stiffness_force(m, i, row_times(m, w.damper, chunk, i, m.state.v))
+        damping += damping_force(m, w, chunk, i, m.state.v)
     inertia = ti.cast(mass_times(m, i, w.change), m.real)
     return inertia - ti.cast(beta, m.real) * (internal + loads + damping), inertia, internal, loads
 
@@ -117,6 +138,24 @@ def residual_parts(m: ti.template(), w: ti.template(), chunk, i, beta):
 def squares(r, inertia, f, external, free):
     """Return the contributions of node i to the norms of `form_residual`."""
     return ti.Vector([norm2(free * r), norm2(free * inertia), norm2(free * f), norm2(free * external), norm2((1.0 - free) * r)])
+
+
+@ti.func
+def norm_weight(s: ti.template(), i):
+    """Weight of node i in squares of norms: that of its piece."""
+    weight = ti.cast(1.0, ti.f64)
+    if ti.static(s.pieces.several):
+        weight = s.pieces.weight[s.pieces.piece[i]]
+    return weight
+
+
+@ti.func
+def merit_weight(s: ti.template(), i):
+    """Weight of node i in slopes: components without contacts are independent of each other, each in the norm of its solve."""
+    weight = ti.cast(1.0, ti.f64)
+    if ti.static(s.pieces.several):
+        weight = s.pieces.factor[s.pieces.component[i]] ** 2
+    return weight
 
 
 @ti.func
@@ -131,7 +170,7 @@ def place_node(m: ti.template(), w: ti.template(), i, step_length, beta):
     m.state.x[i] = w.base[i]
     if step_length != 0.0:  # so that 0 restores the base even if y is not a number
         m.state.x[i] += step_length * beta * ti.cast(w.pcg.y[i], ti.f64)
-    m.state.v[i] = ti.cast(stage_velocity(m, w, i, beta), m.real)
+    m.state.v[i] = stage_velocity(m, w, i, beta)
 
 
 @kernel
@@ -139,7 +178,7 @@ def set_direction_to_rest(m: ti.template(), w: ti.template()):
     """Set y = -v on the free axes."""
     ti.loop_config(serialize=m.serial)
     for i in range(m.n_nodes):
-        w.pcg.y[i] = -m.free[i] * m.state.v[i]
+        w.pcg.y[i] = ti.cast(-m.free[i] * m.state.v[i], m.real)
 
 
 @kernel
@@ -174,7 +213,7 @@ def move(
             for at in range(chunk_size(m, chunk, n)):
                 i = node_of(s.pcg.subset, chunk_entry(m, chunk, at, n))
                 if mode == STEP:
-                    slope += dot64(m.free[i] * s.residual[i], s.pcg.y[i])
+                    slope += merit_weight(s, i) * dot64(m.free[i] * s.residual[i], s.pcg.y[i])
                     s.base[i] = m.state.x[i]
                 if mode != STAY:
                     place_node(m, s, i, step_length, beta)
@@ -232,8 +271,8 @@ def form_residual(
                         r = zero
                 s.residual[i] = r
                 s.pcg.rhs[i] = -free * r
-                sums += squares(r, inertia, f, external, free)
-                slope += dot64(free * r, s.pcg.y[i])
+                sums += norm_weight(s, i) * squares(r, inertia, f, external, free)
+                slope += merit_weight(s, i) * dot64(free * r, s.pcg.y[i])
             for j in ti.static(range(N_NORMS)):
                 m.state.partial[chunk, j] = sums[j]
             m.state.partial[chunk, SUM] = slope

@@ -18,8 +18,7 @@ import taichi as ti
 
 from taisoft.backend.arrays import FieldArena, download, upload
 from taisoft.contact.problem import RESIDUAL, find_factors
-from taisoft.dynamics import frictional
-from taisoft.dynamics.body_balance import RoundingFloor
+from taisoft.dynamics import frictional, rigid_balance
 from taisoft.dynamics.contact_terms import (
     NO_CONTACTS,
     StageContacts,
@@ -31,12 +30,26 @@ from taisoft.dynamics.contact_terms import (
 from taisoft.dynamics.direct import DirectSolver, can_solve_directly
 from taisoft.dynamics.linear_solver import LinearSolver
 from taisoft.dynamics.linearised import LONGEST, advance, begin_linearised, end_linearised
+from taisoft.dynamics.pieces import Pieces
+from taisoft.dynamics.rigid_balance import (
+    AFTER,
+    BEFORE,
+    SOLVED,
+    correct_rigid_motion,
+    equalise,
+    measure_pieces,
+    turn_forces,
+    undo_factors,
+)
+from taisoft.dynamics.rounding import RoundingFloor
+from taisoft.dynamics.simulation_state import SimulationState
 from taisoft.dynamics.stage import (
     AGAIN,
     ELASTIC_STAGE,
     IMPACT,
     LINEARISED,
     STAY,
+    STEP,
     StageWork,
     SubsetLists,
     begin_stage,
@@ -62,6 +75,8 @@ if TYPE_CHECKING:
 # Nodes from which threads share linear solves with contacts, and nodes per contact. Two cubes on two threads: no gain at 16,000
 # nodes, a quarter of the step at 60,000. Contacts themselves stay on one thread: piles with 2 to 3 nodes per contact lose time
 SHARED_FROM, NODES_PER_CONTACT = 25_000, 8
+BALANCED = 4.0  # |r|_p over s_p of a piece, times the tolerance and the root of the number of pieces: a converged piece has less
+NEARLY = 0.1  # of the tolerance: |r|_p over s_p below which a component counts less in linear solves
 VOLUME_PASSES = 2  # corrections of the first iterate, each of which leaves errors of second order
 
 
@@ -97,25 +112,24 @@ class StageSystem:
 
     def __init__(
         self,
-        model: Model,
-        arena: FieldArena,
-        eps: float,
-        prescribed: np.ndarray,
+        simulation: SimulationState,
         contact: "ContactStep | NoContacts",
         x_start: Any = None,
         multipliers: "Multipliers | None" = None,
     ):
-        """prescribed: nodes that follow a path. x_start: (n_nodes) 3-vectors f64, positions at the start of the step.
+        """x_start: (n_nodes) 3-vectors f64, positions at the start of the step.
 
         multipliers: of cavities of given volume and inextensible tendons, if there are any.
         """
+        model, arena, prescribed = simulation.model, simulation.arena, simulation.dirichlet.prescribed_nodes
         self.model, self.contact, self.x_start, self.multipliers = model, contact, x_start, multipliers
+        self.pieces = Pieces(simulation, arena)
         self.matrix: BlockCsr = block_csr.build_block_csr(model, arena)
         self.damper = block_csr.sibling(self.matrix, model, arena, "damping") if model.stiffness_damping else None
         n, k = model.n_nodes, len(prescribed)
         self.work = StageWork(
             x_hat=arena.vectors("x_hat", ti.f64, n),
-            v_hat=arena.vectors("v_hat", model.real, n),
+            v_hat=arena.vectors("v_hat", ti.f64, n),
             base=arena.vectors("x_base", ti.f64, n),
             residual=arena.vectors("residual", model.real, n),
             prescribed_nodes=arena.field("stage_moved", ti.i32, k, prescribed.astype(np.int32)) if k else None,
@@ -125,9 +139,12 @@ class StageSystem:
             n_prescribed=k,
             change=arena.vectors("change", ti.f64, n),
             damper=self.damper,
+            pieces=self.pieces.work,
             pcg=build_pcg(model, arena),
         )
-        self.rounding = RoundingFloor(model, eps)
+        self.rounding = RoundingFloor(model, simulation.runtime.eps, self.pieces)
+        self.floor = 0.0  # rounding floor of |r| of the present stage
+        self.unbalanced = 0.0, ""  # largest relative residual of a piece at the last `balances_pieces`, and its name
         self.linear_solver = LinearSolver(model)
         self._direct = DirectSolver(self) if multipliers is None and can_solve_directly(model) else None
         self.kind = ELASTIC_STAGE
@@ -258,6 +275,9 @@ class StageSystem:
 
     def _begin(self, stage: Stage, kind: int) -> None:
         self.stage, self.kind, self.r_scale, self._k = stage, kind, frictional.R_SCALE, NO_CONTACTS
+        self.floor, self.unbalanced = self.rounding.of_stage(stage.c, stage.beta), (0.0, "")
+        if self.pieces.several:
+            self.pieces.forget_weights()
         self.restrict(None)
         if self.contact.n_contacts == 0:
             return
@@ -284,6 +304,60 @@ class StageSystem:
             update_impulses(m, k, int(new_multipliers), stage.beta, self.r_scale)
         form_residual(m, w, self.matrix, k, self.kind, stage.beta, self.norms)
         return self._norm_and_scale(stage.c, stage.beta)
+
+    def evaluate_start(self, new_multipliers: bool = False) -> tuple[float, float]:
+        """Return (|r|, scale) of the first iterate, with its weights of pieces."""
+        found = self.evaluate(new_multipliers=new_multipliers)
+        if not self.pieces.several:
+            return found
+        self._weigh()
+        return self.evaluate(None)
+
+    def _weigh(self) -> None:
+        """Set the weights of pieces and the rounding floor, and find the least balanced piece."""
+        stage, floor = self.stage, self.rounding.of_pieces(self.stage.c, self.stage.beta)
+        measure_pieces(self.model, self._whole, self.pieces.work, stage.beta)
+        self.unbalanced = self.pieces.weigh(floor, stage.beta, stage.tolerance, self.is_static)
+        self.floor = math.sqrt((floor**2 * self.pieces.work.weight.to_numpy()).sum())
+
+    def balances_pieces(self) -> bool:
+        """Return whether each piece has converged, once |r| has; otherwise its weights are new, and so are |r| and scale."""
+        if not self.pieces.several or self.kind != ELASTIC_STAGE or self.work.pcg.subset.restricted or self.stage.linearised:
+            return True
+        self._weigh()
+        return self.unbalanced[0] <= BALANCED * math.sqrt(self.pieces.work.n) * self.stage.tolerance
+
+    def least_balanced(self) -> tuple[float, str]:
+        """Return the largest relative residual of a piece, and its name; (0, "") if there is one piece, or the stage is none."""
+        balanced = self.balances_pieces()
+        return (0.0, "") if balanced else self.unbalanced
+
+    def balance_rigid_motion(self) -> None:
+        """Balance free components as a whole, see `pieces`; the elastic forces are those at the end, or of the linearisation."""
+        stage, m, w = self.stage, self.model, self.work
+        if stage.c == 0.0 or (stage.linearised and m.has_pressure):  # follower loads change in a linearised step
+            return
+        x = self._k.x_linear if stage.linearised else m.state.x
+        correct_rigid_motion(m, w, self.pieces.work, self._k, x, rigid_balance.LINEARISED if stage.linearised else SOLVED, stage.beta)
+
+    def begin_linearised_step(self) -> tuple[float, float]:
+        """Begin a linearised step without contacts by the rigid motion of its free components; return (|r|, scale)."""
+        m, w, p, beta = self.model, self.work, self.pieces.work, self.stage.beta
+        found = self.evaluate_start()
+        if m.has_pressure:
+            return found
+        correct_rigid_motion(m, w, p, NO_CONTACTS, m.state.x, BEFORE, beta)
+        found = self.evaluate(None)
+        turn_forces(m, w, p, beta)
+        return found
+
+    def take_linearised_step(self) -> tuple[float, float]:
+        """Take the whole step along y; return (|r|, scale)."""
+        m, w = self.model, self.work
+        if m.has_pressure:
+            return self.evaluate(STEP)
+        correct_rigid_motion(m, w, self.pieces.work, NO_CONTACTS, m.state.x, AFTER, self.stage.beta)
+        return self.evaluate(STAY)
 
     def step_with_volumes(self, acceptable: float) -> tuple[float, float] | None:
         """Step along y on a curve to the volumes of nearly incompressible bodies that y leads to in first order.
@@ -451,9 +525,19 @@ class StageSystem:
         """Solve for y of pcg from its right side."""
         m, w = self.model, self.work
         if not self._k.any and not w.pcg.subset.restricted:
-            return self.linear_solver.solve(self, tolerance)
+            return self._solve_equalised(tolerance) if self.pieces.several else self.linear_solver.solve(self, tolerance)
+        if self.pieces.several and w.pcg.subset.restricted:
+            self.pieces.forget_factors()
         solution = pcg.solve(m, self.matrix, w.pcg, tolerance, pcg.iteration_limit(m), self._k.coupling, self._same_matrix)
         self._same_matrix = True
+        return solution
+
+    def _solve_equalised(self, tolerance: float) -> LinearResult:
+        """Solve with all components in equal norms; those whose residual is far below the tolerance count less."""
+        m, w, p = self.model, self.work.pcg, self.pieces.work
+        equalise(m, self.matrix, w, p, (NEARLY * self.stage.tolerance) ** 2)
+        solution = self.linear_solver.solve(self, tolerance)
+        undo_factors(m, w, p)
         return solution
 
     # --- other queries ---------------------------------------------------------------------------------------------

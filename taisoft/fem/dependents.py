@@ -173,9 +173,9 @@ def place(m: ti.template(), k):
     x, v = ti.Vector([0.0, 0.0, 0.0], ti.f64), ti.Vector([0.0, 0.0, 0.0], ti.f64)
     for e in range(m.dependents.start[k], m.dependents.start[k + 1]):
         x += m.dependents.weight[e] * m.state.x[m.dependents.master[e]]
-        v += m.dependents.weight[e] * ti.cast(m.state.v[m.dependents.master[e]], ti.f64)
+        v += m.dependents.weight[e] * m.state.v[m.dependents.master[e]]
     m.state.x[m.dependents.node[k]] = x
-    m.state.v[m.dependents.node[k]] = ti.cast(v, m.real)
+    m.state.v[m.dependents.node[k]] = v
 
 
 @ti.func

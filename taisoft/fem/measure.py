@@ -63,7 +63,7 @@ def measure(m: ti.template()):
             kinetic, weight, loads = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64)
             for k in range(chunk_size(m, c, m.n_nodes)):
                 i = chunk_entry(m, c, k, m.n_nodes)
-                kinetic += 0.5 * ti.cast(m.state.v[i], ti.f64).dot(mass_times(m, i, m.state.v))
+                kinetic += 0.5 * m.state.v[i].dot(mass_times(m, i, m.state.v))
                 weight += gravity.energy(m, i)
                 if ti.static(m.loaded):
                     loads += dead_loads.energy(m, i)

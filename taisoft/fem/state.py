@@ -30,7 +30,7 @@ class State:
     """Positions and velocities of all nodes, and scratch."""
 
     x: Any  # (n_nodes) 3-vectors f64: positions [m]
-    v: Any  # (n_nodes) 3-vectors: velocities [m/s]
+    v: Any  # (n_nodes) 3-vectors f64: velocities [m/s]; an f32 one would bend small bodies that are fast by its rounding
     element_force: Any  # forces of each tet on its nodes [N], per block (node, axis, lane): a `Lanes` buffer
     element_force_at: Count  # first entry of that buffer
     element_force_mask: int  # index mask of that buffer
@@ -43,7 +43,7 @@ def build_state(arena: FieldArena, runtime: Runtime, x: np.ndarray, v: np.ndarra
     force = arena.lanes("element_force", runtime.real, n_force_entries)
     return State(
         x=arena.vectors("x", ti.f64, len(x), x),
-        v=arena.vectors("v", runtime.real, len(v), v.astype(runtime.np_real)),
+        v=arena.vectors("v", ti.f64, len(v), v),
         element_force=force.memory,
         element_force_at=force.at,
         element_force_mask=force.mask,

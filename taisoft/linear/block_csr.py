@@ -301,6 +301,18 @@ def row_times(m: ti.template(), A: ti.template(), c, i, x: ti.template()):
     return block_times(A.diagonal[i], x[i]) + off_diagonal_times(m, A, c, i, x)
 
 
+@ti.func
+def stiffness_times(m: ti.template(), A: ti.template(), c, i, x: ti.template()):
+    """(A x)_i of a stiffness, within chunk c of a loop. Its rows sum to zero: differences leave no rounding of a common x."""
+    y = ti.Vector([0.0, 0.0, 0.0, 0.0], m.real)
+    for half in range(2):
+        row = i + half * m.n_nodes
+        for k in range(A.row_start[row], A.row_start[row + 1]):
+            y += padded_times(A.value[k], ti.cast(x[A.column[k]] - x[i], m.real))
+    keep_padding_lane(m, A, c, y)
+    return ti.Vector([y[0], y[1], y[2]])
+
+
 @kernel
 def multiply(m: ti.template(), A: ti.template(), x: ti.template(), y: ti.template()):
     """y = A x, (n_nodes) 3-vectors."""

@@ -244,7 +244,7 @@ def correct_volumes(m: ti.template(), s: ti.template(), x_hat: ti.template(), be
                 change += s.rhs[s.row[n]] * ti.cast(s.column[n], ti.f64)
             x = m.state.x[i] - change
             m.state.x[i] = x
-            m.state.v[i] = ti.cast((x - x_hat[i]) / beta, m.real)
+            m.state.v[i] = (x - x_hat[i]) / beta
 
 
 @kernel

@@ -18,7 +18,9 @@ from taisoft.contact.problem import RESIDUAL, build_node_problem, fill_field, fi
 from taisoft.dynamics import contact_terms, linearised
 from taisoft.dynamics.contact_terms import NO_CONTACTS
 from taisoft.dynamics.frictional import extrapolate_multipliers
+from taisoft.dynamics.dirichlet import DirichletConditions
 from taisoft.dynamics.no_contacts import NoContacts
+from taisoft.dynamics.simulation_state import SimulationState
 from taisoft.dynamics.stage import AGAIN, ELASTIC_STAGE, STAY, STEP, form_residual, move
 from taisoft.dynamics.stage_system import StageSystem
 from taisoft.fem.node_graph import EVERYTHING
@@ -51,7 +53,8 @@ def rig():
         arity = contacts.arity.copy()
         arity[::5] = (contacts.weight[::5] > 0).sum(axis=1)  # against an obstacle
         p = build_node_problem(arena, K + 3, m.n_nodes, True)
-        solver = StageSystem(m, arena, made.machine.eps, np.zeros(0, dtype=int), NoContacts())
+        simulation = SimulationState(scene, made.machine, arena, m, made.layout, DirichletConditions(scene, made.layout))
+        solver = StageSystem(simulation, NoContacts())
         k = contact_terms.build_stage_contacts(arena, m, p, arena.vectors("x_start", ti.f64, m.n_nodes))
         for name in ("node", "weight", "normal", "tangent"):
             fill_field(getattr(p, name), getattr(contacts, name))

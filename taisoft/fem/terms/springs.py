@@ -92,7 +92,7 @@ def prepare(m: ti.template(), line):
                     at += m.springs.rate_after
                     rate = ti.Vector([m.amplitudes[at], m.amplitudes[at + 1], m.amplitudes[at + 2]], ti.f64)
             for k in range(m.springs.start[s], m.springs.start[s + 1]):
-                rate += m.springs.weight[k] * ti.cast(m.state.v[m.springs.node[k]], ti.f64)
+                rate += m.springs.weight[k] * m.state.v[m.springs.node[k]]
             if not _is_isotropic(m, s):
                 rate = rate.dot(d) * d
             pull += m.springs.numbers[s, 2] * rate

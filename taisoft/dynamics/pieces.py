@@ -1,0 +1,186 @@
+"""Connected pieces of a scene: each counts by itself, and the rigid motion of free ones is known in closed form.
+
+Newton's method and CG end on norms over the whole scene, in which the forces on a light or little strained piece vanish beside
+those of a heavy one. So norms are sums of |r|_p^2 / s_p^2 over the pieces p, with
+    s_p = |M (v - v_hat)|_p + beta (|f_internal|_p + |loads|_p),
+but at least so large that rounding is below the tolerance; and the right side of a linear solve is scaled so that all components,
+pieces joined by connections, have the same energy norm.
+
+Internal forces have no resultant and no moment. A free component therefore obeys, with arms from its centre,
+    sum_i [M (v - v_hat)]_i - beta loads_i = 0,   sum_i arm_i x ([M (v - v_hat)]_i - beta loads_i) = 0,
+mass damping in M (v - v_hat). However loosely a stage is solved, its v is corrected by the rigid motion that restores both sums.
+In a linearly implicit step the arms are those of its start, and the forces f - beta K v, whose moment is beta sum_i f_i x v_i.
+"""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import taichi as ti
+
+from taisoft.backend.arrays import Count, FieldArena, download, upload
+from taisoft.dynamics.rigid_balance import N_MOMENTS, N_SUMS, N_TERMS, measure_pieces
+from taisoft.dynamics.simulation_state import SimulationState
+from taisoft.mesh.topology import connected_pieces, linked_groups
+
+if TYPE_CHECKING:
+    from taisoft.dynamics.stage_system import StageSystem
+
+LIMIT = 0.01  # of the forces on a piece: a larger mean residual of a linearised step means wrong motion
+NEGLIGIBLE_MOMENTUM = 1e-9  # of a piece's momentum and forces: momentum error that a step may always make
+MEAN_ROUNDING = 4.0  # times the rounding of a mean residual
+ROW = 256  # nodes of a partial sum
+ROUNDED = 1e-12  # sum of the weights of an element of springs, between points of bodies: 0 but for rounding
+
+
+@dataclass(frozen=True, eq=False)
+class PieceWork:
+    """Pieces in the order of their components, for kernels."""
+
+    several: bool  # whether norms have weights
+    n: Count
+    n_components: Count
+    n_rows: Count
+    row_start: Any  # (n_rows + 1) i32: first place of each row in `node`
+    piece_row: Any  # (n + 1) i32: first row of each piece
+    component_row: Any  # (n_components + 1) i32: first row of each component
+    node: Any  # (n_nodes) i32: nodes by piece
+    piece: Any  # (n_nodes) i32 of each node
+    component: Any  # (n_nodes) i32 of each node
+    weight: Any  # (n) f64: 1 / s_p^2
+    factor: Any  # (n_components) f64: of right sides and solutions of linear solves
+    norms: Any  # (n, N_SUMS) f64
+    sums: Any  # (n_rows, N_TERMS) f64: scratch
+    anchored: Any  # (n_components) i32: 1 if forces from outside other than loads act on it
+    held: Any  # (n_components) i32: scratch, `anchored` or in contact
+    moments: Any  # (n_components, N_MOMENTS) f64: scratch: mass, centre, resultant, constraints by axis
+    motion: Any  # (n_components, 6) f64: correction, velocity of the centre and angular velocity
+
+class Pieces:
+    """The pieces of a simulation, their names, and the kernels' record of them."""
+
+    def __init__(self, simulation: SimulationState, arena: FieldArena):
+        self.model = simulation.model
+        piece, names, self.body = _pieces(simulation)
+        n_nodes, n = len(piece), len(names)
+        anchored, component = _components(simulation, piece, n)
+        order = np.argsort(component[piece] * n + piece, kind="stable")
+        number = np.unique(component * n + np.arange(n), return_inverse=True)[1]  # of each piece, by component
+        self._names, self.body = [names[k] for k in np.argsort(number)], self.body[np.argsort(number)]
+        component, piece = component[np.argsort(number)], number[piece]
+        self.of_node = piece
+        rows = [-(-count // ROW) for count in np.bincount(piece, minlength=n)]
+        first = np.concatenate([[0], np.cumsum(np.bincount(piece, minlength=n))])
+        starts = np.concatenate([first[k] + ROW * np.arange(rows[k]) for k in range(n)] + [[n_nodes]])
+        piece_row = np.concatenate([[0], np.cumsum(rows)])
+        n_components, n_rows = int(component.max()) + 1, int(piece_row[-1])
+
+        def ids(name: str, data):
+            return arena.field(f"piece_{name}", ti.i32, len(data), np.asarray(data, dtype=np.int32))
+
+        def numbers(name: str, shape, data=None):
+            return arena.field(f"piece_{name}", ti.f64, shape, data)
+
+        self.work = PieceWork(
+            several=n > 1,
+            n=n,
+            n_components=n_components,
+            n_rows=n_rows,
+            row_start=ids("row_start", starts),
+            piece_row=ids("row", piece_row),
+            component_row=ids("component_row", piece_row[np.searchsorted(component, np.arange(n_components + 1))]),
+            node=ids("node", order),
+            piece=ids("number", piece),
+            component=ids("component", component[piece]),
+            weight=numbers("weight", n, np.ones(n)),
+            factor=numbers("factor", n_components, np.ones(n_components)),
+            norms=numbers("norms", (n, N_SUMS)),
+            sums=numbers("sums", (n_rows, N_TERMS)),
+            anchored=ids("anchored", anchored),
+            held=ids("held", anchored),
+            moments=numbers("moments", (n_components, N_MOMENTS)),
+            motion=numbers("motion", (n_components, 6)),
+        )
+
+    @property
+    def several(self) -> bool:
+        """Whether there are several pieces."""
+        return self.work.several
+
+    def forget_weights(self) -> None:
+        """Let all pieces count alike, and linear solves without factors."""
+        upload([(self.work.weight, np.ones(self.work.n)), (self.work.factor, np.ones(self.work.n_components))])
+
+    def forget_factors(self) -> None:
+        """Let all components count alike in slopes."""
+        upload([(self.work.factor, np.ones(self.work.n_components))])
+
+    def unbalanced_mean(self, system: "StageSystem", beta: float) -> tuple[float, str]:
+        """Return the largest relative mean residual of a piece after a linearised step, and its name; 0 if all are rounding.
+
+        It moves a piece as a whole, along the axes on which it has no constraint; elastic forces and their rounding cancel in it.
+        The rest of the residual is the linearisation error.
+        """
+        m, n = self.model, self.work.n
+        measure_pieces(m, system.work, self.work, beta)
+        _r, inertia, internal, loads, _held = np.sqrt(self.work.norms.to_numpy()).T
+        residual, v, free, mass = (a.astype(np.float64) for a in download([system.work.residual, m.state.v, m.free, m.mass]))
+        means = np.zeros((3, n))
+        for axis in range(3):
+            constrained = np.bincount(self.of_node, 1.0 - free[:, axis], n) > 0.0
+            means[axis] = np.where(constrained, 0.0, np.bincount(self.of_node, residual[:, axis], n))
+        mean = np.linalg.norm(means, axis=0) / np.sqrt(np.bincount(self.of_node, minlength=n))
+        momentum = np.sqrt(np.bincount(self.of_node, ((mass[:, None] * v) ** 2).sum(axis=1), n))
+        floor = max(system.rounding.eps, NEGLIGIBLE_MOMENTUM) * (momentum + beta * internal) + system.rounding.piece_mass / beta
+        with np.errstate(divide="ignore", invalid="ignore"):
+            ratio = np.where(mean > MEAN_ROUNDING * floor, mean / (inertia + beta * (internal + loads)), 0.0)
+        k = int(np.argmax(ratio))
+        return float(ratio[k]), self._names[k]
+
+    def weigh(self, floor: np.ndarray, beta: float, tolerance: float, static: bool) -> tuple[float, str]:
+        """Set the weights from `norms`; return the largest |r|_p over s_p, and the name of that piece.
+
+        floor (n,): |r|_p that is rounding [N s].
+        """
+        r, inertia, internal, loads, held = np.sqrt(self.work.norms.to_numpy()).T
+        scale = inertia + beta * (internal + loads)
+        if static:
+            scale = np.where(loads > 0.0, beta * loads, np.where(held > 0.0, held, beta * internal))
+        least = np.maximum(scale, floor / tolerance)
+        least = np.where(least > 0.0, least, max(float(least.max()), np.finfo(np.float64).tiny))
+        upload([(self.work.weight, 1.0 / least**2)])
+        ratio = r / least
+        worst = int(np.argmax(ratio))
+        return float(ratio[worst]), self._names[worst]
+
+
+def _pieces(simulation: SimulationState) -> tuple[np.ndarray, list[str], np.ndarray]:
+    """Return the piece of each node (n_nodes,), the names of the pieces and their bodies (n,)."""
+    pieces, names, bodies = [], [], []
+    for k, body in enumerate(simulation.scene.bodies):
+        n, piece = 1, np.zeros(body.n_nodes, dtype=np.int64)
+        if body.mesh.n_components > 1:
+            n, piece = connected_pieces(body.nodes.elements, body.n_nodes)
+        pieces.append(piece + len(names))
+        names += [f"body '{body.name}'" if n == 1 else f"a piece of body '{body.name}'"] * n
+        bodies += [k] * n
+    return np.concatenate(pieces), names, np.array(bodies)
+
+
+def _components(simulation: SimulationState, piece: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return whether each component is anchored, and the component of each piece (n,), by connections between pieces."""
+    table, dependents = simulation.springs, simulation.dependents
+    links, outside = [], np.zeros(0, dtype=np.int64)
+    if dependents is not None:
+        links.append((np.repeat(dependents.node, np.diff(dependents.start)), dependents.master))
+    if table is not None:
+        links.append((table.node[table.start[table.element]], table.node))
+        fixed = np.abs(np.add.reduceat(table.weight, table.start[:-1])) > ROUNDED
+        # the damping of a spring without length need not act along it, and then has a moment
+        fixed |= table.is_isotropic & (table.damping > 0.0)
+        outside = table.node[fixed[table.element]]
+    a, b = (np.concatenate([link[side] for link in links] or [outside[:0]]) for side in (0, 1))
+    n_components, component = linked_groups(piece[a], piece[b], n)
+    anchored = np.zeros(n_components, dtype=np.int32)
+    anchored[component[piece[outside]]] = 1
+    return anchored, component

@@ -1,0 +1,245 @@
+"""Kernels of `pieces`: norms by piece, factors of linear solves, and the correction of rigid motion."""
+
+import taichi as ti
+
+from taisoft.backend.runtime import kernel
+from taisoft.dynamics.stage import damping_force, internal_on, loads_on, residual_parts, squares
+from taisoft.fem.dependents import place_all
+from taisoft.fem.lanes import mass_times
+from taisoft.fem.terms import rayleigh_damping
+
+N_SUMS, N_MOMENTS, N_TERMS = 5, 10, 12  # columns of a piece's norms, of a component's first moments, of scratch
+SOLVED, LINEARISED, BEFORE, AFTER = range(4)  # modes of `correct_rigid_motion`
+MASS, CENTRE, RESULTANT, FIXED = 0, 1, 4, 7  # columns of these moments; FIXED: constraints by axis
+
+
+@kernel
+def measure_pieces(m: ti.template(), s: ti.template(), p: ti.template(), beta: ti.f64):
+    """Set norms: the squares of `form_residual` by piece, of the last residual."""
+    ti.loop_config(serialize=m.serial)
+    for row in range(p.n_rows):
+        sums = ti.Vector.zero(ti.f64, N_SUMS)
+        for at in range(p.row_start[row], p.row_start[row + 1]):
+            i = p.node[at]
+            _r, inertia, internal, loads = residual_parts(m, s, row, i, beta)
+            sums += squares(s.residual[i], inertia, internal, loads, m.free[i])
+        for j in ti.static(range(N_SUMS)):
+            p.sums[row, j] = sums[j]
+    ti.loop_config(serialize=m.serial)
+    for k in range(p.n):
+        for j in ti.static(range(N_SUMS)):
+            total = ti.cast(0.0, ti.f64)
+            for row in range(p.piece_row[k], p.piece_row[k + 1]):
+                total += p.sums[row, j]
+            p.norms[k, j] = total
+
+
+@kernel
+def equalise(m: ti.template(), A: ti.template(), w: ti.template(), p: ti.template(), least: ti.f64):
+    """Scale rhs of CG work w so that all components have the same energy norm; set the factors.
+
+    least: |rhs|^2 over s_p^2 of a piece below which its component is not scaled up further.
+    """
+    ti.loop_config(serialize=m.serial)
+    for row in range(p.n_rows):
+        energy, weighted = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64)
+        for at in range(p.row_start[row], p.row_start[row + 1]):
+            i = p.node[at]
+            rhs = ti.cast(w.rhs[i], ti.f64)
+            D, square = A.diagonal[i], rhs.dot(rhs)
+            trace = ti.cast(D[0] + D[5] + D[10], ti.f64)
+            if trace > 0.0:
+                energy += 3.0 * square / trace
+            weighted += square * p.weight[p.piece[i]]
+        p.sums[row, 0], p.sums[row, 1] = energy, weighted
+    ti.loop_config(serialize=m.serial)
+    for k in range(p.n_components):
+        energy, weighted = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64)
+        for row in range(p.component_row[k], p.component_row[k + 1]):
+            energy, weighted = energy + p.sums[row, 0], weighted + p.sums[row, 1]
+        p.factor[k] = 1.0
+        if energy > 0.0 and weighted > 0.0:
+            p.factor[k] = ti.sqrt(ti.min(1.0, weighted / least) / energy)
+    ti.loop_config(serialize=m.serial)
+    for i in range(m.n_nodes):
+        w.rhs[i] = ti.cast(p.factor[p.component[i]], m.real) * w.rhs[i]
+
+
+@kernel
+def undo_factors(m: ti.template(), w: ti.template(), p: ti.template()):
+    """Divide y and rhs of CG work w by the factors."""
+    ti.loop_config(serialize=m.serial)
+    for i in range(m.n_nodes):
+        inverse = ti.cast(1.0 / p.factor[p.component[i]], m.real)
+        w.y[i], w.rhs[i] = inverse * w.y[i], inverse * w.rhs[i]
+
+
+@ti.func
+def _effective_mass(m: ti.template(), i, beta):
+    """Mass of node i with mass damping over a stage: d(M (v - v_hat))/dv [kg]."""
+    mass = ti.cast(m.mass[i], ti.f64)
+    if ti.static(m.damped):
+        mass *= 1.0 + beta * ti.cast(rayleigh_damping.mass_rate(m, i), ti.f64)
+    return mass
+
+
+@ti.func
+def _velocity(m: ti.template(), s: ti.template(), i, mode: ti.template()):
+    """Velocity of node i that `correct_rigid_motion` corrects."""
+    v = m.state.v[i]
+    if ti.static(mode == AFTER):
+        v += ti.cast(s.pcg.y[i], ti.f64)
+    return v
+
+
+@ti.func
+def _is_dependent(m: ti.template(), i):
+    """Whether node i depends on others, which have its forces and its mass."""
+    result = False
+    if ti.static(m.has_dependents):
+        result = m.dependents.number[i] >= 0
+    return result
+
+
+@ti.func
+def _in_contact(p: ti.template(), k: ti.template()):
+    """Mark the components in contact as held, as a top-level loop of a kernel."""
+    if ti.static(k.any):
+        ti.loop_config(serialize=True)
+        for c in range(k.problem.count[0]):
+            for j in range(k.problem.arity[c]):
+                p.held[p.component[k.problem.node[c, j]]] = 1
+
+
+@kernel
+def correct_rigid_motion(
+    m: ti.template(),
+    s: ti.template(),
+    p: ti.template(),
+    k: ti.template(),
+    x: ti.template(),
+    mode: ti.template(),
+    beta: ti.f64,
+):
+    """Add to v the rigid motion that balances each free component, see `pieces`, and beta times it to x.
+
+    x: positions of the arms, at which elements and terms hold the forces. mode: SOLVED, after a nonlinear stage, whose residual is
+    corrected, too; LINEARISED, after a linearised one; BEFORE, at the start of one, whose x stays until AFTER adds CG's y.
+    """
+    linear = ti.static(mode != SOLVED)
+    for j in range(p.n_components):
+        p.held[j] = p.anchored[j]
+    _in_contact(p, k)
+    ti.loop_config(serialize=m.serial)
+    for i in range(m.n_nodes):
+        u = _velocity(m, s, i, mode)
+        s.change[i] = u - s.v_hat[i]
+        if ti.static(m.damped):
+            s.change[i] += beta * ti.cast(rayleigh_damping.mass_rate(m, i), ti.f64) * u
+    ti.loop_config(serialize=m.serial)
+    for row in range(p.n_rows):
+        sums = ti.Vector.zero(ti.f64, N_MOMENTS)
+        for at in range(p.row_start[row], p.row_start[row + 1]):
+            i = p.node[at]
+            if _is_dependent(m, i):
+                continue
+            mass, fixed = _effective_mass(m, i, beta), 1.0 - ti.cast(m.free[i], ti.f64)
+            q = mass_times(m, i, s.change) - beta * loads_on(m, i)
+            sums[MASS] += mass
+            for a in ti.static(range(3)):
+                sums[CENTRE + a] += mass * x[i][a]
+                sums[RESULTANT + a] += q[a]
+                sums[FIXED + a] += fixed[a]
+        for j in ti.static(range(N_MOMENTS)):
+            p.sums[row, j] = sums[j]
+    ti.loop_config(serialize=m.serial)
+    for j in range(p.n_components):
+        for q in ti.static(range(N_MOMENTS)):
+            total = ti.cast(0.0, ti.f64)
+            for row in range(p.component_row[j], p.component_row[j + 1]):
+                total += p.sums[row, q]
+            p.moments[j, q] = total
+        for a in ti.static(range(3)):
+            p.moments[j, CENTRE + a] = p.moments[j, CENTRE + a] / p.moments[j, MASS]
+            p.motion[j, a], p.motion[j, 3 + a] = 0.0, 0.0
+            if p.held[j] == 0 and p.moments[j, FIXED + a] == 0.0:
+                p.motion[j, a] = -p.moments[j, RESULTANT + a] / p.moments[j, MASS]
+    ti.loop_config(serialize=m.serial)
+    for row in range(p.n_rows):
+        moment, I, turn = ti.Vector.zero(ti.f64, 3), ti.Matrix.zero(ti.f64, 3, 3), ti.Matrix.zero(ti.f64, 3, 3)
+        for at in range(p.row_start[row], p.row_start[row + 1]):
+            i = p.node[at]
+            if _is_dependent(m, i):
+                continue
+            j = p.component[i]
+            arm = x[i] - ti.Vector([p.moments[j, CENTRE], p.moments[j, CENTRE + 1], p.moments[j, CENTRE + 2]])
+            mass = _effective_mass(m, i, beta)
+            q = mass_times(m, i, s.change) - beta * loads_on(m, i)
+            if ti.static(m.stiffness_damping):
+                q -= beta * ti.cast(damping_force(m, s, row, i, m.state.v), ti.f64)
+                if ti.static(mode == AFTER):
+                    q -= beta * ti.cast(damping_force(m, s, row, i, s.pcg.y), ti.f64)
+            moment += arm.cross(q)
+            I += mass * (arm.dot(arm) * ti.Matrix.identity(ti.f64, 3) - arm.outer_product(arm))
+            if ti.static(linear):
+                f = ti.cast(internal_on(m, i), ti.f64)
+                first = p.node[p.row_start[p.component_row[j]]]  # its velocity has no moment, but that of the forces' rounding
+                moment -= beta * beta * f.cross(_velocity(m, s, i, mode) - _velocity(m, s, first, mode))
+                turn -= beta * beta * (f.dot(arm) * ti.Matrix.identity(ti.f64, 3) - arm.outer_product(f))
+        for a in ti.static(range(3)):
+            p.sums[row, a] = moment[a]
+            for b in ti.static(range(3)):
+                p.sums[row, 3 + 3 * a + b] = I[a, b] + turn[a, b]
+    ti.loop_config(serialize=m.serial)
+    for j in range(p.n_components):
+        moment, I = ti.Vector.zero(ti.f64, 3), ti.Matrix.zero(ti.f64, 3, 3)
+        for row in range(p.component_row[j], p.component_row[j + 1]):
+            for a in ti.static(range(3)):
+                moment[a] += p.sums[row, a]
+                for b in ti.static(range(3)):
+                    I[a, b] += p.sums[row, 3 + 3 * a + b]
+        fixed = ti.Vector([p.moments[j, FIXED], p.moments[j, FIXED + 1], p.moments[j, FIXED + 2]])
+        if p.held[j] == 0:
+            if fixed.sum() == 0.0:
+                w = I.inverse() @ moment
+                for a in ti.static(range(3)):
+                    p.motion[j, 3 + a] = -w[a]
+            else:
+                for a in ti.static(range(3)):
+                    if fixed[(a + 1) % 3] + fixed[(a + 2) % 3] == 0.0:
+                        p.motion[j, 3 + a] = -moment[a] / I[a, a]
+    ti.loop_config(serialize=m.serial)
+    for i in range(m.n_nodes):
+        j, change = p.component[i], ti.Vector.zero(ti.f64, 3)
+        if p.held[j] == 0 and not _is_dependent(m, i):
+            centre = ti.Vector([p.moments[j, CENTRE], p.moments[j, CENTRE + 1], p.moments[j, CENTRE + 2]])
+            w = ti.Vector([p.motion[j, 3], p.motion[j, 4], p.motion[j, 5]])
+            change = ti.Vector([p.motion[j, 0], p.motion[j, 1], p.motion[j, 2]]) + w.cross(x[i] - centre)
+            change *= ti.cast(m.free[i], ti.f64)
+            mass = _effective_mass(m, i, beta)
+            if mass > 0.0:
+                s.change[i] = s.change[i] + mass / ti.cast(m.mass[i], ti.f64) * change
+            if ti.static(not linear):
+                s.residual[i] = s.residual[i] + ti.cast(mass * change, m.real)
+        moved = change
+        if ti.static(mode == AFTER):
+            change += ti.cast(s.pcg.y[i], ti.f64)
+            moved = change + ti.cast(m.free[i], ti.f64) * m.state.v[i]
+        m.state.v[i] = m.state.v[i] + change
+        if ti.static(mode != BEFORE):
+            m.state.x[i] = m.state.x[i] + beta * moved
+    if ti.static(mode != BEFORE):
+        place_all(m)
+
+
+@kernel
+def turn_forces(m: ti.template(), s: ti.template(), p: ti.template(), beta: ti.f64):
+    """Add to residual and rhs the change of internal forces by the turning of `correct_rigid_motion` BEFORE a linearised step."""
+    ti.loop_config(serialize=m.serial)
+    for i in range(m.n_nodes):
+        j = p.component[i]
+        w = ti.Vector([p.motion[j, 3], p.motion[j, 4], p.motion[j, 5]])
+        if not _is_dependent(m, i):
+            r = s.residual[i] - ti.cast(beta * beta * w.cross(ti.cast(internal_on(m, i), ti.f64)), m.real)
+            s.residual[i] = r
+            s.pcg.rhs[i] = -m.free[i] * r
