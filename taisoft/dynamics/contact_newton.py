@@ -97,6 +97,8 @@ class ContactNewton:
         self.newton = self.linear = self.multipliers = 0
         self.eliminated = 0.0  # Newton iterations on few nodes, times their fraction of all nodes
         self.rounding = self.tight = self.stalls = False
+        # laws that hold better than they must let |r| converge in fewer steps, where they can
+        self.law_aim = min(stage.contact_tolerance, stage.tolerance)
         self.has_direction = False  # y is a good first direction on the current matrix
         self.first_r_scale, self.max_r_scale = R_SCALE, MAX_R_FRICTIONLESS  # of the next contact problem
 
@@ -208,7 +210,7 @@ class ContactNewton:
         # if rounding of stiff stress hides the rigid motion in |r|, only a tight first solve gets that motion right, and
         # impulses converge only if |r| decreases with them
         self.tight = self.r <= NEAR_FLOOR * self.floor
-        law_tolerance = LAW_TOLERANCE_FRACTION * stage.contact_tolerance
+        law_tolerance = LAW_TOLERANCE_FRACTION * self.law_aim
         if not self._is_balanced:
             law_tolerance = max(law_tolerance, LAW_BALANCE * tolerance)
         problem = replace(
@@ -225,6 +227,8 @@ class ContactNewton:
         )
         result = solve_linear(system, problem, self._first_residual(), self.scale)
         self.linear, self.multipliers = self.linear + result.linear, self.multipliers + result.multipliers
+        if not (result.converged or result.negative):
+            self.law_aim = stage.contact_tolerance
         if system.frictionless and not (result.negative or result.direct):
             self._choose_r_scale(result, result.converged or system.contact_residual <= problem.contact_tolerance)
         return result

@@ -56,6 +56,7 @@ class PieceWork:
     moments: Any  # (n_components, N_MOMENTS) f64: scratch: mass, centre, resultant, constraints by axis
     motion: Any  # (n_components, 6) f64: correction, velocity of the centre and angular velocity
 
+
 class Pieces:
     """The pieces of a simulation, their names, and the kernels' record of them."""
 

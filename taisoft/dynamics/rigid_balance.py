@@ -113,18 +113,12 @@ def _in_contact(p: ti.template(), k: ti.template()):
 
 @kernel
 def correct_rigid_motion(
-    m: ti.template(),
-    s: ti.template(),
-    p: ti.template(),
-    k: ti.template(),
-    x: ti.template(),
-    mode: ti.template(),
-    beta: ti.f64,
+    m: ti.template(), s: ti.template(), p: ti.template(), k: ti.template(), x: ti.template(), mode: ti.template(), beta: ti.f64
 ):
     """Add to v the rigid motion that balances each free component, see `pieces`, and beta times it to x.
 
-    x: positions of the arms, at which elements and terms hold the forces. mode: SOLVED, after a nonlinear stage, whose residual is
-    corrected, too; LINEARISED, after a linearised one; BEFORE, at the start of one, whose x stays until AFTER adds CG's y.
+    x: positions of the arms, at which elements and terms hold the forces. mode: SOLVED, after a nonlinear stage, whose residual
+    is corrected, too; LINEARISED, after a linearised one; BEFORE, at the start of one, whose x stays until AFTER adds CG's y.
     """
     linear = ti.static(mode != SOLVED)
     for j in range(p.n_components):

@@ -58,7 +58,6 @@ from taisoft.dynamics.stage import (
     negate_direction,
     set_direction_to_rest,
 )
-from taisoft.fem.model import Model
 from taisoft.fem.node_graph import EVERYTHING, Subset
 from taisoft.fem.state import END_SLOPE, START_SLOPE, STEP_LENGTH
 from taisoft.linear import block_csr, pcg, volume_pcg
@@ -338,7 +337,9 @@ class StageSystem:
         if stage.c == 0.0 or (stage.linearised and m.has_pressure):  # follower loads change in a linearised step
             return
         x = self._k.x_linear if stage.linearised else m.state.x
-        correct_rigid_motion(m, w, self.pieces.work, self._k, x, rigid_balance.LINEARISED if stage.linearised else SOLVED, stage.beta)
+        correct_rigid_motion(
+            m, w, self.pieces.work, self._k, x, rigid_balance.LINEARISED if stage.linearised else SOLVED, stage.beta
+        )
 
     def begin_linearised_step(self) -> tuple[float, float]:
         """Begin a linearised step without contacts by the rigid motion of its free components; return (|r|, scale)."""

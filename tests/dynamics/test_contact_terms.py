@@ -17,8 +17,8 @@ import taisoft as ts
 from taisoft.contact.problem import RESIDUAL, build_node_problem, fill_field, find_factors, index_nodes
 from taisoft.dynamics import contact_terms, linearised
 from taisoft.dynamics.contact_terms import NO_CONTACTS
-from taisoft.dynamics.frictional import extrapolate_multipliers
 from taisoft.dynamics.dirichlet import DirichletConditions
+from taisoft.dynamics.frictional import extrapolate_multipliers
 from taisoft.dynamics.no_contacts import NoContacts
 from taisoft.dynamics.simulation_state import SimulationState
 from taisoft.dynamics.stage import AGAIN, ELASTIC_STAGE, STAY, STEP, form_residual, move

@@ -3,15 +3,18 @@
 * it converges quadratically to the given tolerance, and the linear tolerance controls the number of CG iterations;
 * a step that stops early returns converged=False and a message; a linearly implicit step takes one iteration;
 * wild states (inverted, flat) are left along directions of negative curvature: the energy falls and steps converge;
-* statics stops at the rounding of the forces.
+* statics stops at the rounding of the forces;
 * a cube that is free falls beside one under a large load, of the same mesh or not: see also `test_pieces`.
 """
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 import taisoft as ts
 from taisoft.checkpoint import read_checkpoint, write_checkpoint
+from taisoft.dynamics import implicit
 from taisoft.dynamics.contact_newton import solve
 from taisoft.dynamics.schemes import SCHEMES
 from taisoft.dynamics.stage_system import Stage, StageSystem

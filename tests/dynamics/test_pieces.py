@@ -61,7 +61,8 @@ def angular_momentum(sim: ts.Simulator, own: np.ndarray, name: str) -> np.ndarra
 
 
 @pytest.mark.parametrize(
-    "integrator, name", [("implicit_euler", "newton_tolerance"), ("bdf2", "newton_tolerance"), ("linearly_implicit_euler", "linear_tolerance")]
+    "integrator, name",
+    [("implicit_euler", "newton_tolerance"), ("bdf2", "newton_tolerance"), ("linearly_implicit_euler", "linear_tolerance")],
 )
 def test_the_angular_momentum_is_that_of_an_exact_solve(integrator, name):
     """Of a body that tumbles, under tolerances that hardly solve its steps."""
@@ -102,7 +103,9 @@ def hanging(length: float, beside: bool) -> ts.Scene:
     return made
 
 
-@pytest.mark.parametrize("integrator, precision", [("linearly_implicit_euler", "f32"), ("implicit_euler", "f32"), ("bdf2", "f64")])
+@pytest.mark.parametrize(
+    "integrator, precision", [("linearly_implicit_euler", "f32"), ("implicit_euler", "f32"), ("bdf2", "f64")]
+)
 def test_a_light_body_moves_as_it_does_alone(integrator, precision):
     length, found = 4e-4, []
     for beside in (False, True):
