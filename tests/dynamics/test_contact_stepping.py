@@ -97,14 +97,10 @@ def run(sim, seconds: float) -> None:
 
 @by("symplectic_euler", "bdf2")
 def test_a_belt_that_jumps_between_two_steps_is_refused(sim):
-    belt = sim.scene.obstacle("belt").path
     sim.step()
-    belt.speed = 0.1
+    sim.scene.obstacle("belt").path.speed = 0.1
     with pytest.raises(ts.SimulationError, match="step 2: obstacle 'belt': the path gives another value at t = .* than before"):
         sim.step()
-    belt.speed = 0.0
-    sim.step()
-    belt.speed = 0.1
     sim.reset()
     sim.step()
 

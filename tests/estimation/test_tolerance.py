@@ -132,12 +132,8 @@ def test_a_stop_or_ctrl_c_during_the_pilots_leaves_the_start():
     result = run(sim, 0.5, stop=lambda: next(calls) >= 5)
     assert result.interrupted and result.status == "degraded" and result.steps == 0
     assert "interrupted during its pilots" in result.problems[0]
-
-    def ctrl_c():
-        raise KeyboardInterrupt
-
     with pytest.raises(KeyboardInterrupt):
-        run(sim, 0.5, stop=ctrl_c)
+        run(sim, 0.5, stop=lambda: (_ for _ in ()).throw(KeyboardInterrupt))
     assert (sim.settings.integrator, sim.dt, sim.time, sim.step_count) == ("implicit_midpoint", 0.01, 0.0, 0)
     assert np.array_equal(sim.positions(), sim.rest)
 
