@@ -1,8 +1,8 @@
 """Check that the functions which move obstacles and nodes depend on time alone.
 
-A step moves them from the values at its start to those at its end. A function of a present command, of the state or of chance gives
-another value at the same time in the next step: what it moves jumps between two steps, and no contact sees it. So each function is
-evaluated at the end of a first step when the step begins, and there again before the next one.
+A step moves them from the values at its start to those at its end. A function of a present command, of the state or of chance
+gives another value for the same time in the next step: what it moves jumps between two steps, and no contact sees it. So each
+function is evaluated for the end of a step when that begins, and for the same time again before the next one.
 """
 
 from collections.abc import Callable
@@ -17,7 +17,7 @@ from taisoft.scene.key_frames import NodePath, ShapePath
 from taisoft.scene.obstacles import Obstacle
 from taisoft.scene.scene import Scene
 
-DATA = (NodePath, ShapePath, CarriedPath)  # paths that are not functions of a user; the last follows an obstacle, which is checked
+DATA = (NodePath, ShapePath, CarriedPath)  # no functions of a user; the last follows an obstacle, which is checked
 SAME = 1e-12  # of the largest entry, and of 1 m: times that differ by rounding give such differences
 FAILED = object()
 

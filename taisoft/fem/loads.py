@@ -1,7 +1,7 @@
 """Loads of a scene at a time: dead loads as nodal forces f_a(t) = sum over loads of w_a F(t), and loads that are one number.
 
-w_a is the reference area at node a for a traction, the fraction of the lumped mass for a total force, an equal part if the body is
-rigid, and 1 for a force per node.
+w_a is the reference area at node a for a traction; for a total force the fraction of the lumped mass, or on a rigid body an equal
+part; and 1 for a force per node.
 Numbers, such as pressures, which force terms turn into nodal forces at the present x, are the model's `amplitudes`.
 """
 

@@ -198,7 +198,7 @@ def item_ids(given, n: int, what: str, items: str) -> np.ndarray:
     ids = np.atleast_1d(ids)
     for one in (1, 255):
         if ids.size > 2 and np.isin(ids, (0, one)).all():
-            raise SceneError(f"{what}: {ids.size} {items} ids that are all 0 or {one} are a mask: give it as bool, not as integers")
+            raise SceneError(f"{what}: {ids.size} {items} ids that are all 0 or {one} are a mask: give it as bool")
     bad = np.flatnonzero((ids < 0) | (ids >= n))
     if len(bad):
         raise SceneError(f"{what}: {items} {ids[bad[0]]} does not exist (there are {n}, counted from 0)")

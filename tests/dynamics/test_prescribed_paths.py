@@ -1,4 +1,4 @@
-"""Functions that move obstacles, bodies and nodes depend on time alone: another value at a time that a step has used is refused."""
+"""Functions that move obstacles, bodies and nodes depend on time alone: another value at a time that a step used is refused."""
 
 import numpy as np
 import pytest

@@ -109,7 +109,7 @@ REFUSALS = [  # the call on a scene and its body "a", and the message
     (lambda s, b: b.add_force([], (0, 0, 1)), "^body 'a': .*no node is chosen"),
     (lambda s, b: b.fix(np.ones(26, dtype=bool)), r"a mask must have shape \(27,\), not \(26,\)"),
     *((lambda s, b, ids=ids: b.fix(ids), "node ids must be a list of integers") for ids in ("left", [True, 3], [0.0, 1.0])),
-    (lambda s, b: b.fix((MESH.vertices[:, 0] < 0).astype(int)), "a': fix: 27 node ids that are all 0 or 1 are a mask: give it as b"),
+    (lambda s, b: b.fix((MESH.vertices[:, 0] < 0).astype(int)), "a': fix: 27 node ids that are all 0 or 1 are a mask: give"),
     (lambda s, b: b.add_pressure(np.uint8([0, 255] * 24), 1.0), "48 surface triangle ids that are all 0 or 255 are a mask"),
     (lambda s, b: s.attach("a", [0, 1, 1], "ground"), "attachment0.*3 node ids that are all 0 or 1 are a mask"),
     (lambda s, b: b.fix(lambda X: X[:, 0]), r"must return a bool mask of shape \(27,\), not float64"),
