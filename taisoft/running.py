@@ -43,8 +43,8 @@ def run(
     with other steps and tighter tolerances; the report holds it. error_mesh: also estimate the error of the mesh, by a twin on
     another one: "refined", "order" (the elements' other order), or the same scene on a mesh that shares nodes. A run that fails,
     or that `stop` ends, does not raise: see the report's status and problems. Ctrl-C undoes the present step and is raised as
-    KeyboardInterrupt; a run in another thread than the main one is ended by `stop` alone. Raises SimulationError for bad arguments,
-    and for a twin that cannot be made. A simulator with a tolerance first chooses integrator and dt by pilots, unless the run is
+    KeyboardInterrupt; `stop` alone ends a run in another thread than the main one. Raises SimulationError for bad arguments, and
+    for a twin that cannot be made. A simulator with a tolerance first chooses integrator and dt by pilots, unless the run is
     resumed; the report then holds the error in time.
     """
     if error_mesh is not None and not error:
