@@ -149,7 +149,7 @@ def peer_problem() -> str | None:
 
 def measure(extent: Extent, arch: str, peers: bool) -> tuple[Document, dict]:
     """Measure and print everything; returns the page and the numbers."""
-    document, numbers = begin("Elasticity: the falling beam", packages=("taichi", "mujoco", "numpy", "scipy"))
+    document, numbers = begin("Elasticity: the falling beam", packages=("taichi", "mujoco-core", "numpy", "scipy"))
     device = cuda().removeprefix("yes: ") if arch == "cuda" else None
     where = f"taisoft on {device}, MuJoCo on the processor" if device else "both programs on the processor"
     document.add(f"{where}, each on one thread of the processor")

@@ -103,7 +103,7 @@ def order_times(results: Path) -> str:
 def peers(results: Path) -> str:
     """taisoft and other programs at equal error, without the stiff beams."""
     numbers = newest(results, "peers")
-    used = [numbers["versions"][name] for name in ("mujoco", "pybullet", "newton")]
+    used = [numbers["versions"][name] for name in ("mujoco-core", "pybullet", "newton")]
     programs = "MuJoCo {}, PyBullet {}, Newton {}".format(*used)
     shown = [one for one in numbers["comparisons"] if not one["stiff"]]
     return compare_table(shown) + measured_on(numbers, programs)

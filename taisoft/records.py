@@ -111,7 +111,7 @@ class RunReport:
     sim_seconds: float = 0.0  #: simulated time [s]
     wall_seconds: float = 0.0  #: without compile time [s]
     compile_seconds: float = 0.0  #: spent starting Taichi and compiling kernels [s]
-    interrupted: bool = False  #: a signal ended the run early
+    interrupted: bool = False  #: `stop`, or a signal of the command line, ended the run early
     step_reports: list[StepReport] = field(default_factory=list)  #: one a step; of explicit runs one a frame
     dt: float | None = None  #: of its steps [s]
     dt_requested: float | None = None  #: that the simulator had, where the run changed it to fit the frames [s]

@@ -41,10 +41,11 @@ def run(
     on_step(report, seconds): called after every implicit step and every batch of explicit steps, with its wall time without
     compilation [s]. error: estimate the error of the positions by twins (`taisoft.estimation`), simulators that follow the run
     with other steps and tighter tolerances; the report holds it. error_mesh: also estimate the error of the mesh, by a twin on
-    another one: "refined", "order" (the elements' other order), or the same scene on a mesh that shares nodes. A failed or
-    interrupted run does not raise: see the report's status and problems. Raises SimulationError for bad arguments, and for a
-    twin that cannot be made. A simulator with a tolerance first chooses integrator and dt by pilots, unless the run is resumed;
-    the report then holds the error in time.
+    another one: "refined", "order" (the elements' other order), or the same scene on a mesh that shares nodes. A run that fails,
+    or that `stop` ends, does not raise: see the report's status and problems. Ctrl-C undoes the present step and is raised as
+    KeyboardInterrupt; `stop` alone ends a run in another thread than the main one. Raises SimulationError for bad arguments, and
+    for a twin that cannot be made. A simulator with a tolerance first chooses integrator and dt by pilots, unless the run is
+    resumed; the report then holds the error in time.
     """
     if error_mesh is not None and not error:
         raise SimulationError("error_mesh needs error=True")
@@ -87,28 +88,28 @@ def run_steps(
     energy: EnergyCheck | None = None
     estimator = sim._begin_estimate(total - elapsed_steps, error_mesh) if error else None
     try:
-        energy = EnergyCheck(sim)
-        frame, remainder = divmod(elapsed_steps, steps_per_frame)
-        if on_frame is not None and not remainder:
-            on_frame(sim, frame, None)
-        while sim.step_count - first_step < total and not report.interrupted:
-            frame += 1
-            frame_end = min(total, frame * steps_per_frame)
-            merged = _advance_to(sim, first_step + frame_end, stop, report, on_step, energy, estimator)
-            if merged is None:
-                break
-            if sim.settings.explicit:
-                report.step_reports.append(merged)
-            if sim.step_count - first_step == frame_end and on_frame is not None:
-                on_frame(sim, frame, merged)
-    except (SimulationError, MemoryError) as failure:
-        report.status = "failed"
-        report.problems.append(str(no_memory("the next step", failure) if isinstance(failure, MemoryError) else failure))
-    except KeyboardInterrupt:
-        _mark_interrupted(report)
-    finally:
+        try:
+            energy = EnergyCheck(sim)
+            frame, remainder = divmod(elapsed_steps, steps_per_frame)
+            if on_frame is not None and not remainder:
+                on_frame(sim, frame, None)
+            while sim.step_count - first_step < total and not report.interrupted:
+                frame += 1
+                frame_end = min(total, frame * steps_per_frame)
+                merged = _advance_to(sim, first_step + frame_end, stop, report, on_step, energy, estimator)
+                if merged is None:
+                    break
+                if sim.settings.explicit:
+                    report.step_reports.append(merged)
+                if sim.step_count - first_step == frame_end and on_frame is not None:
+                    on_frame(sim, frame, merged)
+        except (SimulationError, MemoryError) as failure:
+            report.status = "failed"
+            report.problems.append(str(no_memory("the next step", failure) if isinstance(failure, MemoryError) else failure))
         if estimator is not None:
             report.error_estimate = estimator.estimate()
+    finally:  # after Ctrl-C, too
+        if estimator is not None:
             sim._end_estimate()
     report.steps = sim.step_count - start_count
     report.sim_seconds = sim.time - start_time
@@ -132,9 +133,6 @@ def run_steps(
             report.status = "failed"
             text = no_memory("the final overlap check", failure) if isinstance(failure, MemoryError) else failure
             report.problems.append(str(text))
-        except KeyboardInterrupt:
-            report.status = "degraded"
-            _mark_interrupted(report)
     return report
 
 
@@ -154,7 +152,8 @@ def _advance_to(
     merged = None
     while sim.step_count < end:
         if stop is not None and stop():
-            _mark_interrupted(report)
+            report.interrupted = True
+            report.problems.append("the run was interrupted before its end")
             break
         energy.before_step()
         until = end if estimator is None else estimator.next_comparison(end)
@@ -193,11 +192,6 @@ def _merge(a: StepReport, b: StepReport) -> StepReport:
     b.converged = a.converged and b.converged
     b.problems = a.problems + b.problems
     return b
-
-
-def _mark_interrupted(report: RunReport) -> None:
-    report.interrupted = True
-    report.problems.append("the run was interrupted before its end")
 
 
 def _check_final_overlap(sim: "Simulator", report: RunReport) -> None:

@@ -1,7 +1,8 @@
 """MuJoCo's flex on the works: the same vertices, tets and lumped masses as for all programs, undamped.
 
 A flex of dim 3 with elasticity is St. Venant-Kirchhoff on linear tets, of which much is squeezed inside out when W2's cube
-lands. Before version 4.0 it used twice the first Lamé parameter, so older versions are refused. By "discrete" alone and by
+lands. Before version 4.0 it used twice the first Lamé parameter, and in 4.0.0 the solver "Newton" factorises the Hessian of a
+sparse Jacobian wrongly (4.0.1 mends it), so these are refused. By "discrete" alone and by
 MjSpec alone (`elastic3d`) there is a second law, which MuJoCo calls simplified stable neo-Hookean: SNH13 of works.semi_discrete,
 to 1e-13. Every free node is a body of the node's mass with three slide joints, every fixed node belongs to the world. All that
 a work does not need is switched off.
@@ -59,10 +60,11 @@ def import_mujoco():
     try:
         import mujoco
     except ImportError:
-        raise SimulationError("the comparison with MuJoCo needs the package mujoco, version 4.0 or later") from None
-    if int(mujoco.__version__.split(".")[0]) < 4:
+        raise SimulationError("the comparison with MuJoCo needs the package mujoco-core, version 4.0.1 or later") from None
+    if tuple(int(part) for part in mujoco.__version__.split(".")[:3]) < (4, 0, 1):
         raise SimulationError(
-            f"mujoco {mujoco.__version__} doubles the first Lamé parameter of a 3D flex: version 4.0 or later is needed"
+            f"mujoco {mujoco.__version__} solves by a wrong Hessian, or doubles the first Lamé parameter of a 3D flex: "
+            "version 4.0.1 of mujoco-core or later is needed"
         )
     return mujoco
 

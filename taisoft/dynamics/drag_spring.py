@@ -49,10 +49,8 @@ class DragSpring:
     def take(self, body: int, nodes, weights, target, stiffness) -> None:
         """Drag that point of a body from the next step on, instead of any previous one. Raise SceneError."""
         own, layout = self._simulation.scene.bodies[body], self._simulation.layout
-        nodes, weights = np.atleast_1d(nodes), np.atleast_1d(np.asarray(weights, dtype=np.float64))
-        valid = nodes.ndim == 1 and nodes.dtype.kind in "iu" and len(nodes) > 0
-        if not valid or nodes.min() < 0 or nodes.max() >= own.n_nodes:
-            raise SceneError(f"body '{own.name}': the nodes to pull at must be whole numbers from 0 to {own.n_nodes - 1}")
+        nodes = checks.item_ids(nodes, own.n_nodes, f"body '{own.name}': the nodes to pull at", "node")
+        weights = np.atleast_1d(np.asarray(weights, dtype=np.float64))
         if weights.shape != nodes.shape or not (np.isfinite(weights).all() and (weights >= 0).all() and weights.sum() > 0):
             raise SceneError(f"body '{own.name}': the weights of a pull must be {len(nodes)} numbers, none below 0, not all 0")
         target = checks.array(target, f"body '{own.name}': the target of a pull", ((3,),))

@@ -15,6 +15,7 @@ from taisoft.backend.arrays import FieldArena
 from taisoft.dynamics.dirichlet import DirichletConditions
 from taisoft.dynamics.drag_spring import DragSpring
 from taisoft.dynamics.no_contacts import NoContacts
+from taisoft.dynamics.prescribed_paths import PrescribedPaths
 from taisoft.dynamics.results import StepResult
 from taisoft.dynamics.schemes import IMPLICIT
 from taisoft.dynamics.simulation_state import SimulationState
@@ -73,6 +74,7 @@ class Dynamics:
         self.drag_spring = DragSpring(self.state) if settings.draggable else None
         self.stepper = make_stepper(self.state, settings, self.contact or NoContacts())
         self._owned.append(self.stepper)
+        self._paths = PrescribedPaths(scene)
         self.reset()
 
     @property
@@ -106,6 +108,8 @@ class Dynamics:
             self.stepper.loads_changed()
         before = (self.state.state()[1].astype(np.float64), self.state.time) if self.model.has_dependents else None
         try:
+            self._paths.check()
+            self._paths.remember(self.state.time + self.dt)
             result = self.stepper.advance(n, self.dt)
         except SimulationError as error:
             raise self._failure(error) from None
@@ -164,6 +168,7 @@ class Dynamics:
         self.state.restart()
         self.end_drag()
         self._time_base = 0.0, 0
+        self._paths.remember(0.0)
         self.state_changed()
 
     def state_changed(self) -> None:
@@ -284,12 +289,14 @@ class Dynamics:
         """Restore a `snapshot` of the same scene with the same numbers."""
         self.dt, self._time_base = check_dt(kept["dt"]), (float(kept["time_base"]), int(kept["count_base"]))
         self.state.restore(kept["simulation"])
+        self._paths.remember(self.state.time)
         self._velocities_before = None
         self.stepper.restore(kept["stepper"])
 
     def continue_from(self, other: "Dynamics") -> None:
         """Take over the state of another instance of the same scene, as `state_changed` does without history."""
         self.state.restore(other.state.snapshot())
+        self._paths.remember(self.state.time)
         self.stepper.forget()
         self._time_base = other.state.time, other.state.step_count
         self.changes = other.changes + 1

@@ -177,9 +177,8 @@ class Substepping:
                 result, fault = replace(result, converged=False), None
             if fault != Fault.FAST and not (fault and may_cut):
                 contact.penetration = contact.end(time + length, dt if last else length)
-                fault = self._find_fault(
-                    result, may_retry and length < min(longest, dt / RETRIES) and n_unconverged < MAX_UNCONVERGED
-                )
+                is_short = length < (1.0 - ROUNDING) * min(longest, dt / RETRIES)
+                fault = self._find_fault(result, may_retry and is_short and n_unconverged < MAX_UNCONVERGED)
             if fault == Fault.FAST or (fault and may_cut):
                 is_trial = fault == Fault.CROSSED and self.limit.is_trial
                 undo_budget -= not (fault == Fault.FAST or is_trial)

@@ -42,6 +42,10 @@ TWO_PILOTS = float(1 + SMALLER)  # cost of explicit steps with their pilots, ove
 LEAST_FRAMES, MOST_FRAMES = 16, 64  # at which pilots are compared where a run has few, or every step is one
 
 
+class Stopped(Exception):
+    """`stop` ended a pilot."""
+
+
 def run_to_tolerance(
     sim: "Simulator", run: RunFunction, seconds: float, fps: float | None, stop: Callable[[], bool] | None, **observers
 ) -> RunReport:
@@ -54,7 +58,7 @@ def run_to_tolerance(
     chooser = Chooser(sim, run, seconds, fps, stop)
     try:
         steps = chooser.choose()
-    except KeyboardInterrupt:
+    except Stopped:
         report.interrupted, report.status = True, "degraded"
         report.problems.append("the run was interrupted during its pilots: nothing was simulated")
     except (SimulationError, MemoryError) as failure:
@@ -239,7 +243,7 @@ class Chooser:
         report, before = pilot.report, self._last_failure
         self.compile_seconds += report.compile_seconds
         if report.interrupted:
-            raise KeyboardInterrupt
+            raise Stopped
         if part is not None:  # whether a part fails does not count
             return pilot
         self._last_failure = (report.sim_seconds, report.problems[-1]) if report.status == "failed" else None

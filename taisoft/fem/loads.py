@@ -1,6 +1,7 @@
 """Loads of a scene at a time: dead loads as nodal forces f_a(t) = sum over loads of w_a F(t), and loads that are one number.
 
-w_a is the reference area at node a for a traction, the fraction of the lumped mass for a total force, and 1 for a force per node.
+w_a is the reference area at node a for a traction; for a total force the fraction of the lumped mass, or on a rigid body an equal
+part; and 1 for a force per node.
 Numbers, such as pressures, which force terms turn into nodal forces at the present x, are the model's `amplitudes`.
 """
 
@@ -13,6 +14,7 @@ from taisoft.fem import reference
 from taisoft.fem.pressure import pressures_of
 from taisoft.scene.connection_records import Tendon
 from taisoft.scene.loads import NodalForce, ScalarLoad, Traction, value_at
+from taisoft.scene.rigid import RigidBody
 from taisoft.scene.scene import Body, Scene
 
 if TYPE_CHECKING:
@@ -132,8 +134,8 @@ def _weights(body: Body, load: Traction | NodalForce) -> tuple[np.ndarray, np.nd
         areas = reference.triangle_areas(body, load.triangles)
         nodes = np.flatnonzero(areas)
         return nodes, areas[nodes]
-    mass = reference.lumped_mass(body)[load.nodes]
-    return load.nodes, mass / mass.sum()
+    parts = np.ones(body.n_nodes) if isinstance(body, RigidBody) else reference.lumped_mass(body)
+    return load.nodes, parts[load.nodes] / parts[load.nodes].sum()
 
 
 def _spread(value: np.ndarray, weights: np.ndarray) -> np.ndarray:

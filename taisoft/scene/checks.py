@@ -169,7 +169,7 @@ def selection(where, points: np.ndarray, what: str, items: str, *, repeats: bool
     if len(distinct) < len(ids) and not repeats:
         twice = np.setdiff1d(np.arange(len(ids)), first)[0]
         raise SceneError(f"{what}: {items} {ids[twice]} is chosen twice")
-    return ids[np.sort(first)].astype(np.int64)
+    return ids[np.sort(first)]
 
 
 def _ids(where, n: int, what: str, items: str) -> np.ndarray:
@@ -183,13 +183,26 @@ def _ids(where, n: int, what: str, items: str) -> np.ndarray:
         if ids.shape != (n,):
             raise SceneError(f"{what}: a mask must have shape ({n},), not {ids.shape}")
         return np.flatnonzero(ids)
-    if ids.dtype.kind not in "iu" or ids.ndim > 1:
-        raise SceneError(f"{what}: {items} ids must be a list of integers, not {value_text(where)}")
+    return item_ids(where, n, what, items)
+
+
+def item_ids(given, n: int, what: str, items: str) -> np.ndarray:
+    """Return ids of some of n items, one or (k,), as (k,) int64. Raises SceneError, also for a mask of integers.
+
+    More than two numbers that are all 0 or 1, or 0 or 255 as in pictures, are a mask: as ids they would repeat two items.
+    """
+    ids = np.asarray(given)
+    has_flag = isinstance(given, (list, tuple)) and any(isinstance(one, (bool, np.bool_)) for one in given)
+    if ids.dtype.kind not in "iu" or ids.ndim > 1 or has_flag:
+        raise SceneError(f"{what}: {items} ids must be a list of integers, not {value_text(given)}")
     ids = np.atleast_1d(ids)
+    for one in (1, 255):
+        if ids.size > 2 and np.isin(ids, (0, one)).all():
+            raise SceneError(f"{what}: {ids.size} {items} ids that are all 0 or {one} are a mask: give it as bool")
     bad = np.flatnonzero((ids < 0) | (ids >= n))
     if len(bad):
         raise SceneError(f"{what}: {items} {ids[bad[0]]} does not exist (there are {n}, counted from 0)")
-    return ids
+    return ids.astype(np.int64)
 
 
 def store(record, **values) -> None:

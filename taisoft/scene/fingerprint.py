@@ -52,6 +52,7 @@ def _body_parts(body: Body) -> dict[str, list]:
     """Return the values that define a body, by the part's name in messages."""
     rigid = isinstance(body, RigidBody)  # its law and its stiffness are chosen by the Simulator
     laws = [] if rigid else [material.law for material in body.composition.materials.values()]
+    constraints = sorted(body.constraints, key=lambda c: c.path is not None)  # scene files have `fix` first
     return {
         "mesh": [body.mesh.vertices, body.mesh.tets],
         "surface": [body.rest_positions[body.nodes.n_elastic :], body.nodes.surface] if body.nodes.embedded is not None else [],
@@ -65,7 +66,7 @@ def _body_parts(body: Body) -> dict[str, list]:
             body.collision,
         ],
         "start": [body.position, body.velocity],
-        "constraints": [x for c in body.constraints for x in (c.nodes, c.axes, *_path_parts(c.path))],
+        "constraints": [x for c in constraints for x in (c.nodes, c.axes, *_path_parts(c.path))],
         "loads": [
             *(x for t in body.tractions for x in ("traction", t.triangles, *_path_parts(t.path))),
             *(x for f in body.forces for x in ("force", f.nodes, *_path_parts(f.path))),
@@ -97,7 +98,7 @@ def _path_parts(path: Callable | None) -> list:
 
 def run_time_numbers(scene: Scene) -> dict:
     """Return the numbers of a scene that may change at run time, except its loads: plain data, and arrays by tet."""
-    pairs = [[sorted(names), *numbers] for names, numbers in scene.contact_pairs.items()]
+    pairs = sorted(([sorted(names), *numbers] for names, numbers in scene.contact_pairs.items()), key=lambda pair: pair[0])
     return {"gravity": scene.gravity.tolist(), "materials": [_materials(body) for body in scene.bodies], "pairs": pairs}
 
 

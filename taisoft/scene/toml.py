@@ -29,12 +29,14 @@ triangles by centroid, boundary included. POINT is a position or a node id. Keys
 import re
 import tomllib
 import warnings
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 
 from taisoft.errors import SceneError
 from taisoft.mesh.safe_reading import UTF16, utf16_head
+from taisoft.mesh.surface_mesh import SurfaceMesh
 from taisoft.mesh.tet_mesh import TetMesh
 from taisoft.scene import checks
 from taisoft.scene.body import Body
@@ -116,18 +118,24 @@ def _read(tables: Table, allow_outside: bool) -> tuple[Scene, dict]:
     if not bodies.known and not rigid.known:
         raise tables.error("bodies", "must hold a table [bodies.NAME]" if "bodies" in tables else "is missing")
     known, _ = arguments_of(Scene.add_body, "name")
-    meshes: dict[str, TetMesh] = {}  # bodies with equal mesh tables share one mesh
+    meshes: dict[str, TetMesh | SurfaceMesh] = {}
+
+    def shared(table: Table, make: Callable) -> TetMesh | SurfaceMesh:
+        """Return the mesh of a body's table; bodies with equal mesh tables share one."""
+        text = str(table.values["mesh"])
+        if text not in meshes:
+            meshes[text] = make(table, allow_outside)
+        return meshes[text]
+
     for name in bodies.known:
         table = bodies.table(name, [*known, *METHODS, "materials", "skin"], ["mesh"])
-        mesh_text = str(table.values["mesh"])
-        meshes[mesh_text] = meshes.get(mesh_text) or mesh_of(table, allow_outside)
-        body = _add_body(scene, name, table, materials, meshes[mesh_text])
+        body = _add_body(scene, name, table, materials, shared(table, mesh_of))
         if "skin" in table:
             skin = table.table("skin", ["surface", "contact"], ["surface"])
             surface = surface_of(skin, "surface", allow_outside)
             skin.make(body.embed, f"body {name!r}: embed: ", keys=["contact"], surface=surface)
     for name in rigid.known:
-        add_rigid_body(scene, name, rigid, selection, allow_outside)
+        add_rigid_body(scene, name, rigid, selection, shared)
     if "body_order" in tables:
         order = tables.values["body_order"]
         if not isinstance(order, list) or sorted(map(str, order)) != sorted([*bodies.known, *rigid.known]):

@@ -13,11 +13,12 @@ from taisoft.scene.toml_methods import call_methods, constraint_tables
 METHODS = {"fix": RigidBody.fix, "move": RigidBody.move, "force": RigidBody.add_force}
 
 
-def add_rigid_body(scene: Scene, name: str, bodies: Table, selection: Callable, allow_outside: bool) -> None:
-    """Add the rigid body in a table of `bodies`. selection: (table, key) -> what chooses vertices. Raises SceneError."""
+def add_rigid_body(scene: Scene, name: str, bodies: Table, selection: Callable, shared: Callable) -> None:
+    """Add the rigid body in a table of `bodies`. selection: (table, key) -> what chooses vertices; shared: (table, what makes it)
+    -> its mesh. Raises SceneError."""
     known, _ = arguments_of(Scene.add_rigid_body, "name", "mesh")
     table = bodies.table(name, [*known, "mesh", *METHODS], ["mesh"])
-    mesh = solid_of(table, allow_outside)
+    mesh = shared(table, solid_of)
     body = table.make(scene.add_rigid_body, f"rigid body {name!r}: ", "scene: ", keys=known, mesh=mesh, name=name)
     call_methods(body, table, f"rigid body {name!r}", METHODS, lambda _: "nodes", selection, optional=True)
 

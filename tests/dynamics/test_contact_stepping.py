@@ -96,6 +96,16 @@ def run(sim, seconds: float) -> None:
 
 
 @by("symplectic_euler", "bdf2")
+def test_a_belt_that_jumps_between_two_steps_is_refused(sim):
+    sim.step()
+    sim.scene.obstacle("belt").path.speed = 0.1
+    with pytest.raises(ts.SimulationError, match="step 2: obstacle 'belt': the path gives another value at t = .* than before"):
+        sim.step()
+    sim.reset()
+    sim.step()
+
+
+@by("symplectic_euler", "bdf2")
 def test_contact_forces_balance_weight(sim):
     """Weight plus damping. Means over several steps, since the contact forces of explicit steps fluctuate."""
     mass = lumped_masses(sim.scene)[:, None]

@@ -95,9 +95,9 @@ def test_drag_is_refused_unless_draggable(beam):
     sim, scene = beam[0], beam[0].scene
     assert sim.plan.on["loads"] and sim.plan.why("loads") == "bodies can be dragged"
     for nodes, weights, target, message in (
-        ([99999], [1.0], (0, 0, 0), "from 0 to"),
-        ([0], [1.0, 1.0], (0, 0, 0), "weights"),
-        ([0], [-1.0], (0, 0, 0), "weights"),
+        ([99999], [1.0], (0, 0, 0), "nodes to pull at: node 99999 does not exist"),
+        ([0, 1, 1], np.ones(3), (0, 0, 0), "nodes to pull at: 3 node ids that are all 0 or 1 are a mask"),
+        *(([0], weights, (0, 0, 0), "weights") for weights in ([1.0, 1.0], [-1.0])),
         ([0], [1.0], (0, np.nan, 0), "target"),
     ):
         with pytest.raises(SceneError, match=message):

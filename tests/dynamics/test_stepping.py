@@ -10,7 +10,7 @@ the others they are linear and have stiffness damping, too.
 
 Dirichlet conditions: fixed and prescribed axes are constrained until the group is released, which a reset undoes; targets are the
 rest positions plus the path's displacement, one for all nodes or one for each, until the first release; a step that ends with a
-path follows it to there, its accelerations too; paths that fail or give invalid values are refused with body and time.
+path follows it to there, its accelerations too; paths that fail, give invalid values or depend on more than time are refused.
 """
 
 from contextlib import contextmanager
@@ -21,6 +21,7 @@ import pytest
 
 import taisoft as ts
 from taisoft.dynamics.dirichlet import DirichletConditions
+from taisoft.dynamics.prescribed_paths import PrescribedPaths
 from taisoft.dynamics.schemes import EXPLICIT, IMPLICIT
 from tests.dynamics.following import DT, follow, simulator
 from tests.dynamics.scenes import cube, driven_scene, element, rows_of, rubber, use_threads
@@ -228,26 +229,22 @@ def until(end, path):
 
 
 @both_orders
-def test_masks(order, n):
+def test_masks_and_targets(order, n):
     """Those at the end are at the middle of an edge if the body is quadratic."""
-    dirichlet, _ = made(([0, 1], "xz", lambda t: (t, 0, 0)), ([1, n - 2], "y", lambda t: (0, t, 0)), order=order)
+    displacement = np.array([[1.0, 2, 3], [4, 5, 6]])
+    paths = ([1, 0], "xz", lambda t: t * displacement), ([1, n - 2], "y", lambda t: (0, -t, 0))
+    dirichlet, rest = made(*paths, order=order)
     expected = np.zeros((8 + n, 3), dtype=bool)
     expected[2, 2] = expected[15, :2] = True
     expected[[8, 9], 0] = expected[[8, 9], 2] = expected[[9, 6 + n], 1] = True
     assert np.array_equal(dirichlet.constrained(), expected)
-    assert list(dirichlet.prescribed_nodes) == [8, 9, 9, 6 + n] and dirichlet.n_prescribed == 4
+    assert list(dirichlet.prescribed_nodes) == [9, 8, 9, 6 + n] and dirichlet.n_prescribed == 4
     assert list(dirichlet.held) == sorted([2, 8, 9, 6 + n, 15])
     assert dirichlet.prescribed_axes().tolist() == [[1, 0, 1], [1, 0, 1], [0, 1, 0], [0, 1, 0]]
-
-
-@both_orders
-def test_targets(order, n):
-    displacement = np.array([[1.0, 2, 3], [4, 5, 6]])
-    dirichlet, rest = made(([n - 3, 2], "xyz", lambda t: t * displacement), ([3], "y", lambda t: (0, -t, 0)), order=order)
     rows, releasing = dirichlet.targets(np.array([0.5, 2.0]))
-    assert rows.shape == (2, 3, 3) and not releasing
+    assert rows.shape == (2, 4, 3) and not releasing
     for row, t in zip(rows, (0.5, 2.0)):
-        assert row == pytest.approx(np.concatenate([rest[[5 + n, 10]] + t * displacement, rest[[11]] + [[0, -t, 0]]]))
+        assert row == pytest.approx(np.concatenate([rest[[9, 8]] + t * displacement, rest[[9, 6 + n]] + [[0, -t, 0]]]))
 
 
 def test_release():
@@ -299,3 +296,29 @@ def test_a_displacement_after_a_release_is_refused():
     with pytest.raises(ts.SimulationError, match="body 'prescribed': moved nodes: the path gave None at t = 0.005,"):
         dirichlet.targets(np.array([0.01]))
         dirichlet.accelerations(0.0, 0.01, True)
+
+
+@pytest.mark.parametrize(
+    "height, refused",  # of t and of past commands, one a step of 0.1 s
+    [
+        (lambda t, past: np.interp(t, 0.1 * np.arange(len(past)), past), False),
+        (lambda t, past: None if t > 0.25 else np.sin(t), False),
+        (lambda t, past: 1 / (t < 0.25), False),  # the step that uses the value refuses it
+        (lambda t, past: past[-1], True),
+        (lambda t, past: np.random.random(), True),
+        (lambda t, past: None if past[-1] > 2 else 0.0, True),
+    ],
+)
+def test_only_functions_of_time_alone_are_paths(height, refused):
+    past, scene, found = [0.0], ts.Scene(), ""
+    path = lambda t: None if (y := height(t, past)) is None else (0.0, y, 0.0)  # noqa: E731
+    scene.add_body(cube(), rubber(), name="it").move([3, 1], path)
+    paths = PrescribedPaths(scene)
+    for k in range(5):
+        paths.remember(0.1 * k * (1 + 1e-15))
+        past.append(float(k))
+        try:
+            paths.check()
+        except ts.SimulationError as error:
+            found = str(error)
+    assert found.startswith("body 'it': moved nodes: the path gives another value at t = ") == refused == bool(found)
