@@ -1,6 +1,7 @@
 """Read and write tetrahedral meshes in files.
 
-Gmsh's files are read by `gmsh.py`, TetGen's by `tetgen.py`, every other format by meshio in a child process (`safe_reading.py`).
+The formats that meshio reads wrongly have modules of their own; every other one is read by meshio in a child process
+(`safe_reading.py`).
 
 Second-order tets in a file have ten nodes, four corners and then one on each edge. Only the corners enter the mesh:
 second-order bodies have straight edges at rest and mid-edge nodes of their own. Curved edges are reported. Formats differ in
@@ -20,18 +21,23 @@ import numpy as np
 
 from taisoft.errors import MeshError, listed, value_text
 from taisoft.files import replacing
+from taisoft.mesh.abaqus import read_abaqus
 from taisoft.mesh.gmsh import PHYSICAL, read_gmsh, split_names
+from taisoft.mesh.medit import REFERENCE, read_medit
+from taisoft.mesh.nastran import read_nastran
 from taisoft.mesh.quality import edge_lengths
 from taisoft.mesh.regions import LARGEST_ID, usable_names
 from taisoft.mesh.safe_reading import Blocks, FileContent, read_by_meshio, read_content
 from taisoft.mesh.tet_mesh import LARGEST_COORDINATE, TetMesh
 from taisoft.mesh.tetgen import read_tetgen
 from taisoft.mesh.topology import EDGES, merge_labels
+from taisoft.mesh.vtu import read_vtu
 
 TETS = ("tetra", "tetra10")
 BOUNDARY = ("vertex", "line", "line3", "triangle", "triangle6")  # boundary markers that meshers add; ignored with a warning
+READERS = {".mesh": read_medit, ".vtu": read_vtu, ".inp": read_abaqus, **dict.fromkeys((".bdf", ".nas", ".fem"), read_nastran)}
 WRITERS = {".msh": "gmsh", ".vtk": "vtk", ".vtu": "vtu", ".mesh": "medit"}
-REGION, REFERENCE = "region", "medit:ref"  # names of cell data that hold regions, as PHYSICAL does
+REGION = "region"  # a name of cell data that hold regions, as PHYSICAL and REFERENCE do
 NONE_IF_ZERO = (PHYSICAL, REFERENCE)  # such data are in files without regions too, where all are 0
 
 # Pattern that counts the faces in a file of a format that cannot hold tets.
@@ -43,7 +49,7 @@ SURFACES = {
 }
 
 # A count of 0 in a file's text, on which meshio's readers fail with an unclear error.
-_ZERO_COUNT = re.compile(rb"(?:POINTS\s+|CELLS\s+(?:1\s+)?|NumberOf(?:Points|Cells)\s*=\s*\")0+\b")
+_ZERO_COUNT = re.compile(rb"(?:POINTS\s+|CELLS\s+(?:1\s+)?)0+\b")
 
 STRAIGHT = 1e-6  # tolerated distance of a node from its edge's midpoint, over the edge's length
 KNOWN_ORDER = 0.25  # largest median of that ratio for which the inferred node order is accepted
@@ -79,11 +85,13 @@ def read_mesh(path, fix_orientation: bool = False, weld: float | None = None, re
             content = _read_by_meshio(file, rest)._replace(region_names=names)
     elif ending in (".node", ".ele"):
         content = read_tetgen(file)
+    elif ending in READERS:
+        content = READERS[ending](name, data)
     content = content or _read_by_meshio(file, data)
     blocks, notes = _tet_blocks(name, content.cells)
     ids, names, region_notes = _regions(name, content, regions)
     labels = {"regions": ids, "region_names": names}
-    return _clean_mesh(name, content.points, blocks, notes + region_notes, fix_orientation, weld, labels)
+    return _clean_mesh(name, content.points, blocks, content.notes + notes + region_notes, fix_orientation, weld, labels)
 
 
 def write_mesh(path, mesh: TetMesh, regions: bool = True) -> None:
@@ -181,7 +189,7 @@ def _read_by_meshio(file: Path, data: bytes) -> FileContent:
     try:
         return read_by_meshio(file, data, "mesh")
     except MeshError as error:
-        if file.suffix.lower() in (".vtk", ".vtu") and _ZERO_COUNT.search(data):
+        if file.suffix.lower() == ".vtk" and _ZERO_COUNT.search(data):
             raise MeshError(f"{file}: no tetrahedra; the file declares 0 points or cells") from error
         raise
 

@@ -35,7 +35,6 @@ MAX_ITERATIONS = 80  # its maximum number of optimisation iterations
 _open = open  # the child replaces the built-in one
 
 Blocks = list[tuple[str, np.ndarray]]  # element blocks: meshio's type name, (k,nodes) indices from 0
-MAX_EXACT_INT = 2.0**53  # float64 holds every integer up to here exactly
 
 
 class FileContent(NamedTuple):
@@ -45,6 +44,7 @@ class FileContent(NamedTuple):
     cells: Blocks
     cell_data: dict[str, list[np.ndarray]] = {}  # by name, the numbers (k,) of each block's elements
     region_names: dict[int, str] = {}
+    notes: list[str] = []  # what was left out
 
 
 def read_content(file: Path) -> bytes:

@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from taisoft.errors import MeshError
-from taisoft.mesh.safe_reading import MAX_EXACT_INT, FileContent, content_lines, read_content
+from taisoft.mesh.safe_reading import FileContent, content_lines, read_content
+from taisoft.mesh.words import MAX_EXACT_INT
 
 
 def read_tetgen(file: Path) -> FileContent:

@@ -264,7 +264,7 @@ def test_errors_of_gmsh_files_give_the_line_and_the_node(tmp_path):
     for changed, message in (
         (lines[:inside], rf"line {inside}: the file ends inside \$Elements, before \$EndElements"),
         (lines[: inside - 1] + lines[inside:], r"line \d+ \(\$Elements\): 50 numbers should follow"),
-        ([*lines[:inside], "11 1 x 3 4\n", *lines[inside + 1 :]], rf"line {inside + 1} \(\$Elements\): b'x' is not a number"),
+        ([*lines[:inside], "11 1 x 3 4\n", *lines[inside + 1 :]], rf"line {inside + 1} \(\$Elements\): expected a number, not .x."),
         ([*lines[: inside - 4], "7 7 ", *lines[inside - 4 :]], r"line \d+ \(\$Elements\): 42 numbers should follow"),
         ([*lines[: first + 2], f"{number} 99 {' '.join(corners[1:])}\n", *lines[first + 3 :]], r"tet 2: node 99 .* \(12 nodes\)"),
         ([*lines[: first - 2], "1 11 1 10\n", *lines[first - 1 :]], r"line \d+ \(\$Elements\): 11 elements were declared, but"),
