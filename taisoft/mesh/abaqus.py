@@ -178,8 +178,9 @@ class _Reader:
         return matrix, matrix @ (shift - a) + a
 
     def _add_nodes(self, section: _Section) -> None:
-        if section.options.get("SYSTEM", "R") != "R":
-            raise self.error(section.line, f"expected SYSTEM=R of *NODE, not {section.options['SYSTEM'][:40]!r}")
+        if section.options.get("SYSTEM", "R") != "R" or section.options.keys() - {"NSET", "SYSTEM", ""}:
+            found = ", ".join(filter(None, (f"{key}={value}".rstrip("=") for key, value in section.options.items())))
+            raise self.error(section.line, f"expected NSET or SYSTEM=R as options of *NODE, not {found[:60]}")
         matrix, shift = self.system
         for line, words in section.rows:
             number = self._ints(line, words[:1])

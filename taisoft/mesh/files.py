@@ -187,7 +187,7 @@ def _read_by_meshio(file: Path, data: bytes) -> FileContent:
     if not any("".join(file.suffixes[-n:]).lower() in known for n in (1, 2)):
         raise MeshError(f"{file}: not a supported mesh: the ending {file.suffix.lower()!r} is not known")
     try:
-        return read_by_meshio(file, data, "mesh")
+        return read_by_meshio(file, data)
     except MeshError as error:
         if file.suffix.lower() == ".vtk" and _ZERO_COUNT.search(data):
             raise MeshError(f"{file}: no tetrahedra; the file declares 0 points or cells") from error

@@ -54,6 +54,10 @@ def read_medit(name: str, data: bytes) -> FileContent:
         elif _ELEMENTS.match(keyword) and keyword in _FORMATS:
             columns = len(_FORMATS[keyword])
             rows = words.ints(columns * words.count()).reshape(-1, columns)
+            bad = np.argwhere((rows[:, :-1] < 1) | (rows[:, :-1] > (0 if points is None else len(points))))
+            if len(bad):
+                at = words.at - rows.size + bad[0] @ (columns, 1)
+                raise words.error(f"vertex {words.quoted(at)} does not exist above ({0 if points is None else len(points)} vertices)", at)
             blocks.append((_KINDS.get(keyword, keyword), rows[:, :-1] - 1))
             references.append(rows[:, -1])
         elif keyword in _FORMATS or _SKIPPED.fullmatch(keyword):

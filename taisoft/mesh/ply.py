@@ -69,10 +69,11 @@ def read_ply(name: str, data: bytes) -> tuple[np.ndarray, list[np.ndarray]]:
             elif element.name == "face":
                 if run[corners].shape[1] < 3:
                     raise rows.error(f"expected a face of at least 3 corners, not {run[corners].shape[1]}")
-                whole = (np.abs(run[corners]) <= MAX_EXACT_INT) & (np.floor(run[corners]) == run[corners])
-                bad = np.flatnonzero(~whole.all(axis=1))
+                n_points = sum(map(len, points)) or MAX_EXACT_INT  # faces may come first
+                fitting = (run[corners] >= 0) & (run[corners] < n_points) & (np.floor(run[corners]) == run[corners])
+                bad = np.flatnonzero(~fitting.all(axis=1))
                 if len(bad):
-                    raise rows.error("expected whole numbers of vertices", int(bad[0]))
+                    raise rows.error(f"expected vertices from 0 to {n_points - 1:.0f}, not {run[corners][bad[0]].tolist()}", int(bad[0]))
                 polygons.append(run[corners].astype(np.int64))
     rows.end()
     return np.concatenate(points), polygons

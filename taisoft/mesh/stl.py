@@ -23,7 +23,7 @@ def read_stl(name: str, data: bytes) -> tuple[np.ndarray, list[np.ndarray]]:
     """Return positions (n,3) and an array of triangles (k,3). Raises MeshError."""
     n = int.from_bytes(data[80:HEADER], "little")
     if len(data) != HEADER + FACET * n:
-        if re.match(rb"\s*(solid|facet)\b", data, re.IGNORECASE) and b"\0" not in data:
+        if re.match(rb"\s*(solid|facet)\b", data, re.IGNORECASE) and (b"\0" not in data or re.search(rb"\bfacet\s+normal\b", data)):
             return _read_text(name, data.replace(b"\r\n", b"\n").replace(b"\r", b"\n"))
         if len(data) < HEADER:
             raise MeshError(f"{name}: byte {len(data)}: not a supported surface: expected text after solid, or {HEADER} bytes or more")

@@ -132,8 +132,9 @@ class _Reader:
             data.append({key: np.split(self._numbers(piece, "CellData", key, n_cells), first[1:]) for key in names})
             total += n_points
         common = [key for key in (data[0] if data else {}) if all(key in one for one in data)]
-        notes = [f"data {key!r} of cells are not in all pieces and are not used" for key in set().union(*data) - set(common)]
-        return FileContent(np.concatenate(points), blocks, {key: [v for one in data for v in one[key]] for key in common}, notes=sorted(notes))
+        lost = any("region" in one for one in data) and "region" not in common
+        notes = ["data 'region' of cells are not in all pieces and are not used"] if lost else []
+        return FileContent(np.concatenate(points), blocks, {key: [v for one in data for v in one[key]] for key in common}, notes=notes)
 
     def _block(self, line, code, sizes, begin, nodes, offsets, shift) -> tuple[str, np.ndarray]:
         """Return the cells from number `begin` on, all of the same type. shift: added to the numbers of nodes."""
