@@ -1,7 +1,7 @@
 """Read Abaqus input files (.inp): nodes and tets of the model, and of its parts where their instances place them.
 
-meshio keeps the last *NODE block alone and knows neither *SYSTEM nor parts and instances. Keywords that make, move or import nodes
-or elements in other ways are refused by name; those of sets, analysis and output say nothing of the mesh.
+meshio keeps the last *NODE block alone and knows neither *SYSTEM nor parts and instances. Keywords that make, move or import
+nodes or elements in other ways are refused by name; those of sets, analysis and output say nothing of the mesh.
 Source: Abaqus keyword reference; Abaqus analysis guide, "Node definition" and "Assembly definition".
 """
 
@@ -102,7 +102,7 @@ class _Reader:
         if key in REFUSED:
             raise self.error(section.line, f"expected nodes and elements as they are: *{key} is not supported")
         if key in ("NODE", "ELEMENT") and (self.part is None or "INPUT" in options):
-            raise self.error(section.line, f"expected *{key} with data in the model or a part, not in an instance or another file")
+            raise self.error(section.line, f"expected *{key} with its data in the model or a part, not elsewhere")
         if key in ("PART", "END PART", "INSTANCE", "END INSTANCE"):
             self.system = AT_ORIGIN
         if key == "PART":
@@ -197,8 +197,8 @@ class _Reader:
         tet = TET.fullmatch(kind)
         if tet is None:
             kind = abaqus_to_meshio_type.get(kind, kind)
-            lines = [words for (_, words), (_, before) in zip(section.rows, [(0, ["0"]), *section.rows]) if before[-1]]  # a comma at the end
-            self.part.others[kind] = self.part.others.get(kind, 0) + len(lines)
+            ends = sum(bool(words[-1]) for _, words in section.rows)  # a line that ends with a comma goes on
+            self.part.others[kind] = self.part.others.get(kind, 0) + ends
             return
         n_nodes = int(tet[1])
         rows = self.part.tets.setdefault("tetra" if n_nodes == 4 else "tetra10", [])

@@ -1,7 +1,7 @@
 """Read Medit's text files (.mesh): words in which line breaks mean nothing.
 
-meshio reads them line by line and refuses files with other sections than it knows. Elements become blocks with their references;
-other known sections are skipped, unknown words refused with their line.
+meshio reads them line by line and refuses files with other sections than it knows. Elements become blocks with their
+references; other known sections are skipped, unknown words refused with their line.
 Source: Frey 2001, MEDIT, INRIA RT-0253; libMeshb, whose table of keywords meshio holds.
 """
 
@@ -10,7 +10,6 @@ import re
 import numpy as np
 from meshio.medit._medit_internal import medit_codes
 
-from taisoft.errors import MeshError
 from taisoft.mesh.safe_reading import Blocks, FileContent
 from taisoft.mesh.words import Words
 
@@ -18,9 +17,17 @@ REFERENCE = "medit:ref"  # meshio's name of the elements' references
 
 _FORMATS = {name.removeprefix("Gmf"): columns for name, _, columns in medit_codes.values()} | {"Hexaedra": 9 * "i"}
 _KINDS = {  # meshio's names, as far as taisoft knows them; others keep Medit's
-    **{"Edges": "line", "Triangles": "triangle", "Tetrahedra": "tetra", "Quadrilaterals": "quad", "Hexahedra": "hexahedron"},
-    **{"EdgesP2": "line3", "TrianglesP2": "triangle6", "TetrahedraP2": "tetra10", "Hexaedra": "hexahedron", "Prisms": "wedge"},
+    "Edges": "line",
+    "EdgesP2": "line3",
+    "Triangles": "triangle",
+    "TrianglesP2": "triangle6",
+    "Quadrilaterals": "quad",
+    "Tetrahedra": "tetra",
+    "TetrahedraP2": "tetra10",
+    "Prisms": "wedge",
     "Pyramids": "pyramid",
+    "Hexahedra": "hexahedron",
+    "Hexaedra": "hexahedron",
 }
 _ELEMENTS = re.compile(r"(Edges|Triangles|Quadrilaterals|Tetrahedra|Prisms|Pyramids|Hexahedra|Hexaedra)([PQ]\d)?$")
 _SKIPPED = re.compile(  # sections that libMeshb does not list
@@ -54,10 +61,11 @@ def read_medit(name: str, data: bytes) -> FileContent:
         elif _ELEMENTS.match(keyword) and keyword in _FORMATS:
             columns = len(_FORMATS[keyword])
             rows = words.ints(columns * words.count()).reshape(-1, columns)
-            bad = np.argwhere((rows[:, :-1] < 1) | (rows[:, :-1] > (0 if points is None else len(points))))
+            n_points = 0 if points is None else len(points)
+            bad = np.argwhere((rows[:, :-1] < 1) | (rows[:, :-1] > n_points))
             if len(bad):
-                at = words.at - rows.size + bad[0] @ (columns, 1)
-                raise words.error(f"vertex {words.quoted(at)} does not exist above ({0 if points is None else len(points)} vertices)", at)
+                at = words.at - rows.size + int(bad[0] @ (columns, 1))
+                raise words.error(f"expected vertices from 1 to {n_points}, not {words.quoted(at)}", at)
             blocks.append((_KINDS.get(keyword, keyword), rows[:, :-1] - 1))
             references.append(rows[:, -1])
         elif keyword in _FORMATS or _SKIPPED.fullmatch(keyword):

@@ -85,7 +85,8 @@ class _Reader:
 
     def _cards(self) -> Iterator[_Card]:
         """Yield the entries between BEGIN BULK, if it is there, and ENDDATA; $ begins a comment."""
-        lines = [(k, line.split("$", 1)[0].rstrip()) for k, line in enumerate(self._data.decode("utf-8", "replace").splitlines(), 1)]
+        text = self._data.decode("utf-8", "replace").splitlines()
+        lines = [(k, line.split("$", 1)[0].rstrip()) for k, line in enumerate(text, 1)]
         begin = next((k for k, line in lines if re.fullmatch(r"\s*BEGIN(\s+BULK)?", line, re.IGNORECASE)), 0)
         card = None
         for number, line in lines[begin:]:
@@ -143,8 +144,8 @@ class _Reader:
             return self.frames[system]
         card = self.systems.get(system)
         if card is None or system in above or len(above) > MAX_DEPTH:
-            rule = "which refers to itself or too many others" if card else "which is not defined by CORD1R, CORD1C, CORD1S, CORD2R, CORD2C or CORD2S"
-            raise self.error(line, f"expected a coordinate system, not {system}, {rule}")
+            rule = "not in terms of itself or too many others" if card else "such as CORD2R"
+            raise self.error(line, f"expected a definition of coordinate system {system}, {rule}")
         above = (*above, system)
         if card.name[4] == "1":
             numbers = [self._int(card, k) for k in (1, 2, 3)]

@@ -7,7 +7,7 @@ from taisoft.mesh.safe_reading import FileContent
 
 
 def indices(name: str, numbers: dict[int, int], rows: list[tuple[int, list[int]]]) -> np.ndarray:
-    """Return cells (k,nodes) as indices of nodes. numbers: index by number of a node; rows: line and numbers of a cell's nodes."""
+    """Return cells (k,nodes) as indices. numbers: index by number of a node; rows: line and numbers of each cell's nodes."""
     try:
         return np.array([[numbers[node] for node in nodes] for _, nodes in rows], dtype=np.int64)
     except KeyError:

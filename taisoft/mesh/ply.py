@@ -1,7 +1,7 @@
 """Read .ply files, text and binary of either byte order, with any elements and properties.
 
-meshio expects the faces' list under one of its two names, before other properties, and no other elements. Here elements are read
-in runs of rows whose lists have equal lengths, each as one array.
+meshio expects the faces' list under one of its two names, before other properties, and no other elements. Here elements are
+read in runs of rows whose lists have equal lengths, each as one array.
 Source: Turk 1994, The PLY Polygon File Format, which calls the list `vertex_index`; most programs write `vertex_indices`.
 """
 
@@ -53,19 +53,19 @@ def read_ply(name: str, data: bytes) -> tuple[np.ndarray, list[np.ndarray]]:
     else:  # as bytes of float64
         words = Words(name, data[head.end() :], data.count(b"\n", 0, head.end()) + 1)
         rows = _Rows(words.floats(words.left()).tobytes(), "=", lambda text, at: words.error(text, at // 8))
-        elements = [one._replace(properties=[p._replace(type="f8", count=p.count and "f8") for p in one.properties]) for one in elements]
+        for element in elements:
+            element.properties[:] = [one._replace(type="f8", count=one.count and "f8") for one in element.properties]
     points, polygons = [np.empty((0, 3))], []
     for element in elements:
-        columns = {one.name: k for k, one in enumerate(element.properties)}
-        corners = next((columns[one] for one in LISTS if one in columns and element.properties[columns[one]].count), None)
+        lists, numbers = ({p.name: k for k, p in enumerate(element.properties) if bool(p.count) == own} for own in (True, False))
+        corners = next((lists[one] for one in LISTS if one in lists), None)
         if element.name == "tristrips" or (element.name == "face" and corners is None):
-            rule = f"expected faces with a list called {' or '.join(LISTS)}, not {element.name!r} with {', '.join(columns) or 'nothing'}"
-            raise MeshError(f"{name}: line {element.line}: {rule}")
-        if element.name == "vertex" and not all(axis in columns and not element.properties[columns[axis]].count for axis in "xyz"):
-            raise MeshError(f"{name}: line {element.line}: expected vertices with x, y and z, not {', '.join(columns) or 'nothing'}")
+            raise _unfit(name, element, f"faces with a list called {' or '.join(LISTS)}")
+        if element.name == "vertex" and not numbers.keys() >= set("xyz"):
+            raise _unfit(name, element, "vertices with x, y and z")
         for run in rows.runs(element):
             if element.name == "vertex":
-                points.append(np.column_stack([run[columns[axis]] for axis in "xyz"]))
+                points.append(np.column_stack([run[numbers[axis]] for axis in "xyz"]))
             elif element.name == "face":
                 if run[corners].shape[1] < 3:
                     raise rows.error(f"expected a face of at least 3 corners, not {run[corners].shape[1]}")
@@ -73,10 +73,15 @@ def read_ply(name: str, data: bytes) -> tuple[np.ndarray, list[np.ndarray]]:
                 fitting = (run[corners] >= 0) & (run[corners] < n_points) & (np.floor(run[corners]) == run[corners])
                 bad = np.flatnonzero(~fitting.all(axis=1))
                 if len(bad):
-                    raise rows.error(f"expected vertices from 0 to {n_points - 1:.0f}, not {run[corners][bad[0]].tolist()}", int(bad[0]))
+                    raise rows.error(f"expected whole numbers of vertices below {n_points:.0f}", int(bad[0]))
                 polygons.append(run[corners].astype(np.int64))
     rows.end()
     return np.concatenate(points), polygons
+
+
+def _unfit(name: str, element: Element, rule: str) -> MeshError:
+    found = ", ".join(one.name for one in element.properties) or "nothing"
+    return MeshError(f"{name}: line {element.line}: expected {rule}, not {element.name!r} with {found}")
 
 
 def _read_header(name: str, text: str) -> tuple[str, list[Element]]:
@@ -89,8 +94,8 @@ def _read_header(name: str, text: str) -> tuple[str, list[Element]]:
                     pass
                 case ["format", kind, "1.0"] if order is None:
                     order = _FORMATS[kind]
-                case ["element", element, n] if order is not None and int(n) >= 0 and element not in [one.name for one in elements]:
-                    elements.append(Element(element, int(n), [], line))
+                case ["element", called, n] if order is not None and int(n) >= 0 and called not in {one.name for one in elements}:
+                    elements.append(Element(called, int(n), [], line))
                 case ["property", "list", count, kind, called] if TYPES[count][0] in "iu":
                     elements[-1].properties.append(Property(called, TYPES[kind], TYPES[count]))
                 case ["property", kind, called]:
@@ -128,7 +133,9 @@ class _Rows:
             lengths, row = self._first_row(element)
             n = min(left, tried, (len(self.data) - self.at) // self.size)
             values = np.frombuffer(self.data, row, n, self.at)
-            equal = np.logical_and.reduce([values[f"n{k}"] == length for k, length in lengths.items()] or [np.ones(n, dtype=bool)])
+            equal = np.ones(n, dtype=bool)
+            for k, length in lengths.items():
+                equal &= values[f"n{k}"] == length
             n = n if equal.all() else int(np.argmin(equal))
             yield [values[f"{k}"][:n] for k in range(len(element.properties))]
             self.at += n * self.size

@@ -1,7 +1,7 @@
 """Read .vtu files, VTK's XML files of unstructured grids: all pieces, numbers in any of the format's encodings.
 
-Of several pieces meshio keeps the cells of the last; it drops cells of types that it does not know, and refuses the present version of the
-format. Here data of cells are kept where all pieces have them.
+Of several pieces meshio keeps the cells of the last; it drops cells of types that it does not know, and refuses versions above 1.
+Here data of cells are kept where all pieces have them.
 Sources: VTK documentation, "VTK XML formats"; vtkCellType.h, whose numbers meshio holds.
 Weak: LZ4 needs a package that is not part of Python, and is refused.
 """
@@ -53,7 +53,7 @@ class _Reader:
 
     def __init__(self, name: str, data: bytes):
         self.name, self._size, self._pieces, self._root = name, len(data), [], {}
-        self._section, self._array = "", None
+        self._section, self._array, self._tags = "", None, []
         encoding = "utf-8" if data[:2] in (b"\xff\xfe", b"\xfe\xff") else None
         data = data.decode("utf-16", "replace").encode() if encoding else data
         appended = _APPENDED.search(data)
@@ -79,6 +79,7 @@ class _Reader:
         raise self._error("expected no document type declaration")
 
     def _start(self, tag: str, attributes: dict[str, str]) -> None:
+        self._tags.append(tag)
         if not self._root:
             if tag != "VTKFile" or attributes.get("type") != "UnstructuredGrid":
                 raise self._error('not a supported mesh: expected <VTKFile type="UnstructuredGrid">')
@@ -97,10 +98,10 @@ class _Reader:
             self._pieces[-1].arrays.setdefault(self._section, {})[key] = self._array
 
     def _end(self, tag: str) -> None:
-        self._array = None if tag == "DataArray" else self._array
+        self._array = None if self._tags.pop() == "DataArray" else self._array
 
     def _text(self, text: str) -> None:
-        if self._array is not None:
+        if self._array is not None and self._tags[-1] == "DataArray":  # not InformationKey in it
             self._array.text.append(text)
 
     def _chosen(self, table: dict, key: str, what: str, line: int | None = None):
@@ -123,18 +124,21 @@ class _Reader:
             nodes = self._numbers(piece, "Cells", "connectivity", int(offsets[-1])).astype(np.int64)
             bad = np.flatnonzero((nodes < 0) | (nodes >= n_points))
             if len(bad):
-                text = f"cell {np.searchsorted(offsets, bad[0], 'right')}: node {nodes[bad[0]]} does not exist ({n_points} points)"
+                cell = np.searchsorted(offsets, bad[0], "right")
+                text = f"cell {cell}: node {nodes[bad[0]]} does not exist ({n_points} points)"
                 raise self._error(text, cells["connectivity"].line)
             first = np.flatnonzero(np.diff(types, prepend=-1))
             for begin, end in zip(first.tolist(), [*first[1:].tolist(), n_cells]):
                 blocks.append(self._block(cells["types"].line, types[begin], sizes[begin:end], begin, nodes, offsets, total))
-            names = {key for key, one in piece.arrays.get("CellData", {}).items() if one.attributes.get("NumberOfComponents", "1") in ("", "1")}
+            arrays = piece.arrays.get("CellData", {})
+            names = [key for key, one in arrays.items() if one.attributes.get("NumberOfComponents", "1") in ("", "1")]
             data.append({key: np.split(self._numbers(piece, "CellData", key, n_cells), first[1:]) for key in names})
             total += n_points
         common = [key for key in (data[0] if data else {}) if all(key in one for one in data)]
         lost = any("region" in one for one in data) and "region" not in common
         notes = ["data 'region' of cells are not in all pieces and are not used"] if lost else []
-        return FileContent(np.concatenate(points), blocks, {key: [v for one in data for v in one[key]] for key in common}, notes=notes)
+        by_name = {key: [values for one in data for values in one[key]] for key in common}
+        return FileContent(np.concatenate(points), blocks, by_name, notes=notes)
 
     def _block(self, line, code, sizes, begin, nodes, offsets, shift) -> tuple[str, np.ndarray]:
         """Return the cells from number `begin` on, all of the same type. shift: added to the numbers of nodes."""
@@ -174,10 +178,8 @@ class _Reader:
             offset = array.attributes.get("offset", "").strip()
             if encoding != "appended" or not re.fullmatch(r"\d{1,15}", offset, re.ASCII):
                 raise self._error("expected format ascii, binary, or appended and an offset", array.line)
-            at = self._first + int(offset)
-            stream = _Stream(
-                self._appended[int(offset) :], not self._raw, lambda text: MeshError(f"{self.name}: byte {at} ({key or section}): {text}")
-            )
+            place = f"{self.name}: byte {self._first + int(offset)} ({key or section})"
+            stream = _Stream(self._appended[int(offset) :], not self._raw, lambda text: MeshError(f"{place}: {text}"))
             found = self._decoded(stream, kind, n)
         if len(found) != n:
             raise self._error(f"expected {n} numbers of {key or section}, not {len(found)}", array.line)

@@ -96,7 +96,7 @@ class UsdWriter:
             self._view.resume(np.array(self._joined.layer.QueryTimeSample(self._view.attribute, times[-1])))
 
     def frame(self, sim, index: int) -> None:
-        """Record sim's state as frame index; index must ascend, and counts from time 0 if the first is not 0. Raises OutputError."""
+        """Record sim's state as frame index, which must ascend; the first, if not 0, counts from time 0. Raises OutputError."""
         from pxr import Gf, Sdf
 
         moved = [(track, surface.at(sim.time).astype(np.float32)) for track, surface in self._moving]  # first, since it may raise
