@@ -28,6 +28,7 @@ from taisoft.mesh.nastran import read_nastran
 from taisoft.mesh.quality import edge_lengths
 from taisoft.mesh.regions import LARGEST_ID, usable_names
 from taisoft.mesh.safe_reading import Blocks, FileContent, read_by_meshio, read_content
+from taisoft.mesh.surface_mesh import READERS as SURFACE_READERS
 from taisoft.mesh.tet_mesh import LARGEST_COORDINATE, TetMesh
 from taisoft.mesh.tetgen import read_tetgen
 from taisoft.mesh.topology import EDGES, merge_labels
@@ -39,14 +40,6 @@ READERS = {".mesh": read_medit, ".vtu": read_vtu, ".inp": read_abaqus, **dict.fr
 WRITERS = {".msh": "gmsh", ".vtk": "vtk", ".vtu": "vtu", ".mesh": "medit"}
 REGION = "region"  # a name of cell data that hold regions, as PHYSICAL and REFERENCE do
 NONE_IF_ZERO = (PHYSICAL, REFERENCE)  # such data are in files without regions too, where all are 0
-
-# Pattern that counts the faces in a file of a format that cannot hold tets.
-SURFACES = {
-    ".obj": rb"^[ \t]*f[ \t]",
-    ".stl": rb"^[ \t]*facet\b",
-    ".off": rb"\A\s*OFF\s+(?:#[^\n]*\s+)*\d+\s+(\d+)",
-    ".ply": rb"^[ \t]*element[ \t]+face[ \t]+(\d+)",
-}
 
 # A count of 0 in a file's text, on which meshio's readers fail with an unclear error.
 _ZERO_COUNT = re.compile(rb"(?:POINTS\s+|CELLS\s+(?:1\s+)?)0+\b")
@@ -74,9 +67,9 @@ def read_mesh(path, fix_orientation: bool = False, weld: float | None = None, re
     name = str(file)
     data = read_content(file)
     ending = file.suffix.lower()
-    if ending in SURFACES:
-        found = _count_faces(ending, data)
-        raise MeshError(f"{name}: no tetrahedra; {found} found; make a volume mesh first: taisoft tetrahedralize")
+    if ending in SURFACE_READERS:
+        n = sum(map(len, SURFACE_READERS[ending](name, data)[1]))
+        raise MeshError(f"{name}: no tetrahedra; {n} faces found; make a volume mesh first: taisoft tetrahedralize")
     content = None
     if ending == ".msh" and data.lstrip()[:1] == b"$":
         content = read_gmsh(name, data)
@@ -140,18 +133,6 @@ def check_ending(file: Path) -> str:
     if ending not in WRITERS:
         raise MeshError(f"{file}: a mesh can be written as {', '.join(WRITERS)}, not with the ending {ending!r}")
     return ending
-
-
-def _count_faces(ending: str, data: bytes) -> str:
-    """Return the number of faces in a surface file, as text."""
-    if ending == ".stl" and len(data) >= 84 and len(data) == 84 + 50 * int.from_bytes(data[80:84], "little"):
-        return _format_counts({"triangle": int.from_bytes(data[80:84], "little")})
-    found = re.findall(SURFACES[ending], data, re.MULTILINE)
-    if ending in (".off", ".ply"):
-        return f"{found[0][:20].decode()} faces" if found else "no faces"
-    if ending == ".obj" and any(len(line.split()) != 4 for line in data.splitlines() if line.split()[:1] == [b"f"]):
-        return f"{len(found)} faces"
-    return _format_counts({"triangle": len(found)})
 
 
 def _regions(name: str, content: FileContent, requested: str | None) -> tuple[np.ndarray | None, dict[int, str], list[str]]:

@@ -34,7 +34,7 @@ SECONDS = 20  # time limit of a reader
 QUICK = re.compile(
     r"surface\.|(text|binary)\.[ps]|(part|text|old)\.msh|part\.(vtu|mesh|inp|bdf|node)$"
 )  # read without a child process
-N_QUICK = 150  # changed files of each of these
+N_QUICK = 200  # changed files of each of these
 PLACE = re.compile(
     r"\b(line|byte|row|node|vertex|vertices|tets?|triangle|edges?) \d|\bno \w+|is empty|the file holds|ten nodes are not"
 )

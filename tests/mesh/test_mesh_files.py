@@ -232,7 +232,7 @@ def test_files_without_a_mesh_are_refused(tmp_path):
         ("a.msh", MARK + b"\r\n", "the file is empty"),
         ("a.svg", b"x", "not a supported mesh (such files can only be written: svg)"),
         ("a.txt", b"hello", "not a supported mesh: the ending '.txt' is not known"),
-        ("a.obj", OBJ.encode(), "no tetrahedra; 2 triangles found; make a volume mesh first"),
+        ("a.obj", OBJ.encode(), "no tetrahedra; 2 faces found; make a volume mesh first"),
         ("a.off", OFF.encode(), "no tetrahedra; 2 faces found"),
     ):
         if content is not None:
