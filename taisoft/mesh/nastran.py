@@ -5,6 +5,7 @@ Source: MSC Nastran quick reference guide, "Format of bulk data entries", GRID, 
 Weak: of elements other than tets only the number is read.
 """
 
+import contextlib
 import re
 from collections.abc import Iterator
 from typing import NamedTuple
@@ -116,15 +117,16 @@ class _Reader:
         text = card.fields[k] if k < len(card.fields) else ""
         if not text and blank is not None:
             return blank
-        if not re.fullmatch(r"[+-]?\d{1,15}", text, re.ASCII):
+        if not (text.isascii() and text.removeprefix("-").isdigit() and len(text) < 16):
             raise self.error(card.line, f"expected a whole number in field {k + 2} of {card.name}, not {text[:40]!r}")
         return int(text)
 
     def _float(self, card: _Card, k: int) -> float:
-        text = card.fields[k] if k < len(card.fields) else ""
-        text = re.sub(r"(?<=[\d.])([+-]\d+)$", r"e\1", re.sub("[dD]", "e", text)) or "0"  # 7.0-1 is 0.7, and a blank is 0
+        text = (card.fields[k] if k < len(card.fields) else "") or "0"  # a blank is 0
         try:
-            return float(text)
+            with contextlib.suppress(ValueError):
+                return float(text)
+            return float(re.sub(r"(?<=[\d.])([+-]\d+)$", r"e\1", re.sub("[dD]", "e", text)))  # 7.0-1 is 0.7
         except ValueError:
             raise self.error(card.line, f"expected a number in field {k + 2} of {card.name}, not {text[:40]!r}") from None
 

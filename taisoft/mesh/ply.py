@@ -1,11 +1,12 @@
 """Read .ply files, text and binary of either byte order, with any elements and properties.
 
-meshio expects the faces' list under one of its two names, before other properties, and no other elements. Here elements are
-read in runs of rows whose lists have equal lengths, each as one array.
+meshio expects the faces' list under one of its two names, before other properties, and no other elements. Here the
+rows whose lists have equal lengths are read as one array.
 Source: Turk 1994, The PLY Polygon File Format, which calls the list `vertex_index`; most programs write `vertex_indices`.
 """
 
 import re
+import struct
 from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
@@ -15,7 +16,7 @@ from taisoft.errors import MeshError
 from taisoft.mesh.words import MAX_EXACT_INT, Words
 
 LISTS = ("vertex_indices", "vertex_index")
-GROWTH = 8  # of the number of rows that are tried, after rows of equal lists
+STRUCT_TYPES = {"i1": "b", "u1": "B", "i2": "h", "u2": "H", "i4": "i", "u4": "I", "i8": "q", "u8": "Q", "f8": "d"}
 _SIZES = {"char": "i1", "short": "i2", "int": "i4", "float": "f4", "double": "f8", "float32": "f4", "float64": "f8"}
 TYPES = _SIZES | {f"u{name}": f"u{_SIZES[name][1]}" for name in ("char", "short", "int")}
 TYPES |= {f"{sign}int{8 * size}": f"{sign or 'i'}{size}" for sign in ("", "u") for size in (1, 2, 4, 8)}
@@ -55,7 +56,7 @@ def read_ply(name: str, data: bytes) -> tuple[np.ndarray, list[np.ndarray]]:
         rows = _Rows(words.floats(words.left()).tobytes(), "=", lambda text, at: words.error(text, at // 8))
         for element in elements:
             element.properties[:] = [one._replace(type="f8", count=one.count and "f8") for one in element.properties]
-    points, polygons = [np.empty((0, 3))], []
+    points, polygons = np.empty((0, 3)), []
     for element in elements:
         lists, numbers = ({p.name: k for k, p in enumerate(element.properties) if bool(p.count) == own} for own in (True, False))
         corners = next((lists[one] for one in LISTS if one in lists), None)
@@ -63,20 +64,20 @@ def read_ply(name: str, data: bytes) -> tuple[np.ndarray, list[np.ndarray]]:
             raise _unfit(name, element, f"faces with a list called {' or '.join(LISTS)}")
         if element.name == "vertex" and not numbers.keys() >= set("xyz"):
             raise _unfit(name, element, "vertices with x, y and z")
-        for run in rows.runs(element):
+        for first, values in rows.groups(element):
             if element.name == "vertex":
-                points.append(np.column_stack([run[numbers[axis]] for axis in "xyz"]))
+                points = np.column_stack([values[numbers[axis]] for axis in "xyz"])
             elif element.name == "face":
-                if run[corners].shape[1] < 3:
-                    raise rows.error(f"expected a face of at least 3 corners, not {run[corners].shape[1]}")
-                n_points = sum(map(len, points)) or MAX_EXACT_INT  # faces may come first
-                fitting = (run[corners] >= 0) & (run[corners] < n_points) & (np.floor(run[corners]) == run[corners])
-                bad = np.flatnonzero(~fitting.all(axis=1))
-                if len(bad):
-                    raise rows.error(f"expected whole numbers of vertices below {n_points:.0f}", int(bad[0]))
-                polygons.append(run[corners].astype(np.int64))
+                nodes = values[corners]
+                if nodes.shape[1] < 3:
+                    raise rows.error(f"expected a face of at least 3 corners, not {nodes.shape[1]}", int(first[0]))
+                n_points = len(points) or MAX_EXACT_INT  # faces may come first
+                bad = ~((nodes >= 0) & (nodes < n_points) & (np.floor(nodes) == nodes)).all(axis=1)
+                if bad.any():
+                    raise rows.error(f"expected whole numbers of vertices below {n_points:.0f}", int(first[bad.argmax()]))
+                polygons.append(nodes.astype(np.int64))
     rows.end()
-    return np.concatenate(points), polygons
+    return points, polygons
 
 
 def _unfit(name: str, element: Element, rule: str) -> MeshError:
@@ -111,52 +112,54 @@ def _read_header(name: str, text: str) -> tuple[str, list[Element]]:
 
 
 class _Rows:
-    """The rows after the header, as bytes. size: of the present row, which begins at byte `at`."""
+    """The rows after the header, as bytes, of which those before byte `at` were read."""
 
     def __init__(self, data: bytes, order: str, error: Callable[[str, int], MeshError]):
         """order: of bytes; error: returns the error at a byte of data."""
-        self.data, self.at, self.size, self._order, self._error = data, 0, 0, order, error
-
-    def error(self, text: str, row: int = 0) -> MeshError:
-        """Return the error at a row from the present one on."""
-        return self._error(text, self.at + row * self.size)
+        self.data, self.at, self.error, self._order = data, 0, error, order
 
     def end(self) -> None:
         """Check that only blank space is left."""
         if self.data[self.at :].strip():
-            raise self._error("expected the file's end after the last row that the header declares", self.at)
+            raise self.error("expected the file's end after the last row that the header declares", self.at)
 
-    def runs(self, element: Element) -> Iterator[list[np.ndarray]]:
-        """Yield, for each run of rows with lists of equal lengths, the values (k,) or (k,length) of each property."""
-        left, tried = element.n_rows, 1 if any(one.count for one in element.properties) else element.n_rows
-        while left and element.properties:
-            lengths, row = self._first_row(element)
-            n = min(left, tried, (len(self.data) - self.at) // self.size)
-            values = np.frombuffer(self.data, row, n, self.at)
-            equal = np.ones(n, dtype=bool)
-            for k, length in lengths.items():
-                equal &= values[f"n{k}"] == length
-            n = n if equal.all() else int(np.argmin(equal))
-            yield [values[f"{k}"][:n] for k in range(len(element.properties))]
-            self.at += n * self.size
-            left, tried = left - n, GROWTH * n
+    def groups(self, element: Element) -> Iterator[tuple[np.ndarray, list[np.ndarray]]]:
+        """Yield rows whose lists have equal lengths: their first bytes (k,), and of each property the values (k,) or (k,length)."""
+        for lengths, first in self._starts(element).items():
+            fields, left = [], list(lengths)
+            for k, one in enumerate(element.properties):
+                fields += [(f"n{k}", self._order + one.count)] if one.count else []
+                fields.append((f"{k}", self._order + one.type, (left.pop(0),)) if one.count else (f"{k}", self._order + one.type))
+            kind = np.dtype(fields)
+            if first[-1] - first[0] == (len(first) - 1) * kind.itemsize:  # without others between them
+                values = np.frombuffer(self.data, kind, len(first), first[0])
+            else:
+                values = np.frombuffer(self.data, np.uint8)[first[:, None] + np.arange(kind.itemsize)].view(kind)[:, 0]
+            yield first, [values[f"{k}"] for k in range(len(element.properties))]
 
-    def _first_row(self, element: Element) -> tuple[dict[int, int], np.dtype]:
-        """Return the lengths of the lists in the present row by the number of the property, and the row's type."""
-        end, lengths, fields = self.at, {}, []
-        for k, one in enumerate(element.properties):
-            if one.count:
-                count = np.dtype(self._order + one.count)
-                found = np.frombuffer(self.data[end : end + count.itemsize].ljust(count.itemsize, b"\xff"), count)[0]
-                if not (0 <= found <= len(self.data) and found == int(found)):
-                    raise self._error(f"expected the length of the list {one.name} of {element.name!r}", end)
-                lengths[k] = int(found)
-                fields.append((f"n{k}", count))
-                end += count.itemsize
-            kind = np.dtype(self._order + one.type)
-            fields.append((f"{k}", kind, (lengths[k],)) if one.count else (f"{k}", kind))
-            end += kind.itemsize * lengths.get(k, 1)
-        if end > len(self.data):
-            raise self._error(f"expected a whole row of {element.name!r}, but the file ends", len(self.data))
-        self.size = end - self.at
-        return lengths, np.dtype(fields)
+    def _starts(self, element: Element) -> dict[tuple[int, ...], np.ndarray]:
+        """Return the first bytes of all rows, by the lengths of their lists, and go on to the end of the last one."""
+        sizes = [np.dtype(one.type).itemsize for one in element.properties]
+        counts = [struct.Struct(self._order + STRUCT_TYPES[one.count]) if one.count else None for one in element.properties]
+        end, n = len(self.data), element.n_rows
+        if not n or not sizes:
+            return {}
+        if not any(counts) and n * sum(sizes) <= end - self.at:
+            first, self.at = self.at, self.at + n * sum(sizes)
+            return {(): np.arange(first, self.at, sum(sizes))}
+        found: dict[tuple[int, ...], list[int]] = {}
+        for _ in range(n):
+            first, lengths = self.at, ()
+            for count, size in zip(counts, sizes):
+                if count is None:
+                    self.at += size
+                    continue
+                (length,) = count.unpack_from(self.data, self.at) if self.at + count.size <= end else (-1,)
+                if not 0 <= length <= end or length != int(length):
+                    raise self.error(f"expected the length of a list of {element.name!r}", min(self.at, end))
+                lengths = (*lengths, int(length))
+                self.at += count.size + int(length) * size
+            if self.at > end:
+                raise self.error(f"expected a whole row of {element.name!r}, but the file ends", end)
+            found.setdefault(lengths, []).append(first)
+        return {lengths: np.array(starts) for lengths, starts in found.items()}
