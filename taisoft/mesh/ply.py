@@ -124,7 +124,7 @@ class _Rows:
             raise self.error("expected the file's end after the last row that the header declares", self.at)
 
     def groups(self, element: Element) -> Iterator[tuple[np.ndarray, list[np.ndarray]]]:
-        """Yield rows whose lists have equal lengths: their first bytes (k,), and of each property the values (k,) or (k,length)."""
+        """Yield rows whose lists have equal lengths: first bytes (k,), and of each property the values (k,) or (k,length)."""
         for lengths, first in self._starts(element).items():
             fields, left = [], list(lengths)
             for k, one in enumerate(element.properties):
