@@ -10,6 +10,7 @@ interrupted.
 """
 
 import dataclasses
+import errno
 import json
 import math
 import zipfile
@@ -223,9 +224,10 @@ def _damaged(path: Path, reason) -> SimulationError:
 
 
 def _sentence(reason) -> str:
-    """Return a reason given as text unchanged, or an exception's type and first line."""
-    text = str(reason).strip().splitlines()
-    return reason if isinstance(reason, str) else f"{type(reason).__name__}: {text[0] if text else 'no reason given'}"
+    """Return a reason given as text unchanged, and an exception's where this module or the system raised it."""
+    text = reason if isinstance(reason, str) else getattr(reason, "strerror", None) or " ".join(str(reason).split())
+    own = isinstance(reason, str) or getattr(reason, "errno", None) not in (None, errno.EINVAL) or "declared" in text
+    return text if own else "expected arrays in a zip archive, as taisoft writes them"
 
 
 # --- methods of Simulator -----------------------------------------------------------------------------------------------
@@ -283,7 +285,7 @@ def from_checkpoint(cls: type["Simulator"], saved: Checkpoint, scene: Scene, arc
         if sim is not None:
             sim.close()
         if isinstance(error, (KeyError, TypeError, ValueError)):  # the checksum is right, but the content does not fit this scene
-            raise SimulationError(f"{saved.path} holds no state of this scene: {type(error).__name__}: {error}") from None
+            raise SimulationError(f"{saved.path} holds no state of this scene: its arrays have other names or sizes") from None
         raise
     scene.freeze()
     return sim

@@ -1,6 +1,7 @@
 """Read and write tetrahedral meshes in files.
 
-Gmsh's files are read by `gmsh.py`, TetGen's by `tetgen.py`, every other format by meshio in a child process (`safe_reading.py`).
+The formats that meshio reads wrongly have modules of their own; every other one is read by meshio in a child process
+(`safe_reading.py`).
 
 Second-order tets in a file have ten nodes, four corners and then one on each edge. Only the corners enter the mesh:
 second-order bodies have straight edges at rest and mid-edge nodes of their own. Curved edges are reported. Formats differ in
@@ -20,30 +21,28 @@ import numpy as np
 
 from taisoft.errors import MeshError, listed, value_text
 from taisoft.files import replacing
+from taisoft.mesh.abaqus import read_abaqus
 from taisoft.mesh.gmsh import PHYSICAL, read_gmsh, split_names
+from taisoft.mesh.medit import REFERENCE, read_medit
+from taisoft.mesh.nastran import read_nastran
 from taisoft.mesh.quality import edge_lengths
 from taisoft.mesh.regions import LARGEST_ID, usable_names
 from taisoft.mesh.safe_reading import Blocks, FileContent, read_by_meshio, read_content
+from taisoft.mesh.surface_mesh import READERS as SURFACE_READERS
 from taisoft.mesh.tet_mesh import LARGEST_COORDINATE, TetMesh
 from taisoft.mesh.tetgen import read_tetgen
 from taisoft.mesh.topology import EDGES, merge_labels
+from taisoft.mesh.vtu import read_vtu
 
 TETS = ("tetra", "tetra10")
 BOUNDARY = ("vertex", "line", "line3", "triangle", "triangle6")  # boundary markers that meshers add; ignored with a warning
+READERS = {".mesh": read_medit, ".vtu": read_vtu, ".inp": read_abaqus, **dict.fromkeys((".bdf", ".nas", ".fem"), read_nastran)}
 WRITERS = {".msh": "gmsh", ".vtk": "vtk", ".vtu": "vtu", ".mesh": "medit"}
-REGION, REFERENCE = "region", "medit:ref"  # names of cell data that hold regions, as PHYSICAL does
+REGION = "region"  # a name of cell data that hold regions, as PHYSICAL and REFERENCE do
 NONE_IF_ZERO = (PHYSICAL, REFERENCE)  # such data are in files without regions too, where all are 0
 
-# Pattern that counts the faces in a file of a format that cannot hold tets.
-SURFACES = {
-    ".obj": rb"^[ \t]*f[ \t]",
-    ".stl": rb"^[ \t]*facet\b",
-    ".off": rb"\A\s*OFF\s+(?:#[^\n]*\s+)*\d+\s+(\d+)",
-    ".ply": rb"^[ \t]*element[ \t]+face[ \t]+(\d+)",
-}
-
 # A count of 0 in a file's text, on which meshio's readers fail with an unclear error.
-_ZERO_COUNT = re.compile(rb"(?:POINTS\s+|CELLS\s+(?:1\s+)?|NumberOf(?:Points|Cells)\s*=\s*\")0+\b")
+_ZERO_COUNT = re.compile(rb"(?:POINTS\s+|CELLS\s+(?:1\s+)?)0+\b")
 
 STRAIGHT = 1e-6  # tolerated distance of a node from its edge's midpoint, over the edge's length
 KNOWN_ORDER = 0.25  # largest median of that ratio for which the inferred node order is accepted
@@ -68,9 +67,9 @@ def read_mesh(path, fix_orientation: bool = False, weld: float | None = None, re
     name = str(file)
     data = read_content(file)
     ending = file.suffix.lower()
-    if ending in SURFACES:
-        found = _count_faces(ending, data)
-        raise MeshError(f"{name}: no tetrahedra; {found} found; make a volume mesh first: taisoft tetrahedralize")
+    if ending in SURFACE_READERS:
+        n = sum(map(len, SURFACE_READERS[ending](name, data)[1]))
+        raise MeshError(f"{name}: no tetrahedra; {n} faces found; make a volume mesh first: taisoft tetrahedralize")
     content = None
     if ending == ".msh" and data.lstrip()[:1] == b"$":
         content = read_gmsh(name, data)
@@ -79,11 +78,13 @@ def read_mesh(path, fix_orientation: bool = False, weld: float | None = None, re
             content = _read_by_meshio(file, rest)._replace(region_names=names)
     elif ending in (".node", ".ele"):
         content = read_tetgen(file)
+    elif ending in READERS:
+        content = READERS[ending](name, data)
     content = content or _read_by_meshio(file, data)
     blocks, notes = _tet_blocks(name, content.cells)
     ids, names, region_notes = _regions(name, content, regions)
     labels = {"regions": ids, "region_names": names}
-    return _clean_mesh(name, content.points, blocks, notes + region_notes, fix_orientation, weld, labels)
+    return _clean_mesh(name, content.points, blocks, content.notes + notes + region_notes, fix_orientation, weld, labels)
 
 
 def write_mesh(path, mesh: TetMesh, regions: bool = True) -> None:
@@ -134,18 +135,6 @@ def check_ending(file: Path) -> str:
     return ending
 
 
-def _count_faces(ending: str, data: bytes) -> str:
-    """Return the number of faces in a surface file, as text."""
-    if ending == ".stl" and len(data) >= 84 and len(data) == 84 + 50 * int.from_bytes(data[80:84], "little"):
-        return _format_counts({"triangle": int.from_bytes(data[80:84], "little")})
-    found = re.findall(SURFACES[ending], data, re.MULTILINE)
-    if ending in (".off", ".ply"):
-        return f"{found[0][:20].decode()} faces" if found else "no faces"
-    if ending == ".obj" and any(len(line.split()) != 4 for line in data.splitlines() if line.split()[:1] == [b"f"]):
-        return f"{len(found)} faces"
-    return _format_counts({"triangle": len(found)})
-
-
 def _regions(name: str, content: FileContent, requested: str | None) -> tuple[np.ndarray | None, dict[int, str], list[str]]:
     """Return the region (m,) of each tet, or None, names of regions, and warnings.
 
@@ -179,9 +168,9 @@ def _read_by_meshio(file: Path, data: bytes) -> FileContent:
     if not any("".join(file.suffixes[-n:]).lower() in known for n in (1, 2)):
         raise MeshError(f"{file}: not a supported mesh: the ending {file.suffix.lower()!r} is not known")
     try:
-        return read_by_meshio(file, data, "mesh")
+        return read_by_meshio(file, data)
     except MeshError as error:
-        if file.suffix.lower() in (".vtk", ".vtu") and _ZERO_COUNT.search(data):
+        if file.suffix.lower() == ".vtk" and _ZERO_COUNT.search(data):
             raise MeshError(f"{file}: no tetrahedra; the file declares 0 points or cells") from error
         raise
 

@@ -1,4 +1,4 @@
-"""Read Gmsh's files of versions 2 (text) and 4.1 (text and binary), with the physical groups of elements.
+"""Read Gmsh's files of versions 2 (text), 4.0 and 4.1 (text and binary), with the physical groups of elements.
 
 meshio refuses parametric nodes and big-endian numbers, makes a mesh of some files that are cut off inside a node's number, and
 names no line. Here every count is checked against the file's content before memory is allocated, and errors name their line.
@@ -7,68 +7,44 @@ Weak: text is read as float64, so tags above 2^53 are refused. Of the groups of 
 """
 
 import re
+from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 from meshio._common import num_nodes_per_cell
 from meshio.gmsh import gmsh_to_meshio_type
 
 from taisoft.errors import MeshError
-from taisoft.mesh.safe_reading import MAX_EXACT_INT, Blocks, FileContent
+from taisoft.mesh.safe_reading import Blocks, FileContent
+from taisoft.mesh.words import Words, last_line
 
 PHYSICAL = "gmsh:physical"  # meshio's name of the elements' physical groups; 0 is none
 
 
-class _Text:
+class _Text(Words):
     """Sequential reader of the numbers in a text section."""
 
     def __init__(self, name: str, data: bytes, start: int, section: str):
         """start: the first byte after the section's opening line."""
-        self.name, self.section, self.at, self.first_line = name, section, 0, data.count(b"\n", 0, start) + 1
         end = re.compile(rb"^[ \t]*\$End%b\b" % section.encode(), re.MULTILINE).search(data, start)
         if end is None:
             raise _truncated(name, data, section)
-        self.text, self.end = data[start : end.start()], end.end()
-        words = self.text.split()
-        try:
-            self.numbers = np.array(words, dtype=np.float64)
-        except ValueError:
-            bad = next(i for i, word in enumerate(words) if not _is_number(word))
-            raise self.error(f"{words[bad][:40]!r} is not a number", bad) from None
+        super().__init__(name, data[start : end.start()], data.count(b"\n", 0, start) + 1, f"${section}")
+        self._after = end.end()
 
-    def error(self, text: str, index: int | None = None) -> MeshError:
-        """Return the error at number `index` of the section, by default the last one read."""
-        starts = [0, *(word.start() for word in re.finditer(rb"\S+", self.text))]
-        index = self.at - 1 if index is None else index
-        line = self.first_line + self.text.count(b"\n", 0, starts[min(max(index + 1, 0), len(starts) - 1)])
-        return MeshError(f"{self.name}: line {line} (${self.section}): {text}")
-
-    def floats(self, n: int) -> np.ndarray:
-        left = len(self.numbers) - self.at
-        if n > left:
-            raise self.error(f"{n} numbers should follow here or before, but only {left} do", len(self.numbers) - 1)
-        self.at += n
-        return self.numbers[self.at - n : self.at]
-
-    def ints(self, n: int, kind: str = "size") -> np.ndarray:
-        return self.as_ints(self.floats(n), self.at - n)
-
-    def as_ints(self, values: np.ndarray, first: int, stride: int = 1) -> np.ndarray:
-        """Return values as integers; they are the section's numbers first, first + stride, ..."""
-        whole = (np.floor(values) == values) & (np.abs(values) <= MAX_EXACT_INT)
-        if not whole.all():
-            k = int(np.argmin(whole))
-            raise self.error(f"{values[k]:g} is not a whole number", first + k * stride)
-        return values.astype(np.int64)
+    def rows(self, n: int, columns: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return tags (n,) and the numbers (n,columns) that follow each."""
+        first, values = self.at, self.floats(n * (1 + columns)).reshape(n, 1 + columns)
+        return self.as_ints(values[:, 0], first, stride=1 + columns), values[:, 1:]
 
     def close(self) -> int:
         """Return the offset of the byte after the section; all its numbers must have been read."""
-        if self.at != len(self.numbers):
-            raise self.error(f"{len(self.numbers) - self.at} numbers are left over", self.at)
-        return self.end
+        self.end()
+        return self._after
 
 
 class _Binary:
-    """Sequential reader of the numbers in a binary section, version 4.1."""
+    """Sequential reader of the numbers in a binary section, version 4."""
 
     def __init__(self, name: str, data: bytes, start: int, section: str, order: str, size: int):
         """order: "<" or ">". size: bytes of a size_t."""
@@ -86,6 +62,17 @@ class _Binary:
         values = np.frombuffer(self.data, dtype, n, self.at)
         self.at += n * dtype.itemsize
         return values
+
+    def count(self) -> int:
+        n = int(self.ints(1)[0])
+        if n < 0:
+            raise self.error(f"expected a number below 2^63, not {n % 2**64}")
+        return n
+
+    def rows(self, n: int, columns: int) -> tuple[np.ndarray, np.ndarray]:
+        self.types["row"] = np.dtype([("tag", self.types["int"]), ("values", self.types["float"], (columns,))])
+        values = self._read(n, "row")
+        return values["tag"].astype(np.int64), values["values"].astype(np.float64)
 
     def floats(self, n: int) -> np.ndarray:
         return self._read(n, "float").astype(np.float64)
@@ -107,24 +94,30 @@ _OPENING = re.compile(rb"^[ \t]*\$(?!End)(\w+)[ \t\r]*\n", re.MULTILINE)
 
 
 def read_gmsh(name: str, data: bytes) -> FileContent | None:
-    """Return the content of a .msh file, with the physical groups PHYSICAL; None for other versions than 2 (text) and 4.1.
+    """Return the content of a .msh file, with the physical groups PHYSICAL; None for version 2 in binary.
 
     name: the file's name for messages. data: its content. Raises MeshError.
     """
     found = _GMSH_HEAD.match(data)
     if found is None:
-        raise MeshError(f"{name}: not a supported mesh: a Gmsh file must start with $MeshFormat and its version")
+        raise MeshError(f"{name}: line 1: not a supported mesh: expected $MeshFormat, then version, file type and data size")
     version, binary, size = found[1].decode("ascii", "replace"), found[2] == b"1", int(found[3])
+    line = data.count(b"\n", 0, found.end())
     major = version.split(".")[0]
-    if (version not in ("4", "4.1") and major != "2") or (major == "2" and binary):
+    if version not in ("4", "4.0", "4.1") and major != "2":
+        raise MeshError(f"{name}: line {line} ($MeshFormat): expected version 2, 4.0 or 4.1, not {version}")
+    if major != "4" and binary:
         return None
     at, order = found.end(), ""
     if binary:
         order = {b"\x01\0\0\0": "<", b"\0\0\0\x01": ">"}.get(data[at : at + 4], "")
         if not order or size not in (4, 8):
-            raise MeshError(f"{name}: line 3 ($MeshFormat): the byte order or the size {size} of a number is not known")
-    needed = {"Nodes": _nodes_2, "Elements": _elements_2} if major == "2" else {"Nodes": _nodes_4, "Elements": _elements_4}
-    readers = needed if major == "2" else needed | {"Entities": _entities_4}
+            rule = "expected numbers of 4 or 8 bytes, then the number 1 in binary"
+            raise MeshError(f"{name}: line {line} ($MeshFormat): {rule}")
+    needed: dict[str, Callable] = {"Nodes": _nodes_2, "Elements": _elements_2}
+    if major == "4":
+        needed = {"Nodes": partial(_nodes_4, old=version != "4.1"), "Elements": partial(_elements_4, old=version != "4.1")}
+    readers = needed if major == "2" else needed | {"Entities": partial(_entities_4, old=version != "4.1")}
     sections = {}
     while opening := _OPENING.search(data, at):
         section, at = opening[1].decode("ascii", "replace"), opening.end()
@@ -135,13 +128,13 @@ def read_gmsh(name: str, data: bytes) -> FileContent | None:
             continue
         if section in sections:
             line = data.count(b"\n", 0, at)
-            raise MeshError(f"{name}: line {line}: a second ${section} section")
+            raise MeshError(f"{name}: line {line}: expected only one ${section} section")
         numbers = _Binary(name, data, at, section, order, size) if binary else _Text(name, data, at, section)
         sections[section] = readers[section](numbers)
         at = numbers.close()
     for section in needed:
         if section not in sections:
-            raise MeshError(f"{name}: there is no ${section} section")
+            raise MeshError(f"{name}: line {last_line(data)}: expected a ${section} section before the file's end")
     tags, points = sections["Nodes"]
     blocks, groups = sections["Elements"]
     if major == "4":  # of an entity, whose elements are one block or several
@@ -163,64 +156,50 @@ def split_names(data: bytes) -> tuple[dict[int, str], bytes]:
 
 
 def _truncated(name: str, data: bytes, section: str) -> MeshError:
-    last = data.rstrip().count(b"\n") + 1
-    return MeshError(f"{name}: line {last}: the file ends inside ${section}, before $End{section}")
+    return MeshError(f"{name}: line {last_line(data)}: the file ends inside ${section}, before $End{section}")
 
 
-def _is_number(word: bytes) -> bool:
-    try:
-        return bool(np.array([word], dtype=np.float64).size)
-    except ValueError:
-        return False
-
-
-def _count(numbers) -> int:
-    n = int(numbers.ints(1)[0])
-    if n < 0:
-        raise numbers.error(f"{n} is not a count")
-    return n
-
-
-def _nodes_4(numbers) -> tuple[np.ndarray, np.ndarray]:
-    """Read tags (n,) and points (n,3), version 4.1: one block per entity, tags first, then coordinates."""
-    n_blocks, total = numbers.ints(4)[:2]
+def _nodes_4(numbers, old: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Read tags (n,) and points (n,3): one block per entity. old: version 4.0, whose rows hold a tag and its coordinates."""
+    n_blocks, total = numbers.ints(2 if old else 4)[:2]
     tags, points = [np.empty(0, dtype=np.int64)], [np.empty((0, 3))]
     for _ in range(n_blocks):
-        dim, _, parametric = numbers.ints(3, "int").tolist()
-        n = _count(numbers)
+        dim, parametric = numbers.ints(3, "int")[[1, 2] if old else [0, 2]].tolist()
+        n = numbers.count()
         columns = 3 + (min(max(dim, 0), 3) if parametric else 0)  # parametric nodes have dim extra parameters
-        tags.append(numbers.ints(n))
-        points.append(numbers.floats(columns * n).reshape(n, columns)[:, :3])
+        own, rows = numbers.rows(n, columns) if old else (numbers.ints(n), numbers.floats(columns * n).reshape(n, columns))
+        tags.append(own)
+        points.append(rows[:, :3])
     _check_total(numbers, total, sum(map(len, tags)), "nodes")
     return np.concatenate(tags), np.concatenate(points)
 
 
-def _entities_4(numbers) -> dict[tuple[int, int], int]:
-    """Read the first physical group of each entity that is in one, by (dimension, tag), version 4.1."""
+def _entities_4(numbers, old: bool) -> dict[tuple[int, int], int]:
+    """Read the first physical group of each entity that is in one, by (dimension, tag). old: version 4.0."""
     found = {}
     counts = numbers.ints(4).tolist()
     for dim, n in enumerate(counts):
         for _ in range(n):
             tag = int(numbers.ints(1, "int")[0])
-            numbers.floats(6 if dim else 3)  # a point's place, or a bounding box
-            groups = numbers.ints(_count(numbers), "int")
+            numbers.floats(6 if dim or old else 3)  # a point's place, or a bounding box
+            groups = numbers.ints(numbers.count(), "int")
             if dim:
-                numbers.ints(_count(numbers), "int")  # the entities of its boundary
+                numbers.ints(numbers.count(), "int")  # the entities of its boundary
             if len(groups):
                 found[dim, tag] = abs(int(groups[0]))  # negative: of reversed orientation
     return found
 
 
-def _elements_4(numbers) -> tuple[Blocks, list[tuple[int, int]]]:
-    """Read type names and node tags (k,nodes), and the entity (dimension, tag) of each block, version 4.1."""
-    n_blocks, total = numbers.ints(4)[:2]
+def _elements_4(numbers, old: bool) -> tuple[Blocks, list[tuple[int, int]]]:
+    """Read type names and node tags (k,nodes), and the entity (dimension, tag) of each block. old: version 4.0."""
+    n_blocks, total = numbers.ints(2 if old else 4)[:2]
     blocks, entities = [], []
     for _ in range(n_blocks):
-        dim, entity, code = numbers.ints(3, "int").tolist()
+        dim, entity, code = numbers.ints(3, "int")[[1, 0, 2] if old else [0, 1, 2]].tolist()
         kind, n_nodes = _element_type(numbers, code)
         entities.append((dim, entity))
-        n = _count(numbers)
-        blocks.append((kind, numbers.ints(n * (1 + n_nodes)).reshape(n, 1 + n_nodes)[:, 1:]))
+        n = numbers.count()
+        blocks.append((kind, numbers.ints(n * (1 + n_nodes), "int" if old else "size").reshape(n, 1 + n_nodes)[:, 1:]))
     _check_total(numbers, total, sum(len(tags) for _, tags in blocks), "elements")
     return blocks, entities
 
@@ -239,8 +218,7 @@ def _element_type(numbers, code: int) -> tuple[str, int]:
 
 def _nodes_2(numbers: _Text) -> tuple[np.ndarray, np.ndarray]:
     """Read tags (n,) and points (n,3), version 2: a count, then rows of tag x y z."""
-    rows = numbers.floats(4 * _count(numbers)).reshape(-1, 4)
-    return numbers.as_ints(rows[:, 0], 1, stride=4), rows[:, 1:]
+    return numbers.rows(numbers.count(), 3)
 
 
 def _elements_2(numbers: _Text) -> tuple[Blocks, list[np.ndarray]]:
@@ -248,8 +226,8 @@ def _elements_2(numbers: _Text) -> tuple[Blocks, list[np.ndarray]]:
 
     A count, then rows of tag, type, number of labels, labels, nodes; the first label is the group.
     """
-    n, start = _count(numbers), numbers.at
-    values = numbers.ints(len(numbers.numbers) - start).tolist()
+    n, start = numbers.count(), numbers.at
+    values = numbers.ints(numbers.left()).tolist()
     found: dict[tuple[str, int], tuple[list[int], list[int]]] = {}
     at = 0
     for _ in range(n):

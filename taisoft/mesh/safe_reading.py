@@ -35,7 +35,6 @@ MAX_ITERATIONS = 80  # its maximum number of optimisation iterations
 _open = open  # the child replaces the built-in one
 
 Blocks = list[tuple[str, np.ndarray]]  # element blocks: meshio's type name, (k,nodes) indices from 0
-MAX_EXACT_INT = 2.0**53  # float64 holds every integer up to here exactly
 
 
 class FileContent(NamedTuple):
@@ -45,6 +44,7 @@ class FileContent(NamedTuple):
     cells: Blocks
     cell_data: dict[str, list[np.ndarray]] = {}  # by name, the numbers (k,) of each block's elements
     region_names: dict[int, str] = {}
+    notes: list[str] = []  # what was left out
 
 
 def read_content(file: Path) -> bytes:
@@ -84,11 +84,8 @@ def content_lines(name: str, data: bytes) -> list[tuple[int, list[str]]]:
     return lines
 
 
-def read_by_meshio(file: Path, data: bytes, kind: str) -> FileContent:
-    """Return what a file holds. data: its bytes. kind: "mesh" or "surface", for messages.
-
-    Raises MeshError for every failure of meshio.
-    """
+def read_by_meshio(file: Path, data: bytes) -> FileContent:
+    """Return what a file holds. data: its bytes. Raises MeshError for every failure of meshio."""
     seconds = SECONDS + SECONDS_PER_BYTE * len(data)
     with tempfile.TemporaryDirectory(prefix="taisoft-") as folder:
         source = file.absolute()
@@ -98,10 +95,12 @@ def read_by_meshio(file: Path, data: bytes, kind: str) -> FileContent:
         try:
             found = run_child(folder, "read", str(source), str(seconds), seconds=WALL_FACTOR * seconds)
         except MeshError as error:
-            raise MeshError(f"{file}: not a supported {kind} ({error})") from None
+            place, text = re.match(r"((?:line|byte) \d+: )?(.*)", str(error)).groups()
+            raise MeshError(f"{file}: {place or ''}not a supported mesh ({text})") from None
     cells = [(str(name), found[f"cells{i}"]) for i, name in enumerate(found["kinds"])]
     cell_data = {str(name): [found[f"data{j},{i}"] for i in range(len(cells))] for j, name in enumerate(found["data"])}
-    return FileContent(found["points"], cells, cell_data, dict(zip(found["region_ids"].tolist(), found["region_names"].tolist())))
+    names = dict(zip(found["region_ids"].tolist(), found["region_names"].tolist()))
+    return FileContent(found["points"], cells, cell_data, names, found["notes"].tolist())
 
 
 def run_child(folder: str, task: str, *arguments: str, seconds: float | None = None) -> dict[str, np.ndarray]:
@@ -166,7 +165,8 @@ def _read(path: str, seconds: str) -> dict[str, np.ndarray]:
     data = Path(path).read_bytes()
     _limit_resources(MEMORY + MEMORY_PER_BYTE * len(data), int(float(seconds)) + 1)
     builtins.open = _open_bounded
-    meshio._common.Console.print = lambda *_, **__: None  # it parses file content as markup, which may fail
+    printed: list[str] = []  # the printer would parse file content as markup, which may fail
+    meshio._common.Console.print = lambda _, text, **__: printed.append(re.sub(r"\[/?\w+\]|Warning: ", "", str(text)))
     try:
         with np.errstate(all="ignore"):
             mesh = _first_fitting(path, data)
@@ -185,10 +185,14 @@ def _read(path: str, seconds: str) -> dict[str, np.ndarray]:
     except MemoryError:
         sys.exit("it declares more data than it can hold")
     except (Exception, SystemExit) as error:
-        text = str(error) if isinstance(error, meshio.ReadError) else f"{type(error).__name__}: {error}"
-        sys.exit(_without_content(text, data.lower()) or "its structure is broken")
+        text = _without_content(str(error), data.lower()) if isinstance(error, (meshio.ReadError, EOFError)) else ""
+        text = text if text and "..." not in text else f"expected the format {Path(path).suffix} here or before"
+        sys.exit(_place(error, data) + text)
+    if skipped := next((text for text in printed if "cannot handle" in text), None):
+        sys.exit(f"cells of {skipped[skipped.rfind('(') + 1 :].rstrip(').')} of VTK are not known here")
     numbers = {name: of for name, of in data_of_cells.items() if all(one.ndim == 1 and one.dtype.kind in "iuf" for one in of)}
     texts = {"kinds": [block.type for block in mesh.cells], "data": list(numbers), "region_names": list(names.values())}
+    texts["notes"] = [_without_content(text, data.lower()) for text in printed]
     found = {"points": arrays[0], "region_ids": np.array(list(names), dtype=np.int64)}
     found |= {name: np.array(values, dtype=str) for name, values in texts.items()}
     found |= {f"data{j},{i}": one for j, of_blocks in enumerate(numbers.values()) for i, one in enumerate(of_blocks)}
@@ -232,10 +236,26 @@ def _without_content(message: str, content: bytes) -> str:
     return " ".join("..." if len(word) > 3 and word.lower().encode() in content else word for word in plain.split())
 
 
+def _place(error: BaseException, data: bytes) -> str:
+    """Return the line or byte that was read last, as the beginning of a message; "" if no file was opened."""
+    if line := getattr(error, "position", (0,))[0]:  # of XML
+        return f"line {line}: "
+    if not _BoundedFile.opened:
+        return ""
+    at = max(file.end if file.closed else file.tell() for file in _BoundedFile.opened)
+    lines = _BoundedText.lines or data.count(b"\n", 0, max(at - 1, 0)) + 1
+    return f"byte {at}: " if b"\0" in data else f"line {lines}: "
+
+
 class _BoundedFile(io.BufferedReader):
     """File that raises EOFError after too many reads past its end."""
 
-    _empty_reads = 0
+    _empty_reads = end = 0
+    opened: list["_BoundedFile"] = []
+
+    def close(self) -> None:
+        self.end = self.end if self.closed else self.tell()
+        super().close()
 
     def _checked(self, found: bytes) -> bytes:
         self._empty_reads = 0 if found else self._empty_reads + 1
@@ -253,11 +273,26 @@ class _BoundedFile(io.BufferedReader):
         return self._checked(super().readline(*size))
 
 
+class _BoundedText(io.TextIOWrapper):
+    """Text that counts the lines read."""
+
+    lines = 0
+
+    def readline(self, *size) -> str:
+        _BoundedText.lines += 1
+        return super().readline(*size)
+
+    def __next__(self) -> str:
+        _BoundedText.lines += 1
+        return super().__next__()
+
+
 def _open_bounded(file, mode: str = "r", buffering: int = -1, encoding: str | None = None, **options) -> io.IOBase:
     if not set(mode) <= set("rbt"):
         return _open(file, mode, buffering, encoding, **options)
     stream = _BoundedFile(io.FileIO(file))
-    return stream if "b" in mode else io.TextIOWrapper(stream, encoding=encoding or "utf-8", **options)
+    _BoundedFile.opened.append(stream)
+    return stream if "b" in mode else _BoundedText(stream, encoding=encoding or "utf-8", **options)
 
 
 TASKS = {"read": _read, "usd": _read_usd, "lone_usd": functools.partial(_read_usd, alone=True), "mesh": _mesh}

@@ -1,13 +1,10 @@
 """Read triangle surfaces from modelling programs, find faults that keep them from bounding a solid, and fill them with tets.
 
-.ply and .stl files are read by meshio. It refuses .obj files with fewer texture coordinates than positions, and of .off files it
-knows neither polygons and colours nor headers such as COFF or OFF8, so these two have readers here.
 Tets are made by fTetWild (package wildmeshing, MPL 2.0, installed by the extra `mesh`). It accepts faulty surfaces, stays within
 an envelope around them, and finds the inside by winding numbers.
-Sources: Geomview manual, "OFF Files"; Hu, Schneider, Wang, Zorin, Panozzo 2020, Fast tetrahedral meshing in the wild.
+Source: Hu, Schneider, Wang, Zorin, Panozzo 2020, Fast tetrahedral meshing in the wild.
 """
 
-import re
 import tempfile
 import warnings
 from dataclasses import dataclass, field
@@ -19,12 +16,15 @@ import numpy as np
 
 from taisoft.attributes import MeshAttributeError, guarded_record
 from taisoft.errors import MeshError, one_line
-from taisoft.mesh.safe_reading import content_lines, read_by_meshio, read_content, run_child
+from taisoft.mesh.obj_off import read_obj, read_off
+from taisoft.mesh.ply import read_ply
+from taisoft.mesh.safe_reading import read_content, run_child
+from taisoft.mesh.stl import read_stl
 from taisoft.mesh.tet_mesh import TetMesh
 from taisoft.mesh.topology import connected_pieces, linked_groups, merge_labels, triangle_edges
 
-FORMATS = (".obj", ".stl", ".ply", ".off")
-HEAD = re.compile(r"(?:ST)?C?N?OFF(\d*)$")  # of .off; some programs write no space before the counts
+READERS = {".obj": read_obj, ".stl": read_stl, ".ply": read_ply, ".off": read_off}
+FORMATS = tuple(READERS)
 INWARD = "all normals point inward; flip them"
 MAKE_ANOTHER = "make a new one, such as ts.SurfaceMesh(0.9 * surface.vertices, surface.triangles)"
 FLAT = 1e-12  # a triangle has no area if its area is below this times its longest edge squared
@@ -156,13 +156,7 @@ def read_surface(path, weld: float = 0.0) -> SurfaceMesh:
         raise MeshError(f"{name}: a surface is read from {', '.join(FORMATS)}, not from {ending or 'a file without ending'}")
     if isinstance(weld, bool) or not isinstance(weld, Real) or not 0.0 <= weld < np.inf:
         raise MeshError(f"{name}: weld must be a distance of at least 0 m, not {weld!r}")
-    data = read_content(file)
-    reader = {".obj": _read_obj, ".off": _read_off}.get(ending)
-    if reader:
-        points, polygons = reader(name, data)
-    else:
-        points, cells = read_by_meshio(file, data, "surface")[:2]
-        polygons = [nodes for kind, nodes in cells if kind in ("triangle", "quad") or "polygon" in kind]
+    points, polygons = READERS[ending](name, read_content(file))
     # Split each polygon as a fan around its first corner.
     fans = [nodes[:, [0, k, k + 1]] for nodes in polygons for k in range(1, nodes.shape[1] - 1)]
     triangles = np.concatenate([np.empty((0, 3), dtype=np.int64), *fans])
@@ -193,65 +187,6 @@ def clean_surface(surface: SurfaceMesh, weld: float) -> SurfaceMesh:
     for text in notes:
         warnings.warn(f"{name}: {text}", UserWarning, stacklevel=3)
     return SurfaceMesh(points[used], inverse.reshape(-1, 3), name, notes)
-
-
-def _read_obj(name: str, data: bytes) -> tuple[np.ndarray, list[np.ndarray]]:
-    """Return positions and polygons, (1,k) each, of a Wavefront file."""
-    points, polygons = [], []
-    for number, words in content_lines(name, data):
-        try:
-            if words[0] == "v":
-                x, y, z = words[1:4]
-                points.append((float(x), float(y), float(z)))
-            elif words[0] == "f":
-                corners = [int(word.split("/", 1)[0]) for word in words[1:]]
-                if len(corners) < 3 or 0 in corners or max(map(abs, corners)) > len(data):
-                    raise ValueError
-                polygons.append(np.array([[k - 1 if k > 0 else len(points) + k for k in corners]]))
-        except (ValueError, OverflowError):
-            raise MeshError(f"{name}: line {number} cannot be read: {one_line(' '.join(words))!r}") from None
-    return np.array(points, dtype=np.float64).reshape(-1, 3), polygons
-
-
-def _read_off(name: str, data: bytes) -> tuple[np.ndarray, list[np.ndarray]]:
-    """Return positions and polygons, (1,k) each, of an Object File Format file.
-
-    OFF, counts of vertices and faces, then one line each. Data after a position or a face, such as colours, are skipped.
-    """
-    (number, words), *rows = content_lines(name, data)
-    head = HEAD.match(words[0])
-    if not head:
-        raise MeshError(f"{name}: line {number}: not a supported surface: expected OFF, not {one_line(words[0])!r}")
-    counts = [*filter(None, head.groups()), *words[1:]]
-    if not counts and rows:
-        (number, counts), *rows = rows
-    try:
-        n_points, n_faces = int(counts[0]), int(counts[1])
-        if min(n_points, n_faces) < 0:
-            raise ValueError
-    except (ValueError, IndexError):
-        raise MeshError(f"{name}: line {number}: expected the counts of vertices and faces") from None
-    if n_points + n_faces > len(rows):
-        raise MeshError(f"{name}: line {number} declares {n_points} vertices and {n_faces} faces, but {len(rows)} lines follow")
-    points, polygons = [], []
-    for number, words in rows[: n_points + n_faces]:
-        try:
-            if len(points) < n_points:
-                x, y, z = words[:3]
-                points.append((float(x), float(y), float(z)))
-                continue
-            n_corners = int(words[0])
-            corners = [int(word) for word in words[1 : 1 + n_corners]]
-            if n_corners < 3 or len(corners) < n_corners:
-                raise ValueError
-        except ValueError:
-            what = "three coordinates" if len(points) < n_points else "a number of at least 3 corners and as many vertices"
-            raise MeshError(f"{name}: line {number}: expected {what}, not {one_line(' '.join(words))!r}") from None
-        missing = [corner for corner in corners if not 0 <= corner < n_points]
-        if missing:
-            raise MeshError(f"{name}: line {number}: vertex {missing[0]} does not exist ({n_points} vertices)")
-        polygons.append(np.array([corners]))
-    return np.array(points, dtype=np.float64).reshape(-1, 3), polygons
 
 
 def tetrahedralize(surface: SurfaceMesh, edge_length: float | None = None, envelope: float | None = None) -> TetMesh:

@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from taisoft.errors import MeshError
-from taisoft.mesh.safe_reading import MAX_EXACT_INT, FileContent, content_lines, read_content
+from taisoft.mesh.safe_reading import FileContent, content_lines, read_content
+from taisoft.mesh.words import MAX_EXACT_INT
 
 
 def read_tetgen(file: Path) -> FileContent:
@@ -23,7 +24,7 @@ def read_tetgen(file: Path) -> FileContent:
     rows = _tetgen_rows(node, "vertices", "3 coordinates", (3,))
     first = _whole(rows[:1, 0], node)[0] if len(rows) else 0
     if first not in (0, 1):
-        raise MeshError(f"{node}: vertices must count from 0 or 1, not from {first}")
+        raise MeshError(f"{node}: row 0: vertices must count from 0 or 1, not from {first}")
     tets = _tetgen_rows(ele, "tets", "4 or 10 nodes", (4, 10))
     return FileContent(rows[:, 1:], [("tetra" if tets.shape[1] == 5 else "tetra10", _whole(tets[:, 1:], ele) - first)])
 
@@ -41,7 +42,7 @@ def _tetgen_rows(file: Path, what: str, rule: str, allowed: tuple[int, ...]) -> 
     except ValueError:
         raise MeshError(f"{file}: line {lines[0][0]}: not a supported mesh: expected the counts of TetGen's format") from None
     if n_columns not in allowed:
-        raise MeshError(f"{file}: {what} must have {rule}, not {n_columns}")
+        raise MeshError(f"{file}: line {lines[0][0]}: {what} must have {rule}, not {n_columns}")
     last, found = lines[-1][0], len(lines) - 1
     if n_rows > found:
         raise MeshError(f"{file}: line {last}: {n_rows} {what} were declared, but the file ends after {found}")

@@ -8,7 +8,8 @@ the separate chunks. Composing the chunks as layers does not work: USD takes an 
 alone, and many readers do not support value clips.
 `join_chunks` makes `scene.usdc` from the chunks of a killed run. A resumed run starts from the earlier frames of both.
 
-Time codes are frame numbers; units are metres, y up. A body is `/World/<name>` with `surface` (Mesh), `tets` (TetMesh, purpose
+Time codes are frame numbers; a state before the time of its frame, as at the end of a run between two frames, has the fraction
+that is its time. Units are metres, y up. A body is `/World/<name>` with `surface` (Mesh), `tets` (TetMesh, purpose
 guide, so that the two are not drawn over each other) and `material`. Both are linear: a second-order body is written as
 the linear triangles and tets that its elements are cut into, with all its nodes as points (`taisoft/mesh/nodes.py`).
 Both carry `primvars:vonMisesStress` [Pa]. If there can be contacts, the surface also carries `primvars:contactImpulse` [N s], the
@@ -19,6 +20,7 @@ whose square lies entirely within others is left out. A spring or a tendon is `/
 a camera and lights (`usd_scene.py`).
 """
 
+import math
 from contextlib import suppress
 from pathlib import Path
 
@@ -35,6 +37,7 @@ from taisoft.output.usd_scene import ERROR, IMPULSE, ROOT, STRESS, TRANSLATE, sc
 
 SCENE_NAME = "scene.usdc"
 CHUNKS_NAME = "chunks"
+SAME_FRAME = 1e-8  # relative error of a frame's time, from the rounding of dt and of its sum, that its time code does not show
 TIME_VARYING = {"points", "extent", TRANSLATE, *(f"primvars:{name}" for name in (STRESS, IMPULSE, ERROR, TENSION))}  # attributes
 
 
@@ -70,7 +73,8 @@ class UsdWriter:
         self._mean = NodalMean(scene.bodies)
         self._joined = _Joined(self.path, self._template)
         self._chunk = None
-        self._frames: list[int] = []  # frame numbers in the unfinished chunk
+        self._codes: list[float] = []  # time codes in the unfinished chunk
+        self._fps, self._start, self._latest = fps, 0.0, float(first - 1)  # start: time of frame 0 [s]; latest: time code
         try:
             self._copy_earlier_frames(first)
         except BaseException:
@@ -92,7 +96,7 @@ class UsdWriter:
             self._view.resume(np.array(self._joined.layer.QueryTimeSample(self._view.attribute, times[-1])))
 
     def frame(self, sim, index: int) -> None:
-        """Record sim's state as frame index; index must ascend. Raises OutputError."""
+        """Record sim's state as frame index, which must ascend; the first, if not 0, counts from time 0. Raises OutputError."""
         from pxr import Gf, Sdf
 
         moved = [(track, surface.at(sim.time).astype(np.float32)) for track, surface in self._moving]  # first, since it may raise
@@ -112,10 +116,14 @@ class UsdWriter:
         for track, corners in moved:
             samples += track.samples(corners, {})
         samples += curves
+        if index == 0:
+            self._start = sim.time
+        code = (sim.time - self._start) * self._fps
+        self._latest = code if self._latest < code < index - SAME_FRAME * (1 + index) else float(index)
         for path, value in samples:
-            self._chunk.SetTimeSample(path, float(index), value)
-        self._frames.append(index)
-        if len(self._frames) >= self.chunk_frames:
+            self._chunk.SetTimeSample(path, self._latest, value)
+        self._codes.append(self._latest)
+        if len(self._codes) >= self.chunk_frames:
             self._publish_chunk()
 
     def close(self) -> None:
@@ -131,17 +139,17 @@ class UsdWriter:
 
     def flush(self) -> None:
         """Publish the unfinished chunk, so that no frame before a checkpoint can be lost. Raises OutputError."""
-        if self._frames:
+        if self._codes:
             self._publish_chunk()
 
     def _publish_chunk(self) -> None:
-        chunk, frames = self._chunk, self._frames
-        self._chunk, self._frames = None, []
+        chunk, codes = self._chunk, self._codes
+        self._chunk, self._codes = None, []
         if self._joined is None:
             raise OutputError(f"cannot continue writing {self.path}: an earlier write failed")
         try:
-            chunk.startTimeCode, chunk.endTimeCode = float(frames[0]), float(frames[-1])
-            path = self.chunks / f"points_{frames[0]:05d}.usdc"
+            chunk.startTimeCode, chunk.endTimeCode = codes[0], codes[-1]
+            path = self.chunks / f"points_{math.ceil(codes[0]):05d}.usdc"
             with replacing(path) as part:
                 _write_checked(path, chunk, lambda: chunk.Export(str(part), args={"format": "usdc"}))
             self._joined.append(chunk)

@@ -169,6 +169,9 @@ def _parsed(file: Path) -> dict:
         check_values(file, tables)
     except (ValueError, RecursionError) as error:
         message = "the file is nested too deeply" if isinstance(error, RecursionError) else " ".join(str(error).split())
+        last = text.rstrip().count("\n") + 1
+        message = message.replace("(at end of document)", f"(at line {last}, column 1)")
+        message = re.sub(r"\((?:'[^']*',? ?)+\)", lambda keys: ".".join(re.findall(r"'([^']*)'", keys[0])), message)
         at = re.search(r" \(at line (\d+), column \d+\)$", message)
         raise SceneError(f"{file}, line {at[1]}: {message[: at.start()]}" if at else f"{file}: {message}") from None
     return tables

@@ -67,7 +67,7 @@ V = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
         ("a.obj", V.replace("1 0\n", "nan 0\n") + "f 1 2 3\n", "vertex 2 coordinate 1 is not finite"),
         ("a.obj", V + "f 1 2 4\n", r"triangle 0: vertex 3 does not exist \(3 vertices\)"),
         ("a.obj", V + "f 1 0 1\n", "line 4 cannot be read"),
-        ("a.ply", "passphrase", r"not a supported surface \(Expected ply\)$"),
+        ("a.ply", "passphrase", "line 1: not a supported surface: expected ply$"),
         ("a.msh", "x", "a surface is read from .obj, .stl, .ply, .off, not from .msh"),
     ],
 )

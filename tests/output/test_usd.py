@@ -182,6 +182,20 @@ def test_joined_chunks_equal_the_finished_scene(tmp_path):
     assert list((tmp_path / "none").iterdir()) == []
 
 
+def test_a_last_frame_between_two_has_its_own_time(tmp_path):
+    """The run that goes on from there replaces it."""
+    sim = FakeSimulator(beam_scene())
+    for first, times, expected in ((0, (0.0, 0.04, 0.06), [0, 1, 1.5]), (2, (0.08, 0.1), [0, 1, 2, 2.5])):
+        writer = UsdWriter(tmp_path, sim.scene, fps=25.0, chunk_frames=2, first=first)
+        for index, sim.time in enumerate(times, first):
+            writer.frame(sim, index)
+        writer.close()
+        stage = Usd.Stage.Open(str(tmp_path / "scene.usdc"))
+        stage.Reload()  # the first one may be kept
+        points = UsdGeom.Mesh(stage.GetPrimAtPath("/World/beam/surface")).GetPointsAttr()
+        assert points.GetTimeSamples() == pytest.approx(expected) and stage.GetEndTimeCode() == pytest.approx(expected[-1])
+
+
 def test_a_full_disk_is_an_error_and_leaves_no_partial_file(tmp_path):
     scene = beam_scene(cells=(16, 4, 4))
     writer, sim = UsdWriter(tmp_path, scene, chunk_frames=5), FakeSimulator(scene)
