@@ -174,10 +174,11 @@ class StaticSolver:
         """Apply the full load in one step; if that fails, use load steps that halve on failure and grow by half on success."""
         rest = self.simulation.layout.rest
         self.newton = self.linear = self.multigrid = 0
+        self.solver.budget.begin()
         result, steps, applied = self._attempt(rest, 1.0, self.tolerance), 1, 1.0
         if not self._is_acceptable(result):
             applied, step, x, steps = 0.0, 0.25, rest, 0
-            while applied < 1.0 and step >= SMALLEST_LOAD_STEP:
+            while applied < 1.0 and step >= SMALLEST_LOAD_STEP and self.solver.budget.left:
                 target = min(1.0, applied + step)
                 result = self._attempt(x, target, self.tolerance if target == 1.0 else max(self.tolerance, 1e-3))
                 if self._is_acceptable(result):
@@ -229,7 +230,7 @@ class StaticSolver:
             load=load,
             at_rounding=result.at_rounding,
             residual=self._residual(result),
-            iterations=self.newton,
+            iterations=round(self.newton),
             linear_iterations=self.linear,
             multigrid_solves=self.multigrid,
             load_steps=steps,

@@ -31,6 +31,7 @@ from taisoft.dynamics.contact_terms import (
 from taisoft.dynamics.direct import DirectSolver, can_solve_directly
 from taisoft.dynamics.linear_solver import LinearSolver
 from taisoft.dynamics.linearised import LONGEST, advance, begin_linearised, end_linearised
+from taisoft.dynamics.newton_budget import NewtonBudget
 from taisoft.dynamics.stage import (
     AGAIN,
     ELASTIC_STAGE,
@@ -128,7 +129,7 @@ class StageSystem:
             pcg=build_pcg(model, arena),
         )
         self.rounding = RoundingFloor(model, eps)
-        self.linear_solver = LinearSolver(model)
+        self.linear_solver, self.budget = LinearSolver(model), NewtonBudget()
         self._direct = DirectSolver(self) if multipliers is None and can_solve_directly(model) else None
         self.kind = ELASTIC_STAGE
         self.scale = 0.0  # that |r| is relative to, at its last evaluation
