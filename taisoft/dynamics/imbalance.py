@@ -50,10 +50,13 @@ def _connections(simulation: "SimulationState", x: np.ndarray, v: np.ndarray, i:
         return {}
     amplitudes = simulation.model.amplitudes
     pulls = table.pulls(x, v, amplitudes.to_numpy() if amplitudes is not None else np.zeros(0))
-    at, found = np.flatnonzero(table.node == i), {}
-    for one in simulation.scene.connections:
-        if one.name in table.elements and (own := at[np.isin(table.element[at], np.arange(len(pulls))[table.elements[one.name]])]).size:
-            found[f"{type(one).__name__.lower()} '{one.name}'"] = table.weight[own] @ pulls[table.element[own]]
+    entries, found = np.flatnonzero(table.node == i), {}
+    element = table.element[entries]
+    for one in [one for one in simulation.scene.connections if one.name in table.elements]:
+        where = table.elements[one.name]
+        own = (element >= where.start) & (element < where.stop)
+        if own.any():
+            found[f"{type(one).__name__.lower()} '{one.name}'"] = table.weight[entries[own]] @ pulls[element[own]]
     return found
 
 

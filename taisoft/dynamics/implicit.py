@@ -19,7 +19,6 @@ from taisoft.dynamics.elimination import solve_on
 from taisoft.dynamics.imbalance import describe_imbalance
 from taisoft.dynamics.impact import solve_bouncing
 from taisoft.dynamics.multipliers import Multipliers, solve_with_multipliers
-from taisoft.dynamics.newton_budget import MAX_ITERATIONS
 from taisoft.dynamics.no_contacts import NoContacts
 from taisoft.dynamics.results import StageResult, StepResult, count_all
 from taisoft.dynamics.schemes import SCHEMES, Scheme
@@ -191,7 +190,7 @@ class ImplicitStepper:
             )
         if self._substepping.held_part > 0.0:
             step.problems.append(
-                f"{MAX_ITERATIONS} Newton iterations, the most in a step, were not enough: the motion in the last "
+                f"{self.solver.budget.limit} Newton iterations, the most in a step, were not enough: the motion in the last "
                 f"{100.0 * self._substepping.held_part:.3g} % of the step was held back"
             )
         if self.contact.paths.held_back:

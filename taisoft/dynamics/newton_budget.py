@@ -28,7 +28,7 @@ class NewtonBudget:
     """Newton iterations of the present step."""
 
     def __init__(self) -> None:
-        self.used = 0.0
+        self.limit, self.used = MAX_ITERATIONS, 0.0
 
     def begin(self) -> None:
         """Begin a step."""
@@ -43,4 +43,4 @@ class NewtonBudget:
     @property
     def left(self) -> int:
         """Whole iterations left, but for one that is kept for a projected matrix."""
-        return max(0, int(MAX_ITERATIONS - 1 - self.used))
+        return max(0, int(self.limit - 1 - self.used))

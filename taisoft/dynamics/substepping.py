@@ -157,13 +157,12 @@ class Substepping:
         length = self._longest(longest, dt)
         while True:
             time, is_rest = start + (dt - remaining), stepper.is_spent()
-            length = remaining if is_rest else next_length(
-                partial(self._closing_ratio, time),
-                remaining,
-                length,
-                self._longest(longest, dt),
-                bool(results) and not undone and undo_budget > 0,
-            )
+            may_grow = bool(results) and not undone and undo_budget > 0
+            if is_rest:
+                length = remaining
+            else:
+                closing_ratio = partial(self._closing_ratio, time)
+                length = next_length(closing_ratio, remaining, length, self._longest(longest, dt), may_grow)
             if length < shortest:
                 if not contact.paths.none_cross:
                     self._refuse_fast_closing(dt)
