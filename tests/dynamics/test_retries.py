@@ -20,6 +20,7 @@ import pytest
 import taisoft as ts
 from taisoft.dynamics import implicit
 from taisoft.dynamics.contact import ContactStep
+from taisoft.dynamics.newton_budget import NewtonBudget
 from taisoft.dynamics.results import StageResult
 from taisoft.dynamics.substepping import LengthLimit, Substepping
 from taisoft.errors import SimulationError
@@ -100,7 +101,7 @@ def test_a_step_that_does_not_converge_is_cut_into_substeps(sim, monkeypatch):
 def test_a_step_ends_at_its_bound_of_iterations(sim, monkeypatch, limit):
     """No tet inverts, what is prescribed moves on, and the report names a node and what acts there."""
     (body,), sim.dt = sim.scene.bodies, DT / 2
-    monkeypatch.setattr(sim._dynamics.stepper.solver.budget, "limit", limit)
+    monkeypatch.setattr(NewtonBudget, "limit", limit)
     sim.set_state(velocities=30.0 * np.random.default_rng(0).standard_normal(sim.positions().shape))
     report, moved = sim.step(), body.constraints[-1]
     assert not report.converged and 0 < report.newton_iterations <= limit and report.n_inverted == 0 and sim.time == sim.dt
@@ -303,7 +304,9 @@ def test_the_number_of_undone_substeps_is_bounded(stepper):
     assert 0 < len(stepper.taken) - len(lengths) <= 20 and stepper.relative_penetration > 1.0
 
 
-@pytest.mark.parametrize("fault, lengths", [("left_path", [STEP]), ("depth", [STEP / 2, STEP / 2]), ("passes", [STEP / 2, STEP / 2])])
+@pytest.mark.parametrize(
+    "fault, lengths", [("left_path", [STEP]), ("depth", [STEP / 2, STEP / 2]), ("passes", [STEP / 2, STEP / 2])]
+)
 def test_the_rest_of_a_step_without_iterations_is_held_back(stepper, fault, lengths):
     """A substep that was too fast to be kept is part of the rest; one with other faults is the last, not halved again."""
     setattr(stepper, fault, longer_than(STEP / 4))

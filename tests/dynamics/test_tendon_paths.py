@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import taisoft as ts
-from taisoft.dynamics.newton_budget import MAX_ITERATIONS
+from taisoft.dynamics.newton_budget import NewtonBudget
 from taisoft.dynamics.schemes import IMPLICIT
 from taisoft.fem.laws import LAWS
 from tests.dynamics.companion import add_companion, simulator
@@ -32,7 +32,7 @@ def reports_of(sim: ts.Simulator, steps: int) -> list[ts.StepReport]:
     for report in reports:
         text = " ".join(report.problems)
         assert report.converged or ("least balanced is node " in text and " of body 'block', between " in text)
-        assert report.newton_iterations <= MAX_ITERATIONS
+        assert report.newton_iterations <= NewtonBudget.limit
     return reports
 
 
