@@ -12,6 +12,7 @@ import numpy as np
 from taisoft.backend.arrays import download
 from taisoft.fem.pressure import pressures_of
 from taisoft.scene.loads import Cavity
+from taisoft.scene.rigid import RigidBody
 
 if TYPE_CHECKING:
     from taisoft.dynamics.contact import ContactStep
@@ -20,11 +21,16 @@ if TYPE_CHECKING:
     from taisoft.dynamics.stage_system import StageSystem
 
 SMALL = 0.1  # of the largest force at the node: those below it are not named
-NAMED = 2  # forces that are named
+NAMED, PAIRS = 2, 3  # forces and pairs that are named
 
 
 def describe_imbalance(simulation: "SimulationState", system: "StageSystem", contact: "ContactStep | NoContacts") -> str:
-    """Name the node with the largest residual of the stage just solved, and the largest forces there; "" if it is not finite."""
+    """Name the node with the largest residual of the stage just solved, and the largest forces there; "" if it is not finite.
+
+    Where the forces are balanced, name the colliders between which the contact laws do not hold.
+    """
+    if contact.n_contacts and system.is_balanced:
+        return f"the contact laws do not hold yet between {_pairs(contact)}"
     m, w, beta, layout = simulation.model, system.work, system.stage.beta, simulation.layout
     free, residual, x, v, x_hat, v_hat, mass = download([m.free, w.residual, m.state.x, m.state.v, w.x_hat, w.v_hat, m.mass])
     size = np.linalg.norm(free * residual.astype(np.float64), axis=1)
@@ -40,7 +46,8 @@ def describe_imbalance(simulation: "SimulationState", system: "StageSystem", con
     named = sorted(((float(np.linalg.norm(free[i] * f)), name) for name, f in forces.items()), reverse=True)
     texts = [f"{name} ({f:.3g} N)" for f, name in named[:NAMED] if f > SMALL * named[0][0]]
     body = simulation.scene.bodies[k]
-    return f"node {i - layout.node_start[k] - body.selectable.start} of body '{body.name}', between {' and '.join(texts)}"
+    node = "" if isinstance(body, RigidBody) else f"node {i - layout.node_start[k] - body.selectable.start} of "
+    return f"least balanced is {node}body '{body.name}', between {' and '.join(texts)}"
 
 
 def _connections(simulation: "SimulationState", x: np.ndarray, v: np.ndarray, i: int) -> dict[str, np.ndarray]:
@@ -70,6 +77,14 @@ def _cavities(simulation: "SimulationState", x: np.ndarray, i: int) -> dict[str,
             if len(gradient):
                 found[f"cavity '{load.name}'"] = pressure * gradient.sum(axis=0)
     return found
+
+
+def _pairs(contact: "ContactStep") -> str:
+    """The pairs of colliders in contact, the first few of them."""
+    names = [one.name for one in contact.detection.scene.colliders]
+    (body,) = download([contact.problem.body], contact.n_contacts)
+    pairs = [f"'{names[a]}' and '{names[b]}'" for a, b in np.unique(body, axis=0)]
+    return ", ".join(pairs[:PAIRS]) + (", ..." if len(pairs) > PAIRS else "")
 
 
 def _contacts(contact: "ContactStep | NoContacts", i: int, beta: float) -> dict[str, np.ndarray]:

@@ -186,7 +186,7 @@ class ImplicitStepper:
             step.problems.append(
                 f"Newton stopped after {step.newton_iterations} iterations at a relative residual of {step.residual:.2e}"
                 + (f" and a contact residual of {step.contact_residual:.2e}" if self.contact.n_contacts else "")
-                + (f"; least balanced is {result.imbalance}" if result.imbalance else "")
+                + (f"; {result.imbalance}" if result.imbalance else "")
             )
         if self._substepping.held_part > 0.0:
             step.problems.append(

@@ -17,7 +17,7 @@ class StageResult:
     contact_residual: float = 0.0
     unbalanced: tuple[float, str] = (0.0, "")  # largest relative residual of a piece, and its name, if unbalanced
     multigrid_solves: int = 0
-    imbalance: str = ""  # where the residual is largest, in words, if it has not converged
+    imbalance: str = ""  # what is out of balance, in words, if it has not converged
 
 
 @dataclass
@@ -58,7 +58,7 @@ def merge(results: list[StageResult]) -> StageResult:
         max(r.contact_residual for r in results),
         max(r.unbalanced for r in results),
         sum(r.multigrid_solves for r in results),
-        max(results, key=lambda r: r.residual).imbalance,
+        max(results, key=lambda r: (not r.converged, r.residual)).imbalance,
     )
 
 

@@ -206,6 +206,11 @@ class StageSystem:
         return self.stage.c == 0.0
 
     @property
+    def is_balanced(self) -> bool:
+        """Whether |r| was within the stage's tolerance at its last evaluation."""
+        return math.sqrt(self.norms[0]) <= self.stage.tolerance * self.scale
+
+    @property
     def contact_residual(self) -> float:
         """Residual of the contact laws at the last evaluation."""
         return float(self._k.problem.state[RESIDUAL]) if self._k.any else 0.0

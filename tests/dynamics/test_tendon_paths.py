@@ -27,4 +27,5 @@ def test_no_path_of_a_tendon_takes_more_iterations_than_the_bound(seed):
         for report in [sim.step() for _ in range(6)]:
             assert report.newton_iterations <= (NewtonBudget.limit if seed else 50)
             text = " ".join(report.problems)
-            assert report.converged or (seed and "least balanced is node " in text and " of body 'block', between " in text)
+            named = "least balanced is node " in text and " of body 'block', between " in text
+            assert report.converged or (seed and (named or "the contact laws do not hold yet between 'block' and" in text))
