@@ -5,7 +5,7 @@ count by their share of the nodes. A linear solve of a linearised contact proble
 stops where it is, nothing is tried again, and the rest of the step is held back, see `substepping`.
 
 MAX_ITERATIONS is about twice the most that a converged step was found to take: 1,193 in case R1 of `taisoft bench hard`
-(`most_newton_iterations` in its records), 673 in `taisoft bench ipc`, 575 in heap 136, one of the slowest of `taisoft bench
+(`most_newton_iterations` in its records), 673 in `taisoft bench ipc`, 872 in heap 053, one of the slowest of `taisoft bench
 crossings`.
 """
 
