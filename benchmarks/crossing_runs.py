@@ -51,6 +51,7 @@ class Watch:
     deepest: float = 0.0  # [m]
     least: float = NEAR  # [m], of every tenth state that does not cross; NEAR if it is larger
     contacts: int = 0  # the engine's, in one step
+    newton: int = 0  # most iterations of a converged step
     unconverged: int = 0
     inverted: int = 0
     judge_seconds: float = 0.0
@@ -67,6 +68,7 @@ class Watch:
         clock = time.perf_counter()
         self.states += 1
         self.unconverged += not report.converged
+        self.newton = max(self.newton, report.newton_iterations if report.converged else 0)
         self.contacts = max(self.contacts, report.n_contacts)
         self.inverted = max(self.inverted, report.n_inverted)
         found = judge.find()

@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
+from taisoft.dynamics.newton_budget import watched
 from taisoft.energy_check import EnergyCheck
 from taisoft.errors import SimulationError, no_memory
 from taisoft.frames import ROUNDING, check_length, fit_dt
@@ -20,6 +21,30 @@ if TYPE_CHECKING:
 
 FrameCallback = Callable[["Simulator", int, StepReport | None], None]
 StepCallback = Callable[[StepReport, float], None]
+IterationCallback = Callable[[int], None]
+LONG_STEP, LOOK_EVERY = 1.0, 0.2  # wall time from which an implicit step is long, and between looks at it [s]
+
+
+class _StepStopped(Exception):
+    """`stop` said so within a step."""
+
+
+class _LongStep:
+    """Looks into a step that takes long, see `run`."""
+
+    def __init__(self, stop: Callable[[], bool] | None, on_iteration: IterationCallback | None):
+        self._stop, self._on_iteration, self._next = stop, on_iteration, time.monotonic() + LONG_STEP
+
+    def __call__(self, n: int) -> None:
+        """Look at the step after n of its Newton iterations."""
+        now = time.monotonic()
+        if now < self._next:
+            return
+        self._next = now + LOOK_EVERY
+        if self._stop is not None and self._stop():
+            raise _StepStopped
+        if self._on_iteration is not None:
+            self._on_iteration(n)
 
 
 def run(
@@ -32,19 +57,21 @@ def run(
     on_step: StepCallback | None = None,
     error: bool = False,
     error_mesh: "str | Scene | None" = None,
+    on_iteration: IterationCallback | None = None,
 ) -> RunReport:
     """Step for `seconds` [s] from now, to the nearest step, with frames at fps, or after every step if fps is None.
 
     on_frame(sim, index, report): called for frame 0 (the start, report None) and after every frame. stop: called between
-    steps; True ends the run. dt is lowered once to the next divisor of 1/fps, or rounded to one within NEAR of it, which
-    the report notes. resumed: seconds and frames count from time 0, not from now; the first frame is `first_frame`.
+    steps, and in long ones; True ends the run. dt is lowered once to the next divisor of 1/fps, or rounded to one within NEAR
+    of it, which the report notes. resumed: seconds and frames count from time 0, not from now; the first frame is `first_frame`.
     on_step(report, seconds): called after every implicit step and every batch of explicit steps, with its wall time without
     compilation [s]. error: estimate the error of the positions by twins (`taisoft.estimation`), simulators that follow the run
     with other steps and tighter tolerances; the report holds it. error_mesh: also estimate the error of the mesh, by a twin on
-    another one: "refined", "order" (the elements' other order), or the same scene on a mesh that shares nodes. A run that fails,
-    or that `stop` ends, does not raise: see the report's status and problems. Ctrl-C undoes the present step and is raised as
-    KeyboardInterrupt; `stop` alone ends a run in another thread than the main one. Raises SimulationError for bad arguments, and
-    for a twin that cannot be made. A simulator with a tolerance first chooses integrator and dt by pilots, unless the run is
+    another one: "refined", "order" (the elements' other order), or the same scene on a mesh that shares nodes. on_iteration(n):
+    called a few times a second in implicit steps of more than 1 s of wall time, with their Newton iterations so far. A run that
+    fails, or that `stop` ends, does not raise: see the report's status and problems. Ctrl-C undoes the present step and is raised
+    as KeyboardInterrupt; `stop` alone ends a run in another thread than the main one. Raises SimulationError for bad arguments,
+    and for a twin that cannot be made. A simulator with a tolerance first chooses integrator and dt by pilots, unless the run is
     resumed; the report then holds the error in time.
     """
     if error_mesh is not None and not error:
@@ -52,7 +79,7 @@ def run(
     seconds = check_positive("seconds", seconds, "s")
     fps = None if fps is None else check_positive("fps", fps, "1/s")
     check_length(seconds, sim.dt, fps)
-    arguments = {"on_frame": on_frame, "on_step": on_step, "error": error, "error_mesh": error_mesh}
+    arguments = {"on_frame": on_frame, "on_step": on_step, "error": error, "error_mesh": error_mesh, "on_iteration": on_iteration}
     if sim.settings.tolerance is None or resumed:
         report = run_steps(sim, seconds, fps=fps, stop=stop, resumed=resumed, **arguments)
         if resumed and sim.settings.tolerance is not None:
@@ -73,6 +100,7 @@ def run_steps(
     on_step: StepCallback | None = None,
     error: bool = False,
     error_mesh: "str | Scene | None" = None,
+    on_iteration: IterationCallback | None = None,
 ) -> RunReport:
     """Run as `run`, with the simulator's integrator and dt, and checked arguments."""
     report = RunReport()
@@ -96,7 +124,7 @@ def run_steps(
             while sim.step_count - first_step < total and not report.interrupted:
                 frame += 1
                 frame_end = min(total, frame * steps_per_frame)
-                merged = _advance_to(sim, first_step + frame_end, stop, report, on_step, energy, estimator)
+                merged = _advance_to(sim, first_step + frame_end, stop, on_iteration, report, on_step, energy, estimator)
                 if merged is None:
                     break
                 if sim.settings.explicit:
@@ -106,6 +134,8 @@ def run_steps(
         except (SimulationError, MemoryError) as failure:
             report.status = "failed"
             report.problems.append(str(no_memory("the next step", failure) if isinstance(failure, MemoryError) else failure))
+        except _StepStopped:
+            _mark_interrupted(report)
         if estimator is not None:
             report.error_estimate = estimator.estimate()
     finally:  # after Ctrl-C, too
@@ -140,6 +170,7 @@ def _advance_to(
     sim: "Simulator",
     end: int,
     stop: Callable[[], bool] | None,
+    on_iteration: IterationCallback | None,
     report: RunReport,
     on_step: StepCallback | None,
     energy: EnergyCheck,
@@ -157,7 +188,8 @@ def _advance_to(
             break
         energy.before_step()
         until = end if estimator is None else estimator.next_comparison(end)
-        latest = timed_advance(sim, until - sim.step_count, on_step)
+        with watched(_LongStep(stop, on_iteration)):
+            latest = timed_advance(sim, until - sim.step_count, on_step)
         energy.after_step(latest)
         if estimator is not None and sim.step_count == until:
             estimator.compare()

@@ -16,7 +16,7 @@ from taisoft.errors import SceneError
 from taisoft.fem import reference
 from taisoft.fem.dependents import DependentTable, dependent_table
 from taisoft.fem.loads import SceneLoads
-from taisoft.fem.spring_table import SpringTable
+from taisoft.fem.spring_table import SpringTable, length_and_gradient
 from taisoft.fem.springs import spring_table
 from taisoft.scene.composition import Composition
 from taisoft.scene.rigid import RigidBody
@@ -222,7 +222,7 @@ def spring_rates(scene: Scene, dependents: DependentTable | None) -> tuple[float
     if table is None:
         return 0.0, 0.0
     amplitudes = SceneLoads(scene, table).amplitudes([0.0])[0]
-    length = np.linalg.norm(table.vectors(_start_positions(scene), amplitudes), axis=1)
+    length, _ = length_and_gradient(table.vectors(_start_positions(scene), amplitudes), table.smoothing)
     tension = table.stretching(length, amplitudes) + table.given(amplitudes)
     stiffness = table.stiffness * np.diff(table.line_start)[table.line]
     largest = np.maximum(stiffness, tension / np.where(tension > 0.0, length, 1.0))

@@ -10,6 +10,7 @@ from taisoft.backend.runtime import Runtime, open_kind, open_runtime
 from taisoft.display import short_repr
 from taisoft.dynamics.contact_newton import solve
 from taisoft.dynamics.dirichlet import DirichletConditions
+from taisoft.dynamics.imbalance import describe_imbalance
 from taisoft.dynamics.multipliers import Multipliers, solve_with_multipliers
 from taisoft.dynamics.no_contacts import NoContacts
 from taisoft.dynamics.results import StageResult
@@ -37,12 +38,13 @@ class StaticResult:
     load: float  #: fraction of the load for which equilibrium was found; below 1 the state is that of the last, failed attempt
     at_rounding: bool  #: the residual is down at the rounding of the forces, so no tolerance below it can be met
     residual: float  #: |force on free axes| / |applied load|, without load relative to the constraint forces
-    iterations: int  #: of Newton's method, over all load steps
+    iterations: int  #: of Newton's method, over all load steps; at most as many as in an implicit step
     linear_iterations: int  #: of conjugate gradients
     multigrid_solves: int  #: linear systems that multigrid preconditioned
     load_steps: int  #: steps that the load was applied in
     elastic: float  #: stored energy [J]
     n_inverted: int  #: tets with J <= 0
+    imbalance: str  #: the node where forces are least balanced, and the largest of them, if it has not converged
     _scene: Scene
     _layout: Layout
     _positions: np.ndarray
@@ -173,10 +175,11 @@ class StaticSolver:
         """Apply the full load in one step; if that fails, use load steps that halve on failure and grow by half on success."""
         rest = self.simulation.layout.rest
         self.newton = self.linear = self.multigrid = 0
+        self.solver.budget.begin()
         result, steps, applied = self._attempt(rest, 1.0, self.tolerance), 1, 1.0
         if not self._is_acceptable(result):
             applied, step, x, steps = 0.0, 0.25, rest, 0
-            while applied < 1.0 and step >= SMALLEST_LOAD_STEP:
+            while applied < 1.0 and step >= SMALLEST_LOAD_STEP and self.solver.budget.left:
                 target = min(1.0, applied + step)
                 result = self._attempt(x, target, self.tolerance if target == 1.0 else max(self.tolerance, 1e-3))
                 if self._is_acceptable(result):
@@ -228,12 +231,13 @@ class StaticSolver:
             load=load,
             at_rounding=result.at_rounding,
             residual=self._residual(result),
-            iterations=self.newton,
+            iterations=round(self.newton),
             linear_iterations=self.linear,
             multigrid_solves=self.multigrid,
             load_steps=steps,
             elastic=float(scalars[ELASTIC]),
             n_inverted=int(scalars[N_INVERTED]),
+            imbalance="" if result.converged else describe_imbalance(simulation, self.solver, NoContacts()),
             _scene=simulation.scene,
             _layout=simulation.layout,
             _positions=simulation.model.state.x.to_numpy(),

@@ -70,7 +70,7 @@ class Signals:
     ending: message printed at the first signal.
     """
 
-    def __init__(self, ending: str = "ending after the current step and saving") -> None:
+    def __init__(self, ending: str = "ending and saving") -> None:
         self._ending = ending
         self.number: int | None = None
         self._running = False

@@ -242,7 +242,8 @@ def _run(sim, settings: RunSettings, arguments, signals, warned: list[str], save
             observers.members.append(LiveWindow(sim, plots, colour=shown.colour, layers=shown.in_window))
         if recording is not None:
             recording.add_writers(observers, sim, settings.fps, settings.seconds, shown, plots)
-        observers.members.append(Progress(settings.seconds, label=Path(arguments.scene).stem))
+        progress = Progress(settings.seconds, label=Path(arguments.scene).stem)
+        observers.members.append(progress)
         if shown.errors:
             print(f"twins    follow the run, {TWINS[arguments.error_mesh]}", flush=True)
         if sim.settings.tolerance is not None and resumed is None:
@@ -256,6 +257,7 @@ def _run(sim, settings: RunSettings, arguments, signals, warned: list[str], save
             on_step=plots.take if plots is not None else None,
             error=shown.errors,
             error_mesh=arguments.error_mesh,
+            on_iteration=progress.iteration,
         )
         observers.close()
         if recording is not None:

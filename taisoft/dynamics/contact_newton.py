@@ -110,7 +110,7 @@ class ContactNewton:
             system.form_matrix_and_factors()
             self.r, self.scale = system.evaluate(None)
         lowest, stalled, n_slow = self.r, 0, 0
-        while self.newton < stage.max_newton and math.isfinite(self.r):
+        while self.newton < stage.max_newton and math.isfinite(self.r) and system.budget.left:
             if self._has_converged():
                 if system.balances_pieces():
                     break
@@ -121,7 +121,7 @@ class ContactNewton:
             previous, law_residual = self.r, system.contact_residual
             only_laws_remain = self._is_balanced
             result, moved = self._solve_contacts(), False
-            self.newton += 1
+            self._count()
             if not result.negative:
                 self.r, self.scale = system.end_linearised()
                 moved = self.r < DECREASE * lowest
@@ -147,7 +147,7 @@ class ContactNewton:
                 break
         converged = self._has_converged() and math.isfinite(self.r) and system.balances_pieces()
         return StageResult(
-            self.newton + round(self.eliminated),
+            self.newton + self.eliminated,
             round(self.linear),
             relative(self.r, self.scale),
             converged,
@@ -156,6 +156,10 @@ class ContactNewton:
             system.contact_residual,
             (0.0, "") if converged else system.least_balanced(),
         )
+
+    def _count(self) -> None:
+        self.newton += 1
+        self.system.budget.spend()
 
     @property
     def floor(self) -> float:
@@ -197,7 +201,7 @@ class ContactNewton:
         if result.negative:
             self.r, self.scale = self.system.end_linearised(accept=False)
             self.system.form_matrix(projected=True)
-            self.newton += 1
+            self._count()
             result = self._solve_on_matrix()
         return result
 
@@ -259,6 +263,8 @@ def solve(system: StageSystem, stage: Stage) -> StageResult:
     The caller sets x_hat, v_hat, the targets and the contacts.
     """
     fresh = system.begin(stage)
+    if stage.linearised and not system.budget.left:
+        return StageResult(0.0, 0, relative(*system.evaluate()), False, False)
     if system.n_contacts == 0:
         # elimination knows no constraint of all nodes of a cavity or a tendon
         newton = Newton(system, stage, eliminate=eliminate if system.multipliers is None else None)
@@ -277,12 +283,14 @@ def solve(system: StageSystem, stage: Stage) -> StageResult:
 def solve_linearised(system: StageSystem, stage: Stage) -> StageResult:
     """Solve the frictional problem alone, at the present state; on a projected matrix if its own is indefinite."""
     tolerance = stage.linear_tolerance or LINEARISED_FORCING
-    problem, linear = replace(stage, max_newton=LINEARISED_SOLVES, linear_tolerance=tolerance), 0
+    solves = min(LINEARISED_SOLVES, system.budget.left)
+    problem, linear = replace(stage, max_newton=solves, linear_tolerance=tolerance), 0
     r, scale = system.evaluate_start(new_multipliers=True)
     for projected in (False, True):
         system.linearise()
         found = solve_linear(system, problem, r, scale)
         linear += found.linear
+        system.budget.spend(found.solves)
         if not found.negative or projected:
             break
         r, scale = system.end_linearised(accept=False)

@@ -65,11 +65,13 @@ def solve_on(system: StageSystem, stage: Stage, nodes: np.ndarray, target: float
     This updates the state and the elastic forces; the residual must be evaluated again, and the matrix is invalid.
     """
     system.restrict(nodes)
+    fraction = len(nodes) / system.model.n_nodes
+    steps = min(STEPS, int(system.budget.left / fraction))
     try:
-        substage = replace(stage, absolute_tolerance=target, contact_tolerance=math.inf, keeps_multipliers=True, max_newton=STEPS)
+        substage = replace(stage, absolute_tolerance=target, contact_tolerance=math.inf, keeps_multipliers=True, max_newton=steps)
         newton = Newton(system, substage)
         newton.run(*system.evaluate(STAY), fresh=False)
     finally:
         system.restrict(None)
-    fraction = len(nodes) / system.model.n_nodes
+    system.budget.spend(fraction * newton.newton)
     return Eliminated(fraction * newton.newton, fraction * newton.linear)

@@ -15,6 +15,7 @@ from taisoft.backend.runtime import kernel
 from taisoft.dynamics.contact import TOLERANCE, ContactStep
 from taisoft.dynamics.contact_newton import solve
 from taisoft.dynamics.elimination import solve_on
+from taisoft.dynamics.imbalance import describe_imbalance
 from taisoft.dynamics.impact import solve_bouncing
 from taisoft.dynamics.multipliers import Multipliers, solve_with_multipliers
 from taisoft.dynamics.no_contacts import NoContacts
@@ -26,9 +27,12 @@ from taisoft.dynamics.stage_system import Stage, StageSystem
 from taisoft.dynamics.substepping import LengthLimit, Substepping
 from taisoft.errors import SimulationError
 from taisoft.fem.dependents import place_all
+from taisoft.fem.measure import measure
 from taisoft.fem.rigid_tets import begin_rigid_stage
+from taisoft.fem.state import N_INVERTED
 from taisoft.settings import Settings
 
+LEAST_PART = 1e-3  # of a motion that is held back: below it nothing moves
 MAX_NEWTON, MAX_NEWTON_WITH_CONTACTS = 50, 25  # a step that needs more is cut in substeps, or reported as not converged
 TIGHTER = 0.1  # of the tolerance that would just balance the forces on a body
 DEFAULT_TOLERANCE = {"f32": 1e-4, "f64": 1e-8}  # relative residual; f32 forces carry 1e-6 to 1e-5 of rounding
@@ -166,7 +170,7 @@ class ImplicitStepper:
         worst, name = result.unbalanced
         step = StepResult(
             substeps=self._substepping.substeps,
-            newton_iterations=result.newton_iterations,
+            newton_iterations=round(result.newton_iterations),
             linear_iterations=result.linear_iterations,
             multigrid_solves=result.multigrid_solves,
             contact_iterations=result.contact_iterations,
@@ -179,6 +183,12 @@ class ImplicitStepper:
             step.problems.append(
                 f"Newton stopped after {step.newton_iterations} iterations at a relative residual of {step.residual:.2e}"
                 + (f" and a contact residual of {step.contact_residual:.2e}" if self.contact.n_contacts else "")
+                + (f"; {result.imbalance}" if result.imbalance else "")
+            )
+        if self._substepping.held_part > 0.0:
+            step.problems.append(
+                f"{self.solver.budget.limit} Newton iterations, the most in a step, were not enough: the motion in the last "
+                f"{100.0 * self._substepping.held_part:.3g} % of the step was held back"
             )
         if self.contact.paths.held_back:
             step.problems.append(self.contact.paths.held_back)
@@ -192,6 +202,46 @@ class ImplicitStepper:
     def is_linear(self) -> bool:
         """Whether steps are linearised, without iterations."""
         return self.scheme.one_iteration
+
+    def begin_iterations(self) -> None:
+        """Let a step have all its Newton iterations."""
+        self.solver.budget.begin()
+
+    def is_spent(self) -> bool:
+        """Return whether the step has no Newton iterations left."""
+        return not self.solver.budget.left
+
+    def hold_substep(self, time: float, dt: float) -> StageResult:
+        """Take a substep in which only what is prescribed moves."""
+        self.take_substep(time, dt)
+        self._return_in_part(0.0)
+        return StageResult(0.0, 0, 0.0, False, False)
+
+    def hold_back_inverted(self) -> float:
+        """Shorten the motion of the last substep until no more tets are inverted than at its start; return what is left of it."""
+        n_end, end = self._count_inverted(), self.simulation.state()
+        self._return_in_part(0.0)
+        n_start, part = self._count_inverted(), 1.0
+        while n_end > n_start and part > 0.0:
+            part = 0.5 * part if part > LEAST_PART else 0.0
+            self.simulation.set_state(*end)
+            self._return_in_part(part)
+            n_end = self._count_inverted()
+        if part == 1.0:
+            self.simulation.set_state(*end)
+        else:
+            self.break_history()
+        return part
+
+    def _count_inverted(self) -> float:
+        measure(self.simulation.model)
+        return self.simulation.model.state.scalars[N_INVERTED]
+
+    def _return_in_part(self, part: float) -> None:
+        """Leave only a part of the last substep's change of the free nodes' positions and velocities."""
+        free, *start = download([self.simulation.model.free, self.history.x_now, self.history.v_now])
+        end = self.simulation.state()
+        self.simulation.set_state(*(np.where(free > 0, a + part * (b - a), b).astype(b.dtype) for a, b in zip(start, end)))
 
     def save_start(self) -> None:
         """Save the start of a step, to which `return_to_start` returns."""
@@ -287,6 +337,8 @@ class ImplicitStepper:
             restore(m, h)
             self.forget()
             raise
+        if not result.converged:
+            result = replace(result, imbalance=describe_imbalance(simulation, self.solver, self.contact))
         if scheme.midpoint:
             finish_midpoint(m, h)
         if not np.isfinite(result.residual):  # a NaN anywhere in x or v reaches the residual

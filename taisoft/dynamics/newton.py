@@ -47,6 +47,7 @@ class Newton:
         """eliminate: as `elimination.eliminate`, called after slow steps; None: no elimination."""
         self.system, self.stage, self.eliminate = system, stage, eliminate
         self.is_linearised = system.kind == LINEARISED  # the caller then handles an indefinite matrix
+        self._counts = not (self.is_linearised or system.work.pcg.subset.restricted)  # in the step's budget; else the caller does
         self.max_forcing = MAX_FORCING if stage.c > 0.0 else STATIC_FORCING
         self.newton = self.linear = self.multigrid = self.multipliers = self.n_remembered = 0
         self.eliminated = 0.0  # Newton iterations on few nodes, times their fraction of all nodes
@@ -68,7 +69,7 @@ class Newton:
                 elif not self._update_multipliers():
                     break
                 continue
-            if self.newton >= self.stage.max_newton:
+            if self.newton >= self.stage.max_newton or (self._counts and not system.budget.left):
                 break
             if not fresh or (n_uses >= MIN_USES[self.has_contacts] and self.r > rebuild_ratio * self.previous):
                 if system.kind == ELASTIC_STAGE:
@@ -146,6 +147,8 @@ class Newton:
         system = self.system
         solution = self._direction(self._linear_tolerance())
         self.newton, self.n_inner = self.newton + 1, self.n_inner + 1
+        if self._counts:
+            system.budget.spend()
         self.previous, self.negative = self.r, self.negative or solution.negative
         if self.is_linearised and solution.negative:
             return False
@@ -205,7 +208,7 @@ class Newton:
     def _result(self, converged: bool) -> StageResult:
         r, system = self.r, self.system
         return StageResult(
-            self.newton + round(self.eliminated),
+            self.newton + self.eliminated,
             round(self.linear),
             relative(r, self.scale),
             converged and math.isfinite(r),
@@ -232,6 +235,7 @@ class Newton:
                     break
             solved = solution.converged and system.linear_residual() <= LINEAR_LIMIT
             self.newton = 1
+            system.budget.spend()
         else:
             system.work.pcg.y.fill(0.0)
         self.r, self.scale = system.take_linearised_step()

@@ -108,6 +108,10 @@ class Pieces:
         """Whether there are several pieces."""
         return self.work.several
 
+    def node_weights(self) -> np.ndarray:
+        """Return 1 / s_p of each node's piece (n_nodes,)."""
+        return np.sqrt(self.work.weight.to_numpy())[self.of_node]
+
     def forget_weights(self) -> None:
         """Let all pieces count alike, and linear solves without factors."""
         upload([(self.work.weight, np.ones(self.work.n)), (self.work.factor, np.ones(self.work.n_components))])
@@ -176,7 +180,7 @@ def _components(simulation: SimulationState, piece: np.ndarray, n: int) -> tuple
         links.append((np.repeat(dependents.node, np.diff(dependents.start)), dependents.master))
     if table is not None:
         links.append((table.node[table.start[table.element]], table.node))
-        fixed = np.abs(np.add.reduceat(table.weight, table.start[:-1])) > ROUNDED
+        fixed = np.abs(np.bincount(table.element, table.weight, len(table.kind))) > ROUNDED
         # the damping of a spring without length need not act along it, and then has a moment
         fixed |= table.is_isotropic & (table.damping > 0.0)
         outside = table.node[fixed[table.element]]

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 class StageResult:
     """Result of solving an implicit stage. Without contacts, contacts count as converged after 0 iterations."""
 
-    newton_iterations: int
+    newton_iterations: float  # those on few nodes count by their share
     linear_iterations: int
     residual: float  # relative
     converged: bool  # including the contacts
@@ -17,6 +17,7 @@ class StageResult:
     contact_residual: float = 0.0
     unbalanced: tuple[float, str] = (0.0, "")  # largest relative residual of a piece, and its name, if unbalanced
     multigrid_solves: int = 0
+    imbalance: str = ""  # what is out of balance, in words, if it has not converged
 
 
 @dataclass
@@ -57,6 +58,7 @@ def merge(results: list[StageResult]) -> StageResult:
         max(r.contact_residual for r in results),
         max(r.unbalanced for r in results),
         sum(r.multigrid_solves for r in results),
+        max(results, key=lambda r: (not r.converged, r.residual)).imbalance,
     )
 
 

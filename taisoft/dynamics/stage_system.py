@@ -30,6 +30,7 @@ from taisoft.dynamics.contact_terms import (
 from taisoft.dynamics.direct import DirectSolver, can_solve_directly
 from taisoft.dynamics.linear_solver import LinearSolver
 from taisoft.dynamics.linearised import LONGEST, advance, begin_linearised, end_linearised
+from taisoft.dynamics.newton_budget import NewtonBudget
 from taisoft.dynamics.pieces import Pieces
 from taisoft.dynamics.rigid_balance import (
     AFTER,
@@ -144,7 +145,7 @@ class StageSystem:
         self.rounding = RoundingFloor(model, simulation.runtime.eps, self.pieces)
         self.floor = 0.0  # rounding floor of |r| of the present stage
         self.unbalanced = 0.0, ""  # largest relative residual of a piece at the last `balances_pieces`, and its name
-        self.linear_solver = LinearSolver(model)
+        self.linear_solver, self.budget = LinearSolver(model), NewtonBudget()
         self._direct = DirectSolver(self) if multipliers is None and can_solve_directly(model) else None
         self.kind = ELASTIC_STAGE
         self.scale = 0.0  # that |r| is relative to, at its last evaluation
@@ -219,6 +220,11 @@ class StageSystem:
     def is_static(self) -> bool:
         """Whether the stage has no inertia."""
         return self.stage.c == 0.0
+
+    @property
+    def is_balanced(self) -> bool:
+        """Whether |r| was within the stage's tolerance at its last evaluation."""
+        return math.sqrt(self.norms[0]) <= self.stage.tolerance * self.scale
 
     @property
     def contact_residual(self) -> float:

@@ -9,6 +9,9 @@ cut, if it left a new deep penetration or crossing, or, if it was short, when it
 impact or a snap, therefore takes short substeps only while it lasts. How soon longer ones are tried again depends on how often
 they failed (`LengthLimit`).
 
+Where the Newton iterations of the step are used up (`newton_budget`), the substep under way is the last: what passes through
+something on its path, or inverts tets, is held back, and in the rest of the step only what is prescribed moves.
+
 No substep is shorter than the step over MAX_SUBSTEPS. Where surfaces cross already, motion that closes too fast even for that is
 refused. A substep of minimum length, or after MAX_UNDONE others were undone, is kept and reported even if deep, unsettled or not
 converged; bodies that would still pass through something are held back.
@@ -102,7 +105,8 @@ class Substepping:
     def __init__(self, stepper: "ImplicitStepper"):
         self._stepper, self._contact = stepper, stepper.contact
         self._deepest = self._most_crossed = 0.0  # over the finer side's mean surface edge: above it a penetration is new
-        self.substeps = 1  # of the last step
+        self.substeps = 1  # of the last step,
+        self.held_part = 0.0  # and its part in which motion was held back for lack of Newton iterations
         self.limit = LengthLimit()
         self.may_retry = True  # whether shorter substeps may help; after they did not, False until a step converges
 
@@ -114,6 +118,7 @@ class Substepping:
         """
         stepper, substeps, discarded = self._stepper, 1, []
         stepper.save_start()
+        stepper.begin_iterations()
         while True:
             result, unconverged, taken = None, True, substeps
             try:
@@ -129,14 +134,14 @@ class Substepping:
                 self.may_retry = may_retry  # only a retry failed
             if result is not None:
                 discarded.append(result)
-            may_help = self.may_retry and not self._contact.paths.held_back
+            may_help = self.may_retry and not (self._contact.paths.held_back or stepper.is_spent())
             if not (unconverged and may_help and (taken < RETRIES or substeps > 1)):
                 break
             self.may_retry = taken < RETRIES
             substeps = min(2 * taken, RETRIES) if self.may_retry else 1
             stepper.return_to_start()
         self.substeps = taken
-        self.may_retry = self.may_retry or not unconverged
+        self.may_retry = (self.may_retry and not stepper.is_spent()) or not unconverged
         return count_all(result, discarded[:-1])
 
     def _in_substeps(self, start: float, dt: float, substeps: int) -> list[StageResult]:
@@ -146,19 +151,18 @@ class Substepping:
         """
         contact, stepper, may_retry = self._contact, self._stepper, self.may_retry and not self._stepper.is_linear
         shortest, longest = (1.0 - 1e-6) * dt / MAX_SUBSTEPS, dt / substeps
-        results, remaining, undo_budget = [], dt, MAX_UNDONE
+        results, remaining, undo_budget, self.held_part = [], dt, MAX_UNDONE, 0.0
         undone, n_unconverged, n_crossed = [], 0, 0  # of the current substep
         self._measure_start(start, dt)
         length = self._longest(longest, dt)
         while True:
-            time = start + (dt - remaining)
-            length = next_length(
-                partial(self._closing_ratio, time),
-                remaining,
-                length,
-                self._longest(longest, dt),
-                bool(results) and not undone and undo_budget > 0,
-            )
+            time, is_rest = start + (dt - remaining), stepper.is_spent()
+            may_grow = bool(results) and not undone and undo_budget > 0
+            if is_rest:
+                length = remaining
+            else:
+                closing_ratio = partial(self._closing_ratio, time)
+                length = next_length(closing_ratio, remaining, length, self._longest(longest, dt), may_grow)
             if length < shortest:
                 if not contact.paths.none_cross:
                     self._refuse_fast_closing(dt)
@@ -166,8 +170,13 @@ class Substepping:
             contact.start_substep(length)
             relative_penetration, last = contact.relative_penetration, length > remaining - shortest
             released = stepper.simulation.dirichlet.released()
-            may_cut = undo_budget > 0 and length >= 2.0 * shortest
-            result, fault = self._take_substep(time, length, may_cut)
+            if is_rest:
+                may_cut, (result, fault) = False, self._hold_substep(time, length)
+                self.held_part += length / dt
+            else:
+                may_cut = undo_budget > 0 and length >= 2.0 * shortest
+                result, fault = self._take_substep(time, length, may_cut)
+                may_cut = may_cut and not stepper.is_spent()
             if fault == Fault.FAST and length < 2.0 * shortest:
                 self._refuse_fast_closing(dt)
             is_held_back = fault == Fault.CROSSED and not may_cut
@@ -175,6 +184,8 @@ class Substepping:
                 contact.paths.hold_back(stepper.history.x_now)
                 stepper.break_history()
                 result, fault = replace(result, converged=False), None
+            if stepper.is_spent() and not (is_rest or result.converged or fault == Fault.FAST):
+                self._hold_back_inverted(length / dt)
             if fault != Fault.FAST and not (fault and may_cut):
                 contact.penetration = contact.end(time + length, dt if last else length)
                 is_short = length < (1.0 - ROUNDING) * min(longest, dt / RETRIES)
@@ -200,6 +211,18 @@ class Substepping:
             if last:
                 return results
             remaining, undone, n_unconverged, n_crossed = remaining - length, [], 0, 0
+
+    def _hold_substep(self, time: float, dt: float) -> tuple[StageResult, Fault | None]:
+        """Take a substep in which only what is prescribed moves."""
+        result = self._stepper.hold_substep(time, dt)
+        return result, Fault.CROSSED if self._contact.paths.find() else None
+
+    def _hold_back_inverted(self, of_step: float) -> None:
+        """Hold back what the last substep, a part of the step, has inverted, and what then passes through something."""
+        held = 1.0 - self._stepper.hold_back_inverted()
+        self.held_part += of_step * held
+        if held and self._contact.paths.find():
+            self._contact.paths.hold_back(self._stepper.history.x_now)
 
     def _longest(self, longest: float, dt: float) -> float:
         """The longest substep that is tried in a step of dt, up to a given length. The limit may stem from smaller steps."""
@@ -253,7 +276,7 @@ class Substepping:
                 # contacts unknown so far matter only if something could have crossed
                 new = contact.search_along_path(time, dt) if passes else new and not contact.paths.none_cross
             n_failed += not (result.converged or stepper.is_linear)
-            hopeless = passes and (contact.paths.is_stuck or (may_cut and n_failed >= MAX_FAILED))
+            hopeless = stepper.is_spent() or (passes and (contact.paths.is_stuck or (may_cut and n_failed >= MAX_FAILED)))
             if not (new or passes) or tries >= (MAX_PASSAGES if passes else MAX_SEARCHES) or hopeless:
                 simulation.set_state(*state)
                 if passes:

@@ -5,7 +5,14 @@ other, and g the position of a point of an obstacle. A line is a sequence of ele
     T = k (l - L) + T_0,   l = sum |e|,
 k the stiffness, L the rest length, T_0 a given tension; plus c_d e.e' / l of its damping c_d. A tendon is a line with an element
 for each of its segments: under a given tension k = 0, and an elastic one has T = k max(0, l - L) and a given L. A spring, and
-each node of an attachment, is a line of one element. Force of node j: -sum_e c_j T e / |e|.
+each node of an attachment, is a line of one element. Force of node j: -sum_e c_j T d, d the gradient of |e|.
+
+|e| has a kink at e = 0: a tension that pulls two points together has its minimum there, where the force has no limit and the
+stiffness T / |e| no bound. Below a length s, a fraction SMOOTHED of the element's rest length, |e| is therefore replaced by
+    s / 3 + |e|^2 / s - |e|^3 / (3 s^2),   d = (2 - |e| / s) e / s,
+whose value and first two derivatives are those of |e| at s: nothing changes above s, d vanishes with e, and T adds at most
+2 T / s to the stiffness. Source: the mollifier of friction of Li et al. 2020, "Incremental Potential Contact", eq. 17.
+Weakness: such an element pulls with less than its tension, and counts as s / 3 long at e = 0.
 """
 
 from dataclasses import dataclass
@@ -20,6 +27,7 @@ from taisoft.scene.obstacles import Obstacle
 
 # What the amplitude of a line is: there is none; its tension; its tension, which is a Lagrange multiplier; its rest length
 PLAIN, TENSION, MULTIPLIER, LENGTH = range(4)
+SMOOTHED = 0.01  # of an element's rest length: the length below which it is smoothed
 RATE_STEP = 1e-5  # [s] of the difference that is the velocity of an obstacle's point
 
 
@@ -71,6 +79,7 @@ class SpringTable:
     stiffness: np.ndarray  # (e,) k [N/m]
     rest_length: np.ndarray  # (e,) L [m]; 0 if it is given
     damping: np.ndarray  # (e,) c_d [N s/m]
+    smoothing: np.ndarray  # (e,) s [m]
     slot: np.ndarray  # (e,) its amplitude, -1: none
     elements: dict[str, slice]  # of each connection, by name
     moving: MovingEnds | None
@@ -133,26 +142,27 @@ class SpringTable:
 
     def tensions(self, x: np.ndarray, v: np.ndarray, amplitudes: np.ndarray) -> np.ndarray:
         """Tension (e,) [N] with damping; negative: it pushes."""
-        length, d = _length_and_direction(self.vectors(x, amplitudes))
+        length, d = length_and_gradient(self.vectors(x, amplitudes), self.smoothing)
         elastic = self.stretching(length, amplitudes)
         return elastic + self.given(amplitudes) + self.damping * (self.rates(v, amplitudes) * d).sum(axis=1)
 
     def pulls(self, x: np.ndarray, v: np.ndarray, amplitudes: np.ndarray) -> np.ndarray:
         """Force (e,3) [N] of each element on its first point."""
-        d, rate = _length_and_direction(self.vectors(x, amplitudes))[1], self.rates(v, amplitudes)
+        d, rate = length_and_gradient(self.vectors(x, amplitudes), self.smoothing)[1], self.rates(v, amplitudes)
         across = rate - (rate * d).sum(axis=1)[:, None] * d
         damped = np.where(self.is_isotropic, self.damping, 0.0)
         return -(self.tensions(x, v, amplitudes)[:, None] * d + damped[:, None] * across)
 
     def stiffness_matrix(self, e: np.ndarray, amplitudes: np.ndarray) -> sp.csr_matrix:
         """S (3e,3e) [N/m] of stretched vectors (e,3): the change of the pulls with them."""
-        length, d = _length_and_direction(e)
+        length, d = length_and_gradient(e, self.smoothing)
         elastic = self.stretching(length, amplitudes)
         slack = (self.kind == LENGTH) & (elastic == 0.0)
         along = np.where(slack, 0.0, self.stiffness)
-        t = (elastic + self.given(amplitudes)) / np.where(length > 0.0, length, np.inf)
-        t = np.where(self.is_isotropic, self.stiffness, t)
-        blocks = t[:, None, None] * (np.eye(3) - d[:, :, None] * d[:, None, :])
+        curvature = _curvature(e, self.smoothing)
+        curvature[self.is_isotropic] = np.eye(3) - d[self.is_isotropic, :, None] * d[self.is_isotropic, None, :]
+        t = np.where(self.is_isotropic, self.stiffness, elastic + self.given(amplitudes))
+        blocks = t[:, None, None] * curvature
         D = sp.csr_matrix((d.reshape(-1), (np.repeat(self.line, 3), np.arange(3 * len(d)))))  # of each line
         return (sp.block_diag(blocks) + D.T @ sp.diags(along[self.line_start[:-1]]) @ D).tocsr()
 
@@ -165,7 +175,7 @@ class SpringTable:
         if self.moving is not None:
             start = self.offset[self.moving.element].reshape(-1)
             amplitudes[self.moving.first : self.moving.first + len(start)] = start
-        length = np.bincount(self.line, np.linalg.norm(self.vectors(x, amplitudes), axis=1))
+        length = np.bincount(self.line, length_and_gradient(self.vectors(x, amplitudes), self.smoothing)[0])
         given = self.kind == LENGTH
         amplitudes[self.slot[given]] = length[self.line[given]]
         return amplitudes
@@ -176,10 +186,26 @@ class SpringTable:
         return (self.rest_length == 0.0) & (self.kind == PLAIN)
 
 
-def _length_and_direction(e: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """l (k,) and d (k,3) of vectors (k,3); d is 0 where l is."""
+def length_and_gradient(e: np.ndarray, smoothing: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Smoothed lengths (k,) of vectors (k,3), and their gradients d (k,3), which are 0 where e is. smoothing: s (k,) [m]."""
+    length, larger, ratio = _sizes(e, smoothing)
+    smoothed = np.where(ratio < 1.0, smoothing * (1.0 / 3.0 + ratio**2 - ratio**3 / 3.0), length)
+    return smoothed, ((2.0 - ratio) / larger)[:, None] * e
+
+
+def _curvature(e: np.ndarray, smoothing: np.ndarray) -> np.ndarray:
+    """Second derivatives (k,3,3) [1/m] of the smoothed lengths."""
+    length, larger, ratio = _sizes(e, smoothing)
+    outer = 1.0 / (np.where(length > 0.0, length, 1.0) * larger**2)
+    return ((2.0 - ratio) / larger)[:, None, None] * np.eye(3) - outer[:, None, None] * e[:, :, None] * e[:, None, :]
+
+
+def _sizes(e: np.ndarray, smoothing: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """|e|, max(|e|, s) and min(|e| / s, 1), each (k,); the second is 1 m where both are 0."""
     length = np.linalg.norm(e, axis=1)
-    return length, e / np.where(length > 0.0, length, 1.0)[:, None]
+    larger = np.maximum(length, smoothing)
+    larger = np.where(larger > 0.0, larger, 1.0)
+    return length, larger, np.where(length < smoothing, length / larger, 1.0)
 
 
 class LengthForm:
@@ -189,6 +215,7 @@ class LengthForm:
         rows = table.rows[table.elements[name]]
         self.nodes, self._table, self._elements = np.unique(rows.indices), table, table.elements[name]
         self._rows, self._offset = rows[:, self.nodes], table.offset[self._elements]
+        self._smoothing = table.smoothing[self._elements]
 
     def set_amplitudes(self, amplitudes: np.ndarray) -> None:
         """Move the ends on obstacles to where they are at the time of the amplitudes."""
@@ -196,5 +223,5 @@ class LengthForm:
 
     def value_and_gradient(self, x: np.ndarray) -> tuple[float, np.ndarray]:
         """-l [m], and its gradient (k,3) at the nodes. x: (n_nodes,3) [m] of the scene."""
-        length, d = _length_and_direction(self._rows @ x[self.nodes] + self._offset)
+        length, d = length_and_gradient(self._rows @ x[self.nodes] + self._offset, self._smoothing)
         return -float(length.sum()), -(self._rows.T @ d)

@@ -11,7 +11,7 @@ from taisoft.backend.arrays import Count, FieldArena, download, upload
 from taisoft.fem.dependents import DependentTable, dependent_table
 from taisoft.fem.loads import scalar_loads, tendon_slots
 from taisoft.fem.node_graph import NodeGraph
-from taisoft.fem.spring_table import LENGTH, MULTIPLIER, PLAIN, TENSION, MovingEnds, SpringTable
+from taisoft.fem.spring_table import LENGTH, MULTIPLIER, PLAIN, SMOOTHED, TENSION, MovingEnds, SpringTable
 from taisoft.scene.body import Body
 from taisoft.scene.connection_records import Attachment, Point, Tendon
 from taisoft.scene.connections import coincide, locate_nodes, start_of
@@ -36,7 +36,7 @@ class Springs:
     offset: Any  # (n) 3-vectors f64
     moving: Any  # (n) i32: first of the three amplitudes that are the offset, -1 if it does not move; or None
     rate_after: Count  # amplitudes from an offset that moves to its rate
-    numbers: Any  # (n, 3) f64: k, L, c_d
+    numbers: Any  # (n, 4) f64: k, L, c_d, s
     kind: Any  # (n) i32
     slot: Any  # (n) i32
     node_start: Any  # (n_nodes + 1) i32: first of each node in node_entry
@@ -155,21 +155,28 @@ class _Builder:
             nodes.append(distinct[total != 0.0])
             weights.append(total[total != 0.0])
         line, kind, slot, stiffness, length, damping = (np.array(column) for column in zip(*self._numbers))
+        offset = np.array([p - q for _, _, (p, _), (q, _) in self._entries])
         return SpringTable(
             n_nodes=sum(body.n_nodes for body in self.scene.bodies),
             start=np.cumsum([0, *map(len, nodes)]),
             node=np.concatenate(nodes),
             weight=np.concatenate(weights),
-            offset=np.array([p - q for _, _, (p, _), (q, _) in self._entries]),
+            offset=offset,
             line=line,
             kind=kind,
             stiffness=stiffness,
             rest_length=length,
             damping=damping,
+            smoothing=SMOOTHED * np.where(kind == PLAIN, length, self._lengths(offset)),
             slot=slot,
             elements=self.elements,
             moving=self._moving(bool(damping.any())),
         )
+
+    def _lengths(self, offset: np.ndarray) -> np.ndarray:
+        """|e| (e,) [m] of all elements at the start."""
+        x = np.concatenate([body.rest_positions + body.position for body in self.scene.bodies])
+        return np.array([np.linalg.norm(c @ x[own] + g) for (own, c, *_), g in zip(self._entries, offset)])
 
     def _moving(self, damped: bool) -> MovingEnds | None:
         ends = [(sign, n, *end) for n, (_, _, *both) in enumerate(self._entries) for sign, end in zip((1.0, -1.0), both)]
@@ -204,7 +211,7 @@ def build_springs(table: SpringTable, arena: FieldArena, assembled: bool) -> Spr
     """Copy a scene's elements to the device. assembled: there will be a stiffness matrix, see `set_pair_entries`."""
     by_node, coupled, n = np.argsort(table.node, kind="stable"), table.coupled, len(table.offset)
     counts = np.diff(coupled, axis=1).reshape(-1)[table.element]  # of the entries that each entry is coupled with
-    numbers = np.stack([table.stiffness, table.rest_length, table.damping], axis=1)
+    numbers = np.stack([table.stiffness, table.rest_length, table.damping, table.smoothing], axis=1)
     n_lines, moving, n_moving = len(table.line_start) - 1, np.full(n, -1), 0
     if table.moving is not None:
         n_moving = len(table.moving.element)
@@ -221,7 +228,7 @@ def build_springs(table: SpringTable, arena: FieldArena, assembled: bool) -> Spr
         offset=arena.vectors("spring_offset", ti.f64, n, table.offset),
         moving=_ids(arena, "spring_moving", moving) if n_moving else None,
         rate_after=3 * n_moving,
-        numbers=arena.field("spring_numbers", ti.f64, (n, 3), numbers),
+        numbers=arena.field("spring_numbers", ti.f64, (n, 4), numbers),
         kind=_ids(arena, "spring_kind", table.kind),
         slot=_ids(arena, "spring_slot", table.slot),
         node_start=_ids(arena, "spring_node_start", np.cumsum([0, *np.bincount(table.node, minlength=table.n_nodes)])),

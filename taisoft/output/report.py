@@ -160,7 +160,8 @@ class Progress:
         self.seconds, self.label = seconds, label
         self.stream = sys.stderr if stream is None else stream
         self._started: float | None = None  # wall time of the first frame; construction and compilation come before
-        self._first_time = self._last_line = self._compiled = 0.0
+        self._first_time = self._last_line = self._compiled = self._time = 0.0
+        self._text = "starting"
         self._first_step = 0
         self._bar = _bar(seconds, label, self.stream) if self.stream.isatty() else None
 
@@ -170,12 +171,19 @@ class Progress:
         if self._started is None:
             self._started, self._first_time, self._first_step = now, sim.time, sim.step_count
             self._last_line, self._compiled = now, sim.compile_seconds
-        text = self._speed(sim, now - self._started - (sim.compile_seconds - self._compiled))
+        self._time, self._text = sim.time, self._speed(sim, now - self._started - (sim.compile_seconds - self._compiled))
+        self._show(self._text, now)
+
+    def iteration(self, n: int) -> None:
+        """Show how many Newton iterations a long step has taken so far, as `Simulator.run` calls it."""
+        self._show(f"{self._text}, a step with {n} Newton iterations so far", time.perf_counter())
+
+    def _show(self, text: str, now: float) -> None:
         if self._bar is not None:
-            self._bar.update(self._bar.task_ids[0], completed=min(sim.time, self.seconds), note=text)
+            self._bar.update(self._bar.task_ids[0], completed=min(self._time, self.seconds), note=text)
         elif now - self._last_line >= LINE_EVERY:
             self._last_line = now
-            print(f"{self.label}: {sim.time:.3f} of {self.seconds:g} s, {text}", file=self.stream, flush=True)
+            print(f"{self.label}: {self._time:.3f} of {self.seconds:g} s, {text}", file=self.stream, flush=True)
 
     def close(self) -> None:
         """Stop the bar; a second call does nothing."""

@@ -78,8 +78,10 @@ def test_a_step_that_does_not_converge_is_reported(d, monkeypatch):
     set_state(d, v=3.0 * random_velocities(d))
     report = d.advance(1)
     assert not report.converged and report.newton_iterations == 2 * (1 + 2 + 4 + 1) and report.residual > 1e-9
-    message = f"Newton stopped after 16 iterations at a relative residual of {report.residual:.2e}"
-    assert [problem.removeprefix("step 1: ") for problem in report.problems] == [message]
+    message = (
+        f"step 1: Newton stopped after 16 iterations at a relative residual of {report.residual:.2e}; least balanced is node "
+    )
+    assert len(report.problems) == 1 and report.problems[0].startswith(message)
 
 
 @pytest.mark.parametrize("kind", ["inside out", "flat", "random"])

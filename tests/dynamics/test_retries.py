@@ -20,6 +20,7 @@ import pytest
 import taisoft as ts
 from taisoft.dynamics import implicit
 from taisoft.dynamics.contact import ContactStep
+from taisoft.dynamics.newton_budget import NewtonBudget
 from taisoft.dynamics.results import StageResult
 from taisoft.dynamics.substepping import LengthLimit, Substepping
 from taisoft.errors import SimulationError
@@ -94,6 +95,19 @@ def test_a_step_that_does_not_converge_is_cut_into_substeps(sim, monkeypatch):
         return replace(results[-1], **bad)
 
     check_retry(sim, lambda: monkeypatch.setattr(implicit, "solve", first_unconverged))
+
+
+@pytest.mark.parametrize("limit", [3, 6])
+def test_a_step_ends_at_its_bound_of_iterations(sim, monkeypatch, limit):
+    """No tet inverts, what is prescribed moves on, and the report names a node and what acts there."""
+    (body,), sim.dt = sim.scene.bodies, DT / 2
+    monkeypatch.setattr(NewtonBudget, "limit", limit)
+    sim.set_state(velocities=30.0 * np.random.default_rng(0).standard_normal(sim.positions().shape))
+    report, moved = sim.step(), body.constraints[-1]
+    assert not report.converged and 0 < report.newton_iterations <= limit and report.n_inverted == 0 and sim.time == sim.dt
+    displacement = (sim.positions() - body.rest_positions - body.position)[moved.nodes]
+    assert np.abs(displacement - moved.path(sim.dt)).max() < 1e-12
+    assert "least balanced is node " in report.problems[0] and f" of body '{body.name}', between " in report.problems[0]
 
 
 def patch_end(patch, events: dict, measure: str = "relative_penetration") -> list:
@@ -288,6 +302,19 @@ def test_the_number_of_undone_substeps_is_bounded(stepper):
     stepper.depth = lambda time, dt: 1.0 + time  # always deeper
     lengths, _ = take(stepper)
     assert 0 < len(stepper.taken) - len(lengths) <= 20 and stepper.relative_penetration > 1.0
+
+
+@pytest.mark.parametrize(
+    "fault, lengths", [("left_path", [STEP]), ("depth", [STEP / 2, STEP / 2]), ("passes", [STEP / 2, STEP / 2])]
+)
+def test_the_rest_of_a_step_without_iterations_is_held_back(stepper, fault, lengths):
+    """A substep that was too fast to be kept is part of the rest; one with other faults is the last, not halved again."""
+    setattr(stepper, fault, longer_than(STEP / 4))
+    stepper.is_spent, stepper.converges = lambda: len(stepper.taken) > (fault != "left_path"), lambda time, dt: False
+    stepper.hold_substep = lambda time, dt: stepper.set_state(time + dt, (time, dt)) or StageResult(0, 0, 0.0, False, False)
+    substepping = Substepping(stepper)
+    assert take(stepper, substepping)[0] == pytest.approx(lengths)
+    assert len(stepper.taken) == len(lengths) and not substepping.may_retry
 
 
 @pytest.mark.parametrize("attempts, faults", [(2, ["left_path", "has_new_contacts"]), (4, ["passes"])])

@@ -84,18 +84,38 @@ def test_assembled_rows_are_the_derivatives_of_the_forces(rig):
     assert (pushed <= np.repeat(rig.springs.rows[0] != 0, 3)).all() and pushed.any()  # the spring that pushes
 
 
-def test_an_element_without_length_does_not_pull_unless_its_rest_length_is_0():
-    scene = ts.Scene()
+@pytest.mark.parametrize("part", [0.0, 0.003, 0.0099, 0.0101])
+def test_short_elements_have_smooth_forces(part):
+    """part: of its length at rest that each has. Forces and stiffness are differences of energy and forces; none at length 0."""
+    scene, step = ts.Scene(), 1e-6
     scene.add_body(cube(), rubber(), name="a")
-    for k, numbers in enumerate(({"rest_length": 0.5, "damping": 3.0}, {"rest_length": 0.0})):
-        scene.add_spring(("a", 2 * k), ("a", 2 * k + 1), 100.0, **numbers)
+    scene.add_spring(("a", 0), ("a", 1), 100.0, rest_length=1.0)
+    scene.add_spring(("a", 6), ("a", 7), 50.0, rest_length=0.0)
+    scene.add_tendon([("a", 2), ("a", 3)], 40.0)
+    scene.add_tendon([("a", 4), ("a", 5), ("a", 7)], length=0.2, stiffness=30.0)
     with built(add_companion(scene, varied=False), "f64") as rig:
-        x = rig.oracle.rest.copy()
-        x[1:8:2] = x[0:8:2]
+        x, zero, table = rig.oracle.rest.copy(), np.zeros_like(rig.oracle.rest), spring_table(scene)
+        x[1:8:2] = x[0:8:2] + part * (x[1:8:2] - x[0:8:2])
         rig.out, rig.matrix = rig.vectors("spring_forces"), block_csr.build_block_csr(rig.model, rig.arena)
-        assert not kernel_forces(rig, x, np.zeros_like(x)).any()
-        found = added(rig, x, 1.0, projected=True)
-        assert np.isfinite(found).all() and found[6, 6] == pytest.approx(100.0)
+        amplitudes, rng = SceneLoads(scene, table).amplitudes([0.0])[0], np.random.default_rng(0)
+
+        def energy(x):
+            rig.model.state.x.from_numpy(x)
+            measure(rig.model)
+            return rig.model.state.scalars[ELASTIC] + rig.model.state.scalars[LOADS] - rig.oracle.energy(x)
+
+        force = kernel_forces(rig, x, zero)
+        assert part > 0.0 or not force[:4].any()
+        on_nodes = np.zeros_like(force)
+        np.add.at(on_nodes, table.node, table.weight[:, None] * table.pulls(x, zero, amplitudes)[table.element])
+        assert np.abs(on_nodes - force).max() < 1e-12 * np.abs(force).max()
+        y, matrix = rng.standard_normal(x.shape), added(rig, x, 1.0)
+        assert (energy(x - step * y) - energy(x + step * y)) / (2 * step) == pytest.approx((force * y).sum(), rel=1e-5, abs=1e-3)
+        change = (kernel_forces(rig, x - step * y, zero) - kernel_forces(rig, x + step * y, zero)).reshape(-1) / (2 * step)
+        assert np.abs(matrix @ y.reshape(-1) - change).max() < 1e-3 * np.abs(change).max()
+        rows = np.kron(table.rows.toarray(), np.eye(3))
+        own = rows.T @ table.stiffness_matrix(table.vectors(x, amplitudes), amplitudes) @ rows
+        assert np.abs((own - matrix)[:24, :24]).max() < 1e-12 * np.abs(matrix).max()  # the companion is damped
 
 
 @pytest.mark.parametrize("stiffness, tension, order", [(1.0, 1.0, 1), (3e5, 1.0, 1), (1.0, 1e6, 1), (3e4, 1.0, 2)])

@@ -82,7 +82,7 @@ def test_the_step_table_holds_every_field_of_every_step(written):
     [(False, 0.0, "10 steps/s, 0:34 left"), (False, 3.0, "20 steps/s, 0:17 left"), (True, 0.0, "10 steps/s, 0:30 left")],
 )
 def test_progress(terminal, compiling, shown, monkeypatch):
-    """Frames at 0, 2, ..., 10 s, each of 20 steps and 0.5 s simulated; a line at the first one after 5 s."""
+    """Frames at 0, 2, ..., 10 s, each of 20 steps and 0.5 s simulated, then a long step; a line at the first one after 5 s."""
     times = iter(range(0, 1000, 2))
     monkeypatch.setattr(report.time, "perf_counter", lambda: float(next(times)))
     sim, stream = FakeSimulator(beam_scene()), io.StringIO()
@@ -91,11 +91,14 @@ def test_progress(terminal, compiling, shown, monkeypatch):
     for index in range(6):
         bar.frame(sim, index)
         sim.time, sim.step_count, sim.compile_seconds = sim.time + 0.5, sim.step_count + 20, compiling
+    bar.iteration(34)
     bar.close()
     bar.close()
     text = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", stream.getvalue())
     assert (
-        all(part in text for part in (*shown.split(", "), "2.50 of 10 s"))
+        all(part in text for part in (*shown.split(", "), "2.50 of 10 s", "34 Newton iterations"))
         if terminal
-        else text == f"beam: 1.500 of 10 s, {shown}\n"
+        else re.fullmatch(
+            rf"beam: 1.500 of 10 s, {shown}\nbeam: 2.500 of 10 s, .* left, a step with 34 Newton iterations so far\n", text
+        )
     )

@@ -15,6 +15,7 @@ import pytest
 import taisoft as ts
 from taisoft.checkpoint import read_checkpoint
 from taisoft.dynamics.contact import ContactStep
+from taisoft.dynamics.newton_budget import NewtonBudget
 from tests.collision.detection_scenes import folded
 from tests.collision.rotations import rotation
 
@@ -54,12 +55,18 @@ def judged(sim: ts.Simulator, steps: int, self_collision: bool = False) -> list:
     return reports
 
 
-@pytest.mark.parametrize("dt, seconds", [(1 / 30, 0.3), long(1 / 240, 0.15)])
+@pytest.mark.parametrize("dt, seconds, limit", [(1 / 30, 0.3, None), (1 / 30, 0.3, 6), long(1 / 240, 0.15, None)])
 @pytest.mark.parametrize("integrator", ["implicit_euler", long("bdf2"), long("linearly_implicit_euler")])
-def test_boxes_at_an_angle(integrator, dt, seconds):
+def test_boxes_at_an_angle(integrator, dt, seconds, limit, monkeypatch):
+    """limit: of the Newton iterations in a step, too small for impacts."""
+    monkeypatch.setattr(NewtonBudget, "limit", limit or NewtonBudget.limit)
     with ts.Simulator(boxes(), dt=dt, integrator=integrator) as sim:
         reports = judged(sim, round(seconds / dt))
-        assert max(r.n_contacts for r in reports) > 3 and sim.velocities("box 1")[:, 1].mean() > -1.0
+        assert max(r.n_contacts for r in reports) > 3 and all(r.newton_iterations <= NewtonBudget.limit for r in reports)
+        if limit:
+            assert not all(r.converged for r in reports) and max(r.n_inverted for r in reports) == 0
+        else:
+            assert sim.velocities("box 1")[:, 1].mean() > -1.0
 
 
 def test_fast_explicit_substeps():

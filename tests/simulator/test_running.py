@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import taisoft as ts
+from taisoft.dynamics.newton_budget import NewtonBudget
 from taisoft.dynamics.stage_system import StageSystem
 from taisoft.frames import dt_sentence, first_frame
 from taisoft.records import Energies, StepReport
@@ -181,6 +182,24 @@ def test_stop_and_ctrl_c_interrupt_a_run(explicit):
     with pytest.raises(KeyboardInterrupt):
         run(sim, 1.0, fps=None)
     assert sim.step_count == 7
+
+
+def test_a_long_step_shows_that_it_lives_and_can_be_stopped(monkeypatch):
+    """An iteration takes 0.4 s: looks begin after 1 s. A step that is stopped does not count."""
+    sim, now, seen = StandIn(False), [0.0], []
+    monkeypatch.setattr("time.monotonic", lambda: now[0])
+
+    def advance(n):
+        budget = NewtonBudget()
+        for _ in range(5):
+            now[0] += 0.4
+            budget.spend()
+        return StandIn.advance(sim, n)
+
+    sim.advance = advance
+    stop = lambda: sim.step_count == 2 and now[0] > 5.0  # noqa: E731
+    result = run(sim, 1.0, fps=None, stop=stop, on_iteration=seen.append)
+    assert seen == [3, 4, 5] * 2 and (result.interrupted, result.steps, len(result.step_reports)) == (True, 2, 2)
 
 
 @BOTH

@@ -3,9 +3,10 @@
 `fem.spring_table` defines the elements and their lines. Before forces are gathered, `prepare` computes for each line its
 elements' directions and pulls from x and v; given tensions, which Newton's method may change without moving nodes, act when
 forces are gathered. Blocks of the stiffness are
-    c_i c_j (k d d'^T + [same element] t (I - d d^T)),   d = e / |e|,   t = T / |e|,
-d' of any element of the line, or k I for an element of rest length 0. At |e| = 0 the direction of an element that has a rest
-length is undefined: it does not pull there.
+    c_i c_j (k d d'^T + [same element] T H),   H = q / m I - d d^T / (|e| q^2),
+    m = max(|e|, s),   q = 2 - min(1, |e| / s),   d = q e / m,
+d' of any element of the line, or k I for an element of rest length 0. d and H are the derivatives of the smoothed length; from
+|e| = s on, they are e / |e| and (I - d d^T) / |e|. At |e| = 0 an element that has a rest length does not pull.
 """
 
 import taichi as ti
@@ -63,11 +64,27 @@ def _is_isotropic(m: ti.template(), s):
 
 
 @ti.func
+def _shape(m: ti.template(), s, length):
+    """q of element s with |e| = length."""
+    return 2.0 - ti.min(1.0, length / ti.max(m.springs.numbers[s, 3], TINY))
+
+
+@ti.func
+def _smoothed(m: ti.template(), s, length):
+    """Smoothed length [m] of element s with |e| = length."""
+    smoothing, smoothed = m.springs.numbers[s, 3], length
+    if length < smoothing:
+        ratio = length / smoothing
+        smoothed = smoothing * (1.0 + ratio * ratio * (3.0 - ratio)) / 3.0
+    return smoothed
+
+
+@ti.func
 def _length(m: ti.template(), line):
     """l of a line [m]."""
     total = ti.cast(0.0, ti.f64)
     for s in range(m.springs.line_start[line], m.springs.line_start[line + 1]):
-        total += _vector(m, s).norm()
+        total += _smoothed(m, s, _vector(m, s).norm())
     return total
 
 
@@ -80,7 +97,7 @@ def prepare(m: ti.template(), line):
     for s in range(first, m.springs.line_start[line + 1]):
         e = _vector(m, s)
         length = e.norm()
-        d = e / ti.max(length, TINY)
+        d = _shape(m, s, length) * e / ti.max(length, m.springs.numbers[s, 3], TINY)
         pull = elastic * d
         if _is_isotropic(m, s):
             pull = m.springs.numbers[s, 0] * e
@@ -139,28 +156,31 @@ def add_stiffness(m: ti.template(), A: ti.template(), i, beta, projected):
         k = m.springs.node_entry[q]
         s = m.springs.element[k]
         d, length, elastic = m.springs.direction[s], m.springs.length[s], m.springs.elastic[m.springs.line[s]]
-        along, t = m.springs.numbers[s, 0], (elastic + _given_tension(m, s)) / ti.max(length, TINY)
+        along, t = m.springs.numbers[s, 0], elastic + _given_tension(m, s)
         if m.springs.kind[s] == LENGTH and elastic == 0.0:
             along = 0.0
-        if _is_isotropic(m, s) or length <= TINY:
-            t = along
-        elif projected != 0:
+        if projected != 0:
             t = ti.max(t, 0.0)
-        across, along = beta * beta * t, beta * beta * along
+        shape = _shape(m, s, length)
+        across, outer = t * shape / ti.max(length, m.springs.numbers[s, 3], TINY), t / (ti.max(length, TINY) * shape * shape)
+        if _is_isotropic(m, s):
+            across, outer = along, along
+        across, outer, along = beta * beta * across, beta * beta * outer, beta * beta * along
         if ti.static(m.spring_damping):
             along += beta * m.springs.numbers[s, 2]
             if _is_isotropic(m, s):
                 across += beta * m.springs.numbers[s, 2]
+                outer += beta * m.springs.numbers[s, 2]
         first = m.springs.coupled[s, 0]
         for other in range(first, m.springs.coupled[s, 1]):
             at = m.springs.pair_at[m.springs.pair_start[k] + other - first]
             scale = m.springs.weight[k] * m.springs.weight[other]
             with_self = 1.0 if m.springs.element[other] == s else 0.0
-            across_other = with_self * across
+            across_other, outer_other = with_self * across, with_self * outer
             along_other = m.springs.direction[m.springs.element[other]]
             for r in ti.static(range(3)):
                 for c in ti.static(range(3)):
-                    block = along * d[r] * along_other[c] - across_other * d[r] * d[c]
+                    block = along * d[r] * along_other[c] - outer_other * d[r] * d[c]
                     if ti.static(r == c):
                         block += across_other
                     add_entry(m, A, i, at, 4 * c + r, scale * block)
