@@ -166,6 +166,11 @@ def run_steps(
     return report
 
 
+def _mark_interrupted(report: RunReport) -> None:
+    report.interrupted = True
+    report.problems.append("the run was interrupted before its end")
+
+
 def _advance_to(
     sim: "Simulator",
     end: int,
@@ -183,8 +188,7 @@ def _advance_to(
     merged = None
     while sim.step_count < end:
         if stop is not None and stop():
-            report.interrupted = True
-            report.problems.append("the run was interrupted before its end")
+            _mark_interrupted(report)
             break
         energy.before_step()
         until = end if estimator is None else estimator.next_comparison(end)
