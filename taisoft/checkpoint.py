@@ -124,9 +124,13 @@ def restore_numbers(saved: Checkpoint, scene: Scene) -> None:
                 continue
             materials = [Material(**material) for material in kept["materials"]]
             by_region = dict(zip(body.composition.materials, materials, strict=True))
+            dilatation = body.dilatation  # decided at the start
             body.material = by_region if body.composition.has_regions else materials[0]
             for name, values in kept["by_tet"].items():
                 setattr(body, name, values)
+            if body.dilatation != dilatation:
+                body.dilatation = dilatation
+                body.warn_locking(stacklevel=2)
         scene.contact_pairs = {frozenset(names): (a, b) for names, a, b in saved.numbers["pairs"]}
         for k, body in enumerate(scene.bodies):
             for kind, name in LOADS.items():
