@@ -200,9 +200,9 @@ def impulse_on_node(k: ti.template(), i):
 def sum_residual(k: ti.template(), t, threads: ti.template()):
     """Compute the residual of the laws over all contacts, by all threads t of a block.
 
-    It is relative to all impulses, and those of roundings over the tolerance, so that a light contact beside heavy ones could let its gap close. The largest part of its
+    It is relative to all impulses, so that a light contact beside heavy ones could let its gap close. The largest part of its
     target, or of the contact offset if that is less, by which a gap ends short is therefore a residual, too: MAX_MISSED
-    corresponds to the tolerance.
+    corresponds to the tolerance. Impulses that only the rounding of positions causes, as between bodies at rest, are within it.
     """
     p, w = ti.static((k.problem, k.work))
     sums, worst = ti.Vector([0.0, 0.0], ti.f64), ti.cast(0.0, ti.f64)

@@ -22,7 +22,7 @@ from taisoft.scene.loads import Cavity, NodalForce, Pressure, Traction, value_or
 from taisoft.scene.material import Material
 from taisoft.scene.skins import Skin, embed
 
-# Poisson's ratio from which linear tets lock: in the sag of a beam four cells high they err by 8 % instead of 5 %, at 0.499 by 16 %
+# Poisson's ratio from which linear tets lock: four cells high, a beam's sag is 8 % too small instead of 5 %, at 0.499 16 %
 NEARLY_INCOMPRESSIBLE = 0.45
 # of each tet's quadrature points, or averaged over patches of tets, or a quadratic tet; "auto": decided from order and numbers
 DILATATIONS = ("auto", "local", "mean")
@@ -68,9 +68,10 @@ class Body(Guarded):
     [m]; nodes start at rest_positions + position. velocity: (3,) or (n,3) [m/s], initial. order: 1 or 2, of the elements'
     shape functions; quadrature_degree: degree of polynomials integrated exactly. dilatation: "local" or "mean", decided by
     `decided_dilatation` when the body is made and when its material or a number of it is set, but not during a run;
-    given_dilatation: one of DILATATIONS. nodes: `Nodes`, the mesh's vertices, for order 2 its mid-edge nodes, and the vertices of a skin that is touched; methods choose among
-    those of tets only. skin: `Skin` or None, see `embed`. constraints, tractions, forces, pressures, cavities: lists
-    of `Constraint`, `Traction`, `NodalForce`, `Pressure`, `Cavity`; items can be removed, but only methods add them.
+    given_dilatation: one of DILATATIONS. nodes: `Nodes`, the mesh's vertices, for order 2 its mid-edge nodes, and the vertices
+    of a skin that is touched; methods choose among those of tets only. skin: `Skin` or None, see `embed`. constraints,
+    tractions, forces, pressures, cavities: lists of `Constraint`, `Traction`, `NodalForce`, `Pressure`, `Cavity`; items can be
+    removed, but only methods add them.
     collision: one of CONTACT_MODES. Only material, its numbers, position, velocity and collision can be assigned; each is
     validated. `warn_locking` and `warn_bending` warn if tets of order 1 are far too stiff; `Scene.add_body` calls both.
     """
@@ -200,7 +201,7 @@ class Body(Guarded):
 
     @property
     def decided_dilatation(self) -> str:
-        """What is given, if that is not "auto"; then "mean" for linear tets of which some has a Poisson's ratio of at least 0.45."""
+        """What is given; if that is "auto", "mean" for linear tets some of which have a Poisson's ratio of at least 0.45."""
         if self.given_dilatation != "auto":
             return self.given_dilatation
         return "mean" if self.order == 1 and np.max(self.poisson) >= NEARLY_INCOMPRESSIBLE else "local"
@@ -225,7 +226,7 @@ class Body(Guarded):
         return f"Body({self.name!r}, {self.n_nodes} nodes, {kind}, {' and '.join(self.composition.laws)})"
 
     def warn_locking(self, stacklevel: int) -> None:
-        """Warn if linear tets lock, or if the numbers have come to ask for another dilatation. stacklevel: 1 is the caller's line."""
+        """Warn if linear tets lock, or if changed numbers ask for another dilatation. stacklevel: 1 is the caller's line."""
         poisson, kept = float(np.max(self.poisson)), self.dilatation != self.decided_dilatation
         if self.order == 1 and self.dilatation == "local" and poisson >= NEARLY_INCOMPRESSIBLE:
             rule = f"is at least {NEARLY_INCOMPRESSIBLE}, where linear tets lock and bend too little"
