@@ -143,7 +143,7 @@ def _prepare(case: Case, element: Element, row: Row, runs: list[tuple], runtime:
     """Build, solve once, record the results and append to `runs`."""
     compiled = compile_clock()
     try:
-        with without_warnings():  # order 1 locks for nu near 1/2, which is measured here
+        with without_warnings():  # order 1 bends too little on coarse meshes, which is measured here
             scene = case.build(row.cells, element)
         row.tets, row.nodes = scene.bodies[0].mesh.n_tets, len(scene.bodies[0].rest_positions)
         run = (Statics if case.dt is None else Fall)(case, scene, runtime)

@@ -33,7 +33,7 @@ from taisoft.settings import NAMES, plan_of
 if TYPE_CHECKING:
     from taisoft.simulator import Simulator
 
-KIND, FORMAT = "taisoft checkpoint", 15  # increment FORMAT with every change of a file's content
+KIND, FORMAT = "taisoft checkpoint", 16  # increment FORMAT with every change of a file's content
 PARTS = ("settings", "numbers", "start", "fingerprint", "state", "notes")  # of the header, each a table
 
 
@@ -125,9 +125,13 @@ def restore_numbers(saved: Checkpoint, scene: Scene) -> None:
                 continue
             materials = [Material(**material) for material in kept["materials"]]
             by_region = dict(zip(body.composition.materials, materials, strict=True))
+            dilatation = body.dilatation  # decided at the start
             body.material = by_region if body.composition.has_regions else materials[0]
             for name, values in kept["by_tet"].items():
                 setattr(body, name, values)
+            if body.dilatation != dilatation:
+                body.dilatation = dilatation
+                body.warn_locking(stacklevel=2)
         scene.contact_pairs = {frozenset(names): (a, b) for names, a, b in saved.numbers["pairs"]}
         for k, body in enumerate(scene.bodies):
             for kind, name in LOADS.items():

@@ -3,8 +3,10 @@
 The target is the smallest gap that a contact may have at the end of a step. It is at most the contact offset, a distance that
 keeps surfaces apart despite the error of linearising the motion. A gap above the offset may close to it. A gap below it opens
 slowly, but in implicit steps at once to LEAST_GAP of it; a true penetration opens within a few steps. Neither is faster than
-strains the softest body by one percent: bodies would fly apart otherwise. Contacts of a body with itself have SELF_CONTACT times
-the contact offset and are corrected SELF_CONTACT times as fast. Where the surfaces meet within the step, restitution raises the
+strains the softest body by one percent: bodies would fly apart otherwise. What touches without a load stays where it is: let w be
+the velocity at which sides approach plus that at which the pair's last impulses moved its contacts. While w dt is below STILL of
+the offset, gaps above minus the offset open no faster than PRESSED w. Contacts of a body with itself have SELF_CONTACT times the
+contact offset and are corrected SELF_CONTACT times as fast. Where the surfaces meet within the step, restitution raises the
 target (`restitution`). Sides that turn in an implicit step are apart: they open at once, however negative their gap is. The
 impulse must satisfy
     u_n = (gap - target)/dt + n.(v_a - v_b) >= 0,
@@ -29,6 +31,8 @@ VANISHING = 1e-9  # a contact with smaller weights alone is rounding: its sides 
 # shorter explicit steps that would be a hop.
 LEAST_GAP = 0.1
 STILL = 0.002  # of the contact offset: surfaces that approach less in a step are at rest
+# Below 1, since a gap that opens causes impulses, too: without a load they must fall from step to step, also in a row of bodies
+PRESSED = 0.1
 SELF_CONTACT = 5.0  # factor of contact offset and correction rate in contacts of a body with itself: folds turn as they meet
 
 
@@ -150,17 +154,51 @@ def _slot(p: ti.template(), feature):
     return ti.cast((h ^ (h >> 17)) & (p.n_slots - 1), ti.i32)
 
 
+@ti.func
+def _pair_slot(p: ti.template(), body):
+    """Slot of a pair of colliders among those of the previous step, or the empty one where it belongs."""
+    k, found = _slot(p, ti.Vector([body[0], body[1], 0], ti.i32)), 0
+    while found == 0 and p.pair_slot[k] >= 0:
+        if (p.previous_body[p.pair_slot[k]] == body).all():
+            found = 1
+        else:
+            k = (k + 1) & (p.n_slots - 1)
+    return k
+
+
+@ti.func
+def _count_load(p: ti.template(), c, common_offset):
+    """Add contact c to the sums of its pair, if it carries an impulse or could be opened."""
+    if p.r[c][0] > 0.0 or p.gap[c] < contact_offset_of(p, c, common_offset):
+        k = _pair_slot(p, p.body[c])
+        if p.pair_slot[k] < 0:
+            p.pair_slot[k] = c
+        first = p.pair_slot[k]
+        p.pair_sum[first] = p.pair_sum[first] + ti.Vector([p.r[c][0], p.factor[c][0]], ti.f64)
+
+
+@ti.func
+def _load(p: ti.template(), c):
+    """Velocity that the impulses of the pair of contact c gave its contacts in the previous step [m/s]."""
+    first, load = p.pair_slot[_pair_slot(p, p.body[c])], ti.cast(0.0, ti.f64)
+    if first >= 0:
+        if p.pair_sum[first][1] > 0.0:
+            load = p.pair_sum[first][0] / p.pair_sum[first][1]
+    return load
+
+
 @kernel
-def keep_impulses(p: ti.template()):
-    """Store the present contacts as those of the previous step."""
+def keep_impulses(p: ti.template(), common_offset: ti.f64):
+    """Store the present contacts as those of the previous step. common_offset: contact offset between different bodies [m]."""
     ti.loop_config(serialize=p.serial)
     for c in range(p.count[0]):
-        p.previous_feature[c] = p.feature[c]
+        p.previous_feature[c], p.previous_body[c] = p.feature[c], p.body[c]
+        p.pair_sum[c] = ti.Vector([0.0, 0.0], ti.f64)
         p.previous_point[c] = p.point[c]
         p.previous_impulse[c] = to_world(p, c, p.r[c])
     ti.loop_config(serialize=p.serial)
     for k in range(p.n_slots):
-        p.slot[k] = -1
+        p.slot[k] = p.pair_slot[k] = -1
     ti.loop_config(serialize=True)
     for _ in range(1):
         for c in range(p.count[0]):
@@ -168,6 +206,7 @@ def keep_impulses(p: ti.template()):
             while p.slot[k] >= 0:
                 k = (k + 1) & (p.n_slots - 1)
             p.slot[k] = c
+            _count_load(p, c, common_offset)
 
 
 @ti.func
@@ -262,7 +301,7 @@ def fill(
         if ti.static(o.any):
             if found.nodes_b[row][0] < 0:
                 p.obstacle_displacement[c] = obstacle_displacement_at(o, p.body[c][1], point - 0.5 * gap * normal)
-        p.approach[c] = normal.dot(relative_velocity(p, m, c, dt))
+        p.approach[c], p.load[c] = normal.dot(relative_velocity(p, m, c, dt)), warm * _load(p, c)
         p.min_opening[c], p.impact_impulse[c] = 0.0, dvec(0.0)
         p.r[c] = prox(to_frame(p, c, warm * _warm_impulse(p, c)), p.friction[c])
 
@@ -296,6 +335,9 @@ def gap_minus_target(
         opening = own * (offset_fraction * (contact_offset - above) + penetration_fraction * (above - gap))
         if gap >= 0.0:
             opening = ti.max(opening, least_gap * contact_offset - gap)
+        pressed = dt * (p.load[c] + ti.max(-p.approach[c], 0.0))
+        if gap > -contact_offset and pressed < STILL * contact_offset:
+            opening = ti.min(opening, PRESSED * pressed)
         target = gap + ti.min(opening, max_speed * dt)
     if min_opening > 0.0:
         target = ti.max(target, gap + min_opening)

@@ -79,6 +79,7 @@ class ContactProblem:
     turned: Any = None  # i32: 1 if a negative gap is no penetration, but tells how far the sides turn in the step
     obstacle_displacement: Any = None  # 3-vectors: obstacle's displacement at the contact in the step [m]
     approach: Any = None  # f64: normal velocity at the start of the step, negative if surfaces approach [m/s]
+    load: Any = None  # f64: velocity that the pair's impulses of the previous step gave its contacts [m/s]
     restitution: Any = None  # f64
     min_velocity: Any = None  # f64: least normal velocity after the impact, set only in steps with one [m/s]
     min_opening: Any = None  # f64: least opening of the gap in the step, 0 without restitution [m]
@@ -88,6 +89,9 @@ class ContactProblem:
     previous_impulse: Any = None  # 3-vectors, world frame
     n_slots: Count = 0  # size of the hash table, a power of two
     slot: Any = None  # (n_slots) i32: hash table of the previous step's contacts, -1 if empty
+    pair_slot: Any = None  # (n_slots) i32: of its pairs of colliders, each by one of its contacts, -1 if empty
+    previous_body: Any = None  # 2-vectors i32: colliders
+    pair_sum: Any = None  # 2-vectors: sums of normal impulses [N s] and of r-factors [kg] over a pair's contacts
 
 
 def build_node_problem(arena: FieldArena, capacity: int, n_nodes: int, serial: bool, masters: int = 1) -> ContactProblem:
@@ -107,14 +111,15 @@ def build_node_problem(arena: FieldArena, capacity: int, n_nodes: int, serial: b
         **_fields(arena, "weight", ti.f64, (n, width)),
         **_fields(arena, "arity turned", ti.i32, n),
         **_fields(arena, vectors, ti.f64, n, 3),
-        **_fields(arena, "gap approach restitution min_velocity min_opening", ti.f64, n),
-        **_fields(arena, "body", ti.i32, n, 2),
+        **_fields(arena, "gap approach load restitution min_velocity min_opening", ti.f64, n),
+        **_fields(arena, "body previous_body", ti.i32, n, 2),
+        **_fields(arena, "pair_sum", ti.f64, n, 2),
         **_fields(arena, "feature previous_feature", ti.i32, n, 3),
         **_fields(arena, "inverse_mass w", ti.f64, n_nodes, 3),
         **_fields(arena, "entry_start", ti.i32, n_nodes + 1),
         **_fields(arena, "entry", ti.i32, width * n),
         **(_fields(arena, "scan", ti.i32, SCAN) if on_cuda() else {}),
-        **_fields(arena, "slot", ti.i32, n_slots),
+        **_fields(arena, "slot pair_slot", ti.i32, n_slots),
     )
 
 

@@ -220,7 +220,7 @@ class ContactStep:
         p = self.problem
         if m.has_dependents and n:
             n = drop_vanishing(p, m, d.surface, d.buffer.data, d.kept, n)
-        keep_impulses(p)
+        keep_impulses(p, self.contact_offset)
         warm = dt / self._last_time if self._last_time > 0.0 else 0.0
         fill(p, m, d.surface, d.shapes, self.numbers, d.buffer.data, d.kept, n, dt, warm)
         self._own_sides = d.sides(n) if m.has_dependents else None

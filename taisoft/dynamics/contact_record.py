@@ -116,4 +116,11 @@ def write_rows(p: ContactProblem, rows: dict[str, np.ndarray]) -> None:
 
 def _fields(p: ContactProblem) -> dict:
     parts = {"normal": p.normal, "tangent": p.tangent, "r": p.r, "node": p.node, "weight": p.weight, "arity": p.arity}
-    return parts | {"point": p.point, "gap": p.gap, "body": p.body, "feature": p.feature, "struck": p.impact_impulse}
+    return parts | {
+        "point": p.point,
+        "gap": p.gap,
+        "body": p.body,
+        "feature": p.feature,
+        "struck": p.impact_impulse,
+        "factor": p.factor,
+    }

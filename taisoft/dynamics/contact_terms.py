@@ -25,6 +25,7 @@ from taisoft.linear.coupling import NO_COUPLING, Coupling, build_coupling
 
 # largest part of its target that a contact's gap may miss at the end; smallest such target, over the contact offset
 MAX_MISSED, MIN_KEPT = 0.5, 1e-3
+ROUNDING = 4.0 * 2.0**-52  # of the largest coordinate: that of a gap, as of positions in f64
 PAST = 2  # multiplier updates that are stored
 
 
@@ -42,8 +43,9 @@ class ContactStageWork:
     rate: Any  # (capacity) 3-vectors f64: derivative of u along the step [m/s]
     kept: Any  # (capacity) 3-vectors f64: impulses at linearisation [N s]
     world_impulse: Any  # (capacity) 3-vectors f64: impulse in world axes [N s]
-    prox_residual: Any  # (capacity) 3-vectors f64: squared norms of the prox residual and of the impulse; residual of the gap
+    prox_residual: Any  # (capacity) 3-vectors f64: squared norms of the prox residual and of its scale; residual of the gap
     gap_weight: Any  # (capacity) f64: residual per length by which the gap misses its target [1/m]
+    rounding: Any  # (capacity) f64: velocity by which the rounding of positions moves a gap, over the tolerance [m/s]
     block: Any  # (capacity) 12-vectors: D in world axes; J^T D J consists of weights times this
     active: Any  # (capacity) i32: 1 if the block is not 0
 
@@ -93,6 +95,7 @@ def begin_contacts(
                 i = p.node[c, j]
                 offset += p.weight[c, j] * (k.x_start[i] - s.x_hat[i])
         w.tangential_offset[c] = offset
+        w.rounding[c] = ti.cast(ROUNDING, ti.f64) * ti.abs(p.point[c]).max() / (beta * tolerance)
         if ti.static(impact):
             w.gap_minus_target[c] = -beta * p.min_velocity[c] - (beta / dt) * p.normal[c].dot(p.obstacle_displacement[c])
             w.gap_weight[c] = 0.0
@@ -178,7 +181,8 @@ def update_contact(m: ti.template(), k: ti.template(), c, beta, r_scale):
     w.active[c] = int(Dn > 0.0 or D_along > 0.0 or D_across > 0.0)
     d = r - prox(r - scaled(p.factor[c], u), p.friction[c])
     missed = ti.select(p.factor[c][0] > 0.0, -u[0] * beta * w.gap_weight[c], 0.0)  # only a node that can move can open a gap
-    w.prox_residual[c] = dvec(d.dot(d), r.dot(r), missed)
+    within_rounding = p.factor[c][0] * w.rounding[c]  # an impulse that only this would change, as between bodies at rest
+    w.prox_residual[c] = dvec(d.dot(d), r.dot(r) + within_rounding * within_rounding, missed)
 
 
 @ti.func
@@ -198,7 +202,7 @@ def sum_residual(k: ti.template(), t, threads: ti.template()):
 
     It is relative to all impulses, so that a light contact beside heavy ones could let its gap close. The largest part of its
     target, or of the contact offset if that is less, by which a gap ends short is therefore a residual, too: MAX_MISSED
-    corresponds to the tolerance.
+    corresponds to the tolerance. Impulses that only the rounding of positions causes, as between bodies at rest, are within it.
     """
     p, w = ti.static((k.problem, k.work))
     sums, worst = ti.Vector([0.0, 0.0], ti.f64), ti.cast(0.0, ti.f64)
@@ -277,6 +281,7 @@ def build_stage_contacts(
         arena.vectors("contact_world_impulse", ti.f64, p.capacity),
         arena.vectors("contact_prox_residual", ti.f64, p.capacity),
         arena.field("contact_gap_weight", ti.f64, p.capacity),
+        arena.field("contact_rounding", ti.f64, p.capacity),
         arena.vectors("contact_block", real, p.capacity, n=BLOCK),
         arena.field("contact_active", ti.i32, p.capacity),
     )

@@ -170,10 +170,10 @@ class ContactExplicitStepper(ExplicitStepper):
         if n:
             p = contact.problem
             set_free_velocities(m, s, p, dt, *contact.gap_targets)
+            find_factors(p)
             if self._rigid is not None:
                 result = self._rigid.solve(p, self.method, self.contact_tolerance, MAX_SWEEPS)
             else:
-                find_factors(p)
                 if self.method == "coloured_gauss_seidel":
                     colour_contacts(p)
                 result = solve(p, self.method, self.contact_tolerance, MAX_SWEEPS)

@@ -15,6 +15,7 @@ import taichi as ti
 from taisoft.backend import parallel
 from taisoft.backend.arrays import Count, FieldArena, download, upload
 from taisoft.backend.runtime import Runtime
+from taisoft.errors import SceneError
 from taisoft.fem import reference, springs
 from taisoft.fem.chunks import FOLDED, SPREAD, SweepOrder
 from taisoft.fem.dependents import DependentTable, build_dependents, dependent_table
@@ -187,6 +188,8 @@ def _layout(scene: Scene, lanes: int) -> tuple[Layout, tuple[Group, ...]]:
     for k, b in enumerate(bodies):
         for law in b.composition.laws:
             floor, mean, rigid = b.composition.has_volume_floor, b.dilatation == "mean", isinstance(b, RigidBody)
+            if mean and not hasattr(LAWS[law], "dilatation"):
+                raise SceneError(f'body {b.name!r}: its law {law} has no mean dilatation: give it dilatation="local"')
             kind = b.order, b.quadrature_degree, laws.index(law), floor, mean, rigid
             parts.setdefault(kind, []).append(tet_start[k] + b.composition.tets_of_law(law))
     n_points = {degree: len(reference.quadrature(degree).weights) for _, degree, *_ in parts}

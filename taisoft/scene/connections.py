@@ -149,7 +149,8 @@ def check_exact(scene: "Scene") -> None:
         if one not in scene.dependent_attachments:
             continue
         if body.dilatation != "local":
-            raise SceneError(f"{what}: nodes of body {one.a!r} cannot be attached exactly, since its dilatation is a mean")
+            rule = f"nodes of body {one.a!r} cannot be attached exactly, since its dilatation is a mean"
+            raise SceneError(f'{what}: {rule}: give the body dilatation="local", or the attachment a stiffness')
         for damping in ("mass_damping", "stiffness_damping"):  # a force on one body's node acts on the other's
             elastic = [owner for name in one.owners if not isinstance(owner := scene.body(name), RigidBody)]
             if len({getattr(owner.composition.first, damping) for owner in elastic}) > 1:

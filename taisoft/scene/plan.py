@@ -13,7 +13,7 @@ import numpy as np
 from taisoft.attributes import thawed
 from taisoft.errors import SceneError
 from taisoft.scene import checks
-from taisoft.scene.body import Body, check_volume
+from taisoft.scene.body import NEARLY_INCOMPRESSIBLE, Body, check_volume
 from taisoft.scene.collision import has_sharp_edges
 from taisoft.scene.connections import check_tendon
 from taisoft.scene.material import LAWS
@@ -75,7 +75,11 @@ def make_plan(scene: Scene, explicit: bool, multistep: bool, self_collision: boo
         "every body has one young and one poisson",
     )
     add_if_any("volume_floor", lambda b: b.composition.has_volume_floor, "material of", "every volume_floor is 0")
-    add_if_any("mean_dilatation", lambda b: b.dilatation == "mean", "requested for", "every body has local dilatation")
+    reasons = []
+    for given, why in (("auto", f"a poisson of at least {NEARLY_INCOMPRESSIBLE} in linear tets of"), ("mean", "requested for")):
+        if names := [b.name for b in scene.bodies if (b.given_dilatation, b.dilatation) == (given, "mean")]:
+            reasons.append(f"{why} {_shorten(names)}")
+    plan.add("mean_dilatation", bool(reasons), "; ".join(reasons), "every body has local dilatation")
     quadratic = [b.name for b in scene.bodies if b.order == 2]
     add_if_any("quadratic_tets", lambda b: b.order == 2, "bodies of order 2:", "every body is of order 1")
     plan.add(

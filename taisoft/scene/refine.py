@@ -111,7 +111,12 @@ def _on_mesh(old: Body, mesh: TetMesh, order: int, parents: np.ndarray) -> Body:
     degree = old.quadrature_degree if order == old.order else None
     copies = mesh.n_tets // old.mesh.n_tets
     numbers = {name: np.repeat(values, copies) for name, values in old.composition.by_tet.items()}
-    new = Body(old.name, mesh, old.material, old.position, velocity, order, degree, old.collision, old.dilatation, **numbers)
+    new = Body(
+        old.name, mesh, old.material, old.position, velocity, order, degree, old.collision, old.given_dilatation, **numbers
+    )
+    if order == old.order:  # as decided, whatever numbers have changed since
+        with thawed(new):
+            new.dilatation = old.dilatation
     if old.skin is not None:
         new.embed(old.skin.surface, old.skin.contact)
     for constraint in old.constraints:

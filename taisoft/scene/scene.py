@@ -206,7 +206,7 @@ class Scene(Guarded):
         young: float | np.ndarray | None = None,
         poisson: float | np.ndarray | None = None,
         density: float | np.ndarray | None = None,
-        dilatation: str = "local",
+        dilatation: str = "auto",
     ) -> Body:
         """Add a body and return it.
 
@@ -216,10 +216,11 @@ class Scene(Guarded):
         and so on by default. position: (3,) [m], initial translation. velocity: (3,) for all nodes or (n,3) [m/s]. order: 1,
         linear tets, or 2, quadratic ones with nodes in the middle of every edge. quadrature_degree: None for the default; order
         2 has four points (2) or fourteen (4). collision: contact geometry, "proximity", also for "auto", or "distance_field".
-        dilatation: "local", or "mean", averaged over patches of a few linear tets, or each quadratic tet, so that a Poisson's
-        ratio near 0.5 does not lock them.
-        Warns if tets of order 1 are far too stiff: at a Poisson's ratio above 0.49, or in a thin body with so few tets through
-        its thickness that it bends at most half as far as it should. Raises SceneError.
+        dilatation: "mean", averaged over patches of a few linear tets, or each quadratic tet, so that a Poisson's ratio near
+        0.5 does not lock them; "local", of each quadrature point; or "auto": "mean" for linear tets if that ratio is at least
+        0.45 in some of them. It stays as decided when the ratio changes during a run.
+        Warns if tets of order 1 are far too stiff: if they lock, or in a thin body with so few tets through its thickness that
+        it bends at most half as far as it should. Raises SceneError.
         """
         self._check_open("add_body")
         name = self._free_name(name, "body")

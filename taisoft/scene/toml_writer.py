@@ -142,7 +142,9 @@ def _body(body: Body, materials: dict[Material, str], stem: str, meshes: dict[st
     names = {body.mesh.region_names.get(key, str(key)): materials[one] for key, one in composition.materials.items()}
     table = {"materials": names} if composition.has_regions else {"material": materials[composition.first]}
     table |= {"mesh": _mesh_table(body.mesh, stem, meshes)} | composition.by_tet
-    table |= {key: getattr(body, key) for key in ("position", "velocity", "order", "collision", "dilatation")}
+    table |= {key: getattr(body, key) for key in ("position", "velocity", "order", "collision")}
+    # what was given, unless numbers have changed since so that it would be decided in another way
+    table["dilatation"] = body.given_dilatation if body.dilatation == body.decided_dilatation else body.dilatation
     if body.quadrature_degree != QUADRATURE_DEGREES[body.order][0]:  # the default stays away, so that order can be edited
         table["quadrature_degree"] = body.quadrature_degree
     if body.velocity.ndim == 2:

@@ -74,7 +74,10 @@ def test_a_failed_run_is_reported_and_keeps_its_last_good_state(tmp_path, capsys
 
 def test_notes_and_warnings_are_printed_and_reported(tmp_path, capsys):
     """Warnings once as they come; in the summary problems first, of which an ok run has none."""
-    path, out = write(tmp_path / "stiff.py", BEAM.replace("young=1e5", "young=1e5, poisson=0.495")), tmp_path / "out"
+    path, out = (
+        write(tmp_path / "stiff.py", BEAM.replace("young=1e5)", 'young=1e5, poisson=0.495), dilatation="local"')),
+        tmp_path / "out",
+    )
     short = ("--set", "solver.dt=0.004", "--set", "solver.fps=none", "--seconds", "0.001")
     assert run(path, "--out", out, *SHORT_OUTPUT, *short) == 0
     shown, error = capsys.readouterr()

@@ -165,6 +165,8 @@ def test_gap_minus_target(fast, slow):
         (-4 * h, 0.5, -1e-3, -4 * h * fast - slow * h),  # correcting the penetration opens faster than the rebound
         (-4 * h, 0.5, -90.0, -45.0 * dt),
         (-3.0 * fastest * dt / fast, 0.0, 0.0, -fastest * dt),  # maximum opening speed
+        (0.25 * h, 0.0, 0.0, 0.0),  # nothing presses them together
+        (-0.5 * h, 0.0, 1.0, 0.0),
     ]
     gap, restitution, approach, expected = np.array(cases).T
     problem, n = build_node_problem(arena, 64, 4, True), len(cases)
@@ -180,6 +182,9 @@ def test_gap_minus_target(fast, slow):
         return out
 
     assert np.abs(found() - expected).max() < 1e-15
+    fill_field(problem.load, np.full(n, 1e-3 * h / dt))
+    assert np.abs(found()[-2:] + 1e-4 * h).max() < 1e-15  # no faster than a tenth of what the load gives
+    fill_field(problem.load, np.zeros(n))
     # forces push together: the speed that they add is not restored; the eighth contact meets now
     less = np.where((restitution > 0) & (expected == -dt * restitution * np.abs(approach)), 0.2 * dt, 0.0)
     later = np.arange(n) == 7

@@ -4,6 +4,7 @@
 * a turning belt carries the cube with it; forces of pairs add up to those of bodies;
 * contact forces and weight are the rate of momentum; two colliding bodies conserve momentum, and angular momentum but for
   friction acting across a gap;
+* what touches, or overlaps by less than the contact offset, is pushed apart by a load alone;
 * impulses and velocities of a step obey Signorini's and Coulomb's laws, recomputed from public queries.
 """
 
@@ -93,6 +94,22 @@ def run(sim, seconds: float) -> None:
         report = sim.advance(end - sim.step_count)
         assert report.converged and report.problems == [], report
         assert report.max_penetration < contact_offset(sim)
+
+
+def test_what_touches_is_pushed_apart_by_a_load_alone(sim):
+    """The cube touches the belt, and the load overlaps with the shelf by half of the contact offset."""
+    offset = contact_offset(sim)
+    for name, shift in (("cube", 3e-4), ("load", 3e-4 + 0.5 * offset)):
+        sim.set_state(sim.positions(name) - [0.0, shift, 0.0], body=name)
+    sim.set_state(velocities=np.zeros_like(sim.positions()))
+    sim.set_gravity((0, 0, 0))
+    for _ in range(30):
+        sim.step()
+        assert np.abs(sim.velocities()).max() < 1e-9 and abs(sim.contacts().gap.min() + 0.5 * offset) < 1e-9
+    sim.set_gravity(GRAVITY)
+    for _ in range(30):
+        sim.advance(round(0.01 / sim.dt))
+    assert sim.contacts().gap.min() > 0.0
 
 
 @by("symplectic_euler", "bdf2")

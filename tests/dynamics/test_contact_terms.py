@@ -61,8 +61,9 @@ def rig():
         obstacle_displacement = np.where((np.arange(K) % 5 == 0)[:, None], 1e-3 * rng.standard_normal((K, 3)), 0.0)
         friction, gap = np.where(np.arange(K) % 7 == 0, 0.0, 0.5), rng.uniform(-2, 3, K) * GAP_TARGETS[0]
         apart = np.tile([0, 1], (K, 1))  # self-contacts have other targets
-        fields = (p.arity, p.friction, p.gap, p.obstacle_displacement, p.body, p.turned)
-        for field, values in zip(fields, (arity, friction, gap, obstacle_displacement, apart, TURNED.astype(np.int32))):
+        fields = (p.arity, p.friction, p.gap, p.obstacle_displacement, p.body, p.turned, p.load)
+        loaded = np.ones(K)  # so that gaps open
+        for field, values in zip(fields, (arity, friction, gap, obstacle_displacement, apart, TURNED.astype(np.int32), loaded)):
             fill_field(field, values)
         p.count[0] = K
         index_nodes(p)

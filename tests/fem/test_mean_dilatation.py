@@ -7,11 +7,13 @@ import numpy as np
 import pytest
 
 import taisoft as ts
+from taisoft.fem.laws import LAWS
 from taisoft.fem.node_graph import EVERYTHING
 from taisoft.fem.reference import lumped_masses, shape_gradients, tet_patches
 from taisoft.fem.terms import elasticity
 from taisoft.linear import block_csr
 from taisoft.mesh.topology import connected_pieces
+from taisoft.scene.refine import refined, with_order
 from taisoft.stability import hooke_stiffness
 from tests.collision.rotations import rotation
 from tests.dynamics.scenes import SNH, built, cube, halved, rubber
@@ -131,10 +133,10 @@ def test_uniform_deformations_are_those_of_the_law(rig):
     assert inner.sum() == 1 and np.abs(f[own][inner]).max() < 1e-12 * np.abs(f).max()
 
 
-def test_stiffness_damping_of_explicit_steps_is_the_matrix_and_changed_numbers_act():
+def test_stiffness_damping_of_explicit_steps_is_the_matrix_and_changed_numbers_act(tmp_path):
     """At rest, where the matrix is positive semi-definite."""
     scene, dt, rate = ts.Scene(gravity=(0, 0, 0)), 1e-8, 0.01
-    scene.add_body(cube(cells=(3, 2, 2)), rubber(poisson=0.45, stiffness_damping=rate), name="a", dilatation="mean")
+    scene.add_body(cube(cells=(3, 2, 2)), rubber(poisson=0.45, stiffness_damping=rate), name="a")
     v = strained(np.zeros_like(scene.bodies[0].rest_positions), 1.0)
     expected = -rate * (hooke_stiffness(scene.bodies[0]) @ v.reshape(-1)).reshape(-1, 3)
     with ts.Simulator(scene, dt=dt, integrator="symplectic_euler", precision="f64") as sim:
@@ -144,10 +146,19 @@ def test_stiffness_damping_of_explicit_steps_is_the_matrix_and_changed_numbers_a
         assert np.abs(change - expected).max() < 1e-3 * np.abs(expected).max()
         assert np.abs(change.sum(axis=0)).max() < 1e-6 * np.abs(change).max()
         before = sim.stress("a")
-        sim.set_material("a", poisson=0.3)
+        with pytest.warns(UserWarning, match="body 'a': poisson = 0.3 is below 0.45, and its dilatation stays the mean"):
+            sim.set_material("a", poisson=0.3)
         assert not np.allclose(sim.stress("a"), before, rtol=0.1)  # at the same strains
+        ts.write_scene(tmp_path / "kept.toml", sim.scene, {})
+        kept = refined(sim.scene), with_order(sim.scene, 2), ts.read_scene(tmp_path / "kept.toml")[0]
+        assert [one.body("a").dilatation for one in kept] == ["mean", "local", "mean"]
 
 
-def test_another_kind_of_dilatation_is_refused():
-    with pytest.raises(ts.SceneError, match="^body 'a': dilatation must be one of local, mean, not 'patch'$"):
+def test_another_kind_of_dilatation_is_refused_and_a_law_without_it(monkeypatch):
+    with pytest.raises(ts.SceneError, match="^body 'a': dilatation must be one of auto, local, mean, not 'patch'$"):
         ts.Scene().add_body(cube(), rubber(), name="a", dilatation="patch")
+    monkeypatch.delattr(LAWS[SNH], "dilatation")
+    scene = ts.Scene()
+    scene.add_body(cube(), rubber(poisson=0.45), name="a")
+    with pytest.raises(ts.SceneError, match="^body 'a': its law stable_neo_hookean has no mean dilatation: give it"):
+        ts.modes(scene)

@@ -98,7 +98,8 @@ def test_assignments_are_checked_as_by_add_body():
         assert str(set_later.value) == str(added.value) and getattr(body, name) is before
     body.position, body.velocity = [1, 2, 3], np.ones((8, 3))
     assert body.position.tolist() == [1, 2, 3] and body.position.dtype == float and body.velocity.shape == (8, 3)
-    with pytest.warns(UserWarning, match="body 'block': poisson = 0.495 is above 0.49") as caught:
+    body = ts.Scene().add_body(cube(), rubber(), name="block", dilatation="local")
+    with pytest.warns(UserWarning, match="body 'block': poisson = 0.495 is at least 0.45") as caught:
         body.material = rubber(poisson=0.495)
     assert len(caught) == 1 and caught[0].filename == __file__ and body.material.poisson == 0.495
 
@@ -194,9 +195,9 @@ def test_arrays_of_a_frozen_scene_and_of_records_are_read_only(frozen):
 def test_set_methods_change_the_simulators_copy_alone(changed):
     scene, sim, before = changed
     sim.set_gravity((0, -1, 0))
-    with pytest.warns(UserWarning, match="body 'block': poisson = 0.495 is above 0.49") as caught:
+    with pytest.warns(UserWarning, match="body 'block': poisson = 0.495 is at least 0.45.*of a body that starts so") as caught:
         sim.set_material("block", young=2e4, poisson=0.495)
-    assert caught[0].filename == __file__
+    assert caught[0].filename == __file__ and sim.scene.snapshot().body("block").dilatation == "local"  # as decided at the start
     sim.set_contact("block", "ball", friction=0.1)
     sim.set_force("block", 0, (2, 0, 0))
     sim.set_tension("line", 3.0)

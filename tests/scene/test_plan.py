@@ -29,6 +29,10 @@ def test_features_and_reasons_of_a_scene():
     assert connected["spring_damping"] == (True, "pushes, pulls, at one place and 2 more")
     mixed = mixed_scene(order="both")
     assert entries(mixed, explicit=True)["consistent_mass"] == (False, "explicit steps need a diagonal mass")
+    for name in "cd":
+        mixed.add_body(cube((9, 0, 0)), rubber(poisson=0.47), name=name, dilatation="auto" if name == "c" else "mean")
+    why = "a poisson of at least 0.45 in linear tets of c; requested for d"
+    assert entries(mixed)["mean_dilatation"] == (True, why)
     assert entries(mixed, explicit=False)["consistent_mass"] == (True, "quadratic tets of beam, tower in implicit steps")
 
 

@@ -45,12 +45,27 @@ def test_lame_parameters_satisfy_hookes_law(poisson):
 
 
 def test_near_incompressibility_is_warned_of_for_linear_tets():
-    soft = Material(poisson=0.495)
-    with pytest.warns(UserWarning, match="body 'locks': poisson = 0.495 is above 0.49, where linear tets lock"):
-        Scene().add_body(box_mesh((1, 1, 1), (1, 1, 1)), soft, name="locks")
+    """From 0.45 their dilatation is a mean, unless a local one is given; quadratic tets have a mean one only if it is given."""
+    mesh, with_region = box_mesh((1, 1, 1), (1, 1, 1)), np.r_[np.full(4, 0.3), 0.45]
+    with pytest.warns(UserWarning, match="body 'locks': poisson = 0.45 is at least 0.45, where linear tets lock"):
+        assert Scene().add_body(mesh, Material(poisson=0.45), name="locks", dilatation="local").dilatation == "local"
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        Scene().add_body(box_mesh((1, 1, 1), (1, 1, 1)), soft, order=2)
+        for expected, given in (
+            ("mean", {"poisson": 0.45}),
+            ("mean", {"poisson": with_region}),
+            ("local", {"poisson": 0.4499}),
+            ("mean", {"poisson": 0.3, "dilatation": "mean"}),
+            ("local", {"poisson": 0.495, "order": 2}),
+            ("mean", {"poisson": 0.495, "order": 2, "dilatation": "mean"}),
+        ):
+            body = Scene().add_body(mesh, Material(), **given)
+            assert (body.dilatation, body.given_dilatation) == (expected, given.get("dilatation", "auto"))
+        body = Scene().add_body(mesh, Material())
+        body.poisson = 0.47
+        assert body.dilatation == "mean"
+        body.material = Material(poisson=0.4)
+        assert body.dilatation == "local"
 
 
 def test_invalid_materials_are_refused():

@@ -36,7 +36,7 @@ def everything() -> ts.Scene:
     velocity = np.random.default_rng(0).standard_normal((12, 3))
     scene.add_body(TURNED, foam, name='b "2"\n\\ü', velocity=velocity)
     scene.add_body(ts.ball_mesh(0.3, 4, (1, 2, 3)), rubber, name="c.d", dilatation="mean")
-    scene.add_body(ts.sheet_mesh((3, 3), (1, 0.3, 1), pattern="six"), rubber, name="1")
+    scene.add_body(ts.sheet_mesh((3, 3), (1, 0.3, 1), pattern="six"), rubber, name="1", poisson=0.45)
     full = ts.box_mesh((3, 3, 3), (3, 3, 3))
     spinning = scene.add_rigid_body(full, name="b", density=0.7, velocity=(0.1, 0, 0), angular_velocity=(0.1, 0.2, 0.3))
     spinning.add_force([1, 2], np.ones((2, 3)))
