@@ -24,12 +24,11 @@ def _offset(s: ti.template(), t, p):
 
 
 @ti.func
-def normal_at_vertex(s: ti.template(), i, first):
-    """Unit normal (3,) at vertex i from the surface around triangle `first`, the distance [m], negative behind a face, and
+def normal_at(s: ti.template(), p, first):
+    """Unit normal (3,) from the surface around triangle `first` to the point p (3,), the distance [m], negative behind a face, and
     whether the nearest point is inside a triangle."""
-    p, t = s.x[i], first
+    t, steps, best = first, 0, -1
     offset, region = _offset(s, t, p)
-    steps, best = 0, -1
     while best != t and steps < MAX_WALK:
         t = ti.select(best < 0, t, best)
         best = t
@@ -60,22 +59,14 @@ def normal_at_vertex(s: ti.template(), i, first):
 
 
 @ti.func
-def normal_of_edges(s: ti.template(), e, f, before):
-    """Unit normal (3,) from edge f to edge e, each 3 triangle + local edge, on the side of `before` where they cross; the distance
-    [m], and whether both nearest points are between the ends."""
+def nearest_of_edges(s: ti.template(), e, f):
+    """Nearest points (3,) of edges e and f, each 3 triangle + local edge, their common normal (3,), and whether both are between the
+    ends."""
     t, k, u, m = e // 3, e % 3, f // 3, f % 3
     a, b, c, d = corner(s, t, k), corner(s, t, k + 1), corner(s, u, m), corner(s, u, m + 1)
     p, q, _ = closest_segments(a, b, c, d)
-    offset = a + p * (b - a) - c - q * (d - c)
-    n, distance = before, offset.norm()
     is_inner = p > 0.0 and p < 1.0 and q > 0.0 and q < 1.0
-    if is_inner:
-        n = unit((b - a).cross(d - c))
-        n = ti.select(n.dot(before) < 0.0, -n, n)
-        distance = offset.dot(n)
-    elif distance > ti.cast(TINY, ti.f64) * (b - a).norm():
-        n = offset / distance
-    return n, distance, is_inner
+    return a + p * (b - a), c + q * (d - c), unit((b - a).cross(d - c)), is_inner
 
 
 @ti.func

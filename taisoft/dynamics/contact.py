@@ -42,7 +42,7 @@ from taisoft.dynamics.contact_record import (
     write_rows,
 )
 from taisoft.dynamics.impact import Rebounds
-from taisoft.dynamics.misplaced import Misplacement, Sums
+from taisoft.dynamics.misplaced import Misplacement
 from taisoft.dynamics.simulation_state import SimulationState
 from taisoft.errors import SimulationError
 from taisoft.scene.rigid import RigidBody
@@ -153,7 +153,7 @@ class ContactStep:
             "dropped": self.dropped,
             "flight": self.flight.copy(),
             "paths": self.paths.snapshot(),
-            "misplaced": self.misplaced.sums._asdict(),
+            "misplaced": self.misplaced.snapshot(),
             "rows": read_rows(self.problem),
         }
 
@@ -169,7 +169,7 @@ class ContactStep:
         self.had_impact, self.dropped = bool(kept["met"]), int(kept["dropped"])
         self.flight[:] = kept["flight"]
         self.paths.restore(kept["paths"])
-        self.misplaced.sums = Sums(**kept["misplaced"])
+        self.misplaced.restore(kept["misplaced"])
         self.crossing, self.last_crossing = 0.0 if self.paths.none_cross else None, Crossing()
         self._searched = self._measured_end = None
         self._indexed = True  # so that the next step rebuilds the node index, even without contacts

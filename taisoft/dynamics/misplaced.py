@@ -15,15 +15,13 @@ impact on an edge may turn a force by 20 %, a slide over many steps by no more t
 Weak: the work of a force that is misplaced across the slip is 0; contacts with distance fields of bodies count as right.
 """
 
-from typing import NamedTuple
-
 import numpy as np
 import taichi as ti
 
 from taisoft.backend.runtime import kernel
 from taisoft.collision.contacts import EDGE_EDGE, FACE_FACE, VERTEX_FACE
 from taisoft.collision.detector import Detection
-from taisoft.collision.end_normals import normal_at_vertex, normal_of_edges, normal_on_shape
+from taisoft.collision.end_normals import nearest_of_edges, normal_at, normal_on_shape
 from taisoft.collision.passages import ADJACENT, N_FEATURES, N_KINDS, NEAR
 from taisoft.collision.surface import dvec
 from taisoft.contact.build import relative_velocity
@@ -32,18 +30,13 @@ from taisoft.dynamics.simulation_state import SimulationState
 
 MAX_MISPLACED = 0.02  # of a pair's contact force: more is reported
 FADING, MIN_STEPS = 0.95, 10
+AT_REST = 0.01  # of the contact offset: slip in a step below which a contact sticks
 LEFT = 0.5  # of the slip: distance beyond that of the linearised motion from which a point beside an edge has left the surface
-SLIP_WORK, FALSE_WORK, FRICTION_WORK, LARGEST = range(4)  # columns of the sums: S, W, that of friction, largest S of a step
-
-
-class Sums(NamedTuple):
-    """Fading sums over steps: pairs (k,), first collider * n_colliders + second, ascending; values (k,4) [J s]."""
-
-    pairs: np.ndarray
-    values: np.ndarray
-
-
-NO_SUMS = Sums(np.zeros(0, dtype=np.int64), np.zeros((0, 4)))
+PAIRS = 16  # rows at first
+# columns of the sums over steps: S, W, the work of friction, the largest S of a step; then S, W and friction of this step; the pair,
+# first collider * n_colliders + second, -1 in unused rows
+SLIP_WORK, FALSE_WORK, FRICTION_WORK, LARGEST, NOW, PAIR, COLUMNS = 0, 1, 2, 3, 4, 7, 8
+UNUSED = np.where(np.arange(COLUMNS) == PAIR, -1.0, 0.0)
 
 
 @ti.func
@@ -91,44 +84,93 @@ def _end_normal(p: ti.template(), m: ti.template(), s: ti.template(), o: ti.temp
             v, d, flag = normal_on_shape(o, p.body[c][1], x)
             if v.dot(v) > 0.0:
                 end, gap, is_smooth = v, d, flag
+    own, foot, first, second, n_points = dvec(0.0), dvec(0.0), face, -1, int(vertex >= 0)
     if vertex >= 0:
-        v, d, flag = normal_at_vertex(s, vertex, face)
-        end, gap, is_smooth = side * v, d, flag
+        own = s.x[vertex]
     if e >= 0:
-        v, d, flag = normal_of_edges(s, e, f, side * n)
-        end, gap, is_smooth = side * v, d, flag
+        x, y, across, is_inner = nearest_of_edges(s, e, f)
+        across = ti.select(across.dot(n) < 0.0, -across, across)
+        height = side * (x - y).dot(across)
+        if is_inner and height <= 0.0:  # they have passed each other
+            end, gap = across, height
+        else:
+            own, foot, first, second, n_points = x, y, f // 3, e // 3, 2
+    least = ti.cast(2.0, ti.f64)
+    for k in range(n_points):  # of two edges, each must be the nearest to the other: else one of their faces is
+        v, d, flag = normal_at(s, ti.select(k == 0, own, foot), ti.select(k == 0, first, second))
+        v *= ti.select(k == 0, side, -side)
+        if v.dot(n) < least:
+            end, gap, is_smooth, least = v, d, flag, v.dot(n)
     return end, gap, is_smooth
 
 
+@ti.func
+def _false_work(p: ti.template(), m: ti.template(), s: ti.template(), o: ti.template(), c, dt, contact_offset):
+    """What contact c adds to S, W and the work of friction of its pair, (3,) [J s], at the end of a step of dt [s]."""
+    n, r, false = p.normal[c], to_world(p, c, p.r[c]), dvec(0.0)
+    u = dt * relative_velocity(p, m, c, dt)
+    lasting = p.gap[c] + u.dot(n)
+    slip, across = u - u.dot(n) * n, r - r.dot(n) * n
+    if slip.norm() > ti.cast(AT_REST, ti.f64) * contact_offset:
+        end, gap, is_smooth = _end_normal(p, m, s, o, c, lasting)
+        if is_smooth or gap - lasting <= ti.cast(LEFT, ti.f64) * slip.norm():
+            turned = across - end.dot(across) / ti.max(1.0 + n.dot(end), 1e-6) * (n + end)
+            false = r.dot(n) * (n - end) + across - turned
+    return dvec(r.norm() * ti.max(slip.norm(), contact_offset), false.dot(slip), ti.abs(across.dot(slip)))
+
+
 @kernel(cse=False)
-def find_false_work(
+def add_step(
     p: ti.template(),
     m: ti.template(),
     s: ti.template(),
     o: ti.template(),
     dt: ti.f64,
-    least: ti.f64,
+    contact_offset: ti.f64,
     n_colliders: ti.i32,
-    pair: ti.types.ndarray(),
-    work: ti.types.ndarray(),
-):
-    """Compute what each contact adds to S, W and the work of friction, work (k,3) [J s], of its pair (k,), at the end of a step of
-    dt [s]. least [m]: the contact offset."""
+    sums: ti.types.ndarray(),
+) -> ti.i32:
+    """Add a step of dt [s] to the sums (k,8) of pairs.
+
+    Return the row of the pair of the largest misplaced part among those that touch, -1 if none does, -2 without change if there
+    are too few rows. p.sweep_start is used as workspace.
+    """
     ti.loop_config(serialize=p.serial)
     for c in range(p.count[0]):
-        n, r = p.normal[c], to_world(p, c, p.r[c])
-        pair[c] = p.body[c][0] * n_colliders + p.body[c][1]
-        u = dt * relative_velocity(p, m, c, dt)
-        lasting, false = p.gap[c] + u.dot(n), dvec(0.0)
-        slip = u - u.dot(n) * n
-        across = r - r.dot(n) * n
-        if r.dot(r) > 0.0 and slip.norm() > 0.01 * least:
-            end, gap, is_smooth = _end_normal(p, m, s, o, c, lasting)
-            if is_smooth or gap - lasting <= ti.cast(LEFT, ti.f64) * slip.norm():
-                turned = across - end.dot(across) / ti.max(1.0 + n.dot(end), 1e-6) * (n + end)
-                false = r.dot(n) * (n - end) + across - turned
-        work[c, 0], work[c, 1] = r.norm() * ti.max(slip.norm(), least), false.dot(slip)
-        work[c, 2] = ti.abs(across.dot(slip))
+        p.sweep_start[c] = dvec(0.0)
+        if p.r[c][0] > 0.0:
+            p.sweep_start[c] = _false_work(p, m, s, o, c, dt, contact_offset)
+    worst = -1
+    ti.loop_config(serialize=True)
+    for _ in range(1):
+        n_rows, row = sums.shape[0], 0
+        for k in range(n_rows):
+            for q in ti.static(range(3)):
+                sums[k, NOW + q] = 0.0
+        for c in range(p.count[0]):
+            if p.sweep_start[c][0] > 0.0 and row < n_rows:
+                own = ti.cast(p.body[c][0] * n_colliders + p.body[c][1], ti.f64)
+                if sums[row, PAIR] != own:  # contacts of a pair mostly follow each other
+                    row = 0
+                    while row < n_rows and sums[row, PAIR] != own and sums[row, PAIR] >= 0.0:
+                        row += 1
+                if row < n_rows:
+                    sums[row, PAIR] = own
+                    for q in ti.static(range(3)):
+                        sums[row, NOW + q] += p.sweep_start[c][q]
+        largest = ti.cast(-1.0, ti.f64)
+        for k in range(ti.select(row < n_rows, n_rows, 0)):
+            own = sums[k, NOW]
+            if own > 0.0:
+                for q in range(3):
+                    sums[k, q] = FADING * sums[k, q] + sums[k, NOW + q]
+                sums[k, LARGEST] = ti.max(FADING * sums[k, LARGEST], own)
+                part = ti.abs(sums[k, FALSE_WORK]) / ti.max(sums[k, SLIP_WORK], MIN_STEPS * sums[k, LARGEST])
+                if part > largest:
+                    worst, largest = k, part
+        if row == n_rows:
+            worst = -2
+    return worst
 
 
 class Misplacement:
@@ -136,49 +178,48 @@ class Misplacement:
 
     def __init__(self, simulation: SimulationState, detection: Detection):
         self._simulation, self._detection = simulation, detection
-        self.sums = self._start = NO_SUMS
         self.forget()
 
     def forget(self) -> None:
         """Discard all sums, after a state was set."""
-        self.sums = self._start = NO_SUMS
+        self.restore(np.zeros((0, COLUMNS)))
         self.start_step()
+
+    def snapshot(self) -> np.ndarray:
+        """Return the sums (k,8)."""
+        return self._sums[self._sums[:, PAIR] >= 0.0]
+
+    def restore(self, kept: np.ndarray) -> None:
+        """Restore a `snapshot`."""
+        self._sums = np.concatenate([kept, np.tile(UNUSED, (PAIRS, 1))])
 
     def start_step(self) -> None:
         """Begin a step."""
-        self.part, self.text, self._start = 0.0, "", self.sums  # largest misplaced part, and a sentence if that is too much
+        self.part, self.text = 0.0, ""  # largest misplaced part in this step, and a sentence if that is too much
+        self._start = self._sums.copy()
 
     def return_to_start(self) -> None:
         """Discard what was added since the step began."""
-        self.sums = self._start
+        self._sums = self._start
         self.start_step()
 
     def add(self, p: ContactProblem, dt: float, contact_offset: float) -> None:
         """Add a substep of dt [s], whose end was searched last."""
-        k, d, n = int(p.count[0]), self._detection, len(self._detection.scene.colliders)
-        pair, work = np.zeros(k, dtype=np.int32), np.zeros((k, 3))
-        find_false_work(p, self._simulation.model, d.surface, d.shapes, dt, contact_offset, n, pair, work)
-        loaded = work[:, 0] > 0.0
-        if not loaded.any():
+        d, n = self._detection, len(self._detection.scene.colliders)
+        records = p, self._simulation.model, d.surface, d.shapes
+        while (row := add_step(*records, dt, contact_offset, n, self._sums)) == -2:
+            self._sums = np.concatenate([self._sums, np.tile(UNUSED, (len(self._sums), 1))])
+        if row < 0:
             return
-        present, at = np.unique(pair[loaded], return_inverse=True)
-        new = np.stack([np.bincount(at, work[loaded, q], len(present)) for q in (0, 1, 2, 0)], axis=1)
-        pairs = np.union1d(self.sums.pairs, present)
-        values, touching = np.zeros((len(pairs), 4)), np.searchsorted(pairs, present)
-        values[np.searchsorted(pairs, self.sums.pairs)] = self.sums.values
-        old = FADING * values[touching]
-        values[touching] = np.where(np.arange(4) == LARGEST, np.maximum(old, new), old + new)
-        self.sums = Sums(pairs, values)
-        slipped = np.maximum(values[touching, SLIP_WORK], MIN_STEPS * values[touching, LARGEST])
-        parts = np.abs(values[touching, FALSE_WORK]) / slipped
-        worst = int(parts.argmax())
-        if parts[worst] > self.part:
-            self.part = float(parts[worst])
-            if self.part > MAX_MISPLACED:
-                self.text = self._describe(*divmod(int(present[worst]), n), *values[touching[worst]])
+        slip, false, friction, largest, *_, pair = self._sums[row].tolist()
+        part = abs(false) / max(slip, MIN_STEPS * largest)
+        if part > self.part:
+            self.part = part
+            if part > MAX_MISPLACED:
+                self.text = self._describe(*divmod(int(pair), n), slip, false, friction)
 
-    def _describe(self, a: int, b: int, slip: float, false: float, friction: float, _largest: float) -> str:
-        """Return a sentence about a pair of colliders and its sums."""
+    def _describe(self, a: int, b: int, slip: float, false: float, friction: float) -> str:
+        """Return a sentence about colliders a and b and the sums of their contacts."""
         names = [f"'{self._detection.scene.colliders[k].name}'" for k in (a, b)]
         where = f"within {names[0]}" if a == b else f"between {names[0]} and {names[1]}"
         if abs(false) < friction:
