@@ -7,7 +7,7 @@ with the first one, not one beyond a gap.
 import taichi as ti
 
 from taisoft.collision.analytic import BOX, rotation_rows
-from taisoft.collision.features import CORNER, EDGE, closest_on_triangle, corner, edge_normal, ring_normal, unit
+from taisoft.collision.features import CORNER, EDGE, FLAT_COSINE, closest_on_triangle, corner, edge_normal, ring_normal, unit
 from taisoft.collision.intersections import closest_segments
 from taisoft.collision.surface import dvec
 from taisoft.collision.vertex_face import TINY
@@ -47,15 +47,15 @@ def normal_at(s: ti.template(), p, first):
             if d.dot(d) < offset.dot(offset):
                 offset, region, best = d, own, u
         steps += 1
-    n, h, distance = 1.0 * s.normal[t], (p - corner(s, t, 0)).dot(s.normal[t]), offset.norm()
-    if region >= EDGE and h >= 0.0:
-        if distance > ti.cast(TINY, ti.f64) * ti.sqrt(s.area[t]):
-            n = offset / distance
-        elif region >= CORNER:
-            n = ring_normal(s, s.triangle[t, region - CORNER])
-        else:
-            n = unit(edge_normal(s, t, region - EDGE))
-    return n, ti.select(h >= 0.0, distance, h), region < EDGE
+    n, distance = 1.0 * s.normal[t], offset.norm()
+    if region >= CORNER:
+        n = ring_normal(s, s.triangle[t, region - CORNER])
+    elif region >= EDGE:
+        n = unit(edge_normal(s, t, region - EDGE))
+    is_outside = offset.dot(n) >= 0.0  # of a closed surface, by the mean normal (Baerentzen, Aanaes 2005)
+    if region >= EDGE and is_outside and distance > ti.cast(TINY, ti.f64) * ti.sqrt(s.area[t]):
+        n = offset / distance
+    return n, ti.select(is_outside, distance, -distance), region < EDGE
 
 
 @ti.func
@@ -70,13 +70,16 @@ def nearest_of_edges(s: ti.template(), e, f):
 
 
 @ti.func
-def normal_on_shape(o: ti.template(), body, x):
+def normal_on_shape(o: ti.template(), body, x, before):
     """Unit normal (3,) of analytic obstacle `body` at the point x (3,), 0 if it is none; the distance [m], and whether the nearest
-    point is on a smooth part."""
-    n, phi, is_smooth = dvec(0.0), ti.cast(0.0, ti.f64), True
+    point and that of the normal `before` are on smooth parts."""
+    n, phi, is_smooth, was_smooth = dvec(0.0), ti.cast(0.0, ti.f64), True, True
     for k in range(o.count):
         if o.body[k] == body:
             R = rotation_rows(o.rotation, k)
             value, g = o.sample(k, R.transpose() @ (x - o.origin[k]))
-            n, phi, is_smooth = R @ g, value, o.kind[k] != BOX or ti.abs(g).max() > 1.0 - 1e-9
-    return n, phi, is_smooth
+            n, phi = R @ g, value
+            if o.kind[k] == BOX:
+                is_smooth = ti.abs(g).max() > ti.cast(FLAT_COSINE, ti.f64)
+                was_smooth = ti.abs(R.transpose() @ before).max() > ti.cast(FLAT_COSINE, ti.f64)
+    return n, phi, is_smooth, was_smooth

@@ -7,7 +7,7 @@ over the contacts of a pair. Sliding by D over a radius R makes W / S = D / R: f
 normal force, or a body without friction drags. At a seam, the edge of the neighbouring box stops what should slide over it.
 Where nothing slides the force follows from balance, whatever the normal, and W is 0.
 
-A contact whose point has left the surface, over an edge or a corner, held until then and counts as right.
+A contact whose point has left a face over an edge held until then, and counts as right.
 
 Both sums fade by FADING with every step in which the pair touches, and a step counts no more than a MIN_STEPS-th of all: one
 impact on an edge may turn a force by 20 %, a slide over many steps by no more than 2 %.
@@ -22,6 +22,7 @@ from taisoft.backend.runtime import kernel
 from taisoft.collision.contacts import EDGE_EDGE, FACE_FACE, VERTEX_FACE
 from taisoft.collision.detector import Detection
 from taisoft.collision.end_normals import nearest_of_edges, normal_at, normal_on_shape
+from taisoft.collision.features import FLAT_COSINE
 from taisoft.collision.passages import ADJACENT, N_FEATURES, N_KINDS, NEAR
 from taisoft.collision.surface import dvec
 from taisoft.contact.build import relative_velocity
@@ -31,7 +32,7 @@ from taisoft.dynamics.simulation_state import SimulationState
 MAX_MISPLACED = 0.02  # of a pair's contact force: more is reported
 FADING, MIN_STEPS = 0.95, 10
 AT_REST = 0.01  # of the contact offset: slip in a step below which a contact sticks
-LEFT = 0.5  # of the slip: distance beyond that of the linearised motion from which a point beside an edge has left the surface
+LEFT = 0.5  # of the slip: distance beyond that of the linearised motion from which a point that stays at edges has left them
 PAIRS = 16  # rows at first
 # columns of the sums over steps: S, W, the work of friction, the largest S of a step; then S, W and friction of this step; the pair,
 # first collider * n_colliders + second, -1 in unused rows
@@ -57,10 +58,10 @@ def _side(s: ti.template(), t, u, i, j):
 
 @ti.func
 def _end_normal(p: ti.template(), m: ti.template(), s: ti.template(), o: ti.template(), c, lasting):
-    """Normal (3,) of contact c at the present positions, its gap [m], and whether its point lies on a smooth part of a surface.
-    lasting: what the gap counts as where the normal does not change [m]."""
+    """Normal (3,) of contact c at the present positions, its gap [m], and whether its point lies on a smooth part of a surface, and
+    did so before. lasting: what the gap counts as where the normal does not change [m]."""
     kind, one, other, n = p.feature[c][0], p.feature[c][1], p.feature[c][2], p.normal[c]
-    end, gap, is_smooth = n, lasting, True
+    end, gap, is_smooth, was_smooth = n, lasting, True, True
     vertex, face, e, f, side = -1, -1, -1, -1, ti.cast(1.0, ti.f64)
     if kind == VERTEX_FACE:
         vertex, face = one, other
@@ -81,9 +82,9 @@ def _end_normal(p: ti.template(), m: ti.template(), s: ti.template(), o: ti.temp
             x = dvec(0.0)
             for k in range(p.arity[c]):
                 x += p.weight[c, k] * m.state.x[p.node[c, k]]
-            v, d, flag = normal_on_shape(o, p.body[c][1], x)
+            v, d, flag, before = normal_on_shape(o, p.body[c][1], x, n)
             if v.dot(v) > 0.0:
-                end, gap, is_smooth = v, d, flag
+                end, gap, is_smooth, was_smooth = v, d, flag, before
     own, foot, first, second, n_points = dvec(0.0), dvec(0.0), face, -1, int(vertex >= 0)
     if vertex >= 0:
         own = s.x[vertex]
@@ -97,11 +98,18 @@ def _end_normal(p: ti.template(), m: ti.template(), s: ti.template(), o: ti.temp
             own, foot, first, second, n_points = x, y, f // 3, e // 3, 2
     least = ti.cast(2.0, ti.f64)
     for k in range(n_points):  # of two edges, each must be the nearest to the other: else one of their faces is
-        v, d, flag = normal_at(s, ti.select(k == 0, own, foot), ti.select(k == 0, first, second))
+        t = ti.select(k == 0, first, second)
+        v, d, flag = normal_at(s, ti.select(k == 0, own, foot), t)
         v *= ti.select(k == 0, side, -side)
         if v.dot(n) < least:
             end, gap, is_smooth, least = v, d, flag, v.dot(n)
-    return end, gap, is_smooth
+            cosine = ti.abs(s.normal[t].dot(n))
+            if e >= 0:
+                u = s.neighbour[t, ti.select(k == 0, f, e) % 3]
+                if u >= 0:
+                    cosine = ti.max(cosine, ti.abs(s.normal[u].dot(n)))
+            was_smooth = cosine > ti.cast(FLAT_COSINE, ti.f64)
+    return end, gap, is_smooth, was_smooth
 
 
 @ti.func
@@ -112,8 +120,9 @@ def _false_work(p: ti.template(), m: ti.template(), s: ti.template(), o: ti.temp
     lasting = p.gap[c] + u.dot(n)
     slip, across = u - u.dot(n) * n, r - r.dot(n) * n
     if slip.norm() > ti.cast(AT_REST, ti.f64) * contact_offset:
-        end, gap, is_smooth = _end_normal(p, m, s, o, c, lasting)
-        if is_smooth or gap - lasting <= ti.cast(LEFT, ti.f64) * slip.norm():
+        end, gap, is_smooth, was_smooth = _end_normal(p, m, s, o, c, lasting)
+        left = ti.select(was_smooth, ti.cast(0.0, ti.f64), ti.cast(LEFT, ti.f64) * slip.norm())
+        if is_smooth or gap - lasting <= left:
             turned = across - end.dot(across) / ti.max(1.0 + n.dot(end), 1e-6) * (n + end)
             false = r.dot(n) * (n - end) + across - turned
     return dvec(r.norm() * ti.max(slip.norm(), contact_offset), false.dot(slip), ti.abs(across.dot(slip)))
@@ -211,11 +220,11 @@ class Misplacement:
             self._sums = np.concatenate([self._sums, np.tile(UNUSED, (len(self._sums), 1))])
         if row < 0:
             return
-        slip, false, friction, largest, *_, pair = self._sums[row].tolist()
+        slip, false, friction, largest, slip_now, false_now, _, pair = self._sums[row].tolist()
         part = abs(false) / max(slip, MIN_STEPS * largest)
         if part > self.part:
             self.part = part
-            if part > MAX_MISPLACED:
+            if part > MAX_MISPLACED and abs(false_now) > MAX_MISPLACED * slip_now:
                 self.text = self._describe(*divmod(int(pair), n), slip, false, friction)
 
     def _describe(self, a: int, b: int, slip: float, false: float, friction: float) -> str:

@@ -82,14 +82,16 @@ def test_a_thin_sheet_thrown_at_itself():
         assert max(r.n_contacts for r in reports) > 10
 
 
-def test_a_moving_obstacle_pushes_a_cube():
-    """A wall that moves and turns, and then stops and turns faster."""
+@pytest.mark.parametrize("is_round", [False, True])
+def test_a_moving_obstacle_pushes_a_cube(is_round):
+    """A wall, or a capsule, that moves and turns, and then stops and turns faster."""
     scene = ts.Scene()
     scene.add_body(turned_box((2, 2, 2), (0.2, 0.2, 0.2)), DAMPED, name="cube", position=(0.3, 0.18, 0.05))
     scene.add_obstacle(FLOOR, name="floor", friction=0.5)
     push = ts.KeyFrames([0.0, 0.3, 0.6], [(0, 0, 0), (0.9, 0, 0), (0.9, 0, 0)], [(0, 0, 0), (0, 0.5, 0.3), (0, 2.5, 0.3)])
     wall = ts.box_mesh((1, 1, 1), (0.05, 0.4, 0.5))
-    scene.add_obstacle(ts.MeshObstacle(wall.vertices + (-0.1, 0.3, 0), wall.surface), name="wall", path=push)
+    shape = ts.MeshObstacle(wall.vertices + (-0.1, 0.3, 0), wall.surface)
+    scene.add_obstacle(ts.Capsule((-0.1, 0.2, -0.2), (-0.1, 0.2, 0.2), 0.02) if is_round else shape, name="wall", path=push)
     with ts.Simulator(scene, dt=1 / 30) as sim:
         reports = judged(sim, 18)
         assert max(r.n_contacts for r in reports) > 3 and sim.positions("cube")[:, 0].mean() > 0.5
