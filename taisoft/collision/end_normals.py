@@ -25,7 +25,7 @@ def _offset(s: ti.template(), t, p):
 
 @ti.func
 def normal_at(s: ti.template(), p, first):
-    """Unit normal (3,) from the surface around triangle `first` to the point p (3,), the distance [m], negative behind a face, and
+    """Unit normal (3,) from the surface around triangle `first` to the point p (3,), the distance [m], negative inside, and
     whether the nearest point is inside a triangle."""
     t, steps, best = first, 0, -1
     offset, region = _offset(s, t, p)
@@ -60,8 +60,8 @@ def normal_at(s: ti.template(), p, first):
 
 @ti.func
 def nearest_of_edges(s: ti.template(), e, f):
-    """Nearest points (3,) of edges e and f, each 3 triangle + local edge, their common normal (3,), and whether both are between the
-    ends."""
+    """Nearest points (3,) of edges e and f, each 3 triangle + local edge, their common normal (3,), and whether both are between
+    the ends."""
     t, k, u, m = e // 3, e % 3, f // 3, f % 3
     a, b, c, d = corner(s, t, k), corner(s, t, k + 1), corner(s, u, m), corner(s, u, m + 1)
     p, q, _ = closest_segments(a, b, c, d)
@@ -71,8 +71,8 @@ def nearest_of_edges(s: ti.template(), e, f):
 
 @ti.func
 def normal_on_shape(o: ti.template(), body, x, before):
-    """Unit normal (3,) of analytic obstacle `body` at the point x (3,), 0 if it is none; the distance [m], and whether the nearest
-    point and that of the normal `before` are on smooth parts."""
+    """Unit normal (3,) of analytic obstacle `body` at the point x (3,), 0 if it is none; the distance [m], and whether the
+    nearest point and that of the normal `before` are on smooth parts."""
     n, phi, is_smooth, was_smooth = dvec(0.0), ti.cast(0.0, ti.f64), True, True
     for k in range(o.count):
         if o.body[k] == body:

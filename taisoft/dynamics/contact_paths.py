@@ -103,7 +103,6 @@ class ContactPaths:
             self._hold(*found)
         return len(found[0]) > 0
 
-    @property
     def are_round(self) -> bool:
         """Whether all passages of the last check are through spheres or capsules that move."""
         return self._detection.are_round_and_move(self._found)

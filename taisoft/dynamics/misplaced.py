@@ -1,7 +1,7 @@
 """What it falsifies that a step uses the contact normals of its start.
 
-The impulse r of a contact should act along the normal n' of the step's end, but acts along that of its start, n. If R turns n into
-n', the force r - R r is misplaced. It matters as it brakes or drives the slip u of the step:
+The impulse r of a contact should act along the normal n' of the step's end, but acts along that of its start, n. If R turns n
+into n', the force r - R r is misplaced. It matters as it brakes or drives the slip u of the step:
     W = sum (r - R r).u   against   S = sum |r| max(|u|, contact offset)
 over the contacts of a pair. Sliding by D over a radius R makes W / S = D / R: friction seems larger by (1 + mu^2) D / R of the
 normal force, or a body without friction drags. At a seam, the edge of the neighbouring box stops what should slide over it.
@@ -10,7 +10,8 @@ Where nothing slides the force follows from balance, whatever the normal, and W 
 A contact whose point has left a face over an edge held until then, and counts as right.
 
 Both sums fade by FADING with every step in which the pair touches, and a step counts no more than a MIN_STEPS-th of all: one
-impact on an edge may turn a force by 20 %, a slide over many steps by no more than 2 %.
+impact on an edge may turn a force by 20 %, a slide over many steps by no more than 2 %. What grazes beside larger forces on both
+bodies for a few steps is not reported.
 
 Weak: the work of a force that is misplaced across the slip is 0; contacts with distance fields of bodies count as right.
 """
@@ -31,11 +32,12 @@ from taisoft.dynamics.simulation_state import SimulationState
 
 MAX_MISPLACED = 0.02  # of a pair's contact force: more is reported
 FADING, MIN_STEPS = 0.95, 10
+LEAST_SHARE = 0.2  # of S of a body in a step: where a pair has less, an event of few steps is not reported
 AT_REST = 0.01  # of the contact offset: slip in a step below which a contact sticks
 LEFT = 0.5  # of the slip: distance beyond that of the linearised motion from which a point that stays at edges has left them
 PAIRS = 16  # rows at first
-# columns of the sums over steps: S, W, the work of friction, the largest S of a step; then S, W and friction of this step; the pair,
-# first collider * n_colliders + second, -1 in unused rows
+# columns of the sums over steps: S, W, the work of friction, the largest S of a step; then S, W and friction of this step; the
+# pair, first collider * n_colliders + second, -1 in unused rows
 SLIP_WORK, FALSE_WORK, FRICTION_WORK, LARGEST, NOW, PAIR, COLUMNS = 0, 1, 2, 3, 4, 7, 8
 UNUSED = np.where(np.arange(COLUMNS) == PAIR, -1.0, 0.0)
 
@@ -52,14 +54,14 @@ def _lower_end(s: ti.template(), e):
 
 @ti.func
 def _side(s: ti.template(), t, u, i, j):
-    """1 if triangle t belongs to side a and u to side b of a contact, else -1; i, j: the lowest vertices of what meets."""
+    """1 if triangle t is on side a of a contact and u on side b, else -1; i, j: the lowest vertices of what meets."""
     return ti.select(s.body[t] < s.body[u] or (s.body[t] == s.body[u] and i <= j), ti.cast(1.0, ti.f64), ti.cast(-1.0, ti.f64))
 
 
 @ti.func
 def _end_normal(p: ti.template(), m: ti.template(), s: ti.template(), o: ti.template(), c, lasting):
-    """Normal (3,) of contact c at the present positions, its gap [m], and whether its point lies on a smooth part of a surface, and
-    did so before. lasting: what the gap counts as where the normal does not change [m]."""
+    """Normal (3,) of contact c at the present positions, its gap [m], and whether its point lies on a smooth part of a surface now,
+    and did at first. lasting: what the gap counts as where the normal does not change [m]."""
     kind, one, other, n = p.feature[c][0], p.feature[c][1], p.feature[c][2], p.normal[c]
     end, gap, is_smooth, was_smooth = n, lasting, True, True
     vertex, face, e, f, side = -1, -1, -1, -1, ti.cast(1.0, ti.f64)
@@ -224,8 +226,16 @@ class Misplacement:
         part = abs(false) / max(slip, MIN_STEPS * largest)
         if part > self.part:
             self.part = part
-            if part > MAX_MISPLACED and abs(false_now) > MAX_MISPLACED * slip_now:
+            is_event, now = MIN_STEPS * largest > slip, abs(false_now) > MAX_MISPLACED * slip_now
+            if part > MAX_MISPLACED and now and not (is_event and self._share(row) < LEAST_SHARE):
                 self.text = self._describe(*divmod(int(pair), n), slip, false, friction)
+
+    def _share(self, row: int) -> float:
+        """Return the part that a row has of S of this step, of that of its two bodies in which it has more."""
+        n = len(self._detection.scene.colliders)
+        of, now = np.stack(np.divmod(self._sums[:, PAIR], n), axis=1), self._sums[:, NOW]
+        bodies = of[row][of[row] < len(self._detection.scene.bodies)]
+        return max(float(now[row] / now[(of == body).any(axis=1)].sum()) for body in bodies)
 
     def _describe(self, a: int, b: int, slip: float, false: float, friction: float) -> str:
         """Return a sentence about colliders a and b and the sums of their contacts."""

@@ -255,7 +255,7 @@ class Substepping:
                 new = contact.search_along_path(time, dt) if passes else new and not contact.paths.none_cross
             n_failed += not (result.converged or stepper.is_linear)
             # a slide by D over a radius R cuts D^2 / 2R deep, farther than contacts of the start keep surfaces apart: try again
-            failed = may_cut and n_failed >= MAX_FAILED and not contact.paths.are_round
+            failed = may_cut and n_failed >= MAX_FAILED and not contact.paths.are_round()
             hopeless = passes and (contact.paths.is_stuck or failed)
             if not (new or passes) or tries >= (MAX_PASSAGES if passes else MAX_SEARCHES) or hopeless:
                 simulation.set_state(*state)

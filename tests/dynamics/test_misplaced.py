@@ -1,7 +1,7 @@
 """What the contact normals of a step's start falsify is measured and reported.
 
-* a capsule that slides by D over a soft block: D / R of the force, as friction that is too large or a false drag, over many steps;
-  in steps of a tenth a tenth, which is not reported; a checkpoint keeps the sums;
+* a capsule that slides by D over a soft block: D / R of the force, as friction that is too large or a false drag; in steps of a
+  tenth a tenth, which is not reported; a checkpoint keeps the sums;
 * a box that slides over two boxes side by side is stopped at the seam, which is reported at once; over one box nothing is.
 """
 
