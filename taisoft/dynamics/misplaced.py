@@ -32,13 +32,13 @@ from taisoft.dynamics.simulation_state import SimulationState
 
 MAX_MISPLACED = 0.02  # of a pair's contact force: more is reported
 FADING, MIN_STEPS = 0.95, 10
-LEAST_SHARE = 0.2  # of S of a body in a step: where a pair has less, an event of few steps is not reported
+LEAST_SHARE = 0.2  # of the contact impulses on a body in a step: where a pair has less, an event of few steps is not reported
 AT_REST = 0.01  # of the contact offset: slip in a step below which a contact sticks
 LEFT = 0.5  # of the slip: distance beyond that of the linearised motion from which a point that stays at edges has left them
 PAIRS = 16  # rows at first
-# columns of the sums over steps: S, W, the work of friction, the largest S of a step; then S, W and friction of this step; the
-# pair, first collider * n_colliders + second, -1 in unused rows
-SLIP_WORK, FALSE_WORK, FRICTION_WORK, LARGEST, NOW, PAIR, COLUMNS = 0, 1, 2, 3, 4, 7, 8
+# columns of the sums over steps: S, W, the work of friction, the largest S of a step; then S, W, friction and impulse of this step;
+# the pair, first collider * n_colliders + second, -1 in unused rows
+SLIP_WORK, FALSE_WORK, FRICTION_WORK, LARGEST, NOW, IMPULSE, PAIR, COLUMNS = 0, 1, 2, 3, 4, 7, 8, 9
 UNUSED = np.where(np.arange(COLUMNS) == PAIR, -1.0, 0.0)
 
 
@@ -60,8 +60,8 @@ def _side(s: ti.template(), t, u, i, j):
 
 @ti.func
 def _end_normal(p: ti.template(), m: ti.template(), s: ti.template(), o: ti.template(), c, lasting):
-    """Normal (3,) of contact c at the present positions, its gap [m], and whether its point lies on a smooth part of a surface now,
-    and did at first. lasting: what the gap counts as where the normal does not change [m]."""
+    """Normal (3,) of contact c at the present positions, its gap [m], and whether its point lies on a smooth part of a surface
+    now, and did at first. lasting: what the gap counts as where the normal does not change [m]."""
     kind, one, other, n = p.feature[c][0], p.feature[c][1], p.feature[c][2], p.normal[c]
     end, gap, is_smooth, was_smooth = n, lasting, True, True
     vertex, face, e, f, side = -1, -1, -1, -1, ti.cast(1.0, ti.f64)
@@ -141,7 +141,7 @@ def add_step(
     n_colliders: ti.i32,
     sums: ti.types.ndarray(),
 ) -> ti.i32:
-    """Add a step of dt [s] to the sums (k,8) of pairs.
+    """Add a step of dt [s] to the sums (k,9) of pairs.
 
     Return the row of the pair of the largest misplaced part among those that touch, -1 if none does, -2 without change if there
     are too few rows. p.sweep_start is used as workspace.
@@ -156,7 +156,7 @@ def add_step(
     for _ in range(1):
         n_rows, row = sums.shape[0], 0
         for k in range(n_rows):
-            for q in ti.static(range(3)):
+            for q in ti.static(range(4)):
                 sums[k, NOW + q] = 0.0
         for c in range(p.count[0]):
             if p.sweep_start[c][0] > 0.0 and row < n_rows:
@@ -169,6 +169,7 @@ def add_step(
                     sums[row, PAIR] = own
                     for q in ti.static(range(3)):
                         sums[row, NOW + q] += p.sweep_start[c][q]
+                    sums[row, IMPULSE] += p.r[c].norm()
         largest = ti.cast(-1.0, ti.f64)
         for k in range(ti.select(row < n_rows, n_rows, 0)):
             own = sums[k, NOW]
@@ -197,7 +198,7 @@ class Misplacement:
         self.start_step()
 
     def snapshot(self) -> np.ndarray:
-        """Return the sums (k,8)."""
+        """Return the sums (k,9)."""
         return self._sums[self._sums[:, PAIR] >= 0.0]
 
     def restore(self, kept: np.ndarray) -> None:
@@ -222,7 +223,7 @@ class Misplacement:
             self._sums = np.concatenate([self._sums, np.tile(UNUSED, (len(self._sums), 1))])
         if row < 0:
             return
-        slip, false, friction, largest, slip_now, false_now, _, pair = self._sums[row].tolist()
+        slip, false, friction, largest, slip_now, false_now, *_, pair = self._sums[row].tolist()
         part = abs(false) / max(slip, MIN_STEPS * largest)
         if part > self.part:
             self.part = part
@@ -231,9 +232,9 @@ class Misplacement:
                 self.text = self._describe(*divmod(int(pair), n), slip, false, friction)
 
     def _share(self, row: int) -> float:
-        """Return the part that a row has of S of this step, of that of its two bodies in which it has more."""
+        """Return the part that a row has of the impulses of this step on its two bodies, that in which it has more."""
         n = len(self._detection.scene.colliders)
-        of, now = np.stack(np.divmod(self._sums[:, PAIR], n), axis=1), self._sums[:, NOW]
+        of, now = np.stack(np.divmod(self._sums[:, PAIR], n), axis=1), self._sums[:, IMPULSE]
         bodies = of[row][of[row] < len(self._detection.scene.bodies)]
         return max(float(now[row] / now[(of == body).any(axis=1)].sum()) for body in bodies)
 
