@@ -36,8 +36,8 @@ LEAST_SHARE = 0.2  # of the contact impulses on a body in a step: where a pair h
 AT_REST = 0.01  # of the contact offset: slip in a step below which a contact sticks
 LEFT = 0.5  # of the slip: distance beyond that of the linearised motion from which a point that stays at edges has left them
 PAIRS = 16  # rows at first
-# columns of the sums over steps: S, W, the work of friction, the largest S of a step; then S, W, friction and impulse of this step;
-# the pair, first collider * n_colliders + second, -1 in unused rows
+# columns of the sums over steps: S, W, the work of friction, the largest S of a step; then S, W, friction and impulse of this
+# step; the pair, first collider * n_colliders + second, -1 in unused rows
 SLIP_WORK, FALSE_WORK, FRICTION_WORK, LARGEST, NOW, IMPULSE, PAIR, COLUMNS = 0, 1, 2, 3, 4, 7, 8, 9
 UNUSED = np.where(np.arange(COLUMNS) == PAIR, -1.0, 0.0)
 
