@@ -225,6 +225,7 @@ def _merge(a: StepReport, b: StepReport) -> StepReport:
     b.n_contacts = max(a.n_contacts, b.n_contacts)
     b.dropped_contacts = max(a.dropped_contacts, b.dropped_contacts)
     b.crossings, b.deep = max(a.crossings, b.crossings), max(a.deep, b.deep)
+    b.contact_error = b.contact_error or a.contact_error
     b.converged = a.converged and b.converged
     b.problems = a.problems + b.problems
     return b
@@ -267,5 +268,12 @@ def _summarize_steps(report: RunReport) -> None:
             f"in {len(deep)} of {len(steps)} reported steps bodies penetrate; the worst, at t = {worst.time:.4g} s, "
             f"by {worst.max_penetration:.3g} m" + (f", with up to {crossings} crossing pairs of triangles" if crossings else "")
         )
-    if report.status == "ok" and (unconverged or inverted or dropped or deep or report.interrupted):
+    inexact = [s for s in steps if s.contact_error]
+    if inexact:
+        worst = max(inexact, key=lambda s: s.misplaced)
+        report.problems.append(
+            f"in {len(inexact)} of {len(steps)} reported steps contacts are inexact; at worst, at t = {worst.time:.4g} s, "
+            f"{worst.contact_error}"
+        )
+    if report.status == "ok" and (unconverged or inverted or dropped or deep or inexact or report.interrupted):
         report.status = "degraded"

@@ -22,7 +22,7 @@ from taisoft.collision.features import BY_EDGES, BY_FACES, BY_FIELD
 from taisoft.collision.intersections import Intersections, find_crossings
 from taisoft.collision.near_list import STILL
 from taisoft.collision.overlap import Containment, Inside
-from taisoft.collision.passages import append_passages
+from taisoft.collision.passages import ROUND, append_passages
 from taisoft.collision.path_check import NO_PASSAGES, PathCheck
 from taisoft.collision.spatial_hash import SpatialHash
 from taisoft.collision.surface import ACTIVE, NONFINITE, PAIRS, build_surface, move_obstacles, update_surface
@@ -30,7 +30,7 @@ from taisoft.errors import SceneError, SimulationError
 from taisoft.fem.model import Layout, Model
 from taisoft.mesh.quality import mean_surface_edge
 from taisoft.scene.connections import attached_pairs
-from taisoft.scene.obstacles import MeshObstacle
+from taisoft.scene.obstacles import MeshObstacle, Obstacle
 from taisoft.scene.plan import make_plan
 from taisoft.scene.scene import Scene
 
@@ -312,6 +312,11 @@ class Detection:
     def colliders_of(self, passages: np.ndarray) -> np.ndarray:
         """Return the two colliders (k,2) of each of the given passages (k,4)."""
         return self._paths.colliders(passages)
+
+    def are_round_and_move(self, passages: np.ndarray) -> bool:
+        """Return whether all of the given passages (k,4) are through spheres or capsules that move."""
+        moving = np.array([isinstance(c, Obstacle) and c.path is not None for c in self.scene.colliders])
+        return bool((passages[:, 0] == ROUND).all() and moving[self.colliders_of(passages)[:, 1]].all())
 
     def features_of(self, passages: np.ndarray) -> np.ndarray:
         """Return the vertices (k,6) of the features that meet in passages (k,4), see `PathCheck.features`."""

@@ -77,8 +77,8 @@ def _vertex(s: ti.template(), g: ti.template(), kind, a, b, k):
 
 
 @ti.func
-def _corner(s: ti.template(), o: ti.template(), g: ti.template(), kind, a, b, k, moves: ti.template()):
-    """Corner k of a pair and its displacement along the given field, (3,) each [m]."""
+def _corner(s: ti.template(), o: ti.template(), g: ti.template(), kind, a, b, k, moves: ti.template(), still):
+    """Corner k of a pair and its displacement along the given field, (3,) each [m]. still: 1 if obstacles stay, too."""
     i = _vertex(s, g, kind, a, b, k)
     now, move = dvec(0.0), dvec(0.0)
     if i >= 0:
@@ -86,30 +86,30 @@ def _corner(s: ti.template(), o: ti.template(), g: ti.template(), kind, a, b, k,
     elif ti.static(o.any):
         side = ti.select(k == 3, ti.cast(-1.0, ti.f64), ti.cast(1.0, ti.f64))
         now = _axis_end(o, b, side, 0)
-        move = _axis_end(o, b, side, 1) - now
+        move = _axis_end(o, b, side, 1 - still) - now
     return now, move
 
 
 @ti.func
-def _rows(s: ti.template(), o: ti.template(), g: ti.template(), kind, a, b, moves: ti.template()):
-    """Corners (6,3) of a pair and their displacements (6,3) along the given field [m]."""
+def _rows(s: ti.template(), o: ti.template(), g: ti.template(), kind, a, b, moves: ti.template(), still):
+    """Corners (6,3) of a pair and their displacements (6,3), as `_corner`."""
     x, p = corners(0.0), corners(0.0)
     for k in ti.static(range(6)):
-        now, move = _corner(s, o, g, kind, a, b, k, moves)
+        now, move = _corner(s, o, g, kind, a, b, k, moves, still)
         for q in ti.static(range(3)):
             x[k, q], p[k, q] = now[q], move[q]
     return x, p
 
 
 @ti.func
-def _separating_plane(s: ti.template(), o: ti.template(), g: ti.template(), kind, a, b, need, first):
+def _separating_plane(s: ti.template(), o: ti.template(), g: ti.template(), kind, a, b, still, need, first):
     """Number of a plane that keeps a pair at least `need` [m] apart, see `separating_plane`."""
-    d0, d = _corner(s, o, g, kind, a, b, 3, g.path)
-    x0, p = _corner(s, o, g, kind, a, b, 0, g.path)
-    x1, q = _corner(s, o, g, kind, a, b, 1, g.path)
-    x2, r = _corner(s, o, g, kind, a, b, 2, g.path)
-    x4, u = _corner(s, o, g, kind, a, b, 4, g.path)
-    x5, v = _corner(s, o, g, kind, a, b, 5, g.path)
+    d0, d = _corner(s, o, g, kind, a, b, 3, g.path, still)
+    x0, p = _corner(s, o, g, kind, a, b, 0, g.path, still)
+    x1, q = _corner(s, o, g, kind, a, b, 1, g.path, still)
+    x2, r = _corner(s, o, g, kind, a, b, 2, g.path, still)
+    x4, u = _corner(s, o, g, kind, a, b, 4, g.path, still)
+    x5, v = _corner(s, o, g, kind, a, b, 5, g.path, still)
     a0, b0, c0, e0, f0 = x0 - d0, x1 - d0, x2 - d0, x4 - d0, x5 - d0
     a1, b1, c1, e1, f1 = a0 + (p - d), b0 + (q - d), c0 + (r - d), e0 + (u - d), f0 + (v - d)
     return separating_plane(a0, b0, c0, e0, f0, a1, b1, c1, e1, f1, need, first, int(kind == NEAR))
@@ -182,6 +182,7 @@ def check_paths(
     near: listed pairs. limit, listed_limit [m]: see `prepare_paths`; beyond them, nothing is checked. floor [m]: to be kept.
     """
     prepare_paths(s, x, g, mode, limit, listed_limit, floor)
+    still = int(mode == STILL)
     ti.loop_config(serialize=s.serial)
     for task in range(s.chunks * s.spread):
         if task % s.spread == 0:
@@ -215,12 +216,12 @@ def check_paths(
                             checked = g.exempt[s.body[a] * s.n_bodies + o.body[b]] == 0
                     radius = _radius(o, kind, b)
                     if checked:
-                        found = _separating_plane(s, o, g, kind, a, b, floor + radius, plane)
+                        found = _separating_plane(s, o, g, kind, a, b, still, floor + radius, plane)
                         checked = found < 0
                         if e < n_near and found >= 0 and found != plane:
                             g.plane[hint_of(a, b)] = found
                     if checked:
-                        y, p = _rows(s, o, g, kind, a, b, g.path)
+                        y, p = _rows(s, o, g, kind, a, b, g.path, still)
                         time, features = free_until(y, p, radius, floor, mode != STILL)
                         if time < 1.0:
                             at = _write_passage(out.data, at, last, kind, a, b, features, time)
@@ -267,7 +268,7 @@ def append_passages(
             else:
                 corner = ivec([_vertex(s, g, kind, a, b, k) for k in ti.static(range(3))])
                 wall = ivec([_vertex(s, g, kind, a, b, k) for k in ti.static(range(3, 6))])
-                x, p = _rows(s, o, g, kind, a, b, s.move)
+                x, p = _rows(s, o, g, kind, a, b, s.move, 0)
                 y = x + times[r] * p  # stored: the compiler fails when an expression is indexed
                 u, v, offset = nearest_of(y, features)
                 n = unit(offset)

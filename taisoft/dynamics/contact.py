@@ -42,6 +42,7 @@ from taisoft.dynamics.contact_record import (
     write_rows,
 )
 from taisoft.dynamics.impact import Rebounds
+from taisoft.dynamics.misplaced import Misplacement
 from taisoft.dynamics.simulation_state import SimulationState
 from taisoft.errors import SimulationError
 from taisoft.scene.rigid import RigidBody
@@ -65,6 +66,7 @@ class ContactStep:
         self.detection = Detection(scene, m, simulation.layout, simulation.runtime, self_collision)
         self.measures = ContactMeasures(self.detection)
         self.paths = ContactPaths(simulation, self.detection)
+        self.misplaced = Misplacement(simulation, self.detection)
         d = self.detection
         self.contact_offset = CONTACT_OFFSET * float(d.edges[: len(scene.bodies)].min())
         if d.margin > 0.0:
@@ -118,6 +120,7 @@ class ContactStep:
     def forget(self) -> None:
         """Discard the search and the impulses of the last step, after the state was set."""
         self.return_to_start(none_crossed=False)
+        self.misplaced.forget()
 
     def return_to_start(self, none_crossed: bool) -> None:
         """Discard them after a step's start was restored. none_crossed: whether no surfaces are known to cross there."""
@@ -127,6 +130,7 @@ class ContactStep:
         self._impulse_sum = self._pair_sum = None
         self.last_crossing = Crossing()
         self.flight[:] = 0.0
+        self.misplaced.return_to_start()
         self.paths.return_to_start(none_crossed)
         self.crossing = 0.0 if none_crossed else None
 
@@ -149,6 +153,7 @@ class ContactStep:
             "dropped": self.dropped,
             "flight": self.flight.copy(),
             "paths": self.paths.snapshot(),
+            "misplaced": self.misplaced.snapshot(),
             "rows": read_rows(self.problem),
         }
 
@@ -164,6 +169,7 @@ class ContactStep:
         self.had_impact, self.dropped = bool(kept["met"]), int(kept["dropped"])
         self.flight[:] = kept["flight"]
         self.paths.restore(kept["paths"])
+        self.misplaced.restore(kept["misplaced"])
         self.crossing, self.last_crossing = 0.0 if self.paths.none_cross else None, Crossing()
         self._searched = self._measured_end = None
         self._indexed = True  # so that the next step rebuilds the node index, even without contacts
@@ -258,6 +264,7 @@ class ContactStep:
         self._substep_fraction, self._step_dt, self.dropped = 1.0, dt, 0
         self._impulse_sum = self._pair_sum = None
         self.paths.start_step()
+        self.misplaced.start_step()
 
     def start_substep(self, dt: float) -> None:
         """Begin a substep of dt, or begin it again with another length."""
@@ -265,7 +272,9 @@ class ContactStep:
         self.paths.begin()
 
     def end_substep(self) -> None:
-        """Add the impulses of a substep; check the paths of colliders that do not cross any more."""
+        """Add the impulses of a substep, and what they misplace; check the paths of colliders that do not cross any more."""
+        if self.n_contacts and not self._explicit:
+            self.misplaced.add(self.problem, self._substep_fraction * self._step_dt, self.contact_offset)
         if not self.paths.none_cross:
             self.paths.exempt_crossing()
         if self._substep_fraction < 1.0:

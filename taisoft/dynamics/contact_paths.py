@@ -37,6 +37,7 @@ class ContactPaths:
         self._names: set[str] = set()  # and their names
         self._n_unchanged = 0  # checks in a row that found no pairs but those held already
         self._held = self._held_before = NO_PASSAGES
+        self._found = NO_PASSAGES.pairs  # at the last check
         n_bodies = len(detection.scene.bodies)
         n, group = connected_components(attached_pairs(detection.scene)[:n_bodies, :n_bodies])
         self._attached = [np.flatnonzero(group == k) for k in range(n) if (group == k).sum() > 1]  # move as one if held back
@@ -97,9 +98,14 @@ class ContactPaths:
         self.uncovered = found is None
         if found is None:
             return True
+        self._found = found[0]
         if len(found[0]):
             self._hold(*found)
         return len(found[0]) > 0
+
+    def are_round(self) -> bool:
+        """Whether all passages of the last check are through spheres or capsules that move."""
+        return self._detection.are_round_and_move(self._found)
 
     def _hold(self, pairs: np.ndarray, times: np.ndarray) -> None:
         """Hold passages and the parts of the step until which they are apart; those of the same features once."""

@@ -141,6 +141,7 @@ class Dynamics:
             report.n_contacts, report.max_penetration = contact.n_contacts, contact.penetration
             report.dropped_contacts, report.deep = contact.dropped, int(contact.is_deep)
             report.crossings = contact.last_crossing.n_pairs
+            report.misplaced, report.contact_error = contact.misplaced.part, contact.misplaced.text
         return report
 
     def _problems(self, report: StepReport) -> list[str]:
@@ -157,6 +158,8 @@ class Dynamics:
                 f"'{a}' and '{b}' overlap by {depth:.3g} m" if a != b else f"parts of '{a}' overlap by {depth:.3g} m"
                 for a, b, depth in self.contact.last_crossing.inside
             ]
+        if report.contact_error:
+            found.append(report.contact_error)
         if report.n_inverted:
             found.append(f"{report.n_inverted} tets are inverted")
         return found

@@ -276,7 +276,9 @@ class Substepping:
                 # contacts unknown so far matter only if something could have crossed
                 new = contact.search_along_path(time, dt) if passes else new and not contact.paths.none_cross
             n_failed += not (result.converged or stepper.is_linear)
-            hopeless = stepper.is_spent() or (passes and (contact.paths.is_stuck or (may_cut and n_failed >= MAX_FAILED)))
+            # a slide by D over a radius R cuts D^2 / 2R deep, farther than contacts of the start keep surfaces apart: try again
+            failed = may_cut and n_failed >= MAX_FAILED and not contact.paths.are_round()
+            hopeless = stepper.is_spent() or (passes and (contact.paths.is_stuck or failed))
             if not (new or passes) or tries >= (MAX_PASSAGES if passes else MAX_SEARCHES) or hopeless:
                 simulation.set_state(*state)
                 if passes:

@@ -60,7 +60,7 @@ def test_the_report_holds_the_run(written):
     assert extremes["residual"] == dict(zip(keys, (1, 1e-9, 1e-7, 0.1, 0.3)))
     assert (extremes["kinetic"]["not_finite"], extremes["n_inverted"]["max"]) == (1, 2)
     assert (extremes["reports"], extremes["not_converged"]) == (3, 1)
-    assert {f.name for f in dataclasses.fields(StepReport)} - {"time", "converged", "problems"} <= set(extremes)
+    assert {f.name for f in dataclasses.fields(StepReport)} - {"time", "converged", "problems", "contact_error"} <= set(extremes)
     assert record["versions"]["python"] == platform.python_version()
     assert all(record["versions"][package][0].isdigit() for package in ("taisoft", "taichi", "numpy", "scipy", "usd-core"))
     assert record["machine"]["cores"] >= 1 and record["machine"]["cpu"] and record["machine"]["name"] == platform.node()

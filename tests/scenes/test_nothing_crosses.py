@@ -89,6 +89,16 @@ def test_a_thin_sheet_thrown_at_itself():
         assert max(r.n_contacts for r in reports) > 10
 
 
+def test_a_capsule_is_shot_at_a_sheet():
+    scene = ts.Scene(gravity=(0, 0, 0))
+    sheet = scene.add_body(ts.box_mesh((1, 8, 8), (0.02, 0.6, 0.6)), DAMPED, name="sheet")
+    sheet.fix(lambda x: abs(x[:, 1]) > 0.29)
+    rod = ts.Capsule((-0.06, 0, -0.2), (-0.06, 0, 0.2), 0.02)
+    scene.add_obstacle(rod, name="rod", path=ts.KeyFrames([0.0, 0.025], [(0, 0, 0), (0.25, 0, 0)]))
+    with ts.Simulator(scene, dt=1 / 120) as sim:
+        assert max(r.max_penetration for r in judged(sim, 3)) < 1e-6 and sim.positions("sheet")[:, 0].max() > 0.2
+
+
 def test_a_moving_obstacle_pushes_a_cube():
     """A wall that moves and turns, and then stops and turns faster."""
     scene = ts.Scene()

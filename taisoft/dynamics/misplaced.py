@@ -1,0 +1,249 @@
+"""What it falsifies that a step uses the contact normals of its start.
+
+The impulse r of a contact should act along the normal n' of the step's end, but acts along that of its start, n. If R turns n
+into n', the force r - R r is misplaced. It matters as it brakes or drives the slip u of the step:
+    W = sum (r - R r).u   against   S = sum |r| max(|u|, contact offset)
+over the contacts of a pair. Sliding by D over a radius R makes W / S = D / R: friction seems larger by (1 + mu^2) D / R of the
+normal force, or a body without friction drags. At a seam, the edge of the neighbouring box stops what should slide over it.
+Where nothing slides the force follows from balance, whatever the normal, and W is 0.
+
+A contact whose point has left a face over an edge held until then, and counts as right.
+
+Both sums fade by FADING with every step in which the pair touches, and a step counts no more than a MIN_STEPS-th of all: one
+impact on an edge may turn a force by 20 %, a slide over many steps by no more than 2 %. What grazes beside larger forces on both
+bodies for a few steps is not reported.
+
+Weak: the work of a force that is misplaced across the slip is 0; contacts with distance fields of bodies count as right.
+"""
+
+import numpy as np
+import taichi as ti
+
+from taisoft.backend.runtime import kernel
+from taisoft.collision.contacts import EDGE_EDGE, FACE_FACE, VERTEX_FACE
+from taisoft.collision.detector import Detection
+from taisoft.collision.end_normals import nearest_of_edges, normal_at, normal_on_shape
+from taisoft.collision.features import FLAT_COSINE
+from taisoft.collision.passages import ADJACENT, N_FEATURES, N_KINDS, NEAR
+from taisoft.collision.surface import dvec
+from taisoft.contact.build import relative_velocity
+from taisoft.contact.problem import ContactProblem, to_world
+from taisoft.dynamics.simulation_state import SimulationState
+
+MAX_MISPLACED = 0.02  # of a pair's contact force: more is reported
+FADING, MIN_STEPS = 0.95, 10
+LEAST_SHARE = 0.2  # of the contact impulses on a body in a step: where a pair has less, an event of few steps is not reported
+AT_REST = 0.01  # of the contact offset: slip in a step below which a contact sticks
+LEFT = 0.5  # of the slip: distance beyond that of the linearised motion from which a point that stays at edges has left them
+PAIRS = 16  # rows at first
+# columns of the sums over steps: S, W, the work of friction, the largest S of a step; then S, W, friction and impulse of this
+# step; the pair, first collider * n_colliders + second, -1 in unused rows
+SLIP_WORK, FALSE_WORK, FRICTION_WORK, LARGEST, NOW, IMPULSE, PAIR, COLUMNS = 0, 1, 2, 3, 4, 7, 8, 9
+UNUSED = np.where(np.arange(COLUMNS) == PAIR, -1.0, 0.0)
+
+
+@ti.func
+def _lowest(s: ti.template(), t):
+    return ti.min(s.triangle[t, 0], s.triangle[t, 1], s.triangle[t, 2])
+
+
+@ti.func
+def _lower_end(s: ti.template(), e):
+    return ti.min(s.triangle[e // 3, e % 3], s.triangle[e // 3, (e % 3 + 1) % 3])
+
+
+@ti.func
+def _side(s: ti.template(), t, u, i, j):
+    """1 if triangle t is on side a of a contact and u on side b, else -1; i, j: the lowest vertices of what meets."""
+    return ti.select(s.body[t] < s.body[u] or (s.body[t] == s.body[u] and i <= j), ti.cast(1.0, ti.f64), ti.cast(-1.0, ti.f64))
+
+
+@ti.func
+def _end_normal(p: ti.template(), m: ti.template(), s: ti.template(), o: ti.template(), c, lasting):
+    """Normal (3,) of contact c at the present positions, its gap [m], and whether its point lies on a smooth part of a surface
+    now, and did at first. lasting: what the gap counts as where the normal does not change [m]."""
+    kind, one, other, n = p.feature[c][0], p.feature[c][1], p.feature[c][2], p.normal[c]
+    end, gap, is_smooth, was_smooth = n, lasting, True, True
+    vertex, face, e, f, side = -1, -1, -1, -1, ti.cast(1.0, ti.f64)
+    if kind == VERTEX_FACE:
+        vertex, face = one, other
+        side = _side(s, s.ring[s.ring_start[one]], other, one, _lowest(s, other))
+    elif kind == EDGE_EDGE:
+        e, f, side = one, other, _side(s, one // 3, other // 3, _lower_end(s, one), _lower_end(s, other))
+    elif kind == FACE_FACE and one % N_KINDS == NEAR:
+        t, u, k = one // N_KINDS, other // N_FEATURES, other % N_FEATURES
+        side = _side(s, t, u, _lowest(s, t), _lowest(s, u))
+        if k >= 6:
+            e, f = 3 * t + (k - 6) // 3, 3 * u + (k - 6) % 3
+        elif k < 3:
+            vertex, face = s.triangle[t, k], u
+        else:
+            vertex, face, side = s.triangle[u, k - 3], t, -side
+    elif kind != FACE_FACE or one % N_KINDS != ADJACENT:
+        if ti.static(o.any):
+            x = dvec(0.0)
+            for k in range(p.arity[c]):
+                x += p.weight[c, k] * m.state.x[p.node[c, k]]
+            v, d, flag, before = normal_on_shape(o, p.body[c][1], x, n)
+            if v.dot(v) > 0.0:
+                end, gap, is_smooth, was_smooth = v, d, flag, before
+    own, foot, first, second, n_points = dvec(0.0), dvec(0.0), face, -1, int(vertex >= 0)
+    if vertex >= 0:
+        own = s.x[vertex]
+    if e >= 0:
+        x, y, across, is_inner = nearest_of_edges(s, e, f)
+        across = ti.select(across.dot(n) < 0.0, -across, across)
+        height = side * (x - y).dot(across)
+        if is_inner and height <= 0.0:  # they have passed each other
+            end, gap = across, height
+        else:
+            own, foot, first, second, n_points = x, y, f // 3, e // 3, 2
+    least = ti.cast(2.0, ti.f64)
+    for k in range(n_points):  # of two edges, each must be the nearest to the other: else one of their faces is
+        t = ti.select(k == 0, first, second)
+        v, d, flag = normal_at(s, ti.select(k == 0, own, foot), t)
+        v *= ti.select(k == 0, side, -side)
+        if v.dot(n) < least:
+            end, gap, is_smooth, least = v, d, flag, v.dot(n)
+            cosine = ti.abs(s.normal[t].dot(n))
+            if e >= 0:
+                u = s.neighbour[t, ti.select(k == 0, f, e) % 3]
+                if u >= 0:
+                    cosine = ti.max(cosine, ti.abs(s.normal[u].dot(n)))
+            was_smooth = cosine > ti.cast(FLAT_COSINE, ti.f64)
+    return end, gap, is_smooth, was_smooth
+
+
+@ti.func
+def _false_work(p: ti.template(), m: ti.template(), s: ti.template(), o: ti.template(), c, dt, contact_offset):
+    """What contact c adds to S, W and the work of friction of its pair, (3,) [J s], at the end of a step of dt [s]."""
+    n, r, false = p.normal[c], to_world(p, c, p.r[c]), dvec(0.0)
+    u = dt * relative_velocity(p, m, c, dt)
+    lasting = p.gap[c] + u.dot(n)
+    slip, across = u - u.dot(n) * n, r - r.dot(n) * n
+    if slip.norm() > ti.cast(AT_REST, ti.f64) * contact_offset:
+        end, gap, is_smooth, was_smooth = _end_normal(p, m, s, o, c, lasting)
+        left = ti.select(was_smooth, ti.cast(0.0, ti.f64), ti.cast(LEFT, ti.f64) * slip.norm())
+        if is_smooth or gap - lasting <= left:
+            turned = across - end.dot(across) / ti.max(1.0 + n.dot(end), 1e-6) * (n + end)
+            false = r.dot(n) * (n - end) + across - turned
+    return dvec(r.norm() * ti.max(slip.norm(), contact_offset), false.dot(slip), ti.abs(across.dot(slip)))
+
+
+@kernel(cse=False)
+def add_step(
+    p: ti.template(),
+    m: ti.template(),
+    s: ti.template(),
+    o: ti.template(),
+    dt: ti.f64,
+    contact_offset: ti.f64,
+    n_colliders: ti.i32,
+    sums: ti.types.ndarray(),
+) -> ti.i32:
+    """Add a step of dt [s] to the sums (k,9) of pairs.
+
+    Return the row of the pair of the largest misplaced part among those that touch, -1 if none does, -2 without change if there
+    are too few rows. p.sweep_start is used as workspace.
+    """
+    ti.loop_config(serialize=p.serial)
+    for c in range(p.count[0]):
+        p.sweep_start[c] = dvec(0.0)
+        if p.r[c][0] > 0.0:
+            p.sweep_start[c] = _false_work(p, m, s, o, c, dt, contact_offset)
+    worst = -1
+    ti.loop_config(serialize=True)
+    for _ in range(1):
+        n_rows, row = sums.shape[0], 0
+        for k in range(n_rows):
+            for q in ti.static(range(4)):
+                sums[k, NOW + q] = 0.0
+        for c in range(p.count[0]):
+            if p.sweep_start[c][0] > 0.0 and row < n_rows:
+                own = ti.cast(p.body[c][0] * n_colliders + p.body[c][1], ti.f64)
+                if sums[row, PAIR] != own:  # contacts of a pair mostly follow each other
+                    row = 0
+                    while row < n_rows and sums[row, PAIR] != own and sums[row, PAIR] >= 0.0:
+                        row += 1
+                if row < n_rows:
+                    sums[row, PAIR] = own
+                    for q in ti.static(range(3)):
+                        sums[row, NOW + q] += p.sweep_start[c][q]
+                    sums[row, IMPULSE] += p.r[c].norm()
+        largest = ti.cast(-1.0, ti.f64)
+        for k in range(ti.select(row < n_rows, n_rows, 0)):
+            own = sums[k, NOW]
+            if own > 0.0:
+                for q in range(3):
+                    sums[k, q] = FADING * sums[k, q] + sums[k, NOW + q]
+                sums[k, LARGEST] = ti.max(FADING * sums[k, LARGEST], own)
+                part = ti.abs(sums[k, FALSE_WORK]) / ti.max(sums[k, SLIP_WORK], MIN_STEPS * sums[k, LARGEST])
+                if part > largest:
+                    worst, largest = k, part
+        if row == n_rows:
+            worst = -2
+    return worst
+
+
+class Misplacement:
+    """Contact forces of a simulation's pairs that the normals of steps' starts misplace."""
+
+    def __init__(self, simulation: SimulationState, detection: Detection):
+        self._simulation, self._detection = simulation, detection
+        self.forget()
+
+    def forget(self) -> None:
+        """Discard all sums, after a state was set."""
+        self.restore(np.zeros((0, COLUMNS)))
+        self.start_step()
+
+    def snapshot(self) -> np.ndarray:
+        """Return the sums (k,9)."""
+        return self._sums[self._sums[:, PAIR] >= 0.0]
+
+    def restore(self, kept: np.ndarray) -> None:
+        """Restore a `snapshot`."""
+        self._sums = np.concatenate([kept, np.tile(UNUSED, (PAIRS, 1))])
+
+    def start_step(self) -> None:
+        """Begin a step."""
+        self.part, self.text = 0.0, ""  # largest misplaced part in this step, and a sentence if that is too much
+        self._start = self._sums.copy()
+
+    def return_to_start(self) -> None:
+        """Discard what was added since the step began."""
+        self._sums = self._start
+        self.start_step()
+
+    def add(self, p: ContactProblem, dt: float, contact_offset: float) -> None:
+        """Add a substep of dt [s], whose end was searched last."""
+        d, n = self._detection, len(self._detection.scene.colliders)
+        records = p, self._simulation.model, d.surface, d.shapes
+        while (row := add_step(*records, dt, contact_offset, n, self._sums)) == -2:
+            self._sums = np.concatenate([self._sums, np.tile(UNUSED, (len(self._sums), 1))])
+        if row < 0:
+            return
+        slip, false, friction, largest, slip_now, false_now, *_, pair = self._sums[row].tolist()
+        part = abs(false) / max(slip, MIN_STEPS * largest)
+        if part > self.part:
+            self.part = part
+            is_event, now = MIN_STEPS * largest > slip, abs(false_now) > MAX_MISPLACED * slip_now
+            if part > MAX_MISPLACED and now and not (is_event and self._share(row) < LEAST_SHARE):
+                self.text = self._describe(*divmod(int(pair), n), slip, false, friction)
+
+    def _share(self, row: int) -> float:
+        """Return the part that a row has of the impulses of this step on its two bodies, that in which it has more."""
+        n = len(self._detection.scene.colliders)
+        of, now = np.stack(np.divmod(self._sums[:, PAIR], n), axis=1), self._sums[:, IMPULSE]
+        bodies = of[row][of[row] < len(self._detection.scene.bodies)]
+        return max(float(now[row] / now[(of == body).any(axis=1)].sum()) for body in bodies)
+
+    def _describe(self, a: int, b: int, slip: float, false: float, friction: float) -> str:
+        """Return a sentence about colliders a and b and the sums of their contacts."""
+        names = [f"'{self._detection.scene.colliders[k].name}'" for k in (a, b)]
+        where = f"within {names[0]}" if a == b else f"between {names[0]} and {names[1]}"
+        if abs(false) < friction:
+            size = "large" if false < 0.0 else "small"
+            return f"friction {where} may be {100.0 * abs(false) / friction:.2g} % too {size}: smaller steps"
+        what = "drag" if false < 0.0 else "push"
+        return f"{100.0 * abs(false) / slip:.2g} % of the contact force {where} may be a false {what}: smaller steps"
