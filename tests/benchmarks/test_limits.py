@@ -78,6 +78,6 @@ def test_bytes_of_an_explicit_step_agree_with_a_count_by_hand():
         n, t, sizes = sim.scene.bodies[0].n_nodes, 20, sim.field_bytes
         elements = 24 * n + t * (16 + 36 + 4 + 1) + 48 * t  # x; nodes, Dm_inv, volume, one body per four tets; element_force
         assert floor_bytes(["elements"], sizes) == elements
-        drift, nodes = n * (24 + 12 + 12 + 24 + 12), 48 * t + 4 * (n + 1) + 16 * t + n * (4 + 12 + 12 + 12 + 12)
+        drift, nodes = n * (24 + 24 + 12 + 24 + 24), 48 * t + 4 * (n + 1) + 16 * t + n * (4 + 24 + 12 + 12 + 24)
         assert floor_bytes(["drift", "elements", "nodes"], sizes) == drift + elements + nodes
         assert group_bytes(sim) == dict.fromkeys(GROUPS, 0) | {GROUPS[0]: sum(sizes.values())}

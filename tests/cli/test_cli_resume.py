@@ -89,7 +89,8 @@ def test_two_parts_draw_the_pictures_of_one_run(tmp_path):
 
 def test_a_run_interrupted_between_frames_continues(tmp_path):
     """Implicit runs can stop after any step: step 28 of 48 lies in the middle of frame 4."""
-    raising = "import signal; signal.raise_signal(2) if 27.8 < 240 * t < 28.2 else None\n    return (0, -t, 0)"
+    raising = "import signal\n    if 27.8 < 240 * t < 28.2 and not hasattr(path, 'pressed'):\n        path.pressed = True\n"
+    raising += "        signal.raise_signal(2)\n    return (0, -t, 0)"
     implicit = ("--set", "solver.integrator=implicit_euler", "--seconds", "0.2", "--no-frames")
     path, out, single = tmp_path / "scene.py", tmp_path / "out", tmp_path / "single"
     write(path, LED_BY_SPRING.replace("{body}", raising))
