@@ -12,6 +12,7 @@ mass damping in M (v - v_hat). However loosely a stage is solved, its v is corre
 In a linearly implicit step the arms are those of its start, and the forces f - beta K v, whose moment is beta sum_i f_i x v_i.
 """
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -29,7 +30,7 @@ if TYPE_CHECKING:
 LIMIT = 0.01  # of the forces on a piece: a larger mean residual of a linearised step means wrong motion
 NEGLIGIBLE_MOMENTUM = 1e-9  # of a piece's momentum and forces: momentum error that a step may always make
 MEAN_ROUNDING = 4.0  # times the rounding of a mean residual
-ROW = 256  # nodes of a partial sum
+ROW = 256  # least nodes of a partial sum: of larger scenes, the root of all nodes
 ROUNDED = 1e-12  # sum of the weights of an element of springs, between points of bodies: 0 but for rounding
 
 
@@ -70,9 +71,10 @@ class Pieces:
         self._names, self.body = [names[k] for k in np.argsort(number)], self.body[np.argsort(number)]
         component, piece = component[np.argsort(number)], number[piece]
         self.of_node = piece
-        rows = [-(-count // ROW) for count in np.bincount(piece, minlength=n)]
+        length = max(ROW, math.isqrt(n_nodes))
+        rows = [-(-count // length) for count in np.bincount(piece, minlength=n)]
         first = np.concatenate([[0], np.cumsum(np.bincount(piece, minlength=n))])
-        starts = np.concatenate([first[k] + ROW * np.arange(rows[k]) for k in range(n)] + [[n_nodes]])
+        starts = np.concatenate([first[k] + length * np.arange(rows[k]) for k in range(n)] + [[n_nodes]])
         piece_row = np.concatenate([[0], np.cumsum(rows)])
         n_components, n_rows = int(component.max()) + 1, int(piece_row[-1])
 

@@ -105,7 +105,7 @@ def _is_dependent(m: ti.template(), i):
 def _in_contact(p: ti.template(), k: ti.template()):
     """Mark the components in contact as held, as a top-level loop of a kernel."""
     if ti.static(k.any):
-        ti.loop_config(serialize=True)
+        ti.loop_config(serialize=k.problem.serial)
         for c in range(k.problem.count[0]):
             for j in range(k.problem.arity[c]):
                 p.held[p.component[k.problem.node[c, j]]] = 1
@@ -121,6 +121,7 @@ def correct_rigid_motion(
     is corrected, too; LINEARISED, after a linearised one; BEFORE, at the start of one, whose x stays until AFTER adds CG's y.
     """
     linear = ti.static(mode != SOLVED)
+    ti.loop_config(serialize=m.serial)
     for j in range(p.n_components):
         p.held[j] = p.anchored[j]
     _in_contact(p, k)
