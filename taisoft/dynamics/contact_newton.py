@@ -283,12 +283,12 @@ def solve(system: StageSystem, stage: Stage) -> StageResult:
 def solve_linearised(system: StageSystem, stage: Stage) -> StageResult:
     """Solve the frictional problem alone, at the present state; on a projected matrix if its own is indefinite."""
     tolerance = stage.linear_tolerance or LINEARISED_FORCING
-    solves = min(LINEARISED_SOLVES, system.budget.left)
-    problem, linear = replace(stage, max_newton=solves, linear_tolerance=tolerance), 0
+    linear = 0
     r, scale = system.evaluate_start(new_multipliers=True)
     for projected in (False, True):
         system.linearise()
-        found = solve_linear(system, problem, r, scale)
+        solves = min(LINEARISED_SOLVES, system.budget.left)
+        found = solve_linear(system, replace(stage, max_newton=solves, linear_tolerance=tolerance), r, scale)
         linear += found.linear
         system.budget.spend(found.solves)
         if not found.negative or projected:

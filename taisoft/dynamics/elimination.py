@@ -55,7 +55,7 @@ def eliminate(system: StageSystem, stage: Stage, r: float) -> Eliminated | None:
         return None
     residual, free = download([system.work.residual, system.model.free])
     lists = system.lists
-    nodes = choose_nodes(free * residual, lists.start, lists.column)
+    nodes = choose_nodes(free * residual * system.pieces.node_weights()[:, None], lists.start, lists.column)
     return None if nodes is None else solve_on(system, stage, nodes, REDUCTION * r)
 
 

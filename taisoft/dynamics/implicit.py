@@ -213,9 +213,9 @@ class ImplicitStepper:
 
     def hold_substep(self, time: float, dt: float) -> StageResult:
         """Take a substep in which only what is prescribed moves."""
-        self.take_substep(time, dt)
+        result = self.take_substep(time, dt)
         self._return_in_part(0.0)
-        return StageResult(0.0, 0, 0.0, False, False)
+        return StageResult(0.0, 0, 0.0, False, False, imbalance=result.imbalance)
 
     def hold_back_inverted(self) -> float:
         """Shorten the motion of the last substep until no more tets are inverted than at its start; return what is left of it."""

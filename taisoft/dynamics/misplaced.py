@@ -1,4 +1,4 @@
-"""What it falsifies that a step uses the contact normals of its start.
+"""Contact forces that act along the normals of a step's start instead of its end.
 
 The impulse r of a contact should act along the normal n' of the step's end, but acts along that of its start, n. If R turns n
 into n', the force r - R r is misplaced. It matters as it brakes or drives the slip u of the step:
@@ -204,6 +204,7 @@ class Misplacement:
     def restore(self, kept: np.ndarray) -> None:
         """Restore a `snapshot`."""
         self._sums = np.concatenate([kept, np.tile(UNUSED, (PAIRS, 1))])
+        self._start = self._sums.copy()
 
     def start_step(self) -> None:
         """Begin a step."""

@@ -199,6 +199,7 @@ class Multipliers:
 
     def _solve_bordered(self, system: "StageSystem", tolerance: float) -> LinearResult:
         m, w, A, chosen = system.model, system.work.pcg, system.matrix, self._candidates
+        system.pieces.forget_factors()
         G, right, penalty = self._rows(system.stage.beta, chosen), w.rhs.host.copy(), self._penalty[chosen]
         inverse = block_inverse(A.diagonal.to_numpy(), m.free.to_numpy())
         if inverse is None:

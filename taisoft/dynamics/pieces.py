@@ -53,7 +53,8 @@ class PieceWork:
     norms: Any  # (n, N_SUMS) f64
     sums: Any  # (n_rows, N_TERMS) f64: scratch
     anchored: Any  # (n_components) i32: 1 if forces from outside other than loads act on it
-    held: Any  # (n_components) i32: scratch, `anchored` or in contact
+    pressed: Any  # (n_components) i32: 1 if pressures act on it, which change in a linearised step
+    held: Any  # (n_components) i32: scratch, state of `correct_rigid_motion`
     moments: Any  # (n_components, N_MOMENTS) f64: scratch: mass, centre, resultant, constraints by axis
     motion: Any  # (n_components, 6) f64: correction, velocity of the centre and angular velocity
 
@@ -66,11 +67,20 @@ class Pieces:
         piece, names, self.body = _pieces(simulation)
         n_nodes, n = len(piece), len(names)
         anchored, component = _components(simulation, piece, n)
+        pressed = np.zeros(len(anchored), dtype=np.int32)
+        pressed[component[[bool(simulation.scene.bodies[k].pressures) for k in self.body]]] = 1
+        self.anchored = anchored > 0
         order = np.argsort(component[piece] * n + piece, kind="stable")
         number = np.unique(component * n + np.arange(n), return_inverse=True)[1]  # of each piece, by component
         self._names, self.body = [names[k] for k in np.argsort(number)], self.body[np.argsort(number)]
         component, piece = component[np.argsort(number)], number[piece]
-        self.of_node = piece
+        self.of_node, self._component = piece, component[piece]
+        self._independent = np.ones(n_nodes, dtype=bool)
+        if simulation.dependents is not None:
+            self._independent[simulation.dependents.node] = False
+        layout = simulation.layout
+        first_node = np.concatenate([b.nodes.elements[:, 0] + s for b, s in zip(simulation.scene.bodies, layout.node_start)])
+        self.of_lane = piece[first_node[layout.tet_of_lane]]
         length = max(ROW, math.isqrt(n_nodes))
         rows = [-(-count // length) for count in np.bincount(piece, minlength=n)]
         first = np.concatenate([[0], np.cumsum(np.bincount(piece, minlength=n))])
@@ -100,6 +110,7 @@ class Pieces:
             norms=numbers("norms", (n, N_SUMS)),
             sums=numbers("sums", (n_rows, N_TERMS)),
             anchored=ids("anchored", anchored),
+            pressed=ids("pressed", pressed),
             held=ids("held", anchored),
             moments=numbers("moments", (n_components, N_MOMENTS)),
             motion=numbers("motion", (n_components, 6)),
@@ -113,6 +124,12 @@ class Pieces:
     def node_weights(self) -> np.ndarray:
         """Return 1 / s_p of each node's piece (n_nodes,)."""
         return np.sqrt(self.work.weight.to_numpy())[self.of_node]
+
+    def any_free(self, free: np.ndarray) -> bool:
+        """Return whether some component is free along some axis, but for contacts. free: (n_nodes, 3), 0 on constrained axes."""
+        held = (free == 0.0) & self._independent[:, None]
+        fixed = [np.bincount(self._component, held[:, axis], len(self.anchored)) for axis in range(3)]
+        return bool(((np.array(fixed) == 0.0) & ~self.anchored).any())
 
     def forget_weights(self) -> None:
         """Let all pieces count alike, and linear solves without factors."""
@@ -181,7 +198,8 @@ def _components(simulation: SimulationState, piece: np.ndarray, n: int) -> tuple
     if dependents is not None:
         links.append((np.repeat(dependents.node, np.diff(dependents.start)), dependents.master))
     if table is not None:
-        links.append((table.node[table.start[table.element]], table.node))
+        line = table.line[table.element]  # one tension couples all elements of a line
+        links.append((table.node[np.searchsorted(line, line)], table.node))
         fixed = np.abs(np.bincount(table.element, table.weight, len(table.kind))) > ROUNDED
         # the damping of a spring without length need not act along it, and then has a moment
         fixed |= table.is_isotropic & (table.damping > 0.0)

@@ -8,8 +8,10 @@ from taisoft.fem.dependents import place_all
 from taisoft.fem.lanes import mass_times
 from taisoft.fem.terms import rayleigh_damping
 
-N_SUMS, N_MOMENTS, N_TERMS = 5, 10, 12  # columns of a piece's norms, of a component's first moments, of scratch
+N_SUMS, N_MOMENTS, N_TERMS = 5, 10, 24  # columns of a piece's norms, of a component's first moments, of scratch
 SOLVED, LINEARISED, BEFORE, AFTER = range(4)  # modes of `correct_rigid_motion`
+FREE, HELD, INERT = range(3)  # states of a component; INERT: free, and turned by inertia alone
+LEAST_INERTIA = 0.25  # of a body's inertia that must remain beside the stiffness of its stress, or that is left out
 MASS, CENTRE, RESULTANT, FIXED = 0, 1, 4, 7  # columns of these moments; FIXED: constraints by axis
 
 
@@ -75,11 +77,20 @@ def undo_factors(m: ti.template(), w: ti.template(), p: ti.template()):
 
 
 @ti.func
-def _effective_mass(m: ti.template(), i, beta):
-    """Mass of node i with mass damping over a stage: d(M (v - v_hat))/dv [kg]."""
-    mass = ti.cast(m.mass[i], ti.f64)
+def _damping_factor(m: ti.template(), i, beta):
+    """Derivative of v - v_hat plus mass damping over a stage by v."""
+    factor = ti.cast(1.0, ti.f64)
     if ti.static(m.damped):
-        mass *= 1.0 + beta * ti.cast(rayleigh_damping.mass_rate(m, i), ti.f64)
+        factor += beta * ti.cast(rayleigh_damping.mass_rate(m, i), ti.f64)
+    return factor
+
+
+@ti.func
+def _row_sum(m: ti.template(), i):
+    """Sum of row i of the mass matrix [kg]."""
+    mass = ti.cast(m.mass[i], ti.f64)
+    if ti.static(m.consistent):
+        mass = ti.cast(m.gravity_mass[i], ti.f64)
     return mass
 
 
@@ -90,6 +101,12 @@ def _velocity(m: ti.template(), s: ti.template(), i, mode: ti.template()):
     if ti.static(mode == AFTER):
         v += ti.cast(s.pcg.y[i], ti.f64)
     return v
+
+
+@ti.func
+def _turning(p: ti.template(), j):
+    """Angular velocity of the correction of component j."""
+    return ti.Vector([p.motion[j, 3], p.motion[j, 4], p.motion[j, 5]])
 
 
 @ti.func
@@ -108,7 +125,95 @@ def _in_contact(p: ti.template(), k: ti.template()):
         ti.loop_config(serialize=k.problem.serial)
         for c in range(k.problem.count[0]):
             for j in range(k.problem.arity[c]):
-                p.held[p.component[k.problem.node[c, j]]] = 1
+                p.held[p.component[k.problem.node[c, j]]] = HELD
+
+
+@ti.func
+def _resultant(m: ti.template(), s: ti.template(), p: ti.template(), x: ti.template(), row, beta):
+    """Add up a row of nodes: mass, its first moment, resultant of inertia and loads, and constraints by axis."""
+    sums = ti.Vector.zero(ti.f64, N_MOMENTS)
+    for at in range(p.row_start[row], p.row_start[row + 1]):
+        i = p.node[at]
+        if not _is_dependent(m, i):
+            mass, fixed = _damping_factor(m, i, beta) * _row_sum(m, i), 1.0 - ti.cast(m.free[i], ti.f64)
+            q = mass_times(m, i, s.change) - beta * ti.cast(loads_on(m, i), ti.f64)
+            sums[MASS] += mass
+            for a in ti.static(range(3)):
+                sums[CENTRE + a] += mass * x[i][a]
+                sums[RESULTANT + a] += q[a]
+                sums[FIXED + a] += fixed[a]
+    for j in ti.static(range(N_MOMENTS)):
+        p.sums[row, j] = sums[j]
+
+
+@ti.func
+def _moment(m: ti.template(), s: ti.template(), p: ti.template(), x: ti.template(), mode: ti.template(), row, beta):
+    """Add up a row of nodes: moment of inertia and loads, moments of inertia; in linearised steps the moment of beta f x v, and its
+    derivative by a turning."""
+    identity = ti.Matrix.identity(ti.f64, 3)
+    moment, I = ti.Vector.zero(ti.f64, 3), ti.Matrix.zero(ti.f64, 3, 3)
+    geometric, turn = ti.Vector.zero(ti.f64, 3), ti.Matrix.zero(ti.f64, 3, 3)
+    for at in range(p.row_start[row], p.row_start[row + 1]):
+        i = p.node[at]
+        if not _is_dependent(m, i):
+            j = p.component[i]
+            c = ti.Vector([p.moments[j, CENTRE], p.moments[j, CENTRE + 1], p.moments[j, CENTRE + 2]])
+            arm = x[i] - c
+            q = mass_times(m, i, s.change) - beta * ti.cast(loads_on(m, i), ti.f64)
+            if ti.static(m.stiffness_damping):
+                q -= beta * ti.cast(damping_force(m, s, row, i, m.state.v), ti.f64)
+                if ti.static(mode == AFTER):
+                    q -= beta * ti.cast(damping_force(m, s, row, i, s.pcg.y), ti.f64)
+            moment += arm.cross(q)
+            mass_arm = _damping_factor(m, i, beta) * (mass_times(m, i, x) - _row_sum(m, i) * c)
+            I += arm.dot(mass_arm) * identity - mass_arm.outer_product(arm)
+            if ti.static(mode != SOLVED):
+                f = ti.cast(internal_on(m, i), ti.f64)
+                first = p.node[p.row_start[p.component_row[j]]]  # its velocity has no moment, but that of the forces' rounding
+                geometric -= beta * beta * f.cross(_velocity(m, s, i, mode) - _velocity(m, s, first, mode))
+                turn -= beta * beta * (f.dot(arm) * identity - arm.outer_product(f))
+    for a in ti.static(range(3)):
+        p.sums[row, a], p.sums[row, 3 + a] = moment[a], geometric[a]
+        for b in ti.static(range(3)):
+            p.sums[row, 6 + 3 * a + b], p.sums[row, 15 + 3 * a + b] = I[a, b], turn[a, b]
+
+
+@ti.func
+def _is_definite(A):
+    """Whether a symmetric matrix is positive definite."""
+    return A[0, 0] > 0.0 and A[0, 0] * A[1, 1] > A[0, 1] * A[1, 0] and A.determinant() > 0.0
+
+
+@ti.func
+def _find_turning(p: ti.template(), j):
+    """Set the angular velocity that balances component j, about the axes across which no node is constrained.
+
+    Compression can make a linearised step turn a body without bound; its matrix is then nearly singular, and only inertia counts.
+    """
+    total = ti.Vector.zero(ti.f64, N_TERMS)
+    for row in range(p.component_row[j], p.component_row[j + 1]):
+        for q in ti.static(range(N_TERMS)):
+            total[q] += p.sums[row, q]
+    moment, I = ti.Vector([total[0], total[1], total[2]]), ti.Matrix.zero(ti.f64, 3, 3)
+    turn = ti.Matrix.zero(ti.f64, 3, 3)
+    for a in ti.static(range(3)):
+        for b in ti.static(range(3)):
+            I[a, b], turn[a, b] = total[6 + 3 * a + b], total[15 + 3 * a + b]
+    if _is_definite((1.0 - LEAST_INERTIA) * I + turn):
+        moment += ti.Vector([total[3], total[4], total[5]])
+        I += turn
+    elif p.held[j] == FREE:
+        p.held[j] = INERT
+    fixed = ti.Vector([p.moments[j, FIXED], p.moments[j, FIXED + 1], p.moments[j, FIXED + 2]])
+    if p.held[j] != HELD:
+        if fixed.sum() == 0.0:
+            w = I.inverse() @ moment
+            for a in ti.static(range(3)):
+                p.motion[j, 3 + a] = -w[a]
+        else:
+            for a in ti.static(range(3)):
+                if fixed[(a + 1) % 3] + fixed[(a + 2) % 3] == 0.0:
+                    p.motion[j, 3 + a] = -moment[a] / I[a, a]
 
 
 @kernel
@@ -120,33 +225,19 @@ def correct_rigid_motion(
     x: positions of the arms, at which elements and terms hold the forces. mode: SOLVED, after a nonlinear stage, whose residual
     is corrected, too; LINEARISED, after a linearised one; BEFORE, at the start of one, whose x stays until AFTER adds CG's y.
     """
-    linear = ti.static(mode != SOLVED)
     ti.loop_config(serialize=m.serial)
     for j in range(p.n_components):
         p.held[j] = p.anchored[j]
+        if ti.static(mode != SOLVED):
+            p.held[j] = ti.max(p.anchored[j], p.pressed[j])
     _in_contact(p, k)
     ti.loop_config(serialize=m.serial)
     for i in range(m.n_nodes):
         u = _velocity(m, s, i, mode)
-        s.change[i] = u - s.v_hat[i]
-        if ti.static(m.damped):
-            s.change[i] += beta * ti.cast(rayleigh_damping.mass_rate(m, i), ti.f64) * u
+        s.change[i] = _damping_factor(m, i, beta) * u - s.v_hat[i]
     ti.loop_config(serialize=m.serial)
     for row in range(p.n_rows):
-        sums = ti.Vector.zero(ti.f64, N_MOMENTS)
-        for at in range(p.row_start[row], p.row_start[row + 1]):
-            i = p.node[at]
-            if _is_dependent(m, i):
-                continue
-            mass, fixed = _effective_mass(m, i, beta), 1.0 - ti.cast(m.free[i], ti.f64)
-            q = mass_times(m, i, s.change) - beta * loads_on(m, i)
-            sums[MASS] += mass
-            for a in ti.static(range(3)):
-                sums[CENTRE + a] += mass * x[i][a]
-                sums[RESULTANT + a] += q[a]
-                sums[FIXED + a] += fixed[a]
-        for j in ti.static(range(N_MOMENTS)):
-            p.sums[row, j] = sums[j]
+        _resultant(m, s, p, x, row, beta)
     ti.loop_config(serialize=m.serial)
     for j in range(p.n_components):
         for q in ti.static(range(N_MOMENTS)):
@@ -157,73 +248,36 @@ def correct_rigid_motion(
         for a in ti.static(range(3)):
             p.moments[j, CENTRE + a] = p.moments[j, CENTRE + a] / p.moments[j, MASS]
             p.motion[j, a], p.motion[j, 3 + a] = 0.0, 0.0
-            if p.held[j] == 0 and p.moments[j, FIXED + a] == 0.0:
+            if p.held[j] == FREE and p.moments[j, FIXED + a] == 0.0:
                 p.motion[j, a] = -p.moments[j, RESULTANT + a] / p.moments[j, MASS]
     ti.loop_config(serialize=m.serial)
     for row in range(p.n_rows):
-        moment, I, turn = ti.Vector.zero(ti.f64, 3), ti.Matrix.zero(ti.f64, 3, 3), ti.Matrix.zero(ti.f64, 3, 3)
-        for at in range(p.row_start[row], p.row_start[row + 1]):
-            i = p.node[at]
-            if _is_dependent(m, i):
-                continue
-            j = p.component[i]
-            arm = x[i] - ti.Vector([p.moments[j, CENTRE], p.moments[j, CENTRE + 1], p.moments[j, CENTRE + 2]])
-            mass = _effective_mass(m, i, beta)
-            q = mass_times(m, i, s.change) - beta * loads_on(m, i)
-            if ti.static(m.stiffness_damping):
-                q -= beta * ti.cast(damping_force(m, s, row, i, m.state.v), ti.f64)
-                if ti.static(mode == AFTER):
-                    q -= beta * ti.cast(damping_force(m, s, row, i, s.pcg.y), ti.f64)
-            moment += arm.cross(q)
-            I += mass * (arm.dot(arm) * ti.Matrix.identity(ti.f64, 3) - arm.outer_product(arm))
-            if ti.static(linear):
-                f = ti.cast(internal_on(m, i), ti.f64)
-                first = p.node[p.row_start[p.component_row[j]]]  # its velocity has no moment, but that of the forces' rounding
-                moment -= beta * beta * f.cross(_velocity(m, s, i, mode) - _velocity(m, s, first, mode))
-                turn -= beta * beta * (f.dot(arm) * ti.Matrix.identity(ti.f64, 3) - arm.outer_product(f))
-        for a in ti.static(range(3)):
-            p.sums[row, a] = moment[a]
-            for b in ti.static(range(3)):
-                p.sums[row, 3 + 3 * a + b] = I[a, b] + turn[a, b]
+        _moment(m, s, p, x, mode, row, beta)
     ti.loop_config(serialize=m.serial)
     for j in range(p.n_components):
-        moment, I = ti.Vector.zero(ti.f64, 3), ti.Matrix.zero(ti.f64, 3, 3)
-        for row in range(p.component_row[j], p.component_row[j + 1]):
-            for a in ti.static(range(3)):
-                moment[a] += p.sums[row, a]
-                for b in ti.static(range(3)):
-                    I[a, b] += p.sums[row, 3 + 3 * a + b]
-        fixed = ti.Vector([p.moments[j, FIXED], p.moments[j, FIXED + 1], p.moments[j, FIXED + 2]])
-        if p.held[j] == 0:
-            if fixed.sum() == 0.0:
-                w = I.inverse() @ moment
-                for a in ti.static(range(3)):
-                    p.motion[j, 3 + a] = -w[a]
-            else:
-                for a in ti.static(range(3)):
-                    if fixed[(a + 1) % 3] + fixed[(a + 2) % 3] == 0.0:
-                        p.motion[j, 3 + a] = -moment[a] / I[a, a]
+        _find_turning(p, j)
     ti.loop_config(serialize=m.serial)
     for i in range(m.n_nodes):
         j, change = p.component[i], ti.Vector.zero(ti.f64, 3)
-        if p.held[j] == 0 and not _is_dependent(m, i):
-            centre = ti.Vector([p.moments[j, CENTRE], p.moments[j, CENTRE + 1], p.moments[j, CENTRE + 2]])
-            w = ti.Vector([p.motion[j, 3], p.motion[j, 4], p.motion[j, 5]])
-            change = ti.Vector([p.motion[j, 0], p.motion[j, 1], p.motion[j, 2]]) + w.cross(x[i] - centre)
-            change *= ti.cast(m.free[i], ti.f64)
-            mass = _effective_mass(m, i, beta)
-            if mass > 0.0:
-                s.change[i] = s.change[i] + mass / ti.cast(m.mass[i], ti.f64) * change
-            if ti.static(not linear):
-                s.residual[i] = s.residual[i] + ti.cast(mass * change, m.real)
+        if p.held[j] != HELD and not _is_dependent(m, i):
+            c = ti.Vector([p.moments[j, CENTRE], p.moments[j, CENTRE + 1], p.moments[j, CENTRE + 2]])
+            u, w = ti.Vector([p.motion[j, 0], p.motion[j, 1], p.motion[j, 2]]), _turning(p, j)
+            free, factor = ti.cast(m.free[i], ti.f64), _damping_factor(m, i, beta)
+            if ti.static(mode == SOLVED):
+                momentum = _row_sum(m, i) * (u - w.cross(c)) + w.cross(mass_times(m, i, x))
+                s.residual[i] = s.residual[i] + ti.cast(free * factor * momentum, m.real)
+            change = free * (u + w.cross(x[i] - c))
+            s.change[i] = s.change[i] + factor * change
         moved = change
         if ti.static(mode == AFTER):
             change += ti.cast(s.pcg.y[i], ti.f64)
             moved = change + ti.cast(m.free[i], ti.f64) * m.state.v[i]
         m.state.v[i] = m.state.v[i] + change
-        if ti.static(mode != BEFORE):
-            m.state.x[i] = m.state.x[i] + beta * moved
+        s.moved[i] = beta * moved
     if ti.static(mode != BEFORE):
+        ti.loop_config(serialize=m.serial)
+        for i in range(m.n_nodes):
+            m.state.x[i] = m.state.x[i] + s.moved[i]
         place_all(m)
 
 
@@ -232,9 +286,8 @@ def turn_forces(m: ti.template(), s: ti.template(), p: ti.template(), beta: ti.f
     """Add to residual and rhs the change of internal forces by the turning of `correct_rigid_motion` BEFORE a linearised step."""
     ti.loop_config(serialize=m.serial)
     for i in range(m.n_nodes):
-        j = p.component[i]
-        w = ti.Vector([p.motion[j, 3], p.motion[j, 4], p.motion[j, 5]])
-        if not _is_dependent(m, i):
-            r = s.residual[i] - ti.cast(beta * beta * w.cross(ti.cast(internal_on(m, i), ti.f64)), m.real)
+        if p.held[p.component[i]] == FREE and not _is_dependent(m, i):
+            f = ti.cast(internal_on(m, i), ti.f64)
+            r = s.residual[i] - ti.cast(beta * beta * _turning(p, p.component[i]).cross(f), m.real)
             s.residual[i] = r
             s.pcg.rhs[i] = -m.free[i] * r

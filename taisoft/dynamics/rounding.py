@@ -37,7 +37,7 @@ class RoundingFloor:
         strain = eps + np.finfo(np.float64).eps * largest * g  # rounding of F, and of the f64 positions it is computed from
         squares = (stiffness * volume * g * strain) ** 2
         self.force = float(np.sqrt(squares.sum()))
-        self.force_by_body = np.sqrt(np.bincount(body, squares.sum(axis=1)))
+        self.piece_force = np.sqrt(np.bincount(self.pieces.of_lane, squares.reshape(-1), len(self.pieces.body)))
         # rounding of v = (x - x_hat) / beta: |M| times the rounding of x, still to be divided by beta
         self.position = 4.0 * float(np.finfo(np.float64).eps) * largest
         self.mass = float(np.linalg.norm(mass) * self.position)
@@ -48,15 +48,15 @@ class RoundingFloor:
         return beta * self.force + c * self.mass / beta
 
     def of_pieces(self, c: float, beta: float) -> np.ndarray:
-        """Return that of each piece (n,) [N s]; pieces of one body share its forces."""
-        return beta * self.force_by_body[self.pieces.body] + c * self.piece_mass / beta
+        """Return that of each piece (n,) [N s]."""
+        return beta * self.piece_force + c * self.piece_mass / beta
 
     def snapshot(self) -> dict:
         """Return the numbers, which depend on the state where they were measured."""
-        by_part = {"force_by_body": self.force_by_body, "piece_mass": self.piece_mass}
+        by_part = {"piece_force": self.piece_force, "piece_mass": self.piece_mass}
         return {"force": self.force, "position": self.position, "mass": self.mass, **by_part}
 
     def restore(self, kept: dict) -> None:
         """Restore a `snapshot`."""
         self.force, self.position, self.mass = (float(kept[name]) for name in ("force", "position", "mass"))
-        self.force_by_body, self.piece_mass = np.array(kept["force_by_body"]), np.array(kept["piece_mass"])
+        self.piece_force, self.piece_mass = np.array(kept["piece_force"]), np.array(kept["piece_mass"])

@@ -47,6 +47,7 @@ class StageWork:
     prescribed_acceleration: Any  # (n_prescribed) f64 3-vectors, only with a consistent mass
     n_prescribed: Count
     change: Any  # f64: velocity change that the mass multiplies, see `set_change`
+    moved: Any  # f64: displacement by `correct_rigid_motion`
     damper: Any  # BlockCsr or None
     pieces: Any  # PieceWork
     pcg: PcgWork  # right side -r; y, the change of v in a Newton step; subset, the nodes that move

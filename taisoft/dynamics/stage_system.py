@@ -138,6 +138,7 @@ class StageSystem:
             prescribed_acceleration=arena.vectors("prescribed_acceleration", ti.f64, k) if k and model.consistent else None,
             n_prescribed=k,
             change=arena.vectors("change", ti.f64, n),
+            moved=arena.vectors("moved", ti.f64, n),
             damper=self.damper,
             pieces=self.pieces.work,
             pcg=build_pcg(model, arena),
@@ -313,7 +314,7 @@ class StageSystem:
     def evaluate_start(self, new_multipliers: bool = False) -> tuple[float, float]:
         """Return (|r|, scale) of the first iterate, with its weights of pieces."""
         found = self.evaluate(new_multipliers=new_multipliers)
-        if not self.pieces.several:
+        if not (self.pieces.several and math.isfinite(found[0])):
             return found
         self._weigh()
         return self.evaluate(None)
@@ -340,18 +341,21 @@ class StageSystem:
     def balance_rigid_motion(self) -> None:
         """Balance free components as a whole, see `pieces`; the elastic forces are those at the end, or of the linearisation."""
         stage, m, w = self.stage, self.model, self.work
-        if stage.c == 0.0 or (stage.linearised and m.has_pressure):  # follower loads change in a linearised step
+        if stage.c == 0.0 or not self._any_free():
             return
         x = self._k.x_linear if stage.linearised else m.state.x
         correct_rigid_motion(
             m, w, self.pieces.work, self._k, x, rigid_balance.LINEARISED if stage.linearised else SOLVED, stage.beta
         )
 
+    def _any_free(self) -> bool:
+        return self.pieces.any_free(self.model.free.host if self.model.on_cpu else self.model.free.to_numpy())
+
     def begin_linearised_step(self) -> tuple[float, float]:
         """Begin a linearised step without contacts by the rigid motion of its free components; return (|r|, scale)."""
         m, w, p, beta = self.model, self.work, self.pieces.work, self.stage.beta
         found = self.evaluate_start()
-        if m.has_pressure:
+        if not self._any_free():
             return found
         correct_rigid_motion(m, w, p, NO_CONTACTS, m.state.x, BEFORE, beta)
         found = self.evaluate(None)
@@ -361,7 +365,7 @@ class StageSystem:
     def take_linearised_step(self) -> tuple[float, float]:
         """Take the whole step along y; return (|r|, scale)."""
         m, w = self.model, self.work
-        if m.has_pressure:
+        if not self._any_free():
             return self.evaluate(STEP)
         correct_rigid_motion(m, w, self.pieces.work, NO_CONTACTS, m.state.x, AFTER, self.stage.beta)
         return self.evaluate(STAY)

@@ -129,7 +129,7 @@ class Substepping:
                 stepper.return_to_start(already_undone=True)
                 may_retry = self.may_retry
                 stepper.forget()
-                if substeps == 1 or not isinstance(error, SimulationError):
+                if substeps == 1 or stepper.is_spent() or not isinstance(error, SimulationError):
                     raise
                 self.may_retry = may_retry  # only a retry failed
             if result is not None:

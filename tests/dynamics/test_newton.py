@@ -168,7 +168,7 @@ def test_a_checkpoint_holds_the_rounding_floor(scene, tmp_path):
 
     def floor(made) -> list[float]:
         rounding = made.stepper.solver.rounding
-        return [rounding.position, *rounding.force_by_body, *rounding.piece_mass]
+        return [rounding.position, *rounding.piece_force, *rounding.piece_mass]
 
     path = tmp_path / "c.npz"
     with dynamics(scene, **LOOSE) as made:

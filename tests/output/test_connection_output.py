@@ -121,7 +121,7 @@ def test_usd_holds_curves(moved, tmp_path):
     for index in range(3):
         sim.step()
         writer.frame(sim, index)
-        wanted.append((lines.points(sim.positions(), sim.time), sim.tensions()))
+        wanted.append((sim.time, lines.points(sim.positions(), sim.time), sim.tensions()))
     writer.close()
     stage = Usd.Stage.Open(str(tmp_path / "scene.usdc"))
     assert faults(stage) == []
@@ -131,12 +131,13 @@ def test_usd_holds_curves(moved, tmp_path):
         assert list(curve.GetCurveVertexCountsAttr().Get()) == [rows.stop - rows.start]
         tension = UsdGeom.PrimvarsAPI(curve).GetPrimvar("tension")
         assert tension.GetInterpolation() == "uniform"
-        for index, (points, tensions) in enumerate(wanted):
-            own = np.array(curve.GetPointsAttr().Get(index))
+        for time, points, tensions in wanted:
+            code = 30.0 * (time - wanted[0][0])
+            own = np.array(curve.GetPointsAttr().Get(code))
             assert np.array_equal(own, points[rows].astype(np.float32))
-            low, high = np.array(curve.GetExtentAttr().Get(index))
+            low, high = np.array(curve.GetExtentAttr().Get(code))
             assert (low < own.min(axis=0)).all() and (high > own.max(axis=0)).all()
-            assert list(tension.Get(index)) == [np.float32(tensions[name])]
+            assert list(tension.Get(code)) == [np.float32(tensions[name])]
 
 
 def stand_in(k: int) -> SimpleNamespace:
