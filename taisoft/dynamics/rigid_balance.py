@@ -148,8 +148,9 @@ def _resultant(m: ti.template(), s: ti.template(), p: ti.template(), x: ti.templ
 
 @ti.func
 def _moment(m: ti.template(), s: ti.template(), p: ti.template(), x: ti.template(), mode: ti.template(), row, beta):
-    """Add up a row of nodes: moment of inertia and loads, moments of inertia; in linearised steps the moment of beta f x v, and its
-    derivative by a turning."""
+    """Add up a row of nodes: moment of inertia and loads, moments of inertia; linearised, the moment of beta f x v, and its
+    derivative by a turning.
+    """
     identity = ti.Matrix.identity(ti.f64, 3)
     moment, I = ti.Vector.zero(ti.f64, 3), ti.Matrix.zero(ti.f64, 3, 3)
     geometric, turn = ti.Vector.zero(ti.f64, 3), ti.Matrix.zero(ti.f64, 3, 3)
