@@ -131,7 +131,6 @@ class SurfaceMesh:
             )
         return [INWARD] if not found and self.volume < 0.0 else found
 
-
     def _cracks_text(self) -> str:
         """Return how wide cracks are, and what welds them; nothing if there are none."""
         widths = crack_widths(self.vertices, self.triangles)
