@@ -103,8 +103,8 @@ def order_times(results: Path) -> str:
 def peers(results: Path) -> str:
     """taisoft and other programs at equal error, without the stiff beams."""
     numbers = newest(results, "peers")
-    used = [numbers["versions"][name] for name in ("mujoco-core", "pybullet", "newton")]
-    programs = "MuJoCo {}, PyBullet {}, Newton {}".format(*used)
+    found = {"mujoco-core": numbers["versions"].get("mujoco")} | numbers["versions"]  # packages of MuJoCo to 4.0.0 and from 4.0.1
+    programs = "MuJoCo {}, PyBullet {}, Newton {}".format(*(found[name] for name in ("mujoco-core", "pybullet", "newton")))
     shown = [one for one in numbers["comparisons"] if not one["stiff"]]
     return compare_table(shown) + measured_on(numbers, programs)
 

@@ -10,7 +10,6 @@ interrupted.
 """
 
 import dataclasses
-import errno
 import json
 import math
 import zipfile
@@ -35,6 +34,10 @@ if TYPE_CHECKING:
 
 KIND, FORMAT = "taisoft checkpoint", 16  # increment FORMAT with every change of a file's content
 PARTS = ("settings", "numbers", "start", "fingerprint", "state", "notes")  # of the header, each a table
+
+
+class _UnfitContent(Exception):
+    """Says in words for users what is wrong with a file, which errors of NumPy and zipfile do not."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -163,19 +166,19 @@ def _checksum(header: np.ndarray, arrays: dict[str, np.ndarray]) -> np.ndarray:
 
 
 def _check_sizes(path: Path) -> None:
-    """Raise ValueError if arrays claim more bytes than the file has. A damaged header could otherwise exhaust memory."""
+    """Raise _UnfitContent if arrays claim more bytes than the file has. A damaged header could otherwise exhaust memory."""
     size = path.stat().st_size
     with zipfile.ZipFile(path) as archive:
         declared = sum(info.file_size for info in archive.infolist())  # np.savez does not compress
         if declared > size:
-            raise ValueError(f"{declared} bytes are declared, but the file has {size}")
+            raise _UnfitContent(f"{declared} bytes are declared, but the file has {size}")
         for info in archive.infolist():
             with archive.open(info) as member:
                 version = np.lib.format.read_magic(member)
                 read_header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
                 shape, _, dtype = read_header(member)
                 if math.prod(shape) * dtype.itemsize > info.file_size:
-                    raise ValueError(f"an array of shape {shape} is declared, but it has {info.file_size} bytes")
+                    raise _UnfitContent(f"an array of shape {shape} is declared, but it has {info.file_size} bytes")
 
 
 def _contents(path: Path) -> tuple[dict, dict[str, np.ndarray]]:
@@ -184,6 +187,8 @@ def _contents(path: Path) -> tuple[dict, dict[str, np.ndarray]]:
         file = np.load(path, allow_pickle=False)
     except FileNotFoundError:
         raise SimulationError(f"{path}: no such checkpoint") from None
+    except OSError as error:  # with a file's name where the system refuses it
+        raise _no_checkpoint(path, error.strerror if error.filename else error) from None
     except Exception as error:  # NumPy and zipfile raise many types for foreign or truncated files
         raise _no_checkpoint(path, error) from None
     if not isinstance(file, np.lib.npyio.NpzFile):
@@ -219,19 +224,16 @@ def _contents(path: Path) -> tuple[dict, dict[str, np.ndarray]]:
     return header, arrays
 
 
-def _no_checkpoint(path: Path, reason) -> SimulationError:
+def _no_checkpoint(path: Path, reason: Exception | str) -> SimulationError:
     return SimulationError(f"{path} is no checkpoint of taisoft, or damaged: {_sentence(reason)}")
 
 
-def _damaged(path: Path, reason) -> SimulationError:
+def _damaged(path: Path, reason: Exception | str) -> SimulationError:
     return SimulationError(f"{path} is damaged: {_sentence(reason)}")
 
 
-def _sentence(reason) -> str:
-    """Return a reason given as text unchanged, and an exception's where this module or the system raised it."""
-    text = reason if isinstance(reason, str) else getattr(reason, "strerror", None) or " ".join(str(reason).split())
-    own = isinstance(reason, str) or getattr(reason, "errno", None) not in (None, errno.EINVAL) or "declared" in text
-    return text if own else "expected arrays in a zip archive, as taisoft writes them"
+def _sentence(reason: Exception | str) -> str:
+    return str(reason) if isinstance(reason, str | _UnfitContent) else "expected arrays in a zip archive, as taisoft writes them"
 
 
 # --- methods of Simulator -----------------------------------------------------------------------------------------------

@@ -26,7 +26,7 @@ LONG_STEP, LOOK_EVERY = 1.0, 0.2  # wall time from which an implicit step is lon
 
 
 class _StepStopped(Exception):
-    """`stop` said so within a step."""
+    """The run was stopped within a step."""
 
 
 class _LongStep:

@@ -121,8 +121,8 @@ def _check(scene: Scene, tolerance: float) -> None:
         raise SceneError(f"tolerance = {tolerance!r}: it must lie between 0 and 1")
     if scene.obstacles and scene.contact_forces:
         raise SceneError(
-            f"solve_static does not model contact, so the scene must have no obstacles ('{scene.obstacles[0].name}'): step it "
-            "to rest with mass damping instead"
+            f"solve_static models no contact, and '{scene.obstacles[0].name}' is an obstacle: take implicit_euler steps with "
+            "mass_damping in the materials until the bodies rest (contact_forces = False would solve another problem)"
         )
     held = {body.name: np.any([c.axes for c in body.constraints], axis=0) for body in scene.bodies if body.constraints}
     for names in _connected(scene):

@@ -156,6 +156,7 @@ def command_parser() -> argparse.ArgumentParser:
 
     option = add("info", ("files", "info"), "report a mesh file's counts, size, quality and problems").add_argument
     option("mesh", metavar="MESH", help="tetrahedra in any format that meshio reads, a surface, or a USD stage")
+    option("--weld", type=float, metavar="D", help="first merge vertices at most this far apart, in the file's unit")
 
     option = add("tetrahedralize", ("files", "fill"), "fill a surface with tets (extra 'mesh')").add_argument
     option("surface", metavar="SURFACE", help="an .obj, .stl, .ply or .off file of triangles")

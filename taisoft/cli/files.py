@@ -11,7 +11,7 @@ import numpy as np
 from taisoft.cli import Signals, printed_warnings
 from taisoft.cli.scene_file import load_scene
 from taisoft.cli.units import MILLIMETRE, MILLIMETRES_ABOVE, longest_side, warn_millimetres
-from taisoft.errors import OutputError, SceneError
+from taisoft.errors import MeshError, OutputError, SceneError
 from taisoft.mesh.files import WRITERS, check_ending, read_mesh, write_mesh
 from taisoft.mesh.placing import place, underside
 from taisoft.mesh.quality import edge_lengths, mean_ratio
@@ -42,11 +42,13 @@ def info(arguments: Namespace) -> int:
         warnings.simplefilter("ignore", UserWarning)  # they are listed as problems below
         ending = Path(arguments.mesh).suffix.lower()
         if ending in FORMATS:
-            found = {arguments.mesh: _describe_surface(read_surface(arguments.mesh))}
+            found = {arguments.mesh: _describe_surface(read_surface(arguments.mesh, arguments.weld or 0.0), arguments.weld)}
         elif ending in USD_FORMATS:
+            if arguments.weld is not None:
+                raise MeshError(f"{arguments.mesh}: the meshes of a USD stage are not welded, so --weld is for other files")
             found = {f"{arguments.mesh}: {name}": describe(mesh) for name, mesh in read_usd(arguments.mesh).items()}
         else:
-            found = {arguments.mesh: describe(read_mesh(arguments.mesh))}
+            found = {arguments.mesh: describe(read_mesh(arguments.mesh, weld=arguments.weld))}
     for title, lines in found.items():
         _print_lines(title, lines)
     return 0
@@ -113,13 +115,14 @@ def describe(mesh: TetMesh) -> list[tuple[str, str]]:
     ]
 
 
-def _describe_surface(surface: SurfaceMesh) -> list[tuple[str, str]]:
+def _describe_surface(surface: SurfaceMesh, weld: float | None) -> list[tuple[str, str]]:
     """Return (name, text) lines about a surface, why it does not bound a solid, and how to fill it with tets."""
     a, b, c = np.moveaxis(surface.vertices[surface.triangles], 1, 0)
     lengths = np.concatenate([np.linalg.norm(p - q, axis=1) for p, q in ((a, b), (b, c), (c, a))])
     counts = f"{len(surface.vertices)} vertices, {len(surface.triangles)} triangles, {_pieces(surface.n_pieces)}; no tets"
     scale = MILLIMETRE.split() if longest_side(surface.vertices) > MILLIMETRES_ABOVE else []
-    command = shlex.join([surface.source, *scale, "--out", f"{Path(surface.source).stem}.msh"])
+    welded = [] if weld is None else ["--weld", f"{weld:g}"]
+    command = shlex.join([surface.source, *welded, *scale, "--out", f"{Path(surface.source).stem}.msh"])
     return [
         *_size_lines(counts, surface.vertices),
         ("area", f"{surface.area:.6g}"),

@@ -96,6 +96,7 @@ class ContactStep:
         self._step_dt = 0.0  # of the last step [s]
         self._impulse_fraction = 1.0
         self._own_sides: tuple[np.ndarray, np.ndarray] | None = None  # nodes of contacts before dependent ones were replaced
+        self._search_counts = 0, 0  # contacts before the reduction and unmapped triangles of the search for the last substep
         self._rigid = np.array([isinstance(one, RigidBody) for one in scene.colliders], dtype=np.int32)
         self.had_impact = False  # whether surfaces met in the last step
         self.dropped = 0  # triangles of the last step under an inverted tet, for which a distance field gives no contacts
@@ -126,6 +127,7 @@ class ContactStep:
         """Discard them after a step's start was restored. none_crossed: whether no surfaces are known to cross there."""
         self._searched = self._measured_end = None
         self.problem.count[0] = 0
+        self._search_counts = 0, 0
         self._last_time = self.penetration = self.relative_penetration = self._step_dt = 0.0
         self._impulse_sum = self._pair_sum = None
         self.last_crossing = Crossing()
@@ -151,6 +153,8 @@ class ContactStep:
             "relative_penetration": self.relative_penetration,
             "met": self.had_impact,
             "dropped": self.dropped,
+            "found": self._search_counts[0],
+            "unmapped": self._search_counts[1],
             "flight": self.flight.copy(),
             "paths": self.paths.snapshot(),
             "misplaced": self.misplaced.snapshot(),
@@ -167,6 +171,7 @@ class ContactStep:
         self._pair_sum = None if kept["pairs"] is None else (kept["pairs"], kept["pair_sum"])
         self.relative_penetration = float(kept["relative_penetration"])
         self.had_impact, self.dropped = bool(kept["met"]), int(kept["dropped"])
+        self._search_counts = int(kept["found"]), int(kept["unmapped"])
         self.flight[:] = kept["flight"]
         self.paths.restore(kept["paths"])
         self.misplaced.restore(kept["misplaced"])
@@ -179,7 +184,7 @@ class ContactStep:
         self._searched = self._measured_end = None
         self.paths.undo()
         if discard_impulses:
-            self.problem.count[0], self._last_time = 0, 0.0
+            self.problem.count[0], self._last_time, self._search_counts = 0, 0.0, (0, 0)
 
     def _gap_targets(self) -> tuple[float, float, float, float]:
         """Contact offset [m]; fractions of a penetration and of a missing offset corrected per substep; maximum speed [m/s]."""
@@ -220,7 +225,7 @@ class ContactStep:
         """Fill the problem for a step of dt [s] from the state at a time, warm-started. Return its number of contacts."""
         n, d, m, self._measured_end = self.search(time, dt), self.detection, self.simulation.model, None
         self.gap_targets = self._gap_targets()
-        self.dropped = max(self.dropped, d.counts.unmapped)
+        self.dropped, self._search_counts = max(self.dropped, d.counts.unmapped), (d.counts.found, d.counts.unmapped)
         if n > self.problem.capacity:
             self._allocate(2 * n)
         p = self.problem
@@ -392,8 +397,9 @@ class ContactStep:
 
     def contacts(self) -> Contacts:
         """Return the contacts of the last substep with their impulses."""
-        found = record_contacts(self.detection, self.problem, self._impulse_fraction)
-        return replace(found, duration=self._last_time / self._impulse_fraction)
+        record = record_contacts(self.detection, self.problem, self._impulse_fraction)
+        found, unmapped = self._search_counts  # others have searched since
+        return replace(record, found=found, unmapped=unmapped, duration=self._last_time / self._impulse_fraction)
 
     @property
     def field_bytes(self) -> dict[str, int]:

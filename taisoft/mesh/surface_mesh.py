@@ -21,7 +21,7 @@ from taisoft.mesh.ply import read_ply
 from taisoft.mesh.safe_reading import read_content, run_child
 from taisoft.mesh.stl import read_stl
 from taisoft.mesh.tet_mesh import TetMesh
-from taisoft.mesh.topology import connected_pieces, linked_groups, merge_labels, triangle_edges
+from taisoft.mesh.topology import connected_pieces, crack_widths, linked_groups, merge_labels, triangle_edges
 
 READERS = {".obj": read_obj, ".stl": read_stl, ".ply": read_ply, ".off": read_off}
 FORMATS = tuple(READERS)
@@ -116,8 +116,8 @@ class SurfaceMesh:
         if len(single):
             found.append(
                 f"{_holes_text(self.n_holes)}: {len(single)} edges belong to one triangle, the first is "
-                f"{_edge_text(single)}; tetrahedralize closes holes, but roughly: fill them "
-                "beforehand for a clean surface, or read with a larger weld if they are cracks"
+                f"{_edge_text(single)}; {self._cracks_text()}tetrahedralize closes holes, but roughly: fill them "
+                "beforehand for a clean surface"
             )
         if len(crowded):
             found.append(
@@ -130,6 +130,17 @@ class SurfaceMesh:
                 f"{_edge_text(mismatched)}; make the normals consistent"
             )
         return [INWARD] if not found and self.volume < 0.0 else found
+
+    def _cracks_text(self) -> str:
+        """Return how wide cracks are, and what welds them; nothing if there are none."""
+        widths = crack_widths(self.vertices, self.triangles)
+        if not len(widths):
+            return ""
+        width = float(f"{1.006 * widths.max():.3g}")  # rounded up
+        corners = self.vertices[self.triangles]
+        shortest = float(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).min())
+        also = f", and with them edges of {shortest:.3g} m" if width >= shortest else ""
+        return f"{len(widths)} of them are the sides of cracks at most {width:g} m wide, which weld = {width:g} m closes{also}; "
 
 
 def _holes_text(n: int) -> str:

@@ -16,6 +16,7 @@ TET_FACES = np.array([(1, 2, 3), (0, 3, 2), (0, 1, 3), (0, 2, 1)])
 EDGES = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))  # corners of a tet's six edges; edges k and 5-k are opposite
 GENERIC_DIRECTION = np.array([0.56071, 0.64493, 0.51922])  # distinct projections for grid vertices; length at most 1
 HALF_EDGES = np.array([(0, 1), (1, 2), (2, 0)])  # corners of a triangle's half-edges
+CRACK = 0.5  # the sides of a crack are less than this times their edges' length apart: wider ones are as well two rims
 
 
 def _group_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -184,6 +185,21 @@ def merge_labels(points: np.ndarray, tolerance: float) -> np.ndarray:
     rank = np.empty(len(first), dtype=np.int64)
     rank[np.argsort(first)] = np.arange(len(first))
     return rank[inverse.ravel()]
+
+
+def crack_widths(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """Return the distance between the two sides of each open edge that lies along a crack, (k,) [m].
+
+    points: (n,3) [m]; triangles: (t,3). Two edges of one triangle each, which run in opposite directions, are the sides of a
+    crack if their ends are less than CRACK of their length apart. Sides that are divided differently are not found.
+    """
+    edges, counts, net_direction = triangle_edges(triangles)
+    edges, upward = edges[counts == 1], net_direction[counts == 1] > 0
+    ends = points[np.where(upward[:, None], edges, edges[:, ::-1])]  # (k, 2, 3), as the triangles traverse them
+    across = ends[:, ::-1]
+    other = scipy.spatial.cKDTree(across.reshape(-1, 6)).query(ends.reshape(-1, 6))[1]
+    widths = np.linalg.norm(ends - across[other], axis=2).max(axis=1)
+    return widths[widths < CRACK * np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)]
 
 
 def _may_be_near(points: np.ndarray, tolerance: float) -> bool:

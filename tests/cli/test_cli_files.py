@@ -54,14 +54,26 @@ def test_scene_places_a_mesh_but_no_scene(tmp_path, capsys):
         assert message in capsys.readouterr().err
 
 
-def test_info_names_the_axes_and_suspects_millimetres(tmp_path, capsys):
-    """A part of 60 mm that is read as 60 m: the next command that `info` proposes scales it."""
-    path = tmp_path / "tower.obj"
+def test_info_measures_welds_cracks_and_suspects_millimetres(tmp_path, capsys):
+    """A part of 60 mm that is read as 60 m: the next command that `info` proposes scales it. A surface and a mesh in which each
+    element has its own vertices, a little apart; a USD stage is not welded."""
+
+    def info(name: str, *options: str) -> str:
+        assert main(["info", str(tmp_path / name), *options]) == 2 * name.endswith("usda")
+        return "".join(capsys.readouterr())
+
     for scale, message in (
         (1, "extent     x 1 (9.5 to 10.5), y 2 (19 to 21), z 6 (27 to 33)"),
-        (10, f"next       fill it with tets: taisoft tetrahedralize {path} --scale 0.001 --out tower.msh"),
+        (10, f"next       fill it with tets: taisoft tetrahedralize {tmp_path / 'tower.obj'} --scale 0.001 --out tower.msh"),
     ):
-        meshio.write(path, meshio.Mesh(scale * TOWER.vertices, [("triangle", TOWER.surface)]))
-        assert main(["info", str(path)]) == 0
-        shown = capsys.readouterr().out
+        meshio.write(tmp_path / "tower.obj", meshio.Mesh(scale * TOWER.vertices, [("triangle", TOWER.surface)]))
+        shown = info("tower.obj")
         assert message in shown and "axes       y is taken for up" in shown and ("0.001" in shown) == (scale == 10)
+    for name, kind, cells in (("a.obj", "triangle", TOWER.surface), ("a.vtu", "tetra", TOWER.tets)):
+        x, surface = TOWER.vertices[cells].reshape(-1, 3), kind == "triangle"
+        x = x + 1e-4 * np.random.default_rng(2).uniform(-1, 1, x.shape)
+        meshio.write(tmp_path / name, meshio.Mesh(x, [(kind, np.arange(len(x)).reshape(cells.shape))]))
+        cracked, welded = info(name), info(name, "--weld", "1e-3")
+        assert f"{len(cells)} pieces" in cracked and ("cracks at most" in cracked) == surface
+        assert "1 piece" in welded and "were welded" in welded and ("--weld 0.001 --out" in welded) == surface
+    assert "--weld is for other files" in info("a.usda", "--weld", "0")

@@ -130,8 +130,7 @@ def test_other_elements_are_refused_by_name_and_number(tmp_path):
 
 
 def test_welding_merges_close_vertices(tmp_path):
-    box = box_mesh((1, 1, 1), (1.0, 1.0, 1.0), pattern="six")
-    gap = 1e-4
+    box, gap = box_mesh((1, 1, 1), (1.0, 1.0, 1.0), pattern="six"), 1e-4
     points = np.vstack([box.vertices, box.vertices + (1.0 + gap, 0, 0)])
     path = write_by_meshio(tmp_path / "part.msh", [("tetra", np.vstack([box.tets, box.tets + 8]))], points, **GMSH2)
     assert read_mesh(path).n_components == 2
