@@ -95,7 +95,7 @@ def set_change(m: ti.template(), w: ti.template(), i, c, beta):
     """Set c (v - v_hat), plus beta a v with mass damping, for node i."""
     change = c * (stage_velocity(m, w, i, beta) - w.v_hat[i])
     if ti.static(m.damped):
-        change += beta * ti.cast(rayleigh_damping.mass_rate(m, i), ti.f64) * ti.cast(m.state.v[i], ti.f64)
+        change += beta * ti.cast(rayleigh_damping.mass_rate(m, i), ti.f64) * m.state.v[i]
     w.change[i] = change
 
 
