@@ -18,14 +18,18 @@ from taisoft.errors import MeshError
 from taisoft.mesh.node_numbers import axes_from_points, indices, merged
 from taisoft.mesh.safe_reading import FileContent
 
-REFUSED = [*"NGEN NFILL NCOPY NMAP ELGEN ELCOPY INCLUDE IMPORT IMPERFECTION PARAMETER".split(), "SYMMETRIC MODEL GENERATION"]
+REFUSED = {key: "" for key in "NMAP INCLUDE IMPORT IMPERFECTION PARAMETER SYMMETRICMODELGENERATION".split()}
+REFUSED |= dict.fromkeys(("NGEN", "NFILL", "NCOPY"), ": write its nodes out")
+REFUSED |= dict.fromkeys(("ELGEN", "ELCOPY"), ": write its elements out")
+USED = {"NODE": ("NSET", "SYSTEM"), "ELEMENT": ("TYPE", "ELSET"), "PART": ("NAME",), "INSTANCE": ("NAME", "PART")}  # and options
+WHOLE = [*USED, *REFUSED, *"SYSTEM ENDPART ENDINSTANCE ASSEMBLY ENDASSEMBLY".split()]  # keywords that are not to be abbreviated
 TET = re.compile(r"[ADQ]?C3D(4|10)[A-Z]*")
 Place = tuple[np.ndarray, np.ndarray]  # matrix (3,3) and shift (3,): x -> matrix @ x + shift
 AT_ORIGIN: Place = (np.eye(3), np.zeros(3))
 
 
 class _Section(NamedTuple):
-    """A keyword with its options, in capitals, and the lines of data that follow it, as words."""
+    """A keyword with its options, in capitals without blanks, and the lines of data that follow it, as words."""
 
     line: int
     keyword: str
@@ -84,9 +88,10 @@ class _Reader:
                     continue
                 if section is not None:
                     yield section
-                keyword, *options = (" ".join(word.split()) for word in begun[1:].upper().split(","))
+                keyword, *options = begun[1:].upper().split(",")
                 pairs = (one.partition("=") for one in options)
-                section, begun = _Section(line, keyword, {key.strip(): value.strip(" \"'") for key, _, value in pairs}, []), ""
+                options = {"".join(key.split()): " ".join(value.strip(" \t\"'").split()) for key, _, value in pairs}
+                section, begun = _Section(line, "".join(keyword.split()), options, []), ""
             elif section is None:
                 raise self.error(line, "not a supported mesh: expected a keyword that begins with *")
             else:
@@ -100,17 +105,21 @@ class _Reader:
         """Take the nodes, elements or place of a section in."""
         key, options = section.keyword, section.options
         if key in REFUSED:
-            raise self.error(section.line, f"expected nodes and elements as they are: *{key} is not supported")
-        if key in ("NODE", "ELEMENT") and (self.part is None or "INPUT" in options):
-            raise self.error(section.line, f"expected *{key} with its data in the model or a part, not elsewhere")
-        if key in ("PART", "END PART", "INSTANCE", "END INSTANCE"):
+            raise self.error(section.line, f"*{key} is not supported{REFUSED[key]}")
+        if key not in WHOLE and len(key) >= 3 and (whole := next((one for one in WHOLE if one.startswith(key)), None)):
+            raise self.error(section.line, f"expected the whole keyword *{whole}, not *{key}")
+        if wrong := [one for one in options if one and one not in USED.get(key, options)]:
+            raise self.error(section.line, f"expected {' or '.join(USED[key])} as option of *{key}, not {wrong[0][:40]!r}")
+        if key in ("NODE", "ELEMENT") and self.part is None:
+            raise self.error(section.line, f"expected *{key} in the model or a part, not elsewhere")
+        if key in ("PART", "ENDPART", "INSTANCE", "ENDINSTANCE"):
             self.system = AT_ORIGIN
         if key == "PART":
             self.part = self.parts[self._option(section, "NAME", known=False)] = _Part()
         elif key == "INSTANCE":
             self.parts[self._option(section, "PART", known=True)].places.append(self._place(section))
             self.part = None
-        elif key in ("END PART", "END INSTANCE", "ASSEMBLY", "END ASSEMBLY"):
+        elif key in ("ENDPART", "ENDINSTANCE", "ASSEMBLY", "ENDASSEMBLY"):
             self.part = self.parts[""]
         elif key == "SYSTEM":
             self.system = self._system(section)
@@ -178,9 +187,8 @@ class _Reader:
         return matrix, matrix @ (shift - a) + a
 
     def _add_nodes(self, section: _Section) -> None:
-        if section.options.get("SYSTEM", "R") != "R" or section.options.keys() - {"NSET", "SYSTEM", ""}:
-            found = ", ".join(filter(None, (f"{key}={value}".rstrip("=") for key, value in section.options.items())))
-            raise self.error(section.line, f"expected NSET or SYSTEM=R as options of *NODE, not {found[:60]}")
+        if (kind := section.options.get("SYSTEM", "R")) != "R":
+            raise self.error(section.line, f"expected SYSTEM=R of *NODE, not {kind[:40]!r}")
         matrix, shift = self.system
         for line, words in section.rows:
             number = self._ints(line, words[:1])
