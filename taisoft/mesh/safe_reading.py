@@ -15,6 +15,7 @@ import subprocess
 import sys
 import tempfile
 from codecs import BOM_UTF8
+from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -42,7 +43,8 @@ class FileContent(NamedTuple):
 
     points: np.ndarray  # (n,3)
     cells: Blocks
-    cell_data: dict[str, list[np.ndarray]] = {}  # by name, the numbers (k,) of each block's elements
+    # by name, the numbers (k,) of each block's elements, or a function that returns them, or none if some elements have none
+    cell_data: dict[str, list[np.ndarray] | Callable[[], list[np.ndarray]]] = {}
     region_names: dict[int, str] = {}
     notes: list[str] = []  # what was left out
 

@@ -129,7 +129,11 @@ def test_all_pieces_of_vtu_are_read(tmp_path, form):
     assert mesh.vertices.tolist() == [[a + x, b, c] for x in (0, 5) for a, b, c in POINTS]
     assert mesh.regions.tolist() == [0, 5] and mesh.tets.tolist() == [[0, 1, 2, 3], [4, 5, 6, 7]]
     if form == "ascii":
-        assert "data 'region' of cells are not in all pieces" in outcome(tmp_path / "a.vtu", vtu(form, "stress"))
+        path, no_types = tmp_path / "a.vtu", vtu(form, "vtkGhostType").replace(b">5<Inf", b">1<Inf")
+        assert "1 cells that vtkGhostType marks are left out" in outcome(path, no_types)
+        text = vtu(form, "String").replace(b'"Int8" Name="String"', b'"String" Name="String"')
+        assert outcome(path, text) == "cell data 'region' are no regions, since not all pieces have them"
+        assert outcome(path, vtu(form).replace(b'Points="4"', b'Points="0"')).startswith("line 2: expected 0 numbers of Points")
         assert outcome(tmp_path / "a.vtu", vtu(form).replace(b">10<", b">11<")).endswith("the file holds 2 VTK type 11 elements")
 
 
