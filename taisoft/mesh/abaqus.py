@@ -15,8 +15,9 @@ from meshio.abaqus._abaqus import abaqus_to_meshio_type
 from scipy.spatial.transform import Rotation
 
 from taisoft.errors import MeshError
-from taisoft.mesh.node_numbers import axes_from_points, indices, merged
+from taisoft.mesh.node_numbers import LineReader, axes_from_points, blocks, merged
 from taisoft.mesh.safe_reading import FileContent
+from taisoft.mesh.words import to_int
 
 REFUSED = {key: "" for key in "NMAP INCLUDE IMPORT IMPERFECTION PARAMETER SYMMETRICMODELGENERATION".split()}
 REFUSED |= dict.fromkeys(("NGEN", "NFILL", "NCOPY"), ": write its nodes out")
@@ -39,10 +40,11 @@ class _Section(NamedTuple):
 
 @dataclass
 class _Part:
-    """The model, or a part. numbers: index by number of a node; tets: lines and nodes by kind; others: counts by type."""
+    """The model, or a part. numbers: index by number of a node; elements: numbers of tets; tets: lines and nodes by kind; others: counts by type."""
 
     places: list[Place] = field(default_factory=list)
     numbers: dict[int, int] = field(default_factory=dict)
+    elements: set[int] = field(default_factory=set)
     points: list[np.ndarray] = field(default_factory=list)
     tets: dict[str, list[tuple[int, list[int]]]] = field(default_factory=dict)
     others: dict[str, int] = field(default_factory=dict)
@@ -50,11 +52,11 @@ class _Part:
     def placed(self, name: str) -> list[FileContent]:
         """Return the part at each of its places."""
         points = np.array(self.points).reshape(-1, 3)
-        cells = [(kind, indices(name, self.numbers, rows)) for kind, rows in self.tets.items()]
-        cells += [(kind, np.empty((n, 0), dtype=np.int64)) for kind, n in self.others.items()]
+        cells = blocks(name, self.numbers, self.tets, self.others)
         return [FileContent(points @ matrix.T + shift, cells) for matrix, shift in self.places]
 
 
+@np.errstate(over="ignore", invalid="ignore")  # too large coordinates are refused later
 def read_abaqus(name: str, data: bytes) -> FileContent:
     """Return points and cells; of cells other than tets only the number. name: the file's, for messages. Raises MeshError."""
     reader = _Reader(name)
@@ -68,11 +70,12 @@ def read_abaqus(name: str, data: bytes) -> FileContent:
     return merged([one for part in (model, *parts) for one in part.placed(name)])._replace(notes=notes)
 
 
-class _Reader:
+class _Reader(LineReader):
     """part: to which nodes and elements belong, none inside an instance; system: in which nodes are given."""
 
     def __init__(self, name: str):
-        self.name, self.parts, self.system = name, {"": _Part([AT_ORIGIN])}, AT_ORIGIN
+        super().__init__(name)
+        self.parts, self.system = {"": _Part([AT_ORIGIN])}, AT_ORIGIN
         self.part: _Part | None = self.parts[""]
 
     def sections(self, text: str) -> Iterator[_Section]:
@@ -128,9 +131,6 @@ class _Reader:
         elif key == "ELEMENT":
             self._add_elements(section)
 
-    def error(self, line: int, text: str) -> MeshError:
-        return MeshError(f"{self.name}: line {line}: {text}")
-
     def _option(self, section: _Section, key: str, known: bool) -> str:
         """Return the name of a part, one from above or a new one."""
         value = section.options.get(key, "")
@@ -141,16 +141,13 @@ class _Reader:
 
     def _floats(self, line: int, words: list[str], n: int, what: str) -> list[float]:
         """Return the first n words as numbers; a blank is 0."""
-        try:
-            if len(words) < n:
-                raise ValueError
-            return [float(re.sub("[dD]", "e", word) or 0) for word in words[:n]]
-        except ValueError:
-            raise self.error(line, f"expected {what}, not {', '.join(words)[:60]!r}") from None
+        if len(words) < n:
+            raise self.error(line, f"expected {what}, not {', '.join(words)[:60]!r}")
+        return self.finite(line, words[:n], what)
 
     def _ints(self, line: int, words: list[str]) -> list[int]:
         try:
-            return [int(word) for word in words if word]
+            return [to_int(word) for word in words if word]
         except ValueError:
             raise self.error(line, f"expected whole numbers, not {', '.join(words)[:60]!r}") from None
 
@@ -215,6 +212,9 @@ class _Reader:
             if open_row:
                 rows[-1][1].extend(numbers)
             else:
+                if not numbers or numbers[0] in self.part.elements:
+                    raise self.error(line, f"expected the number of a new element, not {words[0][:40]!r}")
+                self.part.elements.add(numbers[0])
                 rows.append((line, numbers[1:]))
             open_row = words[-1] == "" and len(rows[-1][1]) < n_nodes
             if not open_row and len(rows[-1][1]) != n_nodes:

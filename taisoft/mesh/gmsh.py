@@ -105,7 +105,7 @@ def read_gmsh(name: str, data: bytes) -> FileContent | None:
     line = data.count(b"\n", 0, found.end())
     major = version.split(".")[0]
     if version not in ("4", "4.0", "4.1") and major != "2":
-        raise MeshError(f"{name}: line {line} ($MeshFormat): expected version 2, 4.0 or 4.1, not {version}")
+        raise MeshError(f"{name}: line {line} ($MeshFormat): expected version 2, 4.0 or 4.1, not {version[:40]!r}")
     if major != "4" and binary:
         return None
     at, order = found.end(), ""
@@ -122,9 +122,9 @@ def read_gmsh(name: str, data: bytes) -> FileContent | None:
     while opening := _OPENING.search(data, at):
         section, at = opening[1].decode("ascii", "replace"), opening.end()
         if section not in readers:
-            at = data.find(b"$End" + opening[1], at)
+            line, at = data.count(b"\n", 0, at), data.find(b"$End" + opening[1], at)
             if at < 0:
-                raise _truncated(name, data, section)
+                raise MeshError(f"{name}: line {line}: expected the end of this section, not the file's")
             continue
         if section in sections:
             line = data.count(b"\n", 0, at)

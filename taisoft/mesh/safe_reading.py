@@ -188,7 +188,7 @@ def _read(path: str, seconds: str) -> dict[str, np.ndarray]:
         sys.exit("it declares more data than it can hold")
     except (Exception, SystemExit) as error:
         text = _without_content(str(error), data.lower()) if isinstance(error, (meshio.ReadError, EOFError)) else ""
-        text = text if text and "..." not in text else f"expected the format {Path(path).suffix} here or before"
+        text = text if text and "..." not in text else f"the reader of {Path(path).suffix} files stopped here"
         sys.exit(_place(error, data) + text)
     if skipped := next((text for text in printed if "cannot handle" in text), None):
         sys.exit(f"cells of {skipped[skipped.rfind('(') + 1 :].rstrip(').')} of VTK are not known here")

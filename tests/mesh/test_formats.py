@@ -44,6 +44,8 @@ EXPECTED = (
     ("a.inp", NODES + TET.replace("type", "inp=b.inp, type"), "line 7: expected TYPE or ELSET as option of .ELEMENT, not 'INP'"),
     ("a.inp", NODES + "*NODE, SYSTEM=C\n9,1,0,0\n" + TET, "line 7: expected SYSTEM=R of .NODE, not 'C'"),
     ("a.inp", NODES + NODES + TET, "line 9: expected the number of a new node, not '1'"),
+    ("a.inp", NODES + TET + TET, "line 11: expected the number of a new element, not '1'"),
+    ("a.inp", NODES.replace("1,0,0,0", "1,0,0,1d999") + TET, "line 3: expected finite numbers, not .0, 0, 1d999"),
     ("a.inp", NODES + NEXT_TET, r"line 8: node 11 does not exist \(4 nodes\)"),
     ("a.bdf", "SOL 1\nbegin bulk\n" + CORD + GRID.replace(",,", ",5,") + CTETRA + END, (10, 11)),
     ("a.nas", CORD + "GRDSET,,5\n" + GRID + CTETRA, (10, 11)),
@@ -60,12 +62,17 @@ EXPECTED = (
         "line 1: expected a definition of coordinate system 5, n",
     ),
     ("a.bdf", "BEGIN BULK\n" + GRID + CTETRA, "line 6: expected ENDDATA before the file's end"),
+    ("a.bdf", GRID + 2 * CTETRA, "line 6: expected the number of a new element, not 1"),
+    ("a.bdf", GRID.replace("4,,0.,", "4,,1e999,") + CTETRA, "line 4: expected finite numbers, not .1e999"),
+    ("a.bdf", GRID.replace("4,,0.", "4,,1_0.") + CTETRA, "line 4: expected a number in field 4 of GRID, not '1_0.'"),
+    ("a.mesh", MEDIT + "Tetrahedra 1 1 2 3 4 1_0\nEnd", "line 9: expected a number, not '1_0'"),
+    ("a.mesh", MEDIT + "Tetrahedra 1 1 2\n3 4", "line 9: 5 numbers should follow, but only 4 do"),
     ("a.mesh", MEDIT + "SubDomainFromGeom\n1\n3 1 1 7\nTetrahedra 1 1 2 3 4 7\nRequiredTetrahedra 1 1 End", (0, 1)),
     ("a.mesh", MEDIT + "Tetrahedra 1 1 2 3 4 7\n", "the keyword End is missing"),
     ("a.mesh", MEDIT + "Tetrahedr 1 1 2 3 4 7\nEnd\n", "line 9: expected a keyword of Medit's format, not 'Tetrahedr'"),
     ("a.mesh", MEDIT + "Tetrahedra 1\n1 2 3 5 7\nEnd\n", "line 10: expected vertices from 1 to 4, not '5'"),
     ("a.msh", GMSH, (0, 1)),
-    ("a.msh", GMSH.replace("4 0 8", "3.0 0 8"), r"line 2 \(.MeshFormat\): expected version 2, 4.0 or 4.1, not 3.0"),
+    ("a.msh", GMSH.replace("4 0 8", "3.0 0 8"), r"line 2 \(.MeshFormat\): expected version 2, 4.0 or 4.1, not '3.0'"),
 )
 
 
@@ -166,7 +173,7 @@ def test_ply_with_any_elements_and_properties(tmp_path, order):
     lost = outcome(tmp_path / "a.ply", (data + b"".join(faces)).replace(b"vertex_index", b"vertices"))
     assert (
         lost
-        == "line 11: expected faces with a list called vertex_indices or vertex_index, not 'face' with area, vertices, texcoord"
+        == "line 11: expected faces with a list called vertex_indices or vertex_index, not 'face' with area, list vertices, list texcoord"
     )
 
 
@@ -185,6 +192,7 @@ def test_stl_of_any_header(tmp_path):
     ):
         surface = outcome(path, data)
         assert len(surface.triangles) == 12 and surface.volume == pytest.approx(1.0) and len(surface.vertices) == 8
+    assert outcome(path, b"solid facet normal".ljust(80) + binary + b"\0").endswith(", but there are 685")
     for data, n in ((binary + b"\0", 685), (binary[:-1], 683)):
         assert outcome(path, b"solid".ljust(80) + data).endswith(f" 684 bytes for 12 triangles, but there are {n}")
     assert outcome(path, text.replace(b"endloop", b"endlop")) == "line 7: expected 'endloop', not 'endlop'"
