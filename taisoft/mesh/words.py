@@ -75,8 +75,8 @@ class Words:
             raise self.error(f"expected a whole number, not {self.quoted(k)}", k)
         return values.astype(np.int64)
 
-    def count(self) -> int:
-        """Return the next number, which counts something."""
+    def count(self, kind: str = "") -> int:
+        """Return the next number, which counts something. kind: as for `ints`."""
         n = int(self.ints(1)[0])
         if n < 0:
             raise self.error(f"expected a number of at least 0, not {n}")

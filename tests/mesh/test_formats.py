@@ -31,6 +31,8 @@ LARGE = rows("GRID*   {:<16}" + 16 * " " + "{:<16.1f}{:<16.1f}*G\n*G      {:<16.
 MEDIT = "MeshVersionFormatted 2 # double\nDimension\n3\nVertices 4\n" + "".join("{} {} {} 0\n".format(*p) for p in POINTS)
 GMSH = "$MeshFormat\n4 0 8\n$EndMeshFormat\n$Entities\n1 0 0 1\n9 0 0 0 0 0 0 0\n1 0 0 0 1 1 1 1 7 0\n$EndEntities\n$Nodes\n1 4\n"
 GMSH += "1 3 0 4\n" + rows("{} {} {} {}\n") + "$EndNodes\n$Elements\n1 1\n1 3 4 1\n1 1 2 3 4\n$EndElements\n"
+PARTED = GMSH.replace("$Nodes", "$PartitionedEntities\n2 0\n0 0 0 1\n5 3 1 1 2 0 0 0 1 1 1 1 8 0\n$EndPartitionedEntities\n$Nodes")
+PARTED = PARTED.replace("1 3 4 1", "5 3 4 1")
 EXPECTED = (
     ("a.inp", NODES + NEXT_NODES + TET + NEXT_TET, (0, 6)),
     ("a.inp", "*SYSTEM\n0,0,0,0,1,0\n-1,0,0\n" + NODES + "*SYSTEM\n" + TET + NEXT_NODES + NEXT_TET, (-1, 6)),
@@ -72,6 +74,7 @@ EXPECTED = (
     ("a.mesh", MEDIT + "Tetrahedr 1 1 2 3 4 7\nEnd\n", "line 9: expected a keyword of Medit's format, not 'Tetrahedr'"),
     ("a.mesh", MEDIT + "Tetrahedra 1\n1 2 3 5 7\nEnd\n", "line 10: expected vertices from 1 to 4, not '5'"),
     ("a.msh", GMSH, (0, 1)),
+    ("a.msh", PARTED, (0, 1)),
     ("a.msh", GMSH.replace("4 0 8", "3.0 0 8"), r"line 2 \(.MeshFormat\): expected version 2, 4.0 or 4.1, not '3.0'"),
 )
 
@@ -98,6 +101,8 @@ def test_nodes_are_where_the_file_puts_them(tmp_path, name, text, expected):
     else:
         x = found.vertices[:, 0]
         assert (x.min(), x.max()) == pytest.approx(expected, abs=1e-12) and found.volumes == pytest.approx(1 / 6)
+        if name == "a.msh":
+            assert found.regions.tolist() == [7]
 
 
 def vtu(form: str, region: str = "region") -> bytes:
