@@ -15,17 +15,22 @@ from meshio.abaqus._abaqus import abaqus_to_meshio_type
 from scipy.spatial.transform import Rotation
 
 from taisoft.errors import MeshError
-from taisoft.mesh.node_numbers import axes_from_points, indices, merged
+from taisoft.mesh.node_numbers import LineReader, axes_from_points, blocks, merged
 from taisoft.mesh.safe_reading import FileContent
+from taisoft.mesh.words import to_int
 
-REFUSED = [*"NGEN NFILL NCOPY NMAP ELGEN ELCOPY INCLUDE IMPORT IMPERFECTION PARAMETER".split(), "SYMMETRIC MODEL GENERATION"]
+REFUSED = {key: "" for key in "NMAP INCLUDE IMPORT IMPERFECTION PARAMETER SYMMETRICMODELGENERATION".split()}
+REFUSED |= dict.fromkeys(("NGEN", "NFILL", "NCOPY"), ": write its nodes out")
+REFUSED |= dict.fromkeys(("ELGEN", "ELCOPY"), ": write its elements out")
+USED = {"NODE": ("NSET", "SYSTEM"), "ELEMENT": ("TYPE", "ELSET"), "PART": ("NAME",), "INSTANCE": ("NAME", "PART")}  # and options
+WHOLE = [*USED, *REFUSED, *"SYSTEM ENDPART ENDINSTANCE ASSEMBLY ENDASSEMBLY".split()]  # keywords that are not to be abbreviated
 TET = re.compile(r"[ADQ]?C3D(4|10)[A-Z]*")
 Place = tuple[np.ndarray, np.ndarray]  # matrix (3,3) and shift (3,): x -> matrix @ x + shift
 AT_ORIGIN: Place = (np.eye(3), np.zeros(3))
 
 
 class _Section(NamedTuple):
-    """A keyword with its options, in capitals, and the lines of data that follow it, as words."""
+    """A keyword with its options, in capitals without blanks, and the lines of data that follow it, as words."""
 
     line: int
     keyword: str
@@ -35,10 +40,11 @@ class _Section(NamedTuple):
 
 @dataclass
 class _Part:
-    """The model, or a part. numbers: index by number of a node; tets: lines and nodes by kind; others: counts by type."""
+    """The model, or a part. numbers: index by number of a node; elements: numbers of tets; tets: lines and nodes by kind; others: counts by type."""
 
     places: list[Place] = field(default_factory=list)
     numbers: dict[int, int] = field(default_factory=dict)
+    elements: set[int] = field(default_factory=set)
     points: list[np.ndarray] = field(default_factory=list)
     tets: dict[str, list[tuple[int, list[int]]]] = field(default_factory=dict)
     others: dict[str, int] = field(default_factory=dict)
@@ -46,11 +52,11 @@ class _Part:
     def placed(self, name: str) -> list[FileContent]:
         """Return the part at each of its places."""
         points = np.array(self.points).reshape(-1, 3)
-        cells = [(kind, indices(name, self.numbers, rows)) for kind, rows in self.tets.items()]
-        cells += [(kind, np.empty((n, 0), dtype=np.int64)) for kind, n in self.others.items()]
+        cells = blocks(name, self.numbers, self.tets, self.others)
         return [FileContent(points @ matrix.T + shift, cells) for matrix, shift in self.places]
 
 
+@np.errstate(over="ignore", invalid="ignore")  # too large coordinates are refused later
 def read_abaqus(name: str, data: bytes) -> FileContent:
     """Return points and cells; of cells other than tets only the number. name: the file's, for messages. Raises MeshError."""
     reader = _Reader(name)
@@ -64,11 +70,12 @@ def read_abaqus(name: str, data: bytes) -> FileContent:
     return merged([one for part in (model, *parts) for one in part.placed(name)])._replace(notes=notes)
 
 
-class _Reader:
+class _Reader(LineReader):
     """part: to which nodes and elements belong, none inside an instance; system: in which nodes are given."""
 
     def __init__(self, name: str):
-        self.name, self.parts, self.system = name, {"": _Part([AT_ORIGIN])}, AT_ORIGIN
+        super().__init__(name)
+        self.parts, self.system = {"": _Part([AT_ORIGIN])}, AT_ORIGIN
         self.part: _Part | None = self.parts[""]
 
     def sections(self, text: str) -> Iterator[_Section]:
@@ -84,9 +91,10 @@ class _Reader:
                     continue
                 if section is not None:
                     yield section
-                keyword, *options = (" ".join(word.split()) for word in begun[1:].upper().split(","))
+                keyword, *options = begun[1:].upper().split(",")
                 pairs = (one.partition("=") for one in options)
-                section, begun = _Section(line, keyword, {key.strip(): value.strip(" \"'") for key, _, value in pairs}, []), ""
+                options = {"".join(key.split()): " ".join(value.strip(" \t\"'").split()) for key, _, value in pairs}
+                section, begun = _Section(line, "".join(keyword.split()), options, []), ""
             elif section is None:
                 raise self.error(line, "not a supported mesh: expected a keyword that begins with *")
             else:
@@ -100,17 +108,21 @@ class _Reader:
         """Take the nodes, elements or place of a section in."""
         key, options = section.keyword, section.options
         if key in REFUSED:
-            raise self.error(section.line, f"expected nodes and elements as they are: *{key} is not supported")
-        if key in ("NODE", "ELEMENT") and (self.part is None or "INPUT" in options):
-            raise self.error(section.line, f"expected *{key} with its data in the model or a part, not elsewhere")
-        if key in ("PART", "END PART", "INSTANCE", "END INSTANCE"):
+            raise self.error(section.line, f"*{key} is not supported{REFUSED[key]}")
+        if key not in WHOLE and len(key) >= 3 and (whole := next((one for one in WHOLE if one.startswith(key)), None)):
+            raise self.error(section.line, f"expected the whole keyword *{whole}, not *{key}")
+        if wrong := [one for one in options if one and one not in USED.get(key, options)]:
+            raise self.error(section.line, f"expected {' or '.join(USED[key])} as option of *{key}, not {wrong[0][:40]!r}")
+        if key in ("NODE", "ELEMENT") and self.part is None:
+            raise self.error(section.line, f"expected *{key} in the model or a part, not elsewhere")
+        if key in ("PART", "ENDPART", "INSTANCE", "ENDINSTANCE"):
             self.system = AT_ORIGIN
         if key == "PART":
             self.part = self.parts[self._option(section, "NAME", known=False)] = _Part()
         elif key == "INSTANCE":
             self.parts[self._option(section, "PART", known=True)].places.append(self._place(section))
             self.part = None
-        elif key in ("END PART", "END INSTANCE", "ASSEMBLY", "END ASSEMBLY"):
+        elif key in ("ENDPART", "ENDINSTANCE", "ASSEMBLY", "ENDASSEMBLY"):
             self.part = self.parts[""]
         elif key == "SYSTEM":
             self.system = self._system(section)
@@ -118,9 +130,6 @@ class _Reader:
             self._add_nodes(section)
         elif key == "ELEMENT":
             self._add_elements(section)
-
-    def error(self, line: int, text: str) -> MeshError:
-        return MeshError(f"{self.name}: line {line}: {text}")
 
     def _option(self, section: _Section, key: str, known: bool) -> str:
         """Return the name of a part, one from above or a new one."""
@@ -132,16 +141,13 @@ class _Reader:
 
     def _floats(self, line: int, words: list[str], n: int, what: str) -> list[float]:
         """Return the first n words as numbers; a blank is 0."""
-        try:
-            if len(words) < n:
-                raise ValueError
-            return [float(re.sub("[dD]", "e", word) or 0) for word in words[:n]]
-        except ValueError:
-            raise self.error(line, f"expected {what}, not {', '.join(words)[:60]!r}") from None
+        if len(words) < n:
+            raise self.error(line, f"expected {what}, not {', '.join(words)[:60]!r}")
+        return self.finite(line, words[:n], what)
 
     def _ints(self, line: int, words: list[str]) -> list[int]:
         try:
-            return [int(word) for word in words if word]
+            return [to_int(word) for word in words if word]
         except ValueError:
             raise self.error(line, f"expected whole numbers, not {', '.join(words)[:60]!r}") from None
 
@@ -178,9 +184,8 @@ class _Reader:
         return matrix, matrix @ (shift - a) + a
 
     def _add_nodes(self, section: _Section) -> None:
-        if section.options.get("SYSTEM", "R") != "R" or section.options.keys() - {"NSET", "SYSTEM", ""}:
-            found = ", ".join(filter(None, (f"{key}={value}".rstrip("=") for key, value in section.options.items())))
-            raise self.error(section.line, f"expected NSET or SYSTEM=R as options of *NODE, not {found[:60]}")
+        if (kind := section.options.get("SYSTEM", "R")) != "R":
+            raise self.error(section.line, f"expected SYSTEM=R of *NODE, not {kind[:40]!r}")
         matrix, shift = self.system
         for line, words in section.rows:
             number = self._ints(line, words[:1])
@@ -207,6 +212,9 @@ class _Reader:
             if open_row:
                 rows[-1][1].extend(numbers)
             else:
+                if not numbers or numbers[0] in self.part.elements:
+                    raise self.error(line, f"expected the number of a new element, not {words[0][:40]!r}")
+                self.part.elements.add(numbers[0])
                 rows.append((line, numbers[1:]))
             open_row = words[-1] == "" and len(rows[-1][1]) < n_nodes
             if not open_row and len(rows[-1][1]) != n_nodes:

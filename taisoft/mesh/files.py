@@ -148,12 +148,15 @@ def _regions(name: str, content: FileContent, requested: str | None) -> tuple[np
     key = next((one for one in (requested, *NONE_IF_ZERO, REGION) if one in content.cell_data), None)
     if key is None:
         return None, {}, []
-    blocks = [values for (kind, nodes), values in zip(content.cells, content.cell_data[key]) if kind in TETS and len(nodes)]
-    values = np.concatenate(blocks)
+    data = content.cell_data[key]
+    data = data() if callable(data) else data
+    blocks = [values for (kind, nodes), values in zip(content.cells, data) if kind in TETS and len(nodes)]
+    values = np.concatenate(blocks) if data else np.empty(0)
     whole = np.isfinite(values) & (np.abs(values) <= LARGEST_ID) & (np.floor(values) == values)
-    if not whole.all():
-        tet = int(np.argmin(whole))
-        text = f"cell data {key!r} are no regions, since that of tet {tet} is {values[tet]:g}, not a whole number of 32 bits"
+    if not data or not whole.all():
+        tet = int(np.argmin(whole)) if data else 0
+        reason = f"that of tet {tet} is {values[tet]:g}, not a whole number of 32 bits" if data else "not all pieces have them"
+        text = f"cell data {key!r} are no regions, since {reason}"
         if requested is not None:
             raise MeshError(f"{name}: {text}")
         return None, {}, [text]

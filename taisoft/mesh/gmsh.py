@@ -63,10 +63,10 @@ class _Binary:
         self.at += n * dtype.itemsize
         return values
 
-    def count(self) -> int:
-        n = int(self.ints(1)[0])
+    def count(self, kind: str = "size") -> int:
+        n = int(self.ints(1, kind)[0])
         if n < 0:
-            raise self.error(f"expected a number below 2^63, not {n % 2**64}")
+            raise self.error("expected a number from 0 to 2^63 - 1")
         return n
 
     def rows(self, n: int, columns: int) -> tuple[np.ndarray, np.ndarray]:
@@ -105,7 +105,7 @@ def read_gmsh(name: str, data: bytes) -> FileContent | None:
     line = data.count(b"\n", 0, found.end())
     major = version.split(".")[0]
     if version not in ("4", "4.0", "4.1") and major != "2":
-        raise MeshError(f"{name}: line {line} ($MeshFormat): expected version 2, 4.0 or 4.1, not {version}")
+        raise MeshError(f"{name}: line {line} ($MeshFormat): expected version 2, 4.0 or 4.1, not {version[:40]!r}")
     if major != "4" and binary:
         return None
     at, order = found.end(), ""
@@ -117,14 +117,17 @@ def read_gmsh(name: str, data: bytes) -> FileContent | None:
     needed: dict[str, Callable] = {"Nodes": _nodes_2, "Elements": _elements_2}
     if major == "4":
         needed = {"Nodes": partial(_nodes_4, old=version != "4.1"), "Elements": partial(_elements_4, old=version != "4.1")}
-    readers = needed if major == "2" else needed | {"Entities": partial(_entities_4, old=version != "4.1")}
+    readers = needed if major == "2" else needed | {
+        "Entities": partial(_entities_4, old=version != "4.1"),
+        "PartitionedEntities": partial(_entities_4, old=version != "4.1", parted=True),
+    }
     sections = {}
     while opening := _OPENING.search(data, at):
         section, at = opening[1].decode("ascii", "replace"), opening.end()
         if section not in readers:
-            at = data.find(b"$End" + opening[1], at)
+            line, at = data.count(b"\n", 0, at), data.find(b"$End" + opening[1], at)
             if at < 0:
-                raise _truncated(name, data, section)
+                raise MeshError(f"{name}: line {line}: expected the end of this section, not the file's")
             continue
         if section in sections:
             line = data.count(b"\n", 0, at)
@@ -138,7 +141,9 @@ def read_gmsh(name: str, data: bytes) -> FileContent | None:
     tags, points = sections["Nodes"]
     blocks, groups = sections["Elements"]
     if major == "4":  # of an entity, whose elements are one block or several
-        physical = sections.get("Entities", {})
+        of_wholes, (of_parts, wholes) = (sections.get(key, ({}, {})) for key in ("Entities", "PartitionedEntities"))
+        of_wholes = of_wholes[0]  # Gmsh may add groups of its own to parts
+        physical = of_wholes | of_parts | {part: of_wholes[whole] for part, whole in wholes.items() if whole in of_wholes}
         groups = [np.full(len(block[1]), physical.get(entity, 0)) for block, entity in zip(blocks, groups)]
     return FileContent(points, _tags_to_indices(name, tags, blocks), {PHYSICAL: groups}, split_names(data)[0])
 
@@ -174,20 +179,29 @@ def _nodes_4(numbers, old: bool) -> tuple[np.ndarray, np.ndarray]:
     return np.concatenate(tags), np.concatenate(points)
 
 
-def _entities_4(numbers, old: bool) -> dict[tuple[int, int], int]:
-    """Read the first physical group of each entity that is in one, by (dimension, tag). old: version 4.0."""
-    found = {}
+def _entities_4(numbers, old: bool, parted: bool = False) -> tuple[dict, dict]:
+    """Read the first physical group of each entity that is in one, and of each part the whole, by (dimension, tag).
+
+    old: version 4.0. parted: whether the entities are parts.
+    """
+    found, wholes, size = {}, {}, "int" if old else "size"
+    if parted:
+        numbers.ints(1, size)  # the number of parts
+        numbers.ints(2 * numbers.count(size), "int")  # ghost entities
     counts = numbers.ints(4).tolist()
     for dim, n in enumerate(counts):
         for _ in range(n):
             tag = int(numbers.ints(1, "int")[0])
+            if parted:
+                wholes[dim, tag] = tuple(numbers.ints(2, "int").tolist())
+                numbers.ints(numbers.count(size), "int")  # numbers of the parts
             numbers.floats(6 if dim or old else 3)  # a point's place, or a bounding box
             groups = numbers.ints(numbers.count(), "int")
             if dim:
                 numbers.ints(numbers.count(), "int")  # the entities of its boundary
             if len(groups):
                 found[dim, tag] = abs(int(groups[0]))  # negative: of reversed orientation
-    return found
+    return found, wholes
 
 
 def _elements_4(numbers, old: bool) -> tuple[Blocks, list[tuple[int, int]]]:

@@ -5,7 +5,6 @@ Source: MSC Nastran quick reference guide, "Format of bulk data entries", GRID, 
 Weak: of elements other than tets only the number is read.
 """
 
-import contextlib
 import re
 from collections.abc import Iterator
 from typing import NamedTuple
@@ -13,10 +12,9 @@ from typing import NamedTuple
 import numpy as np
 from meshio.nastran._nastran import nastran_to_meshio_type
 
-from taisoft.errors import MeshError
-from taisoft.mesh.node_numbers import axes_from_points, indices
+from taisoft.mesh.node_numbers import LineReader, axes_from_points, blocks
 from taisoft.mesh.safe_reading import FileContent
-from taisoft.mesh.words import last_line
+from taisoft.mesh.words import last_line, to_int
 
 PROPERTY = "nastran:ref"  # meshio's name of the elements' property numbers
 MAX_DEPTH = 100  # of coordinate systems defined in one another
@@ -31,14 +29,16 @@ class _Card(NamedTuple):
     fields: list[str]
 
 
+@np.errstate(over="ignore", invalid="ignore")  # too large coordinates are refused later
 def read_nastran(name: str, data: bytes) -> FileContent:
     """Return points, cells and the tets' property numbers. name: the file's, for messages. Raises MeshError."""
     return _Reader(name, data).content()
 
 
-class _Reader:
+class _Reader(LineReader):
     def __init__(self, name: str, data: bytes):
-        self.name, self._data = name, data
+        super().__init__(name)
+        self._data = data
         self.systems: dict[int, _Card] = {}
         self.nodes: dict[int, tuple[int, int, np.ndarray]] = {}  # line, system and coordinates by number
         self.frames: dict[int, tuple[str, np.ndarray, np.ndarray]] = {0: ("R", np.eye(3), np.zeros(3))}  # kind, axes, origin
@@ -47,13 +47,13 @@ class _Reader:
         tets: dict[str, list[tuple[int, list[int]]]] = {}
         properties: dict[str, list[int]] = {}
         others: dict[str, int] = {}
-        default = 0  # of fields CP
+        default, elements = 0, set()  # of fields CP; numbers of tets
         cards = list(self._cards())
         for card in cards:
             if card.name == "GRDSET":
                 default = self._int(card, 1, 0)
             elif card.name in ("INCLUDE", "GRIDA"):
-                raise self.error(card.line, f"expected nodes and elements as they are: {card.name} is not supported")
+                raise self.error(card.line, f"{card.name} is not supported: write its entries out")
         for card in cards:
             if card.name == "GRID":
                 number, x = self._int(card, 0), np.array([self._float(card, k) for k in (2, 3, 4)])
@@ -68,6 +68,9 @@ class _Reader:
                 ids = [self._int(card, k) for k in range(2, len(card.fields))]
                 if len(ids) not in (4, 10):
                     raise self.error(card.line, f"expected 4 or 10 nodes of CTETRA, not {len(ids)}")
+                if (number := self._int(card, 0)) in elements:
+                    raise self.error(card.line, f"expected the number of a new element, not {number}")
+                elements.add(number)
                 kind = "tetra" if len(ids) == 4 else "tetra10"
                 tets.setdefault(kind, []).append((card.line, ids))
                 properties.setdefault(kind, []).append(self._int(card, 1, 0))
@@ -76,13 +79,9 @@ class _Reader:
                 others[kind] = others.get(kind, 0) + 1
         points = np.array([self._placed(*node) for node in self.nodes.values()]).reshape(-1, 3)
         index = {number: k for k, number in enumerate(self.nodes)}
-        cells = [(kind, indices(self.name, index, rows)) for kind, rows in tets.items()]
-        cells += [(kind, np.empty((n, 0), dtype=np.int64)) for kind, n in others.items()]
+        cells = blocks(self.name, index, tets, others)
         data = [np.array(properties.get(kind, [0] * len(nodes)), dtype=np.int64) for kind, nodes in cells]
         return FileContent(points, cells, {PROPERTY: data})
-
-    def error(self, line: int, text: str) -> MeshError:
-        return MeshError(f"{self.name}: line {line}: {text}")
 
     def _cards(self) -> Iterator[_Card]:
         """Yield the entries between BEGIN BULK, if it is there, and ENDDATA; $ begins a comment."""
@@ -117,18 +116,16 @@ class _Reader:
         text = card.fields[k] if k < len(card.fields) else ""
         if not text and blank is not None:
             return blank
-        if not (text.isascii() and text.removeprefix("-").isdigit() and len(text) < 16):
-            raise self.error(card.line, f"expected a whole number in field {k + 2} of {card.name}, not {text[:40]!r}")
-        return int(text)
+        try:
+            return to_int(text)
+        except ValueError:
+            text = f"expected a whole number in field {k + 2} of {card.name}, not {text[:40]!r}"
+            raise self.error(card.line, text) from None
 
     def _float(self, card: _Card, k: int) -> float:
-        text = (card.fields[k] if k < len(card.fields) else "") or "0"  # a blank is 0
-        try:
-            with contextlib.suppress(ValueError):
-                return float(text)
-            return float(re.sub(r"(?<=[\d.])([+-]\d+)$", r"e\1", re.sub("[dD]", "e", text)))  # 7.0-1 is 0.7
-        except ValueError:
-            raise self.error(card.line, f"expected a number in field {k + 2} of {card.name}, not {text[:40]!r}") from None
+        text = card.fields[k] if k < len(card.fields) else ""
+        text = re.sub(r"(?<=[\d.])([+-]\d+)$", r"e\1", text)  # 7.0-1 is 0.7
+        return self.finite(card.line, [text], f"a number in field {k + 2} of {card.name}")[0]
 
     def _placed(self, line: int, system: int, x: np.ndarray) -> np.ndarray:
         """Return coordinates of a system in the basic one."""

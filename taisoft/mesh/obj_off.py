@@ -11,6 +11,7 @@ import numpy as np
 
 from taisoft.errors import MeshError, one_line
 from taisoft.mesh.safe_reading import content_lines
+from taisoft.mesh.words import to_float, to_int
 
 HEAD = re.compile(r"(?:ST)?C?N?OFF(\d*)$")  # of .off; some programs write no space before the counts
 
@@ -22,14 +23,15 @@ def read_obj(name: str, data: bytes) -> tuple[np.ndarray, list[np.ndarray]]:
         try:
             if words[0] == "v":
                 x, y, z = words[1:4]
-                points.append((float(x), float(y), float(z)))
+                points.append((to_float(x), to_float(y), to_float(z)))
             elif words[0] == "f":
-                corners = [int(word.split("/", 1)[0]) for word in words[1:]]
+                corners = [to_int(word.split("/", 1)[0]) for word in words[1:]]
                 if len(corners) < 3 or 0 in corners or max(map(abs, corners)) > len(data):
                     raise ValueError
                 polygons.append(np.array([[k - 1 if k > 0 else len(points) + k for k in corners]]))
-        except (ValueError, OverflowError):
-            raise MeshError(f"{name}: line {number} cannot be read: {one_line(' '.join(words))!r}") from None
+        except ValueError:
+            rule = "v and three coordinates, or f and at least 3 corners"
+            raise MeshError(f"{name}: line {number}: expected {rule}, not {one_line(' '.join(words))!r}") from None
     return np.array(points, dtype=np.float64).reshape(-1, 3), polygons
 
 
@@ -46,7 +48,7 @@ def read_off(name: str, data: bytes) -> tuple[np.ndarray, list[np.ndarray]]:
     if not counts and rows:
         (number, counts), *rows = rows
     try:
-        n_points, n_faces = int(counts[0]), int(counts[1])
+        n_points, n_faces = to_int(counts[0]), to_int(counts[1])
         if min(n_points, n_faces) < 0:
             raise ValueError
     except (ValueError, IndexError):
@@ -58,10 +60,10 @@ def read_off(name: str, data: bytes) -> tuple[np.ndarray, list[np.ndarray]]:
         try:
             if len(points) < n_points:
                 x, y, z = words[:3]
-                points.append((float(x), float(y), float(z)))
+                points.append((to_float(x), to_float(y), to_float(z)))
                 continue
-            n_corners = int(words[0])
-            corners = [int(word) for word in words[1 : 1 + n_corners]]
+            n_corners = to_int(words[0])
+            corners = [to_int(word) for word in words[1 : 1 + n_corners]]
             if n_corners < 3 or len(corners) < n_corners:
                 raise ValueError
         except ValueError:

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from taisoft.errors import MeshError
-from taisoft.mesh.words import MAX_EXACT_INT, Words
+from taisoft.mesh.words import MAX_EXACT_INT, Words, to_int
 
 LISTS = ("vertex_indices", "vertex_index")
 STRUCT_TYPES = {"i1": "b", "u1": "B", "i2": "h", "u2": "H", "i4": "i", "u4": "I", "i8": "q", "u8": "Q", "f8": "d"}
@@ -63,7 +63,7 @@ def read_ply(name: str, data: bytes) -> tuple[np.ndarray, list[np.ndarray]]:
         if element.name == "tristrips" or (element.name == "face" and corners is None):
             raise _unfit(name, element, f"faces with a list called {' or '.join(LISTS)}")
         if element.name == "vertex" and not numbers.keys() >= set("xyz"):
-            raise _unfit(name, element, "vertices with x, y and z")
+            raise _unfit(name, element, "vertices with numbers x, y and z")
         for first, values in rows.groups(element):
             if element.name == "vertex":
                 points = np.column_stack([values[numbers[axis]] for axis in "xyz"])
@@ -81,7 +81,7 @@ def read_ply(name: str, data: bytes) -> tuple[np.ndarray, list[np.ndarray]]:
 
 
 def _unfit(name: str, element: Element, rule: str) -> MeshError:
-    found = ", ".join(one.name for one in element.properties) or "nothing"
+    found = ", ".join(f"{'list ' if one.count else ''}{one.name}" for one in element.properties) or "nothing"
     return MeshError(f"{name}: line {element.line}: expected {rule}, not {element.name!r} with {found}")
 
 
@@ -95,8 +95,8 @@ def _read_header(name: str, text: str) -> tuple[str, list[Element]]:
                     pass
                 case ["format", kind, "1.0"] if order is None:
                     order = _FORMATS[kind]
-                case ["element", called, n] if order is not None and int(n) >= 0 and called not in {one.name for one in elements}:
-                    elements.append(Element(called, int(n), [], line))
+                case ["element", called, n] if order is not None and to_int(n) >= 0 and called not in {one.name for one in elements}:
+                    elements.append(Element(called, to_int(n), [], line))
                 case ["property", "list", count, kind, called] if TYPES[count][0] in "iu":
                     elements[-1].properties.append(Property(called, TYPES[kind], TYPES[count]))
                 case ["property", kind, called]:
@@ -156,10 +156,10 @@ class _Rows:
                     continue
                 (length,) = count.unpack_from(self.data, self.at) if self.at + count.size <= end else (-1,)
                 if not 0 <= length <= end or length != int(length):
-                    raise self.error(f"expected the length of a list of {element.name!r}", min(self.at, end))
+                    raise self.error("expected the length of a list in this row", min(self.at, end))
                 lengths = (*lengths, int(length))
                 self.at += count.size + int(length) * size
             if self.at > end:
-                raise self.error(f"expected a whole row of {element.name!r}, but the file ends", end)
+                raise self.error("expected a whole row, but the file ends", end)
             found.setdefault(lengths, []).append(first)
         return {lengths: np.array(starts) for lengths, starts in found.items()}

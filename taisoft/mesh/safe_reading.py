@@ -15,6 +15,7 @@ import subprocess
 import sys
 import tempfile
 from codecs import BOM_UTF8
+from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -42,7 +43,8 @@ class FileContent(NamedTuple):
 
     points: np.ndarray  # (n,3)
     cells: Blocks
-    cell_data: dict[str, list[np.ndarray]] = {}  # by name, the numbers (k,) of each block's elements
+    # by name, the numbers (k,) of each block's elements, or a function that returns them, or none if some elements have none
+    cell_data: dict[str, list[np.ndarray] | Callable[[], list[np.ndarray]]] = {}
     region_names: dict[int, str] = {}
     notes: list[str] = []  # what was left out
 
@@ -186,7 +188,7 @@ def _read(path: str, seconds: str) -> dict[str, np.ndarray]:
         sys.exit("it declares more data than it can hold")
     except (Exception, SystemExit) as error:
         text = _without_content(str(error), data.lower()) if isinstance(error, (meshio.ReadError, EOFError)) else ""
-        text = text if text and "..." not in text else f"expected the format {Path(path).suffix} here or before"
+        text = text if text and "..." not in text else f"the reader of {Path(path).suffix} files stopped here"
         sys.exit(_place(error, data) + text)
     if skipped := next((text for text in printed if "cannot handle" in text), None):
         sys.exit(f"cells of {skipped[skipped.rfind('(') + 1 :].rstrip(').')} of VTK are not known here")

@@ -26,7 +26,7 @@ def read_stl(name: str, data: bytes) -> tuple[np.ndarray, list[np.ndarray]]:
     """Return positions (n,3) and an array of triangles (k,3). Raises MeshError."""
     n = int.from_bytes(data[80:HEADER], "little")
     if len(data) != HEADER + FACET * n:
-        if _TEXT.match(data) and (b"\0" not in data or b"facet normal" in data):
+        if _TEXT.match(data) and (b"\0" not in data or b"endfacet" in data[HEADER:].lower()):
             return _read_text(name, data.replace(b"\r\n", b"\n").replace(b"\r", b"\n"))
         if len(data) < HEADER:
             raise MeshError(f"{name}: byte {len(data)}: {RULE} at least {HEADER} bytes")

@@ -11,7 +11,7 @@ import numpy as np
 
 from taisoft.errors import MeshError
 from taisoft.mesh.safe_reading import FileContent, content_lines, read_content
-from taisoft.mesh.words import MAX_EXACT_INT
+from taisoft.mesh.words import MAX_EXACT_INT, to_float, to_int
 
 
 def read_tetgen(file: Path) -> FileContent:
@@ -36,7 +36,7 @@ def _tetgen_rows(file: Path, what: str, rule: str, allowed: tuple[int, ...]) -> 
     except MeshError as error:
         raise MeshError(f"{error}; TetGen's files come in pairs") from error
     try:
-        n_rows, n_columns = [int(word) for word in lines[0][1]][:2]
+        n_rows, n_columns = [to_int(word) for word in lines[0][1]][:2]
         if min(n_rows, n_columns) < 0:
             raise ValueError
     except ValueError:
@@ -51,7 +51,7 @@ def _tetgen_rows(file: Path, what: str, rule: str, allowed: tuple[int, ...]) -> 
         try:
             if len(words) <= n_columns:
                 raise ValueError
-            row[:] = [float(word) for word in words[: 1 + n_columns]]
+            row[:] = [to_float(word) for word in words[: 1 + n_columns]]
         except ValueError:
             raise MeshError(f"{file}: line {number}: expected {1 + n_columns} numbers") from None
     return rows

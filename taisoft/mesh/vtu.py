@@ -1,7 +1,7 @@
 """Read .vtu files, VTK's XML files of unstructured grids: all pieces, numbers in any of the format's encodings.
 
 Of several pieces meshio keeps the cells of the last; it drops cells of types that it does not know, and refuses versions above 1.
-Here data of cells are kept where all pieces have them.
+Here data of cells are decoded when they are asked for. Cells that `vtkGhostType` marks belong to another piece and are left out.
 Sources: VTK documentation, "VTK XML formats"; vtkCellType.h, whose numbers meshio holds.
 Weak: LZ4 needs a package that is not part of Python, and is refused.
 """
@@ -11,6 +11,7 @@ import binascii
 import lzma
 import re
 import zlib
+from functools import partial
 from typing import NamedTuple
 from xml.parsers import expat
 
@@ -26,6 +27,7 @@ _TYPES = {f"{kind}Int{8 * n}": f"{kind[:1].lower() or 'i'}{n}" for kind in ("", 
 _TYPES |= {"Float32": "f4", "Float64": "f8"}
 _ORDERS = {"LittleEndian": "<", "BigEndian": ">"}
 _DECOMPRESSORS = {"vtkZLibDataCompressor": zlib.decompressobj, "vtkLZMADataCompressor": lzma.LZMADecompressor}
+_GHOSTS = "vtkGhostType"
 _APPENDED = re.compile(rb"<AppendedData\b[^>]*>\s*_")
 
 
@@ -110,17 +112,18 @@ class _Reader:
         return table[key]
 
     def content(self) -> FileContent:
-        points, blocks, data, total = [np.empty((0, 3))], Blocks(), [], 0
+        points, blocks, total, n_ghosts = [np.empty((0, 3))], Blocks(), 0, 0
+        pieces: list[tuple[_Piece, np.ndarray, np.ndarray]] = []  # with cells: the first of each block, which are kept
         for piece in self._pieces:
             n_points, n_cells = (self._count(piece, what) for what in ("NumberOfPoints", "NumberOfCells"))
-            if n_cells == 0 or n_points == 0:
+            if n_cells == 0:
                 continue
             points.append(self._numbers(piece, "Points", "", 3 * n_points).reshape(-1, 3))
             offsets, types = (self._numbers(piece, "Cells", what, n_cells).astype(np.int64) for what in ("offsets", "types"))
             cells = piece.arrays["Cells"]
             sizes = np.diff(offsets, prepend=0)
             if (sizes < 0).any():
-                raise self._error("expected offsets that do not fall", cells["offsets"].line)
+                raise self._error("expected offsets that do not decrease", cells["offsets"].line)
             nodes = self._numbers(piece, "Cells", "connectivity", int(offsets[-1])).astype(np.int64)
             bad = np.flatnonzero((nodes < 0) | (nodes >= n_points))
             if len(bad):
@@ -128,17 +131,27 @@ class _Reader:
                 text = f"cell {cell}: node {nodes[bad[0]]} does not exist ({n_points} points)"
                 raise self._error(text, cells["connectivity"].line)
             first = np.flatnonzero(np.diff(types, prepend=-1))
+            has_ghosts = _GHOSTS in piece.arrays.get("CellData", {})
+            kept = self._numbers(piece, "CellData", _GHOSTS, n_cells) == 0 if has_ghosts else np.ones(n_cells, dtype=bool)
             for begin, end in zip(first.tolist(), [*first[1:].tolist(), n_cells]):
-                blocks.append(self._block(cells["types"].line, types[begin], sizes[begin:end], begin, nodes, offsets, total))
-            arrays = piece.arrays.get("CellData", {})
-            names = [key for key, one in arrays.items() if one.attributes.get("NumberOfComponents", "1") in ("", "1")]
-            data.append({key: np.split(self._numbers(piece, "CellData", key, n_cells), first[1:]) for key in names})
-            total += n_points
-        common = [key for key in (data[0] if data else {}) if all(key in one for one in data)]
-        lost = any("region" in one for one in data) and "region" not in common
-        notes = ["data 'region' of cells are not in all pieces and are not used"] if lost else []
-        by_name = {key: [values for one in data for values in one[key]] for key in common}
+                kind, own = self._block(cells["types"].line, types[begin], sizes[begin:end], begin, nodes, offsets, total)
+                blocks.append((kind, own[kept[begin:end]]))
+            pieces.append((piece, first, kept))
+            total, n_ghosts = total + n_points, n_ghosts + n_cells - int(kept.sum())
+        keys = {key: None for piece, _, _ in pieces for key in piece.arrays.get("CellData", {}) if _is_scalar(piece, key)}
+        notes = [f"{n_ghosts} cells that {_GHOSTS} marks are left out"] if n_ghosts else []
+        by_name = {key: partial(self._of_cells, key, pieces) for key in keys if key != _GHOSTS}
         return FileContent(np.concatenate(points), blocks, by_name, notes=notes)
+
+    def _of_cells(self, key: str, pieces: list[tuple[_Piece, np.ndarray, np.ndarray]]) -> list[np.ndarray]:
+        """Return data of cells by blocks; none if pieces lack them."""
+        if not all(_is_scalar(piece, key) for piece, _, _ in pieces):
+            return []
+        found = []
+        for piece, first, kept in pieces:
+            values = self._numbers(piece, "CellData", key, len(kept))
+            found += [one[own] for one, own in zip(np.split(values, first[1:]), np.split(kept, first[1:]))]
+        return found
 
     def _block(self, line, code, sizes, begin, nodes, offsets, shift) -> tuple[str, np.ndarray]:
         """Return the cells from number `begin` on, all of the same type. shift: added to the numbers of nodes."""
@@ -208,6 +221,13 @@ class _Reader:
         if len(data) % kind.itemsize:
             raise stream.error(f"expected numbers of {kind.itemsize} bytes, not {len(data)} bytes")
         return np.frombuffer(data, kind)
+
+
+def _is_scalar(piece: _Piece, key: str) -> bool:
+    """Return whether data of a piece's cells are one number each."""
+    array = piece.arrays.get("CellData", {}).get(key)
+    attributes = array.attributes if array else {}
+    return attributes.get("type") in _TYPES and attributes.get("NumberOfComponents", "1") in ("", "1")
 
 
 class _Stream:

@@ -19,7 +19,7 @@ class Words:
 
     def __init__(self, name: str, text: bytes, first_line: int = 1, section: str = ""):
         self.name, self.text, self.words, self.at = name, text, text.split(), 0
-        self._first_line, self._section = first_line, section and f" ({section})"
+        self._first_line, self._section, self._underscores = first_line, section and f" ({section})", b"_" in text
 
     def error(self, text: str, index: int | None = None) -> MeshError:
         """Return the error at word number `index`, by default the last one read."""
@@ -44,7 +44,7 @@ class Words:
     def floats(self, n: int) -> np.ndarray:
         """Return the next n numbers (n,) as float64."""
         if n > self.left():
-            raise self.error(f"{n} numbers should follow here or before, but only {self.left()} do", len(self.words) - 1)
+            raise self.error(f"{n} numbers should follow, but only {self.left()} do")
         self.at += n
         return self.numbers(self.at - n, self.at)
 
@@ -52,6 +52,8 @@ class Words:
         """Return the words first, first + step, ... below end as float64."""
         found = self.words[first:end:step]
         try:
+            if self._underscores and any(b"_" in word for word in found):
+                raise ValueError
             return np.array(found, dtype=np.float64)
         except ValueError:
             bad = first + step * next(i for i, word in enumerate(found) if not _is_number(word))
@@ -73,8 +75,8 @@ class Words:
             raise self.error(f"expected a whole number, not {self.quoted(k)}", k)
         return values.astype(np.int64)
 
-    def count(self) -> int:
-        """Return the next number, which counts something."""
+    def count(self, kind: str = "") -> int:
+        """Return the next number, which counts something. kind: as for `ints`."""
         n = int(self.ints(1)[0])
         if n < 0:
             raise self.error(f"expected a number of at least 0, not {n}")
@@ -91,8 +93,25 @@ def last_line(data: bytes) -> int:
     return data.rstrip().count(b"\n") + 1
 
 
+def to_float(word: str) -> float:
+    """Return a word's number; D may stand for E before its exponent. Raises ValueError, also for Python's 1_0."""
+    if "_" in word:
+        raise ValueError
+    try:
+        return float(word)
+    except ValueError:
+        return float(re.sub(r"(?<=[\d.])[dD](?=[+-]?\d)", "e", word))
+
+
+def to_int(word: str) -> int:
+    """Return a word's whole number, of at most 15 digits. Raises ValueError."""
+    if not re.fullmatch(r"[+-]?\d{1,15}", word, re.ASCII):
+        raise ValueError
+    return int(word)
+
+
 def _is_number(word: bytes) -> bool:
     try:
-        return bool(np.array([word], dtype=np.float64).size)
+        return b"_" not in word and bool(np.array([word], dtype=np.float64).size)
     except ValueError:
         return False

@@ -1,8 +1,11 @@
 """Make the meshes of a scene file: from a shape with the arguments of its function, from a file, or from its own numbers."""
 
+import functools
+import re
 from collections.abc import Callable
 from pathlib import Path
 
+from taisoft.errors import MeshError
 from taisoft.mesh.files import WRITERS, read_mesh
 from taisoft.mesh.shapes import ball_mesh, box_mesh, sheet_mesh
 from taisoft.mesh.surface_mesh import FORMATS, SurfaceMesh, read_surface
@@ -12,7 +15,7 @@ from taisoft.scene import checks
 from taisoft.scene.tables import Table, arguments_of, value_text
 
 MESHES = {"box": box_mesh, "sheet": sheet_mesh, "ball": ball_mesh}
-STANDALONE = (*WRITERS, ".node", ".ele")  # formats whose files reference no other files
+STANDALONE = (*WRITERS, ".node", ".ele", ".inp", ".bdf", ".nas", ".fem")  # their readers open no other files
 
 
 def mesh_of(table: Table, allow_outside: bool) -> TetMesh:
@@ -46,7 +49,7 @@ def _read(table: Table, mesh: Table, allow_outside: bool) -> TetMesh:
     if "fix_orientation" in mesh:
         with mesh.located_errors():
             checks.flag(mesh.values["fix_orientation"], "fix_orientation")
-    return mesh.make(read_mesh, keys=mesh.known[1:], path=path)
+    return mesh.make(_without_quotes(read_mesh), keys=mesh.known[1:], path=path)
 
 
 def solid_of(table: Table, allow_outside: bool) -> TetMesh | SurfaceMesh:
@@ -63,9 +66,22 @@ def surface_of(table: Table, key: str, allow_outside: bool) -> SurfaceMesh:
     """Return the surface under a key, which has a file or vertices and triangles."""
     if isinstance(table.values[key], dict) and "file" in table.values[key]:
         mesh = table.table(key, ["file", *arguments_of(read_surface, "path")[0]])
-        return mesh.make(read_surface, keys=mesh.known[1:], path=_mesh_path(mesh, allow_outside, FORMATS))
+        return mesh.make(_without_quotes(read_surface), keys=mesh.known[1:], path=_mesh_path(mesh, allow_outside, FORMATS))
     mesh = table.table(key, ["vertices", "triangles"], ["vertices", "triangles"])
     return mesh.make(SurfaceMesh, "surface: ")
+
+
+def _without_quotes(reader: Callable) -> Callable:
+    """Return a reader whose refusals do not quote the file: a scene file may name any, also a confidential one."""
+
+    @functools.wraps(reader)
+    def read(**arguments):
+        try:
+            return reader(**arguments)
+        except MeshError as error:
+            raise MeshError(re.sub(r", not (['\"]).*", "", str(error))) from None
+
+    return read
 
 
 def _mesh_path(mesh: Table, allow_outside: bool, formats: tuple[str, ...]) -> Path:

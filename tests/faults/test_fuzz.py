@@ -20,6 +20,7 @@ from pxr import Usd, UsdGeom, Vt
 import taisoft as ts
 from taisoft.checkpoint import read_checkpoint, write_checkpoint
 from taisoft.mesh.surface_mesh import FORMATS, read_surface
+from tests.mesh.test_formats import EXPECTED, vtu
 from tests.scene.toml_scenes import TEXT
 from tests.view.fake_simulator import beam_scene
 
@@ -34,7 +35,7 @@ SECONDS = 20  # time limit of a reader
 QUICK = re.compile(
     r"surface\.|(text|binary)\.[ps]|(part|text|old)\.msh|part\.(vtu|mesh|inp|bdf|node)$"
 )  # read without a child process
-N_QUICK = 200  # changed files of each of these
+N_QUICK, N_SMALL = 200, 40  # changed files of each of these, and of those of test_formats.py
 PLACE = re.compile(
     r"\b(line|byte|row|node|vertex|vertices|tets?|triangle|edges?) \d|\bno \w+|is empty|the file holds|ten nodes are not"
 )
@@ -67,7 +68,9 @@ def samples(tmp_path_factory) -> dict[str, bytes]:
     write_checkpoint(folder / "a.npz", {}, beam_scene(), {}, {"x": np.arange(300.0), "n": 3}, {"fps": 30.0})
     # without cell counts, since changed ones may describe a valid but huge mesh
     (folder / "scene.toml").write_text(TEXT[: TEXT.index("[bodies.beam]")] + "[bodies.beam]\nmesh = { file = 'part.vtk' }\n")
-    return {path.name: path.read_bytes() for path in folder.iterdir()}
+    small = {f"small{k}.{name[2:]}": text.encode() for k, (name, text, _) in enumerate(EXPECTED)}
+    small |= {f"small_{form}.vtu": vtu(form) for form in ("ascii", "binary", "binary zlib", "appended zlib", "appended raw")}
+    return small | {path.name: path.read_bytes() for path in folder.iterdir()}
 
 
 def read(path) -> None:
@@ -146,13 +149,14 @@ def test_readers_survive_mutated_files(tmp_path, samples):
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
+            warnings.simplefilter("error", RuntimeWarning)  # of NumPy
             for name, data in sorted(samples.items()):
                 path = tmp_path / f"file.{name.rsplit('.', 1)[1]}"
                 path.write_bytes(data)  # unchanged at first, so that imports and caches do not count as a file's memory
                 with contextlib.suppress(ts.TaisoftError):  # meshio cannot read every file that it writes
                     read(path)
                 check_reader(path, mutated(data, rng))
-                for _ in range(N_QUICK if QUICK.match(name) else 0):
+                for _ in range(N_SMALL if name.startswith("small") else N_QUICK if QUICK.match(name) else 0):
                     path.write_bytes(mutated(data, rng))
                     try:
                         read(path)

@@ -31,6 +31,8 @@ LARGE = rows("GRID*   {:<16}" + 16 * " " + "{:<16.1f}{:<16.1f}*G\n*G      {:<16.
 MEDIT = "MeshVersionFormatted 2 # double\nDimension\n3\nVertices 4\n" + "".join("{} {} {} 0\n".format(*p) for p in POINTS)
 GMSH = "$MeshFormat\n4 0 8\n$EndMeshFormat\n$Entities\n1 0 0 1\n9 0 0 0 0 0 0 0\n1 0 0 0 1 1 1 1 7 0\n$EndEntities\n$Nodes\n1 4\n"
 GMSH += "1 3 0 4\n" + rows("{} {} {} {}\n") + "$EndNodes\n$Elements\n1 1\n1 3 4 1\n1 1 2 3 4\n$EndElements\n"
+PARTED = GMSH.replace("$Nodes", "$PartitionedEntities\n2 0\n0 0 0 1\n5 3 1 1 2 0 0 0 1 1 1 1 8 0\n$EndPartitionedEntities\n$Nodes")
+PARTED = PARTED.replace("1 3 4 1", "5 3 4 1")
 EXPECTED = (
     ("a.inp", NODES + NEXT_NODES + TET + NEXT_TET, (0, 6)),
     ("a.inp", "*SYSTEM\n0,0,0,0,1,0\n-1,0,0\n" + NODES + "*SYSTEM\n" + TET + NEXT_NODES + NEXT_TET, (-1, 6)),
@@ -38,9 +40,14 @@ EXPECTED = (
     ("a.inp", PART + INSTANCE.format("") + INSTANCE.format("3,0,0\n0,0,0,0,0,2,90\n"), (-1, 1)),
     ("a.inp", PART + "*PART, NAME=Q\n" + INSTANCE.format("9,0,0\n"), "part 'Q' has no .INSTANCE and is left out"),
     ("a.inp", PART + INSTANCE.format("9,0,0\n").replace("=a", "=c"), "line 12: expected the name of a part above as PART of"),
-    ("a.inp", NODES + "*NGEN\n1,9,1\n" + TET, r"line 7: expected nodes and elements as they are: \*NGEN is not supported"),
-    ("a.inp", NODES + "*NODE, SYSTEM=C\n9,1,0,0\n" + TET, "line 7: expected NSET or SYSTEM=R as options of .NODE, not SYSTEM=C"),
+    ("a.inp", NODES + "*NGEN\n1,9,1\n" + TET, r"line 7: \*NGEN is not supported: write its nodes out"),
+    ("a.inp", "*SYST\n5,0,0\n" + NODES + TET, r"line 1: expected the whole keyword \*SYSTEM, not \*SYST"),
+    ("a.inp", PART.replace("*END P", "*En Dp") + INSTANCE.format("3,0,0\n").replace("*In", "* i n"), (3, 4)),
+    ("a.inp", NODES + TET.replace("type", "inp=b.inp, type"), "line 7: expected TYPE or ELSET as option of .ELEMENT, not 'INP'"),
+    ("a.inp", NODES + "*NODE, SYSTEM=C\n9,1,0,0\n" + TET, "line 7: expected SYSTEM=R of .NODE, not 'C'"),
     ("a.inp", NODES + NODES + TET, "line 9: expected the number of a new node, not '1'"),
+    ("a.inp", NODES + TET + TET, "line 11: expected the number of a new element, not '1'"),
+    ("a.inp", NODES.replace("1,0,0,0", "1,0,0,1d999") + TET, "line 3: expected finite numbers, not .0, 0, 1d999"),
     ("a.inp", NODES + NEXT_TET, r"line 8: node 11 does not exist \(4 nodes\)"),
     ("a.bdf", "SOL 1\nbegin bulk\n" + CORD + GRID.replace(",,", ",5,") + CTETRA + END, (10, 11)),
     ("a.nas", CORD + "GRDSET,,5\n" + GRID + CTETRA, (10, 11)),
@@ -57,12 +64,18 @@ EXPECTED = (
         "line 1: expected a definition of coordinate system 5, n",
     ),
     ("a.bdf", "BEGIN BULK\n" + GRID + CTETRA, "line 6: expected ENDDATA before the file's end"),
+    ("a.bdf", GRID + 2 * CTETRA, "line 6: expected the number of a new element, not 1"),
+    ("a.bdf", GRID.replace("4,,0.,", "4,,1e999,") + CTETRA, "line 4: expected finite numbers, not .1e999"),
+    ("a.bdf", GRID.replace("4,,0.", "4,,1_0.") + CTETRA, "line 4: expected a number in field 4 of GRID, not '1_0.'"),
+    ("a.mesh", MEDIT + "Tetrahedra 1 1 2 3 4 1_0\nEnd", "line 9: expected a number, not '1_0'"),
+    ("a.mesh", MEDIT + "Tetrahedra 1 1 2\n3 4", "line 9: 5 numbers should follow, but only 4 do"),
     ("a.mesh", MEDIT + "SubDomainFromGeom\n1\n3 1 1 7\nTetrahedra 1 1 2 3 4 7\nRequiredTetrahedra 1 1 End", (0, 1)),
     ("a.mesh", MEDIT + "Tetrahedra 1 1 2 3 4 7\n", "the keyword End is missing"),
     ("a.mesh", MEDIT + "Tetrahedr 1 1 2 3 4 7\nEnd\n", "line 9: expected a keyword of Medit's format, not 'Tetrahedr'"),
     ("a.mesh", MEDIT + "Tetrahedra 1\n1 2 3 5 7\nEnd\n", "line 10: expected vertices from 1 to 4, not '5'"),
     ("a.msh", GMSH, (0, 1)),
-    ("a.msh", GMSH.replace("4 0 8", "3.0 0 8"), r"line 2 \(.MeshFormat\): expected version 2, 4.0 or 4.1, not 3.0"),
+    ("a.msh", PARTED, (0, 1)),
+    ("a.msh", GMSH.replace("4 0 8", "3.0 0 8"), r"line 2 \(.MeshFormat\): expected version 2, 4.0 or 4.1, not '3.0'"),
 )
 
 
@@ -88,6 +101,8 @@ def test_nodes_are_where_the_file_puts_them(tmp_path, name, text, expected):
     else:
         x = found.vertices[:, 0]
         assert (x.min(), x.max()) == pytest.approx(expected, abs=1e-12) and found.volumes == pytest.approx(1 / 6)
+        if name == "a.msh":
+            assert found.regions.tolist() == [7]
 
 
 def vtu(form: str, region: str = "region") -> bytes:
@@ -126,7 +141,11 @@ def test_all_pieces_of_vtu_are_read(tmp_path, form):
     assert mesh.vertices.tolist() == [[a + x, b, c] for x in (0, 5) for a, b, c in POINTS]
     assert mesh.regions.tolist() == [0, 5] and mesh.tets.tolist() == [[0, 1, 2, 3], [4, 5, 6, 7]]
     if form == "ascii":
-        assert "data 'region' of cells are not in all pieces" in outcome(tmp_path / "a.vtu", vtu(form, "stress"))
+        path, no_types = tmp_path / "a.vtu", vtu(form, "vtkGhostType").replace(b">5<Inf", b">1<Inf")
+        assert "1 cells that vtkGhostType marks are left out" in outcome(path, no_types)
+        text = vtu(form, "String").replace(b'"Int8" Name="String"', b'"String" Name="String"')
+        assert outcome(path, text) == "cell data 'region' are no regions, since not all pieces have them"
+        assert outcome(path, vtu(form).replace(b'Points="4"', b'Points="0"')).startswith("line 2: expected 0 numbers of Points")
         assert outcome(tmp_path / "a.vtu", vtu(form).replace(b">10<", b">11<")).endswith("the file holds 2 VTK type 11 elements")
 
 
@@ -159,7 +178,7 @@ def test_ply_with_any_elements_and_properties(tmp_path, order):
     lost = outcome(tmp_path / "a.ply", (data + b"".join(faces)).replace(b"vertex_index", b"vertices"))
     assert (
         lost
-        == "line 11: expected faces with a list called vertex_indices or vertex_index, not 'face' with area, vertices, texcoord"
+        == "line 11: expected faces with a list called vertex_indices or vertex_index, not 'face' with area, list vertices, list texcoord"
     )
 
 
@@ -178,6 +197,7 @@ def test_stl_of_any_header(tmp_path):
     ):
         surface = outcome(path, data)
         assert len(surface.triangles) == 12 and surface.volume == pytest.approx(1.0) and len(surface.vertices) == 8
+    assert outcome(path, b"solid facet normal".ljust(80) + binary + b"\0").endswith(", but there are 685")
     for data, n in ((binary + b"\0", 685), (binary[:-1], 683)):
         assert outcome(path, b"solid".ljust(80) + data).endswith(f" 684 bytes for 12 triangles, but there are {n}")
     assert outcome(path, text.replace(b"endloop", b"endlop")) == "line 7: expected 'endloop', not 'endlop'"

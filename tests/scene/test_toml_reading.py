@@ -61,6 +61,9 @@ def test_encodings_of_scene_files(tmp_path, monkeypatch):
         ("pair.ele", "must lie inside"),
         ("a.xdmf", "other formats can name further files; --allow-outside (allow_outside=True) lifts this"),
         ("secret.msh", "not a supported mesh"),  # read by a child process
+        ("secret.mesh", "not a supported mesh: expected MeshVersionFormatted"),
+        ("secret.bdf", "line 1: not a supported mesh: expected the name of an entry, such as GRID"),
+        ("secret.ply", "line 2: expected format ascii or binary 1.0"),
     ],
 )
 def test_mesh_files_must_lie_in_the_folder_of_the_scene_file(tmp_path, name, message):
@@ -73,12 +76,14 @@ def test_mesh_files_must_lie_in_the_folder_of_the_scene_file(tmp_path, name, mes
     (inside / "pair.ele").write_text("1 4 0\n1 1 2 3 4\n")
     os.symlink(outside / "out.msh", inside / "link.msh")
     os.symlink(outside / "pair.node", inside / "pair.node")
-    write(inside / "secret.msh", "passphrase")
+    if name.startswith("secret"):
+        write(inside / name, ("ply\n" if "ply" in name else "") + "'pass\"' passphrase\nend_header\n")
     text = MESH.format(name.replace("OUT", str(outside)))
+    text = text.replace("[bodies", "[rigid_bodies").replace("material = {}\n", "") if name.endswith(".ply") else text
     with pytest.raises((ts.SceneError, ts.MeshError)) as caught:
         read(inside, text)
-    assert message in str(caught.value) and str(caught.value).startswith(f"{inside / 'scene.toml'}: bodies.a.mesh")
-    assert "passphrase" not in str(caught.value) and "secret" not in str(caught.value).replace("secret.msh", "")
+    assert message in str(caught.value) and str(caught.value).startswith(f"{inside / 'scene.toml'}: {text[1:text.index(']')]}.mesh")
+    assert "passphrase" not in str(caught.value) and "secret" not in str(caught.value).replace(name, "")
 
 
 def places(values, at=()):
