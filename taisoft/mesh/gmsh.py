@@ -117,10 +117,15 @@ def read_gmsh(name: str, data: bytes) -> FileContent | None:
     needed: dict[str, Callable] = {"Nodes": _nodes_2, "Elements": _elements_2}
     if major == "4":
         needed = {"Nodes": partial(_nodes_4, old=version != "4.1"), "Elements": partial(_elements_4, old=version != "4.1")}
-    readers = needed if major == "2" else needed | {
-        "Entities": partial(_entities_4, old=version != "4.1"),
-        "PartitionedEntities": partial(_entities_4, old=version != "4.1", parted=True),
-    }
+    readers = (
+        needed
+        if major == "2"
+        else needed
+        | {
+            "Entities": partial(_entities_4, old=version != "4.1"),
+            "PartitionedEntities": partial(_entities_4, old=version != "4.1", parted=True),
+        }
+    )
     sections = {}
     while opening := _OPENING.search(data, at):
         section, at = opening[1].decode("ascii", "replace"), opening.end()

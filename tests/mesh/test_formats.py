@@ -31,7 +31,9 @@ LARGE = rows("GRID*   {:<16}" + 16 * " " + "{:<16.1f}{:<16.1f}*G\n*G      {:<16.
 MEDIT = "MeshVersionFormatted 2 # double\nDimension\n3\nVertices 4\n" + "".join("{} {} {} 0\n".format(*p) for p in POINTS)
 GMSH = "$MeshFormat\n4 0 8\n$EndMeshFormat\n$Entities\n1 0 0 1\n9 0 0 0 0 0 0 0\n1 0 0 0 1 1 1 1 7 0\n$EndEntities\n$Nodes\n1 4\n"
 GMSH += "1 3 0 4\n" + rows("{} {} {} {}\n") + "$EndNodes\n$Elements\n1 1\n1 3 4 1\n1 1 2 3 4\n$EndElements\n"
-PARTED = GMSH.replace("$Nodes", "$PartitionedEntities\n2 0\n0 0 0 1\n5 3 1 1 2 0 0 0 1 1 1 1 8 0\n$EndPartitionedEntities\n$Nodes")
+PARTED = GMSH.replace(
+    "$Nodes", "$PartitionedEntities\n2 0\n0 0 0 1\n5 3 1 1 2 0 0 0 1 1 1 1 8 0\n$EndPartitionedEntities\n$Nodes"
+)
 PARTED = PARTED.replace("1 3 4 1", "5 3 4 1")
 EXPECTED = (
     ("a.inp", NODES + NEXT_NODES + TET + NEXT_TET, (0, 6)),

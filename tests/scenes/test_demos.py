@@ -1,4 +1,5 @@
-"""Demos run with status ok, but for two with misplaced contact forces, and pass their own check of the physics: a few, and with --long every one in the folder:
+"""Demos run with status ok, but for two with misplaced contact forces, and pass their own check of the physics: a few, and with
+--long every one in the folder:
 
 * the check fails if the material is 1 % stiffer than in the demo, or another number is off by as much;
 * sheets in contact intersect nothing in any frame, according to ipctk;
@@ -69,7 +70,7 @@ def opened(demo: ModuleType) -> tuple[Simulator, dict]:
     return Simulator(demo.build(), **settings), run
 
 
-# surfaces slide far over small radii in a few steps, which the run reports: fingertips over the cube's edges; falling bodies on each other
+# surfaces slide far over small radii in a few steps, which the run reports: a cube's edges, falling bodies on each other
 MISPLACED = {"gripper", "drop_everything"}
 
 
