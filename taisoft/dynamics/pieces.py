@@ -75,6 +75,7 @@ class Pieces:
         self._names, self.body = [names[k] for k in np.argsort(number)], self.body[np.argsort(number)]
         component, piece = component[np.argsort(number)], number[piece]
         self.of_node, self._component = piece, component[piece]
+        self._free, self._any_free = np.zeros(0), False  # of the last call of `any_free`
         self._independent = np.ones(n_nodes, dtype=bool)
         if simulation.dependents is not None:
             self._independent[simulation.dependents.node] = False
@@ -127,9 +128,11 @@ class Pieces:
 
     def any_free(self, free: np.ndarray) -> bool:
         """Return whether some component is free along some axis, but for contacts. free: (n_nodes, 3), 0 on constrained axes."""
-        held = (free == 0.0) & self._independent[:, None]
-        fixed = [np.bincount(self._component, held[:, axis], len(self.anchored)) for axis in range(3)]
-        return bool(((np.array(fixed) == 0.0) & ~self.anchored).any())
+        if not np.array_equal(free, self._free):
+            held = (free == 0.0) & self._independent[:, None]
+            fixed = [np.bincount(self._component, held[:, axis], len(self.anchored)) for axis in range(3)]
+            self._free, self._any_free = free.copy(), bool(((np.array(fixed) == 0.0) & ~self.anchored).any())
+        return self._any_free
 
     def forget_weights(self) -> None:
         """Let all pieces count alike, and linear solves without factors."""

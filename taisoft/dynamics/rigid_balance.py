@@ -95,6 +95,23 @@ def _row_sum(m: ti.template(), i):
 
 
 @ti.func
+def _mass_times_arm(m: ti.template(), i, x: ti.template(), c):
+    """(M a)_i of the arms a = x - c [kg m]."""
+    result = ti.Vector.zero(ti.f64, 3)
+    if ti.static(m.consistent):
+        result = mass_times(m, i, x) - _row_sum(m, i) * c
+    else:
+        result = ti.cast(m.mass[i], ti.f64) * (x[i] - c)
+    return result
+
+
+@ti.func
+def _is_held(p: ti.template(), row):
+    """Whether a row of nodes belongs to a component that is not corrected."""
+    return p.held[p.component[p.node[p.row_start[row]]]] == HELD
+
+
+@ti.func
 def _velocity(m: ti.template(), s: ti.template(), i, mode: ti.template()):
     """Velocity of node i that `correct_rigid_motion` corrects."""
     v = m.state.v[i]
@@ -130,13 +147,14 @@ def _in_contact(p: ti.template(), k: ti.template()):
 
 @ti.func
 def _resultant(m: ti.template(), s: ti.template(), p: ti.template(), x: ti.template(), row, beta):
-    """Add up a row of nodes: mass, its first moment, resultant of inertia and loads, and constraints by axis."""
+    """Add up a row of nodes: mass, its first moment, resultant of inertia and loads (in `moved` by node), constraints by axis."""
     sums = ti.Vector.zero(ti.f64, N_MOMENTS)
     for at in range(p.row_start[row], p.row_start[row + 1]):
         i = p.node[at]
         if not _is_dependent(m, i):
             mass, fixed = _damping_factor(m, i, beta) * _row_sum(m, i), 1.0 - ti.cast(m.free[i], ti.f64)
             q = mass_times(m, i, s.change) - beta * ti.cast(loads_on(m, i), ti.f64)
+            s.moved[i] = q
             sums[MASS] += mass
             for a in ti.static(range(3)):
                 sums[CENTRE + a] += mass * x[i][a]
@@ -144,6 +162,21 @@ def _resultant(m: ti.template(), s: ti.template(), p: ti.template(), x: ti.templ
                 sums[FIXED + a] += fixed[a]
     for j in ti.static(range(N_MOMENTS)):
         p.sums[row, j] = sums[j]
+
+
+@ti.func
+def _find_translation(p: ti.template(), j):
+    """Add up the rows of component j, and set the velocity that balances it, along the axes without constraints."""
+    for q in ti.static(range(N_MOMENTS)):
+        total = ti.cast(0.0, ti.f64)
+        for row in range(p.component_row[j], p.component_row[j + 1]):
+            total += p.sums[row, q]
+        p.moments[j, q] = total
+    for a in ti.static(range(3)):
+        p.moments[j, CENTRE + a] = p.moments[j, CENTRE + a] / p.moments[j, MASS]
+        p.motion[j, a], p.motion[j, 3 + a] = 0.0, 0.0
+        if p.moments[j, FIXED + a] == 0.0:
+            p.motion[j, a] = -p.moments[j, RESULTANT + a] / p.moments[j, MASS]
 
 
 @ti.func
@@ -159,14 +192,13 @@ def _moment(m: ti.template(), s: ti.template(), p: ti.template(), x: ti.template
         if not _is_dependent(m, i):
             j = p.component[i]
             c = ti.Vector([p.moments[j, CENTRE], p.moments[j, CENTRE + 1], p.moments[j, CENTRE + 2]])
-            arm = x[i] - c
-            q = mass_times(m, i, s.change) - beta * ti.cast(loads_on(m, i), ti.f64)
+            arm, q = x[i] - c, s.moved[i]
             if ti.static(m.stiffness_damping):
                 q -= beta * ti.cast(damping_force(m, s, row, i, m.state.v), ti.f64)
                 if ti.static(mode == AFTER):
                     q -= beta * ti.cast(damping_force(m, s, row, i, s.pcg.y), ti.f64)
             moment += arm.cross(q)
-            mass_arm = _damping_factor(m, i, beta) * (mass_times(m, i, x) - _row_sum(m, i) * c)
+            mass_arm = _damping_factor(m, i, beta) * _mass_times_arm(m, i, x, c)
             I += arm.dot(mass_arm) * identity - mass_arm.outer_product(arm)
             if ti.static(mode != SOLVED):
                 f = ti.cast(internal_on(m, i), ti.f64)
@@ -203,18 +235,17 @@ def _find_turning(p: ti.template(), j):
     if _is_definite((1.0 - LEAST_INERTIA) * I + turn):
         moment += ti.Vector([total[3], total[4], total[5]])
         I += turn
-    elif p.held[j] == FREE:
+    else:
         p.held[j] = INERT
     fixed = ti.Vector([p.moments[j, FIXED], p.moments[j, FIXED + 1], p.moments[j, FIXED + 2]])
-    if p.held[j] != HELD:
-        if fixed.sum() == 0.0:
-            w = I.inverse() @ moment
-            for a in ti.static(range(3)):
-                p.motion[j, 3 + a] = -w[a]
-        else:
-            for a in ti.static(range(3)):
-                if fixed[(a + 1) % 3] + fixed[(a + 2) % 3] == 0.0:
-                    p.motion[j, 3 + a] = -moment[a] / I[a, a]
+    if fixed.sum() == 0.0:
+        w = I.inverse() @ moment
+        for a in ti.static(range(3)):
+            p.motion[j, 3 + a] = -w[a]
+    else:
+        for a in ti.static(range(3)):
+            if fixed[(a + 1) % 3] + fixed[(a + 2) % 3] == 0.0:
+                p.motion[j, 3 + a] = -moment[a] / I[a, a]
 
 
 @kernel
@@ -234,29 +265,24 @@ def correct_rigid_motion(
     _in_contact(p, k)
     ti.loop_config(serialize=m.serial)
     for i in range(m.n_nodes):
-        u = _velocity(m, s, i, mode)
-        s.change[i] = _damping_factor(m, i, beta) * u - s.v_hat[i]
+        if p.held[p.component[i]] != HELD:
+            s.change[i] = _damping_factor(m, i, beta) * _velocity(m, s, i, mode) - s.v_hat[i]
     ti.loop_config(serialize=m.serial)
     for row in range(p.n_rows):
-        _resultant(m, s, p, x, row, beta)
+        if not _is_held(p, row):
+            _resultant(m, s, p, x, row, beta)
     ti.loop_config(serialize=m.serial)
     for j in range(p.n_components):
-        for q in ti.static(range(N_MOMENTS)):
-            total = ti.cast(0.0, ti.f64)
-            for row in range(p.component_row[j], p.component_row[j + 1]):
-                total += p.sums[row, q]
-            p.moments[j, q] = total
-        for a in ti.static(range(3)):
-            p.moments[j, CENTRE + a] = p.moments[j, CENTRE + a] / p.moments[j, MASS]
-            p.motion[j, a], p.motion[j, 3 + a] = 0.0, 0.0
-            if p.held[j] == FREE and p.moments[j, FIXED + a] == 0.0:
-                p.motion[j, a] = -p.moments[j, RESULTANT + a] / p.moments[j, MASS]
+        if p.held[j] != HELD:
+            _find_translation(p, j)
     ti.loop_config(serialize=m.serial)
     for row in range(p.n_rows):
-        _moment(m, s, p, x, mode, row, beta)
+        if not _is_held(p, row):
+            _moment(m, s, p, x, mode, row, beta)
     ti.loop_config(serialize=m.serial)
     for j in range(p.n_components):
-        _find_turning(p, j)
+        if p.held[j] != HELD:
+            _find_turning(p, j)
     ti.loop_config(serialize=m.serial)
     for i in range(m.n_nodes):
         j, change = p.component[i], ti.Vector.zero(ti.f64, 3)
@@ -265,7 +291,7 @@ def correct_rigid_motion(
             u, w = ti.Vector([p.motion[j, 0], p.motion[j, 1], p.motion[j, 2]]), _turning(p, j)
             free, factor = ti.cast(m.free[i], ti.f64), _damping_factor(m, i, beta)
             if ti.static(mode == SOLVED):
-                momentum = _row_sum(m, i) * (u - w.cross(c)) + w.cross(mass_times(m, i, x))
+                momentum = _row_sum(m, i) * u + w.cross(_mass_times_arm(m, i, x, c))
                 s.residual[i] = s.residual[i] + ti.cast(free * factor * momentum, m.real)
             change = free * (u + w.cross(x[i] - c))
             s.change[i] = s.change[i] + factor * change
