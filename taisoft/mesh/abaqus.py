@@ -14,12 +14,11 @@ import numpy as np
 from meshio.abaqus._abaqus import abaqus_to_meshio_type
 from scipy.spatial.transform import Rotation
 
-from taisoft.errors import MeshError
 from taisoft.mesh.node_numbers import LineReader, axes_from_points, blocks, merged
 from taisoft.mesh.safe_reading import FileContent
 from taisoft.mesh.words import to_int
 
-REFUSED = {key: "" for key in "NMAP INCLUDE IMPORT IMPERFECTION PARAMETER SYMMETRICMODELGENERATION".split()}
+REFUSED = dict.fromkeys("NMAP INCLUDE IMPORT IMPERFECTION PARAMETER SYMMETRICMODELGENERATION".split(), "")
 REFUSED |= dict.fromkeys(("NGEN", "NFILL", "NCOPY"), ": write its nodes out")
 REFUSED |= dict.fromkeys(("ELGEN", "ELCOPY"), ": write its elements out")
 USED = {"NODE": ("NSET", "SYSTEM"), "ELEMENT": ("TYPE", "ELSET"), "PART": ("NAME",), "INSTANCE": ("NAME", "PART")}  # and options
@@ -40,7 +39,10 @@ class _Section(NamedTuple):
 
 @dataclass
 class _Part:
-    """The model, or a part. numbers: index by number of a node; elements: numbers of tets; tets: lines and nodes by kind; others: counts by type."""
+    """The model, or a part.
+
+    numbers: index by number of a node; elements: numbers of tets; tets: lines and nodes by kind; others: counts by type.
+    """
 
     places: list[Place] = field(default_factory=list)
     numbers: dict[int, int] = field(default_factory=dict)

@@ -114,18 +114,11 @@ def read_gmsh(name: str, data: bytes) -> FileContent | None:
         if not order or size not in (4, 8):
             rule = "expected numbers of 4 or 8 bytes, then the number 1 in binary"
             raise MeshError(f"{name}: line {line} ($MeshFormat): {rule}")
-    needed: dict[str, Callable] = {"Nodes": _nodes_2, "Elements": _elements_2}
+    readers: dict[str, Callable] = {"Nodes": _nodes_2, "Elements": _elements_2}
     if major == "4":
-        needed = {"Nodes": partial(_nodes_4, old=version != "4.1"), "Elements": partial(_elements_4, old=version != "4.1")}
-    readers = (
-        needed
-        if major == "2"
-        else needed
-        | {
-            "Entities": partial(_entities_4, old=version != "4.1"),
-            "PartitionedEntities": partial(_entities_4, old=version != "4.1", parted=True),
-        }
-    )
+        parts = partial(_entities_4, parted=True)
+        readers = {"Nodes": _nodes_4, "Elements": _elements_4, "Entities": _entities_4, "PartitionedEntities": parts}
+        readers = {section: partial(reader, old=version != "4.1") for section, reader in readers.items()}
     sections = {}
     while opening := _OPENING.search(data, at):
         section, at = opening[1].decode("ascii", "replace"), opening.end()
@@ -140,7 +133,7 @@ def read_gmsh(name: str, data: bytes) -> FileContent | None:
         numbers = _Binary(name, data, at, section, order, size) if binary else _Text(name, data, at, section)
         sections[section] = readers[section](numbers)
         at = numbers.close()
-    for section in needed:
+    for section in ("Nodes", "Elements"):
         if section not in sections:
             raise MeshError(f"{name}: line {last_line(data)}: expected a ${section} section before the file's end")
     tags, points = sections["Nodes"]

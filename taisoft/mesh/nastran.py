@@ -17,6 +17,7 @@ from taisoft.mesh.safe_reading import FileContent
 from taisoft.mesh.words import last_line, to_int
 
 PROPERTY = "nastran:ref"  # meshio's name of the elements' property numbers
+REFUSED = {"INCLUDE": "its entries out", "GRIDA": "GRID"}  # and what to write in place of it
 MAX_DEPTH = 100  # of coordinate systems defined in one another
 _SYSTEM = re.compile(r"CORD[12][RCS]")
 
@@ -52,8 +53,8 @@ class _Reader(LineReader):
         for card in cards:
             if card.name == "GRDSET":
                 default = self._int(card, 1, 0)
-            elif card.name in ("INCLUDE", "GRIDA"):
-                raise self.error(card.line, f"{card.name} is not supported: write its entries out")
+            elif card.name in REFUSED:
+                raise self.error(card.line, f"{card.name} is not supported: write {REFUSED[card.name]}")
         for card in cards:
             if card.name == "GRID":
                 number, x = self._int(card, 0), np.array([self._float(card, k) for k in (2, 3, 4)])

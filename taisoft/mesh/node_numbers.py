@@ -10,7 +10,7 @@ from taisoft.mesh.words import to_float
 
 
 class LineReader:
-    """A reader of lines: what both formats need. name: the file's, for messages; others: elements beside tets, counted by type."""
+    """What readers of lines need. name: the file's, for messages."""
 
     def __init__(self, name: str):
         self.name = name

@@ -95,9 +95,7 @@ def _read_header(name: str, text: str) -> tuple[str, list[Element]]:
                     pass
                 case ["format", kind, "1.0"] if order is None:
                     order = _FORMATS[kind]
-                case ["element", called, n] if (
-                    order is not None and to_int(n) >= 0 and called not in {one.name for one in elements}
-                ):
+                case ["element", called, n] if order is not None and n[0] != "-" and all(one.name != called for one in elements):
                     elements.append(Element(called, to_int(n), [], line))
                 case ["property", "list", count, kind, called] if TYPES[count][0] in "iu":
                     elements[-1].properties.append(Property(called, TYPES[kind], TYPES[count]))

@@ -56,8 +56,14 @@ class Words:
                 raise ValueError
             return np.array(found, dtype=np.float64)
         except ValueError:
-            bad = first + step * next(i for i, word in enumerate(found) if not _is_number(word))
-            raise self.error(f"expected a number, not {self.quoted(bad)}", bad) from None
+            values = []
+        for k, word in enumerate(found):
+            try:
+                values.append(to_float(word.decode("utf-8", "replace")))
+            except ValueError:
+                bad = first + step * k
+                raise self.error(f"expected a number, not {self.quoted(bad)}", bad) from None
+        return np.array(values)
 
     def skip_numbers(self) -> None:
         """Go on to the next word that begins no number."""
@@ -95,7 +101,7 @@ def last_line(data: bytes) -> int:
 
 def to_float(word: str) -> float:
     """Return a word's number; D may stand for E before its exponent. Raises ValueError, also for Python's 1_0."""
-    if "_" in word:
+    if "_" in word or not word.isascii():
         raise ValueError
     try:
         return float(word)
@@ -108,10 +114,3 @@ def to_int(word: str) -> int:
     if not re.fullmatch(r"[+-]?\d{1,15}", word, re.ASCII):
         raise ValueError
     return int(word)
-
-
-def _is_number(word: bytes) -> bool:
-    try:
-        return b"_" not in word and bool(np.array([word], dtype=np.float64).size)
-    except ValueError:
-        return False

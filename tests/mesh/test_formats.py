@@ -27,14 +27,12 @@ PART = "*PART, NAME=A\n" + NODES + TET + "*END PART\n"
 INSTANCE = "*Instance, name=B, part=a\n{}*End Instance\n"
 GRID, CTETRA = rows("GRID,{},,{}.,{}.,{}.\n"), "CTETRA,1,1,1,2,3,4\n"
 CORD, END = "CORD2R,5,,10.,0.,0.,10.,0.,1.\n,11.,0.,0.\n", "ENDDATA\n"
+IN_5 = GRID.replace(",,", ",5,")
 LARGE = rows("GRID*   {:<16}" + 16 * " " + "{:<16.1f}{:<16.1f}*G\n*G      {:<16.1f}\n") + "ctetra* " + "1               " * 3
 MEDIT = "MeshVersionFormatted 2 # double\nDimension\n3\nVertices 4\n" + "".join("{} {} {} 0\n".format(*p) for p in POINTS)
 GMSH = "$MeshFormat\n4 0 8\n$EndMeshFormat\n$Entities\n1 0 0 1\n9 0 0 0 0 0 0 0\n1 0 0 0 1 1 1 1 7 0\n$EndEntities\n$Nodes\n1 4\n"
 GMSH += "1 3 0 4\n" + rows("{} {} {} {}\n") + "$EndNodes\n$Elements\n1 1\n1 3 4 1\n1 1 2 3 4\n$EndElements\n"
-PARTED = GMSH.replace(
-    "$Nodes", "$PartitionedEntities\n2 0\n0 0 0 1\n5 3 1 1 2 0 0 0 1 1 1 1 8 0\n$EndPartitionedEntities\n$Nodes"
-)
-PARTED = PARTED.replace("1 3 4 1", "5 3 4 1")
+PARTS = "$PartitionedEntities\n2 0\n0 0 0 1\n5 3 1 1 2 0 0 0 1 1 1 1 8 0\n$EndPartitionedEntities\n"
 EXPECTED = (
     ("a.inp", NODES + NEXT_NODES + TET + NEXT_TET, (0, 6)),
     ("a.inp", "*SYSTEM\n0,0,0,0,1,0\n-1,0,0\n" + NODES + "*SYSTEM\n" + TET + NEXT_NODES + NEXT_TET, (-1, 6)),
@@ -51,20 +49,12 @@ EXPECTED = (
     ("a.inp", NODES + TET + TET, "line 11: expected the number of a new element, not '1'"),
     ("a.inp", NODES.replace("1,0,0,0", "1,0,0,1d999") + TET, "line 3: expected finite numbers, not .0, 0, 1d999"),
     ("a.inp", NODES + NEXT_TET, r"line 8: node 11 does not exist \(4 nodes\)"),
-    ("a.bdf", "SOL 1\nbegin bulk\n" + CORD + GRID.replace(",,", ",5,") + CTETRA + END, (10, 11)),
+    ("a.bdf", "SOL 1\nbegin bulk\n" + CORD + IN_5 + CTETRA + END, (10, 11)),
     ("a.nas", CORD + "GRDSET,,5\n" + GRID + CTETRA, (10, 11)),
-    (
-        "a.fem",
-        CORD.replace("10", "-1") + "CORD2C,6,5,0.,0.,0.,0.,0.,1.\n+,1.,0.,0.\nGRID,9,6,2.,90.,0.\n" + GRID,
-        "no tetrahedra",
-    ),
+    ("a.fem", CORD + "CORD2C,6,5,0.,0.,0.,0.,0.,1.\n+,1.,0.,0.\nGRID,9,6,2.,90.,0.\n" + GRID, "no tetrahedra"),
     ("a.fem", "CORD2C,6,,0.,0.,0.,0.,0.,1.\n+,1.,0.,0.\n" + GRID.replace("3,,0.,1.", "3,6,1.,90.") + CTETRA, (0, 1)),
     ("a.bdf", LARGE + "2               *\n*       3               4\n", (0, 1)),
-    (
-        "a.bdf",
-        CORD.replace(",,", ",5,") + GRID.replace(",,", ",5,") + CTETRA,
-        "line 1: expected a definition of coordinate system 5, n",
-    ),
+    ("a.bdf", CORD.replace(",,", ",5,") + IN_5 + CTETRA, "line 1: expected a definition of coordinate system 5, n"),
     ("a.bdf", "BEGIN BULK\n" + GRID + CTETRA, "line 6: expected ENDDATA before the file's end"),
     ("a.bdf", GRID + 2 * CTETRA, "line 6: expected the number of a new element, not 1"),
     ("a.bdf", GRID.replace("4,,0.,", "4,,1e999,") + CTETRA, "line 4: expected finite numbers, not .1e999"),
@@ -76,7 +66,7 @@ EXPECTED = (
     ("a.mesh", MEDIT + "Tetrahedr 1 1 2 3 4 7\nEnd\n", "line 9: expected a keyword of Medit's format, not 'Tetrahedr'"),
     ("a.mesh", MEDIT + "Tetrahedra 1\n1 2 3 5 7\nEnd\n", "line 10: expected vertices from 1 to 4, not '5'"),
     ("a.msh", GMSH, (0, 1)),
-    ("a.msh", PARTED, (0, 1)),
+    ("a.msh", GMSH.replace("$Nodes", PARTS + "$Nodes").replace("1 3 4 1", "5 3 4 1"), (0, 1)),
     ("a.msh", GMSH.replace("4 0 8", "3.0 0 8"), r"line 2 \(.MeshFormat\): expected version 2, 4.0 or 4.1, not '3.0'"),
 )
 
@@ -107,16 +97,16 @@ def test_nodes_are_where_the_file_puts_them(tmp_path, name, text, expected):
             assert found.regions.tolist() == [7]
 
 
+FORMS = "ascii", "binary", "binary zlib", "appended", "appended zlib", "appended raw", "appended raw zlib"
+
+
 def vtu(form: str, region: str = "region") -> bytes:
     """Two tets 5 m apart and an empty piece before them. form: "ascii", or "binary" or "appended", with "raw" and "zlib"."""
     body, appended = '<Piece NumberOfPoints="0" NumberOfCells="0"/>', b""
     head = 'byte_order="BigEndian" header_type="UInt64"' + (' compressor="vtkZLibDataCompressor"' if "zlib" in form else "")
     for x, of_cells in ((0, "region"), (5, region)):
-        arrays = ("Points", "", "Float64", np.add(POINTS, (x, 0, 0)).astype(">f8")), ("Cells", "types", "UInt8", np.uint8([10]))
-        arrays += (
-            ("Cells", "connectivity", "Int64", np.arange(4, dtype=">i8")),
-            ("Cells", "offsets", "Int16", np.array([4], ">i2")),
-        )
+        arrays = [("Points", "", "Float64", np.add(POINTS, (x, 0, 0)).astype(">f8")), ("Cells", "types", "UInt8", np.uint8([10]))]
+        arrays += [("Cells", "connectivity", "Int64", np.arange(4, dtype=">i8")), ("Cells", "offsets", "Int8", np.int8([4]))]
         body += '<Piece NumberOfPoints="4" NumberOfCells="1">'
         for section, name, kind, values in (*arrays, ("CellData", of_cells, "Int8", np.int8([x]))):
             start = f'<{section}><DataArray type="{kind}" Name="{name}" format="{form.split()[0]}"'
@@ -135,9 +125,7 @@ def vtu(form: str, region: str = "region") -> bytes:
     return text + (tail if appended else b"") + b"</VTKFile>"
 
 
-@pytest.mark.parametrize(
-    "form", ["ascii", "binary", "binary zlib", "appended", "appended zlib", "appended raw", "appended raw zlib"]
-)
+@pytest.mark.parametrize("form", FORMS)
 def test_all_pieces_of_vtu_are_read(tmp_path, form):
     mesh = outcome(tmp_path / "a.vtu", vtu(form))
     assert mesh.vertices.tolist() == [[a + x, b, c] for x in (0, 5) for a, b, c in POINTS]
@@ -178,10 +166,7 @@ def test_ply_with_any_elements_and_properties(tmp_path, order):
     assert outcome(tmp_path / "a.ply", (data + b"".join(faces))[: end - 5 if order == "ascii" else end - 1]).startswith(place)
     assert outcome(tmp_path / "a.ply", data + b"".join(faces) + b"1").endswith("the last row that the header declares")
     lost = outcome(tmp_path / "a.ply", (data + b"".join(faces)).replace(b"vertex_index", b"vertices"))
-    assert (
-        lost
-        == "line 11: expected faces with a list called vertex_indices or vertex_index, not 'face' with area, list vertices, list texcoord"
-    )
+    assert lost.startswith("line 11: expected faces with a list called vertex_indices or vertex_index, not 'face' with area, ")
 
 
 def test_stl_of_any_header(tmp_path):
@@ -191,12 +176,8 @@ def test_stl_of_any_header(tmp_path):
     solids = [f"solid Würfel\n{''.join(own)}endsolid facet normal\n" for own in (facets[:5], facets[5:])]
     text = "".join(solids).encode("latin-1")
     binary = struct.pack("<I", 12) + b"".join(struct.pack("<12fH", *3 * [0] + [x for k in t for x in CUBE[k]], 0) for t in HALVES)
-    for data in (
-        text,
-        text.upper(),
-        text.replace(b"\n", b"\r"),
-        *(head.ljust(80) + binary for head in (b"solid a facet", b"\xef\xbb\xbf")),
-    ):
+    texts = text, text.upper(), text.replace(b"\n", b"\r")
+    for data in (*texts, *(head.ljust(80) + binary for head in (b"solid a facet", b"\xef\xbb\xbf"))):
         surface = outcome(path, data)
         assert len(surface.triangles) == 12 and surface.volume == pytest.approx(1.0) and len(surface.vertices) == 8
     assert outcome(path, b"solid facet normal".ljust(80) + binary + b"\0").endswith(", but there are 685")

@@ -82,10 +82,9 @@ def test_mesh_files_must_lie_in_the_folder_of_the_scene_file(tmp_path, name, mes
     text = text.replace("[bodies", "[rigid_bodies").replace("material = {}\n", "") if name.endswith(".ply") else text
     with pytest.raises((ts.SceneError, ts.MeshError)) as caught:
         read(inside, text)
-    assert message in str(caught.value) and str(caught.value).startswith(
-        f"{inside / 'scene.toml'}: {text[1 : text.index(']')]}.mesh"
-    )
-    assert "passphrase" not in str(caught.value) and "secret" not in str(caught.value).replace(name, "")
+    found = str(caught.value)
+    assert message in found and found.startswith(f"{inside / 'scene.toml'}: {text[1 : text.index(']')]}.mesh")
+    assert "passphrase" not in found and "secret" not in found.replace(name, "")
 
 
 def places(values, at=()):
