@@ -109,10 +109,10 @@ class ContactNewton:
         if self.has_direction:  # the matrix of the first iterate is invalid
             system.form_matrix_and_factors()
             self.r, self.scale = system.evaluate(None)
-        lowest, stalled, n_slow = self.r, 0, 0
+        lowest, stalled, n_slow, converged = self.r, 0, 0, False
         while self.newton < stage.max_newton and math.isfinite(self.r) and system.budget.left:
             if self._has_converged():
-                if system.balances_pieces():
+                if converged := system.balances_pieces():
                     break
                 self.r, self.scale = system.evaluate(None)
                 lowest, self.rounding = self.r, False
@@ -142,16 +142,16 @@ class ContactNewton:
                 self._eliminate()
             n_slow = 0 if self._is_balanced or self.r < DECREASE * lowest else n_slow + 1
             lowest = min(lowest, self.r)
-            self.rounding = self.r <= ROUNDING * self.floor and self.r > 0.5 * previous and self.tight
+            self.rounding = self.r <= ROUNDING * self.system.floor and self.r > 0.5 * previous and self.tight
             if not moved or n_slow >= MAX_SLOW:
                 break
-        converged = self._has_converged() and math.isfinite(self.r) and system.balances_pieces()
+        converged = converged or (self._has_converged() and math.isfinite(self.r) and system.balances_pieces())
         return StageResult(
             self.newton + self.eliminated,
             round(self.linear),
             relative(self.r, self.scale),
             converged,
-            self.rounding or self.r <= self.floor,
+            self.rounding or self.r <= self.system.floor,
             self.multipliers,
             system.contact_residual,
             (0.0, "") if converged else system.least_balanced(),
@@ -160,11 +160,6 @@ class ContactNewton:
     def _count(self) -> None:
         self.newton += 1
         self.system.budget.spend()
-
-    @property
-    def floor(self) -> float:
-        """Rounding floor of |r|."""
-        return self.system.floor
 
     def _fall_back(self) -> bool:
         """Take a few steps on the nonlinear stage from where it was linearised; return whether any step was taken."""
@@ -213,7 +208,7 @@ class ContactNewton:
         tolerance = target / self.scale if self.scale > 0.0 else 0.0
         # if rounding of stiff stress hides the rigid motion in |r|, only a tight first solve gets that motion right, and
         # impulses converge only if |r| decreases with them
-        self.tight = self.r <= NEAR_FLOOR * self.floor
+        self.tight = self.r <= NEAR_FLOOR * self.system.floor
         law_tolerance = LAW_TOLERANCE_FRACTION * self.law_aim
         if not self._is_balanced:
             law_tolerance = max(law_tolerance, LAW_BALANCE * tolerance)

@@ -60,10 +60,11 @@ class Newton:
         self.r, self.scale, self.has_contacts = r, scale, system.n_contacts > 0
         self.law_residual = math.inf  # the laws' residual at the last multiplier update
         self._begin_multiplier()
+        converged = False
         while True:
             if self._inner_done():
                 if self._has_converged():
-                    if system.balances_pieces():
+                    if converged := system.balances_pieces():
                         break
                     self._begin_again()
                 elif not self._update_multipliers():
@@ -81,18 +82,13 @@ class Newton:
                 break
             fresh = moved and not self._eliminate()
         self.r_scale, system.r_scale = system.r_scale, R_SCALE  # initial value of the next solve
-        return self._result(self._inner_done() and self._has_converged() and system.balances_pieces())
+        return self._result(converged or (self._inner_done() and self._has_converged() and system.balances_pieces()))
 
     def _begin_again(self) -> None:
         """Go on from |r| in new weights, in which it has not converged."""
         self.r, self.scale = self.system.evaluate(None)
         self.rounding = False
         self._begin_multiplier()
-
-    @property
-    def floor(self) -> float:
-        """Rounding floor of |r|."""
-        return self.system.floor
 
     def _begin_multiplier(self) -> None:
         """Set the target of |r| and reset the progress after a multiplier update."""
@@ -120,9 +116,9 @@ class Newton:
 
     def _has_converged(self) -> bool:
         """Return whether the stage has converged."""
-        if not (self.r <= self._target() or (self.has_contacts and self.r <= self.floor)):
+        if not (self.r <= self._target() or (self.has_contacts and self.r <= self.system.floor)):
             # statics without load has no scale to compare the rounding with
-            if not (self.rounding and (self.stage.c > 0.0 or self.scale <= self.floor)):
+            if not (self.rounding and (self.stage.c > 0.0 or self.scale <= self.system.floor)):
                 return False
         return self.system.contact_residual <= self.stage.contact_tolerance
 
@@ -158,7 +154,7 @@ class Newton:
             self.r, self.scale, moved = search(system, self._acceptable_residual(solution.negative))
         self.lowest = min(self.lowest, self.r)
         # statics continues down to the floor
-        near_floor = self.r <= (ROUNDING if self.stage.c > 0.0 else 1.0) * self.floor
+        near_floor = self.r <= (ROUNDING if self.stage.c > 0.0 else 1.0) * self.system.floor
         self.rounding = near_floor and self.r > 0.5 * self.previous
         return moved
 
@@ -182,7 +178,7 @@ class Newton:
     def _acceptable_residual(self, negative: bool) -> float:
         """Return |r| below which a full step is accepted without checking its slope."""
         if self.stage.c == 0.0 or negative:  # a lower |r| may be at a maximum of the energy
-            return self.floor
+            return self.system.floor
         return DECREASE * self.lowest if self.has_contacts else self.r
 
     def _linear_tolerance(self) -> float:
@@ -203,7 +199,7 @@ class Newton:
         # the last solve need not go far below Newton's tolerance; |r| may be below it while given volumes and lengths do not hold
         tolerance = max(self.forcing, 0.1 * target / self.r if self.r > target else 0.1, 1e-12)
         # if rounding of stiff stress hides the rigid motion in |r|, only a tight solve gets that motion right
-        return min(tolerance, self.stage.tolerance) if self.floor > target else tolerance
+        return min(tolerance, self.stage.tolerance) if self.system.floor > target else tolerance
 
     def _result(self, converged: bool) -> StageResult:
         r, system = self.r, self.system
@@ -212,7 +208,7 @@ class Newton:
             round(self.linear),
             relative(r, self.scale),
             converged and math.isfinite(r),
-            self.rounding or r <= self.floor,
+            self.rounding or r <= self.system.floor,
             self.multipliers,
             system.contact_residual,
             unbalanced=(0.0, "") if converged else system.least_balanced(),

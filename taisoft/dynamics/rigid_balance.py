@@ -4,7 +4,7 @@ import taichi as ti
 
 from taisoft.backend.runtime import kernel
 from taisoft.dynamics.stage import damping_force, internal_on, loads_on, residual_parts, squares
-from taisoft.fem.dependents import place_all
+from taisoft.fem.dependents import is_dependent, place_all
 from taisoft.fem.lanes import mass_times
 from taisoft.fem.terms import rayleigh_damping
 
@@ -127,12 +127,9 @@ def _turning(p: ti.template(), j):
 
 
 @ti.func
-def _is_dependent(m: ti.template(), i):
-    """Whether node i depends on others, which have its forces and its mass."""
-    result = False
-    if ti.static(m.has_dependents):
-        result = m.dependents.number[i] >= 0
-    return result
+def _centre(p: ti.template(), j):
+    """Centre of component j."""
+    return ti.Vector([p.moments[j, CENTRE], p.moments[j, CENTRE + 1], p.moments[j, CENTRE + 2]])
 
 
 @ti.func
@@ -151,7 +148,7 @@ def _resultant(m: ti.template(), s: ti.template(), p: ti.template(), x: ti.templ
     sums = ti.Vector.zero(ti.f64, N_MOMENTS)
     for at in range(p.row_start[row], p.row_start[row + 1]):
         i = p.node[at]
-        if not _is_dependent(m, i):
+        if not is_dependent(m, i):
             mass, fixed = _damping_factor(m, i, beta) * _row_sum(m, i), 1.0 - ti.cast(m.free[i], ti.f64)
             q = mass_times(m, i, s.change) - beta * ti.cast(loads_on(m, i), ti.f64)
             s.moved[i] = q
@@ -189,9 +186,9 @@ def _moment(m: ti.template(), s: ti.template(), p: ti.template(), x: ti.template
     geometric, turn = ti.Vector.zero(ti.f64, 3), ti.Matrix.zero(ti.f64, 3, 3)
     for at in range(p.row_start[row], p.row_start[row + 1]):
         i = p.node[at]
-        if not _is_dependent(m, i):
+        if not is_dependent(m, i):
             j = p.component[i]
-            c = ti.Vector([p.moments[j, CENTRE], p.moments[j, CENTRE + 1], p.moments[j, CENTRE + 2]])
+            c = _centre(p, j)
             arm, q = x[i] - c, s.moved[i]
             if ti.static(m.stiffness_damping):
                 q -= beta * ti.cast(damping_force(m, s, row, i, m.state.v), ti.f64)
@@ -286,8 +283,8 @@ def correct_rigid_motion(
     ti.loop_config(serialize=m.serial)
     for i in range(m.n_nodes):
         j, change = p.component[i], ti.Vector.zero(ti.f64, 3)
-        if p.held[j] != HELD and not _is_dependent(m, i):
-            c = ti.Vector([p.moments[j, CENTRE], p.moments[j, CENTRE + 1], p.moments[j, CENTRE + 2]])
+        if p.held[j] != HELD and not is_dependent(m, i):
+            c = _centre(p, j)
             u, w = ti.Vector([p.motion[j, 0], p.motion[j, 1], p.motion[j, 2]]), _turning(p, j)
             free, factor = ti.cast(m.free[i], ti.f64), _damping_factor(m, i, beta)
             if ti.static(mode == SOLVED):
@@ -313,7 +310,7 @@ def turn_forces(m: ti.template(), s: ti.template(), p: ti.template(), beta: ti.f
     """Add to residual and rhs the change of internal forces by the turning of `correct_rigid_motion` BEFORE a linearised step."""
     ti.loop_config(serialize=m.serial)
     for i in range(m.n_nodes):
-        if p.held[p.component[i]] == FREE and not _is_dependent(m, i):
+        if p.held[p.component[i]] == FREE and not is_dependent(m, i):
             f = ti.cast(internal_on(m, i), ti.f64)
             r = s.residual[i] - ti.cast(beta * beta * _turning(p, p.component[i]).cross(f), m.real)
             s.residual[i] = r

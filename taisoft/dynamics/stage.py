@@ -18,7 +18,7 @@ from taisoft.backend.runtime import kernel
 from taisoft.dynamics.contact_terms import impulse_on_node
 from taisoft.dynamics.impact import impact_residual
 from taisoft.fem.chunks import chunk_entry, chunk_size, fold, total
-from taisoft.fem.dependents import force_with_dependents
+from taisoft.fem.dependents import force_with_dependents, is_dependent
 from taisoft.fem.lanes import mass_times
 from taisoft.fem.model import Model
 from taisoft.fem.node_graph import BLOCKS, EDGES, NODES, Subset, n_nodes_of, node_of, whole_rows
@@ -268,7 +268,7 @@ def form_residual(
                 if ti.static(k.any):
                     r -= ti.cast(impulse_on_node(k, i), m.real)
                 if ti.static(m.has_dependents):  # whose forces act on other nodes
-                    if m.dependents.number[i] >= 0:
+                    if is_dependent(m, i):
                         r = zero
                 s.residual[i] = r
                 s.pcg.rhs[i] = -free * r

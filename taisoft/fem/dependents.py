@@ -194,6 +194,15 @@ def place_dependents(m: ti.template()):
 
 
 @ti.func
+def is_dependent(m: ti.template(), i):
+    """Whether node i depends on others, which have its forces and its mass."""
+    result = False
+    if ti.static(m.has_dependents):
+        result = m.dependents.number[i] >= 0
+    return result
+
+
+@ti.func
 def force_with_dependents(m: ti.template(), term: ti.template(), i):
     """Force of a term on node i, and on the nodes that depend on it [N]."""
     f = term.force(m, i)

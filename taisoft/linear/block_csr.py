@@ -284,15 +284,24 @@ def partial_row_times_backward(m: ti.template(), A: ti.template(), c, first, las
 
 
 @ti.func
-def off_diagonal_times(m: ti.template(), A: ti.template(), c, i, x: ti.template()):
-    """((A - D) x)_i, D the diagonal blocks, within chunk c of a loop."""
+def _times_neighbours(m: ti.template(), A: ti.template(), c, i, x: ti.template(), relative: ti.template()):
+    """Off-diagonal blocks of row i times x of their nodes, with `relative` minus that of node i, within chunk c of a loop."""
     y = ti.Vector([0.0, 0.0, 0.0, 0.0], m.real)
     for half in range(2):
         row = i + half * m.n_nodes
         for k in range(A.row_start[row], A.row_start[row + 1]):
-            y += padded_times(A.value[k], x[A.column[k]])
+            if ti.static(relative):
+                y += padded_times(A.value[k], ti.cast(x[A.column[k]] - x[i], m.real))
+            else:
+                y += padded_times(A.value[k], x[A.column[k]])
     keep_padding_lane(m, A, c, y)
     return ti.Vector([y[0], y[1], y[2]])
+
+
+@ti.func
+def off_diagonal_times(m: ti.template(), A: ti.template(), c, i, x: ti.template()):
+    """((A - D) x)_i, D the diagonal blocks, within chunk c of a loop."""
+    return _times_neighbours(m, A, c, i, x, False)
 
 
 @ti.func
@@ -304,13 +313,7 @@ def row_times(m: ti.template(), A: ti.template(), c, i, x: ti.template()):
 @ti.func
 def stiffness_times(m: ti.template(), A: ti.template(), c, i, x: ti.template()):
     """(A x)_i of a stiffness, within chunk c of a loop. Its rows sum to zero: differences leave no rounding of a common x."""
-    y = ti.Vector([0.0, 0.0, 0.0, 0.0], m.real)
-    for half in range(2):
-        row = i + half * m.n_nodes
-        for k in range(A.row_start[row], A.row_start[row + 1]):
-            y += padded_times(A.value[k], ti.cast(x[A.column[k]] - x[i], m.real))
-    keep_padding_lane(m, A, c, y)
-    return ti.Vector([y[0], y[1], y[2]])
+    return _times_neighbours(m, A, c, i, x, True)
 
 
 @kernel

@@ -4,11 +4,13 @@ matrix the derivative, of an open surface the symmetric part (`test_load_paths` 
 
 import numpy as np
 import pytest
+import taichi as ti
 
 import taisoft as ts
+from taisoft.backend.runtime import kernel
 from taisoft.fem.measure import measure
 from taisoft.fem.state import LOADS
-from taisoft.fem.terms.pressure import gather_pressures
+from taisoft.fem.terms import pressure
 from taisoft.linear import block_csr
 from tests.dynamics.companion import add_companion
 from tests.dynamics.scenes import built, cube, rubber
@@ -51,6 +53,14 @@ def rig(request):
         yield made
 
 
+@kernel
+def gather(m: ti.template(), out: ti.template()):
+    """The force on every node."""
+    ti.loop_config(serialize=m.serial)
+    for i in range(m.n_nodes):
+        out[i] = ti.cast(pressure.edge_products(m, i, False), m.real)
+
+
 def set_pressures(model, amplitudes) -> None:
     """Of the body's two pressures; the companion's loads stay."""
     values = model.amplitudes.to_numpy()
@@ -62,7 +72,7 @@ def forces(rig, x: np.ndarray, amplitudes=(P, 0.0), model=None) -> np.ndarray:
     model = model or rig.model
     set_pressures(model, amplitudes)
     model.state.x.from_numpy(x)
-    gather_pressures(model, rig.out)
+    gather(model, rig.out)
     return rig.out.to_numpy()
 
 

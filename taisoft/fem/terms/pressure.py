@@ -8,8 +8,6 @@ whole; on an open one it converges linearly. A projected matrix leaves it out, s
 
 import taichi as ti
 
-from taisoft.backend.runtime import kernel
-
 SWITCH, LOAD, ACCELERATION, STIFFNESS, PREPARED = "pressure", True, False, True, True
 
 
@@ -77,11 +75,3 @@ def add_stiffness(m: ti.template(), A: ti.template(), i, beta, projected):
                     A.value[nodes[0]] = A.value[nodes[0]] + cross
             else:
                 A.value[nodes[0]] = A.value[nodes[0]] + cross
-
-
-@kernel
-def gather_pressures(m: ti.template(), out: ti.template()):
-    """Write the force on every node."""
-    ti.loop_config(serialize=m.serial)
-    for i in range(m.n_nodes):
-        out[i] = ti.cast(edge_products(m, i, False), m.real)
