@@ -26,11 +26,13 @@ FAILED = "failed"  # both, in a RunReport
 
 # Causes of a degraded run.
 UNCONVERGED, INVERTED, DROPPED = "unconverged steps", "inverted tets", "dropped contacts"
-PENETRATION, OVERLAP, INTERRUPTED = "penetration", "overlap at the end", "interruption"
+PENETRATION, INEXACT, OVERLAP, INTERRUPTED = "penetration", "inexact contacts", "overlap at the end", "interruption"
 END = "end of the run"  # quantity of a variant's first verdict
 DEEPEST = "deepest penetration after any step [m]"
 
 IMPLICIT, EXPLICIT = "implicit_euler", "symplectic_euler"
+INEXACT_CAUSE = "contacts act along the normals of the step's start, and brake where these turn within the step; the run says so"
+INEXACT_NEXT = "the contact geometry of the step's end"  # cause and next idea of shortfalls
 FINER = 8  # steps of a reference per step of the run
 FRAMES = 20  # approximate maximum of stored frames
 
@@ -313,6 +315,7 @@ def causes_of(sim: ts.Simulator, result: RunReport) -> set[str]:
         INVERTED: any(step.n_inverted for step in steps),
         DROPPED: any(step.dropped_contacts for step in steps),
         PENETRATION: any(step.deep for step in steps),
+        INEXACT: any(step.contact_error for step in steps),
         INTERRUPTED: result.interrupted,
         OVERLAP: result.status == DEGRADED
         and sim.touches

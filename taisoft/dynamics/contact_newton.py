@@ -3,8 +3,9 @@
 The problem on the fixed matrix needs no elements: `Newton` solves it inexactly as an augmented Lagrangian, from the current
 impulses. Its displacement is a direction for the nonlinear stage. A full step is accepted if |r| falls enough; else a line
 search uses the slope of the augmented Lagrangian with the new impulses as multipliers. An indefinite matrix is replaced by a
-projected one. If that makes no progress, a few steps minimise the nonlinear stage under multipliers instead. If a slow step
-leaves a residual on few nodes, these are solved separately first (`elimination`).
+projected one. A problem that stalls is solved directly, as the stage's later ones then are, if it is not too large (`direct`).
+Without progress, a few steps minimise the nonlinear stage under multipliers instead. If a slow step leaves a residual on few
+nodes, these are solved separately first (`elimination`).
 A stage without progress ends early: a shorter substep costs less.
 """
 
@@ -14,6 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from taisoft.backend.launching import PUBLIC
+from taisoft.dynamics.contact_terms import OF_IMPULSES, TO_IMPULSES
 from taisoft.dynamics.elimination import eliminate
 from taisoft.dynamics.frictional import (
     INDEFINITE,
@@ -47,13 +49,13 @@ LINEARISED_SOLVES, LINEARISED_FORCING = 400, 0.1  # maximum linear solves of a l
 STALLED, STALLED_SOLVES = 0.9, 3  # fraction of |r| left by a stalling step; factor on SOLVES after that
 MAX_SLOW = 6  # Newton iterations in a row that do not lower the smallest |r|; stages that converge have 3 at most, rarely 5
 FALLBACK_STEPS = 6  # steps on the nonlinear stage
-DIRECT_FRACTION = 0.3  # of the tolerances: to what direct solves reduce the laws' residual, which |r| contains
 NEAR_FLOOR = 4.0  # times the floor of |r|: below it, |r| may be mostly rigid motion
 
 
 @dataclass(frozen=True)
 class FrictionalResult:
-    """Result of solving a linearised stage. negative: its matrix is indefinite; direct: only x and the impulses are set."""
+    """Result of solving a linearised stage. negative: its matrix is indefinite; direct: only x and the impulses are set;
+    stalled: iterations failed."""
 
     solves: int
     linear: int
@@ -63,18 +65,38 @@ class FrictionalResult:
     r: float
     r_scale: float = R_SCALE  # R over the r-factors at its end
     direct: bool = False
+    stalled: bool = False
 
 
-def solve_linear(system: StageSystem, problem: Stage, r: float, scale: float) -> FrictionalResult:
-    """Solve a linearised stage from (|r|, scale): directly where that applies, else on one thread in one launch, or from the host
-    where threads share linear solves."""
+def solve_linear(system: StageSystem, problem: Stage, r: float, scale: float, stalled: bool = False) -> FrictionalResult:
+    """Solve a linearised stage from (|r|, scale): directly where that applies, else by iterations; directly, too, if these fail.
+
+    stalled: iterations have failed on a problem of the same stage.
+    """
+    found = _solve_directly(system, problem, r, stalled)
+    if found is None:
+        found = iterate(system, problem, r, scale)
+        if not (found.converged or found.negative or stalled):
+            direct = _solve_directly(system, problem, r, stalled=True)
+            if direct is not None:
+                found = replace(direct, solves=found.solves + 1, linear=found.linear, multipliers=found.multipliers, stalled=True)
+    return found
+
+
+def _solve_directly(system: StageSystem, problem: Stage, r: float, stalled: bool) -> FrictionalResult | None:
+    """Return the result of a direct solve, None if that does not apply."""
     try:
-        found = system.solve_directly(DIRECT_FRACTION * min(problem.contact_tolerance, problem.tolerance))
+        found = system.solve_directly(problem.contact_tolerance, stalled)
     except np.linalg.LinAlgError:
         return FrictionalResult(1, 0, 0, True, False, r)
-    if found is not None:
-        iterations, converged, r = found
-        return FrictionalResult(1, 0, iterations, False, converged, r, direct=True)
+    if found is None:
+        return None
+    iterations, converged, r = found
+    return FrictionalResult(1, 0, iterations, False, converged, r, direct=True)
+
+
+def iterate(system: StageSystem, problem: Stage, r: float, scale: float) -> FrictionalResult:
+    """Solve it by multipliers and linear solves: on one thread in one launch, or from the host where threads share these."""
     if problem.first_r_scale != system.r_scale:
         r = system.set_r_scale(problem.first_r_scale)
     if system.shares_solves or PUBLIC:  # public Taichi takes no more than 64 arguments
@@ -96,7 +118,7 @@ class ContactNewton:
         self.system, self.stage = system, stage
         self.newton = self.linear = self.multipliers = 0
         self.eliminated = 0.0  # Newton iterations on few nodes, times their fraction of all nodes
-        self.rounding = self.tight = self.stalls = False
+        self.rounding = self.tight = self.stalls = self.laws_stall = False
         # laws that hold better than they must let |r| converge in fewer steps, where they can
         self.law_aim = min(stage.contact_tolerance, stage.tolerance)
         self.has_direction = False  # y is a good first direction on the current matrix
@@ -105,7 +127,7 @@ class ContactNewton:
     def run(self) -> StageResult:
         """Solve from the first iterate, where the matrix has been formed."""
         system, stage = self.system, self.stage
-        self.r, self.scale, self.has_direction = choose_start(system, *system.evaluate_start(new_multipliers=True))
+        self.r, self.scale, self.has_direction = choose_start(system, *system.evaluate_start(new_multipliers=TO_IMPULSES))
         if self.has_direction:  # the matrix of the first iterate is invalid
             system.form_matrix_and_factors()
             self.r, self.scale = system.evaluate(None)
@@ -123,7 +145,8 @@ class ContactNewton:
             result, moved = self._solve_contacts(), False
             self._count()
             if not result.negative:
-                self.r, self.scale = system.end_linearised()
+                # the laws hold less well than forces are balanced; keeping the impulses separates the two
+                self.r, self.scale = system.end_linearised(new_multipliers=OF_IMPULSES if result.direct else TO_IMPULSES)
                 moved = self.r < DECREASE * lowest
                 if not moved:  # also if it is not a number
                     system.evaluate(AGAIN, 0.0)
@@ -170,7 +193,7 @@ class ContactNewton:
         steps.run(self.r, self.scale, fresh=True)
         self.newton += max(0, steps.newton - 1)  # the first uses the current matrix
         self.linear, self.multipliers = self.linear + steps.linear, self.multipliers + steps.multipliers
-        self.r, self.scale = system.evaluate(None, new_multipliers=True)
+        self.r, self.scale = system.evaluate(None, new_multipliers=TO_IMPULSES)
         return steps.newton > 0
 
     def _eliminate(self) -> None:
@@ -180,7 +203,7 @@ class ContactNewton:
         found = eliminate(self.system, self.stage, self.r)
         if found is not None:
             self.eliminated, self.linear = self.eliminated + found.newton, self.linear + found.linear
-            self.r, self.scale = self.system.evaluate(None, new_multipliers=True)
+            self.r, self.scale = self.system.evaluate(None, new_multipliers=TO_IMPULSES)
 
     @property
     def _is_balanced(self) -> bool:
@@ -224,7 +247,8 @@ class ContactNewton:
             first_r_scale=self.first_r_scale,
             max_r_scale=self.max_r_scale,
         )
-        result = solve_linear(system, problem, self._first_residual(), self.scale)
+        result = solve_linear(system, problem, self._first_residual(), self.scale, self.laws_stall)
+        self.laws_stall = result.stalled or (self.laws_stall and result.direct)
         self.linear, self.multipliers = self.linear + result.linear, self.multipliers + result.multipliers
         if not (result.converged or result.negative):
             self.law_aim = stage.contact_tolerance
@@ -279,7 +303,7 @@ def solve_linearised(system: StageSystem, stage: Stage) -> StageResult:
     """Solve the frictional problem alone, at the present state; on a projected matrix if its own is indefinite."""
     tolerance = stage.linear_tolerance or LINEARISED_FORCING
     linear = 0
-    r, scale = system.evaluate_start(new_multipliers=True)
+    r, scale = system.evaluate_start(new_multipliers=TO_IMPULSES)
     for projected in (False, True):
         system.linearise()
         solves = min(LINEARISED_SOLVES, system.budget.left)
@@ -292,7 +316,7 @@ def solve_linearised(system: StageSystem, stage: Stage) -> StageResult:
         system.form_matrix(projected=True)
     system.balance_rigid_motion()
     if found.direct:
-        system.end_linearised()
+        system.end_linearised(new_multipliers=OF_IMPULSES)
     elif system.model.has_dependents:  # linearised steps move only the nodes that they depend on
         place_dependents(system.model)
     at_floor = found.r <= system.floor

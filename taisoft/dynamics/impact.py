@@ -32,6 +32,7 @@ from taisoft.backend.runtime import kernel
 from taisoft.contact.problem import ContactProblem, to_world
 from taisoft.contact.prox import dvec
 from taisoft.contact.restitution import find_rebounds
+from taisoft.dynamics.contact_terms import TO_IMPULSES
 from taisoft.dynamics.simulation_state import SimulationState
 from taisoft.fem.chunks import chunk_entry, chunk_size, fold, total
 from taisoft.fem.lanes import mass_times
@@ -189,7 +190,7 @@ def solve_bouncing(system: "StageSystem", stage: "Stage") -> "StageResult":
     impact_stage = replace(stage, beta=tau, contact_tolerance=max(stage.contact_tolerance, TOLERANCE), max_newton=SOLVES)
     k = system.begin_impact(impact_stage)
     begin_impact(m, w, k, tau, system.norms)
-    impact = Newton(system, impact_stage).run(*system.evaluate(new_multipliers=True), fresh=True)
+    impact = Newton(system, impact_stage).run(*system.evaluate(new_multipliers=TO_IMPULSES), fresh=True)
     measure_impact(m, w, k, tau, out)
     slope, curvature = out
     gain = slope + 0.5 * curvature

@@ -21,13 +21,14 @@ from taisoft.contact.problem import RESIDUAL, find_factors
 from taisoft.dynamics import frictional, rigid_balance
 from taisoft.dynamics.contact_terms import (
     NO_CONTACTS,
+    TO_IMPULSES,
     StageContacts,
     begin_contacts,
     build_stage_contacts,
     save_diagonal,
     update_impulses,
 )
-from taisoft.dynamics.direct import DirectSolver, can_solve_directly
+from taisoft.dynamics.direct import DirectSolver
 from taisoft.dynamics.linear_solver import LinearSolver
 from taisoft.dynamics.linearised import LONGEST, advance, begin_linearised, end_linearised
 from taisoft.dynamics.newton_budget import NewtonBudget
@@ -147,7 +148,7 @@ class StageSystem:
         self.floor = 0.0  # rounding floor of |r| of the present stage
         self.unbalanced = 0.0, ""  # largest relative residual of a piece at the last `balances_pieces`, and its name
         self.linear_solver, self.budget = LinearSolver(model), NewtonBudget()
-        self._direct = DirectSolver(self) if multipliers is None and can_solve_directly(model) else None
+        self._direct = DirectSolver(self) if multipliers is None and model.on_cpu else None
         self.kind = ELASTIC_STAGE
         self.scale = 0.0  # that |r| is relative to, at its last evaluation
         self.r_scale = 1.0  # R over the r-factors
@@ -296,10 +297,10 @@ class StageSystem:
             find_last(self.model, self.matrix, self._k.coupling, self.work.pcg)
         self.form_matrix_and_factors(projected=impact)
 
-    def evaluate(self, mode: int | None = STAY, step_length: float = 1.0, new_multipliers: bool = False) -> tuple[float, float]:
+    def evaluate(self, mode: int | None = STAY, step_length: float = 1.0, new_multipliers: int = 0) -> tuple[float, float]:
         """Return (|r|, scale) after `move` in a mode; None: x and the elastic forces are unchanged.
 
-        new_multipliers: first set the multipliers to the impulses, and the friction disks accordingly.
+        new_multipliers: see `update_impulses`.
         """
         m, w, k, stage = self.model, self.work, self._k, self.stage
         if mode is not None:
@@ -307,11 +308,11 @@ class StageSystem:
             if self.multipliers is not None:
                 self.multipliers.measure()
         if k.any:
-            update_impulses(m, k, int(new_multipliers), stage.beta, self.r_scale)
+            update_impulses(m, k, new_multipliers, stage.beta, self.r_scale)
         form_residual(m, w, self.matrix, k, self.kind, stage.beta, self.norms)
         return self._norm_and_scale(stage.c, stage.beta)
 
-    def evaluate_start(self, new_multipliers: bool = False) -> tuple[float, float]:
+    def evaluate_start(self, new_multipliers: int = 0) -> tuple[float, float]:
         """Return (|r|, scale) of the first iterate, with its weights of pieces."""
         found = self.evaluate(new_multipliers=new_multipliers)
         if not (self.pieces.several and math.isfinite(found[0])):
@@ -471,24 +472,25 @@ class StageSystem:
         self._same_matrix = bool(loop[frictional.SAME_MATRIX])
         return loop
 
-    def solve_directly(self, tolerance: float) -> tuple[int, bool, float] | None:
+    def solve_directly(self, tolerance: float, stalled: bool) -> tuple[int, bool, float] | None:
         """Move a linearised stage to the solution of its frictional problem, see `direct`; None if that does not apply.
 
-        tolerance: of the laws' residual. Returns (iterations, converged, |r|); raises numpy.linalg.LinAlgError if the matrix is
-        indefinite.
+        tolerance: of the laws' residual; stalled: whether iterations failed, whose residual is not exceeded. Returns (iterations,
+        converged, |r|); raises numpy.linalg.LinAlgError if the matrix is indefinite.
         """
-        if self._direct is None or not self._direct.prepare(self._k):
+        if self._direct is None or not (stalled or self._direct.always) or not self._direct.prepare(self._k):
             return None
-        return self._direct.solve(self._k, self.stage.beta, tolerance)
+        acceptable = np.inf if self._direct.always else max(tolerance, self.contact_residual)
+        return self._direct.solve(self._k, self.stage.beta, tolerance, acceptable)
 
-    def end_linearised(self, accept: bool = True) -> tuple[float, float]:
+    def end_linearised(self, accept: bool = True, new_multipliers: int = TO_IMPULSES) -> tuple[float, float]:
         """Restore nonlinear elastic forces; return (|r|, scale). y is then the velocity change since linearisation, base its x.
 
-        accept: keep the new state, with its impulses as multipliers; otherwise restore state and multipliers of that time.
+        accept: keep the new state, with multipliers from its impulses; otherwise restore state and multipliers of that time.
         """
         end_linearised(self.model, self.work, self._k, int(accept), self.stage.beta)
         self.kind = ELASTIC_STAGE
-        return self.evaluate(AGAIN, float(accept), new_multipliers=True)
+        return self.evaluate(AGAIN, float(accept), new_multipliers)
 
     def _norm_and_scale(self, c: float, beta: float) -> tuple[float, float]:
         """Return (|r|, scale) from the norms of `form_residual`."""
@@ -521,7 +523,7 @@ class StageSystem:
         """Form the matrix and the contacts' r-factors, which stay fixed during the stage."""
         self.form_matrix(projected)
         find_factors(self._k.problem)
-        if self._direct is not None:
+        if self._direct is not None and self._direct.always:
             with contextlib.suppress(np.linalg.LinAlgError):  # the solve will project the matrix
                 self._direct.set_factors(self._k)
 

@@ -3,7 +3,7 @@
 * the loop on the device and the loop driven by the host find the same step, also with extrapolated multipliers; cut into many
   launches, the loop gives the same bits;
 * a step takes few Newton iterations, also with an indefinite matrix; impulses satisfy the contact laws, also with a tolerance
-  far below that of |r|, and where |r| is mostly rounding.
+  far below that of |r|, and where |r| is mostly rounding; a problem that stalls, as between flush blocks, is solved directly.
 
 Nonlinear elimination: steps that are first solved on the fewest nodes that hold nearly all of the residual, and two rings around
 them, move only these, lower the residual, and find the same result in fewer iterations, with and without contacts.
@@ -16,7 +16,7 @@ import pytest
 
 import taisoft as ts
 from taisoft.dynamics import contact_newton, implicit
-from taisoft.dynamics.contact_newton import FrictionalResult, solve_linear
+from taisoft.dynamics.contact_newton import FrictionalResult, iterate
 from taisoft.dynamics.dynamics import Dynamics
 from taisoft.dynamics.elimination import choose_nodes, eliminate
 from taisoft.dynamics.newton import Newton
@@ -83,12 +83,12 @@ def test_both_loops_find_the_same_step(made, monkeypatch):
     assert all(report.converged for report in reports) and len(whole) >= 3 and max(whole) <= 12
     assert max(report.n_contacts for report in reports) > 10
     with monkeypatch.context() as patch:
-        patch.setattr(contact_newton, "solve_linear", solve_on_host)
+        patch.setattr(contact_newton, "iterate", solve_on_host)
         host, others = steps(made)
         assert np.abs(host - x).max() < 1e-8 and counts(others) == counts(reports)  # [m]
         patch.setattr(implicit, "Stage", partial(Stage, extrapolate_after=0))
         host, others = steps(made)
-        patch.setattr(contact_newton, "solve_linear", solve_linear)
+        patch.setattr(contact_newton, "iterate", iterate)
         extrapolated, sooner = steps(made)
         assert counts(others) == counts(sooner) and np.abs(extrapolated - x).max() < 1e-8
         assert sum(report.contact_iterations for report in sooner) < 0.9 * sum(r.contact_iterations for r in reports)
@@ -111,6 +111,19 @@ def test_rounding_of_a_stiff_cube_does_not_hide_what_lands_on_it():
     with dynamics(cubes(lower_young=1e14), dt=DT, precision="f64") as made:
         _, reports = steps(made, 4)
     assert all(report.converged and report.newton_iterations < 40 for report in reports) and reports[-1].n_contacts > 10
+
+
+def test_flush_blocks_come_to_rest():
+    """Their redundant contacts exchange impulses, so that iterations stall in one step of four: those are solved directly."""
+    scene = ts.Scene()
+    lower = scene.add_body(ts.box_mesh((4, 3, 4), (1.0, 0.5, 1.0)), material(young=2e5, poisson=0.4, density=1000), name="lower")
+    lower.fix(lambda X: X[:, 1] < -0.24)
+    scene.add_body(ts.box_mesh((3, 3, 3), (0.6, 0.5, 0.6)), lower.material, name="upper", position=(0.03, 0.5005, 0.02))
+    scene.add_obstacle(ts.HalfSpace((0, -1, 0), (0, 1, 0)), name="ground", friction=FRICTION)
+    with dynamics(scene, dt=0.01, precision="f64") as made:
+        _, reports = steps(made, 24)
+    assert all(report.converged for report in reports) and reports[-1].n_contacts > 30
+    assert sum(report.newton_iterations for report in reports) < 200
 
 
 @pytest.mark.parametrize("scheme", ["implicit_euler", "linearly_implicit_euler"])
