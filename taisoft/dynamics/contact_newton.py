@@ -211,7 +211,11 @@ class ContactNewton:
         return self.r <= self.stage.tolerance * self.scale
 
     def _has_converged(self) -> bool:
-        return (self._is_balanced or self.rounding) and self.system.contact_residual <= self.stage.contact_tolerance
+        if not (self._is_balanced or self.rounding or self.r <= self.system.floor):
+            return False
+        if self.system.contact_residual <= self.stage.contact_tolerance:
+            return self._is_balanced or self.rounding
+        return self.r <= self.system.floor and self.system.laws_hold_to_rounding()
 
     def _solve_contacts(self) -> "FrictionalResult":
         """Solve the contact problem on the current matrix, or on a projected one if that is indefinite."""

@@ -98,13 +98,13 @@ def _end_normal(p: ti.template(), m: ti.template(), s: ti.template(), o: ti.temp
             end, gap = across, height
         else:
             own, foot, first, second, n_points = x, y, f // 3, e // 3, 2
-    least = ti.cast(2.0, ti.f64)
-    for k in range(n_points):  # of two edges, each must be the nearest to the other: else one of their faces is
+    least = ti.cast(ti.math.inf, ti.f64)
+    for k in range(n_points):  # two edges that are not the nearest to each other: the nearer of what is nearest to each
         t = ti.select(k == 0, first, second)
         v, d, flag = normal_at(s, ti.select(k == 0, own, foot), t)
         v *= ti.select(k == 0, side, -side)
-        if v.dot(n) < least:
-            end, gap, is_smooth, least = v, d, flag, v.dot(n)
+        if ti.abs(d) < least:
+            end, gap, is_smooth, least = v, d, flag, ti.abs(d)
             cosine = ti.abs(s.normal[t].dot(n))
             if e >= 0:
                 u = s.neighbour[t, ti.select(k == 0, f, e) % 3]

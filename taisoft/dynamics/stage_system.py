@@ -233,6 +233,13 @@ class StageSystem:
         """Residual of the contact laws at the last evaluation."""
         return float(self._k.problem.state[RESIDUAL]) if self._k.any else 0.0
 
+    def laws_hold_to_rounding(self) -> bool:
+        """Return whether impulses, and what they miss the laws by, are below the rounding floor of every piece, and gaps hold:
+        bodies barely touch."""
+        square = self.rounding.of_pieces(self.stage.c, self.stage.beta).min() ** 2
+        missed, size, gap = self._k.work.prox_residual.to_numpy()[: int(self._k.problem.count[0])].T
+        return bool(max(missed.sum(), size.sum()) <= square and gap.max(initial=0.0) <= self.stage.contact_tolerance)
+
     @property
     def slopes(self) -> tuple[float, float]:
         """(r.y at the start of the step, r.y at its end); negative: descent."""

@@ -113,6 +113,15 @@ def test_rounding_of_a_stiff_cube_does_not_hide_what_lands_on_it():
     assert all(report.converged and report.newton_iterations < 40 for report in reports) and reports[-1].n_contacts > 10
 
 
+def test_impulses_below_the_rounding_of_forces_need_not_obey_the_laws(made, monkeypatch):
+    """Where bodies drift together without a load, their contacts have nothing but rounding to carry."""
+    _, reports = steps(made)
+    system = made.stepper.solver
+    assert reports[-1].n_contacts > 10 and not system.laws_hold_to_rounding()
+    monkeypatch.setattr(system.rounding, "piece_force", np.full(2, 1e6))  # [N]
+    assert system.laws_hold_to_rounding()
+
+
 def test_flush_blocks_come_to_rest():
     """Their redundant contacts exchange impulses, so that iterations stall in one step of four: those are solved directly."""
     scene = ts.Scene()
