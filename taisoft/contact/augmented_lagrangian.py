@@ -57,9 +57,10 @@ def relative(changed: float, size: float) -> float:
     return changed / size if size > 0.0 else float(changed != 0.0)
 
 
-def find_residual(W, b: np.ndarray, friction: np.ndarray, r: np.ndarray) -> float:
-    """|r - prox(r - f (W r + b))| / |r|."""
-    return float(relative(np.linalg.norm(natural_map(W, b, friction, find_factors(W), r)), np.linalg.norm(r)))
+def find_residual(W, b: np.ndarray, friction: np.ndarray, r: np.ndarray, factor: np.ndarray | None = None) -> float:
+    """|r - prox(r - f (W r + b))| / |r|. factor: f (k,2), by default `find_factors` of W."""
+    f = find_factors(W) if factor is None else factor
+    return float(relative(np.linalg.norm(natural_map(W, b, friction, f, r)), np.linalg.norm(r)))
 
 
 # --- the method -------------------------------------------------------------------------------------------------------

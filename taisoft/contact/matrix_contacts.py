@@ -20,11 +20,20 @@ class MatrixContacts:
         self._serial, self._arena, self._problem = serial, FieldArena(), None
 
     def solve(
-        self, W: sp.csr_matrix, b: np.ndarray, friction: np.ndarray, r: np.ndarray, method: str, tolerance: float, sweeps: int
+        self,
+        W: sp.csr_matrix,
+        b: np.ndarray,
+        friction: np.ndarray,
+        r: np.ndarray,
+        method: str,
+        tolerance: float,
+        sweeps: int,
+        outer: int = OUTER,
     ) -> tuple[np.ndarray, SolveResult]:
         """Return impulses (k,3), from the start r (k,3), and the result; use an augmented Lagrangian if sweeps do not suffice.
 
-        W: (3k,3k); b: (3k,); friction: (k,); method, tolerance, sweeps: as in `contact.solve.solve`.
+        W: (3k,3k); b: (3k,); friction: (k,); method, tolerance, sweeps: as in `contact.solve.solve`; outer: maximum iterations of
+        the augmented Lagrangian.
         """
         W, k = W.tobsr((3, 3)), len(friction)
         p = self._problem
@@ -40,7 +49,7 @@ class MatrixContacts:
         result = solve(p, method, tolerance, sweeps)
         r = p.r.to_numpy(k)
         if not result.converged:
-            r, history = augmented_lagrangian.solve(W.tocsr(), b, friction, r, tolerance, OUTER)
+            r, history = augmented_lagrangian.solve(W.tocsr(), b, friction, r, tolerance, outer)
             result = SolveResult(result.iterations + len(history) - 1, history[-1], history[-1] <= tolerance)
         return r, result
 

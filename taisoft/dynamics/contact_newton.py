@@ -75,7 +75,7 @@ def solve_linear(system: StageSystem, problem: Stage, r: float, scale: float, st
     """
     found = _solve_directly(system, problem, r, stalled)
     if found is None:
-        found = iterate(system, problem, r, scale)
+        found = solve_iteratively(system, problem, r, scale)
         if not (found.converged or found.negative or stalled):
             direct = _solve_directly(system, problem, r, stalled=True)
             if direct is not None:
@@ -95,7 +95,7 @@ def _solve_directly(system: StageSystem, problem: Stage, r: float, stalled: bool
     return FrictionalResult(1, 0, iterations, False, converged, r, direct=True)
 
 
-def iterate(system: StageSystem, problem: Stage, r: float, scale: float) -> FrictionalResult:
+def solve_iteratively(system: StageSystem, problem: Stage, r: float, scale: float) -> FrictionalResult:
     """Solve it by multipliers and linear solves: on one thread in one launch, or from the host where threads share these."""
     if problem.first_r_scale != system.r_scale:
         r = system.set_r_scale(problem.first_r_scale)
@@ -211,11 +211,9 @@ class ContactNewton:
         return self.r <= self.stage.tolerance * self.scale
 
     def _has_converged(self) -> bool:
-        if not (self._is_balanced or self.rounding or self.r <= self.system.floor):
-            return False
         if self.system.contact_residual <= self.stage.contact_tolerance:
             return self._is_balanced or self.rounding
-        return self.r <= self.system.floor and self.system.laws_hold_to_rounding()
+        return self.r <= self.system.floor and self.system.impulses_are_rounding()
 
     def _solve_contacts(self) -> "FrictionalResult":
         """Solve the contact problem on the current matrix, or on a projected one if that is indefinite."""

@@ -244,7 +244,10 @@ def update_impulses(m: ti.template(), k: ti.template(), new_multipliers: ti.i32,
         if new_multipliers != 0:
             set_multiplier(k, n)
         if new_multipliers == OF_IMPULSES:
-            k.work.multiplier[n] += scaled(r_scale * p.factor[n], stage_velocity_of(k, n, beta))
+            z = k.work.multiplier[n] + scaled(r_scale * p.factor[n], stage_velocity_of(k, n, beta))
+            if p.r[n][0] == 0.0:  # it is open: it must not push where the step is shortened
+                z = dvec(ti.min(z[0], 0.0), 0.0, 0.0)
+            k.work.multiplier[n] = z
         update_contact(m, k, n, beta, r_scale)
     find_residual(k)
 

@@ -6,11 +6,12 @@ The change s of v satisfies A s = J^T r - r_0, r_0 the residual without contacts
 with the laws of contact, u_0 the contacts' velocities at the start: Gauss-Seidel sweeps on W, then, if they do not suffice, an
 augmented Lagrangian on the host. A, whose band is that of single bodies unless springs join them, is factorised as multigrid's
 coarsest level is. The r-factors come from W: those from the diagonal of A would be too large by as much as the bodies are stiff,
-and the laws' residual with them. Whether that is done depends on the numbers of unknowns and contacts alone, which
-may be larger in a stage that stalls.
-Weakness: W is dense within each group of bodies that touch, so larger stages that stall are left to the iterations.
+and the laws' residual with them. Where iterations stall, the result counts if it meets the
+laws at least as well as theirs with their r-factors.
+Weakness: W is dense within each group of bodies that touch, and within soft ones altogether: only small stages are solved so.
 """
 
+import math
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -18,25 +19,23 @@ import scipy.sparse as sp
 
 from taisoft.backend.arrays import download, upload
 from taisoft.contact import augmented_lagrangian
-from taisoft.contact.matrix_contacts import MatrixContacts, frames, jacobian
-from taisoft.fem.model import Model
+from taisoft.contact.matrix_contacts import OUTER, MatrixContacts, frames, jacobian
 from taisoft.linear.block_csr import to_bsr
-from taisoft.linear.multigrid import BandedCholesky, factorise
+from taisoft.linear.multigrid import BandedCholesky, factorise, narrow_order
 from taisoft.scene.rigid import FRAME
 
 if TYPE_CHECKING:
     from taisoft.dynamics.contact_terms import StageContacts
     from taisoft.dynamics.stage_system import StageSystem
 
-LARGEST_W = 4_000_000  # numbers in W
-WORK, STALLED_WORK = 2e7, 2e8  # maximum rows of W times numbers in the band of A: about 20 ms, and 0.2 s in stages that stall
-FRACTION = 0.01  # of the laws' tolerance, which r-factors of W meet at little cost
+MAX_ROWS, STALLED_ROWS = (
+    2000,
+    300,
+)  # rows of W; where soft bodies stall, it is dense, and a step of Newton's method on it takes 10 ms
+STALLED_OUTER = 5  # iterations of the augmented Lagrangian there; most need one
+WORK = 5e7  # maximum rows of W times numbers in the band of A: about 50 ms
+FRACTION = 0.1  # of the laws' tolerance, to which they are met with the r-factors of W
 SWEEPS = 1000  # of Gauss-Seidel, before the augmented Lagrangian
-
-
-def is_rigid(m: Model) -> bool:
-    """Whether all nodes are those of rigid bodies, or depend on them."""
-    return m.has_rigid_tets and FRAME * m.rigid_tets.n + m.dependents.n == m.n_nodes
 
 
 class DirectSolver:
@@ -45,11 +44,12 @@ class DirectSolver:
     def __init__(self, system: "StageSystem"):
         m = system.model
         self._system, self._contacts = system, MatrixContacts(m.on_cpu)
-        self.always = is_rigid(m)  # solves all stages, not only those that stall
-        self._work = WORK if self.always else STALLED_WORK
+        self.is_rigid = m.has_rigid_tets and FRAME * m.rigid_tets.n + m.dependents.n == m.n_nodes  # then it solves all stages
+        self._max_rows, self._max_outer = (MAX_ROWS, OUTER) if self.is_rigid else (STALLED_ROWS, STALLED_OUTER)
         self._nodes = np.flatnonzero(m.dependents.number.to_numpy() < 0) if m.has_dependents else np.arange(m.n_nodes)
         self._columns = (3 * self._nodes[:, None] + np.arange(3)).reshape(-1)
         self._factor: BandedCholesky | None = None
+        self._size: float | None = None  # numbers in its band
         self._formed = -1  # `StageSystem.n_formed` of the factor
 
     def prepare(self, stage_contacts: "StageContacts") -> bool:
@@ -58,17 +58,25 @@ class DirectSolver:
         Raises numpy.linalg.LinAlgError if A is indefinite.
         """
         rows = 3 * int(stage_contacts.problem.count[0])
-        if not 0 < rows**2 <= LARGEST_W:
+        if not 0 < rows <= self._max_rows:
+            return False
+        if self._size is None:
+            blocks = self._independent(stage_contacts).tobsr((3, 3))
+            found = narrow_order(blocks.indptr, blocks.indices, 3)
+            self._size = math.inf if found is None else 3 * (found[2] + 1) * len(self._nodes)
+        if rows * self._size > WORK:
             return False
         if self._formed != self._system.n_formed:
-            self._formed, self._factor = -1, None
+            self._formed = -1
             self._free = (self._system.model.free.to_numpy()[self._nodes] > 0.0).reshape(-1).astype(np.float64)
             self._factor = self._factorise(stage_contacts)
-            if self._factor is not None and rows * self._factor.factor.size <= self._work:
-                self._J = (jacobian(stage_contacts.problem)[:, self._columns] @ sp.diags(self._free)).tocsr()
-                self._W = sp.csr_matrix(self._J @ self._factor.solve(self._J.T.toarray()))
+            if self._factor is None:
+                self._size = math.inf
+                return False
+            self._J = (jacobian(stage_contacts.problem)[:, self._columns] @ sp.diags(self._free)).tocsr()
+            self._W = sp.csr_matrix(self._J @ self._factor.solve(self._J.T.toarray()))
             self._formed = self._system.n_formed
-        return self._factor is not None and rows * self._factor.factor.size <= self._work
+        return True
 
     def set_factors(self, stage_contacts: "StageContacts") -> None:
         """Set the r-factors of the contacts to those of W: the diagonal of A alone would give factors far too large.
@@ -86,24 +94,28 @@ class DirectSolver:
     ) -> tuple[int, bool, float] | None:
         """Move a linearised stage, whose matrix is prepared, to its solution; return (iterations, converged, |r|).
 
-        tolerance: of the laws' residual. acceptable: its size with the r-factors of the contacts, not of W, above which the stage
-        stays and None is returned, as where a stiff body makes these factors far larger.
+        tolerance: of the laws' residual. acceptable: that residual with the r-factors of the contacts, not of W, above which the
+        result is rejected, the state kept, and None returned, as where a stiff body makes these factors far larger.
         """
         m, k = self._system.model, stage_contacts
         p, n = k.problem, int(k.problem.count[0])
         J, residual = self._J, self._free * download([k.residual_linear])[0].astype(np.float64)[self._nodes].reshape(-1)
         b = self._start_velocities(k, beta) - J @ self._factor.solve(residual)
-        friction, factor, r = download([p.friction, p.factor, p.r], n)
-        r, found = self._contacts.solve(self._W, b, friction, r, "gauss_seidel", FRACTION * tolerance, SWEEPS)
-        missed = np.linalg.norm(augmented_lagrangian.natural_map(self._W, b, friction, factor, r))
-        if missed > acceptable * np.linalg.norm(r):
-            return None
+        friction, factor, r = download([p.friction, p.factor, k.work.kept], n)
+        r, found = self._contacts.solve(self._W, b, friction, r, "gauss_seidel", FRACTION * tolerance, SWEEPS, self._max_outer)
+        law_residual = found.residual
+        if not self.is_rigid:
+            law_residual = augmented_lagrangian.find_residual(self._W, b, friction, r, factor)
+            if not law_residual <= acceptable:  # also if it is not a number
+                return None
         change = self._factor.solve(J.T @ r.reshape(-1) - residual)
-        x, base, impulses = m.state.x.to_numpy(), k.x_linear.to_numpy(), p.r.to_numpy()
+        x, v, base, impulses = m.state.x.to_numpy(), m.state.v.to_numpy(), k.x_linear.to_numpy(), p.r.to_numpy()
         x[self._nodes] = base[self._nodes] + beta * change.reshape(-1, 3)
+        v[self._nodes] = (x[self._nodes] - self._system.work.x_hat.to_numpy()[self._nodes]) / beta
         impulses[:n] = r
-        upload([(m.state.x, x), (p.r, impulses)])
-        return found.iterations, found.converged, float(np.linalg.norm(self._matrix @ change + residual - J.T @ r.reshape(-1)))
+        upload([(m.state.x, x), (m.state.v, v), (p.r, impulses)])
+        unbalanced = float(np.linalg.norm(self._matrix @ change + residual - J.T @ r.reshape(-1)))
+        return found.iterations, law_residual <= tolerance, unbalanced
 
     def _start_velocities(self, k: "StageContacts", beta: float) -> np.ndarray:
         """u_0 (3k,), see `contact_terms.stage_velocity_of`."""
@@ -114,11 +126,15 @@ class DirectSolver:
         moved = jacobian(k.problem) @ (k.x_linear.to_numpy() - k.x_start.to_numpy()).reshape(-1)
         return (moved + own.reshape(-1)) / beta
 
+    def _independent(self, k: "StageContacts") -> sp.csr_matrix:
+        """A, without the contacts' terms, of the independent nodes."""
+        A = to_bsr(self._system.model, self._system.matrix, k.coupling.base).tocsr()
+        return A[self._columns][:, self._columns]
+
     def _factorise(self, k: "StageContacts") -> BandedCholesky | None:
-        """Factorise A, without the contacts' terms, on the free axes of the independent nodes; None if its band is wide."""
-        system, keep = self._system, sp.diags(self._free)
-        A = to_bsr(system.model, system.matrix, k.coupling.base).tocsr()[self._columns][:, self._columns]
-        self._matrix = (keep @ A @ keep + sp.diags(1.0 - self._free)).tocsr()
+        """Factorise it on the free axes; None if its band is wide."""
+        keep = sp.diags(self._free)
+        self._matrix = (keep @ self._independent(k) @ keep + sp.diags(1.0 - self._free)).tocsr()
         blocks = self._matrix.tobsr((3, 3))
         blocks.sort_indices()
         return factorise(blocks)

@@ -99,7 +99,7 @@ def _end_normal(p: ti.template(), m: ti.template(), s: ti.template(), o: ti.temp
         else:
             own, foot, first, second, n_points = x, y, f // 3, e // 3, 2
     least = ti.cast(ti.math.inf, ti.f64)
-    for k in range(n_points):  # two edges that are not the nearest to each other: the nearer of what is nearest to each
+    for k in range(n_points):  # two edges that are not nearest to each other: take the closer of the two surface points
         t = ti.select(k == 0, first, second)
         v, d, flag = normal_at(s, ti.select(k == 0, own, foot), t)
         v *= ti.select(k == 0, side, -side)

@@ -233,12 +233,14 @@ class StageSystem:
         """Residual of the contact laws at the last evaluation."""
         return float(self._k.problem.state[RESIDUAL]) if self._k.any else 0.0
 
-    def laws_hold_to_rounding(self) -> bool:
-        """Return whether impulses, and what they miss the laws by, are below the rounding floor of every piece, and gaps hold:
-        bodies barely touch."""
-        square = self.rounding.of_pieces(self.stage.c, self.stage.beta).min() ** 2
-        missed, size, gap = self._k.work.prox_residual.to_numpy()[: int(self._k.problem.count[0])].T
-        return bool(max(missed.sum(), size.sum()) <= square and gap.max(initial=0.0) <= self.stage.contact_tolerance)
+    def impulses_are_rounding(self) -> bool:
+        """Return whether impulses are below the rounding of the momenta of the bodies, and gaps hold: bodies that drift together
+        barely touch."""
+        mass, v = download([self.model.mass, self.work.v_hat])
+        of_node = self.pieces.of_node
+        momentum = np.bincount(of_node, mass * np.linalg.norm(v, axis=1), of_node.max() + 1).min()
+        _, square, gap = self._k.work.prox_residual.to_numpy()[: int(self._k.problem.count[0])].T
+        return bool(square.sum() <= (self.rounding.eps * momentum) ** 2 and gap.max(initial=0.0) <= self.stage.contact_tolerance)
 
     @property
     def slopes(self) -> tuple[float, float]:
@@ -482,13 +484,19 @@ class StageSystem:
     def solve_directly(self, tolerance: float, stalled: bool) -> tuple[int, bool, float] | None:
         """Move a linearised stage to the solution of its frictional problem, see `direct`; None if that does not apply.
 
-        tolerance: of the laws' residual; stalled: whether iterations failed, whose residual is not exceeded. Returns (iterations,
-        converged, |r|); raises numpy.linalg.LinAlgError if the matrix is indefinite.
+        tolerance: of the laws' residual; stalled: whether iterations failed. Returns (iterations, converged, |r|); raises
+        numpy.linalg.LinAlgError if the matrix of rigid bodies is indefinite.
         """
-        if self._direct is None or not (stalled or self._direct.always) or not self._direct.prepare(self._k):
+        if self._direct is None or not (stalled or self._direct.is_rigid):
             return None
-        acceptable = np.inf if self._direct.always else max(tolerance, self.contact_residual)
-        return self._direct.solve(self._k, self.stage.beta, tolerance, acceptable)
+        try:
+            if not self._direct.prepare(self._k):
+                return None
+        except np.linalg.LinAlgError:
+            if self._direct.is_rigid:
+                raise
+            return None  # contacts may hold an indefinite matrix
+        return self._direct.solve(self._k, self.stage.beta, tolerance, max(tolerance, self.contact_residual))
 
     def end_linearised(self, accept: bool = True, new_multipliers: int = TO_IMPULSES) -> tuple[float, float]:
         """Restore nonlinear elastic forces; return (|r|, scale). y is then the velocity change since linearisation, base its x.
@@ -530,7 +538,7 @@ class StageSystem:
         """Form the matrix and the contacts' r-factors, which stay fixed during the stage."""
         self.form_matrix(projected)
         find_factors(self._k.problem)
-        if self._direct is not None and self._direct.always:
+        if self._direct is not None and self._direct.is_rigid:
             with contextlib.suppress(np.linalg.LinAlgError):  # the solve will project the matrix
                 self._direct.set_factors(self._k)
 

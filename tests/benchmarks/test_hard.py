@@ -112,7 +112,11 @@ def test_stored_results_are_judged_again(tmp_path):
     counts = tally(stored(results))
     fewer = tally(stored(results | {"rows": [row for row in results["rows"] if row is not solved]}))
     assert counts[ASKED] == sum(len(case.variants) for case in CASES) == sum(counts[name] for name in COLUMNS)
-    assert fewer == counts | {SOLVED: counts[SOLVED] - 1, NOT_RUN: counts[NOT_RUN] + 1, solved["column"]: counts[solved["column"]] - 1}
+    assert fewer == counts | {
+        SOLVED: counts[SOLVED] - 1,
+        NOT_RUN: counts[NOT_RUN] + 1,
+        solved["column"]: counts[solved["column"]] - 1,
+    }
     page = next(path for path in RESULTS.glob("hard-*.md") if results["date"] in path.read_text(encoding="utf-8"))
     again = tmp_path / "hard.json"
     again.write_text(json.dumps(results | {"rows": [row | {"solved": None} for row in results["rows"]]}))

@@ -210,6 +210,17 @@ def test_an_impact_keeps_momentum_and_follows_newtons_law(restitution):
         assert w[0] > 0.3
 
 
+def test_what_flies_is_not_moved_by_what_is_in_contact():
+    """Contacts are solved directly here, also in linearised steps, whose rigid motion is balanced afterwards."""
+    scene = ts.Scene()
+    scene.add_rigid_body(CUBE, name="lying", position=(0, 0.0002 - CUBE.vertices[:, 1].min(), 0))
+    scene.add_rigid_body(CUBE, name="flying", position=(0, 5, 0), velocity=(1, 0, 0))
+    scene.add_obstacle(GROUND)
+    with opened(scene, "linearly_implicit_euler", 0.01) as sim:
+        assert all(sim.step().n_contacts for _ in range(10))
+        assert np.allclose(sim.twist("flying").velocity, (1.0, -0.1 * G, 0.0), atol=1e-6)
+
+
 @pytest.mark.parametrize(
     "integrator, restitution",
     [("velocity_verlet", 0.5), ("implicit_euler", 0.0), ("linearly_implicit_euler", 0.5), ("bdf2", 0.5)],
