@@ -8,7 +8,22 @@ import taisoft as ts
 from taisoft.cli.files import describe
 
 from ..reference_cases.record import face, nearest
-from .case import EXPLICIT, IMPLICIT, MEASURED, OK, PROPOSED, REFUSED, Case, Must, Session, explicit, implicit, refusal
+from .case import (
+    EXPLICIT,
+    IMPLICIT,
+    INEXACT_CAUSE,
+    INEXACT_NEXT,
+    MEASURED,
+    OK,
+    PROPOSED,
+    REFUSED,
+    Case,
+    Must,
+    Session,
+    explicit,
+    implicit,
+    refusal,
+)
 from .shapes import COR, DOWN, SNH, box, not_finite, one_body
 
 NAMED = "volume of the tet that the load report names as worst, over s times the mean"
@@ -140,6 +155,7 @@ G2.add_limit(
     "never deeper than 2 mm",
 )
 G2.add_limit("deepest of vertices and triangles' middles in a knife [m]", 2e-3, PROPOSED)
+G2.add_shortfall(INEXACT_CAUSE, INEXACT_NEXT)
 G2.add_limit("numbers that are not finite at the end", 0.0, PROPOSED)
 
 CASES = (G1, G2)
