@@ -216,7 +216,7 @@ def test_what_flies_is_not_moved_by_what_is_in_contact():
     scene.add_rigid_body(CUBE, name="lying", position=(0, 0.0002 - CUBE.vertices[:, 1].min(), 0))
     scene.add_rigid_body(CUBE, name="flying", position=(0, 5, 0), velocity=(1, 0, 0))
     scene.add_obstacle(GROUND)
-    with opened(scene, "linearly_implicit_euler", 0.01) as sim:
+    with ts.Simulator(scene, dt=0.01, integrator="linearly_implicit_euler", precision="f64") as sim:  # of rigid bodies alone
         assert all(sim.step().n_contacts for _ in range(10))
         assert np.allclose(sim.twist("flying").velocity, (1.0, -0.1 * G, 0.0), atol=1e-6)
 
