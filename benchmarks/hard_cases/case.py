@@ -31,8 +31,10 @@ END = "end of the run"  # quantity of a variant's first verdict
 DEEPEST = "deepest penetration after any step [m]"
 
 IMPLICIT, EXPLICIT = "implicit_euler", "symplectic_euler"
-INEXACT_CAUSE = "contacts act along the normals of the step's start, and brake where these turn within the step; the run says so"
-INEXACT_NEXT = "the contact geometry of the step's end"  # cause and next idea of shortfalls
+OLD_NORMALS = (  # cause and next idea of shortfalls
+    "contacts act along the normals of the step's start, and brake where these turn within the step; the run says so",
+    "the contact geometry of the step's end",
+)
 FINER = 8  # steps of a reference per step of the run
 FRAMES = 20  # approximate maximum of stored frames
 
@@ -63,6 +65,11 @@ class Must:
         if status == DEGRADED:
             return self.end in (OK, DEGRADED) and bool(causes)  # a run degraded without a known cause does not count
         return status == self.end and not (status == OK and causes)
+
+
+def firm(volume_floor: float) -> str:
+    """Why a variant with this volume floor is asked."""
+    return f"not of the catalogue: with a material whose volume floor is {volume_floor:g}"
 
 
 @dataclass(frozen=True)

@@ -31,6 +31,7 @@ from .case import (
     Must,
     Session,
     explicit,
+    firm,
     implicit,
     refusal,
 )
@@ -253,12 +254,12 @@ for dt in TWIST_STEPS[:3]:
     T2.add_limit(f"dt {dt:g} s: inverted tets, most", 0.0, PROPOSED)
 
 BOUNCES = Must(OK, "rubber stands 67 m/s, as a golf ball does: it flattens, keeps its energy and flies back")
-BOUNCES_FIRM = Must(OK, f"{BOUNCES.reason}; not of the catalogue: with a material whose volume floor is {FLOOR:g}")
+BOUNCES_FIRM = Must(OK, f"{BOUNCES.reason}; {firm(FLOOR)}")
 T3 = Case("T3", "a ball at 67 m/s on a wall", impact, size=0.04)
 for floor in (0.0, FLOOR):
-    firm, must = (f", volume floor {floor:g}", BOUNCES_FIRM) if floor else ("", BOUNCES)
-    T3.add_variant("implicit" + firm, implicit(2e-5), must, steps=200, volume_floor=floor)
-    T3.add_variant("explicit" + firm, explicit(2e-6), must, steps=2000, volume_floor=floor)
+    name, must = (f", volume floor {floor:g}", BOUNCES_FIRM) if floor else ("", BOUNCES)
+    T3.add_variant("implicit" + name, implicit(2e-5), must, steps=200, volume_floor=floor)
+    T3.add_variant("explicit" + name, explicit(2e-6), must, steps=2000, volume_floor=floor)
 T3.add_limit("mean velocity away from the wall at the end [m/s]", 0.0, PROPOSED, at_least=True)
 T3.add_limit(DEEPEST, 1e-4, PROPOSED)
 T3.add_limit("largest energy over that of the start", 1.001, PROPOSED)

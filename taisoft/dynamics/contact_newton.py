@@ -54,8 +54,7 @@ NEAR_FLOOR = 4.0  # times the floor of |r|: below it, |r| may be mostly rigid mo
 
 @dataclass(frozen=True)
 class FrictionalResult:
-    """Result of solving a linearised stage. negative: its matrix is indefinite; direct: only x and the impulses are set;
-    stalled: iterations failed."""
+    """Result of solving a linearised stage. negative: its matrix is indefinite; direct: iterations did not solve it."""
 
     solves: int
     linear: int
@@ -65,13 +64,12 @@ class FrictionalResult:
     r: float
     r_scale: float = R_SCALE  # R over the r-factors at its end
     direct: bool = False
-    stalled: bool = False
 
 
 def solve_linear(system: StageSystem, problem: Stage, r: float, scale: float, stalled: bool = False) -> FrictionalResult:
     """Solve a linearised stage from (|r|, scale): directly where that applies, else by iterations; directly, too, if these fail.
 
-    stalled: iterations have failed on a problem of the same stage.
+    stalled: iterations have failed on the stage's last problem.
     """
     found = _solve_directly(system, problem, r, stalled)
     if found is None:
@@ -79,7 +77,7 @@ def solve_linear(system: StageSystem, problem: Stage, r: float, scale: float, st
         if not (found.converged or found.negative or stalled):
             direct = _solve_directly(system, problem, r, stalled=True)
             if direct is not None:
-                found = replace(direct, solves=found.solves + 1, linear=found.linear, multipliers=found.multipliers, stalled=True)
+                found = replace(direct, solves=found.solves + 1, linear=found.linear, multipliers=found.multipliers)
     return found
 
 
@@ -118,7 +116,8 @@ class ContactNewton:
         self.system, self.stage = system, stage
         self.newton = self.linear = self.multipliers = 0
         self.eliminated = 0.0  # Newton iterations on few nodes, times their fraction of all nodes
-        self.rounding = self.tight = self.stalls = self.laws_stall = False
+        self.rounding = self.tight = self.stalls = False
+        self.is_direct = False  # whether the last problem was solved directly, as the next one then is first
         # laws that hold better than they must let |r| converge in fewer steps, where they can
         self.law_aim = min(stage.contact_tolerance, stage.tolerance)
         self.has_direction = False  # y is a good first direction on the current matrix
@@ -127,7 +126,7 @@ class ContactNewton:
     def run(self) -> StageResult:
         """Solve from the first iterate, where the matrix has been formed."""
         system, stage = self.system, self.stage
-        self.r, self.scale, self.has_direction = choose_start(system, *system.evaluate_start(new_multipliers=TO_IMPULSES))
+        self.r, self.scale, self.has_direction = choose_start(system, *system.evaluate_start())
         if self.has_direction:  # the matrix of the first iterate is invalid
             system.form_matrix_and_factors()
             self.r, self.scale = system.evaluate(None)
@@ -249,8 +248,8 @@ class ContactNewton:
             first_r_scale=self.first_r_scale,
             max_r_scale=self.max_r_scale,
         )
-        result = solve_linear(system, problem, self._first_residual(), self.scale, self.laws_stall)
-        self.laws_stall = result.stalled or (self.laws_stall and result.direct)
+        result = solve_linear(system, problem, self._first_residual(), self.scale, self.is_direct)
+        self.is_direct = result.direct
         self.linear, self.multipliers = self.linear + result.linear, self.multipliers + result.multipliers
         if not (result.converged or result.negative):
             self.law_aim = stage.contact_tolerance
@@ -305,7 +304,7 @@ def solve_linearised(system: StageSystem, stage: Stage) -> StageResult:
     """Solve the frictional problem alone, at the present state; on a projected matrix if its own is indefinite."""
     tolerance = stage.linear_tolerance or LINEARISED_FORCING
     linear = 0
-    r, scale = system.evaluate_start(new_multipliers=TO_IMPULSES)
+    r, scale = system.evaluate_start()
     for projected in (False, True):
         system.linearise()
         solves = min(LINEARISED_SOLVES, system.budget.left)

@@ -27,7 +27,7 @@ from taisoft.linear.coupling import NO_COUPLING, Coupling, build_coupling
 MAX_MISSED, MIN_KEPT = 0.5, 1e-3
 ROUNDING = 4.0 * 2.0**-52  # of the largest coordinate: that of a gap, as of positions in f64
 PAST = 2  # multiplier updates that are stored
-TO_IMPULSES, OF_IMPULSES = 1, 2  # new multipliers, see `update_impulses`
+KEEP, TO_IMPULSES, OF_IMPULSES = range(3)  # new multipliers, see `update_impulses`
 
 
 @dataclass(frozen=True, eq=False)
@@ -235,13 +235,13 @@ def find_residual(k: ti.template()):
 def update_impulses(m: ti.template(), k: ti.template(), new_multipliers: ti.i32, beta: ti.f64, r_scale: ti.f64):
     """Compute impulses and matrix blocks of all contacts at the present x, and the residual of their laws.
 
-    new_multipliers: 0; TO_IMPULSES: set the multipliers to the impulses first, and the friction disks accordingly; OF_IMPULSES:
+    new_multipliers: KEEP; TO_IMPULSES: set multipliers to the impulses first, and the friction disks accordingly; OF_IMPULSES:
     set them so that these impulses result. r_scale: R over the r-factors.
     """
     (p,) = ti.static((k.problem,))
     ti.loop_config(serialize=p.serial)
     for n in range(p.count[0]):
-        if new_multipliers != 0:
+        if new_multipliers != KEEP:
             set_multiplier(k, n)
         if new_multipliers == OF_IMPULSES:
             z = k.work.multiplier[n] + scaled(r_scale * p.factor[n], stage_velocity_of(k, n, beta))

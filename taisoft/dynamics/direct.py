@@ -6,8 +6,8 @@ The change s of v satisfies A s = J^T r - r_0, r_0 the residual without contacts
 with the laws of contact, u_0 the contacts' velocities at the start: Gauss-Seidel sweeps on W, then, if they do not suffice, an
 augmented Lagrangian on the host. A, whose band is that of single bodies unless springs join them, is factorised as multigrid's
 coarsest level is. The r-factors come from W: those from the diagonal of A would be too large by as much as the bodies are stiff,
-and the laws' residual with them. Where iterations stall, the result counts if it meets the
-laws at least as well as theirs with their r-factors.
+and the laws' residual with them. Where iterations stall, the result counts if it meets the laws at least as well as theirs, with
+their r-factors.
 Weakness: W is dense within each group of bodies that touch, and within soft ones altogether: only small stages are solved so.
 """
 
@@ -28,11 +28,9 @@ if TYPE_CHECKING:
     from taisoft.dynamics.contact_terms import StageContacts
     from taisoft.dynamics.stage_system import StageSystem
 
-MAX_ROWS, STALLED_ROWS = (
-    2000,
-    300,
-)  # rows of W; where soft bodies stall, it is dense, and a step of Newton's method on it takes 10 ms
-STALLED_OUTER = 5  # iterations of the augmented Lagrangian there; most need one
+MAX_ROWS = 2000  # of W
+# where soft bodies stall, W is dense, and a step of Newton's method on it takes 10 ms; most need one outer iteration
+STALLED_ROWS, STALLED_OUTER = 300, 5
 WORK = 5e7  # maximum rows of W times numbers in the band of A: about 50 ms
 FRACTION = 0.1  # of the laws' tolerance, to which they are met with the r-factors of W
 SWEEPS = 1000  # of Gauss-Seidel, before the augmented Lagrangian
@@ -55,7 +53,7 @@ class DirectSolver:
     def prepare(self, stage_contacts: "StageContacts") -> bool:
         """Factorise the matrix that was formed, and assemble W; return whether that is possible and not too large.
 
-        Raises numpy.linalg.LinAlgError if A is indefinite.
+        Raises numpy.linalg.LinAlgError if A is indefinite, of rigid bodies alone: contacts may hold soft ones whose A is.
         """
         rows = 3 * int(stage_contacts.problem.count[0])
         if not 0 < rows <= self._max_rows:
@@ -69,7 +67,12 @@ class DirectSolver:
         if self._formed != self._system.n_formed:
             self._formed = -1
             self._free = (self._system.model.free.to_numpy()[self._nodes] > 0.0).reshape(-1).astype(np.float64)
-            self._factor = self._factorise(stage_contacts)
+            try:
+                self._factor = self._factorise(stage_contacts)
+            except np.linalg.LinAlgError:
+                if self.is_rigid:
+                    raise
+                return False
             if self._factor is None:
                 self._size = math.inf
                 return False

@@ -21,7 +21,7 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-from taisoft.dynamics.contact_terms import TO_IMPULSES
+from taisoft.dynamics.contact_terms import KEEP, TO_IMPULSES
 from taisoft.dynamics.frictional import FINER, MAX_MULTIPLIERS, PAST, PROGRESS, R_EXTRAPOLATED, R_SCALE, ROUNDING, next_scale
 from taisoft.dynamics.results import StageResult, relative
 from taisoft.dynamics.stage import AGAIN, ELASTIC_STAGE, IMPACT, LINEARISED, STEP
@@ -135,7 +135,7 @@ class Newton:
             bounds = self.stage.max_r_scale, self.stage.contact_tolerance
             system.r_scale = next_scale(system.r_scale, law, self.law_residual, self.n_inner, int(system.frictionless), *bounds)
         self.law_residual, self.multipliers, self.rounding = law, self.multipliers + 1, False
-        self.r, self.scale = system.evaluate(None, new_multipliers=0 if extrapolating else TO_IMPULSES)
+        self.r, self.scale = system.evaluate(None, new_multipliers=KEEP if extrapolating else TO_IMPULSES)
         self._begin_multiplier()
         return True
 

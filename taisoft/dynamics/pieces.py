@@ -142,6 +142,10 @@ class Pieces:
         """Let all components count alike in slopes."""
         upload([(self.work.factor, np.ones(self.work.n_components))])
 
+    def momenta(self, mass: np.ndarray, v: np.ndarray) -> np.ndarray:
+        """Return the norm (n,) of the momenta of each piece's nodes [N s]. mass: (n_nodes,), v: (n_nodes, 3)."""
+        return np.sqrt(np.bincount(self.of_node, ((mass[:, None] * v) ** 2).sum(axis=1), self.work.n))
+
     def unbalanced_mean(self, system: "StageSystem", beta: float) -> tuple[float, str]:
         """Return the largest relative mean residual of a piece after a linearised step, and its name; 0 if all are rounding.
 
@@ -157,8 +161,10 @@ class Pieces:
             constrained = np.bincount(self.of_node, 1.0 - free[:, axis], n) > 0.0
             means[axis] = np.where(constrained, 0.0, np.bincount(self.of_node, residual[:, axis], n))
         mean = np.linalg.norm(means, axis=0) / np.sqrt(np.bincount(self.of_node, minlength=n))
-        momentum = np.sqrt(np.bincount(self.of_node, ((mass[:, None] * v) ** 2).sum(axis=1), n))
-        floor = max(system.rounding.eps, NEGLIGIBLE_MOMENTUM) * (momentum + beta * internal) + system.rounding.piece_mass / beta
+        floor = (
+            max(system.rounding.eps, NEGLIGIBLE_MOMENTUM) * (self.momenta(mass, v) + beta * internal)
+            + system.rounding.piece_mass / beta
+        )
         with np.errstate(divide="ignore", invalid="ignore"):
             ratio = np.where(mean > MEAN_ROUNDING * floor, mean / (inertia + beta * (internal + loads)), 0.0)
         k = int(np.argmax(ratio))

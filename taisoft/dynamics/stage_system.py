@@ -20,6 +20,7 @@ from taisoft.backend.arrays import FieldArena, download, upload
 from taisoft.contact.problem import RESIDUAL, find_factors
 from taisoft.dynamics import frictional, rigid_balance
 from taisoft.dynamics.contact_terms import (
+    KEEP,
     NO_CONTACTS,
     TO_IMPULSES,
     StageContacts,
@@ -237,10 +238,9 @@ class StageSystem:
         """Return whether impulses are below the rounding of the momenta of the bodies, and gaps hold: bodies that drift together
         barely touch."""
         mass, v = download([self.model.mass, self.work.v_hat])
-        of_node = self.pieces.of_node
-        momentum = np.bincount(of_node, mass * np.linalg.norm(v, axis=1), of_node.max() + 1).min()
+        least = self.rounding.eps * self.pieces.momenta(mass.astype(np.float64), v).min()
         _, square, gap = self._k.work.prox_residual.to_numpy()[: int(self._k.problem.count[0])].T
-        return bool(square.sum() <= (self.rounding.eps * momentum) ** 2 and gap.max(initial=0.0) <= self.stage.contact_tolerance)
+        return bool(square.sum() <= least**2 and gap.max(initial=0.0) <= self.stage.contact_tolerance)
 
     @property
     def slopes(self) -> tuple[float, float]:
@@ -306,7 +306,7 @@ class StageSystem:
             find_last(self.model, self.matrix, self._k.coupling, self.work.pcg)
         self.form_matrix_and_factors(projected=impact)
 
-    def evaluate(self, mode: int | None = STAY, step_length: float = 1.0, new_multipliers: int = 0) -> tuple[float, float]:
+    def evaluate(self, mode: int | None = STAY, step_length: float = 1.0, new_multipliers: int = KEEP) -> tuple[float, float]:
         """Return (|r|, scale) after `move` in a mode; None: x and the elastic forces are unchanged.
 
         new_multipliers: see `update_impulses`.
@@ -321,9 +321,9 @@ class StageSystem:
         form_residual(m, w, self.matrix, k, self.kind, stage.beta, self.norms)
         return self._norm_and_scale(stage.c, stage.beta)
 
-    def evaluate_start(self, new_multipliers: int = 0) -> tuple[float, float]:
+    def evaluate_start(self) -> tuple[float, float]:
         """Return (|r|, scale) of the first iterate, with its weights of pieces."""
-        found = self.evaluate(new_multipliers=new_multipliers)
+        found = self.evaluate(new_multipliers=TO_IMPULSES)
         if not (self.pieces.several and math.isfinite(found[0])):
             return found
         self._weigh()
@@ -485,17 +485,10 @@ class StageSystem:
         """Move a linearised stage to the solution of its frictional problem, see `direct`; None if that does not apply.
 
         tolerance: of the laws' residual; stalled: whether iterations failed. Returns (iterations, converged, |r|); raises
-        numpy.linalg.LinAlgError if the matrix of rigid bodies is indefinite.
+        numpy.linalg.LinAlgError as `DirectSolver.prepare`.
         """
-        if self._direct is None or not (stalled or self._direct.is_rigid):
+        if self._direct is None or not (stalled or self._direct.is_rigid) or not self._direct.prepare(self._k):
             return None
-        try:
-            if not self._direct.prepare(self._k):
-                return None
-        except np.linalg.LinAlgError:
-            if self._direct.is_rigid:
-                raise
-            return None  # contacts may hold an indefinite matrix
         return self._direct.solve(self._k, self.stage.beta, tolerance, max(tolerance, self.contact_residual))
 
     def end_linearised(self, accept: bool = True, new_multipliers: int = TO_IMPULSES) -> tuple[float, float]:
