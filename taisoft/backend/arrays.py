@@ -77,6 +77,18 @@ class Array:
         """The properties that compiled code depends on."""
         return self.dtype, self.n, self.shape[1:]
 
+    @property
+    def entries(self) -> int:
+        """Number of entries of the flat array that kernels see."""
+        return math.prod(self.full_shape) // max(self.n, 1)
+
+    @property
+    def address(self) -> int:
+        """Of its memory, on the host or on the device."""
+        if self.memory is not None:
+            return self.memory.ctypes.data
+        return impl.get_runtime().prog.get_ndarray_data_ptr_as_int(self.device.arr)
+
     def to_numpy(self, rows: int | None = None) -> np.ndarray:
         """Return a copy of the array, or of its first `rows` rows."""
         if self.memory is not None:

@@ -4,6 +4,7 @@ from taichi._lib import core as core
 from taichi.lang import expr as expr
 from taichi.lang import impl as impl
 from taichi.lang import kernel_impl as kernel_impl
+from taichi.lang.any_array import AnyArray as AnyArray
 from taichi.lang.ast.ast_transformer import ASTTransformer as ASTTransformer
 from taichi.lang.ast.ast_transformer_utils import ASTTransformerContext as ASTTransformerContext
 from taichi.lang.ast.transform import transform_tree as transform_tree

@@ -34,7 +34,6 @@ _open: list["Runtime"] = []  # current claims on the runtime
 _kind: tuple[str, str] | None = None  # (arch, precision) that Taichi was initialised with
 _program = None  # Taichi's program object of that initialisation
 _totals = {"compile": 0.0, "kernels": 0}
-_all_kernels: list[Kernels] = []
 
 
 class Runtime:
@@ -142,7 +141,7 @@ def _initialise(arch: str, precision: str) -> None:
     except RuntimeError as error:
         raise SimulationError(f"Taichi does not start: {(str(error).splitlines() or ['no reason given'])[0]}") from None
     _program = impl.get_runtime().prog
-    for kernels in _all_kernels:  # they refer to the previous program
+    for kernels in Kernels.every:  # they refer to the previous program
         kernels.forget()
     LanePool.current = LanePool(PRECISIONS[precision]) if arch == "cpu" else None
     _totals["compile"] += time.perf_counter() - clock
@@ -182,9 +181,7 @@ def kernel(function: Callable | None = None, *, cse: bool = True) -> Callable:
     if function is None:
         return functools.partial(kernel, cse=cse)
     kernels = Kernels(function)
-    _all_kernels.append(kernels)
 
-    @functools.wraps(function)
     def launch(*arguments):
         check_program(_program)
         ready = kernels.find(arguments)
@@ -202,7 +199,7 @@ def kernel(function: Callable | None = None, *, cse: bool = True) -> Callable:
             compile_message.show(_compiler_clock() - compiler, seconds, _totals["kernels"])
         return result
 
-    return launch
+    return kernels.launcher(launch)
 
 
 def _compiler_clock() -> float:
