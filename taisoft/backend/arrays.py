@@ -104,13 +104,18 @@ class Array:
         if data.shape != self.full_shape:
             raise ValueError(f"an array of shape {self.full_shape} cannot take one of shape {data.shape}")
 
-    def from_numpy(self, data: np.ndarray) -> None:
-        """Copy data into the array. Raises ValueError, before writing anything, unless it has the array's shape."""
-        self.check(data)
+    def from_numpy(self, data: np.ndarray, first: int | None = None) -> None:
+        """Copy data into the array, or into its entries from `first` on. Raises ValueError for a wrong shape, before writing."""
+        if first is None:
+            self.check(data)
+        elif data.shape[1:] != self.full_shape[1:] or not 0 <= first <= self.shape[0] - len(data):
+            raise ValueError(f"the entries from {first} on of an array of shape {self.full_shape} cannot take {data.shape}")
+        at = first or 0
         if self.memory is not None:
-            np.copyto(self.memory, data, casting="unsafe")
+            np.copyto(self.memory[at : at + len(data)], data, casting="unsafe")
         elif data.size:
-            device_memory.write(self.device, np.ascontiguousarray(data, dtype=DTYPES[self.dtype]))
+            data = np.ascontiguousarray(data, dtype=DTYPES[self.dtype])
+            device_memory.write(self.device, data, at * data[:1].nbytes)
 
     def fill(self, value: float) -> None:
         """Set every number to value."""

@@ -45,7 +45,10 @@ class Pack:
         if not kinds:
             return []
         factory, function = core.get_type_factory_instance(), impl.get_runtime().compiling_callable
-        types = [core.DataType(factory.get_ndarray_struct_type(kind[0], 1, False)) if isinstance(kind, tuple) else kind for kind in kinds]
+        types = [
+            core.DataType(factory.get_ndarray_struct_type(kind[0], 1, False)) if isinstance(kind, tuple) else kind
+            for kind in kinds
+        ]
         members = factory.get_struct_type([(member, f"m{k}") for k, member in enumerate(types)])
         (self._slot,) = function.insert_scalar_param(members, "pack")
         function.finalize_params()

@@ -25,7 +25,7 @@ from taisoft.collision.overlap import Containment, Inside
 from taisoft.collision.passages import ROUND, append_passages
 from taisoft.collision.path_check import NO_PASSAGES, PathCheck
 from taisoft.collision.spatial_hash import SpatialHash
-from taisoft.collision.surface import ACTIVE, NONFINITE, PAIRS, build_surface, move_obstacles, update_surface
+from taisoft.collision.surface import ACTIVE, NONFINITE, PAIRS, build_surface, update_surface
 from taisoft.errors import SceneError, SimulationError
 from taisoft.fem.model import Layout, Model
 from taisoft.mesh.quality import mean_surface_edge
@@ -95,6 +95,7 @@ class Detection:
         self.broad = self._make_broad(runtime) if self._has_pairs else None
         self._unmapped = arena.field("unmapped", ti.i32, 1)
         self._crossing_parts = arena.vectors("crossed", ti.f64, s.chunks)
+        self._crossing = arena.field("crossing", ti.f64, 3)
         self._fields: DistanceFields | None = None
         if any(grids):
             starts = self.topology.first, layout.node_start
@@ -182,7 +183,8 @@ class Detection:
         for o, begin, end in zip(self.scene.obstacles, starts[:-1], starts[1:]):
             if end > begin and (first or o.path is not None):
                 now, then = (o.points_at(t, self._rest[begin:end]) for t in (time, time + dt))
-                move_obstacles(self.surface, begin, now, then - now)
+                self.surface.x.from_numpy(now, begin)
+                self.surface.move.from_numpy(then - now, begin)
         if self._analytic and (first or any(o.path is not None for _, o in self._analytic)):
             place_analytic(self.shapes, self._analytic, time, dt)
         self._placed = True
@@ -285,12 +287,13 @@ class Detection:
 
     def crossings(self) -> np.ndarray:
         """Return (3,) f64: how deeply surfaces cross at the positions of the last search, see `find_crossings`."""
-        depths, buffer = np.zeros(3), self._near_buffer
+        depths, buffer = self._crossing, self._near_buffer
+        depths.fill(0.0)
         while self._broad_result is not None and self.counts.active:
             find_crossings(self.surface, self._broad_result, buffer.parts, 0.5 * self.reach, self._crossing_parts, depths)
             if not buffer.grow_if_full():
                 break
-        return depths
+        return depths.to_numpy()
 
     def prepare_paths(self) -> None:
         """Allocate what the check of paths needs."""

@@ -20,7 +20,7 @@ from taisoft.dynamics.contact_terms import (
 )
 from taisoft.dynamics.stage import norm_weight, place_node
 from taisoft.fem.chunks import THREADS, block_total, chunk_entry, chunk_size, fold, share, total
-from taisoft.fem.state import OTHER_SUM, STEP_LENGTH, SUM
+from taisoft.fem.state import NORMS, OTHER_SUM, STEP_LENGTH, SUM
 from taisoft.linear.block_csr import block_times, off_diagonal_times
 from taisoft.linear.pcg_work import dot64
 
@@ -155,18 +155,10 @@ def node_residual(m: ti.template(), s: ti.template(), k: ti.template(), i):
 
 
 @kernel
-def advance(
-    m: ti.template(),
-    s: ti.template(),
-    A: ti.template(),
-    k: ti.template(),
-    beta: ti.f64,
-    r_scale: ti.f64,
-    norms: ti.types.ndarray(),
-):
+def advance(m: ti.template(), s: ti.template(), A: ti.template(), k: ti.template(), beta: ti.f64, r_scale: ti.f64):
     """Move along y of s.pcg to zero slope; update x, v, impulses, blocks, residual, and -r as CG's right side.
 
-    norms (5,): only |r|^2 on the free axes is set. scalars: STEP_LENGTH.
+    scalars: STEP_LENGTH, and the first of NORMS.
     """
     p, w = ti.static((k.problem, k.work))
     ti.loop_config(serialize=m.serial)
@@ -210,4 +202,4 @@ def advance(
     fold(m, SUM, SUM, ())
     ti.loop_config(serialize=True)
     for _ in range(1):
-        norms[0] = total(m, SUM)
+        m.state.scalars[NORMS] = total(m, SUM)

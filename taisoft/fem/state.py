@@ -19,9 +19,11 @@ ELASTIC, MIN_J, N_INVERTED, KINETIC, GRAVITY, FIRST_SOFTENED, LOADS = range(7)
 STEPS_DONE, LOWEST_J, MOST_INVERTED, INVERTED_NOW, FAILED = range(7, 12)
 # r.y at the start and end of a Newton step (negative is downhill); length of the step taken by a linearised stage
 START_SLOPE, END_SLOPE, STEP_LENGTH = range(12, 15)
-N_SCALARS = 15
+NORMS, N_NORMS = 15, 5  # of a residual, see `form_residual`; in `State.partial` the first columns
+# Of an impact: E'(0) minus the recoverable energy, E''; of a path: largest distance of a vertex from the searched one [m]
+IMPACT_SLOPE, IMPACT_CURVATURE, DEVIATION = range(20, 23)
+N_SCALARS = 23
 
-N_NORMS = 5  # first columns: norms of a residual
 SUM, OTHER_SUM, N_COLUMNS = 5, 6, 8  # further columns; `measure` uses the columns of its scalars
 
 
