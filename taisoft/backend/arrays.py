@@ -132,6 +132,8 @@ class Array:
 
     def __getitem__(self, at):
         """Return a copy of one entry, on the host."""
+        if self.memory is not None and type(at) is int and not (self.n or len(self.shape) > 1):
+            return self.memory.item(at)
         entry = (self.memory if self.memory is not None else self._download())[at]
         return entry.copy() if entry.ndim else entry.item()
 

@@ -12,6 +12,7 @@ import io
 import os
 import time
 from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import numpy as np
 import taichi as ti
@@ -28,6 +29,7 @@ from taisoft.machine import address_space, format_bytes, usable_cores
 PRECISIONS = {"f32": ti.f32, "f64": ti.f64}
 ARCHS = {"cpu": ti.cpu, "cuda": ti.cuda}
 CPU_POOL_BYTES = 2**30  # address space that Taichi reserves at a time on the CPU
+LOCK_SECONDS = 60.0  # after which the lock of the kernel cache, which is held for less than a second, is that of a killed process
 KERNEL_CACHE_BYTES = 2**30  # of kernels on disk, above which Taichi removes the oldest; its default holds only about 450
 
 _open: list["Runtime"] = []  # current claims on the runtime
@@ -111,6 +113,14 @@ def cache_folder() -> str:
     raise SimulationError("no folder for compiled kernels is writable: set XDG_CACHE_HOME to a writable one")
 
 
+def remove_stale_lock(folder: Path) -> None:
+    """Remove the lock of a kernel cache if the process that held it was killed: Taichi would keep no kernels any more."""
+    lock = folder / "ticache.lock"
+    with contextlib.suppress(OSError):  # there is none, or another process removes it
+        if time.time() - lock.stat().st_mtime > LOCK_SECONDS:
+            lock.unlink()
+
+
 def _initialise(arch: str, precision: str) -> None:
     global _program
     clock = time.perf_counter()
@@ -119,6 +129,7 @@ def _initialise(arch: str, precision: str) -> None:
     except FileNotFoundError:
         raise SimulationError("the working folder no longer exists: change to one that does") from None
     folder = cache_folder()
+    remove_stale_lock(Path(folder))
     available = address_space()
     if arch == "cpu" and available is not None and available < CPU_POOL_BYTES:
         shortage = f"{format_bytes(CPU_POOL_BYTES)} are needed at once, available: {format_bytes(available)}"

@@ -185,11 +185,11 @@ def _run_parallel(
         find_velocities(p)
         _prepare_contacts(p, method, with_momentum)
         _check(p, 1, 0)
-    done = 0
+    done, n_colours = 0, int(p.count[1])
     while done < sweeps and not p.state[RESIDUAL] <= tolerance:
         n = min(every, sweeps - done)
         for _ in range(n):
-            sweep_parallel(p, method)
+            sweep_parallel(p, method, n_colours)
             if with_momentum:
                 _extrapolate_all(p)
             find_velocities(p)

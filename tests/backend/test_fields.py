@@ -42,6 +42,20 @@ def test_an_arena_counts_bytes_and_refuses_what_is_too_large(monkeypatch):
         arena.release()
 
 
+def test_part_of_an_array_is_filled():
+    with opened("f64"):
+        arena = FieldArena()
+        x, n = arena.vectors("x", ti.f64, 4), arena.field("n", ti.i32, 3)
+        x.from_numpy(np.ones((2, 3)), 1)
+        n.from_numpy(np.array([7, 8]), 0)
+        assert x.to_numpy()[:, 2].tolist() == [0.0, 1.0, 1.0, 0.0] and n.to_numpy().tolist() == [7, 8, 0]
+        for data, first in ((np.ones((2, 3)), 3), (np.ones((1, 2)), 0), (np.ones((1, 3)), -1)):
+            with pytest.raises(ValueError, match=r"the entries from -?\d on of an array of shape \(4, 3\) cannot take"):
+                x.from_numpy(data, first)
+        assert x.to_numpy().sum() == 6.0
+        arena.release()
+
+
 @pytest.fixture
 def arrays():
     """Scalar and vector fields of each type and shape."""

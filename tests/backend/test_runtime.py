@@ -3,11 +3,14 @@
 * it has one arch and precision at a time; others are refused while it is open, with the name of its user;
 * after the last close any kind can be opened, and the same kind is not initialised again;
 * without CUDA, arch 'cuda' is refused, and the CPU still works;
+* the lock of a killed process does not keep kernels from being stored, and that of a running one stays;
 * a first launch counts as compile time; errors of a kernel name file, line and function;
 * contact problems have the same solution with any runtime open, which stays open.
 """
 
 import inspect
+import os
+import time
 
 import numpy as np
 import pytest
@@ -51,6 +54,16 @@ def test_the_same_kind_is_not_initialised_again(monkeypatch):
         monkeypatch.setattr(ti, "init", lambda **options: pytest.fail("initialised again"))
     with opened("f64"), opened("f64"):
         pass
+
+
+def test_only_an_old_lock_is_removed(tmp_path):
+    lock = tmp_path / "ticache.lock"
+    runtime.remove_stale_lock(tmp_path)
+    for age, stays in ((0.0, True), (2.0 * runtime.LOCK_SECONDS, False)):
+        lock.touch()
+        os.utime(lock, (time.time() - age,) * 2)
+        runtime.remove_stale_lock(tmp_path)
+        assert lock.exists() == stays
 
 
 def test_an_initialisation_from_outside_is_replaced():
