@@ -66,7 +66,9 @@ def often(do: Callable[[], object], repeats: int) -> float:
 def resting(cells: int) -> ts.Scene:
     """A cube that rests on a half-space."""
     scene = ts.Scene()
-    scene.add_body(ts.box_mesh((cells,) * 3, (0.1,) * 3), ts.Material(**RUBBER), name="cube", position=(0.0, 0.0501, 0.0))
+    scene.add_body(
+        ts.box_mesh((cells,) * 3, (0.1,) * 3, pattern="six"), ts.Material(**RUBBER), name="cube", position=(0.0, 0.0501, 0.0)
+    )
     scene.add_obstacle(ts.HalfSpace((0, 0, 0), (0, 1, 0)), name="ground")
     return scene
 
@@ -74,7 +76,9 @@ def resting(cells: int) -> ts.Scene:
 def free(cells: int) -> ts.Scene:
     """A cube that swings from one side, without contacts."""
     scene = ts.Scene()
-    scene.add_body(ts.box_mesh((cells,) * 3, (0.1,) * 3), ts.Material(**RUBBER), name="cube").fix(lambda X: X[:, 0] < -0.0499)
+    scene.add_body(ts.box_mesh((cells,) * 3, (0.1,) * 3, pattern="six"), ts.Material(**RUBBER), name="cube").fix(
+        lambda X: X[:, 0] < -0.0499
+    )
     return scene
 
 

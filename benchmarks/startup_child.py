@@ -201,7 +201,7 @@ def settings(cells: int) -> dict:
 
 
 def calls(*cells: int) -> dict:
-    """Means of what the tenth to twentieth step of a beam and two cubes launch and access; empty if the version does not count."""
+    """Means of what the tenth to twentieth step of each scene launches and accesses; empty if the version does not count."""
     try:
         from taisoft.backend.counters import counting
     except ImportError:
