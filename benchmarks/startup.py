@@ -3,15 +3,15 @@
 taisoft bench startup [--quick] [--baseline FOLDER] [--out FILE.json]
 
 A beam of 540 tets in explicit steps, and cubes of 320 tets in implicit steps with contacts, one on a block, one on a half-space
-("plane"), each to its tenth step: cold (a new process, an empty kernel cache), warm (a new process, the same cache), and warm with
-a new size. In one process: the first simulator, a second one of the same structure, and one of another size. Also three static
-solves of the beam, nine that find Young's modulus from a sag, what changes of an open simulator cost, the launches and accesses by
-the host of a step, the kernels that sheets on a block compile from 224 to 2,144 surface triangles (from 1,500 on, the search for contacts runs on all
-threads: other kernels), and the resident memory that twenty simulators leave behind, and four closed ones of a cube of 53,240
-tets to which something refers. Times are wall and CPU seconds of whole processes, including Python's start; warm times are
-medians over rounds. --baseline: folder of another version, measured in turn with its own cache. The limits compare with it; those
-of warm processes and of kernel speed (a beam of 34,560 tets, landing sheets) use the median of the ratio over rounds. It then
-takes about eight minutes. Exit status: 0, or 1 if a limit is not met or a process failed.
+("plane"), each to its tenth step: cold (a new process, an empty kernel cache), warm (a new process, the same cache), and warm
+with a new size. In one process: the first simulator, a second one of the same structure, and one of another size. Also three
+static solves of the beam, nine that find Young's modulus from a sag, what changes of an open simulator cost, the launches and
+accesses by the host of a step, the kernels that sheets on a block compile from 224 to 2,144 surface triangles (from 1,500 on, the
+search for contacts runs on all threads: other kernels), and the resident memory that twenty simulators leave behind, and four
+closed ones of a cube of 53,240 tets to which something refers. Times are wall and CPU seconds of whole processes, including
+Python's start; warm times are medians over rounds. --baseline: folder of another version, measured in turn with its own cache.
+The limits compare with it; those of warm processes and of kernel speed (a beam of 34,560 tets, landing sheets) use the median of
+the ratio over rounds. It then takes about eight minutes. Exit status: 0, or 1 if a limit is not met or a process failed.
 """
 
 import json
