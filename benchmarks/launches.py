@@ -1,6 +1,6 @@
 """Launches: what a kernel call costs the host by the number of its arrays, and small steps, which consist of such calls.
 
-taisoft bench launches [--quick] [--baseline FOLDER] [--out FILE.json]
+taisoft bench launches [--arch cuda] [--quick] [--baseline FOLDER] [--out FILE.json]
 
 A launch hands over one number, one integer and 1 to 200 arrays. Steps: a resting cube of 384 tets and one of 3,072 in implicit
 steps with contacts, one of 10,368 in implicit steps without, one of 384 in explicit steps of one sub-step each. A new process
@@ -16,8 +16,8 @@ import numpy as np
 
 from taisoft.output.tables import markdown
 
-from .document import Limit, begin, check_out
-from .runner import make_parser, progress, versions_beside
+from .document import Limit, begin
+from .runner import make_parser, parse_options, progress, versions_beside
 
 CHILD = Path(__file__).with_name("launches_child.py")
 ROUNDS = 5
@@ -25,14 +25,14 @@ LAUNCH = 1.5  # largest time of a launch [us]
 RATIOS = {"resting, 384 tets": 0.45, "contact, 3,072 tets": 0.65, "free, 10,368 tets": 0.8}  # largest time over the baseline's
 
 
-def measure(baseline: Path | None, quick: bool) -> dict[str, list[dict]]:
+def measure(baseline: Path | None, arch: str, quick: bool) -> dict[str, list[dict]]:
     """The results of each version by round, the versions in turn."""
     versions = versions_beside(baseline)
     found: dict[str, list[dict]] = {name: [] for name in versions}
     for k in range(1 if quick else ROUNDS):
         for name, version in versions.items():
             progress(f"round {k + 1}: {name} version")
-            found[name].append(json.loads(version.run(CHILD, *(("quick",) if quick else ()))[-1]))
+            found[name].append(json.loads(version.run(CHILD, arch, *(("quick",) if quick else ()))[-1]))
     return found
 
 
@@ -82,11 +82,9 @@ def main(argv=None) -> int:
     parser = make_parser("launches", __doc__)
     parser.add_argument("--quick", action="store_true", help="one round, small scenes, no limit")
     parser.add_argument("--baseline", type=Path, metavar="FOLDER", help="another version of taisoft to compare with")
-    parser.add_argument("--out", type=Path, metavar="FILE.json", help="write FILE.json and FILE.md too")
-    options = parser.parse_args(argv)
-    check_out(options.out, ".json")
-    document, numbers = begin("Launches", "arch cpu")
-    found = measure(options.baseline, options.quick)
+    options = parse_options(parser, argv)
+    document, numbers = begin("Launches", f"arch {options.arch}")
+    found = measure(options.baseline, options.arch, options.quick)
     document.add("## A launch\n\n" + table(found, "launches", "arrays"))
     document.add("## A step\n\n" + table(found, "steps", "scene"))
     return document.finish(options, numbers | {"rounds": found}, [] if options.quick else find_limits(found))

@@ -1,6 +1,6 @@
 """A child process of `taisoft bench launches`; also older versions can run it.
 
-python launches_child.py prints one line of JSON: microseconds of launches by the number of arrays, and of steps by scene, each
+python launches_child.py ARCH [quick] prints one line of JSON: microseconds of launches by the number of arrays, and of steps by scene, each
 the median of several stretches, and a digest of the positions at the end.
 """
 
@@ -40,9 +40,9 @@ def add(to: ti.template(), a: ti.f64, n: ti.i32):
             x[0] = x[0] + a + n
 
 
-def launches(repeats: int) -> dict[str, float]:
+def launches(arch: str, repeats: int) -> dict[str, float]:
     """Microseconds of a launch with one number, one integer and these many arrays."""
-    runtime, found, arena = open_runtime("cpu", "f64"), {}, FieldArena()
+    runtime, found, arena = open_runtime(arch, "f64"), {}, FieldArena()
     for n in ARRAYS:
         arrays = Arrays(tuple(arena.field(f"{n}, {k}", ti.f64, 4) for k in range(n)))
         found[str(n)] = often(lambda arrays=arrays: add(arrays, 1.0, 2), repeats)
@@ -59,6 +59,7 @@ def often(do: Callable[[], object], repeats: int) -> float:
         begin = time.perf_counter()
         for _ in range(repeats):
             do()
+        ti.sync()
         seconds.append((time.perf_counter() - begin) / repeats)
     return 1e6 * float(np.median(seconds[1:]))
 
@@ -90,23 +91,23 @@ SCENES = {  # name -> scene, its cells and those of --quick, settings, steps bef
 }
 
 
-def steps(name: str, quick: bool) -> tuple[float, str]:
+def steps(name: str, arch: str, quick: bool) -> tuple[float, str]:
     """Microseconds of a step, and a digest of the positions at the end."""
     build, cells, few, settings, before, stretch = SCENES[name]
-    with warnings.catch_warnings(), ts.Simulator(build(few if quick else cells), **settings) as sim:
+    with warnings.catch_warnings(), ts.Simulator(build(few if quick else cells), arch=arch, **settings) as sim:
         warnings.simplefilter("ignore")
         for _ in range(before):
             sim.step()
         return often(sim.step, stretch), hashlib.sha256(sim.positions().tobytes()).hexdigest()[:16]
 
 
-def measure(quick: bool) -> dict:
+def measure(arch: str, quick: bool) -> dict:
     """Everything."""
-    found = {"launches": launches(100 if quick else 2000), "steps": {}, "digests": {}}
+    found = {"launches": launches(arch, 100 if quick else 2000), "steps": {}, "digests": {}}
     for name in SCENES:
-        found["steps"][name], found["digests"][name] = steps(name, quick)
+        found["steps"][name], found["digests"][name] = steps(name, arch, quick)
     return found
 
 
 if __name__ == "__main__":
-    print(json.dumps(measure("quick" in sys.argv)))
+    print(json.dumps(measure(sys.argv[1], "quick" in sys.argv)))

@@ -20,21 +20,18 @@ from collections.abc import Callable
 from typing import Any, ClassVar
 
 from taisoft.backend.arrays import Array, on_cuda
-from taisoft.backend.compiled import Compiled, Flat, Packed, Public
+from taisoft.backend.compiled import Compiled, Public
 from taisoft.backend.private import impl, ndarray_type, template
 from taisoft.backend.structure import holders, names_in, names_of_types, structure_of
 from taisoft.backend.tracing import FAST_TRACING
 
 PUBLIC = not FAST_TRACING  # launch only through Taichi's public interface
 PACK = os.environ.get("TAISOFT_PACK")  # "0" or "1": whether arguments are packed; by default, they are on the CPU
-SMALL = -5, 256  # integers that Python keeps one object of each
 
 
-def way() -> type[Compiled]:
-    """How kernels are launched."""
-    if PUBLIC:
-        return Public
-    return Packed if PACK == "1" or (PACK is None and not on_cuda()) else Flat
+def packs() -> bool:
+    """Whether arguments are packed."""
+    return PACK == "1" if PACK else not on_cuda()
 
 
 class Kernels:
@@ -46,27 +43,25 @@ class Kernels:
     def __init__(self, function: Callable):
         self._function = function
         signature = inspect.signature(function)
-        self._names = list(signature.parameters)
-        self._annotations = [p.annotation for p in signature.parameters.values()]
-        self._templates = [k for k, kind in enumerate(self._annotations) if isinstance(kind, template)]
-        self._arrays = [k for k, kind in enumerate(self._annotations) if isinstance(kind, ndarray_type.NdarrayType)]
+        self._kinds = {name: parameter.annotation for name, parameter in signature.parameters.items()}
+        self._templates = [k for k, kind in enumerate(self._kinds.values()) if isinstance(kind, template)]
+        self._arrays = [k for k, kind in enumerate(self._kinds.values()) if isinstance(kind, ndarray_type.NdarrayType)]
         self._used: set[str] | None = None
-        self._prepared: dict[tuple, tuple] = {}  # ids of the templates -> what the function of `launcher` needs
+        self._ready: dict[tuple, tuple] = {}  # key of the arguments -> what `prepare` returned
         self.forget()
         self.every.append(self)
 
     def forget(self) -> None:
         """Drop everything compiled: Taichi has been re-initialised."""
         self._compiled: dict[tuple, Compiled] = {}
-        self._ready: dict[tuple, tuple] = {}  # key of the arguments -> compiled kernel, what `bind` returned, `_references`
-        self._prepared.clear()
+        self._ready.clear()
 
     @classmethod
     def watch(cls, watched: bool) -> None:
         """Let every launch pass through `Compiled.launch`, or no longer."""
         cls.watched = watched
         for kernels in cls.every:
-            kernels._prepared.clear()
+            kernels._ready.clear()
 
     @property
     def n_compiled(self) -> int:
@@ -74,19 +69,18 @@ class Kernels:
         return len(self._compiled)
 
     def launcher(self, prepare: Callable) -> Callable:
-        """Return a function with the kernel's parameters that launches it, and calls `prepare` instead for new arguments.
+        """Return a function with the kernel's parameters that launches it, and calls `prepare` instead where it cannot.
 
         It is the shortest Python can be: one look-up, one call that writes the numbers, one that launches.
         """
-        names = ", ".join(self._names)
-        lines = [f"def {self._function.__name__}({names}):"]
+        names, templates = list(self._kinds), [list(self._kinds)[k] for k in self._templates]
+        numbers, given = ", ".join(name for name in names if name not in templates), ", ".join(names)
+        lines = [f"def {self._function.__name__}({given}):"]
         if not self._arrays:
-            key = "".join(f"id({self._names[k]}), " for k in self._templates)
-            numbers = ", ".join(name for k, name in enumerate(self._names) if k not in self._templates)
             lines += [
-                f"    _entry = _find(({key}))",
+                f"    _entry = _find(({''.join(f'id({name}), ' for name in templates)}))",
                 "    if _entry is not None and _entry[0] is _taichi.pytaichi.prog:",
-                "        _, _write, _launch, _data, _context, _compiled, _ = _entry",
+                "        _, _launch, _data, (_context, _write), _compiled, _ = _entry",
                 "        if _write is not None:",
                 "            try:",
                 f"                _write({numbers})",
@@ -95,47 +89,41 @@ class Kernels:
                 "        _launch(_data, _context)",
                 "        return _compiled.result(_context)" if "return" in self._function.__annotations__ else "        return",
             ]
-        lines.append(f"    return _prepare({names})")
-        scope = {"_find": self._prepared.get, "_taichi": impl, "_Wrong": struct.error, "_prepare": prepare}
+        lines.append(f"    return _prepare({given})")
+        scope = {"_find": self._ready.get, "_taichi": impl, "_Wrong": struct.error, "_prepare": prepare}
         exec("\n".join(lines), scope)
         return functools.wraps(self._function)(scope[self._function.__name__])
 
-    def find(self, arguments: tuple) -> tuple | None:
-        """The prepared (compiled, context, references) for these arguments, or None if they are new."""
-        found = self._ready.get(self._key(arguments))
-        if found is not None:
-            self._prepare(arguments, *found)
-        return found
-
-    def _prepare(self, arguments: tuple, compiled: Compiled, bound: Any, references: list) -> None:
-        """Let `launcher` know these arguments, if each is known by its identity and NumPy arrays are not among them."""
-        given = [arguments[k] for k in self._templates]
-        if isinstance(compiled, Packed) and not self.watched and not self._arrays and all(map(_is_known_by_id, given)):
-            key, (context, write) = tuple(map(id, given)), bound
-            held = self._references(self._prepared, key, arguments)
-            self._prepared[key] = compiled.program, write, compiled.program.launch_kernel, compiled.data, context, compiled, held
-
     def _key(self, arguments: tuple) -> tuple:
-        """Key of the arguments: the identity of each record or array, the value of each constant."""
-        key = [
-            (a, kind) if _is_constant(kind := type(a := arguments[k])) else id(a)  # 1, 1.0 and True are equal
-            for k in self._templates
-        ]
+        """Identities of the templates, and types of the host's arrays."""
+        key = [id(arguments[k]) for k in self._templates]
         for k in self._arrays:
             key += arguments[k].dtype, arguments[k].ndim
         return tuple(key)
 
+    def find(self, arguments: tuple) -> tuple | None:
+        """What `prepare` returned for these arguments, or None if they are new."""
+        return self._ready.get(self._key(arguments))
+
     def prepare(self, arguments: tuple) -> tuple:
-        """As `find`, but compile the kernel if it is new for the structure of these arguments."""
+        """Compile the kernel if it is new for the structure of these arguments, and bind them.
+
+        Returns (program, its launch, compiled code, bound, `Compiled`, references); program None: not for `launcher`.
+        """
         names = self._names_for(arguments)
         structures = [structure_of(a, names) if k in self._templates else None for k, a in enumerate(arguments)]
         kind = tuple(structures), tuple([(arguments[k].dtype, arguments[k].ndim) for k in self._arrays])
         if kind not in self._compiled:
             examples = [a if k in self._arrays else None for k, a in enumerate(arguments)]
-            self._compiled[kind] = way()(self._function, self._names, self._annotations, structures, examples)
+            make = Public if PUBLIC else Compiled
+            self._compiled[kind] = make(self._function, self._kinds, structures, examples, packs())
         compiled, key = self._compiled[kind], self._key(arguments)
-        self._ready[key] = compiled, compiled.bind(arguments), self._references(self._ready, key, arguments)
-        return self._ready[key]
+        direct = compiled.packed and not (PUBLIC or self.watched)
+        program, launch, data = (compiled.program, compiled.program.launch_kernel, compiled.data) if direct else (None,) * 3
+        entry = program, launch, data, compiled.bind(arguments), compiled, self._references(key, arguments)
+        if all(_is_known_by_id(arguments[k]) for k in self._templates):
+            self._ready[key] = entry
+        return entry
 
     def _names_for(self, arguments: tuple) -> set[str]:
         seen: set = set()
@@ -148,11 +136,12 @@ class Kernels:
                 names |= names_of_types(holders(arguments[k]), names, seen)
         return names
 
-    def _references(self, ready: dict, key: tuple, arguments: tuple) -> list:
-        """Weak references that remove the entry `key` of `ready` as soon as one of its records or arrays is collected.
+    def _references(self, key: tuple, arguments: tuple) -> list:
+        """Weak references that remove the entry `key` as soon as one of its records or arrays is collected.
 
-        Modules, functions and all else that is keyed by its id are held, so that no other object takes that id.
+        Modules, functions and all else are held, so that no other object takes that id.
         """
+        ready = self._ready
         return [
             weakref.ref(arguments[k], lambda _, key=key: ready.pop(key, None))
             if isinstance(arguments[k], Array) or dataclasses.is_dataclass(arguments[k])
@@ -161,13 +150,6 @@ class Kernels:
         ]
 
 
-@functools.cache
-def _is_constant(kind: type) -> bool:
-    """Whether arguments of a type are keyed by value. Cached, because a launch asks for every argument."""
-    return issubclass(kind, (bool, int, float, str, tuple))
-
-
 def _is_known_by_id(argument: Any) -> bool:
-    """Whether equal values of its type are one object: all but large integers, other numbers, texts and tuples."""
-    is_small = type(argument) is int and SMALL[0] <= argument <= SMALL[1]
-    return is_small or isinstance(argument, bool) or not _is_constant(type(argument))
+    """Whether an argument is not made anew for each launch, as numbers and tuples may be; Python keeps one of small integers."""
+    return not isinstance(argument, (int, float, tuple)) or (type(argument) in (bool, int) and -5 <= argument <= 256)

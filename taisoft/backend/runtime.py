@@ -197,10 +197,10 @@ def kernel(function: Callable | None = None, *, cse: bool = True) -> Callable:
         check_program(_program)
         ready = kernels.find(arguments)
         if ready is not None:
-            return ready[0].launch(ready[1], arguments)
+            return ready[4].launch(ready[3], arguments)
         start, compiler, before = time.perf_counter(), _compiler_clock(), kernels.n_compiled
         with _common_subexpressions(cse):
-            compiled, bound, _ = kernels.prepare(arguments)
+            *_, bound, compiled, _ = kernels.prepare(arguments)
             result = compiled.launch(bound, arguments)  # loads the code at the first launch
         if kernels.n_compiled > before:
             ti.sync()

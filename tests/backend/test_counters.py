@@ -12,7 +12,7 @@ import taichi as ti
 import taisoft as ts
 from taisoft.backend import arrays, launching, runtime
 from taisoft.backend.arrays import Array, FieldArena
-from taisoft.backend.compiled import Compiled, Flat, Packed, Public
+from taisoft.backend.compiled import Compiled
 from taisoft.backend.counters import ACCESSES, counting, device_only
 from taisoft.backend.runtime import kernel
 from tests.backend.lanes import opened
@@ -33,10 +33,11 @@ def double(x: ti.template()):
         x[i] *= 2.0
 
 
-@pytest.fixture(params=[Packed, Flat, Public])
+@pytest.fixture(params=["pack", "flat", "public"])
 def arena(request, monkeypatch):
     """An arena with each way to launch."""
-    monkeypatch.setattr(launching, "way", lambda: request.param)
+    monkeypatch.setattr(launching, "PUBLIC", request.param == "public")
+    monkeypatch.setattr(launching, "PACK", str(int(request.param == "pack")))
     runtime.forget()  # kernels compiled for another way
     with opened("f64"):
         arena = FieldArena()

@@ -19,17 +19,17 @@ import taichi as ti
 
 from taisoft.backend import launching, runtime
 from taisoft.backend.arrays import Count, FieldArena, index_mask
-from taisoft.backend.compiled import Flat, Packed, Public
-from taisoft.backend.pack import Pack
+from taisoft.backend.pack import Arguments
 from taisoft.backend.runtime import kernel
 from taisoft.fem.laws import corotational, stable_neo_hookean
 from tests.backend.lanes import opened
 
 
-@pytest.fixture(params=[Packed, Flat, Public])
+@pytest.fixture(params=["pack", "flat", "public"])
 def running(request, monkeypatch):
     """A runtime with each way to launch."""
-    monkeypatch.setattr(launching, "way", lambda: request.param)
+    monkeypatch.setattr(launching, "PUBLIC", request.param == "public")
+    monkeypatch.setattr(launching, "PACK", str(int(request.param == "pack")))
     runtime.forget()  # kernels compiled for another way
     with opened("f64"):
         yield
@@ -197,7 +197,7 @@ def add_all(to: ti.template(), a: ti.f64, n: ti.i32) -> ti.i32:
 @pytest.mark.filterwarnings("ignore:You are unrolling")
 def test_a_pack_takes_any_number_of_arrays(memory, monkeypatch):
     if memory == "unknown":
-        monkeypatch.setattr(Pack, "_memory", lambda self, context: None)
+        monkeypatch.setattr(Arguments, "_memory", lambda self, context: None)
     with opened("f64"):
         arena = FieldArena()
         for size in (0, 1, 70):
