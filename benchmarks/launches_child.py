@@ -1,7 +1,7 @@
 """A child process of `taisoft bench launches`; also older versions can run it.
 
-python launches_child.py ARCH [quick] prints one line of JSON: microseconds of launches by the number of arrays, and of steps by scene, each
-the median of several stretches, and a digest of the positions at the end.
+python launches_child.py ARCH [quick] prints one line of JSON: microseconds of launches by the number of arrays, and of steps by
+scene, each the median of several stretches, and a digest of the positions at the end.
 """
 
 import hashlib
