@@ -19,7 +19,7 @@ import taichi as ti
 
 from taisoft import compile_message
 from taisoft.backend import tracing  # noqa: F401  tracing: before any function is decorated
-from taisoft.backend.arrays import LanePool, on_cuda
+from taisoft.backend.arrays import on_cuda
 from taisoft.backend.launching import Kernels
 from taisoft.backend.private import impl
 from taisoft.errors import SimulationError
@@ -154,7 +154,6 @@ def _initialise(arch: str, precision: str) -> None:
     _program = impl.get_runtime().prog
     for kernels in Kernels.every:  # they refer to the previous program
         kernels.forget()
-    LanePool.current = LanePool(PRECISIONS[precision]) if arch == "cpu" else None
     _totals["compile"] += time.perf_counter() - clock
     actual = "cuda" if on_cuda() else "cpu"
     if actual != arch:
