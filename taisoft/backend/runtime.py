@@ -35,6 +35,7 @@ KERNEL_CACHE_BYTES = 2**30  # of kernels on disk, above which Taichi removes the
 _open: list["Runtime"] = []  # current claims on the runtime
 _kind: tuple[str, str] | None = None  # (arch, precision) that Taichi was initialised with
 _program = None  # Taichi's program object of that initialisation
+_functions: list = []  # made by `compiled_function`
 _totals = {"compile": 0.0, "kernels": 0}
 
 
@@ -154,6 +155,8 @@ def _initialise(arch: str, precision: str) -> None:
     _program = impl.get_runtime().prog
     for kernels in Kernels.every:  # they refer to the previous program
         kernels.forget()
+    for function in _functions:
+        function.compiled, function.taichi_functions = None, {}
     _totals["compile"] += time.perf_counter() - clock
     actual = "cuda" if on_cuda() else "cpu"
     if actual != arch:
@@ -210,6 +213,18 @@ def kernel(function: Callable | None = None, *, cse: bool = True) -> Callable:
         return result
 
     return kernels.launcher(launch)
+
+
+def compiled_function(number: int) -> Callable:
+    """`ti.real_func`, for functions that the compiler itself knows as one. number: its own, part of the disk cache's keys."""
+
+    def decorate(function: Callable) -> Callable:
+        made = ti.real_func(function)
+        made.func.func_id = number
+        _functions.append(made.func)
+        return made
+
+    return decorate
 
 
 def _compiler_clock() -> float:

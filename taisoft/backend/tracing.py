@@ -65,7 +65,7 @@ def _tree_and_context(
 ):
     """Replacement of Taichi's function of this name: a syntax tree, which tracing modifies, and its context."""
     file, lines, first, text = source_of(self.func)
-    spare = [] if is_kernel else _spare[self.func]  # a kernel is traced only once
+    spare = [] if is_kernel or is_real_function else _spare[self.func]  # those are traced once, which removes their arguments
     tree = spare.pop() if spare else ast.parse(text)
     tree.body[0].decorator_list = []
     names = kernel_impl._get_global_vars(self.func)
@@ -94,7 +94,7 @@ def _traced(tree: ast.Module, context: ASTTransformerContext) -> Any:
     try:
         return transform_tree(tree, context)
     finally:
-        if not context.is_kernel:
+        if not (context.is_kernel or context.is_real_function):
             for node in context.built:
                 node.__dict__.pop("ptr", None)
                 node.__dict__.pop("caller", None)

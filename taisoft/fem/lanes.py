@@ -10,6 +10,7 @@ from typing import Any
 
 import taichi as ti
 
+from taisoft.backend.runtime import compiled_function
 from taisoft.fem.laws import n_constants
 from taisoft.fem.math3 import ddot, dot, matmul_tn
 
@@ -21,17 +22,15 @@ def _storing(real: Any, number: int) -> Callable:
     """Return a function that the compiler knows as one, which stores a vector of lanes in a row.
 
     LLVM merges such stores, and vectorises what is stored, only if it can prove that their addresses are adjacent. The address of
-    an array is reloaded before each store, which prevents the proof; that of a function's argument is not. number: of the
-    function in the key of the disk cache.
+    an array is reloaded before each store, which prevents the proof; that of a function's argument is not.
     """
 
-    @ti.real_func
+    @compiled_function(number)
     def store(out: ti.types.ndarray(dtype=real, ndim=1), at: ti.i32, values: ti.types.vector(LANES, real)):
         first = at & FIRST
         for q in ti.static(range(LANES)):
             out[first + q] = values[q]
 
-    store.func.func_id = number
     return store
 
 

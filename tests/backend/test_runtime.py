@@ -3,6 +3,7 @@
 * it has one arch and precision at a time; others are refused while it is open, with the name of its user;
 * after the last close any kind can be opened, and the same kind is not initialised again;
 * without CUDA, arch 'cuda' is refused, and the CPU still works;
+* functions that the compiler knows as such are compiled anew, too;
 * the lock of a killed process does not keep kernels from being stored, and that of a running one stays;
 * a first launch counts as compile time; errors of a kernel name file, line and function;
 * contact problems have the same solution with any runtime open, which stays open.
@@ -20,7 +21,7 @@ from taichi._lib import core
 import taisoft as ts
 from taisoft.backend import runtime
 from taisoft.backend.arrays import FieldArena
-from taisoft.backend.runtime import kernel, open_runtime
+from taisoft.backend.runtime import compiled_function, kernel, open_runtime
 from taisoft.errors import SimulationError
 from tests.backend.lanes import opened
 from tests.contact import contact_oracle as oracle
@@ -54,6 +55,30 @@ def test_the_same_kind_is_not_initialised_again(monkeypatch):
         monkeypatch.setattr(ti, "init", lambda **options: pytest.fail("initialised again"))
     with opened("f64"), opened("f64"):
         pass
+
+
+@compiled_function(7)
+def put(out: ti.types.ndarray(dtype=ti.f32, ndim=1), value: ti.f32):
+    out[0] = value
+
+
+@kernel
+def put_twice(x: ti.template(), y: ti.template()):
+    ti.loop_config(serialize=True)
+    for _ in range(1):
+        put(x, 1.0)
+        put(y, 2.0)
+
+
+def test_compiled_functions_are_compiled_for_each_taichi():
+    for precision in ("f32", "f64", "f32", "f64"):
+        with opened(precision):
+            arena = FieldArena()
+            x, y = arena.field("x", ti.f32, 2), arena.field("y", ti.f32, 3)
+            put_twice(x, y)
+            assert (x[0], y[0]) == (1.0, 2.0)
+            arena.release()
+        runtime.forget()
 
 
 def test_only_an_old_lock_is_removed(tmp_path):
