@@ -54,10 +54,16 @@ class Compiled:
         self._cpp, program = self._kernel.compiled_kernels[key], impl.get_runtime().prog
         self.program, self.data = program, program.compile_kernel(program.config(), program.get_device_caps(), self._cpp)
 
-    def bind(self, arguments: tuple) -> tuple[Any, Callable | None]:
-        """What launches with these records need: a context that holds them, and the function that writes the numbers."""
-        context = self._cpp.make_launch_context()
+    def bind(self, arguments: tuple) -> tuple[Any, Any]:
+        """What launches with these records need: a context with their addresses, and the function that writes the numbers.
+
+        None and the records' arrays and counts, if each launch needs a context of its own.
+        """
         leaves = [leaf for value, s in zip(arguments, self.structures) if s is not None for leaf in leaves_of(value, s)]
+        return self._context_with(leaves) if self._arguments.kept else (None, leaves)
+
+    def _context_with(self, leaves: list[Array | int]) -> tuple[Any, Callable | None]:
+        context = self._cpp.make_launch_context()
         return context, self._arguments.bind(context, leaves)
 
     def launch(self, bound: Any, arguments: tuple) -> Any:
@@ -65,7 +71,7 @@ class Compiled:
         return self._launch(bound, arguments)
 
     def _launch(self, bound: Any, arguments: tuple) -> Any:
-        context, write = bound if self._arguments.kept else self.bind(arguments)
+        context, write = bound if self._arguments.kept else self._context_with(bound[1])
         numbers = [arguments[k] for k in self._numbers]
         for slot, k in enumerate(self._hosts):
             if not (array := arguments[k]).flags.c_contiguous:

@@ -15,23 +15,40 @@ import functools
 import inspect
 import os
 import struct
+import sys
 import weakref
 from collections.abc import Callable
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
+
+import numpy as np
 
 from taisoft.backend.arrays import Array, on_cuda
 from taisoft.backend.compiled import Compiled, Public
 from taisoft.backend.private import impl, ndarray_type, template
 from taisoft.backend.structure import holders, names_in, names_of_types, structure_of
 from taisoft.backend.tracing import FAST_TRACING
+from taisoft.errors import SimulationError
 
 PUBLIC = not FAST_TRACING  # launch only through Taichi's public interface
-PACK = os.environ.get("TAISOFT_PACK")  # "0" or "1": whether arguments are packed; by default, they are on the CPU
+PACK = os.environ.get("TAISOFT_PACK", "")  # "0" or "1": whether arguments are packed; by default, they are on the CPU
 
 
 def packs() -> bool:
-    """Whether arguments are packed."""
+    """Whether arguments are packed. Raises SimulationError for another value of TAISOFT_PACK."""
+    if PACK not in ("", "0", "1"):
+        raise SimulationError(f"the environment variable TAISOFT_PACK must be 0 or 1, not '{PACK}'")
     return PACK == "1" if PACK else not on_cuda()
+
+
+class Ready(NamedTuple):
+    """A kernel with what its launches with certain records need. program: None if `Kernels.launcher` must not launch it."""
+
+    program: Any
+    launch: Callable | None  # of the program
+    data: Any  # compiled code
+    bound: tuple  # context, function that writes the numbers
+    compiled: Compiled
+    references: list
 
 
 class Kernels:
@@ -47,7 +64,7 @@ class Kernels:
         self._templates = [k for k, kind in enumerate(self._kinds.values()) if isinstance(kind, template)]
         self._arrays = [k for k, kind in enumerate(self._kinds.values()) if isinstance(kind, ndarray_type.NdarrayType)]
         self._used: set[str] | None = None
-        self._ready: dict[tuple, tuple] = {}  # key of the arguments -> what `prepare` returned
+        self._ready: dict[tuple, Ready] = {}  # by key of the arguments
         self.forget()
         self.every.append(self)
 
@@ -101,15 +118,12 @@ class Kernels:
             key += arguments[k].dtype, arguments[k].ndim
         return tuple(key)
 
-    def find(self, arguments: tuple) -> tuple | None:
+    def find(self, arguments: tuple) -> Ready | None:
         """What `prepare` returned for these arguments, or None if they are new."""
         return self._ready.get(self._key(arguments))
 
-    def prepare(self, arguments: tuple) -> tuple:
-        """Compile the kernel if it is new for the structure of these arguments, and bind them.
-
-        Returns (program, its launch, compiled code, bound, `Compiled`, references); program None: not for `launcher`.
-        """
+    def prepare(self, arguments: tuple) -> Ready:
+        """Compile the kernel if it is new for the structure of these arguments, and bind them."""
         names = self._names_for(arguments)
         structures = [structure_of(a, names) if k in self._templates else None for k, a in enumerate(arguments)]
         kind = tuple(structures), tuple([(arguments[k].dtype, arguments[k].ndim) for k in self._arrays])
@@ -120,7 +134,7 @@ class Kernels:
         compiled, key = self._compiled[kind], self._key(arguments)
         direct = compiled.packed and not (PUBLIC or self.watched)
         program, launch, data = (compiled.program, compiled.program.launch_kernel, compiled.data) if direct else (None,) * 3
-        entry = program, launch, data, compiled.bind(arguments), compiled, self._references(key, arguments)
+        entry = Ready(program, launch, data, compiled.bind(arguments), compiled, self._references(key, arguments))
         if all(_is_known_by_id(arguments[k]) for k in self._templates):
             self._ready[key] = entry
         return entry
@@ -151,5 +165,8 @@ class Kernels:
 
 
 def _is_known_by_id(argument: Any) -> bool:
-    """Whether an argument is not made anew for each launch, as numbers and tuples may be; Python keeps one of small integers."""
-    return not isinstance(argument, (int, float, tuple)) or (type(argument) in (bool, int) and -5 <= argument <= 256)
+    """Whether an argument is not made anew for each launch, as numbers, texts and tuples may be; Python keeps some of these."""
+    if isinstance(argument, str):
+        return sys.intern(argument) is argument
+    is_small = type(argument) in (bool, int) and -5 <= argument <= 256
+    return is_small or not isinstance(argument, (int, float, tuple, np.generic))

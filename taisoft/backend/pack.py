@@ -2,7 +2,7 @@
 
 At each launch Taichi copies the list of a kernel's parameters and looks up every array among them; the pack is one parameter, and
 no array, whatever it holds. Inside the kernel its members are arrays and numbers as any others. A context of a launch is kept for
-each set of arrays, and holds them; the numbers, which come first in the pack, are written into it before a launch.
+each set of arrays, with their addresses; the numbers, which come first in the pack, are written into it before a launch.
 
 Taichi has no public way to reach the memory of a context's arguments, and one call for each number would cost half a launch.
 `_memory` therefore follows three C++ objects of Taichi 1.7.4, compares what they say about each other, and takes the memory only

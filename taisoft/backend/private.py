@@ -1,4 +1,7 @@
-"""All that taisoft uses of Taichi 1.7.4 beyond its public interface; a later version must be checked against this list."""
+"""All that taisoft uses of Taichi 1.7.4 beyond its public interface; a later version must be checked against this list.
+
+Also `func_id`, `compiled` and `taichi_functions` of `Func` (`runtime`, `tracing`), and the memory of contexts (`pack`).
+"""
 
 from taichi._lib import core as core
 from taichi.lang import expr as expr

@@ -28,6 +28,7 @@ from taisoft.machine import address_space, format_bytes, usable_cores
 
 PRECISIONS = {"f32": ti.f32, "f64": ti.f64}
 ARCHS = {"cpu": ti.cpu, "cuda": ti.cuda}
+CPU_LANES = 4  # elements that one thread processes together
 CPU_POOL_BYTES = 2**30  # address space that Taichi reserves at a time on the CPU
 LOCK_SECONDS = 60.0  # after which the lock of the kernel cache, which is held for less than a second, is that of a killed process
 KERNEL_CACHE_BYTES = 2**30  # of kernels on disk, above which Taichi removes the oldest; its default holds only about 450
@@ -51,7 +52,7 @@ class Runtime:
         self.real = PRECISIONS[precision]
         self.np_real = np.float32 if precision == "f32" else np.float64
         self.eps = float(np.finfo(self.np_real).eps)
-        self.lanes = 4 if arch == "cpu" else 1
+        self.lanes = CPU_LANES if arch == "cpu" else 1
         self._program = _program
 
     def check(self) -> None:
@@ -116,10 +117,14 @@ def cache_folder() -> str:
 
 def remove_stale_lock(folder: Path) -> None:
     """Remove the lock of a kernel cache if the process that held it was killed: Taichi would keep no kernels any more."""
-    lock = folder / "ticache.lock"
+    lock, taken = folder / "ticache.lock", folder / f"ticache.{os.getpid()}.stale"
     with contextlib.suppress(OSError):  # there is none, or another process removes it
         if time.time() - lock.stat().st_mtime > LOCK_SECONDS:
-            lock.unlink()
+            lock.rename(taken)
+            if time.time() - taken.stat().st_mtime > LOCK_SECONDS:
+                taken.unlink()
+            else:  # another process has taken a new one meanwhile
+                taken.rename(lock)
 
 
 def _initialise(arch: str, precision: str) -> None:
@@ -199,11 +204,11 @@ def kernel(function: Callable | None = None, *, cse: bool = True) -> Callable:
         check_program(_program)
         ready = kernels.find(arguments)
         if ready is not None:
-            return ready[4].launch(ready[3], arguments)
+            return ready.compiled.launch(ready.bound, arguments)
         start, compiler, before = time.perf_counter(), _compiler_clock(), kernels.n_compiled
         with _common_subexpressions(cse):
-            *_, bound, compiled, _ = kernels.prepare(arguments)
-            result = compiled.launch(bound, arguments)  # loads the code at the first launch
+            ready = kernels.prepare(arguments)
+            result = ready.compiled.launch(ready.bound, arguments)  # loads the code at the first launch
         if kernels.n_compiled > before:
             ti.sync()
             seconds = time.perf_counter() - start
@@ -216,11 +221,11 @@ def kernel(function: Callable | None = None, *, cse: bool = True) -> Callable:
 
 
 def compiled_function(number: int) -> Callable:
-    """`ti.real_func`, for functions that the compiler itself knows as one. number: its own, part of the disk cache's keys."""
+    """`ti.real_func`: a function that is compiled once and called. number: its own, part of the disk cache's keys."""
 
     def decorate(function: Callable) -> Callable:
         made = ti.real_func(function)
-        made.func.func_id = number
+        made.func.func_id = number  # these and `compiled`, `taichi_functions` are private to Taichi, see `private`
         _functions.append(made.func)
         return made
 

@@ -93,6 +93,11 @@ def _traced(tree: ast.Module, context: ASTTransformerContext) -> Any:
     """Trace a tree, then free it of what Taichi has put there, so that the next call of its function can have it."""
     try:
         return transform_tree(tree, context)
+    except BaseException:
+        if context.is_real_function:  # which Taichi has listed as compiled: the next launch compiles it, under another number
+            context.func.compiled, context.func.taichi_functions = None, {}
+            context.func.func_id += 1_000_000
+        raise
     finally:
         if not (context.is_kernel or context.is_real_function):
             for node in context.built:

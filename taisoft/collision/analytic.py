@@ -27,7 +27,6 @@ from taisoft.fem.chunks import part_first
 from taisoft.scene.obstacles import Obstacle
 
 HALF_SPACE, SPHERE, BOX, CAPSULE = 0, 1, 2, 3
-ROUNDING = 1e-12  # of a distance, relative to its parts
 
 
 @ti.func
@@ -155,7 +154,7 @@ def _local(s: ti.template(), o: ti.template(), t, j, k, R, R1):
 
 
 @ti.func
-def _may_touch(s: ti.template(), o: ti.template(), t, k, margin):
+def may_touch(s: ti.template(), o: ti.template(), t, k, margin):
     """Whether the sphere around the box that holds triangle t in the step lets it have contacts with obstacle k.
 
     In the obstacle's frame its points lie in spheres of this radius at the start and at the end, so none moves by more than the
@@ -166,7 +165,7 @@ def _may_touch(s: ti.template(), o: ti.template(), t, k, margin):
     then = rotation_rows(o.next_rotation, k).transpose() @ (centre - o.next_origin[k])
     phi, _ = o.sample(k, now)
     spread = ti.select(o.kind[k] == HALF_SPACE, ti.cast(1.0, ti.f64), ti.cast(3.0, ti.f64))
-    return phi - spread * radius - (then - now).norm() <= margin + ti.cast(ROUNDING, ti.f64) * (ti.abs(phi) + radius)
+    return phi - spread * radius - (then - now).norm() <= margin
 
 
 @ti.func
@@ -234,7 +233,7 @@ def find_analytic(s: ti.template(), o: ti.template(), margin: ti.f64, out: ti.te
                         if ti.static(s.has_attached):
                             if s.attached[s.body[t] * s.n_bodies + o.body[k]] == 1:
                                 continue
-                        if _may_touch(s, o, t, k, margin):
+                        if may_touch(s, o, t, k, margin):
                             at = _obstacle_contacts(s, o, t, k, margin, out.data, at, end)
             out.used[c] = at - c * out.part
     ti.loop_config(serialize=True)

@@ -412,5 +412,5 @@ class ContactStep:
     def release(self) -> None:
         """Free all memory."""
         self.detection.release()
-        for owner in (self._arena, self._numbers_arena, self._lasting):
+        for owner in (self._arena, self._numbers_arena, self._lasting, self.misplaced):
             owner.release()

@@ -192,7 +192,7 @@ def solve_bouncing(system: "StageSystem", stage: "Stage") -> "StageResult":
     begin_impact(m, w, k, tau)
     impact = Newton(system, impact_stage).run(*system.evaluate(new_multipliers=TO_IMPULSES), fresh=True)
     measure_impact(m, w, k, tau)
-    slope, curvature = m.state.scalars[IMPACT_SLOPE], m.state.scalars[IMPACT_CURVATURE]
+    slope, curvature = m.state.scalars.to_numpy()[[IMPACT_SLOPE, IMPACT_CURVATURE]]
     gain = slope + 0.5 * curvature
     fraction = 1.0 if gain <= 0.0 else max(0.0, -2.0 * slope / curvature)
     slack = max(0.0, -fraction * (slope + 0.5 * fraction * curvature))  # 0 except for rounding if the jump is scaled down

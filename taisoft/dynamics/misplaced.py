@@ -207,7 +207,8 @@ class Misplacement:
 
     def __init__(self, simulation: SimulationState, detection: Detection):
         self._simulation, self._detection = simulation, detection
-        self._sums = FieldArena().field("misplaced", ti.f64, (0, COLUMNS))
+        self._arena = FieldArena()
+        self._sums = self._arena.field("misplaced", ti.f64, (0, COLUMNS))
         self.forget()
 
     def forget(self) -> None:
@@ -230,7 +231,12 @@ class Misplacement:
         if self._sums.shape[0] == len(sums):
             self._sums.from_numpy(sums)
         else:
-            self._sums = FieldArena().field("misplaced", ti.f64, sums.shape, sums)
+            self._arena.release()
+            self._sums = self._arena.field("misplaced", ti.f64, sums.shape, sums)
+
+    def release(self) -> None:
+        """Free their memory."""
+        self._arena.release()
 
     def start_step(self) -> None:
         """Begin a step."""

@@ -10,25 +10,24 @@ from typing import Any
 
 import taichi as ti
 
-from taisoft.backend.runtime import compiled_function
+from taisoft.backend.runtime import CPU_LANES, compiled_function
 from taisoft.fem.laws import n_constants
 from taisoft.fem.math3 import ddot, dot, matmul_tn
 
-LANES = 4  # on the CPU; on CUDA, where threads run in parallel instead, one
-FIRST = 2**31 - LANES  # mask of the index of a first lane: it shows the compiler that those of the others do not overflow
+FIRST_LANE_MASK = 2**31 - CPU_LANES  # of an index: it shows the compiler that those of the other lanes do not overflow
 
 
 def _storing(real: Any, number: int) -> Callable:
-    """Return a function that the compiler knows as one, which stores a vector of lanes in a row.
+    """Return a function that is compiled once and called, which stores a vector of lanes in a row.
 
     LLVM merges such stores, and vectorises what is stored, only if it can prove that their addresses are adjacent. The address of
     an array is reloaded before each store, which prevents the proof; that of a function's argument is not.
     """
 
     @compiled_function(number)
-    def store(out: ti.types.ndarray(dtype=real, ndim=1), at: ti.i32, values: ti.types.vector(LANES, real)):
-        first = at & FIRST
-        for q in ti.static(range(LANES)):
+    def store(out: ti.types.ndarray(dtype=real, ndim=1), at: ti.i32, values: ti.types.vector(CPU_LANES, real)):
+        first = at & FIRST_LANE_MASK
+        for q in ti.static(range(CPU_LANES)):
             out[first + q] = values[q]
 
     return store
@@ -162,7 +161,7 @@ def load_lanes(m: ti.template(), source: ti.template(), at):
 @ti.func
 def store_lanes(m: ti.template(), out: ti.template(), at, values):
     """Store a vector of lanes from entry `at * lanes` on."""
-    if ti.static(m.lanes == LANES):
+    if ti.static(m.lanes == CPU_LANES):
         STORE[m.real](out, at * m.lanes, ti.cast(values, m.real))
     else:
         out[at] = values[0]

@@ -19,7 +19,7 @@ import taichi as ti
 from taichi._lib import core
 
 import taisoft as ts
-from taisoft.backend import runtime
+from taisoft.backend import runtime, tracing
 from taisoft.backend.arrays import FieldArena
 from taisoft.backend.runtime import compiled_function, kernel, open_runtime
 from taisoft.errors import SimulationError
@@ -79,6 +79,28 @@ def test_compiled_functions_are_compiled_for_each_taichi():
             assert (x[0], y[0]) == (1.0, 2.0)
             arena.release()
         runtime.forget()
+
+
+def test_an_interrupted_compiled_function_is_compiled_by_the_next_launch(monkeypatch):
+    original, interrupted = tracing.transform_tree, []
+
+    def interrupt(tree, context):
+        if context.is_real_function and not interrupted:
+            interrupted.append(context)
+            raise KeyboardInterrupt
+        return original(tree, context)
+
+    runtime.forget()
+    with opened("f64"):
+        arena = FieldArena()
+        x, y = arena.field("x", ti.f32, 2), arena.field("y", ti.f32, 3)
+        monkeypatch.setattr(tracing, "transform_tree", interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            put_twice(x, y)
+        put_twice(x, y)
+        assert interrupted and (x[0], y[0]) == (1.0, 2.0)
+        arena.release()
+    runtime.forget()
 
 
 def test_only_an_old_lock_is_removed(tmp_path):

@@ -22,6 +22,7 @@ import taichi as ti
 
 from taisoft.backend.runtime import kernel
 from taisoft.backend.tracing import arithmetic, source_of
+from taisoft.collision import analytic
 from tests.backend.lanes import opened
 from tests.cli.command import ROOT
 
@@ -118,8 +119,7 @@ def test_the_text_of_a_function_is_found(tmp_path):
     path, scope = tmp_path / "odd.py", {"ti": SimpleNamespace(func=lambda function: function)}
     path.write_text(ODD)
     exec(compile(ODD, path, "exec"), scope)
-    every = [vars(module).values() for name, module in sys.modules.items() if name in ("taisoft.collision.analytic", __name__)]
-    found = [one for values in every for one in values if inspect.isfunction(one)]
+    found = [one for module in (analytic, sys.modules[__name__]) for one in vars(module).values() if inspect.isfunction(one)]
     for function in (scope["outer"], scope["outer"](), scope["last"], *map(inspect.unwrap, found)):
         lines, first = inspect.getsourcelines(function)
         file, ours, at, _ = source_of(function)
