@@ -32,7 +32,7 @@ from taisoft.dynamics.contact_terms import (
 )
 from taisoft.dynamics.direct import DirectSolver
 from taisoft.dynamics.linear_solver import LinearSolver
-from taisoft.dynamics.linearised import LONGEST, advance, begin_linearised, end_linearised
+from taisoft.dynamics.linearised import LONGEST, advance, begin_linearised, end_linearised, find_step_length
 from taisoft.dynamics.newton_budget import NewtonBudget
 from taisoft.dynamics.pieces import Pieces
 from taisoft.dynamics.rigid_balance import (
@@ -437,7 +437,9 @@ class StageSystem:
     def advance(self) -> tuple[float, float]:
         """Move a linearised stage along y to zero slope; return (|r|, scale) there."""
         stage = self.stage
-        advance(self.model, self.work, self.matrix, self._k, stage.beta, self.r_scale)
+        m, s, k = self.model, self.work, self._k
+        find_step_length(m, s, self.matrix, k, stage.beta, self.r_scale)
+        advance(m, s, k, stage.beta, self.r_scale)
         return self._norm_and_scale(stage.c, stage.beta)
 
     @property
