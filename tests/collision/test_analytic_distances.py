@@ -71,10 +71,10 @@ def select(s: ti.template(), o: ti.template(), k: ti.i32, margin: ti.f64, out: t
 
 def test_no_triangle_with_contacts_is_skipped(run):
     rng, n, margin = np.random.default_rng(3), 2000, 0.02
-    X = rng.uniform(-2.5, 2.5, (n, 1, 3)) + 0.03 * rng.standard_normal((n, 3, 3))
+    X = rng.uniform(-2.5, 2.5, (n, 1, 3)) + 0.1 * rng.standard_normal((n, 3, 3))
     move = 0.02 * rng.standard_normal((n, 3, 3))
     ends = np.concatenate([X, X + move], axis=1)
-    arena, w = FieldArena(), rng.dirichlet(np.ones(3), 20)
+    arena, w = FieldArena(), np.concatenate([np.eye(3), rng.dirichlet(np.ones(3), 9)])
     boxes = Boxes(*(arena.vectors(name, ti.f64, n, x) for name, x in (("lo", ends.min(axis=1)), ("hi", ends.max(axis=1)))))
     chosen = arena.field("chosen", ti.i32, n)
     path = ts.KeyFrames((0.0, 1.0), ((0.0, 0.0, 0.0), (0.03, -0.2, 0.01)), ((0.0, 0.0, 0.0), (0.04, 0.02, -0.1)))
