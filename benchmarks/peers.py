@@ -11,8 +11,7 @@ reaches the last body it falls freely to within 20 % ("free fall" is 1). taisoft
 10 ms. taisoft uses all cores if that is faster, the others one core. Times exclude building and compilation. A setting that takes
 more than 10 s, or more than 20 s to build, is measured in one round. MuJoCo is release 4.0.1 (package mujoco-core) or later:
 in 4.0.0 its solver "Newton" factorises sparse Hessians with elliptic cones wrongly, and older releases double the first Lamé
-parameter of a flex. Both releases gave equal bits for W1 12x3x3 by "discrete", the contact rows of W2, and those of W3 and W4
-with the solver "Newton"; nothing else was compared. MuJoCo's `passive` contact has no friction, all other contact has. A second
+parameter of a flex. MuJoCo's `passive` contact has no friction, all other contact has. A second
 table lists other settings that were tried (benchmarks/programs/tried.py). The exit status is 0 also if limits are not met. With
 --work the other works in FILE.json are kept. A full run takes about 35 minutes on two cores.
 """
