@@ -33,6 +33,7 @@ WRITES = {
     "hard": ("json",),
     "report": ("folder",),
     "startup": ("json",),
+    "launches": ("json",),
     "pictures": ("json",),
     "window": ("json",),
 }

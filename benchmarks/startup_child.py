@@ -32,6 +32,15 @@ def cube(cells: int) -> ts.Scene:
     return on_block("cube", (cells, cells, cells), (0.1, 0.1, 0.1))
 
 
+def plane(cells: int) -> ts.Scene:
+    """A cube that falls onto a half-space."""
+    scene = ts.Scene()
+    mesh = ts.box_mesh((cells, cells, cells), (0.1, 0.1, 0.1))
+    scene.add_body(mesh, ts.Material(**RUBBER), name="cube", position=(0.0, 0.0502, 0.0))
+    scene.add_obstacle(ts.HalfSpace((0, 0, 0), (0, 1, 0)), name="ground")
+    return scene
+
+
 def sheet(cells: int) -> ts.Scene:
     """A thick sheet that falls onto a block: cells x 1 x cells cells."""
     return on_block("sheet", (cells, 1, cells), (0.3, 0.02, 0.3))
@@ -54,6 +63,7 @@ def triangles(cells: int) -> str:
 SCENES = {
     "beam": (beam, {"dt": 2e-4, "integrator": "symplectic_euler"}),
     "cube": (cube, {"dt": 2e-3, "integrator": "implicit_euler"}),
+    "plane": (plane, {"dt": 2e-3, "integrator": "implicit_euler"}),
     "sheet": (sheet, {"dt": 2e-3, "integrator": "implicit_euler"}),
 }
 
@@ -191,13 +201,13 @@ def settings(cells: int) -> dict:
 
 
 def calls(*cells: int) -> dict:
-    """Means of what the tenth to twentieth step of a beam and a cube launch and access; empty if the version does not count."""
+    """Means of what the tenth to twentieth step of each scene launches and accesses; empty if the version does not count."""
     try:
         from taisoft.backend.counters import counting
     except ImportError:
         return {}
     found = {}
-    for name, n in zip(("beam", "cube"), cells):
+    for name, n in zip(("beam", "cube", "plane"), cells):
         build, arguments = SCENES[name]
         with ts.Simulator(build(n), **arguments) as sim:
             walk(sim, 10)

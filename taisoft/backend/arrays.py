@@ -2,20 +2,11 @@
 
 Kernels take arrays as arguments, so compiled code does not depend on their size or owner. On the CPU the memory of an array is
 a NumPy array, which the host accesses directly; on CUDA it is Taichi's.
-
-Buffers that kernels write in SIMD lanes (element forces and stiffness blocks, which nodes then gather) are ranges of one Taichi
-field instead. LLVM merges four adjacent stores into one only if it can prove that their addresses are adjacent, and vectorises
-the rest of a kernel from such stores. The address of an array argument is reloaded before every store, which prevents the proof;
-that of a field is loaded once. The field is the first one created after Taichi starts and always has the same size, since
-compiled code and its key in the disk cache depend on the field's number and size. A buffer too large for it gets a separate
-field, for which kernels are compiled. That field is kept for later buffers, which can then use the same kernels, until a larger
-one replaces it.
 """
 
 import math
 import weakref
-from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar
+from typing import Annotated
 
 import numpy as np
 import taichi as ti
@@ -27,8 +18,6 @@ from taisoft.machine import available_memory, format_bytes
 
 DTYPES = {ti.f32: np.float32, ti.f64: np.float64, ti.i32: np.int32, ti.u8: np.uint8}
 SMALL = 2**20  # bytes up to which available memory is not checked
-ENTRIES = 2**24  # of the shared field: enough for forces and stiffness of 250,000 linear tets
-OWN_MASK = 2**30 - 1  # index mask of a separate field, and its largest number of entries
 
 # Annotation of a number that kernels read from a record of arrays at run time. Other numbers, flags and modules of such a record
 # are compile-time structure: a kernel is compiled for each set of them.
@@ -77,6 +66,18 @@ class Array:
         """The properties that compiled code depends on."""
         return self.dtype, self.n, self.shape[1:]
 
+    @property
+    def entries(self) -> int:
+        """Number of entries of the flat array that kernels see."""
+        return math.prod(self.full_shape) // max(self.n, 1)
+
+    @property
+    def address(self) -> int:
+        """Of its memory, on the host or on the device."""
+        if self.memory is not None:
+            return self.memory.ctypes.data
+        return impl.get_runtime().prog.get_ndarray_data_ptr_as_int(self.device.arr)
+
     def to_numpy(self, rows: int | None = None) -> np.ndarray:
         """Return a copy of the array, or of its first `rows` rows."""
         if self.memory is not None:
@@ -92,13 +93,18 @@ class Array:
         if data.shape != self.full_shape:
             raise ValueError(f"an array of shape {self.full_shape} cannot take one of shape {data.shape}")
 
-    def from_numpy(self, data: np.ndarray) -> None:
-        """Copy data into the array. Raises ValueError, before writing anything, unless it has the array's shape."""
-        self.check(data)
+    def from_numpy(self, data: np.ndarray, first: int | None = None) -> None:
+        """Copy data into the array, or into its entries from `first` on. Raises ValueError for a wrong shape, before writing."""
+        if first is None:
+            self.check(data)
+        elif data.shape[1:] != self.full_shape[1:] or not 0 <= first <= self.shape[0] - len(data):
+            raise ValueError(f"the entries from {first} on of an array of shape {self.full_shape} cannot take {data.shape}")
+        at = first or 0
         if self.memory is not None:
-            np.copyto(self.memory, data, casting="unsafe")
+            np.copyto(self.memory[at : at + len(data)], data, casting="unsafe")
         elif data.size:
-            device_memory.write(self.device, np.ascontiguousarray(data, dtype=DTYPES[self.dtype]))
+            data = np.ascontiguousarray(data, dtype=DTYPES[self.dtype])
+            device_memory.write(self.device, data, at * data[:1].nbytes)
 
     def fill(self, value: float) -> None:
         """Set every number to value."""
@@ -115,6 +121,8 @@ class Array:
 
     def __getitem__(self, at):
         """Return a copy of one entry, on the host."""
+        if self.memory is not None and type(at) is int and not (self.n or len(self.shape) > 1):
+            return self.memory.item(at)
         entry = (self.memory if self.memory is not None else self._download())[at]
         return entry.copy() if entry.ndim else entry.item()
 
@@ -157,83 +165,11 @@ class View:
         return impl.subscript(None, self._flat, at)
 
 
-@dataclass(frozen=True, eq=False)
-class Lanes:
-    """A buffer: entries [at, at + count) of `memory`, a Taichi field or an `Array`. mask: index mask."""
-
-    memory: Any
-    at: int
-    count: int
-    mask: int
-
-
-class LanePool:
-    """The shared field with its allocated ranges, and the separate fields of large buffers."""
-
-    current: ClassVar["LanePool | None"] = None  # of the running Taichi; None on CUDA, which uses threads instead of SIMD lanes
-
-    def __init__(self, dtype):
-        self.memory = ti.field(dtype)
-        place(self.memory, ENTRIES)
-        self._dtype = dtype
-        self._taken: dict[int, int] = {}  # first entry -> one past the last
-        self._large: dict[Any, tuple[int, Any]] = {}  # field -> number of entries, SNode tree
-        self._busy: set = set()  # the large fields in use
-
-    def take(self, count: int) -> Lanes:
-        """Allocate the lowest free range, or a separate field. It is freed when the returned object is collected.
-
-        Raises RuntimeError if memory does not suffice.
-        """
-        at = 0
-        for first in sorted(self._taken):
-            if first - at >= count:
-                break
-            at = self._taken[first]
-        if at + count > ENTRIES:
-            return self._take_large(count)
-        size = -(-count // 64) * 64  # align ranges to cache lines
-        self._taken[at] = at + size
-        lanes = Lanes(self.memory, at, count, ENTRIES - 1)
-        weakref.finalize(lanes, self._taken.pop, at, None)
-        return lanes
-
-    def _take_large(self, count: int) -> Lanes:
-        idle = [(entries, field) for field, (entries, _) in self._large.items() if field not in self._busy]
-        fitting = [entry for entry in idle if entry[0] >= count]
-        if fitting:
-            _, field = min(fitting, key=lambda entry: entry[0])
-        else:  # the new field also replaces the idle ones
-            for tree in [self._large.pop(field)[1] for _, field in idle]:
-                if tree.prog is impl.get_runtime().prog:  # trees of an earlier initialisation of Taichi are already freed
-                    tree.destroy()
-            field, entries = ti.field(self._dtype), size_class(count)
-            self._large[field] = entries, place(field, entries)
-        self._busy.add(field)
-        lanes = Lanes(field, 0, count, OWN_MASK)
-        weakref.finalize(lanes, self._busy.discard, field)
-        return lanes
-
-
-def size_class(count: int) -> int:
-    """Round count up to 4, 5, 6 or 7 times a power of two, at most a quarter more, so that few sizes occur."""
-    unit = 1 << max(count.bit_length() - 3, 0)
-    return -(-count // unit) * unit
-
-
-def place(field: Any, count: int) -> Any:
-    """Allocate a field with `count` entries. Returns its SNode tree: Taichi frees only whole trees."""
-    builder = ti.FieldsBuilder()
-    builder.dense(ti.i, count).place(field)
-    return builder.finalize()
-
-
 class FieldArena:
     """Allocator of one simulator's arrays. bytes: size of each array, by name."""
 
     def __init__(self) -> None:
         self.bytes: dict[str, int] = {}
-        self._lanes: list[Lanes] = []
         self._arrays: weakref.WeakSet[Array] = weakref.WeakSet()
 
     def field(self, name: str, dtype, shape: tuple[int, ...] | int, data: np.ndarray | None = None) -> Array:
@@ -243,19 +179,6 @@ class FieldArena:
     def vectors(self, name: str, dtype, shape: int, data: np.ndarray | None = None, n: int = 3) -> Array:
         """Allocate n-vectors, filled from data (shape, n) if given, else with zeros."""
         return self._allocate(name, dtype, shape, n, data)
-
-    def lanes(self, name: str, dtype, count: int) -> Lanes:
-        """Allocate a buffer that kernels write in SIMD lanes; its initial contents are undefined."""
-        if LanePool.current is None:
-            return Lanes(self.field(name, dtype, count), 0, count, OWN_MASK)
-        needed = self._checked_bytes(name, dtype, count, OWN_MASK)
-        try:
-            lanes = LanePool.current.take(count)
-        except RuntimeError:
-            raise SimulationError(self._memory_message(name, needed, available_memory())) from None
-        self.bytes[name] = needed
-        self._lanes.append(lanes)
-        return lanes
 
     def _allocate(self, name: str, dtype, shape, n: int, data: np.ndarray | None) -> Array:
         shape = (shape,) if isinstance(shape, int) else tuple(shape)
@@ -289,7 +212,6 @@ class FieldArena:
 
     def release(self) -> None:
         """Free all memory, including that of arrays still referenced: kernels must not be launched with them."""
-        self._lanes.clear()
         for array in self._arrays:
             array.release()
         self._arrays.clear()

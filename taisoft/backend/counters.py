@@ -16,7 +16,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from taisoft.backend.arrays import Array
-from taisoft.backend.launching import Compiled, Signature
+from taisoft.backend.compiled import Compiled, Signature
+from taisoft.backend.launching import Kernels
 from taisoft.errors import SimulationError
 
 FILLS = "fills"  # by the device
@@ -126,11 +127,14 @@ def _watched(launched: Callable, compiled: Callable, accessed: Callable) -> Iter
 
     watching = {(Compiled, "launch"): launch, (Compiled, "__init__"): compile_}
     watching |= {(Array, name): _watching(plain[Array, name], kind, accessed) for name, kind in ACCESSES.items()}
+    was_watched = Kernels.watched
     try:
         for (owner, name), attribute in watching.items():
             setattr(owner, name, attribute)
+        Kernels.watch(True)
         yield
     finally:
+        Kernels.watch(was_watched)
         for (owner, name), attribute in plain.items():
             setattr(owner, name, attribute)
 

@@ -43,8 +43,10 @@ def read(array: ti.Ndarray, out: np.ndarray) -> None:
     _check("cuMemcpyDtoH", library.cuMemcpyDtoH_v2(ctypes.c_void_p(out.ctypes.data), address, size))
 
 
-def write(array: ti.Ndarray, data: np.ndarray) -> None:
-    """Copy `data`, contiguous and of the same type, to the start of an array of Taichi's. Raises SimulationError."""
+def write(array: ti.Ndarray, data: np.ndarray, offset: int = 0) -> None:
+    """Copy `data`, contiguous and of the same type, into an array of Taichi's from a byte on. Raises SimulationError."""
     library, address = _ready(array)
     size = ctypes.c_size_t(data.nbytes)
-    _check("cuMemcpyHtoD", library.cuMemcpyHtoD_v2(address, ctypes.c_void_p(data.ctypes.data), size))
+    _check(
+        "cuMemcpyHtoD", library.cuMemcpyHtoD_v2(ctypes.c_uint64(address.value + offset), ctypes.c_void_p(data.ctypes.data), size)
+    )

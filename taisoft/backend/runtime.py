@@ -12,13 +12,14 @@ import io
 import os
 import time
 from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import numpy as np
 import taichi as ti
 
 from taisoft import compile_message
 from taisoft.backend import tracing  # noqa: F401  tracing: before any function is decorated
-from taisoft.backend.arrays import LanePool, on_cuda
+from taisoft.backend.arrays import on_cuda
 from taisoft.backend.launching import Kernels
 from taisoft.backend.private import impl
 from taisoft.errors import SimulationError
@@ -27,14 +28,16 @@ from taisoft.machine import address_space, format_bytes, usable_cores
 
 PRECISIONS = {"f32": ti.f32, "f64": ti.f64}
 ARCHS = {"cpu": ti.cpu, "cuda": ti.cuda}
+CPU_LANES = 4  # elements that one thread processes together
 CPU_POOL_BYTES = 2**30  # address space that Taichi reserves at a time on the CPU
+LOCK_SECONDS = 60.0  # after which the lock of the kernel cache, which is held for less than a second, is that of a killed process
 KERNEL_CACHE_BYTES = 2**30  # of kernels on disk, above which Taichi removes the oldest; its default holds only about 450
 
 _open: list["Runtime"] = []  # current claims on the runtime
 _kind: tuple[str, str] | None = None  # (arch, precision) that Taichi was initialised with
 _program = None  # Taichi's program object of that initialisation
+_functions: list = []  # made by `compiled_function`
 _totals = {"compile": 0.0, "kernels": 0}
-_all_kernels: list[Kernels] = []
 
 
 class Runtime:
@@ -49,7 +52,7 @@ class Runtime:
         self.real = PRECISIONS[precision]
         self.np_real = np.float32 if precision == "f32" else np.float64
         self.eps = float(np.finfo(self.np_real).eps)
-        self.lanes = 4 if arch == "cpu" else 1
+        self.lanes = CPU_LANES if arch == "cpu" else 1
         self._program = _program
 
     def check(self) -> None:
@@ -112,6 +115,18 @@ def cache_folder() -> str:
     raise SimulationError("no folder for compiled kernels is writable: set XDG_CACHE_HOME to a writable one")
 
 
+def remove_stale_lock(folder: Path) -> None:
+    """Remove the lock of a kernel cache if the process that held it was killed: Taichi would keep no kernels any more."""
+    lock, taken = folder / "ticache.lock", folder / f"ticache.{os.getpid()}.stale"
+    with contextlib.suppress(OSError):  # there is none, or another process removes it
+        if time.time() - lock.stat().st_mtime > LOCK_SECONDS:
+            lock.rename(taken)
+            if time.time() - taken.stat().st_mtime > LOCK_SECONDS:
+                taken.unlink()
+            else:  # another process has taken a new one meanwhile
+                taken.rename(lock)
+
+
 def _initialise(arch: str, precision: str) -> None:
     global _program
     clock = time.perf_counter()
@@ -120,6 +135,7 @@ def _initialise(arch: str, precision: str) -> None:
     except FileNotFoundError:
         raise SimulationError("the working folder no longer exists: change to one that does") from None
     folder = cache_folder()
+    remove_stale_lock(Path(folder))
     available = address_space()
     if arch == "cpu" and available is not None and available < CPU_POOL_BYTES:
         shortage = f"{format_bytes(CPU_POOL_BYTES)} are needed at once, available: {format_bytes(available)}"
@@ -142,9 +158,10 @@ def _initialise(arch: str, precision: str) -> None:
     except RuntimeError as error:
         raise SimulationError(f"Taichi does not start: {(str(error).splitlines() or ['no reason given'])[0]}") from None
     _program = impl.get_runtime().prog
-    for kernels in _all_kernels:  # they refer to the previous program
+    for kernels in Kernels.every:  # they refer to the previous program
         kernels.forget()
-    LanePool.current = LanePool(PRECISIONS[precision]) if arch == "cpu" else None
+    for function in _functions:
+        function.compiled, function.taichi_functions = None, {}
     _totals["compile"] += time.perf_counter() - clock
     actual = "cuda" if on_cuda() else "cpu"
     if actual != arch:
@@ -182,18 +199,16 @@ def kernel(function: Callable | None = None, *, cse: bool = True) -> Callable:
     if function is None:
         return functools.partial(kernel, cse=cse)
     kernels = Kernels(function)
-    _all_kernels.append(kernels)
 
-    @functools.wraps(function)
     def launch(*arguments):
         check_program(_program)
         ready = kernels.find(arguments)
         if ready is not None:
-            return ready[0].launch(ready[1], arguments)
+            return ready.compiled.launch(ready.bound, arguments)
         start, compiler, before = time.perf_counter(), _compiler_clock(), kernels.n_compiled
         with _common_subexpressions(cse):
-            compiled, bound, _ = kernels.prepare(arguments)
-            result = compiled.launch(bound, arguments)  # loads the code at the first launch
+            ready = kernels.prepare(arguments)
+            result = ready.compiled.launch(ready.bound, arguments)  # loads the code at the first launch
         if kernels.n_compiled > before:
             ti.sync()
             seconds = time.perf_counter() - start
@@ -202,7 +217,19 @@ def kernel(function: Callable | None = None, *, cse: bool = True) -> Callable:
             compile_message.show(_compiler_clock() - compiler, seconds, _totals["kernels"])
         return result
 
-    return launch
+    return kernels.launcher(launch)
+
+
+def compiled_function(number: int) -> Callable:
+    """`ti.real_func`: a function that is compiled once and called. number: its own, part of the disk cache's keys."""
+
+    def decorate(function: Callable) -> Callable:
+        made = ti.real_func(function)
+        made.func.func_id = number  # these and `compiled`, `taichi_functions` are private to Taichi, see `private`
+        _functions.append(made.func)
+        return made
+
+    return decorate
 
 
 def _compiler_clock() -> float:

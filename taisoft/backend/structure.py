@@ -142,9 +142,10 @@ def _annotation(structure: tuple) -> Any:
 _numbers = itertools.count()  # of generated functions
 
 
-def generate(function: Callable, structures: dict[str, tuple]) -> Callable:
-    """Return the function with its template parameters, given by name, replaced by their leaves.
+def generate(function: Callable, taken: dict[str, Any], make: Callable | None = None) -> Callable:
+    """Return the function without the parameters `taken`, with the values that `make` returns while the kernel is traced.
 
+    make: None if the values of `taken` are structures of records, whose leaves then become parameters in their place.
     Its lines keep their original numbers, in a file of another name that exists only in Python's line cache.
     """
     file, _, first, source = source_of(function)
@@ -153,24 +154,24 @@ def generate(function: Callable, structures: dict[str, tuple]) -> Callable:
     scope = {**function.__globals__, **inspect.getclosurevars(function).nonlocals}
     parameters, handles = [], []
     for name, parameter in inspect.signature(function).parameters.items():
-        if name not in structures:
+        if name not in taken:
             scope[f"_type_{name}"] = parameter.annotation
             parameters.append(f"{name}: _type_{name}")
-            continue
-        for k, kind in enumerate(leaf_structures(structures[name])):
-            scope[f"_type_{name}_{k}"] = _annotation(kind)
-            parameters.append(f"_{name}_{k}: _type_{name}_{k}")
-            handles.append(f"_{name}_{k}")
+        elif make is None:
+            for k, kind in enumerate(leaf_structures(taken[name])):
+                scope[f"_type_{name}_{k}"] = _annotation(kind)
+                parameters.append(f"_{name}_{k}: _type_{name}_{k}")
+                handles.append(f"_{name}_{k}")
 
     def records(*leaves):
         remaining = iter(leaves)
-        return tuple([rebuild(structure, remaining) for structure in structures.values()])
+        return tuple([rebuild(structure, remaining) for structure in taken.values()])
 
-    scope |= {"_records": records, "_static": ti.static, "_returned": function.__annotations__.get("return")}
+    scope |= {"_records": make or records, "_static": ti.static, "_returned": function.__annotations__.get("return")}
     returned = " -> _returned" if scope["_returned"] is not None else ""
     head = f"def {function.__name__}({', '.join(parameters)}){returned}:\n"
-    if structures:
-        head += f"    {', '.join(structures)}, = _static(_records({', '.join(handles)}))\n"
+    if taken:
+        head += f"    {', '.join(taken)}, = _static(_records({', '.join(handles)}))\n"
     start = first - 1 + body[0].lineno - 1 - head.count("\n")  # blank lines before the head
     text = "\n" * start + head + "".join(source.splitlines(keepends=True)[body[0].lineno - 1 :])
     name = f"{file}#{function.__name__}-{next(_numbers)}"

@@ -38,21 +38,26 @@ def _inside_class(level_of_class_stackframe: int) -> bool:
 
 
 @functools.cache
-def _ends(file: str) -> dict[int, int]:
-    """Map the first line of each function in a file, decorators included, to its last line."""
-    found = {}
-    for node in ast.walk(ast.parse("".join(linecache.getlines(file)))):
-        if isinstance(node, ast.FunctionDef):
-            found[min([node.lineno, *[decorator.lineno for decorator in node.decorator_list]])] = node.end_lineno
-    return found
-
-
-@functools.cache
 def source_of(function: Callable) -> tuple[str, list[str], int, str]:
     """File, lines, number of the first line, and the dedented text of a function."""
     file, first = function.__code__.co_filename, function.__code__.co_firstlineno
-    lines = linecache.getlines(file)[first - 1 : _ends(file)[first]]
-    return file, lines, first, textwrap.dedent("".join(lines))
+    lines = linecache.getlines(file)[first - 1 :]
+    return file, lines[: _end(lines)], first, textwrap.dedent("".join(lines[: _end(lines)]))
+
+
+def _end(lines: list[str]) -> int:
+    """Number of the lines of a function with which these begin, decorators included, by their indentation.
+
+    Comments do not end a function, nor do the brackets that close its signature, nor lines of a text in three quotes.
+    """
+    indent, is_inside, quotes = len(lines[0]) - len(lines[0].lstrip()), False, 0
+    for k, line in enumerate(lines):
+        text = line.lstrip()
+        if is_inside and text and text[0] not in "#)]}" and len(line) - len(text) <= indent and quotes % 2 == 0:
+            return k
+        quotes += line.count('"""') + line.count("'''")
+        is_inside |= text.startswith("def ")
+    return len(lines)
 
 
 def _tree_and_context(
@@ -60,14 +65,14 @@ def _tree_and_context(
 ):
     """Replacement of Taichi's function of this name: a syntax tree, which tracing modifies, and its context."""
     file, lines, first, text = source_of(self.func)
-    spare = [] if is_kernel else _spare[self.func]  # a kernel is traced only once
+    spare = [] if is_kernel or is_real_function else _spare[self.func]  # those are traced once, which removes their arguments
     tree = spare.pop() if spare else ast.parse(text)
     tree.body[0].decorator_list = []
     names = kernel_impl._get_global_vars(self.func)
     if is_kernel or is_real_function:
         for k in self.template_slot_locations:
             names[self.arguments[k].name] = args[k]
-    return tree, ASTTransformerContext(
+    context = ASTTransformerContext(
         excluded_parameters=excluded_parameters,
         is_kernel=is_kernel,
         func=self,
@@ -80,16 +85,22 @@ def _tree_and_context(
         ast_builder=ast_builder,
         is_real_function=is_real_function,
     )
+    context.built = []  # syntax nodes
+    return tree, context
 
 
 def _traced(tree: ast.Module, context: ASTTransformerContext) -> Any:
     """Trace a tree, then free it of what Taichi has put there, so that the next call of its function can have it."""
     try:
         return transform_tree(tree, context)
+    except BaseException:
+        if context.is_real_function:  # which Taichi has listed as compiled: the next launch compiles it, under another number
+            context.func.compiled, context.func.taichi_functions = None, {}
+            context.func.func_id += 1_000_000
+        raise
     finally:
-        if not context.is_kernel:
-            tree.nodes = getattr(tree, "nodes", None) or list(ast.walk(tree))
-            for node in tree.nodes:
+        if not (context.is_kernel or context.is_real_function):
+            for node in context.built:
                 node.__dict__.pop("ptr", None)
                 node.__dict__.pop("caller", None)
             _spare[context.func.func].append(tree)
@@ -100,6 +111,7 @@ _build_any = ASTTransformer.__call__
 
 def _build(self, context: ASTTransformerContext, node: ast.AST) -> Any:
     """Build a syntax node. What is part of a statement gets the statement's position, not one of its own."""
+    context.built.append(node)
     build = _BUILDERS.get(type(node))
     return _build_any(self, context, node) if build is None else build(context, node)
 

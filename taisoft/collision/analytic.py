@@ -3,7 +3,7 @@
 A vertex near the obstacle is a contact if the normal lies in its normal cone. A vertex that is below a half-space, or gets below
 it in the step, always is, even if its surface is inside out. A triangle adds its deepest point if that lies deeper than its
 corners, as under a ball. A triangle is skipped if phi at its centre, minus its radius and its motion in the step, exceeds the
-margin, since |grad phi| <= 1.
+margin, since |grad phi| <= 1; first, which is cheaper, the sphere around its box.
 
 phi and its gradient in a shape's own frame, phi negative inside: half-space: y. Sphere: |p| - r. Box: half extents h; outside the
 distance to its surface, inside the largest p_i - h_i. Capsule: a segment along x of half length h, radius r. If the gradient is
@@ -59,16 +59,20 @@ def _box_distance(p, h):
 
 
 @ti.func
-def distance(kind, size, p):
-    """Signed distance [m] and unit gradient (3,) of a shape of that kind and size (3,) [m] at p (3,) [m], in its frame."""
+def distance(kinds: ti.template(), kind, size, p):
+    """Signed distance [m] and unit gradient (3,) of a shape of that kind, one of `kinds`, and size (3,) [m] at p (3,) [m], in its
+    frame."""
     phi, g = p[1], dvec(0.0, 1.0, 0.0)
-    if kind == SPHERE:
-        phi, g = _from_core(p, size[0])
-    elif kind == BOX:
-        phi, g = _box_distance(p, size)
-    elif kind == CAPSULE:
-        x = ti.min(ti.max(p[0], -size[0]), size[0])
-        phi, g = _from_core(p - dvec(x, 0.0, 0.0), size[1])
+    if ti.static(SPHERE in kinds):
+        if kind == SPHERE:
+            phi, g = _from_core(p, size[0])
+    if ti.static(BOX in kinds):
+        if kind == BOX:
+            phi, g = _box_distance(p, size)
+    if ti.static(CAPSULE in kinds):
+        if kind == CAPSULE:
+            x = ti.min(ti.max(p[0], -size[0]), size[0])
+            phi, g = _from_core(p - dvec(x, 0.0, 0.0), size[1])
     return phi, g
 
 
@@ -84,16 +88,22 @@ class AnalyticObstacles:
     rotation: Any  # (3 count) 3-vectors f64 by rows: now
     next_origin: Any  # at the end of the step
     next_rotation: Any
+    kinds: tuple[int, ...] = ()  # that occur, ascending: kernels contain no others
 
     @property
     def any(self) -> bool:
         """Whether there are any."""
         return self.body is not None
 
+    @property
+    def has_round(self) -> bool:
+        """Whether spheres or capsules are among them."""
+        return SPHERE in self.kinds or CAPSULE in self.kinds
+
     @ti.func
     def sample(self, k, p):
         """phi [m] and its gradient at p in the frame of obstacle k."""
-        return distance(self.kind[k], self.size[k], p)
+        return distance(self.kinds, self.kind[k], self.size[k], p)
 
 
 NO_SHAPES = AnalyticObstacles(0, *[None] * 7)
@@ -110,6 +120,7 @@ def build_analytic(obstacles: list[tuple[int, Obstacle]], arena: FieldArena) -> 
         arena.field("obstacle_kind", ti.i32, n, kinds),
         arena.vectors("obstacle_size", ti.f64, n, np.array([x.size() for x in shapes])),
         *(arena.vectors(f"obstacle_{name}", ti.f64, count) for name, count in rows.items()),
+        tuple(sorted({shape.kind for shape in shapes})),
     )
 
 
@@ -143,6 +154,21 @@ def _local(s: ti.template(), o: ti.template(), t, j, k, R, R1):
 
 
 @ti.func
+def may_touch(s: ti.template(), o: ti.template(), t, k, margin):
+    """Whether the sphere around the box that holds triangle t in the step lets it have contacts with obstacle k.
+
+    In the obstacle's frame its points lie in spheres of this radius at the start and at the end, so none moves by more than the
+    distance of these plus two radii; a half-space's phi is linear, and that at the end then bounds it.
+    """
+    centre, radius = 0.5 * (s.lo[t] + s.hi[t]), 0.5 * (s.hi[t] - s.lo[t]).norm()
+    now = rotation_rows(o.rotation, k).transpose() @ (centre - o.origin[k])
+    then = rotation_rows(o.next_rotation, k).transpose() @ (centre - o.next_origin[k])
+    phi, _ = o.sample(k, now)
+    spread = ti.select(o.kind[k] == HALF_SPACE, ti.cast(1.0, ti.f64), ti.cast(3.0, ti.f64))
+    return phi - spread * radius - (then - now).norm() <= margin
+
+
+@ti.func
 def _obstacle_contacts(s: ti.template(), o: ti.template(), t, k, margin, out: ti.template(), start, end):
     """Write contacts of triangle t with obstacle k. Return the new count."""
     at = start
@@ -158,15 +184,17 @@ def _obstacle_contacts(s: ti.template(), o: ti.template(), t, k, margin, out: ti
     middle, _ = o.sample(k, centre)
     if middle - reach - motion <= margin:
         phi = dvec(0.0)
-        for j in range(4):  # the corners, then the deepest point between them
+        has_deepest = ti.static(o.kinds != (HALF_SPACE,))
+        for j in range(ti.static(4 if has_deepest else 3)):  # the corners, then the deepest point between them
             w = dvec(ti.cast(j == 0, ti.f64), ti.cast(j == 1, ti.f64), ti.cast(j == 2, ti.f64))
             accepted = 0
             if j < 3:
                 accepted = (s.owns[t] >> j) & 1
-            elif kind != HALF_SPACE:
-                v, value = deepest_point(o, k, A, B, C, phi)
-                w = 1.0 * v
-                accepted = int(value < phi.min() - ti.cast(MIN_EXTRA_DEPTH, ti.f64) * reach and w.max() < 1.0 - 1e-6)
+            elif ti.static(has_deepest):
+                if kind != HALF_SPACE:
+                    v, value = deepest_point(o, k, A, B, C, phi)
+                    w = 1.0 * v
+                    accepted = int(value < phi.min() - ti.cast(MIN_EXTRA_DEPTH, ti.f64) * reach and w.max() < 1.0 - 1e-6)
             p, move = w[0] * A + w[1] * B + w[2] * C, w[0] * a + w[1] * b + w[2] * c
             value, g = o.sample(k, p)
             for i in ti.static(range(3)):
@@ -180,7 +208,7 @@ def _obstacle_contacts(s: ti.template(), o: ti.template(), t, k, margin, out: ti
                     valid = in_normal_cone(s, s.triangle[t, j], n)
                     if kind == HALF_SPACE and value + ti.min(move.dot(g), 0.0) < 0.0:
                         valid = 1
-                else:
+                elif ti.static(has_deepest):
                     valid = is_surface_minimum(s, t, w, n, x)
                 if valid == 1:
                     write_point_contact(s, out, at, end, t, j, w, o.body[k], x, n, value, ivec(-1), dvec(0.0))
@@ -205,7 +233,8 @@ def find_analytic(s: ti.template(), o: ti.template(), margin: ti.f64, out: ti.te
                         if ti.static(s.has_attached):
                             if s.attached[s.body[t] * s.n_bodies + o.body[k]] == 1:
                                 continue
-                        at = _obstacle_contacts(s, o, t, k, margin, out.data, at, end)
+                        if may_touch(s, o, t, k, margin):
+                            at = _obstacle_contacts(s, o, t, k, margin, out.data, at, end)
             out.used[c] = at - c * out.part
     ti.loop_config(serialize=True)
     for _ in range(1):

@@ -25,7 +25,7 @@ from taisoft.collision.overlap import Containment, Inside
 from taisoft.collision.passages import ROUND, append_passages
 from taisoft.collision.path_check import NO_PASSAGES, PathCheck
 from taisoft.collision.spatial_hash import SpatialHash
-from taisoft.collision.surface import ACTIVE, NONFINITE, PAIRS, build_surface, move_obstacles, update_surface
+from taisoft.collision.surface import ACTIVE, NONFINITE, PAIRS, build_surface, update_surface
 from taisoft.errors import SceneError, SimulationError
 from taisoft.fem.model import Layout, Model
 from taisoft.mesh.quality import mean_surface_edge
@@ -78,9 +78,9 @@ class Detection:
         self.margin = self._checked_margin()
         self.reach = self.margin + DEPTH * self.edge  # boxes grow by half of it
         self.topology, self._rest = collider_surfaces(scene, layout)
-        self._has_pairs = self_collision or int((np.diff(self.topology.first) > 0).sum()) > 1
-        self._proximity = self._has_pairs and make_plan(scene, False, False, self_collision).on["proximity"]
-        on_field = [b if self._has_pairs and b.contact_mode == "distance_field" else None for b in bodies]
+        self.has_pairs = self_collision or int((np.diff(self.topology.first) > 0).sum()) > 1
+        self._proximity = self.has_pairs and make_plan(scene, False, False, self_collision).on["proximity"]
+        on_field = [b if self.has_pairs and b.contact_mode == "distance_field" else None for b in bodies]
         # before any allocation, since this may fail
         grids = [b and body_grid(b, settings.field_cells, 2.0 * self.margin) for b in on_field] + [None] * len(obstacles)
         self._arena = arena = FieldArena()
@@ -92,9 +92,10 @@ class Detection:
         properties = {"soft": soft, "self_on": soft & self_collision, "mode": np.array(modes)}
         properties |= {"thickness": self.thickness, "edge": self.edges, "attached": attached_pairs(scene)}
         self.surface = s = build_surface(self.topology, self._rest, properties, runtime, arena, serial)
-        self.broad = self._make_broad(runtime) if self._has_pairs else None
+        self.broad = self._make_broad(runtime) if self.has_pairs else None
         self._unmapped = arena.field("unmapped", ti.i32, 1)
         self._crossing_parts = arena.vectors("crossed", ti.f64, s.chunks)
+        self._crossing = arena.field("crossing", ti.f64, 3)
         self._fields: DistanceFields | None = None
         if any(grids):
             starts = self.topology.first, layout.node_start
@@ -103,7 +104,7 @@ class Detection:
         self._prescribed_moves = None  # prescribed displacements of vertices, allocated at first use
         initial = min(int(np.diff(self.topology.first).max(initial=1)), MAX_INITIAL_ROW) * s.chunks
         limits = (settings.initial_capacity or initial, settings.max_capacity)
-        self._near_buffer = Buffer("near", entries, *limits, s.chunks, arena) if self._has_pairs else None
+        self._near_buffer = Buffer("near", entries, *limits, s.chunks, arena) if self.has_pairs else None
         capacity = settings.initial_capacity or CONTACTS_PER_TRIANGLE * s.n_triangles + 64
         self.buffer = Buffer("contacts", contact_fields, capacity, settings.max_capacity, s.chunks, arena)
         self._reduction_arena = FieldArena()
@@ -172,7 +173,7 @@ class Detection:
             self._prescribed_moves.from_numpy(prescribed_vertices(self.topology, *prescribed))
         v, span = (m.state.v, dt) if path is None else (path, 1.0)
         moves = self._prescribed_moves if has_prescribed else s.move
-        update_surface(s, m.state.x, v, has_prescribed, moves, span, self.reach, self._has_pairs)
+        update_surface(s, m.state.x, v, has_prescribed, moves, span, self.reach, self.has_pairs)
         if s.count[NONFINITE]:
             raise SimulationError(self._nonfinite())
 
@@ -182,7 +183,8 @@ class Detection:
         for o, begin, end in zip(self.scene.obstacles, starts[:-1], starts[1:]):
             if end > begin and (first or o.path is not None):
                 now, then = (o.points_at(t, self._rest[begin:end]) for t in (time, time + dt))
-                move_obstacles(self.surface, begin, now, then - now)
+                self.surface.x.from_numpy(now, begin)
+                self.surface.move.from_numpy(then - now, begin)
         if self._analytic and (first or any(o.path is not None for _, o in self._analytic)):
             place_analytic(self.shapes, self._analytic, time, dt)
         self._placed = True
@@ -197,7 +199,7 @@ class Detection:
 
     def _near(self) -> Trees | Candidates | None:
         """Run the broad phase; None if no two surfaces can touch."""
-        return self.broad.near() if self._has_pairs else None
+        return self.broad.near() if self.has_pairs else None
 
     def _search(self, near: Trees | Candidates | None) -> None:
         """Fill the buffer of contacts, growing buffers as needed."""
@@ -235,7 +237,7 @@ class Detection:
         lowest_gap = -self.floor if self.none_cross else -np.inf  # if none cross, a vertex behind a face is not inside
         reduce_contacts(self._reduction, b.parts, MERGED * self.edge, REDUCTION_CELL * self.edge, lowest_gap)
         count, surface = self.counts, self.surface.count
-        if self._has_pairs:
+        if self.has_pairs:
             count.active, count.pairs = surface[ACTIVE], surface[PAIRS]
         if self._fields is not None:
             count.unmapped = self._unmapped[0]
@@ -276,7 +278,7 @@ class Detection:
 
     def intersections(self) -> np.ndarray:
         """Return the pairs (k,2) of triangles without a common vertex that intersect, at the positions of the last search."""
-        if not self._has_pairs:
+        if not self.has_pairs:
             return np.zeros((0, 2), dtype=np.int64)
         if self._intersections is None:
             limits = (self.scene.collision.initial_capacity, self.scene.collision.max_capacity)
@@ -285,18 +287,19 @@ class Detection:
 
     def crossings(self) -> np.ndarray:
         """Return (3,) f64: how deeply surfaces cross at the positions of the last search, see `find_crossings`."""
-        depths, buffer = np.zeros(3), self._near_buffer
+        depths, buffer = self._crossing, self._near_buffer
+        depths.fill(0.0)
         while self._broad_result is not None and self.counts.active:
             find_crossings(self.surface, self._broad_result, buffer.parts, 0.5 * self.reach, self._crossing_parts, depths)
             if not buffer.grow_if_full():
                 break
-        return depths
+        return depths.to_numpy()
 
     def prepare_paths(self) -> None:
         """Allocate what the check of paths needs."""
         settings = self.scene.collision
         limits = settings.initial_capacity, settings.max_capacity
-        options = self._self_on, self._has_pairs, self.reach, self.floor, self._arena, *limits
+        options = self._self_on, self.has_pairs, self.reach, self.floor, self._arena, *limits
         self._paths = PathCheck(self.surface, self.topology, self.shapes, *options)
 
     def passages(self, mode: int) -> tuple[np.ndarray, np.ndarray] | None:
@@ -342,7 +345,7 @@ class Detection:
 
     def _buffers(self) -> list[Buffer]:
         paths = () if self._paths is None else self._paths.buffers
-        return [self.buffer, *((self._near_buffer, *self.broad.buffers) if self._has_pairs else ()), *paths]
+        return [self.buffer, *((self._near_buffer, *self.broad.buffers) if self.has_pairs else ()), *paths]
 
     @property
     def field_bytes(self) -> dict[str, int]:

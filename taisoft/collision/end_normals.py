@@ -79,7 +79,8 @@ def normal_on_shape(o: ti.template(), body, x, before):
             R = rotation_rows(o.rotation, k)
             value, g = o.sample(k, R.transpose() @ (x - o.origin[k]))
             n, phi = R @ g, value
-            if o.kind[k] == BOX:
-                is_smooth = ti.abs(g).max() > ti.cast(FLAT_COSINE, ti.f64)
-                was_smooth = ti.abs(R.transpose() @ before).max() > ti.cast(FLAT_COSINE, ti.f64)
+            if ti.static(BOX in o.kinds):
+                if o.kind[k] == BOX:
+                    is_smooth = ti.abs(g).max() > ti.cast(FLAT_COSINE, ti.f64)
+                    was_smooth = ti.abs(R.transpose() @ before).max() > ti.cast(FLAT_COSINE, ti.f64)
     return n, phi, is_smooth, was_smooth

@@ -62,7 +62,7 @@ def crossing_depth(s: ti.template(), t, u):
 
 @kernel
 def find_crossings(
-    s: ti.template(), near: ti.template(), row: ti.template(), padding: ti.f64, part: ti.template(), depths: ti.types.ndarray()
+    s: ti.template(), near: ti.template(), row: ti.template(), padding: ti.f64, part: ti.template(), depths: ti.template()
 ):
     """Write depths (3,): the deepest crossing [m]; the deepest relative to the finer side's mean surface edge; the number of
     triangle pairs that cross by more than CROSSED of that edge.

@@ -32,9 +32,9 @@ class PathFields:
     """Fields of the check, for kernels. Vectors are 3-vectors f64 [m]."""
 
     path: Any  # (n_verts) vectors: displacements to be checked
-    listed_x: Any  # (n_verts) vectors: positions and searched displacements when the near pairs were listed; 1 if n_listed is 0,
+    listed_x: Any  # (n_verts) vectors: positions and searched displacements when the near pairs were listed; 1 without pairs,
     listed_move: Any  # as are the fields of triangles
-    n_listed: Count  # triangles that may be in near pairs: all, or none
+    has_pairs: bool  # whether triangles may touch each other
     can_touch: Any  # (n_verts) i32: 1 for vertices of active triangles; between checks 0
     left_lo: Any  # (2 n_bodies) vectors: boxes of the vectors by which those have left the listed paths at the start and the end
     left_hi: Any
@@ -142,8 +142,9 @@ def prepare_paths(s: ti.template(), x: ti.template(), g: ti.template(), mode, li
     an axis, beside others.
     """
     _set_paths(s, x, g, mode, limit)
-    _box_ends(s, g, floor)
-    _compare_with_listed(s, g, listed_limit)
+    if ti.static(g.has_pairs):
+        _box_ends(s, g, floor)
+        _compare_with_listed(s, g, listed_limit)
 
 
 @ti.func

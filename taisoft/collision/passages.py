@@ -163,6 +163,47 @@ def _write_half_space_passages(
     return at
 
 
+@ti.func
+def _write_triangle_passages(
+    s: ti.template(), o: ti.template(), g: ti.template(), near: ti.template(), c, mode, floor, out: ti.template(), start, last
+):
+    """Write the passages of chunk c through triangles, spheres and capsules. Return the new count."""
+    at, still, n_near, n_adjacent, n_round = start, int(mode == STILL), 0, 0, 0
+    if ti.static(g.has_pairs):
+        n_near = list_unseparated(s, g, near, c)
+        n_adjacent = part_first(c + 1, g.n_adjacent, s.chunks) - part_first(c, g.n_adjacent, s.chunks)
+    if ti.static(o.has_round):
+        n_round = o.count * (part_first(c + 1, s.n_triangles, s.chunks) - part_first(c, s.n_triangles, s.chunks))
+    for e in range(n_near + n_adjacent + n_round):
+        kind, a, b, checked, plane = NEAR, 0, 0, True, 0
+        if e < n_near:
+            pair = near.data[c * near.part + near.data[c * near.part + e][2]]
+            a, b = pair[0], pair[1]
+            plane = g.plane[hint_of(a, b)]
+            checked = g.exempt[s.body[a] * s.n_bodies + s.body[b]] == 0
+        elif e < n_near + n_adjacent:
+            kind, a = ADJACENT, part_first(c, g.n_adjacent, s.chunks) + e - n_near
+            checked = g.exempt[_body_of(s, g.adjacent[a, 0]) * (s.n_bodies + 1)] == 0
+        elif ti.static(o.any):
+            kind, a = ROUND, part_first(c, s.n_triangles, s.chunks) + (e - n_near - n_adjacent) // o.count
+            b = (e - n_near - n_adjacent) % o.count
+            checked = (o.kind[b] == SPHERE or o.kind[b] == CAPSULE) and s.soft[s.body[a]] == 1
+            if checked:
+                checked = g.exempt[s.body[a] * s.n_bodies + o.body[b]] == 0
+        radius = _radius(o, kind, b)
+        if checked:
+            found = _separating_plane(s, o, g, kind, a, b, still, floor + radius, plane)
+            checked = found < 0
+            if e < n_near and found >= 0 and found != plane:
+                g.plane[hint_of(a, b)] = found
+        if checked:
+            y, p = _rows(s, o, g, kind, a, b, g.path, still)
+            time, features = free_until(y, p, radius, floor, mode != STILL)
+            if time < 1.0:
+                at = _write_passage(out, at, last, kind, a, b, features, time)
+    return at
+
+
 @kernel(cse=False)
 def check_paths(
     s: ti.template(),
@@ -182,51 +223,21 @@ def check_paths(
     near: listed pairs. limit, listed_limit [m]: see `prepare_paths`; beyond them, nothing is checked. floor [m]: to be kept.
     """
     prepare_paths(s, x, g, mode, limit, listed_limit, floor)
-    still = int(mode == STILL)
     ti.loop_config(serialize=s.serial)
     for task in range(s.chunks * s.spread):
         if task % s.spread == 0:
             c = task // s.spread
             at, last = c * out.part, (c + 1) * out.part
             if g.left[UNCOVERED] == 0 and g.left[OUTDATED] == 0:
-                n_round, n_near = 0, list_unseparated(s, g, near, c)
-                if ti.static(o.any):
-                    n_triangles = part_first(c + 1, s.n_triangles, s.chunks) - part_first(c, s.n_triangles, s.chunks)
+                if ti.static(HALF_SPACE in o.kinds):
                     for k in range(o.count):
-                        if o.kind[k] == SPHERE or o.kind[k] == CAPSULE:
-                            n_round = o.count * n_triangles
-                        elif o.kind[k] == HALF_SPACE and mode != STILL:
+                        if o.kind[k] == HALF_SPACE and mode != STILL:
                             at = _write_half_space_passages(s, o, g, k, c, limit, floor, out.data, at, last)
-                n_adjacent = part_first(c + 1, g.n_adjacent, s.chunks) - part_first(c, g.n_adjacent, s.chunks)
-                for e in range(n_near + n_adjacent + n_round):
-                    kind, a, b, checked, plane = NEAR, 0, 0, True, 0
-                    if e < n_near:
-                        pair = near.data[c * near.part + near.data[c * near.part + e][2]]
-                        a, b = pair[0], pair[1]
-                        plane = g.plane[hint_of(a, b)]
-                        checked = g.exempt[s.body[a] * s.n_bodies + s.body[b]] == 0
-                    elif e < n_near + n_adjacent:
-                        kind, a = ADJACENT, part_first(c, g.n_adjacent, s.chunks) + e - n_near
-                        checked = g.exempt[_body_of(s, g.adjacent[a, 0]) * (s.n_bodies + 1)] == 0
-                    elif ti.static(o.any):
-                        kind, a = ROUND, part_first(c, s.n_triangles, s.chunks) + (e - n_near - n_adjacent) // o.count
-                        b = (e - n_near - n_adjacent) % o.count
-                        checked = (o.kind[b] == SPHERE or o.kind[b] == CAPSULE) and s.soft[s.body[a]] == 1
-                        if checked:
-                            checked = g.exempt[s.body[a] * s.n_bodies + o.body[b]] == 0
-                    radius = _radius(o, kind, b)
-                    if checked:
-                        found = _separating_plane(s, o, g, kind, a, b, still, floor + radius, plane)
-                        checked = found < 0
-                        if e < n_near and found >= 0 and found != plane:
-                            g.plane[hint_of(a, b)] = found
-                    if checked:
-                        y, p = _rows(s, o, g, kind, a, b, g.path, still)
-                        time, features = free_until(y, p, radius, floor, mode != STILL)
-                        if time < 1.0:
-                            at = _write_passage(out.data, at, last, kind, a, b, features, time)
+                if ti.static(g.has_pairs or o.has_round):
+                    at = _write_triangle_passages(s, o, g, near, c, mode, floor, out.data, at, last)
             out.used[c] = at - c * out.part
-    clear_ends(s, g)
+    if ti.static(g.has_pairs):
+        clear_ends(s, g)
     ti.loop_config(serialize=True)
     for _ in range(1):
         sum_parts(out)

@@ -90,7 +90,7 @@ class PathCheck:
             **{name: arena.vectors(f"path_{name}", ti.f64, length) for name, length in lengths.items()},
             lo=arena.vectors("path_lo", ti.f64, triangle_ends, np.full((triangle_ends, 3), np.inf)),
             **{name: arena.field(f"path_{name}", ti.f64, triangle_ends) for name in ("low", "high")},
-            n_listed=n_listed,
+            has_pairs=has_pairs,
             can_touch=arena.field("path_can_touch", ti.i32, n),
             left=arena.field("path_left", ti.i32, 2),
             plane=arena.field("path_plane", ti.i32, max(HINTS * n_listed, 1)),

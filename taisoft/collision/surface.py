@@ -174,16 +174,6 @@ def may_touch(s: ti.template(), t, u):
 # --- positions, boxes and active triangles -------------------------------------------------------------------
 
 
-@kernel
-def move_obstacles(s: ti.template(), first: ti.i32, x: ti.types.ndarray(), move: ti.types.ndarray()):
-    """Set positions x and displacements move, (n,3) f64 [m], of an obstacle's vertices, from vertex `first` on."""
-    ti.loop_config(serialize=s.serial_cheap)
-    for i in range(x.shape[0]):
-        for q in ti.static(range(3)):
-            s.x[first + i][q] = x[i, q]
-            s.move[first + i][q] = move[i, q]
-
-
 @ti.func
 def _move_soft(
     s: ti.template(), x: ti.template(), v: ti.template(), has_prescribed: ti.template(), prescribed: ti.template(), dt

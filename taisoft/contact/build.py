@@ -347,7 +347,7 @@ def gap_minus_target(
 
 
 @kernel
-def has_impact(p: ti.template(), rigid: ti.types.ndarray(), dt: ti.f64, contact_offset: ti.f64) -> ti.i32:
+def has_impact(p: ti.template(), rigid: ti.template(), dt: ti.f64, contact_offset: ti.f64) -> ti.i32:
     """Return 1 if a contact without impulse in the previous step closes within a step of dt, else 0.
 
     rigid: (n_colliders) i32, 1 for rigid bodies. The gap to one may have closed to the contact offset in the previous step, which

@@ -16,7 +16,7 @@ import scipy.sparse as sp
 import taichi as ti
 
 from taisoft.backend.runtime import kernel
-from taisoft.contact.problem import ContactProblem, fill_field, index_nodes
+from taisoft.contact.problem import ContactProblem, fill_field
 from taisoft.errors import SimulationError
 
 UNCOLOURED = -1
@@ -191,8 +191,7 @@ def _group(p: ti.template()):
 
 
 def colour_contacts(p: ContactProblem) -> None:
-    """Colour and group the contacts of a problem over nodes, once before the sweeps."""
-    index_nodes(p)
+    """Colour and group the contacts of a problem over nodes, once before the sweeps, after `index_nodes`."""
     remaining = int(p.count[0])
     _clear_colours(p)
     while remaining:

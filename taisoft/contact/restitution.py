@@ -40,9 +40,7 @@ def explicit_opening(p: ti.template(), c, dt, common_offset, free, kick_fraction
 
 
 @kernel
-def find_rebounds(
-    p: ti.template(), gravity: ti.template(), flight: ti.types.ndarray(), dt: ti.f64, common_offset: ti.f64
-) -> ti.i32:
+def find_rebounds(p: ti.template(), gravity: ti.template(), flight: ti.template(), dt: ti.f64, common_offset: ti.f64) -> ti.i32:
     """Set `min_velocity` and `min_opening` of every contact for an implicit step of dt. Return the number of rebounds.
 
     gravity: field of one 3-vector [m/s^2]. flight: (n_colliders) f64, sum of dt^2 over the steps of a collider's flight [s^2], 0

@@ -42,7 +42,7 @@ from taisoft.contact.problem import (
     residual_of,
 )
 from taisoft.contact.prox import prox
-from taisoft.contact.sweeps import relaxation, sweep, sweep_parallel
+from taisoft.contact.sweeps import SIMULTANEOUS, relaxation, sweep, sweep_parallel
 
 LAUNCH_VISITS = 1_000_000  # contact visits per launch: about 0.1 s, so that Ctrl-C takes effect
 CHECK_EVERY = 5  # sweeps between residual checks, each of which costs as much as a sweep
@@ -185,11 +185,11 @@ def _run_parallel(
         find_velocities(p)
         _prepare_contacts(p, method, with_momentum)
         _check(p, 1, 0)
-    done = 0
+    done, n_colours = 0, 0 if method in SIMULTANEOUS else int(p.count[1])
     while done < sweeps and not p.state[RESIDUAL] <= tolerance:
         n = min(every, sweeps - done)
         for _ in range(n):
-            sweep_parallel(p, method)
+            sweep_parallel(p, method, n_colours)
             if with_momentum:
                 _extrapolate_all(p)
             find_velocities(p)

@@ -43,12 +43,12 @@ def sweep(p: ti.template(), method: ti.template()):
             _relax(p, p.order[k])
 
 
-def sweep_parallel(p: ContactProblem, method: str) -> None:
+def sweep_parallel(p: ContactProblem, method: str, n_colours: int) -> None:
     """As `sweep`, on all threads, for any method but gauss_seidel."""
     if method in SIMULTANEOUS:
         _relax_all(p, method)
     else:
-        for first in range(0, int(p.count[1]), BATCH):
+        for first in range(0, n_colours, BATCH):
             _relax_colours(p, first)
 
 

@@ -6,6 +6,7 @@ The search at the end of each step also serves the next one, and measures how de
 from dataclasses import replace
 
 import numpy as np
+import taichi as ti
 
 from taisoft.backend.arrays import FieldArena, download
 from taisoft.collision.contacts import Contacts
@@ -64,8 +65,9 @@ class ContactStep:
         self.simulation = simulation
         m, scene = simulation.model, simulation.scene
         self.detection = Detection(scene, m, simulation.layout, simulation.runtime, self_collision)
-        self.measures = ContactMeasures(self.detection)
-        self.paths = ContactPaths(simulation, self.detection)
+        self._lasting = FieldArena()  # of arrays that stay as they are
+        self.measures = ContactMeasures(self.detection, self._lasting)
+        self.paths = ContactPaths(simulation, self.detection, self._lasting)
         self.misplaced = Misplacement(simulation, self.detection)
         d = self.detection
         self.contact_offset = CONTACT_OFFSET * float(d.edges[: len(scene.bodies)].min())
@@ -80,7 +82,7 @@ class ContactStep:
         self._allocate(2 * d.surface.n_triangles + EXTRA_CAPACITY)
         self._numbers_arena = FieldArena()
         self.numbers = build_pair_numbers(self._numbers_arena, scene)
-        self.rebounds = Rebounds(simulation)
+        self.rebounds = Rebounds(simulation, self._lasting)
         self._searched: tuple[float, float] | None = None  # time and dt of the valid search
         self._searched_dt = 0.0  # dt of the last search, valid or not
         self._measured_end: tuple[float, float] | None = None  # time and dt of the measured end, until the next substep begins
@@ -97,7 +99,8 @@ class ContactStep:
         self._impulse_fraction = 1.0
         self._own_sides: tuple[np.ndarray, np.ndarray] | None = None  # nodes of contacts before dependent ones were replaced
         self._search_counts = 0, 0  # contacts before the reduction and unmapped triangles of the search for the last substep
-        self._rigid = np.array([isinstance(one, RigidBody) for one in scene.colliders], dtype=np.int32)
+        rigid = np.array([isinstance(one, RigidBody) for one in scene.colliders], dtype=np.int32)
+        self._rigid = self._lasting.field("is_rigid", ti.i32, len(rigid), rigid)
         self.had_impact = False  # whether surfaces met in the last step
         self.dropped = 0  # triangles of the last step under an inverted tet, for which a distance field gives no contacts
 
@@ -404,10 +407,10 @@ class ContactStep:
     @property
     def field_bytes(self) -> dict[str, int]:
         """Bytes of every allocated field by name."""
-        return self.detection.field_bytes | self._arena.bytes | self._numbers_arena.bytes | self.paths.field_bytes
+        return self.detection.field_bytes | self._arena.bytes | self._numbers_arena.bytes | self._lasting.bytes
 
     def release(self) -> None:
         """Free all memory."""
         self.detection.release()
-        for owner in (self._arena, self._numbers_arena, self.paths):
+        for owner in (self._arena, self._numbers_arena, self._lasting, self.misplaced):
             owner.release()

@@ -20,12 +20,14 @@ from dataclasses import dataclass, field
 import numpy as np
 import taichi as ti
 
+from taisoft.backend.arrays import FieldArena
 from taisoft.backend.runtime import kernel
 from taisoft.collision.contacts import FACE_FACE
 from taisoft.collision.detector import Detection
 from taisoft.collision.intersections import CROSSED, CROSSING_DEPTH, CROSSINGS, DEPTH_OVER_EDGE
 from taisoft.collision.surface import dvec
 from taisoft.contact.build import obstacle_displacement_at
+from taisoft.fem.state import DEVIATION
 
 MAX_CLOSING = 0.5  # of the thinner side's thickness: how far a contact may close in one step
 DEPTH, CLOSING_RATIO, SPEED, WHICH, RELATIVE_PENETRATION = range(5)  # indices into the result of `measure_closing`
@@ -49,9 +51,9 @@ class Crossing:
 class ContactMeasures:
     """Measures of the contacts of a detection's last search."""
 
-    def __init__(self, detection: Detection):
+    def __init__(self, detection: Detection, arena: FieldArena):
         self.detection = detection
-        self._closing = np.zeros(5)  # result of `measure_closing`
+        self._closing = arena.field("closing", ti.f64, 5)  # result of `measure_closing`
         self._dt: float | None = None  # [s] that it was computed for; None: outdated
 
     def forget(self) -> None:
@@ -64,7 +66,7 @@ class ContactMeasures:
         if self._dt != dt:
             measure_closing(d.surface, d.shapes, d.buffer.data, d.kept, d.counts.contacts, dt, self._closing)
             self._dt = dt
-        return self._closing
+        return self._closing.to_numpy()
 
     def drop_uncertain(self) -> None:
         """Drop the contacts of the last search that may never touch, where the check of paths finds those that would: a plane
@@ -149,7 +151,7 @@ def measure_closing(
     kept: ti.template(),
     n: ti.i32,
     dt: ti.f64,
-    closing_data: ti.types.ndarray(),
+    closing_data: ti.template(),
 ):
     """Measure the contacts' closing in the coming step of dt.
 
@@ -177,19 +179,17 @@ def measure_closing(
 
 
 @kernel
-def find_displacement(
-    m: ti.template(), s: ti.template(), x_start: ti.template(), displacement: ti.template(), deviation: ti.types.ndarray()
-):
+def find_displacement(m: ti.template(), s: ti.template(), x_start: ti.template(), displacement: ti.template()):
     """Compute the displacement (n_nodes) [m] since x_start.
 
-    deviation (1,) [m]: largest distance of a vertex from the straight path that was searched.
+    scalars: DEVIATION, from the straight path that was searched.
     """
     ti.loop_config(serialize=m.serial)
     for i in range(m.n_nodes):
         displacement[i] = m.state.x[i] - x_start[i]
     ti.loop_config(serialize=True)
     for _ in range(1):
-        deviation[0] = 0.0
+        m.state.scalars[DEVIATION] = 0.0
     ti.loop_config(serialize=m.on_cpu)
     for k in range(s.n_verts):
         if s.node[k] >= 0:
@@ -199,8 +199,8 @@ def find_displacement(
             if square > 0.0:
                 along = ti.min(ti.max(d.dot(searched) / square, 0.0), 1.0)
             length = (d - along * searched).norm()
-            if length > deviation[0]:  # few do, and atomics on one address wait for each other
-                ti.atomic_max(deviation[0], length)
+            if length > m.state.scalars[DEVIATION]:  # few do, and atomics on one address wait for each other
+                ti.atomic_max(m.state.scalars[DEVIATION], length)
 
 
 def next_length(ratio: Callable[[float], float], remaining: float, length: float, longest: float, may_grow: bool) -> float:

@@ -20,6 +20,7 @@ from taisoft.contact.problem import ContactProblem
 from taisoft.dynamics.contact_measures import find_displacement
 from taisoft.dynamics.simulation_state import SimulationState
 from taisoft.errors import SimulationError
+from taisoft.fem.state import DEVIATION
 from taisoft.scene.connections import attached_pairs
 
 MAX_UNCHANGED = 3  # such checks in a row after which repeating a substep does not help
@@ -30,7 +31,7 @@ MAX_SHORTENINGS, LEAST = 30, 1e-6  # rounds, and part of a path: beyond these, b
 class ContactPaths:
     """Check the paths of substeps and hold the passages found."""
 
-    def __init__(self, simulation: SimulationState, detection: Detection):
+    def __init__(self, simulation: SimulationState, detection: Detection, arena: FieldArena):
         self._simulation, self._detection = simulation, detection
         self.uncovered = False  # whether the paths of the last check left what was searched
         self.held_back = ""  # a sentence about the last step, if bodies were held back,
@@ -42,8 +43,7 @@ class ContactPaths:
         n, group = connected_components(attached_pairs(detection.scene)[:n_bodies, :n_bodies])
         self._attached = [np.flatnonzero(group == k) for k in range(n) if (group == k).sum() > 1]  # move as one if held back
         detection.prepare_paths()
-        self._arena = FieldArena()
-        self.displacement = self._arena.vectors("path", ti.f64, simulation.model.n_nodes)  # of `left_searched` [m]
+        self.displacement = arena.vectors("path", ti.f64, simulation.model.n_nodes)  # of `left_searched` [m]
 
     def return_to_start(self, none_crossed: bool) -> None:
         """Discard all passages and lists after a state was set. none_crossed: whether no surfaces are known to cross there."""
@@ -87,9 +87,9 @@ class ContactPaths:
 
     def left_searched(self, x_start) -> bool:
         """Return whether the surface left the searched path since x_start; keep its displacement for another search."""
-        deviation = np.zeros(1)
-        find_displacement(self._simulation.model, self._detection.surface, x_start, self.displacement, deviation)
-        return bool(deviation[0] > 0.5 * self._detection.margin)
+        model = self._simulation.model
+        find_displacement(model, self._detection.surface, x_start, self.displacement)
+        return bool(model.state.scalars[DEVIATION] > 0.5 * self._detection.margin)
 
     def find(self, as_searched: bool = False) -> bool:
         """Find the passages on the paths from the last search to the present state, or on the searched paths, and hold them from
@@ -188,12 +188,3 @@ class ContactPaths:
                 x[rows] = np.where(free[rows], start[rows] + part[body] * (end[rows] - start[rows]), end[rows])
                 v[rows] = np.where(free[rows], part[body] * velocity[rows], velocity[rows])
         simulation.set_state(x, v)
-
-    @property
-    def field_bytes(self) -> dict[str, int]:
-        """Bytes of its fields by name."""
-        return self._arena.bytes
-
-    def release(self) -> None:
-        """Free their memory."""
-        self._arena.release()

@@ -26,6 +26,7 @@ from taisoft.linear.coupling import NO_COUPLING, Coupling, build_coupling
 # largest part of its target that a contact's gap may miss at the end; smallest such target, over the contact offset
 MAX_MISSED, MIN_KEPT = 0.5, 1e-3
 ROUNDING = 4.0 * 2.0**-52  # of the largest coordinate: that of a gap, as of positions in f64
+N_LIMITS, N_LOOP = 12, 15  # numbers of `frictional.solve_frictional`
 PAST = 2  # multiplier updates that are stored
 KEEP, TO_IMPULSES, OF_IMPULSES = range(3)  # new multipliers, see `update_impulses`
 
@@ -49,6 +50,8 @@ class ContactStageWork:
     rounding: Any  # (capacity) f64: velocity by which the rounding of positions moves a gap, over the tolerance [m/s]
     block: Any  # (capacity) 12-vectors: D in world axes; J^T D J consists of weights times this
     active: Any  # (capacity) i32: 1 if the block is not 0
+    limits: Any  # (N_LIMITS) f64: see `frictional`
+    loop: Any  # (N_LOOP) f64: see `frictional`
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,13 +82,16 @@ def begin_contacts(
     impact: ti.template(),
     beta: ti.f64,
     dt: ti.f64,
-    gap_targets: ti.types.ndarray(),
+    common_offset: ti.f64,
+    penetration_fraction: ti.f64,
+    offset_fraction: ti.f64,
+    max_speed: ti.f64,
     tolerance: ti.f64,
 ):
     """Set the constant contact data of a stage, in a step of dt [s].
 
-    impact: whether the contacts' velocity must be `min_velocity`, regardless of gaps. gap_targets (4,): of `ContactStep`.
-    tolerance: of the laws' residual.
+    impact: whether the contacts' velocity must be `min_velocity`, regardless of gaps. common_offset to max_speed: as of
+    `gap_minus_target`. tolerance: of the laws' residual.
     """
     p, w = ti.static((k.problem, k.work))
     ti.loop_config(serialize=p.serial)
@@ -101,11 +107,12 @@ def begin_contacts(
             w.gap_minus_target[c] = -beta * p.min_velocity[c] - (beta / dt) * p.normal[c].dot(p.obstacle_displacement[c])
             w.gap_weight[c] = 0.0
         else:
-            offset_target, fast, slow, fastest = gap_targets[0], gap_targets[1], gap_targets[2], gap_targets[3]
-            least = ti.cast(LEAST_GAP, ti.f64)
-            gap_to_target = gap_minus_target(p, c, dt, offset_target, fast, slow, fastest, p.min_opening[c], least)
+            opening, least = p.min_opening[c], ti.cast(LEAST_GAP, ti.f64)
+            gap_to_target = gap_minus_target(
+                p, c, dt, common_offset, penetration_fraction, offset_fraction, max_speed, opening, least
+            )
             w.gap_minus_target[c] = gap_to_target - p.normal[c].dot(p.obstacle_displacement[c])
-            wanted = contact_offset_of(p, c, offset_target)
+            wanted = contact_offset_of(p, c, common_offset)
             target = p.gap[c] - gap_to_target
             w.gap_weight[c] = 0.0
             if target > 0.0:
@@ -290,6 +297,8 @@ def build_stage_contacts(
         arena.field("contact_rounding", ti.f64, p.capacity),
         arena.vectors("contact_block", real, p.capacity, n=BLOCK),
         arena.field("contact_active", ti.i32, p.capacity),
+        arena.field("frictional_limits", ti.f64, N_LIMITS),
+        arena.field("frictional_loop", ti.f64, N_LOOP),
     )
     coupling = build_coupling(
         arena,

@@ -294,21 +294,6 @@ def advance_serial(m: ti.template(), s: ti.template(), n: ti.i32, dt: ti.f64, re
 
 
 @kernel
-def set_rows(out: ti.template(), rows: ti.types.ndarray()):
-    """Set the first 3-vectors of a field, the targets or loads of a batch, to rows (sub-steps * nodes, 3)."""
-    for k in range(rows.shape[0]):
-        for a in ti.static(range(3)):
-            out[k][a] = rows[k, a]
-
-
-@kernel
-def set_numbers(out: ti.template(), numbers: ti.types.ndarray()):
-    """Set the first entries of a field to numbers (k,)."""
-    for k in range(numbers.shape[0]):
-        out[k] = numbers[k]
-
-
-@kernel
 def run_elements(m: ti.template()):
     """Run the element loop of a sub-step. scalars: LOWEST_J, INVERTED_NOW, FAILED."""
     elasticity.sum_elements_with_damping(m)

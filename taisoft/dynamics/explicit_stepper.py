@@ -227,12 +227,12 @@ class ExplicitStepper:
         if targets is not None:
             self._upload_targets(targets)
         if loads is not None and self.work.has_varied_nodes:
-            explicit.set_rows(self.work.load_rows, loads[0].reshape(-1, 3))
+            self.work.load_rows.from_numpy(loads[0].reshape(-1, 3), 0)
         if loads is not None and self.work.has_varied_amplitudes:
-            explicit.set_numbers(self.work.amplitude_rows, loads[1].reshape(-1))
+            self.work.amplitude_rows.from_numpy(loads[1].reshape(-1), 0)
 
     def _upload_targets(self, targets: np.ndarray) -> None:
-        explicit.set_rows(self.work.targets, targets.reshape(-1, 3))
+        self.work.targets.from_numpy(targets.reshape(-1, 3), 0)
         upload([(self.work.prescribed_axes, self.simulation.dirichlet.prescribed_axes())])
 
     def _load_rows(self, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -28,7 +28,7 @@ import taichi as ti
 from taisoft.backend.runtime import kernel
 from taisoft.contact.problem import RESIDUAL
 from taisoft.contact.prox import dvec
-from taisoft.dynamics.contact_terms import PAST, open_disk, set_multiplier, sum_residual, update_contact
+from taisoft.dynamics.contact_terms import N_LIMITS, N_LOOP, PAST, open_disk, set_multiplier, sum_residual, update_contact
 from taisoft.dynamics.linearised import contact_slope, move_node_along, node_residual, node_slope, step_length
 from taisoft.linear.pcg_gauss_seidel import iterate_serial, start_serial
 from taisoft.linear.pcg_work import NEGATIVE
@@ -144,7 +144,7 @@ PROGRESS = 0.3  # fraction of |r| after a multiplier update to which the inner s
     SAME_MATRIX,
     STATUS,
     REMEMBERED,
-) = range(15)
+) = range(N_LOOP)
 RUNNING, SOLVED, FAILED, INDEFINITE = range(4)
 # indices into `limits`: |r| [N s] that ends the loop, that ends the steps under one multiplier, rounding floor; laws' residual
 # that ends the loop, tolerance of linear solves; maximum linear solves, CG iterations per solve and per launch; multipliers
@@ -162,7 +162,7 @@ RUNNING, SOLVED, FAILED, INDEFINITE = range(4)
     LATER_TOLERANCE,
     FRICTIONLESS,
     MAX_R,
-) = range(12)
+) = range(N_LIMITS)
 
 
 @ti.func
@@ -194,17 +194,9 @@ def _advance(m: ti.template(), s: ti.template(), A: ti.template(), k: ti.templat
 
 
 @kernel
-def solve_frictional(
-    m: ti.template(),
-    s: ti.template(),
-    A: ti.template(),
-    k: ti.template(),
-    beta: ti.f64,
-    limits: ti.types.ndarray(),
-    loop: ti.types.ndarray(),
-):
-    """Continue from the state in `loop` (15,); limits (12,)."""
-    (p,) = ti.static((k.problem,))
+def solve_frictional(m: ti.template(), s: ti.template(), A: ti.template(), k: ti.template(), beta: ti.f64):
+    """Continue from the state in `loop` of k.work, within its `limits`."""
+    p, limits, loop = ti.static((k.problem, k.work.limits, k.work.loop))
     ti.loop_config(serialize=True)
     for _ in range(1):
         r, scale, previous_law, target, floor = loop[NORM], loop[SCALE], loop[LAW_RESIDUAL], limits[TARGET], limits[FLOOR]

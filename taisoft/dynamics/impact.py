@@ -27,7 +27,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import taichi as ti
 
-from taisoft.backend.arrays import download
+from taisoft.backend.arrays import FieldArena, download
 from taisoft.backend.runtime import kernel
 from taisoft.contact.problem import ContactProblem, to_world
 from taisoft.contact.prox import dvec
@@ -36,7 +36,7 @@ from taisoft.dynamics.contact_terms import TO_IMPULSES
 from taisoft.dynamics.simulation_state import SimulationState
 from taisoft.fem.chunks import chunk_entry, chunk_size, fold, total
 from taisoft.fem.lanes import mass_times
-from taisoft.fem.state import OTHER_SUM, SUM
+from taisoft.fem.state import IMPACT_CURVATURE, IMPACT_SLOPE, NORMS, OTHER_SUM, SUM
 from taisoft.fem.terms import rayleigh_damping
 from taisoft.linear.block_csr import block_times
 
@@ -74,10 +74,10 @@ def impact_residual(m: ti.template(), A: ti.template(), k: ti.template(), i, tau
 
 
 @kernel
-def begin_impact(m: ti.template(), s: ti.template(), k: ti.template(), tau: ti.f64, norms: ti.types.ndarray()):
+def begin_impact(m: ti.template(), s: ti.template(), k: ti.template(), tau: ti.f64):
     """Begin the impact's stage at v_n without impulses, after the matrix was formed; save the last step's in `impact_impulse`.
 
-    norms: as in `form_residual`; the scale is the momentum of all nodes at the largest speed change of a contact.
+    scalars: NORMS, as in `form_residual`; the scale is the momentum of all nodes at the largest speed change of a contact.
     """
     (p,) = ti.static((k.problem,))
     ti.loop_config(serialize=m.serial)
@@ -95,13 +95,13 @@ def begin_impact(m: ti.template(), s: ti.template(), k: ti.template(), tau: ti.f
         for i in range(m.n_nodes):
             mass += ti.cast(m.mass[i], ti.f64) ** 2
         for j in ti.static(range(5)):
-            norms[j] = 0.0
-        norms[1] = mass * speed * speed
+            m.state.scalars[NORMS + j] = 0.0
+        m.state.scalars[NORMS + 1] = mass * speed * speed
 
 
 @kernel
-def measure_impact(m: ti.template(), s: ti.template(), k: ti.template(), tau: ti.f64, out: ti.types.ndarray()):
-    """Store the jump in s.change. out: E'(0) minus the recoverable energy, and E'' of E(s)."""
+def measure_impact(m: ti.template(), s: ti.template(), k: ti.template(), tau: ti.f64):
+    """Store the jump in s.change. scalars: IMPACT_SLOPE, IMPACT_CURVATURE, of E(s)."""
     (p,) = ti.static((k.problem,))
     ti.loop_config(serialize=m.serial)
     for i in range(m.n_nodes):
@@ -129,7 +129,7 @@ def measure_impact(m: ti.template(), s: ti.template(), k: ti.template(), tau: ti
             slope += to_world(p, c, p.r[c]).dot(u_fixed)
             if p.min_opening[c] > 0.0:
                 slope -= 0.5 * p.r[c][0] * ti.max(0.0, p.min_velocity[c] + p.approach[c])
-        out[0], out[1] = slope, total(m, OTHER_SUM)
+        m.state.scalars[IMPACT_SLOPE], m.state.scalars[IMPACT_CURVATURE] = slope, total(m, OTHER_SUM)
 
 
 @kernel
@@ -186,13 +186,13 @@ def solve_bouncing(system: "StageSystem", stage: "Stage") -> "StageResult":
     from taisoft.dynamics.newton import Newton
     from taisoft.dynamics.results import count_all, merge
 
-    m, w, tau, out = system.model, system.work, SPREAD * stage.dt, np.zeros(2)
+    m, w, tau = system.model, system.work, SPREAD * stage.dt
     impact_stage = replace(stage, beta=tau, contact_tolerance=max(stage.contact_tolerance, TOLERANCE), max_newton=SOLVES)
     k = system.begin_impact(impact_stage)
-    begin_impact(m, w, k, tau, system.norms)
+    begin_impact(m, w, k, tau)
     impact = Newton(system, impact_stage).run(*system.evaluate(new_multipliers=TO_IMPULSES), fresh=True)
-    measure_impact(m, w, k, tau, out)
-    slope, curvature = out
+    measure_impact(m, w, k, tau)
+    slope, curvature = m.state.scalars.to_numpy()[[IMPACT_SLOPE, IMPACT_CURVATURE]]
     gain = slope + 0.5 * curvature
     fraction = 1.0 if gain <= 0.0 else max(0.0, -2.0 * slope / curvature)
     slack = max(0.0, -fraction * (slope + 0.5 * fraction * curvature))  # 0 except for rounding if the jump is scaled down
@@ -214,9 +214,10 @@ class Rebounds:
     Free flight in dissipative steps loses energy, which a rebound may give back, see `contact.restitution`.
     """
 
-    def __init__(self, simulation: SimulationState):
+    def __init__(self, simulation: SimulationState, arena: FieldArena):
         self._simulation = simulation
         self.flight = np.zeros(len(simulation.scene.colliders))
+        self._flight = arena.field("flight", ti.f64, len(self.flight))  # for kernels
         self._gravity = simulation.scene.gravity.copy()  # during the flight
         self.numbers_changed()
 
@@ -232,7 +233,8 @@ class Rebounds:
         if (self._gravity != scene.gravity).any():  # energy lost under another gravity is unknown
             self._gravity = scene.gravity.copy()
             self.flight[:] = 0.0
-        return find_rebounds(problem, self._simulation.model.gravity, self.flight, dt, contact_offset) > 0
+        self._flight.from_numpy(self.flight)
+        return find_rebounds(problem, self._simulation.model.gravity, self._flight, dt, contact_offset) > 0
 
     def count_flight(self, problem: ContactProblem, n: int, dt: float, dissipative: bool) -> None:
         """Update `flight` after a substep of dt with n contacts. dissipative: whether free flight loses energy, as with

@@ -20,7 +20,7 @@ from taisoft.dynamics.contact_terms import (
 )
 from taisoft.dynamics.stage import norm_weight, place_node
 from taisoft.fem.chunks import THREADS, block_total, chunk_entry, chunk_size, fold, share, total
-from taisoft.fem.state import OTHER_SUM, STEP_LENGTH, SUM
+from taisoft.fem.state import NORMS, OTHER_SUM, STEP_LENGTH, SUM
 from taisoft.linear.block_csr import block_times, off_diagonal_times
 from taisoft.linear.pcg_work import dot64
 
@@ -155,20 +155,9 @@ def node_residual(m: ti.template(), s: ti.template(), k: ti.template(), i):
 
 
 @kernel
-def advance(
-    m: ti.template(),
-    s: ti.template(),
-    A: ti.template(),
-    k: ti.template(),
-    beta: ti.f64,
-    r_scale: ti.f64,
-    norms: ti.types.ndarray(),
-):
-    """Move along y of s.pcg to zero slope; update x, v, impulses, blocks, residual, and -r as CG's right side.
-
-    norms (5,): only |r|^2 on the free axes is set. scalars: STEP_LENGTH.
-    """
-    p, w = ti.static((k.problem, k.work))
+def find_step_length(m: ti.template(), s: ti.template(), A: ti.template(), k: ti.template(), beta: ti.f64, r_scale: ti.f64):
+    """Find the zero of the slope along y of s.pcg. scalars: STEP_LENGTH."""
+    (p,) = ti.static((k.problem,))
     ti.loop_config(serialize=m.serial)
     for task in range(m.chunks * m.spread):
         if task % m.spread == 0:
@@ -192,6 +181,12 @@ def advance(
         ti.loop_config(block_dim=THREADS)
         for t in range(THREADS):
             _find_step_length(m, k, r_scale, t, THREADS)
+
+
+@kernel
+def advance(m: ti.template(), s: ti.template(), k: ti.template(), beta: ti.f64, r_scale: ti.f64):
+    """Move along y to there; update x, v, impulses, blocks, residual, and -r as CG's right side. scalars: the first of NORMS."""
+    (p,) = ti.static((k.problem,))
     ti.loop_config(serialize=m.serial)
     for i in range(m.n_nodes):
         move_node_along(m, s, k, i, m.state.scalars[STEP_LENGTH], beta)
@@ -210,4 +205,4 @@ def advance(
     fold(m, SUM, SUM, ())
     ti.loop_config(serialize=True)
     for _ in range(1):
-        norms[0] = total(m, SUM)
+        m.state.scalars[NORMS] = total(m, SUM)

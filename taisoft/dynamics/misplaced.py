@@ -19,6 +19,7 @@ Weak: the work of a force that is misplaced across the slip is 0; contacts with 
 import numpy as np
 import taichi as ti
 
+from taisoft.backend.arrays import FieldArena
 from taisoft.backend.runtime import kernel
 from taisoft.collision.contacts import EDGE_EDGE, FACE_FACE, VERTEX_FACE
 from taisoft.collision.detector import Detection
@@ -59,6 +60,20 @@ def _side(s: ti.template(), t, u, i, j):
 
 
 @ti.func
+def _normal_on_shape(p: ti.template(), m: ti.template(), o: ti.template(), c, lasting):
+    """`_end_normal` of a contact with an analytic obstacle, or with none of the kinds that it follows."""
+    n, end, gap, is_smooth, was_smooth = p.normal[c], 1.0 * p.normal[c], lasting, True, True
+    if ti.static(o.any):
+        x = dvec(0.0)
+        for k in range(p.arity[c]):
+            x += p.weight[c, k] * m.state.x[p.node[c, k]]
+        v, d, flag, before = normal_on_shape(o, p.body[c][1], x, n)
+        if v.dot(v) > 0.0:
+            end, gap, is_smooth, was_smooth = v, d, flag, before
+    return end, gap, is_smooth, was_smooth
+
+
+@ti.func
 def _end_normal(p: ti.template(), m: ti.template(), s: ti.template(), o: ti.template(), c, lasting):
     """Normal (3,) of contact c at the present positions, its gap [m], and whether its point lies on a smooth part of a surface
     now, and did at first. lasting: what the gap counts as where the normal does not change [m]."""
@@ -80,13 +95,7 @@ def _end_normal(p: ti.template(), m: ti.template(), s: ti.template(), o: ti.temp
         else:
             vertex, face, side = s.triangle[u, k - 3], t, -side
     elif kind != FACE_FACE or one % N_KINDS != ADJACENT:
-        if ti.static(o.any):
-            x = dvec(0.0)
-            for k in range(p.arity[c]):
-                x += p.weight[c, k] * m.state.x[p.node[c, k]]
-            v, d, flag, before = normal_on_shape(o, p.body[c][1], x, n)
-            if v.dot(v) > 0.0:
-                end, gap, is_smooth, was_smooth = v, d, flag, before
+        end, gap, is_smooth, was_smooth = _normal_on_shape(p, m, o, c, lasting)
     own, foot, first, second, n_points = dvec(0.0), dvec(0.0), face, -1, int(vertex >= 0)
     if vertex >= 0:
         own = s.x[vertex]
@@ -115,14 +124,20 @@ def _end_normal(p: ti.template(), m: ti.template(), s: ti.template(), o: ti.temp
 
 
 @ti.func
-def _false_work(p: ti.template(), m: ti.template(), s: ti.template(), o: ti.template(), c, dt, contact_offset):
+def _false_work(
+    p: ti.template(), m: ti.template(), s: ti.template(), o: ti.template(), has_pairs: ti.template(), c, dt, contact_offset
+):
     """What contact c adds to S, W and the work of friction of its pair, (3,) [J s], at the end of a step of dt [s]."""
     n, r, false = p.normal[c], to_world(p, c, p.r[c]), dvec(0.0)
     u = dt * relative_velocity(p, m, c, dt)
     lasting = p.gap[c] + u.dot(n)
     slip, across = u - u.dot(n) * n, r - r.dot(n) * n
     if slip.norm() > ti.cast(AT_REST, ti.f64) * contact_offset:
-        end, gap, is_smooth, was_smooth = _end_normal(p, m, s, o, c, lasting)
+        end, gap, is_smooth, was_smooth = 1.0 * n, lasting, True, True
+        if ti.static(has_pairs):
+            end, gap, is_smooth, was_smooth = _end_normal(p, m, s, o, c, lasting)
+        else:
+            end, gap, is_smooth, was_smooth = _normal_on_shape(p, m, o, c, lasting)
         left = ti.select(was_smooth, ti.cast(0.0, ti.f64), ti.cast(LEFT, ti.f64) * slip.norm())
         if is_smooth or gap - lasting <= left:
             turned = across - end.dot(across) / ti.max(1.0 + n.dot(end), 1e-6) * (n + end)
@@ -136,12 +151,14 @@ def add_step(
     m: ti.template(),
     s: ti.template(),
     o: ti.template(),
+    has_pairs: ti.template(),
     dt: ti.f64,
     contact_offset: ti.f64,
     n_colliders: ti.i32,
-    sums: ti.types.ndarray(),
+    sums: ti.template(),
+    n_rows: ti.i32,
 ) -> ti.i32:
-    """Add a step of dt [s] to the sums (k,9) of pairs.
+    """Add a step of dt [s] to the sums (n_rows,9) of pairs. has_pairs: whether contacts may be of two triangles.
 
     Return the row of the pair of the largest misplaced part among those that touch, -1 if none does, -2 without change if there
     are too few rows. p.sweep_start is used as workspace.
@@ -150,11 +167,11 @@ def add_step(
     for c in range(p.count[0]):
         p.sweep_start[c] = dvec(0.0)
         if p.r[c][0] > 0.0:
-            p.sweep_start[c] = _false_work(p, m, s, o, c, dt, contact_offset)
+            p.sweep_start[c] = _false_work(p, m, s, o, has_pairs, c, dt, contact_offset)
     worst = -1
     ti.loop_config(serialize=True)
     for _ in range(1):
-        n_rows, row = sums.shape[0], 0
+        row = 0
         for k in range(n_rows):
             for q in ti.static(range(4)):
                 sums[k, NOW + q] = 0.0
@@ -190,6 +207,8 @@ class Misplacement:
 
     def __init__(self, simulation: SimulationState, detection: Detection):
         self._simulation, self._detection = simulation, detection
+        self._arena = FieldArena()
+        self._sums = self._arena.field("misplaced", ti.f64, (0, COLUMNS))
         self.forget()
 
     def forget(self) -> None:
@@ -199,29 +218,43 @@ class Misplacement:
 
     def snapshot(self) -> np.ndarray:
         """Return the sums (k,9)."""
-        return self._sums[self._sums[:, PAIR] >= 0.0]
+        sums = self._sums.to_numpy()
+        return sums[sums[:, PAIR] >= 0.0]
 
     def restore(self, kept: np.ndarray) -> None:
         """Restore a `snapshot`."""
-        self._sums = np.concatenate([kept, np.tile(UNUSED, (PAIRS, 1))])
-        self._start = self._sums.copy()
+        self._store(np.concatenate([kept, np.tile(UNUSED, (PAIRS, 1))]))
+        self._start = self._sums.to_numpy()
+
+    def _store(self, sums: np.ndarray) -> None:
+        """Put the sums where kernels find them."""
+        if self._sums.shape[0] == len(sums):
+            self._sums.from_numpy(sums)
+        else:
+            self._arena.release()
+            self._sums = self._arena.field("misplaced", ti.f64, sums.shape, sums)
+
+    def release(self) -> None:
+        """Free their memory."""
+        self._arena.release()
 
     def start_step(self) -> None:
         """Begin a step."""
         self.part, self.text = 0.0, ""  # largest misplaced part in this step, and a sentence if that is too much
-        self._start = self._sums.copy()
+        self._start = self._sums.to_numpy()
 
     def return_to_start(self) -> None:
         """Discard what was added since the step began."""
-        self._sums = self._start
+        self._store(self._start)
         self.start_step()
 
     def add(self, p: ContactProblem, dt: float, contact_offset: float) -> None:
         """Add a substep of dt [s], whose end was searched last."""
         d, n = self._detection, len(self._detection.scene.colliders)
-        records = p, self._simulation.model, d.surface, d.shapes
-        while (row := add_step(*records, dt, contact_offset, n, self._sums)) == -2:
-            self._sums = np.concatenate([self._sums, np.tile(UNUSED, (len(self._sums), 1))])
+        records = p, self._simulation.model, d.surface, d.shapes, d.has_pairs
+        while (row := add_step(*records, dt, contact_offset, n, self._sums, self._sums.shape[0])) == -2:
+            sums = self._sums.to_numpy()
+            self._store(np.concatenate([sums, np.tile(UNUSED, (len(sums), 1))]))
         if row < 0:
             return
         slip, false, friction, largest, slip_now, false_now, *_, pair = self._sums[row].tolist()
@@ -235,7 +268,8 @@ class Misplacement:
     def _share(self, row: int) -> float:
         """Return the part that a row has of the impulses of this step on its two bodies, that in which it has more."""
         n = len(self._detection.scene.colliders)
-        of, now = np.stack(np.divmod(self._sums[:, PAIR], n), axis=1), self._sums[:, IMPULSE]
+        sums = self._sums.to_numpy()
+        of, now = np.stack(np.divmod(sums[:, PAIR], n), axis=1), sums[:, IMPULSE]
         bodies = of[row][of[row] < len(self._detection.scene.bodies)]
         return max(float(now[row] / now[(of == body).any(axis=1)].sum()) for body in bodies)
 

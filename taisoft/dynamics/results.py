@@ -48,6 +48,8 @@ def relative(r: float, scale: float) -> float:
 
 def merge(results: list[StageResult]) -> StageResult:
     """Merge the substeps of a step: total iterations, largest residuals."""
+    if len(results) == 1:
+        return results[0]
     return StageResult(
         sum(r.newton_iterations for r in results),
         sum(r.linear_iterations for r in results),
@@ -64,6 +66,8 @@ def merge(results: list[StageResult]) -> StageResult:
 
 def count_all(result: StageResult, discarded: list[StageResult]) -> StageResult:
     """Return the result of a step plus the iterations of discarded attempts."""
+    if not discarded:
+        return result
     total = merge([result, *discarded])
     return replace(
         result,

@@ -23,7 +23,7 @@ from taisoft.fem.lanes import mass_times
 from taisoft.fem.model import Model
 from taisoft.fem.node_graph import BLOCKS, EDGES, NODES, Subset, n_nodes_of, node_of, whole_rows
 from taisoft.fem.pattern import patch_nodes
-from taisoft.fem.state import END_SLOPE, N_NORMS, OTHER_SUM, START_SLOPE, SUM
+from taisoft.fem.state import END_SLOPE, N_NORMS, NORMS, OTHER_SUM, START_SLOPE, SUM
 from taisoft.fem.terms import elasticity, rayleigh_damping
 from taisoft.linear.block_csr import BlockCsr, stiffness_times
 from taisoft.linear.pcg_work import PcgWork, dot64
@@ -233,20 +233,11 @@ def move(
 
 
 @kernel
-def form_residual(
-    m: ti.template(),
-    s: ti.template(),
-    A: ti.template(),
-    k: ti.template(),
-    kind: ti.template(),
-    beta: ti.f64,
-    norms: ti.types.ndarray(),
-):
+def form_residual(m: ti.template(), s: ti.template(), A: ti.template(), k: ti.template(), kind: ti.template(), beta: ti.f64):
     """Form the residual on the nodes of s.pcg.subset, and -r as CG's right side, after `move` and `update_impulses`.
 
-    norms (5,), a host array, which is faster than a returned vector: |r|^2, |inertia and mass damping|^2, |f_el|^2, |f_ext|^2
-    on the free axes, and |r|^2 on the others; only those of r if kind is not ELASTIC_STAGE.
-    scalars: END_SLOPE.
+    scalars: END_SLOPE, and from NORMS on |r|^2, |inertia and mass damping|^2, |f_el|^2, |f_ext|^2 on the free axes, and |r|^2 on
+    the others; only those of r if kind is not ELASTIC_STAGE.
     """
     ti.loop_config(serialize=m.serial)
     for task in range(m.chunks * m.spread):
@@ -281,7 +272,7 @@ def form_residual(
     ti.loop_config(serialize=True)  # outside of any loop, the sum would become a parallel loop of its own, 50 us and more
     for _ in range(1):
         for j in ti.static(range(N_NORMS) if kind == ELASTIC_STAGE else (0, 4)):
-            norms[j] = total(m, j)
+            m.state.scalars[NORMS + j] = total(m, j)
         m.state.scalars[END_SLOPE] = total(m, SUM)
 
 
@@ -309,8 +300,9 @@ class SubsetLists:
         self._block = np.zeros(len(entry), dtype=np.int32)  # of each tet at each node
         for g in m.groups:
             size = 3 * g.n_nodes * m.lanes
-            own = (entry >= g.force_at) & (entry < g.force_at + (g.last - g.first) * size)
-            self._block[own] = g.first + (entry[own] - g.force_at) // size
+            block, own = (entry - g.force_at * m.lanes) // size, entry >= g.force_at * m.lanes
+            own &= block < g.last - g.first
+            self._block[own] = g.first + block[own]
         if m.mean_dilatation:  # a node changes the pressure on all tets of its patches
             self._tet_start, self._block = _with_patches(m, self._tet_start, self._block)
         self._arena = FieldArena()

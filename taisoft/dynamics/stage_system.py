@@ -21,6 +21,7 @@ from taisoft.contact.problem import RESIDUAL, find_factors
 from taisoft.dynamics import frictional, rigid_balance
 from taisoft.dynamics.contact_terms import (
     KEEP,
+    N_LOOP,
     NO_CONTACTS,
     TO_IMPULSES,
     StageContacts,
@@ -31,7 +32,7 @@ from taisoft.dynamics.contact_terms import (
 )
 from taisoft.dynamics.direct import DirectSolver
 from taisoft.dynamics.linear_solver import LinearSolver
-from taisoft.dynamics.linearised import LONGEST, advance, begin_linearised, end_linearised
+from taisoft.dynamics.linearised import LONGEST, advance, begin_linearised, end_linearised, find_step_length
 from taisoft.dynamics.newton_budget import NewtonBudget
 from taisoft.dynamics.pieces import Pieces
 from taisoft.dynamics.rigid_balance import (
@@ -62,7 +63,7 @@ from taisoft.dynamics.stage import (
     set_direction_to_rest,
 )
 from taisoft.fem.node_graph import EVERYTHING, Subset
-from taisoft.fem.state import END_SLOPE, START_SLOPE, STEP_LENGTH
+from taisoft.fem.state import END_SLOPE, N_NORMS, NORMS, START_SLOPE, STEP_LENGTH
 from taisoft.linear import block_csr, pcg, volume_pcg
 from taisoft.linear.block_csr import BlockCsr
 from taisoft.linear.pcg_work import LinearResult, build_pcg
@@ -162,7 +163,6 @@ class StageSystem:
         self._volumes: volume_pcg.VolumeSystem | None = None  # whose iterates keep the volumes of patches
         self._same_matrix = False  # whether the matrix is that of the last linear solve of this stage
         self.n_formed = 0  # times that the matrix was formed
-        self.norms = np.zeros(5)  # result of `form_residual`
 
     # --- state ----------------------------------------------------------------------------------------------------
 
@@ -227,7 +227,7 @@ class StageSystem:
     @property
     def is_balanced(self) -> bool:
         """Whether |r| was within the stage's tolerance at its last evaluation."""
-        return math.sqrt(self.norms[0]) <= self.stage.tolerance * self.scale
+        return math.sqrt(self.model.state.scalars[NORMS]) <= self.stage.tolerance * self.scale
 
     @property
     def contact_residual(self) -> float:
@@ -299,8 +299,7 @@ class StageSystem:
             return
         self._allocate_contacts()
         self._k, impact = self._stage_contacts, kind == IMPACT
-        targets = np.array(self.contact.gap_targets)
-        begin_contacts(self.work, self._k, impact, stage.beta, stage.dt, targets, stage.contact_tolerance)
+        begin_contacts(self.work, self._k, impact, stage.beta, stage.dt, *self.contact.gap_targets, stage.contact_tolerance)
         self.frictionless = not download([self._k.problem.friction], self.n_contacts)[0].any()
         if self.work.pcg.has_last(self._k.coupling):
             find_last(self.model, self.matrix, self._k.coupling, self.work.pcg)
@@ -318,7 +317,7 @@ class StageSystem:
                 self.multipliers.measure()
         if k.any:
             update_impulses(m, k, new_multipliers, stage.beta, self.r_scale)
-        form_residual(m, w, self.matrix, k, self.kind, stage.beta, self.norms)
+        form_residual(m, w, self.matrix, k, self.kind, stage.beta)
         return self._norm_and_scale(stage.c, stage.beta)
 
     def evaluate_start(self) -> tuple[float, float]:
@@ -438,7 +437,9 @@ class StageSystem:
     def advance(self) -> tuple[float, float]:
         """Move a linearised stage along y to zero slope; return (|r|, scale) there."""
         stage = self.stage
-        advance(self.model, self.work, self.matrix, self._k, stage.beta, self.r_scale, self.norms)
+        m, s, k = self.model, self.work, self._k
+        find_step_length(m, s, self.matrix, k, stage.beta, self.r_scale)
+        advance(m, s, k, stage.beta, self.r_scale)
         return self._norm_and_scale(stage.c, stage.beta)
 
     @property
@@ -453,7 +454,7 @@ class StageSystem:
 
     def solve_frictional(self, problem: Stage, r: float, floor: float) -> np.ndarray:
         """Run the loop of a linearised stage from |r|, in launches that Ctrl-C can interrupt between: see `frictional`."""
-        m, A, loop, limits = self.model, self.matrix, np.zeros(15), np.zeros(12)
+        m, A, k, loop = self.model, self.matrix, self._k, np.zeros(N_LOOP)
         loop[[frictional.NORM, frictional.SCALE, frictional.LAW_RESIDUAL, frictional.INNER_TARGET, frictional.SAME_MATRIX]] = (
             r,
             problem.first_r_scale,
@@ -461,8 +462,7 @@ class StageSystem:
             frictional.PROGRESS * r,
             self._same_matrix,
         )
-        # in the order of the indices in `frictional`
-        limits[:] = (
+        limits = (  # in the order of the indices in `frictional`
             problem.tolerance * self.scale,
             problem.inner_tolerance * self.scale,
             floor,
@@ -476,8 +476,10 @@ class StageSystem:
             self.frictionless,
             problem.max_r_scale,
         )
+        upload([(k.work.limits, np.array(limits, dtype=np.float64)), (k.work.loop, loop)])
         while loop[frictional.STATUS] == frictional.RUNNING:
-            frictional.solve_frictional(m, self.work, A, self._k, problem.beta, limits, loop)
+            frictional.solve_frictional(m, self.work, A, k, problem.beta)
+            loop = k.work.loop.to_numpy()
         self._same_matrix = bool(loop[frictional.SAME_MATRIX])
         return loop
 
@@ -502,7 +504,8 @@ class StageSystem:
 
     def _norm_and_scale(self, c: float, beta: float) -> tuple[float, float]:
         """Return (|r|, scale) from the norms of `form_residual`."""
-        r, inertia, elastic, external, held = (math.sqrt(square) for square in self.norms)
+        norms = self.model.state.scalars.to_numpy()[NORMS : NORMS + N_NORMS]
+        r, inertia, elastic, external, held = (math.sqrt(square) for square in norms)
         if c == 0.0:
             self.scale = beta * external if external > 0.0 else held
         else:

@@ -5,10 +5,35 @@ With d_a = x_a - x_0 and c_a(q) = dN_a/d(l_1, l_2, l_3) at a quadrature point,
 For order 1, c_a are the unit vectors, one point suffices, and F = Ds Dm^-1.
 """
 
+from collections.abc import Callable
+from typing import Any
+
 import taichi as ti
 
+from taisoft.backend.runtime import CPU_LANES, compiled_function
 from taisoft.fem.laws import n_constants
 from taisoft.fem.math3 import ddot, dot, matmul_tn
+
+FIRST_LANE_MASK = 2**31 - CPU_LANES  # of an index: it shows the compiler that those of the other lanes do not overflow
+
+
+def _storing(real: Any, number: int) -> Callable:
+    """Return a function that is compiled once and called, which stores a vector of lanes in a row.
+
+    LLVM merges such stores, and vectorises what is stored, only if it can prove that their addresses are adjacent. The address of
+    an array is reloaded before each store, which prevents the proof; that of a function's argument is not.
+    """
+
+    @compiled_function(number)
+    def store(out: ti.types.ndarray(dtype=real, ndim=1), at: ti.i32, values: ti.types.vector(CPU_LANES, real)):
+        first = at & FIRST_LANE_MASK
+        for q in ti.static(range(CPU_LANES)):
+            out[first + q] = values[q]
+
+    return store
+
+
+STORE = {ti.f32: _storing(ti.f32, 1_000_001), ti.f64: _storing(ti.f64, 1_000_002)}
 
 
 @ti.func
@@ -129,31 +154,30 @@ def add_forces(m: ti.template(), g: ti.template(), S: ti.template(), P, M, q):
 @ti.func
 def load_lanes(m: ti.template(), source: ti.template(), at):
     """Load the vector of lanes that begins at entry `at * lanes`."""
-    return ti.Vector([source[at * m.lanes + q] for q in ti.static(range(m.lanes))])
+    first = (at * m.lanes) & (2**31 - m.lanes)
+    return ti.Vector([source[first + q] for q in ti.static(range(m.lanes))])
 
 
 @ti.func
 def store_lanes(m: ti.template(), out: ti.template(), at, values):
-    """Store a vector of lanes from entry `at * lanes`, lane by lane, which LLVM vectorises."""
-    for q in ti.static(range(m.lanes)):
-        out[at * m.lanes + q] = values[q]
+    """Store a vector of lanes from entry `at * lanes` on."""
+    if ti.static(m.lanes == CPU_LANES):
+        STORE[m.real](out, at * m.lanes, ti.cast(values, m.real))
+    else:
+        out[at] = values[0]
 
 
 @ti.func
 def store_forces(m: ti.template(), g: ti.template(), b, S):
-    """Write the nodal forces -V S [N] of block b to `State.element_force`, lane by lane, which LLVM vectorises."""
-    V = -volumes(m, b, g.real)
-    # the mask shows the compiler that no index overflows, so that it vectorises over lanes
-    base = (m.state.element_force_at + g.force_at + (b - g.first) * (3 * g.n_nodes * m.lanes)) & m.state.element_force_mask
+    """Write the nodal forces -V S [N] of block b to `State.element_force`."""
+    V, base = -volumes(m, b, g.real), g.force_at + (b - g.first) * (3 * g.n_nodes)
     for i in ti.static(range(3)):
         total = broadcast(ti.cast(0.0, g.real), m.lanes)
         for a in ti.static(range(1, g.n_nodes)):
             f = V * S[3 * a - 3 + i]
             total += f
-            for q in ti.static(range(m.lanes)):
-                m.state.element_force[base + ((3 * a + i) * m.lanes + q)] = ti.cast(f[q], m.real)
-        for q in ti.static(range(m.lanes)):
-            m.state.element_force[base + (i * m.lanes + q)] = ti.cast(-total[q], m.real)
+            store_lanes(m, m.state.element_force, base + 3 * a + i, f)
+        store_lanes(m, m.state.element_force, base + i, -total)
 
 
 @ti.func
@@ -176,7 +200,7 @@ def gather(m: ti.template(), i):
     """Sum of the tets' forces on node i [N], in a fixed order."""
     f = ti.Vector([0.0, 0.0, 0.0], m.real)
     for k in range(m.gather_start[i], m.gather_start[i + 1]):
-        e = (m.state.element_force_at + m.gather_entry[k]) & m.state.element_force_mask
+        e = m.gather_entry[k]
         f += ti.Vector([m.state.element_force[e], m.state.element_force[e + m.lanes], m.state.element_force[e + 2 * m.lanes]])
     return f
 

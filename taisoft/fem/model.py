@@ -55,7 +55,7 @@ class Group:
     first: Count  # first block
     last: Count  # one past the last block
     nodes_at: Count  # offset in Model.nodes
-    force_at: Count  # offset in State.element_force
+    force_at: Count  # offset in State.element_force, in vectors of lanes
     matrix_at: Count  # offset in the assembly buffer
     points_at: Count  # first row in Model.points
     real: Any = None  # Taichi type of stress
@@ -207,7 +207,7 @@ def _layout(scene: Scene, lanes: int) -> tuple[Layout, tuple[Group, ...]]:
         offsets = first, block, nodes_at, force_at, matrix_at, points_at
         groups.append(Group(law_of(laws[law], floor), order, n_nodes, n_points[degree], *switches, *offsets))
         nodes_at += count * n_nodes
-        force_at += count * n_nodes * 3
+        force_at += (block - first) * n_nodes * 3
         matrix_at += (block - first) * MATRIX_BLOCKS[order] * 9
     rest = np.concatenate([b.rest_positions + b.position for b in bodies])
     node_start = np.concatenate([[0], np.cumsum([b.n_nodes for b in bodies])])
@@ -259,7 +259,7 @@ def _gather_table(nodes, groups: tuple[Group, ...], real: np.ndarray, n_nodes: i
         lane = np.flatnonzero(real[g.first * lanes : g.last * lanes])
         base = (lane // lanes)[:, None] * (3 * g.n_nodes * lanes) + (lane % lanes)[:, None]
         ids.append(own[lane].reshape(-1))
-        entries.append((g.force_at + base + 3 * lanes * np.arange(g.n_nodes)).reshape(-1))
+        entries.append((g.force_at * lanes + base + 3 * lanes * np.arange(g.n_nodes)).reshape(-1))
     node, entry = np.concatenate(ids), np.concatenate(entries)
     order = np.argsort(node, kind="stable")
     start = np.concatenate([[0], np.cumsum(np.bincount(node, minlength=n_nodes))])

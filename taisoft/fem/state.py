@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import taichi as ti
 
-from taisoft.backend.arrays import Count, FieldArena
+from taisoft.backend.arrays import FieldArena
 from taisoft.backend.runtime import Runtime
 
 # Of a state: energies [J], smallest J = det F, number of inverted tets; the first tet, by blocks and lanes, so compressed that
@@ -19,9 +19,11 @@ ELASTIC, MIN_J, N_INVERTED, KINETIC, GRAVITY, FIRST_SOFTENED, LOADS = range(7)
 STEPS_DONE, LOWEST_J, MOST_INVERTED, INVERTED_NOW, FAILED = range(7, 12)
 # r.y at the start and end of a Newton step (negative is downhill); length of the step taken by a linearised stage
 START_SLOPE, END_SLOPE, STEP_LENGTH = range(12, 15)
-N_SCALARS = 15
+NORMS, N_NORMS = 15, 5  # of a residual, see `form_residual`; in `State.partial` the first columns
+# Of an impact: E'(0) minus the recoverable energy, E''; of a path: largest distance of a vertex from the searched one [m]
+IMPACT_SLOPE, IMPACT_CURVATURE, DEVIATION = range(20, 23)
+N_SCALARS = 23
 
-N_NORMS = 5  # first columns: norms of a residual
 SUM, OTHER_SUM, N_COLUMNS = 5, 6, 8  # further columns; `measure` uses the columns of its scalars
 
 
@@ -31,22 +33,17 @@ class State:
 
     x: Any  # (n_nodes) 3-vectors f64: positions [m]
     v: Any  # (n_nodes) 3-vectors f64: velocities [m/s]; an f32 one would bend small bodies that are fast by its rounding
-    element_force: Any  # forces of each tet on its nodes [N], per block (node, axis, lane): a `Lanes` buffer
-    element_force_at: Count  # first entry of that buffer
-    element_force_mask: int  # index mask of that buffer
+    element_force: Any  # forces of each tet on its nodes [N], per block (node, axis, lane)
     scalars: Any  # (N_SCALARS) f64: results for the host, indexed by ELASTIC and so on
     partial: Any  # (chunks, N_COLUMNS) f64: partial sums, added in a fixed order
 
 
 def build_state(arena: FieldArena, runtime: Runtime, x: np.ndarray, v: np.ndarray, n_force_entries: int, chunks: int) -> State:
     """Allocate a state and fill it with x and v (n_nodes, 3). n_force_entries: size of `element_force`."""
-    force = arena.lanes("element_force", runtime.real, n_force_entries)
     return State(
         x=arena.vectors("x", ti.f64, len(x), x),
         v=arena.vectors("v", ti.f64, len(v), v),
-        element_force=force.memory,
-        element_force_at=force.at,
-        element_force_mask=force.mask,
+        element_force=arena.field("element_force", runtime.real, n_force_entries),
         scalars=arena.field("scalars", ti.f64, N_SCALARS),
         partial=arena.field("partial", ti.f64, (chunks, N_COLUMNS)),
     )

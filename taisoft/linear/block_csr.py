@@ -46,9 +46,7 @@ class BlockCsr:
     diagonal: Any  # (n_nodes) 12-vectors
     row_sum: Any  # 4-vectors: written but not read, see `keep_padding_lane`
     row_sum_mask: int  # of the chunks that write to it
-    element: Any  # K_ab of each tet, per block of tets (pair, entry, lane): a `Lanes` buffer
-    element_at: Count  # its start, in vectors of lanes
-    element_mask: int  # bit mask of an index into it, in vectors of lanes
+    element: Any  # K_ab of each tet, per block of tets (pair, entry, lane)
     edge_start: Any  # (n_edges + 1) i32: rows of edge_entry
     edge_entry: Any  # i32: index into element, lanes times the first entry plus the lane
     edge_upper: Any  # (n_edges) i32: index of K_ij in value
@@ -99,7 +97,6 @@ def build_block_csr(model: Model, arena: FieldArena, prefix: str = "stiffness") 
         rules["patches"] = build_patch_terms(model, arena, prefix, of_patches, n_edges)
     size = sum((g.last - g.first) * MATRIX_BLOCKS[g.order] * 9 for g in model.groups)
     chunks = model.chunks if model.on_cpu else 1  # a power of two
-    element = arena.lanes(f"{prefix}_element", model.real, size * model.lanes)
     return BlockCsr(
         n_edges=n_edges,
         row_start=copied("row_start", graph.row_start),
@@ -107,9 +104,7 @@ def build_block_csr(model: Model, arena: FieldArena, prefix: str = "stiffness") 
         **_values(model, arena, prefix, n_edges),
         row_sum=arena.vectors(f"{prefix}_row_sum", model.real, ROW_SUM_STEP * (chunks - 1) + 1, n=4),
         row_sum_mask=chunks - 1,
-        element=element.memory,
-        element_at=element.at // model.lanes,
-        element_mask=element.mask // model.lanes,
+        element=arena.field(f"{prefix}_element", model.real, size * model.lanes),
         edge_start=copied("edge_start", np.concatenate([[0], np.cumsum(np.bincount(of_tets, minlength=n_edges))])),
         edge_entry=copied("edge_entry", base[by_edge]),
         edge_upper=copied("edge_upper", graph.upper),
@@ -158,7 +153,7 @@ def gather_edge(m: ti.template(), A: ti.template(), e, projected: ti.template())
     """Sum the element blocks, and terms of patches, of one edge and write K_ij and K_ji."""
     s = ti.Vector([0.0 for _ in ti.static(range(BLOCK))], m.real)
     for k in range(A.edge_start[e], A.edge_start[e + 1]):
-        at = (A.element_at * m.lanes + A.edge_entry[k]) & (A.element_mask * m.lanes + m.lanes - 1)
+        at = A.edge_entry[k]
         for r in ti.static(range(3)):
             for c in ti.static(range(3)):
                 if ti.static(A.is_expanded):

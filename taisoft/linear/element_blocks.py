@@ -56,7 +56,7 @@ def element_blocks(m: ti.template(), g: ti.template(), A: ti.template(), b, proj
     p = stress_constants(m, g, b, m.real)
     M = rest_gradients(m, b, m.real)
     V = volumes(m, b, m.real)
-    base = (A.element_at + g.matrix_at + (b - g.first) * (MATRIX_BLOCKS[g.order] * 9)) & A.element_mask  # see `LanePool`
+    base = g.matrix_at + (b - g.first) * (MATRIX_BLOCKS[g.order] * 9)
     if ti.static(g.order == 2):
         for k in range(N_PAIRS * 9):
             store_lanes(m, A.element, base + k, broadcast(ti.cast(0.0, m.real), m.lanes))

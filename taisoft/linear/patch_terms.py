@@ -94,7 +94,7 @@ def find_gradients(m: ti.template(), A: ti.template()):
     for k in range(A.patches.n_entries):
         s = ti.Vector([0.0, 0.0, 0.0], m.real)
         for n in range(A.patches.gather_start[k], A.patches.gather_start[k + 1]):
-            at = (A.element_at * m.lanes + A.patches.gather[n]) & (A.element_mask * m.lanes + m.lanes - 1)
+            at = A.patches.gather[n]
             s += ti.Vector([A.element[at], A.element[at + m.lanes], A.element[at + 2 * m.lanes]])
         A.patches.gradient[k] = s
 
@@ -109,7 +109,7 @@ def element_gradients(m: ti.template(), g: ti.template(), A: ti.template(), b):
         F = deformation_gradient(m, g, X, N, q, m.real)
         G = g.law.dilatation_gradient(F)
         add_forces(m, g, S, G, M, q)
-    base = (A.element_at + g.matrix_at + (b - g.first) * (MATRIX_BLOCKS[g.order] * 9)) & A.element_mask
+    base = g.matrix_at + (b - g.first) * (MATRIX_BLOCKS[g.order] * 9)
     for i in ti.static(range(3)):
         total = broadcast(ti.cast(0.0, m.real), m.lanes)
         for a in ti.static(range(1, g.n_nodes)):

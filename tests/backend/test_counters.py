@@ -12,8 +12,8 @@ import taichi as ti
 import taisoft as ts
 from taisoft.backend import arrays, launching, runtime
 from taisoft.backend.arrays import Array, FieldArena
+from taisoft.backend.compiled import Compiled
 from taisoft.backend.counters import ACCESSES, counting, device_only
-from taisoft.backend.launching import Compiled
 from taisoft.backend.runtime import kernel
 from tests.backend.lanes import opened
 from tests.dynamics.scenes import SNH, cube, rubber
@@ -33,11 +33,12 @@ def double(x: ti.template()):
         x[i] *= 2.0
 
 
-@pytest.fixture(params=[False, True], ids=["fast", "public"])
+@pytest.fixture(params=["pack", "flat", "public"])
 def arena(request, monkeypatch):
-    """An arena with the fast launch or Taichi's public one."""
-    monkeypatch.setattr(launching, "PUBLIC", request.param)
-    runtime.forget()  # kernels compiled for the other launch
+    """An arena with each way to launch."""
+    monkeypatch.setattr(launching, "PUBLIC", request.param == "public")
+    monkeypatch.setattr(launching, "PACK", str(int(request.param == "pack")))
+    runtime.forget()  # kernels compiled for another way
     with opened("f64"):
         arena = FieldArena()
         yield arena
@@ -63,7 +64,7 @@ def test_counts_are_exact_and_nest(arena):
         arrays.upload([(y, data), (x, data)])
         arrays.download([y])
         y.fill(0.0)
-        with pytest.raises(TypeError, match="double takes 1 arguments, not 2"):
+        with pytest.raises(TypeError, match="takes 1 positional argument but 2"):
             double(x, y)
     assert inner.launches == {"add": 2, "double": 1} and inner.arrays == {"add": 4, "double": 1} and not inner.accesses
     assert inner.host_arrays == inner.returned == {"add": 2, "double": 0} and inner.compiled == {"add": 1, "double": 1}

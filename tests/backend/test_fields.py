@@ -3,19 +3,14 @@
 * names are unique, sizes are counted in bytes, and arrays that are too large are refused before they are allocated;
 * uploads and downloads preserve all types and shapes, NaN and infinities too; downloads are copies;
 * data of a wrong shape is refused before anything is written;
-* lane buffers are disjoint ranges of one pooled field and are reused after release; larger ones share fields of their own;
 * released arrays take no memory, even where references remain.
 """
-
-import gc
 
 import numpy as np
 import pytest
 import taichi as ti
 
-from taisoft.backend import runtime
-from taisoft.backend.arrays import DTYPES, ENTRIES, FieldArena, download, size_class, upload
-from taisoft.backend.runtime import kernel
+from taisoft.backend.arrays import DTYPES, FieldArena, download, upload
 from taisoft.errors import SimulationError
 from tests.backend.lanes import opened
 
@@ -32,13 +27,26 @@ def test_an_arena_counts_bytes_and_refuses_what_is_too_large(monkeypatch):
         with pytest.raises(SimulationError, match="array 'huge' needs 3000000000 numbers, more than the 1610612733 that fit"):
             arena.vectors("huge", ti.f32, 10**9)
         monkeypatch.setattr("taisoft.backend.arrays.available_memory", lambda: 2**21)
-        for allocate in (arena.field, arena.lanes):
-            with pytest.raises(SimulationError, match="not enough memory for the array 'y': .* are needed, available: "):
-                allocate("y", ti.f64, 2**19)
+        with pytest.raises(SimulationError, match="not enough memory for the array 'y': .* are needed, available: "):
+            arena.field("y", ti.f64, 2**19)
         assert set(arena.bytes) == {"x", "v"}
         arena.release()
         assert [array.to_numpy().shape for array in (x, v)] == [(0, 2), (0, 3)] and arena.bytes == {}
         arena.field("x", ti.f64, 2)  # the name is free again
+        arena.release()
+
+
+def test_part_of_an_array_is_filled():
+    with opened("f64"):
+        arena = FieldArena()
+        x, n = arena.vectors("x", ti.f64, 4), arena.field("n", ti.i32, 3)
+        x.from_numpy(np.ones((2, 3)), 1)
+        n.from_numpy(np.array([7, 8]), 0)
+        assert x.to_numpy()[:, 2].tolist() == [0.0, 1.0, 1.0, 0.0] and n.to_numpy().tolist() == [7, 8, 0]
+        for data, first in ((np.ones((2, 3)), 3), (np.ones((1, 2)), 0), (np.ones((1, 3)), -1)):
+            with pytest.raises(ValueError, match=r"the entries from -?\d on of an array of shape \(4, 3\) cannot take"):
+                x.from_numpy(data, first)
+        assert x.to_numpy().sum() == 6.0
         arena.release()
 
 
@@ -94,74 +102,3 @@ def test_single_entries_are_read_and_written_from_the_host(arrays):
     scalar.fill(4)
     scalar[1] = 5
     assert type(scalar[1]) is int and scalar.to_numpy().tolist() == [4, 5, 4, 4, 4, 4, 4]
-
-
-@kernel
-def write_lanes(out: ti.template(), at: ti.i32, count: ti.i32, value: ti.f64):
-    for k in range(at, at + count):
-        out[k] = value
-
-
-@kernel
-def sum_lanes(out: ti.template(), at: ti.i32, count: ti.i32) -> ti.f64:
-    total = ti.cast(0.0, ti.f64)
-    ti.loop_config(serialize=True)
-    for k in range(at, at + count):
-        total += ti.cast(out[k], ti.f64)
-    return total
-
-
-def test_lane_buffers_are_disjoint_ranges_of_one_field():
-    with opened("f64"):
-        arenas = [FieldArena() for _ in range(3)]
-        buffers = [arena.lanes("forces", ti.f64, 100) for arena in arenas]
-        large = FieldArena().lanes("large", ti.f64, ENTRIES + 1)  # larger than the pool: a field of its own
-        assert large.memory is not buffers[0].memory and large.at == 0 and large.mask > buffers[0].mask
-        assert len({lanes.memory for lanes in buffers}) == 1 and arenas[0].bytes == {"forces": 800}
-        for value, lanes in enumerate([*buffers, large]):
-            write_lanes(lanes.memory, lanes.at + lanes.count - 100, 100, float(value + 1))
-        for value, lanes in enumerate([*buffers, large]):
-            assert sum_lanes(lanes.memory, lanes.at + lanes.count - 100, 100) == 100.0 * (value + 1)
-        second = buffers[1].at
-        arenas[1].release()
-        del buffers[1], lanes
-        gc.collect()
-        assert arenas[1].lanes("others", ti.f64, 128).at == second  # rounded up to whole cache lines
-        for arena in arenas:
-            arena.release()
-
-
-def test_large_lane_buffers_share_fields(monkeypatch):
-    """Kernels compiled for one buffer serve the next. Concurrent buffers differ; a larger one replaces those that are idle."""
-    runtime.forget()  # a new Taichi with an empty pool
-    with opened("f64"):
-        monkeypatch.setattr("taisoft.backend.arrays.ENTRIES", 0)
-        arenas = [FieldArena() for _ in range(3)]
-
-        def allocate(k: int, count: int):
-            memory = arenas[k].lanes("large", ti.f64, count).memory
-            write_lanes(memory, count - 4, 4, float(k + 1))
-            return memory
-
-        def release(k: int) -> None:
-            arenas[k].release()
-            gc.collect()
-
-        first, before = allocate(0, 1000), runtime.n_compiled()
-        second = allocate(1, 1000)
-        assert second is not first and runtime.n_compiled() == before + 1
-        release(0)
-        assert allocate(2, 900) is first and runtime.n_compiled() == before + 1
-        release(1)
-        release(2)
-        third = allocate(0, 5000)
-        assert third is not first and third is not second
-        release(0)
-        assert allocate(1, 1000) is third
-        release(1)
-
-
-def test_lane_buffers_are_at_most_a_quarter_larger_than_requested():
-    for count in [*range(1, 300), 2**24 + 1, 1_234_567_891]:
-        assert count <= size_class(count) <= max(1.25 * count, count + 1)
-    assert len({size_class(k) for k in range(1, 2**16)}) <= 4 * 17

@@ -4,7 +4,8 @@
   the first, flags, optional arrays, constants that are not counts, and modules;
 * kernels can use nested records, tuples, properties, methods and arrays of several dimensions;
 * neither a record nor its arrays are kept alive by a launch;
-* the fast launch gives the same results and errors as Taichi's public one; after a new ti.init nothing old is launched.
+* every way to launch gives the same results and errors; after a new ti.init nothing old is launched;
+* a pack takes any number of arrays, and works as well where the memory of its numbers is not found.
 """
 
 import gc
@@ -18,16 +19,18 @@ import taichi as ti
 
 from taisoft.backend import launching, runtime
 from taisoft.backend.arrays import Count, FieldArena, index_mask
+from taisoft.backend.pack import Arguments
 from taisoft.backend.runtime import kernel
 from taisoft.fem.laws import corotational, stable_neo_hookean
 from tests.backend.lanes import opened
 
 
-@pytest.fixture(params=[False, True], ids=["fast", "public"])
+@pytest.fixture(params=["pack", "flat", "public"])
 def running(request, monkeypatch):
-    """A runtime with the fast launch or Taichi's public one."""
-    monkeypatch.setattr(launching, "PUBLIC", request.param)
-    runtime.forget()  # kernels compiled for the other launch
+    """A runtime with each way to launch."""
+    monkeypatch.setattr(launching, "PUBLIC", request.param == "public")
+    monkeypatch.setattr(launching, "PACK", str(int(request.param == "pack")))
+    runtime.forget()  # kernels compiled for another way
     with opened("f64"):
         yield
     runtime.forget()
@@ -156,12 +159,57 @@ def test_wrong_arguments_are_refused(running):
     for wrong in ((x, corotational, 0, 1.0, 1.5, out), (x, corotational, 0, "3.5", 1, out)):
         with pytest.raises(TypeError):
             combine(*wrong)
+    scale(x, 2.0, 1)
+    for a, n in ((None, 1), (1.0, 0.5)):
+        with pytest.raises(TypeError):
+            scale(x, a, n)
     with pytest.raises(ValueError, match="contiguous"):
         combine(x, corotational, 0, 1.0, 1, np.zeros(8)[::2])
     for wrong in ((x, corotational, 0, 1.0, 1), (x, corotational, 0, 1.0, 1, out, out)):
-        with pytest.raises(TypeError, match="takes 6 arguments, not"):
+        with pytest.raises(TypeError, match=r"combine\(\) (missing 1 required|takes 6 positional)"):
             combine(*wrong)
     arena.release()
+
+
+@kernel
+def scale(x: ti.template(), a: ti.f64, n: ti.i32):
+    for i in x:
+        x[i] = a * x[i] + n
+
+
+@dataclass(frozen=True, eq=False)
+class Many:
+    """An argument with many arrays."""
+
+    every: tuple
+
+
+@kernel
+def add_all(to: ti.template(), a: ti.f64, n: ti.i32) -> ti.i32:
+    ti.loop_config(serialize=True)
+    for _ in range(1):
+        for x in ti.static(to.every):
+            x[1] = x[1] + a * n
+    return n - 1
+
+
+@pytest.mark.parametrize("memory", ["known", "unknown"])
+@pytest.mark.filterwarnings("ignore:You are unrolling")
+def test_a_pack_takes_any_number_of_arrays(memory, monkeypatch):
+    if memory == "unknown":
+        monkeypatch.setattr(Arguments, "_memory", lambda self, context: None)
+    with opened("f64"):
+        arena = FieldArena()
+        for size in (0, 1, 70):
+            many = Many(tuple(arena.field(f"{size}, {k}", ti.f64, 2) for k in range(size)))
+            for a, n in ((0.1, 3), (np.float32(2.5), np.int64(-(2**31) + 1)), (True, False)):
+                assert add_all(many, a, n) == n - 1
+            total = 0.1 * 3 + 2.5 * (1 - 2**31)
+            assert all(x.to_numpy().tolist() == [0.0, total] for x in many.every)
+            for name, wrong in {"a": ("x", 1), "n": (1.0, 2**31)}.items():
+                with pytest.raises(TypeError, match=f"^add_all: '{name}' must be an? (number|integer of 32 bits), not "):
+                    add_all(many, *wrong)
+        arena.release()
 
 
 def test_a_new_taichi_compiles_anew():

@@ -3,11 +3,15 @@
 * it has one arch and precision at a time; others are refused while it is open, with the name of its user;
 * after the last close any kind can be opened, and the same kind is not initialised again;
 * without CUDA, arch 'cuda' is refused, and the CPU still works;
+* functions that the compiler knows as such are compiled anew, too;
+* the lock of a killed process does not keep kernels from being stored, and that of a running one stays;
 * a first launch counts as compile time; errors of a kernel name file, line and function;
 * contact problems have the same solution with any runtime open, which stays open.
 """
 
 import inspect
+import os
+import time
 
 import numpy as np
 import pytest
@@ -15,9 +19,9 @@ import taichi as ti
 from taichi._lib import core
 
 import taisoft as ts
-from taisoft.backend import runtime
+from taisoft.backend import runtime, tracing
 from taisoft.backend.arrays import FieldArena
-from taisoft.backend.runtime import kernel, open_runtime
+from taisoft.backend.runtime import compiled_function, kernel, open_runtime
 from taisoft.errors import SimulationError
 from tests.backend.lanes import opened
 from tests.contact import contact_oracle as oracle
@@ -51,6 +55,62 @@ def test_the_same_kind_is_not_initialised_again(monkeypatch):
         monkeypatch.setattr(ti, "init", lambda **options: pytest.fail("initialised again"))
     with opened("f64"), opened("f64"):
         pass
+
+
+@compiled_function(7)
+def put(out: ti.types.ndarray(dtype=ti.f32, ndim=1), value: ti.f32):
+    out[0] = value
+
+
+@kernel
+def put_twice(x: ti.template(), y: ti.template()):
+    ti.loop_config(serialize=True)
+    for _ in range(1):
+        put(x, 1.0)
+        put(y, 2.0)
+
+
+def test_compiled_functions_are_compiled_for_each_taichi():
+    for precision in ("f32", "f64", "f32", "f64"):
+        with opened(precision):
+            arena = FieldArena()
+            x, y = arena.field("x", ti.f32, 2), arena.field("y", ti.f32, 3)
+            put_twice(x, y)
+            assert (x[0], y[0]) == (1.0, 2.0)
+            arena.release()
+        runtime.forget()
+
+
+def test_an_interrupted_compiled_function_is_compiled_by_the_next_launch(monkeypatch):
+    original, interrupted = tracing.transform_tree, []
+
+    def interrupt(tree, context):
+        if context.is_real_function and not interrupted:
+            interrupted.append(context)
+            raise KeyboardInterrupt
+        return original(tree, context)
+
+    runtime.forget()
+    with opened("f64"):
+        arena = FieldArena()
+        x, y = arena.field("x", ti.f32, 2), arena.field("y", ti.f32, 3)
+        monkeypatch.setattr(tracing, "transform_tree", interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            put_twice(x, y)
+        put_twice(x, y)
+        assert interrupted and (x[0], y[0]) == (1.0, 2.0)
+        arena.release()
+    runtime.forget()
+
+
+def test_only_an_old_lock_is_removed(tmp_path):
+    lock = tmp_path / "ticache.lock"
+    runtime.remove_stale_lock(tmp_path)
+    for age, stays in ((0.0, True), (2.0 * runtime.LOCK_SECONDS, False)):
+        lock.touch()
+        os.utime(lock, (time.time() - age,) * 2)
+        runtime.remove_stale_lock(tmp_path)
+        assert lock.exists() == stays
 
 
 def test_an_initialisation_from_outside_is_replaced():

@@ -3,20 +3,26 @@
 * an explicit run, with --long also implicit ones with contacts, ends in the same bits with Taichi's public interface only
   (TAISOFT_PUBLIC_TAICHI), and optimised as users have it, which the tests are not;
 * a function called several times in a kernel, within itself and with values of different types, is traced anew at each call;
+* the text of a function is that which Python finds, whatever is in it;
 * arithmetic functions with static branches, lists and arguments used several times agree with NumPy;
 * arithmetic functions whose run-time branches or loops Python would evaluate while tracing are rejected.
 """
 
+import ast
+import inspect
 import os
 import subprocess
 import sys
+import textwrap
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import taichi as ti
 
 from taisoft.backend.runtime import kernel
-from taisoft.backend.tracing import arithmetic
+from taisoft.backend.tracing import arithmetic, source_of
+from taisoft.collision import analytic
 from tests.backend.lanes import opened
 from tests.cli.command import ROOT
 
@@ -86,6 +92,40 @@ def test_each_call_is_traced_anew():
     with opened("f64"):
         call_several_times(x, out)
     assert out == pytest.approx(np.stack([x**6, 3 * (x + 1) + 2], axis=1), rel=1e-15)
+
+
+ODD = '''
+def outer():
+    """A text
+that begins in the first column."""
+# and a comment there
+    @ti.func
+    def inner(
+        x,  # a number
+    ):
+
+        return x
+    return inner
+
+
+@ti.func
+def last(x): return (
+    x
+)
+'''
+
+
+def test_the_text_of_a_function_is_found(tmp_path):
+    path, scope = tmp_path / "odd.py", {"ti": SimpleNamespace(func=lambda function: function)}
+    path.write_text(ODD)
+    exec(compile(ODD, path, "exec"), scope)
+    found = [one for module in (analytic, sys.modules[__name__]) for one in vars(module).values() if inspect.isfunction(one)]
+    for function in (scope["outer"], scope["outer"](), scope["last"], *map(inspect.unwrap, found)):
+        lines, first = inspect.getsourcelines(function)
+        file, ours, at, _ = source_of(function)
+        assert (file, at) == (inspect.getsourcefile(function), first)
+        assert ast.dump(ast.parse(textwrap.dedent("".join(lines)))) == ast.dump(ast.parse(source_of(function)[3]))
+        assert "".join(ours).strip().startswith("".join(lines).strip())
 
 
 @arithmetic

@@ -3,7 +3,7 @@
 Where a benchmark has no small form, one is made here. Stand-ins take the place of what takes minutes or needs other programs:
 
 * implicit steps with contacts, which take a minute to compile: contact and crossings take explicit ones, paths has none, ipc
-  shows made-up rows, and so does order;
+  shows made-up rows, and so do order and launches;
 * child processes, whose work is done in this process: crossings, hard, paths, pictures, scaling;
 * the simulators of error and tolerance, by one with known errors; MuJoCo in elasticity; the display of window.
 
@@ -30,6 +30,7 @@ from benchmarks import (
     elasticity,
     elasticity_runs,
     hard_runs,
+    launches,
     order,
     path_runs,
     paths,
@@ -222,6 +223,18 @@ class Small:
 
 
 QUICK = ("--quick",)
+
+
+def launches_small(patch: pytest.MonkeyPatch, folder: Path) -> None:
+    """Made-up times, that of the older version four times as long."""
+
+    def measured(baseline, arch: str, quick: bool) -> dict:
+        return {name: [{"launches": {"200": us}, "steps": {"resting": us}, "digests": {}}] for name, us in TIMES.items()}
+
+    replace(patch, launches, measure=measured)
+
+
+TIMES = {"this": 2.0, "older": 8.0}
 BEAM = ("--scene", "hanging beam")
 RUNS = {
     "collision": Small(QUICK, ("| pile 1 | proximity | 162 |", "(fig. 18)", "| yes |"), collision_small, collision_check),
@@ -235,6 +248,9 @@ RUNS = {
     "error": Small(BEAM, ("| hanging beam | bdf2 | 160 |", "a note"), error_small, error_check),
     "hard": Small(("--case", "G1", "--quick"), ("# Hard cases", "**1 of 1 variants are solved.**"), hard_small),
     "ipc": Small(("--quick", "--scene", "twisted_mat"), ("| twisted mat | 800 | 1,805 | 0.04 | 0.08 of 25 (2) |",), ipc_small),
+    "launches": Small(
+        QUICK, ("| 200 | 2.00 (2.00 to 2.00) | 8.00 (8.00 to 8.00) | 0.25 (0.25 to 0.25) |", "| resting"), launches_small
+    ),
     "order": Small(QUICK, ("| SNH | 1 | 1 | 11x2x2 | 220 | 108 | -2.26758 | 16.3 |",), order_small),
     "paths": Small(("--what", "cost", "--quick"), ("## Cost", "| hanging_beam |", "| met |"), paths_small, paths_check),
     "pictures": Small(QUICK, ("| kernels |", "| PNG |", "| hanging_beam |"), pictures_small, pictures_check),

@@ -2,9 +2,13 @@
 
 * distances agree with other formulas in NumPy to a few roundings, from 1e-6 m to 1e150 m: inside, outside, on the surface and
   where gradients jump; gradients are unit vectors and agree with finite differences where the distance is smooth;
+* no triangle that may have a contact in a step is skipped by the sphere around its box, whatever moves, and most others are;
 * weights of deepest points are convex, phi belongs to their point, no corner lies deeper, for needles and points too; the point
   is the deepest one of a dense sampling, to 1e-6 of the triangle's size.
 """
+
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,7 +17,7 @@ import taichi as ti
 import taisoft as ts
 from taisoft.backend.arrays import FieldArena
 from taisoft.backend.runtime import kernel
-from taisoft.collision.analytic import build_analytic
+from taisoft.collision.analytic import build_analytic, may_touch, obstacle_frame, place_analytic
 from taisoft.collision.deepest_point import deepest_point
 from taisoft.collision.surface import dvec
 from tests.collision.checked_paths import obstacle
@@ -49,6 +53,43 @@ def deepest(o: ti.template(), k: ti.i32, X: array, out: array):
         c, _ = o.sample(k, C)
         w, phi = deepest_point(o, k, A, B, C, dvec(a, b, c))
         out[i, 0], out[i, 1], out[i, 2], out[i, 3] = w[0], w[1], w[2], phi
+
+
+@dataclass(frozen=True, eq=False)
+class Boxes:
+    """Boxes of triangles in a step."""
+
+    lo: Any
+    hi: Any
+
+
+@kernel
+def select(s: ti.template(), o: ti.template(), k: ti.i32, margin: ti.f64, out: ti.template()):
+    for t in range(out.shape[0]):
+        out[t] = int(may_touch(s, o, t, k, margin))
+
+
+def test_no_triangle_with_contacts_is_skipped(run):
+    rng, n, margin = np.random.default_rng(3), 2000, 0.02
+    X = rng.uniform(-2.5, 2.5, (n, 1, 3)) + 0.1 * rng.standard_normal((n, 3, 3))
+    move = 0.02 * rng.standard_normal((n, 3, 3))
+    ends = np.concatenate([X, X + move], axis=1)
+    arena, w = FieldArena(), np.concatenate([np.eye(3), rng.dirichlet(np.ones(3), 9)])
+    boxes = Boxes(*(arena.vectors(name, ti.f64, n, x) for name, x in (("lo", ends.min(axis=1)), ("hi", ends.max(axis=1)))))
+    chosen = arena.field("chosen", ti.i32, n)
+    path = ts.KeyFrames((0.0, 1.0), ((0.0, 0.0, 0.0), (0.03, -0.2, 0.01)), ((0.0, 0.0, 0.0), (0.04, 0.02, -0.1)))
+    placed = [(k, obstacle(shape, path)) for k, shape in enumerate(SHAPES.values())]
+    shapes = build_analytic(placed, arena)
+    place_analytic(shapes, placed, 0.0, 1.0)
+    for k, one in placed:
+        frames = [obstacle_frame(one, t) for t in (0.0, 1.0)]
+        now, then = ((w @ x - origin) @ R for x, (origin, R) in zip((X, X + move), frames))
+        phi, *g = run(distances, list(SHAPES)[k], now.reshape(-1, 3)).T
+        closest = phi + np.minimum(((then - now).reshape(-1, 3) * np.array(g).T).sum(axis=1), 0.0)
+        select(boxes, shapes, k, margin, chosen)
+        may, near = chosen.to_numpy() == 1, (closest.reshape(n, -1) <= margin).any(axis=1)
+        assert near.any() and may[near].all() and may.mean() < 0.8
+    arena.release()
 
 
 @pytest.fixture(scope="module")

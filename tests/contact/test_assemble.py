@@ -223,7 +223,8 @@ def test_rebounds_of_implicit_steps():
         fill_field(field, values)
     fill_field(problem.body, bodies)
     problem.count[0] = n
-    count = find_rebounds(problem, gravity, np.array([3.0 * dt**2, 0.0]), dt, h)
+    flight = arena.field("flight", ti.f64, 2, np.array([3.0 * dt**2, 0.0]))
+    count = find_rebounds(problem, gravity, flight, dt, h)
     d = np.maximum(0.0, gap - h)
     speed = np.minimum(dt * closing - u, np.sqrt(u**2 + 3.0 * dt**2 * closing**2))
     w = np.sqrt(np.maximum(0.0, e**2 * (speed**2 + 2 * closing * d) - 2 * closing * d))

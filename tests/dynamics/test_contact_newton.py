@@ -18,7 +18,7 @@ import taisoft as ts
 from taisoft.dynamics import contact_newton, implicit
 from taisoft.dynamics.contact_newton import FrictionalResult, solve_iteratively
 from taisoft.dynamics.dynamics import Dynamics
-from taisoft.dynamics.elimination import choose_nodes, eliminate
+from taisoft.dynamics.elimination import CONCENTRATED, FEW, choose_nodes, eliminate
 from taisoft.dynamics.newton import Newton
 from taisoft.dynamics.schemes import SCHEMES
 from taisoft.dynamics.stage import STAY
@@ -176,6 +176,23 @@ def pinched(scene: ts.Scene) -> np.ndarray:
     x = scene.bodies[0].rest_positions + scene.bodies[0].position
     x[np.argmin(np.abs(x - [0.2, 0.25, 0.0]).sum(axis=1))] -= [0.0, 0.25, 0.0]
     return x
+
+
+def test_nodes_are_chosen_as_by_sorting_all():
+    """Also where a cheaper bound refuses them: residuals from smooth to all on one node, and none."""
+    rng, n, found = np.random.default_rng(5), 40, set()
+    start, column = (
+        np.arange(0, 2 * n + 1, 2),
+        np.stack([np.maximum(np.arange(n) - 1, 0), np.minimum(np.arange(n) + 1, n - 1)], 1),
+    )
+    for power in (0.0, 1.0, 2.0, 3.0, 5.0, 9.0, 40.0, np.inf):
+        residual = rng.standard_normal((n, 3)) * np.maximum(np.arange(1, n + 1.0), 1.0)[rng.permutation(n), None] ** -power
+        squares = np.sort((residual**2).sum(axis=1))[::-1].cumsum()
+        few = squares[-1] > 0.0 and squares[int(FEW * n) - 1] >= CONCENTRATED * squares[-1]
+        nodes = choose_nodes(residual, start, column.reshape(-1))
+        assert (nodes is not None) == few
+        found.add(few)
+    assert found == {False, True} and choose_nodes(np.full((n, 3), np.nan), start, column.reshape(-1)) is None
 
 
 def check_elimination(system: StageSystem, stage, r: float):
