@@ -212,6 +212,25 @@ def test_a_pack_takes_any_number_of_arrays(memory, monkeypatch):
         arena.release()
 
 
+@kernel
+def copy(pair: ti.template()):
+    for i in pair[0]:
+        pair[1][i] = pair[0][i]
+
+
+def test_a_launch_keeps_no_tuple(running):
+    arena = FieldArena()
+    x, y = arena.field("x", ti.f64, 3, np.arange(3.0)), arena.field("y", ti.f64, 3)
+    for _ in range(2):
+        copy((x, y))
+    assert y.to_numpy().tolist() == [0.0, 1.0, 2.0]
+    references = [weakref.ref(array) for array in (x, y)]
+    arena.release()
+    del x, y
+    gc.collect()
+    assert not any(reference() for reference in references)
+
+
 def test_a_new_taichi_compiles_anew():
     for _ in range(2):
         with opened("f64"):
