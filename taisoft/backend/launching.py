@@ -46,7 +46,8 @@ class Ready(NamedTuple):
     program: Any
     launch: Callable | None  # of the program
     data: Any  # compiled code
-    bound: tuple  # context, function that writes the numbers
+    context: Any  # these two from `Compiled.bind`
+    write: Any
     compiled: Compiled
     references: list
 
@@ -64,7 +65,7 @@ class Kernels:
         self._templates = [k for k, kind in enumerate(self._kinds.values()) if isinstance(kind, template)]
         self._arrays = [k for k, kind in enumerate(self._kinds.values()) if isinstance(kind, ndarray_type.NdarrayType)]
         self._used: set[str] | None = None
-        self._ready: dict[tuple, Ready] = {}  # by key of the arguments
+        self._ready: dict[Any, Ready] = {}  # by key of the arguments
         self.forget()
         self.every.append(self)
 
@@ -95,9 +96,9 @@ class Kernels:
         lines = [f"def {self._function.__name__}({given}):"]
         if not self._arrays:
             lines += [
-                f"    _entry = _find(({''.join(f'id({name}), ' for name in templates)}))",
+                f"    _entry = _find(({', '.join(f'id({name})' for name in templates)}))",
                 "    if _entry is not None and _entry[0] is _taichi.pytaichi.prog:",
-                "        _, _launch, _data, (_context, _write), _compiled, _ = _entry",
+                "        _, _launch, _data, _context, _write, _compiled, _ = _entry",
                 "        if _write is not None:",
                 "            try:",
                 f"                _write({numbers})",
@@ -111,12 +112,12 @@ class Kernels:
         exec("\n".join(lines), scope)
         return functools.wraps(self._function)(scope[self._function.__name__])
 
-    def _key(self, arguments: tuple) -> tuple:
-        """Identities of the templates, and types of the host's arrays."""
+    def _key(self, arguments: tuple) -> Any:
+        """Identities of the templates, and types of the host's arrays; no tuple around a single one, which would take longer."""
         key = [id(arguments[k]) for k in self._templates]
         for k in self._arrays:
             key += arguments[k].dtype, arguments[k].ndim
-        return tuple(key)
+        return key[0] if len(key) == 1 else tuple(key)
 
     def find(self, arguments: tuple) -> Ready | None:
         """What `prepare` returned for these arguments, or None if they are new."""
@@ -134,7 +135,7 @@ class Kernels:
         compiled, key = self._compiled[kind], self._key(arguments)
         direct = compiled.packed and not (PUBLIC or self.watched)
         program, launch, data = (compiled.program, compiled.program.launch_kernel, compiled.data) if direct else (None,) * 3
-        entry = Ready(program, launch, data, compiled.bind(arguments), compiled, self._references(key, arguments))
+        entry = Ready(program, launch, data, *compiled.bind(arguments), compiled, self._references(key, arguments))
         if all(_is_known_by_id(arguments[k]) for k in self._templates):
             self._ready[key] = entry
         return entry
@@ -150,7 +151,7 @@ class Kernels:
                 names |= names_of_types(holders(arguments[k]), names, seen)
         return names
 
-    def _references(self, key: tuple, arguments: tuple) -> list:
+    def _references(self, key: Any, arguments: tuple) -> list:
         """Weak references that remove the entry `key` as soon as one of its records or arrays is collected.
 
         Modules, functions and all else are held, so that no other object takes that id.

@@ -204,11 +204,11 @@ def kernel(function: Callable | None = None, *, cse: bool = True) -> Callable:
         check_program(_program)
         ready = kernels.find(arguments)
         if ready is not None:
-            return ready.compiled.launch(ready.bound, arguments)
+            return ready.compiled.launch((ready.context, ready.write), arguments)
         start, compiler, before = time.perf_counter(), _compiler_clock(), kernels.n_compiled
         with _common_subexpressions(cse):
             ready = kernels.prepare(arguments)
-            result = ready.compiled.launch(ready.bound, arguments)  # loads the code at the first launch
+            result = ready.compiled.launch((ready.context, ready.write), arguments)  # loads the code at the first launch
         if kernels.n_compiled > before:
             ti.sync()
             seconds = time.perf_counter() - start
