@@ -64,12 +64,15 @@ def often(do: Callable[[], object], repeats: int) -> float:
     return 1e6 * float(np.median(seconds[1:]))
 
 
+def add_cube(scene: ts.Scene, cells: int) -> ts.Body:
+    """Add a cube of 6 cells^3 tets."""
+    return scene.add_body(ts.box_mesh((cells,) * 3, (0.1,) * 3, pattern="six"), ts.Material(**RUBBER), name="cube")
+
+
 def resting(cells: int) -> ts.Scene:
     """A cube that rests on a half-space."""
     scene = ts.Scene()
-    scene.add_body(
-        ts.box_mesh((cells,) * 3, (0.1,) * 3, pattern="six"), ts.Material(**RUBBER), name="cube", position=(0.0, 0.0501, 0.0)
-    )
+    add_cube(scene, cells).position = (0.0, 0.0501, 0.0)
     scene.add_obstacle(ts.HalfSpace((0, 0, 0), (0, 1, 0)), name="ground")
     return scene
 
@@ -77,9 +80,7 @@ def resting(cells: int) -> ts.Scene:
 def free(cells: int) -> ts.Scene:
     """A cube that swings from one side, without contacts."""
     scene = ts.Scene()
-    scene.add_body(ts.box_mesh((cells,) * 3, (0.1,) * 3, pattern="six"), ts.Material(**RUBBER), name="cube").fix(
-        lambda X: X[:, 0] < -0.0499
-    )
+    add_cube(scene, cells).fix(lambda X: X[:, 0] < -0.0499)
     return scene
 
 

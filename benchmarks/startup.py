@@ -225,10 +225,9 @@ def compare(now: dict, old: dict) -> list[Limit]:
     for name in SCENES:
         second = [one[name]["one process"]["second"]["wall"] for one in (now, old)]
         limits.append(Limit(f"{name}: second simulator over the baseline's", second[0] / second[1], 0.1))
-        walls = [one[name][OTHER]["walls"] for one in (now, old)]
-        limits.append(Limit(f"{name}: {OTHER}, over the baseline's", ratio(*walls), 0.5))
-        walls = [one[name]["warm"]["walls"] for one in (now, old)]
-        limits.append(Limit(f"{name}: warm, over the baseline's", ratio(*walls), 1.1))
+        for what, limit in ((OTHER, 0.5), ("warm", 1.1)):
+            walls = [one[name][what]["walls"] for one in (now, old)]
+            limits.append(Limit(f"{name}: {what}, over the baseline's", ratio(*walls), limit))
     static = now["statics"]["1"]["wall"] / old["statics"]["1"]["wall"]
     limits.append(Limit("second static solve over the baseline's", static, 0.15))
     limits.append(Limit("nine static solves over the baseline's", now["identify"]["wall"] / old["identify"]["wall"], 0.1))

@@ -69,7 +69,7 @@ class Array:
     @property
     def entries(self) -> int:
         """Number of entries of the flat array that kernels see."""
-        return math.prod(self.full_shape) // max(self.n, 1)
+        return math.prod(self.shape)
 
     @property
     def address(self) -> int:

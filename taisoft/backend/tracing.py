@@ -42,7 +42,8 @@ def source_of(function: Callable) -> tuple[str, list[str], int, str]:
     """File, lines, number of the first line, and the dedented text of a function."""
     file, first = function.__code__.co_filename, function.__code__.co_firstlineno
     lines = linecache.getlines(file)[first - 1 :]
-    return file, lines[: _end(lines)], first, textwrap.dedent("".join(lines[: _end(lines)]))
+    lines = lines[: _end(lines)]
+    return file, lines, first, textwrap.dedent("".join(lines))
 
 
 def _end(lines: list[str]) -> int:

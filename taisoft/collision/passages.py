@@ -57,7 +57,7 @@ def _axis_end(o: ti.template(), k, side, at_end):
 def _radius(o: ti.template(), kind, b):
     """Radius [m] of the round shape b, 0 for other kinds of pairs."""
     radius = ti.cast(0.0, ti.f64)
-    if ti.static(o.any):
+    if ti.static(o.has_round):
         if kind == ROUND:
             radius = ti.select(o.kind[b] == CAPSULE, o.size[b][1], o.size[b][0])
     return radius
@@ -83,7 +83,7 @@ def _corner(s: ti.template(), o: ti.template(), g: ti.template(), kind, a, b, k,
     now, move = dvec(0.0), dvec(0.0)
     if i >= 0:
         now, move = s.x[i], moves[i]
-    elif ti.static(o.any):
+    elif ti.static(o.has_round):
         side = ti.select(k == 3, ti.cast(-1.0, ti.f64), ti.cast(1.0, ti.f64))
         now = _axis_end(o, b, side, 0)
         move = _axis_end(o, b, side, 1 - still) - now
@@ -184,7 +184,7 @@ def _write_triangle_passages(
         elif e < n_near + n_adjacent:
             kind, a = ADJACENT, part_first(c, g.n_adjacent, s.chunks) + e - n_near
             checked = g.exempt[_body_of(s, g.adjacent[a, 0]) * (s.n_bodies + 1)] == 0
-        elif ti.static(o.any):
+        elif ti.static(o.has_round):
             kind, a = ROUND, part_first(c, s.n_triangles, s.chunks) + (e - n_near - n_adjacent) // o.count
             b = (e - n_near - n_adjacent) % o.count
             checked = (o.kind[b] == SPHERE or o.kind[b] == CAPSULE) and s.soft[s.body[a]] == 1

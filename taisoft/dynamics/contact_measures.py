@@ -53,7 +53,8 @@ class ContactMeasures:
 
     def __init__(self, detection: Detection, arena: FieldArena):
         self.detection = detection
-        self._closing = arena.field("closing", ti.f64, 5)  # result of `measure_closing`
+        self._closing = arena.field("closing", ti.f64, 5)  # result of `measure_closing`,
+        self._measured = np.zeros(5)  # and a copy of it
         self._dt: float | None = None  # [s] that it was computed for; None: outdated
 
     def forget(self) -> None:
@@ -65,8 +66,8 @@ class ContactMeasures:
         d = self.detection
         if self._dt != dt:
             measure_closing(d.surface, d.shapes, d.buffer.data, d.kept, d.counts.contacts, dt, self._closing)
-            self._dt = dt
-        return self._closing.to_numpy()
+            self._dt, self._measured = dt, self._closing.to_numpy()
+        return self._measured
 
     def drop_uncertain(self) -> None:
         """Drop the contacts of the last search that may never touch, where the check of paths finds those that would: a plane

@@ -36,7 +36,7 @@ from taisoft.dynamics.contact_terms import TO_IMPULSES
 from taisoft.dynamics.simulation_state import SimulationState
 from taisoft.fem.chunks import chunk_entry, chunk_size, fold, total
 from taisoft.fem.lanes import mass_times
-from taisoft.fem.state import IMPACT_CURVATURE, IMPACT_SLOPE, NORMS, OTHER_SUM, SUM
+from taisoft.fem.state import IMPACT_CURVATURE, IMPACT_SLOPE, N_NORMS, NORMS, OTHER_SUM, SUM
 from taisoft.fem.terms import rayleigh_damping
 from taisoft.linear.block_csr import block_times
 
@@ -94,7 +94,7 @@ def begin_impact(m: ti.template(), s: ti.template(), k: ti.template(), tau: ti.f
             speed = ti.max(speed, p.min_velocity[c] - p.approach[c])
         for i in range(m.n_nodes):
             mass += ti.cast(m.mass[i], ti.f64) ** 2
-        for j in ti.static(range(5)):
+        for j in ti.static(range(N_NORMS)):
             m.state.scalars[NORMS + j] = 0.0
         m.state.scalars[NORMS + 1] = mass * speed * speed
 

@@ -299,9 +299,8 @@ class SubsetLists:
         self._tet_start, entry = download([m.gather_start, m.gather_entry])
         self._block = np.zeros(len(entry), dtype=np.int32)  # of each tet at each node
         for g in m.groups:
-            size = 3 * g.n_nodes * m.lanes
-            block, own = (entry - g.force_at * m.lanes) // size, entry >= g.force_at * m.lanes
-            own &= block < g.last - g.first
+            block = (entry - g.force_at * m.lanes) // (3 * g.n_nodes * m.lanes)
+            own = (block >= 0) & (block < g.last - g.first)
             self._block[own] = g.first + block[own]
         if m.mean_dilatation:  # a node changes the pressure on all tets of its patches
             self._tet_start, self._block = _with_patches(m, self._tet_start, self._block)
