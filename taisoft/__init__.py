@@ -41,6 +41,7 @@ _MODULES = {  # public name -> the module that defines it
     "Simulator": "taisoft.simulator",
     "Film": "taisoft.view.notebook",
     "InteractiveView": "taisoft.view.interactive",
+    "LiveWindow": "taisoft.view.window",
     "show": "taisoft.view.window",
     "solve_static": "taisoft.static",
     "modes": "taisoft.stability",

@@ -29,6 +29,8 @@ INSTEAD = {  # what to do instead of assigning to an attribute that a simulator 
     **dict.fromkeys(("cavity", "cavities"), "call sim.set_cavity(name, value)"),
     "gravity": "call sim.set_gravity(gravity)",
     "material": "call sim.set_material(body, young=...)",
+    **dict.fromkeys(("pose", "poses"), "call sim.set_pose(name, translation, rotation)"),
+    **dict.fromkeys(("displacement", "displacements"), "call sim.set_displacement(body, index, value)"),
     "scene": "make a new Simulator of the other scene",
     "settings": "call sim.rebuild(integrator=...)",
     "plan": "it follows from the scene and the settings",
@@ -64,7 +66,10 @@ def check_stability(sim: "Simulator", dt: float, stacklevel: int = 3) -> None:
 
 
 def reset(self: "Simulator") -> None:
-    """Restore the scene's initial state; changed numbers (dt, gravity, materials, loads) stay. Compiles nothing."""
+    """Restore the scene's initial state and its paths, without commands; changed numbers (dt, gravity, materials, loads) stay.
+
+    Compiles nothing.
+    """
     self._open().reset()
 
 

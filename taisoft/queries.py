@@ -11,6 +11,7 @@ from taisoft.errors import SceneError, SimulationError
 from taisoft.fem.reference import gravity_mass, lumped_mass
 from taisoft.fem.terms import elasticity
 from taisoft.records import Energies, ErrorEstimate
+from taisoft.scene.obstacles import Obstacle
 from taisoft.scene.rigid import Pose, RigidBody, Twist
 from taisoft.stability import stable_dt as largest_stable_dt
 
@@ -161,10 +162,14 @@ def nodal_errors(self: "Simulator", body: str | None = None) -> np.ndarray:
 
 
 def pose(self: "Simulator", name: str) -> Pose:
-    """Return translation (3,) [m] of a rigid body's centre since the start, and rotation (3,3) about it.
+    """Return translation (3,) [m] of a rigid body's centre since the start, and rotation (3,3) about it; or an obstacle's pose.
 
-    A point at X in the mesh is at rotation @ (X - body.centre) + body.centre + body.position + translation. Raises SceneError.
+    A point at X in the mesh is at rotation @ (X - body.centre) + body.centre + body.position + translation; one of an obstacle,
+    at rotation @ (X - pivot) + pivot + translation, with the pivot of its shape. Raises SceneError.
     """
+    one = self.scene.collider(name)
+    if isinstance(one, Obstacle):
+        return Pose(*one.pose(self.time))
     return _rigid(self, name).pose(self.positions(name))
 
 

@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
+from taisoft.commanding import refuse_commands
 from taisoft.dynamics.newton_budget import watched
 from taisoft.energy_check import EnergyCheck
 from taisoft.errors import SimulationError, no_memory
@@ -87,6 +88,7 @@ def run(
         return report
     from taisoft.estimation.tolerance import run_to_tolerance
 
+    refuse_commands(sim, "tolerance")
     return run_to_tolerance(sim, run_steps, seconds, fps, stop, **arguments)
 
 

@@ -4,7 +4,7 @@ import dataclasses
 import warnings
 from typing import TYPE_CHECKING
 
-from taisoft import changes, checkpoint, contact_queries, queries, running
+from taisoft import changes, checkpoint, commanding, contact_queries, queries, running
 from taisoft.attributes import Guarded, SimulationAttributeError, thawed
 from taisoft.backend import runtime
 from taisoft.display import drawn, simulator_text
@@ -119,6 +119,7 @@ class Simulator(Guarded):
 
         if self._estimator is not None:
             raise SimulationError("a run with error=True cannot be started during another one")
+        commanding.refuse_commands(self, "error=True")
         self._estimator = ErrorEstimator(self, steps, mesh)
         return self._estimator
 
@@ -186,6 +187,9 @@ class Simulator(Guarded):
     set_length = changes.set_length
     set_pressure = changes.set_pressure
     set_cavity = changes.set_cavity
+    set_pose = commanding.set_pose
+    set_velocity = commanding.set_velocity
+    set_displacement = commanding.set_displacement
     drag = changes.drag
     release = changes.release
 

@@ -73,8 +73,6 @@ class ContactStep:
         self.contact_offset = CONTACT_OFFSET * float(d.edges[: len(scene.bodies)].min())
         if d.margin > 0.0:
             self.contact_offset = min(self.contact_offset, 0.5 * d.margin / (SELF_CONTACT if self_collision else 1.0))
-        # prescribed motion may be changed by the user between two steps, and a path may end with the last one
-        self._has_paths = simulation.dirichlet.n_prescribed > 0 or any(o.path is not None for o in scene.obstacles)
         self._corrections = PENETRATION_CORRECTION[explicit], OFFSET_CORRECTION[explicit]
         self._substep_fraction = 1.0  # of the step, that the current substep takes
         self.gap_targets = self._gap_targets()
@@ -115,6 +113,16 @@ class ContactStep:
     def flight(self) -> np.ndarray:
         """Flight times of the colliders [s^2], see `Rebounds`."""
         return self.rebounds.flight
+
+    @property
+    def _has_paths(self) -> bool:
+        """Whether motion is prescribed: the user may change it between two steps, and a path may end with the last one."""
+        simulation = self.simulation
+        return simulation.dirichlet.n_prescribed > 0 or any(o.path is not None for o in simulation.scene.obstacles)
+
+    def motion_changed(self) -> None:
+        """Discard the search, after an obstacle or nodes were commanded to move."""
+        self._searched = None
 
     @property
     def n_contacts(self) -> int:

@@ -1,5 +1,6 @@
 """Dirichlet conditions: constrained axes, target positions of prescribed nodes over time, and their release."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,25 +15,29 @@ ROUNDING = 1e-9  # of a time: a step that ends this near a release still follows
 
 
 @dataclass
-class _Group:
-    name: str  # of the body
+class MovedNodes:
+    """Nodes whose motion is prescribed along some axes."""
+
+    name: str  #: of the body
     constraint: Constraint
-    nodes: np.ndarray  # (k,) rows of the model
-    rows: slice  # rows among the prescribed nodes
+    of_move: bool  #: whether `Body.move` holds them, not an obstacle
+    nodes: np.ndarray  #: (k,) rows of the model
+    rows: slice  #: rows among the prescribed nodes
+    path: Callable  #: t [s] -> displacement (3,) or (k,3) [m]; the constraint's, or a command
     released: bool = False
 
 
 class DirichletConditions:
     """Constraints of all bodies.
 
-    prescribed_nodes (n_prescribed,): model rows, group by group; a node prescribed by two groups on different axes has two rows.
-    held (n_held,): model rows with a constrained axis at the start.
+    groups: nodes moved by `Body.move` or by a moving obstacle. prescribed_nodes (n_prescribed,): model rows, group by group; a
+    node prescribed by two groups on different axes has two rows. held (n_held,): model rows with a constrained axis at the start.
     """
 
     def __init__(self, scene: Scene, layout: Layout):
         self._rest = layout.rest
         self._fixed = np.zeros((len(layout.rest), 3), dtype=bool)
-        self._groups: list[_Group] = []
+        self.groups: list[MovedNodes] = []
         n_prescribed = 0
         for k, body in enumerate(scene.bodies):
             for c in scene.constraints(body):
@@ -40,23 +45,24 @@ class DirichletConditions:
                 if c.path is None:
                     self._fixed[np.ix_(rows, np.flatnonzero(c.axes))] = True
                 else:
-                    self._groups.append(_Group(body.name, c, rows, slice(n_prescribed, n_prescribed + len(rows))))
+                    held = slice(n_prescribed, n_prescribed + len(rows))
+                    self.groups.append(MovedNodes(body.name, c, c in body.constraints, rows, held, c.path))
                     n_prescribed += len(rows)
-        self.prescribed_nodes = np.concatenate([g.nodes for g in self._groups]) if self._groups else np.zeros(0, dtype=np.int64)
+        self.prescribed_nodes = np.concatenate([g.nodes for g in self.groups]) if self.groups else np.zeros(0, dtype=np.int64)
         self.held = np.flatnonzero(self.constrained().any(axis=1))
 
     def reset(self) -> None:
         """Start every path again."""
-        for g in self._groups:
+        for g in self.groups:
             g.released = False
 
     def released(self) -> list[bool]:
         """Return which groups are released."""
-        return [g.released for g in self._groups]
+        return [g.released for g in self.groups]
 
     def set_released(self, released: list[bool]) -> None:
         """Restore the result of `released`."""
-        for g, value in zip(self._groups, released, strict=True):
+        for g, value in zip(self.groups, released, strict=True):
             g.released = value
 
     @property
@@ -67,7 +73,7 @@ class DirichletConditions:
     def constrained(self) -> np.ndarray:
         """Return the axes that are now fixed or prescribed, (n_nodes, 3) bool."""
         mask = self._fixed.copy()
-        for g in self._groups:
+        for g in self.groups:
             if not g.released:
                 mask[np.ix_(g.nodes, np.flatnonzero(g.constraint.axes))] = True
         return mask
@@ -75,7 +81,7 @@ class DirichletConditions:
     def prescribed_axes(self) -> np.ndarray:
         """Return 1 for each row's axes that are now prescribed, (n_prescribed, 3) int32."""
         axes = np.zeros((self.n_prescribed, 3), dtype=np.int32)
-        for g in self._groups:
+        for g in self.groups:
             if not g.released:
                 axes[g.rows] = g.constraint.axes
         return axes
@@ -90,7 +96,7 @@ class DirichletConditions:
         rows = np.zeros((len(times), self.n_prescribed, 3))
         for r, t in enumerate(times):
             releasing = []
-            for g in self._groups:
+            for g in self.groups:
                 if g.released:
                     continue
                 displacement = self._displacement_by(g, float(t))
@@ -108,7 +114,7 @@ class DirichletConditions:
     def target_positions(self, t: float) -> np.ndarray:
         """Return positions (n_prescribed, 3) of the prescribed nodes at a time [m], nan on axes free or released by then."""
         target_positions = np.full((self.n_prescribed, 3), np.nan)
-        for g in self._groups:
+        for g in self.groups:
             displacement = None if g.released else self._displacement_by(g, t)
             if displacement is not None:
                 target_positions[g.rows] = np.where(g.constraint.axes, self._rest[g.nodes] + displacement, np.nan)
@@ -121,7 +127,7 @@ class DirichletConditions:
         """
         fractions, weights = ((0, 1 / 2, 1), (4, -8, 4)) if middle else ((0, 1 / 3, 2 / 3, 1), (-9, 36, -45, 18))
         total = np.zeros((self.n_prescribed, 3))
-        for g in self._groups:
+        for g in self.groups:
             if g.released:
                 continue
             length = dt
@@ -137,16 +143,16 @@ class DirichletConditions:
                 total[g.rows] += weight / length**2 * displacement
         return total
 
-    def _displacement_by(self, group: _Group, t: float) -> np.ndarray | None:
+    def _displacement_by(self, group: MovedNodes, t: float) -> np.ndarray | None:
         """Return a path's displacement at the end t [s] of a step; at the moment of a release, the last one before."""
         displacement = self._displacement(group, t)
         return self._displacement(group, t * (1.0 - ROUNDING)) if displacement is None else displacement
 
     @staticmethod
-    def _displacement(group: _Group, t: float) -> np.ndarray | None:
+    def _displacement(group: MovedNodes, t: float) -> np.ndarray | None:
         """Return a path's displacement at t, checked; a SimulationError names the body, the time and the rule."""
         what = f"body {group.name!r}: moved nodes"
         try:
-            return checks.path_value(group.constraint.path, t, what, "displacement", ((3,), (len(group.nodes), 3)))
+            return checks.path_value(group.path, t, what, "displacement", ((3,), (len(group.nodes), 3)))
         except SceneError as error:
             raise SimulationError(str(error)) from error.__cause__

@@ -12,6 +12,7 @@ import numpy as np
 
 from taisoft.backend import runtime
 from taisoft.backend.arrays import FieldArena
+from taisoft.dynamics.commands import Commands
 from taisoft.dynamics.dirichlet import DirichletConditions
 from taisoft.dynamics.drag_spring import DragSpring
 from taisoft.dynamics.no_contacts import NoContacts
@@ -25,6 +26,7 @@ from taisoft.fem.measure import NO_TET, measure
 from taisoft.fem.model import Model, build_model
 from taisoft.fem.state import FIRST_SOFTENED, LOADS
 from taisoft.records import Energies, StepReport
+from taisoft.scene.commands import Command
 from taisoft.scene.plan import Plan
 from taisoft.scene.scene import Scene
 from taisoft.settings import Settings, check_dt
@@ -74,7 +76,8 @@ class Dynamics:
         self.drag_spring = DragSpring(self.state) if settings.draggable else None
         self.stepper = make_stepper(self.state, settings, self.contact or NoContacts())
         self._owned.append(self.stepper)
-        self._paths = PrescribedPaths(scene)
+        self._paths = PrescribedPaths(scene, self.state.dirichlet)
+        self.commands, self._explicit = Commands(scene, self.state.dirichlet), settings.explicit
         self.reset()
 
     @property
@@ -100,6 +103,7 @@ class Dynamics:
         Raises SimulationError that names the step; the state stays the last good one.
         """
         spring, start = self.drag_spring, self.state.step_count
+        begin, end = self.state.time, self.state.time + (n if self._explicit else 1) * self.dt
         if spring is not None and spring.drag is not None:
             held = self.stepper.held_steps(self.dt)
             n = min(n, held)
@@ -109,7 +113,8 @@ class Dynamics:
         before = (self.state.state()[1].astype(np.float64), self.state.time) if self.model.has_dependents else None
         try:
             self._paths.check()
-            self._paths.remember(self.state.time + self.dt)
+            self.commands.begin(end)
+            self._paths.begin(begin, self.dt, end)
             result = self.stepper.advance(n, self.dt)
         except SimulationError as error:
             raise self._failure(error) from None
@@ -167,7 +172,11 @@ class Dynamics:
     # --- changes between steps ----------------------------------------------------------------------------------------
 
     def reset(self) -> None:
-        """Restore the scene's initial state; changed numbers (dt, gravity, materials, loads) stay. Compiles nothing."""
+        """Restore the scene's initial state, without commands; changed numbers (dt, gravity, materials, loads) stay.
+
+        Compiles nothing.
+        """
+        self.commands.reset()
         self.state.restart()
         self.end_drag()
         self._time_base = 0.0, 0
@@ -196,6 +205,14 @@ class Dynamics:
         self._time_base = self.state.time, self.state.step_count
         self.changes += 1
         self.dt = dt
+
+    def command(self, movers: list[int], command: Command) -> None:
+        """Let movers of `commands` follow a command from the next step on."""
+        for mover in movers:
+            self.commands.follow(mover, command)
+        self.changes += 1
+        if self.contact is not None:
+            self.contact.motion_changed()
 
     def upload_loads(self) -> None:
         """Copy the scene's present loads, plus the force of the drag spring, to the device."""
@@ -286,11 +303,13 @@ class Dynamics:
         """Return everything the next step depends on besides scene and settings, for a checkpoint."""
         start, count = self._time_base
         own = {"dt": self.dt, "time_base": start, "count_base": count}
-        return own | {"simulation": self.state.snapshot(), "stepper": self.stepper.snapshot()}
+        parts = {"simulation": self.state.snapshot(), "stepper": self.stepper.snapshot(), "commands": self.commands.snapshot()}
+        return own | parts
 
     def restore(self, kept: dict) -> None:
         """Restore a `snapshot` of the same scene with the same numbers."""
         self.dt, self._time_base = check_dt(kept["dt"]), (float(kept["time_base"]), int(kept["count_base"]))
+        self.commands.restore(kept["commands"])
         self.state.restore(kept["simulation"])
         self._paths.remember(self.state.time)
         self._velocities_before = None
@@ -298,6 +317,7 @@ class Dynamics:
 
     def continue_from(self, other: "Dynamics") -> None:
         """Take over the state of another instance of the same scene, as `state_changed` does without history."""
+        self.commands.continue_from(other.commands)
         self.state.restore(other.state.snapshot())
         self._paths.remember(self.state.time)
         self.stepper.forget()

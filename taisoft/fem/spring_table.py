@@ -58,8 +58,8 @@ class MovingEnds:
         try:
             found = [self.offsets(t)]
             if self.damped:
-                start, end = max(t - RATE_STEP, 0.0), t + RATE_STEP
-                found.append((self.offsets(end) - self.offsets(start)) / (end - start))
+                end = max(t, RATE_STEP)  # not later: commanded motion may end at t
+                found.append((self.offsets(end) - self.offsets(end - RATE_STEP)) / RATE_STEP)
         except SceneError as error:
             raise SimulationError(str(error)) from error.__cause__
         return np.concatenate(found).reshape(-1)

@@ -194,7 +194,7 @@ class _Builder:
             elif at < len(element) and element[at] == n:
                 fixed[at] += sign * place
         grouped = [
-            (owner, np.array(places), np.array(signs), owner.undisplaced(0.0, np.array(points)))
+            (owner, np.array(places), np.array(signs), owner.undisplaced(np.array(points)))
             for owner, places, signs, points in found.values()
         ]
         return MovingEnds(len(scalar_loads(self.scene)), damped, element, fixed, grouped)

@@ -39,7 +39,7 @@ class ConnectionLines:
         start = np.cumsum([0, *map(len, nodes)])
         self._matrix = sp.csr_matrix((np.concatenate([np.zeros(0), *weights]), indices, start), (len(nodes), self._n_nodes))
         self._placed = [
-            (obstacle := scene.obstacle(name), np.array(rows), obstacle.undisplaced(0.0, np.array(points)))
+            (obstacle := scene.obstacle(name), np.array(rows), obstacle.undisplaced(np.array(points)))
             for name, (rows, points) in self._on_obstacles.items()
         ]
 

@@ -69,10 +69,10 @@ class UsdWriter:
         self.chunks = make_folder(Path(folder) / CHUNKS_NAME)
         self.chunk_frames = chunk_frames
         self._touching, self._errors = scene.pushes(self_collision), errors
-        self._tracks, self._moving, self._curves, self._view, self._template = scene_layer(scene, fps, self._touching, errors)
+        self._tracks, self._obstacles, self._curves, self._view, self._template = scene_layer(scene, fps, self._touching, errors)
         self._mean = NodalMean(scene.bodies)
         self._joined = _Joined(self.path, self._template)
-        self._chunk = None
+        self._chunk, self._moved = None, set()  # tracks of the obstacles that have moved
         self._codes: list[float] = []  # time codes in the unfinished chunk
         self._fps, self._start, self._latest = fps, 0.0, float(first - 1)  # start: time of frame 0 [s]; latest: time code
         try:
@@ -99,7 +99,8 @@ class UsdWriter:
         """Record sim's state as frame index, which must ascend; the first, if not 0, counts from time 0. Raises OutputError."""
         from pxr import Gf, Sdf
 
-        moved = [(track, surface.at(sim.time).astype(np.float32)) for track, surface in self._moving]  # first, since it may raise
+        moving = [(track, surface) for track, surface in self._obstacles if surface.obstacle.path is not None]
+        moved = [(track, surface.at(sim.time).astype(np.float32)) for track, surface in moving]  # first, since it may raise
         x = sim.positions()
         curves = [] if self._curves is None else self._curves.samples(sim, x)
         if self._chunk is None:
@@ -116,6 +117,11 @@ class UsdWriter:
         for track, corners in moved:
             samples += track.samples(corners, {})
         samples += curves
+        for track, surface in moving:
+            if track not in self._moved and self._latest >= 0.0:  # commanded since the frame before, where it was at rest
+                for path, value in track.samples(surface.vertices.astype(np.float32), {}):
+                    self._chunk.SetTimeSample(path, self._latest, value)
+            self._moved.add(track)
         if index == 0:
             self._start = sim.time
         code = (sim.time - self._start) * self._fps

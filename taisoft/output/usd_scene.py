@@ -138,7 +138,7 @@ def scene_layer(scene, fps: float, touching: bool, errors: bool) -> tuple[list[T
     """Build a layer with everything that does not change, and the tracks that get values with the frames.
 
     touching: whether there can be contacts; errors: whether errors are estimated. Returns the tracks of the bodies, (track,
-    surface) of each obstacle that follows a path, the curves of springs and tendons or None, the camera's track and the layer.
+    surface) of each obstacle, the curves of springs and tendons or None, the camera's track and the layer.
     """
     from pxr import Sdf, Usd, UsdGeom
 
@@ -160,9 +160,9 @@ def scene_layer(scene, fps: float, touching: bool, errors: bool) -> tuple[list[T
     view = ViewTrack(stage, scene)
     n_bodies, n_colliders = len(scene.bodies), len(scene.colliders)
     surfaces = [s for s in zip(obstacle_surfaces(scene), legal[n_bodies:n_colliders]) if len(s[0].triangles)]
-    moving = [(_define_obstacle(stage, surface, name, view.camera.position), surface) for surface, name in surfaces]
+    obstacles = [(_define_obstacle(stage, surface, name, view.camera.position), surface) for surface, name in surfaces]
     curves = Curves(stage, ROOT, scene, legal[n_colliders:]) if scene.springs or scene.tendons else None
-    return tracks, [one for one in moving if one[1].obstacle.path is not None], curves, view, layer
+    return tracks, obstacles, curves, view, layer
 
 
 def _extent(points: np.ndarray) -> np.ndarray:

@@ -17,7 +17,7 @@ from taisoft.mesh.thickness import coarse_bending
 from taisoft.scene import checks
 from taisoft.scene.collision import CONTACT_MODES
 from taisoft.scene.composition import Composition, compose
-from taisoft.scene.key_frames import KeyFrames, NodePath
+from taisoft.scene.key_frames import AT_REST, KeyFrames, NodePath
 from taisoft.scene.loads import Cavity, NodalForce, Pressure, Traction, value_or_path
 from taisoft.scene.material import Material
 from taisoft.scene.skins import Skin, embed
@@ -285,18 +285,18 @@ class Body(Guarded):
         nodes = self.select_nodes(where, what)
         return self._add_constraint(Constraint(nodes, checks.axes(axes, what), None, _callable_or_none(where)), what)
 
-    def move(self, where, path: Callable | KeyFrames, axes: str = "xyz") -> Constraint:
-        """Move nodes along a prescribed path.
+    def move(self, where, path: Callable | KeyFrames | None = None, axes: str = "xyz") -> Constraint:
+        """Move nodes along a prescribed path, or hold them until `Simulator.set_displacement` moves them.
 
         where: as for `fix`, but without repeated ids. path: callable t [s] -> displacement from the start, (3,) or (k,3) [m] in
         the order of the chosen nodes, or None from the time of release; it is called once here, for t = 0. Or `KeyFrames`, whose
-        pivot is in start coordinates. axes: the prescribed directions. Raises SceneError if no node is chosen, one is fixed or
-        moved already, or the path is invalid.
+        pivot is in start coordinates. None: they stay until a command. axes: the prescribed directions. Raises SceneError if no
+        node is chosen, one is fixed or moved already, or the path is invalid.
         """
         self._check_open("move")
         what = f"{self._label()}: move"
         nodes = self.select_nodes(where, what, repeats=False)
-        mask = checks.axes(axes, what)
+        mask, path = checks.axes(axes, what), AT_REST if path is None else path
         if isinstance(path, KeyFrames):
             path = NodePath(path, self.rest_positions[nodes] + self.position)
         if not callable(path):

@@ -165,7 +165,7 @@ class CarriedPath:
     starts: np.ndarray  #: (k,3) [m], start positions
 
     def __call__(self, t: float) -> np.ndarray:
-        return self.obstacle.points_at(t, self.obstacle.undisplaced(0.0, self.starts)) - self.starts
+        return self.obstacle.points_at(t, self.obstacle.undisplaced(self.starts)) - self.starts
 
 
 def constraint_of(scene: "Scene", attachment: Attachment) -> Constraint:

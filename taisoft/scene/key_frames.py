@@ -102,6 +102,9 @@ class KeyFrames:
         return translation, rotation.as_matrix()
 
 
+AT_REST = KeyFrames((0.0,), translations=((0.0, 0.0, 0.0),))
+
+
 @dataclass(frozen=True, eq=False)
 class NodePath:
     """Key frames as a path for nodes: t [s] -> displacement (3,) or (k,3) [m], or None once the nodes are released."""

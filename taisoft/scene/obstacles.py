@@ -267,7 +267,7 @@ class Obstacle:
         checks.store(self, friction=friction, restitution=restitution, path=path)
         if self.path is not None and not callable(self.path):
             raise SceneError(f"{what}: path must be a function of time, not {value_text(self.path)}")
-        self.pose(0.0)
+        checks.store(self, _start=self.pose(0.0))  # a simulation may replace the path
 
     def pose(self, t: float) -> tuple[np.ndarray, np.ndarray]:
         """Return translation (3,) [m] and rotation (3,3) at time t [s]: x -> rotation @ (x - pivot) + pivot + translation.
@@ -289,10 +289,9 @@ class Obstacle:
         pivot = self.shape.pivot
         return (points - pivot) @ rotation.T + pivot + translation
 
-    def undisplaced(self, t: float, points: np.ndarray) -> np.ndarray:
-        """Return the points (n,3) [m] of the undisplaced shape that are at these positions at time t [s]."""
-        translation, rotation = self.pose(t)
-        pivot = self.shape.pivot
+    def undisplaced(self, points: np.ndarray) -> np.ndarray:
+        """Return the points (n,3) [m] of the undisplaced shape that are at these positions at the start."""
+        (translation, rotation), pivot = self._start, self.shape.pivot
         return (points - pivot - translation) @ rotation + pivot
 
 

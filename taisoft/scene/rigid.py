@@ -216,12 +216,13 @@ class RigidBody(Body):
             )
         return self._add_constraint(Constraint(np.arange(FRAME), mask), what)
 
-    def move(self, path: Callable | KeyFrames, axes: str = "xyz") -> Constraint:
-        """Move the body along a prescribed path.
+    def move(self, path: Callable | KeyFrames | None = None, axes: str = "xyz") -> Constraint:
+        """Move the body along a prescribed path, or hold it until `Simulator.set_pose` or `set_velocity` moves it.
 
         path: callable t [s] -> (translation (3,) [m], rotation (3,3) about the centre of mass), or None from the time of release;
         it is called once here, for t = 0. Or `KeyFrames`, whose pivot is in start coordinates, by default the centre of mass.
-        axes: the prescribed directions. Raises SceneError if it is fixed or moved already, or the path is invalid.
+        None: it stays until a command. axes: the prescribed directions. Raises SceneError if it is fixed or moved already, or the
+        path is invalid.
         """
         self._check_open("move")
         if not isinstance(path, KeyFrames) and callable(path):
@@ -268,11 +269,16 @@ class PosePath:
     arms: np.ndarray  #: (k,3) [m], nodes at the start relative to the centre
     what: str
 
-    def __call__(self, t: float) -> np.ndarray | None:
+    def pose(self, t: float) -> tuple[np.ndarray, np.ndarray] | None:
+        """Return translation (3,) [m] and rotation (3,3), or None."""
         value = self.path(t)
-        if value is None:
+        return None if value is None else checked_pose(value, t, self.what)
+
+    def __call__(self, t: float) -> np.ndarray | None:
+        pose = self.pose(t)
+        if pose is None:
             return None
-        translation, rotation = checked_pose(value, t, self.what)
+        translation, rotation = pose
         return self.arms @ rotation.T - self.arms + translation
 
 

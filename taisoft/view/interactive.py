@@ -51,18 +51,21 @@ class InteractiveView:
         self.times: list[float] = []  #: of the frames [s]
         self.scales: list[str] = []  #: what red means in each of them, empty for own colours
         self._frames: list[tuple[np.ndarray, np.ndarray]] = []  # vertices and colours of bodies
+        self._moved: list[dict[int, np.ndarray]] = []  # vertices of the obstacles that move, by number
         self._scene = None
 
     def __call__(self, sim, _index: int = 0, _report=None) -> None:
         """Add sim's present state. Raises OutputError if it has another scene than the first frame."""
         if self._scene is None:
-            self._scene, self._surfaces = sim.scene, Surfaces(sim.scene)
+            self._scene, self._surfaces, self._obstacles = sim.scene, Surfaces(sim.scene), obstacle_surfaces(sim.scene)
             self._used, self._faces = compact_surface(self._surfaces.body_triangles)
             self._colouring = Colouring(sim.scene, self._surfaces, self.colour)
         if sim.scene is not self._scene:
             raise OutputError("an interactive view shows one scene: make another one for another simulator")
         x, colours = self._surfaces.of_bodies(sim)[0], linear_rgb(self._colouring.base(sim))
         self._frames.append((x[self._used].astype(np.float32), np.round(255 * colours[self._used]).astype(np.uint8)))
+        moving = ((number, one) for number, one in enumerate(self._obstacles) if one.obstacle.path is not None)
+        self._moved.append({number: one.at(sim.time).astype(np.float32) for number, one in moving})
         self.scales.append(self._colouring.scale_text)
         self.times.append(sim.time)
 
@@ -115,24 +118,23 @@ class InteractiveView:
         recording = server.get_scene_serializer()
         meshes = [trimesh.Trimesh(x, self._faces, vertex_colors=colours, process=False) for x, colours in self._frames]
         frames = [server.scene.add_mesh_trimesh(f"/frames/{k}", mesh, visible=k == 0) for k, mesh in enumerate(meshes)]
-        moving = self._add_obstacles(server)
+        handles = self._add_obstacles(server)
         for k in range(1, len(frames)):
             recording.insert_sleep(self.times[k] - self.times[k - 1])
             frames[k].visible, frames[k - 1].visible = True, False
-            for surface, handle in moving:
-                handle.vertices = surface.at(self.times[k]).astype(np.float32)
+            for number in handles.keys() & self._moved[k].keys():
+                handles[number].vertices = self._moved[k][number]
         return recording
 
-    def _add_obstacles(self, server) -> list[tuple]:
-        """Put the obstacles on a server at the first frame's time; return surface and handle of those that follow a path."""
+    def _add_obstacles(self, server) -> dict[int, object]:
+        """Put the obstacles on a server at the first frame's time; return the handles of those that have triangles, by number."""
         grey = tuple(np.round(255 * OBSTACLE_COLOUR).astype(int).tolist())
-        moving = []
-        for number, surface in enumerate(obstacle_surfaces(self._scene)):
+        handles = {}
+        for number, surface in enumerate(self._obstacles):
             if len(surface.triangles) == 0:
                 continue
-            x, faces = surface.at(self.times[0]).astype(np.float32), surface.triangles.astype(np.uint32)
+            x, faces = self._moved[0].get(number, surface.vertices.astype(np.float32)), surface.triangles.astype(np.uint32)
             side = "front" if isinstance(surface.obstacle.shape, HalfSpace) else "double"  # walls do not hide what they hold
-            handle = server.scene.add_mesh_simple(f"/obstacles/{number}", x, faces, color=grey, flat_shading=True, side=side)
-            if surface.obstacle.path is not None:
-                moving.append((surface, handle))
-        return moving
+            added = server.scene.add_mesh_simple(f"/obstacles/{number}", x, faces, color=grey, flat_shading=True, side=side)
+            handles[number] = added
+        return handles

@@ -13,6 +13,7 @@ import scipy.sparse as sp
 
 from taisoft.errors import OutputError, SceneError, SimulationError
 from taisoft.records import Energies
+from taisoft.scene import checks
 from taisoft.scene.loads import value_at
 from taisoft.scene.obstacles import Box, Capsule, HalfSpace, MeshObstacle, Obstacle, Sphere
 from taisoft.view.connection_layer import ConnectionMarks
@@ -95,15 +96,16 @@ class MirrorScene:
         ]
         self.gravity = description["gravity"]
         self.connections = [SimpleNamespace(owners=owners) for owners in description["connected"]]
-        self.poses = {o["name"]: o["pose"] for o in description["obstacles"] if o["pose"] is not None}
-        self.obstacles = [
-            Obstacle(
-                SHAPES[o["shape"]](**o["fields"]),
-                o["name"],
-                path=(lambda _, name=o["name"]: self.poses[name]) if o["name"] in self.poses else None,
-            )
-            for o in description["obstacles"]
-        ]
+        self.obstacles = [Obstacle(SHAPES[o["shape"]](**o["fields"]), o["name"]) for o in description["obstacles"]]
+        self.poses = {}
+        self.take_poses({o["name"]: o["pose"] for o in description["obstacles"] if o["pose"] is not None})
+
+    def take_poses(self, poses: dict) -> None:
+        """Take over the poses of the obstacles that move, by name: more may, once they are commanded."""
+        for obstacle in self.obstacles:
+            if obstacle.name in poses and obstacle.name not in self.poses:
+                checks.store(obstacle, path=lambda _, name=obstacle.name: self.poses[name])
+        self.poses.update(poses)
 
     @staticmethod
     def constraints(body: SimpleNamespace) -> list:
@@ -188,7 +190,7 @@ class MirrorSimulation:
         """Take over a state; x (n,3) and values (n,) are copied."""
         self.time, self.step_count = state["time"], state["step_count"]
         self._energies, self._x = Energies(*state["energies"]), x.copy()
-        self.scene.poses.update(state["poses"])
+        self.scene.take_poses(state["poses"])
         tractions = [t for body in self.scene.bodies for t in body.tractions]
         for traction, value in zip(tractions, state["tractions"]):
             traction.value = value

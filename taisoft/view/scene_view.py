@@ -240,7 +240,8 @@ class _RigidSurface:
 
     def at(self, t: float, bodies: np.ndarray) -> np.ndarray:
         """Return the vertices (n,3) [m] at time t [s], with bodies at (m,3) [m], all finite."""
-        return self._surface.at(t) if self._square is None else self._square.below(bodies)
+        moves = self._square is None or self._surface.obstacle.path is not None
+        return self._surface.at(t) if moves else self._square.below(bodies)
 
     def vertices(self, t: float, bodies: np.ndarray, eye: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         x = self.at(t, bodies)

@@ -13,7 +13,7 @@ from typing import NoReturn
 
 from taisoft.errors import OutputError
 from taisoft.frames import dt_sentence, fit_dt
-from taisoft.records import RunReport
+from taisoft.records import RunReport, StepReport
 from taisoft.view.annotations import REFRESH
 from taisoft.view.child_process import ChildProcess, python_module
 from taisoft.view.colouring import NodalValues
@@ -157,14 +157,29 @@ class WindowProcess:
 
 
 class LiveWindow:
-    """A window that shows a run: an observer, with `frame` and `close`, for `Simulator.run`; see `WindowProcess`.
+    """A window that shows a simulation while a loop of the caller steps it: call it with the simulator for each picture.
 
-    A window that is closed or lost does not end the run; the latter is a warning.
+    `sim.run(seconds, on_frame=window)` does so for each frame. plots: names, or `Plots` that are filled elsewhere; colour, layers:
+    as for `show`. A window that is closed or lost does not end the run; the latter is a warning.
+    Raises OutputError if a display or a Vulkan driver is missing, SceneError for a plot of a quantity that is not simulated.
     """
 
-    def __init__(self, sim, plots: Plots, colour: str = "body", layers: tuple[str, ...] = IN_WINDOW):
-        shown = {"colour": colour, "layers": layers, "plots": tuple(name for name in PLOTS if plots.shown[name])}
-        self._plots, self._window = plots, WindowProcess(sim, **shown)
+    def __init__(self, sim, plots: tuple[str, ...] | Plots = (), colour: str = "body", layers: tuple[str, ...] = IN_WINDOW):
+        self._plots, self._own = (plots, False) if isinstance(plots, Plots) else (Plots(sim, plots), True)
+        shown = tuple(name for name in PLOTS if self._plots.shown[name])
+        self._window = WindowProcess(sim, colour=colour, layers=layers, plots=shown)
+
+    def __call__(self, sim, index: int | None = None, report: StepReport | None = None) -> None:
+        """Show sim's present state if the window has shown the previous one. report: of the last step, for the plots."""
+        if self._own and report is not None:
+            self._plots.take(report, 0.0)
+        self.frame(sim, sim.step_count if index is None else index)
+
+    def __enter__(self) -> "LiveWindow":
+        return self
+
+    def __exit__(self, *exception) -> None:
+        self.close()
 
     @property
     def closed(self) -> bool:

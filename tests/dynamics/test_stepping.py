@@ -10,7 +10,8 @@ the others they are linear and have stiffness damping, too.
 
 Dirichlet conditions: fixed and prescribed axes are constrained until the group is released, which a reset undoes; targets are the
 rest positions plus the path's displacement, one for all nodes or one for each, until the first release; a step that ends with a
-path follows it to there, its accelerations too; paths that fail, give invalid values or depend on more than time are refused.
+path follows it to there, its accelerations too; paths that fail, give invalid values or depend on more than time are refused;
+a jump is told from motion.
 """
 
 from contextlib import contextmanager
@@ -21,7 +22,7 @@ import pytest
 
 import taisoft as ts
 from taisoft.dynamics.dirichlet import DirichletConditions
-from taisoft.dynamics.prescribed_paths import PrescribedPaths
+from taisoft.dynamics.prescribed_paths import PrescribedPaths, find_jump
 from taisoft.dynamics.schemes import EXPLICIT, IMPLICIT
 from tests.dynamics.following import DT, follow, simulator
 from tests.dynamics.scenes import cube, driven_scene, element, rows_of, rubber, use_threads
@@ -312,8 +313,8 @@ def test_a_displacement_after_a_release_is_refused():
 def test_only_functions_of_time_alone_are_paths(height, refused):
     past, scene, found = [0.0], ts.Scene(), ""
     path = lambda t: None if (y := height(t, past)) is None else (0.0, y, 0.0)  # noqa: E731
-    scene.add_body(cube(), rubber(), name="it").move([3, 1], path)
-    paths = PrescribedPaths(scene)
+    group = SimpleNamespace(name=scene.add_body(cube(), rubber(), name="it").name, path=path, nodes=np.array([3, 1]))
+    paths = PrescribedPaths(scene, SimpleNamespace(groups=[group]))
     for k in range(5):
         paths.remember(0.1 * k * (1 + 1e-15))
         past.append(float(k))
@@ -322,3 +323,22 @@ def test_only_functions_of_time_alone_are_paths(height, refused):
         except ts.SimulationError as error:
             found = str(error)
     assert found.startswith("body 'it': moved nodes: the path gives another value at t = ") == refused == bool(found)
+    assert ("sim.set_displacement" in found) == refused
+
+
+@pytest.mark.parametrize(
+    "height, at",  # of t in a step from 1 s to 2 s
+    [
+        (lambda t: 0.02 * (t > 1.3), 1.3),
+        (lambda t: 3.0 * t + 1e-3 * (t >= 1.7), None),  # less than the motion
+        (lambda t: max(t - 1.5, 0.0), None),
+        (lambda t: (t - 1.0) ** 4, None),
+        (lambda t: np.sqrt(t - 1.0), None),
+        (lambda t: 2.0, None),
+        (lambda t: None if t > 1.5 else 0.0, None),
+    ],
+)
+def test_jumps_are_told_from_motion(height, at):
+    value = lambda t: None if (y := height(t)) is None else np.array([0.0, y, 0.0])  # noqa: E731
+    found = find_jump(value, 1.0, value(1.0), 2.0, value(2.0))
+    assert found == (None if at is None else (pytest.approx(at, abs=1e-3), pytest.approx(0.02)))

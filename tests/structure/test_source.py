@@ -59,7 +59,7 @@ ORDER = (
     ("view.connection_layer", "view.ground"),
     ("view.scene_view", "view.shadow"),
     (
-        *("simulator", "queries", "contact_queries", "changes", "energy_check", "frames", "running", "static"),
+        *("simulator", "queries", "contact_queries", "changes", "commanding", "energy_check", "frames", "running", "static"),
         *("checkpoint", "estimation"),
         *("output.vtu", "view.offscreen"),  # for methods of Simulator
     ),

@@ -1,0 +1,109 @@
+"""Motions that the user commands between two steps: what moves by them, when they end, and their way into checkpoints.
+
+A command replaces the path of an obstacle, or of nodes that are moved, until `reset`. One without a duration ends with the steps
+that the next call of `advance` asks for: an implicit step, or a number of explicit ones.
+"""
+
+import dataclasses
+
+import numpy as np
+
+from taisoft.dynamics.dirichlet import DirichletConditions, MovedNodes
+from taisoft.errors import SceneError
+from taisoft.scene import checks
+from taisoft.scene.commands import Command
+from taisoft.scene.obstacles import Obstacle
+from taisoft.scene.rigid import FRAME, Pose, PosePath, RigidBody
+from taisoft.scene.scene import Scene
+
+
+class Commands:
+    """The commands that a scene's obstacles and moved nodes follow at present. The scene is the simulator's own copy."""
+
+    def __init__(self, scene: Scene, dirichlet: DirichletConditions):
+        self._scene, self._obstacles = scene, scene.obstacles
+        self._movers: list[Obstacle | MovedNodes] = [*scene.obstacles, *dirichlet.groups]
+        self._given = [one.path for one in self._movers]
+        self._followed: dict[int, Command] = {}  # by mover
+
+    def __bool__(self) -> bool:
+        return bool(self._followed)
+
+    def names(self) -> list[str]:
+        """Return the names of what follows commands."""
+        return [self._movers[k].name for k in self._followed]
+
+    def obstacle(self, obstacle: Obstacle) -> int:
+        """Return the mover that an obstacle is. Raises SceneError if what is attached to it was taken to be at rest."""
+        for one in self._scene.connections:
+            if obstacle.name in one.owners and obstacle.path is None:
+                raise SceneError(
+                    f"obstacle {obstacle.name!r}: {type(one).__name__.lower()} {one.name!r} holds on to it, so that it can be "
+                    "commanded only if it has a path at the start, such as ts.KeyFrames((0,), translations=[(0, 0, 0)])"
+                )
+        return next(k for k, one in enumerate(self._movers) if one is obstacle)
+
+    def moved_nodes(self, name: str) -> list[int]:
+        """Return the movers that are nodes held by `move` of a body, in the order added."""
+        return [k for k, one in enumerate(self._movers) if isinstance(one, MovedNodes) and one.of_move and one.name == name]
+
+    def nodes(self, mover: int, what: str) -> MovedNodes:
+        """Return nodes that are still held. Raises SceneError."""
+        group = self._movers[mover]
+        if group.released:
+            raise SceneError(f"{what}: its path has released it, and it moves freely")
+        return group
+
+    def pose(self, mover: int, time: float) -> Pose:
+        """Return the pose of an obstacle or a rigid body at a time [s], without the rounding of its nodes' positions."""
+        one = self._movers[mover]
+        if isinstance(one, Obstacle):
+            return Pose(*one.pose(time))
+        if isinstance(one.path, PosePath):
+            return Pose(*one.path.pose(time))
+        body, displacement = self._body(one), one.path(time)
+        if displacement.ndim == 1:
+            return Pose(displacement, np.eye(3))
+        return body.pose(body.rest_positions[:FRAME] + body.position + displacement)
+
+    def follow(self, mover: int, command: Command) -> None:
+        """Let a mover follow a command from now on."""
+        self._followed[mover] = command
+        one = self._movers[mover]
+        if isinstance(one, Obstacle):
+            checks.store(one, path=command)
+        elif isinstance(body := self._body(one), RigidBody):
+            one.path = PosePath(command, body.mesh.vertices[:FRAME] - body.centre, f"rigid body {one.name!r}")
+        else:
+            one.path = command
+
+    def begin(self, end: float) -> None:
+        """Let the steps that begin now carry out what is pending; end [s]: when they end."""
+        for mover, command in self._followed.items():
+            if command.is_pending:
+                self.follow(mover, command.until(end if command.seconds is None else command.begin + command.seconds))
+
+    def reset(self) -> None:
+        """Forget all commands: what followed them follows its path again."""
+        for mover in self._followed:
+            checks.store(self._movers[mover], path=self._given[mover])
+        self._followed = {}
+
+    def snapshot(self) -> dict:
+        """Return the commands for a checkpoint."""
+        return {str(mover): dataclasses.asdict(command) for mover, command in self._followed.items()}
+
+    def restore(self, kept: dict) -> None:
+        """Restore a `snapshot`."""
+        self.reset()
+        for mover, command in kept.items():
+            self.follow(int(mover), Command(**command))
+
+    def continue_from(self, other: "Commands") -> None:
+        """Take over the commands of another instance of the same scene, and the paths that they replaced."""
+        self._given = other._given[: len(self._obstacles)] + self._given[len(self._obstacles) :]
+        for mover, command in other._followed.items():
+            self.follow(mover, command)
+
+    def _body(self, group: MovedNodes):
+        return self._scene.body(group.name)
