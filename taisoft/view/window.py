@@ -172,7 +172,7 @@ class LiveWindow:
     def __call__(self, sim, index: int | None = None, report: StepReport | None = None) -> None:
         """Show sim's present state if the window has shown the previous one. report: of the last step, for the plots."""
         if self._own and report is not None:
-            self._plots.take(report, 0.0)
+            self._plots.take(report, math.nan)
         self.frame(sim, sim.step_count if index is None else index)
 
     def __enter__(self) -> "LiveWindow":

@@ -250,7 +250,7 @@ def carried(exact: bool, contact: bool = False, hand=HANDS["box"]) -> ts.Scene:
     else:
         X = bar.rest_positions[end(bar.rest_positions)] + bar.position
         hand = scene.obstacle("hand")
-        bar.move(end, lambda t: hand.points_at(t, hand.undisplaced(0.0, X)) - X)
+        bar.move(end, lambda t: hand.points_at(t, hand.undisplaced(X)) - X)
     return add_companion(scene, attached=True)
 
 

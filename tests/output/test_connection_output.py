@@ -49,7 +49,7 @@ def test_polylines_run_through_the_points(moved):
     for one in (*scene.springs, *scene.tendons):
         for point in one.points:
             row, place = oracle.point(point.owner, point.position)
-            expected.append(row @ x if row.any() else beam.points_at(sim.time, beam.undisplaced(0.0, place[None]))[0])
+            expected.append(row @ x if row.any() else beam.points_at(sim.time, beam.undisplaced(place[None]))[0])
     assert np.abs(points[: len(expected)] - expected).max() < 1e-6
     assert lines.tensions(sim)[:3] == pytest.approx([sim.joint_force(one) for one in NAMES])
     assert sim.tensions() == {name: sim.joint_force(name) for name in NAMES}

@@ -12,6 +12,8 @@ from taisoft.output.camera import Camera, start_positions
 from taisoft.output.nodal_fields import NodalMean, von_mises
 from taisoft.output.usd import UsdWriter, join_chunks
 from taisoft.output.usd_scene import prim_names
+from taisoft.scene.checks import store
+from taisoft.scene.obstacles import Sphere
 from tests.output.usd_stage import check_frames, faults
 from tests.view.fake_simulator import FakeSimulator, beam_scene
 
@@ -194,6 +196,22 @@ def test_a_last_frame_between_two_has_its_own_time(tmp_path):
         stage.Reload()  # the first one may be kept
         points = UsdGeom.Mesh(stage.GetPrimAtPath("/World/beam/surface")).GetPointsAttr()
         assert points.GetTimeSamples() == pytest.approx(expected) and stage.GetEndTimeCode() == pytest.approx(expected[-1])
+
+
+def test_an_obstacle_that_is_commanded_moves_from_then_on(tmp_path):
+    scene = beam_scene()
+    obstacle, sim = scene.add_obstacle(Sphere((0, -3, 0), 0.5), name="ball"), FakeSimulator(scene)
+    writer = UsdWriter(tmp_path, scene, fps=10.0, chunk_frames=2)
+    for index in range(4):
+        sim.time = 0.1 * index
+        if index == 2:
+            store(obstacle, path=lambda t: ((t, 0, 0), np.eye(3)))  # as a command does
+        writer.frame(sim, index)
+    writer.close()
+    stage = Usd.Stage.Open(str(tmp_path / "scene.usdc"))
+    points = UsdGeom.Mesh(stage.GetPrimAtPath("/World/ball/surface")).GetPointsAttr()
+    moved = [float(np.mean(np.array(points.Get(index)) - np.array(points.Get(0)), axis=0)[0]) for index in range(4)]
+    assert points.GetTimeSamples() == [1, 2, 3] and moved == pytest.approx([0.0, 0.0, 0.2, 0.3], abs=1e-6)
 
 
 def test_a_full_disk_is_an_error_and_leaves_no_partial_file(tmp_path):

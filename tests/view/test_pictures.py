@@ -9,6 +9,7 @@ import taisoft as ts
 from taisoft.errors import OutputError
 from taisoft.output.camera import framed_points
 from taisoft.records import StepReport
+from taisoft.scene.checks import store
 from taisoft.scene.plan import Plan
 from taisoft.view import link as links
 from taisoft.view import pictures
@@ -70,6 +71,9 @@ def test_only_what_is_shown_travels():
     mirror.take(state | {"colour": "stress"}, x, np.arange(float(len(x))))
     assert mirror.values_of("speed") is None and mirror.values_of("stress")[-1] == len(x) - 1
     assert np.array_equal(mirror.positions("two"), sim.positions("two")) and mirror.energies() == sim.energies()
+    store(sim.scene.obstacle("rod"), path=lambda t: ((0, 0.25, 0), np.eye(3)))  # as a command does
+    mirror.take(describe_state(sim, marks, set(), None) | {"colour": "body"}, x, np.zeros(0))
+    assert mirror.scene.obstacles[2].pose(0.0)[0].tolist() == [0.0, 0.25, 0.0]
     sim.scene.add_obstacle(ts.Sphere((9, 0, 0), 0.1), name="late", path=lambda t: ((1.0 / (1.0 - t), 0, 0), np.eye(3)))
     sim.time = 1.0
     with pytest.raises(OutputError, match="the scene cannot be shown: obstacle 'late': the path must give"):
