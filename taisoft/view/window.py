@@ -159,8 +159,8 @@ class WindowProcess:
 class LiveWindow:
     """A window that shows a simulation while a loop of the caller steps it: call it with the simulator for each picture.
 
-    `sim.run(seconds, on_frame=window)` does so for each frame. plots: names, or `Plots` that are filled elsewhere; colour, layers:
-    as for `show`. A window that is closed or lost does not end the run; the latter is a warning.
+    `sim.run(seconds, on_frame=window)` does so for each frame. plots: names, or `Plots` that are filled elsewhere; colour and
+    layers: as for `show`. A window that is closed or lost does not end the run; the latter is a warning.
     Raises OutputError if a display or a Vulkan driver is missing, SceneError for a plot of a quantity that is not simulated.
     """
 
