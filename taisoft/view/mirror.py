@@ -26,6 +26,7 @@ def describe_scene(scene, marks: ConnectionMarks) -> dict:
     """Return what the view needs of a scene, as plain data for `MirrorScene`. marks: of its connections and pressures."""
     return {
         "gravity": np.asarray(scene.gravity),
+        "up": scene.up,
         "connected": [list(one.owners) for one in scene.connections],
         "attached": marks.attached,
         "pressed": [{"corners": corners, "longest": longest} for corners, longest in marks.pressed],
@@ -93,7 +94,7 @@ class MirrorScene:
             )
             for b in description["bodies"]
         ]
-        self.gravity = description["gravity"]
+        self.gravity, self.up = description["gravity"], description["up"]
         self.connections = [SimpleNamespace(owners=owners) for owners in description["connected"]]
         self.poses = {o["name"]: o["pose"] for o in description["obstacles"] if o["pose"] is not None}
         self.obstacles = [
