@@ -52,7 +52,6 @@ from taisoft.scene.toml_methods import call_methods
 from taisoft.scene.toml_rigid import add_rigid_body
 
 SHAPES = {"half_space": HalfSpace, "sphere": Sphere, "box": Box, "capsule": Capsule, "mesh": MeshObstacle}
-GROUND = "ground"  # a shape as well: a half-space whose normal is up
 METHODS = {
     "fix": Body.fix,
     "move": Body.move,
@@ -61,6 +60,7 @@ METHODS = {
     "pressure": Body.add_pressure,
     "cavity": Body.add_cavity,
 }
+GROUND = "ground"  # a shape as well: a half-space whose normal is up
 ON_TRIANGLES = ("traction", "pressure", "cavity")  # methods that choose surface triangles, not nodes
 SCENE_KEYS = ("up", "gravity", "allow_initial_overlap", "contact_forces")  # attributes of a Scene at top level
 TOP_KEYS = [
