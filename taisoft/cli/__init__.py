@@ -213,7 +213,9 @@ def _add_run(add) -> None:
     option("--video", action="store_true", help="also make video.mp4 from the pictures with ffmpeg (extra 'video')")
     option("--slow", type=float, metavar="FACTOR", help="film time over simulated time of video.mp4 (default 1)")
     option("--size", metavar="WIDTHxHEIGHT", help="of the pictures in pixels (default 1280x720)")
-    directions = "direction of the pictures [deg]: about y from +z towards +x, and above the horizon (default 32 20)"
+    directions = (
+        "direction of the pictures [deg]: about up from +z (with z up: -y) towards +x, and above the horizon (default 32 20)"
+    )
     option("--view", type=float, nargs=2, metavar=("AZIMUTH", "ELEVATION"), help=directions)
     option("--vtu", action="store_true", help="also write every frame as a .vtu file, and scene.pvd, which ParaView opens")
     option("--npz", action="store_true", help="also write the nodes of every frame as a .npz file")
@@ -233,6 +235,7 @@ def _add_run(add) -> None:
 def _add_placement(option, instead: str = "(default: the mesh stays)") -> None:
     """Add the options that place a mesh, in the order in which they are applied; those that are not given are None."""
     option("--up", choices=("x", "y", "z"), help="axis of the file that points up (default y)")
+    option("--to", choices=("y", "z"), help="axis that points up in the scene, to which that is turned (default y)")
     option("--scale", type=float, metavar="S", help="factor, such as 0.001 for millimetres (default 1)")
     angles = "angles [deg] about x, then y, then z, after --up (default 0 0 0)"
     option("--rotate", type=float, nargs=3, metavar=("RX", "RY", "RZ"), help=angles)

@@ -13,14 +13,13 @@ from taisoft.cli.scene_file import load_scene
 from taisoft.cli.units import MILLIMETRE, MILLIMETRES_ABOVE, longest_side, warn_millimetres
 from taisoft.errors import MeshError, OutputError, SceneError
 from taisoft.mesh.files import WRITERS, check_ending, read_mesh, write_mesh
-from taisoft.mesh.placing import place, underside
+from taisoft.mesh.placing import UP, place, underside
 from taisoft.mesh.quality import edge_lengths, mean_ratio
 from taisoft.mesh.surface_mesh import FORMATS, SurfaceMesh, read_surface, tetrahedralize
 from taisoft.mesh.tet_mesh import TetMesh
 from taisoft.mesh.topology import connected_pieces
 from taisoft.mesh.usd import USD_FORMATS, read_usd
 from taisoft.scene.material import Material
-from taisoft.scene.obstacles import HalfSpace
 from taisoft.scene.scene import Scene
 from taisoft.scene.toml_writer import write_scene
 
@@ -32,7 +31,7 @@ DENSITY = 1000.0  # [kg/m^3]
 GROUND = "ground"
 MAX_REGIONS = 20  # listed by name
 MAX_CAVITIES = 5  # listed by volume
-PLACEMENT = ("up", "scale", "rotate")  # options and arguments of `place`, without at
+PLACEMENT = ("up", "to", "scale", "rotate")  # options and arguments of `place`, without at
 MESH_SUFFIXES = (*WRITERS, ".node", ".ele")
 
 
@@ -79,7 +78,7 @@ def scene(arguments: Namespace) -> int:
             meshes = read_usd(path) if path.suffix.lower() in USD_FORMATS else {path.stem: read_mesh(path)}
             placed_meshes = {name: place(mesh, **placed) for name, mesh in meshes.items()}
             warn_millimetres(placed_meshes)
-            made, solver = _drop_scene(placed_meshes, arguments.at, arguments.order or 1)
+            made, solver = _drop_scene(placed_meshes, arguments.at, arguments.order or 1, arguments.to or "y")
         elif placed or arguments.at is not None:
             options = ", ".join(f"--{name}" for name in (*PLACEMENT, "at"))
             raise SceneError(f"{arguments.scene}: {options} place a mesh, and this is a scene")
@@ -165,7 +164,7 @@ def _size_lines(counts: str, vertices: np.ndarray) -> list[tuple[str, str]]:
         unit = f"read as metres, the longest side is {longest:.4g} m; probably millimetres: {MILLIMETRE}"
     elif longest < TINY_BELOW:
         unit = f"read as metres, the longest side is {longest:.4g} m; very small: is the file scaled?"
-    up = "y is taken for up; tetrahedralize and scene have --up, --scale, --rotate and --at"
+    up = "y is taken for up; tetrahedralize and scene have --up, --to, --scale, --rotate and --at"
     return [("counts", counts), ("extent", ", ".join(extents)), ("axes", up), ("unit", unit)]
 
 
@@ -187,21 +186,22 @@ def _print_lines(title, lines: list[tuple[str, str]]) -> None:
         print(f"  {name:<10} {text}")
 
 
-def _drop_scene(meshes: dict[str, TetMesh], at: list[float] | None, order: int) -> tuple[Scene, dict]:
+def _drop_scene(meshes: dict[str, TetMesh], at: list[float] | None, order: int, up: str) -> tuple[Scene, dict]:
     """Return a scene in which meshes, of rubber with stiffness scaled to their size, fall on the ground; and its solver dict.
 
     meshes: by name, as they stand to each other. at: (3,) [m], where the middle of their underside starts; None: above the
-    ground. order: of the elements.
+    ground. order: of the elements. up: axis that points up.
     """
-    made = Scene(gravity=(0.0, -9.81, 0.0))
+    made = Scene(up=up)
     vertices = np.concatenate([mesh.vertices for mesh in meshes.values()])
-    height = float(np.ptp(vertices[:, 1]))
-    position = (0.0, DROP * height - vertices[:, 1].min(), 0.0) if at is None else at - underside(vertices)
+    heights = vertices @ UP[up]
+    height = float(np.ptp(heights))
+    position = (DROP * height - heights.min()) * UP[up] + 0.0 if at is None else at - underside(vertices, up)
     young = float(f"{RELATIVE_STIFFNESS * DENSITY * 9.81 * height:.0e}")  # one digit
     rubber = Material(young=young, poisson=0.4, density=DENSITY, friction=0.5)
     for name, mesh in meshes.items():
         made.add_body(mesh, rubber, name="body" if name == GROUND else name, position=position, order=order)
-    made.add_obstacle(HalfSpace((0.0, 0.0, 0.0), (0.0, 1.0, 0.0)), name=GROUND, friction=0.5)
+    made.add_ground(friction=0.5, name=GROUND)
     fall = math.sqrt(2.0 * DROP * height / 9.81)  # [s]
     fps = 50.0 if fall > 0.05 else float(np.ceil(2.5 / fall))
     return made, {"dt": 0.5 / fps, "seconds": 100.0 / fps, "fps": fps}

@@ -1,6 +1,7 @@
 """Place a mesh from a modelling program: its up axis, its unit, its direction and where it stands.
 
-In this order: the file's up axis turns to y, the mesh is scaled, turned about x, then y, then z, and moved.
+In this order: the file's up axis turns to that of the scene, the mesh is scaled, turned about x, then y, then z, and moved.
+`FROM_Y_UP` and `UP` say what up means: a scene with z up is one with y up, turned by 90 degrees about x.
 """
 
 import warnings
@@ -16,20 +17,23 @@ TO_Y_UP = {  # up axis -> rotation (3,3) that turns it to y by 90 degrees about 
     "y": np.eye(3),
     "z": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]),
 }
+FROM_Y_UP = {up: TO_Y_UP[up].T for up in ("y", "z")}  # up axis of a scene -> rotation (3,3) that turns y to it
+UP = {up: turn[:, 1] for up, turn in FROM_Y_UP.items()}  # -> unit vector (3,)
 
 
-def place(mesh: TetMesh | SurfaceMesh, up: str = "y", scale: float = 1.0, rotate=(0.0, 0.0, 0.0), at=None):
+def place(mesh: TetMesh | SurfaceMesh, up: str = "y", scale: float = 1.0, rotate=(0.0, 0.0, 0.0), at=None, to: str = "y"):
     """Return a copy of a mesh or a surface, placed, with its regions.
 
-    up: axis of the given vertices that points up, "x", "y" or "z"; "z" turns (x, y, z) to (x, z, -y), "x" to (-y, x, z). scale:
-    factor, such as 0.001 for a file in millimetres. rotate: (3,) angles [deg] about x, then y, then z, through the origin. at:
-    (3,) [m], where the middle of the bounding box's underside goes; None: the mesh stays. Raises MeshError.
+    up: axis of the given vertices that points up, "x", "y" or "z". to: that of the scene, "y" or "z", to which it is turned: "z"
+    to "y" turns (x, y, z) to (x, z, -y), "x" to "y" to (-y, x, z). scale: factor, such as 0.001 for a file in millimetres.
+    rotate: (3,) angles [deg] about x, then y, then z, through the origin. at: (3,) [m], where the middle of the bounding box's
+    underside goes; None: the mesh stays. Raises MeshError.
     """
     if not isinstance(mesh, (TetMesh, SurfaceMesh)):
         raise MeshError(f"place needs a TetMesh or a SurfaceMesh, not {type(mesh).__name__}")
-    vertices = mesh.vertices @ placement(up, scale, rotate).T
+    vertices = mesh.vertices @ placement(up, scale, rotate, to).T
     if at is not None:
-        vertices = vertices + (_vector("at", at) - underside(vertices))
+        vertices = vertices + (_vector("at", at) - underside(vertices, to))
     if isinstance(mesh, SurfaceMesh):
         return SurfaceMesh(vertices, mesh.triangles, mesh.source, list(mesh.warnings))
     with warnings.catch_warnings(record=True) as found:
@@ -41,24 +45,25 @@ def place(mesh: TetMesh | SurfaceMesh, up: str = "y", scale: float = 1.0, rotate
     return placed
 
 
-def placement(up: str, scale: float, rotate) -> np.ndarray:
+def placement(up: str, scale: float, rotate, to: str) -> np.ndarray:
     """Return the matrix (3,3) of `place`. Raises MeshError."""
     from scipy.spatial.transform import Rotation
 
-    if up not in TO_Y_UP:
-        raise MeshError(f"place: up must be one of {', '.join(TO_Y_UP)}, not {value_text(up)}")
+    for what, axis, known in (("up", up, TO_Y_UP), ("to", to, FROM_Y_UP)):
+        if axis not in known:
+            raise MeshError(f"place: {what} must be one of {', '.join(known)}, not {value_text(axis)}")
     if isinstance(scale, bool) or not isinstance(scale, (int, float, np.number)) or not 0.0 < scale < np.inf:
         raise MeshError(f"place: scale must be a number above 0, not {value_text(scale)}")
     turn = Rotation.from_euler("xyz", _vector("rotate", rotate), degrees=True).as_matrix()  # about fixed axes
     whole = np.round(turn)
     turn = np.where(np.abs(turn - whole) < 1e-15, whole, turn)  # quarter turns are exact
-    return scale * (turn @ TO_Y_UP[up])
+    return scale * (turn @ FROM_Y_UP[to] @ TO_Y_UP[up])
 
 
-def underside(vertices: np.ndarray) -> np.ndarray:
+def underside(vertices: np.ndarray, up: str) -> np.ndarray:
     """Return the middle of the lower side of the bounding box of vertices (n,3), (3,)."""
     low, high = vertices.min(axis=0), vertices.max(axis=0)
-    return np.array([0.5 * (low[0] + high[0]), low[1], 0.5 * (low[2] + high[2])])
+    return np.where(UP[up] > 0.0, low, 0.5 * (low + high))
 
 
 def _vector(name: str, value) -> np.ndarray:

@@ -44,18 +44,21 @@ def box_mesh(cells, size, center=(0.0, 0.0, 0.0), pattern: str = "five") -> TetM
     return _with_recipe(recipe, vertices, np.take_along_axis(corners, table.reshape(len(corners), -1), axis=1))
 
 
-def sheet_mesh(cells, size, center=(0.0, 0.0, 0.0), pattern: str = "five") -> TetMesh:
-    """Return the mesh of a flat sheet in the x-z plane: a box that is thin along y.
+def sheet_mesh(cells, size, center=(0.0, 0.0, 0.0), pattern: str = "five", up: str = "y") -> TetMesh:
+    """Return the mesh of a flat sheet: a box that is thin along the axis `up`, "y" or "z".
 
-    cells: (nx, nz) for one layer, or (nx, ny, nz). size: (length x, thickness y, length z) [m]; the thickness must not
+    cells: (nx, ny, nz), or without the number of layers, which is then one. size: (3,) along x, y, z [m]; the thickness must not
     exceed the lengths. center, pattern, vertex order and errors as for `box_mesh`.
     """
+    if up not in ("y", "z"):
+        raise MeshError(f"sheet_mesh: up must be one of y, z, not {value_text(up)}")
+    across = "xyz".index(up)
     cells = _checked_cells(cells, "sheet_mesh", (2, 3))
     if len(cells) == 2:
-        cells = np.array([cells[0], 1, cells[1]])
+        cells = np.insert(cells, across, 1)
     size = _checked_vector(size, "sheet_mesh", "size", positive=True)
-    if size[1] > min(size[0], size[2]):
-        raise MeshError(f"sheet_mesh: size {size.tolist()} has a thickness size[1] above the lengths size[0], size[2]")
+    if size[across] > min(size):
+        raise MeshError(f"sheet_mesh: size {size.tolist()} has a thickness size[{across}] above one of the lengths")
     return box_mesh(cells, size, center, pattern)
 
 

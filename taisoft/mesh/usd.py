@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from taisoft.errors import MeshError, listed, value_text
+from taisoft.mesh.placing import FROM_Y_UP
 from taisoft.mesh.safe_reading import SECONDS, SECONDS_PER_BYTE, WALL_FACTOR, read_content, run_child
 from taisoft.mesh.surface_mesh import SurfaceMesh, clean_surface, tetrahedralize
 from taisoft.mesh.tet_mesh import TetMesh
@@ -35,26 +36,26 @@ class _Prim:
         return _tet_mesh(self.source, self.points, self.tets)
 
 
-def read_usd(path, edge_length: float | None = None) -> dict[str, TetMesh]:
-    """Return the meshes in a USD stage by name, in the stage's order, where they stand in it, in metres and with y up.
+def read_usd(path, edge_length: float | None = None, up: str = "y") -> dict[str, TetMesh]:
+    """Return the meshes in a USD stage by name, in the stage's order, where they stand in it, in metres.
 
-    A TetMesh prim is taken as it is, a closed Mesh is filled with tets (`tetrahedralize`, with its edge_length [m]), an open
-    one is left out with a warning. Points are the default ones, else those of the first time. A name is the prim's, with a
-    number where it occurs twice. A stage that taisoft wrote gives its bodies at their start, quadratic ones cut into linear
-    tets. Raises MeshError.
+    up: axis that points up in what is returned, "y" or "z"; the stage's own is turned to it. A TetMesh prim is taken as it is,
+    a closed Mesh is filled with tets (`tetrahedralize`, with its edge_length [m]), an open one is left out with a warning.
+    Points are the default ones, else those of the first time. A name is the prim's, with a number where it occurs twice. A stage
+    that taisoft wrote gives its bodies at their start, quadratic ones cut into linear tets. Raises MeshError.
     """
-    file, prims, notes = _read_prims(path, "read_usd", alone=False)
+    file, prims, notes = _read_prims(path, "read_usd", False, up)
     _warn(file, notes)
     return {name: prim.mesh(edge_length) for name, prim in prims.items()}
 
 
-def read_usd_prim(path, prim: str | None = None, edge_length: float | None = None, alone: bool = False) -> TetMesh:
+def read_usd_prim(path, prim: str | None = None, edge_length: float | None = None, alone: bool = False, up: str = "y") -> TetMesh:
     """Return one of the meshes that `read_usd` returns; the others are not filled with tets.
 
     prim: its name there, or the path of its prim or of one above it; None for the only one. alone: refuse a stage that names
-    further files. Raises MeshError.
+    further files. up: as for `read_usd`. Raises MeshError.
     """
-    file, prims, notes = _read_prims(path, "read_usd_prim", alone)
+    file, prims, notes = _read_prims(path, "read_usd_prim", alone, up)
     if prim is not None and not isinstance(prim, str):
         raise MeshError(f"prim must be the name or the path of a mesh in the stage, not {value_text(prim)}")
     above = f"{prim}/" if prim and prim.startswith("/") else None
@@ -67,7 +68,7 @@ def read_usd_prim(path, prim: str | None = None, edge_length: float | None = Non
     return one.mesh(edge_length)
 
 
-def _read_prims(path, what: str, alone: bool) -> tuple[Path, dict[str, _Prim], list[str]]:
+def _read_prims(path, what: str, alone: bool, up: str) -> tuple[Path, dict[str, _Prim], list[str]]:
     """Return the file, its meshes by name, and notes about what is left out. Raises MeshError, if there are none too."""
     try:
         file = Path(path)
@@ -75,6 +76,8 @@ def _read_prims(path, what: str, alone: bool) -> tuple[Path, dict[str, _Prim], l
         raise MeshError(f"{what}: path must be a file's name, not {path!r}") from error
     if file.suffix.lower() not in USD_FORMATS:
         raise MeshError(f"{file}: a USD stage is read from {', '.join(USD_FORMATS)}, not from {file.suffix or 'no ending'}")
+    if up not in FROM_Y_UP:
+        raise MeshError(f"{what}: up must be one of {', '.join(FROM_Y_UP)}, not {value_text(up)}")
     seconds = SECONDS + SECONDS_PER_BYTE * len(read_content(file))
     task = "lone_usd" if alone else "usd"
     with tempfile.TemporaryDirectory(prefix="taisoft-") as folder:
@@ -85,7 +88,8 @@ def _read_prims(path, what: str, alone: bool) -> tuple[Path, dict[str, _Prim], l
     prims: dict[str, _Prim] = {}
     notes = found["notes"].tolist()
     for k, (name, prim_path) in enumerate(zip(found["names"].tolist(), found["paths"].tolist())):
-        points, cells, source, surface = found[f"points{k}"], found[f"cells{k}"], f"{file}: {name}", None
+        points = found[f"points{k}"] @ FROM_Y_UP[up].T
+        cells, source, surface = found[f"cells{k}"], f"{file}: {name}", None
         if cells.shape[1] == 3:
             surface = clean_surface(SurfaceMesh(points, cells, source), 0.0)
             if not surface.closed:

@@ -6,9 +6,9 @@ from functools import cached_property
 
 import numpy as np
 
+from taisoft.mesh.placing import FROM_Y_UP, UP
 from taisoft.scene.obstacles import HalfSpace
 
-UP = np.array([0.0, 1.0, 0.0])
 MAX_ELEVATION = 89.0  # [deg]; at 90 "up" is undefined
 FILL = 0.62  # fraction of the picture's width or height, whichever is reached first, that the bodies fill at the start
 BORDER = 0.06  # fraction of the picture, both sides together, kept free when the camera moves back from moving bodies
@@ -65,7 +65,8 @@ def clip_polygon(polygon: np.ndarray, k: int = 0) -> np.ndarray:
 class Camera:
     """A camera aimed at target (3,) [m] from a distance [m].
 
-    azimuth [deg] about y: 0 looks along -z, 90 along -x; elevation [deg] above the horizon; fov [deg]: vertical field of view.
+    azimuth [deg] about up: 0 looks along -z (with z up: +y), 90 along -x; elevation [deg] above the horizon; fov [deg]: vertical
+    field of view; up: axis that points up, "y" or "z".
     """
 
     target: np.ndarray = field(default_factory=lambda: np.zeros(3))
@@ -73,6 +74,7 @@ class Camera:
     azimuth: float = 32.0
     elevation: float = 20.0
     fov: float = 30.0
+    up: str = "y"
 
     @classmethod
     def framing(cls, points: np.ndarray, size: tuple[int, int] = (16, 9), **angles) -> "Camera":
@@ -92,12 +94,13 @@ class Camera:
     def forward(self) -> np.ndarray:
         """Unit vector (3,) from the eye to the target."""
         azimuth, elevation = math.radians(self.azimuth), math.radians(self.elevation)
-        return -np.array([math.sin(azimuth) * math.cos(elevation), math.sin(elevation), math.cos(azimuth) * math.cos(elevation)])
+        level = math.cos(elevation)
+        return -FROM_Y_UP[self.up] @ np.array([math.sin(azimuth) * level, math.sin(elevation), math.cos(azimuth) * level])
 
     @cached_property
     def axes(self) -> np.ndarray:
         """Orthonormal axes of the picture (3,3), rows right, up, forward."""
-        right = np.cross(self.forward, UP)
+        right = np.cross(self.forward, UP[self.up])
         right /= np.linalg.norm(right)
         return np.array([right, np.cross(right, self.forward), self.forward])
 

@@ -9,7 +9,7 @@ alone, and many readers do not support value clips.
 `join_chunks` makes `scene.usdc` from the chunks of a killed run. A resumed run starts from the earlier frames of both.
 
 Time codes are frame numbers; a state before the time of its frame, as at the end of a run between two frames, has the fraction
-that is its time. Units are metres, y up. A body is `/World/<name>` with `surface` (Mesh), `tets` (TetMesh, purpose
+that is its time. Units are metres, up is the scene's. A body is `/World/<name>` with `surface` (Mesh), `tets` (TetMesh, purpose
 guide, so that the two are not drawn over each other) and `material`. Both are linear: a second-order body is written as
 the linear triangles and tets that its elements are cut into, with all its nodes as points (`taisoft/mesh/nodes.py`).
 Both carry `primvars:vonMisesStress` [Pa]. If there can be contacts, the surface also carries `primvars:contactImpulse` [N s], the
@@ -88,7 +88,7 @@ class UsdWriter:
             layer = _opened(path)
             if layer.timeCodesPerSecond != self._template.timeCodesPerSecond or _structure(layer) != _structure(self._template):
                 raise OutputError(
-                    f"{path} is of another scene, frame rate or --error, so no run can resume in it: name another folder"
+                    f"{path} is of another scene, up axis, frame rate or --error, so no run can resume in it: name another folder"
                 )
             self._joined.append(layer, first)
         times = self._joined.layer.ListTimeSamplesForPath(self._view.attribute)
@@ -263,9 +263,9 @@ def _opened(path: Path):
 
 
 def _structure(layer) -> list[str]:
-    """Return the names of a layer's bodies and obstacles, and the paths of its time-varying attributes."""
+    """Return a layer's up axis, the names of its bodies and obstacles, and the paths of its time-varying attributes."""
     root = layer.GetPrimAtPath(ROOT)
-    return [*(child.name for child in root.nameChildren), *_sampled(layer)] if root else []
+    return [layer.pseudoRoot.GetInfo("upAxis"), *(child.name for child in root.nameChildren), *_sampled(layer)] if root else []
 
 
 def _write_checked(path: Path, layer, write) -> None:

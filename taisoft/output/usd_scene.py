@@ -38,7 +38,7 @@ TRANSLATE = "xformOp:translate"  # attribute of the camera
 MAX_NAME = 64  # characters of a prim name; the full name is stored as display name
 PICTURE = (16, 9)  # width and height
 SENSOR = 0.036  # width of the film back [m], as for 36 mm film
-LAMP_TURN, LAMP_ELEVATION = -22.0, 54.0  # [deg]: about y from the camera's azimuth, above the horizon
+LAMP_TURN, LAMP_ELEVATION = -22.0, 54.0  # [deg]: about up from the camera's azimuth, above the horizon
 LAMP, DOME = 2.2, 0.4  # a white diffuse face reflects LAMP / pi of the lamp and DOME of the dome
 LENS = 10.0  # USD gives aperture and focal length in tenths of the scene's unit
 
@@ -98,7 +98,7 @@ class ViewTrack:
     def __init__(self, stage, scene):
         from pxr import Gf, UsdGeom, UsdLux
 
-        self.camera = Camera.framing(framed_points(scene), PICTURE)
+        self.camera = Camera.framing(framed_points(scene), PICTURE, up=scene.up)
         self._widest = MAX_WIDENING * self.camera.distance
         UsdGeom.Xform.Define(stage, VIEW)
 
@@ -117,7 +117,8 @@ class ViewTrack:
         lamp.CreateNormalizeAttr(True)
         aims = (camera, self.camera.azimuth, self.camera.elevation), (lamp, self.camera.azimuth + LAMP_TURN, LAMP_ELEVATION)
         for prim, azimuth, elevation in aims:  # both look along their -z
-            prim.AddRotateXYZOp().Set(Gf.Vec3f(-elevation, azimuth, 0.0))
+            angles = (-elevation, azimuth, 0.0) if scene.up == "y" else (90.0 - elevation, 0.0, azimuth)
+            prim.AddRotateXYZOp().Set(Gf.Vec3f(*angles))
         UsdLux.DomeLight.Define(stage, f"{VIEW}/dome").CreateIntensityAttr(DOME)
 
     def resume(self, position: np.ndarray) -> None:
@@ -148,7 +149,7 @@ def scene_layer(scene, fps: float, touching: bool, errors: bool) -> tuple[list[T
     layer.comment = f"taisoft {taisoft.__version__}"
     stage = Usd.Stage.Open(layer)
     UsdGeom.SetStageMetersPerUnit(stage, 1.0)
-    UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
+    UsdGeom.SetStageUpAxis(stage, getattr(UsdGeom.Tokens, scene.up))
     stage.SetTimeCodesPerSecond(fps)
     stage.SetFramesPerSecond(fps)
     stage.SetDefaultPrim(UsdGeom.Xform.Define(stage, ROOT).GetPrim())

@@ -13,6 +13,7 @@ import numpy as np
 from taisoft.attributes import Guarded, thawed
 from taisoft.display import drawn
 from taisoft.errors import SceneError
+from taisoft.mesh.placing import UP
 from taisoft.mesh.surface_mesh import SurfaceMesh
 from taisoft.mesh.tet_mesh import TetMesh
 from taisoft.scene import checks
@@ -22,12 +23,12 @@ from taisoft.scene.connection_records import Attachment, Connection, Spring, Ten
 from taisoft.scene.connections import add_spring, add_tendon, attach, attached_pairs, check_connections, constraint_of
 from taisoft.scene.loads import Cavity
 from taisoft.scene.material import Material
-from taisoft.scene.obstacles import Obstacle, Shape, surface_numbers
+from taisoft.scene.obstacles import HalfSpace, Obstacle, Shape, surface_numbers
 from taisoft.scene.rigid import RigidBody
 
 
 class Scene(Guarded):
-    """Input of a simulation: gravity, bodies, obstacles and connections. SI units, y up.
+    """Input of a simulation: gravity, bodies, obstacles and connections. SI units, y or z up.
 
     springs, tendons, attachments: what connects points of bodies, see `add_spring`, `add_tendon` and `attach`.
 
@@ -52,9 +53,12 @@ class Scene(Guarded):
         **dict.fromkeys(("tendons", "add_tendon"), "call sim.set_tension(name, force) or sim.set_length(name, length)"),
     }
 
-    def __init__(self, gravity=(0.0, -9.81, 0.0)):
-        """gravity: (3,) [m/s^2]. Raises SceneError unless it is three finite numbers."""
-        self.gravity = gravity
+    def __init__(self, gravity=None, up: str | None = None):
+        """gravity: (3,) [m/s^2], by default 9.81 downwards. up: axis that points up, "y" or "z"; by default "z" if gravity acts
+        exactly along -z, else "y". Raises SceneError for other values."""
+        x, y, z = self._check_gravity((0.0, 0.0, 0.0) if gravity is None else gravity)
+        self.up = up if up is not None else "z" if x == y == 0.0 > z else "y"
+        self.gravity = 0.0 - 9.81 * UP[self.up] if gravity is None else gravity
         self.bodies: list[Body] = []
         self.obstacles: list[Obstacle] = []
         self.springs: list[Spring] = []
@@ -75,6 +79,11 @@ class Scene(Guarded):
         return value
 
     gravity = checks.attribute("gravity", _check_gravity, "Acceleration of gravity (3,) [m/s^2].")
+    up = checks.attribute(
+        "up",
+        lambda _, value: checks.choice(value, "scene: up", tuple(UP)),
+        'Axis that points up, "y" or "z", in pictures, in USD and for `add_ground`; setting it turns nothing in the scene.',
+    )
     collision = checks.attribute("collision", _check_collision, "Settings of the contact search.")
     allow_initial_overlap = checks.attribute(
         "allow_initial_overlap",
@@ -99,7 +108,7 @@ class Scene(Guarded):
         return [*self.bodies, *self.obstacles]
 
     def __repr__(self) -> str:
-        names = f"bodies={[body.name for body in self.bodies]}"
+        names = "up='z', " * (self.up == "z") + f"bodies={[body.name for body in self.bodies]}"
         if self.obstacles:
             names += f", obstacles={[obstacle.name for obstacle in self.obstacles]}"
         return f"Scene(gravity={tuple(self.gravity.tolist())}, {names})"
@@ -270,6 +279,13 @@ class Scene(Guarded):
         obstacle = Obstacle(shape, self._free_name(name, "obstacle"), friction, restitution, path)
         list.append(self.obstacles, obstacle)
         return obstacle
+
+    def add_ground(
+        self, height: float = 0.0, friction: float = 0.5, restitution: float = 0.0, name: str | None = "ground"
+    ) -> Obstacle:
+        """Add a half-space that is level and whose surface has this height [m] along `up`; return it. Raises SceneError."""
+        point = checks.number(height, "ground: height", unit="m") * UP[self.up] + 0.0
+        return self.add_obstacle(HalfSpace(point, UP[self.up]), name, friction, restitution)
 
     def body(self, name: str) -> Body:
         """Return the body with this name. Raises SceneError if there is none."""

@@ -1,6 +1,6 @@
 """Read a scene file in TOML: return a Scene and its `solver` dict. Files hold data only; nothing in them is executed.
 
-    gravity, allow_initial_overlap, contact_forces
+    up, gravity, allow_initial_overlap, contact_forces
     body_order                names of bodies and rigid bodies, in which nodes are numbered; by default bodies come first
     [collision]               CollisionSettings
     [solver]                  arguments of Simulator, seconds, fps; "none" for Python's None
@@ -14,7 +14,7 @@
     [rigid_bodies.NAME]       mesh (below, or a surface), and the arguments of Scene.add_rigid_body
     [[rigid_bodies.NAME.fix]] axes, rotations               [[rigid_bodies.NAME.move]] path (KeyFrames), axes
     [[rigid_bodies.NAME.force]] nodes (vertices; without them the centre of mass), force [N], or its KeyFrames
-    [obstacles.NAME]          shape and its arguments, friction, restitution, path (KeyFrames)
+    [obstacles.NAME]          shape and its arguments, friction, restitution, path (KeyFrames); or shape = "ground", height
     [[contacts]]              between = ["a", "b"], friction, restitution
     [springs.NAME]            a = ["body", POINT], b, and the other arguments of Scene.add_spring
     [tendons.NAME]            points = [["body", POINT], ...], force [N], or its KeyFrames
@@ -60,8 +60,9 @@ METHODS = {
     "pressure": Body.add_pressure,
     "cavity": Body.add_cavity,
 }
+GROUND = "ground"  # a shape as well: a half-space whose normal is up
 ON_TRIANGLES = ("traction", "pressure", "cavity")  # methods that choose surface triangles, not nodes
-SCENE_KEYS = ("gravity", "allow_initial_overlap", "contact_forces")  # attributes of a Scene at top level
+SCENE_KEYS = ("up", "gravity", "allow_initial_overlap", "contact_forces")  # attributes of a Scene at top level
 TOP_KEYS = [
     *SCENE_KEYS,
     "body_order",
@@ -102,8 +103,8 @@ def read_scene(path, allow_outside: bool = False) -> tuple[Scene, dict]:
 
 
 def _read(tables: Table, allow_outside: bool) -> tuple[Scene, dict]:
-    scene, solver = Scene(), {}
-    for key in SCENE_KEYS:
+    scene, solver = tables.make(Scene, "scene: ", keys=["up", "gravity"]), {}
+    for key in SCENE_KEYS[2:]:
         if key in tables:
             value = tables.checked(key)
             with tables.located_errors("scene: "):
@@ -234,9 +235,13 @@ def selection(table: Table, key: str):
 
 
 def _add_obstacle(scene: Scene, name: str, obstacles: Table) -> None:
-    others = arguments_of(Scene.add_obstacle, "name")[0]
-    known = list(dict.fromkeys([*others, *(key for shape in SHAPES.values() for key in arguments_of(shape)[0])]))
-    kind = kind_of(obstacles.table(name, known), SHAPES)
+    others, ground = (arguments_of(add, "name")[0] for add in (Scene.add_obstacle, Scene.add_ground))
+    known = list(dict.fromkeys([*others, *ground, *(key for shape in SHAPES.values() for key in arguments_of(shape)[0])]))
+    kind = kind_of(obstacles.table(name, known), SHAPES | {GROUND: None})
+    if kind == GROUND:
+        table = obstacles.table(name, ["shape", *ground])
+        table.make(scene.add_ground, f"obstacle {name!r}: ", "scene: ", "ground: ", keys=ground, name=name)
+        return
     keys, required = arguments_of(SHAPES[kind])
     table = obstacles.table(name, [key for key in known if key in keys or key in others], required)
     made = {"shape": table.make(SHAPES[kind], f"{SHAPES[kind].word}: ", keys=keys), "name": name}

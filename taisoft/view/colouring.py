@@ -17,6 +17,7 @@ import numpy as np
 
 from taisoft.errors import OutputError
 from taisoft.fem.reference import inverse_rest_edges
+from taisoft.mesh.placing import UP
 from taisoft.output.camera import Camera
 from taisoft.output.nodal_fields import NodalMean, von_mises
 from taisoft.scene.rigid import RigidBody
@@ -168,7 +169,7 @@ def lit_colours(x: np.ndarray, normals: np.ndarray, base: np.ndarray, camera: Ca
     """Return shaded colours (n,3) in [0, 1] of vertices x (n,3) with unit normals (n,3) and base colours (n,3) for a camera."""
     right, up, forward = camera.axes
     frame = np.array([right, up, -forward])
-    light = GROUND + (SKY - GROUND) * (0.5 + 0.5 * normals[:, 1:2])
+    light = GROUND + (SKY - GROUND) * (0.5 + 0.5 * normals @ UP[camera.up])[:, None]
     for lamp, strength in LAMPS:
         direction = (lamp / np.linalg.norm(lamp)) @ frame
         light = light + strength * np.clip(normals @ direction, 0.0, None)[:, None]

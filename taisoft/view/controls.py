@@ -11,6 +11,7 @@ import numpy as np
 from taisoft.dynamics.drag_spring import EARTH
 from taisoft.dynamics.schemes import EXPLICIT
 from taisoft.errors import SimulationError
+from taisoft.mesh.placing import UP
 from taisoft.scene.rigid import RigidBody
 from taisoft.settings import contact_solvers
 from taisoft.stability import stable_dt
@@ -35,7 +36,7 @@ class Controls:
         g = np.asarray(scene.gravity, dtype=float)
         self._g = float(np.linalg.norm(g))
         self._max_g = MAX_GRAVITY * (self._g or EARTH)
-        self._g_direction = g / self._g if self._g else np.array([0.0, -1.0, 0.0])
+        self._g_direction = g / self._g if self._g else 0.0 - UP[scene.up]
         elastic = [body for body in scene.bodies if not isinstance(body, RigidBody)]
         self._names = [body.name for body in scene.bodies]
         self._initial = {what: {body.name: getattr(body, what) for body in elastic} for what in DECADES}

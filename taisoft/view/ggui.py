@@ -24,6 +24,7 @@ import taichi as ti
 from taisoft.backend.private import core, get_field_info
 from taisoft.backend.runtime import open_kind, open_runtime
 from taisoft.errors import OutputError
+from taisoft.mesh.placing import UP
 from taisoft.output.camera import Camera
 from taisoft.view.scene_view import Surfaces
 
@@ -170,7 +171,7 @@ class Canvas:
         eye = ti.ui.Camera()
         eye.position(*(camera.position - camera.target))
         eye.lookat(0.0, 0.0, 0.0)
-        eye.up(0.0, 1.0, 0.0)
+        eye.up(*UP[camera.up].tolist())
         eye.fov(camera.fov)
         eye.z_near(camera.clipping[0])
         eye.z_far(camera.clipping[1])

@@ -111,8 +111,8 @@ class InteractiveView:
         """
         import trimesh
 
-        camera = Camera.framing(framed_points(self._scene))
-        server.scene.set_up_direction("+y")
+        camera = Camera.framing(framed_points(self._scene), up=self._scene.up)
+        server.scene.set_up_direction(f"+{self._scene.up}")
         server.initial_camera.position, server.initial_camera.look_at = tuple(camera.position), tuple(camera.target)
         server.initial_camera.fov = math.radians(camera.fov)
         recording = server.get_scene_serializer()

@@ -27,6 +27,7 @@ def describe_scene(scene, marks: ConnectionMarks) -> dict:
     """Return what the view needs of a scene, as plain data for `MirrorScene`. marks: of its connections and pressures."""
     return {
         "gravity": np.asarray(scene.gravity),
+        "up": scene.up,
         "connected": [list(one.owners) for one in scene.connections],
         "attached": marks.attached,
         "pressed": [{"corners": corners, "longest": longest} for corners, longest in marks.pressed],
@@ -94,7 +95,7 @@ class MirrorScene:
             )
             for b in description["bodies"]
         ]
-        self.gravity = description["gravity"]
+        self.gravity, self.up = description["gravity"], description["up"]
         self.connections = [SimpleNamespace(owners=owners) for owners in description["connected"]]
         self.obstacles = [Obstacle(SHAPES[o["shape"]](**o["fields"]), o["name"]) for o in description["obstacles"]]
         self.poses = {}

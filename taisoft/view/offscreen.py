@@ -103,7 +103,7 @@ class Offscreen(SceneView):
 
     def look_from(self, scene, azimuth: float, elevation: float) -> None:
         """Frame the scene's start from another direction [deg], as of `Camera`; the camera moves back as before."""
-        self.camera = Camera.framing(framed_points(scene), self.size, azimuth=azimuth, elevation=elevation)
+        self.camera = Camera.framing(framed_points(scene), self.size, up=scene.up, azimuth=azimuth, elevation=elevation)
         self._widest = MAX_WIDENING * self.camera.distance
 
     def _triangles(self, x: np.ndarray, attributes: np.ndarray, lines: tuple) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

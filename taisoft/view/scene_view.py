@@ -60,7 +60,7 @@ class SceneView:
         values: Callable | None = None,
         marks=None,
     ):
-        self.camera = camera or Camera.framing(framed_points(scene), size)
+        self.camera = camera or Camera.framing(framed_points(scene), size, up=scene.up)
         self._widest = 0.0 if camera else MAX_WIDENING * self.camera.distance  # largest automatic distance [m]; 0: fixed camera
         self.surfaces = Surfaces(scene)
         self.layers = Layers(scene, layers, marks)

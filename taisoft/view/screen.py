@@ -143,7 +143,8 @@ class Screen(SceneView):
         x = sim.positions()
         x = x[np.isfinite(x).all(axis=1)]
         if len(x):
-            self.camera = Camera.framing(x, size, azimuth=self.camera.azimuth, elevation=self.camera.elevation)
+            kept = {name: getattr(self.camera, name) for name in ("up", "azimuth", "elevation")}
+            self.camera = Camera.framing(x, size, **kept)
             self._widest = MAX_WIDENING * self.camera.distance
 
     def _move_camera(self, right: float, up: float, size) -> None:

@@ -1,6 +1,6 @@
 """Soft shadows of the bodies on half-spaces, as maps of the fraction of light that is missing.
 
-Light falls along -UP. The bodies' triangles are drawn into a map of the half-space's boundary, each point with
+Light falls straight down. The bodies' triangles are drawn into a map of the half-space's boundary, each point with
 exp(-height / FADE), so that a shadow is darkest where a body touches. The map is then blurred. A map covers only the shadows, so
 that its texels are small. Obstacles cast no shadow, and receive none unless they are half-spaces.
 """
@@ -9,13 +9,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from taisoft.output.camera import UP, start_positions
+from taisoft.mesh.placing import UP
+from taisoft.output.camera import start_positions
 from taisoft.view.raster import Raster
 
 TEXELS = 128  # per side of a map
 SOFTNESS, FADE = 0.025, 0.4  # standard deviation of the blur; height: in diagonals of the bodies' bounding box at the start
 STRENGTH = 0.5  # fraction of the ground's light that a body in contact takes away
-MIN_SLOPE = 0.3  # smallest component along UP of the normal of a half-space that gets shadows
+MIN_SLOPE = 0.3  # smallest upward component of the normal of a half-space that gets shadows
 REACH = 2.0  # standard deviations of the blur on either side
 
 
@@ -41,7 +42,7 @@ class Shadows:
     """Shadow maps of the half-spaces of `Surfaces`. scene: read once."""
 
     def __init__(self, scene, surfaces):
-        self._surfaces = surfaces
+        self._surfaces, self._up = surfaces, UP[scene.up]
         self._size = float(np.linalg.norm(np.ptp(start_positions(scene), axis=0)))
         self._raster: Raster | None = None  # made for the first half-space
 
@@ -63,7 +64,7 @@ class Shadows:
         found = []
         for vertices, boundary in self._surfaces.half_spaces(x, t):
             axes = _frame(boundary)
-            if axes is None or axes[2] @ UP < MIN_SLOPE:
+            if axes is None or axes[2] @ self._up < MIN_SLOPE:
                 continue
             drawn = self._map(x[: self._surfaces.n_of_bodies], boundary[0], axes, boundary)
             if drawn is not None:
@@ -72,8 +73,8 @@ class Shadows:
 
     def _map(self, x: np.ndarray, origin, axes, boundary) -> tuple[np.ndarray, ...] | None:
         """Return the last four fields of a `ShadowMap`; None without a shadow."""
-        height = (x - origin) @ axes[2] / (axes[2] @ UP)
-        shadow = (x - origin) @ axes[:2].T - height[:, None] * (axes[:2] @ UP)
+        height = (x - origin) @ axes[2] / (axes[2] @ self._up)
+        shadow = (x - origin) @ axes[:2].T - height[:, None] * (axes[:2] @ self._up)
         drawn = shadow[np.isfinite(shadow).all(axis=1)]
         if len(drawn) == 0:
             return None

@@ -6,8 +6,9 @@ The renderer of the window interpolates colours between vertices only, so that t
 import numpy as np
 from scipy.spatial import ConvexHull
 
+from taisoft.mesh.placing import UP
 from taisoft.output.appearance import OBSTACLE_COLOUR
-from taisoft.output.camera import UP, Camera
+from taisoft.output.camera import Camera
 from taisoft.scene.obstacles import HalfSpace
 from taisoft.view.colouring import lit_colours
 from taisoft.view.shadow import MIN_SLOPE, TEXELS, Shadows
@@ -23,7 +24,7 @@ class ShadowMesh:
     def __init__(self, scene, surfaces):
         self._shadows = Shadows(scene, surfaces)
         grounds = [o for o in scene.obstacles if isinstance(o.shape, HalfSpace)]
-        n_maps = sum(o.path is not None or o.shape.normal @ UP >= MIN_SLOPE for o in grounds)
+        n_maps = sum(o.path is not None or o.shape.normal @ UP[scene.up] >= MIN_SLOPE for o in grounds)
         side = TEXELS // EVERY
         centres = EVERY * np.arange(side) + 0.5 * EVERY
         v, u = np.meshgrid(centres, centres, indexing="ij")

@@ -48,6 +48,11 @@ def test_scene_places_a_mesh_but_no_scene(tmp_path, capsys):
     body = ts.read_scene(out)[0].body("tower")
     x = body.rest_positions + body.position
     assert body.order == 2 and np.allclose(x.min(axis=0), (0.75, 0, -2.5)) and np.allclose(x.max(axis=0), (1.25, 3, -1.5))
+    assert main([*command, "--to", "z", "--overwrite"]) == 0
+    scene = ts.read_scene(out)[0]
+    x = scene.body("tower").rest_positions + scene.body("tower").position
+    assert scene.up == "z" and scene.obstacle("ground").shape.normal.tolist() == [0, 0, 1]
+    assert np.allclose(x.min(axis=0), (0.75, -0.5, -2)) and np.allclose(x.max(axis=0), (1.25, 0.5, 1))
     capsys.readouterr()
     for option, message in ((command[8:12], "--at place a mesh, and this is a scene"), (command[12:], "--order is for a")):
         assert main(["scene", str(out), "--out", str(tmp_path / "b.toml"), *option]) == 2

@@ -16,6 +16,10 @@ def test_the_up_axis_turns_to_y_before_scale_rotation_and_place():
     corner = ts.SurfaceMesh([(1, 2, 3), (0, 0, 0), (1, 0, 0)], [(0, 1, 2)], "corner", ["a note"])
     for up, point in (("y", (1, 2, 3)), ("z", (1, 3, -2)), ("x", (-2, 1, 3))):
         assert np.array_equal(ts.place(corner, up).vertices[0], point)
+        assert np.array_equal(ts.place(ts.place(corner, up), to="z").vertices, ts.place(corner, up, to="z").vertices)
+    assert np.array_equal(ts.place(corner, to="z").vertices[0], (1, -3, 2))
+    standing = ts.place(TOWER, "z", 0.5, at=(1, 2, 3), to="z").vertices
+    assert standing.min(axis=0).tolist() == [0.75, 1.5, 3] and standing.max(axis=0).tolist() == [1.25, 2.5, 6]
     placed = ts.place(corner, "z", 2, (90, 90, 0))
     assert np.array_equal(placed.vertices[0], (6, 4, -2)) and (placed.source, placed.warnings) == ("corner", ["a note"])
     named = ts.TetMesh(TOWER.vertices, TOWER.tets, regions=np.arange(15) // 5, region_names={1: "middle"})
@@ -44,6 +48,7 @@ def test_any_placement_keeps_the_shape(up, scale, rotate, at):
 def test_bad_arguments_are_refused():
     for arguments, message in (
         ({"up": "w"}, "up must be one of x, y, z, not 'w'"),
+        ({"to": "x"}, "to must be one of y, z, not 'x'"),
         ({"scale": 0}, "scale must be a number above 0, not 0"),
         ({"at": (0, float("inf"), 0)}, r"at must be three finite numbers, not \(0, inf, 0\)"),
     ):

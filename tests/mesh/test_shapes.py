@@ -59,8 +59,15 @@ def test_pattern_five_alternates_like_a_checkerboard_and_six_shares_the_diagonal
     sheet = sheet_mesh((4, 3), (2.0, 0.05, 1.5), pattern="six")
     assert sheet.n_tets == 72 and np.ptp(sheet.vertices, axis=0) == pytest.approx([2.0, 0.05, 1.5])
     assert sheet_mesh((4, 2, 3), (2.0, 0.05, 1.5)).n_verts == 60
-    with pytest.raises(MeshError, match="thickness"):
-        sheet_mesh((4, 3), (2.0, 1.6, 1.5))
+    flat, box = sheet_mesh((4, 3), (2.0, 1.5, 0.05), up="z"), box_mesh((4, 3, 1), (2.0, 1.5, 0.05))
+    assert np.array_equal(flat.vertices, box.vertices) and np.array_equal(flat.tets, box.tets)
+    for size, up, message in (
+        ((2.0, 1.6, 1.5), "y", "thickness"),
+        ((2.0, 0.1, 1.5), "z", "thickness"),
+        ((1, 1, 1), "x", "one of y, z"),
+    ):
+        with pytest.raises(MeshError, match=message):
+            sheet_mesh((4, 3), size, up=up)
 
 
 @pytest.mark.parametrize("cells", [2, 4, 8])

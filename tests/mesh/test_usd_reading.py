@@ -91,6 +91,8 @@ def test_units_up_axis_and_transforms(tmp_path):
     x, y, z = MESH.vertices.astype(np.float32).T.astype(float)
     turned = np.stack([x + 10, -z + 20, y + 30], axis=1)  # z up
     assert np.allclose(mesh.vertices, 0.01 * turned[:, [0, 2, 1]] * (1, 1, -1), atol=1e-12)
+    with pytest.raises(MeshError, match="^read_usd: up must be one of y, z, not 'x'$"):
+        ts.read_usd(path, up="x")
     assert mesh.volumes.sum() == pytest.approx(1e-6 * MESH.volumes.sum(), rel=1e-6)
 
 
@@ -159,7 +161,7 @@ def read_scene(folder, more="", **options):
 
 
 def test_info_and_scene_files_take_a_stage(tmp_path, capsys):
-    """With two bodies of tets and an open surface; a mesh by its name or path."""
+    """With two bodies of tets and an open surface; a mesh by its name or path, turned to z up."""
     path = tmp_path / "two.usda"
     stage = new_stage(path)
     UsdGeom.Xform.Define(stage, "/World/upper")
@@ -172,7 +174,7 @@ def test_info_and_scene_files_take_a_stage(tmp_path, capsys):
     assert "two.usda: tets\n" in shown and "two.usda: lower\n" in shown and shown.count(f"{MESH.n_tets} tets") == 2
     for more, message in (
         (', prim = "/World"', "mesh.prim '/World' fits several: {stage} holds tets, lower"),
-        (", fix_orientation = true", "mesh.fix_orientation is not known; there are file, prim, edge_length"),
+        (", fix_orientation = true", "mesh.fix_orientation is not known; there are file, prim, edge_length, up"),
     ):
         with pytest.raises(TaisoftError) as caught:
             read_scene(tmp_path, more)
@@ -184,5 +186,6 @@ def test_info_and_scene_files_take_a_stage(tmp_path, capsys):
         read_scene(tmp_path, ', prim = "lower"')
     with warnings.catch_warnings():
         warnings.simplefilter("error")  # of the surface that is not taken
-        mesh = read_scene(tmp_path, ', prim = "/World/upper"', allow_outside=True)
-    assert np.array_equal(mesh.vertices, MESH.vertices.astype(np.float32) + (0.0, 3.0, 0.0))
+        mesh = read_scene(tmp_path, ', prim = "/World/upper", up = "z"', allow_outside=True)
+    x, y, z = MESH.vertices.astype(np.float32).T.astype(float)
+    assert np.array_equal(mesh.vertices, np.stack([x, -z, y + 3.0], axis=1))

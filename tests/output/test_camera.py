@@ -5,6 +5,7 @@ import pytest
 
 import taisoft as ts
 from benchmarks.numpy_raster import rasterise
+from taisoft.mesh.placing import FROM_Y_UP
 from taisoft.output.camera import Camera, framed_points, start_positions
 
 SIZE = (320, 180)
@@ -69,6 +70,17 @@ def test_orbit_zoom_and_pan():
     assert orbited.azimuth == pytest.approx(10.0) and orbited.elevation == 89.0
     assert np.linalg.norm(orbited.position - orbited.target) == pytest.approx(10.0) and camera.zoom(0.5).distance == 5.0
     assert panned.project(np.zeros((1, 3)), SIZE)[0, 1] == pytest.approx(90 + 45, abs=1e-9)
+
+
+def test_a_camera_with_z_up_is_one_with_y_up_turned():
+    """At azimuth 0 it looks along y, at 90 along -x; turning it leaves the horizon level."""
+    turn, points = FROM_Y_UP["z"], np.random.default_rng(2).uniform(-1, 1, (20, 3))
+    for azimuth, elevation in ((0.0, 0.0), (90.0, 0.0), (32.0, -40.0)):
+        upright = Camera.framing(points, azimuth=azimuth, elevation=elevation).orbit(10.0, 20.0)
+        turned = Camera.framing(points @ turn.T, up="z", azimuth=azimuth, elevation=elevation).orbit(10.0, 20.0)
+        assert np.allclose(turned.position, turn @ upright.position) and np.allclose(turned.axes, upright.axes @ turn.T)
+        assert abs(turned.axes[0, 2]) < 1e-15
+    assert np.allclose([Camera(azimuth=a, elevation=0.0, up="z").forward for a in (0.0, 90.0)], [(0, 1, 0), (-1, 0, 0)])
 
 
 def test_camera_moves_back_from_approaching_bodies():

@@ -106,11 +106,13 @@ def test_impulses_are_written_only_if_contacts_are_possible(tmp_path):
         assert found == {expected}, name
 
 
-def test_the_camera_projects_like_that_of_the_images(tmp_path):
-    """It moves back for bodies that leave the image."""
+@pytest.mark.parametrize("up", ["y", "z"])
+def test_the_camera_projects_like_that_of_the_images(tmp_path, up):
+    """It moves back for bodies that leave the image. No run with another up axis resumes there."""
     scene = beam_scene()
+    scene.up = up
     sim, writer, size = FakeSimulator(scene), UsdWriter(tmp_path, scene), (1600, 900)
-    camera, expected = Camera.framing(start_positions(scene), size), []
+    camera, expected = Camera.framing(start_positions(scene), size, up=up), []
     for index in range(4):
         sim.time = 0.5 * index
         writer.frame(sim, index)
@@ -119,8 +121,14 @@ def test_the_camera_projects_like_that_of_the_images(tmp_path):
     writer.close()
     stage = Usd.Stage.Open(str(tmp_path / "scene.usdc"))
     (prim,) = [prim for prim in stage.Traverse() if prim.IsA(UsdGeom.Camera)]
+    assert UsdGeom.GetStageUpAxis(stage) == up.upper()
+    lamp = UsdGeom.Xformable(stage.GetPrimAtPath("/View/lamp")).ComputeLocalToWorldTransform(0).TransformDir((0, 0, 1))
+    assert lamp["xyz".index(up)] > 0.7
+    scene.up = "z" if up == "y" else "y"
+    with pytest.raises(OutputError, match="is of another scene, up axis, frame rate or --error"):
+        UsdWriter(tmp_path, scene, first=1)
     assert not prim.GetPath().HasPrefix(stage.GetDefaultPrim().GetPath())
-    assert expected[3][0].distance > 1.2 * expected[0][0].distance
+    assert expected[3][0].distance > 1.1 * expected[0][0].distance
     for index, (camera, x) in enumerate(expected):
         usd_camera = UsdGeom.Camera(prim).GetCamera(index)
         frustum = usd_camera.frustum

@@ -35,6 +35,34 @@ def still(t):
     return (0.0, 0.0, 0.0)
 
 
+def test_up_follows_gravity_unless_it_is_given():
+    """And gravity up; the ground is level. Nothing else changes up, not even another gravity."""
+    for arguments, up, gravity in (
+        ({}, "y", (0, -9.81, 0)),
+        ({"up": "z"}, "z", (0, 0, -9.81)),
+        ({"gravity": (0, 0, -1)}, "z", (0, 0, -1)),
+        ({"gravity": (0, 0, -1), "up": "y"}, "y", (0, 0, -1)),
+        ({"gravity": (0, 0, 1)}, "y", (0, 0, 1)),
+        ({"gravity": (0, -1e-9, -1)}, "y", (0, -1e-9, -1)),
+    ):
+        scene = Scene(**arguments)
+        ground, high = scene.add_ground(), scene.add_ground(-0.5, 0.1, 0.2, "high")
+        assert (
+            scene.up == up and np.array_equal(scene.gravity, gravity) and (np.signbit(scene.gravity) == (scene.gravity < 0)).all()
+        )
+        axis = np.eye(3)["xyz".index(up)]
+        assert np.array_equal(ground.shape.normal, axis) and not ground.shape.point.any() and ground.name == "ground"
+        assert np.array_equal(high.shape.point, -0.5 * axis) and (high.friction, high.restitution) == (0.1, 0.2)
+        scene.gravity = (0, 0, -2)
+        scene.freeze()
+        assert scene.up == scene.snapshot().up == up
+        with pytest.raises(SceneError, match="^scene: up cannot change any more"):
+            scene.up = "z"
+    for value in ("x", 1, (0, 0, 1)):
+        with pytest.raises(SceneError, match="^scene: up must be one of y, z, not "):
+            Scene(up=value)
+
+
 @pytest.mark.parametrize("poisson", [-0.5, 0.0, 0.49])
 def test_lame_parameters_satisfy_hookes_law(poisson):
     rubber = Material(young=2e6, poisson=poisson)

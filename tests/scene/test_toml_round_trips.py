@@ -99,6 +99,21 @@ def test_a_scene_with_everything_is_read_back(tmp_path):
     assert set(EVERY_SETTING) == set(SOLVER_CHECKS) == names | set(RUN_KEYS)
 
 
+@pytest.mark.parametrize(
+    "text, up", [('up = "z"', "z"), ("gravity = [0, 0, -9.81]", "z"), ('gravity = [0, 0, -9.81]\nup = "y"', "y")]
+)
+def test_up_and_the_ground_are_read_and_written(tmp_path, text, up):
+    ground = '[obstacles.floor]\nshape = "ground"\nheight = -0.1\nfriction = 0.2\n'
+    write(
+        tmp_path / "a.toml",
+        f'{text}\n{ground}[bodies.a]\nmaterial = {{}}\nmesh = {{ shape = "box", cells = [1, 1, 1], size = [1, 1, 1] }}',
+    )
+    scene, floor = ts.read_scene(tmp_path / "a.toml")[0], ts.Scene(up=up).add_ground(-0.1, 0.2)
+    assert scene.up == up and scene.gravity.tolist() == [0, 0, -9.81] and repr(scene.obstacle("floor").shape) == repr(floor.shape)
+    assert scene.obstacle("floor").friction == 0.2
+    there_and_back(tmp_path / "b.toml", scene, {})
+
+
 LARGEST = float(np.finfo(np.float32).max)
 numbers = floats(-LARGEST, LARGEST)
 vectors = st.tuples(*[floats(-1e30, 1e30)] * 3)

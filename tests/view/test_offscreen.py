@@ -9,6 +9,7 @@ import pytest
 import taisoft as ts
 from taisoft.backend.runtime import open_kind, open_runtime
 from taisoft.errors import OutputError, SimulationError
+from taisoft.mesh.placing import FROM_Y_UP
 from taisoft.output.camera import Camera, start_positions
 from taisoft.view.colouring import COLOURS, Colouring, round_up
 from taisoft.view.ggui import Canvas, window_holder
@@ -59,6 +60,27 @@ def test_falling_body_stays_in_the_picture():
     drawing.look_from(scene, 90.0, 0.0)  # along the beam
     assert np.allclose(drawing.camera.forward, (-1, 0, 0))
     assert np.ptp(drawing.camera.project(start_positions(scene), SIZE)[:, 0]) < 0.5 * SIZE[0]
+
+
+def test_a_scene_with_z_up_is_one_with_y_up_turned():
+    """Of two bodies that slide and touch each other, the ground, a wall and a ball: positions to rounding, and
+    pictures but for a few pixels."""
+    found = []
+    for up in ("y", "z"):
+        turn, scene = FROM_Y_UP[up], ts.Scene(up=up)
+        for name, mesh in (("box", ts.box_mesh((2, 2, 2), (0.4, 0.4, 0.4))), ("ball", ts.ball_mesh(0.2, 2, (0.1, 0.41, 0.05)))):
+            turned = ts.TetMesh((mesh.vertices + (0, 0.201, 0)) @ turn.T, mesh.tets)
+            scene.add_body(turned, ts.Material(young=1e5), name=name, velocity=turn @ (0.5, -0.5, 0.2))
+        scene.add_ground()
+        scene.add_obstacle(ts.HalfSpace(turn @ (0, 0, -0.21), turn @ (0, 0, 1)))
+        scene.add_obstacle(ts.Sphere(turn @ (0.45, 0.2, 0.1), 0.2))
+        with ts.Simulator(scene, dt=0.01, precision="f64") as sim:
+            pictures = [sim.picture(SIZE)]
+            n_contacts = [sim.step().n_contacts for _ in range(6)]
+            found.append((n_contacts, sim.positions() @ turn, np.array([*pictures, sim.picture(SIZE)])))
+    (n, x, pictures), (n_turned, x_turned, pictures_turned) = found
+    assert n == n_turned and max(n) > 4 and np.abs(x - x_turned).max() < 1e-13
+    assert (pictures != pictures_turned).mean() < 1e-3 and body_mask(pictures[0]).mean() > 0.05
 
 
 def has_colour(image, colour):

@@ -124,6 +124,15 @@ def test_an_explicit_dt_follows_density(cubes):
         controls.set_dt(-1.0)
 
 
+def test_gravity_acts_downwards_where_there_was_none():
+    for up, direction in (("y", (0, -1, 0)), ("z", (0, 0, -1))):
+        scene = ts.Scene(gravity=(0, 0, 0), up=up)
+        scene.add_body(ts.box_mesh((1, 1, 1), (1, 1, 1)), ts.Material())
+        with ts.Simulator(scene, dt=1e-3) as sim:
+            Controls(sim).set_gravity(2.0)
+            assert np.array_equal(sim.scene.gravity, 2.0 * np.array(direction)) and sim.scene.up == up
+
+
 def test_a_drag_needs_its_beginning(cubes):
     controls = Controls(cubes)
     controls.drag([0.0, 5.0, 0.0], 10.0)

@@ -83,13 +83,15 @@ def test_only_what_is_shown_travels():
 def test_both_frame_the_same_fall():
     """Of one body; the others are held, prescribed or connected."""
     scene = beam_scene(("held", "moved", "one", "two", "three"))
+    scene.up = "z"
     for body in scene.bodies[1:]:
         body.constraints.clear()
     scene.body("moved").move([0], lambda t: (0, t, 0))
     scene.add_spring(("one", 0), ("two", 0), 1.0)
     scene.add_obstacle(ts.HalfSpace((0, -2, 0), (0, 1, 0)))
-    seen = framed_points(MirrorSimulation(sent(describe_scene(scene, marks_of(scene))), 0).scene)
-    assert len(seen) == 6 * scene.bodies[0].n_nodes and np.array_equal(seen, framed_points(scene))
+    mirrored = MirrorSimulation(sent(describe_scene(scene, marks_of(scene))), 0).scene
+    seen = framed_points(mirrored)
+    assert mirrored.up == "z" and len(seen) == 6 * scene.bodies[0].n_nodes and np.array_equal(seen, framed_points(scene))
 
 
 class Shown(FakeSimulator):
