@@ -172,13 +172,12 @@ def command_parser() -> argparse.ArgumentParser:
     option = add(
         "warm",
         ("warm", "warm"),
-        "compile the kernels of common scenes in advance",
-        description="Compile the kernels of common scenes in advance, which takes a minute or two: the demos without pictures; "
-        "each law in explicit, implicit_euler and bdf2 steps, with fixed nodes, on a half-space and between bodies; and for "
-        "stable_neo_hookean statics, order 2, loads, prescribed nodes, damping, boxes and mesh obstacles, very flat tets, and "
-        "surfaces of more than 1,500 triangles.",
+        "compile the kernels of scenes in advance",
+        description="Compile the kernels of scenes in advance; without names those of the demos, of pictures and of statics, "
+        "which takes some minutes. Scenes of the same kind then start at once, whatever their meshes and numbers.",
     ).add_argument
-    option("--precision", choices=("f32", "f64"), help="of all kernels (default: simulations f32, statics f64)")
+    option("scenes", metavar="SCENE", nargs="*", help="a demo's name, or a .toml or .py file")
+    option("--precision", choices=("f32", "f64"), help="of all kernels (default: the scenes' own, and f64 of statics)")
 
     option = add("bench", ("scene_file", "bench"), "run a benchmark; without a name, list them", add_help=False).add_argument
     option("name", metavar="NAME", nargs="?", help="the benchmark's name")

@@ -10,8 +10,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy
 
-from_rotvec = scipy.spatial.transform.Rotation.from_rotvec
-
 
 @dataclass(frozen=True, eq=False)
 class Command:
@@ -48,7 +46,7 @@ class Command:
             return self._value(self.first, self.first_rotation)
         rotation = self.first_rotation
         if rotation is not None and self.spin.any():
-            rotation = from_rotvec(passed * self.spin).as_matrix() @ rotation
+            rotation = scipy.spatial.transform.Rotation.from_rotvec(passed * self.spin).as_matrix() @ rotation
         return self._value(self.first + passed * self.rate, rotation)
 
     def _value(self, displacement: np.ndarray, rotation: np.ndarray | None) -> np.ndarray | tuple[np.ndarray, np.ndarray]:
