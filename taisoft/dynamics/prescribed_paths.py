@@ -43,13 +43,15 @@ class PrescribedPaths:
     """The functions of time of a scene's obstacles and moved nodes."""
 
     def __init__(self, scene: Scene, dirichlet: DirichletConditions):
-        self._functions = [_Function(f"obstacle {o.name!r}", "set_pose", o, o.path, _pose(o)) for o in scene.obstacles]
+        given = [_Function(f"obstacle {o.name!r}", "set_pose", o, o.path, _pose(o)) for o in scene.obstacles]
         for g in dirichlet.groups:
             call = "set_pose" if isinstance(scene.body(g.name), RigidBody) else "set_displacement"
-            self._functions.append(_Function(f"body {g.name!r}: moved nodes", call, g, g.path, _displacement(g)))
+            given.append(_Function(f"body {g.name!r}: moved nodes", call, g, g.path, _displacement(g)))
+        self._functions = [one for one in given if _is_function(one.path)]
         self._time, self._jumped = 0.0, set()
 
     def _checked(self) -> list[_Function]:
+        """Those that no command has replaced."""
         return [one for one in self._functions if _is_function(one.mover.path)]
 
     def remember(self, time: float) -> None:
