@@ -5,7 +5,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from taisoft.errors import SceneError, SimulationError
-from taisoft.queries import body_index
 from taisoft.scene import checks
 from taisoft.scene.commands import Command
 from taisoft.scene.obstacles import Obstacle, checked_pose
@@ -19,14 +18,18 @@ def set_pose(self: "Simulator", name: str, translation, rotation=None, seconds: 
     """Command an obstacle, or a rigid body that `move` holds, to a pose, at constant velocity from where it is now.
 
     translation: (3,) [m] and rotation: (3,3), as a path gives them; None: the present rotation. seconds: how long it takes [s];
-    None: as long as the next call of `step` or `advance`, an implicit step or all explicit steps that it asks for. The pose then
-    holds; each command replaces the one before, and paths, until `reset`.
+    None: as long as the next call of `step` or `advance`, an implicit step or all explicit steps that it asks for; `advance` may
+    take fewer, the command then goes on in the next call. At least a step. The pose then holds; each command replaces the one
+    before, and paths, until `reset`.
     Raises SceneError, and SimulationError with `tolerance` or during a run with error=True.
     """
-    movers, first = _commanded(self, "set_pose", name)
-    last = checked_pose((translation, first.rotation if rotation is None else rotation), self.time, f"set_pose: {name!r}")
-    ends = {"last": last[0], "first_rotation": first.rotation, "last_rotation": last[1]}
-    self._open().command(movers, Command(self.time, first.translation, **ends, seconds=_duration("set_pose", seconds)))
+    commands, seconds = {}, _duration("set_pose", seconds)
+    for mover, first in _commanded(self, "set_pose", name).items():
+        given = (translation, first.rotation if rotation is None else rotation)
+        last, turned = checked_pose(given, self.time, f"set_pose of {name}")
+        turn = {"first_rotation": first.rotation, "last_rotation": turned}
+        commands[mover] = Command(self.time, first.translation, last, **turn, seconds=seconds)
+    self._open().command(commands)
 
 
 def set_velocity(self: "Simulator", name: str, velocity, angular_velocity=(0.0, 0.0, 0.0)) -> None:
@@ -34,13 +37,12 @@ def set_velocity(self: "Simulator", name: str, velocity, angular_velocity=(0.0, 
 
     velocity: (3,) [m/s] of its pivot or centre; angular_velocity: (3,) [rad/s]. Errors as for `set_pose`.
     """
-    movers, first = _commanded(self, "set_velocity", name)
     rate, spin = (
         checks.array(value, f"set_velocity: {name!r}: {what}", ((3,),))
         for what, value in (("velocity", velocity), ("angular_velocity", angular_velocity))
     )
-    command = Command(self.time, first.translation, rate=rate, first_rotation=first.rotation, spin=spin)
-    self._open().command(movers, command)
+    held = _commanded(self, "set_velocity", name)
+    self._open().command({k: Command(self.time, x, rate=rate, first_rotation=R, spin=spin) for k, (x, R) in held.items()})
 
 
 def set_displacement(self: "Simulator", body: str, index: int, value, seconds: float | None = None) -> None:
@@ -51,35 +53,32 @@ def set_displacement(self: "Simulator", body: str, index: int, value, seconds: f
     """
     _refuse_foresight(self, "set_displacement")
     dynamics, what = self._open(), f"body {body!r}: set_displacement"
-    if isinstance(self.scene.bodies[body_index(self, body)], RigidBody):
-        raise SceneError(f"{what}: it is rigid: call sim.set_pose")
+    one = self.scene.collider(body)
+    if isinstance(one, (Obstacle, RigidBody)):
+        raise SceneError(f"{what}: it is {'rigid' if isinstance(one, RigidBody) else 'an obstacle'}: call sim.set_pose")
     found = dynamics.commands.moved_nodes(body)
     if not found:
         raise SceneError(f"{what}: it has no moved nodes: hold them by body.move(where) before the Simulator is made")
     mover = found[checks.whole(index, f"{what}: index", range(len(found)))]
-    group = dynamics.commands.nodes(mover, f"{what}: {index}")
-    shape = (len(group.nodes), 3)
+    first, shape = dynamics.commands.displacement(mover, self.time, f"{what}: {index}"), (dynamics.commands.n_nodes(mover), 3)
     last = checks.array(value, f"{what}: value", ((3,), shape))
-    first = checks.path_value(group.path, self.time, what, "displacement", ((3,), shape))
-    command = Command(self.time, *(np.broadcast_to(x, shape).copy() for x in (first, last)), seconds=_duration(what, seconds))
-    dynamics.command([mover], command)
+    ends = (np.broadcast_to(x, shape).copy() for x in (first, last))
+    dynamics.command({mover: Command(self.time, *ends, seconds=_duration(what, seconds))})
 
 
-def _commanded(sim: "Simulator", call: str, name: str) -> tuple[list[int], Pose]:
-    """Return what moves by a command to an obstacle or a rigid body, and its present pose."""
+def _commanded(sim: "Simulator", call: str, name: str) -> dict[int, Pose]:
+    """Return what moves by a command to an obstacle or a rigid body, with its present pose."""
     _refuse_foresight(sim, call)
     commands, one = sim._open().commands, sim.scene.collider(name)
     if isinstance(one, Obstacle):
-        movers = [commands.obstacle(one)]
-        return movers, commands.pose(movers[0], sim.time)
+        mover = commands.obstacle(one)
+        return {mover: commands.pose(mover, sim.time, call)}
     if not isinstance(one, RigidBody):
         raise SceneError(f"{call}: body {name!r} is elastic: sim.set_displacement moves the nodes that body.move holds")
     movers = commands.moved_nodes(name)
     if not movers:
         raise SceneError(f"{call}: rigid body {name!r} is not held: call its move() before the Simulator is made")
-    for mover in movers:
-        commands.nodes(mover, f"{call}: rigid body {name!r}")
-    return movers, commands.pose(movers[0], sim.time)
+    return {mover: commands.pose(mover, sim.time, f"{call}: rigid body {name!r}") for mover in movers}
 
 
 def _refuse_foresight(sim: "Simulator", call: str) -> None:

@@ -130,13 +130,20 @@ def obstacle_frame(obstacle: Obstacle, t: float) -> tuple[np.ndarray, np.ndarray
     return obstacle.shape.pivot + translation, rotation @ obstacle.shape.frame()
 
 
-def place_analytic(fields: AnalyticObstacles, obstacles: list[tuple[int, Obstacle]], time: float, dt: float) -> None:
-    """Upload the frames of the obstacles at a time [s] and at the end of the step."""
-    pairs, f = [], fields
-    for t, origin, rotation in ((time, f.origin, f.rotation), (time + dt, f.next_origin, f.next_rotation)):
-        frames = [obstacle_frame(o, t) for _, o in obstacles]
-        pairs += [(origin, np.array([x for x, _ in frames])), (rotation, np.concatenate([r for _, r in frames]))]
-    upload(pairs)
+def empty_frames(n: int) -> np.ndarray:
+    """Return frames of n obstacles, now and at the end of the step: each an origin (3,) [m] and a rotation (3,3) by rows."""
+    return np.zeros((2, n, 4, 3))
+
+
+def place_analytic(
+    fields: AnalyticObstacles, frames: np.ndarray, obstacles: list[tuple[int, Obstacle]], rows: list[int], time: float, dt: float
+) -> None:
+    """Upload the frames of the obstacles, of which those in some rows have changed, at a time [s] and at the end of the step."""
+    for row in rows:
+        for frame, t in zip(frames[:, row], (time, time + dt)):
+            frame[0], frame[1:] = obstacle_frame(obstacles[row][1], t)
+    places = ((fields.origin, fields.rotation), (fields.next_origin, fields.next_rotation))
+    upload([pair for own, (x, r) in zip(frames, places) for pair in ((x, own[:, 0]), (r, own[:, 1:].reshape(-1, 3)))])
 
 
 @ti.func

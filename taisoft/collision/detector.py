@@ -11,7 +11,7 @@ import taichi as ti
 
 from taisoft.backend.arrays import FieldArena, download
 from taisoft.backend.runtime import Runtime
-from taisoft.collision.analytic import NO_SHAPES, build_analytic, find_analytic, place_analytic
+from taisoft.collision.analytic import NO_SHAPES, build_analytic, empty_frames, find_analytic, place_analytic
 from taisoft.collision.bvh import Bvh, Trees
 from taisoft.collision.candidates import Buffer, Candidates, entries
 from taisoft.collision.colliders import body_grid, collider_surfaces, collider_thickness, prescribed_vertices
@@ -41,6 +41,7 @@ FLOOR = 1e-5  # of the finest body's mean surface edge: distance that paths must
 REDUCTION_CELL = 0.25  # of the mean surface edge: cell size of the reduction
 MANY_COLLIDERS = 200  # colliders above which the spatial hash is used
 CONTACTS_PER_TRIANGLE = 1  # initial capacity
+MOVING = object()  # in place of the path of an obstacle that does not rest
 MAX_INITIAL_ROW = 4096  # largest initial capacity for the triangles near one vertex or triangle
 
 
@@ -115,7 +116,8 @@ class Detection:
         self.none_cross = False  # whether no surfaces are known to cross at the positions that are searched
         self.held = NO_PASSAGES  # which every search adds as contacts
         self._containment = Containment(scene, self.topology, layout, self._rest, self._analytic, self_collision)
-        self._placed = False  # whether obstacles have been placed
+        self._placed = [MOVING] * len(obstacles)  # the paths at whose ends obstacles rest, as they were last placed
+        self._frames = empty_frames(len(self._analytic))
         self._broad_result: Trees | Candidates | None = None  # broad-phase result of the last search
         self.counts = Counts(triangles=s.n_triangles)
 
@@ -178,16 +180,20 @@ class Detection:
             raise SimulationError(self._nonfinite())
 
     def _place_obstacles(self, time: float, dt: float) -> None:
-        """Place the obstacles at a time [s] and at the end of the step; static ones are placed once."""
-        first, starts = not self._placed, self.topology.vertex_first[len(self.scene.bodies) :]
-        for o, begin, end in zip(self.scene.obstacles, starts[:-1], starts[1:]):
-            if end > begin and (first or o.path is not None):
+        """Place the obstacles at a time [s] and at the end of the step; those that rest are placed once."""
+        starts, moved = self.topology.vertex_first[len(self.scene.bodies) :], set()
+        for k, (o, begin, end) in enumerate(zip(self.scene.obstacles, starts[:-1], starts[1:])):
+            rests = o.rests(time)
+            if rests and self._placed[k] is o.path:
+                continue
+            self._placed[k] = o.path if rests else MOVING
+            moved.add(len(self.scene.bodies) + k)
+            if end > begin:
                 now, then = (o.points_at(t, self._rest[begin:end]) for t in (time, time + dt))
                 self.surface.x.from_numpy(now, begin)
                 self.surface.move.from_numpy(then - now, begin)
-        if self._analytic and (first or any(o.path is not None for _, o in self._analytic)):
-            place_analytic(self.shapes, self._analytic, time, dt)
-        self._placed = True
+        if rows := [row for row, (k, _) in enumerate(self._analytic) if k in moved]:
+            place_analytic(self.shapes, self._frames, self._analytic, rows, time, dt)
 
     def _nonfinite(self) -> str:
         x, move = download([self.surface.x, self.surface.move])

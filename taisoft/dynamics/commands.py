@@ -21,9 +21,8 @@ class Commands:
     """The commands that a scene's obstacles and moved nodes follow at present. The scene is the simulator's own copy."""
 
     def __init__(self, scene: Scene, dirichlet: DirichletConditions):
-        self._scene, self._obstacles = scene, scene.obstacles
+        self._scene = scene
         self._movers: list[Obstacle | MovedNodes] = [*scene.obstacles, *dirichlet.groups]
-        self._given = [one.path for one in self._movers]
         self._followed: dict[int, Command] = {}  # by mover
 
     def __bool__(self) -> bool:
@@ -47,21 +46,27 @@ class Commands:
         """Return the movers that are nodes held by `move` of a body, in the order added."""
         return [k for k, one in enumerate(self._movers) if isinstance(one, MovedNodes) and one.of_move and one.name == name]
 
-    def nodes(self, mover: int, what: str) -> MovedNodes:
-        """Return nodes that are still held. Raises SceneError."""
-        group = self._movers[mover]
-        if group.released:
-            raise SceneError(f"{what}: its path has released it, and it moves freely")
-        return group
+    def n_nodes(self, mover: int) -> int:
+        """Return the number of nodes of a mover that is nodes."""
+        return len(self._movers[mover].nodes)
 
-    def pose(self, mover: int, time: float) -> Pose:
-        """Return the pose of an obstacle or a rigid body at a time [s], without the rounding of its nodes' positions."""
+    def displacement(self, mover: int, time: float, what: str) -> np.ndarray:
+        """Return the displacement (3,) or (k,3) [m] of nodes that are still held. Raises SceneError."""
+        group = self._movers[mover]
+        shapes = ((3,), (len(group.nodes), 3))
+        found = None if group.released else checks.path_value(group.path, time, what, "displacement", shapes)
+        if found is None:
+            raise SceneError(f"{what}: its path has released it, and it moves freely")
+        return found
+
+    def pose(self, mover: int, time: float, what: str) -> Pose:
+        """Return the pose of an obstacle, or of a rigid body that is still held, without the rounding of its nodes' positions."""
         one = self._movers[mover]
         if isinstance(one, Obstacle):
             return Pose(*one.pose(time))
+        body, displacement = self._body(one), self.displacement(mover, time, what)
         if isinstance(one.path, PosePath):
             return Pose(*one.path.pose(time))
-        body, displacement = self._body(one), one.path(time)
         if displacement.ndim == 1:
             return Pose(displacement, np.eye(3))
         return body.pose(body.rest_positions[:FRAME] + body.position + displacement)
@@ -77,16 +82,23 @@ class Commands:
         else:
             one.path = command
 
-    def begin(self, end: float) -> None:
-        """Let the steps that begin now carry out what is pending; end [s]: when they end."""
-        for mover, command in self._followed.items():
-            if command.is_pending:
-                self.follow(mover, command.until(end if command.seconds is None else command.begin + command.seconds))
+    def begin(self, first: float, last: float) -> dict[int, Command]:
+        """Let the steps that begin now carry out what is pending, and return that; first, last [s]: when these steps end."""
+        pending = {mover: command for mover, command in self._followed.items() if command.is_pending}
+        for mover, command in pending.items():
+            self.follow(mover, command.until(last if command.seconds is None else max(command.begin + command.seconds, first)))
+        return pending
+
+    def undo(self, pending: dict[int, Command]) -> None:
+        """Undo `begin`, after a failure."""
+        for mover, command in pending.items():
+            self.follow(mover, command)
 
     def reset(self) -> None:
         """Forget all commands: what followed them follows its path again."""
         for mover in self._followed:
-            checks.store(self._movers[mover], path=self._given[mover])
+            one = self._movers[mover]
+            checks.store(one, path=one.given_path)
         self._followed = {}
 
     def snapshot(self) -> dict:
@@ -100,8 +112,7 @@ class Commands:
             self.follow(int(mover), Command(**command))
 
     def continue_from(self, other: "Commands") -> None:
-        """Take over the commands of another instance of the same scene, and the paths that they replaced."""
-        self._given = other._given[: len(self._obstacles)] + self._given[len(self._obstacles) :]
+        """Take over the commands of another instance of the same scene."""
         for mover, command in other._followed.items():
             self.follow(mover, command)
 

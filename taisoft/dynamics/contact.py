@@ -118,7 +118,7 @@ class ContactStep:
     def _has_paths(self) -> bool:
         """Whether motion is prescribed: the user may change it between two steps, and a path may end with the last one."""
         simulation = self.simulation
-        return simulation.dirichlet.n_prescribed > 0 or any(o.path is not None for o in simulation.scene.obstacles)
+        return simulation.dirichlet.n_prescribed > 0 or not all(o.rests(simulation.time) for o in simulation.scene.obstacles)
 
     def motion_changed(self) -> None:
         """Discard the search, after an obstacle or nodes were commanded to move."""

@@ -26,6 +26,11 @@ class MovedNodes:
     path: Callable  #: t [s] -> displacement (3,) or (k,3) [m]; the constraint's, or a command
     released: bool = False
 
+    @property
+    def given_path(self) -> Callable:
+        """The path of the constraint."""
+        return self.constraint.path
+
 
 class DirichletConditions:
     """Constraints of all bodies.

@@ -111,13 +111,18 @@ class Dynamics:
             spring.apply(held * self.dt)
             self.stepper.loads_changed()
         before = (self.state.state()[1].astype(np.float64), self.state.time) if self.model.has_dependents else None
+        begun = {}
         try:
             self._paths.check()
-            self.commands.begin(end)
+            begun = self.commands.begin(begin + self.dt, end)
             self._paths.begin(begin, self.dt, end)
             result = self.stepper.advance(n, self.dt)
-        except SimulationError as error:
-            raise self._failure(error) from None
+        except BaseException as error:  # Ctrl-C, too
+            if self.state.step_count == start:
+                self.commands.undo(begun)
+            if isinstance(error, SimulationError):
+                raise self._failure(error) from None
+            raise
         self._velocities_before = before
         self.state.step_count = start + result.steps
         base, count = self._time_base
@@ -206,9 +211,9 @@ class Dynamics:
         self.changes += 1
         self.dt = dt
 
-    def command(self, movers: list[int], command: Command) -> None:
-        """Let movers of `commands` follow a command from the next step on."""
-        for mover in movers:
+    def command(self, commands: dict[int, Command]) -> None:
+        """Let movers of `commands` follow others from the next step on."""
+        for mover, command in commands.items():
             self.commands.follow(mover, command)
         self.changes += 1
         if self.contact is not None:
@@ -228,7 +233,7 @@ class Dynamics:
     def is_driven(self) -> bool:
         """Whether anything does work now that energies do not count: a drag, prescribed nodes, moving obstacles, loads along
         paths or without a potential."""
-        moving = self.contact is not None and any(obstacle.path is not None for obstacle in self.scene.obstacles)
+        moving = self.contact is not None and not all(obstacle.rests(self.state.time) for obstacle in self.scene.obstacles)
         dragged = self.drag_spring is not None and self.drag_spring.drag is not None
         driven = self.state.loads.vary or not self.state.loads.has_potential
         return moving or dragged or driven or not all(self.state.dirichlet.released())

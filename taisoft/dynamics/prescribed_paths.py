@@ -24,8 +24,9 @@ from taisoft.scene.scene import Scene
 
 DATA = (NodePath, ShapePath, CarriedPath, Command)  # no functions of a user; the third follows an obstacle, which is checked
 SAME = 1e-12  # of the largest entry, and of 1 m: times that differ by rounding give such differences
-HALVINGS = 12  # of a step, after which what remains is a jump
-REMAINS = 0.75  # of a change, at least, in one half of the time, if it may be a jump: 0.5 of motion at constant velocity
+SMALL = 1e-6  # likewise, of jumps that do not matter, such as those of single precision
+HALVINGS = 12  # of a step, after which a jump is what remains of a change
+REMAINS = 0.75  # of it, at least, in one half of the time: 0.5 of motion at constant velocity
 FAILED = object()
 
 
@@ -47,7 +48,7 @@ class PrescribedPaths:
         for g in dirichlet.groups:
             call = "set_pose" if isinstance(scene.body(g.name), RigidBody) else "set_displacement"
             given.append(_Function(f"body {g.name!r}: moved nodes", call, g, g.path, _displacement(g)))
-        self._functions = [one for one in given if _is_function(one.path)]
+        self._functions = [one for one in given if _is_function(one.mover.given_path)]
         self._time, self._jumped = 0.0, set()
 
     def _checked(self) -> list[_Function]:
@@ -93,19 +94,19 @@ class PrescribedPaths:
 def find_jump(value: Callable[[float], np.ndarray | None], start: float, a, end: float, b) -> tuple[float, float] | None:
     """Return time [s] and size of a function's jump between two times [s] with values a and b; None if it does not jump, fails or
     ends."""
-    for halving in range(HALVINGS + 1):
-        if a is None or b is None or a is FAILED or b is FAILED or _distance(a, b) <= SAME:
-            return None
-        if halving == HALVINGS:
-            return end, float(np.abs(a - b).max())
+    if any(x is None or x is FAILED for x in (a, b)) or _distance(a, b) <= SMALL:
+        return None
+    at_first = whole = float(np.abs(a - b).max())
+    for _ in range(HALVINGS):
         middle = 0.5 * (start + end)
         m = _value(value, middle)
         if m is None or m is FAILED:
             return None
-        left, right, whole = (float(np.abs(p - q).max()) for p, q in ((a, m), (m, b), (a, b)))
+        left, right = (float(np.abs(p - q).max()) for p, q in ((a, m), (m, b)))
         if max(left, right) < REMAINS * whole:
             return None
-        start, a, end, b = (start, a, middle, m) if left > right else (middle, m, end, b)
+        start, a, end, b, whole = (start, a, middle, m, left) if left > right else (middle, m, end, b, right)
+    return (end, whole) if whole > 0.5 * at_first else None
 
 
 def _is_function(path: Callable | None) -> bool:

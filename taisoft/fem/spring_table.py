@@ -23,6 +23,7 @@ import scipy.sparse as sp
 
 from taisoft.errors import SceneError, SimulationError
 from taisoft.ranges import owners
+from taisoft.scene.commands import Command
 from taisoft.scene.obstacles import Obstacle
 
 # What the amplitude of a line is: there is none; its tension; its tension, which is a Lagrange multiplier; its rest length
@@ -53,13 +54,22 @@ class MovingEnds:
             np.add.at(total, places, signs[:, None] * obstacle.points_at(t, points))
         return total
 
+    def _rates(self, t: float) -> np.ndarray:
+        """Rates (m,3) [m/s] of the offsets at t [s]."""
+        total = np.zeros_like(self.fixed)
+        for obstacle, places, signs, points in self.ends:
+            path, central = obstacle.path, (max(t - RATE_STEP, 0.0), t + RATE_STEP)
+            start, end = path.around(t, RATE_STEP) if isinstance(path, Command) else central
+            rate = (obstacle.points_at(end, points) - obstacle.points_at(start, points)) / (end - start)
+            np.add.at(total, places, signs[:, None] * rate)
+        return total
+
     def amplitudes(self, t: float) -> np.ndarray:
         """Offsets, and rates if they are needed, at t [s]. Raises SimulationError if a path fails."""
         try:
             found = [self.offsets(t)]
             if self.damped:
-                end = max(t, RATE_STEP)  # not later: commanded motion may end at t
-                found.append((self.offsets(end) - self.offsets(end - RATE_STEP)) / RATE_STEP)
+                found.append(self._rates(t))
         except SceneError as error:
             raise SimulationError(str(error)) from error.__cause__
         return np.concatenate(found).reshape(-1)

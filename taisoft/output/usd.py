@@ -91,7 +91,9 @@ class UsdWriter:
                     f"{path} is of another scene, up axis, frame rate or --error, so no run can resume in it: name another folder"
                 )
             self._joined.append(layer, first)
-        times = self._joined.layer.ListTimeSamplesForPath(self._view.attribute)
+        samples = self._joined.layer.ListTimeSamplesForPath
+        self._moved = {track for track, _ in self._obstacles if samples(track.points)}
+        times = samples(self._view.attribute)
         if times:
             self._view.resume(np.array(self._joined.layer.QueryTimeSample(self._view.attribute, times[-1])))
 
@@ -99,7 +101,7 @@ class UsdWriter:
         """Record sim's state as frame index, which must ascend; the first, if not 0, counts from time 0. Raises OutputError."""
         from pxr import Gf, Sdf
 
-        moving = [(track, surface) for track, surface in self._obstacles if surface.obstacle.path is not None]
+        moving = [one for one in self._obstacles if one[1].obstacle.path is not None or one[0] in self._moved]
         moved = [(track, surface.at(sim.time).astype(np.float32)) for track, surface in moving]  # first, since it may raise
         x = sim.positions()
         curves = [] if self._curves is None else self._curves.samples(sim, x)

@@ -70,7 +70,7 @@ class Track:
 
     def __init__(self, gprim, nodes: np.ndarray | slice = slice(None), primvars: tuple[str, ...] = (), weights=None):
         self._nodes, self._weights = nodes, weights
-        self._points, self._extent = gprim.GetPointsAttr().GetPath(), gprim.GetExtentAttr().GetPath()
+        self.points, self._extent = gprim.GetPointsAttr().GetPath(), gprim.GetExtentAttr().GetPath()
         self._primvars = [(name, gprim.GetPath().AppendProperty(f"primvars:{name}")) for name in primvars]
 
     def samples(self, points: np.ndarray, fields: dict[str, np.ndarray]) -> list[tuple]:
@@ -78,7 +78,7 @@ class Track:
         from pxr import Vt
 
         x = self._own(points)
-        found = [(self._points, Vt.Vec3fArray.FromNumpy(x)), (self._extent, Vt.Vec3fArray.FromNumpy(_extent(x)))]
+        found = [(self.points, Vt.Vec3fArray.FromNumpy(x)), (self._extent, Vt.Vec3fArray.FromNumpy(_extent(x)))]
         for name, path in self._primvars:
             values = self._own(fields[name])
             found.append((path, (Vt.FloatArray if values.ndim == 1 else Vt.Vec3fArray).FromNumpy(values)))

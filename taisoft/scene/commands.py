@@ -30,6 +30,10 @@ class Command:
         """Whether its end is not known yet."""
         return self.rate is None
 
+    def around(self, t: float, step: float) -> tuple[float, float]:
+        """Return two times [s], at most a step apart, between which it moves as at t: later ones where it begins."""
+        return (t, t + step) if t <= self.begin or t > self.end else (max(t - step, self.begin), t)
+
     def until(self, end: float) -> "Command":
         """Return the command with its end [s], from which its velocity follows."""
         seconds, spin = end - self.begin, None

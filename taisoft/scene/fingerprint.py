@@ -31,7 +31,7 @@ def scene_fingerprint(scene: Scene, features: dict[str, bool]) -> dict[str, str]
         owner, shape = f"obstacle '{obstacle.name}'", obstacle.shape
         values = [getattr(shape, field.name) for field in dataclasses.fields(shape)]
         fingerprint[f"{owner}: shape, friction, restitution or path"] = digest(
-            [type(shape).__name__, *values, obstacle.friction, obstacle.restitution, *_path_parts(obstacle.path)]
+            [type(shape).__name__, *values, obstacle.friction, obstacle.restitution, *_path_parts(obstacle.given_path)]
         )
     for one in scene.connections:
         fingerprint[f"{type(one).__name__.lower()} '{one.name}'"] = digest(_connection_parts(one))

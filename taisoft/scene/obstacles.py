@@ -17,6 +17,7 @@ from taisoft.errors import MeshError, SceneError, reason, value_text
 from taisoft.mesh.shapes import box_mesh
 from taisoft.mesh.topology import normals_and_heights, opposite_half_edges
 from taisoft.scene import checks
+from taisoft.scene.commands import Command
 from taisoft.scene.key_frames import KeyFrames, ShapePath
 
 DEGENERATE = 1e-9  # a triangle has no area if its smallest height is below this times its longest edge
@@ -246,8 +247,9 @@ def surface_numbers(friction, restitution, what: str) -> tuple[float, float]:
 class Obstacle:
     """A shape in a scene; made by `Scene.add_obstacle`.
 
-    path: None, `KeyFrames`, or callable t [s] -> (translation (3,) [m], rotation (3,3)), called once here for t = 0. Raises
-    SceneError for an invalid shape, values outside the rules, and a path with another result.
+    path: None, `KeyFrames`, or callable t [s] -> (translation (3,) [m], rotation (3,3)), called once here for t = 0. In a
+    simulation a command may replace the given_path. Raises SceneError for an invalid shape, values outside the rules, and a path
+    with another result.
     """
 
     shape: Shape
@@ -267,7 +269,11 @@ class Obstacle:
         checks.store(self, friction=friction, restitution=restitution, path=path)
         if self.path is not None and not callable(self.path):
             raise SceneError(f"{what}: path must be a function of time, not {value_text(self.path)}")
-        checks.store(self, _start=self.pose(0.0))  # a simulation may replace the path
+        checks.store(self, given_path=self.path, _start=self.pose(0.0))  # a simulation may replace the path
+
+    def rests(self, t: float) -> bool:
+        """Return whether it stays where it is from a time t [s] on, unless it is commanded."""
+        return self.path is None or (isinstance(self.path, Command) and t >= self.path.end)
 
     def pose(self, t: float) -> tuple[np.ndarray, np.ndarray]:
         """Return translation (3,) [m] and rotation (3,3) at time t [s]: x -> rotation @ (x - pivot) + pivot + translation.

@@ -125,7 +125,9 @@ class Scene(Guarded):
         copied = copy.copy(self)
         with thawed(copied):
             copied.bodies, copied._start = [copy.copy(body) for body in self.bodies], start
-            copied.obstacles = [copy.copy(obstacle) for obstacle in self.obstacles]  # whose paths a simulation may replace
+            copied.obstacles = [copy.copy(obstacle) for obstacle in self.obstacles]  # a simulation may replace their paths
+            for obstacle in copied.obstacles if start is None else ():
+                checks.store(obstacle, path=obstacle.given_path)
         begun = start or self.start
         for body in copied.rigid_bodies:
             attached = [begun.body(one.a) for one in begun.exact_attachments if one.b == body.name]

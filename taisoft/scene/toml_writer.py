@@ -192,11 +192,11 @@ def _obstacle(obstacle: Obstacle) -> dict:
     if kind is None:
         raise SceneError(f"obstacle {obstacle.name!r}: a file cannot store a {type(shape).__name__}")
     table = {"shape": kind} | _fields(shape) | {key: getattr(obstacle, key) for key in SURFACE_KEYS}
-    if obstacle.path is None:
+    if obstacle.given_path is None:
         return table
-    if not isinstance(obstacle.path, ShapePath):
+    if not isinstance(obstacle.given_path, ShapePath):
         raise SceneError(f"obstacle {obstacle.name!r}: moves along a function, which a file cannot store: use ts.KeyFrames")
-    frames, own = obstacle.path.frames, np.array_equal(obstacle.path.center, shape.pivot)
+    frames, own = obstacle.given_path.frames, np.array_equal(obstacle.given_path.center, shape.pivot)
     if not own and frames.rotations is not None and frames.pivot is not None:  # otherwise the center does not matter
         raise SceneError(f"obstacle {obstacle.name!r}: {FOREIGN_PATH.format('a shape with another center')}")
     return table | {"path": _fields(frames)}

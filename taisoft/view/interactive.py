@@ -122,8 +122,8 @@ class InteractiveView:
         for k in range(1, len(frames)):
             recording.insert_sleep(self.times[k] - self.times[k - 1])
             frames[k].visible, frames[k - 1].visible = True, False
-            for number in handles.keys() & self._moved[k].keys():
-                handles[number].vertices = self._moved[k][number]
+            for number in handles.keys() & {*self._moved[k - 1], *self._moved[k]}:
+                handles[number].vertices = self._moved[k].get(number, self._obstacles[number].vertices.astype(np.float32))
         return recording
 
     def _add_obstacles(self, server) -> dict[int, object]:

@@ -106,7 +106,8 @@ class MirrorScene:
         for obstacle in self.obstacles:
             if obstacle.name in poses and obstacle.name not in self.poses:
                 checks.store(obstacle, path=lambda _, name=obstacle.name: self.poses[name])
-        self.poses.update(poses)
+        at_rest = dict.fromkeys(self.poses, (np.zeros(3), np.eye(3)))  # those whose commands a reset has ended
+        self.poses |= at_rest | poses
 
     @staticmethod
     def constraints(body: SimpleNamespace) -> list:

@@ -165,7 +165,8 @@ class LiveWindow:
     """
 
     def __init__(self, sim, plots: tuple[str, ...] | Plots = (), colour: str = "body", layers: tuple[str, ...] = IN_WINDOW):
-        self._plots, self._own = (plots, False) if isinstance(plots, Plots) else (Plots(sim, plots), True)
+        names = (plots,) if isinstance(plots, str) else plots
+        self._plots, self._own = (plots, False) if isinstance(plots, Plots) else (Plots(sim, names), True)
         shown = tuple(name for name in PLOTS if self._plots.shown[name])
         self._window = WindowProcess(sim, colour=colour, layers=layers, plots=shown)
 

@@ -313,7 +313,8 @@ def test_a_displacement_after_a_release_is_refused():
 def test_only_functions_of_time_alone_are_paths(height, refused):
     past, scene, found = [0.0], ts.Scene(), ""
     path = lambda t: None if (y := height(t, past)) is None else (0.0, y, 0.0)  # noqa: E731
-    group = SimpleNamespace(name=scene.add_body(cube(), rubber(), name="it").name, path=path, nodes=np.array([3, 1]))
+    name = scene.add_body(cube(), rubber(), name="it").name
+    group = SimpleNamespace(name=name, path=path, given_path=path, nodes=np.array([3, 1]))
     paths = PrescribedPaths(scene, SimpleNamespace(groups=[group]))
     for k in range(5):
         paths.remember(0.1 * k * (1 + 1e-15))
@@ -333,7 +334,8 @@ def test_only_functions_of_time_alone_are_paths(height, refused):
         (lambda t: 3.0 * t + 1e-3 * (t >= 1.7), None),  # less than the motion
         (lambda t: max(t - 1.5, 0.0), None),
         (lambda t: (t - 1.0) ** 4, None),
-        (lambda t: np.sqrt(t - 1.0), None),
+        (lambda t: (t - 1.0) ** 0.3, None),
+        (lambda t: float(np.float32(1.0 + 1e-7 * t)), None),
         (lambda t: 2.0, None),
         (lambda t: None if t > 1.5 else 0.0, None),
     ],

@@ -219,7 +219,13 @@ def test_an_obstacle_that_is_commanded_moves_from_then_on(tmp_path):
     stage = Usd.Stage.Open(str(tmp_path / "scene.usdc"))
     points = UsdGeom.Mesh(stage.GetPrimAtPath("/World/ball/surface")).GetPointsAttr()
     moved = [float(np.mean(np.array(points.Get(index)) - np.array(points.Get(0)), axis=0)[0]) for index in range(4)]
-    assert points.GetTimeSamples() == [1, 2, 3] and moved == pytest.approx([0.0, 0.0, 0.2, 0.3], abs=1e-5)
+    resumed = UsdWriter(tmp_path, scene, fps=10.0, first=4)
+    sim.time = 0.4
+    resumed.frame(sim, 4)
+    resumed.close()
+    stage.Reload()
+    assert np.array(points.Get(3))[:, 0].mean() == pytest.approx(0.3, abs=1e-5), "a resumed run leaves earlier frames as they are"
+    assert points.GetTimeSamples() == [1, 2, 3, 4] and moved == pytest.approx([0.0, 0.0, 0.2, 0.3], abs=1e-5)
 
 
 def test_a_full_disk_is_an_error_and_leaves_no_partial_file(tmp_path):

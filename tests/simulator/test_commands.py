@@ -59,7 +59,7 @@ def kind(request):
     with ts.Simulator(scene(sideways), **settings) as sim:
         expected = follow(sim, 10)
     with ts.Simulator(scene(), **settings) as sim:
-        yield sim, expected
+        yield sim, expected, [sim.step().elastic for _ in range(3)]
 
 
 def same(found: list, expected: list) -> bool:
@@ -67,7 +67,7 @@ def same(found: list, expected: list) -> bool:
 
 
 def test_commands_move_things_as_paths_do(kind):
-    sim, expected = kind
+    sim, expected, _ = kind
     sim.reset()
     assert same(follow(sim, 10, lambda: command(sim, sideways(sim.time + DT))), expected)
     sim.reset()
@@ -82,7 +82,7 @@ def test_commands_move_things_as_paths_do(kind):
 
 
 def test_checkpoints_and_rebuild_continue_commands_and_reset_forgets_them(kind, tmp_path):
-    sim, expected = kind
+    sim, expected, at_rest = kind
     sim.reset()
     command(sim, sideways(10 * DT), seconds=10 * DT)
     follow(sim, 4)
@@ -103,13 +103,19 @@ def test_checkpoints_and_rebuild_continue_commands_and_reset_forgets_them(kind, 
         assert all(np.abs(loaded.pose(name).translation).max() < 1e-15 for name in ("wall", "tool"))
         command(loaded, sideways(10 * DT), seconds=10 * DT)
         assert same(follow(loaded, 10), expected)
+        loaded.reset()
+        assert [loaded.step().elastic for _ in range(3)] == at_rest, "nothing is left where it was commanded"
 
 
 def test_commands_turn_things_at_a_constant_rate():
     """Also a rigid body, about its centre; a second command starts where the first one is."""
     made = scene()
     made.contact_forces = False
+    slider = made.add_rigid_body(ts.box_mesh((1, 1, 1), (1, 1, 1)), name="slider")
+    slider.move(ts.KeyFrames((0.0,), translations=[(0.2, 0, 0)]), axes="x")
+    slider.move(axes="yz")
     with ts.Simulator(made, DT, precision="f64") as sim:
+        sim.set_velocity("slider", (0, 0, 0))
         for name in ("wall", "tool"):
             sim.set_velocity(name, (0, 0, 1.0), (0, 0.5, 0))
         sim.step()
@@ -124,8 +130,27 @@ def test_commands_turn_things_at_a_constant_rate():
             assert np.allclose(turn[0], [np.cos(angle), 0, np.sin(angle)], rtol=0, atol=1e-9)
         for _ in range(3):
             sim.step()
+        assert np.allclose(sim.pose("slider").translation, (0.2, 0, 0), rtol=0, atol=1e-12), "each axis stays where it was"
         assert np.array_equal(sim.pose("wall").rotation, quarter)
         assert np.allclose(sim.pose("tool").rotation, quarter, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("integrator", KINDS)
+def test_dampers_on_commanded_obstacles_know_their_velocity(integrator):
+    found = []
+    for path in (lambda t: (np.array([0, 16 * t * t, 0]), np.eye(3)), ts.KeyFrames((0,), translations=[(0, 0, 0)])):
+        made = ts.Scene()
+        made.contact_forces = False
+        made.add_body(cube(1), ts.Material(young=5e4), name="cube")
+        made.add_obstacle(ts.Sphere((0, 1, 0), 0.1), name="hook", path=path)
+        made.add_spring(("cube", (0, SIDE, 0)), ("hook", (0, 1, 0)), 10.0, damping=50.0)
+        with ts.Simulator(made, DT / 8, integrator=integrator, precision="f64") as sim:
+            for _ in range(20):
+                if len(found) == 1:
+                    sim.set_pose("hook", (0, 16 * (sim.time + sim.dt) ** 2, 0))
+                sim.step()
+            found.append(sim.velocities("cube").mean(axis=0)[1])
+    assert found[1] == pytest.approx(found[0], rel=0.02)
 
 
 @pytest.fixture(scope="module")
@@ -145,11 +170,12 @@ def refusing():
         (lambda sim: sim.set_pose("cube", (0, 0, 0)), "set_pose: body 'cube' is elastic: sim.set_displacement"),
         (lambda sim: sim.set_velocity("free", (0, 0, 0)), "set_velocity: rigid body 'free' is not held: call its move()"),
         (lambda sim: sim.set_pose("hook", (0, 0, 0)), "obstacle 'hook': spring 'rope' holds on to it"),
-        (lambda sim: sim.set_pose("wall", (0, np.nan, 0)), "set_pose: 'wall'.s translation"),
-        (lambda sim: sim.set_pose("wall", (0, 0, 0), 2 * np.eye(3)), "set_pose: 'wall'.s rotation .* must be orthonormal"),
+        (lambda sim: sim.set_pose("wall", (0, np.nan, 0)), "set_pose of wall.s translation"),
+        (lambda sim: sim.set_pose("wall", (0, 0, 0), 2 * np.eye(3)), "set_pose of wall.s rotation .* must be orthonormal"),
         (lambda sim: sim.set_pose("wall", (0, 0, 0), seconds=0), "set_pose: seconds must be greater than 0 s"),
         (lambda sim: sim.set_velocity("wall", (0, 0)), "set_velocity: 'wall': velocity"),
         (lambda sim: sim.set_displacement("tool", 0, (0, 0, 0)), "body 'tool': set_displacement: it is rigid"),
+        (lambda sim: sim.set_displacement("wall", 0, (0, 0, 0)), "body 'wall': set_displacement: it is an obstacle"),
         (lambda sim: sim.set_displacement("cube", 1, (0, 0, 0)), "body 'cube': set_displacement: index"),
         (lambda sim: sim.set_displacement("cube", 0, np.zeros((2, 3))), "body 'cube': set_displacement: value"),
     ],
@@ -182,10 +208,14 @@ def test_a_path_that_follows_commands_is_referred_to_set_pose_and_one_that_jumps
     made.obstacles.pop()
     made.add_obstacle(ts.Sphere((1, 1, 1), 0.1), name="jaw", path=lambda t: ((now[0], 0, 0), np.eye(3)))
     made.add_obstacle(ts.Sphere((3, 1, 1), 0.1), name="jumper", path=lambda t: ((t > 1.3 * DT, 0, 0), np.eye(3)))
+    loose = made.add_rigid_body(ts.box_mesh((1, 1, 1), (1, 1, 1)), name="loose", position=(9, 9, 9))
+    loose.move(lambda t: None if t >= 2 * DT else ((0, 0, 0), np.eye(3)))
     with ts.Simulator(made, DT, precision="f64") as sim:
         sim.step()
         with pytest.warns(UserWarning, match=r"obstacle 'jumper': the path jumps by 1 at t = 0.00253"):
             sim.step()
+        with pytest.raises(ts.SceneError, match="set_pose: rigid body 'loose': its path has released it"):
+            sim.set_pose("loose", (0, 0, 0))
         now[0] = 0.1
         with pytest.raises(ts.SimulationError, match="obstacle 'jaw': the path gives another value .* sim.set_pose commands"):
             sim.step()
