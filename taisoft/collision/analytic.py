@@ -10,6 +10,7 @@ distance to its surface, inside the largest p_i - h_i. Capsule: a segment along 
 not unique (at a centre, on a segment, on a box's diagonal planes), one of the possible unit vectors is returned.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -130,20 +131,23 @@ def obstacle_frame(obstacle: Obstacle, t: float) -> tuple[np.ndarray, np.ndarray
     return obstacle.shape.pivot + translation, rotation @ obstacle.shape.frame()
 
 
-def empty_frames(n: int) -> np.ndarray:
-    """Return frames of n obstacles, now and at the end of the step: each an origin (3,) [m] and a rotation (3,3) by rows."""
-    return np.zeros((2, n, 4, 3))
+class AnalyticFrames:
+    """Where analytic obstacles are, now and at the end of the step, on the host. obstacles: as for `build_analytic`."""
 
+    def __init__(self, fields: AnalyticObstacles, obstacles: list[tuple[int, Obstacle]]):
+        self._fields, self._obstacles = fields, obstacles
+        self._frames = np.zeros((2, len(obstacles), 4, 3))  # each an origin (3,) [m] and a rotation (3,3) by rows
 
-def place_analytic(
-    fields: AnalyticObstacles, frames: np.ndarray, obstacles: list[tuple[int, Obstacle]], rows: list[int], time: float, dt: float
-) -> None:
-    """Upload the frames of the obstacles, of which those in some rows have changed, at a time [s] and at the end of the step."""
-    for row in rows:
-        for frame, t in zip(frames[:, row], (time, time + dt)):
-            frame[0], frame[1:] = obstacle_frame(obstacles[row][1], t)
-    places = ((fields.origin, fields.rotation), (fields.next_origin, fields.next_rotation))
-    upload([pair for own, (x, r) in zip(frames, places) for pair in ((x, own[:, 0]), (r, own[:, 1:].reshape(-1, 3)))])
+    def place(self, rows: Iterable[int], time: float, dt: float) -> None:
+        """Update the frames of the obstacles in these rows to a time [s] and to the end of the step; upload all if there are any."""
+        for row in (rows := list(rows)):
+            for frame, t in zip(self._frames[:, row], (time, time + dt)):
+                frame[0], frame[1:] = obstacle_frame(self._obstacles[row][1], t)
+        if rows:
+            f = self._fields
+            places = ((f.origin, f.rotation), (f.next_origin, f.next_rotation))
+            pairs = [((x, own[:, 0]), (r, own[:, 1:].reshape(-1, 3))) for own, (x, r) in zip(self._frames, places)]
+            upload([pair for both in pairs for pair in both])
 
 
 @ti.func

@@ -11,7 +11,7 @@ import taichi as ti
 
 from taisoft.backend.arrays import FieldArena, download
 from taisoft.backend.runtime import Runtime
-from taisoft.collision.analytic import NO_SHAPES, build_analytic, empty_frames, find_analytic, place_analytic
+from taisoft.collision.analytic import NO_SHAPES, AnalyticFrames, build_analytic, find_analytic
 from taisoft.collision.bvh import Bvh, Trees
 from taisoft.collision.candidates import Buffer, Candidates, entries
 from taisoft.collision.colliders import body_grid, collider_surfaces, collider_thickness, prescribed_vertices
@@ -117,7 +117,7 @@ class Detection:
         self.held = NO_PASSAGES  # which every search adds as contacts
         self._containment = Containment(scene, self.topology, layout, self._rest, self._analytic, self_collision)
         self._placed = [MOVING] * len(obstacles)  # the paths at whose ends obstacles rest, as they were last placed
-        self._frames = empty_frames(len(self._analytic))
+        self._frames = AnalyticFrames(self.shapes, self._analytic)
         self._broad_result: Trees | Candidates | None = None  # broad-phase result of the last search
         self.counts = Counts(triangles=s.n_triangles)
 
@@ -192,8 +192,7 @@ class Detection:
                 now, then = (o.points_at(t, self._rest[begin:end]) for t in (time, time + dt))
                 self.surface.x.from_numpy(now, begin)
                 self.surface.move.from_numpy(then - now, begin)
-        if rows := [row for row, (k, _) in enumerate(self._analytic) if k in moved]:
-            place_analytic(self.shapes, self._frames, self._analytic, rows, time, dt)
+        self._frames.place((row for row, (k, _) in enumerate(self._analytic) if k in moved), time, dt)
 
     def _nonfinite(self) -> str:
         x, move = download([self.surface.x, self.surface.move])

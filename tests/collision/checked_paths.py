@@ -8,7 +8,7 @@ import taichi as ti
 
 import taisoft as ts
 from taisoft.backend.arrays import FieldArena
-from taisoft.collision.analytic import build_analytic, place_analytic
+from taisoft.collision.analytic import AnalyticFrames, build_analytic
 from taisoft.collision.bvh import Bvh
 from taisoft.collision.candidates import Buffer, entries
 from taisoft.collision.near_list import SEARCHED, TO_STATE
@@ -43,7 +43,7 @@ class Checked:
     def search(self, x: np.ndarray, move: np.ndarray) -> None:
         """Place vertices (v,3) [m], their displacements [m], and the obstacles from 0 to 1 s."""
         place(self.made, x, move)
-        place_analytic(self.shapes, self._placed, 0.0, 1.0)
+        AnalyticFrames(self.shapes, self._placed).place(range(len(self._placed)), 0.0, 1.0)
         self.near = self.tree.near()
 
     def find(self, state: np.ndarray | None = None, check: PathCheck | None = None):

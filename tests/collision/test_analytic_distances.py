@@ -17,7 +17,7 @@ import taichi as ti
 import taisoft as ts
 from taisoft.backend.arrays import FieldArena
 from taisoft.backend.runtime import kernel
-from taisoft.collision.analytic import build_analytic, may_touch, obstacle_frame, place_analytic
+from taisoft.collision.analytic import AnalyticFrames, build_analytic, may_touch, obstacle_frame
 from taisoft.collision.deepest_point import deepest_point
 from taisoft.collision.surface import dvec
 from tests.collision.checked_paths import obstacle
@@ -80,7 +80,7 @@ def test_no_triangle_with_contacts_is_skipped(run):
     path = ts.KeyFrames((0.0, 1.0), ((0.0, 0.0, 0.0), (0.03, -0.2, 0.01)), ((0.0, 0.0, 0.0), (0.04, 0.02, -0.1)))
     placed = [(k, obstacle(shape, path)) for k, shape in enumerate(SHAPES.values())]
     shapes = build_analytic(placed, arena)
-    place_analytic(shapes, placed, 0.0, 1.0)
+    AnalyticFrames(shapes, placed).place(range(len(placed)), 0.0, 1.0)
     for k, one in placed:
         frames = [obstacle_frame(one, t) for t in (0.0, 1.0)]
         now, then = ((w @ x - origin) @ R for x, (origin, R) in zip((X, X + move), frames))
