@@ -15,6 +15,8 @@ from pathlib import Path
 
 import numpy as np
 
+from taisoft.errors import OutputError
+
 
 @dataclass(frozen=True)
 class Timing:
@@ -129,3 +131,12 @@ def _container_available(root: Path = Path("/sys/fs/cgroup")) -> list[int]:
 def format_bytes(n_bytes: int | None) -> str:
     """Format a number of bytes for a message, such as "2000000000 bytes (2.00 GB)"."""
     return "unknown" if n_bytes is None else f"{n_bytes} bytes ({n_bytes / 1e9:.2f} GB)"
+
+
+def require_pyvista():
+    """Return the package pyvista. Raises OutputError if it is missing."""
+    try:
+        import pyvista
+    except ImportError:
+        raise OutputError("to_pyvista needs the package pyvista, which is missing: pip install pyvista") from None
+    return pyvista

@@ -15,7 +15,8 @@ from pathlib import Path
 import numpy as np
 
 from taisoft.attributes import MeshAttributeError, guarded_record
-from taisoft.errors import MeshError, one_line
+from taisoft.errors import MeshError, one_line, value_text
+from taisoft.machine import require_pyvista
 from taisoft.mesh.obj_off import read_obj, read_off
 from taisoft.mesh.ply import read_ply
 from taisoft.mesh.safe_reading import read_content, run_child
@@ -76,6 +77,10 @@ class SurfaceMesh:
 
     def __repr__(self) -> str:
         return f"SurfaceMesh({len(self.vertices)} vertices, {len(self.triangles)} triangles)"
+
+    def to_pyvista(self):
+        """Return the surface as a pyvista.PolyData. Raises OutputError without pyvista."""
+        return require_pyvista().PolyData.from_regular_faces(self.vertices.copy(), self.triangles)
 
     @property
     def volume(self) -> float:
@@ -154,24 +159,37 @@ def _edge_text(edges: np.ndarray) -> str:
 def read_surface(path, weld: float = 0.0) -> SurfaceMesh:
     """Read triangles from an .obj, .stl, .ply or .off file; polygons are split into triangles.
 
-    weld: merge vertices at most this far apart [m]; 0 merges only equal ones (files with texture or normals per corner repeat
-    vertices). Triangles without area, duplicates and unused vertices are removed; all but the last are reported by a
-    warning. Raises MeshError.
+    path: the file, or another library's surface with `vertices` (n,3) and `faces` (t,3), such as a trimesh.Trimesh. weld: merge
+    vertices at most this far apart [m]; 0 merges only equal ones (files with texture or normals per corner repeat vertices).
+    Triangles without area, duplicates and unused vertices are removed; all but the last are reported by a warning. Raises
+    MeshError.
     """
+    foreign = _is_foreign(path)
     try:
-        file = Path(path)
+        file = Path(type(path).__name__ if foreign else path)
     except TypeError as error:
-        raise MeshError(f"read_surface: path must be a file's name, not {path!r}") from error
+        raise MeshError(f"read_surface: path must be a file's name or have vertices and faces, not {value_text(path)}") from error
     name, ending = str(file), file.suffix.lower()
-    if ending not in FORMATS:
+    if ending not in FORMATS and not foreign:
         raise MeshError(f"{name}: a surface is read from {', '.join(FORMATS)}, not from {ending or 'a file without ending'}")
     if isinstance(weld, bool) or not isinstance(weld, Real) or not 0.0 <= weld < np.inf:
         raise MeshError(f"{name}: weld must be a distance of at least 0 m, not {weld!r}")
+    if foreign:
+        return clean_surface(SurfaceMesh(path.vertices, path.faces, name), float(weld))
     points, polygons = READERS[ending](name, read_content(file))
     # Split each polygon as a fan around its first corner.
     fans = [nodes[:, [0, k, k + 1]] for nodes in polygons for k in range(1, nodes.shape[1] - 1)]
     triangles = np.concatenate([np.empty((0, 3), dtype=np.int64), *fans])
     return clean_surface(SurfaceMesh(points, triangles, name), float(weld))
+
+
+def as_surface(mesh):
+    """Return a surface of another library as `read_surface` reads it, and anything else as it is. Raises MeshError."""
+    return read_surface(mesh) if _is_foreign(mesh) else mesh
+
+
+def _is_foreign(mesh) -> bool:
+    return hasattr(mesh, "vertices") and hasattr(mesh, "faces")
 
 
 def clean_surface(surface: SurfaceMesh, weld: float) -> SurfaceMesh:
@@ -208,6 +226,7 @@ def tetrahedralize(surface: SurfaceMesh, edge_length: float | None = None, envel
     faults, and of the volume with holes closed. Raises MeshError if the extra `mesh` is missing, nothing is enclosed, or the
     mesher fails.
     """
+    surface = as_surface(surface)
     if not isinstance(surface, SurfaceMesh):
         raise MeshError(f"tetrahedralize needs a SurfaceMesh (see read_surface), not {type(surface).__name__}")
     name, diagonal = surface.source, float(np.linalg.norm(np.ptp(surface.vertices, axis=0)))
