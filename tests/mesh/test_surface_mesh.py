@@ -147,7 +147,8 @@ def test_surfaces_of_other_libraries_are_read():
     assert len(surface.vertices) == len(X) and surface.volume == pytest.approx(VOLUME) and not surface.faults()
     scene = ts.Scene()
     for given in (surface, trimesh):
-        scene.add_rigid_body(ts.place(given, scale=2.0)), scene.add_rigid_body(given)
+        for mesh in (given, ts.place(given, scale=2.0)):
+            scene.add_rigid_body(mesh)
         scene.add_body(BALL, ts.Material()).embed(given, contact=True)
     masses = [body.mass for body in scene.bodies]
     assert masses[:3] == masses[3:] and np.array_equal(scene.bodies[2].nodes.surface, scene.bodies[5].nodes.surface)
