@@ -42,7 +42,7 @@ figures: $(READY)
 # Runs every example of the manual, then builds it, which runs its notebooks; any warning is an error.
 docs: $(DOCS_READY)
 	$(BIN)/python -m pytest -q -n auto --maxprocesses 8 --dist loadfile -p no:cacheprovider -p no:warnings docs
-	$(BIN)/sphinx-build -q -n -W --keep-going docs out/docs
+	$(BIN)/sphinx-build -q -n -W --keep-going -d out/doctrees docs out/docs
 	@echo "Written to out/docs: open out/docs/index.html."
 
 # Builds the sdist, and the wheel from it, checks both, installs the wheel in an environment of its own, and runs a demo from there.

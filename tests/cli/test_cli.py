@@ -9,6 +9,7 @@ import os
 import subprocess
 import sys
 import tomllib
+import webbrowser
 from argparse import Namespace
 
 import pytest
