@@ -26,7 +26,7 @@ nb_execution_in_temp = True
 nb_execution_timeout = 120  # of a cell [s]
 logging.getLogger("traitlets").setLevel(logging.WARNING)  # else nbclient announces each notebook
 nb_output_stderr = "remove"  # what kernels are compiled depends on the cache on disk
-myst_enable_extensions = ["dollarmath", "colon_fence", "deflist"]
+myst_enable_extensions = ["dollarmath"]
 myst_heading_anchors = 3
 html_math_renderer = "mathml"  # of this file
 html_theme = "furo"

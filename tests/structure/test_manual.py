@@ -86,7 +86,7 @@ def test_pages_are_readable_on_code_hosts():
     wrong = []
     for path in DOCUMENTS:
         content = path.read_text(encoding="utf-8")
-        syntax = re.findall(r"\[\]\(.*?\)|\{[\w:-]+\}`.*?`|^\([\w-]+\)=$", content, re.MULTILINE)
+        syntax = re.findall(r"\[\]\(.*?\)|\{[\w:-]+\}`.*?`|^\([\w-]+\)=$|^: .*", content, re.MULTILINE)
         wrong += [f"{path.name}: {part}" for part in syntax]
         for link, anchor in re.findall(r"\]\(([^)#\s:]*\.md)?#([^)\s]+)\)", content):
             if anchor not in slugs(path.parent / link if link else path):
