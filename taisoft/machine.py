@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass
-from importlib import metadata
+from importlib import import_module, metadata
 from pathlib import Path
 
 import numpy as np
@@ -133,10 +133,9 @@ def format_bytes(n_bytes: int | None) -> str:
     return "unknown" if n_bytes is None else f"{n_bytes} bytes ({n_bytes / 1e9:.2f} GB)"
 
 
-def require_pyvista():
-    """Return the package pyvista. Raises OutputError if it is missing."""
+def require(package: str, what: str, extra: str):
+    """Return an optional package. what: what needs it. extra: brings it. Raises OutputError if it is missing."""
     try:
-        import pyvista
+        return import_module(package)
     except ImportError:
-        raise OutputError("to_pyvista needs the package pyvista, which is missing: pip install pyvista") from None
-    return pyvista
+        raise OutputError(f"{what} needs the package {package}, which is missing: pip install 'taisoft[{extra}]'") from None

@@ -83,31 +83,11 @@ def read_mesh(path, fix_orientation: bool = False, weld: float | None = None, re
     return _clean_mesh(name, content or _read_by_meshio(file, data), fix_orientation, weld, regions)
 
 
-def from_meshio(mesh, fix_orientation: bool = False, weld: float | None = None, regions: str | None = None) -> TetMesh:
-    """Return the tets of a meshio.Mesh, as `TetMesh.from_meshio`. Raises MeshError."""
+def from_meshio(mesh, *options) -> TetMesh:
+    """Return the tets of a meshio.Mesh, as `TetMesh.from_meshio`. options: its other arguments. Raises MeshError."""
     if not isinstance(mesh, meshio.Mesh):
         raise MeshError(f"from_meshio needs a meshio.Mesh, not {type(mesh).__name__}")
-    try:
-        content = content_of(mesh)
-    except ValueError as error:  # of polyhedra
-        raise MeshError("meshio.Mesh: its cells have rows of different lengths") from error
-    return _clean_mesh("meshio.Mesh", content, fix_orientation, weld, regions)
-
-
-def to_meshio(mesh: TetMesh) -> meshio.Mesh:
-    """Return a mesh as `TetMesh.to_meshio`."""
-    return _record(mesh, None if mesh.regions is None else PHYSICAL if mesh.regions.any() else REGION)
-
-
-def _record(mesh: TetMesh, data: str | None) -> meshio.Mesh:
-    """Return meshio's record of a mesh. data: name of the cell data that hold the regions; None leaves them out."""
-    record = meshio.Mesh(mesh.vertices.copy(), [("tetra", mesh.tets.copy())])
-    if data is not None:
-        record.cell_data[data] = [mesh.regions.astype(np.int32)]
-        if data == PHYSICAL:  # meshio's writer of .msh wants both
-            record.cell_data["gmsh:geometrical"] = record.cell_data[data]
-        record.field_data = {text: np.array([region, 3]) for region, text in mesh.region_names.items()}
-    return record
+    return _clean_mesh("meshio.Mesh", content_of(mesh), *options)
 
 
 def write_mesh(path, mesh: TetMesh, regions: bool = True) -> None:
@@ -121,11 +101,10 @@ def write_mesh(path, mesh: TetMesh, regions: bool = True) -> None:
     ending = check_ending(file)
     if not isinstance(mesh, TetMesh):
         raise MeshError(f"{file}: write_mesh needs a TetMesh, not {type(mesh).__name__}")
-    held = {".msh": PHYSICAL, ".mesh": REFERENCE}.get(ending, REGION) if regions and mesh.regions is not None else None
-    record = _record(mesh, held)
+    record = mesh.to_meshio() if regions else meshio.Mesh(mesh.vertices, [("tetra", mesh.tets)])
     options = {"file_format": WRITERS[ending]} | ({"binary": False} if ending == ".msh" else {})
-    if held is not None:
-        options |= _region_options(file, record, mesh, held)
+    if record.cell_data:
+        options |= _region_options(file, record, mesh)
     elif ending == ".mesh":
         record.cell_data[REFERENCE] = [np.zeros(mesh.n_tets, dtype=np.int32)]  # meshio would write 1
     with replacing(file) as part:
@@ -133,14 +112,16 @@ def write_mesh(path, mesh: TetMesh, regions: bool = True) -> None:
             meshio.write(part, record, **options)
 
 
-def _region_options(file: Path, record: meshio.Mesh, mesh: TetMesh, name: str) -> dict:
-    """Return options of the writer for regions in cell data called `name`. Raises MeshError if they would be read as none."""
+def _region_options(file: Path, record: meshio.Mesh, mesh: TetMesh) -> dict:
+    """Give the regions in meshio's record of a mesh the name of the format; return options of the writer."""
     ending = file.suffix.lower()
+    name = {".msh": PHYSICAL, ".mesh": REFERENCE}.get(ending, REGION)
     if name in NONE_IF_ZERO and not mesh.regions.any():
         raise MeshError(
             f"{file}: a mesh whose only region is 0 cannot be written, since in {ending} 0 means none: use another number"
         )
     if ending != ".msh":
+        record.cell_data = {name: [mesh.regions.astype(np.int32)]}
         if mesh.region_names:
             warnings.warn(f"{file}: {ending} cannot hold the names of regions, only their numbers", UserWarning, stacklevel=3)
         return {}

@@ -107,7 +107,10 @@ def read_by_meshio(file: Path, data: bytes) -> FileContent:
 
 def content_of(mesh) -> FileContent:
     """Return what a meshio.Mesh holds, with its cell data that are numbers, and the names of its groups of solids."""
-    cells = [(block.type, np.asarray(block.data)) for block in mesh.cells]
+    rows = [
+        one.data if isinstance(one.data, np.ndarray) else np.empty((len(one.data), 0), int) for one in mesh.cells
+    ]  # polyhedra
+    cells = [(one.type, nodes) for one, nodes in zip(mesh.cells, rows)]
     of_cells = {name: list(map(np.asarray, of_blocks)) for name, of_blocks in mesh.cell_data.items()}
     numbers = {name: of for name, of in of_cells.items() if all(one.ndim == 1 and one.dtype.kind in "iuf" for one in of)}
     fields = {name: np.asarray(value) for name, value in mesh.field_data.items()}  # of any kind, such as a time

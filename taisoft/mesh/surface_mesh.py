@@ -16,7 +16,7 @@ import numpy as np
 
 from taisoft.attributes import MeshAttributeError, guarded_record
 from taisoft.errors import MeshError, one_line, value_text
-from taisoft.machine import require_pyvista
+from taisoft.machine import require
 from taisoft.mesh.obj_off import read_obj, read_off
 from taisoft.mesh.ply import read_ply
 from taisoft.mesh.safe_reading import read_content, run_child
@@ -80,7 +80,7 @@ class SurfaceMesh:
 
     def to_pyvista(self):
         """Return the surface as a pyvista.PolyData. Raises OutputError without pyvista."""
-        return require_pyvista().PolyData.from_regular_faces(self.vertices.copy(), self.triangles)
+        return require("pyvista", "to_pyvista", "pyvista").PolyData.from_regular_faces(self.vertices.copy(), self.triangles)
 
     @property
     def volume(self) -> float:
@@ -164,39 +164,37 @@ def read_surface(path, weld: float = 0.0) -> SurfaceMesh:
     Triangles without area, duplicates and unused vertices are removed; all but the last are reported by a warning. Raises
     MeshError.
     """
-    foreign = _is_foreign(path)
+    surface = as_surface(path, weld)
+    if surface is not path:
+        return surface
     try:
-        file = Path(type(path).__name__ if foreign else path)
+        file = Path(path)
     except TypeError as error:
         raise MeshError(f"read_surface: path must be a file's name or have vertices and faces, not {value_text(path)}") from error
     name, ending = str(file), file.suffix.lower()
-    if ending not in FORMATS and not foreign:
+    if ending not in FORMATS:
         raise MeshError(f"{name}: a surface is read from {', '.join(FORMATS)}, not from {ending or 'a file without ending'}")
-    if isinstance(weld, bool) or not isinstance(weld, Real) or not 0.0 <= weld < np.inf:
-        raise MeshError(f"{name}: weld must be a distance of at least 0 m, not {weld!r}")
-    if foreign:
-        return clean_surface(SurfaceMesh(path.vertices, path.faces, name), float(weld))
     points, polygons = READERS[ending](name, read_content(file))
     # Split each polygon as a fan around its first corner.
     fans = [nodes[:, [0, k, k + 1]] for nodes in polygons for k in range(1, nodes.shape[1] - 1)]
     triangles = np.concatenate([np.empty((0, 3), dtype=np.int64), *fans])
-    return clean_surface(SurfaceMesh(points, triangles, name), float(weld))
+    return clean_surface(SurfaceMesh(points, triangles, name), weld)
 
 
-def as_surface(mesh):
-    """Return a surface of another library as `read_surface` reads it, and anything else as it is. Raises MeshError."""
-    return read_surface(mesh) if _is_foreign(mesh) else mesh
-
-
-def _is_foreign(mesh) -> bool:
-    return hasattr(mesh, "vertices") and hasattr(mesh, "faces")
+def as_surface(mesh, weld: float = 0.0):
+    """Return another library's surface, with vertices and faces, as `read_surface` reads it, anything else as it is."""
+    if not (hasattr(mesh, "vertices") and hasattr(mesh, "faces")):
+        return mesh
+    return clean_surface(SurfaceMesh(mesh.vertices, mesh.faces, type(mesh).__name__), weld)
 
 
 def clean_surface(surface: SurfaceMesh, weld: float) -> SurfaceMesh:
     """Return the surface, welded [m], without degenerate and duplicate triangles; issue its warnings, at the caller's caller."""
     name, points, triangles = surface.source, surface.vertices, surface.triangles
+    if isinstance(weld, bool) or not isinstance(weld, Real) or not 0.0 <= weld < np.inf:
+        raise MeshError(f"{name}: weld must be a distance of at least 0 m, not {weld!r}")
     notes = []
-    labels = merge_labels(points, weld)
+    labels = merge_labels(points, float(weld))
     first = np.unique(labels, return_index=True)[1]
     if len(first) < len(points):
         notes.append(f"{len(points) - len(first)} of {len(points)} vertices were welded to another one")

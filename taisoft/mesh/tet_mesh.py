@@ -12,7 +12,7 @@ import numpy as np
 
 from taisoft.attributes import Guarded, MeshAttributeError
 from taisoft.errors import MeshError, listed
-from taisoft.machine import require_pyvista
+from taisoft.machine import require
 from taisoft.mesh.quality import edge_lengths, mean_ratio
 from taisoft.mesh.regions import checked_names, checked_regions, region_id, region_text
 from taisoft.mesh.topology import Faces, connected_pieces, first_repeated_tet, joint_edges, joint_vertices, merge_labels
@@ -128,13 +128,18 @@ class TetMesh(Guarded):
         Its regions are the cell data "gmsh:physical" ("region" if all are 0), their names field data, as meshio reads them from
         .msh files.
         """
-        from taisoft.mesh.files import to_meshio
+        import meshio
 
-        return to_meshio(self)
+        record = meshio.Mesh(self.vertices.copy(), [("tetra", self.tets.copy())])
+        if self.regions is not None:
+            names = ("gmsh:physical", "gmsh:geometrical") if self.regions.any() else ("region",)
+            record.cell_data = {name: [self.regions.astype(np.int32)] for name in names}
+            record.field_data = {name: np.array([region, 3]) for region, name in self.region_names.items()}
+        return record
 
     def to_pyvista(self):
         """Return the mesh as a pyvista.UnstructuredGrid, regions as cell data "region". Raises OutputError without pyvista."""
-        grid = require_pyvista().UnstructuredGrid({VTK_TETRA: self.tets}, self.vertices.copy())
+        grid = require("pyvista", "to_pyvista", "pyvista").UnstructuredGrid({VTK_TETRA: self.tets}, self.vertices.copy())
         if self.regions is not None:
             grid.cell_data["region"] = self.regions
         return grid

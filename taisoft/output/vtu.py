@@ -34,7 +34,7 @@ import numpy as np
 from taisoft.dynamics.contact_record import nodal_impulses
 from taisoft.errors import OutputError
 from taisoft.files import write_bytes
-from taisoft.machine import require_pyvista
+from taisoft.machine import require
 from taisoft.output.camera import start_positions
 from taisoft.output.nodal_fields import UNKNOWN_ERROR, von_mises
 from taisoft.scene.rigid import RigidBody
@@ -69,11 +69,20 @@ def write_vtu(self: "Simulator", path) -> None:
 
 def to_pyvista(self: "Simulator"):
     """Return the present state as a pyvista.UnstructuredGrid with the data of `write_vtu`. Raises OutputError without pyvista."""
-    return Grid(self.scene).in_pyvista(self)
+    pyvista, grid = require("pyvista", "to_pyvista", "pyvista"), Grid(self.scene)
+    x, points, cells, of_file = grid.state(self)
+    offsets = grid.cells["offsets"]
+    sizes = np.diff(offsets, prepend=0)  # which pyvista reads before the nodes of each cell
+    made = pyvista.UnstructuredGrid(np.insert(grid.cells["connectivity"], offsets - sizes, sizes), grid.cells["types"], x)
+    made.point_data.update(points)
+    made.cell_data.update(grid.cell_data | cells)
+    for name, value in of_file.items():
+        made.field_data[name] = [value]
+    return made
 
 
 class Grid:
-    """The cells of a scene, which are encoded once; `encoded` and `in_pyvista` add a state. scene: read once."""
+    """The cells of a scene, which are encoded once; `encoded` adds a state. scene: read once."""
 
     def __init__(self, scene):
         self._names, self._start = [body.name for body in scene.bodies], start_positions(scene)
@@ -93,36 +102,22 @@ class Grid:
                 region.append(np.broadcast_to(of_region, len(elements)))
             first, n_tet = first + one.n_nodes, n_tet + n_tets
         sizes, self._tet = np.concatenate(sizes), np.concatenate(tet)  # of each cell, -1 for triangles
-        self._cells = {
+        self.cells = {
             "connectivity": np.concatenate(connectivity).astype(np.int64),
             "offsets": np.cumsum(sizes, dtype=np.int64),
             "types": np.array([CELL_TYPES.get(n, 0) for n in range(11)], dtype=np.uint8)[sizes],
         }
-        self._cell_data = {"body": np.concatenate(body).astype(np.int32)}
+        self.cell_data = {"body": np.concatenate(body).astype(np.int32)}
         if any(one.mesh.regions is not None for one in scene.bodies):
-            self._cell_data["region"] = np.concatenate(region).astype(np.int32)
-
-    def in_pyvista(self, sim: "Simulator"):
-        """Return sim's present state as a pyvista.UnstructuredGrid."""
-        x, points, cells, of_file = self._state(sim, errors=False)
-        offsets = self._cells["offsets"]
-        sizes = np.diff(offsets, prepend=0)  # pyvista reads the number of nodes before those of each cell
-        nodes = np.insert(self._cells["connectivity"], offsets - sizes, sizes)
-        grid = require_pyvista().UnstructuredGrid(nodes, self._cells["types"], x)
-        grid.point_data.update(points)
-        grid.cell_data.update(self._cell_data | cells)
-        for name, value in of_file.items():
-            grid.field_data[name] = [value]
-        return grid
+            self.cell_data["region"] = np.concatenate(region).astype(np.int32)
 
     @functools.cached_property
-    def _encoded(self) -> tuple[list[str], list[str]]:
-        """Return the arrays of the cells and of their constant data as text."""
-        cells, data = ([_array(name, values) for name, values in of.items()] for of in (self._cells, self._cell_data))
-        return cells, data
+    def _encoded(self) -> list[list[str]]:
+        """The arrays of the cells, and those of their constant data, as text."""
+        return [[_array(name, values) for name, values in of.items()] for of in (self.cells, self.cell_data)]
 
-    def _state(self, sim: "Simulator", errors: bool) -> tuple[np.ndarray, dict, dict, dict]:
-        """Return positions (n,3) [m], and the data by name of points, cells and file, of sim's present state."""
+    def state(self, sim: "Simulator", errors: bool = False) -> tuple[np.ndarray, dict, dict, dict]:
+        """Return positions (n,3) [m] of sim's present state, and its data of points, cells and file by name. errors: as below."""
         x, sigma = sim.positions(), sim.stress()[self._tet]
         sigma[self._tet < 0] = 0.0
         points = {"displacement": x - self._start, "velocity": sim.velocities()}
@@ -139,7 +134,7 @@ class Grid:
 
     def encoded(self, sim: "Simulator", errors: bool = False) -> bytes:
         """Return the file's bytes for sim's present state. errors: whether it runs with error=True."""
-        x, points, cells, of_file = self._state(sim, errors)
+        x, points, cells, of_file = self.state(sim, errors)
         of_cells, constant = self._encoded
         parts = [
             *("<FieldData>", *(_number(name, value) for name, value in of_file.items()), "</FieldData>"),

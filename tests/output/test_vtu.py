@@ -103,7 +103,9 @@ def test_pyvista_gets_what_is_written(written):
 def test_a_missing_pyvista_is_reported_in_one_sentence(written, monkeypatch):
     monkeypatch.setitem(sys.modules, "pyvista", None)
     for one in (written[0], written[0].scene.bodies[0].mesh):
-        with pytest.raises(OutputError, match="^to_pyvista needs the package pyvista, which is missing: pip install pyvista$"):
+        with pytest.raises(
+            OutputError, match=r"^to_pyvista needs the package pyvista, which .*: pip install 'taisoft\[pyvista\]'$"
+        ):
             one.to_pyvista()
 
 
