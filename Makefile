@@ -11,11 +11,20 @@ READY := $(VENV)/ready
 DOCS_READY := $(VENV)/docs-ready
 DEMO_OUT := out/hanging_beam
 
-.PHONY: demo test test-long figures docs wheel lint clean
+NO_WINDOW := import sys; from taisoft.view.ggui import display_missing, vulkan_missing; m = display_missing() or vulkan_missing(); \
+  sys.exit(f'No window here, since {m}; make demo writes pictures instead.' if m else 0)
+
+.PHONY: demo window test test-long figures docs wheel lint clean
 
 demo: $(READY)
 	$(BIN)/taisoft run hanging_beam --headless --out $(DEMO_OUT) --overwrite
 	@echo "Written to $(DEMO_OUT): report.json (what happened), steps.csv (every step), frames/ (pictures), scene.usdc (USD)."
+
+# A sheet falls on a box in the live window. The first time, kernels are compiled before: with a window it would take twice as long.
+window: $(READY)
+	@$(BIN)/python -c "$(NO_WINDOW)"
+	@[ -f $(VENV)/window-ready ] || { $(BIN)/taisoft run sheet_on_box --headless --seconds 0.3 && touch $(VENV)/window-ready; }
+	$(BIN)/taisoft run sheet_on_box
 
 # One thread for the dense algebra of each worker: more only spin on cores that the others need.
 test test-long: export OPENBLAS_NUM_THREADS := 1
@@ -34,17 +43,19 @@ figures: $(READY)
 # Runs every example of the manual, then builds it, which runs its notebooks; any warning is an error.
 docs: $(DOCS_READY)
 	$(BIN)/python -m pytest -q -n auto --maxprocesses 8 --dist loadfile -p no:cacheprovider -p no:warnings docs
-	$(BIN)/sphinx-build -q -n -W --keep-going docs out/docs
+	$(BIN)/sphinx-build -q -n -W --keep-going -d out/doctrees docs out/docs
 	@echo "Written to out/docs: open out/docs/index.html."
 
-# Builds the wheel, installs it in an environment of its own, and runs a demo from there.
+# Builds the sdist, and the wheel from it, checks both, installs the wheel in an environment of its own, and runs a demo from there.
 wheel: $(READY)
 	rm -rf out/wheel
-	$(BIN)/python -m pip wheel --quiet --disable-pip-version-check --no-deps --wheel-dir out/wheel .
+	@[ -f out/docs/index.html ] || echo "The wheel will lack the manual: make docs builds it."
+	$(BIN)/python -m build --outdir out/wheel . >/dev/null
+	$(BIN)/twine check --strict out/wheel/taisoft-*
 	$(BIN)/python -m venv out/wheel/venv
 	out/wheel/venv/bin/python -m pip install --quiet --disable-pip-version-check out/wheel/*.whl
 	cd out/wheel && venv/bin/taisoft run hanging_beam --headless --seconds 0.1 --out run && venv/bin/taisoft doctor
-	@echo "Written to out/wheel: the wheel, which installs and runs."
+	@echo "Written to out/wheel: sdist and wheel, which installs and runs."
 
 lint: $(READY)
 	$(BIN)/ruff check .

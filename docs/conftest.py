@@ -35,6 +35,7 @@ def run_shell(example) -> None:
 
 def check_commands(block: str) -> None:
     for line in block.splitlines():
+        line = line.removeprefix(".venv/bin/")
         if line.startswith("taisoft "):
             command_parser().parse_args(shlex.split(line, comments=True)[1:])
 

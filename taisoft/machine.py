@@ -10,10 +10,12 @@ import time
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass
-from importlib import metadata
+from importlib import import_module, metadata
 from pathlib import Path
 
 import numpy as np
+
+from taisoft.errors import OutputError
 
 
 @dataclass(frozen=True)
@@ -129,3 +131,11 @@ def _container_available(root: Path = Path("/sys/fs/cgroup")) -> list[int]:
 def format_bytes(n_bytes: int | None) -> str:
     """Format a number of bytes for a message, such as "2000000000 bytes (2.00 GB)"."""
     return "unknown" if n_bytes is None else f"{n_bytes} bytes ({n_bytes / 1e9:.2f} GB)"
+
+
+def require(package: str, what: str, extra: str):
+    """Return an optional package. what: what needs it. extra: brings it. Raises OutputError if it is missing."""
+    try:
+        return import_module(package)
+    except ImportError:
+        raise OutputError(f"{what} needs the package {package}, which is missing: pip install 'taisoft[{extra}]'") from None

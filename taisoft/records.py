@@ -1,6 +1,6 @@
 """Reports of steps and runs: plain records, without Taichi."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 
 from taisoft.display import PROBLEMS_SHOWN, percent, run_html
 
@@ -48,6 +48,10 @@ class StepReport:
     loads: float = 0.0  #: of dead loads, -sum f.x [J]
     converged: bool = True  #: residuals are within their tolerances
     problems: list[str] = field(default_factory=list)  #: sentences
+
+    def to_dict(self) -> dict:
+        """Return a row of steps.csv: the fields by name, problems joined with '; '."""
+        return {f.name: getattr(self, f.name) for f in fields(self)} | {"problems": "; ".join(self.problems)}
 
     def __repr__(self) -> str:
         counts = {"Newton iterations": self.newton_iterations, "substeps": self.substeps - 1 and self.substeps}
@@ -119,6 +123,10 @@ class RunReport:
     dt_requested: float | None = None  #: that the simulator had, where the run changed it to fit the frames [s]
     pilot_seconds: float = 0.0  #: wall time of the pilots of a run with a tolerance, without compile time [s]
     error_estimate: ErrorEstimate | None = None  #: of a run with error=True or a tolerance
+
+    def to_dicts(self) -> list[dict]:
+        """Return the rows of steps.csv, which pandas.DataFrame takes."""
+        return [report.to_dict() for report in self.step_reports]
 
     def __repr__(self) -> str:
         """One line, and the first problems."""

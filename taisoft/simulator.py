@@ -12,7 +12,7 @@ from taisoft.dynamics.dynamics import Dynamics
 from taisoft.errors import SceneError, SimulationError, no_memory
 from taisoft.estimation.first_choice import settings_for
 from taisoft.fem.laws import LAWS
-from taisoft.output.vtu import write_vtu
+from taisoft.output.vtu import to_pyvista, write_vtu
 from taisoft.records import StepReport
 from taisoft.scene.scene import Scene
 from taisoft.settings import NAMES, Settings, check_count, check_settings, plan_of
@@ -241,6 +241,7 @@ class Simulator(Guarded):
     load_checkpoint = classmethod(checkpoint.load_checkpoint)
     from_checkpoint = classmethod(checkpoint.from_checkpoint)
     write_vtu = write_vtu
+    to_pyvista = to_pyvista
 
     def close(self) -> None:
         """Release memory and runtime; a closed simulator cannot be used."""

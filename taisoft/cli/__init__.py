@@ -167,6 +167,10 @@ def command_parser() -> argparse.ArgumentParser:
     option("--weld", type=float, default=0.0, metavar="D", help="merge vertices at most this far apart, in the file's unit")
     option("--overwrite", action="store_true", help="replace MESH if it exists")
 
+    option = add("docs", ("scene_file", "docs"), "open the manual in a browser, and print where it is").add_argument
+    option("page", metavar="PAGE", nargs="?", default="index", help="such as quickstart, contacts or tutorials/drop")
+    option("--path", action="store_true", help="only print the path")
+
     add("doctor", ("doctor", "doctor"), "report what this machine offers, and how to get what is missing")
 
     option = add(

@@ -1,4 +1,4 @@
-"""Find and load demos, benchmarks and a user's own .toml and .py files; `taisoft list` and `taisoft bench`.
+"""Find and load demos, benchmarks and a user's own .toml and .py files; `taisoft list`, `bench` and `docs`.
 
 A checkout has demos/ and benchmarks/ beside the package; an installed wheel has them inside it. A .py file is executed as
 Python: only run files you trust. A .toml file is data.
@@ -11,6 +11,7 @@ import importlib.util
 import inspect
 import sys
 import traceback
+import webbrowser
 from argparse import Namespace
 from pathlib import Path
 from types import ModuleType
@@ -71,6 +72,31 @@ def bench(arguments: Namespace) -> int:
         hint = nearest(arguments.name, benchmarks)
         raise SceneError(f"no benchmark is called {arguments.name!r}{hint}; there are {', '.join(benchmarks) or 'none'}")
     return load_shipped("benchmarks", arguments.name).main(arguments.rest) or 0
+
+
+def docs(arguments: Namespace) -> int:
+    """Print the path of a page of the manual, and open it where there is a browser. Raises SceneError without it."""
+    folder = shipped_folder("out/docs")  # by `make docs`
+    pages = (
+        {} if folder is None else {path.relative_to(folder).with_suffix("").as_posix(): path for path in folder.rglob("*.html")}
+    )
+    if not pages:
+        in_checkout = (PACKAGE.parent / "docs" / "conf.py").is_file()
+        state = (
+            "is not built yet: `make docs` builds it"
+            if in_checkout
+            else "is not in this installation, which was built without it"
+        )
+        raise SceneError(f"the manual {state}; its pages are in docs/ of the sources, as Markdown")
+    page = pages.get(arguments.page.removesuffix(".html").removesuffix(".md"))
+    if page is None:
+        raise SceneError(
+            f"the manual has no page {arguments.page!r}{nearest(arguments.page, pages)}; `taisoft docs` opens its index"
+        )
+    print(page)
+    if not arguments.path:
+        webbrowser.open(page.as_uri())
+    return 0
 
 
 def _print_table(files: dict[str, Path]) -> None:

@@ -139,7 +139,7 @@ class AnalyticFrames:
         self._frames = np.zeros((2, len(obstacles), 4, 3))  # each an origin (3,) [m] and a rotation (3,3) by rows
 
     def place(self, rows: Iterable[int], time: float, dt: float) -> None:
-        """Update the frames of the obstacles in these rows to a time [s] and to the end of the step; upload all if there are any."""
+        """Update the frames of the obstacles in these rows, if any, to a time [s] and to the end of the step, and upload them."""
         for row in (rows := list(rows)):
             for frame, t in zip(self._frames[:, row], (time, time + dt)):
                 frame[0], frame[1:] = obstacle_frame(self._obstacles[row][1], t)

@@ -83,6 +83,16 @@ class Contacts:
     def __len__(self) -> int:
         return len(self.gap)
 
+    def to_dict(self) -> dict[str, np.ndarray]:
+        """Return the columns of a table with a row for each contact, which pandas.DataFrame takes.
+
+        A vector has three, such as point_x, point_y and point_z, and feature two; nodes and weights are left out.
+        """
+        columns = {name: values for name, values in vars(self).items() if np.ndim(values) == 1}
+        for name, axes in {"point": "xyz", "normal": "xyz", "impulse": "xyz", "feature": "01"}.items():
+            columns |= {f"{name}_{axis}": column for axis, column in zip(axes, getattr(self, name).T)}
+        return columns
+
 
 def no_contacts() -> Contacts:
     """Return an empty record."""

@@ -27,7 +27,7 @@ from taisoft.mesh.medit import REFERENCE, read_medit
 from taisoft.mesh.nastran import read_nastran
 from taisoft.mesh.quality import edge_lengths
 from taisoft.mesh.regions import LARGEST_ID, usable_names
-from taisoft.mesh.safe_reading import Blocks, FileContent, read_by_meshio, read_content
+from taisoft.mesh.safe_reading import Blocks, FileContent, content_of, read_by_meshio, read_content
 from taisoft.mesh.surface_mesh import READERS as SURFACE_READERS
 from taisoft.mesh.tet_mesh import LARGEST_COORDINATE, TetMesh
 from taisoft.mesh.tetgen import read_tetgen
@@ -80,11 +80,14 @@ def read_mesh(path, fix_orientation: bool = False, weld: float | None = None, re
         content = read_tetgen(file)
     elif ending in READERS:
         content = READERS[ending](name, data)
-    content = content or _read_by_meshio(file, data)
-    blocks, notes = _tet_blocks(name, content.cells)
-    ids, names, region_notes = _regions(name, content, regions)
-    labels = {"regions": ids, "region_names": names}
-    return _clean_mesh(name, content.points, blocks, content.notes + notes + region_notes, fix_orientation, weld, labels)
+    return _clean_mesh(name, content or _read_by_meshio(file, data), fix_orientation, weld, regions)
+
+
+def from_meshio(mesh, *options) -> TetMesh:
+    """Return the tets of a meshio.Mesh, as `TetMesh.from_meshio`. options: its other arguments. Raises MeshError."""
+    if not isinstance(mesh, meshio.Mesh):
+        raise MeshError(f"from_meshio needs a meshio.Mesh, not {type(mesh).__name__}")
+    return _clean_mesh("meshio.Mesh", content_of(mesh), *options)
 
 
 def write_mesh(path, mesh: TetMesh, regions: bool = True) -> None:
@@ -98,10 +101,10 @@ def write_mesh(path, mesh: TetMesh, regions: bool = True) -> None:
     ending = check_ending(file)
     if not isinstance(mesh, TetMesh):
         raise MeshError(f"{file}: write_mesh needs a TetMesh, not {type(mesh).__name__}")
-    record = meshio.Mesh(mesh.vertices, [("tetra", mesh.tets)])
+    record = mesh.to_meshio() if regions else meshio.Mesh(mesh.vertices, [("tetra", mesh.tets)])
     options = {"file_format": WRITERS[ending]} | ({"binary": False} if ending == ".msh" else {})
-    if regions and mesh.regions is not None:
-        options |= _add_regions(file, record, mesh)
+    if record.cell_data:
+        options |= _region_options(file, record, mesh)
     elif ending == ".mesh":
         record.cell_data[REFERENCE] = [np.zeros(mesh.n_tets, dtype=np.int32)]  # meshio would write 1
     with replacing(file) as part:
@@ -109,21 +112,19 @@ def write_mesh(path, mesh: TetMesh, regions: bool = True) -> None:
             meshio.write(part, record, **options)
 
 
-def _add_regions(file: Path, record: meshio.Mesh, mesh: TetMesh) -> dict:
-    """Add a mesh's regions to meshio's record of it; return options of the writer."""
+def _region_options(file: Path, record: meshio.Mesh, mesh: TetMesh) -> dict:
+    """Give the regions in meshio's record of a mesh the name of the format; return options of the writer."""
     ending = file.suffix.lower()
     name = {".msh": PHYSICAL, ".mesh": REFERENCE}.get(ending, REGION)
     if name in NONE_IF_ZERO and not mesh.regions.any():
         raise MeshError(
             f"{file}: a mesh whose only region is 0 cannot be written, since in {ending} 0 means none: use another number"
         )
-    record.cell_data[name] = [mesh.regions.astype(np.int32)]
     if ending != ".msh":
+        record.cell_data = {name: [mesh.regions.astype(np.int32)]}
         if mesh.region_names:
             warnings.warn(f"{file}: {ending} cannot hold the names of regions, only their numbers", UserWarning, stacklevel=3)
         return {}
-    record.cell_data["gmsh:geometrical"] = record.cell_data[name]
-    record.field_data = {text: np.array([region, 3]) for region, text in mesh.region_names.items()}
     return {"file_format": "gmsh22"}  # 4.1 would need a block of elements for each region, in another order
 
 
@@ -163,7 +164,8 @@ def _regions(name: str, content: FileContent, requested: str | None) -> tuple[np
     ids = values.astype(np.int64)
     if key in NONE_IF_ZERO and not ids.any() and requested is None:
         return None, {}, []
-    return ids, *usable_names(content.region_names if key == PHYSICAL else {}, np.unique(ids).tolist())
+    are_named = key == PHYSICAL or PHYSICAL not in content.cell_data
+    return ids, *usable_names(content.region_names if are_named else {}, np.unique(ids).tolist())
 
 
 def _read_by_meshio(file: Path, data: bytes) -> FileContent:
@@ -202,8 +204,14 @@ def _format_counts(counts: dict[str, int]) -> str:
     return ", ".join(f"{n} {kind if n == 1 else _PLURALS.get(kind, f'{kind} elements')}" for kind, n in counts.items())
 
 
-def _clean_mesh(name, points, blocks, notes, fix_orientation, weld, labels) -> TetMesh:
-    """Return the TetMesh of the corners, unused vertices removed, the rest welded. TetMesh itself refuses invalid arrays."""
+def _clean_mesh(name: str, content: FileContent, fix_orientation: bool, weld, regions: str | None) -> TetMesh:
+    """Return the TetMesh of the corners, unused vertices removed, the rest welded. TetMesh itself refuses invalid arrays.
+
+    regions: name of cell data, as for `read_mesh`.
+    """
+    blocks, notes = _tet_blocks(name, content.cells)
+    ids, names, region_notes = _regions(name, content, regions)
+    points, notes, labels = content.points, content.notes + notes + region_notes, {"regions": ids, "region_names": names}
     tets = np.concatenate([nodes[..., :4] for nodes in blocks])
     valid = (
         points.ndim == 2

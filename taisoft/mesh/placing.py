@@ -9,7 +9,7 @@ import warnings
 import numpy as np
 
 from taisoft.errors import MeshError, value_text
-from taisoft.mesh.surface_mesh import SurfaceMesh
+from taisoft.mesh.surface_mesh import SurfaceMesh, as_surface
 from taisoft.mesh.tet_mesh import TetMesh
 
 TO_Y_UP = {  # up axis -> rotation (3,3) that turns it to y by 90 degrees about another axis
@@ -29,6 +29,7 @@ def place(mesh: TetMesh | SurfaceMesh, up: str = "y", scale: float = 1.0, rotate
     rotate: (3,) angles [deg] about x, then y, then z, through the origin. at: (3,) [m], where the middle of the bounding box's
     underside goes; None: the mesh stays. Raises MeshError.
     """
+    mesh = as_surface(mesh)
     if not isinstance(mesh, (TetMesh, SurfaceMesh)):
         raise MeshError(f"place needs a TetMesh or a SurfaceMesh, not {type(mesh).__name__}")
     vertices = mesh.vertices @ placement(up, scale, rotate, to).T

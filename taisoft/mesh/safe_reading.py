@@ -105,6 +105,20 @@ def read_by_meshio(file: Path, data: bytes) -> FileContent:
     return FileContent(found["points"], cells, cell_data, names, found["notes"].tolist())
 
 
+def content_of(mesh) -> FileContent:
+    """Return what a meshio.Mesh holds, with its cell data that are numbers, and the names of its groups of solids."""
+    rows = [
+        one.data if isinstance(one.data, np.ndarray) else np.empty((len(one.data), 0), int) for one in mesh.cells
+    ]  # polyhedra
+    cells = [(one.type, nodes) for one, nodes in zip(mesh.cells, rows)]
+    of_cells = {name: list(map(np.asarray, of_blocks)) for name, of_blocks in mesh.cell_data.items()}
+    numbers = {name: of for name, of in of_cells.items() if all(one.ndim == 1 and one.dtype.kind in "iuf" for one in of)}
+    fields = {name: np.asarray(value) for name, value in mesh.field_data.items()}  # of any kind, such as a time
+    pairs = {name: value for name, value in fields.items() if value.shape == (2,) and value.dtype.kind in "iu"}
+    names = {int(tag): name for name, (tag, dim) in pairs.items() if dim == 3}
+    return FileContent(np.asarray(mesh.points), cells, numbers, names)
+
+
 def run_child(folder: str, task: str, *arguments: str, seconds: float | None = None) -> dict[str, np.ndarray]:
     """Run a task of `main` in a child process inside a folder; return the arrays that it writes to result.npz there.
 
@@ -172,14 +186,11 @@ def _read(path: str, seconds: str) -> dict[str, np.ndarray]:
     try:
         with np.errstate(all="ignore"):
             mesh = _first_fitting(path, data)
-            arrays = [np.asarray(mesh.points), *(np.asarray(block.data) for block in mesh.cells)]
-            data_of_cells = {name: list(map(np.asarray, of_blocks)) for name, of_blocks in mesh.cell_data.items()}
-            fields = {name: np.asarray(value) for name, value in mesh.field_data.items()}  # of any kind, such as a time
-            pairs = {name: value for name, value in fields.items() if value.shape == (2,) and value.dtype.kind in "iu"}
-            names = {int(tag): name for name, (tag, dim) in pairs.items() if dim == 3}
+            content = content_of(mesh)
+        arrays = [content.points, *(nodes for _, nodes in content.cells)]
         if any(array.dtype.hasobject for array in arrays):
             raise meshio.ReadError("rows of different lengths")
-        of_cells = [one for of_blocks in data_of_cells.values() for one in of_blocks]
+        of_cells = [np.asarray(one) for of_blocks in mesh.cell_data.values() for one in of_blocks]
         if sum(array.size for array in (*arrays, *of_cells)) > MAX_ENTRIES_PER_BYTE * len(data):
             raise MemoryError
     except ImportError as error:
@@ -192,8 +203,8 @@ def _read(path: str, seconds: str) -> dict[str, np.ndarray]:
         sys.exit(_place(error, data) + text)
     if skipped := next((text for text in printed if "cannot handle" in text), None):
         sys.exit(f"cells of {skipped[skipped.rfind('(') + 1 :].rstrip(').')} of VTK are not known here")
-    numbers = {name: of for name, of in data_of_cells.items() if all(one.ndim == 1 and one.dtype.kind in "iuf" for one in of)}
-    texts = {"kinds": [block.type for block in mesh.cells], "data": list(numbers), "region_names": list(names.values())}
+    numbers, names = content.cell_data, content.region_names
+    texts = {"kinds": [kind for kind, _ in content.cells], "data": list(numbers), "region_names": list(names.values())}
     texts["notes"] = [_without_content(text, data.lower()) for text in printed]
     found = {"points": arrays[0], "region_ids": np.array(list(names), dtype=np.int64)}
     found |= {name: np.array(values, dtype=str) for name, values in texts.items()}

@@ -15,7 +15,8 @@ from pathlib import Path
 import numpy as np
 
 from taisoft.attributes import MeshAttributeError, guarded_record
-from taisoft.errors import MeshError, one_line
+from taisoft.errors import MeshError, one_line, value_text
+from taisoft.machine import require
 from taisoft.mesh.obj_off import read_obj, read_off
 from taisoft.mesh.ply import read_ply
 from taisoft.mesh.safe_reading import read_content, run_child
@@ -76,6 +77,10 @@ class SurfaceMesh:
 
     def __repr__(self) -> str:
         return f"SurfaceMesh({len(self.vertices)} vertices, {len(self.triangles)} triangles)"
+
+    def to_pyvista(self):
+        """Return the surface as a pyvista.PolyData. Raises OutputError without pyvista."""
+        return require("pyvista", "to_pyvista", "pyvista").PolyData.from_regular_faces(self.vertices.copy(), self.triangles)
 
     @property
     def volume(self) -> float:
@@ -154,31 +159,42 @@ def _edge_text(edges: np.ndarray) -> str:
 def read_surface(path, weld: float = 0.0) -> SurfaceMesh:
     """Read triangles from an .obj, .stl, .ply or .off file; polygons are split into triangles.
 
-    weld: merge vertices at most this far apart [m]; 0 merges only equal ones (files with texture or normals per corner repeat
-    vertices). Triangles without area, duplicates and unused vertices are removed; all but the last are reported by a
-    warning. Raises MeshError.
+    path: the file, or another library's surface with `vertices` (n,3) and `faces` (t,3), such as a trimesh.Trimesh. weld: merge
+    vertices at most this far apart [m]; 0 merges only equal ones (files with texture or normals per corner repeat vertices).
+    Triangles without area, duplicates and unused vertices are removed; all but the last are reported by a warning. Raises
+    MeshError.
     """
+    surface = as_surface(path, weld)
+    if surface is not path:
+        return surface
     try:
         file = Path(path)
     except TypeError as error:
-        raise MeshError(f"read_surface: path must be a file's name, not {path!r}") from error
+        raise MeshError(f"read_surface: path must be a file's name or have vertices and faces, not {value_text(path)}") from error
     name, ending = str(file), file.suffix.lower()
     if ending not in FORMATS:
         raise MeshError(f"{name}: a surface is read from {', '.join(FORMATS)}, not from {ending or 'a file without ending'}")
-    if isinstance(weld, bool) or not isinstance(weld, Real) or not 0.0 <= weld < np.inf:
-        raise MeshError(f"{name}: weld must be a distance of at least 0 m, not {weld!r}")
     points, polygons = READERS[ending](name, read_content(file))
     # Split each polygon as a fan around its first corner.
     fans = [nodes[:, [0, k, k + 1]] for nodes in polygons for k in range(1, nodes.shape[1] - 1)]
     triangles = np.concatenate([np.empty((0, 3), dtype=np.int64), *fans])
-    return clean_surface(SurfaceMesh(points, triangles, name), float(weld))
+    return clean_surface(SurfaceMesh(points, triangles, name), weld)
+
+
+def as_surface(mesh, weld: float = 0.0):
+    """Return another library's surface, with vertices and faces, as `read_surface` reads it, anything else as it is."""
+    if not (hasattr(mesh, "vertices") and hasattr(mesh, "faces")):
+        return mesh
+    return clean_surface(SurfaceMesh(mesh.vertices, mesh.faces, type(mesh).__name__), weld)
 
 
 def clean_surface(surface: SurfaceMesh, weld: float) -> SurfaceMesh:
     """Return the surface, welded [m], without degenerate and duplicate triangles; issue its warnings, at the caller's caller."""
     name, points, triangles = surface.source, surface.vertices, surface.triangles
+    if isinstance(weld, bool) or not isinstance(weld, Real) or not 0.0 <= weld < np.inf:
+        raise MeshError(f"{name}: weld must be a distance of at least 0 m, not {weld!r}")
     notes = []
-    labels = merge_labels(points, weld)
+    labels = merge_labels(points, float(weld))
     first = np.unique(labels, return_index=True)[1]
     if len(first) < len(points):
         notes.append(f"{len(points) - len(first)} of {len(points)} vertices were welded to another one")
@@ -208,6 +224,7 @@ def tetrahedralize(surface: SurfaceMesh, edge_length: float | None = None, envel
     faults, and of the volume with holes closed. Raises MeshError if the extra `mesh` is missing, nothing is enclosed, or the
     mesher fails.
     """
+    surface = as_surface(surface)
     if not isinstance(surface, SurfaceMesh):
         raise MeshError(f"tetrahedralize needs a SurfaceMesh (see read_surface), not {type(surface).__name__}")
     name, diagonal = surface.source, float(np.linalg.norm(np.ptp(surface.vertices, axis=0)))

@@ -12,6 +12,7 @@ import numpy as np
 
 from taisoft.attributes import Guarded, MeshAttributeError
 from taisoft.errors import MeshError, listed
+from taisoft.machine import require
 from taisoft.mesh.quality import edge_lengths, mean_ratio
 from taisoft.mesh.regions import checked_names, checked_regions, region_id, region_text
 from taisoft.mesh.topology import Faces, connected_pieces, first_repeated_tet, joint_edges, joint_vertices, merge_labels
@@ -20,6 +21,7 @@ DEGENERATE = 1e-9  # a tet has no volume if it is below this times its longest e
 NEARLY_FLAT = 0.02  # mean ratio below which a tet causes a warning; grids and common meshers stay above
 LARGEST_COORDINATE = float(np.finfo(np.float32).max)  # [m], since forces may be computed in 32 bits
 MAX_OFFSET_RATIO = 1e5  # distance from the origin over size above which a warning is issued
+VTK_TETRA = 10  # VTK's number of the cell type
 COINCIDENT = 1e-9  # vertices closer than this times the mesh's diagonal are coincident
 
 
@@ -112,6 +114,35 @@ class TetMesh(Guarded):
     def __repr__(self) -> str:
         regions = f", {len(self.region_ids)} regions" if self.regions is not None else ""
         return f"TetMesh({self.n_verts} vertices, {self.n_tets} tets, {len(self.surface)} surface triangles{regions})"
+
+    @staticmethod
+    def from_meshio(mesh, fix_orientation: bool = False, weld: float | None = None, regions: str | None = None) -> "TetMesh":
+        """Return the tets of a meshio.Mesh. Arguments, checks and warnings are those of `read_mesh`. Raises MeshError."""
+        from taisoft.mesh.files import from_meshio
+
+        return from_meshio(mesh, fix_orientation, weld, regions)
+
+    def to_meshio(self):
+        """Return the mesh as a meshio.Mesh, from which `from_meshio` makes an equal one.
+
+        Its regions are the cell data "gmsh:physical" ("region" if all are 0), their names field data, as meshio reads them from
+        .msh files.
+        """
+        import meshio
+
+        record = meshio.Mesh(self.vertices.copy(), [("tetra", self.tets.copy())])
+        if self.regions is not None:
+            names = ("gmsh:physical", "gmsh:geometrical") if self.regions.any() else ("region",)
+            record.cell_data = {name: [self.regions.astype(np.int32)] for name in names}
+            record.field_data = {name: np.array([region, 3]) for region, name in self.region_names.items()}
+        return record
+
+    def to_pyvista(self):
+        """Return the mesh as a pyvista.UnstructuredGrid, regions as cell data "region". Raises OutputError without pyvista."""
+        grid = require("pyvista", "to_pyvista", "pyvista").UnstructuredGrid({VTK_TETRA: self.tets}, self.vertices.copy())
+        if self.regions is not None:
+            grid.cell_data["region"] = self.regions
+        return grid
 
     def _warn_distance(self) -> None:
         """Warn of a mesh far from the origin: its positions lose some of their 16 digits to the distance."""

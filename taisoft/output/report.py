@@ -90,8 +90,7 @@ def steps_csv(reports: list[StepReport], earlier: list[list[str]]) -> str:
     text = io.StringIO(newline="")
     writer = csv.writer(text)
     writer.writerows([COLUMNS, *earlier])
-    for report in reports:
-        writer.writerow([getattr(report, name) if name != "problems" else "; ".join(report.problems) for name in COLUMNS])
+    writer.writerows(report.to_dict().values() for report in reports)
     return text.getvalue()
 
 

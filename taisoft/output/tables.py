@@ -4,9 +4,8 @@ import io
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-from taisoft.errors import OutputError
 from taisoft.files import write_bytes
-from taisoft.machine import Timing
+from taisoft.machine import Timing, require
 
 
 def markdown(headings: Sequence[str], rows: Iterable[Sequence[str]], left: Sequence[int] = ()) -> str:
@@ -34,10 +33,7 @@ def spread_of(timing: Timing) -> float | None:
 
 def require_matplotlib(what: str = "--plot"):
     """Return the matplotlib module. what: the feature that needs it. Raises OutputError if it is missing."""
-    try:
-        import matplotlib
-    except ImportError:
-        raise OutputError(f"{what} needs the package matplotlib, which is missing: pip install 'taisoft[plot]'") from None
+    matplotlib = require("matplotlib", what, "plot")
     matplotlib.use("Agg")
     return matplotlib
 

@@ -23,6 +23,7 @@ meshio writes such files too, but without data of the file, so without the time.
 
 import base64
 import dataclasses
+import functools
 import zlib
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -33,6 +34,7 @@ import numpy as np
 from taisoft.dynamics.contact_record import nodal_impulses
 from taisoft.errors import OutputError
 from taisoft.files import write_bytes
+from taisoft.machine import require
 from taisoft.output.camera import start_positions
 from taisoft.output.nodal_fields import UNKNOWN_ERROR, von_mises
 from taisoft.scene.rigid import RigidBody
@@ -65,6 +67,20 @@ def write_vtu(self: "Simulator", path) -> None:
     write_bytes(file, Grid(self.scene).encoded(self))
 
 
+def to_pyvista(self: "Simulator"):
+    """Return the present state as a pyvista.UnstructuredGrid with the data of `write_vtu`. Raises OutputError without pyvista."""
+    pyvista, grid = require("pyvista", "to_pyvista", "pyvista"), Grid(self.scene)
+    x, points, cells, of_file = grid.state(self)
+    offsets = grid.cells["offsets"]
+    sizes = np.diff(offsets, prepend=0)  # which pyvista reads before the nodes of each cell
+    made = pyvista.UnstructuredGrid(np.insert(grid.cells["connectivity"], offsets - sizes, sizes), grid.cells["types"], x)
+    made.point_data.update(points)
+    made.cell_data.update(grid.cell_data | cells)
+    for name, value in of_file.items():
+        made.field_data[name] = [value]
+    return made
+
+
 class Grid:
     """The cells of a scene, which are encoded once; `encoded` adds a state. scene: read once."""
 
@@ -86,18 +102,22 @@ class Grid:
                 region.append(np.broadcast_to(of_region, len(elements)))
             first, n_tet = first + one.n_nodes, n_tet + n_tets
         sizes, self._tet = np.concatenate(sizes), np.concatenate(tet)  # of each cell, -1 for triangles
-        cells = {
+        self.cells = {
             "connectivity": np.concatenate(connectivity).astype(np.int64),
             "offsets": np.cumsum(sizes, dtype=np.int64),
             "types": np.array([CELL_TYPES.get(n, 0) for n in range(11)], dtype=np.uint8)[sizes],
         }
-        self._cells = [_array(name, values) for name, values in cells.items()]
-        self._cell_data = [_array("body", np.concatenate(body).astype(np.int32))]
+        self.cell_data = {"body": np.concatenate(body).astype(np.int32)}
         if any(one.mesh.regions is not None for one in scene.bodies):
-            self._cell_data.append(_array("region", np.concatenate(region).astype(np.int32)))
+            self.cell_data["region"] = np.concatenate(region).astype(np.int32)
 
-    def encoded(self, sim: "Simulator", errors: bool = False) -> bytes:
-        """Return the file's bytes for sim's present state. errors: whether it runs with error=True."""
+    @functools.cached_property
+    def _encoded(self) -> list[list[str]]:
+        """The arrays of the cells, and those of their constant data, as text."""
+        return [[_array(name, values) for name, values in of.items()] for of in (self.cells, self.cell_data)]
+
+    def state(self, sim: "Simulator", errors: bool = False) -> tuple[np.ndarray, dict, dict, dict]:
+        """Return positions (n,3) [m] of sim's present state, and its data of points, cells and file by name. errors: as below."""
         x, sigma = sim.positions(), sim.stress()[self._tet]
         sigma[self._tet < 0] = 0.0
         points = {"displacement": x - self._start, "velocity": sim.velocities()}
@@ -109,14 +129,21 @@ class Grid:
             cells = {"stress": sigma[:, SYMMETRIC[0], SYMMETRIC[1]], "von_mises": von_mises(sigma)}
         of_file = {"TimeValue": sim.time} | dataclasses.asdict(sim.energies())
         of_file |= {f"body {name}": k for k, name in enumerate(self._names)}
+        points, cells = ({name: values.astype(np.float32) for name, values in of.items()} for of in (points, cells))
+        return x, points, cells, of_file
+
+    def encoded(self, sim: "Simulator", errors: bool = False) -> bytes:
+        """Return the file's bytes for sim's present state. errors: whether it runs with error=True."""
+        x, points, cells, of_file = self.state(sim, errors)
+        of_cells, constant = self._encoded
         parts = [
             *("<FieldData>", *(_number(name, value) for name, value in of_file.items()), "</FieldData>"),
-            f'<Piece NumberOfPoints="{len(x)}" NumberOfCells="{len(sigma)}">',
+            f'<Piece NumberOfPoints="{len(x)}" NumberOfCells="{len(self._tet)}">',
             *("<Points>", _array("Points", x), "</Points>"),
-            *("<Cells>", *self._cells, "</Cells>"),
-            *("<PointData>", *(_array(name, values.astype(np.float32)) for name, values in points.items()), "</PointData>"),
-            *("<CellData>", *self._cell_data, *(_array(name, values.astype(np.float32)) for name, values in cells.items())),
-            *("</CellData>", "</Piece>"),
+            *("<Cells>", *of_cells, "</Cells>"),
+            *("<PointData>", *(_array(name, values) for name, values in points.items()), "</PointData>"),
+            *("<CellData>", *constant, *(_array(name, values) for name, values in cells.items()), "</CellData>"),
+            "</Piece>",
         ]
         return vtk_file("UnstructuredGrid", parts, 'header_type="UInt64" compressor="vtkZLibDataCompressor"')
 

@@ -19,7 +19,7 @@ from taisoft.attributes import thawed
 from taisoft.errors import SceneError
 from taisoft.mesh import nodes as mesh_nodes
 from taisoft.mesh.solids import are_inside, distances
-from taisoft.mesh.surface_mesh import SurfaceMesh
+from taisoft.mesh.surface_mesh import SurfaceMesh, as_surface
 from taisoft.mesh.tet_mesh import TetMesh
 from taisoft.scene import checks
 from taisoft.scene.body import Body, Constraint
@@ -67,7 +67,8 @@ class RigidBody(Body):
     ):
         """The arguments of `Scene.add_rigid_body`."""
         what = f"rigid body {name!r}"
-        self.shape, self.surface = mesh, checked_surface(mesh, what)
+        self.shape = as_surface(mesh)
+        self.surface = checked_surface(self.shape, what)
         self._density = checks.number(density, f"{what}: density", above=0.0, unit="kg/m^3")
         volume, self.centre, covariance = volume_moments(self.surface.vertices, self.surface.triangles)
         deviations, axes = np.linalg.eigh(covariance)

@@ -12,7 +12,7 @@ import scipy.sparse as sp
 from taisoft.attributes import guarded_record, thawed
 from taisoft.errors import SceneError
 from taisoft.mesh import nodes as mesh_nodes
-from taisoft.mesh.surface_mesh import SurfaceMesh
+from taisoft.mesh.surface_mesh import SurfaceMesh, as_surface
 from taisoft.scene import checks
 from taisoft.scene.locate import locate, weight_matrix
 
@@ -41,6 +41,7 @@ def embed(self: "Body", surface: SurfaceMesh, contact: bool = False) -> Skin:
     """
     self._check_open("embed")
     what = f"{self._label()}: embed"
+    surface = as_surface(surface)
     if not isinstance(surface, SurfaceMesh):
         raise SceneError(f"{what}: surface must be a SurfaceMesh (see ts.read_surface), not {type(surface).__name__}")
     if self.skin is not None:

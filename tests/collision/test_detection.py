@@ -44,6 +44,9 @@ def test_all_kinds_of_contacts_are_found(still):
     assert set(c.kind) == set(KINDS) - {"face_face"} and c.found >= len(c) >= 12 and c.unmapped == 0
     assert (c.gap < 0).any() and (c.gap > 0).any() and c.gap.max() <= 0.02 and c.gap.min() > -0.05
     assert np.abs(np.linalg.norm(c.normal, axis=1) - 1).max() < 1e-12 and (c.impulse == 0).all()
+    table = c.to_dict()  # as pandas takes it
+    assert {column.shape for column in table.values()} == {(len(c),)} and table["body_a"] is c.body_a
+    assert np.array_equal(np.stack([table[f"point_{axis}"] for axis in "xyz"], axis=1), c.point)
 
 
 def test_contacts_rotate_translate_and_scale_with_the_scene(still):

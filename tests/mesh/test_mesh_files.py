@@ -125,8 +125,12 @@ def test_other_elements_are_refused_by_name_and_number(tmp_path):
     for kind, nodes, named in (("quad", 4, "2 quads"), ("pyramid", 5, "2 pyramid elements")):
         cells = [(kind, np.arange(2 * nodes).reshape(2, nodes) % 12), ("tetra", MESH.tets)]
         path = write_by_meshio(tmp_path / "part.msh", cells, **GMSH2)
-        with pytest.raises(MeshError, match=f"only tetrahedra with four or ten nodes can be used, but the file holds {named}$"):
-            read_mesh(path)
+        refusal = f"only tetrahedra with four or ten nodes can be used, but the file holds {named}$"
+        for read, given in ((read_mesh, path), (TetMesh.from_meshio, meshio.Mesh(MESH.vertices, cells))):
+            with pytest.raises(MeshError, match=refusal):
+                read(given)
+    with pytest.raises(MeshError, match="^from_meshio needs a meshio.Mesh, not str$"):
+        TetMesh.from_meshio("part.msh")
 
 
 def test_welding_merges_close_vertices(tmp_path):

@@ -1,5 +1,6 @@
-"""Regions of mesh files: random ones are written and read back; Gmsh's physical groups of all versions, references of .mesh and
-cell data of .vtu are read; names and data that a mesh cannot have are reported or refused; scene files find regions.
+"""Regions of mesh files: random ones are written and read back, and pass through meshio's record; Gmsh's physical groups of all
+versions, references of .mesh and cell data of .vtu are read; names and data that a mesh cannot have are reported or refused;
+scene files find regions.
 """
 
 import numpy as np
@@ -26,7 +27,11 @@ def test_random_regions_are_read_back(tmp_path, data):
     ids = data.draw(st.lists(st.integers(-(2**31) + 1, 2**31 - 1) | st.integers(0, 3), min_size=10, max_size=10))
     names = data.draw(st.lists(texts, unique=True, max_size=len(set(ids))))
     mesh = ts.TetMesh(BOX.vertices, BOX.tets, regions=ids, region_names=dict(zip(sorted(set(ids)), names)))
-    path = tmp_path / "part.msh"
+    path, record = tmp_path / "part.msh", mesh.to_meshio()
+    again = ts.TetMesh.from_meshio(record)
+    assert again.regions.tolist() == ids and again.region_names == mesh.region_names and again.warnings == []
+    assert np.array_equal(again.vertices, BOX.vertices) and np.array_equal(again.tets, BOX.tets)
+    record.points[:] = 0.0  # its own copy
     if not any(ids):
         with pytest.raises(MeshError, match="part.msh: a mesh whose only region is 0 cannot be written"):
             ts.write_mesh(path, mesh)

@@ -1,9 +1,10 @@
 """Surface meshes and tetrahedralization (other formats, encodings: test_mesh_files.py): polygons, welding, faults and invalid
-files; tets of a ball at any place and scale; the mesher's failure and absence are reported.
+files; those of other libraries; tets of a ball at any place and scale; the mesher's failure and absence are reported.
 """
 
 import re
 import subprocess
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -135,6 +136,28 @@ def test_faults():
     assert any("belong to more than two triangles" in text for text in ts.SurfaceMesh(*wall).faults())
     two = ts.SurfaceMesh(np.vstack([X, X + 3.0]), np.vstack([T, T + len(X)]))
     assert two.n_pieces == 2 and two.volume == pytest.approx(2 * VOLUME) and not two.faults()
+
+
+@pytest.mark.filterwarnings("ignore:SimpleNamespace")
+def test_surfaces_of_other_libraries_are_read():
+    """By their vertices and faces, wherever a surface is expected; the copy of a vertex is welded."""
+    trimesh = SimpleNamespace(vertices=np.vstack([X, X[:1]]), faces=np.where((T == 0) & (np.arange(3) == 1), len(X), T))
+    with pytest.warns(UserWarning, match=f"SimpleNamespace: 1 of {len(X) + 1} vertices were welded"):
+        surface = ts.read_surface(trimesh)
+    assert len(surface.vertices) == len(X) and surface.volume == pytest.approx(VOLUME) and not surface.faults()
+    scene = ts.Scene()
+    for given in (surface, trimesh):
+        for mesh in (given, ts.place(given, scale=2.0)):
+            scene.add_rigid_body(mesh)
+        scene.add_body(BALL, ts.Material()).embed(given, contact=True)
+    masses = [body.mass for body in scene.bodies]
+    assert masses[:3] == masses[3:] and np.array_equal(scene.bodies[2].nodes.surface, scene.bodies[5].nodes.surface)
+    for wrong, message in (
+        (3, "must be a file's name or have vertices"),
+        (SimpleNamespace(vertices=X, faces=QUADS), "triangles must"),
+    ):
+        with pytest.raises(MeshError, match=message):
+            ts.read_surface(wrong)
 
 
 def test_tets_fill_a_ball_that_is_inside_out():

@@ -1,4 +1,4 @@
-"""What a run reports: report.json (JSON without NaN), steps.csv, and progress."""
+"""What a run reports: report.json (JSON without NaN), steps.csv, equal rows for pandas, and progress."""
 
 import csv
 import dataclasses
@@ -72,9 +72,9 @@ def test_the_step_table_holds_every_field_of_every_step(written):
     with open(folder / "steps.csv", newline="") as file:
         rows = list(csv.DictReader(file))
     assert [list(row) for row in rows] == [[f.name for f in dataclasses.fields(StepReport)]] * 3
-    for row, step in zip(rows, result.step_reports):
+    for row, step, given in zip(rows, result.step_reports, result.to_dicts()):
         expected = vars(step) | {"problems": "; ".join(step.problems)}
-        assert row == {name: str(value) for name, value in expected.items()}
+        assert given == expected and row == {name: str(value) for name, value in expected.items()}
 
 
 @pytest.mark.parametrize(

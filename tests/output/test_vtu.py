@@ -1,7 +1,8 @@
-"""Files for ParaView, and frames as .npz, read back by meshio; of a run, and of a resumed one."""
+"""Files for ParaView, and frames as .npz, read back by meshio; of a run, and of a resumed one; the same data for pyvista."""
 
 import base64
 import shutil
+import sys
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
@@ -25,7 +26,7 @@ class Touching(FakeSimulator):
     """With what is written of a simulator whose bodies touch."""
 
     touches = True
-    write_vtu = ts.Simulator.write_vtu
+    write_vtu, to_pyvista = ts.Simulator.write_vtu, ts.Simulator.to_pyvista
 
     def velocities(self, name=None):
         return 2.0 * self.positions(name)
@@ -82,6 +83,30 @@ def test_points_cells_and_data_come_back_from_meshio(written):
     with pytest.warns(UserWarning, match="edges of second-order tets are curved"):
         again = ts.read_mesh(path)
     assert again.n_tets == len(sigma) and again.region_ids == (0, 4, 7)
+
+
+def test_pyvista_gets_what_is_written(written):
+    pyvista = pytest.importorskip("pyvista")
+    sim, path = written
+    grid, read = sim.to_pyvista(), pyvista.read(path)
+    assert np.array_equal(grid.points, sim.positions()) and np.array_equal(grid.cells, read.cells)
+    assert np.array_equal(grid.celltypes, read.celltypes)
+    for given, expected in ((getattr(one, kind) for one in (grid, read)) for kind in ("point_data", "cell_data", "field_data")):
+        assert set(given.keys()) == set(expected.keys())
+        assert all(np.array_equal(given[name], expected[name]) for name in expected.keys())
+    mesh = sim.scene.bodies[0].mesh
+    assert mesh.to_pyvista().volume == pytest.approx(mesh.volumes.sum())
+    assert mesh.to_pyvista().cell_data["region"].tolist() == mesh.regions.tolist()
+    assert ts.SurfaceMesh(mesh.vertices, mesh.surface).to_pyvista().volume == pytest.approx(mesh.volumes.sum())
+
+
+def test_a_missing_pyvista_is_reported_in_one_sentence(written, monkeypatch):
+    monkeypatch.setitem(sys.modules, "pyvista", None)
+    for one in (written[0], written[0].scene.bodies[0].mesh):
+        with pytest.raises(
+            OutputError, match=r"^to_pyvista needs the package pyvista, which .*: pip install 'taisoft\[pyvista\]'$"
+        ):
+            one.to_pyvista()
 
 
 def test_megabytes_of_any_numbers_come_back(tmp_path):

@@ -4,7 +4,9 @@
 * the API reference lists every public name, every argument of a Simulator and all its values;
 * the page of the command line lists exactly the commands, options and keys that exist;
 * every integrator and law has a row in the tables for choosing one;
-* links and file names exist, the README is short, and images are small.
+* links and file names exist, the README is short, and images are small;
+* pages are readable on code hosts: links have titles and lead to headings, and no directive or role of Sphinx shows, but where
+  source and docstrings are filled in.
 """
 
 import importlib.util
@@ -28,7 +30,7 @@ ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / "docs"
 PAGES = sorted(path for path in DOCS.rglob("*.md") if "results" not in path.relative_to(DOCS).parts)
 TESTED = {"python", "toml", "sh", "console"}  # kinds of blocks that docs/conftest.py runs or checks
-UNTESTED = {"text", "{toctree}", "{literalinclude}", "{eval-rst}"}  # kinds of blocks that are not examples
+UNTESTED = {"text", "{literalinclude}", "{eval-rst}"}  # kinds of blocks that are not examples
 READERS_FILES = {"my_scene.py", "drop.py", "taisoft/fem/laws/modified_svk.py"}  # written by the reader
 DOCUMENTS = [*PAGES, ROOT / "README.md", ROOT / "CONTRIBUTING.md"]
 
@@ -71,6 +73,25 @@ def test_commands_use_options_that_exist_and_links_lead_somewhere(runner):
             if "://" not in link and not re.fullmatch(r"[a-z-]+", link) and not (path.parent / link).exists():
                 missing.append(f"{path.name}: {link}")  # Sphinx checks labels
     assert missing == []
+
+
+def slugs(path: Path) -> set[str]:
+    """Anchors of a page's headings, as code hosts and Sphinx make them."""
+    plain = re.sub(r"^```.*?^```", "", path.read_text(encoding="utf-8"), flags=re.DOTALL | re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in re.findall(r"^#+ (.+)$", plain, re.MULTILINE)}
+
+
+def test_pages_are_readable_on_code_hosts():
+    assert "{" not in re.sub(r"^```.*?^```", "", text("index.md"), flags=re.DOTALL | re.MULTILINE)
+    wrong = []
+    for path in DOCUMENTS:
+        content = path.read_text(encoding="utf-8")
+        syntax = re.findall(r"\[\]\(.*?\)|\{[\w:-]+\}`.*?`|^\([\w-]+\)=$|^: .*", content, re.MULTILINE)
+        wrong += [f"{path.name}: {part}" for part in syntax]
+        for link, anchor in re.findall(r"\]\(([^)#\s:]*\.md)?#([^)\s]+)\)", content):
+            if anchor not in slugs(path.parent / link if link else path):
+                wrong.append(f"{path.name}: {link}#{anchor}")
+    assert wrong == []
 
 
 def test_the_readme_is_short_and_images_are_small():
