@@ -48,6 +48,7 @@ class StepReport:
     loads: float = 0.0  #: of dead loads, -sum f.x [J]
     converged: bool = True  #: residuals are within their tolerances
     problems: list[str] = field(default_factory=list)  #: sentences
+    details: dict[str, float] = field(default_factory=dict)  #: of a run with `details`, at the end, by heading in steps.csv
 
     def __repr__(self) -> str:
         counts = {"Newton iterations": self.newton_iterations, "substeps": self.substeps - 1 and self.substeps}

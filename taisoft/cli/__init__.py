@@ -218,6 +218,8 @@ def _add_run(add) -> None:
     option("--vtu", action="store_true", help="also write every frame as a .vtu file, and scene.pvd, which ParaView opens")
     option("--npz", action="store_true", help="also write the nodes of every frame as a .npz file")
     option("--no-usd", action="store_true", help="write no scene.usdc")
+    details = "also write per step: pairs (forces, torques, slip velocities of what presses), bodies (their energies)"
+    option("--details", metavar="NAME,...", help=details)
     option("--error", action="store_true", help="estimate the error by runs with other steps and tolerances beside this one")
     option("--error-mesh", choices=("refined", "order"), help="also by one on another mesh; implies --error")
     colours = ("body", "stress", "stretch", "speed", "error")

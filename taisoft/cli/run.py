@@ -258,6 +258,7 @@ def _run(sim, settings: RunSettings, arguments, signals, warned: list[str], save
             error=shown.errors,
             error_mesh=arguments.error_mesh,
             on_iteration=progress.iteration,
+            details=shown.details,
         )
         observers.close()
         if recording is not None:
