@@ -226,7 +226,8 @@ def _add_run(add) -> None:
     option("--colour", choices=colours, default="body", help="colouring of bodies in pictures and the window")
     layers = "what they show besides bodies: wires, contacts, tractions, pressures, connections, fixed_nodes, or none"
     option("--layers", metavar="NAME,...", help=layers)
-    option("--plots", metavar="NAME,...", help="plots over time: energies, residuals, iterations, contacts, step_time, error")
+    plots = "plots over time: energies, residuals, iterations, contacts, step_time, error, forces, kinetic, elastic"
+    option("--plots", metavar="NAME,...", help=plots)
     option("--caption", action="store_true", help="write scene, frame, time and energies on pictures")
     option("--no-frames", action="store_true", help="write no pictures")
     option("--verbose", action="store_true", help="print why each feature of the plan is on, and which are left out")

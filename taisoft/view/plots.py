@@ -7,6 +7,8 @@ steps. Where errors are estimated, energies are drawn as bands: plus and minus t
 The history takes constant memory: minimum and maximum of every quantity over bins of consecutive steps. A bin holds one step
 until CAPACITY bins are full. Then neighbours are merged in pairs, and from there on a bin holds twice as many steps. So no peak
 is lost, however long a simulation runs, and early and late steps have the same resolution.
+
+Some plots show a quantity of every pair that presses, or of every body: the FEW largest. They are computed once such a plot is shown.
 """
 
 import math
@@ -19,6 +21,7 @@ from taisoft.records import ERROR_KINDS, ErrorEstimate, StepReport
 from taisoft.scene.checks import nearest
 from taisoft.view.colouring import round_up
 
+FEW = 4  # curves of a plot by pair or body
 BLUE, ORANGE, GREEN, DARK = (0.16, 0.42, 0.74), (0.87, 0.42, 0.13), (0.20, 0.56, 0.28), (0.30, 0.30, 0.36)  # sRGB
 GRID_LINES = 4  # at most, between the ends of an axis
 MIN_SPAN = 1e-200  # values that span less count as constant
@@ -30,11 +33,12 @@ ENERGIES = ("kinetic", "elastic", "gravity")  # [J]
 SOLVERS = ("newton_residual", "contact_residual", "newton_iterations", "linear_iterations", "contact_iterations", "n_contacts")
 ERRORS = tuple(f"{kind}_error" for kind in ERROR_KINDS)  # over the largest excursion, in percent
 QUANTITIES = (*ENERGIES, "total", *SOLVERS, "step_time", *ERRORS)  # energies as changes since the start, wall time in [ms]
+Named = dict[str, dict[str, float]]  # plot by pair or body -> name -> value
 
 
 @dataclass(frozen=True)
 class Series:
-    """One curve of a plot. quantity: one of QUANTITIES; needs: "implicit" steps, "contact" forces, "error" estimates, or ""."""
+    """One curve of a plot. quantity: a column of the history; needs: "implicit" steps, "contact" forces, "error" estimates, or ""."""
 
     name: str
     quantity: str
@@ -44,12 +48,16 @@ class Series:
 
 @dataclass(frozen=True)
 class Plot:
-    """Curves that share an axis. log: whether it is logarithmic."""
+    """Curves that share an axis. log: whether it is logarithmic; each: "pair" or "body" if there is a curve for each, or "".
+
+    Such a plot has one series, for all of them.
+    """
 
     title: str
     unit: str
     series: tuple[Series, ...]
     log: bool = False
+    each: str = ""
 
 
 PLOTS = {
@@ -79,21 +87,27 @@ PLOTS = {
         tuple(Series(name, f"{name}_error", colour, "error") for name, colour in zip(ERROR_KINDS, (BLUE, ORANGE, GREEN))),
         log=True,
     ),
+    "forces": Plot("force of each pair", "N", (Series("", "forces", DARK, "contact"),), each="pair"),
+    "kinetic": Plot("kinetic energy of each body", "J", (Series("", "kinetic", DARK),), each="body"),
+    "elastic": Plot("elastic energy of each body", "J", (Series("", "elastic", DARK),), each="body"),
 }
 
 
 class History:
-    """Minima and maxima of QUANTITIES over bins of steps.
+    """Minima and maxima of quantities over bins of steps.
 
-    times: (n,) ends of the bins [s]; low, high: (n, k) minima and maxima over each, columns as QUANTITIES, NaN if unknown;
-    last: (k,) values of the last step; begin: time of the start [s].
+    times: (n,) ends of the bins [s]; low, high: (n, k) minima and maxima over each, NaN if unknown; columns: (k,) their names,
+    QUANTITIES, then "forces: a, b" and the like of plots by pair or body; last: (k,) values of the last step; begin: time of the
+    start [s].
     """
 
     def __init__(self, capacity: int = CAPACITY):
-        self._times, (self._low, self._high) = np.empty(capacity), np.empty((2, capacity, len(QUANTITIES)))
+        self._capacity = capacity
         self._clear()
 
     def _clear(self) -> None:
+        self.columns = list(QUANTITIES)
+        self._times, (self._low, self._high) = np.empty(self._capacity), np.empty((2, self._capacity, len(QUANTITIES)))
         self._n = self._steps_in_last = 0
         self._steps_per_bin = 1
         self._start_energies, self.begin = np.zeros(3), 0.0
@@ -121,12 +135,18 @@ class History:
         self._append(sim.time, np.where(np.arange(len(QUANTITIES)) < 4, 0.0, np.nan), np.zeros(len(QUANTITIES)))
 
     def take(
-        self, report: StepReport, seconds: float, explicit: bool, touching: bool, errors: ErrorEstimate | None = None
+        self,
+        report: StepReport,
+        seconds: float,
+        explicit: bool,
+        touching: bool,
+        errors: ErrorEstimate | None = None,
+        named: Named | None = None,
     ) -> None:
         """Record a step, or a batch of explicit steps.
 
-        seconds: its total wall time [s]; touching: whether contact forces are simulated; errors: so far, if estimated.
-        Quantities not simulated are NaN.
+        seconds: its total wall time [s]; touching: whether contact forces are simulated; errors: so far, if estimated; named: of
+        plots by pair or body, where a pair that is not in there has 0. Quantities not simulated are NaN.
         """
         energies = _energies(report) - self._start_energies
         solved, touched = (np.nan if explicit else 1.0), (1.0 if touching else np.nan)
@@ -147,10 +167,20 @@ class History:
                 ),
             ]
         )
-        half = np.zeros(len(QUANTITIES))
+        row = np.concatenate([row, self._named(named or {})])
+        half = np.zeros(len(row))
         if errors is not None and errors.energies is not None:
             half[:4] = np.abs([*_energies(errors.energies), errors.energies.total])
         self._append(report.time, np.where(np.isfinite(row), row, np.nan), half)
+
+    def _named(self, named: Named) -> list[float]:
+        """Return the values of the columns after QUANTITIES, of which new ones are added."""
+        values = {f"{plot}: {name}": value for plot, own in named.items() for name, value in own.items()}
+        new = [column for column in values if column not in self.columns]
+        unknown = np.full((len(self._times), len(new)), np.nan)
+        self._low, self._high = np.hstack([self._low, unknown]), np.hstack([self._high, unknown])
+        self.columns += new
+        return [values.get(name, 0.0 if name.split(":")[0] in named else np.nan) for name in self.columns[len(QUANTITIES) :]]
 
     def _append(self, time: float, row: np.ndarray, half: np.ndarray) -> None:
         """Append a row, with half the width of each band."""
@@ -196,6 +226,26 @@ class Curves:
     times: tuple[float, float]
 
 
+def plain_history(history: History) -> dict:
+    """Return the arrays of a history as plain data, only with the columns that plots can show."""
+    shown = [history.columns.index(s.quantity) for plot in PLOTS.values() for s in series_of(plot, history)]
+    used = [*range(len(QUANTITIES)), *(column for column in shown if column >= len(QUANTITIES))]
+    parts = {"low": history.low[:, used], "high": history.high[:, used], "last": history.last[used]}
+    return {"times": history.times, "begin": history.begin, "columns": [history.columns[k] for k in used], **parts}
+
+
+def series_of(plot: Plot, history) -> tuple[Series, ...]:
+    """Return the series of a plot, of one by pair or body those with the FEW largest values."""
+    if not plot.each:
+        return plot.series
+    kind = f"{plot.series[0].quantity}: "
+    own = [k for k, name in enumerate(history.columns) if name.startswith(kind)]
+    largest = np.fmax.reduce(history.high[:, own], axis=0, initial=0.0)
+    few = [own[k] for k in sorted(np.argsort(-largest, kind="stable")[:FEW])]
+    names = [history.columns[k] for k in few]
+    return tuple(Series(name.removeprefix(kind), name, colour) for name, colour in zip(names, (BLUE, ORANGE, GREEN, DARK)))
+
+
 class PlotChoice:
     """Which plots of a history are available and shown.
 
@@ -226,10 +276,11 @@ class PlotChoice:
         return [name for name in self.available() if self.shown[name]]
 
     def toggle(self) -> None:
-        """Hide all plots, or show those shown last again; if there were none, show all available ones."""
+        """Hide all plots, or show those shown last again; if there were none, all available ones but those by pair or body."""
         visible = self.visible()
         available = self.available()
-        chosen = () if visible else [name for name in self._last_shown if name in available] or available
+        common = [name for name, plot in available.items() if not plot.each]
+        chosen = () if visible else [name for name in self._last_shown if name in available] or common
         self._last_shown = tuple(visible) or self._last_shown
         self.shown = {name: name in chosen for name in PLOTS}
 
@@ -241,12 +292,13 @@ class PlotChoice:
 class Plots(PlotChoice):
     """History of a simulation, and which plots of it are shown.
 
-    sim: a Simulator; names: of the plots shown initially; errors: whether the run estimates errors. Raises SceneError for an
-    unknown name or a plot of quantities that sim does not simulate.
+    sim: a Simulator; names: of the plots shown initially; errors: whether the run estimates errors. watched: names of the plots
+    by pair or body whose quantities are recorded. Raises SceneError for an unknown name or a plot of quantities that sim does not
+    simulate.
     """
 
     def __init__(self, sim, names: tuple[str, ...] = (), errors: bool = False):
-        self._sim, self._errors = sim, errors
+        self._sim, self._errors, self.watched = sim, errors, set(names)
         super().__init__(History(), {}, names)
         for name in names:
             if name not in PLOTS:
@@ -265,7 +317,17 @@ class Plots(PlotChoice):
             self.history.start(self._sim)
         else:
             errors = self._sim.error_so_far if self._errors else None
-            self.history.take(report, seconds, self._sim.settings.explicit, self._touching, errors)
+            self.history.take(report, seconds, self._sim.settings.explicit, self._touching, errors, self._named())
+
+    def _named(self) -> Named:
+        """Return the present quantities of the watched plots by pair or body: forces [N] and energies [J]."""
+        sim, found = self._sim, {}
+        if "forces" in self.watched:
+            found["forces"] = {f"{a}, {b}": float(np.linalg.norm(sim.contact_force(a, b))) for a, b in sim.pairs_in_contact()}
+        if kinds := self.watched & {"kinetic", "elastic"}:
+            energies = dict(zip((body.name for body in sim.scene.bodies), sim._open().body_energies()))
+            found |= {kind: {name: getattr(one, kind) for name, one in energies.items()} for kind in sorted(kinds)}
+        return found
 
     def restart(self) -> None:
         """Clear the history."""
@@ -288,13 +350,14 @@ class Plots(PlotChoice):
 
 def curves_of(plot: Plot, history: History) -> Curves:
     """Return the drawing of a plot of a history."""
-    columns = [QUANTITIES.index(s.quantity) for s in plot.series]
+    shown = series_of(plot, history)
+    columns = [history.columns.index(s.quantity) for s in shown]
     low, high = history.low[:, columns], history.high[:, columns]
     bottom, top, grid = (_log_axis if plot.log else _axis)(low, high)
     first, last = history.begin, history.times[-1]
     across = (history.times - first) / ((last - first) or 1.0)
     lines, legend = [], []
-    for k, (column, series) in enumerate(zip(columns, plot.series)):
+    for k, (column, series) in enumerate(zip(columns, shown)):
         values = np.stack([low[:, k], high[:, k]], axis=1)
         values = _logarithms(values, bottom) if plot.log else values
         y = np.clip((values - bottom) / (top - bottom), 0.0, 1.0)
