@@ -24,7 +24,8 @@ from taisoft.errors import SceneError, SimulationError
 from taisoft.files import replacing
 from taisoft.nested import join_arrays, part_arrays
 from taisoft.scene.fingerprint import FEATURES, digest, run_time_numbers, scene_fingerprint
-from taisoft.scene.plan import LOADS, Numbers, change_load, change_tendon, first_difference, scene_numbers
+from taisoft.scene.numbers import Numbers, first_difference, scene_numbers
+from taisoft.scene.plan import LOADS, change_load, change_tendon
 from taisoft.scene.rigid import RigidBody
 from taisoft.scene.scene import Material, Scene
 from taisoft.settings import NAMES, plan_of

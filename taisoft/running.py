@@ -63,19 +63,20 @@ def run(
 ) -> RunReport:
     """Step for `seconds` [s] from now, to the nearest step, with frames at fps, or after every step if fps is None.
 
-    on_frame(sim, index, report): called for frame 0 (the start, report None) and after every frame. stop: called between
-    steps, and in long ones; True ends the run. dt is lowered once to the next divisor of 1/fps, or rounded to one within NEAR
-    of it, which the report notes. resumed: seconds and frames count from time 0, not from now; the first frame is `first_frame`.
+    on_frame(sim, index, report): called for frame 0 (the start, report None) and after every frame. stop: called between steps,
+    and in long ones; True ends the run. dt is lowered once to the next divisor of 1/fps, or rounded to one within NEAR of it,
+    which the report notes. resumed: seconds and frames count from time 0, not from now; the first frame is `first_frame`.
     on_step(report, seconds): called after every implicit step and every batch of explicit steps, with its wall time without
     compilation [s]. error: estimate the error of the positions by twins (`taisoft.estimation`), simulators that follow the run
     with other steps and tighter tolerances; the report holds it. error_mesh: also estimate the error of the mesh, by a twin on
     another one: "refined", "order" (the elements' other order), or the same scene on a mesh that shares nodes. on_iteration(n):
     called a few times a second in implicit steps of more than 1 s of wall time, with their Newton iterations so far. details:
     "pairs", "bodies" or both: each report then holds forces, torques and slip velocities of the pairs that pressed in its last
-    step, and kinetic and elastic energies of bodies, see `StepReport.details`. A run that fails, or that `stop` ends, does not raise: see the report's status and problems. Ctrl-C undoes the present step and is raised
-    as KeyboardInterrupt; `stop` alone ends a run in another thread than the main one. Raises SimulationError for bad arguments,
-    and for a twin that cannot be made. A simulator with a tolerance first chooses integrator and dt by pilots, unless the run is
-    resumed; the report then holds the error in time.
+    step, and kinetic and elastic energies of bodies, see `StepReport.details`. A run that fails, or that `stop` ends, does not
+    raise: see the report's status and problems. Ctrl-C undoes the present step and is raised as KeyboardInterrupt; `stop` alone
+    ends a run in another thread than the main one. Raises SimulationError for bad arguments, and for a twin that cannot be made.
+    A simulator with a tolerance first chooses integrator and dt by pilots, unless the run is resumed; the report then holds the
+    error in time.
     """
     if error_mesh is not None and not error:
         raise SimulationError("error_mesh needs error=True")

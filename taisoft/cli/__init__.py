@@ -35,7 +35,10 @@ def main(argv: list[str] | None = None) -> int:
     other exception is a bug in taisoft and keeps its traceback. Only the requested command's module is imported, so that
     `doctor` also works on a broken installation.
     """
-    arguments = command_parser().parse_args(argv)
+    parser = command_parser()
+    if "_ARGCOMPLETE" in os.environ:
+        import_module("taisoft.cli.completion").complete(parser)
+    arguments = parser.parse_args(argv)
     try:
         module, function = arguments.command
         return getattr(import_module(f"taisoft.cli.{module}"), function)(arguments)
@@ -180,6 +183,9 @@ def command_parser() -> argparse.ArgumentParser:
     ).add_argument
     option("--precision", choices=("f32", "f64"), help="of all kernels (default: simulations f32, statics f64)")
 
+    option = add("completion", ("completion", "completion"), "print a shell's script for completion (extra 'completion')")
+    option.add_argument("shell", choices=("bash", "zsh", "fish"), help="where to use it")
+
     option = add("bench", ("scene_file", "bench"), "run a benchmark; without a name, list them", add_help=False).add_argument
     option("name", metavar="NAME", nargs="?", help="the benchmark's name")
     option("rest", nargs=argparse.REMAINDER, help="arguments of the benchmark itself")
@@ -205,8 +211,8 @@ def _add_run(add) -> None:
     option("--fps", type=float, metavar="N", help="frames per simulated second (default: the scene's, or 60)")
     option("--out", metavar="DIR", help="folder for the results; without it nothing is written")
     option("--overwrite", action="store_true", help="replace results already in DIR")
-    assignment = {"action": "append", "default": [], "dest": "assignments", "metavar": "solver.KEY=VALUE"}
-    option("--set", **assignment, help="a Simulator argument, e.g. solver.dt=0.01; may be repeated")
+    assignment = {"action": "append", "default": [], "dest": "assignments", "metavar": "NAME.NUMBER=VALUE"}
+    option("--set", **assignment, help="a number of scene or solver, e.g. beam.young=2e5 or solver.dt=0.01; may be repeated")
     option("--resume", metavar="CHECKPOINT", help="continue a run of this scene from its checkpoint, until --seconds in total")
     every = "write DIR/checkpoint.npz every T of simulated time [s], not only at the end"
     option("--checkpoint-every", type=float, metavar="T", help=every)

@@ -132,8 +132,9 @@ def _names(option: str, text: str | None, known) -> tuple[str, ...] | None:
 
 def check_modelled(shown: DisplayOptions, sim) -> None:
     """Raise SceneError for a layer, plot or detail of a feature that sim does not model."""
-    for option, asked in {"layers contacts": "contacts" in (shown.layers or ()), "details pairs": "pairs" in shown.details}.items():
-        if asked and not sim.plan.on["contact_forces"]:
+    asked = {"layers contacts": "contacts" in (shown.layers or ()), "details pairs": "pairs" in shown.details}
+    for option, given in asked.items():
+        if given and not sim.plan.on["contact_forces"]:
             raise SceneError(f"--{option}: contact forces are not modelled ({sim.plan.why('contact_forces')})")
     Plots(sim, shown.plots, shown.errors)
     if "fixed_nodes" in (shown.layers or ()) and not sim.plan.on["fixed_nodes"]:

@@ -8,7 +8,7 @@ The history takes constant memory: minimum and maximum of every quantity over bi
 until CAPACITY bins are full. Then neighbours are merged in pairs, and from there on a bin holds twice as many steps. So no peak
 is lost, however long a simulation runs, and early and late steps have the same resolution.
 
-Some plots show a quantity of every pair that presses, or of every body: the FEW largest. They are computed once such a plot is shown.
+Some plots show a quantity of each pair that presses, or of each body: the FEW largest. It is recorded from when one is shown.
 """
 
 import math
@@ -38,7 +38,7 @@ Named = dict[str, dict[str, float]]  # plot by pair or body -> name -> value
 
 @dataclass(frozen=True)
 class Series:
-    """One curve of a plot. quantity: a column of the history; needs: "implicit" steps, "contact" forces, "error" estimates, or ""."""
+    """One curve of a plot. quantity: column of `History`; needs: "implicit" steps, "contact" forces, "error" estimates or ""."""
 
     name: str
     quantity: str
