@@ -24,7 +24,7 @@ from taisoft.output.files import check_free, read_last_good
 from taisoft.output.report import Progress
 from taisoft.records import RunReport
 from taisoft.scene import checks
-from taisoft.scene.numbers import set_number
+from taisoft.scene.numbers import set_numbers
 from taisoft.scene.scene import Scene
 from taisoft.simulator import Simulator
 from taisoft.view.ggui import display_missing, vulkan_missing
@@ -64,7 +64,7 @@ def run(arguments: Namespace) -> int:
     _check_working_folder()
     with Signals() as signals, printed_warnings() as warned:
         scene, solver = load_scene(arguments.scene, arguments.allow_outside)
-        numbers = set_numbers(scene, arguments.assignments)
+        numbers = set_given(scene, arguments.assignments)
         warn_millimetres({body.name: body.mesh for body in scene.bodies})
         _check_checkpoint_interval(arguments)
         shown = display_options(arguments, has_window=not arguments.headless and _window_is_possible())
@@ -135,7 +135,7 @@ def resolve(solver: dict, arguments: Namespace, simulator_class: type, saved: di
     )
 
 
-def set_numbers(scene: Scene, assignments: list[str]) -> dict:
+def set_given(scene: Scene, assignments: list[str]) -> dict:
     """Set numbers of a scene as --set NAME.NUMBER=VALUE gives them, and return them by name. Raises SceneError."""
     given = {}
     for assignment in assignments:
@@ -147,7 +147,7 @@ def set_numbers(scene: Scene, assignments: list[str]) -> dict:
         values = [parse_scalar(part.strip(), assignment) for part in text.strip("[]").split(",")]  # a vector has commas
         given[name] = values if len(values) > 1 else values[0]
         try:
-            set_number(scene, name, given[name])
+            set_numbers(scene, {name: given[name]})
         except SceneError as error:
             raise SceneError(f"--set {assignment}: {error}") from None
     return given

@@ -1,4 +1,4 @@
-"""Digests of a scene's parts, which tell whether two scenes are the same, and the numbers that may change at run time."""
+"""Digests of a scene's parts, which tell, with its numbers, whether two scenes are the same."""
 
 import dataclasses
 import hashlib
@@ -90,20 +90,6 @@ def _path_parts(path: Callable | None) -> list:
     values = [frames.times, frames.translations, frames.rotations, frames.pivot, frames.smooth, frames.release, frames.values]
     start = {NodePath: "starts", ShapePath: "center"}.get(type(path))  # in whose frame key frames are
     return values + ([getattr(path, start)] if start else [])
-
-
-def run_time_numbers(scene: Scene) -> dict:
-    """Return the numbers of a scene that may change at run time, except its loads: plain data, and arrays by tet."""
-    pairs = sorted(([sorted(names), *numbers] for names, numbers in scene.contact_pairs.items()), key=lambda pair: pair[0])
-    return {"gravity": scene.gravity.tolist(), "materials": [_materials(body) for body in scene.bodies], "pairs": pairs}
-
-
-def _materials(body: Body) -> dict:
-    """Return a body's materials, in the order of its regions, and its numbers by tet."""
-    if isinstance(body, RigidBody):
-        return {}  # its numbers do not change
-    materials = [dataclasses.asdict(material) for material in body.composition.materials.values()]
-    return {"materials": materials, "by_tet": body.composition.by_tet}
 
 
 def digest(values: list) -> str:

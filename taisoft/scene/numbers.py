@@ -1,4 +1,4 @@
-"""The numbers of a scene by name, such as "beam.young": what checkpoints compare, and what `taisoft run --set` changes."""
+"""The numbers of a scene by name, such as "beam.young": what checkpoints hold and compare, and `taisoft run --set` sets."""
 
 import dataclasses
 import reprlib
@@ -11,13 +11,15 @@ from taisoft.attributes import thawed
 from taisoft.errors import SceneError
 from taisoft.scene import checks
 from taisoft.scene.body import Body
-from taisoft.scene.composition import BY_TET, OF_THE_BODY
+from taisoft.scene.composition import BY_TET
+from taisoft.scene.material import Material
 from taisoft.scene.plan import LOADS, change_load, change_tendon
 from taisoft.scene.rigid import RigidBody
 from taisoft.scene.scene import Scene
 
 Numbers = dict[str, float | list | np.ndarray | None]  # of a scene, by name
-Entry = tuple[str, float | list | np.ndarray | None, Callable | None]  # name, value, and the call that sets it, if there is one
+Entry = tuple[str, float | list | np.ndarray | None, Callable]  # name, value, and the call that sets it
+NUMBERS = tuple(field.name for field in dataclasses.fields(Material) if field.name != "law")
 LIMITS = {  # of the numbers of obstacles and connections
     "friction": {"minimum": 0.0},
     "restitution": {"minimum": 0.0, "maximum": 1.0},
@@ -28,63 +30,63 @@ LIMITS = {  # of the numbers of obstacles and connections
 
 
 def scene_numbers(scene: Scene) -> Numbers:
-    """Return all numbers of a scene that --set may change, and those by tet (m,). Forces per node are arrays (k,3)."""
+    """Return gravity, and all numbers of materials, loads, obstacles, connections, and pairs that have their own.
+
+    Arrays are numbers by tet (m,), and forces per node (k,3). None: chosen by the Simulator, by region, or along a path.
+    """
     return {name: value for name, value, _ in _entries(scene)}
 
 
-def set_number(scene: Scene, name: str, value) -> None:
-    """Set one of the `scene_numbers` of a scene, or friction or restitution of a pair: "contact.a.b.friction".
+def set_numbers(scene: Scene, numbers: Numbers) -> None:
+    """Set numbers by name, also friction and restitution of any pair, "contact.a.b.friction". Raises SceneError.
 
-    Material numbers replace those by tet. Raises SceneError.
+    One for a whole body replaces those by region and by tet, and that of a load its path.
     """
-    calls = {known: assign for known, _, assign in _entries(scene) if assign is not None}
-    kind, *pair = name.split(".")
-    if name in calls:
-        calls[name](value)
-    elif kind == "contact" and len(pair) == 3 and pair[2] in ("friction", "restitution"):
-        scene.set_contact(*pair[:2], **{pair[2]: value})
-    else:
-        hint = checks.nearest(name, calls) or f"; there are {', '.join(list(calls)[:3])} and {len(calls) - 3} more"
-        raise SceneError(f"the scene has no number {name!r}{hint}")
+    calls = {known: assign for known, _, assign in _entries(scene)}
+    for name, value in numbers.items():
+        kind, *pair = name.split(".")
+        if name in calls:
+            calls[name](value)
+        elif kind == "contact" and pair[-1:] in (["friction"], ["restitution"]):
+            _set_pair(scene, pair[:-1], pair[-1], value)
+        else:
+            hint = checks.nearest(name, calls) or f"; there are {', '.join(list(calls)[:3])} and {len(calls) - 3} more"
+            raise SceneError(f"the scene has no number {name!r}{hint}")
 
 
 def _entries(scene: Scene) -> Iterator[Entry]:
     yield "gravity", scene.gravity.tolist(), partial(setattr, scene, "gravity")
     for body in scene.bodies:
         yield from (_of_rigid if isinstance(body, RigidBody) else _of_material)(body)
-        for name, values in body.composition.by_tet.items():
-            yield f"{body.name}.{name} by tet", values, None
         for kind, loads in LOADS.items():
             for i, load in enumerate(getattr(body, loads)):
-                if load.path is None:
-                    name = f"{load.name}.{load.given}" if kind == "cavity" else f"{body.name}.{kind}.{i}"
-                    value = load.value if load.value.ndim == 2 else load.value.tolist()
-                    yield name, value, partial(change_load, body, kind, i)
+                name = f"{load.name}.{load.given}" if kind == "cavity" else f"{body.name}.{kind}.{i}"
+                value = load.value if load.value is None or load.value.ndim == 2 else load.value.tolist()
+                yield name, value, partial(change_load, body, kind, i)
     for one in scene.tendons:
-        if one.path is None:
-            yield f"{one.name}.{one.given}", float(one.value), partial(change_tendon, scene, one.given, one.name)
-    exact = scene.exact_attachments
-    for items in (scene.obstacles, scene.springs, scene.tendons, scene.attachments):
-        for k, one in enumerate(items):
-            for name in (field.name for field in dataclasses.fields(one) if field.name in LIMITS and one not in exact):
-                if getattr(one, name) is not None:
-                    yield f"{one.name}.{name}", getattr(one, name), partial(_set_in, items, k, name)
+        value = None if one.value is None else float(one.value)
+        yield f"{one.name}.{one.given}", value, partial(change_tendon, scene, one.given, one.name)
+    for kind in ("obstacles", "springs", "tendons", "attachments"):
+        for k, one in enumerate(getattr(scene, kind)):
+            for name in LIMITS:
+                if (value := vars(one).get(name)) is not None and one not in scene.exact_attachments:
+                    yield f"{one.name}.{name}", value, partial(_set_in, scene, kind, k, name)
     for names, pair in scene.contact_pairs.items():
-        a, b = min(names), max(names)
         for name, value in zip(("friction", "restitution"), pair):
-            yield f"contact.{a}.{b}.{name}", value, lambda value, a=a, b=b, name=name: scene.set_contact(a, b, **{name: value})
+            ends = [min(names), max(names)]
+            yield f"contact.{'.'.join(ends)}.{name}", value, partial(_set_pair, scene, ends, name)
 
 
 def _of_material(body: Body) -> Iterator[Entry]:
-    """Numbers of a body's material or, by region, of its materials."""
-    for region, material in body.composition.materials.items():
-        for name, value in dataclasses.asdict(material).items():
-            if name == "law":
-                continue
-            whole = region is None or name in OF_THE_BODY
-            owner = body.name if whole else f"{body.name}.{body.mesh.region_names.get(region, region)}"
-            settable = whole or name in BY_TET
-            yield f"{owner}.{name}", value, partial(_set_material, body, name, None if whole else region) if settable else None
+    composition = body.composition
+    for region, material in composition.materials.items() if composition.has_regions else ():
+        owner = f"{body.name}.{body.mesh.region_names.get(region, region)}"
+        for name in (*BY_TET, "volume_floor"):
+            yield f"{owner}.{name}", getattr(material, name), partial(_set_material, body, name, region)
+    for name in NUMBERS:
+        by_region = {getattr(material, name) for material in composition.materials.values()}
+        value = composition.by_tet.get(name, by_region.pop() if len(by_region) == 1 else None)
+        yield f"{body.name}.{name}", value, partial(_set_material, body, name, None)
 
 
 def _of_rigid(body: RigidBody) -> Iterator[Entry]:
@@ -99,16 +101,26 @@ def _set_material(body: Body, name: str, region: int | None, value) -> None:
 
 
 def _set_rigid(body: RigidBody, given: dict, name: str, value) -> None:
-    made = RigidBody(body.name, body.shape, position=body.position, **body.start_twist._asdict(), **given | {name: value})
+    given[name] = value
+    made = RigidBody(body.name, body.shape, position=body.position, **body.start_twist._asdict(), **given)
     with thawed(body):
         for key in ("_density", "inertia", "given_young", "_young", "composition"):
             setattr(body, key, getattr(made, key))
 
 
-def _set_in(items: list, k: int, name: str, value) -> None:
-    """Replace a number of an obstacle or a connection, which are records."""
+def _set_in(scene: Scene, kind: str, k: int, name: str, value) -> None:
+    """Replace a number of an obstacle or a connection, which are records in a list of the scene."""
+    items = getattr(scene, kind)
     value = checks.number(value, f"{items[k].name!r}: {name}", **LIMITS[name])
     list.__setitem__(items, k, dataclasses.replace(items[k], **{name: value}))
+
+
+def _set_pair(scene: Scene, words: list[str], name: str, value) -> None:
+    """Set a number of a pair. words: its two names, cut at dots."""
+    known = {one.name for one in scene.colliders}
+    cuts = [(".".join(words[:k]), ".".join(words[k:])) for k in range(1, len(words))]
+    pair = next((cut for cut in cuts if known.issuperset(cut)), cuts[0] if cuts else (words[0], ""))
+    scene.set_contact(*pair, **{name: value})
 
 
 def first_difference(before: Numbers, now: Numbers) -> str:

@@ -35,7 +35,8 @@ BAD_SCENES = [
 BAD_SETTINGS = [
     (["--set", "solver.newton_tolerence=1e-3"], "did you mean newton_tolerance?"),
     (["--set", "solver.contact_solver=augmented_lagrangian"], "does not fit symplectic_euler: use 'auto' or "),
-    (["--set", "gravity=3"], "write solver.KEY=VALUE"),
+    (["--set", "young=3"], "the scene has no number 'young' (did you mean beam.young?)"),
+    (["--set", "gravity=3,1"], "scene: gravity must have shape (3,), not (2,)"),
     (["--set", "solver.dt=1 ms"], "'1 ms' is not a number"),
     (["--seconds", "nan"], "seconds must be finite, not nan"),
     (["--fps", "-30"], "fps must be greater than 0, not -30.0"),

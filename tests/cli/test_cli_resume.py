@@ -157,7 +157,7 @@ def test_other_scenes_and_numbers_are_refused(begun, tmp_path, capsys):
     arguments = ("--out", tmp_path / "new", "--resume", out / "checkpoint.npz", "--seconds", "0.15")
     for text, message in (
         (BEAM, "is a checkpoint of another scene, which differs in body 'beam': constraints"),
-        (GENTLE.replace("young=1e5", "young=2e5"), "body 'beam': young is 200000.0 in this scene and was 100000.0 at the start"),
+        (GENTLE.replace("young=1e5", "young=2e5"), "beam.young is 200000.0 in this scene and was 100000.0 at the start"),
     ):
         capsys.readouterr()
         assert run(write(tmp_path / "other.py", text), *arguments) == 2
