@@ -4,9 +4,8 @@ each body."""
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from taisoft.errors import SimulationError
 from taisoft.records import StepReport
-from taisoft.scene.checks import nearest
+from taisoft.scene import checks
 
 if TYPE_CHECKING:
     from taisoft.simulator import Simulator
@@ -33,10 +32,9 @@ def details_of(sim: "Simulator", wanted: tuple[str, ...]) -> dict[str, float]:
 
 
 def detailed(sim: "Simulator", wanted: tuple[str, ...], on_step: Callable | None) -> Callable[[StepReport, float], None]:
-    """Return an `on_step` of `run` that fills the details of each report, then calls the given one. Raises SimulationError."""
+    """Return an `on_step` of `run` that fills the details of each report, then calls the given one. Raises SceneError."""
     for name in wanted:
-        if name not in DETAILS:
-            raise SimulationError(f"details: {name!r} is not one of {', '.join(DETAILS)}{nearest(str(name), DETAILS)}")
+        checks.choice(name, "details", DETAILS)
 
     def fill(report: StepReport, seconds: float) -> None:
         report.details = details_of(sim, wanted)

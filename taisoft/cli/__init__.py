@@ -37,7 +37,7 @@ def main(argv: list[str] | None = None) -> int:
     """
     parser = command_parser()
     if "_ARGCOMPLETE" in os.environ:
-        import_module("taisoft.cli.completion").complete(parser)
+        import_module("argcomplete").autocomplete(parser)
     arguments = parser.parse_args(argv)
     try:
         module, function = arguments.command
@@ -183,7 +183,7 @@ def command_parser() -> argparse.ArgumentParser:
     ).add_argument
     option("--precision", choices=("f32", "f64"), help="of all kernels (default: simulations f32, statics f64)")
 
-    option = add("completion", ("completion", "completion"), "print a shell's script for completion (extra 'completion')")
+    option = add("completion", ("scene_file", "completion"), "print a shell's script for completion (extra 'completion')")
     option.add_argument("shell", choices=("bash", "zsh", "fish"), help="where to use it")
 
     option = add("bench", ("scene_file", "bench"), "run a benchmark; without a name, list them", add_help=False).add_argument
@@ -277,5 +277,6 @@ def _add_study(add) -> None:
 
 
 def _add_scene_name(option, others: str = "a .toml scene file or a .py file with build()") -> None:
-    option("scene", metavar="SCENE", help=f"a demo's name (see `taisoft list`), {others}")
+    scene = option("scene", metavar="SCENE", help=f"a demo's name (see `taisoft list`), {others}")
+    scene.completer = lambda **given: import_module("taisoft.cli.scene_file").fitting_scenes(**given)
     option("--allow-outside", action="store_true", help="let a .toml file name mesh files outside its folder")

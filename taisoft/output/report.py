@@ -14,6 +14,7 @@ import os
 import platform
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import TextIO
 
@@ -38,7 +39,8 @@ def write_report(folder: str | Path, result: RunReport, *, resumed: dict | None 
     the run. Values may be plain, NumPy, paths or dataclasses; anything else is written as its text.
     """
     folder = Path(folder)
-    earlier = ([], []) if resumed is None else _rows_until(folder / "steps.csv", resumed["time"])
+    end = -math.inf if resumed is None else resumed["time"] * (1.0 + 1e-12)
+    earlier = read_table(folder / "steps.csv", lambda row: float(row[0]) <= end)
     write_bytes(folder / "steps.csv", steps_csv(result.step_reports, earlier).encode())
     record = {f.name: getattr(result, f.name) for f in dataclasses.fields(result) if f.name != "step_reports"}
     record |= {"extremes": extremes(result.step_reports), "resumed": resumed, **entries}
@@ -98,24 +100,24 @@ def steps_csv(reports: list[StepReport], earlier: tuple[list[str], list[list[str
 
     earlier: an earlier header with its rows. Details that these did not have are 0 there if they had others of that kind.
     """
-    text, before, own = io.StringIO(newline=""), earlier[0][len(COLUMNS) :], headings(reports)
+    header, rows = earlier if earlier[0][: len(COLUMNS)] == COLUMNS and earlier[1] else ([], [])
+    text, before, own = io.StringIO(newline=""), header[len(COLUMNS) :], headings(reports)
     new, kinds = [heading for heading in own if heading not in before], {heading.split()[0] for heading in before}
     filled = [0.0 if heading.split()[0] in kinds else "" for heading in new]
     writer = csv.writer(text)
-    writer.writerows([[*COLUMNS, *before, *new], *([*row, *filled] for row in earlier[1])])
+    writer.writerows([[*COLUMNS, *before, *new], *([*row, *filled] for row in rows)])
     for report in reports:
         row = [getattr(report, name) if name != "problems" else "; ".join(report.problems) for name in COLUMNS]
         writer.writerow([*row, *(report.details.get(heading, 0.0 if own else "") for heading in (*before, *new))])
     return text.getvalue()
 
 
-def _rows_until(path: Path, end: float) -> tuple[list[str], list[list[str]]]:
-    """Return the header of an earlier run's steps.csv and its rows up to time `end` [s]; nothing if there are no such columns."""
+def read_table(path: Path, is_kept: Callable[[list[str]], bool]) -> tuple[list[str], list[list[str]]]:
+    """Return the header of an earlier run's CSV file and the rows that are kept; nothing if there is no such file."""
     try:
         with open(path, newline="", encoding="utf-8") as file:
             header, *rows = csv.reader(file)
-        kept = [row for row in rows if float(row[0]) <= end * (1.0 + 1e-12)]
-        return (header, kept) if header[: len(COLUMNS)] == COLUMNS else ([], [])
+        return header, [row for row in rows if is_kept(row)]
     except (OSError, ValueError, IndexError, csv.Error):
         return [], []
 

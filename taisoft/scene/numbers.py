@@ -1,6 +1,7 @@
 """The numbers of a scene by name, such as "beam.young": what checkpoints hold and compare, and `taisoft run --set` sets."""
 
 import dataclasses
+import re
 import reprlib
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -20,13 +21,8 @@ from taisoft.scene.scene import Scene
 Numbers = dict[str, float | list | np.ndarray | None]  # of a scene, by name
 Entry = tuple[str, float | list | np.ndarray | None, Callable]  # name, value, and the call that sets it
 NUMBERS = tuple(field.name for field in dataclasses.fields(Material) if field.name != "law")
-LIMITS = {  # of the numbers of obstacles and connections
-    "friction": {"minimum": 0.0},
-    "restitution": {"minimum": 0.0, "maximum": 1.0},
-    "stiffness": {"above": 0.0, "unit": "N/m"},
-    "rest_length": {"minimum": 0.0, "unit": "m"},
-    "damping": {"minimum": 0.0, "unit": "N s/m"},
-}
+LIMITS = dict.fromkeys(("friction", "rest_length", "damping"), {"minimum": 0.0}) | {"stiffness": {"above": 0.0}}
+LIMITS |= {"restitution": {"minimum": 0.0, "maximum": 1.0}}  # of the numbers of obstacles and connections
 
 
 def scene_numbers(scene: Scene) -> Numbers:
@@ -44,11 +40,11 @@ def set_numbers(scene: Scene, numbers: Numbers) -> None:
     """
     calls = {known: assign for known, _, assign in _entries(scene)}
     for name, value in numbers.items():
-        kind, *pair = name.split(".")
+        pair = re.fullmatch(r"contact\.(.+\..+)\.(friction|restitution)", name)
         if name in calls:
             calls[name](value)
-        elif kind == "contact" and pair[-1:] in (["friction"], ["restitution"]):
-            _set_pair(scene, pair[:-1], pair[-1], value)
+        elif pair:
+            _set_pair(scene, *pair.groups(), value)
         else:
             hint = checks.nearest(name, calls) or f"; there are {', '.join(list(calls)[:3])} and {len(calls) - 3} more"
             raise SceneError(f"the scene has no number {name!r}{hint}")
@@ -72,9 +68,9 @@ def _entries(scene: Scene) -> Iterator[Entry]:
                 if (value := vars(one).get(name)) is not None and one not in scene.exact_attachments:
                     yield f"{one.name}.{name}", value, partial(_set_in, scene, kind, k, name)
     for names, pair in scene.contact_pairs.items():
+        ends = f"{min(names)}.{max(names)}"
         for name, value in zip(("friction", "restitution"), pair):
-            ends = [min(names), max(names)]
-            yield f"contact.{'.'.join(ends)}.{name}", value, partial(_set_pair, scene, ends, name)
+            yield f"contact.{ends}.{name}", value, partial(_set_pair, scene, ends, name)
 
 
 def _of_material(body: Body) -> Iterator[Entry]:
@@ -115,12 +111,10 @@ def _set_in(scene: Scene, kind: str, k: int, name: str, value) -> None:
     list.__setitem__(items, k, dataclasses.replace(items[k], **{name: value}))
 
 
-def _set_pair(scene: Scene, words: list[str], name: str, value) -> None:
-    """Set a number of a pair. words: its two names, cut at dots."""
-    known = {one.name for one in scene.colliders}
-    cuts = [(".".join(words[:k]), ".".join(words[k:])) for k in range(1, len(words))]
-    pair = next((cut for cut in cuts if known.issuperset(cut)), cuts[0] if cuts else (words[0], ""))
-    scene.set_contact(*pair, **{name: value})
+def _set_pair(scene: Scene, ends: str, name: str, value) -> None:
+    """Set a number of a pair. ends: its names, with a dot between them."""
+    first = max((one.name for one in scene.colliders if ends.startswith(f"{one.name}.")), key=len, default=ends.partition(".")[0])
+    scene.set_contact(first, ends[len(first) + 1 :], **{name: value})
 
 
 def first_difference(before: Numbers, now: Numbers) -> str:

@@ -21,7 +21,7 @@ import numpy as np
 
 from taisoft.errors import OutputError
 from taisoft.view.colouring import TITLES, UNITS, Colouring, colours_of
-from taisoft.view.plots import CAPACITY, ENERGIES, FEW, GRID_LINES, PLOTS, Curves, Plots
+from taisoft.view.plots import CAPACITY, COLOURS, ENERGIES, GRID_LINES, PLOTS, Curves, Plots
 
 HEIGHT = 720.0  # of the picture that lengths refer to
 MARGIN, WIDTH = 16, 300  # of the plots
@@ -42,7 +42,9 @@ BOX_COLOUR = (0.97, 0.975, 0.98)
 REFRESH = 0.2  # time between updates of the curves [s]
 LIGHTER = 0.55  # blend of a curve's colour towards white for its numbers, which have a dark background
 MAX_BOXES = len(PLOTS)
-MAX_SEGMENTS = sum(4 + 2 * GRID_LINES + (FEW if plot.each else len(plot.series)) * 2 * CAPACITY for plot in PLOTS.values())
+MAX_SEGMENTS = sum(
+    4 + 2 * GRID_LINES + (len(COLOURS) if plot.many else len(plot.series)) * 2 * CAPACITY for plot in PLOTS.values()
+)
 LINE_LENGTH = 22  # of a name and its number, in letters
 
 

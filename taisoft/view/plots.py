@@ -8,7 +8,7 @@ The history takes constant memory: minimum and maximum of every quantity over bi
 until CAPACITY bins are full. Then neighbours are merged in pairs, and from there on a bin holds twice as many steps. So no peak
 is lost, however long a simulation runs, and early and late steps have the same resolution.
 
-Some plots show a quantity of each pair that presses, or of each body: the FEW largest. It is recorded from when one is shown.
+Some plots show a quantity of each pair that presses, or of each body: the few largest. It is recorded from when one is shown.
 """
 
 import math
@@ -21,8 +21,8 @@ from taisoft.records import ERROR_KINDS, ErrorEstimate, StepReport
 from taisoft.scene.checks import nearest
 from taisoft.view.colouring import round_up
 
-FEW = 4  # curves of a plot by pair or body
 BLUE, ORANGE, GREEN, DARK = (0.16, 0.42, 0.74), (0.87, 0.42, 0.13), (0.20, 0.56, 0.28), (0.30, 0.30, 0.36)  # sRGB
+COLOURS = (BLUE, ORANGE, GREEN, DARK)  # of a plot with curves by pair or body, as many as it shows
 GRID_LINES = 4  # at most, between the ends of an axis
 MIN_SPAN = 1e-200  # values that span less count as constant
 MAX_DECADES = 12  # of a logarithmic axis; smaller values, and zero, lie on its lower end
@@ -33,7 +33,6 @@ ENERGIES = ("kinetic", "elastic", "gravity")  # [J]
 SOLVERS = ("newton_residual", "contact_residual", "newton_iterations", "linear_iterations", "contact_iterations", "n_contacts")
 ERRORS = tuple(f"{kind}_error" for kind in ERROR_KINDS)  # over the largest excursion, in percent
 QUANTITIES = (*ENERGIES, "total", *SOLVERS, "step_time", *ERRORS)  # energies as changes since the start, wall time in [ms]
-Named = dict[str, dict[str, float]]  # plot by pair or body -> name -> value
 
 
 @dataclass(frozen=True)
@@ -48,16 +47,13 @@ class Series:
 
 @dataclass(frozen=True)
 class Plot:
-    """Curves that share an axis. log: whether it is logarithmic; each: "pair" or "body" if there is a curve for each, or "".
-
-    Such a plot has one series, for all of them.
-    """
+    """Curves that share an axis. log: whether it is logarithmic; many: whether its series stands for one of each pair or body."""
 
     title: str
     unit: str
     series: tuple[Series, ...]
     log: bool = False
-    each: str = ""
+    many: bool = False
 
 
 PLOTS = {
@@ -87,18 +83,18 @@ PLOTS = {
         tuple(Series(name, f"{name}_error", colour, "error") for name, colour in zip(ERROR_KINDS, (BLUE, ORANGE, GREEN))),
         log=True,
     ),
-    "forces": Plot("force of each pair", "N", (Series("", "forces", DARK, "contact"),), each="pair"),
-    "kinetic": Plot("kinetic energy of each body", "J", (Series("", "kinetic", DARK),), each="body"),
-    "elastic": Plot("elastic energy of each body", "J", (Series("", "elastic", DARK),), each="body"),
+    "forces": Plot("force of each pair", "N", (Series("", "forces", DARK, "contact"),), many=True),
+    "kinetic": Plot("kinetic energy of each body", "J", (Series("", "kinetic", DARK),), many=True),
+    "elastic": Plot("elastic energy of each body", "J", (Series("", "elastic", DARK),), many=True),
 }
 
 
 class History:
     """Minima and maxima of quantities over bins of steps.
 
-    times: (n,) ends of the bins [s]; low, high: (n, k) minima and maxima over each, NaN if unknown; columns: (k,) their names,
-    QUANTITIES, then "forces: a, b" and the like of plots by pair or body; last: (k,) values of the last step; begin: time of the
-    start [s].
+    times: (n,) ends of the bins [s]; low, high: (n, k) minima and maxima over each, NaN if unknown; columns: (k,) names,
+    QUANTITIES, then those by pair or body, such as "forces: a, b"; last: (k,) values of the last step; begin: time of the start
+    [s].
     """
 
     def __init__(self, capacity: int = CAPACITY):
@@ -141,12 +137,12 @@ class History:
         explicit: bool,
         touching: bool,
         errors: ErrorEstimate | None = None,
-        named: Named | None = None,
+        **more: float,
     ) -> None:
         """Record a step, or a batch of explicit steps.
 
-        seconds: its total wall time [s]; touching: whether contact forces are simulated; errors: so far, if estimated; named: of
-        plots by pair or body, where a pair that is not in there has 0. Quantities not simulated are NaN.
+        seconds: its total wall time [s]; touching: whether contact forces are simulated; errors: so far, if estimated; more:
+        columns by pair or body, 0 for those that other steps had. Quantities not simulated are NaN.
         """
         energies = _energies(report) - self._start_energies
         solved, touched = (np.nan if explicit else 1.0), (1.0 if touching else np.nan)
@@ -167,20 +163,14 @@ class History:
                 ),
             ]
         )
-        row = np.concatenate([row, self._named(named or {})])
+        new = [name for name in more if name not in self.columns]
+        self.columns += new
+        self._low, self._high = (np.pad(a, ((0, 0), (0, len(new))), constant_values=np.nan) for a in (self._low, self._high))
+        row = np.concatenate([row, [more.get(name, 0.0) for name in self.columns[len(QUANTITIES) :]]])
         half = np.zeros(len(row))
         if errors is not None and errors.energies is not None:
             half[:4] = np.abs([*_energies(errors.energies), errors.energies.total])
         self._append(report.time, np.where(np.isfinite(row), row, np.nan), half)
-
-    def _named(self, named: Named) -> list[float]:
-        """Return the values of the columns after QUANTITIES, of which new ones are added."""
-        values = {f"{plot}: {name}": value for plot, own in named.items() for name, value in own.items()}
-        new = [column for column in values if column not in self.columns]
-        unknown = np.full((len(self._times), len(new)), np.nan)
-        self._low, self._high = np.hstack([self._low, unknown]), np.hstack([self._high, unknown])
-        self.columns += new
-        return [values.get(name, 0.0 if name.split(":")[0] in named else np.nan) for name in self.columns[len(QUANTITIES) :]]
 
     def _append(self, time: float, row: np.ndarray, half: np.ndarray) -> None:
         """Append a row, with half the width of each band."""
@@ -228,22 +218,21 @@ class Curves:
 
 def plain_history(history: History) -> dict:
     """Return the arrays of a history as plain data, only with the columns that plots can show."""
-    shown = [history.columns.index(s.quantity) for plot in PLOTS.values() for s in series_of(plot, history)]
-    used = [*range(len(QUANTITIES)), *(column for column in shown if column >= len(QUANTITIES))]
+    columns = [*QUANTITIES, *(s.quantity for plot in PLOTS.values() if plot.many for s in series_of(plot, history))]
+    used = [history.columns.index(name) for name in columns]
     parts = {"low": history.low[:, used], "high": history.high[:, used], "last": history.last[used]}
-    return {"times": history.times, "begin": history.begin, "columns": [history.columns[k] for k in used], **parts}
+    return {"times": history.times, "begin": history.begin, "columns": columns, **parts}
 
 
 def series_of(plot: Plot, history) -> tuple[Series, ...]:
-    """Return the series of a plot, of one by pair or body those with the FEW largest values."""
-    if not plot.each:
+    """Return the series of a plot, of one by pair or body the few with the largest values."""
+    if not plot.many:
         return plot.series
     kind = f"{plot.series[0].quantity}: "
     own = [k for k, name in enumerate(history.columns) if name.startswith(kind)]
-    largest = np.fmax.reduce(history.high[:, own], axis=0, initial=0.0)
-    few = [own[k] for k in sorted(np.argsort(-largest, kind="stable")[:FEW])]
-    names = [history.columns[k] for k in few]
-    return tuple(Series(name.removeprefix(kind), name, colour) for name, colour in zip(names, (BLUE, ORANGE, GREEN, DARK)))
+    largest = np.argsort(-np.fmax.reduce(history.high[:, own], axis=0, initial=0.0), kind="stable")[: len(COLOURS)]
+    names = [history.columns[own[k]] for k in sorted(largest)]
+    return tuple(Series(name.removeprefix(kind), name, colour) for name, colour in zip(names, COLOURS))
 
 
 class PlotChoice:
@@ -279,7 +268,7 @@ class PlotChoice:
         """Hide all plots, or show those shown last again; if there were none, all available ones but those by pair or body."""
         visible = self.visible()
         available = self.available()
-        common = [name for name, plot in available.items() if not plot.each]
+        common = [name for name, plot in available.items() if not plot.many]
         chosen = () if visible else [name for name in self._last_shown if name in available] or common
         self._last_shown = tuple(visible) or self._last_shown
         self.shown = {name: name in chosen for name in PLOTS}
@@ -317,16 +306,15 @@ class Plots(PlotChoice):
             self.history.start(self._sim)
         else:
             errors = self._sim.error_so_far if self._errors else None
-            self.history.take(report, seconds, self._sim.settings.explicit, self._touching, errors, self._named())
+            self.history.take(report, seconds, self._sim.settings.explicit, self._touching, errors, **self._by_name())
 
-    def _named(self) -> Named:
-        """Return the present quantities of the watched plots by pair or body: forces [N] and energies [J]."""
-        sim, found = self._sim, {}
-        if "forces" in self.watched:
-            found["forces"] = {f"{a}, {b}": float(np.linalg.norm(sim.contact_force(a, b))) for a, b in sim.pairs_in_contact()}
-        if kinds := self.watched & {"kinetic", "elastic"}:
-            energies = dict(zip((body.name for body in sim.scene.bodies), sim._open().body_energies()))
-            found |= {kind: {name: getattr(one, kind) for name, one in energies.items()} for kind in sorted(kinds)}
+    def _by_name(self) -> dict[str, float]:
+        """Return the columns of the watched plots by pair or body: forces [N] and energies [J]."""
+        sim, found, kinds = self._sim, {}, sorted(self.watched & {"kinetic", "elastic"})
+        for a, b in sim.pairs_in_contact() if "forces" in self.watched else ():
+            found[f"forces: {a}, {b}"] = float(np.linalg.norm(sim.contact_force(a, b)))
+        for body, energies in zip(sim.scene.bodies, sim._open().body_energies()) if kinds else ():
+            found |= {f"{kind}: {body.name}": getattr(energies, kind) for kind in kinds}
         return found
 
     def restart(self) -> None:
