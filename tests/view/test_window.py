@@ -20,7 +20,7 @@ from taisoft.view.link import Link, LinkClosed, SharedNodes, receive
 connection = Connection(int(sys.argv[1]))
 description = receive(connection, None)
 link = Link(connection, SharedNodes(description["n_nodes"], description["slots"], int(sys.argv[2])))
-request = {"number": 0, "commands": [], "confirmed": 0, "colour": "body", "layers": [], "plots": False}
+request = {"number": 0, "commands": [], "confirmed": 0, "colour": "body", "layers": [], "plots": []}
 """
 OPEN = START + "link.send({'open': True})\n"
 SHOWN = {"status": "", "messages": []}
