@@ -280,7 +280,7 @@ def cells(plots: Plots, size: tuple[int, int]) -> list[Cell]:
     """Lay out the visible plots from the top down, as many as fit in a window of size (width, height)."""
     found, top = [], GAP
     for curves in [plots.curves(name) for name in plots.visible()]:
-        height = TITLE + LINE * (len(curves.legend) + 2)
+        height = TITLE + LINE * (len(_legend_lines(curves)) + 2)
         left = size[0] - GAP - BOX
         if top + height > size[1] or left - TEXT < 0:
             break
@@ -312,9 +312,17 @@ def write(gui, shown: list[Cell], opened: tuple[int, int]) -> None:
         curves, (left, top, width, height) = cell.curves, cell.text
         rectangle = left / opened[0], top / opened[1], width / opened[0], height / opened[1]
         with gui.sub_window(f"{curves.title}##{cell.text}", *rectangle) as page:
-            for name, value, colour in curves.legend:
-                lighter = tuple(LIGHTER + (1 - LIGHTER) * c for c in colour)
-                short = f"{name[: LINE_LENGTH - 1 - len(value)]:9}"
-                page.text(f"{short}{value:>{LINE_LENGTH - len(short)}}", color=lighter)
+            for text, colour in _legend_lines(curves):
+                page.text(text, color=tuple(LIGHTER + (1 - LIGHTER) * c for c in colour))
             page.text(f"axis {curves.ends[0]} to {curves.ends[1]}")
             page.text(f"time {curves.times[0]:.4g} to {curves.times[1]:.4g} s")
+
+
+def _legend_lines(curves: Curves) -> list[tuple[str, tuple]]:
+    """Return the lines of the legend with their colours: a long name has one of its own."""
+    lines = []
+    for name, value, colour in curves.legend:
+        fits = len(name) + len(value) < LINE_LENGTH
+        lines += [((name if fits else "").ljust(LINE_LENGTH - len(value)) + value, colour)]
+        lines[-1:-1] = [] if fits else [(name, colour)]
+    return lines

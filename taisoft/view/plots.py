@@ -83,9 +83,9 @@ PLOTS = {
         tuple(Series(name, f"{name}_error", colour, "error") for name, colour in zip(ERROR_KINDS, (BLUE, ORANGE, GREEN))),
         log=True,
     ),
-    "forces": Plot("force of each pair", "N", (Series("", "forces", DARK, "contact"),), many=True),
-    "kinetic": Plot("kinetic energy of each body", "J", (Series("", "kinetic", DARK),), many=True),
-    "elastic": Plot("elastic energy of each body", "J", (Series("", "elastic", DARK),), many=True),
+    "forces": Plot("force by pair", "N", (Series("", "forces", DARK, "contact"),), many=True),
+    "kinetic": Plot("kinetic energy by body", "J", (Series("", "kinetic", DARK),), many=True),
+    "elastic": Plot("elastic energy by body", "J", (Series("", "elastic", DARK),), many=True),
 }
 
 
