@@ -42,7 +42,7 @@ def scene_fingerprint(scene: Scene, features: dict[str, bool]) -> dict[str, str]
 
 def scene_digest(scene: Scene) -> str:
     """Return a digest of everything comparable in a scene: its parts as a checkpoint compares them, and its numbers."""
-    numbers = json.dumps(scene_numbers(scene), default=lambda array: digest([array]))
+    numbers = json.dumps(scene_numbers(scene), default=lambda array: digest([array]), sort_keys=True)
     return digest([json.dumps(scene_fingerprint(scene, {})), numbers, scene.allow_initial_overlap])
 
 
