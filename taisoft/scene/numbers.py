@@ -62,10 +62,11 @@ def _entries(scene: Scene) -> Iterator[Entry]:
     for one in scene.tendons:
         value = None if one.value is None else float(one.value)
         yield f"{one.name}.{one.given}", value, partial(change_tendon, scene, one.given, one.name)
+    exact = scene.exact_attachments
     for kind in ("obstacles", "springs", "tendons", "attachments"):
         for k, one in enumerate(getattr(scene, kind)):
             for name in LIMITS:
-                if (value := vars(one).get(name)) is not None and one not in scene.exact_attachments:
+                if (value := vars(one).get(name)) is not None and one not in exact:
                     yield f"{one.name}.{name}", value, partial(_set_in, scene, kind, k, name)
     for names, pair in scene.contact_pairs.items():
         ends = f"{min(names)}.{max(names)}"
