@@ -23,10 +23,9 @@ from taisoft.attributes import thawed
 from taisoft.errors import SceneError, SimulationError
 from taisoft.files import replacing
 from taisoft.nested import join_arrays, part_arrays
-from taisoft.scene.fingerprint import FEATURES, digest, run_time_numbers, scene_fingerprint
-from taisoft.scene.plan import LOADS, Numbers, change_load, change_tendon, first_difference, scene_numbers
-from taisoft.scene.rigid import RigidBody
-from taisoft.scene.scene import Material, Scene
+from taisoft.scene.fingerprint import FEATURES, digest, scene_fingerprint
+from taisoft.scene.numbers import Numbers, first_difference, scene_numbers, set_numbers
+from taisoft.scene.scene import Scene
 from taisoft.settings import NAMES, plan_of
 
 if TYPE_CHECKING:
@@ -44,14 +43,14 @@ class _UnfitContent(Exception):
 class Checkpoint:
     """Content of a checkpoint file.
 
-    settings: arguments of Simulator; numbers: the scene's run-time numbers, of which those by tet are arrays; start: those
-    numbers and the load values at the start of the run; fingerprint: digests of the scene's parts by name; state: nested dict
-    of numbers and arrays; notes: the writer's own plain data.
+    settings: arguments of Simulator; numbers: those of the scene, see `scene_numbers`; start: those at the start of the run;
+    fingerprint: digests of the scene's parts by name; state: nested dict of numbers and arrays; notes: the writer's own plain
+    data.
     """
 
     path: Path
     settings: dict
-    numbers: dict
+    numbers: Numbers
     start: Numbers
     fingerprint: dict[str, str]
     state: dict
@@ -78,7 +77,7 @@ def write_checkpoint(
         "taisoft": __version__,
         "settings": settings,
         "state": part_arrays(state, arrays),
-        "numbers": part_arrays(run_time_numbers(scene), arrays, "numbers"),
+        "numbers": part_arrays(scene_numbers(scene), arrays, "numbers"),
         "start": part_arrays(scene_numbers(start or scene), arrays, "start"),
         "fingerprint": scene_fingerprint(start or scene, features),
         "notes": notes,
@@ -120,43 +119,15 @@ def check_scene(saved: Checkpoint, scene: Scene, features: dict[str, bool]) -> N
 
 
 def restore_numbers(saved: Checkpoint, scene: Scene) -> None:
-    """Set a scene's gravity, materials, contact pairs and loads from a checkpoint. Raises SceneError for invalid numbers."""
+    """Set the numbers of a scene that differ from a checkpoint's. Raises SceneError for invalid numbers."""
+    start, decided = scene_numbers(scene), [body.dilatation for body in scene.bodies]
+    changed = {name: value for name, value in saved.numbers.items() if not np.array_equal(value, start.get(name))}
     with thawed(scene, *scene.bodies):
-        scene.gravity = saved.numbers["gravity"]
-        for body, kept in zip(scene.bodies, saved.numbers["materials"]):
-            if isinstance(body, RigidBody):  # its numbers are those of the start
-                continue
-            materials = [Material(**material) for material in kept["materials"]]
-            by_region = dict(zip(body.composition.materials, materials, strict=True))
-            dilatation = body.dilatation  # decided at the start
-            body.material = by_region if body.composition.has_regions else materials[0]
-            for name, values in kept["by_tet"].items():
-                setattr(body, name, values)
+        set_numbers(scene, {name: value for name, value in changed.items() if value is not None})
+        for body, dilatation in zip(scene.bodies, decided):
             if body.dilatation != dilatation:
                 body.dilatation = dilatation
                 body.warn_locking(stacklevel=2)
-        scene.contact_pairs = {frozenset(names): (a, b) for names, a, b in saved.numbers["pairs"]}
-        for k, body in enumerate(scene.bodies):
-            for kind, name in LOADS.items():
-                for i in range(len(getattr(body, name))):
-                    value = saved.state["loads"][str(k)][kind][str(i)]
-                    if value is not None:
-                        change_load(body, kind, i, value)
-        for i, tendon in enumerate(scene.tendons):
-            value = saved.state["loads"]["tendons"][str(i)]
-            if value is not None:
-                change_tendon(scene, tendon.given, tendon.name, value)
-
-
-def load_values(scene: Scene) -> dict:
-    """Return the present values of all loads of a scene, None for one that follows its path, as part of a checkpoint's state."""
-    values = {
-        str(k): {kind: {str(i): load.value for i, load in enumerate(getattr(body, name))} for kind, name in LOADS.items()}
-        for k, body in enumerate(scene.bodies)
-    }
-    if scene.tendons:
-        values["tendons"] = {str(i): None if one.value is None else float(one.value) for i, one in enumerate(scene.tendons)}
-    return values
 
 
 def _checksum(header: np.ndarray, arrays: dict[str, np.ndarray]) -> np.ndarray:
@@ -251,8 +222,8 @@ def save_checkpoint(self: "Simulator", path: str | Path, notes: dict | None = No
     bad = dynamics.state.find_nonfinite()
     if bad is not None:
         raise SimulationError(f"no checkpoint is written of a state that is not finite: {bad}")
-    state = dynamics.snapshot() | {"loads": load_values(self.scene)}
-    write_checkpoint(path, dataclasses.asdict(self.settings), self.scene, self.plan.on, state, notes or {}, self._start_scene)
+    settings, state = dataclasses.asdict(self.settings), dynamics.snapshot()
+    write_checkpoint(path, settings, self.scene, self.plan.on, state, notes or {}, self._start_scene)
 
 
 def load_checkpoint(cls: type["Simulator"], path: str | Path, scene: Scene, arch: str | None = None) -> "Simulator":

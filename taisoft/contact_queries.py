@@ -55,34 +55,48 @@ def contact_force(self: "Simulator", name: str, other: str | None = None) -> np.
 
     It is the mean over the last step, also where that was cut into substeps. Raises SceneError for unknown names.
     """
-    if other is None:
-        return _contact_force_and_moment(self, name)[:3]
-    contact, scene = self._open().contact, self.scene
-    for one in (name, other):
-        scene.surface_of(one)
-    if name == other:
-        raise SceneError(f"contact_force: {name!r} exerts no net force on itself: name another body or obstacle")
-    names = [c.name for c in scene.colliders]
-    return np.zeros(3) if contact is None else contact.pair_force(names.index(name), names.index(other))
+    return _mean_contact(self, "contact_force", name, other)[:3]
 
 
-def contact_torque(self: "Simulator", name: str) -> np.ndarray:
-    """Return the torque (3,) of the contact forces on a body about its centre of mass, on an obstacle about its pivot, of the
-    last step [N m]."""
-    total, one = _contact_force_and_moment(self, name), self.scene.collider(name)
+def contact_torque(self: "Simulator", name: str, other: str | None = None) -> np.ndarray:
+    """Return the torque (3,) [N m] of `contact_force`: about a body's centre of mass, or an obstacle's pivot."""
+    found, one = _mean_contact(self, "contact_torque", name, other), self.scene.collider(name)
     if isinstance(one, Body):
         nodes, (x, _) = nodes_of(self, name), self._host().state.state()
         centre = np.average(x[nodes], axis=0, weights=gravity_mass(one))
     else:
         centre = one.shape.pivot + one.pose(self.time)[0]
-    return total[3:] - np.cross(centre, total[:3])
+    return found[3:6] - np.cross(centre, found[:3])
 
 
-def _contact_force_and_moment(sim: "Simulator", name: str) -> np.ndarray:
-    """Force [N] on a collider and its moment about the origin [N m], (6,)."""
+def slip_velocity(self: "Simulator", name: str, other: str | None = None) -> np.ndarray:
+    """Return the velocity (3,) [m/s] at which a body or an obstacle slips over `other`, or over all others.
+
+    It is the mean of the tangential relative velocity at their contacts in the last step, weighted by normal impulse; 0 where
+    nothing presses. Nodes have their velocity at the end of the step, of each of its substeps where it was cut, and an obstacle
+    moves by its displacement over that time. Of a thing that spins in place it is near 0. Raises SceneError for unknown names.
+    """
+    found = _mean_contact(self, "slip_velocity", name, other)
+    return found[6:9] / (found[9] or 1.0)
+
+
+def pairs_in_contact(self: "Simulator") -> list[tuple[str, str]]:
+    """Return the names of the two bodies, or body and obstacle, of each pair that pressed on each other in the last step."""
+    contact, names = self._open().contact, [c.name for c in self.scene.colliders]
+    return [] if contact is None else [(names[a], names[b]) for a, b in contact.pressing_pairs()]
+
+
+def _mean_contact(sim: "Simulator", what: str, name: str, other: str | None) -> np.ndarray:
+    """Return `ContactStep.mean_on` a collider, 0 without contacts. Raises SceneError for invalid names."""
     contact, scene = sim._open().contact, sim.scene
-    scene.surface_of(name)
-    return np.zeros(6) if contact is None else contact.force_and_moment([c.name for c in scene.colliders].index(name))
+    for one in (name, other):
+        if one is not None:
+            scene.collider(one)
+    if name == other:
+        raise SceneError(f"{what}: {name!r} exerts no net force on itself: name another body or obstacle")
+    names = [c.name for c in scene.colliders]
+    pair = names.index(name), None if other is None else names.index(other)
+    return np.zeros(10) if contact is None else contact.mean_on(*pair)
 
 
 def deepest_overlap(self: "Simulator") -> "Overlap | None":

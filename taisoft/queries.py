@@ -51,9 +51,13 @@ def momentum(self: "Simulator", body: str | None = None) -> np.ndarray:
     return sum((mass(one) @ self.velocities(one.name) for one in bodies), np.zeros(3))
 
 
-def energies(self: "Simulator") -> Energies:
-    """Return the energies of the present state [J]."""
-    return self._open().energies()
+def energies(self: "Simulator", body: str | None = None) -> Energies:
+    """Return the energies of the present state [J], or those of one body. Raises SceneError for an unknown name.
+
+    Of all bodies they add up to the whole, less what springs, tendons and attachments by springs store. The mass of nodes that
+    are attached exactly counts in the body that they are attached to.
+    """
+    return self._open().energies() if body is None else self._open().body_energies()[body_index(self, body)]
 
 
 def reactions(self: "Simulator", body: str | None = None) -> np.ndarray:

@@ -48,10 +48,12 @@ class StepReport:
     loads: float = 0.0  #: of dead loads, -sum f.x [J]
     converged: bool = True  #: residuals are within their tolerances
     problems: list[str] = field(default_factory=list)  #: sentences
+    details: dict[str, float] = field(default_factory=dict)  #: of a run with `details`, at the end, by heading in steps.csv
 
     def to_dict(self) -> dict:
-        """Return a row of steps.csv: the fields by name, problems joined with '; '."""
-        return {f.name: getattr(self, f.name) for f in fields(self)} | {"problems": "; ".join(self.problems)}
+        """Return a row of steps.csv: the fields by name, problems joined with '; ', and the details by heading."""
+        own = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "details"}
+        return own | {"problems": "; ".join(self.problems)} | self.details
 
     def __repr__(self) -> str:
         counts = {"Newton iterations": self.newton_iterations, "substeps": self.substeps - 1 and self.substeps}

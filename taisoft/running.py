@@ -8,6 +8,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from taisoft.commanding import refuse_commands
+from taisoft.details import detailed
 from taisoft.dynamics.newton_budget import watched
 from taisoft.energy_check import EnergyCheck
 from taisoft.errors import SimulationError, no_memory
@@ -59,27 +60,31 @@ def run(
     error: bool = False,
     error_mesh: "str | Scene | None" = None,
     on_iteration: IterationCallback | None = None,
+    details: tuple[str, ...] = (),
 ) -> RunReport:
     """Step for `seconds` [s] from now, to the nearest step, with frames at fps, or after every step if fps is None.
 
-    on_frame(sim, index, report): called for frame 0 (the start, report None) and after every frame. stop: called between
-    steps, and in long ones; True ends the run. dt is lowered once to the next divisor of 1/fps, or rounded to one within NEAR
-    of it, which the report notes. resumed: seconds and frames count from time 0, not from now; the first frame is `first_frame`.
+    on_frame(sim, index, report): called for frame 0 (the start, report None) and after every frame. stop: called between steps,
+    and in long ones; True ends the run. dt is lowered once to the next divisor of 1/fps, or rounded to one within NEAR of it,
+    which the report notes. resumed: seconds and frames count from time 0, not from now; the first frame is `first_frame`.
     on_step(report, seconds): called after every implicit step and every batch of explicit steps, with its wall time without
     compilation [s]. error: estimate the error of the positions by twins (`taisoft.estimation`), simulators that follow the run
     with other steps and tighter tolerances; the report holds it. error_mesh: also estimate the error of the mesh, by a twin on
     another one: "refined", "order" (the elements' other order), or the same scene on a mesh that shares nodes. on_iteration(n):
-    called a few times a second in implicit steps of more than 1 s of wall time, with their Newton iterations so far. A run that
-    fails, or that `stop` ends, does not raise: see the report's status and problems. Ctrl-C undoes the present step and is raised
-    as KeyboardInterrupt; `stop` alone ends a run in another thread than the main one. Raises SimulationError for bad arguments,
-    and for a twin that cannot be made. A simulator with a tolerance first chooses integrator and dt by pilots, unless the run is
-    resumed; the report then holds the error in time.
+    called a few times a second in implicit steps of more than 1 s of wall time, with their Newton iterations so far. details:
+    "pairs", "bodies" or both: each report then holds forces, torques and slip velocities of the pairs that pressed in its last
+    step, and kinetic and elastic energies of bodies, see `StepReport.details`. A run that fails, or that `stop` ends, does not
+    raise: see the report's status and problems. Ctrl-C undoes the present step and is raised as KeyboardInterrupt; `stop` alone
+    ends a run in another thread than the main one. Raises SimulationError for bad arguments, and for a twin that cannot be made.
+    A simulator with a tolerance first chooses integrator and dt by pilots, unless the run is resumed; the report then holds the
+    error in time.
     """
     if error_mesh is not None and not error:
         raise SimulationError("error_mesh needs error=True")
     seconds = check_positive("seconds", seconds, "s")
     fps = None if fps is None else check_positive("fps", fps, "1/s")
     check_length(seconds, sim.dt, fps)
+    on_step = detailed(sim, details, on_step) if details else on_step
     arguments = {"on_frame": on_frame, "on_step": on_step, "error": error, "error_mesh": error_mesh, "on_iteration": on_iteration}
     if sim.settings.tolerance is None or resumed:
         report = run_steps(sim, seconds, fps=fps, stop=stop, resumed=resumed, **arguments)

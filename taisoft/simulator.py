@@ -158,6 +158,8 @@ class Simulator(Guarded):
     contacts = contact_queries.contacts
     contact_force = contact_queries.contact_force
     contact_torque = contact_queries.contact_torque
+    slip_velocity = contact_queries.slip_velocity
+    pairs_in_contact = contact_queries.pairs_in_contact
     pose = queries.pose
     twist = queries.twist
     rigid_strain = queries.rigid_strain

@@ -35,7 +35,10 @@ def main(argv: list[str] | None = None) -> int:
     other exception is a bug in taisoft and keeps its traceback. Only the requested command's module is imported, so that
     `doctor` also works on a broken installation.
     """
-    arguments = command_parser().parse_args(argv)
+    parser = command_parser()
+    if "_ARGCOMPLETE" in os.environ:
+        import_module("argcomplete").autocomplete(parser)
+    arguments = parser.parse_args(argv)
     try:
         module, function = arguments.command
         return getattr(import_module(f"taisoft.cli.{module}"), function)(arguments)
@@ -183,6 +186,9 @@ def command_parser() -> argparse.ArgumentParser:
     option("scenes", metavar="SCENE", nargs="*", help="a demo's name, or a .toml or .py file")
     option("--precision", choices=("f32", "f64"), help="of all kernels (default: the scenes' own, and f64 of statics)")
 
+    option = add("completion", ("scene_file", "completion"), "print a shell's script for completion (extra 'completion')")
+    option.add_argument("shell", choices=("bash", "zsh", "fish"), help="where to use it")
+
     option = add("bench", ("scene_file", "bench"), "run a benchmark; without a name, list them", add_help=False).add_argument
     option("name", metavar="NAME", nargs="?", help="the benchmark's name")
     option("rest", nargs=argparse.REMAINDER, help="arguments of the benchmark itself")
@@ -208,8 +214,8 @@ def _add_run(add) -> None:
     option("--fps", type=float, metavar="N", help="frames per simulated second (default: the scene's, or 60)")
     option("--out", metavar="DIR", help="folder for the results; without it nothing is written")
     option("--overwrite", action="store_true", help="replace results already in DIR")
-    assignment = {"action": "append", "default": [], "dest": "assignments", "metavar": "solver.KEY=VALUE"}
-    option("--set", **assignment, help="a Simulator argument, e.g. solver.dt=0.01; may be repeated")
+    assignment = {"action": "append", "default": [], "dest": "assignments", "metavar": "NAME.NUMBER=VALUE"}
+    option("--set", **assignment, help="a number of scene or solver, e.g. beam.young=2e5 or solver.dt=0.01; may be repeated")
     option("--resume", metavar="CHECKPOINT", help="continue a run of this scene from its checkpoint, until --seconds in total")
     every = "write DIR/checkpoint.npz every T of simulated time [s], not only at the end"
     option("--checkpoint-every", type=float, metavar="T", help=every)
@@ -223,13 +229,16 @@ def _add_run(add) -> None:
     option("--vtu", action="store_true", help="also write every frame as a .vtu file, and scene.pvd, which ParaView opens")
     option("--npz", action="store_true", help="also write the nodes of every frame as a .npz file")
     option("--no-usd", action="store_true", help="write no scene.usdc")
+    details = "also write per step: pairs (forces, torques, slip velocities of what presses), bodies (their energies)"
+    option("--details", metavar="NAME,...", help=details)
     option("--error", action="store_true", help="estimate the error by runs with other steps and tolerances beside this one")
     option("--error-mesh", choices=("refined", "order"), help="also by one on another mesh; implies --error")
     colours = ("body", "stress", "stretch", "speed", "error")
     option("--colour", choices=colours, default="body", help="colouring of bodies in pictures and the window")
     layers = "what they show besides bodies: wires, contacts, tractions, pressures, connections, fixed_nodes, or none"
     option("--layers", metavar="NAME,...", help=layers)
-    option("--plots", metavar="NAME,...", help="plots over time: energies, residuals, iterations, contacts, step_time, error")
+    plots = "plots over time: energies, residuals, iterations, contacts, step_time, error, forces, kinetic, elastic"
+    option("--plots", metavar="NAME,...", help=plots)
     option("--caption", action="store_true", help="write scene, frame, time and energies on pictures")
     option("--no-frames", action="store_true", help="write no pictures")
     option("--verbose", action="store_true", help="print why each feature of the plan is on, and which are left out")
@@ -274,5 +283,6 @@ def _add_study(add) -> None:
 
 
 def _add_scene_name(option, others: str = "a .toml scene file or a .py file with build()") -> None:
-    option("scene", metavar="SCENE", help=f"a demo's name (see `taisoft list`), {others}")
+    scene = option("scene", metavar="SCENE", help=f"a demo's name (see `taisoft list`), {others}")
+    scene.completer = lambda **given: import_module("taisoft.cli.scene_file").fitting_scenes(**given)
     option("--allow-outside", action="store_true", help="let a .toml file name mesh files outside its folder")

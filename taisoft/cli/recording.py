@@ -8,6 +8,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
+from taisoft.details import DETAILS
 from taisoft.errors import OutputError, SceneError
 from taisoft.output.camera import MAX_ELEVATION
 from taisoft.output.files import RESULT_FILES, RESULT_FOLDERS, CheckpointWriter, OutputFolder
@@ -34,7 +35,7 @@ class DisplayOptions:
 
     size: of pictures [pixels]; slow: film time over simulated time; view: azimuth and elevation of the camera [deg], or None.
     window, pictures, usd, vtu, npz: whether there is a window, and what is written to the folder; errors: whether they are
-    estimated.
+    estimated. details: names, of steps.csv.
     """
 
     window: bool
@@ -47,6 +48,7 @@ class DisplayOptions:
     plots: tuple[str, ...]
     caption: str | None
     errors: bool
+    details: tuple[str, ...] = ()
     size: tuple[int, int] = SIZE
     slow: float = 1.0
     view: tuple[float, float] | None = None
@@ -66,6 +68,7 @@ def display_options(arguments: Namespace, has_window: bool) -> DisplayOptions:
     """Return the requested display options. Raises SceneError for unknown names and for options that nothing would show."""
     pictures = arguments.out is not None and not arguments.no_frames
     layers, plots = _names("layers", arguments.layers, LAYERS), _names("plots", arguments.plots, PLOTS) or ()
+    details = _names("details", arguments.details, DETAILS) or ()
     requested = {"video": arguments.video, "caption": arguments.caption}
     requested |= {"size": arguments.size is not None, "view": arguments.view is not None}
     if not has_window:
@@ -73,7 +76,7 @@ def display_options(arguments: Namespace, has_window: bool) -> DisplayOptions:
     for option, given in requested.items():
         if given and not pictures:
             raise SceneError(f"--{option} needs --out, the folder to write to, and pictures, so it excludes --no-frames")
-    for option, given in {"vtu": arguments.vtu, "npz": arguments.npz}.items():
+    for option, given in {"vtu": arguments.vtu, "npz": arguments.npz, "details": details}.items():
         if given and arguments.out is None:
             raise SceneError(f"--{option} needs --out, the folder to write to")
     if pictures and (plots or arguments.caption) and text_missing():
@@ -89,7 +92,7 @@ def display_options(arguments: Namespace, has_window: bool) -> DisplayOptions:
     slow = checks.number(1.0 if arguments.slow is None else arguments.slow, "--slow", above=0.0)
     files = pictures, not arguments.no_usd, arguments.vtu, arguments.npz
     return DisplayOptions(
-        has_window, *files, arguments.colour, layers, plots, caption, errors, size, slow, _view_of(arguments.view)
+        has_window, *files, arguments.colour, layers, plots, caption, errors, details, size, slow, _view_of(arguments.view)
     )
 
 
@@ -128,9 +131,11 @@ def _names(option: str, text: str | None, known) -> tuple[str, ...] | None:
 
 
 def check_modelled(shown: DisplayOptions, sim) -> None:
-    """Raise SceneError for a layer or plot of a feature that sim does not model."""
-    if "contacts" in (shown.layers or ()) and not sim.plan.on["contact_forces"]:
-        raise SceneError(f"--layers contacts: contact forces are not modelled ({sim.plan.why('contact_forces')})")
+    """Raise SceneError for a layer, plot or detail of a feature that sim does not model."""
+    asked = {"layers contacts": "contacts" in (shown.layers or ()), "details pairs": "pairs" in shown.details}
+    for option, given in asked.items():
+        if given and not sim.plan.on["contact_forces"]:
+            raise SceneError(f"--{option}: contact forces are not modelled ({sim.plan.why('contact_forces')})")
     Plots(sim, shown.plots, shown.errors)
     if "fixed_nodes" in (shown.layers or ()) and not sim.plan.on["fixed_nodes"]:
         print(f"taisoft: --layers fixed_nodes: no node is fixed{NO_BALLS * sim.plan.on['moving_nodes']}", file=sys.stderr)

@@ -24,6 +24,7 @@ from taisoft.output.files import check_free, read_last_good
 from taisoft.output.report import Progress
 from taisoft.records import RunReport
 from taisoft.scene import checks
+from taisoft.scene.numbers import set_numbers
 from taisoft.scene.scene import Scene
 from taisoft.simulator import Simulator
 from taisoft.view.ggui import display_missing, vulkan_missing
@@ -42,7 +43,8 @@ MAY_CHANGE = ("dt", "arch")  # arguments of Simulator that may change when a run
 class RunSettings:
     """Settings of a run. simulator: arguments of Simulator; seconds [s]; fps [1/s], None for a frame per step.
 
-    defaults: Simulator's own; changed: for a resumed run, the arguments that replace the checkpoint's.
+    defaults: Simulator's own; changed: for a resumed run, the arguments that replace the checkpoint's; numbers: of the scene, by
+    --set.
     """
 
     simulator: dict
@@ -50,10 +52,11 @@ class RunSettings:
     fps: float | None
     defaults: dict
     changed: list[str] = field(default_factory=list)
+    numbers: dict = field(default_factory=dict)
 
     def as_dict(self) -> dict:
         """Return every setting of the run by name, given or default."""
-        return self.defaults | self.simulator | {"seconds": self.seconds, "fps": self.fps}
+        return self.defaults | self.simulator | {"seconds": self.seconds, "fps": self.fps, "set": self.numbers}
 
 
 def run(arguments: Namespace) -> int:
@@ -61,6 +64,7 @@ def run(arguments: Namespace) -> int:
     _check_working_folder()
     with Signals() as signals, printed_warnings() as warned:
         scene, solver = load_scene(arguments.scene, arguments.allow_outside)
+        numbers = set_given(scene, arguments.assignments)
         warn_millimetres({body.name: body.mesh for body in scene.bodies})
         _check_checkpoint_interval(arguments)
         shown = display_options(arguments, has_window=not arguments.headless and _window_is_possible())
@@ -84,6 +88,7 @@ def run(arguments: Namespace) -> int:
             if "dt" in settings.changed and saved.settings.get("tolerance") is not None:
                 raise SceneError(f"--resume {arguments.resume}: its dt was chosen for a tolerance and cannot change in a run")
             sim = _resumed(saved, scene, settings)
+        settings.numbers = numbers
         with sim:
             check_modelled(shown, sim)
             print_plan(sim, arguments.verbose)
@@ -130,16 +135,33 @@ def resolve(solver: dict, arguments: Namespace, simulator_class: type, saved: di
     )
 
 
+def set_given(scene: Scene, assignments: list[str]) -> dict:
+    """Set numbers of a scene as --set NAME.NUMBER=VALUE gives them, and return them by name. Raises SceneError."""
+    given = {}
+    for assignment in assignments:
+        name, equals, text = (part.strip() for part in assignment.partition("="))
+        if not equals or not name:
+            raise SceneError(f"--set {assignment}: write NAME.NUMBER=VALUE, such as beam.young=2e5, or solver.KEY=VALUE")
+        if name.startswith("solver."):
+            continue
+        values = [parse_scalar(part.strip(), assignment) for part in text.strip("[]").split(",")]  # a vector has commas
+        given[name] = values if len(values) > 1 else values[0]
+        try:
+            set_numbers(scene, {name: given[name]})
+        except SceneError as error:
+            raise SceneError(f"--set {assignment}: {error}") from None
+    return given
+
+
 def _given(arguments: Namespace, keys: list[str]) -> dict:
     """Return the settings given by --set solver.KEY=VALUE and by the other options."""
     given = {}
     for assignment in arguments.assignments:
-        name, equals, text = assignment.partition("=")
+        name, _, text = assignment.partition("=")
         head, _, key = name.strip().partition(".")
-        if not equals or head != "solver":
-            raise SceneError(f"--set {assignment}: write solver.KEY=VALUE, e.g. solver.dt=0.01")
-        refuse_unknown([key], keys, f"--set {assignment}: ")
-        given[key] = parse_scalar(text.strip(), assignment)
+        if head == "solver":
+            refuse_unknown([key], keys, f"--set {assignment}: ")
+            given[key] = parse_scalar(text.strip(), assignment)
     for key in ("arch", "precision", "tolerance", *RUN_KEYS):
         option = getattr(arguments, key)
         if option is None:
@@ -258,6 +280,7 @@ def _run(sim, settings: RunSettings, arguments, signals, warned: list[str], save
             error=shown.errors,
             error_mesh=arguments.error_mesh,
             on_iteration=progress.iteration,
+            details=shown.details,
         )
         observers.close()
         if recording is not None:

@@ -1,4 +1,4 @@
-"""Find and load demos, benchmarks and a user's own .toml and .py files; `taisoft list`, `bench` and `docs`.
+"""Find and load demos, benchmarks and a user's own .toml and .py files; `taisoft list`, `bench`, `docs` and `completion`.
 
 A checkout has demos/ and benchmarks/ beside the package; an installed wheel has them inside it. A .py file is executed as
 Python: only run files you trust. A .toml file is data.
@@ -103,6 +103,23 @@ def _print_table(files: dict[str, Path]) -> None:
     width = max(map(len, files), default=0)
     for name, path in files.items():
         print(f"{name:<{width}}  {first_line(path)}".rstrip())
+
+
+def completion(arguments: Namespace) -> int:
+    """Print the script by which a shell completes commands; it calls the command itself with _ARGCOMPLETE set."""
+    try:
+        import argcomplete
+    except ImportError:
+        raise SceneError("completion needs argcomplete: pip install 'taisoft[completion]'") from None
+    print(argcomplete.shellcode(["taisoft"], True, arguments.shell))
+    return 0
+
+
+def fitting_scenes(prefix: str, **_) -> list[str]:
+    """Return what may complete a SCENE that begins with prefix: demos, scene files and folders."""
+    from argcomplete.completers import FilesCompleter
+
+    return [*shipped_files("demos"), *FilesCompleter(("toml", "py"))(prefix)]
 
 
 def find_scene(name: str) -> Path:

@@ -33,12 +33,14 @@ from taisoft.dynamics.contact_measures import (
 )
 from taisoft.dynamics.contact_paths import ContactPaths
 from taisoft.dynamics.contact_record import (
+    IMPULSE,
+    MOMENTS,
+    NORMAL,
+    SLIP,
     Pairs,
     distribute,
     read_rows,
     record_contacts,
-    sum_impulses,
-    sum_moments,
     sum_pairs,
     write_rows,
 )
@@ -91,8 +93,7 @@ class ContactStep:
         self._last_time = 0.0
         self.penetration = 0.0  # at the end of the last step [m],
         self.relative_penetration = 0.0  # and over the finer side's mean surface edge
-        self._impulse_sum: np.ndarray | None = None  # (n_colliders, 6) over the last step's substeps, if several: see `_impulses`
-        self._pair_sum: Pairs | None = None  # likewise, of pairs
+        self._pairs: Pairs | None = None  # of the last step, once known; while it is cut, of its substeps so far
         self._step_dt = 0.0  # of the last step [s]
         self._impulse_fraction = 1.0
         self._own_sides: tuple[np.ndarray, np.ndarray] | None = None  # nodes of contacts before dependent ones were replaced
@@ -140,7 +141,7 @@ class ContactStep:
         self.problem.count[0] = 0
         self._search_counts = 0, 0
         self._last_time = self.penetration = self.relative_penetration = self._step_dt = 0.0
-        self._impulse_sum = self._pair_sum = None
+        self._pairs = None
         self.last_crossing = Crossing()
         self.flight[:] = 0.0
         self.misplaced.return_to_start()
@@ -157,9 +158,8 @@ class ContactStep:
             "last_time": self._last_time,
             "share": self._impulse_fraction,
             "span": self._step_dt,
-            "sum": self._impulse_sum,
-            "pairs": None if self._pair_sum is None else self._pair_sum[0],
-            "pair_sum": None if self._pair_sum is None else self._pair_sum[1],
+            "pairs": self.pairs()[0],
+            "pair_sums": self.pairs()[1],
             "penetration": self.penetration,
             "relative_penetration": self.relative_penetration,
             "met": self.had_impact,
@@ -178,8 +178,7 @@ class ContactStep:
             self._allocate(int(kept["capacity"]))
         write_rows(self.problem, kept["rows"])
         self._last_time, self._impulse_fraction, self._step_dt = (float(kept[name]) for name in ("last_time", "share", "span"))
-        self._impulse_sum, self.penetration = kept["sum"], float(kept["penetration"])
-        self._pair_sum = None if kept["pairs"] is None else (kept["pairs"], kept["pair_sum"])
+        self._pairs, self.penetration = (kept["pairs"], kept["pair_sums"]), float(kept["penetration"])
         self.relative_penetration = float(kept["relative_penetration"])
         self.had_impact, self.dropped = bool(kept["met"]), int(kept["dropped"])
         self._search_counts = int(kept["found"]), int(kept["unmapped"])
@@ -278,7 +277,7 @@ class ContactStep:
     def start_step(self, dt: float) -> None:
         """Begin a step of dt."""
         self._substep_fraction, self._step_dt, self.dropped = 1.0, dt, 0
-        self._impulse_sum = self._pair_sum = None
+        self._pairs = None
         self.paths.start_step()
         self.misplaced.start_step()
 
@@ -294,28 +293,35 @@ class ContactStep:
         if not self.paths.none_cross:
             self.paths.exempt_crossing()
         if self._substep_fraction < 1.0:
-            contacts = self.contacts()
-            impulses = self._impulses(contacts)
-            self._impulse_sum = impulses + (0.0 if self._impulse_sum is None else self._impulse_sum)
-            self._pair_sum = sum_pairs(contacts, self.simulation.scene, self._pair_sum)
+            self._pairs = self._sum_pairs()
 
-    def _impulses(self, contacts: Contacts) -> np.ndarray:
-        """Impulses [N s] and their moments about the origin [N m s] on the colliders in the last substep, (n_colliders, 6)."""
-        scene, x = self.simulation.scene, self.simulation.state()[0]
-        return np.hstack([sum_impulses(contacts, scene), sum_moments(contacts, scene, x)])
+    def _sum_pairs(self) -> Pairs:
+        """Add the last substep's contacts to the sums of earlier substeps."""
+        found = self.contacts()
+        nodes, weights = (found.nodes, found.weights) if self._own_sides is None else self._own_sides
+        sides = nodes[: len(found)], weights[: len(found)]
+        return sum_pairs(self.problem, found, sides, *self.simulation.state(), self._pairs)
 
-    def force_and_moment(self, collider: int) -> np.ndarray:
-        """Return the mean contact force [N] on a collider over the last step, and its moment about the origin [N m], (6,)."""
-        total = self._impulses(self.contacts()) if self._impulse_sum is None else self._impulse_sum
-        return total[collider] / self._step_dt if self._step_dt > 0.0 else np.zeros(6)
+    def pairs(self) -> Pairs:
+        """Return the sums over the contacts of each pair in the last step, see `sum_pairs`."""
+        if self._pairs is None:
+            self._pairs = self._sum_pairs()
+        return self._pairs
 
-    def pair_force(self, collider: int, other: int) -> np.ndarray:
-        """Return the mean contact force (3,) [N] on a collider from another one over the last step."""
-        found = sum_pairs(self.contacts(), self.simulation.scene) if self._pair_sum is None else self._pair_sum
-        own = (found[0] == sorted((collider, other))).all(axis=1)
-        if self._step_dt == 0.0 or not own.any():
-            return np.zeros(3)
-        return (1.0 if collider < other else -1.0) * found[1][own][0] / self._step_dt
+    def pressing_pairs(self) -> np.ndarray:
+        """Return the pairs of colliders (k,2) that pressed on each other in the last step."""
+        pairs, sums = self.pairs()
+        return pairs[sums[:, NORMAL.start] > 0.0]
+
+    def mean_on(self, collider: int, other: int | None) -> np.ndarray:
+        """Return means over the last step of what a collider gets from another one, or from all others, (10,): force [N], moment
+        about the origin [N m], slip velocity times normal force [W], and normal force [N]."""
+        (pairs, sums), total = self.pairs(), np.zeros(10)
+        for own in (0, 1):
+            rows = (pairs[:, own] == collider) & ((pairs[:, 1 - own] == other) | (other is None))
+            part, sign = sums[rows].sum(axis=0), 1.0 - 2.0 * own
+            total += np.concatenate([sign * part[IMPULSE], part[MOMENTS[own]], sign * part[SLIP], part[NORMAL]])
+        return total / (self._step_dt or 1.0)
 
     def own_forces(self) -> np.ndarray:
         """Return the contact forces of the last substep on the nodes that touch, dependent ones too, (n_nodes, 3) [N].

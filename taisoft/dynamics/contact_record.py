@@ -1,4 +1,4 @@
-"""Contacts of a problem on the host: their record, the sum of their impulses, and their rows for a checkpoint."""
+"""Contacts of a problem on the host: their record, sums over the contacts of pairs, and their rows for a checkpoint."""
 
 import numpy as np
 
@@ -6,7 +6,6 @@ from taisoft.backend.arrays import download, upload
 from taisoft.collision.contacts import Contacts
 from taisoft.collision.detector import Detection
 from taisoft.contact.problem import NODES, ContactProblem
-from taisoft.scene.scene import Scene
 
 
 def record_contacts(detection: Detection, p: ContactProblem, impulse_fraction: float) -> Contacts:
@@ -19,48 +18,37 @@ def record_contacts(detection: Detection, p: ContactProblem, impulse_fraction: f
     return detection.record(point, normal, gap, impulse, body, feature, *_sides(node, weight, arity))
 
 
-def sum_impulses(contacts: Contacts, scene: Scene) -> np.ndarray:
-    """Return the impulse on each collider from the given contacts, (n_colliders, 3) [N s]."""
-    place = {one.name: k for k, one in enumerate(scene.colliders)}
-    total = np.zeros((len(place), 3))
-    for names, sign in ((contacts.body_a, 1.0), (contacts.body_b, -1.0)):
-        np.add.at(total, [place[name] for name in names], sign * contacts.impulse)
-    return total
+Pairs = tuple[np.ndarray, np.ndarray]  # colliders (k,2), the lower index first, and their sums (k,13), see `sum_pairs`
+IMPULSE, MOMENTS, SLIP, NORMAL = slice(0, 3), (slice(3, 6), slice(6, 9)), slice(9, 12), slice(12, 13)  # columns
 
 
-Pairs = tuple[np.ndarray, np.ndarray]  # colliders (k,2), the lower index first, and impulses (k,3) on the first [N s]
+def sum_pairs(p: ContactProblem, found: Contacts, sides: tuple, x: np.ndarray, v: np.ndarray, before: Pairs | None) -> Pairs:
+    """Return each pair of different colliders that may touch, and sums over their contacts.
 
+    IMPULSE: on the first one [N s]; MOMENTS: of what the first and what the second one gets, about the origin [N m s]; SLIP: the
+    normal impulse times the tangential velocity of the first relative to the second [N m]; NORMAL: the normal impulse [N s].
+    Impulses act on a body at its nodes, and on an obstacle at the contact points.
 
-def sum_pairs(contacts: Contacts, scene: Scene, before: Pairs | None = None) -> Pairs:
-    """Return each pair of colliders that touch, and the impulse that the first gets from the second.
-
-    before: pairs and impulses to be added.
+    found: the record of the problem's contacts; sides: their nodes and weights (k, 2 w), before dependent nodes are replaced;
+    x [m], v [m/s]: (n_nodes, 3). before: pairs and sums to be added.
     """
-    place = {one.name: k for k, one in enumerate(scene.colliders)}
-    names = zip(contacts.body_a, contacts.body_b)
-    pairs = np.array([(place[a], place[b]) for a, b in names], dtype=np.int64).reshape(-1, 2)
-    impulses = contacts.impulse
+    body, node, weight, arity, moved = download([p.body, p.node, p.weight, p.arity, p.obstacle_displacement], p.count[0])
+    weight = np.where(np.arange(node.shape[1]) < arity[:, None], weight, 0.0)
+    u = np.einsum("cj,cji->ci", weight, v[np.where(weight != 0.0, node, 0)]) - moved / found.duration
+    normal = (found.impulse * found.normal).sum(axis=1, keepdims=True)
+    slip = normal * (u - (u * found.normal).sum(axis=1, keepdims=True) * found.normal)
+    (nodes, weights), half = sides, sides[0].shape[1] // 2
+    arms = [np.einsum("cj,cji->ci", weights[:, own], x[nodes[:, own]]) for own in (slice(0, half), slice(half, None))]
+    arms[1] = np.where(nodes[:, half:].max(axis=1, keepdims=True) < 0, found.point, arms[1])
+    sums = np.hstack([found.impulse, np.cross(arms[0], found.impulse), np.cross(found.impulse, arms[1]), slip, normal])
+    different = body[:, 0] != body[:, 1]
+    pairs, sums = body[different].astype(np.int64), sums[different]
     if before is not None:
-        pairs, impulses = np.concatenate([before[0], pairs]), np.concatenate([before[1], impulses])
+        pairs, sums = np.concatenate([before[0], pairs]), np.concatenate([before[1], sums])
     unique, pair = np.unique(pairs, axis=0, return_inverse=True)
-    total = np.zeros((len(unique), 3))
-    np.add.at(total, pair.reshape(-1), impulses)
+    total = np.zeros((len(unique), sums.shape[1]))
+    np.add.at(total, pair.reshape(-1), sums)
     return unique, total
-
-
-def sum_moments(contacts: Contacts, scene: Scene, x: np.ndarray) -> np.ndarray:
-    """Return the moment of the given contacts' impulses on each collider about the origin, (n_colliders, 3) [N m s].
-
-    x: (n_nodes, 3) [m]; impulses act on a body at its nodes, and on an obstacle at the contact points.
-    """
-    starts = np.cumsum([0, *(body.n_nodes for body in scene.bodies)])
-    moments = np.concatenate([np.zeros((1, 3)), np.cross(x, nodal_impulses(contacts, len(x))).cumsum(axis=0)])
-    total = np.zeros((len(scene.colliders), 3))
-    total[: len(scene.bodies)] = np.diff(moments[starts], axis=0)
-    for k, obstacle in enumerate(scene.obstacles, len(scene.bodies)):
-        own = contacts.body_b == obstacle.name
-        total[k] = -np.cross(contacts.point[own], contacts.impulse[own]).sum(axis=0)
-    return total
 
 
 def nodal_impulses(contacts: Contacts, n_nodes: int) -> np.ndarray:

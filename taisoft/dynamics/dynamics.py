@@ -22,7 +22,7 @@ from taisoft.dynamics.schemes import IMPLICIT
 from taisoft.dynamics.simulation_state import SimulationState
 from taisoft.errors import SimulationError
 from taisoft.fem.laws import LAWS
-from taisoft.fem.measure import NO_TET, measure
+from taisoft.fem.measure import NO_TET, measure, measure_parts
 from taisoft.fem.model import Model, build_model
 from taisoft.fem.state import FIRST_SOFTENED, LOADS
 from taisoft.records import Energies, StepReport
@@ -253,6 +253,16 @@ class Dynamics:
     def energies(self) -> Energies:
         """Return the energies of the present state [J]."""
         return self._measure()[0]
+
+    def body_energies(self) -> list[Energies]:
+        """Return the energies of each body in the present state [J], without those of springs, tendons and attachments."""
+        m, layout = self.model, self.state.layout
+        lanes, nodes = np.zeros(m.n_blocks * m.lanes), np.zeros((m.n_nodes, 3))
+        self.state.set_load_time(self.state.time)
+        measure_parts(m, lanes, nodes)
+        elastic = np.add.reduceat(lanes[layout.lane_of_tet], layout.tet_start[:-1])
+        kinetic, gravity, loads = np.add.reduceat(nodes, layout.node_start[:-1]).T
+        return [Energies(*row) for row in zip(*(part.tolist() for part in (kinetic, elastic, gravity, loads)))]
 
     def _measure(self) -> tuple[Energies, float, int]:
         """Return the energies of the present state [J], its smallest J, and its number of inverted tets."""

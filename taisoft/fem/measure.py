@@ -32,6 +32,32 @@ def _lane_min(values):
     return low
 
 
+@ti.func
+def _node_energies(m: ti.template(), i):
+    """Kinetic energy of node i, and its parts of the potentials of gravity and of loads [J]."""
+    kinetic, weight, loads = 0.5 * m.state.v[i].dot(mass_times(m, i, m.state.v)), gravity.energy(m, i), ti.cast(0.0, ti.f64)
+    if ti.static(m.loaded):
+        loads += dead_loads.energy(m, i)
+    if ti.static(m.has_pressure):
+        loads += pressure.energy(m, i)
+    return kinetic, weight, loads
+
+
+@kernel
+def measure_parts(m: ti.template(), tets: ti.types.ndarray(), nodes: ti.types.ndarray()):
+    """Compute elastic energies by lane (n_blocks * lanes,), and those of `_node_energies` (n_nodes, 3) [J], in f64."""
+    find_dilatations(m)
+    for g in ti.static(m.groups):
+        ti.loop_config(serialize=m.serial)
+        for b in range(g.first, g.last):
+            psi, _, _ = elasticity.element_energy(m, g, b)
+            for q in ti.static(range(m.lanes)):
+                tets[b * m.lanes + q] = psi[q]
+    ti.loop_config(serialize=m.serial)
+    for i in range(m.n_nodes):
+        nodes[i, 0], nodes[i, 1], nodes[i, 2] = _node_energies(m, i)
+
+
 @kernel(cse=False)
 def measure(m: ti.template()):
     """Compute energies and volume ratios of the present state, in f64 with sums in a fixed order.
@@ -63,12 +89,10 @@ def measure(m: ti.template()):
             kinetic, weight, loads = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64)
             for k in range(chunk_size(m, c, m.n_nodes)):
                 i = chunk_entry(m, c, k, m.n_nodes)
-                kinetic += 0.5 * m.state.v[i].dot(mass_times(m, i, m.state.v))
-                weight += gravity.energy(m, i)
-                if ti.static(m.loaded):
-                    loads += dead_loads.energy(m, i)
-                if ti.static(m.has_pressure):
-                    loads += pressure.energy(m, i)
+                own = _node_energies(m, i)
+                kinetic += own[0]
+                weight += own[1]
+                loads += own[2]
             m.state.partial[c, KINETIC], m.state.partial[c, GRAVITY], m.state.partial[c, LOADS] = kinetic, weight, loads
             m.state.partial[c, FIRST_SOFTENED] = ti.cast(_lane_min(softened), ti.f64)
     fold(m, FIRST, LAST, LEAST)

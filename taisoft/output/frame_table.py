@@ -9,6 +9,7 @@ from pathlib import Path
 from scipy.spatial.transform import Rotation
 
 from taisoft.files import write_bytes
+from taisoft.output.report import read_table
 
 TABLE_NAME = "frames.csv"
 POSE = (*((axis, " [m]") for axis in "xyz"), *((f"q{part}", "") for part in "wxyz"))  # columns and units
@@ -29,7 +30,8 @@ class FrameTable:
         self._rigid_bodies = list(scene.rigid_bodies)
         poses = [f"{column} of {body.name}{unit}" for body in self._rigid_bodies for column, unit in POSE]
         self._header = ["frame", "time", *tensions, *of_cavities, *poses]
-        self._rows = _rows_before(self.path, self._header, first) if first else []
+        header, rows = read_table(self.path, lambda row: int(row[0]) < first)
+        self._rows = rows if first and header == self._header else []
 
     @staticmethod
     def needed(scene) -> bool:
@@ -56,13 +58,3 @@ class FrameTable:
     def close(self) -> None:
         """Write the table. Raises OutputError."""
         self.flush()
-
-
-def _rows_before(path: Path, header: list[str], first: int) -> list[list[str]]:
-    """Rows of an earlier table before frame `first`; none if there is no such file with these columns."""
-    try:
-        with open(path, newline="", encoding="utf-8") as file:
-            found, *rows = csv.reader(file)
-        return [row for row in rows if int(row[0]) < first] if found == header else []
-    except (OSError, ValueError, IndexError, csv.Error):
-        return []

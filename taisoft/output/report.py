@@ -1,6 +1,7 @@
 """Reports of a run: its progress on a stream, and its result in `report.json` and `steps.csv`, with settings and machine.
 
-report.json holds the RunReport, with extremes over the steps in place of the steps; steps.csv holds one StepReport per row.
+report.json holds the RunReport, with extremes over the steps in place of the steps; steps.csv holds one StepReport per row, and
+its details in further columns, where a pair that did not press in a step has zeros.
 JSON has no NaN: numbers that are not finite are null there, and counted in the extremes.
 """
 
@@ -13,6 +14,7 @@ import os
 import platform
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import TextIO
 
@@ -25,7 +27,7 @@ from taisoft.records import RunReport, StepReport
 
 PACKAGES = ("taichi", "numpy", "scipy", "usd-core")
 LINE_EVERY = 5.0  # time between lines of progress if the stream is not a terminal [s]
-COLUMNS = [f.name for f in dataclasses.fields(StepReport)]
+COLUMNS = [f.name for f in dataclasses.fields(StepReport) if f.name != "details"]
 NUMERIC = [f.name for f in dataclasses.fields(StepReport) if f.type in (int, float) and f.name != "time"]
 
 
@@ -37,7 +39,8 @@ def write_report(folder: str | Path, result: RunReport, *, resumed: dict | None 
     the run. Values may be plain, NumPy, paths or dataclasses; anything else is written as its text.
     """
     folder = Path(folder)
-    earlier = [] if resumed is None else _rows_until(folder / "steps.csv", resumed["time"])
+    end = -math.inf if resumed is None else resumed["time"] * (1.0 + 1e-12)
+    earlier = read_table(folder / "steps.csv", lambda row: float(row[0]) <= end)
     write_bytes(folder / "steps.csv", steps_csv(result.step_reports, earlier).encode())
     record = {f.name: getattr(result, f.name) for f in dataclasses.fields(result) if f.name != "step_reports"}
     record |= {"extremes": extremes(result.step_reports), "resumed": resumed, **entries}
@@ -72,36 +75,53 @@ def extremes(reports: list[StepReport]) -> dict:
         return {}
     times = np.array([r.time for r in reports])
     found: dict = {"reports": len(reports), "not_converged": sum(not r.converged for r in reports)}
-    for name in NUMERIC:
-        values = np.array([getattr(r, name) for r in reports], dtype=float)
+    table = {name: [getattr(r, name) for r in reports] for name in NUMERIC}
+    table |= {heading: [r.details.get(heading, 0.0) for r in reports] for heading in headings(reports)}
+    for name, given in table.items():
+        values = np.array(given, dtype=float)
         finite = np.flatnonzero(np.isfinite(values))
         entry: dict = {"not_finite": len(values) - len(finite)}
         if len(finite):
             low, high = finite[values[finite].argmin()], finite[values[finite].argmax()]
-            kind = int if all(isinstance(getattr(reports[k], name), int) for k in (low, high)) else float
+            kind = int if all(isinstance(given[k], int) for k in (low, high)) else float
             entry |= {"min": kind(values[low]), "max": kind(values[high])}
             entry |= {"time_of_min": times[low], "time_of_max": times[high]}
         found[name] = entry
     return found
 
 
-def steps_csv(reports: list[StepReport], earlier: list[list[str]]) -> str:
-    """Return the reports as CSV text (RFC 4180): a header, earlier rows, and a row per report; problems are joined with '; '."""
-    text = io.StringIO(newline="")
+def headings(reports: list[StepReport]) -> list[str]:
+    """Return the headings of all details of reports, in the order of their first appearance."""
+    return list(dict.fromkeys(heading for report in reports for heading in report.details))
+
+
+def steps_csv(reports: list[StepReport], earlier: tuple[list[str], list[list[str]]]) -> str:
+    """Return the reports as CSV text (RFC 4180): a header, earlier rows, and a row per report; problems are joined with '; '.
+
+    earlier: an earlier header with its rows. Details that these did not have are 0 there if they had others of that kind.
+    """
+    header, rows = earlier if earlier[0][: len(COLUMNS)] == COLUMNS and earlier[1] else ([], [])
+    text, before, own = io.StringIO(newline=""), header[len(COLUMNS) :], headings(reports)
+    new, kinds = [heading for heading in own if heading not in before], {heading.split()[0] for heading in before}
+    filled = [0.0 if heading.split()[0] in kinds else "" for heading in new]
     writer = csv.writer(text)
-    writer.writerows([COLUMNS, *earlier])
-    writer.writerows(report.to_dict().values() for report in reports)
+    writer.writerows([[*COLUMNS, *before, *new], *([*row, *filled] for row in rows)])
+    for report in reports:
+        row = report.to_dict()
+        writer.writerow(
+            [row[name] if name in COLUMNS else row.get(name, 0.0 if own else "") for name in (*COLUMNS, *before, *new)]
+        )
     return text.getvalue()
 
 
-def _rows_until(path: Path, end: float) -> list[list[str]]:
-    """Return the rows of an earlier run's steps.csv up to time `end` [s]; none if there is no such file with these columns."""
+def read_table(path: Path, is_kept: Callable[[list[str]], bool]) -> tuple[list[str], list[list[str]]]:
+    """Return the header of an earlier run's CSV file and the rows that are kept; nothing if there is no such file."""
     try:
         with open(path, newline="", encoding="utf-8") as file:
             header, *rows = csv.reader(file)
-        return [row for row in rows if float(row[0]) <= end * (1.0 + 1e-12)] if header == COLUMNS else []
+        return header, [row for row in rows if is_kept(row)]
     except (OSError, ValueError, IndexError, csv.Error):
-        return []
+        return [], []
 
 
 def json_text(record: dict) -> str:

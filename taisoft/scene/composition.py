@@ -106,9 +106,10 @@ class Composition:
 
     def _changed_in(self, what: str, numbers: dict, region: int | str) -> "Composition":
         """Return a composition with other numbers in one region: of its material, or by tet where they are given so."""
+        allowed = (*BY_TET, "volume_floor") if self.has_regions else BY_TET
         for name in numbers:
-            if name not in BY_TET:
-                raise SceneError(f"{what}: {name} is one number for the whole body; {', '.join(BY_TET)} can differ by region")
+            if name not in allowed:
+                raise SceneError(f"{what}: {name} is one number for the whole body; {', '.join(allowed)} can differ by region")
         try:
             key = self.mesh.region_id(region)
         except MeshError as error:

@@ -1,4 +1,4 @@
-"""Digests of a scene's parts, which tell whether two scenes are the same, and the numbers that may change at run time."""
+"""Digests of a scene's parts, which tell, with its numbers, whether two scenes are the same."""
 
 import dataclasses
 import hashlib
@@ -11,6 +11,7 @@ from taisoft.scene.body import Body
 from taisoft.scene.connection_records import Attachment, Connection, Tendon
 from taisoft.scene.key_frames import NodePath, ShapePath
 from taisoft.scene.loads import LoadPath
+from taisoft.scene.numbers import scene_numbers
 from taisoft.scene.rigid import RigidBody
 from taisoft.scene.scene import Scene
 
@@ -30,9 +31,7 @@ def scene_fingerprint(scene: Scene, features: dict[str, bool]) -> dict[str, str]
     for obstacle in scene.obstacles:
         owner, shape = f"obstacle '{obstacle.name}'", obstacle.shape
         values = [getattr(shape, field.name) for field in dataclasses.fields(shape)]
-        fingerprint[f"{owner}: shape, friction, restitution or path"] = digest(
-            [type(shape).__name__, *values, obstacle.friction, obstacle.restitution, *_path_parts(obstacle.given_path)]
-        )
+        fingerprint[f"{owner}: shape or path"] = digest([type(shape).__name__, *values, *_path_parts(obstacle.given_path)])
     for one in scene.connections:
         fingerprint[f"{type(one).__name__.lower()} '{one.name}'"] = digest(_connection_parts(one))
     fingerprint["collision settings"] = digest([json.dumps(dataclasses.asdict(scene.collision)), scene.contact_forces])
@@ -43,9 +42,8 @@ def scene_fingerprint(scene: Scene, features: dict[str, bool]) -> dict[str, str]
 
 def scene_digest(scene: Scene) -> str:
     """Return a digest of everything comparable in a scene: its parts as a checkpoint compares them, and its numbers."""
-    numbers = json.dumps(run_time_numbers(scene), default=lambda array: digest([array]))
-    loads = [load.value for load in scene.loads]
-    return digest([json.dumps(scene_fingerprint(scene, {})), numbers, scene.allow_initial_overlap, *loads])
+    numbers = json.dumps(scene_numbers(scene), default=lambda array: digest([array]), sort_keys=True)
+    return digest([json.dumps(scene_fingerprint(scene, {})), numbers, scene.allow_initial_overlap])
 
 
 def _body_parts(body: Body) -> dict[str, list]:
@@ -77,13 +75,11 @@ def _body_parts(body: Body) -> dict[str, list]:
 
 
 def _connection_parts(one: Connection) -> list:
-    """Return the values that define a connection; the tension or length of a tendon is one of the numbers that may change."""
+    """Return the values that define a connection besides its numbers."""
     if isinstance(one, Attachment):
-        return [one.a, one.nodes, one.b, one.stiffness, one.damping]
+        return [one.a, one.nodes, one.b, one.stiffness is None]
     points = [part for point in one.points for part in (point.owner, point.position)]
-    if isinstance(one, Tendon):
-        return [*points, one.given, one.stiffness, *_path_parts(one.path)]
-    return [*points, one.stiffness, one.rest_length, one.damping]
+    return [*points, one.given, one.stiffness is None, *_path_parts(one.path)] if isinstance(one, Tendon) else points
 
 
 def _path_parts(path: Callable | None) -> list:
@@ -94,21 +90,6 @@ def _path_parts(path: Callable | None) -> list:
     values = [frames.times, frames.translations, frames.rotations, frames.pivot, frames.smooth, frames.release, frames.values]
     start = {NodePath: "starts", ShapePath: "center"}.get(type(path))  # in whose frame key frames are
     return values + ([getattr(path, start)] if start else [])
-
-
-def run_time_numbers(scene: Scene) -> dict:
-    """Return the numbers of a scene that may change at run time, except its loads: plain data, and arrays by tet."""
-    pairs = sorted(([sorted(names), *numbers] for names, numbers in scene.contact_pairs.items()), key=lambda pair: pair[0])
-    return {"gravity": scene.gravity.tolist(), "materials": [_materials(body) for body in scene.bodies], "pairs": pairs}
-
-
-def _materials(body: Body) -> dict:
-    """Return a body's materials, in the order of its regions, and its numbers by tet."""
-    if isinstance(body, RigidBody):
-        first = body.composition.first
-        return {"density": body.density, "friction": first.friction, "restitution": first.restitution, "young": body.given_young}
-    materials = [dataclasses.asdict(material) for material in body.composition.materials.values()]
-    return {"materials": materials, "by_tet": body.composition.by_tet}
 
 
 def digest(values: list) -> str:

@@ -4,11 +4,7 @@ The plan lists which features a scene needs, and why. Disabled features allocate
 features that are enabled may change at run time, in the simulator's own copy of the scene.
 """
 
-import dataclasses
-import reprlib
 from dataclasses import dataclass, field, replace
-
-import numpy as np
 
 from taisoft.attributes import thawed
 from taisoft.errors import SceneError
@@ -28,7 +24,6 @@ LOADS = {  # kind of load -> the body's list of them
     "pressure": "pressures",
     "cavity": "cavities",
 }
-Numbers = dict[str, float | list | np.ndarray | None]  # of a scene, by name
 
 
 @dataclass
@@ -224,46 +219,3 @@ def change_tendon(scene: Scene, given: str, name: str, value) -> None:
     check_tendon(new, new.value, what)
     with thawed(scene):
         scene.tendons[index] = new
-
-
-def scene_numbers(scene: Scene) -> Numbers:
-    """Return gravity, all material numbers, load values, and friction and restitution set for pairs.
-
-    Arrays are the numbers by tet (m,), and forces per node (k,3).
-    """
-    numbers: Numbers = {"gravity": scene.gravity.tolist()}
-    for body in scene.bodies:
-        for region, material in body.composition.materials.items():
-            own = "" if region is None else f"region {body.mesh.region_text(region)}: "
-            chosen = ("law", "young", "stiffness_damping") if isinstance(body, RigidBody) else ("law",)  # by the Simulator
-            for name, value in dataclasses.asdict(material).items():
-                if name not in chosen:
-                    numbers[f"body {body.name!r}: {own}{name}"] = value
-        if isinstance(body, RigidBody):
-            numbers[f"body {body.name!r}: given young"] = body.given_young
-        for name, values in body.composition.by_tet.items():
-            numbers[f"body {body.name!r}: {name} by tet"] = values
-        for kind, loads in LOADS.items():
-            for i, load in enumerate(getattr(body, loads)):
-                if load.path is None:
-                    numbers[f"body {body.name!r}: {kind} {i}"] = load.value if load.value.ndim == 2 else load.value.tolist()
-    numbers |= {f"tendon {one.name!r}: {one.given}": float(one.value) for one in scene.tendons if one.path is None}
-    for names, (friction, restitution) in scene.contact_pairs.items():
-        pair = " and ".join(repr(name) for name in sorted(names))
-        numbers |= {f"contact of {pair}: friction": friction, f"contact of {pair}: restitution": restitution}
-    return numbers
-
-
-def first_difference(before: Numbers, now: Numbers) -> str:
-    """Return a sentence about the first difference between two scenes' numbers; "" if there is none."""
-    for name in before | now:
-        old, new = before.get(name), now.get(name)
-        if isinstance(old, np.ndarray) == isinstance(new, np.ndarray) and np.array_equal(old, new):
-            continue
-        if isinstance(old, np.ndarray) and isinstance(new, np.ndarray) and old.shape == new.shape:
-            row = int(np.argmax((old != new).reshape(len(old), -1).any(axis=1)))
-            name, old, new = f"{name}, {'row' if old.ndim == 2 else 'tet'} {row}", old[row], new[row]
-        old, new = (value.tolist() if isinstance(value, (np.ndarray, np.generic)) else value for value in (old, new))
-        old, new = ("not set" if value is None else reprlib.repr(value) for value in (old, new))
-        return f"{name} is {new} in this scene and was {old} at the start of the saved run"
-    return ""

@@ -21,7 +21,7 @@ import numpy as np
 
 from taisoft.errors import OutputError
 from taisoft.view.colouring import TITLES, UNITS, Colouring, colours_of
-from taisoft.view.plots import CAPACITY, ENERGIES, GRID_LINES, PLOTS, Curves, Plots
+from taisoft.view.plots import CAPACITY, COLOURS, ENERGIES, GRID_LINES, PLOTS, Curves, Plots
 
 HEIGHT = 720.0  # of the picture that lengths refer to
 MARGIN, WIDTH = 16, 300  # of the plots
@@ -42,7 +42,10 @@ BOX_COLOUR = (0.97, 0.975, 0.98)
 REFRESH = 0.2  # time between updates of the curves [s]
 LIGHTER = 0.55  # blend of a curve's colour towards white for its numbers, which have a dark background
 MAX_BOXES = len(PLOTS)
-MAX_SEGMENTS = sum(4 + 2 * GRID_LINES + len(plot.series) * 2 * CAPACITY for plot in PLOTS.values())
+MAX_SEGMENTS = sum(
+    4 + 2 * GRID_LINES + (len(COLOURS) if plot.many else len(plot.series)) * 2 * CAPACITY for plot in PLOTS.values()
+)
+LINE_LENGTH = 22  # of a name and its number, in letters
 
 
 def text_missing() -> str:
@@ -160,10 +163,13 @@ class Annotations:
         self._write(x0 + 3, y1 - 2, curves.ends[0], SMALL_SIZE - 2, FAINT, anchor="lb", halo=True)
         self._write(x0, y1 + 2, f"{curves.times[0]:.4g}", SMALL_SIZE - 2, FAINT)
         self._write(x1, y1 + 2, f"{curves.times[1]:.4g} s", SMALL_SIZE - 2, FAINT, anchor="ra")
-        x = x1
-        for name, value, colour in reversed(curves.legend):
-            text = name if len(curves.legend) > 1 else value
-            self._write(x, top + pad, text, SMALL_SIZE, _bytes(colour), anchor="ra")
+        x, y = x1, top + pad
+        texts = [(name if len(curves.legend) > 1 else value, _bytes(colour)) for name, value, colour in reversed(curves.legend)]
+        stacked = sum(self._width(text, SMALL_SIZE) + 8 for text in (curves.title, *(text for text, _ in texts))) > x1 - x0
+        for k, (text, colour) in enumerate(texts):
+            if stacked:  # in the plot, one below the other
+                x, y = x1 - 4, y0 + 2 + SMALL_SIZE * (len(texts) - 1 - k)
+            self._write(x, y, text, SMALL_SIZE, colour, anchor="ra", halo=stacked)
             x -= self._width(text, SMALL_SIZE) + 8
 
     # --- caption ------------------------------------------------------------------------------------------------------
@@ -274,7 +280,7 @@ def cells(plots: Plots, size: tuple[int, int]) -> list[Cell]:
     """Lay out the visible plots from the top down, as many as fit in a window of size (width, height)."""
     found, top = [], GAP
     for curves in [plots.curves(name) for name in plots.visible()]:
-        height = TITLE + LINE * (len(curves.legend) + 2)
+        height = TITLE + LINE * (len(_legend_lines(curves)) + 2)
         left = size[0] - GAP - BOX
         if top + height > size[1] or left - TEXT < 0:
             break
@@ -306,8 +312,17 @@ def write(gui, shown: list[Cell], opened: tuple[int, int]) -> None:
         curves, (left, top, width, height) = cell.curves, cell.text
         rectangle = left / opened[0], top / opened[1], width / opened[0], height / opened[1]
         with gui.sub_window(f"{curves.title}##{cell.text}", *rectangle) as page:
-            for name, value, colour in curves.legend:
-                lighter = tuple(LIGHTER + (1 - LIGHTER) * c for c in colour)
-                page.text(f"{name:9}{value:>13}", color=lighter)
+            for text, colour in _legend_lines(curves):
+                page.text(text, color=tuple(LIGHTER + (1 - LIGHTER) * c for c in colour))
             page.text(f"axis {curves.ends[0]} to {curves.ends[1]}")
             page.text(f"time {curves.times[0]:.4g} to {curves.times[1]:.4g} s")
+
+
+def _legend_lines(curves: Curves) -> list[tuple[str, tuple]]:
+    """Return the lines of the legend with their colours: a long name has one of its own."""
+    lines = []
+    for name, value, colour in curves.legend:
+        fits = len(name) + len(value) < LINE_LENGTH
+        lines += [((name if fits else "").ljust(LINE_LENGTH - len(value)) + value, colour)]
+        lines[-1:-1] = [] if fits else [(name, colour)]
+    return lines

@@ -17,7 +17,7 @@ from taisoft.scene import checks
 from taisoft.scene.loads import value_at
 from taisoft.scene.obstacles import Box, Capsule, HalfSpace, MeshObstacle, Obstacle, Sphere
 from taisoft.view.connection_layer import ConnectionMarks
-from taisoft.view.plots import ENERGIES, History
+from taisoft.view.plots import ENERGIES, History, plain_history
 from taisoft.view.scene_view import MAX_CONTACTS
 
 SHAPES = {shape.__name__: shape for shape in (HalfSpace, Sphere, Box, Capsule, MeshObstacle)}
@@ -145,7 +145,7 @@ def describe_state(sim, marks: ConnectionMarks, layers: set[str], history: Histo
     if "pressures" in layers:
         state["pressures"] = pressures
     if history is not None:
-        state["history"] = {name: getattr(history, name) for name in ("times", "low", "high", "last", "begin")}
+        state["history"] = plain_history(history)
     return state
 
 

@@ -7,6 +7,8 @@ steps. Where errors are estimated, energies are drawn as bands: plus and minus t
 The history takes constant memory: minimum and maximum of every quantity over bins of consecutive steps. A bin holds one step
 until CAPACITY bins are full. Then neighbours are merged in pairs, and from there on a bin holds twice as many steps. So no peak
 is lost, however long a simulation runs, and early and late steps have the same resolution.
+
+Some plots show a quantity of each pair that presses, or of each body: the few largest. It is recorded from when one is shown.
 """
 
 import math
@@ -20,6 +22,7 @@ from taisoft.scene.checks import nearest
 from taisoft.view.colouring import round_up
 
 BLUE, ORANGE, GREEN, DARK = (0.16, 0.42, 0.74), (0.87, 0.42, 0.13), (0.20, 0.56, 0.28), (0.30, 0.30, 0.36)  # sRGB
+COLOURS = (BLUE, ORANGE, GREEN, DARK)  # of a plot with curves by pair or body, as many as it shows
 GRID_LINES = 4  # at most, between the ends of an axis
 MIN_SPAN = 1e-200  # values that span less count as constant
 MAX_DECADES = 12  # of a logarithmic axis; smaller values, and zero, lie on its lower end
@@ -34,7 +37,7 @@ QUANTITIES = (*ENERGIES, "total", *SOLVERS, "step_time", *ERRORS)  # energies as
 
 @dataclass(frozen=True)
 class Series:
-    """One curve of a plot. quantity: one of QUANTITIES; needs: "implicit" steps, "contact" forces, "error" estimates, or ""."""
+    """One curve of a plot. quantity: column of `History`; needs: "implicit" steps, "contact" forces, "error" estimates or ""."""
 
     name: str
     quantity: str
@@ -44,12 +47,13 @@ class Series:
 
 @dataclass(frozen=True)
 class Plot:
-    """Curves that share an axis. log: whether it is logarithmic."""
+    """Curves that share an axis. log: whether it is logarithmic; many: whether its series stands for one of each pair or body."""
 
     title: str
     unit: str
     series: tuple[Series, ...]
     log: bool = False
+    many: bool = False
 
 
 PLOTS = {
@@ -79,21 +83,27 @@ PLOTS = {
         tuple(Series(name, f"{name}_error", colour, "error") for name, colour in zip(ERROR_KINDS, (BLUE, ORANGE, GREEN))),
         log=True,
     ),
+    "forces": Plot("force by pair", "N", (Series("", "forces", DARK, "contact"),), many=True),
+    "kinetic": Plot("kinetic energy by body", "J", (Series("", "kinetic", DARK),), many=True),
+    "elastic": Plot("elastic energy by body", "J", (Series("", "elastic", DARK),), many=True),
 }
 
 
 class History:
-    """Minima and maxima of QUANTITIES over bins of steps.
+    """Minima and maxima of quantities over bins of steps.
 
-    times: (n,) ends of the bins [s]; low, high: (n, k) minima and maxima over each, columns as QUANTITIES, NaN if unknown;
-    last: (k,) values of the last step; begin: time of the start [s].
+    times: (n,) ends of the bins [s]; low, high: (n, k) minima and maxima over each, NaN if unknown; columns: (k,) names,
+    QUANTITIES, then those by pair or body, such as "forces: a, b"; last: (k,) values of the last step; begin: time of the start
+    [s].
     """
 
     def __init__(self, capacity: int = CAPACITY):
-        self._times, (self._low, self._high) = np.empty(capacity), np.empty((2, capacity, len(QUANTITIES)))
+        self._capacity = capacity
         self._clear()
 
     def _clear(self) -> None:
+        self.columns = list(QUANTITIES)
+        self._times, (self._low, self._high) = np.empty(self._capacity), np.empty((2, self._capacity, len(QUANTITIES)))
         self._n = self._steps_in_last = 0
         self._steps_per_bin = 1
         self._start_energies, self.begin = np.zeros(3), 0.0
@@ -121,12 +131,18 @@ class History:
         self._append(sim.time, np.where(np.arange(len(QUANTITIES)) < 4, 0.0, np.nan), np.zeros(len(QUANTITIES)))
 
     def take(
-        self, report: StepReport, seconds: float, explicit: bool, touching: bool, errors: ErrorEstimate | None = None
+        self,
+        report: StepReport,
+        seconds: float,
+        explicit: bool,
+        touching: bool,
+        errors: ErrorEstimate | None = None,
+        **more: float,
     ) -> None:
         """Record a step, or a batch of explicit steps.
 
-        seconds: its total wall time [s]; touching: whether contact forces are simulated; errors: so far, if estimated.
-        Quantities not simulated are NaN.
+        seconds: its total wall time [s]; touching: whether contact forces are simulated; errors: so far, if estimated; more:
+        columns by pair or body, 0 for those that other steps had. Quantities not simulated are NaN.
         """
         energies = _energies(report) - self._start_energies
         solved, touched = (np.nan if explicit else 1.0), (1.0 if touching else np.nan)
@@ -147,7 +163,11 @@ class History:
                 ),
             ]
         )
-        half = np.zeros(len(QUANTITIES))
+        new = [name for name in more if name not in self.columns]
+        self.columns += new
+        self._low, self._high = (np.pad(a, ((0, 0), (0, len(new))), constant_values=np.nan) for a in (self._low, self._high))
+        row = np.concatenate([row, [more.get(name, 0.0) for name in self.columns[len(QUANTITIES) :]]])
+        half = np.zeros(len(row))
         if errors is not None and errors.energies is not None:
             half[:4] = np.abs([*_energies(errors.energies), errors.energies.total])
         self._append(report.time, np.where(np.isfinite(row), row, np.nan), half)
@@ -196,6 +216,25 @@ class Curves:
     times: tuple[float, float]
 
 
+def plain_history(history: History) -> dict:
+    """Return the arrays of a history as plain data, only with the columns that plots can show."""
+    columns = [*QUANTITIES, *(s.quantity for plot in PLOTS.values() if plot.many for s in series_of(plot, history))]
+    used = [history.columns.index(name) for name in columns]
+    parts = {"low": history.low[:, used], "high": history.high[:, used], "last": history.last[used]}
+    return {"times": history.times, "begin": history.begin, "columns": columns, **parts}
+
+
+def series_of(plot: Plot, history) -> tuple[Series, ...]:
+    """Return the series of a plot, of one by pair or body the few with the largest values."""
+    if not plot.many:
+        return plot.series
+    kind = f"{plot.series[0].quantity}: "
+    own = [k for k, name in enumerate(history.columns) if name.startswith(kind)]
+    largest = np.argsort(-np.fmax.reduce(history.high[:, own], axis=0, initial=0.0), kind="stable")[: len(COLOURS)]
+    names = [history.columns[own[k]] for k in sorted(largest)]
+    return tuple(Series(name.removeprefix(kind), name, colour) for name, colour in zip(names, COLOURS))
+
+
 class PlotChoice:
     """Which plots of a history are available and shown.
 
@@ -226,10 +265,11 @@ class PlotChoice:
         return [name for name in self.available() if self.shown[name]]
 
     def toggle(self) -> None:
-        """Hide all plots, or show those shown last again; if there were none, show all available ones."""
+        """Hide all plots, or show those shown last again; if there were none, all available ones but those by pair or body."""
         visible = self.visible()
         available = self.available()
-        chosen = () if visible else [name for name in self._last_shown if name in available] or available
+        common = [name for name, plot in available.items() if not plot.many]
+        chosen = () if visible else [name for name in self._last_shown if name in available] or common
         self._last_shown = tuple(visible) or self._last_shown
         self.shown = {name: name in chosen for name in PLOTS}
 
@@ -241,12 +281,13 @@ class PlotChoice:
 class Plots(PlotChoice):
     """History of a simulation, and which plots of it are shown.
 
-    sim: a Simulator; names: of the plots shown initially; errors: whether the run estimates errors. Raises SceneError for an
-    unknown name or a plot of quantities that sim does not simulate.
+    sim: a Simulator; names: of the plots shown initially; errors: whether the run estimates errors. watched: names of the plots
+    by pair or body whose quantities are recorded. Raises SceneError for an unknown name or a plot of quantities that sim does not
+    simulate.
     """
 
     def __init__(self, sim, names: tuple[str, ...] = (), errors: bool = False):
-        self._sim, self._errors = sim, errors
+        self._sim, self._errors, self.watched = sim, errors, set(names)
         super().__init__(History(), {}, names)
         for name in names:
             if name not in PLOTS:
@@ -265,7 +306,16 @@ class Plots(PlotChoice):
             self.history.start(self._sim)
         else:
             errors = self._sim.error_so_far if self._errors else None
-            self.history.take(report, seconds, self._sim.settings.explicit, self._touching, errors)
+            self.history.take(report, seconds, self._sim.settings.explicit, self._touching, errors, **self._by_name())
+
+    def _by_name(self) -> dict[str, float]:
+        """Return the columns of the watched plots by pair or body: forces [N] and energies [J]."""
+        sim, found, kinds = self._sim, {}, sorted(self.watched & {"kinetic", "elastic"})
+        for a, b in sim.pairs_in_contact() if "forces" in self.watched else ():
+            found[f"forces: {a}, {b}"] = float(np.linalg.norm(sim.contact_force(a, b)))
+        for body, energies in zip(sim.scene.bodies, sim._open().body_energies()) if kinds else ():
+            found |= {f"{kind}: {body.name}": getattr(energies, kind) for kind in kinds}
+        return found
 
     def restart(self) -> None:
         """Clear the history."""
@@ -288,13 +338,14 @@ class Plots(PlotChoice):
 
 def curves_of(plot: Plot, history: History) -> Curves:
     """Return the drawing of a plot of a history."""
-    columns = [QUANTITIES.index(s.quantity) for s in plot.series]
+    shown = series_of(plot, history)
+    columns = [history.columns.index(s.quantity) for s in shown]
     low, high = history.low[:, columns], history.high[:, columns]
     bottom, top, grid = (_log_axis if plot.log else _axis)(low, high)
     first, last = history.begin, history.times[-1]
     across = (history.times - first) / ((last - first) or 1.0)
     lines, legend = [], []
-    for k, (column, series) in enumerate(zip(columns, plot.series)):
+    for k, (column, series) in enumerate(zip(columns, shown)):
         values = np.stack([low[:, k], high[:, k]], axis=1)
         values = _logarithms(values, bottom) if plot.log else values
         y = np.clip((values - bottom) / (top - bottom), 0.0, 1.0)

@@ -56,7 +56,7 @@ class WindowProcess:
             raise OutputError(f"{FAILURE}: {missing}")
         scene = sim.scene
         n_nodes = sum(body.n_nodes for body in scene.bodies)
-        self._values, self._colour, self._layers, self._wants_plots = NodalValues(scene.bodies), colour, set(layers), bool(plots)
+        self._values, self._colour, self._layers, self._wants_plots = NodalValues(scene.bodies), colour, set(layers), list(plots)
         self._sent = self._confirmed = self._answered = 0  # numbers of states, and of the last request
         self._history_sent = -math.inf  # wall time
         self._requests: list[tuple[int, list]] = []  # not yet returned
@@ -132,6 +132,7 @@ class WindowProcess:
         if not self.ready or self.closed:
             return
         now, history = time.perf_counter(), None
+        plots.watched.update(self._wants_plots)
         if self._wants_plots and now - self._history_sent >= REFRESH:
             history, self._history_sent = plots.history, now
         state = describe_state(sim, self._marks, self._layers, history)

@@ -79,7 +79,7 @@ class View:
         """Send commands, and confirm the state, if there is anything new."""
         screen = self._screen
         layers = [name for name, shown in screen.layers.shown.items() if shown]
-        shown = (self._state["number"], screen.colouring.kind, layers, bool(screen.plots.visible()))
+        shown = (self._state["number"], screen.colouring.kind, layers, screen.plots.visible())
         waits = self._requests.number - self._state["answered"] >= MAX_UNANSWERED
         commands = [] if waits else self._requests.take()
         if commands or shown != self._confirmed:

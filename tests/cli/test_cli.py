@@ -36,7 +36,11 @@ BAD_SCENES = [
 BAD_SETTINGS = [
     (["--set", "solver.newton_tolerence=1e-3"], "did you mean newton_tolerance?"),
     (["--set", "solver.contact_solver=augmented_lagrangian"], "does not fit symplectic_euler: use 'auto' or "),
-    (["--set", "gravity=3"], "write solver.KEY=VALUE"),
+    (["--set", "young=3"], "the scene has no number 'young' (did you mean beam.young?)"),
+    (["--set", "beam.young"], "write NAME.NUMBER=VALUE, such as beam.young=2e5, or solver.KEY=VALUE"),
+    (["--details", "pair"], "did you mean pairs?"),
+    (["--details", "pairs"], "--details pairs: contact forces are not modelled (one body"),
+    (["--set", "gravity=3,1"], "scene: gravity must have shape (3,), not (2,)"),
     (["--set", "solver.dt=1 ms"], "'1 ms' is not a number"),
     (["--seconds", "nan"], "seconds must be finite, not nan"),
     (["--fps", "-30"], "fps must be greater than 0, not -30.0"),
@@ -53,7 +57,7 @@ def test_bad_scene_files_and_settings_are_refused(tmp_path, capsys):
         assert message in error and error.startswith("taisoft: ") and error.count("\n") == 1
         assert not (tmp_path / "out").exists()
     path = tmp_path / "scene.py"
-    for option, *value in (["--vtu"], ["--npz"], ["--video"], ["--checkpoint-every", "0.1"]):
+    for option, *value in (["--vtu"], ["--npz"], ["--video"], ["--checkpoint-every", "0.1"], ["--details", "bodies"]):
         assert run(path, option, *value) == 2
         assert f"{option} needs --out" in capsys.readouterr().err
 
@@ -161,6 +165,22 @@ def test_doctor_lists_what_is_installed_and_missing(monkeypatch, capsys):
         assert part in shown
     assert "surely-not-installed missing: pip install 'taisoft[mesh]'" in shown
     assert "no-kernel missing: pip install jupyterlab nbconvert" in shown
+
+
+def test_a_shell_completes_demos_and_scene_files(tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "argcomplete", None)
+    assert main(["completion", "bash"]) == 2
+    assert capsys.readouterr().err == "taisoft: completion needs argcomplete: pip install 'taisoft[completion]'\n"
+    monkeypatch.undo()
+    pytest.importorskip("argcomplete")
+    for shell in ("bash", "zsh", "fish"):
+        assert main(["completion", shell]) == 0
+        assert "_ARGCOMPLETE" in capsys.readouterr().out
+    monkeypatch.chdir(tmp_path)
+    for name in ("hand.toml", "hand.txt"):
+        write(tmp_path / name, "")
+    found = scene_file.fitting_scenes("hand")
+    assert {"hanging_beam", "hand.toml"} <= set(found) and "hand.txt" not in found
 
 
 def test_bench_passes_its_arguments_on(tmp_path, monkeypatch, capsys):

@@ -18,7 +18,7 @@ from tests.cli.command import BEAM, LED, SHORT_OUTPUT, child, report, run, write
 SPRING = '    scene.add_spring(("beam", 0), ("beam", 3), 10.0)\n    return scene\n'
 LED_BY_SPRING = LED.replace("    return scene\n", SPRING)
 GENTLE = LED_BY_SPRING.replace("{body}", "return (0, -t, 0)")
-ALL = ("--vtu", "--npz", "--seconds", "0.2")
+ALL = ("--vtu", "--npz", "--seconds", "0.2", "--details", "bodies")
 
 
 def usd(folder: Path) -> str:
@@ -64,7 +64,7 @@ def begun(tmp_path_factory) -> tuple[Path, Path]:
 
 def test_two_parts_equal_one_run(single, tmp_path, capsys):
     path, out = write(tmp_path / "scene.py", GENTLE), tmp_path / "out"
-    assert run(path, "--out", out, "--vtu", "--npz") == 0
+    assert run(path, "--out", out, "--vtu", "--npz", "--details", "bodies") == 0
     assert run(path, "--out", out, "--resume", out / "checkpoint.npz", *ALL) == 0
     assert_same_folders(single, out)
     record = report(out)
@@ -157,8 +157,10 @@ def test_other_scenes_and_numbers_are_refused(begun, tmp_path, capsys):
     arguments = ("--out", tmp_path / "new", "--resume", out / "checkpoint.npz", "--seconds", "0.15")
     for text, message in (
         (BEAM, "is a checkpoint of another scene, which differs in body 'beam': constraints"),
-        (GENTLE.replace("young=1e5", "young=2e5"), "body 'beam': young is 200000.0 in this scene and was 100000.0 at the start"),
+        (GENTLE.replace("young=1e5", "young=2e5"), "beam.young is 200000.0 in this scene and was 100000.0 at the start"),
     ):
         capsys.readouterr()
         assert run(write(tmp_path / "other.py", text), *arguments) == 2
         assert message in capsys.readouterr().err and not (tmp_path / "new").exists()
+    assert run(begun[0], *arguments, "--set", "beam.young=2e5") == 2
+    assert "beam.young is 200000.0 in this scene and was 100000.0 at the start" in capsys.readouterr().err

@@ -22,13 +22,15 @@ from tests.cli.command import BEAM, LED, ROOT, SHORT_OUTPUT, child, report, run,
 
 def test_a_run_writes_and_prints_its_results(beam, tmp_path, capsys):
     out = tmp_path / "out"
-    assert run(beam, "--out", out, "--set", "solver.dt=0.004") == 0
+    numbers = ("--set", "beam.young=9e4", "--set", "gravity=[0, -9, 0]")
+    assert run(beam, "--out", out, "--set", "solver.dt=0.004", *numbers) == 0
     record = report(out)
     assert record["status"] == "ok" and record["sim_seconds"] == pytest.approx(0.1)
     lowered = "dt lowered from 0.004 s to 0.0037037 s"
     assert [problem for problem in record["problems"] if problem.startswith(f"note: {lowered}, so that 9 steps make a frame")]
     assert record["dt_requested"] == 0.004 and record["dt"] == pytest.approx(1 / 270)
     expected = {"integrator": "symplectic_euler", "fps": 30, "seconds": 0.1, "allow_unstable": False}
+    expected |= {"set": {"beam.young": 9e4, "gravity": [0, -9, 0]}}
     assert expected.items() <= record["settings"].items()
     assert record["settings"]["dt"] == pytest.approx(1 / 270) and record["plan"]  # the dt in use, not the requested one
     assert sorted(path.name for path in (out / "frames").iterdir()) == [f"{i:05d}.png" for i in range(4)]

@@ -154,8 +154,8 @@ def test_contact_of_parts_equals_the_whole(integrator):
 def test_contacts_of_attached_nodes_count():
     """All nodes of the pad are attached, and the block stands on it."""
     scene, material = ts.Scene(), rubber(young=2e5, mass_damping=40.0, friction=0.5)
-    block = scene.add_body(ts.box_mesh((2, 2, 2), (0.1, 0.1, 0.1)), material, name="block", position=(0.0, 0.051, 0.0))
-    pad = scene.add_body(ts.box_mesh((2, 1, 2), (0.06, 0.02, 0.06)), material, name="pad", position=(0.0, 0.01, 0.0))
+    block = scene.add_body(ts.box_mesh((2, 2, 2), (0.1, 0.1, 0.1)), material, name="block", position=(1.0, 0.051, 0.0))
+    pad = scene.add_body(ts.box_mesh((2, 1, 2), (0.06, 0.02, 0.06)), material, name="pad", position=(1.0, 0.01, 0.0))
     scene.attach("pad", np.arange(pad.n_nodes), "block", name="joint")
     scene.add_obstacle(ts.HalfSpace((0.0, -1e-4, 0.0), (0.0, 1.0, 0.0)), name="ground")
     with simulator(add_companion(scene, attached=True), "implicit_euler", 0.01, **LOOSE) as sim:
@@ -163,6 +163,7 @@ def test_contacts_of_attached_nodes_count():
         sim.run(seconds=0.4)
         contact, weight = sim.contact_force("pad"), 9.81 * (block.mass + pad.mass)
         assert contact[1] == pytest.approx(weight, rel=5e-2) and not sim.contact_force("block").any()
+        assert np.abs(sim.contact_torque("pad")).max() < 1e-3 * weight * 0.06 and not sim.contact_torque("block", "ground").any()
         expected = -contact + (0.0, 9.81 * pad.mass, 0.0)
         assert np.linalg.norm(sim.joint_force("joint").sum(axis=0) - expected) < 1e-2 * weight
 

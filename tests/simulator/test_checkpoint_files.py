@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 
 import taisoft as ts
-from taisoft.checkpoint import check_scene, load_values, read_checkpoint, restore_numbers, write_checkpoint
+from taisoft.checkpoint import check_scene, read_checkpoint, restore_numbers, write_checkpoint
 from taisoft.errors import OutputError, SceneError, SimulationError
 from taisoft.scene.fingerprint import digest
-from taisoft.scene.plan import first_difference, scene_numbers
+from taisoft.scene.numbers import first_difference, scene_numbers
 from tests.dynamics.scenes import cube, driven_scene, halved, rubber
 
 
@@ -175,14 +175,14 @@ def with_numbers(scale=1.0, gravity=-9.81, force=(1.0, 2.0, 3.0), friction=0.3, 
 
 def test_numbers_are_compared_with_the_initial_ones_and_restored(tmp_path):
     path, start, present = tmp_path / "a.npz", with_numbers(), with_numbers(2.0)  # changed during the run
-    write_checkpoint(path, {}, present, {}, {"loads": load_values(present)}, {}, start)
+    write_checkpoint(path, {}, present, {}, {}, {}, start)
     read = read_checkpoint(path)
     check_scene(read, start, {})
     for other, message in (
         (with_numbers(gravity=-1.0), "gravity is [0.0, -1.0, 0.0] in this scene and was [0.0, -9.81, 0.0] at the start"),
-        (with_numbers(force=(1.0, 2.0, 3.5)), "'a/b': force 0, row 0 is [1.0, 2.0, 3.5] in this scene and was [1.0, 2.0, 3.0]"),
-        (with_numbers(friction=0.4), "contact of 'a/b' and 'ball': friction is 0.4 in this scene and was 0.3 at the start"),
-        (with_numbers(young=2e6), "body 'a/b': young is 2000000.0 in this scene and was 100000.0 at the start"),
+        (with_numbers(force=(1.0, 2.0, 3.5)), "a/b.force.0, row 0 is [1.0, 2.0, 3.5] in this scene and was [1.0, 2.0, 3.0]"),
+        (with_numbers(friction=0.4), "contact.a/b.ball.friction is 0.4 in this scene and was 0.3 at the start"),
+        (with_numbers(young=2e6), "a/b.young is 2000000.0 in this scene and was 100000.0 at the start"),
         (present, "gravity is"),
     ):
         with pytest.raises(ts.SceneError, match="is a checkpoint of another scene") as caught:

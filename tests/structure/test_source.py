@@ -60,7 +60,7 @@ ORDER = (
     ("view.scene_view", "view.shadow"),
     (
         *("simulator", "queries", "contact_queries", "changes", "commanding", "energy_check", "frames", "running", "static"),
-        *("checkpoint", "estimation"),
+        *("checkpoint", "estimation", "details"),
         *("output.vtu", "view.offscreen"),  # for methods of Simulator
     ),
     ("output", "view"),

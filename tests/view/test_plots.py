@@ -14,7 +14,7 @@ from taisoft.scene.plan import Plan
 from taisoft.view import annotations
 from taisoft.view.annotations import Annotations, cells, drawing
 from taisoft.view.colouring import COLOURS, Colouring
-from taisoft.view.plots import PLOTS, QUANTITIES, History, Plots, curves_of
+from taisoft.view.plots import PLOTS, QUANTITIES, History, Plots, curves_of, plain_history
 from taisoft.view.scene_view import Surfaces
 from tests.cli.command import BEAM, run, write
 from tests.output.png import decode
@@ -70,6 +70,7 @@ class Stub:
     """The part of a simulator that plots use."""
 
     time = 0.0
+    scene, forces = SimpleNamespace(bodies=[SimpleNamespace(name="a"), SimpleNamespace(name="b")]), {}
 
     def __init__(self, explicit=False, touching=True):
         self.settings = SimpleNamespace(explicit=explicit, integrator="velocity_verlet" if explicit else "bdf2")
@@ -78,6 +79,15 @@ class Stub:
 
     def energies(self):
         return Energies(0.0, 0.0, 0.0)
+
+    def _open(self):
+        return SimpleNamespace(body_energies=lambda: [Energies(1.0, 2.0, 0.0), Energies(3.0, 4.0, 0.0)])
+
+    def pairs_in_contact(self):
+        return list(self.forces)
+
+    def contact_force(self, a, b):
+        return np.array(self.forces[a, b])
 
 
 def filled(n=400):
@@ -95,7 +105,8 @@ def curves_with(name: str, **series):
     for quantity, column in series.items():
         values[:, QUANTITIES.index(quantity)] = column
     times = np.arange(n, dtype=float)
-    return curves_of(PLOTS[name], SimpleNamespace(times=times, low=values, high=values, last=values[-1], begin=0.0))
+    history = SimpleNamespace(times=times, low=values, high=values, last=values[-1], begin=0.0, columns=list(QUANTITIES))
+    return curves_of(PLOTS[name], history)
 
 
 def test_curves_have_the_heights_given_by_the_axis():
@@ -108,6 +119,27 @@ def test_curves_have_the_heights_given_by_the_axis():
     down = curves_with("energies", kinetic=[0.0, 5.0], gravity=[0.0, -12.0])
     assert down.ends == ("-15 J", "5 J") and np.allclose(down.lines[2][1][-1], (1, 0.15))
     assert [value for _, value, _ in down.legend] == ["5 J", "-", "-12 J", "-"]
+
+
+def test_of_many_pairs_the_few_with_the_largest_forces_are_drawn_and_bodies_only_where_wanted():
+    """Also of what a window gets. A pair that does not press has no force; what was not recorded is a gap."""
+    sim = Stub()
+    plots = Plots(sim)
+    for k, watched in enumerate(("", "forces", "forces", "kinetic")):
+        plots.watched.update([watched])
+        sim.forces = {("a", str(j)): (3.0 * j * (k == 1), 4.0 * j, 0.0) for j in range(9 if k == 1 else 7)}
+        plots.take(StepReport(time=k + 1.0), 0.01)
+    sent = SimpleNamespace(**plain_history(plots.history))
+    assert (
+        len(sent.columns) == len(QUANTITIES) + 4 + 2 == sent.low.shape[1] and len(plots.history.columns) == len(QUANTITIES) + 11
+    )
+    for history in (plots.history, sent):
+        curves = curves_of(PLOTS["forces"], history)
+        assert [entry[:2] for entry in curves.legend] == [("a, 5", "20 N"), ("a, 6", "24 N"), ("a, 7", "0 N"), ("a, 8", "0 N")]
+        assert len({colour for _, _, colour in curves.legend}) == 4 and curves.ends == ("0 N", "40 N")
+        assert np.array_equal(curves.lines[3][1][-4:, 1], [np.nan, 1.0, 0.0, 0.0], equal_nan=True)
+        assert [entry[:2] for entry in curves_of(PLOTS["kinetic"], history).legend] == [("a", "1 J"), ("b", "3 J")]
+        assert curves_of(PLOTS["elastic"], history).legend == []
 
 
 def test_a_logarithmic_axis_accepts_zero():
@@ -133,7 +165,9 @@ def test_only_simulated_quantities_are_available():
     both = {name: newton.get(name, []) + contact for name in touched}
     for kind, expected in (((False, True), both), ((False, False), newton), ((True, True), touched), ((True, False), {})):
         available = {name: [s.name for s in plot.series] for name, plot in Plots(Stub(*kind)).available().items()}
-        assert available.pop("step_time") == ["step"] and len(available.pop("energies")) == 4 and available == expected
+        assert available.pop("step_time") == ["step"] and len(available.pop("energies")) == 4
+        assert [available.pop(name) for name in ("kinetic", "elastic")] == [[""], [""]]
+        assert bool(available.pop("forces", None)) == kind[1] and available == expected
     for stub, name, message in (
         (Stub(True, False), "residuals", "not available: steps of velocity_verlet are explicit .* and contact forces"),
         (Stub(), "energy", "plot 'energy' is unknown.*did you mean energies"),
@@ -143,7 +177,8 @@ def test_only_simulated_quantities_are_available():
 
 
 def test_the_key_hides_and_shows_again_and_a_restart_clears():
-    plots, visible = Plots(Stub()), [name for name in PLOTS if name not in ("error", "residuals")]  # a run without estimates
+    hidden = {"error", "residuals", "forces", "kinetic", "elastic"}  # a run without estimates, and those by pair or body
+    plots, visible = Plots(Stub()), [name for name in PLOTS if name not in hidden]
     plots.toggle()
     plots.shown["residuals"] = False
     for expected in (visible, [], visible):
@@ -154,7 +189,7 @@ def test_the_key_hides_and_shows_again_and_a_restart_clears():
     assert plots.history.times.tolist() == [0.0]
 
 
-@pytest.mark.parametrize("size, n_shown", [((1280, 720), 5), ((800, 300), 2), ((300, 100), 0)])
+@pytest.mark.parametrize("size, n_shown", [((1280, 720), 6), ((800, 300), 2), ((300, 100), 0)])
 def test_plots_lie_in_the_window_without_overlap(size, n_shown):
     shown = cells(filled(), size)
     boxes, ends, colours = drawing(shown, size)

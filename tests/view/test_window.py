@@ -20,7 +20,7 @@ from taisoft.view.link import Link, LinkClosed, SharedNodes, receive
 connection = Connection(int(sys.argv[1]))
 description = receive(connection, None)
 link = Link(connection, SharedNodes(description["n_nodes"], description["slots"], int(sys.argv[2])))
-request = {"number": 0, "commands": [], "confirmed": 0, "colour": "body", "layers": [], "plots": False}
+request = {"number": 0, "commands": [], "confirmed": 0, "colour": "body", "layers": [], "plots": []}
 """
 OPEN = START + "link.send({'open': True})\n"
 SHOWN = {"status": "", "messages": []}
@@ -43,7 +43,7 @@ link.receive(None)
 first = link.nodes.x[0].copy()
 time.sleep(0.3)
 for number in (4, 5):
-    wishes = {{"colour": "speed", "layers": ["contacts"], "commands": [["pause"], ["step"]]}}
+    wishes = {{"colour": "speed", "layers": ["contacts"], "plots": ["elastic"], "commands": [["pause"], ["step"]]}}
     link.send(request | wishes | {{"confirmed": number - 4, "number": number}})
 state = link.receive(None)
 np.savez({str(tmp_path / "saved.npz")!r}, first=first, x=link.nodes.x[0], values=link.nodes.values[0], answered=state["answered"],
@@ -63,7 +63,7 @@ link.send({{"closed": True}})
         window.publish(sim, plots, SHOWN)
     window.close()
     window.close()
-    assert got == [(number, [["pause"], ["step"]]) for number in (4, 5)]
+    assert got == [(number, [["pause"], ["step"]]) for number in (4, 5)] and plots.watched == {"elastic"}
     with np.load(tmp_path / "saved.npz", allow_pickle=False) as saved:
         assert np.array_equal(saved["first"], start) and np.array_equal(saved["x"], sim.positions())
         assert np.allclose(saved["values"], np.linalg.norm(sim.velocities(), axis=1))

@@ -1,0 +1,133 @@
+"""The numbers of a scene by name, such as "beam.young": what checkpoints hold and compare, and `taisoft run --set` sets."""
+
+import dataclasses
+import re
+import reprlib
+from collections.abc import Callable, Iterator
+from functools import partial
+
+import numpy as np
+
+from taisoft.attributes import thawed
+from taisoft.errors import SceneError
+from taisoft.scene import checks
+from taisoft.scene.body import Body
+from taisoft.scene.composition import BY_TET
+from taisoft.scene.material import Material
+from taisoft.scene.plan import LOADS, change_load, change_tendon
+from taisoft.scene.rigid import RigidBody
+from taisoft.scene.scene import Scene
+
+Numbers = dict[str, float | list | np.ndarray | None]  # of a scene, by name
+Entry = tuple[str, float | list | np.ndarray | None, Callable]  # name, value, and the call that sets it
+NUMBERS = tuple(field.name for field in dataclasses.fields(Material) if field.name != "law")
+LIMITS = dict.fromkeys(("friction", "rest_length", "damping"), {"minimum": 0.0}) | {"stiffness": {"above": 0.0}}
+LIMITS |= {"restitution": {"minimum": 0.0, "maximum": 1.0}}  # of the numbers of obstacles and connections
+
+
+def scene_numbers(scene: Scene) -> Numbers:
+    """Return gravity, and all numbers of materials, loads, obstacles, connections, and pairs that have their own.
+
+    Arrays are numbers by tet (m,), and forces per node (k,3). None: chosen by the Simulator, by region, or along a path.
+    """
+    return {name: value for name, value, _ in _entries(scene)}
+
+
+def set_numbers(scene: Scene, numbers: Numbers) -> None:
+    """Set numbers by name, also friction and restitution of any pair, "contact.a.b.friction". Raises SceneError.
+
+    One for a whole body replaces those by region and by tet, and that of a load its path.
+    """
+    calls = {known: assign for known, _, assign in _entries(scene)}
+    for name, value in numbers.items():
+        pair = re.fullmatch(r"contact\.(.+\..+)\.(friction|restitution)", name)
+        if name in calls:
+            calls[name](value)
+        elif pair:
+            _set_pair(scene, *pair.groups(), value)
+        else:
+            hint = checks.nearest(name, calls) or f"; there are {', '.join(list(calls)[:3])} and {len(calls) - 3} more"
+            raise SceneError(f"the scene has no number {name!r}{hint}")
+
+
+def _entries(scene: Scene) -> Iterator[Entry]:
+    yield "gravity", scene.gravity.tolist(), partial(setattr, scene, "gravity")
+    for body in scene.bodies:
+        yield from (_of_rigid if isinstance(body, RigidBody) else _of_material)(body)
+        for kind, loads in LOADS.items():
+            for i, load in enumerate(getattr(body, loads)):
+                name = f"{load.name}.{load.given}" if kind == "cavity" else f"{body.name}.{kind}.{i}"
+                value = load.value if load.value is None or load.value.ndim == 2 else load.value.tolist()
+                yield name, value, partial(change_load, body, kind, i)
+    for one in scene.tendons:
+        value = None if one.value is None else float(one.value)
+        yield f"{one.name}.{one.given}", value, partial(change_tendon, scene, one.given, one.name)
+    exact = scene.exact_attachments
+    for kind in ("obstacles", "springs", "tendons", "attachments"):
+        for k, one in enumerate(getattr(scene, kind)):
+            for name in LIMITS:
+                if (value := vars(one).get(name)) is not None and one not in exact:
+                    yield f"{one.name}.{name}", value, partial(_set_in, scene, kind, k, name)
+    for names, pair in scene.contact_pairs.items():
+        ends = f"{min(names)}.{max(names)}"
+        for name, value in zip(("friction", "restitution"), pair):
+            yield f"contact.{ends}.{name}", value, partial(_set_pair, scene, ends, name)
+
+
+def _of_material(body: Body) -> Iterator[Entry]:
+    composition = body.composition
+    for region, material in composition.materials.items() if composition.has_regions else ():
+        owner = f"{body.name}.{body.mesh.region_names.get(region, region)}"
+        for name in (*BY_TET, "volume_floor"):
+            yield f"{owner}.{name}", getattr(material, name), partial(_set_material, body, name, region)
+    for name in NUMBERS:
+        by_region = {getattr(material, name) for material in composition.materials.values()}
+        value = composition.by_tet.get(name, by_region.pop() if len(by_region) == 1 else None)
+        yield f"{body.name}.{name}", value, partial(_set_material, body, name, None)
+
+
+def _of_rigid(body: RigidBody) -> Iterator[Entry]:
+    first = body.composition.first
+    given = {"density": body.density, "friction": first.friction, "restitution": first.restitution, "young": body.given_young}
+    for name, value in given.items():
+        yield f"{body.name}.{name}", value, partial(_set_rigid, body, given, name)
+
+
+def _set_material(body: Body, name: str, region: int | None, value) -> None:
+    body._compose(body.composition.changed(f"body {body.name!r}", {name: value}, region))
+
+
+def _set_rigid(body: RigidBody, given: dict, name: str, value) -> None:
+    given[name] = value
+    made = RigidBody(body.name, body.shape, position=body.position, **body.start_twist._asdict(), **given)
+    with thawed(body):
+        for key in ("_density", "inertia", "given_young", "_young", "composition"):
+            setattr(body, key, getattr(made, key))
+
+
+def _set_in(scene: Scene, kind: str, k: int, name: str, value) -> None:
+    """Replace a number of an obstacle or a connection, which are records in a list of the scene."""
+    items = getattr(scene, kind)
+    value = checks.number(value, f"{items[k].name!r}: {name}", **LIMITS[name])
+    list.__setitem__(items, k, dataclasses.replace(items[k], **{name: value}))
+
+
+def _set_pair(scene: Scene, ends: str, name: str, value) -> None:
+    """Set a number of a pair. ends: its names, with a dot between them."""
+    first = max((one.name for one in scene.colliders if ends.startswith(f"{one.name}.")), key=len, default=ends.partition(".")[0])
+    scene.set_contact(first, ends[len(first) + 1 :], **{name: value})
+
+
+def first_difference(before: Numbers, now: Numbers) -> str:
+    """Return a sentence about the first difference between two scenes' numbers; "" if there is none."""
+    for name in before | now:
+        old, new = before.get(name), now.get(name)
+        if isinstance(old, np.ndarray) == isinstance(new, np.ndarray) and np.array_equal(old, new):
+            continue
+        if isinstance(old, np.ndarray) and isinstance(new, np.ndarray) and old.shape == new.shape:
+            row = int(np.argmax((old != new).reshape(len(old), -1).any(axis=1)))
+            name, old, new = f"{name}, {'row' if old.ndim == 2 else 'tet'} {row}", old[row], new[row]
+        old, new = (value.tolist() if isinstance(value, (np.ndarray, np.generic)) else value for value in (old, new))
+        old, new = ("not set" if value is None else reprlib.repr(value) for value in (old, new))
+        return f"{name} is {new} in this scene and was {old} at the start of the saved run"
+    return ""
