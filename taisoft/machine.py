@@ -6,8 +6,7 @@ refused before allocation.
 
 import os
 import platform
-import time
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import dataclass
 from importlib import import_module, metadata
@@ -36,16 +35,6 @@ def summarise(seconds: Iterable[float]) -> Timing:
         raise ValueError("a timing needs at least one repeat")
     low, median, high = np.percentile(seconds, (25, 50, 75))
     return Timing(float(median), float(seconds.min()), float(seconds.max()), float((high - low) / median), len(seconds))
-
-
-def time_repeats(call: Callable[[], object], repeats: int) -> Timing:
-    """Time `call()` the given number of times. Warm-up is left to the caller."""
-    seconds = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        call()
-        seconds.append(time.perf_counter() - start)
-    return summarise(seconds)
 
 
 def load_average() -> float | None:

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from taisoft.machine import Timing
-from taisoft.output.tables import log_ticks, require_matplotlib
+from taisoft.output.tables import require_matplotlib, ticks
 
 from ..document import plain, table
 
@@ -127,7 +127,9 @@ def plot_png(figure) -> bytes:
     from matplotlib import pyplot
 
     for panel in figure.axes:
-        log_ticks(panel)
+        for axis, (low, high) in ((panel.xaxis, panel.get_xlim()), (panel.yaxis, panel.get_ylim())):
+            if axis.get_scale() == "log":
+                ticks(axis, high / low)
     figure.canvas.draw()
     image = np.asarray(figure.canvas.buffer_rgba())[..., :3].copy()
     pyplot.close(figure)

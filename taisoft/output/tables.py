@@ -58,10 +58,3 @@ def ticks(axis, ratio: float) -> None:
     axis.set_major_locator(LogLocator(subs=(1.0,) if ratio > 300.0 else (1.0, 3.0) if ratio > 30.0 else (1.0, 2.0, 5.0)))
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axis.set_minor_formatter(NullFormatter())
-
-
-def log_ticks(panel) -> None:
-    """Apply `ticks` to the logarithmic axes of a panel, by their present limits."""
-    for axis, (low, high) in ((panel.xaxis, panel.get_xlim()), (panel.yaxis, panel.get_ylim())):
-        if axis.get_scale() == "log":
-            ticks(axis, high / low)

@@ -167,28 +167,6 @@ class UsdWriter:
             raise
 
 
-def join_chunks(folder: str | Path) -> Path:
-    """Make folder/scene.usdc from the chunks left by a killed run, then remove the chunks; return the path.
-
-    Raises OutputError if there is no chunk, one cannot be read, or the scene cannot be written.
-    """
-    target, chunks = Path(folder) / SCENE_NAME, Path(folder) / CHUNKS_NAME
-    paths = _chunk_paths(chunks)
-    if not paths:
-        raise OutputError(f"{chunks} holds no chunk of a USD export")
-    joined = None
-    for path in paths:
-        chunk = _opened(path)
-        if joined is None:
-            joined = _Joined(target, chunk)
-            for attribute, time in _samples(joined.layer):
-                joined.layer.EraseTimeSample(attribute, time)
-        joined.append(chunk)
-    joined.publish()
-    _remove_chunks(chunks)
-    return target
-
-
 class _Joined:
     """The unfinished `scene.usdc`, under a temporary name until `publish`."""
 

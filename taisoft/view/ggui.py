@@ -65,11 +65,6 @@ def display_missing() -> str:
     return ""
 
 
-def window_holder() -> str:
-    """Return the name of the holder of the process's one window; empty if there is no window."""
-    return _holder[0] if _holder else ""
-
-
 def _future_panel_file() -> Path | None:
     """Return the path of the file that a closing window will write; None if it exists already or cannot be written."""
     try:

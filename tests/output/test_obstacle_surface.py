@@ -7,7 +7,7 @@ from pxr import Usd, UsdGeom
 import taisoft as ts
 from taisoft.mesh.topology import opposite_half_edges
 from taisoft.output.appearance import obstacle_surfaces
-from taisoft.output.usd import UsdWriter, join_chunks
+from taisoft.output.usd import UsdWriter
 from taisoft.view.scene_view import Surfaces
 from tests.collision.rotations import rotation
 from tests.output.usd_stage import faults
@@ -112,7 +112,8 @@ def test_usd_stages_hold_obstacles_in_every_frame(tmp_path):
     sim.time = 0.6
     with pytest.raises(ts.OutputError, match="the path has ended"):
         writer.frame(sim, 4)
-    stage = Usd.Stage.Open(str(join_chunks(tmp_path)))
+    writer.close()
+    stage = Usd.Stage.Open(str(tmp_path / "scene.usdc"))
     assert faults(stage) == []
     floor, box = obstacle_surfaces(scene)[4], obstacle_surfaces(scene)[6]
     points = stage.GetAttributeAtPath("/World/floor/surface.points")
