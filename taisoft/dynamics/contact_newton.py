@@ -10,29 +10,22 @@ A stage without progress ends early: a shorter substep costs less.
 """
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
-from taisoft.backend.launching import PUBLIC
 from taisoft.dynamics.contact_terms import OF_IMPULSES, TO_IMPULSES
 from taisoft.dynamics.elimination import eliminate
-from taisoft.dynamics.frictional import (
-    INDEFINITE,
-    LINEAR,
+from taisoft.dynamics.friction import (
     MAX_MULTIPLIERS,
     MAX_R_FRICTIONLESS,
     MAX_R_STALLED,
-    MULTIPLIERS,
-    NORM,
     R_SCALE,
     R_STALLED,
     ROUNDING,
-    SCALE,
-    SOLVED,
-    STATUS,
+    FrictionalResult,
+    solve_frictional,
 )
-from taisoft.dynamics.frictional import SOLVES as SOLVES_DONE
 from taisoft.dynamics.newton import DECREASE, ELIMINATION_RATIO, Newton, choose_start, search
 from taisoft.dynamics.results import StageResult, relative
 from taisoft.dynamics.stage import AGAIN
@@ -52,28 +45,14 @@ FALLBACK_STEPS = 6  # steps on the nonlinear stage
 NEAR_FLOOR = 4.0  # times the floor of |r|: below it, |r| may be mostly rigid motion
 
 
-@dataclass(frozen=True)
-class FrictionalResult:
-    """Result of solving a linearised stage. negative: its matrix is indefinite; direct: iterations did not solve it."""
-
-    solves: int
-    linear: int
-    multipliers: int
-    negative: bool
-    converged: bool
-    r: float
-    r_scale: float = R_SCALE  # R over the r-factors at its end
-    direct: bool = False
-
-
-def solve_linear(system: StageSystem, problem: Stage, r: float, scale: float, stalled: bool = False) -> FrictionalResult:
-    """Solve a linearised stage from (|r|, scale): directly where that applies, else by iterations; directly, too, if these fail.
+def solve_linear(system: StageSystem, problem: Stage, r: float, stalled: bool = False) -> FrictionalResult:
+    """Solve a linearised stage from |r|: directly where that applies, else by iterations; directly, too, if these fail.
 
     stalled: iterations have failed on the stage's last problem.
     """
     found = _solve_directly(system, problem, r, stalled)
     if found is None:
-        found = solve_iteratively(system, problem, r, scale)
+        found = solve_frictional(system, problem, r)
         if not (found.converged or found.negative or stalled):
             direct = _solve_directly(system, problem, r, stalled=True)
             if direct is not None:
@@ -91,22 +70,6 @@ def _solve_directly(system: StageSystem, problem: Stage, r: float, stalled: bool
         return None
     iterations, converged, r = found
     return FrictionalResult(1, 0, iterations, False, converged, r, direct=True)
-
-
-def solve_iteratively(system: StageSystem, problem: Stage, r: float, scale: float) -> FrictionalResult:
-    """Solve it by multipliers and linear solves: on one thread in one launch, or from the host where threads share these."""
-    if problem.first_r_scale != system.r_scale:
-        r = system.set_r_scale(problem.first_r_scale)
-    if system.shares_solves or PUBLIC:  # public Taichi takes no more than 64 arguments
-        newton = Newton(system, problem)
-        result = newton.run(r, scale, fresh=True)
-        counts = newton.newton, newton.linear, newton.multipliers
-        return FrictionalResult(*counts, newton.negative, result.converged, newton.r, newton.r_scale)
-    loop = system.solve_frictional(problem, r, system.floor)
-    system.r_scale = R_SCALE
-    counts = (int(loop[place]) for place in (SOLVES_DONE, LINEAR, MULTIPLIERS))
-    ended = loop[STATUS] == INDEFINITE, loop[STATUS] == SOLVED
-    return FrictionalResult(*counts, *ended, float(loop[NORM]), float(loop[SCALE]))
 
 
 class ContactNewton:
@@ -248,7 +211,7 @@ class ContactNewton:
             first_r_scale=self.first_r_scale,
             max_r_scale=self.max_r_scale,
         )
-        result = solve_linear(system, problem, self._first_residual(), self.scale, self.is_direct)
+        result = solve_linear(system, problem, self._first_residual(), self.is_direct)
         self.is_direct = result.direct
         self.linear, self.multipliers = self.linear + result.linear, self.multipliers + result.multipliers
         if not (result.converged or result.negative):
@@ -269,7 +232,7 @@ class ContactNewton:
         if not self.has_direction:
             return self.r
         self.has_direction = False
-        r, _ = system.advance()
+        r = system.advance(system.r_scale)
         if math.isfinite(r) and system.found_zero_slope:
             return r
         r, _ = system.end_linearised(accept=False)
@@ -308,7 +271,7 @@ def solve_linearised(system: StageSystem, stage: Stage) -> StageResult:
     for projected in (False, True):
         system.linearise()
         solves = min(LINEARISED_SOLVES, system.budget.left)
-        found = solve_linear(system, replace(stage, max_newton=solves, linear_tolerance=tolerance), r, scale)
+        found = solve_linear(system, replace(stage, max_newton=solves, linear_tolerance=tolerance), r)
         linear += found.linear
         system.budget.spend(found.solves)
         if not found.negative or projected:

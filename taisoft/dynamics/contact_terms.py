@@ -26,7 +26,6 @@ from taisoft.linear.coupling import NO_COUPLING, Coupling, build_coupling
 # largest part of its target that a contact's gap may miss at the end; smallest such target, over the contact offset
 MAX_MISSED, MIN_KEPT = 0.5, 1e-3
 ROUNDING = 4.0 * 2.0**-52  # of the largest coordinate: that of a gap, as of positions in f64
-N_LIMITS, N_LOOP = 12, 15  # numbers of `frictional.solve_frictional`
 PAST = 2  # multiplier updates that are stored
 KEEP, TO_IMPULSES, OF_IMPULSES = range(3)  # new multipliers, see `update_impulses`
 
@@ -50,8 +49,6 @@ class ContactStageWork:
     rounding: Any  # (capacity) f64: velocity by which the rounding of positions moves a gap, over the tolerance [m/s]
     block: Any  # (capacity) 12-vectors: D in world axes; J^T D J consists of weights times this
     active: Any  # (capacity) i32: 1 if the block is not 0
-    limits: Any  # (N_LIMITS) f64: see `frictional`
-    loop: Any  # (N_LOOP) f64: see `frictional`
 
 
 @dataclass(frozen=True, eq=False)
@@ -297,8 +294,6 @@ def build_stage_contacts(
         arena.field("contact_rounding", ti.f64, p.capacity),
         arena.vectors("contact_block", real, p.capacity, n=BLOCK),
         arena.field("contact_active", ti.i32, p.capacity),
-        arena.field("frictional_limits", ti.f64, N_LIMITS),
-        arena.field("frictional_loop", ti.f64, N_LOOP),
     )
     coupling = build_coupling(
         arena,

@@ -14,6 +14,7 @@ from taisoft.dynamics.contact_terms import (
     find_residual,
     impulse_on_node,
     projected_impulse,
+    set_multiplier,
     stage_velocity_of,
     unprojected_impulse,
     update_contact,
@@ -114,7 +115,7 @@ def _find_step_length(m: ti.template(), k: ti.template(), r_scale, t, threads: t
 
 
 @ti.func
-def node_slope(m: ti.template(), s: ti.template(), A: ti.template(), k: ti.template(), chunk, i):
+def _node_slope(m: ti.template(), s: ti.template(), A: ti.template(), k: ti.template(), chunk, i):
     """Return (r.y, y.A y) of node i; store its row of A y, and base = x."""
     y = s.pcg.y[i]
     q = block_times(k.coupling.base[i], y) + off_diagonal_times(m, A, chunk, i, s.pcg.y)
@@ -124,20 +125,18 @@ def node_slope(m: ti.template(), s: ti.template(), A: ti.template(), k: ti.templ
 
 
 @ti.func
-def contact_slope(s: ti.template(), k: ti.template(), c, beta):
-    """Compute u of contact c and its rate along y; return p.rate."""
+def _contact_slope(s: ti.template(), k: ti.template(), c, beta):
+    """Compute u of contact c and its rate along y."""
     p, w = ti.static((k.problem, k.work))
     w.velocity[c] = stage_velocity_of(k, c, beta)
     d, n, t = dvec(0.0), p.normal[c], p.tangent[c]
     for j in range(p.arity[c]):
         d += p.weight[c, j] * ti.cast(s.pcg.y[p.node[c, j]], ti.f64)
-    rate = dvec(n.dot(d), t.dot(d), n.cross(t).dot(d))
-    w.rate[c] = rate
-    return rate.dot(p.r[c])
+    w.rate[c] = dvec(n.dot(d), t.dot(d), n.cross(t).dot(d))
 
 
 @ti.func
-def move_node_along(m: ti.template(), s: ti.template(), k: ti.template(), i, a, beta):
+def _move_node_along(m: ti.template(), s: ti.template(), k: ti.template(), i, a, beta):
     """Move node i by a y, and update the residual without contacts."""
     place_node(m, s, i, a, beta)
     k.displacement[i] = m.state.x[i] - k.x_start[i]
@@ -145,7 +144,7 @@ def move_node_along(m: ti.template(), s: ti.template(), k: ti.template(), i, a, 
 
 
 @ti.func
-def node_residual(m: ti.template(), s: ti.template(), k: ti.template(), i):
+def _node_residual(m: ti.template(), s: ti.template(), k: ti.template(), i):
     """Compute the residual of node i with impulses, and -r as CG's right side; return |r|^2 on its free axes."""
     r = k.residual_linear[i] - ti.cast(impulse_on_node(k, i), m.real)
     s.residual[i] = r
@@ -154,9 +153,30 @@ def node_residual(m: ti.template(), s: ti.template(), k: ti.template(), i):
     return norm_weight(s, i) * dot64(free_residual, free_residual)
 
 
+@ti.func
+def _find_residual(m: ti.template(), s: ti.template(), k: ti.template()):
+    """Compute the residual, -r as CG's right side, and the first of NORMS, as top-level loops of a kernel."""
+    find_residual(k)
+    ti.loop_config(serialize=m.serial)
+    for task in range(m.chunks * m.spread):
+        if task % m.spread == 0:
+            chunk = task // m.spread
+            square = ti.cast(0.0, ti.f64)
+            for j in range(chunk_size(m, chunk, m.n_nodes)):
+                square += _node_residual(m, s, k, chunk_entry(m, chunk, j, m.n_nodes))
+            m.state.partial[chunk, SUM] = square
+    fold(m, SUM, SUM, ())
+    ti.loop_config(serialize=True)
+    for _ in range(1):
+        m.state.scalars[NORMS] = total(m, SUM)
+
+
 @kernel
-def find_step_length(m: ti.template(), s: ti.template(), A: ti.template(), k: ti.template(), beta: ti.f64, r_scale: ti.f64):
-    """Find the zero of the slope along y of s.pcg. scalars: STEP_LENGTH."""
+def advance(m: ti.template(), s: ti.template(), A: ti.template(), k: ti.template(), beta: ti.f64, r_scale: ti.f64):
+    """Move along y of s.pcg to the zero of the slope; update x, v, impulses, blocks, residual, and -r as CG's right side.
+
+    scalars: STEP_LENGTH, and the first of NORMS.
+    """
     (p,) = ti.static((k.problem,))
     ti.loop_config(serialize=m.serial)
     for task in range(m.chunks * m.spread):
@@ -165,14 +185,14 @@ def find_step_length(m: ti.template(), s: ti.template(), A: ti.template(), k: ti
             slope, curvature = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64)
             for j in range(chunk_size(m, chunk, m.n_nodes)):
                 i = chunk_entry(m, chunk, j, m.n_nodes)
-                slope_i, curvature_i = node_slope(m, s, A, k, chunk, i)
+                slope_i, curvature_i = _node_slope(m, s, A, k, chunk, i)
                 slope += slope_i
                 curvature += curvature_i
             m.state.partial[chunk, SUM], m.state.partial[chunk, OTHER_SUM] = slope, curvature
     fold(m, SUM, OTHER_SUM, ())
     ti.loop_config(serialize=p.serial)
     for c in range(p.count[0]):
-        contact_slope(s, k, c, beta)
+        _contact_slope(s, k, c, beta)
     if ti.static(m.on_cpu):
         ti.loop_config(serialize=True)
         for _ in range(1):
@@ -181,28 +201,22 @@ def find_step_length(m: ti.template(), s: ti.template(), A: ti.template(), k: ti
         ti.loop_config(block_dim=THREADS)
         for t in range(THREADS):
             _find_step_length(m, k, r_scale, t, THREADS)
-
-
-@kernel
-def advance(m: ti.template(), s: ti.template(), k: ti.template(), beta: ti.f64, r_scale: ti.f64):
-    """Move along y to there; update x, v, impulses, blocks, residual, and -r as CG's right side. scalars: the first of NORMS."""
-    (p,) = ti.static((k.problem,))
     ti.loop_config(serialize=m.serial)
     for i in range(m.n_nodes):
-        move_node_along(m, s, k, i, m.state.scalars[STEP_LENGTH], beta)
+        _move_node_along(m, s, k, i, m.state.scalars[STEP_LENGTH], beta)
     ti.loop_config(serialize=p.serial)
     for c in range(p.count[0]):
         update_contact(m, k, c, beta, r_scale)
-    find_residual(k)
-    ti.loop_config(serialize=m.serial)
-    for task in range(m.chunks * m.spread):
-        if task % m.spread == 0:
-            chunk = task // m.spread
-            square = ti.cast(0.0, ti.f64)
-            for j in range(chunk_size(m, chunk, m.n_nodes)):
-                square += node_residual(m, s, k, chunk_entry(m, chunk, j, m.n_nodes))
-            m.state.partial[chunk, SUM] = square
-    fold(m, SUM, SUM, ())
-    ti.loop_config(serialize=True)
-    for _ in range(1):
-        m.state.scalars[NORMS] = total(m, SUM)
+    _find_residual(m, s, k)
+
+
+@kernel
+def update_multipliers(m: ti.template(), s: ti.template(), k: ti.template(), to_impulses: ti.i32, beta: ti.f64, r_scale: ti.f64):
+    """Set the multipliers to the impulses first, if told so; update impulses, blocks, residual, -r, and the first of NORMS."""
+    (p,) = ti.static((k.problem,))
+    ti.loop_config(serialize=p.serial)
+    for c in range(p.count[0]):
+        if to_impulses == 1:
+            set_multiplier(k, c)
+        update_contact(m, k, c, beta, r_scale)
+    _find_residual(m, s, k)

@@ -4,7 +4,7 @@ Each step solves with the unprojected matrix by conjugate gradients; at negative
 (`linear.pcg`). The step length is found by `search`. CG's tolerance follows Newton's progress (Eisenstat and Walker 1996,
 choice 2). If a slow step leaves a residual on few nodes, these are solved separately first, see `elimination`.
 With contacts, inner solves are inexact: the augmented Lagrangian is minimised until |r| is PROGRESS times its value after the
-multiplier update, or small enough, unless `multiplier_tolerance` or extrapolation require a smaller |r|, see `frictional`.
+multiplier update, or small enough, unless `multiplier_tolerance` or extrapolation require a smaller |r|, see `friction`.
 
 Convergence: |r| <= tolerance * scale, scale = |c M (v - v_hat)| + beta (|f_el| + |f_ext|) on the free axes, impulses in r, and
 the residual of the contact laws, |p - prox(p - f u)| / |p| with f = 1 / (J diag(A)^-1 J^T), within its own tolerance. A residual
@@ -22,9 +22,9 @@ from collections.abc import Callable
 from typing import Any
 
 from taisoft.dynamics.contact_terms import KEEP, TO_IMPULSES
-from taisoft.dynamics.frictional import FINER, MAX_MULTIPLIERS, PAST, PROGRESS, R_EXTRAPOLATED, R_SCALE, ROUNDING, next_scale
+from taisoft.dynamics.friction import FINER, MAX_MULTIPLIERS, PAST, PROGRESS, R_EXTRAPOLATED, R_SCALE, ROUNDING, next_scale
 from taisoft.dynamics.results import StageResult, relative
-from taisoft.dynamics.stage import AGAIN, ELASTIC_STAGE, IMPACT, LINEARISED, STEP
+from taisoft.dynamics.stage import AGAIN, ELASTIC_STAGE, IMPACT, STEP
 from taisoft.dynamics.stage_system import Stage, StageSystem
 from taisoft.linear.pcg_work import LinearResult
 
@@ -42,17 +42,16 @@ FAR = 0.5  # |r| over scale at the first iterate above which v = 0 is tried
 
 
 class Newton:
-    """Newton steps and multiplier updates of a stage; if it is linearised, of its contact problem alone."""
+    """Newton steps and multiplier updates of a stage."""
 
     def __init__(self, system: StageSystem, stage: Stage, eliminate: "Callable[[StageSystem, Stage, float], Any] | None" = None):
         """eliminate: as `elimination.eliminate`, called after slow steps; None: no elimination."""
         self.system, self.stage, self.eliminate = system, stage, eliminate
-        self.is_linearised = system.kind == LINEARISED  # the caller then handles an indefinite matrix
-        self._counts = not (self.is_linearised or system.work.pcg.subset.restricted)  # in the step's budget; else the caller does
+        self._counts = not system.work.pcg.subset.restricted  # in the step's budget; else the caller does
         self.max_forcing = MAX_FORCING if stage.c > 0.0 else STATIC_FORCING
         self.newton = self.linear = self.multigrid = self.multipliers = self.n_remembered = 0
         self.eliminated = 0.0  # Newton iterations on few nodes, times their fraction of all nodes
-        self.rounding = self.negative = False  # |r| is only rounding; negative curvature was found
+        self.rounding = False  # |r| is only rounding
 
     def run(self, r: float, scale: float, fresh: bool) -> StageResult:
         """Solve from the present state, whose (|r|, scale) is given. fresh: whether the matrix is formed there."""
@@ -79,10 +78,10 @@ class Newton:
                 fresh, n_uses = True, 0
             n_uses += 1
             moved = self._step()
-            if not math.isfinite(self.r) or not (moved or n_uses > 1) or (self.is_linearised and self.negative):
+            if not math.isfinite(self.r) or not (moved or n_uses > 1):
                 break
             fresh = moved and not self._eliminate()
-        self.r_scale, system.r_scale = system.r_scale, R_SCALE  # initial value of the next solve
+        system.r_scale = R_SCALE  # initial value of the next solve
         return self._result(converged or (self._inner_done() and self._has_converged() and system.balances_pieces()))
 
     def _begin_again(self) -> None:
@@ -146,13 +145,8 @@ class Newton:
         self.newton, self.n_inner = self.newton + 1, self.n_inner + 1
         if self._counts:
             system.budget.spend()
-        self.previous, self.negative = self.r, self.negative or solution.negative
-        if self.is_linearised and solution.negative:
-            return False
-        if self.is_linearised:
-            (self.r, self.scale), moved = system.advance(), True
-        else:
-            self.r, self.scale, moved = search(system, self._acceptable_residual(solution.negative))
+        self.previous = self.r
+        self.r, self.scale, moved = search(system, self._acceptable_residual(solution.negative))
         self.lowest = min(self.lowest, self.r)
         # statics continues down to the floor
         near_floor = self.r <= (ROUNDING if self.stage.c > 0.0 else 1.0) * self.system.floor
@@ -188,7 +182,7 @@ class Newton:
         A step that bends a slender body increases |r| by stretching it; a loose solve would then only undo that stretch.
         """
         if self.stage.linear_tolerance is not None:
-            return max(self.stage.linear_tolerance, self.stage.later_tolerance if self.newton > 0 else 0.0)
+            return self.stage.linear_tolerance
         target = self._target()
         if self.previous == 0.0:
             self.forcing = self.max_forcing

@@ -18,10 +18,9 @@ import taichi as ti
 
 from taisoft.backend.arrays import FieldArena, download, upload
 from taisoft.contact.problem import RESIDUAL, find_factors
-from taisoft.dynamics import frictional, rigid_balance
+from taisoft.dynamics import friction, rigid_balance
 from taisoft.dynamics.contact_terms import (
     KEEP,
-    N_LOOP,
     NO_CONTACTS,
     TO_IMPULSES,
     StageContacts,
@@ -32,7 +31,7 @@ from taisoft.dynamics.contact_terms import (
 )
 from taisoft.dynamics.direct import DirectSolver
 from taisoft.dynamics.linear_solver import LinearSolver
-from taisoft.dynamics.linearised import LONGEST, advance, begin_linearised, end_linearised, find_step_length
+from taisoft.dynamics.linearised import LONGEST, advance, begin_linearised, end_linearised, update_multipliers
 from taisoft.dynamics.newton_budget import NewtonBudget
 from taisoft.dynamics.pieces import Pieces
 from taisoft.dynamics.rigid_balance import (
@@ -99,10 +98,10 @@ class Stage:
     multiplier_tolerance: float | None = None  # as `tolerance`, for the steps under one multiplier; None: the same
     absolute_tolerance: float = 0.0  # |r| [N s] that also ends the stage, regardless of the scale
     keeps_multipliers: bool = False  # do not update the multipliers
-    extrapolate_after: int = frictional.EXTRAPOLATION_START  # multiplier updates
+    extrapolate_after: int = friction.EXTRAPOLATION_START  # multiplier updates
     later_tolerance: float = 0.0  # lower bound on linear_tolerance after the first solve
-    first_r_scale: float = frictional.R_SCALE  # R over the r-factors of a contact problem at its start,
-    max_r_scale: float = frictional.MAX_R_FRICTIONLESS  # and its upper bound without friction
+    first_r_scale: float = friction.R_SCALE  # R over the r-factors of a contact problem at its start,
+    max_r_scale: float = friction.MAX_R_FRICTIONLESS  # and its upper bound without friction
 
     @property
     def inner_tolerance(self) -> float:
@@ -214,12 +213,6 @@ class StageSystem:
         return int(self._k.problem.count[0]) if self._k.any else 0
 
     @property
-    def shares_solves(self) -> bool:
-        """Whether several threads may share linear solves of the present stage."""
-        few = NODES_PER_CONTACT * self.n_contacts <= self.model.n_nodes
-        return not self.model.on_cpu or (few and self.work.pcg.is_shared(self._k.coupling))
-
-    @property
     def is_static(self) -> bool:
         """Whether the stage has no inertia."""
         return self.stage.c == 0.0
@@ -290,7 +283,7 @@ class StageSystem:
         return self._k
 
     def _begin(self, stage: Stage, kind: int) -> None:
-        self.stage, self.kind, self.r_scale, self._k = stage, kind, frictional.R_SCALE, NO_CONTACTS
+        self.stage, self.kind, self.r_scale, self._k = stage, kind, friction.R_SCALE, NO_CONTACTS
         self.floor, self.unbalanced = self.rounding.of_stage(stage.c, stage.beta), (0.0, "")
         if self.pieces.several:
             self.pieces.forget_weights()
@@ -400,7 +393,7 @@ class StageSystem:
 
     def extrapolate_multipliers(self, n_remembered: int) -> None:
         """Extrapolate multipliers from the impulses and the last n_remembered updates; keep impulses and residual."""
-        frictional.extrapolate_multipliers(self._k, n_remembered)
+        friction.extrapolate_multipliers(self._k, n_remembered)
 
     def set_direction_to_rest(self) -> None:
         """Set y so that a full step leads to v = 0."""
@@ -434,54 +427,22 @@ class StageSystem:
         begin_linearised(self.model, self.work, self._k)
         self.kind = LINEARISED
 
-    def advance(self) -> tuple[float, float]:
-        """Move a linearised stage along y to zero slope; return (|r|, scale) there."""
-        stage = self.stage
-        m, s, k = self.model, self.work, self._k
-        find_step_length(m, s, self.matrix, k, stage.beta, self.r_scale)
-        advance(m, s, k, stage.beta, self.r_scale)
-        return self._norm_and_scale(stage.c, stage.beta)
+    def advance(self, r_scale: float) -> float:
+        """Move a linearised stage along y to zero slope, with R over the r-factors; return |r| there."""
+        self.r_scale = r_scale
+        advance(self.model, self.work, self.matrix, self._k, self.stage.beta, r_scale)
+        return math.sqrt(self.model.state.scalars[NORMS])
+
+    def update_multipliers(self, r_scale: float, to_impulses: bool) -> float:
+        """Set R over the r-factors of a linearised stage, and the multipliers to the impulses if told so; return |r|."""
+        self.r_scale = r_scale
+        update_multipliers(self.model, self.work, self._k, int(to_impulses), self.stage.beta, r_scale)
+        return math.sqrt(self.model.state.scalars[NORMS])
 
     @property
     def found_zero_slope(self) -> bool:
         """Whether the slope along y has a zero: it need not if the matrix is indefinite."""
         return self.model.state.scalars[STEP_LENGTH] < LONGEST
-
-    def set_r_scale(self, r_scale: float) -> float:
-        """Set R over the r-factors; return |r|."""
-        self.r_scale = r_scale
-        return self.evaluate(None)[0]
-
-    def solve_frictional(self, problem: Stage, r: float, floor: float) -> np.ndarray:
-        """Run the loop of a linearised stage from |r|, in launches that Ctrl-C can interrupt between: see `frictional`."""
-        m, A, k, loop = self.model, self.matrix, self._k, np.zeros(N_LOOP)
-        loop[[frictional.NORM, frictional.SCALE, frictional.LAW_RESIDUAL, frictional.INNER_TARGET, frictional.SAME_MATRIX]] = (
-            r,
-            problem.first_r_scale,
-            math.inf,
-            frictional.PROGRESS * r,
-            self._same_matrix,
-        )
-        limits = (  # in the order of the indices in `frictional`
-            problem.tolerance * self.scale,
-            problem.inner_tolerance * self.scale,
-            floor,
-            problem.contact_tolerance,
-            problem.linear_tolerance,
-            problem.max_newton,
-            pcg.iteration_limit(m),
-            pcg.batch_of(m, A),
-            problem.extrapolate_after,
-            problem.later_tolerance,
-            self.frictionless,
-            problem.max_r_scale,
-        )
-        upload([(k.work.limits, np.array(limits, dtype=np.float64)), (k.work.loop, loop)])
-        while loop[frictional.STATUS] == frictional.RUNNING:
-            frictional.solve_frictional(m, self.work, A, k, problem.beta)
-            loop = k.work.loop.to_numpy()
-        self._same_matrix = bool(loop[frictional.SAME_MATRIX])
-        return loop
 
     def solve_directly(self, tolerance: float, stalled: bool) -> tuple[int, bool, float] | None:
         """Move a linearised stage to the solution of its frictional problem, see `direct`; None if that does not apply.
@@ -552,7 +513,9 @@ class StageSystem:
             return self._solve_equalised(tolerance) if self.pieces.several else self.linear_solver.solve(self, tolerance)
         if self.pieces.several and w.pcg.subset.restricted:
             self.pieces.forget_factors()
-        solution = pcg.solve(m, self.matrix, w.pcg, tolerance, pcg.iteration_limit(m), self._k.coupling, self._same_matrix)
+        few = NODES_PER_CONTACT * self.n_contacts <= m.n_nodes
+        limit, coupling = pcg.iteration_limit(m), self._k.coupling
+        solution = pcg.solve(m, self.matrix, w.pcg, tolerance, limit, coupling, self._same_matrix, may_share=few)
         self._same_matrix = True
         return solution
 

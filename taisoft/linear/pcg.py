@@ -34,20 +34,27 @@ def batch_of(m: Model, A: BlockCsr) -> int:
 
 
 def solve(
-    m: Model, A: BlockCsr, w: PcgWork, tolerance: float, max_iterations: int, coupling=NO_COUPLING, same_matrix=False
+    m: Model,
+    A: BlockCsr,
+    w: PcgWork,
+    tolerance: float,
+    max_iterations: int,
+    coupling=NO_COUPLING,
+    same_matrix: bool = False,
+    may_share: bool = True,
 ) -> LinearResult:
     """Solve for w.y given w.rhs. tolerance: sqrt(r.z) relative to the start.
 
     coupling: terms added to A. The diagonal of A alone must then be in coupling.base; A.diagonal is set to that of the sum.
     w.subset: the nodes whose rows and unknowns form the system; w.r, w.p and w.q must be 0 on all others.
     same_matrix: whether A and the nodes of the terms are those of the last solve; rows without terms then keep their
-    preconditioner.
+    preconditioner. may_share: whether several threads may share the sweeps; the result is the same.
     """
     done = 0
     while True:
         if not m.on_cpu:
             _take_jacobi_batch(m, A, w, tolerance, min(JACOBI_BATCH, max_iterations - done), coupling, same_matrix, done == 0)
-        elif m.serial or not w.is_shared(coupling) or w.n_chunks < SHARED_FROM:
+        elif m.serial or not (may_share and w.is_shared(coupling)) or w.n_chunks < SHARED_FROM:
             begin = 0 if done else 1 + same_matrix
             iterate_kernel(m, A, coupling, w, min(batch_of(m, A), max_iterations - done), tolerance, begin)
         else:

@@ -1,7 +1,6 @@
 """Newton's method of implicit steps with contacts, on a tilted cube that lands on the ground and on another cube:
 
-* the loop on the device and the loop driven by the host find the same step, also with extrapolated multipliers; cut into many
-  launches, the loop gives the same bits;
+* linear solves cut into many launches give the same bits, and extrapolated multipliers the same step in fewer updates;
 * a step takes few Newton iterations, also with an indefinite matrix; impulses satisfy the contact laws, also with a tolerance
   far below that of |r|, and where |r| is mostly rounding; a problem that stalls, as between flush blocks, is solved directly.
 
@@ -16,10 +15,8 @@ import pytest
 
 import taisoft as ts
 from taisoft.dynamics import contact_newton, implicit
-from taisoft.dynamics.contact_newton import FrictionalResult, solve_iteratively
 from taisoft.dynamics.dynamics import Dynamics
 from taisoft.dynamics.elimination import CONCENTRATED, FEW, choose_nodes, eliminate
-from taisoft.dynamics.newton import Newton
 from taisoft.dynamics.schemes import SCHEMES
 from taisoft.dynamics.stage import STAY
 from taisoft.dynamics.stage_system import Stage, StageSystem
@@ -65,32 +62,20 @@ def positions(made: Dynamics) -> np.ndarray:
     return made.state.state()[0]
 
 
-def solve_on_host(system, problem, r, scale) -> FrictionalResult:
-    """The loop that the host drives, as with parallel kernels."""
-    newton = Newton(system, problem)
-    result = newton.run(r, scale, fresh=True)
-    return FrictionalResult(newton.newton, newton.linear, newton.multipliers, newton.negative, result.converged, newton.r)
-
-
 def counts(reports: list[ts.StepReport]) -> list[tuple[int, int, int]]:
     return [(r.newton_iterations, r.linear_iterations, r.contact_iterations) for r in reports]
 
 
-def test_both_loops_find_the_same_step(made, monkeypatch):
-    """In as many iterations; those of extrapolated multipliers find it sooner."""
+def test_steps_take_few_iterations_and_extrapolated_multipliers_fewer(made, monkeypatch):
+    """However many iterations of a linear solve a launch takes."""
     x, reports = steps(made)
     whole = [report.newton_iterations for report in reports if report.substeps == 1]
     assert all(report.converged for report in reports) and len(whole) >= 3 and max(whole) <= 12
     assert max(report.n_contacts for report in reports) > 10
     with monkeypatch.context() as patch:
-        patch.setattr(contact_newton, "solve_iteratively", solve_on_host)
-        host, others = steps(made)
-        assert np.abs(host - x).max() < 1e-8 and counts(others) == counts(reports)  # [m]
         patch.setattr(implicit, "Stage", partial(Stage, extrapolate_after=0))
-        host, others = steps(made)
-        patch.setattr(contact_newton, "solve_iteratively", solve_iteratively)
         extrapolated, sooner = steps(made)
-        assert counts(others) == counts(sooner) and np.abs(extrapolated - x).max() < 1e-8
+        assert np.abs(extrapolated - x).max() < 1e-8  # [m]
         assert sum(report.contact_iterations for report in sooner) < 0.9 * sum(r.contact_iterations for r in reports)
     monkeypatch.setattr(pcg, "batch_of", lambda m, A: 1)  # one iteration a launch
     again, others = steps(made)

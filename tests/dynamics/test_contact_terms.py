@@ -18,7 +18,7 @@ from taisoft.contact.problem import RESIDUAL, build_node_problem, fill_field, fi
 from taisoft.dynamics import contact_terms, linearised
 from taisoft.dynamics.contact_terms import NO_CONTACTS
 from taisoft.dynamics.dirichlet import DirichletConditions
-from taisoft.dynamics.frictional import extrapolate_multipliers
+from taisoft.dynamics.friction import extrapolate_multipliers
 from taisoft.dynamics.no_contacts import NoContacts
 from taisoft.dynamics.simulation_state import SimulationState
 from taisoft.dynamics.stage import AGAIN, ELASTIC_STAGE, STAY, STEP, form_residual, move
@@ -247,8 +247,7 @@ def test_a_linearised_stage_is_linear(rig, threads):
     y = np.linalg.solve(rig.A + 1e6 * np.diag(1 - rig.free.ravel()), -(rig.free * at_start).ravel()).reshape(-1, 3) * rig.free
     y += 0.1 * np.abs(y).max() * rig.free * rng.standard_normal(y.shape)
     cg.y.from_numpy(y)
-    linearised.find_step_length(m, work, rig.solver.matrix, rig.k, BETA, STIFFNESS)
-    linearised.advance(m, work, rig.k, BETA, STIFFNESS)
+    linearised.advance(m, work, rig.solver.matrix, rig.k, BETA, STIFFNESS)
     r, length = rig.p.r.to_numpy()[:K], m.state.scalars[STEP_LENGTH]
     assert length > 0.0 and np.abs(r - there).max() > 0.01 * np.abs(r).max()
     displacement = length * BETA * y
