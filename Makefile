@@ -50,6 +50,7 @@ docs: $(DOCS_READY)
 wheel: $(READY)
 	rm -rf out/wheel
 	@[ -f out/docs/index.html ] || echo "The wheel will lack the manual: make docs builds it."
+	@[ -z "$$(find docs -name '*.md' -newer out/docs/index.html 2>/dev/null)" ] || echo "The manual in out/docs is older than its pages: make docs."
 	$(BIN)/python -m build --outdir out/wheel . >/dev/null
 	$(BIN)/twine check --strict out/wheel/taisoft-*
 	$(BIN)/python -m venv out/wheel/venv

@@ -119,7 +119,7 @@ def peers_short(results: Path) -> str:
     lines: dict[tuple, tuple] = {}
     for one in numbers["comparisons"]:
         (own, own_seconds), (other, seconds) = one["taisoft"], one["others"]
-        if one["stiff"] or own_seconds == "-":
+        if one["stiff"] or own_seconds == seconds == "-":
             continue
         work, tets = WORKS[one["work"].split()[0]], f"{one['tets']:,}"
         at = "it stands" if one["at"] == "stands" else f"{100 * float(one['at'].split()[-1]):g} %"

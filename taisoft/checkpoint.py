@@ -121,8 +121,11 @@ def check_scene(saved: Checkpoint, scene: Scene, features: dict[str, bool]) -> N
 def restore_numbers(saved: Checkpoint, scene: Scene) -> None:
     """Set the numbers of a scene that differ from a checkpoint's. Raises SceneError for invalid numbers."""
     start, decided = scene_numbers(scene), [body.dilatation for body in scene.bodies]
-    changed = {name: value for name, value in saved.numbers.items() if not np.array_equal(value, start.get(name))}
+    by_tet = [name for name, value in saved.numbers.items() if value is None and isinstance(start.get(name), np.ndarray)]
     with thawed(scene, *scene.bodies):
+        set_numbers(scene, {name: float(start[name].mean()) for name in by_tet})  # no longer; those by region follow
+        start = scene_numbers(scene)
+        changed = {name: value for name, value in saved.numbers.items() if not np.array_equal(value, start.get(name))}
         set_numbers(scene, {name: value for name, value in changed.items() if value is not None})
         for body, dilatation in zip(scene.bodies, decided):
             if body.dilatation != dilatation:

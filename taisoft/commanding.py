@@ -60,10 +60,9 @@ def set_displacement(self: "Simulator", body: str, index: int, value, seconds: f
     if not found:
         raise SceneError(f"{what}: it has no moved nodes: hold them by body.move(where) before the Simulator is made")
     mover = found[checks.whole(index, f"{what}: index", range(len(found)))]
-    first, shape = dynamics.commands.displacement(mover, self.time, f"{what}: {index}"), (dynamics.commands.n_nodes(mover), 3)
-    last = checks.array(value, f"{what}: value", ((3,), shape))
-    ends = (np.broadcast_to(x, shape).copy() for x in (first, last))
-    dynamics.command({mover: Command(self.time, *ends, seconds=_duration(what, seconds))})
+    first = dynamics.commands.displacement(mover, self.time, f"{what}: {index}")
+    last = np.broadcast_to(checks.array(value, f"{what}: value", ((3,), first.shape)), first.shape)
+    dynamics.command({mover: Command(self.time, first, last.copy(), seconds=_duration(what, seconds))})
 
 
 def _commanded(sim: "Simulator", call: str, name: str) -> dict[int, Pose]:
@@ -91,10 +90,8 @@ def _refuse_foresight(sim: "Simulator", call: str) -> None:
 
 def refuse_commands(sim: "Simulator", what: str) -> None:
     """Refuse a run that has to foresee motion while anything follows a command. what: the argument that asks for it."""
-    if commands := sim._host().commands:
-        raise SimulationError(
-            f"{what}: {commands.names()[0]!r} follows a command, which cannot be foreseen: give it a path, or call sim.reset()"
-        )
+    for name in sim._host().commands:
+        raise SimulationError(f"{what}: {name!r} follows a command, which cannot be foreseen: give a path, or call sim.reset()")
 
 
 def _duration(what: str, seconds: float | None) -> float | None:

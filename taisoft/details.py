@@ -4,6 +4,7 @@ each body."""
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
+from taisoft.errors import SceneError
 from taisoft.records import StepReport
 from taisoft.scene import checks
 
@@ -33,8 +34,11 @@ def details_of(sim: "Simulator", wanted: tuple[str, ...]) -> dict[str, float]:
 
 def detailed(sim: "Simulator", wanted: tuple[str, ...], on_step: Callable | None) -> Callable[[StepReport, float], None]:
     """Return an `on_step` of `run` that fills the details of each report, then calls the given one. Raises SceneError."""
+    wanted = (wanted,) if isinstance(wanted, str) else tuple(wanted)
     for name in wanted:
         checks.choice(name, "details", DETAILS)
+    if "pairs" in wanted and not sim.touches:
+        raise SceneError("details: pairs need contact forces, which are not simulated here")
 
     def fill(report: StepReport, seconds: float) -> None:
         report.details = details_of(sim, wanted)

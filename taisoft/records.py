@@ -128,7 +128,8 @@ class RunReport:
 
     def to_dicts(self) -> list[dict]:
         """Return the rows of steps.csv, which pandas.DataFrame takes."""
-        return [report.to_dict() for report in self.step_reports]
+        absent = dict.fromkeys((name for report in self.step_reports for name in report.details), 0.0)
+        return [report.to_dict() | absent | report.details for report in self.step_reports]
 
     def __repr__(self) -> str:
         """One line, and the first problems."""

@@ -15,6 +15,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import fields
 from importlib import import_module
+from importlib.util import find_spec
 
 from taisoft import __version__
 from taisoft.errors import OutputError, SceneError, TaisoftError, no_memory
@@ -36,7 +37,7 @@ def main(argv: list[str] | None = None) -> int:
     `doctor` also works on a broken installation.
     """
     parser = command_parser()
-    if "_ARGCOMPLETE" in os.environ:
+    if "_ARGCOMPLETE" in os.environ and find_spec("argcomplete"):
         import_module("argcomplete").autocomplete(parser)
     arguments = parser.parse_args(argv)
     try:
@@ -183,7 +184,7 @@ def command_parser() -> argparse.ArgumentParser:
         description="Compile the kernels of scenes in advance; without names those of the demos, of pictures and of statics, "
         "which takes some minutes. Scenes of the same kind then start at once, whatever their meshes and numbers.",
     ).add_argument
-    option("scenes", metavar="SCENE", nargs="*", help="a demo's name, or a .toml or .py file")
+    _complete(option("scenes", metavar="SCENE", nargs="*", help="a demo's name, or a .toml or .py file"))
     option("--precision", choices=("f32", "f64"), help="of all kernels (default: the scenes' own, and f64 of statics)")
 
     option = add("completion", ("scene_file", "completion"), "print a shell's script for completion (extra 'completion')")
@@ -247,7 +248,7 @@ def _add_run(add) -> None:
 def _add_placement(option, instead: str = "(default: the mesh stays)") -> None:
     """Add the options that place a mesh, in the order in which they are applied; those that are not given are None."""
     option("--up", choices=("x", "y", "z"), help="axis of the file that points up (default y)")
-    option("--to", choices=("y", "z"), help="axis that points up in the scene, to which that is turned (default y)")
+    option("--to", choices=("y", "z"), help="axis that points up in the scene; the mesh is turned to it (default y)")
     option("--scale", type=float, metavar="S", help="factor, such as 0.001 for millimetres (default 1)")
     angles = "angles [deg] about x, then y, then z, after --up (default 0 0 0)"
     option("--rotate", type=float, nargs=3, metavar=("RX", "RY", "RZ"), help=angles)
@@ -282,7 +283,10 @@ def _add_study(add) -> None:
     option("--scheduler", metavar="ADDRESS", help="run on a Dask cluster, e.g. tcp://host:8786 (extra 'cluster')")
 
 
-def _add_scene_name(option, others: str = "a .toml scene file or a .py file with build()") -> None:
-    scene = option("scene", metavar="SCENE", help=f"a demo's name (see `taisoft list`), {others}")
+def _complete(scene: argparse.Action) -> None:
     scene.completer = lambda **given: import_module("taisoft.cli.scene_file").fitting_scenes(**given)
+
+
+def _add_scene_name(option, others: str = "a .toml scene file or a .py file with build()") -> None:
+    _complete(option("scene", metavar="SCENE", help=f"a demo's name (see `taisoft list`), {others}"))
     option("--allow-outside", action="store_true", help="let a .toml file name mesh files outside its folder")

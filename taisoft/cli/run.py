@@ -6,11 +6,14 @@ Settings come from the scene's `solver` dict, --set and the other options; the l
 import inspect
 import os
 import sys
+import tomllib
 from argparse import Namespace
 from collections.abc import Iterator
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
+
+import numpy as np
 
 from taisoft.checkpoint import Checkpoint
 from taisoft.cli import EXIT_FAILED, EXIT_OUTPUT, EXIT_SIGNAL, Signals, parse_scalar, printed_warnings
@@ -144,13 +147,23 @@ def set_given(scene: Scene, assignments: list[str]) -> dict:
             raise SceneError(f"--set {assignment}: write NAME.NUMBER=VALUE, such as beam.young=2e5, or solver.KEY=VALUE")
         if name.startswith("solver."):
             continue
-        values = [parse_scalar(part.strip(), assignment) for part in text.strip("[]").split(",")]  # a vector has commas
-        given[name] = values if len(values) > 1 else values[0]
+        given[name] = _number_or_list(text, assignment)
         try:
             set_numbers(scene, {name: given[name]})
         except SceneError as error:
             raise SceneError(f"--set {assignment}: {error}") from None
     return given
+
+
+def _number_or_list(text: str, assignment: str) -> float | int | bool | str | list | None:
+    """Parse a value as `parse_scalar`, or a list of numbers in TOML syntax, whose outer brackets may be left out."""
+    if "," not in text and "[" not in text:
+        return parse_scalar(text, assignment)
+    with suppress(tomllib.TOMLDecodeError, ValueError):
+        value = tomllib.loads(f"value = {text if text.startswith('[') else f'[{text}]'}")["value"]
+        if not any(isinstance(one, bool) for one in np.array(value, dtype=object).flat):
+            return value
+    raise SceneError(f"--set {assignment}: {text!r} is not a list of numbers")
 
 
 def _given(arguments: Namespace, keys: list[str]) -> dict:

@@ -77,22 +77,15 @@ def bench(arguments: Namespace) -> int:
 def docs(arguments: Namespace) -> int:
     """Print the path of a page of the manual, and open it where there is a browser. Raises SceneError without it."""
     folder = shipped_folder("out/docs")  # by `make docs`
-    pages = (
-        {} if folder is None else {path.relative_to(folder).with_suffix("").as_posix(): path for path in folder.rglob("*.html")}
-    )
+    paths = () if folder is None else folder.rglob("*.html")
+    pages = {path.relative_to(folder).with_suffix("").as_posix(): path for path in paths}
     if not pages:
         in_checkout = (PACKAGE.parent / "docs" / "conf.py").is_file()
-        state = (
-            "is not built yet: `make docs` builds it"
-            if in_checkout
-            else "is not in this installation, which was built without it"
-        )
+        state = "is not built yet: `make docs` builds it" if in_checkout else "was left out when this installation was built"
         raise SceneError(f"the manual {state}; its pages are in docs/ of the sources, as Markdown")
     page = pages.get(arguments.page.removesuffix(".html").removesuffix(".md"))
     if page is None:
-        raise SceneError(
-            f"the manual has no page {arguments.page!r}{nearest(arguments.page, pages)}; `taisoft docs` opens its index"
-        )
+        raise SceneError(f"the manual has no page {arguments.page!r}{nearest(arguments.page, pages)}")
     print(page)
     if not arguments.path:
         webbrowser.open(page.as_uri())

@@ -1,7 +1,7 @@
 """`taisoft warm [SCENE ...]`: compiles the kernels of scenes in advance, so that later runs find them in the disk cache.
 
-Kernels depend on what a scene holds, not on meshes or numbers, so that a scene serves all others of its kind. Without names the
-demos are compiled, their pictures, and statics.
+Kernels depend on what a scene holds, and little on its meshes and numbers, so that a scene serves all others of its kind. Without
+names the demos are compiled, their pictures, and statics.
 """
 
 import contextlib

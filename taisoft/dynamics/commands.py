@@ -5,6 +5,7 @@ that the next call of `advance` asks for: an implicit step, or a number of expli
 """
 
 import dataclasses
+from collections.abc import Iterator
 
 import numpy as np
 
@@ -25,12 +26,9 @@ class Commands:
         self._movers: list[Obstacle | MovedNodes] = [*scene.obstacles, *dirichlet.groups]
         self._followed: dict[int, Command] = {}  # by mover
 
-    def __bool__(self) -> bool:
-        return bool(self._followed)
-
-    def names(self) -> list[str]:
-        """Return the names of what follows commands."""
-        return [self._movers[k].name for k in self._followed]
+    def __iter__(self) -> Iterator[str]:
+        """The names of what follows commands."""
+        return (self._movers[k].name for k in self._followed)
 
     def obstacle(self, obstacle: Obstacle) -> int:
         """Return the mover that an obstacle is. Raises SceneError if what is attached to it was taken to be at rest."""
@@ -46,18 +44,14 @@ class Commands:
         """Return the movers that are nodes held by `move` of a body, in the order added."""
         return [k for k, one in enumerate(self._movers) if isinstance(one, MovedNodes) and one.of_move and one.name == name]
 
-    def n_nodes(self, mover: int) -> int:
-        """Return the number of nodes of a mover that is nodes."""
-        return len(self._movers[mover].nodes)
-
     def displacement(self, mover: int, time: float, what: str) -> np.ndarray:
-        """Return the displacement (3,) or (k,3) [m] of nodes that are still held. Raises SceneError."""
+        """Return the displacements (k,3) [m] of nodes that are still held. Raises SceneError."""
         group = self._movers[mover]
         shapes = ((3,), (len(group.nodes), 3))
         found = None if group.released else checks.path_value(group.path, time, what, "displacement", shapes)
         if found is None:
             raise SceneError(f"{what}: its path has released it, and it moves freely")
-        return found
+        return np.broadcast_to(found, shapes[1]).copy()
 
     def pose(self, mover: int, time: float, what: str) -> Pose:
         """Return the pose of an obstacle, or of a rigid body that is still held, without the rounding of its nodes' positions."""
@@ -67,8 +61,8 @@ class Commands:
         body, displacement = self._body(one), self.displacement(mover, time, what)
         if isinstance(one.path, PosePath):
             return Pose(*one.path.pose(time))
-        if displacement.ndim == 1:
-            return Pose(displacement, np.eye(3))
+        if (displacement == displacement[0]).all():
+            return Pose(displacement[0], np.eye(3))
         return body.pose(body.rest_positions[:FRAME] + body.position + displacement)
 
     def follow(self, mover: int, command: Command) -> None:

@@ -344,8 +344,3 @@ def to_bsr(m: Model, A: BlockCsr, diagonal: Any = None) -> sp.bsr_matrix:
     order = np.lexsort((column, row))  # SciPy's sum would leave out blocks that are 0
     blocks, whole = np.concatenate([unpacked(value), unpacked(diagonal)]), np.concatenate([[0], np.cumsum(np.bincount(row))])
     return sp.bsr_matrix((blocks[order], column[order], whole), shape=(3 * m.n_nodes, 3 * m.n_nodes))
-
-
-def to_scipy(m: Model, A: BlockCsr) -> sp.csr_matrix:
-    """Copy the matrix to the host, (3 n_nodes, 3 n_nodes) float64."""
-    return to_bsr(m, A).tocsr()

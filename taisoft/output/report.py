@@ -106,11 +106,9 @@ def steps_csv(reports: list[StepReport], earlier: tuple[list[str], list[list[str
     filled = [0.0 if heading.split()[0] in kinds else "" for heading in new]
     writer = csv.writer(text)
     writer.writerows([[*COLUMNS, *before, *new], *([*row, *filled] for row in rows)])
-    for report in reports:
-        row = report.to_dict()
-        writer.writerow(
-            [row[name] if name in COLUMNS else row.get(name, 0.0 if own else "") for name in (*COLUMNS, *before, *new)]
-        )
+    asked = {heading.split()[0] for heading in own}
+    for row in (report.to_dict() for report in reports):
+        writer.writerow([row.get(name, 0.0 if name.split()[0] in asked else "") for name in (*COLUMNS, *before, *new)])
     return text.getvalue()
 
 

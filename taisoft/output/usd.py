@@ -6,7 +6,7 @@ the self-contained `scene.usdc` at the end; then the chunks are removed. Appendi
 writes new values after the old ones) and frees their memory, but it would corrupt the file if the process died meanwhile; hence
 the separate chunks. Composing the chunks as layers does not work: USD takes an attribute's time samples from the strongest layer
 alone, and many readers do not support value clips.
-`join_chunks` makes `scene.usdc` from the chunks of a killed run. A resumed run starts from the earlier frames of both.
+A resumed run starts from the earlier frames of `scene.usdc` and of the chunks that a killed run left.
 
 Time codes are frame numbers; a state before the time of its frame, as at the end of a run between two frames, has the fraction
 that is its time. Units are metres, up is the scene's. A body is `/World/<name>` with `surface` (Mesh), `tets` (TetMesh, purpose

@@ -30,7 +30,12 @@ def scene_numbers(scene: Scene) -> Numbers:
 
     Arrays are numbers by tet (m,), and forces per node (k,3). None: chosen by the Simulator, by region, or along a path.
     """
-    return {name: value for name, value, _ in _entries(scene)}
+    found = {}
+    for name, value, _ in _entries(scene):
+        if name in found:
+            raise SceneError(f"two numbers of the scene are called {name!r}: rename a body, a region or an obstacle")
+        found[name] = value
+    return found
 
 
 def set_numbers(scene: Scene, numbers: Numbers) -> None:
@@ -46,7 +51,7 @@ def set_numbers(scene: Scene, numbers: Numbers) -> None:
         elif pair:
             _set_pair(scene, *pair.groups(), value)
         else:
-            hint = checks.nearest(name, calls) or f"; there are {', '.join(list(calls)[:3])} and {len(calls) - 3} more"
+            hint = checks.nearest(name, calls) or f"; it has {', '.join(list(calls)[:3])}{', ...' * (len(calls) > 3)}"
             raise SceneError(f"the scene has no number {name!r}{hint}")
 
 

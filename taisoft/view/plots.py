@@ -8,7 +8,7 @@ The history takes constant memory: minimum and maximum of every quantity over bi
 until CAPACITY bins are full. Then neighbours are merged in pairs, and from there on a bin holds twice as many steps. So no peak
 is lost, however long a simulation runs, and early and late steps have the same resolution.
 
-Some plots show a quantity of each pair that presses, or of each body: the few largest. It is recorded from when one is shown.
+Some plots show a quantity of each pair that presses, or of each body: the few largest. Recording starts when one is first shown.
 """
 
 import math

@@ -26,7 +26,7 @@ from taisoft.dynamics.stage_system import StageSystem
 from taisoft.fem.node_graph import EVERYTHING
 from taisoft.fem.state import END_SLOPE, N_NORMS, NORMS, START_SLOPE, STEP_LENGTH
 from taisoft.linear import block_csr, pcg
-from taisoft.linear.block_csr import to_scipy, unpacked
+from taisoft.linear.block_csr import to_bsr, unpacked
 from tests.contact import contact_oracle as oracle
 from tests.dynamics.scenes import built, cube, rubber
 
@@ -71,7 +71,7 @@ def rig():
         block_csr.to_system(m, solver.matrix, solver.matrix, EVERYTHING, 0, 1.0, BETA)
         contact_terms.save_diagonal(m, solver.matrix, k, EVERYTHING)
         find_factors(p)
-        A = to_scipy(m, solver.matrix).toarray()
+        A = to_bsr(m, solver.matrix).toarray()
         sides = contacts.node, arity, contacts.weight, contacts.normal, contacts.tangent
         found = oracle.NodeContacts(*sides, np.zeros((m.n_nodes, 3)), np.zeros(3 * K), friction)
         start = made.oracle.rest

@@ -118,7 +118,7 @@ def test_blocks_are_the_derivative_of_the_force(rig, projected):
         matrix.value.fill(0.0)
         matrix.diagonal.fill(0.0)
         block_csr.to_system(m, matrix, matrix, EVERYTHING, int(projected), 1.0, BETA)
-        matrices.append(block_csr.to_scipy(m, matrix))
+        matrices.append(block_csr.to_bsr(m, matrix))
     K, rows = (matrices[1] - matrices[0]) / BETA**2, np.concatenate(rig.frames)
     for seed in range(3):
         way = np.zeros_like(x)

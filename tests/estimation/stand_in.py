@@ -39,6 +39,7 @@ class StandIn:
     """
 
     frequency, damping, width_error, floor, newton, stable_dt = 5.0, 0.0, 0.0, -np.inf, 2, 0.03
+    commands = ()  # none are followed
     offset, before_step, unconverged = (staticmethod(f) for f in (lambda sim: 0.0, lambda sim: None, lambda sim: False))
     dragged, is_driven, compile_seconds, contact = None, False, 0.0, SimpleNamespace(contact_offset=0.01)
     made: list["StandIn"] = []

@@ -78,4 +78,4 @@ def added(rig, x: np.ndarray, beta: float, projected: bool = False) -> np.ndarra
     rig.matrix.value.fill(0.0)
     rig.matrix.diagonal.fill(0.0)
     block_csr.to_system(rig.model, rig.matrix, rig.matrix, EVERYTHING, int(projected), 0.0, beta)
-    return block_csr.to_scipy(rig.model, rig.matrix).toarray()
+    return block_csr.to_bsr(rig.model, rig.matrix).toarray()

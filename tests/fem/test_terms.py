@@ -102,7 +102,7 @@ def test_dampers_act_by_the_rates_of_each_body(rig):
     assert np.abs(mass + drag[:, None] * v).max() <= 1e-12 * np.abs(mass).max()
     assert np.abs(decayed - np.exp(-0.1 * rates)[:, None] * v).max() < 1e-14 * np.abs(v).max()
     rates = np.where(np.arange(len(v)) < rig.start[1], 0.004, 0.0)[:, None]  # the flyer has none
-    expected = -rates * (block_csr.to_scipy(m, matrix) @ v.reshape(-1)).reshape(-1, 3)
+    expected = -rates * (block_csr.to_bsr(m, matrix) @ v.reshape(-1)).reshape(-1, 3)
     assert np.abs(stiffness - expected).max() < 1e-12 * np.abs(expected).max()
 
 
@@ -121,6 +121,6 @@ def test_forces_and_stiffness_of_dependent_nodes_act_on_the_others():
         matrix = block_csr.build_block_csr(rig.model, rig.arena)
         block_csr.assemble(rig.model, matrix, EVERYTHING, False)
         axes = (3 * own[:, None] + np.arange(3)).reshape(-1)
-        found, K = block_csr.to_scipy(rig.model, matrix).toarray(), rig.oracle.stiffness(T @ q)
+        found, K = block_csr.to_bsr(rig.model, matrix).toarray(), rig.oracle.stiffness(T @ q)
         wanted = np.kron(T, np.eye(3)).T @ K @ np.kron(T, np.eye(3))
         assert np.abs(found - wanted)[np.ix_(axes, axes)].max() < 1e-12 * np.abs(wanted).max()

@@ -105,7 +105,7 @@ def test_conjugate_gradients_with_a_cycle():
     """The prolongation keeps the motions without energy; the solution is exact; limits and negative curvature end the solve."""
     with assembled(held_box()) as made:
         m, A, w = made.model, made.A, made.work
-        K = (block_csr.to_scipy(m, A) + 1e-6 * sp.identity(made.free.size)).tobsr((3, 3))
+        K = (block_csr.to_bsr(m, A) + 1e-6 * sp.identity(made.free.size)).tobsr((3, 3))
         K.sort_indices()
         modes = rigid_modes(made.x, np.ones_like(made.free))
         P = Multigrid(K, modes, ti.f64).levels[0].prolongation.to_scipy()

@@ -42,7 +42,7 @@ def upload(rig, dense: np.ndarray) -> np.ndarray:
     """Upload a matrix with the node graph's pattern to all ways; returns the exact solution (n,3)."""
     for m, matrix, _ in rig.ways.values():
         fill(m, matrix, sp.bsr_matrix(dense, blocksize=(3, 3)))
-        assert abs(block_csr.to_scipy(m, matrix) - dense).max() == 0.0
+        assert abs(block_csr.to_bsr(m, matrix) - dense).max() == 0.0
     f, y = rig.free.reshape(-1), np.zeros(len(dense))
     y[f] = np.linalg.solve(dense[f][:, f], rig.rhs.reshape(-1)[f])
     return y.reshape(-1, 3)

@@ -38,7 +38,7 @@ def test_the_preconditioner_solves_the_system_in_few_iterations_whatever_lambda(
             volumes = system.linear_solver.volumes(A)
             volume_pcg.prepare_volumes(m, A, w, volumes, BETA**2)
             found = volume_pcg.solve(m, A, w, volumes, 1e-10, 1000)
-            K = block_csr.to_scipy(m, A).toarray()[free][:, free]
+            K = block_csr.to_bsr(m, A).toarray()[free][:, free]
             exact, y = np.linalg.solve(K, rhs[free]), w.y.to_numpy().reshape(-1)
             assert found.converged and np.abs(y[free] - exact).max() < 1e-7 * np.abs(exact).max() and not y[~free].any()
             iterations.append(found.iterations)
@@ -46,7 +46,7 @@ def test_the_preconditioner_solves_the_system_in_few_iterations_whatever_lambda(
                 m.state.x.from_numpy(m.state.x.to_numpy() + 0.1 * np.random.default_rng(1).standard_normal((len(free) // 3, 3)))
                 other = block_csr.build_block_csr(m, made.arena, "other")
                 block_csr.assemble(m, other, EVERYTHING, True)
-                values = np.linalg.eigvalsh(block_csr.to_scipy(m, other).toarray())
+                values = np.linalg.eigvalsh(block_csr.to_bsr(m, other).toarray())
                 assert values[0] > -1e-12 * values[-1]
             stopped = volume_pcg.solve(m, A, w, volumes, 1e-10, 3)
             assert stopped.iterations == 3 and not stopped.converged

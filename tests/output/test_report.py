@@ -84,6 +84,20 @@ def test_the_step_table_holds_every_field_of_every_step(written):
         assert given["problems"] == "; ".join(step.problems) and given["time"] == step.time
 
 
+def test_details_that_a_resumed_run_does_not_ask_for_are_left_empty():
+    """A pair that does not press in a step has zeros, in the earlier rows, too."""
+    header = [*report.COLUMNS, "force x on a by b [N]", "kinetic of a [J]"]
+    earlier = [str(k) for k in range(len(header))]
+    steps = [StepReport(time=t, details={"kinetic of a [J]": t}) for t in (1.0, 2.0)]
+    rows = list(csv.DictReader(io.StringIO(report.steps_csv(steps, (header, [earlier])))))
+    assert [row["force x on a by b [N]"] for row in rows] == [earlier[-2], "", ""]
+    steps[0].details = {"force x on a by c [N]": 3.0}
+    rows = list(csv.DictReader(io.StringIO(report.steps_csv(steps, (header, [earlier])))))
+    assert [row["force x on a by c [N]"] for row in rows] == ["0.0", "3.0", "0.0"]
+    rows = RunReport(step_reports=steps).to_dicts()
+    assert [(row["force x on a by c [N]"], row["kinetic of a [J]"]) for row in rows] == [(3.0, 0.0), (0.0, 2.0)]
+
+
 @pytest.mark.parametrize(
     "terminal, compiling, shown",
     [(False, 0.0, "10 steps/s, 0:34 left"), (False, 3.0, "20 steps/s, 0:17 left"), (True, 0.0, "10 steps/s, 0:30 left")],

@@ -5,6 +5,7 @@ import shutil
 import sys
 import xml.etree.ElementTree as ET
 from pathlib import Path
+from types import SimpleNamespace
 
 import meshio
 import numpy as np
@@ -83,6 +84,25 @@ def test_points_cells_and_data_come_back_from_meshio(written):
     with pytest.warns(UserWarning, match="edges of second-order tets are curved"):
         again = ts.read_mesh(path)
     assert again.n_tets == len(sigma) and again.region_ids == (0, 4, 7)
+
+
+def test_the_grid_of_a_simulator_has_what_is_written(written, monkeypatch):
+    """By a stand-in for pyvista, which takes the number of nodes before those of each cell."""
+    taken = []
+
+    def grid(cells, types, points):
+        taken[:] = cells, types, points
+        return SimpleNamespace(point_data={}, cell_data={}, field_data={})
+
+    monkeypatch.setitem(sys.modules, "pyvista", SimpleNamespace(UnstructuredGrid=grid))
+    sim, path = written
+    made, read = sim.to_pyvista(), meshio.read(path)
+    rows = [np.insert(block.data, 0, block.data.shape[1], axis=1).ravel() for block in read.cells]
+    assert np.array_equal(taken[0], np.concatenate(rows)) and np.array_equal(taken[2], read.points)
+    assert taken[1].tolist() == [24] * len(read.cells[0].data) + [10] * len(read.cells[1].data)
+    assert all(np.array_equal(made.point_data[name], values) for name, values in read.point_data.items())
+    assert all(np.array_equal(made.cell_data[name], np.concatenate(blocks)) for name, blocks in read.cell_data.items())
+    assert {name: value.item() for name, value in read.field_data.items()} == {n: v[0] for n, v in made.field_data.items()}
 
 
 def test_pyvista_gets_what_is_written(written):

@@ -1,11 +1,13 @@
 """Numbers of a scene by name: each can be set, alone, and is then what a scene made with it has; others are refused."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 import taisoft as ts
+from taisoft.checkpoint import restore_numbers
 from taisoft.scene.fingerprint import scene_digest
 from taisoft.scene.numbers import scene_numbers, set_numbers
 from tests.dynamics.scenes import cube, halved, rubber
@@ -82,7 +84,7 @@ def test_a_number_that_is_set_is_that_of_a_scene_made_with_it():
     "name, value, message",
     [
         ("body.yuong", 1.0, "the scene has no number 'body.yuong' (did you mean body.young?)"),
-        ("zzz", 1.0, "the scene has no number 'zzz'; there are gravity, body.young, body.poisson and 50 more"),
+        ("zzz", 1.0, "the scene has no number 'zzz'; it has gravity, body.young, body.poisson, ..."),
         ("body.young", -1.0, "body 'body': young must be greater than 0 Pa, not -1.0"),
         ("two.left.friction", 0.1, "the scene has no number 'two.left.friction' (did you mean two.friction?)"),
         ("rigid.density", 0.0, "rigid body 'rigid': density must be greater than 0 kg/m^3, not 0.0"),
@@ -100,3 +102,21 @@ def test_other_names_and_values_are_refused(name, value, message):
     with pytest.raises(ts.SceneError) as caught:
         set_numbers(made, {name: value})
     assert message in str(caught.value) and "\n" not in str(caught.value) and scene_digest(made) == before
+
+
+def test_a_checkpoint_brings_back_regions_whose_numbers_were_given_by_tet():
+    made = ts.Scene()
+    made.add_body(halved(cube()), {"left": rubber(), 7: rubber()}, name="two", young=np.linspace(1e5, 2e5, 5))
+    changed = made.snapshot()
+    set_numbers(changed, {"two.young": 1e5})
+    set_numbers(changed, {"two.left.young": 3e5})
+    restore_numbers(SimpleNamespace(numbers=scene_numbers(changed)), made)
+    assert np.array_equal(made.bodies[0].young, changed.bodies[0].young) and np.ptp(made.bodies[0].young) > 1e5
+
+
+def test_two_numbers_of_one_name_are_refused():
+    made = ts.Scene()
+    made.add_body(halved(cube()), {"left": rubber(), 7: rubber()}, name="two")
+    made.add_body(cube(), rubber(), name="two.left", position=(3, 0, 0))
+    with pytest.raises(ts.SceneError, match="two numbers of the scene are called 'two.left.young'"):
+        scene_numbers(made)
