@@ -23,7 +23,8 @@ demo: $(READY)
 # A sheet falls on a box in the live window. The first time, kernels are compiled before: with a window it would take twice as long.
 window: $(READY)
 	@$(BIN)/python -c "$(NO_WINDOW)"
-	@[ -f $(VENV)/window-ready ] || { $(BIN)/taisoft run sheet_on_box --headless --seconds 0.3 && touch $(VENV)/window-ready; }
+	@[ -f $(VENV)/window-ready ] || { echo "Compiling kernels, once, for about half a minute."; \
+	  $(BIN)/taisoft run sheet_on_box --headless --seconds 0.3 >/dev/null 2>&1 && touch $(VENV)/window-ready; }
 	$(BIN)/taisoft run sheet_on_box
 
 # One thread for the dense algebra of each worker: more only spin on cores that the others need.

@@ -12,13 +12,13 @@ from taisoft.backend.runtime import open_runtime
 from taisoft.dynamics.schemes import EXPLICIT
 from taisoft.errors import TaisoftError
 from taisoft.scene.scene import Scene
-from taisoft.study.measure import advance, warm_up
+from taisoft.study.measure import advance
 
 from .contact_colouring import measure_crossover
 from .elasticity_runs import MARGIN, beam_scene
 from .programs import own
 from .programs.session import Setting
-from .runner import patched, print_result
+from .runner import patched, print_result, warm_up
 from .scaling_runs import cubes_on_ground
 from .works.evaluation import evaluate
 from .works.references import MUJOCO, TAISOFT

@@ -24,6 +24,7 @@ from taisoft.backend.runtime import compile_clock
 from taisoft.errors import SimulationError
 from taisoft.output.files import make_folder
 from taisoft.output.tables import require_matplotlib
+from taisoft.simulator import Simulator
 
 from .document import RESULTS, check_out, default_out
 
@@ -124,6 +125,13 @@ def patched(owner, name: str, value) -> Iterator[None]:
             setattr(owner, name, before)
         else:
             delattr(owner, name)
+
+
+def warm_up(sim: Simulator, steps: int = 3) -> None:
+    """Compile the kernels that steps need, in as many as those of a multistep integrator take, then reset to the start."""
+    for _ in range(steps):
+        sim.step()
+    sim.reset()
 
 
 @contextmanager

@@ -61,7 +61,7 @@ def check_stability(sim: "Simulator", dt: float, stacklevel: int = 3) -> None:
     limit = sim.stable_dt
     text = f"dt = {dt:.3g} s is above the estimated stability limit of {limit:.3g} s of {settings.integrator}"
     if not settings.allow_unstable:
-        raise SimulationError(f"{text}: take a smaller dt (0.9 of the limit is {0.9 * limit:.3g} s) or allow_unstable=True")
+        raise SimulationError(f"{text}: take a smaller dt (0.7 of the limit is {0.7 * limit:.3g} s) or allow_unstable=True")
     warnings.warn(text, stacklevel=stacklevel)
 
 

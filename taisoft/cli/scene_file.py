@@ -80,10 +80,9 @@ def docs(arguments: Namespace) -> int:
     paths = () if folder is None else folder.rglob("*.html")
     pages = {path.relative_to(folder).with_suffix("").as_posix(): path for path in paths}
     if not pages:
-        in_checkout = (PACKAGE.parent / "docs" / "conf.py").is_file()
-        state = "is not built yet: `make docs` builds it" if in_checkout else "was left out when this installation was built"
-        raise SceneError(f"the manual {state}; its pages are in docs/ of the sources, as Markdown")
-    page = pages.get(arguments.page.removesuffix(".html").removesuffix(".md"))
+        raise SceneError("the manual was not built with this installation: `make docs` builds it from docs/ of the sources")
+    name = arguments.page.removesuffix(".html").removesuffix(".md")
+    page = pages.get(name) or next((path for page, path in pages.items() if page.endswith(f"/{name}")), None)
     if page is None:
         raise SceneError(f"the manual has no page {arguments.page!r}{nearest(arguments.page, pages)}")
     print(page)

@@ -55,7 +55,7 @@ def check_free(path: str | Path, overwrite: bool) -> dict:
     found = _results(Path(path)) if Path(path).is_dir() else {}
     if found and not overwrite:
         raise OutputError(
-            f"the output folder {path} already holds results ({', '.join(found)}): name another folder or ask to overwrite"
+            f"the output folder {path} already holds results ({', '.join(found)}): name another, or overwrite it (--overwrite)"
         )
     return found
 

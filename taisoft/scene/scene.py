@@ -360,7 +360,7 @@ class Scene(Guarded):
 def _find(items: list, name: str, kind: str) -> Body | Obstacle | Cavity:
     """Return the item with this name. Raises SceneError with the closest name if there is none."""
     for item in items:
-        if item.name == name:
+        if isinstance(name, str) and item.name == name:
             return item
     names = [item.name for item in items]
     near = difflib.get_close_matches(name, names, n=1) if isinstance(name, str) else []

@@ -1,6 +1,6 @@
 """One run of a study, in its own process: recorded once at the frames, then timed from the start without recording.
 
-Benchmarks time whole runs with `warm_up` and `advance` too.
+Benchmarks time whole runs with `advance`, too.
 """
 
 import time
@@ -21,7 +21,6 @@ from taisoft.simulator import Simulator
 from taisoft.study import simulator_arguments
 from taisoft.study.accuracy import pack
 
-WARM_STEPS = 3  # enough for a multistep integrator to compile all its kernels
 MAX_REPEATED_SECONDS = 20.0  # a run with a longer wall time is not repeated: the recorded run gives its time
 ITERATIONS = ("newton_iterations", "linear_iterations", "contact_iterations")
 SHORT_SECONDS, MAX_RUNS = 0.5, 25  # short runs are repeated until their total time [s] or their number reaches these
@@ -57,13 +56,6 @@ def advance(sim: Simulator, steps: int) -> TimedRun:
         timed.linear_iterations += report.linear_iterations
     timed.seconds = time.perf_counter() - start - (sim.compile_seconds - compiled)
     return timed
-
-
-def warm_up(sim: Simulator) -> None:
-    """Compile the kernels that steps need, then reset to the start."""
-    for _ in range(WARM_STEPS):
-        sim.step()
-    sim.reset()
 
 
 def measure(scene: Scene, task: dict) -> dict:

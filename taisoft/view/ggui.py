@@ -129,6 +129,7 @@ class Canvas:
         self._indices[: len(surfaces.triangles)] = surfaces.triangles
         self._decals = self._indices[len(surfaces.triangles) :]  # unused triangles have no area
         self._ends = VertexBuffer(2 * n_segments)
+        self._most = 0  # ends of lines drawn at once so far
         self._flat_boxes: VertexBuffer | None = None  # like `_flat_lines` drawn over the picture; made at the first `draw_over`
         self._flat_lines: VertexBuffer | None = None
         self._flat_ends: np.ndarray | None = None  # the array that `_flat_lines` was filled from
@@ -179,7 +180,9 @@ class Canvas:
         n = min(len(ends), len(self._ends))
         if n > 0:
             self._ends.x[:n], self._ends.colours[:n] = ends[:n] - camera.target, line_colours[:n]
-            self._scene.scene.lines(self._ends.info, get_field_info(None), True, GREY, self._line_width, n, 0, n, 0)
+            most = self._most = max(n, self._most)  # the renderer goes on drawing as many as there were once
+            self._ends.x[n:most] = 0.0
+            self._scene.scene.lines(self._ends.info, get_field_info(None), True, GREY, self._line_width, most, 0, most, 0)
         self._canvas.scene(self._scene)
 
     def draw_over(

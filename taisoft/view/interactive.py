@@ -72,6 +72,9 @@ class InteractiveView:
     def __len__(self) -> int:
         return len(self.times)
 
+    def __bool__(self) -> bool:
+        return True
+
     def __repr__(self) -> str:
         return f"InteractiveView({len(self)} frames" + (
             f", t = {self.times[0]:.6g} to {self.times[-1]:.6g} s)" if self.times else ")"

@@ -113,6 +113,9 @@ class Film:
     def __len__(self) -> int:
         return len(self.pngs)
 
+    def __bool__(self) -> bool:
+        return True
+
     def __repr__(self) -> str:
         return f"Film({len(self)} pictures" + (f", t = {self.times[0]:.6g} to {self.times[-1]:.6g} s)" if self.times else ")")
 

@@ -117,7 +117,7 @@ class Screen(SceneView):
     def _show_messages(self, gui, state: dict, age: float) -> None:
         """Show what the simulation and this window have to say, in a sub-window that is there only then."""
         late = age > LONG and not state.get("paused")
-        long_step = [f"the present step has taken {age:.0f} s so far"] if late else []
+        long_step = [f"no new state for {age:.0f} s"] if late else []
         self._messages = [*state["messages"], *self._note.shown, *long_step]
         if self._messages:
             with gui.sub_window("messages", *MESSAGES) as page:

@@ -119,7 +119,7 @@ def test_a_film_holds_a_picture_a_frame(ran, tmp_path):
     assert re.fullmatch(r"von Mises stress, red: \S+ Pa or more", film.scales[-1])
     found = [decode(base64.b64decode(url.split(",")[1])) for url in data["pictures"]]
     assert all(picture.shape == (54, 96, 3) for picture in found) and not np.array_equal(found[0], found[-1])
-    assert shown(film).startswith('<iframe srcdoc="') and shown(ts.Film()) is None
+    assert shown(film).startswith('<iframe srcdoc="') and shown(ts.Film()) is None and ts.Film()
     for one, name, message in (
         (ts.Film(), "a.html", "the film holds no picture"),
         (film, "a.txt", r"a\.txt: the name of a page must end in \.html"),

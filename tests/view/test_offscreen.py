@@ -221,3 +221,18 @@ def test_a_process_has_one_window_which_leaves_no_files(tmp_path, monkeypatch):
     (tmp_path / "imgui.ini").write_text("[Window][mine]\n")
     Canvas(surfaces, SIZE, visible=False).close()
     assert "[Window][mine]" in (tmp_path / "imgui.ini").read_text()
+
+
+@needs_vulkan
+def test_lines_that_are_gone_are_not_drawn_any_more():
+    surfaces = Surfaces(beam_scene())
+    camera, n = Camera.framing(np.array([(-1.0, -1, -1), (1, 1, 1)])), len(surfaces.colours)
+    ends, red = np.array([(-0.5, 0, 0), (0.5, 0, 0), (0, -0.5, 0), (0, 0.5, 0)]), np.tile((1.0, 0.0, 0.0), (4, 1))
+    canvas, pictures = Canvas(surfaces, SIZE, visible=False, n_segments=4), []
+    try:
+        for rows in (2, 4, 2):
+            canvas.draw(np.zeros((n, 3)), np.zeros((n, 3)), camera, (1, 1, 1), (ends[:rows], red[:rows]))
+            pictures.append(canvas.pixels(0, 0, *SIZE))
+    finally:
+        canvas.close()
+    assert np.array_equal(pictures[0], pictures[2]) and not np.array_equal(pictures[0], pictures[1])
