@@ -172,11 +172,8 @@ def _find_residual(m: ti.template(), s: ti.template(), k: ti.template()):
 
 
 @kernel
-def advance(m: ti.template(), s: ti.template(), A: ti.template(), k: ti.template(), beta: ti.f64, r_scale: ti.f64):
-    """Move along y of s.pcg to the zero of the slope; update x, v, impulses, blocks, residual, and -r as CG's right side.
-
-    scalars: STEP_LENGTH, and the first of NORMS.
-    """
+def find_step_length(m: ti.template(), s: ti.template(), A: ti.template(), k: ti.template(), beta: ti.f64, r_scale: ti.f64):
+    """Find the zero of the slope along y of s.pcg. scalars: STEP_LENGTH."""
     (p,) = ti.static((k.problem,))
     ti.loop_config(serialize=m.serial)
     for task in range(m.chunks * m.spread):
@@ -201,6 +198,12 @@ def advance(m: ti.template(), s: ti.template(), A: ti.template(), k: ti.template
         ti.loop_config(block_dim=THREADS)
         for t in range(THREADS):
             _find_step_length(m, k, r_scale, t, THREADS)
+
+
+@kernel
+def advance(m: ti.template(), s: ti.template(), k: ti.template(), beta: ti.f64, r_scale: ti.f64):
+    """Move along y to there; update x, v, impulses, blocks, residual, and -r as CG's right side. scalars: the first of NORMS."""
+    (p,) = ti.static((k.problem,))
     ti.loop_config(serialize=m.serial)
     for i in range(m.n_nodes):
         _move_node_along(m, s, k, i, m.state.scalars[STEP_LENGTH], beta)

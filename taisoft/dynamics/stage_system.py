@@ -31,7 +31,7 @@ from taisoft.dynamics.contact_terms import (
 )
 from taisoft.dynamics.direct import DirectSolver
 from taisoft.dynamics.linear_solver import LinearSolver
-from taisoft.dynamics.linearised import LONGEST, advance, begin_linearised, end_linearised, update_multipliers
+from taisoft.dynamics.linearised import LONGEST, advance, begin_linearised, end_linearised, find_step_length, update_multipliers
 from taisoft.dynamics.newton_budget import NewtonBudget
 from taisoft.dynamics.pieces import Pieces
 from taisoft.dynamics.rigid_balance import (
@@ -430,7 +430,8 @@ class StageSystem:
     def advance(self, r_scale: float) -> float:
         """Move a linearised stage along y to zero slope, with R over the r-factors; return |r| there."""
         self.r_scale = r_scale
-        advance(self.model, self.work, self.matrix, self._k, self.stage.beta, r_scale)
+        find_step_length(self.model, self.work, self.matrix, self._k, self.stage.beta, r_scale)
+        advance(self.model, self.work, self._k, self.stage.beta, r_scale)
         return math.sqrt(self.model.state.scalars[NORMS])
 
     def update_multipliers(self, r_scale: float, to_impulses: bool) -> float:

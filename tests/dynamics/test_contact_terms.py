@@ -247,7 +247,8 @@ def test_a_linearised_stage_is_linear(rig, threads):
     y = np.linalg.solve(rig.A + 1e6 * np.diag(1 - rig.free.ravel()), -(rig.free * at_start).ravel()).reshape(-1, 3) * rig.free
     y += 0.1 * np.abs(y).max() * rig.free * rng.standard_normal(y.shape)
     cg.y.from_numpy(y)
-    linearised.advance(m, work, rig.solver.matrix, rig.k, BETA, STIFFNESS)
+    linearised.find_step_length(m, work, rig.solver.matrix, rig.k, BETA, STIFFNESS)
+    linearised.advance(m, work, rig.k, BETA, STIFFNESS)
     r, length = rig.p.r.to_numpy()[:K], m.state.scalars[STEP_LENGTH]
     assert length > 0.0 and np.abs(r - there).max() > 0.01 * np.abs(r).max()
     displacement = length * BETA * y
