@@ -1,8 +1,8 @@
 """Newton's method for a stage with contacts: each step linearises elasticity and solves the frictional problem on that matrix.
 
-The problem on the fixed matrix needs no elements: `Newton` solves it inexactly as an augmented Lagrangian, from the current
-impulses. Its displacement is a direction for the nonlinear stage. A full step is accepted if |r| falls enough; else a line
-search uses the slope of the augmented Lagrangian with the new impulses as multipliers. An indefinite matrix is replaced by a
+The problem on the fixed matrix needs no elements: `solve_frictional` solves it inexactly as an augmented Lagrangian, from the
+current impulses. Its displacement is a direction for the nonlinear stage. A full step is accepted if |r| falls enough; else a
+line search uses the slope of the augmented Lagrangian with the new impulses as multipliers. An indefinite matrix is replaced by a
 projected one. A problem that stalls is solved directly, as the stage's later ones then are, if it is not too large (`direct`).
 Without progress, a few steps minimise the nonlinear stage under multipliers instead. If a slow step leaves a residual on few
 nodes, these are solved separately first (`elimination`).

@@ -65,7 +65,10 @@ class FrictionalResult:
 
 
 def solve_frictional(system: "StageSystem", problem: "Stage", r: float) -> FrictionalResult:
-    """Solve from |r| by linear solves, each followed by the step to zero slope, and multiplier updates."""
+    """Solve from |r| by linear solves, each followed by the step to zero slope, and multiplier updates.
+
+    problem: with a linear_tolerance, and its other tolerances relative to the system's present scale.
+    """
     if problem.first_r_scale != system.r_scale:
         r = system.update_multipliers(problem.first_r_scale, to_impulses=False)
     target, least_inner = problem.tolerance * system.scale, problem.inner_tolerance * system.scale

@@ -398,6 +398,8 @@ class ImplicitStepper:
             solve_on(self.solver, replace(self.solver.stage, tolerance=0.0), free[:1], 0.0)
         self.solver.form_matrix(projected=True)
         self.solver.linear_residual()  # multiplies by the matrix, as multigrid does
+        if self.solver.n_contacts:
+            self.solver.extrapolate_multipliers(0)
 
     def reactions(self) -> np.ndarray:
         """Return the constraint forces of the last step, (n_nodes, 3) [N]."""

@@ -73,7 +73,7 @@ def _slope(k: ti.template(), linear_slope, curvature, a, r_scale, t, threads: ti
 
 
 @ti.func
-def step_length(k: ti.template(), linear_slope, curvature, start, r_scale, t, threads: ti.template()):
+def _root(k: ti.template(), linear_slope, curvature, start, r_scale, t, threads: ti.template()):
     """Return the root of the slope by the Illinois method; the slope increases if the matrix is positive definite.
 
     All threads t of a block call it, with the same numbers.
@@ -109,7 +109,7 @@ def _find_step_length(m: ti.template(), k: ti.template(), r_scale, t, threads: t
         c = t + j * threads
         linear_slope += w.rate[c].dot(p.r[c])
     linear_slope = block_total(linear_slope, t, threads, False)
-    length = step_length(k, linear_slope, total(m, OTHER_SUM), start, r_scale, t, threads)
+    length = _root(k, linear_slope, total(m, OTHER_SUM), start, r_scale, t, threads)
     if t == 0:
         m.state.scalars[STEP_LENGTH] = length
 
@@ -215,7 +215,7 @@ def advance(m: ti.template(), s: ti.template(), k: ti.template(), beta: ti.f64, 
 
 @kernel
 def update_multipliers(m: ti.template(), s: ti.template(), k: ti.template(), to_impulses: ti.i32, beta: ti.f64, r_scale: ti.f64):
-    """Set the multipliers to the impulses first, if told so; update impulses, blocks, residual, -r, and the first of NORMS."""
+    """Update impulses, blocks, residual, -r, and the first of NORMS; to_impulses: 1 sets the multipliers to the impulses first."""
     (p,) = ti.static((k.problem,))
     ti.loop_config(serialize=p.serial)
     for c in range(p.count[0]):

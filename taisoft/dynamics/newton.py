@@ -4,7 +4,7 @@ Each step solves with the unprojected matrix by conjugate gradients; at negative
 (`linear.pcg`). The step length is found by `search`. CG's tolerance follows Newton's progress (Eisenstat and Walker 1996,
 choice 2). If a slow step leaves a residual on few nodes, these are solved separately first, see `elimination`.
 With contacts, inner solves are inexact: the augmented Lagrangian is minimised until |r| is PROGRESS times its value after the
-multiplier update, or small enough, unless `multiplier_tolerance` or extrapolation require a smaller |r|, see `friction`.
+multiplier update, or small enough, unless extrapolation requires a smaller |r|, see `friction`.
 
 Convergence: |r| <= tolerance * scale, scale = |c M (v - v_hat)| + beta (|f_el| + |f_ext|) on the free axes, impulses in r, and
 the residual of the contact laws, |p - prox(p - f u)| / |p| with f = 1 / (J diag(A)^-1 J^T), within its own tolerance. A residual
@@ -107,7 +107,7 @@ class Newton:
             return (self.r <= target or self.rounding) and self.system.multipliers_hold
         laws_hold = self.system.contact_residual <= self.stage.contact_tolerance
         # in an impact whose laws hold, only the momenta remain to be balanced
-        inner = (FINER if self.multipliers >= self.stage.extrapolate_after else 1.0) * self.stage.inner_tolerance * self.scale
+        inner = (FINER if self.multipliers >= self.stage.extrapolate_after else 1.0) * self.stage.tolerance * self.scale
         inner_target = 0.0 if laws_hold and self.system.kind == IMPACT else max(inner, self.inner_target)
         return self.r <= (max(target, inner_target) if laws_hold else inner_target) or self.rounding
 
@@ -132,7 +132,7 @@ class Newton:
             system.r_scale, self.n_remembered = R_EXTRAPOLATED, min(self.n_remembered + 1, PAST)
         else:
             bounds = self.stage.max_r_scale, self.stage.contact_tolerance
-            system.r_scale = next_scale(system.r_scale, law, self.law_residual, self.n_inner, int(system.frictionless), *bounds)
+            system.r_scale = next_scale(system.r_scale, law, self.law_residual, self.n_inner, system.frictionless, *bounds)
         self.law_residual, self.multipliers, self.rounding = law, self.multipliers + 1, False
         self.r, self.scale = system.evaluate(None, new_multipliers=KEEP if extrapolating else TO_IMPULSES)
         self._begin_multiplier()

@@ -237,7 +237,7 @@ def form_residual(m: ti.template(), s: ti.template(), A: ti.template(), k: ti.te
     """Form the residual on the nodes of s.pcg.subset, and -r as CG's right side, after `move` and `update_impulses`.
 
     scalars: END_SLOPE, and from NORMS on |r|^2, |inertia and mass damping|^2, |f_el|^2, |f_ext|^2 on the free axes, and |r|^2 on
-    the others; only those of r if kind is not ELASTIC_STAGE.
+    the others; only those of r in an impact.
     """
     ti.loop_config(serialize=m.serial)
     for task in range(m.chunks * m.spread):
@@ -252,8 +252,6 @@ def form_residual(m: ti.template(), s: ti.template(), A: ti.template(), k: ti.te
                 r, inertia, f, external = zero, zero, zero, zero
                 if ti.static(kind == IMPACT):
                     r = impact_residual(m, A, k, i, beta)
-                elif ti.static(kind == LINEARISED):
-                    r = k.residual_linear[i]
                 else:
                     r, inertia, f, external = residual_parts(m, s, chunk, i, beta)
                 if ti.static(k.any):

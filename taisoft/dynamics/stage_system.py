@@ -161,6 +161,7 @@ class StageSystem:
         self._lists: SubsetLists | None = None
         self._volumes: volume_pcg.VolumeSystem | None = None  # whose iterates keep the volumes of patches
         self._same_matrix = False  # whether the matrix is that of the last linear solve of this stage
+        self._may_share = True  # whether threads may share linear solves with its contacts: if they are few
         self.n_formed = 0  # times that the matrix was formed
 
     # --- state ----------------------------------------------------------------------------------------------------
@@ -292,8 +293,10 @@ class StageSystem:
             return
         self._allocate_contacts()
         self._k, impact = self._stage_contacts, kind == IMPACT
+        n = self.n_contacts
+        self._may_share = NODES_PER_CONTACT * n <= self.model.n_nodes
         begin_contacts(self.work, self._k, impact, stage.beta, stage.dt, *self.contact.gap_targets, stage.contact_tolerance)
-        self.frictionless = not download([self._k.problem.friction], self.n_contacts)[0].any()
+        self.frictionless = not download([self._k.problem.friction], n)[0].any()
         if self.work.pcg.has_last(self._k.coupling):
             find_last(self.model, self.matrix, self._k.coupling, self.work.pcg)
         self.form_matrix_and_factors(projected=impact)
@@ -435,7 +438,7 @@ class StageSystem:
         return math.sqrt(self.model.state.scalars[NORMS])
 
     def update_multipliers(self, r_scale: float, to_impulses: bool) -> float:
-        """Set R over the r-factors of a linearised stage, and the multipliers to the impulses if told so; return |r|."""
+        """Set R over the r-factors of a linearised stage, and the multipliers to the impulses if `to_impulses`; return |r|."""
         self.r_scale = r_scale
         update_multipliers(self.model, self.work, self._k, int(to_impulses), self.stage.beta, r_scale)
         return math.sqrt(self.model.state.scalars[NORMS])
@@ -514,9 +517,8 @@ class StageSystem:
             return self._solve_equalised(tolerance) if self.pieces.several else self.linear_solver.solve(self, tolerance)
         if self.pieces.several and w.pcg.subset.restricted:
             self.pieces.forget_factors()
-        few = NODES_PER_CONTACT * self.n_contacts <= m.n_nodes
-        limit, coupling = pcg.iteration_limit(m), self._k.coupling
-        solution = pcg.solve(m, self.matrix, w.pcg, tolerance, limit, coupling, self._same_matrix, may_share=few)
+        limit, k = pcg.iteration_limit(m), self._k.coupling
+        solution = pcg.solve(m, self.matrix, w.pcg, tolerance, limit, k, self._same_matrix, self._may_share)
         self._same_matrix = True
         return solution
 

@@ -260,6 +260,13 @@ def test_a_linearised_stage_is_linear(rig, threads):
     assert norms_of(m)[0] == pytest.approx(((rig.free * expected) ** 2).sum(), rel=1e-9)
     start, end = (rig.free * at_start * y).sum(), (rig.free * expected * y).sum()
     assert abs(end) <= 0.05 * abs(start) + 1e-10 * size * np.abs(y).sum()
+    for to_impulses in (0, 1):
+        linearised.update_multipliers(m, work, rig.k, to_impulses, BETA, STIFFNESS)
+        assert to_impulses or np.array_equal(rig.p.r.to_numpy()[:K], r), "the impulses of the same multipliers"
+        found = before + (length * rig.A @ y.ravel() - rig.J.T @ rig.p.r.to_numpy()[:K].ravel()).reshape(-1, 3)
+        assert np.abs(work.residual.to_numpy() - found).max() < 1e-10 * size
+    assert np.array_equal(rig.k.work.multiplier.to_numpy()[:K], r) and not np.array_equal(rig.p.r.to_numpy()[:K], r)
+    fill_field(rig.p.r, r)
     linearised.end_linearised(m, work, rig.k, 1, BETA)
     assert np.array_equal(rig.p.r.to_numpy()[:K], r) and np.array_equal(work.base.to_numpy(), rig.start)
     assert np.abs(cg.y.to_numpy() - length * y).max() < 1e-11 * np.abs(length * y).max()
