@@ -215,7 +215,7 @@ def advance(m: ti.template(), s: ti.template(), k: ti.template(), beta: ti.f64, 
 
 @kernel
 def update_multipliers(m: ti.template(), s: ti.template(), k: ti.template(), to_impulses: ti.i32, beta: ti.f64, r_scale: ti.f64):
-    """Update impulses, blocks, residual, -r, and the first of NORMS; to_impulses: 1 sets the multipliers to the impulses first."""
+    """Update impulses, blocks, residual, -r, and the first of NORMS; to_impulses: 1 sets multipliers to the impulses first."""
     (p,) = ti.static((k.problem,))
     ti.loop_config(serialize=p.serial)
     for c in range(p.count[0]):

@@ -84,7 +84,7 @@ def strained(rest: np.ndarray, size: float = 0.03, seed: int = 1) -> np.ndarray:
 def stiffness(rig, x: np.ndarray):
     rig.model.state.x.from_numpy(x)
     block_csr.assemble(rig.model, rig.matrix, EVERYTHING, False)
-    return block_csr.to_bsr(rig.model, rig.matrix)
+    return block_csr.to_bsr(rig.model, rig.matrix).tocsr()
 
 
 def test_energy_is_the_formula_and_forces_are_minus_its_gradient(rig):
