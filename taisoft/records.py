@@ -68,6 +68,11 @@ class StepReport:
 ERROR_KINDS = ("time", "space", "solver")  # fields of the following records
 
 
+def headings(reports: list[StepReport]) -> list[str]:
+    """Return the headings of all details of reports, in the order of their first appearance."""
+    return list(dict.fromkeys(heading for report in reports for heading in report.details))
+
+
 @dataclass
 class BodyError:
     """Estimated errors of a body's positions, as in `ErrorEstimate`."""
@@ -128,7 +133,7 @@ class RunReport:
 
     def to_dicts(self) -> list[dict]:
         """Return the rows of steps.csv, which pandas.DataFrame takes."""
-        absent = dict.fromkeys((name for report in self.step_reports for name in report.details), 0.0)
+        absent = dict.fromkeys(headings(self.step_reports), 0.0)
         return [report.to_dict() | absent | report.details for report in self.step_reports]
 
     def __repr__(self) -> str:

@@ -47,7 +47,8 @@ def print_summary(result: RunReport, sim, observers: Observers, recording: Recor
     if result.error_estimate is not None:
         _print_lines("error", describe_error(result.error_estimate, result.wall_seconds - observers.seconds))
     print_state(sim)
-    output, compiling = (f"{observers.seconds:.2f} s of it for output", f"{result.compile_seconds:.2f} s for kernels")
+    output = f"{observers.seconds:.2f} s of it for output"
+    compiling = f"{result.compile_seconds:.2f} s for kernels"
     pilots = f"{result.pilot_seconds:.2f} s of pilots and " if result.pilot_seconds else ""
     twins = result.error_estimate.wall_seconds if result.error_estimate is not None else 0.0
     twins_text = f"{twins:.2f} s of twins for the error and " if twins else ""

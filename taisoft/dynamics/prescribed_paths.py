@@ -3,7 +3,7 @@
 A step moves them from the values at its start to those at its end. A function of a present command, of the state or of chance
 gives another value for the same time in the next step: what it moves jumps between two steps, and no contact sees it. So each
 function is evaluated for the end of a step when that begins, and for the same time again before the next one. A jump within a
-step is halved until it is told from fast motion: contacts see it as motion at the speed of the jump over the step.
+step is halved until it is distinguished from fast motion: contacts see it as motion at the speed of the jump over the step.
 """
 
 import warnings

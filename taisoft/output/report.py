@@ -23,7 +23,7 @@ import numpy as np
 from taisoft.files import write_bytes
 from taisoft.machine import processor
 from taisoft.machine import versions as installed
-from taisoft.records import RunReport, StepReport
+from taisoft.records import RunReport, StepReport, headings
 
 PACKAGES = ("taichi", "numpy", "scipy", "usd-core")
 LINE_EVERY = 5.0  # time between lines of progress if the stream is not a terminal [s]
@@ -88,11 +88,6 @@ def extremes(reports: list[StepReport]) -> dict:
             entry |= {"time_of_min": times[low], "time_of_max": times[high]}
         found[name] = entry
     return found
-
-
-def headings(reports: list[StepReport]) -> list[str]:
-    """Return the headings of all details of reports, in the order of their first appearance."""
-    return list(dict.fromkeys(heading for report in reports for heading in report.details))
 
 
 def steps_csv(reports: list[StepReport], earlier: tuple[list[str], list[list[str]]]) -> str:

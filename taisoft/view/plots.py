@@ -164,8 +164,9 @@ class History:
             ]
         )
         new = [name for name in more if name not in self.columns]
-        self.columns += new
-        self._low, self._high = (np.pad(a, ((0, 0), (0, len(new))), constant_values=np.nan) for a in (self._low, self._high))
+        if new:
+            self.columns += new
+            self._low, self._high = (np.pad(a, ((0, 0), (0, len(new))), constant_values=np.nan) for a in (self._low, self._high))
         row = np.concatenate([row, [more.get(name, 0.0) for name in self.columns[len(QUANTITIES) :]]])
         half = np.zeros(len(row))
         if errors is not None and errors.energies is not None:

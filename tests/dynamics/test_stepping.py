@@ -11,7 +11,7 @@ the others they are linear and have stiffness damping, too.
 Dirichlet conditions: fixed and prescribed axes are constrained until the group is released, which a reset undoes; targets are the
 rest positions plus the path's displacement, one for all nodes or one for each, until the first release; a step that ends with a
 path follows it to there, its accelerations too; paths that fail, give invalid values or depend on more than time are refused;
-a jump is told from motion.
+a jump is distinguished from motion.
 """
 
 from contextlib import contextmanager
@@ -340,7 +340,7 @@ def test_only_functions_of_time_alone_are_paths(height, refused):
         (lambda t: None if t > 1.5 else 0.0, None),
     ],
 )
-def test_jumps_are_told_from_motion(height, at):
+def test_jumps_are_distinguished_from_motion(height, at):
     value = lambda t: None if (y := height(t)) is None else np.array([0.0, y, 0.0])  # noqa: E731
     found = find_jump(value, 1.0, value(1.0), 2.0, value(2.0))
     assert found == (None if at is None else (pytest.approx(at, abs=1e-3), pytest.approx(0.02)))

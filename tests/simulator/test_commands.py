@@ -1,7 +1,7 @@
 """Motions commanded from a loop: `set_pose`, `set_velocity` and `set_displacement`.
 
 * they move obstacles, rigid bodies and held nodes as paths do, bit by bit, with the same contact forces;
-* they turn at a constant rate, last as long as they are told, and then hold, or go on;
+* they turn at a constant rate, last as long as asked, and then hold, or go on;
 * checkpoints and `rebuild` keep them, `reset` forgets them, a search made before does not outlast them;
 * what cannot follow them, or cannot be foreseen, is refused in a sentence; a path that follows commands is referred to them.
 """
