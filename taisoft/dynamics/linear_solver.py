@@ -1,17 +1,17 @@
-"""Choose the preconditioner of a linear solve without contacts: that of `pcg`, or multigrid where that is faster.
+"""Choose the preconditioner of a linear solve without contacts: Gauss-Seidel, or multigrid where that is faster.
 
-A solve starts with `pcg`. What its iterations take beyond an expected solve by multigrid is added up over the solves; when that
-is worth building the hierarchy, it is built, and the solve starts again with it. From then on all solves use it,
-until they have lost the same amount against the last solve by `pcg`, which then needs a multiple of the saving before multigrid
-is tried again. After PERIOD solves `pcg` is tried again anyway.
+A solve starts with `gauss_seidel`. What its iterations take beyond an expected solve by multigrid is added up over the solves;
+when that is worth building the hierarchy, it is built, and the solve starts again with it. From then on all solves use it, until
+they have lost the same amount against the last solve without it, which then needs a multiple of the saving before multigrid is
+tried again. After PERIOD solves Gauss-Seidel is tried again anyway.
 
 The hierarchy is built from the projected matrix, which is positive definite, at the present positions. It is kept over Newton
 iterations and steps, until a solve takes GROWTH times as many iterations as the first one did for the same accuracy. All
 decisions count iterations and nodes, so they are the same in every run. A checkpoint holds the positions of the last build, from
 which the hierarchy is built again.
 
-Nearly incompressible bodies with mean dilatation have the preconditioner of `volume_pcg` instead of that of `pcg`, if its band
-is narrow enough. Solves with contacts, those of elimination and those on CUDA use `pcg`.
+Nearly incompressible bodies with mean dilatation have the preconditioner of `volumes` instead of Gauss-Seidel, if its band is
+narrow enough. Solves with contacts and those of elimination use Gauss-Seidel, on CUDA all use block Jacobi.
 """
 
 import math
@@ -24,9 +24,12 @@ import taichi as ti
 from taisoft.backend.arrays import FieldArena, upload
 from taisoft.fem.model import Model
 from taisoft.fem.node_graph import EVERYTHING
-from taisoft.linear import block_csr, pcg, volume_pcg
-from taisoft.linear.hierarchy import ExactPreconditioner, build_hierarchy, has_narrow_band
-from taisoft.linear.pcg_multigrid import CoarseCorrection
+from taisoft.linear import block_csr, gauss_seidel, pcg, volumes
+from taisoft.linear.banded import BandedPreconditioner
+from taisoft.linear.coarse_correction import CoarseCorrection
+from taisoft.linear.coupling import NO_COUPLING, Coupling
+from taisoft.linear.hierarchy import build_hierarchy, has_narrow_band
+from taisoft.linear.jacobi import JACOBI
 from taisoft.linear.pcg_work import LinearResult
 
 if TYPE_CHECKING:
@@ -52,7 +55,7 @@ class LinearSolver:
 
     def __init__(self, model: Model):
         self.model = model
-        self._arena, self._volumes = FieldArena(), None  # of `volume_pcg`, built on first use
+        self._arena, self._volumes = FieldArena(), None  # of `volumes`, built on first use
         self._use_volumes: bool | None = None  # None: to be decided
         self._prepared = -1  # `StageSystem.n_formed` of the matrix it was prepared for
         self._exact: bool | None = None  # whether the hierarchy is a factorisation; None: not known yet
@@ -94,7 +97,7 @@ class LinearSolver:
 
     def release(self) -> None:
         """Discard the hierarchy; the next solve by multigrid builds a new one."""
-        self._hierarchy: ExactPreconditioner | CoarseCorrection | None = None
+        self._hierarchy: BandedPreconditioner | CoarseCorrection | None = None
         self._built: tuple | None = None  # (c, beta, x, free) of the last build
 
     def snapshot(self) -> dict:
@@ -112,9 +115,9 @@ class LinearSolver:
 
     def solve(self, system: "StageSystem", tolerance: float) -> LinearResult:
         """Solve for y of pcg from its rhs. system: of a stage without contacts, on all nodes, whose matrix is formed."""
-        m, w, done = self.model, system.work.pcg, 0
+        m, done = self.model, 0
         if not m.on_cpu:
-            return pcg.solve(m, system.matrix, w, tolerance, pcg.iteration_limit(m))
+            return self.solve_with(system, tolerance)
         if self._exact is None:
             self._exact = has_narrow_band(m, system.matrix)
         digits = max(-math.log10(tolerance), 1.0)
@@ -135,6 +138,20 @@ class LinearSolver:
             found = self._solve_plain(system, tolerance, pcg.iteration_limit(m))
         return replace(found, iterations=done + found.iterations)
 
+    def solve_with(
+        self,
+        system: "StageSystem",
+        tolerance: float,
+        terms: Coupling = NO_COUPLING,
+        same_matrix: bool = False,
+        may_share: bool = True,
+    ) -> LinearResult:
+        """Solve with the terms of contacts, or on a subset; see `gauss_seidel.solve`."""
+        m, A, w, limit = self.model, system.matrix, system.work.pcg, pcg.iteration_limit(self.model)
+        if m.on_cpu:
+            return gauss_seidel.solve(m, A, w, tolerance, limit, terms, same_matrix, may_share)
+        return pcg.solve(m, A, JACOBI, w, tolerance, limit, terms, same_matrix)
+
     def _solve_pcg(self, system: "StageSystem", tolerance: float, digits: float) -> LinearResult:
         """Solve without multigrid, or stop where it has become worth building: it is then active."""
         worth = ITERATIONS * self._ratio
@@ -149,27 +166,27 @@ class LinearSolver:
         return found
 
     def _solve_plain(self, system: "StageSystem", tolerance: float, most: int) -> LinearResult:
-        """Solve by `volume_pcg` or `pcg`."""
+        """Solve with `volumes` or `gauss_seidel`."""
         m, A, w = self.model, system.matrix, system.work.pcg
         if self.volumes(A) is None:
-            return pcg.solve(m, A, w, tolerance, most)
+            return gauss_seidel.solve(m, A, w, tolerance, most)
         self.prepare(system)
-        return volume_pcg.solve(m, A, w, self._volumes, tolerance, most)
+        return pcg.solve(m, A, self._volumes, w, tolerance, most)
 
-    def volumes(self, A: block_csr.BlockCsr) -> volume_pcg.VolumeSystem | None:
-        """Return the system of `volume_pcg` for matrices like A if it is to be used."""
+    def volumes(self, A: block_csr.BlockCsr) -> volumes.VolumeSystem | None:
+        """Return the system of `volumes` for matrices like A if it is to be used."""
         m = self.model
         if self._use_volumes is None:
-            self._use_volumes = m.mean_dilatation and m.on_cpu and volume_pcg.is_nearly_incompressible(m)
+            self._use_volumes = m.mean_dilatation and m.on_cpu and volumes.is_nearly_incompressible(m)
             if self._use_volumes and self._volumes is None:
-                self._volumes = volume_pcg.build_volume_system(m, A, self._arena)
+                self._volumes = volumes.build_volume_system(m, A, self._arena)
                 self._use_volumes = self._volumes is not None
         return self._volumes if self._use_volumes else None
 
     def prepare(self, system: "StageSystem") -> None:
-        """Prepare `volume_pcg` for the system's matrix, unless it is."""
+        """Prepare `volumes` for the system's matrix, unless it is."""
         if self._prepared != system.n_formed:
-            volume_pcg.prepare_volumes(self.model, system.matrix, system.work.pcg, self._volumes, system.stage.beta**2)
+            volumes.prepare_volumes(self.model, system.matrix, system.work.pcg, self._volumes, system.stage.beta**2)
             self._prepared = system.n_formed
 
     def _solve_multigrid(self, system: "StageSystem", tolerance: float, digits: float) -> LinearResult | None:

@@ -6,7 +6,7 @@ Without contacts, each Newton step solves for y and the change q of p together (
     A y - beta q g = -r,   beta g.y = c, or for a tendon that slackens, beta g.y >= c and p + q = 0.
 A may be indefinite where the pressure falls as a balloon grows; A + k beta^2 g g^T, which has the same solution, need not be:
     y = y_0 + s z,   y_0 = -(A + k beta^2 g g^T)^-1 r,   z = (A + k beta^2 g g^T)^-1 beta g,
-by conjugate gradients on the host with block-Jacobi preconditioning; the rank-one term costs about one iteration more. Several
+by conjugate gradients with block-Jacobi preconditioning; the rank-one term costs about one iteration more. Several
 multipliers are several columns, and `solve_active` finds s and which tendons slacken. r is evaluated with p + k c, at least 0 for
 tendons: the gradient of the augmented Lagrangian in x, by whose slope the step length is searched; A is formed with p alone.
 With contacts, and on CUDA, p is fixed while a stage is solved. Then p and v are corrected in the same way, with A^-1 for the
@@ -19,6 +19,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
+import taichi as ti
 
 from taisoft.backend.arrays import download, upload
 from taisoft.dynamics.results import StageResult, count_all
@@ -26,8 +27,9 @@ from taisoft.dynamics.simulation_state import SimulationState
 from taisoft.errors import SceneError, SimulationError
 from taisoft.fem.loads import number_at
 from taisoft.fem.spring_table import LengthForm
-from taisoft.linear import host_pcg, pcg
-from taisoft.linear.bordered import block_inverse, products, solve_active
+from taisoft.linear import pcg
+from taisoft.linear.bordered import products, solve_active
+from taisoft.linear.jacobi import JACOBI
 from taisoft.linear.pcg_work import LinearResult
 from taisoft.scene.connection_records import Tendon
 from taisoft.scene.loads import Cavity
@@ -60,6 +62,7 @@ class Multipliers:
         self._weight = float(np.linalg.norm(scene.gravity)) * sum(body.mass for body in scene.bodies)  # [N]
         self.penalised = False  # whether the stage's residual is that of p + k c
         self.slope_change = 0.0  # of the residual along y, by the last change of p
+        self._stored: pcg.Border | None = None
 
     def _form(self, owner: Cavity | Tendon):
         simulation = self._simulation
@@ -201,19 +204,14 @@ class Multipliers:
         m, w, A, chosen = system.model, system.work.pcg, system.matrix, self._candidates
         system.pieces.forget_factors()
         G, right, penalty = self._rows(system.stage.beta, chosen), w.rhs.host.copy(), self._penalty[chosen]
-        inverse = block_inverse(A.diagonal.to_numpy(), m.free.to_numpy())
-        if inverse is None:
+        if not np.isfinite(A.diagonal.host).all():
             w.y.host[...] = 0.0
             return LinearResult(0, False, False)
-
-        def precondition(r: np.ndarray) -> np.ndarray:
-            return np.einsum("nrc,nc->nr", inverse, r.reshape(-1, 3)).reshape(-1)
-
-        found, solutions = [], []
+        border, found, solutions = self._border(G, penalty), [], []
         for k, rhs in enumerate((right, *G)):
             w.rhs.host[...] = rhs.reshape(-1, 3)
             accuracy = tolerance if k == 0 else min(tolerance, MAX_TOLERANCE)
-            found.append(host_pcg.solve(m, A, w, accuracy, pcg.iteration_limit(m), precondition, (G, penalty)))
+            found.append(pcg.solve(m, A, JACOBI, w, accuracy, pcg.iteration_limit(m), border=border))
             solutions.append(w.y.host.astype(np.float64).reshape(-1))
         w.rhs.host[...] = right
         y, z = solutions[0], np.array(solutions[1:])
@@ -226,6 +224,23 @@ class Multipliers:
         w.y.host[...] = y.reshape(-1, 3)
         converged = change is not None and all(one.converged for one in found)
         return LinearResult(sum(one.iterations for one in found), converged, negative)
+
+    def _border(self, G: np.ndarray, factors: np.ndarray) -> pcg.Border:
+        """The term G^T s G for rows (k, 3 n_nodes) and factors (k,)."""
+        n_nodes, capacity = self._simulation.model.n_nodes, len(self._owners)
+        if self._stored is None:
+            arena = self._simulation.arena
+            self._stored = pcg.Border(
+                n=arena.field("border_rows", ti.i32, 1),
+                row=arena.vectors("border_row", ti.f64, capacity * n_nodes),
+                factor=arena.field("border_factor", ti.f64, capacity),
+                product=arena.field("border_product", ti.f64, capacity),
+            )
+        k = len(G)
+        self._stored.n.host[0] = k
+        self._stored.row.host[: k * n_nodes] = G.reshape(-1, 3)
+        self._stored.factor.host[:k] = factors
+        return self._stored
 
     def _change(
         self, G: np.ndarray, y: np.ndarray, z: np.ndarray, shift: np.ndarray, penalty: np.ndarray

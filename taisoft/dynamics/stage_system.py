@@ -63,10 +63,11 @@ from taisoft.dynamics.stage import (
 )
 from taisoft.fem.node_graph import EVERYTHING, Subset
 from taisoft.fem.state import END_SLOPE, N_NORMS, NORMS, START_SLOPE, STEP_LENGTH
-from taisoft.linear import block_csr, pcg, volume_pcg
+from taisoft.linear import block_csr
 from taisoft.linear.block_csr import BlockCsr
 from taisoft.linear.pcg_work import LinearResult, build_pcg
 from taisoft.linear.sweep_order import find_last
+from taisoft.linear.volumes import VolumeSystem, restore_volumes, save_volumes, step_with_volumes
 
 if TYPE_CHECKING:
     from taisoft.dynamics.contact import ContactStep
@@ -159,7 +160,7 @@ class StageSystem:
         self._k = NO_CONTACTS  # contacts of the present stage
         self._whole, self._restricted = self.work, None  # `work` for all nodes, and for a subset
         self._lists: SubsetLists | None = None
-        self._volumes: volume_pcg.VolumeSystem | None = None  # whose iterates keep the volumes of patches
+        self._volumes: VolumeSystem | None = None  # whose iterates keep the volumes of patches
         self._same_matrix = False  # whether the matrix is that of the last linear solve of this stage
         self._may_share = True  # whether threads may share linear solves with its contacts: if they are few
         self.n_formed = 0  # times that the matrix was formed
@@ -265,10 +266,10 @@ class StageSystem:
                 self.multipliers.measure()
             self.form_matrix()
             self.linear_solver.prepare(self)
-            volume_pcg.save_volumes(m, volumes)
+            save_volumes(m, volumes)
         begin_stage(m, start, stage.beta, stage.prescribed_fraction)
         for _ in range(VOLUME_PASSES if volumes is not None else 0):
-            volume_pcg.restore_volumes(m, volumes, start.x_hat, stage.beta)
+            restore_volumes(m, volumes, start.x_hat, stage.beta)
         self._begin(stage, ELASTIC_STAGE)
         return volumes is not None
 
@@ -385,7 +386,7 @@ class StageSystem:
         if not self.keeps_volumes:
             return None
         self.linear_solver.prepare(self)  # multigrid may have solved
-        volume_pcg.step_with_volumes(m, self.matrix, self._volumes, w.base, w.pcg.y, w.x_hat, self.stage.beta)
+        step_with_volumes(m, self.matrix, self._volumes, w.base, w.pcg.y, w.x_hat, self.stage.beta)
         found = self.evaluate(STAY)
         if found[0] < acceptable:
             return found
@@ -512,13 +513,12 @@ class StageSystem:
 
     def solve_linear(self, tolerance: float) -> LinearResult:
         """Solve for y of pcg from its right side."""
-        m, w = self.model, self.work
+        w = self.work
         if not self._k.any and not w.pcg.subset.restricted:
             return self._solve_equalised(tolerance) if self.pieces.several else self.linear_solver.solve(self, tolerance)
         if self.pieces.several and w.pcg.subset.restricted:
             self.pieces.forget_factors()
-        limit, k = pcg.iteration_limit(m), self._k.coupling
-        solution = pcg.solve(m, self.matrix, w.pcg, tolerance, limit, k, self._same_matrix, self._may_share)
+        solution = self.linear_solver.solve_with(self, tolerance, self._k.coupling, self._same_matrix, self._may_share)
         self._same_matrix = True
         return solution
 

@@ -2,10 +2,6 @@
 
 import numpy as np
 
-from taisoft.linear import block_csr
-
-SINGULAR = 1e-6  # of a diagonal block's largest eigenvalue: smaller ones are raised to it in the preconditioner
-
 
 def solve_active(
     N: np.ndarray,
@@ -50,18 +46,3 @@ def solve_small(A: np.ndarray, b: np.ndarray) -> np.ndarray | None:
     except np.linalg.LinAlgError:
         return None
     return x if np.isfinite(x).all() else None
-
-
-def block_inverse(diagonal: np.ndarray, free: np.ndarray) -> np.ndarray | None:
-    """Positive definite inverses (n, 3, 3) of the diagonal blocks, 0 on constrained axes; None if a block is not finite.
-
-    diagonal: (n, 12) as stored.
-    """
-    if not np.isfinite(diagonal).all():
-        return None
-    mask = free[:, :, None] * free[:, None, :]
-    blocks = block_csr.unpacked(diagonal) * mask + np.eye(3) * (1.0 - free[:, :, None])
-    values, vectors = np.linalg.eigh(blocks)
-    values = np.abs(values)
-    values = np.maximum(values, SINGULAR * values.max(axis=1, keepdims=True))
-    return np.einsum("nrk,nk,nck->nrc", vectors, 1.0 / values, vectors) * mask

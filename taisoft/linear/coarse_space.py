@@ -1,4 +1,4 @@
-"""Rigid motions of aggregates of nodes as a coarse space for `pcg_multigrid`: T, and T^T A T formed from a matrix on the device.
+"""Rigid motions of aggregates of nodes as a coarse space for `coarse_correction`: T, and T^T A T of a matrix on the device.
 
 A row of T has the six motions of its node's aggregate (`aggregation`), of which only the arm is stored. With A = L + D + L^T, L
 the half-rows before the diagonal, T^T A T = T^T B + (T^T B)^T + T^T D T, B = L T. It is summed in f64, block by block of B, which

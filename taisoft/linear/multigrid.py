@@ -1,4 +1,4 @@
-"""Smoothed aggregation multigrid: a symmetric V-cycle, here on the coarse space of `pcg_multigrid`.
+"""Smoothed aggregation multigrid: a symmetric V-cycle, here on the coarse space of `coarse_correction`.
 
 Level: A, S = D^-1 / lambda with the diagonal blocks D of A and the largest eigenvalue lambda of D^-1 A, and the prolongation
 P = (I - omega D^-1 A) T of the next level, where T makes each aggregate a rigid body (`aggregation`) and the next level's matrix
@@ -13,6 +13,7 @@ Computing 56, 1996.
 Weakness: nearly incompressible materials, whose stiff volumes the smoother cannot separate, still take many iterations.
 """
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,7 +24,6 @@ from scipy.sparse.csgraph import reverse_cuthill_mckee
 from taisoft.backend.arrays import FieldArena
 from taisoft.linear.aggregation import MODES, prolongation
 from taisoft.linear.block_rows import LANES, CycleLevel, ascend, descend, padded, upload_matrix
-from taisoft.linear.host_pcg import norm
 from taisoft.mesh.aggregates import aggregate
 from taisoft.ranges import owners
 
@@ -136,6 +136,11 @@ class Multigrid:
         self.right.host[:, : self._rows] = r.reshape(-1, self._rows)
         self.cycle()
         return self.solution.host[:, : self._rows].astype(np.float64).reshape(-1)
+
+
+def norm(a: np.ndarray) -> float:
+    """|a|, without BLAS, which would start threads for these few numbers and sum in an order that depends on their number."""
+    return math.sqrt(float(np.einsum("n,n->", a, a)))
 
 
 def block_rows(A: sp.bsr_matrix) -> np.ndarray:

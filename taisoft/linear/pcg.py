@@ -1,75 +1,192 @@
-"""Preconditioned conjugate gradients for A y = rhs on the free axes, A a `BlockCsr` that holds the whole system.
+"""Preconditioned conjugate gradients for A y = rhs on the free axes, with any preconditioner; `gauss_seidel` has its own.
 
-On the CPU: symmetric Gauss-Seidel as preconditioner. It needs two to three times fewer iterations than block-Jacobi and, by
-Eisenstat's trick, costs no extra product. On one thread all iterations run in one launch, since a launch per iteration would cost
-more than the iteration; several threads take a launch per iteration. On CUDA: block-Jacobi, whose residual is read every few
-iterations.
-Vectors are in the model's precision, sums in f64 and in a fixed order, independent of threads. All stop on sqrt(r.z) relative to
-the start, z the preconditioned residual, and on a direction p of negative curvature (p.Ap <= 0), which is reported. y is then the
-iterate so far plus min(r.z / |p.Ap|, MAX_NEGATIVE_STEP) p, a descent direction for a function with this gradient and second
-derivative. The preconditioner replaces diagonal blocks that are not positive definite by the absolute row sums, which makes it
-positive definite.
+A is a `BlockCsr` that holds the whole system, plus coupling terms J^T D J, plus a border G^T s G of few dense rows.
+Used with `Jacobi` on CUDA and for bordered systems, with `BandedFactor` for slender bodies, and with `Volumes` for nearly
+incompressible ones. See `pcg_work` for where a solve stops.
 """
 
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import taichi as ti
+
+from taisoft.backend.runtime import kernel
+from taisoft.fem.chunks import chunk_entry, chunk_size, fold, total
 from taisoft.fem.model import Model
-from taisoft.linear.block_csr import BlockCsr
-from taisoft.linear.coupling import NO_COUPLING
-from taisoft.linear.pcg_gauss_seidel import iterate_kernel, iterate_parallel, start_parallel
-from taisoft.linear.pcg_jacobi import iterate_jacobi, start_jacobi
-from taisoft.linear.pcg_work import CONVERGED, COUNT, NEGATIVE, NEGATIVE_PENDING, RUNNING, STATUS, LinearResult, PcgWork
+from taisoft.fem.node_graph import n_nodes_of, node_of
+from taisoft.fem.state import OTHER_SUM, SUM
+from taisoft.linear.block_csr import BlockCsr, block_times, off_diagonal_times
+from taisoft.linear.coupling import NO_COUPLING, Coupling, form_product, gather_products
+from taisoft.linear.pcg_work import (
+    NEGATIVE_PENDING,
+    RUNNING,
+    STATUS,
+    STEP,
+    LinearResult,
+    PcgWork,
+    begin_with,
+    dot64,
+    end_iteration,
+    set_step,
+)
 
-SERIAL_WORK = 40_000_000  # block products per launch: about 0.2 s, so that Ctrl-C takes effect
-SHARED_FROM = 4  # chunks that several threads share: of fewer, one or two have work at a time
-JACOBI_BATCH = 8  # iterations between residual checks
+BATCH = 8  # iterations between two readings of the status on CUDA
 
 
-def iteration_limit(m: Model) -> int:
+class Preconditioner(Protocol):
+    """A record whose functions are part of the kernels; symmetric, positive definite on the free axes, 0 on the others."""
+
+    def prepare(self, model, A, terms, work, i, same_matrix) -> None:
+        """Set what node i needs; for all but `Jacobi`, which alone takes coupling terms, the caller has prepared everything."""
+
+    def apply(self, model, work) -> None:
+        """Set work.z to the preconditioned work.r, in loops at the top level of a kernel. Partial sums: OTHER_SUM of r.z."""
+
+
+@dataclass(frozen=True, eq=False)
+class Border:
+    """G^T s G."""
+
+    n: Any = None  # (1) i32: rows
+    row: Any = None  # (capacity * n_nodes) 3-vectors f64: G, 0 on constrained axes
+    factor: Any = None  # (capacity) f64: s
+    product: Any = None  # (capacity) f64: s G p
+    any: bool = True
+
+
+NO_BORDER = Border(any=False)
+
+
+def iteration_limit(model: Model) -> int:
     """Maximum iterations of a solve."""
-    return max(1000, 30 * m.n_nodes)
-
-
-def batch_of(m: Model, A: BlockCsr) -> int:
-    """Iterations per serial launch."""
-    return max(1, SERIAL_WORK // (2 * A.n_edges + m.n_nodes))
+    return max(1000, 30 * model.n_nodes)
 
 
 def solve(
-    m: Model,
+    model: Model,
     A: BlockCsr,
-    w: PcgWork,
+    preconditioner: Preconditioner,
+    work: PcgWork,
     tolerance: float,
     max_iterations: int,
-    coupling=NO_COUPLING,
+    terms: Coupling = NO_COUPLING,
     same_matrix: bool = False,
-    may_share: bool = True,
+    border: Border = NO_BORDER,
 ) -> LinearResult:
-    """Solve for w.y given w.rhs. tolerance: sqrt(r.z) relative to the start.
+    """Solve for work.y given work.rhs. tolerance: of sqrt(r.z); terms, same_matrix: see `gauss_seidel.solve`."""
 
-    coupling: terms added to A. The diagonal of A alone must then be in coupling.base; A.diagonal is set to that of the sum.
-    w.subset: the nodes whose rows and unknowns form the system; w.r, w.p and w.q must be 0 on all others.
-    same_matrix: whether A and the nodes of the terms are those of the last solve; rows without terms then keep their
-    preconditioner. may_share: whether several threads may share the sweeps; the result is the same.
-    """
-    done = 0
-    while True:
-        if not m.on_cpu:
-            _take_jacobi_batch(m, A, w, tolerance, min(JACOBI_BATCH, max_iterations - done), coupling, same_matrix, done == 0)
-        elif m.serial or not (may_share and w.is_shared(coupling)) or w.n_chunks < SHARED_FROM:
-            begin = 0 if done else 1 + same_matrix
-            iterate_kernel(m, A, coupling, w, min(batch_of(m, A), max_iterations - done), tolerance, begin)
-        else:
-            if done == 0:
-                start_parallel(m, A, coupling, w, tolerance, int(same_matrix))
-            if max_iterations > 0 and w.state[STATUS] == RUNNING:
-                iterate_parallel(m, A, coupling, w, tolerance)
-        state = w.state.to_numpy()
-        done, status = int(state[COUNT]), int(state[STATUS])
-        if status != RUNNING or done >= max_iterations:
-            return LinearResult(done, status == CONVERGED, status in (NEGATIVE, NEGATIVE_PENDING))
+    def run(left: int) -> None:
+        for _ in range(1 if model.on_cpu else min(BATCH, left)):
+            iterate(model, A, preconditioner, terms, border, work, tolerance)
+
+    start(model, A, preconditioner, terms, work, tolerance, int(same_matrix))
+    return work.run(run, max_iterations)
 
 
-def _take_jacobi_batch(m, A, w, tolerance: float, n: int, coupling, same_matrix: bool, first: bool) -> None:
-    if first:
-        start_jacobi(m, A, coupling, w, int(same_matrix))
-    for _ in range(n):
-        iterate_jacobi(m, A, coupling, w, tolerance)
+@kernel
+def start(
+    model: ti.template(),
+    A: ti.template(),
+    preconditioner: ti.template(),
+    terms: ti.template(),
+    work: ti.template(),
+    tolerance: ti.f64,
+    same_matrix: ti.i32,
+):
+    """Begin a solve from y = 0 with r = rhs and p = z."""
+    ti.loop_config(serialize=model.serial)
+    for task in range(model.chunks * model.spread):
+        if task % model.spread == 0:
+            c, n = task // model.spread, n_nodes_of(model, work.subset)
+            for at in range(chunk_size(model, c, n)):
+                i = node_of(work.subset, chunk_entry(model, c, at, n))
+                preconditioner.prepare(model, A, terms, work, i, same_matrix)
+                work.r[i] = model.free[i] * work.rhs[i]
+                work.y[i], work.p[i] = ti.Vector.zero(model.real, 3), ti.Vector.zero(model.real, 3)
+    preconditioner.apply(model, work)
+    fold(model, OTHER_SUM, OTHER_SUM, ())
+    ti.loop_config(serialize=True)
+    for _ in range(1):
+        begin_with(work, tolerance, total(model, OTHER_SUM))
+    _turn(model, work)
+
+
+@kernel
+def iterate(
+    model: ti.template(),
+    A: ti.template(),
+    preconditioner: ti.template(),
+    terms: ti.template(),
+    border: ti.template(),
+    work: ti.template(),
+    tolerance: ti.f64,
+):
+    """Run one iteration, or nothing if the status is not RUNNING."""
+    _multiply(model, A, terms, border, work)
+    fold(model, SUM, SUM, ())
+    ti.loop_config(serialize=True)
+    for _ in range(1):
+        if work.state[STATUS] == RUNNING:
+            set_step(work, total(model, SUM))
+    ti.loop_config(serialize=model.serial)
+    for task in range(model.chunks * model.spread):
+        if task % model.spread == 0 and (work.state[STATUS] == RUNNING or work.state[STATUS] == NEGATIVE_PENDING):
+            c, n, step = task // model.spread, n_nodes_of(model, work.subset), ti.cast(work.state[STEP], model.real)
+            for at in range(chunk_size(model, c, n)):
+                i = node_of(work.subset, chunk_entry(model, c, at, n))
+                work.y[i] = work.y[i] + step * work.p[i]
+                work.r[i] = work.r[i] - step * work.q[i]
+    preconditioner.apply(model, work)
+    fold(model, OTHER_SUM, OTHER_SUM, ())
+    ti.loop_config(serialize=True)
+    for _ in range(1):
+        end_iteration(work, tolerance, total(model, OTHER_SUM))
+    _turn(model, work)
+
+
+@ti.func
+def _multiply(model: ti.template(), A: ti.template(), terms: ti.template(), border: ti.template(), work: ti.template()):
+    """q = A p. Partial sums: SUM of p.q."""
+    if ti.static(terms.width > 0):
+        ti.loop_config(serialize=model.serial)
+        for c in range(model.chunks):
+            for at in range(chunk_size(model, c, terms.count[0])):
+                form_product(model, terms, chunk_entry(model, c, at, terms.count[0]), work.p)
+    if ti.static(border.any):
+        ti.loop_config(serialize=model.serial)
+        for k in range(border.n[0]):
+            s = ti.cast(0.0, ti.f64)
+            for i in range(model.n_nodes):
+                s += border.row[k * model.n_nodes + i].dot(ti.cast(work.p[i], ti.f64))
+            border.product[k] = border.factor[k] * s
+    ti.loop_config(serialize=model.serial)
+    for task in range(model.chunks * model.spread):
+        if task % model.spread == 0:
+            c, n, s = task // model.spread, n_nodes_of(model, work.subset), ti.cast(0.0, ti.f64)
+            if work.state[STATUS] == RUNNING:
+                for at in range(chunk_size(model, c, n)):
+                    i = node_of(work.subset, chunk_entry(model, c, at, n))
+                    product = off_diagonal_times(model, A, c, i, work.p)
+                    if ti.static(terms.width > 0):
+                        product += block_times(terms.base[i], work.p[i]) + gather_products(model, terms, i)
+                    else:
+                        product += block_times(A.diagonal[i], work.p[i])
+                    if ti.static(border.any):
+                        for k in range(border.n[0]):
+                            product += ti.cast(border.product[k] * border.row[k * model.n_nodes + i], model.real)
+                    q = model.free[i] * product
+                    work.q[i] = q
+                    s += dot64(work.p[i], q)
+            model.state.partial[c, SUM] = s
+
+
+@ti.func
+def _turn(model: ti.template(), work: ti.template()):
+    """p = z + STEP p."""
+    ti.loop_config(serialize=model.serial)
+    for task in range(model.chunks * model.spread):
+        if task % model.spread == 0 and work.state[STATUS] == RUNNING:
+            c, n, ratio = task // model.spread, n_nodes_of(model, work.subset), ti.cast(work.state[STEP], model.real)
+            for at in range(chunk_size(model, c, n)):
+                i = node_of(work.subset, chunk_entry(model, c, at, n))
+                work.p[i] = work.z[i] + ratio * work.p[i]

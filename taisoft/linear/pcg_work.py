@@ -1,19 +1,28 @@
-"""Vectors and preconditioner of `pcg`."""
+"""Vectors, state and diagonal blocks of conjugate gradients: what `pcg` and `gauss_seidel` share.
 
+Both stop on sqrt(r.z) relative to the start, z the preconditioned residual, and on a direction p of negative curvature
+(p.Ap <= 0), which is reported. y is then the iterate so far plus min(r.z / |p.Ap|, MAX_NEGATIVE_STEP) p, a descent direction for
+a function with this gradient and second derivative. Vectors are in the model's precision, sums in f64 and in a fixed order,
+independent of threads.
+"""
+
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import taichi as ti
 
 from taisoft.backend.arrays import Count, FieldArena
-from taisoft.fem.chunks import WHOLE
+from taisoft.fem.chunks import WHOLE, chunk_entry, chunk_size
 from taisoft.fem.model import Model
 from taisoft.fem.node_graph import EVERYTHING, Subset
+from taisoft.fem.state import OTHER_SUM
 from taisoft.linear.block_csr import BLOCK, definite_inverse
 from taisoft.linear.coupling import Coupling, has_terms, prepare_terms
 
 RZ, RZ_START, STEP, COUNT, STATUS = range(5)  # indices into `state`
-RUNNING, CONVERGED, NEGATIVE, NEGATIVE_PENDING = range(4)  # NEGATIVE_PENDING: found in the present iteration
+# NEGATIVE_PENDING: found in the present iteration; FAILED: rounding keeps the preconditioner from being positive definite
+RUNNING, CONVERGED, NEGATIVE, NEGATIVE_PENDING, FAILED = range(5)
 MAX_NEGATIVE_STEP = 10.0  # multiple of a direction of negative curvature; the caller's line search continues from there
 
 
@@ -31,7 +40,7 @@ class PcgWork:
     inverse: Any  # (n_nodes) 12-vectors: of P, the diagonal blocks D of A or their replacements, 0 on constrained axes
     block: Any = None  # (n_nodes) 12-vectors: P; Gauss-Seidel only
     mirror: Any = None  # (n_nodes) 12-vectors: 2 P - D; Gauss-Seidel only
-    n_chunks: Count = 1  # of `pcg_gauss_seidel`
+    n_chunks: Count = 1  # of `gauss_seidel`
     chunk_shift: Count = WHOLE  # a chunk has 2^chunk_shift nodes
     divided: bool = False  # whether the half-rows of matrices are those of a divided sweep
     subset: Subset = EVERYTHING  # nodes that form the system
@@ -40,6 +49,15 @@ class PcgWork:
     def in_chunks(self) -> bool:
         """Whether Gauss-Seidel passes the system's nodes chunk by chunk."""
         return self.divided and not self.subset.restricted
+
+    def run(self, iterate: Callable[[int], None], max_iterations: int) -> "LinearResult":
+        """Run a solve that has begun. iterate: a function of the iterations left that runs one of them at least."""
+        while True:
+            state = self.state.to_numpy()
+            count, status = int(state[COUNT]), int(state[STATUS])
+            if status != RUNNING or count >= max_iterations:
+                return LinearResult(count, status == CONVERGED, status in (NEGATIVE, NEGATIVE_PENDING))
+            iterate(max_iterations - count)
 
     def is_shared(self, coupling: Coupling) -> bool:
         """Whether several threads may share the chunks of one parity."""
@@ -73,21 +91,75 @@ def build_pcg(model: Model, arena: FieldArena) -> PcgWork:
 
 
 @ti.func
-def precondition(m: ti.template(), A: ti.template(), k: ti.template(), w: ti.template(), i, same_matrix):
+def precondition(model: ti.template(), A: ti.template(), terms: ti.template(), work: ti.template(), i, same_matrix):
     """Set diagonal and preconditioner of node i, unless it has those of the last solve."""
     changed = True
-    if ti.static(k.width > 0):
-        changed = same_matrix == 0 or has_terms(k, i)
+    if ti.static(terms.width > 0):
+        changed = same_matrix == 0 or has_terms(terms, i)
         if changed:
-            A.diagonal[i] = prepare_terms(m, k, i)
+            A.diagonal[i] = prepare_terms(model, terms, i)
     if changed:
-        w.inverse[i], P = definite_inverse(m, A.diagonal[i], m.free[i])
-        if ti.static(m.on_cpu):
-            w.block[i] = P
-            w.mirror[i] = 2.0 * P - A.diagonal[i]
+        work.inverse[i], P = definite_inverse(model, A.diagonal[i], model.free[i])
+        if ti.static(model.on_cpu):
+            work.block[i] = P
+            work.mirror[i] = 2.0 * P - A.diagonal[i]
+
+
+@ti.func
+def begin_with(work: ti.template(), tolerance, rz):
+    """Set the state before the first iteration from r.z."""
+    work.state[RZ], work.state[RZ_START], work.state[STEP], work.state[COUNT] = rz, rz, 0.0, 0.0
+    work.state[STATUS] = _status(tolerance, rz, rz)
+
+
+@ti.func
+def _status(tolerance, rz, start):
+    """Status at r.z, which was `start` at the start."""
+    status = RUNNING
+    if rz < 0.0:
+        status = FAILED
+    elif rz <= tolerance * tolerance * start:
+        status = CONVERGED
+    return status
+
+
+@ti.func
+def set_step(work: ti.template(), curvature):
+    """Set the length of the step along p from p.Ap."""
+    rz = work.state[RZ]
+    if not curvature > 0.0:
+        work.state[STATUS], work.state[STEP] = NEGATIVE_PENDING, MAX_NEGATIVE_STEP
+        if curvature < 0.0:
+            work.state[STEP] = ti.min(rz, -MAX_NEGATIVE_STEP * curvature) / -curvature
+    else:
+        work.state[STEP] = rz / curvature
+
+
+@ti.func
+def end_iteration(work: ti.template(), tolerance, rz):
+    """Set the state after a step from the new r.z. STEP is then the factor of p in the next direction."""
+    if work.state[STATUS] == RUNNING:
+        work.state[STEP] = rz / work.state[RZ]
+        work.state[RZ], work.state[COUNT] = rz, work.state[COUNT] + 1.0
+        work.state[STATUS] = _status(tolerance, rz, work.state[RZ_START])
+    elif work.state[STATUS] == NEGATIVE_PENDING:
+        work.state[STATUS] = NEGATIVE
 
 
 @ti.func
 def dot64(a, b):
     """a . b in f64."""
     return ti.cast(a, ti.f64).dot(ti.cast(b, ti.f64))
+
+
+@ti.func
+def sum_products(model: ti.template(), work: ti.template()):
+    """Partial sums: OTHER_SUM of r.z, of all nodes; a loop at the top level of a kernel."""
+    ti.loop_config(serialize=model.serial)
+    for task in range(model.chunks * model.spread):
+        if task % model.spread == 0:
+            c, s = task // model.spread, ti.cast(0.0, ti.f64)
+            for at in range(chunk_size(model, c, model.n_nodes)):
+                i = chunk_entry(model, c, at, model.n_nodes)
+                s += dot64(work.r[i], work.z[i])
+            model.state.partial[c, OTHER_SUM] = s

@@ -20,7 +20,7 @@ from taisoft.dynamics.elimination import CONCENTRATED, FEW, choose_nodes, elimin
 from taisoft.dynamics.schemes import SCHEMES
 from taisoft.dynamics.stage import STAY
 from taisoft.dynamics.stage_system import Stage, StageSystem
-from taisoft.linear import pcg
+from taisoft.linear import gauss_seidel
 from tests.collision.rotations import rotation
 from tests.dynamics.contact_scenes import FRICTION, ground, material
 from tests.dynamics.scenes import dynamics, set_state
@@ -77,7 +77,7 @@ def test_steps_take_few_iterations_and_extrapolated_multipliers_fewer(made, monk
         extrapolated, sooner = steps(made)
         assert np.abs(extrapolated - x).max() < 1e-8  # [m]
         assert sum(report.contact_iterations for report in sooner) < 0.9 * sum(r.contact_iterations for r in reports)
-    monkeypatch.setattr(pcg, "batch_of", lambda m, A: 1)  # one iteration a launch
+    monkeypatch.setattr(gauss_seidel, "SERIAL_WORK", 1)  # one iteration a launch
     again, others = steps(made)
     assert np.array_equal(again, x) and counts(others) == counts(reports)
 

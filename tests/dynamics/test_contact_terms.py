@@ -25,7 +25,7 @@ from taisoft.dynamics.stage import AGAIN, ELASTIC_STAGE, STAY, STEP, form_residu
 from taisoft.dynamics.stage_system import StageSystem
 from taisoft.fem.node_graph import EVERYTHING
 from taisoft.fem.state import END_SLOPE, N_NORMS, NORMS, START_SLOPE, STEP_LENGTH
-from taisoft.linear import block_csr, pcg
+from taisoft.linear import block_csr, gauss_seidel
 from taisoft.linear.block_csr import to_bsr, unpacked
 from tests.contact import contact_oracle as oracle
 from tests.dynamics.scenes import built, cube, rubber
@@ -193,7 +193,7 @@ def test_conjugate_gradients(rig, pressed, threads):
     rhs, on = np.random.default_rng(4).standard_normal(rig.x.shape), rig.free.ravel() > 0
     work.rhs.from_numpy(rig.free * rhs)
     expected, without = (np.linalg.solve(A[np.ix_(on, on)], rhs.ravel()[on]) for A in (rig.A + dense, rig.A))
-    result = pcg.solve(m, rig.solver.matrix, work, 1e-12, 2000, rig.k.coupling)
+    result = gauss_seidel.solve(m, rig.solver.matrix, work, 1e-12, 2000, rig.k.coupling)
     y = work.y.to_numpy().ravel()
     assert result.converged and np.abs(y[on] - expected).max() < 1e-9 * np.abs(expected).max() and not y[~on].any()
     assert np.abs(without - expected).max() > 0.1 * np.abs(expected).max()

@@ -1,6 +1,6 @@
 """Bodies with mean dilatation, in f64: patches are cells or sets of tets of one region; energies are the formula's, forces and
 tangents its derivatives, also of regions, numbers by tet and a volume floor; explicit damping is that of the
-matrix (the other laws: `test_single_precision`; the solver: `tests/linear/test_volume_pcg.py`).
+matrix (the other laws: `test_single_precision`; the solver: `tests/linear/test_volumes.py`).
 """
 
 import numpy as np

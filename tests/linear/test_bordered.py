@@ -1,9 +1,8 @@
-"""Parts of bordered systems, on the host: multipliers of the active set, and inverses of diagonal blocks."""
+"""Bordered systems: multipliers of the active set."""
 
 import numpy as np
 
-from taisoft.linear import block_csr
-from taisoft.linear.bordered import block_inverse, solve_active
+from taisoft.linear.bordered import solve_active
 
 
 def test_one_sided_multipliers_are_complementary():
@@ -21,16 +20,3 @@ def test_one_sided_multipliers_are_complementary():
         active += on.sum()
     assert 60 < active < 140
     assert solve_active(np.zeros((1, 1)), *np.ones((5, 1)), np.array([False])) is None
-
-
-def test_inverses_of_diagonal_blocks():
-    rng, free = np.random.default_rng(2), np.ones((4, 3))
-    A = rng.standard_normal((4, 3, 3))
-    A = A + A.swapaxes(1, 2)  # indefinite
-    free[1, 2], free[3] = 0.0, 0.0
-    found = block_inverse(block_csr.packed(A), free)
-    values, vectors = np.linalg.eigh(A[0])
-    assert np.abs(found[0] - (vectors / np.abs(values)) @ vectors.T).max() < 1e-12
-    assert np.abs(np.linalg.inv(found[1, :2, :2] @ found[1, :2, :2]) - A[1, :2, :2] @ A[1, :2, :2]).max() < 1e-10
-    assert not found[3].any() and not found[1, 2].any() and not found[1, :, 2].any()
-    assert block_inverse(np.full((1, 12), np.inf), np.ones((1, 3))) is None

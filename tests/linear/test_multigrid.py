@@ -10,11 +10,11 @@ import taichi as ti
 
 import taisoft as ts
 from taisoft.fem.reference import lumped_masses
-from taisoft.linear import block_csr, block_rows, host_pcg
+from taisoft.linear import block_csr, block_rows
 from taisoft.linear.aggregation import MODES, rigid_modes
 from taisoft.linear.multigrid import Multigrid
 from tests.backend.lanes import opened
-from tests.linear.boxes import assembled, error, held_box, strip
+from tests.linear.boxes import assembled, held_box, strip
 
 N = 1500
 
@@ -102,10 +102,9 @@ def test_a_narrow_band_is_solved_exactly_and_an_indefinite_matrix_refused():
 
 
 def test_conjugate_gradients_with_a_cycle():
-    """The prolongation keeps the motions without energy; the solution is exact; limits and negative curvature end the solve."""
+    """The prolongation keeps the motions without energy; SciPy solves with the cycle in few iterations."""
     with assembled(held_box()) as made:
-        m, A, w = made.model, made.A, made.work
-        K = (block_csr.to_bsr(m, A) + 1e-6 * sp.identity(made.free.size)).tobsr((3, 3))
+        K = (block_csr.to_bsr(made.model, made.A) + 1e-6 * sp.identity(made.free.size)).tobsr((3, 3))
         K.sort_indices()
         modes = rigid_modes(made.x, np.ones_like(made.free))
         P = Multigrid(K, modes, ti.f64).levels[0].prolongation.to_scipy()
@@ -113,19 +112,10 @@ def test_conjugate_gradients_with_a_cycle():
             nearest = P @ spl.lsmr(P, mode, atol=1e-14, btol=1e-14)[0]
             assert np.linalg.norm(nearest - mode) < 1e-7 * np.linalg.norm(mode)
         cycle = Multigrid(made.matrix, rigid_modes(made.x, made.free), ti.f64)
-        result = host_pcg.solve(m, A, w, 1e-10, 200, cycle.apply)
-        assert result.converged and not result.negative and 4 < result.iterations < 60 and error(made) < 1e-7
-        stopped = host_pcg.solve(m, A, w, 1e-10, 3, cycle.apply)
-        assert stopped.iterations == 3 and not stopped.converged and not stopped.negative
-        G, scale = np.random.default_rng(2).standard_normal((2, made.free.size)) * made.free.reshape(-1), np.array([300.0, 20.0])
-        assert host_pcg.solve(m, A, w, 1e-10, 200, cycle.apply, low_rank=(G, scale)).converged
-        y = w.y.to_numpy().reshape(-1)
-        residual = made.matrix @ y + G.T @ (scale * (G @ y)) - (made.free * w.rhs.to_numpy()).reshape(-1)
-        assert np.abs(residual).max() < 1e-6
-        A.diagonal.host[:, [0, 5, 10]] -= 3e4
-        result = host_pcg.solve(m, A, w, 1e-8, 200, cycle.apply)
-        assert result.negative and not result.converged
-        assert np.isfinite(w.y.to_numpy()).all() and np.sum(w.y.to_numpy() * w.rhs.to_numpy()) > 0.0
+        iterates, rhs = [], (made.free * made.work.rhs.to_numpy()).reshape(-1)
+        M = spl.LinearOperator(made.matrix.shape, matvec=cycle.apply)
+        y, failed = spl.cg(made.matrix, rhs, rtol=1e-10, maxiter=60, M=M, callback=iterates.append)
+        assert not failed and 4 < len(iterates) and np.abs(made.matrix @ y - rhs).max() < 1e-8
 
 
 def test_steps_solve_the_equations_of_motion_after_a_release_and_resume_bitwise(tmp_path):

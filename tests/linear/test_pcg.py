@@ -7,9 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scipy.sparse as sp
+import taichi as ti
 
 from taisoft.backend.arrays import FieldArena
-from taisoft.linear import block_csr, pcg
+from taisoft.linear import block_csr, gauss_seidel, pcg
+from taisoft.linear.jacobi import JACOBI
 from taisoft.linear.pcg_work import build_pcg
 from tests.dynamics.scenes import built, mixed_scene
 from tests.linear.boxes import divided, fill
@@ -52,7 +54,9 @@ def solve(rig, method: str, tolerance: float, limit: int = 1000, rhs: np.ndarray
     model, matrix, work = rig.ways[method]
     work.rhs.from_numpy(rig.rhs if rhs is None else rhs)
     work.y.fill(np.nan)
-    return pcg.solve(model, matrix, work, tolerance, limit), work.y.to_numpy()
+    if method == "jacobi":
+        return pcg.solve(model, matrix, JACOBI, work, tolerance, limit), work.y.to_numpy()
+    return gauss_seidel.solve(model, matrix, work, tolerance, limit), work.y.to_numpy()
 
 
 @pytest.fixture
@@ -84,6 +88,25 @@ def test_threads_give_the_same_bits_and_gauss_seidel_takes_fewer_iterations(rig,
         assert again[0] == found["chunks"][0] and np.array_equal(again[1], found["chunks"][1])
     whole, chunks, jacobi = (found[method][0].iterations for method in ("whole", "chunks", "jacobi"))
     assert whole < 0.8 * jacobi and chunks < 0.9 * jacobi
+
+
+def test_a_border_is_part_of_the_matrix(rig, exact):
+    """G^T s G of two rows, of which storage has three."""
+    model, matrix, work = rig.ways["jacobi"]
+    arena, rng, n, f = FieldArena(), np.random.default_rng(3), model.n_nodes, rig.free.reshape(-1)
+    G, scale = rng.standard_normal((2, 3 * n)) * f, np.array([3e3, 2e2])
+    rows = np.concatenate([G.reshape(-1, 3), np.full((n, 3), np.nan)])
+    border = pcg.Border(
+        n=arena.field("n", ti.i32, 1, np.array([2], dtype=np.int32)),
+        row=arena.vectors("row", ti.f64, 3 * n, rows),
+        factor=arena.field("factor", ti.f64, 3, np.array([*scale, np.nan])),
+        product=arena.field("product", ti.f64, 3),
+    )
+    work.rhs.from_numpy(rig.rhs)
+    assert pcg.solve(model, matrix, JACOBI, work, 1e-12, 1000, border=border).converged
+    y, A = work.y.to_numpy().reshape(-1), block_csr.to_bsr(model, matrix).toarray() + G.T @ (scale[:, None] * G)
+    assert np.abs((A @ y - rig.rhs.reshape(-1))[f]).max() < 1e-8 * np.abs(rig.rhs).max()
+    arena.release()
 
 
 @pytest.mark.parametrize("method", METHODS)

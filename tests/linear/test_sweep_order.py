@@ -8,7 +8,7 @@ import scipy.sparse as sp
 import taichi as ti
 
 from taisoft.backend.arrays import FieldArena
-from taisoft.linear import block_csr, pcg
+from taisoft.linear import block_csr, gauss_seidel
 from taisoft.linear.coupling import build_coupling
 from taisoft.linear.pcg_work import RZ, build_pcg
 from taisoft.linear.sweep_order import find_last
@@ -84,7 +84,7 @@ def solve(made, serial: bool, tolerance: float, limit: int):
     if made.shared:
         find_last(m, made.matrix, made.coupling, w)
     w.rhs.from_numpy(made.rhs)
-    result = pcg.solve(m, made.matrix, w, tolerance, limit, made.coupling)
+    result = gauss_seidel.solve(m, made.matrix, w, tolerance, limit, made.coupling)
     return result, w.y.to_numpy(), float(w.state.to_numpy()[RZ])
 
 

@@ -8,7 +8,8 @@ import numpy as np
 
 import taisoft as ts
 from taisoft.fem.node_graph import EVERYTHING
-from taisoft.linear import block_csr, volume_pcg
+from taisoft.linear import block_csr, pcg
+from taisoft.linear.volumes import prepare_volumes, restore_volumes, save_volumes
 from tests.dynamics.scenes import dynamics, rubber
 
 BETA = 1 / 60  # [s]
@@ -36,8 +37,8 @@ def test_the_preconditioner_solves_the_system_in_few_iterations_whatever_lambda(
             rhs = np.random.default_rng(0).standard_normal(len(free)) * free
             w.rhs.from_numpy(rhs.reshape(-1, 3))
             volumes = system.linear_solver.volumes(A)
-            volume_pcg.prepare_volumes(m, A, w, volumes, BETA**2)
-            found = volume_pcg.solve(m, A, w, volumes, 1e-10, 1000)
+            prepare_volumes(m, A, w, volumes, BETA**2)
+            found = pcg.solve(m, A, volumes, w, 1e-10, 1000)
             K = block_csr.to_bsr(m, A).toarray()[free][:, free]
             exact, y = np.linalg.solve(K, rhs[free]), w.y.to_numpy().reshape(-1)
             assert found.converged and np.abs(y[free] - exact).max() < 1e-7 * np.abs(exact).max() and not y[~free].any()
@@ -48,11 +49,11 @@ def test_the_preconditioner_solves_the_system_in_few_iterations_whatever_lambda(
                 block_csr.assemble(m, other, EVERYTHING, True)
                 values = np.linalg.eigvalsh(block_csr.to_bsr(m, other).toarray())
                 assert values[0] > -1e-12 * values[-1]
-            stopped = volume_pcg.solve(m, A, w, volumes, 1e-10, 3)
+            stopped = pcg.solve(m, A, volumes, w, 1e-10, 3)
             assert stopped.iterations == 3 and not stopped.converged
             A.diagonal.host[:, [0, 5, 10]] -= 1e5 * BETA**2
-            volume_pcg.prepare_volumes(m, A, w, volumes, BETA**2)
-            found = volume_pcg.solve(m, A, w, volumes, 1e-10, 1000)
+            prepare_volumes(m, A, w, volumes, BETA**2)
+            found = pcg.solve(m, A, volumes, w, 1e-10, 1000)
             assert found.negative and np.sum(w.y.to_numpy().reshape(-1) * rhs) > 0.0
     assert max(iterations) < 1.2 * min(iterations) < 100
 
@@ -85,11 +86,11 @@ def test_steps_keep_the_volumes_to_second_order():
         system.evaluate()
         assert system.step_with_volumes(0.0) is None and np.array_equal(m.state.x.to_numpy(), x)
         kept = m.mean.dilatation.to_numpy()
-        volume_pcg.save_volumes(m, s)
+        save_volumes(m, s)
         moved = x + 1e-3 * spin * x[:, [2, 0, 1]]
         m.state.x.from_numpy(moved)
         system.evaluate()
         apart = np.abs(m.mean.dilatation.to_numpy() - kept).max()
-        volume_pcg.restore_volumes(m, s, w.x_hat, BETA)
+        restore_volumes(m, s, w.x_hat, BETA)
         system.evaluate()
         assert np.abs(m.mean.dilatation.to_numpy() - kept).max() < 0.1 * apart and np.abs(m.state.x.to_numpy() - x).max() > 1e-6
