@@ -261,13 +261,19 @@ def residual_of(sums):
     return result
 
 
-@kernel
-def find_velocities(p: ti.template()):
+@ti.func
+def refresh(p: ti.template()):
     """Set w = M^-1 J^T r over nodes; does nothing if W is a matrix."""
     if ti.static(not p.matrix):
         ti.loop_config(serialize=p.serial)
         for i in range(p.n_nodes):
             p.w[i] = gather_velocity(p, i)
+
+
+@kernel
+def find_velocities(p: ti.template()):
+    """See `refresh`."""
+    refresh(p)
 
 
 @ti.func

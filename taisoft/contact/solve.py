@@ -1,4 +1,4 @@
-"""Sweep until the residual is small: on one thread in one kernel, or in parallel loops.
+"""Sweep until the residual is small: on one thread in one kernel, or in the same loops on all threads.
 
 On a CPU one thread is faster: it takes 0.15 us per contact and sweep. A parallel loop costs some 30 us to start, a sweep has two
 to twenty of them, and memory bandwidth limits two threads to little more than the speed of one.
@@ -39,10 +39,11 @@ from taisoft.contact.problem import (
     find_velocities,
     gather_velocity,
     natural_map,
+    refresh,
     residual_of,
 )
 from taisoft.contact.prox import prox
-from taisoft.contact.sweeps import SIMULTANEOUS, relaxation, sweep, sweep_parallel
+from taisoft.contact.sweeps import SIMULTANEOUS, relaxation, sweep, sweep_shared
 
 LAUNCH_VISITS = 1_000_000  # contact visits per launch: about 0.1 s, so that Ctrl-C takes effect
 CHECK_EVERY = 5  # sweeps between residual checks, each of which costs as much as a sweep
@@ -81,7 +82,7 @@ def solve(
     momentum: False for the plain method.
     """
     # Gauss-Seidel has no parallel form: it runs on one thread even if the problem has parallel loops
-    run = _run_serial if p.serial or method == "gauss_seidel" else _run_parallel
+    run = _run_alone if p.serial or method == "gauss_seidel" else _run_shared
     batch = max(1, min(HISTORY - 1, LAUNCH_VISITS // max(1, int(p.count[0])) // every)) * every
     remaining, first, residuals = max_iterations, 1, []
     while True:
@@ -109,11 +110,25 @@ def _restore_best(p: ti.template()):
         p.r[c] = p.best[c]
 
 
-# --- on one thread ----------------------------------------------------------------------------------------------------
+def _run_shared(
+    p: ContactProblem, method: str, first: int, sweeps: int, every: int, tolerance: float, with_momentum: int
+) -> None:
+    """As `_run_alone`, on all threads; the host reads the residual."""
+    p.state[CHECKS] = 0.0
+    if first:
+        _start_shared(p, method, with_momentum)
+    done, n_colours = 0, 0 if method in SIMULTANEOUS else int(p.count[1])
+    while done < sweeps and not p.state[RESIDUAL] <= tolerance:
+        n = min(every, sweeps - done)
+        for _ in range(n):
+            sweep_shared(p, method, n_colours)
+            _follow_shared(p, with_momentum)
+        done += n
+        _check_shared(p, n)
 
 
 @kernel
-def _run_serial(
+def _run_alone(
     p: ti.template(),
     method: ti.template(),
     first: ti.i32,
@@ -127,132 +142,101 @@ def _run_serial(
     for _ in range(1):
         p.state[CHECKS] = 0.0
         if first == 1:
-            _refresh(p)
-            p.state[RESIDUAL] = _residual(p)
-            _begin(p)
-            for c in range(p.count[0]):
-                p.relaxation[c] = relaxation(p, c, method, with_momentum)
-                p.previous[c] = p.r[c]
-                p.best[c] = p.r[c]
+            _start(p, method, with_momentum, True)
         done = 0
         while done < sweeps and not p.state[RESIDUAL] <= tolerance:
             n = ti.min(every, sweeps - done)
             for _k in range(n):
                 sweep(p, method)
                 if with_momentum == 1:
-                    total = ti.cast(0.0, ti.f64)
-                    for c in range(p.count[0]):
-                        total += _restart_test(p, c)
-                    _set_weight(p, total)
-                    for c in range(p.count[0]):
-                        _extrapolate(p, c)
-                _refresh(p)
+                    _extrapolate_all(p, True)
+                refresh(p)
             done += n
-            p.state[RESIDUAL] = _residual(p)
-            _accept_or_reject(p, n)
-            for c in range(p.count[0]):
-                _apply_verdict(p, c)
-            if p.state[RESIDUAL] == p.state[BEST]:
-                _refresh(p)
-
-
-@ti.func
-def _refresh(p: ti.template()):
-    """Recompute w from the impulses, as `find_velocities`."""
-    if ti.static(not p.matrix):
-        for i in range(p.n_nodes):
-            p.w[i] = gather_velocity(p, i)
-
-
-@ti.func
-def _residual(p: ti.template()):
-    """The residual of the present impulses, summed in order; w is up to date."""
-    sums = ti.Vector([0.0, 0.0], ti.f64)
-    for c in range(p.count[0]):
-        sums += natural_map(p, c)
-    return residual_of(sums)
-
-
-# --- on all threads ---------------------------------------------------------------------------------------------------
-
-
-def _run_parallel(
-    p: ContactProblem, method: str, first: int, sweeps: int, every: int, tolerance: float, with_momentum: int
-) -> None:
-    """As `_run_serial`, on all threads; the host reads the residual."""
-    p.state[CHECKS] = 0.0
-    if first:
-        find_velocities(p)
-        _prepare_contacts(p, method, with_momentum)
-        _check(p, 1, 0)
-    done, n_colours = 0, 0 if method in SIMULTANEOUS else int(p.count[1])
-    while done < sweeps and not p.state[RESIDUAL] <= tolerance:
-        n = min(every, sweeps - done)
-        for _ in range(n):
-            sweep_parallel(p, method, n_colours)
-            if with_momentum:
-                _extrapolate_all(p)
-            find_velocities(p)
-        done += n
-        _check(p, 0, n)
-        if p.state[RESIDUAL] == p.state[BEST]:
-            find_velocities(p)
+            _check(p, 0, n, True)
 
 
 @kernel
-def _prepare_contacts(p: ti.template(), method: ti.template(), with_momentum: ti.i32):
+def _start_shared(p: ti.template(), method: ti.template(), with_momentum: ti.i32):
+    _start(p, method, with_momentum, False)
+
+
+@kernel
+def _follow_shared(p: ti.template(), with_momentum: ti.template()):
+    if ti.static(with_momentum):
+        _extrapolate_all(p, False)
+    refresh(p)
+
+
+@kernel
+def _check_shared(p: ti.template(), sweeps: ti.i32):
+    _check(p, 0, sweeps, False)
+
+
+# --- loops: at a kernel's top level, or inside a loop on one thread (`alone`) ------------------------------------------------
+
+
+@ti.func
+def _start(p: ti.template(), method: ti.template(), with_momentum, alone: ti.template()):
+    """Begin a solve from the present impulses, and check their residual."""
+    refresh(p)
     for c in range(p.count[0]):
         p.relaxation[c] = relaxation(p, c, method, with_momentum)
         p.previous[c] = p.r[c]
+    _check(p, 1, 0, alone)
 
 
 @ti.func
-def _sum_chunk(p: ti.template(), k):
-    """Sum the terms of chunk k, in order."""
-    n = p.count[0]
-    total = ti.Vector([0.0, 0.0], ti.f64)
-    for c in range(k * n // CHUNKS, (k + 1) * n // CHUNKS):
-        total += p.term[c]
-    p.partial[k] = total
-
-
-@ti.func
-def _total(p: ti.template()):
-    total = ti.Vector([0.0, 0.0], ti.f64)
-    for k in range(CHUNKS):
-        total += p.partial[k]
-    return total
-
-
-@kernel
-def _check(p: ti.template(), first: ti.i32, sweeps: ti.i32):
-    """Check the residual and save or restore the impulses; w must be up to date."""
+def _check(p: ti.template(), first, sweeps, alone: ti.template()):
+    """Check the residual after so many sweeps, and save or restore the impulses; w must be up to date."""
     for c in range(p.count[0]):
         p.term[c] = natural_map(p, c)
-    for k in range(CHUNKS):
-        _sum_chunk(p, k)
+    _sum_terms(p, alone)
     ti.loop_config(serialize=True)
     for _ in range(1):
-        p.state[RESIDUAL] = residual_of(_total(p))
+        p.state[RESIDUAL] = residual_of(_total(p, alone))
         if first == 1:
             _begin(p)
         else:
             _accept_or_reject(p, sweeps)
     for c in range(p.count[0]):
         _apply_verdict(p, c)
+    if ti.static(not p.matrix):
+        for i in range(p.n_nodes):
+            if p.state[VERDICT] == RESTORE:
+                p.w[i] = gather_velocity(p, i)
 
 
-@kernel
-def _extrapolate_all(p: ti.template()):
+@ti.func
+def _extrapolate_all(p: ti.template(), alone: ti.template()):
+    """Set the impulses from which the next sweep starts."""
     for c in range(p.count[0]):
         p.term[c] = [_restart_test(p, c), 0.0]
-    for k in range(CHUNKS):
-        _sum_chunk(p, k)
+    _sum_terms(p, alone)
     ti.loop_config(serialize=True)
     for _ in range(1):
-        _set_weight(p, _total(p)[0])
+        _set_weight(p, _total(p, alone)[0])
     for c in range(p.count[0]):
         _extrapolate(p, c)
+
+
+@ti.func
+def _sum_terms(p: ti.template(), alone: ti.template()):
+    """Sum the terms of each chunk, in order."""
+    for k in range(ti.static(1 if alone else CHUNKS)):
+        n, chunks = p.count[0], ti.static(1 if alone else CHUNKS)
+        total = ti.Vector([0.0, 0.0], ti.f64)
+        for c in range(k * n // chunks, (k + 1) * n // chunks):
+            total += p.term[c]
+        p.partial[k] = total
+
+
+@ti.func
+def _total(p: ti.template(), alone: ti.template()):
+    """Sum of all terms."""
+    total = ti.Vector([0.0, 0.0], ti.f64)
+    for k in range(ti.static(1 if alone else CHUNKS)):
+        total += p.partial[k]
+    return total
 
 
 # --- momentum ---------------------------------------------------------------------------------------------------------

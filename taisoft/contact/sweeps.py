@@ -32,7 +32,7 @@ BATCH = 4  # colours per launch: a launch costs more than a loop in it
 
 @ti.func
 def sweep(p: ti.template(), method: ti.template()):
-    """Relax every contact once, on this thread; leave the old impulses in `sweep_start`."""
+    """Relax every contact once, on this thread or, if SIMULTANEOUS, on all; leave the old impulses in `sweep_start`."""
     if ti.static(method in SIMULTANEOUS):
         for c in range(p.count[0]):
             p.sweep_start[c] = _relaxed(p, c, method)
@@ -43,10 +43,10 @@ def sweep(p: ti.template(), method: ti.template()):
             _relax(p, p.order[k])
 
 
-def sweep_parallel(p: ContactProblem, method: str, n_colours: int) -> None:
+def sweep_shared(p: ContactProblem, method: str, n_colours: int) -> None:
     """As `sweep`, on all threads, for any method but gauss_seidel."""
     if method in SIMULTANEOUS:
-        _relax_all(p, method)
+        _relax_simultaneously(p, method)
     else:
         for first in range(0, n_colours, BATCH):
             _relax_colours(p, first)
@@ -87,11 +87,8 @@ def _swap(p: ti.template(), c):
 
 
 @kernel
-def _relax_all(p: ti.template(), method: ti.template()):
-    for c in range(p.count[0]):
-        p.sweep_start[c] = _relaxed(p, c, method)
-    for c in range(p.count[0]):
-        _swap(p, c)
+def _relax_simultaneously(p: ti.template(), method: ti.template()):
+    sweep(p, method)
 
 
 @kernel
