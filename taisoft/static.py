@@ -8,14 +8,15 @@ import numpy as np
 from taisoft.backend.arrays import FieldArena, upload
 from taisoft.backend.runtime import Runtime, open_kind, open_runtime
 from taisoft.display import short_repr
-from taisoft.dynamics.contact_newton import solve
+from taisoft.dynamics.contact_newton import solve, solve_with_multipliers
 from taisoft.dynamics.dirichlet import DirichletConditions
 from taisoft.dynamics.imbalance import describe_imbalance
-from taisoft.dynamics.multipliers import Multipliers, solve_with_multipliers
+from taisoft.dynamics.multipliers import Multipliers
 from taisoft.dynamics.no_contacts import NoContacts
 from taisoft.dynamics.results import StageResult
 from taisoft.dynamics.simulation_state import SimulationState
-from taisoft.dynamics.stage_system import Stage, StageSystem
+from taisoft.dynamics.stage import Stage
+from taisoft.dynamics.stage_system import StageSystem
 from taisoft.errors import SceneError, SimulationError
 from taisoft.fem.measure import measure
 from taisoft.fem.model import Layout, build_model

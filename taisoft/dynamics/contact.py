@@ -44,8 +44,8 @@ from taisoft.dynamics.contact_record import (
     sum_pairs,
     write_rows,
 )
-from taisoft.dynamics.impact import Rebounds
 from taisoft.dynamics.misplaced import Misplacement
+from taisoft.dynamics.rebounds import Rebounds
 from taisoft.dynamics.simulation_state import SimulationState
 from taisoft.errors import SimulationError
 from taisoft.scene.rigid import RigidBody

@@ -1,6 +1,6 @@
 """Newton's method for a stage with contacts: each step linearises elasticity and solves the frictional problem on that matrix.
 
-The problem on the fixed matrix needs no elements: `solve_frictional` solves it inexactly as an augmented Lagrangian, from the
+The problem on the fixed matrix needs no elements: `Friction` solves it inexactly as an augmented Lagrangian, from the
 current impulses. Its displacement is a direction for the nonlinear stage. A full step is accepted if |r| falls enough; else a
 line search uses the slope of the augmented Lagrangian with the new impulses as multipliers. An indefinite matrix is replaced by a
 projected one. A problem that stalls is solved directly, as the stage's later ones then are, if it is not too large (`direct`).
@@ -10,39 +10,23 @@ A stage without progress ends early: a shorter substep costs less.
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 
+from taisoft.dynamics.constraints import correct
 from taisoft.dynamics.contact_terms import OF_IMPULSES, TO_IMPULSES
 from taisoft.dynamics.elimination import eliminate
-from taisoft.dynamics.friction import (
-    MAX_MULTIPLIERS,
-    MAX_R_FRICTIONLESS,
-    MAX_R_STALLED,
-    R_SCALE,
-    R_STALLED,
-    ROUNDING,
-    FrictionalResult,
-    solve_frictional,
-)
-from taisoft.dynamics.newton import DECREASE, ELIMINATION_RATIO, Newton, choose_start, search
-from taisoft.dynamics.results import StageResult, relative
-from taisoft.dynamics.stage import AGAIN
-from taisoft.dynamics.stage_system import Stage, StageSystem
+from taisoft.dynamics.friction import Friction, FrictionalResult
+from taisoft.dynamics.newton import Newton, choose_start, search
+from taisoft.dynamics.results import StageResult, count_all, relative
+from taisoft.dynamics.stage import AGAIN, Stage
+from taisoft.dynamics.stage_system import StageSystem
 from taisoft.fem.dependents import place_dependents
 
-SOLVES, FORCING = 60, 0.3  # maximum linear solves of a frictional problem, and their tolerance
-LATER_FORCING = 0.01  # minimum tolerance of those after the first, which no longer change rigid motion
-REDUCTION, LAW_REDUCTION = 0.1, 0.1  # fractions of the stage's |r| and laws' residual to which such a problem is solved,
-TOLERANCE_FRACTION, LAW_TOLERANCE_FRACTION = 0.3, 0.8  # or these of the tolerances, which survive a full nonlinear step
-LAW_BALANCE = 0.03  # laws' residual over the required relative |r|; the next matrix would undo more accuracy
-MULTIPLIER_FRACTION = 0.3  # of the required |r|, ends the steps under one multiplier: updates at a large |r| overshoot
 LINEARISED_SOLVES, LINEARISED_FORCING = 400, 0.1  # maximum linear solves of a linearised stage, and their tolerance
-STALLED, STALLED_SOLVES = 0.9, 3  # fraction of |r| left by a stalling step; factor on SOLVES after that
-MAX_SLOW = 6  # Newton iterations in a row that do not lower the smallest |r|; stages that converge have 3 at most, rarely 5
-FALLBACK_STEPS = 6  # steps on the nonlinear stage
-NEAR_FLOOR = 4.0  # times the floor of |r|: below it, |r| may be mostly rigid motion
+MAX_CORRECTIONS = 20  # of the multipliers of given volumes and lengths, with contacts
 
 
 def solve_linear(system: StageSystem, problem: Stage, r: float, stalled: bool = False) -> FrictionalResult:
@@ -52,7 +36,7 @@ def solve_linear(system: StageSystem, problem: Stage, r: float, stalled: bool = 
     """
     found = _solve_directly(system, problem, r, stalled)
     if found is None:
-        found = solve_frictional(system, problem, r)
+        found = Friction.solve(system, problem, r)
         if not (found.converged or found.negative or stalled):
             direct = _solve_directly(system, problem, r, stalled=True)
             if direct is not None:
@@ -75,6 +59,18 @@ def _solve_directly(system: StageSystem, problem: Stage, r: float, stalled: bool
 class ContactNewton:
     """Newton steps of a stage with contacts: each linearises elasticity and solves the contact problem on the fixed matrix."""
 
+    SOLVES, FORCING = 60, 0.3  # maximum linear solves of a frictional problem, and their tolerance
+    LATER_FORCING = 0.01  # minimum tolerance of those after the first, which no longer change rigid motion
+    REDUCTION, LAW_REDUCTION = 0.1, 0.1  # fractions of the stage's |r| and laws' residual to which such a problem is solved,
+    TOLERANCE_FRACTION, LAW_TOLERANCE_FRACTION = 0.3, 0.8  # or these of the tolerances, which survive a full nonlinear step
+    LAW_BALANCE = 0.03  # laws' residual over the required relative |r|; the next matrix would undo more accuracy
+    MULTIPLIER_FRACTION = 0.3  # of the required |r|, ends the steps under one multiplier: updates at a large |r| overshoot
+    STALLED, STALLED_SOLVES = 0.9, 3  # fraction of |r| left by a stalling step; factor on SOLVES after that
+    MAX_SLOW = 6  # Newton iterations in a row that do not lower the smallest |r|; stages that converge have 3 at most, rarely 5
+    FALLBACK_STEPS = 6  # steps on the nonlinear stage
+    R_STALLED, MAX_R_STALLED = 1000.0, 1e5  # smallest first R and upper bound without friction, where the laws stalled before
+    NEAR_FLOOR = 4.0  # times the floor of |r|: below it, |r| may be mostly rigid motion
+
     def __init__(self, system: StageSystem, stage: Stage):
         self.system, self.stage = system, stage
         self.newton = self.linear = self.multipliers = 0
@@ -84,7 +80,7 @@ class ContactNewton:
         # laws that hold better than they must let |r| converge in fewer steps, where they can
         self.law_aim = min(stage.contact_tolerance, stage.tolerance)
         self.has_direction = False  # y is a good first direction on the current matrix
-        self.first_r_scale, self.max_r_scale = R_SCALE, MAX_R_FRICTIONLESS  # of the next contact problem
+        self.first_r_scale, self.max_r_scale = Stage.first_r_scale, Stage.max_r_scale  # of the next contact problem
 
     def run(self) -> StageResult:
         """Solve from the first iterate, where the matrix has been formed."""
@@ -109,26 +105,26 @@ class ContactNewton:
             if not result.negative:
                 # the laws hold less well than forces are balanced; keeping the impulses separates the two
                 self.r, self.scale = system.end_linearised(new_multipliers=OF_IMPULSES if result.direct else TO_IMPULSES)
-                moved = self.r < DECREASE * lowest
+                moved = self.r < Newton.DECREASE * lowest
                 if not moved:  # also if it is not a number
                     system.evaluate(AGAIN, 0.0)
-                    self.r, self.scale, moved = search(system, DECREASE * lowest)
+                    self.r, self.scale, moved = search(system, Newton.DECREASE * lowest)
             if not moved:
                 moved = self._fall_back()
                 if not (result.negative or self.tight):
                     # if friction cycles, a shorter time step helps, and more of these steps do not
-                    moved &= self.r < DECREASE * lowest or (
-                        only_laws_remain and system.contact_residual < DECREASE * law_residual
+                    moved &= self.r < Newton.DECREASE * lowest or (
+                        only_laws_remain and system.contact_residual < Newton.DECREASE * law_residual
                     )
             # if redundant contacts exchange impulses slowly, only plain multipliers and a large R make progress
-            stalled += self.r > STALLED * lowest
+            stalled += self.r > self.STALLED * lowest
             self.stalls = stalled >= 2
-            if moved and self.r > ELIMINATION_RATIO * previous and not self._has_converged():
+            if moved and self.r > Newton.ELIMINATION_RATIO * previous and not self._has_converged():
                 self._eliminate()
-            n_slow = 0 if self._is_balanced or self.r < DECREASE * lowest else n_slow + 1
+            n_slow = 0 if self._is_balanced or self.r < Newton.DECREASE * lowest else n_slow + 1
             lowest = min(lowest, self.r)
-            self.rounding = self.r <= ROUNDING * self.system.floor and self.r > 0.5 * previous and self.tight
-            if not moved or n_slow >= MAX_SLOW:
+            self.rounding = self.r <= Friction.ROUNDING * self.system.floor and self.r > 0.5 * previous and self.tight
+            if not moved or n_slow >= self.MAX_SLOW:
                 break
         converged = converged or (self._has_converged() and math.isfinite(self.r) and system.balances_pieces())
         return StageResult(
@@ -151,7 +147,7 @@ class ContactNewton:
         system, stage = self.system, self.stage
         self.r, self.scale = system.end_linearised(accept=False)
         law_tolerance = stage.contact_tolerance if self._is_balanced else math.inf
-        steps = Newton(system, replace(stage, max_newton=FALLBACK_STEPS, contact_tolerance=law_tolerance))
+        steps = Newton(system, replace(stage, max_newton=self.FALLBACK_STEPS, contact_tolerance=law_tolerance))
         steps.run(self.r, self.scale, fresh=True)
         self.newton += max(0, steps.newton - 1)  # the first uses the current matrix
         self.linear, self.multipliers = self.linear + steps.linear, self.multipliers + steps.multipliers
@@ -189,25 +185,26 @@ class ContactNewton:
 
     def _solve_on_matrix(self) -> "FrictionalResult":
         """Solve the contact problem on the current matrix, to a fraction of the stage's residuals."""
-        system, stage, laws_stalled = self.system, self.stage, self.first_r_scale > R_SCALE
+        system, stage, laws_stalled = self.system, self.stage, self.first_r_scale > Stage.first_r_scale
         system.linearise()
-        target = max(REDUCTION * self.r, TOLERANCE_FRACTION * stage.tolerance * self.scale)
+        target = max(self.REDUCTION * self.r, self.TOLERANCE_FRACTION * stage.tolerance * self.scale)
         tolerance = target / self.scale if self.scale > 0.0 else 0.0
         # if rounding of stiff stress hides the rigid motion in |r|, only a tight first solve gets that motion right, and
         # impulses converge only if |r| decreases with them
-        self.tight = self.r <= NEAR_FLOOR * self.system.floor
-        law_tolerance = LAW_TOLERANCE_FRACTION * self.law_aim
+        self.tight = self.r <= self.NEAR_FLOOR * self.system.floor
+        law_tolerance = self.LAW_TOLERANCE_FRACTION * self.law_aim
         if not self._is_balanced:
-            law_tolerance = max(law_tolerance, LAW_BALANCE * tolerance)
+            law_tolerance = max(law_tolerance, self.LAW_BALANCE * tolerance)
+        plain = Friction.MAX_MULTIPLIERS if self.stalls or laws_stalled else 0 if self.tight else stage.extrapolate_after
         problem = replace(
             stage,
             tolerance=tolerance,
-            contact_tolerance=max(LAW_REDUCTION * system.contact_residual, law_tolerance),
-            multiplier_tolerance=0.0 if self.tight else MULTIPLIER_FRACTION * tolerance,
-            extrapolate_after=MAX_MULTIPLIERS if self.stalls or laws_stalled else 0 if self.tight else stage.extrapolate_after,
-            max_newton=STALLED_SOLVES * SOLVES if self.stalls else SOLVES,
-            linear_tolerance=stage.linear_tolerance or (min(stage.tolerance, FORCING) if self.tight else FORCING),
-            later_tolerance=0.0 if stage.linear_tolerance else LATER_FORCING,
+            contact_tolerance=max(self.LAW_REDUCTION * system.contact_residual, law_tolerance),
+            multiplier_tolerance=0.0 if self.tight else self.MULTIPLIER_FRACTION * tolerance,
+            extrapolate_after=plain,
+            max_newton=self.STALLED_SOLVES * self.SOLVES if self.stalls else self.SOLVES,
+            linear_tolerance=stage.linear_tolerance or (min(stage.tolerance, self.FORCING) if self.tight else self.FORCING),
+            later_tolerance=0.0 if stage.linear_tolerance else self.LATER_FORCING,
             first_r_scale=self.first_r_scale,
             max_r_scale=self.max_r_scale,
         )
@@ -222,9 +219,9 @@ class ContactNewton:
 
     def _choose_r_scale(self, result: FrictionalResult, laws_hold: bool) -> None:
         """Choose the first R of the next contact problem without friction. laws_hold: whether the laws held in the last one."""
-        self.first_r_scale = R_SCALE if laws_hold else max(R_STALLED, result.r_scale)
+        self.first_r_scale = Stage.first_r_scale if laws_hold else max(self.R_STALLED, result.r_scale)
         if not laws_hold:
-            self.max_r_scale = MAX_R_STALLED
+            self.max_r_scale = self.MAX_R_STALLED
 
     def _first_residual(self) -> float:
         """Return |r| at the start of a solve, of the stage just linearised."""
@@ -261,6 +258,26 @@ def solve(system: StageSystem, stage: Stage) -> StageResult:
         result = ContactNewton(system, stage).run()
     system.balance_rigid_motion()
     return result
+
+
+def solve_with_multipliers(system: StageSystem, stage: Stage, solve_stage: Callable[[], StageResult]) -> StageResult:
+    """Solve a stage by a function, and again with other multipliers until volumes and lengths are those given."""
+    multipliers = system.multipliers
+    if multipliers is None:
+        return solve_stage()
+    multipliers.penalised = system.contact.n_contacts == 0 and system.model.on_cpu
+    result, discarded, linear = solve_stage(), [], 0
+    while not multipliers.penalised and result.converged and not multipliers.hold and len(discarded) < MAX_CORRECTIONS:
+        iterations, corrected = correct(system)
+        linear += iterations
+        if not corrected:
+            break
+        discarded.append(result)
+        result = solve(system, stage)
+    result = replace(count_all(result, discarded), converged=result.converged and multipliers.hold)
+    if result.converged:
+        multipliers.end()
+    return replace(result, linear_iterations=result.linear_iterations + linear)
 
 
 def solve_linearised(system: StageSystem, stage: Stage) -> StageResult:

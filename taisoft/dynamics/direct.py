@@ -12,7 +12,7 @@ Weakness: W is dense within each group of bodies that touch, and within soft one
 """
 
 import math
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
@@ -20,37 +20,40 @@ import scipy.sparse as sp
 from taisoft.backend.arrays import download, upload
 from taisoft.contact import augmented_lagrangian
 from taisoft.contact.matrix_contacts import OUTER, MatrixContacts, frames, jacobian
-from taisoft.linear.block_csr import to_bsr
+from taisoft.dynamics.contact_terms import StageContacts
+from taisoft.fem.model import Model
+from taisoft.linear.block_csr import BlockCsr, to_bsr
 from taisoft.linear.multigrid import BandedCholesky, factorise, narrow_order
 from taisoft.scene.rigid import FRAME
-
-if TYPE_CHECKING:
-    from taisoft.dynamics.contact_terms import StageContacts
-    from taisoft.dynamics.stage_system import StageSystem
-
-MAX_ROWS = 2000  # of W
-# where soft bodies stall, W is dense, and a step of Newton's method on it takes 10 ms; most need one outer iteration
-STALLED_ROWS, STALLED_OUTER = 300, 5
-WORK = 5e7  # maximum rows of W times numbers in the band of A: about 50 ms
-FRACTION = 0.1  # of the laws' tolerance, to which they are met with the r-factors of W
-SWEEPS = 1000  # of Gauss-Seidel, before the augmented Lagrangian
 
 
 class DirectSolver:
     """Direct solves of the linearised stages of one system, whose unknowns are the nodes that depend on no others."""
 
-    def __init__(self, system: "StageSystem"):
-        m = system.model
-        self._system, self._contacts = system, MatrixContacts(m.on_cpu)
+    MAX_ROWS = 2000  # of W
+    # where soft bodies stall, W is dense, and a step of Newton's method on it takes 10 ms; most need one outer iteration
+    STALLED_ROWS, STALLED_OUTER = 300, 5
+    WORK = 5e7  # maximum rows of W times numbers in the band of A: about 50 ms
+    FRACTION = 0.1  # of the laws' tolerance, to which they are met with the r-factors of W
+    SWEEPS = 1000  # of Gauss-Seidel, before the augmented Lagrangian
+
+    def __init__(self, model: Model, matrix: BlockCsr, x_hat: Any):
+        """x_hat: of the stage, see `StageWork`."""
+        m = model
+        self._model, self._A, self._x_hat, self._contacts = model, matrix, x_hat, MatrixContacts(model.on_cpu)
         self.is_rigid = m.has_rigid_tets and FRAME * m.rigid_tets.n + m.dependents.n == m.n_nodes  # then it solves all stages
-        self._max_rows, self._max_outer = (MAX_ROWS, OUTER) if self.is_rigid else (STALLED_ROWS, STALLED_OUTER)
+        self._max_rows, self._max_outer = (self.MAX_ROWS, OUTER) if self.is_rigid else (self.STALLED_ROWS, self.STALLED_OUTER)
         self._nodes = np.flatnonzero(m.dependents.number.to_numpy() < 0) if m.has_dependents else np.arange(m.n_nodes)
         self._columns = (3 * self._nodes[:, None] + np.arange(3)).reshape(-1)
         self._factor: BandedCholesky | None = None
         self._size: float | None = None  # numbers in its band
-        self._formed = -1  # `StageSystem.n_formed` of the factor
+        self._is_prepared = False  # for the present matrix
 
-    def prepare(self, stage_contacts: "StageContacts") -> bool:
+    def matrix_changed(self) -> None:
+        """Update for a matrix that was formed."""
+        self._is_prepared = False
+
+    def prepare(self, stage_contacts: StageContacts) -> bool:
         """Factorise the matrix that was formed, and assemble W; return whether that is possible and not too large.
 
         Raises numpy.linalg.LinAlgError if A is indefinite, of rigid bodies alone: contacts may hold soft ones whose A is.
@@ -62,11 +65,10 @@ class DirectSolver:
             blocks = self._independent(stage_contacts).tobsr((3, 3))
             found = narrow_order(blocks.indptr, blocks.indices, 3)
             self._size = math.inf if found is None else 3 * (found[2] + 1) * len(self._nodes)
-        if rows * self._size > WORK:
+        if rows * self._size > self.WORK:
             return False
-        if self._formed != self._system.n_formed:
-            self._formed = -1
-            self._free = (self._system.model.free.to_numpy()[self._nodes] > 0.0).reshape(-1).astype(np.float64)
+        if not self._is_prepared:
+            self._free = (self._model.free.to_numpy()[self._nodes] > 0.0).reshape(-1).astype(np.float64)
             try:
                 self._factor = self._factorise(stage_contacts)
             except np.linalg.LinAlgError:
@@ -78,10 +80,10 @@ class DirectSolver:
                 return False
             self._J = (jacobian(stage_contacts.problem)[:, self._columns] @ sp.diags(self._free)).tocsr()
             self._W = sp.csr_matrix(self._J @ self._factor.solve(self._J.T.toarray()))
-            self._formed = self._system.n_formed
+            self._is_prepared = True
         return True
 
-    def set_factors(self, stage_contacts: "StageContacts") -> None:
+    def set_factors(self, stage_contacts: StageContacts) -> None:
         """Set the r-factors of the contacts to those of W: the diagonal of A alone would give factors far too large.
 
         Raises numpy.linalg.LinAlgError if A is indefinite.
@@ -93,19 +95,21 @@ class DirectSolver:
             upload([(p.factor, factor)])
 
     def solve(
-        self, stage_contacts: "StageContacts", beta: float, tolerance: float, acceptable: float
+        self, stage_contacts: StageContacts, beta: float, tolerance: float, acceptable: float
     ) -> tuple[int, bool, float] | None:
         """Move a linearised stage, whose matrix is prepared, to its solution; return (iterations, converged, |r|).
 
         tolerance: of the laws' residual. acceptable: that residual with the r-factors of the contacts, not of W, above which the
         result is rejected, the state kept, and None returned, as where a stiff body makes these factors far larger.
         """
-        m, k = self._system.model, stage_contacts
+        m, k = self._model, stage_contacts
         p, n = k.problem, int(k.problem.count[0])
         J, residual = self._J, self._free * download([k.residual_linear])[0].astype(np.float64)[self._nodes].reshape(-1)
         b = self._start_velocities(k, beta) - J @ self._factor.solve(residual)
         friction, factor, r = download([p.friction, p.factor, k.work.kept], n)
-        r, found = self._contacts.solve(self._W, b, friction, r, "gauss_seidel", FRACTION * tolerance, SWEEPS, self._max_outer)
+        r, found = self._contacts.solve(
+            self._W, b, friction, r, "gauss_seidel", self.FRACTION * tolerance, self.SWEEPS, self._max_outer
+        )
         law_residual = found.residual
         if not self.is_rigid:
             law_residual = augmented_lagrangian.find_residual(self._W, b, friction, r, factor)
@@ -114,13 +118,13 @@ class DirectSolver:
         change = self._factor.solve(J.T @ r.reshape(-1) - residual)
         x, v, base, impulses = m.state.x.to_numpy(), m.state.v.to_numpy(), k.x_linear.to_numpy(), p.r.to_numpy()
         x[self._nodes] = base[self._nodes] + beta * change.reshape(-1, 3)
-        v[self._nodes] = (x[self._nodes] - self._system.work.x_hat.to_numpy()[self._nodes]) / beta
+        v[self._nodes] = (x[self._nodes] - self._x_hat.to_numpy()[self._nodes]) / beta
         impulses[:n] = r
         upload([(m.state.x, x), (m.state.v, v), (p.r, impulses)])
         unbalanced = float(np.linalg.norm(self._matrix @ change + residual - J.T @ r.reshape(-1)))
         return found.iterations, law_residual <= tolerance, unbalanced
 
-    def _start_velocities(self, k: "StageContacts", beta: float) -> np.ndarray:
+    def _start_velocities(self, k: StageContacts, beta: float) -> np.ndarray:
         """u_0 (3k,), see `contact_terms.stage_velocity_of`."""
         n = int(k.problem.count[0])
         gap, offset = download([k.work.gap_minus_target, k.work.tangential_offset], n)
@@ -129,12 +133,12 @@ class DirectSolver:
         moved = jacobian(k.problem) @ (k.x_linear.to_numpy() - k.x_start.to_numpy()).reshape(-1)
         return (moved + own.reshape(-1)) / beta
 
-    def _independent(self, k: "StageContacts") -> sp.csr_matrix:
+    def _independent(self, k: StageContacts) -> sp.csr_matrix:
         """A, without the contacts' terms, of the independent nodes."""
-        A = to_bsr(self._system.model, self._system.matrix, k.coupling.base).tocsr()
+        A = to_bsr(self._model, self._A, k.coupling.base).tocsr()
         return A[self._columns][:, self._columns]
 
-    def _factorise(self, k: "StageContacts") -> BandedCholesky | None:
+    def _factorise(self, k: StageContacts) -> BandedCholesky | None:
         """Factorise it on the free axes; None if its band is wide."""
         keep = sp.diags(self._free)
         self._matrix = (keep @ self._independent(k) @ keep + sp.diags(1.0 - self._free)).tocsr()

@@ -13,13 +13,11 @@ import numpy as np
 
 from taisoft.backend.arrays import download
 from taisoft.dynamics.newton import Newton
-from taisoft.dynamics.stage import STAY
-from taisoft.dynamics.stage_system import Stage, StageSystem
+from taisoft.dynamics.stage import STAY, Stage
+from taisoft.dynamics.stage_system import StageSystem
 from taisoft.ranges import entries_of
 
 CONCENTRATED, FEW = 0.99, 0.35  # minimum fraction of |r|^2 on the chosen nodes, and maximum fraction of nodes
-SUM_ROUNDING = 1e-9  # of a sum of squares
-RINGS = 2  # of neighbours added to them
 STEPS, REDUCTION = 32, 0.1  # maximum Newton steps of an elimination, and target fraction of |r|
 
 
@@ -36,9 +34,10 @@ def choose_nodes(residual: np.ndarray, start: np.ndarray, column: np.ndarray) ->
 
     residual: (n, 3) on the free axes, 0 on others. start (n + 1), column: each node's neighbours.
     """
+    rounding, rings = 1e-9, 2  # of a sum of squares; of neighbours that are added
     squares = (residual.astype(np.float64) ** 2).sum(axis=1)
     first = len(squares) - int(FEW * len(squares))
-    if np.partition(squares, min(first, len(squares) - 1))[first:].sum() < (1.0 - SUM_ROUNDING) * CONCENTRATED * squares.sum():
+    if np.partition(squares, min(first, len(squares) - 1))[first:].sum() < (1.0 - rounding) * CONCENTRATED * squares.sum():
         return None  # without sorting all
     largest = np.argsort(-squares, kind="stable")
     cumulative = np.cumsum(squares[largest])
@@ -48,7 +47,7 @@ def choose_nodes(residual: np.ndarray, start: np.ndarray, column: np.ndarray) ->
     if n > FEW * len(squares):
         return None
     nodes = largest[:n]
-    for _ in range(RINGS):
+    for _ in range(rings):
         nodes = np.unique(np.concatenate([nodes, column[entries_of(start, nodes)]]))
     return nodes
 

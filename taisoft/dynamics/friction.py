@@ -7,47 +7,33 @@ An update sets the multiplier to the resulting impulse p = prox(lambda - R u), a
 its normal part: a fixed-point iteration lambda -> p. R stays while the laws' residual falls. Otherwise it is doubled after a
 multiplier that took one step, and halved after one that took many, or if that residual rose: with a large R each multiplier
 nearly solves the problem with frozen disks, and that iteration need not converge. Without friction there are no disks, and a
-large R only makes linear solves harder: R then doubles after a few steps, too, and up to MAX_R_FRICTIONLESS. Contacts on both
+large R only makes linear solves harder: R then doubles after a few steps, too, and up to `Stage.max_r_scale`. Contacts on both
 sides of a fold around a spike need this: their impulses must grow far before the fold opens. Several such contacts at one node
 depend on each other but for a part in 1e7. The next problem of a stage therefore begins where the last one left the laws open.
 Once they hold, R falls.
 Source: Alart and Curnier 1991 for the laws as a prox; the loop is that of the method of multipliers.
 
 Most problems, and the impacts before a step, need few multipliers. If disks and normal impulses keep changing each other
-slowly, each multiplier may leave 98 % of the laws' residual. So after EXTRAPOLATION_START of them (`ContactNewton`: at once if
-|r| is only rounding) R becomes R_EXTRAPOLATED and stays, and multipliers are extrapolated from the last two
+slowly, each multiplier may leave 98 % of the laws' residual. So after `Stage.extrapolate_after` of them (`ContactNewton`: at once
+if |r| is only rounding) R becomes R_EXTRAPOLATED and stays, and multipliers are extrapolated from the last two
 (Anderson 1965, in the form of Walker and Ni 2011): with f = p - lambda, the new one is p - sum t_i (p_i+1 - p_i), where t
 minimises |f - sum t_i (f_i+1 - f_i)|, each entry divided by the square root of its r-factor. Problems of a Newton iteration that
-stalls are never extrapolated: redundant contacts exchange impulses slowly there, which R up to MAX_R_SCALE speeds up.
+stalls are never extrapolated: redundant contacts exchange impulses slowly there, which R up to MAX_R speeds up.
 """
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import taichi as ti
 
 from taisoft.backend.runtime import kernel
 from taisoft.contact.prox import dvec
 from taisoft.dynamics.contact_terms import PAST, open_disk
+from taisoft.dynamics.stage import Stage
+from taisoft.dynamics.stage_system import StageSystem
 
-if TYPE_CHECKING:
-    from taisoft.dynamics.stage_system import Stage, StageSystem
-
-R_SCALE, MIN_R_SCALE, MAX_R_SCALE, MANY_STEPS = 1.0, 0.3, 100.0, 5  # R over the r-factors: start, bounds; steps that halve it
-MAX_R_FRICTIONLESS = 1000.0  # the upper bound without friction
-R_STALLED, MAX_R_STALLED = 1000.0, 1e5  # smallest first value and upper bound without friction, where the laws stalled before
-EASED = 0.25  # factor on R without friction once the laws hold, so that the linear solves become easier
-LAW_INCREASE, STEADY = 1.2, 4.0  # times the previous laws' residual: above it R is halved, if larger than STEADY
-LAW_DECREASE = 0.8  # times the previous laws' residual: below it R stays
-MAX_MULTIPLIERS = 200
-EXTRAPOLATION_START = 25  # multipliers
-R_EXTRAPOLATED = 5.0  # R over the r-factors from then on: iterations vary little from 5 to 7 and increase outside
-FINER = 0.1  # times the |r| that ends the steps under one multiplier, from then on
-MAX_EXTRAPOLATION = 100.0  # maximum extrapolation, in steps
+MAX_EXTRAPOLATION = 100.0  # in steps
 PARALLEL = 1e-12  # squared sine between two changes below which the older one is ignored
-ROUNDING = 4.0  # times the floor: |r| that may be rounding, as strains grow (up to 2.8 times was measured, in a thin sheet)
-PROGRESS = 0.3  # fraction of |r| after a multiplier update to which the inner steps reduce it
 
 
 @dataclass(frozen=True)
@@ -60,71 +46,85 @@ class FrictionalResult:
     negative: bool
     converged: bool
     r: float
-    r_scale: float = R_SCALE  # R over the r-factors at its end
+    r_scale: float = Stage.first_r_scale  # R over the r-factors at its end
     direct: bool = False
 
 
-def solve_frictional(system: "StageSystem", problem: "Stage", r: float) -> FrictionalResult:
-    """Solve from |r| by linear solves, each followed by the step to zero slope, and multiplier updates.
+class Friction:
+    """Solver of frictional problems."""
 
-    problem: with a linear_tolerance, and its other tolerances relative to the system's present scale.
-    """
-    if problem.first_r_scale != system.r_scale:
-        r = system.update_multipliers(problem.first_r_scale, to_impulses=False)
-    target, least_inner = problem.tolerance * system.scale, problem.inner_tolerance * system.scale
-    scale, law_before, n_steps, n_stored, rounding = problem.first_r_scale, math.inf, 0, 0, False
-    solves = linear = multipliers = 0
-    inner_target, negative, converged = PROGRESS * r, False, False
-    while True:
-        law, extrapolating = system.contact_residual, multipliers >= problem.extrapolate_after
-        holds = law <= problem.contact_tolerance
-        is_inner_done = r <= max(least_inner * (FINER if extrapolating else 1.0), inner_target) or rounding
-        if is_inner_done or (holds and r <= target):
-            converged = holds and (r <= max(target, system.floor) or rounding)
-            if converged or multipliers >= MAX_MULTIPLIERS:
+    PROGRESS = 0.3  # fraction of |r| after a multiplier update to which the inner steps reduce it
+    FINER = 0.1  # times the |r| that ends the steps under one multiplier, once multipliers are extrapolated
+    ROUNDING = 4.0  # times the floor: |r| that may be rounding, as strains grow (up to 2.8 times was measured, in a thin sheet)
+    MAX_MULTIPLIERS = 200
+    R_EXTRAPOLATED = 5.0  # R over the r-factors from then on: iterations vary little from 5 to 7 and increase outside
+    MIN_R, MAX_R, MANY_STEPS = 0.3, 100.0, 5  # bounds of R over the r-factors; steps that halve it
+    EASED = 0.25  # factor on R without friction once the laws hold, so that the linear solves become easier
+    LAW_INCREASE, STEADY = 1.2, 4.0  # times the previous laws' residual: above it R is halved, if larger than STEADY
+    LAW_DECREASE = 0.8  # times the previous laws' residual: below it R stays
+
+    @classmethod
+    def solve(cls, system: StageSystem, problem: Stage, r: float) -> FrictionalResult:
+        """Solve from |r| by linear solves, each followed by the step to zero slope, and multiplier updates.
+
+        problem: with a linear_tolerance, and its other tolerances relative to the system's present scale.
+        """
+        if problem.first_r_scale != system.r_scale:
+            r = system.update_multipliers(problem.first_r_scale, to_impulses=False)
+        target, least_inner = problem.tolerance * system.scale, problem.inner_tolerance * system.scale
+        scale, law_before, n_steps, n_stored, rounding = problem.first_r_scale, math.inf, 0, 0, False
+        solves = linear = multipliers = 0
+        inner_target, negative, converged = cls.PROGRESS * r, False, False
+        while True:
+            law, extrapolating = system.contact_residual, multipliers >= problem.extrapolate_after
+            holds = law <= problem.contact_tolerance
+            is_inner_done = r <= max(least_inner * (cls.FINER if extrapolating else 1.0), inner_target) or rounding
+            if is_inner_done or (holds and r <= target):
+                converged = holds and (r <= max(target, system.floor) or rounding)
+                if converged or multipliers >= cls.MAX_MULTIPLIERS:
+                    break
+                if extrapolating:
+                    extrapolate_multipliers(system.contacts, n_stored)
+                    scale, n_stored = cls.R_EXTRAPOLATED, min(n_stored + 1, PAST)
+                else:
+                    bounds = problem.max_r_scale, problem.contact_tolerance
+                    scale = cls.next_scale(scale, law, law_before, n_steps, system.frictionless, *bounds)
+                r = system.update_multipliers(scale, to_impulses=not extrapolating)
+                law_before, n_steps, rounding, inner_target, multipliers = law, 0, False, cls.PROGRESS * r, multipliers + 1
+            elif solves >= problem.max_newton:
                 break
-            if extrapolating:
-                system.extrapolate_multipliers(n_stored)
-                scale, n_stored = R_EXTRAPOLATED, min(n_stored + 1, PAST)
             else:
-                bounds = problem.max_r_scale, problem.contact_tolerance
-                scale = next_scale(scale, law, law_before, n_steps, system.frictionless, *bounds)
-            r = system.update_multipliers(scale, to_impulses=not extrapolating)
-            law_before, n_steps, rounding, inner_target, multipliers = law, 0, False, PROGRESS * r, multipliers + 1
-        elif solves >= problem.max_newton:
-            break
-        else:
-            found = system.solve_linear(max(problem.linear_tolerance, problem.later_tolerance if solves else 0.0))
-            solves, linear, n_steps = solves + 1, linear + found.iterations, n_steps + 1
-            if negative := found.negative:
-                break
-            before, r = r, system.advance(scale)
-            if not r < math.inf:
-                break
-            rounding = r <= ROUNDING * system.floor and r > 0.5 * before
-    system.r_scale = R_SCALE
-    return FrictionalResult(solves, linear, multipliers, negative, converged, r, scale)
+                found = system.solve_linear(max(problem.linear_tolerance, problem.later_tolerance if solves else 0.0))
+                solves, linear, n_steps = solves + 1, linear + found.iterations, n_steps + 1
+                if negative := found.negative:
+                    break
+                before, r = r, system.advance(scale)
+                if not r < math.inf:
+                    break
+                rounding = r <= cls.ROUNDING * system.floor and r > 0.5 * before
+        system.r_scale = Stage.first_r_scale
+        return FrictionalResult(solves, linear, multipliers, negative, converged, r, scale)
 
+    @classmethod
+    def next_scale(
+        cls, scale: float, law: float, before: float, n_steps: int, frictionless: bool, max_r: float, law_tolerance: float
+    ) -> float:
+        """Return R over the r-factors for new multipliers.
 
-def next_scale(
-    scale: float, law: float, before: float, n_steps: int, frictionless: bool, max_r: float, law_tolerance: float
-) -> float:
-    """Return R over the r-factors for new multipliers.
-
-    law, before: residual of the laws now and at the last update; n_steps: steps since. A rising residual means that friction
-    disks and normal impulses increase each other. frictionless: there are no disks, so that a large R only makes the linear
-    solves harder; max_r, law_tolerance: then the upper bound of R, and the residual below which the laws hold.
-    """
-    if frictionless and law <= law_tolerance:
-        return max(R_SCALE, EASED * scale)
-    if not frictionless and law > LAW_INCREASE * before and scale > STEADY:
-        return 0.5 * scale
-    if law > LAW_DECREASE * before:
-        if n_steps <= 1 or (frictionless and n_steps < MANY_STEPS):
-            return min(max_r if frictionless else MAX_R_SCALE, 2.0 * scale)
-        if n_steps >= MANY_STEPS:
-            return max(MIN_R_SCALE, 0.5 * scale)
-    return scale
+        law, before: residual of the laws now and at the last update; n_steps: steps since. A rising residual means that friction
+        disks and normal impulses increase each other. frictionless: there are no disks, so that a large R only makes the linear
+        solves harder; max_r, law_tolerance: then the upper bound of R, and the residual below which the laws hold.
+        """
+        if frictionless and law <= law_tolerance:
+            return max(Stage.first_r_scale, cls.EASED * scale)
+        if not frictionless and law > cls.LAW_INCREASE * before and scale > cls.STEADY:
+            return 0.5 * scale
+        if law > cls.LAW_DECREASE * before:
+            if n_steps <= 1 or (frictionless and n_steps < cls.MANY_STEPS):
+                return min(max_r if frictionless else cls.MAX_R, 2.0 * scale)
+            if n_steps >= cls.MANY_STEPS:
+                return max(cls.MIN_R, 0.5 * scale)
+        return scale
 
 
 @ti.func

@@ -22,55 +22,25 @@ requires. Fixed nodes act as walls: bodies attached to them absorb the impact.
 
 import math
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
-import numpy as np
 import taichi as ti
 
-from taisoft.backend.arrays import FieldArena, download
 from taisoft.backend.runtime import kernel
-from taisoft.contact.problem import ContactProblem, to_world
+from taisoft.contact.problem import to_world
 from taisoft.contact.prox import dvec
-from taisoft.contact.restitution import find_rebounds
+from taisoft.dynamics.contact_newton import solve
 from taisoft.dynamics.contact_terms import TO_IMPULSES
-from taisoft.dynamics.simulation_state import SimulationState
+from taisoft.dynamics.newton import Newton
+from taisoft.dynamics.results import StageResult, count_all, merge
+from taisoft.dynamics.stage import Stage
+from taisoft.dynamics.stage_system import StageSystem
 from taisoft.fem.chunks import chunk_entry, chunk_size, fold, total
 from taisoft.fem.lanes import mass_times
 from taisoft.fem.state import IMPACT_CURVATURE, IMPACT_SLOPE, N_NORMS, NORMS, OTHER_SUM, SUM
-from taisoft.fem.terms import rayleigh_damping
-from taisoft.linear.block_csr import block_times
-
-if TYPE_CHECKING:
-    from taisoft.dynamics.results import StageResult
-    from taisoft.dynamics.stage_system import Stage, StageSystem
 
 SPREAD = 2.0 * math.pi  # tau / dt
 SOLVES = 400  # maximum linear solves of an impact
 TOLERANCE = 1e-3  # of the contact laws' residual in an impact; the step after it corrects the rest
-
-
-@ti.func
-def impact_residual(m: ti.template(), A: ti.template(), k: ti.template(), i, tau):
-    """Return (A D)_i of the jump D = (x - x_linear) / tau, without impulses.
-
-    Uses differences between neighbours in f64: stiffness does not resist the common part of the jump, which is most of it, and
-    its rounding, tau^2 times as large, would hide the rigid motion.
-    """
-    inertia = ti.cast(1.0, m.real)
-    if ti.static(m.damped):
-        inertia += ti.cast(tau, m.real) * rayleigh_damping.mass_rate(m, i)
-    velocity_jump, mass = (m.state.x[i] - k.x_linear[i]) / tau, m.mass[i]
-    if ti.static(m.consistent):
-        mass = m.mass_matrix.diagonal[i]
-    r = ti.Vector([0.0, 0.0, 0.0], m.real)
-    for half in range(2):
-        row = i + half * m.n_nodes
-        for at in range(A.row_start[row], A.row_start[row + 1]):
-            j = A.column[at]
-            r += block_times(A.value[at], ti.cast((m.state.x[j] - k.x_linear[j]) / tau - velocity_jump, m.real))
-            if ti.static(m.consistent):
-                mass += m.mass_matrix.value[at]
-    return r + inertia * mass * ti.cast(velocity_jump, m.real)
 
 
 @kernel
@@ -180,12 +150,8 @@ def release_contacts(p: ti.template()):
         p.min_opening[c] = 0.0
 
 
-def solve_bouncing(system: "StageSystem", stage: "Stage") -> "StageResult":
+def solve_bouncing(system: StageSystem, stage: Stage) -> StageResult:
     """Solve a step of implicit Euler with restitution: the impact, then the stage."""
-    from taisoft.dynamics.contact_newton import solve
-    from taisoft.dynamics.newton import Newton
-    from taisoft.dynamics.results import count_all, merge
-
     m, w, tau = system.model, system.work, SPREAD * stage.dt
     impact_stage = replace(stage, beta=tau, contact_tolerance=max(stage.contact_tolerance, TOLERANCE), max_newton=SOLVES)
     k = system.begin_impact(impact_stage)
@@ -206,46 +172,3 @@ def solve_bouncing(system: "StageSystem", stage: "Stage") -> "StageResult":
         if rebound_work(k, stage.dt) <= slack:
             return count_all(merge([impact, results[-1]]), results[1:-1])
         release_contacts(k.problem)
-
-
-class Rebounds:
-    """Finds contacts that rebound. flight (n_colliders,): sum of dt^2 over the steps since each collider's last contact [s^2].
-
-    Free flight in dissipative steps loses energy, which a rebound may give back, see `contact.restitution`.
-    """
-
-    def __init__(self, simulation: SimulationState, arena: FieldArena):
-        self._simulation = simulation
-        self.flight = np.zeros(len(simulation.scene.colliders))
-        self._flight = arena.field("flight", ti.f64, len(self.flight))  # for kernels
-        self._gravity = simulation.scene.gravity.copy()  # during the flight
-        self.numbers_changed()
-
-    def numbers_changed(self) -> None:
-        """Update for changed coefficients of restitution."""
-        self._any = self._simulation.scene.bounces
-
-    def detect(self, problem: ContactProblem, dt: float, contact_offset: float) -> bool:
-        """Return whether surfaces rebound in the step of dt [s] that has begun."""
-        scene = self._simulation.scene
-        if not self._any:
-            return False
-        if (self._gravity != scene.gravity).any():  # energy lost under another gravity is unknown
-            self._gravity = scene.gravity.copy()
-            self.flight[:] = 0.0
-        self._flight.from_numpy(self.flight)
-        return find_rebounds(problem, self._simulation.model.gravity, self._flight, dt, contact_offset) > 0
-
-    def count_flight(self, problem: ContactProblem, n: int, dt: float, dissipative: bool) -> None:
-        """Update `flight` after a substep of dt with n contacts. dissipative: whether free flight loses energy, as with
-        implicit Euler."""
-        if not self._any:
-            return
-        scene, layout, dirichlet = self._simulation.scene, self._simulation.layout, self._simulation.dirichlet
-        self.flight += np.where(self.flight > 0.0, dt**2 if dissipative else 0.0, dt**2)
-        r, struck, body = download([problem.r, problem.impact_impulse, problem.body], n)
-        self.flight[body[(r != 0.0).any(axis=1)]] = 0.0
-        self.flight[body[(struck != 0.0).any(axis=1)]] = dt**2
-        constrained = np.logical_or.reduceat(dirichlet.constrained().any(axis=1), layout.node_start[:-1])
-        self.flight[: len(scene.bodies)][constrained] = 0.0
-        self.flight[len(scene.bodies) :] = 0.0

@@ -13,17 +13,19 @@ import taichi as ti
 from taisoft.backend.arrays import download, upload
 from taisoft.backend.runtime import kernel
 from taisoft.dynamics.contact import TOLERANCE, ContactStep
-from taisoft.dynamics.contact_newton import solve
+from taisoft.dynamics.contact_newton import solve, solve_with_multipliers
 from taisoft.dynamics.elimination import solve_on
+from taisoft.dynamics.friction import extrapolate_multipliers
 from taisoft.dynamics.imbalance import describe_imbalance
 from taisoft.dynamics.impact import solve_bouncing
-from taisoft.dynamics.multipliers import Multipliers, solve_with_multipliers
+from taisoft.dynamics.multipliers import Multipliers
 from taisoft.dynamics.no_contacts import NoContacts
-from taisoft.dynamics.pieces import LIMIT
+from taisoft.dynamics.pieces import Pieces
 from taisoft.dynamics.results import StageResult, StepResult, count_all
 from taisoft.dynamics.schemes import SCHEMES, Scheme
 from taisoft.dynamics.simulation_state import SimulationState
-from taisoft.dynamics.stage_system import Stage, StageSystem
+from taisoft.dynamics.stage import Stage
+from taisoft.dynamics.stage_system import StageSystem
 from taisoft.dynamics.substepping import LengthLimit, Substepping
 from taisoft.errors import SimulationError
 from taisoft.fem.dependents import place_all
@@ -365,14 +367,18 @@ class ImplicitStepper:
         result, pieces = self._solve(scheme, dt, bounces, self.tolerance), self.solver.pieces
         if not (scheme.one_iteration and pieces.several and result.converged and np.isfinite(result.residual)):
             return result
-        worst, name = pieces.unbalanced_mean(self.solver, self._beta)
-        if worst > LIMIT and not bounces:
+        worst, name = self._unbalanced_mean()
+        if worst > Pieces.LIMIT and not bounces:
             self.restore_start()
             self._begin(scheme, 0.0)
-            tighter = self.tolerance * LIMIT / min(worst, 1.0) * TIGHTER
+            tighter = self.tolerance * Pieces.LIMIT / min(worst, 1.0) * TIGHTER
             result = count_all(self._solve(scheme, dt, bounces, tighter), [result])
-            worst, name = pieces.unbalanced_mean(self.solver, self._beta)
-        return replace(result, unbalanced=(worst, name)) if worst > LIMIT else result
+            worst, name = self._unbalanced_mean()
+        return replace(result, unbalanced=(worst, name)) if worst > Pieces.LIMIT else result
+
+    def _unbalanced_mean(self) -> tuple[float, str]:
+        rounding = self.solver.rounding
+        return self.solver.pieces.unbalanced_mean(self.solver.work, self._beta, rounding.eps, rounding.piece_mass)
 
     def _solve(self, scheme: Scheme, dt: float, bounces: bool, tolerance: float) -> StageResult:
         """Solve the stage. bounces: whether any contacts rebound."""
@@ -399,7 +405,7 @@ class ImplicitStepper:
         self.solver.form_matrix(projected=True)
         self.solver.linear_residual()  # multiplies by the matrix, as multigrid does
         if self.solver.n_contacts:
-            self.solver.extrapolate_multipliers(0)
+            extrapolate_multipliers(self.solver.contacts, 0)
 
     def reactions(self) -> np.ndarray:
         """Return the constraint forces of the last step, (n_nodes, 3) [N]."""

@@ -15,49 +15,49 @@ narrow enough. Solves with contacts and those of elimination use Gauss-Seidel, o
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 import taichi as ti
 
 from taisoft.backend.arrays import FieldArena, upload
+from taisoft.dynamics.stage import Stage
 from taisoft.fem.model import Model
-from taisoft.fem.node_graph import EVERYTHING
-from taisoft.linear import block_csr, gauss_seidel, pcg, volumes
+from taisoft.fem.node_graph import EVERYTHING, Subset
+from taisoft.linear import gauss_seidel, pcg, volumes
 from taisoft.linear.banded import BandedPreconditioner
+from taisoft.linear.block_csr import BlockCsr
 from taisoft.linear.coarse_correction import CoarseCorrection
 from taisoft.linear.coupling import NO_COUPLING, Coupling
 from taisoft.linear.hierarchy import build_hierarchy, has_narrow_band
 from taisoft.linear.jacobi import JACOBI
-from taisoft.linear.pcg_work import LinearResult
-
-if TYPE_CHECKING:
-    from taisoft.dynamics.stage_system import StageSystem
-
-# Durations in iterations of `pcg`, measured on one core and two: an iteration with the hierarchy takes RATIO plus OVERHEAD over
-# the number of nodes, by (whether it is a factorisation, precision). It is built once it would have saved BUILD: what a
-# factorisation takes, but half of what multigrid takes, since most simulations that need it go on. A solve is expected to take
-# ITERATIONS, before the first one. LOADING over the number of nodes is what kernels of multigrid take to load, about 0.2 s.
-RATIO = {(False, ti.f32): 2.6, (False, ti.f64): 2.6, (True, ti.f32): 3.5, (True, ti.f64): 3.2}
-OVERHEAD = {(False, ti.f32): 5_000, (False, ti.f64): 10_000, (True, ti.f32): 25_000, (True, ti.f64): 20_000}
-BUILD, LOADING, ITERATIONS = {False: 90, True: 450}, {False: 5_000_000, True: 0}, 8
-GROWTH, SLACK = 2.0, 10  # a solve that takes more than GROWTH times the first iterations + SLACK requires a new hierarchy
-LONGEST = 300  # iterations of a solve with a new hierarchy
-PERIOD = 128  # solves by multigrid between trials of pcg
-UNFINISHED = 2.0  # of the iterations of a solve that multigrid interrupted: how many it is expected to have needed
-RETRY = 4  # a failure of multigrid multiplies the savings needed for a next trial by this
-STATE = {"active": bool, "savings": float, "uses": int, "failures": int, "rate": float, "pcg_rate": float}  # in a checkpoint
+from taisoft.linear.pcg_work import LinearResult, PcgWork
 
 
 class LinearSolver:
     """Linear solver of one model's stages."""
 
-    def __init__(self, model: Model):
-        self.model = model
+    # Durations in iterations of `gauss_seidel`, measured on one core and two: an iteration with the hierarchy takes RATIO plus
+    # OVERHEAD over the number of nodes, by (whether it is a factorisation, precision). It is built once it would save BUILD:
+    # what a factorisation takes, but half of what multigrid takes, since most simulations that need it go on. A solve is expected
+    # to take ITERATIONS, before the first one. LOADING over the number of nodes is what multigrid's kernels take to load, 0.2 s.
+    RATIO = {(False, ti.f32): 2.6, (False, ti.f64): 2.6, (True, ti.f32): 3.5, (True, ti.f64): 3.2}
+    OVERHEAD = {(False, ti.f32): 5_000, (False, ti.f64): 10_000, (True, ti.f32): 25_000, (True, ti.f64): 20_000}
+    BUILD, LOADING, ITERATIONS = {False: 90, True: 450}, {False: 5_000_000, True: 0}, 8
+    GROWTH, SLACK = 2.0, 10  # a solve that takes more than GROWTH times the first iterations + SLACK requires a new hierarchy
+    LONGEST = 300  # iterations of a solve with a new hierarchy
+    PERIOD = 128  # solves by multigrid between trials of pcg
+    UNFINISHED = 2.0  # of the iterations of a solve that multigrid interrupted: how many it is expected to have needed
+    RETRY = 4  # a failure of multigrid multiplies the savings needed for a next trial by this
+    STATE = {"active": bool, "savings": float, "uses": int, "failures": int, "rate": float, "pcg_rate": float}  # in a checkpoint
+
+    def __init__(self, model: Model, matrix: BlockCsr, work: PcgWork, form: Callable[[Subset, bool, float, float], None]):
+        """form: as `StageSystem.form`."""
+        self.model, self._matrix, self._work, self._form = model, matrix, work, form
         self._arena, self._volumes = FieldArena(), None  # of `volumes`, built on first use
         self._use_volumes: bool | None = None  # None: to be decided
-        self._prepared = -1  # `StageSystem.n_formed` of the matrix it was prepared for
+        self._is_prepared = False  # for the present matrix
         self._exact: bool | None = None  # whether the hierarchy is a factorisation; None: not known yet
         self.forget()
 
@@ -88,12 +88,12 @@ class LinearSolver:
     def _ratio(self) -> float:
         """Duration of an iteration with the hierarchy over one of pcg."""
         kind = self._exact, self.model.real
-        return RATIO[kind] + OVERHEAD[kind] / self.model.n_nodes
+        return self.RATIO[kind] + self.OVERHEAD[kind] / self.model.n_nodes
 
     @property
     def _build_cost(self) -> float:
         """Iterations of pcg that the hierarchy must save, its kernels included."""
-        return BUILD[self._exact] + LOADING[self._exact] / self.model.n_nodes
+        return self.BUILD[self._exact] + self.LOADING[self._exact] / self.model.n_nodes
 
     def release(self) -> None:
         """Discard the hierarchy; the next solve by multigrid builds a new one."""
@@ -103,109 +103,107 @@ class LinearSolver:
     def snapshot(self) -> dict:
         """Return what later solves depend on."""
         c, beta, x, free = self._built or (0.0, 0.0, np.zeros((0, 3)), np.zeros((0, 3), dtype=bool))
-        return {name: getattr(self, name) for name in STATE} | {"c": c, "beta": beta, "x": x, "free": free}
+        return {name: getattr(self, name) for name in self.STATE} | {"c": c, "beta": beta, "x": x, "free": free}
 
     def restore(self, kept: dict) -> None:
         """Restore a `snapshot`."""
-        for name, kind in STATE.items():
+        for name, kind in self.STATE.items():
             setattr(self, name, kind(kept[name]))
         self.release()
         if len(kept["x"]):
             self._built = float(kept["c"]), float(kept["beta"]), np.array(kept["x"]), np.array(kept["free"], dtype=bool)
 
-    def solve(self, system: "StageSystem", tolerance: float) -> LinearResult:
-        """Solve for y of pcg from its rhs. system: of a stage without contacts, on all nodes, whose matrix is formed."""
+    def matrix_changed(self) -> None:
+        """Update for a matrix that was formed."""
+        self._is_prepared = False
+
+    def solve(self, stage: Stage, tolerance: float) -> LinearResult:
+        """Solve for y of pcg from its rhs, in a stage without contacts, on all nodes, whose matrix is formed."""
         m, done = self.model, 0
         if not m.on_cpu:
-            return self.solve_with(system, tolerance)
+            return self.solve_with(self._work, tolerance)
         if self._exact is None:
-            self._exact = has_narrow_band(m, system.matrix)
+            self._exact = has_narrow_band(m, self._matrix)
         digits = max(-math.log10(tolerance), 1.0)
         if not self.active:
-            found = self._solve_pcg(system, tolerance, digits)
+            found = self._solve_alone(stage.beta, tolerance, digits)
             if not self.active:
                 return found
             done = found.iterations
-        found = self._solve_multigrid(system, tolerance, digits)
+        found = self._solve_multigrid(stage, tolerance, digits)
         self.uses += 1
         if found is None or self.savings < -self._build_cost:
             self.failures += 1
             self.release()
-            self.active, self.uses, self.savings = False, 0, -self._build_cost * float(RETRY**self.failures)
-        elif self.uses >= PERIOD:
+            self.active, self.uses, self.savings = False, 0, -self._build_cost * float(self.RETRY**self.failures)
+        elif self.uses >= self.PERIOD:
             self.active, self.uses, self.savings = False, 0, 0.8 * self._build_cost
         if found is None:
-            found = self._solve_plain(system, tolerance, pcg.iteration_limit(m))
+            found = self._solve_plain(stage.beta, tolerance, pcg.iteration_limit(m))
         return replace(found, iterations=done + found.iterations)
 
     def solve_with(
-        self,
-        system: "StageSystem",
-        tolerance: float,
-        terms: Coupling = NO_COUPLING,
-        same_matrix: bool = False,
-        may_share: bool = True,
+        self, work: PcgWork, tolerance: float, terms: Coupling = NO_COUPLING, same_matrix: bool = False, may_share: bool = True
     ) -> LinearResult:
         """Solve with the terms of contacts, or on a subset; see `gauss_seidel.solve`."""
-        m, A, w, limit = self.model, system.matrix, system.work.pcg, pcg.iteration_limit(self.model)
+        m, A, limit = self.model, self._matrix, pcg.iteration_limit(self.model)
         if m.on_cpu:
-            return gauss_seidel.solve(m, A, w, tolerance, limit, terms, same_matrix, may_share)
-        return pcg.solve(m, A, JACOBI, w, tolerance, limit, terms, same_matrix)
+            return gauss_seidel.solve(m, A, work, tolerance, limit, terms, same_matrix, may_share)
+        return pcg.solve(m, A, JACOBI, work, tolerance, limit, terms, same_matrix)
 
-    def _solve_pcg(self, system: "StageSystem", tolerance: float, digits: float) -> LinearResult:
+    def _solve_alone(self, beta: float, tolerance: float, digits: float) -> LinearResult:
         """Solve without multigrid, or stop where it has become worth building: it is then active."""
-        worth = ITERATIONS * self._ratio
+        worth = self.ITERATIONS * self._ratio
         most = math.ceil(worth + self._build_cost - self.savings)
         limit = pcg.iteration_limit(self.model)
-        found = self._solve_plain(system, tolerance, min(most, limit))
+        found = self._solve_plain(beta, tolerance, min(most, limit))
         self.savings = max(self.savings + found.iterations - worth, min(self.savings, 0.0))
         self.pcg_rate = found.iterations / digits
         if most <= found.iterations < limit and not (found.converged or found.negative):
             self.active, self.savings = True, 0.0
-            self.pcg_rate *= UNFINISHED
+            self.pcg_rate *= self.UNFINISHED
         return found
 
-    def _solve_plain(self, system: "StageSystem", tolerance: float, most: int) -> LinearResult:
+    def _solve_plain(self, beta: float, tolerance: float, most: int) -> LinearResult:
         """Solve with `volumes` or `gauss_seidel`."""
-        m, A, w = self.model, system.matrix, system.work.pcg
-        if self.volumes(A) is None:
-            return gauss_seidel.solve(m, A, w, tolerance, most)
-        self.prepare(system)
-        return pcg.solve(m, A, self._volumes, w, tolerance, most)
+        if self.volumes() is None:
+            return gauss_seidel.solve(self.model, self._matrix, self._work, tolerance, most)
+        self.prepare(beta)
+        return pcg.solve(self.model, self._matrix, self._volumes, self._work, tolerance, most)
 
-    def volumes(self, A: block_csr.BlockCsr) -> volumes.VolumeSystem | None:
-        """Return the system of `volumes` for matrices like A if it is to be used."""
+    def volumes(self) -> volumes.VolumeSystem | None:
+        """Return the system of `volumes` if it is to be used."""
         m = self.model
         if self._use_volumes is None:
             self._use_volumes = m.mean_dilatation and m.on_cpu and volumes.is_nearly_incompressible(m)
             if self._use_volumes and self._volumes is None:
-                self._volumes = volumes.build_volume_system(m, A, self._arena)
+                self._volumes = volumes.build_volume_system(m, self._matrix, self._arena)
                 self._use_volumes = self._volumes is not None
         return self._volumes if self._use_volumes else None
 
-    def prepare(self, system: "StageSystem") -> None:
-        """Prepare `volumes` for the system's matrix, unless it is."""
-        if self._prepared != system.n_formed:
-            volumes.prepare_volumes(self.model, system.matrix, system.work.pcg, self._volumes, system.stage.beta**2)
-            self._prepared = system.n_formed
+    def prepare(self, beta: float) -> None:
+        """Prepare `volumes` for the present matrix, unless it is."""
+        if not self._is_prepared:
+            volumes.prepare_volumes(self.model, self._matrix, self._work, self._volumes, beta**2)
+            self._is_prepared = True
 
-    def _solve_multigrid(self, system: "StageSystem", tolerance: float, digits: float) -> LinearResult | None:
+    def _solve_multigrid(self, stage: Stage, tolerance: float, digits: float) -> LinearResult | None:
         """Solve with the hierarchy, or with a new one if there is none or it is out of date; None if that fails too."""
-        m, w, free, wasted = self.model, system.work.pcg, self.model.free.host > 0.0, 0
+        m, A, w, free, wasted = self.model, self._matrix, self._work, self.model.free.host > 0.0, 0
         if self._built is not None and np.array_equal(self._built[3], free):
-            if self._hierarchy is None and not self._could_build(system, *self._built):
+            if self._hierarchy is None and not self._could_build(*self._built):
                 return None
-            most = math.ceil(GROWTH * self.rate * digits) + SLACK
-            stiffness = (system.stage.beta / self._built[1]) ** 2
-            found = self._hierarchy.solve(m, system.matrix, w, tolerance, most, stiffness)
+            most = math.ceil(self.GROWTH * self.rate * digits) + self.SLACK
+            stiffness = (stage.beta / self._built[1]) ** 2
+            found = self._hierarchy.solve(m, A, w, tolerance, most, stiffness)
             if found.converged or found.negative:
                 return self._account(found, digits)
             wasted = found.iterations
             self.savings -= self._build_cost
         self.release()
-        if not self._could_build(system, system.stage.c, system.stage.beta, m.state.x.to_numpy(), free):
+        if not self._could_build(stage.c, stage.beta, m.state.x.to_numpy(), free):
             return None
-        found = self._hierarchy.solve(m, system.matrix, w, tolerance, LONGEST)
+        found = self._hierarchy.solve(m, A, w, tolerance, self.LONGEST)
         if not (found.converged or found.negative):
             return None
         self.rate = found.iterations / digits
@@ -217,21 +215,21 @@ class LinearSolver:
             self.savings = min(self.savings + self.pcg_rate * digits - self._ratio * found.iterations, self._build_cost)
         return replace(found, multigrid=True)
 
-    def _could_build(self, system: "StageSystem", c: float, beta: float, x: np.ndarray, free: np.ndarray) -> bool:
+    def _could_build(self, c: float, beta: float, x: np.ndarray, free: np.ndarray) -> bool:
         """`_build`; False if the matrix is not positive definite."""
         try:
-            self._build(system, c, beta, x, free)
+            self._build(c, beta, x, free)
         except np.linalg.LinAlgError:
             return False
         return True
 
-    def _build(self, system: "StageSystem", c: float, beta: float, x: np.ndarray, free: np.ndarray) -> None:
+    def _build(self, c: float, beta: float, x: np.ndarray, free: np.ndarray) -> None:
         """Build the hierarchy from the projected matrix at positions x."""
-        m, A = self.model, system.matrix
+        m, A = self.model, self._matrix
         changed = [m.state.x, A.value, A.diagonal] + ([m.mean.dilatation, A.patches.gradient] if m.mean_dilatation else [])
         present = [(array, array.to_numpy()) for array in changed]
         m.state.x.from_numpy(x)
-        system.form(EVERYTHING, True, c, beta)
+        self._form(EVERYTHING, True, c, beta)
         try:
             self._hierarchy, self._built = build_hierarchy(m, A, x, free), (c, beta, x, free)
         finally:

@@ -15,35 +15,21 @@ largest pressure of a balloon that does not converge.
 Source: Nocedal, Wright, Numerical Optimization, 2nd ed. 2006, sections 11.1, 16.1, 17.3 and 17.4.
 """
 
-from dataclasses import replace
-from typing import TYPE_CHECKING
-
 import numpy as np
 import taichi as ti
 
 from taisoft.backend.arrays import download, upload
-from taisoft.dynamics.results import StageResult, count_all
 from taisoft.dynamics.simulation_state import SimulationState
 from taisoft.errors import SceneError, SimulationError
 from taisoft.fem.loads import number_at
 from taisoft.fem.spring_table import LengthForm
 from taisoft.linear import pcg
 from taisoft.linear.bordered import products, solve_active
-from taisoft.linear.jacobi import JACOBI
-from taisoft.linear.pcg_work import LinearResult
 from taisoft.scene.connection_records import Tendon
 from taisoft.scene.loads import Cavity
 
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from taisoft.dynamics.stage_system import Stage, StageSystem
-
 TOLERANCE = 1e-6  # of |c| over V_0
 PENALTY = 10.0  # k V_0 over Young's modulus of a cavity's body
-MAX_CORRECTIONS = 20  # of p, with contacts
-MAX_TOLERANCE = 3e-2  # of the linear solves for z without contacts, which the size of r says nothing about
-SLOPE_TOLERANCE = 1e-3  # of those with contacts
 HELD = 1e-9  # of the largest component of g: if those on free axes are smaller, they are rounding
 
 
@@ -99,7 +85,7 @@ class Multipliers:
         self.values = self._simulation.multipliers.copy()
         young = [1.0 if isinstance(one, Tendon) else float(np.max(scene.cavity(one.name)[0].young)) for one in present]
         force = np.where(self._is_tendon, np.maximum(self.values, self._weight), PENALTY * np.array(young))
-        self._penalty = force / np.abs(np.where(self._is_tendon, self.targets, self._rest))
+        self.penalty = force / np.abs(np.where(self._is_tendon, self.targets, self._rest))
         self.slope_change = 0.0
 
     def _wanted(self, owner: Cavity | Tendon, time: float) -> float:
@@ -143,7 +129,7 @@ class Multipliers:
         """Multipliers (k,) of the residual."""
         if not self.penalised:
             return self.values
-        shifted = self.values + self._penalty * self.missing
+        shifted = self.values + self.penalty * self.missing
         return np.where(self._is_tendon, np.maximum(shifted, 0.0), shifted)
 
     def upload(self, values: np.ndarray) -> None:
@@ -171,11 +157,11 @@ class Multipliers:
         return found
 
     @property
-    def _candidates(self) -> np.ndarray:
+    def candidates(self) -> np.ndarray:
         """Multipliers that may change: not those of tendons that are slack now; of some that tighten, the next step decides."""
         return np.flatnonzero(~self._is_tendon | (self.values > 0.0) | (self.missing > 0.0))
 
-    def _rows(self, beta: float, chosen: np.ndarray) -> np.ndarray:
+    def rows(self, beta: float, chosen: np.ndarray) -> np.ndarray:
         """beta g of the chosen, (k, 3 n_nodes), 0 on constrained axes."""
         m = self._simulation.model
         rows = np.zeros((len(chosen), m.n_nodes, 3))
@@ -185,47 +171,7 @@ class Multipliers:
             rows = np.stack([self._simulation.dependents.matrix.T @ row for row in rows])
         return (rows * m.free.to_numpy()).reshape(len(rows), -1)
 
-    def direction(self, system: "StageSystem", tolerance: float) -> LinearResult:
-        """Solve the bordered system for y of pcg, and change the multipliers.
-
-        Where it is singular, or A indefinite even when projected, y is y_0 and they stay; where A is not finite, y is 0.
-        """
-        self.slope_change = 0.0
-        if not len(self._candidates):
-            return system.solve_linear(tolerance)
-        solution = self._solve_bordered(system, tolerance)
-        if not solution.negative:
-            return solution
-        system.form_matrix(projected=True)
-        again = self._solve_bordered(system, tolerance)
-        return replace(again, iterations=solution.iterations + again.iterations, negative=False)
-
-    def _solve_bordered(self, system: "StageSystem", tolerance: float) -> LinearResult:
-        m, w, A, chosen = system.model, system.work.pcg, system.matrix, self._candidates
-        system.pieces.forget_factors()
-        G, right, penalty = self._rows(system.stage.beta, chosen), w.rhs.host.copy(), self._penalty[chosen]
-        if not np.isfinite(A.diagonal.host).all():
-            w.y.host[...] = 0.0
-            return LinearResult(0, False, False)
-        border, found, solutions = self._border(G, penalty), [], []
-        for k, rhs in enumerate((right, *G)):
-            w.rhs.host[...] = rhs.reshape(-1, 3)
-            accuracy = tolerance if k == 0 else min(tolerance, MAX_TOLERANCE)
-            found.append(pcg.solve(m, A, JACOBI, w, accuracy, pcg.iteration_limit(m), border=border))
-            solutions.append(w.y.host.astype(np.float64).reshape(-1))
-        w.rhs.host[...] = right
-        y, z = solutions[0], np.array(solutions[1:])
-        negative = any(one.negative for one in found)
-        change = None if negative else self._change(G, y, z, self.effective[chosen] - self.values[chosen], penalty)
-        if change is not None:
-            factors, changed = change
-            y = y + np.einsum("k,kn->n", factors, z)
-            self.slope_change = -float(changed @ products(G, y[None])[:, 0])
-        w.y.host[...] = y.reshape(-1, 3)
-        converged = change is not None and all(one.converged for one in found)
-        return LinearResult(sum(one.iterations for one in found), converged, negative)
-
-    def _border(self, G: np.ndarray, factors: np.ndarray) -> pcg.Border:
+    def border(self, G: np.ndarray, factors: np.ndarray) -> pcg.Border:
         """The term G^T s G for rows (k, 3 n_nodes) and factors (k,)."""
         n_nodes, capacity = self._simulation.model.n_nodes, len(self._owners)
         if self._stored is None:
@@ -242,14 +188,14 @@ class Multipliers:
         self._stored.factor.host[:k] = factors
         return self._stored
 
-    def _change(
+    def change(
         self, G: np.ndarray, y: np.ndarray, z: np.ndarray, shift: np.ndarray, penalty: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray] | None:
         """Change the candidates to reach c = 0 to first order. None: singular, no change.
 
         Return the factors s of z, and the changes of the residual's multipliers.
         """
-        chosen, before = self._candidates, self.effective
+        chosen, before = self.candidates, self.effective
         solved = solve_active(
             products(G, z),
             products(G, y[None])[:, 0],
@@ -266,48 +212,6 @@ class Multipliers:
         self.values[chosen] = values
         return factors, (self.effective - before)[chosen]
 
-    def correct(self, system: "StageSystem") -> tuple[int, bool]:
-        """Change the multipliers, and v along with them, to reach the volumes and lengths to first order.
-
-        Return the linear iterations, and whether it was possible; if not, nothing is changed.
-        """
-        m, w = system.model, system.work.pcg
-        G, z, n = self._rows(system.stage.beta, self._candidates), [], 0
-        system.form_matrix(projected=True)
-        for row in G:
-            upload([(w.rhs, row.reshape(-1, 3))])
-            n += system.solve_linear(SLOPE_TOLERANCE).iterations
-            z.append(w.y.to_numpy().astype(np.float64).reshape(-1))
-        zero = np.zeros(len(G))
-        change = self._change(G, np.zeros(G.shape[1]), np.array(z), zero, zero)
-        if change is None:
-            return n, False
-        upload([(m.state.v, m.state.v.to_numpy() + np.einsum("k,kn->n", change[0], np.array(z)).reshape(-1, 3))])
-        self.upload(self.values)
-        return n, True
-
 
 def _kind(owner: Cavity | Tendon) -> str:
     return type(owner).__name__.lower()
-
-
-def solve_with_multipliers(system: "StageSystem", stage: "Stage", solve_stage: "Callable[[], StageResult]") -> StageResult:
-    """Solve a stage by a function, and again with other multipliers until volumes and lengths are those given."""
-    from taisoft.dynamics.contact_newton import solve
-
-    multipliers = system.multipliers
-    if multipliers is None:
-        return solve_stage()
-    multipliers.penalised = system.contact.n_contacts == 0 and system.model.on_cpu
-    result, discarded, linear = solve_stage(), [], 0
-    while not multipliers.penalised and result.converged and not multipliers.hold and len(discarded) < MAX_CORRECTIONS:
-        iterations, corrected = multipliers.correct(system)
-        linear += iterations
-        if not corrected:
-            break
-        discarded.append(result)
-        result = solve(system, stage)
-    result = replace(count_all(result, discarded), converged=result.converged and multipliers.hold)
-    if result.converged:
-        multipliers.end()
-    return replace(result, linear_iterations=result.linear_iterations + linear)

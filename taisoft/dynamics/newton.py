@@ -21,21 +21,14 @@ import math
 from collections.abc import Callable
 from typing import Any
 
+from taisoft.dynamics.constraints import direction
 from taisoft.dynamics.contact_terms import KEEP, TO_IMPULSES
-from taisoft.dynamics.friction import FINER, MAX_MULTIPLIERS, PAST, PROGRESS, R_EXTRAPOLATED, R_SCALE, ROUNDING, next_scale
+from taisoft.dynamics.friction import PAST, Friction, extrapolate_multipliers
 from taisoft.dynamics.results import StageResult, relative
-from taisoft.dynamics.stage import AGAIN, ELASTIC_STAGE, IMPACT, STEP
-from taisoft.dynamics.stage_system import Stage, StageSystem
+from taisoft.dynamics.stage import AGAIN, ELASTIC_STAGE, IMPACT, STEP, Stage
+from taisoft.dynamics.stage_system import StageSystem
 from taisoft.linear.pcg_work import LinearResult
 
-LINEAR_LIMIT = 0.01  # relative true residual above which a linearly implicit step has failed
-MAX_FORCING, INCREASE_FORCING = 0.1, 3e-2  # CG's maximum tolerance, and that after a step that increased |r|
-STATIC_FORCING = 1e-2  # maximum in statics, where a loose solve leaves a slender body stretched for the next step to correct
-REBUILD_RATIO = 0.2  # a step that leaves a larger fraction of |r| requires a new matrix,
-REBUILD_VOLUMES = 0.01  # with `step_with_volumes`, whose first matrix is that of the step's start and whose solves are longer
-MIN_USES = {False: 1, True: 3}  # minimum steps per matrix, without and with contacts; with them mostly the active contacts change
-ELIMINATION_RATIO = 0.1  # a step that leaves a larger fraction of |r| requires elimination
-DECREASE = 0.9  # with contacts, fraction of the smallest |r| so far below which a step is accepted without its slope
 FLAT, STEEP = 0.5, 0.3  # of the initial slope: rise that shortens a step; descent that doubles it
 TRIES, LONGEST = 20, 1024.0  # trial step lengths, and the longest
 FAR = 0.5  # |r| over scale at the first iterate above which v = 0 is tried
@@ -44,11 +37,23 @@ FAR = 0.5  # |r| over scale at the first iterate above which v = 0 is tried
 class Newton:
     """Newton steps and multiplier updates of a stage."""
 
+    LINEAR_LIMIT = 0.01  # relative true residual above which a linearly implicit step has failed
+    MAX_FORCING, INCREASE_FORCING = 0.1, 3e-2  # CG's maximum tolerance, and that after a step that increased |r|
+    STATIC_FORCING = 1e-2  # maximum in statics, where a loose solve leaves a slender body stretched for the next step to correct
+    REBUILD_RATIO = 0.2  # a step that leaves a larger fraction of |r| requires a new matrix,
+    REBUILD_VOLUMES = 0.01  # with `step_with_volumes`, whose first matrix is that of the step's start and whose solves are longer
+    MIN_USES = {
+        False: 1,
+        True: 3,
+    }  # minimum steps per matrix, without and with contacts; with them mostly the active contacts change
+    ELIMINATION_RATIO = 0.1  # a step that leaves a larger fraction of |r| requires elimination
+    DECREASE = 0.9  # with contacts, fraction of the smallest |r| so far below which a step is accepted without its slope
+
     def __init__(self, system: StageSystem, stage: Stage, eliminate: "Callable[[StageSystem, Stage, float], Any] | None" = None):
         """eliminate: as `elimination.eliminate`, called after slow steps; None: no elimination."""
         self.system, self.stage, self.eliminate = system, stage, eliminate
         self._counts = not system.work.pcg.subset.restricted  # in the step's budget; else the caller does
-        self.max_forcing = MAX_FORCING if stage.c > 0.0 else STATIC_FORCING
+        self.max_forcing = self.MAX_FORCING if stage.c > 0.0 else self.STATIC_FORCING
         self.newton = self.linear = self.multigrid = self.multipliers = self.n_remembered = 0
         self.eliminated = 0.0  # Newton iterations on few nodes, times their fraction of all nodes
         self.rounding = False  # |r| is only rounding
@@ -56,7 +61,7 @@ class Newton:
     def run(self, r: float, scale: float, fresh: bool) -> StageResult:
         """Solve from the present state, whose (|r|, scale) is given. fresh: whether the matrix is formed there."""
         system, n_uses = self.system, 0
-        rebuild_ratio = REBUILD_VOLUMES if system.keeps_volumes else REBUILD_RATIO
+        rebuild_ratio = self.REBUILD_VOLUMES if system.keeps_volumes else self.REBUILD_RATIO
         self.r, self.scale, self.has_contacts = r, scale, system.n_contacts > 0
         self.law_residual = math.inf  # the laws' residual at the last multiplier update
         self._begin_multiplier()
@@ -72,7 +77,7 @@ class Newton:
                 continue
             if self.newton >= self.stage.max_newton or (self._counts and not system.budget.left):
                 break
-            if not fresh or (n_uses >= MIN_USES[self.has_contacts] and self.r > rebuild_ratio * self.previous):
+            if not fresh or (n_uses >= self.MIN_USES[self.has_contacts] and self.r > rebuild_ratio * self.previous):
                 if system.kind == ELASTIC_STAGE:
                     system.form_matrix()
                 fresh, n_uses = True, 0
@@ -81,7 +86,7 @@ class Newton:
             if not math.isfinite(self.r) or not (moved or n_uses > 1):
                 break
             fresh = moved and not self._eliminate()
-        system.r_scale = R_SCALE  # initial value of the next solve
+        system.r_scale = Stage.first_r_scale  # initial value of the next solve
         return self._result(converged or (self._inner_done() and self._has_converged() and system.balances_pieces()))
 
     def _begin_again(self) -> None:
@@ -93,7 +98,7 @@ class Newton:
     def _begin_multiplier(self) -> None:
         """Set the target of |r| and reset the progress after a multiplier update."""
         self.inner_target, self.lowest, self.previous, self.forcing, self.n_inner = (
-            PROGRESS * self.r,
+            Friction.PROGRESS * self.r,
             self.r,
             0.0,
             self.max_forcing,
@@ -107,7 +112,7 @@ class Newton:
             return (self.r <= target or self.rounding) and self.system.multipliers_hold
         laws_hold = self.system.contact_residual <= self.stage.contact_tolerance
         # in an impact whose laws hold, only the momenta remain to be balanced
-        inner = (FINER if self.multipliers >= self.stage.extrapolate_after else 1.0) * self.stage.tolerance * self.scale
+        inner = (Friction.FINER if self.multipliers >= self.stage.extrapolate_after else 1.0) * self.stage.tolerance * self.scale
         inner_target = 0.0 if laws_hold and self.system.kind == IMPACT else max(inner, self.inner_target)
         return self.r <= (max(target, inner_target) if laws_hold else inner_target) or self.rounding
 
@@ -124,15 +129,17 @@ class Newton:
 
     def _update_multipliers(self) -> bool:
         """Update the multipliers; return False if their maximum number is reached."""
-        if not self.has_contacts or self.stage.keeps_multipliers or self.multipliers >= MAX_MULTIPLIERS:
+        if not self.has_contacts or self.stage.keeps_multipliers or self.multipliers >= Friction.MAX_MULTIPLIERS:
             return False
         system, law, extrapolating = self.system, self.system.contact_residual, self.multipliers >= self.stage.extrapolate_after
         if extrapolating:
-            system.extrapolate_multipliers(self.n_remembered)
-            system.r_scale, self.n_remembered = R_EXTRAPOLATED, min(self.n_remembered + 1, PAST)
+            extrapolate_multipliers(system.contacts, self.n_remembered)
+            system.r_scale, self.n_remembered = Friction.R_EXTRAPOLATED, min(self.n_remembered + 1, PAST)
         else:
             bounds = self.stage.max_r_scale, self.stage.contact_tolerance
-            system.r_scale = next_scale(system.r_scale, law, self.law_residual, self.n_inner, system.frictionless, *bounds)
+            system.r_scale = Friction.next_scale(
+                system.r_scale, law, self.law_residual, self.n_inner, system.frictionless, *bounds
+            )
         self.law_residual, self.multipliers, self.rounding = law, self.multipliers + 1, False
         self.r, self.scale = system.evaluate(None, new_multipliers=KEEP if extrapolating else TO_IMPULSES)
         self._begin_multiplier()
@@ -149,19 +156,19 @@ class Newton:
         self.r, self.scale, moved = search(system, self._acceptable_residual(solution.negative))
         self.lowest = min(self.lowest, self.r)
         # statics continues down to the floor
-        near_floor = self.r <= (ROUNDING if self.stage.c > 0.0 else 1.0) * self.system.floor
+        near_floor = self.r <= (Friction.ROUNDING if self.stage.c > 0.0 else 1.0) * self.system.floor
         self.rounding = near_floor and self.r > 0.5 * self.previous
         return moved
 
     def _direction(self, tolerance: float) -> LinearResult:
         """Solve for a direction and count the iterations."""
-        solution = self.system.direction(tolerance)
+        solution = direction(self.system, tolerance)
         self.linear, self.multigrid = self.linear + solution.iterations, self.multigrid + solution.multigrid
         return solution
 
     def _eliminate(self) -> bool:
         """Solve the few nodes that dominate |r| after a slow step; return whether there were any."""
-        if self.eliminate is None or self.r <= ELIMINATION_RATIO * self.previous or self._inner_done():
+        if self.eliminate is None or self.r <= self.ELIMINATION_RATIO * self.previous or self._inner_done():
             return False
         if (found := self.eliminate(self.system, self.stage, self.r)) is None:
             return False
@@ -174,7 +181,7 @@ class Newton:
         """Return |r| below which a full step is accepted without checking its slope."""
         if self.stage.c == 0.0 or negative:  # a lower |r| may be at a maximum of the energy
             return self.system.floor
-        return DECREASE * self.lowest if self.has_contacts else self.r
+        return self.DECREASE * self.lowest if self.has_contacts else self.r
 
     def _linear_tolerance(self) -> float:
         """Return CG's tolerance by Newton's progress: Eisenstat and Walker's choice 2, with their safeguard.
@@ -187,7 +194,7 @@ class Newton:
         if self.previous == 0.0:
             self.forcing = self.max_forcing
         elif self.r > self.previous:
-            self.forcing = min(INCREASE_FORCING, self.max_forcing)
+            self.forcing = min(self.INCREASE_FORCING, self.max_forcing)
         else:
             wanted, safeguard = 0.9 * (self.r / self.previous) ** 2, 0.9 * self.forcing**2
             self.forcing = min(self.max_forcing, max(wanted, safeguard if safeguard > 0.1 else 0.0))
@@ -224,7 +231,7 @@ class Newton:
                 solution = self._direction(tolerance)
                 if not solution.negative:
                     break
-            solved = solution.converged and system.linear_residual() <= LINEAR_LIMIT
+            solved = solution.converged and system.linear_residual() <= self.LINEAR_LIMIT
             self.newton = 1
             system.budget.spend()
         else:

@@ -14,7 +14,7 @@ In a linearly implicit step the arms are those of its start, and the forces f - 
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import taichi as ti
@@ -22,15 +22,9 @@ import taichi as ti
 from taisoft.backend.arrays import Count, FieldArena, download, upload
 from taisoft.dynamics.rigid_balance import N_MOMENTS, N_SUMS, N_TERMS, measure_pieces
 from taisoft.dynamics.simulation_state import SimulationState
+from taisoft.dynamics.stage import StageWork
 from taisoft.mesh.topology import connected_pieces, linked_groups
 
-if TYPE_CHECKING:
-    from taisoft.dynamics.stage_system import StageSystem
-
-LIMIT = 0.01  # of the forces on a piece: a larger mean residual of a linearised step means wrong motion
-NEGLIGIBLE_MOMENTUM = 1e-9  # of a piece's momentum and forces: momentum error that a step may always make
-MEAN_ROUNDING = 4.0  # times the rounding of a mean residual
-ROW = 256  # least nodes of a partial sum: of larger scenes, the root of all nodes
 ROUNDED = 1e-12  # sum of the weights of an element of springs, between points of bodies: 0 but for rounding
 
 
@@ -62,6 +56,11 @@ class PieceWork:
 class Pieces:
     """The pieces of a simulation, their names, and the kernels' record of them."""
 
+    LIMIT = 0.01  # of the forces on a piece: a larger mean residual of a linearised step means wrong motion
+    NEGLIGIBLE_MOMENTUM = 1e-9  # of a piece's momentum and forces: momentum error that a step may always make
+    MEAN_ROUNDING = 4.0  # times the rounding of a mean residual
+    ROW = 256  # least nodes of a partial sum: of larger scenes, the root of all nodes
+
     def __init__(self, simulation: SimulationState, arena: FieldArena):
         self.model = simulation.model
         piece, names, self.body = _pieces(simulation)
@@ -82,7 +81,7 @@ class Pieces:
         layout = simulation.layout
         first_node = np.concatenate([b.nodes.elements[:, 0] + s for b, s in zip(simulation.scene.bodies, layout.node_start)])
         self.of_lane = piece[first_node[layout.tet_of_lane]]
-        length = max(ROW, math.isqrt(n_nodes))
+        length = max(self.ROW, math.isqrt(n_nodes))
         rows = [-(-count // length) for count in np.bincount(piece, minlength=n)]
         first = np.concatenate([[0], np.cumsum(np.bincount(piece, minlength=n))])
         starts = np.concatenate([first[k] + length * np.arange(rows[k]) for k in range(n)] + [[n_nodes]])
@@ -146,27 +145,25 @@ class Pieces:
         """Return the norm (n,) of the momenta of each piece's nodes [N s]. mass: (n_nodes,), v: (n_nodes, 3)."""
         return np.sqrt(np.bincount(self.of_node, ((mass[:, None] * v) ** 2).sum(axis=1), self.work.n))
 
-    def unbalanced_mean(self, system: "StageSystem", beta: float) -> tuple[float, str]:
+    def unbalanced_mean(self, stage_work: StageWork, beta: float, eps: float, least: np.ndarray) -> tuple[float, str]:
         """Return the largest relative mean residual of a piece after a linearised step, and its name; 0 if all are rounding.
 
         It moves a piece as a whole, along the axes on which it has no constraint; elastic forces and their rounding cancel in it.
-        The rest of the residual is the linearisation error.
+        The rest of the residual is the linearisation error. eps: rounding of the model's precision; least (n,): that of
+        momenta, times beta [kg m].
         """
         m, n = self.model, self.work.n
-        measure_pieces(m, system.work, self.work, beta)
+        measure_pieces(m, stage_work, self.work, beta)
         _r, inertia, internal, loads, _held = np.sqrt(self.work.norms.to_numpy()).T
-        residual, v, free, mass = (a.astype(np.float64) for a in download([system.work.residual, m.state.v, m.free, m.mass]))
+        residual, v, free, mass = (a.astype(np.float64) for a in download([stage_work.residual, m.state.v, m.free, m.mass]))
         means = np.zeros((3, n))
         for axis in range(3):
             constrained = np.bincount(self.of_node, 1.0 - free[:, axis], n) > 0.0
             means[axis] = np.where(constrained, 0.0, np.bincount(self.of_node, residual[:, axis], n))
         mean = np.linalg.norm(means, axis=0) / np.sqrt(np.bincount(self.of_node, minlength=n))
-        floor = (
-            max(system.rounding.eps, NEGLIGIBLE_MOMENTUM) * (self.momenta(mass, v) + beta * internal)
-            + system.rounding.piece_mass / beta
-        )
+        floor = max(eps, self.NEGLIGIBLE_MOMENTUM) * (self.momenta(mass, v) + beta * internal) + least / beta
         with np.errstate(divide="ignore", invalid="ignore"):
-            ratio = np.where(mean > MEAN_ROUNDING * floor, mean / (inertia + beta * (internal + loads)), 0.0)
+            ratio = np.where(mean > self.MEAN_ROUNDING * floor, mean / (inertia + beta * (internal + loads)), 0.0)
         k = int(np.argmax(ratio))
         return float(ratio[k]), self._names[k]
 

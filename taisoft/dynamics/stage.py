@@ -7,16 +7,17 @@ residual without contacts.
 A stage may be restricted to a `Subset` of nodes, with the edges and blocks at them.
 """
 
+import math
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import taichi as ti
 
 from taisoft.backend.arrays import Count, FieldArena, download, upload
 from taisoft.backend.runtime import kernel
+from taisoft.contact.problem import ContactProblem
 from taisoft.dynamics.contact_terms import impulse_on_node
-from taisoft.dynamics.impact import impact_residual
 from taisoft.fem.chunks import chunk_entry, chunk_size, fold, total
 from taisoft.fem.dependents import force_with_dependents, is_dependent
 from taisoft.fem.lanes import mass_times
@@ -25,12 +26,53 @@ from taisoft.fem.node_graph import BLOCKS, EDGES, NODES, Subset, n_nodes_of, nod
 from taisoft.fem.pattern import patch_nodes
 from taisoft.fem.state import END_SLOPE, N_NORMS, NORMS, OTHER_SUM, START_SLOPE, SUM
 from taisoft.fem.terms import elasticity, rayleigh_damping
-from taisoft.linear.block_csr import BlockCsr, stiffness_times
+from taisoft.linear.block_csr import BlockCsr, block_times, stiffness_times
 from taisoft.linear.pcg_work import PcgWork, dot64
 from taisoft.ranges import entries_of, owners
 
 STAY, STEP, AGAIN = range(3)  # modes of `move`: stay, full step, another length of the same step
 ELASTIC_STAGE, LINEARISED, IMPACT = range(3)  # kinds of stages; IMPACT: see `impact`
+
+
+@dataclass(frozen=True)
+class Stage:
+    """Parameters of a stage. tolerance: of |r| over scale; contact_tolerance: of the residual of the contact laws."""
+
+    c: float  # 1: a time step; 0: statics
+    beta: float  # [s]
+    dt: float  # [s] of the step
+    tolerance: float
+    contact_tolerance: float = math.inf
+    max_newton: int = 50
+    linear_tolerance: float | None = None  # of every linear solve; None: adaptive
+    linearised: bool = False  # elastic forces are linear from the first iterate on
+    prescribed_fraction: float = 1.0  # see `begin_stage`
+    multiplier_tolerance: float | None = None  # as `tolerance`, for the steps under one multiplier; None: the same
+    absolute_tolerance: float = 0.0  # |r| [N s] that also ends the stage, regardless of the scale
+    keeps_multipliers: bool = False  # do not update the multipliers
+    extrapolate_after: int = 25  # multiplier updates
+    later_tolerance: float = 0.0  # lower bound on linear_tolerance after the first solve
+    first_r_scale: float = 1.0  # R over the r-factors of a contact problem at its start,
+    max_r_scale: float = 1000.0  # and its upper bound without friction
+
+    @property
+    def inner_tolerance(self) -> float:
+        """|r| over scale that ends the steps under one multiplier."""
+        return self.tolerance if self.multiplier_tolerance is None else self.multiplier_tolerance
+
+
+class StepContacts(Protocol):
+    """Contacts of a step, as found by its search."""
+
+    problem: ContactProblem
+
+    @property
+    def n_contacts(self) -> int:
+        """Number of contacts."""
+
+    @property
+    def gap_targets(self) -> tuple[float, ...]:
+        """See `contact_terms.begin_contacts`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,6 +175,30 @@ def residual_parts(m: ti.template(), w: ti.template(), chunk, i, beta):
         damping += damping_force(m, w, chunk, i, m.state.v)
     inertia = ti.cast(mass_times(m, i, w.change), m.real)
     return inertia - ti.cast(beta, m.real) * (internal + loads + damping), inertia, internal, loads
+
+
+@ti.func
+def impact_residual(m: ti.template(), A: ti.template(), k: ti.template(), i, tau):
+    """Return (A D)_i of the jump D = (x - x_linear) / tau, without impulses.
+
+    Uses differences between neighbours in f64: stiffness does not resist the common part of the jump, which is most of it, and
+    its rounding, tau^2 times as large, would hide the rigid motion.
+    """
+    inertia = ti.cast(1.0, m.real)
+    if ti.static(m.damped):
+        inertia += ti.cast(tau, m.real) * rayleigh_damping.mass_rate(m, i)
+    velocity_jump, mass = (m.state.x[i] - k.x_linear[i]) / tau, m.mass[i]
+    if ti.static(m.consistent):
+        mass = m.mass_matrix.diagonal[i]
+    r = ti.Vector([0.0, 0.0, 0.0], m.real)
+    for half in range(2):
+        row = i + half * m.n_nodes
+        for at in range(A.row_start[row], A.row_start[row + 1]):
+            j = A.column[at]
+            r += block_times(A.value[at], ti.cast((m.state.x[j] - k.x_linear[j]) / tau - velocity_jump, m.real))
+            if ti.static(m.consistent):
+                mass += m.mass_matrix.value[at]
+    return r + inertia * mass * ti.cast(velocity_jump, m.real)
 
 
 @ti.func

@@ -10,15 +10,15 @@ displacement). K is unprojected.
 
 import contextlib
 import math
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import taichi as ti
 
 from taisoft.backend.arrays import FieldArena, download, upload
 from taisoft.contact.problem import RESIDUAL, find_factors
-from taisoft.dynamics import friction, rigid_balance
+from taisoft.dynamics import rigid_balance
 from taisoft.dynamics.contact_terms import (
     KEEP,
     NO_CONTACTS,
@@ -32,6 +32,7 @@ from taisoft.dynamics.contact_terms import (
 from taisoft.dynamics.direct import DirectSolver
 from taisoft.dynamics.linear_solver import LinearSolver
 from taisoft.dynamics.linearised import LONGEST, advance, begin_linearised, end_linearised, find_step_length, update_multipliers
+from taisoft.dynamics.multipliers import Multipliers
 from taisoft.dynamics.newton_budget import NewtonBudget
 from taisoft.dynamics.pieces import Pieces
 from taisoft.dynamics.rigid_balance import (
@@ -53,7 +54,9 @@ from taisoft.dynamics.stage import (
     LINEARISED,
     STAY,
     STEP,
+    Stage,
     StageWork,
+    StepContacts,
     SubsetLists,
     begin_stage,
     form_residual,
@@ -69,56 +72,20 @@ from taisoft.linear.pcg_work import LinearResult, build_pcg
 from taisoft.linear.sweep_order import find_last
 from taisoft.linear.volumes import VolumeSystem, restore_volumes, save_volumes, step_with_volumes
 
-if TYPE_CHECKING:
-    from taisoft.dynamics.contact import ContactStep
-    from taisoft.dynamics.multipliers import Multipliers
-    from taisoft.dynamics.no_contacts import NoContacts
-
-
 # Nodes from which threads share linear solves with contacts, and nodes per contact. Two cubes on two threads: no gain at 16,000
 # nodes, a quarter of the step at 60,000. Contacts themselves stay on one thread: piles with 2 to 3 nodes per contact lose time
 SHARED_FROM, NODES_PER_CONTACT = 25_000, 8
-BALANCED = 4.0  # |r|_p over s_p of a piece, times the tolerance and the root of the number of pieces: a converged piece has less
-NEARLY = 0.1  # of the tolerance: |r|_p over s_p below which a component counts less in linear solves
-VOLUME_PASSES = 2  # corrections of the first iterate, each of which leaves errors of second order
-
-
-@dataclass(frozen=True)
-class Stage:
-    """Parameters of a stage. tolerance: of |r| over scale; contact_tolerance: of the residual of the contact laws."""
-
-    c: float  # 1: a time step; 0: statics
-    beta: float  # [s]
-    dt: float  # [s] of the step
-    tolerance: float
-    contact_tolerance: float = math.inf
-    max_newton: int = 50
-    linear_tolerance: float | None = None  # of every linear solve; None: adaptive
-    linearised: bool = False  # elastic forces are linear from the first iterate on
-    prescribed_fraction: float = 1.0  # see `begin_stage`
-    multiplier_tolerance: float | None = None  # as `tolerance`, for the steps under one multiplier; None: the same
-    absolute_tolerance: float = 0.0  # |r| [N s] that also ends the stage, regardless of the scale
-    keeps_multipliers: bool = False  # do not update the multipliers
-    extrapolate_after: int = friction.EXTRAPOLATION_START  # multiplier updates
-    later_tolerance: float = 0.0  # lower bound on linear_tolerance after the first solve
-    first_r_scale: float = friction.R_SCALE  # R over the r-factors of a contact problem at its start,
-    max_r_scale: float = friction.MAX_R_FRICTIONLESS  # and its upper bound without friction
-
-    @property
-    def inner_tolerance(self) -> float:
-        """|r| over scale that ends the steps under one multiplier."""
-        return self.tolerance if self.multiplier_tolerance is None else self.multiplier_tolerance
 
 
 class StageSystem:
     """Matrix and vectors of the implicit stages of one model, and of their contacts."""
 
+    BALANCED = 4.0  # |r|_p over s_p of a piece, times the tolerance and the root of their number: a converged piece has less
+    NEARLY = 0.1  # of the tolerance: |r|_p over s_p below which a component counts less in linear solves
+    VOLUME_PASSES = 2  # corrections of the first iterate, each of which leaves errors of second order
+
     def __init__(
-        self,
-        simulation: SimulationState,
-        contact: "ContactStep | NoContacts",
-        x_start: Any = None,
-        multipliers: "Multipliers | None" = None,
+        self, simulation: SimulationState, contact: StepContacts, x_start: Any = None, multipliers: Multipliers | None = None
     ):
         """x_start: (n_nodes) 3-vectors f64, positions at the start of the step.
 
@@ -149,21 +116,21 @@ class StageSystem:
         self.rounding = RoundingFloor(model, simulation.runtime.eps, self.pieces)
         self.floor = 0.0  # rounding floor of |r| of the present stage
         self.unbalanced = 0.0, ""  # largest relative residual of a piece at the last `balances_pieces`, and its name
-        self.linear_solver, self.budget = LinearSolver(model), NewtonBudget()
-        self._direct = DirectSolver(self) if multipliers is None and model.on_cpu else None
+        self.linear_solver = LinearSolver(model, self.matrix, self.work.pcg, self.form)
+        self.budget = NewtonBudget()
+        self._direct = DirectSolver(model, self.matrix, self.work.x_hat) if multipliers is None and model.on_cpu else None
         self.kind = ELASTIC_STAGE
         self.scale = 0.0  # that |r| is relative to, at its last evaluation
         self.r_scale = 1.0  # R over the r-factors
         self.frictionless = False  # whether no contact of the stage has friction
         self._contact_arena = FieldArena()
-        self._stage_contacts: StageContacts | None = None  # storage for the contacts of this step
-        self._k = NO_CONTACTS  # contacts of the present stage
+        self._storage: StageContacts | None = None  # storage for the contacts of this step
+        self.contacts = NO_CONTACTS  # of the present stage
         self._whole, self._restricted = self.work, None  # `work` for all nodes, and for a subset
         self._lists: SubsetLists | None = None
         self._volumes: VolumeSystem | None = None  # whose iterates keep the volumes of patches
         self._same_matrix = False  # whether the matrix is that of the last linear solve of this stage
         self._may_share = True  # whether threads may share linear solves with its contacts: if they are few
-        self.n_formed = 0  # times that the matrix was formed
 
     # --- state ----------------------------------------------------------------------------------------------------
 
@@ -201,9 +168,9 @@ class StageSystem:
 
     def _allocate_contacts(self) -> None:
         """Allocate storage for the contacts of this step."""
-        if self._stage_contacts is None or self._stage_contacts.problem is not self.contact.problem:
+        if self._storage is None or self._storage.problem is not self.contact.problem:
             arena, shared = FieldArena(), self.work.pcg.divided and self.model.n_nodes >= SHARED_FROM
-            self._stage_contacts = build_stage_contacts(arena, self.model, self.contact.problem, self.x_start, shared)
+            self._storage = build_stage_contacts(arena, self.model, self.contact.problem, self.x_start, shared)
             self._contact_arena.release()
             self._contact_arena = arena
 
@@ -212,7 +179,7 @@ class StageSystem:
     @property
     def n_contacts(self) -> int:
         """Contacts of the present stage."""
-        return int(self._k.problem.count[0]) if self._k.any else 0
+        return int(self.contacts.problem.count[0]) if self.contacts.any else 0
 
     @property
     def is_static(self) -> bool:
@@ -227,14 +194,14 @@ class StageSystem:
     @property
     def contact_residual(self) -> float:
         """Residual of the contact laws at the last evaluation."""
-        return float(self._k.problem.state[RESIDUAL]) if self._k.any else 0.0
+        return float(self.contacts.problem.state[RESIDUAL]) if self.contacts.any else 0.0
 
     def impulses_are_rounding(self) -> bool:
         """Return whether impulses are below the rounding of the momenta of the bodies, and gaps hold: bodies that drift together
         barely touch."""
         mass, v = download([self.model.mass, self.work.v_hat])
         least = self.rounding.eps * self.pieces.momenta(mass.astype(np.float64), v).min()
-        _, square, gap = self._k.work.prox_residual.to_numpy()[: int(self._k.problem.count[0])].T
+        _, square, gap = self.contacts.work.prox_residual.to_numpy()[: int(self.contacts.problem.count[0])].T
         return bool(square.sum() <= least**2 and gap.max(initial=0.0) <= self.stage.contact_tolerance)
 
     @property
@@ -257,7 +224,7 @@ class StageSystem:
         """
         m, start, self._volumes = self.model, self._whole, None
         if stage.c > 0.0 and not stage.linearised and self.contact.n_contacts == 0:
-            self._volumes = self.linear_solver.volumes(self.matrix)
+            self._volumes = self.linear_solver.volumes()
         volumes = self._volumes
         if volumes is not None:
             self.restrict(None)
@@ -265,10 +232,10 @@ class StageSystem:
             if self.multipliers is not None:
                 self.multipliers.measure()
             self.form_matrix()
-            self.linear_solver.prepare(self)
+            self.linear_solver.prepare(self.stage.beta)
             save_volumes(m, volumes)
         begin_stage(m, start, stage.beta, stage.prescribed_fraction)
-        for _ in range(VOLUME_PASSES if volumes is not None else 0):
+        for _ in range(self.VOLUME_PASSES if volumes is not None else 0):
             restore_volumes(m, volumes, start.x_hat, stage.beta)
         self._begin(stage, ELASTIC_STAGE)
         return volumes is not None
@@ -282,10 +249,10 @@ class StageSystem:
         """Begin the impact before a step, and form the matrix."""
         self._volumes = None
         self._begin(stage, IMPACT)
-        return self._k
+        return self.contacts
 
     def _begin(self, stage: Stage, kind: int) -> None:
-        self.stage, self.kind, self.r_scale, self._k = stage, kind, friction.R_SCALE, NO_CONTACTS
+        self.stage, self.kind, self.r_scale, self.contacts = stage, kind, Stage.first_r_scale, NO_CONTACTS
         self.floor, self.unbalanced = self.rounding.of_stage(stage.c, stage.beta), (0.0, "")
         if self.pieces.several:
             self.pieces.forget_weights()
@@ -293,13 +260,13 @@ class StageSystem:
         if self.contact.n_contacts == 0:
             return
         self._allocate_contacts()
-        self._k, impact = self._stage_contacts, kind == IMPACT
+        self.contacts, impact = self._storage, kind == IMPACT
         n = self.n_contacts
         self._may_share = NODES_PER_CONTACT * n <= self.model.n_nodes
-        begin_contacts(self.work, self._k, impact, stage.beta, stage.dt, *self.contact.gap_targets, stage.contact_tolerance)
-        self.frictionless = not download([self._k.problem.friction], n)[0].any()
-        if self.work.pcg.has_last(self._k.coupling):
-            find_last(self.model, self.matrix, self._k.coupling, self.work.pcg)
+        begin_contacts(self.work, self.contacts, impact, stage.beta, stage.dt, *self.contact.gap_targets, stage.contact_tolerance)
+        self.frictionless = not download([self.contacts.problem.friction], n)[0].any()
+        if self.work.pcg.has_last(self.contacts.coupling):
+            find_last(self.model, self.matrix, self.contacts.coupling, self.work.pcg)
         self.form_matrix_and_factors(projected=impact)
 
     def evaluate(self, mode: int | None = STAY, step_length: float = 1.0, new_multipliers: int = KEEP) -> tuple[float, float]:
@@ -307,7 +274,7 @@ class StageSystem:
 
         new_multipliers: see `update_impulses`.
         """
-        m, w, k, stage = self.model, self.work, self._k, self.stage
+        m, w, k, stage = self.model, self.work, self.contacts, self.stage
         if mode is not None:
             move(m, w, k, self.kind, mode, step_length, stage.c, stage.beta)
             if self.multipliers is not None:
@@ -337,7 +304,7 @@ class StageSystem:
         if not self.pieces.several or self.kind != ELASTIC_STAGE or self.work.pcg.subset.restricted or self.stage.linearised:
             return True
         self._weigh()
-        return self.unbalanced[0] <= BALANCED * math.sqrt(self.pieces.work.n) * self.stage.tolerance
+        return self.unbalanced[0] <= self.BALANCED * math.sqrt(self.pieces.work.n) * self.stage.tolerance
 
     def least_balanced(self) -> tuple[float, str]:
         """Return the largest relative residual of a piece, and its name; (0, "") if there is one piece, or the stage is none."""
@@ -349,9 +316,9 @@ class StageSystem:
         stage, m, w = self.stage, self.model, self.work
         if stage.c == 0.0 or not self._any_free():
             return
-        x = self._k.x_linear if stage.linearised else m.state.x
+        x = self.contacts.x_linear if stage.linearised else m.state.x
         correct_rigid_motion(
-            m, w, self.pieces.work, self._k, x, rigid_balance.LINEARISED if stage.linearised else SOLVED, stage.beta
+            m, w, self.pieces.work, self.contacts, x, rigid_balance.LINEARISED if stage.linearised else SOLVED, stage.beta
         )
 
     def _any_free(self) -> bool:
@@ -385,7 +352,7 @@ class StageSystem:
         m, w = self.model, self.work
         if not self.keeps_volumes:
             return None
-        self.linear_solver.prepare(self)  # multigrid may have solved
+        self.linear_solver.prepare(self.stage.beta)  # multigrid may have solved
         step_with_volumes(m, self.matrix, self._volumes, w.base, w.pcg.y, w.x_hat, self.stage.beta)
         found = self.evaluate(STAY)
         if found[0] < acceptable:
@@ -394,10 +361,6 @@ class StageSystem:
         if self.multipliers is not None:
             self.multipliers.slope_change = 0.0  # the residual has the changed multipliers now
         return None
-
-    def extrapolate_multipliers(self, n_remembered: int) -> None:
-        """Extrapolate multipliers from the impulses and the last n_remembered updates; keep impulses and residual."""
-        friction.extrapolate_multipliers(self._k, n_remembered)
 
     def set_direction_to_rest(self) -> None:
         """Set y so that a full step leads to v = 0."""
@@ -428,20 +391,20 @@ class StageSystem:
 
     def linearise(self) -> None:
         """Make the elastic forces linear, by the current matrix."""
-        begin_linearised(self.model, self.work, self._k)
+        begin_linearised(self.model, self.work, self.contacts)
         self.kind = LINEARISED
 
     def advance(self, r_scale: float) -> float:
         """Move a linearised stage along y to zero slope, with R over the r-factors; return |r| there."""
         self.r_scale = r_scale
-        find_step_length(self.model, self.work, self.matrix, self._k, self.stage.beta, r_scale)
-        advance(self.model, self.work, self._k, self.stage.beta, r_scale)
+        find_step_length(self.model, self.work, self.matrix, self.contacts, self.stage.beta, r_scale)
+        advance(self.model, self.work, self.contacts, self.stage.beta, r_scale)
         return math.sqrt(self.model.state.scalars[NORMS])
 
     def update_multipliers(self, r_scale: float, to_impulses: bool) -> float:
         """Set R over the r-factors of a linearised stage, and the multipliers to the impulses if `to_impulses`; return |r|."""
         self.r_scale = r_scale
-        update_multipliers(self.model, self.work, self._k, int(to_impulses), self.stage.beta, r_scale)
+        update_multipliers(self.model, self.work, self.contacts, int(to_impulses), self.stage.beta, r_scale)
         return math.sqrt(self.model.state.scalars[NORMS])
 
     @property
@@ -455,16 +418,16 @@ class StageSystem:
         tolerance: of the laws' residual; stalled: whether iterations failed. Returns (iterations, converged, |r|); raises
         numpy.linalg.LinAlgError as `DirectSolver.prepare`.
         """
-        if self._direct is None or not (stalled or self._direct.is_rigid) or not self._direct.prepare(self._k):
+        if self._direct is None or not (stalled or self._direct.is_rigid) or not self._direct.prepare(self.contacts):
             return None
-        return self._direct.solve(self._k, self.stage.beta, tolerance, max(tolerance, self.contact_residual))
+        return self._direct.solve(self.contacts, self.stage.beta, tolerance, max(tolerance, self.contact_residual))
 
     def end_linearised(self, accept: bool = True, new_multipliers: int = TO_IMPULSES) -> tuple[float, float]:
         """Restore nonlinear elastic forces; return (|r|, scale). y is then the velocity change since linearisation, base its x.
 
         accept: keep the new state, with multipliers from its impulses; otherwise restore state and multipliers of that time.
         """
-        end_linearised(self.model, self.work, self._k, int(accept), self.stage.beta)
+        end_linearised(self.model, self.work, self.contacts, int(accept), self.stage.beta)
         self.kind = ELASTIC_STAGE
         return self.evaluate(AGAIN, float(accept), new_multipliers)
 
@@ -483,12 +446,14 @@ class StageSystem:
         subset = self.work.pcg.subset
         self.form(subset, projected, self.stage.c, self.stage.beta)
         self._same_matrix = False
-        if self._k.any:
-            save_diagonal(self.model, self.matrix, self._k, subset)
+        if self.contacts.any:
+            save_diagonal(self.model, self.matrix, self.contacts, subset)
 
     def form(self, subset: Subset, projected: bool, c: float, beta: float) -> None:
         """Form the matrix of c and beta at the present positions, for the rows of a subset."""
-        self.n_formed += 1
+        self.linear_solver.matrix_changed()
+        if self._direct is not None:
+            self._direct.matrix_changed()
         block_csr.assemble(self.model, self.matrix, subset, projected)
         if self.multipliers is not None:
             self.multipliers.upload(self.multipliers.values)
@@ -499,34 +464,27 @@ class StageSystem:
     def form_matrix_and_factors(self, projected: bool = False) -> None:
         """Form the matrix and the contacts' r-factors, which stay fixed during the stage."""
         self.form_matrix(projected)
-        find_factors(self._k.problem)
+        find_factors(self.contacts.problem)
         if self._direct is not None and self._direct.is_rigid:
             with contextlib.suppress(np.linalg.LinAlgError):  # the solve will project the matrix
-                self._direct.set_factors(self._k)
-
-    def direction(self, tolerance: float) -> LinearResult:
-        """Solve for y of pcg from -r."""
-        restricted = self.work.pcg.subset.restricted
-        if self.multipliers is not None and self.multipliers.penalised and not restricted:
-            return self.multipliers.direction(self, tolerance)
-        return self.solve_linear(tolerance)
+                self._direct.set_factors(self.contacts)
 
     def solve_linear(self, tolerance: float) -> LinearResult:
         """Solve for y of pcg from its right side."""
         w = self.work
-        if not self._k.any and not w.pcg.subset.restricted:
-            return self._solve_equalised(tolerance) if self.pieces.several else self.linear_solver.solve(self, tolerance)
+        if not self.contacts.any and not w.pcg.subset.restricted:
+            return self._solve_equalised(tolerance) if self.pieces.several else self.linear_solver.solve(self.stage, tolerance)
         if self.pieces.several and w.pcg.subset.restricted:
             self.pieces.forget_factors()
-        solution = self.linear_solver.solve_with(self, tolerance, self._k.coupling, self._same_matrix, self._may_share)
+        solution = self.linear_solver.solve_with(w.pcg, tolerance, self.contacts.coupling, self._same_matrix, self._may_share)
         self._same_matrix = True
         return solution
 
     def _solve_equalised(self, tolerance: float) -> LinearResult:
         """Solve with all components in equal norms; those whose residual is far below the tolerance count less."""
         m, w, p = self.model, self.work.pcg, self.pieces.work
-        equalise(m, self.matrix, w, p, (NEARLY * self.stage.tolerance) ** 2)
-        solution = self.linear_solver.solve(self, tolerance)
+        equalise(m, self.matrix, w, p, (self.NEARLY * self.stage.tolerance) ** 2)
+        solution = self.linear_solver.solve(self.stage, tolerance)
         undo_factors(m, w, p)
         return solution
 

@@ -18,8 +18,8 @@ from taisoft.dynamics import contact_newton, implicit
 from taisoft.dynamics.dynamics import Dynamics
 from taisoft.dynamics.elimination import CONCENTRATED, FEW, choose_nodes, eliminate
 from taisoft.dynamics.schemes import SCHEMES
-from taisoft.dynamics.stage import STAY
-from taisoft.dynamics.stage_system import Stage, StageSystem
+from taisoft.dynamics.stage import STAY, Stage
+from taisoft.dynamics.stage_system import StageSystem
 from taisoft.linear import gauss_seidel
 from tests.collision.rotations import rotation
 from tests.dynamics.contact_scenes import FRICTION, ground, material
