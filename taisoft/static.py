@@ -1,14 +1,13 @@
 """Static equilibrium: Newton's method on the elastic forces, with load steps if the full load fails in one step."""
 
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 
 from taisoft.backend.arrays import FieldArena, upload
 from taisoft.backend.runtime import Runtime, open_kind, open_runtime
 from taisoft.display import short_repr
-from taisoft.dynamics.contact_newton import solve, solve_with_multipliers
+from taisoft.dynamics.contact_newton import correct_multipliers, solve
 from taisoft.dynamics.dirichlet import DirichletConditions
 from taisoft.dynamics.imbalance import describe_imbalance
 from taisoft.dynamics.multipliers import Multipliers
@@ -207,9 +206,9 @@ class StaticSolver:
             start += [(w.targets, rest + fraction * (self.target - rest)), (w.prescribed_axes, axes)]
         upload(start)
         if self.multipliers is not None:
-            self.multipliers.begin(self.time, fraction)
+            self.multipliers.begin(self.time, m.on_cpu, fraction)
         stage = Stage(0.0, 1.0, 1.0, tolerance, max_newton=max_newton)
-        result = solve_with_multipliers(self.solver, stage, partial(solve, self.solver, stage))
+        result = correct_multipliers(self.solver, stage, solve(self.solver, stage))
         self.newton += result.newton_iterations
         self.linear += result.linear_iterations
         self.multigrid += result.multigrid_solves

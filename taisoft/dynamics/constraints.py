@@ -15,16 +15,13 @@ MAX_TOLERANCE = 3e-2  # of the linear solves for z without contacts, which the s
 SLOPE_TOLERANCE = 1e-3  # of those with contacts
 
 
-def direction(system: StageSystem, tolerance: float) -> LinearResult:
-    """Solve for y of pcg from -r; with multipliers that are penalised, solve the bordered system, and change them.
+def solve_constrained(system: StageSystem, tolerance: float) -> LinearResult:
+    """Solve the bordered system for y of pcg from -r, and change the multipliers.
 
-    Where that is singular, or A indefinite even when projected, y is y_0 and they stay; where A is not finite, y is 0.
+    Where it is singular, or A indefinite even when projected, y is y_0 and they stay; where A is not finite, y is 0.
     """
-    multipliers = system.multipliers
-    if multipliers is None or not multipliers.penalised or system.work.pcg.subset.restricted:
-        return system.solve_linear(tolerance)
-    multipliers.slope_change = 0.0
-    if not len(multipliers.candidates):
+    system.multipliers.slope_change = 0.0
+    if not len(system.multipliers.candidates):
         return system.solve_linear(tolerance)
     solution = _solve_bordered(system, tolerance)
     if not solution.negative:

@@ -10,10 +10,7 @@ A stage without progress ends early: a shorter substep costs less.
 """
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
-
-import numpy as np
 
 from taisoft.dynamics.constraints import correct
 from taisoft.dynamics.contact_terms import OF_IMPULSES, TO_IMPULSES
@@ -27,33 +24,6 @@ from taisoft.fem.dependents import place_dependents
 
 LINEARISED_SOLVES, LINEARISED_FORCING = 400, 0.1  # maximum linear solves of a linearised stage, and their tolerance
 MAX_CORRECTIONS = 20  # of the multipliers of given volumes and lengths, with contacts
-
-
-def solve_linear(system: StageSystem, problem: Stage, r: float, stalled: bool = False) -> FrictionalResult:
-    """Solve a linearised stage from |r|: directly where that applies, else by iterations; directly, too, if these fail.
-
-    stalled: iterations have failed on the stage's last problem.
-    """
-    found = _solve_directly(system, problem, r, stalled)
-    if found is None:
-        found = Friction.solve(system, problem, r)
-        if not (found.converged or found.negative or stalled):
-            direct = _solve_directly(system, problem, r, stalled=True)
-            if direct is not None:
-                found = replace(direct, solves=found.solves + 1, linear=found.linear, multipliers=found.multipliers)
-    return found
-
-
-def _solve_directly(system: StageSystem, problem: Stage, r: float, stalled: bool) -> FrictionalResult | None:
-    """Return the result of a direct solve, None if that does not apply."""
-    try:
-        found = system.solve_directly(problem.contact_tolerance, stalled)
-    except np.linalg.LinAlgError:
-        return FrictionalResult(1, 0, 0, True, False, r)
-    if found is None:
-        return None
-    iterations, converged, r = found
-    return FrictionalResult(1, 0, iterations, False, converged, r, direct=True)
 
 
 class ContactNewton:
@@ -101,6 +71,11 @@ class ContactNewton:
             previous, law_residual = self.r, system.contact_residual
             only_laws_remain = self._is_balanced
             result, moved = self._solve_contacts(), False
+            if result.negative:  # the frictional problem has no minimum
+                self.r, self.scale = system.end_linearised(accept=False)
+                system.form_matrix(projected=True)
+                self._count()
+                result = self._solve_contacts()
             self._count()
             if not result.negative:
                 # the laws hold less well than forces are balanced; keeping the impulses separates the two
@@ -119,14 +94,18 @@ class ContactNewton:
             # if redundant contacts exchange impulses slowly, only plain multipliers and a large R make progress
             stalled += self.r > self.STALLED * lowest
             self.stalls = stalled >= 2
-            if moved and self.r > Newton.ELIMINATION_RATIO * previous and not self._has_converged():
-                self._eliminate()
+            is_slow = moved and self.r > Newton.ELIMINATION_RATIO * previous and not (self._has_converged() or self._is_balanced)
+            if is_slow and (found := eliminate(system, stage, self.r)) is not None:
+                self.eliminated, self.linear = self.eliminated + found.newton, self.linear + found.linear
+                self.r, self.scale = system.evaluate(None, new_multipliers=TO_IMPULSES)
             n_slow = 0 if self._is_balanced or self.r < Newton.DECREASE * lowest else n_slow + 1
             lowest = min(lowest, self.r)
             self.rounding = self.r <= Friction.ROUNDING * self.system.floor and self.r > 0.5 * previous and self.tight
             if not moved or n_slow >= self.MAX_SLOW:
                 break
-        converged = converged or (self._has_converged() and math.isfinite(self.r) and system.balances_pieces())
+        return self._result(converged or (self._has_converged() and math.isfinite(self.r) and system.balances_pieces()))
+
+    def _result(self, converged: bool) -> StageResult:
         return StageResult(
             self.newton + self.eliminated,
             round(self.linear),
@@ -134,8 +113,8 @@ class ContactNewton:
             converged,
             self.rounding or self.r <= self.system.floor,
             self.multipliers,
-            system.contact_residual,
-            (0.0, "") if converged else system.least_balanced(),
+            self.system.contact_residual,
+            (0.0, "") if converged else self.system.least_balanced(),
         )
 
     def _count(self) -> None:
@@ -154,15 +133,6 @@ class ContactNewton:
         self.r, self.scale = system.evaluate(None, new_multipliers=TO_IMPULSES)
         return steps.newton > 0
 
-    def _eliminate(self) -> None:
-        """Solve the few nodes that dominate |r| after a slow step."""
-        if self._is_balanced:
-            return
-        found = eliminate(self.system, self.stage, self.r)
-        if found is not None:
-            self.eliminated, self.linear = self.eliminated + found.newton, self.linear + found.linear
-            self.r, self.scale = self.system.evaluate(None, new_multipliers=TO_IMPULSES)
-
     @property
     def _is_balanced(self) -> bool:
         """Whether |r| has converged, so that only the contact laws remain."""
@@ -174,16 +144,6 @@ class ContactNewton:
         return self.r <= self.system.floor and self.system.impulses_are_rounding()
 
     def _solve_contacts(self) -> "FrictionalResult":
-        """Solve the contact problem on the current matrix, or on a projected one if that is indefinite."""
-        result = self._solve_on_matrix()
-        if result.negative:
-            self.r, self.scale = self.system.end_linearised(accept=False)
-            self.system.form_matrix(projected=True)
-            self._count()
-            result = self._solve_on_matrix()
-        return result
-
-    def _solve_on_matrix(self) -> "FrictionalResult":
         """Solve the contact problem on the current matrix, to a fraction of the stage's residuals."""
         system, stage, laws_stalled = self.system, self.stage, self.first_r_scale > Stage.first_r_scale
         system.linearise()
@@ -208,7 +168,7 @@ class ContactNewton:
             first_r_scale=self.first_r_scale,
             max_r_scale=self.max_r_scale,
         )
-        result = solve_linear(system, problem, self._first_residual(), self.is_direct)
+        result = Friction.solve(system, problem, self._first_residual(), self.is_direct)
         self.is_direct = result.direct
         self.linear, self.multipliers = self.linear + result.linear, self.multipliers + result.multipliers
         if not (result.converged or result.negative):
@@ -260,13 +220,11 @@ def solve(system: StageSystem, stage: Stage) -> StageResult:
     return result
 
 
-def solve_with_multipliers(system: StageSystem, stage: Stage, solve_stage: Callable[[], StageResult]) -> StageResult:
-    """Solve a stage by a function, and again with other multipliers until volumes and lengths are those given."""
-    multipliers = system.multipliers
+def correct_multipliers(system: StageSystem, stage: Stage, result: StageResult) -> StageResult:
+    """Solve a stage that was solved again with other multipliers until volumes and lengths are those given, if any are."""
+    multipliers, discarded, linear = system.multipliers, [], 0
     if multipliers is None:
-        return solve_stage()
-    multipliers.penalised = system.contact.n_contacts == 0 and system.model.on_cpu
-    result, discarded, linear = solve_stage(), [], 0
+        return result
     while not multipliers.penalised and result.converged and not multipliers.hold and len(discarded) < MAX_CORRECTIONS:
         iterations, corrected = correct(system)
         linear += iterations
@@ -288,7 +246,7 @@ def solve_linearised(system: StageSystem, stage: Stage) -> StageResult:
     for projected in (False, True):
         system.linearise()
         solves = min(LINEARISED_SOLVES, system.budget.left)
-        found = solve_linear(system, replace(stage, max_newton=solves, linear_tolerance=tolerance), r)
+        found = Friction.solve(system, replace(stage, max_newton=solves, linear_tolerance=tolerance), r)
         linear += found.linear
         system.budget.spend(found.solves)
         if not found.negative or projected:

@@ -52,21 +52,21 @@ def choose_nodes(residual: np.ndarray, start: np.ndarray, column: np.ndarray) ->
     return nodes
 
 
-def eliminate(system: StageSystem, stage: Stage, r: float) -> Eliminated | None:
-    """Solve a stage on the few nodes with nearly all of |r|, see `solve_on`; None if they are many or nodes depend on others."""
-    if system.model.has_dependents:  # whose tets act on nodes that may not be among the few
-        return None
-    residual, free = download([system.work.residual, system.model.free])
-    lists = system.lists
-    nodes = choose_nodes(free * residual * system.pieces.node_weights()[:, None], lists.start, lists.column)
-    return None if nodes is None else solve_on(system, stage, nodes, REDUCTION * r)
+def eliminate(system: StageSystem, stage: Stage, r: float, nodes: np.ndarray | None = None) -> Eliminated | None:
+    """Solve a stage on the few nodes with nearly all of |r|, under the current multipliers, until their |r| is a tenth of that.
 
-
-def solve_on(system: StageSystem, stage: Stage, nodes: np.ndarray, target: float) -> Eliminated:
-    """Solve a stage on some nodes, ascending, under the current multipliers, until their |r| is at most `target` [N s].
-
+    None if they are many or nodes depend on others. nodes: solve on these instead, ascending.
     This updates the state and the elastic forces; the residual must be evaluated again, and the matrix is invalid.
     """
+    if system.model.has_dependents:  # whose tets act on nodes that may not be among the few
+        return None
+    if nodes is None:
+        residual, free = download([system.work.residual, system.model.free])
+        lists = system.lists
+        nodes = choose_nodes(free * residual * system.pieces.node_weights()[:, None], lists.start, lists.column)
+    if nodes is None:
+        return None
+    target = REDUCTION * r
     system.restrict(nodes)
     fraction = len(nodes) / system.model.n_nodes
     steps = min(STEPS, int(system.budget.left / fraction))

@@ -22,8 +22,9 @@ stalls are never extrapolated: redundant contacts exchange impulses slowly there
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+import numpy as np
 import taichi as ti
 
 from taisoft.backend.runtime import kernel
@@ -64,11 +65,14 @@ class Friction:
     LAW_DECREASE = 0.8  # times the previous laws' residual: below it R stays
 
     @classmethod
-    def solve(cls, system: StageSystem, problem: Stage, r: float) -> FrictionalResult:
+    def solve(cls, system: StageSystem, problem: Stage, r: float, stalled: bool = False) -> FrictionalResult:
         """Solve from |r| by linear solves, each followed by the step to zero slope, and multiplier updates.
 
-        problem: with a linear_tolerance, and its other tolerances relative to the system's present scale.
+        Directly where that applies, and if these fail. problem: with a linear_tolerance, and its other tolerances relative to the
+        system's present scale; stalled: iterations have failed on the stage's last problem.
         """
+        if (found := cls._solve_directly(system, problem, r, stalled)) is not None:
+            return found
         if problem.first_r_scale != system.r_scale:
             r = system.update_multipliers(problem.first_r_scale, to_impulses=False)
         target, least_inner = problem.tolerance * system.scale, problem.inner_tolerance * system.scale
@@ -103,7 +107,22 @@ class Friction:
                     break
                 rounding = r <= cls.ROUNDING * system.floor and r > 0.5 * before
         system.r_scale = Stage.first_r_scale
+        if not (converged or negative or stalled):
+            if (found := cls._solve_directly(system, problem, r, stalled=True)) is not None:
+                return replace(found, solves=solves + 1, linear=linear, multipliers=multipliers)
         return FrictionalResult(solves, linear, multipliers, negative, converged, r, scale)
+
+    @staticmethod
+    def _solve_directly(system: StageSystem, problem: Stage, r: float, stalled: bool) -> FrictionalResult | None:
+        """Return the result of a direct solve, None if that does not apply."""
+        try:
+            found = system.solve_directly(problem.contact_tolerance, stalled)
+        except np.linalg.LinAlgError:
+            return FrictionalResult(1, 0, 0, True, False, r)
+        if found is None:
+            return None
+        iterations, converged, r = found
+        return FrictionalResult(1, 0, iterations, False, converged, r, direct=True)
 
     @classmethod
     def next_scale(

@@ -5,7 +5,6 @@ step's midpoint.
 """
 
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 import taichi as ti
@@ -13,8 +12,8 @@ import taichi as ti
 from taisoft.backend.arrays import download, upload
 from taisoft.backend.runtime import kernel
 from taisoft.dynamics.contact import TOLERANCE, ContactStep
-from taisoft.dynamics.contact_newton import solve, solve_with_multipliers
-from taisoft.dynamics.elimination import solve_on
+from taisoft.dynamics.contact_newton import correct_multipliers, solve
+from taisoft.dynamics.elimination import eliminate
 from taisoft.dynamics.friction import extrapolate_multipliers
 from taisoft.dynamics.imbalance import describe_imbalance
 from taisoft.dynamics.impact import solve_bouncing
@@ -325,7 +324,7 @@ class ImplicitStepper:
             upload(prescribed)
         simulation.set_load_time(time + (0.5 if scheme.midpoint else 1.0) * dt)
         if self._multipliers is not None:
-            self._multipliers.begin(time + dt)
+            self._multipliers.begin(time + dt, self.contact.n_contacts == 0 and m.on_cpu)
         self._beta = scheme.beta_over_dt * dt
         self.contact.set_impulse_fraction(scheme.beta_over_dt)
         self.solver.assemble_damper()
@@ -364,7 +363,9 @@ class ImplicitStepper:
 
     def _solve_balanced(self, scheme: Scheme, dt: float, bounces: bool) -> StageResult:
         """Solve the stage; a linearised one again, to a tighter tolerance, if the forces on a piece as a whole are unbalanced."""
-        result, pieces = self._solve(scheme, dt, bounces, self.tolerance), self.solver.pieces
+        stage, pieces = self._stage(scheme, dt, self.tolerance), self.solver.pieces
+        result = solve_bouncing(self.solver, stage) if bounces else solve(self.solver, stage)
+        result = correct_multipliers(self.solver, stage, result)
         if not (scheme.one_iteration and pieces.several and result.converged and np.isfinite(result.residual)):
             return result
         worst, name = self._unbalanced_mean()
@@ -372,7 +373,8 @@ class ImplicitStepper:
             self.restore_start()
             self._begin(scheme, 0.0)
             tighter = self.tolerance * Pieces.LIMIT / min(worst, 1.0) * TIGHTER
-            result = count_all(self._solve(scheme, dt, bounces, tighter), [result])
+            stage = replace(stage, tolerance=tighter)
+            result = count_all(correct_multipliers(self.solver, stage, solve(self.solver, stage)), [result])
             worst, name = self._unbalanced_mean()
         return replace(result, unbalanced=(worst, name)) if worst > Pieces.LIMIT else result
 
@@ -380,10 +382,9 @@ class ImplicitStepper:
         rounding = self.solver.rounding
         return self.solver.pieces.unbalanced_mean(self.solver.work, self._beta, rounding.eps, rounding.piece_mass)
 
-    def _solve(self, scheme: Scheme, dt: float, bounces: bool, tolerance: float) -> StageResult:
-        """Solve the stage. bounces: whether any contacts rebound."""
+    def _stage(self, scheme: Scheme, dt: float, tolerance: float) -> Stage:
         max_newton = MAX_NEWTON if self.contact.n_contacts == 0 else MAX_NEWTON_WITH_CONTACTS
-        stage = Stage(
+        return Stage(
             1.0,
             self._beta,
             dt,
@@ -395,13 +396,11 @@ class ImplicitStepper:
             # prescribed nodes change their velocity once a step, not twice within the midpoint's half step
             0.5 if scheme.midpoint else 1.0,
         )
-        return solve_with_multipliers(self.solver, stage, partial(solve_bouncing if bounces else solve, self.solver, stage))
 
     def compile_hard_steps(self) -> None:
         """Compile the kernels that only hard steps need, by running them on the current stage; its state is then invalid."""
         free = np.flatnonzero(self.simulation.model.free.to_numpy().any(axis=1))
-        if not self.simulation.model.has_dependents:
-            solve_on(self.solver, replace(self.solver.stage, tolerance=0.0), free[:1], 0.0)
+        eliminate(self.solver, replace(self.solver.stage, tolerance=0.0), 0.0, free[:1])
         self.solver.form_matrix(projected=True)
         self.solver.linear_residual()  # multiplies by the matrix, as multigrid does
         if self.solver.n_contacts:

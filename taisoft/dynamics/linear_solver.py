@@ -29,7 +29,6 @@ from taisoft.linear import gauss_seidel, pcg, volumes
 from taisoft.linear.banded import BandedPreconditioner
 from taisoft.linear.block_csr import BlockCsr
 from taisoft.linear.coarse_correction import CoarseCorrection
-from taisoft.linear.coupling import NO_COUPLING, Coupling
 from taisoft.linear.hierarchy import build_hierarchy, has_narrow_band
 from taisoft.linear.jacobi import JACOBI
 from taisoft.linear.pcg_work import LinearResult, PcgWork
@@ -121,12 +120,15 @@ class LinearSolver:
         """Solve for y of pcg from its rhs, in a stage without contacts, on all nodes, whose matrix is formed."""
         m, done = self.model, 0
         if not m.on_cpu:
-            return self.solve_with(self._work, tolerance)
+            return pcg.solve(m, self._matrix, JACOBI, self._work, tolerance, pcg.iteration_limit(m))
         if self._exact is None:
             self._exact = has_narrow_band(m, self._matrix)
         digits = max(-math.log10(tolerance), 1.0)
         if not self.active:
-            found = self._solve_alone(stage.beta, tolerance, digits)
+            worth = self.ITERATIONS * self._ratio
+            most = math.ceil(worth + self._build_cost - self.savings)
+            found = self._solve_plain(stage.beta, tolerance, min(most, pcg.iteration_limit(m)))
+            self._consider_multigrid(found, worth, most, digits)
             if not self.active:
                 return found
             done = found.iterations
@@ -142,27 +144,13 @@ class LinearSolver:
             found = self._solve_plain(stage.beta, tolerance, pcg.iteration_limit(m))
         return replace(found, iterations=done + found.iterations)
 
-    def solve_with(
-        self, work: PcgWork, tolerance: float, terms: Coupling = NO_COUPLING, same_matrix: bool = False, may_share: bool = True
-    ) -> LinearResult:
-        """Solve with the terms of contacts, or on a subset; see `gauss_seidel.solve`."""
-        m, A, limit = self.model, self._matrix, pcg.iteration_limit(self.model)
-        if m.on_cpu:
-            return gauss_seidel.solve(m, A, work, tolerance, limit, terms, same_matrix, may_share)
-        return pcg.solve(m, A, JACOBI, work, tolerance, limit, terms, same_matrix)
-
-    def _solve_alone(self, beta: float, tolerance: float, digits: float) -> LinearResult:
-        """Solve without multigrid, or stop where it has become worth building: it is then active."""
-        worth = self.ITERATIONS * self._ratio
-        most = math.ceil(worth + self._build_cost - self.savings)
-        limit = pcg.iteration_limit(self.model)
-        found = self._solve_plain(beta, tolerance, min(most, limit))
+    def _consider_multigrid(self, found: LinearResult, worth: float, most: int, digits: float) -> None:
+        """Activate multigrid after a solve without it that had to stop at `most` iterations; with it, it is worth `worth`."""
         self.savings = max(self.savings + found.iterations - worth, min(self.savings, 0.0))
         self.pcg_rate = found.iterations / digits
-        if most <= found.iterations < limit and not (found.converged or found.negative):
+        if most <= found.iterations < pcg.iteration_limit(self.model) and not (found.converged or found.negative):
             self.active, self.savings = True, 0.0
             self.pcg_rate *= self.UNFINISHED
-        return found
 
     def _solve_plain(self, beta: float, tolerance: float, most: int) -> LinearResult:
         """Solve with `volumes` or `gauss_seidel`."""

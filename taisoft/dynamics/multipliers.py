@@ -75,8 +75,12 @@ class Multipliers:
         """Values (k,) from which statics starts: tendons carry the weight, and so hold bodies across from the first step."""
         return np.where(self._is_tendon, self._weight / max(1, int(self._is_tendon.sum())), 0.0)
 
-    def begin(self, time: float, fraction: float = 1.0) -> None:
-        """Set volumes and lengths of a time [s], or a fraction of the way there from those at rest. Raises SimulationError."""
+    def begin(self, time: float, penalised: bool, fraction: float = 1.0) -> None:
+        """Set volumes and lengths of a time [s], or a fraction of the way there from those at rest. Raises SimulationError.
+
+        penalised: whether the stage's residual is that of p + k c, and p changes while it is solved.
+        """
+        self.penalised = penalised
         scene = self._simulation.scene
         tendons = {one.name: one for one in scene.tendons}
         present = [tendons[one.name] if isinstance(one, Tendon) else scene.cavity(one.name)[1] for one in self._owners]

@@ -19,9 +19,10 @@ on a steep descent is doubled. Nearly incompressible bodies with mean dilatation
 
 import math
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
-from taisoft.dynamics.constraints import direction
+from taisoft.dynamics.constraints import solve_constrained
 from taisoft.dynamics.contact_terms import KEEP, TO_IMPULSES
 from taisoft.dynamics.friction import PAST, Friction, extrapolate_multipliers
 from taisoft.dynamics.results import StageResult, relative
@@ -53,6 +54,8 @@ class Newton:
         """eliminate: as `elimination.eliminate`, called after slow steps; None: no elimination."""
         self.system, self.stage, self.eliminate = system, stage, eliminate
         self._counts = not system.work.pcg.subset.restricted  # in the step's budget; else the caller does
+        is_constrained = self._counts and system.multipliers is not None and system.multipliers.penalised
+        self._solve_linear = partial(solve_constrained, system) if is_constrained else system.solve_linear
         self.max_forcing = self.MAX_FORCING if stage.c > 0.0 else self.STATIC_FORCING
         self.newton = self.linear = self.multigrid = self.multipliers = self.n_remembered = 0
         self.eliminated = 0.0  # Newton iterations on few nodes, times their fraction of all nodes
@@ -148,7 +151,8 @@ class Newton:
     def _step(self) -> bool:
         """Solve for a direction and step along it; return whether the state moved."""
         system = self.system
-        solution = self._direction(self._linear_tolerance())
+        solution = self._solve_linear(self._linear_tolerance())
+        self._count_linear(solution)
         self.newton, self.n_inner = self.newton + 1, self.n_inner + 1
         if self._counts:
             system.budget.spend()
@@ -160,11 +164,8 @@ class Newton:
         self.rounding = near_floor and self.r > 0.5 * self.previous
         return moved
 
-    def _direction(self, tolerance: float) -> LinearResult:
-        """Solve for a direction and count the iterations."""
-        solution = direction(self.system, tolerance)
+    def _count_linear(self, solution: LinearResult) -> None:
         self.linear, self.multigrid = self.linear + solution.iterations, self.multigrid + solution.multigrid
-        return solution
 
     def _eliminate(self) -> bool:
         """Solve the few nodes that dominate |r| after a slow step; return whether there were any."""
@@ -228,7 +229,8 @@ class Newton:
             tolerance = self.stage.linear_tolerance or min(self._linear_tolerance(), self.stage.tolerance)
             for projected in (False, True):  # an indefinite quadratic form has no minimum
                 system.form_matrix(projected)
-                solution = self._direction(tolerance)
+                solution = self._solve_linear(tolerance)
+                self._count_linear(solution)
                 if not solution.negative:
                     break
             solved = solution.converged and system.linear_residual() <= self.LINEAR_LIMIT

@@ -66,8 +66,9 @@ from taisoft.dynamics.stage import (
 )
 from taisoft.fem.node_graph import EVERYTHING, Subset
 from taisoft.fem.state import END_SLOPE, N_NORMS, NORMS, START_SLOPE, STEP_LENGTH
-from taisoft.linear import block_csr
+from taisoft.linear import block_csr, gauss_seidel, pcg
 from taisoft.linear.block_csr import BlockCsr
+from taisoft.linear.jacobi import JACOBI
 from taisoft.linear.pcg_work import LinearResult, build_pcg
 from taisoft.linear.sweep_order import find_last
 from taisoft.linear.volumes import VolumeSystem, restore_volumes, save_volumes, step_with_volumes
@@ -470,22 +471,26 @@ class StageSystem:
                 self._direct.set_factors(self.contacts)
 
     def solve_linear(self, tolerance: float) -> LinearResult:
-        """Solve for y of pcg from its right side."""
-        w = self.work
-        if not self.contacts.any and not w.pcg.subset.restricted:
-            return self._solve_equalised(tolerance) if self.pieces.several else self.linear_solver.solve(self.stage, tolerance)
-        if self.pieces.several and w.pcg.subset.restricted:
-            self.pieces.forget_factors()
-        solution = self.linear_solver.solve_with(w.pcg, tolerance, self.contacts.coupling, self._same_matrix, self._may_share)
-        self._same_matrix = True
-        return solution
+        """Solve for y of pcg from its right side.
 
-    def _solve_equalised(self, tolerance: float) -> LinearResult:
-        """Solve with all components in equal norms; those whose residual is far below the tolerance count less."""
-        m, w, p = self.model, self.work.pcg, self.pieces.work
-        equalise(m, self.matrix, w, p, (self.NEARLY * self.stage.tolerance) ** 2)
-        solution = self.linear_solver.solve(self.stage, tolerance)
-        undo_factors(m, w, p)
+        Without contacts all components are solved in equal norms; those whose residual is far below the tolerance count less.
+        """
+        m, work, pieces = self.model, self.work.pcg, self.pieces
+        if not self.contacts.any and not work.subset.restricted:
+            if pieces.several:
+                equalise(m, self.matrix, work, pieces.work, (self.NEARLY * self.stage.tolerance) ** 2)
+            solution = self.linear_solver.solve(self.stage, tolerance)
+            if pieces.several:
+                undo_factors(m, work, pieces.work)
+            return solution
+        if pieces.several and work.subset.restricted:
+            pieces.forget_factors()
+        terms, same, limit = self.contacts.coupling, self._same_matrix, pcg.iteration_limit(m)
+        if m.on_cpu:
+            solution = gauss_seidel.solve(m, self.matrix, work, tolerance, limit, terms, same, self._may_share)
+        else:
+            solution = pcg.solve(m, self.matrix, JACOBI, work, tolerance, limit, terms, same)
+        self._same_matrix = True
         return solution
 
     # --- other queries ---------------------------------------------------------------------------------------------

@@ -55,7 +55,9 @@ class CoarseCorrection:
         preconditioner from being positive definite, the solve ends without convergence.
         """
         self._iterate(model, A, work, tolerance, stiffness, begin=True)
-        return work.run(lambda left: self._iterate(model, A, work, tolerance, stiffness, begin=False), max_iterations)
+        while (result := work.result(max_iterations)) is None:
+            self._iterate(model, A, work, tolerance, stiffness, begin=False)
+        return result
 
     def _iterate(self, model: Model, A: BlockCsr, work: PcgWork, tolerance: float, stiffness: float, begin: bool) -> None:
         cycle = self.cycle

@@ -26,6 +26,7 @@ from taisoft.fem.state import OTHER_SUM, SUM
 from taisoft.linear.block_csr import BlockCsr, block_times
 from taisoft.linear.coupling import NO_COUPLING, Coupling, add_products, clear_products, gather_products
 from taisoft.linear.pcg_work import (
+    COUNT,
     RUNNING,
     STATUS,
     STEP,
@@ -72,12 +73,18 @@ def solve(
     same_matrix: whether A and the nodes of the terms are those of the last solve; rows without terms then keep their
     preconditioner. may_share: whether several threads may share the sweeps; the result is the same.
     """
+    shared = may_share and not model.serial and work.is_shared(terms) and work.n_chunks >= SHARED_FROM
     most = max(1, SERIAL_WORK // (2 * A.n_edges + model.n_nodes))
-    if may_share and not model.serial and work.is_shared(terms) and work.n_chunks >= SHARED_FROM:
+    if shared:
         start_shared(model, A, terms, work, tolerance, int(same_matrix))
-        return work.run(lambda left: iterate_shared(model, A, terms, work, tolerance), max_iterations)
-    run_alone(model, A, terms, work, min(most, max_iterations), tolerance, 1 + same_matrix)
-    return work.run(lambda left: run_alone(model, A, terms, work, min(most, left), tolerance, 0), max_iterations)
+    else:
+        run_alone(model, A, terms, work, most, max_iterations, tolerance, 1 + same_matrix)
+    while (result := work.result(max_iterations)) is None:
+        if shared:
+            iterate_shared(model, A, terms, work, tolerance)
+        else:
+            run_alone(model, A, terms, work, most, max_iterations, tolerance, 0)
+    return result
 
 
 @kernel
@@ -99,15 +106,25 @@ def iterate_shared(model: ti.template(), A: ti.template(), terms: ti.template(),
 
 @kernel
 def run_alone(
-    model: ti.template(), A: ti.template(), terms: ti.template(), work: ti.template(), n: ti.i32, tolerance: ti.f64, begin: ti.i32
+    model: ti.template(),
+    A: ti.template(),
+    terms: ti.template(),
+    work: ti.template(),
+    n: ti.i32,
+    end: ti.i32,
+    tolerance: ti.f64,
+    begin: ti.i32,
 ):
-    """Run up to n iterations on one thread. begin: 0 to go on, 1 to start from y = 0, 2 to start with the last solve's matrix."""
+    """Run up to n iterations on one thread, `end` since the start.
+
+    begin: 0 to go on, 1 to start from y = 0, 2 to start with the last solve's matrix.
+    """
     ti.loop_config(serialize=True)
     for _ in range(1):
         if begin > 0:
             start(model, A, terms, work, tolerance, begin - 1, False)
         count = 0
-        while count < n and work.state[STATUS] == RUNNING:
+        while count < n and work.state[STATUS] == RUNNING and work.state[COUNT] < end:
             take_step(model, A, terms, work, False)
             end_iteration(work, tolerance, sum_of_chunks(model, work, OTHER_SUM))
             count += 1

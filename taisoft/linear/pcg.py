@@ -75,12 +75,14 @@ def solve(
 ) -> LinearResult:
     """Solve for work.y given work.rhs. tolerance: of sqrt(r.z); terms, same_matrix: see `gauss_seidel.solve`."""
 
-    def run(left: int) -> None:
-        for _ in range(1 if model.on_cpu else min(BATCH, left)):
-            iterate(model, A, preconditioner, terms, border, work, tolerance)
-
+    left = max_iterations
     start(model, A, preconditioner, terms, work, tolerance, int(same_matrix))
-    return work.run(run, max_iterations)
+    while (result := work.result(max_iterations)) is None:
+        n = 1 if model.on_cpu else min(BATCH, left)
+        for _ in range(n):
+            iterate(model, A, preconditioner, terms, border, work, tolerance)
+        left -= n
+    return result
 
 
 @kernel

@@ -6,7 +6,6 @@ a function with this gradient and second derivative. Vectors are in the model's 
 independent of threads.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -50,14 +49,13 @@ class PcgWork:
         """Whether Gauss-Seidel passes the system's nodes chunk by chunk."""
         return self.divided and not self.subset.restricted
 
-    def run(self, iterate: Callable[[int], None], max_iterations: int) -> "LinearResult":
-        """Run a solve that has begun. iterate: a function of the iterations left that runs one of them at least."""
-        while True:
-            state = self.state.to_numpy()
-            count, status = int(state[COUNT]), int(state[STATUS])
-            if status != RUNNING or count >= max_iterations:
-                return LinearResult(count, status == CONVERGED, status in (NEGATIVE, NEGATIVE_PENDING))
-            iterate(max_iterations - count)
+    def result(self, max_iterations: int) -> "LinearResult | None":
+        """The outcome of a solve; None if it must go on."""
+        state = self.state.to_numpy()
+        count, status = int(state[COUNT]), int(state[STATUS])
+        if status == RUNNING and count < max_iterations:
+            return None
+        return LinearResult(count, status == CONVERGED, status in (NEGATIVE, NEGATIVE_PENDING))
 
     def is_shared(self, coupling: Coupling) -> bool:
         """Whether several threads may share the chunks of one parity."""

@@ -12,7 +12,7 @@ import taisoft as ts
 from taisoft.backend.runtime import n_compiled
 from taisoft.cli import main, warm
 from taisoft.cli.scene_file import shipped_files
-from taisoft.dynamics.elimination import solve_on
+from taisoft.dynamics.elimination import eliminate
 from tests.dynamics.scenes import dynamics
 
 
@@ -33,7 +33,7 @@ def test_scenes_of_other_sizes_compile_nothing():
     with dynamics(scene, dt=2e-3, integrator="implicit_euler") as made:
         made.advance(1)
         solver, x = made.stepper.solver, made.state.state()[0]
-        solved = solve_on(solver, replace(solver.stage, tolerance=0.0), np.arange(20, 40), 0.0)  # as hard steps do
+        solved = eliminate(solver, replace(solver.stage, tolerance=0.0), 0.0, np.arange(20, 40))  # as hard steps do
         assert solved.linear > 0.0 and not np.array_equal(made.state.state()[0], x) and n_compiled() == before
 
 
