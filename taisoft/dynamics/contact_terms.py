@@ -74,8 +74,8 @@ NO_CONTACTS = StageContacts(None, None, NO_COUPLING, *[None] * 4)
 
 @kernel
 def begin_contacts(
-    s: ti.template(),
-    k: ti.template(),
+    stage: ti.template(),
+    contacts: ti.template(),
     impact: ti.template(),
     beta: ti.f64,
     dt: ti.f64,
@@ -90,82 +90,84 @@ def begin_contacts(
     impact: whether the contacts' velocity must be `min_velocity`, regardless of gaps. common_offset to max_speed: as of
     `gap_minus_target`. tolerance: of the laws' residual.
     """
-    p, w = ti.static((k.problem, k.work))
-    ti.loop_config(serialize=p.serial)
-    for c in range(p.count[0]):
-        offset = -(beta / dt) * p.obstacle_displacement[c]
+    rows, work = ti.static((contacts.problem, contacts.work))
+    ti.loop_config(serialize=rows.serial)
+    for c in range(rows.count[0]):
+        offset = -(beta / dt) * rows.obstacle_displacement[c]
         if ti.static(not impact):  # in an impact x_hat is x_start
-            for j in range(p.arity[c]):
-                i = p.node[c, j]
-                offset += p.weight[c, j] * (k.x_start[i] - s.x_hat[i])
-        w.tangential_offset[c] = offset
-        w.rounding[c] = ti.cast(ROUNDING, ti.f64) * ti.abs(p.point[c]).max() / (beta * tolerance)
+            for j in range(rows.arity[c]):
+                i = rows.node[c, j]
+                offset += rows.weight[c, j] * (contacts.x_start[i] - stage.x_hat[i])
+        work.tangential_offset[c] = offset
+        work.rounding[c] = ti.cast(ROUNDING, ti.f64) * ti.abs(rows.point[c]).max() / (beta * tolerance)
         if ti.static(impact):
-            w.gap_minus_target[c] = -beta * p.min_velocity[c] - (beta / dt) * p.normal[c].dot(p.obstacle_displacement[c])
-            w.gap_weight[c] = 0.0
-        else:
-            opening, least = p.min_opening[c], ti.cast(LEAST_GAP, ti.f64)
-            gap_to_target = gap_minus_target(
-                p, c, dt, common_offset, penetration_fraction, offset_fraction, max_speed, opening, least
+            work.gap_minus_target[c] = -beta * rows.min_velocity[c] - (beta / dt) * rows.normal[c].dot(
+                rows.obstacle_displacement[c]
             )
-            w.gap_minus_target[c] = gap_to_target - p.normal[c].dot(p.obstacle_displacement[c])
-            wanted = contact_offset_of(p, c, common_offset)
-            target = p.gap[c] - gap_to_target
-            w.gap_weight[c] = 0.0
+            work.gap_weight[c] = 0.0
+        else:
+            opening, least = rows.min_opening[c], ti.cast(LEAST_GAP, ti.f64)
+            gap_to_target = gap_minus_target(
+                rows, c, dt, common_offset, penetration_fraction, offset_fraction, max_speed, opening, least
+            )
+            work.gap_minus_target[c] = gap_to_target - rows.normal[c].dot(rows.obstacle_displacement[c])
+            wanted = contact_offset_of(rows, c, common_offset)
+            target = rows.gap[c] - gap_to_target
+            work.gap_weight[c] = 0.0
             if target > 0.0:
-                w.gap_weight[c] = tolerance / (MAX_MISSED * ti.min(ti.max(target, ti.cast(MIN_KEPT, ti.f64) * wanted), wanted))
+                work.gap_weight[c] = tolerance / (MAX_MISSED * ti.min(ti.max(target, ti.cast(MIN_KEPT, ti.f64) * wanted), wanted))
 
 
 @ti.func
-def set_multiplier(k: ti.template(), c):
+def set_multiplier(contacts: ti.template(), c):
     """Set the multiplier of contact c to its impulse, and the friction disk accordingly."""
-    k.work.multiplier[c] = k.problem.r[c]
-    open_disk(k, c)
+    contacts.work.multiplier[c] = contacts.problem.r[c]
+    open_disk(contacts, c)
 
 
 @ti.func
-def open_disk(k: ti.template(), c):
+def open_disk(contacts: ti.template(), c):
     """Set the friction disk's radius from the multiplier of contact c."""
-    k.work.radius[c] = k.problem.friction[c] * k.work.multiplier[c][0]
+    contacts.work.radius[c] = contacts.problem.friction[c] * contacts.work.multiplier[c][0]
 
 
 @ti.func
-def stage_velocity_of(k: ti.template(), c, beta):
+def stage_velocity_of(contacts: ti.template(), c, beta):
     """Return u of contact c at the present x: (normal, t1, t2) [m/s]."""
-    p, w = ti.static((k.problem, k.work))
+    rows, work = ti.static((contacts.problem, contacts.work))
     displacement = dvec(0.0)
-    for j in range(p.arity[c]):
-        displacement += p.weight[c, j] * k.displacement[p.node[c, j]]
-    n, t, v = p.normal[c], p.tangent[c], displacement + w.tangential_offset[c]
-    return dvec(w.gap_minus_target[c] + n.dot(displacement), t.dot(v), n.cross(t).dot(v)) / beta
+    for j in range(rows.arity[c]):
+        displacement += rows.weight[c, j] * contacts.displacement[rows.node[c, j]]
+    n, t, v = rows.normal[c], rows.tangent[c], displacement + work.tangential_offset[c]
+    return dvec(work.gap_minus_target[c] + n.dot(displacement), t.dot(v), n.cross(t).dot(v)) / beta
 
 
 @ti.func
-def unprojected_impulse(k: ti.template(), c, u, r_scale):
+def unprojected_impulse(contacts: ti.template(), c, u, r_scale):
     """Return z = lambda - R u of contact c."""
-    R = r_scale * k.problem.factor[c]
-    return k.work.multiplier[c] - dvec(R[0] * u[0], R[1] * u[1], R[1] * u[2])
+    R = r_scale * contacts.problem.factor[c]
+    return contacts.work.multiplier[c] - dvec(R[0] * u[0], R[1] * u[1], R[1] * u[2])
 
 
 @ti.func
-def projected_impulse(k: ti.template(), c, z):
+def projected_impulse(contacts: ti.template(), c, z):
     """Return p = prox(z) with the friction disk fixed; 0 if no node of the contact can move."""
-    p = into_disk(dvec(ti.max(z[0], 0.0), z[1], z[2]), k.work.radius[c])
-    if k.problem.factor[c][0] == 0.0:
+    p = into_disk(dvec(ti.max(z[0], 0.0), z[1], z[2]), contacts.work.radius[c])
+    if contacts.problem.factor[c][0] == 0.0:
         p = dvec(0.0)
     return p
 
 
 @ti.func
-def update_contact(m: ti.template(), k: ti.template(), c, beta, r_scale):
+def update_contact(m: ti.template(), contacts: ti.template(), c, beta, r_scale):
     """Compute the impulse p.r of contact c at the present x, its matrix block, and its part of the laws' residual."""
-    p, w = ti.static((k.problem, k.work))
-    u = stage_velocity_of(k, c, beta)
-    Rn, Rt = r_scale * p.factor[c][0], r_scale * p.factor[c][1]
-    z, rho = unprojected_impulse(k, c, u, r_scale), w.radius[c]
+    rows, work = ti.static((contacts.problem, contacts.work))
+    u = stage_velocity_of(contacts, c, beta)
+    Rn, Rt = r_scale * rows.factor[c][0], r_scale * rows.factor[c][1]
+    z, rho = unprojected_impulse(contacts, c, u, r_scale), work.radius[c]
     size = ti.sqrt(z[1] * z[1] + z[2] * z[2])
-    r = projected_impulse(k, c, z)
-    p.r[c] = r
+    r = projected_impulse(contacts, c, z)
+    rows.r[c] = r
     # D in the contact frame, then in world axes
     Dn = ti.select(z[0] > 0.0, Rn, 0.0)
     D_along, D_across = Rt, Rt  # along z_t, and perpendicular to it
@@ -173,101 +175,103 @@ def update_contact(m: ti.template(), k: ti.template(), c, beta, r_scale):
         D_along, D_across = 0.0 * Rt, 0.0 * Rt
         if size > 0.0:
             D_across = Rt * rho / size
-    n, t1 = p.normal[c], p.tangent[c]
+    n, t1 = rows.normal[c], rows.tangent[c]
     t2 = n.cross(t1)
-    w.world_impulse[c] = r[0] * n + r[1] * t1 + r[2] * t2
+    work.world_impulse[c] = r[0] * n + r[1] * t1 + r[2] * t2
     e = t1
     if size > 0.0:
         e = (z[1] * t1 + z[2] * t2) / size
     g = n.cross(e)
     for i in ti.static(range(3)):
         for j in ti.static(range(3)):
-            w.block[c][4 * j + i] = ti.cast(Dn * n[i] * n[j] + D_along * e[i] * e[j] + D_across * g[i] * g[j], m.real)
-    w.active[c] = int(Dn > 0.0 or D_along > 0.0 or D_across > 0.0)
-    d = r - prox(r - scaled(p.factor[c], u), p.friction[c])
-    missed = ti.select(p.factor[c][0] > 0.0, -u[0] * beta * w.gap_weight[c], 0.0)  # only a node that can move can open a gap
-    within_rounding = p.factor[c][0] * w.rounding[c]  # an impulse that only this would change, as between bodies at rest
-    w.prox_residual[c] = dvec(d.dot(d), r.dot(r) + within_rounding * within_rounding, missed)
+            work.block[c][4 * j + i] = ti.cast(Dn * n[i] * n[j] + D_along * e[i] * e[j] + D_across * g[i] * g[j], m.real)
+    work.active[c] = int(Dn > 0.0 or D_along > 0.0 or D_across > 0.0)
+    d = r - prox(r - scaled(rows.factor[c], u), rows.friction[c])
+    missed = ti.select(
+        rows.factor[c][0] > 0.0, -u[0] * beta * work.gap_weight[c], 0.0
+    )  # only a node that can move can open a gap
+    within_rounding = rows.factor[c][0] * work.rounding[c]  # an impulse that only this would change, as between bodies at rest
+    work.prox_residual[c] = dvec(d.dot(d), r.dot(r) + within_rounding * within_rounding, missed)
 
 
 @ti.func
-def impulse_on_node(k: ti.template(), i):
+def impulse_on_node(contacts: ti.template(), i):
     """Return (J^T r) of node i [N s]; as `impulse_on`, but from impulses in world axes."""
-    p, w = ti.static((k.problem, k.work))
+    rows, work = ti.static((contacts.problem, contacts.work))
     d = dvec(0.0)
-    for e in range(p.entry_start[i], p.entry_start[i + 1]):
-        c, slot = p.entry[e] // p.width, p.entry[e] % p.width
-        d += p.weight[c, slot] * w.world_impulse[c]
+    for e in range(rows.entry_start[i], rows.entry_start[i + 1]):
+        c, slot = rows.entry[e] // rows.width, rows.entry[e] % rows.width
+        d += rows.weight[c, slot] * work.world_impulse[c]
     return d
 
 
 @ti.func
-def sum_residual(k: ti.template(), t, threads: ti.template()):
+def sum_residual(contacts: ti.template(), t, threads: ti.template()):
     """Compute the residual of the laws over all contacts, by all threads t of a block.
 
     It is relative to all impulses, so that a light contact beside heavy ones could let its gap close. The largest part of its
     target, or of the contact offset if that is less, by which a gap ends short is therefore a residual, too: MAX_MISSED
     corresponds to the tolerance. Impulses that only the rounding of positions causes, as between bodies at rest, are within it.
     """
-    p, w = ti.static((k.problem, k.work))
+    rows, work = ti.static((contacts.problem, contacts.work))
     sums, worst = ti.Vector([0.0, 0.0], ti.f64), ti.cast(0.0, ti.f64)
-    for j in range(share(t, p.count[0], threads)):
-        one = w.prox_residual[t + j * threads]
+    for j in range(share(t, rows.count[0], threads)):
+        one = work.prox_residual[t + j * threads]
         sums += ti.Vector([one[0], one[1]], ti.f64)
         worst = ti.max(worst, one[2])
     for j in ti.static(range(2)):
         sums[j] = block_total(sums[j], t, threads, False)
     worst = block_total(worst, t, threads, True)
     if t == 0:
-        p.state[RESIDUAL] = ti.max(residual_of(sums), worst)
+        rows.state[RESIDUAL] = ti.max(residual_of(sums), worst)
 
 
 @ti.func
-def find_residual(k: ti.template()):
+def find_residual(contacts: ti.template()):
     """`sum_residual` as a top-level loop of a kernel: on the CPU on one thread, on CUDA by those of a block."""
-    if ti.static(k.problem.on_cpu):
+    if ti.static(contacts.problem.on_cpu):
         ti.loop_config(serialize=True)
         for _ in range(1):
-            sum_residual(k, 0, 1)
+            sum_residual(contacts, 0, 1)
     else:
         ti.loop_config(block_dim=THREADS)
         for t in range(THREADS):
-            sum_residual(k, t, THREADS)
+            sum_residual(contacts, t, THREADS)
 
 
 @kernel
-def update_impulses(m: ti.template(), k: ti.template(), new_multipliers: ti.i32, beta: ti.f64, r_scale: ti.f64):
+def update_impulses(m: ti.template(), contacts: ti.template(), new_multipliers: ti.i32, beta: ti.f64, r_scale: ti.f64):
     """Compute impulses and matrix blocks of all contacts at the present x, and the residual of their laws.
 
     new_multipliers: KEEP; TO_IMPULSES: set multipliers to the impulses first, and the friction disks accordingly; OF_IMPULSES:
     set them so that these impulses result. r_scale: R over the r-factors.
     """
-    (p,) = ti.static((k.problem,))
-    ti.loop_config(serialize=p.serial)
-    for n in range(p.count[0]):
+    (rows,) = ti.static((contacts.problem,))
+    ti.loop_config(serialize=rows.serial)
+    for n in range(rows.count[0]):
         if new_multipliers != KEEP:
-            set_multiplier(k, n)
+            set_multiplier(contacts, n)
         if new_multipliers == OF_IMPULSES:
-            z = k.work.multiplier[n] + scaled(r_scale * p.factor[n], stage_velocity_of(k, n, beta))
-            if p.r[n][0] == 0.0:  # it is open: it must not push where the step is shortened
+            z = contacts.work.multiplier[n] + scaled(r_scale * rows.factor[n], stage_velocity_of(contacts, n, beta))
+            if rows.r[n][0] == 0.0:  # it is open: it must not push where the step is shortened
                 z = dvec(ti.min(z[0], 0.0), 0.0, 0.0)
-            k.work.multiplier[n] = z
-        update_contact(m, k, n, beta, r_scale)
-    find_residual(k)
+            contacts.work.multiplier[n] = z
+        update_contact(m, contacts, n, beta, r_scale)
+    find_residual(contacts)
 
 
 @kernel
-def save_diagonal(m: ti.template(), A: ti.template(), k: ti.template(), subset: ti.template()):
+def save_diagonal(m: ti.template(), A: ti.template(), contacts: ti.template(), subset: ti.template()):
     """Save the new matrix's diagonal without contacts, and diag(A)^-1, the inverse masses for the r-factors."""
-    (p,) = ti.static((k.problem,))
+    (rows,) = ti.static((contacts.problem,))
     ti.loop_config(serialize=m.serial)
     for j in range(n_nodes_of(m, subset)):
         i = node_of(subset, j)
-        k.coupling.base[i] = A.diagonal[i]
+        contacts.coupling.base[i] = A.diagonal[i]
         for a in ti.static(range(3)):
             # an entry can be negative if tets are strongly compressed
             d = ti.max(ti.abs(ti.cast(A.diagonal[i][5 * a], ti.f64)), ti.cast(m.mass[i], ti.f64))
-            p.inverse_mass[i][a] = ti.cast(m.free[i][a], ti.f64) / d
+            rows.inverse_mass[i][a] = ti.cast(m.free[i][a], ti.f64) / d
 
 
 def build_stage_contacts(

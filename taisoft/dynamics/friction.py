@@ -147,18 +147,18 @@ class Friction:
 
 
 @ti.func
-def _coefficients(k: ti.template(), n_remembered):
+def _coefficients(contacts: ti.template(), n_remembered):
     """Return the coefficients (t_1, t_2) of the last two changes."""
-    p, w = ti.static((k.problem, k.work))
+    rows, work = ti.static((contacts.problem, contacts.work))
     dot = ti.Vector([0.0, 0.0, 0.0, 0.0, 0.0], ti.f64)  # a.a, a.b, b.b, a.f, b.f
     if n_remembered > 0:
-        for c in range(p.count[0]):
-            f, last = p.r[c] - w.multiplier[c], w.past_change[PAST * c]
+        for c in range(rows.count[0]):
+            f, last = rows.r[c] - work.multiplier[c], work.past_change[PAST * c]
             a, b = f - last, dvec(0.0)
             if n_remembered > 1:
-                b = last - w.past_change[PAST * c + 1]
+                b = last - work.past_change[PAST * c + 1]
             for i in ti.static(range(3)):
-                factor = p.factor[c][ti.static(min(i, 1))]
+                factor = rows.factor[c][ti.static(min(i, 1))]
                 if factor > 0.0:
                     dot += ti.Vector([a[i] * a[i], a[i] * b[i], b[i] * b[i], a[i] * f[i], b[i] * f[i]]) / factor
     first, second = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64)
@@ -174,20 +174,20 @@ def _coefficients(k: ti.template(), n_remembered):
 
 
 @kernel
-def extrapolate_multipliers(k: ti.template(), n_remembered: ti.i32):
+def extrapolate_multipliers(contacts: ti.template(), n_remembered: ti.i32):
     """Set the multipliers to impulses extrapolated from the last n_remembered updates, 0 to PAST; store this one."""
-    p, w = ti.static((k.problem, k.work))
+    rows, work = ti.static((contacts.problem, contacts.work))
     ti.loop_config(serialize=True)
     for _ in range(1):
-        first, second = _coefficients(k, n_remembered)
-        for c in range(p.count[0]):
-            r, last, last_but_one = p.r[c], w.past_impulse[PAST * c], w.past_impulse[PAST * c + 1]
-            w.past_impulse[PAST * c], w.past_impulse[PAST * c + 1] = r, last
-            w.past_change[PAST * c], w.past_change[PAST * c + 1] = r - w.multiplier[c], w.past_change[PAST * c]
+        first, second = _coefficients(contacts, n_remembered)
+        for c in range(rows.count[0]):
+            r, last, last_but_one = rows.r[c], work.past_impulse[PAST * c], work.past_impulse[PAST * c + 1]
+            work.past_impulse[PAST * c], work.past_impulse[PAST * c + 1] = r, last
+            work.past_change[PAST * c], work.past_change[PAST * c + 1] = r - work.multiplier[c], work.past_change[PAST * c]
             if n_remembered > 0:
                 r -= first * (r - last)
             if n_remembered > 1:
                 r -= second * (last - last_but_one)
             r[0] = ti.max(r[0], 0.0)
-            w.multiplier[c] = r
-            open_disk(k, c)
+            work.multiplier[c] = r
+            open_disk(contacts, c)

@@ -44,24 +44,24 @@ TOLERANCE = 1e-3  # of the contact laws' residual in an impact; the step after i
 
 
 @kernel
-def begin_impact(m: ti.template(), s: ti.template(), k: ti.template(), tau: ti.f64):
+def begin_impact(m: ti.template(), stage: ti.template(), contacts: ti.template(), tau: ti.f64):
     """Begin the impact's stage at v_n without impulses, after the matrix was formed; save the last step's in `impact_impulse`.
 
     scalars: NORMS, as in `form_residual`; the scale is the momentum of all nodes at the largest speed change of a contact.
     """
-    (p,) = ti.static((k.problem,))
+    (rows,) = ti.static((contacts.problem,))
     ti.loop_config(serialize=m.serial)
     for i in range(m.n_nodes):
-        m.state.x[i] = k.x_start[i] + tau * s.v_hat[i]
-        s.x_hat[i] = k.x_start[i]
-        k.x_linear[i] = m.state.x[i]
+        m.state.x[i] = contacts.x_start[i] + tau * stage.v_hat[i]
+        stage.x_hat[i] = contacts.x_start[i]
+        contacts.x_linear[i] = m.state.x[i]
     ti.loop_config(serialize=True)
     for _ in range(1):
         speed, mass = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64)
-        for c in range(p.count[0]):
-            p.impact_impulse[c] = p.r[c]
-            p.r[c] = dvec(0.0)
-            speed = ti.max(speed, p.min_velocity[c] - p.approach[c])
+        for c in range(rows.count[0]):
+            rows.impact_impulse[c] = rows.r[c]
+            rows.r[c] = dvec(0.0)
+            speed = ti.max(speed, rows.min_velocity[c] - rows.approach[c])
         for i in range(m.n_nodes):
             mass += ti.cast(m.mass[i], ti.f64) ** 2
         for j in ti.static(range(N_NORMS)):
@@ -70,12 +70,12 @@ def begin_impact(m: ti.template(), s: ti.template(), k: ti.template(), tau: ti.f
 
 
 @kernel
-def measure_impact(m: ti.template(), s: ti.template(), k: ti.template(), tau: ti.f64):
-    """Store the jump in s.change. scalars: IMPACT_SLOPE, IMPACT_CURVATURE, of E(s)."""
-    (p,) = ti.static((k.problem,))
+def measure_impact(m: ti.template(), stage: ti.template(), contacts: ti.template(), tau: ti.f64):
+    """Store the jump in stage.change. scalars: IMPACT_SLOPE, IMPACT_CURVATURE, of E(s)."""
+    (rows,) = ti.static((contacts.problem,))
     ti.loop_config(serialize=m.serial)
     for i in range(m.n_nodes):
-        s.change[i] = (m.state.x[i] - k.x_linear[i]) / tau
+        stage.change[i] = (m.state.x[i] - contacts.x_linear[i]) / tau
     ti.loop_config(serialize=m.serial)
     for task in range(m.chunks * m.spread):
         if task % m.spread == 0:
@@ -83,71 +83,71 @@ def measure_impact(m: ti.template(), s: ti.template(), k: ti.template(), tau: ti
             slope, curvature = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64)
             for j in range(chunk_size(m, chunk, m.n_nodes)):
                 i = chunk_entry(m, chunk, j, m.n_nodes)
-                d = mass_times(m, i, s.change)
-                slope += d.dot(s.v_hat[i])
-                curvature += d.dot(s.change[i])
+                d = mass_times(m, i, stage.change)
+                slope += d.dot(stage.v_hat[i])
+                curvature += d.dot(stage.change[i])
             m.state.partial[chunk, SUM], m.state.partial[chunk, OTHER_SUM] = slope, curvature
     fold(m, SUM, OTHER_SUM, ())
     ti.loop_config(serialize=True)
     for _ in range(1):
         slope = total(m, SUM)
-        for c in range(p.count[0]):
-            u_fixed = -(SPREAD / tau) * p.obstacle_displacement[c]
-            for j in range(p.arity[c]):
-                i = p.node[c, j]
-                u_fixed += p.weight[c, j] * (1.0 - ti.cast(m.free[i], ti.f64)) * s.v_hat[i]
-            slope += to_world(p, c, p.r[c]).dot(u_fixed)
-            if p.min_opening[c] > 0.0:
-                slope -= 0.5 * p.r[c][0] * ti.max(0.0, p.min_velocity[c] + p.approach[c])
+        for c in range(rows.count[0]):
+            u_fixed = -(SPREAD / tau) * rows.obstacle_displacement[c]
+            for j in range(rows.arity[c]):
+                i = rows.node[c, j]
+                u_fixed += rows.weight[c, j] * (1.0 - ti.cast(m.free[i], ti.f64)) * stage.v_hat[i]
+            slope += to_world(rows, c, rows.r[c]).dot(u_fixed)
+            if rows.min_opening[c] > 0.0:
+                slope -= 0.5 * rows.r[c][0] * ti.max(0.0, rows.min_velocity[c] + rows.approach[c])
         m.state.scalars[IMPACT_SLOPE], m.state.scalars[IMPACT_CURVATURE] = slope, total(m, OTHER_SUM)
 
 
 @kernel
-def apply_impact(m: ti.template(), s: ti.template(), k: ti.template(), fraction: ti.f64):
+def apply_impact(m: ti.template(), stage: ti.template(), contacts: ti.template(), fraction: ti.f64):
     """Apply that fraction of the jump to v_hat; restore the last step's impulses, and set `impact_impulse` to the impact's."""
-    (p,) = ti.static((k.problem,))
+    (rows,) = ti.static((contacts.problem,))
     ti.loop_config(serialize=m.serial)
     for i in range(m.n_nodes):
-        m.state.x[i] = k.x_start[i]
-        s.v_hat[i] += fraction * s.change[i]
-    ti.loop_config(serialize=p.serial)
-    for c in range(p.count[0]):
-        struck = fraction * p.r[c]
-        p.r[c] = p.impact_impulse[c]
-        p.impact_impulse[c] = struck
+        m.state.x[i] = contacts.x_start[i]
+        stage.v_hat[i] += fraction * stage.change[i]
+    ti.loop_config(serialize=rows.serial)
+    for c in range(rows.count[0]):
+        struck = fraction * rows.r[c]
+        rows.r[c] = rows.impact_impulse[c]
+        rows.impact_impulse[c] = struck
 
 
 @kernel
-def start_from(m: ti.template(), s: ti.template(), still: ti.f64):
+def start_from(m: ti.template(), stage: ti.template(), still: ti.f64):
     """Set the first iterate after an impact: v_hat, or 0 if the step is linearised at x_n (still = 1)."""
     ti.loop_config(serialize=m.serial)
     for i in range(m.n_nodes):
-        m.state.x[i] = s.x_hat[i]
-        m.state.v[i] = (1.0 - still) * m.free[i] * s.v_hat[i]
+        m.state.x[i] = stage.x_hat[i]
+        m.state.v[i] = (1.0 - still) * m.free[i] * stage.v_hat[i]
 
 
 @kernel
-def rebound_work(k: ti.template(), beta: ti.f64) -> ti.f64:
+def rebound_work(contacts: ti.template(), beta: ti.f64) -> ti.f64:
     """Return the work of contacts constrained to their rebound displacement, at the end of the step [J]."""
-    p, w = ti.static((k.problem, k.work))
-    work = ti.cast(0.0, ti.f64)
+    rows, work = ti.static((contacts.problem, contacts.work))
+    total_work = ti.cast(0.0, ti.f64)
     ti.loop_config(serialize=True)
     for _ in range(1):
-        for c in range(p.count[0]):
-            if p.min_opening[c] > 0.0:
-                displacement = w.tangential_offset[c]
-                for j in range(p.arity[c]):
-                    displacement += p.weight[c, j] * k.displacement[p.node[c, j]]
-                work += p.r[c][0] * p.normal[c].dot(displacement) / beta
-    return work
+        for c in range(rows.count[0]):
+            if rows.min_opening[c] > 0.0:
+                displacement = work.tangential_offset[c]
+                for j in range(rows.arity[c]):
+                    displacement += rows.weight[c, j] * contacts.displacement[rows.node[c, j]]
+                total_work += rows.r[c][0] * rows.normal[c].dot(displacement) / beta
+    return total_work
 
 
 @kernel
-def release_contacts(p: ti.template()):
+def release_contacts(rows: ti.template()):
     """Release all contacts from their rebound displacement."""
-    ti.loop_config(serialize=p.serial)
-    for c in range(p.count[0]):
-        p.min_opening[c] = 0.0
+    ti.loop_config(serialize=rows.serial)
+    for c in range(rows.count[0]):
+        rows.min_opening[c] = 0.0
 
 
 def solve_bouncing(system: StageSystem, stage: Stage) -> StageResult:

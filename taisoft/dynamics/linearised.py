@@ -29,57 +29,57 @@ ROOT, TRIES, LONGEST = 0.05, 40, 1e3  # tolerance over the initial slope; maximu
 
 
 @kernel
-def begin_linearised(m: ti.template(), s: ti.template(), k: ti.template()):
+def begin_linearised(m: ti.template(), stage: ti.template(), contacts: ti.template()):
     """Begin the linearised stage: save x, the residual without contacts, and the impulses."""
-    p, w = ti.static((k.problem, k.work))
+    rows, work = ti.static((contacts.problem, contacts.work))
     ti.loop_config(serialize=m.serial)
     for i in range(m.n_nodes):
-        k.x_linear[i] = m.state.x[i]
-        k.residual_linear[i] = s.residual[i] + ti.cast(impulse_on_node(k, i), m.real)
-    ti.loop_config(serialize=p.serial)
-    for c in range(p.count[0]):
-        w.kept[c] = p.r[c]
+        contacts.x_linear[i] = m.state.x[i]
+        contacts.residual_linear[i] = stage.residual[i] + ti.cast(impulse_on_node(contacts, i), m.real)
+    ti.loop_config(serialize=rows.serial)
+    for c in range(rows.count[0]):
+        work.kept[c] = rows.r[c]
 
 
 @kernel
-def end_linearised(m: ti.template(), s: ti.template(), k: ti.template(), accept: ti.i32, beta: ti.f64):
+def end_linearised(m: ti.template(), stage: ti.template(), contacts: ti.template(), accept: ti.i32, beta: ti.f64):
     """Set y to the velocity change since linearisation, and base to x at that time.
 
     accept: 0 restores the impulses of that time.
     """
-    p, w = ti.static((k.problem, k.work))
+    rows, work = ti.static((contacts.problem, contacts.work))
     ti.loop_config(serialize=m.serial)
     for i in range(m.n_nodes):
-        s.pcg.y[i] = ti.cast((m.state.x[i] - k.x_linear[i]) / beta, m.real)
-        s.base[i] = k.x_linear[i]
-    ti.loop_config(serialize=p.serial)
-    for c in range(p.count[0]):
+        stage.pcg.y[i] = ti.cast((m.state.x[i] - contacts.x_linear[i]) / beta, m.real)
+        stage.base[i] = contacts.x_linear[i]
+    ti.loop_config(serialize=rows.serial)
+    for c in range(rows.count[0]):
         if accept == 0:
-            p.r[c] = w.kept[c]
+            rows.r[c] = work.kept[c]
 
 
 @ti.func
-def _slope(k: ti.template(), linear_slope, curvature, a, r_scale, t, threads: ti.template()):
+def _slope(contacts: ti.template(), linear_slope, curvature, a, r_scale, t, threads: ti.template()):
     """Return the slope of the augmented Lagrangian at step length a, by all threads t of a block. linear_slope: e.r_lin."""
-    p, w = ti.static((k.problem, k.work))
+    rows, work = ti.static((contacts.problem, contacts.work))
     slope = linear_slope + a * curvature
     if t > 0:
         slope = 0.0
-    for j in range(share(t, p.count[0], threads)):
+    for j in range(share(t, rows.count[0], threads)):
         c = t + j * threads
-        z = unprojected_impulse(k, c, w.velocity[c] + a * w.rate[c], r_scale)
-        slope -= w.rate[c].dot(projected_impulse(k, c, z))
+        z = unprojected_impulse(contacts, c, work.velocity[c] + a * work.rate[c], r_scale)
+        slope -= work.rate[c].dot(projected_impulse(contacts, c, z))
     return block_total(slope, t, threads, False)
 
 
 @ti.func
-def _root(k: ti.template(), linear_slope, curvature, start, r_scale, t, threads: ti.template()):
+def _root(contacts: ti.template(), linear_slope, curvature, start, r_scale, t, threads: ti.template()):
     """Return the root of the slope by the Illinois method; the slope increases if the matrix is positive definite.
 
     All threads t of a block call it, with the same numbers.
     """
     a, low, at_low, high, at_high = 1.0, 0.0, start, -1.0, 0.0
-    slope = _slope(k, linear_slope, curvature, a, r_scale, t, threads)
+    slope = _slope(contacts, linear_slope, curvature, a, r_scale, t, threads)
     tries = 0
     while ti.abs(slope) > ROOT * ti.abs(start) and tries < TRIES and a < LONGEST:
         if slope > 0.0:
@@ -92,78 +92,78 @@ def _root(k: ti.template(), linear_slope, curvature, start, r_scale, t, threads:
             a *= 2.0
         else:
             a = low + (high - low) * ti.min(ti.max(at_low / (at_low - at_high), 0.01), 0.99)
-        slope = _slope(k, linear_slope, curvature, a, r_scale, t, threads)
+        slope = _slope(contacts, linear_slope, curvature, a, r_scale, t, threads)
         tries += 1
     return a
 
 
 @ti.func
-def _find_step_length(m: ti.template(), k: ti.template(), r_scale, t, threads: ti.template()):
+def _find_step_length(m: ti.template(), contacts: ti.template(), r_scale, t, threads: ti.template()):
     """Set STEP_LENGTH, by all threads t of a block, from the sums over the nodes and the contacts' rates."""
-    p, w = ti.static((k.problem, k.work))
+    rows, work = ti.static((contacts.problem, contacts.work))
     start = total(m, SUM)
     linear_slope = start
     if t > 0:
         linear_slope = 0.0
-    for j in range(share(t, p.count[0], threads)):
+    for j in range(share(t, rows.count[0], threads)):
         c = t + j * threads
-        linear_slope += w.rate[c].dot(p.r[c])
+        linear_slope += work.rate[c].dot(rows.r[c])
     linear_slope = block_total(linear_slope, t, threads, False)
-    length = _root(k, linear_slope, total(m, OTHER_SUM), start, r_scale, t, threads)
+    length = _root(contacts, linear_slope, total(m, OTHER_SUM), start, r_scale, t, threads)
     if t == 0:
         m.state.scalars[STEP_LENGTH] = length
 
 
 @ti.func
-def _node_slope(m: ti.template(), s: ti.template(), A: ti.template(), k: ti.template(), chunk, i):
+def _node_slope(m: ti.template(), stage: ti.template(), A: ti.template(), contacts: ti.template(), chunk, i):
     """Return (r.y, y.A y) of node i; store its row of A y, and base = x."""
-    y = s.pcg.y[i]
-    q = block_times(k.coupling.base[i], y) + off_diagonal_times(m, A, chunk, i, s.pcg.y)
-    s.pcg.q[i] = q
-    s.base[i] = m.state.x[i]
-    return dot64(m.free[i] * s.residual[i], y), dot64(y, q)
+    y = stage.pcg.y[i]
+    q = block_times(contacts.coupling.base[i], y) + off_diagonal_times(m, A, chunk, i, stage.pcg.y)
+    stage.pcg.q[i] = q
+    stage.base[i] = m.state.x[i]
+    return dot64(m.free[i] * stage.residual[i], y), dot64(y, q)
 
 
 @ti.func
-def _contact_slope(s: ti.template(), k: ti.template(), c, beta):
+def _contact_slope(stage: ti.template(), contacts: ti.template(), c, beta):
     """Compute u of contact c and its rate along y."""
-    p, w = ti.static((k.problem, k.work))
-    w.velocity[c] = stage_velocity_of(k, c, beta)
-    d, n, t = dvec(0.0), p.normal[c], p.tangent[c]
-    for j in range(p.arity[c]):
-        d += p.weight[c, j] * ti.cast(s.pcg.y[p.node[c, j]], ti.f64)
-    w.rate[c] = dvec(n.dot(d), t.dot(d), n.cross(t).dot(d))
+    rows, work = ti.static((contacts.problem, contacts.work))
+    work.velocity[c] = stage_velocity_of(contacts, c, beta)
+    d, n, t = dvec(0.0), rows.normal[c], rows.tangent[c]
+    for j in range(rows.arity[c]):
+        d += rows.weight[c, j] * ti.cast(stage.pcg.y[rows.node[c, j]], ti.f64)
+    work.rate[c] = dvec(n.dot(d), t.dot(d), n.cross(t).dot(d))
 
 
 @ti.func
-def _move_node_along(m: ti.template(), s: ti.template(), k: ti.template(), i, a, beta):
+def _move_node_along(m: ti.template(), stage: ti.template(), contacts: ti.template(), i, a, beta):
     """Move node i by a y, and update the residual without contacts."""
-    place_node(m, s, i, a, beta)
-    k.displacement[i] = m.state.x[i] - k.x_start[i]
-    k.residual_linear[i] += ti.cast(a, m.real) * s.pcg.q[i]
+    place_node(m, stage, i, a, beta)
+    contacts.displacement[i] = m.state.x[i] - contacts.x_start[i]
+    contacts.residual_linear[i] += ti.cast(a, m.real) * stage.pcg.q[i]
 
 
 @ti.func
-def _node_residual(m: ti.template(), s: ti.template(), k: ti.template(), i):
+def _node_residual(m: ti.template(), stage: ti.template(), contacts: ti.template(), i):
     """Compute the residual of node i with impulses, and -r as CG's right side; return |r|^2 on its free axes."""
-    r = k.residual_linear[i] - ti.cast(impulse_on_node(k, i), m.real)
-    s.residual[i] = r
+    r = contacts.residual_linear[i] - ti.cast(impulse_on_node(contacts, i), m.real)
+    stage.residual[i] = r
     free_residual = m.free[i] * r
-    s.pcg.rhs[i] = -free_residual
-    return norm_weight(s, i) * dot64(free_residual, free_residual)
+    stage.pcg.rhs[i] = -free_residual
+    return norm_weight(stage, i) * dot64(free_residual, free_residual)
 
 
 @ti.func
-def _find_residual(m: ti.template(), s: ti.template(), k: ti.template()):
+def _find_residual(m: ti.template(), stage: ti.template(), contacts: ti.template()):
     """Compute the residual, -r as CG's right side, and the first of NORMS, as top-level loops of a kernel."""
-    find_residual(k)
+    find_residual(contacts)
     ti.loop_config(serialize=m.serial)
     for task in range(m.chunks * m.spread):
         if task % m.spread == 0:
             chunk = task // m.spread
             square = ti.cast(0.0, ti.f64)
             for j in range(chunk_size(m, chunk, m.n_nodes)):
-                square += _node_residual(m, s, k, chunk_entry(m, chunk, j, m.n_nodes))
+                square += _node_residual(m, stage, contacts, chunk_entry(m, chunk, j, m.n_nodes))
             m.state.partial[chunk, SUM] = square
     fold(m, SUM, SUM, ())
     ti.loop_config(serialize=True)
@@ -172,9 +172,11 @@ def _find_residual(m: ti.template(), s: ti.template(), k: ti.template()):
 
 
 @kernel
-def find_step_length(m: ti.template(), s: ti.template(), A: ti.template(), k: ti.template(), beta: ti.f64, r_scale: ti.f64):
-    """Find the zero of the slope along y of s.pcg. scalars: STEP_LENGTH."""
-    (p,) = ti.static((k.problem,))
+def find_step_length(
+    m: ti.template(), stage: ti.template(), A: ti.template(), contacts: ti.template(), beta: ti.f64, r_scale: ti.f64
+):
+    """Find the zero of the slope along y of stage.pcg. scalars: STEP_LENGTH."""
+    (rows,) = ti.static((contacts.problem,))
     ti.loop_config(serialize=m.serial)
     for task in range(m.chunks * m.spread):
         if task % m.spread == 0:
@@ -182,44 +184,46 @@ def find_step_length(m: ti.template(), s: ti.template(), A: ti.template(), k: ti
             slope, curvature = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64)
             for j in range(chunk_size(m, chunk, m.n_nodes)):
                 i = chunk_entry(m, chunk, j, m.n_nodes)
-                slope_i, curvature_i = _node_slope(m, s, A, k, chunk, i)
+                slope_i, curvature_i = _node_slope(m, stage, A, contacts, chunk, i)
                 slope += slope_i
                 curvature += curvature_i
             m.state.partial[chunk, SUM], m.state.partial[chunk, OTHER_SUM] = slope, curvature
     fold(m, SUM, OTHER_SUM, ())
-    ti.loop_config(serialize=p.serial)
-    for c in range(p.count[0]):
-        _contact_slope(s, k, c, beta)
+    ti.loop_config(serialize=rows.serial)
+    for c in range(rows.count[0]):
+        _contact_slope(stage, contacts, c, beta)
     if ti.static(m.on_cpu):
         ti.loop_config(serialize=True)
         for _ in range(1):
-            _find_step_length(m, k, r_scale, 0, 1)
+            _find_step_length(m, contacts, r_scale, 0, 1)
     else:
         ti.loop_config(block_dim=THREADS)
         for t in range(THREADS):
-            _find_step_length(m, k, r_scale, t, THREADS)
+            _find_step_length(m, contacts, r_scale, t, THREADS)
 
 
 @kernel
-def advance(m: ti.template(), s: ti.template(), k: ti.template(), beta: ti.f64, r_scale: ti.f64):
+def advance(m: ti.template(), stage: ti.template(), contacts: ti.template(), beta: ti.f64, r_scale: ti.f64):
     """Move along y to there; update x, v, impulses, blocks, residual, and -r as CG's right side. scalars: the first of NORMS."""
-    (p,) = ti.static((k.problem,))
+    (rows,) = ti.static((contacts.problem,))
     ti.loop_config(serialize=m.serial)
     for i in range(m.n_nodes):
-        _move_node_along(m, s, k, i, m.state.scalars[STEP_LENGTH], beta)
-    ti.loop_config(serialize=p.serial)
-    for c in range(p.count[0]):
-        update_contact(m, k, c, beta, r_scale)
-    _find_residual(m, s, k)
+        _move_node_along(m, stage, contacts, i, m.state.scalars[STEP_LENGTH], beta)
+    ti.loop_config(serialize=rows.serial)
+    for c in range(rows.count[0]):
+        update_contact(m, contacts, c, beta, r_scale)
+    _find_residual(m, stage, contacts)
 
 
 @kernel
-def update_multipliers(m: ti.template(), s: ti.template(), k: ti.template(), to_impulses: ti.i32, beta: ti.f64, r_scale: ti.f64):
+def update_multipliers(
+    m: ti.template(), stage: ti.template(), contacts: ti.template(), to_impulses: ti.i32, beta: ti.f64, r_scale: ti.f64
+):
     """Update impulses, blocks, residual, -r, and the first of NORMS; to_impulses: 1 sets multipliers to the impulses first."""
-    (p,) = ti.static((k.problem,))
-    ti.loop_config(serialize=p.serial)
-    for c in range(p.count[0]):
+    (rows,) = ti.static((contacts.problem,))
+    ti.loop_config(serialize=rows.serial)
+    for c in range(rows.count[0]):
         if to_impulses == 1:
-            set_multiplier(k, c)
-        update_contact(m, k, c, beta, r_scale)
-    _find_residual(m, s, k)
+            set_multiplier(contacts, c)
+        update_contact(m, contacts, c, beta, r_scale)
+    _find_residual(m, stage, contacts)

@@ -101,13 +101,13 @@ class StageWork:
 
 
 @ti.func
-def stage_velocity(m: ti.template(), w: ti.template(), i, beta):
+def stage_velocity(m: ti.template(), stage: ti.template(), i, beta):
     """Return (x - x_hat) / beta of node i."""
-    return (m.state.x[i] - w.x_hat[i]) / beta
+    return (m.state.x[i] - stage.x_hat[i]) / beta
 
 
 @kernel
-def begin_stage(m: ti.template(), w: ti.template(), beta: ti.f64, prescribed_fraction: ti.f64):
+def begin_stage(m: ti.template(), stage: ti.template(), beta: ti.f64, prescribed_fraction: ti.f64):
     """Set x from the first iterate v; prescribed nodes move to their targets, which gives their v.
 
     v_hat of a prescribed node is set so that (v - v_hat) / beta is its acceleration. With a lumped mass, which affects only the
@@ -116,29 +116,29 @@ def begin_stage(m: ti.template(), w: ti.template(), beta: ti.f64, prescribed_fra
     """
     ti.loop_config(serialize=m.serial)
     for i in range(m.n_nodes):
-        m.state.x[i] = w.x_hat[i] + beta * m.state.v[i]
-    if ti.static(w.has_prescribed):
+        m.state.x[i] = stage.x_hat[i] + beta * m.state.v[i]
+    if ti.static(stage.has_prescribed):
         ti.loop_config(serialize=True)
-        for k in range(w.n_prescribed):
-            i = w.prescribed_nodes[k]
+        for k in range(stage.n_prescribed):
+            i = stage.prescribed_nodes[k]
             for a in ti.static(range(3)):
-                if w.prescribed_axes[k][a] != 0:
-                    v = (w.targets[k][a] - w.x_hat[i][a]) / beta
+                if stage.prescribed_axes[k][a] != 0:
+                    v = (stage.targets[k][a] - stage.x_hat[i][a]) / beta
                     if ti.static(m.consistent):
-                        w.v_hat[i][a] = v - beta * w.prescribed_acceleration[k][a]
+                        stage.v_hat[i][a] = v - beta * stage.prescribed_acceleration[k][a]
                     else:
-                        w.v_hat[i][a] = v - prescribed_fraction * (v - w.v_hat[i][a])
+                        stage.v_hat[i][a] = v - prescribed_fraction * (v - stage.v_hat[i][a])
                     m.state.v[i][a] = v
-                    m.state.x[i][a] = w.targets[k][a]
+                    m.state.x[i][a] = stage.targets[k][a]
 
 
 @ti.func
-def set_change(m: ti.template(), w: ti.template(), i, c, beta):
+def set_change(m: ti.template(), stage: ti.template(), i, c, beta):
     """Set c (v - v_hat), plus beta a v with mass damping, for node i."""
-    change = c * (stage_velocity(m, w, i, beta) - w.v_hat[i])
+    change = c * (stage_velocity(m, stage, i, beta) - stage.v_hat[i])
     if ti.static(m.damped):
         change += beta * ti.cast(rayleigh_damping.mass_rate(m, i), ti.f64) * m.state.v[i]
-    w.change[i] = change
+    stage.change[i] = change
 
 
 @ti.func
@@ -162,23 +162,23 @@ def internal_on(m: ti.template(), i):
 
 
 @ti.func
-def damping_force(m: ti.template(), w: ti.template(), chunk, i, v: ti.template()):
+def damping_force(m: ti.template(), stage: ti.template(), chunk, i, v: ti.template()):
     """Force of stiffness damping on node i at velocities v [N], within a chunk of a loop."""
-    return rayleigh_damping.stiffness_force(m, i, stiffness_times(m, w.damper, chunk, i, v))
+    return rayleigh_damping.stiffness_force(m, i, stiffness_times(m, stage.damper, chunk, i, v))
 
 
 @ti.func
-def residual_parts(m: ti.template(), w: ti.template(), chunk, i, beta):
+def residual_parts(m: ti.template(), stage: ti.template(), chunk, i, beta):
     """Return (r, inertia and mass damping, internal forces, loads) of node i without contacts; uses `change`."""
     internal, loads, damping = internal_on(m, i), loads_on(m, i), ti.Vector([0.0, 0.0, 0.0], m.real)
     if ti.static(m.stiffness_damping):
-        damping += damping_force(m, w, chunk, i, m.state.v)
-    inertia = ti.cast(mass_times(m, i, w.change), m.real)
+        damping += damping_force(m, stage, chunk, i, m.state.v)
+    inertia = ti.cast(mass_times(m, i, stage.change), m.real)
     return inertia - ti.cast(beta, m.real) * (internal + loads + damping), inertia, internal, loads
 
 
 @ti.func
-def impact_residual(m: ti.template(), A: ti.template(), k: ti.template(), i, tau):
+def impact_residual(m: ti.template(), A: ti.template(), contacts: ti.template(), i, tau):
     """Return (A D)_i of the jump D = (x - x_linear) / tau, without impulses.
 
     Uses differences between neighbours in f64: stiffness does not resist the common part of the jump, which is most of it, and
@@ -187,7 +187,7 @@ def impact_residual(m: ti.template(), A: ti.template(), k: ti.template(), i, tau
     inertia = ti.cast(1.0, m.real)
     if ti.static(m.damped):
         inertia += ti.cast(tau, m.real) * rayleigh_damping.mass_rate(m, i)
-    velocity_jump, mass = (m.state.x[i] - k.x_linear[i]) / tau, m.mass[i]
+    velocity_jump, mass = (m.state.x[i] - contacts.x_linear[i]) / tau, m.mass[i]
     if ti.static(m.consistent):
         mass = m.mass_matrix.diagonal[i]
     r = ti.Vector([0.0, 0.0, 0.0], m.real)
@@ -195,7 +195,7 @@ def impact_residual(m: ti.template(), A: ti.template(), k: ti.template(), i, tau
         row = i + half * m.n_nodes
         for at in range(A.row_start[row], A.row_start[row + 1]):
             j = A.column[at]
-            r += block_times(A.value[at], ti.cast((m.state.x[j] - k.x_linear[j]) / tau - velocity_jump, m.real))
+            r += block_times(A.value[at], ti.cast((m.state.x[j] - contacts.x_linear[j]) / tau - velocity_jump, m.real))
             if ti.static(m.consistent):
                 mass += m.mass_matrix.value[at]
     return r + inertia * mass * ti.cast(velocity_jump, m.real)
@@ -208,20 +208,20 @@ def squares(r, inertia, f, external, free):
 
 
 @ti.func
-def norm_weight(s: ti.template(), i):
+def norm_weight(stage: ti.template(), i):
     """Weight of node i in squares of norms: that of its piece."""
     weight = ti.cast(1.0, ti.f64)
-    if ti.static(s.pieces.several):
-        weight = s.pieces.weight[s.pieces.piece[i]]
+    if ti.static(stage.pieces.several):
+        weight = stage.pieces.weight[stage.pieces.piece[i]]
     return weight
 
 
 @ti.func
-def merit_weight(s: ti.template(), i):
+def merit_weight(stage: ti.template(), i):
     """Weight of node i in slopes: components without contacts are independent of each other, each in the norm of its solve."""
     weight = ti.cast(1.0, ti.f64)
-    if ti.static(s.pieces.several):
-        weight = s.pieces.factor[s.pieces.component[i]] ** 2
+    if ti.static(stage.pieces.several):
+        weight = stage.pieces.factor[stage.pieces.component[i]] ** 2
     return weight
 
 
@@ -232,66 +232,66 @@ def norm2(a):
 
 
 @ti.func
-def place_node(m: ti.template(), w: ti.template(), i, step_length, beta):
+def place_node(m: ti.template(), stage: ti.template(), i, step_length, beta):
     """Move node i to base + step_length beta y, and set v accordingly; y is 0 on constrained axes."""
-    m.state.x[i] = w.base[i]
+    m.state.x[i] = stage.base[i]
     if step_length != 0.0:  # so that 0 restores the base even if y is not a number
-        m.state.x[i] += step_length * beta * ti.cast(w.pcg.y[i], ti.f64)
-    m.state.v[i] = stage_velocity(m, w, i, beta)
+        m.state.x[i] += step_length * beta * ti.cast(stage.pcg.y[i], ti.f64)
+    m.state.v[i] = stage_velocity(m, stage, i, beta)
 
 
 @kernel
-def set_direction_to_rest(m: ti.template(), w: ti.template()):
+def set_direction_to_rest(m: ti.template(), stage: ti.template()):
     """Set y = -v on the free axes."""
     ti.loop_config(serialize=m.serial)
     for i in range(m.n_nodes):
-        w.pcg.y[i] = ti.cast(-m.free[i] * m.state.v[i], m.real)
+        stage.pcg.y[i] = ti.cast(-m.free[i] * m.state.v[i], m.real)
 
 
 @kernel
-def negate_direction(m: ti.template(), w: ti.template()):
+def negate_direction(m: ti.template(), stage: ti.template()):
     """Set y = -y."""
     ti.loop_config(serialize=m.serial)
     for i in range(m.n_nodes):
-        w.pcg.y[i] = -w.pcg.y[i]
+        stage.pcg.y[i] = -stage.pcg.y[i]
 
 
 @kernel
 def move(
     m: ti.template(),
-    s: ti.template(),
-    k: ti.template(),
+    stage: ti.template(),
+    contacts: ti.template(),
     kind: ti.template(),
     mode: ti.i32,
     step_length: ti.f64,
     c: ti.f64,
     beta: ti.f64,
 ):
-    """Move the nodes of s.pcg.subset and compute the elastic forces there.
+    """Move the nodes of stage.pcg.subset and compute the elastic forces there.
 
-    mode: STAY; STEP: base = x, then step_length y, y of s.pcg; AGAIN: base + step_length y. scalars: START_SLOPE of a STEP.
+    mode: STAY; STEP: base = x, then step_length y, y of stage.pcg; AGAIN: base + step_length y. scalars: START_SLOPE of a STEP.
     """
     ti.loop_config(serialize=m.serial)
     for task in range(m.chunks * m.spread):
         if task % m.spread == 0:
             chunk = task // m.spread
-            n = n_nodes_of(m, s.pcg.subset)
+            n = n_nodes_of(m, stage.pcg.subset)
             slope = ti.cast(0.0, ti.f64)
             for at in range(chunk_size(m, chunk, n)):
-                i = node_of(s.pcg.subset, chunk_entry(m, chunk, at, n))
+                i = node_of(stage.pcg.subset, chunk_entry(m, chunk, at, n))
                 if mode == STEP:
-                    slope += merit_weight(s, i) * dot64(m.free[i] * s.residual[i], s.pcg.y[i])
-                    s.base[i] = m.state.x[i]
+                    slope += merit_weight(stage, i) * dot64(m.free[i] * stage.residual[i], stage.pcg.y[i])
+                    stage.base[i] = m.state.x[i]
                 if mode != STAY:
-                    place_node(m, s, i, step_length, beta)
-                if ti.static(k.any):
-                    k.displacement[i] = m.state.x[i] - k.x_start[i]
+                    place_node(m, stage, i, step_length, beta)
+                if ti.static(contacts.any):
+                    contacts.displacement[i] = m.state.x[i] - contacts.x_start[i]
                 if ti.static(kind == ELASTIC_STAGE):
-                    set_change(m, s, i, c, beta)
+                    set_change(m, stage, i, c, beta)
             m.state.partial[chunk, OTHER_SUM] = slope
     fold(m, OTHER_SUM, OTHER_SUM, ())
     if ti.static(kind == ELASTIC_STAGE):
-        elasticity.sum_elements(m, s.pcg.subset)
+        elasticity.sum_elements(m, stage.pcg.subset)
     ti.loop_config(serialize=True)
     for _ in range(1):
         if mode == STEP:
@@ -299,8 +299,10 @@ def move(
 
 
 @kernel
-def form_residual(m: ti.template(), s: ti.template(), A: ti.template(), k: ti.template(), kind: ti.template(), beta: ti.f64):
-    """Form the residual on the nodes of s.pcg.subset, and -r as CG's right side, after `move` and `update_impulses`.
+def form_residual(
+    m: ti.template(), stage: ti.template(), A: ti.template(), contacts: ti.template(), kind: ti.template(), beta: ti.f64
+):
+    """Form the residual on the nodes of stage.pcg.subset, and -r as CG's right side, after `move` and `update_impulses`.
 
     scalars: END_SLOPE, and from NORMS on |r|^2, |inertia and mass damping|^2, |f_el|^2, |f_ext|^2 on the free axes, and |r|^2 on
     the others; only those of r in an impact.
@@ -309,26 +311,26 @@ def form_residual(m: ti.template(), s: ti.template(), A: ti.template(), k: ti.te
     for task in range(m.chunks * m.spread):
         if task % m.spread == 0:
             chunk = task // m.spread
-            n = n_nodes_of(m, s.pcg.subset)
+            n = n_nodes_of(m, stage.pcg.subset)
             sums, slope = ti.Vector([0.0, 0.0, 0.0, 0.0, 0.0], ti.f64), ti.cast(0.0, ti.f64)
             for at in range(chunk_size(m, chunk, n)):
-                i = node_of(s.pcg.subset, chunk_entry(m, chunk, at, n))
+                i = node_of(stage.pcg.subset, chunk_entry(m, chunk, at, n))
                 free = m.free[i]
                 zero = ti.Vector([0.0, 0.0, 0.0], m.real)
                 r, inertia, f, external = zero, zero, zero, zero
                 if ti.static(kind == IMPACT):
-                    r = impact_residual(m, A, k, i, beta)
+                    r = impact_residual(m, A, contacts, i, beta)
                 else:
-                    r, inertia, f, external = residual_parts(m, s, chunk, i, beta)
-                if ti.static(k.any):
-                    r -= ti.cast(impulse_on_node(k, i), m.real)
+                    r, inertia, f, external = residual_parts(m, stage, chunk, i, beta)
+                if ti.static(contacts.any):
+                    r -= ti.cast(impulse_on_node(contacts, i), m.real)
                 if ti.static(m.has_dependents):  # whose forces act on other nodes
                     if is_dependent(m, i):
                         r = zero
-                s.residual[i] = r
-                s.pcg.rhs[i] = -free * r
-                sums += norm_weight(s, i) * squares(r, inertia, f, external, free)
-                slope += merit_weight(s, i) * dot64(free * r, s.pcg.y[i])
+                stage.residual[i] = r
+                stage.pcg.rhs[i] = -free * r
+                sums += norm_weight(stage, i) * squares(r, inertia, f, external, free)
+                slope += merit_weight(stage, i) * dot64(free * r, stage.pcg.y[i])
             for j in ti.static(range(N_NORMS)):
                 m.state.partial[chunk, j] = sums[j]
             m.state.partial[chunk, SUM] = slope
