@@ -24,6 +24,7 @@ from taisoft.backend.runtime import kernel
 from taisoft.collision.candidates import Parts
 from taisoft.collision.surface import cell_of, dvec, ivec
 from taisoft.display import short_repr
+from taisoft.scene.scene import Scene
 
 # kinds of contacts; their two ids are: vertex and triangle; edge and edge (3 triangle + local edge); vertex and collider;
 # triangle and collider; a passage (`passages`)
@@ -94,12 +95,23 @@ class Contacts:
         return columns
 
 
-def no_contacts() -> Contacts:
+def named_contacts(
+    scene: Scene, point, normal, gap, impulse, collider, feature, nodes, weights, *, found: int, unmapped: int, duration=0.0
+) -> Contacts:
+    """Return the record of contact arrays (k, ...), with names, friction and restitution. collider: (k,2) indices."""
+    names, kinds = np.array([c.name for c in scene.colliders], dtype=object), np.array(KINDS, dtype=object)
+    pairs, pair = np.unique(collider, axis=0, return_inverse=True)
+    numbers = np.array([scene.contact_numbers(names[a], names[b]) for a, b in pairs]).reshape(-1, 2)[pair.reshape(-1)]
+    geometry, labels = (point, normal, gap, impulse), (names[collider[:, 0]], names[collider[:, 1]])
+    what = (nodes, weights, kinds[feature[:, 0]], feature[:, 1:], numbers[:, 0], numbers[:, 1])
+    return Contacts(*geometry, *labels, *what, found, unmapped, duration)
+
+
+def no_contacts(scene: Scene) -> Contacts:
     """Return an empty record."""
-    names, numbers, vectors = np.zeros(0, dtype=object), np.zeros(0), np.zeros((0, 3))
-    nodes, feature = np.zeros((0, 6), dtype=np.int64), np.zeros((0, 2), dtype=np.int64)
-    geometry = (vectors, vectors, numbers, vectors, names, names, nodes, np.zeros((0, 6)))
-    return Contacts(*geometry, names, feature, numbers, numbers, found=0, unmapped=0)
+    geometry = np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros((0, 3))
+    integers = (np.zeros((0, n), dtype=np.int64) for n in (2, 3, 6))
+    return named_contacts(scene, *geometry, *integers, np.zeros((0, 6)), found=0, unmapped=0)
 
 
 def contact_fields(arena: FieldArena, capacity: int) -> ContactFields:

@@ -15,7 +15,16 @@ from taisoft.collision.analytic import NO_SHAPES, AnalyticFrames, build_analytic
 from taisoft.collision.bvh import Bvh, Trees
 from taisoft.collision.candidates import Buffer, Candidates, entries
 from taisoft.collision.colliders import body_grid, collider_surfaces, collider_thickness, prescribed_vertices
-from taisoft.collision.contacts import FOUND, KINDS, LEFT, Contacts, contact_fields, gather, reduce_contacts, reduction_fields
+from taisoft.collision.contacts import (
+    FOUND,
+    LEFT,
+    Contacts,
+    contact_fields,
+    gather,
+    named_contacts,
+    reduce_contacts,
+    reduction_fields,
+)
 from taisoft.collision.distance_field import DistanceFields, build_fields, find_in_fields
 from taisoft.collision.edge_edge import find_proximity
 from taisoft.collision.features import BY_EDGES, BY_FACES, BY_FIELD
@@ -256,7 +265,8 @@ class Detection:
         floats, integers = gather(self.buffer.data, self._reduction.kept, self._reduction.count[LEFT])
         none, (nodes, weights) = np.zeros((len(floats), 3)), self._sides(floats, integers)
         geometry = (x.copy() for x in (floats[:, :3], floats[:, 3:6], floats[:, 12]))
-        return self.record(*geometry, none, integers[:, :2], integers[:, 2:5], nodes, weights)
+        what = none, integers[:, :2], integers[:, 2:5], nodes, weights
+        return named_contacts(self.scene, *geometry, *what, found=self.counts.found, unmapped=self.counts.unmapped)
 
     def _sides(self, floats: np.ndarray, integers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Nodes and weights (k,6) of contacts, three of each side, from rows of the buffer; -1 where there is none."""
@@ -266,15 +276,6 @@ class Detection:
     def sides(self, n: int) -> tuple[np.ndarray, np.ndarray]:
         """Nodes and weights (n,6) of the first n kept contacts of the last search, before dependent ones are replaced."""
         return self._sides(*gather(self.buffer.data, self._reduction.kept, n, ordered=False))
-
-    def record(self, point, normal, gap, impulse, body, feature, nodes, weights) -> Contacts:
-        """Return a record of contact arrays (k, ...), with collider names, friction and restitution. body: (k,2) colliders."""
-        names = np.array([c.name for c in self.scene.colliders], dtype=object)
-        pairs, pair = np.unique(body, axis=0, return_inverse=True)
-        numbers = np.array([self.scene.contact_numbers(names[a], names[b]) for a, b in pairs]).reshape(-1, 2)[pair.reshape(-1)]
-        kinds, labels = np.array(KINDS, dtype=object), (names[body[:, 0]], names[body[:, 1]])
-        what = (nodes, weights, kinds[feature[:, 0]], feature[:, 1:], numbers[:, 0], numbers[:, 1])
-        return Contacts(point, normal, gap, impulse, *labels, *what, self.counts.found, self.counts.unmapped)
 
     @property
     def kept(self):

@@ -32,20 +32,9 @@ from taisoft.dynamics.contact_measures import (
     Crossing,
 )
 from taisoft.dynamics.contact_paths import ContactPaths
-from taisoft.dynamics.contact_record import (
-    IMPULSE,
-    MOMENTS,
-    NORMAL,
-    SLIP,
-    Pairs,
-    distribute,
-    read_rows,
-    record_contacts,
-    sum_pairs,
-    write_rows,
-)
 from taisoft.dynamics.impact import Rebounds
 from taisoft.dynamics.misplaced import Misplacement
+from taisoft.dynamics.readout import ContactRows, Pairs, read_contacts, read_rows, sum_on, sum_pairs, write_rows
 from taisoft.dynamics.simulation_state import SimulationState
 from taisoft.errors import SimulationError
 from taisoft.scene.rigid import RigidBody
@@ -295,12 +284,22 @@ class ContactStep:
         if self._substep_fraction < 1.0:
             self._pairs = self._sum_pairs()
 
+    @property
+    def _duration(self) -> float:
+        """Time [s] in which the impulses of the last substep acted."""
+        return self._last_time / self._impulse_fraction
+
+    def rows(self, own: bool = False) -> ContactRows:
+        """Return the contacts of the last substep. own: with the nodes before dependent ones were replaced, if they are known."""
+        found = read_contacts(self.problem, self._impulse_fraction)
+        if not own or self._own_sides is None:
+            return found
+        nodes, weights = (side[: len(found.gap)] for side in self._own_sides)
+        return replace(found, nodes=nodes, weights=weights)
+
     def _sum_pairs(self) -> Pairs:
         """Add the last substep's contacts to the sums of earlier substeps."""
-        found = self.contacts()
-        nodes, weights = (found.nodes, found.weights) if self._own_sides is None else self._own_sides
-        sides = nodes[: len(found)], weights[: len(found)]
-        return sum_pairs(self.problem, found, sides, *self.simulation.state(), self._pairs)
+        return sum_pairs(self.problem, self.rows(own=True), self._duration, *self.simulation.state(), self._pairs)
 
     def pairs(self) -> Pairs:
         """Return the sums over the contacts of each pair in the last step, see `sum_pairs`."""
@@ -308,30 +307,18 @@ class ContactStep:
             self._pairs = self._sum_pairs()
         return self._pairs
 
-    def pressing_pairs(self) -> np.ndarray:
-        """Return the pairs of colliders (k,2) that pressed on each other in the last step."""
-        pairs, sums = self.pairs()
-        return pairs[sums[:, NORMAL.start] > 0.0]
-
     def mean_on(self, collider: int, other: int | None) -> np.ndarray:
-        """Return means over the last step of what a collider gets from another one, or from all others, (10,): force [N], moment
-        about the origin [N m], slip velocity times normal force [W], and normal force [N]."""
-        (pairs, sums), total = self.pairs(), np.zeros(10)
-        for own in (0, 1):
-            rows = (pairs[:, own] == collider) & ((pairs[:, 1 - own] == other) | (other is None))
-            part, sign = sums[rows].sum(axis=0), 1.0 - 2.0 * own
-            total += np.concatenate([sign * part[IMPULSE], part[MOMENTS[own]], sign * part[SLIP], part[NORMAL]])
-        return total / (self._step_dt or 1.0)
+        """Return the means of `sum_on` over the last step, (10,): force [N], moment [N m], and so on."""
+        return sum_on(self.pairs(), collider, other) / (self._step_dt or 1.0)
 
     def own_forces(self) -> np.ndarray:
         """Return the contact forces of the last substep on the nodes that touch, dependent ones too, (n_nodes, 3) [N].
 
         Known only in scenes with dependent nodes, and not after a checkpoint was loaded; else 0.
         """
-        n, found = self.simulation.model.n_nodes, self.contacts()
-        if self._own_sides is None or len(self._own_sides[0]) != len(found) or self._last_time == 0.0:
-            return np.zeros((n, 3))
-        return distribute(found.impulse, *self._own_sides, n) * self._impulse_fraction / self._last_time
+        if self._own_sides is None or len(self._own_sides[0]) != self.n_contacts or self._last_time == 0.0:
+            return np.zeros((self.simulation.model.n_nodes, 3))
+        return self.rows(own=True).on_nodes(self.simulation.model.n_nodes) * self._impulse_fraction / self._last_time
 
     def penetrates_deeper(self, time: float, dt: float, before: float) -> bool:
         """Return whether a substep of dt that ends at a time leaves a new or deeper penetration.
@@ -414,9 +401,8 @@ class ContactStep:
 
     def contacts(self) -> Contacts:
         """Return the contacts of the last substep with their impulses."""
-        record = record_contacts(self.detection, self.problem, self._impulse_fraction)
         found, unmapped = self._search_counts  # others have searched since
-        return replace(record, found=found, unmapped=unmapped, duration=self._last_time / self._impulse_fraction)
+        return self.rows().named(self.simulation.scene, found=found, unmapped=unmapped, duration=self._duration)
 
     @property
     def field_bytes(self) -> dict[str, int]:

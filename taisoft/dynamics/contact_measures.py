@@ -15,7 +15,7 @@ drops the contacts that it would be for, unless they close head-on.
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 import taichi as ti
@@ -45,7 +45,7 @@ class Crossing:
     depth: float = 0.0  # [m]
     relative: float = 0.0  # over the finer side's mean surface edge
     n_pairs: int = 0  # of crossing triangles
-    inside: list[tuple[str, str, float]] = field(default_factory=list)  # colliders inside each other, and depth [m]
+    inside: tuple[tuple[int, int, float], ...] = ()  # colliders inside each other, and depth [m]
 
 
 class ContactMeasures:
@@ -85,8 +85,7 @@ class ContactMeasures:
             # a piece thinner than an edge counts as deep if its middle is half as deep in the other as in itself
             scale = min(edges[one.a], edges[one.b], 0.5 * one.room / DEEP_PENETRATION if one.room > 0.0 else np.inf)
             depth, relative = max(depth, one.depth), max(relative, one.depth / scale)
-        names = [c.name for c in self.detection.scene.colliders]
-        return Crossing(depth, relative, int(crossings[CROSSINGS]), [(names[a], names[b], d) for (a, b), d in inside.items()])
+        return Crossing(depth, relative, int(crossings[CROSSINGS]), tuple((*pair, d) for pair, d in inside.items()))
 
     def deep_from(self, a: int, b: int) -> float:
         """Return the penetration [m] of two colliders above which a step counts as deep."""
