@@ -134,7 +134,7 @@ def find_window(sim: ts.Simulator, cost: Cost) -> dict:
     contact, passing = sim._dynamics.contact, []
     for _ in range(WINDOWS):
         kept, near, contacts, cost.start, cost.relisting = sim._dynamics.snapshot(), [], [], sim.time, 0
-        held = contact is not None and len(contact.detection.held.pairs)
+        held = contact is not None and len(sim._dynamics.state.now.held.pairs)
         sim._dynamics.restore(kept)
         passing.clear()
         with observed(lambda paths, found, *_: passing.append(sim.step_count) if found else None):

@@ -167,39 +167,6 @@ def write_point_contact(s: ti.template(), out: ti.template(), at, last, t, j, w,
     write_contact(out, at, last, s.body[t], other, feature, point, n, gap, nodes, weights, nodes_b, weights_b)
 
 
-@kernel
-def gather_contacts(
-    out: ti.template(), index: ti.template(), n: ti.i32, floats: ti.types.ndarray(), integers: ti.types.ndarray()
-):
-    """Copy the contacts index[:n] for `gather`: floats (n,13) and integers (n,11)."""
-    ti.loop_config(serialize=True)
-    for i in range(n):
-        at = index[i]
-        floats[i, 12] = out.gap[at]
-        for q in ti.static(range(3)):
-            floats[i, q], floats[i, 3 + q] = out.point[at][q], out.normal[at][q]
-            floats[i, 6 + q], floats[i, 9 + q] = out.weights_a[at][q], out.weights_b[at][q]
-            integers[i, 2 + q] = out.feature[at][q]
-            integers[i, 5 + q], integers[i, 8 + q] = out.nodes_a[at][q], out.nodes_b[at][q]
-        for q in ti.static(range(2)):
-            integers[i, q] = out.body[at][q]
-
-
-def gather(out: ContactFields, index: Any, n: int, ordered: bool = True) -> tuple[np.ndarray, np.ndarray]:
-    """Download the contacts at the buffer indices index[:n], in order of colliders and feature: an order independent of threads
-    and chunks, so that a solver meets the same one in the next step. ordered: False, in that of `index`.
-
-    Returns (n,13) point, normal, weights (6) and gap; (n,11) colliders (2), feature (3), nodes (6).
-    """
-    floats, integers = np.zeros((n, 13)), np.zeros((n, 11), dtype=np.int32)
-    if n:
-        gather_contacts(out, index, n, floats, integers)
-    if not ordered:
-        return floats, integers
-    order = np.lexsort(integers[:, 4::-1].T)
-    return floats[order], integers[order]
-
-
 # --- reduction -----------------------------------------------------------------------------------------------
 
 

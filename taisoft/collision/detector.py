@@ -15,16 +15,7 @@ from taisoft.collision.analytic import NO_SHAPES, AnalyticFrames, build_analytic
 from taisoft.collision.bvh import Bvh, Trees
 from taisoft.collision.candidates import Buffer, Candidates, entries
 from taisoft.collision.colliders import body_grid, collider_surfaces, collider_thickness, prescribed_vertices
-from taisoft.collision.contacts import (
-    FOUND,
-    LEFT,
-    Contacts,
-    contact_fields,
-    gather,
-    named_contacts,
-    reduce_contacts,
-    reduction_fields,
-)
+from taisoft.collision.contacts import FOUND, LEFT, Contacts, contact_fields, named_contacts, reduce_contacts, reduction_fields
 from taisoft.collision.distance_field import DistanceFields, build_fields, find_in_fields
 from taisoft.collision.edge_edge import find_proximity
 from taisoft.collision.features import BY_EDGES, BY_FACES, BY_FIELD
@@ -32,7 +23,7 @@ from taisoft.collision.intersections import Intersections, find_crossings
 from taisoft.collision.near_list import STILL
 from taisoft.collision.overlap import Containment, Inside
 from taisoft.collision.passages import ROUND, append_passages
-from taisoft.collision.path_check import NO_PASSAGES, PathCheck
+from taisoft.collision.path_check import NO_PASSAGES, HeldPassages, PathCheck
 from taisoft.collision.spatial_hash import SpatialHash
 from taisoft.collision.surface import ACTIVE, NONFINITE, PAIRS, build_surface, update_surface
 from taisoft.errors import SceneError, SimulationError
@@ -122,8 +113,6 @@ class Detection:
         self._intersections: Intersections | None = None
         self._self_on, self.floor = properties["self_on"], FLOOR * float(self.edges[: len(bodies)].min())
         self._paths: PathCheck | None = None
-        self.none_cross = False  # whether no surfaces are known to cross at the positions that are searched
-        self.held = NO_PASSAGES  # which every search adds as contacts
         self._containment = Containment(scene, self.topology, layout, self._rest, self._analytic, self_collision)
         self._placed = [MOVING] * len(obstacles)  # the paths at whose ends obstacles rest, as they were last placed
         self._frames = AnalyticFrames(self.shapes, self._analytic)
@@ -156,19 +145,28 @@ class Detection:
 
     # --- a search -------------------------------------------------------------------------------------------------
 
-    def find(self, time: float, dt: float, prescribed: tuple[np.ndarray, np.ndarray] | None = None, path=None) -> None:
+    def find(
+        self,
+        time: float,
+        dt: float,
+        prescribed: tuple[np.ndarray, np.ndarray] | None = None,
+        path=None,
+        held: HeldPassages = NO_PASSAGES,
+        none_cross: bool = False,
+    ) -> None:
         """Find the contacts of the model's present state swept by dt [s]: pairs closer than the margin at any time in the step.
 
         Faces that have passed each other are found to a depth of `reach`, the margin plus a tenth of the mean edge.
 
         time [s]: of the obstacles. prescribed: (k,) nodes and their (k,3) displacements in the step [m], nan where free.
-        path: field of (n_nodes) f64 3-vectors [m], displacements of the nodes to use instead of v dt.
+        path: field of (n_nodes) f64 3-vectors [m], displacements of the nodes to use instead of v dt. held: passages that become
+        contacts. none_cross: whether no surfaces are known to cross here.
         Raise SimulationError if positions are not finite, or if a buffer would outgrow its limit.
         """
         self._move(time, dt, prescribed, path)
         self._broad_result = self._near()
-        self._search(self._broad_result)
-        self._reduce()
+        self._search(self._broad_result, held)
+        self._reduce(none_cross)
 
     def _move(self, time: float, dt: float, prescribed: tuple[np.ndarray, np.ndarray] | None = None, path=None) -> None:
         """Update positions and displacements of the surface, and the boxes."""
@@ -215,15 +213,15 @@ class Detection:
         """Run the broad phase; None if no two surfaces can touch."""
         return self.broad.near() if self.has_pairs else None
 
-    def _search(self, near: Trees | Candidates | None) -> None:
+    def _search(self, near: Trees | Candidates | None, held: HeldPassages) -> None:
         """Fill the buffer of contacts, growing buffers as needed."""
         while True:
-            self._fill_buffer(near)
+            self._fill_buffer(near, held)
             grown = near is not None and self._near_buffer.grow_if_full()
             if not self.buffer.grow_if_full() and not grown:
                 break
 
-    def _fill_buffer(self, near: Trees | Candidates | None) -> None:
+    def _fill_buffer(self, near: Trees | Candidates | None, held: HeldPassages) -> None:
         """Write the contacts before reduction, as many as fit."""
         s, out, append, padding = self.surface, self.buffer.parts, 0, 0.5 * self.reach
         if near is not None:
@@ -237,10 +235,10 @@ class Detection:
         if self.shapes.count:
             find_analytic(s, self.shapes, self.margin, out, append)
             append = 1
-        if len(self.held.pairs):
-            append_passages(s, self.shapes, self._paths.fields, *self.held, out, append)
+        if len(held.pairs):
+            append_passages(s, self.shapes, self._paths.fields, *held, out, append)
 
-    def _reduce(self) -> None:
+    def _reduce(self, none_cross: bool) -> None:
         """Reduce the contacts and update the counts."""
         b = self.buffer
         if self._reduction is None or self._reduction.place.shape[0] != b.capacity:
@@ -248,7 +246,7 @@ class Detection:
             self._reduction = reduction_fields(arena, b.capacity, b.chunks, self.surface.serial_cheap, self.surface.cheap_spread)
             self._reduction_arena.release()
             self._reduction_arena = arena
-        lowest_gap = -self.floor if self.none_cross else -np.inf  # if none cross, a vertex behind a face is not inside
+        lowest_gap = -self.floor if none_cross else -np.inf  # if none cross, a vertex behind a face is not inside
         reduce_contacts(self._reduction, b.parts, MERGED * self.edge, REDUCTION_CELL * self.edge, lowest_gap)
         count, surface = self.counts, self.surface.count
         if self.has_pairs:
@@ -261,21 +259,23 @@ class Detection:
     # --- results --------------------------------------------------------------------------------------------------
 
     def contacts(self) -> Contacts:
-        """Return the contacts of the last search, with impulses 0."""
-        floats, integers = gather(self.buffer.data, self._reduction.kept, self._reduction.count[LEFT])
-        none, (nodes, weights) = np.zeros((len(floats), 3)), self._sides(floats, integers)
-        geometry = (x.copy() for x in (floats[:, :3], floats[:, 3:6], floats[:, 12]))
-        what = none, integers[:, :2], integers[:, 2:5], nodes, weights
-        return named_contacts(self.scene, *geometry, *what, found=self.counts.found, unmapped=self.counts.unmapped)
+        """Return the contacts of the last search, with impulses 0, in order of colliders and feature: one that does not depend on
+        threads or chunks."""
+        data, at, counts = self.buffer.data, self.kept.to_numpy(self.counts.contacts), self.counts
+        at = at[np.lexsort(np.hstack([data.body.at(at), data.feature.at(at)])[:, ::-1].T)]
+        point, normal, gap, collider, feature = (x.at(at) for x in (data.point, data.normal, data.gap, data.body, data.feature))
+        what = np.zeros((len(at), 3)), collider, feature, *self.sides(at)
+        return named_contacts(self.scene, point, normal, gap, *what, found=counts.found, unmapped=counts.unmapped)
 
-    def _sides(self, floats: np.ndarray, integers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Nodes and weights (k,6) of contacts, three of each side, from rows of the buffer; -1 where there is none."""
-        nodes = np.where(integers[:, 5:] >= 0, np.append(self.topology.node, -1)[integers[:, 5:]], -1)
-        return nodes, np.where(nodes >= 0, floats[:, 6:12], 0.0)
+    def sides(self, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Nodes and weights (k,6) of the contacts at places (k,) of the buffer, before dependent nodes are replaced.
 
-    def sides(self, n: int) -> tuple[np.ndarray, np.ndarray]:
-        """Nodes and weights (n,6) of the first n kept contacts of the last search, before dependent ones are replaced."""
-        return self._sides(*gather(self.buffer.data, self._reduction.kept, n, ordered=False))
+        There are three of each side, -1 where there is none.
+        """
+        data = self.buffer.data
+        vertices = np.hstack([data.nodes_a.at(at), data.nodes_b.at(at)])
+        nodes = np.where(vertices >= 0, np.append(self.topology.node, -1)[vertices], -1)
+        return nodes, np.where(nodes >= 0, np.hstack([data.weights_a.at(at), data.weights_b.at(at)]), 0.0)
 
     @property
     def kept(self):

@@ -8,9 +8,10 @@ from dataclasses import replace
 import numpy as np
 import taichi as ti
 
-from taisoft.backend.arrays import FieldArena, download
+from taisoft.backend.arrays import FieldArena
 from taisoft.collision.contacts import Contacts
 from taisoft.collision.detector import Detection
+from taisoft.collision.path_check import NO_PASSAGES
 from taisoft.contact.build import (
     SELF_CONTACT,
     build_pair_numbers,
@@ -33,8 +34,8 @@ from taisoft.dynamics.contact_measures import (
 )
 from taisoft.dynamics.contact_paths import ContactPaths
 from taisoft.dynamics.impact import Rebounds
-from taisoft.dynamics.misplaced import Misplacement
-from taisoft.dynamics.readout import ContactRows, Pairs, read_contacts, read_rows, sum_on, sum_pairs, write_rows
+from taisoft.dynamics.misplaced import NO_SUMS, Misplacement
+from taisoft.dynamics.readout import ContactRows, Pairs, nodal_impulses, read_contacts, read_rows, sum_on, sum_pairs, write_rows
 from taisoft.dynamics.simulation_state import SimulationState
 from taisoft.errors import SimulationError
 from taisoft.scene.rigid import RigidBody
@@ -100,11 +101,6 @@ class ContactStep:
         self._arena, self._last_time, self._indexed = arena, 0.0, False
 
     @property
-    def flight(self) -> np.ndarray:
-        """Flight times of the colliders [s^2], see `Rebounds`."""
-        return self.rebounds.flight
-
-    @property
     def _has_paths(self) -> bool:
         """Whether motion is prescribed: the user may change it between two steps, and a path may end with the last one."""
         simulation = self.simulation
@@ -120,22 +116,26 @@ class ContactStep:
         return int(self.problem.count[0])
 
     def forget(self) -> None:
-        """Discard the search and the impulses of the last step, after the state was set."""
-        self.return_to_start(none_crossed=False)
-        self.misplaced.forget()
+        """Discard all that is known of a state and its past, after another one was set."""
+        now = self.simulation.now
+        now.flight[:], now.none_cross, now.misplaced = 0.0, False, NO_SUMS
+        self.discard()
 
-    def return_to_start(self, none_crossed: bool) -> None:
-        """Discard them after a step's start was restored. none_crossed: whether no surfaces are known to cross there."""
+    def discard(self) -> None:
+        """Discard the search, the impulses, and what was measured, after a return to the start of a step."""
+        now = self.simulation.now
+        self.discard_search(with_impulses=True)
+        self.penetration = self.relative_penetration = self._step_dt = 0.0
+        self._pairs, self.last_crossing, self.crossing = None, Crossing(), 0.0 if now.none_cross else None
+        now.held = NO_PASSAGES
+        self.misplaced.start_step()
+        self.paths.forget()
+
+    def discard_search(self, with_impulses: bool) -> None:
+        """Discard the search of a substep that was undone; the impulses that are left warm-start the next attempt."""
         self._searched = self._measured_end = None
-        self.problem.count[0] = 0
-        self._search_counts = 0, 0
-        self._last_time = self.penetration = self.relative_penetration = self._step_dt = 0.0
-        self._pairs = None
-        self.last_crossing = Crossing()
-        self.flight[:] = 0.0
-        self.misplaced.return_to_start()
-        self.paths.return_to_start(none_crossed)
-        self.crossing = 0.0 if none_crossed else None
+        if with_impulses:
+            self.problem.count[0], self._last_time, self._search_counts = 0, 0.0, (0, 0)
 
     def snapshot(self) -> dict:
         """Return the last step's contacts and impulses, and the capacity: a step that exceeds it starts without impulses.
@@ -155,9 +155,6 @@ class ContactStep:
             "dropped": self.dropped,
             "found": self._search_counts[0],
             "unmapped": self._search_counts[1],
-            "flight": self.flight.copy(),
-            "paths": self.paths.snapshot(),
-            "misplaced": self.misplaced.snapshot(),
             "rows": read_rows(self.problem),
         }
 
@@ -171,19 +168,11 @@ class ContactStep:
         self.relative_penetration = float(kept["relative_penetration"])
         self.had_impact, self.dropped = bool(kept["met"]), int(kept["dropped"])
         self._search_counts = int(kept["found"]), int(kept["unmapped"])
-        self.flight[:] = kept["flight"]
-        self.paths.restore(kept["paths"])
-        self.misplaced.restore(kept["misplaced"])
+        self.paths.forget()
+        self.misplaced.start_step()
         self.crossing, self.last_crossing = 0.0 if self.paths.none_cross else None, Crossing()
         self._searched = self._measured_end = None
         self._indexed = True  # so that the next step rebuilds the node index, even without contacts
-
-    def reset_substep(self, discard_impulses: bool) -> None:
-        """Discard the search after a substep was undone; the impulses warm-start the next attempt unless discarded, too."""
-        self._searched = self._measured_end = None
-        self.paths.undo()
-        if discard_impulses:
-            self.problem.count[0], self._last_time, self._search_counts = 0, 0.0, (0, 0)
 
     def _gap_targets(self) -> tuple[float, float, float, float]:
         """Contact offset [m]; fractions of a penetration and of a missing offset corrected per substep; maximum speed [m/s]."""
@@ -216,7 +205,8 @@ class ContactStep:
     def _find(self, *arguments, **named) -> None:
         """Call `Detection.find`; where nothing crosses, implicit steps drop what may never touch."""
         self.measures.forget()
-        self.detection.find(*arguments, **named)
+        now = self.simulation.now
+        self.detection.find(*arguments, **named, held=now.held, none_cross=now.none_cross)
         if self.paths.none_cross and not self._explicit and self.detection.counts.contacts:
             self.measures.drop_uncertain()
 
@@ -233,7 +223,7 @@ class ContactStep:
         keep_impulses(p, self.contact_offset)
         warm = dt / self._last_time if self._last_time > 0.0 else 0.0
         fill(p, m, d.surface, d.shapes, self.numbers, d.buffer.data, d.kept, n, dt, warm)
-        self._own_sides = d.sides(n) if m.has_dependents else None
+        self._own_sides = d.sides(d.kept.to_numpy(n)) if m.has_dependents else None
         if n or self._indexed:  # an empty index needs no update
             index_nodes(p)
             self._indexed = n > 0
@@ -318,7 +308,7 @@ class ContactStep:
         """
         if self._own_sides is None or len(self._own_sides[0]) != self.n_contacts or self._last_time == 0.0:
             return np.zeros((self.simulation.model.n_nodes, 3))
-        return self.rows(own=True).on_nodes(self.simulation.model.n_nodes) * self._impulse_fraction / self._last_time
+        return nodal_impulses(self.rows(own=True), self.simulation.model.n_nodes) * self._impulse_fraction / self._last_time
 
     def penetrates_deeper(self, time: float, dt: float, before: float) -> bool:
         """Return whether a substep of dt that ends at a time leaves a new or deeper penetration.
@@ -373,9 +363,9 @@ class ContactStep:
         self.paths.use_all()
         self._find(time, dt, path=self.paths.displacement)
         self._searched, self._searched_dt = (time, dt), dt
-        searched = set(map(tuple, download([self.problem.feature], self.n_contacts)[0].tolist()))
-        found = self.detection.buffer.data.feature.to_numpy()[download([self.detection.kept], self.detection.counts.contacts)[0]]
-        return not searched.issuperset(map(tuple, found.tolist()))
+        d, known = self.detection, set(map(tuple, self.problem.feature.to_numpy(self.n_contacts).tolist()))
+        found = d.buffer.data.feature.at(d.kept.to_numpy(d.counts.contacts))
+        return not known.issuperset(map(tuple, found.tolist()))
 
     def measure_start(self, time: float, dt: float) -> tuple[float, float]:
         """Return the deepest penetration before a step of dt over the finer mean surface edge, and its largest closing ratio."""

@@ -236,7 +236,7 @@ class Dynamics:
         moving = self.contact is not None and not all(obstacle.rests(self.state.time) for obstacle in self.scene.obstacles)
         dragged = self.drag_spring is not None and self.drag_spring.drag is not None
         driven = self.state.loads.vary or not self.state.loads.has_potential
-        return moving or dragged or driven or not all(self.state.dirichlet.released())
+        return moving or dragged or driven or not self.state.now.released.all()
 
     def mean_acceleration(self, nodes: np.ndarray) -> np.ndarray:
         """Return the mean acceleration (k,3) [m/s^2] of nodes (k,) in the last step or batch; 0 before the first one here.

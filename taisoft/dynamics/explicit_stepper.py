@@ -135,6 +135,7 @@ class ExplicitStepper:
             held_velocity=vectors("held_velocity", n_held, ti.f64),
             reaction=vectors("reaction", n_held),
         )
+        self.good = simulation.now.another(arena, "good")  # the last good state
         self.acceleration_stale = True  # Verlet's acceleration does not match the present state
 
     def forget(self) -> None:
@@ -191,27 +192,27 @@ class ExplicitStepper:
             times = simulation.time + dt * (np.arange(n) + int(self.work.verlet))  # Euler's forces are those at the start
             loads = self._load_rows(times)
         self._upload_rows(targets, loads)
-        kept = simulation.state()
+        self.good.copy_from(simulation.now)
         try:
             result = self._launch(n, dt)
         except BaseException:  # Ctrl-C, raised when the launch has ended: the batch is abandoned
-            self._restore_state(*kept)
+            self._return_to_good()
             raise
         if result.steps < n:
-            self._restore_state(*kept)
+            self._return_to_good()
             if result.steps > 0:  # deterministic on the CPU: repeat up to the last good sub-step
                 self._launch(result.steps, dt)
-            good = simulation.state()
+            self.good.copy_from(simulation.now)
             simulation.step_count += result.steps
             simulation.time += result.steps * dt
-            self._restore_state(*good)
+            self._return_to_good()
             rest = slice(result.steps, None)
             self._upload_rows(
                 None if targets is None else targets[rest], None if loads is None else tuple(rows[rest] for rows in loads)
             )
             self._launch(1, dt)
             fault = self._describe_fault()
-            self._restore_state(*good)
+            self._return_to_good()
             raise SimulationError(f"step {simulation.step_count + 1}: {fault}")
         return result
 
@@ -240,8 +241,9 @@ class ExplicitStepper:
         simulation = self.simulation
         return simulation.load_rows(times, self._varied), simulation.loads.amplitudes(times)
 
-    def _restore_state(self, x: np.ndarray, v: np.ndarray) -> None:
-        self.simulation.set_state(x, v)
+    def _return_to_good(self) -> None:
+        """Return to the last good state."""
+        self.simulation.return_to(self.good)
         self.simulation.set_load_time(self.simulation.time)
         self.acceleration_stale = True
 

@@ -30,10 +30,6 @@ class ContactRows:
     nodes: np.ndarray  # (k, 2 w), w of each side, -1 where there is none
     weights: np.ndarray  # (k, 2 w)
 
-    def on_nodes(self, n_nodes: int) -> np.ndarray:
-        """Return the impulses (n_nodes,3) [N s] on the nodes."""
-        return distribute(self.impulse, self.nodes, self.weights, n_nodes)
-
     def named(self, scene: Scene, **counts) -> Contacts:
         """Return the record by names. counts: `found`, `unmapped` and `duration` of a `Contacts`."""
         geometry = self.point, self.normal, self.gap, self.impulse, self.collider, self.feature, self.nodes, self.weights
@@ -92,19 +88,15 @@ def sum_on(found: Pairs, collider: int, other: int | None) -> np.ndarray:
     return total
 
 
-def nodal_impulses(contacts: Contacts, n_nodes: int) -> np.ndarray:
+def nodal_impulses(contacts: Contacts | ContactRows, n_nodes: int) -> np.ndarray:
     """Return the contact impulses (n_nodes, 3) [N s] on the nodes of all bodies, in the order added.
 
     contacts: a record from `Simulator.contacts`. Each impulse is distributed to the nodes that it acted on in the solver, by
     their weights, with its sign on side a and the opposite on side b, so that sums over a body are those of its contacts.
     """
-    return distribute(contacts.impulse, contacts.nodes, contacts.weights, n_nodes)
-
-
-def distribute(impulse: np.ndarray, nodes: np.ndarray, weights: np.ndarray, n_nodes: int) -> np.ndarray:
-    """Distribute impulses (k,3) [N s] to the nodes of both sides (k, 2 w) by their weights, with opposite signs: (n_nodes,3)."""
-    signs = np.repeat([1.0, -1.0], weights.shape[1] // 2)
-    parts, used, total = (signs * weights)[:, :, None] * impulse[:, None], nodes >= 0, np.zeros((n_nodes, 3))
+    nodes, weights = contacts.nodes, contacts.weights
+    signs, used, total = np.repeat([1.0, -1.0], weights.shape[1] // 2), nodes >= 0, np.zeros((n_nodes, 3))
+    parts = (signs * weights)[:, :, None] * contacts.impulse[:, None]
     for axis in range(3):
         total[:, axis] = np.bincount(nodes[used], parts[used][:, axis], n_nodes)
     return total

@@ -96,11 +96,7 @@ class LengthLimit:
 
 
 class Substepping:
-    """Wrap the plain steps of an implicit stepper: substeps, undoing and retries.
-
-    The stepper takes a substep (`take_substep`), repeats it with other contacts (`restore_start`, `retry_substep`), or undoes it
-    for another length (`undo_substep`). `save_start` and `return_to_start` save and restore the start of a step.
-    """
+    """Wrap the plain steps of an implicit stepper: substeps, undoing and retries."""
 
     def __init__(self, stepper: "ImplicitStepper"):
         self._stepper, self._contact = stepper, stepper.contact
@@ -117,8 +113,7 @@ class Substepping:
         history. Linearly implicit steps do not iterate. Raise SimulationError if a step fails; the state is then the one before.
         """
         stepper, substeps, discarded = self._stepper, 1, []
-        stepper.save_start()
-        stepper.begin_iterations()
+        stepper.begin_step()
         while True:
             result, unconverged, taken = None, True, substeps
             try:
@@ -126,7 +121,7 @@ class Substepping:
                 result, taken = merge(results), len(results)
                 unconverged = not (result.converged or stepper.is_linear)
             except BaseException as error:  # Ctrl-C, too
-                stepper.return_to_start(already_undone=True)
+                stepper.return_to_first()
                 may_retry = self.may_retry
                 stepper.forget()
                 if substeps == 1 or stepper.is_spent() or not isinstance(error, SimulationError):
@@ -139,7 +134,7 @@ class Substepping:
                 break
             self.may_retry = taken < RETRIES
             substeps = min(2 * taken, RETRIES) if self.may_retry else 1
-            stepper.return_to_start()
+            stepper.return_to_first()
         self.substeps = taken
         self.may_retry = (self.may_retry and not stepper.is_spent()) or not unconverged
         return count_all(result, discarded[:-1])
@@ -167,9 +162,8 @@ class Substepping:
                 if not contact.paths.none_cross:
                     self._refuse_fast_closing(dt)
                 length = min(dt / MAX_SUBSTEPS, remaining)  # the check of its path suffices
-            contact.start_substep(length)
+            stepper.begin_substep(length)
             relative_penetration, last = contact.relative_penetration, length > remaining - shortest
-            released = stepper.simulation.dirichlet.released()
             if is_rest:
                 may_cut, (result, fault) = False, self._hold_substep(time, length)
                 self.held_part += length / dt
@@ -181,8 +175,7 @@ class Substepping:
                 self._refuse_fast_closing(dt)
             is_held_back = fault == Fault.CROSSED and not may_cut
             if is_held_back:
-                contact.paths.hold_back(stepper.history.x_now)
-                stepper.break_history()
+                stepper.hold_back_paths()
                 result, fault = replace(result, converged=False), None
             if stepper.is_spent() and not (is_rest or result.converged or fault == Fault.FAST):
                 self._hold_back_inverted(length / dt)
@@ -198,7 +191,7 @@ class Substepping:
                 if fault == Fault.CROSSED:
                     self.limit.undo(length, again=n_crossed > 0)
                     n_crossed += 1
-                stepper.undo_substep(released, discard_impulses=fault == Fault.UNCONVERGED)
+                stepper.undo_substep(discard_impulses=fault == Fault.UNCONVERGED)
                 contact.relative_penetration, length = relative_penetration, 0.5 * length
                 continue
             # the present penetration is not new for the next substep
@@ -222,7 +215,7 @@ class Substepping:
         held = 1.0 - self._stepper.hold_back_inverted()
         self.held_part += of_step * held
         if held and self._contact.paths.find():
-            self._contact.paths.hold_back(self._stepper.history.x_now)
+            self._stepper.hold_back_paths()
 
     def _longest(self, longest: float, dt: float) -> float:
         """The longest substep that is tried in a step of dt, up to a given length. The limit may stem from smaller steps."""
@@ -261,15 +254,15 @@ class Substepping:
     def _take_substep(self, time: float, dt: float, may_cut: bool) -> tuple[StageResult, Fault | None]:
         """Take a substep of dt from a time, and repeat it while its path has new contacts. Leave its end as the state."""
         contact, stepper, before = self._contact, self._stepper, self._contact.relative_penetration
-        simulation, start, result = stepper.simulation, stepper.history.x_now, stepper.take_substep(time, dt)
+        simulation, start, result = stepper.simulation, stepper.start, stepper.take_substep(time, dt)
         n_failed = 0
         for tries in range(MAX_PASSAGES + 1):
-            as_searched = not contact.paths.left_searched(start)
+            as_searched = not contact.paths.left_searched(start.x)
             passes = as_searched and contact.paths.find()
             if as_searched and not passes and not contact.penetrates_deeper(time + dt, dt, before):
                 break
             state = simulation.state()
-            stepper.restore_start()
+            simulation.now.copy_nodes_from(start)
             new = contact.search_along_path(time, dt)
             if not as_searched:
                 passes = contact.paths.find(as_searched=True)
