@@ -112,7 +112,7 @@ class Detection:
         self._reduction = None
         self._intersections: Intersections | None = None
         self._self_on, self.floor = properties["self_on"], FLOOR * float(self.edges[: len(bodies)].min())
-        self._paths: PathCheck | None = None
+        self.paths: PathCheck | None = None  # see `prepare_paths`
         self._containment = Containment(scene, self.topology, layout, self._rest, self._analytic, self_collision)
         self._placed = [MOVING] * len(obstacles)  # the paths at whose ends obstacles rest, as they were last placed
         self._frames = AnalyticFrames(self.shapes, self._analytic)
@@ -236,7 +236,7 @@ class Detection:
             find_analytic(s, self.shapes, self.margin, out, append)
             append = 1
         if len(held.pairs):
-            append_passages(s, self.shapes, self._paths.fields, *held, out, append)
+            append_passages(s, self.shapes, self.paths.fields, *held, out, append)
 
     def _reduce(self, none_cross: bool) -> None:
         """Reduce the contacts and update the counts."""
@@ -306,43 +306,30 @@ class Detection:
         settings = self.scene.collision
         limits = settings.initial_capacity, settings.max_capacity
         options = self._self_on, self.has_pairs, self.reach, self.floor, self._arena, *limits
-        self._paths = PathCheck(self.surface, self.topology, self.shapes, *options)
+        self.paths = PathCheck(self.surface, self.topology, self.shapes, *options)
 
     def passages(self, mode: int) -> tuple[np.ndarray, np.ndarray] | None:
         """Return the passages (k,4) on the paths from the positions of the last search, and the parts (k,) of the step until
         which they are apart, or None, see `PathCheck.find`."""
-        return self._paths.find(self.model.state.x, self._broad_result, self._near_buffer, mode)
-
-    def forget_paths(self) -> None:
-        """Discard lists of near pairs, after positions were set."""
-        if self._paths is not None:
-            self._paths.forget()
-
-    def colliders_of(self, passages: np.ndarray) -> np.ndarray:
-        """Return the two colliders (k,2) of each of the given passages (k,4)."""
-        return self._paths.colliders(passages)
+        return self.paths.find(self.model.state.x, self._broad_result, self._near_buffer, mode)
 
     def are_round_and_move(self, passages: np.ndarray) -> bool:
         """Return whether all of the given passages (k,4) are through spheres or capsules that move."""
         moving = np.array([isinstance(c, Obstacle) and c.path is not None for c in self.scene.colliders])
-        return bool((passages[:, 0] == ROUND).all() and moving[self.colliders_of(passages)[:, 1]].all())
-
-    def features_of(self, passages: np.ndarray) -> np.ndarray:
-        """Return the vertices (k,6) of the features that meet in passages (k,4), see `PathCheck.features`."""
-        return self._paths.features(passages)
+        return bool((passages[:, 0] == ROUND).all() and moving[self.paths.colliders(passages)[:, 1]].all())
 
     def exempt_crossing(self) -> bool:
         """Exempt the pairs of colliders that cross or touch at the positions of the last search from further checks of paths, and
         no others. Return whether there are any."""
         n = len(self.scene.colliders)
         pairs = np.zeros((n, n), dtype=bool)
-        self._paths.exempt(pairs)
-        found = self.colliders_of(self.passages(STILL)[0])
+        self.paths.exempt(pairs)
+        found = self.paths.colliders(self.passages(STILL)[0])
         pairs[found[:, 0], found[:, 1]] = True
         for one in self.contained():
             pairs[one.a, one.b] = True
         if pairs.any():
-            self._paths.exempt(pairs)
+            self.paths.exempt(pairs)
         return bool(pairs.any())
 
     def contained(self) -> list[Inside]:
@@ -350,7 +337,7 @@ class Detection:
         return self._containment.find(self.surface, self.model.state.x, self.shapes)
 
     def _buffers(self) -> list[Buffer]:
-        paths = () if self._paths is None else self._paths.buffers
+        paths = () if self.paths is None else self.paths.buffers
         return [self.buffer, *((self._near_buffer, *self.broad.buffers) if self.has_pairs else ()), *paths]
 
     @property
@@ -360,7 +347,7 @@ class Detection:
 
     def release(self) -> None:
         """Free all memory."""
-        for part in (self.broad, self._intersections, self._near_buffer, self._paths):
+        for part in (self.broad, self._intersections, self._near_buffer, self.paths):
             if part is not None:
                 part.release()
         self.buffer.release()

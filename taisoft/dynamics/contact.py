@@ -23,15 +23,7 @@ from taisoft.contact.build import (
     upload_pair_numbers,
 )
 from taisoft.contact.problem import build_node_problem, index_nodes
-from taisoft.dynamics.contact_measures import (
-    CLOSING_RATIO,
-    DEEP_PENETRATION,
-    DEPTH,
-    NOTICEABLE_PENETRATION,
-    RELATIVE_PENETRATION,
-    ContactMeasures,
-    Crossing,
-)
+from taisoft.dynamics.contact_measures import DEEP_PENETRATION, DEPTH, RELATIVE_PENETRATION, ContactMeasures, Crossing
 from taisoft.dynamics.contact_paths import ContactPaths
 from taisoft.dynamics.impact import Rebounds
 from taisoft.dynamics.misplaced import NO_SUMS, Misplacement
@@ -40,18 +32,16 @@ from taisoft.dynamics.simulation_state import SimulationState
 from taisoft.errors import SimulationError
 from taisoft.scene.rigid import RigidBody
 
-CONTACT_OFFSET = 2e-3  # of the finest body's mean surface edge: gap to keep, so that motion in curves seldom needs a repetition
-PENETRATION_CORRECTION = {True: 0.05, False: 0.2}  # fraction of a penetration that an explicit (True) or implicit step corrects
-OFFSET_CORRECTION = {True: 0.005, False: 0.02}  # fraction of a missing contact offset, likewise
-MAX_OPENING_SPEED = 0.01  # of the slowest bar wave speed, sqrt(E / rho): maximum opening speed of both; a strain as large
 TOLERANCE = {"f32": 1e-4, "f64": 1e-6}  # default for the residual of the contact laws
-EXTRA_CAPACITY = 1024  # initial capacity beyond two contacts per triangle
 
 
 class ContactStep:
     """Find the contacts of each step and keep their problem. explicit: whether the steps are explicit."""
 
     idle = False  # see `NoContacts`
+    OFFSET = 2e-3  # of the finest body's mean surface edge: gap to keep, so that motion in curves seldom needs a repetition
+    MAX_OPENING_SPEED = 0.01  # of the slowest bar wave speed, sqrt(E / rho): of what is corrected; a strain as large
+    NOTICEABLE = 1e-3  # penetration over the finer side's mean edge above which the path of an implicit substep is searched
 
     def __init__(self, simulation: SimulationState, self_collision: bool, explicit: bool):
         self.simulation = simulation
@@ -62,19 +52,19 @@ class ContactStep:
         self.paths = ContactPaths(simulation, self.detection, self._lasting)
         self.misplaced = Misplacement(simulation, self.detection)
         d = self.detection
-        self.contact_offset = CONTACT_OFFSET * float(d.edges[: len(scene.bodies)].min())
+        self.contact_offset = self.OFFSET * float(d.edges[: len(scene.bodies)].min())
         if d.margin > 0.0:
             self.contact_offset = min(self.contact_offset, 0.5 * d.margin / (SELF_CONTACT if self_collision else 1.0))
-        self._corrections = PENETRATION_CORRECTION[explicit], OFFSET_CORRECTION[explicit]
+        # parts of a penetration and of a missing contact offset that a step corrects
+        self._corrections = (0.05, 0.005) if explicit else (0.2, 0.02)
         self._substep_fraction = 1.0  # of the step, that the current substep takes
         self.gap_targets = self._gap_targets()
         self._arena = FieldArena()
-        self._allocate(2 * d.surface.n_triangles + EXTRA_CAPACITY)
+        self._allocate(2 * d.surface.n_triangles + 1024)  # contacts at first
         self._numbers_arena = FieldArena()
         self.numbers = build_pair_numbers(self._numbers_arena, scene)
         self.rebounds = Rebounds(simulation, self._lasting)
         self._searched: tuple[float, float] | None = None  # time and dt of the valid search
-        self._searched_dt = 0.0  # dt of the last search, valid or not
         self._measured_end: tuple[float, float] | None = None  # time and dt of the measured end, until the next substep begins
         self._depth = 0.0  # deepest penetration there [m]
         self.crossing: float | None = None  # depth of crossing triangles over the finer side's edge; None: not measured
@@ -181,7 +171,7 @@ class ContactStep:
             self.contact_offset,
             self._substep_fraction * self._corrections[0],
             self._substep_fraction * self._corrections[1],
-            MAX_OPENING_SPEED * slowest,
+            self.MAX_OPENING_SPEED * slowest,
         )
 
     def numbers_changed(self) -> None:
@@ -199,14 +189,13 @@ class ContactStep:
         if searched is None or searched[1] != dt or abs(searched[0] - time) > 1e-6 * dt:
             self._searched = None
             self._find(time, dt, simulation.prescribed_moves(time + dt))
-            self._searched, self._searched_dt = (time, dt), dt
+            self._searched = time, dt
         return d.counts.contacts
 
-    def _find(self, *arguments, **named) -> None:
+    def _find(self, time: float, dt: float, prescribed=None, path=None) -> None:
         """Call `Detection.find`; where nothing crosses, implicit steps drop what may never touch."""
-        self.measures.forget()
-        now = self.simulation.now
-        self.detection.find(*arguments, **named, held=now.held, none_cross=now.none_cross)
+        self.measures.begin(dt)
+        self.detection.find(time, dt, prescribed, path, self.simulation.now.held, self.simulation.now.none_cross)
         if self.paths.none_cross and not self._explicit and self.detection.counts.contacts:
             self.measures.drop_uncertain()
 
@@ -316,7 +305,7 @@ class ContactStep:
         before: `relative_penetration` at its start.
         """
         self._measure_penetration(time, dt)
-        return self.relative_penetration > max(NOTICEABLE_PENETRATION, 1.1 * before)
+        return self.relative_penetration > max(self.NOTICEABLE, 1.1 * before)
 
     def end(self, time: float, dt: float) -> float:
         """Return the deepest penetration [m] at a time, the end of a step or substep of dt. Set `relative_penetration`."""
@@ -335,7 +324,7 @@ class ContactStep:
             if not self._has_paths:
                 raise
             self._find(time, 0.0)  # a path ends here; the next step reports it
-        closing = self.measures.closing(dt)
+        closing = self.measures.closing
         depth, self.relative_penetration = float(closing[DEPTH]), float(closing[RELATIVE_PENETRATION])
         if not self._explicit:
             crossing = self.measure_crossings()
@@ -362,7 +351,7 @@ class ContactStep:
         self._searched = self._measured_end = None
         self.paths.use_all()
         self._find(time, dt, path=self.paths.displacement)
-        self._searched, self._searched_dt = (time, dt), dt
+        self._searched = time, dt
         d, known = self.detection, set(map(tuple, self.problem.feature.to_numpy(self.n_contacts).tolist()))
         found = d.buffer.data.feature.at(d.kept.to_numpy(d.counts.contacts))
         return not known.issuperset(map(tuple, found.tolist()))
@@ -370,12 +359,7 @@ class ContactStep:
     def measure_start(self, time: float, dt: float) -> tuple[float, float]:
         """Return the deepest penetration before a step of dt over the finer mean surface edge, and its largest closing ratio."""
         self.search(time, dt)
-        closing = self.measures.closing(dt)
-        return float(closing[RELATIVE_PENETRATION]), float(closing[CLOSING_RATIO])
-
-    def closing_ratio_along_path(self) -> float:
-        """Return the largest closing ratio along the path of `search_along_path`."""
-        return float(self.measures.closing(self._searched_dt)[CLOSING_RATIO])
+        return float(self.measures.closing[RELATIVE_PENETRATION]), self.measures.closing_ratio
 
     def initial_crossing(self) -> float:
         """Return the depth of crossing triangles over the finer side's mean surface edge, at the start of a searched step."""
@@ -384,10 +368,6 @@ class ContactStep:
             self.paths.exempt_crossing()
             self._searched = None  # where none cross, other contacts are found
         return self.crossing
-
-    def describe_fast_closing(self, dt: float, substeps: int = 1) -> str:
-        """See `ContactMeasures.describe_fast_closing`; dt [s]."""
-        return self.measures.describe_fast_closing(dt, self._searched_dt, substeps)
 
     def contacts(self) -> Contacts:
         """Return the contacts of the last substep with their impulses."""

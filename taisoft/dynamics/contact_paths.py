@@ -23,13 +23,13 @@ from taisoft.errors import SimulationError
 from taisoft.fem.state import DEVIATION
 from taisoft.scene.connections import attached_pairs
 
-MAX_UNCHANGED = 3  # such checks in a row after which repeating a substep does not help
-SHORTENED = 0.9  # of the part of a path that is certainly free
-MAX_SHORTENINGS, LEAST = 30, 1e-6  # rounds, and part of a path: beyond these, bodies do not move at all
-
 
 class ContactPaths:
     """Check the paths of substeps and hold the passages found."""
+
+    MAX_UNCHANGED = 3  # checks in a row that find the same pairs, after which repeating a substep does not help
+    SHORTENED = 0.9  # of the part of a path that is certainly free: how far bodies that are held back move
+    MAX_SHORTENINGS, LEAST = 30, 1e-6  # rounds, and part of a path: beyond these, they do not move at all
 
     def __init__(self, simulation: SimulationState, detection: Detection, arena: FieldArena):
         self._simulation, self._detection = simulation, detection
@@ -47,13 +47,13 @@ class ContactPaths:
 
     def forget(self) -> None:
         """Discard all lists, after a state was set."""
-        self._detection.forget_paths()
+        self._detection.paths.forget()
         self.start_step()
 
     @property
     def is_stuck(self) -> bool:
         """Whether repeating the substep does not help any more: the same pairs pass, although they are contacts."""
-        return self._n_unchanged >= MAX_UNCHANGED
+        return self._n_unchanged >= self.MAX_UNCHANGED
 
     def start_step(self) -> None:
         """Begin a step, in which no bodies have been held back yet."""
@@ -96,7 +96,7 @@ class ContactPaths:
         held, n_held = self._held, len(self._held.pairs)
         every, time = np.concatenate([held.pairs, pairs]), np.concatenate([held.times, times])
         passed = np.concatenate([held.passed, np.zeros(len(pairs), dtype=np.int32)])
-        _, first, group = np.unique(self._detection.features_of(every), axis=0, return_index=True, return_inverse=True)
+        _, first, group = np.unique(self._detection.paths.features(every), axis=0, return_index=True, return_inverse=True)
         earliest = np.full(len(first), np.inf)
         np.minimum.at(earliest, group.reshape(-1)[n_held:], times)
         self._n_unchanged = self._n_unchanged + 1 if len(first) == n_held else 0
@@ -137,15 +137,15 @@ class ContactPaths:
             can_move[inert] = can_move[together].any()
         part, n_rounds = can_move.astype(np.float64), 0
         while len((found := d.passages(TO_STATE))[0]):
-            colliders, n_rounds = d.colliders_of(found[0]), n_rounds + 1
+            colliders, n_rounds = d.paths.colliders(found[0]), n_rounds + 1
             stuck = ~(part[colliders] > 0.0).any(axis=1)
             if stuck.any():
                 self._refuse(*colliders[stuck][0])
             shortened = np.ones(len(part))
             for side in range(2):
-                np.minimum.at(shortened, colliders[:, side], SHORTENED * found[1])
-            part = np.where(shortened < 1.0, part * shortened if n_rounds < MAX_SHORTENINGS else 0.0, part)
-            part[part < LEAST] = 0.0
+                np.minimum.at(shortened, colliders[:, side], self.SHORTENED * found[1])
+            part = np.where(shortened < 1.0, part * shortened if n_rounds < self.MAX_SHORTENINGS else 0.0, part)
+            part[part < self.LEAST] = 0.0
             for together in self._attached:
                 moving = together[can_move[together]]
                 part[moving] = part[moving].min(initial=1.0)

@@ -114,7 +114,7 @@ class ContactExplicitStepper(ExplicitStepper):
         simulation, contact, good = self.simulation, self.contact, self.good
         closing_ratio = contact.measure_start(time, dt)[1]
         if closing_ratio > 1.0 and not contact.paths.none_cross:
-            raise SimulationError(f"step {step}: {contact.describe_fast_closing(dt)}")
+            raise SimulationError(f"step {step}: {contact.measures.describe_fast_closing(dt)}")
         contact.start_substep(dt)
         result = self._solve_and_move(step, time, dt)
         for tries in range(MAX_PASSAGES + 1):

@@ -32,9 +32,7 @@ from taisoft.fem.rigid_tets import begin_rigid_stage
 from taisoft.fem.state import N_INVERTED
 from taisoft.settings import Settings
 
-LEAST_PART = 1e-3  # of a motion that is held back: below it nothing moves
 MAX_NEWTON, MAX_NEWTON_WITH_CONTACTS = 50, 25  # a step that needs more is cut in substeps, or reported as not converged
-TIGHTER = 0.1  # of the tolerance that would just balance the forces on a body
 DEFAULT_TOLERANCE = {"f32": 1e-4, "f64": 1e-8}  # relative residual; f32 forces carry 1e-6 to 1e-5 of rounding
 
 
@@ -209,7 +207,7 @@ class ImplicitStepper:
         self._return_in_part(0.0)
         n_start, part = self._count_inverted(), 1.0
         while n_end > n_start and part > 0.0:
-            part = 0.5 * part if part > LEAST_PART else 0.0
+            part = 0.5 * part if part > 1e-3 else 0.0
             self.simulation.set_state(*end)
             self._return_in_part(part)
             n_end = self._count_inverted()
@@ -328,7 +326,7 @@ class ImplicitStepper:
         if worst > LIMIT and not bounces:
             self.simulation.now.copy_nodes_from(self.start)
             self._begin(scheme, 0.0)
-            tighter = self.tolerance * LIMIT / min(worst, 1.0) * TIGHTER
+            tighter = self.tolerance * LIMIT / min(worst, 1.0) * 0.1  # a tenth of what would just balance the piece
             result = count_all(self._solve(scheme, dt, bounces, tighter), [result])
             worst, name = pieces.unbalanced_mean(self.solver, self._beta)
         return replace(result, unbalanced=(worst, name)) if worst > LIMIT else result

@@ -25,24 +25,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from taisoft.dynamics.contact_measures import DEEP_CROSSING, DEEP_PENETRATION, ROUNDING, next_length
+from taisoft.collision.intersections import CROSSED
+from taisoft.dynamics.contact_measures import DEEP_PENETRATION, ROUNDING, next_length
 from taisoft.dynamics.results import StageResult, count_all, merge
 from taisoft.errors import SimulationError
 
 if TYPE_CHECKING:
     from taisoft.dynamics.implicit import ImplicitStepper
 
-MAX_SUBSTEPS = 256  # per step
-MAX_CLOSING_RATIO = 2.0  # maximum closing ratio after a substep: its speed was not known when the step was cut
-MAX_SEARCHES = 3  # along a substep's actual path, if it left the expected one
 MAX_PASSAGES = 8  # repetitions of a substep with the pairs that would have passed through each other
-MAX_FAILED = 1  # attempts at a substep that did not converge, after which it is halved if something still passes
-MAX_PATIENCE = 8  # substeps kept before a longer one is tried
-HALF_TRIED = 0.51  # of a doubled limit: a substep up to this long, which divides a step equally, does not try it
-MAX_UNDONE = 16  # per step, for reasons other than speed and trials of a longer substep: each costs a few solves
-WORSENING = 1.1  # growth of an existing penetration that counts as a new one
-RETRIES = 4  # maximum number of equal substeps after non-convergence; only shorter substeps are halved for that
-MAX_UNCONVERGED = 2  # maximum consecutive halvings for that: if they do not help, more do not either
 
 
 class Fault(Enum):
@@ -63,19 +54,22 @@ class LengthLimit:
     persists from step to step, until a substep that is a whole step is kept.
     """
 
+    MAX_PATIENCE = 8
+    HALF_TRIED = 0.51  # of a doubled limit: a substep up to this long, which divides a step equally, does not try it
+
     def __init__(self):
         self.longest, self.patience, self.n_kept = math.inf, 1, 0  # [s]; substeps; substeps kept under this limit
         self.is_trial = False  # whether the limit was doubled, and no substep of that length has been kept since
 
     def undo(self, length: float, again: bool) -> None:
         """Count a substep that was undone, for half its length. again: whether the one before, at the same place, was too."""
-        self.patience = self.patience if again else min(2 * self.patience, MAX_PATIENCE)
+        self.patience = self.patience if again else min(2 * self.patience, self.MAX_PATIENCE)
         self.longest, self.n_kept, self.is_trial = 0.5 * length, 0, False
 
     def keep(self, length: float, dt: float) -> None:
         """Count a substep of a length that was kept in a step of dt."""
         is_whole = length > (1.0 - ROUNDING) * dt
-        if self.longest == math.inf or (self.is_trial and length <= HALF_TRIED * self.longest and not is_whole):
+        if self.longest == math.inf or (self.is_trial and length <= self.HALF_TRIED * self.longest and not is_whole):
             return
         if is_whole:
             self.__init__()
@@ -97,6 +91,15 @@ class LengthLimit:
 
 class Substepping:
     """Wrap the plain steps of an implicit stepper: substeps, undoing and retries."""
+
+    MAX_SUBSTEPS = 256  # per step
+    MAX_CLOSING_RATIO = 2.0  # maximum closing ratio after a substep: its speed was not known when the step was cut
+    MAX_SEARCHES = 3  # along a substep's actual path, if it left the expected one
+    MAX_FAILED = 1  # attempts at a substep that did not converge, after which it is halved if something still passes
+    MAX_UNDONE = 16  # per step, for reasons other than speed and trials of a longer substep: each costs a few solves
+    WORSENING = 1.1  # growth of an existing penetration that counts as a new one
+    RETRIES = 4  # maximum number of equal substeps after non-convergence; only shorter substeps are halved for that
+    MAX_UNCONVERGED = 2  # maximum consecutive halvings for that: if they do not help, more do not either
 
     def __init__(self, stepper: "ImplicitStepper"):
         self._stepper, self._contact = stepper, stepper.contact
@@ -130,10 +133,10 @@ class Substepping:
             if result is not None:
                 discarded.append(result)
             may_help = self.may_retry and not (self._contact.paths.held_back or stepper.is_spent())
-            if not (unconverged and may_help and (taken < RETRIES or substeps > 1)):
+            if not (unconverged and may_help and (taken < self.RETRIES or substeps > 1)):
                 break
-            self.may_retry = taken < RETRIES
-            substeps = min(2 * taken, RETRIES) if self.may_retry else 1
+            self.may_retry = taken < self.RETRIES
+            substeps = min(2 * taken, self.RETRIES) if self.may_retry else 1
             stepper.return_to_first()
         self.substeps = taken
         self.may_retry = (self.may_retry and not stepper.is_spent()) or not unconverged
@@ -145,8 +148,8 @@ class Substepping:
         Raise SimulationError if contacts close too fast.
         """
         contact, stepper, may_retry = self._contact, self._stepper, self.may_retry and not self._stepper.is_linear
-        shortest, longest = (1.0 - 1e-6) * dt / MAX_SUBSTEPS, dt / substeps
-        results, remaining, undo_budget, self.held_part = [], dt, MAX_UNDONE, 0.0
+        shortest, longest = (1.0 - 1e-6) * dt / self.MAX_SUBSTEPS, dt / substeps
+        results, remaining, undo_budget, self.held_part = [], dt, self.MAX_UNDONE, 0.0
         undone, n_unconverged, n_crossed = [], 0, 0  # of the current substep
         self._measure_start(start, dt)
         length = self._longest(longest, dt)
@@ -161,7 +164,7 @@ class Substepping:
             if length < shortest:
                 if not contact.paths.none_cross:
                     self._refuse_fast_closing(dt)
-                length = min(dt / MAX_SUBSTEPS, remaining)  # the check of its path suffices
+                length = min(dt / self.MAX_SUBSTEPS, remaining)  # the check of its path suffices
             stepper.begin_substep(length)
             relative_penetration, last = contact.relative_penetration, length > remaining - shortest
             if is_rest:
@@ -181,8 +184,8 @@ class Substepping:
                 self._hold_back_inverted(length / dt)
             if fault != Fault.FAST and not (fault and may_cut):
                 contact.penetration = contact.end(time + length, dt if last else length)
-                is_short = length < (1.0 - ROUNDING) * min(longest, dt / RETRIES)
-                fault = self._find_fault(result, may_retry and is_short and n_unconverged < MAX_UNCONVERGED)
+                is_short = length < (1.0 - ROUNDING) * min(longest, dt / self.RETRIES)
+                fault = self._find_fault(result, may_retry and is_short and n_unconverged < self.MAX_UNCONVERGED)
             if fault == Fault.FAST or (fault and may_cut):
                 is_trial = fault == Fault.CROSSED and self.limit.is_trial
                 undo_budget -= not (fault == Fault.FAST or is_trial)
@@ -219,7 +222,7 @@ class Substepping:
 
     def _longest(self, longest: float, dt: float) -> float:
         """The longest substep that is tried in a step of dt, up to a given length. The limit may stem from smaller steps."""
-        return min(longest, max(self.limit.longest, dt / MAX_SUBSTEPS))
+        return min(longest, max(self.limit.longest, dt / self.MAX_SUBSTEPS))
 
     def _closing_ratio(self, time: float, length: float) -> float:
         """Return the largest closing ratio of a substep; where nothing crosses 0, since the check of its path suffices."""
@@ -231,14 +234,14 @@ class Substepping:
         relative_penetration, _ = contact.measure_start(start, dt)
         crossing = contact.initial_crossing()
         contact.relative_penetration = max(relative_penetration, crossing)
-        self._deepest, self._most_crossed = DEEP_PENETRATION, DEEP_CROSSING
+        self._deepest, self._most_crossed = DEEP_PENETRATION, CROSSED
         self._raise_limits(contact.relative_penetration, crossing)
         contact.start_step(dt)
 
     def _raise_limits(self, relative_penetration: float, crossing: float) -> None:
         """Raise the limits above which a penetration or crossing is new to WORSENING times the given ones."""
-        self._deepest = max(self._deepest, WORSENING * relative_penetration)
-        self._most_crossed = max(self._most_crossed, WORSENING * crossing)
+        self._deepest = max(self._deepest, self.WORSENING * relative_penetration)
+        self._most_crossed = max(self._most_crossed, self.WORSENING * crossing)
 
     def _find_fault(self, result: StageResult, may_be_unconverged: bool) -> Fault | None:
         """Return the fault of a substep whose end has been measured, if any."""
@@ -249,7 +252,7 @@ class Substepping:
 
     def _refuse_fast_closing(self, dt: float) -> None:
         number = self._stepper.simulation.step_count + 1
-        raise SimulationError(f"step {number}: {self._contact.describe_fast_closing(dt, MAX_SUBSTEPS)}")
+        raise SimulationError(f"step {number}: {self._contact.measures.describe_fast_closing(dt, self.MAX_SUBSTEPS)}")
 
     def _take_substep(self, time: float, dt: float, may_cut: bool) -> tuple[StageResult, Fault | None]:
         """Take a substep of dt from a time, and repeat it while its path has new contacts. Leave its end as the state."""
@@ -270,13 +273,13 @@ class Substepping:
                 new = contact.search_along_path(time, dt) if passes else new and not contact.paths.none_cross
             n_failed += not (result.converged or stepper.is_linear)
             # a slide by D over a radius R cuts D^2 / 2R deep, farther than contacts of the start keep surfaces apart: try again
-            failed = may_cut and n_failed >= MAX_FAILED and not contact.paths.are_round()
+            failed = may_cut and n_failed >= self.MAX_FAILED and not contact.paths.are_round()
             hopeless = stepper.is_spent() or (passes and (contact.paths.is_stuck or failed))
-            if not (new or passes) or tries >= (MAX_PASSAGES if passes else MAX_SEARCHES) or hopeless:
+            if not (new or passes) or tries >= (MAX_PASSAGES if passes else self.MAX_SEARCHES) or hopeless:
                 simulation.set_state(*state)
                 if passes:
                     return result, Fault.CROSSED
-                if not contact.paths.none_cross and contact.closing_ratio_along_path() > MAX_CLOSING_RATIO:
+                if not contact.paths.none_cross and contact.measures.closing_ratio > self.MAX_CLOSING_RATIO:
                     return result, Fault.FAST
                 return result, Fault.UNSETTLED if new else None
             result = count_all(stepper.retry_substep(time, dt, state[1]), [result])

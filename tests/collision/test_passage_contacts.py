@@ -50,7 +50,7 @@ class Detected:
     def meeting(self) -> set[frozenset[str]]:
         """The names of colliders that would pass each other."""
         names = [c.name for c in self.made.scene.colliders]
-        found = self.detection.colliders_of(self.detection.passages(SEARCHED)[0])
+        found = self.detection.paths.colliders(self.detection.passages(SEARCHED)[0])
         return {frozenset((names[a], names[b])) for a, b in found}
 
 
@@ -125,7 +125,7 @@ def test_held_passages_are_contacts():
                     radius, expected = 0.0, distance_of(start[i] + s * move[i], f)
                     assert set(nodes[w > 0]) <= set(i)
                 else:
-                    o = scene.obstacles[d.colliders_of(np.array([(kind, a, b, f)]))[0, 1] - n_soft]
+                    o = scene.obstacles[d.paths.colliders(np.array([(kind, a, b, f)]))[0, 1] - n_soft]
                     x_b, move_b, radius, expected = o.shape.pivot, np.zeros(3), 0.0, 0.0
                     if kind == ROUND:
                         i, radius = node[t[a]], o.shape.radius

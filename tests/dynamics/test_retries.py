@@ -181,10 +181,10 @@ class FakeStepper:
 
     is_linear = none_cross = is_stuck = False
     relative_penetration = crossing = x = 0.0
-    step_count = 4
+    step_count, closing_ratio = 4, 10.0
 
     def __init__(self):
-        self.contact = self.paths = self.simulation = self.now = self.start = self
+        self.contact = self.paths = self.measures = self.simulation = self.now = self.start = self
         self.taken, self.kept, self.held_back, self.retry_starts = [], [], [], []
         self.converges = lambda time, dt: True
         self.depth = self.left_path = self.has_new_contacts = self.passes = self.fails = lambda time, dt: 0.0
@@ -194,9 +194,6 @@ class FakeStepper:
 
     def measure_start(self, time, dt):
         return 0.0, 0.0
-
-    def closing_ratio_along_path(self):
-        return 10.0
 
     def begin_step(self):
         self.first = self.x
