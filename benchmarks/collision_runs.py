@@ -15,6 +15,7 @@ from taisoft.backend.runtime import Runtime, compile_clock, kernel
 from taisoft.collision.bvh import Bvh
 from taisoft.collision.contacts import FOUND, KEPT, LEFT, UNKNOWN, is_same
 from taisoft.collision.detector import MERGED, Detection
+from taisoft.collision.path_check import NO_PASSAGES
 from taisoft.collision.spatial_hash import SpatialHash
 from taisoft.fem.model import build_model
 from taisoft.machine import Timing, summarise
@@ -210,9 +211,9 @@ class Rig:
         times.append(clock())
         near = d._near()
         times.append(clock())
-        d._search(near)
+        d._search(near, NO_PASSAGES)
         times.append(clock())
-        d._reduce()
+        d._reduce(none_cross=False)
         times.append(clock())
         return dict(zip(PHASES, np.diff(times).tolist()))
 

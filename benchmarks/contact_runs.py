@@ -37,7 +37,7 @@ PARTS = {
     "search": ("find", "closing"),
     "problem": ("begin", "set_free_velocities", "find_factors"),
     "solve": ("colour_contacts", "solve"),
-    "elasticity": ("keep_state", "predict", "move"),
+    "elasticity": ("predict", "move"),
 }
 
 

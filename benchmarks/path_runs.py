@@ -77,8 +77,8 @@ def unchecked():
 def pairs_checked(detection: Detection) -> int:
     """Pairs that a check looks at: near and adjacent triangles, and triangles beside spheres and capsules."""
     round_shapes = sum(isinstance(obstacle.shape, Sphere | Capsule) for obstacle in detection.scene.obstacles)
-    near = detection._paths.near.count[TOTAL] if detection.has_pairs else 0
-    return int(near) + len(detection._paths._rows) + round_shapes * detection.surface.n_triangles
+    near = detection.paths.near.count[TOTAL] if detection.has_pairs else 0
+    return int(near) + len(detection.paths._rows) + round_shapes * detection.surface.n_triangles
 
 
 # --- cost ---------------------------------------------------------------------------------------------------------------
@@ -134,7 +134,7 @@ def find_window(sim: ts.Simulator, cost: Cost) -> dict:
     contact, passing = sim._dynamics.contact, []
     for _ in range(WINDOWS):
         kept, near, contacts, cost.start, cost.relisting = sim._dynamics.snapshot(), [], [], sim.time, 0
-        held = contact is not None and len(contact.detection.held.pairs)
+        held = contact is not None and len(sim._dynamics.state.now.held.pairs)
         sim._dynamics.restore(kept)
         passing.clear()
         with observed(lambda paths, found, *_: passing.append(sim.step_count) if found else None):
@@ -144,7 +144,7 @@ def find_window(sim: ts.Simulator, cost: Cost) -> dict:
                     listed = counts.launches[LIST]
                     contacts.append(sim.step().n_contacts)
                     cost.relisting += counts.launches[LIST] > listed
-                    near.append(contact.detection._paths.near.count[TOTAL] if contact and contact.detection.has_pairs else 0)
+                    near.append(contact.detection.paths.near.count[TOTAL] if contact and contact.detection.has_pairs else 0)
         cost.launches = {kernel: counts.launches[kernel] for kernel in KERNELS}
         cost.near, cost.contacts, cost.passages = float(np.mean(near)), contacts[-1], len(set(passing))
         if contact is None or not passing and not held and min(contacts) > 0:
@@ -232,7 +232,7 @@ def capture(sim: ts.Simulator, row: Ways, steps: int) -> list[tuple[np.ndarray, 
         row.checks, row.pairs, row.seconds = row.checks + 1, row.pairs + pairs_checked(detection), row.seconds + seconds
         row.passages += new
         passages.append(found and not paths.uncovered)
-        last.append(None if found else (detection.surface.x.to_numpy(), detection._paths.fields.path.to_numpy()))
+        last.append(None if found else (detection.surface.x.to_numpy(), detection.paths.fields.path.to_numpy()))
 
     def end_substep(self) -> None:
         plain(self)

@@ -47,7 +47,7 @@ def contacts(self: "Simulator") -> "Contacts":
         return dynamics.contact.contacts()
     from taisoft.collision.contacts import no_contacts
 
-    return no_contacts()
+    return no_contacts(self.scene)
 
 
 def contact_force(self: "Simulator", name: str, other: str | None = None) -> np.ndarray:
@@ -83,7 +83,8 @@ def slip_velocity(self: "Simulator", name: str, other: str | None = None) -> np.
 def pairs_in_contact(self: "Simulator") -> list[tuple[str, str]]:
     """Return the names of the two bodies, or body and obstacle, of each pair that pressed on each other in the last step."""
     contact, names = self._open().contact, [c.name for c in self.scene.colliders]
-    return [] if contact is None else [(names[a], names[b]) for a, b in contact.pressing_pairs()]
+    pairs, sums = ((), ()) if contact is None else contact.pairs()
+    return [(names[a], names[b]) for (a, b), own in zip(pairs, sums) if own[-1] > 0.0]  # the last sum is of normal impulses
 
 
 def _mean_contact(sim: "Simulator", what: str, name: str, other: str | None) -> np.ndarray:

@@ -88,6 +88,10 @@ class Array:
             device_memory.read(self.device, data)
         return data
 
+    def at(self, indices: np.ndarray) -> np.ndarray:
+        """Return a copy of the entries at some indices (k,)."""
+        return (self.memory if self.memory is not None else self._download())[indices]
+
     def check(self, data: np.ndarray) -> None:
         """Raise ValueError unless data has the array's shape."""
         if data.shape != self.full_shape:

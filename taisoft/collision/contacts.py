@@ -24,6 +24,7 @@ from taisoft.backend.runtime import kernel
 from taisoft.collision.candidates import Parts
 from taisoft.collision.surface import cell_of, dvec, ivec
 from taisoft.display import short_repr
+from taisoft.scene.scene import Scene
 
 # kinds of contacts; their two ids are: vertex and triangle; edge and edge (3 triangle + local edge); vertex and collider;
 # triangle and collider; a passage (`passages`)
@@ -94,12 +95,23 @@ class Contacts:
         return columns
 
 
-def no_contacts() -> Contacts:
+def named_contacts(
+    scene: Scene, point, normal, gap, impulse, collider, feature, nodes, weights, *, found: int, unmapped: int, duration=0.0
+) -> Contacts:
+    """Return the record of contact arrays (k, ...), with names, friction and restitution. collider: (k,2) indices."""
+    names, kinds = np.array([c.name for c in scene.colliders], dtype=object), np.array(KINDS, dtype=object)
+    pairs, pair = np.unique(collider, axis=0, return_inverse=True)
+    numbers = np.array([scene.contact_numbers(names[a], names[b]) for a, b in pairs]).reshape(-1, 2)[pair.reshape(-1)]
+    geometry, labels = (point, normal, gap, impulse), (names[collider[:, 0]], names[collider[:, 1]])
+    what = (nodes, weights, kinds[feature[:, 0]], feature[:, 1:], numbers[:, 0], numbers[:, 1])
+    return Contacts(*geometry, *labels, *what, found, unmapped, duration)
+
+
+def no_contacts(scene: Scene) -> Contacts:
     """Return an empty record."""
-    names, numbers, vectors = np.zeros(0, dtype=object), np.zeros(0), np.zeros((0, 3))
-    nodes, feature = np.zeros((0, 6), dtype=np.int64), np.zeros((0, 2), dtype=np.int64)
-    geometry = (vectors, vectors, numbers, vectors, names, names, nodes, np.zeros((0, 6)))
-    return Contacts(*geometry, names, feature, numbers, numbers, found=0, unmapped=0)
+    geometry = np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros((0, 3))
+    integers = (np.zeros((0, n), dtype=np.int64) for n in (2, 3, 6))
+    return named_contacts(scene, *geometry, *integers, np.zeros((0, 6)), found=0, unmapped=0)
 
 
 def contact_fields(arena: FieldArena, capacity: int) -> ContactFields:
@@ -153,39 +165,6 @@ def write_point_contact(s: ti.template(), out: ti.template(), at, last, t, j, w,
         i = s.triangle[t, j]
         feature, nodes, weights = ivec(VERTEX_FIELD, i, other), ivec(i, -1, -1), dvec(1.0, 0.0, 0.0)
     write_contact(out, at, last, s.body[t], other, feature, point, n, gap, nodes, weights, nodes_b, weights_b)
-
-
-@kernel
-def gather_contacts(
-    out: ti.template(), index: ti.template(), n: ti.i32, floats: ti.types.ndarray(), integers: ti.types.ndarray()
-):
-    """Copy the contacts index[:n] for `gather`: floats (n,13) and integers (n,11)."""
-    ti.loop_config(serialize=True)
-    for i in range(n):
-        at = index[i]
-        floats[i, 12] = out.gap[at]
-        for q in ti.static(range(3)):
-            floats[i, q], floats[i, 3 + q] = out.point[at][q], out.normal[at][q]
-            floats[i, 6 + q], floats[i, 9 + q] = out.weights_a[at][q], out.weights_b[at][q]
-            integers[i, 2 + q] = out.feature[at][q]
-            integers[i, 5 + q], integers[i, 8 + q] = out.nodes_a[at][q], out.nodes_b[at][q]
-        for q in ti.static(range(2)):
-            integers[i, q] = out.body[at][q]
-
-
-def gather(out: ContactFields, index: Any, n: int, ordered: bool = True) -> tuple[np.ndarray, np.ndarray]:
-    """Download the contacts at the buffer indices index[:n], in order of colliders and feature: an order independent of threads
-    and chunks, so that a solver meets the same one in the next step. ordered: False, in that of `index`.
-
-    Returns (n,13) point, normal, weights (6) and gap; (n,11) colliders (2), feature (3), nodes (6).
-    """
-    floats, integers = np.zeros((n, 13)), np.zeros((n, 11), dtype=np.int32)
-    if n:
-        gather_contacts(out, index, n, floats, integers)
-    if not ordered:
-        return floats, integers
-    order = np.lexsort(integers[:, 4::-1].T)
-    return floats[order], integers[order]
 
 
 # --- reduction -----------------------------------------------------------------------------------------------

@@ -15,7 +15,7 @@ from taisoft.collision.analytic import NO_SHAPES, AnalyticFrames, build_analytic
 from taisoft.collision.bvh import Bvh, Trees
 from taisoft.collision.candidates import Buffer, Candidates, entries
 from taisoft.collision.colliders import body_grid, collider_surfaces, collider_thickness, prescribed_vertices
-from taisoft.collision.contacts import FOUND, KINDS, LEFT, Contacts, contact_fields, gather, reduce_contacts, reduction_fields
+from taisoft.collision.contacts import FOUND, LEFT, Contacts, contact_fields, named_contacts, reduce_contacts, reduction_fields
 from taisoft.collision.distance_field import DistanceFields, build_fields, find_in_fields
 from taisoft.collision.edge_edge import find_proximity
 from taisoft.collision.features import BY_EDGES, BY_FACES, BY_FIELD
@@ -23,7 +23,7 @@ from taisoft.collision.intersections import Intersections, find_crossings
 from taisoft.collision.near_list import STILL
 from taisoft.collision.overlap import Containment, Inside
 from taisoft.collision.passages import ROUND, append_passages
-from taisoft.collision.path_check import NO_PASSAGES, PathCheck
+from taisoft.collision.path_check import NO_PASSAGES, HeldPassages, PathCheck
 from taisoft.collision.spatial_hash import SpatialHash
 from taisoft.collision.surface import ACTIVE, NONFINITE, PAIRS, build_surface, update_surface
 from taisoft.errors import SceneError, SimulationError
@@ -112,9 +112,7 @@ class Detection:
         self._reduction = None
         self._intersections: Intersections | None = None
         self._self_on, self.floor = properties["self_on"], FLOOR * float(self.edges[: len(bodies)].min())
-        self._paths: PathCheck | None = None
-        self.none_cross = False  # whether no surfaces are known to cross at the positions that are searched
-        self.held = NO_PASSAGES  # which every search adds as contacts
+        self.paths: PathCheck | None = None  # see `prepare_paths`
         self._containment = Containment(scene, self.topology, layout, self._rest, self._analytic, self_collision)
         self._placed = [MOVING] * len(obstacles)  # the paths at whose ends obstacles rest, as they were last placed
         self._frames = AnalyticFrames(self.shapes, self._analytic)
@@ -147,19 +145,28 @@ class Detection:
 
     # --- a search -------------------------------------------------------------------------------------------------
 
-    def find(self, time: float, dt: float, prescribed: tuple[np.ndarray, np.ndarray] | None = None, path=None) -> None:
+    def find(
+        self,
+        time: float,
+        dt: float,
+        prescribed: tuple[np.ndarray, np.ndarray] | None = None,
+        path=None,
+        held: HeldPassages = NO_PASSAGES,
+        none_cross: bool = False,
+    ) -> None:
         """Find the contacts of the model's present state swept by dt [s]: pairs closer than the margin at any time in the step.
 
         Faces that have passed each other are found to a depth of `reach`, the margin plus a tenth of the mean edge.
 
         time [s]: of the obstacles. prescribed: (k,) nodes and their (k,3) displacements in the step [m], nan where free.
-        path: field of (n_nodes) f64 3-vectors [m], displacements of the nodes to use instead of v dt.
+        path: field of (n_nodes) f64 3-vectors [m], displacements of the nodes to use instead of v dt. held: passages that become
+        contacts. none_cross: whether no surfaces are known to cross here.
         Raise SimulationError if positions are not finite, or if a buffer would outgrow its limit.
         """
         self._move(time, dt, prescribed, path)
         self._broad_result = self._near()
-        self._search(self._broad_result)
-        self._reduce()
+        self._search(self._broad_result, held)
+        self._reduce(none_cross)
 
     def _move(self, time: float, dt: float, prescribed: tuple[np.ndarray, np.ndarray] | None = None, path=None) -> None:
         """Update positions and displacements of the surface, and the boxes."""
@@ -206,15 +213,15 @@ class Detection:
         """Run the broad phase; None if no two surfaces can touch."""
         return self.broad.near() if self.has_pairs else None
 
-    def _search(self, near: Trees | Candidates | None) -> None:
+    def _search(self, near: Trees | Candidates | None, held: HeldPassages) -> None:
         """Fill the buffer of contacts, growing buffers as needed."""
         while True:
-            self._fill_buffer(near)
+            self._fill_buffer(near, held)
             grown = near is not None and self._near_buffer.grow_if_full()
             if not self.buffer.grow_if_full() and not grown:
                 break
 
-    def _fill_buffer(self, near: Trees | Candidates | None) -> None:
+    def _fill_buffer(self, near: Trees | Candidates | None, held: HeldPassages) -> None:
         """Write the contacts before reduction, as many as fit."""
         s, out, append, padding = self.surface, self.buffer.parts, 0, 0.5 * self.reach
         if near is not None:
@@ -228,10 +235,10 @@ class Detection:
         if self.shapes.count:
             find_analytic(s, self.shapes, self.margin, out, append)
             append = 1
-        if len(self.held.pairs):
-            append_passages(s, self.shapes, self._paths.fields, *self.held, out, append)
+        if len(held.pairs):
+            append_passages(s, self.shapes, self.paths.fields, *held, out, append)
 
-    def _reduce(self) -> None:
+    def _reduce(self, none_cross: bool) -> None:
         """Reduce the contacts and update the counts."""
         b = self.buffer
         if self._reduction is None or self._reduction.place.shape[0] != b.capacity:
@@ -239,7 +246,7 @@ class Detection:
             self._reduction = reduction_fields(arena, b.capacity, b.chunks, self.surface.serial_cheap, self.surface.cheap_spread)
             self._reduction_arena.release()
             self._reduction_arena = arena
-        lowest_gap = -self.floor if self.none_cross else -np.inf  # if none cross, a vertex behind a face is not inside
+        lowest_gap = -self.floor if none_cross else -np.inf  # if none cross, a vertex behind a face is not inside
         reduce_contacts(self._reduction, b.parts, MERGED * self.edge, REDUCTION_CELL * self.edge, lowest_gap)
         count, surface = self.counts, self.surface.count
         if self.has_pairs:
@@ -252,29 +259,23 @@ class Detection:
     # --- results --------------------------------------------------------------------------------------------------
 
     def contacts(self) -> Contacts:
-        """Return the contacts of the last search, with impulses 0."""
-        floats, integers = gather(self.buffer.data, self._reduction.kept, self._reduction.count[LEFT])
-        none, (nodes, weights) = np.zeros((len(floats), 3)), self._sides(floats, integers)
-        geometry = (x.copy() for x in (floats[:, :3], floats[:, 3:6], floats[:, 12]))
-        return self.record(*geometry, none, integers[:, :2], integers[:, 2:5], nodes, weights)
+        """Return the contacts of the last search, with impulses 0, in order of colliders and feature: one that does not depend on
+        threads or chunks."""
+        data, at, counts = self.buffer.data, self.kept.to_numpy(self.counts.contacts), self.counts
+        at = at[np.lexsort(np.hstack([data.body.at(at), data.feature.at(at)])[:, ::-1].T)]
+        point, normal, gap, collider, feature = (x.at(at) for x in (data.point, data.normal, data.gap, data.body, data.feature))
+        what = np.zeros((len(at), 3)), collider, feature, *self.sides(at)
+        return named_contacts(self.scene, point, normal, gap, *what, found=counts.found, unmapped=counts.unmapped)
 
-    def _sides(self, floats: np.ndarray, integers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Nodes and weights (k,6) of contacts, three of each side, from rows of the buffer; -1 where there is none."""
-        nodes = np.where(integers[:, 5:] >= 0, np.append(self.topology.node, -1)[integers[:, 5:]], -1)
-        return nodes, np.where(nodes >= 0, floats[:, 6:12], 0.0)
+    def sides(self, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Nodes and weights (k,6) of the contacts at places (k,) of the buffer, before dependent nodes are replaced.
 
-    def sides(self, n: int) -> tuple[np.ndarray, np.ndarray]:
-        """Nodes and weights (n,6) of the first n kept contacts of the last search, before dependent ones are replaced."""
-        return self._sides(*gather(self.buffer.data, self._reduction.kept, n, ordered=False))
-
-    def record(self, point, normal, gap, impulse, body, feature, nodes, weights) -> Contacts:
-        """Return a record of contact arrays (k, ...), with collider names, friction and restitution. body: (k,2) colliders."""
-        names = np.array([c.name for c in self.scene.colliders], dtype=object)
-        pairs, pair = np.unique(body, axis=0, return_inverse=True)
-        numbers = np.array([self.scene.contact_numbers(names[a], names[b]) for a, b in pairs]).reshape(-1, 2)[pair.reshape(-1)]
-        kinds, labels = np.array(KINDS, dtype=object), (names[body[:, 0]], names[body[:, 1]])
-        what = (nodes, weights, kinds[feature[:, 0]], feature[:, 1:], numbers[:, 0], numbers[:, 1])
-        return Contacts(point, normal, gap, impulse, *labels, *what, self.counts.found, self.counts.unmapped)
+        There are three of each side, -1 where there is none.
+        """
+        data = self.buffer.data
+        vertices = np.hstack([data.nodes_a.at(at), data.nodes_b.at(at)])
+        nodes = np.where(vertices >= 0, np.append(self.topology.node, -1)[vertices], -1)
+        return nodes, np.where(nodes >= 0, np.hstack([data.weights_a.at(at), data.weights_b.at(at)]), 0.0)
 
     @property
     def kept(self):
@@ -305,43 +306,30 @@ class Detection:
         settings = self.scene.collision
         limits = settings.initial_capacity, settings.max_capacity
         options = self._self_on, self.has_pairs, self.reach, self.floor, self._arena, *limits
-        self._paths = PathCheck(self.surface, self.topology, self.shapes, *options)
+        self.paths = PathCheck(self.surface, self.topology, self.shapes, *options)
 
     def passages(self, mode: int) -> tuple[np.ndarray, np.ndarray] | None:
         """Return the passages (k,4) on the paths from the positions of the last search, and the parts (k,) of the step until
         which they are apart, or None, see `PathCheck.find`."""
-        return self._paths.find(self.model.state.x, self._broad_result, self._near_buffer, mode)
-
-    def forget_paths(self) -> None:
-        """Discard lists of near pairs, after positions were set."""
-        if self._paths is not None:
-            self._paths.forget()
-
-    def colliders_of(self, passages: np.ndarray) -> np.ndarray:
-        """Return the two colliders (k,2) of each of the given passages (k,4)."""
-        return self._paths.colliders(passages)
+        return self.paths.find(self.model.state.x, self._broad_result, self._near_buffer, mode)
 
     def are_round_and_move(self, passages: np.ndarray) -> bool:
         """Return whether all of the given passages (k,4) are through spheres or capsules that move."""
         moving = np.array([isinstance(c, Obstacle) and c.path is not None for c in self.scene.colliders])
-        return bool((passages[:, 0] == ROUND).all() and moving[self.colliders_of(passages)[:, 1]].all())
-
-    def features_of(self, passages: np.ndarray) -> np.ndarray:
-        """Return the vertices (k,6) of the features that meet in passages (k,4), see `PathCheck.features`."""
-        return self._paths.features(passages)
+        return bool((passages[:, 0] == ROUND).all() and moving[self.paths.colliders(passages)[:, 1]].all())
 
     def exempt_crossing(self) -> bool:
         """Exempt the pairs of colliders that cross or touch at the positions of the last search from further checks of paths, and
         no others. Return whether there are any."""
         n = len(self.scene.colliders)
         pairs = np.zeros((n, n), dtype=bool)
-        self._paths.exempt(pairs)
-        found = self.colliders_of(self.passages(STILL)[0])
+        self.paths.exempt(pairs)
+        found = self.paths.colliders(self.passages(STILL)[0])
         pairs[found[:, 0], found[:, 1]] = True
         for one in self.contained():
             pairs[one.a, one.b] = True
         if pairs.any():
-            self._paths.exempt(pairs)
+            self.paths.exempt(pairs)
         return bool(pairs.any())
 
     def contained(self) -> list[Inside]:
@@ -349,7 +337,7 @@ class Detection:
         return self._containment.find(self.surface, self.model.state.x, self.shapes)
 
     def _buffers(self) -> list[Buffer]:
-        paths = () if self._paths is None else self._paths.buffers
+        paths = () if self.paths is None else self.paths.buffers
         return [self.buffer, *((self._near_buffer, *self.broad.buffers) if self.has_pairs else ()), *paths]
 
     @property
@@ -359,7 +347,7 @@ class Detection:
 
     def release(self) -> None:
         """Free all memory."""
-        for part in (self.broad, self._intersections, self._near_buffer, self._paths):
+        for part in (self.broad, self._intersections, self._near_buffer, self.paths):
             if part is not None:
                 part.release()
         self.buffer.release()

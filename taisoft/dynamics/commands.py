@@ -22,7 +22,7 @@ class Commands:
     """The commands that a scene's obstacles and moved nodes follow at present. The scene is the simulator's own copy."""
 
     def __init__(self, scene: Scene, dirichlet: DirichletConditions):
-        self._scene = scene
+        self._scene, self._dirichlet = scene, dirichlet
         self._movers: list[Obstacle | MovedNodes] = [*scene.obstacles, *dirichlet.groups]
         self._followed: dict[int, Command] = {}  # by mover
 
@@ -48,7 +48,8 @@ class Commands:
         """Return the displacements (k,3) [m] of nodes that are still held. Raises SceneError."""
         group = self._movers[mover]
         shapes = ((3,), (len(group.nodes), 3))
-        found = None if group.released else checks.path_value(group.path, time, what, "displacement", shapes)
+        released = self._dirichlet.released[mover - len(self._scene.obstacles)]
+        found = None if released else checks.path_value(group.path, time, what, "displacement", shapes)
         if found is None:
             raise SceneError(f"{what}: its path has released it, and it moves freely")
         return np.broadcast_to(found, shapes[1]).copy()

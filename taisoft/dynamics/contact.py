@@ -8,9 +8,10 @@ from dataclasses import replace
 import numpy as np
 import taichi as ti
 
-from taisoft.backend.arrays import FieldArena, download
+from taisoft.backend.arrays import FieldArena
 from taisoft.collision.contacts import Contacts
 from taisoft.collision.detector import Detection
+from taisoft.collision.path_check import NO_PASSAGES
 from taisoft.contact.build import (
     SELF_CONTACT,
     build_pair_numbers,
@@ -22,46 +23,25 @@ from taisoft.contact.build import (
     upload_pair_numbers,
 )
 from taisoft.contact.problem import build_node_problem, index_nodes
-from taisoft.dynamics.contact_measures import (
-    CLOSING_RATIO,
-    DEEP_PENETRATION,
-    DEPTH,
-    NOTICEABLE_PENETRATION,
-    RELATIVE_PENETRATION,
-    ContactMeasures,
-    Crossing,
-)
+from taisoft.dynamics.contact_measures import DEEP_PENETRATION, DEPTH, RELATIVE_PENETRATION, ContactMeasures, Crossing
 from taisoft.dynamics.contact_paths import ContactPaths
-from taisoft.dynamics.contact_record import (
-    IMPULSE,
-    MOMENTS,
-    NORMAL,
-    SLIP,
-    Pairs,
-    distribute,
-    read_rows,
-    record_contacts,
-    sum_pairs,
-    write_rows,
-)
-from taisoft.dynamics.misplaced import Misplacement
+from taisoft.dynamics.misplaced import NO_SUMS, Misplacement
+from taisoft.dynamics.readout import ContactRows, Pairs, nodal_impulses, read_contacts, read_rows, sum_on, sum_pairs, write_rows
 from taisoft.dynamics.rebounds import Rebounds
 from taisoft.dynamics.simulation_state import SimulationState
 from taisoft.errors import SimulationError
 from taisoft.scene.rigid import RigidBody
 
-CONTACT_OFFSET = 2e-3  # of the finest body's mean surface edge: gap to keep, so that motion in curves seldom needs a repetition
-PENETRATION_CORRECTION = {True: 0.05, False: 0.2}  # fraction of a penetration that an explicit (True) or implicit step corrects
-OFFSET_CORRECTION = {True: 0.005, False: 0.02}  # fraction of a missing contact offset, likewise
-MAX_OPENING_SPEED = 0.01  # of the slowest bar wave speed, sqrt(E / rho): maximum opening speed of both; a strain as large
 TOLERANCE = {"f32": 1e-4, "f64": 1e-6}  # default for the residual of the contact laws
-EXTRA_CAPACITY = 1024  # initial capacity beyond two contacts per triangle
 
 
 class ContactStep:
     """Find the contacts of each step and keep their problem. explicit: whether the steps are explicit."""
 
     idle = False  # see `NoContacts`
+    OFFSET = 2e-3  # of the finest body's mean surface edge: gap to keep, so that motion in curves seldom needs a repetition
+    MAX_OPENING_SPEED = 0.01  # of the slowest bar wave speed, sqrt(E / rho): of what is corrected; a strain as large
+    NOTICEABLE = 1e-3  # penetration over the finer side's mean edge above which the path of an implicit substep is searched
 
     def __init__(self, simulation: SimulationState, self_collision: bool, explicit: bool):
         self.simulation = simulation
@@ -72,19 +52,19 @@ class ContactStep:
         self.paths = ContactPaths(simulation, self.detection, self._lasting)
         self.misplaced = Misplacement(simulation, self.detection)
         d = self.detection
-        self.contact_offset = CONTACT_OFFSET * float(d.edges[: len(scene.bodies)].min())
+        self.contact_offset = self.OFFSET * float(d.edges[: len(scene.bodies)].min())
         if d.margin > 0.0:
             self.contact_offset = min(self.contact_offset, 0.5 * d.margin / (SELF_CONTACT if self_collision else 1.0))
-        self._corrections = PENETRATION_CORRECTION[explicit], OFFSET_CORRECTION[explicit]
+        # parts of a penetration and of a missing contact offset that a step corrects
+        self._corrections = (0.05, 0.005) if explicit else (0.2, 0.02)
         self._substep_fraction = 1.0  # of the step, that the current substep takes
         self.gap_targets = self._gap_targets()
         self._arena = FieldArena()
-        self._allocate(2 * d.surface.n_triangles + EXTRA_CAPACITY)
+        self._allocate(2 * d.surface.n_triangles + 1024)  # contacts at first
         self._numbers_arena = FieldArena()
         self.numbers = build_pair_numbers(self._numbers_arena, scene)
         self.rebounds = Rebounds(simulation, self._lasting)
         self._searched: tuple[float, float] | None = None  # time and dt of the valid search
-        self._searched_dt = 0.0  # dt of the last search, valid or not
         self._measured_end: tuple[float, float] | None = None  # time and dt of the measured end, until the next substep begins
         self._depth = 0.0  # deepest penetration there [m]
         self.crossing: float | None = None  # depth of crossing triangles over the finer side's edge; None: not measured
@@ -111,11 +91,6 @@ class ContactStep:
         self._arena, self._last_time, self._indexed = arena, 0.0, False
 
     @property
-    def flight(self) -> np.ndarray:
-        """Flight times of the colliders [s^2], see `Rebounds`."""
-        return self.rebounds.flight
-
-    @property
     def _has_paths(self) -> bool:
         """Whether motion is prescribed: the user may change it between two steps, and a path may end with the last one."""
         simulation = self.simulation
@@ -131,22 +106,26 @@ class ContactStep:
         return int(self.problem.count[0])
 
     def forget(self) -> None:
-        """Discard the search and the impulses of the last step, after the state was set."""
-        self.return_to_start(none_crossed=False)
-        self.misplaced.forget()
+        """Discard all that is known of a state and its past, after another one was set."""
+        now = self.simulation.now
+        now.flight[:], now.none_cross, now.misplaced = 0.0, False, NO_SUMS
+        self.discard()
 
-    def return_to_start(self, none_crossed: bool) -> None:
-        """Discard them after a step's start was restored. none_crossed: whether no surfaces are known to cross there."""
+    def discard(self) -> None:
+        """Discard the search, the impulses, and what was measured, after a return to the start of a step."""
+        now = self.simulation.now
+        self.discard_search(with_impulses=True)
+        self.penetration = self.relative_penetration = self._step_dt = 0.0
+        self._pairs, self.last_crossing, self.crossing = None, Crossing(), 0.0 if now.none_cross else None
+        now.held = NO_PASSAGES
+        self.misplaced.start_step()
+        self.paths.forget()
+
+    def discard_search(self, with_impulses: bool) -> None:
+        """Discard the search of a substep that was undone; the impulses that are left warm-start the next attempt."""
         self._searched = self._measured_end = None
-        self.problem.count[0] = 0
-        self._search_counts = 0, 0
-        self._last_time = self.penetration = self.relative_penetration = self._step_dt = 0.0
-        self._pairs = None
-        self.last_crossing = Crossing()
-        self.flight[:] = 0.0
-        self.misplaced.return_to_start()
-        self.paths.return_to_start(none_crossed)
-        self.crossing = 0.0 if none_crossed else None
+        if with_impulses:
+            self.problem.count[0], self._last_time, self._search_counts = 0, 0.0, (0, 0)
 
     def snapshot(self) -> dict:
         """Return the last step's contacts and impulses, and the capacity: a step that exceeds it starts without impulses.
@@ -166,9 +145,6 @@ class ContactStep:
             "dropped": self.dropped,
             "found": self._search_counts[0],
             "unmapped": self._search_counts[1],
-            "flight": self.flight.copy(),
-            "paths": self.paths.snapshot(),
-            "misplaced": self.misplaced.snapshot(),
             "rows": read_rows(self.problem),
         }
 
@@ -182,19 +158,11 @@ class ContactStep:
         self.relative_penetration = float(kept["relative_penetration"])
         self.had_impact, self.dropped = bool(kept["met"]), int(kept["dropped"])
         self._search_counts = int(kept["found"]), int(kept["unmapped"])
-        self.flight[:] = kept["flight"]
-        self.paths.restore(kept["paths"])
-        self.misplaced.restore(kept["misplaced"])
+        self.paths.forget()
+        self.misplaced.start_step()
         self.crossing, self.last_crossing = 0.0 if self.paths.none_cross else None, Crossing()
         self._searched = self._measured_end = None
         self._indexed = True  # so that the next step rebuilds the node index, even without contacts
-
-    def reset_substep(self, discard_impulses: bool) -> None:
-        """Discard the search after a substep was undone; the impulses warm-start the next attempt unless discarded, too."""
-        self._searched = self._measured_end = None
-        self.paths.undo()
-        if discard_impulses:
-            self.problem.count[0], self._last_time, self._search_counts = 0, 0.0, (0, 0)
 
     def _gap_targets(self) -> tuple[float, float, float, float]:
         """Contact offset [m]; fractions of a penetration and of a missing offset corrected per substep; maximum speed [m/s]."""
@@ -203,7 +171,7 @@ class ContactStep:
             self.contact_offset,
             self._substep_fraction * self._corrections[0],
             self._substep_fraction * self._corrections[1],
-            MAX_OPENING_SPEED * slowest,
+            self.MAX_OPENING_SPEED * slowest,
         )
 
     def numbers_changed(self) -> None:
@@ -221,13 +189,13 @@ class ContactStep:
         if searched is None or searched[1] != dt or abs(searched[0] - time) > 1e-6 * dt:
             self._searched = None
             self._find(time, dt, simulation.prescribed_moves(time + dt))
-            self._searched, self._searched_dt = (time, dt), dt
+            self._searched = time, dt
         return d.counts.contacts
 
-    def _find(self, *arguments, **named) -> None:
+    def _find(self, time: float, dt: float, prescribed=None, path=None) -> None:
         """Call `Detection.find`; where nothing crosses, implicit steps drop what may never touch."""
-        self.measures.forget()
-        self.detection.find(*arguments, **named)
+        self.measures.begin(dt)
+        self.detection.find(time, dt, prescribed, path, self.simulation.now.held, self.simulation.now.none_cross)
         if self.paths.none_cross and not self._explicit and self.detection.counts.contacts:
             self.measures.drop_uncertain()
 
@@ -244,7 +212,7 @@ class ContactStep:
         keep_impulses(p, self.contact_offset)
         warm = dt / self._last_time if self._last_time > 0.0 else 0.0
         fill(p, m, d.surface, d.shapes, self.numbers, d.buffer.data, d.kept, n, dt, warm)
-        self._own_sides = d.sides(n) if m.has_dependents else None
+        self._own_sides = d.sides(d.kept.to_numpy(n)) if m.has_dependents else None
         if n or self._indexed:  # an empty index needs no update
             index_nodes(p)
             self._indexed = n > 0
@@ -295,12 +263,22 @@ class ContactStep:
         if self._substep_fraction < 1.0:
             self._pairs = self._sum_pairs()
 
+    @property
+    def _duration(self) -> float:
+        """Time [s] in which the impulses of the last substep acted."""
+        return self._last_time / self._impulse_fraction
+
+    def rows(self, own: bool = False) -> ContactRows:
+        """Return the contacts of the last substep. own: with the nodes before dependent ones were replaced, if they are known."""
+        found = read_contacts(self.problem, self._impulse_fraction)
+        if not own or self._own_sides is None:
+            return found
+        nodes, weights = (side[: len(found.gap)] for side in self._own_sides)
+        return replace(found, nodes=nodes, weights=weights)
+
     def _sum_pairs(self) -> Pairs:
         """Add the last substep's contacts to the sums of earlier substeps."""
-        found = self.contacts()
-        nodes, weights = (found.nodes, found.weights) if self._own_sides is None else self._own_sides
-        sides = nodes[: len(found)], weights[: len(found)]
-        return sum_pairs(self.problem, found, sides, *self.simulation.state(), self._pairs)
+        return sum_pairs(self.problem, self.rows(own=True), self._duration, *self.simulation.state(), self._pairs)
 
     def pairs(self) -> Pairs:
         """Return the sums over the contacts of each pair in the last step, see `sum_pairs`."""
@@ -308,30 +286,18 @@ class ContactStep:
             self._pairs = self._sum_pairs()
         return self._pairs
 
-    def pressing_pairs(self) -> np.ndarray:
-        """Return the pairs of colliders (k,2) that pressed on each other in the last step."""
-        pairs, sums = self.pairs()
-        return pairs[sums[:, NORMAL.start] > 0.0]
-
     def mean_on(self, collider: int, other: int | None) -> np.ndarray:
-        """Return means over the last step of what a collider gets from another one, or from all others, (10,): force [N], moment
-        about the origin [N m], slip velocity times normal force [W], and normal force [N]."""
-        (pairs, sums), total = self.pairs(), np.zeros(10)
-        for own in (0, 1):
-            rows = (pairs[:, own] == collider) & ((pairs[:, 1 - own] == other) | (other is None))
-            part, sign = sums[rows].sum(axis=0), 1.0 - 2.0 * own
-            total += np.concatenate([sign * part[IMPULSE], part[MOMENTS[own]], sign * part[SLIP], part[NORMAL]])
-        return total / (self._step_dt or 1.0)
+        """Return the means of `sum_on` over the last step, (10,): force [N], moment [N m], and so on."""
+        return sum_on(self.pairs(), collider, other) / (self._step_dt or 1.0)
 
     def own_forces(self) -> np.ndarray:
         """Return the contact forces of the last substep on the nodes that touch, dependent ones too, (n_nodes, 3) [N].
 
         Known only in scenes with dependent nodes, and not after a checkpoint was loaded; else 0.
         """
-        n, found = self.simulation.model.n_nodes, self.contacts()
-        if self._own_sides is None or len(self._own_sides[0]) != len(found) or self._last_time == 0.0:
-            return np.zeros((n, 3))
-        return distribute(found.impulse, *self._own_sides, n) * self._impulse_fraction / self._last_time
+        if self._own_sides is None or len(self._own_sides[0]) != self.n_contacts or self._last_time == 0.0:
+            return np.zeros((self.simulation.model.n_nodes, 3))
+        return nodal_impulses(self.rows(own=True), self.simulation.model.n_nodes) * self._impulse_fraction / self._last_time
 
     def penetrates_deeper(self, time: float, dt: float, before: float) -> bool:
         """Return whether a substep of dt that ends at a time leaves a new or deeper penetration.
@@ -339,7 +305,7 @@ class ContactStep:
         before: `relative_penetration` at its start.
         """
         self._measure_penetration(time, dt)
-        return self.relative_penetration > max(NOTICEABLE_PENETRATION, 1.1 * before)
+        return self.relative_penetration > max(self.NOTICEABLE, 1.1 * before)
 
     def end(self, time: float, dt: float) -> float:
         """Return the deepest penetration [m] at a time, the end of a step or substep of dt. Set `relative_penetration`."""
@@ -358,7 +324,7 @@ class ContactStep:
             if not self._has_paths:
                 raise
             self._find(time, 0.0)  # a path ends here; the next step reports it
-        closing = self.measures.closing(dt)
+        closing = self.measures.closing
         depth, self.relative_penetration = float(closing[DEPTH]), float(closing[RELATIVE_PENETRATION])
         if not self._explicit:
             crossing = self.measure_crossings()
@@ -385,20 +351,15 @@ class ContactStep:
         self._searched = self._measured_end = None
         self.paths.use_all()
         self._find(time, dt, path=self.paths.displacement)
-        self._searched, self._searched_dt = (time, dt), dt
-        searched = set(map(tuple, download([self.problem.feature], self.n_contacts)[0].tolist()))
-        found = self.detection.buffer.data.feature.to_numpy()[download([self.detection.kept], self.detection.counts.contacts)[0]]
-        return not searched.issuperset(map(tuple, found.tolist()))
+        self._searched = time, dt
+        d, known = self.detection, set(map(tuple, self.problem.feature.to_numpy(self.n_contacts).tolist()))
+        found = d.buffer.data.feature.at(d.kept.to_numpy(d.counts.contacts))
+        return not known.issuperset(map(tuple, found.tolist()))
 
     def measure_start(self, time: float, dt: float) -> tuple[float, float]:
         """Return the deepest penetration before a step of dt over the finer mean surface edge, and its largest closing ratio."""
         self.search(time, dt)
-        closing = self.measures.closing(dt)
-        return float(closing[RELATIVE_PENETRATION]), float(closing[CLOSING_RATIO])
-
-    def closing_ratio_along_path(self) -> float:
-        """Return the largest closing ratio along the path of `search_along_path`."""
-        return float(self.measures.closing(self._searched_dt)[CLOSING_RATIO])
+        return float(self.measures.closing[RELATIVE_PENETRATION]), self.measures.closing_ratio
 
     def initial_crossing(self) -> float:
         """Return the depth of crossing triangles over the finer side's mean surface edge, at the start of a searched step."""
@@ -408,15 +369,10 @@ class ContactStep:
             self._searched = None  # where none cross, other contacts are found
         return self.crossing
 
-    def describe_fast_closing(self, dt: float, substeps: int = 1) -> str:
-        """See `ContactMeasures.describe_fast_closing`; dt [s]."""
-        return self.measures.describe_fast_closing(dt, self._searched_dt, substeps)
-
     def contacts(self) -> Contacts:
         """Return the contacts of the last substep with their impulses."""
-        record = record_contacts(self.detection, self.problem, self._impulse_fraction)
         found, unmapped = self._search_counts  # others have searched since
-        return replace(record, found=found, unmapped=unmapped, duration=self._last_time / self._impulse_fraction)
+        return self.rows().named(self.simulation.scene, found=found, unmapped=unmapped, duration=self._duration)
 
     @property
     def field_bytes(self) -> dict[str, int]:

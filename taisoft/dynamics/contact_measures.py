@@ -15,7 +15,7 @@ drops the contacts that it would be for, unless they close head-on.
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 import taichi as ti
@@ -24,18 +24,15 @@ from taisoft.backend.arrays import FieldArena
 from taisoft.backend.runtime import kernel
 from taisoft.collision.contacts import FACE_FACE
 from taisoft.collision.detector import Detection
-from taisoft.collision.intersections import CROSSED, CROSSING_DEPTH, CROSSINGS, DEPTH_OVER_EDGE
+from taisoft.collision.intersections import CROSSING_DEPTH, CROSSINGS, DEPTH_OVER_EDGE
 from taisoft.collision.surface import dvec
 from taisoft.contact.build import obstacle_displacement_at
 from taisoft.fem.state import DEVIATION
 
 MAX_CLOSING = 0.5  # of the thinner side's thickness: how far a contact may close in one step
 DEPTH, CLOSING_RATIO, SPEED, WHICH, RELATIVE_PENETRATION = range(5)  # indices into the result of `measure_closing`
-GROWTH = 2.0  # maximum ratio of a substep's length to the previous one, so that the motion after an impact is resolved
 ROUNDING = 1e-9  # of a number of substeps
 DEEP_PENETRATION = 0.02  # of the finer side's mean surface edge: penetration reported as a problem
-DEEP_CROSSING = CROSSED  # of the same: depth of crossing triangles above which an implicit step is repeated in smaller substeps
-NOTICEABLE_PENETRATION = 1e-3  # of the same: penetration above which the path of an implicit substep is searched
 
 
 @dataclass(frozen=True)
@@ -45,7 +42,7 @@ class Crossing:
     depth: float = 0.0  # [m]
     relative: float = 0.0  # over the finer side's mean surface edge
     n_pairs: int = 0  # of crossing triangles
-    inside: list[tuple[str, str, float]] = field(default_factory=list)  # colliders inside each other, and depth [m]
+    inside: tuple[tuple[int, int, float], ...] = ()  # colliders inside each other, and depth [m]
 
 
 class ContactMeasures:
@@ -54,20 +51,26 @@ class ContactMeasures:
     def __init__(self, detection: Detection, arena: FieldArena):
         self.detection = detection
         self._closing = arena.field("closing", ti.f64, 5)  # result of `measure_closing`,
-        self._measured = np.zeros(5)  # and a copy of it
-        self._dt: float | None = None  # [s] that it was computed for; None: outdated
+        self._measured: np.ndarray | None = None  # and a copy of it; None: outdated
+        self._dt = 0.0  # [s] of the last search
 
-    def forget(self) -> None:
-        """Discard the measures, before another search."""
-        self._dt = None
+    def begin(self, dt: float) -> None:
+        """Discard the measures, before another search, for a step of dt [s]."""
+        self._measured, self._dt = None, dt
 
-    def closing(self, dt: float) -> np.ndarray:
-        """Return the result of `measure_closing` for a step of dt [s]."""
-        d = self.detection
-        if self._dt != dt:
-            measure_closing(d.surface, d.shapes, d.buffer.data, d.kept, d.counts.contacts, dt, self._closing)
-            self._dt, self._measured = dt, self._closing.to_numpy()
+    @property
+    def closing(self) -> np.ndarray:
+        """The result of `measure_closing` for the step of the last search."""
+        if self._measured is None:
+            d = self.detection
+            measure_closing(d.surface, d.shapes, d.buffer.data, d.kept, d.counts.contacts, self._dt, self._closing)
+            self._measured = self._closing.to_numpy()
         return self._measured
+
+    @property
+    def closing_ratio(self) -> float:
+        """Largest closing ratio of a contact in that step."""
+        return float(self.closing[CLOSING_RATIO])
 
     def drop_uncertain(self) -> None:
         """Drop the contacts of the last search that may never touch, where the check of paths finds those that would: a plane
@@ -85,17 +88,16 @@ class ContactMeasures:
             # a piece thinner than an edge counts as deep if its middle is half as deep in the other as in itself
             scale = min(edges[one.a], edges[one.b], 0.5 * one.room / DEEP_PENETRATION if one.room > 0.0 else np.inf)
             depth, relative = max(depth, one.depth), max(relative, one.depth / scale)
-        names = [c.name for c in self.detection.scene.colliders]
-        return Crossing(depth, relative, int(crossings[CROSSINGS]), [(names[a], names[b], d) for (a, b), d in inside.items()])
+        return Crossing(depth, relative, int(crossings[CROSSINGS]), tuple((*pair, d) for pair, d in inside.items()))
 
     def deep_from(self, a: int, b: int) -> float:
         """Return the penetration [m] of two colliders above which a step counts as deep."""
         return DEEP_PENETRATION * float(min(self.detection.edges[a], self.detection.edges[b]))
 
-    def describe_fast_closing(self, dt: float, searched_dt: float, substeps: int = 1) -> str:
+    def describe_fast_closing(self, dt: float, substeps: int = 1) -> str:
         """Return a sentence that names the two colliders closing too fast for a step of dt, their speed, the thickness of the
-        thinner one, and a sufficient dt. searched_dt: of the last search; substeps: maximum number per step."""
-        closing, d = self.closing(searched_dt), self.detection
+        thinner one, and a sufficient dt. substeps: maximum number per step."""
+        closing, d = self.closing, self.detection
         a, b = d.buffer.data.body[d.kept[int(closing[WHICH])]]
         names = [d.scene.colliders[k].name for k in (a, b)]
         thin, speed = float(min(d.thickness[a], d.thickness[b])), float(closing[SPEED])
@@ -210,6 +212,7 @@ def next_length(ratio: Callable[[float], float], remaining: float, length: float
     ratio: largest closing ratio of a substep of the given length [s] from here; length: of the previous substep; longest: maximum
     length; may_grow: whether the substep may be longer than the previous one.
     """
+    GROWTH = 2.0  # maximum ratio of its length to the previous one, so that the motion after an impact is resolved
     length = remaining / _count(remaining / length)
     found = ratio(length)
     if may_grow and GROWTH * found <= 1.0 and length < min(remaining, longest) * (1.0 - ROUNDING):

@@ -23,13 +23,13 @@ from taisoft.errors import SimulationError
 from taisoft.fem.state import DEVIATION
 from taisoft.scene.connections import attached_pairs
 
-MAX_UNCHANGED = 3  # such checks in a row after which repeating a substep does not help
-SHORTENED = 0.9  # of the part of a path that is certainly free
-MAX_SHORTENINGS, LEAST = 30, 1e-6  # rounds, and part of a path: beyond these, bodies do not move at all
-
 
 class ContactPaths:
     """Check the paths of substeps and hold the passages found."""
+
+    MAX_UNCHANGED = 3  # checks in a row that find the same pairs, after which repeating a substep does not help
+    SHORTENED = 0.9  # of the part of a path that is certainly free: how far bodies that are held back move
+    MAX_SHORTENINGS, LEAST = 30, 1e-6  # rounds, and part of a path: beyond these, they do not move at all
 
     def __init__(self, simulation: SimulationState, detection: Detection, arena: FieldArena):
         self._simulation, self._detection = simulation, detection
@@ -37,7 +37,7 @@ class ContactPaths:
         self.held_back = ""  # a sentence about the last step, if bodies were held back,
         self._names: set[str] = set()  # and their names
         self._n_unchanged = 0  # checks in a row that found no pairs but those held already
-        self._held = self._held_before = NO_PASSAGES
+        self._held = NO_PASSAGES  # in this substep so far
         self._found = NO_PASSAGES.pairs  # at the last check
         n_bodies = len(detection.scene.bodies)
         n, group = connected_components(attached_pairs(detection.scene)[:n_bodies, :n_bodies])
@@ -45,17 +45,15 @@ class ContactPaths:
         detection.prepare_paths()
         self.displacement = arena.vectors("path", ti.f64, simulation.model.n_nodes)  # of `left_searched` [m]
 
-    def return_to_start(self, none_crossed: bool) -> None:
-        """Discard all passages and lists after a state was set. none_crossed: whether no surfaces are known to cross there."""
-        self._detection.forget_paths()
-        self._detection.held = self._held = self._held_before = NO_PASSAGES
-        self._detection.none_cross = none_crossed
+    def forget(self) -> None:
+        """Discard all lists, after a state was set."""
+        self._detection.paths.forget()
         self.start_step()
 
     @property
     def is_stuck(self) -> bool:
         """Whether repeating the substep does not help any more: the same pairs pass, although they are contacts."""
-        return self._n_unchanged >= MAX_UNCHANGED
+        return self._n_unchanged >= self.MAX_UNCHANGED
 
     def start_step(self) -> None:
         """Begin a step, in which no bodies have been held back yet."""
@@ -65,25 +63,11 @@ class ContactPaths:
     @property
     def none_cross(self) -> bool:
         """Whether no colliders crossed at the start of the substep, so that all paths are checked."""
-        return self._detection.none_cross
-
-    def snapshot(self) -> dict:
-        """Return the passages (k,4) that the next search adds as contacts, and whether no surfaces cross."""
-        return {"held": self._detection.held.pairs, "none_cross": self._detection.none_cross}
-
-    def restore(self, kept: dict) -> None:
-        """Restore a `snapshot`."""
-        self.return_to_start(bool(kept["none_cross"]))
-        self._detection.held = HeldPassages.at_start(np.asarray(kept["held"], dtype=np.int32).reshape(-1, 4))
+        return self._simulation.now.none_cross
 
     def begin(self) -> None:
         """Begin a substep."""
-        self._held = self._held_before = self._detection.held
-        self._n_unchanged = 0
-
-    def undo(self) -> None:
-        """Return to the passages held at the start of the substep."""
-        self._detection.held = self._held = self._held_before
+        self._held, self._n_unchanged = self._simulation.now.held, 0
 
     def left_searched(self, x_start) -> bool:
         """Return whether the surface left the searched path since x_start; keep its displacement for another search."""
@@ -112,7 +96,7 @@ class ContactPaths:
         held, n_held = self._held, len(self._held.pairs)
         every, time = np.concatenate([held.pairs, pairs]), np.concatenate([held.times, times])
         passed = np.concatenate([held.passed, np.zeros(len(pairs), dtype=np.int32)])
-        _, first, group = np.unique(self._detection.features_of(every), axis=0, return_index=True, return_inverse=True)
+        _, first, group = np.unique(self._detection.paths.features(every), axis=0, return_index=True, return_inverse=True)
         earliest = np.full(len(first), np.inf)
         np.minimum.at(earliest, group.reshape(-1)[n_held:], times)
         self._n_unchanged = self._n_unchanged + 1 if len(first) == n_held else 0
@@ -122,7 +106,7 @@ class ContactPaths:
 
     def use_all(self) -> None:
         """Let the next search add all passages held, at their times along the searched paths."""
-        self._detection.held = self._held
+        self._simulation.now.held = self._held
 
     def use_active(self, problem: ContactProblem) -> None:
         """Let the next search add those that carry an impulse, at its positions."""
@@ -133,11 +117,11 @@ class ContactPaths:
         one, other = active[:, 1], active[:, 2]
         keys = set(zip(*(x.tolist() for x in (one % N_KINDS, one // N_KINDS, other // N_FEATURES, other % N_FEATURES))))
         kept = np.array([tuple(pair) in keys for pair in self._held.pairs.tolist()], dtype=bool)
-        self._detection.held = HeldPassages.at_start(self._held.pairs[kept])
+        self._simulation.now.held = HeldPassages.at_start(self._held.pairs[kept])
 
     def exempt_crossing(self) -> None:
         """Exempt the colliders that cross at the last search, and no others."""
-        self._detection.none_cross = not self._detection.exempt_crossing()
+        self._simulation.now.none_cross = not self._detection.exempt_crossing()
 
     def hold_back(self, x_start) -> None:
         """Shorten the paths of bodies from x_start to the present state until nothing passes through anything. The last search
@@ -153,15 +137,15 @@ class ContactPaths:
             can_move[inert] = can_move[together].any()
         part, n_rounds = can_move.astype(np.float64), 0
         while len((found := d.passages(TO_STATE))[0]):
-            colliders, n_rounds = d.colliders_of(found[0]), n_rounds + 1
+            colliders, n_rounds = d.paths.colliders(found[0]), n_rounds + 1
             stuck = ~(part[colliders] > 0.0).any(axis=1)
             if stuck.any():
                 self._refuse(*colliders[stuck][0])
             shortened = np.ones(len(part))
             for side in range(2):
-                np.minimum.at(shortened, colliders[:, side], SHORTENED * found[1])
-            part = np.where(shortened < 1.0, part * shortened if n_rounds < MAX_SHORTENINGS else 0.0, part)
-            part[part < LEAST] = 0.0
+                np.minimum.at(shortened, colliders[:, side], self.SHORTENED * found[1])
+            part = np.where(shortened < 1.0, part * shortened if n_rounds < self.MAX_SHORTENINGS else 0.0, part)
+            part[part < self.LEAST] = 0.0
             for together in self._attached:
                 moving = together[can_move[together]]
                 part[moving] = part[moving].min(initial=1.0)

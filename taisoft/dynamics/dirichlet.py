@@ -24,7 +24,6 @@ class MovedNodes:
     nodes: np.ndarray  #: (k,) rows of the model
     rows: slice  #: rows among the prescribed nodes
     path: Callable  #: t [s] -> displacement (3,) or (k,3) [m]; the constraint's, or a command
-    released: bool = False
 
     @property
     def given_path(self) -> Callable:
@@ -35,8 +34,9 @@ class MovedNodes:
 class DirichletConditions:
     """Constraints of all bodies.
 
-    groups: nodes moved by `Body.move` or by a moving obstacle. prescribed_nodes (n_prescribed,): model rows, group by group; a
-    node prescribed by two groups on different axes has two rows. held (n_held,): model rows with a constrained axis at the start.
+    groups: nodes moved by `Body.move` or by a moving obstacle; released (n_groups,) bool: those that move freely by now.
+    prescribed_nodes (n_prescribed,): model rows, group by group; a node prescribed by two groups on different axes has two rows.
+    held (n_held,): model rows with a constrained axis at the start.
     """
 
     def __init__(self, scene: Scene, layout: Layout):
@@ -54,21 +54,13 @@ class DirichletConditions:
                     self.groups.append(MovedNodes(body.name, c, c in body.constraints, rows, held, c.path))
                     n_prescribed += len(rows)
         self.prescribed_nodes = np.concatenate([g.nodes for g in self.groups]) if self.groups else np.zeros(0, dtype=np.int64)
+        self.released = np.zeros(len(self.groups), dtype=bool)
         self.held = np.flatnonzero(self.constrained().any(axis=1))
 
-    def reset(self) -> None:
-        """Start every path again."""
-        for g in self.groups:
-            g.released = False
-
-    def released(self) -> list[bool]:
-        """Return which groups are released."""
-        return [g.released for g in self.groups]
-
-    def set_released(self, released: list[bool]) -> None:
-        """Restore the result of `released`."""
-        for g, value in zip(self.groups, released, strict=True):
-            g.released = value
+    @property
+    def _moved(self) -> list[MovedNodes]:
+        """The groups that are not released."""
+        return [group for group, released in zip(self.groups, self.released.tolist()) if not released]
 
     @property
     def n_prescribed(self) -> int:
@@ -78,17 +70,15 @@ class DirichletConditions:
     def constrained(self) -> np.ndarray:
         """Return the axes that are now fixed or prescribed, (n_nodes, 3) bool."""
         mask = self._fixed.copy()
-        for g in self.groups:
-            if not g.released:
-                mask[np.ix_(g.nodes, np.flatnonzero(g.constraint.axes))] = True
+        for g in self._moved:
+            mask[np.ix_(g.nodes, np.flatnonzero(g.constraint.axes))] = True
         return mask
 
     def prescribed_axes(self) -> np.ndarray:
         """Return 1 for each row's axes that are now prescribed, (n_prescribed, 3) int32."""
         axes = np.zeros((self.n_prescribed, 3), dtype=np.int32)
-        for g in self.groups:
-            if not g.released:
-                axes[g.rows] = g.constraint.axes
+        for g in self._moved:
+            axes[g.rows] = g.constraint.axes
         return axes
 
     def targets(self, times: np.ndarray) -> tuple[np.ndarray, bool]:
@@ -100,27 +90,24 @@ class DirichletConditions:
         """
         rows = np.zeros((len(times), self.n_prescribed, 3))
         for r, t in enumerate(times):
-            releasing = []
-            for g in self.groups:
-                if g.released:
-                    continue
+            releasing = np.zeros_like(self.released)
+            for k in np.flatnonzero(~self.released):
+                g = self.groups[k]
                 displacement = self._displacement_by(g, float(t))
-                if displacement is None:
-                    releasing.append(g)
-                    continue
-                rows[r, g.rows] = self._rest[g.nodes] + displacement
-            if releasing:
+                releasing[k] = displacement is None
+                if displacement is not None:
+                    rows[r, g.rows] = self._rest[g.nodes] + displacement
+            if releasing.any():
                 if r == 0:
-                    for g in releasing:
-                        g.released = True
+                    self.released |= releasing
                 return rows[:r], True
         return rows, False
 
     def target_positions(self, t: float) -> np.ndarray:
         """Return positions (n_prescribed, 3) of the prescribed nodes at a time [m], nan on axes free or released by then."""
         target_positions = np.full((self.n_prescribed, 3), np.nan)
-        for g in self.groups:
-            displacement = None if g.released else self._displacement_by(g, t)
+        for g in self._moved:
+            displacement = self._displacement_by(g, t)
             if displacement is not None:
                 target_positions[g.rows] = np.where(g.constraint.axes, self._rest[g.nodes] + displacement, np.nan)
         return target_positions
@@ -132,9 +119,7 @@ class DirichletConditions:
         """
         fractions, weights = ((0, 1 / 2, 1), (4, -8, 4)) if middle else ((0, 1 / 3, 2 / 3, 1), (-9, 36, -45, 18))
         total = np.zeros((self.n_prescribed, 3))
-        for g in self.groups:
-            if g.released:
-                continue
+        for g in self._moved:
             length = dt
             if self._displacement(g, start + dt) is None:  # released as the step ends
                 length = (start + dt) * (1.0 - ROUNDING) - start

@@ -164,10 +164,10 @@ class Dynamics:
                 f"bodies are {report.max_penetration:.3g} m deep in each other or in obstacles"
                 + (f", {report.crossings} pairs of surface triangles cross" if report.crossings else "")
             )
-            found += [
-                f"'{a}' and '{b}' overlap by {depth:.3g} m" if a != b else f"parts of '{a}' overlap by {depth:.3g} m"
-                for a, b, depth in self.contact.last_crossing.inside
-            ]
+            names = [f"'{c.name}'" for c in self.scene.colliders]
+            overlaps = self.contact.last_crossing.inside
+            owners = (f"{names[a]} and {names[b]}" if a != b else f"parts of {names[a]}" for a, b, _ in overlaps)
+            found += [f"{owner} overlap by {depth:.3g} m" for owner, (*_, depth) in zip(owners, overlaps)]
         if report.contact_error:
             found.append(report.contact_error)
         if report.n_inverted:
@@ -236,7 +236,7 @@ class Dynamics:
         moving = self.contact is not None and not all(obstacle.rests(self.state.time) for obstacle in self.scene.obstacles)
         dragged = self.drag_spring is not None and self.drag_spring.drag is not None
         driven = self.state.loads.vary or not self.state.loads.has_potential
-        return moving or dragged or driven or not all(self.state.dirichlet.released())
+        return moving or dragged or driven or not self.state.now.released.all()
 
     def mean_acceleration(self, nodes: np.ndarray) -> np.ndarray:
         """Return the mean acceleration (k,3) [m/s^2] of nodes (k,) in the last step or batch; 0 before the first one here.

@@ -31,14 +31,6 @@ from taisoft.fem.terms import elasticity
 
 
 @kernel
-def keep_state(m: ti.template(), g: ti.template()):
-    """Save the state before a sub-step, in case it fails."""
-    ti.loop_config(serialize=m.serial)
-    for i in range(m.n_nodes):
-        g.x[i], g.v[i] = m.state.x[i], m.state.v[i]
-
-
-@kernel
 def predict(m: ti.template(), s: ti.template(), dt: ti.f64):
     """Compute v* of every node. scalars: LOWEST_J, INVERTED_NOW.
 

@@ -1,18 +1,15 @@
 """Explicit sub-steps with contacts: a search, a contact problem and a solve in each."""
 
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import replace
 
 import numpy as np
-import taichi as ti
 
-from taisoft.backend.arrays import download
 from taisoft.contact.colouring import colour_contacts
 from taisoft.contact.problem import find_factors
 from taisoft.contact.solve import SolveResult, solve
 from taisoft.dynamics import explicit
 from taisoft.dynamics.contact import TOLERANCE, ContactStep
-from taisoft.dynamics.explicit_contact import finish_verlet, keep_state, move, predict, set_free_velocities
+from taisoft.dynamics.explicit_contact import finish_verlet, move, predict, set_free_velocities
 from taisoft.dynamics.explicit_stepper import ExplicitStepper
 from taisoft.dynamics.results import StepResult
 from taisoft.dynamics.rigid_contacts import RigidContacts
@@ -26,14 +23,6 @@ MAX_SWEEPS = 1000  # per contact solve; one that needs more is reported as not c
 MAX_CONTACT_BATCH = 200  # maximum sub-steps per batch, between checks for interruption
 
 
-@dataclass(frozen=True, eq=False)
-class GoodState:
-    """The state before the sub-step, (n_nodes) 3-vectors."""
-
-    x: Any  # f64
-    v: Any
-
-
 class ContactExplicitStepper(ExplicitStepper):
     """Take sub-steps of symplectic Euler or velocity Verlet with contacts."""
 
@@ -45,10 +34,8 @@ class ContactExplicitStepper(ExplicitStepper):
         if self.method == "auto":
             self.method = "gauss_seidel" if settings.arch == "cpu" else "coloured_gauss_seidel"
         self.max_batch = min(self.max_batch, MAX_CONTACT_BATCH)
-        m, arena = simulation.model, simulation.arena
-        self._good = GoodState(arena.vectors("x_good", ti.f64, m.n_nodes), arena.vectors("v_good", ti.f64, m.n_nodes))
         self.contact_tolerance = settings.contact_tolerance or TOLERANCE[settings.precision]
-        self._rigid = RigidContacts(m) if m.has_rigid_tets else None
+        self._rigid = RigidContacts(simulation.model) if simulation.model.has_rigid_tets else None
 
     def forget(self) -> None:
         """Discard the search and impulses, after the state was set."""
@@ -72,7 +59,8 @@ class ContactExplicitStepper(ExplicitStepper):
         simulation, m, results, depth, done = self.simulation, self.simulation.model, [], 0.0, 0
         explicit.begin_parallel(m)
         n, start = min(n, self.max_batch), simulation.time
-        self._released, releases, targets = simulation.dirichlet.released(), simulation.releases, None
+        self.good.copy_from(simulation.now)
+        releases, targets = simulation.releases, None
         if self.work.n_prescribed:
             n = min(n, self.rows)
             targets = simulation.next_targets(start + dt * np.arange(1, n + 1))
@@ -85,7 +73,6 @@ class ContactExplicitStepper(ExplicitStepper):
             self.contact.initial_crossing()
         try:
             while done < n:
-                keep_state(m, self._good)
                 if targets is not None:
                     self._upload_targets(targets[done : done + 1])
                 results.append(self._substep(simulation.step_count + done + 1, start + done * dt, dt))
@@ -96,9 +83,11 @@ class ContactExplicitStepper(ExplicitStepper):
                     depth, relative_penetration = max(depth, crossing[0]), max(relative_penetration, crossing[1])
                 done += 1
                 self.contact.end_substep()
-                self._released = simulation.dirichlet.released()
+                if done < n:
+                    self.good.copy_from(simulation.now)
         except BaseException:  # Ctrl-C, too
-            self._restore()
+            self._return_to_good()
+            self.contact.discard()
             simulation.step_count += done
             simulation.time = start + done * dt
             raise
@@ -117,23 +106,15 @@ class ContactExplicitStepper(ExplicitStepper):
             result.problems.append(f"the contact solver stopped at a residual of {result.contact_residual:.2e}")
         return result
 
-    def _restore(self) -> None:
-        simulation = self.simulation
-        self._restore_state(*download([self._good.x, self._good.v]))
-        if simulation.dirichlet.released() != self._released:
-            simulation.dirichlet.set_released(self._released)
-            simulation.upload_constraints()
-        self.contact.return_to_start(self.contact.paths.none_cross)
-
     def _substep(self, step: int, time: float, dt: float) -> SolveResult | None:
         """Take sub-step number `step` from a time, and repeat it while surfaces pass through each other on its paths.
 
         Return the contact solver's result, None without contacts.
         """
-        simulation, contact, good = self.simulation, self.contact, self._good
+        simulation, contact, good = self.simulation, self.contact, self.good
         closing_ratio = contact.measure_start(time, dt)[1]
         if closing_ratio > 1.0 and not contact.paths.none_cross:
-            raise SimulationError(f"step {step}: {contact.describe_fast_closing(dt)}")
+            raise SimulationError(f"step {step}: {contact.measures.describe_fast_closing(dt)}")
         contact.start_substep(dt)
         result = self._solve_and_move(step, time, dt)
         for tries in range(MAX_PASSAGES + 1):
@@ -141,7 +122,8 @@ class ContactExplicitStepper(ExplicitStepper):
                 break
             end = simulation.state()
             contact.paths.left_searched(good.x)
-            self._restore_state(*download([good.x, good.v]))
+            simulation.now.copy_nodes_from(good)
+            self.acceleration_stale = True
             contact.search_along_path(time, dt)
             if contact.paths.uncovered:
                 if not contact.paths.find(as_searched=True):

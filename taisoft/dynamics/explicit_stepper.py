@@ -15,17 +15,6 @@ from taisoft.fem.model import Model
 from taisoft.fem.state import LOWEST_J, MOST_INVERTED, STEPS_DONE
 from taisoft.settings import Settings
 
-LAUNCH_SECONDS = 0.1  # rough maximum of one launch, so that Ctrl-C takes effect
-# The same of a batch, on one thread, in scenes whose loops are divided: on several threads each sub-step has launches of its own,
-# and the measurement that ends a batch takes almost as long as a sub-step
-CHUNKED_BATCH_SECONDS = 0.4
-GPU_SPEEDUP = 30  # of a large mesh over one CPU thread, roughly
-DAMPING_POINT_SECONDS = 800e-9  # added by stiffness damping to a law's POINT_SECONDS: it projects the stiffness of each point
-MAX_BATCH = 4096
-MAX_HOLD_TIME = 0.002  # [s] maximum time that sub-steps hold a drag force, if longer than one of them
-MAX_HOLD_SUBSTEPS = 16  # maximum number of these sub-steps
-TARGET_BYTES_PER_TET = 200  # maximum memory for the targets of a batch
-
 
 @dataclass(frozen=True, eq=False)
 class SubstepWork:
@@ -85,11 +74,13 @@ def largest_batch(m: Model) -> int:
     """Return the maximum number of sub-steps per launch.
 
     It depends on the scene alone, not on measured time, since the ends of batches affect the last digit of the report's extremes.
+    A launch takes about 0.1 s at most, so that Ctrl-C takes effect; a GPU does about 30 times as much in that time. Where loops
+    are divided, each sub-step has launches of its own, and the measurement that ends a batch takes almost as long as a sub-step.
     """
-    damping = DAMPING_POINT_SECONDS if m.stiffness_damping else 0.0
+    damping = 800e-9 if m.stiffness_damping else 0.0  # [s] a point, to project its stiffness
     seconds = sum((g.last - g.first) * m.lanes * g.n_points * (g.law.POINT_SECONDS + damping) for g in m.groups)
-    longest = LAUNCH_SECONDS * GPU_SPEEDUP if not m.on_cpu else CHUNKED_BATCH_SECONDS if m.chunks > 1 else LAUNCH_SECONDS
-    return max(1, min(MAX_BATCH, int(longest / seconds)))
+    longest = 0.1 * 30 if not m.on_cpu else 0.4 if m.chunks > 1 else 0.1
+    return max(1, min(4096, int(longest / seconds)))
 
 
 class ExplicitStepper:
@@ -107,7 +98,7 @@ class ExplicitStepper:
         n_varied = len(self._varied)
         n_amplitudes = simulation.loads.n_amplitudes if simulation.loads.amplitudes_vary else 0
         row_bytes = 24 * (n_prescribed + n_varied) + 8 * n_amplitudes
-        self.rows = max(1, min(self.max_batch, TARGET_BYTES_PER_TET * n_tets // max(24, row_bytes)))
+        self.rows = max(1, min(self.max_batch, 200 * n_tets // max(24, row_bytes)))  # of targets: at most 200 bytes a tet
 
         def ids(name: str, nodes: np.ndarray):
             return arena.field(name, ti.i32, len(nodes), nodes.astype(np.int32)) if len(nodes) else None
@@ -135,6 +126,7 @@ class ExplicitStepper:
             held_velocity=vectors("held_velocity", n_held, ti.f64),
             reaction=vectors("reaction", n_held),
         )
+        self.good = simulation.now.another(arena, "good")  # the last good state
         self.acceleration_stale = True  # Verlet's acceleration does not match the present state
 
     def forget(self) -> None:
@@ -151,7 +143,7 @@ class ExplicitStepper:
 
     def held_steps(self, dt: float) -> int:
         """Return the number of sub-steps of dt [s] over which a drag force is held."""
-        return max(1, min(MAX_HOLD_SUBSTEPS, int(MAX_HOLD_TIME / dt)))
+        return max(1, min(16, int(0.002 / dt)))  # at most 2 ms
 
     def _kept_fields(self) -> dict[str, Any]:
         """Fields kept from one sub-step to the next, by name, if the scene has them."""
@@ -191,27 +183,27 @@ class ExplicitStepper:
             times = simulation.time + dt * (np.arange(n) + int(self.work.verlet))  # Euler's forces are those at the start
             loads = self._load_rows(times)
         self._upload_rows(targets, loads)
-        kept = simulation.state()
+        self.good.copy_from(simulation.now)
         try:
             result = self._launch(n, dt)
         except BaseException:  # Ctrl-C, raised when the launch has ended: the batch is abandoned
-            self._restore_state(*kept)
+            self._return_to_good()
             raise
         if result.steps < n:
-            self._restore_state(*kept)
+            self._return_to_good()
             if result.steps > 0:  # deterministic on the CPU: repeat up to the last good sub-step
                 self._launch(result.steps, dt)
-            good = simulation.state()
+            self.good.copy_from(simulation.now)
             simulation.step_count += result.steps
             simulation.time += result.steps * dt
-            self._restore_state(*good)
+            self._return_to_good()
             rest = slice(result.steps, None)
             self._upload_rows(
                 None if targets is None else targets[rest], None if loads is None else tuple(rows[rest] for rows in loads)
             )
             self._launch(1, dt)
             fault = self._describe_fault()
-            self._restore_state(*good)
+            self._return_to_good()
             raise SimulationError(f"step {simulation.step_count + 1}: {fault}")
         return result
 
@@ -240,8 +232,9 @@ class ExplicitStepper:
         simulation = self.simulation
         return simulation.load_rows(times, self._varied), simulation.loads.amplitudes(times)
 
-    def _restore_state(self, x: np.ndarray, v: np.ndarray) -> None:
-        self.simulation.set_state(x, v)
+    def _return_to_good(self) -> None:
+        """Return to the last good state."""
+        self.simulation.return_to(self.good)
         self.simulation.set_load_time(self.simulation.time)
         self.acceleration_stale = True
 

@@ -82,8 +82,8 @@ def _cavities(simulation: "SimulationState", x: np.ndarray, i: int) -> dict[str,
 def _pairs(contact: "ContactStep") -> str:
     """The pairs of colliders in contact, the first few of them."""
     names = [one.name for one in contact.detection.scene.colliders]
-    (body,) = download([contact.problem.body], contact.n_contacts)
-    pairs = [f"'{names[a]}' and '{names[b]}'" for a, b in np.unique(body, axis=0)]
+    (collider,) = download([contact.problem.body], contact.n_contacts)
+    pairs = [f"'{names[a]}' and '{names[b]}'" for a, b in np.unique(collider, axis=0)]
     return ", ".join(pairs[:PAIRS]) + (", ..." if len(pairs) > PAIRS else "")
 
 
@@ -92,12 +92,11 @@ def _contacts(contact: "ContactStep | NoContacts", i: int, beta: float) -> dict[
     if contact.n_contacts == 0:
         return {}
     p, names, found = contact.problem, [one.name for one in contact.detection.scene.colliders], {}
-    normal, tangent, r, body, node, weight, arity = download(
-        [p.normal, p.tangent, p.r, p.body, p.node, p.weight, p.arity], contact.n_contacts
-    )
+    arrays = p.normal, p.tangent, p.r, p.body, p.node, p.weight, p.arity
+    normal, tangent, r, collider, node, weight, arity = download(arrays, contact.n_contacts)
     impulse = r[:, :1] * normal + r[:, 1:2] * tangent + r[:, 2:] * np.cross(normal, tangent)
     used = (node == i) & (np.arange(node.shape[1]) < arity[:, None])
     for c, place in zip(*np.nonzero(used)):
-        what = "contact of " + " and ".join(f"'{names[side]}'" for side in body[c])
+        what = "contact of " + " and ".join(f"'{names[side]}'" for side in collider[c])
         found[what] = found.get(what, 0.0) + weight[c, place] * impulse[c] / beta
     return found

@@ -33,9 +33,7 @@ from taisoft.fem.rigid_tets import begin_rigid_stage
 from taisoft.fem.state import N_INVERTED
 from taisoft.settings import Settings
 
-LEAST_PART = 1e-3  # of a motion that is held back: below it nothing moves
 MAX_NEWTON, MAX_NEWTON_WITH_CONTACTS = 50, 25  # a step that needs more is cut in substeps, or reported as not converged
-TIGHTER = 0.1  # of the tolerance that would just balance the forces on a body
 DEFAULT_TOLERANCE = {"f32": 1e-4, "f64": 1e-8}  # relative residual; f32 forces carry 1e-6 to 1e-5 of rounding
 
 
@@ -81,15 +79,6 @@ def finish_midpoint(m: ti.template(), h: ti.template()):
     place_all(m)
 
 
-@kernel
-def restore(m: ti.template(), h: ti.template()):
-    """Restore state n."""
-    ti.loop_config(serialize=m.serial)
-    for i in range(m.n_nodes):
-        m.state.x[i] = h.x_now[i]
-        m.state.v[i] = h.v_now[i]
-
-
 @dataclass(frozen=True, eq=False)
 class History:
     """States n and n - 1, (n_nodes) 3-vectors f64; x_before only for multistep schemes."""
@@ -106,9 +95,10 @@ class ImplicitStepper:
     def __init__(self, simulation: SimulationState, settings: Settings, contact: ContactStep | NoContacts):
         self.simulation, self.scheme, self.contact = simulation, SCHEMES[settings.integrator], contact
         m, arena = simulation.model, simulation.arena
+        self.first, self.start = simulation.now.another(arena, "first"), simulation.now.another(arena, "now")
         self.history = History(
-            arena.vectors("x_now", ti.f64, m.n_nodes),
-            arena.vectors("v_now", ti.f64, m.n_nodes),
+            self.start.x,
+            self.start.v,
             arena.vectors("v_before", ti.f64, m.n_nodes),
             arena.vectors("x_before", ti.f64, m.n_nodes) if self.scheme.before else None,
         )
@@ -118,8 +108,6 @@ class ImplicitStepper:
         self.contact_tolerance = settings.contact_tolerance or TOLERANCE[settings.precision]
         self.linear_tolerance = settings.linear_tolerance
         self._substepping = Substepping(self)
-        self._saved_start = None, [], contact.flight, False, None  # see `save_start`
-        self._start_multipliers = None  # at the start of the last substep
         self.forget()
 
     def forget(self) -> None:
@@ -143,7 +131,7 @@ class ImplicitStepper:
 
     def snapshot(self) -> dict:
         """Return the state of the stepper: history, solver and contacts."""
-        x, v = download([self.history.x_now, self.history.v_now])
+        x, v = download([self.start.x, self.start.v])
         return {
             "past": self._n_previous,
             "beta": self._beta,
@@ -158,7 +146,7 @@ class ImplicitStepper:
 
     def restore(self, kept: dict) -> None:
         """Restore a `snapshot`. It has no x_before and v_before, since each step writes them first."""
-        upload([(self.history.x_now, kept["x_now"]), (self.history.v_now, kept["v_now"])])
+        upload([(self.start.x, kept["x_now"]), (self.start.v, kept["v_now"])])
         self._n_previous, self._beta, self._dt = int(kept["past"]), float(kept["beta"]), float(kept["dt"])
         self._substepping.may_retry = bool(kept["recovers"])
         self._substepping.limit.restore(kept["length_limit"])
@@ -204,10 +192,6 @@ class ImplicitStepper:
         """Whether steps are linearised, without iterations."""
         return self.scheme.one_iteration
 
-    def begin_iterations(self) -> None:
-        """Let a step have all its Newton iterations."""
-        self.solver.budget.begin()
-
     def is_spent(self) -> bool:
         """Return whether the step has no Newton iterations left."""
         return not self.solver.budget.left
@@ -224,14 +208,14 @@ class ImplicitStepper:
         self._return_in_part(0.0)
         n_start, part = self._count_inverted(), 1.0
         while n_end > n_start and part > 0.0:
-            part = 0.5 * part if part > LEAST_PART else 0.0
+            part = 0.5 * part if part > 1e-3 else 0.0
             self.simulation.set_state(*end)
             self._return_in_part(part)
             n_end = self._count_inverted()
         if part == 1.0:
             self.simulation.set_state(*end)
         else:
-            self.break_history()
+            self._n_previous = 0
         return part
 
     def _count_inverted(self) -> float:
@@ -240,69 +224,49 @@ class ImplicitStepper:
 
     def _return_in_part(self, part: float) -> None:
         """Leave only a part of the last substep's change of the free nodes' positions and velocities."""
-        free, *start = download([self.simulation.model.free, self.history.x_now, self.history.v_now])
+        free, *start = download([self.simulation.model.free, self.start.x, self.start.v])
         end = self.simulation.state()
         self.simulation.set_state(*(np.where(free > 0, a + part * (b - a), b).astype(b.dtype) for a, b in zip(start, end)))
 
-    def save_start(self) -> None:
-        """Save the start of a step, to which `return_to_start` returns."""
-        state = None if self.contact.idle else self.simulation.state()
-        simulation, contact = self.simulation, self.contact
-        flight, none_cross = contact.flight.copy(), contact.paths.none_cross
-        self._saved_start = state, simulation.dirichlet.released(), flight, none_cross, simulation.multipliers
+    def begin_step(self) -> None:
+        """Save the start of a step, which may take all its Newton iterations."""
+        self.first.copy_from(self.simulation.now)
+        self.solver.budget.begin()
 
-    def return_to_start(self, already_undone: bool = False) -> None:
-        """Restore the step's start, without history. already_undone: whether the only substep so far has been undone."""
-        state, released, flight, none_crossed, multipliers = self._saved_start
-        if state is None and not already_undone:
-            restore(self.simulation.model, self.history)
-            state = self.simulation.state()
-            self._saved_start = state, released, flight, none_crossed, multipliers
-        self._restore_state(state, released, multipliers)
+    def return_to_first(self) -> None:
+        """Return to the start of the step, without history."""
+        self.simulation.return_to(self.first)
         self._n_previous = 0
-        self.contact.return_to_start(none_crossed)
-        self.contact.flight[:] = flight
+        self.contact.discard()
 
-    def _restore_state(
-        self, state: tuple[np.ndarray, np.ndarray] | None, released: list[bool], multipliers: np.ndarray | None
-    ) -> None:
-        """Restore a state, if not None, the released groups and the Lagrange multipliers (k,), if any."""
-        simulation = self.simulation
-        if multipliers is not None:
-            simulation.set_multipliers(multipliers)
-        if state is not None:
-            simulation.set_state(*state)
-        if simulation.dirichlet.released() != released:
-            simulation.dirichlet.set_released(released)
-            simulation.upload_constraints()
+    def begin_substep(self, dt: float) -> None:
+        """Save the start of a substep of dt; the stage saves positions and velocities."""
+        self.start.copy_rest_from(self.simulation.now)
+        self.contact.start_substep(dt)
 
-    def restore_start(self) -> None:
-        """Restore the start of the last substep."""
-        restore(self.simulation.model, self.history)
-
-    def retry_substep(self, time: float, dt: float, start: np.ndarray) -> StageResult:
-        """Repeat the restored substep with other contacts. start: (n_nodes, 3) [m/s] velocities reached before."""
-        past, self._n_previous, multipliers = self._n_previous, 0, self._start_multipliers
-        result = self.take_substep(time, dt, start)
-        self._n_previous, self._start_multipliers = min(self._n_previous, past), multipliers
-        return result
-
-    def break_history(self) -> None:
-        """Let the next substep start without history, after the state was changed."""
-        self._n_previous = 0
-
-    def undo_substep(self, released: list[bool], discard_impulses: bool) -> None:
-        """Restore the start of the last substep and the groups released then, for another length of it."""
-        self.restore_start()
-        self._restore_state(None, released, self._start_multipliers)
+    def undo_substep(self, discard_impulses: bool) -> None:
+        """Return to the start of the last substep, for another length of it."""
+        self.simulation.return_to(self.start)
         self._n_previous = 0
         # BDF2 detects impacts by the contacts without impulse in the last step
-        self.contact.reset_substep(discard_impulses or self.scheme.before > 0.0)
+        self.contact.discard_search(with_impulses=discard_impulses or self.scheme.before > 0.0)
+
+    def retry_substep(self, time: float, dt: float, start: np.ndarray) -> StageResult:
+        """Repeat a substep with other contacts, from its start. start: (n_nodes, 3) [m/s] velocities reached before."""
+        past, self._n_previous = self._n_previous, 0
+        result = self.take_substep(time, dt, start)
+        self._n_previous = min(self._n_previous, past)
+        return result
+
+    def hold_back_paths(self) -> None:
+        """Hold back bodies of the last substep that pass through something; the next one starts without history."""
+        self.contact.paths.hold_back(self.start.x)
+        self._n_previous = 0
 
     def take_substep(self, time: float, dt: float, start: np.ndarray | None = None) -> StageResult:
         """Take a substep of dt from a time with the contacts of one search. start: (n_nodes, 3) [m/s] first iterate of v."""
         simulation, m, h, w = self.simulation, self.simulation.model, self.history, self.solver.work
-        releases, self._start_multipliers = simulation.releases, simulation.multipliers
+        releases = simulation.releases
         target = simulation.next_target(time + dt)
         if simulation.releases != releases or dt != self._dt:
             self._n_previous = 0
@@ -332,20 +296,13 @@ class ImplicitStepper:
         self._begin(scheme, extrapolation)
         if start is not None and not scheme.one_iteration:  # that one is linearised at the step's start
             upload([(m.state.v, start)])
-        try:
-            result = self._solve_balanced(scheme, dt, bounces)
-        except BaseException:  # Ctrl-C, too: the step is abandoned
-            restore(m, h)
-            self.forget()
-            raise
+        result = self._solve_balanced(scheme, dt, bounces)
         if not result.converged:
             result = replace(result, imbalance=describe_imbalance(simulation, self.solver, self.contact))
         if scheme.midpoint:
             finish_midpoint(m, h)
         if not np.isfinite(result.residual):  # a NaN anywhere in x or v reaches the residual
             where = simulation.find_nonfinite(self.solver.work.residual.to_numpy()) or "the residual is not finite"
-            restore(m, h)
-            self.forget()
             raise SimulationError(f"step {simulation.step_count + 1}: {where}")
         self._n_previous += 1
         if self.contact.had_impact:
@@ -370,9 +327,9 @@ class ImplicitStepper:
             return result
         worst, name = self._unbalanced_mean()
         if worst > Pieces.LIMIT and not bounces:
-            self.restore_start()
+            self.simulation.now.copy_nodes_from(self.start)
             self._begin(scheme, 0.0)
-            tighter = self.tolerance * Pieces.LIMIT / min(worst, 1.0) * TIGHTER
+            tighter = self.tolerance * Pieces.LIMIT / min(worst, 1.0) * 0.1  # a tenth of what would just balance the piece
             stage = replace(stage, tolerance=tighter)
             result = count_all(correct_multipliers(self.solver, stage, solve(self.solver, stage)), [result])
             worst, name = self._unbalanced_mean()

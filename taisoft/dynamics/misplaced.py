@@ -36,11 +36,10 @@ FADING, MIN_STEPS = 0.95, 10
 LEAST_SHARE = 0.2  # of the contact impulses on a body in a step: where a pair has less, an event of few steps is not reported
 AT_REST = 0.01  # of the contact offset: slip in a step below which a contact sticks
 LEFT = 0.5  # of the slip: distance beyond that of the linearised motion from which a point that stays at edges has left them
-PAIRS = 16  # rows at first
 # columns of the sums over steps: S, W, the work of friction, the largest S of a step; then S, W, friction and impulse of this
 # step; the pair, first collider * n_colliders + second, -1 in unused rows
 SLIP_WORK, FALSE_WORK, FRICTION_WORK, LARGEST, NOW, IMPULSE, PAIR, COLUMNS = 0, 1, 2, 3, 4, 7, 8, 9
-UNUSED = np.where(np.arange(COLUMNS) == PAIR, -1.0, 0.0)
+NO_SUMS = np.tile(np.where(np.arange(COLUMNS) == PAIR, -1.0, 0.0), (16, 1))
 
 
 @ti.func
@@ -203,28 +202,13 @@ def add_step(
 
 
 class Misplacement:
-    """Contact forces of a simulation's pairs that the normals of steps' starts misplace."""
+    """Contact forces of a simulation's pairs that the normals of steps' starts misplace. Their sums are `StepState.misplaced`."""
 
     def __init__(self, simulation: SimulationState, detection: Detection):
         self._simulation, self._detection = simulation, detection
         self._arena = FieldArena()
-        self._sums = self._arena.field("misplaced", ti.f64, (0, COLUMNS))
-        self.forget()
-
-    def forget(self) -> None:
-        """Discard all sums, after a state was set."""
-        self.restore(np.zeros((0, COLUMNS)))
+        self._sums = self._arena.field("misplaced", ti.f64, NO_SUMS.shape)  # for kernels
         self.start_step()
-
-    def snapshot(self) -> np.ndarray:
-        """Return the sums (k,9)."""
-        sums = self._sums.to_numpy()
-        return sums[sums[:, PAIR] >= 0.0]
-
-    def restore(self, kept: np.ndarray) -> None:
-        """Restore a `snapshot`."""
-        self._store(np.concatenate([kept, np.tile(UNUSED, (PAIRS, 1))]))
-        self._start = self._sums.to_numpy()
 
     def _store(self, sums: np.ndarray) -> None:
         """Put the sums where kernels find them."""
@@ -241,34 +225,28 @@ class Misplacement:
     def start_step(self) -> None:
         """Begin a step."""
         self.part, self.text = 0.0, ""  # largest misplaced part in this step, and a sentence if that is too much
-        self._start = self._sums.to_numpy()
 
-    def return_to_start(self) -> None:
-        """Discard what was added since the step began."""
-        self._store(self._start)
-        self.start_step()
-
-    def add(self, p: ContactProblem, dt: float, contact_offset: float) -> None:
+    def add(self, problem: ContactProblem, dt: float, contact_offset: float) -> None:
         """Add a substep of dt [s], whose end was searched last."""
-        d, n = self._detection, len(self._detection.scene.colliders)
-        records = p, self._simulation.model, d.surface, d.shapes, d.has_pairs
+        detection, now, n = self._detection, self._simulation.now, len(self._detection.scene.colliders)
+        records = problem, self._simulation.model, detection.surface, detection.shapes, detection.has_pairs
+        self._store(now.misplaced)
         while (row := add_step(*records, dt, contact_offset, n, self._sums, self._sums.shape[0])) == -2:
-            sums = self._sums.to_numpy()
-            self._store(np.concatenate([sums, np.tile(UNUSED, (len(sums), 1))]))
+            self._store(np.concatenate([self._sums.to_numpy(), np.resize(NO_SUMS, self._sums.shape)]))
+        now.misplaced = self._sums.to_numpy()
         if row < 0:
             return
-        slip, false, friction, largest, slip_now, false_now, *_, pair = self._sums[row].tolist()
+        slip, false, friction, largest, slip_now, false_now, *_, pair = now.misplaced[row].tolist()
         part = abs(false) / max(slip, MIN_STEPS * largest)
         if part > self.part:
             self.part = part
-            is_event, now = MIN_STEPS * largest > slip, abs(false_now) > MAX_MISPLACED * slip_now
-            if part > MAX_MISPLACED and now and not (is_event and self._share(row) < LEAST_SHARE):
+            is_event, is_false = MIN_STEPS * largest > slip, abs(false_now) > MAX_MISPLACED * slip_now
+            if part > MAX_MISPLACED and is_false and not (is_event and self._share(row) < LEAST_SHARE):
                 self.text = self._describe(*divmod(int(pair), n), slip, false, friction)
 
     def _share(self, row: int) -> float:
         """Return the part that a row has of the impulses of this step on its two bodies, that in which it has more."""
-        n = len(self._detection.scene.colliders)
-        sums = self._sums.to_numpy()
+        n, sums = len(self._detection.scene.colliders), self._simulation.now.misplaced
         of, now = np.stack(np.divmod(sums[:, PAIR], n), axis=1), sums[:, IMPULSE]
         bodies = of[row][of[row] < len(self._detection.scene.bodies)]
         return max(float(now[row] / now[(of == body).any(axis=1)].sum()) for body in bodies)

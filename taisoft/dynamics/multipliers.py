@@ -86,7 +86,7 @@ class Multipliers:
         present = [tendons[one.name] if isinstance(one, Tendon) else scene.cavity(one.name)[1] for one in self._owners]
         wanted = np.array([self._wanted(one, time) for one in present])
         self.targets = self._rest + fraction * (wanted - self._rest)
-        self.values = self._simulation.multipliers.copy()
+        self.values = self._simulation.now.multipliers.copy()
         young = [1.0 if isinstance(one, Tendon) else float(np.max(scene.cavity(one.name)[0].young)) for one in present]
         force = np.where(self._is_tendon, np.maximum(self.values, self._weight), PENALTY * np.array(young))
         self.penalty = force / np.abs(np.where(self._is_tendon, self.targets, self._rest))

@@ -10,16 +10,14 @@ from taisoft.dynamics.simulation_state import SimulationState
 
 
 class Rebounds:
-    """Finds contacts that rebound. flight (n_colliders,): sum of dt^2 over the steps since each collider's last contact [s^2].
+    """Finds contacts that rebound. `StepState.flight`: sum of dt^2 over the steps since each collider's last contact.
 
     Free flight in dissipative steps loses energy, which a rebound may give back, see `contact.restitution`.
     """
 
     def __init__(self, simulation: SimulationState, arena: FieldArena):
         self._simulation = simulation
-        self.flight = np.zeros(len(simulation.scene.colliders))
-        self._flight = arena.field("flight", ti.f64, len(self.flight))  # for kernels
-        self._gravity = simulation.scene.gravity.copy()  # during the flight
+        self._flight = arena.field("flight", ti.f64, len(simulation.scene.colliders))  # for kernels
         self.numbers_changed()
 
     def numbers_changed(self) -> None:
@@ -28,13 +26,12 @@ class Rebounds:
 
     def detect(self, problem: ContactProblem, dt: float, contact_offset: float) -> bool:
         """Return whether surfaces rebound in the step of dt [s] that has begun."""
-        scene = self._simulation.scene
+        now, gravity = self._simulation.now, self._simulation.scene.gravity
         if not self._any:
             return False
-        if (self._gravity != scene.gravity).any():  # energy lost under another gravity is unknown
-            self._gravity = scene.gravity.copy()
-            self.flight[:] = 0.0
-        self._flight.from_numpy(self.flight)
+        if (now.gravity != gravity).any():  # energy lost under another gravity is unknown
+            now.gravity[:], now.flight[:] = gravity, 0.0
+        self._flight.from_numpy(now.flight)
         return find_rebounds(problem, self._simulation.model.gravity, self._flight, dt, contact_offset) > 0
 
     def count_flight(self, problem: ContactProblem, n: int, dt: float, dissipative: bool) -> None:
@@ -42,11 +39,11 @@ class Rebounds:
         implicit Euler."""
         if not self._any:
             return
-        scene, layout, dirichlet = self._simulation.scene, self._simulation.layout, self._simulation.dirichlet
-        self.flight += np.where(self.flight > 0.0, dt**2 if dissipative else 0.0, dt**2)
-        r, struck, body = download([problem.r, problem.impact_impulse, problem.body], n)
-        self.flight[body[(r != 0.0).any(axis=1)]] = 0.0
-        self.flight[body[(struck != 0.0).any(axis=1)]] = dt**2
-        constrained = np.logical_or.reduceat(dirichlet.constrained().any(axis=1), layout.node_start[:-1])
-        self.flight[: len(scene.bodies)][constrained] = 0.0
-        self.flight[len(scene.bodies) :] = 0.0
+        simulation, flight = self._simulation, self._simulation.now.flight
+        flight += np.where(flight > 0.0, dt**2 if dissipative else 0.0, dt**2)
+        r, struck, collider = download([problem.r, problem.impact_impulse, problem.body], n)
+        flight[collider[(r != 0.0).any(axis=1)]] = 0.0
+        flight[collider[(struck != 0.0).any(axis=1)]] = dt**2
+        starts = simulation.layout.node_start[:-1]
+        constrained = np.logical_or.reduceat(simulation.dirichlet.constrained().any(axis=1), starts)
+        flight[: len(starts)][constrained] = flight[len(starts) :] = 0.0

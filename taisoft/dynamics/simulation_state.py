@@ -8,6 +8,7 @@ import numpy as np
 from taisoft.backend.arrays import FieldArena, download, upload
 from taisoft.backend.runtime import Runtime
 from taisoft.dynamics.dirichlet import DirichletConditions
+from taisoft.dynamics.state import StepState
 from taisoft.fem.dependents import DependentTable
 from taisoft.fem.loads import SceneLoads
 from taisoft.fem.mean_dilatation import patch_moduli
@@ -36,11 +37,16 @@ class SimulationState:
     time: float = 0.0
     step_count: int = 0
     releases: int = 0  # number of releases of prescribed nodes; each invalidates the steppers' history
+    now: StepState = field(init=False)
     drag: tuple[np.ndarray, np.ndarray] | None = None  # nodes (k,) and forces (k, 3) [N] of a drag spring
     _loads: SceneLoads | None = None  # None: not computed, or outdated
     load_time: float | None = None  # of the loads on the device; None: several, or outdated
-    multipliers: np.ndarray | None = None  # (k,) Lagrange multipliers [Pa] or [N], see `SceneLoads.multipliers`; None: none
     _cavity_forms: dict[str, CavityForm] = field(default_factory=dict)  # those built so far, by name
+
+    def __post_init__(self) -> None:
+        nodes, gravity = self.model.state, np.array(self.scene.gravity)
+        multipliers, flight = np.zeros(len(self.loads.multipliers)), np.zeros(len(self.scene.colliders))
+        self.now = StepState(self.model, nodes.x, nodes.v, self.dirichlet.released, multipliers, flight, gravity)
 
     @property
     def dependents(self) -> DependentTable | None:
@@ -76,29 +82,36 @@ class SimulationState:
 
     def snapshot(self) -> dict:
         """Return the state for a checkpoint; see `taisoft/checkpoint.py`."""
-        x, v = self.state()
-        own = {"time": self.time, "step_count": self.step_count, "released": self.dirichlet.released(), "x": x, "v": v}
-        return own if self.multipliers is None else own | {"multipliers": self.multipliers}
+        return {"time": self.time, "step_count": self.step_count} | self.now.snapshot()
 
     def restore(self, kept: dict) -> None:
         """Restore a `snapshot`, also one of another instance of the same scene."""
-        self.dirichlet.set_released(kept["released"])
-        self.upload_constraints()
-        self.set_state(kept["x"], kept["v"])
-        self.time, self.step_count = float(kept["time"]), int(kept["step_count"])
-        if self.multipliers is not None:
-            self.set_multipliers(kept["multipliers"])
-        self.set_load_time(self.time)
+        for name in ("released", "flight", "gravity"):
+            getattr(self.now, name)[:] = kept[name]
+        self.now.none_cross = bool(kept["none_cross"])
+        if self.now.held is not None:
+            self.now.held, self.now.misplaced = self.now.held.at_start(kept["held"]), kept["misplaced"]
+        self._begin_at(kept["x"], kept["v"], float(kept["time"]), int(kept["step_count"]), kept["multipliers"])
 
     def restart(self) -> None:
         """Set the initial state of the scene."""
-        self.dirichlet.reset()
+        self.now.released[:] = False
+        self._begin_at(self.layout.rest, self._rest_velocities(), 0.0, 0, np.zeros(len(self.loads.multipliers)))
+
+    def _begin_at(self, x: np.ndarray, v: np.ndarray, time: float, step_count: int, multipliers: np.ndarray) -> None:
         self.upload_constraints()
-        self.set_state(self.layout.rest, self._rest_velocities())  # compiles it before a step may need it
-        self.time, self.step_count = 0.0, 0
-        if len(self.loads.multipliers):
-            self.set_multipliers(np.zeros(len(self.loads.multipliers)))
-        self.set_load_time(0.0)
+        self.set_state(x, v)
+        self.time, self.step_count = time, step_count
+        self.set_multipliers(multipliers)
+        self.set_load_time(time)
+
+    def return_to(self, earlier: StepState) -> None:
+        """Return to an earlier state of the same step."""
+        is_constrained_alike = (self.now.released == earlier.released).all()
+        self.now.copy_from(earlier)
+        self.set_multipliers(earlier.multipliers)
+        if not is_constrained_alike:
+            self.upload_constraints()
 
     def prescribed_moves(self, t: float) -> tuple[np.ndarray, np.ndarray] | None:
         """Return nodes (k,) whose motion from the present state to a time t [s] is prescribed, those that depend on such nodes
@@ -155,7 +168,9 @@ class SimulationState:
 
     def set_multipliers(self, values: np.ndarray) -> None:
         """Set the Lagrange multipliers (k,) [Pa] or [N]; `set_load_time` uploads them."""
-        self.multipliers, self.load_time = np.array(values), None
+        self.now.multipliers = np.array(values)
+        if len(values):
+            self.load_time = None
 
     def set_drag(self, drag: tuple[np.ndarray, np.ndarray] | None) -> None:
         """Set nodes and forces of a drag spring, or None, and upload the loads of the present time."""
@@ -182,8 +197,7 @@ class SimulationState:
     def amplitudes(self, time: float) -> np.ndarray:
         """Return the loads that are one number at a time [s], with the present Lagrange multipliers."""
         amplitudes = self.loads.amplitudes([time])[0]
-        if self.multipliers is not None:
-            amplitudes[self.loads.multipliers] = self.multipliers
+        amplitudes[self.loads.multipliers] = self.now.multipliers
         return amplitudes
 
     def cavity_pressures_by_name(self, time: float) -> dict[str, float]:

@@ -25,24 +25,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from taisoft.dynamics.contact_measures import DEEP_CROSSING, DEEP_PENETRATION, ROUNDING, next_length
+from taisoft.collision.intersections import CROSSED
+from taisoft.dynamics.contact_measures import DEEP_PENETRATION, ROUNDING, next_length
 from taisoft.dynamics.results import StageResult, count_all, merge
 from taisoft.errors import SimulationError
 
 if TYPE_CHECKING:
     from taisoft.dynamics.implicit import ImplicitStepper
 
-MAX_SUBSTEPS = 256  # per step
-MAX_CLOSING_RATIO = 2.0  # maximum closing ratio after a substep: its speed was not known when the step was cut
-MAX_SEARCHES = 3  # along a substep's actual path, if it left the expected one
 MAX_PASSAGES = 8  # repetitions of a substep with the pairs that would have passed through each other
-MAX_FAILED = 1  # attempts at a substep that did not converge, after which it is halved if something still passes
-MAX_PATIENCE = 8  # substeps kept before a longer one is tried
-HALF_TRIED = 0.51  # of a doubled limit: a substep up to this long, which divides a step equally, does not try it
-MAX_UNDONE = 16  # per step, for reasons other than speed and trials of a longer substep: each costs a few solves
-WORSENING = 1.1  # growth of an existing penetration that counts as a new one
-RETRIES = 4  # maximum number of equal substeps after non-convergence; only shorter substeps are halved for that
-MAX_UNCONVERGED = 2  # maximum consecutive halvings for that: if they do not help, more do not either
 
 
 class Fault(Enum):
@@ -63,19 +54,22 @@ class LengthLimit:
     persists from step to step, until a substep that is a whole step is kept.
     """
 
+    MAX_PATIENCE = 8
+    HALF_TRIED = 0.51  # of a doubled limit: a substep up to this long, which divides a step equally, does not try it
+
     def __init__(self):
         self.longest, self.patience, self.n_kept = math.inf, 1, 0  # [s]; substeps; substeps kept under this limit
         self.is_trial = False  # whether the limit was doubled, and no substep of that length has been kept since
 
     def undo(self, length: float, again: bool) -> None:
         """Count a substep that was undone, for half its length. again: whether the one before, at the same place, was too."""
-        self.patience = self.patience if again else min(2 * self.patience, MAX_PATIENCE)
+        self.patience = self.patience if again else min(2 * self.patience, self.MAX_PATIENCE)
         self.longest, self.n_kept, self.is_trial = 0.5 * length, 0, False
 
     def keep(self, length: float, dt: float) -> None:
         """Count a substep of a length that was kept in a step of dt."""
         is_whole = length > (1.0 - ROUNDING) * dt
-        if self.longest == math.inf or (self.is_trial and length <= HALF_TRIED * self.longest and not is_whole):
+        if self.longest == math.inf or (self.is_trial and length <= self.HALF_TRIED * self.longest and not is_whole):
             return
         if is_whole:
             self.__init__()
@@ -96,11 +90,16 @@ class LengthLimit:
 
 
 class Substepping:
-    """Wrap the plain steps of an implicit stepper: substeps, undoing and retries.
+    """Wrap the plain steps of an implicit stepper: substeps, undoing and retries."""
 
-    The stepper takes a substep (`take_substep`), repeats it with other contacts (`restore_start`, `retry_substep`), or undoes it
-    for another length (`undo_substep`). `save_start` and `return_to_start` save and restore the start of a step.
-    """
+    MAX_SUBSTEPS = 256  # per step
+    MAX_CLOSING_RATIO = 2.0  # maximum closing ratio after a substep: its speed was not known when the step was cut
+    MAX_SEARCHES = 3  # along a substep's actual path, if it left the expected one
+    MAX_FAILED = 1  # attempts at a substep that did not converge, after which it is halved if something still passes
+    MAX_UNDONE = 16  # per step, for reasons other than speed and trials of a longer substep: each costs a few solves
+    WORSENING = 1.1  # growth of an existing penetration that counts as a new one
+    RETRIES = 4  # maximum number of equal substeps after non-convergence; only shorter substeps are halved for that
+    MAX_UNCONVERGED = 2  # maximum consecutive halvings for that: if they do not help, more do not either
 
     def __init__(self, stepper: "ImplicitStepper"):
         self._stepper, self._contact = stepper, stepper.contact
@@ -117,8 +116,7 @@ class Substepping:
         history. Linearly implicit steps do not iterate. Raise SimulationError if a step fails; the state is then the one before.
         """
         stepper, substeps, discarded = self._stepper, 1, []
-        stepper.save_start()
-        stepper.begin_iterations()
+        stepper.begin_step()
         while True:
             result, unconverged, taken = None, True, substeps
             try:
@@ -126,7 +124,7 @@ class Substepping:
                 result, taken = merge(results), len(results)
                 unconverged = not (result.converged or stepper.is_linear)
             except BaseException as error:  # Ctrl-C, too
-                stepper.return_to_start(already_undone=True)
+                stepper.return_to_first()
                 may_retry = self.may_retry
                 stepper.forget()
                 if substeps == 1 or stepper.is_spent() or not isinstance(error, SimulationError):
@@ -135,11 +133,11 @@ class Substepping:
             if result is not None:
                 discarded.append(result)
             may_help = self.may_retry and not (self._contact.paths.held_back or stepper.is_spent())
-            if not (unconverged and may_help and (taken < RETRIES or substeps > 1)):
+            if not (unconverged and may_help and (taken < self.RETRIES or substeps > 1)):
                 break
-            self.may_retry = taken < RETRIES
-            substeps = min(2 * taken, RETRIES) if self.may_retry else 1
-            stepper.return_to_start()
+            self.may_retry = taken < self.RETRIES
+            substeps = min(2 * taken, self.RETRIES) if self.may_retry else 1
+            stepper.return_to_first()
         self.substeps = taken
         self.may_retry = (self.may_retry and not stepper.is_spent()) or not unconverged
         return count_all(result, discarded[:-1])
@@ -150,8 +148,8 @@ class Substepping:
         Raise SimulationError if contacts close too fast.
         """
         contact, stepper, may_retry = self._contact, self._stepper, self.may_retry and not self._stepper.is_linear
-        shortest, longest = (1.0 - 1e-6) * dt / MAX_SUBSTEPS, dt / substeps
-        results, remaining, undo_budget, self.held_part = [], dt, MAX_UNDONE, 0.0
+        shortest, longest = (1.0 - 1e-6) * dt / self.MAX_SUBSTEPS, dt / substeps
+        results, remaining, undo_budget, self.held_part = [], dt, self.MAX_UNDONE, 0.0
         undone, n_unconverged, n_crossed = [], 0, 0  # of the current substep
         self._measure_start(start, dt)
         length = self._longest(longest, dt)
@@ -166,10 +164,9 @@ class Substepping:
             if length < shortest:
                 if not contact.paths.none_cross:
                     self._refuse_fast_closing(dt)
-                length = min(dt / MAX_SUBSTEPS, remaining)  # the check of its path suffices
-            contact.start_substep(length)
+                length = min(dt / self.MAX_SUBSTEPS, remaining)  # the check of its path suffices
+            stepper.begin_substep(length)
             relative_penetration, last = contact.relative_penetration, length > remaining - shortest
-            released = stepper.simulation.dirichlet.released()
             if is_rest:
                 may_cut, (result, fault) = False, self._hold_substep(time, length)
                 self.held_part += length / dt
@@ -181,15 +178,14 @@ class Substepping:
                 self._refuse_fast_closing(dt)
             is_held_back = fault == Fault.CROSSED and not may_cut
             if is_held_back:
-                contact.paths.hold_back(stepper.history.x_now)
-                stepper.break_history()
+                stepper.hold_back_paths()
                 result, fault = replace(result, converged=False), None
             if stepper.is_spent() and not (is_rest or result.converged or fault == Fault.FAST):
                 self._hold_back_inverted(length / dt)
             if fault != Fault.FAST and not (fault and may_cut):
                 contact.penetration = contact.end(time + length, dt if last else length)
-                is_short = length < (1.0 - ROUNDING) * min(longest, dt / RETRIES)
-                fault = self._find_fault(result, may_retry and is_short and n_unconverged < MAX_UNCONVERGED)
+                is_short = length < (1.0 - ROUNDING) * min(longest, dt / self.RETRIES)
+                fault = self._find_fault(result, may_retry and is_short and n_unconverged < self.MAX_UNCONVERGED)
             if fault == Fault.FAST or (fault and may_cut):
                 is_trial = fault == Fault.CROSSED and self.limit.is_trial
                 undo_budget -= not (fault == Fault.FAST or is_trial)
@@ -198,7 +194,7 @@ class Substepping:
                 if fault == Fault.CROSSED:
                     self.limit.undo(length, again=n_crossed > 0)
                     n_crossed += 1
-                stepper.undo_substep(released, discard_impulses=fault == Fault.UNCONVERGED)
+                stepper.undo_substep(discard_impulses=fault == Fault.UNCONVERGED)
                 contact.relative_penetration, length = relative_penetration, 0.5 * length
                 continue
             # the present penetration is not new for the next substep
@@ -222,11 +218,11 @@ class Substepping:
         held = 1.0 - self._stepper.hold_back_inverted()
         self.held_part += of_step * held
         if held and self._contact.paths.find():
-            self._contact.paths.hold_back(self._stepper.history.x_now)
+            self._stepper.hold_back_paths()
 
     def _longest(self, longest: float, dt: float) -> float:
         """The longest substep that is tried in a step of dt, up to a given length. The limit may stem from smaller steps."""
-        return min(longest, max(self.limit.longest, dt / MAX_SUBSTEPS))
+        return min(longest, max(self.limit.longest, dt / self.MAX_SUBSTEPS))
 
     def _closing_ratio(self, time: float, length: float) -> float:
         """Return the largest closing ratio of a substep; where nothing crosses 0, since the check of its path suffices."""
@@ -238,14 +234,14 @@ class Substepping:
         relative_penetration, _ = contact.measure_start(start, dt)
         crossing = contact.initial_crossing()
         contact.relative_penetration = max(relative_penetration, crossing)
-        self._deepest, self._most_crossed = DEEP_PENETRATION, DEEP_CROSSING
+        self._deepest, self._most_crossed = DEEP_PENETRATION, CROSSED
         self._raise_limits(contact.relative_penetration, crossing)
         contact.start_step(dt)
 
     def _raise_limits(self, relative_penetration: float, crossing: float) -> None:
         """Raise the limits above which a penetration or crossing is new to WORSENING times the given ones."""
-        self._deepest = max(self._deepest, WORSENING * relative_penetration)
-        self._most_crossed = max(self._most_crossed, WORSENING * crossing)
+        self._deepest = max(self._deepest, self.WORSENING * relative_penetration)
+        self._most_crossed = max(self._most_crossed, self.WORSENING * crossing)
 
     def _find_fault(self, result: StageResult, may_be_unconverged: bool) -> Fault | None:
         """Return the fault of a substep whose end has been measured, if any."""
@@ -256,20 +252,20 @@ class Substepping:
 
     def _refuse_fast_closing(self, dt: float) -> None:
         number = self._stepper.simulation.step_count + 1
-        raise SimulationError(f"step {number}: {self._contact.describe_fast_closing(dt, MAX_SUBSTEPS)}")
+        raise SimulationError(f"step {number}: {self._contact.measures.describe_fast_closing(dt, self.MAX_SUBSTEPS)}")
 
     def _take_substep(self, time: float, dt: float, may_cut: bool) -> tuple[StageResult, Fault | None]:
         """Take a substep of dt from a time, and repeat it while its path has new contacts. Leave its end as the state."""
         contact, stepper, before = self._contact, self._stepper, self._contact.relative_penetration
-        simulation, start, result = stepper.simulation, stepper.history.x_now, stepper.take_substep(time, dt)
+        simulation, start, result = stepper.simulation, stepper.start, stepper.take_substep(time, dt)
         n_failed = 0
         for tries in range(MAX_PASSAGES + 1):
-            as_searched = not contact.paths.left_searched(start)
+            as_searched = not contact.paths.left_searched(start.x)
             passes = as_searched and contact.paths.find()
             if as_searched and not passes and not contact.penetrates_deeper(time + dt, dt, before):
                 break
             state = simulation.state()
-            stepper.restore_start()
+            simulation.now.copy_nodes_from(start)
             new = contact.search_along_path(time, dt)
             if not as_searched:
                 passes = contact.paths.find(as_searched=True)
@@ -277,13 +273,13 @@ class Substepping:
                 new = contact.search_along_path(time, dt) if passes else new and not contact.paths.none_cross
             n_failed += not (result.converged or stepper.is_linear)
             # a slide by D over a radius R cuts D^2 / 2R deep, farther than contacts of the start keep surfaces apart: try again
-            failed = may_cut and n_failed >= MAX_FAILED and not contact.paths.are_round()
+            failed = may_cut and n_failed >= self.MAX_FAILED and not contact.paths.are_round()
             hopeless = stepper.is_spent() or (passes and (contact.paths.is_stuck or failed))
-            if not (new or passes) or tries >= (MAX_PASSAGES if passes else MAX_SEARCHES) or hopeless:
+            if not (new or passes) or tries >= (MAX_PASSAGES if passes else self.MAX_SEARCHES) or hopeless:
                 simulation.set_state(*state)
                 if passes:
                     return result, Fault.CROSSED
-                if not contact.paths.none_cross and contact.closing_ratio_along_path() > MAX_CLOSING_RATIO:
+                if not contact.paths.none_cross and contact.measures.closing_ratio > self.MAX_CLOSING_RATIO:
                     return result, Fault.FAST
                 return result, Fault.UNSETTLED if new else None
             result = count_all(stepper.retry_substep(time, dt, state[1]), [result])

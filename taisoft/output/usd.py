@@ -26,7 +26,7 @@ from pathlib import Path
 
 import numpy as np
 
-from taisoft.dynamics.contact_record import nodal_impulses
+from taisoft.dynamics.readout import nodal_impulses
 from taisoft.errors import OutputError
 from taisoft.files import part_path, publish, replacing
 from taisoft.mesh.usd_content import usd_message

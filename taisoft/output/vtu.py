@@ -31,7 +31,7 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
-from taisoft.dynamics.contact_record import nodal_impulses
+from taisoft.dynamics.readout import nodal_impulses
 from taisoft.errors import OutputError
 from taisoft.files import write_bytes
 from taisoft.machine import require

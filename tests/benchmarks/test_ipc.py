@@ -70,7 +70,7 @@ def test_work_and_creep_of_friction(substeps):
     normal, mu = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]), 0.5
     pressing, tangential = np.array([2.0, 3.0]), np.array([[0.4, 0.0, 0.8], [0.9, 1.2, 0.0]])  # |p_t| / mu p_n: 0.89, 1
     contacts = replace(
-        no_contacts(),
+        no_contacts(scene),
         point=np.array([[0.3, -0.5, 0.2], [0.0, 0.5, 0.0]]),
         normal=normal,
         gap=np.zeros(2),

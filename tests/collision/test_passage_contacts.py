@@ -17,7 +17,7 @@ import taisoft as ts
 from taisoft.backend.arrays import FieldArena
 from taisoft.collision.near_list import SEARCHED
 from taisoft.collision.passages import ADJACENT, FLAT, N_FEATURES, N_KINDS, NEAR, ROUND
-from taisoft.collision.path_check import HeldPassages, adjacent_rows
+from taisoft.collision.path_check import NO_PASSAGES, HeldPassages, adjacent_rows
 from tests.collision.checked_paths import axis_at
 from tests.collision.detection_scenes import folded
 from tests.collision.rotations import rotation
@@ -35,6 +35,7 @@ class Detected:
 
     def __init__(self, made, path):
         self.made, self._path, self.detection = made, path, made.find_contacts(0.0)
+        self.held, self.none_cross = NO_PASSAGES, False
 
     def search(self, x: np.ndarray, move: np.ndarray) -> None:
         """Find contacts from nodes (n,3) [m] displaced by `move` [m], and obstacles from 0 to 1 s."""
@@ -44,12 +45,12 @@ class Detected:
 
     def again(self) -> None:
         """Repeat the last search, with the passages held by now."""
-        self.detection.find(0.0, 1.0, None, self._path)
+        self.detection.find(0.0, 1.0, None, self._path, self.held, self.none_cross)
 
     def meeting(self) -> set[frozenset[str]]:
         """The names of colliders that would pass each other."""
         names = [c.name for c in self.made.scene.colliders]
-        found = self.detection.colliders_of(self.detection.passages(SEARCHED)[0])
+        found = self.detection.paths.colliders(self.detection.passages(SEARCHED)[0])
         return {frozenset((names[a], names[b])) for a, b in found}
 
 
@@ -107,8 +108,8 @@ def test_held_passages_are_contacts():
             move[rows_of(one.made, "box 1"), 1] -= 0.5
             move[rows_of(one.made, "box 0"), 1] -= 0.2
             one.search(start, move)
-            d.held = held(*d.passages(SEARCHED))
-            time = dict(zip(map(tuple, d.held[0].tolist()), d.held[1].tolist()))
+            one.held = held(*d.passages(SEARCHED))
+            time = dict(zip(map(tuple, one.held[0].tolist()), one.held[1].tolist()))
             one.again()
             c = d.contacts()
             own = np.flatnonzero(c.kind == "face_face")
@@ -124,7 +125,7 @@ def test_held_passages_are_contacts():
                     radius, expected = 0.0, distance_of(start[i] + s * move[i], f)
                     assert set(nodes[w > 0]) <= set(i)
                 else:
-                    o = scene.obstacles[d.colliders_of(np.array([(kind, a, b, f)]))[0, 1] - n_soft]
+                    o = scene.obstacles[d.paths.colliders(np.array([(kind, a, b, f)]))[0, 1] - n_soft]
                     x_b, move_b, radius, expected = o.shape.pivot, np.zeros(3), 0.0, 0.0
                     if kind == ROUND:
                         i, radius = node[t[a]], o.shape.radius
@@ -162,7 +163,7 @@ def test_passages_that_pass_again_are_taken_at_the_end_of_their_path():
         pairs, times = d.passages(SEARCHED)
         found = []
         for passed in (0, 1):
-            d.held = held(pairs, times, passed)
+            one.held = held(pairs, times, passed)
             one.again()
             c = d.contacts()
             own = np.flatnonzero(c.kind == "face_face")
@@ -200,8 +201,8 @@ def test_where_nothing_crosses_nothing_is_behind():
         one.search(start, np.zeros_like(start))
         every = d.contacts()
         assert set(every.body_b[every.gap < -1e-4]) == {"box 1", "ground"}
-        d.none_cross = True
-        d.held = held(np.array([(NEAR, 0, len(d.topology.triangle) - 1, 9)], dtype=np.int32), np.zeros(1))
+        one.none_cross = True
+        one.held = held(np.array([(NEAR, 0, len(d.topology.triangle) - 1, 9)], dtype=np.int32), np.zeros(1))
         one.again()
         left = d.contacts()
         assert set(left.body_b[left.gap < -1e-4]) == {"ground"} and (left.kind == "face_face").sum() == 1 < len(left)

@@ -181,10 +181,10 @@ class FakeStepper:
 
     is_linear = none_cross = is_stuck = False
     relative_penetration = crossing = x = 0.0
-    x_now, step_count = None, 4
+    step_count, closing_ratio = 4, 10.0
 
     def __init__(self):
-        self.contact = self.paths = self.simulation = self.dirichlet = self.history = self
+        self.contact = self.paths = self.measures = self.simulation = self.now = self.start = self
         self.taken, self.kept, self.held_back, self.retry_starts = [], [], [], []
         self.converges = lambda time, dt: True
         self.depth = self.left_path = self.has_new_contacts = self.passes = self.fails = lambda time, dt: 0.0
@@ -195,28 +195,25 @@ class FakeStepper:
     def measure_start(self, time, dt):
         return 0.0, 0.0
 
-    def closing_ratio_along_path(self):
-        return 10.0
+    def begin_step(self):
+        self.first = self.x
 
-    def save_start(self):
-        self.saved = self.x
-
-    def return_to_start(self, already_undone=False):
-        self.x, self.kept = self.saved, []
+    def return_to_first(self):
+        self.x, self.kept = self.first, []
 
     def take_substep(self, time, dt):
         assert time == pytest.approx(self.x)
-        self.start = self.x
+        self.before = self.x
         self.set_state(time + dt, (time, dt))
         self.taken.append((time, dt))
         good = self.converges(time, dt) and not self.fails(time, dt)
         return StageResult(3, 10, 1e-6 if good else 0.1, good, False)
 
-    def restore_start(self, *released, discard_impulses=False):
-        self.x = self.start
+    def undo_substep(self, discard_impulses=False):
+        self.x = self.before
         self.kept.pop()
 
-    undo_substep = restore_start
+    copy_nodes_from = undo_substep
 
     def retry_substep(self, time, dt, start):
         self.retry_starts.append(start)
@@ -229,13 +226,13 @@ class FakeStepper:
         self.x = x
         self.kept.append(last)
 
-    def left_searched(self, x_now):
+    def left_searched(self, x_start):
         return self.left_path(*self.kept[-1])
 
     def find(self, as_searched=False):
         return self.passes(*(self.searched if as_searched else self.kept[-1]))
 
-    def hold_back(self, x_start):
+    def hold_back_paths(self):
         self.held_back.append(self.kept[-1])
 
     def search_along_path(self, time, dt):

@@ -259,7 +259,7 @@ def test_release():
     rows, releasing = dirichlet.targets(times[2:])
     assert len(rows) == 2 and releasing and rows[1, 2] == pytest.approx(rest[11] + [0, 1.75, 0])
     assert dirichlet.targets(times[4:])[1] and not dirichlet.targets(times[4:])[1]
-    dirichlet.reset()
+    dirichlet.released[:] = False
     assert dirichlet.constrained()[8].all() and len(dirichlet.targets(times)[0]) == 2
 
 

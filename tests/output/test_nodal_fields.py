@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import taisoft as ts
-from taisoft.dynamics.contact_record import nodal_impulses
+from taisoft.dynamics.readout import nodal_impulses
 from taisoft.output.nodal_fields import NodalMean, von_mises
 from tests.collision.rotations import rotation
 from tests.dynamics.scenes import rubber

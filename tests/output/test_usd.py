@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from pxr import Tf, Usd, UsdGeom, UsdLux, UsdShade
 
-from taisoft.dynamics.contact_record import nodal_impulses
+from taisoft.dynamics.readout import nodal_impulses
 from taisoft.errors import OutputError
 from taisoft.output.camera import Camera, start_positions
 from taisoft.output.nodal_fields import NodalMean, von_mises

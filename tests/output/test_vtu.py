@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import taisoft as ts
-from taisoft.dynamics.contact_record import nodal_impulses
+from taisoft.dynamics.readout import nodal_impulses
 from taisoft.errors import OutputError
 from taisoft.output.nodal_fields import von_mises
 from taisoft.records import Energies

@@ -179,7 +179,7 @@ def test_runs_are_the_same_and_continue_bitwise_while_passages_are_held(tmp_path
             if k >= 0.5 * steps or implicit:
                 file = tmp_path / f"{k}.npz"
                 sim.save_checkpoint(file)
-                held += [(k, file)] if len(read_checkpoint(file).state["stepper"]["contact"]["paths"]["held"]) else []
+                held += [(k, file)] if len(read_checkpoint(file).state["simulation"]["held"]) else []
         sim.reset()
         for k in range(6):
             sim.step()

@@ -1,0 +1,130 @@
+"""What the contacts of a step have done: sums of impulses by collider, pair, moment and node, and their record by names.
+
+Colliders are indices, and impulses in world axes. Impulses act on a body at its nodes, and on an obstacle at the point.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from taisoft.backend.arrays import download
+from taisoft.collision.contacts import Contacts, named_contacts
+from taisoft.contact.problem import NODES, ContactProblem
+from taisoft.scene.scene import Scene
+
+Pairs = tuple[np.ndarray, np.ndarray]  # colliders (k,2), the lower index first, and their sums (k,13), see `sum_pairs`
+IMPULSE, MOMENTS, SLIP, NORMAL = slice(0, 3), (slice(3, 6), slice(6, 9)), slice(9, 12), slice(12, 13)  # columns
+ROWS = "normal tangent r impact_impulse node weight arity point gap body feature factor".split()  # what a later step needs
+
+
+@dataclass(frozen=True)
+class ContactRows:
+    """Contacts of a problem on the host, each array (k, ...)."""
+
+    collider: np.ndarray  # (k,2) indices
+    feature: np.ndarray  # (k,3)
+    point: np.ndarray  # (k,3) [m]
+    normal: np.ndarray  # (k,3) from b to a
+    gap: np.ndarray  # (k,) [m]
+    impulse: np.ndarray  # (k,3) on a [N s]
+    nodes: np.ndarray  # (k, 2 w), w of each side, -1 where there is none
+    weights: np.ndarray  # (k, 2 w)
+
+    def named(self, scene: Scene, **counts) -> Contacts:
+        """Return the record by names. counts: `found`, `unmapped` and `duration` of a `Contacts`."""
+        geometry = self.point, self.normal, self.gap, self.impulse, self.collider, self.feature, self.nodes, self.weights
+        return named_contacts(scene, *geometry, **counts)
+
+
+def read_contacts(problem: ContactProblem, impulse_fraction: float) -> ContactRows:
+    """Return a problem's contacts with their impulses. impulse_fraction: of a step, in which they act."""
+    rows = read_rows(problem)
+    normal, tangent, r = rows["normal"], rows["tangent"], rows["r"] / impulse_fraction + rows["impact_impulse"]
+    impulse = r[:, :1] * normal + r[:, 1:2] * tangent + r[:, 2:] * np.cross(normal, tangent)
+    nodes, weights = _sides(rows["node"], rows["weight"], rows["arity"])
+    return ContactRows(rows["body"], rows["feature"], rows["point"], normal, rows["gap"], impulse, nodes, weights)
+
+
+def sum_pairs(
+    problem: ContactProblem, rows: ContactRows, duration: float, x: np.ndarray, v: np.ndarray, before: Pairs | None
+) -> Pairs:
+    """Return each pair of different colliders that may touch, and sums over their contacts.
+
+    IMPULSE: on the first one [N s]; MOMENTS: of what the first and what the second one gets, about the origin [N m s]; SLIP: the
+    normal impulse times the tangential velocity of the first relative to the second [N m]; NORMAL: the normal impulse [N s].
+
+    rows: of the problem, with the nodes before dependent ones were replaced; duration [s]: in which impulses acted; x [m],
+    v [m/s]: (n_nodes, 3). before: pairs and sums to be added.
+    """
+    node, weight, arity, moved = download(
+        [problem.node, problem.weight, problem.arity, problem.obstacle_displacement], problem.count[0]
+    )
+    weight = np.where(np.arange(node.shape[1]) < arity[:, None], weight, 0.0)
+    u = np.einsum("cj,cji->ci", weight, v[np.where(weight != 0.0, node, 0)]) - moved / duration
+    normal = (rows.impulse * rows.normal).sum(axis=1, keepdims=True)
+    slip = normal * (u - (u * rows.normal).sum(axis=1, keepdims=True) * rows.normal)
+    nodes, weights, half = rows.nodes, rows.weights, rows.nodes.shape[1] // 2
+    arms = [np.einsum("cj,cji->ci", weights[:, own], x[nodes[:, own]]) for own in (slice(0, half), slice(half, None))]
+    arms[1] = np.where(nodes[:, half:].max(axis=1, keepdims=True) < 0, rows.point, arms[1])
+    sums = np.hstack([rows.impulse, np.cross(arms[0], rows.impulse), np.cross(rows.impulse, arms[1]), slip, normal])
+    different = rows.collider[:, 0] != rows.collider[:, 1]
+    pairs, sums = rows.collider[different].astype(np.int64), sums[different]
+    if before is not None:
+        pairs, sums = np.concatenate([before[0], pairs]), np.concatenate([before[1], sums])
+    unique, pair = np.unique(pairs, axis=0, return_inverse=True)
+    total = np.zeros((len(unique), sums.shape[1]))
+    np.add.at(total, pair.reshape(-1), sums)
+    return unique, total
+
+
+def sum_on(found: Pairs, collider: int, other: int | None) -> np.ndarray:
+    """Return what a collider gets from another one, or from all others, (10,): impulse [N s], moment about the origin [N m s],
+    slip velocity times normal impulse [N m], and normal impulse [N s]."""
+    (pairs, sums), total = found, np.zeros(10)
+    for own in (0, 1):
+        chosen = (pairs[:, own] == collider) & ((pairs[:, 1 - own] == other) | (other is None))
+        part, sign = sums[chosen].sum(axis=0), 1.0 - 2.0 * own
+        total += np.concatenate([sign * part[IMPULSE], part[MOMENTS[own]], sign * part[SLIP], part[NORMAL]])
+    return total
+
+
+def nodal_impulses(contacts: Contacts | ContactRows, n_nodes: int) -> np.ndarray:
+    """Return the contact impulses (n_nodes, 3) [N s] on the nodes of all bodies, in the order added.
+
+    contacts: a record from `Simulator.contacts`. Each impulse is distributed to the nodes that it acted on in the solver, by
+    their weights, with its sign on side a and the opposite on side b, so that sums over a body are those of its contacts.
+    """
+    nodes, weights = contacts.nodes, contacts.weights
+    signs, used, total = np.repeat([1.0, -1.0], weights.shape[1] // 2), nodes >= 0, np.zeros((n_nodes, 3))
+    parts = (signs * weights)[:, :, None] * contacts.impulse[:, None]
+    for axis in range(3):
+        total[:, axis] = np.bincount(nodes[used], parts[used][:, axis], n_nodes)
+    return total
+
+
+def _sides(node: np.ndarray, weight: np.ndarray, arity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return nodes and weights (n, 2 w) of a problem's contacts, w of each side.
+
+    A node is on side a if its weight is positive. If nodes depend on others, those of one side may have weights of both signs.
+    """
+    n, width = node.shape
+    used, half = np.arange(width) < arity[:, None], NODES // 2 if width == NODES else width
+    side_b = used & (weight < 0.0)
+    nodes, weights = np.full((n, 2 * half), -1), np.zeros((n, 2 * half))
+    for side, first in ((used & ~side_b, 0), (side_b, half)):
+        row, column = np.nonzero(side)
+        place = first + np.cumsum(side, axis=1)[row, column] - 1
+        nodes[row, place], weights[row, place] = node[row, column], np.abs(weight[row, column])
+    return nodes, weights
+
+
+def read_rows(problem: ContactProblem) -> dict[str, np.ndarray]:
+    """Return everything that a later step, or `read_contacts`, needs of a problem's contacts."""
+    return dict(zip(ROWS, download([getattr(problem, name) for name in ROWS], problem.count[0])))
+
+
+def write_rows(problem: ContactProblem, rows: dict[str, np.ndarray]) -> None:
+    """Restore the result of `read_rows`, of at most `capacity` contacts."""
+    problem.count[0] = len(rows["gap"])
+    for name in ROWS:
+        getattr(problem, name).from_numpy(rows[name], 0)
