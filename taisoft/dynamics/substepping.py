@@ -18,20 +18,22 @@ converged; bodies that would still pass through something are held back.
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from enum import Enum, auto
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import numpy as np
 
 from taisoft.collision.intersections import CROSSED
+from taisoft.dynamics.contact import ContactStep
 from taisoft.dynamics.contact_measures import DEEP_PENETRATION, ROUNDING, next_length
+from taisoft.dynamics.no_contacts import NoContacts
 from taisoft.dynamics.results import StageResult, count_all, merge
+from taisoft.dynamics.simulation_state import SimulationState
+from taisoft.dynamics.state import StepState
 from taisoft.errors import SimulationError
-
-if TYPE_CHECKING:
-    from taisoft.dynamics.implicit import ImplicitStepper
 
 MAX_PASSAGES = 8  # repetitions of a substep with the pairs that would have passed through each other
 
@@ -89,6 +91,27 @@ class LengthLimit:
         self.longest, self.patience, self.n_kept, self.is_trial = float(kept[0]), int(kept[1]), int(kept[2]), bool(kept[3])
 
 
+class Stepper(Protocol):
+    """What takes the substeps: `ImplicitStepper`."""
+
+    simulation: SimulationState
+    contact: ContactStep | NoContacts
+    start: StepState  # of the present substep
+    is_linear: bool
+    dissipative: bool
+    begin_step: Callable[[], None]
+    begin_substep: Callable[[float], None]
+    take_substep: Callable[[float, float], StageResult]
+    retry_substep: Callable[[float, float, np.ndarray], StageResult]
+    hold_substep: Callable[[float, float], StageResult]
+    undo_substep: Callable[..., None]
+    return_to_first: Callable[[], None]
+    hold_back_paths: Callable[[], None]
+    hold_back_inverted: Callable[[], float]
+    is_spent: Callable[[], bool]
+    forget: Callable[[], None]
+
+
 class Substepping:
     """Wrap the plain steps of an implicit stepper: substeps, undoing and retries."""
 
@@ -101,7 +124,7 @@ class Substepping:
     RETRIES = 4  # maximum number of equal substeps after non-convergence; only shorter substeps are halved for that
     MAX_UNCONVERGED = 2  # maximum consecutive halvings for that: if they do not help, more do not either
 
-    def __init__(self, stepper: "ImplicitStepper"):
+    def __init__(self, stepper: Stepper):
         self._stepper, self._contact = stepper, stepper.contact
         self._deepest = self._most_crossed = 0.0  # over the finer side's mean surface edge: above it a penetration is new
         self.substeps = 1  # of the last step,
