@@ -16,17 +16,18 @@ from taisoft.linear.pcg_work import build_pcg
 from tests.dynamics.scenes import built, mixed_scene
 from tests.linear.boxes import divided, fill
 
-METHODS = ("whole", "chunks", "threads", "jacobi")
+PRECONDITIONERS = {"jacobi": JACOBI}  # of `pcg`
+METHODS = ("whole", "chunks", "threads", *PRECONDITIONERS)
 
 
 @pytest.fixture(scope="module")
 def rig():
     with built(mixed_scene(order="both"), "f64") as made:
         arenas, made.ways = [FieldArena() for _ in METHODS], {}
-        models = {"whole": made.model, "jacobi": replace(made.parallel, on_cpu=False)}
+        models = {"whole": made.model} | dict.fromkeys(PRECONDITIONERS, replace(made.parallel, on_cpu=False))
         models |= {name: divided(made.model, arenas[0], 4, serial=name == "chunks") for name in ("chunks", "threads")}
         for arena, (name, m) in zip(arenas, models.items()):
-            of_cpu = models["whole"] if name == "jacobi" else m
+            of_cpu = models["whole"] if name in PRECONDITIONERS else m
             made.ways[name] = m, block_csr.build_block_csr(of_cpu, arena), build_pcg(of_cpu, arena)
         assert made.ways["chunks"][2].n_chunks == 6 and made.ways["chunks"][1].crossed
         rng = np.random.default_rng(1)
@@ -54,8 +55,8 @@ def solve(rig, method: str, tolerance: float, limit: int = 1000, rhs: np.ndarray
     model, matrix, work = rig.ways[method]
     work.rhs.from_numpy(rig.rhs if rhs is None else rhs)
     work.y.fill(np.nan)
-    if method == "jacobi":
-        return pcg.solve(model, matrix, JACOBI, work, tolerance, limit), work.y.to_numpy()
+    if method in PRECONDITIONERS:
+        return pcg.solve(model, matrix, PRECONDITIONERS[method], work, tolerance, limit), work.y.to_numpy()
     return gauss_seidel.solve(model, matrix, work, tolerance, limit), work.y.to_numpy()
 
 
