@@ -4,10 +4,12 @@
 * a changed bit is found, with the step, the part and the difference, and a failed, missing or new case is no success;
 * a file that is missing, damaged, foreign or of another kind of run is refused before anything runs;
 * what makes small scenes run on several threads is where the benchmark expects it;
-* a case ends after its steps, and is the same when it is run again.
+* a case ends after its steps, and is the same when it is run again;
+* from `Simulator.step` to the launch of a linear solve there are at most 16 calls of the package, the backend left out.
 """
 
 import gzip
+import sys
 from importlib import import_module
 
 import numpy as np
@@ -16,6 +18,7 @@ import pytest
 from benchmarks import bits
 from benchmarks.bits_cases import all_cases
 from taisoft.errors import SceneError
+from taisoft.linear import gauss_seidel, pcg
 from taisoft.study.accuracy import pack
 
 SETTINGS = {"steps": bits.STEPS, "quick": True, "case": ""}
@@ -81,3 +84,32 @@ def test_a_case_repeats_itself():
     first, second = (bits.run(case, 2) for _ in range(2))
     assert first["error"] == "" and len(first["digests"]) == 2 and first["contacts"] > 0
     assert bits.verdict(first, second) == bits.SAME
+
+
+def calls_above(frame) -> int:
+    """Functions of the package on the stack, from `Simulator.step` on, without those of the backend."""
+    names = []
+    while frame is not None:
+        names.append((frame.f_globals.get("__name__", ""), frame.f_code.co_name))
+        frame = frame.f_back
+    names = names[: 1 + max((k for k, (_, name) in enumerate(names) if name == "step"), default=len(names) - 1)]
+    return sum(module.startswith("taisoft.") and not module.startswith("taisoft.backend") for module, _ in names)
+
+
+def test_a_step_is_not_deep(monkeypatch):
+    depths = []
+
+    def watch(launch):
+        def watched(*arguments):
+            depths.append(calls_above(sys._getframe(1)))
+            return launch(*arguments)
+
+        return watched
+
+    for module, names in ((gauss_seidel, ("run_alone", "start_shared", "iterate_shared")), (pcg, ("start", "iterate"))):
+        for name in names:
+            monkeypatch.setattr(module, name, watch(getattr(module, name)))
+    for key in ("scene squeeze, implicit, f32, 1", "demo cube_pile, f32, 1"):
+        case, before = next(case for case in all_cases() if case.key == key), len(depths)
+        assert not bits.run(case, steps=4)["error"] and len(depths) > before
+    assert 10 < max(depths) <= 16

@@ -1,6 +1,7 @@
 """The source of the package and of its tests, read without running it. Each test lists every violation:
 
-* imports go one way, from right to left in ORDER, and collision and contact do not import each other;
+* imports go one way, from right to left in ORDER, and collision and contact do not import each other; no modules of the core
+  import one another in a circle, be it inside functions or for type checkers;
 * only backend/runtime.py initialises Taichi, only backend/private.py imports its private modules, and meshes, scenes and records
   do not import Taichi at all;
 * nothing evaluates text, unpickles or starts a shell, and Taichi's faulty 3x3 decompositions are not used;
@@ -72,6 +73,7 @@ LEVEL = {name: level for level, group in enumerate(ORDER) for name in group}
 ALLOWED_CALLS = {
     (file, call) for file in ("structure.py", "tracing.py", "launching.py") for call in ("compile", "exec")
 }  # of functions' source
+CORE = ("backend", "fem", "linear", "collision", "contact", "dynamics")
 FORBIDDEN = {("mesh", "scene"), ("collision", "contact"), ("contact", "collision")}  # (importer, imported) within a group
 
 WITHOUT_TAICHI = {*ORDER[0], "attributes", "mesh", "scene"}
@@ -150,6 +152,17 @@ def test_imports_go_one_way():
             if (own, other) in FORBIDDEN:
                 found.append(f"{short(path)} imports {name}")
     assert found == []
+
+
+def test_the_core_has_no_circles():
+    core = {".".join(("taisoft", *parts_of(path))): path for path in FILES if parts_of(path)[:1] and parts_of(path)[0] in CORE}
+    remaining = {name: {other for other in imports(path) if other in core and other != name} for name, path in core.items()}
+    for package in CORE:  # whose own modules import it only for names that are modules
+        for others in remaining.values():
+            others.discard(f"taisoft.{package}")
+    while free := [name for name, others in remaining.items() if not others]:
+        remaining = {name: others - set(free) for name, others in remaining.items() if name not in free}
+    assert remaining == {}
 
 
 def test_taichi_is_used_only_where_allowed():
