@@ -21,11 +21,11 @@ import numpy as np
 import taichi as ti
 
 from taisoft.backend.arrays import Count, FieldArena
+from taisoft.backend.lists import part_first, sort_range
 from taisoft.backend.runtime import Runtime, kernel
-from taisoft.collision.candidates import WHOLE, Buffer, Candidates, entries, is_candidate, sort_row, sum_parts
+from taisoft.collision.candidates import WHOLE, Buffer, Candidates, entries, is_candidate, sum_parts
 from taisoft.collision.colliders import Topology
 from taisoft.collision.surface import ACTIVE, Surface, dvec, integers, list_near
-from taisoft.fem.chunks import part_first
 from taisoft.ranges import expand
 
 LEAVES = {"cpu": 64, "cuda": 8}  # triangles per chunk: the fastest of 4 to 256 on the CPU, small on CUDA for enough threads
@@ -147,7 +147,7 @@ class Trees:
                         at += 1
             node += step
         if at <= last:
-            sort_row(entry, begin, at)
+            sort_range(entry, begin, at)
         return at - begin
 
 

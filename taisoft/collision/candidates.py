@@ -121,23 +121,6 @@ def sum_parts(p: ti.template()):
 
 
 @ti.func
-def sort_row(entry: ti.template(), first, last):
-    """Sort entry[first:last] in place by Shell sort: rows are mostly short, but not always."""
-    step = 1
-    while step < (last - first) // 9:
-        step = 3 * step + 1
-    while step > 0:
-        for i in range(first + step, last):
-            value = entry[i]
-            j = i - step
-            while j >= first and entry[ti.max(j, first)] > value:
-                entry[j + step] = entry[j]
-                j -= step
-            entry[j + step] = value
-        step //= 3
-
-
-@ti.func
 def is_candidate(s: ti.template(), t, q, u):
     """1 if t may touch triangle u and, if q is EDGES, their edges may cross. t has a sharp edge in that case; if both have one,
     only t < u is accepted."""

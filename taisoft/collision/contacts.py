@@ -19,9 +19,19 @@ from typing import Any
 import numpy as np
 import taichi as ti
 
-from taisoft.backend.arrays import Count, FieldArena
+from taisoft.backend.arrays import FieldArena
+from taisoft.backend.lists import (
+    Lists,
+    add_up_counts,
+    bucket_of,
+    clear_counts,
+    count_entry,
+    make_lists,
+    place_of_entry,
+    sum_before,
+)
 from taisoft.backend.runtime import kernel
-from taisoft.collision.candidates import Parts
+from taisoft.collision.candidates import TOTAL, Parts
 from taisoft.collision.surface import cell_of, dvec, ivec
 from taisoft.display import short_repr
 
@@ -195,75 +205,56 @@ def gather(out: ContactFields, index: Any, n: int, ordered: bool = True) -> tupl
 class ReductionFields:
     """Workspace of the reduction. The first count[LEFT] entries of `kept` are the kept contacts' buffer indices, ascending."""
 
-    buckets: Count  # a power of two; the number in use grows with the number of contacts
     serial: bool
     spread: int  # as of the surface
     place: Any  # (capacity) i32: buffer index of the i-th contact found
     bucket: Any  # (capacity) i32: bucket of the i-th contact
-    bucket_start: Any  # (buckets) i32: range of its entries in `member`
-    bucket_end: Any
+    lists: Lists  # of the buckets, in `member`
     member: Any  # (capacity) i32: buffer indices, by bucket
     state: Any  # (capacity) i32: state of the contact at each buffer index
     kept: Any  # (capacity) i32
     count: Any  # (4) i32
-    first: Any  # (chunks) i32: number of the first contact of each part
 
 
-def reduction_fields(arena: FieldArena, capacity: int, chunks: int, serial: bool, spread: int = 1) -> ReductionFields:
-    """Allocate the workspace for `capacity` contacts in `chunks` parts."""
-    buckets = 1 << max(capacity - 1, 63).bit_length()
-    sizes = dict.fromkeys(("place", "bucket", "member", "state", "kept"), capacity) | {"count": 4, "first": chunks}
-    sizes |= {"bucket_start": buckets, "bucket_end": buckets}
+def reduction_fields(arena: FieldArena, capacity: int, serial: bool, spread: int = 1) -> ReductionFields:
+    """Allocate the workspace for `capacity` contacts."""
+    buckets = 1 << max(capacity - 1, 63).bit_length()  # the number in use grows with the number of contacts
+    sizes = dict.fromkeys(("place", "bucket", "member", "state", "kept"), capacity) | {"count": 4}
     fields = {name: arena.field(f"reduction_{name}", ti.i32, size) for name, size in sizes.items()}
-    return ReductionFields(buckets, serial, spread, **fields)
+    return ReductionFields(serial, spread, lists=make_lists(arena, "reduction", buckets, serial), **fields)
 
 
 @ti.func
-def _bucket(r: ti.template(), cell):
-    x, y, z = ti.cast(cell[0], ti.i64), ti.cast(cell[1], ti.i64), ti.cast(cell[2], ti.i64)
-    h = (x * 73856093) ^ (y * 19349663) ^ (z * 83492791)  # Teschner et al. 2003
-    return ti.cast((h ^ (h >> 15)) & r.count[MASK], ti.i32)
+def _bucket(work: ti.template(), cell):
+    return bucket_of(cell[0], cell[1], cell[2], work.count[MASK])
 
 
 @ti.func
-def _fill_cells(r: ti.template(), out: ti.template(), inverse, lowest_gap):
+def _fill_cells(work: ti.template(), out: ti.template(), inverse, lowest_gap):
     """Number the contacts over all parts, drop those between surfaces whose gap is lower, and enter the others into the cells."""
     ti.loop_config(serialize=True)
     for _ in range(1):
-        total = 0
-        for k in range(out.chunks):
-            r.first[k] = total
-            total += out.used[k]
-        r.count[FOUND] = total
         mask = 63
-        while mask + 1 < total:
+        while mask + 1 < out.count[TOTAL]:
             mask = 2 * mask + 1
-        r.count[MASK] = mask
-    ti.loop_config(serialize=r.serial)
-    for b in range(r.count[MASK] + 1):
-        r.bucket_end[b] = 0
-    ti.loop_config(serialize=r.serial)
-    for task in range(out.chunks * r.spread):
-        if task % r.spread == 0:
-            c = task // r.spread
+        work.count[FOUND], work.count[MASK] = out.count[TOTAL], mask
+    clear_counts(work.lists, work.count[MASK] + 1)
+    ti.loop_config(serialize=work.serial)
+    for task in range(out.chunks * work.spread):
+        if task % work.spread == 0:
+            c = task // work.spread
+            first = sum_before(out.used, c)
             for k in range(out.used[c]):
-                i, at = r.first[c] + k, c * out.part + k
-                r.place[i] = at
+                i, at = first + k, c * out.part + k
+                work.place[i] = at
                 by_surfaces = out.data.feature[at][0] == VERTEX_FACE or out.data.feature[at][0] == EDGE_EDGE
-                r.state[at] = ti.select(by_surfaces and out.data.gap[at] < lowest_gap, DROPPED, UNKNOWN)
-                b = _bucket(r, cell_of(out.data.point[at], inverse, PERIOD))
-                r.bucket[i] = b
-                ti.atomic_add(r.bucket_end[b], 1)
-    ti.loop_config(serialize=True)
-    for _ in range(1):
-        total = 0
-        for b in range(r.count[MASK] + 1):
-            r.bucket_start[b] = total
-            total += r.bucket_end[b]
-            r.bucket_end[b] = r.bucket_start[b]
-    ti.loop_config(serialize=r.serial)
-    for i in range(r.count[FOUND]):
-        r.member[ti.atomic_add(r.bucket_end[r.bucket[i]], 1)] = r.place[i]
+                work.state[at] = ti.select(by_surfaces and out.data.gap[at] < lowest_gap, DROPPED, UNKNOWN)
+                work.bucket[i] = _bucket(work, cell_of(out.data.point[at], inverse, PERIOD))
+                count_entry(work.lists, work.bucket[i])
+    add_up_counts(work.lists, work.count[MASK] + 1)
+    ti.loop_config(serialize=work.serial)
+    for i in range(work.count[FOUND]):
+        work.member[place_of_entry(work.lists, work.bucket[i])] = work.place[i]
 
 
 @ti.func
@@ -300,7 +291,7 @@ def _decide(r: ti.template(), out: ti.template(), at, inverse, tolerance):
         z, y, x = k % n[2], (k // n[2]) % n[1], k // (n[2] * n[1])
         cell = ivec(ti.select(x == 0, lo[0], hi[0]), ti.select(y == 0, lo[1], hi[1]), ti.select(z == 0, lo[2], hi[2]))
         b = _bucket(r, cell)
-        for m in range(r.bucket_start[b], r.bucket_end[b]):
+        for m in range(r.lists.start[b], r.lists.start[b + 1]):
             other = r.member[m]
             d = p - out.point[other]
             if d.dot(d) <= tolerance * tolerance:  # this test rejects most

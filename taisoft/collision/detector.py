@@ -236,7 +236,7 @@ class Detection:
         b = self.buffer
         if self._reduction is None or self._reduction.place.shape[0] != b.capacity:
             arena = FieldArena()
-            self._reduction = reduction_fields(arena, b.capacity, b.chunks, self.surface.serial_cheap, self.surface.cheap_spread)
+            self._reduction = reduction_fields(arena, b.capacity, self.surface.serial_cheap, self.surface.cheap_spread)
             self._reduction_arena.release()
             self._reduction_arena = arena
         lowest_gap = -self.floor if self.none_cross else -np.inf  # if none cross, a vertex behind a face is not inside

@@ -14,13 +14,13 @@ import numpy as np
 import taichi as ti
 
 from taisoft.backend.arrays import FieldArena
+from taisoft.backend.lists import part_first
 from taisoft.backend.runtime import Runtime, kernel
 from taisoft.collision.candidates import WHOLE, sum_parts
 from taisoft.collision.contacts import write_point_contact
 from taisoft.collision.deepest_point import MIN_EXTRA_DEPTH, deepest_point, is_surface_minimum
 from taisoft.collision.features import choose, closest_on_triangle, corner, in_normal_cone, moved, unit, vertices_of
 from taisoft.collision.surface import ACTIVE, dvec, ivec, list_near, sum_pairs
-from taisoft.fem.chunks import part_first
 from taisoft.mesh.sdf import SdfGrid
 from taisoft.scene.body import Body
 

@@ -10,6 +10,7 @@ be wrong.
 
 import taichi as ti
 
+from taisoft.backend.lists import part_first
 from taisoft.backend.runtime import kernel
 from taisoft.collision.candidates import EDGES, sum_parts
 from taisoft.collision.contacts import EDGE_EDGE, write_contact
@@ -26,7 +27,6 @@ from taisoft.collision.features import (
 )
 from taisoft.collision.surface import ACTIVE, INSIDE_BITS, dvec, ivec, list_near, sum_pairs
 from taisoft.collision.vertex_face import max_self_depth, vertex_contacts
-from taisoft.fem.chunks import part_first
 
 # Penetrating edges have shifted along each other and may cross beyond an end, by at most MAX_MISS depths and MAX_OVERHANG lengths
 # of the edge; the surfaces are elsewhere farther out

@@ -15,11 +15,11 @@ import numpy as np
 import taichi as ti
 
 from taisoft.backend.arrays import FieldArena, download
+from taisoft.backend.lists import part_first
 from taisoft.backend.runtime import kernel
 from taisoft.collision.candidates import WHOLE, Buffer, Candidates, sum_parts
 from taisoft.collision.features import closest_lines, closest_on_segment, closest_on_triangle, corner
 from taisoft.collision.surface import ACTIVE, Surface, dvec, list_near
-from taisoft.fem.chunks import part_first
 
 COMMON_NORMAL = 1e-6  # sine below which two edges have no common normal
 CROSSED = 1e-3  # of the finer side's mean surface edge: depth below which crossings do not count; about the contact accuracy

@@ -17,10 +17,10 @@ from typing import Any
 import taichi as ti
 
 from taisoft.backend.arrays import Count, FieldArena
+from taisoft.backend.lists import part_first
 from taisoft.backend.runtime import kernel
 from taisoft.collision.candidates import WHOLE, sum_parts
 from taisoft.collision.surface import ACTIVE, dvec, ivec, list_near, may_meet
-from taisoft.fem.chunks import part_first
 
 SEARCHED, TO_STATE, STILL = range(3)  # which paths are checked
 HINTS = 16  # planes stored per triangle

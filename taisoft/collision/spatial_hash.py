@@ -1,6 +1,6 @@
 """Candidates by spatial hashing over a dense grid (report, section 3.1.4; Teschner et al. 2003, Vision, Modeling, Visualization).
 
-Count, prefix scan, scatter: each triangle is entered into the cells that its swept box covers; then each searches its cells.
+Each triangle is entered into the cells that its swept box covers; then each searches its cells.
 A pair is accepted only in the cell that holds the lower corner of the boxes' overlap, so it is found once. The grid is periodic:
 indices wrap around its size, so distant triangles may share a cell but never leave the memory; the box test keeps the result
 exact. A triangle that covers more than LARGE cells, or lies beyond COUNTABLE cells, is compared with every other one instead.
@@ -14,18 +14,26 @@ import numpy as np
 import taichi as ti
 
 from taisoft.backend.arrays import Count, FieldArena
+from taisoft.backend.lists import (
+    Lists,
+    add_up_counts,
+    clear_counts,
+    count_entry,
+    make_lists,
+    part_first,
+    place_of_entry,
+    sort_range,
+)
 from taisoft.backend.runtime import kernel
-from taisoft.collision.candidates import Buffer, Candidates, entries, sort_row, sum_parts
+from taisoft.collision.candidates import Buffer, Candidates, entries, sum_parts
 from taisoft.collision.surface import ACTIVE, Surface, cell_of, ivec, may_touch
-from taisoft.fem.chunks import part_first
 
 LARGE = 512  # cells above which a triangle counts as large
 COUNTABLE = 2.0**50  # cells from the origin beyond which f64 cannot distinguish neighbouring cells
 MAX_CELLS = 2**22
 CELLS_PER_TRIANGLE = 2
 ENTRIES_PER_TRIANGLE = 24  # row entries, initial capacity
-SCAN = 256  # parts of the prefix scan
-N_LARGE, N_ENTRIES = 0, 1  # indices into Grid.count
+N_LARGE = 0  # index into Grid.count
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,13 +44,11 @@ class Grid:
     ny: Count
     nz: Count
     n_cells: Count
-    cell_start: Any  # (n_cells) i32: members of each cell
-    cell_end: Any
-    scan: Any  # (SCAN) i32: sums of the parts of the scan
+    cells: Lists  # members of each cell
     first_cell: Any  # (n_triangles) 3-vectors i32: of the cells that a box covers
     cell_count: Any  # (n_triangles) 3-vectors i32: along each axis, 0 for large ones
     large: Any  # i32: large triangles, the first count[N_LARGE] entries
-    count: Any  # (2) i32
+    count: Any  # (1) i32
     start: Any  # (n_triangles) i32: rows
     end: Any
 
@@ -94,70 +100,38 @@ def _bucket(g: ti.template(), first, count, k):
 
 
 @kernel
-def count_cells(s: ti.template(), g: ti.template(), inverse: ti.f64):
-    """Find the cells of each active triangle, count the entries of each cell, list the large triangles."""
-    ti.loop_config(serialize=s.serial)
-    for c in range(g.n_cells):
-        g.cell_end[c] = 0
-    ti.loop_config(serialize=s.serial)
-    for i in range(s.count[ACTIVE]):
-        t = s.active[i]
-        first, count = _cells_of(s, g, t, inverse)
-        g.first_cell[t] = first
-        g.cell_count[t] = count
+def list_cells(surface: ti.template(), grid: ti.template(), inverse: ti.f64):
+    """Find the cells of each active triangle and where the list of each cell starts; list the large triangles."""
+    clear_counts(grid.cells, grid.n_cells)
+    ti.loop_config(serialize=surface.serial)
+    for i in range(surface.count[ACTIVE]):
+        t = surface.active[i]
+        first, count = _cells_of(surface, grid, t, inverse)
+        grid.first_cell[t] = first
+        grid.cell_count[t] = count
         for k in range(count[0] * count[1] * count[2]):
-            ti.atomic_add(g.cell_end[_bucket(g, first, count, k)], 1)
+            count_entry(grid.cells, _bucket(grid, first, count, k))
     ti.loop_config(serialize=True)
     for _ in range(1):
         n = 0
-        for j in range(s.count[ACTIVE]):
-            t = s.active[j]
-            if g.cell_count[t][0] == 0:
-                g.large[n] = t
+        for j in range(surface.count[ACTIVE]):
+            t = surface.active[j]
+            if grid.cell_count[t][0] == 0:
+                grid.large[n] = t
                 n += 1
-        g.count[N_LARGE] = n
+        grid.count[N_LARGE] = n
+    add_up_counts(grid.cells, grid.n_cells)
 
 
 @kernel
-def scan_cells(s: ti.template(), g: ti.template()):
-    """Compute cell_start as the prefix sums of the counts in cell_end, and set cell_end to the same."""
-    ti.loop_config(serialize=s.serial)
-    for task in range(SCAN * s.spread):
-        if task % s.spread == 0:
-            c = task // s.spread
-            total = 0
-            for k in range(part_first(c, g.n_cells, SCAN), part_first(c + 1, g.n_cells, SCAN)):
-                total += g.cell_end[k]
-            g.scan[c] = total
-    ti.loop_config(serialize=True)
-    for _ in range(1):
-        total = 0
-        for k in range(SCAN):
-            n = g.scan[k]
-            g.scan[k] = total
-            total += n
-        g.count[N_ENTRIES] = total
-    ti.loop_config(serialize=s.serial)
-    for task in range(SCAN * s.spread):
-        if task % s.spread == 0:
-            c = task // s.spread
-            total = g.scan[c]
-            for k in range(part_first(c, g.n_cells, SCAN), part_first(c + 1, g.n_cells, SCAN)):
-                n = g.cell_end[k]
-                g.cell_start[k] = total
-                g.cell_end[k] = total
-                total += n
-
-
-@kernel
-def scatter_cells(s: ti.template(), g: ti.template(), member: ti.template()):
+def fill_cells(surface: ti.template(), grid: ti.template(), member: ti.template()):
     """Write the active triangles into their cells; the order within a cell depends on the threads."""
-    ti.loop_config(serialize=s.serial)
-    for i in range(s.count[ACTIVE]):
-        t = s.active[i]
-        first, count = g.first_cell[t], g.cell_count[t]
+    ti.loop_config(serialize=surface.serial)
+    for i in range(surface.count[ACTIVE]):
+        t = surface.active[i]
+        first, count = grid.first_cell[t], grid.cell_count[t]
         for k in range(count[0] * count[1] * count[2]):
-            member[ti.atomic_add(g.cell_end[_bucket(g, first, count, k)], 1)] = t
+            member[place_of_entry(grid.cells, _bucket(grid, first, count, k))] = t
 
 
 @ti.func
@@ -191,7 +165,7 @@ def find_rows(s: ti.template(), g: ti.template(), member: ti.template(), out: ti
                 first, count = g.first_cell[t], g.cell_count[t]
                 for k in range(count[0] * count[1] * count[2]):
                     bucket = _bucket(g, first, count, k)
-                    for e in range(g.cell_start[bucket], g.cell_end[bucket]):
+                    for e in range(g.cells.start[bucket], g.cells.start[bucket + 1]):
                         u = member[e]
                         if s.body[u] != own or self_on == 1:
                             if _is_pair(s, t, u) == 1:
@@ -208,7 +182,7 @@ def find_rows(s: ti.template(), g: ti.template(), member: ti.template(), out: ti
                 if at <= last:
                     g.start[t] = begin
                     g.end[t] = at
-                    sort_row(out.data, begin, at)
+                    sort_range(out.data, begin, at)
             out.used[c] = at - c * out.part
     ti.loop_config(serialize=True)
     for _ in range(1):
@@ -230,26 +204,25 @@ class SpatialHash:
         """extent: typical extent (3,) [m]. capacity, max_capacity: initial and maximum entries; None for the default."""
         self.surface, self.cell, n = surface, cell, max(surface.n_triangles, 1)
         size = grid_size(extent, cell, surface.n_triangles)
-        cells = size[0] * size[1] * size[2]
-        counts = {"cell_start": cells, "cell_end": cells, "scan": SCAN, "large": n, "count": 2, "start": n, "end": n}
+        n_cells = size[0] * size[1] * size[2]
+        counts = {"large": n, "count": 1, "start": n, "end": n}
         fields = {name: arena.field(f"hash_{name}", ti.i32, count) for name, count in counts.items()}
         fields |= {name: arena.vectors(f"hash_{name}", ti.i32, n) for name in ("first_cell", "cell_count")}
-        self.grid = Grid(*size, cells, **fields)
+        self.grid = Grid(*size, n_cells, make_lists(arena, "hash_cell", n_cells, surface.serial), **fields)
         self.members = Buffer("hash_cells", entries, capacity or 8 * n + 64, max_capacity, 1, arena)
         self.rows = Buffer("hash_rows", entries, capacity or ENTRIES_PER_TRIANGLE * n + 64, max_capacity, surface.chunks, arena)
 
     def find(self) -> Candidates:
         """Return the candidates of the present boxes. Raise SimulationError if a buffer would outgrow its limit."""
-        s, g, inverse = self.surface, self.grid, 1.0 / self.cell
-        count_cells(s, g, inverse)
-        scan_cells(s, g)
-        self.members.count[0] = g.count[N_ENTRIES]
+        surface, grid = self.surface, self.grid
+        list_cells(surface, grid, 1.0 / self.cell)
+        self.members.count[0] = grid.cells.start[grid.n_cells + 1]
         self.members.grow_if_full()
-        scatter_cells(s, g, self.members.data)
+        fill_cells(surface, grid, self.members.data)
         while True:
-            find_rows(s, g, self.members.data, self.rows.parts)
+            find_rows(surface, grid, self.members.data, self.rows.parts)
             if not self.rows.grow_if_full():
-                return Candidates(g.start, g.end, self.rows.data)
+                return Candidates(grid.start, grid.end, self.rows.data)
 
     near = find  # queries read the rows
 

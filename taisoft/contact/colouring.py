@@ -15,6 +15,7 @@ import numpy as np
 import scipy.sparse as sp
 import taichi as ti
 
+from taisoft.backend.lists import add_up_counts, clear_counts, count_entry, place_of_entry, sort_lists
 from taisoft.backend.runtime import kernel
 from taisoft.contact.problem import ContactProblem, fill_field
 from taisoft.errors import SimulationError
@@ -107,7 +108,7 @@ def groups(colour: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def store(p: ContactProblem, colour: np.ndarray) -> None:
     """Set the colours (k,) of the problem's contacts and group them."""
     order, start = groups(colour)
-    for field, values in ((p.colour, colour), (p.order, order), (p.colour_start, start)):
+    for field, values in ((p.colour, colour), (p.order, order), (p.by_colour.start, start)):
         fill_field(field, values)
     p.count[1] = len(start) - 1
 
@@ -133,7 +134,7 @@ def _first_free(p: ti.template(), c):
         for k in range(p.arity[c]):
             i = p.node[c, k]
             if (p.inverse_mass[i] != 0.0).any():
-                for e in range(p.entry_start[i], p.entry_start[i + 1]):
+                for e in range(p.by_node.start[i], p.by_node.start[i + 1]):
                     d = p.entry[e] // p.width
                     if _priority(d) > _priority(c):
                         colour = p.colour[d]
@@ -169,25 +170,20 @@ def _colour_round(p: ti.template()) -> ti.i32:
 
 
 @kernel
-def _group(p: ti.template()):
-    """Set `order` and `colour_start` from the colours by a counting sort."""
-    ti.loop_config(serialize=True)
-    for _ in range(1):
-        n, colours = p.count[0], 0
-        for k in range(n + 1):
-            p.colour_start[k] = 0
-        for c in range(n):
-            p.colour_start[p.colour[c]] += 1
-            colours = ti.max(colours, p.colour[c] + 1)
-        total = 0
-        for k in range(colours + 1):
-            total += p.colour_start[k]
-            p.colour_start[k] = total
-        for back in range(n):
-            c = n - 1 - back
-            p.colour_start[p.colour[c]] -= 1
-            p.order[p.colour_start[p.colour[c]]] = c
-        p.count[1] = colours
+def _group(problem: ti.template()):
+    """Group the contacts by colour, in ascending order."""
+    n = problem.count[0]
+    clear_counts(problem.by_colour, n)
+    problem.count[1] = 0
+    ti.loop_config(serialize=problem.by_colour.serial)
+    for c in range(n):
+        count_entry(problem.by_colour, problem.colour[c])
+        ti.atomic_max(problem.count[1], problem.colour[c] + 1)
+    add_up_counts(problem.by_colour, n)
+    ti.loop_config(serialize=problem.by_colour.serial)
+    for c in range(n):
+        problem.order[place_of_entry(problem.by_colour, problem.colour[c])] = c
+    sort_lists(problem.by_colour, problem.count[1], problem.order)
 
 
 def colour_contacts(p: ContactProblem) -> None:

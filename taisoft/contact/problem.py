@@ -18,15 +18,14 @@ import scipy.sparse as sp
 import taichi as ti
 
 from taisoft.backend.arrays import Count, FieldArena, on_cuda, upload
+from taisoft.backend.lists import Lists, add_up_counts, clear_counts, count_entry, make_lists, place_of_entry, sort_lists
 from taisoft.backend.runtime import kernel
 from taisoft.contact.prox import dvec, prox, scaled
-from taisoft.fem.chunks import part_first
 
 NODES = 6  # maximum nodes of a contact, three on each side
 RESIDUAL, BEST, STEP, SWEEPS, CHECKS, AGE, MOMENTUM, WEIGHT, VERDICT = range(9)  # in `state`, see `solve`
 HISTORY = 1024  # residuals kept per launch
 CHUNKS = 256  # partial sums over the contacts, so that a sum does not depend on threads
-SCAN = 1024  # parts of a parallel prefix sum over the nodes
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +50,7 @@ class ContactProblem:
     partial: Any  # (CHUNKS) 2-vectors: sums over chunks of the contacts
     order: Any  # i32: contacts in sweep order
     colour: Any  # i32: of each contact, see `colouring`
-    colour_start: Any  # (capacity + 1) i32: start of each colour in `order`
+    by_colour: Lists  # of each colour's contacts, in `order`
     state: Any  # (9) f64: residual, that of `best`, fraction of the r-factors; see `solve`
     history: Any  # (HISTORY) f64: residuals at the checks of a launch
     # W as a matrix
@@ -68,9 +67,8 @@ class ContactProblem:
     tangent: Any = None  # 3-vectors: t1; t2 = normal x t1
     inverse_mass: Any = None  # (n_nodes) 3-vectors [1/kg], 0 on constrained axes
     w: Any = None  # (n_nodes) 3-vectors [m/s]: M^-1 J^T r
-    entry_start: Any = None  # (n_nodes + 1) i32: contacts of each node
+    by_node: Lists | None = None  # of the contacts of each node, in `entry`
     entry: Any = None  # i32: width * contact + index of the node in it
-    scan: Any = None  # (SCAN) i32, on CUDA: scratch of their prefix sums
     # of detected contacts, see `build`
     body: Any = None  # 2-vectors i32: colliders
     feature: Any = None  # 3-vectors i32
@@ -106,7 +104,7 @@ def build_node_problem(arena: FieldArena, capacity: int, n_nodes: int, serial: b
         n_nodes=n_nodes,
         width=width,
         n_slots=n_slots,
-        **_solver_fields(arena, n),
+        **_solver_fields(arena, n, serial),
         **_fields(arena, "node", ti.i32, (n, width)),
         **_fields(arena, "weight", ti.f64, (n, width)),
         **_fields(arena, "arity turned", ti.i32, n),
@@ -116,9 +114,8 @@ def build_node_problem(arena: FieldArena, capacity: int, n_nodes: int, serial: b
         **_fields(arena, "pair_sum", ti.f64, n, 2),
         **_fields(arena, "feature previous_feature", ti.i32, n, 3),
         **_fields(arena, "inverse_mass w", ti.f64, n_nodes, 3),
-        **_fields(arena, "entry_start", ti.i32, n_nodes + 1),
         **_fields(arena, "entry", ti.i32, width * n),
-        **(_fields(arena, "scan", ti.i32, SCAN) if on_cuda() else {}),
+        by_node=make_lists(arena, "problem_node", n_nodes, serial),
         **_fields(arena, "slot pair_slot", ti.i32, n_slots),
     )
 
@@ -130,14 +127,14 @@ def build_matrix_problem(arena: FieldArena, n: int, n_blocks: int, serial: bool)
         serial,
         not on_cuda(),
         True,
-        **_solver_fields(arena, n),
+        **_solver_fields(arena, n, serial),
         **_fields(arena, "row_start", ti.i32, n + 1),
         **_fields(arena, "column", ti.i32, n_blocks),
         **_fields(arena, "block", ti.f64, (n_blocks, 9)),
     )
 
 
-def _solver_fields(arena: FieldArena, n: int) -> dict[str, Any]:
+def _solver_fields(arena: FieldArena, n: int, serial: bool) -> dict[str, Any]:
     """Fields that both forms of W need."""
     return {
         **_fields(arena, "count", ti.i32, 2),
@@ -146,7 +143,7 @@ def _solver_fields(arena: FieldArena, n: int) -> dict[str, Any]:
         **_fields(arena, "factor term", ti.f64, n, 2),
         **_fields(arena, "partial", ti.f64, CHUNKS, 2),
         **_fields(arena, "order colour", ti.i32, n),
-        **_fields(arena, "colour_start", ti.i32, n + 1),
+        "by_colour": make_lists(arena, "problem_colour", n, serial),
         **_fields(arena, "state", ti.f64, VERDICT + 1),
         **_fields(arena, "history", ti.f64, HISTORY),
     }
@@ -230,7 +227,7 @@ def add_impulse(p: ti.template(), c, change):
 def impulse_on(p: ti.template(), i):
     """(J^T r) of node i [N s], summed over its contacts in a fixed order."""
     d = dvec(0.0)
-    for e in range(p.entry_start[i], p.entry_start[i + 1]):
+    for e in range(p.by_node.start[i], p.by_node.start[i + 1]):
         c, k = p.entry[e] // p.width, p.entry[e] % p.width
         d += p.weight[c, k] * to_world(p, c, p.r[c])
     return d
@@ -305,63 +302,16 @@ def find_factors(p: ti.template()):
 
 
 @kernel
-def index_nodes(p: ti.template()):
+def index_nodes(problem: ti.template()):
     """List the contacts of each node, in ascending order."""
-    if ti.static(p.on_cpu):
-        _index_serially(p)
-    else:
-        _index_in_parallel(p)
-
-
-@ti.func
-def _index_in_parallel(p: ti.template()):
-    """`index_nodes` as top-level loops for many threads: counts, their prefix sums, entries in any order, sorted by node."""
-    for i in range(p.n_nodes + 1):
-        p.entry_start[i] = 0
-    for c in range(p.count[0]):
-        for k in range(p.arity[c]):
-            ti.atomic_add(p.entry_start[p.node[c, k]], 1)
-    for part in range(SCAN):
-        total = 0
-        for i in range(part_first(part, p.n_nodes + 1, SCAN), part_first(part + 1, p.n_nodes + 1, SCAN)):
-            total += p.entry_start[i]
-        p.scan[part] = total
-    for part in range(SCAN):
-        total = 0  # many threads that sum take less time than one that stores prefix sums
-        for k in range(part):
-            total += p.scan[k]
-        for i in range(part_first(part, p.n_nodes + 1, SCAN), part_first(part + 1, p.n_nodes + 1, SCAN)):
-            total += p.entry_start[i]
-            p.entry_start[i] = total
-    for c in range(p.count[0]):
-        for k in range(p.arity[c]):
-            p.entry[ti.atomic_sub(p.entry_start[p.node[c, k]], 1) - 1] = p.width * c + k
-    for i in range(p.n_nodes):
-        first = p.entry_start[i]
-        for j in range(first + 1, p.entry_start[i + 1]):
-            entry, at = p.entry[j], j
-            while at > first and p.entry[at - 1] > entry:
-                p.entry[at] = p.entry[at - 1]
-                at -= 1
-            p.entry[at] = entry
-
-
-@ti.func
-def _index_serially(p: ti.template()):
-    ti.loop_config(serialize=True)
-    for _ in range(1):
-        for i in range(p.n_nodes + 1):
-            p.entry_start[i] = 0
-        for c in range(p.count[0]):
-            for k in range(p.arity[c]):
-                p.entry_start[p.node[c, k]] += 1
-        total = 0
-        for i in range(p.n_nodes + 1):
-            total += p.entry_start[i]
-            p.entry_start[i] = total
-        for back in range(p.count[0]):
-            c = p.count[0] - 1 - back
-            for k in range(p.arity[c]):
-                i = p.node[c, k]
-                p.entry_start[i] -= 1
-                p.entry[p.entry_start[i]] = p.width * c + k
+    clear_counts(problem.by_node, problem.n_nodes)
+    ti.loop_config(serialize=problem.by_node.serial)
+    for c in range(problem.count[0]):
+        for k in range(problem.arity[c]):
+            count_entry(problem.by_node, problem.node[c, k])
+    add_up_counts(problem.by_node, problem.n_nodes)
+    ti.loop_config(serialize=problem.by_node.serial)
+    for c in range(problem.count[0]):
+        for k in range(problem.arity[c]):
+            problem.entry[place_of_entry(problem.by_node, problem.node[c, k])] = problem.width * c + k
+    sort_lists(problem.by_node, problem.n_nodes, problem.entry)

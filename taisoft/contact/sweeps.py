@@ -105,7 +105,7 @@ def _relax_colours(p: ti.template(), first: ti.i32):
 @ti.func
 def _colour_start(p: ti.template(), colour):
     """Start of a colour in `order`; the end of the last colour for any later one."""
-    return p.colour_start[ti.min(colour, p.count[1])]
+    return p.by_colour.start[ti.min(colour, p.count[1])]
 
 
 # --- fraction of the r-factors ----------------------------------------------------------------------------------------
@@ -138,7 +138,7 @@ def _row_norm(p: ti.template(), c):
         for k in range(p.arity[c]):
             i = p.node[c, k]
             weights = ti.cast(0.0, ti.f64)
-            for e in range(p.entry_start[i], p.entry_start[i + 1]):
+            for e in range(p.by_node.start[i], p.by_node.start[i + 1]):
                 d = p.entry[e] // p.width
                 weights += ti.abs(p.weight[d, p.entry[e] % p.width]) * _roots(p, d).max()
             total += ti.abs(p.weight[c, k]) * p.inverse_mass[i].max() * a.max() * weights

@@ -195,7 +195,7 @@ def impulse_on_node(k: ti.template(), i):
     """Return (J^T r) of node i [N s]; as `impulse_on`, but from impulses in world axes."""
     p, w = ti.static((k.problem, k.work))
     d = dvec(0.0)
-    for e in range(p.entry_start[i], p.entry_start[i + 1]):
+    for e in range(p.by_node.start[i], p.by_node.start[i + 1]):
         c, slot = p.entry[e] // p.width, p.entry[e] % p.width
         d += p.weight[c, slot] * w.world_impulse[c]
     return d
@@ -304,7 +304,7 @@ def build_stage_contacts(
         count=p.count,
         arity=p.arity,
         weight=p.weight,
-        entry_start=p.entry_start,
+        entry_start=p.by_node.start,
         entry=p.entry,
         block=work.block,
         active=work.active,
