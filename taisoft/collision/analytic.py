@@ -247,6 +247,4 @@ def find_analytic(s: ti.template(), o: ti.template(), margin: ti.f64, out: ti.te
                         if may_touch(s, o, t, k, margin):
                             at = _obstacle_contacts(s, o, t, k, margin, out.data, at, end)
             out.used[c] = at - c * out.part
-    ti.loop_config(serialize=True)
-    for _ in range(1):
-        sum_parts(out)
+    sum_parts(out)

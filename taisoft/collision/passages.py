@@ -238,9 +238,7 @@ def check_paths(
             out.used[c] = at - c * out.part
     if ti.static(g.has_pairs):
         clear_ends(s, g)
-    ti.loop_config(serialize=True)
-    for _ in range(1):
-        sum_parts(out)
+    sum_parts(out)
 
 
 @kernel(cse=False)
@@ -303,9 +301,7 @@ def append_passages(
                 at += 1
             r += out.chunks
         out.used[c] = at - c * out.part
-    ti.loop_config(serialize=True)
-    for _ in range(1):
-        sum_parts(out)
+    sum_parts(out)
 
 
 @dataclass(frozen=True, eq=False)

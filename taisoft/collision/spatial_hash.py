@@ -25,7 +25,7 @@ from taisoft.backend.lists import (
     sort_range,
 )
 from taisoft.backend.runtime import kernel
-from taisoft.collision.candidates import Buffer, Candidates, entries, sum_parts
+from taisoft.collision.candidates import Buffer, Candidates, entries, fill, sum_parts
 from taisoft.collision.surface import ACTIVE, Surface, cell_of, ivec, may_touch
 
 LARGE = 512  # cells above which a triangle counts as large
@@ -184,9 +184,7 @@ def find_rows(s: ti.template(), g: ti.template(), member: ti.template(), out: ti
                     g.end[t] = at
                     sort_range(out.data, begin, at)
             out.used[c] = at - c * out.part
-    ti.loop_config(serialize=True)
-    for _ in range(1):
-        sum_parts(out)
+    sum_parts(out)
 
 
 class SpatialHash:
@@ -212,19 +210,15 @@ class SpatialHash:
         self.members = Buffer("hash_cells", entries, capacity or 8 * n + 64, max_capacity, 1, arena)
         self.rows = Buffer("hash_rows", entries, capacity or ENTRIES_PER_TRIANGLE * n + 64, max_capacity, surface.chunks, arena)
 
-    def find(self) -> Candidates:
-        """Return the candidates of the present boxes. Raise SimulationError if a buffer would outgrow its limit."""
+    def near(self) -> Candidates:
+        """Return the candidates of the present boxes, for queries. Raise SimulationError if a buffer would outgrow its limit."""
         surface, grid = self.surface, self.grid
         list_cells(surface, grid, 1.0 / self.cell)
         self.members.count[0] = grid.cells.start[grid.n_cells + 1]
         self.members.grow_if_full()
         fill_cells(surface, grid, self.members.data)
-        while True:
-            find_rows(surface, grid, self.members.data, self.rows.parts)
-            if not self.rows.grow_if_full():
-                return Candidates(grid.start, grid.end, self.rows.data)
-
-    near = find  # queries read the rows
+        fill(lambda: find_rows(surface, grid, self.members.data, self.rows.parts), self.rows)
+        return Candidates(grid.start, grid.end, self.rows.data)
 
     @property
     def buffers(self) -> tuple[Buffer, ...]:

@@ -76,6 +76,8 @@ class Surface:
     sharp: Any  # (n_triangles) i32: edge bits, see `mark_sharp_edges`
     inside: Any  # (n_verts) i32: bit k % INSIDE_BITS is set if the vertex is in collider k and has contacts that move it out
     exit_direction: Any  # (n_verts) 3-vectors f64: summed exit displacements of those contacts [m]
+    padding: Any  # (1) f64: half of the distance by which boxes are grown together, for queries [m]
+    margin: Any  # (1) f64: distance within which contacts are found [m]
 
     @property
     def has_attached(self) -> bool:
@@ -93,8 +95,8 @@ def build_surface(
 ) -> Surface:
     """Allocate and fill the fields.
 
-    rest: (v,3) [m]; properties: soft, self_on, mode, thickness and edge, (n_bodies,) each, and attached, (n_bodies, n_bodies)
-    bool, if any are. serial: None decides by size, and by what threads gain.
+    rest: (v,3) [m]; properties: soft, self_on, mode, thickness and edge, (n_bodies,) each; attached, (n_bodies, n_bodies)
+    bool, if any are; padding and margin [m]. serial: None decides by size, and by what threads gain.
     """
     t, bodies, attached = topology, len(properties["soft"]), properties.get("attached")
     n, v = len(t.triangle), len(t.node)
@@ -129,6 +131,7 @@ def build_surface(
         mode=integers(arena, "contact_mode", properties["mode"]),
         attached=integers(arena, "attached", attached.reshape(-1)) if attached is not None and attached.any() else None,
         rest=arena.vectors("surface_rest", ti.f64, max(v, 1), rest if v else None),
+        **{name: arena.field(f"surface_{name}", ti.f64, 1, np.array([properties[name]])) for name in ("padding", "margin")},
         area=arena.field("surface_area", ti.f64, max(n, 1)),
         exit_direction=arena.vectors("surface_exit_direction", ti.f64, max(v, 1)),
         **fields,
@@ -277,12 +280,11 @@ def list_near(s: ti.template(), c, own):
 
 
 @ti.func
-def sum_pairs(s: ti.template(), append):
-    """Sum the tested pairs of all parts; if `append` is 1, add them to the previous sum."""
-    total = append * s.count[PAIRS]
-    for c in range(s.chunks):
-        total += s.part[c]
-    s.count[PAIRS] = total
+def sum_pairs(surface: ti.template()):
+    """Sum the tested pairs of all parts. A top-level loop of a kernel."""
+    ti.loop_config(serialize=True)
+    for _ in range(1):
+        surface.count[PAIRS] = sum_before(surface.part, surface.chunks)
 
 
 @ti.func
