@@ -226,32 +226,24 @@ def _box_triangles(s: ti.template(), margin):
 
 
 @ti.func
-def _box_bodies(s: ti.template()):
-    """Compute the boxes of the colliders."""
-    if ti.static(s.on_cpu):
-        _box_each_body(s)
-    else:
-        for b in range(s.n_bodies):
-            s.body_lo[b], s.body_hi[b] = dvec(ti.math.inf), dvec(-ti.math.inf)
-        for t in range(s.n_triangles):
-            b = s.body[t]
-            for a in ti.static(range(3)):
-                if s.lo[t][a] < s.body_lo[b][a]:  # few are, and atomics on one address wait for each other
-                    ti.atomic_min(s.body_lo[b][a], s.lo[t][a])
-                if s.hi[t][a] > s.body_hi[b][a]:
-                    ti.atomic_max(s.body_hi[b][a], s.hi[t][a])
-
-
-@ti.func
-def _box_each_body(s: ti.template()):
-    ti.loop_config(serialize=s.serial_cheap)
-    for task in range(s.n_bodies * s.cheap_spread):
-        if task % s.cheap_spread == 0:
-            b = task // s.cheap_spread
-            lo, hi = dvec(ti.math.inf), dvec(-ti.math.inf)
-            for t in range(s.first_of[b], s.first_of[b + 1]):
-                lo, hi = ti.min(lo, s.lo[t]), ti.max(hi, s.hi[t])
-            s.body_lo[b], s.body_hi[b] = lo, hi
+def _box_bodies(surface: ti.template()):
+    """Compute the boxes of the colliders, from those of each one's triangles in each chunk."""
+    ti.loop_config(serialize=surface.serial_cheap)
+    for b in range(surface.n_bodies):
+        surface.body_lo[b], surface.body_hi[b] = dvec(ti.math.inf), dvec(-ti.math.inf)
+    ti.loop_config(serialize=surface.serial_cheap)
+    for task in range(surface.chunks * surface.cheap_spread):
+        if task % surface.cheap_spread == 0:
+            c, lo, hi = task // surface.cheap_spread, dvec(ti.math.inf), dvec(-ti.math.inf)
+            last = part_first(c + 1, surface.n_triangles, surface.chunks) - 1
+            for t in range(part_first(c, surface.n_triangles, surface.chunks), last + 1):
+                b = surface.body[t]
+                lo, hi = ti.min(lo, surface.lo[t]), ti.max(hi, surface.hi[t])
+                if t == last or surface.body[ti.min(t + 1, last)] != b:
+                    for axis in ti.static(range(3)):
+                        ti.atomic_min(surface.body_lo[b][axis], lo[axis])
+                        ti.atomic_max(surface.body_hi[b][axis], hi[axis])
+                    lo, hi = dvec(ti.math.inf), dvec(-ti.math.inf)
 
 
 @ti.func

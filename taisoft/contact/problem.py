@@ -234,12 +234,6 @@ def impulse_on(p: ti.template(), i):
 
 
 @ti.func
-def gather_velocity(p: ti.template(), i):
-    """M^-1 J^T r at node i."""
-    return p.inverse_mass[i] * impulse_on(p, i)
-
-
-@ti.func
 def natural_map(p: ti.template(), c):
     """(|r - prox(r - f u)|^2, |r|^2) of contact c."""
     r = p.r[c]
@@ -258,13 +252,19 @@ def residual_of(sums):
     return result
 
 
-@kernel
-def find_velocities(p: ti.template()):
+@ti.func
+def update_velocities(problem: ti.template()):
     """Set w = M^-1 J^T r over nodes; does nothing if W is a matrix."""
-    if ti.static(not p.matrix):
-        ti.loop_config(serialize=p.serial)
-        for i in range(p.n_nodes):
-            p.w[i] = gather_velocity(p, i)
+    if ti.static(not problem.matrix):
+        ti.loop_config(serialize=problem.serial)
+        for i in range(problem.n_nodes):
+            problem.w[i] = problem.inverse_mass[i] * impulse_on(problem, i)
+
+
+@kernel
+def find_velocities(problem: ti.template()):
+    """See `update_velocities`."""
+    update_velocities(problem)
 
 
 @ti.func

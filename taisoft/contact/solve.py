@@ -37,9 +37,9 @@ from taisoft.contact.problem import (
     WEIGHT,
     ContactProblem,
     find_velocities,
-    gather_velocity,
     natural_map,
     residual_of,
+    update_velocities,
 )
 from taisoft.contact.prox import prox
 from taisoft.contact.sweeps import SIMULTANEOUS, relaxation, sweep, sweep_parallel
@@ -109,12 +109,70 @@ def _restore_best(p: ti.template()):
         p.r[c] = p.best[c]
 
 
-# --- on one thread ----------------------------------------------------------------------------------------------------
+# --- loops: parallel at the top level of a kernel, serial in the loop of `_run_serial` -----------------------------------
+
+
+@ti.func
+def _prepare(problem: ti.template(), method: ti.template(), with_momentum):
+    """Set the fractions of the r-factors and the impulses before the first sweep."""
+    for c in range(problem.count[0]):
+        problem.relaxation[c] = relaxation(problem, c, method, with_momentum)
+        problem.previous[c] = problem.r[c]
+
+
+@ti.func
+def _sum_chunks(problem: ti.template(), chunks: ti.template()):
+    """Sum the terms of each chunk, in order."""
+    for k in range(chunks):
+        n, total = problem.count[0], ti.Vector([0.0, 0.0], ti.f64)
+        for c in range(k * n // chunks, (k + 1) * n // chunks):
+            total += problem.term[c]
+        problem.partial[k] = total
+
+
+@ti.func
+def _total(problem: ti.template(), chunks: ti.template()):
+    total = ti.Vector([0.0, 0.0], ti.f64)
+    for k in range(chunks):
+        total += problem.partial[k]
+    return total
+
+
+@ti.func
+def _check(problem: ti.template(), chunks: ti.template(), first, sweeps):
+    """Check the residual and save or restore the impulses; w must be up to date."""
+    for c in range(problem.count[0]):
+        problem.term[c] = natural_map(problem, c)
+    _sum_chunks(problem, chunks)
+    ti.loop_config(serialize=True)
+    for _ in range(1):
+        problem.state[RESIDUAL] = residual_of(_total(problem, chunks))
+        if first == 1:
+            _begin(problem)
+        else:
+            _accept_or_reject(problem, sweeps)
+    for c in range(problem.count[0]):
+        _apply_verdict(problem, c)
+
+
+@ti.func
+def _extrapolate(problem: ti.template(), chunks: ti.template()):
+    """Set the impulses from which the next sweep starts."""
+    for c in range(problem.count[0]):
+        problem.term[c] = [_restart_test(problem, c), 0.0]
+    _sum_chunks(problem, chunks)
+    ti.loop_config(serialize=True)
+    for _ in range(1):
+        _set_weight(problem, _total(problem, chunks)[0])
+    for c in range(problem.count[0]):
+        x = problem.r[c]
+        problem.r[c] = prox(x + problem.state[WEIGHT] * (x - problem.previous[c]), problem.friction[c])
+        problem.previous[c] = x
 
 
 @kernel
 def _run_serial(
-    p: ti.template(),
+    problem: ti.template(),
     method: ti.template(),
     first: ti.i32,
     sweeps: ti.i32,
@@ -125,134 +183,61 @@ def _run_serial(
     """Run up to `sweeps` sweeps with a residual check after each `every`; first: 1 at the start of a solve."""
     ti.loop_config(serialize=True)
     for _ in range(1):
-        p.state[CHECKS] = 0.0
+        problem.state[CHECKS] = 0.0
         if first == 1:
-            _refresh(p)
-            p.state[RESIDUAL] = _residual(p)
-            _begin(p)
-            for c in range(p.count[0]):
-                p.relaxation[c] = relaxation(p, c, method, with_momentum)
-                p.previous[c] = p.r[c]
-                p.best[c] = p.r[c]
+            update_velocities(problem)
+            _prepare(problem, method, with_momentum)
+            _check(problem, 1, 1, 0)
         done = 0
-        while done < sweeps and not p.state[RESIDUAL] <= tolerance:
+        while done < sweeps and not problem.state[RESIDUAL] <= tolerance:
             n = ti.min(every, sweeps - done)
             for _k in range(n):
-                sweep(p, method)
+                sweep(problem, method)
                 if with_momentum == 1:
-                    total = ti.cast(0.0, ti.f64)
-                    for c in range(p.count[0]):
-                        total += _restart_test(p, c)
-                    _set_weight(p, total)
-                    for c in range(p.count[0]):
-                        _extrapolate(p, c)
-                _refresh(p)
+                    _extrapolate(problem, 1)
+                update_velocities(problem)
             done += n
-            p.state[RESIDUAL] = _residual(p)
-            _accept_or_reject(p, n)
-            for c in range(p.count[0]):
-                _apply_verdict(p, c)
-            if p.state[RESIDUAL] == p.state[BEST]:
-                _refresh(p)
-
-
-@ti.func
-def _refresh(p: ti.template()):
-    """Recompute w from the impulses, as `find_velocities`."""
-    if ti.static(not p.matrix):
-        for i in range(p.n_nodes):
-            p.w[i] = gather_velocity(p, i)
-
-
-@ti.func
-def _residual(p: ti.template()):
-    """The residual of the present impulses, summed in order; w is up to date."""
-    sums = ti.Vector([0.0, 0.0], ti.f64)
-    for c in range(p.count[0]):
-        sums += natural_map(p, c)
-    return residual_of(sums)
-
-
-# --- on all threads ---------------------------------------------------------------------------------------------------
+            _check(problem, 1, 0, n)
+            if problem.state[RESIDUAL] == problem.state[BEST]:
+                update_velocities(problem)
 
 
 def _run_parallel(
-    p: ContactProblem, method: str, first: int, sweeps: int, every: int, tolerance: float, with_momentum: int
+    problem: ContactProblem, method: str, first: int, sweeps: int, every: int, tolerance: float, with_momentum: int
 ) -> None:
     """As `_run_serial`, on all threads; the host reads the residual."""
-    p.state[CHECKS] = 0.0
+    problem.state[CHECKS] = 0.0
     if first:
-        find_velocities(p)
-        _prepare_contacts(p, method, with_momentum)
-        _check(p, 1, 0)
-    done, n_colours = 0, 0 if method in SIMULTANEOUS else int(p.count[1])
-    while done < sweeps and not p.state[RESIDUAL] <= tolerance:
+        find_velocities(problem)
+        _prepare_all(problem, method, with_momentum)
+        _check_all(problem, 1, 0)
+    done, n_colours = 0, 0 if method in SIMULTANEOUS else int(problem.count[1])
+    while done < sweeps and not problem.state[RESIDUAL] <= tolerance:
         n = min(every, sweeps - done)
         for _ in range(n):
-            sweep_parallel(p, method, n_colours)
+            sweep_parallel(problem, method, n_colours)
             if with_momentum:
-                _extrapolate_all(p)
-            find_velocities(p)
+                _extrapolate_all(problem)
+            find_velocities(problem)
         done += n
-        _check(p, 0, n)
-        if p.state[RESIDUAL] == p.state[BEST]:
-            find_velocities(p)
+        _check_all(problem, 0, n)
+        if problem.state[RESIDUAL] == problem.state[BEST]:
+            find_velocities(problem)
 
 
 @kernel
-def _prepare_contacts(p: ti.template(), method: ti.template(), with_momentum: ti.i32):
-    for c in range(p.count[0]):
-        p.relaxation[c] = relaxation(p, c, method, with_momentum)
-        p.previous[c] = p.r[c]
-
-
-@ti.func
-def _sum_chunk(p: ti.template(), k):
-    """Sum the terms of chunk k, in order."""
-    n = p.count[0]
-    total = ti.Vector([0.0, 0.0], ti.f64)
-    for c in range(k * n // CHUNKS, (k + 1) * n // CHUNKS):
-        total += p.term[c]
-    p.partial[k] = total
-
-
-@ti.func
-def _total(p: ti.template()):
-    total = ti.Vector([0.0, 0.0], ti.f64)
-    for k in range(CHUNKS):
-        total += p.partial[k]
-    return total
+def _prepare_all(problem: ti.template(), method: ti.template(), with_momentum: ti.i32):
+    _prepare(problem, method, with_momentum)
 
 
 @kernel
-def _check(p: ti.template(), first: ti.i32, sweeps: ti.i32):
-    """Check the residual and save or restore the impulses; w must be up to date."""
-    for c in range(p.count[0]):
-        p.term[c] = natural_map(p, c)
-    for k in range(CHUNKS):
-        _sum_chunk(p, k)
-    ti.loop_config(serialize=True)
-    for _ in range(1):
-        p.state[RESIDUAL] = residual_of(_total(p))
-        if first == 1:
-            _begin(p)
-        else:
-            _accept_or_reject(p, sweeps)
-    for c in range(p.count[0]):
-        _apply_verdict(p, c)
+def _check_all(problem: ti.template(), first: ti.i32, sweeps: ti.i32):
+    _check(problem, CHUNKS, first, sweeps)
 
 
 @kernel
-def _extrapolate_all(p: ti.template()):
-    for c in range(p.count[0]):
-        p.term[c] = [_restart_test(p, c), 0.0]
-    for k in range(CHUNKS):
-        _sum_chunk(p, k)
-    ti.loop_config(serialize=True)
-    for _ in range(1):
-        _set_weight(p, _total(p)[0])
-    for c in range(p.count[0]):
-        _extrapolate(p, c)
+def _extrapolate_all(problem: ti.template()):
+    _extrapolate(problem, CHUNKS)
 
 
 # --- momentum ---------------------------------------------------------------------------------------------------------
@@ -276,14 +261,6 @@ def _set_weight(p: ti.template(), total):
     if not total > 0.0:
         p.state[MOMENTUM] = 0.5 * (1.0 + ti.sqrt(1.0 + 4.0 * t * t))
         p.state[WEIGHT] = p.state[STEP] * (t - 1.0) / p.state[MOMENTUM]
-
-
-@ti.func
-def _extrapolate(p: ti.template(), c):
-    """Set the impulse of contact c from which the next sweep starts."""
-    x = p.r[c]
-    p.r[c] = prox(x + p.state[WEIGHT] * (x - p.previous[c]), p.friction[c])
-    p.previous[c] = x
 
 
 # --- r-factor strategy ------------------------------------------------------------------------------------------------

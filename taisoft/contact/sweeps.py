@@ -32,7 +32,8 @@ BATCH = 4  # colours per launch: a launch costs more than a loop in it
 
 @ti.func
 def sweep(p: ti.template(), method: ti.template()):
-    """Relax every contact once, on this thread; leave the old impulses in `sweep_start`."""
+    """Relax every contact once; leave the old impulses in `sweep_start`. Called at a kernel's top level, with a method of
+    SIMULTANEOUS only, its loops are parallel."""
     if ti.static(method in SIMULTANEOUS):
         for c in range(p.count[0]):
             p.sweep_start[c] = _relaxed(p, c, method)
@@ -88,10 +89,7 @@ def _swap(p: ti.template(), c):
 
 @kernel
 def _relax_all(p: ti.template(), method: ti.template()):
-    for c in range(p.count[0]):
-        p.sweep_start[c] = _relaxed(p, c, method)
-    for c in range(p.count[0]):
-        _swap(p, c)
+    sweep(p, method)
 
 
 @kernel
