@@ -280,7 +280,7 @@ def is_earlier(out: ti.template(), a, b):
 
 
 @ti.func
-def _decide(r: ti.template(), out: ti.template(), at, inverse, tolerance):
+def _decide(work: ti.template(), out: ti.template(), at, inverse, tolerance):
     """State of the contact at a buffer index, from the states of the earlier ones near it."""
     p = out.point[at]
     lo, hi = cell_of(p - tolerance, inverse, PERIOD), cell_of(p + tolerance, inverse, PERIOD)
@@ -290,13 +290,13 @@ def _decide(r: ti.template(), out: ti.template(), at, inverse, tolerance):
     while state != DROPPED and k < n[0] * n[1] * n[2]:
         z, y, x = k % n[2], (k // n[2]) % n[1], k // (n[2] * n[1])
         cell = ivec(ti.select(x == 0, lo[0], hi[0]), ti.select(y == 0, lo[1], hi[1]), ti.select(z == 0, lo[2], hi[2]))
-        b = _bucket(r, cell)
-        for m in range(r.lists.start[b], r.lists.start[b + 1]):
-            other = r.member[m]
+        b = _bucket(work, cell)
+        for m in range(work.lists.start[b], work.lists.start[b + 1]):
+            other = work.member[m]
             d = p - out.point[other]
             if d.dot(d) <= tolerance * tolerance:  # this test rejects most
                 if is_earlier(out, other, at) == 1:
-                    other_state = r.state[other]
+                    other_state = work.state[other]
                     if other_state != DROPPED and is_same(out, at, other, tolerance):
                         if other_state == KEPT:
                             state = DROPPED
@@ -307,55 +307,55 @@ def _decide(r: ti.template(), out: ti.template(), at, inverse, tolerance):
 
 
 @ti.func
-def _decide_all(r: ti.template(), out: ti.template(), inverse, tolerance):
+def _decide_all(work: ti.template(), out: ti.template(), inverse, tolerance):
     """Run one round: decide every contact that can be decided."""
-    r.count[UNDECIDED] = 0
-    ti.loop_config(serialize=r.serial)
-    for i in range(r.count[FOUND]):
-        at = r.place[i]
-        if r.state[at] == UNKNOWN:
-            state = _decide(r, out, at, inverse, tolerance)
+    work.count[UNDECIDED] = 0
+    ti.loop_config(serialize=work.serial)
+    for i in range(work.count[FOUND]):
+        at = work.place[i]
+        if work.state[at] == UNKNOWN:
+            state = _decide(work, out, at, inverse, tolerance)
             if state == UNKNOWN:
-                ti.atomic_add(r.count[UNDECIDED], 1)
+                ti.atomic_add(work.count[UNDECIDED], 1)
             else:
-                r.state[at] = state
+                work.state[at] = state
 
 
 @ti.func
-def _list_kept(r: ti.template()):
+def _list_kept(work: ti.template()):
     """List the kept contacts in order, once all are decided."""
     ti.loop_config(serialize=True)
     for _ in range(1):
         n = 0
-        if r.count[UNDECIDED] == 0:
-            for i in range(r.count[FOUND]):
-                if r.state[r.place[i]] == KEPT:
-                    r.kept[n] = r.place[i]
+        if work.count[UNDECIDED] == 0:
+            for i in range(work.count[FOUND]):
+                if work.state[work.place[i]] == KEPT:
+                    work.kept[n] = work.place[i]
                     n += 1
-        r.count[LEFT] = n
+        work.count[LEFT] = n
 
 
 @kernel
-def begin_reduction(r: ti.template(), out: ti.template(), inverse: ti.f64, tolerance: ti.f64, lowest_gap: ti.f64):
+def begin_reduction(work: ti.template(), out: ti.template(), inverse: ti.f64, tolerance: ti.f64, lowest_gap: ti.f64):
     """Enter the contacts into the cells and run the first round; more are needed only while contacts are undecided."""
-    _fill_cells(r, out, inverse, lowest_gap)
-    _decide_all(r, out.data, inverse, tolerance)
-    _list_kept(r)
+    _fill_cells(work, out, inverse, lowest_gap)
+    _decide_all(work, out.data, inverse, tolerance)
+    _list_kept(work)
 
 
 @kernel
-def decide(r: ti.template(), out: ti.template(), inverse: ti.f64, tolerance: ti.f64):
+def decide(work: ti.template(), out: ti.template(), inverse: ti.f64, tolerance: ti.f64):
     """Run a further round."""
-    _decide_all(r, out.data, inverse, tolerance)
-    _list_kept(r)
+    _decide_all(work, out.data, inverse, tolerance)
+    _list_kept(work)
 
 
-def reduce_contacts(r: ReductionFields, out: Parts, tolerance: float, cell: float, lowest_gap: float = -np.inf) -> None:
-    """Fill r.kept and r.count for a buffer of contacts.
+def reduce_contacts(work: ReductionFields, out: Parts, tolerance: float, cell: float, lowest_gap: float = -np.inf) -> None:
+    """Fill work.kept and work.count for a buffer of contacts.
 
     tolerance [m]; cell: edge of the cells [m], at least 2.5 tolerances; lowest_gap [m]: of surfaces that do not cross.
     """
     inverse = 1.0 / max(cell, 2.5 * tolerance)
-    begin_reduction(r, out, inverse, tolerance, lowest_gap)
-    while r.count[UNDECIDED] > 0:
-        decide(r, out, inverse, tolerance)
+    begin_reduction(work, out, inverse, tolerance, lowest_gap)
+    while work.count[UNDECIDED] > 0:
+        decide(work, out, inverse, tolerance)

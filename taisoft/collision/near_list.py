@@ -48,25 +48,25 @@ class PathFields:
 
 
 @ti.func
-def _set_paths(s: ti.template(), x: ti.template(), g: ti.template(), mode, limit, is_new):
+def _set_paths(surface: ti.template(), x: ti.template(), paths: ti.template(), mode, limit, is_new):
     """Set the paths, and whether they leave the searched ones by more than `limit` [m]; store these if the list is new."""
     for k in ti.static(range(2)):
-        g.left[k] = 0
-    ti.loop_config(serialize=s.serial_cheap)
-    for i in range(s.n_verts):
-        path = s.move[i]
+        paths.left[k] = 0
+    ti.loop_config(serialize=surface.serial_cheap)
+    for i in range(surface.n_verts):
+        path = surface.move[i]
         if mode == STILL:
             path = dvec(0.0)
-        elif mode == TO_STATE and s.node[i] >= 0:
-            path = x[s.node[i]] - s.x[i]
-            change = path - s.move[i]
+        elif mode == TO_STATE and surface.node[i] >= 0:
+            path = x[surface.node[i]] - surface.x[i]
+            change = path - surface.move[i]
             if not change.dot(change) <= limit * limit:  # cheaper, and mostly enough; also if it is not a number
-                if not _leaving(path, s.move[i]).norm() <= limit:
-                    g.left[UNCOVERED] = 1
-        g.path[i] = path
-        if ti.static(g.has_pairs):
+                if not _leaving(path, surface.move[i]).norm() <= limit:
+                    paths.left[UNCOVERED] = 1
+        paths.path[i] = path
+        if ti.static(paths.has_pairs):
             if is_new:
-                g.listed_x[i], g.listed_move[i] = s.x[i], s.move[i]
+                paths.listed_x[i], paths.listed_move[i] = surface.x[i], surface.move[i]
 
 
 @ti.func
@@ -135,16 +135,16 @@ def _compare_with_listed(s: ti.template(), g: ti.template(), limit):
 
 
 @ti.func
-def prepare_paths(s: ti.template(), x: ti.template(), g: ti.template(), mode, limit, listed_limit, floor):
+def prepare_paths(surface: ti.template(), x: ti.template(), paths: ti.template(), mode, limit, listed_limit, floor):
     """Set the paths of a mode, see `passages.check_paths`, what is computed once for each triangle and vertex, and `left`.
 
     limit [m]: of how far vertices may leave the searched paths; listed_limit [m]: of how far they may leave the listed ones along
     an axis, beside others, infinite if the list is new.
     """
-    _set_paths(s, x, g, mode, limit, listed_limit == ti.math.inf)
-    if ti.static(g.has_pairs):
-        _box_ends(s, g, floor)
-        _compare_with_listed(s, g, listed_limit)
+    _set_paths(surface, x, paths, mode, limit, listed_limit == ti.math.inf)
+    if ti.static(paths.has_pairs):
+        _box_ends(surface, paths, floor)
+        _compare_with_listed(surface, paths, listed_limit)
 
 
 @ti.func

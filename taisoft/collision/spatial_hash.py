@@ -68,35 +68,35 @@ def grid_size(extent: np.ndarray, cell: float, n_triangles: int) -> tuple[int, i
 
 
 @ti.func
-def _cells_of(s: ti.template(), g: ti.template(), t, inverse):
+def _cells_of(surface: ti.template(), grid: ti.template(), t, inverse):
     """First wrapped cell of a triangle's box, and the number it covers along each axis; (0, 0, 0) for a large one."""
-    lo, hi = s.lo[t], s.hi[t]
+    lo, hi = surface.lo[t], surface.hi[t]
     count = ivec(0)
     farthest = ti.cast(0.0, ti.f64)
     cells = ti.cast(1.0, ti.f64)
     for q in ti.static(range(3)):
         farthest = ti.max(farthest, ti.max(ti.abs(lo[q]), ti.abs(hi[q])) * inverse)
         # the same floors as for the corner of an overlap, so that no cell is missed
-        cells *= ti.min(ti.floor(hi[q] * inverse) - ti.floor(lo[q] * inverse) + 1.0, ti.cast(g.size[q], ti.f64))
+        cells *= ti.min(ti.floor(hi[q] * inverse) - ti.floor(lo[q] * inverse) + 1.0, ti.cast(grid.size[q], ti.f64))
     first = ivec(0)
     if farthest < COUNTABLE and cells <= LARGE:
-        first = cell_of(lo, inverse, g.size)
+        first = cell_of(lo, inverse, grid.size)
         for q in ti.static(range(3)):
             span = ti.floor(hi[q] * inverse) - ti.floor(lo[q] * inverse) + 1.0
-            count[q] = ti.cast(ti.min(span, ti.cast(g.size[q], ti.f64)), ti.i32)
+            count[q] = ti.cast(ti.min(span, ti.cast(grid.size[q], ti.f64)), ti.i32)
     return first, count
 
 
 @ti.func
-def _index(g: ti.template(), cell):
-    return (cell[0] * g.size[1] + cell[1]) * g.size[2] + cell[2]
+def _index(grid: ti.template(), cell):
+    return (cell[0] * grid.size[1] + cell[1]) * grid.size[2] + cell[2]
 
 
 @ti.func
-def _bucket(g: ti.template(), first, count, k):
+def _bucket(grid: ti.template(), first, count, k):
     """Index in memory of the k-th cell of a box."""
     cell = first + ivec(k // (count[2] * count[1]), (k // count[2]) % count[1], k % count[2])
-    return _index(g, cell & ivec(g.size[0] - 1, g.size[1] - 1, g.size[2] - 1))  # sizes are powers of two
+    return _index(grid, cell & ivec(grid.size[0] - 1, grid.size[1] - 1, grid.size[2] - 1))  # sizes are powers of two
 
 
 @kernel
@@ -135,53 +135,55 @@ def fill_cells(surface: ti.template(), grid: ti.template(), member: ti.template(
 
 
 @ti.func
-def _is_pair(s: ti.template(), t, u):
+def _is_pair(surface: ti.template(), t, u):
     """1 if two triangles' boxes overlap and they may touch."""
     found = 0  # axis by axis: the first one separates most boxes
-    if u != t and s.lo[t][0] <= s.hi[u][0] and s.lo[u][0] <= s.hi[t][0]:
-        if s.lo[t][1] <= s.hi[u][1] and s.lo[u][1] <= s.hi[t][1]:
-            if s.lo[t][2] <= s.hi[u][2] and s.lo[u][2] <= s.hi[t][2]:
-                found = may_touch(s, t, u)
+    if u != t and surface.lo[t][0] <= surface.hi[u][0] and surface.lo[u][0] <= surface.hi[t][0]:
+        if surface.lo[t][1] <= surface.hi[u][1] and surface.lo[u][1] <= surface.hi[t][1]:
+            if surface.lo[t][2] <= surface.hi[u][2] and surface.lo[u][2] <= surface.hi[t][2]:
+                found = may_touch(surface, t, u)
     return found
 
 
 @kernel
-def find_rows(s: ti.template(), g: ti.template(), member: ti.template(), out: ti.template()):
+def find_rows(surface: ti.template(), grid: ti.template(), member: ti.template(), out: ti.template()):
     """Write each active triangle's row, sorted; each chunk fills its own part of the entries."""
-    ti.loop_config(serialize=s.serial)
-    for t in range(s.n_triangles):
-        g.start[t] = 0
-        g.end[t] = 0
-    ti.loop_config(serialize=s.serial)
-    for task in range(s.chunks * s.spread):
-        if task % s.spread == 0:
-            c = task // s.spread
+    ti.loop_config(serialize=surface.serial)
+    for t in range(surface.n_triangles):
+        grid.start[t] = 0
+        grid.end[t] = 0
+    ti.loop_config(serialize=surface.serial)
+    for task in range(surface.chunks * surface.spread):
+        if task % surface.spread == 0:
+            c = task // surface.spread
             at, last = c * out.part, (c + 1) * out.part
-            for i in range(part_first(c, s.count[ACTIVE], s.chunks), part_first(c + 1, s.count[ACTIVE], s.chunks)):
-                t = s.active[i]
+            for i in range(
+                part_first(c, surface.count[ACTIVE], surface.chunks), part_first(c + 1, surface.count[ACTIVE], surface.chunks)
+            ):
+                t = surface.active[i]
                 begin = at
-                own = s.body[t]
-                self_on = s.self_on[own]
-                first, count = g.first_cell[t], g.cell_count[t]
+                own = surface.body[t]
+                self_on = surface.self_on[own]
+                first, count = grid.first_cell[t], grid.cell_count[t]
                 for k in range(count[0] * count[1] * count[2]):
-                    bucket = _bucket(g, first, count, k)
-                    for e in range(g.cells.start[bucket], g.cells.start[bucket + 1]):
+                    bucket = _bucket(grid, first, count, k)
+                    for e in range(grid.cells.start[bucket], grid.cells.start[bucket + 1]):
                         u = member[e]
-                        if s.body[u] != own or self_on == 1:
-                            if _is_pair(s, t, u) == 1:
-                                if _index(g, ti.select(s.lo[t] >= s.lo[u], first, g.first_cell[u])) == bucket:
+                        if surface.body[u] != own or self_on == 1:
+                            if _is_pair(surface, t, u) == 1:
+                                if _index(grid, ti.select(surface.lo[t] >= surface.lo[u], first, grid.first_cell[u])) == bucket:
                                     if at < last:
                                         out.data[at] = u
                                     at += 1
-                for j in range(ti.select(count[0] == 0, s.count[ACTIVE], g.count[N_LARGE])):
-                    u = ti.select(count[0] == 0, s.active[j], g.large[j])
-                    if _is_pair(s, t, u) == 1:
+                for j in range(ti.select(count[0] == 0, surface.count[ACTIVE], grid.count[N_LARGE])):
+                    u = ti.select(count[0] == 0, surface.active[j], grid.large[j])
+                    if _is_pair(surface, t, u) == 1:
                         if at < last:
                             out.data[at] = u
                         at += 1
                 if at <= last:
-                    g.start[t] = begin
-                    g.end[t] = at
+                    grid.start[t] = begin
+                    grid.end[t] = at
                     sort_range(out.data, begin, at)
             out.used[c] = at - c * out.part
     sum_parts(out)

@@ -165,79 +165,79 @@ def fill_field(field, values: np.ndarray) -> None:
     upload([(field, whole)])
 
 
-def fill_matrix_problem(p: ContactProblem, W: sp.spmatrix, b: np.ndarray, friction: np.ndarray) -> None:
+def fill_matrix_problem(problem: ContactProblem, W: sp.spmatrix, b: np.ndarray, friction: np.ndarray) -> None:
     """Upload W (3k,3k), b (3k,) and coefficients of friction (k,) to a problem large enough; keep its impulses."""
     W, k = sp.bsr_matrix(W, blocksize=(3, 3)), len(friction)
     W.sort_indices()
-    p.count[0] = k
-    fill_field(p.row_start, W.indptr)
-    fill_field(p.column, W.indices)
-    fill_field(p.block, W.data.reshape(-1, 9))
-    fill_field(p.b, b.reshape(k, 3))
-    fill_field(p.friction, friction)
-    fill_field(p.order, np.arange(k))
-    find_factors(p)
+    problem.count[0] = k
+    fill_field(problem.row_start, W.indptr)
+    fill_field(problem.column, W.indices)
+    fill_field(problem.block, W.data.reshape(-1, 9))
+    fill_field(problem.b, b.reshape(k, 3))
+    fill_field(problem.friction, friction)
+    fill_field(problem.order, np.arange(k))
+    find_factors(problem)
 
 
 # --- solver interface -------------------------------------------------------------------------------------------------
 
 
 @ti.func
-def to_frame(p: ti.template(), c, v):
+def to_frame(problem: ti.template(), c, v):
     """Transform a world vector to the frame of contact c."""
-    n, t = p.normal[c], p.tangent[c]
+    n, t = problem.normal[c], problem.tangent[c]
     return dvec(n.dot(v), t.dot(v), n.cross(t).dot(v))
 
 
 @ti.func
-def to_world(p: ti.template(), c, r):
+def to_world(problem: ti.template(), c, r):
     """Transform a vector from the frame of contact c to the world."""
-    n, t = p.normal[c], p.tangent[c]
+    n, t = problem.normal[c], problem.tangent[c]
     return r[0] * n + r[1] * t + r[2] * n.cross(t)
 
 
 @ti.func
-def velocity(p: ti.template(), c):
+def velocity(problem: ti.template(), c):
     """u of contact c at the present impulses [m/s]."""
-    u = p.b[c]
-    if ti.static(p.matrix):
-        for k in range(p.row_start[c], p.row_start[c + 1]):
-            r = p.r[p.column[k]]
+    u = problem.b[c]
+    if ti.static(problem.matrix):
+        for k in range(problem.row_start[c], problem.row_start[c + 1]):
+            r = problem.r[problem.column[k]]
             for i in ti.static(range(3)):
-                u[i] += p.block[k, 3 * i] * r[0] + p.block[k, 3 * i + 1] * r[1] + p.block[k, 3 * i + 2] * r[2]
+                u[i] += problem.block[k, 3 * i] * r[0] + problem.block[k, 3 * i + 1] * r[1] + problem.block[k, 3 * i + 2] * r[2]
     else:
         v = dvec(0.0)
-        for k in range(p.arity[c]):
-            v += p.weight[c, k] * p.w[p.node[c, k]]
-        u += to_frame(p, c, v)
+        for k in range(problem.arity[c]):
+            v += problem.weight[c, k] * problem.w[problem.node[c, k]]
+        u += to_frame(problem, c, v)
     return u
 
 
 @ti.func
-def add_impulse(p: ti.template(), c, change):
+def add_impulse(problem: ti.template(), c, change):
     """Add a change of contact c's impulse to w at its nodes. Contacts updated in parallel must share no movable node."""
-    if ti.static(not p.matrix):
-        d = to_world(p, c, change)
-        for k in range(p.arity[c]):
-            i = p.node[c, k]
-            p.w[i] = p.w[i] + p.weight[c, k] * (p.inverse_mass[i] * d)
+    if ti.static(not problem.matrix):
+        d = to_world(problem, c, change)
+        for k in range(problem.arity[c]):
+            i = problem.node[c, k]
+            problem.w[i] = problem.w[i] + problem.weight[c, k] * (problem.inverse_mass[i] * d)
 
 
 @ti.func
-def impulse_on(p: ti.template(), i):
+def impulse_on(problem: ti.template(), i):
     """(J^T r) of node i [N s], summed over its contacts in a fixed order."""
     d = dvec(0.0)
-    for e in range(p.by_node.start[i], p.by_node.start[i + 1]):
-        c, k = p.entry[e] // p.width, p.entry[e] % p.width
-        d += p.weight[c, k] * to_world(p, c, p.r[c])
+    for e in range(problem.by_node.start[i], problem.by_node.start[i + 1]):
+        c, k = problem.entry[e] // problem.width, problem.entry[e] % problem.width
+        d += problem.weight[c, k] * to_world(problem, c, problem.r[c])
     return d
 
 
 @ti.func
-def natural_map(p: ti.template(), c):
+def natural_map(problem: ti.template(), c):
     """(|r - prox(r - f u)|^2, |r|^2) of contact c."""
-    r = p.r[c]
-    d = r - prox(r - scaled(p.factor[c], velocity(p, c)), p.friction[c])
+    r = problem.r[c]
+    d = r - prox(r - scaled(problem.factor[c], velocity(problem, c)), problem.friction[c])
     return ti.Vector([d.dot(d), r.dot(r)], ti.f64)
 
 
@@ -268,20 +268,20 @@ def find_velocities(problem: ti.template()):
 
 
 @ti.func
-def own_block(p: ti.template(), c):
+def own_block(problem: ti.template(), c):
     """The 3x3 block of W between contact c and itself."""
     B = ti.Matrix.zero(ti.f64, 3, 3)
-    if ti.static(p.matrix):
-        for k in range(p.row_start[c], p.row_start[c + 1]):
-            if p.column[k] == c:
+    if ti.static(problem.matrix):
+        for k in range(problem.row_start[c], problem.row_start[c + 1]):
+            if problem.column[k] == c:
                 for i, j in ti.static(ti.ndrange(3, 3)):
-                    B[i, j] += p.block[k, 3 * i + j]
+                    B[i, j] += problem.block[k, 3 * i + j]
     else:
-        n, t = p.normal[c], p.tangent[c]
+        n, t = problem.normal[c], problem.tangent[c]
         E = ti.Matrix.rows([n, t, n.cross(t)])
         h = dvec(0.0)
-        for k in range(p.arity[c]):
-            h += p.weight[c, k] * p.weight[c, k] * p.inverse_mass[p.node[c, k]]
+        for k in range(problem.arity[c]):
+            h += problem.weight[c, k] * problem.weight[c, k] * problem.inverse_mass[problem.node[c, k]]
         for i, j in ti.static(ti.ndrange(3, 3)):
             for q in ti.static(range(3)):
                 B[i, j] += E[i, q] * h[q] * E[j, q]
@@ -289,16 +289,16 @@ def own_block(p: ti.template(), c):
 
 
 @kernel
-def find_factors(p: ti.template()):
+def find_factors(problem: ti.template()):
     """Set the r-factors from the diagonal of W."""
-    ti.loop_config(serialize=p.serial)
-    for c in range(p.count[0]):
-        B = own_block(p, c)
+    ti.loop_config(serialize=problem.serial)
+    for c in range(problem.count[0]):
+        B = own_block(problem, c)
         across = ti.max(B[1, 1], B[2, 2])
-        p.factor[c][0] = ti.select(B[0, 0] > 0.0, 1.0 / B[0, 0], 0.0)
-        p.factor[c][1] = ti.select(across > 0.0, 1.0 / across, 0.0)
+        problem.factor[c][0] = ti.select(B[0, 0] > 0.0, 1.0 / B[0, 0], 0.0)
+        problem.factor[c][1] = ti.select(across > 0.0, 1.0 / across, 0.0)
         if B[0, 0] <= 0.0:  # immovable
-            p.r[c] = dvec(0.0)
+            problem.r[c] = dvec(0.0)
 
 
 @kernel

@@ -66,7 +66,7 @@ class SolveResult:
 
 
 def solve(
-    p: ContactProblem,
+    problem: ContactProblem,
     method: str,
     tolerance: float,
     max_iterations: int,
@@ -81,32 +81,32 @@ def solve(
     momentum: False for the plain method.
     """
     # Gauss-Seidel has no parallel form: it runs on one thread even if the problem has parallel loops
-    run = _run_serial if p.serial or method == "gauss_seidel" else _run_parallel
-    batch = max(1, min(HISTORY - 1, LAUNCH_VISITS // max(1, int(p.count[0])) // every)) * every
+    run = _run_serial if problem.serial or method == "gauss_seidel" else _run_parallel
+    batch = max(1, min(HISTORY - 1, LAUNCH_VISITS // max(1, int(problem.count[0])) // every)) * every
     remaining, first, residuals = max_iterations, 1, []
     while True:
         n = min(batch, remaining)
-        run(p, method, first, n, every, tolerance, int(momentum))
+        run(problem, method, first, n, every, tolerance, int(momentum))
         remaining, first = remaining - n, 0
-        residual = float(p.state[RESIDUAL])
+        residual = float(problem.state[RESIDUAL])
         if history:
-            residuals += p.history.to_numpy(int(p.state[CHECKS])).tolist()
+            residuals += problem.history.to_numpy(int(problem.state[CHECKS])).tolist()
         if remaining == 0 or residual <= tolerance:
             break
-    best = float(p.state[BEST])
+    best = float(problem.state[BEST])
     if best < residual or residual != residual:
-        _restore_best(p)
-        find_velocities(p)
+        _restore_best(problem)
+        find_velocities(problem)
         residual = best
-    return SolveResult(int(p.state[SWEEPS]), residual, residual <= tolerance, residuals)
+    return SolveResult(int(problem.state[SWEEPS]), residual, residual <= tolerance, residuals)
 
 
 @kernel
-def _restore_best(p: ti.template()):
+def _restore_best(problem: ti.template()):
     """Replace the present impulses by the best ones."""
-    ti.loop_config(serialize=p.serial)
-    for c in range(p.count[0]):
-        p.r[c] = p.best[c]
+    ti.loop_config(serialize=problem.serial)
+    for c in range(problem.count[0]):
+        problem.r[c] = problem.best[c]
 
 
 # --- loops: parallel at the top level of a kernel, serial in the loop of `_run_serial` -----------------------------------
@@ -244,74 +244,74 @@ def _extrapolate_all(problem: ti.template()):
 
 
 @ti.func
-def _restart_test(p: ti.template(), c):
+def _restart_test(problem: ti.template(), c):
     """Contribution of contact c to (y - x).F^-1 (x - x_before): y is `sweep_start`, x is `r`, x_before is `previous`."""
-    x, f = p.r[c], p.factor[c]
-    backward, forward = p.sweep_start[c] - x, x - p.previous[c]
+    x, f = problem.r[c], problem.factor[c]
+    backward, forward = problem.sweep_start[c] - x, x - problem.previous[c]
     n = ti.select(f[0] > 0.0, 1.0 / f[0], 0.0)
     t = ti.select(f[1] > 0.0, 1.0 / f[1], 0.0)
     return n * backward[0] * forward[0] + t * (backward[1] * forward[1] + backward[2] * forward[2])
 
 
 @ti.func
-def _set_weight(p: ti.template(), total):
+def _set_weight(problem: ti.template(), total):
     """Set the weight to (t - 1)/t' times the strategy's fraction, or 0 to restart. total: sum of `_restart_test`."""
-    t = p.state[MOMENTUM]
-    p.state[MOMENTUM], p.state[WEIGHT] = 1.0, 0.0
+    t = problem.state[MOMENTUM]
+    problem.state[MOMENTUM], problem.state[WEIGHT] = 1.0, 0.0
     if not total > 0.0:
-        p.state[MOMENTUM] = 0.5 * (1.0 + ti.sqrt(1.0 + 4.0 * t * t))
-        p.state[WEIGHT] = p.state[STEP] * (t - 1.0) / p.state[MOMENTUM]
+        problem.state[MOMENTUM] = 0.5 * (1.0 + ti.sqrt(1.0 + 4.0 * t * t))
+        problem.state[WEIGHT] = problem.state[STEP] * (t - 1.0) / problem.state[MOMENTUM]
 
 
 # --- r-factor strategy ------------------------------------------------------------------------------------------------
 
 
 @ti.func
-def _begin(p: ti.template()):
+def _begin(problem: ti.template()):
     """Initialise a solve; state[RESIDUAL] is that of the initial impulses, the first best ones.
 
     If it is 1 or more, they are no better than zero impulses and are not saved. (A first sweep from zero yields small impulses,
     whose residual can be far above 1, since it is relative to them.)
     """
-    p.state[BEST], p.state[STEP], p.state[SWEEPS] = p.state[RESIDUAL], 1.0, 0.0
-    if not p.state[RESIDUAL] < 1.0:
-        p.state[BEST] = ti.cast(ti.math.inf, ti.f64)
-    p.state[AGE], p.state[MOMENTUM], p.state[VERDICT] = 0.0, 1.0, SAVE
-    _record(p)
+    problem.state[BEST], problem.state[STEP], problem.state[SWEEPS] = problem.state[RESIDUAL], 1.0, 0.0
+    if not problem.state[RESIDUAL] < 1.0:
+        problem.state[BEST] = ti.cast(ti.math.inf, ti.f64)
+    problem.state[AGE], problem.state[MOMENTUM], problem.state[VERDICT] = 0.0, 1.0, SAVE
+    _record(problem)
 
 
 @ti.func
-def _record(p: ti.template()):
+def _record(problem: ti.template()):
     """Append state[RESIDUAL] to the history of this launch."""
-    k = ti.cast(p.state[CHECKS], ti.i32)
+    k = ti.cast(problem.state[CHECKS], ti.i32)
     if k < HISTORY:
-        p.history[k] = p.state[RESIDUAL]
-    p.state[CHECKS] += 1.0
+        problem.history[k] = problem.state[RESIDUAL]
+    problem.state[CHECKS] += 1.0
 
 
 @ti.func
-def _accept_or_reject(p: ti.template(), sweeps):
+def _accept_or_reject(problem: ti.template(), sweeps):
     """Set state[VERDICT] from state[RESIDUAL] after the given number of sweeps."""
-    residual, best = p.state[RESIDUAL], p.state[BEST]
-    _record(p)
-    p.state[SWEEPS] += sweeps
-    p.state[AGE] += sweeps
-    p.state[VERDICT] = CONTINUE
+    residual, best = problem.state[RESIDUAL], problem.state[BEST]
+    _record(problem)
+    problem.state[SWEEPS] += sweeps
+    problem.state[AGE] += sweeps
+    problem.state[VERDICT] = CONTINUE
     if residual < best:
-        p.state[VERDICT] = SAVE
-        p.state[BEST], p.state[AGE] = residual, 0.0
-        p.state[STEP] = ti.min(1.0, RECOVER * p.state[STEP])
-    elif not (residual <= MAX_GROWTH * best and p.state[AGE] <= PATIENCE):  # also if the residual is not a number
-        p.state[VERDICT] = RESTORE
-        p.state[RESIDUAL], p.state[AGE], p.state[MOMENTUM] = best, 0.0, 1.0
-        p.state[STEP] = ti.max(MIN_FRACTION, SHRINK * p.state[STEP])
+        problem.state[VERDICT] = SAVE
+        problem.state[BEST], problem.state[AGE] = residual, 0.0
+        problem.state[STEP] = ti.min(1.0, RECOVER * problem.state[STEP])
+    elif not (residual <= MAX_GROWTH * best and problem.state[AGE] <= PATIENCE):  # also if the residual is not a number
+        problem.state[VERDICT] = RESTORE
+        problem.state[RESIDUAL], problem.state[AGE], problem.state[MOMENTUM] = best, 0.0, 1.0
+        problem.state[STEP] = ti.max(MIN_FRACTION, SHRINK * problem.state[STEP])
 
 
 @ti.func
-def _apply_verdict(p: ti.template(), c):
+def _apply_verdict(problem: ti.template(), c):
     """Save or restore the impulse of contact c by the verdict."""
-    if p.state[VERDICT] == SAVE:
-        p.best[c] = p.r[c]
-    elif p.state[VERDICT] == RESTORE:
-        p.r[c] = p.best[c]
-        p.previous[c] = p.best[c]
+    if problem.state[VERDICT] == SAVE:
+        problem.best[c] = problem.r[c]
+    elif problem.state[VERDICT] == RESTORE:
+        problem.r[c] = problem.best[c]
+        problem.previous[c] = problem.best[c]
