@@ -5,6 +5,7 @@ separately.
 """
 
 from dataclasses import asdict, dataclass, field
+from functools import partial
 
 import numpy as np
 import taichi as ti
@@ -13,6 +14,7 @@ import taisoft as ts
 from taisoft.backend.arrays import FieldArena
 from taisoft.backend.runtime import Runtime, compile_clock, kernel
 from taisoft.collision.bvh import Bvh
+from taisoft.collision.candidates import Buffer, Pairs, entries, fill, list_pairs, pair_entries
 from taisoft.collision.contacts import FOUND, KEPT, LEFT, UNKNOWN, is_same
 from taisoft.collision.detector import MERGED, Detection
 from taisoft.collision.path_check import NO_PASSAGES
@@ -31,6 +33,9 @@ DT = 1 / FPS
 ROUNDS, QUICK_ROUNDS = 15, 2
 FRAME_ROUNDS = 3
 TURNS = 3  # the rounds of compared broad phases are divided into this many turns
+
+
+NEAR = Pairs()  # a visitor of all near pairs
 
 
 @dataclass
@@ -184,13 +189,15 @@ class Rig:
             self.scene, runtime, self._arena, make_plan(self.scene, explicit=True, multistep=False).on
         )
         self.detection = Detection(self.scene, self.model, layout, runtime)
+        surface, makers = self.detection.surface, {"row": entries, "pairs": pair_entries}
+        self._lists = [Buffer(name, make, 2**12, None, surface.chunks, self._arena) for name, make in makers.items()]
         self.tets = sum(body.mesh.n_tets for body in self.scene.bodies)
 
     def __enter__(self) -> "Rig":
         return self
 
     def __exit__(self, *error) -> None:
-        for part in self._others:
+        for part in (*self._lists, *self._others):
             part.release()
         self.detection.release()
         self._arena.release()
@@ -217,10 +224,21 @@ class Rig:
         times.append(clock())
         return dict(zip(PHASES, np.diff(times).tolist()))
 
+    def list_pairs(self, broad=None) -> None:
+        """Run a broad phase, by default the detection's, and list the pairs of triangles that are near each other."""
+        d = self.detection
+        near, (row, out) = (broad or d.broad).near(), self._lists
+        fill(lambda: list_pairs(d.surface, near, row.parts, NEAR, out.parts), row, out)
+
+    def pairs(self, broad=None) -> np.ndarray:
+        """These pairs (k,2)."""
+        self.list_pairs(broad)
+        out = self._lists[1]
+        return out.data.to_numpy()[out.filled(out.used.to_numpy()), :2]
+
     def n_pairs(self, broad=None) -> int:
-        """Number of pairs of a broad phase, by default the detection's."""
-        rows = (broad or self.detection.broad).find()
-        return int((rows.end.to_numpy() - rows.start.to_numpy())[: self.detection.surface.n_triangles].sum()) // 2
+        """Number of these pairs."""
+        return len(self.pairs(broad))
 
     def broad_phase(self, name: str, ratio: float | None = None) -> SpatialHash | Bvh:
         """A broad phase of this surface: HASH with a ratio of cell to mean edge, or one of TREES."""
@@ -283,7 +301,7 @@ def measure_film(setup: Setup, geometry: str, runtime: Runtime, frames: int = FR
             numbers["quadratic"] = float(np.median(repeated(quadratic.reduce, FRAME_ROUNDS)))
             for name, other in others.items():
                 rig.n_pairs(other)
-                numbers[name] = float(np.median(repeated(other.find, FRAME_ROUNDS)))
+                numbers[name] = float(np.median(repeated(partial(rig.list_pairs, other), FRAME_ROUNDS)))
             if k >= 0:
                 counts = rig.detection.counts
                 film.add(active=counts.active, found=counts.found, kept=counts.contacts, **numbers)
@@ -307,6 +325,6 @@ def measure_broad(setup: Setup, runtime: Runtime, rounds: int, ratios=None, turn
             rig.n_pairs(broad)
         for _ in range(turns):  # a slow moment of the machine affects all
             for sweep, name, broad in jobs:
-                some = repeated(broad.find, max(rounds // turns, 1))
+                some = repeated(partial(rig.list_pairs, broad), max(rounds // turns, 1))
                 sweep.rounds.setdefault(name, []).extend(some)
     return sweeps

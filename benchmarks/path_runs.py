@@ -23,7 +23,7 @@ from .runner import patched, timed, without_warnings
 from .works.scenes import WORKS
 
 Made = tuple[ts.Scene, dict]  # a scene and settings of its simulator
-KERNELS = CHECK, LIST = "check_paths", "list_near_pairs"
+KERNELS = CHECK, LIST = "check_paths", "list_pairs"
 FIELDS = ("path_", "near_pairs", "passages")  # how the names of the check's fields start
 WINDOWS = 20  # at most so many windows are tried until one has no passages
 FRACTION = 0.45  # of the least distance: bound on the displacement of a vertex

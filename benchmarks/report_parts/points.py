@@ -40,12 +40,8 @@ TENFOLD, FLAT = 10.0, 0.1  # the report's speed-up; largest exponent that counts
 
 def candidate_pairs(rig: Rig) -> np.ndarray:
     """(k, 2) pairs of triangles of different bodies with overlapping boxes, each pair once."""
-    rows, n = rig.detection.broad.find(), rig.detection.surface.n_triangles
-    start, end, entry = (field.to_numpy() for field in (rows.start, rows.end, rows.entry))
-    own = np.repeat(np.arange(n), (end - start)[:n])
-    other = np.concatenate([entry[a:b] for a, b in zip(start[:n], end[:n])]) if len(own) else np.zeros(0, int)
-    body = rig.detection.topology.body
-    return np.column_stack([own, other])[(own < other) & (body[own] != body[other])]
+    pairs, body = rig.pairs(), rig.detection.topology.body
+    return pairs[body[pairs[:, 0]] != body[pairs[:, 1]]]
 
 
 def sample(grid: SdfGrid, X: np.ndarray) -> tuple[float, np.ndarray]:

@@ -53,8 +53,8 @@ def names_of_types(values: Iterator[Any], names: set[str], seen: set) -> set[str
     """Names used by those methods of records and functions of modules among the arguments that the kernel names."""
     found = set()
     for value in values:
-        holder = value if isinstance(value, types.ModuleType) else type(value)
-        for name, member in vars(holder).items():
+        owners = [value] if isinstance(value, types.ModuleType) else type(value).__mro__
+        for name, member in itertools.chain.from_iterable(vars(owner).items() for owner in owners):
             member = member.fget if isinstance(member, property) else member
             if name in names and isinstance(member, types.FunctionType):
                 found |= names_in(member, seen)

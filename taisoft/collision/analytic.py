@@ -18,13 +18,13 @@ import numpy as np
 import taichi as ti
 
 from taisoft.backend.arrays import Count, FieldArena, upload
+from taisoft.backend.lists import part_first
 from taisoft.backend.runtime import kernel
 from taisoft.collision.candidates import sum_parts
 from taisoft.collision.contacts import write_point_contact
 from taisoft.collision.deepest_point import MIN_EXTRA_DEPTH, deepest_point, is_surface_minimum
 from taisoft.collision.features import corner, in_normal_cone
 from taisoft.collision.surface import dvec, ivec
-from taisoft.fem.chunks import part_first
 from taisoft.scene.obstacles import Obstacle
 
 HALF_SPACE, SPHERE, BOX, CAPSULE = 0, 1, 2, 3
@@ -247,6 +247,4 @@ def find_analytic(s: ti.template(), o: ti.template(), margin: ti.f64, out: ti.te
                         if may_touch(s, o, t, k, margin):
                             at = _obstacle_contacts(s, o, t, k, margin, out.data, at, end)
             out.used[c] = at - c * out.part
-    ti.loop_config(serialize=True)
-    for _ in range(1):
-        sum_parts(out)
+    sum_parts(out)

@@ -21,15 +21,14 @@ import numpy as np
 import taichi as ti
 
 from taisoft.backend.arrays import Count, FieldArena
+from taisoft.backend.lists import sort_range
 from taisoft.backend.runtime import Runtime, kernel
-from taisoft.collision.candidates import WHOLE, Buffer, Candidates, entries, is_candidate, sort_row, sum_parts
+from taisoft.collision.candidates import WHOLE, Buffer, is_candidate
 from taisoft.collision.colliders import Topology
-from taisoft.collision.surface import ACTIVE, Surface, dvec, integers, list_near
-from taisoft.fem.chunks import part_first
+from taisoft.collision.surface import Surface, dvec, integers
 from taisoft.ranges import expand
 
 LEAVES = {"cpu": 64, "cuda": 8}  # triangles per chunk: the fastest of 4 to 256 on the CPU, small on CUDA for enough threads
-ROW_PER_TRIANGLE = 24  # row entries, initial capacity
 
 AXES = ((1, 0, 0), (0, 1, 0), (0, 0, 1))
 DIRECTIONS = {  # k -> normals of the slabs
@@ -147,7 +146,7 @@ class Trees:
                         at += 1
             node += step
         if at <= last:
-            sort_row(entry, begin, at)
+            sort_range(entry, begin, at)
         return at - begin
 
 
@@ -195,36 +194,6 @@ def refit_level(b: ti.template(), first: ti.i32, last: ti.i32):
         _refit_inner(b, b.top[k])
 
 
-@kernel
-def list_rows(s: ti.template(), b: ti.template(), start: ti.template(), end: ti.template(), out: ti.template(), padding: ti.f64):
-    """Write the row of each active triangle; each chunk of them fills its own part of the entries."""
-    ti.loop_config(serialize=s.serial)
-    for t in range(s.n_triangles):
-        start[t] = 0
-        end[t] = 0
-    ti.loop_config(serialize=s.serial)
-    for task in range(s.chunks * s.spread):
-        if task % s.spread == 0:
-            c = task // s.spread
-            at, last, own, n_near = c * out.part, (c + 1) * out.part, -1, 0
-            for j in range(part_first(c, s.count[ACTIVE], s.chunks), part_first(c + 1, s.count[ACTIVE], s.chunks)):
-                t = s.active[j]
-                if s.body[t] != own:
-                    own = s.body[t]
-                    n_near = list_near(s, c, own)
-                begin = at
-                lo, hi = b.bounds(s, t, WHOLE, padding)
-                for k in range(n_near):
-                    at += b.list_triangles(s, s.near[c * s.n_bodies + k], t, WHOLE, lo, hi, out.data, at, last)
-                if at <= last:
-                    start[t] = begin
-                    end[t] = at
-            out.used[c] = at - c * out.part
-    ti.loop_config(serialize=True)
-    for _ in range(1):
-        sum_parts(out)
-
-
 class Bvh:
     """Broad phase by trees. margin [m] must be that of the surface's boxes; it may be changed at any time."""
 
@@ -238,11 +207,9 @@ class Bvh:
         arena: FieldArena,
         k_dop: int = 6,
         leaves: int | None = None,
-        capacity: int | None = None,
-        max_capacity: int | None = None,
     ):
-        """x: (n_verts, 3) [m], the positions that the trees are built for. k_dop: 6, 14 or 18. leaves: most triangles per chunk.
-        capacity: initial row entries; max_capacity: their limit. None for the default."""
+        """x: (n_verts, 3) [m], the positions that the trees are built for. k_dop: 6, 14 or 18. leaves: most triangles per chunk,
+        None for the default."""
         self.surface, self.margin = surface, margin
         self.tables = t = build_trees(x[topology.triangle].mean(axis=1), topology.first, leaves or LEAVES[runtime.arch])
 
@@ -250,8 +217,6 @@ class Bvh:
         indices = {name: integers(arena, f"bvh_{name}", getattr(t, name)) for name in ("link", "root", "chunk", "top")}
         self.trees = Trees(k_dop // 2, DIRECTIONS[k_dop], len(t.chunk), **indices, **slabs)
         self.by_levels = runtime.arch != "cpu"  # else one thread refits the nodes above the chunks, in one launch
-        self._limits, self._arena = (capacity or ROW_PER_TRIANGLE * surface.n_triangles + 64, max_capacity), arena
-        self.rows: Buffer | None = None  # allocated at the first call of `find`
 
     def near(self) -> Trees:
         """Refit the trees to the present boxes and return them, for queries."""
@@ -261,24 +226,10 @@ class Bvh:
             refit_level(self.trees, int(begin), int(end))
         return self.trees
 
-    def find(self) -> Candidates:
-        """Return the rows of the present boxes. Raise SimulationError if a buffer would outgrow its limit."""
-        self.near()
-        s, arena = self.surface, self._arena
-        if self.rows is None:
-            self._start, self._end = (arena.field(f"bvh_row_{name}", ti.i32, max(s.n_triangles, 1)) for name in ("start", "end"))
-            self.rows = Buffer("bvh_rows", entries, *self._limits, s.chunks, arena)
-        while True:
-            list_rows(s, self.trees, self._start, self._end, self.rows.parts, 0.5 * self.margin)
-            if not self.rows.grow_if_full():
-                return Candidates(self._start, self._end, self.rows.data)
-
     @property
     def buffers(self) -> tuple[Buffer, ...]:
         """The growing buffers."""
-        return () if self.rows is None else (self.rows,)
+        return ()
 
     def release(self) -> None:
         """Free the memory of the buffers."""
-        for buffer in self.buffers:
-            buffer.release()

@@ -16,8 +16,10 @@ from typing import Any
 import numpy as np
 import taichi as ti
 
-from taisoft.backend.arrays import Count, FieldArena
-from taisoft.collision.surface import may_touch
+from taisoft.backend.arrays import Count, FieldArena, download
+from taisoft.backend.lists import part_first
+from taisoft.backend.runtime import kernel
+from taisoft.collision.surface import ACTIVE, Surface, ivec, list_near, may_touch
 from taisoft.errors import SimulationError
 
 SLACK = 1.5  # a full buffer grows to this times the required size
@@ -109,32 +111,24 @@ def entries(arena: FieldArena, capacity: int):
     return arena.field("entry", ti.i32, capacity)
 
 
-@ti.func
-def sum_parts(p: ti.template()):
-    """Set `count` of a buffer: the entries of the largest part, and of all parts."""
-    largest, total = 0, 0
-    for c in range(p.chunks):
-        largest = ti.max(largest, p.used[c])
-        total += p.used[c]
-    p.count[NEEDED] = largest
-    p.count[TOTAL] = total
+def fill(search: Callable[[], None], *buffers: Buffer) -> None:
+    """Run a search, again and again until all that it finds fits into its buffers."""
+    search()
+    while sum([buffer.grow_if_full() for buffer in buffers]):  # each of them
+        search()
 
 
 @ti.func
-def sort_row(entry: ti.template(), first, last):
-    """Sort entry[first:last] in place by Shell sort: rows are mostly short, but not always."""
-    step = 1
-    while step < (last - first) // 9:
-        step = 3 * step + 1
-    while step > 0:
-        for i in range(first + step, last):
-            value = entry[i]
-            j = i - step
-            while j >= first and entry[ti.max(j, first)] > value:
-                entry[j + step] = entry[j]
-                j -= step
-            entry[j + step] = value
-        step //= 3
+def sum_parts(parts: ti.template()):
+    """Set `count` of a buffer: the entries of the largest part, and of all parts. A top-level loop of a kernel."""
+    ti.loop_config(serialize=True)
+    for _ in range(1):
+        largest, total = 0, 0
+        for c in range(parts.chunks):
+            largest = ti.max(largest, parts.used[c])
+            total += parts.used[c]
+        parts.count[NEEDED] = largest
+        parts.count[TOTAL] = total
 
 
 @ti.func
@@ -184,3 +178,101 @@ class Candidates:
                             entry[at] = u
                         at += 1
         return at - begin
+
+
+@dataclass(frozen=True, eq=False)
+class Visitor:
+    """What `visit_near` asks of the active triangles, and what it does with the triangles that it finds.
+
+    Each of the queries from first_query to last_query - 1 (corners, EDGES or WHOLE) is asked of each triangle that `asks`
+    accepts, for each near collider that `meets` accepts: by default each pair of triangles once, by its first triangle.
+    visit(surface, t, q, entry, first, last, out, start, end) writes what query q of triangle t finds among entry[first:last], all
+    of one collider, to out[start:end]. It returns the new start, which may be more than fits.
+    """
+
+    first_query, last_query = WHOLE, WHOLE + 1
+
+    @ti.func
+    def asks(self, surface: ti.template(), t, q):
+        """Whether query q is asked of triangle t."""
+        return 1
+
+    @ti.func
+    def meets(self, surface: ti.template(), own, other):
+        """Whether triangles of collider `own` are tested against those of `other`."""
+        return int(other >= own)
+
+
+class Pairs(Visitor):
+    """The pairs t < u of near triangles that `accepts` accepts, as (t, u, 0): in ascending order within each part and over the
+    parts."""
+
+    @ti.func
+    def accepts(self, surface: ti.template(), t, u):
+        """Whether a pair is written."""
+        return 1
+
+    @ti.func
+    def visit(self, surface: ti.template(), t, q, entry: ti.template(), first, last, out: ti.template(), start, end):
+        """See Visitor."""
+        at = start
+        for e in range(first, last):
+            if entry[e] > t:
+                if self.accepts(surface, t, entry[e]) == 1:
+                    if at < end:
+                        out[at] = ivec(t, entry[e], 0)
+                    at += 1
+        return at
+
+
+@ti.func
+def visit_near(
+    surface: ti.template(), near: ti.template(), row: ti.template(), visitor: ti.template(), out: ti.template(), append
+):
+    """Visit the triangles near each active one. A top-level loop of a kernel; each chunk fills its own part of `out`.
+
+    near: trees or rows of a broad phase; row: buffer of the triangles near one query; append: 1 if what the same search has found
+    before is kept, else 0.
+    """
+    ti.loop_config(serialize=surface.serial)
+    for task in range(surface.chunks * surface.spread):
+        if task % surface.spread == 0:
+            c, n = task // surface.spread, surface.count[ACTIVE]
+            at, end, begin = c * out.part + append * out.used[c], (c + 1) * out.part, c * row.part
+            own, n_near, max_row, n_pairs = -1, 0, append * row.used[c], append * surface.part[c]
+            for j in range(part_first(c, n, surface.chunks), part_first(c + 1, n, surface.chunks)):
+                t = surface.active[j]
+                if surface.body[t] != own:
+                    own = surface.body[t]
+                    n_near = list_near(surface, c, own)
+                for q in range(visitor.first_query, visitor.last_query):
+                    if visitor.asks(surface, t, q) == 1:
+                        lo, hi = near.bounds(surface, t, q, surface.padding[0])
+                        for k in range(n_near):
+                            other = surface.near[c * surface.n_bodies + k]
+                            if visitor.meets(surface, own, other) == 1:
+                                found = near.list_triangles(surface, other, t, q, lo, hi, row.data, begin, begin + row.part)
+                                max_row, n_pairs = ti.max(max_row, found), n_pairs + found
+                                if 0 < found <= row.part:
+                                    at = visitor.visit(surface, t, q, row.data, begin, begin + found, out.data, at, end)
+            out.used[c], row.used[c], surface.part[c] = at - c * out.part, max_row, n_pairs
+
+
+@kernel(cse=False)
+def list_pairs(surface: ti.template(), near: ti.template(), row: ti.template(), visitor: ti.template(), out: ti.template()):
+    """Write the pairs of a visitor, see `visit_near`."""
+    visit_near(surface, near, row, visitor, out, 0)
+    sum_parts(out)
+    sum_parts(row)
+
+
+def pair_entries(arena: FieldArena, capacity: int):
+    """Allocate a field of entries for `list_pairs`."""
+    return arena.vectors("pair", ti.i32, capacity)
+
+
+def pairs_of(surface: Surface, near: Any, row: Buffer, visitor: Pairs, out: Buffer) -> np.ndarray:
+    """Return the pairs (k,2) of a visitor, ascending. Raise SimulationError if a buffer would outgrow its limit."""
+    fill(lambda: list_pairs(surface, near, row.parts, visitor, out.parts), row, out)
+    data, used = download([out.data, out.used])
+    return data[out.filled(used)][:, :2]

@@ -19,9 +19,19 @@ from typing import Any
 import numpy as np
 import taichi as ti
 
-from taisoft.backend.arrays import Count, FieldArena
+from taisoft.backend.arrays import FieldArena
+from taisoft.backend.lists import (
+    Lists,
+    add_up_counts,
+    bucket_of,
+    clear_counts,
+    count_entry,
+    make_lists,
+    place_of_entry,
+    sum_before,
+)
 from taisoft.backend.runtime import kernel
-from taisoft.collision.candidates import Parts
+from taisoft.collision.candidates import TOTAL, Parts
 from taisoft.collision.surface import cell_of, dvec, ivec
 from taisoft.display import short_repr
 from taisoft.scene.scene import Scene
@@ -174,75 +184,56 @@ def write_point_contact(s: ti.template(), out: ti.template(), at, last, t, j, w,
 class ReductionFields:
     """Workspace of the reduction. The first count[LEFT] entries of `kept` are the kept contacts' buffer indices, ascending."""
 
-    buckets: Count  # a power of two; the number in use grows with the number of contacts
     serial: bool
     spread: int  # as of the surface
     place: Any  # (capacity) i32: buffer index of the i-th contact found
     bucket: Any  # (capacity) i32: bucket of the i-th contact
-    bucket_start: Any  # (buckets) i32: range of its entries in `member`
-    bucket_end: Any
+    lists: Lists  # of the buckets, in `member`
     member: Any  # (capacity) i32: buffer indices, by bucket
     state: Any  # (capacity) i32: state of the contact at each buffer index
     kept: Any  # (capacity) i32
     count: Any  # (4) i32
-    first: Any  # (chunks) i32: number of the first contact of each part
 
 
-def reduction_fields(arena: FieldArena, capacity: int, chunks: int, serial: bool, spread: int = 1) -> ReductionFields:
-    """Allocate the workspace for `capacity` contacts in `chunks` parts."""
-    buckets = 1 << max(capacity - 1, 63).bit_length()
-    sizes = dict.fromkeys(("place", "bucket", "member", "state", "kept"), capacity) | {"count": 4, "first": chunks}
-    sizes |= {"bucket_start": buckets, "bucket_end": buckets}
+def reduction_fields(arena: FieldArena, capacity: int, serial: bool, spread: int = 1) -> ReductionFields:
+    """Allocate the workspace for `capacity` contacts."""
+    buckets = 1 << max(capacity - 1, 63).bit_length()  # the number in use grows with the number of contacts
+    sizes = dict.fromkeys(("place", "bucket", "member", "state", "kept"), capacity) | {"count": 4}
     fields = {name: arena.field(f"reduction_{name}", ti.i32, size) for name, size in sizes.items()}
-    return ReductionFields(buckets, serial, spread, **fields)
+    return ReductionFields(serial, spread, lists=make_lists(arena, "reduction", buckets, serial), **fields)
 
 
 @ti.func
-def _bucket(r: ti.template(), cell):
-    x, y, z = ti.cast(cell[0], ti.i64), ti.cast(cell[1], ti.i64), ti.cast(cell[2], ti.i64)
-    h = (x * 73856093) ^ (y * 19349663) ^ (z * 83492791)  # Teschner et al. 2003
-    return ti.cast((h ^ (h >> 15)) & r.count[MASK], ti.i32)
+def _bucket(work: ti.template(), cell):
+    return bucket_of(cell[0], cell[1], cell[2], work.count[MASK])
 
 
 @ti.func
-def _fill_cells(r: ti.template(), out: ti.template(), inverse, lowest_gap):
+def _fill_cells(work: ti.template(), out: ti.template(), inverse, lowest_gap):
     """Number the contacts over all parts, drop those between surfaces whose gap is lower, and enter the others into the cells."""
     ti.loop_config(serialize=True)
     for _ in range(1):
-        total = 0
-        for k in range(out.chunks):
-            r.first[k] = total
-            total += out.used[k]
-        r.count[FOUND] = total
         mask = 63
-        while mask + 1 < total:
+        while mask + 1 < out.count[TOTAL]:
             mask = 2 * mask + 1
-        r.count[MASK] = mask
-    ti.loop_config(serialize=r.serial)
-    for b in range(r.count[MASK] + 1):
-        r.bucket_end[b] = 0
-    ti.loop_config(serialize=r.serial)
-    for task in range(out.chunks * r.spread):
-        if task % r.spread == 0:
-            c = task // r.spread
+        work.count[FOUND], work.count[MASK] = out.count[TOTAL], mask
+    clear_counts(work.lists, work.count[MASK] + 1)
+    ti.loop_config(serialize=work.serial)
+    for task in range(out.chunks * work.spread):
+        if task % work.spread == 0:
+            c = task // work.spread
+            first = sum_before(out.used, c)
             for k in range(out.used[c]):
-                i, at = r.first[c] + k, c * out.part + k
-                r.place[i] = at
+                i, at = first + k, c * out.part + k
+                work.place[i] = at
                 by_surfaces = out.data.feature[at][0] == VERTEX_FACE or out.data.feature[at][0] == EDGE_EDGE
-                r.state[at] = ti.select(by_surfaces and out.data.gap[at] < lowest_gap, DROPPED, UNKNOWN)
-                b = _bucket(r, cell_of(out.data.point[at], inverse, PERIOD))
-                r.bucket[i] = b
-                ti.atomic_add(r.bucket_end[b], 1)
-    ti.loop_config(serialize=True)
-    for _ in range(1):
-        total = 0
-        for b in range(r.count[MASK] + 1):
-            r.bucket_start[b] = total
-            total += r.bucket_end[b]
-            r.bucket_end[b] = r.bucket_start[b]
-    ti.loop_config(serialize=r.serial)
-    for i in range(r.count[FOUND]):
-        r.member[ti.atomic_add(r.bucket_end[r.bucket[i]], 1)] = r.place[i]
+                work.state[at] = ti.select(by_surfaces and out.data.gap[at] < lowest_gap, DROPPED, UNKNOWN)
+                work.bucket[i] = _bucket(work, cell_of(out.data.point[at], inverse, PERIOD))
+                count_entry(work.lists, work.bucket[i])
+    add_up_counts(work.lists, work.count[MASK] + 1)
+    ti.loop_config(serialize=work.serial)
+    for i in range(work.count[FOUND]):
+        work.member[place_of_entry(work.lists, work.bucket[i])] = work.place[i]
 
 
 @ti.func
@@ -268,7 +259,7 @@ def is_earlier(out: ti.template(), a, b):
 
 
 @ti.func
-def _decide(r: ti.template(), out: ti.template(), at, inverse, tolerance):
+def _decide(work: ti.template(), out: ti.template(), at, inverse, tolerance):
     """State of the contact at a buffer index, from the states of the earlier ones near it."""
     p = out.point[at]
     lo, hi = cell_of(p - tolerance, inverse, PERIOD), cell_of(p + tolerance, inverse, PERIOD)
@@ -278,13 +269,13 @@ def _decide(r: ti.template(), out: ti.template(), at, inverse, tolerance):
     while state != DROPPED and k < n[0] * n[1] * n[2]:
         z, y, x = k % n[2], (k // n[2]) % n[1], k // (n[2] * n[1])
         cell = ivec(ti.select(x == 0, lo[0], hi[0]), ti.select(y == 0, lo[1], hi[1]), ti.select(z == 0, lo[2], hi[2]))
-        b = _bucket(r, cell)
-        for m in range(r.bucket_start[b], r.bucket_end[b]):
-            other = r.member[m]
+        b = _bucket(work, cell)
+        for m in range(work.lists.start[b], work.lists.start[b + 1]):
+            other = work.member[m]
             d = p - out.point[other]
             if d.dot(d) <= tolerance * tolerance:  # this test rejects most
                 if is_earlier(out, other, at) == 1:
-                    other_state = r.state[other]
+                    other_state = work.state[other]
                     if other_state != DROPPED and is_same(out, at, other, tolerance):
                         if other_state == KEPT:
                             state = DROPPED
@@ -295,55 +286,55 @@ def _decide(r: ti.template(), out: ti.template(), at, inverse, tolerance):
 
 
 @ti.func
-def _decide_all(r: ti.template(), out: ti.template(), inverse, tolerance):
+def _decide_all(work: ti.template(), out: ti.template(), inverse, tolerance):
     """Run one round: decide every contact that can be decided."""
-    r.count[UNDECIDED] = 0
-    ti.loop_config(serialize=r.serial)
-    for i in range(r.count[FOUND]):
-        at = r.place[i]
-        if r.state[at] == UNKNOWN:
-            state = _decide(r, out, at, inverse, tolerance)
+    work.count[UNDECIDED] = 0
+    ti.loop_config(serialize=work.serial)
+    for i in range(work.count[FOUND]):
+        at = work.place[i]
+        if work.state[at] == UNKNOWN:
+            state = _decide(work, out, at, inverse, tolerance)
             if state == UNKNOWN:
-                ti.atomic_add(r.count[UNDECIDED], 1)
+                ti.atomic_add(work.count[UNDECIDED], 1)
             else:
-                r.state[at] = state
+                work.state[at] = state
 
 
 @ti.func
-def _list_kept(r: ti.template()):
+def _list_kept(work: ti.template()):
     """List the kept contacts in order, once all are decided."""
     ti.loop_config(serialize=True)
     for _ in range(1):
         n = 0
-        if r.count[UNDECIDED] == 0:
-            for i in range(r.count[FOUND]):
-                if r.state[r.place[i]] == KEPT:
-                    r.kept[n] = r.place[i]
+        if work.count[UNDECIDED] == 0:
+            for i in range(work.count[FOUND]):
+                if work.state[work.place[i]] == KEPT:
+                    work.kept[n] = work.place[i]
                     n += 1
-        r.count[LEFT] = n
+        work.count[LEFT] = n
 
 
 @kernel
-def begin_reduction(r: ti.template(), out: ti.template(), inverse: ti.f64, tolerance: ti.f64, lowest_gap: ti.f64):
+def begin_reduction(work: ti.template(), out: ti.template(), inverse: ti.f64, tolerance: ti.f64, lowest_gap: ti.f64):
     """Enter the contacts into the cells and run the first round; more are needed only while contacts are undecided."""
-    _fill_cells(r, out, inverse, lowest_gap)
-    _decide_all(r, out.data, inverse, tolerance)
-    _list_kept(r)
+    _fill_cells(work, out, inverse, lowest_gap)
+    _decide_all(work, out.data, inverse, tolerance)
+    _list_kept(work)
 
 
 @kernel
-def decide(r: ti.template(), out: ti.template(), inverse: ti.f64, tolerance: ti.f64):
+def decide(work: ti.template(), out: ti.template(), inverse: ti.f64, tolerance: ti.f64):
     """Run a further round."""
-    _decide_all(r, out.data, inverse, tolerance)
-    _list_kept(r)
+    _decide_all(work, out.data, inverse, tolerance)
+    _list_kept(work)
 
 
-def reduce_contacts(r: ReductionFields, out: Parts, tolerance: float, cell: float, lowest_gap: float = -np.inf) -> None:
-    """Fill r.kept and r.count for a buffer of contacts.
+def reduce_contacts(work: ReductionFields, out: Parts, tolerance: float, cell: float, lowest_gap: float = -np.inf) -> None:
+    """Fill work.kept and work.count for a buffer of contacts.
 
     tolerance [m]; cell: edge of the cells [m], at least 2.5 tolerances; lowest_gap [m]: of surfaces that do not cross.
     """
     inverse = 1.0 / max(cell, 2.5 * tolerance)
-    begin_reduction(r, out, inverse, tolerance, lowest_gap)
-    while r.count[UNDECIDED] > 0:
-        decide(r, out, inverse, tolerance)
+    begin_reduction(work, out, inverse, tolerance, lowest_gap)
+    while work.count[UNDECIDED] > 0:
+        decide(work, out, inverse, tolerance)

@@ -13,13 +13,13 @@ from taisoft.backend.arrays import FieldArena, download
 from taisoft.backend.runtime import Runtime
 from taisoft.collision.analytic import NO_SHAPES, AnalyticFrames, build_analytic, find_analytic
 from taisoft.collision.bvh import Bvh, Trees
-from taisoft.collision.candidates import Buffer, Candidates, entries
+from taisoft.collision.candidates import Buffer, Candidates, Parts, entries, fill, pair_entries, pairs_of
 from taisoft.collision.colliders import body_grid, collider_surfaces, collider_thickness, prescribed_vertices
 from taisoft.collision.contacts import FOUND, LEFT, Contacts, contact_fields, named_contacts, reduce_contacts, reduction_fields
 from taisoft.collision.distance_field import DistanceFields, build_fields, find_in_fields
-from taisoft.collision.edge_edge import find_proximity
+from taisoft.collision.edge_edge import PROXIMITY, find_proximity
 from taisoft.collision.features import BY_EDGES, BY_FACES, BY_FIELD
-from taisoft.collision.intersections import Intersections, find_crossings
+from taisoft.collision.intersections import CROSSINGS_OF, INTERSECTING, find_crossings
 from taisoft.collision.near_list import STILL
 from taisoft.collision.overlap import Containment, Inside
 from taisoft.collision.passages import ROUND, append_passages
@@ -92,11 +92,11 @@ class Detection:
         modes += [BY_FACES if isinstance(o.shape, MeshObstacle) else BY_EDGES for o in obstacles]
         properties = {"soft": soft, "self_on": soft & self_collision, "mode": np.array(modes)}
         properties |= {"thickness": self.thickness, "edge": self.edges, "attached": attached_pairs(scene)}
+        properties |= {"padding": 0.5 * self.reach, "margin": self.margin}
         self.surface = s = build_surface(self.topology, self._rest, properties, runtime, arena, serial)
         self.broad = self._make_broad(runtime) if self.has_pairs else None
-        self._unmapped = arena.field("unmapped", ti.i32, 1)
-        self._crossing_parts = arena.vectors("crossed", ti.f64, s.chunks)
-        self._crossing = arena.field("crossing", ti.f64, 3)
+        crossed = arena.vectors("crossed", ti.f64, s.chunks), arena.field("crossed_used", ti.i32, s.chunks)
+        self._crossed = Parts(*crossed, None, 1, s.chunks)
         self._fields: DistanceFields | None = None
         if any(grids):
             starts = self.topology.first, layout.node_start
@@ -110,7 +110,7 @@ class Detection:
         self.buffer = Buffer("contacts", contact_fields, capacity, settings.max_capacity, s.chunks, arena)
         self._reduction_arena = FieldArena()
         self._reduction = None
-        self._intersections: Intersections | None = None
+        self._intersecting: Buffer | None = None  # pairs of triangles, allocated at first use
         self._self_on, self.floor = properties["self_on"], FLOOR * float(self.edges[: len(bodies)].min())
         self.paths: PathCheck | None = None  # see `prepare_paths`
         self._containment = Containment(scene, self.topology, layout, self._rest, self._analytic, self_collision)
@@ -139,7 +139,7 @@ class Detection:
             few_colliders = len(self.scene.colliders) <= MANY_COLLIDERS
             kind = "bvh" if runtime.arch == "cpu" and few_colliders else "spatial_hash"
         if kind == "bvh":
-            return Bvh(s, topology, x, self.reach, runtime, self._arena, settings.k_dop, None, *limits)
+            return Bvh(s, topology, x, self.reach, runtime, self._arena, settings.k_dop)
         extent = np.ptp(x[topology.triangle].reshape(-1, 3), axis=0)
         return SpatialHash(s, self._arena, settings.cell_ratio * self.edge, extent, *limits)
 
@@ -215,22 +215,18 @@ class Detection:
 
     def _search(self, near: Trees | Candidates | None, held: HeldPassages) -> None:
         """Fill the buffer of contacts, growing buffers as needed."""
-        while True:
-            self._fill_buffer(near, held)
-            grown = near is not None and self._near_buffer.grow_if_full()
-            if not self.buffer.grow_if_full() and not grown:
-                break
+        fill(lambda: self._fill_buffer(near, held), *((self._near_buffer,) if self.has_pairs else ()), self.buffer)
 
     def _fill_buffer(self, near: Trees | Candidates | None, held: HeldPassages) -> None:
         """Write the contacts before reduction, as many as fit."""
-        s, out, append, padding = self.surface, self.buffer.parts, 0, 0.5 * self.reach
+        s, out, append = self.surface, self.buffer.parts, 0
         if near is not None:
             row = self._near_buffer.parts
             if self._proximity:
-                find_proximity(s, near, row, self.margin, padding, out)
+                find_proximity(s, near, row, PROXIMITY, out)
                 append = 1
             if self._fields is not None:
-                find_in_fields(s, near, self._fields, row, self.margin, padding, out, append, self._unmapped)
+                find_in_fields(s, near, row, self._fields, out, append)
                 append = 1
         if self.shapes.count:
             find_analytic(s, self.shapes, self.margin, out, append)
@@ -243,7 +239,7 @@ class Detection:
         b = self.buffer
         if self._reduction is None or self._reduction.place.shape[0] != b.capacity:
             arena = FieldArena()
-            self._reduction = reduction_fields(arena, b.capacity, b.chunks, self.surface.serial_cheap, self.surface.cheap_spread)
+            self._reduction = reduction_fields(arena, b.capacity, self.surface.serial_cheap, self.surface.cheap_spread)
             self._reduction_arena.release()
             self._reduction_arena = arena
         lowest_gap = -self.floor if none_cross else -np.inf  # if none cross, a vertex behind a face is not inside
@@ -252,7 +248,7 @@ class Detection:
         if self.has_pairs:
             count.active, count.pairs = surface[ACTIVE], surface[PAIRS]
         if self._fields is not None:
-            count.unmapped = self._unmapped[0]
+            count.unmapped = self._fields.unmapped[0]
         count.found, count.contacts = self._reduction.count[FOUND], self._reduction.count[LEFT]
         count.growths = {b.name: b.growths for b in self._buffers()}
 
@@ -284,22 +280,21 @@ class Detection:
 
     def intersections(self) -> np.ndarray:
         """Return the pairs (k,2) of triangles without a common vertex that intersect, at the positions of the last search."""
-        if not self.has_pairs:
+        if self._broad_result is None:
             return np.zeros((0, 2), dtype=np.int64)
-        if self._intersections is None:
-            limits = (self.scene.collision.initial_capacity, self.scene.collision.max_capacity)
-            self._intersections = Intersections(self.surface, self._arena, *limits)
-        return self._intersections.find(self.broad.find())
+        s, settings = self.surface, self.scene.collision
+        if self._intersecting is None:
+            capacity = settings.initial_capacity or s.n_triangles + 64
+            self._intersecting = Buffer("intersections", pair_entries, capacity, settings.max_capacity, s.chunks, self._arena)
+        return pairs_of(s, self._broad_result, self._near_buffer, INTERSECTING, self._intersecting)
 
     def crossings(self) -> np.ndarray:
         """Return (3,) f64: how deeply surfaces cross at the positions of the last search, see `find_crossings`."""
-        depths, buffer = self._crossing, self._near_buffer
-        depths.fill(0.0)
-        while self._broad_result is not None and self.counts.active:
-            find_crossings(self.surface, self._broad_result, buffer.parts, 0.5 * self.reach, self._crossing_parts, depths)
-            if not buffer.grow_if_full():
-                break
-        return depths.to_numpy()
+        near, row, crossed = self._broad_result, self._near_buffer, self._crossed
+        if near is None or not self.counts.active:
+            return np.zeros(3)
+        fill(lambda: find_crossings(self.surface, near, row.parts, CROSSINGS_OF, crossed), row)
+        return crossed.data.to_numpy(1)[0]
 
     def prepare_paths(self) -> None:
         """Allocate what the check of paths needs."""
@@ -347,7 +342,7 @@ class Detection:
 
     def release(self) -> None:
         """Free all memory."""
-        for part in (self.broad, self._intersections, self._near_buffer, self.paths):
+        for part in (self.broad, self._intersecting, self._near_buffer, self.paths):
             if part is not None:
                 part.release()
         self.buffer.release()

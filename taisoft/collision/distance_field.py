@@ -15,12 +15,11 @@ import taichi as ti
 
 from taisoft.backend.arrays import FieldArena
 from taisoft.backend.runtime import Runtime, kernel
-from taisoft.collision.candidates import WHOLE, sum_parts
+from taisoft.collision.candidates import Visitor, sum_parts, visit_near
 from taisoft.collision.contacts import write_point_contact
 from taisoft.collision.deepest_point import MIN_EXTRA_DEPTH, deepest_point, is_surface_minimum
 from taisoft.collision.features import choose, closest_on_triangle, corner, in_normal_cone, moved, unit, vertices_of
-from taisoft.collision.surface import ACTIVE, dvec, ivec, list_near, sum_pairs
-from taisoft.fem.chunks import part_first
+from taisoft.collision.surface import dvec, ivec, sum_pairs
 from taisoft.mesh.sdf import SdfGrid
 from taisoft.scene.body import Body
 
@@ -28,7 +27,7 @@ MIN_DET_F = 1e-3  # det F below which a tet is not used for the mapping
 
 
 @dataclass(frozen=True, eq=False)
-class DistanceFields:
+class DistanceFields(Visitor):
     """Signed distance grids of the bodies, and the tets behind all surface triangles."""
 
     of_body: Any  # (n_bodies) i32: field of each collider, -1 for none
@@ -41,6 +40,19 @@ class DistanceFields:
     behind: Any  # (n_triangles) 4-vectors i32: nodes of the tet behind each triangle
     corner: Any  # (n_triangles) 3-vectors f64: its first node at rest [m]
     inverse: Any  # (n_triangles, 3) 3-vectors f64 by rows: inverse of its rest edges [1/m]
+    unmapped: Any  # (1) i32: pairs of a triangle and a body of the last search that no tet maps
+
+    @ti.func
+    def meets(self, surface: ti.template(), own, other):
+        """See Visitor."""
+        return int(self.of_body[other] >= 0) & int(other != own)
+
+    @ti.func
+    def visit(self, surface: ti.template(), t, q, entry: ti.template(), first, last, out: ti.template(), start, end):
+        """See Visitor."""
+        at, failed = _field_contacts(surface, self, entry, first, last, t, surface.margin[0], out, start, end)
+        ti.atomic_add(self.unmapped[0], failed)
+        return at
 
     @ti.func
     def sample(self, k, p):
@@ -112,6 +124,7 @@ def build_fields(
         arena.vectors("field_behind", ti.i32, n, behind, n=4),
         arena.vectors("field_corner", ti.f64, n, tet_corner),
         arena.vectors("field_inverse", ti.f64, 3 * n, inverse.reshape(-1, 3)),
+        arena.field("unmapped", ti.i32, 1),
     )
 
 
@@ -209,43 +222,11 @@ def _field_contacts(
 
 @kernel(cse=False)
 def find_in_fields(
-    s: ti.template(),
-    near: ti.template(),
-    f: ti.template(),
-    row: ti.template(),
-    margin: ti.f64,
-    padding: ti.f64,
-    out: ti.template(),
-    append: ti.i32,
-    unmapped: ti.template(),
+    surface: ti.template(), near: ti.template(), row: ti.template(), fields: ti.template(), out: ti.template(), append: ti.i32
 ):
-    """Write contacts with distance fields; unmapped[0] counts the (triangle, body) pairs that no tet maps. Arguments as in
-    `find_proximity`; contacts are appended to its own if `append` is 1."""
-    unmapped[0] = 0
-    ti.loop_config(serialize=s.serial)
-    for task in range(s.chunks * s.spread):
-        if task % s.spread == 0:
-            c = task // s.spread
-            at, end, begin = c * out.part + append * out.used[c], (c + 1) * out.part, c * row.part
-            own, n_near, max_row, pairs, n_unmapped = -1, 0, append * row.used[c], 0, 0
-            for i in range(part_first(c, s.count[ACTIVE], s.chunks), part_first(c + 1, s.count[ACTIVE], s.chunks)):
-                t = s.active[i]
-                if s.body[t] != own:
-                    own = s.body[t]
-                    n_near = list_near(s, c, own)
-                lo, hi = near.bounds(s, t, WHOLE, padding)
-                for k in range(n_near):
-                    other = s.near[c * s.n_bodies + k]
-                    if f.of_body[other] >= 0 and other != own:
-                        n = near.list_triangles(s, other, t, WHOLE, lo, hi, row.data, begin, begin + row.part)
-                        max_row, pairs = ti.max(max_row, n), pairs + n
-                        if 0 < n <= row.part:
-                            at, failed = _field_contacts(s, f, row.data, begin, begin + n, t, margin, out.data, at, end)
-                            n_unmapped += failed
-            out.used[c], row.used[c], s.part[c] = at - c * out.part, max_row, pairs
-            ti.atomic_add(unmapped[0], n_unmapped)
-    ti.loop_config(serialize=True)
-    for _ in range(1):
-        sum_parts(out)
-        sum_parts(row)
-        sum_pairs(s, append)
+    """Write contacts with distance fields, and count in `fields.unmapped`. The others are as for `visit_near`."""
+    fields.unmapped[0] = 0
+    visit_near(surface, near, row, fields, out, append)
+    sum_parts(out)
+    sum_parts(row)
+    sum_pairs(surface)

@@ -8,10 +8,12 @@ their positions at the end of the step, with the face normals of its start. Weak
 be wrong.
 """
 
+from dataclasses import dataclass
+
 import taichi as ti
 
 from taisoft.backend.runtime import kernel
-from taisoft.collision.candidates import EDGES, sum_parts
+from taisoft.collision.candidates import EDGES, Visitor, sum_parts, visit_near
 from taisoft.collision.contacts import EDGE_EDGE, write_contact
 from taisoft.collision.features import (
     BY_FACES,
@@ -24,9 +26,8 @@ from taisoft.collision.features import (
     mark_sharp_edges,
     unit,
 )
-from taisoft.collision.surface import ACTIVE, INSIDE_BITS, dvec, ivec, list_near, sum_pairs
+from taisoft.collision.surface import INSIDE_BITS, dvec, ivec, sum_pairs
 from taisoft.collision.vertex_face import max_self_depth, vertex_contacts
-from taisoft.fem.chunks import part_first
 
 # Penetrating edges have shifted along each other and may cross beyond an end, by at most MAX_MISS depths and MAX_OVERHANG lengths
 # of the edge; the surfaces are elsewhere farther out
@@ -222,78 +223,74 @@ def can_cross(a, b):
     return ((a & (b >> 3)) | ((a >> 3) & b)) & 1
 
 
-@ti.func
-def _vertices(s: ti.template(), near: ti.template(), row: ti.template(), margin, padding, out: ti.template()):
-    """Write the contacts of vertices, the first in each part of the buffer."""
-    ti.loop_config(serialize=s.serial)
-    for task in range(s.chunks * s.spread):
-        if task % s.spread == 0:
-            c = task // s.spread
-            at, end, begin = c * out.part, (c + 1) * out.part, c * row.part
-            own, n_near, max_row, pairs = -1, 0, 0, 0
-            for j in range(part_first(c, s.count[ACTIVE], s.chunks), part_first(c + 1, s.count[ACTIVE], s.chunks)):
-                t = s.active[j]
-                if s.body[t] != own:
-                    own = s.body[t]
-                    n_near = list_near(s, c, own)
-                for q in range(3):
-                    if (s.owns[t] >> q) & 1:
-                        lo, hi = near.bounds(s, t, q, padding)
-                        for k in range(n_near):
-                            other = s.near[c * s.n_bodies + k]
-                            if s.mode[other] == BY_FACES or other == own:
-                                n = near.list_triangles(s, other, t, q, lo, hi, row.data, begin, begin + row.part)
-                                max_row, pairs = ti.max(max_row, n), pairs + n
-                                if 0 < n <= row.part:
-                                    i = s.triangle[t, q]
-                                    at = vertex_contacts(s, row.data, begin, begin + n, i, own, margin, out.data, at, end)
-            out.used[c], row.used[c], s.part[c] = at - c * out.part, max_row, pairs
+class Vertices(Visitor):
+    """Contacts of the vertices that a triangle owns."""
+
+    first_query, last_query = 0, 3
+
+    @ti.func
+    def asks(self, surface: ti.template(), t, q):
+        """See Visitor."""
+        return (surface.owns[t] >> q) & 1
+
+    @ti.func
+    def meets(self, surface: ti.template(), own, other):
+        """See Visitor."""
+        return int(surface.mode[other] == BY_FACES) | int(other == own)
+
+    @ti.func
+    def visit(self, surface: ti.template(), t, q, entry: ti.template(), first, last, out: ti.template(), start, end):
+        """See Visitor."""
+        i, own = surface.triangle[t, q], surface.body[t]
+        return vertex_contacts(surface, entry, first, last, i, own, surface.margin[0], out, start, end)
 
 
-@ti.func
-def _edges(s: ti.template(), near: ti.template(), row: ti.template(), margin, padding, out: ti.template()):
-    """Append the contacts of edges. They depend on the vertices found inside."""
-    ti.loop_config(serialize=s.serial)
-    for task in range(s.chunks * s.spread):
-        if task % s.spread == 0:
-            c = task // s.spread
-            at, end, begin = c * out.part + out.used[c], (c + 1) * out.part, c * row.part
-            own, n_near, max_row, pairs = -1, 0, row.used[c], s.part[c]
-            for j in range(part_first(c, s.count[ACTIVE], s.chunks), part_first(c + 1, s.count[ACTIVE], s.chunks)):
-                t = s.active[j]
-                if s.body[t] != own:
-                    own = s.body[t]
-                    n_near = list_near(s, c, own)
-                if s.sharp[t] & 7 != 0:
-                    lo, hi = near.bounds(s, t, EDGES, padding)
-                    for k in range(n_near):
-                        other = s.near[c * s.n_bodies + k]
-                        n = near.list_triangles(s, other, t, EDGES, lo, hi, row.data, begin, begin + row.part)
-                        max_row, pairs = ti.max(max_row, n), pairs + n
-                        if n <= row.part:
-                            for e in range(9 * n):
-                                u, k_t, k_u = row.data[begin + e // 9], e % 9 // 3, e % 3
-                                if can_cross(s.sharp[t] >> k_t, s.sharp[u] >> k_u) == 1:
-                                    t1, k1, t2, k2 = t, k_t, u, k_u
-                                    if u < t:
-                                        t1, k1, t2, k2 = u, k_u, t, k_t
-                                    at = edge_contact(s, t1, k1, t2, k2, margin, out.data, at, end)
-            out.used[c], row.used[c], s.part[c] = at - c * out.part, max_row, pairs
+class Edges(Visitor):
+    """Contacts of a triangle's sharp edges. They depend on the vertices found inside."""
+
+    first_query, last_query = EDGES, EDGES + 1
+
+    @ti.func
+    def asks(self, surface: ti.template(), t, q):
+        """See Visitor."""
+        return int(surface.sharp[t] & 7 != 0)
+
+    @ti.func
+    def meets(self, surface: ti.template(), own, other):
+        """See Visitor."""
+        return 1
+
+    @ti.func
+    def visit(self, surface: ti.template(), t, q, entry: ti.template(), first, last, out: ti.template(), start, end):
+        """See Visitor."""
+        at = start
+        for e in range(9 * (last - first)):
+            u, k_t, k_u = entry[first + e // 9], e % 9 // 3, e % 3
+            if can_cross(surface.sharp[t] >> k_t, surface.sharp[u] >> k_u) == 1:
+                t1, k1, t2, k2 = t, k_t, u, k_u
+                if u < t:
+                    t1, k1, t2, k2 = u, k_u, t, k_t
+                at = edge_contact(surface, t1, k1, t2, k2, surface.margin[0], out, at, end)
+        return at
+
+
+@dataclass(frozen=True, eq=False)
+class Proximity:
+    """Visitors of `find_proximity`."""
+
+    vertices: Vertices = Vertices()
+    edges: Edges = Edges()
+
+
+PROXIMITY = Proximity()
 
 
 @kernel(cse=False)
-def find_proximity(
-    s: ti.template(), near: ti.template(), row: ti.template(), margin: ti.f64, padding: ti.f64, out: ti.template()
-):
-    """Write all contacts by proximity, the first in the buffer `out`.
-
-    near: trees or rows of a broad phase; row: buffer of the triangles near one query; padding: half the reach [m].
-    """
-    mark_sharp_edges(s)
-    _vertices(s, near, row, margin, padding, out)
-    _edges(s, near, row, margin, padding, out)
-    ti.loop_config(serialize=True)
-    for _ in range(1):
-        sum_parts(out)
-        sum_parts(row)
-        sum_pairs(s, 0)
+def find_proximity(surface: ti.template(), near: ti.template(), row: ti.template(), visitors: ti.template(), out: ti.template()):
+    """Write all contacts by proximity, the first in the buffer `out`. visitors: PROXIMITY; the others as for `visit_near`."""
+    mark_sharp_edges(surface)
+    visit_near(surface, near, row, visitors.vertices, out, 0)
+    visit_near(surface, near, row, visitors.edges, out, 1)
+    sum_parts(out)
+    sum_parts(row)
+    sum_pairs(surface)

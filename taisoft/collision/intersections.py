@@ -11,15 +11,12 @@ and edges.
 Triangles that share a vertex always touch, so they are not tested. A fold is still found through their neighbours.
 """
 
-import numpy as np
 import taichi as ti
 
-from taisoft.backend.arrays import FieldArena, download
 from taisoft.backend.runtime import kernel
-from taisoft.collision.candidates import WHOLE, Buffer, Candidates, sum_parts
+from taisoft.collision.candidates import Pairs, Visitor, sum_parts, visit_near
 from taisoft.collision.features import closest_lines, closest_on_segment, closest_on_triangle, corner
-from taisoft.collision.surface import ACTIVE, Surface, dvec, list_near
-from taisoft.fem.chunks import part_first
+from taisoft.collision.surface import dvec
 
 COMMON_NORMAL = 1e-6  # sine below which two edges have no common normal
 CROSSED = 1e-3  # of the finer side's mean surface edge: depth below which crossings do not count; about the contact accuracy
@@ -60,48 +57,43 @@ def crossing_depth(s: ti.template(), t, u):
     return ti.max(depth, 0.0)
 
 
+class Crossings(Visitor):
+    """The deepest crossings in each chunk, and their number: in the first entry of its part."""
+
+    @ti.func
+    def visit(self, surface: ti.template(), t, q, entry: ti.template(), first, last, out: ti.template(), start, end):
+        """See Visitor."""
+        worst = 1.0 * out[start]
+        for e in range(first, last):
+            if entry[e] > t:
+                depth = crossing_depth(surface, t, entry[e])
+                relative = depth / ti.min(surface.edge[surface.body[t]], surface.edge[surface.body[entry[e]]])
+                worst = ti.max(worst, dvec(depth, relative, 0.0))
+                worst[CROSSINGS] += ti.cast(relative > CROSSED, ti.f64)
+        out[start] = worst
+        return start
+
+
+CROSSINGS_OF = Crossings()
+
+
 @kernel
-def find_crossings(
-    s: ti.template(), near: ti.template(), row: ti.template(), padding: ti.f64, part: ti.template(), depths: ti.template()
-):
-    """Write depths (3,): the deepest crossing [m]; the deepest relative to the finer side's mean surface edge; the number of
+def find_crossings(surface: ti.template(), near: ti.template(), row: ti.template(), visitor: ti.template(), out: ti.template()):
+    """Write out.data[0]: the deepest crossing [m]; the deepest relative to the finer side's mean surface edge; the number of
     triangle pairs that cross by more than CROSSED of that edge.
 
-    near, row, padding: as in the last search. part: (chunks) 3-vectors f64.
+    visitor: CROSSINGS_OF; out: parts of one 3-vector f64 each; near, row: as in the last search.
     """
-    ti.loop_config(serialize=s.serial)
-    for task in range(s.chunks * s.spread):
-        if task % s.spread == 0:
-            c = task // s.spread
-            begin, own, n_near, max_row, worst = c * row.part, -1, 0, 0, dvec(0.0)
-            for j in range(part_first(c, s.count[ACTIVE], s.chunks), part_first(c + 1, s.count[ACTIVE], s.chunks)):
-                t = s.active[j]
-                if s.body[t] != own:
-                    own = s.body[t]
-                    n_near = list_near(s, c, own)
-                lo, hi = near.bounds(s, t, WHOLE, padding)
-                for k in range(n_near):
-                    other = s.near[c * s.n_bodies + k]
-                    if other >= own:  # each pair is found once, by its first triangle
-                        n = near.list_triangles(s, other, t, WHOLE, lo, hi, row.data, begin, begin + row.part)
-                        max_row = ti.max(max_row, n)
-                        if n <= row.part:
-                            for e in range(begin, begin + n):
-                                if row.data[e] > t:
-                                    d = crossing_depth(s, t, row.data[e])
-                                    relative = d / ti.min(s.edge[own], s.edge[other])
-                                    worst = ti.max(worst, dvec(d, relative, 0.0))
-                                    worst[CROSSINGS] += ti.cast(relative > CROSSED, ti.f64)
-            part[c], row.used[c] = worst, max_row
     ti.loop_config(serialize=True)
-    for _ in range(1):
-        sum_parts(row)
-        for i in range(3):
-            depths[i] = 0.0
-        for c in range(s.chunks):
-            depths[CROSSING_DEPTH] = ti.max(depths[CROSSING_DEPTH], part[c][CROSSING_DEPTH])
-            depths[DEPTH_OVER_EDGE] = ti.max(depths[DEPTH_OVER_EDGE], part[c][DEPTH_OVER_EDGE])
-            depths[CROSSINGS] += part[c][CROSSINGS]
+    for c in range(out.chunks):
+        out.data[c] = dvec(0.0)
+    visit_near(surface, near, row, visitor, out, 0)
+    sum_parts(row)
+    ti.loop_config(serialize=True)
+    for c in range(1, out.chunks):
+        total = out.data[0][CROSSINGS] + out.data[c][CROSSINGS]
+        out.data[0] = ti.max(out.data[0], out.data[c])
+        out.data[0][CROSSINGS] = total
 
 
 @ti.func
@@ -219,54 +211,14 @@ def triangles_intersect(a0, a1, a2, b0, b1, b2):
     return result
 
 
-@kernel(cse=False)
-def find_intersections(s: ti.template(), rows: ti.template(), out: ti.template()):
-    """Find the pairs t < u of the rows that intersect, in ascending order within each part and over the parts."""
-    ti.loop_config(serialize=s.serial)
-    for task in range(s.chunks * s.spread):
-        if task % s.spread == 0:
-            c = task // s.spread
-            at, last = c * out.part, (c + 1) * out.part
-            for t in range(part_first(c, s.n_triangles, s.chunks), part_first(c + 1, s.n_triangles, s.chunks)):
-                for e in range(rows.start[t], rows.end[t]):
-                    u = rows.entry[e]
-                    if t < u:
-                        a0, a1, a2 = corner(s, t, 0), corner(s, t, 1), corner(s, t, 2)
-                        if triangles_intersect(a0, a1, a2, corner(s, u, 0), corner(s, u, 1), corner(s, u, 2)) == 1:
-                            if at < last:
-                                out.data[at] = ti.Vector([t, u], ti.i32)
-                            at += 1
-            out.used[c] = at - c * out.part
-    ti.loop_config(serialize=True)
-    for _ in range(1):
-        sum_parts(out)
+class Intersecting(Pairs):
+    """The pairs that intersect or touch."""
+
+    @ti.func
+    def accepts(self, surface: ti.template(), t, u):
+        """See Pairs."""
+        a, b, c = corner(surface, t, 0), corner(surface, t, 1), corner(surface, t, 2)
+        return triangles_intersect(a, b, c, corner(surface, u, 0), corner(surface, u, 1), corner(surface, u, 2))
 
 
-def pairs(arena: FieldArena, capacity: int):
-    """Allocate a field of pairs."""
-    return arena.vectors("pair", ti.i32, capacity, n=2)
-
-
-class Intersections:
-    """Find the intersecting triangles among candidates."""
-
-    def __init__(self, surface: Surface, arena: FieldArena, capacity: int | None = None, max_capacity: int | None = None):
-        """capacity, max_capacity: initial and maximum number of pairs; None for the default."""
-        self.surface = surface
-        self.pairs = Buffer("intersections", pairs, capacity or surface.n_triangles + 64, max_capacity, surface.chunks, arena)
-
-    def find(self, candidates: Candidates) -> np.ndarray:
-        """Return the (k,2) triangles t < u that intersect or touch at the present positions, in ascending order.
-
-        Raise SimulationError if the buffer would outgrow its limit.
-        """
-        while True:
-            find_intersections(self.surface, candidates, self.pairs.parts)
-            if not self.pairs.grow_if_full():
-                break
-        data, used = download([self.pairs.data, self.pairs.used])
-        return data[self.pairs.filled(used)]
-
-    def release(self) -> None:
-        """Free the memory of the buffer."""
-        self.pairs.release()
+INTERSECTING = Intersecting()

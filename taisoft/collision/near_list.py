@@ -16,11 +16,8 @@ from typing import Any
 
 import taichi as ti
 
-from taisoft.backend.arrays import Count, FieldArena
-from taisoft.backend.runtime import kernel
-from taisoft.collision.candidates import WHOLE, sum_parts
-from taisoft.collision.surface import ACTIVE, dvec, ivec, list_near, may_meet
-from taisoft.fem.chunks import part_first
+from taisoft.backend.arrays import Count
+from taisoft.collision.surface import ACTIVE, dvec, may_meet
 
 SEARCHED, TO_STATE, STILL = range(3)  # which paths are checked
 HINTS = 16  # planes stored per triangle
@@ -51,22 +48,25 @@ class PathFields:
 
 
 @ti.func
-def _set_paths(s: ti.template(), x: ti.template(), g: ti.template(), mode, limit):
-    """Set the paths, and whether they leave the searched ones by more than `limit` [m]."""
+def _set_paths(surface: ti.template(), x: ti.template(), paths: ti.template(), mode, limit, is_new):
+    """Set the paths, and whether they leave the searched ones by more than `limit` [m]; store these if the list is new."""
     for k in ti.static(range(2)):
-        g.left[k] = 0
-    ti.loop_config(serialize=s.serial_cheap)
-    for i in range(s.n_verts):
-        path = s.move[i]
+        paths.left[k] = 0
+    ti.loop_config(serialize=surface.serial_cheap)
+    for i in range(surface.n_verts):
+        path = surface.move[i]
         if mode == STILL:
             path = dvec(0.0)
-        elif mode == TO_STATE and s.node[i] >= 0:
-            path = x[s.node[i]] - s.x[i]
-            change = path - s.move[i]
+        elif mode == TO_STATE and surface.node[i] >= 0:
+            path = x[surface.node[i]] - surface.x[i]
+            change = path - surface.move[i]
             if not change.dot(change) <= limit * limit:  # cheaper, and mostly enough; also if it is not a number
-                if not _leaving(path, s.move[i]).norm() <= limit:
-                    g.left[UNCOVERED] = 1
-        g.path[i] = path
+                if not _leaving(path, surface.move[i]).norm() <= limit:
+                    paths.left[UNCOVERED] = 1
+        paths.path[i] = path
+        if ti.static(paths.has_pairs):
+            if is_new:
+                paths.listed_x[i], paths.listed_move[i] = surface.x[i], surface.move[i]
 
 
 @ti.func
@@ -135,16 +135,16 @@ def _compare_with_listed(s: ti.template(), g: ti.template(), limit):
 
 
 @ti.func
-def prepare_paths(s: ti.template(), x: ti.template(), g: ti.template(), mode, limit, listed_limit, floor):
+def prepare_paths(surface: ti.template(), x: ti.template(), paths: ti.template(), mode, limit, listed_limit, floor):
     """Set the paths of a mode, see `passages.check_paths`, what is computed once for each triangle and vertex, and `left`.
 
     limit [m]: of how far vertices may leave the searched paths; listed_limit [m]: of how far they may leave the listed ones along
-    an axis, beside others.
+    an axis, beside others, infinite if the list is new.
     """
-    _set_paths(s, x, g, mode, limit)
-    if ti.static(g.has_pairs):
-        _box_ends(s, g, floor)
-        _compare_with_listed(s, g, listed_limit)
+    _set_paths(surface, x, paths, mode, limit, listed_limit == ti.math.inf)
+    if ti.static(paths.has_pairs):
+        _box_ends(surface, paths, floor)
+        _compare_with_listed(surface, paths, listed_limit)
 
 
 @ti.func
@@ -193,48 +193,3 @@ def list_unseparated(s: ti.template(), g: ti.template(), near: ti.template(), c)
             near.data[begin + n][2] = e
             n += 1 - _is_beyond(s, g, ti.select(side == 0, t, u), ti.select(side == 0, u, t))
     return n
-
-
-@kernel
-def list_near_pairs(
-    s: ti.template(), g: ti.template(), near: ti.template(), row: ti.template(), padding: ti.f64, out: ti.template()
-):
-    """List the near pairs, and store the paths that were searched.
-
-    near, row, padding: as in the last search.
-    """
-    ti.loop_config(serialize=s.serial_cheap)
-    for i in range(s.n_verts):
-        g.listed_x[i], g.listed_move[i] = s.x[i], s.move[i]
-    ti.loop_config(serialize=s.serial)
-    for task in range(s.chunks * s.spread):
-        if task % s.spread == 0:
-            c = task // s.spread
-            at, last, begin, own, n_near, max_row = c * out.part, (c + 1) * out.part, c * row.part, -1, 0, 0
-            for j in range(part_first(c, s.count[ACTIVE], s.chunks), part_first(c + 1, s.count[ACTIVE], s.chunks)):
-                t = s.active[j]
-                if s.body[t] != own:
-                    own = s.body[t]
-                    n_near = list_near(s, c, own)
-                lo, hi = near.bounds(s, t, WHOLE, padding)
-                for k in range(n_near):
-                    other = s.near[c * s.n_bodies + k]
-                    if other >= own:  # each pair is found once, by its first triangle
-                        n = near.list_triangles(s, other, t, WHOLE, lo, hi, row.data, begin, begin + row.part)
-                        max_row = ti.max(max_row, n)
-                        if n <= row.part:
-                            for e in range(begin, begin + n):
-                                if row.data[e] > t:
-                                    if at < last:
-                                        out.data[at] = ivec(t, row.data[e], 0)
-                                    at += 1
-            out.used[c], row.used[c] = at - c * out.part, max_row
-    ti.loop_config(serialize=True)
-    for _ in range(1):
-        sum_parts(out)
-        sum_parts(row)
-
-
-def near_pairs(arena: FieldArena, capacity: int) -> Any:
-    """Allocate a field of pairs of triangles, and of a component that is free between checks."""
-    return arena.vectors("near_pair", ti.i32, capacity)

@@ -18,6 +18,7 @@ from typing import Any
 import taichi as ti
 
 from taisoft.backend.arrays import FieldArena
+from taisoft.backend.lists import part_first
 from taisoft.backend.runtime import kernel
 from taisoft.collision.analytic import CAPSULE, HALF_SPACE, SPHERE, rotation_rows
 from taisoft.collision.candidates import sum_parts
@@ -26,7 +27,6 @@ from taisoft.collision.features import unit
 from taisoft.collision.near_list import OUTDATED, STILL, UNCOVERED, clear_ends, hint_of, list_unseparated, prepare_paths
 from taisoft.collision.separation import across, are_inner, at_weights, free_until, nearest_of, separating_plane, unit_row
 from taisoft.collision.surface import dvec, ivec
-from taisoft.fem.chunks import part_first
 
 # kinds of passages, by two ids: two triangles; a row of `adjacent`; a triangle and a sphere or capsule; a vertex and a half-space
 NEAR, ADJACENT, ROUND, FLAT = range(4)
@@ -238,9 +238,7 @@ def check_paths(
             out.used[c] = at - c * out.part
     if ti.static(g.has_pairs):
         clear_ends(s, g)
-    ti.loop_config(serialize=True)
-    for _ in range(1):
-        sum_parts(out)
+    sum_parts(out)
 
 
 @kernel(cse=False)
@@ -303,9 +301,7 @@ def append_passages(
                 at += 1
             r += out.chunks
         out.used[c] = at - c * out.part
-    ti.loop_config(serialize=True)
-    for _ in range(1):
-        sum_parts(out)
+    sum_parts(out)
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,13 +8,14 @@ import taichi as ti
 from taisoft.backend.arrays import FieldArena, download
 from taisoft.collision.analytic import AnalyticObstacles
 from taisoft.collision.bvh import Trees
-from taisoft.collision.candidates import TOTAL, Buffer
+from taisoft.collision.candidates import TOTAL, Buffer, Pairs, fill, list_pairs, pair_entries
 from taisoft.collision.colliders import Topology
-from taisoft.collision.near_list import HINTS, OUTDATED, UNCOVERED, PathFields, list_near_pairs, near_pairs
+from taisoft.collision.near_list import HINTS, OUTDATED, UNCOVERED, PathFields
 from taisoft.collision.passages import ADJACENT, FLAT, N_KINDS, NEAR, ROUND, check_paths, passage_fields
 from taisoft.collision.surface import Surface, integers
 from taisoft.ranges import expand
 
+NEAR_PAIRS = Pairs()
 IN_BOXES = 0.49  # of the reach: how far a vertex may leave its searched path and still be in the boxes, grown by half of it
 
 
@@ -100,7 +101,7 @@ class PathCheck:
             n_adjacent=len(rows),
         )
         limits = capacity or (4 * n_listed + 64 if has_pairs else 1), max_capacity
-        self.near = Buffer("near_pairs", near_pairs, *limits, s.chunks, arena)
+        self.near = Buffer("near_pairs", pair_entries, *limits, s.chunks, arena)
         self.passages = Buffer("passages", passage_fields, 64 * s.chunks, max_capacity, s.chunks, arena)
         self._is_listed = False
 
@@ -150,11 +151,7 @@ class PathCheck:
 
     def _list(self, broad, row: Buffer) -> None:
         """List the near pairs of the last search."""
-        while True:
-            list_near_pairs(self.surface, self.fields, broad, row.parts, self.limit / IN_BOXES * 0.5, self.near.parts)
-            grown = row.grow_if_full()
-            if not self.near.grow_if_full() and not grown:
-                break
+        fill(lambda: list_pairs(self.surface, broad, row.parts, NEAR_PAIRS, self.near.parts), row, self.near)
         self._is_listed = True
 
     def _listed_limit(self, broad) -> float:

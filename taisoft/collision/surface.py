@@ -14,9 +14,9 @@ import taichi as ti
 
 from taisoft.backend import parallel
 from taisoft.backend.arrays import Count, FieldArena
+from taisoft.backend.lists import SPREAD, part_first, sum_before
 from taisoft.backend.runtime import Runtime, kernel
 from taisoft.collision.colliders import Topology
-from taisoft.fem.chunks import SPREAD, part_first
 
 SERIAL_BELOW = 1500  # triangles below which one thread is faster than starting the others (about 50 us a loop)
 # Of one thread per triangle: in the loops over nearby pairs, and in cheap loops (boxes, tree refit, sharp edges, reduction)
@@ -69,12 +69,15 @@ class Surface:
     body_lo: Any  # (n_bodies) 3-vectors f64: boxes of the colliders [m]
     body_hi: Any
     active: Any  # i32: triangles whose box meets another collider's, ascending; the first count[ACTIVE] are valid
+    active_of_chunk: Any  # i32: the same, those of each chunk from its first triangle on
     count: Any  # (4) i32: numbers of NONFINITE and ACTIVE triangles, and of (query, nearby triangle) PAIRS
     part: Any  # (chunks) i32: count of each chunk
     near: Any  # (chunks * n_bodies) i32: colliders near each chunk's current collider
     sharp: Any  # (n_triangles) i32: edge bits, see `mark_sharp_edges`
     inside: Any  # (n_verts) i32: bit k % INSIDE_BITS is set if the vertex is in collider k and has contacts that move it out
     exit_direction: Any  # (n_verts) 3-vectors f64: summed exit displacements of those contacts [m]
+    padding: Any  # (1) f64: half of the distance by which boxes are grown together, for queries [m]
+    margin: Any  # (1) f64: distance within which contacts are found [m]
 
     @property
     def has_attached(self) -> bool:
@@ -92,8 +95,8 @@ def build_surface(
 ) -> Surface:
     """Allocate and fill the fields.
 
-    rest: (v,3) [m]; properties: soft, self_on, mode, thickness and edge, (n_bodies,) each, and attached, (n_bodies, n_bodies)
-    bool, if any are. serial: None decides by size, and by what threads gain.
+    rest: (v,3) [m]; properties: soft, self_on, mode, thickness and edge, (n_bodies,) each; attached, (n_bodies, n_bodies)
+    bool, if any are; padding and margin [m]. serial: None decides by size, and by what threads gain.
     """
     t, bodies, attached = topology, len(properties["soft"]), properties.get("attached")
     n, v = len(t.triangle), len(t.node)
@@ -108,7 +111,7 @@ def build_surface(
     tables |= {name: properties[name] for name in ("soft", "self_on")} | {"first_of": t.first}
     vectors = dict.fromkeys(("x", "move"), v) | dict.fromkeys(("lo", "hi", "normal"), n)
     vectors |= dict.fromkeys(("body_lo", "body_hi"), bodies)
-    zeros = {"active": n, "count": 4, "part": chunks, "near": chunks * bodies, "sharp": n, "inside": v}
+    zeros = {"active": n, "active_of_chunk": n, "count": 4, "part": chunks, "near": chunks * bodies, "sharp": n, "inside": v}
     # triangles are rows, not vectors: the compiler confuses run-time and fixed component indices within one kernel
     fields = {name: integers(arena, f"surface_{name}", data) for name, data in tables.items()}
     fields |= {name: arena.vectors(f"surface_{name}", ti.f64, max(count, 1)) for name, count in vectors.items()}
@@ -128,6 +131,7 @@ def build_surface(
         mode=integers(arena, "contact_mode", properties["mode"]),
         attached=integers(arena, "attached", attached.reshape(-1)) if attached is not None and attached.any() else None,
         rest=arena.vectors("surface_rest", ti.f64, max(v, 1), rest if v else None),
+        **{name: arena.field(f"surface_{name}", ti.f64, 1, np.array([properties[name]])) for name in ("padding", "margin")},
         area=arena.field("surface_area", ti.f64, max(n, 1)),
         exit_direction=arena.vectors("surface_exit_direction", ti.f64, max(v, 1)),
         **fields,
@@ -222,32 +226,24 @@ def _box_triangles(s: ti.template(), margin):
 
 
 @ti.func
-def _box_bodies(s: ti.template()):
-    """Compute the boxes of the colliders."""
-    if ti.static(s.on_cpu):
-        _box_each_body(s)
-    else:
-        for b in range(s.n_bodies):
-            s.body_lo[b], s.body_hi[b] = dvec(ti.math.inf), dvec(-ti.math.inf)
-        for t in range(s.n_triangles):
-            b = s.body[t]
-            for a in ti.static(range(3)):
-                if s.lo[t][a] < s.body_lo[b][a]:  # few are, and atomics on one address wait for each other
-                    ti.atomic_min(s.body_lo[b][a], s.lo[t][a])
-                if s.hi[t][a] > s.body_hi[b][a]:
-                    ti.atomic_max(s.body_hi[b][a], s.hi[t][a])
-
-
-@ti.func
-def _box_each_body(s: ti.template()):
-    ti.loop_config(serialize=s.serial_cheap)
-    for task in range(s.n_bodies * s.cheap_spread):
-        if task % s.cheap_spread == 0:
-            b = task // s.cheap_spread
-            lo, hi = dvec(ti.math.inf), dvec(-ti.math.inf)
-            for t in range(s.first_of[b], s.first_of[b + 1]):
-                lo, hi = ti.min(lo, s.lo[t]), ti.max(hi, s.hi[t])
-            s.body_lo[b], s.body_hi[b] = lo, hi
+def _box_bodies(surface: ti.template()):
+    """Compute the boxes of the colliders, from those of each one's triangles in each chunk."""
+    ti.loop_config(serialize=surface.serial_cheap)
+    for b in range(surface.n_bodies):
+        surface.body_lo[b], surface.body_hi[b] = dvec(ti.math.inf), dvec(-ti.math.inf)
+    ti.loop_config(serialize=surface.serial_cheap)
+    for task in range(surface.chunks * surface.cheap_spread):
+        if task % surface.cheap_spread == 0:
+            c, lo, hi = task // surface.cheap_spread, dvec(ti.math.inf), dvec(-ti.math.inf)
+            last = part_first(c + 1, surface.n_triangles, surface.chunks) - 1
+            for t in range(part_first(c, surface.n_triangles, surface.chunks), last + 1):
+                b = surface.body[t]
+                lo, hi = ti.min(lo, surface.lo[t]), ti.max(hi, surface.hi[t])
+                if t == last or surface.body[ti.min(t + 1, last)] != b:
+                    for axis in ti.static(range(3)):
+                        ti.atomic_min(surface.body_lo[b][axis], lo[axis])
+                        ti.atomic_max(surface.body_hi[b][axis], hi[axis])
+                    lo, hi = dvec(ti.math.inf), dvec(-ti.math.inf)
 
 
 @ti.func
@@ -276,12 +272,11 @@ def list_near(s: ti.template(), c, own):
 
 
 @ti.func
-def sum_pairs(s: ti.template(), append):
-    """Sum the tested pairs of all parts; if `append` is 1, add them to the previous sum."""
-    total = append * s.count[PAIRS]
-    for c in range(s.chunks):
-        total += s.part[c]
-    s.count[PAIRS] = total
+def sum_pairs(surface: ti.template()):
+    """Sum the tested pairs of all parts. A top-level loop of a kernel."""
+    ti.loop_config(serialize=True)
+    for _ in range(1):
+        surface.count[PAIRS] = sum_before(surface.part, surface.chunks)
 
 
 @ti.func
@@ -302,54 +297,29 @@ def _can_have_partner(s: ti.template(), t, first, last):
 
 
 @ti.func
-def _list_active(s: ti.template()):
-    """List the triangles that can have a partner, in ascending order."""
-    if ti.static(s.on_cpu):
-        _list_and_compact(s)
-    else:
-        for c in range(s.chunks):
-            s.part[c] = _list_active_of(s, c, 0, 0)
-        for c in range(s.chunks):
-            first = 0  # many threads that sum take less time than one that stores prefix sums
-            for k in range(c):
-                first += s.part[k]
-            n = _list_active_of(s, c, first, 1)
-            if c == s.chunks - 1:
-                s.count[ACTIVE] = first + n
-
-
-@ti.func
-def _list_active_of(s: ti.template(), c, first, write):
-    """Count the triangles of chunk c that can have a partner; with `write` 1, also list them from s.active[first]."""
-    near, n, n_near, own = c * s.n_bodies, 0, 0, -1
-    for t in range(part_first(c, s.n_triangles, s.chunks), part_first(c + 1, s.n_triangles, s.chunks)):
-        if s.body[t] != own:
-            own = s.body[t]
-            n_near = list_near(s, c, own)
-        if _can_have_partner(s, t, near, near + n_near) == 1:
-            if write == 1:
-                s.active[first + n] = t
-            n += 1
-    return n
-
-
-@ti.func
-def _list_and_compact(s: ti.template()):
-    """List the triangles of each chunk, then move the lists together, which takes less time than to test them twice."""
-    ti.loop_config(serialize=s.serial_cheap)
-    for task in range(s.chunks * s.cheap_spread):
-        if task % s.cheap_spread == 0:
-            c = task // s.cheap_spread
-            s.part[c] = _list_active_of(s, c, part_first(c, s.n_triangles, s.chunks), 1)
-    ti.loop_config(serialize=True)
-    for _ in range(1):
-        total = 0
-        for k in range(s.chunks):
-            base = part_first(k, s.n_triangles, s.chunks)
-            for j in range(s.part[k]):  # entries move left only, so none is overwritten before it is read
-                s.active[total + j] = s.active[base + j]
-            total += s.part[k]
-        s.count[ACTIVE] = total
+def _list_active(surface: ti.template()):
+    """List the triangles that can have a partner, in ascending order: in each chunk, then all together, which takes less time
+    than to test them twice."""
+    ti.loop_config(serialize=surface.serial_cheap)
+    for task in range(surface.chunks * surface.cheap_spread):
+        if task % surface.cheap_spread == 0:
+            c = task // surface.cheap_spread
+            first, n, n_near, own = part_first(c, surface.n_triangles, surface.chunks), 0, 0, -1
+            for t in range(first, part_first(c + 1, surface.n_triangles, surface.chunks)):
+                if surface.body[t] != own:
+                    own = surface.body[t]
+                    n_near = list_near(surface, c, own)
+                if _can_have_partner(surface, t, c * surface.n_bodies, c * surface.n_bodies + n_near) == 1:
+                    surface.active_of_chunk[first + n] = t
+                    n += 1
+            surface.part[c] = n
+    ti.loop_config(serialize=surface.on_cpu)
+    for c in range(surface.chunks):
+        at, first = sum_before(surface.part, c), part_first(c, surface.n_triangles, surface.chunks)
+        for k in range(surface.part[c]):
+            surface.active[at + k] = surface.active_of_chunk[first + k]
+        if c == surface.chunks - 1:
+            surface.count[ACTIVE] = at + surface.part[c]
 
 
 @kernel

@@ -20,6 +20,7 @@ import numpy as np
 import taichi as ti
 
 from taisoft.backend.arrays import FieldArena
+from taisoft.backend.lists import bucket_of
 from taisoft.backend.runtime import kernel
 from taisoft.contact.problem import fill_field, to_frame, to_world
 from taisoft.contact.prox import dvec, prox, tangent
@@ -148,22 +149,21 @@ def _add_vertex(p: ti.template(), m: ti.template(), s: ti.template(), c, k, v, w
 
 
 @ti.func
-def _slot(p: ti.template(), feature):
-    x, y, z = ti.cast(feature[0], ti.i64), ti.cast(feature[1], ti.i64), ti.cast(feature[2], ti.i64)
-    h = (x * 73856093) ^ (y * 19349663) ^ (z * 83492791)
-    return ti.cast((h ^ (h >> 17)) & (p.n_slots - 1), ti.i32)
+def _pair_slot(problem: ti.template(), body):
+    """Slot of a pair of colliders among those of the previous step, or the empty one where it belongs."""
+    mask, found = problem.n_slots - 1, 0
+    k = bucket_of(body[0], body[1], 0, mask)
+    while found == 0 and problem.pair_slot[k] >= 0:
+        if (problem.previous_body[problem.pair_slot[k]] == body).all():
+            found = 1
+        else:
+            k = (k + 1) & mask
+    return k
 
 
 @ti.func
-def _pair_slot(p: ti.template(), body):
-    """Slot of a pair of colliders among those of the previous step, or the empty one where it belongs."""
-    k, found = _slot(p, ti.Vector([body[0], body[1], 0], ti.i32)), 0
-    while found == 0 and p.pair_slot[k] >= 0:
-        if (p.previous_body[p.pair_slot[k]] == body).all():
-            found = 1
-        else:
-            k = (k + 1) & (p.n_slots - 1)
-    return k
+def _slot(problem: ti.template(), feature):
+    return bucket_of(feature[0], feature[1], feature[2], problem.n_slots - 1)
 
 
 @ti.func

@@ -15,6 +15,7 @@ import numpy as np
 import scipy.sparse as sp
 import taichi as ti
 
+from taisoft.backend.lists import add_up_counts, clear_counts, count_entry, place_of_entry, sort_lists
 from taisoft.backend.runtime import kernel
 from taisoft.contact.problem import ContactProblem, fill_field
 from taisoft.errors import SimulationError
@@ -39,10 +40,10 @@ def node_graph(node: np.ndarray, arity: np.ndarray, inverse_mass: np.ndarray) ->
     return _without_loops(touches @ touches.T)
 
 
-def graph_of(p: ContactProblem) -> sp.csr_matrix:
+def graph_of(problem: ContactProblem) -> sp.csr_matrix:
     """Adjacency matrix of the contacts of a problem over nodes."""
-    k = int(p.count[0])
-    return node_graph(p.node.to_numpy(k), p.arity.to_numpy(k), p.inverse_mass.to_numpy())
+    k = int(problem.count[0])
+    return node_graph(problem.node.to_numpy(k), problem.arity.to_numpy(k), problem.inverse_mass.to_numpy())
 
 
 def matrix_graph(W: sp.spmatrix) -> sp.csr_matrix:
@@ -104,12 +105,12 @@ def groups(colour: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return order, start
 
 
-def store(p: ContactProblem, colour: np.ndarray) -> None:
+def store(problem: ContactProblem, colour: np.ndarray) -> None:
     """Set the colours (k,) of the problem's contacts and group them."""
     order, start = groups(colour)
-    for field, values in ((p.colour, colour), (p.order, order), (p.colour_start, start)):
+    for field, values in ((problem.colour, colour), (problem.order, order), (problem.by_colour.start, start)):
         fill_field(field, values)
-    p.count[1] = len(start) - 1
+    problem.count[1] = len(start) - 1
 
 
 # --- in kernels -------------------------------------------------------------------------------------------------------
@@ -125,18 +126,18 @@ def _priority(c):
 
 
 @ti.func
-def _first_free(p: ti.template(), c):
+def _first_free(problem: ti.template(), c):
     """The lowest colour that no neighbour of higher priority has; UNCOLOURED if one of these is uncoloured."""
     result, low, waiting = UNCOLOURED, 0, False
     while result == UNCOLOURED and not waiting:
         taken = 0
-        for k in range(p.arity[c]):
-            i = p.node[c, k]
-            if (p.inverse_mass[i] != 0.0).any():
-                for e in range(p.entry_start[i], p.entry_start[i + 1]):
-                    d = p.entry[e] // p.width
+        for k in range(problem.arity[c]):
+            i = problem.node[c, k]
+            if (problem.inverse_mass[i] != 0.0).any():
+                for e in range(problem.by_node.start[i], problem.by_node.start[i + 1]):
+                    d = problem.entry[e] // problem.width
                     if _priority(d) > _priority(c):
-                        colour = p.colour[d]
+                        colour = problem.colour[d]
                         if colour == UNCOLOURED:
                             waiting = True
                         elif colour >= low and colour < low + BITS:
@@ -149,54 +150,49 @@ def _first_free(p: ti.template(), c):
 
 
 @kernel
-def _clear_colours(p: ti.template()):
-    ti.loop_config(serialize=p.serial)
-    for c in range(p.count[0]):
-        p.colour[c] = UNCOLOURED
+def _clear_colours(problem: ti.template()):
+    ti.loop_config(serialize=problem.serial)
+    for c in range(problem.count[0]):
+        problem.colour[c] = UNCOLOURED
 
 
 @kernel
-def _colour_round(p: ti.template()) -> ti.i32:
+def _colour_round(problem: ti.template()) -> ti.i32:
     """Colour contacts whose higher-priority neighbours are coloured (same round included, if visible). Return their number."""
     coloured = 0
-    ti.loop_config(serialize=p.serial)
-    for c in range(p.count[0]):
-        if p.colour[c] == UNCOLOURED:
-            p.colour[c] = _first_free(p, c)
-            if p.colour[c] != UNCOLOURED:
+    ti.loop_config(serialize=problem.serial)
+    for c in range(problem.count[0]):
+        if problem.colour[c] == UNCOLOURED:
+            problem.colour[c] = _first_free(problem, c)
+            if problem.colour[c] != UNCOLOURED:
                 coloured += 1
     return coloured
 
 
 @kernel
-def _group(p: ti.template()):
-    """Set `order` and `colour_start` from the colours by a counting sort."""
-    ti.loop_config(serialize=True)
-    for _ in range(1):
-        n, colours = p.count[0], 0
-        for k in range(n + 1):
-            p.colour_start[k] = 0
-        for c in range(n):
-            p.colour_start[p.colour[c]] += 1
-            colours = ti.max(colours, p.colour[c] + 1)
-        total = 0
-        for k in range(colours + 1):
-            total += p.colour_start[k]
-            p.colour_start[k] = total
-        for back in range(n):
-            c = n - 1 - back
-            p.colour_start[p.colour[c]] -= 1
-            p.order[p.colour_start[p.colour[c]]] = c
-        p.count[1] = colours
+def _group(problem: ti.template()):
+    """Group the contacts by colour, in ascending order."""
+    n = problem.count[0]
+    clear_counts(problem.by_colour, n)
+    problem.count[1] = 0
+    ti.loop_config(serialize=problem.by_colour.serial)
+    for c in range(n):
+        count_entry(problem.by_colour, problem.colour[c])
+        ti.atomic_max(problem.count[1], problem.colour[c] + 1)
+    add_up_counts(problem.by_colour, n)
+    ti.loop_config(serialize=problem.by_colour.serial)
+    for c in range(n):
+        problem.order[place_of_entry(problem.by_colour, problem.colour[c])] = c
+    sort_lists(problem.by_colour, problem.count[1], problem.order)
 
 
-def colour_contacts(p: ContactProblem) -> None:
+def colour_contacts(problem: ContactProblem) -> None:
     """Colour and group the contacts of a problem over nodes, once before the sweeps, after `index_nodes`."""
-    remaining = int(p.count[0])
-    _clear_colours(p)
+    remaining = int(problem.count[0])
+    _clear_colours(problem)
     while remaining:
-        coloured = int(_colour_round(p))
+        coloured = int(_colour_round(problem))
         if not coloured:
             raise SimulationError(f"{remaining} contacts could not be coloured")
         remaining -= coloured
-    _group(p)
+    _group(problem)

@@ -18,15 +18,14 @@ import scipy.sparse as sp
 import taichi as ti
 
 from taisoft.backend.arrays import Count, FieldArena, on_cuda, upload
+from taisoft.backend.lists import Lists, add_up_counts, clear_counts, count_entry, make_lists, place_of_entry, sort_lists
 from taisoft.backend.runtime import kernel
 from taisoft.contact.prox import dvec, prox, scaled
-from taisoft.fem.chunks import part_first
 
 NODES = 6  # maximum nodes of a contact, three on each side
 RESIDUAL, BEST, STEP, SWEEPS, CHECKS, AGE, MOMENTUM, WEIGHT, VERDICT = range(9)  # in `state`, see `solve`
 HISTORY = 1024  # residuals kept per launch
 CHUNKS = 256  # partial sums over the contacts, so that a sum does not depend on threads
-SCAN = 1024  # parts of a parallel prefix sum over the nodes
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +50,7 @@ class ContactProblem:
     partial: Any  # (CHUNKS) 2-vectors: sums over chunks of the contacts
     order: Any  # i32: contacts in sweep order
     colour: Any  # i32: of each contact, see `colouring`
-    colour_start: Any  # (capacity + 1) i32: start of each colour in `order`
+    by_colour: Lists  # of each colour's contacts, in `order`
     state: Any  # (9) f64: residual, that of `best`, fraction of the r-factors; see `solve`
     history: Any  # (HISTORY) f64: residuals at the checks of a launch
     # W as a matrix
@@ -68,9 +67,8 @@ class ContactProblem:
     tangent: Any = None  # 3-vectors: t1; t2 = normal x t1
     inverse_mass: Any = None  # (n_nodes) 3-vectors [1/kg], 0 on constrained axes
     w: Any = None  # (n_nodes) 3-vectors [m/s]: M^-1 J^T r
-    entry_start: Any = None  # (n_nodes + 1) i32: contacts of each node
+    by_node: Lists | None = None  # of the contacts of each node, in `entry`
     entry: Any = None  # i32: width * contact + index of the node in it
-    scan: Any = None  # (SCAN) i32, on CUDA: scratch of their prefix sums
     # of detected contacts, see `build`
     body: Any = None  # 2-vectors i32: colliders
     feature: Any = None  # 3-vectors i32
@@ -106,7 +104,7 @@ def build_node_problem(arena: FieldArena, capacity: int, n_nodes: int, serial: b
         n_nodes=n_nodes,
         width=width,
         n_slots=n_slots,
-        **_solver_fields(arena, n),
+        **_solver_fields(arena, n, serial),
         **_fields(arena, "node", ti.i32, (n, width)),
         **_fields(arena, "weight", ti.f64, (n, width)),
         **_fields(arena, "arity turned", ti.i32, n),
@@ -116,9 +114,8 @@ def build_node_problem(arena: FieldArena, capacity: int, n_nodes: int, serial: b
         **_fields(arena, "pair_sum", ti.f64, n, 2),
         **_fields(arena, "feature previous_feature", ti.i32, n, 3),
         **_fields(arena, "inverse_mass w", ti.f64, n_nodes, 3),
-        **_fields(arena, "entry_start", ti.i32, n_nodes + 1),
         **_fields(arena, "entry", ti.i32, width * n),
-        **(_fields(arena, "scan", ti.i32, SCAN) if on_cuda() else {}),
+        by_node=make_lists(arena, "problem_node", n_nodes, serial),
         **_fields(arena, "slot pair_slot", ti.i32, n_slots),
     )
 
@@ -130,14 +127,14 @@ def build_matrix_problem(arena: FieldArena, n: int, n_blocks: int, serial: bool)
         serial,
         not on_cuda(),
         True,
-        **_solver_fields(arena, n),
+        **_solver_fields(arena, n, serial),
         **_fields(arena, "row_start", ti.i32, n + 1),
         **_fields(arena, "column", ti.i32, n_blocks),
         **_fields(arena, "block", ti.f64, (n_blocks, 9)),
     )
 
 
-def _solver_fields(arena: FieldArena, n: int) -> dict[str, Any]:
+def _solver_fields(arena: FieldArena, n: int, serial: bool) -> dict[str, Any]:
     """Fields that both forms of W need."""
     return {
         **_fields(arena, "count", ti.i32, 2),
@@ -146,7 +143,7 @@ def _solver_fields(arena: FieldArena, n: int) -> dict[str, Any]:
         **_fields(arena, "factor term", ti.f64, n, 2),
         **_fields(arena, "partial", ti.f64, CHUNKS, 2),
         **_fields(arena, "order colour", ti.i32, n),
-        **_fields(arena, "colour_start", ti.i32, n + 1),
+        "by_colour": make_lists(arena, "problem_colour", n, serial),
         **_fields(arena, "state", ti.f64, VERDICT + 1),
         **_fields(arena, "history", ti.f64, HISTORY),
     }
@@ -168,85 +165,79 @@ def fill_field(field, values: np.ndarray) -> None:
     upload([(field, whole)])
 
 
-def fill_matrix_problem(p: ContactProblem, W: sp.spmatrix, b: np.ndarray, friction: np.ndarray) -> None:
+def fill_matrix_problem(problem: ContactProblem, W: sp.spmatrix, b: np.ndarray, friction: np.ndarray) -> None:
     """Upload W (3k,3k), b (3k,) and coefficients of friction (k,) to a problem large enough; keep its impulses."""
     W, k = sp.bsr_matrix(W, blocksize=(3, 3)), len(friction)
     W.sort_indices()
-    p.count[0] = k
-    fill_field(p.row_start, W.indptr)
-    fill_field(p.column, W.indices)
-    fill_field(p.block, W.data.reshape(-1, 9))
-    fill_field(p.b, b.reshape(k, 3))
-    fill_field(p.friction, friction)
-    fill_field(p.order, np.arange(k))
-    find_factors(p)
+    problem.count[0] = k
+    fill_field(problem.row_start, W.indptr)
+    fill_field(problem.column, W.indices)
+    fill_field(problem.block, W.data.reshape(-1, 9))
+    fill_field(problem.b, b.reshape(k, 3))
+    fill_field(problem.friction, friction)
+    fill_field(problem.order, np.arange(k))
+    find_factors(problem)
 
 
 # --- solver interface -------------------------------------------------------------------------------------------------
 
 
 @ti.func
-def to_frame(p: ti.template(), c, v):
+def to_frame(problem: ti.template(), c, v):
     """Transform a world vector to the frame of contact c."""
-    n, t = p.normal[c], p.tangent[c]
+    n, t = problem.normal[c], problem.tangent[c]
     return dvec(n.dot(v), t.dot(v), n.cross(t).dot(v))
 
 
 @ti.func
-def to_world(p: ti.template(), c, r):
+def to_world(problem: ti.template(), c, r):
     """Transform a vector from the frame of contact c to the world."""
-    n, t = p.normal[c], p.tangent[c]
+    n, t = problem.normal[c], problem.tangent[c]
     return r[0] * n + r[1] * t + r[2] * n.cross(t)
 
 
 @ti.func
-def velocity(p: ti.template(), c):
+def velocity(problem: ti.template(), c):
     """u of contact c at the present impulses [m/s]."""
-    u = p.b[c]
-    if ti.static(p.matrix):
-        for k in range(p.row_start[c], p.row_start[c + 1]):
-            r = p.r[p.column[k]]
+    u = problem.b[c]
+    if ti.static(problem.matrix):
+        for k in range(problem.row_start[c], problem.row_start[c + 1]):
+            r = problem.r[problem.column[k]]
             for i in ti.static(range(3)):
-                u[i] += p.block[k, 3 * i] * r[0] + p.block[k, 3 * i + 1] * r[1] + p.block[k, 3 * i + 2] * r[2]
+                u[i] += problem.block[k, 3 * i] * r[0] + problem.block[k, 3 * i + 1] * r[1] + problem.block[k, 3 * i + 2] * r[2]
     else:
         v = dvec(0.0)
-        for k in range(p.arity[c]):
-            v += p.weight[c, k] * p.w[p.node[c, k]]
-        u += to_frame(p, c, v)
+        for k in range(problem.arity[c]):
+            v += problem.weight[c, k] * problem.w[problem.node[c, k]]
+        u += to_frame(problem, c, v)
     return u
 
 
 @ti.func
-def add_impulse(p: ti.template(), c, change):
+def add_impulse(problem: ti.template(), c, change):
     """Add a change of contact c's impulse to w at its nodes. Contacts updated in parallel must share no movable node."""
-    if ti.static(not p.matrix):
-        d = to_world(p, c, change)
-        for k in range(p.arity[c]):
-            i = p.node[c, k]
-            p.w[i] = p.w[i] + p.weight[c, k] * (p.inverse_mass[i] * d)
+    if ti.static(not problem.matrix):
+        d = to_world(problem, c, change)
+        for k in range(problem.arity[c]):
+            i = problem.node[c, k]
+            problem.w[i] = problem.w[i] + problem.weight[c, k] * (problem.inverse_mass[i] * d)
 
 
 @ti.func
-def impulse_on(p: ti.template(), i):
+def impulse_on(problem: ti.template(), i):
     """(J^T r) of node i [N s], summed over its contacts in a fixed order."""
     d = dvec(0.0)
-    for e in range(p.entry_start[i], p.entry_start[i + 1]):
-        c, k = p.entry[e] // p.width, p.entry[e] % p.width
-        d += p.weight[c, k] * to_world(p, c, p.r[c])
+    for e in range(problem.by_node.start[i], problem.by_node.start[i + 1]):
+        c, k = problem.entry[e] // problem.width, problem.entry[e] % problem.width
+        d += problem.weight[c, k] * to_world(problem, c, problem.r[c])
     return d
 
 
 @ti.func
-def gather_velocity(p: ti.template(), i):
-    """M^-1 J^T r at node i."""
-    return p.inverse_mass[i] * impulse_on(p, i)
-
-
-@ti.func
-def natural_map(p: ti.template(), c):
+def natural_map(problem: ti.template(), c):
     """(|r - prox(r - f u)|^2, |r|^2) of contact c."""
-    r = p.r[c]
-    d = r - prox(r - scaled(p.factor[c], velocity(p, c)), p.friction[c])
+    r = problem.r[c]
+    d = r - prox(r - scaled(problem.factor[c], velocity(problem, c)), problem.friction[c])
     return ti.Vector([d.dot(d), r.dot(r)], ti.f64)
 
 
@@ -262,35 +253,35 @@ def residual_of(sums):
 
 
 @ti.func
-def refresh(p: ti.template()):
+def update_velocities(problem: ti.template()):
     """Set w = M^-1 J^T r over nodes; does nothing if W is a matrix."""
-    if ti.static(not p.matrix):
-        ti.loop_config(serialize=p.serial)
-        for i in range(p.n_nodes):
-            p.w[i] = gather_velocity(p, i)
+    if ti.static(not problem.matrix):
+        ti.loop_config(serialize=problem.serial)
+        for i in range(problem.n_nodes):
+            problem.w[i] = problem.inverse_mass[i] * impulse_on(problem, i)
 
 
 @kernel
-def find_velocities(p: ti.template()):
-    """See `refresh`."""
-    refresh(p)
+def find_velocities(problem: ti.template()):
+    """See `update_velocities`."""
+    update_velocities(problem)
 
 
 @ti.func
-def own_block(p: ti.template(), c):
+def own_block(problem: ti.template(), c):
     """The 3x3 block of W between contact c and itself."""
     B = ti.Matrix.zero(ti.f64, 3, 3)
-    if ti.static(p.matrix):
-        for k in range(p.row_start[c], p.row_start[c + 1]):
-            if p.column[k] == c:
+    if ti.static(problem.matrix):
+        for k in range(problem.row_start[c], problem.row_start[c + 1]):
+            if problem.column[k] == c:
                 for i, j in ti.static(ti.ndrange(3, 3)):
-                    B[i, j] += p.block[k, 3 * i + j]
+                    B[i, j] += problem.block[k, 3 * i + j]
     else:
-        n, t = p.normal[c], p.tangent[c]
+        n, t = problem.normal[c], problem.tangent[c]
         E = ti.Matrix.rows([n, t, n.cross(t)])
         h = dvec(0.0)
-        for k in range(p.arity[c]):
-            h += p.weight[c, k] * p.weight[c, k] * p.inverse_mass[p.node[c, k]]
+        for k in range(problem.arity[c]):
+            h += problem.weight[c, k] * problem.weight[c, k] * problem.inverse_mass[problem.node[c, k]]
         for i, j in ti.static(ti.ndrange(3, 3)):
             for q in ti.static(range(3)):
                 B[i, j] += E[i, q] * h[q] * E[j, q]
@@ -298,76 +289,29 @@ def own_block(p: ti.template(), c):
 
 
 @kernel
-def find_factors(p: ti.template()):
+def find_factors(problem: ti.template()):
     """Set the r-factors from the diagonal of W."""
-    ti.loop_config(serialize=p.serial)
-    for c in range(p.count[0]):
-        B = own_block(p, c)
+    ti.loop_config(serialize=problem.serial)
+    for c in range(problem.count[0]):
+        B = own_block(problem, c)
         across = ti.max(B[1, 1], B[2, 2])
-        p.factor[c][0] = ti.select(B[0, 0] > 0.0, 1.0 / B[0, 0], 0.0)
-        p.factor[c][1] = ti.select(across > 0.0, 1.0 / across, 0.0)
+        problem.factor[c][0] = ti.select(B[0, 0] > 0.0, 1.0 / B[0, 0], 0.0)
+        problem.factor[c][1] = ti.select(across > 0.0, 1.0 / across, 0.0)
         if B[0, 0] <= 0.0:  # immovable
-            p.r[c] = dvec(0.0)
+            problem.r[c] = dvec(0.0)
 
 
 @kernel
-def index_nodes(p: ti.template()):
+def index_nodes(problem: ti.template()):
     """List the contacts of each node, in ascending order."""
-    if ti.static(p.on_cpu):
-        _index_serially(p)
-    else:
-        _index_in_parallel(p)
-
-
-@ti.func
-def _index_in_parallel(p: ti.template()):
-    """`index_nodes` as top-level loops for many threads: counts, their prefix sums, entries in any order, sorted by node."""
-    for i in range(p.n_nodes + 1):
-        p.entry_start[i] = 0
-    for c in range(p.count[0]):
-        for k in range(p.arity[c]):
-            ti.atomic_add(p.entry_start[p.node[c, k]], 1)
-    for part in range(SCAN):
-        total = 0
-        for i in range(part_first(part, p.n_nodes + 1, SCAN), part_first(part + 1, p.n_nodes + 1, SCAN)):
-            total += p.entry_start[i]
-        p.scan[part] = total
-    for part in range(SCAN):
-        total = 0  # many threads that sum take less time than one that stores prefix sums
-        for k in range(part):
-            total += p.scan[k]
-        for i in range(part_first(part, p.n_nodes + 1, SCAN), part_first(part + 1, p.n_nodes + 1, SCAN)):
-            total += p.entry_start[i]
-            p.entry_start[i] = total
-    for c in range(p.count[0]):
-        for k in range(p.arity[c]):
-            p.entry[ti.atomic_sub(p.entry_start[p.node[c, k]], 1) - 1] = p.width * c + k
-    for i in range(p.n_nodes):
-        first = p.entry_start[i]
-        for j in range(first + 1, p.entry_start[i + 1]):
-            entry, at = p.entry[j], j
-            while at > first and p.entry[at - 1] > entry:
-                p.entry[at] = p.entry[at - 1]
-                at -= 1
-            p.entry[at] = entry
-
-
-@ti.func
-def _index_serially(p: ti.template()):
-    ti.loop_config(serialize=True)
-    for _ in range(1):
-        for i in range(p.n_nodes + 1):
-            p.entry_start[i] = 0
-        for c in range(p.count[0]):
-            for k in range(p.arity[c]):
-                p.entry_start[p.node[c, k]] += 1
-        total = 0
-        for i in range(p.n_nodes + 1):
-            total += p.entry_start[i]
-            p.entry_start[i] = total
-        for back in range(p.count[0]):
-            c = p.count[0] - 1 - back
-            for k in range(p.arity[c]):
-                i = p.node[c, k]
-                p.entry_start[i] -= 1
-                p.entry[p.entry_start[i]] = p.width * c + k
+    clear_counts(problem.by_node, problem.n_nodes)
+    ti.loop_config(serialize=problem.by_node.serial)
+    for c in range(problem.count[0]):
+        for k in range(problem.arity[c]):
+            count_entry(problem.by_node, problem.node[c, k])
+    add_up_counts(problem.by_node, problem.n_nodes)
+    ti.loop_config(serialize=problem.by_node.serial)
+    for c in range(problem.count[0]):
+        for k in range(problem.arity[c]):
+            problem.entry[place_of_entry(problem.by_node, problem.node[c, k])] = problem.width * c + k
+    sort_lists(problem.by_node, problem.n_nodes, problem.entry)

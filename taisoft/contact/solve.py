@@ -1,4 +1,4 @@
-"""Sweep until the residual is small: on one thread in one kernel, or in the same loops on all threads.
+"""Sweep until the residual is small: on one thread in one kernel, or in parallel loops.
 
 On a CPU one thread is faster: it takes 0.15 us per contact and sweep. A parallel loop costs some 30 us to start, a sweep has two
 to twenty of them, and memory bandwidth limits two threads to little more than the speed of one.
@@ -37,13 +37,12 @@ from taisoft.contact.problem import (
     WEIGHT,
     ContactProblem,
     find_velocities,
-    gather_velocity,
     natural_map,
-    refresh,
     residual_of,
+    update_velocities,
 )
 from taisoft.contact.prox import prox
-from taisoft.contact.sweeps import SIMULTANEOUS, relaxation, sweep, sweep_shared
+from taisoft.contact.sweeps import SIMULTANEOUS, relaxation, sweep, sweep_parallel
 
 LAUNCH_VISITS = 1_000_000  # contact visits per launch: about 0.1 s, so that Ctrl-C takes effect
 CHECK_EVERY = 5  # sweeps between residual checks, each of which costs as much as a sweep
@@ -67,7 +66,7 @@ class SolveResult:
 
 
 def solve(
-    p: ContactProblem,
+    problem: ContactProblem,
     method: str,
     tolerance: float,
     max_iterations: int,
@@ -82,54 +81,98 @@ def solve(
     momentum: False for the plain method.
     """
     # Gauss-Seidel has no parallel form: it runs on one thread even if the problem has parallel loops
-    run = _run_alone if p.serial or method == "gauss_seidel" else _run_shared
-    batch = max(1, min(HISTORY - 1, LAUNCH_VISITS // max(1, int(p.count[0])) // every)) * every
+    run = _run_serial if problem.serial or method == "gauss_seidel" else _run_parallel
+    batch = max(1, min(HISTORY - 1, LAUNCH_VISITS // max(1, int(problem.count[0])) // every)) * every
     remaining, first, residuals = max_iterations, 1, []
     while True:
         n = min(batch, remaining)
-        run(p, method, first, n, every, tolerance, int(momentum))
+        run(problem, method, first, n, every, tolerance, int(momentum))
         remaining, first = remaining - n, 0
-        residual = float(p.state[RESIDUAL])
+        residual = float(problem.state[RESIDUAL])
         if history:
-            residuals += p.history.to_numpy(int(p.state[CHECKS])).tolist()
+            residuals += problem.history.to_numpy(int(problem.state[CHECKS])).tolist()
         if remaining == 0 or residual <= tolerance:
             break
-    best = float(p.state[BEST])
+    best = float(problem.state[BEST])
     if best < residual or residual != residual:
-        _restore_best(p)
-        find_velocities(p)
+        _restore_best(problem)
+        find_velocities(problem)
         residual = best
-    return SolveResult(int(p.state[SWEEPS]), residual, residual <= tolerance, residuals)
+    return SolveResult(int(problem.state[SWEEPS]), residual, residual <= tolerance, residuals)
 
 
 @kernel
-def _restore_best(p: ti.template()):
+def _restore_best(problem: ti.template()):
     """Replace the present impulses by the best ones."""
-    ti.loop_config(serialize=p.serial)
-    for c in range(p.count[0]):
-        p.r[c] = p.best[c]
+    ti.loop_config(serialize=problem.serial)
+    for c in range(problem.count[0]):
+        problem.r[c] = problem.best[c]
 
 
-def _run_shared(
-    p: ContactProblem, method: str, first: int, sweeps: int, every: int, tolerance: float, with_momentum: int
-) -> None:
-    """As `_run_alone`, on all threads; the host reads the residual."""
-    p.state[CHECKS] = 0.0
-    if first:
-        _start_shared(p, method, with_momentum)
-    done, n_colours = 0, 0 if method in SIMULTANEOUS else int(p.count[1])
-    while done < sweeps and not p.state[RESIDUAL] <= tolerance:
-        n = min(every, sweeps - done)
-        for _ in range(n):
-            sweep_shared(p, method, n_colours)
-            _follow_shared(p, with_momentum)
-        done += n
-        _check_shared(p, n)
+# --- loops: parallel at the top level of a kernel, serial in the loop of `_run_serial` -----------------------------------
+
+
+@ti.func
+def _prepare(problem: ti.template(), method: ti.template(), with_momentum):
+    """Set the fractions of the r-factors and the impulses before the first sweep."""
+    for c in range(problem.count[0]):
+        problem.relaxation[c] = relaxation(problem, c, method, with_momentum)
+        problem.previous[c] = problem.r[c]
+
+
+@ti.func
+def _sum_chunks(problem: ti.template(), chunks: ti.template()):
+    """Sum the terms of each chunk, in order."""
+    for k in range(chunks):
+        n, total = problem.count[0], ti.Vector([0.0, 0.0], ti.f64)
+        for c in range(k * n // chunks, (k + 1) * n // chunks):
+            total += problem.term[c]
+        problem.partial[k] = total
+
+
+@ti.func
+def _total(problem: ti.template(), chunks: ti.template()):
+    total = ti.Vector([0.0, 0.0], ti.f64)
+    for k in range(chunks):
+        total += problem.partial[k]
+    return total
+
+
+@ti.func
+def _check(problem: ti.template(), chunks: ti.template(), first, sweeps):
+    """Check the residual and save or restore the impulses; w must be up to date."""
+    for c in range(problem.count[0]):
+        problem.term[c] = natural_map(problem, c)
+    _sum_chunks(problem, chunks)
+    ti.loop_config(serialize=True)
+    for _ in range(1):
+        problem.state[RESIDUAL] = residual_of(_total(problem, chunks))
+        if first == 1:
+            _begin(problem)
+        else:
+            _accept_or_reject(problem, sweeps)
+    for c in range(problem.count[0]):
+        _apply_verdict(problem, c)
+
+
+@ti.func
+def _extrapolate(problem: ti.template(), chunks: ti.template()):
+    """Set the impulses from which the next sweep starts."""
+    for c in range(problem.count[0]):
+        problem.term[c] = [_restart_test(problem, c), 0.0]
+    _sum_chunks(problem, chunks)
+    ti.loop_config(serialize=True)
+    for _ in range(1):
+        _set_weight(problem, _total(problem, chunks)[0])
+    for c in range(problem.count[0]):
+        x = problem.r[c]
+        problem.r[c] = prox(x + problem.state[WEIGHT] * (x - problem.previous[c]), problem.friction[c])
+        problem.previous[c] = x
 
 
 @kernel
-def _run_alone(
-    p: ti.template(),
+def _run_serial(
+    problem: ti.template(),
     method: ti.template(),
     first: ti.i32,
     sweeps: ti.i32,
@@ -140,185 +183,135 @@ def _run_alone(
     """Run up to `sweeps` sweeps with a residual check after each `every`; first: 1 at the start of a solve."""
     ti.loop_config(serialize=True)
     for _ in range(1):
-        p.state[CHECKS] = 0.0
+        problem.state[CHECKS] = 0.0
         if first == 1:
-            _start(p, method, with_momentum, True)
+            update_velocities(problem)
+            _prepare(problem, method, with_momentum)
+            _check(problem, 1, 1, 0)
         done = 0
-        while done < sweeps and not p.state[RESIDUAL] <= tolerance:
+        while done < sweeps and not problem.state[RESIDUAL] <= tolerance:
             n = ti.min(every, sweeps - done)
             for _k in range(n):
-                sweep(p, method)
+                sweep(problem, method)
                 if with_momentum == 1:
-                    _extrapolate_all(p, True)
-                refresh(p)
+                    _extrapolate(problem, 1)
+                update_velocities(problem)
             done += n
-            _check(p, 0, n, True)
+            _check(problem, 1, 0, n)
+            if problem.state[RESIDUAL] == problem.state[BEST]:
+                update_velocities(problem)
+
+
+def _run_parallel(
+    problem: ContactProblem, method: str, first: int, sweeps: int, every: int, tolerance: float, with_momentum: int
+) -> None:
+    """As `_run_serial`, on all threads; the host reads the residual."""
+    problem.state[CHECKS] = 0.0
+    if first:
+        find_velocities(problem)
+        _prepare_all(problem, method, with_momentum)
+        _check_all(problem, 1, 0)
+    done, n_colours = 0, 0 if method in SIMULTANEOUS else int(problem.count[1])
+    while done < sweeps and not problem.state[RESIDUAL] <= tolerance:
+        n = min(every, sweeps - done)
+        for _ in range(n):
+            sweep_parallel(problem, method, n_colours)
+            if with_momentum:
+                _extrapolate_all(problem)
+            find_velocities(problem)
+        done += n
+        _check_all(problem, 0, n)
+        if problem.state[RESIDUAL] == problem.state[BEST]:
+            find_velocities(problem)
 
 
 @kernel
-def _start_shared(p: ti.template(), method: ti.template(), with_momentum: ti.i32):
-    _start(p, method, with_momentum, False)
+def _prepare_all(problem: ti.template(), method: ti.template(), with_momentum: ti.i32):
+    _prepare(problem, method, with_momentum)
 
 
 @kernel
-def _follow_shared(p: ti.template(), with_momentum: ti.template()):
-    if ti.static(with_momentum):
-        _extrapolate_all(p, False)
-    refresh(p)
+def _check_all(problem: ti.template(), first: ti.i32, sweeps: ti.i32):
+    _check(problem, CHUNKS, first, sweeps)
 
 
 @kernel
-def _check_shared(p: ti.template(), sweeps: ti.i32):
-    _check(p, 0, sweeps, False)
-
-
-# --- loops: at a kernel's top level, or inside a loop on one thread (`alone`) ------------------------------------------------
-
-
-@ti.func
-def _start(p: ti.template(), method: ti.template(), with_momentum, alone: ti.template()):
-    """Begin a solve from the present impulses, and check their residual."""
-    refresh(p)
-    for c in range(p.count[0]):
-        p.relaxation[c] = relaxation(p, c, method, with_momentum)
-        p.previous[c] = p.r[c]
-    _check(p, 1, 0, alone)
-
-
-@ti.func
-def _check(p: ti.template(), first, sweeps, alone: ti.template()):
-    """Check the residual after so many sweeps, and save or restore the impulses; w must be up to date."""
-    for c in range(p.count[0]):
-        p.term[c] = natural_map(p, c)
-    _sum_terms(p, alone)
-    ti.loop_config(serialize=True)
-    for _ in range(1):
-        p.state[RESIDUAL] = residual_of(_total(p, alone))
-        if first == 1:
-            _begin(p)
-        else:
-            _accept_or_reject(p, sweeps)
-    for c in range(p.count[0]):
-        _apply_verdict(p, c)
-    if ti.static(not p.matrix):
-        for i in range(p.n_nodes):
-            if p.state[VERDICT] == RESTORE:
-                p.w[i] = gather_velocity(p, i)
-
-
-@ti.func
-def _extrapolate_all(p: ti.template(), alone: ti.template()):
-    """Set the impulses from which the next sweep starts."""
-    for c in range(p.count[0]):
-        p.term[c] = [_restart_test(p, c), 0.0]
-    _sum_terms(p, alone)
-    ti.loop_config(serialize=True)
-    for _ in range(1):
-        _set_weight(p, _total(p, alone)[0])
-    for c in range(p.count[0]):
-        _extrapolate(p, c)
-
-
-@ti.func
-def _sum_terms(p: ti.template(), alone: ti.template()):
-    """Sum the terms of each chunk, in order."""
-    for k in range(ti.static(1 if alone else CHUNKS)):
-        n, chunks = p.count[0], ti.static(1 if alone else CHUNKS)
-        total = ti.Vector([0.0, 0.0], ti.f64)
-        for c in range(k * n // chunks, (k + 1) * n // chunks):
-            total += p.term[c]
-        p.partial[k] = total
-
-
-@ti.func
-def _total(p: ti.template(), alone: ti.template()):
-    """Sum of all terms."""
-    total = ti.Vector([0.0, 0.0], ti.f64)
-    for k in range(ti.static(1 if alone else CHUNKS)):
-        total += p.partial[k]
-    return total
+def _extrapolate_all(problem: ti.template()):
+    _extrapolate(problem, CHUNKS)
 
 
 # --- momentum ---------------------------------------------------------------------------------------------------------
 
 
 @ti.func
-def _restart_test(p: ti.template(), c):
+def _restart_test(problem: ti.template(), c):
     """Contribution of contact c to (y - x).F^-1 (x - x_before): y is `sweep_start`, x is `r`, x_before is `previous`."""
-    x, f = p.r[c], p.factor[c]
-    backward, forward = p.sweep_start[c] - x, x - p.previous[c]
+    x, f = problem.r[c], problem.factor[c]
+    backward, forward = problem.sweep_start[c] - x, x - problem.previous[c]
     n = ti.select(f[0] > 0.0, 1.0 / f[0], 0.0)
     t = ti.select(f[1] > 0.0, 1.0 / f[1], 0.0)
     return n * backward[0] * forward[0] + t * (backward[1] * forward[1] + backward[2] * forward[2])
 
 
 @ti.func
-def _set_weight(p: ti.template(), total):
+def _set_weight(problem: ti.template(), total):
     """Set the weight to (t - 1)/t' times the strategy's fraction, or 0 to restart. total: sum of `_restart_test`."""
-    t = p.state[MOMENTUM]
-    p.state[MOMENTUM], p.state[WEIGHT] = 1.0, 0.0
+    t = problem.state[MOMENTUM]
+    problem.state[MOMENTUM], problem.state[WEIGHT] = 1.0, 0.0
     if not total > 0.0:
-        p.state[MOMENTUM] = 0.5 * (1.0 + ti.sqrt(1.0 + 4.0 * t * t))
-        p.state[WEIGHT] = p.state[STEP] * (t - 1.0) / p.state[MOMENTUM]
-
-
-@ti.func
-def _extrapolate(p: ti.template(), c):
-    """Set the impulse of contact c from which the next sweep starts."""
-    x = p.r[c]
-    p.r[c] = prox(x + p.state[WEIGHT] * (x - p.previous[c]), p.friction[c])
-    p.previous[c] = x
+        problem.state[MOMENTUM] = 0.5 * (1.0 + ti.sqrt(1.0 + 4.0 * t * t))
+        problem.state[WEIGHT] = problem.state[STEP] * (t - 1.0) / problem.state[MOMENTUM]
 
 
 # --- r-factor strategy ------------------------------------------------------------------------------------------------
 
 
 @ti.func
-def _begin(p: ti.template()):
+def _begin(problem: ti.template()):
     """Initialise a solve; state[RESIDUAL] is that of the initial impulses, the first best ones.
 
     If it is 1 or more, they are no better than zero impulses and are not saved. (A first sweep from zero yields small impulses,
     whose residual can be far above 1, since it is relative to them.)
     """
-    p.state[BEST], p.state[STEP], p.state[SWEEPS] = p.state[RESIDUAL], 1.0, 0.0
-    if not p.state[RESIDUAL] < 1.0:
-        p.state[BEST] = ti.cast(ti.math.inf, ti.f64)
-    p.state[AGE], p.state[MOMENTUM], p.state[VERDICT] = 0.0, 1.0, SAVE
-    _record(p)
+    problem.state[BEST], problem.state[STEP], problem.state[SWEEPS] = problem.state[RESIDUAL], 1.0, 0.0
+    if not problem.state[RESIDUAL] < 1.0:
+        problem.state[BEST] = ti.cast(ti.math.inf, ti.f64)
+    problem.state[AGE], problem.state[MOMENTUM], problem.state[VERDICT] = 0.0, 1.0, SAVE
+    _record(problem)
 
 
 @ti.func
-def _record(p: ti.template()):
+def _record(problem: ti.template()):
     """Append state[RESIDUAL] to the history of this launch."""
-    k = ti.cast(p.state[CHECKS], ti.i32)
+    k = ti.cast(problem.state[CHECKS], ti.i32)
     if k < HISTORY:
-        p.history[k] = p.state[RESIDUAL]
-    p.state[CHECKS] += 1.0
+        problem.history[k] = problem.state[RESIDUAL]
+    problem.state[CHECKS] += 1.0
 
 
 @ti.func
-def _accept_or_reject(p: ti.template(), sweeps):
+def _accept_or_reject(problem: ti.template(), sweeps):
     """Set state[VERDICT] from state[RESIDUAL] after the given number of sweeps."""
-    residual, best = p.state[RESIDUAL], p.state[BEST]
-    _record(p)
-    p.state[SWEEPS] += sweeps
-    p.state[AGE] += sweeps
-    p.state[VERDICT] = CONTINUE
+    residual, best = problem.state[RESIDUAL], problem.state[BEST]
+    _record(problem)
+    problem.state[SWEEPS] += sweeps
+    problem.state[AGE] += sweeps
+    problem.state[VERDICT] = CONTINUE
     if residual < best:
-        p.state[VERDICT] = SAVE
-        p.state[BEST], p.state[AGE] = residual, 0.0
-        p.state[STEP] = ti.min(1.0, RECOVER * p.state[STEP])
-    elif not (residual <= MAX_GROWTH * best and p.state[AGE] <= PATIENCE):  # also if the residual is not a number
-        p.state[VERDICT] = RESTORE
-        p.state[RESIDUAL], p.state[AGE], p.state[MOMENTUM] = best, 0.0, 1.0
-        p.state[STEP] = ti.max(MIN_FRACTION, SHRINK * p.state[STEP])
+        problem.state[VERDICT] = SAVE
+        problem.state[BEST], problem.state[AGE] = residual, 0.0
+        problem.state[STEP] = ti.min(1.0, RECOVER * problem.state[STEP])
+    elif not (residual <= MAX_GROWTH * best and problem.state[AGE] <= PATIENCE):  # also if the residual is not a number
+        problem.state[VERDICT] = RESTORE
+        problem.state[RESIDUAL], problem.state[AGE], problem.state[MOMENTUM] = best, 0.0, 1.0
+        problem.state[STEP] = ti.max(MIN_FRACTION, SHRINK * problem.state[STEP])
 
 
 @ti.func
-def _apply_verdict(p: ti.template(), c):
+def _apply_verdict(problem: ti.template(), c):
     """Save or restore the impulse of contact c by the verdict."""
-    if p.state[VERDICT] == SAVE:
-        p.best[c] = p.r[c]
-    elif p.state[VERDICT] == RESTORE:
-        p.r[c] = p.best[c]
-        p.previous[c] = p.best[c]
+    if problem.state[VERDICT] == SAVE:
+        problem.best[c] = problem.r[c]
+    elif problem.state[VERDICT] == RESTORE:
+        problem.r[c] = problem.best[c]
+        problem.previous[c] = problem.best[c]

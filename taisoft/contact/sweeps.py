@@ -31,121 +31,122 @@ BATCH = 4  # colours per launch: a launch costs more than a loop in it
 
 
 @ti.func
-def sweep(p: ti.template(), method: ti.template()):
-    """Relax every contact once, on this thread or, if SIMULTANEOUS, on all; leave the old impulses in `sweep_start`."""
+def sweep(problem: ti.template(), method: ti.template()):
+    """Relax every contact once; leave the old impulses in `sweep_start`. Called at a kernel's top level, with a method of
+    SIMULTANEOUS only, its loops are parallel."""
     if ti.static(method in SIMULTANEOUS):
-        for c in range(p.count[0]):
-            p.sweep_start[c] = _relaxed(p, c, method)
-        for c in range(p.count[0]):
-            _swap(p, c)
+        for c in range(problem.count[0]):
+            problem.sweep_start[c] = _relaxed(problem, c, method)
+        for c in range(problem.count[0]):
+            _swap(problem, c)
     else:
-        for k in range(p.count[0]):
-            _relax(p, p.order[k])
+        for k in range(problem.count[0]):
+            _relax(problem, problem.order[k])
 
 
-def sweep_shared(p: ContactProblem, method: str, n_colours: int) -> None:
+def sweep_parallel(problem: ContactProblem, method: str, n_colours: int) -> None:
     """As `sweep`, on all threads, for any method but gauss_seidel."""
     if method in SIMULTANEOUS:
-        _relax_simultaneously(p, method)
+        _relax_all(problem, method)
     else:
         for first in range(0, n_colours, BATCH):
-            _relax_colours(p, first)
+            _relax_colours(problem, first)
 
 
 @ti.func
-def _relax(p: ti.template(), c):
+def _relax(problem: ti.template(), c):
     """Apply one prox step to contact c and add the change of its impulse to its nodes."""
-    r = p.r[c]
-    p.sweep_start[c] = r
-    new = prox(_step(p, c), p.friction[c])
-    add_impulse(p, c, new - r)
-    p.r[c] = new
+    r = problem.r[c]
+    problem.sweep_start[c] = r
+    new = prox(_step(problem, c), problem.friction[c])
+    add_impulse(problem, c, new - r)
+    problem.r[c] = new
 
 
 @ti.func
-def _relaxed(p: ti.template(), c, method: ti.template()):
+def _relaxed(problem: ti.template(), c, method: ti.template()):
     """Impulse of contact c after one prox step."""
-    z = _step(p, c)
-    new = prox(z, p.friction[c])
+    z = _step(problem, c)
+    new = prox(z, problem.friction[c])
     if ti.static(method == "jacobi"):
-        new = into_disk([new[0], z[1], z[2]], p.friction[c] * p.r[c][0])
+        new = into_disk([new[0], z[1], z[2]], problem.friction[c] * problem.r[c][0])
     return new
 
 
 @ti.func
-def _step(p: ti.template(), c):
+def _step(problem: ti.template(), c):
     """Impulse of contact c after a step against its velocity, before the projection."""
-    return p.r[c] - scaled(p.state[STEP] * p.relaxation[c] * p.factor[c], velocity(p, c))
+    return problem.r[c] - scaled(problem.state[STEP] * problem.relaxation[c] * problem.factor[c], velocity(problem, c))
 
 
 @ti.func
-def _swap(p: ti.template(), c):
+def _swap(problem: ti.template(), c):
     """Swap the new impulse of contact c, held in sweep_start, with its present one."""
-    new = p.sweep_start[c]
-    p.sweep_start[c] = p.r[c]
-    p.r[c] = new
+    new = problem.sweep_start[c]
+    problem.sweep_start[c] = problem.r[c]
+    problem.r[c] = new
 
 
 @kernel
-def _relax_simultaneously(p: ti.template(), method: ti.template()):
-    sweep(p, method)
+def _relax_all(problem: ti.template(), method: ti.template()):
+    sweep(problem, method)
 
 
 @kernel
-def _relax_colours(p: ti.template(), first: ti.i32):
+def _relax_colours(problem: ti.template(), first: ti.i32):
     """Relax the contacts of BATCH colours from `first` on, each colour on all threads."""
     for q in ti.static(range(BATCH)):
-        for k in range(_colour_start(p, first + q), _colour_start(p, first + q + 1)):
-            _relax(p, p.order[k])
+        for k in range(_colour_start(problem, first + q), _colour_start(problem, first + q + 1)):
+            _relax(problem, problem.order[k])
 
 
 @ti.func
-def _colour_start(p: ti.template(), colour):
+def _colour_start(problem: ti.template(), colour):
     """Start of a colour in `order`; the end of the last colour for any later one."""
-    return p.colour_start[ti.min(colour, p.count[1])]
+    return problem.by_colour.start[ti.min(colour, problem.count[1])]
 
 
 # --- fraction of the r-factors ----------------------------------------------------------------------------------------
 
 
 @ti.func
-def relaxation(p: ti.template(), c, method: ti.template(), with_momentum):
+def relaxation(problem: ti.template(), c, method: ti.template(), with_momentum):
     """Fraction of its r-factors, in (0, 1], that contact c uses; with_momentum: 0 or 1."""
     total = ti.cast(0.0, ti.f64)
     if ti.static(method in SIMULTANEOUS):
-        total = _row_norm(p, c)
+        total = _row_norm(problem, c)
     elif with_momentum == 1:
-        a = _roots(p, c)
-        total = _norm(own_block(p, c), a, a)
+        a = _roots(problem, c)
+        total = _norm(own_block(problem, c), a, a)
     return ti.min(1.0, ti.select(total > 0.0, 1.0 / total, 1.0))
 
 
 @ti.func
-def _row_norm(p: ti.template(), c):
+def _row_norm(problem: ti.template(), c):
     """sum_d |B_cd|."""
     total = ti.cast(0.0, ti.f64)
-    a = _roots(p, c)
-    if ti.static(p.matrix):
-        for k in range(p.row_start[c], p.row_start[c + 1]):
+    a = _roots(problem, c)
+    if ti.static(problem.matrix):
+        for k in range(problem.row_start[c], problem.row_start[c + 1]):
             B = ti.Matrix.zero(ti.f64, 3, 3)
             for i, j in ti.static(ti.ndrange(3, 3)):
-                B[i, j] = p.block[k, 3 * i + j]
-            total += _norm(B, a, _roots(p, p.column[k]))
+                B[i, j] = problem.block[k, 3 * i + j]
+            total += _norm(B, a, _roots(problem, problem.column[k]))
     else:
-        for k in range(p.arity[c]):
-            i = p.node[c, k]
+        for k in range(problem.arity[c]):
+            i = problem.node[c, k]
             weights = ti.cast(0.0, ti.f64)
-            for e in range(p.entry_start[i], p.entry_start[i + 1]):
-                d = p.entry[e] // p.width
-                weights += ti.abs(p.weight[d, p.entry[e] % p.width]) * _roots(p, d).max()
-            total += ti.abs(p.weight[c, k]) * p.inverse_mass[i].max() * a.max() * weights
+            for e in range(problem.by_node.start[i], problem.by_node.start[i + 1]):
+                d = problem.entry[e] // problem.width
+                weights += ti.abs(problem.weight[d, problem.entry[e] % problem.width]) * _roots(problem, d).max()
+            total += ti.abs(problem.weight[c, k]) * problem.inverse_mass[i].max() * a.max() * weights
     return total
 
 
 @ti.func
-def _roots(p: ti.template(), c):
+def _roots(problem: ti.template(), c):
     """Square roots of the r-factors of contact c, by component."""
-    n, t = ti.sqrt(p.factor[c][0]), ti.sqrt(p.factor[c][1])
+    n, t = ti.sqrt(problem.factor[c][0]), ti.sqrt(problem.factor[c][1])
     return dvec(n, t, t)
 
 

@@ -199,7 +199,7 @@ def impulse_on_node(contacts: ti.template(), i):
     """Return (J^T r) of node i [N s]; as `impulse_on`, but from impulses in world axes."""
     rows, work = ti.static((contacts.problem, contacts.work))
     d = dvec(0.0)
-    for e in range(rows.entry_start[i], rows.entry_start[i + 1]):
+    for e in range(rows.by_node.start[i], rows.by_node.start[i + 1]):
         c, slot = rows.entry[e] // rows.width, rows.entry[e] % rows.width
         d += rows.weight[c, slot] * work.world_impulse[c]
     return d
@@ -308,7 +308,7 @@ def build_stage_contacts(
         count=p.count,
         arity=p.arity,
         weight=p.weight,
-        entry_start=p.entry_start,
+        entry_start=p.by_node.start,
         entry=p.entry,
         block=work.block,
         active=work.active,

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 import taichi as ti
 
-# Taichi gives each CPU thread at least 512 iterations of a loop: each chunk takes that many, and only the first does the work
-SPREAD = {"cpu": 512, "cuda": 1}
+from taisoft.backend.lists import part_first
+
 FOLDED = 512  # partial sums that `fold` leaves on CUDA; of more chunks than these, a multiple
 THREADS = 256  # CUDA threads that share a loop with sums which each of them needs
 # Most chunks of a sweep, and 2^this is the least number of their nodes: the more chunks, the more rows couple them
@@ -42,12 +42,6 @@ class SweepOrder:
         """Whether nodes i and j (k,) are in different chunks of one parity."""
         distance = (i >> self.shift) - (j >> self.shift)
         return (distance != 0) & (distance % 2 == 0)
-
-
-@ti.func
-def part_first(c, n, parts: ti.template()):
-    """Return the start of part c of a list of n entries divided into equal parts."""
-    return c * (n // parts) + ti.min(c, n % parts)
 
 
 @ti.func

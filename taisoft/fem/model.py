@@ -14,10 +14,11 @@ import taichi as ti
 
 from taisoft.backend import parallel
 from taisoft.backend.arrays import Count, FieldArena, download, upload
+from taisoft.backend.lists import SPREAD
 from taisoft.backend.runtime import Runtime
 from taisoft.errors import SceneError
 from taisoft.fem import reference, springs
-from taisoft.fem.chunks import FOLDED, SPREAD, SweepOrder
+from taisoft.fem.chunks import FOLDED, SweepOrder
 from taisoft.fem.dependents import DependentTable, build_dependents, dependent_table
 from taisoft.fem.laws import LAWS, law_of, volume_floor
 from taisoft.fem.loads import SceneLoads

@@ -7,10 +7,12 @@ from types import SimpleNamespace
 import numpy as np
 
 from taisoft.backend.arrays import FieldArena
-from taisoft.collision.candidates import EDGES, WHOLE, Candidates
+from taisoft.collision.candidates import EDGES, WHOLE, Buffer, Candidates, Pairs, entries, pair_entries, pairs_of
 from taisoft.collision.colliders import make_topology
 from taisoft.collision.surface import build_surface, update_boxes
 from tests.backend.lanes import opened
+
+NEAR = Pairs()  # a visitor of all near pairs
 
 
 @contextmanager
@@ -32,13 +34,15 @@ def surface_of(
     arena = FieldArena()
     with opened("f64") as runtime:
         properties = {"soft": soft, "self_on": self_on, "mode": np.zeros(len(soft))}
-        properties |= dict.fromkeys(("thickness", "edge"), np.full(len(soft), np.inf))
+        properties |= dict.fromkeys(("thickness", "edge"), np.full(len(soft), np.inf)) | {"padding": 0.0, "margin": 0.0}
         surface = build_surface(topology, x, properties, runtime, arena, serial)
         made = SimpleNamespace(surface=surface, topology=topology, soft=soft, self_on=self_on, margin=margin, arena=arena)
-        made.runtime = runtime
+        made.runtime, made.row = runtime, Buffer("near", entries, 64, None, surface.chunks, arena)
+        made.pairs = Buffer("pairs", pair_entries, 64, None, surface.chunks, arena)
         place(made, x, move)
         yield made
-    arena.release()
+    for part in (made.row, made.pairs, arena):
+        part.release()
 
 
 def place(made: SimpleNamespace, x: np.ndarray, move: np.ndarray | None = None) -> None:
@@ -46,10 +50,16 @@ def place(made: SimpleNamespace, x: np.ndarray, move: np.ndarray | None = None) 
     made.x, made.move = x, np.zeros_like(x) if move is None else move
     made.surface.x.from_numpy(made.x)
     made.surface.move.from_numpy(made.move)
+    made.surface.padding[0] = 0.5 * made.margin
     update_boxes(made.surface, made.margin)
 
 
-def pairs_of(candidates: Candidates) -> np.ndarray:
+def visited_pairs(made: SimpleNamespace, broad, visitor: Pairs = NEAR, out: Buffer | None = None) -> np.ndarray:
+    """(k,2) pairs t < u of a broad phase that the visitor accepts, in the order found."""
+    return pairs_of(made.surface, broad.near(), made.row, visitor, out or made.pairs)
+
+
+def row_pairs(candidates: Candidates) -> np.ndarray:
     """(k,2) pairs t < u, ascending; checks that rows hold both directions, ascending, each once."""
     start, end, entry = (f.to_numpy() for f in (candidates.start, candidates.end, candidates.entry))
     rows = [entry[a:b] for a, b in zip(start, end)]

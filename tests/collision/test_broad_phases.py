@@ -15,11 +15,22 @@ import taichi as ti
 from taisoft.backend.arrays import FieldArena
 from taisoft.backend.runtime import kernel
 from taisoft.collision.bvh import DIRECTIONS, Bvh
-from taisoft.collision.candidates import EDGES, WHOLE, Buffer, entries
+from taisoft.collision.candidates import EDGES, WHOLE, Buffer, entries, pair_entries
 from taisoft.collision.spatial_hash import N_LARGE, SpatialHash
 from taisoft.collision.surface import list_near, update_boxes
 from taisoft.errors import SimulationError
-from tests.collision.surfaces import EMPTY, brute_pairs, colliders, near_pairs, pairs_of, place, scatter, soup, surface_of
+from tests.collision.surfaces import (
+    EMPTY,
+    brute_pairs,
+    colliders,
+    near_pairs,
+    place,
+    row_pairs,
+    scatter,
+    soup,
+    surface_of,
+    visited_pairs,
+)
 
 CAPACITY = 300  # entries per corner and collider
 
@@ -45,7 +56,7 @@ def rig():
 
 def found(made, tree: Bvh) -> np.ndarray:
     tree.margin = made.margin
-    return pairs_of(tree.find())
+    return visited_pairs(made, tree)
 
 
 def test_candidates_are_those_of_brute_force(rig):
@@ -56,7 +67,7 @@ def test_candidates_are_those_of_brute_force(rig):
         total += len(expected)
         assert np.array_equal(found(rig, rig.trees[6]), expected)
         grid.cell = (10.0 ** rng.uniform(-5, 2), 1e-300, 1e300)[kind % 11 if kind % 11 in (1, 2) else 0]
-        assert np.array_equal(pairs_of(grid.find()), expected)
+        assert np.array_equal(row_pairs(grid.near()), expected)
         large += 0 < grid.grid.count[N_LARGE] < rig.surface.n_triangles / 2
     assert total > 10000 and large > 1
 
@@ -74,22 +85,24 @@ def test_chunks_levels_and_loops_as_on_cuda_change_nothing(rig):
     assert all(np.array_equal(f.to_numpy(), b) for f, b in zip((s.body_lo, s.body_hi, s.active, s.count), before))
 
 
-@pytest.mark.parametrize("kind", ["tree", "hash"])
+@pytest.mark.parametrize("kind", ["pairs", "hash"])
 def test_small_buffers_grow_up_to_their_limit(rig, kind):
     scatter(np.random.default_rng(7), rig, 0)
     expected = brute_pairs(rig)
 
-    def make(limit: int | None):
-        limits = {"capacity": 64, "max_capacity": limit}
-        return rig.new_tree(**limits) if kind == "tree" else SpatialHash(rig.surface, rig.new_arena(), 0.1, np.ones(3), **limits)
+    def find(limit: int | None) -> tuple[np.ndarray, tuple[Buffer, ...]]:
+        if kind == "pairs":
+            out = Buffer("pairs", pair_entries, 64, limit, rig.surface.chunks, rig.new_arena())
+            return visited_pairs(rig, rig.trees[6], out=out), (out,)
+        grid = SpatialHash(rig.surface, rig.new_arena(), 0.1, np.ones(3), capacity=64, max_capacity=limit)
+        return row_pairs(grid.near()), grid.buffers
 
-    broad = make(None)
-    assert np.array_equal(pairs_of(broad.find()), expected) and all(buffer.growths for buffer in broad.buffers)
-    broad.release()
-    broad = make(65)
+    pairs, buffers = find(None)
+    assert np.array_equal(pairs, expected) and all(buffer.growths for buffer in buffers)
     with pytest.raises(SimulationError, match=r"\w+: [0-9]+ entries are needed .*, and max_capacity allows 65$"):
-        broad.find()
-    broad.release()
+        find(65)
+    for buffer in buffers:
+        buffer.release()
 
 
 def test_more_slabs_drop_only_separated_pairs(rig):
@@ -174,7 +187,7 @@ def test_the_grid_is_periodic(rig):
         def check(*parts: np.ndarray) -> np.ndarray:
             place(made, np.concatenate(parts))
             expected = brute_pairs(made)
-            assert np.array_equal(pairs_of(grid.find()), expected) and len(expected) > 100
+            assert np.array_equal(row_pairs(grid.near()), expected) and len(expected) > 100
             return made.topology.body[expected]
 
         coincident = check(x, x)
@@ -191,7 +204,7 @@ def test_the_grid_is_periodic(rig):
     with surface_of([EMPTY, EMPTY], serial=False) as made:
         grid = SpatialHash(made.surface, rig.new_arena(), 0.1, np.ones(3))
         for broad in (Bvh(made.surface, made.topology, made.x, 0.1, made.runtime, rig.new_arena()), grid):
-            assert len(pairs_of(broad.find())) == 0
+            assert len(visited_pairs(made, broad)) == 0
             broad.release()
 
 

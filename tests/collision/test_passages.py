@@ -131,7 +131,7 @@ def test_an_old_list_misses_nothing_however_bodies_move(name):
                 one.search(begin, path)
                 with counting() as counts:
                     found = one.find()
-                is_old = step > 0 and counts.launches["list_near_pairs"] == 0
+                is_old = step > 0 and counts.launches["list_pairs"] == 0
                 pairs, times = one.find(check=one.another())
                 assert np.array_equal(found[0][:, :3], pairs[:, :3])  # nearest features may tie
                 assert np.abs(found[1] - times).max(initial=0.0) < 1e-9
@@ -166,7 +166,7 @@ def test_paths_that_leave_what_was_searched_are_not_judged():
         assert len(one.find(x + move)[0]) == 0
         one.search(x + 3.0 * limit * aside, 0.0 * move)  # a new search, from where the old list is useless
         with counting() as counts:
-            assert one.find() is not None and counts.launches["list_near_pairs"] == 1
+            assert one.find() is not None and counts.launches["list_pairs"] == 1
         assert one.find(x) is None
 
 

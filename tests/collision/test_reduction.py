@@ -11,7 +11,7 @@ import taichi as ti
 
 from taisoft.backend.arrays import FieldArena
 from taisoft.collision import contacts as kinds
-from taisoft.collision.candidates import Parts
+from taisoft.collision.candidates import TOTAL, Parts
 from taisoft.collision.contacts import FOUND, LEFT, UNDECIDED, contact_fields, reduce_contacts, reduction_fields
 
 CAPACITY = 2**13
@@ -25,8 +25,8 @@ class Reducer:
         self.arena, self.chunks, self.part = FieldArena(), chunks, CAPACITY // chunks
         self.out = contact_fields(self.arena, CAPACITY)
         self.used = self.arena.field("used", ti.i32, chunks)
-        self.parts = Parts(self.out, self.used, None, self.part, chunks)
-        self.fields = reduction_fields(self.arena, CAPACITY, chunks, serial)
+        self.parts = Parts(self.out, self.used, self.arena.field("count", ti.i32, 2), self.part, chunks)
+        self.fields = reduction_fields(self.arena, CAPACITY, serial)
 
     def __call__(self, contacts, tolerance: float, cell: float, seed=0, feature=None, gap=None, lowest_gap=-np.inf) -> np.ndarray:
         """Indices of the contacts kept. contacts: point (k,3), normal (k,3), body (k,2); seed: of the lengths of the parts."""
@@ -44,6 +44,7 @@ class Reducer:
             whole[places] = values
             field.from_numpy(whole)
         self.used.from_numpy(used)
+        self.parts.count[TOTAL] = k
         r = self.fields
         reduce_contacts(r, self.parts, tolerance, cell, lowest_gap)
         assert (r.count[FOUND], r.count[UNDECIDED]) == (k, 0)

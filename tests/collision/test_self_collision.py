@@ -14,11 +14,10 @@ import pytest
 import taisoft as ts
 from taisoft.backend.arrays import FieldArena
 from taisoft.collision.bvh import Bvh
-from taisoft.collision.intersections import Intersections
+from taisoft.collision.intersections import INTERSECTING
 from taisoft.collision.spatial_hash import SpatialHash
-from taisoft.errors import SimulationError
 from tests.collision.checked_paths import waves
-from tests.collision.surfaces import place, separation, sheet, soup, surface_of
+from tests.collision.surfaces import place, separation, sheet, soup, surface_of, visited_pairs
 from tests.dynamics.scenes import dynamics, rubber, set_state
 
 
@@ -47,7 +46,6 @@ def test_intersections_are_those_by_separating_axes():
     with surface_of([(flat, faces), (x, free)], self_on=[True, False], margin=0.0) as made:
         tree = Bvh(made.surface, made.topology, made.x, 0.0, made.runtime, arena)
         cells = SpatialHash(made.surface, arena, 0.2, np.ones(3))
-        finder, other = Intersections(made.surface, arena, capacity=64), Intersections(made.surface, FieldArena())
         t, own, total = made.topology.triangle, made.topology.body == 0, 0
         for _ in range(8):
             folded = flat + sum(waves(flat, rng, 0.5) for _ in range(4))
@@ -56,19 +54,17 @@ def test_intersections_are_those_by_separating_axes():
             pairs = close_pairs(made.x, t)
             pairs = pairs[own[pairs].any(axis=1)]
             expected = pairs[separation(np.concatenate([made.x[t[pairs[:, 0]]], made.x[t[pairs[:, 1]]]], axis=1)) <= 1e-13]
-            assert np.array_equal(finder.find(tree.find()), expected) and np.array_equal(other.find(cells.find()), expected)
+            assert all(np.array_equal(visited_pairs(made, broad, INTERSECTING), expected) for broad in (tree, cells))
             pierced = {pair for pair in judged(ipctk, made.x, t) if own[list(pair)].any()}
             assert pierced <= set(map(tuple, expected.tolist())) and own[expected].all(axis=1).any()
             total += len(pierced)
-        assert total > 300 and finder.pairs.growths
+        assert total > 300 and made.pairs.growths
         x = made.x.copy()
         x[t[expected[0, 0], 0]] = np.nan
         place(made, x)
         kept = np.isfinite(x[t[expected]]).all(axis=(1, 2, 3))
-        assert np.array_equal(finder.find(tree.find()), expected[kept]) and not kept.all()
-        with pytest.raises(SimulationError, match="intersections: [0-9]+ entries are needed .* allows 64"):
-            Intersections(made.surface, FieldArena(), capacity=64, max_capacity=64).find(tree.find())
-    for part in (tree, cells, finder, other, arena):
+        assert np.array_equal(visited_pairs(made, tree, INTERSECTING), expected[kept]) and not kept.all()
+    for part in (tree, cells, arena):
         part.release()
 
 

@@ -4,17 +4,13 @@
   is not zero;
 * colourings give adjacent contacts different colours, number them without gaps and use at most degree + 1; groups hold every
   contact once, by colour; the kernels colour first-fit, alike on any number of threads;
-* the index of each node's contacts made for many threads, as on CUDA, is the serial one.
+* the contacts of each node are listed in ascending order, on any number of threads.
 """
-
-from dataclasses import replace
 
 import numpy as np
 import pytest
 import scipy.sparse as sp
-import taichi as ti
 
-from taisoft.backend.arrays import FieldArena
 from taisoft.contact import colouring, problem
 from taisoft.contact.colouring import colour_greedy, colour_random, groups, matrix_graph, node_graph
 from tests.contact import contact_oracle as oracle
@@ -82,7 +78,7 @@ def test_kernels_colour_first_fit(rig, k):
         found.append(p.colour.to_numpy()[:k])
         order, start = np.argsort(found[0], kind="stable"), np.cumsum([0, *np.bincount(found[0])])
         assert p.count[1] == len(start) - 1 and np.array_equal(p.order.to_numpy()[:k], order)
-        assert np.array_equal(p.colour_start.to_numpy()[: len(start)], start)
+        assert np.array_equal(p.by_colour.start.to_numpy()[: len(start)], start)
         p.count[0] = 0
         colouring.colour_contacts(p)
         assert p.count[1] == 0
@@ -92,17 +88,14 @@ def test_kernels_colour_first_fit(rig, k):
 
 
 @pytest.mark.parametrize("n", [0, 1, 300])
-def test_index_for_many_threads(rig, n):
-    arena, made = FieldArena(), oracle.random_contacts(9, max(n, 1), N_NODES)
-    scan = arena.field("scan", ti.i32, problem.SCAN)
+def test_index_of_nodes(rig, n):
+    made = oracle.random_contacts(9, max(n, 1), N_NODES)
+    expected = [
+        [problem.NODES * c + k for c in range(n) for k in range(made.arity[c]) if made.node[c, k] == i] for i in range(N_NODES)
+    ]
     for serial in (True, False):
         p = rig.nodes(made, serial)
         p.count[0] = n
         problem.index_nodes(p)
-        start, entry = p.entry_start.to_numpy(), p.entry.to_numpy()
-        p.entry_start.fill(-1)
-        p.entry.fill(-1)
-        problem.index_nodes(replace(p, on_cpu=False, scan=scan))
-        assert np.array_equal(p.entry_start.to_numpy(), start) and start[-1] == made.arity[:n].sum()
-        assert np.array_equal(p.entry.to_numpy()[: start[-1]], entry[: start[-1]])
-    arena.release()
+        start, entry = p.by_node.start.to_numpy(), p.entry.to_numpy()
+        assert [entry[a:b].tolist() for a, b in zip(start[:N_NODES], start[1:])] == expected

@@ -38,7 +38,7 @@ ORDER = (
     ("backend.launching",),
     ("backend.counters",),
     ("backend.runtime",),
-    ("backend.parallel",),
+    ("backend.parallel", "backend.lists"),
     ("mesh", "scene"),
     ("fem.state", "fem.math3", "fem.node_graph", "fem.chunks"),
     (
