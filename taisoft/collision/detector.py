@@ -16,12 +16,12 @@ from taisoft.collision.bvh import Bvh, Trees
 from taisoft.collision.candidates import Buffer, Candidates, Parts, entries, fill, pair_entries, pairs_of
 from taisoft.collision.colliders import body_grid, collider_surfaces, collider_thickness, prescribed_vertices
 from taisoft.collision.contacts import FOUND, LEFT, Contacts, contact_fields, named_contacts, reduce_contacts, reduction_fields
+from taisoft.collision.containment import Containment, Inside
 from taisoft.collision.distance_field import DistanceFields, build_fields, find_in_fields
 from taisoft.collision.edge_edge import PROXIMITY, find_proximity
 from taisoft.collision.features import BY_EDGES, BY_FACES, BY_FIELD
 from taisoft.collision.intersections import CROSSINGS_OF, INTERSECTING, find_crossings
 from taisoft.collision.near_list import STILL
-from taisoft.collision.overlap import Containment, Inside
 from taisoft.collision.passages import ROUND, append_passages
 from taisoft.collision.path_check import NO_PASSAGES, HeldPassages, PathCheck
 from taisoft.collision.spatial_hash import SpatialHash
