@@ -10,12 +10,11 @@ A small mesh runs all its sub-steps in one serial kernel; a large one takes two 
 import taichi as ti
 
 from taisoft.backend.runtime import kernel
-from taisoft.dynamics.rigid_motion import project_all, project_velocities, turn_all, turn_drifted
-from taisoft.fem.dependents import force_with_dependents, place, place_all
-from taisoft.fem.lanes import broadcast
+from taisoft.dynamics.rigid_motion import project_all, turn_all
+from taisoft.fem.dependents import force_with_dependents, place_all
 from taisoft.fem.state import FAILED, INVERTED_NOW, LOWEST_J, MOST_INVERTED, STEPS_DONE
 from taisoft.fem.terms import elasticity, rayleigh_damping
-from taisoft.fem.terms.elasticity import EXPLODED, HUGE
+from taisoft.fem.terms.elasticity import HUGE
 
 
 @ti.func
@@ -145,7 +144,7 @@ def prescribe_positions(m: ti.template(), s: ti.template(), row):
 
 @ti.func
 def prescribe_all(m: ti.template(), s: ti.template(), row, dt):
-    """`prescribe`, as top-level loops of a kernel: on the CPU on one thread, since several would take longer to start."""
+    """`prescribe`, in loops: on the CPU on one thread, since several would take longer to start."""
     if ti.static(m.on_cpu):
         ti.loop_config(serialize=True)
         for _ in range(1):
@@ -189,8 +188,9 @@ def compute_reactions(m: ti.template(), s: ti.template(), dt):
 
 
 @ti.func
-def save_held_velocities(m: ti.template(), s: ti.template()):
-    for k in range(s.n_held):
+def save_held_velocities(m: ti.template(), s: ti.template(), n):
+    """Save the velocities of the first n held nodes: of all before the last sub-step, whose reactions need them."""
+    for k in range(n):
         s.held_velocity[k] = m.state.v[s.held[k]]
 
 
@@ -199,123 +199,18 @@ def begins_alone(m, s) -> bool:
     return s.has_prescribed or s.has_varied_loads or m.has_rigid_tets
 
 
-@ti.func
-def begin_substep(m: ti.template(), s: ti.template(), done, n, dt, begun):
-    """Run the part of a sub-step before the element loop, serially. begun: 1 if the nodes have drifted already."""
-    if ti.static(s.has_held):
-        if done == n - 1:
-            save_held_velocities(m, s)
-    if ti.static(s.has_prescribed):
-        save_prescribed_positions(m, s)
-    if ti.static(s.verlet):
-        if begun == 0:
-            for i in range(m.n_nodes):
-                verlet_drift(m, s, i, dt, verlet_half(m, s, i, dt, verlet_decay(m, s, i, dt)))
-        if ti.static(m.has_rigid_tets):
-            for k in range(m.rigid_tets.n):
-                turn_drifted(m, s, k, dt)
-        if ti.static(s.has_prescribed):
-            prescribe(m, s, done, dt)
-    if ti.static(s.has_varied_loads):
-        set_loads(m, s, done)
+# --- loops: at the top level of a kernel, or inside the loop of `advance_alone` -----------------------------------------
 
 
 @ti.func
-def end_substep(m: ti.template(), s: ti.template(), done, n, dt, drift):
-    """Run the part of a sub-step after the element loop, serially. Return the sum of the velocities.
-
-    drift: 1 to begin the next sub-step of Verlet, as in `nodes_parallel`.
-    """
-    total = ti.Vector([0.0, 0.0, 0.0], ti.f64)
-    for i in range(m.n_nodes):
-        if ti.static(s.verlet):
-            decay = verlet_decay(m, s, i, dt)
-            total += verlet_kick(m, s, i, dt, decay)
-            if ti.static(not begins_alone(m, s)):
-                if drift == 1:
-                    verlet_drift(m, s, i, dt, verlet_half(m, s, i, dt, decay))
-        else:
-            total += euler_node(m, i, dt)
-    if ti.static(m.has_rigid_tets):
-        for k in range(m.rigid_tets.n):
-            if ti.static(s.verlet):
-                project_velocities(m, k)
-            else:
-                turn_drifted(m, s, k, dt)
-    if ti.static(s.has_prescribed):
-        prescribe(m, s, done, dt)
+def begin_substep(m: ti.template(), s: ti.template(), row, dt, saves, drifts):
+    """Run the part of a sub-step before the elements. saves: 1 in the last one; drifts: 0 if the nodes have drifted already."""
     if ti.static(s.has_held):
-        if done == n - 1:
-            compute_reactions(m, s, dt)
-    return total
-
-
-@kernel
-def advance_serial(m: ti.template(), s: ti.template(), n: ti.i32, dt: ti.f64, restart: ti.i32):
-    """Take n sub-steps of dt on one thread. scalars: STEPS_DONE, LOWEST_J, MOST_INVERTED.
-
-    Stop after a sub-step with a non-finite velocity or an exploded tet. restart: recompute Verlet's stale acceleration.
-    """
-    ti.loop_config(serialize=True)
-    for _ in range(1):
-        done, running, begun = 0, True, 0
-        lowest_by_lane = broadcast(ti.cast(HUGE, m.real), m.lanes)
-        min_J, max_inverted = ti.cast(HUGE, m.real), 0
-        starting = False
-        if ti.static(s.verlet):
-            starting = restart != 0
-            keep_decays(m, s, dt)
-        while starting or (done < n and running):
-            if not starting:
-                begin_substep(m, s, done, n, dt, begun)
-            lowest_now, inverted = elasticity.sum_elements_serially(m)
-            if starting:  # forces alone, in the loop of the sub-steps: another copy of them takes long to compile
-                if ti.static(s.verlet):
-                    for i in range(m.n_nodes):
-                        s.acceleration[i] = acceleration(m, i)
-                starting = False
-            else:
-                lowest_by_lane = ti.min(lowest_by_lane, lowest_now)
-                if ti.static(s.verlet and not begins_alone(m, s)):
-                    last = n - 1
-                    if ti.static(s.has_held):  # whose velocities before the last one are needed
-                        last = n - 2
-                    begun = 1 if done < last else 0
-                total = end_substep(m, s, done, n, dt, begun)
-                low, count = elasticity.lowest_and_count(m, lowest_by_lane, inverted)
-                min_J, max_inverted = low, ti.max(max_inverted, count)
-                running = min_J > -EXPLODED and not nonfinite(total[0] + total[1] + total[2])
-                done += 1
-        if ti.static(m.has_dependents):
-            for k in range(m.dependents.n):
-                place(m, k)
-        m.state.scalars[STEPS_DONE] = done - (0 if running else 1)
-        m.state.scalars[LOWEST_J], m.state.scalars[MOST_INVERTED] = min_J, max_inverted
-
-
-@kernel
-def run_elements(m: ti.template()):
-    """Run the element loop of a sub-step. scalars: LOWEST_J, INVERTED_NOW, FAILED."""
-    elasticity.sum_elements_with_damping(m)
-
-
-@kernel
-def find_acceleration(m: ti.template(), s: ti.template()):
-    """Compute Verlet's acceleration of the present state, after `run_elements`."""
-    ti.loop_config(serialize=m.serial)
-    for i in range(m.n_nodes):
-        s.acceleration[i] = acceleration(m, i)
-
-
-@kernel
-def drift_parallel(m: ti.template(), s: ti.template(), row: ti.i32, dt: ti.f64):
-    """Run the part of a sub-step before the element loop."""
-    if ti.static(s.has_held):
-        save_held_velocities(m, s)
+        save_held_velocities(m, s, saves * s.n_held)
     if ti.static(s.has_prescribed):
         save_prescribed_positions(m, s)
     if ti.static(s.verlet):
-        for i in range(m.n_nodes):
+        for i in range(drifts * m.n_nodes):
             verlet_drift(m, s, i, dt, verlet_half(m, s, i, dt, verlet_decay(m, s, i, dt)))
         turn_all(m, s, dt)
         if ti.static(s.has_prescribed):
@@ -326,19 +221,20 @@ def drift_parallel(m: ti.template(), s: ti.template(), row: ti.i32, dt: ti.f64):
             set_loads(m, s, row)
 
 
-@kernel
-def nodes_parallel(m: ti.template(), s: ti.template(), row: ti.i32, dt: ti.f64, drift: ti.i32):
-    """Run the part of a sub-step after the element loop. scalars: STEPS_DONE, MOST_INVERTED, FAILED.
+@ti.func
+def end_substep(m: ti.template(), s: ti.template(), row, dt, drift):
+    """Run the part of a sub-step after the elements. scalars: STEPS_DONE, MOST_INVERTED, FAILED.
 
-    drift: 1 to begin the next sub-step of Verlet, which `drift_parallel` would do in a loop of its own.
+    drift: 1 to begin the next sub-step of Verlet, which `begin_substep` would do in a loop of its own.
     """
     for i in range(m.n_nodes):
         v = ti.Vector([0.0, 0.0, 0.0], ti.f64)
         if ti.static(s.verlet):
             decay = verlet_decay(m, s, i, dt)
             v = verlet_kick(m, s, i, dt, decay)
-            if drift == 1:
-                verlet_drift(m, s, i, dt, verlet_half(m, s, i, dt, decay))
+            if ti.static(not begins_alone(m, s)):
+                if drift == 1:
+                    verlet_drift(m, s, i, dt, verlet_half(m, s, i, dt, decay))
         else:
             v = euler_node(m, i, dt)
         if nonfinite(v[0] + v[1] + v[2]):
@@ -358,16 +254,83 @@ def nodes_parallel(m: ti.template(), s: ti.template(), row: ti.i32, dt: ti.f64, 
             m.state.scalars[STEPS_DONE] = m.state.scalars[STEPS_DONE] + 1.0
 
 
-@kernel
-def react_parallel(m: ti.template(), s: ti.template(), dt: ti.f64):
-    """Compute the reactions of the last sub-step of a batch."""
-    compute_reactions(m, s, dt)
+@ti.func
+def reset_counters(m: ti.template()):
+    """Begin to count, inside a loop on one thread."""
+    m.state.scalars[STEPS_DONE], m.state.scalars[LOWEST_J], m.state.scalars[FAILED] = 0.0, HUGE, 0.0
+    m.state.scalars[MOST_INVERTED], m.state.scalars[INVERTED_NOW] = 0.0, 0.0
+
+
+# --- kernels ------------------------------------------------------------------------------------------------------------
 
 
 @kernel
-def begin_parallel(m: ti.template()):
-    """Reset the counters of a batch of parallel sub-steps."""
+def advance_alone(m: ti.template(), s: ti.template(), n: ti.i32, dt: ti.f64, restart: ti.i32):
+    """Take n sub-steps of dt on one thread. scalars: STEPS_DONE, LOWEST_J, MOST_INVERTED.
+
+    Stop after a sub-step with a non-finite velocity or an exploded tet. restart: recompute Verlet's stale acceleration.
+    """
     ti.loop_config(serialize=True)
     for _ in range(1):
-        m.state.scalars[STEPS_DONE], m.state.scalars[LOWEST_J], m.state.scalars[FAILED] = 0.0, HUGE, 0.0
-        m.state.scalars[MOST_INVERTED], m.state.scalars[INVERTED_NOW] = 0.0, 0.0
+        row, begun, starting = 0, 0, False
+        reset_counters(m)
+        if ti.static(s.verlet):
+            starting = restart != 0
+            keep_decays(m, s, dt)
+        while starting or (row < n and m.state.scalars[FAILED] == 0.0):
+            if not starting:
+                begin_substep(m, s, row, dt, int(row == n - 1), 1 - begun)
+            elasticity.sum_elements_with_damping(m)
+            if starting:  # forces alone, in the loop of the sub-steps: another copy of them takes long to compile
+                if ti.static(s.verlet):
+                    for i in range(m.n_nodes):
+                        s.acceleration[i] = acceleration(m, i)
+                reset_counters(m)
+                starting = False
+            else:
+                if ti.static(s.verlet and not begins_alone(m, s)):
+                    begun = int(row < n - ti.static(2 if s.has_held else 1))  # held: velocities before the last one are needed
+                end_substep(m, s, row, dt, begun)
+                row += 1
+        if ti.static(s.has_held):
+            compute_reactions(m, s, dt)
+
+
+@kernel
+def begin_batch(m: ti.template()):
+    """Reset the counters of a batch."""
+    ti.loop_config(serialize=True)
+    for _ in range(1):
+        reset_counters(m)
+
+
+@kernel
+def run_elements(m: ti.template()):
+    """Run the element loop of a sub-step. scalars: LOWEST_J, INVERTED_NOW, FAILED."""
+    elasticity.sum_elements_with_damping(m)
+
+
+@kernel
+def find_acceleration(m: ti.template(), s: ti.template()):
+    """Compute Verlet's acceleration of the present state, after `run_elements`."""
+    ti.loop_config(serialize=m.serial)
+    for i in range(m.n_nodes):
+        s.acceleration[i] = acceleration(m, i)
+
+
+@kernel
+def begin_shared(m: ti.template(), s: ti.template(), row: ti.i32, dt: ti.f64):
+    """See `begin_substep`."""
+    begin_substep(m, s, row, dt, 1, 1)
+
+
+@kernel
+def end_shared(m: ti.template(), s: ti.template(), row: ti.i32, dt: ti.f64, drift: ti.i32):
+    """See `end_substep`."""
+    end_substep(m, s, row, dt, drift)
+
+
+@kernel
+def find_reactions(m: ti.template(), s: ti.template(), dt: ti.f64):
+    """Compute the reactions of the last sub-step of a batch."""
+    compute_reactions(m, s, dt)

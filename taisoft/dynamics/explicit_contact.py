@@ -41,7 +41,7 @@ def predict(m: ti.template(), s: ti.template(), dt: ti.f64):
     ti.loop_config(serialize=True)
     for _ in range(1):
         if ti.static(s.has_held):
-            save_held_velocities(m, s)
+            save_held_velocities(m, s, s.n_held)
         if ti.static(s.has_prescribed):
             save_prescribed_positions(m, s)
     ti.loop_config(serialize=m.serial)

@@ -57,7 +57,7 @@ class ContactExplicitStepper(ExplicitStepper):
         If a sub-step fails, the state is the one before it.
         """
         simulation, m, results, depth, done = self.simulation, self.simulation.model, [], 0.0, 0
-        explicit.begin_parallel(m)
+        explicit.begin_batch(m)
         n, start = min(n, self.max_batch), simulation.time
         self.good.copy_from(simulation.now)
         releases, targets = simulation.releases, None

@@ -243,19 +243,19 @@ class ExplicitStepper:
         if s.has_varied_loads:
             self.simulation.load_time = None  # sub-steps set them
         if m.serial:
-            explicit.advance_serial(m, s, n, dt, int(self.acceleration_stale))
+            explicit.advance_alone(m, s, n, dt, int(self.acceleration_stale))
         else:
-            self._launch_parallel(n, dt)
+            self._launch_shared(n, dt)
         self.acceleration_stale = False
         done, lowest, inverted = m.state.scalars.to_numpy()[STEPS_DONE : MOST_INVERTED + 1].tolist()
         return StepResult(int(done), min_volume_ratio=lowest, n_inverted=int(inverted))
 
-    def _launch_parallel(self, n: int, dt: float) -> None:
+    def _launch_shared(self, n: int, dt: float) -> None:
         m, s = self.simulation.model, self.work
         if s.verlet and self.acceleration_stale:
             explicit.run_elements(m)
             explicit.find_acceleration(m, s)
-        explicit.begin_parallel(m)
+        explicit.begin_batch(m)
         special = explicit.begins_alone(m, s)
 
         def needs_drift(row: int) -> bool:  # not in the loop over nodes that ends the last sub-step
@@ -264,11 +264,11 @@ class ExplicitStepper:
 
         for row in range(n):
             if needs_drift(row):
-                explicit.drift_parallel(m, s, row, dt)
+                explicit.begin_shared(m, s, row, dt)
             explicit.run_elements(m)
-            explicit.nodes_parallel(m, s, row, dt, int(s.verlet and row < n - 1 and not needs_drift(row + 1)))
+            explicit.end_shared(m, s, row, dt, int(s.verlet and row < n - 1 and not needs_drift(row + 1)))
         if s.n_held:
-            explicit.react_parallel(m, s, dt)
+            explicit.find_reactions(m, s, dt)
 
     @property
     def field_bytes(self) -> dict[str, int]:

@@ -177,22 +177,3 @@ def find_rates(m: ti.template(), u: ti.template()):
         ti.loop_config(serialize=m.serial)
         for p in range(m.mean.n_patches):
             m.mean.rate[p] = patch_mean(m, p)
-
-
-@ti.func
-def find_serially(m: ti.template()):
-    """Compute dilatations, and with stiffness damping their rates, inside a serial loop."""
-    if ti.static(m.mean_dilatation):
-        for g in ti.static(m.groups):
-            if ti.static(g.mean_dilatation):
-                for b in range(g.first, g.last):
-                    element_dilatation(m, g, b)
-        for p in range(m.mean.n_patches):
-            m.mean.dilatation[p] = patch_mean(m, p)
-        if ti.static(m.stiffness_damping):
-            for g in ti.static(m.groups):
-                if ti.static(g.mean_dilatation):
-                    for b in range(g.first, g.last):
-                        element_rate(m, g, b, m.state.v)
-            for p in range(m.mean.n_patches):
-                m.mean.rate[p] = patch_mean(m, p)

@@ -10,7 +10,7 @@ import taichi as ti
 
 from taisoft.backend.runtime import kernel
 from taisoft.fem.chunks import block_first
-from taisoft.fem.dependents import place, place_all
+from taisoft.fem.dependents import place_all
 from taisoft.fem.lanes import (
     add_forces,
     broadcast,
@@ -29,7 +29,7 @@ from taisoft.fem.lanes import (
 )
 from taisoft.fem.laws import dpk1_projected, prepare_projected
 from taisoft.fem.math3 import determinant, matmul_nt, matmul_tn
-from taisoft.fem.mean_dilatation import find_dilatations, find_rates, find_serially, patch_energy, patch_values, stress_constants
+from taisoft.fem.mean_dilatation import find_dilatations, find_rates, patch_energy, patch_values, stress_constants
 from taisoft.fem.node_graph import BLOCKS, EVERYTHING, block_of, count_of
 from taisoft.fem.state import FAILED, INVERTED_NOW, LOWEST_J, OTHER_SUM, SUM
 
@@ -176,26 +176,6 @@ def sum_chunk(m: ti.template(), c):
             J = element_force(m, g, m.stiffness_damping, b)
             lowest = ti.min(lowest, J)
             inverted += count_inverted(m, b, J)
-    return lowest, inverted
-
-
-@ti.func
-def sum_elements_serially(m: ti.template()):
-    """The same inside a serial loop. Returns the smallest J and the number of inverted tets, per lane."""
-    lowest = broadcast(ti.cast(HUGE, m.real), m.lanes)
-    inverted = broadcast(ti.cast(0, ti.i32), m.lanes)
-    if ti.static(m.has_dependents):
-        for k in range(m.dependents.n):
-            place(m, k)
-    find_serially(m)
-    for c in range(m.chunks):
-        J, bad = sum_chunk(m, c)
-        lowest = ti.min(lowest, J)
-        inverted += bad
-    for term in ti.static(m.terms):
-        if ti.static(term.PREPARED):
-            for k in range(term.count(m)):
-                term.prepare(m, k)
     return lowest, inverted
 
 
