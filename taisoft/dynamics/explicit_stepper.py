@@ -13,6 +13,7 @@ from taisoft.dynamics.simulation_state import SimulationState
 from taisoft.errors import SimulationError
 from taisoft.fem.model import Model
 from taisoft.fem.state import LOWEST_J, MOST_INVERTED, STEPS_DONE
+from taisoft.fem.terms.elasticity import EXPLODED
 from taisoft.settings import Settings
 
 
@@ -211,7 +212,7 @@ class ExplicitStepper:
         """Describe the failure of the last sub-step, from its state."""
         lowest = self.simulation.model.state.scalars[LOWEST_J]
         exploded = f"a tet is inverted by {-lowest:.1e} times its volume: the motion has diverged, and a smaller dt is needed"
-        other = exploded if lowest <= -explicit.EXPLODED else "a velocity is no longer finite"
+        other = exploded if lowest <= -EXPLODED else "a velocity is no longer finite"
         return self.simulation.find_nonfinite() or other
 
     def _upload_rows(self, targets: np.ndarray | None, loads: tuple[np.ndarray, np.ndarray] | None) -> None:
