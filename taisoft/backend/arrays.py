@@ -88,10 +88,6 @@ class Array:
             device_memory.read(self.device, data)
         return data
 
-    def at(self, indices: np.ndarray) -> np.ndarray:
-        """Return a copy of the entries at some indices (k,)."""
-        return (self.memory if self.memory is not None else self._download())[indices]
-
     def check(self, data: np.ndarray) -> None:
         """Raise ValueError unless data has the array's shape."""
         if data.shape != self.full_shape:
@@ -124,7 +120,7 @@ class Array:
         self.device = None
 
     def __getitem__(self, at):
-        """Return a copy of one entry, on the host."""
+        """Return a copy of one entry, or of those at indices (k,), on the host."""
         if self.memory is not None and type(at) is int and not (self.n or len(self.shape) > 1):
             return self.memory.item(at)
         entry = (self.memory if self.memory is not None else self._download())[at]

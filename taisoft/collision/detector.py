@@ -258,8 +258,8 @@ class Detection:
         """Return the contacts of the last search, with impulses 0, in order of colliders and feature: one that does not depend on
         threads or chunks."""
         data, at, counts = self.buffer.data, self.kept.to_numpy(self.counts.contacts), self.counts
-        at = at[np.lexsort(np.hstack([data.body.at(at), data.feature.at(at)])[:, ::-1].T)]
-        point, normal, gap, collider, feature = (x.at(at) for x in (data.point, data.normal, data.gap, data.body, data.feature))
+        at = at[np.lexsort(np.hstack([data.body[at], data.feature[at]])[:, ::-1].T)]
+        point, normal, gap, collider, feature = (x[at] for x in (data.point, data.normal, data.gap, data.body, data.feature))
         what = np.zeros((len(at), 3)), collider, feature, *self.sides(at)
         return named_contacts(self.scene, point, normal, gap, *what, found=counts.found, unmapped=counts.unmapped)
 
@@ -269,9 +269,14 @@ class Detection:
         There are three of each side, -1 where there is none.
         """
         data = self.buffer.data
-        vertices = np.hstack([data.nodes_a.at(at), data.nodes_b.at(at)])
+        vertices = np.hstack([data.nodes_a[at], data.nodes_b[at]])
         nodes = np.where(vertices >= 0, np.append(self.topology.node, -1)[vertices], -1)
-        return nodes, np.where(nodes >= 0, np.hstack([data.weights_a.at(at), data.weights_b.at(at)]), 0.0)
+        return nodes, np.where(nodes >= 0, np.hstack([data.weights_a[at], data.weights_b[at]]), 0.0)
+
+    @property
+    def found(self) -> tuple:
+        """The contacts of the last search, for kernels: surface, shapes, buffer, and the indices there of those that are kept."""
+        return self.surface, self.shapes, self.buffer.data, self.kept
 
     @property
     def kept(self):

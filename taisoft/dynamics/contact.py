@@ -45,22 +45,22 @@ class ContactStep:
 
     def __init__(self, simulation: SimulationState, self_collision: bool, explicit: bool):
         self.simulation = simulation
-        m, scene = simulation.model, simulation.scene
-        self.detection = Detection(scene, m, simulation.layout, simulation.runtime, self_collision)
+        model, scene = simulation.model, simulation.scene
+        self.detection = Detection(scene, model, simulation.layout, simulation.runtime, self_collision)
         self._lasting = FieldArena()  # of arrays that stay as they are
         self.measures = ContactMeasures(self.detection, self._lasting)
         self.paths = ContactPaths(simulation, self.detection, self._lasting)
         self.misplaced = Misplacement(simulation, self.detection)
-        d = self.detection
-        self.contact_offset = self.OFFSET * float(d.edges[: len(scene.bodies)].min())
-        if d.margin > 0.0:
-            self.contact_offset = min(self.contact_offset, 0.5 * d.margin / (SELF_CONTACT if self_collision else 1.0))
+        detection = self.detection
+        self.contact_offset = self.OFFSET * float(detection.edges[: len(scene.bodies)].min())
+        if detection.margin > 0.0:
+            self.contact_offset = min(self.contact_offset, 0.5 * detection.margin / (SELF_CONTACT if self_collision else 1.0))
         # parts of a penetration and of a missing contact offset that a step corrects
         self._corrections = (0.05, 0.005) if explicit else (0.2, 0.02)
         self._substep_fraction = 1.0  # of the step, that the current substep takes
         self.gap_targets = self._gap_targets()
         self._arena = FieldArena()
-        self._allocate(2 * d.surface.n_triangles + 1024)  # contacts at first
+        self._allocate(2 * detection.surface.n_triangles + 1024)  # contacts at first
         self._numbers_arena = FieldArena()
         self.numbers = build_pair_numbers(self._numbers_arena, scene)
         self.rebounds = Rebounds(simulation, self._lasting)
@@ -84,9 +84,9 @@ class ContactStep:
         self.dropped = 0  # triangles of the last step under an inverted tet, for which a distance field gives no contacts
 
     def _allocate(self, capacity: int) -> None:
-        arena, m = FieldArena(), self.simulation.model
+        arena, model = FieldArena(), self.simulation.model
         masters = 1 if self.simulation.dependents is None else self.simulation.dependents.most_masters
-        self.problem = build_node_problem(arena, capacity, m.n_nodes, m.on_cpu, masters)  # of the last step begun
+        self.problem = build_node_problem(arena, capacity, model.n_nodes, model.on_cpu, masters)  # of the last step begun
         self._arena.release()
         self._arena, self._last_time, self._indexed = arena, 0.0, False
 
@@ -185,12 +185,12 @@ class ContactStep:
 
     def search(self, time: float, dt: float) -> int:
         """Find the contacts of the present state at a time [s], swept by dt, unless known. Return their number."""
-        simulation, d, searched = self.simulation, self.detection, self._searched
+        simulation, detection, searched = self.simulation, self.detection, self._searched
         if searched is None or searched[1] != dt or abs(searched[0] - time) > 1e-6 * dt:
             self._searched = None
             self._find(time, dt, simulation.prescribed_moves(time + dt))
             self._searched = time, dt
-        return d.counts.contacts
+        return detection.counts.contacts
 
     def _find(self, time: float, dt: float, prescribed=None, path=None) -> None:
         """Call `Detection.find`; where nothing crosses, implicit steps drop what may never touch."""
@@ -201,20 +201,21 @@ class ContactStep:
 
     def begin(self, time: float, dt: float) -> int:
         """Fill the problem for a step of dt [s] from the state at a time, warm-started. Return its number of contacts."""
-        n, d, m, self._measured_end = self.search(time, dt), self.detection, self.simulation.model, None
+        n, self._measured_end, model = self.search(time, dt), None, self.simulation.model
+        (surface, shapes, found, kept), counts = self.detection.found, self.detection.counts
         self.gap_targets = self._gap_targets()
-        self.dropped, self._search_counts = max(self.dropped, d.counts.unmapped), (d.counts.found, d.counts.unmapped)
+        self.dropped, self._search_counts = max(self.dropped, counts.unmapped), (counts.found, counts.unmapped)
         if n > self.problem.capacity:
             self._allocate(2 * n)
-        p = self.problem
-        if m.has_dependents and n:
-            n = drop_vanishing(p, m, d.surface, d.buffer.data, d.kept, n)
-        keep_impulses(p, self.contact_offset)
+        problem = self.problem
+        if model.has_dependents and n:
+            n = drop_vanishing(problem, model, surface, found, kept, n)
+        keep_impulses(problem, self.contact_offset)
         warm = dt / self._last_time if self._last_time > 0.0 else 0.0
-        fill(p, m, d.surface, d.shapes, self.numbers, d.buffer.data, d.kept, n, dt, warm)
-        self._own_sides = d.sides(d.kept.to_numpy(n)) if m.has_dependents else None
+        fill(problem, model, surface, shapes, self.numbers, found, kept, n, dt, warm)
+        self._own_sides = self.detection.sides(kept.to_numpy(n)) if model.has_dependents else None
         if n or self._indexed:  # an empty index needs no update
-            index_nodes(p)
+            index_nodes(problem)
             self._indexed = n > 0
         self._last_time, self._impulse_fraction, self.had_impact = dt, 1.0, False
         return n
@@ -352,8 +353,8 @@ class ContactStep:
         self.paths.use_all()
         self._find(time, dt, path=self.paths.displacement)
         self._searched = time, dt
-        d, known = self.detection, set(map(tuple, self.problem.feature.to_numpy(self.n_contacts).tolist()))
-        found = d.buffer.data.feature.at(d.kept.to_numpy(d.counts.contacts))
+        detection, known = self.detection, set(map(tuple, self.problem.feature.to_numpy(self.n_contacts).tolist()))
+        found = detection.buffer.data.feature[detection.kept.to_numpy(detection.counts.contacts)]
         return not known.issuperset(map(tuple, found.tolist()))
 
     def measure_start(self, time: float, dt: float) -> tuple[float, float]:

@@ -62,8 +62,8 @@ class ContactMeasures:
     def closing(self) -> np.ndarray:
         """The result of `measure_closing` for the step of the last search."""
         if self._measured is None:
-            d = self.detection
-            measure_closing(d.surface, d.shapes, d.buffer.data, d.kept, d.counts.contacts, self._dt, self._closing)
+            detection = self.detection
+            measure_closing(*detection.found, detection.counts.contacts, self._dt, self._closing)
             self._measured = self._closing.to_numpy()
         return self._measured
 
@@ -75,8 +75,8 @@ class ContactMeasures:
     def drop_uncertain(self) -> None:
         """Drop the contacts of the last search that may never touch, where the check of paths finds those that would: a plane
         across the nearest features also stops what flies past them."""
-        d = self.detection
-        d.counts.contacts = drop_uncertain(d.surface, d.shapes, d.buffer.data, d.kept, d.counts.contacts)
+        detection = self.detection
+        detection.counts.contacts = drop_uncertain(*detection.found, detection.counts.contacts)
 
     def crossing(self) -> Crossing:
         """Measure crossing triangles and contained colliders."""
@@ -97,10 +97,10 @@ class ContactMeasures:
     def describe_fast_closing(self, dt: float, substeps: int = 1) -> str:
         """Return a sentence that names the two colliders closing too fast for a step of dt, their speed, the thickness of the
         thinner one, and a sufficient dt. substeps: maximum number per step."""
-        closing, d = self.closing, self.detection
-        a, b = d.buffer.data.body[d.kept[int(closing[WHICH])]]
-        names = [d.scene.colliders[k].name for k in (a, b)]
-        thin, speed = float(min(d.thickness[a], d.thickness[b])), float(closing[SPEED])
+        closing, detection = self.closing, self.detection
+        a, b = detection.buffer.data.body[detection.kept[int(closing[WHICH])]]
+        names = [detection.scene.colliders[k].name for k in (a, b)]
+        thin, speed = float(min(detection.thickness[a], detection.thickness[b])), float(closing[SPEED])
         cut = f"even in {substeps} substeps " if substeps > 1 else ""
         return (
             f"'{names[0]}' and '{names[1]}' close at {speed:.3g} m/s, {speed * dt:.3g} m in a step of {dt:.3g} s, "

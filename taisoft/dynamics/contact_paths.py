@@ -126,18 +126,18 @@ class ContactPaths:
     def hold_back(self, x_start) -> None:
         """Shorten the paths of bodies from x_start to the present state until nothing passes through anything. The last search
         must have started there. Raise SimulationError if nothing passes only where no body can be held back."""
-        simulation, d = self._simulation, self._detection
+        simulation, detection = self._simulation, self._detection
         free = simulation.model.free.to_numpy() > 0
         path = free, x_start.to_numpy(), *simulation.state()
-        can_move = np.zeros(len(d.scene.colliders), dtype=bool)
+        can_move = np.zeros(len(detection.scene.colliders), dtype=bool)
         for body in range(len(simulation.scene.bodies)):
             can_move[body] = free[simulation.layout.nodes(body)].any()
         for together in self._attached:  # a body all of whose nodes depend on others moves with them
             inert = [k for k in together if not can_move[k] and not simulation.scene.bodies[k].constraints]
             can_move[inert] = can_move[together].any()
         part, n_rounds = can_move.astype(np.float64), 0
-        while len((found := d.passages(TO_STATE))[0]):
-            colliders, n_rounds = d.paths.colliders(found[0]), n_rounds + 1
+        while len((found := detection.passages(TO_STATE))[0]):
+            colliders, n_rounds = detection.paths.colliders(found[0]), n_rounds + 1
             stuck = ~(part[colliders] > 0.0).any(axis=1)
             if stuck.any():
                 self._refuse(*colliders[stuck][0])
@@ -150,7 +150,7 @@ class ContactPaths:
                 moving = together[can_move[together]]
                 part[moving] = part[moving].min(initial=1.0)
             self._move_in_part(part, *path)
-        self._names.update(d.scene.colliders[k].name for k in np.flatnonzero(can_move & (part < 1.0)))
+        self._names.update(detection.scene.colliders[k].name for k in np.flatnonzero(can_move & (part < 1.0)))
         listed = ", ".join(f"'{name}'" for name in sorted(self._names))
         self.held_back = f"held back {listed}, which would have passed through another surface or through itself"
 

@@ -56,8 +56,8 @@ class ContactExplicitStepper(ExplicitStepper):
 
         If a sub-step fails, the state is the one before it.
         """
-        simulation, m, results, depth, done = self.simulation, self.simulation.model, [], 0.0, 0
-        explicit.begin_batch(m)
+        simulation, model, results, depth, done = self.simulation, self.simulation.model, [], 0.0, 0
+        explicit.begin_batch(model)
         n, start = min(n, self.max_batch), simulation.time
         self.good.copy_from(simulation.now)
         releases, targets = simulation.releases, None
@@ -94,8 +94,8 @@ class ContactExplicitStepper(ExplicitStepper):
         self.contact.penetration, self.contact.relative_penetration = depth, relative_penetration
         result = StepResult(
             steps=n,
-            min_volume_ratio=m.state.scalars[LOWEST_J],
-            n_inverted=int(m.state.scalars[MOST_INVERTED]),
+            min_volume_ratio=model.state.scalars[LOWEST_J],
+            n_inverted=int(model.state.scalars[MOST_INVERTED]),
             contact_iterations=sum(r.iterations for r in results if r),
             contact_residual=max((r.residual for r in results if r), default=0.0),
             converged=all(r.converged for r in results if r) and not self.contact.paths.held_back,
@@ -140,31 +140,31 @@ class ContactExplicitStepper(ExplicitStepper):
 
     def _solve_and_move(self, step: int, time: float, dt: float) -> SolveResult | None:
         """Solve for the impulses of the contacts found, and move; return the contact solver's result, None without contacts."""
-        m, s, contact = self.simulation.model, self.work, self.contact
+        model, work, contact = self.simulation.model, self.work, self.contact
         self.simulation.set_load_time(time)
-        if s.verlet and self.acceleration_stale:
-            explicit.run_elements(m)
-            explicit.find_acceleration(m, s)
+        if work.verlet and self.acceleration_stale:
+            explicit.run_elements(model)
+            explicit.find_acceleration(model, work)
         self.acceleration_stale = False
         n = contact.begin(time, dt)
-        predict(m, s, dt)
+        predict(model, work, dt)
         result = None
         if n:
-            p = contact.problem
-            set_free_velocities(m, s, p, dt, *contact.gap_targets)
-            find_factors(p)
+            problem = contact.problem
+            set_free_velocities(model, work, problem, dt, *contact.gap_targets)
+            find_factors(problem)
             if self._rigid is not None:
-                result = self._rigid.solve(p, self.method, self.contact_tolerance, MAX_SWEEPS)
+                result = self._rigid.solve(problem, self.method, self.contact_tolerance, MAX_SWEEPS)
             else:
                 if self.method == "coloured_gauss_seidel":
-                    colour_contacts(p)
-                result = solve(p, self.method, self.contact_tolerance, MAX_SWEEPS)
-        move(m, s, contact.problem, dt, int(n > 0))
-        if s.verlet:
+                    colour_contacts(problem)
+                result = solve(problem, self.method, self.contact_tolerance, MAX_SWEEPS)
+        move(model, work, contact.problem, dt, int(n > 0))
+        if work.verlet:
             self.simulation.set_load_time(time + dt)
-            explicit.run_elements(m)
-            finish_verlet(m, s, contact.problem, dt, int(n > 0))
-        if m.state.scalars[FAILED] != 0.0:
+            explicit.run_elements(model)
+            finish_verlet(model, work, contact.problem, dt, int(n > 0))
+        if model.state.scalars[FAILED] != 0.0:
             raise SimulationError(f"step {step}: {self._describe_fault()}")
         return result
 

@@ -91,8 +91,8 @@ def _contacts(contact: "ContactStep | NoContacts", i: int, beta: float) -> dict[
     """Force [N] on node i by its contacts with each pair of colliders."""
     if contact.n_contacts == 0:
         return {}
-    p, names, found = contact.problem, [one.name for one in contact.detection.scene.colliders], {}
-    arrays = p.normal, p.tangent, p.r, p.body, p.node, p.weight, p.arity
+    problem, names, found = contact.problem, [one.name for one in contact.detection.scene.colliders], {}
+    arrays = problem.normal, problem.tangent, problem.r, problem.body, problem.node, problem.weight, problem.arity
     normal, tangent, r, collider, node, weight, arity = download(arrays, contact.n_contacts)
     impulse = r[:, :1] * normal + r[:, 1:2] * tangent + r[:, 2:] * np.cross(normal, tangent)
     used = (node == i) & (np.arange(node.shape[1]) < arity[:, None])

@@ -94,13 +94,13 @@ class ImplicitStepper:
 
     def __init__(self, simulation: SimulationState, settings: Settings, contact: ContactStep | NoContacts):
         self.simulation, self.scheme, self.contact = simulation, SCHEMES[settings.integrator], contact
-        m, arena = simulation.model, simulation.arena
+        model, arena = simulation.model, simulation.arena
         self.first, self.start = simulation.now.another(arena, "first"), simulation.now.another(arena, "now")
         self.history = History(
             self.start.x,
             self.start.v,
-            arena.vectors("v_before", ti.f64, m.n_nodes),
-            arena.vectors("x_before", ti.f64, m.n_nodes) if self.scheme.before else None,
+            arena.vectors("v_before", ti.f64, model.n_nodes),
+            arena.vectors("x_before", ti.f64, model.n_nodes) if self.scheme.before else None,
         )
         self._multipliers = Multipliers(simulation) if len(simulation.loads.multipliers) else None
         self.solver = StageSystem(simulation, contact, self.history.x_now, self._multipliers)
@@ -265,7 +265,7 @@ class ImplicitStepper:
 
     def take_substep(self, time: float, dt: float, start: np.ndarray | None = None) -> StageResult:
         """Take a substep of dt from a time with the contacts of one search. start: (n_nodes, 3) [m/s] first iterate of v."""
-        simulation, m, h, w = self.simulation, self.simulation.model, self.history, self.solver.work
+        simulation, model, history, work = self.simulation, self.simulation.model, self.history, self.solver.work
         releases = simulation.releases
         target = simulation.next_target(time + dt)
         if simulation.releases != releases or dt != self._dt:
@@ -280,11 +280,11 @@ class ImplicitStepper:
         self.dissipative = scheme.before == 0.0
         if target is not None:
             if scheme.midpoint:
-                target = 0.5 * (target + m.state.x.to_numpy()[simulation.dirichlet.prescribed_nodes])
-            prescribed = [(w.prescribed_axes, simulation.dirichlet.prescribed_axes()), (w.targets, target)]
-            if m.consistent:
+                target = 0.5 * (target + model.state.x.to_numpy()[simulation.dirichlet.prescribed_nodes])
+            prescribed = [(work.prescribed_axes, simulation.dirichlet.prescribed_axes()), (work.targets, target)]
+            if model.consistent:
                 accelerations = simulation.dirichlet.accelerations(time, dt, self.scheme.before == 0.0)
-                prescribed.append((w.prescribed_acceleration, accelerations))
+                prescribed.append((work.prescribed_acceleration, accelerations))
             upload(prescribed)
         simulation.set_load_time(time + (0.5 if scheme.midpoint else 1.0) * dt)
         if self._multipliers is not None:
@@ -295,12 +295,12 @@ class ImplicitStepper:
         extrapolation = (0.5 if scheme.midpoint else 1.0) if self._n_previous > 1 and not scheme.one_iteration else 0.0
         self._begin(scheme, extrapolation)
         if start is not None and not scheme.one_iteration:  # that one is linearised at the step's start
-            upload([(m.state.v, start)])
+            upload([(model.state.v, start)])
         result = self._solve_balanced(scheme, dt, bounces)
         if not result.converged:
             result = replace(result, imbalance=describe_imbalance(simulation, self.solver, self.contact))
         if scheme.midpoint:
-            finish_midpoint(m, h)
+            finish_midpoint(model, history)
         if not np.isfinite(result.residual):  # a NaN anywhere in x or v reaches the residual
             where = simulation.find_nonfinite(self.solver.work.residual.to_numpy()) or "the residual is not finite"
             raise SimulationError(f"step {simulation.step_count + 1}: {where}")
