@@ -54,7 +54,7 @@ def proper(graph: sp.csr_matrix, colour: np.ndarray) -> bool:
 def _parallel(p: ContactProblem) -> np.ndarray:
     index_nodes(p)
     colour_contacts(p)
-    return p.colour.to_numpy()[: int(p.count[0])]
+    return p.sweep.colour.to_numpy()[: int(p.count[0])]
 
 
 def colour_all(scene: str, p: ContactProblem, seeds: int) -> tuple[list[Colouring], dict[str, np.ndarray]]:
@@ -164,7 +164,7 @@ def build_plates(n: int, runtime: Runtime, arena: FieldArena) -> ContactProblem:
         (p.inverse_mass, one((2 * first, 3))),
         (p.b, np.column_stack([u[:, 1], u[:, 0], across])),
         (p.friction, np.full(k, FRICTION)),
-        (p.order, np.arange(k, dtype=np.int32)),
+        (p.sweep.order, np.arange(k, dtype=np.int32)),
     ):
         held.from_numpy(np.ascontiguousarray(values))
     index_nodes(p)

@@ -150,11 +150,11 @@ def sweeper_rows(problem: Problem, repeats: int) -> list[Row]:
     W, b, mu = problem.W, problem.b, problem.mu
     with api._problem(W, b, mu) as p:
         store(p, colour_greedy(matrix_graph(W)))
-        orders = {True: p.order.to_numpy(), False: np.zeros(p.capacity, dtype=np.int32)}
+        orders = {True: p.sweep.order.to_numpy(), False: np.zeros(p.capacity, dtype=np.int32)}
         orders[False][: len(mu)] = np.arange(len(mu))
 
         def sweep(method: str, momentum: bool, goal: float = GOAL, most: int = SWEEPS[-1]):
-            p.order.from_numpy(orders[method == "coloured_gauss_seidel"])
+            p.sweep.order.from_numpy(orders[method == "coloured_gauss_seidel"])
             p.r.fill(0.0)
             return solve(p, method, goal, most, momentum=momentum)
 

@@ -123,14 +123,14 @@ class Solvers:
         self, p: ContactProblem, start: np.ndarray, rounds: int, names: Iterable[str] | None = None
     ) -> dict[str, Outcome]:
         """Solve `p` to GOAL from the impulses `start` (capacity, 3) with each solver in turn; `p` is restored."""
-        r, order, k = p.r.to_numpy(), p.order.to_numpy(), int(p.count[0])
+        r, order, k = p.r.to_numpy(), p.sweep.order.to_numpy(), int(p.count[0])
         names = self.names(p) if names is None else list(names)
         residual_of, found = make_residual(p), {name: Outcome() for name in names}
         for _ in range(rounds):
             for name in names:
                 form, method = self._form(p, name)
                 p.r.from_numpy(start)
-                p.order.from_numpy(order)
+                p.sweep.order.from_numpy(order)
                 begin = clock()
                 if method == COLOURED:
                     colour_contacts(form)
@@ -141,7 +141,7 @@ class Solvers:
                 found[name].sweeps = result.iterations
                 found[name].residual = residual_of(p.r.to_numpy()[:k])
         p.r.from_numpy(r)
-        p.order.from_numpy(order)
+        p.sweep.order.from_numpy(order)
         return found
 
 

@@ -151,10 +151,10 @@ def _add_vertex(p: ti.template(), m: ti.template(), s: ti.template(), c, k, v, w
 @ti.func
 def _pair_slot(problem: ti.template(), body):
     """Slot of a pair of colliders among those of the previous step, or the empty one where it belongs."""
-    mask, found = problem.n_slots - 1, 0
+    mask, found = problem.past.n_slots - 1, 0
     k = bucket_of(body[0], body[1], 0, mask)
-    while found == 0 and problem.pair_slot[k] >= 0:
-        if (problem.previous_body[problem.pair_slot[k]] == body).all():
+    while found == 0 and problem.past.pair_slot[k] >= 0:
+        if (problem.past.collider[problem.past.pair_slot[k]] == body).all():
             found = 1
         else:
             k = (k + 1) & mask
@@ -163,7 +163,7 @@ def _pair_slot(problem: ti.template(), body):
 
 @ti.func
 def _slot(problem: ti.template(), feature):
-    return bucket_of(feature[0], feature[1], feature[2], problem.n_slots - 1)
+    return bucket_of(feature[0], feature[1], feature[2], problem.past.n_slots - 1)
 
 
 @ti.func
@@ -171,19 +171,19 @@ def _count_load(p: ti.template(), c, common_offset):
     """Add contact c to the sums of its pair, if it carries an impulse or could be opened."""
     if p.r[c][0] > 0.0 or p.gap[c] < contact_offset_of(p, c, common_offset):
         k = _pair_slot(p, p.body[c])
-        if p.pair_slot[k] < 0:
-            p.pair_slot[k] = c
-        first = p.pair_slot[k]
-        p.pair_sum[first] = p.pair_sum[first] + ti.Vector([p.r[c][0], p.factor[c][0]], ti.f64)
+        if p.past.pair_slot[k] < 0:
+            p.past.pair_slot[k] = c
+        first = p.past.pair_slot[k]
+        p.past.pair_sum[first] = p.past.pair_sum[first] + ti.Vector([p.r[c][0], p.factor[c][0]], ti.f64)
 
 
 @ti.func
 def _load(p: ti.template(), c):
     """Velocity that the impulses of the pair of contact c gave its contacts in the previous step [m/s]."""
-    first, load = p.pair_slot[_pair_slot(p, p.body[c])], ti.cast(0.0, ti.f64)
+    first, load = p.past.pair_slot[_pair_slot(p, p.body[c])], ti.cast(0.0, ti.f64)
     if first >= 0:
-        if p.pair_sum[first][1] > 0.0:
-            load = p.pair_sum[first][0] / p.pair_sum[first][1]
+        if p.past.pair_sum[first][1] > 0.0:
+            load = p.past.pair_sum[first][0] / p.past.pair_sum[first][1]
     return load
 
 
@@ -192,20 +192,20 @@ def keep_impulses(p: ti.template(), common_offset: ti.f64):
     """Store the present contacts as those of the previous step. common_offset: contact offset between different bodies [m]."""
     ti.loop_config(serialize=p.serial)
     for c in range(p.count[0]):
-        p.previous_feature[c], p.previous_body[c] = p.feature[c], p.body[c]
-        p.pair_sum[c] = ti.Vector([0.0, 0.0], ti.f64)
-        p.previous_point[c] = p.point[c]
-        p.previous_impulse[c] = to_world(p, c, p.r[c])
+        p.past.feature[c], p.past.collider[c] = p.feature[c], p.body[c]
+        p.past.pair_sum[c] = ti.Vector([0.0, 0.0], ti.f64)
+        p.past.point[c] = p.point[c]
+        p.past.impulse[c] = to_world(p, c, p.r[c])
     ti.loop_config(serialize=p.serial)
-    for k in range(p.n_slots):
-        p.slot[k] = p.pair_slot[k] = -1
+    for k in range(p.past.n_slots):
+        p.past.slot[k] = p.past.pair_slot[k] = -1
     ti.loop_config(serialize=True)
     for _ in range(1):
         for c in range(p.count[0]):
-            k = _slot(p, p.previous_feature[c])
-            while p.slot[k] >= 0:
-                k = (k + 1) & (p.n_slots - 1)
-            p.slot[k] = c
+            k = _slot(p, p.past.feature[c])
+            while p.past.slot[k] >= 0:
+                k = (k + 1) & (p.past.n_slots - 1)
+            p.past.slot[k] = c
             _count_load(p, c, common_offset)
 
 
@@ -214,16 +214,16 @@ def _warm_impulse(p: ti.template(), c):
     """World impulse of the nearest contact with the same feature in the previous step; 0 if there is none."""
     best, smallest = -1, ti.cast(ti.math.inf, ti.f64)
     k = _slot(p, p.feature[c])
-    while p.slot[k] >= 0:
-        j = p.slot[k]
-        if (p.previous_feature[j] == p.feature[c]).all():
-            d = (p.previous_point[j] - p.point[c]).norm()
+    while p.past.slot[k] >= 0:
+        j = p.past.slot[k]
+        if (p.past.feature[j] == p.feature[c]).all():
+            d = (p.past.point[j] - p.point[c]).norm()
             if d < smallest:
                 best, smallest = j, d
-        k = (k + 1) & (p.n_slots - 1)
+        k = (k + 1) & (p.past.n_slots - 1)
     impulse = dvec(0.0)
     if best >= 0:
-        impulse = p.previous_impulse[best]
+        impulse = p.past.impulse[best]
     return impulse
 
 
@@ -293,7 +293,7 @@ def fill(
         row = kept[c]
         normal, gap, point = found.normal[row], found.gap[row], found.point[row]
         p.normal[c], p.gap[c], p.point[c], p.turned[c] = normal, gap, point, found.turned[row]
-        p.tangent[c], p.order[c] = tangent(normal), c
+        p.tangent[c], p.sweep.order[c] = tangent(normal), c
         p.body[c], p.feature[c] = found.body[row], found.feature[row]
         p.friction[c], p.restitution[c] = _pair_coefficients(q, p.body[c][0], p.body[c][1])
         p.obstacle_displacement[c] = dvec(0.0)

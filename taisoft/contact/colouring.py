@@ -108,7 +108,7 @@ def groups(colour: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def store(problem: ContactProblem, colour: np.ndarray) -> None:
     """Set the colours (k,) of the problem's contacts and group them."""
     order, start = groups(colour)
-    for field, values in ((problem.colour, colour), (problem.order, order), (problem.by_colour.start, start)):
+    for field, values in ((problem.sweep.colour, colour), (problem.sweep.order, order), (problem.sweep.by_colour.start, start)):
         fill_field(field, values)
     problem.count[1] = len(start) - 1
 
@@ -137,7 +137,7 @@ def _first_free(problem: ti.template(), c):
                 for e in range(problem.by_node.start[i], problem.by_node.start[i + 1]):
                     d = problem.entry[e] // problem.width
                     if _priority(d) > _priority(c):
-                        colour = problem.colour[d]
+                        colour = problem.sweep.colour[d]
                         if colour == UNCOLOURED:
                             waiting = True
                         elif colour >= low and colour < low + BITS:
@@ -153,7 +153,7 @@ def _first_free(problem: ti.template(), c):
 def _clear_colours(problem: ti.template()):
     ti.loop_config(serialize=problem.serial)
     for c in range(problem.count[0]):
-        problem.colour[c] = UNCOLOURED
+        problem.sweep.colour[c] = UNCOLOURED
 
 
 @kernel
@@ -162,9 +162,9 @@ def _colour_round(problem: ti.template()) -> ti.i32:
     coloured = 0
     ti.loop_config(serialize=problem.serial)
     for c in range(problem.count[0]):
-        if problem.colour[c] == UNCOLOURED:
-            problem.colour[c] = _first_free(problem, c)
-            if problem.colour[c] != UNCOLOURED:
+        if problem.sweep.colour[c] == UNCOLOURED:
+            problem.sweep.colour[c] = _first_free(problem, c)
+            if problem.sweep.colour[c] != UNCOLOURED:
                 coloured += 1
     return coloured
 
@@ -173,17 +173,17 @@ def _colour_round(problem: ti.template()) -> ti.i32:
 def _group(problem: ti.template()):
     """Group the contacts by colour, in ascending order."""
     n = problem.count[0]
-    clear_counts(problem.by_colour, n)
+    clear_counts(problem.sweep.by_colour, n)
     problem.count[1] = 0
-    ti.loop_config(serialize=problem.by_colour.serial)
+    ti.loop_config(serialize=problem.sweep.by_colour.serial)
     for c in range(n):
-        count_entry(problem.by_colour, problem.colour[c])
-        ti.atomic_max(problem.count[1], problem.colour[c] + 1)
-    add_up_counts(problem.by_colour, n)
-    ti.loop_config(serialize=problem.by_colour.serial)
+        count_entry(problem.sweep.by_colour, problem.sweep.colour[c])
+        ti.atomic_max(problem.count[1], problem.sweep.colour[c] + 1)
+    add_up_counts(problem.sweep.by_colour, n)
+    ti.loop_config(serialize=problem.sweep.by_colour.serial)
     for c in range(n):
-        problem.order[place_of_entry(problem.by_colour, problem.colour[c])] = c
-    sort_lists(problem.by_colour, problem.count[1], problem.order)
+        problem.sweep.order[place_of_entry(problem.sweep.by_colour, problem.sweep.colour[c])] = c
+    sort_lists(problem.sweep.by_colour, problem.count[1], problem.sweep.order)
 
 
 def colour_contacts(problem: ContactProblem) -> None:

@@ -29,6 +29,37 @@ CHUNKS = 256  # partial sums over the contacts, so that a sum does not depend on
 
 
 @dataclass(frozen=True, eq=False)
+class SweepWork:
+    """What solvers by sweeps keep of each contact."""
+
+    relaxation: Any  # f64: largest fraction of the r-factors that a sweep uses
+    best: Any  # 3-vectors: the best impulses so far
+    sweep_start: Any  # 3-vectors: impulses at the start of the sweep
+    previous: Any  # 3-vectors: impulses after the previous sweep, before extrapolation
+    term: Any  # 2-vectors: contributions of each contact to two sums
+    partial: Any  # (CHUNKS) 2-vectors: sums over chunks of the contacts
+    order: Any  # i32: contacts in sweep order
+    colour: Any  # i32: of each contact, see `colouring`
+    by_colour: Lists  # of each colour's contacts, in `order`
+    state: Any  # (9) f64: residual, that of `best`, fraction of the r-factors; see `solve`
+    history: Any  # (HISTORY) f64: residuals at the checks of a launch
+
+
+@dataclass(frozen=True, eq=False)
+class PastContacts:
+    """Contacts of the previous step, which the next one starts from, see `build`."""
+
+    feature: Any  # 3-vectors i32
+    point: Any  # 3-vectors [m]
+    impulse: Any  # 3-vectors, world frame [N s]
+    collider: Any  # 2-vectors i32
+    n_slots: Count  # size of the hash table, a power of two
+    slot: Any  # (n_slots) i32: hash table of the contacts, -1 if empty
+    pair_slot: Any  # (n_slots) i32: of their pairs of colliders, each by one of its contacts, -1 if empty
+    pair_sum: Any  # 2-vectors: sums of normal impulses [N s] and of r-factors [kg] over a pair's contacts
+
+
+@dataclass(frozen=True, eq=False)
 class ContactProblem:
     """Fields of up to `capacity` contacts; the first count[0] are in use. Fields of the other form of W are None."""
 
@@ -41,18 +72,7 @@ class ContactProblem:
     b: Any  # 3-vectors [m/s]: u without impulses; (normal, t1, t2)
     factor: Any  # 2-vectors: r-factors of normal and tangents [kg]; 0 if nothing can move
     r: Any  # 3-vectors: impulses [N s]
-    # of the solvers
-    relaxation: Any  # f64: largest fraction of the r-factors that a sweep uses
-    best: Any  # 3-vectors: the best impulses so far
-    sweep_start: Any  # 3-vectors: impulses at the start of the sweep
-    previous: Any  # 3-vectors: impulses after the previous sweep, before extrapolation
-    term: Any  # 2-vectors: contributions of each contact to two sums
-    partial: Any  # (CHUNKS) 2-vectors: sums over chunks of the contacts
-    order: Any  # i32: contacts in sweep order
-    colour: Any  # i32: of each contact, see `colouring`
-    by_colour: Lists  # of each colour's contacts, in `order`
-    state: Any  # (9) f64: residual, that of `best`, fraction of the r-factors; see `solve`
-    history: Any  # (HISTORY) f64: residuals at the checks of a launch
+    sweep: SweepWork
     # W as a matrix
     row_start: Any = None  # (capacity + 1) i32
     column: Any = None  # i32
@@ -82,20 +102,20 @@ class ContactProblem:
     min_velocity: Any = None  # f64: least normal velocity after the impact, set only in steps with one [m/s]
     min_opening: Any = None  # f64: least opening of the gap in the step, 0 without restitution [m]
     impact_impulse: Any = None  # 3-vectors: impulse of the impact before the step [N s]
-    previous_feature: Any = None  # 3-vectors i32: of the previous step
-    previous_point: Any = None  # 3-vectors
-    previous_impulse: Any = None  # 3-vectors, world frame
-    n_slots: Count = 0  # size of the hash table, a power of two
-    slot: Any = None  # (n_slots) i32: hash table of the previous step's contacts, -1 if empty
-    pair_slot: Any = None  # (n_slots) i32: of its pairs of colliders, each by one of its contacts, -1 if empty
-    previous_body: Any = None  # 2-vectors i32: colliders
-    pair_sum: Any = None  # 2-vectors: sums of normal impulses [N s] and of r-factors [kg] over a pair's contacts
+    past: PastContacts | None = None
 
 
 def build_node_problem(arena: FieldArena, capacity: int, n_nodes: int, serial: bool, masters: int = 1) -> ContactProblem:
     """Allocate a problem for contacts between the nodes of a model. masters: largest number of nodes that a node depends on."""
     n, width, n_slots = capacity, NODES * masters, 1 << (2 * capacity - 1).bit_length()
-    vectors = "normal tangent point obstacle_displacement impact_impulse previous_point previous_impulse"
+    past = PastContacts(
+        n_slots=n_slots,
+        **_fields(arena, "feature", ti.i32, n, 3, "past"),
+        **_fields(arena, "collider", ti.i32, n, 2, "past"),
+        **_fields(arena, "point impulse", ti.f64, n, 3, "past"),
+        **_fields(arena, "pair_sum", ti.f64, n, 2, "past"),
+        **_fields(arena, "slot pair_slot", ti.i32, n_slots, 0, "past"),
+    )
     return ContactProblem(
         n,
         serial,
@@ -103,20 +123,18 @@ def build_node_problem(arena: FieldArena, capacity: int, n_nodes: int, serial: b
         False,
         n_nodes=n_nodes,
         width=width,
-        n_slots=n_slots,
+        past=past,
         **_solver_fields(arena, n, serial),
         **_fields(arena, "node", ti.i32, (n, width)),
         **_fields(arena, "weight", ti.f64, (n, width)),
         **_fields(arena, "arity turned", ti.i32, n),
-        **_fields(arena, vectors, ti.f64, n, 3),
+        **_fields(arena, "normal tangent point obstacle_displacement impact_impulse", ti.f64, n, 3),
         **_fields(arena, "gap approach load restitution min_velocity min_opening", ti.f64, n),
-        **_fields(arena, "body previous_body", ti.i32, n, 2),
-        **_fields(arena, "pair_sum", ti.f64, n, 2),
-        **_fields(arena, "feature previous_feature", ti.i32, n, 3),
+        **_fields(arena, "body", ti.i32, n, 2),
+        **_fields(arena, "feature", ti.i32, n, 3),
         **_fields(arena, "inverse_mass w", ti.f64, n_nodes, 3),
         **_fields(arena, "entry", ti.i32, width * n),
         by_node=make_lists(arena, "problem_node", n_nodes, serial),
-        **_fields(arena, "slot pair_slot", ti.i32, n_slots),
     )
 
 
@@ -136,26 +154,32 @@ def build_matrix_problem(arena: FieldArena, n: int, n_blocks: int, serial: bool)
 
 def _solver_fields(arena: FieldArena, n: int, serial: bool) -> dict[str, Any]:
     """Fields that both forms of W need."""
-    return {
-        **_fields(arena, "count", ti.i32, 2),
-        **_fields(arena, "friction relaxation", ti.f64, n),
-        **_fields(arena, "b r best sweep_start previous", ti.f64, n, 3),
-        **_fields(arena, "factor term", ti.f64, n, 2),
+    sweep = SweepWork(
+        by_colour=make_lists(arena, "problem_colour", n, serial),
+        **_fields(arena, "relaxation", ti.f64, n),
+        **_fields(arena, "best sweep_start previous", ti.f64, n, 3),
+        **_fields(arena, "term", ti.f64, n, 2),
         **_fields(arena, "partial", ti.f64, CHUNKS, 2),
         **_fields(arena, "order colour", ti.i32, n),
-        "by_colour": make_lists(arena, "problem_colour", n, serial),
         **_fields(arena, "state", ti.f64, VERDICT + 1),
         **_fields(arena, "history", ti.f64, HISTORY),
+    )
+    return {
+        "sweep": sweep,
+        **_fields(arena, "count", ti.i32, 2),
+        **_fields(arena, "friction", ti.f64, n),
+        **_fields(arena, "b r", ti.f64, n, 3),
+        **_fields(arena, "factor", ti.f64, n, 2),
     }
 
 
-def _fields(arena: FieldArena, names: str, dtype, shape, components: int = 0) -> dict[str, Any]:
+def _fields(arena: FieldArena, names: str, dtype, shape, components: int = 0, of: str = "problem") -> dict[str, Any]:
     """Allocate scalars, or vectors of so many components, by name."""
 
     def allocate(name: str):
         return arena.vectors(name, dtype, shape, n=components) if components else arena.field(name, dtype, shape)
 
-    return {name: allocate(f"problem_{name}") for name in names.split()}
+    return {name: allocate(f"{of}_{name}") for name in names.split()}
 
 
 def fill_field(field, values: np.ndarray) -> None:
@@ -175,7 +199,7 @@ def fill_matrix_problem(problem: ContactProblem, W: sp.spmatrix, b: np.ndarray, 
     fill_field(problem.block, W.data.reshape(-1, 9))
     fill_field(problem.b, b.reshape(k, 3))
     fill_field(problem.friction, friction)
-    fill_field(problem.order, np.arange(k))
+    fill_field(problem.sweep.order, np.arange(k))
     find_factors(problem)
 
 

@@ -88,17 +88,17 @@ def solve(
         n = min(batch, remaining)
         run(problem, method, first, n, every, tolerance, int(momentum))
         remaining, first = remaining - n, 0
-        residual = float(problem.state[RESIDUAL])
+        residual = float(problem.sweep.state[RESIDUAL])
         if history:
-            residuals += problem.history.to_numpy(int(problem.state[CHECKS])).tolist()
+            residuals += problem.sweep.history.to_numpy(int(problem.sweep.state[CHECKS])).tolist()
         if remaining == 0 or residual <= tolerance:
             break
-    best = float(problem.state[BEST])
+    best = float(problem.sweep.state[BEST])
     if best < residual or residual != residual:
         _restore_best(problem)
         find_velocities(problem)
         residual = best
-    return SolveResult(int(problem.state[SWEEPS]), residual, residual <= tolerance, residuals)
+    return SolveResult(int(problem.sweep.state[SWEEPS]), residual, residual <= tolerance, residuals)
 
 
 @kernel
@@ -106,7 +106,7 @@ def _restore_best(problem: ti.template()):
     """Replace the present impulses by the best ones."""
     ti.loop_config(serialize=problem.serial)
     for c in range(problem.count[0]):
-        problem.r[c] = problem.best[c]
+        problem.r[c] = problem.sweep.best[c]
 
 
 # --- loops: parallel at the top level of a kernel, serial in the loop of `_run_serial` -----------------------------------
@@ -116,8 +116,8 @@ def _restore_best(problem: ti.template()):
 def _prepare(problem: ti.template(), method: ti.template(), with_momentum):
     """Set the fractions of the r-factors and the impulses before the first sweep."""
     for c in range(problem.count[0]):
-        problem.relaxation[c] = relaxation(problem, c, method, with_momentum)
-        problem.previous[c] = problem.r[c]
+        problem.sweep.relaxation[c] = relaxation(problem, c, method, with_momentum)
+        problem.sweep.previous[c] = problem.r[c]
 
 
 @ti.func
@@ -126,15 +126,15 @@ def _sum_chunks(problem: ti.template(), chunks: ti.template()):
     for k in range(chunks):
         n, total = problem.count[0], ti.Vector([0.0, 0.0], ti.f64)
         for c in range(k * n // chunks, (k + 1) * n // chunks):
-            total += problem.term[c]
-        problem.partial[k] = total
+            total += problem.sweep.term[c]
+        problem.sweep.partial[k] = total
 
 
 @ti.func
 def _total(problem: ti.template(), chunks: ti.template()):
     total = ti.Vector([0.0, 0.0], ti.f64)
     for k in range(chunks):
-        total += problem.partial[k]
+        total += problem.sweep.partial[k]
     return total
 
 
@@ -142,11 +142,11 @@ def _total(problem: ti.template(), chunks: ti.template()):
 def _check(problem: ti.template(), chunks: ti.template(), first, sweeps):
     """Check the residual and save or restore the impulses; w must be up to date."""
     for c in range(problem.count[0]):
-        problem.term[c] = natural_map(problem, c)
+        problem.sweep.term[c] = natural_map(problem, c)
     _sum_chunks(problem, chunks)
     ti.loop_config(serialize=True)
     for _ in range(1):
-        problem.state[RESIDUAL] = residual_of(_total(problem, chunks))
+        problem.sweep.state[RESIDUAL] = residual_of(_total(problem, chunks))
         if first == 1:
             _begin(problem)
         else:
@@ -159,15 +159,15 @@ def _check(problem: ti.template(), chunks: ti.template(), first, sweeps):
 def _extrapolate(problem: ti.template(), chunks: ti.template()):
     """Set the impulses from which the next sweep starts."""
     for c in range(problem.count[0]):
-        problem.term[c] = [_restart_test(problem, c), 0.0]
+        problem.sweep.term[c] = [_restart_test(problem, c), 0.0]
     _sum_chunks(problem, chunks)
     ti.loop_config(serialize=True)
     for _ in range(1):
         _set_weight(problem, _total(problem, chunks)[0])
     for c in range(problem.count[0]):
         x = problem.r[c]
-        problem.r[c] = prox(x + problem.state[WEIGHT] * (x - problem.previous[c]), problem.friction[c])
-        problem.previous[c] = x
+        problem.r[c] = prox(x + problem.sweep.state[WEIGHT] * (x - problem.sweep.previous[c]), problem.friction[c])
+        problem.sweep.previous[c] = x
 
 
 @kernel
@@ -183,13 +183,13 @@ def _run_serial(
     """Run up to `sweeps` sweeps with a residual check after each `every`; first: 1 at the start of a solve."""
     ti.loop_config(serialize=True)
     for _ in range(1):
-        problem.state[CHECKS] = 0.0
+        problem.sweep.state[CHECKS] = 0.0
         if first == 1:
             update_velocities(problem)
             _prepare(problem, method, with_momentum)
             _check(problem, 1, 1, 0)
         done = 0
-        while done < sweeps and not problem.state[RESIDUAL] <= tolerance:
+        while done < sweeps and not problem.sweep.state[RESIDUAL] <= tolerance:
             n = ti.min(every, sweeps - done)
             for _k in range(n):
                 sweep(problem, method)
@@ -198,7 +198,7 @@ def _run_serial(
                 update_velocities(problem)
             done += n
             _check(problem, 1, 0, n)
-            if problem.state[RESIDUAL] == problem.state[BEST]:
+            if problem.sweep.state[RESIDUAL] == problem.sweep.state[BEST]:
                 update_velocities(problem)
 
 
@@ -206,13 +206,13 @@ def _run_parallel(
     problem: ContactProblem, method: str, first: int, sweeps: int, every: int, tolerance: float, with_momentum: int
 ) -> None:
     """As `_run_serial`, on all threads; the host reads the residual."""
-    problem.state[CHECKS] = 0.0
+    problem.sweep.state[CHECKS] = 0.0
     if first:
         find_velocities(problem)
         _prepare_all(problem, method, with_momentum)
         _check_all(problem, 1, 0)
     done, n_colours = 0, 0 if method in SIMULTANEOUS else int(problem.count[1])
-    while done < sweeps and not problem.state[RESIDUAL] <= tolerance:
+    while done < sweeps and not problem.sweep.state[RESIDUAL] <= tolerance:
         n = min(every, sweeps - done)
         for _ in range(n):
             sweep_parallel(problem, method, n_colours)
@@ -221,7 +221,7 @@ def _run_parallel(
             find_velocities(problem)
         done += n
         _check_all(problem, 0, n)
-        if problem.state[RESIDUAL] == problem.state[BEST]:
+        if problem.sweep.state[RESIDUAL] == problem.sweep.state[BEST]:
             find_velocities(problem)
 
 
@@ -247,7 +247,7 @@ def _extrapolate_all(problem: ti.template()):
 def _restart_test(problem: ti.template(), c):
     """Contribution of contact c to (y - x).F^-1 (x - x_before): y is `sweep_start`, x is `r`, x_before is `previous`."""
     x, f = problem.r[c], problem.factor[c]
-    backward, forward = problem.sweep_start[c] - x, x - problem.previous[c]
+    backward, forward = problem.sweep.sweep_start[c] - x, x - problem.sweep.previous[c]
     n = ti.select(f[0] > 0.0, 1.0 / f[0], 0.0)
     t = ti.select(f[1] > 0.0, 1.0 / f[1], 0.0)
     return n * backward[0] * forward[0] + t * (backward[1] * forward[1] + backward[2] * forward[2])
@@ -256,11 +256,11 @@ def _restart_test(problem: ti.template(), c):
 @ti.func
 def _set_weight(problem: ti.template(), total):
     """Set the weight to (t - 1)/t' times the strategy's fraction, or 0 to restart. total: sum of `_restart_test`."""
-    t = problem.state[MOMENTUM]
-    problem.state[MOMENTUM], problem.state[WEIGHT] = 1.0, 0.0
+    t = problem.sweep.state[MOMENTUM]
+    problem.sweep.state[MOMENTUM], problem.sweep.state[WEIGHT] = 1.0, 0.0
     if not total > 0.0:
-        problem.state[MOMENTUM] = 0.5 * (1.0 + ti.sqrt(1.0 + 4.0 * t * t))
-        problem.state[WEIGHT] = problem.state[STEP] * (t - 1.0) / problem.state[MOMENTUM]
+        problem.sweep.state[MOMENTUM] = 0.5 * (1.0 + ti.sqrt(1.0 + 4.0 * t * t))
+        problem.sweep.state[WEIGHT] = problem.sweep.state[STEP] * (t - 1.0) / problem.sweep.state[MOMENTUM]
 
 
 # --- r-factor strategy ------------------------------------------------------------------------------------------------
@@ -273,45 +273,45 @@ def _begin(problem: ti.template()):
     If it is 1 or more, they are no better than zero impulses and are not saved. (A first sweep from zero yields small impulses,
     whose residual can be far above 1, since it is relative to them.)
     """
-    problem.state[BEST], problem.state[STEP], problem.state[SWEEPS] = problem.state[RESIDUAL], 1.0, 0.0
-    if not problem.state[RESIDUAL] < 1.0:
-        problem.state[BEST] = ti.cast(ti.math.inf, ti.f64)
-    problem.state[AGE], problem.state[MOMENTUM], problem.state[VERDICT] = 0.0, 1.0, SAVE
+    problem.sweep.state[BEST], problem.sweep.state[STEP], problem.sweep.state[SWEEPS] = problem.sweep.state[RESIDUAL], 1.0, 0.0
+    if not problem.sweep.state[RESIDUAL] < 1.0:
+        problem.sweep.state[BEST] = ti.cast(ti.math.inf, ti.f64)
+    problem.sweep.state[AGE], problem.sweep.state[MOMENTUM], problem.sweep.state[VERDICT] = 0.0, 1.0, SAVE
     _record(problem)
 
 
 @ti.func
 def _record(problem: ti.template()):
     """Append state[RESIDUAL] to the history of this launch."""
-    k = ti.cast(problem.state[CHECKS], ti.i32)
+    k = ti.cast(problem.sweep.state[CHECKS], ti.i32)
     if k < HISTORY:
-        problem.history[k] = problem.state[RESIDUAL]
-    problem.state[CHECKS] += 1.0
+        problem.sweep.history[k] = problem.sweep.state[RESIDUAL]
+    problem.sweep.state[CHECKS] += 1.0
 
 
 @ti.func
 def _accept_or_reject(problem: ti.template(), sweeps):
     """Set state[VERDICT] from state[RESIDUAL] after the given number of sweeps."""
-    residual, best = problem.state[RESIDUAL], problem.state[BEST]
+    residual, best = problem.sweep.state[RESIDUAL], problem.sweep.state[BEST]
     _record(problem)
-    problem.state[SWEEPS] += sweeps
-    problem.state[AGE] += sweeps
-    problem.state[VERDICT] = CONTINUE
+    problem.sweep.state[SWEEPS] += sweeps
+    problem.sweep.state[AGE] += sweeps
+    problem.sweep.state[VERDICT] = CONTINUE
     if residual < best:
-        problem.state[VERDICT] = SAVE
-        problem.state[BEST], problem.state[AGE] = residual, 0.0
-        problem.state[STEP] = ti.min(1.0, RECOVER * problem.state[STEP])
-    elif not (residual <= MAX_GROWTH * best and problem.state[AGE] <= PATIENCE):  # also if the residual is not a number
-        problem.state[VERDICT] = RESTORE
-        problem.state[RESIDUAL], problem.state[AGE], problem.state[MOMENTUM] = best, 0.0, 1.0
-        problem.state[STEP] = ti.max(MIN_FRACTION, SHRINK * problem.state[STEP])
+        problem.sweep.state[VERDICT] = SAVE
+        problem.sweep.state[BEST], problem.sweep.state[AGE] = residual, 0.0
+        problem.sweep.state[STEP] = ti.min(1.0, RECOVER * problem.sweep.state[STEP])
+    elif not (residual <= MAX_GROWTH * best and problem.sweep.state[AGE] <= PATIENCE):  # also if the residual is not a number
+        problem.sweep.state[VERDICT] = RESTORE
+        problem.sweep.state[RESIDUAL], problem.sweep.state[AGE], problem.sweep.state[MOMENTUM] = best, 0.0, 1.0
+        problem.sweep.state[STEP] = ti.max(MIN_FRACTION, SHRINK * problem.sweep.state[STEP])
 
 
 @ti.func
 def _apply_verdict(problem: ti.template(), c):
     """Save or restore the impulse of contact c by the verdict."""
-    if problem.state[VERDICT] == SAVE:
-        problem.best[c] = problem.r[c]
-    elif problem.state[VERDICT] == RESTORE:
-        problem.r[c] = problem.best[c]
-        problem.previous[c] = problem.best[c]
+    if problem.sweep.state[VERDICT] == SAVE:
+        problem.sweep.best[c] = problem.r[c]
+    elif problem.sweep.state[VERDICT] == RESTORE:
+        problem.r[c] = problem.sweep.best[c]
+        problem.sweep.previous[c] = problem.sweep.best[c]

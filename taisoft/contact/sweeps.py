@@ -36,12 +36,12 @@ def sweep(problem: ti.template(), method: ti.template()):
     SIMULTANEOUS only, its loops are parallel."""
     if ti.static(method in SIMULTANEOUS):
         for c in range(problem.count[0]):
-            problem.sweep_start[c] = _relaxed(problem, c, method)
+            problem.sweep.sweep_start[c] = _relaxed(problem, c, method)
         for c in range(problem.count[0]):
             _swap(problem, c)
     else:
         for k in range(problem.count[0]):
-            _relax(problem, problem.order[k])
+            _relax(problem, problem.sweep.order[k])
 
 
 def sweep_parallel(problem: ContactProblem, method: str, n_colours: int) -> None:
@@ -57,7 +57,7 @@ def sweep_parallel(problem: ContactProblem, method: str, n_colours: int) -> None
 def _relax(problem: ti.template(), c):
     """Apply one prox step to contact c and add the change of its impulse to its nodes."""
     r = problem.r[c]
-    problem.sweep_start[c] = r
+    problem.sweep.sweep_start[c] = r
     new = prox(_step(problem, c), problem.friction[c])
     add_impulse(problem, c, new - r)
     problem.r[c] = new
@@ -76,14 +76,16 @@ def _relaxed(problem: ti.template(), c, method: ti.template()):
 @ti.func
 def _step(problem: ti.template(), c):
     """Impulse of contact c after a step against its velocity, before the projection."""
-    return problem.r[c] - scaled(problem.state[STEP] * problem.relaxation[c] * problem.factor[c], velocity(problem, c))
+    return problem.r[c] - scaled(
+        problem.sweep.state[STEP] * problem.sweep.relaxation[c] * problem.factor[c], velocity(problem, c)
+    )
 
 
 @ti.func
 def _swap(problem: ti.template(), c):
     """Swap the new impulse of contact c, held in sweep_start, with its present one."""
-    new = problem.sweep_start[c]
-    problem.sweep_start[c] = problem.r[c]
+    new = problem.sweep.sweep_start[c]
+    problem.sweep.sweep_start[c] = problem.r[c]
     problem.r[c] = new
 
 
@@ -97,13 +99,13 @@ def _relax_colours(problem: ti.template(), first: ti.i32):
     """Relax the contacts of BATCH colours from `first` on, each colour on all threads."""
     for q in ti.static(range(BATCH)):
         for k in range(_colour_start(problem, first + q), _colour_start(problem, first + q + 1)):
-            _relax(problem, problem.order[k])
+            _relax(problem, problem.sweep.order[k])
 
 
 @ti.func
 def _colour_start(problem: ti.template(), colour):
     """Start of a colour in `order`; the end of the last colour for any later one."""
-    return problem.by_colour.start[ti.min(colour, problem.count[1])]
+    return problem.sweep.by_colour.start[ti.min(colour, problem.count[1])]
 
 
 # --- fraction of the r-factors ----------------------------------------------------------------------------------------

@@ -223,7 +223,7 @@ def sum_residual(contacts: ti.template(), t, threads: ti.template()):
         sums[j] = block_total(sums[j], t, threads, False)
     worst = block_total(worst, t, threads, True)
     if t == 0:
-        rows.state[RESIDUAL] = ti.max(residual_of(sums), worst)
+        rows.sweep.state[RESIDUAL] = ti.max(residual_of(sums), worst)
 
 
 @ti.func

@@ -288,7 +288,7 @@ class ImplicitStepper:
             upload(prescribed)
         simulation.set_load_time(time + (0.5 if scheme.midpoint else 1.0) * dt)
         if self._multipliers is not None:
-            self._multipliers.begin(time + dt, self.contact.n_contacts == 0 and m.on_cpu)
+            self._multipliers.begin(time + dt, self.contact.n_contacts == 0 and model.on_cpu)
         self._beta = scheme.beta_over_dt * dt
         self.contact.set_impulse_fraction(scheme.beta_over_dt)
         self.solver.assemble_damper()

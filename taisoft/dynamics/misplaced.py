@@ -160,13 +160,13 @@ def add_step(
     """Add a step of dt [s] to the sums (n_rows,9) of pairs. has_pairs: whether contacts may be of two triangles.
 
     Return the row of the pair of the largest misplaced part among those that touch, -1 if none does, -2 without change if there
-    are too few rows. p.sweep_start is used as workspace.
+    are too few rows. p.sweep.sweep_start is used as workspace.
     """
     ti.loop_config(serialize=p.serial)
     for c in range(p.count[0]):
-        p.sweep_start[c] = dvec(0.0)
+        p.sweep.sweep_start[c] = dvec(0.0)
         if p.r[c][0] > 0.0:
-            p.sweep_start[c] = _false_work(p, m, s, o, has_pairs, c, dt, contact_offset)
+            p.sweep.sweep_start[c] = _false_work(p, m, s, o, has_pairs, c, dt, contact_offset)
     worst = -1
     ti.loop_config(serialize=True)
     for _ in range(1):
@@ -175,7 +175,7 @@ def add_step(
             for q in ti.static(range(4)):
                 sums[k, NOW + q] = 0.0
         for c in range(p.count[0]):
-            if p.sweep_start[c][0] > 0.0 and row < n_rows:
+            if p.sweep.sweep_start[c][0] > 0.0 and row < n_rows:
                 own = ti.cast(p.body[c][0] * n_colliders + p.body[c][1], ti.f64)
                 if sums[row, PAIR] != own:  # contacts of a pair mostly follow each other
                     row = 0
@@ -184,7 +184,7 @@ def add_step(
                 if row < n_rows:
                     sums[row, PAIR] = own
                     for q in ti.static(range(3)):
-                        sums[row, NOW + q] += p.sweep_start[c][q]
+                        sums[row, NOW + q] += p.sweep.sweep_start[c][q]
                     sums[row, IMPULSE] += p.r[c].norm()
         largest = ti.cast(-1.0, ti.f64)
         for k in range(ti.select(row < n_rows, n_rows, 0)):

@@ -195,7 +195,7 @@ class StageSystem:
     @property
     def contact_residual(self) -> float:
         """Residual of the contact laws at the last evaluation."""
-        return float(self.contacts.problem.state[RESIDUAL]) if self.contacts.any else 0.0
+        return float(self.contacts.problem.sweep.state[RESIDUAL]) if self.contacts.any else 0.0
 
     def impulses_are_rounding(self) -> bool:
         """Return whether impulses are below the rounding of the momenta of the bodies, and gaps hold: bodies that drift together

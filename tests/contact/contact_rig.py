@@ -29,7 +29,7 @@ class Rig:
             problem.fill_field(getattr(p, name), values.reshape(k, 3) if name == "b" else values)
         p.count[0] = k
         p.r.fill(0.0)
-        problem.fill_field(p.order, np.arange(k))
+        problem.fill_field(p.sweep.order, np.arange(k))
         problem.index_nodes(p)
         problem.find_factors(p)
         return p

@@ -62,7 +62,7 @@ def test_frames_and_pairs(begun):
     assert pairs == {("block", "brick"), ("block", "table"), ("other", "lift")} and n >= 12
     for a, b in ((normal, t1), (t1, np.cross(normal, t1))):
         assert np.abs(np.linalg.norm(a, axis=1) - 1).max() < 1e-14 and np.abs((a * b).sum(axis=1)).max() < 1e-14
-    assert np.array_equal(rows(p.order, n), np.arange(n))
+    assert np.array_equal(rows(p.sweep.order, n), np.arange(n))
     before = made.scene.contact_numbers("block", "table")
     for numbers in (before, (0.05, 0.9)):
         made.scene.set_contact("table", "block", *numbers)

@@ -61,8 +61,8 @@ def test_colouring_on_the_host(rig, method):
         p, (order, start) = rig.nodes(made), groups(colour)
         colouring.store(p, colour)
         assert np.array_equal(order, np.argsort(colour, kind="stable")) and start.tolist() == [0, *np.cumsum(np.bincount(colour))]
-        assert np.array_equal(p.order.to_numpy()[:k], order) and p.count[1] == len(start) - 1
-        assert np.array_equal(p.colour.to_numpy()[:k], colour)
+        assert np.array_equal(p.sweep.order.to_numpy()[:k], order) and p.count[1] == len(start) - 1
+        assert np.array_equal(p.sweep.colour.to_numpy()[:k], colour)
     assert np.array_equal(colour, colours(graph)) and np.array_equal(colour, colours(graph, 4)) == (method != "random")
     assert sorted(colours(sp.csr_matrix(~np.eye(12, dtype=bool)))) == list(range(12))  # a clique
     assert not colours(sp.csr_matrix((4, 4), dtype=bool)).any() and len(colours(sp.csr_matrix((0, 0), dtype=bool))) == 0
@@ -75,10 +75,10 @@ def test_kernels_colour_first_fit(rig, k):
     for serial in (True, False, False):
         p = rig.nodes(made, serial)
         colouring.colour_contacts(p)
-        found.append(p.colour.to_numpy()[:k])
+        found.append(p.sweep.colour.to_numpy()[:k])
         order, start = np.argsort(found[0], kind="stable"), np.cumsum([0, *np.bincount(found[0])])
-        assert p.count[1] == len(start) - 1 and np.array_equal(p.order.to_numpy()[:k], order)
-        assert np.array_equal(p.by_colour.start.to_numpy()[: len(start)], start)
+        assert p.count[1] == len(start) - 1 and np.array_equal(p.sweep.order.to_numpy()[:k], order)
+        assert np.array_equal(p.sweep.by_colour.start.to_numpy()[: len(start)], start)
         p.count[0] = 0
         colouring.colour_contacts(p)
         assert p.count[1] == 0

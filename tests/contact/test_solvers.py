@@ -88,7 +88,7 @@ def test_forms_agree(rig, prescribed):
     for form in (p, q):
         form.r.fill(0.0)
         solve(form, "gauss_seidel", 0.0, 12)  # with momentum
-    relaxation = p.relaxation.to_numpy()[:30]
+    relaxation = p.sweep.relaxation.to_numpy()[:30]
     assert relaxation == pytest.approx(q.relaxation.to_numpy()[:30], rel=1e-12)
     assert (relaxation < 0.999).any() == prescribed  # with one axis prescribed, blocks are no multiples of the identity
     assert impulses(p) == pytest.approx(impulses(q), rel=1e-9, abs=1e-12)
@@ -103,9 +103,9 @@ def test_coloured_equals_serial_in_the_order_of_the_colours(rig, matrix):
         for serial in (True, False):
             p = rig.matrix(W, b, mu, serial) if matrix else rig.nodes(made, serial)
             store(p, colour_greedy(matrix_graph(sp.csr_matrix(W)))) if matrix else colour_contacts(p)
-            order = p.order.to_numpy()[:40]
+            order = p.sweep.order.to_numpy()[:40]
             assert 1 < p.count[1] < 40 and sorted(order) == list(range(40)) and (np.diff(order) < 0).any()
-            for method in ("coloured_gauss_seidel", "gauss_seidel"):  # the second in p.order too
+            for method in ("coloured_gauss_seidel", "gauss_seidel"):  # the second in p.sweep.order too
                 p.r.fill(0.0)
                 solve(p, method, 0.0, 6, momentum=momentum)
                 found.append(impulses(p))

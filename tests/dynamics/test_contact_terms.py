@@ -156,7 +156,7 @@ def test_impulses_and_residual_of_the_contact_laws(rig, pressed):
     assert np.abs(r - expected).max() < 1e-11 * np.abs(expected).max()
     fixed_point = np.array([oracle.project(row, mu) for row, mu in zip(r - oracle.factors(rig.W) * u, rig.friction)])
     residual = np.linalg.norm(r - fixed_point) / np.linalg.norm(r)
-    assert rig.p.state[RESIDUAL] == pytest.approx(residual, rel=1e-11) and residual > 0.01
+    assert rig.p.sweep.state[RESIDUAL] == pytest.approx(residual, rel=1e-11) and residual > 0.01
 
 
 def test_a_gap_that_misses_its_target_is_a_residual(rig, pressed):
@@ -168,7 +168,7 @@ def test_a_gap_that_misses_its_target_is_a_residual(rig, pressed):
     rig.k.work.gap_weight.from_numpy(weights * (1e3 / TOLERANCE))
     impulses_at(rig, rig.x)
     rig.k.work.gap_weight.from_numpy(weights)
-    assert rig.p.state[RESIDUAL] == pytest.approx(1e3 * (-BETA * u[:, 0] / (0.5 * kept))[target > 0].max(), rel=1e-6)
+    assert rig.p.sweep.state[RESIDUAL] == pytest.approx(1e3 * (-BETA * u[:, 0] / (0.5 * kept))[target > 0].max(), rel=1e-6)
 
 
 def test_blocks_are_minus_the_derivative_of_the_impulses(rig, pressed):
