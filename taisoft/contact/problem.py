@@ -110,11 +110,11 @@ def build_node_problem(arena: FieldArena, capacity: int, n_nodes: int, serial: b
     n, width, n_slots = capacity, NODES * masters, 1 << (2 * capacity - 1).bit_length()
     past = PastContacts(
         n_slots=n_slots,
-        **_fields(arena, "feature", ti.i32, n, 3, "past"),
-        **_fields(arena, "collider", ti.i32, n, 2, "past"),
-        **_fields(arena, "point impulse", ti.f64, n, 3, "past"),
-        **_fields(arena, "pair_sum", ti.f64, n, 2, "past"),
-        **_fields(arena, "slot pair_slot", ti.i32, n_slots, 0, "past"),
+        **_fields(arena, "feature", ti.i32, n, 3, "past_contact"),
+        **_fields(arena, "collider", ti.i32, n, 2, "past_contact"),
+        **_fields(arena, "point impulse", ti.f64, n, 3, "past_contact"),
+        **_fields(arena, "pair_sum", ti.f64, n, 2, "past_contact"),
+        **_fields(arena, "slot pair_slot", ti.i32, n_slots, 0, "past_contact"),
     )
     return ContactProblem(
         n,

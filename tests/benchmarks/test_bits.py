@@ -9,7 +9,7 @@
 """
 
 import gzip
-import sys
+import inspect
 from importlib import import_module
 
 import numpy as np
@@ -101,7 +101,7 @@ def test_a_step_is_not_deep(monkeypatch):
 
     def watch(launch):
         def watched(*arguments):
-            depths.append(calls_above(sys._getframe(1)))
+            depths.append(calls_above(inspect.currentframe().f_back))
             return launch(*arguments)
 
         return watched

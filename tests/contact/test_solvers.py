@@ -89,7 +89,7 @@ def test_forms_agree(rig, prescribed):
         form.r.fill(0.0)
         solve(form, "gauss_seidel", 0.0, 12)  # with momentum
     relaxation = p.sweep.relaxation.to_numpy()[:30]
-    assert relaxation == pytest.approx(q.relaxation.to_numpy()[:30], rel=1e-12)
+    assert relaxation == pytest.approx(q.sweep.relaxation.to_numpy()[:30], rel=1e-12)
     assert (relaxation < 0.999).any() == prescribed  # with one axis prescribed, blocks are no multiples of the identity
     assert impulses(p) == pytest.approx(impulses(q), rel=1e-9, abs=1e-12)
 
