@@ -48,7 +48,7 @@ NOTHING = {"digests": [], "positions": pack(np.zeros((0, 3))), "contacts": 0, "e
 # What makes loops over small scenes parallel: module, name, value
 PARALLEL = (
     ("backend.parallel", "pays", lambda seconds: True),
-    ("fem.model", "CHUNKED_FROM", 0),
+    ("fem.build", "CHUNKED_FROM", 0),
     ("fem.chunks", "MIN_SHIFT", 2),
     ("collision.surface", "SERIAL_BELOW", 0),
     ("dynamics.stage_system", "SHARED_FROM", 0),

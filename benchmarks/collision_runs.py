@@ -19,7 +19,7 @@ from taisoft.collision.contacts import FOUND, KEPT, LEFT, UNKNOWN, is_same
 from taisoft.collision.detector import MERGED, Detection
 from taisoft.collision.path_check import NO_PASSAGES
 from taisoft.collision.spatial_hash import SpatialHash
-from taisoft.fem.model import build_model
+from taisoft.fem.build import build_model
 from taisoft.machine import Timing, summarise
 from taisoft.scene.plan import make_plan
 

@@ -14,7 +14,7 @@ import scipy.sparse.linalg as spl
 from taisoft.display import short_repr
 from taisoft.errors import SceneError
 from taisoft.fem import reference
-from taisoft.fem.dependents import DependentTable, dependent_table
+from taisoft.fem.dependent_table import DependentTable, dependent_table
 from taisoft.fem.loads import SceneLoads
 from taisoft.fem.spring_table import SpringTable, length_and_gradient
 from taisoft.fem.springs import spring_table

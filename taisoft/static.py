@@ -17,8 +17,9 @@ from taisoft.dynamics.simulation_state import SimulationState
 from taisoft.dynamics.stage import Stage
 from taisoft.dynamics.stage_system import StageSystem
 from taisoft.errors import SceneError, SimulationError
+from taisoft.fem.build import build_model
 from taisoft.fem.measure import measure
-from taisoft.fem.model import Layout, build_model
+from taisoft.fem.model import Layout
 from taisoft.fem.pressure import cavity_form
 from taisoft.fem.spring_table import SpringTable
 from taisoft.fem.state import ELASTIC, N_INVERTED

@@ -176,6 +176,10 @@ class FieldArena:
         """Allocate scalars, filled from data if given, else with zeros."""
         return self._allocate(name, dtype, shape, 0, data)
 
+    def filled(self, name: str, dtype, data: np.ndarray) -> Array:
+        """Allocate scalars of the shape of data, and fill them from it."""
+        return self._allocate(name, dtype, data.shape, 0, data)
+
     def vectors(self, name: str, dtype, shape: int, data: np.ndarray | None = None, n: int = 3) -> Array:
         """Allocate n-vectors, filled from data (shape, n) if given, else with zeros."""
         return self._allocate(name, dtype, shape, n, data)

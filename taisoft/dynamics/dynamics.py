@@ -21,9 +21,10 @@ from taisoft.dynamics.results import StepResult
 from taisoft.dynamics.schemes import IMPLICIT
 from taisoft.dynamics.simulation_state import SimulationState
 from taisoft.errors import SimulationError
+from taisoft.fem.build import build_model
 from taisoft.fem.laws import LAWS
 from taisoft.fem.measure import NO_TET, measure, measure_parts
-from taisoft.fem.model import Model, build_model
+from taisoft.fem.model import Model
 from taisoft.fem.state import FIRST_SOFTENED, LOADS
 from taisoft.records import Energies, StepReport
 from taisoft.scene.commands import Command

@@ -9,14 +9,17 @@ from taisoft.backend.arrays import FieldArena, download, upload
 from taisoft.backend.runtime import Runtime
 from taisoft.dynamics.dirichlet import DirichletConditions
 from taisoft.dynamics.state import StepState
-from taisoft.fem.dependents import DependentTable
+from taisoft.fem.dependent_table import DependentTable
+from taisoft.fem.elements import law_table
 from taisoft.fem.loads import SceneLoads
+from taisoft.fem.masses import upload_mass_matrix
 from taisoft.fem.mean_dilatation import patch_moduli
-from taisoft.fem.model import Layout, Model, damping_table, law_table, upload_mass_matrix
+from taisoft.fem.model import Layout, Model
 from taisoft.fem.pressure import CavityForm, cavity_form, pressures_of
 from taisoft.fem.reference import gravity_masses, lumped_masses
 from taisoft.fem.spring_table import SpringTable
-from taisoft.fem.springs import own_spring_table
+from taisoft.fem.springs import spring_table
+from taisoft.fem.terms.rayleigh_damping import damping_table
 from taisoft.scene.loads import Cavity
 from taisoft.scene.scene import Scene
 
@@ -61,7 +64,7 @@ class SimulationState:
     @cached_property
     def own_springs(self) -> SpringTable | None:
         """The same at the nodes where they end, even if these depend on others."""
-        return self.springs if self.dependents is None else own_spring_table(self.scene)
+        return self.springs if self.dependents is None else spring_table(self.scene, None)
 
     def state(self) -> tuple[np.ndarray, np.ndarray]:
         """Return positions and velocities of all nodes, in their stored precision."""

@@ -5,20 +5,20 @@ part; and 1 for a force per node.
 Numbers, such as pressures, which force terms turn into nodal forces at the present x, are the model's `amplitudes`.
 """
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+import taichi as ti
 
 from taisoft.errors import SimulationError
 from taisoft.fem import reference
+from taisoft.fem.model import Setup
 from taisoft.fem.pressure import pressures_of
+from taisoft.fem.spring_table import SpringTable
 from taisoft.scene.connection_records import Tendon
 from taisoft.scene.loads import NodalForce, ScalarLoad, Traction, value_at
 from taisoft.scene.rigid import RigidBody
 from taisoft.scene.scene import Body, Scene
-
-if TYPE_CHECKING:
-    from taisoft.fem.spring_table import SpringTable
 
 FOLLOWS = ScalarLoad(np.zeros(()))  # a pressure or a tension that is a Lagrange multiplier, which steppers find
 
@@ -48,7 +48,7 @@ class SceneLoads:
     fluid in a given volume, and of a tendon whose given length follows a path.
     """
 
-    def __init__(self, scene: Scene, springs: "SpringTable | None" = None):
+    def __init__(self, scene: Scene, springs: SpringTable | None = None):
         """springs: the scene's table; only its ends on obstacles that move matter."""
         starts = np.cumsum([0, *(body.n_nodes for body in scene.bodies)])
         self._constant, self._paths = np.zeros((starts[-1], 3)), []
@@ -102,6 +102,17 @@ class SceneLoads:
         for path in self._paths:
             rows[:, np.searchsorted(nodes, path.nodes)] += path.forces(times.tolist())
         return rows
+
+
+def model_fields(setup: Setup) -> dict[str, Any]:
+    """Fields of Model: dead loads and amplitudes at the start, each if there are any."""
+    arena, layout, on = setup.arena, setup.layout, setup.on["loads"]
+    loads = SceneLoads(setup.scene, layout.springs)
+    return {
+        "loaded": on,
+        "loads": arena.vectors("loads", setup.runtime.real, len(layout.rest), loads.at(0.0)) if on else None,
+        "amplitudes": arena.filled("amplitudes", ti.f64, loads.amplitudes([0.0])[0]) if loads.n_amplitudes else None,
+    }
 
 
 def number_at(load: ScalarLoad | Tendon, t: float, what: str) -> float:

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import taichi as ti
 
-from taisoft.backend.arrays import Count, FieldArena
+from taisoft.backend.arrays import Count
 from taisoft.fem import reference
 from taisoft.fem.lanes import (
     broadcast,
@@ -33,6 +33,7 @@ from taisoft.fem.lanes import (
     weight_at,
 )
 from taisoft.fem.math3 import ddot
+from taisoft.fem.model import Setup
 from taisoft.scene.scene import Scene
 
 
@@ -51,30 +52,33 @@ class MeanDilatation:
     rate: Any  # (n_patches) f64: change of the dilatation along a velocity or displacement
 
 
-def build_mean_dilatation(scene: Scene, layout, arena: FieldArena) -> MeanDilatation:
-    """Allocate and fill the patches of a scene. layout: `model.Layout`."""
+def model_fields(setup: Setup) -> dict[str, Any]:
+    """Fields of Model: the patches of bodies with mean dilatation, if there are any."""
+    if not setup.on["mean_dilatation"]:
+        return {}
+    layout, arena = setup.layout, setup.arena
     of_tet, volume = np.full(layout.tet_start[-1], -1), []
-    for k, body in enumerate(scene.bodies):
+    for k, body in enumerate(setup.scene.bodies):
         if body.dilatation == "mean":
             patch = reference.tet_patches(body)
             of_tet[layout.tets(k)] = patch + sum(len(own) for own in volume)
             volume.append(np.bincount(patch, body.mesh.volumes))
     mean = np.flatnonzero(of_tet >= 0)
     tets = mean[np.argsort(of_tet[mean], kind="stable")]
-    volume = np.concatenate(volume)
-    n_lanes, n = len(layout.tet_of_lane), len(volume)
-    patch = np.maximum(of_tet[layout.tet_of_lane], 0).reshape(-1, layout.lanes)
-    return MeanDilatation(
+    volume, n_lanes = np.concatenate(volume), len(layout.tet_of_lane)
+    n, patch = len(volume), np.maximum(of_tet[layout.tet_of_lane], 0).reshape(-1, layout.lanes)
+    table = MeanDilatation(
         n_patches=n,
-        patch=arena.field("patch", ti.i32, patch.shape, patch.astype(np.int32)),
-        tet_start=arena.field("patch_start", ti.i32, n + 1, np.searchsorted(of_tet[tets], np.arange(n + 1)).astype(np.int32)),
-        tet=arena.field("patch_tet", ti.i32, len(tets), layout.lane_of_tet[tets].astype(np.int32)),
-        volume=arena.field("patch_volume", ti.f64, n, volume),
-        modulus=arena.field("patch_modulus", ti.f64, n, patch_moduli(scene)),
+        patch=arena.filled("patch", ti.i32, patch),
+        tet_start=arena.filled("patch_start", ti.i32, np.searchsorted(of_tet[tets], np.arange(n + 1))),
+        tet=arena.filled("patch_tet", ti.i32, layout.lane_of_tet[tets]),
+        volume=arena.filled("patch_volume", ti.f64, volume),
+        modulus=arena.filled("patch_modulus", ti.f64, patch_moduli(setup.scene)),
         content=arena.field("patch_content", ti.f64, n_lanes),
         dilatation=arena.field("patch_dilatation", ti.f64, n),
         rate=arena.field("patch_rate", ti.f64, n),
     )
+    return {"mean_dilatation": True, "mean": table}
 
 
 def patch_moduli(scene: Scene) -> np.ndarray:

@@ -7,39 +7,21 @@ from taisoft.fem.chunks import chunk_entry, chunk_size, fold
 from taisoft.fem.lanes import broadcast, mass_times
 from taisoft.fem.mean_dilatation import find_dilatations
 from taisoft.fem.state import ELASTIC, FIRST_SOFTENED, GRAVITY, KINETIC, LOADS, MIN_J, N_INVERTED
-from taisoft.fem.terms import dead_loads, elasticity, gravity, pressure, springs
+from taisoft.fem.terms import elasticity, gravity, springs
 from taisoft.fem.terms.elasticity import HUGE
 
 NO_TET = 2**31 - 1  # above any tet index
 SCALARS = (ELASTIC, MIN_J, N_INVERTED, KINETIC, GRAVITY, LOADS, FIRST_SOFTENED)
-FIRST, LAST = min(SCALARS), max(SCALARS)
 LEAST = (MIN_J, FIRST_SOFTENED)  # of the partial values of these the least counts, of the others the sum
-
-
-@ti.func
-def _lane_sum(values):
-    total = values[0]
-    for q in ti.static(range(1, values.n)):
-        total += values[q]
-    return total
-
-
-@ti.func
-def _lane_min(values):
-    low = values[0]
-    for q in ti.static(range(1, values.n)):
-        low = ti.min(low, values[q])
-    return low
 
 
 @ti.func
 def _node_energies(m: ti.template(), i):
     """Kinetic energy of node i, and its parts of the potentials of gravity and of loads [J]."""
     kinetic, weight, loads = 0.5 * m.state.v[i].dot(mass_times(m, i, m.state.v)), gravity.energy(m, i), ti.cast(0.0, ti.f64)
-    if ti.static(m.loaded):
-        loads += dead_loads.energy(m, i)
-    if ti.static(m.has_pressure):
-        loads += pressure.energy(m, i)
+    for term in ti.static(m.terms):
+        if ti.static(term.LOAD and not term.ACCELERATION):
+            loads += term.energy(m, i)
     return kinetic, weight, loads
 
 
@@ -83,9 +65,9 @@ def measure(m: ti.template()):
                     inverted += elasticity.count_inverted(m, b, J)
                     tets = ti.Vector([b * m.lanes + q for q in ti.static(range(m.lanes))])
                     softened = ti.min(softened, ti.select(soft == 1, tets, no_tets))
-            m.state.partial[c, ELASTIC] = _lane_sum(energy)
-            m.state.partial[c, MIN_J] = _lane_min(lowest)
-            m.state.partial[c, N_INVERTED] = ti.cast(_lane_sum(inverted), ti.f64)
+            m.state.partial[c, ELASTIC] = energy.sum()
+            m.state.partial[c, MIN_J] = lowest.min()
+            m.state.partial[c, N_INVERTED] = ti.cast(inverted.sum(), ti.f64)
             kinetic, weight, loads = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64)
             for k in range(chunk_size(m, c, m.n_nodes)):
                 i = chunk_entry(m, c, k, m.n_nodes)
@@ -94,8 +76,8 @@ def measure(m: ti.template()):
                 weight += own[1]
                 loads += own[2]
             m.state.partial[c, KINETIC], m.state.partial[c, GRAVITY], m.state.partial[c, LOADS] = kinetic, weight, loads
-            m.state.partial[c, FIRST_SOFTENED] = ti.cast(_lane_min(softened), ti.f64)
-    fold(m, FIRST, LAST, LEAST)
+            m.state.partial[c, FIRST_SOFTENED] = ti.cast(softened.min(), ti.f64)
+    fold(m, ELASTIC, LOADS, LEAST)
     ti.loop_config(serialize=True)
     for _ in range(1):
         for k in ti.static(SCALARS):

@@ -2,22 +2,19 @@
 
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from taisoft.backend.arrays import download
 from taisoft.fem import springs
-from taisoft.fem.dependents import expanded_pairs, master_pairs, table_of
+from taisoft.fem.dependent_table import DependentTable, expanded_pairs, master_pairs
+from taisoft.fem.model import Group, Model
 from taisoft.fem.node_graph import PAIRS, NodeGraph, node_graph
-
-if TYPE_CHECKING:
-    from taisoft.fem.model import Group, Model
 
 MATRIX_BLOCKS = {1: 6, 2: 45 + 6}  # 3x3 blocks per tet in the assembly buffer: node pairs, and six scratch blocks of order 2
 
 
-def group_nodes(model: "Model") -> Iterator[tuple["Group", np.ndarray, np.ndarray]]:
+def group_nodes(model: Model) -> Iterator[tuple[Group, np.ndarray, np.ndarray]]:
     """For each group its lanes (k,) that are not padding, counted from its first, and the nodes (k, n_nodes) of their tets."""
     (nodes, volume), lanes = download([model.nodes, model.volume]), model.lanes
     flat, real = nodes.astype(np.int64), volume.reshape(-1) > 0
@@ -27,7 +24,7 @@ def group_nodes(model: "Model") -> Iterator[tuple["Group", np.ndarray, np.ndarra
         yield g, lane, block.transpose(0, 2, 1).reshape(-1, g.n_nodes)[lane]
 
 
-def patch_nodes(model: "Model") -> tuple[np.ndarray, np.ndarray]:
+def patch_nodes(model: Model) -> tuple[np.ndarray, np.ndarray]:
     """Patches (k,), ascending, and their nodes (k,), ascending in each patch."""
     patch, lanes, pairs = model.mean.patch.to_numpy().reshape(-1).astype(np.int64), model.lanes, []
     for g, lane, own in group_nodes(model):
@@ -46,7 +43,7 @@ def patch_pairs(patch: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.concatenate(firsts), np.concatenate(seconds)
 
 
-def model_graph(model: "Model") -> tuple[NodeGraph, np.ndarray, np.ndarray | None]:
+def model_graph(model: Model) -> tuple[NodeGraph, np.ndarray, np.ndarray | None]:
     """Pairs of nodes that share a tet, a patch or a spring, and where the assembly buffer has the blocks (e,) that they sum up.
 
     The latter are indices times lanes, plus the lane, in the order of the graph's `pair`, which goes on with those of
@@ -60,7 +57,9 @@ def model_graph(model: "Model") -> tuple[NodeGraph, np.ndarray, np.ndarray | Non
         entries.append((base * lanes + (lane % lanes)[:, None]).reshape(-1))
     ends, entries, factors, others = np.concatenate(ends), np.concatenate(entries), None, []
     if model.dependents is not None:
-        table = table_of(model.dependents, model.n_nodes)
+        own = model.dependents
+        node, start, master, weight = download([own.node, own.start, own.master, own.weight])
+        table = DependentTable(model.n_nodes, *(ids.astype(np.int64) for ids in (node, start, master)), weight)
         others += [ends, master_pairs(table, ends)]
         ends, rows, factors = expanded_pairs(table, ends)
         entries = entries[rows]

@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 import taichi as ti
 
-from taisoft.backend.arrays import FieldArena
-from taisoft.fem.dependents import DependentTable
+from taisoft.fem.dependent_table import DependentTable
+from taisoft.fem.model import Setup
 from taisoft.fem.node_graph import NodeGraph
 from taisoft.ranges import entries_of
 from taisoft.scene.body import Body
@@ -39,12 +39,8 @@ class PressureTable:
     stiffness_nodes: Any  # 4-vectors i32: entry of the matrix, -1 on the diagonal, c, the index of p, and i
     stiffness_weight: Any  # f64: u_ijc, times the weights of the independent nodes of row and column in i and j
     has_potential: Any  # i32, of each pressure: 1 if energies count its work
+    is_prepared: bool  # forces are computed before any node moves: in explicit steps
     force: Any  # (n_nodes) 3-vectors f64 [N]: scratch of explicit steps, else None
-
-    @property
-    def is_prepared(self) -> bool:
-        """Whether forces are computed before any node moves."""
-        return self.force is not None
 
 
 def pressures_of(scene: Scene) -> list[tuple[int, Pressure | Cavity]]:
@@ -162,31 +158,30 @@ def independent_rows(rows: np.ndarray, weights: np.ndarray, dependents: Dependen
     return rows[order], weights[order]
 
 
-def build_pressures(
-    scene: Scene, node_start: np.ndarray, arena: FieldArena, graph: NodeGraph | None, dependents: DependentTable | None
-) -> PressureTable:
-    """Fill the table. node_start: first node of each body, then their number; graph: of the matrix, None in explicit steps."""
-    n_nodes = int(node_start[-1])
+def matrix_fields(setup: Setup, graph: NodeGraph | None) -> dict[str, Any]:
+    """Fields of Model: all pressures. graph: of the matrix, None in explicit steps."""
+    scene, arena, n_nodes, dependents = setup.scene, setup.arena, len(setup.layout.rest), setup.layout.dependents
 
     def table(name: str, rows: np.ndarray, weights: np.ndarray) -> dict:
         start = np.concatenate([[0], np.cumsum(np.bincount(rows[:, 0], minlength=n_nodes))])
         width = rows.shape[1] - 1
         return {
-            f"{name}_start": arena.field(f"pressure_{name}_start", ti.i32, n_nodes + 1, start),
+            f"{name}_start": arena.filled(f"pressure_{name}_start", ti.i32, start),
             f"{name}_nodes": arena.vectors(f"pressure_{name}_nodes", ti.i32, len(rows), rows[:, 1:], n=width),
-            f"{name}_weight": arena.field(f"pressure_{name}_weight", ti.f64, len(rows), weights),
+            f"{name}_weight": arena.filled(f"pressure_{name}_weight", ti.f64, weights),
         }
 
-    arrays = table("force", *all_terms(scene, node_start, force_terms))
+    arrays = table("force", *all_terms(scene, setup.layout.node_start, force_terms))
     if graph is None:
         arrays |= dict.fromkeys(("stiffness_start", "stiffness_nodes", "stiffness_weight"))
     else:
-        rows, weights = all_terms(scene, node_start, stiffness_terms)
+        rows, weights = all_terms(scene, setup.layout.node_start, stiffness_terms)
         rows = np.column_stack([rows, rows[:, 0]])
         if dependents is not None:
             rows, weights = independent_rows(rows, weights, dependents)
         rows[:, 1] = np.where(rows[:, 0] == rows[:, 1], -1, graph.entries(rows[:, 0], rows[:, 1]))
         arrays |= table("stiffness", rows, weights)
     closed = np.array([pressure.has_potential for _, pressure in pressures_of(scene)])
-    arrays["has_potential"] = arena.field("pressure_has_potential", ti.i32, len(closed), closed)
-    return PressureTable(**arrays, force=arena.vectors("pressure_force", ti.f64, n_nodes) if graph is None else None)
+    arrays["has_potential"] = arena.filled("pressure_has_potential", ti.i32, closed)
+    arrays["force"] = arena.vectors("pressure_force", ti.f64, n_nodes) if graph is None else None
+    return {"pressure": PressureTable(**arrays, is_prepared=graph is None)}

@@ -18,7 +18,7 @@ from itertools import permutations
 import numpy as np
 import scipy.sparse as sp
 
-from taisoft.fem.dependents import DependentTable, dependent_table
+from taisoft.fem.dependent_table import DependentTable, dependent_table
 from taisoft.mesh import aggregates
 from taisoft.mesh.topology import EDGES
 from taisoft.scene.rigid import RigidBody

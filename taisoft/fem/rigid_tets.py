@@ -6,13 +6,12 @@ from typing import Any
 import numpy as np
 import taichi as ti
 
-from taisoft.backend.arrays import Count, FieldArena, upload
+from taisoft.backend.arrays import Count, upload
 from taisoft.backend.runtime import kernel
 from taisoft.fem import reference
-from taisoft.fem.dependents import DependentTable
+from taisoft.fem.model import Setup
 from taisoft.fem.node_graph import NodeGraph
 from taisoft.scene.rigid import FRAME
-from taisoft.scene.scene import Scene
 
 # Relaxation time of a strain, times the lowest angular frequency w of the tet. A body that hits the ground rebounds by
 # 1/(w times the time)^2 of its speed, even if dt is short.
@@ -34,11 +33,17 @@ class RigidTets:
     force: Any  # (4 n) 3-vectors f64 [N]: scratch
 
 
-def build_rigid_tets(scene: Scene, node_start: np.ndarray, dependents: DependentTable, arena: FieldArena) -> RigidTets | None:
-    """Allocate and fill the tets of a scene's rigid bodies; None if all depend on other nodes."""
-    nodes, gradients, viscosities, independent = [], [], [], dependents.matrix.diagonal() != 0.0
+def model_fields(setup: Setup) -> dict[str, Any]:
+    """Fields of Model: the tets of the scene's rigid bodies, to be damped, or moved as rigid bodies.
+
+    If all of them depend on other nodes there are none, and their damping is switched off.
+    """
+    if not (setup.on["rigid_damping"] or setup.on["rigid_motion"]):
+        return {}
+    scene, layout, arena = setup.scene, setup.layout, setup.arena
+    nodes, gradients, viscosities, independent = [], [], [], layout.dependents.matrix.diagonal() != 0.0
     for k, body in enumerate(scene.bodies):
-        own = node_start[k] + body.nodes.elements[0]
+        own = layout.node_start[k] + body.nodes.elements[0]
         if body not in scene.rigid_bodies or not independent[own].all():
             continue
         shape_gradients, volumes = reference.shape_gradients(body)
@@ -46,21 +51,23 @@ def build_rigid_tets(scene: Scene, node_start: np.ndarray, dependents: Dependent
         gradients.append(shape_gradients[0, 0])
         viscosities.append(RELAXATION / body.lowest_frequency * body.young * body.mass / body.density)
     if not nodes:
-        return None
+        setup.on["rigid_damping"] = False
+        return {}
     n, node = len(nodes), np.concatenate(nodes)
     number = np.full(len(independent), -1, dtype=np.int32)
     number[node] = np.arange(len(node))
-    return RigidTets(
+    tets = RigidTets(
         n=n,
-        node=arena.field("rigid_node", ti.i32, len(node), node.astype(np.int32)),
+        node=arena.filled("rigid_node", ti.i32, node),
         gradient=arena.vectors("rigid_gradient", ti.f64, len(node), np.concatenate(gradients)),
-        viscosity=arena.field("rigid_viscosity", ti.f64, n, np.array(viscosities)),
-        number=arena.field("rigid_number", ti.i32, len(number), number),
+        viscosity=arena.filled("rigid_viscosity", ti.f64, np.array(viscosities)),
+        number=arena.filled("rigid_number", ti.i32, number),
         pair_at=arena.field("rigid_pair_at", ti.i32, FRAME * len(node)),
         strain=arena.vectors("rigid_strain", ti.f64, n, n=9),
         rate=arena.field("rigid_rate", ti.f64, 1),
         force=arena.vectors("rigid_force", ti.f64, len(node)),
     )
+    return {"has_rigid_tets": True, "rigid_tets": tets}
 
 
 def set_pair_entries(tets: RigidTets, graph: NodeGraph) -> None:

@@ -7,13 +7,14 @@ import numpy as np
 import scipy.sparse as sp
 import taichi as ti
 
-from taisoft.backend.arrays import Count, FieldArena, download, upload
-from taisoft.fem.dependents import DependentTable, dependent_table
+from taisoft.backend.arrays import Count, download, upload
+from taisoft.fem.dependent_table import DependentTable
 from taisoft.fem.loads import scalar_loads, tendon_slots
+from taisoft.fem.model import Setup
 from taisoft.fem.node_graph import NodeGraph
 from taisoft.fem.spring_table import LENGTH, MULTIPLIER, PLAIN, SMOOTHED, TENSION, MovingEnds, SpringTable
 from taisoft.scene.body import Body
-from taisoft.scene.connection_records import Attachment, Point, Tendon
+from taisoft.scene.connection_records import Attachment, Point
 from taisoft.scene.connections import coincide, locate_nodes, start_of
 from taisoft.scene.locate import locate
 from taisoft.scene.scene import Scene
@@ -25,7 +26,6 @@ NOWHERE = (np.zeros(3), None)  # the part of an offset that an end on a body has
 class Springs:
     """A `SpringTable` on the device, with what kernels derive from it."""
 
-    n: Count
     n_lines: Count
     line_start: Any  # (n_lines + 1) i32
     line: Any  # (n) i32
@@ -34,6 +34,7 @@ class Springs:
     weight: Any  # (s) f64
     element: Any  # (s) i32 of each entry
     offset: Any  # (n) 3-vectors f64
+    has_moving: bool  # ends, with obstacles
     moving: Any  # (n) i32: first of the three amplitudes that are the offset, -1 if it does not move; or None
     rate_after: Count  # amplitudes from an offset that moves to its rate
     numbers: Any  # (n, 4) f64: k, L, c_d, s
@@ -51,25 +52,9 @@ class Springs:
     has_tensions: bool  # given ones
     has_lengths: bool  # given ones, of elastic tendons
 
-    @property
-    def has_moving(self) -> bool:
-        """Whether ends move with obstacles."""
-        return self.moving is not None
-
 
 def spring_table(scene: Scene, dependents: DependentTable | None = None) -> SpringTable | None:
-    """The elements of a scene; None if it has none. dependents: the scene's table, if it is known already."""
-    made = _collect(scene)
-    return None if made is None else made.table(dependents or dependent_table(scene))
-
-
-def own_spring_table(scene: Scene) -> SpringTable | None:
-    """The elements of a scene at the nodes where they end, even if these depend on others; None if it has none."""
-    made = _collect(scene)
-    return None if made is None else made.table(None)
-
-
-def _collect(scene: Scene) -> "_Builder | None":
+    """The elements of a scene at the nodes that its `dependents` depend on, or where they end; None if it has none."""
     if not scene.has_springs:
         return None
     made, slots = _Builder(scene), tendon_slots(scene)
@@ -80,18 +65,15 @@ def _collect(scene: Scene) -> "_Builder | None":
             length = 0.0 if coincide(scene, *spring.points) else float(np.linalg.norm(a - b))
         made.add(spring.name, [[made.between(*spring.points)]], PLAIN, spring.stiffness, length, spring.damping)
     for tendon in scene.tendons:
-        segments, kind = [made.between(p, q) for p, q in zip(tendon.points, tendon.points[1:])], _kind(tendon)
+        segments = [made.between(p, q) for p, q in zip(tendon.points, tendon.points[1:])]
+        kind = LENGTH if tendon.is_elastic else MULTIPLIER if tendon.is_inextensible else TENSION
         if kind == TENSION:  # segments between two obstacles move nothing
             segments = [one for one in segments if len(one[0])]
         made.add(tendon.name, [segments], kind, tendon.stiffness or 0.0, slot=slots[tendon.name])
     for attachment in [one for one in scene.attachments if one.stiffness is not None]:
         lines = [[one] for one in made.attached(attachment)]
         made.add(attachment.name, lines, PLAIN, attachment.stiffness, damping=attachment.damping)
-    return made
-
-
-def _kind(tendon: Tendon) -> int:
-    return LENGTH if tendon.is_elastic else MULTIPLIER if tendon.is_inextensible else TENSION
+    return made.table(dependents)
 
 
 class _Builder:
@@ -207,35 +189,39 @@ def node_pairs(springs: Springs) -> np.ndarray:
     return np.concatenate([own[np.stack(np.triu_indices(len(own), 1), axis=1)] for own in groups])
 
 
-def build_springs(table: SpringTable, arena: FieldArena, assembled: bool) -> Springs:
-    """Copy a scene's elements to the device. assembled: there will be a stiffness matrix, see `set_pair_entries`."""
-    by_node, coupled, n = np.argsort(table.node, kind="stable"), table.coupled, len(table.offset)
+def model_fields(setup: Setup) -> dict[str, Any]:
+    """Fields of Model: springs, tendons and attachments, if there are any."""
+    if not setup.on["springs"]:
+        return {}
+    table, arena = setup.layout.springs, setup.arena
+    coupled, n, n_lines = table.coupled, len(table.offset), len(table.line_start) - 1
     counts = np.diff(coupled, axis=1).reshape(-1)[table.element]  # of the entries that each entry is coupled with
+    node_start = np.cumsum([0, *np.bincount(table.node, minlength=table.n_nodes)])
     numbers = np.stack([table.stiffness, table.rest_length, table.damping, table.smoothing], axis=1)
-    n_lines, moving, n_moving = len(table.line_start) - 1, np.full(n, -1), 0
+    moving, n_moving = np.full(n, -1), 0
     if table.moving is not None:
         n_moving = len(table.moving.element)
         moving[table.moving.element] = table.moving.first + 3 * np.arange(n_moving)
-    return Springs(
-        n=n,
+    springs = Springs(
         n_lines=n_lines,
-        line_start=_ids(arena, "spring_line_start", table.line_start),
-        line=_ids(arena, "spring_line", table.line),
-        start=_ids(arena, "spring_start", table.start),
-        node=_ids(arena, "spring_node", table.node),
-        weight=arena.field("spring_weight", ti.f64, len(table.weight), table.weight),
-        element=_ids(arena, "spring_element", table.element),
+        line_start=arena.filled("spring_line_start", ti.i32, table.line_start),
+        line=arena.filled("spring_line", ti.i32, table.line),
+        start=arena.filled("spring_start", ti.i32, table.start),
+        node=arena.filled("spring_node", ti.i32, table.node),
+        weight=arena.filled("spring_weight", ti.f64, table.weight),
+        element=arena.filled("spring_element", ti.i32, table.element),
         offset=arena.vectors("spring_offset", ti.f64, n, table.offset),
-        moving=_ids(arena, "spring_moving", moving) if n_moving else None,
+        has_moving=n_moving > 0,
+        moving=arena.filled("spring_moving", ti.i32, moving) if n_moving else None,
         rate_after=3 * n_moving,
-        numbers=arena.field("spring_numbers", ti.f64, (n, 4), numbers),
-        kind=_ids(arena, "spring_kind", table.kind),
-        slot=_ids(arena, "spring_slot", table.slot),
-        node_start=_ids(arena, "spring_node_start", np.cumsum([0, *np.bincount(table.node, minlength=table.n_nodes)])),
-        node_entry=_ids(arena, "spring_node_entry", by_node),
-        coupled=arena.field("spring_coupled", ti.i32, coupled.shape, coupled.astype(np.int32)),
-        pair_start=_ids(arena, "spring_pair_start", np.cumsum([0, *counts])[:-1]),
-        pair_at=arena.field("spring_pair_at", ti.i32, int(counts.sum())) if assembled else None,
+        numbers=arena.filled("spring_numbers", ti.f64, numbers),
+        kind=arena.filled("spring_kind", ti.i32, table.kind),
+        slot=arena.filled("spring_slot", ti.i32, table.slot),
+        node_start=arena.filled("spring_node_start", ti.i32, node_start),
+        node_entry=arena.filled("spring_node_entry", ti.i32, np.argsort(table.node, kind="stable")),
+        coupled=arena.filled("spring_coupled", ti.i32, coupled),
+        pair_start=arena.filled("spring_pair_start", ti.i32, np.cumsum([0, *counts])[:-1]),
+        pair_at=arena.field("spring_pair_at", ti.i32, int(counts.sum())) if setup.on["assembled_stiffness"] else None,
         pull=arena.vectors("spring_pull", ti.f64, n),
         direction=arena.vectors("spring_direction", ti.f64, n),
         length=arena.field("spring_length", ti.f64, n),
@@ -243,6 +229,7 @@ def build_springs(table: SpringTable, arena: FieldArena, assembled: bool) -> Spr
         has_tensions=bool(np.isin(table.kind, (TENSION, MULTIPLIER)).any()),
         has_lengths=bool((table.kind == LENGTH).any()),
     )
+    return {"has_springs": True, "springs": springs, "spring_damping": setup.on["spring_damping"]}
 
 
 def set_pair_entries(springs: Springs, graph: NodeGraph) -> None:
@@ -252,7 +239,3 @@ def set_pair_entries(springs: Springs, graph: NodeGraph) -> None:
     rows = np.repeat(node, np.diff(ranges, axis=1).reshape(-1))
     columns = np.concatenate([node[first:last] for first, last in ranges])
     upload([(springs.pair_at, np.where(rows == columns, -1, graph.entries(rows, columns)))])
-
-
-def _ids(arena: FieldArena, name: str, data: np.ndarray):
-    return arena.field(name, ti.i32, len(data), data.astype(np.int32))

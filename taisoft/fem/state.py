@@ -6,12 +6,6 @@ Kernels return scalars to the host in `State.scalars`; below are their indices, 
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-import taichi as ti
-
-from taisoft.backend.arrays import FieldArena
-from taisoft.backend.runtime import Runtime
-
 # Of a state: energies [J], smallest J = det F, number of inverted tets; the first tet, by blocks and lanes, so compressed that
 # its law softens; the potential of its dead loads [J]
 ELASTIC, MIN_J, N_INVERTED, KINETIC, GRAVITY, FIRST_SOFTENED, LOADS = range(7)
@@ -36,14 +30,3 @@ class State:
     element_force: Any  # forces of each tet on its nodes [N], per block (node, axis, lane)
     scalars: Any  # (N_SCALARS) f64: results for the host, indexed by ELASTIC and so on
     partial: Any  # (chunks, N_COLUMNS) f64: partial sums, added in a fixed order
-
-
-def build_state(arena: FieldArena, runtime: Runtime, x: np.ndarray, v: np.ndarray, n_force_entries: int, chunks: int) -> State:
-    """Allocate a state and fill it with x and v (n_nodes, 3). n_force_entries: size of `element_force`."""
-    return State(
-        x=arena.vectors("x", ti.f64, len(x), x),
-        v=arena.vectors("v", ti.f64, len(v), v),
-        element_force=arena.field("element_force", runtime.real, n_force_entries),
-        scalars=arena.field("scalars", ti.f64, N_SCALARS),
-        partial=arena.field("partial", ti.f64, (chunks, N_COLUMNS)),
-    )

@@ -55,7 +55,7 @@ class BlockCsr:
     term_pair: Any = None
     term_factor: Any = None
     apart_start: Any = None  # (2 n_nodes) i32, see `node_graph.NodeGraph`
-    edge_factor: Any = None  # (entries, 2), see `fem.dependents.expanded_pairs`; only with dependent nodes
+    edge_factor: Any = None  # (entries, 2), see `fem.dependent_table.expanded_pairs`; only with dependent nodes
     patches: PatchTerms | None = None  # of mean dilatation
 
     @property

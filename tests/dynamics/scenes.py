@@ -11,7 +11,8 @@ import taisoft as ts
 from taisoft.backend.arrays import FieldArena
 from taisoft.backend.runtime import Runtime
 from taisoft.dynamics.dynamics import Dynamics
-from taisoft.fem.model import Layout, Model, build_model
+from taisoft.fem.build import build_model
+from taisoft.fem.model import Layout, Model
 from taisoft.scene.plan import make_plan
 from taisoft.settings import check_settings, plan_of
 from tests.backend.lanes import opened
@@ -201,7 +202,7 @@ class Rig:
 def use_threads(monkeypatch, several: bool = True) -> list[bool]:
     """Divide loops over any mesh into chunks, and run them on several threads, or on one. Return the answers given."""
     answers: list[bool] = []
-    monkeypatch.setattr("taisoft.fem.model.CHUNKED_FROM", 0)
+    monkeypatch.setattr("taisoft.fem.build.CHUNKED_FROM", 0)
     monkeypatch.setattr("taisoft.fem.chunks.MIN_SHIFT", 2)
     monkeypatch.setattr("taisoft.dynamics.stage_system.SHARED_FROM", 0)
     monkeypatch.setattr("taisoft.backend.parallel.pays", lambda seconds: answers.append(several) or several)

@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 
 import taisoft as ts
 from taisoft.dynamics.schemes import EXPLICIT, IMPLICIT
-from taisoft.fem.dependents import dependent_table
+from taisoft.fem.dependent_table import dependent_table
 from tests.dynamics.companion import LOOSE, add_companion, simulator
 from tests.dynamics.scenes import rubber
 

@@ -8,9 +8,9 @@ import taichi as ti
 
 import taisoft as ts
 from taisoft.backend.runtime import kernel
-from taisoft.fem.dependents import dependent_table, force_with_dependents
+from taisoft.fem.dependent_table import dependent_table
+from taisoft.fem.dependents import force_with_dependents
 from taisoft.fem.measure import measure
-from taisoft.fem.model import damping_table
 from taisoft.fem.node_graph import EVERYTHING
 from taisoft.fem.state import ELASTIC, GRAVITY, LOADS
 from taisoft.fem.terms import TERMS, elasticity, gravity, rayleigh_damping, rigid_damping
@@ -93,7 +93,7 @@ def test_dampers_act_by_the_rates_of_each_body(rig):
     matrix = block_csr.build_block_csr(m, rig.arena, "test_damper")
     m.state.x.from_numpy(rig.x)
     block_csr.assemble(m, matrix, EVERYTHING, True)  # a stiffness: its rows sum to zero
-    rates = np.repeat(damping_table(rig.scene)[:, 0], [body.n_nodes for body in rig.scene.bodies])
+    rates = np.repeat(rayleigh_damping.damping_table(rig.scene)[:, 0], [body.n_nodes for body in rig.scene.bodies])
     drag = rates * m.mass.to_numpy()
     v = rng.standard_normal(rig.x.shape)
     m.state.v.from_numpy(v)

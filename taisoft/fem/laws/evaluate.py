@@ -46,13 +46,9 @@ def _differential(law: ti.template(), projected: ti.template(), lanes: ti.templa
         H = _load(D, b, lanes)
         c = [ti.Vector([p[k] for q in ti.static(range(lanes))]) for k in ti.static(range(n_constants(law)))]
         if ti.static(projected):
-            S = prepare_projected(law, G, c)
-            T = dpk1_projected(S, H)
-            _store(P, b, T, lanes)
+            _store(P, b, dpk1_projected(prepare_projected(law, G, c), H), lanes)
         else:
-            S = law.prepare(G, c)
-            T = law.dpk1(G, S, H)
-            _store(P, b, T, lanes)
+            _store(P, b, law.dpk1(G, law.prepare(G, c), H), lanes)
 
 
 def _checked(law: str, F: np.ndarray, young: float, poisson: float, floor: float):

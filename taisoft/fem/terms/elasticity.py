@@ -108,10 +108,7 @@ def record_volumes(m: ti.template(), J, bad):
 @ti.func
 def lowest_and_count(m: ti.template(), J, bad):
     """Smallest J and sum of `bad` over the lanes."""
-    low, count = J[0], bad[0]
-    for q in ti.static(range(1, m.lanes)):
-        low, count = ti.min(low, J[q]), count + bad[q]
-    return low, count
+    return J.min(), bad.sum()
 
 
 @ti.func

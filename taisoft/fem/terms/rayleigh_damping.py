@@ -5,7 +5,33 @@ Stiffness damping b: explicit steps evaluate K_d at the present x inside the ele
 steps assemble it at the start of the step.
 """
 
+from typing import Any
+
+import numpy as np
 import taichi as ti
+
+from taisoft.fem.model import Setup
+from taisoft.ranges import owners
+from taisoft.scene.scene import Scene
+
+
+def damping_table(scene: Scene) -> np.ndarray:
+    """Mass damping [1/s] and stiffness damping [s] of each body (n_bodies, 2)."""
+    materials = [body.composition.first for body in scene.bodies]
+    return np.array([[material.mass_damping, material.stiffness_damping] for material in materials])
+
+
+def model_fields(setup: Setup) -> dict[str, Any]:
+    """Fields of Model: the rates of each body, and the body of each node, if any is damped."""
+    by_stiffness = setup.on["stiffness_damping"]
+    if not (setup.on["mass_damping"] or by_stiffness):
+        return {}
+    return {
+        "damped": True,
+        "stiffness_damping": by_stiffness,
+        "node_body": setup.arena.filled("node_body", ti.i32, owners(np.diff(setup.layout.node_start))),
+        "damping": setup.arena.filled("damping", setup.runtime.real, damping_table(setup.scene)),
+    }
 
 
 @ti.func
