@@ -93,9 +93,9 @@ def _strain_type(setup: Setup, elements: np.ndarray, Dm_inv: np.ndarray) -> Any:
     if setup.runtime.real == ti.f64:
         return ti.f64
     elastic = np.concatenate([np.full(body.mesh.n_tets, not isinstance(body, RigidBody)) for body in setup.scene.bodies])
-    x = setup.layout.rest[elements[elastic, :4]]
-    squares = ((x[:, 1:] - x[:, :1]) ** 2).sum(axis=(1, 2)) * (Dm_inv[elastic] ** 2).sum(axis=(1, 2))
-    return ti.f64 if np.sqrt(squares.max(initial=0.0)) > 100.0 else ti.f32
+    x = setup.layout.rest[elements[:, :4]]
+    squares = np.prod([np.einsum("eij,eij->e", a, a) for a in (x[:, 1:] - x[:, :1], Dm_inv)], axis=0)
+    return ti.f64 if np.sqrt(squares[elastic].max(initial=0.0)) > 100.0 else ti.f32
 
 
 def _groups(kinds: dict[tuple, np.ndarray], lanes: int, real: Any, strain_real: Any) -> tuple[Group, ...]:
@@ -146,14 +146,15 @@ def law_table(scene: Scene, layout: Layout, by_tet: bool) -> np.ndarray:
     the patches have its part; the floor has it.
     """
     n_constants = 6 if any(body.composition.has_volume_floor for body in scene.bodies) else 4
-    table = np.zeros((len(layout.lane_of_tet), n_constants))
-    for k, body in enumerate(scene.bodies):
+    start = layout.tet_start if by_tet else np.arange(len(scene.bodies) + 1)
+    table = np.zeros((start[-1], n_constants))
+    for body, first, last in zip(scene.bodies, start, start[1:]):
         own, numbers = body.composition, (*body.composition.lame, body.composition.number("volume_floor"))
-        mu, lam, floor = (np.broadcast_to(number, body.mesh.n_tets) for number in numbers)
-        table[layout.tets(k), 4:] = np.stack(volume_floor.constants(floor, mu, lam), axis=1)[:, : n_constants - 4]
+        mu, lam, floor = (np.broadcast_to(number, last - first) for number in numbers)
+        table[first:last, 4:] = np.stack(volume_floor.constants(floor, mu, lam), axis=1)[:, : n_constants - 4]
         lam = 0.0 * lam if body.dilatation == "mean" else lam
         for law in own.laws:
-            tets = own.tets_of_law(law)
+            tets = own.tets_of_law(law) if by_tet else np.zeros(1, dtype=np.int64)
             for c, values in enumerate(LAWS[law].constants(mu[tets], lam[tets])):
-                table[layout.tet_start[k] + tets, c] = values
-    return layout.blocks(table[layout.tet_of_lane]) if by_tet else table[layout.tet_start[:-1]]
+                table[first + tets, c] = values
+    return layout.blocks(table[layout.tet_of_lane]) if by_tet else table
