@@ -31,9 +31,7 @@ from taisoft.contact.build import relative_velocity
 from taisoft.contact.problem import ContactProblem, to_world
 from taisoft.dynamics.simulation_state import SimulationState
 
-MAX_MISPLACED = 0.02  # of a pair's contact force: more is reported
 FADING, MIN_STEPS = 0.95, 10
-LEAST_SHARE = 0.2  # of the contact impulses on a body in a step: where a pair has less, an event of few steps is not reported
 AT_REST = 0.01  # of the contact offset: slip in a step below which a contact sticks
 LEFT = 0.5  # of the slip: distance beyond that of the linearised motion from which a point that stays at edges has left them
 # columns of the sums over steps: S, W, the work of friction, the largest S of a step; then S, W, friction and impulse of this
@@ -204,6 +202,9 @@ def add_step(
 class Misplacement:
     """Contact forces of a simulation's pairs that the normals of steps' starts misplace. Their sums are `StepState.misplaced`."""
 
+    MAX_MISPLACED = 0.02  # of a pair's contact force: more is reported
+    LEAST_SHARE = 0.2  # of the contact impulses on a body in a step: where a pair has less, an event of few steps is not reported
+
     def __init__(self, simulation: SimulationState, detection: Detection):
         self._simulation, self._detection = simulation, detection
         self._arena = FieldArena()
@@ -240,8 +241,8 @@ class Misplacement:
         part = abs(false) / max(slip, MIN_STEPS * largest)
         if part > self.part:
             self.part = part
-            is_event, is_false = MIN_STEPS * largest > slip, abs(false_now) > MAX_MISPLACED * slip_now
-            if part > MAX_MISPLACED and is_false and not (is_event and self._share(row) < LEAST_SHARE):
+            is_event, is_false = MIN_STEPS * largest > slip, abs(false_now) > self.MAX_MISPLACED * slip_now
+            if part > self.MAX_MISPLACED and is_false and not (is_event and self._share(row) < self.LEAST_SHARE):
                 self.text = self._describe(*divmod(int(pair), n), slip, false, friction)
 
     def _share(self, row: int) -> float:

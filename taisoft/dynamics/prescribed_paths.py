@@ -25,8 +25,6 @@ from taisoft.scene.scene import Scene
 DATA = (NodePath, ShapePath, CarriedPath, Command)  # no functions of a user; the third follows an obstacle, which is checked
 SAME = 1e-12  # of the largest entry, and of 1 m: times that differ by rounding give such differences
 SMALL = 1e-6  # likewise, of jumps that do not matter, such as those of single precision
-HALVINGS = 12  # of a step, after which a jump is what remains of a change
-REMAINS = 0.75  # of it, at least, in one half of the time: 0.5 of motion at constant velocity
 FAILED = object()
 
 
@@ -97,13 +95,14 @@ def find_jump(value: Callable[[float], np.ndarray | None], start: float, a, end:
     if any(x is None or x is FAILED for x in (a, b)) or _distance(a, b) <= SMALL:
         return None
     at_first = whole = float(np.abs(a - b).max())
-    for _ in range(HALVINGS):
+    remains = 0.75  # of a change, at least, in one half of the time if it is a jump: 0.5 of motion at constant velocity
+    for _ in range(12):
         middle = 0.5 * (start + end)
         m = _value(value, middle)
         if m is None or m is FAILED:
             return None
         left, right = (float(np.abs(p - q).max()) for p, q in ((a, m), (m, b)))
-        if max(left, right) < REMAINS * whole:
+        if max(left, right) < remains * whole:
             return None
         start, a, end, b, whole = (start, a, middle, m, left) if left > right else (middle, m, end, b, right)
     return (end, whole) if whole > 0.5 * at_first else None

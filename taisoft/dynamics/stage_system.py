@@ -57,13 +57,13 @@ from taisoft.dynamics.stage import (
     Stage,
     StageWork,
     StepContacts,
-    SubsetLists,
     begin_stage,
     form_residual,
     move,
     negate_direction,
     set_direction_to_rest,
 )
+from taisoft.dynamics.subset import SubsetLists
 from taisoft.fem.node_graph import EVERYTHING, Subset
 from taisoft.fem.state import END_SLOPE, N_NORMS, NORMS, START_SLOPE, STEP_LENGTH
 from taisoft.linear import block_csr, gauss_seidel, pcg
