@@ -6,8 +6,8 @@ computed at the start of every step, or of every batch of explicit sub-steps, an
 This is stable if k T^2 and c T are small compared with the effective mass m_p = 1 / sum_i (w_i^2 / m_i). So k is limited to
 SOFT m_p / T^2, and c, half of the critical 2 sqrt(k m_p), to SOFT m_p / T. With SOFT = 0.5 a mass on such a spring comes to
 rest under every integrator here, including BDF2. Weakness: finer meshes and longer steps allow only weaker springs.
-|F| is limited, too, so that dragging inverts no tets: to DragSpring.STRAIN young A, where A = (m_p / density)^(2/3) is the dragged area,
-and to DragSpring.HEAVY times the body's weight. young is that of the body's softest tet, and density its mean.
+|F| is limited, too, so that dragging inverts no tets: to STRAIN young A, where A = (m_p / density)^(2/3) is the dragged area,
+and to HEAVY times the body's weight. young is that of the body's softest tet, and density its mean.
 """
 
 from dataclasses import dataclass
@@ -19,6 +19,7 @@ from taisoft.errors import SceneError
 from taisoft.scene import checks
 
 SOFT = 0.5
+EARTH = 9.81  # [m/s^2], for a body's weight, also in scenes without gravity
 
 
 @dataclass
@@ -41,7 +42,6 @@ class DragSpring:
 
     STRAIN = 0.25
     HEAVY = 20.0
-    EARTH = 9.81  # [m/s^2], for a body's weight, also in scenes without gravity
 
     def __init__(self, simulation: SimulationState):
         self._simulation = simulation
@@ -63,7 +63,7 @@ class DragSpring:
             nodes, weights = np.flatnonzero(every), every[every != 0.0]
         mass = 1.0 / float((weights**2 / masses[nodes]).sum())
         area = (mass * float(own.mesh.volumes.sum()) / own.mass) ** (2 / 3)
-        max_force = min(self.STRAIN * float(np.min(own.young)) * area, self.HEAVY * self.EARTH * own.mass)
+        max_force = min(self.STRAIN * float(np.min(own.young)) * area, self.HEAVY * EARTH * own.mass)
         self.release()  # removes the force from the previous nodes
         self.drag = Drag(own.name, nodes, weights, target, stiffness, mass, max_force, target, np.zeros(3))
         self.drag.point = weights @ self._simulation.state()[0][nodes]
