@@ -60,7 +60,7 @@ def _parallel(p: ContactProblem) -> np.ndarray:
 def colour_all(scene: str, p: ContactProblem, seeds: int) -> tuple[list[Colouring], dict[str, np.ndarray]]:
     """Colourings of the contacts of `p`, and the colours (k,) by method."""
     graph, k, colourings, colours = graph_of(p), int(p.count[0]), [], {}
-    start, movable = p.by_node.start.to_numpy(), (p.inverse_mass.to_numpy() != 0.0).any(axis=1)
+    start, movable = p.by_node.start.to_numpy(p.n_nodes + 1), (p.inverse_mass.to_numpy() != 0.0).any(axis=1)
     least = int(np.diff(start)[movable].max())
     _parallel(p)  # compiles
     methods = {

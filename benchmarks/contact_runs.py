@@ -19,7 +19,7 @@ from taisoft.contact.augmented_lagrangian import find_residual
 from taisoft.contact.colouring import colour_contacts
 from taisoft.contact.problem import NODES, ContactProblem
 from taisoft.contact.solve import solve
-from taisoft.dynamics import explicit_contact_stepper
+from taisoft.dynamics import contact_measures, explicit_contact_stepper
 from taisoft.dynamics.explicit_contact_stepper import MAX_SWEEPS
 
 from .runner import REST, Stopwatch, clock, patched, timed
@@ -34,7 +34,7 @@ ROUNDS, COLD_ROUNDS = 3, 1
 SETTINGS = ("integrator", "contact_solver", "contact_tolerance", "newton_tolerance", "linear_tolerance", "dt")
 # parts of an explicit step and the functions called in them
 PARTS = {
-    "search": ("find", "closing"),
+    "search": ("find", "measure_closing"),
     "problem": ("begin", "set_free_velocities", "find_factors"),
     "solve": ("colour_contacts", "solve"),
     "elasticity": ("predict", "move"),
@@ -261,7 +261,7 @@ def measure_film(name: str, sim: ts.Simulator, frames: int, solvers: Solvers) ->
 def explicit_places(sim: ts.Simulator) -> list[tuple[str, object, str]]:
     """The functions of each part of explicit steps, for `Stopwatch.on`."""
     contact = sim._dynamics.contact
-    owners = {"find": contact.detection, "closing": contact.measures, "begin": contact}
+    owners = {"find": contact.detection, "measure_closing": contact_measures, "begin": contact}
     return [(part, owners.get(name, explicit_contact_stepper), name) for part, names in PARTS.items() for name in names]
 
 

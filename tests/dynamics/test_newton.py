@@ -14,10 +14,11 @@ import pytest
 
 import taisoft as ts
 from taisoft.checkpoint import read_checkpoint, write_checkpoint
-from taisoft.dynamics import constraints, implicit, newton
+from taisoft.dynamics import implicit
 from taisoft.dynamics.contact_newton import solve
 from taisoft.dynamics.schemes import SCHEMES
 from taisoft.dynamics.stage import Stage
+from taisoft.dynamics.stage_system import StageSystem
 from tests.dynamics.contact_scenes import material
 from tests.dynamics.scenes import cube, dynamics
 
@@ -87,14 +88,14 @@ def test_a_step_that_does_not_converge_is_reported(d, monkeypatch):
 @pytest.mark.parametrize("kind", ["inside out", "flat", "random"])
 def test_wild_states_are_left_along_negative_curvature(d, kind, monkeypatch):
     """No matrix is projected."""
-    indefinite = []
+    solver, indefinite = d.stepper.solver, []
 
-    def direction(system, tolerance):
-        answer = constraints.direction(system, tolerance)
+    def solve_linear(tolerance):
+        answer = StageSystem.solve_linear(solver, tolerance)
         indefinite.append(answer.negative)
         return answer
 
-    monkeypatch.setattr(newton, "direction", direction)
+    monkeypatch.setattr(solver, "solve_linear", solve_linear)
     rest, rng = d.state.state()[0], np.random.default_rng(1)
     x = {
         "inside out": rest * [-1.0, 1.0, 1.0],
