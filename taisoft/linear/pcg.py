@@ -37,7 +37,7 @@ class Preconditioner(Protocol):
     """A record whose functions are part of the kernels; symmetric, positive definite on the free axes, 0 on the others."""
 
     def prepare(self, model, A, terms, work, i, same_matrix) -> None:
-        """Set what node i needs; for all but `Jacobi`, which alone takes coupling terms, the caller has prepared everything."""
+        """Set what node i needs when a solve begins, if the caller has not prepared everything; add coupling terms."""
 
     def apply(self, model, work) -> None:
         """Set work.z to the preconditioned work.r, in loops at the top level of a kernel. Partial sums: OTHER_SUM of r.z."""
