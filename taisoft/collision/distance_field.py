@@ -51,7 +51,8 @@ class DistanceFields(Visitor):
     def visit(self, surface: ti.template(), t, q, entry: ti.template(), first, last, out: ti.template(), start, end):
         """See Visitor."""
         at, failed = _field_contacts(surface, self, entry, first, last, t, surface.margin[0], out, start, end)
-        ti.atomic_add(self.unmapped[0], failed)
+        if failed > 0:  # rarely: atomics on one address wait for each other
+            ti.atomic_add(self.unmapped[0], failed)
         return at
 
     @ti.func

@@ -52,7 +52,6 @@ class Surface:
     ring: Any
     around_start: Any
     around: Any
-    first_of: Any  # (n_bodies + 1) i32: first triangle of each collider
     soft: Any  # (n_bodies) i32: 1 for soft bodies
     self_on: Any  # (n_bodies) i32: 1 if a body is tested against itself
     attached: Any  # (n_bodies^2) i32: 1 for pairs that are not tested, since they are attached to each other; None: no pair is
@@ -108,7 +107,7 @@ def build_surface(
         serial, serial_cheap = (on_cpu and not parallel.pays(n * seconds) for seconds in (TRIANGLE_SECONDS, CHEAP_SECONDS))
     tables = {name: getattr(t, name) for name in ("triangle", "body", "node", "neighbour", "owns")}
     tables |= {name: getattr(t, name) for name in ("ring_start", "ring", "around_start", "around")}
-    tables |= {name: properties[name] for name in ("soft", "self_on")} | {"first_of": t.first}
+    tables |= {name: properties[name] for name in ("soft", "self_on")}
     vectors = dict.fromkeys(("x", "move"), v) | dict.fromkeys(("lo", "hi", "normal"), n)
     vectors |= dict.fromkeys(("body_lo", "body_hi"), bodies)
     zeros = {"active": n, "active_of_chunk": n, "count": 4, "part": chunks, "near": chunks * bodies, "sharp": n, "inside": v}

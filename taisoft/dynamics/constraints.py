@@ -46,6 +46,7 @@ def _solve_bordered(system: StageSystem, tolerance: float) -> LinearResult:
         found.append(pcg.solve(model, A, JACOBI, work, accuracy, pcg.iteration_limit(model), border=border))
         solutions.append(work.y.host.astype(np.float64).reshape(-1))
     work.rhs.host[...] = right
+    system.linear_solver.matrix_changed()  # its preconditioner may share the inverses of blocks with Jacobi's
     y, z = solutions[0], np.array(solutions[1:])
     negative = any(one.negative for one in found)
     shift = multipliers.effective[chosen] - multipliers.values[chosen]

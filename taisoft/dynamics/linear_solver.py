@@ -46,7 +46,7 @@ class LinearSolver:
     BUILD, LOADING, ITERATIONS = {False: 90, True: 450}, {False: 5_000_000, True: 0}, 8
     GROWTH, SLACK = 2.0, 10  # a solve that takes more than GROWTH times the first iterations + SLACK requires a new hierarchy
     LONGEST = 300  # iterations of a solve with a new hierarchy
-    PERIOD = 128  # solves by multigrid between trials of pcg
+    PERIOD = 128  # solves by multigrid between trials without it
     UNFINISHED = 2.0  # of the iterations of a solve that multigrid interrupted: how many it is expected to have needed
     RETRY = 4  # a failure of multigrid multiplies the savings needed for a next trial by this
     STATE = {"active": bool, "savings": float, "uses": int, "failures": int, "rate": float, "pcg_rate": float}  # in a checkpoint
@@ -63,9 +63,9 @@ class LinearSolver:
     def forget(self) -> None:
         """Discard everything learned so far, after the state was set."""
         self.active = False  # multigrid is in use
-        self.savings = 0.0  # iterations of pcg that multigrid would have saved since it was last in use, or has saved since
-        self.uses = self.failures = 0  # solves by multigrid since the last trial of pcg; times that it did not pay
-        self.rate = self.pcg_rate = 0.0  # iterations per decimal digit: first solve with the hierarchy, last one by pcg
+        self.savings = 0.0  # iterations that multigrid would have saved since it was last in use, or has saved since
+        self.uses = self.failures = 0  # solves by multigrid since the last trial without it; times that it did not pay
+        self.rate = self.pcg_rate = 0.0  # iterations per decimal digit: first solve with the hierarchy, last one without
         self.release()
 
     @property
@@ -85,13 +85,13 @@ class LinearSolver:
 
     @property
     def _ratio(self) -> float:
-        """Duration of an iteration with the hierarchy over one of pcg."""
+        """Duration of an iteration with the hierarchy over one without."""
         kind = self._exact, self.model.real
         return self.RATIO[kind] + self.OVERHEAD[kind] / self.model.n_nodes
 
     @property
     def _build_cost(self) -> float:
-        """Iterations of pcg that the hierarchy must save, its kernels included."""
+        """Iterations that the hierarchy must save, its kernels included."""
         return self.BUILD[self._exact] + self.LOADING[self._exact] / self.model.n_nodes
 
     def release(self) -> None:

@@ -92,7 +92,7 @@ class SimulationState:
         for name in ("released", "flight", "gravity"):
             getattr(self.now, name)[:] = kept[name]
         self.now.none_cross = bool(kept["none_cross"])
-        if self.now.held is not None:
+        if self.now.held is not None and "held" in kept:  # another instance may have no contacts
             self.now.held, self.now.misplaced = self.now.held.at_start(kept["held"]), kept["misplaced"]
         self._begin_at(kept["x"], kept["v"], float(kept["time"]), int(kept["step_count"]), kept["multipliers"])
 

@@ -28,7 +28,7 @@ def copy_nodes(m: ti.template(), x: ti.template(), v: ti.template(), from_x: ti.
 
 @dataclass(eq=False)
 class StepState:
-    """A state; the arrays of numbers belong to it alone."""
+    """A state. Its arrays of numbers belong to it alone, but for `multipliers`, which are replaced and never changed."""
 
     model: Model
     x: Array  # (n_nodes) 3-vectors f64 [m]

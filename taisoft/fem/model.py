@@ -93,7 +93,7 @@ class Model:
 
     @property
     def spread(self) -> int:
-        """Iterations of a loop per chunk, see `fem.chunks`."""
+        """Iterations of a loop per chunk, see `backend.lists`."""
         return 1 if self.serial else SPREAD["cpu" if self.on_cpu else "cuda"]
 
     @property

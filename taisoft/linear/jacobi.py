@@ -12,7 +12,7 @@ from taisoft.fem.node_graph import n_nodes_of, node_of
 from taisoft.fem.state import OTHER_SUM
 from taisoft.linear import pcg_work
 from taisoft.linear.block_csr import block_times
-from taisoft.linear.pcg_work import dot64
+from taisoft.linear.pcg_work import RUNNING, STATUS, dot64
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,7 +29,7 @@ class Jacobi:
         """z = B r."""
         ti.loop_config(serialize=model.serial)
         for task in range(model.chunks * model.spread):
-            if task % model.spread == 0:
+            if task % model.spread == 0 and work.state[STATUS] == RUNNING:
                 c, n, s = task // model.spread, n_nodes_of(model, work.subset), ti.cast(0.0, ti.f64)
                 for at in range(chunk_size(model, c, n)):
                     i = node_of(work.subset, chunk_entry(model, c, at, n))

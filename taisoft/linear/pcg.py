@@ -96,6 +96,9 @@ def start(
     same_matrix: ti.i32,
 ):
     """Begin a solve from y = 0 with r = rhs and p = z."""
+    ti.loop_config(serialize=True)
+    for _ in range(1):
+        work.state[STATUS] = RUNNING
     ti.loop_config(serialize=model.serial)
     for task in range(model.chunks * model.spread):
         if task % model.spread == 0:

@@ -113,4 +113,15 @@ def test_a_narrow_band_is_factorised():
         hierarchy = hierarchy_of(made)
         assert isinstance(hierarchy, BandedPreconditioner)
         result = hierarchy.solve(made.model, made.A, made.work, 1e-8, 200)
-        assert result.converged and result.iterations <= 2 and hierarchy.n_bytes > 8 * made.A.n_edges
+        assert result.converged and result.iterations <= 2 and hierarchy.n_bytes > 8 * made.A.n_edges and error(made) < 1e-7
+        m, A, w, f = made.model, made.A, made.work, made.free
+        A.diagonal.host[:, [0, 5, 10]] += 1e4  # the factor is now another matrix's
+        made.matrix = made.matrix + sp.diags(1e4 * f.reshape(-1))
+        result = hierarchy.solve(m, A, w, 1e-8, 200)
+        assert result.converged and 4 < result.iterations < 100 and error(made) < 1e-5
+        stopped = hierarchy.solve(m, A, w, 1e-8, 3)
+        assert stopped.iterations == 3 and not stopped.converged and not stopped.negative
+        A.diagonal.host[:, [0, 5, 10]] -= 1e5
+        result = hierarchy.solve(m, A, w, 1e-8, 200)
+        assert result.negative and not result.converged
+        assert np.isfinite(w.y.to_numpy()).all() and np.sum(w.y.to_numpy() * w.rhs.to_numpy()) > 0.0

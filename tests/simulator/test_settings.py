@@ -120,6 +120,17 @@ def test_released_nodes_stay_free(tmp_path):
         assert_same(kept_values(sim), after)
 
 
+@pytest.mark.parametrize("integrator", ["implicit_euler", "symplectic_euler"])
+def test_contacts_can_be_turned_on(integrator):
+    """In a scene where nothing could touch before."""
+    with ts.Simulator(block_scene(), 1e-3, integrator) as sim:
+        sim.advance(3)
+        before = kept_values(sim)
+        sim.rebuild(self_collision=True)
+        assert_same(kept_values(sim), before)
+        assert sim.step().n_contacts == 0
+
+
 def test_refused_settings_change_nothing():
     with pressed() as sim:
         before, settings, scene, sizes = kept_values(sim), sim.settings, sim.scene, sim.field_bytes
