@@ -93,7 +93,7 @@ class StageSystem:
         multipliers: of cavities of given volume and inextensible tendons, if there are any.
         """
         model, arena, prescribed = simulation.model, simulation.arena, simulation.dirichlet.prescribed_nodes
-        self.model, self.contact, self.x_start, self.multipliers = model, contact, x_start, multipliers
+        self.model, self.step_contacts, self.x_start, self.multipliers = model, contact, x_start, multipliers
         self.pieces = Pieces(simulation, arena)
         self.matrix: BlockCsr = block_csr.build_block_csr(model, arena)
         self.damper = block_csr.sibling(self.matrix, model, arena, "damping") if model.stiffness_damping else None
@@ -169,9 +169,9 @@ class StageSystem:
 
     def _allocate_contacts(self) -> None:
         """Allocate storage for the contacts of this step."""
-        if self._storage is None or self._storage.problem is not self.contact.problem:
+        if self._storage is None or self._storage.problem is not self.step_contacts.problem:
             arena, shared = FieldArena(), self.work.pcg.divided and self.model.n_nodes >= SHARED_FROM
-            self._storage = build_stage_contacts(arena, self.model, self.contact.problem, self.x_start, shared)
+            self._storage = build_stage_contacts(arena, self.model, self.step_contacts.problem, self.x_start, shared)
             self._contact_arena.release()
             self._contact_arena = arena
 
@@ -224,7 +224,7 @@ class StageSystem:
         start of the step. Return whether that is formed.
         """
         m, start, self._volumes = self.model, self._whole, None
-        if stage.c > 0.0 and not stage.linearised and self.contact.n_contacts == 0:
+        if stage.c > 0.0 and not stage.linearised and self.step_contacts.n_contacts == 0:
             self._volumes = self.linear_solver.volumes()
         volumes = self._volumes
         if volumes is not None:
@@ -258,13 +258,15 @@ class StageSystem:
         if self.pieces.several:
             self.pieces.forget_weights()
         self.restrict(None)
-        if self.contact.n_contacts == 0:
+        if self.step_contacts.n_contacts == 0:
             return
         self._allocate_contacts()
         self.contacts, impact = self._storage, kind == IMPACT
         n = self.n_contacts
         self._may_share = NODES_PER_CONTACT * n <= self.model.n_nodes
-        begin_contacts(self.work, self.contacts, impact, stage.beta, stage.dt, *self.contact.gap_targets, stage.contact_tolerance)
+        begin_contacts(
+            self.work, self.contacts, impact, stage.beta, stage.dt, *self.step_contacts.gap_targets, stage.contact_tolerance
+        )
         self.frictionless = not download([self.contacts.problem.friction], n)[0].any()
         if self.work.pcg.has_last(self.contacts.coupling):
             find_last(self.model, self.matrix, self.contacts.coupling, self.work.pcg)
