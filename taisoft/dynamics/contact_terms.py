@@ -187,9 +187,8 @@ def update_contact(m: ti.template(), contacts: ti.template(), c, beta, r_scale):
             work.block[c][4 * j + i] = ti.cast(Dn * n[i] * n[j] + D_along * e[i] * e[j] + D_across * g[i] * g[j], m.real)
     work.active[c] = int(Dn > 0.0 or D_along > 0.0 or D_across > 0.0)
     d = r - prox(r - scaled(rows.factor[c], u), rows.friction[c])
-    missed = ti.select(
-        rows.factor[c][0] > 0.0, -u[0] * beta * work.gap_weight[c], 0.0
-    )  # only a node that can move can open a gap
+    # only a node that can move can open a gap
+    missed = ti.select(rows.factor[c][0] > 0.0, -u[0] * beta * work.gap_weight[c], 0.0)
     within_rounding = rows.factor[c][0] * work.rounding[c]  # an impulse that only this would change, as between bodies at rest
     work.prox_residual[c] = dvec(d.dot(d), r.dot(r) + within_rounding * within_rounding, missed)
 

@@ -43,10 +43,8 @@ class Newton:
     STATIC_FORCING = 1e-2  # maximum in statics, where a loose solve leaves a slender body stretched for the next step to correct
     REBUILD_RATIO = 0.2  # a step that leaves a larger fraction of |r| requires a new matrix,
     REBUILD_VOLUMES = 0.01  # with `step_with_volumes`, whose first matrix is that of the step's start and whose solves are longer
-    MIN_USES = {
-        False: 1,
-        True: 3,
-    }  # minimum steps per matrix, without and with contacts; with them mostly the active contacts change
+    # minimum steps per matrix, without and with contacts; with them mostly the active contacts change
+    MIN_USES = {False: 1, True: 3}
     ELIMINATION_RATIO = 0.1  # a step that leaves a larger fraction of |r| requires elimination
     DECREASE = 0.9  # with contacts, fraction of the smallest |r| so far below which a step is accepted without its slope
 

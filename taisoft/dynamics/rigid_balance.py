@@ -199,9 +199,8 @@ def _moment(m: ti.template(), stage: ti.template(), pieces: ti.template(), x: ti
             I += arm.dot(mass_arm) * identity - mass_arm.outer_product(arm)
             if ti.static(mode != SOLVED):
                 f = ti.cast(internal_on(m, i), ti.f64)
-                first = pieces.node[
-                    pieces.row_start[pieces.component_row[j]]
-                ]  # its velocity has no moment, but that of the forces' rounding
+                # the velocity of the first node has no moment, but that of the forces' rounding
+                first = pieces.node[pieces.row_start[pieces.component_row[j]]]
                 geometric -= beta * beta * f.cross(_velocity(m, stage, i, mode) - _velocity(m, stage, first, mode))
                 turn -= beta * beta * (f.dot(arm) * identity - arm.outer_product(f))
     for a in ti.static(range(3)):

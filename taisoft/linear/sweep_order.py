@@ -120,9 +120,8 @@ def times_last_above(model: ti.template(), A: ti.template(), terms: ti.template(
     """Part of (L^T x)_i that `times_above` leaves out: at last nodes before the diagonal, or apart."""
     row, beside = i + model.n_nodes, terms.place[i] == BESIDE
     first = A.row_start[i]
-    y = _times_last(
-        model, A, terms, first, ti.select(beside, A.row_start[i + 1], first), -1, x
-    )  # an empty loop costs less than a branch
+    # elsewhere an empty loop, which costs less than a branch
+    y = _times_last(model, A, terms, first, ti.select(beside, A.row_start[i + 1], first), -1, x)
     if ti.static(A.crossed):
         first = A.apart_start[row]
         y += _times_last(model, A, terms, first, ti.select(beside, A.row_start[row + 1], first), -1, x)
