@@ -265,7 +265,28 @@ class ImplicitStepper:
 
     def take_substep(self, time: float, dt: float, start: np.ndarray | None = None) -> StageResult:
         """Take a substep of dt from a time with the contacts of one search. start: (n_nodes, 3) [m/s] first iterate of v."""
-        simulation, model, history, work = self.simulation, self.simulation.model, self.history, self.solver.work
+        simulation, solver = self.simulation, self.solver
+        scheme, bounces = self._prepare(time, dt, start)
+        stage = self._stage(scheme, dt, self.tolerance)
+        result = solve_bouncing(solver, stage) if bounces else solve(solver, stage)
+        result = correct_multipliers(solver, stage, result)
+        if scheme.one_iteration and solver.pieces.several and result.converged and np.isfinite(result.residual):
+            result = self._balance(scheme, stage, result, may_repeat=not bounces)
+        if not result.converged:
+            result = replace(result, imbalance=describe_imbalance(simulation, solver, self.contact))
+        if scheme.midpoint:
+            finish_midpoint(simulation.model, self.history)
+        if not np.isfinite(result.residual):  # a NaN anywhere in x or v reaches the residual
+            where = simulation.find_nonfinite(solver.work.residual.to_numpy()) or "the residual is not finite"
+            raise SimulationError(f"step {simulation.step_count + 1}: {where}")
+        self._n_previous += 1
+        if self.contact.had_impact:
+            self._n_previous = 0
+        return result
+
+    def _prepare(self, time: float, dt: float, start: np.ndarray | None) -> tuple[Scheme, bool]:
+        """Search contacts and begin the stage of a substep; return its scheme, and whether any contacts rebound."""
+        simulation, model, work = self.simulation, self.simulation.model, self.solver.work
         releases = simulation.releases
         target = simulation.next_target(time + dt)
         if simulation.releases != releases or dt != self._dt:
@@ -296,18 +317,7 @@ class ImplicitStepper:
         self._begin(scheme, extrapolation)
         if start is not None and not scheme.one_iteration:  # that one is linearised at the step's start
             upload([(model.state.v, start)])
-        result = self._solve_balanced(scheme, dt, bounces)
-        if not result.converged:
-            result = replace(result, imbalance=describe_imbalance(simulation, self.solver, self.contact))
-        if scheme.midpoint:
-            finish_midpoint(model, history)
-        if not np.isfinite(result.residual):  # a NaN anywhere in x or v reaches the residual
-            where = simulation.find_nonfinite(self.solver.work.residual.to_numpy()) or "the residual is not finite"
-            raise SimulationError(f"step {simulation.step_count + 1}: {where}")
-        self._n_previous += 1
-        if self.contact.had_impact:
-            self._n_previous = 0
-        return result
+        return scheme, bounces
 
     def _begin(self, scheme: Scheme, extrapolation: float) -> None:
         """Begin the stage from the present state."""
@@ -318,15 +328,10 @@ class ImplicitStepper:
         if self.simulation.model.rigid_tets is not None:
             begin_rigid_stage(self.simulation.model, self.history, multistep, scheme.now, scheme.before, self._beta)
 
-    def _solve_balanced(self, scheme: Scheme, dt: float, bounces: bool) -> StageResult:
-        """Solve the stage; a linearised one again, to a tighter tolerance, if the forces on a piece as a whole are unbalanced."""
-        stage, pieces = self._stage(scheme, dt, self.tolerance), self.solver.pieces
-        result = solve_bouncing(self.solver, stage) if bounces else solve(self.solver, stage)
-        result = correct_multipliers(self.solver, stage, result)
-        if not (scheme.one_iteration and pieces.several and result.converged and np.isfinite(result.residual)):
-            return result
+    def _balance(self, scheme: Scheme, stage: Stage, result: StageResult, may_repeat: bool) -> StageResult:
+        """Solve a linearised stage again, to a tighter tolerance, if the forces on a piece as a whole are unbalanced."""
         worst, name = self._unbalanced_mean()
-        if worst > Pieces.LIMIT and not bounces:
+        if worst > Pieces.LIMIT and may_repeat:
             self.simulation.now.copy_nodes_from(self.start)
             self._begin(scheme, 0.0)
             tighter = self.tolerance * Pieces.LIMIT / min(worst, 1.0) * 0.1  # a tenth of what would just balance the piece
