@@ -15,7 +15,7 @@ from taisoft.backend.arrays import FieldArena
 from taisoft.backend.runtime import Runtime, compile_clock, kernel
 from taisoft.collision.bvh import Bvh
 from taisoft.collision.candidates import Buffer, Pairs, entries, fill, list_pairs, pair_entries
-from taisoft.collision.contacts import FOUND, KEPT, LEFT, UNKNOWN, is_same
+from taisoft.collision.reduction import FOUND, KEPT, LEFT, UNKNOWN, is_same
 from taisoft.collision.detector import MERGED, Detection
 from taisoft.collision.path_check import NO_PASSAGES
 from taisoft.collision.spatial_hash import SpatialHash
@@ -164,7 +164,7 @@ class Quadratic:
 
     def same(self) -> bool:
         """Whether it kept the same contacts as the detection's reduction."""
-        r = self._detection._reduction
+        r = self._detection._reduction.work
         found, left = r.count[FOUND], r.count[LEFT]
         if self._state.to_numpy()[found] != left:
             return False

@@ -1,16 +1,9 @@
-"""Contacts of surfaces that touch or will touch within the step: fields for kernels, a record for the host, and their reduction.
+"""Contacts of surfaces that touch or will touch within the step: fields for kernels, and a record for the host.
 
 A contact has a side a and a side b, each a point on up to three nodes with weights that sum to 1; an obstacle is always b and
 has no nodes. The normal is a unit vector from b to a; the gap is the signed distance of the two points along it, negative in
 penetration, or of a passage whose sides turn in the step. A feature identifies the pair of mesh features in contact, and
 persists while they stay in contact.
-
-The reduction merges contacts of one pair of bodies that are within a tolerance, with one normal (report, section 3.1.3). In the
-order of kind, feature and position in the buffer, a contact is kept unless an earlier kept one is within the tolerance: the
-result of two nested loops. Here each contact is compared only with those in the cells around it, so the cost is linear. Cells
-hash into buckets. A cell is wider than twice the tolerance, and every cell within the tolerance is searched, so the result does
-not depend on the placement of the cells. Rounds are repeated until all contacts are decided: a contact is kept once all its
-earlier neighbours are dropped, and dropped once an earlier neighbour is kept.
 """
 
 from dataclasses import dataclass
@@ -20,19 +13,7 @@ import numpy as np
 import taichi as ti
 
 from taisoft.backend.arrays import FieldArena
-from taisoft.backend.lists import (
-    Lists,
-    add_up_counts,
-    bucket_of,
-    clear_counts,
-    count_entry,
-    make_lists,
-    place_of_entry,
-    sum_before,
-)
-from taisoft.backend.runtime import kernel
-from taisoft.collision.candidates import TOTAL, Parts
-from taisoft.collision.surface import cell_of, dvec, ivec
+from taisoft.collision.surface import dvec, ivec
 from taisoft.display import short_repr
 from taisoft.scene.scene import Scene
 
@@ -40,11 +21,6 @@ from taisoft.scene.scene import Scene
 # triangle and collider; a passage (`passages`)
 VERTEX_FACE, EDGE_EDGE, VERTEX_FIELD, FACE_FIELD, FACE_FACE = range(5)
 KINDS = ("vertex_face", "edge_edge", "vertex_field", "face_field", "face_face")
-
-SAME_NORMAL = 0.996  # cosine of 5 degrees
-UNKNOWN, KEPT, DROPPED = 0, 1, 2
-PERIOD = (2**20,) * 3  # cells along each axis after which their indices repeat
-FOUND, LEFT, UNDECIDED, MASK = 0, 1, 2, 3  # indices into the count; LEFT: kept contacts; MASK: buckets in use, minus one
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,166 +151,3 @@ def write_point_contact(s: ti.template(), out: ti.template(), at, last, t, j, w,
         i = s.triangle[t, j]
         feature, nodes, weights = ivec(VERTEX_FIELD, i, other), ivec(i, -1, -1), dvec(1.0, 0.0, 0.0)
     write_contact(out, at, last, s.body[t], other, feature, point, n, gap, nodes, weights, nodes_b, weights_b)
-
-
-# --- reduction -----------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, eq=False)
-class ReductionFields:
-    """Workspace of the reduction. The first count[LEFT] entries of `kept` are the kept contacts' buffer indices, ascending."""
-
-    serial: bool
-    spread: int  # as of the surface
-    place: Any  # (capacity) i32: buffer index of the i-th contact found
-    bucket: Any  # (capacity) i32: bucket of the i-th contact
-    lists: Lists  # of the buckets, in `member`
-    member: Any  # (capacity) i32: buffer indices, by bucket
-    state: Any  # (capacity) i32: state of the contact at each buffer index
-    kept: Any  # (capacity) i32
-    count: Any  # (4) i32
-
-
-def reduction_fields(arena: FieldArena, capacity: int, serial: bool, spread: int = 1) -> ReductionFields:
-    """Allocate the workspace for `capacity` contacts."""
-    buckets = 1 << max(capacity - 1, 63).bit_length()  # the number in use grows with the number of contacts
-    sizes = dict.fromkeys(("place", "bucket", "member", "state", "kept"), capacity) | {"count": 4}
-    fields = {name: arena.field(f"reduction_{name}", ti.i32, size) for name, size in sizes.items()}
-    return ReductionFields(serial, spread, lists=make_lists(arena, "reduction", buckets, serial), **fields)
-
-
-@ti.func
-def _bucket(work: ti.template(), cell):
-    return bucket_of(cell[0], cell[1], cell[2], work.count[MASK])
-
-
-@ti.func
-def _fill_cells(work: ti.template(), out: ti.template(), inverse, lowest_gap):
-    """Number the contacts over all parts, drop those between surfaces whose gap is lower, and enter the others into the cells."""
-    ti.loop_config(serialize=True)
-    for _ in range(1):
-        mask = 63
-        while mask + 1 < out.count[TOTAL]:
-            mask = 2 * mask + 1
-        work.count[FOUND], work.count[MASK] = out.count[TOTAL], mask
-    clear_counts(work.lists, work.count[MASK] + 1)
-    ti.loop_config(serialize=work.serial)
-    for task in range(out.chunks * work.spread):
-        if task % work.spread == 0:
-            c = task // work.spread
-            first = sum_before(out.used, c)
-            for k in range(out.used[c]):
-                i, at = first + k, c * out.part + k
-                work.place[i] = at
-                by_surfaces = out.data.feature[at][0] == VERTEX_FACE or out.data.feature[at][0] == EDGE_EDGE
-                work.state[at] = ti.select(by_surfaces and out.data.gap[at] < lowest_gap, DROPPED, UNKNOWN)
-                work.bucket[i] = _bucket(work, cell_of(out.data.point[at], inverse, PERIOD))
-                count_entry(work.lists, work.bucket[i])
-    add_up_counts(work.lists, work.count[MASK] + 1)
-    ti.loop_config(serialize=work.serial)
-    for i in range(work.count[FOUND]):
-        work.member[place_of_entry(work.lists, work.bucket[i])] = work.place[i]
-
-
-@ti.func
-def is_same(out: ti.template(), a, b, tolerance):
-    """Whether the contacts at a and b are to be merged."""
-    result = False
-    if (out.body[a] == out.body[b]).all():
-        d = out.point[a] - out.point[b]
-        result = d.dot(d) <= tolerance * tolerance and out.normal[a].dot(out.normal[b]) >= ti.cast(SAME_NORMAL, ti.f64)
-        # a passage that was found in spite of another contact must not be lost to that one
-        result = result and out.feature[a][0] != FACE_FACE and out.feature[b][0] != FACE_FACE
-    return result
-
-
-@ti.func
-def is_earlier(out: ti.template(), a, b):
-    """1 if the contact at a precedes that at b: by kind, exact ones first, then by feature, then by buffer index."""
-    result = int(a < b)
-    for q in ti.static((2, 1, 0)):
-        if out.feature[a][q] != out.feature[b][q]:
-            result = int(out.feature[a][q] < out.feature[b][q])
-    return result
-
-
-@ti.func
-def _decide(work: ti.template(), out: ti.template(), at, inverse, tolerance):
-    """State of the contact at a buffer index, from the states of the earlier ones near it."""
-    p = out.point[at]
-    lo, hi = cell_of(p - tolerance, inverse, PERIOD), cell_of(p + tolerance, inverse, PERIOD)
-    n = ti.select(lo == hi, 1, 2)
-    state = KEPT
-    k = 0
-    while state != DROPPED and k < n[0] * n[1] * n[2]:
-        z, y, x = k % n[2], (k // n[2]) % n[1], k // (n[2] * n[1])
-        cell = ivec(ti.select(x == 0, lo[0], hi[0]), ti.select(y == 0, lo[1], hi[1]), ti.select(z == 0, lo[2], hi[2]))
-        b = _bucket(work, cell)
-        for m in range(work.lists.start[b], work.lists.start[b + 1]):
-            other = work.member[m]
-            d = p - out.point[other]
-            if d.dot(d) <= tolerance * tolerance:  # this test rejects most
-                if is_earlier(out, other, at) == 1:
-                    other_state = work.state[other]
-                    if other_state != DROPPED and is_same(out, at, other, tolerance):
-                        if other_state == KEPT:
-                            state = DROPPED
-                        elif state == KEPT:
-                            state = UNKNOWN
-        k += 1
-    return state
-
-
-@ti.func
-def _decide_all(work: ti.template(), out: ti.template(), inverse, tolerance):
-    """Run one round: decide every contact that can be decided."""
-    work.count[UNDECIDED] = 0
-    ti.loop_config(serialize=work.serial)
-    for i in range(work.count[FOUND]):
-        at = work.place[i]
-        if work.state[at] == UNKNOWN:
-            state = _decide(work, out, at, inverse, tolerance)
-            if state == UNKNOWN:
-                ti.atomic_add(work.count[UNDECIDED], 1)
-            else:
-                work.state[at] = state
-
-
-@ti.func
-def _list_kept(work: ti.template()):
-    """List the kept contacts in order, once all are decided."""
-    ti.loop_config(serialize=True)
-    for _ in range(1):
-        n = 0
-        if work.count[UNDECIDED] == 0:
-            for i in range(work.count[FOUND]):
-                if work.state[work.place[i]] == KEPT:
-                    work.kept[n] = work.place[i]
-                    n += 1
-        work.count[LEFT] = n
-
-
-@kernel
-def begin_reduction(work: ti.template(), out: ti.template(), inverse: ti.f64, tolerance: ti.f64, lowest_gap: ti.f64):
-    """Enter the contacts into the cells and run the first round; more are needed only while contacts are undecided."""
-    _fill_cells(work, out, inverse, lowest_gap)
-    _decide_all(work, out.data, inverse, tolerance)
-    _list_kept(work)
-
-
-@kernel
-def decide(work: ti.template(), out: ti.template(), inverse: ti.f64, tolerance: ti.f64):
-    """Run a further round."""
-    _decide_all(work, out.data, inverse, tolerance)
-    _list_kept(work)
-
-
-def reduce_contacts(work: ReductionFields, out: Parts, tolerance: float, cell: float, lowest_gap: float = -np.inf) -> None:
-    """Fill work.kept and work.count for a buffer of contacts.
-
-    tolerance [m]; cell: edge of the cells [m], at least 2.5 tolerances; lowest_gap [m]: of surfaces that do not cross.
-    """
-    inverse = 1.0 / max(cell, 2.5 * tolerance)
-    begin_reduction(work, out, inverse, tolerance, lowest_gap)
-    while work.count[UNDECIDED] > 0:
-        decide(work, out, inverse, tolerance)

@@ -11,21 +11,23 @@ import taichi as ti
 
 from taisoft.backend.arrays import FieldArena, download
 from taisoft.backend.runtime import Runtime
-from taisoft.collision.analytic import NO_SHAPES, AnalyticFrames, build_analytic, find_analytic
+from taisoft.collision.analytic import NO_SHAPES, AnalyticFrames, AnalyticObstacles, build_analytic, find_analytic
 from taisoft.collision.bvh import Bvh, Trees
 from taisoft.collision.candidates import Buffer, Candidates, Parts, entries, fill, pair_entries, pairs_of
 from taisoft.collision.colliders import body_grid, collider_surfaces, collider_thickness, prescribed_vertices
-from taisoft.collision.contacts import FOUND, LEFT, Contacts, contact_fields, named_contacts, reduce_contacts, reduction_fields
+from taisoft.collision.contacts import ContactFields, Contacts, contact_fields, named_contacts
 from taisoft.collision.containment import Containment, Inside
 from taisoft.collision.distance_field import DistanceFields, build_fields, find_in_fields
 from taisoft.collision.edge_edge import PROXIMITY, find_proximity
+from taisoft.collision.end_search import EndSearch, place_at_end
 from taisoft.collision.features import BY_EDGES, BY_FACES, BY_FIELD
 from taisoft.collision.intersections import CROSSINGS_OF, INTERSECTING, find_crossings
 from taisoft.collision.near_list import STILL
 from taisoft.collision.passages import ROUND, append_passages
-from taisoft.collision.path_check import NO_PASSAGES, HeldPassages, PathCheck
+from taisoft.collision.path_check import IN_BOXES, NO_PASSAGES, HeldPassages, PathCheck
+from taisoft.collision.reduction import Reduction
 from taisoft.collision.spatial_hash import SpatialHash
-from taisoft.collision.surface import ACTIVE, NONFINITE, PAIRS, build_surface, update_surface
+from taisoft.collision.surface import ACTIVE, NONFINITE, PAIRS, Surface, build_surface, update_surface
 from taisoft.errors import SceneError, SimulationError
 from taisoft.fem.model import Layout, Model
 from taisoft.mesh.quality import mean_surface_edge
@@ -108,8 +110,9 @@ class Detection:
         self._near_buffer = Buffer("near", entries, *limits, s.chunks, arena) if self.has_pairs else None
         capacity = settings.initial_capacity or CONTACTS_PER_TRIANGLE * s.n_triangles + 64
         self.buffer = Buffer("contacts", contact_fields, capacity, settings.max_capacity, s.chunks, arena)
-        self._reduction_arena = FieldArena()
-        self._reduction = None
+        self._lengths = MERGED * self.edge, REDUCTION_CELL * self.edge
+        self._reduction = Reduction(s, self.buffer, *self._lengths)
+        self.end: EndSearch | None = None  # see `find_at_end`
         self._intersecting: Buffer | None = None  # pairs of triangles, allocated at first use
         self._self_on, self.floor = properties["self_on"], FLOOR * float(self.edges[: len(bodies)].min())
         self.paths: PathCheck | None = None  # see `prepare_paths`
@@ -166,10 +169,11 @@ class Detection:
         self._move(time, dt, prescribed, path)
         self._broad_result = self._near()
         self._search(self._broad_result, held)
-        self._reduce(none_cross)
+        self._reduction.reduce(-self.floor if none_cross else -np.inf)  # if none cross, a vertex behind a face is not inside
+        self._count()
 
-    def _move(self, time: float, dt: float, prescribed: tuple[np.ndarray, np.ndarray] | None = None, path=None) -> None:
-        """Update positions and displacements of the surface, and the boxes."""
+    def _move(self, time: float, dt: float, prescribed=None, path=None, x=None) -> None:
+        """Update positions and displacements of the surface, and the boxes. x: the nodes' positions if not the present ones."""
         s, m = self.surface, self.model
         try:
             self._place_obstacles(time, dt)
@@ -182,7 +186,7 @@ class Detection:
             self._prescribed_moves.from_numpy(prescribed_vertices(self.topology, *prescribed))
         v, span = (m.state.v, dt) if path is None else (path, 1.0)
         moves = self._prescribed_moves if has_prescribed else s.move
-        update_surface(s, m.state.x, v, has_prescribed, moves, span, self.reach, self.has_pairs)
+        update_surface(s, m.state.x if x is None else x, v, has_prescribed, moves, span, self.reach, self.has_pairs)
         if s.count[NONFINITE]:
             raise SimulationError(self._nonfinite())
 
@@ -219,7 +223,13 @@ class Detection:
 
     def _fill_buffer(self, near: Trees | Candidates | None, held: HeldPassages) -> None:
         """Write the contacts before reduction, as many as fit."""
-        s, out, append = self.surface, self.buffer.parts, 0
+        append = self._fill_with(near, self.surface, self.shapes, self.buffer)
+        if len(held.pairs):
+            append_passages(self.surface, self.shapes, self.paths.fields, *held, self.buffer.parts, append)
+
+    def _fill_with(self, near: Trees | Candidates | None, s: Surface, shapes: AnalyticObstacles, buffer: Buffer) -> int:
+        """Write the contacts of a surface and shapes; return 1 if anything was searched, else 0."""
+        out, append = buffer.parts, 0
         if near is not None:
             row = self._near_buffer.parts
             if self._proximity:
@@ -228,29 +238,40 @@ class Detection:
             if self._fields is not None:
                 find_in_fields(s, near, row, self._fields, out, append)
                 append = 1
-        if self.shapes.count:
-            find_analytic(s, self.shapes, self.margin, out, append)
+        if shapes.count:
+            find_analytic(s, shapes, self.margin, out, append)
             append = 1
-        if len(held.pairs):
-            append_passages(s, self.shapes, self.paths.fields, *held, out, append)
+        return append
 
-    def _reduce(self, none_cross: bool) -> None:
-        """Reduce the contacts and update the counts."""
-        b = self.buffer
-        if self._reduction is None or self._reduction.place.shape[0] != b.capacity:
-            arena = FieldArena()
-            self._reduction = reduction_fields(arena, b.capacity, self.surface.serial_cheap, self.surface.cheap_spread)
-            self._reduction_arena.release()
-            self._reduction_arena = arena
-        lowest_gap = -self.floor if none_cross else -np.inf  # if none cross, a vertex behind a face is not inside
-        reduce_contacts(self._reduction, b.parts, MERGED * self.edge, REDUCTION_CELL * self.edge, lowest_gap)
+    def _count(self) -> None:
+        """Update the counts."""
         count, surface = self.counts, self.surface.count
         if self.has_pairs:
             count.active, count.pairs = surface[ACTIVE], surface[PAIRS]
         if self._fields is not None:
             count.unmapped = self._fields.unmapped[0]
-        count.found, count.contacts = self._reduction.count[FOUND], self._reduction.count[LEFT]
+        count.found, count.contacts = self._reduction.n_found, self._reduction.n_kept
         count.growths = {b.name: b.growths for b in self._buffers()}
+
+    def find_at_end(self, time: float, dt: float, x_start, displacement) -> EndSearch:
+        """Find the contacts at displacements from x_start, (n_nodes) [m] each, with obstacles as at the end of a step of dt from a
+        time. The last search must have been that of the step; it is repeated along these displacements if they leave its paths.
+        Surfaces may cross there."""
+        if self.end is None:
+            self.end = EndSearch(self.surface, self.shapes, self.buffer, self._lengths)
+        end, place = self.end, (displacement, self.reach, self.end.left)
+        place_at_end(self.surface, end.surface, *place)
+        if not end.left[0] <= IN_BOXES * self.reach:
+            self._move(time, dt, None, displacement, x_start)
+            self._broad_result = self._near()
+            place_at_end(self.surface, end.surface, *place)
+        unmapped = 0 if self._fields is None else self._fields.unmapped[0]
+        buffers = (self._near_buffer,) if self.has_pairs else ()
+        fill(lambda: self._fill_with(self._broad_result, end.surface, end.shapes, end.buffer), *buffers, end.buffer)
+        end.reduction.reduce(-np.inf)
+        if self._fields is not None:
+            self._fields.unmapped[0] = unmapped
+        return end
 
     # --- results --------------------------------------------------------------------------------------------------
 
@@ -263,12 +284,12 @@ class Detection:
         what = np.zeros((len(at), 3)), collider, feature, *self.sides(at)
         return named_contacts(self.scene, point, normal, gap, *what, found=counts.found, unmapped=counts.unmapped)
 
-    def sides(self, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Nodes and weights (k,6) of the contacts at places (k,) of the buffer, before dependent nodes are replaced.
+    def sides(self, at: np.ndarray, data: ContactFields | None = None) -> tuple[np.ndarray, np.ndarray]:
+        """Nodes and weights (k,6) of the contacts at places (k,) of a buffer, before dependent nodes are replaced.
 
-        There are three of each side, -1 where there is none.
+        There are three of each side, -1 where there is none. data: of the buffer, None for that of the last search.
         """
-        data = self.buffer.data
+        data = self.buffer.data if data is None else data
         vertices = np.hstack([data.nodes_a[at], data.nodes_b[at]])
         nodes = np.where(vertices >= 0, np.append(self.topology.node, -1)[vertices], -1)
         return nodes, np.where(nodes >= 0, np.hstack([data.weights_a[at], data.weights_b[at]]), 0.0)
@@ -281,7 +302,7 @@ class Detection:
     @property
     def kept(self):
         """Field of the kept contacts' indices in the buffer; the first counts.contacts are valid."""
-        return self._reduction.kept
+        return self._reduction.work.kept
 
     def intersections(self) -> np.ndarray:
         """Return the pairs (k,2) of triangles without a common vertex that intersect, at the positions of the last search."""
@@ -343,13 +364,13 @@ class Detection:
     @property
     def field_bytes(self) -> dict[str, int]:
         """Size of every allocated field [bytes], by name."""
-        return self._arena.bytes | self._reduction_arena.bytes | {b.name: b.bytes for b in self._buffers()}
+        return self._arena.bytes | self._reduction.bytes | {b.name: b.bytes for b in self._buffers()}
 
     def release(self) -> None:
         """Free all memory."""
-        for part in (self.broad, self._intersecting, self._near_buffer, self.paths):
+        for part in (self.broad, self._intersecting, self._near_buffer, self.paths, self.end):
             if part is not None:
                 part.release()
         self.buffer.release()
-        self._reduction_arena.release()
+        self._reduction.release()
         self._arena.release()

@@ -61,7 +61,7 @@ def _set_paths(surface: ti.template(), x: ti.template(), paths: ti.template(), m
             path = x[surface.node[i]] - surface.x[i]
             change = path - surface.move[i]
             if not change.dot(change) <= limit * limit:  # cheaper, and mostly enough; also if it is not a number
-                if not _leaving(path, surface.move[i]).norm() <= limit:
+                if not leaving(path, surface.move[i]).norm() <= limit:
                     paths.left[UNCOVERED] = 1
         paths.path[i] = path
         if ti.static(paths.has_pairs):
@@ -70,7 +70,7 @@ def _set_paths(surface: ti.template(), x: ti.template(), paths: ti.template(), m
 
 
 @ti.func
-def _leaving(r, move):
+def leaving(r, move):
     """Vector (3,) by which a point r (3,) has left the way from the origin along a displacement [m]."""
     square, along = move.dot(move), ti.cast(0.0, ti.f64)
     if square > 0.0:
@@ -119,7 +119,7 @@ def _compare_with_listed(s: ti.template(), g: ti.template(), limit):
             for i in range(g.first_vertex[b], g.first_vertex[b + 1]):
                 if g.can_touch[i] == 1:
                     now = s.x[i] - g.listed_x[i]
-                    first, last = _leaving(now, g.listed_move[i]), _leaving(now + g.path[i], g.listed_move[i])
+                    first, last = leaving(now, g.listed_move[i]), leaving(now + g.path[i], g.listed_move[i])
                     lo0, hi0, lo1, hi1 = ti.min(lo0, first), ti.max(hi0, first), ti.min(lo1, last), ti.max(hi1, last)
             g.left_lo[2 * b], g.left_hi[2 * b], g.left_lo[2 * b + 1], g.left_hi[2 * b + 1] = lo0, hi0, lo1, hi1
     ti.loop_config(serialize=s.serial_cheap)

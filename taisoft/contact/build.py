@@ -149,7 +149,7 @@ def _add_vertex(p: ti.template(), m: ti.template(), s: ti.template(), c, k, v, w
 
 
 @ti.func
-def _pair_slot(problem: ti.template(), body):
+def pair_slot(problem: ti.template(), body):
     """Slot of a pair of colliders among those of the previous step, or the empty one where it belongs."""
     mask, found = problem.past.n_slots - 1, 0
     k = bucket_of(body[0], body[1], 0, mask)
@@ -170,7 +170,7 @@ def _slot(problem: ti.template(), feature):
 def _count_load(p: ti.template(), c, common_offset):
     """Add contact c to the sums of its pair, if it carries an impulse or could be opened."""
     if p.r[c][0] > 0.0 or p.gap[c] < contact_offset_of(p, c, common_offset):
-        k = _pair_slot(p, p.body[c])
+        k = pair_slot(p, p.body[c])
         if p.past.pair_slot[k] < 0:
             p.past.pair_slot[k] = c
         first = p.past.pair_slot[k]
@@ -180,50 +180,65 @@ def _count_load(p: ti.template(), c, common_offset):
 @ti.func
 def _load(p: ti.template(), c):
     """Velocity that the impulses of the pair of contact c gave its contacts in the previous step [m/s]."""
-    first, load = p.past.pair_slot[_pair_slot(p, p.body[c])], ti.cast(0.0, ti.f64)
+    first, load = p.past.pair_slot[pair_slot(p, p.body[c])], ti.cast(0.0, ti.f64)
     if first >= 0:
         if p.past.pair_sum[first][1] > 0.0:
             load = p.past.pair_sum[first][0] / p.past.pair_sum[first][1]
     return load
 
 
+@ti.func
+def enter_past(problem: ti.template()):
+    """Store the present contacts as those of the past. Top-level loops of a kernel."""
+    ti.loop_config(serialize=problem.serial)
+    for c in range(problem.count[0]):
+        problem.past.feature[c], problem.past.collider[c] = problem.feature[c], problem.body[c]
+        problem.past.pair_sum[c] = ti.Vector([0.0, 0.0], ti.f64)
+        problem.past.point[c] = problem.point[c]
+        problem.past.impulse[c] = to_world(problem, c, problem.r[c])
+    ti.loop_config(serialize=problem.serial)
+    for k in range(problem.past.n_slots):
+        problem.past.slot[k] = problem.past.pair_slot[k] = -1
+    ti.loop_config(serialize=True)
+    for _ in range(1):
+        for c in range(problem.count[0]):
+            k = _slot(problem, problem.past.feature[c])
+            while problem.past.slot[k] >= 0:
+                k = (k + 1) & (problem.past.n_slots - 1)
+            problem.past.slot[k] = c
+
+
 @kernel
 def keep_impulses(p: ti.template(), common_offset: ti.f64):
     """Store the present contacts as those of the previous step. common_offset: contact offset between different bodies [m]."""
-    ti.loop_config(serialize=p.serial)
-    for c in range(p.count[0]):
-        p.past.feature[c], p.past.collider[c] = p.feature[c], p.body[c]
-        p.past.pair_sum[c] = ti.Vector([0.0, 0.0], ti.f64)
-        p.past.point[c] = p.point[c]
-        p.past.impulse[c] = to_world(p, c, p.r[c])
-    ti.loop_config(serialize=p.serial)
-    for k in range(p.past.n_slots):
-        p.past.slot[k] = p.past.pair_slot[k] = -1
+    enter_past(p)
     ti.loop_config(serialize=True)
     for _ in range(1):
         for c in range(p.count[0]):
-            k = _slot(p, p.past.feature[c])
-            while p.past.slot[k] >= 0:
-                k = (k + 1) & (p.past.n_slots - 1)
-            p.past.slot[k] = c
             _count_load(p, c, common_offset)
+
+
+@ti.func
+def past_of(p: ti.template(), feature, point):
+    """The past contact with the same feature that is nearest to a point (3,), -1 if there is none."""
+    best, smallest = -1, ti.cast(ti.math.inf, ti.f64)
+    k = _slot(p, feature)
+    while p.past.slot[k] >= 0:
+        j = p.past.slot[k]
+        if (p.past.feature[j] == feature).all():
+            d = (p.past.point[j] - point).norm()
+            if d < smallest:
+                best, smallest = j, d
+        k = (k + 1) & (p.past.n_slots - 1)
+    return best
 
 
 @ti.func
 def _warm_impulse(p: ti.template(), c):
     """World impulse of the nearest contact with the same feature in the previous step; 0 if there is none."""
-    best, smallest = -1, ti.cast(ti.math.inf, ti.f64)
-    k = _slot(p, p.feature[c])
-    while p.past.slot[k] >= 0:
-        j = p.past.slot[k]
-        if (p.past.feature[j] == p.feature[c]).all():
-            d = (p.past.point[j] - p.point[c]).norm()
-            if d < smallest:
-                best, smallest = j, d
-        k = (k + 1) & (p.past.n_slots - 1)
-    impulse = dvec(0.0)
-    if best >= 0:
-        impulse = p.past.impulse[best]
+    j, impulse = past_of(p, p.feature[c], p.point[c]), dvec(0.0)
+    if j >= 0:
+        impulse = p.past.impulse[j]
     return impulse
 
 
@@ -238,21 +253,21 @@ def relative_velocity(p: ti.template(), m: ti.template(), c, dt):
 
 @kernel
 def drop_vanishing(
-    p: ti.template(), m: ti.template(), s: ti.template(), found: ti.template(), kept: ti.template(), n: ti.i32
+    p: ti.template(), m: ti.template(), s: ti.template(), found: ti.template(), kept: ti.template(), n: ti.i32, free: ti.i32
 ) -> ti.i32:
     """Leave out of kept[:n] the contacts whose weights cancel, since both sides depend on the same nodes.
 
-    Returns the number of contacts left.
+    free: a contact of the problem that is not in use. Returns the number of contacts left.
     """
     left = 0
     ti.loop_config(serialize=True)
     for _ in range(1):
         for c in range(n):
             row = kept[c]
-            k = _add_sides(p, m, s, 0, found, row)
+            k = _add_sides(p, m, s, free, found, row)
             largest = ti.cast(0.0, ti.f64)
             for j in range(k):
-                largest = ti.max(largest, ti.abs(p.weight[0, j]))
+                largest = ti.max(largest, ti.abs(p.weight[free, j]))
             if k == 0 or largest > VANISHING:
                 kept[left] = row
                 left += 1
@@ -268,6 +283,18 @@ def _add_sides(p: ti.template(), m: ti.template(), s: ti.template(), c, found: t
     for j in ti.static(range(3)):
         k = _add_vertex(p, m, s, c, k, found.nodes_b[row][j], found.weights_b[row][j], -1.0)
     return k
+
+
+@ti.func
+def fill_row(p: ti.template(), m: ti.template(), s: ti.template(), q: ti.template(), c, found: ti.template(), row):
+    """Set the geometry and coefficients of contact c to those found, but for the displacement of an analytic obstacle."""
+    p.normal[c], p.gap[c], p.point[c], p.turned[c] = found.normal[row], found.gap[row], found.point[row], found.turned[row]
+    p.tangent[c], p.sweep.order[c] = tangent(p.normal[c]), c
+    p.body[c], p.feature[c] = found.body[row], found.feature[row]
+    p.friction[c], p.restitution[c] = _pair_coefficients(q, p.body[c][0], p.body[c][1])
+    p.obstacle_displacement[c] = dvec(0.0)
+    p.arity[c] = _add_sides(p, m, s, c, found, row)
+    p.min_opening[c], p.impact_impulse[c] = 0.0, dvec(0.0)
 
 
 @kernel
@@ -290,19 +317,12 @@ def fill(
     p.count[0] = n
     ti.loop_config(serialize=p.serial)
     for c in range(n):
-        row = kept[c]
-        normal, gap, point = found.normal[row], found.gap[row], found.point[row]
-        p.normal[c], p.gap[c], p.point[c], p.turned[c] = normal, gap, point, found.turned[row]
-        p.tangent[c], p.sweep.order[c] = tangent(normal), c
-        p.body[c], p.feature[c] = found.body[row], found.feature[row]
-        p.friction[c], p.restitution[c] = _pair_coefficients(q, p.body[c][0], p.body[c][1])
-        p.obstacle_displacement[c] = dvec(0.0)
-        p.arity[c] = _add_sides(p, m, s, c, found, row)
+        fill_row(p, m, s, q, c, found, kept[c])
+        normal = p.normal[c]
         if ti.static(o.any):
-            if found.nodes_b[row][0] < 0:
-                p.obstacle_displacement[c] = obstacle_displacement_at(o, p.body[c][1], point - 0.5 * gap * normal)
+            if found.nodes_b[kept[c]][0] < 0:
+                p.obstacle_displacement[c] = obstacle_displacement_at(o, p.body[c][1], p.point[c] - 0.5 * p.gap[c] * normal)
         p.approach[c], p.load[c] = normal.dot(relative_velocity(p, m, c, dt)), warm * _load(p, c)
-        p.min_opening[c], p.impact_impulse[c] = 0.0, dvec(0.0)
         p.r[c] = prox(to_frame(p, c, warm * _warm_impulse(p, c)), p.friction[c])
 
 
@@ -313,9 +333,15 @@ def _self_contact_factor(p: ti.template(), c):
 
 
 @ti.func
+def offset_between(body, common):
+    """Contact offset [m] of a pair of colliders; common: that between different bodies."""
+    return ti.select(body[0] == body[1], ti.cast(SELF_CONTACT, ti.f64), ti.cast(1.0, ti.f64)) * common
+
+
+@ti.func
 def contact_offset_of(p: ti.template(), c, common):
     """Contact offset of contact c [m]; common: that between different bodies."""
-    return _self_contact_factor(p, c) * common
+    return offset_between(p.body[c], common)
 
 
 @ti.func
@@ -344,6 +370,24 @@ def gap_minus_target(
     if least_gap > 0.0 and p.turned[c] == 1:
         target = ti.max(target, least_gap * contact_offset)
     return gap - target
+
+
+@kernel
+def set_targets(
+    p: ti.template(),
+    dt: ti.f64,
+    common_offset: ti.f64,
+    penetration_fraction: ti.f64,
+    offset_fraction: ti.f64,
+    max_speed: ti.f64,
+):
+    """Set the targets of all contacts in an implicit step of dt [s], without restitution; the others as of `gap_minus_target`."""
+    none, least = ti.cast(0.0, ti.f64), ti.cast(LEAST_GAP, ti.f64)
+    ti.loop_config(serialize=p.serial)
+    for c in range(p.count[0]):
+        p.target[c] = p.gap[c] - gap_minus_target(
+            p, c, dt, common_offset, penetration_fraction, offset_fraction, max_speed, none, least
+        )
 
 
 @kernel

@@ -60,6 +60,19 @@ class PastContacts:
 
 
 @dataclass(frozen=True, eq=False)
+class Renewal:
+    """What a renewal of the geometry decides about contacts, see `geometry`."""
+
+    fate: Any  # i32: what becomes of each present contact
+    heir: Any  # i32: the new contact that gets its impulse, -1 for none
+    match: Any  # i32: of each new contact, the present one that it replaces, or how it was judged
+    inherited: Any  # 3-vectors, world frame: impulses that a new contact gets from others [N s]
+    target: Any  # f64: target of each new contact [m]
+    height: Any  # f64: of each new contact, its gap minus what it has opened since the step's start [m]
+    is_kept: Any  # i32: 1 at the first contact of a pair of colliders whose contacts stay as they are
+
+
+@dataclass(frozen=True, eq=False)
 class ContactProblem:
     """Fields of up to `capacity` contacts; the first count[0] are in use. Fields of the other form of W are None."""
 
@@ -94,6 +107,7 @@ class ContactProblem:
     feature: Any = None  # 3-vectors i32
     point: Any = None  # 3-vectors [m]
     gap: Any = None  # f64 [m]
+    target: Any = None  # f64: smallest gap at the end of an implicit step [m], see `build`
     turned: Any = None  # i32: 1 if a negative gap is no penetration, but tells how far the sides turn in the step
     obstacle_displacement: Any = None  # 3-vectors: obstacle's displacement at the contact in the step [m]
     approach: Any = None  # f64: normal velocity at the start of the step, negative if surfaces approach [m/s]
@@ -103,6 +117,7 @@ class ContactProblem:
     min_opening: Any = None  # f64: least opening of the gap in the step, 0 without restitution [m]
     impact_impulse: Any = None  # 3-vectors: impulse of the impact before the step [N s]
     past: PastContacts | None = None
+    renewal: Renewal | None = None
 
 
 def build_node_problem(arena: FieldArena, capacity: int, n_nodes: int, serial: bool, masters: int = 1) -> ContactProblem:
@@ -116,6 +131,11 @@ def build_node_problem(arena: FieldArena, capacity: int, n_nodes: int, serial: b
         **_fields(arena, "pair_sum", ti.f64, n, 2, "past_contact"),
         **_fields(arena, "slot pair_slot", ti.i32, n_slots, 0, "past_contact"),
     )
+    renewal = Renewal(
+        **_fields(arena, "fate heir match is_kept", ti.i32, n, 0, "renewal"),
+        **_fields(arena, "target height", ti.f64, n, 0, "renewal"),
+        **_fields(arena, "inherited", ti.f64, n, 3, "renewal"),
+    )
     return ContactProblem(
         n,
         serial,
@@ -124,12 +144,13 @@ def build_node_problem(arena: FieldArena, capacity: int, n_nodes: int, serial: b
         n_nodes=n_nodes,
         width=width,
         past=past,
+        renewal=renewal,
         **_solver_fields(arena, n, serial),
         **_fields(arena, "node", ti.i32, (n, width)),
         **_fields(arena, "weight", ti.f64, (n, width)),
         **_fields(arena, "arity turned", ti.i32, n),
         **_fields(arena, "normal tangent point obstacle_displacement impact_impulse", ti.f64, n, 3),
-        **_fields(arena, "gap approach load restitution min_velocity min_opening", ti.f64, n),
+        **_fields(arena, "gap target approach load restitution min_velocity min_opening", ti.f64, n),
         **_fields(arena, "body", ti.i32, n, 2),
         **_fields(arena, "feature", ti.i32, n, 3),
         **_fields(arena, "inverse_mass w", ti.f64, n_nodes, 3),

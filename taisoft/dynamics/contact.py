@@ -4,6 +4,7 @@ The search at the end of each step also serves the next one, and measures how de
 """
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import taichi as ti
@@ -20,14 +21,26 @@ from taisoft.contact.build import (
     has_impact,
     keep_impulses,
     scale_impulses,
+    set_targets,
     upload_pair_numbers,
 )
 from taisoft.contact.problem import build_node_problem, index_nodes
 from taisoft.dynamics.contact_measures import DEEP_PENETRATION, DEPTH, RELATIVE_PENETRATION, ContactMeasures, Crossing
 from taisoft.dynamics.contact_paths import ContactPaths
 from taisoft.dynamics.misplaced import NO_SUMS, Misplacement
-from taisoft.dynamics.readout import ContactRows, Pairs, nodal_impulses, read_contacts, read_rows, sum_on, sum_pairs, write_rows
+from taisoft.dynamics.readout import (
+    MORE_ROWS,
+    ContactRows,
+    Pairs,
+    nodal_impulses,
+    read_contacts,
+    read_rows,
+    sum_on,
+    sum_pairs,
+    write_rows,
+)
 from taisoft.dynamics.rebounds import Rebounds
+from taisoft.dynamics.renewal import Renewal
 from taisoft.dynamics.simulation_state import SimulationState
 from taisoft.errors import SimulationError
 from taisoft.scene.rigid import RigidBody
@@ -76,7 +89,7 @@ class ContactStep:
         self._pairs: Pairs | None = None  # of the last step, once known; while it is cut, of its substeps so far
         self._step_dt = 0.0  # of the last step [s]
         self._impulse_fraction = 1.0
-        self._own_sides: tuple[np.ndarray, np.ndarray] | None = None  # nodes of contacts before dependent ones were replaced
+        self._renewal = Renewal(model, detection)
         self._search_counts = 0, 0  # contacts before the reduction and unmapped triangles of the search for the last substep
         rigid = np.array([isinstance(one, RigidBody) for one in scene.colliders], dtype=np.int32)
         self._rigid = self._lasting.field("is_rigid", ti.i32, len(rigid), rigid)
@@ -205,20 +218,38 @@ class ContactStep:
         (surface, shapes, found, kept), counts = self.detection.found, self.detection.counts
         self.gap_targets = self._gap_targets()
         self.dropped, self._search_counts = max(self.dropped, counts.unmapped), (counts.found, counts.unmapped)
-        if n > self.problem.capacity:
+        if n >= self.problem.capacity:
             self._allocate(2 * n)
         problem = self.problem
         if model.has_dependents and n:
-            n = drop_vanishing(problem, model, surface, found, kept, n)
+            n = drop_vanishing(problem, model, surface, found, kept, n, problem.capacity - 1)
         keep_impulses(problem, self.contact_offset)
         warm = dt / self._last_time if self._last_time > 0.0 else 0.0
         fill(problem, model, surface, shapes, self.numbers, found, kept, n, dt, warm)
-        self._own_sides = self.detection.sides(kept.to_numpy(n)) if model.has_dependents else None
+        if not self._explicit:
+            set_targets(problem, dt, *self.gap_targets)
+        self._renewal.sides, self._renewal.n_looks = self.detection.sides(kept.to_numpy(n)) if model.has_dependents else None, 0
         if n or self._indexed:  # an empty index needs no update
             index_nodes(problem)
             self._indexed = n > 0
         self._last_time, self._impulse_fraction, self.had_impact = dt, 1.0, False
         return n
+
+    def renew(self, x_start: Any, displacement: Any) -> bool:
+        """Take the contacts' geometry at displacements from x_start, (n_nodes) 3-vectors f64 [m] each; return whether it changed.
+
+        Impulses and targets stay. `problem` is another one if it had to grow.
+        """
+        (time, dt), renewal = self._searched, self._renewal
+        needed = renewal.look(self.problem, time, dt, x_start, displacement, self.contact_offset)
+        if not needed:
+            return False
+        if needed >= self.problem.capacity:
+            last_time, rows = self._last_time, read_rows(self.problem, MORE_ROWS)
+            self._allocate(2 * needed)
+            write_rows(self.problem, rows)
+            self._last_time, self._indexed = last_time, True
+        return renewal.adopt(self.problem, self.numbers, x_start, displacement, self.contact_offset)
 
     def set_impulse_fraction(self, fraction: float) -> None:
         """Set the fraction of the step in which impulses act, beta / dt of an implicit stage."""
@@ -272,9 +303,9 @@ class ContactStep:
     def rows(self, own: bool = False) -> ContactRows:
         """Return the contacts of the last substep. own: with the nodes before dependent ones were replaced, if they are known."""
         found = read_contacts(self.problem, self._impulse_fraction)
-        if not own or self._own_sides is None:
+        if not own or self._renewal.sides is None:
             return found
-        nodes, weights = (side[: len(found.gap)] for side in self._own_sides)
+        nodes, weights = (side[: len(found.gap)] for side in self._renewal.sides)
         return replace(found, nodes=nodes, weights=weights)
 
     def _sum_pairs(self) -> Pairs:
@@ -296,7 +327,8 @@ class ContactStep:
 
         Known only in scenes with dependent nodes, and not after a checkpoint was loaded; else 0.
         """
-        if self._own_sides is None or len(self._own_sides[0]) != self.n_contacts or self._last_time == 0.0:
+        sides = self._renewal.sides
+        if sides is None or len(sides[0]) != self.n_contacts or self._last_time == 0.0:
             return np.zeros((self.simulation.model.n_nodes, 3))
         return nodal_impulses(self.rows(own=True), self.simulation.model.n_nodes) * self._impulse_fraction / self._last_time
 

@@ -61,12 +61,15 @@ class ContactNewton:
             self.r, self.scale = system.evaluate(None)
         lowest, stalled, n_slow, converged = self.r, 0, 0, False
         while self.newton < stage.max_newton and math.isfinite(self.r) and system.budget.left:
+            if renewed := self.newton > 0 and stage.renews and system.renew_contacts():
+                self.r, self.scale = system.evaluate(None, new_multipliers=TO_IMPULSES)
+                lowest, stalled, n_slow, self.rounding = self.r, 0, 0, False
             if self._has_converged():
                 if converged := system.balances_pieces():
                     break
                 self.r, self.scale = system.evaluate(None)
                 lowest, self.rounding = self.r, False
-            if self.newton > 0:
+            if self.newton > 0 and not renewed:
                 system.form_matrix()
             previous, law_residual = self.r, system.contact_residual
             only_laws_remain = self._is_balanced

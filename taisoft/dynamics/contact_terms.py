@@ -14,7 +14,7 @@ import taichi as ti
 
 from taisoft.backend.arrays import FieldArena
 from taisoft.backend.runtime import kernel
-from taisoft.contact.build import LEAST_GAP, contact_offset_of, gap_minus_target
+from taisoft.contact.build import contact_offset_of
 from taisoft.contact.problem import RESIDUAL, ContactProblem, residual_of
 from taisoft.contact.prox import dvec, into_disk, prox, scaled
 from taisoft.fem.chunks import THREADS, block_total, share
@@ -80,15 +80,12 @@ def begin_contacts(
     beta: ti.f64,
     dt: ti.f64,
     common_offset: ti.f64,
-    penetration_fraction: ti.f64,
-    offset_fraction: ti.f64,
-    max_speed: ti.f64,
     tolerance: ti.f64,
 ):
     """Set the constant contact data of a stage, in a step of dt [s].
 
-    impact: whether the contacts' velocity must be `min_velocity`, regardless of gaps. common_offset to max_speed: as of
-    `gap_minus_target`. tolerance: of the laws' residual.
+    impact: whether the contacts' velocity must be `min_velocity`, regardless of gaps. common_offset: contact offset between
+    different bodies [m]. tolerance: of the laws' residual.
     """
     rows, work = ti.static((contacts.problem, contacts.work))
     ti.loop_config(serialize=rows.serial)
@@ -106,13 +103,10 @@ def begin_contacts(
             )
             work.gap_weight[c] = 0.0
         else:
-            opening, least = rows.min_opening[c], ti.cast(LEAST_GAP, ti.f64)
-            gap_to_target = gap_minus_target(
-                rows, c, dt, common_offset, penetration_fraction, offset_fraction, max_speed, opening, least
-            )
-            work.gap_minus_target[c] = gap_to_target - rows.normal[c].dot(rows.obstacle_displacement[c])
-            wanted = contact_offset_of(rows, c, common_offset)
-            target = rows.gap[c] - gap_to_target
+            target, wanted = rows.target[c], contact_offset_of(rows, c, common_offset)
+            if rows.min_opening[c] > 0.0:
+                target = ti.max(target, rows.gap[c] + rows.min_opening[c])
+            work.gap_minus_target[c] = rows.gap[c] - target - rows.normal[c].dot(rows.obstacle_displacement[c])
             work.gap_weight[c] = 0.0
             if target > 0.0:
                 work.gap_weight[c] = tolerance / (MAX_MISSED * ti.min(ti.max(target, ti.cast(MIN_KEPT, ti.f64) * wanted), wanted))

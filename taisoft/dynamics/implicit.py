@@ -267,7 +267,7 @@ class ImplicitStepper:
         """Take a substep of dt from a time with the contacts of one search. start: (n_nodes, 3) [m/s] first iterate of v."""
         simulation, solver = self.simulation, self.solver
         scheme, bounces = self._prepare(time, dt, start)
-        stage = self._stage(scheme, dt, self.tolerance)
+        stage = replace(self._stage(scheme, dt, self.tolerance), renews=not bounces)
         result = solve_bouncing(solver, stage) if bounces else solve(solver, stage)
         result = correct_multipliers(solver, stage, result)
         if scheme.one_iteration and solver.pieces.several and result.converged and np.isfinite(result.residual):

@@ -15,6 +15,7 @@ from taisoft.scene.scene import Scene
 Pairs = tuple[np.ndarray, np.ndarray]  # colliders (k,2), the lower index first, and their sums (k,13), see `sum_pairs`
 IMPULSE, MOMENTS, SLIP, NORMAL = slice(0, 3), (slice(3, 6), slice(6, 9)), slice(9, 12), slice(12, 13)  # columns
 ROWS = "normal tangent r impact_impulse node weight arity point gap body feature factor".split()  # what a later step needs
+MORE_ROWS = [*ROWS, *"friction restitution obstacle_displacement turned approach load target min_opening".split()]
 
 
 @dataclass(frozen=True)
@@ -118,13 +119,13 @@ def _sides(node: np.ndarray, weight: np.ndarray, arity: np.ndarray) -> tuple[np.
     return nodes, weights
 
 
-def read_rows(problem: ContactProblem) -> dict[str, np.ndarray]:
-    """Return everything that a later step, or `read_contacts`, needs of a problem's contacts."""
-    return dict(zip(ROWS, download([getattr(problem, name) for name in ROWS], problem.count[0])))
+def read_rows(problem: ContactProblem, names: list[str] = ROWS) -> dict[str, np.ndarray]:
+    """Return what a later step, or `read_contacts`, needs of a problem's contacts. names: MORE_ROWS for what this step needs."""
+    return dict(zip(names, download([getattr(problem, name) for name in names], problem.count[0])))
 
 
 def write_rows(problem: ContactProblem, rows: dict[str, np.ndarray]) -> None:
     """Restore the result of `read_rows`, of at most `capacity` contacts."""
     problem.count[0] = len(rows["gap"])
-    for name in ROWS:
-        getattr(problem, name).from_numpy(rows[name], 0)
+    for name, values in rows.items():
+        getattr(problem, name).from_numpy(values, 0)

@@ -50,6 +50,7 @@ class Stage:
     later_tolerance: float = 0.0  # lower bound on linear_tolerance after the first solve
     first_r_scale: float = 1.0  # R over the r-factors of a contact problem at its start,
     max_r_scale: float = 1000.0  # and its upper bound without friction
+    renews: bool = True  # whether contacts take their geometry at the iterates
 
     @property
     def inner_tolerance(self) -> float:
@@ -67,8 +68,11 @@ class StepContacts(Protocol):
         """Number of contacts."""
 
     @property
-    def gap_targets(self) -> tuple[float, ...]:
-        """See `contact_terms.begin_contacts`."""
+    def contact_offset(self) -> float:
+        """Contact offset between different bodies [m]."""
+
+    def renew(self, x_start: Any, displacement: Any) -> bool:
+        """Take their geometry at displacements from x_start; return whether it changed. `problem` may then be another one."""
 
 
 @dataclass(frozen=True, eq=False)

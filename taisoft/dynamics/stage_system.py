@@ -258,19 +258,35 @@ class StageSystem:
         if self.pieces.several:
             self.pieces.forget_weights()
         self.restrict(None)
-        if self.step_contacts.n_contacts == 0:
-            return
+        if self.step_contacts.n_contacts > 0:
+            self._begin_contacts()
+            self.form_matrix_and_factors(projected=kind == IMPACT)
+
+    def _begin_contacts(self) -> None:
+        """Begin the contacts of the step in the present stage."""
         self._allocate_contacts()
-        self.contacts, impact = self._storage, kind == IMPACT
-        n = self.n_contacts
+        self.contacts, stage = self._storage, self.stage
+        n, offset = self.n_contacts, self.step_contacts.contact_offset
         self._may_share = NODES_PER_CONTACT * n <= self.model.n_nodes
-        begin_contacts(
-            self.work, self.contacts, impact, stage.beta, stage.dt, *self.step_contacts.gap_targets, stage.contact_tolerance
-        )
+        impact = self.kind == IMPACT
+        begin_contacts(self.work, self.contacts, impact, stage.beta, stage.dt, offset, stage.contact_tolerance)
         self.frictionless = not download([self.contacts.problem.friction], n)[0].any()
         if self.work.pcg.has_last(self.contacts.coupling):
             find_last(self.model, self.matrix, self.contacts.coupling, self.work.pcg)
-        self.form_matrix_and_factors(projected=impact)
+
+    def renew_contacts(self) -> bool:
+        """Take the contacts' geometry at the present iterate, see `contact.geometry`; return whether it changed.
+
+        The matrix is then formed, and (|r|, scale) must be evaluated again.
+        """
+        if not self.step_contacts.renew(self.x_start, self.contacts.displacement):
+            return False
+        before = self.contacts
+        self._begin_contacts()
+        if self.contacts is not before:  # the storage has grown: set the displacements there
+            move(self.model, self.work, self.contacts, self.kind, STAY, 1.0, self.stage.c, self.stage.beta)
+        self.form_matrix_and_factors()
+        return True
 
     def evaluate(self, mode: int | None = STAY, step_length: float = 1.0, new_multipliers: int = KEEP) -> tuple[float, float]:
         """Return (|r|, scale) after `move` in a mode; None: x and the elastic forces are unchanged.

@@ -12,7 +12,8 @@ import taichi as ti
 from taisoft.backend.arrays import FieldArena
 from taisoft.collision import contacts as kinds
 from taisoft.collision.candidates import TOTAL, Parts
-from taisoft.collision.contacts import FOUND, LEFT, UNDECIDED, contact_fields, reduce_contacts, reduction_fields
+from taisoft.collision.contacts import contact_fields
+from taisoft.collision.reduction import FOUND, LEFT, UNDECIDED, reduce_contacts, reduction_fields
 
 CAPACITY = 2**13
 SAME, OTHER = np.radians(4.0), np.radians(7.0)  # two normals at most the first apart are one; from the second on, they are two

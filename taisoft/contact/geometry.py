@@ -1,0 +1,361 @@
+"""Geometry of the contacts at Newton's iterate: the laws of an implicit step hold at its end, so their normals are those there.
+
+At an iterate x_k the contacts there, found by a search with the obstacles at the end of the step, replace those known so far
+(*renewal*). With the gap g_k and normal n_k found, the constraint is
+    g_k + n_k.J (x - x_k) >= target.
+As for contacts of the step's start, `gap` is what this says about the start, the *height* g_k - n_k.(J (x_k - x_start) - motion
+of the obstacle). Slip is still measured from x_start, on the plane of n_k.
+
+A contact is the one known so far if its features are the same; it inherits target and impulse. A new one that touches takes the
+target of the nearest of its pair. Contacts that are found no more go if they push; their impulse goes to the nearest new one of
+the pair with nearly the same normal. Those that do not push stay, as guards. These stay as they are:
+
+* passages, and where a distance field is deepest in a triangle;
+* all contacts of a pair that is deeper than half the margin at x_k, or closes by more than half an edge in the step: such an
+  iterate is not trusted.
+
+The deepest point of a triangle in an analytic shape stays the same material point, with new gap and normal: a deepest point that
+follows the iterate would cycle. A new one counts only if it violates the offset. A contact is not accepted if its sides were
+behind each other at the start, along its new normal.
+
+Nothing is replaced where nothing would change: no normal of a contact that pushes turns by more than TURNED, no gap changes by
+more than MISSED of the contact offset, and no new contact violates its target.
+"""
+
+import taichi as ti
+
+from taisoft.backend.runtime import kernel
+from taisoft.collision.analytic import rotation_rows
+from taisoft.collision.contacts import FACE_FACE, FACE_FIELD
+from taisoft.collision.surface import dvec
+from taisoft.contact.build import enter_past, fill_row, offset_between, pair_slot, past_of
+from taisoft.contact.problem import to_frame
+from taisoft.contact.prox import prox, tangent
+
+TURNED, MISSED = 1e-3, 0.02  # [rad]; of the contact offset: smaller changes of a contact do not count
+SHIFTED = 0.05  # of the finer side's edge: a smaller slip does not change where a contact acts on another body
+STILL = 0.01  # of the contact offset: where all contacts move less in a step, no geometry changes
+TRUSTED_DEPTH, TRUSTED_CLOSING = 0.5, 0.5  # of the margin; of the finer side's edge
+BEHIND = 0.3  # of the slip: how far sides may have been behind each other at the start
+DEEPEST = 0.5  # of the contact offset: gap below which a new deepest point counts
+SAME_NORMAL = 0.9  # cosine between normals of a contact and its heir
+KEPT, IN_PLACE, REPLACED, GONE, OPEN = range(5)  # fates of present contacts
+REJECTED, NEW = -2, -1  # of contacts found that replace none
+
+
+@ti.func
+def _slip(v, n):
+    """Length of the part of v across n."""
+    return (v - v.dot(n) * n).norm()
+
+
+@ti.func
+def _finer_edge(s: ti.template(), body):
+    return ti.min(s.edge[body[0]], s.edge[body[1]])
+
+
+@ti.func
+def _motion(p: ti.template(), c, displacement: ti.template()):
+    """Displacement (3,) of side a of present contact c relative to side b, since the step's start [m]."""
+    d = -p.obstacle_displacement[c]
+    for j in range(p.arity[c]):
+        d += p.weight[c, j] * displacement[p.node[c, j]]
+    return d
+
+
+@ti.func
+def _shape(o: ti.template(), body):
+    """Row of the analytic obstacle that is collider `body`, -1 if it is none."""
+    row = -1
+    for k in range(o.count):
+        if o.body[k] == body:
+            row = k
+    return row
+
+
+@ti.func
+def _shape_motion(o: ti.template(), k, x):
+    """Displacement (3,) in the step of the point of analytic obstacle k that is at x (3,) at the step's end [m]."""
+    local = rotation_rows(o.next_rotation, k).transpose() @ (x - o.next_origin[k])
+    return x - rotation_rows(o.rotation, k) @ local - o.origin[k]
+
+
+@ti.func
+def _gap_to_shape(p: ti.template(), o: ti.template(), c, k, x_start: ti.template(), displacement: ti.template()):
+    """Gap [m] and normal (3,) at the step's end of the material point of contact c, to analytic obstacle k; and the point (3,)."""
+    x = dvec(0.0)
+    for j in range(p.arity[c]):
+        i = p.node[c, j]
+        x += p.weight[c, j] * (x_start[i] + displacement[i])
+    R = rotation_rows(o.next_rotation, k)
+    gap, g = o.sample(k, R.transpose() @ (x - o.next_origin[k]))
+    return gap, R @ g, x
+
+
+@ti.func
+def _found_motion(s: ti.template(), end: ti.template(), o: ti.template(), found: ti.template(), row):
+    """Displacement (3,) of side a of a contact found at the end relative to side b, since the step's start [m]."""
+    d = dvec(0.0)
+    for j in ti.static(range(3)):
+        a, b = found.nodes_a[row][j], found.nodes_b[row][j]
+        if a >= 0:
+            d += found.weights_a[row][j] * (end.x[a] - s.x[a])
+        if b >= 0:
+            d -= found.weights_b[row][j] * (end.x[b] - s.x[b])
+    if ti.static(o.any):
+        if found.nodes_b[row][0] < 0:
+            k = _shape(o, found.body[row][1])
+            d -= _shape_motion(o, k, found.point[row] - 0.5 * found.gap[row] * found.normal[row])
+    return d
+
+
+@ti.func
+def _differs(n, gap, new_n, new_gap, offset):
+    """1 if a contact's normal or gap has changed."""
+    turned = (new_n - n).norm() > ti.cast(TURNED, ti.f64)
+    return int(turned or ti.abs(new_gap - gap) > ti.cast(MISSED, ti.f64) * offset)
+
+
+@ti.func
+def _nearest_present(p: ti.template(), body, point):
+    """The present contact of a pair of colliders that is nearest to a point (3,), -1 if there is none."""
+    best, smallest = -1, ti.cast(ti.math.inf, ti.f64)
+    for c in range(p.count[0]):
+        if (p.body[c] == body).all():
+            d = p.point[c] - point
+            if d.dot(d) < smallest:
+                best, smallest = c, d.dot(d)
+    return best
+
+
+@ti.func
+def _heir(p: ti.template(), found: ti.template(), kept: ti.template(), n, c):
+    """The accepted contact found of the pair of present contact c that is nearest to it, with nearly its normal; -1 for none."""
+    best, smallest = -1, ti.cast(ti.math.inf, ti.f64)
+    for b in range(n):
+        row = kept[b]
+        if p.renewal.match[b] != REJECTED and (found.body[row] == p.body[c]).all():
+            if found.normal[row].dot(p.normal[c]) > ti.cast(SAME_NORMAL, ti.f64):
+                d = found.point[row] - p.point[c]
+                if d.dot(d) < smallest:
+                    best, smallest = b, d.dot(d)
+    return best
+
+
+@ti.func
+def _keep_untrusted(
+    p: ti.template(), s: ti.template(), displacement: ti.template(), found: ti.template(), kept: ti.template(), n, margin
+):
+    """Mark the pairs whose contacts stay as they are."""
+    for c in range(p.count[0]):
+        slot = pair_slot(p, p.body[c])
+        if p.past.pair_slot[slot] < 0:
+            p.past.pair_slot[slot] = c
+        p.renewal.is_kept[c] = 0
+        closing = -p.normal[c].dot(_motion(p, c, displacement))
+        if closing > ti.cast(TRUSTED_CLOSING, ti.f64) * _finer_edge(s, p.body[c]):
+            p.renewal.is_kept[p.past.pair_slot[slot]] = 1
+    for b in range(n):
+        if found.gap[kept[b]] < -ti.cast(TRUSTED_DEPTH, ti.f64) * margin:
+            first = p.past.pair_slot[pair_slot(p, found.body[kept[b]])]
+            if first >= 0:
+                p.renewal.is_kept[first] = 1
+
+
+@ti.func
+def _judge_present(
+    p: ti.template(), o: ti.template(), c, x_start: ti.template(), displacement: ti.template(), common_offset, margin
+):
+    """Set the fate of present contact c, as far as that does not depend on those found. Return 1 if its geometry changes."""
+    fate, changed, kind = OPEN, 0, p.feature[c][0]
+    if kind == FACE_FACE or p.renewal.is_kept[p.past.pair_slot[pair_slot(p, p.body[c])]] == 1:
+        fate = KEPT
+    elif kind == FACE_FIELD:
+        fate = KEPT
+        if ti.static(o.any):
+            k = _shape(o, p.body[c][1])
+            if k >= 0:
+                gap, n, _ = _gap_to_shape(p, o, c, k, x_start, displacement)
+                if gap > -ti.cast(TRUSTED_DEPTH, ti.f64) * margin:
+                    fate = IN_PLACE
+                    motion, offset = _motion(p, c, displacement), offset_between(p.body[c], common_offset)
+                    if p.r[c][0] > 0.0 or gap < p.target[c]:
+                        changed = _differs(p.normal[c], p.gap[c] + p.normal[c].dot(motion), n, gap, offset)
+    p.renewal.fate[c] = fate
+    return changed
+
+
+@ti.func
+def _judge_found(
+    p: ti.template(),
+    s: ti.template(),
+    end: ti.template(),
+    o: ti.template(),
+    displacement: ti.template(),
+    found: ti.template(),
+    row,
+    b,
+    common_offset,
+    margin,
+    floor,
+):
+    """Match contact b found, in a row of the buffer, with a present one; set its height and target. Return 1 if it changes the
+    geometry."""
+    n, gap, body, changed = found.normal[row], found.gap[row], found.body[row], 0
+    motion = _found_motion(s, end, o, found, row)
+    height, offset = gap - n.dot(motion), offset_between(body, common_offset)
+    j, first = past_of(p, found.feature[row], found.point[row]), p.past.pair_slot[pair_slot(p, body)]
+    match = j
+    is_kept = gap < -ti.cast(TRUSTED_DEPTH, ti.f64) * margin
+    if first >= 0:
+        is_kept = is_kept or p.renewal.is_kept[first] == 1
+    if is_kept or height < -ti.cast(BEHIND, ti.f64) * _slip(motion, n) - floor:
+        match = REJECTED
+    elif found.feature[row][0] == FACE_FIELD and (j >= 0 or gap >= ti.cast(DEEPEST, ti.f64) * offset):
+        match = REJECTED
+    elif j >= 0:
+        if p.renewal.fate[j] == REPLACED:
+            match = NEW
+        else:
+            p.renewal.fate[j] = REPLACED
+            p.renewal.target[b] = p.target[j]
+            if p.r[j][0] > 0.0 or gap < p.target[j]:
+                old = _motion(p, j, displacement)
+                changed = _differs(p.normal[j], p.gap[j] + p.normal[j].dot(old), n, gap, offset)
+                wall = found.nodes_b[row][0]
+                if wall >= 0 and s.node[ti.max(wall, 0)] >= 0:
+                    changed |= int(_slip(old, n) > ti.cast(SHIFTED, ti.f64) * _finer_edge(s, body))
+    if match == NEW:
+        target = offset
+        if gap < offset:
+            nearest = _nearest_present(p, body, found.point[row])
+            if nearest >= 0:
+                target = ti.min(p.target[nearest], offset)
+        p.renewal.target[b] = target
+        changed = int(gap < target - ti.cast(MISSED, ti.f64) * offset)
+    p.renewal.match[b], p.renewal.height[b], p.renewal.inherited[b] = match, height, dvec(0.0)
+    return changed
+
+
+@kernel(cse=False)
+def judge(
+    p: ti.template(),
+    s: ti.template(),
+    end: ti.template(),
+    o: ti.template(),
+    x_start: ti.template(),
+    displacement: ti.template(),
+    found: ti.template(),
+    kept: ti.template(),
+    n: ti.i32,
+    common_offset: ti.f64,
+    margin: ti.f64,
+    floor: ti.f64,
+) -> ti.i32:
+    """Compare the present contacts with the n found at the iterate; return 1 if `adopt` would change the geometry.
+
+    s, end: surfaces at the step's start and at its end; o: analytic obstacles; x_start, displacement: (n_nodes) 3-vectors [m];
+    found, kept: buffer and the n rows in it; common_offset, margin, floor [m].
+    """
+    enter_past(p)
+    changed = 0
+    ti.loop_config(serialize=True)
+    for _ in range(1):
+        _keep_untrusted(p, s, displacement, found, kept, n, margin)
+        for c in range(p.count[0]):
+            changed |= _judge_present(p, o, c, x_start, displacement, common_offset, margin)
+        for b in range(n):
+            changed |= _judge_found(p, s, end, o, displacement, found, kept[b], b, common_offset, margin, floor)
+        for c in range(p.count[0]):
+            p.renewal.heir[c] = -1
+            if p.renewal.fate[c] == OPEN:
+                if p.r[c][0] > 0.0:
+                    p.renewal.fate[c] = GONE
+                    b = p.renewal.heir[c] = _heir(p, found, kept, n, c)
+                    changed = 1
+                    if b >= 0:
+                        p.renewal.inherited[b] = p.renewal.inherited[b] + p.past.impulse[c]
+                else:
+                    p.renewal.fate[c] = KEPT
+    return changed
+
+
+@ti.func
+def _copy(p: ti.template(), c, to):
+    """Copy contact c to place `to`."""
+    p.normal[to], p.tangent[to], p.point[to] = p.normal[c], p.tangent[c], p.point[c]
+    p.obstacle_displacement[to], p.impact_impulse[to], p.r[to] = p.obstacle_displacement[c], p.impact_impulse[c], p.r[c]
+    p.body[to], p.feature[to], p.turned[to], p.arity[to] = p.body[c], p.feature[c], p.turned[c], p.arity[c]
+    p.gap[to], p.target[to], p.approach[to], p.load[to] = p.gap[c], p.target[c], p.approach[c], p.load[c]
+    p.friction[to], p.restitution[to], p.min_opening[to] = p.friction[c], p.restitution[c], p.min_opening[c]
+    for j in range(p.arity[c]):
+        p.node[to, j], p.weight[to, j] = p.node[c, j], p.weight[c, j]
+
+
+@ti.func
+def _renew_in_place(p: ti.template(), o: ti.template(), c, x_start: ti.template(), displacement: ti.template(), impulse):
+    """Set gap and normal of contact c with an analytic obstacle to those of its material point at the end."""
+    k = _shape(o, p.body[c][1])
+    gap, n, x = _gap_to_shape(p, o, c, k, x_start, displacement)
+    moved, own = _shape_motion(o, k, x - gap * n), dvec(0.0)
+    for j in range(p.arity[c]):
+        own += p.weight[c, j] * displacement[p.node[c, j]]
+    p.normal[c], p.tangent[c], p.gap[c] = n, tangent(n), gap - n.dot(own - moved)
+    p.obstacle_displacement[c], p.point[c] = moved, x - 0.5 * gap * n
+    p.r[c] = prox(to_frame(p, c, impulse), p.friction[c])
+
+
+@kernel(cse=False)
+def adopt(
+    p: ti.template(),
+    m: ti.template(),
+    s: ti.template(),
+    o: ti.template(),
+    q: ti.template(),
+    x_start: ti.template(),
+    displacement: ti.template(),
+    found: ti.template(),
+    kept: ti.template(),
+    n: ti.i32,
+):
+    """Replace the contacts as `judge` has decided, with its arguments; m: Model; q: PairNumbers. They must fit."""
+    ti.loop_config(serialize=True)
+    for _ in range(1):
+        left = 0
+        for c in range(p.count[0]):
+            fate = p.renewal.fate[c]
+            if fate == KEPT or fate == IN_PLACE:
+                if c != left:
+                    _copy(p, c, left)
+                p.sweep.order[left] = left
+                if ti.static(o.any):
+                    if fate == IN_PLACE:
+                        _renew_in_place(p, o, left, x_start, displacement, p.past.impulse[c])
+                left += 1
+        for b in range(n):
+            match, row = p.renewal.match[b], kept[b]
+            if match != REJECTED:
+                fill_row(p, m, s, q, left, found, row)
+                if ti.static(o.any):
+                    if found.nodes_b[row][0] < 0:
+                        k = _shape(o, p.body[left][1])
+                        x = p.point[left] - 0.5 * p.gap[left] * p.normal[left]
+                        p.obstacle_displacement[left] = _shape_motion(o, k, x)
+                p.gap[left], p.target[left], p.approach[left], p.load[left] = p.renewal.height[b], p.renewal.target[b], 0.0, 0.0
+                impulse = p.renewal.inherited[b]
+                if match >= 0:
+                    impulse += p.past.impulse[match]
+                p.r[left] = prox(to_frame(p, left, impulse), p.friction[left])
+                left += 1
+        p.count[0] = left
+
+
+@kernel
+def largest_motion(p: ti.template(), displacement: ti.template()) -> ti.f64:
+    """Return the largest displacement of two sides of a contact relative to each other since the step's start [m]."""
+    largest = ti.cast(0.0, ti.f64)
+    ti.loop_config(serialize=True)
+    for _ in range(1):
+        for c in range(p.count[0]):
+            largest = ti.max(largest, _motion(p, c, displacement).norm())
+    return largest

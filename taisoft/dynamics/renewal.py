@@ -1,0 +1,58 @@
+"""Renewal of the contacts' geometry at the iterates of an implicit stage, see `contact.geometry`."""
+
+from typing import Any
+
+import numpy as np
+
+from taisoft.backend.arrays import download
+from taisoft.collision.detector import Detection
+from taisoft.contact.build import PairNumbers, drop_vanishing
+from taisoft.contact.geometry import IN_PLACE, KEPT, REJECTED, STILL, adopt, judge, largest_motion
+from taisoft.contact.problem import ContactProblem, index_nodes
+from taisoft.fem.model import Model
+
+
+class Renewal:
+    """Renews the contacts of one step. sides: nodes and weights of contacts before dependent nodes were replaced, or None."""
+
+    MAX_LOOKS = 4  # in a stage: the part of a normal's error that each leaves is a quarter, and it must end for Newton to converge
+
+    def __init__(self, model: Model, detection: Detection):
+        self._model, self._detection = model, detection
+        self.sides: tuple[np.ndarray, np.ndarray] | None = None
+        self.n_looks = 0  # in this stage
+
+    def look(self, problem: ContactProblem, time: float, dt: float, x_start: Any, displacement: Any, offset: float) -> int:
+        """Find the contacts at displacements from x_start, (n_nodes) 3-vectors f64 [m] each, in a step of dt from a time [s].
+
+        offset [m]: contact offset. Return the number of contacts that `problem` needs room for if these are to be adopted; 0 if
+        nothing changes.
+        """
+        if self.n_looks == self.MAX_LOOKS or not largest_motion(problem, displacement) > STILL * offset:
+            return 0
+        self.n_looks += 1
+        self._found = end = self._detection.find_at_end(time, dt, x_start, displacement)
+        return end.reduction.n_kept + int(problem.count[0])
+
+    def adopt(self, problem: ContactProblem, numbers: PairNumbers, x_start: Any, displacement: Any, offset: float) -> bool:
+        """Replace the contacts by those that `look` has found, for which there must be room; return whether any changed."""
+        model, detection, end = self._model, self._detection, self._found
+        s, shapes, (surface, found, kept, n) = detection.surface, detection.shapes, end.found
+        if model.has_dependents and n:
+            n = drop_vanishing(problem, model, s, found, kept, n, problem.capacity - 1)
+        lengths = offset, detection.margin, detection.floor
+        if not judge(problem, s, surface, shapes, x_start, displacement, found, kept, n, *lengths):
+            return False
+        if self.sides is not None:
+            self._renew_sides(problem, n)
+        adopt(problem, model, s, shapes, numbers, x_start, displacement, found, kept, n)
+        index_nodes(problem)
+        return True
+
+    def _renew_sides(self, problem: ContactProblem, n: int) -> None:
+        """Update `sides` as `adopt` will update the contacts, n of which were found."""
+        end, (fate,) = self._found, download([problem.renewal.fate], problem.count[0])
+        rows = end.reduction.work.kept.to_numpy(n)[problem.renewal.match.to_numpy(n) != REJECTED]
+        stay = np.isin(fate, (KEPT, IN_PLACE))
+        new = self._detection.sides(rows, end.buffer.data)
+        self.sides = tuple(np.concatenate([own[: len(stay)][stay], more]) for own, more in zip(self.sides, new))
