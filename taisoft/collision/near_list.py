@@ -19,7 +19,7 @@ import taichi as ti
 from taisoft.backend.arrays import Count
 from taisoft.collision.surface import ACTIVE, dvec, may_meet
 
-SEARCHED, TO_STATE, STILL = range(3)  # which paths are checked
+SEARCHED, TO_STATE, STILL, GIVEN = range(4)  # which paths are checked
 HINTS = 16  # planes stored per triangle
 UNCOVERED, OUTDATED = range(2)  # indices into PathFields.left
 
@@ -50,12 +50,15 @@ class PathFields:
 @ti.func
 def _set_paths(surface: ti.template(), x: ti.template(), paths: ti.template(), mode, limit, is_new):
     """Set the paths, and whether they leave the searched ones by more than `limit` [m]; store these if the list is new."""
-    for k in ti.static(range(2)):
-        paths.left[k] = 0
+    paths.left[OUTDATED] = 0
+    if mode != GIVEN:
+        paths.left[UNCOVERED] = 0
     ti.loop_config(serialize=surface.serial_cheap)
     for i in range(surface.n_verts):
         path = surface.move[i]
-        if mode == STILL:
+        if mode == GIVEN:
+            path = paths.path[i]
+        elif mode == STILL:
             path = dvec(0.0)
         elif mode == TO_STATE and surface.node[i] >= 0:
             path = x[surface.node[i]] - surface.x[i]

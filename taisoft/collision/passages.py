@@ -37,20 +37,18 @@ corners = ti.types.matrix(6, 3, ti.f64)
 
 
 @ti.func
-def _pose(o: ti.template(), k, at_end):
-    """Origin and rotation of analytic obstacle k now, or at the end of the step."""
-    x, R = o.origin[k], rotation_rows(o.rotation, k)
-    if at_end == 1:
-        x, R = o.next_origin[k], rotation_rows(o.next_rotation, k)
-    return x, R
+def _carried(o: ti.template(), k, p, time):
+    """Origin of analytic obstacle k and vector p (3,) of its frame, at a part of the step; both lead straight to the end."""
+    turned = (1.0 - time) * (rotation_rows(o.rotation, k) @ p) + time * (rotation_rows(o.next_rotation, k) @ p)
+    return (1.0 - time) * o.origin[k] + time * o.next_origin[k], turned
 
 
 @ti.func
-def _axis_end(o: ti.template(), k, side, at_end):
-    """An end of the axis of a capsule, or the centre of a sphere (3,) [m]; side: -1 or 1."""
-    x, R = _pose(o, k, at_end)
+def _axis_end(o: ti.template(), k, side, time):
+    """An end of the axis of a capsule, or the centre of a sphere, at a part of the step (3,) [m]; side: -1 or 1."""
     half = ti.select(o.kind[k] == CAPSULE, o.size[k][0], ti.cast(0.0, ti.f64))
-    return x + R @ dvec(side * half, 0.0, 0.0)
+    origin, turned = _carried(o, k, dvec(side * half, 0.0, 0.0), time)
+    return origin + turned
 
 
 @ti.func
@@ -77,49 +75,50 @@ def _vertex(s: ti.template(), g: ti.template(), kind, a, b, k):
 
 
 @ti.func
-def _corner(s: ti.template(), o: ti.template(), g: ti.template(), kind, a, b, k, moves: ti.template(), still):
-    """Corner k of a pair and its displacement along the given field, (3,) each [m]. still: 1 if obstacles stay, too."""
+def _corner(s: ti.template(), o: ti.template(), g: ti.template(), kind, a, b, k, moves: ti.template(), span):
+    """Corner k of a pair and its displacement along the given field, (3,) each [m]. span: parts of the step (2,) between which
+    analytic obstacles move."""
     i = _vertex(s, g, kind, a, b, k)
     now, move = dvec(0.0), dvec(0.0)
     if i >= 0:
         now, move = s.x[i], moves[i]
     elif ti.static(o.has_round):
         side = ti.select(k == 3, ti.cast(-1.0, ti.f64), ti.cast(1.0, ti.f64))
-        now = _axis_end(o, b, side, 0)
-        move = _axis_end(o, b, side, 1 - still) - now
+        now = _axis_end(o, b, side, span[0])
+        move = _axis_end(o, b, side, span[1]) - now
     return now, move
 
 
 @ti.func
-def _rows(s: ti.template(), o: ti.template(), g: ti.template(), kind, a, b, moves: ti.template(), still):
+def _rows(s: ti.template(), o: ti.template(), g: ti.template(), kind, a, b, moves: ti.template(), span):
     """Corners (6,3) of a pair and their displacements (6,3), as `_corner`."""
     x, p = corners(0.0), corners(0.0)
     for k in ti.static(range(6)):
-        now, move = _corner(s, o, g, kind, a, b, k, moves, still)
+        now, move = _corner(s, o, g, kind, a, b, k, moves, span)
         for q in ti.static(range(3)):
             x[k, q], p[k, q] = now[q], move[q]
     return x, p
 
 
 @ti.func
-def _separating_plane(s: ti.template(), o: ti.template(), g: ti.template(), kind, a, b, still, need, first):
+def _separating_plane(s: ti.template(), o: ti.template(), g: ti.template(), kind, a, b, span, need, first):
     """Number of a plane that keeps a pair at least `need` [m] apart, see `separating_plane`."""
-    d0, d = _corner(s, o, g, kind, a, b, 3, g.path, still)
-    x0, p = _corner(s, o, g, kind, a, b, 0, g.path, still)
-    x1, q = _corner(s, o, g, kind, a, b, 1, g.path, still)
-    x2, r = _corner(s, o, g, kind, a, b, 2, g.path, still)
-    x4, u = _corner(s, o, g, kind, a, b, 4, g.path, still)
-    x5, v = _corner(s, o, g, kind, a, b, 5, g.path, still)
+    d0, d = _corner(s, o, g, kind, a, b, 3, g.path, span)
+    x0, p = _corner(s, o, g, kind, a, b, 0, g.path, span)
+    x1, q = _corner(s, o, g, kind, a, b, 1, g.path, span)
+    x2, r = _corner(s, o, g, kind, a, b, 2, g.path, span)
+    x4, u = _corner(s, o, g, kind, a, b, 4, g.path, span)
+    x5, v = _corner(s, o, g, kind, a, b, 5, g.path, span)
     a0, b0, c0, e0, f0 = x0 - d0, x1 - d0, x2 - d0, x4 - d0, x5 - d0
     a1, b1, c1, e1, f1 = a0 + (p - d), b0 + (q - d), c0 + (r - d), e0 + (u - d), f0 + (v - d)
     return separating_plane(a0, b0, c0, e0, f0, a1, b1, c1, e1, f1, need, first, int(kind == NEAR))
 
 
 @ti.func
-def _plane(o: ti.template(), k, at_end):
-    """A point (3,) [m] and the normal (3,) of half-space k now, or at the end of the step."""
-    x, R = _pose(o, k, at_end)
-    return x, R @ dvec(0.0, 1.0, 0.0)
+def _plane(o: ti.template(), k, time):
+    """A point (3,) [m] and the normal (3,) of half-space k at a part of the step."""
+    origin, normal = _carried(o, k, dvec(0.0, 1.0, 0.0), time)
+    return origin, unit(normal)
 
 
 @ti.func
@@ -145,13 +144,13 @@ def _write_passage(out: ti.template(), at, last, kind, a, b, features, time):
 
 @ti.func
 def _write_half_space_passages(
-    s: ti.template(), o: ti.template(), g: ti.template(), k, c, limit, floor, out: ti.template(), start, last
+    s: ti.template(), o: ti.template(), g: ti.template(), k, c, span, limit, floor, out: ti.template(), start, last
 ):
     """Write the passages of the vertices of chunk c through half-space k; limit, floor [m]: as in `check_paths`. Return the new
     count."""
     at, first, end = start, part_first(c, s.n_verts, s.chunks), part_first(c + 1, s.n_verts, s.chunks)
-    x0, n0 = _plane(o, k, 0)
-    x1, n1 = _plane(o, k, 1)
+    x0, n0 = _plane(o, k, span[0])
+    x1, n1 = _plane(o, k, span[1])
     for b in range(s.n_bodies):
         # without a limit, paths may leave the boxes, and there may be none
         if s.soft[b] == 1 and (limit == ti.math.inf or _lowest(s, b, x1, n1) < floor):
@@ -165,10 +164,10 @@ def _write_half_space_passages(
 
 @ti.func
 def _write_triangle_passages(
-    s: ti.template(), o: ti.template(), g: ti.template(), near: ti.template(), c, mode, floor, out: ti.template(), start, last
+    s: ti.template(), o: ti.template(), g: ti.template(), near: ti.template(), c, mode, span, floor, out: ti.template(), start, last
 ):
     """Write the passages of chunk c through triangles, spheres and capsules. Return the new count."""
-    at, still, n_near, n_adjacent, n_round = start, int(mode == STILL), 0, 0, 0
+    at, n_near, n_adjacent, n_round = start, 0, 0, 0
     if ti.static(g.has_pairs):
         n_near = list_unseparated(s, g, near, c)
         n_adjacent = part_first(c + 1, g.n_adjacent, s.chunks) - part_first(c, g.n_adjacent, s.chunks)
@@ -192,12 +191,12 @@ def _write_triangle_passages(
                 checked = g.exempt[s.body[a] * s.n_bodies + o.body[b]] == 0
         radius = _radius(o, kind, b)
         if checked:
-            found = _separating_plane(s, o, g, kind, a, b, still, floor + radius, plane)
+            found = _separating_plane(s, o, g, kind, a, b, span, floor + radius, plane)
             checked = found < 0
             if e < n_near and found >= 0 and found != plane:
                 g.plane[hint_of(a, b)] = found
         if checked:
-            y, p = _rows(s, o, g, kind, a, b, g.path, still)
+            y, p = _rows(s, o, g, kind, a, b, g.path, span)
             time, features = free_until(y, p, radius, floor, mode != STILL)
             if time < 1.0:
                 at = _write_passage(out, at, last, kind, a, b, features, time)
@@ -213,15 +212,19 @@ def check_paths(
     near: ti.template(),
     out: ti.template(),
     mode: ti.i32,
+    begin: ti.f64,
+    end: ti.f64,
     limit: ti.f64,
     listed_limit: ti.f64,
     floor: ti.f64,
 ):
-    """Find the passages on the paths to the positions x (n_nodes) [m] (TO_STATE), on the searched ones (SEARCHED), or where
-    surfaces are already, half-spaces left out (STILL).
+    """Find the passages on the paths to the positions x (n_nodes) [m] (TO_STATE), on the searched ones (SEARCHED), on those given
+    (GIVEN), or where surfaces are already, half-spaces left out (STILL).
 
-    near: listed pairs. limit, listed_limit [m]: see `prepare_paths`; beyond them, nothing is checked. floor [m]: to be kept.
+    near: listed pairs. begin, end: parts of the step between which obstacles move. limit, listed_limit [m]: see `prepare_paths`;
+    beyond them, nothing is checked. floor [m]: to be kept.
     """
+    span = ti.Vector([begin, end], ti.f64)
     prepare_paths(s, x, g, mode, limit, listed_limit, floor)
     ti.loop_config(serialize=s.serial)
     for task in range(s.chunks * s.spread):
@@ -232,9 +235,9 @@ def check_paths(
                 if ti.static(HALF_SPACE in o.kinds):
                     for k in range(o.count):
                         if o.kind[k] == HALF_SPACE and mode != STILL:
-                            at = _write_half_space_passages(s, o, g, k, c, limit, floor, out.data, at, last)
+                            at = _write_half_space_passages(s, o, g, k, c, span, limit, floor, out.data, at, last)
                 if ti.static(g.has_pairs or o.has_round):
-                    at = _write_triangle_passages(s, o, g, near, c, mode, floor, out.data, at, last)
+                    at = _write_triangle_passages(s, o, g, near, c, mode, span, floor, out.data, at, last)
             out.used[c] = at - c * out.part
     if ti.static(g.has_pairs):
         clear_ends(s, g)
@@ -271,13 +274,13 @@ def append_passages(
                     body_b = o.body[b]
             if kind == FLAT:
                 if ti.static(o.any):
-                    origin, normal = _plane(o, b, 0)
+                    origin, normal = _plane(o, b, ti.cast(0.0, ti.f64))
                     n, point = normal, s.x[a]
                     gap = (point - origin).dot(n)
             else:
                 corner = ivec([_vertex(s, g, kind, a, b, k) for k in ti.static(range(3))])
                 wall = ivec([_vertex(s, g, kind, a, b, k) for k in ti.static(range(3, 6))])
-                x, p = _rows(s, o, g, kind, a, b, s.move, 0)
+                x, p = _rows(s, o, g, kind, a, b, s.move, ti.Vector([0.0, 1.0], ti.f64))
                 y = x + times[r] * p  # stored: the compiler fails when an expression is indexed
                 u, v, offset = nearest_of(y, features)
                 n = unit(offset)

@@ -1,16 +1,18 @@
 """The check of a step's paths: lists of pairs, exempt colliders, and the passages found; see `passages`."""
 
-from typing import NamedTuple
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 import numpy as np
 import taichi as ti
 
 from taisoft.backend.arrays import FieldArena, download
 from taisoft.collision.analytic import AnalyticObstacles
+from taisoft.collision.bent_path import TRIALS, find_inwards, set_leg
 from taisoft.collision.bvh import Trees
 from taisoft.collision.candidates import TOTAL, Buffer, Pairs, fill, list_pairs, pair_entries
 from taisoft.collision.colliders import Topology
-from taisoft.collision.near_list import HINTS, OUTDATED, UNCOVERED, PathFields
+from taisoft.collision.near_list import GIVEN, HINTS, OUTDATED, SEARCHED, STILL, UNCOVERED, PathFields
 from taisoft.collision.passages import ADJACENT, FLAT, N_KINDS, NEAR, ROUND, check_paths, passage_fields
 from taisoft.collision.surface import Surface, integers
 from taisoft.ranges import expand
@@ -103,7 +105,9 @@ class PathCheck:
         limits = capacity or (4 * n_listed + 64 if has_pairs else 1), max_capacity
         self.near = Buffer("near_pairs", pair_entries, *limits, s.chunks, arena)
         self.passages = Buffer("passages", passage_fields, 64 * s.chunks, max_capacity, s.chunks, arena)
-        self._is_listed = False
+        self._is_listed, self._arena = False, arena
+        self._leg: Surface | None = None  # of bent paths, allocated at first use
+        self._inwards: Any = None
 
     def exempt(self, pairs: np.ndarray) -> None:
         """Exempt pairs of colliders, (n_bodies, n_bodies) bool, and no others."""
@@ -166,18 +170,64 @@ class PathCheck:
         x: field of the nodes' positions [m]; mode: which paths, see `check_paths`. broad, row: result of the last broad phase and
         buffer of its rows, or None.
         """
-        s, is_new, covers = self.surface, False, broad is not None
+        return self._check(self.surface, x, broad, row, mode, 0.0, float(mode != STILL))
+
+    def crosses_at_end(self, x, broad, row: Buffer | None, mode: int) -> bool:
+        """Return whether any pair crosses or touches at the end of paths, with obstacles as at the step's end, or if the paths
+        leave what was searched. Half-spaces are left out. The others are as for `find`."""
+        return not self._is_leg_free(x, broad, row, mode, 0.0, 1.0, 1.0)
+
+    def bends(self, x, broad, row: Buffer | None, mode: int, margin: float) -> bool:
+        """Return whether a bent path is free, see `bent_path`. margin [m]: of the detection; the others are as for `find`."""
+        self._allocate_leg()
+        find_inwards(self.surface, x, int(mode == SEARCHED), self._inwards)
+
+        def is_free(legs: int, depth: float) -> bool:
+            return all(self._is_leg_free(x, broad, row, mode, depth, k / legs, (k + 1) / legs) for k in range(legs))
+
+        return any(is_free(legs, part * margin) for legs, part in TRIALS)
+
+    def _allocate_leg(self) -> None:
+        if self._leg is None:
+            n = max(self.surface.n_verts, 1)
+            self._leg = replace(self.surface, x=self._arena.vectors("leg_x", ti.f64, n))
+            self._inwards = self._arena.vectors("inwards", ti.f64, n)
+
+    def _is_leg_free(self, x, broad, row: Buffer | None, mode: int, depth: float, begin: float, end: float) -> bool:
+        """Return whether nothing passes on a leg, see `bent_path.set_leg`, or crosses where it is a point; False if it leaves what
+        was searched."""
+        self._allocate_leg()
+        for _ in range(2):
+            where = self._inwards, depth, begin, end, self.limit if broad is not None else np.inf
+            set_leg(self.surface, self._leg, self.fields, x, int(mode == SEARCHED), *where)
+            if self.fields.left[UNCOVERED]:
+                return False
+            found = self._check(self._leg, x, broad, row, STILL if begin == end else GIVEN, begin, end)
+            if found is not None:
+                return len(found[0]) == 0
+            self._is_listed = False  # the list of near pairs is renewed along the straight paths
+            self._check(self.surface, x, broad, row, mode, 0.0, 1.0)
+        return False
+
+    def _check(
+        self, s: Surface, x, broad, row: Buffer | None, mode: int, begin: float, end: float
+    ) -> tuple[np.ndarray, np.ndarray] | None:
+        """See `find`; surface s is that of the last search, or a leg between two parts of the step: None if the list is of no use
+        for that."""
+        is_new, covers = False, broad is not None
         while True:
             if not self._is_listed and covers:
                 self._list(broad, row)
                 is_new = True
             limit, listed_limit = self.limit if covers else np.inf, np.inf if is_new or not covers else self._listed_limit(broad)
             lists = self.near.parts, self.passages.parts
-            check_paths(s, x, self.shapes, self.fields, *lists, mode, limit, listed_limit, self.floor)
+            check_paths(s, x, self.shapes, self.fields, *lists, mode, begin, end, limit, listed_limit, self.floor)
             if self.fields.left[UNCOVERED]:
                 return None
             if self.fields.left[OUTDATED]:
                 self._is_listed = False
+                if s is not self.surface:
+                    return None
             elif not self.passages.grow_if_full():
                 break
         return self._read()

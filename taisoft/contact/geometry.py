@@ -26,7 +26,8 @@ import taichi as ti
 
 from taisoft.backend.runtime import kernel
 from taisoft.collision.analytic import rotation_rows
-from taisoft.collision.contacts import FACE_FACE, FACE_FIELD
+from taisoft.collision.contacts import EDGE_EDGE, FACE_FACE, FACE_FIELD, VERTEX_FACE
+from taisoft.collision.features import closest_lines
 from taisoft.collision.surface import dvec
 from taisoft.contact.build import enter_past, fill_row, offset_between, pair_slot, past_of
 from taisoft.contact.problem import to_frame
@@ -110,6 +111,19 @@ def _found_motion(s: ti.template(), end: ti.template(), o: ti.template(), found:
 
 
 @ti.func
+def _still_cross(p: ti.template(), s: ti.template(), end: ti.template(), c):
+    """Whether the two edges of contact c still cross at the end, with nearly its normal."""
+    e, f = p.feature[c][1], p.feature[c][2]
+    a0, a1 = end.x[s.triangle[e // 3, e % 3]], end.x[s.triangle[e // 3, (e % 3 + 1) % 3]]
+    b0, b1 = end.x[s.triangle[f // 3, f % 3]], end.x[s.triangle[f // 3, (f % 3 + 1) % 3]]
+    q, r, _ = closest_lines(a0, a1, b0, b1)
+    n = (a1 - a0).cross(b1 - b0)
+    cosine = n.dot(p.normal[c]) / ti.max(n.norm(), 1e-300)
+    is_inner = ti.min(q, r) > 0.0 and ti.max(q, r) < 1.0
+    return is_inner and ti.abs(cosine) > ti.cast(SAME_NORMAL, ti.f64)
+
+
+@ti.func
 def _differs(n, gap, new_n, new_gap, offset):
     """1 if a contact's normal or gap has changed."""
     turned = (new_n - n).norm() > ti.cast(TURNED, ti.f64)
@@ -130,21 +144,24 @@ def _nearest_present(p: ti.template(), body, point):
 
 @ti.func
 def _heir(p: ti.template(), found: ti.template(), kept: ti.template(), n, c):
-    """The accepted contact found of the pair of present contact c that is nearest to it, with nearly its normal; -1 for none."""
-    best, smallest = -1, ti.cast(ti.math.inf, ti.f64)
+    """The accepted contact found of the pair of present contact c that is nearest to it, with nearly its normal, -1 for none; and
+    whether one is of the same vertex."""
+    best, smallest, same = -1, ti.cast(ti.math.inf, ti.f64), False
     for b in range(n):
         row = kept[b]
         if p.renewal.match[b] != REJECTED and (found.body[row] == p.body[c]).all():
+            if found.feature[row][0] == VERTEX_FACE and p.feature[c][0] == VERTEX_FACE:
+                same = same or found.feature[row][1] == p.feature[c][1]
             if found.normal[row].dot(p.normal[c]) > ti.cast(SAME_NORMAL, ti.f64):
                 d = found.point[row] - p.point[c]
                 if d.dot(d) < smallest:
                     best, smallest = b, d.dot(d)
-    return best
+    return best, same
 
 
 @ti.func
 def _keep_untrusted(
-    p: ti.template(), s: ti.template(), displacement: ti.template(), found: ti.template(), kept: ti.template(), n, margin
+    p: ti.template(), s: ti.template(), displacement: ti.template(), found: ti.template(), kept: ti.template(), n, dt, margin
 ):
     """Mark the pairs whose contacts stay as they are."""
     for c in range(p.count[0]):
@@ -152,7 +169,7 @@ def _keep_untrusted(
         if p.past.pair_slot[slot] < 0:
             p.past.pair_slot[slot] = c
         p.renewal.is_kept[c] = 0
-        closing = -p.normal[c].dot(_motion(p, c, displacement))
+        closing = -ti.min(p.normal[c].dot(_motion(p, c, displacement)), dt * p.approach[c])
         if closing > ti.cast(TRUSTED_CLOSING, ti.f64) * _finer_edge(s, p.body[c]):
             p.renewal.is_kept[p.past.pair_slot[slot]] = 1
     for b in range(n):
@@ -211,8 +228,8 @@ def _judge_found(
         is_kept = is_kept or p.renewal.is_kept[first] == 1
     if is_kept or height < -ti.cast(BEHIND, ti.f64) * _slip(motion, n) - floor:
         match = REJECTED
-    elif found.feature[row][0] == FACE_FIELD and (j >= 0 or gap >= ti.cast(DEEPEST, ti.f64) * offset):
-        match = REJECTED
+    elif found.feature[row][0] == FACE_FIELD:
+        match = ti.select(gap < ti.cast(DEEPEST, ti.f64) * offset, NEW, REJECTED)
     elif j >= 0:
         if p.renewal.fate[j] == REPLACED:
             match = NEW
@@ -248,6 +265,7 @@ def judge(
     found: ti.template(),
     kept: ti.template(),
     n: ti.i32,
+    dt: ti.f64,
     common_offset: ti.f64,
     margin: ti.f64,
     floor: ti.f64,
@@ -261,7 +279,7 @@ def judge(
     changed = 0
     ti.loop_config(serialize=True)
     for _ in range(1):
-        _keep_untrusted(p, s, displacement, found, kept, n, margin)
+        _keep_untrusted(p, s, displacement, found, kept, n, dt, margin)
         for c in range(p.count[0]):
             changed |= _judge_present(p, o, c, x_start, displacement, common_offset, margin)
         for b in range(n):
@@ -269,11 +287,16 @@ def judge(
         for c in range(p.count[0]):
             p.renewal.heir[c] = -1
             if p.renewal.fate[c] == OPEN:
-                if p.r[c][0] > 0.0:
+                b, same = _heir(p, found, kept, n, c)
+                pushes = p.r[c][0] > 0.0
+                is_gone = same or pushes
+                if pushes and p.feature[c][0] == EDGE_EDGE:
+                    is_gone = not _still_cross(p, s, end, c)
+                if is_gone:
                     p.renewal.fate[c] = GONE
-                    b = p.renewal.heir[c] = _heir(p, found, kept, n, c)
-                    changed = 1
-                    if b >= 0:
+                    p.renewal.heir[c] = b
+                    changed |= int(pushes)
+                    if pushes and b >= 0:
                         p.renewal.inherited[b] = p.renewal.inherited[b] + p.past.impulse[c]
                 else:
                     p.renewal.fate[c] = KEPT

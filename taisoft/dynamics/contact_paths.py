@@ -14,7 +14,7 @@ from taisoft.backend.arrays import FieldArena, download
 from taisoft.collision.contacts import FACE_FACE
 from taisoft.collision.detector import Detection
 from taisoft.collision.near_list import SEARCHED, TO_STATE
-from taisoft.collision.passages import N_FEATURES, N_KINDS
+from taisoft.collision.passages import FLAT, N_FEATURES, N_KINDS
 from taisoft.collision.path_check import NO_PASSAGES, HeldPassages
 from taisoft.contact.problem import ContactProblem
 from taisoft.dynamics.contact_measures import find_displacement
@@ -33,6 +33,7 @@ class ContactPaths:
 
     def __init__(self, simulation: SimulationState, detection: Detection, arena: FieldArena):
         self._simulation, self._detection = simulation, detection
+        self.may_cut_corner = False  # whether nothing crosses at the end of those, though something passes
         self.uncovered = False  # whether the paths of the last check left what was searched
         self.held_back = ""  # a sentence about the last step, if bodies were held back,
         self._names: set[str] = set()  # and their names
@@ -78,7 +79,7 @@ class ContactPaths:
     def find(self, as_searched: bool = False) -> bool:
         """Find the passages on the paths from the last search to the present state, or on the searched paths, and hold them from
         now on. Return whether there are any, or whether the paths leave what was searched."""
-        found = self._detection.passages(SEARCHED if as_searched else TO_STATE)
+        found = self._passages(SEARCHED if as_searched else TO_STATE)
         self.uncovered = found is None
         if found is None:
             return True
@@ -86,6 +87,18 @@ class ContactPaths:
         if len(found[0]):
             self._hold(*found)
         return len(found[0]) > 0
+
+    def _passages(self, mode: int) -> tuple[np.ndarray, np.ndarray] | None:
+        """Return the passages on the paths of a mode, none if a bent path is free, see `collision.bent_path`."""
+        found, self.may_cut_corner = self._detection.passages(mode), False
+        if found is None or len(found[0]) == 0:
+            return found
+        if (found[0][:, 0] == FLAT).any() or self._detection.crosses_at_end(mode):
+            return found
+        if self._detection.bends(mode):
+            return NO_PASSAGES[:2]
+        self.may_cut_corner = True
+        return found
 
     def are_round(self) -> bool:
         """Whether all passages of the last check are through spheres or capsules that move."""
@@ -136,7 +149,7 @@ class ContactPaths:
             inert = [k for k in together if not can_move[k] and not simulation.scene.bodies[k].constraints]
             can_move[inert] = can_move[together].any()
         part, n_rounds = can_move.astype(np.float64), 0
-        while len((found := detection.passages(TO_STATE))[0]):
+        while len((found := self._passages(TO_STATE))[0]):
             colliders, n_rounds = detection.paths.colliders(found[0]), n_rounds + 1
             stuck = ~(part[colliders] > 0.0).any(axis=1)
             if stuck.any():

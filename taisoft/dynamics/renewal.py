@@ -30,7 +30,7 @@ class Renewal:
         """
         if self.n_looks == self.MAX_LOOKS or not largest_motion(problem, displacement) > STILL * offset:
             return 0
-        self.n_looks += 1
+        self.n_looks, self._dt = self.n_looks + 1, dt
         self._found = end = self._detection.find_at_end(time, dt, x_start, displacement)
         return end.reduction.n_kept + int(problem.count[0])
 
@@ -40,7 +40,7 @@ class Renewal:
         s, shapes, (surface, found, kept, n) = detection.surface, detection.shapes, end.found
         if model.has_dependents and n:
             n = drop_vanishing(problem, model, s, found, kept, n, problem.capacity - 1)
-        lengths = offset, detection.margin, detection.floor
+        lengths = self._dt, offset, detection.margin, detection.floor
         if not judge(problem, s, surface, shapes, x_start, displacement, found, kept, n, *lengths):
             return False
         if self.sides is not None:
