@@ -245,6 +245,8 @@ def solve_linearised(system: StageSystem, stage: Stage) -> StageResult:
     """Solve the frictional problem alone, at the present state; on a projected matrix if its own is indefinite."""
     tolerance = stage.linear_tolerance or LINEARISED_FORCING
     linear = 0
+    if stage.renews:
+        system.renew_contacts()
     r, scale = system.evaluate_start()
     for projected in (False, True):
         system.linearise()

@@ -112,6 +112,24 @@ def begin_contacts(
                 work.gap_weight[c] = tolerance / (MAX_MISSED * ti.min(ti.max(target, ti.cast(MIN_KEPT, ti.f64) * wanted), wanted))
 
 
+@kernel
+def predict(m: ti.template(), stage: ti.template(), contacts: ti.template(), beta: ti.f64):
+    """Move the nodes to where they would be at the end of a linearised step without forces; stage.base keeps where they were."""
+    ti.loop_config(serialize=m.serial)
+    for i in range(m.n_nodes):
+        stage.base[i] = m.state.x[i]
+        contacts.displacement[i] = beta * (m.state.v[i] + m.free[i] * stage.v_hat[i])
+        m.state.x[i] = contacts.x_start[i] + contacts.displacement[i]
+
+
+@kernel
+def return_to_base(m: ti.template(), stage: ti.template()):
+    """Move the nodes back to stage.base."""
+    ti.loop_config(serialize=m.serial)
+    for i in range(m.n_nodes):
+        m.state.x[i] = stage.base[i]
+
+
 @ti.func
 def set_multiplier(contacts: ti.template(), c):
     """Set the multiplier of contact c to its impulse, and the friction disk accordingly."""

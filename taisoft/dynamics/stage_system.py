@@ -26,6 +26,8 @@ from taisoft.dynamics.contact_terms import (
     StageContacts,
     begin_contacts,
     build_stage_contacts,
+    predict,
+    return_to_base,
     save_diagonal,
     update_impulses,
 )
@@ -277,9 +279,15 @@ class StageSystem:
     def renew_contacts(self) -> bool:
         """Take the contacts' geometry at the present iterate, see `contact.geometry`; return whether it changed.
 
-        The matrix is then formed, and (|r|, scale) must be evaluated again.
+        That of a linearised step, which has one iterate, is where its nodes would be at its end without forces. If it changed, the
+        matrix is formed, and (|r|, scale) must be evaluated again.
         """
-        if not self.step_contacts.renew(self.x_start, self.contacts.displacement):
+        if self.stage.linearised:
+            predict(self.model, self.work, self.contacts, self.stage.beta)
+        changed = self.step_contacts.renew(self.x_start, self.contacts.displacement)
+        if self.stage.linearised:
+            return_to_base(self.model, self.work)
+        if not changed:
             return False
         before = self.contacts
         self._begin_contacts()

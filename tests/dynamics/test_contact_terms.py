@@ -14,6 +14,7 @@ import pytest
 import taichi as ti
 
 import taisoft as ts
+from taisoft.contact.build import set_targets
 from taisoft.contact.problem import RESIDUAL, build_node_problem, fill_field, find_factors, index_nodes
 from taisoft.dynamics import contact_terms, linearised
 from taisoft.dynamics.contact_terms import NO_CONTACTS
@@ -78,7 +79,8 @@ def rig():
         x_hat, x = (start + size * rng.standard_normal(start.shape) for size in (1e-4, 1e-3))
         k.x_start.from_numpy(start)
         solver.work.x_hat.from_numpy(x_hat)
-        contact_terms.begin_contacts(solver.work, k, False, BETA, DT, *GAP_TARGETS, TOLERANCE)
+        set_targets(p, DT, *GAP_TARGETS)
+        contact_terms.begin_contacts(solver.work, k, False, BETA, DT, GAP_TARGETS[0], TOLERANCE)
         J = found.jacobian
         W = J @ np.diag(free.ravel() / np.diag(A)) @ J.T
         rig = SimpleNamespace(m=m, p=p, k=k, solver=solver, work=solver.work, A=A, J=J, W=W, free=free)
