@@ -23,7 +23,7 @@ from taisoft.collision.end_search import EndSearch, place_at_end
 from taisoft.collision.features import BY_EDGES, BY_FACES, BY_FIELD
 from taisoft.collision.intersections import CROSSINGS_OF, INTERSECTING, find_crossings
 from taisoft.collision.near_list import STILL
-from taisoft.collision.passages import ROUND, append_passages
+from taisoft.collision.passages import append_passages
 from taisoft.collision.path_check import IN_BOXES, NO_PASSAGES, HeldPassages, PathCheck
 from taisoft.collision.reduction import Reduction
 from taisoft.collision.spatial_hash import SpatialHash
@@ -32,7 +32,7 @@ from taisoft.errors import SceneError, SimulationError
 from taisoft.fem.model import Layout, Model
 from taisoft.mesh.quality import mean_surface_edge
 from taisoft.scene.connections import attached_pairs
-from taisoft.scene.obstacles import MeshObstacle, Obstacle
+from taisoft.scene.obstacles import MeshObstacle
 from taisoft.scene.plan import make_plan
 from taisoft.scene.scene import Scene
 
@@ -341,11 +341,6 @@ class Detection:
     def bends(self, mode: int) -> bool:
         """Return whether a bent path is free instead of a straight one of that mode."""
         return self.paths.bends(self.model.state.x, self._broad_result, self._near_buffer, mode, self.margin)
-
-    def are_round_and_move(self, passages: np.ndarray) -> bool:
-        """Return whether all of the given passages (k,4) are through spheres or capsules that move."""
-        moving = np.array([isinstance(c, Obstacle) and c.path is not None for c in self.scene.colliders])
-        return bool((passages[:, 0] == ROUND).all() and moving[self.paths.colliders(passages)[:, 1]].all())
 
     def exempt_crossing(self) -> bool:
         """Exempt the pairs of colliders that cross or touch at the positions of the last search from further checks of paths, and

@@ -411,6 +411,18 @@ def has_impact(p: ti.template(), rigid: ti.template(), dt: ti.f64, contact_offse
 
 
 @kernel
+def set_end_gaps(p: ti.template(), m: ti.template(), x_start: ti.template()):
+    """Set gaps to those at the present positions, after a step from the positions x_start (n_nodes) [m]."""
+    ti.loop_config(serialize=p.serial)
+    for c in range(p.count[0]):
+        motion = -p.obstacle_displacement[c]
+        for j in range(p.arity[c]):
+            i = p.node[c, j]
+            motion += p.weight[c, j] * (m.state.x[i] - x_start[i])
+        p.gap[c] += p.normal[c].dot(motion)
+
+
+@kernel
 def scale_impulses(p: ti.template(), factor: ti.f64):
     """Multiply all impulses by `factor`."""
     ti.loop_config(serialize=p.serial)

@@ -21,6 +21,7 @@ from taisoft.contact.build import (
     has_impact,
     keep_impulses,
     scale_impulses,
+    set_end_gaps,
     set_targets,
     upload_pair_numbers,
 )
@@ -286,10 +287,13 @@ class ContactStep:
         self._substep_fraction = dt / self._step_dt
         self.paths.begin()
 
-    def end_substep(self) -> None:
-        """Add the impulses of a substep, and what they misplace; check the paths of colliders that do not cross any more."""
-        if self.n_contacts and not self._explicit:
-            self.misplaced.add(self.problem, self._substep_fraction * self._step_dt, self.contact_offset)
+    def end_substep(self, x_start: Any) -> None:
+        """Add the impulses of a substep that began at positions x_start, and what they misplace; set gaps to those at its end, and
+        check the paths of colliders that do not cross any more."""
+        if self.n_contacts:
+            if not self._explicit:
+                self.misplaced.add(self.problem, self._substep_fraction * self._step_dt, self.contact_offset)
+            set_end_gaps(self.problem, self.simulation.model, x_start)
         if not self.paths.none_cross:
             self.paths.exempt_crossing()
         if self._substep_fraction < 1.0:

@@ -33,13 +33,12 @@ class ContactPaths:
 
     def __init__(self, simulation: SimulationState, detection: Detection, arena: FieldArena):
         self._simulation, self._detection = simulation, detection
-        self.may_cut_corner = False  # whether nothing crosses at the end of those, though something passes
+        self.ends_free = False  # whether nothing crosses at the end of the paths of the last check, though something passes
         self.uncovered = False  # whether the paths of the last check left what was searched
         self.held_back = ""  # a sentence about the last step, if bodies were held back,
         self._names: set[str] = set()  # and their names
         self._n_unchanged = 0  # checks in a row that found no pairs but those held already
         self._held = NO_PASSAGES  # in this substep so far
-        self._found = NO_PASSAGES.pairs  # at the last check
         n_bodies = len(detection.scene.bodies)
         n, group = connected_components(attached_pairs(detection.scene)[:n_bodies, :n_bodies])
         self._attached = [np.flatnonzero(group == k) for k in range(n) if (group == k).sum() > 1]  # move as one if held back
@@ -83,26 +82,21 @@ class ContactPaths:
         self.uncovered = found is None
         if found is None:
             return True
-        self._found = found[0]
         if len(found[0]):
             self._hold(*found)
         return len(found[0]) > 0
 
     def _passages(self, mode: int) -> tuple[np.ndarray, np.ndarray] | None:
         """Return the passages on the paths of a mode, none if a bent path is free, see `collision.bent_path`."""
-        found, self.may_cut_corner = self._detection.passages(mode), False
+        found, self.ends_free = self._detection.passages(mode), False
         if found is None or len(found[0]) == 0:
             return found
         if (found[0][:, 0] == FLAT).any() or self._detection.crosses_at_end(mode):
             return found
         if self._detection.bends(mode):
             return NO_PASSAGES[:2]
-        self.may_cut_corner = True
+        self.ends_free = True
         return found
-
-    def are_round(self) -> bool:
-        """Whether all passages of the last check are through spheres or capsules that move."""
-        return self._detection.are_round_and_move(self._found)
 
     def _hold(self, pairs: np.ndarray, times: np.ndarray) -> None:
         """Hold passages and the parts of the step until which they are apart; those of the same features once."""

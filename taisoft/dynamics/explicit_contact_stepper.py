@@ -82,7 +82,7 @@ class ContactExplicitStepper(ExplicitStepper):
                     crossing = self.contact.measure_crossings()
                     depth, relative_penetration = max(depth, crossing[0]), max(relative_penetration, crossing[1])
                 done += 1
-                self.contact.end_substep()
+                self.contact.end_substep(self.good.x)
                 if done < n:
                     self.good.copy_from(simulation.now)
         except BaseException:  # Ctrl-C, too

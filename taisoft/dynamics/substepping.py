@@ -222,7 +222,7 @@ class Substepping:
                 continue
             # the present penetration is not new for the next substep
             self._raise_limits(contact.relative_penetration, contact.crossing)
-            contact.end_substep()
+            contact.end_substep(stepper.start.x)
             contact.count_flight(length, stepper.dissipative)
             results.append(count_all(result, undone))
             if not is_held_back:
@@ -295,9 +295,9 @@ class Substepping:
                 # contacts unknown so far matter only if something could have crossed
                 new = contact.search_along_path(time, dt) if passes else new and not contact.paths.none_cross
             n_failed += not (result.converged or stepper.is_linear)
-            # a slide by D over a radius R cuts D^2 / 2R deep, farther than contacts of the start keep surfaces apart: try again
-            failed = may_cut and n_failed >= self.MAX_FAILED and not contact.paths.are_round()
-            hopeless = stepper.is_spent() or (passes and (contact.paths.is_stuck or failed))
+            # a contact would hold up what ends free: a shorter part of the motion cuts less deep
+            shorter_helps = may_cut and (n_failed >= self.MAX_FAILED or contact.paths.ends_free)
+            hopeless = stepper.is_spent() or (passes and (contact.paths.is_stuck or shorter_helps))
             if not (new or passes) or tries >= (MAX_PASSAGES if passes else self.MAX_SEARCHES) or hopeless:
                 simulation.set_state(*state)
                 if passes:
