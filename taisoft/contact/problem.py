@@ -61,7 +61,7 @@ class PastContacts:
 
 @dataclass(frozen=True, eq=False)
 class Renewal:
-    """What a renewal of the geometry decides about contacts, see `geometry`."""
+    """What a renewal of the geometry decides about contacts, see `dynamics.contact_geometry`."""
 
     fate: Any  # i32: what becomes of each present contact
     heir: Any  # i32: the new contact that gets its impulse, -1 for none

@@ -1,4 +1,4 @@
-"""Renewal of the contacts' geometry at the iterates of an implicit stage, see `contact.geometry`."""
+"""Renewal of the contacts' geometry at the iterates of an implicit stage, see `contact_geometry`."""
 
 from typing import Any
 
@@ -7,7 +7,7 @@ import numpy as np
 from taisoft.backend.arrays import download
 from taisoft.collision.detector import Detection
 from taisoft.contact.build import PairNumbers, drop_vanishing
-from taisoft.contact.geometry import IN_PLACE, KEPT, REJECTED, STILL, adopt, judge, largest_motion
+from taisoft.dynamics.contact_geometry import IN_PLACE, KEPT, REJECTED, STILL, adopt, judge, largest_motion
 from taisoft.contact.problem import ContactProblem, index_nodes
 from taisoft.fem.model import Model
 

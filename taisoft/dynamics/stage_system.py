@@ -277,7 +277,7 @@ class StageSystem:
             find_last(self.model, self.matrix, self.contacts.coupling, self.work.pcg)
 
     def renew_contacts(self) -> bool:
-        """Take the contacts' geometry at the present iterate, see `contact.geometry`; return whether it changed.
+        """Take the contacts' geometry at the present iterate, see `contact_geometry`; return whether it changed.
 
         That of a linearised step, which has one iterate, is where its nodes would be at its end without forces. If it changed, the
         matrix is formed, and (|r|, scale) must be evaluated again.

@@ -226,7 +226,13 @@ def _judge_found(
     is_kept = gap < -ti.cast(TRUSTED_DEPTH, ti.f64) * margin
     if first >= 0:
         is_kept = is_kept or p.renewal.is_kept[first] == 1
-    if is_kept or height < -ti.cast(BEHIND, ti.f64) * _slip(motion, n) - floor:
+    lowest = -ti.cast(BEHIND, ti.f64) * _slip(motion, n) - floor
+    nearest = -1
+    if j < 0 and (height < lowest or gap < offset):
+        nearest = _nearest_present(p, body, found.point[row])
+        if nearest >= 0:  # what is behind each other there may be so here
+            lowest += ti.min(p.gap[nearest], 0.0)
+    if is_kept or (j < 0 and height < lowest):
         match = REJECTED
     elif found.feature[row][0] == FACE_FIELD:
         match = ti.select(gap < ti.cast(DEEPEST, ti.f64) * offset, NEW, REJECTED)
@@ -244,10 +250,8 @@ def _judge_found(
                     changed |= int(_slip(old, n) > ti.cast(SHIFTED, ti.f64) * _finer_edge(s, body))
     if match == NEW:
         target = offset
-        if gap < offset:
-            nearest = _nearest_present(p, body, found.point[row])
-            if nearest >= 0:
-                target = ti.min(p.target[nearest], offset)
+        if gap < offset and nearest >= 0:
+            target = ti.min(p.target[nearest], offset)
         p.renewal.target[b] = target
         changed = int(gap < target - ti.cast(MISSED, ti.f64) * offset)
     p.renewal.match[b], p.renewal.height[b], p.renewal.inherited[b] = match, height, dvec(0.0)
