@@ -250,7 +250,7 @@ class ContactStep:
             self._allocate(2 * needed)
             write_rows(self.problem, rows)
             self._last_time, self._indexed = last_time, True
-        return renewal.adopt(self.problem, self.numbers, x_start, displacement, self.contact_offset)
+        return renewal.adopt(self.problem, self.numbers, self._step_dt, x_start, displacement, self.contact_offset)
 
     def set_impulse_fraction(self, fraction: float) -> None:
         """Set the fraction of the step in which impulses act, beta / dt of an implicit stage."""

@@ -23,24 +23,29 @@ class Renewal:
         self.n_looks = 0  # in this stage
 
     def look(self, problem: ContactProblem, time: float, dt: float, x_start: Any, displacement: Any, offset: float) -> int:
-        """Find the contacts at displacements from x_start, (n_nodes) 3-vectors f64 [m] each, in a step of dt from a time [s].
+        """Find the contacts at displacements from x_start, (n_nodes) 3-vectors f64 [m] each, in a substep of dt from a time [s].
 
         offset [m]: contact offset. Return the number of contacts that `problem` needs room for if these are to be adopted; 0 if
         nothing changes.
         """
         if self.n_looks == self.MAX_LOOKS or not largest_motion(problem, displacement) > STILL * offset:
             return 0
-        self.n_looks, self._dt = self.n_looks + 1, dt
+        self.n_looks += 1
         self._found = end = self._detection.find_at_end(time, dt, x_start, displacement)
         return end.reduction.n_kept + int(problem.count[0])
 
-    def adopt(self, problem: ContactProblem, numbers: PairNumbers, x_start: Any, displacement: Any, offset: float) -> bool:
-        """Replace the contacts by those that `look` has found, for which there must be room; return whether any changed."""
+    def adopt(
+        self, problem: ContactProblem, numbers: PairNumbers, dt: float, x_start: Any, displacement: Any, offset: float
+    ) -> bool:
+        """Replace the contacts by those that `look` has found, for which there must be room; return whether any changed.
+
+        dt [s]: of the whole step; the others are those of `look`.
+        """
         model, detection, end = self._model, self._detection, self._found
         s, shapes, (surface, found, kept, n) = detection.surface, detection.shapes, end.found
         if model.has_dependents and n:
             n = drop_vanishing(problem, model, s, found, kept, n, problem.capacity - 1)
-        lengths = self._dt, offset, detection.margin, detection.floor
+        lengths = dt, offset, detection.margin, detection.floor
         if not judge(problem, s, surface, shapes, x_start, displacement, found, kept, n, *lengths):
             return False
         if self.sides is not None:
