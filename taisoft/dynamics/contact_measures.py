@@ -72,12 +72,6 @@ class ContactMeasures:
         """Largest closing ratio of a contact in that step."""
         return float(self.closing[CLOSING_RATIO])
 
-    def drop_uncertain(self) -> None:
-        """Drop the contacts of the last search that may never touch, where the check of paths finds those that would: a plane
-        across the nearest features also stops what flies past them."""
-        detection = self.detection
-        detection.counts.contacts = drop_uncertain(*detection.found, detection.counts.contacts)
-
     def crossing(self) -> Crossing:
         """Measure crossing triangles and contained colliders."""
         crossings, edges = self.detection.crossings(), self.detection.edges
@@ -122,28 +116,6 @@ def _relative_displacement(s: ti.template(), o: ti.template(), found: ti.templat
         if found.nodes_b[at][j] >= 0:
             displacement -= found.weights_b[at][j] * s.move[found.nodes_b[at][j]]
     return displacement
-
-
-@kernel
-def drop_uncertain(s: ti.template(), o: ti.template(), found: ti.template(), kept: ti.template(), n: ti.i32) -> ti.i32:
-    """Leave out of kept[:n] the contacts whose sides close by more than MAX_CLOSING of the thinner one's thickness in the
-    searched step, and move aside by as much before they meet: they may never touch. Passages remain. Return the number left."""
-    left = 0
-    ti.loop_config(serialize=True)
-    for _ in range(1):
-        for c in range(n):
-            at = kept[c]
-            displacement, normal = _relative_displacement(s, o, found, at), found.normal[at]
-            closing = -displacement.dot(normal)
-            allowed = MAX_CLOSING * ti.min(s.thickness[found.body[at][0]], s.thickness[found.body[at][1]])
-            is_certain = found.feature[at][0] == FACE_FACE or closing <= allowed
-            if not is_certain:
-                until = ti.min(ti.max(found.gap[at], 0.0) / closing, 1.0)
-                is_certain = until * (displacement + closing * normal).norm() <= allowed
-            if is_certain:
-                kept[left] = at
-                left += 1
-    return left
 
 
 @kernel

@@ -1,0 +1,105 @@
+"""Contacts take their geometry at the end of an implicit step.
+
+* Normals and gaps that a step reports are those of its end, by the obstacle's formula.
+* What slides without friction passes a seam of flush boxes, meshes and bodies.
+* A frictionless cube swings in a bowl as far up as it came down, and never farther.
+* Where nothing moves, nothing is searched again.
+"""
+
+import numpy as np
+import pytest
+
+import taisoft as ts
+from taisoft.collision.detector import Detection
+
+RUBBER = ts.Material(young=1e5, friction=0.0)
+CENTRE, RADIUS = np.array([0.0, -0.5, 0.0]), 0.5
+
+
+@pytest.mark.parametrize("integrator", ["implicit_euler", "bdf2", "linearly_implicit_euler"])
+def test_normals_and_gaps_are_those_of_the_end(integrator):
+    """Of a cube that slides over a ball by a tenth of an edge a step."""
+    scene = ts.Scene()
+    scene.add_obstacle(ts.Sphere(CENTRE, RADIUS), name="ball", friction=0.0)
+    cube = ts.box_mesh((3, 3, 3), (0.3, 0.3, 0.3))
+    scene.add_body(cube, RUBBER, name="cube", position=(0, 0.151, 0), velocity=(1.0, 0, 0.5))
+    with ts.Simulator(scene, dt=0.01, integrator=integrator, precision="f64") as sim:
+        turned, missed, n = 0.0, 0.0, 0
+        for _ in range(20):
+            assert sim.step().converged
+            c = sim.contacts()
+            pressed = np.linalg.norm(c.impulse, axis=1) > 0.0
+            points = np.einsum("kj,kjx->kx", np.where(c.nodes >= 0, c.weights, 0.0), sim.positions()[c.nodes])
+            offset = points - CENTRE
+            distance = np.linalg.norm(offset, axis=1)
+            turned = max(turned, np.linalg.norm(c.normal - offset / distance[:, None], axis=1)[pressed].max(initial=0.0))
+            missed = max(missed, np.abs(c.gap - (distance - RADIUS))[pressed].max(initial=0.0))
+            n += pressed.sum()
+        slip = np.linalg.norm(sim.velocities().mean(axis=0)) * sim.dt / RADIUS  # by which a normal turns in a step
+    linear = integrator == "linearly_implicit_euler"
+    assert n > 50 and turned < (slip if linear else 0.1 * slip)
+    assert missed < (1e-4 if linear else 1e-5)  # [m]; the slip in a step is 1e-2 m
+
+
+def floor_of(kind: str, scene: ts.Scene) -> None:
+    """Add two flush boxes of a kind, whose tops are at y = 0 and which meet at x = 0."""
+    for k, x in enumerate((-0.5, 0.5)):
+        mesh = ts.box_mesh((5, 1, 2), (1.0, 0.2, 1.0))
+        if kind == "boxes":
+            scene.add_obstacle(ts.Box((x, -0.1, 0), (0.5, 0.1, 0.5)), name=f"floor {k}", friction=0.0)
+        elif kind == "meshes":
+            scene.add_obstacle(ts.MeshObstacle(mesh.vertices + [x, -0.1, 0], mesh.surface), name=f"floor {k}", friction=0.0)
+        else:
+            body = scene.add_body(mesh, RUBBER, name=f"floor {k}", position=(x, -0.1, 0))
+            body.fix(lambda X: np.ones(len(X), dtype=bool))
+
+
+@pytest.mark.parametrize("kind", ["boxes", "meshes", "bodies"])
+@pytest.mark.parametrize("integrator", ["implicit_euler", "linearly_implicit_euler"])
+def test_a_seam_does_not_brake(kind, integrator):
+    scene = ts.Scene()
+    floor_of(kind, scene)
+    mesh = ts.box_mesh((2, 1, 2), (0.2, 0.1, 0.2))
+    soft = ts.Material(young=1e6, friction=0.0)
+    scene.add_body(mesh, soft, name="slider", position=(-0.13, 0.0503, 0.03), velocity=(1, 0, 0))
+    with ts.Simulator(scene, dt=1 / 120, integrator=integrator) as sim:
+        result = sim.run(30 / 120)
+        assert result.status == "ok" and sim.velocities("slider")[:, 0].mean() > (0.99 if integrator == "implicit_euler" else 0.98)
+
+
+def bowl(facets: int, radius: float) -> ts.MeshObstacle:
+    """A tube about z, seen from inside."""
+    angle, i = np.linspace(0.0, 2.0 * np.pi, facets, endpoint=False), np.arange(facets)
+    ring, j = radius * np.column_stack([np.cos(angle), np.sin(angle)]), (i + 1) % facets
+    vertices = np.concatenate([np.column_stack([ring, np.full(facets, z)]) for z in (-0.3, 0.3)])
+    return ts.MeshObstacle(vertices, np.concatenate([np.stack([i, j, i + facets], 1), np.stack([j, j + facets, i + facets], 1)])[:, ::-1])
+
+
+def test_a_bowl_keeps_energy():
+    scene, start, facets = ts.Scene(), np.radians(45.0), 180
+    scene.add_obstacle(bowl(facets, 1.0 / np.cos(np.pi / facets)), name="bowl", friction=0.0)
+    cube, c, s = ts.box_mesh((2, 2, 2), (0.1,) * 3), np.cos(start), np.sin(start)
+    tilted = ts.TetMesh(cube.vertices @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]).T, cube.tets)
+    at = 1.0 - 0.051 - 0.00125
+    scene.add_body(tilted, ts.Material(young=1e6, friction=0.0), name="cube", position=(at * s, -at * c, 0))
+    with ts.Simulator(scene, dt=1 / 120, integrator="bdf2") as sim:
+        angles = []
+        for _ in range(144):
+            sim.step()
+            x = sim.positions("cube").mean(axis=0)
+            angles.append(np.degrees(np.arctan2(x[0], -x[1])))
+    assert 44.0 < -min(angles) < 45.5, min(angles)
+
+
+def test_what_rests_is_not_searched_again(monkeypatch):
+    looks, find = [], Detection.find_at_end
+    monkeypatch.setattr(Detection, "find_at_end", lambda self, *arguments: looks.append(1) or find(self, *arguments))
+    scene = ts.Scene()
+    scene.add_ground(friction=0.5)
+    scene.add_body(ts.box_mesh((2, 2, 2), (0.1,) * 3), ts.Material(young=1e5, mass_damping=20.0), name="cube", position=(0, 0.0505, 0))
+    with ts.Simulator(scene, dt=0.01) as sim:
+        sim.run(1.0, fps=None)
+        assert looks
+        looks.clear()
+        sim.run(0.2, fps=None)
+        assert not looks
