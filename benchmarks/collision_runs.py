@@ -15,9 +15,9 @@ from taisoft.backend.arrays import FieldArena
 from taisoft.backend.runtime import Runtime, compile_clock, kernel
 from taisoft.collision.bvh import Bvh
 from taisoft.collision.candidates import Buffer, Pairs, entries, fill, list_pairs, pair_entries
-from taisoft.collision.reduction import FOUND, KEPT, LEFT, UNKNOWN, is_same
 from taisoft.collision.detector import MERGED, Detection
 from taisoft.collision.path_check import NO_PASSAGES
+from taisoft.collision.reduction import FOUND, KEPT, LEFT, UNKNOWN, is_same
 from taisoft.collision.spatial_hash import SpatialHash
 from taisoft.fem.build import build_model
 from taisoft.machine import Timing, summarise

@@ -36,7 +36,6 @@ class ContactFields:
     nodes_b: Any
     weights_a: Any  # 3-vectors f64
     weights_b: Any
-    turned: Any  # i32: 1 for a passage that is taken at the end of its path; a negative gap then tells how far its sides turn
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,8 +104,7 @@ def contact_fields(arena: FieldArena, capacity: int) -> ContactFields:
     vectors = dict.fromkeys(("point", "normal", "weights_a", "weights_b"), (ti.f64, 3))
     vectors |= dict.fromkeys(("feature", "nodes_a", "nodes_b"), (ti.i32, 3)) | {"body": (ti.i32, 2)}
     fields = {name: arena.vectors(f"contact_{name}", dtype, capacity, n=n) for name, (dtype, n) in vectors.items()}
-    fields |= {name: arena.field(f"contact_{name}", dtype, capacity) for name, dtype in (("gap", ti.f64), ("turned", ti.i32))}
-    return ContactFields(**fields)
+    return ContactFields(gap=arena.field("contact_gap", ti.f64, capacity), **fields)
 
 
 @ti.func
@@ -129,7 +127,7 @@ def write_contact(out: ti.template(), at, last, body_a, body_b, feature, point_a
     if at < last:
         out.point[at] = point_a - 0.5 * gap * n
         out.gap[at] = gap
-        out.feature[at], out.turned[at] = feature, 0
+        out.feature[at] = feature
         sign = ti.cast(1.0, ti.f64)
         lowest_a, lowest_b = _lowest_vertex(nodes_a), _lowest_vertex(nodes_b)
         if body_a > body_b or (body_a == body_b and lowest_a > lowest_b):

@@ -25,13 +25,12 @@ from taisoft.collision.candidates import sum_parts
 from taisoft.collision.contacts import FACE_FACE, write_contact
 from taisoft.collision.features import unit
 from taisoft.collision.near_list import OUTDATED, STILL, UNCOVERED, clear_ends, hint_of, list_unseparated, prepare_paths
-from taisoft.collision.separation import across, are_inner, at_weights, free_until, nearest_of, separating_plane, unit_row
+from taisoft.collision.separation import at_weights, free_until, nearest_of, separating_plane, unit_row
 from taisoft.collision.surface import dvec, ivec
 
 # kinds of passages, by two ids: two triangles; a row of `adjacent`; a triangle and a sphere or capsule; a vertex and a half-space
 NEAR, ADJACENT, ROUND, FLAT = range(4)
 N_KINDS, N_FEATURES = 4, 16  # factors in ids of contacts
-FACING = 0.5  # least cosine between the shortest connection and the normal across the features: beside them, sides are unclear
 
 corners = ti.types.matrix(6, 3, ti.f64)
 
@@ -164,7 +163,17 @@ def _write_half_space_passages(
 
 @ti.func
 def _write_triangle_passages(
-    s: ti.template(), o: ti.template(), g: ti.template(), near: ti.template(), c, mode, span, floor, out: ti.template(), start, last
+    s: ti.template(),
+    o: ti.template(),
+    g: ti.template(),
+    near: ti.template(),
+    c,
+    mode,
+    span,
+    floor,
+    out: ti.template(),
+    start,
+    last,
 ):
     """Write the passages of chunk c through triangles, spheres and capsules. Return the new count."""
     at, n_near, n_adjacent, n_round = start, 0, 0, 0
@@ -251,23 +260,18 @@ def append_passages(
     g: ti.template(),
     pairs: ti.types.ndarray(),
     times: ti.types.ndarray(),
-    passed: ti.types.ndarray(),
     out: ti.template(),
     append: ti.i32,
 ):
     """Append a contact for each passage (k,4) to the buffer of contacts: between its features at a time (k,) along the
     searched paths. Their normal then holds them apart; the gap is that of the same points now.
-
-    passed (k,): 1 for those that passed although they were contacts, since surfaces turned or slid. They are taken where they
-    come to lie at the end of the path, with the normal across the features on the side of before: if these are inner points, and
-    it is clear which side that was.
     """
     ti.loop_config(serialize=True)
     for c in range(out.chunks):
         at, last, r = c * out.part + append * out.used[c], (c + 1) * out.part, c
         while r < pairs.shape[0]:  # dealt out to the parts in turn
             kind, a, b, features = pairs[r, 0], pairs[r, 1], pairs[r, 2], pairs[r, 3]
-            corner, wall, n, is_turned = ivec(a, -1, -1), ivec(-1), dvec(0.0), 0
+            corner, wall, n = ivec(a, -1, -1), ivec(-1), dvec(0.0)
             u, v, point, gap, body_b = unit_row(0), dvec(0.0), dvec(0.0), ti.cast(0.0, ti.f64), 0
             if ti.static(o.any):
                 if kind == FLAT or kind == ROUND:
@@ -284,13 +288,6 @@ def append_passages(
                 y = x + times[r] * p  # stored: the compiler fails when an expression is indexed
                 u, v, offset = nearest_of(y, features)
                 n = unit(offset)
-                if passed[r] == 1 and kind != ROUND:
-                    end, before = x + p, unit(across(y, features))
-                    side = ti.select(before.dot(n) > 0.0, 1.0, -1.0)
-                    turned = side * unit(across(end, features))
-                    u_end, v_end, _ = nearest_of(end, features)
-                    if side * before.dot(n) > FACING and turned.dot(n) > 0.0 and are_inner(u_end, v_end, features):
-                        u, v, n, is_turned = u_end, v_end, turned, 1
                 point = at_weights(x, 0, u)
                 gap = (point - at_weights(x, 3, v)).dot(n) - _radius(o, kind, b)
                 if kind != ROUND:
@@ -299,8 +296,6 @@ def append_passages(
                 feature = ivec(FACE_FACE, N_KINDS * a + kind, N_FEATURES * b + features)
                 body_a = _body_of(s, corner[0])
                 write_contact(out.data, at, last, body_a, body_b, feature, point, n, gap, corner, 1.0 * u, wall, 1.0 * v)
-                if at < last:
-                    out.data.turned[at] = is_turned
                 at += 1
             r += out.chunks
         out.used[c] = at - c * out.part

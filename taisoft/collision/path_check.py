@@ -26,12 +26,11 @@ class HeldPassages(NamedTuple):
 
     pairs: np.ndarray  # (k,4) i32: kind, two ids and the nearest features
     times: np.ndarray  # (k,) parts of the searched path until which they are certainly apart
-    passed: np.ndarray  # (k,) i32: 1 where they passed although they were contacts
 
     @classmethod
     def at_start(cls, pairs: np.ndarray) -> "HeldPassages":
         """Hold passages (k,4) where they are at the start of a step."""
-        return cls(pairs, np.zeros(len(pairs)), np.zeros(len(pairs), dtype=np.int32))
+        return cls(pairs, np.zeros(len(pairs)))
 
 
 NO_PASSAGES = HeldPassages.at_start(np.zeros((0, 4), dtype=np.int32))
@@ -236,7 +235,7 @@ class PathCheck:
         """Return the passages found."""
         out = self.passages
         if out.count[TOTAL] == 0:
-            return NO_PASSAGES[:2]
+            return NO_PASSAGES
         pair, time, used = download([out.data.pair, out.data.time, out.used])
         filled = out.filled(used)
         pair, time = pair[filled], time[filled]

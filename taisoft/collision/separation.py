@@ -57,30 +57,6 @@ def nearest_of(corners, k):
 
 
 @ti.func
-def across(corners, k):
-    """A vector across the plane of features k, see `nearest_of`: across the triangle, or both edges. It changes steadily as these
-    move, also while they pass through each other."""
-    e, f = row_of(corners, 1) - row_of(corners, 0), row_of(corners, 2) - row_of(corners, 0)
-    if k < 3:
-        e, f = row_of(corners, 4) - row_of(corners, 3), row_of(corners, 5) - row_of(corners, 3)
-    elif k >= 6:
-        e = _edge((k - 6) // 3, row_of(corners, 0), row_of(corners, 1), row_of(corners, 2))
-        f = _edge((k - 6) % 3, row_of(corners, 3), row_of(corners, 4), row_of(corners, 5))
-    return e.cross(f)
-
-
-@ti.func
-def are_inner(a, b, k):
-    """Whether the weights of the nearest points of features k are those of inner points of the triangle, or of both edges."""
-    result = a.max() < 1.0 and b.max() < 1.0
-    if k < 3:
-        result = b.min() > 0.0
-    elif k < 6:
-        result = a.min() > 0.0
-    return result
-
-
-@ti.func
 def closest_features(corners):
     """The nearest features of two triangles, see `nearest_of`, and the offset (3,) between them [m]."""
     best, shortest, nearest = 0, dvec(0.0), ti.cast(ti.math.inf, ti.f64)

@@ -7,8 +7,7 @@ strains the softest body by one percent: bodies would fly apart otherwise. What 
 the velocity at which sides approach plus that at which the pair's last impulses moved its contacts. While w dt is below STILL of
 the offset, gaps above minus the offset open no faster than PRESSED w. Contacts of a body with itself have SELF_CONTACT times the
 contact offset and are corrected SELF_CONTACT times as fast. Where the surfaces meet within the step, restitution raises the
-target (`restitution`). Sides that turn in an implicit step are apart: they open at once, however negative their gap is. The
-impulse must satisfy
+target (`restitution`). The impulse must satisfy
     u_n = (gap - target)/dt + n.(v_a - v_b) >= 0,
 which counts motion once, since the gap is the one at the start of the step.
 """
@@ -288,7 +287,7 @@ def _add_sides(p: ti.template(), m: ti.template(), s: ti.template(), c, found: t
 @ti.func
 def fill_row(p: ti.template(), m: ti.template(), s: ti.template(), q: ti.template(), c, found: ti.template(), row):
     """Set the geometry and coefficients of contact c to those found, but for the displacement of an analytic obstacle."""
-    p.normal[c], p.gap[c], p.point[c], p.turned[c] = found.normal[row], found.gap[row], found.point[row], found.turned[row]
+    p.normal[c], p.gap[c], p.point[c] = found.normal[row], found.gap[row], found.point[row]
     p.tangent[c], p.sweep.order[c] = tangent(p.normal[c]), c
     p.body[c], p.feature[c] = found.body[row], found.feature[row]
     p.friction[c], p.restitution[c] = _pair_coefficients(q, p.body[c][0], p.body[c][1])
@@ -367,19 +366,12 @@ def gap_minus_target(
         target = gap + ti.min(opening, max_speed * dt)
     if min_opening > 0.0:
         target = ti.max(target, gap + min_opening)
-    if least_gap > 0.0 and p.turned[c] == 1:
-        target = ti.max(target, least_gap * contact_offset)
     return gap - target
 
 
 @kernel
 def set_targets(
-    p: ti.template(),
-    dt: ti.f64,
-    common_offset: ti.f64,
-    penetration_fraction: ti.f64,
-    offset_fraction: ti.f64,
-    max_speed: ti.f64,
+    p: ti.template(), dt: ti.f64, common_offset: ti.f64, penetration_fraction: ti.f64, offset_fraction: ti.f64, max_speed: ti.f64
 ):
     """Set the targets of all contacts in an implicit step of dt [s], without restitution; the others as of `gap_minus_target`."""
     none, least = ti.cast(0.0, ti.f64), ti.cast(LEAST_GAP, ti.f64)

@@ -108,7 +108,6 @@ class ContactProblem:
     point: Any = None  # 3-vectors [m]
     gap: Any = None  # f64 [m]
     target: Any = None  # f64: smallest gap at the end of an implicit step [m], see `build`
-    turned: Any = None  # i32: 1 if a negative gap is no penetration, but tells how far the sides turn in the step
     obstacle_displacement: Any = None  # 3-vectors: obstacle's displacement at the contact in the step [m]
     approach: Any = None  # f64: normal velocity at the start of the step, negative if surfaces approach [m/s]
     load: Any = None  # f64: velocity that the pair's impulses of the previous step gave its contacts [m/s]
@@ -148,7 +147,7 @@ def build_node_problem(arena: FieldArena, capacity: int, n_nodes: int, serial: b
         **_solver_fields(arena, n, serial),
         **_fields(arena, "node", ti.i32, (n, width)),
         **_fields(arena, "weight", ti.f64, (n, width)),
-        **_fields(arena, "arity turned", ti.i32, n),
+        **_fields(arena, "arity", ti.i32, n),
         **_fields(arena, "normal tangent point obstacle_displacement impact_impulse", ti.f64, n, 3),
         **_fields(arena, "gap target approach load restitution min_velocity min_opening", ti.f64, n),
         **_fields(arena, "body", ti.i32, n, 2),

@@ -312,7 +312,7 @@ def _copy(p: ti.template(), c, to):
     """Copy contact c to place `to`."""
     p.normal[to], p.tangent[to], p.point[to] = p.normal[c], p.tangent[c], p.point[c]
     p.obstacle_displacement[to], p.impact_impulse[to], p.r[to] = p.obstacle_displacement[c], p.impact_impulse[c], p.r[c]
-    p.body[to], p.feature[to], p.turned[to], p.arity[to] = p.body[c], p.feature[c], p.turned[c], p.arity[c]
+    p.body[to], p.feature[to], p.arity[to] = p.body[c], p.feature[c], p.arity[c]
     p.gap[to], p.target[to], p.approach[to], p.load[to] = p.gap[c], p.target[c], p.approach[c], p.load[c]
     p.friction[to], p.restitution[to], p.min_opening[to] = p.friction[c], p.restitution[c], p.min_opening[c]
     for j in range(p.arity[c]):

@@ -22,7 +22,6 @@ import taichi as ti
 
 from taisoft.backend.arrays import FieldArena
 from taisoft.backend.runtime import kernel
-from taisoft.collision.contacts import FACE_FACE
 from taisoft.collision.detector import Detection
 from taisoft.collision.intersections import CROSSING_DEPTH, CROSSINGS, DEPTH_OVER_EDGE
 from taisoft.collision.surface import dvec

@@ -94,7 +94,7 @@ class ContactPaths:
         if (found[0][:, 0] == FLAT).any() or self._detection.crosses_at_end(mode):
             return found
         if self._detection.bends(mode):
-            return NO_PASSAGES[:2]
+            return NO_PASSAGES
         self.ends_free = True
         return found
 
@@ -102,14 +102,12 @@ class ContactPaths:
         """Hold passages and the parts of the step until which they are apart; those of the same features once."""
         held, n_held = self._held, len(self._held.pairs)
         every, time = np.concatenate([held.pairs, pairs]), np.concatenate([held.times, times])
-        passed = np.concatenate([held.passed, np.zeros(len(pairs), dtype=np.int32)])
         _, first, group = np.unique(self._detection.paths.features(every), axis=0, return_index=True, return_inverse=True)
         earliest = np.full(len(first), np.inf)
         np.minimum.at(earliest, group.reshape(-1)[n_held:], times)
         self._n_unchanged = self._n_unchanged + 1 if len(first) == n_held else 0
         again = np.isfinite(earliest)
-        passed = np.where(again & (first < n_held), 1, passed[first]).astype(np.int32)
-        self._held = HeldPassages(every[first], np.where(again, earliest, time[first]), passed)
+        self._held = HeldPassages(every[first], np.where(again, earliest, time[first]))
 
     def use_all(self) -> None:
         """Let the next search add all passages held, at their times along the searched paths."""

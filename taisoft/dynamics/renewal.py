@@ -7,15 +7,17 @@ import numpy as np
 from taisoft.backend.arrays import download
 from taisoft.collision.detector import Detection
 from taisoft.contact.build import PairNumbers, drop_vanishing
-from taisoft.dynamics.contact_geometry import IN_PLACE, KEPT, REJECTED, STILL, adopt, judge, largest_motion
 from taisoft.contact.problem import ContactProblem, index_nodes
+from taisoft.dynamics.contact_geometry import IN_PLACE, KEPT, REJECTED, STILL, adopt, judge, largest_motion
 from taisoft.fem.model import Model
 
 
 class Renewal:
     """Renews the contacts of one step. sides: nodes and weights of contacts before dependent nodes were replaced, or None."""
 
-    MAX_LOOKS = 4  # in a stage: the part of a normal's error that each leaves is a quarter, and it must end for Newton to converge
+    MAX_LOOKS = (
+        4  # in a stage: the part of a normal's error that each leaves is a quarter, and it must end for Newton to converge
+    )
 
     def __init__(self, model: Model, detection: Detection):
         self._model, self._detection = model, detection

@@ -100,7 +100,9 @@ def test_a_slide_over_a_curve_is_accepted(slide, around):
 @pytest.mark.parametrize("depth", [1e-4, 5e-3])
 def test_a_corner_over_a_ridge_is_accepted(depth):
     scene, half = ts.Scene(gravity=(0, 0, 0)), np.tan(0.5) * 0.3
-    wedge = np.array([[-half, -0.3, z] for z in (-0.3, 0.3)] + [[half, -0.3, z] for z in (-0.3, 0.3)] + [[0, 0, -0.3], [0, 0, 0.3]])
+    wedge = np.array(
+        [[-half, -0.3, z] for z in (-0.3, 0.3)] + [[half, -0.3, z] for z in (-0.3, 0.3)] + [[0, 0, -0.3], [0, 0, 0.3]]
+    )
     faces = [[0, 4, 2], [1, 3, 5], [0, 2, 3], [0, 3, 1], [2, 4, 5], [2, 5, 3], [4, 0, 1], [4, 1, 5]]
     scene.add_obstacle(ts.MeshObstacle(wedge, np.array(faces)), name="wedge")
     c, s, d, e = np.cos(0.6), np.sin(0.6), np.cos(0.7), np.sin(0.7)

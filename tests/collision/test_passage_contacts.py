@@ -2,7 +2,6 @@
 
 * those that are held become contacts: the nearest points of their features at their time, the normal between these, and the gap
   of the same points now, against NumPy and ipctk;
-* those that pass in spite of that are taken where they come to lie, with the normal across their features, on their first side;
 * where nothing crosses, a contact of surfaces behind each other is none; passages and obstacles remain;
 * pairs of colliders that cross or lie inside each other are exempt until they do not, and no others.
 """
@@ -62,11 +61,6 @@ def detected(scene: ts.Scene):
     arena.release()
 
 
-def held(pairs: np.ndarray, times: np.ndarray, passed: int = 0) -> HeldPassages:
-    """Passages held at their times, all of which passed in spite of their contacts, or none did."""
-    return HeldPassages(pairs, times, np.full(len(pairs), passed, dtype=np.int32))
-
-
 def crowd() -> ts.Scene:
     """Two boxes turned at random above each other, on a ground that turns, beside a sphere and a capsule that move."""
     scene = ts.Scene(gravity=(0, 0, 0))
@@ -108,7 +102,7 @@ def test_held_passages_are_contacts():
             move[rows_of(one.made, "box 1"), 1] -= 0.5
             move[rows_of(one.made, "box 0"), 1] -= 0.2
             one.search(start, move)
-            one.held = held(*d.passages(SEARCHED))
+            one.held = HeldPassages(*d.passages(SEARCHED))
             time = dict(zip(map(tuple, one.held[0].tolist()), one.held[1].tolist()))
             one.again()
             c = d.contacts()
@@ -143,52 +137,6 @@ def test_held_passages_are_contacts():
     assert set(kinds) == {NEAR, ADJACENT, ROUND, FLAT} and min(kinds.values()) > 2
 
 
-def across(y: np.ndarray, f: int) -> np.ndarray:
-    """A vector across the triangle of features f of two triangles (6,3), or across both edges."""
-    i, j = divmod(f - 6, 3)
-    if f >= 6:
-        return np.cross(y[(i + 1) % 3] - y[i], y[3 + (j + 1) % 3] - y[3 + j])
-    return np.cross(*np.diff(y[3:] if f < 3 else y[:3], axis=0))
-
-
-def test_passages_that_pass_again_are_taken_at_the_end_of_their_path():
-    rng, kinds, n_passed_through = np.random.default_rng(1), set(), 0
-    with detected(crowd()) as one:
-        d, start = one.detection, one.made.state.state()[0]
-        t, node = d.topology.triangle, d.topology.node
-        rows = adjacent_rows(t)
-        move = rng.uniform(-0.3, 0.3, start.shape)
-        move[rows_of(one.made, "box 1"), 1] -= 0.5
-        one.search(start, move)
-        pairs, times = d.passages(SEARCHED)
-        found = []
-        for passed in (0, 1):
-            one.held = held(pairs, times, passed)
-            one.again()
-            c = d.contacts()
-            own = np.flatnonzero(c.kind == "face_face")
-            turned = d.buffer.data.turned.to_numpy()
-            assert turned.sum() == 0 if passed == 0 else 0 < turned.sum() < len(pairs)
-            found.append({tuple(c.feature[k]): (c.weights[k], c.normal[k], c.gap[k], c.nodes[k]) for k in own})
-        for (kind, a, b, f), time in zip(pairs.tolist(), times):
-            key = N_KINDS * a + kind, N_FEATURES * b + f
-            (_, before, _, _), (w, n, gap, nodes) = found[0][key], found[1][key]
-            if kind not in (NEAR, ADJACENT) or (w == found[0][key][0]).all():
-                assert (n == before).all()
-                continue
-            i = node[np.concatenate([t[a], t[b]]) if kind == NEAR else rows[a]]
-            end, early = start[i] + move[i], start[i] + time * move[i]
-            sides = w[:3] @ (start + move)[nodes[:3]], w[3:] @ (start + move)[nodes[3:]]
-            offset = sides[0] - sides[1]
-            assert np.linalg.norm(np.cross(offset, n)) < 1e-12 and np.linalg.norm(n) == pytest.approx(1.0, abs=1e-12)
-            assert np.linalg.norm(np.cross(n, across(end, f))) < 1e-9 * np.linalg.norm(across(end, f))
-            assert (n @ across(end, f) > 0.0) == (before @ across(early, f) > 0.0)
-            assert gap == pytest.approx((w[:3] @ start[nodes[:3]] - w[3:] @ start[nodes[3:]]) @ n, abs=1e-12)
-            kinds.add((kind, f < 6))
-            n_passed_through += offset @ n < 0.0
-    assert kinds >= {(NEAR, True), (NEAR, False), (ADJACENT, False)} and n_passed_through > 3
-
-
 def test_where_nothing_crosses_nothing_is_behind():
     """A vertex behind a face, found by its distance alone, is then in front of another part of the surface."""
     scene = ts.Scene(gravity=(0, 0, 0))
@@ -202,7 +150,7 @@ def test_where_nothing_crosses_nothing_is_behind():
         every = d.contacts()
         assert set(every.body_b[every.gap < -1e-4]) == {"box 1", "ground"}
         one.none_cross = True
-        one.held = held(np.array([(NEAR, 0, len(d.topology.triangle) - 1, 9)], dtype=np.int32), np.zeros(1))
+        one.held = HeldPassages(np.array([(NEAR, 0, len(d.topology.triangle) - 1, 9)], dtype=np.int32), np.zeros(1))
         one.again()
         left = d.contacts()
         assert set(left.body_b[left.gap < -1e-4]) == {"ground"} and (left.kind == "face_face").sum() == 1 < len(left)

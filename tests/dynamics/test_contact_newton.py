@@ -14,8 +14,7 @@ import numpy as np
 import pytest
 
 import taisoft as ts
-from taisoft.dynamics import contact_geometry
-from taisoft.dynamics import contact_newton, implicit
+from taisoft.dynamics import contact_geometry, contact_newton, implicit
 from taisoft.dynamics.dynamics import Dynamics
 from taisoft.dynamics.elimination import CONCENTRATED, FEW, choose_nodes, eliminate
 from taisoft.dynamics.schemes import SCHEMES

@@ -34,7 +34,6 @@ from tests.dynamics.scenes import built, cube, rubber
 K, BETA, DT = 24, 0.002, 0.003  # contacts; [s]
 TOLERANCE = 1e-12  # of the contact laws: so small that missed gaps do not count
 GAP_TARGETS = 1e-3, 0.2, 0.02, 0.05  # contact offset [m], fractions corrected in a step, maximum speed of that [m/s]
-TURNED = np.arange(K) % 3 == 1  # contacts whose sides are apart, however negative their gap is
 STIFFNESS = 5.0
 CLOSE = 1e-12  # relative rounding
 FIXED = [0, 7]  # nodes
@@ -62,9 +61,9 @@ def rig():
         obstacle_displacement = np.where((np.arange(K) % 5 == 0)[:, None], 1e-3 * rng.standard_normal((K, 3)), 0.0)
         friction, gap = np.where(np.arange(K) % 7 == 0, 0.0, 0.5), rng.uniform(-2, 3, K) * GAP_TARGETS[0]
         apart = np.tile([0, 1], (K, 1))  # self-contacts have other targets
-        fields = (p.arity, p.friction, p.gap, p.obstacle_displacement, p.body, p.turned, p.load)
+        fields = (p.arity, p.friction, p.gap, p.obstacle_displacement, p.body, p.load)
         loaded = np.ones(K)  # so that gaps open
-        for field, values in zip(fields, (arity, friction, gap, obstacle_displacement, apart, TURNED.astype(np.int32), loaded)):
+        for field, values in zip(fields, (arity, friction, gap, obstacle_displacement, apart, loaded)):
             fill_field(field, values)
         p.count[0] = K
         index_nodes(p)
@@ -120,8 +119,8 @@ def targets(rig) -> np.ndarray:
     opening = np.minimum(slow * (contact_offset - above) + fast * (above - rig.gap), fastest * DT)
     assert 0 < (opening == fastest * DT).sum() < (rig.gap < contact_offset).sum()
     target = np.where(rig.gap >= contact_offset, contact_offset, rig.gap + opening)
-    assert (TURNED & (target < 0.0)).sum() > 1 and (~TURNED & (target < 0.0)).sum() > 1
-    return np.where(TURNED, np.maximum(target, 0.1 * contact_offset), target)
+    assert (target < 0.0).sum() > 1
+    return target
 
 
 @pytest.fixture

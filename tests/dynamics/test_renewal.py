@@ -64,7 +64,9 @@ def test_a_seam_does_not_brake(kind, integrator):
     scene.add_body(mesh, soft, name="slider", position=(-0.13, 0.0503, 0.03), velocity=(1, 0, 0))
     with ts.Simulator(scene, dt=1 / 120, integrator=integrator) as sim:
         result = sim.run(30 / 120)
-        assert result.status == "ok" and sim.velocities("slider")[:, 0].mean() > (0.99 if integrator == "implicit_euler" else 0.98)
+        assert result.status == "ok" and sim.velocities("slider")[:, 0].mean() > (
+            0.99 if integrator == "implicit_euler" else 0.98
+        )
 
 
 def bowl(facets: int, radius: float) -> ts.MeshObstacle:
@@ -72,7 +74,9 @@ def bowl(facets: int, radius: float) -> ts.MeshObstacle:
     angle, i = np.linspace(0.0, 2.0 * np.pi, facets, endpoint=False), np.arange(facets)
     ring, j = radius * np.column_stack([np.cos(angle), np.sin(angle)]), (i + 1) % facets
     vertices = np.concatenate([np.column_stack([ring, np.full(facets, z)]) for z in (-0.3, 0.3)])
-    return ts.MeshObstacle(vertices, np.concatenate([np.stack([i, j, i + facets], 1), np.stack([j, j + facets, i + facets], 1)])[:, ::-1])
+    return ts.MeshObstacle(
+        vertices, np.concatenate([np.stack([i, j, i + facets], 1), np.stack([j, j + facets, i + facets], 1)])[:, ::-1]
+    )
 
 
 def test_a_bowl_keeps_energy():
@@ -96,7 +100,9 @@ def test_what_rests_is_not_searched_again(monkeypatch):
     monkeypatch.setattr(Detection, "find_at_end", lambda self, *arguments: looks.append(1) or find(self, *arguments))
     scene = ts.Scene()
     scene.add_ground(friction=0.5)
-    scene.add_body(ts.box_mesh((2, 2, 2), (0.1,) * 3), ts.Material(young=1e5, mass_damping=20.0), name="cube", position=(0, 0.0505, 0))
+    scene.add_body(
+        ts.box_mesh((2, 2, 2), (0.1,) * 3), ts.Material(young=1e5, mass_damping=20.0), name="cube", position=(0, 0.0505, 0)
+    )
     with ts.Simulator(scene, dt=0.01) as sim:
         sim.run(1.0, fps=None)
         assert looks
