@@ -254,9 +254,11 @@ class Detection:
         count.growths = {b.name: b.growths for b in self._buffers()}
 
     def find_at_end(self, time: float, dt: float, x_start, displacement) -> EndSearch:
-        """Find the contacts at displacements from x_start, (n_nodes) [m] each, with obstacles as at the end of a step of dt from a
-        time. The last search must have been that of the step; it is repeated along these displacements if they leave its paths.
-        Surfaces may cross there."""
+        """Find the contacts at displacements from x_start, (n_nodes) [m] each, with obstacles as at the end of a step of dt.
+
+        time: of the step's start. The last search must have been that of the step; it is repeated along these displacements if
+        they leave its paths. Surfaces may cross there.
+        """
         if self.end is None:
             self.end = EndSearch(self.surface, self.shapes, self.buffer, self._lengths)
         end, place = self.end, (displacement, self.reach, self.end.left)

@@ -193,8 +193,10 @@ class PathCheck:
             self._inwards = self._arena.vectors("inwards", ti.f64, n)
 
     def _is_leg_free(self, x, broad, row: Buffer | None, mode: int, depth: float, begin: float, end: float) -> bool:
-        """Return whether nothing passes on a leg, see `bent_path.set_leg`, or crosses where it is a point; False if it leaves what
-        was searched."""
+        """Return whether nothing passes on a leg, see `bent_path.set_leg`, or crosses there if its begin is its end.
+
+        False if it leaves what was searched.
+        """
         self._allocate_leg()
         for _ in range(2):
             where = self._inwards, depth, begin, end, self.limit if broad is not None else np.inf

@@ -286,8 +286,10 @@ class ContactStep:
         self.paths.begin()
 
     def end_substep(self, x_start: Any) -> None:
-        """Add the impulses of a substep that began at positions x_start, and what they misplace; set gaps to those at its end, and
-        check the paths of colliders that do not cross any more."""
+        """Add the impulses of a substep that began at positions x_start, and what they misplace; set gaps to those at its end.
+
+        Check the paths of colliders that do not cross any more.
+        """
         if self.n_contacts:
             if not self._explicit:
                 self.misplaced.add(self.problem, self._substep_fraction * self._step_dt, self.contact_offset)

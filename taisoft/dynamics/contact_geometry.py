@@ -83,7 +83,7 @@ def _shape_motion(o: ti.template(), k, x):
 
 @ti.func
 def _gap_to_shape(p: ti.template(), o: ti.template(), c, k, x_start: ti.template(), displacement: ti.template()):
-    """Gap [m] and normal (3,) at the step's end of the material point of contact c, to analytic obstacle k; and the point (3,)."""
+    """Gap [m] and normal (3,) at the step's end of the material point of contact c to analytic obstacle k; that point (3,)."""
     x = dvec(0.0)
     for j in range(p.arity[c]):
         i = p.node[c, j]

@@ -279,8 +279,8 @@ class StageSystem:
     def renew_contacts(self) -> bool:
         """Take the contacts' geometry at the present iterate, see `contact_geometry`; return whether it changed.
 
-        That of a linearised step, which has one iterate, is where its nodes would be at its end without forces. If it changed, the
-        matrix is formed, and (|r|, scale) must be evaluated again.
+        A linearised step has one iterate: its geometry is that where the nodes would be at its end without forces. If it changed,
+        the matrix is formed, and (|r|, scale) must be evaluated again.
         """
         if self.stage.linearised:
             predict(self.model, self.work, self.contacts, self.stage.beta)

@@ -8,6 +8,7 @@ import pytest
 
 import taisoft as ts
 from taisoft.collision.near_list import TO_STATE
+from tests.dynamics.scenes import dynamics
 
 SOFT = ts.Material(young=1e6)
 
@@ -28,19 +29,19 @@ def shell(inner: float, outer: float, half: float, width: float, n: int = 24) ->
     return ts.TetMesh(np.column_stack([radius * np.sin(angle), radius * np.cos(angle), z]), mesh.tets)
 
 
-def refused(scene: ts.Scene, move, self_collision: bool = False) -> bool:
+def refused(scene: ts.Scene, move) -> bool:
     """Whether displacements move(positions) of body b, with obstacles over a second, are refused."""
-    with ts.Simulator(scene, dt=1.0, precision="f64", self_collision=self_collision) as sim:
-        contact, x = sim._dynamics.contact, sim.positions()
+    with dynamics(scene, dt=1.0, precision="f64") as made:
+        contact, x = made.contact, made.state.state()[0]
         contact.search(0.0, 1.0)
         contact.initial_crossing()
         assert contact.paths.none_cross
         displacement = np.zeros_like(x)
-        rows = sim._dynamics.state.layout.nodes(len(scene.bodies) - 1)
+        rows = made.state.layout.nodes(len(scene.bodies) - 1)
         displacement[rows] = move(x[rows])
         contact.paths.displacement.from_numpy(displacement)
         contact.detection.find(0.0, 1.0, path=contact.paths.displacement, none_cross=True)
-        sim._dynamics.state.set_state(x + displacement, np.zeros_like(x))
+        made.state.set_state(x + displacement, np.zeros_like(x))
         assert len(contact.detection.passages(TO_STATE)[0])  # the straight path passes something
         return contact.paths.find()
 

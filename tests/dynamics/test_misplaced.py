@@ -1,7 +1,7 @@
 """Contact normals are those of the step's end; what those of its start would falsify is measured and reported.
 
-* a capsule that slides by D over a soft block: the forces are right; with the normals of the start, D / R of the force is friction
-  that is too large or a false drag; in steps of a tenth a tenth, which is not reported; a checkpoint keeps the sums;
+* a capsule that slides by D over a soft block: the forces are right; with the normals of the start, D / R of the force is
+  friction that is too large or a false drag; in steps of a tenth a tenth, which is not reported; a checkpoint keeps the sums;
 * a box that slides over two boxes side by side passes the seam; with the normals of the start it is stopped there, which is
   reported at once; over one box nothing is.
 """
