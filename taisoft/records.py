@@ -39,7 +39,7 @@ class StepReport:
     crossings: int = 0  #: pairs of surface triangles that cross by more than 0.1 % of the finer side's mean surface edge
     deep: int = 0  #: 1 where something is deeper than 2 % of the finer side's mean surface edge, else 0
     misplaced: float = 0.0  #: largest part of a pair's contact force that acts along wrong normals, see docs/contacts.md
-    contact_error: str = ""  #: what contact geometry of the step's start falsifies, a sentence, if that is noteworthy
+    contact_error: str = ""  #: what contact normals that do not hold at the step's end falsify, a sentence, if that is noteworthy
     min_volume_ratio: float = 1.0  #: smallest J = det F
     n_inverted: int = 0  #: tets with J <= 0
     kinetic: float = 0.0  #: [J]

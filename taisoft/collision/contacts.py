@@ -2,7 +2,7 @@
 
 A contact has a side a and a side b, each a point on up to three nodes with weights that sum to 1; an obstacle is always b and
 has no nodes. The normal is a unit vector from b to a; the gap is the signed distance of the two points along it, negative in
-penetration, or of a passage whose sides turn in the step. A feature identifies the pair of mesh features in contact, and
+penetration. A feature identifies the pair of mesh features in contact, and
 persists while they stay in contact.
 """
 
@@ -43,14 +43,14 @@ class Contacts:
     """Contacts on the host, all arrays (k, ...) and in an order that does not depend on threads.
 
     An attribute of a record from `sim.contacts()` holds for the last step, or for its last substep if it was cut into several.
-    point, normal, gap: geometry at the start of that step; impulse: of normal force and friction together; impulse / duration is
+    point, normal, gap: geometry at its end, but of point and normal in explicit steps at its start; impulse: of normal force and friction together; impulse / duration is
     the force. kind: what meets, a vertex and a triangle, two edges, a vertex or a triangle and a distance field or obstacle, or
     two triangles that would pass through each other. Contacts that are near each other are merged into one: there were `found`.
     """
 
     point: np.ndarray  #: (k,3) midway between the two surface points [m]
     normal: np.ndarray  #: (k,3) unit vectors from b to a
-    gap: np.ndarray  #: (k,) [m], negative for a penetration; of "face_face" it tells how far the sides turn in the step
+    gap: np.ndarray  #: (k,) [m], negative for a penetration
     impulse: np.ndarray  #: (k,3) on a [N s], with friction; b gets the opposite
     body_a: np.ndarray  #: (k,) names
     body_b: np.ndarray  #: (k,) names; an obstacle is always b

@@ -9,8 +9,7 @@ advancement: Mirtich 1996). A contact's ratio is the smaller of
 and a step in which no contact's ratio exceeds 1 is short enough. Weakness: a surface that protrudes behind the nearest one is a
 separate contact only if its distance has a local minimum there.
 
-Where nothing crosses, implicit steps need no such limit, since what they miss is found along their paths: there `drop_uncertain`
-drops the contacts that it would be for, unless they close head-on.
+Where nothing crosses, implicit steps need no such limit, since what they miss is found along their paths.
 """
 
 import math

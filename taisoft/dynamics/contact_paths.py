@@ -1,9 +1,10 @@
 """Nothing crosses: the passages on a substep's paths, the contacts that hold them apart, and what is held back if those fail.
 
-A substep is accepted only if no pair of surfaces passes through each other on its straight paths (`collision.passages`). A pair
-that would becomes a contact, and the substep is repeated with it. It remains one in the next substeps while it carries an
-impulse. If passages are left after all retries, whole bodies are held back: their paths are shortened until nothing passes, and
-the step counts as not converged.
+A substep is accepted only if no pair of surfaces passes through each other on its straight paths (`collision.passages`), or on a
+bent path (`collision.bent_path`). Where surfaces would cross at its end, pairs that pass become contacts, and the substep is
+repeated with them; else it is halved. They remain contacts in the next substeps while they carry an impulse. If passages are
+left after all retries, whole bodies are held back: their paths are shortened until nothing passes, and the step counts as not
+converged.
 """
 
 import numpy as np
