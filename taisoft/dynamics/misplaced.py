@@ -1,7 +1,8 @@
 """Contact forces that act along normals that do not hold at the step's end.
 
 The impulse r of a contact should act along the normal n' of the step's end, but acts along that with which the step was solved,
-n: the same to a thousandth where `contact_geometry` has renewed it, else that of the start. If R turns n into n', the force r - R r is misplaced. It matters as it brakes or drives the slip u of the step:
+n: the same to a thousandth where `contact_geometry` has renewed it, else that of the start. If R turns n into n', the force
+r - R r is misplaced. It matters as it brakes or drives the slip u of the step:
     W = sum (r - R r).u   against   S = sum |r| max(|u|, contact offset)
 over the contacts of a pair. Sliding by D over a radius R makes W / S = D / R: friction seems larger by (1 + mu^2) D / R of the
 normal force, or a body without friction drags. At a seam, the edge of the neighbouring box stops what should slide over it.
