@@ -90,7 +90,7 @@ class ContactStep:
         self._pairs: Pairs | None = None  # of the last step, once known; while it is cut, of its substeps so far
         self._step_dt = 0.0  # of the last step [s]
         self._impulse_fraction = 1.0
-        self._renewal = Renewal(model, detection)
+        self._renewal = Renewal(model, detection, self._lasting)
         self._search_counts = 0, 0  # contacts before the reduction and unmapped triangles of the search for the last substep
         rigid = np.array([isinstance(one, RigidBody) for one in scene.colliders], dtype=np.int32)
         self._rigid = self._lasting.field("is_rigid", ti.i32, len(rigid), rigid)

@@ -25,7 +25,7 @@ more than MISSED of the contact offset, and no new contact violates its target.
 import taichi as ti
 
 from taisoft.backend.runtime import kernel
-from taisoft.collision.analytic import rotation_rows
+from taisoft.collision.analytic import HALF_SPACE, rotation_rows
 from taisoft.collision.contacts import EDGE_EDGE, FACE_FACE, FACE_FIELD, VERTEX_FACE
 from taisoft.collision.features import closest_lines
 from taisoft.collision.surface import dvec
@@ -35,7 +35,7 @@ from taisoft.contact.prox import prox, tangent
 
 TURNED, MISSED = 1e-3, 0.02  # [rad]; of the contact offset: smaller changes of a contact do not count
 SHIFTED = 0.05  # of the finer side's edge: a smaller slip does not change where a contact acts on another body
-STILL = 0.01  # of the contact offset: where all contacts move less in a step, no geometry changes
+STILL = 0.05  # of the contact offset: where all contacts have moved less, no geometry changes
 TRUSTED_DEPTH, TRUSTED_CLOSING = 0.5, 0.5  # of the margin; of the finer side's edge
 BEHIND = 0.3  # of the slip: how far sides may have been behind each other at the start
 DEEPEST = 0.1  # of the contact offset: gap below which a new deepest point counts
@@ -377,12 +377,41 @@ def adopt(
         p.count[0] = left
 
 
+@ti.func
+def _is_flat(o: ti.template(), body):
+    """Whether a collider is a half-space that does not turn in the step: the geometry of its contacts never changes."""
+    result = False
+    if ti.static(HALF_SPACE in o.kinds):
+        k = _shape(o, body)
+        if k >= 0:
+            turns = (rotation_rows(o.next_rotation, k) - rotation_rows(o.rotation, k)).norm()
+            result = o.kind[k] == HALF_SPACE and turns == 0.0
+    return result
+
+
 @kernel
-def largest_motion(p: ti.template(), displacement: ti.template()) -> ti.f64:
-    """Return the largest displacement of two sides of a contact relative to each other since the step's start [m]."""
+def largest_motion(
+    p: ti.template(), o: ti.template(), displacement: ti.template(), seen: ti.template(), n_looks: ti.i32
+) -> ti.f64:
+    """Return the largest displacement of two sides of a contact relative to each other [m], since the step's start or, after
+    n_looks, since the displacements (n_nodes) `seen`; contacts whose geometry never changes left out."""
     largest = ti.cast(0.0, ti.f64)
     ti.loop_config(serialize=True)
     for _ in range(1):
         for c in range(p.count[0]):
-            largest = ti.max(largest, _motion(p, c, displacement).norm())
+            if not _is_flat(o, p.body[c][1]):
+                motion = _motion(p, c, displacement)
+                if n_looks > 0:
+                    motion += p.obstacle_displacement[c]
+                    for j in range(p.arity[c]):
+                        motion -= p.weight[c, j] * seen[p.node[c, j]]
+                largest = ti.max(largest, motion.norm())
     return largest
+
+
+@kernel
+def keep_displacements(m: ti.template(), displacement: ti.template(), seen: ti.template()):
+    """Copy displacements (n_nodes) [m]."""
+    ti.loop_config(serialize=m.serial)
+    for i in range(m.n_nodes):
+        seen[i] = displacement[i]

@@ -3,12 +3,13 @@
 from typing import Any
 
 import numpy as np
+import taichi as ti
 
-from taisoft.backend.arrays import download
+from taisoft.backend.arrays import FieldArena, download
 from taisoft.collision.detector import Detection
 from taisoft.contact.build import PairNumbers, drop_vanishing
 from taisoft.contact.problem import ContactProblem, index_nodes
-from taisoft.dynamics.contact_geometry import IN_PLACE, KEPT, REJECTED, STILL, adopt, judge, largest_motion
+from taisoft.dynamics.contact_geometry import IN_PLACE, KEPT, REJECTED, STILL, adopt, judge, keep_displacements, largest_motion
 from taisoft.fem.model import Model
 
 
@@ -19,8 +20,9 @@ class Renewal:
         4  # in a stage: the part of a normal's error that each leaves is a quarter, and it must end for Newton to converge
     )
 
-    def __init__(self, model: Model, detection: Detection):
+    def __init__(self, model: Model, detection: Detection, arena: FieldArena):
         self._model, self._detection = model, detection
+        self._seen = arena.vectors("seen_displacement", ti.f64, model.n_nodes)  # at the last look [m]
         self.sides: tuple[np.ndarray, np.ndarray] | None = None
         self.n_looks = 0  # in this stage
 
@@ -30,9 +32,13 @@ class Renewal:
         offset [m]: contact offset. Return the number of contacts that `problem` needs room for if these are to be adopted; 0 if
         nothing changes.
         """
-        if self.n_looks == self.MAX_LOOKS or not largest_motion(problem, displacement) > STILL * offset:
+        if self.n_looks == self.MAX_LOOKS:
+            return 0
+        moved = largest_motion(problem, self._detection.shapes, displacement, self._seen, self.n_looks)
+        if not moved > STILL * offset:
             return 0
         self.n_looks += 1
+        keep_displacements(self._model, displacement, self._seen)
         self._found = end = self._detection.find_at_end(time, dt, x_start, displacement)
         return end.reduction.n_kept + int(problem.count[0])
 
