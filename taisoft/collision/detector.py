@@ -253,17 +253,19 @@ class Detection:
         count.found, count.contacts = self._reduction.n_found, self._reduction.n_kept
         count.growths = {b.name: b.growths for b in self._buffers()}
 
-    def find_at_end(self, time: float, dt: float, x_start, displacement) -> EndSearch:
+    def find_at_end(self, time: float, dt: float, x_start, displacement, farthest: float) -> EndSearch | None:
         """Find the contacts at displacements from x_start, (n_nodes) [m] each, with obstacles as at the end of a step of dt.
 
         time: of the step's start. The last search must have been that of the step; it is repeated along these displacements if
-        they leave its paths. Surfaces may cross there.
+        they leave its paths, and None returned if that is by more than `farthest` [m]. Surfaces may cross there.
         """
         if self.end is None:
             self.end = EndSearch(self.surface, self.shapes, self.buffer, self._lengths)
         end, place = self.end, (displacement, self.reach, self.end.left)
         place_at_end(self.surface, end.surface, *place)
-        if not end.left[0] <= IN_BOXES * self.reach:
+        if not end.left[0] <= farthest:
+            return None
+        if end.left[0] > IN_BOXES * self.reach:
             self._move(time, dt, None, displacement, x_start)
             self._broad_result = self._near()
             place_at_end(self.surface, end.surface, *place)
@@ -363,13 +365,14 @@ class Detection:
         return self._containment.find(self.surface, self.model.state.x, self.shapes)
 
     def _buffers(self) -> list[Buffer]:
-        paths = () if self.paths is None else self.paths.buffers
-        return [self.buffer, *((self._near_buffer, *self.broad.buffers) if self.has_pairs else ()), *paths]
+        paths, end = () if self.paths is None else self.paths.buffers, () if self.end is None else (self.end.buffer,)
+        return [self.buffer, *end, *((self._near_buffer, *self.broad.buffers) if self.has_pairs else ()), *paths]
 
     @property
     def field_bytes(self) -> dict[str, int]:
         """Size of every allocated field [bytes], by name."""
-        return self._arena.bytes | self._reduction.bytes | {b.name: b.bytes for b in self._buffers()}
+        end = {} if self.end is None else self.end.bytes
+        return self._arena.bytes | self._reduction.bytes | end | {b.name: b.bytes for b in self._buffers()}
 
     def release(self) -> None:
         """Free all memory."""

@@ -69,7 +69,7 @@ class EndSearch:
     @property
     def bytes(self) -> dict[str, int]:
         """Bytes of the fields by name."""
-        return self._arena.bytes | {self.buffer.name: self.buffer.bytes}
+        return self._arena.bytes | {f"end_{name}": size for name, size in self.reduction.bytes.items()}
 
     def release(self) -> None:
         """Free the memory."""

@@ -60,11 +60,10 @@ class PastContacts:
 
 
 @dataclass(frozen=True, eq=False)
-class Renewal:
+class RenewalWork:
     """What a renewal of the geometry decides about contacts, see `dynamics.contact_geometry`."""
 
     fate: Any  # i32: what becomes of each present contact
-    heir: Any  # i32: the new contact that gets its impulse, -1 for none
     match: Any  # i32: of each new contact, the present one that it replaces, or how it was judged
     inherited: Any  # 3-vectors, world frame: impulses that a new contact gets from others [N s]
     target: Any  # f64: target of each new contact [m]
@@ -116,7 +115,7 @@ class ContactProblem:
     min_opening: Any = None  # f64: least opening of the gap in the step, 0 without restitution [m]
     impact_impulse: Any = None  # 3-vectors: impulse of the impact before the step [N s]
     past: PastContacts | None = None
-    renewal: Renewal | None = None
+    renewal: RenewalWork | None = None
 
 
 def build_node_problem(arena: FieldArena, capacity: int, n_nodes: int, serial: bool, masters: int = 1) -> ContactProblem:
@@ -130,8 +129,8 @@ def build_node_problem(arena: FieldArena, capacity: int, n_nodes: int, serial: b
         **_fields(arena, "pair_sum", ti.f64, n, 2, "past_contact"),
         **_fields(arena, "slot pair_slot", ti.i32, n_slots, 0, "past_contact"),
     )
-    renewal = Renewal(
-        **_fields(arena, "fate heir match is_kept", ti.i32, n, 0, "renewal"),
+    renewal = RenewalWork(
+        **_fields(arena, "fate match is_kept", ti.i32, n, 0, "renewal"),
         **_fields(arena, "target height", ti.f64, n, 0, "renewal"),
         **_fields(arena, "inherited", ti.f64, n, 3, "renewal"),
     )

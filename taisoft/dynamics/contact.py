@@ -173,6 +173,7 @@ class ContactStep:
         self.had_impact, self.dropped = bool(kept["met"]), int(kept["dropped"])
         self._search_counts = int(kept["found"]), int(kept["unmapped"])
         self.paths.forget()
+        self._renewal.sides = None
         self.misplaced.start_step()
         self.crossing, self.last_crossing = 0.0 if self.paths.none_cross else None, Crossing()
         self._searched = self._measured_end = None
@@ -237,7 +238,7 @@ class ContactStep:
     def renew(self, x_start: Any, displacement: Any) -> bool:
         """Take the contacts' geometry at displacements from x_start, (n_nodes) 3-vectors f64 [m] each; return whether it changed.
 
-        Impulses and targets stay. `problem` is another one if it had to grow.
+        Impulses and targets pass to the new contacts. `problem` is another one if it had to grow.
         """
         (time, dt), renewal = self._searched, self._renewal
         needed = renewal.look(self.problem, time, dt, x_start, displacement, self.contact_offset)
@@ -386,12 +387,17 @@ class ContactStep:
     def search_along_path(self, time: float, dt: float) -> bool:
         """Search along `paths.displacement` from the start state; return whether that finds new contacts."""
         self._searched = self._measured_end = None
+        known = self._found_features()
         self.paths.use_all()
         self._find(time, dt, path=self.paths.displacement)
         self._searched = time, dt
-        detection, known = self.detection, set(map(tuple, self.problem.feature.to_numpy(self.n_contacts).tolist()))
+        return not known.issuperset(self._found_features())
+
+    def _found_features(self) -> set[tuple]:
+        """Return the features of the contacts of the last search."""
+        detection = self.detection
         found = detection.buffer.data.feature[detection.kept.to_numpy(detection.counts.contacts)]
-        return not known.issuperset(map(tuple, found.tolist()))
+        return set(map(tuple, found.tolist()))
 
     def measure_start(self, time: float, dt: float) -> tuple[float, float]:
         """Return the deepest penetration before a step of dt over the finer mean surface edge, and its largest closing ratio."""

@@ -227,7 +227,7 @@ def _judge_found(
     if first >= 0:
         is_kept = is_kept or p.renewal.is_kept[first] == 1
     lowest = -ti.cast(BEHIND, ti.f64) * _slip(motion, n) - floor
-    nearest = -1
+    nearest = j
     if j < 0 and (height < lowest or gap < offset):
         nearest = _nearest_present(p, body, found.point[row])
         if nearest >= 0:  # what is behind each other there may be so here
@@ -289,7 +289,6 @@ def judge(
         for b in range(n):
             changed |= _judge_found(p, s, end, o, displacement, found, kept[b], b, common_offset, margin, floor)
         for c in range(p.count[0]):
-            p.renewal.heir[c] = -1
             if p.renewal.fate[c] == OPEN:
                 b, same = _heir(p, found, kept, n, c)
                 pushes = p.r[c][0] > 0.0
@@ -298,7 +297,6 @@ def judge(
                     is_gone = not _still_cross(p, s, end, c)
                 if is_gone:
                     p.renewal.fate[c] = GONE
-                    p.renewal.heir[c] = b
                     changed |= int(pushes)
                     if pushes and b >= 0:
                         p.renewal.inherited[b] = p.renewal.inherited[b] + p.past.impulse[c]

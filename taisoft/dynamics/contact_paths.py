@@ -2,7 +2,7 @@
 
 A substep is accepted only if no pair of surfaces passes through each other on its straight paths (`collision.passages`), or on a
 bent path (`collision.bent_path`). Where surfaces would cross at its end, pairs that pass become contacts, and the substep is
-repeated with them; else it is halved. They remain contacts in the next substeps while they carry an impulse. If passages are
+repeated with them; else it is halved. Such contacts stay in the next substeps while they carry an impulse. If passages are
 left after all retries, whole bodies are held back: their paths are shortened until nothing passes, and the step counts as not
 converged.
 """

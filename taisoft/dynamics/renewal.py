@@ -7,6 +7,7 @@ import taichi as ti
 
 from taisoft.backend.arrays import FieldArena, download
 from taisoft.collision.detector import Detection
+from taisoft.collision.end_search import EndSearch
 from taisoft.contact.build import PairNumbers, drop_vanishing
 from taisoft.contact.problem import ContactProblem, index_nodes
 from taisoft.dynamics.contact_geometry import IN_PLACE, KEPT, REJECTED, STILL, adopt, judge, keep_displacements, largest_motion
@@ -16,15 +17,16 @@ from taisoft.fem.model import Model
 class Renewal:
     """Renews the contacts of one step. sides: nodes and weights of contacts before dependent nodes were replaced, or None."""
 
-    MAX_LOOKS = (
-        4  # in a stage: the part of a normal's error that each leaves is a quarter, and it must end for Newton to converge
-    )
+    # in a stage: each leaves about a quarter of the error of the normals, and they must end for Newton to converge
+    MAX_LOOKS = 4
+    TRUSTED = 1.0  # of the mean edge: iterates farther from the searched paths are not looked at
 
     def __init__(self, model: Model, detection: Detection, arena: FieldArena):
         self._model, self._detection = model, detection
         self._seen = arena.vectors("seen_displacement", ti.f64, model.n_nodes)  # at the last look [m]
         self.sides: tuple[np.ndarray, np.ndarray] | None = None
         self.n_looks = 0  # in this stage
+        self._found: EndSearch | None = None  # by the last look
 
     def look(self, problem: ContactProblem, time: float, dt: float, x_start: Any, displacement: Any, offset: float) -> int:
         """Find the contacts at displacements from x_start, (n_nodes) 3-vectors f64 [m] each, in a substep of dt from a time [s].
@@ -39,7 +41,9 @@ class Renewal:
             return 0
         self.n_looks += 1
         keep_displacements(self._model, displacement, self._seen)
-        self._found = end = self._detection.find_at_end(time, dt, x_start, displacement)
+        self._found = end = self._detection.find_at_end(time, dt, x_start, displacement, self.TRUSTED * self._detection.edge)
+        if end is None:
+            return 0
         return end.reduction.n_kept + int(problem.count[0])
 
     def adopt(

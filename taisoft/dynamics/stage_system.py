@@ -287,9 +287,9 @@ class StageSystem:
         changed = self.step_contacts.renew(self.x_start, self.contacts.displacement)
         if self.stage.linearised:
             return_to_base(self.model, self.work)
-        if not changed:
-            return False
         before = self.contacts
+        if not changed and self.step_contacts.problem is before.problem:
+            return False
         self._begin_contacts()
         if self.contacts is not before:  # the storage has grown: set the displacements there
             move(self.model, self.work, self.contacts, self.kind, STAY, 1.0, self.stage.c, self.stage.beta)

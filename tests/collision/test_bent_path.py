@@ -42,7 +42,8 @@ def refused(scene: ts.Scene, move) -> bool:
         contact.paths.displacement.from_numpy(displacement)
         contact.detection.find(0.0, 1.0, path=contact.paths.displacement, none_cross=True)
         made.state.set_state(x + displacement, np.zeros_like(x))
-        assert len(contact.detection.passages(TO_STATE)[0])  # the straight path passes something
+        assert len(contact.detection.passages(TO_STATE)[0])  # the straight path passes something,
+        assert not contact.detection.crosses_at_end(TO_STATE)  # and its end does not
         return contact.paths.find()
 
 

@@ -192,7 +192,6 @@ def test_gap_minus_target(fast, slow):
     # half of it acts before the impact, and rebounds too
     back = np.where(less > 0, (0.1 - 0.1 * restitution) * dt, 0.0)
     assert np.abs(found(force=-0.2, before=0.5) - np.where(later, -(0.4 - 0.1) * dt, expected + back)).max() < 1e-15
-    # sides that turn are apart: they open at once
     # self-contact scales the numbers
     factor = (gap - found(1e-3 * h, body=(1, 1)))[0] / (1e-3 * h)
     assert factor > 1.5

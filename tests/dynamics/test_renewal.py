@@ -4,6 +4,8 @@
 * What slides without friction passes a seam of flush boxes, meshes and bodies.
 * A frictionless cube swings in a bowl as far up as it came down, and never farther.
 * Where nothing moves, nothing is searched again.
+* What overlaps from the start is not thrown apart.
+* Contacts that outgrow their storage within a step get more.
 """
 
 import numpy as np
@@ -11,6 +13,7 @@ import pytest
 
 import taisoft as ts
 from taisoft.collision.detector import Detection
+from tests.dynamics.scenes import dynamics
 
 RUBBER = ts.Material(young=1e5, friction=0.0)
 CENTRE, RADIUS = np.array([0.0, -0.5, 0.0]), 0.5
@@ -38,7 +41,7 @@ def test_normals_and_gaps_are_those_of_the_end(integrator):
         slip = np.linalg.norm(sim.velocities().mean(axis=0)) * sim.dt / RADIUS  # by which a normal turns in a step
     linear = integrator == "linearly_implicit_euler"
     assert n > 50 and turned < (slip if linear else 0.1 * slip)
-    assert missed < (1e-4 if linear else 1e-5)  # [m]; the slip in a step is 1e-2 m
+    assert missed < (2e-4 if linear else 1e-5)  # [m]; the slip in a step is 1e-2 m
 
 
 def floor_of(kind: str, scene: ts.Scene) -> None:
@@ -99,7 +102,7 @@ def test_what_rests_is_not_searched_again(monkeypatch):
     looks, find = [], Detection.find_at_end
     monkeypatch.setattr(Detection, "find_at_end", lambda self, *arguments: looks.append(1) or find(self, *arguments))
     scene = ts.Scene()
-    scene.add_ground(friction=0.5)
+    scene.add_obstacle(ts.Box((0, -0.1, 0), (0.5, 0.1, 0.5)), name="floor", friction=0.5)
     scene.add_body(
         ts.box_mesh((2, 2, 2), (0.1,) * 3), ts.Material(young=1e5, mass_damping=20.0), name="cube", position=(0, 0.0505, 0)
     )
@@ -109,3 +112,31 @@ def test_what_rests_is_not_searched_again(monkeypatch):
         looks.clear()
         sim.run(0.2, fps=None)
         assert not looks
+
+
+@pytest.mark.parametrize("depth", [2e-4, 3e-3])
+def test_an_overlap_opens_slowly(depth):
+    scene = ts.Scene()
+    scene.allow_initial_overlap = True
+    scene.add_obstacle(ts.Sphere(CENTRE, RADIUS), name="ball", friction=0.0)
+    scene.add_body(ts.box_mesh((2, 2, 2), (0.2,) * 3), RUBBER, name="cube", position=(0, 0.1 - depth, 0))
+    with ts.Simulator(scene, dt=0.01, precision="f64") as sim:
+        sim.step()
+        assert sim.velocities()[:, 1].mean() < 0.02
+
+
+def test_contacts_that_outgrow_their_storage():
+    """The same bits as with storage that was large enough."""
+    scene = ts.Scene()
+    scene.add_obstacle(ts.Sphere(CENTRE, RADIUS), name="ball", friction=0.5)
+    scene.add_body(ts.box_mesh((3, 3, 3), (0.3,) * 3), RUBBER, name="cube", position=(0, 0.151, 0), velocity=(1.0, 0, 0.5))
+    found = []
+    for tight in (False, True):
+        with dynamics(scene, dt=0.01, precision="f64") as made:
+            for _ in range(8):
+                if tight and made.contact.n_contacts:
+                    kept = made.contact.snapshot()
+                    made.contact.restore(kept | {"capacity": made.contact.n_contacts + 3})
+                made.advance(1)
+            found.append(made.state.state()[0])
+    assert np.abs(found[0] - found[1]).max() < 1e-9
