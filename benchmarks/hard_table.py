@@ -20,7 +20,7 @@ RULE = (
 )
 HEADINGS = (
     *("case", "variant", "run", "quantity", "measured", "limit", "basis", ""),
-    *("steps", "wall [s]", "step [ms]", "peak [MB]", "error"),
+    *("steps", "substeps", "Newton", "CG", "wall [s]", "step [ms]", "peak [MB]", "error"),
 )
 LEFT = (0, 1, 2, 3, 5, 6, 7)
 NOTHING = "-"
@@ -120,6 +120,7 @@ def row_lines(row: Row) -> list[tuple[str, ...]]:
     first = (row.case.id, row.variant.name, record["status"])
     cost = (
         str(record["steps"]),
+        *(str(record.get(key, NOTHING)) for key in ("substeps", "newton_iterations", "linear_iterations")),
         f"{record['seconds']:.1f}",
         _or_nothing(record["step_seconds"], 1e3, ".3g"),
         _or_nothing(record["peak_memory_bytes"], 1e-6, ".0f"),

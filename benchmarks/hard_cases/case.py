@@ -306,6 +306,7 @@ class Session:
             "total_seconds": time.perf_counter() - start,
             "step_seconds": float(np.median(self.step_seconds)) if self.step_seconds else None,
             **{f"{what}_iterations": self.total(f"{what}_iterations") for what in ("newton", "linear", "contact")},
+            "substeps": self.total("substeps"),
             "most_newton_iterations": max((r.newton_iterations for r in self.reports if r.converged), default=0),
             "inverted": self.largest("n_inverted"),
             "unconverged": self.unconverged,
