@@ -88,12 +88,13 @@ def triangle_distance(x: np.ndarray, a: np.ndarray, b: np.ndarray) -> float:
     return float(np.sqrt(least))
 
 
-def winding_number(point: np.ndarray, corners: np.ndarray) -> float:
-    """How often a surface winds around a point (3,): 1 inside a closed one, 0 outside. corners: (n,3,3) of its triangles [m]."""
-    a, b, c = np.moveaxis(corners - point, 1, 0)
-    la, lb, lc = (np.linalg.norm(one, axis=1) for one in (a, b, c))
-    dots = (a * b).sum(axis=1) * lc + (b * c).sum(axis=1) * la + (c * a).sum(axis=1) * lb
-    return float(np.arctan2((a * np.cross(b, c)).sum(axis=1), la * lb * lc + dots).sum() / (2.0 * np.pi))
+def winding_numbers(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
+    """How often (k,) a surface winds around points (k,3): 1 inside a closed one, 0 outside. corners: (n,3,3) of its triangles
+    [m]."""
+    a, b, c = np.moveaxis(corners - points[:, None, None], 2, 0)
+    la, lb, lc = (np.linalg.norm(one, axis=2) for one in (a, b, c))
+    dots = (a * b).sum(axis=2) * lc + (b * c).sum(axis=2) * la + (c * a).sum(axis=2) * lb
+    return np.arctan2((a * np.cross(b, c)).sum(axis=2), la * lb * lc + dots).sum(axis=1) / (2.0 * np.pi)
 
 
 def separation(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -222,8 +223,23 @@ class Judge:
             for j, name, part in points:
                 may_touch = j != k and min(j, k) < self._n_soft and not self._are_attached(name, self._names[k])
                 if may_touch and (part > lo).all() and (part < hi).all():
-                    found[name, self._names[k]] += winding_number(part[0], corners) > 0.5
+                    found[name, self._names[k]] += winding_numbers(part[:1], corners)[0] > 0.5
         return +found
+
+    def inside(self) -> int:
+        """The number of vertices around which a closed surface of another body or obstacle, that they may not cross, winds.
+
+        Where nothing has got through anything there are none, even if surfaces cross themselves."""
+        x, found = self.vertices(), 0
+        for k in filter(self._solid.__getitem__, range(len(self._of))):
+            corners = x[self.triangles[self._of[k]]]
+            lo, hi = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))
+            for j, parts in enumerate(self._components):
+                if j != k and min(j, k) < self._n_soft and not self._are_attached(self._names[j], self._names[k]):
+                    points = x[np.concatenate(parts)]
+                    near = points[((points > lo) & (points < hi)).all(axis=1)]
+                    found += int((np.abs(winding_numbers(near, corners)) > 0.5).sum())
+        return found
 
     def least_distance(self, within: float) -> float:
         """The least distance [m] between surfaces that may meet, `within` if it is larger; of vertices and edges from faces and

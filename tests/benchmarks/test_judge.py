@@ -4,6 +4,7 @@
   crosses where the edge opposite it pierces the other triangle;
 * the pairs are those of all pairs in random crumpled bodies, and the least distance that of brute force;
 * distances of triangles are those of sampled points;
+* a closed surface winds once around a point inside it, and vertices inside are counted;
 * a surface wholly inside another one counts, and so do shapes inside a body; obstacles may cross each other;
 * what is attached to each other exactly may cross, and nothing else.
 """
@@ -153,3 +154,13 @@ def test_attached_bodies_may_cross():
         small = 0.1 * scene.body("cube 1").rest_positions
         names = judging.Judge(standing(scene, {"cube 1": small}), False).find().names
         assert set(names) == (set() if attached else {("cube 1", "cube 0")})
+
+
+def test_winding_numbers():
+    mesh = ts.box_mesh((2, 2, 2), (1.0, 1.0, 1.0))
+    points = np.array([(0.1, 0.2, 0.3), (0.499, 0.0, 0.1), (0.501, 0.0, 0.1), (3.0, 2.0, 1.0)])
+    assert judging.winding_numbers(points, mesh.vertices[mesh.surface]) == pytest.approx([1.0, 1.0, 0.0, 0.0], abs=1e-12)
+    scene = ts.Scene()
+    for k, (size, at) in enumerate(((1.0, 0.0), (0.2, 0.0), (0.2, 0.5), (0.2, 2.0))):
+        scene.add_body(ts.box_mesh((1, 1, 1), (size,) * 3), ts.Material(), name=f"cube {k}", position=(at, 0.03, 0.01))
+    assert judging.Judge(standing(scene), False).inside() == 8 + 4
