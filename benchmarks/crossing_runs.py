@@ -1,7 +1,7 @@
 """Runs of `taisoft bench crossings`: simulators whose every state is judged, each run in its own process, stored by its inputs.
 
 A run is a group and a name. Its record has the number of judged states and of those that cross, the first crossing, the largest
-depth, the least distance of states that do not cross, and how the run ended.
+depth, the least distance of states that do not cross, sums over its steps, and how the run ended.
 """
 
 import sys
@@ -22,6 +22,7 @@ from taisoft.scene.scene import Scene
 from taisoft.study.output import NoStore, Store, code_digest, digest
 from taisoft.study.workers import LocalPlace, carry_out
 
+from . import crossing_shots
 from .crossing_heaps import folded_strip, make_heap
 from .hard_cases import CASES
 from .hard_cases.case import REFUSED, Session
@@ -29,7 +30,7 @@ from .hard_runs import find
 from .runner import files_digest
 
 CHILD = (sys.executable, "-m", "taisoft", "bench", "crossings", "--child")
-DEMOS, HARD, HEAPS, JITTERED = GROUPS = ("demos", "hard", "heaps", "jittered")
+DEMOS, HARD, HEAPS, SHOTS, JITTERED = GROUPS = ("demos", "hard", "heaps", "shots", "jittered")
 N_HEAPS, N_STARTS = 200, 10
 JITTER = 1e-4  # [m], largest displacement along each axis of a jittered start
 FOLD = "fold"
@@ -52,6 +53,10 @@ class Watch:
     least: float = NEAR  # [m], of every tenth state that does not cross; NEAR if it is larger
     contacts: int = 0  # the engine's, in one step
     newton: int = 0  # most iterations of a converged step
+    newton_iterations: int = 0  # of all steps, as are the next two
+    linear_iterations: int = 0
+    substeps: int = 0
+    tunnelled: int | None = None  # first step after which something has got through, or into, something else; of shots only
     unconverged: int = 0
     inverted: int = 0
     judge_seconds: float = 0.0
@@ -62,6 +67,12 @@ class Watch:
         """Judge the start of a simulator."""
         self.simulators += 1
         self.starts_crossing += judge.crossings() > 0
+
+    def count(self, report: StepReport) -> None:
+        """Add to the sums."""
+        self.newton_iterations += report.newton_iterations
+        self.linear_iterations += report.linear_iterations
+        self.substeps += report.substeps
 
     def look(self, sim: Simulator, judge, report: StepReport) -> None:
         """Judge the state after a step."""
@@ -96,14 +107,34 @@ class JudgedSimulator(Simulator):
     def advance(self, n: int) -> StepReport:
         """See Simulator; takes one step, or `n` where nothing can touch, which is not judged."""
         if not self.touches:
-            return super().advance(n)
+            report = super().advance(n)
+            self._watch.count(report)
+            return report
         if self._judge is None:
             from .judge import Judge  # needs ipctk
 
             self._judge = Judge(self, self.settings.self_collision)
             self._watch.begin(self, self._judge)
         report = super().advance(1)
+        self._watch.count(report)
         self._watch.look(self, self._judge, report)
+        return report
+
+
+class ShotSimulator(JudgedSimulator):
+    """A simulator of a shot: each state is also judged by sides, and by vertices inside something else."""
+
+    def __init__(self, shot: crossing_shots.Shot, *, watch: Watch, arch: str):
+        super().__init__(shot.scene, watch=watch, arch=arch, **shot.settings)
+        self._passed = shot.passed
+        if shot.velocities is not None:
+            self.set_state(velocities=shot.velocities)
+
+    def advance(self, n: int) -> StepReport:
+        """See JudgedSimulator."""
+        report = super().advance(n)
+        if self._watch.tunnelled is None and (self._judge.inside() or self._passed(self)):
+            self._watch.tunnelled = self.step_count
         return report
 
 
@@ -135,26 +166,29 @@ def jitter_start(sim: Simulator, number: int) -> None:
 
 
 def runs_of(group: str, count: int | None = None) -> list[str]:
-    """The names of a group's runs; count: of heaps, or of starts of each jittered scene."""
+    """The names of a group's runs; count: of heaps, of shots of each kind, or of starts of each jittered scene."""
     if group == DEMOS:
         return list(shipped_files("demos"))
     if group == HARD:
         return [f"{case.id}: {variant.name}" for case in CASES for variant in case.variants if variant.must.end != REFUSED]
     if group == HEAPS:
         return [f"heap {k:03d}" for k in range(N_HEAPS if count is None else count)]
+    if group == SHOTS:
+        return crossing_shots.names(crossing_shots.N_SHOTS if count is None else count)
     starts = range(N_STARTS if count is None else min(count, N_STARTS))
     scenes = [FOLD, TWISTED[0], *(f"{SQUEEZED[0]} {law}" for law in SQUEEZED[1])]
     return [f"{scene}, start {k}" for scene in scenes for k in starts]
 
 
 def run(group: str, name: str, arch: str, steps: int | None = None) -> dict:
-    """Run and judge in this process; returns the record. steps: at most, of heaps and folds."""
+    """Run and judge in this process; returns the record. steps: at most, of heaps, shots and folds."""
     clock, watch = time.perf_counter(), Watch()
     ended = {"status": REFUSED, "problems": [], "settings": "", "kinds": []}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)
         try:
-            ended |= {DEMOS: _demo, HARD: _hard, HEAPS: _heap, JITTERED: _jittered}[group](name, arch, watch, steps)
+            by = {DEMOS: _demo, HARD: _hard, HEAPS: _heap, SHOTS: _shot, JITTERED: _jittered}[group]
+            ended |= by(name, arch, watch, steps)
         except TaisoftError as error:
             ended["problems"] = [str(error)]
     ended["problems"] = list(dict.fromkeys(ended["problems"]))
@@ -186,6 +220,13 @@ def _heap(name: str, arch: str, watch: Watch, steps: int | None) -> dict:
     known = {"settings": settings_text(heap.settings), "kinds": heap.kinds}
     with JudgedSimulator(heap.scene, watch=watch, arch=arch, **heap.settings) as sim:
         return _ended(sim.run(min(heap.steps, steps or heap.steps) * sim.dt, fps=None), heap.settings) | known
+
+
+def _shot(name: str, arch: str, watch: Watch, steps: int | None) -> dict:
+    shot = crossing_shots.make_shot(name)
+    with ShotSimulator(shot, watch=watch, arch=arch) as sim:
+        steps = min(crossing_shots.STEPS, steps or crossing_shots.STEPS)
+        return _ended(sim.run(steps * sim.dt, fps=None), shot.settings)
 
 
 def _session(session: Session) -> dict:
@@ -244,6 +285,7 @@ def carry_out_all(
             return
         one = found[key] = store.write(key, result["answer"])
         first = f" from step {one['first']['step']} on" if one["first"] else ""
+        first += "" if one["tunnelled"] is None else f", tunnelled in step {one['tunnelled']}"
         say(
             f"{number}: {name}: {one['crossing']} of {one['states']} states cross{first}, {one['status']}, {one['seconds']:.0f} s"
         )

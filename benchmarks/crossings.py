@@ -6,13 +6,18 @@ ipctk judges every state: after each step of an implicit integrator, after each 
 against each other and against obstacles, and against themselves where self-collision is on.
 
 Groups: demos, each as it is. hard: all variants of the hard cases that need not be refused. heaps: 200 random heaps of 5 to 20
-bodies, thrown at each other at up to 5 m/s, half of them in single precision and a fifth with explicit integrators. jittered: ten
+bodies, thrown at each other at up to 5 m/s, half of them in single precision and a fifth with explicit integrators. shots: 20
+random ones of each of ten kinds, such as a cube through a wall, that one step may carry far beyond what they meet. jittered: ten
 starts each, displaced by up to 0.1 mm at random, of a folded strip, the twisted mat (S1) and the trash compactor (S4).
+
+Shots are also judged by sides, since a body may get through another one without a state that crosses: they have tunnelled where
+something is behind a wall that it cannot have passed beside, rings are linked, or a vertex is inside another surface.
 
 Each run has a process of its own. Nothing is judged where nothing can touch. Contacts, inverted: the most contacts, and inverted
 tets, in a step. Depth: how far two crossing triangles must move to part, or how deep one is in a half-space, sphere or capsule.
-Least: the least distance of every tenth state that does not cross, up to 1 mm. --keep stores finished runs in DIR, and the same
-command resumes there. Exit status: 1 if any state crosses or a run crashes, else 0.
+Least: the least distance of every tenth state that does not cross, up to 1 mm. Newton, CG, substeps: sums over the run. --keep
+stores finished runs in DIR, and the same command resumes there. Exit status: 1 if any state crosses, a shot tunnels or a run
+crashes, else 0.
 """
 
 import argparse
@@ -20,6 +25,7 @@ import sys
 import time
 from collections.abc import Iterable
 from contextlib import ExitStack, closing
+from functools import partial
 from pathlib import Path
 
 from taisoft.cli import Signals
@@ -29,7 +35,7 @@ from taisoft.output.files import FolderLock, make_folder
 from taisoft.study.output import NoStore, Store
 from taisoft.study.workers import serve
 
-from .crossing_runs import DEMOS, GROUPS, HARD, HEAPS, JITTERED, NEAR, answer, carry_out_all, runs_of
+from .crossing_runs import DEMOS, DISTANCE_EVERY, GROUPS, HARD, HEAPS, JITTERED, NEAR, SHOTS, answer, carry_out_all, runs_of
 from .document import Document, header, table
 from .runner import add_arch, add_named_out, make_parser, named_out, progress
 
@@ -39,10 +45,12 @@ QUICK = {
     DEMOS: ("cube_on_box", "sheet_on_box"),
     HARD: ("S3: two bodies",),
     HEAPS: ("heap 000", "heap 001", "heap 004"),
+    SHOTS: ("cube through wall 00", "linked rings 00"),
     JITTERED: ("fold, start 0",),
 }
 QUICK_STEPS = 20
 SECONDS = ("seconds", "judge_seconds")
+TOTALS = {"Newton": "newton_iterations", "CG": "linear_iterations", "substeps": "substeps"}  # by heading
 MOST_PAIRS = 4  # of names in a sentence
 
 
@@ -63,9 +71,14 @@ def ran(rows: Iterable[dict]) -> list[dict]:
 
 def least_text(row: dict) -> str:
     """The least distance [mm]."""
-    if not row["states"]:
+    if row["states"] < DISTANCE_EVERY:
         return ""
     return f"> {1e3 * NEAR:g}" if row["least"] >= NEAR else f"{1e3 * row['least']:.2g}"
+
+
+def total_of(key: str, row: dict) -> str:
+    """A sum over the steps; results stored earlier have none."""
+    return str(row.get(key) or "")
 
 
 COLUMNS = (
@@ -77,8 +90,10 @@ COLUMNS = (
     ("cross", lambda row: str(row["crossing"] or "")),
     ("first", lambda row: str(row["first"]["step"]) if row["first"] else ""),
     ("most", lambda row: str(row["most"] or "")),
+    ("tunnelled", lambda row: str(row.get("tunnelled") or "")),
     ("depth [mm]", lambda row: f"{1e3 * row['deepest']:.2g}" if row["crossing"] else ""),
     ("least [mm]", least_text),
+    *((title, partial(total_of, key)) for title, key in TOTALS.items()),
     ("not converged", lambda row: str(row["unconverged"] or "")),
     ("inverted", lambda row: str(row["inverted"] or "")),
     ("<status", "{0[status]}"),
@@ -101,6 +116,9 @@ def group_text(group: str, rows: list[dict]) -> str:
     """The section of a group: its table, where each run first crosses, what went wrong."""
     found = ran(rows)
     notes = [f"First crossing of {first_text(row)}." for row in found if row["first"]]
+    notes += [
+        f"{row['name']} ({row['settings']}) has tunnelled in step {row['tunnelled']}." for row in found if row.get("tunnelled")
+    ]
     notes += [f"{row['name']}: {row['starts_crossing']} starts cross before any step." for row in found if row["starts_crossing"]]
     notes += [f"{row['name']}: {problem}" for row in found for problem in row["problems"]]
     notes += [f"{row['name']} was not run: {row['left_out']}" for row in rows if "left_out" in row]
@@ -113,6 +131,8 @@ def total_text(what: str, rows: list[dict]) -> str:
     found = ran(rows)
     states, crossing, seconds, judging = (sum(row[key] for row in found) for key in ("states", "crossing", *SECONDS))
     runs = f"{sum(row['crossing'] > 0 for row in found)} of {len(found)} runs"
+    tunnelled = sum(bool(row.get("tunnelled")) for row in found)
+    runs += f"; **{tunnelled} tunnelled**" if tunnelled else ""
     return f"**{what}: {states} states judged, {crossing} cross**, in {runs}; {seconds:.0f} s, of which {judging:.0f} s judging"
 
 
@@ -123,8 +143,8 @@ def page(rows: list[dict]) -> list[str]:
 
 
 def failed(rows: list[dict]) -> bool:
-    """Whether a state crosses or a run crashed."""
-    return any(row.get("crossing") or row.get("starts_crossing") or row.get("crashed") for row in rows)
+    """Whether a state crosses, a shot has tunnelled or a run crashed."""
+    return any(row.get(key) for row in rows for key in ("crossing", "starts_crossing", "tunnelled", "crashed"))
 
 
 def main(argv=None) -> int:
@@ -132,7 +152,9 @@ def main(argv=None) -> int:
     parser = make_parser("crossings", __doc__)
     parser.add_argument("--what", nargs="+", choices=GROUPS, default=list(GROUPS), help="only these groups")
     parser.add_argument("--only", default="", metavar="NAME", help="only runs whose name contains this, such as 'heap 017'")
-    parser.add_argument("--count", type=int, metavar="N", help="only the first N heaps, and N starts of each jittered scene")
+    parser.add_argument(
+        "--count", type=int, metavar="N", help="only the first N heaps, N shots of each kind, N starts of each jittered scene"
+    )
     parser.add_argument("--budget", type=float, default=DAY, metavar="SECONDS", help="start no run after this time")
     parser.add_argument("--quick", action="store_true", help="a few runs, heaps and folds of 20 steps")
     add_arch(parser)

@@ -211,7 +211,7 @@ def ipc(results: Path) -> str:
 
 
 def crossings(results: Path) -> str:
-    """States judged and states that cross, by group of runs."""
+    """States judged, states that cross and shots that tunnelled, by group of runs."""
     numbers = newest(results, "crossings")
     groups: dict[str, list[dict]] = {}
     for row in numbers["rows"]:
@@ -222,6 +222,8 @@ def crossings(results: Path) -> str:
         ("states judged", lambda group: f"{sum(row['states'] for row in groups[group]):,}"),
         ("states that cross", lambda group: f"{sum(row['crossing'] for row in groups[group]):,}"),
     )
+    if "shots" in groups:  # which alone are judged by sides
+        columns += (("tunnelled", lambda group: str(sum(bool(row.get("tunnelled")) for row in groups[group]))),)
     return table(list(groups), columns) + measured_on(numbers)
 
 
