@@ -149,12 +149,13 @@ class Quadratic:
     def reduce(self) -> None:
         """Reduce the contacts."""
         d = self._detection
-        reduce_by_pairs(d._reduction, d.buffer.data, self._order(), self._state, self._kept, MERGED * d.edge)
+        reduce_by_pairs(d._reduction.work, d.buffer.data, self._order(), self._state, self._kept, MERGED * d.edge)
 
     def _order(self) -> np.ndarray:
         """Indices of the contacts ordered by kind and feature, then by index; computed once per search."""
         d = self._detection
-        place = d._reduction.place.to_numpy()[: d._reduction.count[FOUND]]
+        work = d._reduction.work
+        place = work.place.to_numpy()[: work.count[FOUND]]
         feature = d.buffer.data.feature.to_numpy()[place]
         known = self._known
         if known is None or not (np.array_equal(known[0], place) and np.array_equal(known[1], feature)):
@@ -220,7 +221,7 @@ class Rig:
         times.append(clock())
         d._search(near, NO_PASSAGES)
         times.append(clock())
-        d._reduce(none_cross=False)
+        d._reduction.reduce(-np.inf)
         times.append(clock())
         return dict(zip(PHASES, np.diff(times).tolist()))
 

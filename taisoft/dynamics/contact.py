@@ -208,9 +208,11 @@ class ContactStep:
         return detection.counts.contacts
 
     def _find(self, time: float, dt: float, prescribed=None, path=None) -> None:
-        """Call `Detection.find`."""
+        """Call `Detection.find`; where nothing crosses, implicit steps drop what may never touch."""
         self.measures.begin(dt)
         self.detection.find(time, dt, prescribed, path, self.simulation.now.held, self.simulation.now.none_cross)
+        if self.paths.none_cross and not self._explicit and self.detection.counts.contacts:
+            self.measures.drop_uncertain()
 
     def begin(self, time: float, dt: float) -> int:
         """Fill the problem for a step of dt [s] from the state at a time, warm-started. Return its number of contacts."""

@@ -9,7 +9,8 @@ advancement: Mirtich 1996). A contact's ratio is the smaller of
 and a step in which no contact's ratio exceeds 1 is short enough. Weakness: a surface that protrudes behind the nearest one is a
 separate contact only if its distance has a local minimum there.
 
-Where nothing crosses, implicit steps need no such limit, since what they miss is found along their paths.
+Where nothing crosses, implicit steps need no such limit, since what they miss is found along their paths: there `drop_uncertain`
+drops the contacts that it would be for, unless they close head-on.
 """
 
 import math
@@ -21,6 +22,7 @@ import taichi as ti
 
 from taisoft.backend.arrays import FieldArena
 from taisoft.backend.runtime import kernel
+from taisoft.collision.contacts import FACE_FACE
 from taisoft.collision.detector import Detection
 from taisoft.collision.intersections import CROSSING_DEPTH, CROSSINGS, DEPTH_OVER_EDGE
 from taisoft.collision.surface import dvec
@@ -70,6 +72,12 @@ class ContactMeasures:
         """Largest closing ratio of a contact in that step."""
         return float(self.closing[CLOSING_RATIO])
 
+    def drop_uncertain(self) -> None:
+        """Drop the contacts of the last search that may never touch, where the check of paths finds those that would: a plane
+        across the nearest features also stops what flies past them."""
+        detection = self.detection
+        detection.counts.contacts = drop_uncertain(*detection.found, detection.counts.contacts)
+
     def crossing(self) -> Crossing:
         """Measure crossing triangles and contained colliders."""
         crossings, edges = self.detection.crossings(), self.detection.edges
@@ -114,6 +122,28 @@ def _relative_displacement(s: ti.template(), o: ti.template(), found: ti.templat
         if found.nodes_b[at][j] >= 0:
             displacement -= found.weights_b[at][j] * s.move[found.nodes_b[at][j]]
     return displacement
+
+
+@kernel
+def drop_uncertain(s: ti.template(), o: ti.template(), found: ti.template(), kept: ti.template(), n: ti.i32) -> ti.i32:
+    """Leave out of kept[:n] the contacts whose sides close by more than MAX_CLOSING of the thinner one's thickness in the
+    searched step, and move aside by as much before they meet: they may never touch. Passages remain. Return the number left."""
+    left = 0
+    ti.loop_config(serialize=True)
+    for _ in range(1):
+        for c in range(n):
+            at = kept[c]
+            displacement, normal = _relative_displacement(s, o, found, at), found.normal[at]
+            closing = -displacement.dot(normal)
+            allowed = MAX_CLOSING * ti.min(s.thickness[found.body[at][0]], s.thickness[found.body[at][1]])
+            is_certain = found.feature[at][0] == FACE_FACE or closing <= allowed
+            if not is_certain:
+                until = ti.min(ti.max(found.gap[at], 0.0) / closing, 1.0)
+                is_certain = until * (displacement + closing * normal).norm() <= allowed
+            if is_certain:
+                kept[left] = at
+                left += 1
+    return left
 
 
 @kernel
