@@ -4,7 +4,7 @@ Something flies along x, from at most 5 cm away, at a wall, rod, sheet or ring a
 the legs of a strip into each other. Speed, place, direction, tilt and settings are random.
 
 A state after a step that went through may be free of crossings. So each kind has a test of sides. Walls are held at their rims:
-a point behind one has passed it. Lines held at their ends, or closed, are told apart by their crossings seen along x.
+a point behind one has passed it. Lines held at their ends, or closed, are judged by their crossings seen along x.
 """
 
 from collections.abc import Callable

@@ -16,7 +16,7 @@ from taisoft.collision.candidates import Buffer
 from taisoft.collision.contacts import contact_fields
 from taisoft.collision.near_list import leaving
 from taisoft.collision.reduction import Reduction
-from taisoft.collision.surface import Surface
+from taisoft.collision.surface import Surface, box_triangles
 
 
 @kernel
@@ -24,7 +24,6 @@ def place_at_end(s: ti.template(), end: ti.template(), displacement: ti.template
     """Set positions, boxes and normals of surface `end`: displacements (n_nodes) [m] from surface s, where the other vertices are
     displaced as in the searched step. margin [m]: boxes grow by half of it. left[0]: how far the surface has left the searched
     paths [m]."""
-    half = ti.cast(0.5, ti.f64) * margin
     ti.loop_config(serialize=True)
     for _ in range(1):
         left[0] = 0.0
@@ -37,14 +36,7 @@ def place_at_end(s: ti.template(), end: ti.template(), displacement: ti.template
             if length > left[0]:  # few do, and atomics on one address wait for each other
                 ti.atomic_max(left[0], length)
         end.x[i] = s.x[i] + move
-    ti.loop_config(serialize=s.serial_cheap)
-    for t in range(s.n_triangles):
-        a, b, c = end.x[s.triangle[t, 0]], end.x[s.triangle[t, 1]], end.x[s.triangle[t, 2]]
-        n = (b - a).cross(c - a)
-        length = n.norm()
-        end.area[t] = length
-        end.normal[t] = ti.select(length > 0.0, n / length, 0.0)
-        end.lo[t], end.hi[t] = ti.min(a, b, c) - half, ti.max(a, b, c) + half
+    box_triangles(end, margin)  # whose move is 0
 
 
 class EndSearch:

@@ -201,8 +201,8 @@ def _exponent(value):
 
 
 @ti.func
-def _box_triangles(s: ti.template(), margin):
-    """Compute boxes, normals and areas of the triangles, and count the non-finite ones."""
+def box_triangles(s: ti.template(), margin):
+    """Compute boxes, normals and areas of the triangles, and count the non-finite ones. Top-level loops of a kernel."""
     s.count[NONFINITE] = 0
     half = ti.cast(0.5, ti.f64) * margin
     ti.loop_config(serialize=s.serial_cheap)
@@ -324,7 +324,7 @@ def _list_active(surface: ti.template()):
 @kernel
 def update_boxes(s: ti.template(), margin: ti.f64):
     """Update the boxes of triangles and colliders from x and move, the normals, and the active triangles."""
-    _box_triangles(s, margin)
+    box_triangles(s, margin)
     _box_bodies(s)
     _list_active(s)
 
@@ -346,7 +346,7 @@ def update_surface(
     active triangles too.
     """
     _move_soft(s, x, v, has_prescribed, prescribed, dt)
-    _box_triangles(s, margin)
+    box_triangles(s, margin)
     if ti.static(active):
         _box_bodies(s)
         _list_active(s)

@@ -25,6 +25,7 @@ from taisoft.backend.runtime import kernel
 from taisoft.collision.contacts import FACE_FACE
 from taisoft.collision.detector import Detection
 from taisoft.collision.intersections import CROSSING_DEPTH, CROSSINGS, DEPTH_OVER_EDGE
+from taisoft.collision.near_list import leaving
 from taisoft.collision.surface import dvec
 from taisoft.contact.build import obstacle_displacement_at
 from taisoft.fem.state import DEVIATION
@@ -196,12 +197,7 @@ def find_displacement(m: ti.template(), s: ti.template(), x_start: ti.template()
     ti.loop_config(serialize=m.on_cpu)
     for k in range(s.n_verts):
         if s.node[k] >= 0:
-            d, searched = displacement[s.node[k]], s.move[k]
-            square = searched.dot(searched)
-            along = ti.cast(0.0, ti.f64)
-            if square > 0.0:
-                along = ti.min(ti.max(d.dot(searched) / square, 0.0), 1.0)
-            length = (d - along * searched).norm()
+            length = leaving(displacement[s.node[k]], s.move[k]).norm()
             if length > m.state.scalars[DEVIATION]:  # few do, and atomics on one address wait for each other
                 ti.atomic_max(m.state.scalars[DEVIATION], length)
 
