@@ -104,8 +104,10 @@ class DirectSolver:
         """
         m, k = self._model, stage_contacts
         p, n = k.problem, int(k.problem.count[0])
-        J, residual = self._J, self._free * download([k.residual_linear])[0].astype(np.float64)[self._nodes].reshape(-1)
-        b = self._start_velocities(k, beta) - J @ self._factor.solve(residual)
+        # at the present x: iterations may have moved it, and the residual with it
+        x, v, residual = download([m.state.x, m.state.v, k.residual_linear])
+        J, residual = self._J, self._free * residual.astype(np.float64)[self._nodes].reshape(-1)
+        b = self._velocities(k, x, beta) - J @ self._factor.solve(residual)
         friction, factor, r = download([p.friction, p.factor, k.work.kept], n)
         r, found = self._contacts.solve(
             self._W, b, friction, r, "gauss_seidel", self.FRACTION * tolerance, self.SWEEPS, self._max_outer
@@ -116,21 +118,21 @@ class DirectSolver:
             if not law_residual <= acceptable:  # also if it is not a number
                 return None
         change = self._factor.solve(J.T @ r.reshape(-1) - residual)
-        x, v, base, impulses = m.state.x.to_numpy(), m.state.v.to_numpy(), k.x_linear.to_numpy(), p.r.to_numpy()
-        x[self._nodes] = base[self._nodes] + beta * change.reshape(-1, 3)
+        impulses = p.r.to_numpy()
+        x[self._nodes] += beta * change.reshape(-1, 3)
         v[self._nodes] = (x[self._nodes] - self._x_hat.to_numpy()[self._nodes]) / beta
         impulses[:n] = r
         upload([(m.state.x, x), (m.state.v, v), (p.r, impulses)])
         unbalanced = float(np.linalg.norm(self._matrix @ change + residual - J.T @ r.reshape(-1)))
         return found.iterations, law_residual <= tolerance, unbalanced
 
-    def _start_velocities(self, k: StageContacts, beta: float) -> np.ndarray:
-        """u_0 (3k,), see `contact_terms.stage_velocity_of`."""
+    def _velocities(self, k: StageContacts, x: np.ndarray, beta: float) -> np.ndarray:
+        """u (3k,) at positions x (n_nodes,3), see `contact_terms.stage_velocity_of`."""
         n = int(k.problem.count[0])
         gap, offset = download([k.work.gap_minus_target, k.work.tangential_offset], n)
         own = np.einsum("kij,kj->ki", frames(k.problem), offset)
         own[:, 0] = gap
-        moved = jacobian(k.problem) @ (k.x_linear.to_numpy() - k.x_start.to_numpy()).reshape(-1)
+        moved = jacobian(k.problem) @ (x - k.x_start.to_numpy()).reshape(-1)
         return (moved + own.reshape(-1)) / beta
 
     def _independent(self, k: StageContacts) -> sp.csr_matrix:
