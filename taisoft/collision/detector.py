@@ -338,10 +338,6 @@ class Detection:
         which they are apart, or None, see `PathCheck.find`."""
         return self.paths.find(self.model.state.x, self._broad_result, self._near_buffer, mode)
 
-    def crosses_at_end(self, mode: int) -> bool:
-        """Return whether surfaces cross or touch at the end of the paths of a mode, see `PathCheck.crosses_at_end`."""
-        return self.paths.crosses_at_end(self.model.state.x, self._broad_result, self._near_buffer, mode)
-
     def bends(self, mode: int) -> bool:
         """Return whether a bent path is free instead of a straight one of that mode."""
         return self.paths.bends(self.model.state.x, self._broad_result, self._near_buffer, mode, self.margin)

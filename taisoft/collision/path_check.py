@@ -171,33 +171,25 @@ class PathCheck:
         """
         return self._check(self.surface, x, broad, row, mode, 0.0, float(mode != STILL))
 
-    def crosses_at_end(self, x, broad, row: Buffer | None, mode: int) -> bool:
-        """Return whether any pair crosses or touches at the end of paths, with obstacles as at the step's end, or if the paths
-        leave what was searched. Half-spaces are left out. The others are as for `find`."""
-        return not self._is_leg_free(x, broad, row, mode, 0.0, 1.0, 1.0)
-
     def bends(self, x, broad, row: Buffer | None, mode: int, margin: float) -> bool:
         """Return whether a bent path is free, see `bent_path`. margin [m]: of the detection; the others are as for `find`."""
-        self._allocate_leg()
+        if self._leg is None:
+            n = max(self.surface.n_verts, 1)
+            self._leg = replace(self.surface, x=self._arena.vectors("leg_x", ti.f64, n))
+            self._inwards = self._arena.vectors("inwards", ti.f64, n)
         find_inwards(self.surface, x, int(mode == SEARCHED), self._inwards)
 
         def is_free(legs: int, depth: float) -> bool:
             return all(self._is_leg_free(x, broad, row, mode, depth, k / legs, (k + 1) / legs) for k in range(legs))
 
-        return any(is_free(legs, part * margin) for legs, part in TRIALS)
-
-    def _allocate_leg(self) -> None:
-        if self._leg is None:
-            n = max(self.surface.n_verts, 1)
-            self._leg = replace(self.surface, x=self._arena.vectors("leg_x", ti.f64, n))
-            self._inwards = self._arena.vectors("inwards", ti.f64, n)
+        crosses_at_end = not self._is_leg_free(x, broad, row, mode, 0.0, 1.0, 1.0)
+        return not crosses_at_end and any(is_free(legs, part * margin) for legs, part in TRIALS)
 
     def _is_leg_free(self, x, broad, row: Buffer | None, mode: int, depth: float, begin: float, end: float) -> bool:
         """Return whether nothing passes on a leg, see `bent_path.set_leg`, or crosses there if its begin is its end.
 
         False if it leaves what was searched.
         """
-        self._allocate_leg()
         for _ in range(2):
             where = self._inwards, depth, begin, end, self.limit if broad is not None else np.inf
             set_leg(self.surface, self._leg, self.fields, x, int(mode == SEARCHED), *where)

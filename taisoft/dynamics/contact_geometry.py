@@ -11,8 +11,8 @@ target of the nearest of its pair. Contacts that are found no more go if they pu
 the pair with nearly the same normal. Those that do not push stay, as guards. These stay as they are:
 
 * passages, and where a distance field is deepest in a triangle;
-* all contacts of a pair that is deeper than half the margin at x_k, or closes by more than half an edge in the step: such an
-  iterate is not trusted.
+* all contacts of a pair that is deeper than half the margin at x_k, or of two bodies that close by more than half an edge in the
+  step: such an iterate is not trusted.
 
 The deepest point of a triangle in an analytic shape stays the same material point, with new gap and normal: a deepest point that
 follows the iterate would cycle. A new one counts only if it violates the offset. A contact is not accepted if its sides were
@@ -169,9 +169,10 @@ def _keep_untrusted(
         if p.past.pair_slot[slot] < 0:
             p.past.pair_slot[slot] = c
         p.renewal.is_kept[c] = 0
-        closing = -ti.min(p.normal[c].dot(_motion(p, c, displacement)), dt * p.approach[c])
-        if closing > ti.cast(TRUSTED_CLOSING, ti.f64) * _finer_edge(s, p.body[c]):
-            p.renewal.is_kept[p.past.pair_slot[slot]] = 1
+        if p.body[c][0] != p.body[c][1]:  # all contacts of a body with itself are one pair
+            closing = -ti.min(p.normal[c].dot(_motion(p, c, displacement)), dt * p.approach[c])
+            if closing > ti.cast(TRUSTED_CLOSING, ti.f64) * _finer_edge(s, p.body[c]):
+                p.renewal.is_kept[p.past.pair_slot[slot]] = 1
     for b in range(n):
         if found.gap[kept[b]] < -ti.cast(TRUSTED_DEPTH, ti.f64) * margin:
             first = p.past.pair_slot[pair_slot(p, found.body[kept[b]])]

@@ -1,10 +1,9 @@
 """Nothing crosses: the passages on a substep's paths, the contacts that hold them apart, and what is held back if those fail.
 
 A substep is accepted only if no pair of surfaces passes through each other on its straight paths (`collision.passages`), or on a
-bent path (`collision.bent_path`). Where surfaces would cross at its end, pairs that pass become contacts, and the substep is
-repeated with them; else it is halved. Such contacts stay in the next substeps while they carry an impulse. If passages are
-left after all retries, whole bodies are held back: their paths are shortened until nothing passes, and the step counts as not
-converged.
+bent path (`collision.bent_path`). Else pairs that pass become contacts, and the substep is repeated with them. They stay in the
+next substeps while they carry an impulse. If passages are left after all retries, whole bodies are held back: their paths are
+shortened until nothing passes, and the step counts as not converged.
 """
 
 import numpy as np
@@ -34,7 +33,6 @@ class ContactPaths:
 
     def __init__(self, simulation: SimulationState, detection: Detection, arena: FieldArena):
         self._simulation, self._detection = simulation, detection
-        self.ends_free = False  # whether nothing crosses at the end of the paths of the last check, though something passes
         self.uncovered = False  # whether the paths of the last check left what was searched
         self.held_back = ""  # a sentence about the last step, if bodies were held back,
         self._names: set[str] = set()  # and their names
@@ -89,15 +87,10 @@ class ContactPaths:
 
     def _passages(self, mode: int) -> tuple[np.ndarray, np.ndarray] | None:
         """Return the passages on the paths of a mode, none if a bent path is free, see `collision.bent_path`."""
-        found, self.ends_free = self._detection.passages(mode), False
-        if found is None or len(found[0]) == 0:
+        found = self._detection.passages(mode)
+        if found is None or len(found[0]) == 0 or (found[0][:, 0] == FLAT).any():
             return found
-        if (found[0][:, 0] == FLAT).any() or self._detection.crosses_at_end(mode):
-            return found
-        if self._detection.bends(mode):
-            return NO_PASSAGES
-        self.ends_free = True
-        return found
+        return NO_PASSAGES if self._detection.bends(mode) else found
 
     def _hold(self, pairs: np.ndarray, times: np.ndarray) -> None:
         """Hold passages and the parts of the step until which they are apart; those of the same features once."""

@@ -8,7 +8,8 @@ over the contacts of a pair. Sliding by D over a radius R makes W / S = D / R: f
 normal force, or a body without friction drags. At a seam, the edge of the neighbouring box stops what should slide over it.
 Where nothing slides the force follows from balance, whatever the normal, and W is 0.
 
-A contact whose point has left a face over an edge held until then, and counts as right.
+A contact whose point has left a face over an edge held until then, and counts as right. So does a passage: what would go through
+something within the step is stopped along the normal of that time, as by an impact.
 
 Both sums fade by FADING with every step in which the pair touches, and a step counts no more than a MIN_STEPS-th of all: one
 impact on an edge may turn a force by 20 %, a slide over many steps by no more than 2 %. What grazes beside larger forces on both
@@ -26,7 +27,6 @@ from taisoft.collision.contacts import EDGE_EDGE, FACE_FACE, VERTEX_FACE
 from taisoft.collision.detector import Detection
 from taisoft.collision.end_normals import nearest_of_edges, normal_at, normal_on_shape
 from taisoft.collision.features import FLAT_COSINE
-from taisoft.collision.passages import ADJACENT, N_FEATURES, N_KINDS, NEAR
 from taisoft.collision.surface import dvec
 from taisoft.contact.build import relative_velocity
 from taisoft.contact.problem import ContactProblem, to_world
@@ -83,16 +83,7 @@ def _end_normal(p: ti.template(), m: ti.template(), s: ti.template(), o: ti.temp
         side = _side(s, s.ring[s.ring_start[one]], other, one, _lowest(s, other))
     elif kind == EDGE_EDGE:
         e, f, side = one, other, _side(s, one // 3, other // 3, _lower_end(s, one), _lower_end(s, other))
-    elif kind == FACE_FACE and one % N_KINDS == NEAR:
-        t, u, k = one // N_KINDS, other // N_FEATURES, other % N_FEATURES
-        side = _side(s, t, u, _lowest(s, t), _lowest(s, u))
-        if k >= 6:
-            e, f = 3 * t + (k - 6) // 3, 3 * u + (k - 6) % 3
-        elif k < 3:
-            vertex, face = s.triangle[t, k], u
-        else:
-            vertex, face, side = s.triangle[u, k - 3], t, -side
-    elif kind != FACE_FACE or one % N_KINDS != ADJACENT:
+    elif kind != FACE_FACE:
         end, gap, is_smooth, was_smooth = _normal_on_shape(p, m, o, c, lasting)
     own, foot, first, second, n_points = dvec(0.0), dvec(0.0), face, -1, int(vertex >= 0)
     if vertex >= 0:

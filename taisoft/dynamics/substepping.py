@@ -295,8 +295,7 @@ class Substepping:
                 # contacts unknown so far matter only if something could have crossed
                 new = contact.search_along_path(time, dt) if passes else new and not contact.paths.none_cross
             n_failed += not (result.converged or stepper.is_linear)
-            # a contact would hold up what ends free: a shorter part of the motion cuts less deep
-            shorter_helps = may_cut and (n_failed >= self.MAX_FAILED or contact.paths.ends_free)
+            shorter_helps = may_cut and n_failed >= self.MAX_FAILED
             hopeless = stepper.is_spent() or (passes and (contact.paths.is_stuck or shorter_helps))
             if not (new or passes) or tries >= (MAX_PASSAGES if passes else self.MAX_SEARCHES) or hopeless:
                 simulation.set_state(*state)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import taisoft as ts
-from taisoft.collision.near_list import TO_STATE
+from taisoft.collision.near_list import STILL, TO_STATE
 from tests.dynamics.scenes import dynamics
 
 SOFT = ts.Material(young=1e6)
@@ -43,8 +43,10 @@ def refused(scene: ts.Scene, move) -> bool:
         contact.detection.find(0.0, 1.0, path=contact.paths.displacement, none_cross=True)
         made.state.set_state(x + displacement, np.zeros_like(x))
         assert len(contact.detection.passages(TO_STATE)[0])  # the straight path passes something,
-        assert not contact.detection.crosses_at_end(TO_STATE)  # and its end does not
-        return contact.paths.find()
+        passes = contact.paths.find()
+        contact.detection.find(1.0, 0.0)
+        assert len(contact.detection.passages(STILL)[0]) == 0  # and its end does not
+        return passes
 
 
 def two(a: ts.TetMesh, b: ts.TetMesh) -> ts.Scene:

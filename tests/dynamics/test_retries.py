@@ -184,7 +184,6 @@ class FakeStepper:
     step_count, closing_ratio = 4, 10.0
 
     def __init__(self):
-        self.ends_free = False  # whether nothing crosses at the end of a path on which something passes
         self.contact = self.paths = self.measures = self.simulation = self.now = self.start = self
         self.taken, self.kept, self.held_back, self.retry_starts = [], [], [], []
         self.converges = lambda time, dt: True
@@ -294,12 +293,6 @@ def test_a_substep_with_a_fault_is_repeated_and_then_halved(stepper, faults, len
     assert max(lengths) == pytest.approx(length) and result.converged and not stepper.held_back
     assert sum(dt == STEP for _, dt in stepper.taken) == attempts
     assert result.newton_iterations == 3 * len(stepper.taken) and substepping.substeps == len(lengths)
-
-
-def test_a_substep_whose_end_is_free_is_halved_at_once(stepper):
-    stepper.passes, stepper.ends_free = longer_than(STEP / 2), True
-    lengths, result = take(stepper)
-    assert lengths == [STEP / 2] * 2 and result.converged and sum(dt == STEP for _, dt in stepper.taken) == 1
 
 
 def test_the_number_of_undone_substeps_is_bounded(stepper):
