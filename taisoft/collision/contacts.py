@@ -2,8 +2,7 @@
 
 A contact has a side a and a side b, each a point on up to three nodes with weights that sum to 1; an obstacle is always b and
 has no nodes. The normal is a unit vector from b to a; the gap is the signed distance of the two points along it, negative in
-penetration. A feature identifies the pair of mesh features in contact, and
-persists while they stay in contact.
+penetration. A feature identifies the pair of mesh features in contact, and persists while they stay in contact.
 """
 
 from dataclasses import dataclass
@@ -43,10 +42,10 @@ class Contacts:
     """Contacts on the host, all arrays (k, ...) and in an order that does not depend on threads.
 
     An attribute of a record from `sim.contacts()` holds for the last step, or for its last substep if it was cut into several.
-    point, normal, gap: geometry at its end, but point and normal of an explicit step at its start; impulse: of normal force and
-    friction together; impulse / duration is the force. kind: what meets, a vertex and a triangle, two edges, a vertex or a
-    triangle and a distance field or obstacle, or two triangles that would pass through each other. Contacts that are near each
-    other are merged into one: there were `found`.
+    point, normal, gap: geometry at its end, but point and normal of an explicit step, and of contacts that keep the geometry of
+    the start, at its start; impulse: of normal force and friction together; impulse / duration is the force. kind: what meets, a
+    vertex and a triangle, two edges, a vertex or a triangle and a distance field or obstacle, or two triangles that would pass
+    through each other. Contacts that are near each other are merged into one: there were `found`.
     """
 
     point: np.ndarray  #: (k,3) midway between the two surface points [m]

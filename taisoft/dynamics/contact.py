@@ -250,6 +250,7 @@ class ContactStep:
             last_time, rows = self._last_time, read_rows(self.problem, MORE_ROWS)
             self._allocate(2 * needed)
             write_rows(self.problem, rows)
+            index_nodes(self.problem)
             self._last_time, self._indexed = last_time, True
         return renewal.adopt(self.problem, self.numbers, self._step_dt, x_start, displacement, self.contact_offset)
 
@@ -295,7 +296,8 @@ class ContactStep:
         """
         if self.n_contacts:
             if not self._explicit:
-                self.misplaced.add(self.problem, self._substep_fraction * self._step_dt, self.contact_offset)
+                dt = self._substep_fraction * self._step_dt
+                self.misplaced.add(self.problem, dt, self.contact_offset, self.paths.has_found)
             set_end_gaps(self.problem, self.simulation.model, x_start)
         if not self.paths.none_cross:
             self.paths.exempt_crossing()

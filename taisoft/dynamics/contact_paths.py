@@ -37,6 +37,7 @@ class ContactPaths:
         self.held_back = ""  # a sentence about the last step, if bodies were held back,
         self._names: set[str] = set()  # and their names
         self._n_unchanged = 0  # checks in a row that found no pairs but those held already
+        self.has_found = False  # whether any passage was found in this substep
         self._held = NO_PASSAGES  # in this substep so far
         n_bodies = len(detection.scene.bodies)
         n, group = connected_components(attached_pairs(detection.scene)[:n_bodies, :n_bodies])
@@ -66,7 +67,7 @@ class ContactPaths:
 
     def begin(self) -> None:
         """Begin a substep."""
-        self._held, self._n_unchanged = self._simulation.now.held, 0
+        self._held, self._n_unchanged, self.has_found = self._simulation.now.held, 0, False
 
     def left_searched(self, x_start) -> bool:
         """Return whether the surface left the searched path since x_start; keep its displacement for another search."""
@@ -94,7 +95,7 @@ class ContactPaths:
 
     def _hold(self, pairs: np.ndarray, times: np.ndarray) -> None:
         """Hold passages and the parts of the step until which they are apart; those of the same features once."""
-        held, n_held = self._held, len(self._held.pairs)
+        held, n_held, self.has_found = self._held, len(self._held.pairs), True
         every, time = np.concatenate([held.pairs, pairs]), np.concatenate([held.times, times])
         _, first, group = np.unique(self._detection.paths.features(every), axis=0, return_index=True, return_inverse=True)
         earliest = np.full(len(first), np.inf)
@@ -122,9 +123,10 @@ class ContactPaths:
         """Exempt the colliders that cross at the last search, and no others."""
         self._simulation.now.none_cross = not self._detection.exempt_crossing()
 
-    def hold_back(self, x_start) -> None:
-        """Shorten the paths of bodies from x_start to the present state until nothing passes through anything. The last search
-        must have started there. Raise SimulationError if nothing passes only where no body can be held back."""
+    def hold_back(self, x_start) -> bool:
+        """Shorten the paths of bodies from x_start to the present state until nothing passes through anything; return whether any
+        had to be. The last search must have started there. Raise SimulationError if nothing passes only where no body can be
+        held back."""
         simulation, detection = self._simulation, self._detection
         free = simulation.model.free.to_numpy() > 0
         path = free, x_start.to_numpy(), *simulation.state()
@@ -149,9 +151,12 @@ class ContactPaths:
                 moving = together[can_move[together]]
                 part[moving] = part[moving].min(initial=1.0)
             self._move_in_part(part, *path)
+        if n_rounds == 0:
+            return False
         self._names.update(detection.scene.colliders[k].name for k in np.flatnonzero(can_move & (part < 1.0)))
         listed = ", ".join(f"'{name}'" for name in sorted(self._names))
         self.held_back = f"held back {listed}, which would have passed through another surface or through itself"
+        return True
 
     def _refuse(self, a: int, b: int) -> None:
         """Raise SimulationError about two colliders that pass through each other wherever bodies stay."""

@@ -132,9 +132,9 @@ class ContactExplicitStepper(ExplicitStepper):
                 contact.search_along_path(time, dt)
             if tries == MAX_PASSAGES or contact.paths.is_stuck:
                 simulation.set_state(*end)
-                contact.paths.hold_back(good.x)
+                held = contact.paths.hold_back(good.x)
                 self.acceleration_stale = True
-                return replace(result, converged=False) if result else None
+                return replace(result, converged=result.converged and not held) if result else None
             result = self._solve_and_move(step, time, dt)
         return result
 

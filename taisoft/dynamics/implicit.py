@@ -258,10 +258,12 @@ class ImplicitStepper:
         self._n_previous = min(self._n_previous, past)
         return result
 
-    def hold_back_paths(self) -> None:
-        """Hold back bodies of the last substep that pass through something; the next one starts without history."""
-        self.contact.paths.hold_back(self.start.x)
-        self._n_previous = 0
+    def hold_back_paths(self) -> bool:
+        """Hold back bodies of the last substep that pass through something; return whether any do. The next substep then starts
+        without history."""
+        held = self.contact.paths.hold_back(self.start.x)
+        self._n_previous *= not held
+        return held
 
     def take_substep(self, time: float, dt: float, start: np.ndarray | None = None) -> StageResult:
         """Take a substep of dt from a time with the contacts of one search. start: (n_nodes, 3) [m/s] first iterate of v."""

@@ -8,8 +8,8 @@ over the contacts of a pair. Sliding by D over a radius R makes W / S = D / R: f
 normal force, or a body without friction drags. At a seam, the edge of the neighbouring box stops what should slide over it.
 Where nothing slides the force follows from balance, whatever the normal, and W is 0.
 
-A contact whose point has left a face over an edge held until then, and counts as right. So does a passage: what would go through
-something within the step is stopped along the normal of that time, as by an impact.
+A contact whose point has left a face over an edge held until then, and counts as right. So do passages in a substep that finds
+some: what would go through something then is stopped along the normal of that time, as by an impact.
 
 Both sums fade by FADING with every step in which the pair touches, and a step counts no more than a MIN_STEPS-th of all: one
 impact on an edge may turn a force by 20 %, a slide over many steps by no more than 2 %. What grazes beside larger forces on both
@@ -27,6 +27,7 @@ from taisoft.collision.contacts import EDGE_EDGE, FACE_FACE, VERTEX_FACE
 from taisoft.collision.detector import Detection
 from taisoft.collision.end_normals import nearest_of_edges, normal_at, normal_on_shape
 from taisoft.collision.features import FLAT_COSINE
+from taisoft.collision.passages import ADJACENT, N_FEATURES, N_KINDS, NEAR
 from taisoft.collision.surface import dvec
 from taisoft.contact.build import relative_velocity
 from taisoft.contact.problem import ContactProblem, to_world
@@ -83,7 +84,16 @@ def _end_normal(p: ti.template(), m: ti.template(), s: ti.template(), o: ti.temp
         side = _side(s, s.ring[s.ring_start[one]], other, one, _lowest(s, other))
     elif kind == EDGE_EDGE:
         e, f, side = one, other, _side(s, one // 3, other // 3, _lower_end(s, one), _lower_end(s, other))
-    elif kind != FACE_FACE:
+    elif kind == FACE_FACE and one % N_KINDS == NEAR:
+        t, u, k = one // N_KINDS, other // N_FEATURES, other % N_FEATURES
+        side = _side(s, t, u, _lowest(s, t), _lowest(s, u))
+        if k >= 6:
+            e, f = 3 * t + (k - 6) // 3, 3 * u + (k - 6) % 3
+        elif k < 3:
+            vertex, face = s.triangle[t, k], u
+        else:
+            vertex, face, side = s.triangle[u, k - 3], t, -side
+    elif kind != FACE_FACE or one % N_KINDS != ADJACENT:
         end, gap, is_smooth, was_smooth = _normal_on_shape(p, m, o, c, lasting)
     own, foot, first, second, n_points = dvec(0.0), dvec(0.0), face, -1, int(vertex >= 0)
     if vertex >= 0:
@@ -114,14 +124,22 @@ def _end_normal(p: ti.template(), m: ti.template(), s: ti.template(), o: ti.temp
 
 @ti.func
 def _false_work(
-    p: ti.template(), m: ti.template(), s: ti.template(), o: ti.template(), has_pairs: ti.template(), c, dt, contact_offset
+    p: ti.template(),
+    m: ti.template(),
+    s: ti.template(),
+    o: ti.template(),
+    has_pairs: ti.template(),
+    c,
+    dt,
+    contact_offset,
+    passes,
 ):
     """What contact c adds to S, W and the work of friction of its pair, (3,) [J s], at the end of a step of dt [s]."""
     n, r, false = p.normal[c], to_world(p, c, p.r[c]), dvec(0.0)
     u = dt * relative_velocity(p, m, c, dt)
     lasting = p.gap[c] + u.dot(n)
     slip, across = u - u.dot(n) * n, r - r.dot(n) * n
-    if slip.norm() > ti.cast(AT_REST, ti.f64) * contact_offset:
+    if slip.norm() > ti.cast(AT_REST, ti.f64) * contact_offset and not (passes == 1 and p.feature[c][0] == FACE_FACE):
         end, gap, is_smooth, was_smooth = 1.0 * n, lasting, True, True
         if ti.static(has_pairs):
             end, gap, is_smooth, was_smooth = _end_normal(p, m, s, o, c, lasting)
@@ -146,8 +164,10 @@ def add_step(
     n_colliders: ti.i32,
     sums: ti.template(),
     n_rows: ti.i32,
+    passes: ti.i32,
 ) -> ti.i32:
-    """Add a step of dt [s] to the sums (n_rows,9) of pairs. has_pairs: whether contacts may be of two triangles.
+    """Add a step of dt [s] to the sums (n_rows,9) of pairs. has_pairs: whether contacts may be of two triangles; passes: 1 if the
+    substep found passages.
 
     Return the row of the pair of the largest misplaced part among those that touch, -1 if none does, -2 without change if there
     are too few rows. p.sweep.sweep_start is used as workspace.
@@ -156,7 +176,7 @@ def add_step(
     for c in range(p.count[0]):
         p.sweep.sweep_start[c] = dvec(0.0)
         if p.r[c][0] > 0.0:
-            p.sweep.sweep_start[c] = _false_work(p, m, s, o, has_pairs, c, dt, contact_offset)
+            p.sweep.sweep_start[c] = _false_work(p, m, s, o, has_pairs, c, dt, contact_offset, passes)
     worst = -1
     ti.loop_config(serialize=True)
     for _ in range(1):
@@ -219,12 +239,12 @@ class Misplacement:
         """Begin a step."""
         self.part, self.text = 0.0, ""  # largest misplaced part in this step, and a sentence if that is too much
 
-    def add(self, problem: ContactProblem, dt: float, contact_offset: float) -> None:
-        """Add a substep of dt [s], whose end was searched last."""
+    def add(self, problem: ContactProblem, dt: float, contact_offset: float, passes: bool) -> None:
+        """Add a substep of dt [s], whose end was searched last; passes: whether passages were found in it."""
         detection, now, n = self._detection, self._simulation.now, len(self._detection.scene.colliders)
         records = problem, self._simulation.model, detection.surface, detection.shapes, detection.has_pairs
         self._store(now.misplaced)
-        while (row := add_step(*records, dt, contact_offset, n, self._sums, self._sums.shape[0])) == -2:
+        while (row := add_step(*records, dt, contact_offset, n, self._sums, self._sums.shape[0], int(passes))) == -2:
             self._store(np.concatenate([self._sums.to_numpy(), np.resize(NO_SUMS, self._sums.shape)]))
         now.misplaced = self._sums.to_numpy()
         if row < 0:

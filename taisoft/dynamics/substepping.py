@@ -106,7 +106,7 @@ class Stepper(Protocol):
     hold_substep: Callable[[float, float], StageResult]
     undo_substep: Callable[..., None]
     return_to_first: Callable[[], None]
-    hold_back_paths: Callable[[], None]
+    hold_back_paths: Callable[[], bool]
     hold_back_inverted: Callable[[], float]
     is_spent: Callable[[], bool]
     forget: Callable[[], None]
@@ -199,10 +199,10 @@ class Substepping:
                 may_cut = may_cut and not stepper.is_spent()
             if fault == Fault.FAST and length < 2.0 * shortest:
                 self._refuse_fast_closing(dt)
-            is_held_back = fault == Fault.CROSSED and not may_cut
-            if is_held_back:
-                stepper.hold_back_paths()
-                result, fault = replace(result, converged=False), None
+            is_held_back = False
+            if fault == Fault.CROSSED and not may_cut:
+                is_held_back = stepper.hold_back_paths()
+                result, fault = replace(result, converged=result.converged and not is_held_back), None
             if stepper.is_spent() and not (is_rest or result.converged or fault == Fault.FAST):
                 self._hold_back_inverted(length / dt)
             if fault != Fault.FAST and not (fault and may_cut):

@@ -5,7 +5,7 @@
   far below that of |r|, and where |r| is mostly rounding; a problem that stalls, as between flush blocks, is solved directly.
 
 Nonlinear elimination: steps that are first solved on the fewest nodes that hold nearly all of the residual, and two rings around
-them, move only these, lower the residual, and find the same result, with and without contacts, in fewer iterations without.
+them, move only these, lower the residual, and find the same result; without contacts in fewer iterations.
 """
 
 from functools import partial

@@ -59,7 +59,7 @@ def test_normals_and_gaps_are_those_of_the_end(integrator):
 
 
 def test_contacts_of_attached_nodes():
-    """Of two halves of that cube, joined over the ball: nodes and weights are those of the halves, at new points, too."""
+    """Of two halves of that cube, joined over the ball: points of their own nodes are those of the nodes that these depend on."""
     scene = ts.Scene()
     scene.add_obstacle(ts.Sphere(CENTRE, RADIUS), name="ball", friction=0.0)
     half = ts.box_mesh((2, 3, 3), (0.15, 0.3, 0.3))
@@ -67,7 +67,17 @@ def test_contacts_of_attached_nodes():
         scene.add_body(half, RUBBER, name=name, position=(x, 0.151, 0), velocity=(1.0, 0, 0.5))
     scene.attach("right", lambda X: X[:, 0] < -0.07, "left")
     turned, missed, n = end_errors(scene, from_ball)
-    assert n > 50 and turned < 0.002 and missed < 1e-5
+    assert n > 20 and turned < 0.002 and missed < 1e-5
+    changed, differ = 0, 0
+    with dynamics(scene, dt=0.01, precision="f64") as made:
+        for _ in range(20):
+            made.advance(1)
+            x, rows = made.state.state()[0], (made.contact.rows(), made.contact.rows(own=True))
+            masters, own = (np.einsum("kj,kjx->kx", np.where(r.nodes >= 0, r.weights, 0.0), x[r.nodes]) for r in rows)
+            assert len(own) == len(masters) and np.abs(own - masters).max(initial=0.0) < 1e-12
+            changed += made.contact.problem.renewal.match.to_numpy().any()
+            differ += sum(set(a[a >= 0]) != set(b[b >= 0]) for a, b in zip(*(r.nodes for r in rows)))
+    assert changed and differ  # contacts were renewed, and some are at the joint
 
 
 def test_an_obstacle_that_turns():
@@ -195,10 +205,13 @@ def test_an_overlap_opens_slowly(depth):
         assert sim.velocities()[:, 1].mean() < 0.02
 
 
-def test_contacts_that_outgrow_their_storage():
-    """The same bits as with storage that was large enough."""
+@pytest.mark.parametrize(
+    "shape", [ts.Sphere(CENTRE, RADIUS), ts.Box((0, -0.1, 0), (2.0, 0.1, 2.0))], ids=["new geometry", "the same geometry"]
+)
+def test_contacts_that_outgrow_their_storage(shape):
+    """The same motion, in as many iterations, as with storage that was large enough."""
     scene = ts.Scene()
-    scene.add_obstacle(ts.Sphere(CENTRE, RADIUS), name="ball", friction=0.5)
+    scene.add_obstacle(shape, name="ball", friction=0.5)
     scene.add_body(ts.box_mesh((3, 3, 3), (0.3,) * 3), RUBBER, name="cube", position=(0, 0.151, 0), velocity=(1.0, 0, 0.5))
     found = []
     for tight in (False, True):
@@ -207,6 +220,6 @@ def test_contacts_that_outgrow_their_storage():
                 if tight and made.contact.n_contacts:
                     kept = made.contact.snapshot()
                     made.contact.restore(kept | {"capacity": made.contact.n_contacts + 3})
-                made.advance(1)
-            found.append(made.state.state()[0])
-    assert np.abs(found[0] - found[1]).max() < 1e-9
+                report = made.advance(1)
+            found.append((made.state.state()[0], report.newton_iterations))
+    assert np.abs(found[0][0] - found[1][0]).max() < 1e-8 and found[1][1] <= found[0][1] + 2

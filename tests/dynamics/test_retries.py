@@ -234,6 +234,7 @@ class FakeStepper:
 
     def hold_back_paths(self):
         self.held_back.append(self.kept[-1])
+        return True
 
     def search_along_path(self, time, dt):
         self.searched = time, dt
