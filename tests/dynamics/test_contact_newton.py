@@ -5,7 +5,7 @@
   far below that of |r|, and where |r| is mostly rounding; a problem that stalls, as between flush blocks, is solved directly.
 
 Nonlinear elimination: steps that are first solved on the fewest nodes that hold nearly all of the residual, and two rings around
-them, move only these, lower the residual, and find the same result; without contacts in fewer iterations.
+them, move only these, lower the residual, and find the same result in fewer iterations, with and without contacts.
 """
 
 from functools import partial
@@ -210,7 +210,11 @@ def check_elimination(system: StageSystem, stage, r: float):
 
 @pytest.mark.parametrize("on_ground", [False, True])
 def test_steps_with_and_without_eliminations_agree(monkeypatch, on_ground):
-    """With eliminations, they take fewer Newton and CG iterations; with contacts, direct solves do as well."""
+    """With eliminations, they take fewer Newton and CG iterations; with contacts, three quarters of the CG iterations.
+
+    Direct solves, which help as much there, are left out.
+    """
+    monkeypatch.setattr(StageSystem, "solve_directly", lambda *_: None)
     results, found = [], []
 
     def checked(system, stage, r):
@@ -226,5 +230,5 @@ def test_steps_with_and_without_eliminations_agree(monkeypatch, on_ground):
     assert any(one is not None for one in found) and report.converged and without.converged
     assert (report.n_contacts > 0) == on_ground
     assert np.abs(x - x_without).max() < 1e-7
-    if not on_ground:
-        assert report.linear_iterations < without.linear_iterations and report.newton_iterations < without.newton_iterations
+    assert report.linear_iterations < (0.8 if on_ground else 1.0) * without.linear_iterations
+    assert report.newton_iterations < without.newton_iterations or on_ground

@@ -47,7 +47,7 @@ def from_ball(points: np.ndarray, time: float) -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.mark.parametrize("integrator", ["implicit_euler", "bdf2", "linearly_implicit_euler"])
 def test_normals_and_gaps_are_those_of_the_end(integrator):
-    """Of a cube that slides over a ball by a tenth of an edge a step, which turns a normal by 0.024."""
+    """Of a cube that slides over a ball by a tenth of an edge a step, which turns a normal by 0.022 to 0.028."""
     scene = ts.Scene()
     scene.add_obstacle(ts.Sphere(CENTRE, RADIUS), name="ball", friction=0.0)
     cube = ts.box_mesh((3, 3, 3), (0.3, 0.3, 0.3))
@@ -222,4 +222,4 @@ def test_contacts_that_outgrow_their_storage(shape):
                     made.contact.restore(kept | {"capacity": made.contact.n_contacts + 3})
                 report = made.advance(1)
             found.append((made.state.state()[0], report.newton_iterations))
-    assert np.abs(found[0][0] - found[1][0]).max() < 1e-8 and found[1][1] <= found[0][1] + 2
+    assert np.abs(found[0][0] - found[1][0]).max() < 1e-9 and found[1][1] <= found[0][1] + 2
