@@ -14,7 +14,7 @@ import taichi as ti
 from taisoft.backend.arrays import FieldArena
 from taisoft.backend.runtime import Runtime
 from taisoft.contact.colouring import colour_contacts, colour_greedy, colour_random, graph_of
-from taisoft.contact.problem import NODES, ContactProblem, build_node_problem, find_factors, index_nodes
+from taisoft.contact.problem import ContactProblem, build_node_problem, fill_rows, find_factors, index_nodes
 
 from .contact_runs import COLOURED, SERIAL, THREADED, Outcome, Solvers
 from .document import crossovers, ms, table
@@ -143,22 +143,17 @@ def build_plates(n: int, runtime: Runtime, arena: FieldArena) -> ContactProblem:
     up, under, under_weight = find_under(flat @ turn.T, n)
     down, over, over_weight = find_under(flat @ turn, n)
     k, one = len(up) + len(down), np.ones
-    node, weight = np.zeros((k, NODES), np.int32), np.zeros((k, NODES))
-    node[: len(up), :4] = np.column_stack([first + up, under])  # side a, the upper, comes first
-    weight[: len(up), :4] = np.column_stack([one(len(up)), -under_weight])
-    node[len(up) :, :4] = np.column_stack([first + over, down])
-    weight[len(up) :, :4] = np.column_stack([over_weight, -one(len(down))])
+    # side a, the upper plate, comes first
+    node = np.vstack([np.column_stack([first + up, under]), np.column_stack([first + over, down])])
+    weight = np.vstack([np.column_stack([one(len(up)), -under_weight]), np.column_stack([over_weight, -one(len(down))])])
     v = SHAKE * rng.standard_normal((2 * first, 3))
     v[first:, 1] += FALL
     u = np.einsum("cj,cja->ca", weight, v[node])
-    p = build_node_problem(arena, k, 2 * first, runtime.arch == "cpu")
-    p.count[0] = k
+    p = build_node_problem(arena, k, 2 * first, runtime.arch == "cpu", node.size)
+    fill_rows(p, np.full(k, 4), node.reshape(-1), weight.reshape(-1))
     normal, tangent = np.tile([0.0, 1.0, 0.0], (k, 1)), np.tile([1.0, 0.0, 0.0], (k, 1))
     across = -u[:, 2]  # along normal x tangent
     for held, values in (
-        (p.node, node),
-        (p.arity, np.full(k, 4, np.int32)),
-        (p.weight, weight),
         (p.normal, normal),
         (p.tangent, tangent),
         (p.inverse_mass, one((2 * first, 3))),

@@ -17,7 +17,8 @@ from taisoft.cli.scene_file import load_scene
 from taisoft.contact import SOLVERS
 from taisoft.contact.augmented_lagrangian import find_residual
 from taisoft.contact.colouring import colour_contacts
-from taisoft.contact.problem import NODES, ContactProblem
+from taisoft.contact.matrix_contacts import jacobian
+from taisoft.contact.problem import ContactProblem
 from taisoft.contact.solve import solve
 from taisoft.dynamics import contact_measures, explicit_contact_stepper
 from taisoft.dynamics.explicit_contact_stepper import MAX_SWEEPS
@@ -77,23 +78,10 @@ def observe_problems(observe: Callable[[ContactProblem], None]) -> Iterator[None
         yield
 
 
-def contact_jacobian(p: ContactProblem) -> sp.csr_matrix:
-    """J (3k, 3 n_nodes) from nodal to contact velocities, with rows (normal, t1, t2) per contact."""
-    k = int(p.count[0])
-    node, weight = p.node.to_numpy()[:k], p.weight.to_numpy()[:k]
-    normal, tangent = p.normal.to_numpy()[:k], p.tangent.to_numpy()[:k]
-    frame = np.stack([normal, tangent, np.cross(normal, tangent)], axis=1)
-    c, j = np.nonzero(np.arange(NODES) < p.arity.to_numpy()[:k, None])
-    row, column = (3 * c)[:, None, None] + np.arange(3)[:, None], (3 * node[c, j])[:, None, None] + np.arange(3)
-    row, column = np.broadcast_arrays(row, column)
-    entries = weight[c, j][:, None, None] * frame[c]
-    return sp.csr_matrix((entries.ravel(), (row.ravel(), column.ravel())), shape=(3 * k, 3 * p.n_nodes))
-
-
 def make_residual(p: ContactProblem) -> Callable[[np.ndarray], float]:
     """A function that returns the residual of impulses (k,3) in this problem."""
     k = int(p.count[0])
-    J, b, mu = contact_jacobian(p), p.b.to_numpy()[:k].ravel(), p.friction.to_numpy()[:k]
+    J, b, mu = jacobian(p), p.b.to_numpy()[:k].ravel(), p.friction.to_numpy()[:k]
     W = (J @ sp.diags(p.inverse_mass.to_numpy().ravel()) @ J.T).tocsr()
     return lambda r: find_residual(W, b, mu, r)
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from taisoft.backend.runtime import open_runtime
 from taisoft.contact.colouring import groups
+from taisoft.contact.matrix_contacts import jacobian
 from taisoft.machine import summarise
 from taisoft.view.offscreen import Offscreen
 
@@ -26,7 +27,7 @@ from ..contact_colouring import (
     crossover_text,
     measure_crossover,
 )
-from ..contact_runs import COLOURED, SERIAL, THREADED, Film, Solvers, contact_jacobian, measure_film, open_explicit, to_impulses
+from ..contact_runs import COLOURED, SERIAL, THREADED, Film, Solvers, measure_film, open_explicit, to_impulses
 from ..document import ms
 from .page import COLOURS, Claim, Extent, Part, clearly_less, is_near, new_figure, plot_png
 
@@ -104,7 +105,7 @@ class Snapshot:
 
 def take_snapshot(scene: str, sim, colours: dict[str, np.ndarray]) -> Snapshot:
     """Picture of a simulator and its contact Jacobian, for nodes with contacts."""
-    J = contact_jacobian(sim._dynamics.contact.problem).tocoo()
+    J = jacobian(sim._dynamics.contact.problem).tocoo()
     touched = np.zeros((J.shape[0] // 3, J.shape[1] // 3), dtype=bool)
     touched[J.row // 3, J.col // 3] = True
     image = Offscreen(sim.scene, PICTURE).image(sim)

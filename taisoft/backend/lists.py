@@ -68,6 +68,12 @@ def count_entry(lists: ti.template(), key):
 
 
 @ti.func
+def count_entries(lists: ti.template(), key, n):
+    """Count n entries of a key that only one thread counts."""
+    lists.start[key + 2] += n
+
+
+@ti.func
 def add_up_counts(lists: ti.template(), n_keys):
     """Find where the lists start."""
     if ti.static(lists.parts > 1):

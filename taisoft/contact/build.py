@@ -19,9 +19,9 @@ import numpy as np
 import taichi as ti
 
 from taisoft.backend.arrays import FieldArena
-from taisoft.backend.lists import bucket_of
+from taisoft.backend.lists import add_up_counts, bucket_of, clear_counts, count_entries
 from taisoft.backend.runtime import kernel
-from taisoft.contact.problem import fill_field, to_frame, to_world
+from taisoft.contact.problem import NODES, fill_field, to_frame, to_world
 from taisoft.contact.prox import dvec, prox, tangent
 from taisoft.scene.scene import Scene
 
@@ -111,7 +111,7 @@ def obstacle_displacement_at(o: ti.template(), body, x):
 def _add_masters(p: ti.template(), m: ti.template(), c, n_before, i, weight):
     """Add node i to contact c, or the nodes that it depends on; nodes that the contact has already get the sum of weights. Return
     the contact's new number of nodes."""
-    n, k = n_before, m.dependents.number[i]
+    n, k, row = n_before, m.dependents.number[i], p.first[c]
     first, last = 0, 1
     if k >= 0:
         first, last = m.dependents.start[k], m.dependents.start[k + 1]
@@ -119,14 +119,14 @@ def _add_masters(p: ti.template(), m: ti.template(), c, n_before, i, weight):
         node, part = i, weight
         if k >= 0:
             node, part = m.dependents.master[e], weight * m.dependents.weight[e]
-        at = n
-        for j in range(n):
-            if p.node[c, j] == node:
+        at = row + n
+        for j in range(row, row + n):
+            if p.node[j] == node:
                 at = j
-        if at == n:
-            p.node[c, n], p.weight[c, n] = node, 0.0
+        if at == row + n:
+            p.node[at], p.weight[at], p.contact[at] = node, 0.0, c
             n += 1
-        p.weight[c, at] += part
+        p.weight[at] += part
     return n
 
 
@@ -141,8 +141,8 @@ def _add_vertex(p: ti.template(), m: ti.template(), s: ti.template(), c, k, v, w
             elif ti.static(m.has_dependents):
                 n = _add_masters(p, m, c, n, s.node[v], sign * weight)
             else:
-                p.node[c, k] = s.node[v]
-                p.weight[c, k] = sign * weight
+                at = p.first[c] + k
+                p.node[at], p.weight[at], p.contact[at] = s.node[v], sign * weight, c
                 n = k + 1
     return n
 
@@ -245,54 +245,66 @@ def _warm_impulse(p: ti.template(), c):
 def relative_velocity(p: ti.template(), m: ti.template(), c, dt):
     """Velocity of side a relative to side b at contact c, at the present v [m/s]."""
     v = -p.obstacle_displacement[c] / dt
-    for j in range(p.arity[c]):
-        v += p.weight[c, j] * m.state.v[p.node[c, j]]
+    for e in range(p.first[c], p.first[c] + p.arity[c]):
+        v += p.weight[e] * m.state.v[p.node[e]]
     return v
 
 
 @kernel
 def drop_vanishing(
-    p: ti.template(), m: ti.template(), s: ti.template(), found: ti.template(), kept: ti.template(), n: ti.i32, free: ti.i32
+    p: ti.template(), m: ti.template(), s: ti.template(), found: ti.template(), kept: ti.template(), n: ti.i32
 ) -> ti.i32:
     """Leave out of kept[:n] the contacts whose weights cancel, since both sides depend on the same nodes.
 
-    free: a contact of the problem that is not in use. Returns the number of contacts left.
+    There must be room for one more contact than the problem has. Returns the number of contacts left.
     """
     left = 0
     ti.loop_config(serialize=True)
     for _ in range(1):
+        free, first = p.count[0], p.count[2]
         for c in range(n):
             row = kept[c]
-            k = _add_sides(p, m, s, free, found, row)
+            _add_sides(p, m, s, free, first, found, row)
             largest = ti.cast(0.0, ti.f64)
-            for j in range(k):
-                largest = ti.max(largest, ti.abs(p.weight[free, j]))
-            if k == 0 or largest > VANISHING:
+            for e in range(first, first + p.arity[free]):
+                largest = ti.max(largest, ti.abs(p.weight[e]))
+            if p.arity[free] == 0 or largest > VANISHING:
                 kept[left] = row
                 left += 1
     return left
 
 
 @ti.func
-def _add_sides(p: ti.template(), m: ti.template(), s: ti.template(), c, found: ti.template(), row):
-    """Add the nodes of both sides of a detected contact to contact c; return their number."""
+def _add_sides(p: ti.template(), m: ti.template(), s: ti.template(), c, first, found: ti.template(), row):
+    """Set the entries of contact c, from entry `first` on, to the nodes of both sides of a detected contact."""
     k = 0
+    p.first[c] = first
     for j in ti.static(range(3)):
         k = _add_vertex(p, m, s, c, k, found.nodes_a[row][j], found.weights_a[row][j], 1.0)
+    p.arity_a[c] = k
     for j in ti.static(range(3)):
         k = _add_vertex(p, m, s, c, k, found.nodes_b[row][j], found.weights_b[row][j], -1.0)
-    return k
+    p.arity[c] = k
+
+
+@ti.pyfunc
+def most_entries(m: ti.template()):
+    """Most entries that a contact found may need."""
+    return NODES * m.most_masters
 
 
 @ti.func
-def fill_row(p: ti.template(), m: ti.template(), s: ti.template(), q: ti.template(), c, found: ti.template(), row):
-    """Set the geometry and coefficients of contact c to those found, but for the displacement of an analytic obstacle."""
+def fill_row(p: ti.template(), m: ti.template(), s: ti.template(), q: ti.template(), c, first, found: ti.template(), row):
+    """Set the geometry and coefficients of contact c to those found, but for the displacement of an analytic obstacle.
+
+    first: where its entries start.
+    """
     p.normal[c], p.gap[c], p.point[c] = found.normal[row], found.gap[row], found.point[row]
     p.tangent[c], p.sweep.order[c] = tangent(p.normal[c]), c
     p.body[c], p.feature[c] = found.body[row], found.feature[row]
     p.friction[c], p.restitution[c] = _pair_coefficients(q, p.body[c][0], p.body[c][1])
     p.obstacle_displacement[c] = dvec(0.0)
-    p.arity[c] = _add_sides(p, m, s, c, found, row)
+    _add_sides(p, m, s, c, first, found, row)
     p.min_opening[c], p.impact_impulse[c] = 0.0, dvec(0.0)
 
 
@@ -313,10 +325,15 @@ def fill(
 
     s: Surface; o: AnalyticObstacles; q: PairNumbers. warm: factor of the previous step's impulses.
     """
-    p.count[0] = n
+    clear_counts(p.room, n)
     ti.loop_config(serialize=p.serial)
     for c in range(n):
-        fill_row(p, m, s, q, c, found, kept[c])
+        count_entries(p.room, c, most_entries(m))
+    add_up_counts(p.room, n)
+    p.count[0], p.count[2] = n, p.room.start[n + 1]
+    ti.loop_config(serialize=p.serial)
+    for c in range(n):
+        fill_row(p, m, s, q, c, p.room.start[c + 1], found, kept[c])
         normal = p.normal[c]
         if ti.static(o.any):
             if found.nodes_b[kept[c]][0] < 0:
@@ -408,9 +425,9 @@ def set_end_gaps(p: ti.template(), m: ti.template(), x_start: ti.template()):
     ti.loop_config(serialize=p.serial)
     for c in range(p.count[0]):
         motion = -p.obstacle_displacement[c]
-        for j in range(p.arity[c]):
-            i = p.node[c, j]
-            motion += p.weight[c, j] * (m.state.x[i] - x_start[i])
+        for e in range(p.first[c], p.first[c] + p.arity[c]):
+            i = p.node[e]
+            motion += p.weight[e] * (m.state.x[i] - x_start[i])
         p.gap[c] += p.normal[c].dot(motion)
 
 

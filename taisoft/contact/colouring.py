@@ -17,7 +17,7 @@ import taichi as ti
 
 from taisoft.backend.lists import add_up_counts, clear_counts, count_entry, place_of_entry, sort_lists
 from taisoft.backend.runtime import kernel
-from taisoft.contact.problem import ContactProblem, fill_field
+from taisoft.contact.problem import ContactProblem, fill_field, read_entries
 from taisoft.errors import SimulationError
 
 UNCOLOURED = -1
@@ -27,23 +27,20 @@ BITS = 30  # colours tested at a time, as bits of an integer
 # --- on the host ------------------------------------------------------------------------------------------------------
 
 
-def node_graph(node: np.ndarray, arity: np.ndarray, inverse_mass: np.ndarray) -> sp.csr_matrix:
+def node_graph(contact: np.ndarray, node: np.ndarray, k: int, inverse_mass: np.ndarray) -> sp.csr_matrix:
     """Adjacency (k,k), bool, of contacts over nodes.
 
-    node: (k, width), the first arity[c] are used; inverse_mass: (n_nodes, 3) [1/kg].
+    contact, node: of each entry; k: number of contacts; inverse_mass: (n_nodes, 3) [1/kg].
     """
-    k = len(arity)
-    used = np.arange(node.shape[1]) < arity[:, None]
-    contact, nodes = np.broadcast_to(np.arange(k)[:, None], node.shape)[used], node[used]
-    free = np.any(inverse_mass[nodes] != 0.0, axis=1)
-    touches = sp.csr_matrix((np.ones(free.sum(), dtype=np.int32), (contact[free], nodes[free])), shape=(k, len(inverse_mass)))
+    free = np.any(inverse_mass[node] != 0.0, axis=1)
+    touches = sp.csr_matrix((np.ones(free.sum(), dtype=np.int32), (contact[free], node[free])), shape=(k, len(inverse_mass)))
     return _without_loops(touches @ touches.T)
 
 
 def graph_of(problem: ContactProblem) -> sp.csr_matrix:
     """Adjacency matrix of the contacts of a problem over nodes."""
-    k = int(problem.count[0])
-    return node_graph(problem.node.to_numpy(k), problem.arity.to_numpy(k), problem.inverse_mass.to_numpy())
+    contact, node, _ = read_entries(problem)
+    return node_graph(contact, node, int(problem.count[0]), problem.inverse_mass.to_numpy())
 
 
 def matrix_graph(W: sp.spmatrix) -> sp.csr_matrix:
@@ -131,11 +128,11 @@ def _first_free(problem: ti.template(), c):
     result, low, waiting = UNCOLOURED, 0, False
     while result == UNCOLOURED and not waiting:
         taken = 0
-        for k in range(problem.arity[c]):
-            i = problem.node[c, k]
+        for e in range(problem.first[c], problem.first[c] + problem.arity[c]):
+            i = problem.node[e]
             if (problem.inverse_mass[i] != 0.0).any():
-                for e in range(problem.by_node.start[i], problem.by_node.start[i + 1]):
-                    d = problem.entry[e] // problem.width
+                for at in range(problem.by_node.start[i], problem.by_node.start[i + 1]):
+                    d = problem.contact[problem.entry[at]]
                     if _priority(d) > _priority(c):
                         colour = problem.sweep.colour[d]
                         if colour == UNCOLOURED:

@@ -6,7 +6,7 @@ import scipy.sparse as sp
 from taisoft.backend.arrays import FieldArena, download
 from taisoft.contact import augmented_lagrangian
 from taisoft.contact.colouring import colour_greedy, matrix_graph, store
-from taisoft.contact.problem import ContactProblem, build_matrix_problem, fill_field, fill_matrix_problem
+from taisoft.contact.problem import ContactProblem, build_matrix_problem, fill_field, fill_matrix_problem, read_entries
 from taisoft.contact.solve import SolveResult, solve
 
 OUTER = 30  # maximum iterations of the augmented Lagrangian
@@ -72,9 +72,8 @@ def frames(p: ContactProblem) -> np.ndarray:
 def jacobian(p: ContactProblem) -> sp.csr_matrix:
     """J (3k, 3 n_nodes): velocities in the frames of the contacts from those of nodes."""
     k = int(p.count[0])
-    node, arity, weight = download([p.node, p.arity, p.weight], k)
-    contact, place = np.nonzero(np.arange(node.shape[1]) < arity[:, None])
-    values = weight[contact, place][:, None, None] * frames(p)[contact]
+    contact, node, weight = read_entries(p)
+    values = weight[:, None, None] * frames(p)[contact]
     rows = np.broadcast_to((3 * contact[:, None] + np.arange(3))[:, :, None], values.shape)
-    columns = np.broadcast_to((3 * node[contact, place].astype(np.int64)[:, None] + np.arange(3))[:, None, :], values.shape)
+    columns = np.broadcast_to((3 * node.astype(np.int64)[:, None] + np.arange(3))[:, None, :], values.shape)
     return sp.csr_matrix((values.reshape(-1), (rows.reshape(-1), columns.reshape(-1))), shape=(3 * k, 3 * p.n_nodes))

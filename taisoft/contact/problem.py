@@ -17,10 +17,11 @@ import numpy as np
 import scipy.sparse as sp
 import taichi as ti
 
-from taisoft.backend.arrays import Count, FieldArena, on_cuda, upload
+from taisoft.backend.arrays import Count, FieldArena, download, on_cuda, upload
 from taisoft.backend.lists import Lists, add_up_counts, clear_counts, count_entry, make_lists, place_of_entry, sort_lists
 from taisoft.backend.runtime import kernel
 from taisoft.contact.prox import dvec, prox, scaled
+from taisoft.ranges import expand, owners
 
 NODES = 6  # maximum nodes of a contact, three on each side
 RESIDUAL, BEST, STEP, SWEEPS, CHECKS, AGE, MOMENTUM, WEIGHT, VERDICT = range(9)  # in `state`, see `solve`
@@ -79,7 +80,7 @@ class ContactProblem:
     serial: bool  # whether loops run on one thread
     on_cpu: bool
     matrix: bool  # whether W is given as a matrix
-    count: Any  # (2) i32: contacts, colours
+    count: Any  # (3) i32: contacts, colours, entries up to the end of the last row
     friction: Any  # f64
     b: Any  # 3-vectors [m/s]: u without impulses; (normal, t1, t2)
     factor: Any  # 2-vectors: r-factors of normal and tangents [kg]; 0 if nothing can move
@@ -91,16 +92,19 @@ class ContactProblem:
     block: Any = None  # (blocks, 9) f64
     # W over nodes
     n_nodes: Count = 0
-    width: int = NODES  # largest number of nodes of a contact: more than NODES if some depend on others
-    node: Any = None  # (capacity, width) i32, the first arity[c] are in use
-    arity: Any = None  # i32
-    weight: Any = None  # (capacity, width) f64: positive on side a, negative on side b, unless nodes depend on others
+    first: Any = None  # i32: first entry of each contact's row; rows ascend, and there may be gaps between them
+    arity: Any = None  # i32: number of its entries
+    arity_a: Any = None  # i32: of these, the first ones, which belong to side a
+    node: Any = None  # (n_entries) i32
+    weight: Any = None  # (n_entries) f64: positive on side a, negative on side b, unless nodes depend on others
+    contact: Any = None  # (n_entries) i32
+    room: Lists | None = None  # of rows, see `build.fill`
     normal: Any = None  # 3-vectors: from b to a
     tangent: Any = None  # 3-vectors: t1; t2 = normal x t1
     inverse_mass: Any = None  # (n_nodes) 3-vectors [1/kg], 0 on constrained axes
     w: Any = None  # (n_nodes) 3-vectors [m/s]: M^-1 J^T r
-    by_node: Lists | None = None  # of the contacts of each node, in `entry`
-    entry: Any = None  # i32: width * contact + index of the node in it
+    by_node: Lists | None = None  # of the entries of each node, in `entry`
+    entry: Any = None  # (n_entries) i32
     # of detected contacts, see `build`
     body: Any = None  # 2-vectors i32: colliders
     feature: Any = None  # 3-vectors i32
@@ -118,9 +122,9 @@ class ContactProblem:
     renewal: RenewalWork | None = None
 
 
-def build_node_problem(arena: FieldArena, capacity: int, n_nodes: int, serial: bool, masters: int = 1) -> ContactProblem:
-    """Allocate a problem for contacts between the nodes of a model. masters: largest number of nodes that a node depends on."""
-    n, width, n_slots = capacity, NODES * masters, 1 << (2 * capacity - 1).bit_length()
+def build_node_problem(arena: FieldArena, capacity: int, n_nodes: int, serial: bool, entries: int) -> ContactProblem:
+    """Allocate a problem for contacts between the nodes of a model, whose rows have up to `entries` entries in all."""
+    n, n_slots = capacity, 1 << (2 * capacity - 1).bit_length()
     past = PastContacts(
         n_slots=n_slots,
         **_fields(arena, "feature", ti.i32, n, 3, "past_contact"),
@@ -140,19 +144,18 @@ def build_node_problem(arena: FieldArena, capacity: int, n_nodes: int, serial: b
         not on_cuda(),
         False,
         n_nodes=n_nodes,
-        width=width,
         past=past,
         renewal=renewal,
         **_solver_fields(arena, n, serial),
-        **_fields(arena, "node", ti.i32, (n, width)),
-        **_fields(arena, "weight", ti.f64, (n, width)),
-        **_fields(arena, "arity", ti.i32, n),
+        **_fields(arena, "first arity arity_a", ti.i32, n),
+        **_fields(arena, "node contact entry", ti.i32, entries),
+        **_fields(arena, "weight", ti.f64, entries),
         **_fields(arena, "normal tangent point obstacle_displacement impact_impulse", ti.f64, n, 3),
         **_fields(arena, "gap target approach load restitution min_velocity min_opening", ti.f64, n),
         **_fields(arena, "body", ti.i32, n, 2),
         **_fields(arena, "feature", ti.i32, n, 3),
         **_fields(arena, "inverse_mass w", ti.f64, n_nodes, 3),
-        **_fields(arena, "entry", ti.i32, width * n),
+        room=make_lists(arena, "problem_room", n, serial),
         by_node=make_lists(arena, "problem_node", n_nodes, serial),
     )
 
@@ -185,7 +188,7 @@ def _solver_fields(arena: FieldArena, n: int, serial: bool) -> dict[str, Any]:
     )
     return {
         "sweep": sweep,
-        **_fields(arena, "count", ti.i32, 2),
+        **_fields(arena, "count", ti.i32, 3),
         **_fields(arena, "friction", ti.f64, n),
         **_fields(arena, "b r", ti.f64, n, 3),
         **_fields(arena, "factor", ti.f64, n, 2),
@@ -206,6 +209,22 @@ def fill_field(field, values: np.ndarray) -> None:
     whole = np.zeros((field.shape[0], *values.shape[1:]))
     whole[: len(values)] = values
     upload([(field, whole)])
+
+
+def fill_rows(problem: ContactProblem, arity: np.ndarray, node: np.ndarray, weight: np.ndarray) -> None:
+    """Set the number of contacts and their rows: arity (k,), and node and weight of all entries, row by row."""
+    contact, first = owners(arity), np.cumsum(arity) - arity
+    problem.count[0], problem.count[2] = len(arity), len(contact)
+    rows = {"first": first, "arity": arity, "contact": contact, "node": node, "weight": weight}
+    for name, values in rows.items():
+        getattr(problem, name).from_numpy(values, 0)
+
+
+def read_entries(problem: ContactProblem) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the contact, node and weight of all entries, row by row."""
+    contact, at = expand(*download([problem.first, problem.arity], problem.count[0]))
+    node, weight = download([problem.node, problem.weight], problem.count[2])
+    return contact, node[at], weight[at]
 
 
 def fill_matrix_problem(problem: ContactProblem, W: sp.spmatrix, b: np.ndarray, friction: np.ndarray) -> None:
@@ -250,8 +269,8 @@ def velocity(problem: ti.template(), c):
                 u[i] += problem.block[k, 3 * i] * r[0] + problem.block[k, 3 * i + 1] * r[1] + problem.block[k, 3 * i + 2] * r[2]
     else:
         v = dvec(0.0)
-        for k in range(problem.arity[c]):
-            v += problem.weight[c, k] * problem.w[problem.node[c, k]]
+        for e in range(problem.first[c], problem.first[c] + problem.arity[c]):
+            v += problem.weight[e] * problem.w[problem.node[e]]
         u += to_frame(problem, c, v)
     return u
 
@@ -261,18 +280,18 @@ def add_impulse(problem: ti.template(), c, change):
     """Add a change of contact c's impulse to w at its nodes. Contacts updated in parallel must share no movable node."""
     if ti.static(not problem.matrix):
         d = to_world(problem, c, change)
-        for k in range(problem.arity[c]):
-            i = problem.node[c, k]
-            problem.w[i] = problem.w[i] + problem.weight[c, k] * (problem.inverse_mass[i] * d)
+        for e in range(problem.first[c], problem.first[c] + problem.arity[c]):
+            i = problem.node[e]
+            problem.w[i] = problem.w[i] + problem.weight[e] * (problem.inverse_mass[i] * d)
 
 
 @ti.func
 def impulse_on(problem: ti.template(), i):
     """(J^T r) of node i [N s], summed over its contacts in a fixed order."""
     d = dvec(0.0)
-    for e in range(problem.by_node.start[i], problem.by_node.start[i + 1]):
-        c, k = problem.entry[e] // problem.width, problem.entry[e] % problem.width
-        d += problem.weight[c, k] * to_world(problem, c, problem.r[c])
+    for at in range(problem.by_node.start[i], problem.by_node.start[i + 1]):
+        c = problem.contact[problem.entry[at]]
+        d += problem.weight[problem.entry[at]] * to_world(problem, c, problem.r[c])
     return d
 
 
@@ -323,8 +342,8 @@ def own_block(problem: ti.template(), c):
         n, t = problem.normal[c], problem.tangent[c]
         E = ti.Matrix.rows([n, t, n.cross(t)])
         h = dvec(0.0)
-        for k in range(problem.arity[c]):
-            h += problem.weight[c, k] * problem.weight[c, k] * problem.inverse_mass[problem.node[c, k]]
+        for e in range(problem.first[c], problem.first[c] + problem.arity[c]):
+            h += problem.weight[e] * problem.weight[e] * problem.inverse_mass[problem.node[e]]
         for i, j in ti.static(ti.ndrange(3, 3)):
             for q in ti.static(range(3)):
                 B[i, j] += E[i, q] * h[q] * E[j, q]
@@ -346,15 +365,15 @@ def find_factors(problem: ti.template()):
 
 @kernel
 def index_nodes(problem: ti.template()):
-    """List the contacts of each node, in ascending order."""
+    """List the entries of each node, in ascending order."""
     clear_counts(problem.by_node, problem.n_nodes)
     ti.loop_config(serialize=problem.by_node.serial)
     for c in range(problem.count[0]):
-        for k in range(problem.arity[c]):
-            count_entry(problem.by_node, problem.node[c, k])
+        for e in range(problem.first[c], problem.first[c] + problem.arity[c]):
+            count_entry(problem.by_node, problem.node[e])
     add_up_counts(problem.by_node, problem.n_nodes)
     ti.loop_config(serialize=problem.by_node.serial)
     for c in range(problem.count[0]):
-        for k in range(problem.arity[c]):
-            problem.entry[place_of_entry(problem.by_node, problem.node[c, k])] = problem.width * c + k
+        for e in range(problem.first[c], problem.first[c] + problem.arity[c]):
+            problem.entry[place_of_entry(problem.by_node, problem.node[e])] = e
     sort_lists(problem.by_node, problem.n_nodes, problem.entry)

@@ -135,13 +135,13 @@ def _row_norm(problem: ti.template(), c):
                 B[i, j] = problem.block[k, 3 * i + j]
             total += _norm(B, a, _roots(problem, problem.column[k]))
     else:
-        for k in range(problem.arity[c]):
-            i = problem.node[c, k]
+        for e in range(problem.first[c], problem.first[c] + problem.arity[c]):
+            i = problem.node[e]
             weights = ti.cast(0.0, ti.f64)
-            for e in range(problem.by_node.start[i], problem.by_node.start[i + 1]):
-                d = problem.entry[e] // problem.width
-                weights += ti.abs(problem.weight[d, problem.entry[e] % problem.width]) * _roots(problem, d).max()
-            total += ti.abs(problem.weight[c, k]) * problem.inverse_mass[i].max() * a.max() * weights
+            for at in range(problem.by_node.start[i], problem.by_node.start[i + 1]):
+                other = problem.entry[at]
+                weights += ti.abs(problem.weight[other]) * _roots(problem, problem.contact[other]).max()
+            total += ti.abs(problem.weight[e]) * problem.inverse_mass[i].max() * a.max() * weights
     return total
 
 

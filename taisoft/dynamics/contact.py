@@ -20,6 +20,7 @@ from taisoft.contact.build import (
     fill,
     has_impact,
     keep_impulses,
+    most_entries,
     scale_impulses,
     set_end_gaps,
     set_targets,
@@ -74,7 +75,8 @@ class ContactStep:
         self._substep_fraction = 1.0  # of the step, that the current substep takes
         self.gap_targets = self._gap_targets()
         self._arena = FieldArena()
-        self._allocate(2 * detection.surface.n_triangles + 1024)  # contacts at first
+        capacity = 2 * detection.surface.n_triangles + 1024  # contacts at first
+        self._allocate(capacity, capacity * most_entries(model))
         self._numbers_arena = FieldArena()
         self.numbers = build_pair_numbers(self._numbers_arena, scene)
         self.rebounds = Rebounds(simulation, self._lasting)
@@ -97,10 +99,9 @@ class ContactStep:
         self.had_impact = False  # whether surfaces met in the last step
         self.dropped = 0  # triangles of the last step under an inverted tet, for which a distance field gives no contacts
 
-    def _allocate(self, capacity: int) -> None:
+    def _allocate(self, capacity: int, entries: int) -> None:
         arena, model = FieldArena(), self.simulation.model
-        masters = 1 if self.simulation.dependents is None else self.simulation.dependents.most_masters
-        self.problem = build_node_problem(arena, capacity, model.n_nodes, model.on_cpu, masters)  # of the last step begun
+        self.problem = build_node_problem(arena, capacity, model.n_nodes, model.on_cpu, entries)  # of the last step begun
         self._arena.release()
         self._arena, self._last_time, self._indexed = arena, 0.0, False
 
@@ -142,12 +143,13 @@ class ContactStep:
             self.problem.count[0], self._last_time, self._search_counts = 0, 0.0, (0, 0)
 
     def snapshot(self) -> dict:
-        """Return the last step's contacts and impulses, and the capacity: a step that exceeds it starts without impulses.
+        """Return the last step's contacts and impulses, and the capacities: a step that exceeds them starts without impulses.
 
         The search is not included: from the same state the next one finds the same contacts in the same order.
         """
         return {
             "capacity": self.problem.capacity,
+            "entries": self.problem.node.shape[0],
             "last_time": self._last_time,
             "share": self._impulse_fraction,
             "span": self._step_dt,
@@ -164,8 +166,9 @@ class ContactStep:
 
     def restore(self, kept: dict) -> None:
         """Restore a `snapshot`."""
-        if kept["capacity"] != self.problem.capacity:
-            self._allocate(int(kept["capacity"]))
+        room = int(kept["capacity"]), int(kept["entries"])
+        if room != (self.problem.capacity, self.problem.node.shape[0]):
+            self._allocate(*room)
         write_rows(self.problem, kept["rows"])
         self._last_time, self._impulse_fraction, self._step_dt = (float(kept[name]) for name in ("last_time", "share", "span"))
         self._pairs, self.penetration = (kept["pairs"], kept["pair_sums"]), float(kept["penetration"])
@@ -220,11 +223,12 @@ class ContactStep:
         (surface, shapes, found, kept), counts = self.detection.found, self.detection.counts
         self.gap_targets = self._gap_targets()
         self.dropped, self._search_counts = max(self.dropped, counts.unmapped), (counts.found, counts.unmapped)
-        if n >= self.problem.capacity:
-            self._allocate(2 * n)
+        entries = (n + 1) * most_entries(model)  # one more, for `drop_vanishing`
+        if n >= self.problem.capacity or entries > self.problem.node.shape[0]:
+            self._allocate(2 * n, 2 * entries)
         problem = self.problem
         if model.has_dependents and n:
-            n = drop_vanishing(problem, model, surface, found, kept, n, problem.capacity - 1)
+            n = drop_vanishing(problem, model, surface, found, kept, n)
         keep_impulses(problem, self.contact_offset)
         warm = dt / self._last_time if self._last_time > 0.0 else 0.0
         fill(problem, model, surface, shapes, self.numbers, found, kept, n, dt, warm)
@@ -246,9 +250,10 @@ class ContactStep:
         needed = renewal.look(self.problem, time, dt, x_start, displacement, self.contact_offset)
         if not needed:
             return False
-        if needed >= self.problem.capacity:
+        entries = int(self.problem.count[2]) + (needed - self.n_contacts + 1) * most_entries(self.simulation.model)
+        if needed >= self.problem.capacity or entries > self.problem.node.shape[0]:
             last_time, rows = self._last_time, read_rows(self.problem, MORE_ROWS)
-            self._allocate(2 * needed)
+            self._allocate(2 * needed, 2 * entries)
             write_rows(self.problem, rows)
             index_nodes(self.problem)
             self._last_time, self._indexed = last_time, True

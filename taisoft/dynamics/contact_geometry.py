@@ -59,8 +59,8 @@ def _finer_edge(s: ti.template(), body):
 def _motion(p: ti.template(), c, displacement: ti.template()):
     """Displacement (3,) of side a of present contact c relative to side b, since the step's start [m]."""
     d = -p.obstacle_displacement[c]
-    for j in range(p.arity[c]):
-        d += p.weight[c, j] * displacement[p.node[c, j]]
+    for e in range(p.first[c], p.first[c] + p.arity[c]):
+        d += p.weight[e] * displacement[p.node[e]]
     return d
 
 
@@ -85,9 +85,9 @@ def _shape_motion(o: ti.template(), k, x):
 def _gap_to_shape(p: ti.template(), o: ti.template(), c, k, x_start: ti.template(), displacement: ti.template()):
     """Gap [m] and normal (3,) at the step's end of the material point of contact c to analytic obstacle k; that point (3,)."""
     x = dvec(0.0)
-    for j in range(p.arity[c]):
-        i = p.node[c, j]
-        x += p.weight[c, j] * (x_start[i] + displacement[i])
+    for e in range(p.first[c], p.first[c] + p.arity[c]):
+        i = p.node[e]
+        x += p.weight[e] * (x_start[i] + displacement[i])
     R = rotation_rows(o.next_rotation, k)
     gap, g = o.sample(k, R.transpose() @ (x - o.next_origin[k]))
     return gap, R @ g, x
@@ -307,15 +307,17 @@ def judge(
 
 
 @ti.func
-def _copy(p: ti.template(), c, to):
-    """Copy contact c to place `to`."""
+def _copy(p: ti.template(), c, to, first):
+    """Copy contact c to place `to`, and its entries to those from `first` on, at or before their own."""
     p.normal[to], p.tangent[to], p.point[to] = p.normal[c], p.tangent[c], p.point[c]
     p.obstacle_displacement[to], p.impact_impulse[to], p.r[to] = p.obstacle_displacement[c], p.impact_impulse[c], p.r[c]
-    p.body[to], p.feature[to], p.arity[to] = p.body[c], p.feature[c], p.arity[c]
+    p.body[to], p.feature[to] = p.body[c], p.feature[c]
     p.gap[to], p.target[to], p.approach[to], p.load[to] = p.gap[c], p.target[c], p.approach[c], p.load[c]
     p.friction[to], p.restitution[to], p.min_opening[to] = p.friction[c], p.restitution[c], p.min_opening[c]
-    for j in range(p.arity[c]):
-        p.node[to, j], p.weight[to, j] = p.node[c, j], p.weight[c, j]
+    for k in range(p.arity[c]):
+        at, e = first + k, p.first[c] + k
+        p.node[at], p.weight[at], p.contact[at] = p.node[e], p.weight[e], to
+    p.first[to], p.arity[to], p.arity_a[to] = first, p.arity[c], p.arity_a[c]
 
 
 @ti.func
@@ -324,8 +326,8 @@ def _renew_in_place(p: ti.template(), o: ti.template(), c, x_start: ti.template(
     k = _shape(o, p.body[c][1])
     gap, n, x = _gap_to_shape(p, o, c, k, x_start, displacement)
     moved, own = _shape_motion(o, k, x - gap * n), dvec(0.0)
-    for j in range(p.arity[c]):
-        own += p.weight[c, j] * displacement[p.node[c, j]]
+    for e in range(p.first[c], p.first[c] + p.arity[c]):
+        own += p.weight[e] * displacement[p.node[e]]
     p.normal[c], p.tangent[c], p.gap[c] = n, tangent(n), gap - n.dot(own - moved)
     p.obstacle_displacement[c], p.point[c] = moved, x - 0.5 * gap * n
     p.r[c] = prox(to_frame(p, c, impulse), p.friction[c])
@@ -347,12 +349,12 @@ def adopt(
     """Replace the contacts as `judge` has decided, with its arguments; m: Model; q: PairNumbers. They must fit."""
     ti.loop_config(serialize=True)
     for _ in range(1):
-        left = 0
+        left, entries = 0, 0
         for c in range(p.count[0]):
             fate = p.renewal.fate[c]
             if fate == KEPT or fate == IN_PLACE:
-                if c != left:
-                    _copy(p, c, left)
+                _copy(p, c, left, entries)
+                entries += p.arity[left]
                 p.sweep.order[left] = left
                 if ti.static(o.any):
                     if fate == IN_PLACE:
@@ -361,7 +363,8 @@ def adopt(
         for b in range(n):
             match, row = p.renewal.match[b], kept[b]
             if match != REJECTED:
-                fill_row(p, m, s, q, left, found, row)
+                fill_row(p, m, s, q, left, entries, found, row)
+                entries += p.arity[left]
                 if ti.static(o.any):
                     if found.nodes_b[row][0] < 0:
                         k = _shape(o, p.body[left][1])
@@ -373,7 +376,7 @@ def adopt(
                     impulse += p.past.impulse[match]
                 p.r[left] = prox(to_frame(p, left, impulse), p.friction[left])
                 left += 1
-        p.count[0] = left
+        p.count[0], p.count[2] = left, entries
 
 
 @ti.func
@@ -402,8 +405,8 @@ def largest_motion(
                 motion = _motion(p, c, displacement)
                 if n_looks > 0:
                     motion += p.obstacle_displacement[c]
-                    for j in range(p.arity[c]):
-                        motion -= p.weight[c, j] * seen[p.node[c, j]]
+                    for e in range(p.first[c], p.first[c] + p.arity[c]):
+                        motion -= p.weight[e] * seen[p.node[e]]
                 largest = ti.max(largest, motion.norm())
     return largest
 

@@ -92,9 +92,9 @@ def begin_contacts(
     for c in range(rows.count[0]):
         offset = -(beta / dt) * rows.obstacle_displacement[c]
         if ti.static(not impact):  # in an impact x_hat is x_start
-            for j in range(rows.arity[c]):
-                i = rows.node[c, j]
-                offset += rows.weight[c, j] * (contacts.x_start[i] - stage.x_hat[i])
+            for e in range(rows.first[c], rows.first[c] + rows.arity[c]):
+                i = rows.node[e]
+                offset += rows.weight[e] * (contacts.x_start[i] - stage.x_hat[i])
         work.tangential_offset[c] = offset
         work.rounding[c] = ti.cast(ROUNDING, ti.f64) * ti.abs(rows.point[c]).max() / (beta * tolerance)
         if ti.static(impact):
@@ -148,8 +148,8 @@ def stage_velocity_of(contacts: ti.template(), c, beta):
     """Return u of contact c at the present x: (normal, t1, t2) [m/s]."""
     rows, work = ti.static((contacts.problem, contacts.work))
     displacement = dvec(0.0)
-    for j in range(rows.arity[c]):
-        displacement += rows.weight[c, j] * contacts.displacement[rows.node[c, j]]
+    for e in range(rows.first[c], rows.first[c] + rows.arity[c]):
+        displacement += rows.weight[e] * contacts.displacement[rows.node[e]]
     n, t, v = rows.normal[c], rows.tangent[c], displacement + work.tangential_offset[c]
     return dvec(work.gap_minus_target[c] + n.dot(displacement), t.dot(v), n.cross(t).dot(v)) / beta
 
@@ -210,9 +210,8 @@ def impulse_on_node(contacts: ti.template(), i):
     """Return (J^T r) of node i [N s]; as `impulse_on`, but from impulses in world axes."""
     rows, work = ti.static((contacts.problem, contacts.work))
     d = dvec(0.0)
-    for e in range(rows.by_node.start[i], rows.by_node.start[i + 1]):
-        c, slot = rows.entry[e] // rows.width, rows.entry[e] % rows.width
-        d += rows.weight[c, slot] * work.world_impulse[c]
+    for at in range(rows.by_node.start[i], rows.by_node.start[i + 1]):
+        d += rows.weight[rows.entry[at]] * work.world_impulse[rows.contact[rows.entry[at]]]
     return d
 
 
@@ -314,11 +313,13 @@ def build_stage_contacts(
         arena,
         real,
         n,
-        p.node,
         shared,
         count=p.count,
+        first=p.first,
         arity=p.arity,
+        node=p.node,
         weight=p.weight,
+        contact=p.contact,
         entry_start=p.by_node.start,
         entry=p.entry,
         block=work.block,

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from taisoft.backend.arrays import download
+from taisoft.contact.problem import read_entries
 from taisoft.fem.pressure import pressures_of
 from taisoft.scene.loads import Cavity
 from taisoft.scene.rigid import RigidBody
@@ -92,11 +93,12 @@ def _contacts(contact: "ContactStep | NoContacts", i: int, beta: float) -> dict[
     if contact.n_contacts == 0:
         return {}
     problem, names, found = contact.problem, [one.name for one in contact.detection.scene.colliders], {}
-    arrays = problem.normal, problem.tangent, problem.r, problem.body, problem.node, problem.weight, problem.arity
-    normal, tangent, r, collider, node, weight, arity = download(arrays, contact.n_contacts)
+    arrays = problem.normal, problem.tangent, problem.r, problem.body
+    normal, tangent, r, collider = download(arrays, contact.n_contacts)
     impulse = r[:, :1] * normal + r[:, 1:2] * tangent + r[:, 2:] * np.cross(normal, tangent)
-    used = (node == i) & (np.arange(node.shape[1]) < arity[:, None])
-    for c, place in zip(*np.nonzero(used)):
+    row, node, weight = read_entries(problem)
+    for at in np.flatnonzero(node == i):
+        c = row[at]
         what = "contact of " + " and ".join(f"'{names[side]}'" for side in collider[c])
-        found[what] = found.get(what, 0.0) + weight[c, place] * impulse[c] / beta
+        found[what] = found.get(what, 0.0) + weight[at] * impulse[c] / beta
     return found

@@ -93,9 +93,9 @@ def measure_impact(m: ti.template(), stage: ti.template(), contacts: ti.template
         slope = total(m, SUM)
         for c in range(rows.count[0]):
             u_fixed = -(SPREAD / tau) * rows.obstacle_displacement[c]
-            for j in range(rows.arity[c]):
-                i = rows.node[c, j]
-                u_fixed += rows.weight[c, j] * (1.0 - ti.cast(m.free[i], ti.f64)) * stage.v_hat[i]
+            for e in range(rows.first[c], rows.first[c] + rows.arity[c]):
+                i = rows.node[e]
+                u_fixed += rows.weight[e] * (1.0 - ti.cast(m.free[i], ti.f64)) * stage.v_hat[i]
             slope += to_world(rows, c, rows.r[c]).dot(u_fixed)
             if rows.min_opening[c] > 0.0:
                 slope -= 0.5 * rows.r[c][0] * ti.max(0.0, rows.min_velocity[c] + rows.approach[c])
@@ -136,8 +136,8 @@ def rebound_work(contacts: ti.template(), beta: ti.f64) -> ti.f64:
         for c in range(rows.count[0]):
             if rows.min_opening[c] > 0.0:
                 displacement = work.tangential_offset[c]
-                for j in range(rows.arity[c]):
-                    displacement += rows.weight[c, j] * contacts.displacement[rows.node[c, j]]
+                for e in range(rows.first[c], rows.first[c] + rows.arity[c]):
+                    displacement += rows.weight[e] * contacts.displacement[rows.node[e]]
                 total_work += rows.r[c][0] * rows.normal[c].dot(displacement) / beta
     return total_work
 

@@ -130,8 +130,8 @@ def _contact_slope(stage: ti.template(), contacts: ti.template(), c, beta):
     rows, work = ti.static((contacts.problem, contacts.work))
     work.velocity[c] = stage_velocity_of(contacts, c, beta)
     d, n, t = dvec(0.0), rows.normal[c], rows.tangent[c]
-    for j in range(rows.arity[c]):
-        d += rows.weight[c, j] * ti.cast(stage.pcg.y[rows.node[c, j]], ti.f64)
+    for e in range(rows.first[c], rows.first[c] + rows.arity[c]):
+        d += rows.weight[e] * ti.cast(stage.pcg.y[rows.node[e]], ti.f64)
     work.rate[c] = dvec(n.dot(d), t.dot(d), n.cross(t).dot(d))
 
 

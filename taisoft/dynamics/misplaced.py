@@ -64,8 +64,8 @@ def _normal_on_shape(p: ti.template(), m: ti.template(), o: ti.template(), c, la
     n, end, gap, is_smooth, was_smooth = p.normal[c], 1.0 * p.normal[c], lasting, True, True
     if ti.static(o.any):
         x = dvec(0.0)
-        for k in range(p.arity[c]):
-            x += p.weight[c, k] * m.state.x[p.node[c, k]]
+        for e in range(p.first[c], p.first[c] + p.arity[c]):
+            x += p.weight[e] * m.state.x[p.node[e]]
         v, d, flag, before = normal_on_shape(o, p.body[c][1], x, n)
         if v.dot(v) > 0.0:
             end, gap, is_smooth, was_smooth = v, d, flag, before

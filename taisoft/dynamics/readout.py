@@ -9,12 +9,13 @@ import numpy as np
 
 from taisoft.backend.arrays import download
 from taisoft.collision.contacts import Contacts, named_contacts
-from taisoft.contact.problem import NODES, ContactProblem
+from taisoft.contact.problem import NODES, ContactProblem, fill_rows, read_entries
+from taisoft.ranges import expand
 from taisoft.scene.scene import Scene
 
 Pairs = tuple[np.ndarray, np.ndarray]  # colliders (k,2), the lower index first, and their sums (k,13), see `sum_pairs`
 IMPULSE, MOMENTS, SLIP, NORMAL = slice(0, 3), (slice(3, 6), slice(6, 9)), slice(9, 12), slice(12, 13)  # columns
-ROWS = "normal tangent r impact_impulse node weight arity point gap body feature factor".split()  # what a later step needs
+ROWS = "normal tangent r impact_impulse arity arity_a point gap body feature factor".split()  # what a later step needs
 MORE_ROWS = [*ROWS, *"friction restitution obstacle_displacement approach load target min_opening".split()]
 
 
@@ -42,7 +43,7 @@ def read_contacts(problem: ContactProblem, impulse_fraction: float) -> ContactRo
     rows = read_rows(problem)
     normal, tangent, r = rows["normal"], rows["tangent"], rows["r"] / impulse_fraction + rows["impact_impulse"]
     impulse = r[:, :1] * normal + r[:, 1:2] * tangent + r[:, 2:] * np.cross(normal, tangent)
-    nodes, weights = _sides(rows["node"], rows["weight"], rows["arity"])
+    nodes, weights = _sides(*(rows[name] for name in ("arity", "arity_a", "node", "weight")))
     return ContactRows(rows["body"], rows["feature"], rows["point"], normal, rows["gap"], impulse, nodes, weights)
 
 
@@ -57,11 +58,9 @@ def sum_pairs(
     rows: of the problem, with the nodes before dependent ones were replaced; duration [s]: in which impulses acted; x [m],
     v [m/s]: (n_nodes, 3). before: pairs and sums to be added.
     """
-    node, weight, arity, moved = download(
-        [problem.node, problem.weight, problem.arity, problem.obstacle_displacement], problem.count[0]
-    )
-    weight = np.where(np.arange(node.shape[1]) < arity[:, None], weight, 0.0)
-    u = np.einsum("cj,cji->ci", weight, v[np.where(weight != 0.0, node, 0)]) - moved / duration
+    (contact, node, weight), u = read_entries(problem), np.zeros((problem.count[0], 3))
+    np.add.at(u, contact, weight[:, None] * v[node])
+    u -= problem.obstacle_displacement.to_numpy(len(u)) / duration
     normal = (rows.impulse * rows.normal).sum(axis=1, keepdims=True)
     slip = normal * (u - (u * rows.normal).sum(axis=1, keepdims=True) * rows.normal)
     nodes, weights, half = rows.nodes, rows.weights, rows.nodes.shape[1] // 2
@@ -103,29 +102,29 @@ def nodal_impulses(contacts: Contacts | ContactRows, n_nodes: int) -> np.ndarray
     return total
 
 
-def _sides(node: np.ndarray, weight: np.ndarray, arity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return nodes and weights (n, 2 w) of a problem's contacts, w of each side.
-
-    A node is on side a if its weight is positive. If nodes depend on others, those of one side may have weights of both signs.
-    """
-    n, width = node.shape
-    used, half = np.arange(width) < arity[:, None], NODES // 2 if width == NODES else width
-    side_b = used & (weight < 0.0)
-    nodes, weights = np.full((n, 2 * half), -1), np.zeros((n, 2 * half))
-    for side, first in ((used & ~side_b, 0), (side_b, half)):
-        row, column = np.nonzero(side)
-        place = first + np.cumsum(side, axis=1)[row, column] - 1
-        nodes[row, place], weights[row, place] = node[row, column], np.abs(weight[row, column])
+def _sides(arity: np.ndarray, arity_a: np.ndarray, node: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return nodes and weights (k, 2 w) of contacts from their rows, w of each side; the weights of side b change their sign."""
+    contact, place = expand(np.zeros_like(arity), arity)
+    half = max(NODES // 2, arity_a.max(initial=0), (arity - arity_a).max(initial=0))
+    nodes, weights = np.full((len(arity), 2 * half), -1), np.zeros((len(arity), 2 * half))
+    on_b = place >= arity_a[contact]
+    at = contact, place + on_b * (half - arity_a[contact])
+    nodes[at], weights[at] = node, np.where(on_b, -weight, weight)
     return nodes, weights
 
 
 def read_rows(problem: ContactProblem, names: list[str] = ROWS) -> dict[str, np.ndarray]:
-    """Return what a later step, or `read_contacts`, needs of a problem's contacts. names: MORE_ROWS for what this step needs."""
-    return dict(zip(names, download([getattr(problem, name) for name in names], problem.count[0])))
+    """Return what a later step, or `read_contacts`, needs of a problem's contacts: fields by name, node and weight row by row.
+
+    names: MORE_ROWS for what this step needs.
+    """
+    rows = dict(zip(names, download([getattr(problem, name) for name in names], problem.count[0])))
+    return rows | dict(zip(("node", "weight"), read_entries(problem)[1:]))
 
 
 def write_rows(problem: ContactProblem, rows: dict[str, np.ndarray]) -> None:
-    """Restore the result of `read_rows`, of at most `capacity` contacts."""
-    problem.count[0] = len(rows["gap"])
+    """Restore the result of `read_rows`, for which there must be room."""
+    rows = dict(rows)
+    fill_rows(problem, *(rows.pop(name) for name in ("arity", "node", "weight")))
     for name, values in rows.items():
         getattr(problem, name).from_numpy(values, 0)

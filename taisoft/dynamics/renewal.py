@@ -56,7 +56,7 @@ class Renewal:
         model, detection, end = self._model, self._detection, self._found
         s, shapes, (surface, found, kept, n) = detection.surface, detection.shapes, end.found
         if model.has_dependents and n:
-            n = drop_vanishing(problem, model, s, found, kept, n, problem.capacity - 1)
+            n = drop_vanishing(problem, model, s, found, kept, n)
         lengths = dt, offset, detection.margin, detection.floor
         if not judge(problem, s, surface, shapes, x_start, displacement, found, kept, n, *lengths):
             return False

@@ -138,8 +138,9 @@ def _in_contact(pieces: ti.template(), contacts: ti.template()):
     if ti.static(contacts.any):
         ti.loop_config(serialize=contacts.problem.serial)
         for c in range(contacts.problem.count[0]):
-            for j in range(contacts.problem.arity[c]):
-                pieces.held[pieces.component[contacts.problem.node[c, j]]] = HELD
+            first = contacts.problem.first[c]
+            for e in range(first, first + contacts.problem.arity[c]):
+                pieces.held[pieces.component[contacts.problem.node[e]]] = HELD
 
 
 @ti.func

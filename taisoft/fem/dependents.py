@@ -45,7 +45,7 @@ def model_fields(setup: Setup) -> dict[str, Any]:
         of_node=arena.filled("dependent_of_node", ti.i32, table.node[by_master.indices]),
         of_weight=arena.filled("dependent_of_weight", ti.f64, by_master.data),
     )
-    return {"has_dependents": True, "dependents": dependents}
+    return {"has_dependents": True, "most_masters": table.most_masters, "dependents": dependents}
 
 
 @ti.func

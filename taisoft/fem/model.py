@@ -72,6 +72,7 @@ class Model:
     gravity: Any  # () 3-vector [m/s^2]
     springs: Any = None  # fem.springs.Springs
     dependents: Any = None  # fem.dependents.Dependents
+    most_masters: Count = 1  # largest number of nodes that a node depends on
     loads: Any = None  # (n_nodes) 3-vectors [N]: tractions and forces
     amplitudes: Any = None  # f64: present values of the loads that are one number, see `fem.loads.scalar_loads`
     pressure: Any = None  # fem.pressure.PressureTable

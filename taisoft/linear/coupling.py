@@ -16,47 +16,51 @@ from taisoft.linear.block_csr import padded_times
 
 @dataclass(frozen=True, eq=False)
 class Coupling:
-    """Terms c with nodes node[c, 0..arity[c]), and for each node its entries = width * c + index in the term."""
+    """Terms c, each with arity[c] entries from first[c] on, and the entries of each node."""
 
-    width: int
     count: Any = None  # i32: count[0] terms
-    node: Any = None  # (capacity, width) i32
+    first: Any = None  # (capacity) i32
     arity: Any = None  # (capacity) i32
-    weight: Any = None  # (capacity, width) f64
+    node: Any = None  # (n_entries) i32
+    weight: Any = None  # (n_entries) f64
+    contact: Any = None  # (n_entries) i32: the term
     entry_start: Any = None  # (n_nodes + 1) i32
     entry: Any = None  # i32, ascending for each node
     block: Any = None  # (capacity) 12-vectors
     active: Any = None  # (capacity) i32: 0 if the block is 0
     base: Any = None  # (n_nodes) 12-vectors: the matrix's diagonal without the terms
     n_active: Any = None  # (n_nodes) i32: active terms of each node, listed from entry_start on in term and term_weight
-    term: Any = None  # (capacity * width) i32
-    term_weight: Any = None  # (capacity * width): the node's weight in the term
+    term: Any = None  # (n_entries) i32
+    term_weight: Any = None  # (n_entries): the node's weight in the term
     product: Any = None  # (capacity) 4-vectors: D J x of each term, the last entry 0
     place: Any = None  # (n_nodes) i32: PLAIN, BESIDE or IS_LAST of `sweep_order`; this and the next two None if not shared
     last: Any = None  # (n_nodes) i32: the last nodes, ascending
     n_last: Any = None  # (1) i32: their number
 
+    @property
+    def any(self) -> bool:
+        """Whether there can be terms."""
+        return self.node is not None
 
-NO_COUPLING = Coupling(0)
+
+NO_COUPLING = Coupling()
 
 
-def build_coupling(arena, real, n_nodes: int, node, shared: bool = False, **fields) -> Coupling:
+def build_coupling(arena, real, n_nodes: int, shared: bool = False, **fields) -> Coupling:
     """Build terms over existing fields of nodes, weights and blocks (all up to `base`), which the caller fills.
 
     shared: whether threads share chunks of a sweep; `sweep_order.find_last` must then follow every change of the terms' nodes.
     """
-    capacity, width = node.shape
+    entries = fields["node"].shape[0]
     if shared:
         fields |= {name: arena.field(f"coupling_{name}", ti.i32, n_nodes) for name in ("place", "last")}
         fields["n_last"] = arena.field("coupling_n_last", ti.i32, 1)
     return Coupling(
-        width,
-        node=node,
         **fields,
         n_active=arena.field("coupling_n_active", ti.i32, n_nodes),
-        term=arena.field("coupling_term", ti.i32, capacity * width),
-        term_weight=arena.field("coupling_term_weight", real, capacity * width),
-        product=arena.vectors("coupling_product", real, capacity, n=4),
+        term=arena.field("coupling_term", ti.i32, entries),
+        term_weight=arena.field("coupling_term_weight", real, entries),
+        product=arena.vectors("coupling_product", real, fields["block"].shape[0], n=4),
     )
 
 
@@ -71,10 +75,10 @@ def prepare_terms(m: ti.template(), k: ti.template(), i):
     """List the active terms of node i. Return the diagonal block of the matrix plus terms."""
     total, n = k.base[i], 0
     first = k.entry_start[i]
-    for e in range(first, k.entry_start[i + 1]):
-        c, index = k.entry[e] // k.width, k.entry[e] % k.width
+    for at in range(first, k.entry_start[i + 1]):
+        c = k.contact[k.entry[at]]
         if k.active[c] == 1:
-            weight = ti.cast(k.weight[c, index], m.real)
+            weight = ti.cast(k.weight[k.entry[at]], m.real)
             total += weight * weight * k.block[c]
             k.term[first + n], k.term_weight[first + n] = c, weight
             n += 1
@@ -85,7 +89,7 @@ def prepare_terms(m: ti.template(), k: ti.template(), i):
 @ti.func
 def clear_products(m: ti.template(), k: ti.template()):
     """Set the products of all terms, if there can be any, to 0."""
-    if ti.static(k.width > 0):
+    if ti.static(k.any):
         for c in range(k.count[0]):
             k.product[c] = ti.Vector([0.0, 0.0, 0.0, 0.0], m.real)
 
@@ -93,7 +97,7 @@ def clear_products(m: ti.template(), k: ti.template()):
 @ti.func
 def add_products(m: ti.template(), k: ti.template(), i, x):
     """Add the contribution of x at node i to the products of its terms, if there can be any."""
-    if ti.static(k.width > 0):
+    if ti.static(k.any):
         first = k.entry_start[i]
         for e in range(first, first + k.n_active[i]):
             c = k.term[e]
@@ -115,6 +119,6 @@ def form_product(m: ti.template(), k: ti.template(), c, x: ti.template()):
     """Set the product D J x of term c."""
     if k.active[c] == 1:
         s = ti.Vector([0.0, 0.0, 0.0], m.real)
-        for j in range(k.arity[c]):
-            s += ti.cast(k.weight[c, j], m.real) * x[k.node[c, j]]
+        for e in range(k.first[c], k.first[c] + k.arity[c]):
+            s += ti.cast(k.weight[e], m.real) * x[k.node[e]]
         k.product[c] = padded_times(k.block[c], s)

@@ -145,7 +145,7 @@ def start(
 ):
     """Begin a solve: diagonal and P, y = 0, s = (P + L)^-1 rhs, t = P s, and the state."""
     spread = ti.static(model.spread if shared else 1)
-    if ti.static(terms.width > 0):
+    if ti.static(terms.any):
         ti.loop_config(serialize=True)
         for _ in range(1):
             clear_products(model, terms)
@@ -168,7 +168,7 @@ def start(
 def take_step(model: ti.template(), A: ti.template(), terms: ti.template(), work: ti.template(), shared: ti.template()):
     """Run both sweeps and take the step along p. Partial sums: OTHER_SUM of s.P s."""
     spread = ti.static(model.spread if shared else 1)
-    if ti.static(terms.width > 0):
+    if ti.static(terms.any):
         ti.loop_config(serialize=True)
         for _ in range(1):
             clear_products(model, terms)
@@ -180,7 +180,7 @@ def take_step(model: ti.template(), A: ti.template(), terms: ti.template(), work
             if task % spread == 0:
                 c = _chunk(work, part, _n_chunks(work, part) - 1 - task // spread)
                 _sweep_backward(model, A, terms, work, c, work.state[STEP], False)
-    if ti.static(terms.width > 0):
+    if ti.static(terms.any):
         ti.loop_config(serialize=True)
         for _ in range(1):
             clear_products(model, terms)
@@ -251,7 +251,7 @@ def _start_chunk(
             continue
         precondition(model, A, terms, work, i, same_matrix)
         below = times_below(model, A, terms, work, c, i, work.r, last)
-        if ti.static(terms.width > 0):
+        if ti.static(terms.any):
             below += gather_products(model, terms, i)
         s = block_times(work.inverse[i], work.rhs[i] - below)
         add_products(model, terms, i, s)
@@ -275,7 +275,7 @@ def _sweep_backward(
         t = work.q[i] + ti.cast(beta, model.real) * work.z[i]
         work.z[i] = t
         above = times_above(model, A, terms, work, c, i, work.p, last)
-        if ti.static(terms.width > 0):
+        if ti.static(terms.any):
             above += gather_products(model, terms, i)
         if ti.static(work.has_last(terms) and not last):
             above += times_last_above(model, A, terms, work, i, work.p)
@@ -297,7 +297,7 @@ def _sweep_forward(model: ti.template(), A: ti.template(), terms: ti.template(),
         rest = t - block_times(work.mirror[i], p) - times_below(model, A, terms, work, c, i, work.q, last)
         if ti.static(A.crossed and work.is_shared(terms) and not last):
             rest += times_apart(model, A, terms, work, c, i, work.p)
-        if ti.static(terms.width > 0):
+        if ti.static(terms.any):
             rest -= gather_products(model, terms, i)
         s = block_times(work.inverse[i], rest)
         add_products(model, terms, i, s)

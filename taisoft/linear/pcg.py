@@ -152,7 +152,7 @@ def iterate(
 @ti.func
 def _multiply(model: ti.template(), A: ti.template(), terms: ti.template(), border: ti.template(), work: ti.template()):
     """q = A p. Partial sums: SUM of p.q."""
-    if ti.static(terms.width > 0):
+    if ti.static(terms.any):
         ti.loop_config(serialize=model.serial)
         for c in range(model.chunks):
             for at in range(chunk_size(model, c, terms.count[0])):
@@ -172,7 +172,7 @@ def _multiply(model: ti.template(), A: ti.template(), terms: ti.template(), bord
                 for at in range(chunk_size(model, c, n)):
                     i = node_of(work.subset, chunk_entry(model, c, at, n))
                     product = off_diagonal_times(model, A, c, i, work.p)
-                    if ti.static(terms.width > 0):
+                    if ti.static(terms.any):
                         product += block_times(terms.base[i], work.p[i]) + gather_products(model, terms, i)
                     else:
                         product += block_times(A.diagonal[i], work.p[i])

@@ -59,11 +59,11 @@ class PcgWork:
 
     def is_shared(self, coupling: Coupling) -> bool:
         """Whether several threads may share the chunks of one parity."""
-        return self.in_chunks and (coupling.width == 0 or coupling.place is not None)
+        return self.in_chunks and (not coupling.any or coupling.place is not None)
 
     def has_last(self, coupling: Coupling) -> bool:
         """Whether some nodes are passed after all chunks, see `sweep_order`."""
-        return self.is_shared(coupling) and coupling.width > 0
+        return self.is_shared(coupling) and coupling.any
 
 
 @dataclass(frozen=True)
@@ -92,7 +92,7 @@ def build_pcg(model: Model, arena: FieldArena) -> PcgWork:
 def precondition(model: ti.template(), A: ti.template(), terms: ti.template(), work: ti.template(), i, same_matrix):
     """Set diagonal and preconditioner of node i, unless it has those of the last solve."""
     changed = True
-    if ti.static(terms.width > 0):
+    if ti.static(terms.any):
         changed = same_matrix == 0 or has_terms(terms, i)
         if changed:
             A.diagonal[i] = prepare_terms(model, terms, i)

@@ -159,13 +159,13 @@ def find_last(model: ti.template(), A: ti.template(), terms: ti.template(), work
     for _ in range(1):
         for c in range(terms.count[0]):
             home = ti.Vector([NO_CHUNK, NO_CHUNK])  # first chunk of each parity
-            for j in range(terms.arity[c]):
-                chunk = terms.node[c, j] >> work.chunk_shift
+            for e in range(terms.first[c], terms.first[c] + terms.arity[c]):
+                chunk = terms.node[e] >> work.chunk_shift
                 for parity in ti.static((EVEN, ODD)):
                     if chunk % 2 == parity:
                         home[parity] = ti.min(home[parity], chunk)
-            for j in range(terms.arity[c]):
-                i = terms.node[c, j]
+            for e in range(terms.first[c], terms.first[c] + terms.arity[c]):
+                i = terms.node[e]
                 if i >> work.chunk_shift != home[EVEN] and i >> work.chunk_shift != home[ODD]:
                     terms.place[i] = IS_LAST
         n = 0

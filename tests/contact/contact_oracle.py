@@ -75,13 +75,18 @@ class NodeContacts:
     friction: np.ndarray
 
     @property
+    def entries(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Contact, node and weight of those in use, row by row."""
+        used = np.arange(NODES) < self.arity[:, None]
+        return np.nonzero(used)[0], self.node[used], self.weight[used]
+
+    @property
     def jacobian(self) -> np.ndarray:
         """J (3k, 3n)."""
         J = np.zeros((len(self.arity), 3, len(self.inverse_mass), 3))
         frame = np.stack([self.normal, self.tangent, np.cross(self.normal, self.tangent)], axis=1)
-        for c, arity in enumerate(self.arity):
-            for i, w in zip(self.node[c, :arity], self.weight[c, :arity]):
-                J[c, :, i] += w * frame[c]
+        for c, i, w in zip(*self.entries):
+            J[c, :, i] += w * frame[c]
         return J.reshape(3 * len(self.arity), -1)
 
     @property

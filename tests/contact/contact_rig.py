@@ -14,9 +14,11 @@ class Rig:
 
     def __init__(self):
         self._arenas = [FieldArena() for _ in range(4)]
-        forms = {False: (problem.build_node_problem, N_NODES), True: (problem.build_matrix_problem, BLOCKS)}
-        kinds = [(matrix, serial) for matrix in forms for serial in (True, False)]
-        self._of = {(m, s): forms[m][0](arena, CAPACITY, forms[m][1], s) for arena, (m, s) in zip(self._arenas, kinds)}
+        arenas, self._of = iter(self._arenas), {}
+        for serial in (True, False):
+            entries = problem.NODES * CAPACITY
+            self._of[False, serial] = problem.build_node_problem(next(arenas), CAPACITY, N_NODES, serial, entries)
+            self._of[True, serial] = problem.build_matrix_problem(next(arenas), CAPACITY, BLOCKS, serial)
 
     def close(self) -> None:
         while self._arenas:
@@ -24,10 +26,10 @@ class Rig:
 
     def nodes(self, contacts: oracle.NodeContacts, serial: bool = True) -> problem.ContactProblem:
         p, k = self._of[False, serial], len(contacts.arity)
-        for name in ("node", "arity", "weight", "normal", "tangent", "friction", "inverse_mass", "b"):
+        for name in ("normal", "tangent", "friction", "inverse_mass", "b"):
             values = getattr(contacts, name)
             problem.fill_field(getattr(p, name), values.reshape(k, 3) if name == "b" else values)
-        p.count[0] = k
+        problem.fill_rows(p, contacts.arity, *contacts.entries[1:])
         p.r.fill(0.0)
         problem.fill_field(p.sweep.order, np.arange(k))
         problem.index_nodes(p)

@@ -15,7 +15,7 @@ import taisoft as ts
 from taisoft.backend.arrays import FieldArena
 from taisoft.backend.runtime import kernel
 from taisoft.contact.build import gap_minus_target
-from taisoft.contact.problem import build_node_problem, fill_field
+from taisoft.contact.problem import build_node_problem, fill_field, read_entries
 from taisoft.contact.restitution import explicit_opening, find_rebounds
 from tests.collision.rotations import rotation
 from tests.contact import contact_oracle as oracle
@@ -79,19 +79,17 @@ def test_nodes_and_weights(begun):
     """The weighted nodes of each side give the two surface points of a contact."""
     made, n = begun
     p, x, n_bodies = made.contact.problem, made.state.state()[0], len(made.scene.bodies)
-    weight, arity = rows(p.weight, n), rows(p.arity, n)
-    used = np.arange(6) < arity[:, None]
-    node = np.where(used, rows(p.node, n), 0)
-    assert (weight[used] != 0).all() and arity.min() >= 1 and all(len(set(r[u])) == u.sum() for r, u in zip(node, used))
+    (contact, node, weight), body = read_entries(p), rows(p.body, n)
+    assert (weight != 0).all() and set(contact) == set(range(n)) and len(set(zip(contact, node))) == len(node)
     owner = np.repeat(np.arange(n_bodies), [b.n_nodes for b in made.scene.bodies])[node]
-    body, half = rows(p.body, n), 0.5 * rows(p.gap, n)[:, None] * rows(p.normal, n)
+    half = 0.5 * rows(p.gap, n)[:, None] * rows(p.normal, n)
     for side, sign in ((0, 1.0), (1, -1.0)):
-        mine, soft = used & (sign * weight > 0), body[:, side] < n_bodies
-        assert (owner == body[:, side : side + 1])[mine].all() and not mine[~soft].any()
-        weights = np.where(mine, np.abs(weight), 0.0)
-        assert np.abs(weights.sum(axis=1)[soft] - 1).max() < 1e-12
-        points = np.einsum("kj,kjx->kx", weights, x[node])
-        assert np.abs(points - (rows(p.point, n) + sign * half))[soft].max() < 1e-9
+        mine, soft = sign * weight > 0, body[:, side] < n_bodies
+        assert (owner == body[contact, side])[mine].all() and soft[contact[mine]].all()
+        points = np.zeros((n, 4))  # and the sum of weights
+        np.add.at(points, contact[mine], np.abs(weight[mine])[:, None] * np.column_stack([x, np.ones(len(x))])[node[mine]])
+        assert np.abs(points[soft, 3] - 1).max() < 1e-12
+        assert np.abs(points[:, :3] - (rows(p.point, n) + sign * half))[soft].max() < 1e-9
 
 
 def test_obstacle_displacement_and_approach(begun):
@@ -108,7 +106,8 @@ def test_obstacle_displacement_and_approach(begun):
         assert on.sum() >= 2 and np.abs(expected[on]).max() > 1e-4
     assert np.abs(rows(p.obstacle_displacement, n) - expected).max() < 1e-12
     v = made.state.state()[1]
-    relative = np.einsum("kj,kjx->kx", rows(p.weight, n) * (np.arange(6) < rows(p.arity, n)[:, None]), v[rows(p.node, n)])
+    (contact, node, weight), relative = read_entries(p), np.zeros((n, 3))
+    np.add.at(relative, contact, weight[:, None] * v[node])
     approach = ((relative - expected / DT) * rows(p.normal, n)).sum(axis=1)
     assert np.abs(rows(p.approach, n) - approach).max() < 1e-9 and np.abs(approach).max() > 0.1
 
@@ -169,7 +168,7 @@ def test_gap_minus_target(fast, slow):
         (-0.5 * h, 0.0, 1.0, 0.0),
     ]
     gap, restitution, approach, expected = np.array(cases).T
-    problem, n = build_node_problem(arena, 64, 4, True), len(cases)
+    problem, n = build_node_problem(arena, 64, 4, True, 64), len(cases)
     for field, values in ((problem.gap, gap), (problem.restitution, restitution), (problem.approach, approach)):
         fill_field(field, values)
     problem.count[0] = n
@@ -213,7 +212,7 @@ def test_rebounds_of_implicit_steps():
         (h, 0.5, 2.0, 0, 1, 9.0),  # separates
     ]
     gap, e, u, a, b, closing = np.array(cases).T
-    problem, gravity, n = build_node_problem(arena, 64, 4, True), arena.vectors("gravity", ti.f64, 1, g[None]), len(cases)
+    problem, gravity, n = build_node_problem(arena, 64, 4, True, 64), arena.vectors("gravity", ti.f64, 1, g[None]), len(cases)
     normals = np.tile([0.0, 1.0, 0.0], (n, 1))
     bodies = np.stack([a, b], axis=1).astype(np.int32)
     for field, values in ((problem.gap, gap), (problem.restitution, e), (problem.approach, u), (problem.normal, normals)):

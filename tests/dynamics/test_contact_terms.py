@@ -7,6 +7,7 @@
 * Anderson extrapolation of multipliers is that of least squares, also beside contacts that cannot move.
 """
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -15,7 +16,7 @@ import taichi as ti
 
 import taisoft as ts
 from taisoft.contact.build import set_targets
-from taisoft.contact.problem import RESIDUAL, build_node_problem, fill_field, find_factors, index_nodes
+from taisoft.contact.problem import RESIDUAL, build_node_problem, fill_field, fill_rows, find_factors, index_nodes
 from taisoft.dynamics import contact_terms, linearised
 from taisoft.dynamics.contact_terms import NO_CONTACTS
 from taisoft.dynamics.dirichlet import DirichletConditions
@@ -50,30 +51,28 @@ def rig():
         free[FIXED] = 0.0
         m.free.from_numpy(free)
         contacts = oracle.random_contacts(5, K, m.n_nodes - 4)  # none at the last nodes
-        arity = contacts.arity.copy()
-        arity[::5] = (contacts.weight[::5] > 0).sum(axis=1)  # against an obstacle
-        p = build_node_problem(arena, K + 3, m.n_nodes, True)
+        contacts.arity[::5] = (contacts.weight[::5] > 0).sum(axis=1)  # against an obstacle
+        p = build_node_problem(arena, K + 3, m.n_nodes, True, oracle.NODES * K)
         simulation = SimulationState(scene, made.machine, arena, m, made.layout, DirichletConditions(scene, made.layout))
         solver = StageSystem(simulation, NoContacts())
         k = contact_terms.build_stage_contacts(arena, m, p, arena.vectors("x_start", ti.f64, m.n_nodes))
-        for name in ("node", "weight", "normal", "tangent"):
+        fill_rows(p, contacts.arity, *contacts.entries[1:])
+        for name in ("normal", "tangent"):
             fill_field(getattr(p, name), getattr(contacts, name))
         obstacle_displacement = np.where((np.arange(K) % 5 == 0)[:, None], 1e-3 * rng.standard_normal((K, 3)), 0.0)
         friction, gap = np.where(np.arange(K) % 7 == 0, 0.0, 0.5), rng.uniform(-2, 3, K) * GAP_TARGETS[0]
         apart = np.tile([0, 1], (K, 1))  # self-contacts have other targets
-        fields = (p.arity, p.friction, p.gap, p.obstacle_displacement, p.body, p.load)
+        fields = (p.friction, p.gap, p.obstacle_displacement, p.body, p.load)
         loaded = np.ones(K)  # so that gaps open
-        for field, values in zip(fields, (arity, friction, gap, obstacle_displacement, apart, loaded)):
+        for field, values in zip(fields, (friction, gap, obstacle_displacement, apart, loaded)):
             fill_field(field, values)
-        p.count[0] = K
         index_nodes(p)
         block_csr.assemble(m, solver.matrix, EVERYTHING, False)
         block_csr.to_system(m, solver.matrix, solver.matrix, EVERYTHING, 0, 1.0, BETA)
         contact_terms.save_diagonal(m, solver.matrix, k, EVERYTHING)
         find_factors(p)
         A = to_bsr(m, solver.matrix).toarray()
-        sides = contacts.node, arity, contacts.weight, contacts.normal, contacts.tangent
-        found = oracle.NodeContacts(*sides, np.zeros((m.n_nodes, 3)), np.zeros(3 * K), friction)
+        found = replace(contacts, inverse_mass=np.zeros((m.n_nodes, 3)), friction=friction)
         start = made.oracle.rest
         x_hat, x = (start + size * rng.standard_normal(start.shape) for size in (1e-4, 1e-3))
         k.x_start.from_numpy(start)

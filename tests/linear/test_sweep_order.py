@@ -48,18 +48,16 @@ def rig(request):
 
 
 def upload_terms(made, arena, weights, D, active, base):
-    m, node = made.model, np.zeros((N_TERMS, WIDTH), dtype=np.int32)
-    for c, own in enumerate(made.nodes):
-        node[c, : len(own)] = own
-    entries = np.array(sorted((i, WIDTH * c + j) for c, own in enumerate(made.nodes) for j, i in enumerate(own)))
-    start = np.searchsorted(entries[:, 0], np.arange(m.n_nodes + 1))
-    integers = {"count": [N_TERMS], "arity": [len(own) for own in made.nodes]}
-    integers |= {"entry_start": start, "entry": entries[:, 1], "active": active}
+    m, arity, node = made.model, [len(own) for own in made.nodes], np.concatenate(made.nodes)
+    start, entry = np.searchsorted(np.sort(node), np.arange(m.n_nodes + 1)), np.argsort(node, kind="stable")
+    integers = {"count": [N_TERMS], "first": np.cumsum(arity) - arity, "arity": arity, "node": node}
+    integers |= {"contact": np.repeat(np.arange(N_TERMS), arity), "entry_start": start, "entry": entry, "active": active}
     fields = {name: arena.field(name, ti.i32, np.shape(v), np.array(v, dtype=np.int32)) for name, v in integers.items()}
     for name, v in (("block", block_csr.packed(D)), ("base", base)):
         fields[name] = arena.vectors(name, m.real, len(v), v, n=block_csr.BLOCK)
+    weights = np.concatenate([w[:n] for w, n in zip(weights, arity)])
     fields["weight"] = arena.field("weight", ti.f64, weights.shape, weights)
-    return build_coupling(arena, m.real, m.n_nodes, arena.field("node", ti.i32, node.shape, node), made.shared, **fields)
+    return build_coupling(arena, m.real, m.n_nodes, made.shared, **fields)
 
 
 def last_nodes(made) -> np.ndarray:
