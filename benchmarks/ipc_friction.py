@@ -68,7 +68,7 @@ class FrictionMeter:
 
 def relative_velocities(c: Contacts, v: np.ndarray) -> np.ndarray:
     """(k,3) [m/s] velocity of side a minus that of side b, for nodes of velocities v (n,3) [m/s]; obstacles at rest."""
-    signs = np.array([1.0, 1.0, 1.0, -1.0, -1.0, -1.0])
+    signs = np.repeat([1.0, -1.0], c.nodes.shape[1] // 2)
     return np.einsum("kq,kqi->ki", np.where(c.nodes >= 0, c.weights, 0.0) * signs, v[c.nodes])
 
 

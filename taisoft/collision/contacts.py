@@ -1,25 +1,30 @@
 """Contacts of surfaces that touch or will touch within the step: fields for kernels, and a record for the host.
 
-A contact has a side a and a side b, each a point on up to three nodes with weights that sum to 1; an obstacle is always b and
-has no nodes. The normal is a unit vector from b to a; the gap is the signed distance of the two points along it, negative in
-penetration. A feature identifies the pair of mesh features in contact, and persists while they stay in contact.
+A contact has a side a and a side b, each a point on up to three nodes, of mortar contacts more, with weights that sum to 1; an
+obstacle is always b and has no nodes. The normal is a unit vector from b to a; the gap is the signed distance of the two points
+along it, negative in penetration. A feature identifies the pair of mesh features in contact, and persists while they stay in
+contact.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import taichi as ti
 
 from taisoft.backend.arrays import FieldArena
+from taisoft.collision.candidates import TOTAL, Buffer
 from taisoft.collision.surface import dvec, ivec
 from taisoft.display import short_repr
+from taisoft.ranges import expand
 from taisoft.scene.scene import Scene
 
 # kinds of contacts; their two ids are: vertex and triangle; edge and edge (3 triangle + local edge); vertex and collider;
-# triangle and collider; a passage (`passages`)
-VERTEX_FACE, EDGE_EDGE, VERTEX_FIELD, FACE_FIELD, FACE_FACE = range(5)
-KINDS = ("vertex_face", "edge_edge", "vertex_field", "face_field", "face_face")
+# triangle and collider; a passage (`passages`); vertex and collider (`mortar`)
+VERTEX_FACE, EDGE_EDGE, VERTEX_FIELD, FACE_FIELD, FACE_FACE, MORTAR = range(6)
+# capacity for vertices of mortar contacts, over that for contacts: at first; at most, since a list that does not fit is overrated
+LISTED, MOST_LISTED = 8, 64
+KINDS = ("vertex_face", "edge_edge", "vertex_field", "face_field", "face_face", "mortar")
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,8 +38,39 @@ class ContactFields:
     feature: Any  # 3-vectors i32: kind and two ids
     nodes_a: Any  # 3-vectors i32: vertices of the surface, -1 for unused entries
     nodes_b: Any
-    weights_a: Any  # 3-vectors f64
+    weights_a: Any  # 3-vectors f64, 0 for mortar contacts
     weights_b: Any
+    guard: Any  # i32: 1 where a mortar contact carries the load
+    area: Any  # f64: of mortar contacts, 0 for others [m^2]
+    carried: Any  # 3-vectors f64: of mortar contacts, displacement of the obstacle in the step [m]
+    entries: (
+        Any  # 3-vectors i32: of mortar contacts, the first of their vertices in `vertex`, how many are of side a, and of both
+    )
+    vertex: Any = None  # i32; None if there can be no mortar contacts
+    weight: Any = None  # f64: of those vertices, with a sum of 1 on each side
+
+    @property
+    def has_mortar(self) -> bool:
+        """Whether there can be mortar contacts."""
+        return self.vertex is not None
+
+    @ti.func
+    def is_mortar(self, at):
+        """Whether a contact is a mortar contact."""
+        result = False
+        if ti.static(self.has_mortar):
+            result = self.feature[at][0] == MORTAR
+        return result
+
+    @ti.func
+    def moved(self, at, x: ti.template()):
+        """Difference (3,) between the sides of a mortar contact in the mean of a field of vertices, that of an obstacle 0."""
+        total = dvec(0.0)
+        if ti.static(self.has_mortar):
+            first, n_a = self.entries[at][0], self.entries[at][1]
+            for k in range(first, first + self.entries[at][2]):
+                total += ti.select(k - first < n_a, self.weight[k], -self.weight[k]) * x[self.vertex[k]]
+        return total
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,8 +80,9 @@ class Contacts:
     An attribute of a record from `sim.contacts()` holds for the last step, or for its last substep if it was cut into several.
     point, normal, gap: geometry at its end, but point and normal of an explicit step, and of contacts that keep the geometry of
     the start, at its start; impulse: of normal force and friction together; impulse / duration is the force. kind: what meets, a
-    vertex and a triangle, two edges, a vertex or a triangle and a distance field or obstacle, or two triangles that would pass
-    through each other. Contacts that are near each other are merged into one: there were `found`.
+    vertex and a triangle, two edges, a vertex or a triangle and a distance field or obstacle, two triangles that would pass
+    through each other, or two meshes around a node ("mortar", a mean). Contacts of points near each other are merged into one:
+    there were `found`.
     """
 
     point: np.ndarray  #: (k,3) midway between the two surface points [m]
@@ -54,12 +91,15 @@ class Contacts:
     impulse: np.ndarray  #: (k,3) on a [N s], with friction; b gets the opposite
     body_a: np.ndarray  #: (k,) names
     body_b: np.ndarray  #: (k,) names; an obstacle is always b
-    nodes: np.ndarray  #: (k,6) three of each side, numbered over all bodies, -1 where there is none; more with exact attachments
-    weights: np.ndarray  #: (k,6) of these nodes, 0 where there is none
-    kind: np.ndarray  #: (k,) "vertex_face", "edge_edge", "vertex_field", "face_field" or "face_face"
+    nodes: np.ndarray  #: (k,2w) w of each side, at least three, numbered over all bodies, -1 where there is none
+    weights: np.ndarray  #: (k,2w) of these nodes, 0 where there is none
+    kind: np.ndarray  #: (k,) "vertex_face", "edge_edge", "vertex_field", "face_field", "face_face" or "mortar"
     feature: np.ndarray  #: (k,2) ids that stay while the same two features meet
     friction: np.ndarray  #: (k,) of the pair
     restitution: np.ndarray  #: (k,) of the pair
+    guard: np.ndarray  #: (k,) bool: keeps half the contact offset only, since a mortar contact carries the load
+    area: np.ndarray  #: (k,) [m^2] over which a mortar contact is a mean, 0 for others
+    pressure: np.ndarray  #: (k,) [Pa] at the node of a mortar contact: its normal force over its area; nan for others
     found: int  #: contacts before the reduction
     unmapped: int  #: triangles whose tet is inverted, so that a distance field could not be used
     duration: float = 0.0  #: in which the impulses acted [s]: the step, or its last substep; 0 without a step
@@ -81,30 +121,121 @@ class Contacts:
 
 
 def named_contacts(
-    scene: Scene, point, normal, gap, impulse, collider, feature, nodes, weights, *, found: int, unmapped: int, duration=0.0
+    scene: Scene,
+    point,
+    normal,
+    gap,
+    impulse,
+    collider,
+    feature,
+    nodes,
+    weights,
+    guard,
+    area,
+    *,
+    found: int,
+    unmapped: int,
+    duration: float = 0.0,
 ) -> Contacts:
-    """Return the record of contact arrays (k, ...), with names, friction and restitution. collider: (k,2) indices."""
+    """Return the record of contact arrays (k, ...), with names, numbers of the pairs, pressures. collider: (k,2) indices."""
     names, kinds = np.array([c.name for c in scene.colliders], dtype=object), np.array(KINDS, dtype=object)
     pairs, pair = np.unique(collider, axis=0, return_inverse=True)
     numbers = np.array([scene.contact_numbers(names[a], names[b]) for a, b in pairs]).reshape(-1, 2)[pair.reshape(-1)]
     geometry, labels = (point, normal, gap, impulse), (names[collider[:, 0]], names[collider[:, 1]])
     what = (nodes, weights, kinds[feature[:, 0]], feature[:, 1:], numbers[:, 0], numbers[:, 1])
-    return Contacts(*geometry, *labels, *what, found, unmapped, duration)
+    pressure = np.full(len(gap), np.nan)
+    normal_force = (impulse * normal).sum(axis=1) / (duration or 1.0)
+    np.divide(normal_force, area, out=pressure, where=area > 0.0)
+    return Contacts(*geometry, *labels, *what, guard == 1, area, pressure, found, unmapped, duration)
 
 
 def no_contacts(scene: Scene) -> Contacts:
     """Return an empty record."""
     geometry = np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros((0, 3))
     integers = (np.zeros((0, n), dtype=np.int64) for n in (2, 3, 6))
-    return named_contacts(scene, *geometry, *integers, np.zeros((0, 6)), found=0, unmapped=0)
+    return named_contacts(scene, *geometry, *integers, np.zeros((0, 6)), np.zeros(0), np.zeros(0), found=0, unmapped=0)
 
 
 def contact_fields(arena: FieldArena, capacity: int) -> ContactFields:
     """Allocate a buffer for `capacity` contacts."""
-    vectors = dict.fromkeys(("point", "normal", "weights_a", "weights_b"), (ti.f64, 3))
-    vectors |= dict.fromkeys(("feature", "nodes_a", "nodes_b"), (ti.i32, 3)) | {"body": (ti.i32, 2)}
+    vectors = dict.fromkeys(("point", "normal", "weights_a", "weights_b", "carried"), (ti.f64, 3))
+    vectors |= dict.fromkeys(("feature", "nodes_a", "nodes_b", "entries"), (ti.i32, 3)) | {"body": (ti.i32, 2)}
     fields = {name: arena.vectors(f"contact_{name}", dtype, capacity, n=n) for name, (dtype, n) in vectors.items()}
-    return ContactFields(gap=arena.field("contact_gap", ti.f64, capacity), **fields)
+    scalars = {"gap": ti.f64, "area": ti.f64, "guard": ti.i32}
+    return ContactFields(**fields, **{name: arena.field(f"contact_{name}", dtype, capacity) for name, dtype in scalars.items()})
+
+
+def listed_vertices(arena: FieldArena, capacity: int) -> tuple[Any, Any]:
+    """Allocate a buffer for `vertex` and `weight` of contacts."""
+    return arena.field("listed_vertex", ti.i32, capacity), arena.field("listed_weight", ti.f64, capacity)
+
+
+class ContactBuffer(Buffer):
+    """A buffer of contacts. lists: that of the vertices of mortar contacts, None if there can be none."""
+
+    def __init__(self, name: str, capacity: int, max_capacity: int | None, chunks: int, arena: FieldArena, has_mortar: bool):
+        super().__init__(name, contact_fields, capacity, max_capacity, chunks, arena)
+        limits = LISTED * capacity, None if max_capacity is None else MOST_LISTED * max_capacity
+        self.lists = Buffer(f"{name}_vertices", listed_vertices, *limits, chunks, arena) if has_mortar else None
+        self._join()
+
+    def _join(self) -> None:
+        if self.lists is not None:
+            vertex, weight = self.lists.data
+            self.parts = replace(self.parts, data=replace(self.data, vertex=vertex, weight=weight))
+
+    def grow_if_full(self) -> bool:
+        """See Buffer."""
+        grown = super().grow_if_full()
+        grown |= self.lists is not None and self.lists.grow_if_full()
+        if grown:
+            self._join()
+        return grown
+
+    @property
+    def n_listed(self) -> int:
+        """Vertices of all mortar contacts."""
+        return 0 if self.lists is None else self.lists.count[TOTAL]
+
+    @property
+    def bytes(self) -> int:
+        """See Buffer."""
+        return super().bytes + (0 if self.lists is None else self.lists.bytes)
+
+    def release(self) -> None:
+        """Free the memory."""
+        super().release()
+        if self.lists is not None:
+            self.lists.release()
+
+
+def sides_of(found: ContactFields, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices and weights (k, 2 w) of contacts at places (k,), see `in_columns`."""
+    vertex, weight = (np.hstack([getattr(found, f"{name}_{side}")[at] for side in "ab"]) for name in ("nodes", "weights"))
+    mortar = np.flatnonzero(found.feature[at][:, 0] == MORTAR) if len(at) else at
+    vertex[mortar] = -1
+    contact, column = np.nonzero(vertex >= 0)
+    rows = [contact, column >= 3, vertex[contact, column], weight[contact, column]]
+    if len(mortar):
+        first, n_a, n = found.entries[at[mortar]].T
+        row, entry = expand(first, n)
+        of_mortar = mortar[row], entry - first[row] >= n_a[row], found.vertex[entry], found.weight[entry]
+        rows = [np.concatenate(parts) for parts in zip(rows, of_mortar)]
+    contact, on_b, vertex, weight = (part[np.lexsort(rows[1::-1])] for part in rows)
+    return in_columns(np.bincount(contact, minlength=len(at)), np.bincount(contact[~on_b], minlength=len(at)), vertex, weight)
+
+
+def in_columns(n: np.ndarray, n_a: np.ndarray, node: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return nodes and weights (k, 2 w), w of each side and at least three, -1 and 0 where there is none, from their rows.
+
+    n, n_a: (k,) nodes of each contact, and the first of them, which are of side a; node, weight: of all, row by row.
+    """
+    contact, place = expand(np.zeros_like(n), n)
+    half = max(3, n_a.max(initial=0), (n - n_a).max(initial=0))
+    nodes, weights = np.full((len(n), 2 * half), -1), np.zeros((len(n), 2 * half))
+    at = contact, place + (place >= n_a[contact]) * (half - n_a[contact])
+    nodes[at], weights[at] = node, weight
+    return nodes, weights
 
 
 @ti.func
@@ -126,8 +257,7 @@ def write_contact(out: ti.template(), at, last, body_a, body_b, feature, point_a
     """
     if at < last:
         out.point[at] = point_a - 0.5 * gap * n
-        out.gap[at] = gap
-        out.feature[at] = feature
+        out.gap[at], out.feature[at], out.guard[at], out.area[at] = gap, feature, 0, 0.0
         sign = ti.cast(1.0, ti.f64)
         lowest_a, lowest_b = _lowest_vertex(nodes_a), _lowest_vertex(nodes_b)
         if body_a > body_b or (body_a == body_b and lowest_a > lowest_b):

@@ -11,23 +11,25 @@ import taichi as ti
 
 from taisoft.backend.arrays import FieldArena, download
 from taisoft.backend.runtime import Runtime
-from taisoft.collision.analytic import NO_SHAPES, AnalyticFrames, AnalyticObstacles, build_analytic, find_analytic
+from taisoft.collision.analytic import NO_SHAPES, AnalyticFrames, build_analytic, find_analytic
 from taisoft.collision.bvh import Bvh, Trees
 from taisoft.collision.candidates import Buffer, Candidates, Parts, entries, fill, pair_entries, pairs_of
 from taisoft.collision.colliders import body_grid, collider_surfaces, collider_thickness, prescribed_vertices
-from taisoft.collision.contacts import ContactFields, Contacts, contact_fields, named_contacts
+from taisoft.collision.contacts import ContactBuffer, ContactFields, Contacts, named_contacts, sides_of
 from taisoft.collision.containment import Containment, Inside
 from taisoft.collision.distance_field import DistanceFields, build_fields, find_in_fields
 from taisoft.collision.edge_edge import PROXIMITY, find_proximity
 from taisoft.collision.end_search import EndSearch, place_at_end
 from taisoft.collision.features import BY_EDGES, BY_FACES, BY_FIELD
 from taisoft.collision.intersections import CROSSINGS_OF, INTERSECTING, find_crossings
+from taisoft.collision.mortar import find_mortar
 from taisoft.collision.near_list import STILL
+from taisoft.collision.overlay import build_overlay, overlay_points
 from taisoft.collision.passages import append_passages
 from taisoft.collision.path_check import IN_BOXES, NO_PASSAGES, HeldPassages, PathCheck
 from taisoft.collision.reduction import Reduction
 from taisoft.collision.spatial_hash import SpatialHash
-from taisoft.collision.surface import ACTIVE, NONFINITE, PAIRS, Surface, build_surface, update_surface
+from taisoft.collision.surface import ACTIVE, NONFINITE, PAIRS, build_surface, update_surface
 from taisoft.errors import SceneError, SimulationError
 from taisoft.fem.model import Layout, Model
 from taisoft.mesh.quality import mean_surface_edge
@@ -42,7 +44,7 @@ MERGED = 1e-3  # of the mean surface edge: distance below which contacts are mer
 FLOOR = 1e-5  # of the finest body's mean surface edge: distance that paths must keep, far above the rounding of f64
 REDUCTION_CELL = 0.25  # of the mean surface edge: cell size of the reduction
 MANY_COLLIDERS = 200  # colliders above which the spatial hash is used
-CONTACTS_PER_TRIANGLE = 1  # initial capacity
+CONTACTS_PER_TRIANGLE, POINTS = 1, 8  # initial capacity; integration points of overlays over contacts
 MOVING = object()  # in place of the path of an obstacle that does not rest
 MAX_INITIAL_ROW = 4096  # largest initial capacity for the triangles near one vertex or triangle
 
@@ -82,7 +84,7 @@ class Detection:
         self.reach = self.margin + DEPTH * self.edge  # boxes grow by half of it
         self.topology, self._rest = collider_surfaces(scene, layout)
         self.has_pairs = self_collision or int((np.diff(self.topology.first) > 0).sum()) > 1
-        self._proximity = self.has_pairs and make_plan(scene, False, False, self_collision).on["proximity"]
+        self._plan = make_plan(scene, False, False, self_collision).on
         on_field = [b if self.has_pairs and b.contact_mode == "distance_field" else None for b in bodies]
         # before any allocation, since this may fail
         grids = [b and body_grid(b, settings.field_cells, 2.0 * self.margin) for b in on_field] + [None] * len(obstacles)
@@ -109,7 +111,13 @@ class Detection:
         limits = (settings.initial_capacity or initial, settings.max_capacity)
         self._near_buffer = Buffer("near", entries, *limits, s.chunks, arena) if self.has_pairs else None
         capacity = settings.initial_capacity or CONTACTS_PER_TRIANGLE * s.n_triangles + 64
-        self.buffer = Buffer("contacts", contact_fields, capacity, settings.max_capacity, s.chunks, arena)
+        self.overlay = self._points = None
+        if self._plan["mortar"]:
+            quadratic = np.array([b.order == 2 and b.nodes.embedded is None for b in bodies] + [False] * len(obstacles))
+            limit = None if settings.max_capacity is None else POINTS * settings.max_capacity
+            self.overlay = build_overlay(arena, self.edges, self.topology.first, quadratic, s.n_verts)
+            self._points = Buffer("overlay_points", overlay_points, POINTS * capacity, limit, s.chunks, arena)
+        self.buffer = ContactBuffer("contacts", capacity, settings.max_capacity, s.chunks, arena, self.overlay is not None)
         self._lengths = MERGED * self.edge, REDUCTION_CELL * self.edge
         self._reduction = Reduction(s, self.buffer, *self._lengths)
         self.end: EndSearch | None = None  # see `find_at_end`
@@ -219,22 +227,28 @@ class Detection:
 
     def _search(self, near: Trees | Candidates | None, held: HeldPassages) -> None:
         """Fill the buffer of contacts, growing buffers as needed."""
-        fill(lambda: self._fill_buffer(near, held), *((self._near_buffer,) if self.has_pairs else ()), self.buffer)
+        fill(lambda: self._fill_buffer(near, held), *self._scratch(), self.buffer)
 
     def _fill_buffer(self, near: Trees | Candidates | None, held: HeldPassages) -> None:
         """Write the contacts before reduction, as many as fit."""
-        append = self._fill_with(near, self.surface, self.shapes, self.buffer)
+        append = self._fill_with(near, self)
         if len(held.pairs):
             append_passages(self.surface, self.shapes, self.paths.fields, *held, self.buffer.parts, append)
 
-    def _fill_with(self, near: Trees | Candidates | None, s: Surface, shapes: AnalyticObstacles, buffer: Buffer) -> int:
-        """Write the contacts of a surface and shapes; return 1 if anything was searched, else 0."""
-        out, append = buffer.parts, 0
+    def _scratch(self) -> list[Buffer]:
+        """Buffers that every search fills."""
+        return [buffer for buffer in (self._near_buffer, self._points) if buffer is not None]
+
+    def _fill_with(self, near: Trees | Candidates | None, place: "Detection | EndSearch") -> int:
+        """Write the contacts of the surface and shapes at a place; return 1 if anything was searched, else 0."""
+        s, shapes, out, append = place.surface, place.shapes, place.buffer.parts, 0
         if near is not None:
             row = self._near_buffer.parts
-            if self._proximity:
+            if self._plan["proximity"]:
                 find_proximity(s, near, row, PROXIMITY, out)
                 append = 1
+            if self.overlay is not None:
+                find_mortar(s, near, row, self.overlay, self._points.parts, self.surface.move, place.buffer.lists.parts, out)
             if self._fields is not None:
                 find_in_fields(s, near, row, self._fields, out, append)
                 append = 1
@@ -270,8 +284,7 @@ class Detection:
             self._broad_result = self._near()
             place_at_end(self.surface, end.surface, *place)
         unmapped = 0 if self._fields is None else self._fields.unmapped[0]
-        buffers = (self._near_buffer,) if self.has_pairs else ()
-        fill(lambda: self._fill_with(self._broad_result, end.surface, end.shapes, end.buffer), *buffers, end.buffer)
+        fill(lambda: self._fill_with(self._broad_result, end), *self._scratch(), end.buffer)
         end.reduction.reduce(-np.inf)
         if self._fields is not None:
             self._fields.unmapped[0] = unmapped
@@ -285,18 +298,18 @@ class Detection:
         data, at, counts = self.buffer.data, self.kept.to_numpy(self.counts.contacts), self.counts
         at = at[np.lexsort(np.hstack([data.body[at], data.feature[at]])[:, ::-1].T)]
         point, normal, gap, collider, feature = (x[at] for x in (data.point, data.normal, data.gap, data.body, data.feature))
-        what = np.zeros((len(at), 3)), collider, feature, *self.sides(at)
+        what = np.zeros((len(at), 3)), collider, feature, *self.sides(at), data.guard[at], data.area[at]
         return named_contacts(self.scene, point, normal, gap, *what, found=counts.found, unmapped=counts.unmapped)
 
     def sides(self, at: np.ndarray, data: ContactFields | None = None) -> tuple[np.ndarray, np.ndarray]:
-        """Nodes and weights (k,6) of the contacts at places (k,) of a buffer, before dependent nodes are replaced.
+        """Nodes and weights (k, 2 w) of the contacts at places (k,) of a buffer, before dependent nodes are replaced.
 
-        There are three of each side, -1 where there is none. data: of the buffer, None for that of the last search.
+        There are w of each side, at least three, -1 where there is none. data: of the buffer, None for that of the last search.
         """
         data = self.buffer.data if data is None else data
-        vertices = np.hstack([data.nodes_a[at], data.nodes_b[at]])
+        vertices, weights = sides_of(data, at)
         nodes = np.where(vertices >= 0, np.append(self.topology.node, -1)[vertices], -1)
-        return nodes, np.where(nodes >= 0, np.hstack([data.weights_a[at], data.weights_b[at]]), 0.0)
+        return nodes, np.where(nodes >= 0, weights, 0.0)
 
     @property
     def found(self) -> tuple:
@@ -362,7 +375,8 @@ class Detection:
 
     def _buffers(self) -> list[Buffer]:
         paths, end = () if self.paths is None else self.paths.buffers, () if self.end is None else (self.end.buffer,)
-        return [self.buffer, *end, *((self._near_buffer, *self.broad.buffers) if self.has_pairs else ()), *paths]
+        broad = self.broad.buffers if self.has_pairs else ()
+        return [self.buffer, *end, *self._scratch(), *broad, *paths]
 
     @property
     def field_bytes(self) -> dict[str, int]:
@@ -372,7 +386,7 @@ class Detection:
 
     def release(self) -> None:
         """Free all memory."""
-        for part in (self.broad, self._intersecting, self._near_buffer, self.paths, self.end):
+        for part in (self.broad, self._intersecting, self._near_buffer, self._points, self.paths, self.end):
             if part is not None:
                 part.release()
         self.buffer.release()

@@ -12,8 +12,7 @@ import taichi as ti
 from taisoft.backend.arrays import FieldArena
 from taisoft.backend.runtime import kernel
 from taisoft.collision.analytic import AnalyticObstacles
-from taisoft.collision.candidates import Buffer
-from taisoft.collision.contacts import contact_fields
+from taisoft.collision.contacts import ContactBuffer
 from taisoft.collision.near_list import leaving
 from taisoft.collision.reduction import Reduction
 from taisoft.collision.surface import Surface, box_triangles
@@ -42,7 +41,7 @@ def place_at_end(s: ti.template(), end: ti.template(), displacement: ti.template
 class EndSearch:
     """Surface and shapes at the end of a step, and the contacts found there."""
 
-    def __init__(self, start: Surface, shapes: AnalyticObstacles, buffer: Buffer, lengths: tuple[float, float]):
+    def __init__(self, start: Surface, shapes: AnalyticObstacles, buffer: ContactBuffer, lengths: tuple[float, float]):
         """start, shapes: of the step's start; buffer: whose capacity the new one has; lengths [m]: as of `Reduction`."""
         self._arena, n, v = FieldArena(), max(start.n_triangles, 1), max(start.n_verts, 1)
         own = {name: self._arena.vectors(f"end_{name}", ti.f64, v) for name in ("x", "move")}
@@ -50,7 +49,8 @@ class EndSearch:
         self.left = self._arena.field("end_left", ti.f64, 1)
         self.surface = replace(start, **own, area=self._arena.field("end_area", ti.f64, n))
         self.shapes = replace(shapes, origin=shapes.next_origin, rotation=shapes.next_rotation)
-        self.buffer = Buffer("end_contacts", contact_fields, buffer.capacity, buffer.max_capacity, start.chunks, self._arena)
+        same = buffer.capacity, buffer.max_capacity, start.chunks, self._arena, buffer.lists is not None
+        self.buffer = ContactBuffer("end_contacts", *same)
         self.reduction = Reduction(start, self.buffer, *lengths)
 
     @property

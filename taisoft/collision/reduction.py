@@ -27,7 +27,7 @@ from taisoft.backend.lists import (
 )
 from taisoft.backend.runtime import kernel
 from taisoft.collision.candidates import TOTAL, Buffer, Parts
-from taisoft.collision.contacts import EDGE_EDGE, FACE_FACE, VERTEX_FACE
+from taisoft.collision.contacts import EDGE_EDGE, FACE_FACE, MORTAR, VERTEX_FACE
 from taisoft.collision.surface import Surface, cell_of, ivec
 
 SAME_NORMAL = 0.996  # cosine of 5 degrees
@@ -99,8 +99,9 @@ def is_same(out: ti.template(), a, b, tolerance):
     if (out.body[a] == out.body[b]).all():
         d = out.point[a] - out.point[b]
         result = d.dot(d) <= tolerance * tolerance and out.normal[a].dot(out.normal[b]) >= ti.cast(SAME_NORMAL, ti.f64)
-        # a passage that was found in spite of another contact must not be lost to that one
-        result = result and out.feature[a][0] != FACE_FACE and out.feature[b][0] != FACE_FACE
+        # a passage that was found in spite of another contact must not be lost to that one, nor a mean over surfaces to a point
+        for k in ti.static((FACE_FACE, MORTAR)):
+            result = result and out.feature[a][0] != k and out.feature[b][0] != k
     return result
 
 

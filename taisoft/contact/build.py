@@ -23,6 +23,7 @@ from taisoft.backend.lists import add_up_counts, bucket_of, clear_counts, count_
 from taisoft.backend.runtime import kernel
 from taisoft.contact.problem import NODES, fill_field, to_frame, to_world
 from taisoft.contact.prox import dvec, prox, tangent
+from taisoft.fem.model import Model
 from taisoft.scene.scene import Scene
 
 NEGLIGIBLE = 1e-12  # a node with a smaller weight is left out of the contact
@@ -33,6 +34,7 @@ LEAST_GAP = 0.1
 STILL = 0.002  # of the contact offset: surfaces that approach less in a step are at rest
 # Below 1, since a gap that opens causes impulses, too: without a load they must fall from step to step, also in a row of bodies
 PRESSED = 0.1
+GUARD = 0.5  # factor of the contact offset for contacts beside mortar contacts: room for what a mean leaves uneven
 SELF_CONTACT = 5.0  # factor of contact offset and correction rate in contacts of a body with itself: folds turn as they meet
 
 
@@ -108,10 +110,23 @@ def obstacle_displacement_at(o: ti.template(), body, x):
 
 
 @ti.func
+def _add_node(p: ti.template(), c, n, node, weight):
+    """Add a weight to a node of contact c, which has n nodes, or to a new one. Return their new number."""
+    at, first = p.first[c] + n, p.first[c]
+    for j in range(first, first + n):
+        if p.node[j] == node:
+            at = j
+    if at == first + n:
+        p.node[at], p.weight[at], p.contact[at] = node, 0.0, c
+    p.weight[at] += weight
+    return ti.max(n, at - first + 1)
+
+
+@ti.func
 def _add_masters(p: ti.template(), m: ti.template(), c, n_before, i, weight):
     """Add node i to contact c, or the nodes that it depends on; nodes that the contact has already get the sum of weights. Return
     the contact's new number of nodes."""
-    n, k, row = n_before, m.dependents.number[i], p.first[c]
+    n, k = n_before, m.dependents.number[i]
     first, last = 0, 1
     if k >= 0:
         first, last = m.dependents.start[k], m.dependents.start[k + 1]
@@ -119,14 +134,7 @@ def _add_masters(p: ti.template(), m: ti.template(), c, n_before, i, weight):
         node, part = i, weight
         if k >= 0:
             node, part = m.dependents.master[e], weight * m.dependents.weight[e]
-        at = row + n
-        for j in range(row, row + n):
-            if p.node[j] == node:
-                at = j
-        if at == row + n:
-            p.node[at], p.weight[at], p.contact[at] = node, 0.0, c
-            n += 1
-        p.weight[at] += part
+        n = _add_node(p, c, n, node, part)
     return n
 
 
@@ -252,16 +260,17 @@ def relative_velocity(p: ti.template(), m: ti.template(), c, dt):
 
 @kernel
 def drop_vanishing(
-    p: ti.template(), m: ti.template(), s: ti.template(), found: ti.template(), kept: ti.template(), n: ti.i32
+    p: ti.template(), m: ti.template(), s: ti.template(), found: ti.template(), kept: ti.template(), n: ti.i32, first: ti.i32
 ) -> ti.i32:
     """Leave out of kept[:n] the contacts whose weights cancel, since both sides depend on the same nodes.
 
-    There must be room for one more contact than the problem has. Returns the number of contacts left.
+    Entries from `first` on are overwritten, and there must be room for one more contact than the problem has. Returns the number
+    of contacts left.
     """
     left = 0
     ti.loop_config(serialize=True)
     for _ in range(1):
-        free, first = p.count[0], p.count[2]
+        free = p.count[0]
         for c in range(n):
             row = kept[c]
             _add_sides(p, m, s, free, first, found, row)
@@ -284,21 +293,35 @@ def _add_sides(p: ti.template(), m: ti.template(), s: ti.template(), c, first, f
     p.arity_a[c] = k
     for j in ti.static(range(3)):
         k = _add_vertex(p, m, s, c, k, found.nodes_b[row][j], found.weights_b[row][j], -1.0)
+    if ti.static(found.has_mortar):
+        if found.is_mortar(row):
+            begin, n_a = found.entries[row][0], found.entries[row][1]
+            for e in range(begin, begin + found.entries[row][2]):
+                weight = ti.select(e - begin < n_a, found.weight[e], -found.weight[e])
+                if ti.static(m.has_dependents):
+                    k = _add_masters(p, m, c, k, s.node[found.vertex[e]], weight)
+                elif ti.abs(weight) > NEGLIGIBLE:  # in a notch a node may be on both sides
+                    k = _add_node(p, c, k, s.node[found.vertex[e]], weight)
+                if e - begin < n_a:
+                    p.arity_a[c] = k
+            p.obstacle_displacement[c] = p.obstacle_displacement[c] + found.carried[row]
     p.arity[c] = k
 
 
-@ti.pyfunc
-def most_entries(m: ti.template()):
+def most_entries(m: Model, n: int, n_listed: int) -> int:
+    """Most entries that n contacts found may need. n_listed: vertices of those that are mortar contacts."""
+    return (NODES * n + n_listed) * m.most_masters
+
+
+@ti.func
+def _room(m: ti.template(), found: ti.template(), row):
     """Most entries that a contact found may need."""
-    return NODES * m.most_masters
+    return m.most_masters * ti.select(found.is_mortar(row), found.entries[row][2], NODES)
 
 
 @ti.func
 def fill_row(p: ti.template(), m: ti.template(), s: ti.template(), q: ti.template(), c, first, found: ti.template(), row):
-    """Set the geometry and coefficients of contact c to those found, but for the displacement of an analytic obstacle.
-
-    first: where its entries start.
-    """
+    """Set contact c, with entries from `first` on, to one found, but for the displacement of an analytic obstacle."""
     p.normal[c], p.gap[c], p.point[c] = found.normal[row], found.gap[row], found.point[row]
     p.tangent[c], p.sweep.order[c] = tangent(p.normal[c]), c
     p.body[c], p.feature[c] = found.body[row], found.feature[row]
@@ -306,6 +329,7 @@ def fill_row(p: ti.template(), m: ti.template(), s: ti.template(), q: ti.templat
     p.obstacle_displacement[c] = dvec(0.0)
     _add_sides(p, m, s, c, first, found, row)
     p.min_opening[c], p.impact_impulse[c] = 0.0, dvec(0.0)
+    p.guard[c], p.area[c] = found.guard[row], found.area[row]
 
 
 @kernel
@@ -328,7 +352,7 @@ def fill(
     clear_counts(p.room, n)
     ti.loop_config(serialize=p.serial)
     for c in range(n):
-        count_entries(p.room, c, most_entries(m))
+        count_entries(p.room, c, _room(m, found, kept[c]))
     add_up_counts(p.room, n)
     p.count[0], p.count[2] = n, p.room.start[n + 1]
     ti.loop_config(serialize=p.serial)
@@ -343,21 +367,21 @@ def fill(
 
 
 @ti.func
-def _self_contact_factor(p: ti.template(), c):
-    """SELF_CONTACT if contact c joins a body with itself, else 1."""
-    return ti.select(p.body[c][0] == p.body[c][1], ti.cast(SELF_CONTACT, ti.f64), ti.cast(1.0, ti.f64))
+def _self_contact_factor(body):
+    """SELF_CONTACT if a pair of colliders is one body, else 1."""
+    return ti.select(body[0] == body[1], ti.cast(SELF_CONTACT, ti.f64), ti.cast(1.0, ti.f64))
 
 
 @ti.func
-def offset_between(body, common):
-    """Contact offset [m] of a pair of colliders; common: that between different bodies."""
-    return ti.select(body[0] == body[1], ti.cast(SELF_CONTACT, ti.f64), ti.cast(1.0, ti.f64)) * common
+def offset_between(body, is_guard, common):
+    """Contact offset [m] of a contact between a pair of colliders; common: that between different bodies."""
+    return _self_contact_factor(body) * ti.select(is_guard == 1, GUARD * common, common)
 
 
 @ti.func
 def contact_offset_of(p: ti.template(), c, common):
     """Contact offset of contact c [m]; common: that between different bodies."""
-    return offset_between(p.body[c], common)
+    return offset_between(p.body[c], p.guard[c], common)
 
 
 @ti.func
@@ -370,7 +394,8 @@ def gap_minus_target(
     and of a missing contact offset that the step corrects, at most at max_speed [m/s]. min_opening: for restitution, or 0 [m].
     least_gap: part of the contact offset to which a smaller gap opens at once.
     """
-    gap, own, contact_offset = p.gap[c], _self_contact_factor(p, c), contact_offset_of(p, c, common_offset)
+    gap, own, contact_offset = p.gap[c], _self_contact_factor(p.body[c]), contact_offset_of(p, c, common_offset)
+    whole = own * common_offset  # of a guard, too, where it says what rests
     target = contact_offset
     if gap < contact_offset:
         above = ti.max(gap, 0.0)
@@ -378,7 +403,7 @@ def gap_minus_target(
         if gap >= 0.0:
             opening = ti.max(opening, least_gap * contact_offset - gap)
         pressed = dt * (p.load[c] + ti.max(-p.approach[c], 0.0))
-        if gap > -contact_offset and pressed < STILL * contact_offset:
+        if gap > -whole and pressed < STILL * whole:
             opening = ti.min(opening, PRESSED * pressed)
         target = gap + ti.min(opening, max_speed * dt)
     if min_opening > 0.0:
@@ -412,6 +437,8 @@ def has_impact(p: ti.template(), rigid: ti.template(), dt: ti.f64, contact_offse
         for c in range(p.count[0]):
             closes = p.gap[c] - contact_offset_of(p, c, contact_offset) + dt * p.approach[c] < 0.0
             stops = p.r[c][0] == 0.0 and p.approach[c] < 0.0
+            if p.area[c] > 0.0:  # where points carry the load of the pair, a mean comes and goes without an impact
+                stops = stops and p.load[c] == 0.0
             if rigid[p.body[c][0]] + rigid[p.body[c][1]] > 0:
                 stops = stops or dt * p.approach[c] < -STILL * contact_offset
             if stops and closes:

@@ -76,7 +76,7 @@ class ContactStep:
         self.gap_targets = self._gap_targets()
         self._arena = FieldArena()
         capacity = 2 * detection.surface.n_triangles + 1024  # contacts at first
-        self._allocate(capacity, capacity * most_entries(model))
+        self._allocate(capacity, most_entries(model, capacity, 0))
         self._numbers_arena = FieldArena()
         self.numbers = build_pair_numbers(self._numbers_arena, scene)
         self.rebounds = Rebounds(simulation, self._lasting)
@@ -104,6 +104,13 @@ class ContactStep:
         self.problem = build_node_problem(arena, capacity, model.n_nodes, model.on_cpu, entries)  # of the last step begun
         self._arena.release()
         self._arena, self._last_time, self._indexed = arena, 0.0, False
+
+    def _room(self, n: int, entries: int) -> tuple[int, int] | None:
+        """Return larger capacities if there is no room for n contacts and one more with so many entries in all, else None."""
+        capacity, most = self.problem.capacity, self.problem.node.shape[0]
+        if n < capacity and entries <= most:
+            return None
+        return max(capacity, 2 * n), max(most, 2 * entries)
 
     @property
     def _has_paths(self) -> bool:
@@ -223,12 +230,11 @@ class ContactStep:
         (surface, shapes, found, kept), counts = self.detection.found, self.detection.counts
         self.gap_targets = self._gap_targets()
         self.dropped, self._search_counts = max(self.dropped, counts.unmapped), (counts.found, counts.unmapped)
-        entries = (n + 1) * most_entries(model)  # one more, for `drop_vanishing`
-        if n >= self.problem.capacity or entries > self.problem.node.shape[0]:
-            self._allocate(2 * n, 2 * entries)
+        if room := self._room(n, most_entries(model, n, self.detection.buffer.n_listed)):
+            self._allocate(*room)
         problem = self.problem
         if model.has_dependents and n:
-            n = drop_vanishing(problem, model, surface, found, kept, n)
+            n = drop_vanishing(problem, model, surface, found, kept, n, 0)  # the past's entries are needed no more
         keep_impulses(problem, self.contact_offset)
         warm = dt / self._last_time if self._last_time > 0.0 else 0.0
         fill(problem, model, surface, shapes, self.numbers, found, kept, n, dt, warm)
@@ -250,10 +256,10 @@ class ContactStep:
         needed = renewal.look(self.problem, time, dt, x_start, displacement, self.contact_offset)
         if not needed:
             return False
-        entries = int(self.problem.count[2]) + (needed - self.n_contacts + 1) * most_entries(self.simulation.model)
-        if needed >= self.problem.capacity or entries > self.problem.node.shape[0]:
+        entries = most_entries(self.simulation.model, needed - self.n_contacts, self.detection.end.buffer.n_listed)
+        if room := self._room(needed, int(self.problem.count[2]) + entries):
             last_time, rows = self._last_time, read_rows(self.problem, MORE_ROWS)
-            self._allocate(2 * needed, 2 * entries)
+            self._allocate(*room)
             write_rows(self.problem, rows)
             index_nodes(self.problem)
             self._last_time, self._indexed = last_time, True

@@ -26,10 +26,10 @@ import taichi as ti
 
 from taisoft.backend.runtime import kernel
 from taisoft.collision.analytic import HALF_SPACE, rotation_rows
-from taisoft.collision.contacts import EDGE_EDGE, FACE_FACE, FACE_FIELD, VERTEX_FACE
+from taisoft.collision.contacts import EDGE_EDGE, FACE_FACE, FACE_FIELD, MORTAR, VERTEX_FACE
 from taisoft.collision.features import closest_lines
 from taisoft.collision.surface import dvec
-from taisoft.contact.build import enter_past, fill_row, offset_between, pair_slot, past_of
+from taisoft.contact.build import contact_offset_of, enter_past, fill_row, offset_between, pair_slot, past_of
 from taisoft.contact.problem import to_frame
 from taisoft.contact.prox import prox, tangent
 
@@ -107,6 +107,8 @@ def _found_motion(s: ti.template(), end: ti.template(), o: ti.template(), found:
         if found.nodes_b[row][0] < 0:
             k = _shape(o, found.body[row][1])
             d -= _shape_motion(o, k, found.point[row] - 0.5 * found.gap[row] * found.normal[row])
+    if found.is_mortar(row):
+        d += found.moved(row, end.x) - found.moved(row, s.x) - found.carried[row]
     return d
 
 
@@ -131,11 +133,17 @@ def _differs(n, gap, new_n, new_gap, offset):
 
 
 @ti.func
-def _nearest_present(p: ti.template(), body, point):
-    """The present contact of a pair of colliders that is nearest to a point (3,), -1 if there is none."""
+def _is_alike(kind, other):
+    """Whether both of two kinds of contacts are means over areas, or neither."""
+    return (kind == MORTAR) == (other == MORTAR)
+
+
+@ti.func
+def _nearest_present(p: ti.template(), kind, body, point):
+    """The present contact of a pair of colliders, of a like kind, that is nearest to a point (3,), -1 if there is none."""
     best, smallest = -1, ti.cast(ti.math.inf, ti.f64)
     for c in range(p.count[0]):
-        if (p.body[c] == body).all():
+        if _is_alike(kind, p.feature[c][0]) and (p.body[c] == body).all():
             d = p.point[c] - point
             if d.dot(d) < smallest:
                 best, smallest = c, d.dot(d)
@@ -144,15 +152,16 @@ def _nearest_present(p: ti.template(), body, point):
 
 @ti.func
 def _heir(p: ti.template(), found: ti.template(), kept: ti.template(), n, c):
-    """The accepted contact found of the pair of present contact c that is nearest to it, with nearly its normal, -1 for none; and
-    whether one is of the same vertex."""
+    """The accepted contact found of the pair of present contact c that is nearest to it, of a like kind and with nearly its
+    normal, -1 for none; and whether one is of the same vertex."""
     best, smallest, same = -1, ti.cast(ti.math.inf, ti.f64), False
     for b in range(n):
         row = kept[b]
         if p.renewal.match[b] != REJECTED and (found.body[row] == p.body[c]).all():
             if found.feature[row][0] == VERTEX_FACE and p.feature[c][0] == VERTEX_FACE:
                 same = same or found.feature[row][1] == p.feature[c][1]
-            if found.normal[row].dot(p.normal[c]) > ti.cast(SAME_NORMAL, ti.f64):
+            is_alike = _is_alike(found.feature[row][0], p.feature[c][0])
+            if is_alike and found.normal[row].dot(p.normal[c]) > ti.cast(SAME_NORMAL, ti.f64):
                 d = found.point[row] - p.point[c]
                 if d.dot(d) < smallest:
                     best, smallest = b, d.dot(d)
@@ -196,7 +205,7 @@ def _judge_present(
                 gap, n, _ = _gap_to_shape(p, o, c, k, x_start, displacement)
                 if gap > -ti.cast(TRUSTED_DEPTH, ti.f64) * margin:
                     fate = IN_PLACE
-                    motion, offset = _motion(p, c, displacement), offset_between(p.body[c], common_offset)
+                    motion, offset = _motion(p, c, displacement), contact_offset_of(p, c, common_offset)
                     if p.r[c][0] > 0.0 or gap < p.target[c]:
                         changed = _differs(p.normal[c], p.gap[c] + p.normal[c].dot(motion), n, gap, offset)
     p.renewal.fate[c] = fate
@@ -221,7 +230,7 @@ def _judge_found(
     geometry."""
     n, gap, body, changed = found.normal[row], found.gap[row], found.body[row], 0
     motion = _found_motion(s, end, o, found, row)
-    height, offset = gap - n.dot(motion), offset_between(body, common_offset)
+    height, offset = gap - n.dot(motion), offset_between(body, found.guard[row], common_offset)
     j, first = past_of(p, found.feature[row], found.point[row]), p.past.pair_slot[pair_slot(p, body)]
     match = j
     is_kept = gap < -ti.cast(TRUSTED_DEPTH, ti.f64) * margin
@@ -230,7 +239,7 @@ def _judge_found(
     lowest = -ti.cast(BEHIND, ti.f64) * _slip(motion, n) - floor
     nearest = j
     if j < 0 and (height < lowest or gap < offset):
-        nearest = _nearest_present(p, body, found.point[row])
+        nearest = _nearest_present(p, found.feature[row][0], body, found.point[row])
         if nearest >= 0:  # what is behind each other there may be so here
             lowest += ti.min(p.gap[nearest], 0.0)
     if is_kept or (j < 0 and height < lowest):
@@ -242,10 +251,14 @@ def _judge_found(
             match = NEW
         else:
             p.renewal.fate[j] = REPLACED
-            p.renewal.target[b] = p.target[j]
-            if p.r[j][0] > 0.0 or gap < p.target[j]:
-                old = _motion(p, j, displacement)
-                changed = _differs(p.normal[j], p.gap[j] + p.normal[j].dot(old), n, gap, offset)
+            p.renewal.target[b] = ti.min(p.target[j], offset)
+            old = _motion(p, j, displacement)
+            known = p.gap[j] + p.normal[j].dot(old)
+            counts = p.r[j][0] > 0.0 or gap < p.target[j]
+            if ti.static(found.has_mortar):  # a guard's target is so low that the gap found seldom violates it
+                counts = counts or known < p.target[j]
+            if counts:
+                changed = _differs(p.normal[j], known, n, gap, offset)
                 wall = found.nodes_b[row][0]
                 if wall >= 0 and s.node[ti.max(wall, 0)] >= 0:
                     changed |= int(_slip(old, n) > ti.cast(SHIFTED, ti.f64) * _finer_edge(s, body))
@@ -313,6 +326,7 @@ def _copy(p: ti.template(), c, to, first):
     p.obstacle_displacement[to], p.impact_impulse[to], p.r[to] = p.obstacle_displacement[c], p.impact_impulse[c], p.r[c]
     p.body[to], p.feature[to] = p.body[c], p.feature[c]
     p.gap[to], p.target[to], p.approach[to], p.load[to] = p.gap[c], p.target[c], p.approach[c], p.load[c]
+    p.area[to], p.guard[to] = p.area[c], p.guard[c]
     p.friction[to], p.restitution[to], p.min_opening[to] = p.friction[c], p.restitution[c], p.min_opening[c]
     for k in range(p.arity[c]):
         at, e = first + k, p.first[c] + k

@@ -122,6 +122,8 @@ def _relative_displacement(s: ti.template(), o: ti.template(), found: ti.templat
             displacement += found.weights_a[at][j] * s.move[found.nodes_a[at][j]]
         if found.nodes_b[at][j] >= 0:
             displacement -= found.weights_b[at][j] * s.move[found.nodes_b[at][j]]
+    if found.is_mortar(at):
+        displacement += found.moved(at, s.move) - found.carried[at]
     return displacement
 
 

@@ -23,10 +23,11 @@ import taichi as ti
 
 from taisoft.backend.arrays import FieldArena
 from taisoft.backend.runtime import kernel
-from taisoft.collision.contacts import EDGE_EDGE, FACE_FACE, VERTEX_FACE
+from taisoft.collision.contacts import EDGE_EDGE, FACE_FACE, MORTAR, VERTEX_FACE
 from taisoft.collision.detector import Detection
 from taisoft.collision.end_normals import nearest_of_edges, normal_at, normal_on_shape
 from taisoft.collision.features import FLAT_COSINE
+from taisoft.collision.mortar import SAME_CLUSTER
 from taisoft.collision.passages import ADJACENT, N_FEATURES, N_KINDS, NEAR
 from taisoft.collision.surface import dvec
 from taisoft.contact.build import relative_velocity
@@ -73,7 +74,29 @@ def _normal_on_shape(p: ti.template(), m: ti.template(), o: ti.template(), c, la
 
 
 @ti.func
-def _end_normal(p: ti.template(), m: ti.template(), s: ti.template(), o: ti.template(), c, lasting):
+def _mortar_normal(p: ti.template(), overlay: ti.template(), found: ti.template(), c):
+    """Normal (3,) of mortar contact c in the last search; its own if it was not found there with nearly that."""
+    own, best = p.normal[c], ti.cast(SAME_CLUSTER, ti.f64)
+    end = 1.0 * own
+    first, n = overlay.contacts[p.feature[c][1]][0], overlay.contacts[p.feature[c][1]][1]
+    for row in range(first, first + n):
+        along = found.normal[row].dot(own)
+        if (found.body[row] == p.body[c]).all() and along > best:
+            end, best = found.normal[row], along
+    return end
+
+
+@ti.func
+def _end_normal(
+    p: ti.template(),
+    m: ti.template(),
+    s: ti.template(),
+    o: ti.template(),
+    overlay: ti.template(),
+    found: ti.template(),
+    c,
+    lasting,
+):
     """Normal (3,) of contact c at the present positions, its gap [m], and whether its point lies on a smooth part of a surface
     now, and did at first. lasting: what the gap counts as where the normal does not change [m]."""
     kind, one, other, n = p.feature[c][0], p.feature[c][1], p.feature[c][2], p.normal[c]
@@ -93,6 +116,9 @@ def _end_normal(p: ti.template(), m: ti.template(), s: ti.template(), o: ti.temp
             vertex, face = s.triangle[t, k], u
         else:
             vertex, face, side = s.triangle[u, k - 3], t, -side
+    elif kind == MORTAR:
+        if ti.static(found.has_mortar):
+            end = _mortar_normal(p, overlay, found, c)
     elif kind != FACE_FACE or one % N_KINDS != ADJACENT:
         end, gap, is_smooth, was_smooth = _normal_on_shape(p, m, o, c, lasting)
     own, foot, first, second, n_points = dvec(0.0), dvec(0.0), face, -1, int(vertex >= 0)
@@ -128,6 +154,8 @@ def _false_work(
     m: ti.template(),
     s: ti.template(),
     o: ti.template(),
+    overlay: ti.template(),
+    found: ti.template(),
     has_pairs: ti.template(),
     c,
     dt,
@@ -142,7 +170,7 @@ def _false_work(
     if slip.norm() > ti.cast(AT_REST, ti.f64) * contact_offset and not (passes == 1 and p.feature[c][0] == FACE_FACE):
         end, gap, is_smooth, was_smooth = 1.0 * n, lasting, True, True
         if ti.static(has_pairs):
-            end, gap, is_smooth, was_smooth = _end_normal(p, m, s, o, c, lasting)
+            end, gap, is_smooth, was_smooth = _end_normal(p, m, s, o, overlay, found, c, lasting)
         else:
             end, gap, is_smooth, was_smooth = _normal_on_shape(p, m, o, c, lasting)
         left = ti.select(was_smooth, ti.cast(0.0, ti.f64), ti.cast(LEFT, ti.f64) * slip.norm())
@@ -158,6 +186,8 @@ def add_step(
     m: ti.template(),
     s: ti.template(),
     o: ti.template(),
+    overlay: ti.template(),
+    found: ti.template(),
     has_pairs: ti.template(),
     dt: ti.f64,
     contact_offset: ti.f64,
@@ -166,8 +196,8 @@ def add_step(
     n_rows: ti.i32,
     passes: ti.i32,
 ) -> ti.i32:
-    """Add a step of dt [s] to the sums (n_rows,9) of pairs. has_pairs: whether contacts may be of two triangles; passes: 1 if the
-    substep found passages.
+    """Add a step of dt [s] to the sums (n_rows,9) of pairs. overlay, found: those of the search at its end; has_pairs: whether
+    contacts may be of two triangles; passes: 1 if the substep found passages.
 
     Return the row of the pair of the largest misplaced part among those that touch, -1 if none does, -2 without change if there
     are too few rows. p.sweep.sweep_start is used as workspace.
@@ -176,7 +206,7 @@ def add_step(
     for c in range(p.count[0]):
         p.sweep.sweep_start[c] = dvec(0.0)
         if p.r[c][0] > 0.0:
-            p.sweep.sweep_start[c] = _false_work(p, m, s, o, has_pairs, c, dt, contact_offset, passes)
+            p.sweep.sweep_start[c] = _false_work(p, m, s, o, overlay, found, has_pairs, c, dt, contact_offset, passes)
     worst = -1
     ti.loop_config(serialize=True)
     for _ in range(1):
@@ -242,7 +272,8 @@ class Misplacement:
     def add(self, problem: ContactProblem, dt: float, contact_offset: float, passes: bool) -> None:
         """Add a substep of dt [s], whose end was searched last; passes: whether passages were found in it."""
         detection, now, n = self._detection, self._simulation.now, len(self._detection.scene.colliders)
-        records = problem, self._simulation.model, detection.surface, detection.shapes, detection.has_pairs
+        last = detection.surface, detection.shapes, detection.overlay, detection.buffer.data, detection.has_pairs
+        records = problem, self._simulation.model, *last
         self._store(now.misplaced)
         while (row := add_step(*records, dt, contact_offset, n, self._sums, self._sums.shape[0], int(passes))) == -2:
             self._store(np.concatenate([self._sums.to_numpy(), np.resize(NO_SUMS, self._sums.shape)]))

@@ -8,14 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from taisoft.backend.arrays import download
-from taisoft.collision.contacts import Contacts, named_contacts
-from taisoft.contact.problem import NODES, ContactProblem, fill_rows, read_entries
-from taisoft.ranges import expand
+from taisoft.collision.contacts import Contacts, in_columns, named_contacts
+from taisoft.contact.problem import ContactProblem, fill_rows, read_entries
 from taisoft.scene.scene import Scene
 
 Pairs = tuple[np.ndarray, np.ndarray]  # colliders (k,2), the lower index first, and their sums (k,13), see `sum_pairs`
 IMPULSE, MOMENTS, SLIP, NORMAL = slice(0, 3), (slice(3, 6), slice(6, 9)), slice(9, 12), slice(12, 13)  # columns
-ROWS = "normal tangent r impact_impulse arity arity_a point gap body feature factor".split()  # what a later step needs
+ROWS = "normal tangent r impact_impulse arity arity_a point gap area guard body feature factor".split()  # what a later step needs
 MORE_ROWS = [*ROWS, *"friction restitution obstacle_displacement approach load target min_opening".split()]
 
 
@@ -31,11 +30,13 @@ class ContactRows:
     impulse: np.ndarray  # (k,3) on a [N s]
     nodes: np.ndarray  # (k, 2 w), w of each side, -1 where there is none
     weights: np.ndarray  # (k, 2 w)
+    guard: np.ndarray  # (k,) as of `Contacts`
+    area: np.ndarray  # (k,) of mortar contacts, else 0 [m^2]
 
     def named(self, scene: Scene, **counts) -> Contacts:
         """Return the record by names. counts: `found`, `unmapped` and `duration` of a `Contacts`."""
         geometry = self.point, self.normal, self.gap, self.impulse, self.collider, self.feature, self.nodes, self.weights
-        return named_contacts(scene, *geometry, **counts)
+        return named_contacts(scene, *geometry, self.guard, self.area, **counts)
 
 
 def read_contacts(problem: ContactProblem, impulse_fraction: float) -> ContactRows:
@@ -43,8 +44,12 @@ def read_contacts(problem: ContactProblem, impulse_fraction: float) -> ContactRo
     rows = read_rows(problem)
     normal, tangent, r = rows["normal"], rows["tangent"], rows["r"] / impulse_fraction + rows["impact_impulse"]
     impulse = r[:, :1] * normal + r[:, 1:2] * tangent + r[:, 2:] * np.cross(normal, tangent)
-    nodes, weights = _sides(*(rows[name] for name in ("arity", "arity_a", "node", "weight")))
-    return ContactRows(rows["body"], rows["feature"], rows["point"], normal, rows["gap"], impulse, nodes, weights)
+    nodes, weights = in_columns(*(rows[name] for name in ("arity", "arity_a", "node", "weight")))
+    on_b = slice(weights.shape[1] // 2, None)
+    weights[:, on_b] = 0.0 - weights[:, on_b]
+    return ContactRows(
+        rows["body"], rows["feature"], rows["point"], normal, rows["gap"], impulse, nodes, weights, rows["guard"], rows["area"]
+    )
 
 
 def sum_pairs(
@@ -100,17 +105,6 @@ def nodal_impulses(contacts: Contacts | ContactRows, n_nodes: int) -> np.ndarray
     for axis in range(3):
         total[:, axis] = np.bincount(nodes[used], parts[used][:, axis], n_nodes)
     return total
-
-
-def _sides(arity: np.ndarray, arity_a: np.ndarray, node: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return nodes and weights (k, 2 w) of contacts from their rows, w of each side; the weights of side b change their sign."""
-    contact, place = expand(np.zeros_like(arity), arity)
-    half = max(NODES // 2, arity_a.max(initial=0), (arity - arity_a).max(initial=0))
-    nodes, weights = np.full((len(arity), 2 * half), -1), np.zeros((len(arity), 2 * half))
-    on_b = place >= arity_a[contact]
-    at = contact, place + on_b * (half - arity_a[contact])
-    nodes[at], weights[at] = node, np.where(on_b, -weight, weight)
-    return nodes, weights
 
 
 def read_rows(problem: ContactProblem, names: list[str] = ROWS) -> dict[str, np.ndarray]:

@@ -56,7 +56,7 @@ class Renewal:
         model, detection, end = self._model, self._detection, self._found
         s, shapes, (surface, found, kept, n) = detection.surface, detection.shapes, end.found
         if model.has_dependents and n:
-            n = drop_vanishing(problem, model, s, found, kept, n)
+            n = drop_vanishing(problem, model, s, found, kept, n, problem.count[2])
         lengths = dt, offset, detection.margin, detection.floor
         if not judge(problem, s, surface, shapes, x_start, displacement, found, kept, n, *lengths):
             return False
@@ -71,5 +71,10 @@ class Renewal:
         end, (fate,) = self._found, download([problem.renewal.fate], problem.count[0])
         rows = end.reduction.work.kept.to_numpy(n)[problem.renewal.match.to_numpy(n) != REJECTED]
         stay = np.isin(fate, (KEPT, IN_PLACE))
-        new = self._detection.sides(rows, end.buffer.data)
-        self.sides = tuple(np.concatenate([own[: len(stay)][stay], more]) for own, more in zip(self.sides, new))
+        new, merged = self._detection.sides(rows, end.buffer.data), []
+        for k, none in enumerate((-1, 0)):
+            parts = [part.reshape(len(part), 2, part.shape[1] // 2) for part in (self.sides[k][: len(stay)][stay], new[k])]
+            width = max(part.shape[2] for part in parts)
+            parts = [np.pad(part, ((0, 0), (0, 0), (0, width - part.shape[2])), constant_values=none) for part in parts]
+            merged.append(np.concatenate(parts).reshape(-1, 2 * width))
+        self.sides = tuple(merged)

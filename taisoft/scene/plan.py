@@ -150,6 +150,10 @@ def _add_collision(plan: Plan, scene: Scene, self_collision: bool) -> None:
     fields, near = modes["distance_field"], modes["proximity"]
     plan.add("distance_fields", bool(fields), "hits " + ", ".join(fields), idle + ("proximity" if hit else ""))
     plan.add("proximity", bool(near), "hits " + ", ".join(near), idle + ("its distance field" if hit else ""))
+    meshes = [b.name for b in (scene.bodies if self_collision else hit) if b.contact_mode == "proximity"]
+    n_meshes = len(meshes) + sum(isinstance(o.shape, MeshObstacle) for o in obstacles)
+    meet = bool(meshes) and (self_collision or n_meshes > 1)
+    plan.add("mortar", meet, f"mean gaps of {_shorten(meshes)} to meshes", "no two meshes hit by proximity can touch")
     plan.add("self_collision", self_collision, "requested", "not requested")
     several = len(scene.colliders) > 1
     plan.add(

@@ -22,6 +22,7 @@ def test_features_and_reasons_of_a_scene():
         "fixed_nodes": "on beam, block, tower",
         "mass_damping": "material of beam, tower",
         "proximity": "hits beam, block, tower, flyer",
+        "mortar": "mean gaps of beam, block, tower and 1 more to meshes",
     }
     assert found["contact_forces"][1] == "the scene's contact_forces are off"
     connected = entries(connected_scene(damping=2.0))
@@ -81,6 +82,7 @@ def test_contact_features_are_on_if_something_can_touch():
     assert two["distance_fields"][1] == "hits ball (requested)" and two["proximity"][1] == "hits block (requested), sheet"
     meshed = contact_plan([ball], [ts.MeshObstacle(*box.surface())])
     assert meshed["proximity"] == (True, "hits obstacle0 (triangles)") and meshed["distance_fields"][0]
+    assert two["mortar"] == (True, "mean gaps of block, sheet to meshes") and not (boxed["mortar"][0] or meshed["mortar"][0])
     itself = contact_plan([("ball", "auto")], self_collision=True)
     assert itself["proximity"] == (True, "hits every body (itself)") and itself["self_collision"] == (True, "requested")
     assert itself["contact_forces"] == (True, "it can touch itself")

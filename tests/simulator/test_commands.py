@@ -90,14 +90,14 @@ def test_checkpoints_and_rebuild_continue_commands_and_reset_forgets_them(kind, 
     sim.save_checkpoint(tmp_path / "kept.npz")
     rest = follow(sim, 1)
     sim.rebuild()  # without the integrator's history
-    command(sim, sideways(6 * DT))
+    command(sim, sideways(7 * DT), seconds=2 * DT)  # still moves at the end, and so presses
     followed = follow(sim, 2)
-    assert np.allclose(sim.pose("wall").translation, sideways(6 * DT), rtol=0, atol=1e-15), "a pose holds"
-    assert np.allclose(sim.pose("tool").translation, sideways(6 * DT), rtol=0, atol=1e-12)
+    assert np.allclose(sim.pose("wall").translation, sideways(7 * DT), rtol=0, atol=1e-15), "a pose holds"
+    assert np.allclose(sim.pose("tool").translation, sideways(7 * DT), rtol=0, atol=1e-12)
     with ts.Simulator.load_checkpoint(tmp_path / "kept.npz", scene()) as loaded:
         assert same(follow(loaded, 1), rest)
         loaded.rebuild()
-        command(loaded, sideways(6 * DT))
+        command(loaded, sideways(7 * DT), seconds=2 * DT)
         assert same(follow(loaded, 2), followed)
         loaded.reset()
         assert all(np.abs(loaded.pose(name).translation).max() < 1e-15 for name in ("wall", "tool"))

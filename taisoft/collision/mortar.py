@@ -1,0 +1,252 @@
+"""Mortar contacts between two meshes: gaps in the mean around a node, which can carry any uniform pressure.
+
+For a corner node j of the *slave* surface, which has the closer corner nodes, with hat function h_j,
+    A_j = sum w h_j,   gap = n . sum w h_j (x_s - x_m) / A_j,   W_j = sum w h_j (N_s, -N_m) / A_j,
+where the sums are integrals over the overlay of both surfaces (`overlay`) and N their shape functions, quadratic ones on faces
+of second order. n is the mean normal. The impulses p A_j dt give the nodal forces of the pressure p on both sides. A mean does
+not keep each point apart: contacts of vertices and edges remain as *guards*, at part of the contact offset.
+
+A node has a contact for each master and each cluster of normals. Where hardly any of the faces around a node is covered, its hat
+function passes to other nodes.
+
+Source: Puso, Laursen 2004, A mortar segment-to-segment contact method (there with one averaged law and no guards).
+"""
+
+import taichi as ti
+
+from taisoft.backend.lists import part_first
+from taisoft.backend.runtime import kernel
+from taisoft.collision.candidates import NEEDED, sum_parts, visit_near
+from taisoft.collision.contacts import EDGE_EDGE, MORTAR, VERTEX_FACE, write_contact
+from taisoft.collision.features import choose, unit
+from taisoft.collision.overlay import face_vertex, n_face, on_face, shape
+from taisoft.collision.surface import dvec, ivec
+
+LEAST_COVERED = 0.2  # of the faces around a node: where less is, contacts of several nodes would be nearly the same
+SAME_CLUSTER = 0.9  # cosine between normals of points of one contact
+MAX_CLUSTERS = 8  # contacts of one node; what exceeds them is left to the guards
+
+
+@ti.func
+def _add_face(s: ti.template(), overlay: ti.template(), out: ti.template(), t, b, weight, first, n_before, end):
+    """Add a weight at barycentric coordinates b (3,) of the face of triangle t to its vertices among entries `first` to
+    n_before - 1 of the list, or as new ones if they fit before `end`. Return the new end of the entries, which may be more."""
+    n = n_before
+    for node in range(n_face(overlay, t)):
+        vertex, part = face_vertex(s, overlay, t, node), weight * shape(overlay, t, b, node)
+        k = ti.min(n, end) - 1  # backwards, since neighbours share vertices
+        while k >= first and out.vertex[ti.max(k, first)] != vertex:
+            k -= 1
+        if k >= first:
+            out.weight[k] = out.weight[k] + part
+        else:
+            if n < end:
+                out.vertex[n], out.weight[n] = vertex, part
+            n += 1
+    return n
+
+
+@ti.func
+def _corner_of(s: ti.template(), overlay: ti.template(), t, i):
+    """Number of corner node i in the face of triangle t, -1 if t does not lie at that corner of a face."""
+    found = -1
+    for k in range(3):
+        if s.triangle[t, k] == i and (overlay.quarter[t] < 0 or overlay.quarter[t] == k):
+            found = k
+    return found
+
+
+@ti.func
+def _coverage(s: ti.template(), overlay: ti.template(), points: ti.template(), i):
+    """Part of the faces around slave node i that is covered, those without any point left out."""
+    covered, whole = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64)
+    for r in range(s.ring_start[i], s.ring_start[i + 1]):
+        j, base, n_parts = _corner_of(s, overlay, s.ring[r], i), s.ring[r], 1
+        if overlay.quarter[base] >= 0:
+            base, n_parts = base - overlay.quarter[base], 4
+        n, face = 0, ti.cast(0.0, ti.f64)
+        for t in range(base, ti.select(j < 0, base, base + n_parts)):
+            n, face = n + overlay.count[t], face + s.area[t]
+            for e in range(overlay.first[t], overlay.first[t] + overlay.count[t]):
+                b = points.slave[e]
+                covered += points.share[e] * points.area[e] * choose(j, b[0], b[1], b[2])
+        if n > 0:
+            whole += face / 6.0
+    return covered / whole
+
+
+@ti.func
+def _hat(s: ti.template(), overlay: ti.template(), t, b, j):
+    """Hat function of corner j of the face of triangle t at barycentric coordinates b (3,). Those of corners that are hardly
+    covered pass to the others, or all to the one that is covered most, so that their sum stays 1."""
+    total, most, best = ti.cast(0.0, ti.f64), ti.cast(-1.0, ti.f64), 0
+    for k in range(3):
+        coverage = overlay.coverage[face_vertex(s, overlay, t, k)]
+        if coverage >= ti.cast(LEAST_COVERED, ti.f64):
+            total += choose(k, b[0], b[1], b[2])
+        if coverage > most:
+            best, most = k, coverage
+    result = ti.cast(0.0, ti.f64)
+    if most < ti.cast(LEAST_COVERED, ti.f64):
+        result = ti.select(best == j, ti.cast(1.0, ti.f64), ti.cast(0.0, ti.f64))
+    elif overlay.coverage[face_vertex(s, overlay, t, j)] >= ti.cast(LEAST_COVERED, ti.f64):
+        result = choose(j, b[0], b[1], b[2]) / total
+    return result
+
+
+@ti.func
+def _belongs(seeds: ti.template(), k, n_seeds, other, n):
+    """Whether a point with normal n (3,) on collider `other` belongs to contact k: the first, or a new one, with such a seed."""
+    first = n_seeds
+    for z in range(n_seeds):
+        along = n[0] * seeds[z, 0] + n[1] * seeds[z, 1] + n[2] * seeds[z, 2]
+        if first == n_seeds and seeds[z, 3] == other and along > ti.cast(SAME_CLUSTER, ti.f64):
+            first = z
+    return first == k
+
+
+@ti.func
+def _node_contacts(
+    s: ti.template(),
+    overlay: ti.template(),
+    points: ti.template(),
+    move: ti.template(),
+    i,
+    out: ti.template(),
+    start,
+    end,
+    begin,
+    list_end,
+):
+    """Write the contacts of slave node i to out[start:end], and their vertices to the list from `begin` to list_end. Return both
+    new counts."""
+    at, last, k, n_seeds = start, begin, 0, 0
+    seeds = ti.Matrix.zero(ti.f64, MAX_CLUSTERS + 1, 4)  # a normal and the master of each contact
+    own = s.body[s.ring[s.ring_start[i]]]
+    while k == n_seeds and k < MAX_CLUSTERS:
+        other, opposite, first, n_first = -1, -1, last, 0
+        area, total, normal, apart, carried = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64), dvec(0.0), dvec(0.0), dvec(0.0)
+        for side in range(2):  # a and b
+            side_first = last
+            for r in range(s.ring_start[i], s.ring_start[i + 1]):
+                j, base, n_parts = _corner_of(s, overlay, s.ring[r], i), s.ring[r], 1
+                if overlay.quarter[base] >= 0:
+                    base, n_parts = base - overlay.quarter[base], 4
+                for t in range(base, ti.select(j < 0, base, base + n_parts)):
+                    for e in range(overlay.first[t], overlay.first[t] + overlay.count[t]):
+                        u, n, b = points.triangle[e], points.normal[e], points.slave[e]
+                        hat = _hat(s, overlay, t, b, j)
+                        if hat > 0.0 and _belongs(seeds, k, n_seeds, s.body[u], n):
+                            if k == n_seeds:
+                                other, opposite = s.body[u], s.triangle[u, 0]
+                                seeds[k, 0], seeds[k, 1], seeds[k, 2], seeds[k, 3] = n[0], n[1], n[2], other
+                                n_seeds += 1
+                            w, is_master = points.share[e] * points.area[e] * hat, (side == 0) == (own > other)
+                            if side == 0:
+                                area += points.area[e] * hat
+                                total, normal, apart = total + w, normal + w * n, apart + w * points.apart[e]
+                            if is_master and s.node[opposite] < 0:
+                                carried += w * on_face(s, overlay, u, points.master[e], move)
+                            elif is_master:
+                                last = _add_face(s, overlay, out, u, points.master[e], w, side_first, last, list_end)
+                            else:
+                                last = _add_face(s, overlay, out, t, b, w, side_first, last, list_end)
+            if side == 0:
+                n_first = last - first
+        if k < n_seeds:
+            n, point, zero = unit(normal), dvec(0.0), dvec(0.0)
+            for e in range(first, ti.min(last, list_end)):
+                out.weight[e] = out.weight[e] / total
+                if (e - first < n_first) == (own <= other):
+                    point += out.weight[e] * s.x[out.vertex[e]]
+            # a vertex of either side, without weight, says which collider it is
+            one, far = ivec(i, -1, -1), ivec(ti.select(own == other, i, opposite), -1, -1)
+            write_contact(out, at, end, own, other, ivec(MORTAR, i, other), point, n, apart.dot(n) / total, one, zero, far, zero)
+            if at < end:
+                out.entries[at], out.area[at], out.carried[at] = ivec(first, n_first, last - first), area, carried / total
+            at += 1
+        k += 1
+    return at, last
+
+
+@ti.func
+def _write_contacts(
+    s: ti.template(), overlay: ti.template(), points: ti.template(), move: ti.template(), lists: ti.template(), out: ti.template()
+):
+    """Append the contacts of all slave nodes to the buffer. A top-level loop of a kernel."""
+    ti.loop_config(serialize=s.serial)
+    for task in range(s.chunks * s.spread):
+        if task % s.spread == 0:
+            c = task // s.spread
+            at, end = c * out.part + out.used[c], (c + 1) * out.part
+            last, list_end = c * lists.part, (c + 1) * lists.part
+            if points.count[NEEDED] <= points.part:  # else the search is repeated
+                for i in range(part_first(c, s.n_verts, s.chunks), part_first(c + 1, s.n_verts, s.chunks)):
+                    if overlay.is_slave[i] == 1:
+                        before = at
+                        at, last = _node_contacts(s, overlay, points.data, move, i, out.data, at, end, last, list_end)
+                        overlay.contacts[i] = ti.Vector([before, at - before], ti.i32)
+            out.used[c], lists.used[c] = at - c * out.part, last - c * lists.part
+
+
+@ti.func
+def _is_beside(s: ti.template(), overlay: ti.template(), out: ti.template(), nodes, other):
+    """Whether a corner node of the faces at one of three vertices (-1 for none) has a mortar contact with collider `other`."""
+    found = False
+    for k in ti.static(range(3)):
+        if nodes[k] >= 0:
+            t = s.ring[s.ring_start[nodes[k]]]
+            for j in range(ti.select(overlay.quarter[t] < 0, 1, 3)):
+                i = nodes[k]
+                if overlay.quarter[t] >= 0:
+                    i = face_vertex(s, overlay, t, j)
+                for row in range(overlay.contacts[i][0], overlay.contacts[i][0] + overlay.contacts[i][1]):
+                    found = found or out.feature[row][2] == other
+    return found
+
+
+@kernel(cse=False)
+def find_mortar(
+    surface: ti.template(),
+    near: ti.template(),
+    row: ti.template(),
+    overlay: ti.template(),
+    points: ti.template(),
+    move: ti.template(),
+    lists: ti.template(),
+    out: ti.template(),
+):
+    """Append the mortar contacts to those by proximity in `out`, and mark which of these are guards.
+
+    near, row: as for `visit_near`; overlay: an Overlay; points: its buffer; move: displacements of vertices in the step [m], of
+    which those of obstacles are read; lists: buffer of the vertices of `out`.
+    """
+    ti.loop_config(serialize=surface.serial_cheap)
+    for t in range(surface.n_triangles):
+        overlay.count[t] = 0
+    ti.loop_config(serialize=surface.serial_cheap)
+    for i in range(surface.n_verts):
+        overlay.is_slave[i], overlay.contacts[i] = 0, ti.Vector([0, 0], ti.i32)
+    ti.loop_config(serialize=True)
+    for c in range(points.chunks):
+        points.used[c] = 0
+    visit_near(surface, near, row, overlay, points, 1)  # keeps what the search by proximity needs of `row`
+    sum_parts(points)
+    ti.loop_config(serialize=surface.serial_cheap)
+    for i in range(surface.n_verts):
+        if overlay.is_slave[i] == 1 and points.count[NEEDED] <= points.part:
+            overlay.coverage[i] = _coverage(surface, overlay, points.data, i)
+    _write_contacts(surface, overlay, points, move, lists, out)
+    ti.loop_config(serialize=surface.serial_cheap)
+    for task in range(out.chunks * surface.cheap_spread):
+        if task % surface.cheap_spread == 0:
+            c = task // surface.cheap_spread
+            for at in range(c * out.part, c * out.part + ti.min(out.used[c], out.part)):
+                kind, body = out.data.feature[at][0], out.data.body[at]
+                if kind == VERTEX_FACE or kind == EDGE_EDGE:
+                    of_a = _is_beside(surface, overlay, out.data, out.data.nodes_a[at], body[1])
+                    of_b = _is_beside(surface, overlay, out.data, out.data.nodes_b[at], body[0])
+                    out.data.guard[at] = int(of_a or of_b)
+    sum_parts(lists)
+    sum_parts(out)
+    sum_parts(row)
