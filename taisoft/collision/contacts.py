@@ -22,9 +22,9 @@ from taisoft.scene.scene import Scene
 # kinds of contacts; their two ids are: vertex and triangle; edge and edge (3 triangle + local edge); vertex and collider;
 # triangle and collider; a passage (`passages`); vertex and collider (`mortar`)
 VERTEX_FACE, EDGE_EDGE, VERTEX_FIELD, FACE_FIELD, FACE_FACE, MORTAR = range(6)
+KINDS = ("vertex_face", "edge_edge", "vertex_field", "face_field", "face_face", "mortar")
 # capacity for vertices of mortar contacts, over that for contacts: at first; at most, since a list that does not fit is overrated
 LISTED, MOST_LISTED = 8, 64
-KINDS = ("vertex_face", "edge_edge", "vertex_field", "face_field", "face_face", "mortar")
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,9 +43,7 @@ class ContactFields:
     guard: Any  # i32: 1 where a mortar contact carries the load
     area: Any  # f64: of mortar contacts, 0 for others [m^2]
     carried: Any  # 3-vectors f64: of mortar contacts, displacement of the obstacle in the step [m]
-    entries: (
-        Any  # 3-vectors i32: of mortar contacts, the first of their vertices in `vertex`, how many are of side a, and of both
-    )
+    entries: Any  # 3-vectors i32: of mortar contacts, the first of their vertices, how many are of side a, and of both
     vertex: Any = None  # i32; None if there can be no mortar contacts
     weight: Any = None  # f64: of those vertices, with a sum of 1 on each side
 

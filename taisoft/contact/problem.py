@@ -96,7 +96,7 @@ class ContactProblem:
     arity: Any = None  # i32: number of its entries
     arity_a: Any = None  # i32: of these, the first ones, which belong to side a
     node: Any = None  # (n_entries) i32
-    weight: Any = None  # (n_entries) f64: positive on side a, negative on side b, unless nodes depend on others
+    weight: Any = None  # (n_entries) f64: of side a those of its point, of side b minus those
     contact: Any = None  # (n_entries) i32
     room: Lists | None = None  # of rows, see `build.fill`
     normal: Any = None  # 3-vectors: from b to a
