@@ -115,7 +115,7 @@ class Detection:
         if self._plan["mortar"]:
             quadratic = np.array([b.order == 2 and b.nodes.embedded is None for b in bodies] + [False] * len(obstacles))
             limit = None if settings.max_capacity is None else POINTS * settings.max_capacity
-            self.overlay = build_overlay(arena, self.edges, self.topology.first, quadratic, s.n_verts)
+            self.overlay = build_overlay(arena, s.x, self.edges, self.topology.first, quadratic)
             self._points = Buffer("overlay_points", overlay_points, POINTS * capacity, limit, s.chunks, arena)
         self.buffer = ContactBuffer("contacts", capacity, settings.max_capacity, s.chunks, arena, self.overlay is not None)
         self._lengths = MERGED * self.edge, REDUCTION_CELL * self.edge
@@ -176,6 +176,9 @@ class Detection:
         """
         self._move(time, dt, prescribed, path)
         self._broad_result = self._near()
+        depth = self.floor if none_cross else np.inf
+        if self.overlay is not None and self.overlay.behind[0] != depth:
+            self.overlay.behind[0] = depth
         self._search(self._broad_result, held)
         self._reduction.reduce(-self.floor if none_cross else -np.inf)  # if none cross, a vertex behind a face is not inside
         self._count()

@@ -6,8 +6,8 @@ where the sums are integrals over the overlay of both surfaces (`overlay`) and N
 of second order. n is the mean normal. The impulses p A_j dt give the nodal forces of the pressure p on both sides. A mean does
 not keep each point apart: contacts of vertices and edges remain as *guards*, at part of the contact offset.
 
-A node has a contact for each master and each cluster of normals. Where hardly any of the faces around a node is covered, its hat
-function passes to other nodes.
+A node has a contact for each master and each cluster of normals, unless the gap stays large in the step. Where hardly any of the
+faces around a node is covered, its hat function passes to other nodes.
 
 Source: Puso, Laursen 2004, A mortar segment-to-segment contact method (there with one averaged law and no guards).
 """
@@ -24,6 +24,7 @@ from taisoft.collision.surface import dvec, ivec
 
 LEAST_COVERED = 0.2  # of the faces around a node: where less is, contacts of several nodes would be nearly the same
 SAME_CLUSTER = 0.9  # cosine between normals of points of one contact
+FARTHEST = 0.2  # of the margin: mean gap in the step beyond which there is no contact
 MAX_CLUSTERS = 8  # contacts of one node; what exceeds them is left to the guards
 
 
@@ -125,7 +126,8 @@ def _node_contacts(
     own = s.body[s.ring[s.ring_start[i]]]
     while k == n_seeds and k < MAX_CLUSTERS:
         other, opposite, first, n_first = -1, -1, last, 0
-        area, total, normal, apart, carried = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64), dvec(0.0), dvec(0.0), dvec(0.0)
+        area, total, nearest = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64)
+        normal, apart, carried = dvec(0.0), dvec(0.0), dvec(0.0)
         for side in range(2):  # a and b
             side_first = last
             for r in range(s.ring_start[i], s.ring_start[i + 1]):
@@ -143,7 +145,7 @@ def _node_contacts(
                                 n_seeds += 1
                             w, is_master = points.share[e] * points.area[e] * hat, (side == 0) == (own > other)
                             if side == 0:
-                                area += points.area[e] * hat
+                                area, nearest = area + points.area[e] * hat, nearest + w * points.nearest[e]
                                 total, normal, apart = total + w, normal + w * n, apart + w * points.apart[e]
                             if is_master and s.node[opposite] < 0:
                                 carried += w * on_face(s, overlay, u, points.master[e], move)
@@ -153,7 +155,9 @@ def _node_contacts(
                                 last = _add_face(s, overlay, out, t, b, w, side_first, last, list_end)
             if side == 0:
                 n_first = last - first
-        if k < n_seeds:
+        if k < n_seeds and nearest > ti.cast(FARTHEST, ti.f64) * total * s.margin[0]:
+            last = first
+        elif k < n_seeds:
             n, point, zero = unit(normal), dvec(0.0), dvec(0.0)
             for e in range(first, ti.min(last, list_end)):
                 out.weight[e] = out.weight[e] / total

@@ -3,7 +3,8 @@
 A triangle of the slave is projected on the plane of one of the master, along whose normal gaps are measured: so a slave that
 slides does not change them. Three points with the centroid and covariance of the intersection integrate exactly to degree 2.
 A face of second order is four triangles; points have coordinates in the whole face. They count less from half the margin on and
-not at all beyond it, nor where they are too deep.
+not at all beyond it, nor where they are too deep, or were behind each other at the step's start: so no far side of a flattened
+body counts.
 """
 
 from dataclasses import dataclass
@@ -21,6 +22,7 @@ from taisoft.collision.vertex_face import max_self_depth
 FACING = -0.9  # cosine between normals of triangles that face each other
 MAX_DEPTH = 0.1  # of an overlay's width: deeper surfaces meet elsewhere first
 TINY = 1e-7  # of a triangle's area: smaller overlays are rounding
+BEHIND = 0.3  # of the slip: how far sides that meet in front of each other may have been behind each other at the start
 MAX_CORNERS = 8  # of an intersection, which has six at most but for rounding
 
 dvec2 = ti.types.vector(2, ti.f64)
@@ -36,20 +38,23 @@ class Points:
     normal: Any  # 3-vectors f64: of the master
     slave: Any  # 3-vectors f64: barycentric coordinates in the slave face,
     master: Any  # 3-vectors f64: and in the master face
+    nearest: Any  # f64: least gap in the step [m]
     apart: Any  # 3-vectors f64: from the point of the master to that of the slave [m]
 
 
 def overlay_points(arena: FieldArena, capacity: int) -> Points:
     """Allocate a buffer."""
-    scalars = (arena.field(f"overlay_{name}", ti.f64, capacity) for name in ("area", "share"))
-    vectors = (arena.vectors(f"overlay_{name}", ti.f64, capacity) for name in ("normal", "slave", "master", "apart"))
-    return Points(arena.field("overlay_triangle", ti.i32, capacity), *scalars, *vectors)
+    fields = {name: arena.field(f"overlay_{name}", ti.f64, capacity) for name in ("area", "share", "nearest")}
+    fields |= {name: arena.vectors(f"overlay_{name}", ti.f64, capacity) for name in ("normal", "slave", "master", "apart")}
+    return Points(arena.field("overlay_triangle", ti.i32, capacity), **fields)
 
 
 @dataclass(frozen=True, eq=False)
 class Overlay(Visitor):
     """Fields beside those of the surface, for kernels; writes integration points, those of each slave triangle together."""
 
+    start: Any  # (n_verts) 3-vectors f64: positions at the start of the step [m]
+    behind: Any  # (1) f64: how far the surfaces may be behind each other there [m]
     spacing: Any  # (n_bodies) f64: mean distance of corner nodes [m], inf for obstacles
     quarter: Any  # (n_triangles) i32: place among the four triangles of a face of second order, -1 for a face of first order
     first: Any  # (n_triangles) i32: first integration point of each slave triangle,
@@ -80,13 +85,15 @@ class Overlay(Visitor):
         return at
 
 
-def build_overlay(arena: FieldArena, edges: np.ndarray, first: np.ndarray, quadratic: np.ndarray, n_verts: int) -> Overlay:
-    """Allocate and fill the fields. edges [m]: mean surface edge of each collider; first: its first triangle; quadratic: whether
-    its faces are of second order."""
-    quarter, n = np.full(max(first[-1], 1), -1), max(n_verts, 1)
+def build_overlay(arena: FieldArena, start: Any, edges: np.ndarray, first: np.ndarray, quadratic: np.ndarray) -> Overlay:
+    """Allocate and fill the fields. start: as of Overlay; edges [m]: mean surface edge of each collider; first: its first
+    triangle; quadratic: whether its faces are of second order."""
+    quarter, n = np.full(max(first[-1], 1), -1), start.shape[0]
     for begin, end in zip(first[:-1][quadratic], first[1:][quadratic]):
         quarter[begin:end] = np.arange(end - begin) % 4
     return Overlay(
+        start,
+        arena.field("overlay_behind", ti.f64, 1, np.array([np.inf])),
         arena.field("overlay_spacing", ti.f64, len(edges), np.where(quadratic, 2.0, 1.0) * edges),
         arena.field("overlay_quarter", ti.i32, len(quarter), quarter.astype(np.int32)),
         *(arena.field(f"overlay_{name}", ti.i32, len(quarter)) for name in ("first", "count")),
@@ -137,6 +144,12 @@ def on_face(s: ti.template(), overlay: ti.template(), t, b, x: ti.template()):
     for k in range(n_face(overlay, t)):
         total += shape(overlay, t, b, k) * x[face_vertex(s, overlay, t, k)]
     return total
+
+
+@ti.func
+def _apart(s: ti.template(), overlay: ti.template(), t, u, slave, master, x: ti.template()):
+    """Difference (3,) of a field of vertices between points on the faces of triangles t and u."""
+    return on_face(s, overlay, t, slave, x) - on_face(s, overlay, u, master, x)
 
 
 # --- integration points -----------------------------------------------------------------------------------------------
@@ -201,7 +214,7 @@ def _max_depth(s: ti.template(), overlay: ti.template(), t, u, slave, master, wi
     a, b = s.body[t], s.body[u]
     depth = ti.min(0.5 * ti.min(s.thickness[a], s.thickness[b]), MAX_DEPTH * width)
     if a == b:
-        rest, n = on_face(s, overlay, t, slave, s.rest) - on_face(s, overlay, u, master, s.rest), _rest_normal(s, u)
+        rest, n = _apart(s, overlay, t, u, slave, master, s.rest), _rest_normal(s, u)
         depth = ti.min(depth, max_self_depth(s, a, rest.norm()))
         # what is near at rest counts only across a slot
         if rest.norm() <= s.edge[a] and (rest.dot(n) <= 0.0 or n.dot(_rest_normal(s, t)) > ti.cast(FACING, ti.f64)):
@@ -229,13 +242,14 @@ def _integrate(s: ti.template(), overlay: ti.template(), t, u, out: ti.template(
             d = ti.sqrt(ti.cast(1.5, ti.f64)) * ti.select(k == 0, 0.0, ti.select(k == 1, 1.0, -1.0))
             x = middle + dvec2(l0 * c, l1 * c + l2 * d)
             slave, master = _in_face(overlay, t, _barycentric(x, a0, a1, a2)), _in_face(overlay, u, _barycentric(x, b0, b1, b2))
-            apart = on_face(s, overlay, t, slave, s.x) - on_face(s, overlay, u, master, s.x)
-            closing = (on_face(s, overlay, u, master, s.move) - on_face(s, overlay, t, slave, s.move)).dot(n)
-            gap = apart.dot(n)
-            share = ti.min(2.0 - 2.0 * (gap - ti.max(closing, 0.0)) / s.margin[0], 1.0)
-            if share > 0.0 and gap > -_max_depth(s, overlay, t, u, slave, master, width):
+            apart, before = _apart(s, overlay, t, u, slave, master, s.x), _apart(s, overlay, t, u, slave, master, overlay.start)
+            closing, gap, motion = -_apart(s, overlay, t, u, slave, master, s.move).dot(n), apart.dot(n), apart - before
+            behind = overlay.behind[0] + ti.cast(BEHIND, ti.f64) * (motion - motion.dot(n) * n).norm()
+            nearest = gap - ti.max(closing, 0.0)
+            share = ti.min(2.0 - 2.0 * nearest / s.margin[0], 1.0)
+            if share > 0.0 and before.dot(n) >= -behind and gap > -_max_depth(s, overlay, t, u, slave, master, width):
                 if at < end:
-                    out.triangle[at], out.area[at], out.share[at] = u, area / 3.0, share
+                    out.triangle[at], out.area[at], out.share[at], out.nearest[at] = u, area / 3.0, share, nearest
                     out.normal[at], out.slave[at], out.master[at], out.apart[at] = n, slave, master, apart
                 at += 1
         if at > start:

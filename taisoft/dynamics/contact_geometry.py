@@ -28,6 +28,7 @@ from taisoft.backend.runtime import kernel
 from taisoft.collision.analytic import HALF_SPACE, rotation_rows
 from taisoft.collision.contacts import EDGE_EDGE, FACE_FACE, FACE_FIELD, MORTAR, VERTEX_FACE
 from taisoft.collision.features import closest_lines
+from taisoft.collision.overlay import BEHIND
 from taisoft.collision.surface import dvec
 from taisoft.contact.build import contact_offset_of, enter_past, fill_row, offset_between, pair_slot, past_of
 from taisoft.contact.problem import to_frame
@@ -37,7 +38,6 @@ TURNED, MISSED = 1e-3, 0.02  # [rad]; of the contact offset: smaller changes of 
 SHIFTED = 0.05  # of the finer side's edge: a smaller slip does not change where a contact acts on another body
 STILL = 0.05  # of the contact offset: where all contacts have moved less, no geometry changes
 TRUSTED_DEPTH, TRUSTED_CLOSING = 0.5, 0.5  # of the margin; of the finer side's edge
-BEHIND = 0.3  # of the slip: how far sides may have been behind each other at the start
 DEEPEST = 0.1  # of the contact offset: gap below which a new deepest point counts
 SAME_NORMAL = 0.9  # cosine between normals of a contact and its heir
 KEPT, IN_PLACE, REPLACED, GONE, OPEN = range(5)  # fates of present contacts

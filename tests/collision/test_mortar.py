@@ -2,18 +2,22 @@
 
 * their weights times areas are the integrals of the shape functions of both orders over what two surfaces share, however the
   scene is turned and its bodies are ordered, also between faces of different order and where one lies within the other;
-* their gaps are the means of the distance between surfaces that are not parallel or partly beyond the margin;
+* their gaps are the means of the distance between surfaces that are not parallel or partly beyond the margin, and none is far;
 * threads, the broad phase and small buffers change nothing;
-* a node in a groove has one for each wall; thin bodies have none through their thickness; a fold has them within a body;
+* a node in a groove has one for each wall; thin and flattened bodies have none through their thickness; a fold has them within a
+  body;
 * guards are the contacts of points beside them, not those of another pair.
 """
 
 import numpy as np
 import pytest
+import taichi as ti
 
 import taisoft as ts
-from taisoft.collision.contacts import Contacts
+from taisoft.backend.arrays import FieldArena
+from taisoft.collision.contacts import MORTAR, Contacts
 from taisoft.collision.detector import Detection
+from taisoft.collision.mortar import FARTHEST
 from taisoft.mesh.quality import mean_surface_edge
 from tests.collision.rotations import rotation
 from tests.dynamics.scenes import dynamics
@@ -123,8 +127,8 @@ def upper(scene: ts.Scene) -> np.ndarray:
 
 
 def test_gaps_are_means_over_what_is_near():
-    scene, tilt = blocks(), np.array([0.0, 0.01, 0.0])
-    margin = 0.1 * mean_surface_edge([(body.rest_positions, body.nodes.surface) for body in scene.bodies])
+    scene, tilt = blocks(), np.array([0.0, 0.004, 0.0])
+    far = FARTHEST * 0.1 * mean_surface_edge([(body.rest_positions, body.nodes.surface) for body in scene.bodies])
     with ts.Simulator(scene, dt=0.01, precision="f64") as sim:
 
         def opened(gap):
@@ -133,11 +137,19 @@ def test_gaps_are_means_over_what_is_near():
             return c, GAP + gap + tilt[1] * ((c.point @ TURN)[:, 0] + 0.5)  # the distance is linear
 
         c, distance = opened(0.0)
-        assert c.gap.max() < margin / 2 and abs(c.area.sum() - SIZE[0] * SIZE[2]) < 1e-3
+        assert c.gap.max() < far and abs(c.area.sum() - SIZE[0] * SIZE[2]) < 1e-3
         assert np.abs(c.gap - distance).max() < 1e-3 * distance.max()
-        near, _ = opened(margin - 0.5 * tilt[1] - GAP)  # half of it is beyond the margin
-        assert 0.3 < near.area.sum() / c.area.sum() < 0.7 and near.gap.max() < margin
-        assert len(opened(1.1 * margin)[0]) == 0
+        near, _ = opened(far - 0.5 * tilt[1] - GAP)  # half of the contacts are beyond it
+        assert 0.3 < near.area.sum() / c.area.sum() < 0.7 and near.gap.max() < far
+        assert len(opened(1.1 * far)[0]) == 0
+    with dynamics(scene, dt=0.01, precision="f64") as made:  # what will be near in the step
+        m, d = made.state.model, Detection(scene, made.state.model, made.state.layout, made.runtime)
+        m.state.x.from_numpy(m.state.x.to_numpy() + upper(scene) * [0, 2 * far, 0])
+        for speed in (0.0, 2 * far / 0.01):
+            m.state.v.from_numpy(upper(scene) * [0, -speed, 0])
+            d.find(0.0, 0.01)
+            assert ((d.contacts().kind == "mortar").sum() == len(c)) == (speed > 0.0)
+        d.release()
 
 
 def test_neither_threads_nor_the_order_of_bodies_matter():
@@ -191,6 +203,31 @@ def test_thin_plates_meet_only_with_the_sides_that_face_each_other():
         c = mortar_of(sim)
     assert np.abs(c.gap - GAP).max() < 1e-12 and abs(c.area.sum() - 1.0) < 1e-12
     assert (c.normal[:, 1] < -1 + 1e-12).all() and set(zip(c.body_a, c.body_b)) == {("plate 0", "plate 1")}
+
+
+def test_flattened_bodies_meet_only_with_the_sides_that_face_each_other():
+    """At the step's start and at iterates, where surfaces may cross: cubes pressed flat, whose far sides are as near."""
+    scene, height = ts.Scene(gravity=(0, 0, 0)), 0.002
+    for k in range(2):
+        scene.add_body(ts.box_mesh((1 + k,) * 3, (0.2,) * 3), MATERIAL, name=f"cube {k}")
+    rest, arena = [body.rest_positions * [1, height / 0.2, 1] for body in scene.bodies], FieldArena()
+    with dynamics(scene, dt=0.01, precision="f64") as made:
+        m, raised = made.state.model, np.repeat([0.0, 1.0], [len(x) for x in rest])[:, None] * [0, 1, 0]
+        start = np.concatenate(rest) + (height + GAP) * raised
+        m.state.x.from_numpy(start)
+        x_start, move = (arena.vectors(name, ti.f64, m.n_nodes) for name in ("start", "move"))
+        x_start.from_numpy(start)
+        d = Detection(scene, m, made.state.layout, made.runtime)
+        d.find(0.0, 0.01, none_cross=True)
+        for up in (0.0, -0.5 * GAP, -1.5 * GAP):
+            move.from_numpy(up * raised)
+            end = d.find_at_end(0.0, 0.01, x_start, move, 1.0)
+            data, kept = end.buffer.data, end.reduction.work.kept.to_numpy(end.reduction.n_kept)
+            kept = kept[data.feature[kept][:, 0] == MORTAR]
+            assert abs(data.area[kept].sum() - 0.2**2) < 1e-12
+            assert np.abs(data.gap[kept] - (GAP + up)).max() < 1e-12 and (data.normal[kept][:, 1] < -0.999).all()
+        d.release()
+    arena.release()
 
 
 @pytest.mark.parametrize("order", [1, 2])
