@@ -48,13 +48,14 @@ def _add_face(s: ti.template(), overlay: ti.template(), out: ti.template(), t, b
 
 
 @ti.func
-def _corner_of(s: ti.template(), overlay: ti.template(), t, i):
-    """Number of corner node i in the face of triangle t, -1 if t does not lie at that corner of a face."""
-    found = -1
+def _face_at(s: ti.template(), overlay: ti.template(), t, i):
+    """Number of corner node i in the face of triangle t, and the first and end of that face's triangles, none if t does not lie
+    at that corner of a face."""
+    corner, begin, n = -1, t - ti.max(overlay.quarter[t], 0), ti.select(overlay.quarter[t] < 0, 1, 4)
     for k in range(3):
         if s.triangle[t, k] == i and (overlay.quarter[t] < 0 or overlay.quarter[t] == k):
-            found = k
-    return found
+            corner = k
+    return corner, begin, ti.select(corner < 0, begin, begin + n)
 
 
 @ti.func
@@ -62,11 +63,9 @@ def _coverage(s: ti.template(), overlay: ti.template(), points: ti.template(), i
     """Part of the faces around slave node i that is covered, those without any point left out."""
     covered, whole = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64)
     for r in range(s.ring_start[i], s.ring_start[i + 1]):
-        j, base, n_parts = _corner_of(s, overlay, s.ring[r], i), s.ring[r], 1
-        if overlay.quarter[base] >= 0:
-            base, n_parts = base - overlay.quarter[base], 4
+        j, begin, end = _face_at(s, overlay, s.ring[r], i)
         n, face = 0, ti.cast(0.0, ti.f64)
-        for t in range(base, ti.select(j < 0, base, base + n_parts)):
+        for t in range(begin, end):
             n, face = n + overlay.count[t], face + s.area[t]
             for e in range(overlay.first[t], overlay.first[t] + overlay.count[t]):
                 b = points.slave[e]
@@ -131,10 +130,8 @@ def _node_contacts(
         for side in range(2):  # a and b
             side_first = last
             for r in range(s.ring_start[i], s.ring_start[i + 1]):
-                j, base, n_parts = _corner_of(s, overlay, s.ring[r], i), s.ring[r], 1
-                if overlay.quarter[base] >= 0:
-                    base, n_parts = base - overlay.quarter[base], 4
-                for t in range(base, ti.select(j < 0, base, base + n_parts)):
+                j, face_begin, face_end = _face_at(s, overlay, s.ring[r], i)
+                for t in range(face_begin, face_end):
                     for e in range(overlay.first[t], overlay.first[t] + overlay.count[t]):
                         u, n, b = points.triangle[e], points.normal[e], points.slave[e]
                         hat = _hat(s, overlay, t, b, j)
