@@ -111,7 +111,7 @@ class Detection:
         limits = (settings.initial_capacity or initial, settings.max_capacity)
         self._near_buffer = Buffer("near", entries, *limits, s.chunks, arena) if self.has_pairs else None
         capacity = settings.initial_capacity or CONTACTS_PER_TRIANGLE * s.n_triangles + 64
-        self.overlay = self._points = None
+        self.overlay, self._points, self._none_cross = None, None, False
         if self._plan["mortar"]:
             quadratic = np.array([b.order == 2 and b.nodes.embedded is None for b in bodies] + [False] * len(obstacles))
             limit = None if settings.max_capacity is None else POINTS * settings.max_capacity
@@ -176,9 +176,8 @@ class Detection:
         """
         self._move(time, dt, prescribed, path)
         self._broad_result = self._near()
-        depth = self.floor if none_cross else np.inf
-        if self.overlay is not None and self.overlay.behind[0] != depth:
-            self.overlay.behind[0] = depth
+        if self.overlay is not None and none_cross != self._none_cross:
+            self._none_cross, self.overlay.behind[0] = none_cross, self.floor if none_cross else np.inf
         self._search(self._broad_result, held)
         self._reduction.reduce(-self.floor if none_cross else -np.inf)  # if none cross, a vertex behind a face is not inside
         self._count()
