@@ -227,10 +227,15 @@ def find_mortar(
         overlay.count[t] = 0
     ti.loop_config(serialize=surface.serial_cheap)
     for i in range(surface.n_verts):
-        overlay.is_slave[i], overlay.contacts[i] = 0, ti.Vector([0, 0], ti.i32)
-    ti.loop_config(serialize=True)
-    for c in range(points.chunks):
+        overlay.is_near[i], overlay.is_slave[i], overlay.contacts[i] = 0, 0, ti.Vector([0, 0], ti.i32)
+    ti.loop_config(serialize=surface.serial_cheap)
+    for c in range(out.chunks):
         points.used[c] = 0
+        for at in range(c * out.part, c * out.part + ti.min(out.used[c], out.part)):
+            for k in ti.static(range(3)):
+                for v in ti.static((out.data.nodes_a, out.data.nodes_b)):
+                    if v[at][k] >= 0:
+                        overlay.is_near[v[at][k]] = 1
     visit_near(surface, near, row, overlay, points, 1)  # keeps what the search by proximity needs of `row`
     sum_parts(points)
     ti.loop_config(serialize=surface.serial_cheap)

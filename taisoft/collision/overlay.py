@@ -3,8 +3,8 @@
 A triangle of the slave is projected on the plane of one of the master, along whose normal gaps are measured: so a slave that
 slides does not change them. Three points with the centroid and covariance of the intersection integrate exactly to degree 2.
 A face of second order is four triangles; points have coordinates in the whole face. They count less from half the margin on and
-not at all beyond it, nor where they are too deep, or were behind each other at the step's start: so no far side of a flattened
-body counts.
+not at all beyond it, nor where they are too deep. Where no surfaces cross, both sides must have been in front of each other at
+the start, so that no far side of a flattened body counts.
 """
 
 from dataclasses import dataclass
@@ -38,7 +38,7 @@ class Points:
     normal: Any  # 3-vectors f64: of the master
     slave: Any  # 3-vectors f64: barycentric coordinates in the slave face,
     master: Any  # 3-vectors f64: and in the master face
-    nearest: Any  # f64: least gap in the step [m]
+    nearest: Any  # f64: least gap in the step, at an iterate the gap there [m]
     apart: Any  # 3-vectors f64: from the point of the master to that of the slave [m]
 
 
@@ -59,9 +59,17 @@ class Overlay(Visitor):
     quarter: Any  # (n_triangles) i32: place among the four triangles of a face of second order, -1 for a face of first order
     first: Any  # (n_triangles) i32: first integration point of each slave triangle,
     count: Any  # (n_triangles) i32: and their number
+    is_near: Any  # (n_verts) i32: 1 for vertices of contacts of points: every overlay has one of its triangle
     is_slave: Any  # (n_verts) i32: 1 for corner nodes of faces with integration points
     coverage: Any  # (n_verts) f64: part of the faces around a slave node that is covered, those without any point left out
     contacts: Any  # (n_verts) 2-vectors i32: first mortar contact of each slave node in the buffer filled last, and their number
+
+    @ti.func
+    def asks(self, surface: ti.template(), t, q):
+        """See Visitor."""
+        return ti.max(
+            self.is_near[surface.triangle[t, 0]], self.is_near[surface.triangle[t, 1]], self.is_near[surface.triangle[t, 2]]
+        )
 
     @ti.func
     def meets(self, surface: ti.template(), own, other):
@@ -97,7 +105,7 @@ def build_overlay(arena: FieldArena, start: Any, edges: np.ndarray, first: np.nd
         arena.field("overlay_spacing", ti.f64, len(edges), np.where(quadratic, 2.0, 1.0) * edges),
         arena.field("overlay_quarter", ti.i32, len(quarter), quarter.astype(np.int32)),
         *(arena.field(f"overlay_{name}", ti.i32, len(quarter)) for name in ("first", "count")),
-        arena.field("overlay_is_slave", ti.i32, n),
+        *(arena.field(f"overlay_{name}", ti.i32, n) for name in ("is_near", "is_slave")),
         arena.field("overlay_coverage", ti.f64, n),
         arena.vectors("overlay_contacts", ti.i32, n, n=2),
     )
@@ -150,6 +158,16 @@ def on_face(s: ti.template(), overlay: ti.template(), t, b, x: ti.template()):
 def _apart(s: ti.template(), overlay: ti.template(), t, u, slave, master, x: ti.template()):
     """Difference (3,) of a field of vertices between points on the faces of triangles t and u."""
     return on_face(s, overlay, t, slave, x) - on_face(s, overlay, u, master, x)
+
+
+@ti.func
+def _flat_apart(s: ti.template(), t, u, on_t, on_u, x: ti.template()):
+    """The same between points on triangles t and u themselves, whose paths are checked: faces of second order that are bent may
+    overlap a little."""
+    total = dvec(0.0)
+    for k in ti.static(range(3)):
+        total += on_t[k] * x[s.triangle[t, k]] - on_u[k] * x[s.triangle[u, k]]
+    return total
 
 
 # --- integration points -----------------------------------------------------------------------------------------------
@@ -241,9 +259,11 @@ def _integrate(s: ti.template(), overlay: ti.template(), t, u, out: ti.template(
             c = ti.sqrt(ti.cast(2.0, ti.f64)) * ti.select(k == 0, 1.0, -0.5)
             d = ti.sqrt(ti.cast(1.5, ti.f64)) * ti.select(k == 0, 0.0, ti.select(k == 1, 1.0, -1.0))
             x = middle + dvec2(l0 * c, l1 * c + l2 * d)
-            slave, master = _in_face(overlay, t, _barycentric(x, a0, a1, a2)), _in_face(overlay, u, _barycentric(x, b0, b1, b2))
-            apart, before = _apart(s, overlay, t, u, slave, master, s.x), _apart(s, overlay, t, u, slave, master, overlay.start)
-            closing, gap, motion = -_apart(s, overlay, t, u, slave, master, s.move).dot(n), apart.dot(n), apart - before
+            on_t, on_u = _barycentric(x, a0, a1, a2), _barycentric(x, b0, b1, b2)
+            slave, master = _in_face(overlay, t, on_t), _in_face(overlay, u, on_u)
+            apart, before = _apart(s, overlay, t, u, slave, master, s.x), _flat_apart(s, t, u, on_t, on_u, overlay.start)
+            closing, gap = -_apart(s, overlay, t, u, slave, master, s.move).dot(n), apart.dot(n)
+            motion = _flat_apart(s, t, u, on_t, on_u, s.x) - before
             behind = overlay.behind[0] + ti.cast(BEHIND, ti.f64) * (motion - motion.dot(n) * n).norm()
             nearest = gap - ti.max(closing, 0.0)
             share = ti.min(2.0 - 2.0 * nearest / s.margin[0], 1.0)

@@ -55,6 +55,7 @@ class ContactStep:
 
     idle = False  # see `NoContacts`
     OFFSET = 2e-3  # of the finest body's mean surface edge: gap to keep, so that motion in curves seldom needs a repetition
+    MOST_OFFSET = 0.1  # of the margin: half of what `mortar` takes for near
     MAX_OPENING_SPEED = 0.01  # of the slowest bar wave speed, sqrt(E / rho): of what is corrected; a strain as large
     NOTICEABLE = 1e-3  # penetration over the finer side's mean edge above which the path of an implicit substep is searched
 
@@ -69,7 +70,8 @@ class ContactStep:
         detection = self.detection
         self.contact_offset = self.OFFSET * float(detection.edges[: len(scene.bodies)].min())
         if detection.margin > 0.0:
-            self.contact_offset = min(self.contact_offset, 0.5 * detection.margin / (SELF_CONTACT if self_collision else 1.0))
+            most = self.MOST_OFFSET * detection.margin / (SELF_CONTACT if self_collision else 1.0)
+            self.contact_offset = min(self.contact_offset, most)
         # parts of a penetration and of a missing contact offset that a step corrects
         self._corrections = (0.05, 0.005) if explicit else (0.2, 0.02)
         self._substep_fraction = 1.0  # of the step, that the current substep takes
@@ -312,6 +314,8 @@ class ContactStep:
             set_end_gaps(self.problem, self.simulation.model, x_start)
         if not self.paths.none_cross:
             self.paths.exempt_crossing()
+            if self.paths.none_cross:
+                self._searched = None  # where none cross, other contacts are found
         if self._substep_fraction < 1.0:
             self._pairs = self._sum_pairs()
 

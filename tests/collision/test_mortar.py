@@ -4,18 +4,15 @@
   scene is turned and its bodies are ordered, also between faces of different order and where one lies within the other;
 * their gaps are the means of the distance between surfaces that are not parallel or partly beyond the margin, and none is far;
 * threads, the broad phase and small buffers change nothing;
-* a node in a groove has one for each wall; thin and flattened bodies have none through their thickness; a fold has them within a
-  body;
+* a node in a groove has one for each wall; thin bodies have none through their thickness; a fold has them within a body;
 * guards are the contacts of points beside them, not those of another pair.
 """
 
 import numpy as np
 import pytest
-import taichi as ti
 
 import taisoft as ts
-from taisoft.backend.arrays import FieldArena
-from taisoft.collision.contacts import MORTAR, Contacts
+from taisoft.collision.contacts import Contacts
 from taisoft.collision.detector import Detection
 from taisoft.collision.mortar import FARTHEST
 from taisoft.mesh.quality import mean_surface_edge
@@ -203,31 +200,6 @@ def test_thin_plates_meet_only_with_the_sides_that_face_each_other():
         c = mortar_of(sim)
     assert np.abs(c.gap - GAP).max() < 1e-12 and abs(c.area.sum() - 1.0) < 1e-12
     assert (c.normal[:, 1] < -1 + 1e-12).all() and set(zip(c.body_a, c.body_b)) == {("plate 0", "plate 1")}
-
-
-def test_flattened_bodies_meet_only_with_the_sides_that_face_each_other():
-    """At the step's start and at iterates, where surfaces may cross: cubes pressed flat, whose far sides are as near."""
-    scene, height = ts.Scene(gravity=(0, 0, 0)), 0.002
-    for k in range(2):
-        scene.add_body(ts.box_mesh((1 + k,) * 3, (0.2,) * 3), MATERIAL, name=f"cube {k}")
-    rest, arena = [body.rest_positions * [1, height / 0.2, 1] for body in scene.bodies], FieldArena()
-    with dynamics(scene, dt=0.01, precision="f64") as made:
-        m, raised = made.state.model, np.repeat([0.0, 1.0], [len(x) for x in rest])[:, None] * [0, 1, 0]
-        start = np.concatenate(rest) + (height + GAP) * raised
-        m.state.x.from_numpy(start)
-        x_start, move = (arena.vectors(name, ti.f64, m.n_nodes) for name in ("start", "move"))
-        x_start.from_numpy(start)
-        d = Detection(scene, m, made.state.layout, made.runtime)
-        d.find(0.0, 0.01, none_cross=True)
-        for up in (0.0, -0.5 * GAP, -1.5 * GAP):
-            move.from_numpy(up * raised)
-            end = d.find_at_end(0.0, 0.01, x_start, move, 1.0)
-            data, kept = end.buffer.data, end.reduction.work.kept.to_numpy(end.reduction.n_kept)
-            kept = kept[data.feature[kept][:, 0] == MORTAR]
-            assert abs(data.area[kept].sum() - 0.2**2) < 1e-12
-            assert np.abs(data.gap[kept] - (GAP + up)).max() < 1e-12 and (data.normal[kept][:, 1] < -0.999).all()
-        d.release()
-    arena.release()
 
 
 @pytest.mark.parametrize("order", [1, 2])
