@@ -76,22 +76,22 @@ def _coverage(s: ti.template(), overlay: ti.template(), points: ti.template(), i
 
 
 @ti.func
-def _hat(s: ti.template(), overlay: ti.template(), t, b, j):
-    """Hat function of corner j of the face of triangle t at barycentric coordinates b (3,). Those of corners that are hardly
-    covered pass to the others, or all to the one that is covered most, so that their sum stays 1."""
-    total, most, best = ti.cast(0.0, ti.f64), ti.cast(-1.0, ti.f64), 0
-    for k in range(3):
+def _hats(s: ti.template(), overlay: ti.template(), t, b):
+    """Hat functions (3,) of the corners of the face of triangle t at barycentric coordinates b (3,). Those of corners that are
+    hardly covered pass to the others, or all to the one that is covered most, so that their sum stays 1."""
+    hats, total, most, best = dvec(0.0), ti.cast(0.0, ti.f64), ti.cast(-1.0, ti.f64), 0
+    for k in ti.static(range(3)):
         coverage = overlay.coverage[face_vertex(s, overlay, t, k)]
         if coverage >= ti.cast(LEAST_COVERED, ti.f64):
-            total += choose(k, b[0], b[1], b[2])
+            hats[k] = b[k]
+            total += b[k]
         if coverage > most:
             best, most = k, coverage
-    result = ti.cast(0.0, ti.f64)
     if most < ti.cast(LEAST_COVERED, ti.f64):
-        result = ti.select(best == j, ti.cast(1.0, ti.f64), ti.cast(0.0, ti.f64))
-    elif overlay.coverage[face_vertex(s, overlay, t, j)] >= ti.cast(LEAST_COVERED, ti.f64):
-        result = choose(j, b[0], b[1], b[2]) / total
-    return result
+        total = 1.0
+        for k in ti.static(range(3)):
+            hats[k] = ti.cast(int(best == k), ti.f64)
+    return hats / total
 
 
 @ti.func
@@ -124,37 +124,40 @@ def _node_contacts(
     seeds = ti.Matrix.zero(ti.f64, MAX_CLUSTERS + 1, 4)  # a normal and the master of each contact
     own = s.body[s.ring[s.ring_start[i]]]
     while k == n_seeds and k < MAX_CLUSTERS:
-        other, opposite, first, n_first = -1, -1, last, 0
+        other, opposite, first, n_first, is_near = -1, -1, last, 0, False
         area, total, nearest = ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64), ti.cast(0.0, ti.f64)
         normal, apart, carried = dvec(0.0), dvec(0.0), dvec(0.0)
-        for side in range(2):  # a and b
-            side_first = last
-            for r in range(s.ring_start[i], s.ring_start[i + 1]):
+        for step in range(3):  # sums, then vertices of a and b
+            step_first, is_master = last, (step == 1) == (own > other)
+            for r in range(s.ring_start[i], ti.select(step == 0 or is_near, s.ring_start[i + 1], 0)):
                 j, face_begin, face_end = _face_at(s, overlay, s.ring[r], i)
                 for t in range(face_begin, face_end):
                     for e in range(overlay.first[t], overlay.first[t] + overlay.count[t]):
-                        u, n, b = points.triangle[e], points.normal[e], points.slave[e]
-                        hat = _hat(s, overlay, t, b, j)
-                        if hat > 0.0 and _belongs(seeds, k, n_seeds, s.body[u], n):
+                        u, n, hat = (
+                            points.triangle[e],
+                            points.normal[e],
+                            choose(j, points.hat[e][0], points.hat[e][1], points.hat[e][2]),
+                        )
+                        w = points.share[e] * points.area[e] * hat
+                        if w > 0.0 and _belongs(seeds, k, n_seeds, s.body[u], n):
                             if k == n_seeds:
                                 other, opposite = s.body[u], s.triangle[u, 0]
                                 seeds[k, 0], seeds[k, 1], seeds[k, 2], seeds[k, 3] = n[0], n[1], n[2], other
                                 n_seeds += 1
-                            w, is_master = points.share[e] * points.area[e] * hat, (side == 0) == (own > other)
-                            if side == 0:
+                            if step == 0:
                                 area, nearest = area + points.area[e] * hat, nearest + w * points.nearest[e]
                                 total, normal, apart = total + w, normal + w * n, apart + w * points.apart[e]
-                            if is_master and s.node[opposite] < 0:
+                            elif is_master and s.node[opposite] < 0:
                                 carried += w * on_face(s, overlay, u, points.master[e], move)
                             elif is_master:
-                                last = _add_face(s, overlay, out, u, points.master[e], w, side_first, last, list_end)
+                                last = _add_face(s, overlay, out, u, points.master[e], w, step_first, last, list_end)
                             else:
-                                last = _add_face(s, overlay, out, t, b, w, side_first, last, list_end)
-            if side == 0:
+                                last = _add_face(s, overlay, out, t, points.slave[e], w, step_first, last, list_end)
+            if step == 0:
+                is_near = k < n_seeds and nearest <= ti.cast(FARTHEST, ti.f64) * total * s.margin[0]
+            elif step == 1:
                 n_first = last - first
-        if k < n_seeds and nearest > ti.cast(FARTHEST, ti.f64) * total * s.margin[0]:
-            last = first
-        elif k < n_seeds:
+        if is_near:
             n, point, zero = unit(normal), dvec(0.0), dvec(0.0)
             for e in range(first, ti.min(last, list_end)):
                 out.weight[e] = out.weight[e] / total
@@ -242,6 +245,11 @@ def find_mortar(
     for i in range(surface.n_verts):
         if overlay.is_slave[i] == 1 and points.count[NEEDED] <= points.part:
             overlay.coverage[i] = _coverage(surface, overlay, points.data, i)
+    ti.loop_config(serialize=surface.serial_cheap)
+    for t in range(surface.n_triangles):
+        if overlay.count[t] > 0 and points.count[NEEDED] <= points.part:
+            for e in range(overlay.first[t], overlay.first[t] + overlay.count[t]):
+                points.data.hat[e] = _hats(surface, overlay, t, points.data.slave[e])
     _write_contacts(surface, overlay, points, move, lists, out)
     ti.loop_config(serialize=surface.serial_cheap)
     for task in range(out.chunks * surface.cheap_spread):

@@ -38,6 +38,7 @@ class Points:
     normal: Any  # 3-vectors f64: of the master
     slave: Any  # 3-vectors f64: barycentric coordinates in the slave face,
     master: Any  # 3-vectors f64: and in the master face
+    hat: Any  # 3-vectors f64: hat functions of the corners of the slave face, see `mortar`
     nearest: Any  # f64: least gap in the step, at an iterate the gap there [m]
     apart: Any  # 3-vectors f64: from the point of the master to that of the slave [m]
 
@@ -45,7 +46,7 @@ class Points:
 def overlay_points(arena: FieldArena, capacity: int) -> Points:
     """Allocate a buffer."""
     fields = {name: arena.field(f"overlay_{name}", ti.f64, capacity) for name in ("area", "share", "nearest")}
-    fields |= {name: arena.vectors(f"overlay_{name}", ti.f64, capacity) for name in ("normal", "slave", "master", "apart")}
+    fields |= {name: arena.vectors(f"overlay_{name}", ti.f64, capacity) for name in ("normal", "slave", "master", "hat", "apart")}
     return Points(arena.field("overlay_triangle", ti.i32, capacity), **fields)
 
 
