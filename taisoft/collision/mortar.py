@@ -24,7 +24,7 @@ from taisoft.collision.surface import dvec, ivec
 
 LEAST_COVERED = 0.2  # of the faces around a node: where less is, contacts of several nodes would be nearly the same
 SAME_CLUSTER = 0.9  # cosine between normals of points of one contact
-FARTHEST = 0.2  # of the margin: mean gap in the step beyond which there is no contact
+FARTHEST = 0.2  # of the margin: mean gap beyond which there is no contact
 MAX_CLUSTERS = 8  # contacts of one node; what exceeds them is left to the guards
 
 
@@ -133,11 +133,8 @@ def _node_contacts(
                 j, face_begin, face_end = _face_at(s, overlay, s.ring[r], i)
                 for t in range(face_begin, face_end):
                     for e in range(overlay.first[t], overlay.first[t] + overlay.count[t]):
-                        u, n, hat = (
-                            points.triangle[e],
-                            points.normal[e],
-                            choose(j, points.hat[e][0], points.hat[e][1], points.hat[e][2]),
-                        )
+                        u, n, hats = points.triangle[e], points.normal[e], points.hat[e]
+                        hat = choose(j, hats[0], hats[1], hats[2])
                         w = points.share[e] * points.area[e] * hat
                         if w > 0.0 and _belongs(seeds, k, n_seeds, s.body[u], n):
                             if k == n_seeds:

@@ -60,7 +60,7 @@ class Overlay(Visitor):
     quarter: Any  # (n_triangles) i32: place among the four triangles of a face of second order, -1 for a face of first order
     first: Any  # (n_triangles) i32: first integration point of each slave triangle,
     count: Any  # (n_triangles) i32: and their number
-    is_near: Any  # (n_verts) i32: 1 for vertices of contacts of points: every overlay has one of its triangle
+    is_near: Any  # (n_verts) i32: 1 for vertices of contacts of points: slave triangles have one at least
     is_slave: Any  # (n_verts) i32: 1 for corner nodes of faces with integration points
     coverage: Any  # (n_verts) f64: part of the faces around a slave node that is covered, those without any point left out
     contacts: Any  # (n_verts) 2-vectors i32: first mortar contact of each slave node in the buffer filled last, and their number
