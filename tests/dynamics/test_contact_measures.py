@@ -109,7 +109,8 @@ def test_a_projectile_may_be_too_fast_only_where_paths_are_not_checked(sim, monk
     speed, near = 300.0 * THICK / sim.dt, sim.positions("shot") - (0, 0.1 - 0.025 - 0.5 * THICK - 0.015, 0)  # [m/s], [m]
     shoot(sim, speed)
     sim.set_state(positions=near, body="shot")
-    assert fly(sim, 1) >= 1
+    fly(sim, 1)
+    assert sim.velocities("shot")[:, 1].mean() > -0.1 * speed
     sim.reset()
     shoot(sim, speed)
     sim.set_state(positions=near, body="shot")

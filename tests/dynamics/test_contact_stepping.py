@@ -217,19 +217,20 @@ def test_contact_laws(sim):
     (fast, slow), fastest = CORRECTIONS[explicit], OPENING_SPEED
     for k in range(40 if explicit else 8):
         x, found = sim.positions(), sim.detect_contacts()
-        at_start = {(kind, *ids): gap for kind, ids, gap in zip(found.kind, found.feature.tolist(), found.gap)}
+        rows = zip(found.kind, found.feature.tolist(), found.gap, found.guard)
+        at_start = {(kind, *ids): (gap, guard) for kind, ids, gap, guard in rows}
         sim.step()
         c, moved = sim.contacts(), sim.positions() - x
         known = [(kind, *ids) in at_start for kind, ids in zip(c.kind, c.feature.tolist())]
         assert np.mean(known) > 0.8
         c = Contacts(**{name: values[known] if isinstance(values, np.ndarray) else values for name, values in vars(c).items()})
-        gap = np.array([at_start[kind, *ids] for kind, ids in zip(c.kind, c.feature.tolist())])
+        gap, guard = np.array([at_start[kind, *ids] for kind, ids in zip(c.kind, c.feature.tolist())]).T
         on = c.nodes >= 0
         signed = np.where(on, c.weights, 0.0) * np.repeat([1, -1], c.nodes.shape[1] // 2)
         obstacle_displacement = np.where((c.body_b == "belt")[:, None], [speed * dt, 0, 0], 0.0)
         v = sim.velocities() if bdf2 else moved / dt
         slip = np.einsum("kj,kjx->kx", signed, v[c.nodes]) - obstacle_displacement / dt
-        above, own = np.maximum(gap, 0.0), np.where(c.guard, 0.5, 1.0) * offset
+        above, own = np.maximum(gap, 0.0), np.where(c.guard | (guard == 1), 0.5, 1.0) * offset  # at the start or the end
         opening = np.minimum(slow * (own - above) + fast * (above - gap), fastest * dt)
         target_gap = np.where(gap < own, gap + opening, own)
         impulse_fraction = 2.0 / 3.0 if bdf2 and k > 0 else 1.0  # of a step, in which impulses act: beta / dt
