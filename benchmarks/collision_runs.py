@@ -219,7 +219,7 @@ class Rig:
         times.append(clock())
         near = d._near()
         times.append(clock())
-        d._search(near, NO_PASSAGES)
+        fill(lambda: d._fill_buffer(near, NO_PASSAGES), *d._scratch(), d.buffer)
         times.append(clock())
         d._reduction.reduce(-np.inf)
         times.append(clock())

@@ -229,7 +229,6 @@ def edge(mesh: ts.TetMesh) -> float:
 def solve(sim: ts.Simulator, kept: dict, dt: float, max_halves: int) -> tuple[dict, np.ndarray]:
     """Solve a stage of dt from a state, divided into halves until it converges. Returns a row and the final positions."""
     stepper, world = parts_of(sim)
-    take = next(getattr(stepper, name) for name in ("take_substep", "take", "_try_part") if hasattr(stepper, name))
     halves, newton, linear, first, seconds, launched = 1, 0, 0, None, 0.0, 0
     while True:
         world.restore(kept["world"])
@@ -237,33 +236,29 @@ def solve(sim: ts.Simulator, kept: dict, dt: float, max_halves: int) -> tuple[di
         done, begin, compiled = [], time.perf_counter(), runtime.compile_clock()
         with counting() as counts:
             for part in range(halves):
-                try:
-                    done.append(take(world.time + part * dt / halves, dt / halves))
-                except ts.SimulationError:
-                    done.append(None)
-                if done[-1] is None or not done[-1].converged:
+                done.append(stepper.solve_stage(world.time + part * dt / halves, dt / halves, None))
+                if not done[-1].converged:
                     break
         seconds += time.perf_counter() - begin - (runtime.compile_clock() - compiled)
         launched += counts.launches.total()
-        newton += sum(r.newton_iterations for r in done if r)
-        linear += sum(r.linear_iterations for r in done if r)
+        newton += sum(r.newton_iterations for r in done)
+        linear += sum(r.linear_iterations for r in done)
         first = first or done[0]
-        good = done[-1] is not None and done[-1].converged
+        good = done[-1].converged
         if good or halves >= max_halves:
             break
         halves *= 2
-    stage = first or done[-1]
     row = {
-        "newton": stage.newton_iterations if stage else 0,
-        "linear": stage.linear_iterations if stage else 0,
+        "newton": first.newton_iterations,
+        "linear": first.linear_iterations,
         "all newton": newton,
         "all linear": linear,
         "halves": halves,
         "converged": good,
         "seconds": seconds,
         "launches": launched,
-        "residual": done[-1].residual if done[-1] else None,
-        "contact residual": done[-1].contact_residual if done[-1] else None,
+        "residual": done[-1].residual,
+        "contact residual": done[-1].contact_residual,
         "contacts": int(stepper.contact.n_contacts),
     }
     return row, sim.positions()

@@ -27,7 +27,7 @@ class StepReport:
     time: float  #: at the end of the step [s]
     steps: int = 1  #: steps of size dt that this report covers
     substeps: int = 1  #: of an implicit step; more than one if it did not converge or bodies would have passed each other
-    newton_iterations: int = 0  #: with those of discarded attempts; an elimination counts by its share of the nodes
+    newton_iterations: int = 0  #: with those of rejected parts
     linear_iterations: int = 0  #: of conjugate gradients, counted alike
     multigrid_solves: int = 0  #: linear systems that multigrid preconditioned
     contact_iterations: int = 0  #: sweeps of explicit steps, multiplier updates of implicit ones

@@ -7,10 +7,10 @@ import numpy as np
 from taisoft.backend.arrays import FieldArena, upload
 from taisoft.backend.runtime import Runtime, open_kind, open_runtime
 from taisoft.display import short_repr
-from taisoft.dynamics.contact_newton import correct_multipliers, solve
 from taisoft.dynamics.dirichlet import DirichletConditions
 from taisoft.dynamics.imbalance import describe_imbalance
 from taisoft.dynamics.multipliers import Multipliers
+from taisoft.dynamics.newton import solve
 from taisoft.dynamics.no_contacts import NoContacts
 from taisoft.dynamics.results import StageResult
 from taisoft.dynamics.simulation_state import SimulationState
@@ -209,7 +209,7 @@ class StaticSolver:
         if self.multipliers is not None:
             self.multipliers.begin(self.time, m.on_cpu, fraction)
         stage = Stage(0.0, 1.0, 1.0, tolerance, max_newton=max_newton)
-        result = correct_multipliers(self.solver, stage, solve(self.solver, stage))
+        result = solve(self.solver, stage)
         self.newton += result.newton_iterations
         self.linear += result.linear_iterations
         self.multigrid += result.multigrid_solves

@@ -178,7 +178,7 @@ class Detection:
         self._broad_result = self._near()
         if self.overlay is not None and none_cross != self._none_cross:
             self._none_cross, self.overlay.behind[0] = none_cross, self.floor if none_cross else np.inf
-        self._search(self._broad_result, held)
+        fill(lambda: self._fill_buffer(self._broad_result, held), *self._scratch(), self.buffer)
         self._reduction.reduce(-self.floor if none_cross else -np.inf)  # if none cross, a vertex behind a face is not inside
         self._count()
 
@@ -226,10 +226,6 @@ class Detection:
     def _near(self) -> Trees | Candidates | None:
         """Run the broad phase; None if no two surfaces can touch."""
         return self.broad.near() if self.has_pairs else None
-
-    def _search(self, near: Trees | Candidates | None, held: HeldPassages) -> None:
-        """Fill the buffer of contacts, growing buffers as needed."""
-        fill(lambda: self._fill_buffer(near, held), *self._scratch(), self.buffer)
 
     def _fill_buffer(self, near: Trees | Candidates | None, held: HeldPassages) -> None:
         """Write the contacts before reduction, as many as fit."""

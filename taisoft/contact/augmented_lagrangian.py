@@ -204,7 +204,10 @@ def _linearise(q: np.ndarray, change: np.ndarray, friction: np.ndarray) -> tuple
 
 
 def _step(i: _Island, R_inverse: np.ndarray, f: np.ndarray, G: np.ndarray, D: np.ndarray) -> np.ndarray | None:
-    """Newton step (3k,): (1 - D (1 - F W')) step = -G; None if the system is singular."""
+    """Newton step (3k,): (1 - D (1 - F W')) step = -G; None if the system is singular.
+
+    Where D is 0, the contact is open, and its step -G; only the others are unknown.
+    """
     k = len(D)
     blocks = i.W.data.copy()
     blocks[i.diagonal] += R_inverse.reshape(k, 3, 1) * np.eye(3)
@@ -212,7 +215,10 @@ def _step(i: _Island, R_inverse: np.ndarray, f: np.ndarray, G: np.ndarray, D: np
     blocks[i.diagonal] += np.eye(3) - D
     try:
         if 3 * k > DENSE:
-            return splu(sp.bsr_matrix((blocks, i.W.indices, i.W.indptr)).tocsc()).solve(-G)
+            closed, step = np.repeat(D.any(axis=(1, 2)), 3), -G
+            rows = sp.bsr_matrix((blocks, i.W.indices, i.W.indptr)).tocsr()[closed].tocsc()
+            step[closed] = splu(rows[:, closed]).solve(rows[:, ~closed] @ G[~closed] - G[closed])
+            return step
         J = np.zeros((k, k, 3, 3))
         J[i.row, i.W.indices] = blocks
         return np.linalg.solve(J.transpose(0, 2, 1, 3).reshape(3 * k, 3 * k), -G)

@@ -12,6 +12,7 @@ import taichi as ti
 from taisoft.backend.arrays import FieldArena
 from taisoft.collision.contacts import Contacts
 from taisoft.collision.detector import Detection
+from taisoft.collision.intersections import CROSSED
 from taisoft.collision.path_check import NO_PASSAGES
 from taisoft.contact.build import (
     SELF_CONTACT,
@@ -30,6 +31,7 @@ from taisoft.contact.problem import build_node_problem, index_nodes
 from taisoft.dynamics.contact_measures import DEEP_PENETRATION, DEPTH, RELATIVE_PENETRATION, ContactMeasures, Crossing
 from taisoft.dynamics.contact_paths import ContactPaths
 from taisoft.dynamics.misplaced import NO_SUMS, Misplacement
+from taisoft.dynamics.part_length import PARTS
 from taisoft.dynamics.readout import (
     MORE_ROWS,
     ContactRows,
@@ -44,9 +46,12 @@ from taisoft.dynamics.readout import (
 from taisoft.dynamics.rebounds import Rebounds
 from taisoft.dynamics.renewal import Renewal
 from taisoft.dynamics.simulation_state import SimulationState
+from taisoft.dynamics.state import StepState
 from taisoft.errors import SimulationError
 from taisoft.scene.rigid import RigidBody
 
+MAX_PASSAGES = 8  # repetitions of a part with what its way meets
+FREE, MET, BLOCKED = range(3)  # ways: nothing passes; contacts were met that are known now; they are known, but do not help
 TOLERANCE = {"f32": 1e-4, "f64": 1e-6}  # default for the residual of the contact laws
 
 
@@ -57,7 +62,9 @@ class ContactStep:
     OFFSET = 2e-3  # of the finest body's mean surface edge: gap to keep, so that motion in curves seldom needs a repetition
     MOST_OFFSET = 0.1  # of the margin: half of what `mortar` takes for near
     MAX_OPENING_SPEED = 0.01  # of the slowest bar wave speed, sqrt(E / rho): of what is corrected; a strain as large
-    NOTICEABLE = 1e-3  # penetration over the finer side's mean edge above which the path of an implicit substep is searched
+    MAX_CLOSING_RATIO = 2.0  # along the way of a part, where surfaces cross: its speed was not known when the step was cut
+    LEAST_DEEP = 1.0 / 16.0  # of a step: parts up to this long are kept even if they lead deeper
+    WORSENING = 1.1  # growth of an existing penetration that counts as a new one
 
     def __init__(self, simulation: SimulationState, self_collision: bool, explicit: bool):
         self.simulation = simulation
@@ -99,6 +106,7 @@ class ContactStep:
         rigid = np.array([isinstance(one, RigidBody) for one in scene.colliders], dtype=np.int32)
         self._rigid = self._lasting.field("is_rigid", ti.i32, len(rigid), rigid)
         self.had_impact = False  # whether surfaces met in the last step
+        self._is_fast = False  # whether contacts closed too fast on the way that was last certified
         self.dropped = 0  # triangles of the last step under an inverted tet, for which a distance field gives no contacts
 
     def _allocate(self, capacity: int, entries: int) -> None:
@@ -215,14 +223,14 @@ class ContactStep:
         simulation, detection, searched = self.simulation, self.detection, self._searched
         if searched is None or searched[1] != dt or abs(searched[0] - time) > 1e-6 * dt:
             self._searched = None
-            self._find(time, dt, simulation.prescribed_moves(time + dt))
+            self._find(time, dt, prescribed=simulation.prescribed_moves(time + dt))
             self._searched = time, dt
         return detection.counts.contacts
 
-    def _find(self, time: float, dt: float, prescribed=None, path=None) -> None:
+    def _find(self, time: float, dt: float, **along) -> None:
         """Call `Detection.find`; where nothing crosses, implicit steps drop what may never touch."""
         self.measures.begin(dt)
-        self.detection.find(time, dt, prescribed, path, self.simulation.now.held, self.simulation.now.none_cross)
+        self.detection.find(time, dt, held=self.simulation.now.held, none_cross=self.simulation.now.none_cross, **along)
         if self.paths.none_cross and not self._explicit and self.detection.counts.contacts:
             self.measures.drop_uncertain()
 
@@ -286,21 +294,45 @@ class ContactStep:
         self.had_impact = self.had_impact or found
         return found
 
-    def count_flight(self, dt: float, dissipative: bool) -> None:
-        """Update the flight times after a substep of dt, see `Rebounds.count_flight`."""
-        self.rebounds.count_flight(self.problem, self.n_contacts, dt, dissipative)
-
-    def start_step(self, dt: float) -> None:
-        """Begin a step of dt."""
+    def start_step(self, time: float, dt: float) -> None:
+        """Begin a step of dt from a time. Penetration that exists there is not new."""
+        self.search(time, dt)
+        self.relative_penetration = float(self.measures.closing[RELATIVE_PENETRATION])
+        self.relative_penetration = max(self.relative_penetration, self.initial_crossing())
+        self._deepest, self._most_crossed = DEEP_PENETRATION, CROSSED
+        self._raise_limits()
         self._substep_fraction, self._step_dt, self.dropped = 1.0, dt, 0
         self._pairs = None
         self.paths.start_step()
         self.misplaced.start_step()
 
+    def _raise_limits(self) -> None:
+        """Raise the limits above which a penetration or crossing is new to WORSENING times the present ones."""
+        self._deepest = max(self._deepest, self.WORSENING * self.relative_penetration)
+        self._most_crossed = max(self._most_crossed, self.WORSENING * self.crossing)
+
+    def most_units(self, time: float, dt: float, units: int) -> int:
+        """Return the length of the next part of a step of dt, in units of dt / PARTS: the given one, or where surfaces cross, one
+        in which no contact closes further than its ratio allows. Raise SimulationError if the shortest part is too long."""
+        if self.paths.none_cross:
+            return units
+        self.search(time, units / PARTS * dt)
+        most = int(units / max(1.0, self.measures.closing_ratio))
+        self._is_fast = most == 0
+        self.refuse_fast_closing(dt)
+        return most
+
     def start_substep(self, dt: float) -> None:
         """Begin a substep of dt, or begin it again with another length."""
         self._substep_fraction = dt / self._step_dt
         self.paths.begin()
+
+    def end_part(self, time: float, dt: float, x_start: Any, dissipative: bool) -> None:
+        """End a part of a step at a time, from which the next one of dt is searched, see `end` and `end_substep`."""
+        self.penetration = self.end(time, dt)
+        self._raise_limits()
+        self.end_substep(x_start)
+        self.rebounds.count_flight(self.problem, self.n_contacts, self._substep_fraction * self._step_dt, dissipative)
 
     def end_substep(self, x_start: Any) -> None:
         """Add the impulses of a substep that began at positions x_start, and what they misplace; set gaps to those at its end.
@@ -356,20 +388,59 @@ class ContactStep:
             return np.zeros((self.simulation.model.n_nodes, 3))
         return nodal_impulses(self.rows(own=True), self.simulation.model.n_nodes) * self._impulse_fraction / self._last_time
 
-    def penetrates_deeper(self, time: float, dt: float, before: float) -> bool:
-        """Return whether a substep of dt that ends at a time leaves a new or deeper penetration.
+    def certify(self, time: float, dt: float, start: StepState) -> int:
+        """Return what the way from a start to the present state is, in a part of dt [s] from a time: FREE, MET or BLOCKED.
+        From the start, `search_along` then finds what it met.
 
-        before: `relative_penetration` at its start.
+        Where it left what was searched, it is searched along. Where surfaces cross already, it is not free either if it led
+        deeper, met contacts that were unknown, or if contacts close too fast along it.
         """
-        self._measure_penetration(time, dt)
-        return self.relative_penetration > max(self.NOTICEABLE, 1.1 * before)
+        paths, self._is_fast = self.paths, False
+        known = set() if paths.none_cross else self.found_features()
+        has_left = not self._explicit and paths.left_searched(start.x)  # explicit steps seldom do, and are many
+        passes = not has_left and paths.find()
+        if has_left or paths.uncovered:
+            self._search_way(time, dt, start)
+            passes = paths.find(as_searched=True)
+        elif passes and self._explicit:
+            paths.left_searched(start.x)  # which keeps the way
+        if passes:
+            return BLOCKED if paths.is_stuck else MET
+        if paths.none_cross or self._explicit:
+            return FREE
+        if has_left:
+            found = self.found_features()
+            if not known.issuperset(found):
+                return MET
+            self._is_fast, known = self.measures.closing_ratio > self.MAX_CLOSING_RATIO, found
+        if self._is_fast:
+            return BLOCKED
+        self.end(time + dt, dt)
+        is_deep = self.relative_penetration > self._deepest or self.crossing > self._most_crossed
+        if not is_deep or dt <= self.LEAST_DEEP * self._step_dt:
+            return FREE
+        self._search_way(time, dt, start)
+        return BLOCKED if known.issuperset(self.found_features()) else MET
+
+    def refuse_fast_closing(self, dt: float) -> None:
+        """Raise SimulationError if contacts closed too fast on the way that was last certified, in a step of dt."""
+        if self._is_fast:
+            number = self.simulation.step_count + 1
+            raise SimulationError(f"step {number}: {self.measures.describe_fast_closing(dt, PARTS)}")
+
+    def _search_way(self, time: float, dt: float, start: StepState) -> None:
+        """Search the way from a start to the present state, which stays."""
+        self.paths.left_searched(start.x)
+        end = self.simulation.state()
+        self.simulation.now.copy_nodes_from(start)
+        self.search_along(time, dt)
+        self.simulation.set_state(*end)
 
     def end(self, time: float, dt: float) -> float:
-        """Return the deepest penetration [m] at a time, the end of a step or substep of dt. Set `relative_penetration`."""
-        return self._measure_penetration(time, dt)
+        """Return the deepest penetration [m] at a time, the end of a step or a part of dt. Set `relative_penetration`.
 
-    def _measure_penetration(self, time: float, dt: float) -> float:
-        """Search there, and reuse the result until the next substep begins."""
+        The search there is reused until the next part begins.
+        """
         ended = self._measured_end
         if ended is not None and ended[1] == dt and abs(ended[0] - time) <= 1e-6 * dt:
             return self._depth
@@ -403,25 +474,18 @@ class ContactStep:
         self.crossing = found.relative
         return found.depth, found.relative
 
-    def search_along_path(self, time: float, dt: float) -> bool:
-        """Search along `paths.displacement` from the start state; return whether that finds new contacts."""
+    def search_along(self, time: float, dt: float) -> None:
+        """Search along `paths.displacement` from the present state, with all that was met."""
         self._searched = self._measured_end = None
-        known = self._found_features()
         self.paths.use_all()
         self._find(time, dt, path=self.paths.displacement)
         self._searched = time, dt
-        return not known.issuperset(self._found_features())
 
-    def _found_features(self) -> set[tuple]:
+    def found_features(self) -> set[tuple]:
         """Return the features of the contacts of the last search."""
         detection = self.detection
         found = detection.buffer.data.feature[detection.kept.to_numpy(detection.counts.contacts)]
         return set(map(tuple, found.tolist()))
-
-    def measure_start(self, time: float, dt: float) -> tuple[float, float]:
-        """Return the deepest penetration before a step of dt over the finer mean surface edge, and its largest closing ratio."""
-        self.search(time, dt)
-        return float(self.measures.closing[RELATIVE_PENETRATION]), self.measures.closing_ratio
 
     def initial_crossing(self) -> float:
         """Return the depth of crossing triangles over the finer side's mean surface edge, at the start of a searched step."""

@@ -13,8 +13,6 @@ Where nothing crosses, implicit steps need no such limit, since what they miss i
 drops the contacts that it would be for, unless they close head-on.
 """
 
-import math
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -32,7 +30,6 @@ from taisoft.fem.state import DEVIATION
 
 MAX_CLOSING = 0.5  # of the thinner side's thickness: how far a contact may close in one step
 DEPTH, CLOSING_RATIO, SPEED, WHICH, RELATIVE_PENETRATION = range(5)  # indices into the result of `measure_closing`
-ROUNDING = 1e-9  # of a number of substeps
 DEEP_PENETRATION = 0.02  # of the finer side's mean surface edge: penetration reported as a problem
 
 
@@ -202,24 +199,3 @@ def find_displacement(m: ti.template(), s: ti.template(), x_start: ti.template()
             length = leaving(displacement[s.node[k]], s.move[k]).norm()
             if length > m.state.scalars[DEVIATION]:  # few do, and atomics on one address wait for each other
                 ti.atomic_max(m.state.scalars[DEVIATION], length)
-
-
-def next_length(ratio: Callable[[float], float], remaining: float, length: float, longest: float, may_grow: bool) -> float:
-    """Return the length [s] of the next substep: the remaining time cut equally, so that no contact's ratio exceeds 1.
-
-    ratio: largest closing ratio of a substep of the given length [s] from here; length: of the previous substep; longest: maximum
-    length; may_grow: whether the substep may be longer than the previous one.
-    """
-    GROWTH = 2.0  # maximum ratio of its length to the previous one, so that the motion after an impact is resolved
-    length = remaining / _count(remaining / length)
-    found = ratio(length)
-    if may_grow and GROWTH * found <= 1.0 and length < min(remaining, longest) * (1.0 - ROUNDING):
-        # the ratio holds for the searched length; a longer substep may have more contacts
-        length = remaining / _count(remaining / min(GROWTH * length, longest))
-        found = ratio(length)
-    return remaining / _count(remaining / length * max(found, 1.0))
-
-
-def _count(substeps: float) -> int:
-    """Round a number of equal substeps up, except for rounding errors."""
-    return max(1, math.ceil(substeps * (1.0 - ROUNDING)))

@@ -19,7 +19,6 @@ from taisoft.contact.problem import RESIDUAL, ContactProblem, residual_of
 from taisoft.contact.prox import dvec, into_disk, prox, scaled
 from taisoft.fem.chunks import THREADS, block_total, share
 from taisoft.fem.model import Model
-from taisoft.fem.node_graph import n_nodes_of, node_of
 from taisoft.linear.block_csr import BLOCK
 from taisoft.linear.coupling import NO_COUPLING, Coupling, build_coupling
 
@@ -271,12 +270,11 @@ def update_impulses(m: ti.template(), contacts: ti.template(), new_multipliers: 
 
 
 @kernel
-def save_diagonal(m: ti.template(), A: ti.template(), contacts: ti.template(), subset: ti.template()):
+def save_diagonal(m: ti.template(), A: ti.template(), contacts: ti.template()):
     """Save the new matrix's diagonal without contacts, and diag(A)^-1, the inverse masses for the r-factors."""
     (rows,) = ti.static((contacts.problem,))
     ti.loop_config(serialize=m.serial)
-    for j in range(n_nodes_of(m, subset)):
-        i = node_of(subset, j)
+    for i in range(m.n_nodes):
         contacts.coupling.base[i] = A.diagonal[i]
         for a in ti.static(range(3)):
             # an entry can be negative if tets are strongly compressed

@@ -8,14 +8,17 @@ augmented Lagrangian on the host. A, whose band is that of single bodies unless 
 coarsest level is. The r-factors come from W: those from the diagonal of A would be too large by as much as the bodies are stiff,
 and the laws' residual with them. Where iterations stall, the result counts if it meets the laws at least as well as theirs, with
 their r-factors.
-Weakness: W is dense within each group of bodies that touch, and within soft ones altogether: only small stages are solved so.
+A couples no nodes of different parts, bodies in general, so that W is found part by part.
+Weakness: W is dense within each part: only stages with few contacts a body are solved so.
 """
 
-import math
+import itertools
 from typing import Any
 
 import numpy as np
+import scipy.linalg as sl
 import scipy.sparse as sp
+from scipy.sparse.csgraph import connected_components
 
 from taisoft.backend.arrays import download, upload
 from taisoft.contact import augmented_lagrangian
@@ -30,23 +33,23 @@ from taisoft.scene.rigid import FRAME
 class DirectSolver:
     """Direct solves of the linearised stages of one system, whose unknowns are the nodes that depend on no others."""
 
-    MAX_ROWS = 2000  # of W
-    # where soft bodies stall, W is dense, and a step of Newton's method on it takes 10 ms; most need one outer iteration
-    STALLED_ROWS, STALLED_OUTER = 300, 5
-    WORK = 5e7  # maximum rows of W times numbers in the band of A: about 50 ms
+    # most rows of W, Gauss-Seidel sweeps, and iterations of the augmented Lagrangian after these: of rigid bodies alone, and
+    # where soft ones stall, whose W takes longer
+    RIGID, STALLED = (2000, 1000, OUTER), (900, 200, 5)
+    WORK = 2e8  # maximum sum over parts of rows of W times numbers in the band of A: about 0.2 s
     FRACTION = 0.1  # of the laws' tolerance, to which they are met with the r-factors of W
-    SWEEPS = 1000  # of Gauss-Seidel, before the augmented Lagrangian
 
     def __init__(self, model: Model, matrix: BlockCsr, x_hat: Any):
         """x_hat: of the stage, see `StageWork`."""
         m = model
         self._model, self._A, self._x_hat, self._contacts = model, matrix, x_hat, MatrixContacts(model.on_cpu)
         self.is_rigid = m.has_rigid_tets and FRAME * m.rigid_tets.n + m.dependents.n == m.n_nodes  # then it solves all stages
-        self._max_rows, self._max_outer = (self.MAX_ROWS, OUTER) if self.is_rigid else (self.STALLED_ROWS, self.STALLED_OUTER)
+        self._max_rows, *self._limits = self.RIGID if self.is_rigid else self.STALLED
         self._nodes = np.flatnonzero(m.dependents.number.to_numpy() < 0) if m.has_dependents else np.arange(m.n_nodes)
         self._columns = (3 * self._nodes[:, None] + np.arange(3)).reshape(-1)
         self._factor: BandedCholesky | None = None
-        self._size: float | None = None  # numbers in its band
+        self._band: int | None = None  # numbers of a row in its band; 0: not narrow
+        self._part = np.zeros(0, dtype=np.int64)  # of each unknown
         self._is_prepared = False  # for the present matrix
 
     def matrix_changed(self) -> None:
@@ -61,14 +64,15 @@ class DirectSolver:
         rows = 3 * int(stage_contacts.problem.count[0])
         if not 0 < rows <= self._max_rows:
             return False
-        if self._size is None:
-            blocks = self._independent(stage_contacts).tobsr((3, 3))
-            found = narrow_order(blocks.indptr, blocks.indices, 3)
-            self._size = math.inf if found is None else 3 * (found[2] + 1) * len(self._nodes)
-        if rows * self._size > self.WORK:
+        if self._band is None:
+            self._find_parts(self._independent(stage_contacts).tobsr((3, 3)))
+        if self._band == 0:
             return False
         if not self._is_prepared:
             self._free = (self._model.free.to_numpy()[self._nodes] > 0.0).reshape(-1).astype(np.float64)
+            self._J = (jacobian(stage_contacts.problem)[:, self._columns] @ sp.diags(self._free)).tocsr()
+            if self._work() > self.WORK:
+                return False
             try:
                 self._factor = self._factorise(stage_contacts)
             except np.linalg.LinAlgError:
@@ -76,12 +80,40 @@ class DirectSolver:
                     raise
                 return False
             if self._factor is None:
-                self._size = math.inf
+                self._band = 0
                 return False
-            self._J = (jacobian(stage_contacts.problem)[:, self._columns] @ sp.diags(self._free)).tocsr()
-            self._W = sp.csr_matrix(self._J @ self._factor.solve(self._J.T.toarray()))
+            self._W = self._delassus()
             self._is_prepared = True
         return True
+
+    def _find_parts(self, blocks: sp.bsr_matrix) -> None:
+        """Find the parts of A and the width of its band; its pattern stays."""
+        found = narrow_order(blocks.indptr, blocks.indices, 3)
+        self._band = 0 if found is None else found[2] + 1
+        pattern = sp.csr_matrix((np.ones(len(blocks.indices)), blocks.indices, blocks.indptr))
+        self._part = np.repeat(connected_components(pattern, directed=False)[1], 3)
+
+    def _work(self) -> int:
+        """Sum over the parts of the rows of J that are not 0 there times numbers in the band."""
+        is_in = sp.csr_matrix((np.ones(len(self._part)), (np.arange(len(self._part)), self._part)))
+        rows = np.diff((abs(self._J) @ is_in).tocsc().indptr)
+        return self._band * int(rows @ np.bincount(self._part))
+
+    def _delassus(self) -> sp.csr_matrix:
+        """W, from the rows of J that are not 0 in each part. The order of the band leads from part to part."""
+        order, n, entries = self._factor.order, self._J.shape[0], []
+        J, changes = self._J.tocsc()[:, order], np.flatnonzero(np.diff(self._part[order])) + 1
+        for first, last in itertools.pairwise([0, *changes.tolist(), len(order)]):
+            part = J[:, first:last].tocsr()
+            rows = np.flatnonzero(np.diff(part.indptr))
+            if len(rows):
+                part, band = part[rows].toarray(), self._factor.factor[: last - first, first:last]
+                W = part @ sl.cho_solve_banded((band, True), part.T, check_finite=False)
+                entries.append((np.repeat(rows, len(rows)), np.tile(rows, len(rows)), W.reshape(-1)))
+        if not entries:  # no contact can move
+            return sp.csr_matrix((n, n))
+        i, j, values = (np.concatenate(one) for one in zip(*entries))
+        return sp.csr_matrix((values, (i, j)), shape=(n, n))
 
     def set_factors(self, stage_contacts: StageContacts) -> None:
         """Set the r-factors of the contacts to those of W: the diagonal of A alone would give factors far too large.
@@ -109,9 +141,7 @@ class DirectSolver:
         J, residual = self._J, self._free * residual.astype(np.float64)[self._nodes].reshape(-1)
         b = self._velocities(k, x, beta) - J @ self._factor.solve(residual)
         friction, factor, r = download([p.friction, p.factor, k.work.kept], n)
-        r, found = self._contacts.solve(
-            self._W, b, friction, r, "gauss_seidel", self.FRACTION * tolerance, self.SWEEPS, self._max_outer
-        )
+        r, found = self._contacts.solve(self._W, b, friction, r, "gauss_seidel", self.FRACTION * tolerance, *self._limits)
         law_residual = found.residual
         if not self.is_rigid:
             law_residual = augmented_lagrangian.find_residual(self._W, b, friction, r, factor)

@@ -8,13 +8,12 @@ from taisoft.contact.colouring import colour_contacts
 from taisoft.contact.problem import find_factors
 from taisoft.contact.solve import SolveResult, solve
 from taisoft.dynamics import explicit
-from taisoft.dynamics.contact import TOLERANCE, ContactStep
+from taisoft.dynamics.contact import BLOCKED, FREE, MAX_PASSAGES, TOLERANCE, ContactStep
 from taisoft.dynamics.explicit_contact import finish_verlet, move, predict, set_free_velocities
 from taisoft.dynamics.explicit_stepper import ExplicitStepper
 from taisoft.dynamics.results import StepResult
 from taisoft.dynamics.rigid_contacts import RigidContacts
 from taisoft.dynamics.simulation_state import SimulationState
-from taisoft.dynamics.substepping import MAX_PASSAGES
 from taisoft.errors import SimulationError
 from taisoft.fem.state import FAILED, LOWEST_J, MOST_INVERTED
 from taisoft.settings import Settings
@@ -66,11 +65,8 @@ class ContactExplicitStepper(ExplicitStepper):
             targets = simulation.next_targets(start + dt * np.arange(1, n + 1))
             self.acceleration_stale = self.acceleration_stale or simulation.releases != releases
             n = len(targets)
-        self.contact.start_step(dt)
+        self.contact.start_step(start, dt)
         relative_penetration = 0.0
-        if self.contact.crossing is None:
-            self.contact.measure_start(start, dt)
-            self.contact.initial_crossing()
         try:
             while done < n:
                 if targets is not None:
@@ -112,30 +108,21 @@ class ContactExplicitStepper(ExplicitStepper):
         Return the contact solver's result, None without contacts.
         """
         simulation, contact, good = self.simulation, self.contact, self.good
-        closing_ratio = contact.measure_start(time, dt)[1]
-        if closing_ratio > 1.0 and not contact.paths.none_cross:
+        contact.search(time, dt)
+        if not contact.paths.none_cross and contact.measures.closing_ratio > 1.0:
             raise SimulationError(f"step {step}: {contact.measures.describe_fast_closing(dt)}")
         contact.start_substep(dt)
-        result = self._solve_and_move(step, time, dt)
         for tries in range(MAX_PASSAGES + 1):
-            if not contact.paths.find():
-                break
-            end = simulation.state()
-            contact.paths.left_searched(good.x)
-            simulation.now.copy_nodes_from(good)
-            self.acceleration_stale = True
-            contact.search_along_path(time, dt)
-            if contact.paths.uncovered:
-                if not contact.paths.find(as_searched=True):
-                    simulation.set_state(*end)
-                    break
-                contact.search_along_path(time, dt)
-            if tries == MAX_PASSAGES or contact.paths.is_stuck:
-                simulation.set_state(*end)
-                held = contact.paths.hold_back(good.x)
-                self.acceleration_stale = True
-                return replace(result, converged=result.converged and not held) if result else None
             result = self._solve_and_move(step, time, dt)
+            way = contact.certify(time, dt, good)
+            if way == FREE:
+                break
+            self.acceleration_stale = True
+            if way == BLOCKED or tries == MAX_PASSAGES:
+                held = contact.paths.hold_back(good.x)
+                return replace(result, converged=result.converged and not held) if result else None
+            simulation.now.copy_nodes_from(good)
+            contact.search_along(time, dt)
         return result
 
     def _solve_and_move(self, step: int, time: float, dt: float) -> SolveResult | None:

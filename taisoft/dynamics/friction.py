@@ -7,22 +7,22 @@ An update sets the multiplier to the resulting impulse p = prox(lambda - R u), a
 its normal part: a fixed-point iteration lambda -> p. R stays while the laws' residual falls. Otherwise it is doubled after a
 multiplier that took one step, and halved after one that took many, or if that residual rose: with a large R each multiplier
 nearly solves the problem with frozen disks, and that iteration need not converge. Without friction there are no disks, and a
-large R only makes linear solves harder: R then doubles after a few steps, too, and up to `Stage.max_r_scale`. Contacts on both
+large R only makes linear solves harder: R then doubles after a few steps, too, and up to `Goal.max_r_scale`. Contacts on both
 sides of a fold around a spike need this: their impulses must grow far before the fold opens. Several such contacts at one node
-depend on each other but for a part in 1e7. The next problem of a stage therefore begins where the last one left the laws open.
+depend on each other but for a part in 1e7. If a problem leaves the laws open, the stage's next one therefore begins with its R.
 Once they hold, R falls.
 Source: Alart and Curnier 1991 for the laws as a prox; the loop is that of the method of multipliers.
 
 Most problems, and the impacts before a step, need few multipliers. If disks and normal impulses keep changing each other
-slowly, each multiplier may leave 98 % of the laws' residual. So after `Stage.extrapolate_after` of them (`ContactNewton`: at once
-if |r| is only rounding) R becomes R_EXTRAPOLATED and stays, and multipliers are extrapolated from the last two
+slowly, each multiplier may leave 98 % of the laws' residual. So after `Goal.plain` of them (at once if |r| is only
+rounding) R becomes R_EXTRAPOLATED and stays, and multipliers are extrapolated from the last two
 (Anderson 1965, in the form of Walker and Ni 2011): with f = p - lambda, the new one is p - sum t_i (p_i+1 - p_i), where t
-minimises |f - sum t_i (f_i+1 - f_i)|, each entry divided by the square root of its r-factor. Problems of a Newton iteration that
-stalls are never extrapolated: redundant contacts exchange impulses slowly there, which R up to MAX_R speeds up.
+minimises |f - sum t_i (f_i+1 - f_i)|, each entry divided by the square root of its r-factor. Without friction, problems after
+one that left the laws open are not extrapolated (`FrictionalProblems`).
 """
 
 import math
-from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import taichi as ti
@@ -30,34 +30,48 @@ import taichi as ti
 from taisoft.backend.runtime import kernel
 from taisoft.contact.prox import dvec
 from taisoft.dynamics.contact_terms import PAST, open_disk
-from taisoft.dynamics.stage import Stage
 from taisoft.dynamics.stage_system import StageSystem
 
+FIRST_R, MAX_R_FRICTIONLESS = 1.0, 1000.0  # R over the r-factors at first; its upper bound without friction
+PLAIN = 25  # updates of the multipliers before they are extrapolated
 MAX_EXTRAPOLATION = 100.0  # in steps
 PARALLEL = 1e-12  # squared sine between two changes below which the older one is ignored
 
 
-@dataclass(frozen=True)
-class FrictionalResult:
-    """Result of solving a linearised stage. negative: its matrix is indefinite; direct: iterations did not solve it."""
+class Goal(NamedTuple):
+    """To what a frictional problem is solved."""
+
+    norm: float  # |r| [N s]
+    law: float  # residual of the contact laws
+    inner: float  # |r| that ends the steps under one multiplier, whatever PROGRESS [N s]
+    forcing: float  # tolerance of the first linear solve,
+    later: float = 0.0  # and its minimum for the others
+    plain: int = PLAIN
+    max_solves: int = 60
+    r_scale: float = FIRST_R
+    max_r_scale: float = MAX_R_FRICTIONLESS
+
+
+class Solution(NamedTuple):
+    """Solution of a frictional problem. negative: its matrix is indefinite; direct: iterations did not solve it."""
 
     solves: int
     linear: int
-    multipliers: int
+    updates: int  # of the multipliers
     negative: bool
     converged: bool
     r: float
-    r_scale: float = Stage.first_r_scale  # R over the r-factors at its end
+    r_scale: float = FIRST_R  # R over the r-factors at its end
     direct: bool = False
 
 
 class Friction:
     """Solver of frictional problems."""
 
-    PROGRESS = 0.3  # fraction of |r| after a multiplier update to which the inner steps reduce it
+    PROGRESS = 0.3  # fraction of |r| after an update of the multipliers to which the steps under it reduce |r|
     FINER = 0.1  # times the |r| that ends the steps under one multiplier, once multipliers are extrapolated
     ROUNDING = 4.0  # times the floor: |r| that may be rounding, as strains grow (up to 2.8 times was measured, in a thin sheet)
-    MAX_MULTIPLIERS = 200
+    MAX_UPDATES = 200
     R_EXTRAPOLATED = 5.0  # R over the r-factors from then on: iterations vary little from 5 to 7 and increase outside
     MIN_R, MAX_R, MANY_STEPS = 0.3, 100.0, 5  # bounds of R over the r-factors; steps that halve it
     EASED = 0.25  # factor on R without friction once the laws hold, so that the linear solves become easier
@@ -65,64 +79,59 @@ class Friction:
     LAW_DECREASE = 0.8  # times the previous laws' residual: below it R stays
 
     @classmethod
-    def solve(cls, system: StageSystem, problem: Stage, r: float, stalled: bool = False) -> FrictionalResult:
-        """Solve from |r| by linear solves, each followed by the step to zero slope, and multiplier updates.
+    def solve(cls, system: StageSystem, goal: Goal, r: float, stalled: bool = False) -> Solution:
+        """Solve from |r| by linear solves, each followed by the step to zero slope, and updates of the multipliers.
 
-        Directly where that applies, and if these fail. problem: with a linear_tolerance, and its other tolerances relative to the
-        system's present scale; stalled: iterations have failed on the stage's last problem.
+        Directly where that applies, and if these fail. stalled: iterations have failed on the stage's last problem.
         """
-        if (found := cls._solve_directly(system, problem, r, stalled)) is not None:
+        if (found := cls._solve_directly(system, goal, r, stalled)) is not None:
             return found
-        if problem.first_r_scale != system.r_scale:
-            r = system.update_multipliers(problem.first_r_scale, to_impulses=False)
-        target, least_inner = problem.tolerance * system.scale, problem.inner_tolerance * system.scale
-        scale, law_before, n_steps, n_stored, rounding = problem.first_r_scale, math.inf, 0, 0, False
-        solves = linear = multipliers = 0
-        inner_target, negative, converged = cls.PROGRESS * r, False, False
-        while True:
-            law, extrapolating = system.contact_residual, multipliers >= problem.extrapolate_after
-            holds = law <= problem.contact_tolerance
-            is_inner_done = r <= max(least_inner * (cls.FINER if extrapolating else 1.0), inner_target) or rounding
-            if is_inner_done or (holds and r <= target):
-                converged = holds and (r <= max(target, system.floor) or rounding)
-                if converged or multipliers >= cls.MAX_MULTIPLIERS:
+        if goal.r_scale != system.r_scale:
+            r = system.update_multipliers(goal.r_scale, to_impulses=False)
+        scale, law_before, n_steps, n_stored, rounding = goal.r_scale, math.inf, 0, 0, False
+        solves = linear = updates = 0
+        inner, negative, converged = cls.PROGRESS * r, False, False
+        while math.isfinite(r):
+            law, extrapolating = system.contact_residual, updates >= goal.plain
+            holds = law <= goal.law
+            is_inner_done = rounding or r <= max(goal.inner * (cls.FINER if extrapolating else 1.0), inner)
+            if is_inner_done or (holds and r <= goal.norm):
+                converged = holds and (rounding or r <= max(goal.norm, system.floor))
+                if converged or updates >= cls.MAX_UPDATES:
                     break
                 if extrapolating:
                     extrapolate_multipliers(system.contacts, n_stored)
                     scale, n_stored = cls.R_EXTRAPOLATED, min(n_stored + 1, PAST)
                 else:
-                    bounds = problem.max_r_scale, problem.contact_tolerance
-                    scale = cls.next_scale(scale, law, law_before, n_steps, system.frictionless, *bounds)
+                    scale = cls.next_scale(scale, law, law_before, n_steps, system.frictionless, goal.max_r_scale, goal.law)
                 r = system.update_multipliers(scale, to_impulses=not extrapolating)
-                law_before, n_steps, rounding, inner_target, multipliers = law, 0, False, cls.PROGRESS * r, multipliers + 1
-            elif solves >= problem.max_newton:
+                law_before, n_steps, rounding, inner, updates = law, 0, False, cls.PROGRESS * r, updates + 1
+            elif solves >= goal.max_solves:
                 break
             else:
-                found = system.solve_linear(max(problem.linear_tolerance, problem.later_tolerance if solves else 0.0))
+                found = system.solve_linear(max(goal.forcing, goal.later if solves else 0.0))
                 solves, linear, n_steps = solves + 1, linear + found.iterations, n_steps + 1
                 if negative := found.negative:
                     break
                 before, r = r, system.advance(scale)
-                if not r < math.inf:
-                    break
                 rounding = r <= cls.ROUNDING * system.floor and r > 0.5 * before
-        system.r_scale = Stage.first_r_scale
+        system.r_scale = FIRST_R
         if not (converged or negative or stalled):
-            if (found := cls._solve_directly(system, problem, r, stalled=True)) is not None:
-                return replace(found, solves=solves + 1, linear=linear, multipliers=multipliers)
-        return FrictionalResult(solves, linear, multipliers, negative, converged, r, scale)
+            if (found := cls._solve_directly(system, goal, r, stalled=True)) is not None:
+                return found._replace(solves=solves + 1, linear=linear, updates=updates)
+        return Solution(solves, linear, updates, negative, converged, r, scale)
 
     @staticmethod
-    def _solve_directly(system: StageSystem, problem: Stage, r: float, stalled: bool) -> FrictionalResult | None:
+    def _solve_directly(system: StageSystem, goal: Goal, r: float, stalled: bool) -> Solution | None:
         """Return the result of a direct solve, None if that does not apply."""
         try:
-            found = system.solve_directly(problem.contact_tolerance, stalled)
+            found = system.solve_directly(goal.law, stalled)
         except np.linalg.LinAlgError:
-            return FrictionalResult(1, 0, 0, True, False, r)
+            return Solution(1, 0, 0, True, False, r)
         if found is None:
             return None
         iterations, converged, r = found
-        return FrictionalResult(1, 0, iterations, False, converged, r, direct=True)
+        return Solution(1, 0, iterations, False, converged, r, direct=True)
 
     @classmethod
     def next_scale(
@@ -135,7 +144,7 @@ class Friction:
         solves harder; max_r, law_tolerance: then the upper bound of R, and the residual below which the laws hold.
         """
         if frictionless and law <= law_tolerance:
-            return max(Stage.first_r_scale, cls.EASED * scale)
+            return max(FIRST_R, cls.EASED * scale)
         if not frictionless and law > cls.LAW_INCREASE * before and scale > cls.STEADY:
             return 0.5 * scale
         if law > cls.LAW_DECREASE * before:

@@ -1,164 +1,203 @@
-"""Implicit integrators: a step is one stage x = x_hat + beta v, M (v - v_hat) = beta f(x, v), or several if it is cut.
+"""Implicit integrators: a step is one stage (`implicit_stages`), or several if it is cut.
 
-An integrator is a `Scheme` (`schemes`): how x_hat, v_hat and beta follow from previous states, and whether the stage is the
-step's midpoint.
+A step is tried whole, or as long as the last parts that were kept allow (`part_length`). What the way of a part meets becomes a
+contact, with which its stage is solved on (`_attempt`). A part is rejected, undone and halved if its way is not free all the
+same (`ContactStep.certify`), or if Newton's method failed and shorter parts may help. What cannot be halved is kept and reported;
+bodies that would still pass through something are held back. Where surfaces cross already, contacts that close fast limit the
+length, and motion too fast for the shortest part is refused.
+
+Where the Newton iterations of the step are used up (`newton_budget`), the part under way is the last: what passes through
+something on its way, or inverts tets, is held back, and in the rest of the step only what is prescribed moves.
 """
 
-from dataclasses import dataclass, replace
+import math
+from dataclasses import replace
 
 import numpy as np
-import taichi as ti
 
-from taisoft.backend.arrays import download, upload
-from taisoft.backend.runtime import kernel
-from taisoft.dynamics.contact import TOLERANCE, ContactStep
-from taisoft.dynamics.contact_newton import correct_multipliers, solve
-from taisoft.dynamics.elimination import eliminate
-from taisoft.dynamics.friction import extrapolate_multipliers
-from taisoft.dynamics.imbalance import describe_imbalance
-from taisoft.dynamics.impact import solve_bouncing
-from taisoft.dynamics.multipliers import Multipliers
+from taisoft.backend.arrays import download
+from taisoft.dynamics.contact import FREE, MAX_PASSAGES, MET, ContactStep
+from taisoft.dynamics.implicit_stages import ImplicitStages
 from taisoft.dynamics.no_contacts import NoContacts
-from taisoft.dynamics.pieces import Pieces
-from taisoft.dynamics.results import StageResult, StepResult, count_all
-from taisoft.dynamics.schemes import SCHEMES, Scheme
+from taisoft.dynamics.part_length import PARTS, PartLength
+from taisoft.dynamics.results import StageResult, StepResult, count_all, merge
 from taisoft.dynamics.simulation_state import SimulationState
-from taisoft.dynamics.stage import Stage
-from taisoft.dynamics.stage_system import StageSystem
-from taisoft.dynamics.substepping import LengthLimit, Substepping
 from taisoft.errors import SimulationError
-from taisoft.fem.dependents import place_all
 from taisoft.fem.measure import measure
-from taisoft.fem.rigid_tets import begin_rigid_stage
 from taisoft.fem.state import N_INVERTED
 from taisoft.settings import Settings
 
-MAX_NEWTON, MAX_NEWTON_WITH_CONTACTS = 50, 25  # a step that needs more is cut in substeps, or reported as not converged
-DEFAULT_TOLERANCE = {"f32": 1e-4, "f64": 1e-8}  # relative residual; f32 forces carry 1e-6 to 1e-5 of rounding
 
-
-@kernel
-def begin_step(
-    m: ti.template(),
-    w: ti.template(),
-    h: ti.template(),
-    multistep: ti.template(),
-    now: ti.f64,
-    before: ti.f64,
-    still: ti.f64,
-    extrapolation: ti.f64,
-):
-    """Store state n in the history; compute x_hat and v_hat of the stage, and the first iterate of v on the free axes.
-
-    The iterate is (1 - still) v_n + extrapolation (v_n - v_(n-1)). still is 1 for the linearly implicit step, which is
-    linearised at x_n. Fixed axes keep 0; prescribed nodes are set with the targets.
-    """
-    ti.loop_config(serialize=m.serial)
-    for i in range(m.n_nodes):
-        if ti.static(multistep):
-            h.x_before[i] = h.x_now[i]
-        h.v_before[i] = h.v_now[i]
-        h.x_now[i] = m.state.x[i]
-        h.v_now[i] = m.state.v[i]
-        w.x_hat[i] = h.x_now[i]
-        w.v_hat[i] = h.v_now[i]
-        if ti.static(multistep):
-            w.x_hat[i] = now * h.x_now[i] - before * h.x_before[i]
-            w.v_hat[i] = now * h.v_now[i] - before * h.v_before[i]
-        v = (1.0 - still) * h.v_now[i] + extrapolation * (h.v_now[i] - h.v_before[i])
-        m.state.v[i] = m.free[i] * v
-
-
-@kernel
-def finish_midpoint(m: ti.template(), h: ti.template()):
-    """Extrapolate from the midpoint: x = 2 x_m - x_n, v = 2 v_m - v_n."""
-    ti.loop_config(serialize=m.serial)
-    for i in range(m.n_nodes):
-        m.state.x[i] = 2.0 * m.state.x[i] - h.x_now[i]
-        m.state.v[i] = m.state.v[i] + m.free[i] * (m.state.v[i] - h.v_now[i])
-    place_all(m)
-
-
-@dataclass(frozen=True, eq=False)
-class History:
-    """States n and n - 1, (n_nodes) 3-vectors f64; x_before only for multistep schemes."""
-
-    x_now: object
-    v_now: object
-    v_before: object
-    x_before: object
-
-
-class ImplicitStepper:
-    """Take steps of one scheme for a simulation state and its contacts."""
+class ImplicitStepper(ImplicitStages):
+    """Take steps of one scheme, see above."""
 
     def __init__(self, simulation: SimulationState, settings: Settings, contact: ContactStep | NoContacts):
-        self.simulation, self.scheme, self.contact = simulation, SCHEMES[settings.integrator], contact
-        model, arena = simulation.model, simulation.arena
-        self.first, self.start = simulation.now.another(arena, "first"), simulation.now.another(arena, "now")
-        self.history = History(
-            self.start.x,
-            self.start.v,
-            arena.vectors("v_before", ti.f64, model.n_nodes),
-            arena.vectors("x_before", ti.f64, model.n_nodes) if self.scheme.before else None,
-        )
-        self._multipliers = Multipliers(simulation) if len(simulation.loads.multipliers) else None
-        self.solver = StageSystem(simulation, contact, self.history.x_now, self._multipliers)
-        self.tolerance = settings.newton_tolerance or DEFAULT_TOLERANCE[settings.precision]
-        self.contact_tolerance = settings.contact_tolerance or TOLERANCE[settings.precision]
-        self.linear_tolerance = settings.linear_tolerance
-        self._substepping = Substepping(self)
+        super().__init__(simulation, settings, contact)
+        self.first = simulation.now.another(simulation.arena, "first")  # state before the step
         self.forget()
 
     def forget(self) -> None:
         """Discard the history, after the state was set."""
-        self._substepping.may_retry, self._substepping.limit = True, LengthLimit()
-        self._n_previous = 0  # previous states in the history
-        self._beta = self._dt = 0.0  # of the last step
-        self.contact.forget()
-        self.solver.linear_solver.forget()
+        super().forget()
+        self._length = PartLength()
 
-    def numbers_changed(self) -> None:
-        """Update for changed gravity or material numbers."""
-        self.solver.numbers_changed()
+    def snapshot(self) -> dict:
+        """Return the state of the stepper: history, solver, contacts, and the length of the next part."""
+        return super().snapshot() | {"part_length": self._length.snapshot()}
 
-    def loads_changed(self) -> None:
-        """Do nothing: every stage reads the loads."""
+    def restore(self, kept: dict) -> None:
+        """Restore a `snapshot`."""
+        super().restore(kept)
+        self._length.restore(kept["part_length"])
 
     def held_steps(self, dt: float) -> int:
         """Return the number of steps of dt over which a drag force is held."""
         return 1
 
-    def snapshot(self) -> dict:
-        """Return the state of the stepper: history, solver and contacts."""
-        x, v = download([self.start.x, self.start.v])
-        return {
-            "past": self._n_previous,
-            "beta": self._beta,
-            "dt": self._dt,
-            "recovers": self._substepping.may_retry,
-            "length_limit": self._substepping.limit.snapshot(),
-            "x_now": x,
-            "v_now": v,
-            "contact": self.contact.snapshot(),
-            "solver": self.solver.snapshot(),
-        }
-
-    def restore(self, kept: dict) -> None:
-        """Restore a `snapshot`. It has no x_before and v_before, since each step writes them first."""
-        upload([(self.start.x, kept["x_now"]), (self.start.v, kept["v_now"])])
-        self._n_previous, self._beta, self._dt = int(kept["past"]), float(kept["beta"]), float(kept["dt"])
-        self._substepping.may_retry = bool(kept["recovers"])
-        self._substepping.limit.restore(kept["length_limit"])
-        self.contact.restore(kept["contact"])
-        self.solver.restore(kept["solver"])  # after the contacts, whose fields it uses
-
     def advance(self, n: int, dt: float) -> StepResult:
-        """Take one step of dt, whatever n, see `Substepping.step`."""
-        result = self._substepping.step(self.simulation.time, dt)
+        """Take one step of dt, whatever n. Raise SimulationError if it fails; the state is then the one before."""
+        self.first.copy_from(self.simulation.now)
+        self.solver.budget.begin()
+        dropped: list[StageResult] = []
+        for is_last in (False, True):
+            try:
+                kept, held = self._take_parts(dt, dropped)
+                break
+            except BaseException as error:  # Ctrl-C, too
+                self.simulation.return_to(self.first)
+                was_halved = isinstance(error, SimulationError) and any(result.free for result in dropped)
+                length = self._length
+                self.forget()
+                if is_last or not was_halved:
+                    raise
+                self._length = length  # an error where only convergence was missing: the step is taken without halving for that
+                length.give_up()
+        if self._is_spent():
+            self._length.give_up()
+        return self._report(count_all(merge(kept), dropped), len(kept), held)
+
+    def _take_parts(self, dt: float, dropped: list[StageResult]) -> tuple[list[StageResult], float]:
+        """Take a step of dt in parts, which are halved while they are rejected, and then in `dropped`. Return the results of the
+        others, and the fraction of the step in which motion was held back for lack of iterations."""
+        contact, length, time = self.contact, self._length, self.simulation.time
+        kept, held, left = [], 0.0, PARTS  # left: in dt / PARTS
+        contact.start_step(time, dt)
+        while left:
+            now, is_rest = time + (1.0 - left / PARTS) * dt, self._is_spent()
+            units = left if is_rest else contact.most_units(now, dt, min(left, length.units(dt)))
+            part = units / PARTS * dt
+            result = self._hold(now, part) if is_rest else self._attempt(now, part)
+            # linearly implicit stages do not iterate: shorter ones need not converge sooner
+            converged = result.converged or self.scheme.one_iteration
+            if not self._is_spent() and length.should_halve(result.free, converged, units):
+                if not (is_finite := math.isfinite(result.residual)):
+                    self.solver.linear_solver.forget()
+                self._undo(discard_impulses=result.free or not is_finite)
+                length.halve(units, dt)
+                dropped.append(result)
+                continue
+            if not math.isfinite(result.residual):
+                raise SimulationError(f"step {self.simulation.step_count + 1}: {result.imbalance}")
+            result, part_held = (result, 1.0) if is_rest else self._hold_back(result, dt)
+            held += units / PARTS * part_held
+            left -= units
+            contact.end_part(now + part, part if left else dt, self.start.x, self.dissipative)
+            length.keep(units, converged)
+            kept.append(result)
+        return kept, held
+
+    def _attempt(self, time: float, dt: float) -> StageResult:
+        """Solve the stage of a part of dt from a time [s]. What its way meets becomes contacts, and the stage is solved on from
+        the velocities reached."""
+        contact, results, start, n_previous = self.contact, [], None, self.n_previous + 1
+        self.start.copy_rest_from(self.simulation.now)
+        contact.start_substep(dt)
+        while True:
+            result = self.solve_stage(time, dt, start)
+            results.append(result)
+            # an impact of the first attempt is none for the next, whose contacts have impulses from the start
+            self.n_previous = n_previous = min(n_previous, self.n_previous)
+            if not math.isfinite(result.residual):
+                return count_all(result, results[:-1])
+            way = contact.certify(time, dt, self.start)
+            is_hopeless = not (result.converged or self.scheme.one_iteration)
+            if way != MET or len(results) > MAX_PASSAGES or is_hopeless or self._is_spent():
+                return count_all(replace(result, free=way == FREE), results[:-1])
+            start = self.simulation.velocities()
+            self.simulation.now.copy_nodes_from(self.start)
+            self.n_previous = 0
+            contact.search_along(time, dt)
+
+    def _undo(self, discard_impulses: bool) -> None:
+        """Return to the start of the part, for a shorter one. discard_impulses: they would not help it."""
+        self.simulation.return_to(self.start)
+        self.n_previous = 0
+        # BDF2 detects impacts by the contacts without impulse in the last step
+        self.contact.discard_search(with_impulses=discard_impulses or self.scheme.before > 0.0)
+
+    def _is_spent(self) -> bool:
+        """Whether the step has no Newton iterations left."""
+        return not self.solver.budget.left
+
+    def _hold(self, time: float, dt: float) -> StageResult:
+        """Take a part in which only what is prescribed moves."""
+        self.start.copy_rest_from(self.simulation.now)
+        self.contact.start_substep(dt)
+        result = self.solve_stage(time, dt, None)
+        self._return_by(0.0)
+        if self.contact.paths.find():
+            self.contact.paths.hold_back(self.start.x)
+        return StageResult(0.0, 0, 0.0, False, False, imbalance=result.imbalance)
+
+    def _hold_back(self, result: StageResult, dt: float) -> tuple[StageResult, float]:
+        """Hold back what passes through something on the way of a part that is kept, and, where the iterations are used up, what
+        inverts tets; return the result, and the fraction of the motion that is held back for that.
+
+        Raise SimulationError if contacts close too fast even for the shortest part of a step of dt.
+        """
+        paths, held = self.contact.paths, 0.0
+        if not result.free:
+            if not self._is_spent():
+                self.contact.refuse_fast_closing(dt)
+            if paths.hold_back(self.start.x):
+                self.n_previous, result = 0, replace(result, converged=False)
+        if self._is_spent() and not result.converged:
+            held = 1.0 - self._hold_back_inverted()
+            if held and paths.find():
+                paths.hold_back(self.start.x)
+        return result, held
+
+    def _hold_back_inverted(self) -> float:
+        """Shorten the motion of the last part until no more tets are inverted than at its start; return what is left of it."""
+        n_end, end = self._count_inverted(), self.simulation.state()
+        self._return_by(0.0)
+        n_start, part = self._count_inverted(), 1.0
+        while n_end > n_start and part > 0.0:
+            part = 0.5 * part if part > 1e-3 else 0.0
+            self.simulation.set_state(*end)
+            self._return_by(part)
+            n_end = self._count_inverted()
+        if part == 1.0:
+            self.simulation.set_state(*end)
+        else:
+            self.n_previous = 0
+        return part
+
+    def _count_inverted(self) -> float:
+        measure(self.simulation.model)
+        return self.simulation.model.state.scalars[N_INVERTED]
+
+    def _return_by(self, left: float) -> None:
+        """Leave only a fraction of the last part's change of the free nodes' positions and velocities."""
+        free, *start = download([self.simulation.model.free, self.start.x, self.start.v])
+        end = self.simulation.state()
+        self.simulation.set_state(*(np.where(free > 0, a + left * (b - a), b).astype(b.dtype) for a, b in zip(start, end)))
+
+    def _report(self, result: StageResult, n_parts: int, held: float) -> StepResult:
+        """What is reported of a step. held: the fraction of it in which motion was held back for lack of iterations."""
         worst, name = result.unbalanced
         step = StepResult(
-            substeps=self._substepping.substeps,
+            substeps=n_parts,
             newton_iterations=round(result.newton_iterations),
             linear_iterations=result.linear_iterations,
             multigrid_solves=result.multigrid_solves,
@@ -174,10 +213,10 @@ class ImplicitStepper:
                 + (f" and a contact residual of {step.contact_residual:.2e}" if self.contact.n_contacts else "")
                 + (f"; {result.imbalance}" if result.imbalance else "")
             )
-        if self._substepping.held_part > 0.0:
+        if held > 0.0:
             step.problems.append(
                 f"{self.solver.budget.limit} Newton iterations, the most in a step, were not enough: the motion in the last "
-                f"{100.0 * self._substepping.held_part:.3g} % of the step was held back"
+                f"{100.0 * held:.3g} % of the step was held back"
             )
         if self.contact.paths.held_back:
             step.problems.append(self.contact.paths.held_back)
@@ -186,201 +225,3 @@ class ImplicitStepper:
         if name:
             step.problems.append(f"forces on {name} are unbalanced by {worst:.2g} of their size, beside larger forces elsewhere")
         return step
-
-    @property
-    def is_linear(self) -> bool:
-        """Whether steps are linearised, without iterations."""
-        return self.scheme.one_iteration
-
-    def is_spent(self) -> bool:
-        """Return whether the step has no Newton iterations left."""
-        return not self.solver.budget.left
-
-    def hold_substep(self, time: float, dt: float) -> StageResult:
-        """Take a substep in which only what is prescribed moves."""
-        result = self.take_substep(time, dt)
-        self._return_in_part(0.0)
-        return StageResult(0.0, 0, 0.0, False, False, imbalance=result.imbalance)
-
-    def hold_back_inverted(self) -> float:
-        """Shorten the motion of the last substep until no more tets are inverted than at its start; return what is left of it."""
-        n_end, end = self._count_inverted(), self.simulation.state()
-        self._return_in_part(0.0)
-        n_start, part = self._count_inverted(), 1.0
-        while n_end > n_start and part > 0.0:
-            part = 0.5 * part if part > 1e-3 else 0.0
-            self.simulation.set_state(*end)
-            self._return_in_part(part)
-            n_end = self._count_inverted()
-        if part == 1.0:
-            self.simulation.set_state(*end)
-        else:
-            self._n_previous = 0
-        return part
-
-    def _count_inverted(self) -> float:
-        measure(self.simulation.model)
-        return self.simulation.model.state.scalars[N_INVERTED]
-
-    def _return_in_part(self, part: float) -> None:
-        """Leave only a part of the last substep's change of the free nodes' positions and velocities."""
-        free, *start = download([self.simulation.model.free, self.start.x, self.start.v])
-        end = self.simulation.state()
-        self.simulation.set_state(*(np.where(free > 0, a + part * (b - a), b).astype(b.dtype) for a, b in zip(start, end)))
-
-    def begin_step(self) -> None:
-        """Save the start of a step, which may take all its Newton iterations."""
-        self.first.copy_from(self.simulation.now)
-        self.solver.budget.begin()
-
-    def return_to_first(self) -> None:
-        """Return to the start of the step, without history."""
-        self.simulation.return_to(self.first)
-        self._n_previous = 0
-        self.contact.discard()
-
-    def begin_substep(self, dt: float) -> None:
-        """Save the start of a substep of dt; the stage saves positions and velocities."""
-        self.start.copy_rest_from(self.simulation.now)
-        self.contact.start_substep(dt)
-
-    def undo_substep(self, discard_impulses: bool) -> None:
-        """Return to the start of the last substep, for another length of it."""
-        self.simulation.return_to(self.start)
-        self._n_previous = 0
-        # BDF2 detects impacts by the contacts without impulse in the last step
-        self.contact.discard_search(with_impulses=discard_impulses or self.scheme.before > 0.0)
-
-    def retry_substep(self, time: float, dt: float, start: np.ndarray) -> StageResult:
-        """Repeat a substep with other contacts, from its start. start: (n_nodes, 3) [m/s] velocities reached before."""
-        past, self._n_previous = self._n_previous, 0
-        result = self.take_substep(time, dt, start)
-        self._n_previous = min(self._n_previous, past)
-        return result
-
-    def hold_back_paths(self) -> bool:
-        """Hold back bodies of the last substep that pass through something; return whether any do. The next substep then starts
-        without history."""
-        held = self.contact.paths.hold_back(self.start.x)
-        self._n_previous *= not held
-        return held
-
-    def take_substep(self, time: float, dt: float, start: np.ndarray | None = None) -> StageResult:
-        """Take a substep of dt from a time with the contacts of one search. start: (n_nodes, 3) [m/s] first iterate of v."""
-        simulation, solver = self.simulation, self.solver
-        scheme, bounces = self._prepare(time, dt, start)
-        stage = replace(self._stage(scheme, dt, self.tolerance), renews=not bounces)
-        result = solve_bouncing(solver, stage) if bounces else solve(solver, stage)
-        result = correct_multipliers(solver, stage, result)
-        if scheme.one_iteration and solver.pieces.several and result.converged and np.isfinite(result.residual):
-            result = self._balance(scheme, stage, result, may_repeat=not bounces)
-        if not result.converged:
-            result = replace(result, imbalance=describe_imbalance(simulation, solver, self.contact))
-        if scheme.midpoint:
-            finish_midpoint(simulation.model, self.history)
-        if not np.isfinite(result.residual):  # a NaN anywhere in x or v reaches the residual
-            where = simulation.find_nonfinite(solver.work.residual.to_numpy()) or "the residual is not finite"
-            raise SimulationError(f"step {simulation.step_count + 1}: {where}")
-        self._n_previous += 1
-        if self.contact.had_impact:
-            self._n_previous = 0
-        return result
-
-    def _prepare(self, time: float, dt: float, start: np.ndarray | None) -> tuple[Scheme, bool]:
-        """Search contacts and begin the stage of a substep; return its scheme, and whether any contacts rebound."""
-        simulation, model, work = self.simulation, self.simulation.model, self.solver.work
-        releases = simulation.releases
-        target = simulation.next_target(time + dt)
-        if simulation.releases != releases or dt != self._dt:
-            self._n_previous = 0
-        self.contact.begin(time, dt)
-        # multistep schemes restart at an impact: they would take the velocity jump for an acceleration
-        impact = self.scheme.before and self.contact.detect_impact(dt)
-        if (bounces := self.contact.detect_rebounds(dt)) or impact:
-            self._n_previous = 0
-        self._dt = dt
-        scheme = self.scheme if self._n_previous > 0 or self.scheme.start is None else self.scheme.start
-        self.dissipative = scheme.before == 0.0
-        if target is not None:
-            if scheme.midpoint:
-                target = 0.5 * (target + model.state.x.to_numpy()[simulation.dirichlet.prescribed_nodes])
-            prescribed = [(work.prescribed_axes, simulation.dirichlet.prescribed_axes()), (work.targets, target)]
-            if model.consistent:
-                accelerations = simulation.dirichlet.accelerations(time, dt, self.scheme.before == 0.0)
-                prescribed.append((work.prescribed_acceleration, accelerations))
-            upload(prescribed)
-        simulation.set_load_time(time + (0.5 if scheme.midpoint else 1.0) * dt)
-        if self._multipliers is not None:
-            self._multipliers.begin(time + dt, self.contact.n_contacts == 0 and model.on_cpu)
-        self._beta = scheme.beta_over_dt * dt
-        self.contact.set_impulse_fraction(scheme.beta_over_dt)
-        self.solver.assemble_damper()
-        extrapolation = (0.5 if scheme.midpoint else 1.0) if self._n_previous > 1 and not scheme.one_iteration else 0.0
-        self._begin(scheme, extrapolation)
-        if start is not None and not scheme.one_iteration:  # that one is linearised at the step's start
-            upload([(model.state.v, start)])
-        return scheme, bounces
-
-    def _begin(self, scheme: Scheme, extrapolation: float) -> None:
-        """Begin the stage from the present state."""
-        multistep, still = self.scheme.before > 0.0, float(scheme.one_iteration)
-        begin_step(
-            self.simulation.model, self.solver.work, self.history, multistep, scheme.now, scheme.before, still, extrapolation
-        )
-        if self.simulation.model.rigid_tets is not None:
-            begin_rigid_stage(self.simulation.model, self.history, multistep, scheme.now, scheme.before, self._beta)
-
-    def _balance(self, scheme: Scheme, stage: Stage, result: StageResult, may_repeat: bool) -> StageResult:
-        """Solve a linearised stage again, to a tighter tolerance, if the forces on a piece as a whole are unbalanced."""
-        worst, name = self._unbalanced_mean()
-        if worst > Pieces.LIMIT and may_repeat:
-            self.simulation.now.copy_nodes_from(self.start)
-            self._begin(scheme, 0.0)
-            tighter = self.tolerance * Pieces.LIMIT / min(worst, 1.0) * 0.1  # a tenth of what would just balance the piece
-            stage = replace(stage, tolerance=tighter)
-            result = count_all(correct_multipliers(self.solver, stage, solve(self.solver, stage)), [result])
-            worst, name = self._unbalanced_mean()
-        return replace(result, unbalanced=(worst, name)) if worst > Pieces.LIMIT else result
-
-    def _unbalanced_mean(self) -> tuple[float, str]:
-        rounding = self.solver.rounding
-        return self.solver.pieces.unbalanced_mean(self.solver.work, self._beta, rounding.eps, rounding.piece_mass)
-
-    def _stage(self, scheme: Scheme, dt: float, tolerance: float) -> Stage:
-        max_newton = MAX_NEWTON if self.contact.n_contacts == 0 else MAX_NEWTON_WITH_CONTACTS
-        return Stage(
-            1.0,
-            self._beta,
-            dt,
-            tolerance,
-            self.contact_tolerance,
-            max_newton,
-            self.linear_tolerance,
-            scheme.one_iteration,
-            # prescribed nodes change their velocity once a step, not twice within the midpoint's half step
-            0.5 if scheme.midpoint else 1.0,
-        )
-
-    def compile_hard_steps(self) -> None:
-        """Compile the kernels that only hard steps need, by running them on the current stage; its state is then invalid."""
-        free = np.flatnonzero(self.simulation.model.free.to_numpy().any(axis=1))
-        eliminate(self.solver, replace(self.solver.stage, tolerance=0.0), 0.0, free[:1])
-        self.solver.form_matrix(projected=True)
-        self.solver.linear_residual()  # multiplies by the matrix, as multigrid does
-        if self.solver.n_contacts:
-            extrapolate_multipliers(self.solver.contacts, 0)
-
-    def reactions(self) -> np.ndarray:
-        """Return the constraint forces of the last step, (n_nodes, 3) [N]."""
-        if self._beta == 0.0:
-            return np.zeros((self.simulation.model.n_nodes, 3))
-        return self.solver.held_residual() / self._beta
-
-    @property
-    def field_bytes(self) -> dict[str, int]:
-        """Bytes by name of the solver's temporary fields."""
-        return self.solver.field_bytes
-
-    def release(self) -> None:
-        """Free the memory of these fields."""
-        self.solver.release()

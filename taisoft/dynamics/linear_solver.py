@@ -11,7 +11,7 @@ decisions count iterations and nodes, so they are the same in every run. A check
 which the hierarchy is built again.
 
 Nearly incompressible bodies with mean dilatation have the preconditioner of `volumes` instead of Gauss-Seidel, if its band is
-narrow enough. Solves with contacts and those of elimination use Gauss-Seidel, on CUDA all use block Jacobi.
+narrow enough. Solves with contacts use Gauss-Seidel, on CUDA all use block Jacobi.
 """
 
 import math
@@ -24,7 +24,6 @@ import taichi as ti
 from taisoft.backend.arrays import FieldArena, upload
 from taisoft.dynamics.stage import Stage
 from taisoft.fem.model import Model
-from taisoft.fem.node_graph import EVERYTHING, Subset
 from taisoft.linear import gauss_seidel, pcg, volumes
 from taisoft.linear.banded import BandedPreconditioner
 from taisoft.linear.block_csr import BlockCsr
@@ -51,7 +50,7 @@ class LinearSolver:
     RETRY = 4  # a failure of multigrid multiplies the savings needed for a next trial by this
     STATE = {"active": bool, "savings": float, "uses": int, "failures": int, "rate": float, "pcg_rate": float}  # in a checkpoint
 
-    def __init__(self, model: Model, matrix: BlockCsr, work: PcgWork, form: Callable[[Subset, bool, float, float], None]):
+    def __init__(self, model: Model, matrix: BlockCsr, work: PcgWork, form: Callable[[bool, float, float], None]):
         """form: as `StageSystem.form`."""
         self.model, self._matrix, self._work, self._form = model, matrix, work, form
         self._arena, self._volumes = FieldArena(), None  # of `volumes`, built on first use
@@ -217,7 +216,7 @@ class LinearSolver:
         changed = [m.state.x, A.value, A.diagonal] + ([m.mean.dilatation, A.patches.gradient] if m.mean_dilatation else [])
         present = [(array, array.to_numpy()) for array in changed]
         m.state.x.from_numpy(x)
-        self._form(EVERYTHING, True, c, beta)
+        self._form(True, c, beta)
         try:
             self._hierarchy, self._built = build_hierarchy(m, A, x, free), (c, beta, x, free)
         finally:

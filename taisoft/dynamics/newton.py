@@ -1,10 +1,14 @@
-"""Newton's method for an implicit stage; with contacts, inside an augmented Lagrangian loop.
+"""Newton's method of an implicit stage, with or without contacts, in time or in statics.
 
-Each step solves with the unprojected matrix by conjugate gradients; at negative curvature the direction follows it
-(`linear.pcg`). The step length is found by `search`. CG's tolerance follows Newton's progress (Eisenstat and Walker 1996,
-choice 2). If a slow step leaves a residual on few nodes, these are solved separately first, see `elimination`.
-With contacts, inner solves are inexact: the augmented Lagrangian is minimised until |r| is PROGRESS times its value after the
-multiplier update, or small enough, unless extrapolation requires a smaller |r|, see `friction`.
+An iteration linearises elasticity, with the unprojected matrix, and finds a direction: without contacts by one linear solve, by
+conjugate gradients, which follow negative curvature; with contacts by solving the frictional problem on that matrix (`friction`),
+which needs no elements. A matrix on which that problem has no minimum is replaced by a projected one. The full step is taken if
+|r| falls enough; else `search` finds its length by the slope of the merit function, with contacts that of the augmented
+Lagrangian under the new impulses: opening and closing contacts, and tets that invert, can increase |r| in one step and decrease
+it in the next.
+
+Solves are inexact: CG's tolerance follows Newton's progress (Eisenstat and Walker 1996, choice 2), frictional problems are solved
+to a fraction of the stage's residuals.
 
 Convergence: |r| <= tolerance * scale, scale = |c M (v - v_hat)| + beta (|f_el| + |f_ext|) on the free axes, impulses in r, and
 the residual of the contact laws, |p - prox(p - f u)| / |p| with f = 1 / (J diag(A)^-1 J^T), within its own tolerance. A residual
@@ -12,277 +16,329 @@ below a few times the rounding of the forces (at rest) that a Newton step no lon
 of rounding size, so the stage ends as converged and reports its actual residual. In statics the scale is the applied load
 (without any: the constraint forces), and rounding above the tolerance is not convergence.
 
-The line search goes by the slope of the merit function along a step, since opening and closing contacts, and tets that invert,
-can increase |r| in one step and decrease it in the next. A step that ends on a steep rise is shortened by secants, one that ends
-on a steep descent is doubled. Nearly incompressible bodies with mean dilatation first try a curved step (`step_with_volumes`).
+A converged iterate must pass checks: the balance of each piece, given volumes and lengths, the work of rebounds. One that fails
+changes the running problem, and the iterations go on. Whether the way there is free is checked outside: see `implicit`.
 """
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
-from typing import Any
 
-from taisoft.dynamics.constraints import solve_constrained
-from taisoft.dynamics.contact_terms import KEEP, TO_IMPULSES
-from taisoft.dynamics.friction import PAST, Friction, extrapolate_multipliers
+from taisoft.dynamics.constraints import correct, solve_constrained
+from taisoft.dynamics.contact_terms import KEEP, OF_IMPULSES, TO_IMPULSES
+from taisoft.dynamics.friction import Friction, Goal, Solution
+from taisoft.dynamics.frictional_problems import FrictionalProblems
 from taisoft.dynamics.results import StageResult, relative
-from taisoft.dynamics.stage import AGAIN, ELASTIC_STAGE, IMPACT, STEP, Stage
+from taisoft.dynamics.search import search
+from taisoft.dynamics.stage import AGAIN, ELASTIC_STAGE, IMPACT, STAY, Stage
 from taisoft.dynamics.stage_system import StageSystem
 from taisoft.linear.pcg_work import LinearResult
 
-FLAT, STEEP = 0.5, 0.3  # of the initial slope: rise that shortens a step; descent that doubles it
-TRIES, LONGEST = 20, 1024.0  # trial step lengths, and the longest
-FAR = 0.5  # |r| over scale at the first iterate above which v = 0 is tried
-
 
 class Newton:
-    """Newton steps and multiplier updates of a stage."""
+    """Newton's method of one stage."""
 
-    LINEAR_LIMIT = 0.01  # relative true residual above which a linearly implicit step has failed
-    MAX_FORCING, INCREASE_FORCING = 0.1, 3e-2  # CG's maximum tolerance, and that after a step that increased |r|
-    STATIC_FORCING = 1e-2  # maximum in statics, where a loose solve leaves a slender body stretched for the next step to correct
-    REBUILD_RATIO = 0.2  # a step that leaves a larger fraction of |r| requires a new matrix,
-    REBUILD_VOLUMES = 0.01  # with `step_with_volumes`, whose first matrix is that of the step's start and whose solves are longer
-    # minimum steps per matrix, without and with contacts; with them mostly the active contacts change
-    MIN_USES = {False: 1, True: 3}
-    ELIMINATION_RATIO = 0.1  # a step that leaves a larger fraction of |r| requires elimination
-    DECREASE = 0.9  # with contacts, fraction of the smallest |r| so far below which a step is accepted without its slope
+    FAR = 0.5  # |r| over its scale at the first iterate above which v = 0 is tried
+    # with contacts: of the smallest |r| so far; iterations in a row that do not reach that; with a projected matrix, which creeps
+    # where a shorter part would not, iterations count twice
+    DECREASE, PROJECTED, MAX_SLOW = 0.9, 0.5, 6
+    MAX_CORRECTIONS = 20  # of given volumes and lengths, where they are not part of the linear solve
+    # linear solves without contacts: CG's maximum tolerance, after a step that increased |r|, and in statics, where a loose solve
+    # leaves a slender body stretched for the next step to correct
+    MAX_FORCING, INCREASE_FORCING, STATIC_FORCING = 0.1, 3e-2, 1e-2
+    # a step that leaves a larger fraction of |r| requires a new matrix; with curved steps, whose first matrix is that of the
+    # step's start and whose solves are longer
+    REBUILD_RATIO, REBUILD_VOLUMES = 0.2, 0.01
+    LINEAR_LIMIT = 0.01  # relative true residual above which a linearised stage without contacts has failed
+    LINEARISED_SOLVES, LINEARISED_FORCING = 400, 0.1  # maximum linear solves of one with contacts, and their tolerance
 
-    def __init__(self, system: StageSystem, stage: Stage, eliminate: "Callable[[StageSystem, Stage, float], Any] | None" = None):
-        """eliminate: as `elimination.eliminate`, called after slow steps; None: no elimination."""
-        self.system, self.stage, self.eliminate = system, stage, eliminate
-        self._counts = not system.work.pcg.subset.restricted  # in the step's budget; else the caller does
-        is_constrained = self._counts and system.multipliers is not None and system.multipliers.penalised
+    def __init__(self, system: StageSystem, stage: Stage, check: Callable[[], bool] | None = None):
+        """check: of a converged iterate, may change the problem."""
+        self.system, self.stage, self.check, self.has_rows = system, stage, check, system.n_contacts > 0
+        is_constrained = system.multipliers is not None and system.multipliers.penalised
         self._solve_linear = partial(solve_constrained, system) if is_constrained else system.solve_linear
         self.max_forcing = self.MAX_FORCING if stage.c > 0.0 else self.STATIC_FORCING
-        self.newton = self.linear = self.multigrid = self.multipliers = self.n_remembered = 0
-        self.eliminated = 0.0  # Newton iterations on few nodes, times their fraction of all nodes
-        self.rounding = False  # |r| is only rounding
+        self.newton = self.linear = self.multigrid = self.updates = self.n_corrections = 0
+        self.most, self.is_projected = stage.max_newton, False  # the latter of the last iteration
+        self.problems = FrictionalProblems(system, stage)
 
-    def run(self, r: float, scale: float, fresh: bool) -> StageResult:
-        """Solve from the present state, whose (|r|, scale) is given. fresh: whether the matrix is formed there."""
-        system, n_uses = self.system, 0
-        rebuild_ratio = self.REBUILD_VOLUMES if system.keeps_volumes else self.REBUILD_RATIO
-        self.r, self.scale, self.has_contacts = r, scale, system.n_contacts > 0
-        self.law_residual = math.inf  # the laws' residual at the last multiplier update
-        self._begin_multiplier()
-        converged = False
+    def run(self, fresh: bool) -> StageResult:
+        """Solve from the present state. fresh: whether the matrix is formed there."""
+        system, stage, is_accepted = self.system, self.stage, False
+        self.r, self.scale = system.evaluate_start()
+        self._start_at_rest()
+        self._restart()
         while True:
-            if self._inner_done():
-                if self._has_converged():
-                    if converged := system.balances_pieces():
-                        break
-                    self._begin_again()
-                elif not self._update_multipliers():
+            if self.has_rows and self.newton and stage.renews and system.renew_contacts():
+                self._evaluate_again()
+                fresh = True
+            if self._has_converged():
+                if is_accepted := self._passes_checks():
                     break
-                continue
-            if self.newton >= self.stage.max_newton or (self._counts and not system.budget.left):
+            if not self._may_go_on():
                 break
-            if not fresh or (n_uses >= self.MIN_USES[self.has_contacts] and self.r > rebuild_ratio * self.previous):
+            if not fresh or self._needs_matrix():
                 if system.kind == ELASTIC_STAGE:
                     system.form_matrix()
-                fresh, n_uses = True, 0
-            n_uses += 1
-            moved = self._step()
-            if not math.isfinite(self.r) or not (moved or n_uses > 1):
+                self.n_uses = 0
+            self.n_uses += 1
+            moved = self._iterate_rows() if self.has_rows else self._iterate()
+            self._find_rounding()
+            if not moved and self.n_uses == 1 and not self._has_converged():
                 break
-            fresh = moved and not self._eliminate()
-        system.r_scale = Stage.first_r_scale  # initial value of the next solve
-        return self._result(converged or (self._inner_done() and self._has_converged() and system.balances_pieces()))
+            fresh = moved and not self.has_rows
+            decrease = self.PROJECTED if self.is_projected else self.DECREASE
+            is_slow = not (self._is_balanced or self.r < decrease * self.lowest)
+            self.n_slow = self.n_slow + 1 + self.is_projected if is_slow else 0
+            self.lowest = min(self.lowest, self.r)
+        return self._result(is_accepted)
 
-    def _begin_again(self) -> None:
-        """Go on from |r| in new weights, in which it has not converged."""
-        self.r, self.scale = self.system.evaluate(None)
-        self.rounding = False
-        self._begin_multiplier()
+    def _start_at_rest(self) -> None:
+        """Start from v = 0 if |r| is smaller there than at a first iterate far from balance.
 
-    def _begin_multiplier(self) -> None:
-        """Set the target of |r| and reset the progress after a multiplier update."""
-        self.inner_target, self.lowest, self.previous, self.forcing, self.n_inner = (
-            Friction.PROGRESS * self.r,
-            self.r,
-            0.0,
-            self.max_forcing,
-            0,
-        )
+        Motion that stiffness or contacts stop within the step, as of light bodies and of inverted tets, is far from balance.
+        """
+        system = self.system
+        if system.is_static or system.kind != ELASTIC_STAGE or self.r <= self.FAR * self.scale:
+            return
+        at_rest = system.evaluate_at_rest()
+        if not at_rest[0] < self.r and math.isfinite(self.r):
+            self.r, self.scale = system.evaluate(AGAIN, 0.0)
+            return
+        self.r, self.scale = at_rest
+        if self.has_rows:
+            system.form_matrix_and_factors()
+            self.r, self.scale = system.evaluate(None)
 
-    def _inner_done(self) -> bool:
-        """Return whether |r| is small enough for the present multipliers."""
-        target = self._target()
-        if not self.has_contacts or self.stage.keeps_multipliers:
-            return (self.r <= target or self.rounding) and self.system.multipliers_hold
-        laws_hold = self.system.contact_residual <= self.stage.contact_tolerance
-        # in an impact whose laws hold, only the momenta remain to be balanced
-        inner = (Friction.FINER if self.multipliers >= self.stage.extrapolate_after else 1.0) * self.stage.tolerance * self.scale
-        inner_target = 0.0 if laws_hold and self.system.kind == IMPACT else max(inner, self.inner_target)
-        return self.r <= (max(target, inner_target) if laws_hold else inner_target) or self.rounding
+    # --- progress -----------------------------------------------------------------------------------------------------------
 
-    def _target(self) -> float:
-        return max(self.stage.tolerance * self.scale, self.stage.absolute_tolerance)
+    def _restart(self) -> None:
+        """Reset the progress, for a new or changed problem."""
+        self.lowest, self.previous, self.forcing, self.n_slow, self.n_uses = self.r, 0.0, self.max_forcing, 0, 0
+        self.rounding = False  # |r| is only rounding
+
+    def _evaluate_again(self, mode: int | None = None) -> None:
+        """Evaluate a changed problem, and begin anew from there."""
+        self.r, self.scale = self.system.evaluate(mode, new_multipliers=TO_IMPULSES if self.has_rows else KEEP)
+        self._restart()
+
+    def _may_go_on(self) -> bool:
+        """Whether there are iterations left, and progress."""
+        ends = self.n_slow >= self.MAX_SLOW if self.has_rows else self.rounding and self.system.multipliers_hold
+        has_iterations = self.newton < self.most and self.system.budget.left > 0
+        return has_iterations and math.isfinite(self.r) and not ends
+
+    @property
+    def _is_balanced(self) -> bool:
+        """Whether |r| has converged; with contacts, only their laws may remain then."""
+        return self.r <= self.stage.tolerance * self.scale
 
     def _has_converged(self) -> bool:
-        """Return whether the stage has converged."""
-        if not (self.r <= self._target() or (self.has_contacts and self.r <= self.system.floor)):
+        system = self.system
+        if not self.has_rows:
             # statics without load has no scale to compare the rounding with
-            if not (self.rounding and (self.stage.c > 0.0 or self.scale <= self.system.floor)):
-                return False
-        return self.system.contact_residual <= self.stage.contact_tolerance
+            is_rounding = self.rounding and (self.stage.c > 0.0 or self.scale <= system.floor)
+            return (self._is_balanced or is_rounding) and system.multipliers_hold
+        if system.contact_residual <= self.stage.contact_tolerance:
+            return self._is_balanced or self.rounding
+        return self.r <= system.floor and system.impulses_are_rounding()
 
-    def _update_multipliers(self) -> bool:
-        """Update the multipliers; return False if their maximum number is reached."""
-        if not self.has_contacts or self.stage.keeps_multipliers or self.multipliers >= Friction.MAX_MULTIPLIERS:
+    def _find_rounding(self) -> None:
+        """Find out whether |r| is only rounding after an iteration. Statics continues down to the floor."""
+        near = self.r <= (Friction.ROUNDING if self.stage.c > 0.0 else 1.0) * self.system.floor
+        self.rounding = near and self.r > 0.5 * self.previous and (not self.has_rows or self.problems.tight)
+
+    def _passes_checks(self) -> bool:
+        """Whether a converged iterate passes all checks. If not, the running problem has changed, or the iterations end."""
+        system, m = self.system, self.system.multipliers
+        if system.kind == IMPACT:
+            return True
+        if not system.balances_pieces():
+            self.r, self.scale = system.evaluate(None)
+            self._restart()
             return False
-        system, law, extrapolating = self.system, self.system.contact_residual, self.multipliers >= self.stage.extrapolate_after
-        if extrapolating:
-            extrapolate_multipliers(system.contacts, self.n_remembered)
-            system.r_scale, self.n_remembered = Friction.R_EXTRAPOLATED, min(self.n_remembered + 1, PAST)
-        else:
-            bounds = self.stage.max_r_scale, self.stage.contact_tolerance
-            system.r_scale = Friction.next_scale(
-                system.r_scale, law, self.law_residual, self.n_inner, system.frictionless, *bounds
-            )
-        self.law_residual, self.multipliers, self.rounding = law, self.multipliers + 1, False
-        self.r, self.scale = system.evaluate(None, new_multipliers=KEEP if extrapolating else TO_IMPULSES)
-        self._begin_multiplier()
+        if m is not None and not m.penalised and not m.hold:
+            changed = self.newton < self.most and self.n_corrections < self.MAX_CORRECTIONS and self._correct_volumes()
+            self.most = self.newton + self.stage.max_newton if changed else 0
+            return False
+        if self.check is not None and not self.check():
+            self._evaluate_again()
+            self.most = self.newton + self.stage.max_newton
+            return False
         return True
 
-    def _step(self) -> bool:
-        """Solve for a direction and step along it; return whether the state moved."""
+    def _correct_volumes(self) -> bool:
+        """Change given volumes' and lengths' multipliers, and v along with them; return whether that was possible."""
+        n, changed = correct(self.system)
+        self.linear, self.n_corrections = self.linear + n, self.n_corrections + 1
+        if changed:
+            self.system.move_to_velocities()
+            self._evaluate_again(STAY)
+        return changed
+
+    def _count(self, n: int = 1) -> None:
+        self.newton += n
+        self.system.budget.spend(n)
+
+    def _result(self, converged: bool) -> StageResult:
         system = self.system
+        return StageResult(
+            self.newton,
+            round(self.linear),
+            relative(self.r, self.scale),
+            converged and math.isfinite(self.r),
+            self.rounding or self.r <= system.floor,
+            self.updates,
+            system.contact_residual,
+            (0.0, "") if converged else system.least_balanced(),
+            self.multigrid,
+        )
+
+    # --- an iteration -------------------------------------------------------------------------------------------------------
+
+    def _needs_matrix(self) -> bool:
+        """Whether a matrix that is formed is used up."""
+        ratio = self.REBUILD_VOLUMES if self.system.keeps_volumes else self.REBUILD_RATIO
+        return self.n_uses >= 1 and self.r > ratio * self.previous
+
+    def _iterate(self) -> bool:
+        """Solve for a direction and step along it; return whether the state moved."""
         solution = self._solve_linear(self._linear_tolerance())
-        self._count_linear(solution)
-        self.newton, self.n_inner = self.newton + 1, self.n_inner + 1
-        if self._counts:
-            system.budget.spend()
-        self.previous = self.r
-        self.r, self.scale, moved = search(system, self._acceptable_residual(solution.negative))
-        self.lowest = min(self.lowest, self.r)
-        # statics continues down to the floor
-        near_floor = self.r <= (Friction.ROUNDING if self.stage.c > 0.0 else 1.0) * self.system.floor
-        self.rounding = near_floor and self.r > 0.5 * self.previous
+        self._add(solution)
+        self._count()
+        accept = self.previous = self.r
+        if self.system.is_static or solution.negative:  # a lower |r| may be at a maximum of the energy
+            accept = self.system.floor
+        self.r, self.scale, moved = search(self.system, accept)
         return moved
 
-    def _count_linear(self, solution: LinearResult) -> None:
+    def _add(self, solution: LinearResult) -> None:
         self.linear, self.multigrid = self.linear + solution.iterations, self.multigrid + solution.multigrid
 
-    def _eliminate(self) -> bool:
-        """Solve the few nodes that dominate |r| after a slow step; return whether there were any."""
-        if self.eliminate is None or self.r <= self.ELIMINATION_RATIO * self.previous or self._inner_done():
-            return False
-        if (found := self.eliminate(self.system, self.stage, self.r)) is None:
-            return False
-        self.eliminated, self.linear = self.eliminated + found.newton, self.linear + found.linear
-        self.r, self.scale = self.system.evaluate(None)
-        self.lowest = min(self.lowest, self.r)
-        return True
-
-    def _acceptable_residual(self, negative: bool) -> float:
-        """Return |r| below which a full step is accepted without checking its slope."""
-        if self.stage.c == 0.0 or negative:  # a lower |r| may be at a maximum of the energy
-            return self.system.floor
-        return self.DECREASE * self.lowest if self.has_contacts else self.r
-
     def _linear_tolerance(self) -> float:
-        """Return CG's tolerance by Newton's progress: Eisenstat and Walker's choice 2, with their safeguard.
+        """CG's tolerance by Newton's progress: Eisenstat and Walker's choice 2, with their safeguard.
 
         A step that bends a slender body increases |r| by stretching it; a loose solve would then only undo that stretch.
         """
         if self.stage.linear_tolerance is not None:
             return self.stage.linear_tolerance
-        target = self._target()
-        if self.previous == 0.0:
+        target, before = self.stage.tolerance * self.scale, self.previous
+        if before == 0.0:
             self.forcing = self.max_forcing
-        elif self.r > self.previous:
+        elif self.r > before:
             self.forcing = min(self.INCREASE_FORCING, self.max_forcing)
         else:
-            wanted, safeguard = 0.9 * (self.r / self.previous) ** 2, 0.9 * self.forcing**2
+            wanted, safeguard = 0.9 * (self.r / before) ** 2, 0.9 * self.forcing**2
             self.forcing = min(self.max_forcing, max(wanted, safeguard if safeguard > 0.1 else 0.0))
         # the last solve need not go far below Newton's tolerance; |r| may be below it while given volumes and lengths do not hold
         tolerance = max(self.forcing, 0.1 * target / self.r if self.r > target else 0.1, 1e-12)
         # if rounding of stiff stress hides the rigid motion in |r|, only a tight solve gets that motion right
         return min(tolerance, self.stage.tolerance) if self.system.floor > target else tolerance
 
-    def _result(self, converged: bool) -> StageResult:
-        r, system = self.r, self.system
-        return StageResult(
-            self.newton + self.eliminated,
-            round(self.linear),
-            relative(r, self.scale),
-            converged and math.isfinite(r),
-            self.rounding or r <= self.system.floor,
-            self.multipliers,
-            system.contact_residual,
-            unbalanced=(0.0, "") if converged else system.least_balanced(),
-            multigrid_solves=self.multigrid,
-        )
+    def _add_friction(self, found: Solution) -> Solution:
+        self.linear, self.updates = self.linear + found.linear, self.updates + found.updates
+        return found
 
-    def solve_once(self) -> StageResult:
-        """Take one full step without line search, of a linearised stage without contacts; it converges if the solve does."""
-        system = self.system
-        self.has_contacts, self.previous = False, 0.0
+    def _iterate_rows(self) -> bool:
+        """Solve the frictional problem and step to its solution; return whether the state moved."""
+        system, accept, self.previous = self.system, self.DECREASE * self.lowest, self.r
+        system.linearise()
+        goal = self.problems.goal(self.r, self.scale, self._is_balanced)
+        found = self._add_friction(Friction.solve(system, goal, self.r, self.problems.is_direct and not self.problems.tight))
+        self.is_projected = found.negative
+        if found.negative:  # the problem has no minimum
+            system.end_linearised(accept=False)
+            system.form_matrix(projected=True)
+            self._count()
+            system.linearise()
+            found = self._add_friction(Friction.solve(system, goal, self.r))
+        self._count()
+        self.problems.learn(goal, found)
+        if found.negative:
+            self.r, self.scale = system.end_linearised(accept=False)
+            return False
+        # the laws hold less well than forces are balanced; keeping the impulses separates the two
+        self.r, self.scale = system.end_linearised(new_multipliers=OF_IMPULSES if found.direct else TO_IMPULSES)
+        if self.r < accept:
+            return True
+        system.evaluate(AGAIN, 0.0)
+        self.r, self.scale, moved = search(system, accept)
+        if not moved:  # nor do the impulses change
+            self.r, self.scale = system.end_linearised(accept=False)
+        return moved
+
+    # --- linearised stages --------------------------------------------------------------------------------------------------
+
+    def run_once(self) -> StageResult:
+        """Solve a linearised stage: once, and again where a check has changed the problem. No volumes and lengths are given."""
+        while True:
+            solved = self._solve_rows_once() if self.has_rows else self._solve_once()
+            if not solved or self._passes_checks():
+                return self._result(solved)
+
+    def _solve_once(self) -> bool:
+        """Take one full step, of a stage without contacts; return whether the solve converged."""
+        system, stage, solved = self.system, self.stage, True
         self.r, self.scale = system.begin_linearised_step()
-        solved = True
-        if self.r > self.stage.tolerance * self.scale:
+        self._restart()
+        if self._is_balanced:
+            system.work.pcg.y.fill(0.0)
+        else:
             # no later step corrects this solve
-            tolerance = self.stage.linear_tolerance or min(self._linear_tolerance(), self.stage.tolerance)
+            tolerance = stage.linear_tolerance or min(self._linear_tolerance(), stage.tolerance)
             for projected in (False, True):  # an indefinite quadratic form has no minimum
                 system.form_matrix(projected)
                 solution = self._solve_linear(tolerance)
-                self._count_linear(solution)
+                self._add(solution)
                 if not solution.negative:
                     break
             solved = solution.converged and system.linear_residual() <= self.LINEAR_LIMIT
-            self.newton = 1
-            system.budget.spend()
-        else:
-            system.work.pcg.y.fill(0.0)
+            self._count()
         self.r, self.scale = system.take_linearised_step()
-        return self._result(solved)
+        return solved
+
+    def _solve_rows_once(self) -> bool:
+        """Solve the frictional problem at the present state; on a projected matrix if its own is indefinite."""
+        system, stage = self.system, self.stage
+        if stage.renews:
+            system.renew_contacts()
+        self.r, self.scale = system.evaluate_start()
+        self._restart()
+        for projected in (False, True):
+            system.linearise()
+            norm = stage.tolerance * self.scale
+            forcing = stage.linear_tolerance or self.LINEARISED_FORCING
+            solves = min(self.LINEARISED_SOLVES, system.budget.left)
+            goal = Goal(norm, stage.contact_tolerance, norm, forcing, max_solves=solves)
+            found = self._add_friction(Friction.solve(system, goal, self.r))
+            self._count(found.solves)
+            if not found.negative or projected:
+                break
+            self.r, self.scale = system.end_linearised(accept=False)
+            system.form_matrix(projected=True)
+        self.r = found.r
+        system.end_once(found.direct)
+        return found.converged
 
 
-def choose_start(system: StageSystem, r: float, scale: float) -> tuple[float, float, bool]:
-    """Start from v = 0 if |r| is smaller there than at the first iterate, whose (|r|, scale) is given.
+def solve(system: StageSystem, stage: Stage, check: Callable[[], bool] | None = None) -> StageResult:
+    """Solve a stage from the present v. The caller sets x_hat, v_hat, the targets and the contacts.
 
-    Return (|r|, scale) there, and whether it is v = 0; then y points back to the first iterate, a good first direction on the
-    matrix formed at v = 0. If tets oscillate many times in a step, as inverted ones do, continuing their motion is far from
-    balance. Statics keeps its start.
+    check: of a converged iterate; where it fails, it has changed the problem, and the iterations go on.
     """
-    if r <= FAR * scale or system.is_static:
-        return r, scale, False
-    system.set_direction_to_rest()
-    trial = system.evaluate(STEP)
-    if trial[0] < r or not math.isfinite(r):
-        system.negate_direction()
-        return *trial, True
-    return *system.evaluate(AGAIN, 0.0), False
-
-
-def search(system: StageSystem, acceptable: float) -> tuple[float, float, bool]:
-    """Search the step length; return (|r|, scale, success). acceptable: |r| below which the slope is not checked.
-
-    The straight step is searched if there is no curved one, or if that leaves more than `acceptable`.
-    """
-    if (found := system.step_with_volumes(acceptable)) is not None:
-        return *found, True
-    r, scale = system.evaluate(STEP)
-    length, low, at_low, high, at_high = 1.0, 0.0, system.slopes[0], math.inf, math.inf
-    slope = at_low
-    for _ in range(TRIES):
-        rise = system.slopes[1]
-        too_far = not rise <= -FLAT * slope  # also if it is not a number
-        if r < acceptable or (slope < 0.0 and not too_far and (rise >= STEEP * slope or length >= min(0.4 * high, LONGEST))):
-            return r, scale, True
-        if slope >= 0.0:
-            break
-        if too_far:
-            high, at_high = length, rise
-        else:
-            low, at_low = length, rise
-        if high == math.inf:
-            length *= 2.0
-        else:
-            secant = at_low / (at_low - at_high) if math.isfinite(at_high) else 0.5
-            length = low + (high - low) * min(max(secant, 0.1 if low == 0.0 else 0.4), 0.9)
-        r, scale = system.evaluate(AGAIN, length)
-    r, scale = system.evaluate(AGAIN, 0.0)
-    return r, scale, False
+    fresh = system.begin(stage)
+    newton = Newton(system, stage, check)
+    if not stage.linearised:
+        result = newton.run(fresh)
+    elif system.budget.left:
+        result = newton.run_once()
+    else:
+        return StageResult(0.0, 0, relative(*system.evaluate()), False, False)
+    if not stage.linearised:
+        system.balance_rigid_motion()
+    if (multipliers := system.multipliers) is not None:
+        result = replace(result, converged=result.converged and multipliers.hold)
+        if result.converged:
+            multipliers.end()
+    return result

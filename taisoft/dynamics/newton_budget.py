@@ -1,8 +1,7 @@
 """Bound on the Newton iterations of a step, and on those of a static solve, in all parts together.
 
-Parts are substeps, discarded attempts, impacts, fallbacks, repeated solves for multipliers and balance, and eliminations, which
-count by their share of the nodes. A linear solve of a linearised contact problem counts as one. At the bound Newton's method
-stops where it is, nothing is tried again, and the rest of the step is held back, see `substepping`.
+Those of rejected parts count, and of impacts; a linear solve of a linearised contact problem counts as one. At the bound Newton's
+method stops where it is, nothing is tried again, and the rest of the step is held back, see `implicit`.
 
 MAX_ITERATIONS is about twice the most that a converged step was found to take: 1,193 in case R1 of `taisoft bench hard`
 (`most_newton_iterations` in its records), 673 in `taisoft bench ipc`, 872 in heap 053, one of the slowest of `taisoft bench

@@ -16,9 +16,9 @@ class NoContacts:
         return 0
 
     forget = discard = discard_search = restore = snapshot = start_step = start_substep = end_substep = _nothing
-    begin = end = initial_crossing = set_impulse_fraction = count_flight = _nothing
-    detect_impact = detect_rebounds = penetrates_deeper = left_searched = find = _nothing
+    begin = end = end_part = set_impulse_fraction = certify = refuse_fast_closing = _nothing
+    detect_impact = detect_rebounds = find = _nothing
 
-    def measure_start(self, time: float, dt: float) -> tuple[float, float]:
-        """Return the relative penetration before a step of dt, and the largest closing ratio in it."""
-        return 0.0, 0.0
+    def most_units(self, time: float, dt: float, units: int) -> int:
+        """Return `units`: nothing limits the length of a part."""
+        return units

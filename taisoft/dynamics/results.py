@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 class StageResult:
     """Result of solving an implicit stage. Without contacts, contacts count as converged after 0 iterations."""
 
-    newton_iterations: float  # those on few nodes count by their share
+    newton_iterations: float
     linear_iterations: int
     residual: float  # relative
     converged: bool  # including the contacts
@@ -18,6 +18,7 @@ class StageResult:
     unbalanced: tuple[float, str] = (0.0, "")  # largest relative residual of a piece, and its name, if unbalanced
     multigrid_solves: int = 0
     imbalance: str = ""  # what is out of balance, in words, if it has not converged
+    free: bool = True  # whether nothing passes through anything on the way, and all is finite
 
 
 @dataclass

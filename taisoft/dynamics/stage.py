@@ -3,8 +3,6 @@
 After a Newton step `move` updates the state and computes elastic forces, `contact_terms.update_impulses` computes contact
 impulses, and `form_residual` adds everything. A linearised stage moves by `linearised.advance` instead, which updates the
 residual without contacts.
-
-A stage may be restricted to a `Subset` of nodes, with the edges and blocks at them.
 """
 
 import math
@@ -20,7 +18,6 @@ from taisoft.dynamics.contact_terms import impulse_on_node
 from taisoft.fem.chunks import chunk_entry, chunk_size, fold, total
 from taisoft.fem.dependents import force_with_dependents, is_dependent
 from taisoft.fem.lanes import mass_times
-from taisoft.fem.node_graph import n_nodes_of, node_of
 from taisoft.fem.state import END_SLOPE, N_NORMS, NORMS, OTHER_SUM, START_SLOPE, SUM
 from taisoft.fem.terms import elasticity, rayleigh_damping
 from taisoft.linear.block_csr import block_times, stiffness_times
@@ -43,19 +40,7 @@ class Stage:
     linear_tolerance: float | None = None  # of every linear solve; None: adaptive
     linearised: bool = False  # elastic forces are linear from the first iterate on
     prescribed_fraction: float = 1.0  # see `begin_stage`
-    multiplier_tolerance: float | None = None  # as `tolerance`, for the steps under one multiplier; None: the same
-    absolute_tolerance: float = 0.0  # |r| [N s] that also ends the stage, regardless of the scale
-    keeps_multipliers: bool = False  # do not update the multipliers
-    extrapolate_after: int = 25  # multiplier updates
-    later_tolerance: float = 0.0  # lower bound on linear_tolerance after the first solve
-    first_r_scale: float = 1.0  # R over the r-factors of a contact problem at its start,
-    max_r_scale: float = 1000.0  # and its upper bound without friction
     renews: bool = True  # whether contacts take their geometry at the iterates
-
-    @property
-    def inner_tolerance(self) -> float:
-        """|r| over scale that ends the steps under one multiplier."""
-        return self.tolerance if self.multiplier_tolerance is None else self.multiplier_tolerance
 
 
 class StepContacts(Protocol):
@@ -92,7 +77,7 @@ class StageWork:
     moved: Any  # f64: displacement by `correct_rigid_motion`
     damper: Any  # BlockCsr or None
     pieces: Any  # PieceWork
-    pcg: PcgWork  # right side -r; y, the change of v in a Newton step; subset, the nodes that move
+    pcg: PcgWork  # right side -r; y, the change of v in a Newton step
 
     @property
     def has_prescribed(self) -> bool:
@@ -178,8 +163,14 @@ def residual_parts(m: ti.template(), stage: ti.template(), chunk, i, beta):
 
 
 @ti.func
-def impact_residual(m: ti.template(), A: ti.template(), contacts: ti.template(), i, tau):
-    """Return (A D)_i of the jump D = (x - x_linear) / tau, without impulses.
+def impact_jump(m: ti.template(), stage: ti.template(), contacts: ti.template(), i, tau):
+    """Velocity jump of node i at its present x in an impact, see `impact_residual`."""
+    return (m.state.x[i] - contacts.x_start[i]) / tau - stage.v_hat[i]
+
+
+@ti.func
+def impact_residual(m: ti.template(), stage: ti.template(), A: ti.template(), contacts: ti.template(), i, tau):
+    """Return (A D)_i of the jump D = v - v_hat, v = (x - x_start) / tau, without impulses.
 
     Uses differences between neighbours in f64: stiffness does not resist the common part of the jump, which is most of it, and
     its rounding, tau^2 times as large, would hide the rigid motion.
@@ -187,7 +178,7 @@ def impact_residual(m: ti.template(), A: ti.template(), contacts: ti.template(),
     inertia = ti.cast(1.0, m.real)
     if ti.static(m.damped):
         inertia += ti.cast(tau, m.real) * rayleigh_damping.mass_rate(m, i)
-    velocity_jump, mass = (m.state.x[i] - contacts.x_linear[i]) / tau, m.mass[i]
+    velocity_jump, mass = impact_jump(m, stage, contacts, i, tau), m.mass[i]
     if ti.static(m.consistent):
         mass = m.mass_matrix.diagonal[i]
     r = ti.Vector([0.0, 0.0, 0.0], m.real)
@@ -195,7 +186,7 @@ def impact_residual(m: ti.template(), A: ti.template(), contacts: ti.template(),
         row = i + half * m.n_nodes
         for at in range(A.row_start[row], A.row_start[row + 1]):
             j = A.column[at]
-            r += block_times(A.value[at], ti.cast((m.state.x[j] - contacts.x_linear[j]) / tau - velocity_jump, m.real))
+            r += block_times(A.value[at], ti.cast(impact_jump(m, stage, contacts, j, tau) - velocity_jump, m.real))
             if ti.static(m.consistent):
                 mass += m.mass_matrix.value[at]
     return r + inertia * mass * ti.cast(velocity_jump, m.real)
@@ -242,18 +233,10 @@ def place_node(m: ti.template(), stage: ti.template(), i, step_length, beta):
 
 @kernel
 def set_direction_to_rest(m: ti.template(), stage: ti.template()):
-    """Set y = -v on the free axes."""
+    """Set y so that a full step leads to v = 0 on the free axes."""
     ti.loop_config(serialize=m.serial)
     for i in range(m.n_nodes):
         stage.pcg.y[i] = ti.cast(-m.free[i] * m.state.v[i], m.real)
-
-
-@kernel
-def negate_direction(m: ti.template(), stage: ti.template()):
-    """Set y = -y."""
-    ti.loop_config(serialize=m.serial)
-    for i in range(m.n_nodes):
-        stage.pcg.y[i] = -stage.pcg.y[i]
 
 
 @kernel
@@ -267,7 +250,7 @@ def move(
     c: ti.f64,
     beta: ti.f64,
 ):
-    """Move the nodes of stage.pcg.subset and compute the elastic forces there.
+    """Move the nodes and compute the elastic forces there.
 
     mode: STAY; STEP: base = x, then step_length y, y of stage.pcg; AGAIN: base + step_length y. scalars: START_SLOPE of a STEP.
     """
@@ -275,10 +258,9 @@ def move(
     for task in range(m.chunks * m.spread):
         if task % m.spread == 0:
             chunk = task // m.spread
-            n = n_nodes_of(m, stage.pcg.subset)
             slope = ti.cast(0.0, ti.f64)
-            for at in range(chunk_size(m, chunk, n)):
-                i = node_of(stage.pcg.subset, chunk_entry(m, chunk, at, n))
+            for at in range(chunk_size(m, chunk, m.n_nodes)):
+                i = chunk_entry(m, chunk, at, m.n_nodes)
                 if mode == STEP:
                     slope += merit_weight(stage, i) * dot64(m.free[i] * stage.residual[i], stage.pcg.y[i])
                     stage.base[i] = m.state.x[i]
@@ -291,7 +273,7 @@ def move(
             m.state.partial[chunk, OTHER_SUM] = slope
     fold(m, OTHER_SUM, OTHER_SUM, ())
     if ti.static(kind == ELASTIC_STAGE):
-        elasticity.sum_elements(m, stage.pcg.subset)
+        elasticity.sum_elements(m)
     ti.loop_config(serialize=True)
     for _ in range(1):
         if mode == STEP:
@@ -302,7 +284,7 @@ def move(
 def form_residual(
     m: ti.template(), stage: ti.template(), A: ti.template(), contacts: ti.template(), kind: ti.template(), beta: ti.f64
 ):
-    """Form the residual on the nodes of stage.pcg.subset, and -r as CG's right side, after `move` and `update_impulses`.
+    """Form the residual, and -r as CG's right side, after `move` and `update_impulses`.
 
     scalars: END_SLOPE, and from NORMS on |r|^2, |inertia and mass damping|^2, |f_el|^2, |f_ext|^2 on the free axes, and |r|^2 on
     the others; only those of r in an impact.
@@ -311,15 +293,14 @@ def form_residual(
     for task in range(m.chunks * m.spread):
         if task % m.spread == 0:
             chunk = task // m.spread
-            n = n_nodes_of(m, stage.pcg.subset)
             sums, slope = ti.Vector([0.0, 0.0, 0.0, 0.0, 0.0], ti.f64), ti.cast(0.0, ti.f64)
-            for at in range(chunk_size(m, chunk, n)):
-                i = node_of(stage.pcg.subset, chunk_entry(m, chunk, at, n))
+            for at in range(chunk_size(m, chunk, m.n_nodes)):
+                i = chunk_entry(m, chunk, at, m.n_nodes)
                 free = m.free[i]
                 zero = ti.Vector([0.0, 0.0, 0.0], m.real)
                 r, inertia, f, external = zero, zero, zero, zero
                 if ti.static(kind == IMPACT):
-                    r = impact_residual(m, A, contacts, i, beta)
+                    r = impact_residual(m, stage, A, contacts, i, beta)
                 else:
                     r, inertia, f, external = residual_parts(m, stage, chunk, i, beta)
                 if ti.static(contacts.any):

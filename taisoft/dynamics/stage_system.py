@@ -10,7 +10,6 @@ displacement). K is unprojected.
 
 import contextlib
 import math
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -22,6 +21,7 @@ from taisoft.dynamics import rigid_balance
 from taisoft.dynamics.contact_terms import (
     KEEP,
     NO_CONTACTS,
+    OF_IMPULSES,
     TO_IMPULSES,
     StageContacts,
     begin_contacts,
@@ -33,7 +33,7 @@ from taisoft.dynamics.contact_terms import (
 )
 from taisoft.dynamics.direct import DirectSolver
 from taisoft.dynamics.linear_solver import LinearSolver
-from taisoft.dynamics.linearised import LONGEST, advance, begin_linearised, end_linearised, find_step_length, update_multipliers
+from taisoft.dynamics.linearised import advance, begin_linearised, end_linearised, find_step_length, update_multipliers
 from taisoft.dynamics.multipliers import Multipliers
 from taisoft.dynamics.newton_budget import NewtonBudget
 from taisoft.dynamics.pieces import Pieces
@@ -62,12 +62,10 @@ from taisoft.dynamics.stage import (
     begin_stage,
     form_residual,
     move,
-    negate_direction,
     set_direction_to_rest,
 )
-from taisoft.dynamics.subset import SubsetLists
-from taisoft.fem.node_graph import EVERYTHING, Subset
-from taisoft.fem.state import END_SLOPE, N_NORMS, NORMS, START_SLOPE, STEP_LENGTH
+from taisoft.fem.dependents import place_dependents
+from taisoft.fem.state import END_SLOPE, N_NORMS, NORMS, START_SLOPE
 from taisoft.linear import block_csr, gauss_seidel, pcg
 from taisoft.linear.block_csr import BlockCsr
 from taisoft.linear.jacobi import JACOBI
@@ -122,15 +120,13 @@ class StageSystem:
         self.linear_solver = LinearSolver(model, self.matrix, self.work.pcg, self.form)
         self.budget = NewtonBudget()
         self._direct = DirectSolver(model, self.matrix, self.work.x_hat) if multipliers is None and model.on_cpu else None
-        self.kind = ELASTIC_STAGE
+        self.kind = self._nonlinear_kind = ELASTIC_STAGE  # the latter without LINEARISED
         self.scale = 0.0  # that |r| is relative to, at its last evaluation
         self.r_scale = 1.0  # R over the r-factors
         self.frictionless = False  # whether no contact of the stage has friction
         self._contact_arena = FieldArena()
         self._storage: StageContacts | None = None  # storage for the contacts of this step
         self.contacts = NO_CONTACTS  # of the present stage
-        self._whole, self._restricted = self.work, None  # `work` for all nodes, and for a subset
-        self._lists: SubsetLists | None = None
         self._volumes: VolumeSystem | None = None  # whose iterates keep the volumes of patches
         self._same_matrix = False  # whether the matrix is that of the last linear solve of this stage
         self._may_share = True  # whether threads may share linear solves with its contacts: if they are few
@@ -139,10 +135,9 @@ class StageSystem:
 
     @property
     def field_bytes(self) -> dict[str, int]:
-        """Bytes by name of the fields allocated for contacts, elimination and multigrid."""
-        lists = self._lists.field_bytes if self._lists else {}
+        """Bytes by name of the fields allocated for contacts and multigrid."""
         direct = self._direct.field_bytes if self._direct else {}
-        return self._contact_arena.bytes | lists | self.linear_solver.field_bytes | direct
+        return self._contact_arena.bytes | self.linear_solver.field_bytes | direct
 
     def release(self) -> None:
         """Free their memory."""
@@ -150,8 +145,6 @@ class StageSystem:
         self.linear_solver.free()
         if self._direct:
             self._direct.release()
-        if self._lists:
-            self._lists.release()
 
     def snapshot(self) -> dict:
         """Return what persists between stages: rounding floor, reactions, and the choice of the linear solver."""
@@ -223,14 +216,13 @@ class StageSystem:
         """Begin a stage at its first iterate; with contacts, form the matrix, which the r-factors depend on.
 
         Nearly incompressible bodies with mean dilatation get a first iterate that keeps their volumes, from the matrix at the
-        start of the step. Return whether that is formed.
+        start of the step. Return whether the matrix is formed.
         """
-        m, start, self._volumes = self.model, self._whole, None
+        m, start, self._volumes = self.model, self.work, None
         if stage.c > 0.0 and not stage.linearised and self.step_contacts.n_contacts == 0:
             self._volumes = self.linear_solver.volumes()
         volumes = self._volumes
         if volumes is not None:
-            self.restrict(None)
             self.stage = stage
             if self.multipliers is not None:
                 self.multipliers.measure()
@@ -241,12 +233,17 @@ class StageSystem:
         for _ in range(self.VOLUME_PASSES if volumes is not None else 0):
             restore_volumes(m, volumes, start.x_hat, stage.beta)
         self._begin(stage, ELASTIC_STAGE)
-        return volumes is not None
+        return volumes is not None or self.contacts.any
+
+    def move_to_velocities(self) -> None:
+        """Begin the stage again at the present v, with the present impulses and multipliers."""
+        begin_stage(self.model, self.work, self.stage.beta, self.stage.prescribed_fraction)
+        self._begin(self.stage, ELASTIC_STAGE)
 
     @property
     def keeps_volumes(self) -> bool:
-        """Whether steps go by `step_with_volumes`: not those on a few nodes."""
-        return self._volumes is not None and not self.work.pcg.subset.restricted
+        """Whether steps go by `step_with_volumes`."""
+        return self._volumes is not None
 
     def begin_impact(self, stage: Stage) -> StageContacts:
         """Begin the impact before a step, and form the matrix."""
@@ -255,16 +252,15 @@ class StageSystem:
         return self.contacts
 
     def _begin(self, stage: Stage, kind: int) -> None:
-        self.stage, self.kind, self.r_scale, self.contacts = stage, kind, Stage.first_r_scale, NO_CONTACTS
+        self.stage, self.kind, self._nonlinear_kind, self.r_scale, self.contacts = stage, kind, kind, 1.0, NO_CONTACTS
         self.floor, self.unbalanced = self.rounding.of_stage(stage.c, stage.beta), (0.0, "")
         if self.pieces.several:
             self.pieces.forget_weights()
-        self.restrict(None)
         if self.step_contacts.n_contacts > 0:
-            self._begin_contacts()
+            self.begin_contacts()
             self.form_matrix_and_factors(projected=kind == IMPACT)
 
-    def _begin_contacts(self) -> None:
+    def begin_contacts(self) -> None:
         """Begin the contacts of the step in the present stage."""
         self._allocate_contacts()
         self.contacts, stage = self._storage, self.stage
@@ -290,7 +286,7 @@ class StageSystem:
         before = self.contacts
         if not changed and self.step_contacts.problem is before.problem:
             return False
-        self._begin_contacts()
+        self.begin_contacts()
         if self.contacts is not before:  # the storage has grown: set the displacements there
             move(self.model, self.work, self.contacts, self.kind, STAY, 1.0, self.stage.c, self.stage.beta)
         self.form_matrix_and_factors()
@@ -314,7 +310,7 @@ class StageSystem:
     def evaluate_start(self) -> tuple[float, float]:
         """Return (|r|, scale) of the first iterate, with its weights of pieces."""
         found = self.evaluate(new_multipliers=TO_IMPULSES)
-        if not (self.pieces.several and math.isfinite(found[0])):
+        if not (self.pieces.several and math.isfinite(found[0]) and self.kind == ELASTIC_STAGE):
             return found
         self._weigh()
         return self.evaluate(None)
@@ -322,13 +318,13 @@ class StageSystem:
     def _weigh(self) -> None:
         """Set the weights of pieces and the rounding floor, and find the least balanced piece."""
         stage, floor = self.stage, self.rounding.of_pieces(self.stage.c, self.stage.beta)
-        measure_pieces(self.model, self._whole, self.pieces.work, stage.beta)
+        measure_pieces(self.model, self.work, self.pieces.work, stage.beta)
         self.unbalanced = self.pieces.weigh(floor, stage.beta, stage.tolerance, self.is_static)
         self.floor = math.sqrt((floor**2 * self.pieces.work.weight.to_numpy()).sum())
 
     def balances_pieces(self) -> bool:
         """Return whether each piece has converged, once |r| has; otherwise its weights are new, and so are |r| and scale."""
-        if not self.pieces.several or self.kind != ELASTIC_STAGE or self.work.pcg.subset.restricted or self.stage.linearised:
+        if not self.pieces.several or self.kind != ELASTIC_STAGE or self.stage.linearised:
             return True
         self._weigh()
         return self.unbalanced[0] <= self.BALANCED * math.sqrt(self.pieces.work.n) * self.stage.tolerance
@@ -389,32 +385,10 @@ class StageSystem:
             self.multipliers.slope_change = 0.0  # the residual has the changed multipliers now
         return None
 
-    def set_direction_to_rest(self) -> None:
-        """Set y so that a full step leads to v = 0."""
+    def evaluate_at_rest(self) -> tuple[float, float]:
+        """Return (|r|, scale) at v = 0 on the free axes; a step of length 0 leads back."""
         set_direction_to_rest(self.model, self.work)
-
-    def negate_direction(self) -> None:
-        """Set y = -y."""
-        negate_direction(self.model, self.work)
-
-    @property
-    def lists(self) -> SubsetLists:
-        """Edges and blocks at each node, built on first use."""
-        if self._lists is None:
-            self._lists = SubsetLists(self.model, self.matrix)
-        return self._lists
-
-    def restrict(self, nodes: np.ndarray | None) -> None:
-        """Restrict the stage to some nodes, ascending, or to all (None). The matrix must be formed again, for these rows."""
-        self.work = self._whole
-        if nodes is None:
-            return
-        subset, cg = self.lists.subset(nodes), self.work.pcg
-        for field in (cg.r, cg.p, cg.q):  # rows of the subset couple to other nodes, whose change is 0
-            field.fill(0.0)
-        if self._restricted is None:
-            self._restricted = replace(self._whole, pcg=replace(cg, subset=subset))
-        self.work = self._restricted
+        return self.evaluate(STEP)
 
     def linearise(self) -> None:
         """Make the elastic forces linear, by the current matrix."""
@@ -434,11 +408,6 @@ class StageSystem:
         update_multipliers(self.model, self.work, self.contacts, int(to_impulses), self.stage.beta, r_scale)
         return math.sqrt(self.model.state.scalars[NORMS])
 
-    @property
-    def found_zero_slope(self) -> bool:
-        """Whether the slope along y has a zero: it need not if the matrix is indefinite."""
-        return self.model.state.scalars[STEP_LENGTH] < LONGEST
-
     def solve_directly(self, tolerance: float, stalled: bool) -> tuple[int, bool, float] | None:
         """Move a linearised stage to the solution of its frictional problem, see `direct`; None if that does not apply.
 
@@ -455,8 +424,16 @@ class StageSystem:
         accept: keep the new state, with multipliers from its impulses; otherwise restore state and multipliers of that time.
         """
         end_linearised(self.model, self.work, self.contacts, int(accept), self.stage.beta)
-        self.kind = ELASTIC_STAGE
+        self.kind = self._nonlinear_kind
         return self.evaluate(AGAIN, float(accept), new_multipliers)
+
+    def end_once(self, direct: bool) -> None:
+        """End a stage that was linearised once. direct: whether its frictional problem was solved directly."""
+        self.balance_rigid_motion()
+        if direct:
+            self.end_linearised(new_multipliers=OF_IMPULSES)
+        elif self.model.has_dependents:  # linearised steps move only the nodes that they depend on
+            place_dependents(self.model)
 
     def _norm_and_scale(self, c: float, beta: float) -> tuple[float, float]:
         """Return (|r|, scale) from the norms of `form_residual`."""
@@ -470,21 +447,20 @@ class StageSystem:
 
     def form_matrix(self, projected: bool = False) -> None:
         """Form the matrix at the present state, without J^T D J, which the linear solve adds."""
-        subset = self.work.pcg.subset
-        self.form(subset, projected, self.stage.c, self.stage.beta)
+        self.form(projected, self.stage.c, self.stage.beta)
         self._same_matrix = False
         if self.contacts.any:
-            save_diagonal(self.model, self.matrix, self.contacts, subset)
+            save_diagonal(self.model, self.matrix, self.contacts)
 
-    def form(self, subset: Subset, projected: bool, c: float, beta: float) -> None:
-        """Form the matrix of c and beta at the present positions, for the rows of a subset."""
+    def form(self, projected: bool, c: float, beta: float) -> None:
+        """Form the matrix of c and beta at the present positions."""
         self.linear_solver.matrix_changed()
         if self._direct is not None:
             self._direct.matrix_changed()
-        block_csr.assemble(self.model, self.matrix, subset, projected)
+        block_csr.assemble(self.model, self.matrix, projected)
         if self.multipliers is not None:
             self.multipliers.upload(self.multipliers.values)
-        block_csr.to_system(self.model, self.matrix, self.damper or self.matrix, subset, int(projected), c, beta)
+        block_csr.to_system(self.model, self.matrix, self.damper or self.matrix, int(projected), c, beta)
         if self.multipliers is not None and self.multipliers.penalised:
             self.multipliers.upload(self.multipliers.effective)
 
@@ -502,15 +478,13 @@ class StageSystem:
         Without contacts all components are solved in equal norms; those whose residual is far below the tolerance count less.
         """
         m, work, pieces = self.model, self.work.pcg, self.pieces
-        if not self.contacts.any and not work.subset.restricted:
+        if not self.contacts.any:
             if pieces.several:
                 equalise(m, self.matrix, work, pieces.work, (self.NEARLY * self.stage.tolerance) ** 2)
             solution = self.linear_solver.solve(self.stage, tolerance)
             if pieces.several:
                 undo_factors(m, work, pieces.work)
             return solution
-        if pieces.several and work.subset.restricted:
-            pieces.forget_factors()
         terms, same, limit = self.contacts.coupling, self._same_matrix, pcg.iteration_limit(m)
         if m.on_cpu:
             solution = gauss_seidel.solve(m, self.matrix, work, tolerance, limit, terms, same, self._may_share)
@@ -525,7 +499,7 @@ class StageSystem:
         """Assemble K_d, the projected K at the present x, for the new step."""
         if self.damper is not None:
             self.linear_solver.release()  # its matrix contains K_d
-            block_csr.assemble(self.model, self.damper, EVERYTHING, True)
+            block_csr.assemble(self.model, self.damper, True)
 
     def linear_residual(self) -> float:
         """Return the true |rhs - A y| / |rhs|: in f32 CG's recursive residual can fall while the true one stays."""

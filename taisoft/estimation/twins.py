@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from taisoft.dynamics.contact import TOLERANCE as CONTACT_TOLERANCE
-from taisoft.dynamics.implicit import DEFAULT_TOLERANCE
+from taisoft.dynamics.implicit_stages import DEFAULT_TOLERANCE
 from taisoft.errors import SimulationError, no_memory
 from taisoft.estimation.comparison import shared_nodes
 from taisoft.scene.refine import refined, with_order

@@ -1,15 +1,9 @@
-"""Graph of the nodes that share an element, which is the sparsity pattern of every matrix over nodes, and subsets of it.
-
-A subset restricts a stage to the nodes that move in it, and to the edges and elements that touch them. A kernel takes a `Subset`
-as a template: for EVERYTHING it loops over all nodes, edges and blocks of elements.
-"""
+"""Graph of the nodes that share an element, which is the sparsity pattern of every matrix over nodes."""
 
 from dataclasses import dataclass
 from itertools import combinations, product
-from typing import Any
 
 import numpy as np
-import taichi as ti
 
 from taisoft.fem.chunks import SweepOrder
 from taisoft.mesh import topology
@@ -80,66 +74,3 @@ def whole_rows(row_start: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     row = owners(np.diff(row_start)) % n
     start = np.concatenate([[0], np.cumsum(np.bincount(row, minlength=n))])
     return start, np.argsort(row, kind="stable")
-
-
-NODES, EDGES, BLOCKS = range(3)  # indices into `count`; from BLOCKS on: start of each group's blocks, then the total
-
-
-@dataclass(frozen=True, eq=False)
-class Subset:
-    """Lists of indices, nodes in the order of a Gauss-Seidel sweep, others ascending; None: all."""
-
-    count: Any = None  # (3 + n_groups) i32
-    node: Any = None  # i32
-    edge: Any = None  # i32: pairs of nodes that share an element, at least one of them in the list
-    block: Any = None  # i32: blocks of elements with a node in the list, by group
-
-    @property
-    def restricted(self) -> bool:
-        """Whether the subset is given by lists."""
-        return self.node is not None
-
-
-EVERYTHING = Subset()
-
-
-@ti.func
-def count_of(subset: ti.template(), k: ti.template(), everything):
-    """Entry k of a subset's count: NODES, EDGES or an end of a group's blocks; `everything` if it is not restricted."""
-    n = everything
-    if ti.static(subset.restricted):
-        n = subset.count[k]
-    return n
-
-
-@ti.func
-def n_nodes_of(m: ti.template(), subset: ti.template()):
-    """Number of nodes in a subset."""
-    return count_of(subset, NODES, m.n_nodes)
-
-
-@ti.func
-def node_of(subset: ti.template(), j):
-    """The j-th node of a subset."""
-    i = j
-    if ti.static(subset.restricted):
-        i = subset.node[j]
-    return i
-
-
-@ti.func
-def edge_of(subset: ti.template(), j):
-    """The j-th node pair of a subset."""
-    e = j
-    if ti.static(subset.restricted):
-        e = subset.edge[j]
-    return e
-
-
-@ti.func
-def block_of(subset: ti.template(), j):
-    """The j-th block of a subset."""
-    b = j
-    if ti.static(subset.restricted):
-        b = subset.block[j]
-    return b

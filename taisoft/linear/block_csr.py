@@ -19,7 +19,6 @@ from taisoft.errors import SimulationError
 from taisoft.fem import rigid_tets, springs
 from taisoft.fem.chunks import chunk_entry, chunk_size
 from taisoft.fem.model import Model
-from taisoft.fem.node_graph import BLOCKS, EDGES, block_of, count_of, edge_of, n_nodes_of, node_of
 from taisoft.fem.pattern import MATRIX_BLOCKS, model_graph
 from taisoft.fem.terms import rayleigh_damping
 from taisoft.fem.terms.elasticity import prepare_terms
@@ -126,20 +125,19 @@ def _values(model: Model, arena: FieldArena, prefix: str, n_edges: int) -> dict[
 
 
 @kernel
-def assemble(m: ti.template(), A: ti.template(), subset: ti.template(), projected: ti.template()):
-    """Assemble the rows of a subset of A = K(x) [N/m]. projected: with positive semi-definite element contributions."""
+def assemble(m: ti.template(), A: ti.template(), projected: ti.template()):
+    """Assemble A = K(x) [N/m]. projected: with positive semi-definite element contributions."""
     if ti.static(m.mean_dilatation):
         find_gradients(m, A)
-    for n, g in ti.static(enumerate(m.groups)):
+    for g in ti.static(m.groups):
         ti.loop_config(serialize=m.serial)
-        for j in range(count_of(subset, BLOCKS + n, g.first), count_of(subset, BLOCKS + n + 1, g.last)):
-            element_blocks(m, g, A, block_of(subset, j), projected)
+        for b in range(g.first, g.last):
+            element_blocks(m, g, A, b, projected)
     ti.loop_config(serialize=m.serial)
-    for j in range(count_of(subset, EDGES, A.n_edges)):
-        gather_edge(m, A, edge_of(subset, j), projected)
+    for e in range(A.n_edges):
+        gather_edge(m, A, e, projected)
     ti.loop_config(serialize=m.serial)
-    for j in range(n_nodes_of(m, subset)):
-        i = node_of(subset, j)
+    for i in range(m.n_nodes):
         s = ti.Vector([0.0 for _ in ti.static(range(BLOCK))], m.real)
         for half in range(2):
             row = i + half * m.n_nodes
@@ -170,18 +168,15 @@ def gather_edge(m: ti.template(), A: ti.template(), e, projected: ti.template())
 
 
 @kernel
-def to_system(
-    m: ti.template(), A: ti.template(), damper: ti.template(), subset: ti.template(), projected: ti.i32, c: ti.f64, beta: ti.f64
-):
-    """Set A = (c + beta a) M + beta^2 (A + K_t) + beta b K_d in place, for the rows of a subset.
+def to_system(m: ti.template(), A: ti.template(), damper: ti.template(), projected: ti.i32, c: ti.f64, beta: ti.f64):
+    """Set A = (c + beta a) M + beta^2 (A + K_t) + beta b K_d in place.
 
     a, b: mass and stiffness damping of the row's body; K_d: values of the matrix `damper`; K_t: stiffness of the terms that have
     STIFFNESS, without their negative part if projected.
     """
     prepare_terms(m)
     ti.loop_config(serialize=m.serial)
-    for j in range(n_nodes_of(m, subset)):
-        i = node_of(subset, j)
+    for i in range(m.n_nodes):
         k, inertia, damping = ti.cast(beta * beta, m.real), ti.cast(c, m.real), ti.cast(0.0, m.real)
         if ti.static(m.damped):
             inertia += ti.cast(beta, m.real) * rayleigh_damping.mass_rate(m, i)

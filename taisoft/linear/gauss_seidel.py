@@ -21,7 +21,6 @@ import taichi as ti
 
 from taisoft.backend.runtime import kernel
 from taisoft.fem.model import Model
-from taisoft.fem.node_graph import node_of
 from taisoft.fem.state import OTHER_SUM, SUM
 from taisoft.linear.block_csr import BlockCsr, block_times
 from taisoft.linear.coupling import NO_COUPLING, Coupling, add_products, clear_products, gather_products
@@ -69,7 +68,6 @@ def solve(
     """Solve for work.y given work.rhs. tolerance: sqrt(r.z) relative to the start.
 
     terms: added to A. The diagonal of A alone must then be in terms.base; A.diagonal is set to that of the sum.
-    work.subset: the nodes whose rows and unknowns form the system; work.r, p and q must be 0 on all others.
     same_matrix: whether A and the nodes of the terms are those of the last solve; rows without terms then keep their
     preconditioner. may_share: whether several threads may share the sweeps; the result is the same.
     """
@@ -208,7 +206,7 @@ def take_step(model: ti.template(), A: ti.template(), terms: ti.template(), work
 def _n_chunks(work: ti.template(), part: ti.template()):
     """Number of chunks of a parity, or of all."""
     n = 1
-    if ti.static(work.in_chunks):
+    if ti.static(work.divided):
         n = work.n_chunks
     if ti.static(part != ALL):
         n = (n + 1 - part) // 2
@@ -311,8 +309,7 @@ def _update(model: ti.template(), terms: ti.template(), work: ti.template(), c, 
     """Take a step along p; at negative curvature, where the solve ends, y alone matters. Return r.z."""
     rz = ti.cast(0.0, ti.f64)
     first, end = chunk_range(model, terms, work, c, False)
-    for at in range(first, end):
-        i = node_of(work.subset, at)
+    for i in range(first, end):
         p = work.p[i]
         work.y[i] = work.y[i] + step * p
         s = work.r[i] - step * (p + work.q[i])

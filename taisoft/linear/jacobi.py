@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import taichi as ti
 
 from taisoft.fem.chunks import chunk_entry, chunk_size
-from taisoft.fem.node_graph import n_nodes_of, node_of
 from taisoft.fem.state import OTHER_SUM
 from taisoft.linear import pcg_work
 from taisoft.linear.block_csr import block_times
@@ -30,9 +29,9 @@ class Jacobi:
         ti.loop_config(serialize=model.serial)
         for task in range(model.chunks * model.spread):
             if task % model.spread == 0 and work.state[STATUS] == RUNNING:
-                c, n, s = task // model.spread, n_nodes_of(model, work.subset), ti.cast(0.0, ti.f64)
+                c, n, s = task // model.spread, model.n_nodes, ti.cast(0.0, ti.f64)
                 for at in range(chunk_size(model, c, n)):
-                    i = node_of(work.subset, chunk_entry(model, c, at, n))
+                    i = chunk_entry(model, c, at, n)
                     r = work.r[i]
                     z = block_times(work.inverse[i], r)
                     work.z[i] = z

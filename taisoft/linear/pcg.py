@@ -13,7 +13,6 @@ import taichi as ti
 from taisoft.backend.runtime import kernel
 from taisoft.fem.chunks import chunk_entry, chunk_size, fold, total
 from taisoft.fem.model import Model
-from taisoft.fem.node_graph import n_nodes_of, node_of
 from taisoft.fem.state import OTHER_SUM, SUM
 from taisoft.linear.block_csr import BlockCsr, block_times, off_diagonal_times
 from taisoft.linear.coupling import NO_COUPLING, Coupling, form_product, gather_products
@@ -102,9 +101,9 @@ def start(
     ti.loop_config(serialize=model.serial)
     for task in range(model.chunks * model.spread):
         if task % model.spread == 0:
-            c, n = task // model.spread, n_nodes_of(model, work.subset)
+            c, n = task // model.spread, model.n_nodes
             for at in range(chunk_size(model, c, n)):
-                i = node_of(work.subset, chunk_entry(model, c, at, n))
+                i = chunk_entry(model, c, at, n)
                 preconditioner.prepare(model, A, terms, work, i, same_matrix)
                 work.r[i] = model.free[i] * work.rhs[i]
                 work.y[i], work.p[i] = ti.Vector.zero(model.real, 3), ti.Vector.zero(model.real, 3)
@@ -136,9 +135,9 @@ def iterate(
     ti.loop_config(serialize=model.serial)
     for task in range(model.chunks * model.spread):
         if task % model.spread == 0 and (work.state[STATUS] == RUNNING or work.state[STATUS] == NEGATIVE_PENDING):
-            c, n, step = task // model.spread, n_nodes_of(model, work.subset), ti.cast(work.state[STEP], model.real)
+            c, n, step = task // model.spread, model.n_nodes, ti.cast(work.state[STEP], model.real)
             for at in range(chunk_size(model, c, n)):
-                i = node_of(work.subset, chunk_entry(model, c, at, n))
+                i = chunk_entry(model, c, at, n)
                 work.y[i] = work.y[i] + step * work.p[i]
                 work.r[i] = work.r[i] - step * work.q[i]
     preconditioner.apply(model, work)
@@ -167,10 +166,10 @@ def _multiply(model: ti.template(), A: ti.template(), terms: ti.template(), bord
     ti.loop_config(serialize=model.serial)
     for task in range(model.chunks * model.spread):
         if task % model.spread == 0:
-            c, n, s = task // model.spread, n_nodes_of(model, work.subset), ti.cast(0.0, ti.f64)
+            c, n, s = task // model.spread, model.n_nodes, ti.cast(0.0, ti.f64)
             if work.state[STATUS] == RUNNING:
                 for at in range(chunk_size(model, c, n)):
-                    i = node_of(work.subset, chunk_entry(model, c, at, n))
+                    i = chunk_entry(model, c, at, n)
                     product = off_diagonal_times(model, A, c, i, work.p)
                     if ti.static(terms.any):
                         product += block_times(terms.base[i], work.p[i]) + gather_products(model, terms, i)
@@ -191,7 +190,7 @@ def _turn(model: ti.template(), work: ti.template()):
     ti.loop_config(serialize=model.serial)
     for task in range(model.chunks * model.spread):
         if task % model.spread == 0 and work.state[STATUS] == RUNNING:
-            c, n, ratio = task // model.spread, n_nodes_of(model, work.subset), ti.cast(work.state[STEP], model.real)
+            c, n, ratio = task // model.spread, model.n_nodes, ti.cast(work.state[STEP], model.real)
             for at in range(chunk_size(model, c, n)):
-                i = node_of(work.subset, chunk_entry(model, c, at, n))
+                i = chunk_entry(model, c, at, n)
                 work.p[i] = work.z[i] + ratio * work.p[i]

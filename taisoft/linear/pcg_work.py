@@ -14,7 +14,6 @@ import taichi as ti
 from taisoft.backend.arrays import Count, FieldArena
 from taisoft.fem.chunks import WHOLE, chunk_entry, chunk_size
 from taisoft.fem.model import Model
-from taisoft.fem.node_graph import EVERYTHING, Subset
 from taisoft.fem.state import OTHER_SUM
 from taisoft.linear.block_csr import BLOCK, definite_inverse
 from taisoft.linear.coupling import Coupling, has_terms, prepare_terms
@@ -42,12 +41,6 @@ class PcgWork:
     n_chunks: Count = 1  # of `gauss_seidel`
     chunk_shift: Count = WHOLE  # a chunk has 2^chunk_shift nodes
     divided: bool = False  # whether the half-rows of matrices are those of a divided sweep
-    subset: Subset = EVERYTHING  # nodes that form the system
-
-    @property
-    def in_chunks(self) -> bool:
-        """Whether Gauss-Seidel passes the system's nodes chunk by chunk."""
-        return self.divided and not self.subset.restricted
 
     def result(self, max_iterations: int) -> "LinearResult | None":
         """The outcome of a solve; None if it must go on."""
@@ -59,7 +52,7 @@ class PcgWork:
 
     def is_shared(self, coupling: Coupling) -> bool:
         """Whether several threads may share the chunks of one parity."""
-        return self.in_chunks and (not coupling.any or coupling.place is not None)
+        return self.divided and (not coupling.any or coupling.place is not None)
 
     def has_last(self, coupling: Coupling) -> bool:
         """Whether some nodes are passed after all chunks, see `sweep_order`."""

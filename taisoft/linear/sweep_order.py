@@ -11,7 +11,6 @@ nodes until their turn, which leaves these blocks out. In a backward sweep neigh
 import taichi as ti
 
 from taisoft.backend.runtime import kernel
-from taisoft.fem.node_graph import n_nodes_of, node_of
 from taisoft.linear.block_csr import (
     keep_padding_lane,
     off_diagonal_times,
@@ -28,10 +27,10 @@ NO_CHUNK = 1 << 30
 @ti.func
 def chunk_range(model: ti.template(), terms: ti.template(), work: ti.template(), c, last: ti.template()):
     """Return the first place of chunk c, or of the last nodes, in their list, and one past its end."""
-    first, end = 0, n_nodes_of(model, work.subset)
+    first, end = 0, model.n_nodes
     if ti.static(last):
         end = terms.n_last[0]
-    elif ti.static(work.in_chunks):
+    elif ti.static(work.divided):
         first, end = c << work.chunk_shift, ti.min(end, (c + 1) << work.chunk_shift)
     return first, end
 
@@ -39,7 +38,7 @@ def chunk_range(model: ti.template(), terms: ti.template(), work: ti.template(),
 @ti.func
 def node_at(terms: ti.template(), work: ti.template(), at, last: ti.template()):
     """Return the node at a place of a chunk, or of the last nodes."""
-    i = node_of(work.subset, at)
+    i = at
     if ti.static(last):
         i = terms.last[at]
     return i

@@ -13,7 +13,6 @@ import taisoft as ts
 from benchmarks.contact_colouring import measure_crossover
 from benchmarks.contact_runs import GOAL
 from taisoft.fem.measure import measure
-from taisoft.fem.node_graph import EVERYTHING
 from taisoft.fem.state import ELASTIC
 from taisoft.fem.terms import elasticity
 from taisoft.linear import block_csr
@@ -47,7 +46,7 @@ def test_energy_force_and_stiffness_agree_with_the_oracle(arch, precision):
         expected = rig.oracle.force(x)
         assert np.abs(force.to_numpy() - expected).max() < 100 * rig.eps * np.abs(expected).max()
         matrix = block_csr.build_block_csr(rig.model, rig.arena)
-        block_csr.assemble(rig.model, matrix, EVERYTHING, False)
+        block_csr.assemble(rig.model, matrix, False)
         direction, product = rng.standard_normal(x.shape), rig.vectors("product")
         factor = rig.vectors("factor", direction.astype(rig.machine.np_real))
         block_csr.multiply(rig.model, matrix, factor, product)

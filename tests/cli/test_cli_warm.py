@@ -4,16 +4,12 @@
 * without names, every demo can be built and is compiled, with the requested precision or its own.
 """
 
-from dataclasses import replace
-
 import numpy as np
 
 import taisoft as ts
 from taisoft.backend.runtime import n_compiled
 from taisoft.cli import main, warm
 from taisoft.cli.scene_file import shipped_files
-from taisoft.dynamics.elimination import eliminate
-from tests.dynamics.scenes import dynamics
 
 
 def falling(cells, size, **numbers) -> ts.Scene:
@@ -30,11 +26,6 @@ def test_scenes_of_other_sizes_compile_nothing():
     with ts.Simulator(scene, dt=2e-3, integrator="implicit_euler") as sim:
         sim.advance(2)
         assert np.isfinite(sim.positions()).all() and n_compiled() == before
-    with dynamics(scene, dt=2e-3, integrator="implicit_euler") as made:
-        made.advance(1)
-        solver, x = made.stepper.solver, made.state.state()[0]
-        solved = eliminate(solver, replace(solver.stage, tolerance=0.0), 0.0, np.arange(20, 40))  # as hard steps do
-        assert solved.linear > 0.0 and not np.array_equal(made.state.state()[0], x) and n_compiled() == before
 
 
 def test_all_demos_are_compiled_in_the_requested_precision_or_their_own(monkeypatch, capsys):

@@ -16,7 +16,7 @@ import pytest
 
 import taisoft as ts
 from taisoft.dynamics import contact_measures, contact_paths
-from taisoft.dynamics.contact_measures import find_displacement, next_length
+from taisoft.dynamics.contact_measures import find_displacement
 from taisoft.dynamics.contact_paths import ContactPaths
 from taisoft.fem.state import DEVIATION
 from tests.dynamics.contact_scenes import material
@@ -140,16 +140,6 @@ def test_a_plane_stops_bodies_of_any_speed(sim):
         lowest = min(lowest, sim.positions("faller")[:, 1].min())
         force.append(sim.contact_force("plane")[1])
     assert min(force) < -400.0 and -1.0 < lowest < -0.99  # [N]; 450 N stop the cube within a step
-
-
-def test_length_of_the_next_substep():
-    """The closing ratio of a substep is a function of its length. Substeps fill the step, and grow at most twofold."""
-    assert next_length(lambda h: h, 1.0, 1.0, 1.0, False) == 1.0
-    assert next_length(lambda h: 2.5 * h, 1.0, 1.0, 1.0, False) == pytest.approx(1 / 3)  # the rest in equal substeps
-    assert next_length(lambda h: 0.0, 0.9, 0.1, 1.0, False) == pytest.approx(0.1)
-    assert next_length(lambda h: 0.0, 0.9, 0.1, 1.0, True) == pytest.approx(0.18)
-    assert next_length(lambda h: 0.0, 0.9, 0.1, 0.15, True) == pytest.approx(0.15)
-    assert next_length(lambda h: 40.0 * h if h > 0.1 else 0.0, 0.8, 0.1, 1.0, True) == pytest.approx(0.025)
 
 
 def test_penetration_over_the_edge_of_the_finer_side(sim, monkeypatch):

@@ -3,24 +3,19 @@
 * linear solves cut into many launches give the same bits, and extrapolated multipliers the same step in fewer updates;
 * a step takes few Newton iterations, also with an indefinite matrix; impulses satisfy the contact laws, also with a tolerance
   far below that of |r|, and where |r| is mostly rounding; a problem that stalls, as between flush blocks, is solved directly.
-
-Nonlinear elimination: steps that are first solved on the fewest nodes that hold nearly all of the residual, and two rings around
-them, move only these, lower the residual, and find the same result in fewer iterations, with and without contacts.
 """
 
-from functools import partial
+import inspect
 
 import numpy as np
 import pytest
 
 import taisoft as ts
-from taisoft.dynamics import contact_newton, implicit
 from taisoft.dynamics.dynamics import Dynamics
-from taisoft.dynamics.elimination import CONCENTRATED, FEW, choose_nodes, eliminate
 from taisoft.dynamics.friction import Friction
+from taisoft.dynamics.frictional_problems import FrictionalProblems
 from taisoft.dynamics.renewal import Renewal
 from taisoft.dynamics.schemes import SCHEMES
-from taisoft.dynamics.stage import STAY, Stage
 from taisoft.dynamics.stage_system import StageSystem
 from taisoft.linear import gauss_seidel
 from tests.collision.rotations import rotation
@@ -76,13 +71,30 @@ def test_steps_take_few_iterations_and_extrapolated_multipliers_fewer(made, monk
     assert all(report.converged for report in reports) and len(whole) >= 3 and max(whole) <= 12
     assert max(report.n_contacts for report in reports) > 10
     with monkeypatch.context() as patch:
-        patch.setattr(implicit, "Stage", partial(Stage, extrapolate_after=0))
+        goal = FrictionalProblems.goal
+        patch.setattr(FrictionalProblems, "goal", lambda *given: goal(*given)._replace(plain=0))
         extrapolated, sooner = steps(made)
         assert np.abs(extrapolated - x).max() < 1e-8  # [m]
         assert sum(report.contact_iterations for report in sooner) < 0.9 * sum(r.contact_iterations for r in reports)
     monkeypatch.setattr(gauss_seidel, "SERIAL_WORK", 1)  # one iteration a launch
     again, others = steps(made)
     assert np.array_equal(again, x) and counts(others) == counts(reports)
+
+
+def test_linear_solves_are_at_most_thirteen_calls_deep(made, monkeypatch):
+    """Those with contacts. Two of them are those of `Simulator`."""
+    solve, depths = gauss_seidel.solve, []
+
+    def counted(*given):
+        frame, depth = inspect.currentframe().f_back, 3
+        while frame.f_code is not Dynamics.advance.__code__:
+            frame, depth = frame.f_back, depth + 1
+        depths.append(depth)
+        return solve(*given)
+
+    monkeypatch.setattr(gauss_seidel, "solve", counted)
+    steps(made, 3)
+    assert made.contact.n_contacts > 0 and 0 < max(depths) <= 13 - 1
 
 
 def test_contact_laws_converge_to_their_own_tolerance(made, monkeypatch):
@@ -129,7 +141,7 @@ def test_a_direct_solve_goes_on_where_iterations_ended(made, monkeypatch):
     expected, _ = steps(made, 4)
     found, solve = [], StageSystem.solve_directly
     monkeypatch.setattr(StageSystem, "solve_directly", lambda self, *given: found.append(solve(self, *given)) or found[-1])
-    monkeypatch.setattr(Friction, "MAX_MULTIPLIERS", 2)
+    monkeypatch.setattr(Friction, "MAX_UPDATES", 2)
     x, _ = steps(made, 4)
     assert any(one is not None for one in found) and np.abs(x - expected).max() < 1e-8
 
@@ -158,77 +170,3 @@ def test_contact_laws_hold_with_an_indefinite_matrix(made, monkeypatch, scheme):
     normal = np.einsum("ij,ij->i", c.impulse, c.normal)
     tangential = np.linalg.norm(c.impulse - normal[:, None] * c.normal, axis=1)
     assert (normal >= 0.0).all() and (tangential <= 0.5 * normal + 1e-9 * normal.max()).all() and normal.max() > 0.0
-
-
-def beam(on_ground: bool) -> ts.Scene:
-    """A beam fixed at its left end, optionally with a ground just below it."""
-    scene = ts.Scene()
-    body = scene.add_body(ts.box_mesh((10, 3, 3), (1.0, 0.3, 0.3)), material(), name="beam", position=(0.0, 0.1501, 0.0))
-    body.fix(lambda X: X[:, 0] < -0.49)
-    if on_ground:
-        scene.add_obstacle(ground(), name="ground", friction=0.5)
-    return scene
-
-
-def pinched(scene: ts.Scene) -> np.ndarray:
-    """Positions with one node pushed through its tets, far from the fixed end."""
-    x = scene.bodies[0].rest_positions + scene.bodies[0].position
-    x[np.argmin(np.abs(x - [0.2, 0.25, 0.0]).sum(axis=1))] -= [0.0, 0.25, 0.0]
-    return x
-
-
-def test_nodes_are_chosen_as_by_sorting_all():
-    """Also where a cheaper bound refuses them: residuals from smooth to all on one node, and none."""
-    rng, n, found = np.random.default_rng(5), 40, set()
-    start, column = np.arange(0, 2 * n + 1, 2), np.clip(np.arange(n)[:, None] + (-1, 1), 0, n - 1)  # a chain
-    for power in (0.0, 1.0, 2.0, 3.0, 5.0, 9.0, 40.0, np.inf):
-        residual = rng.standard_normal((n, 3)) * np.maximum(np.arange(1, n + 1.0), 1.0)[rng.permutation(n), None] ** -power
-        squares = np.sort((residual**2).sum(axis=1))[::-1].cumsum()
-        few = squares[-1] > 0.0 and squares[int(FEW * n) - 1] >= CONCENTRATED * squares[-1]
-        nodes = choose_nodes(residual, start, column.reshape(-1))
-        assert (nodes is not None) == few
-        found.add(few)
-    assert found == {False, True} and choose_nodes(np.full((n, 3), np.nan), start, column.reshape(-1)) is None
-
-
-def check_elimination(system: StageSystem, stage, r: float):
-    """Eliminate, and check what changes."""
-    lists, free, state = system.lists, system.model.free.to_numpy(), system.model.state
-    nodes = choose_nodes(free * system.work.residual.to_numpy(), lists.start, lists.column)
-    before = state.x.to_numpy()
-    found = eliminate(system, stage, r)
-    assert (found is None) == (nodes is None) and not system.work.pcg.subset.restricted
-    if found is not None:
-        moved = (state.x.to_numpy() != before).any(axis=1)
-        assert 0 < moved.sum() <= len(nodes) < len(before) and not moved[np.setdiff1d(np.arange(len(before)), nodes)].any()
-        left, _ = system.evaluate(None)  # with the same multipliers
-        inside = (free * system.work.residual.to_numpy())[nodes]
-        assert left < 0.9 * r and np.linalg.norm(inside) < 0.11 * r
-        assert system.evaluate(STAY)[0] == pytest.approx(left, rel=1e-9)  # forces were up to date
-    return found
-
-
-@pytest.mark.parametrize("on_ground", [False, True])
-def test_steps_with_and_without_eliminations_agree(monkeypatch, on_ground):
-    """With eliminations, they take fewer Newton and CG iterations; with contacts, three quarters of the CG iterations.
-
-    Direct solves, which help as much there, are left out.
-    """
-    monkeypatch.setattr(StageSystem, "solve_directly", lambda *_: None)
-    results, found = [], []
-
-    def checked(system, stage, r):
-        found.append(check_elimination(system, stage, r))
-        return found[-1]
-
-    for function in (checked, lambda system, stage, r: None):
-        monkeypatch.setattr(contact_newton, "eliminate", function)
-        with ts.Simulator(beam(on_ground), dt=0.01, precision="f64", newton_tolerance=1e-9, contact_tolerance=1e-8) as sim:
-            sim.set_state(positions=pinched(sim.scene))
-            results.append((sim.step(), sim.positions()))
-    (report, x), (without, x_without) = results
-    assert any(one is not None for one in found) and report.converged and without.converged
-    assert (report.n_contacts > 0) == on_ground
-    assert np.abs(x - x_without).max() < 1e-7
-    assert report.linear_iterations < (0.8 if on_ground else 1.0) * without.linear_iterations
-    assert report.newton_iterations < without.newton_iterations or on_ground

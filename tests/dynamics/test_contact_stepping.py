@@ -13,7 +13,7 @@ import pytest
 
 import taisoft as ts
 from taisoft.collision.contacts import Contacts
-from taisoft.dynamics.contact import ContactStep
+from taisoft.dynamics.contact import BLOCKED, ContactStep
 from taisoft.dynamics.schemes import EXPLICIT
 from taisoft.fem.reference import lumped_masses
 from taisoft.mesh.quality import mean_surface_edge
@@ -250,17 +250,15 @@ def test_contact_laws(sim):
 
 @by("implicit_euler", "velocity_verlet")
 def test_forces_of_pairs_add_up_to_those_of_bodies(sim, monkeypatch):
-    """The load falls on the cube; the first implicit step is cut into substeps, as if it had ended too deep."""
-    explicit, cut, whole, ends, end = sim.settings.explicit, 0, 0, [], ContactStep.end
+    """The load falls on the cube; the first implicit step is halved, as if its way were blocked."""
+    explicit, cut, whole, ways, certify = sim.settings.explicit, 0, 0, [], ContactStep.certify
 
-    def too_deep_once(contact, time, dt):
-        ends.append(end(contact, time, dt))
-        if len(ends) == 1:
-            contact.relative_penetration = 1.0
-        return ends[-1]
+    def blocked_once(*given):
+        ways.append(certify(*given))
+        return BLOCKED if len(ways) == 1 else ways[-1]
 
     if not explicit:
-        monkeypatch.setattr(ContactStep, "end", too_deep_once)
+        monkeypatch.setattr(ContactStep, "certify", blocked_once)
     sim.dt = 0.001 if explicit else 0.002
     x = sim.positions("load") + (0.1 - 2.02, SIDE + 4e-4 - 0.5, 0.0)
     sim.set_state(x, np.tile([0.5, -3.0, 0.0], (len(x), 1)), body="load")

@@ -25,7 +25,6 @@ from taisoft.dynamics.no_contacts import NoContacts
 from taisoft.dynamics.simulation_state import SimulationState
 from taisoft.dynamics.stage import AGAIN, ELASTIC_STAGE, STAY, STEP, form_residual, move
 from taisoft.dynamics.stage_system import StageSystem
-from taisoft.fem.node_graph import EVERYTHING
 from taisoft.fem.state import END_SLOPE, N_NORMS, NORMS, START_SLOPE, STEP_LENGTH
 from taisoft.linear import block_csr, gauss_seidel
 from taisoft.linear.block_csr import to_bsr, unpacked
@@ -67,9 +66,9 @@ def rig():
         for field, values in zip(fields, (friction, gap, obstacle_displacement, apart, loaded)):
             fill_field(field, values)
         index_nodes(p)
-        block_csr.assemble(m, solver.matrix, EVERYTHING, False)
-        block_csr.to_system(m, solver.matrix, solver.matrix, EVERYTHING, 0, 1.0, BETA)
-        contact_terms.save_diagonal(m, solver.matrix, k, EVERYTHING)
+        block_csr.assemble(m, solver.matrix, False)
+        block_csr.to_system(m, solver.matrix, solver.matrix, 0, 1.0, BETA)
+        contact_terms.save_diagonal(m, solver.matrix, k)
         find_factors(p)
         A = to_bsr(m, solver.matrix).toarray()
         found = replace(contacts, inverse_mass=np.zeros((m.n_nodes, 3)), friction=friction)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import taisoft as ts
-from taisoft.dynamics import implicit
+from taisoft.dynamics import implicit_stages
 from taisoft.dynamics.schemes import EXPLICIT, INTEGRATORS
 from taisoft.fem.reference import lumped_mass
 from tests.dynamics.contact_scenes import material
@@ -138,7 +138,7 @@ def test_statics_of_a_light_body_beside_a_heavy_one():
 
 
 def test_a_piece_that_does_not_converge_is_named(monkeypatch):
-    monkeypatch.setattr(implicit, "MAX_NEWTON", 1)
+    monkeypatch.setattr(implicit_stages, "MAX_NEWTON", 1)
     made = falling(masses=(1e3, 1e-6))
     with ts.Simulator(made, dt=1 / 60, precision="f64") as sim:
         x = sim.positions("1")

@@ -1,15 +1,10 @@
 """Implicit steps that are done again, without and with contacts:
 
-* a step that does not converge, or ends too deep, is retried from its start with twice as many substeps, and prescribed nodes
-  that it released are prescribed again; the result equals that many steps, and the report counts the iterations of all attempts;
-* where a step fails, the state is that before it.
-
-Substepping, with a fake stepper: a point whose position is the time.
-
-* a step that does not converge is retried in 2 and 4 substeps and then whole, and later steps are not until one converges;
-* a substep that met unknown contacts, or in which something passes through something, is repeated; one that ends deep, leaves the
-  searched path, or does not settle, is undone and halved, a bounded number of times; longer ones are tried ever more seldom;
-* what passes in spite of all is held back and reported.
+* a part of a step that does not converge, or whose way is not free, is halved, and prescribed nodes that it released are
+  prescribed again; the result equals that many steps, and the report counts the iterations of all attempts;
+* what a way meets becomes a contact, and the stage is solved on; what stays blocked is held back and reported;
+* where a step fails, the state is that before it;
+* where halving does not help, it ends, and is tried again once it may help (`PartLength`).
 """
 
 from dataclasses import replace
@@ -18,13 +13,15 @@ import numpy as np
 import pytest
 
 import taisoft as ts
-from taisoft.dynamics import implicit
-from taisoft.dynamics.contact import ContactStep
+from taisoft.dynamics import implicit_stages
+from taisoft.dynamics.contact import BLOCKED, FREE, MAX_PASSAGES, MET, ContactStep
+from taisoft.dynamics.contact_measures import ContactMeasures
+from taisoft.dynamics.contact_paths import ContactPaths
+from taisoft.dynamics.implicit import ImplicitStepper
 from taisoft.dynamics.newton_budget import NewtonBudget
-from taisoft.dynamics.results import StageResult
-from taisoft.dynamics.substepping import LengthLimit, Substepping
-from taisoft.errors import SimulationError
+from taisoft.dynamics.part_length import PARTS, PartLength
 from tests.dynamics.contact_scenes import ground, material
+from tests.dynamics.scenes import dynamics
 
 DT, RELEASE = 0.02, 0.015  # [s]
 TIGHT = {"precision": "f64", "newton_tolerance": 1e-11, "contact_tolerance": 1e-10}
@@ -86,7 +83,7 @@ def check_retry(sim, retry) -> None:
 
 
 def test_a_step_that_does_not_converge_is_cut_into_substeps(sim, monkeypatch):
-    solve, results = implicit.solve, []
+    solve, results = implicit_stages.solve, []
 
     def first_unconverged(system, stage):
         results.append(solve(system, stage))
@@ -94,7 +91,7 @@ def test_a_step_that_does_not_converge_is_cut_into_substeps(sim, monkeypatch):
         bad = {"converged": False, "unbalanced": (0.5, "body 'bar'")} if len(results) == 1 else {}
         return replace(results[-1], **bad)
 
-    check_retry(sim, lambda: monkeypatch.setattr(implicit, "solve", first_unconverged))
+    check_retry(sim, lambda: monkeypatch.setattr(implicit_stages, "solve", first_unconverged))
 
 
 @pytest.mark.parametrize("limit", [3, 6])
@@ -110,37 +107,103 @@ def test_a_step_ends_at_its_bound_of_iterations(sim, monkeypatch, limit):
     assert "least balanced is node " in report.problems[0] and f" of body '{body.name}', between " in report.problems[0]
 
 
-def patch_end(patch, events: dict, measure: str = "relative_penetration") -> list:
-    """Patch the measurement at the end of a substep. events: by number of the call, an exception, or a value of the measure."""
-    calls, end = [], ContactStep.end
+def patch_ways(patch, ways: list[int]) -> list:
+    """Let the next ways be these, and those after them free. Return the lengths of the parts whose ways are certified."""
+    calls, certify = [], ContactStep.certify
 
-    def patched(contact, time, dt):
-        depth = end(contact, time, dt)
-        calls.append((time, dt))
-        event = events.get(len(calls))
-        if isinstance(event, Exception):
-            raise event
-        if event is not None:
-            setattr(contact, measure, event)
-        return depth
+    def patched(contact, time, dt, start):
+        calls.append(dt)
+        certify(contact, time, dt, start)
+        return ways[len(calls) - 1] if len(calls) <= len(ways) else FREE
 
-    patch.setattr(ContactStep, "end", patched)
+    patch.setattr(ContactStep, "certify", patched)
+
     return calls
 
 
 @by("contacts")
-@pytest.mark.parametrize("measure, depth", [("relative_penetration", 1.0), ("crossing", 3e-3)])
-def test_a_step_that_ends_too_deep_is_retried(sim, monkeypatch, measure, depth):
+def test_a_step_whose_way_is_blocked_is_halved(sim, monkeypatch):
     calls = []
-    check_retry(sim, lambda: calls.append(patch_end(monkeypatch, {1: depth}, measure)))
-    assert calls == [[(DT, DT), (DT / 2, DT / 2), (DT, DT)]] and sim.contact_force("ground")[1] < 0.0
+    check_retry(sim, lambda: calls.append(patch_ways(monkeypatch, [BLOCKED])))
+    assert calls == [[DT, DT / 2, DT / 2]] and sim.contact_force("ground")[1] < 0.0
+
+
+@by("contacts")
+@pytest.mark.parametrize("measure, depth", [("relative_penetration", 1.0), ("crossing", 3e-3)])
+def test_where_surfaces_cross_a_part_that_leads_deeper_is_halved(sim, monkeypatch, measure, depth):
+    calls, end = [], ContactStep.end
+
+    def too_deep_once(contact, time, dt):
+        calls.append((time, dt))
+        found = end(contact, time, dt)
+        setattr(contact, measure, depth if len(calls) == 1 else getattr(contact, measure))
+        return found
+
+    def begin():
+        monkeypatch.setattr(ContactPaths, "none_cross", property(lambda self: False))
+        monkeypatch.setattr(ContactStep, "end", too_deep_once)
+
+    check_retry(sim, begin)
+    assert calls[0] == (DT, DT) and {dt for _, dt in calls[1:-1]} == {DT / 2} and calls[-1] == (DT, DT)
+
+
+@by("contacts")
+def test_where_surfaces_cross_unknown_contacts_are_met(sim, monkeypatch):
+    """And a way that closes too fast even in the shortest part is refused."""
+    monkeypatch.setattr(ContactPaths, "none_cross", property(lambda self: False))
+    left = ContactPaths.left_searched
+    monkeypatch.setattr(ContactPaths, "left_searched", lambda self, x_start: left(self, x_start) or True)
+    features, found = ContactStep.found_features, []
+
+    def unknown_at_first(contact):
+        found.append(features(contact) | ({("unknown",)} if len(found) == 1 else set()))
+        return found[-1]
+
+    with monkeypatch.context() as patch:
+        patch.setattr(ContactStep, "found_features", unknown_at_first)
+        report = sim.step()
+    assert report.converged and report.substeps == 1 and len(found) == 4  # twice before and after the search of the way
+    monkeypatch.setattr(ContactStep, "MAX_CLOSING_RATIO", -1.0)
+    monkeypatch.setattr(ContactMeasures, "describe_fast_closing", lambda self, dt, parts: f"too fast for {dt} in {parts}")
+    x = sim.positions()
+    with pytest.raises(ts.SimulationError, match=f"^step 2: too fast for {DT} in {PARTS}$"):
+        sim.step()
+    assert np.array_equal(sim.positions(), x)
+
+
+@by("contacts")
+def test_what_a_way_meets_becomes_a_contact_of_the_same_part(sim, monkeypatch):
+    """Each time the stage is solved on from the velocities reached, at most MAX_PASSAGES times; then it is halved."""
+    first, begun = sim.step().newton_iterations, []
+    x = sim.positions()
+    sim.reset()
+    begin = ImplicitStepper.solve_stage
+    monkeypatch.setattr(ImplicitStepper, "solve_stage", lambda self, *given: begun.append(given[2]) or begin(self, *given))
+    with monkeypatch.context() as patch:
+        calls = patch_ways(patch, [MET] * 2)
+        report = sim.step()
+    assert calls == [DT] * 3 and report.converged and report.substeps == 1
+    assert [start is None for start in begun] == [True, False, False] and report.newton_iterations < 3 * first
+    assert np.abs(sim.positions() - x).max() < 1e-9
+    sim.reset()
+    calls = patch_ways(monkeypatch, [MET] * (MAX_PASSAGES + 1))
+    assert sim.step().substeps == 2 and calls == [DT] * (MAX_PASSAGES + 1) + [DT / 2] * 2
+
+
+@by("contacts")
+def test_what_stays_blocked_is_held_back_and_reported(sim, monkeypatch):
+    held = []
+    monkeypatch.setattr(ContactPaths, "hold_back", lambda self, x_start: held.append(sim.time) or True)
+    monkeypatch.setattr(ContactStep, "certify", lambda *_: BLOCKED)
+    report = sim.step()
+    assert not report.converged and report.substeps == len(held) == PARTS
 
 
 @by("implicit_euler", "contacts")
 @pytest.mark.parametrize("call, error", [(1, ts.SimulationError("no room")), (3, KeyboardInterrupt())])
 def test_a_failed_step_leaves_the_state_before_it(sim, monkeypatch, call, error):
     """In the first try, after the release, and Ctrl-C in the second substep of the second try; prescribed nodes, too."""
-    x, v, solve, calls = sim.positions(), sim.velocities(), implicit.solve, []
+    x, v, solve, calls = sim.positions(), sim.velocities(), implicit_stages.solve, []
 
     def failing(system, stage):
         calls.append(stage)
@@ -149,7 +212,7 @@ def test_a_failed_step_leaves_the_state_before_it(sim, monkeypatch, call, error)
         return replace(solve(system, stage), converged=False)
 
     with monkeypatch.context() as patch:
-        patch.setattr(implicit, "solve", failing)
+        patch.setattr(implicit_stages, "solve", failing)
         with pytest.raises(type(error)):
             sim.step()
     assert np.array_equal(sim.positions(), x) and np.array_equal(sim.velocities(), v)
@@ -166,205 +229,112 @@ def test_a_failed_step_leaves_the_state_before_it(sim, monkeypatch, call, error)
     assert np.abs(sim.positions() - first).max() < 1e-9  # [m], as of a new simulator
 
 
-STEP = 0.02  # [s]; in the second step a quarter of it is rounded down
+@pytest.mark.parametrize("ways, has_impact, n_previous", [([], True, 0), ([MET], True, 0), ([MET], False, 1)])
+def test_an_impact_of_the_first_attempt_counts(monkeypatch, ways, has_impact, n_previous):
+    """Those that are solved on from it have impulses from the start, but a multistep scheme must begin anew after the step."""
+    with dynamics(pressed(), dt=DT, integrator="bdf2", **TIGHT) as made:
+        calls = patch_ways(monkeypatch, ways)
+        had_impact = property(lambda self: has_impact and not calls, lambda self, value: None)
+        monkeypatch.setattr(ContactStep, "had_impact", had_impact, raising=False)
+        made.advance(1)
+        assert made.stepper.n_previous == n_previous and len(calls) == len(ways) + 1
 
 
-def longer_than(length: float):
-    return lambda time, dt: dt > length
+def test_linearly_implicit_steps_are_not_halved_for_convergence(monkeypatch):
+    solve = implicit_stages.solve
+    monkeypatch.setattr(implicit_stages, "solve", lambda *given: replace(solve(*given), converged=False))
+    with ts.Simulator(bar(), DT, "linearly_implicit_euler", precision="f64") as sim:
+        assert [(report.substeps, report.converged) for report in (sim.step(), sim.step())] == [(1, False)] * 2
 
 
-class FakeStepper:
-    """Stepper, simulation state and contacts at once: x is the time reached. What is not defined does nothing and measures 0.
+def test_an_error_in_a_part_halved_for_convergence_keeps_the_whole_step(monkeypatch):
+    step = ImplicitStepper.solve_stage
 
-    Tests set when something happens, as functions of a substep's start and length.
-    """
+    def fails(self, time, dt, start):
+        if dt < 0.9 * DT and time > 0.0:
+            raise ts.SimulationError("no motion was found")
+        return replace(step(self, time, dt, start), converged=dt < 0.9 * DT)
 
-    is_linear = none_cross = is_stuck = False
-    relative_penetration = crossing = x = 0.0
-    step_count, closing_ratio = 4, 10.0
-
-    def __init__(self):
-        self.contact = self.paths = self.measures = self.simulation = self.now = self.start = self
-        self.taken, self.kept, self.held_back, self.retry_starts = [], [], [], []
-        self.converges = lambda time, dt: True
-        self.depth = self.left_path = self.has_new_contacts = self.passes = self.fails = lambda time, dt: 0.0
-
-    def __getattr__(self, name: str):
-        return lambda *args, **given: 0.0
-
-    def measure_start(self, time, dt):
-        return 0.0, 0.0
-
-    def begin_step(self):
-        self.first = self.x
-
-    def return_to_first(self):
-        self.x, self.kept = self.first, []
-
-    def take_substep(self, time, dt):
-        assert time == pytest.approx(self.x)
-        self.before = self.x
-        self.set_state(time + dt, (time, dt))
-        self.taken.append((time, dt))
-        good = self.converges(time, dt) and not self.fails(time, dt)
-        return StageResult(3, 10, 1e-6 if good else 0.1, good, False)
-
-    def undo_substep(self, discard_impulses=False):
-        self.x = self.before
-        self.kept.pop()
-
-    copy_nodes_from = undo_substep
-
-    def retry_substep(self, time, dt, start):
-        self.retry_starts.append(start)
-        return self.take_substep(time, dt)
-
-    def state(self):
-        return self.x, self.kept[-1]
-
-    def set_state(self, x, last):
-        self.x = x
-        self.kept.append(last)
-
-    def left_searched(self, x_start):
-        return self.left_path(*self.kept[-1])
-
-    def find(self, as_searched=False):
-        return self.passes(*(self.searched if as_searched else self.kept[-1]))
-
-    def hold_back_paths(self):
-        self.held_back.append(self.kept[-1])
-        return True
-
-    def search_along_path(self, time, dt):
-        self.searched = time, dt
-        return self.has_new_contacts(time, dt)
-
-    def end(self, time, dt):
-        self.relative_penetration = self.depth(*self.kept[-1])
+    monkeypatch.setattr(ImplicitStepper, "solve_stage", fails)
+    with ts.Simulator(bar(), DT, **TIGHT) as sim:
+        report = sim.step()
+        assert not report.converged and report.substeps == 1 and sim.time == DT
 
 
-@pytest.fixture
-def stepper():
-    return FakeStepper()
+def take(length: PartLength, dt: float, free=lambda units: True, converged=lambda units: True) -> tuple[list[int], list[int]]:
+    """Take a step of dt. Return the lengths of all parts that are tried and of those that are kept, in units of dt / PARTS."""
+    tried, kept, left = [], [], PARTS
+    while left:
+        units = min(left, length.units(dt))
+        tried.append(units)
+        if length.should_halve(free(units), converged(units), units):
+            length.halve(units, dt)
+        else:
+            length.keep(units, converged(units))
+            kept.append(units)
+            left -= units
+    return tried, kept
 
 
-def take(stepper: FakeStepper, substepping: Substepping | None = None) -> tuple[list[float], StageResult]:
-    """Take the next step. Return the lengths of its substeps, which must be contiguous and add up to the step, and its result."""
-    start, stepper.taken, stepper.kept = stepper.x, [], []
-    result = (substepping or Substepping(stepper)).step(start, STEP)
-    times, lengths = np.transpose(stepper.kept)
-    assert np.allclose(times - start, np.cumsum(lengths) - lengths) and np.isclose(lengths.sum(), STEP)
-    return lengths.tolist(), result
+def test_parts_that_fail_are_halved_until_that_does_not_help():
+    """Then the rest is tried at once, and nothing is tried again until a part converges."""
+    length, least = PartLength(), PartLength.LEAST_UNCONVERGED
+    tried, kept = take(length, DT, converged=lambda units: units <= PARTS // 2)
+    assert tried == [PARTS, PARTS // 2, PARTS // 2] and kept == tried[1:] and length.helps
+    tried, kept = take(length, DT, converged=lambda units: False)
+    assert kept == [least, PARTS - least] and len(tried) <= 2 + np.log2(PARTS / least) and not length.helps
+    assert take(length, DT, converged=lambda units: False)[0] == [PARTS]
+    assert take(length, DT)[0] == [PARTS] and length.helps
 
 
-def test_a_step_that_does_not_converge_is_retried_until_that_does_not_help(stepper):
-    substepping, stepper.converges = Substepping(stepper), lambda time, dt: dt <= 0.5 * STEP
-    lengths, result = take(stepper, substepping)
-    assert [dt for _, dt in stepper.taken] == pytest.approx([STEP, STEP / 2, STEP / 2]) and result.newton_iterations == 9
-    assert result.converged and substepping.may_retry and len(lengths) == substepping.substeps == 2
-    stepper.converges = longer_than(STEP)
-    lengths, result = take(stepper, substepping)
-    assert [dt for _, dt in stepper.taken] == pytest.approx([STEP, *[STEP / 2] * 2, *[STEP / 4] * 4, STEP])
-    assert substepping.substeps == 1 and not result.converged and not substepping.may_retry and lengths == [STEP]
-    take(stepper, substepping)
-    assert len(stepper.taken) == 1
-    stepper.converges = longer_than(0.0)
-    take(stepper, substepping)
-    assert substepping.may_retry
-    stepper.is_linear, stepper.converges = True, longer_than(STEP)  # linear steps are not retried
-    assert not take(stepper, substepping)[1].converged and len(stepper.taken) == 1
+@pytest.mark.parametrize("most", [PARTS // 2, PARTS // 16, 1, 0])
+def test_parts_whose_way_is_not_free_are_halved(most):
+    """Down to the shortest, which is kept in any case. Longer ones are tried ever more seldom, whole steps again in the end."""
+    length = PartLength()
+    for _ in range(3):
+        tried, kept = take(length, DT, free=lambda units: units <= most)
+        assert sum(kept) == PARTS and max(kept) <= max(most, 1) and len(tried) - len(kept) <= 8 + len(kept) / 2
+        again = PartLength()
+        again.restore(length.snapshot())
+        assert again == length
+    while length.longest < np.inf:
+        assert take(length, DT)[1] != []
+    assert take(length, 2.0 * DT)[0] == [PARTS]
+    length.halve(PARTS, DT)
+    assert length.units(DT) == PARTS // 2 and length.units(100.0 * DT) == 1 and length.units(0.1 * DT) == PARTS
 
 
-@pytest.mark.parametrize(
-    "faults, length, attempts",
-    [
-        (["depth"], STEP / 8, 1),  # it ends deep
-        (["left_path"], STEP / 4, 1),  # it was faster than known when the step was cut
-        (["left_path", "has_new_contacts"], STEP / 2, 4),  # each path that is searched has unknown contacts
-        (["passes"], STEP / 2, 9),  # something passes through something whatever contacts are added,
-        (["passes", "fails"], STEP / 2, 1),  # which is not tried again with equations that cannot be solved
-    ],
-)
-def test_a_substep_with_a_fault_is_repeated_and_then_halved(stepper, faults, length, attempts):
-    for fault in faults:
-        setattr(stepper, fault, longer_than(length))
-    substepping = Substepping(stepper)
-    lengths, result = take(stepper, substepping)
-    assert max(lengths) == pytest.approx(length) and result.converged and not stepper.held_back
-    assert sum(dt == STEP for _, dt in stepper.taken) == attempts
-    assert result.newton_iterations == 3 * len(stepper.taken) and substepping.substeps == len(lengths)
+def test_what_is_not_finite_is_halved_without_its_impulses(monkeypatch):
+    with dynamics(pressed(), dt=DT, **TIGHT) as made:
+        step, problem = ImplicitStepper.solve_stage, made.contact.problem
+
+        def broken(self, time, dt, start):
+            result = step(self, time, dt, start)
+            if dt == DT:
+                problem.r.fill(np.nan)
+                result = replace(result, residual=np.nan, converged=False, free=False)
+            return result
+
+        monkeypatch.setattr(ImplicitStepper, "solve_stage", broken)
+        report = made.advance(1)
+        assert report.converged and report.substeps == 2 and report.n_contacts > 0
 
 
-def test_the_number_of_undone_substeps_is_bounded(stepper):
-    stepper.depth = lambda time, dt: 1.0 + time  # always deeper
-    lengths, _ = take(stepper)
-    assert 0 < len(stepper.taken) - len(lengths) <= 20 and stepper.relative_penetration > 1.0
+def test_what_is_not_finite_is_halved_and_then_refused(monkeypatch):
+    with ts.Simulator(bar(), DT, **TIGHT) as sim:
+        x, step = sim.positions(), ImplicitStepper.solve_stage
+        lengths = []
 
+        def broken(self, time, dt, start):
+            lengths.append(dt)
+            result = step(self, time, dt, start)
+            return replace(result, residual=np.nan, converged=False, free=False, imbalance="a node") if dt > limit else result
 
-@pytest.mark.parametrize(
-    "fault, lengths", [("left_path", [STEP]), ("depth", [STEP / 2, STEP / 2]), ("passes", [STEP / 2, STEP / 2])]
-)
-def test_the_rest_of_a_step_without_iterations_is_held_back(stepper, fault, lengths):
-    """A substep that was too fast to be kept is part of the rest; one with other faults is the last, not halved again."""
-    setattr(stepper, fault, longer_than(STEP / 4))
-    stepper.is_spent, stepper.converges = lambda: len(stepper.taken) > (fault != "left_path"), lambda time, dt: False
-    stepper.hold_substep = lambda time, dt: stepper.set_state(time + dt, (time, dt)) or StageResult(0, 0, 0.0, False, False)
-    substepping = Substepping(stepper)
-    assert take(stepper, substepping)[0] == pytest.approx(lengths)
-    assert len(stepper.taken) == len(lengths) and not substepping.may_retry
-
-
-@pytest.mark.parametrize("attempts, faults", [(2, ["left_path", "has_new_contacts"]), (4, ["passes"])])
-def test_a_substep_that_met_unknown_contacts_is_repeated_with_them(stepper, attempts, faults):
-    for fault in faults:
-        setattr(stepper, fault, lambda time, dt: len(stepper.taken) <= attempts)
-    lengths, result = take(stepper)
-    assert stepper.taken == [(0.0, STEP)] * (attempts + 1) and lengths == [STEP] and result.converged
-    assert stepper.retry_starts == [(0.0, STEP)] * attempts  # each starts from the result before
-    assert result.newton_iterations == 3 * (attempts + 1)
-
-
-def test_longer_substeps_are_tried_ever_more_seldom():
-    """The limit is half of a failed length, and doubles after as many substeps as its patience; a snapshot holds its state."""
-    limit, waits = LengthLimit(), []
-    limit.keep(0.5 * STEP, STEP)
-    assert limit.longest == np.inf
-    for _ in range(5):
-        limit.undo(0.8 * STEP, again=False)
-        waits.append(limit.patience)
-        for _ in range(limit.patience):
-            assert limit.longest == 0.4 * STEP
-            kept, limit = limit.snapshot(), LengthLimit()
-            limit.restore(kept)
-            assert np.array_equal(limit.snapshot(), kept)
-            limit.keep(0.4 * STEP, STEP)
-        assert limit.is_trial and limit.longest == 0.8 * STEP
-    assert waits == [2, 4, 8, 8, 8]
-    patience = limit.patience
-    limit.undo(0.8 * STEP, again=True)
-    for _ in range(patience + 1):  # the last is half of the trial's length, which shows nothing
-        limit.keep(0.4 * STEP, STEP)
-    assert limit.is_trial and limit.patience == patience
-    limit.keep(0.8 * STEP, STEP)
-    assert not limit.is_trial and limit.patience == patience // 2
-    limit.keep(STEP, STEP)
-    assert limit.longest == np.inf and limit.patience == 1
-
-
-def test_what_passes_in_spite_of_all_is_held_back_and_reported(stepper):
-    stepper.passes = lambda time, dt: True
-    _, result = take(stepper)
-    assert stepper.held_back == stepper.kept and not result.converged
-    assert len(stepper.taken) < 30 * len(stepper.kept)
-
-
-def test_an_error_in_a_retry_keeps_the_first_result(stepper):
-    def fails(time, dt):
-        if dt < STEP and time > 0.0:
-            raise SimulationError("not finite")
-        return False
-
-    stepper.converges = fails
-    lengths, result = take(stepper)
-    assert not result.converged and lengths == [STEP]
+        monkeypatch.setattr(ImplicitStepper, "solve_stage", broken)
+        limit = 0.3 * DT
+        assert sim.step().converged and lengths[:3] == [DT, DT / 2, DT / 4]
+        sim.reset()
+        limit = 0.0
+        with pytest.raises(ts.SimulationError, match="^step 1: a node$"):
+            sim.step()
+        assert lengths[-1] == DT / PARTS and np.array_equal(sim.positions(), x)

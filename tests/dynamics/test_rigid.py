@@ -210,15 +210,29 @@ def test_an_impact_keeps_momentum_and_follows_newtons_law(restitution):
         assert w[0] > 0.3
 
 
+SPIN = (0.0, 1.0, 0.3)  # [1/s]
+
+
 def test_what_flies_is_not_moved_by_what_is_in_contact():
     """Contacts are solved directly here, also in linearised steps, whose rigid motion is balanced afterwards."""
     scene = ts.Scene()
     scene.add_rigid_body(CUBE, name="lying", position=(0, 0.0002 - CUBE.vertices[:, 1].min(), 0))
-    scene.add_rigid_body(CUBE, name="flying", position=(0, 5, 0), velocity=(1, 0, 0))
+    scene.add_rigid_body(CUBE, name="flying", position=(0, 5, 0), velocity=(1, 0, 0), angular_velocity=SPIN)
     scene.add_obstacle(GROUND)
     with ts.Simulator(scene, dt=0.01, integrator="linearly_implicit_euler", precision="f64") as sim:  # of rigid bodies alone
-        assert all(sim.step().n_contacts for _ in range(10))
+        assert sim.step().n_contacts and np.allclose(sim.twist("flying").angular_velocity, SPIN, atol=1e-3)
+        assert all(sim.step().n_contacts for _ in range(9))
         assert np.allclose(sim.twist("flying").velocity, (1.0, -0.1 * G, 0.0), atol=1e-6)
+
+
+def test_contacts_of_what_cannot_move_are_solved():
+    """They have no rows in the matrix of the impulses."""
+    scene = ts.Scene()
+    scene.add_rigid_body(CUBE, name="fixed", position=(0, 0.0002 - CUBE.vertices[:, 1].min(), 0)).fix()
+    scene.add_obstacle(GROUND)
+    with ts.Simulator(scene, dt=0.01, integrator="implicit_euler", precision="f64") as sim:
+        report = sim.step()
+        assert report.converged and report.n_contacts > 0 and not sim.twist("fixed").velocity.any()
 
 
 @pytest.mark.parametrize(

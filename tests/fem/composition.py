@@ -7,7 +7,6 @@ import numpy as np
 
 import taisoft as ts
 from taisoft.fem.measure import measure
-from taisoft.fem.node_graph import EVERYTHING
 from taisoft.fem.state import ELASTIC
 from taisoft.fem.terms import elasticity
 from taisoft.linear import block_csr
@@ -77,5 +76,5 @@ def added(rig, x: np.ndarray, beta: float, projected: bool = False) -> np.ndarra
     rig.model.state.x.from_numpy(x)
     rig.matrix.value.fill(0.0)
     rig.matrix.diagonal.fill(0.0)
-    block_csr.to_system(rig.model, rig.matrix, rig.matrix, EVERYTHING, int(projected), 0.0, beta)
+    block_csr.to_system(rig.model, rig.matrix, rig.matrix, int(projected), 0.0, beta)
     return block_csr.to_bsr(rig.model, rig.matrix).toarray()

@@ -11,7 +11,6 @@ from taisoft.backend.runtime import kernel
 from taisoft.fem.dependent_table import dependent_table
 from taisoft.fem.dependents import force_with_dependents
 from taisoft.fem.measure import measure
-from taisoft.fem.node_graph import EVERYTHING
 from taisoft.fem.state import ELASTIC, GRAVITY, LOADS
 from taisoft.fem.terms import TERMS, elasticity, gravity, rayleigh_damping, rigid_damping
 from taisoft.linear import block_csr
@@ -92,7 +91,7 @@ def test_dampers_act_by_the_rates_of_each_body(rig):
     outs = [rig.vectors(f"term_{k}") for k in range(3)]
     matrix = block_csr.build_block_csr(m, rig.arena, "test_damper")
     m.state.x.from_numpy(rig.x)
-    block_csr.assemble(m, matrix, EVERYTHING, True)  # a stiffness: its rows sum to zero
+    block_csr.assemble(m, matrix, True)  # a stiffness: its rows sum to zero
     rates = np.repeat(rayleigh_damping.damping_table(rig.scene)[:, 0], [body.n_nodes for body in rig.scene.bodies])
     drag = rates * m.mass.to_numpy()
     v = rng.standard_normal(rig.x.shape)
@@ -119,7 +118,7 @@ def test_forces_and_stiffness_of_dependent_nodes_act_on_the_others():
         f, wanted = forces(rig, q)[elasticity], T.T @ rig.oracle.force(T @ q)
         assert np.abs(f - wanted)[own].max() < 1e-12 * np.abs(wanted).max()
         matrix = block_csr.build_block_csr(rig.model, rig.arena)
-        block_csr.assemble(rig.model, matrix, EVERYTHING, False)
+        block_csr.assemble(rig.model, matrix, False)
         axes = (3 * own[:, None] + np.arange(3)).reshape(-1)
         found, K = block_csr.to_bsr(rig.model, matrix).toarray(), rig.oracle.stiffness(T @ q)
         wanted = np.kron(T, np.eye(3)).T @ K @ np.kron(T, np.eye(3))

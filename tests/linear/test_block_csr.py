@@ -5,7 +5,6 @@ projected; the system adds mass, mass damping and stiffness damping.
 import numpy as np
 import pytest
 
-from taisoft.fem.node_graph import EVERYTHING
 from taisoft.linear import block_csr
 from tests.dynamics.scenes import built
 from tests.fem.composition import composition
@@ -28,7 +27,7 @@ def test_the_stiffness_is_the_oracles(rig, projected):
     m.state.x.from_numpy(x)
     rig.matrix.value.fill(np.nan)
     rig.matrix.diagonal.fill(np.nan)
-    block_csr.assemble(m, rig.matrix, EVERYTHING, projected)
+    block_csr.assemble(m, rig.matrix, projected)
     K, size = block_csr.to_bsr(m, rig.matrix).toarray(), np.abs(expected).max()
     assert np.abs(K - expected).max() < 1e-12 * size and np.abs(K - K.T).max() < 1e-14 * size
     assert (np.linalg.eigvalsh(K)[0] > -1e-13 * size) == projected
@@ -47,7 +46,7 @@ def test_the_system_adds_mass_and_damping(rig):
     a, b = (np.repeat(rates, 3)[:, None] for rates in (rig.oracle.mass_damping, rig.oracle.stiffness_damping))
     assert 0.4 in a and 3e-3 in b
     K, K_d = (block_csr.to_bsr(rig.model, A).toarray() for A in (rig.matrix, damper))
-    block_csr.to_system(rig.model, rig.matrix, damper, EVERYTHING, 0, c, beta)
+    block_csr.to_system(rig.model, rig.matrix, damper, 0, c, beta)
     expected = (c + beta * a) * np.kron(rig.oracle.mass, np.eye(3)) + beta**2 * K + beta * b * K_d
     found = block_csr.to_bsr(rig.model, rig.matrix).toarray()
     assert np.abs(found - expected).max() < 1e-14 * np.abs(expected).max()

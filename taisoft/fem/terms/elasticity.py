@@ -30,7 +30,6 @@ from taisoft.fem.lanes import (
 from taisoft.fem.laws import dpk1_projected, prepare_projected
 from taisoft.fem.math3 import determinant, matmul_nt, matmul_tn
 from taisoft.fem.mean_dilatation import find_dilatations, find_rates, patch_energy, patch_values, stress_constants
-from taisoft.fem.node_graph import BLOCKS, EVERYTHING, block_of, count_of
 from taisoft.fem.state import FAILED, INVERTED_NOW, LOWEST_J, OTHER_SUM, SUM
 
 SWITCH, LOAD, ACCELERATION, STIFFNESS, PREPARED = None, False, False, False, False
@@ -112,14 +111,14 @@ def lowest_and_count(m: ti.template(), J, bad):
 
 
 @ti.func
-def sum_elements(m: ti.template(), subset: ti.template()):
-    """Run `element_force` over all blocks of a subset and prepare other terms, as top-level loops of a kernel."""
+def sum_elements(m: ti.template()):
+    """Run `element_force` over all blocks and prepare other terms, as top-level loops of a kernel."""
     place_all(m)
     find_dilatations(m)
-    for n, g in ti.static(enumerate(m.groups)):
+    for g in ti.static(m.groups):
         ti.loop_config(serialize=m.serial)
-        for j in range(count_of(subset, BLOCKS + n, g.first), count_of(subset, BLOCKS + n + 1, g.last)):
-            element_force(m, g, False, block_of(subset, j))
+        for b in range(g.first, g.last):
+            element_force(m, g, False, b)
     prepare_terms(m)
 
 
@@ -208,7 +207,7 @@ def element_energy(m: ti.template(), g: ti.template(), b):
 @kernel
 def elastic_forces(m: ti.template()):
     """Fill the element force buffer from x; `gather_forces` sums it over nodes."""
-    sum_elements(m, EVERYTHING)
+    sum_elements(m)
 
 
 @kernel
