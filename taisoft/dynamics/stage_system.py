@@ -253,6 +253,7 @@ class StageSystem:
 
     def _begin(self, stage: Stage, kind: int) -> None:
         self.stage, self.kind, self._nonlinear_kind, self.r_scale, self.contacts = stage, kind, kind, 1.0, NO_CONTACTS
+        self._rejects_direct = False  # whether a direct solve of this stage was rejected: others would be, too
         self.floor, self.unbalanced = self.rounding.of_stage(stage.c, stage.beta), (0.0, "")
         if self.pieces.several:
             self.pieces.forget_weights()
@@ -414,9 +415,12 @@ class StageSystem:
         tolerance: of the laws' residual; stalled: whether iterations failed. Returns (iterations, converged, |r|); raises
         numpy.linalg.LinAlgError as `DirectSolver.prepare`.
         """
-        if self._direct is None or not (stalled or self._direct.is_rigid) or not self._direct.prepare(self.contacts):
+        direct = self._direct
+        if direct is None or self._rejects_direct or not (stalled or direct.is_rigid) or not direct.prepare(self.contacts):
             return None
-        return self._direct.solve(self.contacts, self.stage.beta, tolerance, max(tolerance, self.contact_residual))
+        found = direct.solve(self.contacts, self.stage.beta, tolerance, max(tolerance, self.contact_residual))
+        self._rejects_direct = found is None
+        return found
 
     def end_linearised(self, accept: bool = True, new_multipliers: int = TO_IMPULSES) -> tuple[float, float]:
         """Restore nonlinear elastic forces; return (|r|, scale). y is then the velocity change since linearisation, base its x.
