@@ -1,9 +1,10 @@
-"""Nothing crosses: the passages on a substep's paths, the contacts that hold them apart, and what is held back if those fail.
+"""Nothing crosses: the passages on the paths of a part of a step, the contacts that hold them apart, and what is held back if those
+fail.
 
-A substep is accepted only if no pair of surfaces passes through each other on its straight paths (`collision.passages`), or on a
-bent path (`collision.bent_path`). Else pairs that pass become contacts, and the substep is repeated with them. They stay in the
-next substeps while they carry an impulse. If passages are left after all retries, whole bodies are held back: their paths are
-shortened until nothing passes, and the step counts as not converged.
+A part is accepted only if no pair of surfaces passes through each other on its straight paths (`collision.passages`), or on a bent
+path (`collision.bent_path`). Else pairs that pass become contacts, with which it is solved on. They stay in the next parts while
+they carry an impulse. If passages are left where it cannot be halved, whole bodies are held back: their paths are shortened until
+nothing passes, and the step counts as not converged.
 """
 
 import numpy as np
@@ -27,7 +28,7 @@ from taisoft.scene.connections import attached_pairs
 class ContactPaths:
     """Check the paths of substeps and hold the passages found."""
 
-    MAX_UNCHANGED = 3  # checks in a row that find the same pairs, after which repeating a substep does not help
+    MAX_UNCHANGED = 3  # checks in a row that find the same pairs, after which solving on does not help
     SHORTENED = 0.9  # of the part of a path that is certainly free: how far bodies that are held back move
     MAX_SHORTENINGS, LEAST = 30, 1e-6  # rounds, and part of a path: beyond these, they do not move at all
 
@@ -37,8 +38,8 @@ class ContactPaths:
         self.held_back = ""  # a sentence about the last step, if bodies were held back,
         self._names: set[str] = set()  # and their names
         self._n_unchanged = 0  # checks in a row that found no pairs but those held already
-        self.has_found = False  # whether any passage was found in this substep
-        self._held = NO_PASSAGES  # in this substep so far
+        self.has_found = False  # whether any passage was found in this part of a step
+        self._held = NO_PASSAGES  # in this part so far
         n_bodies = len(detection.scene.bodies)
         n, group = connected_components(attached_pairs(detection.scene)[:n_bodies, :n_bodies])
         self._attached = [np.flatnonzero(group == k) for k in range(n) if (group == k).sum() > 1]  # move as one if held back
@@ -52,7 +53,7 @@ class ContactPaths:
 
     @property
     def is_stuck(self) -> bool:
-        """Whether repeating the substep does not help any more: the same pairs pass, although they are contacts."""
+        """Whether solving on does not help any more: the same pairs pass, although they are contacts."""
         return self._n_unchanged >= self.MAX_UNCHANGED
 
     def start_step(self) -> None:
@@ -62,11 +63,11 @@ class ContactPaths:
 
     @property
     def none_cross(self) -> bool:
-        """Whether no colliders crossed at the start of the substep, so that all paths are checked."""
+        """Whether no colliders crossed at the start of the part, so that all paths are checked."""
         return self._simulation.now.none_cross
 
     def begin(self) -> None:
-        """Begin a substep."""
+        """Begin a part of a step."""
         self._held, self._n_unchanged, self.has_found = self._simulation.now.held, 0, False
 
     def left_searched(self, x_start) -> bool:
