@@ -1,10 +1,9 @@
-"""Nothing crosses: the passages on the paths of a part of a step, the contacts that hold them apart, and what is held back if those
-fail.
+"""Nothing crosses: the passages on the paths of a part of a step, contacts that hold them apart, and what is held back if those fail.
 
-A part is accepted only if no pair of surfaces passes through each other on its straight paths (`collision.passages`), or on a bent
-path (`collision.bent_path`). Else pairs that pass become contacts, with which it is solved on. They stay in the next parts while
-they carry an impulse. If passages are left where it cannot be halved, whole bodies are held back: their paths are shortened until
-nothing passes, and the step counts as not converged.
+A part is accepted only if no pair of surfaces passes through each other on its straight paths (`collision.passages`), or on a
+bent path (`collision.bent_path`). Else pairs that pass become contacts, with which it is solved on. They stay in the next parts
+while they carry an impulse. If passages are left where it cannot be halved, whole bodies are held back: their paths are shortened
+until nothing passes, and the step counts as not converged.
 """
 
 import numpy as np
@@ -26,7 +25,7 @@ from taisoft.scene.connections import attached_pairs
 
 
 class ContactPaths:
-    """Check the paths of substeps and hold the passages found."""
+    """Check the paths of parts of steps and hold the passages found."""
 
     MAX_UNCHANGED = 3  # checks in a row that find the same pairs, after which solving on does not help
     SHORTENED = 0.9  # of the part of a path that is certainly free: how far bodies that are held back move
