@@ -1,4 +1,4 @@
-"""Nothing crosses: the passages on the paths of a part of a step, contacts that hold them apart, and what is held back if those fail.
+"""Nothing crosses: passages on the paths of a part of a step, contacts that hold them apart, what is held back if they fail.
 
 A part is accepted only if no pair of surfaces passes through each other on its straight paths (`collision.passages`), or on a
 bent path (`collision.bent_path`). Else pairs that pass become contacts, with which it is solved on. They stay in the next parts
