@@ -32,11 +32,11 @@ def test_normals_of_the_end_on_a_curve():
     for friction in (0.3, 0.0):
         with ts.Simulator(ironed(friction), dt=1.0, precision="f64") as sim:
             assert sim.run(12.0, fps=None).status == "ok"
-            reports, forces = zip(*((sim.step(), sim.contact_force("block", "iron")) for _ in range(5)))
-            assert all(report.converged for report in reports) and reports[-1].misplaced < 0.005
-            ratios.append(np.mean([force[0] / -force[1] for force in forces]))  # over an edge: it oscillates
+            reports, forces = zip(*((sim.step(), sim.contact_force("block", "iron")) for _ in range(8)))
+            assert all(r.converged and not r.problems for r in reports) and reports[-1].misplaced < 0.005
+            ratios.append(np.mean([force[0] / -force[1] for force in forces]))  # from edge to edge: it oscillates
     # the block bulges ahead of the capsule as the slide begins, with friction or without
-    assert abs(ratios[1]) < 0.05 and ratios[0] - ratios[1] == pytest.approx(0.3, rel=0.05)
+    assert abs(ratios[1]) < 0.03 and ratios[0] - ratios[1] == pytest.approx(0.3, rel=0.05)
 
 
 @pytest.mark.parametrize("friction, text", [(0.3, "friction between 'block' and 'iron' may be"), (0.0, "may be a false drag")])
