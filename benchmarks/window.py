@@ -17,6 +17,7 @@ from statistics import median
 import numpy as np
 
 from taisoft.cli.scene_file import load_scene, shipped_files
+from taisoft.errors import MissingPackage
 
 from .document import Limit, begin, check_out, table
 from .runner import make_parser, parse_result, progress, run_python, without_warnings
@@ -30,11 +31,14 @@ KEEPS_UP = 0.95  # speed from which on a simulation keeps up with the clock
 
 
 def demos() -> list[str]:
-    """Names of the demos with contacts and at most MAX_TETS tets."""
+    """Names of the demos with contacts and at most MAX_TETS tets, but for those whose extra is not installed."""
     found = []
     with without_warnings():
         for name in shipped_files("demos"):
-            scene, solver = load_scene(name)
+            try:
+                scene, solver = load_scene(name)
+            except MissingPackage:
+                continue
             tets = sum(len(body.mesh.tets) for body in scene.bodies)
             if tets <= MAX_TETS and scene.pushes(bool(solver.get("self_collision"))):
                 found.append(name)

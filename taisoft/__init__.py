@@ -34,6 +34,7 @@ _MODULES = {  # public name -> the module that defines it
     "Capsule": "taisoft.scene.obstacles",
     "MeshObstacle": "taisoft.scene.obstacles",
     "Obstacle": "taisoft.scene.obstacles",
+    "Robot": "taisoft.scene.robot",
     "KeyFrames": "taisoft.scene.key_frames",
     "read_scene": "taisoft.scene.toml",
     "write_scene": "taisoft.scene.toml_writer",

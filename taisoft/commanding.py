@@ -69,6 +69,8 @@ def _commanded(sim: "Simulator", call: str, name: str) -> dict[int, Pose]:
     """Return what moves by a command to an obstacle or a rigid body, with its present pose."""
     _refuse_foresight(sim, call)
     commands, one = sim._open().commands, sim.scene.collider(name)
+    if owner := next((robot.name for robot in sim.scene.robots if name in robot.shapes), None):
+        raise SceneError(f"{call}: {name!r} belongs to robot {owner!r}: set sim.robots[{owner!r}].control")
     if isinstance(one, Obstacle):
         mover = commands.obstacle(one)
         return {mover: commands.pose(mover, sim.time, call)}
@@ -89,7 +91,9 @@ def _refuse_foresight(sim: "Simulator", call: str) -> None:
 
 
 def refuse_commands(sim: "Simulator", what: str) -> None:
-    """Refuse a run that has to foresee motion while anything follows a command. what: the argument that asks for it."""
+    """Refuse a run that has to foresee motion while anything follows a command, or robots move. what: what asks for it."""
+    for robot in sim.scene.robots:
+        raise SimulationError(f"{what}: robot {robot.name!r} answers to forces, so that its motion cannot be foreseen")
     for name in sim._host().commands:
         raise SimulationError(f"{what}: {name!r} follows a command, which cannot be foreseen: give a path, or call sim.reset()")
 

@@ -17,6 +17,10 @@ class SceneError(TaisoftError):
     """A scene, a material or a setting breaks a rule."""
 
 
+class MissingPackage(SceneError):
+    """A scene needs an optional package."""
+
+
 class OutputError(TaisoftError):
     """A result could not be written."""
 

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from taisoft.errors import OutputError
+from taisoft.errors import OutputError, TaisoftError
 
 
 @dataclass(frozen=True)
@@ -122,9 +122,9 @@ def format_bytes(n_bytes: int | None) -> str:
     return "unknown" if n_bytes is None else f"{n_bytes} bytes ({n_bytes / 1e9:.2f} GB)"
 
 
-def require(package: str, what: str, extra: str):
-    """Return an optional package. what: what needs it. extra: brings it. Raises OutputError if it is missing."""
+def require(package: str, what: str, extra: str, error: type[TaisoftError] = OutputError):
+    """Return an optional package. what: what needs it. extra: brings it. Raises the error if it is missing."""
     try:
         return import_module(package)
     except ImportError:
-        raise OutputError(f"{what} needs the package {package}, which is missing: pip install 'taisoft[{extra}]'") from None
+        raise error(f"{what} needs the package {package}, which is missing: pip install 'taisoft[{extra}]'") from None

@@ -16,6 +16,7 @@ from taisoft.scene.rigid import Pose, RigidBody, Twist
 from taisoft.stability import stable_dt as largest_stable_dt
 
 if TYPE_CHECKING:
+    from taisoft.dynamics.robots import RunningRobot
     from taisoft.simulator import Simulator
 
 
@@ -160,6 +161,20 @@ def nodal_errors(self: "Simulator", body: str | None = None) -> np.ndarray:
     if self._estimator is None:
         raise SimulationError("errors are estimated only during sim.run(..., error=True): ask for them in on_frame or on_step")
     return self._estimator.nodal_errors()[nodes_of(self, body)]
+
+
+def robots(self: "Simulator") -> "dict[str, RunningRobot]":
+    """The robots that run with the simulation, by name."""
+    return dict(self._host().robots.running)
+
+
+def robot(self: "Simulator") -> "RunningRobot":
+    """The only robot. Raises SimulationError if there is none, or more than one."""
+    found = self.robots
+    if len(found) != 1:
+        there_are = f"there are {list(found)}: take one from sim.robots" if found else "the scene has none: call scene.add_robot"
+        raise SimulationError(f"sim.robot: {there_are}")
+    return next(iter(found.values()))
 
 
 # --- rigid bodies -----------------------------------------------------------------------------------------------------

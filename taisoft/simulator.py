@@ -163,6 +163,8 @@ class Simulator(Guarded):
     pose = queries.pose
     twist = queries.twist
     rigid_strain = queries.rigid_strain
+    robots = property(queries.robots)
+    robot = property(queries.robot)
     deepest_overlap = contact_queries.deepest_overlap
     overlaps = contact_queries.overlaps
     intersecting_triangles = contact_queries.intersecting_triangles

@@ -17,7 +17,7 @@ from taisoft import compile_message
 from taisoft.backend.runtime import n_compiled
 from taisoft.cli.run import RUN_KEYS
 from taisoft.cli.scene_file import load_scene, shipped_files
-from taisoft.errors import SimulationError
+from taisoft.errors import MissingPackage, SimulationError
 from taisoft.static import solve_static
 from taisoft.view.offscreen import Offscreen
 
@@ -32,7 +32,13 @@ def warm(arguments: Namespace) -> int:
     start, before, chosen = time.perf_counter(), n_compiled(), arguments.precision
     with compile_message.silenced():
         for name in arguments.scenes or shipped_files("demos"):
-            scene, solver = load_scene(name)
+            try:
+                scene, solver = load_scene(name)
+            except MissingPackage as error:
+                if arguments.scenes:
+                    raise
+                print(f"{name:<30} left out: {error}", flush=True)
+                continue
             given = {key: value for key, value in solver.items() if key not in (*RUN_KEYS, "tolerance")}
             _report(name, simulate, scene, given | ({"precision": chosen} if chosen else {}))
         if not arguments.scenes:

@@ -18,6 +18,7 @@ from taisoft.dynamics.drag_spring import DragSpring
 from taisoft.dynamics.no_contacts import NoContacts
 from taisoft.dynamics.prescribed_paths import PrescribedPaths
 from taisoft.dynamics.results import StepResult
+from taisoft.dynamics.robots import Robots
 from taisoft.dynamics.schemes import IMPLICIT
 from taisoft.dynamics.simulation_state import SimulationState
 from taisoft.errors import SimulationError
@@ -29,6 +30,7 @@ from taisoft.fem.state import FIRST_SOFTENED, LOADS
 from taisoft.records import Energies, StepReport
 from taisoft.scene.commands import Command
 from taisoft.scene.plan import Plan
+from taisoft.scene.rigid import Pose
 from taisoft.scene.scene import Scene
 from taisoft.settings import Settings, check_dt
 
@@ -79,6 +81,7 @@ class Dynamics:
         self._owned.append(self.stepper)
         self._paths = PrescribedPaths(scene, self.state.dirichlet)
         self.commands, self._explicit = Commands(scene, self.state.dirichlet), settings.explicit
+        self.robots = Robots(scene)
         self.reset()
 
     @property
@@ -101,8 +104,12 @@ class Dynamics:
     def advance(self, n: int) -> StepReport:
         """Take up to n steps of dt, at least one: explicit steps in one launch, implicit steps one per call.
 
-        Raises SimulationError that names the step; the state stays the last good one.
+        With robots one step. Raises SimulationError that names the step; the state stays the last good one.
         """
+        return self.robots.step(self) if self.robots else self.take_steps(n)
+
+    def take_steps(self, n: int) -> StepReport:
+        """Do as `advance`, of bodies alone."""
         spring, start = self.drag_spring, self.state.step_count
         begin, end = self.state.time, self.state.time + (n if self._explicit else 1) * self.dt
         if spring is not None and spring.drag is not None:
@@ -183,6 +190,7 @@ class Dynamics:
         Compiles nothing.
         """
         self.commands.reset()
+        self.robots.restart()
         self.state.restart()
         self.end_drag()
         self._time_base = 0.0, 0
@@ -220,6 +228,15 @@ class Dynamics:
         if self.contact is not None:
             self.contact.motion_changed()
 
+    def command_poses(self, poses: dict[str, Pose]) -> None:
+        """Let obstacles, by name, move to poses in the next step."""
+        commands, now = {}, self.state.time
+        for name, last in poses.items():
+            mover = self.commands.obstacle(self.scene.obstacle(name))
+            first, turned = self.commands.pose(mover, now, name)
+            commands[mover] = Command(now, first, last.translation, first_rotation=turned, last_rotation=last.rotation)
+        self.command(commands)
+
     def upload_loads(self) -> None:
         """Copy the scene's present loads, plus the force of the drag spring, to the device."""
         self.state.upload_loads()
@@ -237,7 +254,7 @@ class Dynamics:
         moving = self.contact is not None and not all(obstacle.rests(self.state.time) for obstacle in self.scene.obstacles)
         dragged = self.drag_spring is not None and self.drag_spring.drag is not None
         driven = self.state.loads.vary or not self.state.loads.has_potential
-        return moving or dragged or driven or not self.state.now.released.all()
+        return bool(self.robots) or moving or dragged or driven or not self.state.now.released.all()
 
     def mean_acceleration(self, nodes: np.ndarray) -> np.ndarray:
         """Return the mean acceleration (k,3) [m/s^2] of nodes (k,) in the last step or batch; 0 before the first one here.
@@ -320,12 +337,13 @@ class Dynamics:
         start, count = self._time_base
         own = {"dt": self.dt, "time_base": start, "count_base": count}
         parts = {"simulation": self.state.snapshot(), "stepper": self.stepper.snapshot(), "commands": self.commands.snapshot()}
-        return own | parts
+        return own | parts | {"robots": self.robots.snapshot()}
 
     def restore(self, kept: dict) -> None:
         """Restore a `snapshot` of the same scene with the same numbers."""
         self.dt, self._time_base = check_dt(kept["dt"]), (float(kept["time_base"]), int(kept["count_base"]))
         self.commands.restore(kept["commands"])
+        self.robots.restore(kept["robots"])
         self.state.restore(kept["simulation"])
         self._paths.remember(self.state.time)
         self._velocities_before = None
@@ -334,6 +352,7 @@ class Dynamics:
     def continue_from(self, other: "Dynamics") -> None:
         """Take over the state of another instance of the same scene, as `state_changed` does without history."""
         self.commands.continue_from(other.commands)
+        self.robots.restore(other.robots.snapshot())
         self.state.restore(other.state.snapshot())
         self._paths.remember(self.state.time)
         self.stepper.forget()

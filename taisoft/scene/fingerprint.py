@@ -13,6 +13,7 @@ from taisoft.scene.key_frames import NodePath, ShapePath
 from taisoft.scene.loads import LoadPath
 from taisoft.scene.numbers import scene_numbers
 from taisoft.scene.rigid import RigidBody
+from taisoft.scene.robot import robot_parts
 from taisoft.scene.scene import Scene
 
 FEATURES = "the features that it needs"  # last entry of a fingerprint: of the plan, which follows from the parts and numbers
@@ -34,6 +35,8 @@ def scene_fingerprint(scene: Scene, features: dict[str, bool]) -> dict[str, str]
         fingerprint[f"{owner}: shape or path"] = digest([type(shape).__name__, *values, *_path_parts(obstacle.given_path)])
     for one in scene.connections:
         fingerprint[f"{type(one).__name__.lower()} '{one.name}'"] = digest(_connection_parts(one))
+    for placed in scene.robots:
+        fingerprint[f"robot '{placed.name}'"] = digest([*robot_parts(placed.robot), placed.position, placed.axes])
     fingerprint["collision settings"] = digest([json.dumps(dataclasses.asdict(scene.collision)), scene.contact_forces])
     # features unused at the start, such as damping 0, are compiled out
     fingerprint[FEATURES] = digest([json.dumps(features)])

@@ -25,12 +25,14 @@ from taisoft.scene.loads import Cavity
 from taisoft.scene.material import Material
 from taisoft.scene.obstacles import HalfSpace, Obstacle, Shape, surface_numbers
 from taisoft.scene.rigid import RigidBody
+from taisoft.scene.robot import PlacedRobot, add_robot
 
 
 class Scene(Guarded):
     """Input of a simulation: gravity, bodies, obstacles and connections. SI units, y or z up.
 
-    springs, tendons, attachments: what connects points of bodies, see `add_spring`, `add_tendon` and `attach`.
+    springs, tendons, attachments: what connects points of bodies, see `add_spring`, `add_tendon` and `attach`. robots: see
+    `add_robot`.
 
     contact_pairs: {frozenset of two names, or of one for a body with itself: (friction, restitution)}, each a number, or
     None for the default of `contact_numbers`; read-only, changed by `set_contact`. Bodies, obstacles and connections can be
@@ -43,6 +45,7 @@ class Scene(Guarded):
         "springs": "call scene.add_spring",
         "tendons": "call scene.add_tendon",
         "attachments": "call scene.attach",
+        "robots": "call scene.add_robot",
         "contact_pairs": "call scene.set_contact(name_a, name_b, friction=...)",
     }
     _default_frozen = USE_A_COPY
@@ -64,6 +67,7 @@ class Scene(Guarded):
         self.springs: list[Spring] = []
         self.tendons: list[Tendon] = []
         self.attachments: list[Attachment] = []
+        self.robots: list[PlacedRobot] = []
         self.contact_pairs: dict[frozenset[str], tuple[float | None, float | None]] = {}
         self.collision = CollisionSettings()
         self.allow_initial_overlap, self.contact_forces = False, True
@@ -197,7 +201,7 @@ class Scene(Guarded):
         """The loads of all bodies, then the tendons: what has a value or a path."""
         return [*(load for body in self.bodies for load in body.loads), *self.tendons]
 
-    add_spring, add_tendon, attach = add_spring, add_tendon, attach
+    add_spring, add_tendon, attach, add_robot = add_spring, add_tendon, attach, add_robot
 
     def freeze(self) -> None:
         """Refuse all later changes of the scene and its bodies. A Simulator calls this when it takes the scene, since changes

@@ -82,6 +82,8 @@ def _keeps_regions(scene: Scene, mesh: TetMesh) -> bool:
 
 def _document(scene: Scene, solver: dict, stem: str, meshes: dict[str, TetMesh]) -> dict:
     """Return the file's tables. Meshes that need a file are added to `meshes`, file name -> mesh."""
+    for placed in scene.robots:
+        raise SceneError(f"robot {placed.name!r}: a scene file cannot hold robots: keep the scene as a Python file")
     materials: dict[Material, str] = {}
     elastic = [body for body in scene.bodies if not isinstance(body, RigidBody)]
     for body in elastic:

@@ -42,10 +42,16 @@ def rougher(sim: Simulator) -> None:
 
 def heavier(sim: Simulator) -> None:
     """All bodies by 1 %: the shape of a pile at rest is chaotic, but its weight is not, nor is free flight."""
-    sim.set_gravity((0.0, -1.01 * 9.81, 0.0))
+    sim.set_gravity(1.01 * sim.scene.gravity)
+
+
+def rougher_ground(sim: Simulator) -> None:
+    """The ground, by 1 %."""
+    sim.set_contact("cube", "ground", friction=1.01 * 0.4)
 
 
 WRONG = {"incline": rougher, "cube_pile": heavier, "seesaw": heavier}
+WRONG |= {"robot_arm": heavier, "robot_gripper": heavier, "robot_pusher": rougher_ground}
 
 
 def crossing(sim: Simulator) -> list[tuple[str, str]]:
