@@ -40,6 +40,7 @@ STRIPS = {
     "bending_beam_orders": ((0.0, 0.7, 5.0), (440, 290), ((0.0, -1.15, 0.0), 9.0, 88.0, 3.0)),
     "gripper": ((0.0, 0.4, 1.6), (330, 260), ((0.0, 0.1, 0.0), 0.75, 15.0, 6.0)),
     "seesaw": ((0.0, 0.1, 0.2, 0.4, 0.6), (330, 260), ((0.05, 0.6, 0.0), 5.2, 12.0, 8.0)),
+    "robot_gripper": ((0.0, 0.52, 1.0, 2.0, 3.0), (280, 260), ((0.1, 0.0, 0.12), 0.85, 20.0, 10.0)),
     "inflated_finger": ((0.0, 0.5, 1.0, 4.0), (330, 200), ((0.2, -0.02, 0.0), 0.75, 12.0, 8.0), "stress"),
     "drop_test": ((0.0, 0.145, 0.16, 0.175, 0.24), (220, 300), ((0.0, 0.13, 0.0), 0.7, 28.0, 8.0), "stress"),
     "foot_on_ground": ((0.0, 0.2, 0.5, 0.8, 1.2), (300, 220), ((0.0, 0.06, 0.0), 0.55, 20.0, 8.0), "stress", ()),
@@ -67,7 +68,8 @@ def film(
     on_moment: called with each picture; on_step: as `Simulator.run` has it; colour: as of `Offscreen`.
     """
     target, distance, azimuth, elevation = view
-    drawing = Offscreen(sim.scene, size, Camera(np.array(target), distance, azimuth, elevation), colour=colour, layers=layers)
+    camera = Camera(np.array(target), distance, azimuth, elevation, up=sim.scene.up)
+    drawing = Offscreen(sim.scene, size, camera, colour=colour, layers=layers)
     frames = [round(moment * fps) for moment in moments]
     pictures: list[np.ndarray] = []
 

@@ -18,7 +18,7 @@ from taisoft import __version__
 REQUIRED = ("taichi", "numpy", "scipy", "meshio", "usd-core", "networkx", "rich")
 # package -> the extra that installs it; only benchmarks use other programs, only studies use a cluster
 OPTIONAL = {"wildmeshing": "mesh", "imageio-ffmpeg": "video", "matplotlib": "plot", "pillow": "plot", "viser": "notebook"}
-OPTIONAL |= {"pyvista": "pyvista", "distributed": "cluster", "mujoco-core": "peers", "pybullet": "peers", "newton": "peers"}
+OPTIONAL |= {"pyvista": "pyvista", "distributed": "cluster", "mujoco-core": "robot", "pybullet": "peers", "newton": "peers"}
 OPTIONAL |= {"argcomplete": "completion"}
 KERNEL = "ipykernel"  # of Jupyter, which no extra installs
 VULKAN_PROBE = "from taichi._lib import core; print('vulkan', core.with_vulkan())"

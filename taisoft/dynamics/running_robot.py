@@ -197,8 +197,9 @@ class RunningRobot:
     def feel(self, bodies: Bodies) -> None:
         """Set the wrenches to those of the last step: of contacts, and of what is attached to the links."""
         total = np.zeros((self.model.nbody, 6))  # force and moment about the origin
+        touched = set() if bodies.contact is None else set(bodies.contact.pairs()[0].ravel().tolist())
         for collider, obstacle, k in zip(self._colliders, self._obstacles, self._bodies):
-            if bodies.contact is not None:
+            if collider in touched:
                 total[k] += bodies.contact.mean_on(collider, None)[:6]
             for forces, points in forces_on(bodies, obstacle):
                 total[k] += np.concatenate([forces, np.cross(points, forces)], axis=1).sum(axis=0)

@@ -193,12 +193,12 @@ class MeshObstacle(Shape):
             opposite_half_edges(triangles)
         except MeshError as error:
             raise SceneError(f"mesh obstacle: {error}") from None
-        checks.store(self, vertices=vertices, triangles=triangles)
+        checks.store(self, vertices=vertices, triangles=triangles, _mean=vertices.mean(axis=0))
 
     @property
     def pivot(self) -> np.ndarray:
         """Mean vertex (3,) [m]."""
-        return self.vertices.mean(axis=0)
+        return self._mean
 
     def surface(self) -> tuple[np.ndarray, np.ndarray]:
         """Return copies of the given arrays."""

@@ -17,6 +17,7 @@ import numpy as np
 from taisoft.attributes import guarded_record
 from taisoft.errors import MissingPackage, SceneError, value_text
 from taisoft.machine import require
+from taisoft.mesh.placing import FROM_Y_UP, TO_Y_UP
 from taisoft.scene import checks
 from taisoft.scene.commands import Command
 from taisoft.scene.key_frames import KeyFrames
@@ -27,7 +28,6 @@ if TYPE_CHECKING:
 
 VERSION = (4, 0, 1)  # of MuJoCo, before which its solver used a wrong Hessian
 SUFFIXES = (".xml", ".urdf", ".mjb")
-UPRIGHT = {"z": np.eye(3), "y": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])}  # robot's axes to the scene's
 MAX_ITERATIONS = 100
 
 
@@ -204,7 +204,7 @@ def add_robot(
     name = checks.free_name(name, "robot", [one.name for one in self.robots])
     what = f"robot {name!r}"
     position, turn = checked_pose((position, np.eye(3) if rotation is None else rotation), 0.0, f"{what}: its place")
-    axes = turn @ UPRIGHT[self.up]
+    axes = turn @ FROM_Y_UP[self.up] @ TO_Y_UP["z"]
     iterations = checks.whole(iterations, f"{what}: iterations", range(1, MAX_ITERATIONS + 1))
     touched = set(robot.links) | {"world"} if links is None else set(links)
     for one in touched - set(robot.links) - {"world"}:

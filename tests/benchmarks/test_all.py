@@ -255,6 +255,7 @@ RUNS = {
     "paths": Small(("--what", "cost", "--quick"), ("## Cost", "| hanging_beam |", "| met |"), paths_small, paths_check),
     "pictures": Small(QUICK, ("| kernels |", "| PNG |", "| hanging_beam |"), pictures_small, pictures_check),
     "regression": Small(("--case", "search, two"), ("| search, two cubes | f32 |", "nothing has changed")),
+    "robots": Small(QUICK, ("| 2 | 8 |", "weak, amplitude 0.", "| of it MuJoCo and exchange |")),
     "scaling": Small(
         ("--sizes", "20", "--kind", "explicit"), ("| explicit | 20 | 1 |", "no earlier run"), scaling_small, scaling_check
     ),
