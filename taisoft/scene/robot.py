@@ -21,7 +21,7 @@ from taisoft.mesh.placing import FROM_Y_UP, TO_Y_UP
 from taisoft.scene import checks
 from taisoft.scene.commands import Command
 from taisoft.scene.key_frames import KeyFrames
-from taisoft.scene.obstacles import Obstacle, checked_pose
+from taisoft.scene.obstacles import HalfSpace, Obstacle, checked_pose
 
 if TYPE_CHECKING:
     from taisoft.scene.scene import Scene
@@ -227,6 +227,8 @@ def add_robot(
         translation, turned = placed_pose(placed, shape, data, geom)
         still = {"last": translation, "rate": np.zeros(3), "last_rotation": turned, "spin": np.zeros(3), "end": 0.0}
         path = Command(0.0, translation, first_rotation=turned, **still)
+        if link == "world" and isinstance(shape, HalfSpace):  # a ground, drawn as one
+            shape, path = HalfSpace(translation, turned @ shape.normal), None
         made.append(Obstacle(shape, own, friction, restitution, path))
         placed.shapes[own] = geom
     if not made:

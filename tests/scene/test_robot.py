@@ -77,10 +77,12 @@ def test_geoms_become_shapes_where_mujoco_has_them(file, up):
     for name, geom in placed.shapes.items():
         one, size = scene.obstacle(name), robot.model.geom_size[geom]
         assert one.friction == 0.3
-        local = {"Box": size * [1, 1, 1], "Sphere": np.zeros(3), "Capsule": np.array([0, 0, size[1]]), "HalfSpace": np.zeros(3)}
-        point = local.get(type(one.shape).__name__)
-        if point is None:
-            point = one.shape.vertices[0]
+        local = {"Box": size * [1, 1, 1], "Sphere": np.zeros(3), "Capsule": np.array([0, 0, size[1]])}
+        if name == "r/world":
+            own = (one.shape.point - (1.0, 0.0, 0.0), one.shape.normal)
+            np.testing.assert_allclose(own, np.array([(0, 0, -1), (0, 0, 1)]) @ (turn @ upright).T, atol=1e-12)
+            continue
+        point = local[type(one.shape).__name__] if type(one.shape).__name__ in local else one.shape.vertices[0]
         there = data.geom_xpos[geom] + data.geom_xmat[geom].reshape(3, 3) @ point
         np.testing.assert_allclose(one.points_at(0.0, point[None])[0], turn @ upright @ there + (1.0, 0.0, 0.0), atol=1e-12)
     extents = [np.ptp(scene.obstacle(f"r/part/{k}").shape.vertices, axis=0) for k in (3, 4)]
