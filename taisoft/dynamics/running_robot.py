@@ -10,7 +10,7 @@ from taisoft.errors import SimulationError
 from taisoft.scene import checks
 from taisoft.scene.obstacles import Obstacle
 from taisoft.scene.rigid import Pose
-from taisoft.scene.robot import PlacedRobot, import_mujoco
+from taisoft.scene.robot import PlacedRobot, import_mujoco, names_of
 from taisoft.scene.robot_shapes import placed_pose
 from taisoft.scene.scene import Scene
 
@@ -42,16 +42,10 @@ class Wrench(NamedTuple):
 class Named:
     """Numbers of a robot by name, or by index as in an array: `control["elbow"] = 1.0`, `control[:] = 0.0`."""
 
-    def __init__(
-        self,
-        what: str,
-        names: list[str],
-        first: list[int],
-        values: np.ndarray,
-        was_set: Callable[[np.ndarray], None] | None = None,
-    ):
-        """first: index of each name's first number, and their end; was_set: called with the indices set, None: none can be."""
-        self._what, self._names, self._first, self._values, self._was_set = what, names, first, values, was_set
+    def __init__(self, what: str, names: list[str], first: list[int], values: np.ndarray, was_set: Callable | None = None):
+        """what: start of messages, and the kind, such as "robot 'arm': no joint"; first: index of each name's first number, and
+        their end; was_set: called with the indices that were set (k,), None: none can be."""
+        self._what, self.names, self._first, self._values, self._was_set = what, names, first, values, was_set
 
     def __getitem__(self, key: str | int | slice) -> float | np.ndarray:
         found = self._values[self._at(key)]
@@ -60,9 +54,8 @@ class Named:
     def __setitem__(self, key: str | int | slice, value) -> None:
         at = self._at(key)
         if self._was_set is None:
-            raise SimulationError(f"{self._what} {key!r} cannot be set: a robot moves by its actuators' controls")
-        shape = np.shape(self._values[at])
-        self._values[at] = checks.array(value, f"{self._what} {key!r}", ((), shape))
+            raise SimulationError(f"{self._what} can be set, nor {key!r}: a robot moves by its actuators' controls")
+        self._values[at] = checks.array(value, f"{self._what}: {key!r}", ((), np.shape(self._values[at])))
         self._was_set(np.atleast_1d(np.arange(len(self._values))[at]))
 
     def __len__(self) -> int:
@@ -75,21 +68,14 @@ class Named:
         return np.array(self._values, dtype=dtype)
 
     def __repr__(self) -> str:
-        return f"{{{', '.join(f'{name}: {self[name]}' for name in self._names)}}}"
-
-    @property
-    def names(self) -> list[str]:
-        """The names, in order."""
-        return list(self._names)
+        return f"{{{', '.join(f'{name}: {self[name]}' for name in self.names)}}}"
 
     def _at(self, key: str | int | slice) -> int | slice:
         if not isinstance(key, str):
             return key
-        if key not in self._names:
-            hint = checks.nearest(key, self._names)
-            raise SimulationError(f"no {self._what} is called {key!r}{hint}; there are {self._names}")
-        k = self._names.index(key)
-        first, end = self._first[k], self._first[k + 1]
+        if key not in self.names:
+            raise SimulationError(f"{self._what} is called {key!r}{checks.nearest(key, self.names)}; there are {self.names}")
+        first, end = self._first[(k := self.names.index(key)) : k + 2]
         return first if end == first + 1 else slice(first, end)
 
 
@@ -106,18 +92,17 @@ class RunningRobot:
         self.model = model = copy.copy(robot.model)  # of its own, since its time step and gravity are set
         self.data = data = mujoco.MjData(model)
         self._longest = float(robot.model.opt.timestep)
-        what, names = f"robot {self.name!r}: ", ("actuator", "joint", "sensor")
-        actuators, joints, sensors = (
-            [getattr(model, n)(k).name for k in range(getattr(model, c))] for n, c in zip(names, ("nu", "njnt", "nsensor"))
-        )
+        kinds = {"actuator": model.nu, "joint": model.njnt, "sensor": model.nsensor}
+        actuators, joints, sensors = ((f"robot {self.name!r}: no {one}", names_of(model, one, n)) for one, n in kinds.items())
+        self._axes = *joints, [*model.jnt_dofadr.tolist(), model.nv]
         #: actuators' controls, see `Named`; held until they are set again
-        self.control = Named(f"{what}actuator", actuators, list(range(model.nu + 1)), data.ctrl, self._hold)
+        self.control = Named(*actuators, list(range(model.nu + 1)), data.ctrl, self._hold)
         #: positions of joints [rad, m]; a ball joint has a quaternion, a free one position and quaternion
-        self.joint = Named(f"{what}joint", joints, [*model.jnt_qposadr, model.nq], data.qpos)
+        self.joint = Named(*joints, [*model.jnt_qposadr.tolist(), model.nq], data.qpos)
         #: velocities of joints [rad/s, m/s]
-        self.joint_velocity = Named(f"{what}joint", joints, [*model.jnt_dofadr, model.nv], data.qvel)
+        self.joint_velocity = Named(*self._axes, data.qvel)
         #: sensors' values in MuJoCo's units and frames, at the start of its last step
-        self.sensor = Named(f"{what}sensor", sensors, [*model.sensor_adr, model.nsensordata], data.sensordata)
+        self.sensor = Named(*sensors, [*model.sensor_adr.tolist(), model.nsensordata], data.sensordata)
         self.wrenches = np.zeros((model.nbody, 6))  # by MuJoCo's body, in the scene's axes: of the last step,
         self.applied = np.zeros((model.nbody, 6))  # and those that act in the next one
         self._scene = scene
@@ -139,12 +124,21 @@ class RunningRobot:
         found = self.wrenches[self._link(link)]
         return Wrench(found[:3].copy(), found[3:].copy())
 
+    @property
+    def joint_load(self) -> Named:
+        """What touches and what is attached exerts along each joint [N m, N], mean over the last step, in its present pose."""
+        load, axes = np.zeros(self.model.nv), self.placed.axes
+        self.mujoco.mj_comPos(self.model, self.data)
+        for k in np.flatnonzero(self.wrenches.any(axis=1)):
+            force, torque = self.wrenches[k].reshape(2, 3) @ axes
+            self.mujoco.mj_applyFT(self.model, self.data, force, torque, self.data.xipos[k], k, load)
+        return Named(*self._axes, load)
+
     def _link(self, name: str) -> int:
         links = self.placed.robot.links
         if name not in links:
-            raise SimulationError(
-                f"robot {self.name!r}: no link is called {name!r}{checks.nearest(str(name), links)}; there are {list(links)}"
-            )
+            hint = f"{checks.nearest(str(name), links)}; there are {list(links)}"
+            raise SimulationError(f"robot {self.name!r}: no link is called {name!r}{hint}")
         return 1 + links.index(name)
 
     def __repr__(self) -> str:

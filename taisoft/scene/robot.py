@@ -7,7 +7,7 @@ touch each other; a floor that a robot stands on belongs in its file.
 """
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -56,15 +56,16 @@ class Robot:
         path: str | Path,
         joints: Mapping[str, float] | None = None,
         keyframe: str | None = None,
-        servo: tuple[float, float] | None = None,
+        servo: tuple[float, float] | Mapping[str, tuple[float, float]] | None = None,
     ) -> "Robot":
         """Read a robot from MJCF (.xml), URDF (.urdf) or a compiled model (.mjb).
 
         joints: positions at the start by joint [rad or m], instead of those in the file. keyframe: the file's key frame that
-        holds positions and controls at the start. servo: (stiffness, damping), in N m/rad and N m s/rad or N/m and N s/m: adds a
-        position servo to each hinge and slider without an actuator, named like its joint, which holds it where it starts; files
-        in URDF name no actuators. `package://` in mesh names is looked for in the file's folder and those above. Raises
-        SceneError.
+        holds positions and controls at the start. servo: (stiffness, damping), in N m/rad and N m s/rad or N/m and N s/m, or a
+        dict of them by joint: adds a position servo to each hinge and slider, or to these, that has no actuator, named like its
+        joint, which holds it where it starts; files in URDF name no actuators. MuJoCo's Euler steps, its default, then become
+        "implicitfast", since a servo's damping can make them unstable. `package://` in mesh names is looked for in the file's
+        folder and those above. Raises SceneError.
         """
         file = Path(path)
         mujoco = import_mujoco()
@@ -138,31 +139,32 @@ def _in_package(file: Path, name: str) -> Path:
 
 def _add_servos(mujoco, spec, file: Path, servo) -> None:
     """Add a position servo to each hinge and slider that no actuator drives."""
-    stiffness, damping = checks.array(servo, f"{file}: servo", ((2,),)).tolist()
-    if stiffness <= 0.0 or damping < 0.0:
-        raise SceneError(f"{file}: servo must be a stiffness above 0 and a damping of at least 0, not {servo}")
-    driven = {actuator.target for actuator in spec.actuators}
-    simple = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
-    for joint in spec.joints:
-        if joint.type in simple and joint.name and joint.name not in driven:
-            made = spec.add_actuator(name=joint.name, target=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
-            made.set_to_position(kp=stiffness, kv=damping)
+    simple, driven = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE), {actuator.target for actuator in spec.actuators}
+    names = [joint.name for joint in spec.joints if joint.type in simple and joint.name and joint.name not in driven]
+    for name, numbers in servo.items() if isinstance(servo, Mapping) else [(name, servo) for name in names]:
+        _known(name, names, f"{file}: servo: no hinge or slider without an actuator")
+        stiffness, damping = checks.array(numbers, f"{file}: servo", ((2,),)).tolist()
+        if stiffness <= 0.0 or damping < 0.0:
+            raise SceneError(f"{file}: servo must be a stiffness above 0 and a damping of at least 0, not {numbers}")
+        made = spec.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+        made.set_to_position(kp=stiffness, kv=damping)
+    if spec.option.integrator == mujoco.mjtIntegrator.mjINT_EULER:
+        spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
 
 
 def _start(mujoco, model, file: Path, joints, keyframe) -> Any:
     """Return MuJoCo's data at the start."""
     data = mujoco.MjData(model)
     if keyframe is not None:
-        names = [model.key(k).name for k in range(model.nkey)]
-        if keyframe not in names:
-            raise SceneError(f"{file}: no key frame is called {keyframe!r}{checks.nearest(str(keyframe), names)}")
-        mujoco.mj_resetDataKeyframe(model, data, names.index(keyframe))
-    names = [model.joint(k).name for k in range(model.njnt)]
+        at = _known(keyframe, [model.key(k).name for k in range(model.nkey)], f"{file}: no key frame")
+        mujoco.mj_resetDataKeyframe(model, data, at)
+    names = names_of(model, "joint", model.njnt)
     for name, value in (joints or {}).items():
-        if name not in names:
-            raise SceneError(f"{file}: no joint is called {name!r}{checks.nearest(str(name), names)}; there are {names}")
-        own = data.joint(name).qpos
+        _known(name, names, f"{file}: no joint")
+        own, one = data.joint(name).qpos, model.joint(name)
         own[:] = checks.array(np.atleast_1d(value), f"{file}: joint {name!r}", (own.shape,))
+        if one.limited[0] and len(own) == 1 and not one.range[0] <= own[0] <= one.range[1]:
+            raise SceneError(f"{file}: joint {name!r} must start within its limits {one.range.tolist()}, not at {own[0]:g}")
     for k in range(model.nu if keyframe is None else 0):
         joint = model.actuator_trnid[k, 0]
         if model.actuator_trntype[k] == mujoco.mjtTrn.mjTRN_JOINT and model.actuator_biastype[k] == mujoco.mjtBias.mjBIAS_AFFINE:
@@ -208,10 +210,9 @@ def add_robot(
     iterations = checks.whole(iterations, f"{what}: iterations", range(1, MAX_ITERATIONS + 1))
     touched = set(robot.links) | {"world"} if links is None else set(links)
     for one in touched - set(robot.links) - {"world"}:
-        raise SceneError(
-            f"{what}: no link is called {one!r}{checks.nearest(str(one), robot.links)}; there are {list(robot.links)}"
-        )
-    paths = {_actuator(robot, one, what): _control(path, f"{what}: control of {one!r}") for one, path in (control or {}).items()}
+        _known(one, robot.links, f"{what}: no link")
+    actuators, given = names_of(robot.model, "actuator", robot.model.nu), (control or {}).items()
+    paths = {_known(one, actuators, f"{what}: no actuator"): _control(path, f"{what}: control of {one!r}") for one, path in given}
     placed, counts = PlacedRobot(robot, name, position, axes, iterations, paths), Counter()
     mujoco, made = import_mujoco(), []
     data = mujoco.MjData(robot.model)
@@ -239,17 +240,22 @@ def add_robot(
     return placed
 
 
-def _actuator(robot: Robot, name: str, what: str) -> int:
-    names = [robot.model.actuator(k).name for k in range(robot.model.nu)]
+def names_of(model: Any, kind: str, n: int) -> list[str]:
+    """Return the names of a model's n joints, actuators or sensors, by MuJoCo's word for them."""
+    return [getattr(model, kind)(k).name for k in range(n)]
+
+
+def _known(name, names: Sequence[str], what: str) -> int:
+    """Return the index of a name. what: start of the message, such as "no joint". Raises SceneError if it is unknown."""
     if name not in names:
-        raise SceneError(f"{what}: no actuator is called {name!r}{checks.nearest(str(name), names)}; there are {names}")
-    return names.index(name)
+        raise SceneError(f"{what} is called {name!r}{checks.nearest(str(name), names)}; there are {list(names)}")
+    return list(names).index(name)
 
 
 def _control(path, what: str) -> Callable[[float], float]:
     """Return a control as a checked function of time [s]."""
     given = path.value_at if isinstance(path, KeyFrames) else path
-    if not callable(given):
+    if not callable(given) or (isinstance(path, KeyFrames) and path.values is None):
         raise SceneError(f"{what} must be a function of time or KeyFrames of values, not {value_text(path)}")
 
     def at(t: float) -> float:

@@ -133,6 +133,7 @@ def test_a_link_feels_the_sum_of_its_contacts_about_its_centre(load, up):
         np.testing.assert_allclose(torque, moments, atol=1e-3 * size)  # [m]: points lie midway in the gap, and were at the start
         down = -np.array([0.0, 0.0, 1.0] if up == "z" else [0.0, 1.0, 0.0])
         assert force @ down > 0.5 * size and abs(torque).max() > 0.02 * size
+        assert sim.robot.joint_load["lift"] == pytest.approx(-force @ down) and sim.robot.joint_load["swing"] == 0.0
 
 
 def oscillation(t: np.ndarray, mass: float) -> np.ndarray:
@@ -235,12 +236,12 @@ def test_what_cannot_work_with_robots_is_refused(load):
         for call, text in (
             (lambda: sim.set_pose("robot/plate", (0, 0, 1)), "'robot/plate' belongs to robot 'robot'"),
             (lambda: sim.run(0.1, error=True), "error=True: robot 'robot' answers to forces"),
-            (lambda: sim.robot.control["swng"], r"no robot 'robot': actuator is called 'swng' \(did you mean swing\?\)"),
+            (lambda: sim.robot.control["swng"], r"robot 'robot': no actuator is called 'swng' \(did you mean swing\?\)"),
             (lambda: sim.robot.link_wrench("plat"), r"no link is called 'plat' \(did you mean plate\?\)"),
         ):
             with pytest.raises(ts.TaisoftError, match=text):
                 call()
-        with pytest.raises(ts.SimulationError, match="'lift' cannot be set: a robot moves by its actuators' controls"):
+        with pytest.raises(ts.SimulationError, match="no joint can be set, nor 'lift': a robot moves by"):
             sim.robot.joint["lift"] = 1.0
         with pytest.raises(ts.SceneError, match="'swing' .* not finite"):
             sim.robot.control["swing"] = np.nan

@@ -24,6 +24,7 @@ KINDS = """<mujoco>
     <geom name="floor" type="plane" size="1 1 .1" pos="0 0 -1"/>
     <geom name="picture" type="box" size="9 9 9" contype="0" conaffinity="0"/>
     <body name="part" pos="1 2 3" euler="20 30 40">
+      <joint name="slide" type="slide" range="-.1 .1"/>
       <joint name="ball" type="ball"/>
       <geom type="box" size=".1 .2 .3" pos=".1 0 0" euler="10 0 0"/>
       <geom type="sphere" size=".2"/>
@@ -35,7 +36,7 @@ KINDS = """<mujoco>
     HILLS
   </worldbody>
   <actuator><motor name="spin" joint="ball" gear="1 0 0"/></actuator>
-  <keyframe><key name="home" qpos="1 0 0 0" ctrl="2"/></keyframe>
+  <keyframe><key name="home" qpos="0 1 0 0 0" ctrl="2"/></keyframe>
 </mujoco>"""
 URDF = """<robot name="arm">
   <link name="base"><collision><geometry><box size="1 1 1"/></geometry></collision></link>
@@ -98,7 +99,7 @@ def test_a_start_is_of_joints_a_key_frame_or_the_file(file):
     assert ts.Robot.load(file, keyframe="home").control.tolist() == [2.0]
     half = np.sqrt(0.5)
     turned = ts.Robot.load(file, joints={"ball": (half, half, 0.0, 0.0)})
-    assert turned.start.tolist() == [half, half, 0.0, 0.0] and turned.control.tolist() == [0.0]
+    assert turned.start.tolist() == [0.0, half, half, 0.0, 0.0] and turned.control.tolist() == [0.0]
 
 
 def test_urdf_finds_packages_and_servos_hold_where_it_starts(tmp_path):
@@ -108,6 +109,8 @@ def test_urdf_finds_packages_and_servos_hold_where_it_starts(tmp_path):
     path = tmp_path / "own/urdf/arm.urdf"
     path.write_text(URDF)
     robot = ts.Robot.load(path, joints={"turn": 0.5}, servo=(10.0, 1.0))
+    assert robot.model.opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST  # Euler's would be unstable
+    assert ts.Robot.load(path, servo={"turn": (20.0, 1.0)}).model.actuator_gainprm[0, 0] == 20.0
     assert robot.links == ("tip",) and robot.control.tolist() == robot.start.tolist() == [0.5]
     scene = ts.Scene(up="z")
     scene.add_robot(robot, links=("tip",))
@@ -134,7 +137,9 @@ def test_urdf_finds_packages_and_servos_hold_where_it_starts(tmp_path):
         ({"joints": {"bal": 1.0}}, r"no joint is called 'bal' \(did you mean ball\?\)"),
         ({"joints": {"ball": (1.0, 2.0)}}, r"joint 'ball' must have shape \(4,\)"),
         ({"keyframe": "hom"}, "no key frame is called 'hom'"),
-        ({"servo": (0.0, 1.0)}, "servo must be a stiffness above 0"),
+        ({"servo": {"bal": (1.0, 1.0)}}, "servo: no hinge or slider without an actuator is called 'bal'"),
+        ({"joints": {"slide": 0.5}}, r"joint 'slide' must start within its limits \[-0.1, 0.1\], not at 0.5"),
+        ({"servo": {"slide": (0.0, 1.0)}}, "servo must be a stiffness above 0"),
     ],
 )
 def test_bad_arguments_of_load_are_refused(file, arguments, text):
@@ -166,6 +171,10 @@ def test_bad_places_are_refused_before_the_scene_changes(file):
         ({"iterations": 0}, "iterations must be a whole number from 1"),
         ({"rotation": -np.eye(3)}, "its place's rotation .* determinant 1"),
         ({"control": {"spn": abs}}, r"no actuator is called 'spn' \(did you mean spin\?\)"),
+        (
+            {"control": {"spin": ts.KeyFrames((0.0,), translations=[(0, 0, 0)])}},
+            "control of 'spin' must be .* KeyFrames of values",
+        ),
         ({"control": {"spin": 1.0}}, "control of 'spin' must be a function of time or KeyFrames"),
         ({"friction": -1.0}, "friction must be at least 0"),
     ):
