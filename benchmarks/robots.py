@@ -133,9 +133,7 @@ def free_and_hit(name: str, path: Path, servo: bool) -> dict:
 
     robot = ts.Robot.load(path, servo=(2000.0, 100.0) if servo else None)
     model = copy.copy(robot.model)
-    data = mujoco.MjData(model)
-    data.qpos[:], data.ctrl[:] = robot.start, robot.control
-    mujoco.mj_kinematics(model, data)
+    data = robot.make_data(model)
     scene = ts.Scene(up="z")
     shapes = scene.add_robot(robot, friction=0.5).shapes
     surfaces = [(one, one.shape.surface()) for one in scene.obstacles]
@@ -145,7 +143,7 @@ def free_and_hit(name: str, path: Path, servo: bool) -> dict:
     scene.add_body(ts.ball_mesh(BALL, 4), soft, name="ball", position=place)
     with ts.Simulator(scene, dt=0.01) as sim:
         model.opt.timestep = 0.01 / np.ceil(0.01 / robot.model.opt.timestep - 1e-9)
-        n, same, worst, pressed, seconds = round(0.01 / model.opt.timestep), True, 0.0, 0, []
+        n, same, worst, free, pressed, seconds = round(0.01 / model.opt.timestep), True, 0.0, 0, 0, []
         for _ in range(FREE_STEPS + BALL_STEPS):
             begin = time.perf_counter()
             report = sim.step()
@@ -153,18 +151,26 @@ def free_and_hit(name: str, path: Path, servo: bool) -> dict:
             contacts = sim.contacts()
             if not pressed and not contacts.impulse.any():
                 mujoco.mj_step(model, data, n)
-                same = same and np.array_equal(data.qpos, sim.robot.data.qpos)
+                same, free = same and np.array_equal(data.qpos, sim.robot.data.qpos), free + 1
             pressed += bool(contacts.impulse.any())
             if report.substeps > 1:  # contacts are those of the last of them
                 continue
             for link in robot.links:
-                own = [name for name in shapes if name.split("/")[1] == link]
+                own = [name for name, geom in shapes.items() if model.geom_bodyid[geom] == 1 + robot.links.index(link)]
                 summed = -contacts.impulse[np.isin(contacts.body_b, own)].sum(axis=0) / sim.dt
                 if (size := np.abs(summed).max(initial=0.0)) > 1e-3:  # [N]
                     worst = max(worst, float(np.abs(sim.robot.link_wrench(link).force - summed).max() / size))
     kinds = [one.shape for one in scene.obstacles]
     triangles = sum(len(shape.triangles) for shape in kinds if isinstance(shape, ts.MeshObstacle))
-    row = {"robot": name, "shapes": len(shapes), "triangles": triangles, "same": same, "pressed": pressed, "worst": worst}
+    row = {
+        "robot": name,
+        "shapes": len(shapes),
+        "triangles": triangles,
+        "same": same,
+        "free": free,
+        "pressed": pressed,
+        "worst": worst,
+    }
     return row | {"step": median(seconds)}
 
 
@@ -229,7 +235,9 @@ def limits_of(found: dict[str, float], rows: list[dict], robots: list[dict]) -> 
     limits.append(Limit("iterated steps that did not agree", sum(row["iterated"]["failed"] for row in rows), 0))
     for row in robots:
         limits.append(Limit(f"{row['robot']}: wrench off the sum over contacts", row["worst"], 1e-6))
-        limits.append(Limit(f"{row['robot']}: free, as in MuJoCo alone", float(row["same"]), 1.0, at_least=True))
+        same = row["free"] if row["same"] else 0
+        limits.append(Limit(f"{row['robot']}: free steps as in MuJoCo alone", same, FREE_STEPS // 2, at_least=True))
+        limits.append(Limit(f"{row['robot']}: steps with contact", row["pressed"], 1, at_least=True))
     return limits
 
 

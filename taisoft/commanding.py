@@ -93,7 +93,7 @@ def _refuse_foresight(sim: "Simulator", call: str) -> None:
 def refuse_commands(sim: "Simulator", what: str) -> None:
     """Refuse a run that has to foresee motion while anything follows a command, or robots move. what: what asks for it."""
     for robot in sim.scene.robots:
-        raise SimulationError(f"{what}: robot {robot.name!r} answers to forces, so that its motion cannot be foreseen")
+        raise SimulationError(f"{what}: the motion of robot {robot.name!r} depends on forces and is not known ahead")
     for name in sim._host().commands:
         raise SimulationError(f"{what}: {name!r} follows a command, which cannot be foreseen: give a path, or call sim.reset()")
 

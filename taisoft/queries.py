@@ -16,7 +16,7 @@ from taisoft.scene.rigid import Pose, RigidBody, Twist
 from taisoft.stability import stable_dt as largest_stable_dt
 
 if TYPE_CHECKING:
-    from taisoft.dynamics.robots import RunningRobot
+    from taisoft.dynamics.running_robot import RunningRobot
     from taisoft.simulator import Simulator
 
 

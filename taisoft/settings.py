@@ -66,6 +66,9 @@ def check_settings(scene: Scene, **given) -> Settings:
     _check_name("contact_solver", settings.contact_solver, CONTACT_SOLVERS)
     _check_contact_solver(settings, scene.pushes(settings.self_collision))
     _check_multipliers(settings, scene)
+    if settings.tolerance is not None and scene.robots:
+        name = scene.robots[0].name
+        raise SimulationError(f"tolerance: the motion of robot {name!r} depends on forces and is not known ahead")
     return settings
 
 

@@ -16,7 +16,7 @@ from argparse import Namespace
 from pathlib import Path
 from types import ModuleType
 
-from taisoft.errors import MeshError, SceneError
+from taisoft.errors import MeshError, MissingPackage, SceneError
 from taisoft.scene.checks import SOLVER_CHECKS, check_solver, nearest
 from taisoft.scene.refine import refined, with_order
 from taisoft.scene.scene import Scene
@@ -197,7 +197,7 @@ def _call(path: Path, function, *arguments):
     try:
         return function(*arguments)
     except (Exception, SystemExit) as error:  # a file may raise anything
-        kind = MeshError if isinstance(error, MeshError) else SceneError
+        kind = type(error) if isinstance(error, (MeshError, MissingPackage)) else SceneError
         raise kind(f"{_place(path, error)}: {_sentence(error)}") from error
 
 

@@ -51,6 +51,7 @@ class Dynamics:
     def __init__(self, scene: Scene, settings: Settings, plan: Plan):
         self.scene, self.plan, self.dt = scene, plan, settings.dt
         self._velocities_before: tuple[np.ndarray, float] | None = None  # before the last step, and its time [s]; of joints only
+        self.robots: Robots | None = None  # until it is built
         self.tangent = None  # fields of `Simulator.force_differential`; made on request
         self.changes = 0  # count of user changes to the state or to numbers; at each the energy jumps
         self._time_base = 0.0, 0  # time [s] and step count when dt, the state or the settings last changed
@@ -91,6 +92,8 @@ class Dynamics:
 
     def close(self) -> None:
         """Free all memory and the runtime; dt alone stays readable."""
+        if self.robots is not None:
+            self.robots.close()
         self._free()
         self.state = self.contact = self.stepper = self.drag_spring = self._idle_detection = self.tangent = None
 

@@ -18,28 +18,23 @@ from taisoft.records import StepReport
 from taisoft.scene.rigid import Pose
 from taisoft.scene.scene import Scene
 
-TOLERANCE = 1e-4  # of iterations: change of the wrenches over the largest one, or the robots' weight
+TOLERANCE = 1e-4  # of iterations: change of the wrenches over the largest one, or the weight of the lightest link
 FIRST_RELAXATION, RELAXATIONS = 0.5, (0.02, 1.0)  # of the change of the wrenches, at first; bounds of a step's first one
 MAX_RELAXATION = 2.0  # in either direction
+# weak coupling is unstable if wrenches turn round in so many steps in a row by more than this part of their size
+MAX_TURNS, TURN = 4, 0.5
 
 
 class Simulation(Bodies, Protocol):
-    """What robots run with: the simulation of bodies, which they move and whose steps they repeat."""
+    """What robots run with: the simulation of bodies, see `Dynamics`."""
 
     dt: float
     is_open: bool
 
-    def command_poses(self, poses: dict[str, Pose]) -> None:
-        """Let obstacles, by name, move to poses in the next step."""
-
-    def take_steps(self, n: int) -> StepReport:
-        """Take up to n steps of dt, of bodies alone."""
-
-    def snapshot(self) -> dict:
-        """Return everything the next step depends on, robots too."""
-
-    def restore(self, kept: dict) -> None:
-        """Restore a `snapshot`."""
+    def command_poses(self, poses: dict[str, Pose]) -> None: ...
+    def take_steps(self, n: int) -> StepReport: ...
+    def snapshot(self) -> dict: ...
+    def restore(self, kept: dict) -> None: ...
 
 
 class Robots:
@@ -48,14 +43,18 @@ class Robots:
     def __init__(self, scene: Scene):
         self.running = {placed.name: RunningRobot(placed, scene) for placed in scene.robots}
         self._iterations = max((placed.iterations for placed in scene.robots), default=1)
-        self._relaxation = FIRST_RELAXATION  # in the last iteration of the last step
+        self._forget()
 
     def __bool__(self) -> bool:
         return bool(self.running)
 
+    def _forget(self) -> None:
+        self._relaxation, self._turns = FIRST_RELAXATION, 0
+        self._change: np.ndarray | None = None  # of the wrenches in the last step
+
     def restart(self) -> None:
         """Return all to their starts."""
-        self._relaxation = FIRST_RELAXATION
+        self._forget()
         for robot in self.running.values():
             robot.restart()
 
@@ -65,35 +64,43 @@ class Robots:
 
     def restore(self, kept: dict) -> None:
         """Restore a `snapshot`."""
+        self._forget()
         self._relaxation = float(kept["relaxation"])
         for name, robot in self.running.items():
             robot.restore(kept["running"][name])
 
+    def close(self) -> None:
+        """Refuse controls from now on."""
+        for robot in self.running.values():
+            robot.close()
+
     def step(self, bodies: Simulation) -> StepReport:
         """Take one step of the simulation and of the robots. Raises SimulationError; both are then as before."""
-        before, start = self.snapshot(), bodies.snapshot() if self._iterations > 1 else {}
+        count, before = bodies.state.step_count, self.snapshot()
+        start = bodies.snapshot() if self._iterations > 1 else {}
+        exchange = Exchange(list(self.running.values()), self._relaxation)
         try:
             report = self._take(bodies)
-            exchange = Exchange(list(self.running.values()), self._relaxation)
             for _ in range(self._iterations - 1):
-                if exchange.agrees():
+                if exchange.change <= TOLERANCE:
                     break
                 wrenches = exchange.relaxed()
                 bodies.restore(start)
                 exchange.apply(wrenches)
                 report = _sum(report, self._take(bodies))
-            if self._iterations > 1 and not exchange.agrees():
-                report.converged = False
-                report.problems.append(
-                    f"step {bodies.state.step_count}: forces and motion of {', '.join(self.running)} do not agree after "
-                    f"{self._iterations} iterations: wrenches still change by {exchange.change:.2g} of their size"
-                )
         except BaseException:  # Ctrl-C, too
             if start and bodies.is_open:
                 bodies.restore(start)
-            self.restore(before)
+            elif bodies.is_open and bodies.state.step_count > count:  # bodies have taken their step
+                self._measure(bodies)
+                exchange.apply(exchange.response())
+            else:
+                self.restore(before)
             raise
-        exchange.apply(exchange.felt())
+        if problem := self._problem(exchange):
+            report.converged = False
+            report.problems.append(f"step {bodies.state.step_count}: {problem}")
+        exchange.apply(exchange.response())
         self._relaxation = min(max(abs(exchange.relaxation), RELAXATIONS[0]), RELAXATIONS[1])
         return report
 
@@ -107,22 +114,40 @@ class Robots:
             raise SimulationError(f"step {bodies.state.step_count + 1}: {error}") from None
         bodies.command_poses(poses)
         report = bodies.take_steps(1)
-        for robot in self.running.values():
-            robot.feel(bodies)
+        self._measure(bodies)
         return report
+
+    def _measure(self, bodies: Simulation) -> None:
+        for robot in self.running.values():
+            robot.measure_wrenches(bodies)
+
+    def _problem(self, exchange: "Exchange") -> str:
+        """Say that iterations do not agree, or that weak coupling oscillates; else nothing."""
+        names = ", ".join(self.running)
+        if self._iterations > 1:
+            if exchange.change <= TOLERANCE:
+                return ""
+            many = f"after {self._iterations} iterations: wrenches still change by {exchange.change:.2g} of their size"
+            return f"forces and motion of {names} do not agree {many}"
+        change, last = exchange.differences(), self._change
+        turned = last is not None and float(change @ last) < -TURN * float(last @ last) < 0.0
+        self._turns = self._turns + 1 if turned and exchange.change > TURN else 0
+        self._change = change
+        return f"forces on {names} oscillate from step to step: couple with iterations=20" if self._turns >= MAX_TURNS else ""
 
 
 class Exchange:
-    """Wrenches of robots in the iterations of one step, with Aitken's relaxation."""
+    """Wrenches on links that forces can move, in the iterations of one step, with Aitken's relaxation."""
 
     def __init__(self, robots: list[RunningRobot], relaxation: float):
         self._robots, self.relaxation = robots, relaxation
         self._applied = np.concatenate([robot.applied for robot in robots])
-        self._lengths = np.concatenate([robot.sizes() for robot in robots])
+        self._lengths, self._yields = (np.concatenate(rows) for rows in zip(*((one.sizes(), one.can_yield) for one in robots)))
         self._last: np.ndarray | None = None  # change at the last relaxation
-        self._weight = sum(float(np.linalg.norm(one.model.opt.gravity) * one.model.body_mass.sum()) for one in robots)
+        weights = [float(np.linalg.norm(one.model.opt.gravity)) * one.lightest for one in robots if np.isfinite(one.lightest)]
+        self._weight = min(weights, default=0.0)
 
-    def felt(self) -> np.ndarray:
+    def response(self) -> np.ndarray:
         """The wrenches of the last iteration, those of all robots one below the other."""
         return np.concatenate([robot.wrenches for robot in self._robots])
 
@@ -133,29 +158,31 @@ class Exchange:
             robot.applied[:] = wrenches[first : first + len(robot.applied)]
             first += len(robot.applied)
 
+    def differences(self) -> np.ndarray:
+        """By how much the bodies' response differs from the wrenches applied, as forces [N]."""
+        return self._as_forces(self.response() - self._applied)
+
     @property
     def change(self) -> float:
-        """How much the bodies' answer to the applied wrenches differs from these, over the largest of both and the weight."""
-        largest = max(self._weight, *(np.abs(self._as_forces(wrenches)).max() for wrenches in (self.felt(), self._applied)))
-        return float(np.abs(self._as_forces(self.felt() - self._applied)).max() / largest) if largest > 0.0 else 0.0
-
-    def agrees(self) -> bool:
-        """Whether it is within TOLERANCE."""
-        return self.change <= TOLERANCE
+        """Their largest, over the largest wrench and the weight."""
+        sizes = (np.abs(self._as_forces(wrenches)).max(initial=0.0) for wrenches in (self.response(), self._applied))
+        largest = max(self._weight, *sizes)
+        return float(np.abs(self.differences()).max(initial=0.0) / largest) if largest > 0.0 else 0.0
 
     def relaxed(self) -> np.ndarray:
         """Return the wrenches of the next iteration."""
-        change = self._as_forces(self.felt() - self._applied).ravel()
+        change = self.differences()
         if self._last is not None:
             turn = change - self._last
             if square := float(turn @ turn):
                 self.relaxation *= -float(self._last @ turn) / square
                 self.relaxation = min(max(self.relaxation, -MAX_RELAXATION), MAX_RELAXATION) or FIRST_RELAXATION
         self._last = change
-        return self._applied + self.relaxation * (self.felt() - self._applied)
+        return self._applied + self.relaxation * (self.response() - self._applied)
 
     def _as_forces(self, wrenches: np.ndarray) -> np.ndarray:
-        return np.concatenate([wrenches[:, :3], wrenches[:, 3:] / self._lengths], axis=1)
+        scaled = np.concatenate([wrenches[:, :3], wrenches[:, 3:] / self._lengths], axis=1)
+        return scaled[self._yields].ravel()
 
 
 def _sum(first: StepReport, last: StepReport) -> StepReport:

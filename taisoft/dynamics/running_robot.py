@@ -6,11 +6,12 @@ from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 import numpy as np
 
-from taisoft.errors import SimulationError
+from taisoft.errors import SceneError, SimulationError
 from taisoft.scene import checks
+from taisoft.scene.loads import value_at
 from taisoft.scene.obstacles import Obstacle
 from taisoft.scene.rigid import Pose
-from taisoft.scene.robot import PlacedRobot, import_mujoco, names_of
+from taisoft.scene.robot import PlacedRobot, check_control, import_mujoco, names_of, state_of
 from taisoft.scene.robot_shapes import placed_pose
 from taisoft.scene.scene import Scene
 
@@ -24,7 +25,7 @@ NEAR = 1e-9  # of a step of MuJoCo, by which dt may exceed a multiple of it
 
 
 class Bodies(Protocol):
-    """What robots feel: a simulation of bodies, after a step."""
+    """What loads robots: a simulation of bodies, after a step."""
 
     scene: Scene
     state: "SimulationState"
@@ -42,10 +43,10 @@ class Wrench(NamedTuple):
 class Named:
     """Numbers of a robot by name, or by index as in an array: `control["elbow"] = 1.0`, `control[:] = 0.0`."""
 
-    def __init__(self, what: str, names: list[str], first: list[int], values: np.ndarray, was_set: Callable | None = None):
+    def __init__(self, what: str, names: list[str], first: list[int], values: np.ndarray, check: Callable | None = None):
         """what: start of messages, and the kind, such as "robot 'arm': no joint"; first: index of each name's first number, and
-        their end; was_set: called with the indices that were set (k,), None: none can be."""
-        self._what, self.names, self._first, self._values, self._was_set = what, names, first, values, was_set
+        their end; check: called with indices and values (k,) that are to be set, None: none can be."""
+        self._what, self.names, self._first, self._values, self.check = what, names, first, values, check
 
     def __getitem__(self, key: str | int | slice) -> float | np.ndarray:
         found = self._values[self._at(key)]
@@ -53,16 +54,16 @@ class Named:
 
     def __setitem__(self, key: str | int | slice, value) -> None:
         at = self._at(key)
-        if self._was_set is None:
+        if self.check is None:
             raise SimulationError(f"{self._what} can be set, nor {key!r}: a robot moves by its actuators' controls")
-        self._values[at] = checks.array(value, f"{self._what}: {key!r}", ((), np.shape(self._values[at])))
-        self._was_set(np.atleast_1d(np.arange(len(self._values))[at]))
+        chosen = np.arange(len(self._values))[at]
+        what = f"{self._what.replace(': no ', ': ')} {repr(key) if isinstance(key, str) else 'numbers'}"
+        value = np.broadcast_to(checks.array(value, what, ((), chosen.shape)), chosen.shape)
+        self.check(np.atleast_1d(chosen), np.atleast_1d(value))
+        self._values[at] = value
 
     def __len__(self) -> int:
         return len(self._values)
-
-    def __iter__(self) -> Iterator[float]:
-        return iter(self._values.tolist())
 
     def __array__(self, dtype=None, copy=None) -> np.ndarray:
         return np.array(self._values, dtype=dtype)
@@ -82,21 +83,21 @@ class Named:
 class RunningRobot:
     """A robot while it runs, between the steps of a simulator; `Simulator.robots` holds them.
 
-    Vectors are in the scene's axes. model, data: MuJoCo's own records, of this simulator; what changes their positions or times
-    is not followed.
+    Vectors are in the scene's axes. model, data: MuJoCo's own records, of this simulator alone. Its `xfrc_applied` is overwritten
+    in each step, and what is changed in `model` is in no checkpoint.
     """
 
     def __init__(self, placed: PlacedRobot, scene: Scene):
-        self.mujoco = mujoco = import_mujoco()
-        self.placed, self.name, robot = placed, placed.name, placed.robot
-        self.model = model = copy.copy(robot.model)  # of its own, since its time step and gravity are set
-        self.data = data = mujoco.MjData(model)
-        self._longest = float(robot.model.opt.timestep)
-        kinds = {"actuator": model.nu, "joint": model.njnt, "sensor": model.nsensor}
-        actuators, joints, sensors = ((f"robot {self.name!r}: no {one}", names_of(model, one, n)) for one, n in kinds.items())
+        self.mujoco = import_mujoco()
+        self.placed, self.name, self._scene = placed, placed.name, scene
+        self.model = model = copy.copy(placed.robot.model)  # of its own, since its time step and gravity are set
+        self.data = data = placed.robot.make_data(model)
+        actuators, joints, sensors = (
+            (f"robot {self.name!r}: no {kind}", names_of(model, kind)) for kind in ("actuator", "joint", "sensor")
+        )
         self._axes = *joints, [*model.jnt_dofadr.tolist(), model.nv]
         #: actuators' controls, see `Named`; held until they are set again
-        self.control = Named(*actuators, list(range(model.nu + 1)), data.ctrl, self._hold)
+        self.control = Named(*actuators, list(range(model.nu + 1)), data.ctrl, self._set_control)
         #: positions of joints [rad, m]; a ball joint has a quaternion, a free one position and quaternion
         self.joint = Named(*joints, [*model.jnt_qposadr.tolist(), model.nq], data.qpos)
         #: velocities of joints [rad/s, m/s]
@@ -105,11 +106,13 @@ class RunningRobot:
         self.sensor = Named(*sensors, [*model.sensor_adr.tolist(), model.nsensordata], data.sensordata)
         self.wrenches = np.zeros((model.nbody, 6))  # by MuJoCo's body, in the scene's axes: of the last step,
         self.applied = np.zeros((model.nbody, 6))  # and those that act in the next one
-        self._scene = scene
-        self._obstacles = [scene.obstacle(name) for name in placed.shapes]
-        self._colliders = [scene.colliders.index(one) for one in self._obstacles]
-        self._geoms = list(placed.shapes.values())
-        self._bodies = model.geom_bodyid[self._geoms]
+        welded = model.body_weldid
+        self.can_yield = (welded > 0) & (model.body_mocapid[welded] < 0)  # (nbody,) whether forces can move a body
+        shapes = [(scene.obstacle(name), geom, int(model.geom_bodyid[geom])) for name, geom in placed.shapes.items()]
+        self._shapes = [(scene.colliders.index(one), one, body) for one, _, body in shapes]
+        self._moving = [(one, geom) for one, geom, body in shapes if welded[body]]
+        touched = [body for *_, body in shapes if self.can_yield[body]]
+        self.lightest = float(model.body_mass[touched].min(initial=np.inf))  # touched link that forces can move [kg]
         self.restart()
 
     # --- for users ----------------------------------------------------------------------------------------------------------
@@ -128,7 +131,6 @@ class RunningRobot:
     def joint_load(self) -> Named:
         """What touches and what is attached exerts along each joint [N m, N], mean over the last step, in its present pose."""
         load, axes = np.zeros(self.model.nv), self.placed.axes
-        self.mujoco.mj_comPos(self.model, self.data)
         for k in np.flatnonzero(self.wrenches.any(axis=1)):
             force, torque = self.wrenches[k].reshape(2, 3) @ axes
             self.mujoco.mj_applyFT(self.model, self.data, force, torque, self.data.xipos[k], k, load)
@@ -141,6 +143,13 @@ class RunningRobot:
             raise SimulationError(f"robot {self.name!r}: no link is called {name!r}{hint}")
         return 1 + links.index(name)
 
+    def _set_control(self, actuators: np.ndarray, values: np.ndarray) -> None:
+        """Check controls that are to be set, and hold them from now on, whatever their paths."""
+        for k, value in zip(actuators.tolist(), values.tolist()):
+            check_control(self.model, k, value, f"robot {self.name!r}: control of {self.control.names[k]!r}")
+        for k in actuators.tolist():
+            self._paths.pop(k, None)
+
     def __repr__(self) -> str:
         return f"RunningRobot({self.name!r}, joints={self.joint.names}, actuators={self.control.names})"
 
@@ -148,51 +157,58 @@ class RunningRobot:
 
     def restart(self) -> None:
         """Return to the start: joints, controls, no forces."""
-        robot = self.placed.robot
-        self.mujoco.mj_resetData(self.model, self.data)  # its counts of warnings, too
-        self.data.qpos[:], self.data.ctrl[:] = robot.start, robot.control
-        self.wrenches[:] = self.applied[:] = 0.0
+        scratch = self.placed.robot.make_data(self.model)
+        self.mujoco.mj_forward(self.model, scratch)  # would change what the first step begins with
         self._paths = dict(self.placed.control)  # of controls that were not set since
-        self.mujoco.mj_kinematics(self.model, self.data)
+        none = np.zeros_like(self.wrenches)
+        self._set_state(self.placed.robot.state, scratch.sensordata, none, none)
 
     def advance(self, dt: float, end: float) -> dict[str, Pose]:
         """Advance MuJoCo by dt [s], to `end` of the simulation, under the wrenches; return poses of the shapes that can move.
 
-        Raises SimulationError with MuJoCo's words where it warns of its state.
+        Raises SimulationError with MuJoCo's words where it warns of its state, and where a control's path fails.
         """
-        model, data, mujoco = self.model, self.data, self.mujoco
-        n = max(1, int(np.ceil(dt / self._longest - NEAR)))
+        model, data = self.model, self.data
+        n = max(1, int(np.ceil(dt / self.placed.robot.model.opt.timestep - NEAR)))
         model.opt.timestep = dt / n
         model.opt.gravity[:] = self.placed.axes.T @ self._scene.gravity
         data.xfrc_applied[:] = (self.applied.reshape(-1, 3) @ self.placed.axes).reshape(-1, 6)
         for k, path in self._paths.items():
-            data.ctrl[k] = path(end)
+            what = f"robot {self.name!r}: control of {self.control.names[k]!r}"
+            data.ctrl[k] = float(value_at(path, end, what))
+            try:
+                check_control(model, k, data.ctrl[k], f"{what} at t = {end:g}")
+            except SceneError as error:
+                raise SimulationError(str(error)) from None
         self._take_steps(n)
-        mujoco.mj_kinematics(model, data)
-        moving = [k for k, body in enumerate(self._bodies) if model.body_weldid[body]]
-        return {
-            self._obstacles[k].name: Pose(*placed_pose(self.placed, self._obstacles[k].shape, data, self._geoms[k]))
-            for k in moving
-        }
+        self._place()
+        return {one.name: Pose(*placed_pose(self.placed, one.shape, data, geom)) for one, geom in self._moving}
+
+    def _place(self) -> None:
+        """Compute where links are, and what Jacobians need."""
+        self.mujoco.mj_kinematics(self.model, self.data)
+        self.mujoco.mj_comPos(self.model, self.data)
 
     def _take_steps(self, n: int) -> None:
         """Take n of MuJoCo's steps. It warns of what it cannot compute, then goes on with controls of 0, or from its start."""
         mujoco, warnings = self.mujoco, []
+        for one in self.data.warning:  # MuJoCo speaks of the first of each kind only
+            one.number = 0
         before = mujoco.get_mju_user_warning()
         mujoco.set_mju_user_warning(warnings.append)  # else MuJoCo writes a file into the working folder
         try:
             mujoco.mj_step(self.model, self.data, n)
         finally:
             mujoco.set_mju_user_warning(before)
-        if warnings:
-            text = warnings[0].decode() if isinstance(warnings[0], bytes) else str(warnings[0])
-            raise SimulationError(f"robot {self.name!r}: MuJoCo: {text.strip().rstrip('.')}")
+        if self.data.warning.number.any():
+            text = warnings[0].strip().rstrip(".") if warnings else "its state is not finite"
+            raise SimulationError(f"robot {self.name!r}: MuJoCo: {text}")
 
-    def feel(self, bodies: Bodies) -> None:
+    def measure_wrenches(self, bodies: Bodies) -> None:
         """Set the wrenches to those of the last step: of contacts, and of what is attached to the links."""
         total = np.zeros((self.model.nbody, 6))  # force and moment about the origin
         touched = set() if bodies.contact is None else set(bodies.contact.pairs()[0].ravel().tolist())
-        for collider, obstacle, k in zip(self._colliders, self._obstacles, self._bodies):
+        for collider, obstacle, k in self._shapes:
             if collider in touched:
                 total[k] += bodies.contact.mean_on(collider, None)[:6]
             for forces, points in forces_on(bodies, obstacle):
@@ -203,32 +219,38 @@ class RunningRobot:
 
     def sizes(self) -> np.ndarray:
         """Lengths (nbody,1) [m] that make a torque about a link's centre comparable to a force."""
-        reach = np.full(self.model.nbody, np.finfo(np.float64).tiny)  # no torque acts on a link without shapes
-        ends = np.linalg.norm(self.data.geom_xpos - self.data.xipos[self.model.geom_bodyid], axis=1) + self.model.geom_rbound
-        np.maximum.at(reach, self.model.geom_bodyid, ends)
+        reach = np.full(self.model.nbody, np.inf)  # no torque acts on a link without shapes
+        for _, geom in self._moving:
+            k = self.model.geom_bodyid[geom]
+            arm = np.linalg.norm(self.data.geom_xpos[geom] - self.data.xipos[k]) + self.model.geom_rbound[geom]
+            reach[k] = max(arm, reach[k]) if np.isfinite(reach[k]) else arm
         return reach[:, None]
 
     # --- its state ------------------------------------------------------------------------------------------------------------
 
     def snapshot(self) -> dict:
-        """Return what the next step depends on."""
-        kind = self.mujoco.mjtState.mjSTATE_INTEGRATION
-        state = np.empty(self.mujoco.mj_stateSize(self.model, kind))
-        self.mujoco.mj_getState(self.model, self.data, state, kind)
-        paths = np.array(list(self._paths), dtype=np.int64)
-        return {"state": state, "wrenches": self.wrenches.copy(), "applied": self.applied.copy(), "paths": paths}
+        """Return what the next step depends on, and the sensors."""
+        arrays = {name: getattr(self, name).copy() for name in ("wrenches", "applied")}
+        arrays |= {"state": state_of(self.model, self.data), "sensors": self.data.sensordata.copy()}
+        return arrays | {"paths": np.array(list(self._paths), dtype=np.int64)}
 
     def restore(self, kept: dict) -> None:
         """Restore a `snapshot`."""
-        self.mujoco.mj_setState(self.model, self.data, kept["state"], self.mujoco.mjtState.mjSTATE_INTEGRATION)
-        self.mujoco.mj_kinematics(self.model, self.data)
-        self.wrenches[:], self.applied[:] = kept["wrenches"], kept["applied"]
         self._paths = {k: self.placed.control[k] for k in kept["paths"].tolist()}
+        self._set_state(kept["state"], kept["sensors"], kept["wrenches"], kept["applied"])
 
-    def _hold(self, actuators: np.ndarray) -> None:
-        """Hold controls that were set, whatever their paths."""
-        for k in actuators.tolist():
-            self._paths.pop(k, None)
+    def _set_state(self, state: np.ndarray, sensors: np.ndarray, wrenches: np.ndarray, applied: np.ndarray) -> None:
+        self.mujoco.mj_setState(self.model, self.data, state, self.mujoco.mjtState.mjSTATE_INTEGRATION)
+        self._place()
+        self.data.sensordata[:], self.wrenches[:], self.applied[:] = sensors, wrenches, applied
+
+    def close(self) -> None:
+        """Refuse controls from now on: the simulator is closed, or was rebuilt with a robot of its own."""
+
+        def refuse(*_) -> None:
+            raise SimulationError(f"robot {self.name!r}: its simulator was closed or rebuilt: take it from sim.robots again")
+
+        self.control.check = refuse
 
 
 def forces_on(bodies: Bodies, obstacle: Obstacle) -> Iterator[tuple[np.ndarray, np.ndarray]]:

@@ -13,7 +13,7 @@ from taisoft.scene.key_frames import NodePath, ShapePath
 from taisoft.scene.loads import LoadPath
 from taisoft.scene.numbers import scene_numbers
 from taisoft.scene.rigid import RigidBody
-from taisoft.scene.robot import robot_parts
+from taisoft.scene.robot import PlacedRobot
 from taisoft.scene.scene import Scene
 
 FEATURES = "the features that it needs"  # last entry of a fingerprint: of the plan, which follows from the parts and numbers
@@ -36,7 +36,7 @@ def scene_fingerprint(scene: Scene, features: dict[str, bool]) -> dict[str, str]
     for one in scene.connections:
         fingerprint[f"{type(one).__name__.lower()} '{one.name}'"] = digest(_connection_parts(one))
     for placed in scene.robots:
-        fingerprint[f"robot '{placed.name}'"] = digest([*robot_parts(placed.robot), placed.position, placed.axes])
+        fingerprint[f"robot '{placed.name}'"] = digest(_robot_parts(placed))
     fingerprint["collision settings"] = digest([json.dumps(dataclasses.asdict(scene.collision)), scene.contact_forces])
     # features unused at the start, such as damping 0, are compiled out
     fingerprint[FEATURES] = digest([json.dumps(features)])
@@ -83,6 +83,16 @@ def _connection_parts(one: Connection) -> list:
         return [one.a, one.nodes, one.b, one.stiffness is None]
     points = [part for point in one.points for part in (point.owner, point.position)]
     return [*points, one.given, one.stiffness is None, *_path_parts(one.path)] if isinstance(one, Tendon) else points
+
+
+def _robot_parts(placed: PlacedRobot) -> list:
+    """Return the values that define a robot and its place: arrays of its model, but not names of files, its start, its paths."""
+    model = placed.robot.model
+    arrays = [array for name in dir(model) if "path" not in name and isinstance(array := getattr(model, name), np.ndarray)]
+    option = [getattr(model.opt, name) for name in dir(model.opt) if not name.startswith("_")]
+    numbers = [one if isinstance(one, np.ndarray) else float(one) for one in option if not callable(one)]
+    paths = [part for k, load in placed.control.items() for part in (k, load.value, *_path_parts(load.path))]
+    return [*arrays, *numbers, placed.robot.state, placed.position, placed.axes, placed.iterations, *paths]
 
 
 def _path_parts(path: Callable | None) -> list:

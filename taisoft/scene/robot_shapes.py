@@ -56,6 +56,8 @@ def _mesh(model: Any, k: int, what: str) -> MeshObstacle:
     first, n = model.mesh_faceadr[k], model.mesh_facenum[k]
     vertices, where = np.unique(vertices, axis=0, return_inverse=True)
     triangles = where.reshape(-1)[model.mesh_face[first : first + n]]
+    if np.linalg.det(vertices[triangles]).sum() < 0.0:  # six times the volume: it is inside out, and a solid for MuJoCo
+        triangles = triangles[:, ::-1]
     try:
         return MeshObstacle(vertices, triangles[_have_area(vertices, triangles)])
     except SceneError as error:
