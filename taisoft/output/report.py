@@ -117,9 +117,9 @@ def read_table(path: Path, is_kept: Callable[[list[str]], bool]) -> tuple[list[s
         return [], []
 
 
-def json_text(record: dict) -> str:
-    """Return the record as standard JSON text: numbers that are not finite become null."""
-    return json.dumps(_plain(record), indent=1, allow_nan=False) + "\n"
+def json_text(record: dict, indent: int | None = 1) -> str:
+    """Return the record as standard JSON text: numbers that are not finite become null. indent: None for a single line."""
+    return json.dumps(_plain(record), indent=indent, allow_nan=False) + "\n"
 
 
 def versions() -> dict[str, str | None]:
@@ -175,7 +175,7 @@ class Progress:
         self._first_time = self._last_line = self._compiled = self._time = 0.0
         self._text = "starting"
         self._first_step = 0
-        self._bar = _bar(seconds, label, self.stream) if self.stream.isatty() else None
+        self._bar = progress_bar(seconds, label, self.stream) if self.stream.isatty() else None
 
     def frame(self, sim, index: int) -> None:
         """Show sim.time, and the speed since the first frame without compiling, which does not go on."""
@@ -209,22 +209,22 @@ class Progress:
             return "starting"
         rate = (sim.step_count - self._first_step) / elapsed
         left = max(self.seconds - sim.time, 0.0) * elapsed / done
-        return f"{rate:.4g} steps/s, {_clock(left)} left"
+        return f"{rate:.4g} steps/s, {clock_text(left)} left"
 
 
-def _bar(seconds: float, label: str, stream: TextIO):
+def progress_bar(total: float, label: str, stream: TextIO, done: str = "{task.completed:.2f} of {task.total:g} s"):
+    """Return a started bar of rich's with one task, whose field `note` is shown behind it. done: format of what is done."""
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn
 
-    label_text, done = TextColumn("{task.description}"), TextColumn("{task.completed:.2f} of {task.total:g} s")
-    columns = label_text, BarColumn(bar_width=30), done, TextColumn("{task.fields[note]}")
+    columns = TextColumn("{task.description}"), BarColumn(bar_width=30), TextColumn(done), TextColumn("{task.fields[note]}")
     bar = Progress(*columns, console=Console(file=stream), refresh_per_second=5, transient=False)
-    bar.add_task(label, total=seconds, note="starting")
+    bar.add_task(label, total=total, note="starting")
     bar.start()
     return bar
 
 
-def _clock(seconds: float) -> str:
+def clock_text(seconds: float) -> str:
     """Format seconds as h:mm:ss or m:ss."""
     minutes, second = divmod(round(seconds), 60)
     hours, minute = divmod(minutes, 60)
