@@ -29,6 +29,7 @@ POLL_INTERVAL = 0.01  # [s]
 IDLE_SECONDS = 120.0  # after which a child without a request ends: that of a cluster's worker whose client was killed
 END_SECONDS = 10.0  # in which an idle child must end
 BLAS_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+serving = False  # whether this process is the child of a place
 BUDGET_SPENT, CUT_BY_BUDGET = "the budget was spent", "the budget was spent while it ran"
 
 
@@ -213,7 +214,8 @@ def serve(answer: Callable[[dict], dict]) -> None:
 
     What else is printed goes to stderr, and nothing can be read from stdin.
     """
-    requests, is_idle = queue.SimpleQueue(), threading.Event()
+    global serving
+    serving, requests, is_idle = True, queue.SimpleQueue(), threading.Event()
     stdin, out = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb")
     os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
     os.dup2(2, 1)
