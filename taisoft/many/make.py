@@ -1,7 +1,7 @@
 """The function of `run_many`, by name so that other processes import it, and the child process that calls it for each row.
 
-A script is imported under the name __mp_main__, as multiprocessing does. The process reports the digests that the files of the
-function and of the modules beside it had when it first saw them, and starts Taichi only if the function needs it.
+A script is imported by its path under the name __mp_main__, as multiprocessing does. The process reports the digests that the
+files of the function and of the modules beside it had when it first saw them, and starts Taichi only if the function needs it.
 """
 
 import base64
@@ -35,7 +35,7 @@ SCRIPT = "__mp_main__"  # name under which a script is imported
 class Make:
     """A function that other processes can import.
 
-    module: its name, empty for a script; file: the module's or script's; function: the name in it; folder: that of the modules
+    module: its name, empty for a file that is imported by its path; function: the name in it; folder: that of the modules
     beside it, whose files count as its source.
     """
 
@@ -82,8 +82,9 @@ def make_of(function: Callable) -> Make:
             f"make, {name}, is defined in a notebook or console, whose code other processes cannot import: write it to a file, "
             "such as my_runs.py (%%writefile my_runs.py in a notebook), and import it from there"
         )
-    script = module.__name__ == "__main__" and spec is None
-    dotted = "" if script else spec.name if spec is not None else module.__name__
+    dotted = "" if spec is None else spec.name
+    if not any(finder.find_spec(dotted.partition(".")[0], None) for finder in sys.meta_path):
+        dotted = ""  # a script, or a file that was imported under a name of its own
     path = Path(file).resolve()
     return Make(dotted, str(path), name, str(path.parents[dotted.count(".") + (path.name == "__init__.py")]))
 
