@@ -21,7 +21,7 @@ ROWS_SHOWN = 20
 LEFT_OUT = "left out"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Row:
     """One run of `run_many`."""
 
