@@ -1,8 +1,8 @@
 """The examples of the manual run: `python -m pytest docs`.
 
-Every page is a script, in a folder of its own. Blocks marked `python` run one after the other and share their names, and are
-written to NAME as well after a line "Save this as `NAME`:"; blocks marked `toml` are written to my_scene.toml and read; blocks marked `sh` run in a shell. Lines that begin with `taisoft` in
-blocks marked `console` are not run, but their options must exist.
+Every page is a script, in a folder of its own. Blocks marked `python` run one after the other and share their names, and after a
+line "Save this as `NAME`:" they are written to NAME, too; blocks marked `toml` are written to my_scene.toml and read; blocks
+marked `sh` run in a shell. Lines that begin with `taisoft` in blocks marked `console` are not run, but their options must exist.
 """
 
 import os

@@ -89,7 +89,7 @@ def make_of(function: Callable) -> Make:
     return Make(dotted, str(path), name, str(path.parents[dotted.count(".") + (path.name == "__init__.py")]))
 
 
-_seen: dict[str, str] = {}  # digests of source files
+_seen: dict[Make, dict[str, str]] = {}  # digests of source files
 
 
 @cache
@@ -102,7 +102,7 @@ def _loaded(make: Make) -> tuple[Callable, str]:
 def _see(make: Make, _n_modules: int) -> None:
     """Enter new files; called where modules may have been imported."""
     for name, found in sources(Path(make.file), Path(make.folder)).items():
-        _seen.setdefault(name, found)
+        _seen.setdefault(make, {}).setdefault(name, found)
 
 
 def answer(request: dict) -> dict:
@@ -127,7 +127,7 @@ def answer(request: dict) -> dict:
     _see(make, len(sys.modules))
     runtime = sys.modules.get("taisoft.backend.runtime")
     is_last = runtime is not None and runtime.open_kind() is not None
-    return {"answer": record | {"sources": _seen, "code": request["code"]}, "last": is_last}
+    return {"answer": record | {"sources": _seen[make], "code": request["code"]}, "last": is_last}
 
 
 def _row(function: Callable, parameters: dict, make: Make) -> dict:

@@ -112,7 +112,8 @@ class Results(Sequence):
         names = [name for name in self.names if name != "problem" or any(row.problems for row in self.rows)]
         rows = [[_cell(row.get(name)) for name in names] for row in self.to_dicts()[:ROWS_SHOWN]]
         more = [f"and {len(self) - ROWS_SHOWN} more rows"] if len(self) > ROWS_SHOWN else []
-        table = [markdown(names, rows, left=[names.index("status"), len(names) - 1])] if self.rows else []
+        left = [k for k, name in enumerate(names) if name in ("status", "problem")]
+        table = [markdown(names, rows, left)] if self.rows else []
         return "\n".join([f"Results of {len(self)} runs: {counts}", *self.notes, *table, *more])
 
 

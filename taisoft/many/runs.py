@@ -148,7 +148,8 @@ class Many:
     def run(self, there: list[Place], how: str, progress: bool, out: Path | None) -> None:
         """Run what is not done, and write table.csv and many.json, also after an interruption."""
         done, total = len(self._rows), len(self._rows) + len(self.waiting)
-        plan = f"{total} runs, " + (f"{done} of them already done, " if done else "") + how
+        before = f"{done} of them already done, " if self.waiting else "all of them already done"
+        plan = f"{total} runs, " + (before if done else "") + (how if self.waiting else "")
         shown = Progress(total, done, self._make.function, progress)
         for text in (plan, *self._notes):
             shown.print(text)
@@ -225,6 +226,7 @@ class Progress:
         self._first, self._failed, self._bar = done, 0, None
         if on and sys.stderr.isatty():
             self._bar = progress_bar(total, label, sys.stderr, "{task.completed:.0f} of {task.total:.0f}")
+            self._bar.update(self._bar.task_ids[0], completed=done, note="starting; a new kind of scene compiles first")
 
     def print(self, text: str) -> None:
         """Print a line."""
