@@ -6,6 +6,7 @@ files of the function and of the modules beside it had when it first saw them, a
 
 import base64
 import io
+import json
 import os
 import random
 import sys
@@ -13,10 +14,10 @@ import time
 import traceback
 import warnings
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from functools import cache, reduce
 from importlib import import_module, util
-from numbers import Real
 from pathlib import Path
 
 import numpy as np
@@ -82,7 +83,7 @@ def make_of(function: Callable) -> Make:
             f"make, {name}, is defined in a notebook or console, whose code other processes cannot import: write it to a file, "
             "such as my_runs.py (%%writefile my_runs.py in a notebook), and import it from there"
         )
-    dotted = "" if spec is None else spec.name
+    dotted = "" if spec is None or spec.name == "__main__" else spec.name
     if not any(finder.find_spec(dotted.partition(".")[0], None) for finder in sys.meta_path):
         dotted = ""  # a script, or a file that was imported under a name of its own
     path = Path(file).resolve()
@@ -131,66 +132,58 @@ def answer(request: dict) -> dict:
 
 
 def _row(function: Callable, parameters: dict, make: Make) -> dict:
-    """Return the record of a row: status, problems, whether it raised, wall time [s], texts, and arrays in base64."""
-    record = {"status": "ok", "problems": [], "raised": False, "order": [], "texts": {}, "arrays": {}}
+    """Return the record of a row: status, problems, values, arrays as .npy files in base64, and wall time [s]."""
+    record = {"status": "ok", "problems": [], "values": {}, "arrays": {}, "raised": False}
     start = time.perf_counter()
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", UserWarning)
         try:
-            _add(record, function(**parameters), parameters)
+            for name, value in _checked(function(**parameters), parameters).items():
+                if isinstance(value, RunReport):
+                    record["status"] = max(record["status"], value.status, key=STATUSES.index)
+                    record["problems"] += value.problems
+                elif isinstance(value, np.ndarray):
+                    file = io.BytesIO()
+                    np.save(file, value, allow_pickle=False)
+                    record["arrays"][name] = base64.b64encode(file.getvalue()).decode()
+                else:
+                    record["values"][name] = value
         except (Exception, SystemExit) as error:
             frames = traceback.extract_tb(error.__traceback__)
             lines = [frame.lineno for frame in frames if Path(frame.filename).resolve() == Path(make.file)]
             text = f"{type(error).__name__}: {' '.join(str(error).split())}"
             text += f" ({Path(make.file).name}, line {lines[-1]})" if lines else ""
-            record |= {"status": "failed", "problems": [text], "raised": True, "order": [], "texts": {}, "arrays": {}}
+            record |= {"status": "failed", "problems": [text], "raised": True}
     record["wall_seconds"] = time.perf_counter() - start
-    own = (f"warning: {one.message}" for one in caught if issubclass(one.category, UserWarning))
-    record["problems"] += list(dict.fromkeys(own))
+    texts = (f"warning: {one.message}" for one in caught if issubclass(one.category, UserWarning))
+    record["problems"] += dict.fromkeys(texts)
     return record
 
 
-def _add(record: dict, result, parameters: dict) -> None:
-    """Add what the function returned. Raises SceneError if it breaks a rule."""
+def _checked(result, parameters: dict) -> dict:
+    """Return what the function returned as numbers, texts, None, arrays and reports. Raises SceneError if it breaks a rule."""
     if not isinstance(result, Mapping):
         raise SceneError(f"make must return a mapping from names to values, not {value_text(result)}")
+    found = {}
     for name, value in result.items():
         if not isinstance(name, str) or not name.isidentifier():
             raise SceneError(f"make returned the name {value_text(name)}: it must be a word")
         if name in parameters or name in COLUMNS:
             other = "a parameter's" if name in parameters else "a column's of every table; a RunReport sets the status"
             raise SceneError(f"make returned the name '{name}', which is {other}")
-        if isinstance(value, RunReport):
-            record["status"] = max(record["status"], value.status, key=STATUSES.index)
-            record["problems"] += value.problems
-            continue
-        record["order"].append(name)
-        if value is None or isinstance(value, str):
-            record["texts"][name] = value
-        else:
-            record["arrays"][name] = _coded(name, value)
-
-
-def _coded(name: str, value) -> str:
-    """Return a number or an array as the text of an .npy file in base64; numbers have no dimension."""
-    try:
-        array = np.asarray(value)
-    except ValueError:  # lists of different lengths
-        array = np.array(None)
-    if array.dtype.kind not in "biufc" or (array.ndim == 0 and not isinstance(value, Real | np.generic | np.ndarray)):
-        raise SceneError(f"make returned {name} = {value_text(value)}: it must be a number, a text, None or an array of numbers")
-    file = io.BytesIO()
-    np.save(file, array, allow_pickle=False)
-    return base64.b64encode(file.getvalue()).decode()
-
-
-def decoded(text: str) -> np.ndarray | float | int | bool:
-    """Return the number or array of `_coded`."""
-    array = np.load(io.BytesIO(base64.b64decode(text)), allow_pickle=False)
-    return array if array.ndim else array.item()
+        if isinstance(value, list | tuple):
+            with suppress(ValueError):  # of different lengths
+                value = np.asarray(value)
+        value = value.item() if isinstance(value, np.ndarray | np.generic) and value.ndim == 0 else value
+        is_array = isinstance(value, np.ndarray) and value.dtype.kind in "biufc"
+        if not is_array and not isinstance(value, bool | int | float | str | RunReport | None):
+            rule = "it must be a number, a text, None or an array of numbers"
+            raise SceneError(f"make returned {name} = {value_text(value)}: {rule}")
+        found[name] = value
+    return found
 
 
 if __name__ == "__main__":
     from taisoft.many import make
 
-    serve(make.answer)  # of the module that others import, too
+    serve(make.answer, json.dumps)  # of the module that others import, too

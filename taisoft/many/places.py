@@ -203,16 +203,16 @@ def _answer_in(file) -> dict | None:
 
 
 def _content(file) -> bytes:
-    size, parts = os.fstat(file.fileno()).st_size, []
-    while (done := sum(map(len, parts))) < size:  # the system reads at most 2 GB at a time
-        parts.append(os.pread(file.fileno(), size - done, done))
-    return b"".join(parts)
+    size, content = os.fstat(file.fileno()).st_size, b""
+    while len(content) < size:  # the system reads at most 2 GB at a time
+        content += os.pread(file.fileno(), size - len(content), len(content))
+    return content
 
 
-def serve(answer: Callable[[dict], dict]) -> None:
+def serve(answer: Callable[[dict], dict], encode: Callable[[dict], str] = json_text) -> None:
     """Be the child of a place: write answer(request) for each request, and exit when stdin closes, even while one is executed.
 
-    What else is printed goes to stderr, and nothing can be read from stdin.
+    What else is printed goes to stderr, and nothing can be read from stdin. encode: returns an answer as JSON.
     """
     global serving
     serving, requests, is_idle = True, queue.SimpleQueue(), threading.Event()
@@ -222,7 +222,7 @@ def serve(answer: Callable[[dict], dict]) -> None:
     threading.Thread(target=_read, args=(stdin, requests, is_idle), daemon=True).start()
     while line := _next(requests):
         is_idle.clear()
-        text = json_text(answer(json.loads(line)), indent=None)
+        text = encode(answer(json.loads(line))).replace("\n", "") + "\n"
         sys.stdout.flush()
         sys.stderr.flush()
         is_idle.set()

@@ -1,6 +1,8 @@
 """`run_many`: one function for many parameters, each run in a process, into one table."""
 
+import base64
 import inspect
+import io
 import json
 import os
 import sys
@@ -16,12 +18,12 @@ from taisoft.errors import OutputError, SceneError, value_text
 from taisoft.files import write_bytes
 from taisoft.machine import THREADS, thread_count, usable_cores
 from taisoft.many import places
-from taisoft.many.make import Make, decoded, make_of
+from taisoft.many.make import Make, make_of
 from taisoft.many.places import LocalPlace, Place, carry_out
 from taisoft.many.results import Results, Row
 from taisoft.many.store import NoStore, RowStore, digest, digests
 from taisoft.output.files import FolderLock, check_free, make_folder
-from taisoft.output.report import LINE_EVERY, clock_text, json_text, machine, progress_bar, versions
+from taisoft.output.report import Bar, clock_text, json_text, machine, versions
 from taisoft.scene import checks
 
 CHILD = ("-m", "taisoft.many.make")
@@ -150,25 +152,37 @@ class Many:
         done, total = len(self._rows), len(self._rows) + len(self.waiting)
         before = f"{done} of them already done, " if self.waiting else "all of them already done"
         plan = f"{total} runs, " + (before if done else "") + (how if self.waiting else "")
-        shown = Progress(total, done, self._make.function, progress)
+        bar = Bar(total, "taisoft", sys.stderr if progress else io.StringIO(), "{} of {} runs")
         for text in (plan, *self._notes):
-            shown.print(text)
+            bar.say(text)
+        start, failures = time.perf_counter(), []
+        bar.show(done, "starting; a new kind of scene compiles first", start)
 
         def finished(key: str, answer: dict) -> None:
-            self._finished(key, answer)
-            shown.advance(self._rows[key])
+            row = self._rows[key] = self._row(key, answer)
+            if row.status == "failed":
+                failures.append(f"{', '.join(f'{name}={value}' for name, value in row.parameters.items())}: {row.problems[0]}")
+                if len(failures) <= FAILURES_SHOWN:
+                    bar.say(f"failed: {failures[-1]}")
+            n, now = len(self._rows), time.perf_counter()
+            text = f"{clock_text((now - start) * (total - n) / (n - done))} left"
+            bar.show(n, f"{len(failures)} failed, {text}" if failures else text, now)
 
         requests = [(key, self._request | {"parameters": one}) for key, one in self.waiting.items()]
         left = dict.fromkeys(self.waiting, "it was interrupted")
         try:
             left = carry_out(requests, there, finished)
         finally:
-            shown.close()
+            bar.close()
             is_empty = not self._rows
             for key, why in left.items():
                 self._rows.setdefault(key, Row(self.waiting[key], problems=[why]))
             if out is not None and not (left and is_empty):
-                self._write(out, how)
+                results = self.results()
+                results.write(out / TABLE)
+                record = {"kind": KIND, "make": self._make.name, "runs": total, "status": results.counts(), "processes": how}
+                record |= {"notes": self._notes, "versions": versions(), "machine": machine(), "digest": results.digest()}
+                write_bytes(out / REPORT, json_text(record).encode())
 
     def _reuse(self) -> None:
         """Take over finished rows of the same source and taisoft."""
@@ -188,69 +202,22 @@ class Many:
             self._notes.append(f"{other} rows were done by another version of {files} and are run again")
         self._notes += self._store.damaged
 
-    def _finished(self, key: str, answer: dict) -> None:
+    def _row(self, key: str, answer: dict) -> Row:
+        """Return the row of an answer, and keep it unless the function raised."""
         if "error" in answer:
             raise SceneError(answer["error"])
         if "crash" in answer:
-            self._rows[key] = Row(self.waiting[key], "failed", [answer["crash"]])
-            return
+            return Row(self.waiting[key], "failed", [answer["crash"]])
         record = answer["answer"]
         for name, found in record["sources"].items():
             if self._seen.setdefault(name, found) != found:
                 raise SceneError(f"{name} was changed while {self._make.name} ran: call run_many again")
         if not record["raised"]:
             self._store.write(key, record)
-        self._rows[key] = _row(self.waiting[key], record)
-
-    def _write(self, out: Path, how: str) -> None:
-        results = self.results()
-        results.write(out / TABLE)
-        record = {"kind": KIND, "make": self._make.name, "runs": len(results), "status": results.counts(), "processes": how}
-        record |= {"notes": self._notes, "versions": versions(), "machine": machine(), "digest": results.digest()}
-        write_bytes(out / REPORT, json_text(record).encode())
+        return _row(self.waiting[key], record)
 
 
 def _row(parameters: dict, record: dict) -> Row:
-    found = {name: decoded(text) for name, text in record["arrays"].items()}
-    arrays = {name: value for name, value in found.items() if isinstance(value, np.ndarray)}
-    values = {name: (found | record["texts"])[name] for name in record["order"] if name not in arrays}
-    return Row(parameters, record["status"], record["problems"], values, arrays, record["wall_seconds"])
-
-
-class Progress:
-    """Progress on stderr: a bar on a terminal, elsewhere a line every few seconds; the first failures at once."""
-
-    def __init__(self, total: int, done: int, label: str, on: bool):
-        self._total, self._done, self._on = total, done, on
-        self._start = self._last = time.perf_counter()
-        self._first, self._failed, self._bar = done, 0, None
-        if on and sys.stderr.isatty():
-            self._bar = progress_bar(total, label, sys.stderr, "{task.completed:.0f} of {task.total:.0f}")
-            self._bar.update(self._bar.task_ids[0], completed=done, note="starting; a new kind of scene compiles first")
-
-    def print(self, text: str) -> None:
-        """Print a line."""
-        if self._bar is not None:
-            self._bar.console.print(text, markup=False, highlight=False)
-        elif self._on:
-            print(f"taisoft: {text}", file=sys.stderr, flush=True)
-
-    def advance(self, row: Row) -> None:
-        """Count a finished row."""
-        self._done += 1
-        self._failed += row.status == "failed"
-        if row.status == "failed" and self._failed <= FAILURES_SHOWN:
-            self.print(f"failed: {', '.join(f'{name}={value}' for name, value in row.parameters.items())}: {row.problems[0]}")
-        now = time.perf_counter()
-        left = (now - self._start) * (self._total - self._done) / (self._done - self._first)
-        text = f"{self._failed} failed, {clock_text(left)} left" if self._failed else f"{clock_text(left)} left"
-        if self._bar is not None:
-            self._bar.update(self._bar.task_ids[0], completed=self._done, note=text)
-        elif now - self._last >= LINE_EVERY:
-            self._last = now
-            self.print(f"{self._done} of {self._total} runs, {text}")
-
-    def close(self) -> None:
-        """Stop the bar."""
-        if self._bar is not None:
-            self._bar.stop()
+    files = {name: io.BytesIO(base64.b64decode(text)) for name, text in record["arrays"].items()}
+    arrays = {name: np.load(file, allow_pickle=False) for name, file in files.items()}
+    return Row(parameters, record["status"], record["problems"], record["values"], arrays, record["wall_seconds"])

@@ -18,7 +18,6 @@ from taisoft import __version__
 from taisoft.files import write_bytes
 from taisoft.machine import versions
 from taisoft.output.files import make_folder
-from taisoft.output.report import json_text
 
 RUNS = "runs"
 FORMAT = 1
@@ -99,11 +98,10 @@ class Store:
         return content["record"]
 
     def write(self, key: str, record: dict) -> dict:
-        """Save a record; return it as it will be read back. Raises OutputError."""
-        plain = json.loads(json_text(record))  # numbers that are not finite become null, here as in the file
-        content = {"kind": self.kind, "format": FORMAT, "key": key, "sha256": digest(plain), "record": plain}
+        """Save a record, plain data, and return it. Raises OutputError."""
+        content = {"kind": self.kind, "format": FORMAT, "key": key, "sha256": digest(record), "record": record}
         write_bytes(self._path(key), self._pack(content))
-        return plain
+        return record
 
     def _path(self, key: str) -> Path:
         return self._folder / f"{key}{self.suffix}"
@@ -116,7 +114,7 @@ class Store:
 
 
 class RowStore(Store):
-    """Finished rows of `run_many`, as .npz files: numbers and arrays by name, and the rest of the record as row.json."""
+    """Finished rows of `run_many`, as .npz files: arrays by name, and the rest of the record as row.json."""
 
     kind, suffix = "taisoft row", ".npz"
 
@@ -149,5 +147,5 @@ class NoStore:
         """Return None."""
 
     def write(self, key: str, record: dict) -> dict:
-        """Return the record as Store.write does."""
-        return json.loads(json_text(record))
+        """Return the record."""
+        return record

@@ -106,5 +106,5 @@ def test_a_place_on_a_cluster_keeps_its_process_until_it_is_stopped():
     request = make_of(makes.slow).request()
     answers: dict = {}
     carry_out([(k, request | {"parameters": {"a": k}}) for k in "ab"], places[:1], answers.__setitem__)
-    pids = {answer["answer"]["arrays"]["pid"] for answer in answers.values()}
+    pids = {answer["answer"]["values"]["pid"] for answer in answers.values()}
     assert len(answers) == 2 and len(pids) == 1 and len(stopped) == 1
