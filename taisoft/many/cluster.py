@@ -23,7 +23,7 @@ class ClusterPlace:
     """One worker of a Dask cluster, which has a LocalPlace. child, threads: of that."""
 
     def __init__(self, client, address: str, cores: list[int], child: tuple[str, ...], threads: int | None = None):
-        self.cores, self._client, self._address = cores, client, address
+        self.cores, self.threads, self._client, self._address = cores, threads, client, address
         self._local, self._name = (cores, child, threads), ""
         self._future, self._last_check = None, 0.0
 

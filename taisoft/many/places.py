@@ -101,7 +101,7 @@ class LocalPlace:
     """
 
     def __init__(self, cores: list[int], child: tuple[str, ...], threads: int | None = None):
-        self.cores, self._child, self._threads = cores, child, threads
+        self.cores, self._child, self.threads = cores, child, threads
         self._process: subprocess.Popen | None = None
         self._request, self._answer, self._n_requests = b"", None, 0
 
@@ -120,7 +120,7 @@ class LocalPlace:
         self._answer = self._answer or _answer_in(self._stdout)
         if self._answer is None:
             return None if code is None else self._crash(code)
-        if self._threads is None or self._answer.get("last"):  # it stores its kernels and ends
+        if self.threads is None or self._answer.get("last"):  # it stores its kernels and ends
             self._close_stdin()
             if code is None:
                 return None
@@ -147,8 +147,8 @@ class LocalPlace:
         """Start a process. A new session shields it from the terminal's Ctrl-C."""
         self._stdout, self._stderr, self._n_requests = tempfile.TemporaryFile(), tempfile.TemporaryFile(), 0
         environment, on_cores = own_environment(), _pinned(self.cores)  # which count when NumPy and Taichi start
-        if self._threads is not None:
-            environment |= {THREADS: str(self._threads)} | dict.fromkeys(BLAS_THREADS, "1")
+        if self.threads is not None:
+            environment |= {THREADS: str(self.threads)} | dict.fromkeys(BLAS_THREADS, "1")
             on_cores = nullcontext()
         streams = {"stdin": subprocess.PIPE, "stdout": self._stdout, "stderr": self._stderr}
         with on_cores:

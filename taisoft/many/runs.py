@@ -18,6 +18,7 @@ from taisoft.errors import OutputError, SceneError, value_text
 from taisoft.files import write_bytes
 from taisoft.machine import THREADS, thread_count, usable_cores
 from taisoft.many import places
+from taisoft.many.cluster import cluster_places, connect
 from taisoft.many.make import Make, make_of
 from taisoft.many.places import LocalPlace, Place, carry_out
 from taisoft.many.results import Results, Row
@@ -62,9 +63,11 @@ def run_many(
     if workers is not None and cluster is not None:
         raise SceneError("workers are processes of this machine, and a cluster has its own: give one of them")
     with ExitStack() as stack:
-        many = Many(function, given, *_store(out, function, stack))
-        there, how = _places(workers, cluster, len(many.waiting), stack)
-        many.run(there, how, progress, None if out is None else Path(out))
+        client = None if cluster is None else stack.enter_context(closing(connect(cluster, "cluster")))
+        threads = thread_count(1) if os.environ.get(THREADS) else None
+        many = Many(function, given, NoStore() if out is None else _store(Path(out), function, stack))
+        there = _places(workers, threads, len(many.waiting)) if client is None else cluster_places(client, CHILD, timed=False)[0]
+        many.run(there, progress, None if out is None else Path(out))
         return many.results()
 
 
@@ -95,12 +98,10 @@ def _plain(value, name: str):
     raise SceneError(f"{name} must be {kinds}, not {value_text(value)}: let make build the rest")
 
 
-def _store(out: str | Path | None, make: Make, stack: ExitStack) -> tuple:
-    """Return the store of finished rows, locked. Raises OutputError for a folder of other results."""
-    if out is None:
-        return (NoStore(),)
+def _store(out: Path, make: Make, stack: ExitStack) -> RowStore:
+    """Return the store of finished rows in a folder, which is locked. Raises OutputError for a folder of other results."""
     check_free(out, overwrite=False)
-    path = Path(out) / REPORT
+    path = out / REPORT
     try:
         found = json.loads(path.read_bytes())["make"]
     except FileNotFoundError:
@@ -111,25 +112,15 @@ def _store(out: str | Path | None, make: Make, stack: ExitStack) -> tuple:
         raise OutputError(f"the folder {out} holds runs of {found}, not of {make.name}: name another folder")
     folder = make_folder(out)
     stack.enter_context(closing(FolderLock(folder)))
-    return (RowStore(folder),)
+    return RowStore(folder)
 
 
-def _places(workers: int | None, cluster: str | None, n_runs: int, stack: ExitStack) -> tuple[list[Place], str]:
-    """Return where rows are executed, and a description of it."""
-    if cluster is not None:
-        from taisoft.many.cluster import cluster_places, connect
-
-        found, _ = cluster_places(stack.enter_context(closing(connect(cluster, "cluster"))), CHILD, timed=False)
-        return found, _counted(len(found), len(found[0].cores))
+def _places(workers: int | None, threads: int | None, n_runs: int) -> list[LocalPlace]:
+    """Return places that share the cores of this machine. workers, threads: their number and that of each, if given."""
     cores = usable_cores()
-    wanted = thread_count(len(cores)) if os.environ.get(THREADS) else None
-    workers = workers or max(1, min(n_runs, len(cores) // (wanted or 1)))
-    threads = wanted or max(1, len(cores) // workers)
-    return [LocalPlace(cores[:threads], CHILD, threads) for _ in range(workers)], _counted(workers, threads)
-
-
-def _counted(workers: int, threads: int) -> str:
-    return f"{workers} worker{'s' * (workers > 1)} with {threads} thread{'s' * (threads > 1)} each"
+    workers = workers or max(1, min(n_runs, len(cores) // (threads or 1)))
+    threads = threads or max(1, len(cores) // workers)
+    return [LocalPlace(cores, CHILD, threads) for _ in range(workers)]
 
 
 class Many:
@@ -147,8 +138,10 @@ class Many:
         """Return all rows, in the order of the parameters."""
         return Results([self._rows[key] for key in self._keys], self._notes)
 
-    def run(self, there: list[Place], how: str, progress: bool, out: Path | None) -> None:
+    def run(self, there: list[Place], progress: bool, out: Path | None) -> None:
         """Run what is not done, and write table.csv and many.json, also after an interruption."""
+        n, threads = len(there), there[0].threads
+        how = f"{n} worker{'s' * (n > 1)} with {threads} thread{'s' * (threads > 1)} each"
         done, total = len(self._rows), len(self._rows) + len(self.waiting)
         before = f"{done} of them already done, " if self.waiting else "all of them already done"
         plan = f"{total} runs, " + (before if done else "") + (how if self.waiting else "")
@@ -161,9 +154,10 @@ class Many:
         def finished(key: str, answer: dict) -> None:
             row = self._rows[key] = self._row(key, answer)
             if row.status == "failed":
-                failures.append(f"{', '.join(f'{name}={value}' for name, value in row.parameters.items())}: {row.problems[0]}")
+                failures.append(key)
                 if len(failures) <= FAILURES_SHOWN:
-                    bar.say(f"failed: {failures[-1]}")
+                    given = ", ".join(f"{name}={value}" for name, value in row.parameters.items())
+                    bar.say(f"failed: {given}: {'; '.join(row.problems)}")
             n, now = len(self._rows), time.perf_counter()
             text = f"{clock_text((now - start) * (total - n) / (n - done))} left"
             bar.show(n, f"{len(failures)} failed, {text}" if failures else text, now)
