@@ -21,29 +21,9 @@ from taisoft.many import make, places, runs
 from taisoft.many.results import Results
 from taisoft.output.files import FolderLock
 from tests.many import makes
+from tests.many.stand_in import InProcess
 
 ROWS = [{"a": 1}, {"a": 2, "b": 0.5}, {"a": 3, "how": "degraded"}]
-
-
-class InProcess:
-    """A place in this process, which counts its requests. crash: what all end with."""
-
-    requests: list[dict] = []
-    crash = ""
-
-    def __init__(self, cores, child, threads):
-        self.cores, self.threads = cores, threads
-
-    def start(self, request: dict) -> None:
-        self.requests.append(request["parameters"])
-        answer = {"crash": self.crash} if self.crash else make.answer(json.loads(json.dumps(request)))
-        self._answer = json.loads(json.dumps(answer))
-
-    def poll(self) -> dict:
-        return self._answer
-
-    def stop(self) -> None:
-        pass
 
 
 @pytest.fixture(autouse=True)
