@@ -10,20 +10,22 @@ from pathlib import Path
 import numpy as np
 
 import taisoft as ts
+from taisoft.backend import runtime
 
-calls: list[int] = []  # of this process
+calls: list = []  # of this process
 
 
 def add(a: float, b: float = 1.0, how: str = "") -> dict:
-    """The sum, an array, a text, None, random numbers; or what `how` says."""
+    """The sum, an array, a text, None, random numbers; or what `how` says: "once" ends a process that was used."""
     if how == "raise":
         raise ValueError("no\nsuch thing")
     if how == "exit":
         sys.exit(3)
     if how == "warn":
         warnings.warn("thin", UserWarning, stacklevel=1)
-    if how == "die":
+    if how == "die" or (how == "once" and calls):
         os.kill(os.getpid(), signal.SIGKILL)
+    calls.append(how)
     report = ts.RunReport(status="degraded", problems=["two steps did not converge"])
     values = {"sum": a + b, "is_big": a > 2, "name": f"<{a}>", "nothing": None, "path": np.arange(a), "noise": np.random.rand()}
     return values | ({"run": report} if how == "degraded" else {})
@@ -39,14 +41,6 @@ def returned(kind: str):
         "object": {"x": object()},
     }
     return kinds[kind]
-
-
-def once(a: float) -> dict:
-    """Ends the process if it was called there before."""
-    if calls:
-        os.kill(os.getpid(), signal.SIGKILL)
-    calls.append(1)
-    return {"same": a}
 
 
 def slow(a: float) -> dict:
@@ -67,7 +61,7 @@ def beam(young: float, precision: str = "f32", closes: bool = True) -> dict:
         sim.close()
     else:
         calls.append(sim)
-    return {"low": x[:, 1].min(), "x": x, "run": report}
+    return {"low": x[:, 1].min(), "x": x, "run": report, "threads": runtime.threads()}
 
 
 if __name__ == "__main__":  # runs `slow` until a signal comes
