@@ -5,10 +5,12 @@ import inspect
 import io
 import json
 import os
+import signal
 import sys
+import threading
 import time
-from collections.abc import Callable, Iterable, Mapping
-from contextlib import ExitStack, closing
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import ExitStack, closing, contextmanager
 from functools import cache
 from pathlib import Path
 
@@ -165,7 +167,8 @@ class Many:
         requests = [(key, self._request | {"parameters": one}) for key, one in self.waiting.items()]
         left = dict.fromkeys(self.waiting, "it was interrupted")
         try:
-            left = carry_out(requests, there, finished)
+            with _interruption() as interrupted:
+                left = carry_out(requests, there, finished, stop_requested=interrupted)
         finally:
             bar.close()
             is_empty = not self._rows
@@ -209,6 +212,32 @@ class Many:
         if not record["raised"]:
             self._store.write(key, record)
         return _row(self.waiting[key], record)
+
+
+@contextmanager
+def _interruption() -> Iterator[Callable[[], bool]]:
+    """Yield a function that tells whether Ctrl-C was pressed, and raise KeyboardInterrupt at the end, or at a second Ctrl-C.
+
+    So it does not part what belongs together, such as a row and its file. Another handler of the caller's stays.
+    """
+    pressed: list[bool] = []
+
+    def press(*arguments) -> None:
+        if pressed:
+            signal.default_int_handler(*arguments)
+        pressed.append(True)
+
+    is_main = threading.current_thread() is threading.main_thread()
+    before = signal.getsignal(signal.SIGINT)
+    if is_ours := is_main and before is signal.default_int_handler:
+        signal.signal(signal.SIGINT, press)
+    try:
+        yield lambda: bool(pressed)
+    finally:
+        if is_ours:
+            signal.signal(signal.SIGINT, before)
+    if pressed:
+        raise KeyboardInterrupt
 
 
 def _row(parameters: dict, record: dict) -> Row:
