@@ -9,7 +9,7 @@ KNOTS, SECONDS = 6, 0.5  # of a rollout's tensions, and its length [s]
 LEG = (0.04, 0.16, 0.04)  # [m]
 
 
-def slide(friction: float, speed: float, cells: int = 8) -> dict:
+def slide(friction: float, speed: float, cells: int = 6) -> dict:
     """A cube that starts at a speed [m/s] along the ground: how far it slides until it rests, beside v^2 / (2 mu g) [m]."""
     scene = ts.Scene(gravity=(0.0, -GRAVITY, 0.0))
     rubber = ts.Material(young=1e6, poisson=0.3, density=1000.0, friction=friction, mass_damping=0.0, stiffness_damping=1e-3)
@@ -18,7 +18,7 @@ def slide(friction: float, speed: float, cells: int = 8) -> dict:
     scene.add_ground(friction=friction)
     ideal = speed**2 / (2.0 * friction * GRAVITY)
     path = []
-    with ts.Simulator(scene, dt=1 / 200, integrator="implicit_euler") as sim:
+    with ts.Simulator(scene, dt=1 / 720, integrator="implicit_euler") as sim:
         report = sim.run(
             1.2 * speed / (friction * GRAVITY), fps=100, on_frame=lambda sim, *_: path.append(sim.positions("cube").mean(axis=0))
         )

@@ -21,6 +21,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, nullcontext, suppress
 from typing import Protocol
 
+from taisoft.errors import SimulationError
 from taisoft.machine import THREADS
 from taisoft.output.report import json_text
 from taisoft.processes import how_it_ended, own_environment
@@ -151,9 +152,12 @@ class LocalPlace:
             environment |= {THREADS: str(self.threads)} | dict.fromkeys(BLAS_THREADS, "1")
             on_cores = nullcontext()
         streams = {"stdin": subprocess.PIPE, "stdout": self._stdout, "stderr": self._stderr}
-        with on_cores:
-            command = (sys.executable, *self._child)
-            self._process = subprocess.Popen(command, env=environment, start_new_session=True, **streams)
+        command = (sys.executable, *self._child)
+        try:
+            with on_cores:
+                self._process = subprocess.Popen(command, env=environment, start_new_session=True, **streams)
+        except OSError as error:
+            raise SimulationError(f"no further process can be started: {error.strerror or error}") from error
 
     def _send(self) -> None:
         self._n_requests += 1
