@@ -5,7 +5,7 @@ import numpy as np
 import taisoft as ts
 
 CUBE, GRAVITY = 0.1, 9.81  # edge [m], [m/s^2]
-KNOTS, SECONDS = 6, 0.5  # of a rollout's tensions, and its length [s]
+KNOTS, SECONDS = 6, 0.6  # of a rollout's tensions, and its length [s]
 LEG = (0.04, 0.16, 0.04)  # [m]
 
 
@@ -18,7 +18,7 @@ def slide(friction: float, speed: float, cells: int = 6) -> dict:
     scene.add_ground(friction=friction)
     ideal = speed**2 / (2.0 * friction * GRAVITY)
     path = []
-    with ts.Simulator(scene, dt=1 / 720, integrator="implicit_euler") as sim:
+    with ts.Simulator(scene, dt=1 / 800, integrator="implicit_euler") as sim:
         report = sim.run(
             1.2 * speed / (friction * GRAVITY), fps=100, on_frame=lambda sim, *_: path.append(sim.positions("cube").mean(axis=0))
         )
