@@ -24,16 +24,15 @@ from itertools import zip_longest
 from pathlib import Path
 
 import numpy as np
-import taichi as ti
 
 import taisoft as ts
 from taisoft.cli import Signals
 from taisoft.errors import SceneError, SimulationError
 from taisoft.files import write_bytes
 from taisoft.machine import machine, usable_cores
+from taisoft.many.places import LocalPlace, carry_out, serve
 from taisoft.output.tables import markdown
 from taisoft.study.accuracy import pack, unpack
-from taisoft.study.workers import LocalPlace, carry_out, serve
 
 from .bits_cases import Case, all_cases
 from .document import check_out, header
@@ -41,7 +40,7 @@ from .runner import make_parser, patched, progress, without_warnings
 
 STEPS = 20
 KIND, FORMAT = "taisoft bits", 1
-CHILD = (sys.executable, "-m", "taisoft", "bench", "bits", "--child")
+CHILD = ("-m", "taisoft", "bench", "bits", "--child")
 PARTS = ("positions", "velocities", "contacts")
 SAME, RECORDED = "same", "recorded"
 NOTHING = {"digests": [], "positions": pack(np.zeros((0, 3))), "contacts": 0, "error": "", "seconds": 0.0}
@@ -109,7 +108,6 @@ def answer(request: dict) -> dict:
         for module, name, value in PARALLEL if threads > 1 else ():
             stack.enter_context(patched(import_module(f"taisoft.{module}"), name, value))
         records = {case.key: run(case) for case in all_cases() if case.key in keys}
-    ti.reset()  # stores the compiled kernels
     return {"answer": records}
 
 

@@ -4,7 +4,6 @@ A run is a group and a name. Its record has the number of judged states and of t
 depth, the least distance of states that do not cross, sums over its steps, and how the run ended.
 """
 
-import sys
 import time
 import warnings
 from collections.abc import Callable
@@ -17,10 +16,10 @@ from taisoft import Simulator
 from taisoft.cli.scene_file import load_module, shipped_files
 from taisoft.errors import TaisoftError
 from taisoft.machine import machine, usable_cores
+from taisoft.many.places import LocalPlace, carry_out
+from taisoft.many.store import NoStore, Store, code_digest, digest
 from taisoft.records import RunReport, StepReport
 from taisoft.scene.scene import Scene
-from taisoft.study.output import NoStore, Store, code_digest, digest
-from taisoft.study.workers import LocalPlace, carry_out
 
 from . import crossing_shots
 from .crossing_heaps import folded_strip, make_heap
@@ -29,7 +28,7 @@ from .hard_cases.case import REFUSED, Session
 from .hard_runs import find
 from .runner import files_digest
 
-CHILD = (sys.executable, "-m", "taisoft", "bench", "crossings", "--child")
+CHILD = ("-m", "taisoft", "bench", "crossings", "--child")
 DEMOS, HARD, HEAPS, SHOTS, JITTERED = GROUPS = ("demos", "hard", "heaps", "shots", "jittered")
 N_HEAPS, N_STARTS = 200, 10
 JITTER = 1e-4  # [m], largest displacement along each axis of a jittered start

@@ -31,9 +31,9 @@ from pathlib import Path
 from taisoft.cli import Signals
 from taisoft.errors import OutputError
 from taisoft.machine import load_average
+from taisoft.many.places import serve
+from taisoft.many.store import NoStore, Store
 from taisoft.output.files import FolderLock, make_folder
-from taisoft.study.output import NoStore, Store
-from taisoft.study.workers import serve
 
 from .crossing_runs import DEMOS, DISTANCE_EVERY, GROUPS, HARD, HEAPS, JITTERED, NEAR, SHOTS, answer, carry_out_all, runs_of
 from .document import Document, header, table

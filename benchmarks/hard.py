@@ -23,9 +23,9 @@ from pathlib import Path
 from taisoft.cli import Signals
 from taisoft.errors import OutputError
 from taisoft.machine import load_average
+from taisoft.many.places import serve
+from taisoft.many.store import NoStore, Store
 from taisoft.output.files import FolderLock, make_folder
-from taisoft.study.output import NoStore, Store
-from taisoft.study.workers import serve
 
 from .document import Document, header, header_text
 from .hard_cases import CASES

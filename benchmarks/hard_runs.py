@@ -4,7 +4,6 @@ A variant is solved if it ended as required and met every limit. It is in one co
 an ok end that is not allowed or that misses a limit on the answer.
 """
 
-import sys
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -12,15 +11,15 @@ from pathlib import Path
 import numpy as np
 
 from taisoft.machine import machine, usable_cores
+from taisoft.many.places import LocalPlace, carry_out
+from taisoft.many.store import NoStore, Store, code_digest, digest
 from taisoft.study.accuracy import pack, unpack
-from taisoft.study.output import NoStore, Store, code_digest, digest
-from taisoft.study.workers import LocalPlace, carry_out
 
 from .hard_cases import CASES
 from .hard_cases.case import DEGRADED, END, FINER, OK, REFUSED, STOPPED, Case, Session, Variant, Verdict, judge
 from .runner import files_digest
 
-CHILD = (sys.executable, "-m", "taisoft", "bench", "hard", "--child")
+CHILD = ("-m", "taisoft", "bench", "hard", "--child")
 ANSWERED = (OK, DEGRADED)  # ends of complete runs
 CHEAP_SECONDS = 60.0  # estimated time up to which references run by default
 WRONG, NOT_RUN = "wrong", "not run"

@@ -13,13 +13,13 @@ import numpy as np
 from taisoft.errors import OutputError
 from taisoft.files import cache_folders, replacing
 from taisoft.machine import machine
-from taisoft.study.output import code_digest, digest
+from taisoft.many.store import NOT_COMPUTING, code_digest, digest
 
 from .runner import files_digest
 
 HERE = Path(__file__).parent
 SOURCES = (HERE / "error_cases.py", HERE / "reference_cases" / "record.py")
-NOT_RUNNING = ("estimation",)  # folder of taisoft on which runs with given steps do not depend
+NOT_RUNNING = (*NOT_COMPUTING, "estimation")  # folders of taisoft on which runs with given steps do not depend
 
 
 class StoredRuns:

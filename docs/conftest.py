@@ -1,11 +1,12 @@
 """The examples of the manual run: `python -m pytest docs`.
 
-Every page is a script, in a folder of its own. Blocks marked `python` run one after the other and share their names; blocks
-marked `toml` are written to my_scene.toml and read; blocks marked `sh` run in a shell. Lines that begin with `taisoft` in
-blocks marked `console` are not run, but their options must exist.
+Every page is a script, in a folder of its own. Blocks marked `python` run one after the other and share their names, and after a
+line "Save this as `NAME`:" they are written to NAME, too; blocks marked `toml` are written to my_scene.toml and read; blocks
+marked `sh` run in a shell. Lines that begin with `taisoft` in blocks marked `console` are not run, but their options must exist.
 """
 
 import os
+import re
 import shlex
 import subprocess
 import sys
@@ -25,6 +26,24 @@ def read_scene(example) -> None:
     Path("my_scene.toml").write_text(example.parsed)
     scene, _ = ts.read_scene("my_scene.toml")
     assert scene.bodies
+
+
+class PythonBlocks(PythonCodeBlockParser):
+    """Runs blocks, and writes those that the reader saves."""
+
+    def __call__(self, document):
+        for region in super().__call__(document):
+            if saved := re.search(r"Save this as `([\w.]+)`:\n\n$", document.text[: region.start]):
+                region.evaluator = save_before(saved[1], region.evaluator)
+            yield region
+
+
+def save_before(name: str, run):
+    def evaluate(example):
+        Path(name).write_text(example.parsed)
+        return run(example)
+
+    return evaluate
 
 
 def run_shell(example) -> None:
@@ -50,7 +69,7 @@ def own_folder(tmp_path_factory):
 
 SYBIL = Sybil(
     parsers=[
-        PythonCodeBlockParser(),
+        PythonBlocks(),
         CodeBlockParser("toml", read_scene),
         CodeBlockParser("sh", run_shell),
         CodeBlockParser("console", lambda example: check_commands(example.parsed)),

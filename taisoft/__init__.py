@@ -48,6 +48,8 @@ _MODULES = {  # public name -> the module that defines it
     "modes": "taisoft.stability",
     "evaluate_law": "taisoft.fem.laws.evaluate",
     "solve_contact_problem": "taisoft.contact.api",
+    "run_many": "taisoft.many.runs",
+    "Results": "taisoft.many.results",
     "Energies": "taisoft.records",
     "ErrorEstimate": "taisoft.records",
     "StepReport": "taisoft.records",

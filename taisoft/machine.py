@@ -14,7 +14,9 @@ from pathlib import Path
 
 import numpy as np
 
-from taisoft.errors import OutputError, TaisoftError
+from taisoft.errors import OutputError, SimulationError, TaisoftError
+
+THREADS, MAX_THREADS = "TAISOFT_THREADS", 1024
 
 
 @dataclass(frozen=True)
@@ -61,6 +63,17 @@ def versions(*packages: str) -> dict[str, str | None]:
 def usable_cores() -> list[int]:
     """Numbers of the cores that this process may use, ascending; all of them if the system has no CPU affinity."""
     return sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else list(range(os.cpu_count() or 1))
+
+
+def thread_count(cores: int) -> int:
+    """Number of threads of parallel loops: the environment variable TAISOFT_THREADS, else the number of usable cores.
+
+    Raises SimulationError unless the variable is a whole number from 1 to 1024.
+    """
+    text = os.environ.get(THREADS, "").strip() or str(cores)
+    if not text.isdecimal() or not 1 <= int(text) <= MAX_THREADS:
+        raise SimulationError(f"{THREADS} must be the number of threads, a whole number from 1 to {MAX_THREADS}, not {text!r}")
+    return int(text)
 
 
 def processor() -> str:

@@ -21,7 +21,7 @@ SHARED = Path(__file__).resolve().parents[1].parent / "shared"
 FOLDERS = (
     *("references", "dynamics", "fem", "contact", "collision", "linear", "simulator", "estimation"),
     *("structure", "scene", "mesh", "backend"),
-    *("output", "study", "view", "faults", "cli", "benchmarks", "scenes"),
+    *("output", "study", "many", "view", "faults", "cli", "benchmarks", "scenes"),
 )
 
 

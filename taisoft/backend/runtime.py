@@ -24,7 +24,7 @@ from taisoft.backend.launching import Kernels
 from taisoft.backend.private import impl
 from taisoft.errors import SimulationError
 from taisoft.files import cache_folders
-from taisoft.machine import address_space, format_bytes, usable_cores
+from taisoft.machine import address_space, format_bytes, thread_count, usable_cores
 
 PRECISIONS = {"f32": ti.f32, "f64": ti.f64}
 ARCHS = {"cpu": ti.cpu, "cuda": ti.cuda}
@@ -136,7 +136,7 @@ def _initialise(arch: str, precision: str) -> None:
         raise SimulationError("the working folder no longer exists: change to one that does") from None
     folder = cache_folder()
     remove_stale_lock(Path(folder))
-    available = address_space()
+    available, threads_wanted = address_space(), thread_count(len(usable_cores()))
     if arch == "cpu" and available is not None and available < CPU_POOL_BYTES:
         shortage = f"{format_bytes(CPU_POOL_BYTES)} are needed at once, available: {format_bytes(available)}"
         raise SimulationError(f"not enough memory to start Taichi: {shortage}")
@@ -153,7 +153,7 @@ def _initialise(arch: str, precision: str) -> None:
                 log_level=ti.ERROR,
                 random_seed=0,
                 offline_cache_max_size_of_files=KERNEL_CACHE_BYTES,
-                cpu_max_num_threads=len(usable_cores()),  # Taichi's default also counts cores this process may not use
+                cpu_max_num_threads=threads_wanted,  # Taichi's default also counts cores this process may not use
             )
     except RuntimeError as error:
         raise SimulationError(f"Taichi does not start: {(str(error).splitlines() or ['no reason given'])[0]}") from None
@@ -177,6 +177,11 @@ def forget() -> None:
     if _open:
         raise SimulationError(f"{_open[0].owner} is open: close it first")
     _kind = None
+
+
+def end() -> None:
+    """Store compiled kernels on disk, which Taichi does when it ends; everything in its memory is then gone."""
+    ti.reset()
 
 
 def threads() -> int:

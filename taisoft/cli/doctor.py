@@ -16,7 +16,7 @@ from importlib import metadata
 from taisoft import __version__
 
 REQUIRED = ("taichi", "numpy", "scipy", "meshio", "usd-core", "networkx", "rich")
-# package -> the extra that installs it; only benchmarks use other programs, only studies use a cluster
+# package -> the extra that installs it; only benchmarks use other programs, only studies and run_many use a cluster
 OPTIONAL = {"wildmeshing": "mesh", "imageio-ffmpeg": "video", "matplotlib": "plot", "pillow": "plot", "viser": "notebook"}
 OPTIONAL |= {"pyvista": "pyvista", "distributed": "cluster", "mujoco-core": "robot", "pybullet": "peers", "newton": "peers"}
 OPTIONAL |= {"argcomplete": "completion"}

@@ -3,6 +3,7 @@
 `python -m taisoft.cli.study` is the child process that plans, or executes one run. The command itself loads no Taichi.
 """
 
+import os
 import sys
 import time
 from argparse import Namespace
@@ -13,15 +14,18 @@ from pathlib import Path
 from taisoft.cli import EXIT_FAILED, EXIT_SIGNAL, Interrupted, Signals, parse_scalar
 from taisoft.cli.scene_file import check_scene_solver, find_scene, load_scene
 from taisoft.errors import SceneError, TaisoftError
+from taisoft.machine import usable_cores
+from taisoft.many.cluster import cluster_places, connect
+from taisoft.many.places import LocalPlace, serve
+from taisoft.many.store import Store, code_digest, digests, sources
 from taisoft.output.files import FolderLock, check_free, make_folder
 from taisoft.output.report import machine
 from taisoft.scene import checks
 from taisoft.scene.checks import check_solver
 from taisoft.study import AXES, Request, mesh_name
-from taisoft.study.output import FILES, Store, check_scene, code_digest, digests, sources, write
+from taisoft.study.output import FILES, check_scene, write
 from taisoft.study.results import Study, text_of
-from taisoft.study.runner import Runner
-from taisoft.study.workers import cluster_places, connect, local_places, serve
+from taisoft.study.runner import CHILD, Runner
 
 INTEGER_AXES = {"order": (1, 2), "refine": (0, 1, 2, 3, 4)}
 ENDING = "ending; runs that are finished are kept"
@@ -77,9 +81,20 @@ def _places(arguments: Namespace, request: Request, stack: ExitStack) -> tuple[l
         return local_places(1 if arguments.workers is None else arguments.workers), [machine()]
     if arguments.workers is not None:
         raise SceneError("--workers sets this machine's processes, and --scheduler has its own workers: give one of them")
-    client = stack.enter_context(closing(connect(arguments.scheduler)))
+    client = stack.enter_context(closing(connect(arguments.scheduler, "--scheduler")))
     request.scene = str(Path(request.scene).absolute()) if request.scene.endswith((".py", ".toml")) else request.scene
-    return cluster_places(client)
+    return cluster_places(client, CHILD)
+
+
+def local_places(number: int) -> list[LocalPlace]:
+    """Return places that divide this process's cores evenly. Raises SceneError if there are fewer cores than places."""
+    cores = usable_cores()
+    if not 1 <= number <= len(cores):
+        raise SceneError(f"--workers {number}: it must be between 1 and {len(cores)}, the number of cores: timed runs share none")
+    if number > 1 and not hasattr(os, "sched_setaffinity"):
+        raise SceneError(f"--workers {number}: this system cannot pin processes to cores, so timed runs could share one")
+    each = len(cores) // number
+    return [LocalPlace(cores[k * each : (k + 1) * each], CHILD) for k in range(number)]
 
 
 def parse_request(arguments: Namespace) -> Request:
@@ -139,7 +154,7 @@ def answer(request: dict) -> dict:
             return {"error": "taisoft, Taichi or NumPy there differs from the one that planned the study"}
         task = request["task"]
         scene = variant(task["setting"]["refine"], task["setting"]["order"])
-        found = digests(find_scene(name), request["sources"])
+        found = digests(find_scene(name).parent, request["sources"])
         if scenes != {mesh_name(task["setting"]): request["digest"]} or found != request["sources"]:
             return {"error": "the scene there differs from the planned one: it was changed meanwhile, or is another file"}
         return {"answer": measure(scene, task)}

@@ -162,40 +162,38 @@ def _plain(value):
     return str(value)
 
 
-class Progress:
-    """Observer that shows the progress of a run of `seconds` [s] of simulated time on a stream (stderr by default).
+class Bar:
+    """Progress on a stream: a bar on a terminal, elsewhere a line every few seconds. form: of what is done and the total."""
 
-    On a terminal it is a bar with steps/s and the remaining time, elsewhere a line every few seconds.
-    """
+    def __init__(self, total: float, label: str, stream: TextIO, form: str):
+        self._total, self._label, self._stream, self._form = total, label, stream, form
+        self._last_line: float | None = None
+        self._bar = None
+        if stream.isatty():
+            from rich.console import Console
+            from rich.progress import BarColumn, Progress, TextColumn
 
-    def __init__(self, seconds: float, label: str = "run", stream: TextIO | None = None):
-        self.seconds, self.label = seconds, label
-        self.stream = sys.stderr if stream is None else stream
-        self._started: float | None = None  # wall time of the first frame; construction and compilation come before
-        self._first_time = self._last_line = self._compiled = self._time = 0.0
-        self._text = "starting"
-        self._first_step = 0
-        self._bar = _bar(seconds, label, self.stream) if self.stream.isatty() else None
+            columns = TextColumn("{task.description}"), BarColumn(bar_width=30), TextColumn("{task.fields[note]}")
+            self._bar = Progress(*columns, console=Console(file=stream), refresh_per_second=5, transient=False)
+            self._bar.add_task(label, total=total, note="starting")
+            self._bar.start()
 
-    def frame(self, sim, index: int) -> None:
-        """Show sim.time, and the speed since the first frame without compiling, which does not go on."""
-        now = time.perf_counter()
-        if self._started is None:
-            self._started, self._first_time, self._first_step = now, sim.time, sim.step_count
-            self._last_line, self._compiled = now, sim.compile_seconds
-        self._time, self._text = sim.time, self._speed(sim, now - self._started - (sim.compile_seconds - self._compiled))
-        self._show(self._text, now)
-
-    def iteration(self, n: int) -> None:
-        """Show how many Newton iterations a long step has taken so far, as `Simulator.run` calls it."""
-        self._show(f"{self._text}, a step with {n} Newton iterations so far", time.perf_counter())
-
-    def _show(self, text: str, now: float) -> None:
+    def say(self, text: str) -> None:
+        """Print a line."""
         if self._bar is not None:
-            self._bar.update(self._bar.task_ids[0], completed=min(self._time, self.seconds), note=text)
+            self._bar.console.print(text, markup=False, highlight=False)
+        else:
+            print(f"{self._label}: {text}", file=self._stream, flush=True)
+
+    def show(self, done: float, text: str, now: float) -> None:
+        """Show what is done, with a text. now: wall time [s]."""
+        text = f"{self._form.format(done, self._total)}, {text}"
+        self._last_line = now if self._last_line is None else self._last_line
+        if self._bar is not None:
+            self._bar.update(self._bar.task_ids[0], completed=min(done, self._total), note=text)
         elif now - self._last_line >= LINE_EVERY:
             self._last_line = now
-            print(f"{self.label}: {self._time:.3f} of {self.seconds:g} s, {text}", file=self.stream, flush=True)
+            self.say(text)
 
     def close(self) -> None:
         """Stop the bar; a second call does nothing."""
@@ -203,28 +201,45 @@ class Progress:
             self._bar.stop()
             self._bar = None
 
+
+class Progress:
+    """Observer that shows the progress of a run of `seconds` [s] of simulated time on a stream (stderr by default): a Bar with
+    steps/s and the remaining time."""
+
+    def __init__(self, seconds: float, label: str = "run", stream: TextIO | None = None):
+        self.seconds, self._bar = seconds, Bar(seconds, label, stream or sys.stderr, "{:.3f} of {:g} s")
+        self._started: float | None = None  # wall time of the first frame; construction and compilation come before
+        self._first_time = self._compiled = self._time = 0.0
+        self._text = "starting"
+        self._first_step = 0
+
+    def frame(self, sim, index: int) -> None:
+        """Show sim.time, and the speed since the first frame without compiling, which does not go on."""
+        now = time.perf_counter()
+        if self._started is None:
+            self._started, self._first_time, self._first_step = now, sim.time, sim.step_count
+            self._compiled = sim.compile_seconds
+        self._time, self._text = sim.time, self._speed(sim, now - self._started - (sim.compile_seconds - self._compiled))
+        self._bar.show(self._time, self._text, now)
+
+    def iteration(self, n: int) -> None:
+        """Show how many Newton iterations a long step has taken so far, as `Simulator.run` calls it."""
+        self._bar.show(self._time, f"{self._text}, a step with {n} Newton iterations so far", time.perf_counter())
+
+    def close(self) -> None:
+        """Stop the bar; a second call does nothing."""
+        self._bar.close()
+
     def _speed(self, sim, elapsed: float) -> str:
         done = sim.time - self._first_time
         if elapsed <= 0 or done <= 0:
             return "starting"
         rate = (sim.step_count - self._first_step) / elapsed
         left = max(self.seconds - sim.time, 0.0) * elapsed / done
-        return f"{rate:.4g} steps/s, {_clock(left)} left"
+        return f"{rate:.4g} steps/s, {clock_text(left)} left"
 
 
-def _bar(seconds: float, label: str, stream: TextIO):
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn
-
-    label_text, done = TextColumn("{task.description}"), TextColumn("{task.completed:.2f} of {task.total:g} s")
-    columns = label_text, BarColumn(bar_width=30), done, TextColumn("{task.fields[note]}")
-    bar = Progress(*columns, console=Console(file=stream), refresh_per_second=5, transient=False)
-    bar.add_task(label, total=seconds, note="starting")
-    bar.start()
-    return bar
-
-
-def _clock(seconds: float) -> str:
+def clock_text(seconds: float) -> str:
     """Format seconds as h:mm:ss or m:ss."""
     minutes, second = divmod(round(seconds), 60)
     hours, minute = divmod(minutes, 60)

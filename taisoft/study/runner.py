@@ -5,12 +5,14 @@ from dataclasses import dataclass, field
 
 from taisoft.errors import SceneError, SimulationError
 from taisoft.estimation.comparison import Error
-from taisoft.machine import summarise, usable_cores
+from taisoft.machine import summarise, thread_count, usable_cores
+from taisoft.many.places import BUDGET_SPENT, CUT_BY_BUDGET, LocalPlace, Place, carry_out
+from taisoft.many.store import NoStore, Store, digest
 from taisoft.study import Request, describe, mesh_name
 from taisoft.study.accuracy import Reference, Row, error_in_space, finest_own_error, make_reference, row_of, unpack
-from taisoft.study.output import NoStore, Store, digest
 from taisoft.study.results import Study
-from taisoft.study.workers import BUDGET_SPENT, CUT_BY_BUDGET, LocalPlace, Place, carry_out
+
+CHILD = ("-m", "taisoft.cli.study")
 
 
 @dataclass(frozen=True)
@@ -62,7 +64,7 @@ class Runner:
     seconds_left: Callable[[], float]
     report: Callable[[str], None]
     store: Store | NoStore = field(default_factory=NoStore)
-    planner: Place = field(default_factory=lambda: LocalPlace(usable_cores()))
+    planner: Place = field(default_factory=lambda: LocalPlace(usable_cores(), CHILD))
 
     def plan(self) -> dict | None:
         """Plan in a child process on this machine, which loads the scene; its time does not count towards the budget.
@@ -71,8 +73,7 @@ class Runner:
         """
         answers: dict[str, dict] = {}
         requests = [("plan", self._request("plan") | {"request": self.request.for_plan()})]
-        limits = {"seconds_left": lambda: 1.0, "stop_requested": self.stop_requested}
-        if carry_out(requests, [self.planner], answers.__setitem__, **limits):
+        if carry_out(requests, [self.planner], answers.__setitem__, stop_requested=self.stop_requested):
             return None
         found = answers["plan"]
         if "answer" not in found:
@@ -111,7 +112,7 @@ class Runner:
 
     def key(self, plan: dict, task: Task) -> str:
         machines = sorted(self.machines, key=lambda one: one["name"])  # a cluster lists them in any order
-        hardware = [machines, len(self.places[0].cores)]
+        hardware = [machines, thread_count(len(self.places[0].cores))]
         scene = [plan["scenes"][mesh_name(task.setting)], plan["sources"]]
         return digest([self._task(plan, task), scene, plan["code"], hardware])[:32]
 

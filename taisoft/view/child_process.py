@@ -5,17 +5,14 @@ no `if __name__ == "__main__"`, and nothing but what travels over the link (`tai
 it is asked to, and when its caller ends, however that ends.
 """
 
-import os
-import signal
 import subprocess
 import sys
 from collections.abc import Callable
 from contextlib import suppress
 from multiprocessing.connection import Connection
-from pathlib import Path
 
-import taisoft
 from taisoft.errors import OutputError, TaisoftError, no_memory
+from taisoft.processes import how_it_ended, own_environment
 from taisoft.view.link import Link, LinkClosed, SharedNodes, receive
 
 END_SECONDS = 5.0  # in which a process must end
@@ -61,8 +58,7 @@ class ChildProcess:
             status = self._process.wait(END_SECONDS)
         except subprocess.TimeoutExpired:
             return "its process does not answer"
-        how = f"by signal {signal.Signals(-status).name}" if status < 0 else f"with exit status {status}"
-        return f"its process ended {how}"
+        return how_it_ended(status)
 
     def close(self) -> None:
         """Ask the process to end and wait for that; a second call does nothing."""
@@ -81,10 +77,9 @@ class ChildProcess:
 
 def _start(command: tuple[str, ...], *descriptors: int) -> subprocess.Popen:
     """Start a process with this version of taisoft; a session of its own shields it from the terminal's Ctrl-C."""
-    folder = str(Path(taisoft.__file__).resolve().parents[1])
-    paths = {"PYTHONPATH": os.pathsep.join(filter(None, (folder, os.environ.get("PYTHONPATH"))))}
     full = [*command, *map(str, descriptors)]
-    return subprocess.Popen(full, env=os.environ | paths, pass_fds=descriptors, stdin=subprocess.DEVNULL, start_new_session=True)
+    streams = {"pass_fds": descriptors, "stdin": subprocess.DEVNULL}
+    return subprocess.Popen(full, env=own_environment(), start_new_session=True, **streams)
 
 
 def serve(make: Callable[[Link, dict], object], socket: int, memory: int) -> None:

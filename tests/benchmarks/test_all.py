@@ -4,7 +4,7 @@ Where a benchmark has no small form, one is made here. Stand-ins take the place 
 
 * implicit steps with contacts, which take a minute to compile: contact and crossings take explicit ones, paths has none, ipc
   shows made-up rows, and so do order and launches;
-* child processes, whose work is done in this process: crossings, hard, paths, pictures, scaling;
+* child processes, whose work is done in this process: crossings, hard, many, paths, pictures, scaling;
 * the simulators of error and tolerance, by one with known errors; MuJoCo in elasticity; the display of window.
 
 The long runs do without them. The others run in test_cuda_check.py, test_document.py (figures, manual), test_peers.py and
@@ -31,6 +31,7 @@ from benchmarks import (
     elasticity_runs,
     hard_runs,
     launches,
+    many,
     order,
     path_runs,
     paths,
@@ -50,6 +51,8 @@ from taisoft.dynamics.schemes import EXPLICIT, IMPLICIT
 from taisoft.view.pictures import picture_writer
 from tests.benchmarks import stand_ins
 from tests.benchmarks.stand_ins import SOLVER, SPACE, TIME, ModelSimulator, answered
+from tests.many import makes
+from tests.many.stand_in import InProcess
 
 CELLS = (12, 3, 3)
 
@@ -142,6 +145,18 @@ def ipc_small(patch, folder):
     from benchmarks import ipc
 
     replace(patch, ipc, run_child=stand_ins.ipc_record)
+
+
+def many_small(patch, folder):
+    """No kill."""
+    patch.setattr("taisoft.many.runs.LocalPlace", InProcess)
+    replace(patch, many, PARTS={"sums": (makes.add, [{"a": float(k)} for k in range(9)])})
+    replace(patch, many, killed=lambda name, n, workers, whole, folder: (many.run(name, n, 1, out=folder)[0].digest(), n // 2))
+
+
+def many_check(n):
+    digests = n["parts"]["sums"]["digests"]
+    assert len(digests) >= 5 and len(set(digests.values())) == 1 and n["parts"]["sums"]["runs"] == many.QUICK_RUNS
 
 
 def order_small(patch, folder):
@@ -251,6 +266,7 @@ RUNS = {
     "launches": Small(
         QUICK, ("| 200 | 2.00 (2.00 to 2.00) | 8.00 (8.00 to 8.00) | 0.25 (0.25 to 0.25) |", "| resting"), launches_small
     ),
+    "many": Small(QUICK, ("| sums | 6 |", "| killed and called again |", "| met |"), many_small, many_check),
     "order": Small(QUICK, ("| SNH | 1 | 1 | 11x2x2 | 220 | 108 | -2.26758 | 16.3 |",), order_small),
     "paths": Small(("--what", "cost", "--quick"), ("## Cost", "| hanging_beam |", "| met |"), paths_small, paths_check),
     "pictures": Small(QUICK, ("| kernels |", "| PNG |", "| hanging_beam |"), pictures_small, pictures_check),

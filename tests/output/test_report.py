@@ -117,7 +117,7 @@ def test_progress(terminal, compiling, shown, monkeypatch):
     bar.close()
     text = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", stream.getvalue())
     assert (
-        all(part in text for part in (*shown.split(", "), "2.50 of 10 s", "34 Newton iterations"))
+        all(part in text for part in (*shown.split(", "), "2.500 of 10 s", "34 Newton iterations"))
         if terminal
         else re.fullmatch(
             rf"beam: 1.500 of 10 s, {shown}\nbeam: 2.500 of 10 s, .* left, a step with 34 Newton iterations so far\n", text

@@ -31,7 +31,7 @@ DOCS = ROOT / "docs"
 PAGES = sorted(path for path in DOCS.rglob("*.md") if "results" not in path.relative_to(DOCS).parts)
 TESTED = {"python", "toml", "sh", "console"}  # kinds of blocks that docs/conftest.py runs or checks
 UNTESTED = {"text", "{literalinclude}", "{eval-rst}"}  # kinds of blocks that are not examples
-READERS_FILES = {"my_scene.py", "drop.py", "taisoft/fem/laws/modified_svk.py"}  # written by the reader
+READERS_FILES = {"my_scene.py", "drop.py", "beams.py", "my_runs.py", "taisoft/fem/laws/modified_svk.py"}  # written by the reader
 DOCUMENTS = [*PAGES, ROOT / "README.md", ROOT / "CONTRIBUTING.md"]
 
 

@@ -27,7 +27,7 @@ TEST_FILES = sorted(TESTS.rglob("*.py"))
 
 # Modules and packages under taisoft/, left to right; those of one group may import one another, except the pairs in FORBIDDEN.
 ORDER = (
-    ("errors", "records", "files", "nested", "ranges", "machine", "compile_message", "display"),
+    ("errors", "records", "files", "nested", "ranges", "machine", "processes", "compile_message", "display"),
     ("attributes",),
     ("backend.private",),
     ("backend.tracing", "backend.device_memory"),
@@ -65,6 +65,7 @@ ORDER = (
         *("output.vtu", "view.offscreen"),  # for methods of Simulator
     ),
     ("output", "view"),
+    ("many",),
     ("study",),
     ("cli",),
     ("__main__",),

@@ -11,7 +11,7 @@ from taisoft.cli import study as study_command
 from taisoft.cli.study import check_device
 from taisoft.errors import SceneError
 from taisoft.machine import usable_cores
-from taisoft.study import workers
+from taisoft.many import cluster
 
 
 def study(*arguments) -> int:
@@ -37,7 +37,7 @@ def test_invalid_arguments_are_rejected(beam, tmp_path, capsys):
 def test_unknown_scenes_schedulers_and_used_folders_are_refused(beam, tmp_path, capsys, monkeypatch):
     assert study("no_such_demo") == 2
     assert "neither a demo nor a .toml or .py file" in capsys.readouterr().err
-    monkeypatch.setattr(workers, "CONNECT_SECONDS", 0.3)
+    monkeypatch.setattr(cluster, "CONNECT_SECONDS", 0.3)
     assert study(beam, "--scheduler", "tcp://127.0.0.1:9") == 2
     assert re.search("no Dask scheduler answers there|needs the package distributed", capsys.readouterr().err)
     (tmp_path / "report.json").write_text("{}")

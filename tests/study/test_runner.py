@@ -16,8 +16,10 @@ import pytest
 
 from taisoft.errors import OutputError
 from taisoft.machine import versions
-from taisoft.study import Request, Setting, output
-from taisoft.study.output import NoStore, Store, check_scene, write
+from taisoft.many import store as stores
+from taisoft.many.store import NoStore, Store
+from taisoft.study import Request, Setting
+from taisoft.study.output import check_scene, write
 from taisoft.study.results import csv_of, text_of
 from taisoft.study.runner import Runner
 from tests.study.study_places import Pendulum
@@ -168,7 +170,7 @@ def test_damaged_records_are_reported_and_repeated(tmp_path, damage):
 def test_interrupted_study_keeps_finished_runs(tmp_path):
     place = Pendulum(plan())
     study = run(place, Store(tmp_path), requested=lambda: len(place.requests) >= 5)
-    assert study.ended == "the study was interrupted" and len(list((tmp_path / "runs").iterdir())) == 3
+    assert study.ended == "it was interrupted" and len(list((tmp_path / "runs").iterdir())) == 3
     assert run(Pendulum(plan()), requested=lambda: True) is None
 
 
@@ -200,8 +202,8 @@ def test_folder_of_another_scenes_study_is_rejected(tmp_path):
 
 
 def test_code_digest_depends_on_package_versions(monkeypatch):
-    installed = output.code_digest()
-    assert output.code_digest() == installed
+    installed = stores.code_digest()
+    assert stores.code_digest() == installed
     for changed in ({"taichi": "9.9"}, {"numpy": "9.9"}):
-        monkeypatch.setattr(output, "versions", lambda *names, changed=changed: versions(*names) | changed)
-        assert output.code_digest() != installed
+        monkeypatch.setattr(stores, "versions", lambda *names, changed=changed: versions(*names) | changed)
+        assert stores.code_digest() != installed

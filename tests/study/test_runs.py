@@ -14,11 +14,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from taisoft.cli.study import local_places
 from taisoft.errors import SceneError
 from taisoft.machine import usable_cores
+from taisoft.many.cluster import cluster_places
+from taisoft.many.places import LocalPlace, carry_out
 from taisoft.study import Request
-from taisoft.study.runner import Runner, tasks_of
-from taisoft.study.workers import CHILD, LocalPlace, carry_out, cluster_places, local_places
+from taisoft.study.runner import CHILD, Runner, tasks_of
 from tests.cli.command import ROOT, write
 from tests.study.study_places import InProcess
 
@@ -101,7 +103,7 @@ PINNED = "import os\nraise ValueError(f'cores {sorted(os.sched_getaffinity(0))}'
 
 def answers_of(requests: list, places: list) -> dict:
     answers: dict = {}
-    assert carry_out(requests, places, answers.__setitem__, seconds_left=lambda: 1.0, stop_requested=bool) == {}
+    assert carry_out(requests, places, answers.__setitem__) == {}
     return answers
 
 
@@ -125,9 +127,9 @@ def test_workers_are_pinned_to_separate_cores(tmp_path):
 def test_processes_that_exit_early_are_reported(tmp_path):
     """Without an answer, and without reading the request."""
     path = write(tmp_path / "dead.py", "import os, sys\nprint('hello', file=sys.stderr, flush=True)\nos._exit(7)\n")
-    answers = answers_of([("a", request(path))], [LocalPlace(usable_cores())])
+    answers = answers_of([("a", request(path))], [LocalPlace(usable_cores(), CHILD)])
     assert answers["a"] == {"crash": "its process ended with exit status 7 without an answer: hello"}
-    child = (sys.executable, "-c", "import os; os._exit(3)")
+    child = ("-c", "import os; os._exit(3)")
     large = {"text": "x" * 1_000_000}  # more than a pipe holds
     answers = answers_of([("a", large)], [LocalPlace(usable_cores(), child)])
     assert answers["a"] == {"crash": "its process ended with exit status 3 without an answer"}
@@ -135,7 +137,7 @@ def test_processes_that_exit_early_are_reported(tmp_path):
 
 def test_a_run_ends_with_its_study(tmp_path):
     """Its process ends when its stdin closes."""
-    process = subprocess.Popen(CHILD, stdin=subprocess.PIPE, env=os.environ | {"PYTHONPATH": str(ROOT)})
+    process = subprocess.Popen((sys.executable, *CHILD), stdin=subprocess.PIPE, env=os.environ | {"PYTHONPATH": str(ROOT)})
     path = write(tmp_path / "slow.py", "import time\ntime.sleep(100)\n")
     process.communicate(json.dumps(request(path)).encode() + b"\n", timeout=60)
     assert process.returncode == 1
@@ -144,7 +146,7 @@ def test_a_run_ends_with_its_study(tmp_path):
 def test_workers_of_a_cluster_use_separate_cores_and_may_be_lost():
     def places(*infos):
         table = {f"tcp://{k}": {"machine": {"name": name}, "cores": cores} for k, (name, cores) in enumerate(infos)}
-        return cluster_places(SimpleNamespace(run=lambda function: table))
+        return cluster_places(SimpleNamespace(run=lambda function: table), CHILD)
 
     found, machines = places(("a", [0, 1, 2, 3, 4]), ("a", [0, 1, 2, 3, 4]), ("b", [0, 1, 2]))
     assert [place.cores for place in found] == [[0, 1], [2, 3], [0, 1]] and machines == [{"name": "a"}, {"name": "b"}]
@@ -160,5 +162,5 @@ def test_workers_of_a_cluster_use_separate_cores_and_may_be_lost():
     lost.is_lost, kept.is_lost = True, False
     assert answers_of([("a", {"n": 1}), ("b", {"n": 2})], [lost, kept]) == {"a": {"answer": {"n": 1}}, "b": {"answer": {"n": 2}}}
     assert len(lost.requests) == 1
-    left = carry_out([("a", {})], [lost], print, seconds_left=lambda: 1.0, stop_requested=lambda: False)
+    left = carry_out([("a", {})], [lost], print)
     assert left == {"a": "it is gone"}

@@ -1,0 +1,135 @@
+"""Places on the workers of a Dask cluster.
+
+Every worker of a machine has its share of the cores, and all use as many as the smallest share. Workers need this taisoft and the
+user's files under the same names, which each request's child checks. Dask sends Python objects unencrypted: use only a cluster on
+a trusted network.
+"""
+
+import threading
+import time
+import uuid
+from contextlib import suppress
+
+from taisoft.errors import SceneError
+from taisoft.machine import usable_cores
+from taisoft.many.places import POLL_INTERVAL, LocalPlace
+from taisoft.output.report import machine
+
+CONNECT_SECONDS = 10  # to a cluster's scheduler
+ALIVE_CHECK_INTERVAL = 2.0  # [s]
+
+
+class ClusterPlace:
+    """One worker of a Dask cluster, which has a LocalPlace. child, threads: of that."""
+
+    def __init__(self, client, address: str, cores: list[int], child: tuple[str, ...], threads: int | None = None):
+        self.cores, self.threads, self._client, self._address = cores, threads, client, address
+        self._local, self._name = (cores, child, threads), ""
+        self._future, self._last_check = None, 0.0
+
+    def start(self, request: dict) -> None:
+        """See Place."""
+        self._name = self._name or uuid.uuid4().hex
+        there = {"workers": [self._address], "allow_other_workers": False, "pure": False, "retries": 0}
+        self._future = self._client.submit(run_on_worker, request, self._name, self._local, **there)
+
+    def poll(self) -> dict | None:
+        """See Place."""
+        if self._future is None:
+            return None
+        if not self._future.done():
+            return self._check_alive()
+        future, self._future = self._future, None
+        if future.status == "finished":
+            return future.result()
+        if future.status == "error":
+            return {"crash": f"the worker {self._address}: {type(future.exception()).__name__}: {future.exception()}"}
+        return {"lost": f"the worker {self._address} is gone"}
+
+    def stop(self) -> None:
+        """See Place. Dask cannot stop a running task, so a second task stops it on the worker."""
+        if self._name:
+            with suppress(Exception):  # Dask may raise anything if worker or scheduler are gone; nothing is then left to stop
+                self._client.run(stop_on_worker, self._name, workers=[self._address], on_error="ignore")
+                if self._future is not None:
+                    self._future.cancel()
+            self._future, self._name = None, ""
+
+    def _check_alive(self) -> dict | None:
+        """Check periodically that the worker is alive, because Dask keeps a task waiting for a lost worker."""
+        if time.monotonic() - self._last_check < ALIVE_CHECK_INTERVAL:
+            return None
+        self._last_check = time.monotonic()
+        try:
+            alive = self._address in self._client.scheduler_info(n_workers=-1)["workers"]
+        except Exception as error:  # Dask and Tornado have their own exception types
+            return {"lost": f"the scheduler does not answer ({type(error).__name__})"}
+        if alive:
+            return None
+        self._future = None
+        return {"lost": f"the worker {self._address} is gone"}
+
+
+_places: dict[str, LocalPlace] = {}  # on a worker: its places, by name
+_lock = threading.Lock()
+
+
+def run_on_worker(request: dict, name: str, local: tuple) -> dict:
+    """Execute a request on a cluster's worker, in its place of this name, which LocalPlace(*local) makes."""
+    with _lock:
+        place = _places.setdefault(name, LocalPlace(*local))
+        place.start(request)
+    while True:
+        with _lock:
+            answer = place.poll() if name in _places else {"crash": "it was stopped"}
+        if answer is not None:
+            return answer
+        time.sleep(POLL_INTERVAL)
+
+
+def stop_on_worker(name: str) -> None:
+    """Stop the place of that name."""
+    with _lock:
+        if place := _places.pop(name, None):
+            place.stop()
+
+
+def _worker_info() -> dict:
+    return {"machine": machine(), "cores": usable_cores()}
+
+
+def connect(address: str, argument: str):
+    """Return a client of the scheduler at this address. argument: gives it, in messages. Raises SceneError if there is none."""
+    try:
+        from distributed import Client
+    except ImportError:
+        raise SceneError(f"{argument} needs the package distributed, which is missing: pip install 'taisoft[cluster]'") from None
+    try:
+        return Client(address, timeout=CONNECT_SECONDS, set_as_default=False)
+    except (OSError, ValueError, TimeoutError) as error:
+        raise SceneError(f"{argument} {address}: no Dask scheduler answers there ({type(error).__name__})") from None
+
+
+def cluster_places(client, child: tuple[str, ...], timed: bool = True) -> tuple[list[ClusterPlace], list[dict]]:
+    """Return one place per worker, and their machines. timed: as in LocalPlace without `threads`, else with one per core.
+
+    Raises SceneError without workers or, if timed, with fewer cores than workers.
+    """
+    try:
+        workers = client.run(_worker_info)
+    except Exception as error:  # exceptions of the workers are re-raised here unchanged
+        raise SceneError(f"the cluster's workers cannot run taisoft: {type(error).__name__}: {error}") from None
+    if not workers:
+        raise SceneError("the cluster has no worker")
+    machines = {info["machine"]["name"]: info["machine"] for info in workers.values()}
+    places = []
+    for name in machines:
+        own = {address: info["cores"] for address, info in workers.items() if info["machine"]["name"] == name}
+        cores = sorted(set().union(*own.values()))
+        each = len(cores) // len(own)
+        if each == 0 and timed:
+            raise SceneError(f"{len(own)} workers on {name} share {len(cores)} cores: each timed run needs its own")
+        places += [(address, cores[k * each : (k + 1) * each] or cores[:1]) for k, address in enumerate(own)]
+    n = min(len(cores) for _, cores in places)
+    threads = None if timed else n
+    return [ClusterPlace(client, address, cores[:n], child, threads) for address, cores in places], list(machines.values())
