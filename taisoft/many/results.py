@@ -29,7 +29,7 @@ class Row:
     status: str = LEFT_OUT  #: "ok", "degraded", "failed" or "left out"
     problems: list[str] = field(default_factory=list)  #: sentences: of the RunReports, of an exception, warnings
     values: dict = field(default_factory=dict)  #: numbers, texts and None that `make` returned
-    arrays: dict[str, np.ndarray] = field(default_factory=dict)  #: that it returned
+    arrays: dict[str, np.ndarray] = field(default_factory=dict, repr=False)  #: that it returned
     wall_seconds: float = math.nan  #: of the call of `make`, with what it compiled [s]
 
     def to_dict(self) -> dict:
@@ -107,11 +107,13 @@ class Results(Sequence):
         return hashlib.sha256(json.dumps(sorted(parts)).encode()).hexdigest()
 
     def __repr__(self) -> str:
-        """What became of the runs, and the first rows."""
+        """What became of the runs, the first rows, and the first that failed."""
         counts = ", ".join(f"{n} {status}" for status, n in self.counts().items())
         names = [name for name in self.names if name != "problem" or any(row.problems for row in self.rows)]
-        rows = [[_cell(row.get(name)) for name in names] for row in self.to_dicts()[:ROWS_SHOWN]]
-        more = [f"and {len(self) - ROWS_SHOWN} more rows"] if len(self) > ROWS_SHOWN else []
+        failed = [k for k, row in enumerate(self.rows) if row.status == "failed" and k >= ROWS_SHOWN][:ROWS_SHOWN]
+        shown, all_rows = [*range(min(len(self), ROWS_SHOWN)), *failed], self.to_dicts()
+        rows = [[_cell(all_rows[k].get(name)) for name in names] for k in shown]
+        more = [f"and {len(self) - len(shown)} more rows"] if len(self) > len(shown) else []
         left = [k for k, name in enumerate(names) if name in ("status", "problem")]
         table = [markdown(names, rows, left)] if self.rows else []
         return "\n".join([f"Results of {len(self)} runs: {counts}", *self.notes, *table, *more])
