@@ -36,6 +36,7 @@ KERNEL_CACHE_BYTES = 2**30  # of kernels on disk, above which Taichi removes the
 _open: list["Runtime"] = []  # current claims on the runtime
 _kind: tuple[str, str] | None = None  # (arch, precision) that Taichi was initialised with
 _program = None  # Taichi's program object of that initialisation
+_inherited: list = []  # programs of processes that this one was forked from; freeing one would wait for its threads
 _functions: list = []  # made by `compiled_function`
 _totals = {"compile": 0.0, "kernels": 0}
 
@@ -127,9 +128,25 @@ def remove_stale_lock(folder: Path) -> None:
                 taken.rename(lock)
 
 
+def _leave_to_parent() -> None:
+    """In a forked process, give up Taichi's program: its threads have stayed in the parent, and loops would wait for them."""
+    global _kind, _program
+    if _program is not None and impl.get_runtime().prog is _program:
+        _inherited.append((_program, on_cuda()))
+        impl.get_runtime().prog = _program = _kind = None
+        _open.clear()
+
+
+os.register_at_fork(after_in_child=_leave_to_parent)
+
+
 def _initialise(arch: str, precision: str) -> None:
     global _program
     clock = time.perf_counter()
+    for program, is_on_cuda in _inherited:
+        if is_on_cuda:
+            raise SimulationError("this process was forked from one that uses a GPU: start it by the method 'spawn' instead")
+        program.finalize()  # Taichi counts programs, and allows one; a second call does nothing
     try:
         os.getcwd()
     except FileNotFoundError:

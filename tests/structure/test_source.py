@@ -67,6 +67,7 @@ ORDER = (
     ("output", "view"),
     ("study",),
     ("cli",),
+    ("gym",),
     ("__main__",),
 )
 LEVEL = {name: level for level, group in enumerate(ORDER) for name in group}
