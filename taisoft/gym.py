@@ -58,13 +58,14 @@ class Env(gymnasium.Env):
     Simulator. render_mode: None or "rgb_array". size: of pictures, width and height [pixels]; colour: as of `sim.picture`;
     view (k,3): points that pictures show [m], such as two corners; None: the bodies at the start. The camera does not move.
 
-    `sim` is the simulator. Same seed and actions give the same bits, on as many threads. What functions set by sim.set_... (tensions,
-    materials) stays set over a reset, as always: let `start` set whatever `action` does not set in each step.
+    `sim` is the simulator. Same seed and actions give the same bits. What functions set by sim.set_... (tensions, materials)
+    stays set over a reset, as by `sim.reset`: let `start` set whatever `action` does not set in each step.
     An episode has no limit of its own: wrap in gymnasium.wrappers.TimeLimit.
 
     info has "time" [s], "degraded", the number of steps since the reset whose report has problems, "failed", "problems",
-    sentences about this step, and n_contacts, max_penetration and min_volume_ratio of its last `StepReport`. If the simulation fails, "failed" is True and the episode has terminated: observation and reward
-    are those of the last good state, and `reset` must be called.
+    sentences about this step, and n_contacts, max_penetration and min_volume_ratio of its last `StepReport`. If the simulation
+    fails, "failed" is True and the episode has terminated: observation and reward are those of the last good state, and `reset`
+    must be called.
 
     In vectors of processes, which share compiled kernels on disk, each process should use one thread: set TAISOFT_THREADS=1
     before the processes start, else all of them compete for all cores. Processes may be forked, except on a GPU.

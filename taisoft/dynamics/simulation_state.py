@@ -173,10 +173,9 @@ class SimulationState:
             self._loads = SceneLoads(self.scene, self.springs)
         return self._loads
 
-    def upload_loads(self) -> None:
-        """Upload the loads of the present time, after some changed, with the drag force."""
+    def loads_changed(self) -> None:
+        """Compute the loads anew when they are used next: a controller changes several before a step."""
         self._loads = self.load_time = None
-        self.set_load_time(self.time)
 
     def set_multipliers(self, values: np.ndarray) -> None:
         """Set the Lagrange multipliers (k,) [Pa] or [N]; `set_load_time` uploads them."""

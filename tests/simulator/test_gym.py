@@ -194,6 +194,8 @@ def test_numbers_that_are_not_finite_are_named(env):
 
 
 def test_without_gymnasium_it_says_how_to_get_it():
-    program = "import sys; sys.modules['gymnasium'] = None\nimport taisoft as ts\ntry: ts.gym\nexcept ts.TaisoftError as e: print(e)"
+    program = (
+        "import sys; sys.modules['gymnasium'] = None\nimport taisoft\ntry: taisoft.gym\nexcept taisoft.OutputError as e: print(e)"
+    )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert done.stdout == "ts.gym needs the package gymnasium, which is missing: pip install 'taisoft[gym]'\n"
