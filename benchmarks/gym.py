@@ -3,16 +3,16 @@
 taisoft bench gym [--quick] [--out [FILE.json]]
 
 The first table is of a block of 400 tets that stands on the ground, with two tendons that do nothing. A step is 10 ms: an
-implicit step, or twenty explicit ones in a batch. Functions are trivial, so that `step` less `sim.advance` is what the environment
-adds; both are timed in turn. "worker" is a process that gymnasium's AsyncVectorEnv forks, from its start to the end of the first
-`reset`, without the environment that the parent makes to read the spaces. The first step, with cached kernels, is of the first
-environment of its kind in this process.
+implicit step, or twenty explicit ones in a batch. Functions are trivial, so that `step` less `sim.advance` is what the
+environment adds; both are timed in turn. "vector" is gymnasium's AsyncVectorEnv of one process, from its start to the end of the
+first `reset`, with the environment that it makes in its own process to read the spaces. The first step, with cached kernels, is
+of the first environment of its kind in this process.
 
-The second table is of works of `taisoft bench peers`, whose page has their errors: W1, a hanging beam of 540 tets, and W2, a cube
-of 5,000 tets that drops on the ground. An environment's step is 50 ms. Of W1, both programs have St. Venant-Kirchhoff's law and the
-fastest setting with an error of at most 1 %. Of W2, MuJoCo's errors remain above 4 %, which takes the setting here. Several
-environments are processes of AsyncVectorEnv, each on one thread (TAISOFT_THREADS=1); rates are steps of single environments a
-second, medians over rounds. MuJoCo's are environments of the same form. --quick: few steps, two processes, W1 alone.
+The second table is of works of `taisoft bench peers`, whose page has their errors: W1, a hanging beam of 540 tets, and W2, a
+cube of 5,000 tets that drops on the ground. An environment's step is 50 ms. Of W1, both programs have St. Venant-Kirchhoff's
+law and the fastest setting with an error of at most 1 %. Of W2, MuJoCo's errors remain above 4 %, which takes the setting here.
+Several environments are processes of AsyncVectorEnv, each on one thread (TAISOFT_THREADS=1); rates are steps of single
+environments a second, medians over rounds. MuJoCo's are environments of the same form. --quick: few steps, two processes, W1.
 """
 
 import os
@@ -115,20 +115,12 @@ def measure_block(integrator: str, times: int) -> dict:
             found[name] = float(np.median(resets))
         env.render()
         found["picture"] = float(np.median([seconds_of(env.render) for _ in range(10)]))
-        dummy = seconds_of(lambda: make().close())
-        found["worker"] = worker_seconds(make) - dummy
-    return found
-
-
-def worker_seconds(make: Callable) -> float:
-    """Seconds to the end of the first `reset` of a vector of one process."""
     start = time.perf_counter()
     envs = vector([make])
-    try:
-        envs.reset()
-        return time.perf_counter() - start
-    finally:
-        envs.close()
+    envs.reset()
+    found["vector"] = time.perf_counter() - start
+    envs.close()
+    return found
 
 
 def vector(makes: list[Callable]):
@@ -223,7 +215,7 @@ def add_costs(document: Document, costs: dict[str, dict]) -> list[Limit]:
     def ms(what: str) -> Callable:
         return lambda row: f"{1e3 * row[1][what]:.3g}"
 
-    names = ("make", "worker", "first reset", "first step", "reset", "sim.reset", "step", "advance", "picture")
+    names = ("make", "vector", "first reset", "first step", "reset", "sim.reset", "step", "advance", "picture")
     columns = [("<[ms]", lambda row: row[0]), *((name, ms(name)) for name in names)]
     columns.append(("added to a step", lambda row: f"{overhead(row[1]):.1%}"))
     document.add("## A block of 400 tets\n\n" + table(costs.items(), columns))
