@@ -112,8 +112,9 @@ class Env(gymnasium.Env):
         self.sim = Simulator(made, **settings | (solver or {}))
         self.metadata = {"render_modes": ["rgb_array"], "render_fps": 1.0 / (self.frame_skip * self.sim.dt)}
         try:
-            shape = None if observation_space is not None else np.shape(observation(self.sim))
-            self.observation_space = observation_space or gymnasium.spaces.Box(-np.inf, np.inf, shape, np.float32)
+            if observation_space is None:
+                observation_space = gymnasium.spaces.Box(-np.inf, np.inf, np.shape(observation(self.sim)), np.float32)
+            self.observation_space = observation_space
             self._observation()
         except BaseException:
             self.close()

@@ -7,6 +7,7 @@ if a is not finite, and divides f32 numbers with an error of up to two units in 
 """
 
 import contextlib
+import ctypes
 import functools
 import io
 import os
@@ -36,7 +37,7 @@ KERNEL_CACHE_BYTES = 2**30  # of kernels on disk, above which Taichi removes the
 _open: list["Runtime"] = []  # current claims on the runtime
 _kind: tuple[str, str] | None = None  # (arch, precision) that Taichi was initialised with
 _program = None  # Taichi's program object of that initialisation
-_inherited: list = []  # programs of processes that this one was forked from; freeing one would wait for its threads
+_inherited: list = []  # programs of processes that this one was forked from, and whether they are on CUDA
 _functions: list = []  # made by `compiled_function`
 _totals = {"compile": 0.0, "kernels": 0}
 
@@ -133,6 +134,7 @@ def _leave_to_parent() -> None:
     global _kind, _program
     if _program is not None and impl.get_runtime().prog is _program:
         _inherited.append((_program, on_cuda()))
+        ctypes.pythonapi.Py_IncRef(ctypes.py_object(_program))  # it is never freed: that would wait, too
         impl.get_runtime().prog = _program = _kind = None
         _open.clear()
 
