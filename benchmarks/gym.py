@@ -36,7 +36,7 @@ from .works.references import MUJOCO, TAISOFT
 from .works.scenes import WORKS, Work
 
 STEP = 5  # samples of 10 ms in a step
-PROCESSES, ROUNDS = 16, 5
+PROCESSES, ROUNDS = 16, 3
 F32 = {"precision": "f32", "arch": "cpu"}
 SETTINGS = {  # work -> those compared
     "W1 12x3x3": (Setting(own.NAME, MUJOCO, "velocity_verlet", 3, F32), Setting("MuJoCo", MUJOCO, "euler_staggered", 2)),

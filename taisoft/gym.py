@@ -124,7 +124,7 @@ class Env(gymnasium.Env):
         """Return to the scene's initial state, call `start`, and return the observation and the info. options: ignored."""
         super().reset(seed=seed)
         self.sim.reset()
-        self._degraded, self._is_running = 0, True
+        self._degraded, self._is_running, self._drawing = 0, True, None  # the scale of colours starts anew, too
         if self._start is not None:
             self._start(self.sim, self.np_random)
         return self._observation(), self._info([], None)
