@@ -122,7 +122,7 @@ def hopper() -> np.ndarray:
     corners = [(middle - 0.08, 0.0, -0.05), (middle + 0.14, 0.16, 0.05)]
     moments = np.linspace(first - 2, last + 2, 6).round().astype(int)
     pictures = [env.render() for k, env in enumerate(episode(record["mean"], corners)) if k in moments]
-    figure = Figure((7.2, 4.4), dpi=100, layout="constrained")
+    figure = Figure((6.4, 4.0), dpi=96, layout="constrained")
     axes, below = figure.subplots(2, 1, height_ratios=(1.0, 0.9))
     for values, label in zip(np.transpose(record["curve"]), ("mean", "best")):
         axes.plot(values, label=label)
@@ -134,13 +134,15 @@ def hopper() -> np.ndarray:
     return drawn(figure)
 
 
-def episode(mean: list[float], corners=None):
-    """The environment after each step of two seconds of the trained hopper."""
+def episode(mean: list[float], corners=None, seed: int = 5):
+    """The environment after each step of an episode of the trained hopper, before it falls."""
     names = program()
     with names["make"](render_mode="rgb_array", size=(200, 216), view=corners) as env:
-        sensed, _ = env.reset(seed=1)
+        sensed, _ = env.reset(seed=seed)
         for _ in range(200):
-            sensed, *_ = env.step(names["policy"](np.array([mean]), sensed[None])[0])
+            sensed, _, fell, *_ = env.step(names["policy"](np.array([mean]), sensed[None])[0])
+            if fell:
+                break
             yield env
 
 
