@@ -34,6 +34,7 @@ WRITES = {
     "report": ("folder",),
     "startup": ("json",),
     "launches": ("json",),
+    "gym": ("json",),
     "pictures": ("json",),
     "window": ("json",),
 }

@@ -1,5 +1,6 @@
 """Draws pictures and plots of the manual: `python docs/make_pictures.py [NAME ...]` writes docs/pictures/NAME.png."""
 
+import json
 import sys
 from pathlib import Path
 
@@ -11,6 +12,7 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / "assets")]
 
 from make_gallery import film  # noqa: E402
+from train_hopper import STORED, program  # noqa: E402
 
 import taisoft as ts  # noqa: E402
 from taisoft.cli.scene_file import load_shipped  # noqa: E402
@@ -108,7 +110,50 @@ def foot_forces() -> np.ndarray:
     return drawn(figure)
 
 
-PICTURES = {"drop": drop, "ring": ring, "identify": identify, "drop_force": drop_force, "foot_forces": foot_forces}
+def hopper() -> np.ndarray:
+    """What candidates flew while the hopper was trained, and the longest hop of the last mean."""
+    record = json.loads(STORED.read_text())
+    states = [env.sim.positions("block") for env in episode(record["mean"])]
+    lowest = np.array([x[:, 1].min() for x in states])
+    grounded = np.flatnonzero(np.append(lowest, 0.0) < 0.002)
+    longest = int(np.diff(grounded).argmax())
+    first, last = grounded[longest], grounded[longest + 1]
+    middle = states[first][:, 0].mean()
+    corners = [(middle - 0.08, 0.0, -0.05), (middle + 0.14, 0.16, 0.05)]
+    moments = np.linspace(first - 2, last + 2, 6).round().astype(int)
+    pictures = [env.render() for k, env in enumerate(episode(record["mean"], corners)) if k in moments]
+    figure = Figure((6.4, 4.0), dpi=96, layout="constrained")
+    axes, below = figure.subplots(2, 1, height_ratios=(1.0, 0.9))
+    for values, label in zip(np.transpose(record["curve"]), ("mean", "best")):
+        axes.plot(values, label=label)
+    title = f"{len(record['curve'])} generations of 32 candidates, in {record['minutes']:.0f} minutes"
+    axes.set(xlabel="generation", ylabel="distance in the air [m]", title=title)
+    axes.legend()
+    below.imshow(np.concatenate(pictures, axis=1))
+    below.set(title=f"a hop, in pictures {10 * (moments[1] - moments[0])} ms apart", xticks=[], yticks=[])
+    return drawn(figure)
+
+
+def episode(mean: list[float], corners=None, seed: int = 5):
+    """The environment after each step of an episode of the trained hopper, before it falls."""
+    names = program()
+    with names["make"](render_mode="rgb_array", size=(200, 216), view=corners) as env:
+        sensed, _ = env.reset(seed=seed)
+        for _ in range(200):
+            sensed, _, fell, *_ = env.step(names["policy"](np.array([mean]), sensed[None])[0])
+            if fell:
+                break
+            yield env
+
+
+PICTURES = {
+    "drop": drop,
+    "ring": ring,
+    "identify": identify,
+    "drop_force": drop_force,
+    "foot_forces": foot_forces,
+    "hopper": hopper,
+}
 
 
 def main(names: list[str]) -> None:

@@ -61,11 +61,15 @@ _MODULES = {  # public name -> the module that defines it
     "SimulationError": "taisoft.errors",
 }
 
+_SUBMODULES = ("gym",)  # whose names stay in them; not in __all__, since they need optional packages
+
 __all__ = sorted(_MODULES) + ["__version__"]
 
 
 def __getattr__(name: str):
     """Import a public name from its module at the first use (PEP 562)."""
+    if name in _SUBMODULES:
+        return import_module(f"taisoft.{name}")
     if name not in _MODULES:
         raise AttributeError(f"module 'taisoft' has no attribute {name!r}")
     value = getattr(import_module(_MODULES[name]), name)

@@ -121,7 +121,7 @@ def set_material(self: "Simulator", body: str, region: int | str | None = None, 
         raise
     dynamics.state.upload_material("density" in numbers)
     if "density" in numbers:  # total forces are spread by mass
-        dynamics.upload_loads()
+        dynamics.state.loads_changed()
     dynamics.numbers_changed()
 
 

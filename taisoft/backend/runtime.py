@@ -7,6 +7,7 @@ if a is not finite, and divides f32 numbers with an error of up to two units in 
 """
 
 import contextlib
+import ctypes
 import functools
 import io
 import os
@@ -36,6 +37,7 @@ KERNEL_CACHE_BYTES = 2**30  # of kernels on disk, above which Taichi removes the
 _open: list["Runtime"] = []  # current claims on the runtime
 _kind: tuple[str, str] | None = None  # (arch, precision) that Taichi was initialised with
 _program = None  # Taichi's program object of that initialisation
+_inherited: list = []  # programs of processes that this one was forked from, and whether they are on CUDA
 _functions: list = []  # made by `compiled_function`
 _totals = {"compile": 0.0, "kernels": 0}
 
@@ -127,9 +129,26 @@ def remove_stale_lock(folder: Path) -> None:
                 taken.rename(lock)
 
 
+def _leave_to_parent() -> None:
+    """In a forked process, give up Taichi's program: its threads have stayed in the parent, and loops would wait for them."""
+    global _kind, _program
+    if _program is not None and impl.get_runtime().prog is _program:
+        _inherited.append((_program, on_cuda()))
+        ctypes.pythonapi.Py_IncRef(ctypes.py_object(_program))  # it is never freed: that would wait, too
+        impl.get_runtime().prog = _program = _kind = None
+        _open.clear()
+
+
+os.register_at_fork(after_in_child=_leave_to_parent)
+
+
 def _initialise(arch: str, precision: str) -> None:
     global _program
     clock = time.perf_counter()
+    for program, is_on_cuda in _inherited:
+        if is_on_cuda:
+            raise SimulationError("this process was forked from one that uses a GPU: start it by the method 'spawn' instead")
+        program.finalize()  # Taichi counts programs, and allows one; a second call does nothing
     try:
         os.getcwd()
     except FileNotFoundError:

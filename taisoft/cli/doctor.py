@@ -19,7 +19,7 @@ REQUIRED = ("taichi", "numpy", "scipy", "meshio", "usd-core", "networkx", "rich"
 # package -> the extra that installs it; only benchmarks use other programs, only studies and run_many use a cluster
 OPTIONAL = {"wildmeshing": "mesh", "imageio-ffmpeg": "video", "matplotlib": "plot", "pillow": "plot", "viser": "notebook"}
 OPTIONAL |= {"pyvista": "pyvista", "distributed": "cluster", "mujoco-core": "robot", "pybullet": "peers", "newton": "peers"}
-OPTIONAL |= {"argcomplete": "completion"}
+OPTIONAL |= {"argcomplete": "completion", "gymnasium": "gym"}
 KERNEL = "ipykernel"  # of Jupyter, which no extra installs
 VULKAN_PROBE = "from taichi._lib import core; print('vulkan', core.with_vulkan())"
 PROBE_SECONDS = 60.0  # loading Taichi from a cold disk takes several seconds

@@ -212,9 +212,9 @@ class Dynamics:
         self.stepper.numbers_changed()
 
     def loads_changed(self) -> None:
-        """Upload the scene's loads, after they changed, and update the stepper."""
+        """Follow a change of the scene's loads."""
         self.changes += 1
-        self.upload_loads()
+        self.state.loads_changed()
         self.stepper.loads_changed()
 
     def set_dt(self, dt: float) -> None:
@@ -239,10 +239,6 @@ class Dynamics:
             first, turned = self.commands.pose(mover, now, name)
             commands[mover] = Command(now, first, last.translation, first_rotation=turned, last_rotation=last.rotation)
         self.command(commands)
-
-    def upload_loads(self) -> None:
-        """Copy the scene's present loads, plus the force of the drag spring, to the device."""
-        self.state.upload_loads()
 
     def end_drag(self) -> None:
         """End the drag, if any."""

@@ -44,6 +44,7 @@ class SimulationState:
     drag: tuple[np.ndarray, np.ndarray] | None = None  # nodes (k,) and forces (k, 3) [N] of a drag spring
     _loads: SceneLoads | None = None  # None: not computed, or outdated
     load_time: float | None = None  # of the loads on the device; None: several, or outdated
+    _start: list[np.ndarray] | None = None  # free axes, positions and velocities at the start
     _cavity_forms: dict[str, CavityForm] = field(default_factory=dict)  # those built so far, by name
 
     def __post_init__(self) -> None:
@@ -94,16 +95,24 @@ class SimulationState:
         self.now.none_cross = bool(kept["none_cross"])
         if self.now.held is not None and "held" in kept:  # another instance may have no contacts
             self.now.held, self.now.misplaced = self.now.held.at_start(kept["held"]), kept["misplaced"]
-        self._begin_at(kept["x"], kept["v"], float(kept["time"]), int(kept["step_count"]), kept["multipliers"])
+        self.upload_constraints()
+        self.set_state(kept["x"], kept["v"])
+        self._begin_at(float(kept["time"]), int(kept["step_count"]), kept["multipliers"])
 
     def restart(self) -> None:
-        """Set the initial state of the scene."""
+        """Set the initial state of the scene. From the first reset after a step on, it is kept ready: learning resets often."""
         self.now.released[:] = False
-        self._begin_at(self.layout.rest, self._rest_velocities(), 0.0, 0, np.zeros(len(self.loads.multipliers)))
+        m = self.model
+        arrays = (m.free, m.state.x, m.state.v)
+        if self._start is not None:
+            upload(list(zip(arrays, self._start)))
+        else:
+            self.upload_constraints()
+            self.set_state(self.layout.rest, self._rest_velocities())
+            self._start = download(arrays) if self.step_count else None
+        self._begin_at(0.0, 0, np.zeros(len(self.loads.multipliers)))
 
-    def _begin_at(self, x: np.ndarray, v: np.ndarray, time: float, step_count: int, multipliers: np.ndarray) -> None:
-        self.upload_constraints()
-        self.set_state(x, v)
+    def _begin_at(self, time: float, step_count: int, multipliers: np.ndarray) -> None:
         self.time, self.step_count = time, step_count
         self.set_multipliers(multipliers)
         self.set_load_time(time)
@@ -164,10 +173,9 @@ class SimulationState:
             self._loads = SceneLoads(self.scene, self.springs)
         return self._loads
 
-    def upload_loads(self) -> None:
-        """Upload the loads of the present time, after some changed, with the drag force."""
+    def loads_changed(self) -> None:
+        """Compute the loads anew when they are used next: a controller changes several before a step."""
         self._loads = self.load_time = None
-        self.set_load_time(self.time)
 
     def set_multipliers(self, values: np.ndarray) -> None:
         """Set the Lagrange multipliers (k,) [Pa] or [N]; `set_load_time` uploads them."""

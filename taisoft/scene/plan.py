@@ -206,8 +206,7 @@ def change_load(body: Body, kind: str, index: int, value) -> None:
     new = replace(old, value=checks.array(value, f"{what}: {kind} {index}", old.shapes), path=None, path_shape=None)
     if kind == "cavity":
         check_volume(new, f"{what}: volume")
-    with thawed(body):
-        getattr(body, LOADS[kind])[index] = new
+    list.__setitem__(loads, index, new)  # past the guard, as `thawed`, but at the rate of a controller
 
 
 def change_tendon(scene: Scene, given: str, name: str, value) -> None:
@@ -221,5 +220,4 @@ def change_tendon(scene: Scene, given: str, name: str, value) -> None:
         raise SceneError(f"{calls[given]}: {what} has a given {old.given}: call {calls[old.given]}")
     new = replace(old, value=checks.array(value, f"{what}: {given}", ((),)), path=None, path_shape=None)
     check_tendon(new, new.value, what)
-    with thawed(scene):
-        scene.tendons[index] = new
+    list.__setitem__(scene.tendons, index, new)  # as in `change_load`

@@ -29,6 +29,7 @@ from benchmarks import (
     contact_runs,
     elasticity,
     elasticity_runs,
+    gym,
     hard_runs,
     launches,
     many,
@@ -135,6 +136,21 @@ def error_check(n):
     true = {"time": TIME * dt * 15 / 16 + SOLVER, "space": SPACE / n_tets * 63 / 64, "solver": SOLVER}
     for what, value in true.items():
         assert beam["true"][what] == pytest.approx(value / (1.0 + SPACE / n_tets + TIME * dt / 16), rel=1e-6)
+
+
+def gym_small(patch, folder):
+    """Environments in this process, all of one beam, without MuJoCo."""
+    gymnasium = pytest.importorskip("gymnasium")
+    (work,) = (work for work in gym.WORKS if work.key == "W1 12x3x3")
+    replace(patch, gym, INTEGRATORS={"velocity_verlet": 3}, block=lambda: gym.own.make_scene(work, gym.MUJOCO))
+    replace(patch, gym, vector=gymnasium.vector.SyncVectorEnv)
+    patch.setattr(gym.mujoco_flex, "problem", lambda: "it is not asked for")
+
+
+def gym_check(n):
+    cost, (row,) = n["costs"]["velocity_verlet"], n["works"]
+    assert 0 < cost["reset"] < cost["make"] and min(cost.values()) > 0 and row["processes"] == 2 and row["error"] < 1e-4
+    assert len(row["one"]) == len(row["several"]) == 1 and min(row["one"] + row["several"]) > 0
 
 
 def hard_small(patch, folder):
@@ -261,6 +277,12 @@ RUNS = {
     ),
     "elasticity": Small(QUICK, ("| MuJoCo |", "2.0000% | (1.0000%)", "cores, load"), elasticity_small, elasticity_check),
     "error": Small(BEAM, ("| hanging beam | bdf2 | 160 |", "a note"), error_small, error_check),
+    "gym": Small(
+        QUICK,
+        ("| velocity_verlet |", "| W1 12x3x3 | taisoft |", "MuJoCo is left out: it is not asked for."),
+        gym_small,
+        gym_check,
+    ),
     "hard": Small(("--case", "G1", "--quick"), ("# Hard cases", "**1 of 1 variants are solved.**"), hard_small),
     "ipc": Small(("--quick", "--scene", "twisted_mat"), ("| twisted mat | 800 | 1,805 | 0.04 | 0.08 of 25 (2) |",), ipc_small),
     "launches": Small(

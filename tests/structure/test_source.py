@@ -68,6 +68,7 @@ ORDER = (
     ("many",),
     ("study",),
     ("cli",),
+    ("gym",),
     ("__main__",),
 )
 LEVEL = {name: level for level, group in enumerate(ORDER) for name in group}
