@@ -228,7 +228,6 @@ def _add_run(add) -> None:
     )
     option("--view", type=float, nargs=2, metavar=("AZIMUTH", "ELEVATION"), help=directions)
     option("--vtu", action="store_true", help="also write every frame as a .vtu file, and scene.pvd, which ParaView opens")
-    option("--npz", action="store_true", help="also write the nodes of every frame as a .npz file")
     option("--no-usd", action="store_true", help="write no scene.usdc")
     details = "also write per step: pairs (forces, torques, slip velocities of what presses), bodies (their energies)"
     option("--details", metavar="NAME,...", help=details)

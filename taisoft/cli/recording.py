@@ -12,7 +12,7 @@ from taisoft.details import DETAILS
 from taisoft.errors import OutputError, SceneError
 from taisoft.output.camera import MAX_ELEVATION
 from taisoft.output.files import RESULT_FILES, RESULT_FOLDERS, CheckpointWriter, OutputFolder
-from taisoft.output.frame_files import NPZ_NAME, VTU_NAME, NpzWriter, VtuWriter, cut_pvd
+from taisoft.output.frame_files import VTU_NAME, VtuWriter, cut_pvd
 from taisoft.output.frame_table import FrameTable
 from taisoft.output.frames import FRAMES_NAME, FrameWriter, ffmpeg_command, find_ffmpeg, picture_numbers, write_video
 from taisoft.output.report import body_records, write_report
@@ -34,7 +34,7 @@ class DisplayOptions:
     """colour: as in `Offscreen`; layers: names, or None for the defaults; plots: names; caption: the scene's name, or None.
 
     size: of pictures [pixels]; slow: film time over simulated time; view: azimuth and elevation of the camera [deg], or None.
-    window, pictures, usd, vtu, npz: whether there is a window, and what is written to the folder; errors: whether they are
+    window, pictures, usd, vtu: whether there is a window, and what is written to the folder; errors: whether they are
     estimated. details: names, of steps.csv.
     """
 
@@ -42,7 +42,6 @@ class DisplayOptions:
     pictures: bool
     usd: bool
     vtu: bool
-    npz: bool
     colour: str
     layers: tuple[str, ...] | None
     plots: tuple[str, ...]
@@ -76,7 +75,7 @@ def display_options(arguments: Namespace, has_window: bool) -> DisplayOptions:
     for option, given in requested.items():
         if given and not pictures:
             raise SceneError(f"--{option} needs --out, the folder to write to, and pictures, so it excludes --no-frames")
-    for option, given in {"vtu": arguments.vtu, "npz": arguments.npz, "details": details}.items():
+    for option, given in {"vtu": arguments.vtu, "details": details}.items():
         if given and arguments.out is None:
             raise SceneError(f"--{option} needs --out, the folder to write to")
     if pictures and (plots or arguments.caption) and text_missing():
@@ -90,7 +89,7 @@ def display_options(arguments: Namespace, has_window: bool) -> DisplayOptions:
         raise SceneError("--slow is the speed of the film, so it needs --video")
     size = SIZE if arguments.size is None else _size_of(arguments.size)
     slow = checks.number(1.0 if arguments.slow is None else arguments.slow, "--slow", above=0.0)
-    files = pictures, not arguments.no_usd, arguments.vtu, arguments.npz
+    files = pictures, not arguments.no_usd, arguments.vtu
     return DisplayOptions(
         has_window, *files, arguments.colour, layers, plots, caption, errors, details, size, slow, _view_of(arguments.view)
     )
@@ -182,7 +181,7 @@ class Observers:
 
 
 class Recording:
-    """Results of a run in one folder: report.json, steps.csv, checkpoint.npz and, if requested, pictures, USD, .vtu and .npz.
+    """Results of a run in one folder: report.json, steps.csv, checkpoint.npz and, if requested, pictures, USD and .vtu.
 
     resumed: for a resumed run, the `checkpoint`, its `time` [s] and the first `frame`; earlier results in the folder are
     continued. every: simulated time between two checkpoints [s]; None for one at the end. notes: those of the checkpoint of
@@ -201,7 +200,7 @@ class Recording:
     def add_writers(
         self, observers: Observers, sim, fps: float | None, seconds: float, shown: DisplayOptions, plots: Plots | None
     ) -> None:
-        """Add the writers of pictures, USD, .vtu, .npz and checkpoints to the observers of a run that ends at `seconds`.
+        """Add the writers of pictures, USD, .vtu and checkpoints to the observers of a run that ends at `seconds`.
 
         A resumed run that does not match the earlier files is refused before anything is removed.
         """
@@ -221,8 +220,6 @@ class Recording:
             self._folder.clear(self._first)
         if shown.vtu:
             observers.members.append(VtuWriter(folder, sim.scene, self._first or 0, shown.errors))
-        if shown.npz:
-            observers.members.append(NpzWriter(folder, sim.scene))
         pictures = None
         if shown.pictures:
             n_pictures = round((seconds - (0.0 if self._resumed is None else self._resumed["time"])) * (fps or 1.0 / sim.dt))
@@ -275,7 +272,7 @@ class Recording:
         """Return the contents of the folder: one text per file, and one for each folder of frames."""
         paths = [path for path in (self.path / name for name in RESULT_FILES) if path.is_file()]
         found = [f"{path} ({_size([path])})" for path in paths]
-        for name, what in ((FRAMES_NAME, "pictures"), (VTU_NAME, "files"), (NPZ_NAME, "files")):
+        for name, what in ((FRAMES_NAME, "pictures"), (VTU_NAME, "files")):
             if files := list((self.path / name).glob(RESULT_FOLDERS[name])):
                 found.append(f"{self.path / name}/ ({len(files)} {what}, {_size(files)})")
         return found

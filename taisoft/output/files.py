@@ -18,16 +18,16 @@ from taisoft.files import link_file, part_path
 
 LOCK_NAME = "taisoft.lock"
 CHECKPOINT_NAME, PREVIOUS_NAME = "checkpoint.npz", "checkpoint.previous.npz"
-PVD_NAME, BODIES_NAME = "scene.pvd", "npz/bodies.npz"
+PVD_NAME = "scene.pvd"
 RESULT_FILES = (
-    *("report.json", "steps.csv", "frames.csv", "scene.usdc", PVD_NAME, BODIES_NAME),
+    *("report.json", "steps.csv", "frames.csv", "scene.usdc", PVD_NAME),
     *(CHECKPOINT_NAME, PREVIOUS_NAME, "video.mp4"),
 )
 REPORT_FILES = ("report.json", "steps.csv", PVD_NAME)  # removed at once: beside another run's results they would be wrong
 # Left by a killed writer: see `taisoft.files.part_path`; USD adds temporary files with a suffix of its own
 TEMPORARY = re.compile(r"\.\d+-\d+\.part$|\.usdc\.\d+-\d+\.[A-Za-z0-9]{6}$")
 # folder -> pattern of a run's files in it, one for each frame or chunk of frames
-RESULT_FOLDERS = {"frames": "[0-9]*.png", "chunks": "points_*.usdc", "vtu": "[0-9]*.vtu", "npz": "[0-9]*.npz"}
+RESULT_FOLDERS = {"frames": "[0-9]*.png", "chunks": "points_*.usdc", "vtu": "[0-9]*.vtu"}
 
 
 @contextmanager

@@ -57,7 +57,7 @@ def test_bad_scene_files_and_settings_are_refused(tmp_path, capsys):
         assert message in error and error.startswith("taisoft: ") and error.count("\n") == 1
         assert not (tmp_path / "out").exists()
     path = tmp_path / "scene.py"
-    for option, *value in (["--vtu"], ["--npz"], ["--video"], ["--checkpoint-every", "0.1"], ["--details", "bodies"]):
+    for option, *value in (["--vtu"], ["--video"], ["--checkpoint-every", "0.1"], ["--details", "bodies"]):
         assert run(path, option, *value) == 2
         assert f"{option} needs --out" in capsys.readouterr().err
 

@@ -1,6 +1,6 @@
 """`taisoft run --resume` and the checkpoints of a run:
 
-* a resumed run gives the same files as a single run: pictures, tables, VTK, npz and USD bytewise, and the last state;
+* a resumed run gives the same files as a single run: pictures, tables, VTK and USD bytewise, and the last state;
 * so does a run that was interrupted, or killed after writing checkpoints;
 * settings that cannot change within a run, a run that is already over, and another scene: status 2, and no file changes.
 """
@@ -18,7 +18,7 @@ from tests.cli.command import BEAM, LED, SHORT_OUTPUT, child, report, run, write
 SPRING = '    scene.add_spring(("beam", 0), ("beam", 3), 10.0)\n    return scene\n'
 LED_BY_SPRING = LED.replace("    return scene\n", SPRING)
 GENTLE = LED_BY_SPRING.replace("{body}", "return (0, -t, 0)")
-ALL = ("--vtu", "--npz", "--seconds", "0.2", "--details", "bodies")
+ALL = ("--vtu", "--seconds", "0.2", "--details", "bodies")
 
 
 def usd(folder: Path) -> str:
@@ -35,7 +35,7 @@ def assert_same_folders(a: Path, b: Path, rows: int = 0) -> None:
     assert names[0] == names[1] and {"frames/00006.png", "vtu/00006.vtu", "frames.csv"} <= set(names[0])
     assert not {"chunks", "scene.usdc.part"} & set(names[0])
     for name in names[0]:
-        if name.startswith(("frames", "vtu/", "npz/", "scene.pvd")) and (a / name).is_file():
+        if name.startswith(("frames", "vtu/", "scene.pvd")) and (a / name).is_file():
             assert (a / name).read_bytes() == (b / name).read_bytes(), name
     steps = [(folder / "steps.csv").read_text().splitlines() for folder in (a, b)]
     assert len(steps[0]) == 7 and steps[0][rows:] == steps[1][max(0, len(steps[1]) - 7 + rows) :]
@@ -64,7 +64,7 @@ def begun(tmp_path_factory) -> tuple[Path, Path]:
 
 def test_two_parts_equal_one_run(single, tmp_path, capsys):
     path, out = write(tmp_path / "scene.py", GENTLE), tmp_path / "out"
-    assert run(path, "--out", out, "--vtu", "--npz", "--details", "bodies") == 0
+    assert run(path, "--out", out, "--vtu", "--details", "bodies") == 0
     assert run(path, "--out", out, "--resume", out / "checkpoint.npz", *ALL) == 0
     assert_same_folders(single, out)
     record = report(out)
