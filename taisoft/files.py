@@ -7,7 +7,6 @@ folder is fsynced. So a file under its final name is always complete.
 import errno
 import itertools
 import os
-import shutil
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -63,23 +62,6 @@ def replacing(path: str | Path, n_bytes: int | None = None) -> Iterator[Path]:
         raise write_error(path, error, n_bytes) from error
     finally:
         with suppress(OSError):  # gone after a rename; unreachable when the folder is
-            part.unlink()
-
-
-def link_file(path: Path, other: Path) -> None:
-    """Give a file, if it exists, a second name `other`, atomically replacing any file of that name. Raises OSError."""
-    part = part_path(other)
-    try:
-        try:
-            os.link(path, part)
-        except FileNotFoundError:
-            return
-        except OSError:  # a file system without hard links
-            shutil.copyfile(path, part)
-            _fsync(part, os.O_RDWR)
-        os.replace(part, other)
-    finally:
-        with suppress(OSError):
             part.unlink()
 
 

@@ -195,7 +195,7 @@ class Recording:
         self._first = None if resumed is None else resumed["frame"]
         self._folder = OutputFolder(path, overwrite, self._first)
         self.path, self._resumed, self._notes = Path(path), resumed, notes or {}
-        self._checkpoints = CheckpointWriter(self._folder.path, every, None if resumed is None else resumed["checkpoint"])
+        self._checkpoints = CheckpointWriter(self._folder.path, every)
 
     def add_writers(
         self, observers: Observers, sim, fps: float | None, seconds: float, shown: DisplayOptions, plots: Plots | None

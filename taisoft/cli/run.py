@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from taisoft.checkpoint import Checkpoint
+from taisoft.checkpoint import Checkpoint, read_checkpoint
 from taisoft.cli import EXIT_FAILED, EXIT_OUTPUT, EXIT_SIGNAL, Signals, parse_scalar, printed_warnings
 from taisoft.cli.recording import DisplayOptions, Observers, Recording, check_modelled, display_options
 from taisoft.cli.scene_file import OF_SCENE, load_scene, refuse_unknown
@@ -23,7 +23,7 @@ from taisoft.cli.summary import print_plan, print_state, print_summary
 from taisoft.cli.units import warn_millimetres
 from taisoft.errors import SceneError, SimulationError
 from taisoft.frames import check_length, first_frame
-from taisoft.output.files import check_free, read_last_good
+from taisoft.output.files import check_free
 from taisoft.output.report import Progress
 from taisoft.records import RunReport
 from taisoft.scene import checks
@@ -85,7 +85,7 @@ def run(arguments: Namespace) -> int:
             with _prefix_errors(arguments.scene):
                 sim = Simulator(scene, **settings.simulator | ({"draggable": True} if interactive else {}))  # by the mouse
         else:
-            saved = read_last_good(arguments.resume)
+            saved = read_checkpoint(arguments.resume)
             kept = saved.settings | ({"fps": saved.notes["fps"]} if "fps" in saved.notes else {})  # frames have numbers
             settings = resolve(solver, arguments, Simulator, kept)
             if "dt" in settings.changed and saved.settings.get("tolerance") is not None:

@@ -1,28 +1,21 @@
 """The output folder of a run, and its checkpoint. The folder has one writer; its files are complete or absent.
 
 The folder's lock is an advisory kernel lock (flock) on a file that holds the writer's process id. The kernel releases it when
-the writer dies. `checkpoint.npz` is the run's last good state, written at its end and, if requested, at intervals before. The
-previous one is kept as `checkpoint.previous.npz`, so that a run can resume if the last one cannot be read.
+the writer dies. `checkpoint.npz` is the run's last good state, written at its end and, if requested, at intervals before.
 """
 
 import os
 import re
-import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from taisoft.checkpoint import Checkpoint, read_checkpoint
-from taisoft.errors import OutputError, SimulationError
-from taisoft.files import link_file, part_path
+from taisoft.errors import OutputError
+from taisoft.files import part_path
 
 LOCK_NAME = "taisoft.lock"
-CHECKPOINT_NAME, PREVIOUS_NAME = "checkpoint.npz", "checkpoint.previous.npz"
-PVD_NAME = "scene.pvd"
-RESULT_FILES = (
-    *("report.json", "steps.csv", "frames.csv", "scene.usdc", PVD_NAME),
-    *(CHECKPOINT_NAME, PREVIOUS_NAME, "video.mp4"),
-)
+CHECKPOINT_NAME, PVD_NAME = "checkpoint.npz", "scene.pvd"
+RESULT_FILES = ("report.json", "steps.csv", "frames.csv", "scene.usdc", PVD_NAME, CHECKPOINT_NAME, "video.mp4")
 REPORT_FILES = ("report.json", "steps.csv", PVD_NAME)  # removed at once: beside another run's results they would be wrong
 # Left by a killed writer: see `taisoft.files.part_path`; USD adds temporary files with a suffix of its own
 TEMPORARY = re.compile(r"\.\d+-\d+\.part$|\.usdc\.\d+-\d+\.[A-Za-z0-9]{6}$")
@@ -204,21 +197,15 @@ def _probe(folder: Path) -> None:
 class CheckpointWriter:
     """Observer that writes folder/checkpoint.npz.
 
-    every: simulated time between checkpoints, which are written at frames [s]; None: only at the end. resumed: the checkpoint
-    from which the run resumes; if it is the folder's own it is kept as the previous one, that of another run is not. before:
-    functions called before each checkpoint at an interval, to flush the run's other files. notes: returns data to store with
-    the state.
+    every: simulated time between checkpoints, which are written at frames [s]; None: only at the end. before: functions called
+    before each checkpoint at an interval, to flush the run's other files. notes: returns data to store with the state.
     """
 
-    def __init__(self, folder: str | Path, every: float | None = None, resumed: str | Path | None = None):
+    def __init__(self, folder: str | Path, every: float | None = None):
         self.path, self.every = Path(folder) / CHECKPOINT_NAME, every
         self.before: list[Callable[[], None]] = []
         self.notes: Callable[[], dict] = dict
         self._last: float | None = None  # simulated time of the last checkpoint, or of the start
-        self._previous = self.path.with_name(PREVIOUS_NAME)
-        resumed = None if resumed is None else Path(resumed).resolve()
-        self._own = resumed == self.path.resolve()  # whether the existing file is of this run
-        self._from_previous = resumed == self._previous.resolve()  # then it is the only good one
 
     def frame(self, sim, _index: int) -> None:
         """Write a checkpoint if one is due. Raises OutputError."""
@@ -231,33 +218,8 @@ class CheckpointWriter:
 
     def write(self, sim) -> None:
         """Write sim's present state. Raises OutputError; the existing checkpoint then remains."""
-        with output_errors(f"cannot write {self._previous}"):
-            if self._own:
-                link_file(self.path, self._previous)
-            elif not self._from_previous:  # it is of another run
-                self._previous.unlink(missing_ok=True)
         sim.save_checkpoint(self.path, self.notes())
-        self._last, self._own = sim.time, True
+        self._last = sim.time
 
     def close(self) -> None:
         """Do nothing; part of the observer interface."""
-
-
-def read_last_good(path: str | Path) -> Checkpoint:
-    """Return the checkpoint in a file or, if that cannot be read, the previous one beside it, with a warning that names both.
-
-    Raises SimulationError if neither can be read, with the reasons of both.
-    """
-    path = Path(path)
-    previous = path.with_name(PREVIOUS_NAME)
-    try:
-        return read_checkpoint(path)
-    except SimulationError as error:
-        if path.name != CHECKPOINT_NAME or not previous.is_file():
-            raise
-        try:
-            found = read_checkpoint(previous)
-        except SimulationError as other:
-            raise SimulationError(f"{error}; nor can the previous one be used: {other}") from None
-        warnings.warn(f"{error}; resuming from the previous checkpoint instead, {previous}", UserWarning, stacklevel=2)
-        return found

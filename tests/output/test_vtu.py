@@ -178,8 +178,10 @@ def test_a_run_writes_a_file_a_frame_and_their_list(single):
 def test_a_resumed_run_continues_the_list(tmp_path, capsys):
     """A broken one is refused before anything is removed; without --vtu later frames leave it."""
     path, out = write(tmp_path / "scene.py", GENTLE), tmp_path / "out"
-    assert run(path, "--out", out, "--checkpoint-every", "0.06", *OPTIONS) == 0
-    text, early = (out / "scene.pvd").read_text(), shutil.copy(out / "checkpoint.previous.npz", tmp_path)
+    assert run(path, "--out", out, "--seconds", str(2 / 30), *OPTIONS) == 0
+    early = shutil.copy(out / "checkpoint.npz", tmp_path)
+    assert run(path, "--out", out, "--resume", early, "--seconds", "0.1", *OPTIONS) == 0
+    text = (out / "scene.pvd").read_text()
     resumed = ("--out", out, "--no-usd", "--no-frames", "--seconds", "0.1", "--resume", early)
     for listed, options, status, n in (("<VTKFile", ["--vtu"], 3, 4), (text, ["--vtu"], 0, 4), (text, [], 0, 2)):
         (out / "scene.pvd").write_text(listed)
