@@ -16,9 +16,6 @@ if TYPE_CHECKING:
     from taisoft.records import RunReport
 
 MAX_ENTRIES = 9  # of arrays, lists and dicts that a short repr shows in full
-CHART = (420, 130)  # width and height of the chart of energies [pixels]
-CHART_POINTS = 400  # of a curve
-CURVES = (("kinetic", "#2f6fb0"), ("elastic", "#c8662b"), ("gravity", "#3d8b52"), ("loads", "#8465ad"))  # energies and colours
 PROBLEMS_SHOWN = 5
 LEAST = 1e-6  # smaller fractions are shown as "below" it
 
@@ -63,7 +60,7 @@ def caption(text: str) -> str:
 
 
 def run_html(report: "RunReport") -> str:
-    """Return status, problems, numbers and a chart of the energies of a run as HTML."""
+    """Return status, problems and numbers of a run as HTML."""
     first, *problems = repr(report).splitlines()
     numbers = {
         "smallest J": _extreme(report, "min_volume_ratio", min),
@@ -75,45 +72,11 @@ def run_html(report: "RunReport") -> str:
     }
     rows = [f"<tr><td>{html.escape(name)}</td><td>{value:.4g}</td></tr>" for name, value in numbers.items() if value is not None]
     lines = [f"<div>{html.escape(line.strip())}</div>" for line in problems]
-    return "".join(
-        [
-            f'<div style="font-family: monospace; font-size: 12px"><b>{html.escape(first)}</b>',
-            *lines,
-            f'<table style="display: inline-table; vertical-align: top">{"".join(rows)}</table>' if rows else "",
-            _chart(report),
-            "</div>",
-        ]
-    )
+    table = f"<table>{''.join(rows)}</table>" if rows else ""
+    head = f'<div style="font-family: monospace; font-size: 12px"><b>{html.escape(first)}</b>'
+    return "".join([head, *lines, table, "</div>"])
 
 
 def _extreme(report: "RunReport", name: str, which) -> float | None:
     """Return the smallest or largest value of a field over the steps."""
     return which((getattr(step, name) for step in report.step_reports), default=None)
-
-
-def _chart(report: "RunReport") -> str:
-    """Return curves of the energies over time, as changes since the first step, as SVG; "" if there are fewer than two steps."""
-    steps = report.step_reports[:: -(-len(report.step_reports) // CHART_POINTS) or 1]
-    time = np.array([step.time for step in steps])
-    curves = {name: np.array([getattr(step, name) for step in steps]) for name, _ in CURVES}
-    curves = {name: values - values[0] for name, values in curves.items() if len(steps) > 1 and np.ptp(values) > 0.0}
-    if not curves or not all(np.isfinite(values).all() for values in curves.values()):
-        return ""
-    low, high = min(values.min() for values in curves.values()), max(values.max() for values in curves.values())
-    (width, height), left, bottom = CHART, 82, 18
-    across = left + (time - time[0]) / (time[-1] - time[0]) * (width - left - 70)
-    parts, line, colours = [], 12, dict(CURVES)
-    for name, values in curves.items():
-        down = 8 + (high - values) / (high - low) * (height - bottom - 16)
-        points = " ".join(f"{x:.1f},{y:.1f}" for x, y in zip(across, down))
-        parts.append(f'<polyline points="{points}" fill="none" stroke="{colours[name]}" stroke-width="1.5"/>')
-        parts.append(f'<text x="{width - 62}" y="{line}" fill="{colours[name]}">{name}</text>')
-        line += 13
-    labels = [
-        f'<text x="{left - 4}" y="12" text-anchor="end">{high:.3g} J</text>',
-        f'<text x="{left - 4}" y="{height - bottom - 4}" text-anchor="end">{low:.3g} J</text>',
-        f'<text x="{left}" y="{height - 4}">{time[0]:.3g} s</text>',
-        f'<text x="{across[-1]:.0f}" y="{height - 4}" text-anchor="end">{time[-1]:.3g} s, change of energies</text>',
-    ]
-    head = f'<svg width="{width}" height="{height}" style="background: white; vertical-align: top" font-size="11" fill="#333">'
-    return "".join([head, *parts, *labels, "</svg>"])

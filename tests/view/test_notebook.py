@@ -91,21 +91,13 @@ def test_a_scene_shows_its_start_and_a_simulator_its_state(ran, monkeypatch):
     assert shown(scene) is None and shown(ts.Scene()) is None, "nothing to draw gives the repr alone"
 
 
-def test_a_result_shows_numbers_problems_and_energies(ran):
+def test_a_result_shows_numbers_and_problems(ran):
     page = shown(ran[1])
     assert page.startswith("<div") and "<b>RunReport: ok, 0.1 s in 6 steps" in page
     smallest = min(step.min_volume_ratio for step in ran[1].step_reports)
     assert f"<td>smallest J</td><td>{smallest:.4g}</td>" in page
-    curves = re.findall(r'<polyline points="([^"]*)"', page)
-    assert len(curves) == 3 and ">kinetic</text>" in page and ">gravity</text>" in page and ">loads</text>" not in page
-    at = np.array([[pair.split(",") for pair in curve.split()] for curve in curves], dtype=float)
-    assert at.shape == (3, 6, 2) and (np.diff(at[..., 0]) > 0).all() and at.min() >= 0 and (at <= (420, 130)).all()
-    kinetic = np.array([step.kinetic for step in ran[1].step_reports])
-    assert np.corrcoef(kinetic, -at[0, :, 1])[0, 1] > 0.999
     page = shown(ts.RunReport(status="failed", problems=["<script>"]))
-    assert "polyline" not in page and "&lt;script&gt;" in page
-    steps = [ts.StepReport(time=t, kinetic=float("nan") if t else 1.0) for t in (0.0, 1.0)]
-    assert "polyline" not in shown(ts.RunReport(step_reports=steps))
+    assert "<table>" not in page and "&lt;script&gt;" in page
 
 
 def test_a_film_holds_a_picture_a_frame(ran, tmp_path):
