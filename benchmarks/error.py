@@ -19,8 +19,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 import taisoft as ts
+from taisoft.display import percent
 from taisoft.estimation.comparison import distance, largest_excursion, shared_nodes
-from taisoft.estimation.forecast import percent
 from taisoft.records import ERROR_KINDS
 from taisoft.scene.refine import refined
 from taisoft.scene.scene import Scene

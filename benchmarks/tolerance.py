@@ -25,10 +25,10 @@ from dataclasses import dataclass
 import numpy as np
 
 import taisoft as ts
+from taisoft.display import percent
 from taisoft.dynamics.schemes import EXPLICIT, IMPLICIT, takes_contacts
 from taisoft.estimation.comparison import distance, largest_excursion
 from taisoft.estimation.first_choice import stable_steps
-from taisoft.estimation.forecast import percent
 
 from .document import Limit, begin, table
 from .error import EXACT, EXPLICIT_FPS

@@ -3,9 +3,9 @@
 import textwrap
 
 from taisoft.cli.recording import Observers, Recording
-from taisoft.estimation.forecast import describe_error
+from taisoft.display import percent
 from taisoft.frames import dt_sentence
-from taisoft.records import RunReport
+from taisoft.records import ERROR_KINDS, ErrorEstimate, RunReport
 
 WIDTH = 118  # of the terminal
 PROBLEMS_SHOWN = 5
@@ -45,7 +45,7 @@ def print_summary(result: RunReport, sim, observers: Observers, recording: Recor
     if len(entries) > PROBLEMS_SHOWN:
         _print_lines("", [f"and {len(entries) - PROBLEMS_SHOWN} more"])
     if result.error_estimate is not None:
-        _print_lines("error", describe_error(result.error_estimate, result.wall_seconds - observers.seconds))
+        _print_lines("error", describe_error(result.error_estimate))
     print_state(sim)
     output = f"{observers.seconds:.2f} s of it for output"
     compiling = f"{result.compile_seconds:.2f} s for kernels"
@@ -64,6 +64,25 @@ def print_summary(result: RunReport, sim, observers: Observers, recording: Recor
             _print_lines("substeps", [f"{len(divided)} steps were divided, into at most {max(divided)} substeps"])
     if recording is not None:
         _print_lines("files", recording.files())
+
+
+def describe_error(estimate: ErrorEstimate) -> list[str]:
+    """Return sentences on the error of a run, and the notes."""
+    parts = {name: getattr(estimate, name) for name in ERROR_KINDS}
+    known = {name: value for name, value in parts.items() if value is not None}
+    listed = ", ".join(f"{name} {percent(value)}" for name, value in known.items())
+    sentences = []
+    if estimate.total is not None:
+        on_mesh = "" if "space" in known else " on this mesh"
+        sentences.append(f"about {percent(estimate.total)} % of the largest excursion{on_mesh} ({listed})")
+    elif estimate.time_until_then is not None:
+        until = f"until t = {estimate.agree_until:.4g} s"
+        sentences.append(f"about {percent(estimate.time_until_then)} % in time {until}, then unknown")
+        apart = max(estimate.spread_after.values())
+        sentences.append(f"afterwards the mean positions of bodies change by up to {percent(apart)} % with the step")
+    elif known:
+        sentences.append(f"unknown in time; in percent of the largest excursion {listed}")
+    return sentences + estimate.notes
 
 
 def _named(problem: str) -> tuple[str, str]:

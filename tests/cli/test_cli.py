@@ -2,6 +2,7 @@
 
 * bad input: exit status 2, one sentence that names the cause, no traceback, no output file;
 * settings: options override --set, --set overrides the scene's solver dict, and contradictions are refused;
+* the summary describes an error in a sentence;
 * list, info, doctor and bench list what is available, without importing Taichi.
 """
 
@@ -17,7 +18,10 @@ import pytest
 import taisoft as ts
 from taisoft.cli import main, parse_scalar, scene_file
 from taisoft.cli.run import resolve
+from taisoft.cli.summary import describe_error
+from taisoft.display import percent
 from taisoft.errors import SceneError
+from taisoft.records import ErrorEstimate
 from tests.cli.command import BEAM, ROOT, child, run, write
 
 BAD_SCENES = [
@@ -214,3 +218,19 @@ def test_the_command_imports_no_taichi_and_needs_a_working_folder(beam, tmp_path
     done = subprocess.run(command, cwd=tmp_path / "gone", env=environment, capture_output=True, text=True)
     assert done.returncode == 2 and not (tmp_path / "out").exists()
     assert done.stderr == "taisoft: the working folder cannot be used (No such file or directory): change to another one\n"
+
+
+def test_errors_are_described():
+    (sentence,) = describe_error(ErrorEstimate(time=0.02, space=0.02, solver=0.0, order=2.0))
+    assert sentence == "about 4 % of the largest excursion (time 2, space 2, solver 0)"
+    (sentence,) = describe_error(ErrorEstimate(time=0.04, solver=0.0, order=2.0))
+    assert sentence == "about 4 % of the largest excursion on this mesh (time 4, solver 0)"
+    (sentence,) = describe_error(ErrorEstimate(space=0.1, solver=0.001))
+    assert sentence == "unknown in time; in percent of the largest excursion space 10, solver 0.1"
+    assert [percent(value) for value in (0.0, 1e-9, 0.01234, 2.0)] == ["0", "< 0.0001", "1.2", "200"]
+    parted = ErrorEstimate(time_until_then=0.03, agree_until=1.25, spread_after={"a": 0.1, "b": 0.2}, notes=["a note"])
+    until, after = (
+        "about 3 % in time until t = 1.25 s, then unknown",
+        "afterwards the mean positions of bodies change by up to 20 %",
+    )
+    assert describe_error(parted) == [until, f"{after} with the step", "a note"]

@@ -1,8 +1,6 @@
-"""Orders, distances of paths, forecasts and vibrations, as arithmetic: orders and Richardson factors are exact for power laws;
-what lowers the order of a scene; the forecast follows the orders; vibrations that steps do not resolve raise an error.
+"""Orders, distances of paths and vibrations, as arithmetic: orders and Richardson factors are exact for power laws; what lowers
+the order of a scene; vibrations that steps do not resolve raise an error.
 """
-
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,7 +8,6 @@ import pytest
 import taisoft as ts
 from taisoft.errors import SimulationError
 from taisoft.estimation.comparison import distance, largest_excursion, shared_nodes
-from taisoft.estimation.forecast import describe_error, forecast, percent
 from taisoft.estimation.order import agreement, error_over_difference, may_jump, nominal_order, observed_order
 from taisoft.estimation.vibrations import add_vibrations, are_passed_over, shortest_period
 from taisoft.records import ErrorEstimate
@@ -96,28 +93,6 @@ def test_nodes_are_shared_body_by_body():
     starts[1][sizes[1][0][1] :] += 1e-6
     with pytest.raises(SimulationError, match="body 'other': no node of one mesh is also in the other"):
         shared_nodes(starts[0], sizes[0], starts[1], sizes[1])
-
-
-def test_forecasts_follow_the_orders():
-    only_time = ErrorEstimate(time=0.04, solver=0.0, order=2.0)
-    assert forecast(only_time, 3.0) == (pytest.approx(0.01), pytest.approx(6.0))
-    both = replace(only_time, time=0.02, space=0.02)
-    assert forecast(both, 1.0) == (pytest.approx(0.01), pytest.approx(4.0**0.5 * 4.0**2))
-    (sentence,) = describe_error(both, 1.0)
-    assert sentence == "about 4 % of the largest excursion (time 2, space 2, solver 0); 1 % would take about 32 s"
-    solver = replace(only_time, solver=0.005)
-    assert forecast(solver, 1.0) == (pytest.approx(0.01), pytest.approx(8.0**0.5))
-    assert forecast(replace(solver, solver=0.02), 1.0) is None  # steps would not help
-    (sentence,) = describe_error(ErrorEstimate(space=0.1, solver=0.001), 1.0)
-    assert sentence == "unknown in time; in percent of the largest excursion space 10, solver 0.1"
-    assert forecast(ErrorEstimate(), 1.0) is None and forecast(ErrorEstimate(time=0.0), 1.0) is None
-    assert [percent(value) for value in (0.0, 1e-9, 0.01234, 2.0)] == ["0", "< 0.0001", "1.2", "200"]
-    parted = ErrorEstimate(time_until_then=0.03, agree_until=1.25, spread_after={"a": 0.1, "b": 0.2}, notes=["a note"])
-    until, after = (
-        "about 3 % in time until t = 1.25 s, then unknown",
-        "afterwards the mean positions of bodies change by up to 20 %",
-    )
-    assert describe_error(parted, 1.0) == [until, f"{after} with the step", "a note"]
 
 
 def test_vibrations_of_bodies_with_friction():
