@@ -19,7 +19,6 @@ from taisoft.cli.scene_file import load_scene
 from taisoft.output.camera import Camera
 from taisoft.view.live import LiveRun
 from taisoft.view.picking import pick
-from taisoft.view.plots import Plots
 from taisoft.view.screen import MESSAGES, PANEL, SIZE
 from taisoft.view.window import WindowProcess
 
@@ -30,16 +29,15 @@ AWAIT = 1.0  # for keys and the last pictures [s]
 SIDES = np.linspace(0.2, 0.8, 37)  # of the window, where a body is looked for
 
 
-class Recorder(Plots):
-    """A history that also keeps the wall times of the steps [s]."""
+class RecordedRun(LiveRun):
+    """A run that also keeps the wall times of its steps [s]."""
 
-    def __init__(self, sim):
-        super().__init__(sim)
+    def __init__(self, *arguments):
+        super().__init__(*arguments)
         self.steps: list[float] = []
 
-    def take(self, report, seconds) -> None:
-        """Record a step."""
-        super().take(report, seconds)
+    def _after_step(self, report, seconds) -> None:
+        super()._after_step(report, seconds)
         self.steps += [seconds / report.steps] * report.steps
 
 
@@ -91,16 +89,15 @@ def measure(name: str) -> dict:
         sim.reset()
         report = sim.run(seconds, fps=fps)
         sim.reset()
-        recorder = Recorder(sim)
         window = WindowProcess(sim, controls=True)
         try:
             subprocess.run(["xdotool", *SEARCH, "windowmove", "0", "0", "windowfocus"], check=True, stdout=subprocess.DEVNULL)
-            run = LiveRun(sim, window, recorder)
+            run = RecordedRun(sim, window)
             run.turn()
             begin = time.perf_counter()
             while sim.time < seconds and time.perf_counter() < begin + LONGEST:
                 run.turn()
-            speed, steps, end = sim.time / (time.perf_counter() - begin), recorder.steps[1:], time.perf_counter()
+            speed, steps, end = sim.time / (time.perf_counter() - begin), run.steps[1:], time.perf_counter()
             for key in ("space", "h"):  # bodies that move would be framed otherwise when they are gripped
                 press(key, run)
             moving = mouse(grip(sim))

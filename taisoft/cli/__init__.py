@@ -237,7 +237,7 @@ def _add_run(add) -> None:
     option("--colour", choices=colours, default="body", help="colouring of bodies in pictures and the window")
     layers = "what they show besides bodies: wires, contacts, tractions, pressures, connections, fixed_nodes, or none"
     option("--layers", metavar="NAME,...", help=layers)
-    plots = "plots over time: energies, residuals, iterations, contacts, step_time, error, forces, kinetic, elastic"
+    plots = "on pictures, over time: energies, residuals, iterations, contacts, step_time, error, forces, kinetic, elastic"
     option("--plots", metavar="NAME,...", help=plots)
     option("--caption", action="store_true", help="write scene, frame, time and energies on pictures")
     option("--no-frames", action="store_true", help="write no pictures")

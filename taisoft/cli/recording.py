@@ -68,10 +68,10 @@ def display_options(arguments: Namespace, has_window: bool) -> DisplayOptions:
     pictures = arguments.out is not None and not arguments.no_frames
     layers, plots = _names("layers", arguments.layers, LAYERS), _names("plots", arguments.plots, PLOTS) or ()
     details = _names("details", arguments.details, DETAILS) or ()
-    requested = {"video": arguments.video, "caption": arguments.caption}
+    requested = {"video": arguments.video, "caption": arguments.caption, "plots": bool(plots)}
     requested |= {"size": arguments.size is not None, "view": arguments.view is not None}
     if not has_window:
-        requested |= {"layers": layers is not None, "plots": bool(plots)}
+        requested |= {"layers": layers is not None}
     for option, given in requested.items():
         if given and not pictures:
             raise SceneError(f"--{option} needs --out, the folder to write to, and pictures, so it excludes --no-frames")

@@ -29,7 +29,6 @@ from taisoft.output.camera import Camera
 from taisoft.view.scene_view import Surfaces
 
 LINE_WIDTH = 2.0  # pixels
-FLAT_WIDTH = 0.002  # of 2D lines over the picture, in units of its height
 
 POSITION, NORMAL, COLOUR, ALPHA = slice(0, 3), slice(3, 6), slice(8, 11), 11  # columns of vertices; 6 and 7 are for textures
 WIDTH = 12
@@ -77,7 +76,7 @@ def _future_panel_file() -> Path | None:
 class VertexBuffer:
     """Vertices in the layout of Taichi's renderer, with x, normals and colours, each (n,3) and initially zero.
 
-    2D drawings use the first two columns of x. The renderer gets the address of the array, which lives as long as the buffer.
+    The renderer gets the address of the array, which lives as long as the buffer.
     """
 
     def __init__(self, n: int) -> None:
@@ -130,9 +129,6 @@ class Canvas:
         self._decals = self._indices[len(surfaces.triangles) :]  # unused triangles have no area
         self._ends = VertexBuffer(2 * n_segments)
         self._most = 0  # ends of lines drawn at once so far
-        self._flat_boxes: VertexBuffer | None = None  # like `_flat_lines` drawn over the picture; made at the first `draw_over`
-        self._flat_lines: VertexBuffer | None = None
-        self._flat_ends: np.ndarray | None = None  # the array that `_flat_lines` was filled from
         self.window = self._canvas = self._scene = None
         self._panel_file = _future_panel_file()
         try:
@@ -184,26 +180,6 @@ class Canvas:
             self._ends.x[n:most] = 0.0
             self._scene.scene.lines(self._ends.info, get_field_info(None), True, GREY, self._line_width, most, 0, most, 0)
         self._canvas.scene(self._scene)
-
-    def draw_over(
-        self, boxes: np.ndarray, ends: np.ndarray, colours: np.ndarray, capacity: tuple[int, int], box_colour: tuple
-    ) -> None:
-        """Draw boxes (k,4), rows left, bottom, right, top, and lines, ends (2n,2) with colours (2n,3), over the picture.
-
-        Coordinates are in [0, 1] from the picture's lower left corner. capacity: largest numbers of boxes and lines, the same in
-        every call. If `ends` is the array of the last call, nothing is copied again.
-        """
-        if self._flat_boxes is None:
-            self._flat_boxes, self._flat_lines = VertexBuffer(6 * capacity[0]), VertexBuffer(2 * capacity[1])
-        if self._flat_ends is not ends:  # unused boxes and lines get zero size
-            left, bottom, right, top = boxes.T
-            corners = [(left, bottom), (right, bottom), (right, top), (left, bottom), (right, top), (left, top)]
-            self._flat_boxes.x[:], self._flat_lines.x[:] = 0.0, 0.0
-            self._flat_boxes.x[: 6 * len(boxes), :2] = np.array(corners).transpose(2, 0, 1).reshape(-1, 2)
-            self._flat_lines.x[: len(ends), :2], self._flat_lines.colours[: len(ends)] = ends, colours
-            self._flat_ends = ends
-        self._canvas.canvas.triangles(self._flat_boxes.info, get_field_info(None), False, box_colour)
-        self._canvas.canvas.lines(self._flat_lines.info, get_field_info(None), True, GREY, FLAT_WIDTH)
 
     def pixels(self, left: int, top: int, right: int, bottom: int) -> np.ndarray:
         """Return a part of the drawn picture, uint8 (bottom - top, right - left, 3), first row on top."""

@@ -31,9 +31,8 @@ KEYS = (
     Key(("t",), "T", "tractions", "tractions", "tractions"),
     Key(("f",), "F", "fixed_nodes", "fixed nodes", "fixed nodes"),
     Key(("d",), "D", "shadows", "shadows", "shadows on half-spaces"),
-    Key(("g",), "G", "plots", "plots", "plots over time"),
-    Key(("i",), "I", "screenshot", "picture", "write a picture, without panel and plots, to `out/window-1.png`"),
-    Key(("p",), "P", "record", "record", "record pictures, without panel and plots, to `out/window-1`"),
+    Key(("i",), "I", "screenshot", "picture", "write a picture, without the panel, to `out/window-1.png`"),
+    Key(("p",), "P", "record", "record", "record pictures, without the panel, to `out/window-1`"),
     Key((ti.ui.ESCAPE,), "Escape", "close", "end", "end"),
 )
 MOUSE = (

@@ -16,7 +16,6 @@ from taisoft.errors import SimulationError, TaisoftError
 from taisoft.records import StepReport
 from taisoft.running import timed_advance
 from taisoft.view.controls import Controls
-from taisoft.view.plots import Plots
 from taisoft.view.timing import Note
 
 BATCH = 1.0 / 60.0  # longest wall time of a batch of explicit steps [s]
@@ -36,10 +35,10 @@ class LiveRun:
     fast as possible. note: about the start; problem: why the run paused, a sentence or empty.
     """
 
-    def __init__(self, sim, window, plots: Plots, paused: bool = False, speed: float = 1.0, note: str = ""):
+    def __init__(self, sim, window, paused: bool = False, speed: float = 1.0, note: str = ""):
         self.sim, self.paused, self.speed = sim, paused, speed
         self.problem, self._note = "", Note(note)
-        self._window, self._plots, self._controls = window, plots, Controls(sim)
+        self._window, self._controls = window, Controls(sim)
         self._last_speed = 1.0  # before it was unbound
         self._compiled = False  # True after a step, since that compiles everything
         self._published = -math.inf  # wall time of the last published state
@@ -106,7 +105,6 @@ class LiveRun:
         self._spent[0] += seconds
         self._spent[1] += report.steps * self.sim.dt
         self._measured["cost"] = self._measured["cost"] or seconds / (report.steps * self.sim.dt)
-        self._plots.take(report, seconds)
         if report.problems:
             self._note.set(report.problems[-1])
 
@@ -152,7 +150,6 @@ class LiveRun:
 
     def _on_reset(self) -> None:
         self.sim.reset()
-        self._plots.restart()
         self.problem = ""
         self._start_measuring()
 
@@ -222,7 +219,7 @@ class LiveRun:
         due = age > REPEAT or (self._changed and not awaited)
         if not due or not (self._window.ready or patience):
             return
-        self._window.publish(self.sim, self._plots, self.panel_state(), patience)
+        self._window.publish(self.sim, self.panel_state(), patience)
         self._published, self._changed = time.perf_counter(), False
 
     def panel_state(self) -> dict:

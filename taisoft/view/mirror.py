@@ -17,7 +17,7 @@ from taisoft.scene import checks
 from taisoft.scene.loads import value_at
 from taisoft.scene.obstacles import Box, Capsule, HalfSpace, MeshObstacle, Obstacle, Sphere
 from taisoft.view.connection_layer import ConnectionMarks
-from taisoft.view.plots import ENERGIES, History, plain_history
+from taisoft.view.plots import ENERGIES
 from taisoft.view.scene_view import MAX_CONTACTS
 
 SHAPES = {shape.__name__: shape for shape in (HalfSpace, Sphere, Box, Capsule, MeshObstacle)}
@@ -115,11 +115,10 @@ class MirrorScene:
         return body.constraints
 
 
-def describe_state(sim, marks: ConnectionMarks, layers: set[str], history: History | None) -> dict:
+def describe_state(sim, marks: ConnectionMarks, layers: set[str]) -> dict:
     """Return what the view needs of sim's present state besides positions and nodal values.
 
-    marks: as for `describe_scene`; layers: those that are visible; history: for plots, if they are. Raises OutputError if a path
-    fails.
+    marks: as for `describe_scene`; layers: those that are visible. Raises OutputError if a path fails.
     """
     try:
         poses = {o.name: o.pose(sim.time) for o in sim.scene.obstacles if o.path is not None}
@@ -144,8 +143,6 @@ def describe_state(sim, marks: ConnectionMarks, layers: set[str], history: Histo
         state["segments"] = dict(zip(("ends", "tensions"), segments))
     if "pressures" in layers:
         state["pressures"] = pressures
-    if history is not None:
-        state["history"] = plain_history(history)
     return state
 
 
@@ -175,7 +172,7 @@ class MirrorMarks:
 class MirrorSimulation:
     """The latest state of a simulation, with those attributes of `Simulator` that pictures need.
 
-    nodal_values: (n_nodes,) of the quantity `nodal_kind`; history: with the arrays of `History`; both None until they are known.
+    nodal_values: (n_nodes,) of the quantity `nodal_kind`, None until they are known.
     """
 
     def __init__(self, description: dict, n_nodes: int):
@@ -185,7 +182,6 @@ class MirrorSimulation:
         ends = np.cumsum([0] + [body.n_nodes for body in self.scene.bodies])
         self._rows = {body.name: slice(*pair) for body, pair in zip(self.scene.bodies, zip(ends, ends[1:]))}
         self._x = np.zeros((n_nodes, 3))
-        self.history: SimpleNamespace | None = None
         self.nodal_kind, self.nodal_values = "body", None
 
     def take(self, state: dict, x: np.ndarray, values: np.ndarray) -> None:
@@ -198,8 +194,6 @@ class MirrorSimulation:
             traction.value = value
         self._contacts = state.get("contacts")
         self.marks.take(state)
-        if "history" in state:
-            self.history = SimpleNamespace(**state["history"])
         self.nodal_kind = state["colour"]
         self.nodal_values = None if self.nodal_kind == "body" else values.copy()
 

@@ -14,7 +14,6 @@ from taisoft.settings import contact_solvers
 from taisoft.view.colouring import TITLES, Colouring, following
 from taisoft.view.controls import DECADES
 from taisoft.view.keys import KEYS
-from taisoft.view.plots import PLOTS, PlotChoice
 from taisoft.view.scene_view import Layers
 
 MAX_FRICTION = 1.5
@@ -56,14 +55,12 @@ class Requests:
 class Panel:
     """Panel of a window that changes a simulation. Rarely used choices are in sections, of which one is open at a time.
 
-    bodies: names; pairs: of names, of those that can touch; colouring, layers, plots: what is drawn; requests: get the commands.
+    bodies: names; pairs: of names, of those that can touch; colouring, layers: what is drawn; requests: get the commands.
     chosen: name of the body whose material the sliders change, the last one dragged.
     """
 
-    def __init__(
-        self, bodies: list[str], pairs: list, colouring: Colouring, layers: Layers, plots: PlotChoice, requests: Requests
-    ):
-        self._bodies, self._pairs, self._colouring, self._layers, self._plots = bodies, pairs, colouring, layers, plots
+    def __init__(self, bodies: list[str], pairs: list, colouring: Colouring, layers: Layers, requests: Requests):
+        self._bodies, self._pairs, self._colouring, self._layers = bodies, pairs, colouring, layers
         self._requests = requests
         self.pressed: set[str] = set()
         self.chosen, self._all_bodies = bodies[0], len(bodies) > 1
@@ -168,7 +165,7 @@ class Panel:
 
     def _sections(self, gui) -> None:
         sections: dict[str, Callable] = {"friction of pairs": self._choose_frictions} if self._pairs else {}
-        sections |= {"solver": self._choose_solver, "layers": self._choose_layers, "plots": self._choose_plots}
+        sections |= {"solver": self._choose_solver, "layers": self._choose_layers}
         sections["keys and mouse"] = _write_help
         for name, section in sections.items():
             is_open = gui.checkbox(name, self._open_section == name)
@@ -193,11 +190,6 @@ class Panel:
         shown = self._layers.shown
         for name in shown:
             shown[name] = gui.checkbox(name.replace("_", " "), shown[name])
-
-    def _choose_plots(self, gui) -> None:
-        shown = self._plots.shown
-        for name in self._plots.available():
-            shown[name] = gui.checkbox(f"{PLOTS[name].title}###plot {name}", shown[name])
 
     def _choose_solver(self, gui) -> None:
         """Declare two buttons that cycle through the choices, and one that applies them, which compiles for seconds."""

@@ -8,6 +8,7 @@ import os
 import sys
 from dataclasses import fields
 from pathlib import Path
+from types import SimpleNamespace
 
 from taisoft.compile_message import silenced
 from taisoft.errors import TaisoftError, no_memory, reason
@@ -56,7 +57,7 @@ class Drawing:
         nodes, slot = self._link.nodes, message["slot"]
         self._sim.take(message, nodes.x[slot], nodes.values[slot])
         if self._plots is not None:
-            self._plots.history = self._sim.history
+            self._plots.history = SimpleNamespace(**message["history"])
             self._plots.set_enabled(message["enabled"])
         self._writer.frame(self._sim, message["index"])
         drawing = self._writer.renderer

@@ -20,7 +20,7 @@ from taisoft.view.connection_layer import ConnectionMarks
 from taisoft.view.link import LinkClosed
 from taisoft.view.mirror import describe_scene, describe_state
 from taisoft.view.offscreen import SIZE, Offscreen
-from taisoft.view.plots import PlotChoice, Plots
+from taisoft.view.plots import PlotChoice, Plots, plain_history
 from taisoft.view.scene_view import IN_PICTURES, scene_size
 
 SLOTS = 8  # states that wait to be drawn, besides the pictures that wait to be written
@@ -112,13 +112,13 @@ class PictureProcess:
         while self._sent - self._drawn >= SLOTS:
             self._read(None)
         nodes, slot = self._child.link.nodes, self._sent % SLOTS
-        state = describe_state(sim, self._marks, self._layers, self._plots and self._plots.history)
+        state = describe_state(sim, self._marks, self._layers)
         nodes.x[slot] = sim.positions()
         if self._options.colour != "body":
             nodes.values[slot] = self._values(self._options.colour, sim)
         state |= {"slot": slot, "index": index, "colour": self._options.colour}
         if self._plots is not None:
-            state["enabled"] = self._plots.enabled()
+            state |= {"enabled": self._plots.enabled(), "history": plain_history(self._plots.history)}
         self._sent += 1
         self._send(state)
 

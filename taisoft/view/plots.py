@@ -1,14 +1,14 @@
 """Plots over time of the step reports: energies, residuals, iterations, contacts, wall time of a step, and estimated errors.
 
-This module keeps the history of a run and computes the curves in a unit square; `taisoft.view.annotations` draws them on pictures
-and in the window. Only simulated quantities are available: no contacts if nothing can touch, no Newton iterations for explicit
+This module keeps the history of a run and computes the curves in a unit square; `taisoft.view.annotations` draws them on
+pictures. Only simulated quantities are available: no contacts if nothing can touch, no Newton iterations for explicit
 steps. Where errors are estimated, energies are drawn as bands: plus and minus the error in time at the last comparison.
 
 The history takes constant memory: minimum and maximum of every quantity over bins of consecutive steps. A bin holds one step
 until CAPACITY bins are full. Then neighbours are merged in pairs, and from there on a bin holds twice as many steps. So no peak
 is lost, however long a simulation runs, and early and late steps have the same resolution.
 
-Some plots show a quantity of each pair that presses, or of each body: the few largest. Recording starts when one is first shown.
+Some plots show a quantity of each pair that presses, or of each body: the few largest.
 """
 
 import math
@@ -237,15 +237,13 @@ def series_of(plot: Plot, history) -> tuple[Series, ...]:
 
 
 class PlotChoice:
-    """Which plots of a history are available and shown.
+    """Which plots of a history are available and drawn.
 
-    history: a `History`, or what has its arrays; enabled: which of the `needs` of series are met; shown: name -> whether it is.
+    history: a `History`, or what has its arrays; enabled: which of the `needs` of series are met; names: of the requested plots.
     """
 
     def __init__(self, history, enabled: dict[str, bool], names: tuple[str, ...] = ()):
-        self.history, self._enabled = history, enabled
-        self.shown = {name: name in names for name in PLOTS}
-        self._last_shown = tuple(names)
+        self.history, self._enabled, self.names = history, enabled, names
 
     def enabled(self) -> dict[str, bool]:
         """Return which `needs` of series are met now."""
@@ -262,17 +260,8 @@ class PlotChoice:
         return {name: replace(PLOTS[name], series=series) for name, series in kept.items() if series}
 
     def visible(self) -> list[str]:
-        """Return the names of the plots that are shown and available."""
-        return [name for name in self.available() if self.shown[name]]
-
-    def toggle(self) -> None:
-        """Hide all plots, or show those shown last again; if there were none, all available ones but those by pair or body."""
-        visible = self.visible()
-        available = self.available()
-        common = [name for name, plot in available.items() if not plot.many]
-        chosen = () if visible else [name for name in self._last_shown if name in available] or common
-        self._last_shown = tuple(visible) or self._last_shown
-        self.shown = {name: name in chosen for name in PLOTS}
+        """Return the names of the plots that are requested and available."""
+        return [name for name in self.available() if name in self.names]
 
     def curves(self, name: str) -> "Curves":
         """Return the present drawing of a plot."""
@@ -280,15 +269,14 @@ class PlotChoice:
 
 
 class Plots(PlotChoice):
-    """History of a simulation, and which plots of it are shown.
+    """History of a simulation, and which plots of it are drawn.
 
-    sim: a Simulator; names: of the plots shown initially; errors: whether the run estimates errors. watched: names of the plots
-    by pair or body whose quantities are recorded. Raises SceneError for an unknown name or a plot of quantities that sim does not
-    simulate.
+    sim: a Simulator; names: of the plots; errors: whether the run estimates errors. Raises SceneError for an unknown name or a
+    plot of quantities that sim does not simulate.
     """
 
     def __init__(self, sim, names: tuple[str, ...] = (), errors: bool = False):
-        self._sim, self._errors, self.watched = sim, errors, set(names)
+        self._sim, self._errors = sim, errors
         super().__init__(History(), {}, names)
         for name in names:
             if name not in PLOTS:
@@ -303,24 +291,17 @@ class Plots(PlotChoice):
 
     def take(self, report: StepReport, seconds: float) -> None:
         """Record a step report; seconds: its wall time [s]. For `on_step` of a run."""
-        if report.time < self.history.times[-1]:  # the simulation was reset
-            self.history.start(self._sim)
-        else:
-            errors = self._sim.error_so_far if self._errors else None
-            self.history.take(report, seconds, self._sim.settings.explicit, self._touching, errors, **self._by_name())
+        errors = self._sim.error_so_far if self._errors else None
+        self.history.take(report, seconds, self._sim.settings.explicit, self._touching, errors, **self._by_name())
 
     def _by_name(self) -> dict[str, float]:
-        """Return the columns of the watched plots by pair or body: forces [N] and energies [J]."""
-        sim, found, kinds = self._sim, {}, sorted(self.watched & {"kinetic", "elastic"})
-        for a, b in sim.pairs_in_contact() if "forces" in self.watched else ():
+        """Return the columns of the requested plots by pair or body: forces [N] and energies [J]."""
+        sim, found, kinds = self._sim, {}, [kind for kind in ("kinetic", "elastic") if kind in self.names]
+        for a, b in sim.pairs_in_contact() if "forces" in self.names else ():
             found[f"forces: {a}, {b}"] = float(np.linalg.norm(sim.contact_force(a, b)))
         for body, energies in zip(sim.scene.bodies, sim._open().body_energies()) if kinds else ():
             found |= {f"{kind}: {body.name}": getattr(energies, kind) for kind in kinds}
         return found
-
-    def restart(self) -> None:
-        """Clear the history."""
-        self.history.start(self._sim)
 
     @property
     def _touching(self) -> bool:

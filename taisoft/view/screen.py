@@ -12,14 +12,13 @@ from taisoft.files import write_bytes
 from taisoft.output.camera import MAX_WIDENING, Camera
 from taisoft.output.files import make_folder
 from taisoft.output.frames import png_bytes
-from taisoft.view.annotations import PlotOverlay
 from taisoft.view.colouring import BACKGROUND_TOP
 from taisoft.view.ggui import Canvas
 from taisoft.view.keys import ACTIONS
 from taisoft.view.mirror import MirrorSimulation
 from taisoft.view.panel import Panel, Requests, wrapped
 from taisoft.view.picking import MouseDrag, pick
-from taisoft.view.plots import ENERGIES, PlotChoice
+from taisoft.view.plots import ENERGIES
 from taisoft.view.scene_view import IN_FRONT, SceneView
 from taisoft.view.timing import Note, Timing
 from taisoft.view.window_shadow import ShadowMesh
@@ -39,25 +38,23 @@ FOR_SIMULATION = {"pause", "step", "reset", "faster", "slower", "unbound"}  # ac
 class Screen(SceneView):
     """The window. The user may change colours and layers and move the camera, which then follows the bodies no more.
 
-    sim: the latest state; description: what `WindowProcess` sends. requests: gets commands, if the window has controls; plots:
-    those that can be shown; timing: of pictures and drags. Raises OutputError, before anything is opened, if a display or a
-    Vulkan driver is missing or a name is unknown.
+    sim: the latest state; description: what `WindowProcess` sends. requests: gets commands, if the window has controls; timing:
+    of pictures and drags. Raises OutputError, before anything is opened, if a display or a Vulkan driver is missing or a name is
+    unknown.
     """
 
     def __init__(self, sim: MirrorSimulation, description: dict, requests: Requests):
         super().__init__(sim.scene, SIZE, None, description["colour"], tuple(description["layers"]), sim.values_of, sim.marks)
-        self.plots = PlotChoice(sim.history, {"implicit": True, "contact": True, "error": True}, tuple(description["plots"]))
         self.timing = Timing()
         self.layers.shown["shadows"] = True
-        self._requests, self._overlay = requests, PlotOverlay(self.plots, SIZE)
+        self._requests = requests
         self._panel: Panel | None = None
         if description["controls"]:
             names = [body.name for body in sim.scene.bodies]
-            self._panel = Panel(names, description["pairs"], self.colouring, self.layers, self.plots, requests)
+            self._panel = Panel(names, description["pairs"], self.colouring, self.layers, requests)
         self._panel_rectangle = PANEL if self._panel is not None else SHORT_PANEL
         self._cursor: tuple[float, float] | None = None  # at the last picture
         self._mode = ""  # of the present mouse drag: "turn", "zoom", "shift", "drag", or "panel", which GGUI handles
-        self._plots_hidden = False  # while a drag that began over them turns the view
         self._follows, self._centre = False, None  # whether the camera follows the bodies; their last centre
         self._picture_size: tuple[int, int] | None = None  # of the last picture taken of the window
         self._close_requested = False
@@ -89,7 +86,6 @@ class Screen(SceneView):
         """Draw a state, show it, and process keys and mouse. age: wall time since it came [s]."""
         window = self._canvas.window
         size = window.get_window_shape()
-        self.plots.history = sim.history
         self._follow(sim)
         x, colours, (ends, line_colours) = self._drawn(sim, size)
         if self._drag is not None:
@@ -99,8 +95,6 @@ class Screen(SceneView):
         shadows = self._shadow_mesh.draw(x, sim.time, self.camera) if self.layers.shown["shadows"] else None
         self._canvas.draw(x, colours, self.camera, tuple(BACKGROUND_TOP), (ends, line_colours), shadows)
         self._take_picture(size)
-        if sim.history is not None and not self._plots_hidden:
-            self._overlay.draw(self._canvas, window.get_gui(), size)
         # lines above the sliders must be constant in number: a transient line would move the sliders under the cursor
         with window.get_gui().sub_window("taisoft", *self._panel_rectangle) as gui:
             for line in [state["status"], *state_lines(sim), *self.timing.lines(state)]:
@@ -170,8 +164,6 @@ class Screen(SceneView):
                 self._requests.add(action)
         for name in pressed & set(self.layers.shown):
             self.layers.shown[name] = not self.layers.shown[name]
-        if "plots" in pressed:
-            self.plots.toggle()
         if "colour" in pressed:
             self.colouring.choose_next()
         if "frame" in pressed:
@@ -191,7 +183,7 @@ class Screen(SceneView):
             if self._drag is not None:
                 self._drag = None
                 self._requests.add("release")
-            self._mode, self._plots_hidden = "", False
+            self._mode = ""
         elif not self._mode:
             self._mode = self._begin_drag(sim, button, cursor, size)
         else:
@@ -202,15 +194,14 @@ class Screen(SceneView):
         self._cursor = cursor
 
     def _begin_drag(self, sim: MirrorSimulation, button, cursor, size) -> str:
-        """Start a mouse drag at the cursor and return its mode. Over plots it moves the view, and hides them meanwhile."""
+        """Start a mouse drag at the cursor and return its mode."""
         x, y = cursor[0] * size[0], (1.0 - cursor[1]) * size[1]
         rectangles = [self._panel_rectangle, *([MESSAGES] if self._messages else [])]
         if any(_contains(rectangle, x, y) for rectangle in rectangles):
             return "panel"
-        self._plots_hidden = self._overlay.contains(x, y)
         if button != ti.ui.LMB:
             return "zoom" if button == ti.ui.RMB else "shift"
-        can_drag = self._panel is not None and self._panel.strength > 0.0 and not self._plots_hidden
+        can_drag = self._panel is not None and self._panel.strength > 0.0
         if can_drag and not self._canvas.window.is_pressed(ti.ui.CTRL):
             hit = pick(sim, self.camera, cursor, size)
             if hit is not None:

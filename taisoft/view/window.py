@@ -6,7 +6,6 @@ computed. The simulation stays in the caller's process, whatever its scene holds
 ends with its caller, however that ends.
 """
 
-import math
 import time
 import warnings
 from typing import NoReturn
@@ -14,7 +13,6 @@ from typing import NoReturn
 from taisoft.errors import OutputError
 from taisoft.frames import dt_sentence, fit_dt
 from taisoft.records import RunReport, StepReport
-from taisoft.view.annotations import REFRESH
 from taisoft.view.child_process import ChildProcess, python_module
 from taisoft.view.colouring import NodalValues
 from taisoft.view.connection_layer import ConnectionMarks
@@ -23,7 +21,6 @@ from taisoft.view.ggui import display_missing, vulkan_missing
 from taisoft.view.link import LinkClosed
 from taisoft.view.live import LiveRun
 from taisoft.view.mirror import describe_scene, describe_state
-from taisoft.view.plots import PLOTS, Plots
 from taisoft.view.scene_view import IN_WINDOW, scene_size
 
 FAILURE = "cannot open a window"
@@ -35,7 +32,7 @@ CHILD = python_module("taisoft.view.window_process")
 class WindowProcess:
     """A window in a child process that shows a simulation.
 
-    sim: a Simulator; controls: whether the window changes it, or only shows it; colour, layers, plots: those shown initially;
+    sim: a Simulator; controls: whether the window changes it, or only shows it; colour, layers: those shown initially;
     fps: of the window's pictures, at most; child: command of the process, if not CHILD.
     closed: whether it is; timing: once its user has closed it, times of its pictures and latencies of drags, see
     `taisoft.view.timing`. Raises OutputError if a display or a Vulkan driver is missing or the window does not open.
@@ -47,7 +44,6 @@ class WindowProcess:
         controls: bool = False,
         colour: str = "body",
         layers: tuple[str, ...] = IN_WINDOW,
-        plots: tuple[str, ...] = (),
         fps: float = FPS,
         child: tuple[str, ...] | None = None,
     ):
@@ -56,14 +52,12 @@ class WindowProcess:
             raise OutputError(f"{FAILURE}: {missing}")
         scene = sim.scene
         n_nodes = sum(body.n_nodes for body in scene.bodies)
-        self._values, self._colour, self._layers, self._wants_plots = NodalValues(scene.bodies), colour, set(layers), list(plots)
+        self._values, self._colour, self._layers = NodalValues(scene.bodies), colour, set(layers)
         self._sent = self._confirmed = self._answered = 0  # numbers of states, and of the last request
-        self._history_sent = -math.inf  # wall time
         self._requests: list[tuple[int, list]] = []  # not yet returned
         self.closed, self.timing = False, {}
         self._marks = ConnectionMarks(scene, scene_size(scene))
-        description = describe_scene(scene, self._marks) | {"fps": fps, "colour": colour}
-        description |= {"layers": list(layers), "plots": list(plots)}
+        description = describe_scene(scene, self._marks) | {"fps": fps, "colour": colour, "layers": list(layers)}
         description |= {"controls": controls, "pairs": touching_pairs(sim) if controls else []}
         self._child = ChildProcess(child or CHILD, description, FAILURE, n_nodes)
         self._link = self._child.link
@@ -115,12 +109,12 @@ class WindowProcess:
             self.closed, self.timing = True, message
             return False
         self._confirmed = message["confirmed"]
-        self._colour, self._layers, self._wants_plots = message["colour"], set(message["layers"]), message["plots"]
+        self._colour, self._layers = message["colour"], set(message["layers"])
         if message["commands"]:
             self._requests.append((message["number"], message["commands"]))
         return True
 
-    def publish(self, sim, plots: Plots, shown: dict, patience: float = 0.0) -> None:
+    def publish(self, sim, shown: dict, patience: float = 0.0) -> None:
         """Send sim's present state, unless the window does not take the previous one within a time [s].
 
         shown: what else the window shows, see `LiveRun.panel_state`.
@@ -131,16 +125,12 @@ class WindowProcess:
             self._read(left)
         if not self.ready or self.closed:
             return
-        now, history = time.perf_counter(), None
-        plots.watched.update(self._wants_plots)
-        if self._wants_plots and now - self._history_sent >= REFRESH:
-            history, self._history_sent = plots.history, now
-        state = describe_state(sim, self._marks, self._layers, history)
+        state = describe_state(sim, self._marks, self._layers)
         self._link.nodes.x[0] = sim.positions()
         if self._colour != "body":
             self._link.nodes.values[0] = self._values(self._colour, sim)
         self._sent += 1
-        state |= {"enabled": plots.enabled(), "number": self._sent, "answered": self._answered, "colour": self._colour} | shown
+        state |= {"number": self._sent, "answered": self._answered, "colour": self._colour} | shown
         try:
             self._link.send(state)
         except LinkClosed:
@@ -160,21 +150,15 @@ class WindowProcess:
 class LiveWindow:
     """A window that shows a simulation while a loop of the caller steps it: call it with the simulator for each picture.
 
-    `sim.run(seconds, on_frame=window)` does so for each frame. plots: names, or `Plots` that are filled elsewhere; colour and
-    layers: as for `show`. A window that is closed or lost does not end the run; the latter is a warning.
-    Raises OutputError if a display or a Vulkan driver is missing, SceneError for a plot of a quantity that is not simulated.
+    `sim.run(seconds, on_frame=window)` does so for each frame. colour and layers: as for `show`. A window that is closed or lost
+    does not end the run; the latter is a warning. Raises OutputError if a display or a Vulkan driver is missing.
     """
 
-    def __init__(self, sim, plots: tuple[str, ...] | Plots = (), colour: str = "body", layers: tuple[str, ...] = IN_WINDOW):
-        names = (plots,) if isinstance(plots, str) else plots
-        self._plots, self._own = (plots, False) if isinstance(plots, Plots) else (Plots(sim, names), True)
-        shown = tuple(name for name in PLOTS if self._plots.shown[name])
-        self._window = WindowProcess(sim, colour=colour, layers=layers, plots=shown)
+    def __init__(self, sim, colour: str = "body", layers: tuple[str, ...] = IN_WINDOW):
+        self._window = WindowProcess(sim, colour=colour, layers=layers)
 
-    def __call__(self, sim, index: int | None = None, report: StepReport | None = None) -> None:
-        """Show sim's present state if the window has shown the previous one. report: of the last step, for the plots."""
-        if self._own and report is not None:
-            self._plots.take(report, math.nan)
+    def __call__(self, sim, index: int | None = None, _report: StepReport | None = None) -> None:
+        """Show sim's present state if the window has shown the previous one."""
         self.frame(sim, sim.step_count if index is None else index)
 
     def __enter__(self) -> "LiveWindow":
@@ -192,7 +176,7 @@ class LiveWindow:
         """Show a frame of a run if the window has shown the previous one."""
         try:
             self._window.receive()
-            self._window.publish(sim, self._plots, {"status": f"frame {index}", "messages": []})
+            self._window.publish(sim, {"status": f"frame {index}", "messages": []})
         except OutputError as error:
             warnings.warn(f"{error}; the run continues without it", UserWarning, stacklevel=2)
 
@@ -207,7 +191,6 @@ def show(
     paused: bool = False,
     colour: str = "body",
     layers: tuple[str, ...] = IN_WINDOW,
-    plots: tuple[str, ...] = (),
     speed: float = 1.0,
 ) -> None:
     """Run a simulation in a window until it is closed, following the clock.
@@ -215,18 +198,18 @@ def show(
     sim: an open Simulator; if made with draggable=True, its bodies can be dragged with the mouse. fps: dt is lowered to a divisor
     of 1/fps as by `run`, so that without a drag the states are those of `run`, bit by bit; None keeps dt. speed: simulated over
     wall time, `math.inf` for as fast as possible. A failed step pauses the run and the reason is shown; R restarts. colour,
-    layers, plots: initial ones. Raises OutputError, before anything is opened, if a display or a Vulkan driver is missing, and
-    if the window's process is lost; SceneError for a plot of a quantity that is not simulated.
+    layers: initial ones. Raises OutputError, before anything is opened, if a display or a Vulkan driver is missing, and if the
+    window's process is lost.
     """
     if fps is not None and not fps > 0:
         raise OutputError(f"the window's fps is {fps}; it must be positive")
     if not speed > 0:
         raise OutputError(f"the window's speed is {speed}; it must be positive")
-    history, report = Plots(sim, plots), RunReport()
-    window = WindowProcess(sim, controls=True, colour=colour, layers=layers, plots=plots)
+    report = RunReport()
+    window = WindowProcess(sim, controls=True, colour=colour, layers=layers)
     try:
         fit_dt(sim, fps, report)
-        LiveRun(sim, window, history, paused, speed, dt_sentence(report)).run()
+        LiveRun(sim, window, paused, speed, dt_sentence(report)).run()
     finally:
         window.close()
         if sim.dragged is not None:

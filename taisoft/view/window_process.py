@@ -72,18 +72,17 @@ class View:
             self._state, self._came = message, time.perf_counter()
             self._sim.take(message, self._link.nodes.x[0], self._link.nodes.values[0])
             self._screen.timing.came(message)
-            self._screen.plots.set_enabled(message["enabled"])
             self._send()  # at once, so that the simulation may send the next one
 
     def _send(self) -> None:
         """Send commands, and confirm the state, if there is anything new."""
         screen = self._screen
         layers = [name for name, shown in screen.layers.shown.items() if shown]
-        shown = (self._state["number"], screen.colouring.kind, layers, screen.plots.visible())
+        shown = (self._state["number"], screen.colouring.kind, layers)
         waits = self._requests.number - self._state["answered"] >= MAX_UNANSWERED
         commands = [] if waits else self._requests.take()
         if commands or shown != self._confirmed:
-            names = ("confirmed", "colour", "layers", "plots")
+            names = ("confirmed", "colour", "layers")
             self._link.send(dict(zip(names, shown)) | {"number": self._requests.number, "commands": commands})
             self._confirmed = shown
 

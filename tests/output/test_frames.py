@@ -153,6 +153,7 @@ def test_bad_sizes_and_speeds_are_refused(beam, tmp_path, capsys):
         ("--size 0x5", "both must be 1 to 16384"),
         ("--view 0 90", "--view: the elevation must be from -89 to 89 degrees, not 90"),
         ("--size 64x36 --no-frames", "--size needs --out"),
+        ("--plots energies --no-frames", "--plots needs --out, the folder to write to, and pictures"),
     ):
         assert run(beam, "--out", tmp_path / "out", *options.split()) == 2
         assert message in capsys.readouterr().err and not (tmp_path / "out").exists()

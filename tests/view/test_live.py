@@ -12,7 +12,6 @@ from taisoft.frames import fit_dt
 from taisoft.records import RunReport, StepReport
 from taisoft.settings import Settings
 from taisoft.view.live import LiveRun
-from taisoft.view.plots import Plots
 from tests.view.drawing import cubes_scene
 from tests.view.fake_simulator import FakeSimulator, beam_scene
 
@@ -67,7 +66,7 @@ class Window:
         self.waits.append(timeout)
         return []
 
-    def publish(self, sim, plots, shown, patience=0.0):
+    def publish(self, sim, shown, patience=0.0):
         self.states.append(shown | {"time": sim.time, "step_count": sim.step_count, "patience": patience})
 
 
@@ -78,7 +77,7 @@ def live(monkeypatch):
     def make(sim, requests=(), **options):
         monkeypatch.setattr("time.perf_counter", lambda: sim.now)
         window = Window(sim, requests)
-        return LiveRun(sim, window, Plots(sim), **options), window
+        return LiveRun(sim, window, **options), window
 
     return make
 
@@ -218,7 +217,7 @@ def test_without_a_drag_the_states_are_those_of_run():
     settings = {"integrator": "symplectic_euler", "dt": 2e-3, "draggable": True}
     with ts.Simulator(cubes_scene(), **settings) as sim:
         fit_dt(sim, 60.0, RunReport())
-        LiveRun(sim, Window(sim, steps=round(0.1 / sim.dt)), Plots(sim)).run()
+        LiveRun(sim, Window(sim, steps=round(0.1 / sim.dt))).run()
         n, found = sim.step_count, (sim.time, sim.positions(), sim.velocities())  # a last batch may exceed 0.1 s
     with ts.Simulator(cubes_scene(), **settings) as sim:
         sim.run(0.1, fps=60)

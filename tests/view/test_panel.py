@@ -13,7 +13,6 @@ from taisoft.output.camera import Camera
 from taisoft.view.controls import Controls, touching_pairs
 from taisoft.view.mirror import MirrorSimulation, describe_scene, describe_state
 from taisoft.view.panel import Panel, Requests
-from taisoft.view.plots import PlotChoice, Plots
 from taisoft.view.screen import SIZE, Screen
 from taisoft.view.timing import Timing
 from tests.output.png import decode
@@ -57,8 +56,8 @@ def state_of(controls, answered=0):
 def draw(cubes):
     """A function that draws the panel with moves and presses, and returns the labels of sliders and the commands."""
     colouring = SimpleNamespace(kind="body", legend=list, choose_next=lambda: None)
-    plots, requests = PlotChoice(None, {"implicit": True, "contact": True, "error": False}), Requests()
-    panel = Panel(["a", "b", "c"], touching_pairs(cubes), colouring, SimpleNamespace(shown={}), plots, requests)
+    requests = Requests()
+    panel = Panel(["a", "b", "c"], touching_pairs(cubes), colouring, SimpleNamespace(shown={}), requests)
     controls = Controls(cubes)
 
     def draw(moves=None, state=None, **more):
@@ -164,9 +163,9 @@ def test_latency_counts_from_the_last_look_that_saw_nothing(monkeypatch):
 
 
 class FakeCanvas(Gui):
-    """A canvas and its window, without a display. drawn: the camera of the last picture; has_plots: whether that shows plots."""
+    """A canvas and its window, without a display. drawn: the camera of the last picture."""
 
-    keys, buttons, cursor, running, has_plots = (), (), (0.9, 0.1), True, False
+    keys, buttons, cursor, running = (), (), (0.9, 0.1), True
     window = property(lambda self: self)
     get_gui = show = lambda self: self
 
@@ -186,10 +185,7 @@ class FakeCanvas(Gui):
         return self.cursor
 
     def draw(self, x, colours, camera, background, lines, shadows):
-        self.drawn, self.has_plots = camera, False
-
-    def draw_over(self, *_):
-        self.has_plots = True
+        self.drawn = camera
 
     def pixels(self, left, top, right, bottom):
         return np.full((bottom - top, right - left, 3), 90, np.uint8)
@@ -198,13 +194,13 @@ class FakeCanvas(Gui):
 @pytest.fixture
 def screen(cubes, monkeypatch, tmp_path):
     """The window of the cubes, its canvas, and a function that draws with keys and buttons pressed and returns the commands."""
-    canvas, requests, marks, history = FakeCanvas(), Requests(), marks_of(cubes.scene), Plots(cubes).history
+    canvas, requests, marks = FakeCanvas(), Requests(), marks_of(cubes.scene)
     monkeypatch.setattr("taisoft.view.screen.Canvas", lambda *_, **__: canvas)
     monkeypatch.chdir(tmp_path)
     description = describe_scene(cubes.scene, marks)
     mirror = MirrorSimulation(description, len(cubes.positions()))
-    mirror.take(describe_state(cubes, marks, set(), history) | {"colour": "body"}, cubes.positions(), np.zeros(0))
-    shown = {"colour": "body", "layers": ("fixed_nodes",), "plots": (), "controls": True, "pairs": touching_pairs(cubes)}
+    mirror.take(describe_state(cubes, marks, set()) | {"colour": "body"}, cubes.positions(), np.zeros(0))
+    shown = {"colour": "body", "layers": ("fixed_nodes",), "controls": True, "pairs": touching_pairs(cubes)}
     screen, state = Screen(mirror, description | shown, requests), state_of(Controls(cubes)) | {"status": "", "messages": []}
 
     def act(keys=(), buttons=(), cursor=(0.9, 0.1)):
@@ -225,9 +221,6 @@ def test_keys(screen, tmp_path, cubes):
     assert {k for k in before if screen.layers.shown[k] != before[k]} == {"contacts", "fixed_nodes", "shadows", "wires"}
     act("v")
     assert screen.colouring.kind == "stress"
-    act("g")
-    act()
-    assert canvas.has_plots and "energies" in screen.plots.visible()
     for keys in ("i", "p", (), (), "p", ()):  # the first picture of "p" also writes the one that was asked for
         act(keys)
     assert decode((tmp_path / "out/window-1.png").read_bytes()).shape == (720, 1280, 3)
@@ -263,12 +256,6 @@ def test_the_mouse_moves_the_view(screen):
     moved = np.diff([camera.project(start.target[None], SIZE)[0, :2] for camera in (start, drag(ti.ui.MMB))], axis=0)[0]
     assert moved == pytest.approx((0.05 * SIZE[0], -0.1 * SIZE[1])), "what is under the cursor stays under it"
     assert drag(ti.ui.LMB, begin=(0.1, 0.5)) == start, "on the panel"
-    screen.plots.shown["energies"] = True  # in the upper right corner, hidden while the view turns
-    for buttons, across in (((), 0.9), ([ti.ui.LMB], 0.95), ([ti.ui.LMB], 0.94), ((), 0.94)):
-        act(buttons=buttons, cursor=(across, 0.95))
-        act(buttons=buttons, cursor=(across, 0.95))
-        assert canvas.has_plots == (not buttons)
-    assert screen.camera.azimuth != start.azimuth
 
 
 def test_the_mouse_drags_a_body(screen, cubes):

@@ -16,7 +16,7 @@ from taisoft.view import pictures
 from taisoft.view.link import Link, LinkClosed, SharedNodes, encode
 from taisoft.view.mirror import MirrorSimulation, describe_scene, describe_state
 from taisoft.view.pictures import MIN_PICTURES, SLOTS, PictureOptions, PictureProcess, open_pictures, picture_writer
-from taisoft.view.plots import History, Plots
+from taisoft.view.plots import Plots
 from tests.view.drawing import connected_scene, marks_of, moving_scene, program
 from tests.view.fake_simulator import FakeSimulator, beam_scene
 
@@ -58,26 +58,25 @@ def test_both_ends():
 
 
 def test_only_what_is_shown_travels():
-    sim, history = FakeSimulator(moving_scene()), History()
+    sim = FakeSimulator(moving_scene())
     marks, x = marks_of(sim.scene), sim.positions()
-    state = describe_state(sim, marks, set(), None)
-    assert {"contacts", "history"}.isdisjoint(state) and state["tractions"] == []
-    history.start(sim)
-    state = sent(describe_state(sim, marks, {"tractions"}, history) | {"colour": "body"})
+    state = describe_state(sim, marks, set())
+    assert "contacts" not in state and state["tractions"] == []
+    state = sent(describe_state(sim, marks, {"tractions"}) | {"colour": "body"})
     assert state["tractions"][0].tolist() == [0.0, 0.0, 50.0]
     mirror = MirrorSimulation(sent(describe_scene(sim.scene, marks)), len(x))
     mirror.take(state, x, np.zeros(0))
-    assert np.array_equal(mirror.history.high, history.high, equal_nan=True) and mirror.nodal_values is None
+    assert mirror.nodal_values is None
     mirror.take(state | {"colour": "stress"}, x, np.arange(float(len(x))))
     assert mirror.values_of("speed") is None and mirror.values_of("stress")[-1] == len(x) - 1
     assert np.array_equal(mirror.positions("two"), sim.positions("two")) and mirror.energies() == sim.energies()
     store(sim.scene.obstacle("rod"), path=lambda t: ((0, 0.25, 0), np.eye(3)))  # as a command does
-    mirror.take(describe_state(sim, marks, set(), None) | {"colour": "body"}, x, np.zeros(0))
+    mirror.take(describe_state(sim, marks, set()) | {"colour": "body"}, x, np.zeros(0))
     assert mirror.scene.obstacles[2].pose(0.0)[0].tolist() == [0.0, 0.25, 0.0]
     sim.scene.add_obstacle(ts.Sphere((9, 0, 0), 0.1), name="late", path=lambda t: ((1.0 / (1.0 - t), 0, 0), np.eye(3)))
     sim.time = 1.0
     with pytest.raises(OutputError, match="the scene cannot be shown: obstacle 'late': the path must give"):
-        describe_state(sim, marks_of(sim.scene), set(), None)
+        describe_state(sim, marks_of(sim.scene), set())
 
 
 def test_both_frame_the_same_fall():

@@ -1,4 +1,4 @@
-"""Plots over time: history, curves in the unit square, their place in the window and on pictures; captions and colour bars."""
+"""Plots over time: history, curves in the unit square, their place on pictures; captions and colour bars."""
 
 import math
 from types import SimpleNamespace
@@ -12,7 +12,7 @@ from taisoft.errors import OutputError, SceneError
 from taisoft.records import Energies, ErrorEstimate, StepReport
 from taisoft.scene.plan import Plan
 from taisoft.view import annotations
-from taisoft.view.annotations import Annotations, cells, drawing
+from taisoft.view.annotations import Annotations
 from taisoft.view.colouring import COLOURS, Colouring
 from taisoft.view.plots import PLOTS, QUANTITIES, History, Plots, curves_of, plain_history
 from taisoft.view.scene_view import Surfaces
@@ -122,11 +122,11 @@ def test_curves_have_the_heights_given_by_the_axis():
 
 
 def test_of_many_pairs_the_few_with_the_largest_forces_are_drawn_and_bodies_only_where_wanted():
-    """Also of what a window gets. A pair that does not press has no force; what was not recorded is a gap."""
+    """Also of what the process of pictures gets. A pair that does not press has no force; what was not recorded is a gap."""
     sim = Stub()
     plots = Plots(sim)
-    for k, watched in enumerate(("", "forces", "forces", "kinetic")):
-        plots.watched.update([watched])
+    for k, names in enumerate(((), ("forces",), ("forces",), ("forces", "kinetic"))):
+        plots.names = names
         sim.forces = {("a", str(j)): (3.0 * j * (k == 1), 4.0 * j, 0.0) for j in range(9 if k == 1 else 7)}
         plots.take(StepReport(time=k + 1.0), 0.01)
     sent = SimpleNamespace(**plain_history(plots.history))
@@ -176,35 +176,6 @@ def test_only_simulated_quantities_are_available():
             Plots(stub, (name,))
 
 
-def test_the_key_hides_and_shows_again_and_a_restart_clears():
-    hidden = {"error", "residuals", "forces", "kinetic", "elastic"}  # a run without estimates, and those by pair or body
-    plots, visible = Plots(Stub()), [name for name in PLOTS if name not in hidden]
-    plots.toggle()
-    plots.shown["residuals"] = False
-    for expected in (visible, [], visible):
-        assert plots.visible() == expected
-        plots.toggle()
-    plots.take(StepReport(time=0.5), 0.01)
-    plots.take(StepReport(time=0.1), 0.01)  # the simulator was reset
-    assert plots.history.times.tolist() == [0.0]
-
-
-@pytest.mark.parametrize("size, n_shown", [((1280, 720), 6), ((800, 300), 2), ((300, 100), 0)])
-def test_plots_lie_in_the_window_without_overlap(size, n_shown):
-    shown = cells(filled(), size)
-    boxes, ends, colours = drawing(shown, size)
-    assert len(boxes) == len(shown) == n_shown and len(ends) == len(colours)
-    assert np.isfinite(ends).all() and (ends >= 0).all() and (ends <= 1).all() and (boxes >= 0).all() and (boxes <= 1).all()
-    (width, height), pixels = size, np.reshape([cell.box for cell in shown], (-1, 4))
-    left, top, right, bottom = np.hstack([pixels[:, :2], pixels[:, :2] + pixels[:, 2:]]).T
-    assert boxes == pytest.approx(np.stack([left / width, 1 - bottom / height, right / width, 1 - top / height], axis=1))
-    tops = [cell.box[1] for cell in shown]
-    assert all(b >= a + cell.box[3] for a, b, cell in zip(tops, tops[1:], shown))
-    for cell in shown:
-        assert cell.text[0] + cell.text[2] == cell.box[0] and cell.contains(cell.box[0] + 1, cell.box[1] + 1)
-        assert not cell.contains(cell.text[0] - 1, cell.box[1] + 1)
-
-
 SIZE, LARGE = (640, 360), (1280, 720)
 
 
@@ -227,7 +198,7 @@ def test_lines_show_their_values():
     column, half = QUANTITIES.index("n_contacts"), len(plots.history.times) // 2
     for part, value in ((slice(0, half), 1.0), (slice(half, None), 4.5)):
         plots.history.low[part, column] = plots.history.high[part, column] = value
-    plots.shown = {name: name == "contacts" for name in PLOTS}
+    plots.names = ("contacts",)
     before = grey(LARGE)
     picture = Annotations(plots).draw(before, sim, 0)
     left, top, right, bottom = bounds(picture, before)

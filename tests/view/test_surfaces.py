@@ -188,7 +188,7 @@ def test_cursor_picks_and_drags_a_body(build, arguments):
     real, marks, body = FakeSimulator(scene), marks_of(scene), scene.bodies[-1]
     real.time, n = 1.0, sum(body.n_nodes for body in scene.bodies)
     sim, camera, x = MirrorSimulation(describe_scene(scene, marks), n), Camera.framing(real.positions()), real.positions("two")
-    sim.take(describe_state(real, marks, set(), None) | {"colour": "body"}, real.positions(), np.zeros(n))
+    sim.take(describe_state(real, marks, set()) | {"colour": "body"}, real.positions(), np.zeros(n))
     skin = body.riding_skin
     shown, triangles = (x, body.nodes.surface) if skin is None else (skin.weights @ x, skin.surface.triangles)
     centres = shown[triangles].mean(axis=1)

@@ -7,7 +7,6 @@ import pytest
 
 from taisoft.errors import OutputError
 from taisoft.view.child_process import ChildProcess
-from taisoft.view.plots import Plots
 from taisoft.view.window import LiveWindow, WindowProcess, show
 from tests.view.desktop import ROOT, TOOLS, Desktop
 from tests.view.drawing import body_mask, needs_vulkan, program
@@ -20,7 +19,7 @@ from taisoft.view.link import Link, LinkClosed, SharedNodes, receive
 connection = Connection(int(sys.argv[1]))
 description = receive(connection, None)
 link = Link(connection, SharedNodes(description["n_nodes"], description["slots"], int(sys.argv[2])))
-request = {"number": 0, "commands": [], "confirmed": 0, "colour": "body", "layers": [], "plots": []}
+request = {"number": 0, "commands": [], "confirmed": 0, "colour": "body", "layers": []}
 """
 OPEN = START + "link.send({'open': True})\n"
 SHOWN = {"status": "", "messages": []}
@@ -43,27 +42,27 @@ link.receive(None)
 first = link.nodes.x[0].copy()
 time.sleep(0.3)
 for number in (4, 5):
-    wishes = {{"colour": "speed", "layers": ["contacts"], "plots": ["elastic"], "commands": [["pause"], ["step"]]}}
+    wishes = {{"colour": "speed", "layers": ["contacts"], "commands": [["pause"], ["step"]]}}
     link.send(request | wishes | {{"confirmed": number - 4, "number": number}})
 state = link.receive(None)
 np.savez({str(tmp_path / "saved.npz")!r}, first=first, x=link.nodes.x[0], values=link.nodes.values[0], answered=state["answered"],
          contacts=state["contacts"]["point"], time=state["time"])
 link.send({{"closed": True}})
 """
-    sim, plots, got, end = simulator, Plots(simulator), [], time.monotonic() + 30
+    sim, got, end = simulator, [], time.monotonic() + 30
     window, start = WindowProcess(sim, child=program(code)), sim.positions()
-    window.publish(sim, plots, SHOWN)
+    window.publish(sim, SHOWN)
     for sim.time in np.linspace(0.0, 1.0, 100):
-        window.publish(sim, plots, SHOWN)
+        window.publish(sim, SHOWN)
     assert not window.ready, "a slow window is not waited for"
     for sim.time, condition in ((2.0, lambda: window.ready), (2.0, lambda: window.closed)):
         while not condition():
             assert time.monotonic() < end
             got += window.receive(0.05)
-        window.publish(sim, plots, SHOWN)
+        window.publish(sim, SHOWN)
     window.close()
     window.close()
-    assert got == [(number, [["pause"], ["step"]]) for number in (4, 5)] and plots.watched == {"elastic"}
+    assert got == [(number, [["pause"], ["step"]]) for number in (4, 5)]
     with np.load(tmp_path / "saved.npz", allow_pickle=False) as saved:
         assert np.array_equal(saved["first"], start) and np.array_equal(saved["x"], sim.positions())
         assert np.allclose(saved["values"], np.linalg.norm(sim.velocities(), axis=1))
@@ -86,7 +85,7 @@ def test_a_lost_window_is_an_error_but_a_run_goes_on(simulator, monkeypatch):
     with pytest.raises(OutputError, match="^the window is lost: its process ended by signal SIGSEGV$"):
         show(sim, fps=None)
     monkeypatch.setattr("taisoft.view.window.CHILD", program(OPEN + "link.receive(None); sys.exit(3)"))
-    window, index = LiveWindow(sim, Plots(sim)), 0
+    window, index = LiveWindow(sim), 0
     with pytest.warns(UserWarning, match="is lost: its process ended with exit status 3; the run continues without it"):
         while not window.closed and index < 1000:
             window.frame(sim, index)
@@ -181,9 +180,6 @@ def test_a_window_on_a_display(desktop):
     screen = desktop.picture()
     assert body_mask(screen[:, RIGHT:]).mean() > 0.05, "the beam is visible"
     assert (screen[60:160, 30:300] > 200).any(), "the panel's text is visible"
-    boxes = np.s_[:720, 1030:1038]  # of text beside the plots
-    plots = lambda: (desktop.picture()[boxes] < 60).all(axis=2).mean() > 0.2  # noqa: E731
-    desktop.wait_for(plots, "plots", lambda: desktop.xdotool("key", "g"))
     for width, height in ((1, 1), (1000, 700)):
         desktop.xdotool("search", "--name", "taisoft", "windowsize", width, height, "sleep", 0.3)
     before = numbers()[0]
