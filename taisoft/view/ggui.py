@@ -96,19 +96,13 @@ class VertexBuffer:
 class Canvas:
     """The process's one Taichi window, on the screen or only in memory, which draws the scene's surfaces.
 
-    size: (width, height) in pixels; visible: on the screen; n_segments: largest number of lines; line_width: in pixels;
-    n_decals: largest numbers of vertices and triangles of what is drawn on the surfaces.
+    size: (width, height) in pixels; visible: on the screen; n_segments: largest number of lines; n_decals:
+    largest numbers of vertices and triangles of what is drawn on the surfaces.
     Raises OutputError, before anything is opened, if a Vulkan driver or a display is missing or a window is open already.
     """
 
     def __init__(
-        self,
-        surfaces: Surfaces,
-        size: tuple[int, int],
-        visible: bool,
-        n_segments: int = 0,
-        line_width: float = LINE_WIDTH,
-        n_decals: tuple[int, int] = (0, 0),
+        self, surfaces: Surfaces, size: tuple[int, int], visible: bool, n_segments: int = 0, n_decals: tuple[int, int] = (0, 0)
     ):
         missing = (visible and display_missing()) or vulkan_missing()
         if missing:
@@ -120,7 +114,7 @@ class Canvas:
             raise OutputError(f"cannot open a window: arch is '{arch}', and windows need arch cpu")
         self._runtime = open_runtime(arch, precision, owner="a window")
         _holder.append("a window")
-        self._surfaces, self._line_width = surfaces, line_width
+        self._surfaces = surfaces
         self._n = len(surfaces.colours)  # drawn vertices of the surfaces; those of decals follow in the same mesh
         self._vertices = VertexBuffer(self._n + n_decals[0])
         self._vertices.normals[:] = 0.0, 1.0, 0.0  # no effect: the colours are lit already
@@ -178,7 +172,7 @@ class Canvas:
             self._ends.x[:n], self._ends.colours[:n] = ends[:n] - camera.target, line_colours[:n]
             most = self._most = max(n, self._most)  # the renderer goes on drawing as many as there were once
             self._ends.x[n:most] = 0.0
-            self._scene.scene.lines(self._ends.info, get_field_info(None), True, GREY, self._line_width, most, 0, most, 0)
+            self._scene.scene.lines(self._ends.info, get_field_info(None), True, GREY, LINE_WIDTH, most, 0, most, 0)
         self._canvas.scene(self._scene)
 
     def pixels(self, left: int, top: int, right: int, bottom: int) -> np.ndarray:

@@ -94,20 +94,16 @@ class History:
 
     times: (n,) ends of the bins [s]; low, high: (n, k) minima and maxima over each, NaN if unknown; columns: (k,) names,
     QUANTITIES, then those by pair or body, such as "forces: a, b"; last: (k,) values of the last step; begin: time of the start
-    [s].
+    [s]. sim: energies are recorded relative to its present ones.
     """
 
-    def __init__(self, capacity: int = CAPACITY):
-        self._capacity = capacity
-        self._clear()
-
-    def _clear(self) -> None:
+    def __init__(self, sim, capacity: int = CAPACITY):
         self.columns = list(QUANTITIES)
-        self._times, (self._low, self._high) = np.empty(self._capacity), np.empty((2, self._capacity, len(QUANTITIES)))
+        self._times, (self._low, self._high) = np.empty(capacity), np.empty((2, capacity, len(QUANTITIES)))
         self._n = self._steps_in_last = 0
         self._steps_per_bin = 1
-        self._start_energies, self.begin = np.zeros(3), 0.0
-        self.last = np.full(len(QUANTITIES), np.nan)
+        self._start_energies, self.begin = _energies(sim.energies()), sim.time
+        self._append(sim.time, np.where(np.arange(len(QUANTITIES)) < 4, 0.0, np.nan), np.zeros(len(QUANTITIES)))
 
     @property
     def times(self) -> np.ndarray:
@@ -123,12 +119,6 @@ class History:
     def high(self) -> np.ndarray:
         """Maxima over each bin (n, k)."""
         return self._high[: self._n]
-
-    def start(self, sim) -> None:
-        """Clear the history; energies are recorded relative to sim's present ones."""
-        self._clear()
-        self._start_energies, self.begin = _energies(sim.energies()), sim.time
-        self._append(sim.time, np.where(np.arange(len(QUANTITIES)) < 4, 0.0, np.nan), np.zeros(len(QUANTITIES)))
 
     def take(
         self,
@@ -277,13 +267,12 @@ class Plots(PlotChoice):
 
     def __init__(self, sim, names: tuple[str, ...] = (), errors: bool = False):
         self._sim, self._errors = sim, errors
-        super().__init__(History(), {}, names)
+        super().__init__(History(sim), {}, names)
         for name in names:
             if name not in PLOTS:
                 raise SceneError(f"plot '{name}' is unknown{nearest(name, PLOTS)}; there are {', '.join(PLOTS)}")
             if name not in self.available():
                 raise SceneError(f"plot '{name}' is not available: {self._why_unavailable(name)}")
-        self.history.start(sim)
 
     def enabled(self) -> dict[str, bool]:
         """Return which `needs` of series the simulator meets now."""

@@ -23,9 +23,7 @@ from tests.view.fake_simulator import FakeSimulator, beam_scene
 
 
 def started(capacity: int = 8, time: float = 0.0, kinetic: float = 0.0) -> History:
-    history = History(capacity)
-    history.start(SimpleNamespace(time=time, energies=lambda: Energies(kinetic, 1.0, 2.0)))
-    return history
+    return History(SimpleNamespace(time=time, energies=lambda: Energies(kinetic, 1.0, 2.0)), capacity)
 
 
 @settings(max_examples=60, deadline=None)
