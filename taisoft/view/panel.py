@@ -75,14 +75,13 @@ class Panel:
         """Drag force over the body's weight, for a displacement as long as the body's diagonal; 0 if nothing can be dragged."""
         return 10.0**self._strength if self._state.get("controls", {}).get("draggable") else 0.0
 
-    def draw(self, gui, state: dict, recording: bool) -> None:
+    def draw(self, gui, state: dict) -> None:
         """Declare buttons and sliders in a GGUI sub-window, and request their changes."""
         self.pressed.clear()
         self._state, values = state, state["controls"]
         names = {"pause": "run" if state["paused"] else "pause", "step": "step", "reset": "restart", "unbound": "real time"}
         if state["asked_speed"] is not None:
             names["unbound"] = "as fast as possible"
-        names["record"] = "stop recording" if recording else "record"
         for action, text in names.items():
             if gui.button(f"{text}###{action}"):
                 self.pressed.add(action)

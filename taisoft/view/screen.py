@@ -59,8 +59,6 @@ class Screen(SceneView):
         self._picture_size: tuple[int, int] | None = None  # of the last picture taken of the window
         self._close_requested = False
         self._drag: MouseDrag | None = None
-        self._folder: Path | None = None  # of pictures while recording
-        self._frames = 0
         self._screenshot = False  # requested
         self._note = Note()  # about pictures and camera
         self._messages: list[str] = []  # those shown
@@ -100,7 +98,7 @@ class Screen(SceneView):
             for line in [state["status"], *state_lines(sim), *self.timing.lines(state)]:
                 gui.text(line)
             if self._panel is not None:
-                self._panel.draw(gui, state, self._folder is not None)
+                self._panel.draw(gui, state)
         self._show_messages(window.get_gui(), state, age)
         window.show()
         self.timing.shown(state)
@@ -172,8 +170,6 @@ class Screen(SceneView):
             self._follows, self._centre, self._widest = not self._follows, None, 0.0
             self._note.set("the camera follows the bodies" if self._follows else "the camera stays")
         self._screenshot |= "screenshot" in pressed
-        if "record" in pressed:
-            self._toggle_recording()
 
     def _read_mouse(self, sim: MirrorSimulation, size) -> None:
         window = self._canvas.window
@@ -218,40 +214,20 @@ class Screen(SceneView):
     def _take_picture(self, size: tuple[int, int]) -> None:
         """Write the drawn picture if that is requested, before the panel is declared, which would else be in it."""
         # GGUI shows an empty window after a picture was taken of it at another size than the present one
-        if not (self._screenshot or self._folder is not None) and self._picture_size in (None, size):
+        if not self._screenshot and self._picture_size in (None, size):
             return
         picture = self._canvas.pixels(0, 0, *size)
         self._picture_size = size
-        try:
-            if self._screenshot:
-                path = _free_path(".png")
-                make_folder(OUT)
-                write_bytes(path, png_bytes(picture))
-                self._note.set(f"written: {path}")
-            if self._folder is not None:
-                write_bytes(self._folder / f"{self._frames:05d}.png", png_bytes(picture))
-                self._frames += 1
-                self._note.set(f"recording: {self._frames} pictures in {self._folder}")
-        except OutputError as error:
-            self._folder = None
-            self._note.set(str(error))
-        self._screenshot = False
-
-    def _toggle_recording(self) -> None:
-        if self._folder is not None:
-            self._note.set(f"recorded {self._frames} pictures in {self._folder}")
-            self._folder = None
+        if not self._screenshot:
             return
+        self._screenshot = False
+        path = next(one for n in itertools.count(1) if not (one := OUT / f"window-{n}.png").exists())
         try:
-            self._folder, self._frames = make_folder(_free_path("")), 0
+            make_folder(OUT)
+            write_bytes(path, png_bytes(picture))
+            self._note.set(f"written: {path}")
         except OutputError as error:
             self._note.set(str(error))
-
-
-def _free_path(suffix: str) -> Path:
-    """Return the first path in OUT that neither a picture nor a folder of pictures has."""
-    names = (OUT / f"window-{n}" for n in itertools.count(1))
-    return next(path for path in names if not path.exists() and not path.with_suffix(".png").exists()).with_suffix(suffix)
 
 
 def _contains(rectangle: tuple[float, float, float, float], x: float, y: float) -> bool:
