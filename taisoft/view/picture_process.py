@@ -57,8 +57,7 @@ class Drawing:
         nodes, slot = self._link.nodes, message["slot"]
         self._sim.take(message, nodes.x[slot], nodes.values[slot])
         if self._plots is not None:
-            self._plots.history = SimpleNamespace(**message["history"])
-            self._plots.set_enabled(message["enabled"])
+            self._plots.history, self._plots.enabled = SimpleNamespace(**message["history"]), message["enabled"]
         self._writer.frame(self._sim, message["index"])
         drawing = self._writer.renderer
         self._link.send({"drawn": self._sim.time, "kept": [drawing.kept(self._sim.time), drawing.kept()]})

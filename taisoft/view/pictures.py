@@ -93,7 +93,7 @@ class PictureProcess:
         self._flushed, self._error = True, None
         self._drawn_at, self._kept = None, [options.kept, options.kept]  # time of the last picture [s]; before it, and after it
         description = describe_scene(scene, self._marks) | asdict(options) | {"folder": str(self.folder.parent)}
-        description |= {"caller": os.getpid(), "enabled": self._plots.enabled() if self._plots else {}}
+        description |= {"caller": os.getpid(), "enabled": self._plots.enabled if self._plots else {}}
         n_nodes = sum(body.n_nodes for body in scene.bodies)
         self._child: ChildProcess | None = ChildProcess(child or CHILD, description, FAILURE, n_nodes, SLOTS)
 
@@ -118,7 +118,7 @@ class PictureProcess:
             nodes.values[slot] = self._values(self._options.colour, sim)
         state |= {"slot": slot, "index": index, "colour": self._options.colour}
         if self._plots is not None:
-            state |= {"enabled": self._plots.enabled(), "history": plain_history(self._plots.history)}
+            state |= {"enabled": self._plots.enabled, "history": plain_history(self._plots.history)}
         self._sent += 1
         self._send(state)
 

@@ -233,19 +233,11 @@ class PlotChoice:
     """
 
     def __init__(self, history, enabled: dict[str, bool], names: tuple[str, ...] = ()):
-        self.history, self._enabled, self.names = history, enabled, names
-
-    def enabled(self) -> dict[str, bool]:
-        """Return which `needs` of series are met now."""
-        return self._enabled
-
-    def set_enabled(self, enabled: dict[str, bool]) -> None:
-        """Set which `needs` of series are met from now on."""
-        self._enabled = enabled
+        self.history, self.enabled, self.names = history, enabled, names
 
     def available(self) -> dict[str, Plot]:
         """Return the plots that have simulated quantities now, each with the curves of these."""
-        enabled = {"": True} | self.enabled()
+        enabled = {"": True} | self.enabled
         kept = {name: tuple(s for s in plot.series if enabled[s.needs]) for name, plot in PLOTS.items()}
         return {name: replace(PLOTS[name], series=series) for name, series in kept.items() if series}
 
@@ -267,15 +259,16 @@ class Plots(PlotChoice):
 
     def __init__(self, sim, names: tuple[str, ...] = (), errors: bool = False):
         self._sim, self._errors = sim, errors
-        super().__init__(History(sim), {}, names)
+        self.history, self.names = History(sim), names
         for name in names:
             if name not in PLOTS:
                 raise SceneError(f"plot '{name}' is unknown{nearest(name, PLOTS)}; there are {', '.join(PLOTS)}")
             if name not in self.available():
                 raise SceneError(f"plot '{name}' is not available: {self._why_unavailable(name)}")
 
+    @property
     def enabled(self) -> dict[str, bool]:
-        """Return which `needs` of series the simulator meets now."""
+        """Which `needs` of series the simulator meets now."""
         return {"implicit": not self._sim.settings.explicit, "contact": self._touching, "error": self._errors}
 
     def take(self, report: StepReport, seconds: float) -> None:
