@@ -14,7 +14,7 @@ from taisoft.energy_check import EnergyCheck
 from taisoft.errors import SimulationError, no_memory
 from taisoft.frames import ROUNDING, check_length, fit_dt
 from taisoft.records import RunReport, StepReport
-from taisoft.settings import check_positive
+from taisoft.scene import checks
 
 if TYPE_CHECKING:
     from taisoft.estimation.estimator import ErrorEstimator
@@ -81,8 +81,8 @@ def run(
     """
     if error_mesh is not None and not error:
         raise SimulationError("error_mesh needs error=True")
-    seconds = check_positive("seconds", seconds, "s")
-    fps = None if fps is None else check_positive("fps", fps, "1/s")
+    seconds = checks.number(seconds, "seconds", above=0.0, unit="s", error=SimulationError)
+    fps = None if fps is None else checks.number(fps, "fps", above=0.0, unit="1/s", error=SimulationError)
     check_length(seconds, sim.dt, fps)
     on_step = detailed(sim, details, on_step) if details else on_step
     arguments = {"on_frame": on_frame, "on_step": on_step, "error": error, "error_mesh": error_mesh, "on_iteration": on_iteration}

@@ -1,7 +1,6 @@
 """Settings of a simulation: names, defaults and allowed values, checked before anything is allocated."""
 
 import dataclasses
-import difflib
 
 import numpy as np
 
@@ -58,12 +57,12 @@ def check_settings(scene: Scene, **given) -> Settings:
     settings = Settings(**given | {"dt": check_dt(given.get("dt", Settings.dt))})
     try:
         checks.check_solver(**dataclasses.asdict(settings))
+        checks.choice(settings.integrator, "integrator", INTEGRATORS)
+        checks.choice(settings.contact_solver, "contact_solver", CONTACT_SOLVERS)
     except SceneError as error:
         raise SimulationError(str(error)) from None
     given = {name: value for name in (*TOLERANCES, "tolerance") if (value := getattr(settings, name)) is not None}
     settings = dataclasses.replace(settings, **{name: float(value) for name, value in given.items()})
-    _check_name("integrator", settings.integrator, INTEGRATORS)
-    _check_name("contact_solver", settings.contact_solver, CONTACT_SOLVERS)
     _check_contact_solver(settings, scene.pushes(settings.self_collision))
     _check_multipliers(settings, scene)
     if settings.tolerance is not None and scene.robots:
@@ -84,15 +83,7 @@ def contact_solvers(integrator: str) -> tuple[str, ...]:
 
 def check_dt(dt) -> float:
     """Return dt as a float; SimulationError unless it is a finite number above 0."""
-    return check_positive("dt", dt, "s")
-
-
-def check_positive(name: str, value, unit: str) -> float:
-    """Return value as a float; SimulationError unless it is a finite number above 0."""
-    try:
-        return checks.number(value, name, above=0.0, unit=unit)
-    except SceneError as error:
-        raise SimulationError(str(error)) from None
+    return checks.number(dt, "dt", above=0.0, unit="s", error=SimulationError)
 
 
 def check_count(name: str, value) -> int:
@@ -100,13 +91,6 @@ def check_count(name: str, value) -> int:
     if isinstance(value, (bool, np.bool_)) or not isinstance(value, (int, np.integer)) or value < 1:
         raise SimulationError(f"{name} must be an integer of at least 1, not {value!r}")
     return int(value)
-
-
-def _check_name(name: str, value: str, known: tuple[str, ...]) -> None:
-    if value not in known:
-        near = difflib.get_close_matches(value, known, 1)
-        hint = f" (did you mean '{near[0]}'?)" if near else ""
-        raise SimulationError(f"{name} {value!r} is unknown{hint}: it must be one of {', '.join(known)}")
 
 
 def kept_by_multipliers(scene: Scene) -> list[str]:

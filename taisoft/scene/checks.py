@@ -17,24 +17,24 @@ LARGEST, SMALLEST = float(np.finfo(np.float32).max), float(np.finfo(np.float32).
 MAX_TOLERANCE = {"newton_tolerance": 0.1}  # a residual of a tenth of the forces is no solution; others: 1
 
 
-def number(value, what: str, *, above=None, minimum=None, maximum=None, unit: str = "") -> float:
-    """Return value as a finite float in the 32-bit range, > above, >= minimum, <= maximum where given."""
+def number(value, what: str, *, above=None, minimum=None, maximum=None, unit: str = "", error=SceneError) -> float:
+    """Return value as a finite float in the 32-bit range, > above, >= minimum, <= maximum where given; or raise the error."""
     value = value[()] if isinstance(value, np.ndarray) and value.ndim == 0 else value
     if isinstance(value, (bool, np.bool_)) or not isinstance(value, Real):
-        raise SceneError(f"{what} must be a number, not {value_text(value)}")
+        raise error(f"{what} must be a number, not {value_text(value)}")
     try:
         result = float(value)
     except OverflowError:
         result = float("inf")
     if not np.isfinite(result):
-        raise SceneError(f"{what} must be finite, not {value_text(value)}")
+        raise error(f"{what} must be finite, not {value_text(value)}")
     rules = (("greater than", operator.gt, above), ("at least", operator.ge, minimum), ("at most", operator.le, maximum))
     rules = [rule for rule in rules if rule[2] is not None]
     if not all(holds(result, limit) for _, holds, limit in rules):
         rule = " and ".join(f"{words} {limit:g}" for words, _, limit in rules)
-        raise SceneError(f"{what} must be {rule}{unit and ' ' + unit}, not {value_text(value)}")
+        raise error(f"{what} must be {rule}{unit and ' ' + unit}, not {value_text(value)}")
     if abs(result) > LARGEST or (above == 0.0 and result < SMALLEST):
-        raise SceneError(f"{what} is {result:g}, too {'large' if abs(result) > 1.0 else 'small'} for a 32-bit float")
+        raise error(f"{what} is {result:g}, too {'large' if abs(result) > 1.0 else 'small'} for a 32-bit float")
     return result
 
 

@@ -15,6 +15,7 @@ from taisoft.attributes import guarded_record
 from taisoft.display import short_repr
 from taisoft.errors import MeshError, SceneError, reason, value_text
 from taisoft.mesh.shapes import box_mesh
+from taisoft.mesh.surface_mesh import SurfaceMesh
 from taisoft.mesh.topology import normals_and_heights, opposite_half_edges
 from taisoft.scene import checks
 from taisoft.scene.commands import Command
@@ -170,29 +171,17 @@ class MeshObstacle(Shape):
 
     def __post_init__(self):
         vertices = checks.array(self.vertices, "mesh obstacle: vertices", ((max(checks.length(self.vertices), 3), 3),))
-        rule = "mesh obstacle: triangles must be integers of shape (t, 3) with t > 0"
         try:
-            triangles = np.asarray(self.triangles)
-        except (ValueError, TypeError, OverflowError) as error:
-            raise SceneError(f"{rule} ({error})") from error
-        if triangles.ndim != 2 or triangles.shape[1] != 3 or not len(triangles) or triangles.dtype.kind not in "iu":
-            raise SceneError(f"{rule}, not {triangles.dtype} of shape {triangles.shape}")
-        bad = np.argwhere((triangles < 0) | (triangles >= len(vertices)))
-        if len(bad):
-            t, vertex = bad[0, 0], triangles[tuple(bad[0])]
-            there_are = f"({len(vertices)} vertices, counted from 0)"
-            raise SceneError(f"mesh obstacle: triangle {t}: vertex {vertex} does not exist {there_are}")
-        triangles = np.array(triangles, dtype=np.int64)
-        flat = np.flatnonzero(~(normals_and_heights(vertices, triangles)[1] > DEGENERATE))
-        if len(flat):
-            raise SceneError(
-                f"mesh obstacle: triangle {flat[0]} {tuple(triangles[flat[0]].tolist())} has no area "
-                f"({len(flat)} such triangles; the smallest height must exceed {DEGENERATE:g} of the longest edge)"
-            )
-        try:
+            triangles = SurfaceMesh(vertices, self.triangles, "mesh obstacle").triangles
+            flat = np.flatnonzero(~(normals_and_heights(vertices, triangles)[1] > DEGENERATE))
+            if len(flat):
+                raise SceneError(
+                    f"mesh obstacle: triangle {flat[0]} {tuple(triangles[flat[0]].tolist())} has no area "
+                    f"({len(flat)} such triangles; the smallest height must exceed {DEGENERATE:g} of the longest edge)"
+                )
             opposite_half_edges(triangles)
         except MeshError as error:
-            raise SceneError(f"mesh obstacle: {error}") from None
+            raise SceneError(f"mesh obstacle: {str(error).removeprefix('mesh obstacle: ')}") from None
         checks.store(self, vertices=vertices, triangles=triangles, _mean=vertices.mean(axis=0))
 
     @property

@@ -68,7 +68,7 @@ def test_invalid_obstacles_are_refused():
         (lambda: ts.Box((0, 0, 0), (1, 0, 1)), r"^box: half_extents must be greater than 0 m, not \[1.0, 0.0, 1.0\]"),
         (lambda: ts.Capsule((0, 1, 0), (0, 1, 0), 1), "^capsule: a and b must not be the same point"),
         (lambda: ts.MeshObstacle(TETRA[:, :2], FACES), r"^mesh obstacle: vertices must have shape \(4, 3\), not \(4, 2\)"),
-        (lambda: ts.MeshObstacle(TETRA, FACES[:, :2]), r"^mesh obstacle: triangles must be integers of shape \(t, 3\)"),
+        (lambda: ts.MeshObstacle(TETRA, FACES[:, :2]), r"^mesh obstacle: triangles must have shape \(n, 3\), not \(4, 2\)"),
         (lambda: ts.MeshObstacle(TETRA, FACES + 1), r"^mesh obstacle: triangle 1: vertex 4 does not exist \(4 vertices"),
         (lambda: ts.MeshObstacle(TETRA, [(0, 1, 2), (3, 1, 1)]), r"^mesh obstacle: triangle 1 \(3, 1, 1\) has no area"),
         (lambda: ts.MeshObstacle(TETRA, [(0, 1, 2), (0, 1, 3)]), r"triangles 0 and 1 traverse their edge \(0, 1\) in the same"),
