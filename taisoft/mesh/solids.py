@@ -52,17 +52,24 @@ def distances(corners: np.ndarray, points: np.ndarray) -> np.ndarray:
     return np.where(inside, plane_distance, edge_distance).min(axis=1)
 
 
+def ray_hits(
+    corners: np.ndarray, origin: np.ndarray, direction: np.ndarray, tolerance: float = 0.0
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return where a ray hits each triangle (t,3,3) [m], from both sides: lengths of direction (t,), inf without a hit, and the
+    point's barycentric weights (t,) of the second and the third corner, with their tolerance. Source: Moeller and Trumbore 1997.
+    """
+    e, f, s = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0], origin - corners[:, 0]
+    p, q = np.cross(direction, f), np.cross(s, e)
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        inverse = 1.0 / np.einsum("tx,tx->t", e, p)
+        u, v, along = np.einsum("tx,tx->t", s, p) * inverse, q @ direction * inverse, np.einsum("tx,tx->t", f, q) * inverse
+        hits = (u >= -tolerance) & (v >= -tolerance) & (u + v <= 1.0 + tolerance) & (along > 0.0)
+    return np.where(hits, along, np.inf), u, v
+
+
 def nearest_hit(corners: np.ndarray, origin: np.ndarray, direction: np.ndarray) -> float:
     """Return the distance along a ray, in lengths of direction, to the first triangle hit, inf if none. corners: (t,3,3) [m]."""
-    e1, e2 = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    p = np.cross(direction, e2)
-    det = np.einsum("tx,tx->t", e1, p)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        u = np.einsum("tx,tx->t", origin - corners[:, 0], p) / det
-        q = np.cross(origin - corners[:, 0], e1)
-        v, along = (q @ direction) / det, np.einsum("tx,tx->t", e2, q) / det
-        hits = (u >= -EDGE_TOLERANCE) & (v >= -EDGE_TOLERANCE) & (u + v <= 1.0 + EDGE_TOLERANCE) & (along > 0.0)
-    return float(along[hits].min(initial=np.inf))
+    return float(ray_hits(corners, origin, direction, EDGE_TOLERANCE)[0].min(initial=np.inf))
 
 
 def segment_distance(corners: np.ndarray, a: np.ndarray, b: np.ndarray) -> float:

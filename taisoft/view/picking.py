@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from taisoft.mesh.solids import ray_hits
 from taisoft.output.camera import Camera
 
 PATCH = 0.1  # radius in units of the diagonal of the body's bounding box at rest
@@ -33,23 +34,11 @@ class Hit:
 def nearest_hit(origin: np.ndarray, direction: np.ndarray, x: np.ndarray, triangles: np.ndarray) -> tuple[int, np.ndarray] | None:
     """Return the first triangle hit by a ray from origin, and the point's barycentric weights (3,); None if there is no hit.
 
-    triangles: (t,3); x: their vertices (n,3). Triangles are hit from both sides. Source: Moeller and Trumbore 1997.
+    triangles: (t,3); x: their vertices (n,3).
     """
-    a, b, c = (x[triangles[:, k]] for k in range(3))
-    e, f = b - a, c - a
-    p = np.cross(direction, f)
-    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        inverse = 1.0 / np.einsum("ti,ti->t", e, p)
-        s = origin - a
-        u = np.einsum("ti,ti->t", s, p) * inverse
-        q = np.cross(s, e)
-        v = q @ direction * inverse
-        t_ray = np.einsum("ti,ti->t", f, q) * inverse
-        is_hit = (u >= 0) & (v >= 0) & (u + v <= 1) & (t_ray > 0) & np.isfinite(t_ray)
-    if not is_hit.any():
-        return None
-    t = int(np.argmin(np.where(is_hit, t_ray, np.inf)))
-    return t, np.array([1 - u[t] - v[t], u[t], v[t]])
+    along, u, v = ray_hits(x[triangles], origin, direction)
+    t = int(np.argmin(along))
+    return None if np.isinf(along[t]) else (t, np.array([1 - u[t] - v[t], u[t], v[t]]))
 
 
 def pick(sim, camera: Camera, cursor: tuple[float, float], size: tuple[int, int]) -> Hit | None:
