@@ -12,7 +12,6 @@ Regions are numbers of the elements: physical groups, references, or other cell 
 
 import contextlib
 import io
-import re
 import warnings
 from pathlib import Path
 
@@ -41,9 +40,6 @@ WRITERS = {".msh": "gmsh", ".vtk": "vtk", ".vtu": "vtu", ".mesh": "medit"}
 REGION = "region"  # a name of cell data that hold regions, as PHYSICAL and REFERENCE do
 NONE_IF_ZERO = (PHYSICAL, REFERENCE)  # such data are in files without regions too, where all are 0
 
-# A count of 0 in a file's text, on which meshio's readers fail with an unclear error.
-_ZERO_COUNT = re.compile(rb"(?:POINTS\s+|CELLS\s+(?:1\s+)?)0+\b")
-
 STRAIGHT = 1e-6  # tolerated distance of a node from its edge's midpoint, over the edge's length
 KNOWN_ORDER = 0.25  # largest median of that ratio for which the inferred node order is accepted
 
@@ -68,8 +64,7 @@ def read_mesh(path, fix_orientation: bool = False, weld: float | None = None, re
     data = read_content(file)
     ending = file.suffix.lower()
     if ending in SURFACE_READERS:
-        n = sum(map(len, SURFACE_READERS[ending](name, data)[1]))
-        raise MeshError(f"{name}: no tetrahedra; {n} faces found; make a volume mesh first: taisoft tetrahedralize")
+        raise MeshError(f"{name}: no tetrahedra; {ending} holds surfaces; make a volume mesh first: taisoft tetrahedralize")
     content = None
     if ending == ".msh" and data.lstrip()[:1] == b"$":
         content = read_gmsh(name, data)
@@ -172,12 +167,7 @@ def _read_by_meshio(file: Path, data: bytes) -> FileContent:
     known = meshio.extension_to_filetypes
     if not any("".join(file.suffixes[-n:]).lower() in known for n in (1, 2)):
         raise MeshError(f"{file}: not a supported mesh: the ending {file.suffix.lower()!r} is not known")
-    try:
-        return read_by_meshio(file, data)
-    except MeshError as error:
-        if file.suffix.lower() == ".vtk" and _ZERO_COUNT.search(data):
-            raise MeshError(f"{file}: no tetrahedra; the file declares 0 points or cells") from error
-        raise
+    return read_by_meshio(file, data)
 
 
 def _tet_blocks(name: str, cells: Blocks) -> tuple[list[np.ndarray], list[str]]:

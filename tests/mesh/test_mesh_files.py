@@ -235,15 +235,16 @@ def test_files_without_a_mesh_are_refused(tmp_path):
         ("a.msh", MARK + b"\r\n", "the file is empty"),
         ("a.svg", b"x", "not a supported mesh (such files can only be written: svg)"),
         ("a.txt", b"hello", "not a supported mesh: the ending '.txt' is not known"),
-        ("a.obj", OBJ.encode(), "no tetrahedra; 2 faces found; make a volume mesh first"),
-        ("a.off", OFF.encode(), "no tetrahedra; 2 faces found"),
+        ("a.obj", OBJ.encode(), "no tetrahedra; .obj holds surfaces; make a volume mesh first"),
+        ("a.off", OFF.encode(), "no tetrahedra; .off holds surfaces"),
     ):
         if content is not None:
             (tmp_path / name).write_bytes(content)
         assert refusal(read_mesh, tmp_path / name).startswith(message)
     for name, options in (("a.stl", TEXT), ("a.ply", {"binary": True}), ("a.msh", GMSH2)):
         path = write_by_meshio(tmp_path / name, [("triangle", MESH.surface)], **options)
-        assert re.match(f"no tetrahedra; {len(MESH.surface)} (triangles|faces) found", refusal(read_mesh, path))
+        found = f"no tetrahedra; ({path.suffix} holds surfaces|{len(MESH.surface)} triangles found); make a volume mesh first"
+        assert re.match(found, refusal(read_mesh, path))
     for path, message in ((tmp_path, "this is not a file"), (tmp_path / "\0.msh", "."), (3, "must be a file's name")):
         with pytest.raises(MeshError, match=message):
             read_mesh(path)
