@@ -2,14 +2,12 @@
 rigid bodies: the centre of mass [m] and the rotation from the mesh's axes as a unit quaternion with w >= 0.
 """
 
-import csv
-import io
 from pathlib import Path
 
 from scipy.spatial.transform import Rotation
 
 from taisoft.files import write_bytes
-from taisoft.output.report import read_table
+from taisoft.output.report import csv_text, read_table
 
 TABLE_NAME = "frames.csv"
 POSE = (*((axis, " [m]") for axis in "xyz"), *((f"q{part}", "") for part in "wxyz"))  # columns and units
@@ -51,9 +49,7 @@ class FrameTable:
 
     def flush(self) -> None:
         """Write the rows so far. Raises OutputError."""
-        text = io.StringIO(newline="")
-        csv.writer(text).writerows([self._header, *self._rows])
-        write_bytes(self.path, text.getvalue().encode())
+        write_bytes(self.path, csv_text([self._header, *self._rows]).encode())
 
     def close(self) -> None:
         """Write the table. Raises OutputError."""

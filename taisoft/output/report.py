@@ -14,7 +14,7 @@ import os
 import platform
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TextIO
 
@@ -96,14 +96,19 @@ def steps_csv(reports: list[StepReport], earlier: tuple[list[str], list[list[str
     earlier: an earlier header with its rows. Details that these did not have are 0 there if they had others of that kind.
     """
     header, rows = earlier if earlier[0][: len(COLUMNS)] == COLUMNS and earlier[1] else ([], [])
-    text, before, own = io.StringIO(newline=""), header[len(COLUMNS) :], headings(reports)
+    before, own = header[len(COLUMNS) :], headings(reports)
     new, kinds = [heading for heading in own if heading not in before], {heading.split()[0] for heading in before}
     filled = [0.0 if heading.split()[0] in kinds else "" for heading in new]
-    writer = csv.writer(text)
-    writer.writerows([[*COLUMNS, *before, *new], *([*row, *filled] for row in rows)])
-    asked = {heading.split()[0] for heading in own}
-    for row in (report.to_dict() for report in reports):
-        writer.writerow([row.get(name, 0.0 if name.split()[0] in asked else "") for name in (*COLUMNS, *before, *new)])
+    asked, columns = {heading.split()[0] for heading in own}, [*COLUMNS, *before, *new]
+    records = (report.to_dict() for report in reports)
+    own_rows = ([row.get(name, 0.0 if name.split()[0] in asked else "") for name in columns] for row in records)
+    return csv_text([columns, *([*row, *filled] for row in rows), *own_rows])
+
+
+def csv_text(rows: Iterable[Iterable]) -> str:
+    """Return rows as CSV text (RFC 4180)."""
+    text = io.StringIO(newline="")
+    csv.writer(text).writerows(rows)
     return text.getvalue()
 
 

@@ -1,12 +1,11 @@
 """Results of a study: the Pareto front of time against error, and all numbers as Markdown, CSV and plain data."""
 
-import csv
-import io
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 
 from taisoft.estimation.comparison import Error
+from taisoft.output.report import csv_text
 from taisoft.output.tables import markdown, percent, spread_of
 from taisoft.study import AXES, Request, describe, mesh_name
 from taisoft.study.accuracy import Reference, Row
@@ -212,14 +211,9 @@ def _count(value: int | None) -> str:
 
 def csv_of(study: Study) -> str:
     """Return all numbers as CSV (RFC 4180), one row per combination; unknown values are empty."""
-    text = io.StringIO(newline="")
-    writer, front = csv.writer(text), study.front()
-    for number, row in enumerate(study.rows):
-        cells = _cells(row, row in front) | {"error_by": study.request.by}
-        if number == 0:
-            writer.writerow(cells)
-        writer.writerow("" if value is None else value for value in cells.values())
-    return text.getvalue()
+    front = study.front()
+    rows = [_cells(row, row in front) | {"error_by": study.request.by} for row in study.rows]
+    return csv_text([*rows[:1], *(["" if value is None else value for value in cells.values()] for cells in rows)])
 
 
 def _cells(row: Row, on_front: bool) -> dict:
