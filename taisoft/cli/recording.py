@@ -5,7 +5,7 @@ import sys
 import time
 from argparse import Namespace
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from taisoft.details import DETAILS
@@ -31,31 +31,20 @@ NO_BALLS = "; nodes that follow a path have no balls, since it may release them"
 
 @dataclass(frozen=True)
 class DisplayOptions:
-    """colour: as in `Offscreen`; layers: names, or None for the defaults; plots: names; caption: the scene's name, or None.
-
-    size: of pictures [pixels]; slow: film time over simulated time; view: azimuth and elevation of the camera [deg], or None.
-    window, pictures, usd, vtu: whether there is a window, and what is written to the folder; errors: whether they are
-    estimated. details: names, of steps.csv.
+    """window, pictures, usd, vtu: whether there is a window, and what is written to the folder; layers: names, or None for the
+    defaults; picture: what pictures show; errors: whether they are estimated. details: names, of steps.csv. slow: film time over
+    simulated time.
     """
 
     window: bool
     pictures: bool
     usd: bool
     vtu: bool
-    colour: str
     layers: tuple[str, ...] | None
-    plots: tuple[str, ...]
-    caption: str | None
+    picture: PictureOptions
     errors: bool
-    details: tuple[str, ...] = ()
-    size: tuple[int, int] = SIZE
-    slow: float = 1.0
-    view: tuple[float, float] | None = None
-
-    @property
-    def in_pictures(self) -> tuple[str, ...]:
-        """Layers of pictures."""
-        return IN_PICTURES if self.layers is None else self.layers
+    details: tuple[str, ...]
+    slow: float
 
     @property
     def in_window(self) -> tuple[str, ...]:
@@ -90,9 +79,9 @@ def display_options(arguments: Namespace, has_window: bool) -> DisplayOptions:
     size = SIZE if arguments.size is None else _size_of(arguments.size)
     slow = checks.number(1.0 if arguments.slow is None else arguments.slow, "--slow", above=0.0)
     files = pictures, not arguments.no_usd, arguments.vtu
-    return DisplayOptions(
-        has_window, *files, arguments.colour, layers, plots, caption, errors, details, size, slow, _view_of(arguments.view)
-    )
+    drawn = {"colour": arguments.colour, "layers": IN_PICTURES if layers is None else layers, "plots": plots, "caption": caption}
+    picture = PictureOptions(**drawn, size=size, view=_view_of(arguments.view))
+    return DisplayOptions(has_window, *files, layers, picture, errors, details, slow)
 
 
 def _view_of(angles: list[float] | None) -> tuple[float, float] | None:
@@ -135,7 +124,7 @@ def check_modelled(shown: DisplayOptions, sim) -> None:
     for option, given in asked.items():
         if given and not sim.plan.on["contact_forces"]:
             raise SceneError(f"--{option}: contact forces are not modelled ({sim.plan.why('contact_forces')})")
-    Plots(sim, shown.plots, shown.errors)
+    Plots(sim, shown.picture.plots, shown.errors)
     if "fixed_nodes" in (shown.layers or ()) and not sim.plan.on["fixed_nodes"]:
         print(f"taisoft: --layers fixed_nodes: no node is fixed{NO_BALLS * sim.plan.on['moving_nodes']}", file=sys.stderr)
 
@@ -223,20 +212,18 @@ class Recording:
         pictures = None
         if shown.pictures:
             n_pictures = round((seconds - (0.0 if self._resumed is None else self._resumed["time"])) * (fps or 1.0 / sim.dt))
-            pictures = open_pictures(folder, sim, self._picture_options(shown), plots, n_pictures)
+            pictures = open_pictures(folder, sim, self._picture_options(shown.picture), plots, n_pictures)
             observers.members.append(pictures)
             self._checkpoints.before.append(pictures.flush)
         self._checkpoints.notes = lambda: {"fps": fps} | (pictures.kept(sim.time) if pictures else {})
         observers.members.append(self._checkpoints)
 
-    def _picture_options(self, shown: DisplayOptions) -> PictureOptions:
-        has_scale = shown.colour != "body"
+    def _picture_options(self, picture: PictureOptions) -> PictureOptions:
+        has_scale = picture.colour != "body"
         no_bar = has_scale and text_missing()
         if no_bar:
             print(f"taisoft: pictures have no colour bar: {no_bar}", file=sys.stderr)
-        texts = {"plots": shown.plots, "caption": shown.caption, "bar": has_scale and not no_bar}
-        frame = {"size": shown.size, "view": shown.view}
-        return PictureOptions(colour=shown.colour, layers=shown.in_pictures, kept=self._notes, **frame, **texts)
+        return replace(picture, bar=has_scale and not no_bar, kept=self._notes)
 
     def checkpoint(self, sim) -> None:
         """Write checkpoint.npz. Raises OutputError."""

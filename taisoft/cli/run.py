@@ -253,7 +253,7 @@ def _show_window(sim: Simulator, settings: RunSettings, shown: DisplayOptions) -
     """Show the live window until it is closed."""
     from taisoft.view.window import show
 
-    show(sim, fps=settings.fps, colour=shown.colour, layers=shown.in_window)
+    show(sim, fps=settings.fps, colour=shown.picture.colour, layers=shown.in_window)
     print_state(sim)
     return 0
 
@@ -261,7 +261,7 @@ def _show_window(sim: Simulator, settings: RunSettings, shown: DisplayOptions) -
 def _run(sim, settings: RunSettings, arguments, signals, warned: list[str], saved, shown: DisplayOptions) -> int:
     """Run until settings.seconds; save what was computed, however the run ends."""
     observers, recording, resumed, notes = Observers(), None, None, {}
-    plots = Plots(sim, shown.plots, shown.errors) if shown.plots else None
+    plots = Plots(sim, shown.picture.plots, shown.errors) if shown.picture.plots else None
     if saved is not None:
         notes = saved.notes
         resumed = {"checkpoint": str(saved.path), "time": sim.time, "frame": first_frame(sim, settings.fps)}
@@ -274,7 +274,7 @@ def _run(sim, settings: RunSettings, arguments, signals, warned: list[str], save
         if shown.window:
             from taisoft.view.window import LiveWindow
 
-            observers.members.append(LiveWindow(sim, colour=shown.colour, layers=shown.in_window))
+            observers.members.append(LiveWindow(sim, colour=shown.picture.colour, layers=shown.in_window))
         if recording is not None:
             recording.add_writers(observers, sim, settings.fps, settings.seconds, shown, plots)
         progress = Progress(settings.seconds, label=Path(arguments.scene).stem)
