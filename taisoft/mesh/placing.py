@@ -9,6 +9,7 @@ import warnings
 import numpy as np
 
 from taisoft.errors import MeshError, value_text
+from taisoft.mesh.shapes import checked_vector
 from taisoft.mesh.surface_mesh import SurfaceMesh, as_surface
 from taisoft.mesh.tet_mesh import TetMesh
 
@@ -34,7 +35,7 @@ def place(mesh: TetMesh | SurfaceMesh, up: str = "y", scale: float = 1.0, rotate
         raise MeshError(f"place needs a TetMesh or a SurfaceMesh, not {type(mesh).__name__}")
     vertices = mesh.vertices @ placement(up, scale, rotate, to).T
     if at is not None:
-        vertices = vertices + (_vector("at", at) - underside(vertices, to))
+        vertices = vertices + (checked_vector(at, "place", "at") - underside(vertices, to))
     if isinstance(mesh, SurfaceMesh):
         return SurfaceMesh(vertices, mesh.triangles, mesh.source, list(mesh.warnings))
     with warnings.catch_warnings(record=True) as found:
@@ -55,7 +56,7 @@ def placement(up: str, scale: float, rotate, to: str) -> np.ndarray:
             raise MeshError(f"place: {what} must be one of {', '.join(known)}, not {value_text(axis)}")
     if isinstance(scale, bool) or not isinstance(scale, (int, float, np.number)) or not 0.0 < scale < np.inf:
         raise MeshError(f"place: scale must be a number above 0, not {value_text(scale)}")
-    turn = Rotation.from_euler("xyz", _vector("rotate", rotate), degrees=True).as_matrix()  # about fixed axes
+    turn = Rotation.from_euler("xyz", checked_vector(rotate, "place", "rotate"), degrees=True).as_matrix()  # about fixed axes
     whole = np.round(turn)
     turn = np.where(np.abs(turn - whole) < 1e-15, whole, turn)  # quarter turns are exact
     return scale * (turn @ FROM_Y_UP[to] @ TO_Y_UP[up])
@@ -65,13 +66,3 @@ def underside(vertices: np.ndarray, up: str) -> np.ndarray:
     """Return the middle of the lower side of the bounding box of vertices (n,3), (3,)."""
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     return np.where(UP[up] > 0.0, low, 0.5 * (low + high))
-
-
-def _vector(name: str, value) -> np.ndarray:
-    try:
-        vector = np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError):
-        vector = np.empty(0)
-    if vector.shape != (3,) or not np.isfinite(vector).all():
-        raise MeshError(f"place: {name} must be three finite numbers, not {value_text(value)}")
-    return vector

@@ -29,7 +29,7 @@ def box_mesh(cells, size, center=(0.0, 0.0, 0.0), pattern: str = "five") -> TetM
     Raises MeshError for arguments outside these rules.
     """
     cells = _checked_cells(cells, "box_mesh", (3,))
-    size, center = _checked_vector(size, "box_mesh", "size", positive=True), _checked_vector(center, "box_mesh", "center")
+    size, center = checked_vector(size, "box_mesh", "size", positive=True), checked_vector(center, "box_mesh", "center")
     if pattern not in ("five", "six"):
         raise MeshError(f"box_mesh: pattern must be 'five' or 'six', not {value_text(pattern)}")
     _check_count(cells, 5 if pattern == "five" else 6, "box_mesh")
@@ -56,7 +56,7 @@ def sheet_mesh(cells, size, center=(0.0, 0.0, 0.0), pattern: str = "five", up: s
     cells = _checked_cells(cells, "sheet_mesh", (2, 3))
     if len(cells) == 2:
         cells = np.insert(cells, across, 1)
-    size = _checked_vector(size, "sheet_mesh", "size", positive=True)
+    size = checked_vector(size, "sheet_mesh", "size", positive=True)
     if size[across] > min(size):
         raise MeshError(f"sheet_mesh: size {size.tolist()} has a thickness size[{across}] above one of the lengths")
     return box_mesh(cells, size, center, pattern)
@@ -73,8 +73,8 @@ def ball_mesh(radius: float, cells: int, center=(0.0, 0.0, 0.0)) -> TetMesh:
     """
     if isinstance(cells, bool) or not isinstance(cells, Integral) or cells < 2 or cells % 2:
         raise MeshError(f"ball_mesh: cells must be an even integer, at least 2, not {value_text(cells)}")
-    radius = float(_checked_vector([radius] * 3, "ball_mesh", "radius", positive=True)[0])
-    center = _checked_vector(center, "ball_mesh", "center")
+    radius = float(checked_vector([radius] * 3, "ball_mesh", "radius", positive=True)[0])
+    center = checked_vector(center, "ball_mesh", "center")
     grid = np.array([cells] * 3)
     _check_count(grid, 6, "ball_mesh")
     inward = 2 * _cell_indices(grid) < cells  # cells below the middle along an axis are mirrored along it
@@ -154,13 +154,14 @@ def _check_count(cells: np.ndarray, tets_per_cell: int, shape: str) -> None:
         )
 
 
-def _checked_vector(values, shape: str, what: str, positive: bool = False) -> np.ndarray:
+def checked_vector(values, owner: str, what: str, positive: bool = False) -> np.ndarray:
+    """Return three finite numbers, positive ones if requested, as float64 (3,). Raises MeshError; owner: starts its text."""
     try:
         array = np.asarray(values)
     except ValueError as error:
-        raise MeshError(f"{shape}: {what} must be three numbers, not {value_text(values)}") from error
+        raise MeshError(f"{owner}: {what} must be three numbers, not {value_text(values)}") from error
     if array.shape != (3,) or array.dtype.kind not in "fiu" or not np.isfinite(array).all():
-        raise MeshError(f"{shape}: {what} must be three finite numbers, not {value_text(values)}")
+        raise MeshError(f"{owner}: {what} must be three finite numbers, not {value_text(values)}")
     if positive and not (array > 0).all():
-        raise MeshError(f"{shape}: {what} must be positive, not {value_text(values)}")
+        raise MeshError(f"{owner}: {what} must be positive, not {value_text(values)}")
     return array.astype(np.float64)

@@ -15,13 +15,13 @@ from pathlib import Path
 import numpy as np
 
 from taisoft.attributes import MeshAttributeError, guarded_record
-from taisoft.errors import MeshError, one_line, value_text
+from taisoft.errors import MeshError, value_text
 from taisoft.machine import require
 from taisoft.mesh.obj_off import read_obj, read_off
 from taisoft.mesh.ply import read_ply
 from taisoft.mesh.safe_reading import read_content, run_child
 from taisoft.mesh.stl import read_stl
-from taisoft.mesh.tet_mesh import TetMesh
+from taisoft.mesh.tet_mesh import TetMesh, checked_array
 from taisoft.mesh.topology import connected_pieces, crack_widths, linked_groups, merge_labels, triangle_edges
 
 READERS = {".obj": read_obj, ".stl": read_stl, ".ply": read_ply, ".off": read_off}
@@ -48,11 +48,11 @@ class SurfaceMesh:
     warnings: list[str] = field(default_factory=list)
 
     def __post_init__(self):
-        vertices = self._as_array("vertices", "fiu", "numbers").astype(np.float64)
+        vertices = checked_array(self.vertices, "vertices", 3, "fiu", "numbers", self._error).astype(np.float64)
         bad = np.argwhere(~np.isfinite(vertices))
         if len(bad):
             raise MeshError(f"{self.source}: vertex {bad[0, 0]} coordinate {bad[0, 1]} is not finite")
-        triangles = self._as_array("triangles", "iu", "integers")
+        triangles = checked_array(self.triangles, "triangles", 3, "iu", "integers", self._error)
         bad = np.argwhere((triangles < 0) | (triangles >= len(vertices)))
         if len(bad):
             t, k = bad[0]
@@ -61,19 +61,8 @@ class SurfaceMesh:
             array.setflags(write=False)
             object.__setattr__(self, field_name, array)  # the only way to store a value in a frozen record
 
-    def _as_array(self, what: str, kinds: str, description: str) -> np.ndarray:
-        """Return the field as an array (n,3) of these kinds with at least one row."""
-        try:
-            array = np.asarray(getattr(self, what))
-        except (ValueError, TypeError, OverflowError) as error:
-            raise MeshError(f"{self.source}: {what} must be {description} of shape (n, 3): {one_line(str(error))}") from error
-        if array.size == 0:
-            raise MeshError(f"{self.source}: no {what} found")
-        if array.dtype.kind not in kinds:
-            raise MeshError(f"{self.source}: {what} must be {description}, not {array.dtype}")
-        if array.ndim != 2 or array.shape[1] != 3:
-            raise MeshError(f"{self.source}: {what} must have shape (n, 3), not {array.shape}")
-        return array
+    def _error(self, text: str) -> MeshError:
+        return MeshError(f"{self.source}: {text}")
 
     def __repr__(self) -> str:
         return f"SurfaceMesh({len(self.vertices)} vertices, {len(self.triangles)} triangles)"

@@ -7,11 +7,12 @@ no face are not detected.
 """
 
 import warnings
+from collections.abc import Callable
 
 import numpy as np
 
 from taisoft.attributes import Guarded, MeshAttributeError
-from taisoft.errors import MeshError, listed
+from taisoft.errors import MeshError, listed, one_line
 from taisoft.machine import require
 from taisoft.mesh.quality import edge_lengths, mean_ratio
 from taisoft.mesh.regions import checked_names, checked_regions, region_id, region_text
@@ -23,6 +24,21 @@ LARGEST_COORDINATE = float(np.finfo(np.float32).max)  # [m], since forces may be
 MAX_OFFSET_RATIO = 1e5  # distance from the origin over size above which a warning is issued
 VTK_TETRA = 10  # VTK's number of the cell type
 COINCIDENT = 1e-9  # vertices closer than this times the mesh's diagonal are coincident
+
+
+def checked_array(values, what: str, width: int, kinds: str, kinds_text: str, error: Callable[[str], MeshError]) -> np.ndarray:
+    """Return values as an array (n, width) of these kinds with at least one row. error: makes an error of its text."""
+    try:
+        array = np.asarray(values)
+    except (ValueError, TypeError, OverflowError) as reason:
+        raise error(f"{what} must be an array of {kinds_text}: {one_line(str(reason))}") from reason
+    if array.size == 0:
+        raise error(f"no {what} found")
+    if array.dtype.kind not in kinds:
+        raise error(f"{what} must be {kinds_text}, not {array.dtype}")
+    if array.ndim != 2 or array.shape[1] != width:
+        raise error(f"{what} must have shape ({'n' if width == 3 else 'm'}, {width}), not {array.shape}")
+    return array
 
 
 class TetMesh(Guarded):
@@ -163,23 +179,9 @@ class TetMesh(Guarded):
         self.warnings.append(text)
         warnings.warn(self._named(text), UserWarning, stacklevel=4)
 
-    def _checked_array(self, values, what: str, width: int, kinds: str, kinds_text: str) -> np.ndarray:
-        """Return the values as an array (n, width) of these kinds with at least one row."""
-        try:
-            array = np.asarray(values)
-        except (ValueError, TypeError, OverflowError) as error:
-            raise self._mesh_error(f"{what} must be an array of {kinds_text} ({error})") from error
-        if array.size and array.dtype.kind not in kinds:
-            raise self._mesh_error(f"{what} must be {kinds_text}, not of type {array.dtype}")
-        if array.size == 0:
-            raise self._mesh_error(f"the mesh has no {'vertices' if width == 3 else 'tetrahedra'}")
-        if array.ndim != 2 or array.shape[1] != width:
-            raise self._mesh_error(f"{what} must have shape ({'n' if width == 3 else 'm'}, {width}), not {array.shape}")
-        return array
-
     def _checked_vertices(self, vertices) -> np.ndarray:
         """Return an (n,3) float64 copy of finite coordinates."""
-        array = self._checked_array(vertices, "vertices", 3, "fiu", "numbers")
+        array = checked_array(vertices, "vertices", 3, "fiu", "numbers", self._mesh_error)
         array = np.array(array, dtype=np.float64, order="C")
         for bad, rule in (
             (~np.isfinite(array), "is not finite"),
@@ -192,7 +194,7 @@ class TetMesh(Guarded):
 
     def _checked_tets(self, tets) -> np.ndarray:
         """Return an (m,4) int64 copy: valid indices, no repeated vertex in a tet, no duplicate tet, no unused vertex."""
-        array = self._checked_array(tets, "tets", 4, "iu", "integers")
+        array = checked_array(tets, "tets", 4, "iu", "integers", self._mesh_error)
         n = self.n_verts
         bad = np.argwhere((array < 0) | (array >= n))
         if len(bad):
