@@ -25,7 +25,7 @@ from taisoft.view.scene_view import IN_WINDOW, scene_size
 
 FAILURE = "cannot open a window"
 START_SECONDS = 60.0  # in which the window must open
-FPS = 60.0
+FPS = 60.0  # of the window's pictures, at most
 CHILD = python_module("taisoft.view.window_process")
 
 
@@ -33,7 +33,7 @@ class WindowProcess:
     """A window in a child process that shows a simulation.
 
     sim: a Simulator; controls: whether the window changes it, or only shows it; colour, layers: those shown initially;
-    fps: of the window's pictures, at most; child: command of the process, if not CHILD.
+    child: command of the process, if not CHILD.
     closed: whether it is; timing: once its user has closed it, times of its pictures and latencies of drags, see
     `taisoft.view.timing`. Raises OutputError if a display or a Vulkan driver is missing or the window does not open.
     """
@@ -44,7 +44,6 @@ class WindowProcess:
         controls: bool = False,
         colour: str = "body",
         layers: tuple[str, ...] = IN_WINDOW,
-        fps: float = FPS,
         child: tuple[str, ...] | None = None,
     ):
         missing = display_missing() or vulkan_missing()
@@ -57,7 +56,7 @@ class WindowProcess:
         self._requests: list[tuple[int, list]] = []  # not yet returned
         self.closed, self.timing = False, {}
         self._marks = ConnectionMarks(scene, scene_size(scene))
-        description = describe_scene(scene, self._marks) | {"fps": fps, "colour": colour, "layers": list(layers)}
+        description = describe_scene(scene, self._marks) | {"fps": FPS, "colour": colour, "layers": list(layers)}
         description |= {"controls": controls, "pairs": touching_pairs(sim) if controls else []}
         self._child = ChildProcess(child or CHILD, description, FAILURE, n_nodes)
         self._link = self._child.link
@@ -157,10 +156,6 @@ class LiveWindow:
     def __init__(self, sim, colour: str = "body", layers: tuple[str, ...] = IN_WINDOW):
         self._window = WindowProcess(sim, colour=colour, layers=layers)
 
-    def __call__(self, sim, index: int | None = None, _report: StepReport | None = None) -> None:
-        """Show sim's present state if the window has shown the previous one."""
-        self.frame(sim, sim.step_count if index is None else index)
-
     def __enter__(self) -> "LiveWindow":
         return self
 
@@ -172,13 +167,15 @@ class LiveWindow:
         """Whether the window is closed."""
         return self._window.closed
 
-    def frame(self, sim, index: int) -> None:
-        """Show a frame of a run if the window has shown the previous one."""
+    def __call__(self, sim, index: int | None = None, _report: StepReport | None = None) -> None:
+        """Show sim's present state if the window has shown the previous one."""
         try:
             self._window.receive()
-            self._window.publish(sim, {"status": f"frame {index}", "messages": []})
+            self._window.publish(sim, {"status": f"frame {sim.step_count if index is None else index}", "messages": []})
         except OutputError as error:
             warnings.warn(f"{error}; the run continues without it", UserWarning, stacklevel=2)
+
+    frame = __call__  # as an observer of a run
 
     def close(self) -> None:
         """Close the window; a second call does nothing."""
