@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from taisoft.cli.scene_file import load_scene
-from taisoft.errors import SceneError, SimulationError, value_text
+from taisoft.errors import MissingPackage, SceneError, SimulationError, value_text
 from taisoft.machine import require
 from taisoft.output.camera import Camera, framed_points
 from taisoft.records import StepReport
@@ -18,7 +18,7 @@ from taisoft.simulator import Simulator
 from taisoft.view.colouring import checked_colour
 from taisoft.view.offscreen import Offscreen, checked_size
 
-gymnasium = require("gymnasium", "ts.gym", "gym")
+gymnasium = require("gymnasium", "ts.gym", "gym", MissingPackage)
 Row = tuple[str, float, float, str]
 REPORTED = ("time", "n_contacts", "max_penetration", "min_volume_ratio")  # of the last step's report, in the info
 
@@ -124,10 +124,11 @@ class Env(gymnasium.Env):
         """Return to the scene's initial state, call `start`, and return the observation and the info. options: ignored."""
         super().reset(seed=seed)
         self.sim.reset()
-        self._degraded, self._is_running, self._drawing = 0, True, None  # the scale of colours starts anew, too
+        self._degraded, self._is_running, self._drawing = 0, False, None  # the scale of colours starts anew, too
         if self._start is not None:
             self._start(self.sim, self.np_random)
-        return self._observation(), self._info([], None)
+        observation, self._is_running = self._observation(), True
+        return observation, self._info([], None)
 
     def step(self, action) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Apply an action and take `frame_skip` steps; return observation, reward, terminated, truncated (False), info.
@@ -172,14 +173,14 @@ class Env(gymnasium.Env):
 
     def close(self) -> None:
         """Release memory; a second call does nothing."""
+        self._is_running = False
         self.sim.close()
         if self._drawing is not None:
             self._drawing.close()
 
     def _info(self, problems: list[str], report: StepReport | None) -> dict[str, Any]:
         own = {"degraded": self._degraded, "failed": not self._is_running, "problems": problems}
-        if report is None:
-            return own | {"time": self.sim.time}
+        report = StepReport(self.sim.time) if report is None else report  # before the first step, and if it failed
         return own | {name: getattr(report, name) for name in REPORTED}
 
     def _checked(self, action):
@@ -191,9 +192,9 @@ class Env(gymnasium.Env):
             return action
         shape, dtype, low, high = self._acts_by
         try:
-            found = np.array(action, dtype)
-        except (TypeError, ValueError):
-            raise SceneError(f"an action must be numbers of shape {shape}, not {value_text(action)}") from None
+            found = _cast(action, dtype)
+        except (TypeError, ValueError, OverflowError):
+            raise SceneError(f"an action must be numbers of type {dtype} and shape {shape}, not {value_text(action)}") from None
         if found.shape != shape:
             raise SceneError(f"an action must have shape {shape}, not {found.shape}")
         if 0 in ((found >= low) & (found <= high)).tobytes():  # where code is cold, `all` takes three times as long
@@ -207,15 +208,23 @@ class Env(gymnasium.Env):
             return found
         shape, dtype, _, _ = self._sensed_by
         try:
-            numbers = np.array(found, dtype)
-        except (TypeError, ValueError):
-            raise SceneError(f"observation: it returned {value_text(found)}, numbers are needed") from None
+            numbers = _cast(found, dtype)
+        except (TypeError, ValueError, OverflowError):
+            raise SceneError(f"observation: it returned {value_text(found)}, numbers of type {dtype} are needed") from None
         if numbers.shape != shape:
             raise SceneError(f"observation: it returned shape {numbers.shape}, the observation space has {shape}")
         if not (math.isfinite(np.vdot(numbers, numbers)) or np.isfinite(numbers).all()):  # the former is fast
             at = _label(self.observation_space, np.argwhere(~np.isfinite(numbers))[0])
             raise SceneError(f"observation: {at} is not finite at t = {self.sim.time:.6g} s")
         return numbers
+
+
+def _cast(values, dtype: np.dtype) -> np.ndarray:
+    """Return values as an array of a space's type. Raises ValueError where that would change integers."""
+    found = np.array(values, dtype)
+    if dtype.kind in "iu" and not np.array_equal(found, values):
+        raise ValueError
+    return found
 
 
 def _box(space: "gymnasium.Space") -> tuple | None:

@@ -11,6 +11,7 @@ import ctypes
 import functools
 import io
 import os
+import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -139,7 +140,8 @@ def _leave_to_parent() -> None:
         _open.clear()
 
 
-os.register_at_fork(after_in_child=_leave_to_parent)
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_leave_to_parent)
 
 
 def _initialise(arch: str, precision: str) -> None:
@@ -177,6 +179,10 @@ def _initialise(arch: str, precision: str) -> None:
     except RuntimeError as error:
         raise SimulationError(f"Taichi does not start: {(str(error).splitlines() or ['no reason given'])[0]}") from None
     _program = impl.get_runtime().prog
+    if (forked := sys.modules.get("multiprocessing.util")) and sys.modules[
+        "multiprocessing.process"
+    ].parent_process() is not None:
+        forked.Finalize(None, end, exitpriority=0)  # such a process skips what Python does at its end, and its kernels with it
     for kernels in Kernels.every:  # they refer to the previous program
         kernels.forget()
     for function in _functions:

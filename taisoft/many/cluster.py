@@ -110,8 +110,10 @@ def connect(address: str, argument: str):
         raise SceneError(f"{argument} {address}: no Dask scheduler answers there ({type(error).__name__})") from None
 
 
-def cluster_places(client, child: tuple[str, ...], timed: bool = True) -> tuple[list[ClusterPlace], list[dict]]:
-    """Return one place per worker, and their machines. timed: as in LocalPlace without `threads`, else with one per core.
+def cluster_places(
+    client, child: tuple[str, ...], timed: bool = True, threads: int | None = None
+) -> tuple[list[ClusterPlace], list[dict]]:
+    """Return one place per worker, and their machines. timed: as in LocalPlace without `threads`, else with these, or all.
 
     Raises SceneError without workers or, if timed, with fewer cores than workers.
     """
@@ -131,5 +133,5 @@ def cluster_places(client, child: tuple[str, ...], timed: bool = True) -> tuple[
             raise SceneError(f"{len(own)} workers on {name} share {len(cores)} cores: each timed run needs its own")
         places += [(address, cores[k * each : (k + 1) * each] or cores[:1]) for k, address in enumerate(own)]
     n = min(len(cores) for _, cores in places)
-    threads = None if timed else n
+    threads = None if timed else threads or n
     return [ClusterPlace(client, address, cores[:n], child, threads) for address, cores in places], list(machines.values())

@@ -18,6 +18,7 @@ from contextlib import suppress
 from dataclasses import asdict, dataclass
 from functools import cache, reduce
 from importlib import import_module, util
+from importlib.machinery import SourceFileLoader
 from pathlib import Path
 
 import numpy as np
@@ -54,8 +55,10 @@ class Make:
         """Import the function."""
         if self.module:
             module = import_module(self.module)
+            if Path(module.__file__).resolve() != Path(self.file):
+                raise ImportError(f"it imports {module.__file__} by this name, not {self.file}: give the file another name")
         else:
-            spec = util.spec_from_file_location(SCRIPT, self.file)
+            spec = util.spec_from_file_location(SCRIPT, self.file, loader=SourceFileLoader(SCRIPT, self.file))
             module = sys.modules[SCRIPT] = sys.modules["__main__"] = util.module_from_spec(spec)
             spec.loader.exec_module(module)
         return reduce(getattr, self.function.split("."), module)
@@ -124,7 +127,11 @@ def answer(request: dict) -> dict:
     seed = int(digest(request["parameters"])[:8], 16)
     random.seed(seed)
     np.random.seed(seed)
+    environment, errors = dict(os.environ), np.geterr()
     record = _row(function, request["parameters"], make)
+    os.environ.clear()  # what one row sets must not reach the next
+    os.environ.update(environment)
+    np.seterr(**errors)
     _see(make, len(sys.modules))
     runtime = sys.modules.get("taisoft.backend.runtime")
     is_last = runtime is not None and runtime.open_kind() is not None

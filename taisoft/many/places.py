@@ -11,6 +11,7 @@ import json
 import math
 import os
 import queue
+import signal
 import subprocess
 import sys
 import tempfile
@@ -135,25 +136,25 @@ class LocalPlace:
         if self._process is None:
             return
         if self._request:
-            self._process.kill()
+            _kill(self._process.pid)
         self._close_stdin()
         try:
             self._process.wait(END_SECONDS)
         except subprocess.TimeoutExpired:
-            self._process.kill()
+            _kill(self._process.pid)
             self._process.wait()
         self._process, self._request, self._answer = None, b"", None
 
     def _launch(self) -> None:
         """Start a process. A new session shields it from the terminal's Ctrl-C."""
-        self._stdout, self._stderr, self._n_requests = tempfile.TemporaryFile(), tempfile.TemporaryFile(), 0
         environment, on_cores = own_environment(), _pinned(self.cores)  # which count when NumPy and Taichi start
         if self.threads is not None:
-            environment |= {THREADS: str(self.threads)} | dict.fromkeys(BLAS_THREADS, "1")
+            environment |= {THREADS: str(self.threads), "PYTHONHASHSEED": "0"} | dict.fromkeys(BLAS_THREADS, "1")
             on_cores = nullcontext()
-        streams = {"stdin": subprocess.PIPE, "stdout": self._stdout, "stderr": self._stderr}
         command = (sys.executable, *self._child)
         try:
+            self._stdout, self._stderr, self._n_requests = tempfile.TemporaryFile(), tempfile.TemporaryFile(), 0
+            streams = {"stdin": subprocess.PIPE, "stdout": self._stdout, "stderr": self._stderr}
             with on_cores:
                 self._process = subprocess.Popen(command, env=environment, start_new_session=True, **streams)
         except OSError as error:
@@ -203,7 +204,20 @@ def _answer_in(file) -> dict | None:
     size = os.fstat(file.fileno()).st_size
     if size == 0 or os.pread(file.fileno(), 1, size - 1) != b"\n":
         return None
-    return json.loads(_content(file))
+    content = _content(file)
+    try:
+        return json.loads(content)
+    except ValueError:  # something that runs when Python starts has written it
+        return {
+            "crash": f"its process printed {content.splitlines()[0].decode(errors='replace')!r} when it started",
+            "last": True,
+        }
+
+
+def _kill(pid: int) -> None:
+    """Kill the process, which leads a session of its own, and what it has started."""
+    with suppress(ProcessLookupError):
+        os.killpg(pid, signal.SIGKILL)
 
 
 def _content(file) -> bytes:
@@ -248,4 +262,5 @@ def _read(stdin, requests: queue.SimpleQueue, is_idle: threading.Event) -> None:
         requests.put(line)
     requests.put(b"")
     if not is_idle.is_set():
+        _kill(os.getpid())
         os._exit(1)

@@ -14,6 +14,7 @@ import numpy as np
 
 from taisoft.errors import SceneError, listed, one_line
 from taisoft.files import write_bytes
+from taisoft.many.store import digest
 from taisoft.output.tables import markdown
 from taisoft.scene.checks import nearest
 
@@ -68,7 +69,8 @@ class Results(Sequence):
             other = f": results.arrays('{name}') returns its arrays" if is_array else nearest(name, self.names)
             raise SceneError(f"no column is called '{name}'{other}; there are {listed(self.names)}")
         found = [row.to_dict().get(name) for row in self.rows]
-        if any(isinstance(one, str | list | dict) for one in found) or all(one is None for one in found):
+        large = None in found and any(isinstance(one, int) and abs(one) > 2**53 for one in found)  # that a float would change
+        if large or any(isinstance(one, str | list | dict) for one in found) or all(one is None for one in found):
             column = np.empty(len(found), object)
             column[:] = found
             return column
@@ -94,13 +96,13 @@ class Results(Sequence):
         writer = csv.DictWriter(text, self.names)
         writer.writeheader()
         writer.writerows(self.to_dicts())
-        write_bytes(path, text.getvalue().encode())
+        write_bytes(path, text.getvalue().encode(errors="backslashreplace"))
 
     def digest(self) -> str:
         """Return a SHA-256 digest of all bits of parameters, status, values and arrays, whatever the order of the rows."""
         parts = []
         for row in self.rows:
-            total = hashlib.sha256(repr([row.parameters, row.status, row.values]).encode())
+            total = hashlib.sha256(digest([row.parameters, row.status, row.values]).encode())
             for name, array in row.arrays.items():
                 total.update(repr((name, array.dtype.str, array.shape)).encode() + array.tobytes())
             parts.append(total.hexdigest())

@@ -21,7 +21,7 @@ from taisoft.files import write_bytes
 from taisoft.machine import THREADS, thread_count, usable_cores
 from taisoft.many import places
 from taisoft.many.cluster import cluster_places, connect
-from taisoft.many.make import Make, make_of
+from taisoft.many.make import COLUMNS, Make, make_of
 from taisoft.many.places import LocalPlace, Place, carry_out
 from taisoft.many.results import Results, Row
 from taisoft.many.store import NoStore, RowStore, digest, digests
@@ -68,7 +68,9 @@ def run_many(
         client = None if cluster is None else stack.enter_context(closing(connect(cluster, "cluster")))
         threads = thread_count(1) if os.environ.get(THREADS) else None
         many = Many(function, given, NoStore() if out is None else _store(Path(out), function, stack))
-        there = _places(workers, threads, len(many.waiting)) if client is None else cluster_places(client, CHILD, timed=False)[0]
+        there = (
+            _places(workers, threads, len(many.waiting)) if client is None else cluster_places(client, CHILD, False, threads)[0]
+        )
         many.run(there, progress, None if out is None else Path(out))
         return many.results()
 
@@ -85,6 +87,8 @@ def _checked(make: Callable, parameters: Iterable[Mapping]) -> list[dict]:
             signature.bind(**one)
         except TypeError as error:
             raise SceneError(f"parameters[{k}] do not fit {make.__qualname__}{signature}: {error}") from None
+        if own := [name for name in one if name in COLUMNS]:
+            raise SceneError(f"parameters[{k}]: '{own[0]}' is a column of every table: give the argument another name")
         found.append({name: _plain(value, f"parameters[{k}]['{name}']") for name, value in one.items()})
     return found
 
@@ -103,6 +107,8 @@ def _plain(value, name: str):
 def _store(out: Path, make: Make, stack: ExitStack) -> RowStore:
     """Return the store of finished rows in a folder, which is locked. Raises OutputError for a folder of other results."""
     check_free(out, overwrite=False)
+    if (out / "study.json").exists():
+        raise OutputError(f"the folder {out} holds a study: name another folder")
     path = out / REPORT
     try:
         found = json.loads(path.read_bytes())["make"]
@@ -158,7 +164,7 @@ class Many:
             if row.status == "failed":
                 failures.append(key)
                 if len(failures) <= FAILURES_SHOWN:
-                    given = ", ".join(f"{name}={value}" for name, value in row.parameters.items())
+                    given = ", ".join(f"{name}={value_text(value)}" for name, value in row.parameters.items())
                     bar.say(f"failed: {given}: {'; '.join(row.problems)}")
             n, now = len(self._rows), time.perf_counter()
             text = f"{clock_text((now - start) * (total - n) / (n - done))} left"
@@ -169,6 +175,9 @@ class Many:
         try:
             with _interruption() as interrupted:
                 left = carry_out(requests, there, finished, stop_requested=interrupted)
+        except Exception as error:  # of a file that cannot be written, or a source that was changed
+            left = dict.fromkeys(self.waiting, str(error))
+            raise
         finally:
             bar.close()
             is_empty = not self._rows

@@ -45,10 +45,11 @@ def sources(path: Path, folder: Path | None = None) -> dict[str, str]:
 
     Installed packages are left out.
     """
-    path = path.absolute()
-    folder = path.parent if folder is None else folder.absolute()
-    installed = [PACKAGE, *(Path(sysconfig.get_path(name)) for name in ("stdlib", "platstdlib", "purelib", "platlib"))]
-    loaded = {Path(file).absolute() for module in list(sys.modules.values()) if (file := getattr(module, "__file__", None))}
+    path = path.resolve()
+    folder = path.parent if folder is None else folder.resolve()
+    places = (Path(sysconfig.get_path(name)).resolve() for name in ("stdlib", "platstdlib", "purelib", "platlib"))
+    installed = [PACKAGE, *places]
+    loaded = {Path(file).resolve() for module in list(sys.modules.values()) if (file := getattr(module, "__file__", None))}
     own = (one for one in loaded if folder in one.parents and not any(place in one.parents for place in installed))
     names = sorted(one.relative_to(folder).as_posix() for one in {path, *own})
     return digests(folder, names)

@@ -2,6 +2,7 @@
 
 import os
 import signal
+import subprocess
 import sys
 import time
 import warnings
@@ -29,6 +30,22 @@ def add(a: float, b: float = 1.0, how: str = "") -> dict:
     report = ts.RunReport(status="degraded", problems=["two steps did not converge"])
     values = {"sum": a + b, "is_big": a > 2, "name": f"<{a}>", "nothing": None, "path": np.arange(a), "noise": np.random.rand()}
     return values | ({"run": report} if how == "degraded" else {})
+
+
+def leaves(a: float) -> dict:
+    """What the process of a row is left with, and leaves behind."""
+    before = [os.environ.get("LEFT_BEHIND", ""), np.geterr()["divide"], hash("abc")]
+    os.environ["LEFT_BEHIND"] = "1"
+    np.seterr(divide="raise")
+    return {"before": str(before)}
+
+
+def waits(path: str) -> dict:
+    """Start a process of its own, write its number to a file, and wait for it."""
+    child = subprocess.Popen(["sleep", "60"])
+    Path(path).write_text(str(child.pid))
+    child.wait()
+    return {}
 
 
 def returned(kind: str):

@@ -17,9 +17,10 @@ from types import SimpleNamespace
 import numpy as np
 
 import taisoft as ts
+from taisoft.machine import usable_cores
 from taisoft.many.cluster import cluster_places, stop_on_worker
 from taisoft.many.make import make_of
-from taisoft.many.places import carry_out
+from taisoft.many.places import LocalPlace, carry_out
 from taisoft.many.runs import CHILD
 from tests.cli.command import ROOT
 from tests.many import makes
@@ -42,6 +43,27 @@ def test_a_row_whose_process_ends_is_named():
     rows = [{"a": 1}, {"a": 2, "how": "once"}, {"a": 3, "how": "die"}, {"a": 4}]
     results = ts.run_many(makes.add, rows, workers=1, progress=False)
     assert results["status"].tolist() == ["ok", "ok", "failed", "ok"] and "by signal SIGKILL" in results["problem"][2]
+
+
+def test_rows_leave_no_state_to_others():
+    for workers in (1, 2):
+        assert len(set(ts.run_many(makes.leaves, [{"a": k} for k in range(4)], workers, progress=False)["before"])) == 1
+
+
+def test_what_a_row_has_started_ends_with_it(tmp_path):
+    place = LocalPlace(usable_cores(), CHILD, 1)
+    place.start(make_of(makes.waits).request() | {"parameters": {"path": str(tmp_path / "pid")}})
+    wait_until(lambda: (tmp_path / "pid").exists() and (tmp_path / "pid").read_text())
+    pid = int((tmp_path / "pid").read_text())
+    place.stop()
+    wait_until(lambda: not Path(f"/proc/{pid}").exists() or "Z" in Path(f"/proc/{pid}/stat").read_text().split()[2])
+
+
+def test_a_print_when_python_starts_is_named(tmp_path, monkeypatch):
+    (tmp_path / "sitecustomize.py").write_text("print('hello')\n")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    (row,) = ts.run_many(makes.returned, [{"kind": "list"}], progress=False)
+    assert row.problems == ["its process printed 'hello' when it started"]
 
 
 def rows_in(folder: Path) -> int:
@@ -101,7 +123,8 @@ def test_a_place_on_a_cluster_keeps_its_process_until_it_is_stopped():
         return {f"tcp://{k}": {"machine": {"name": "a"}, "cores": [0, 1]} for k in range(3)}
 
     places, _ = cluster_places(SimpleNamespace(submit=submit, run=run), CHILD, timed=False)
-    assert [place.cores for place in places] == [[0], [0], [0]]
+    assert [(place.cores, place.threads) for place in places] == [([0], 1)] * 3
+    assert cluster_places(SimpleNamespace(submit=submit, run=run), CHILD, False, threads=5)[0][0].threads == 5
     request = make_of(makes.slow).request()
     answers: dict = {}
     carry_out([(k, request | {"parameters": {"a": k}}) for k in "ab"], places[:1], answers.__setitem__)

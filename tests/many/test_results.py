@@ -41,6 +41,13 @@ def test_columns():
     assert "and 26 more rows" in (text := repr(Results(ROWS * 20))) and text.count("ValueError") == 20  # of 60, all that failed
 
 
+def test_large_integers_and_odd_texts_are_kept(tmp_path):
+    results = Results([Row({"a": "f\udcff"}, "ok", values={"n": 2**60 + 1}), Row({"a": "b"}, "failed")])
+    assert results["n"].tolist() == [2**60 + 1, None]
+    results.write(tmp_path / "t.csv")
+    assert "f\\udcff" in (tmp_path / "t.csv").read_text()
+
+
 def test_the_digest_depends_on_every_bit_and_not_on_order_or_time():
     first, digest = ROWS[0], Results(ROWS).digest()
     assert Results(ROWS[::-1]).digest() == Results([replace(first, wall_seconds=9.0), *ROWS[1:]]).digest() == digest

@@ -7,6 +7,7 @@
 """
 
 import json
+import sys
 from contextlib import closing
 from functools import partial
 from importlib import import_module
@@ -22,6 +23,12 @@ from taisoft.many.results import Results
 from taisoft.output.files import FolderLock
 from tests.many import makes
 from tests.many.stand_in import InProcess
+
+
+def named(status: int) -> dict:
+    """Its argument has the name of a column."""
+    return {}
+
 
 ROWS = [{"a": 1}, {"a": 2, "b": 0.5}, {"a": 3, "how": "degraded"}]
 
@@ -47,7 +54,7 @@ def test_rows_and_their_status(capsys):
     assert results[0].values == {"sum": 2.0, "is_big": False, "name": "<1>", "nothing": None, "noise": results[0].values["noise"]}
     assert results.arrays("path")[2].tolist() == [0, 1, 2] and (results["wall_seconds"] >= 0).all()
     error = capsys.readouterr().err
-    assert error.startswith("taisoft: 6 runs, ") and "failed: a=1, how=raise: ValueError: no such thing" in error
+    assert error.startswith("taisoft: 6 runs, ") and "failed: a=1, how='raise': ValueError: no such thing" in error
 
 
 def test_random_numbers_depend_on_the_parameters_alone():
@@ -110,6 +117,34 @@ def test_damaged_rows_and_those_of_another_source_or_taisoft_are_run_again(tmp_p
         run([{"a": 1}, {"a": 2}])
 
 
+def test_modules_reached_through_a_link_count_as_source(tmp_path, requests, monkeypatch):
+    (tmp_path / "real").mkdir()
+    (tmp_path / "link").symlink_to(tmp_path / "real")
+    monkeypatch.syspath_prepend(tmp_path / "link")
+    helper = tmp_path / "real" / "many_helper.py"
+    helper.write_text("K = 1\n")
+    (tmp_path / "real" / "many_linked.py").write_text("import many_helper\ndef k(a):\n    return {'k': many_helper.K}\n")
+    run = partial(ts.run_many, import_module("many_linked").k, [{"a": 1}], out=tmp_path / "out", progress=False)
+    run()
+    helper.write_text("K = 7\n")
+    requests.clear()
+    assert "1 rows were done by another version" in repr(run()) and len(requests) == 1
+
+
+def test_a_module_that_hides_the_functions_own_is_refused(tmp_path, monkeypatch):
+    (tmp_path / "own").mkdir()
+    for folder, value in ((tmp_path, 1), (tmp_path / "own", 2)):
+        (folder / "many_shadow.py").write_text(f"def f(a):\n    return {{'y': {value}}}\n")
+    monkeypatch.syspath_prepend(tmp_path / "own")
+    module = import_module("many_shadow")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "many_shadow")
+    made = make.Make("many_shadow", str(tmp_path / "own" / "many_shadow.py"), "f", str(tmp_path / "own"))
+    with pytest.raises(ImportError, match="by this name, not .*own/many_shadow.py: give the file another name"):
+        made.load()
+    assert module.f(0) == {"y": 2}
+
+
 def test_ended_processes_are_failed_rows(tmp_path, monkeypatch):
     monkeypatch.setattr(InProcess, "crash", "its process ended by signal SIGSEGV without an answer")
     results = ts.run_many(makes.add, ROWS, out=tmp_path, progress=False)
@@ -128,6 +163,8 @@ def test_what_cannot_be_run_is_refused(tmp_path, requests, monkeypatch):
         (makes.add, {"a": [1, 2]}, "must be a list of mappings, such as"),
         (makes.add, [{"a": 1}, 2], r"parameters\[1\] must be a mapping"),
         (makes.add, [{"a": 1}, {"b": 2}], r"parameters\[1\] do not fit add\(.*missing a required argument: 'a'"),
+        (makes.returned, [{"status": 1}], r"parameters\[0\] do not fit"),
+        (named, [{"status": 1}], r"parameters\[0\]: 'status' is a column of every table"),
         (makes.add, [{"a": [1, object()]}], r"parameters\[0\]\['a'\]\[1\] must be a number, a text"),
     ):
         with pytest.raises(SceneError, match=message):
@@ -151,7 +188,10 @@ def test_folders_of_other_results_are_refused(tmp_path):
     (tmp_path / "run" / "report.json").write_text("{}")
     (tmp_path / "odd").mkdir()
     (tmp_path / "odd" / "many.json").write_text("[]")
+    (tmp_path / "study").mkdir()
+    (tmp_path / "study" / "study.json").write_text("{}")
     for folder, message in (
+        ("study", "holds a study"),
         ("add", "holds runs of tests.many.makes:add, not of tests.many.makes:slow"),
         ("run", "already holds results"),
         ("odd", "was not written by run_many"),

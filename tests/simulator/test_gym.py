@@ -129,9 +129,25 @@ def test_a_problem_counts_and_a_failure_terminates(env):
     observation, reward, terminated, truncated, info = env.step(ACTIONS[0])
     assert terminated and not truncated and info["failed"] and "body 'flyer', node 2" in info["problems"][-1]
     assert np.array_equal(good, env.sim.positions()) and np.isfinite(observation).all() and np.isfinite(reward)
+    assert {"n_contacts", "max_penetration", "min_volume_ratio"} <= set(info)
     with pytest.raises(gymnasium.error.ResetNeeded):
         env.step(ACTIONS[0])
     assert env.reset(seed=1)[1]["degraded"] == 0
+
+
+def test_after_a_reset_that_fails_no_episode_runs(env, monkeypatch):
+    monkeypatch.setattr(env, "_start", lambda sim, rng: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        env.reset()
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        env.step(ACTIONS[0])
+
+
+def test_integers_are_not_changed():
+    counted = gymnasium.spaces.Box(0, 255, (1,), np.uint8)
+    for value in (1.5, 300):
+        with pytest.raises(ts.SceneError, match="observation: it returned .* numbers of type uint8 are needed"):
+            make(observation=lambda sim, value=value: [value], observation_space=counted)
 
 
 def test_an_episode_ends_when_terminated_says_so():
@@ -151,7 +167,7 @@ def test_pictures(env):
     "action, text",
     [
         ([1.0], r"an action must have shape \(2,\), not \(1,\)"),
-        ("left", r"an action must be numbers of shape \(2,\), not 'left'"),
+        ("left", r"an action must be numbers of type float32 and shape \(2,\), not 'left'"),
         ([0.0, 11.0], r"action: 1 \('up'\) is 11 m/s\^2, outside of -10 to 10 m/s\^2: gymnasium.wrappers.ClipAction"),
         ([np.nan, 0.0], r"action: 0 \('sideways'\) is nan"),
     ],
@@ -173,7 +189,7 @@ def test_actions_outside_of_the_space_are_refused_before_the_step(env, action, t
         ({"scene": dict}, ts.SceneError, "scene must be a Scene, not dict"),
         ({"scene": "hanging_bean"}, ts.SceneError, "did you mean hanging_beam"),
         ({"observation": lambda sim: [np.nan]}, ts.SceneError, "observation: number 0 is not finite at t = 0 s"),
-        ({"observation": lambda sim: ["a"]}, ts.SceneError, "observation: it returned .* numbers are needed"),
+        ({"observation": lambda sim: ["a"]}, ts.SceneError, "observation: it returned .* numbers of type float32 are needed"),
     ],
 )
 def test_arguments_that_break_a_rule_are_refused(changes, error, text):
@@ -195,7 +211,7 @@ def test_numbers_that_are_not_finite_are_named(env):
 
 def test_without_gymnasium_it_says_how_to_get_it():
     program = (
-        "import sys; sys.modules['gymnasium'] = None\nimport taisoft\ntry: taisoft.gym\nexcept taisoft.OutputError as e: print(e)"
+        "import sys; sys.modules['gymnasium'] = None\nimport taisoft\ntry: taisoft.gym\nexcept taisoft.SceneError as e: print(e)"
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert done.stdout == "ts.gym needs the package gymnasium, which is missing: pip install 'taisoft[gym]'\n"
