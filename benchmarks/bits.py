@@ -12,7 +12,6 @@ Two cores are needed. Exit status: 0, 1 if anything differs or a case fails, 2 f
 import argparse
 import gzip
 import hashlib
-import json
 import math
 import sys
 import time
@@ -31,19 +30,19 @@ from taisoft.errors import SceneError, SimulationError
 from taisoft.files import write_bytes
 from taisoft.machine import machine, usable_cores
 from taisoft.many.places import LocalPlace, carry_out, serve
+from taisoft.nested import from_json, to_json
 from taisoft.output.tables import markdown
-from taisoft.study.accuracy import pack, unpack
 
 from .bits_cases import Case, all_cases
 from .document import check_out, header
 from .runner import make_parser, patched, progress, without_warnings
 
 STEPS = 20
-KIND, FORMAT = "taisoft bits", 1
+KIND, FORMAT = "taisoft bits", 2
 CHILD = ("-m", "taisoft", "bench", "bits", "--child")
 PARTS = ("positions", "velocities", "contacts")
 SAME, RECORDED = "same", "recorded"
-NOTHING = {"digests": [], "positions": pack(np.zeros((0, 3))), "contacts": 0, "error": "", "seconds": 0.0}
+NOTHING = {"digests": [], "positions": np.zeros((0, 3)), "contacts": 0, "error": "", "seconds": 0.0}
 # What makes loops over small scenes parallel: module, name, value
 PARALLEL = (
     ("backend.parallel", "pays", lambda seconds: True),
@@ -74,7 +73,7 @@ class RecordedSimulator(ts.Simulator):
         found, record, positions = self.contacts(), self._record, self.positions()
         record["digests"].append(digests_of(positions, self.velocities(), found.point, found.impulse))
         record["contacts"] = max(record["contacts"], len(found))
-        record["positions"] = pack(positions)
+        record["positions"] = positions
         if len(record["digests"]) == self._steps:
             raise Finished
         return report
@@ -140,17 +139,15 @@ def run_all(cases: list[Case]) -> dict[str, dict]:
 def write(path: Path, settings: dict, records: dict[str, dict]) -> None:
     """Write records atomically. Raises OutputError."""
     whole = {"kind": KIND, "format": FORMAT, "header": header("")[1], "settings": settings, "records": records}
-    write_bytes(path, gzip.compress(json.dumps(whole).encode(), mtime=0))
+    write_bytes(path, gzip.compress(to_json(whole).encode(), mtime=0))
 
 
 def read(path: Path, settings: dict) -> dict:
     """The content of a file. Raises SceneError if it is missing, damaged or of a run with other settings."""
     try:
-        whole = json.loads(gzip.decompress(path.read_bytes()))
+        whole = from_json(gzip.decompress(path.read_bytes()))
         if (whole["kind"], whole["format"]) != (KIND, FORMAT):
             raise ValueError("another kind or format")
-        for one in whole["records"].values():
-            unpack(one["positions"])
         stored = whole["settings"]
     except OSError as error:
         raise SceneError(f"{path} cannot be read: {error.strerror or error}") from None
@@ -176,7 +173,7 @@ def verdict(new: dict | None, old: dict | None) -> str:
 
 def difference(new: dict | None, old: dict | None) -> tuple[float, float]:
     """The greatest difference of last positions [m], and over the diagonal of the old ones; nan for other numbers of nodes."""
-    x, y = (unpack((one or NOTHING)["positions"]) for one in (new, old))
+    x, y = ((one or NOTHING)["positions"] for one in (new, old))
     if x.shape != y.shape or not len(y):
         return math.nan, math.nan
     greatest = float(np.abs(x - y).max())

@@ -13,7 +13,6 @@ import numpy as np
 from taisoft.machine import machine, usable_cores
 from taisoft.many.places import LocalPlace, carry_out
 from taisoft.many.store import NoStore, Store, code_digest, digest
-from taisoft.study.accuracy import pack, unpack
 
 from .hard_cases import CASES
 from .hard_cases.case import DEGRADED, END, FINER, OK, REFUSED, STOPPED, Case, Session, Variant, Verdict, judge
@@ -51,7 +50,7 @@ class Row:
         """Set the error from the points of both runs."""
         if self.record is None or self.reference is None or self.reference["status"] not in ANSWERED:
             return
-        own, finer = unpack(self.record["points"]), unpack(self.reference["points"])
+        own, finer = self.record["points"], self.reference["points"]
         if own.shape == finer.shape and len(own):
             self.error = float(np.linalg.norm(own - finer, axis=1).max() / self.case.size)
 
@@ -119,9 +118,8 @@ def find(case: str, variant: str) -> tuple[Case, Variant]:
 
 
 def run(case: Case, variant: Variant, arch: str, finer: int = 1) -> dict:
-    """Run a variant in this process; returns its record as plain data."""
-    record = Session(case, variant, arch, finer).record()
-    return record | {"points": pack(record["points"])}
+    """Run a variant in this process; returns its record."""
+    return Session(case, variant, arch, finer).record()
 
 
 def answer(request: dict) -> dict:

@@ -59,7 +59,7 @@ def killed(name: str, n: int, workers: int, whole: bool, folder: Path) -> tuple[
     """The digest after a kill in the middle, and how many rows were finished then. whole: of the caller, else of a worker."""
     process = subprocess.Popen([sys.executable, *CHILD, name, str(n), str(workers), str(folder)], env=own_environment())
     try:
-        while (done := len(list((folder / "runs").glob("*.npz")))) < n // 2:
+        while (done := len(list((folder / "runs").glob("*.json")))) < n // 2:
             if process.poll() is not None:
                 raise SimulationError(f"{name}: the process ended with {done} rows")
             time.sleep(0.02)

@@ -2,12 +2,12 @@
 
 A place takes one request at a time: `start(request)`, `poll()` -> the answer or None, `stop()`. A LocalPlace has a child process;
 a ClusterPlace (`taisoft.many.cluster`) has one on a worker of a Dask cluster. A child reads requests from stdin and writes an
-answer to each on stdout, both lines of JSON. It ends when its stdin closes, so it does not outlive its caller, however that ends.
+answer to each on stdout, both lines of JSON (`taisoft.nested`). It ends when its stdin closes, so it does not outlive its caller,
+however that ends.
 
 Timed runs have a new process each, on cores of their own. Other runs share processes, since Taichi takes seconds to start.
 """
 
-import json
 import math
 import os
 import queue
@@ -24,7 +24,7 @@ from typing import Protocol
 
 from taisoft.errors import SimulationError
 from taisoft.machine import THREADS
-from taisoft.output.report import json_text
+from taisoft.nested import from_json, to_json
 from taisoft.processes import how_it_ended, own_environment
 
 POLL_INTERVAL = 0.01  # [s]
@@ -109,7 +109,7 @@ class LocalPlace:
 
     def start(self, request: dict) -> None:
         """See Place."""
-        self._request = json.dumps(request).encode() + b"\n"
+        self._request = to_json(request).encode() + b"\n"
         if self._process is None or self._process.poll() is not None:
             self._launch()
         self._send()
@@ -206,7 +206,7 @@ def _answer_in(file) -> dict | None:
         return None
     content = _content(file)
     try:
-        return json.loads(content)
+        return from_json(content)
     except ValueError:  # something that runs when Python starts has written it
         return {
             "crash": f"its process printed {content.splitlines()[0].decode(errors='replace')!r} when it started",
@@ -227,10 +227,10 @@ def _content(file) -> bytes:
     return content
 
 
-def serve(answer: Callable[[dict], dict], encode: Callable[[dict], str] = json_text) -> None:
+def serve(answer: Callable[[dict], dict]) -> None:
     """Be the child of a place: write answer(request) for each request, and exit when stdin closes, even while one is executed.
 
-    What else is printed goes to stderr, and nothing can be read from stdin. encode: returns an answer as JSON.
+    What else is printed goes to stderr, and nothing can be read from stdin.
     """
     global serving
     serving, requests, is_idle = True, queue.SimpleQueue(), threading.Event()
@@ -240,7 +240,7 @@ def serve(answer: Callable[[dict], dict], encode: Callable[[dict], str] = json_t
     threading.Thread(target=_read, args=(stdin, requests, is_idle), daemon=True).start()
     while line := _next(requests):
         is_idle.clear()
-        text = encode(answer(json.loads(line))).replace("\n", "") + "\n"
+        text = to_json(answer(from_json(line))) + "\n"
         sys.stdout.flush()
         sys.stderr.flush()
         is_idle.set()

@@ -1,9 +1,6 @@
 """The results of `run_many`: a row for each mapping of parameters, and columns by name."""
 
-import csv
 import hashlib
-import io
-import json
 import math
 from collections import Counter
 from collections.abc import Sequence
@@ -15,6 +12,7 @@ import numpy as np
 from taisoft.errors import SceneError, listed, one_line
 from taisoft.files import write_bytes
 from taisoft.many.store import digest
+from taisoft.output.report import csv_text
 from taisoft.output.tables import markdown
 from taisoft.scene.checks import nearest
 
@@ -92,11 +90,7 @@ class Results(Sequence):
 
     def write(self, path: str | Path) -> None:
         """Write the table as CSV. Raises OutputError."""
-        text = io.StringIO(newline="")
-        writer = csv.DictWriter(text, self.names)
-        writer.writeheader()
-        writer.writerows(self.to_dicts())
-        write_bytes(path, text.getvalue().encode(errors="backslashreplace"))
+        write_bytes(path, csv_text([self.names, *(row.values() for row in self.to_dicts())]).encode(errors="backslashreplace"))
 
     def digest(self) -> str:
         """Return a SHA-256 digest of all bits of parameters, status, values and arrays, whatever the order of the rows."""
@@ -106,7 +100,7 @@ class Results(Sequence):
             for name, array in row.arrays.items():
                 total.update(repr((name, array.dtype.str, array.shape)).encode() + array.tobytes())
             parts.append(total.hexdigest())
-        return hashlib.sha256(json.dumps(sorted(parts)).encode()).hexdigest()
+        return digest(sorted(parts))
 
     def __repr__(self) -> str:
         """What became of the runs, the first rows, and the first that failed."""

@@ -1,6 +1,5 @@
 """`run_many`: one function for many parameters, each run in a process, into one table."""
 
-import base64
 import inspect
 import io
 import json
@@ -24,7 +23,7 @@ from taisoft.many.cluster import cluster_places, connect
 from taisoft.many.make import COLUMNS, Make, make_of
 from taisoft.many.places import LocalPlace, Place, carry_out
 from taisoft.many.results import Results, Row
-from taisoft.many.store import NoStore, RowStore, digest, digests
+from taisoft.many.store import NoStore, Store, digest, digests
 from taisoft.output.files import FolderLock, check_free, make_folder
 from taisoft.output.report import Bar, clock_text, json_text, machine, versions
 from taisoft.scene import checks
@@ -104,7 +103,7 @@ def _plain(value, name: str):
     raise SceneError(f"{name} must be {kinds}, not {value_text(value)}: let make build the rest")
 
 
-def _store(out: Path, make: Make, stack: ExitStack) -> RowStore:
+def _store(out: Path, make: Make, stack: ExitStack) -> Store:
     """Return the store of finished rows in a folder, which is locked. Raises OutputError for a folder of other results."""
     check_free(out, overwrite=False)
     if (out / "study.json").exists():
@@ -120,7 +119,7 @@ def _store(out: Path, make: Make, stack: ExitStack) -> RowStore:
         raise OutputError(f"the folder {out} holds runs of {found}, not of {make.name}: name another folder")
     folder = make_folder(out)
     stack.enter_context(closing(FolderLock(folder)))
-    return RowStore(folder)
+    return Store(folder)
 
 
 def _places(workers: int | None, threads: int | None, n_runs: int) -> list[LocalPlace]:
@@ -134,7 +133,7 @@ def _places(workers: int | None, threads: int | None, n_runs: int) -> list[Local
 class Many:
     """Rows to run: each is executed once for equal parameters, or taken from the store."""
 
-    def __init__(self, make: Make, parameters: list[dict], store: RowStore | NoStore):
+    def __init__(self, make: Make, parameters: list[dict], store: Store | NoStore):
         self._make, self._parameters, self._store = make, parameters, store
         self._request, self._notes, self._seen = make.request(), [], {}
         self._keys = [digest([make.name, one])[:32] for one in parameters]
@@ -250,6 +249,5 @@ def _interruption() -> Iterator[Callable[[], bool]]:
 
 
 def _row(parameters: dict, record: dict) -> Row:
-    files = {name: io.BytesIO(base64.b64decode(text)) for name, text in record["arrays"].items()}
-    arrays = {name: np.load(file, allow_pickle=False) for name, file in files.items()}
-    return Row(parameters, record["status"], record["problems"], record["values"], arrays, record["wall_seconds"])
+    names = ("status", "problems", "values", "arrays", "wall_seconds")
+    return Row(parameters, **{name: record[name] for name in names})

@@ -3,13 +3,9 @@
 A file holds a record and the record's digest; a damaged file is reported and its run repeated.
 """
 
-import base64
 import hashlib
-import io
-import json
 import sys
 import sysconfig
-import zipfile
 from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
@@ -17,10 +13,11 @@ from pathlib import Path
 from taisoft import __version__
 from taisoft.files import write_bytes
 from taisoft.machine import versions
+from taisoft.nested import from_json, to_json
 from taisoft.output.files import make_folder
 
 RUNS = "runs"
-FORMAT = 1
+KIND, FORMAT = "taisoft run", 2
 PACKAGE = Path(__file__).resolve().parents[1]
 NOT_COMPUTING = ("cli", "view", "output", "many", "study")  # folders of the package that results do not depend on
 COMPUTING = ("study/measure.py",)  # except these
@@ -65,14 +62,12 @@ def digests(folder: Path, names: Iterable[str]) -> dict[str, str]:
 
 
 def digest(values) -> str:
-    """Return the SHA-256 digest of plain data."""
-    return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
+    """Return the SHA-256 digest of plain data and arrays."""
+    return hashlib.sha256(to_json(values, sort_keys=True).encode()).hexdigest()
 
 
 class Store:
     """Finished runs in a folder, which the caller has locked. damaged: sentences on files that could not be used."""
-
-    kind, suffix = "taisoft study run", ".json"
 
     def __init__(self, folder: Path):
         self._folder = make_folder(folder / RUNS)
@@ -85,8 +80,8 @@ class Store:
         """Return the record with this key, or None if it is absent or damaged."""
         path = self._path(key)
         try:
-            content = self._unpack(path.read_bytes())
-            if (content["kind"], content["format"]) != (self.kind, FORMAT) or content["key"] != key:
+            content = from_json(path.read_bytes())
+            if (content["kind"], content["format"]) != (KIND, FORMAT) or content["key"] != key:
                 raise ValueError("it has another kind, format or key")
             if content["sha256"] != digest(content["record"]):
                 raise ValueError("its digest does not match its content")
@@ -99,44 +94,13 @@ class Store:
         return content["record"]
 
     def write(self, key: str, record: dict) -> dict:
-        """Save a record, plain data, and return it. Raises OutputError."""
-        content = {"kind": self.kind, "format": FORMAT, "key": key, "sha256": digest(record), "record": record}
-        write_bytes(self._path(key), self._pack(content))
+        """Save a record, plain data and arrays, and return it. Raises OutputError."""
+        content = {"kind": KIND, "format": FORMAT, "key": key, "sha256": digest(record), "record": record}
+        write_bytes(self._path(key), to_json(content).encode())
         return record
 
     def _path(self, key: str) -> Path:
-        return self._folder / f"{key}{self.suffix}"
-
-    def _pack(self, content: dict) -> bytes:
-        return json.dumps(content).encode()
-
-    def _unpack(self, data: bytes) -> dict:
-        return json.loads(data)
-
-
-class RowStore(Store):
-    """Finished rows of `run_many`, as .npz files: arrays by name, and the rest of the record as row.json."""
-
-    kind, suffix = "taisoft row", ".npz"
-
-    def _pack(self, content: dict) -> bytes:
-        record = dict(content["record"])
-        arrays, file = record.pop("arrays"), io.BytesIO()
-        with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as parts:
-            for name, text in arrays.items():
-                parts.writestr(f"{name}.npy", base64.b64decode(text))
-            parts.writestr("row.json", json.dumps(content | {"record": record}))
-        return file.getvalue()
-
-    def _unpack(self, data: bytes) -> dict:
-        try:
-            with zipfile.ZipFile(io.BytesIO(data)) as parts:
-                content = json.loads(parts.read("row.json"))
-                names = [name for name in parts.namelist() if name.endswith(".npy")]
-                arrays = {name.removesuffix(".npy"): base64.b64encode(parts.read(name)).decode() for name in names}
-        except Exception as error:  # a damaged file raises many types
-            raise ValueError(f"{type(error).__name__}: {error}") from None
-        return content | {"record": content["record"] | {"arrays": arrays}}
+        return self._folder / f"{key}.json"
 
 
 class NoStore:

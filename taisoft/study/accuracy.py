@@ -8,8 +8,6 @@ is its order in time. For the finest mesh it is also at least a third of the dis
 order in the mesh width), or all of it if the motion is not smooth.
 """
 
-import base64
-import zlib
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -85,21 +83,6 @@ class Row:
         return None if pair is None else max(pair)
 
 
-def pack(values: np.ndarray) -> dict:
-    """Encode an array of float64 as text, losslessly, for a run's record."""
-    data = zlib.compress(np.ascontiguousarray(values, dtype="<f8").tobytes(), 1)
-    return {"shape": list(values.shape), "zlib_base64": base64.b64encode(data).decode()}
-
-
-def unpack(packed: dict) -> np.ndarray:
-    """Decode an array from `pack`. Raises ValueError for invalid data."""
-    try:
-        data = zlib.decompress(base64.b64decode(packed["zlib_base64"], validate=True))
-        return np.frombuffer(data, dtype="<f8").reshape(packed["shape"])
-    except (zlib.error, KeyError, TypeError) as error:
-        raise ValueError(f"{type(error).__name__}: {error}") from None
-
-
 def make_reference(fine: dict, coarse: dict, kind: str, order_in_time: int) -> Reference:
     """Build a reference from the records of its fine and coarse runs.
 
@@ -109,11 +92,11 @@ def make_reference(fine: dict, coarse: dict, kind: str, order_in_time: int) -> R
         if record["status"] == "failed":
             setting, reason = record["task"]["setting"], record["problems"][-1]
             raise SimulationError(f"the reference {setting['integrator']}, dt = {setting['dt']:.3g} s, failed: {reason}")
-    path = unpack(fine["path"])
+    path = fine["path"]
     excursion = largest_excursion(path)
     if excursion == 0.0:
         raise SimulationError("nothing moves in the reference, so errors relative to its motion are undefined")
-    difference = distance(unpack(coarse["path"]), path, excursion)
+    difference = distance(coarse["path"], path, excursion)
     divisor = 2.0**order_in_time - 1.0
     energies = np.array(fine["energies"])
     return Reference(
@@ -168,7 +151,7 @@ def row_of(record: dict, reference: Reference | None) -> Row:
         row.penetration = None if deepest is None else deepest / record["smallest_edge"]
     if record["path"] is None or reference is None:
         return row
-    row.in_time, row.in_time_sure = distance(unpack(record["path"]), reference.path, reference.excursion), reference.own_error
+    row.in_time, row.in_time_sure = distance(record["path"], reference.path, reference.excursion), reference.own_error
     energy, row.energy_kept = np.array(record["energies"], float).sum(axis=1), record["keeps_energy"]
     expected = energy[0] if row.energy_kept else reference.energy
     row.energy = _relative(np.abs(energy - expected).max(), reference.energy_scale)

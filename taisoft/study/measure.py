@@ -19,7 +19,6 @@ from taisoft.output.report import extremes, machine, peak_memory, versions
 from taisoft.scene.scene import Scene
 from taisoft.simulator import Simulator
 from taisoft.study import simulator_arguments
-from taisoft.study.accuracy import pack
 
 MAX_REPEATED_SECONDS = 20.0  # a run with a longer wall time is not repeated: the recorded run gives its time
 ITERATIONS = ("newton_iterations", "linear_iterations", "contact_iterations")
@@ -173,5 +172,5 @@ class Observer:
         self.seconds += time.perf_counter() - start - (sim.compile_seconds - compiled)
 
     def numbers(self) -> dict:
-        """Return plain data: energies (k,3) [J], momentum (k,3) [kg m/s], path (k,n,3) [m] packed."""
-        return {"energies": self._energies, "momentum": self._momentum, "path": pack(np.array(self._path))}
+        """Return energies (k,3) [J], momentum (k,3) [kg m/s], path (k,n,3) [m]."""
+        return {"energies": self._energies, "momentum": self._momentum, "path": np.array(self._path)}

@@ -9,7 +9,7 @@ from taisoft.machine import summarise, thread_count, usable_cores
 from taisoft.many.places import BUDGET_SPENT, CUT_BY_BUDGET, LocalPlace, Place, carry_out
 from taisoft.many.store import NoStore, Store, digest
 from taisoft.study import Request, describe, mesh_name
-from taisoft.study.accuracy import Reference, Row, error_in_space, finest_own_error, make_reference, row_of, unpack
+from taisoft.study.accuracy import Reference, Row, error_in_space, finest_own_error, make_reference, row_of
 from taisoft.study.results import Study
 
 CHILD = ("-m", "taisoft.cli.study")
@@ -179,7 +179,7 @@ def _add_rows(study: Study, outcomes: list[Outcome], references: list[Reference 
         if space_error is not None and run.record["path"] is not None:
             row.in_space_sure = space_error
             try:
-                row.in_space = error_in_space(unpack(run.record["path"]), run.record["bodies"], study.space)
+                row.in_space = error_in_space(run.record["path"], run.record["bodies"], study.space)
             except SimulationError as error:
                 study.notes.append(f"{run.task}: {error}")
         study.rows.append(row)

@@ -1,11 +1,10 @@
 """The link between a simulation and the process that shows it: small messages over a socket, node data in shared memory.
 
-A message is a dict of plain data and arrays, in bytes a header in JSON followed by the arrays; nothing is pickled. Positions
-and values at the nodes, which may be large, lie in memory that both processes map, in one or several slots. The writer fills a
-slot only after the reader has confirmed the message about its previous content, so sending rarely waits for the reader.
+A message is a dict of plain data and arrays in JSON (`taisoft.nested`); nothing is pickled. Positions and values at the nodes,
+which may be large, lie in memory that both processes map, in one or several slots. The writer fills a slot only after the reader
+has confirmed the message about its previous content, so sending rarely waits for the reader.
 """
 
-import json
 import mmap
 import os
 import tempfile
@@ -14,41 +13,11 @@ from multiprocessing.connection import Connection
 
 import numpy as np
 
-HEADER = 4  # bytes of the length of the header
+from taisoft.nested import from_json, to_json
 
 
 class LinkClosed(Exception):
     """The other process has ended or closed its end."""
-
-
-def encode(message: dict) -> bytes:
-    """Return a message as bytes; arrays may be nested in its dicts and lists."""
-    arrays: list[bytes] = []
-
-    def plain(value):
-        if isinstance(value, np.generic):
-            return value.item()
-        if not isinstance(value, np.ndarray):
-            raise TypeError(f"a message cannot hold a {type(value).__name__}")
-        arrays.append(np.ascontiguousarray(value).tobytes())
-        return {"ndarray": len(arrays[-1]), "dtype": value.dtype.str, "shape": value.shape}
-
-    header = json.dumps(message, default=plain).encode()
-    return b"".join([len(header).to_bytes(HEADER, "little"), header, *arrays])
-
-
-def decode(data: bytes) -> dict:
-    """Return the message of `encode`, with its arrays in the order of the header."""
-    at = HEADER + int.from_bytes(data[:HEADER], "little")
-
-    def array(value: dict):
-        nonlocal at
-        if "ndarray" not in value:
-            return value
-        begin, at = at, at + value["ndarray"]
-        return np.frombuffer(data[begin:at], dtype=value["dtype"]).reshape(value["shape"])
-
-    return json.loads(data[HEADER:at], object_hook=array)
 
 
 class SharedNodes:
@@ -92,7 +61,7 @@ class Link:
     def send(self, message: dict) -> None:
         """Send a message. Raises LinkClosed."""
         try:
-            self._connection.send_bytes(encode(message))
+            self._connection.send_bytes(to_json(message, level=0).encode())
         except OSError as error:
             raise LinkClosed from error
 
@@ -109,6 +78,6 @@ class Link:
 def receive(connection: Connection, timeout: float | None) -> dict | None:
     """Return the next message, or None if there is none within the time [s]; None waits for one. Raises LinkClosed."""
     try:
-        return decode(connection.recv_bytes()) if connection.poll(timeout) else None
+        return from_json(connection.recv_bytes()) if connection.poll(timeout) else None
     except (EOFError, OSError) as error:
         raise LinkClosed from error

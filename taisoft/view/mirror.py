@@ -20,6 +20,7 @@ from taisoft.view.connection_layer import ConnectionMarks
 from taisoft.view.plots import ENERGIES
 from taisoft.view.scene_view import MAX_CONTACTS
 
+ELSEWHERE = "in the other process"  # stands for a path
 SHAPES = {shape.__name__: shape for shape in (HalfSpace, Sphere, Box, Capsule, MeshObstacle)}
 
 
@@ -28,20 +29,21 @@ def describe_scene(scene, marks: ConnectionMarks) -> dict:
     return {
         "gravity": np.asarray(scene.gravity),
         "up": scene.up,
-        "connected": [list(one.owners) for one in scene.connections],
-        "attached": marks.attached,
-        "pressed": [{"corners": corners, "longest": longest} for corners, longest in marks.pressed],
+        "connections": [{"owners": list(one.owners)} for one in scene.connections],
+        "marks": {"attached": marks.attached, "pressed": marks.pressed},
         "bodies": [
             {
                 "name": body.name,
                 "position": np.asarray(body.position),
                 "rest_positions": np.asarray(body.rest_positions),
-                "surface": np.asarray(body.nodes.surface),
-                "corners": np.asarray(body.mesh.surface),
-                "skin": body.riding_skin and _describe_skin(body.riding_skin),
-                "fixed": [c.nodes for c in scene.constraints(body) if c.path is None],
-                "prescribed": [c.nodes for c in scene.constraints(body) if c.path is not None],
-                "loaded": [t.triangles for t in body.tractions],
+                "n_nodes": body.n_nodes,
+                "nodes": {"surface": np.asarray(body.nodes.surface)},
+                "mesh": {"surface": np.asarray(body.mesh.surface)},
+                "riding_skin": body.riding_skin and _describe_skin(body.riding_skin),
+                "constraints": [
+                    {"nodes": c.nodes, "path": None if c.path is None else ELSEWHERE} for c in scene.constraints(body)
+                ],
+                "tractions": [{"triangles": t.triangles, "path": None, "value": np.zeros(3)} for t in body.tractions],
             }
             for body in scene.bodies
         ],
@@ -59,44 +61,26 @@ def describe_scene(scene, marks: ConnectionMarks) -> dict:
 
 def _describe_skin(skin) -> dict:
     weights, surface = skin.weights, skin.surface
-    parts = {name: getattr(weights, name) for name in ("data", "indices", "indptr")}
-    return parts | {"n": weights.shape[1], "vertices": surface.vertices, "triangles": surface.triangles}
+    parts = {name: getattr(weights, name) for name in ("data", "indices", "indptr", "shape")}
+    return {"weights": parts, "surface": {"vertices": surface.vertices, "triangles": surface.triangles}}
 
 
-def _mirror_skin(skin: dict) -> SimpleNamespace:
-    weights = sp.csr_matrix((skin["data"], skin["indices"], skin["indptr"]), shape=(len(skin["vertices"]), skin["n"]))
-    surface = SimpleNamespace(vertices=skin["vertices"], triangles=skin["triangles"])
-    return SimpleNamespace(surface=surface, weights=weights)
-
-
-def _not_known(_t: float) -> None:
-    """The path of prescribed nodes, which stays in the other process."""
+def _namespace(value):
+    """Return nested plain data with the entries of its dicts as attributes."""
+    if isinstance(value, dict):
+        return SimpleNamespace(**{key: _namespace(inner) for key, inner in value.items()})
+    return [_namespace(inner) for inner in value] if isinstance(value, list) else value
 
 
 class MirrorScene:
     """A scene from its description: `bodies` with what is drawn of them, and `obstacles`, whose paths give the latest poses."""
 
     def __init__(self, description: dict):
-        self.bodies = [
-            SimpleNamespace(
-                name=b["name"],
-                position=b["position"],
-                rest_positions=b["rest_positions"],
-                n_nodes=len(b["rest_positions"]),
-                nodes=SimpleNamespace(surface=b["surface"]),
-                mesh=SimpleNamespace(surface=b["corners"]),
-                riding_skin=b["skin"] and _mirror_skin(b["skin"]),
-                constraints=[
-                    SimpleNamespace(path=path, nodes=nodes)
-                    for path, key in ((None, "fixed"), (_not_known, "prescribed"))
-                    for nodes in b[key]
-                ],
-                tractions=[SimpleNamespace(path=None, triangles=t, value=np.zeros(3)) for t in b["loaded"]],
-            )
-            for b in description["bodies"]
-        ]
+        self.bodies, self.connections = (_namespace(description[name]) for name in ("bodies", "connections"))
+        for skin in (body.riding_skin for body in self.bodies if body.riding_skin):
+            parts = skin.weights
+            skin.weights = sp.csr_matrix((parts.data, parts.indices, parts.indptr), shape=parts.shape)
         self.gravity, self.up = description["gravity"], description["up"]
-        self.connections = [SimpleNamespace(owners=owners) for owners in description["connected"]]
         self.obstacles = [Obstacle(SHAPES[o["shape"]](**o["fields"]), o["name"]) for o in description["obstacles"]]
         self.poses = {}
         self.take_poses({o["name"]: o["pose"] for o in description["obstacles"] if o["pose"] is not None})
@@ -139,25 +123,21 @@ def describe_state(sim, marks: ConnectionMarks, layers: set[str]) -> dict:
     if "contacts" in layers:
         found, k = sim.contacts(), slice(0, MAX_CONTACTS)
         state["contacts"] = {name: getattr(found, name)[k] for name in ("point", "normal", "impulse")}
-    if segments is not None:
-        state["segments"] = dict(zip(("ends", "tensions"), segments))
     if "pressures" in layers:
         state["pressures"] = pressures
-    return state
+    return state | {"segments": segments}
 
 
 class MirrorMarks:
     """The `ConnectionMarks` of a simulation in another process, with the values of its latest state."""
 
-    def __init__(self, description: dict):
-        self.attached = description["attached"]
-        self.pressed = [(one["corners"], one["longest"]) for one in description["pressed"]]
+    def __init__(self, attached: np.ndarray, pressed: list):
+        self.attached, self.pressed = attached, pressed
         self._segments, self._pressures = None, [0.0] * len(self.pressed)
 
     def take(self, state: dict) -> None:
         """Take over a state."""
-        found = state.get("segments")
-        self._segments = found and (found["ends"], found["tensions"])
+        self._segments = state["segments"]
         self._pressures = state.get("pressures", self._pressures)
 
     def segments(self, _sim) -> tuple[np.ndarray, np.ndarray] | None:
@@ -176,7 +156,7 @@ class MirrorSimulation:
     """
 
     def __init__(self, description: dict, n_nodes: int):
-        self.scene, self.marks = MirrorScene(description), MirrorMarks(description)
+        self.scene, self.marks = MirrorScene(description), MirrorMarks(**description["marks"])
         self.time, self.step_count = 0.0, 0
         self._energies, self._contacts = Energies(0.0, 0.0, 0.0), None
         ends = np.cumsum([0] + [body.n_nodes for body in self.scene.bodies])

@@ -1,8 +1,7 @@
 """A place that executes the rows of `run_many` in this process."""
 
-import json
-
 from taisoft.many import make
+from taisoft.nested import from_json, to_json
 
 
 class InProcess:
@@ -16,8 +15,8 @@ class InProcess:
 
     def start(self, request: dict) -> None:
         self.requests.append(request["parameters"])
-        answer = {"crash": self.crash} if self.crash else make.answer(json.loads(json.dumps(request)))
-        self._answer = json.loads(json.dumps(answer))
+        answer = {"crash": self.crash} if self.crash else make.answer(from_json(to_json(request)))
+        self._answer = from_json(to_json(answer))
 
     def poll(self) -> dict:
         return self._answer

@@ -67,7 +67,7 @@ def test_a_print_when_python_starts_is_named(tmp_path, monkeypatch):
 
 
 def rows_in(folder: Path) -> int:
-    return len(list((folder / "runs").glob("*.npz")))
+    return len(list((folder / "runs").glob("*.json")))
 
 
 def start(folder: Path, done: int) -> tuple[subprocess.Popen, list[int]]:

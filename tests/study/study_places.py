@@ -1,12 +1,9 @@
 """Places of a study without child processes: runs in this process, or of a fake program."""
 
-import json
-
 import numpy as np
 
 from taisoft.cli.study import answer
-from taisoft.output.report import json_text
-from taisoft.study.accuracy import pack
+from taisoft.nested import from_json, to_json
 
 
 class InProcess:
@@ -19,7 +16,7 @@ class InProcess:
 
     def start(self, request: dict) -> None:
         self.requests.append(request)
-        self._answer = json.loads(json_text(answer(request)))
+        self._answer = from_json(to_json(answer(request)))
 
     def poll(self) -> dict | None:
         answer, self._answer = self._answer, None
@@ -85,5 +82,5 @@ class Pendulum(InProcess):
             "bodies": [["mass", 2]],
             "energies": energies,
             "momentum": momentum,
-            "path": None if problem else pack(path),
+            "path": None if problem else path,
         }

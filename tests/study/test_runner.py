@@ -157,7 +157,7 @@ def test_damaged_records_are_reported_and_repeated(tmp_path, damage):
     first = run(Pendulum(plan()), Store(tmp_path))
     path = sorted((tmp_path / "runs").iterdir())[3]
     text = path.read_text()
-    k = text.index("zlib_base64") + 40
+    k = text.index("zlib, base64") + 40
     path.write_text(text[:-100] if damage == "cut" else text[:k] + ("A" if text[k] != "A" else "B") + text[k + 1 :])
     place, store = Pendulum(plan()), Store(tmp_path)
     again = run(place, store)
