@@ -76,8 +76,7 @@ class StaticResult:
     def tension(self, name: str) -> float:
         """Tension [N] of a spring or tendon; negative: it pushes. Raises SceneError."""
         names = [one.name for one in (*self._scene.springs, *self._scene.tendons)]
-        if name not in names:
-            raise SceneError(f"tension: no spring or tendon is called {name!r}{checks.nearest(str(name), names)}")
+        checks.index(name, names, "tension: no spring or tendon")
         state = self._positions, np.zeros_like(self._positions), self._amplitudes
         return float(self._springs.tensions(*state)[self._springs.elements[name]][0])
 

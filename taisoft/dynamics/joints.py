@@ -14,10 +14,9 @@ import taichi as ti
 
 from taisoft.backend.arrays import FieldArena
 from taisoft.backend.runtime import kernel
-from taisoft.errors import SceneError
 from taisoft.fem import reference
 from taisoft.fem.terms.elasticity import sum_elements_with_damping
-from taisoft.scene.checks import nearest
+from taisoft.scene import checks
 from taisoft.scene.connection_records import Attachment
 
 if TYPE_CHECKING:
@@ -41,9 +40,7 @@ def joint_force(dynamics: "Dynamics", name: str) -> float | np.ndarray:
     """Return the tension [N] of a spring or tendon, or the forces (k,3) [N] on the nodes of an attachment. Raises SceneError."""
     scene, state = dynamics.scene, dynamics.state
     names = [one.name for one in scene.connections]
-    if name not in names:
-        raise SceneError(f"joint_force: no spring, tendon or attachment is called {name!r}{nearest(str(name), names)}")
-    one = scene.connections[names.index(name)]
+    one = scene.connections[checks.index(name, names, "joint_force: no spring, tendon or attachment")]
     if isinstance(one, Attachment) and one.stiffness is None:
         nodes = state.layout.node_start[scene.bodies.index(scene.body(one.a))] + one.nodes
         if one not in scene.dependent_attachments:

@@ -74,9 +74,8 @@ class Named:
     def _at(self, key: str | int | slice) -> int | slice:
         if not isinstance(key, str):
             return key
-        if key not in self.names:
-            raise SimulationError(f"{self._what} is called {key!r}{checks.nearest(key, self.names)}; there are {self.names}")
-        first, end = self._first[(k := self.names.index(key)) : k + 2]
+        k = checks.index(key, self.names, self._what, SimulationError)
+        first, end = self._first[k : k + 2]
         return first if end == first + 1 else slice(first, end)
 
 
@@ -137,11 +136,7 @@ class RunningRobot:
         return Named(*self._axes, load)
 
     def _link(self, name: str) -> int:
-        links = self.placed.robot.links
-        if name not in links:
-            hint = f"{checks.nearest(str(name), links)}; there are {list(links)}"
-            raise SimulationError(f"robot {self.name!r}: no link is called {name!r}{hint}")
-        return 1 + links.index(name)
+        return 1 + checks.index(name, self.placed.robot.links, f"robot {self.name!r}: no link", SimulationError)
 
     def _set_control(self, actuators: np.ndarray, values: np.ndarray) -> None:
         """Check controls that are to be set, and hold them from now on, whatever their paths."""

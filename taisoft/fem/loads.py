@@ -20,7 +20,7 @@ from taisoft.scene.loads import NodalForce, ScalarLoad, Traction, value_at
 from taisoft.scene.rigid import RigidBody
 from taisoft.scene.scene import Body, Scene
 
-FOLLOWS = ScalarLoad(np.zeros(()))  # a pressure or a tension that is a Lagrange multiplier, which steppers find
+FOLLOWS = ScalarLoad(value=np.zeros(()))  # a pressure or a tension that is a Lagrange multiplier, which steppers find
 
 
 class _Path(NamedTuple):

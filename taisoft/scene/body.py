@@ -18,7 +18,7 @@ from taisoft.scene import checks
 from taisoft.scene.collision import CONTACT_MODES
 from taisoft.scene.composition import Composition, compose
 from taisoft.scene.key_frames import AT_REST, KeyFrames, NodePath
-from taisoft.scene.loads import Cavity, NodalForce, Pressure, Traction, value_or_path
+from taisoft.scene.loads import Cavity, Load, NodalForce, Pressure, Traction, value_or_path
 from taisoft.scene.material import Material
 from taisoft.scene.skins import Skin, embed
 
@@ -166,7 +166,7 @@ class Body(Guarded):
         return self.nodes.positions
 
     @property
-    def loads(self) -> list[Traction | NodalForce | Pressure | Cavity]:
+    def loads(self) -> list[Load]:
         """Its tractions, then its forces, its pressures and its cavities."""
         return [*self.tractions, *self.forces, *self.pressures, *self.cavities]
 

@@ -6,7 +6,7 @@ validates names of integrators and contact solvers and their combinations.
 
 import difflib
 import operator
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from numbers import Real
 
 import numpy as np
@@ -96,6 +96,14 @@ def nearest(name: str, known) -> str:
     """Return " (did you mean X?)" for the known name closest to `name`, or an empty string."""
     close = difflib.get_close_matches(name, list(known), n=1, cutoff=0.5)
     return f" (did you mean {close[0]}?)" if close else ""
+
+
+def index(name, known: Sequence[str], what: str, error=SceneError) -> int:
+    """Return the index of a known name. what: start of the message, such as "robot 'arm': no joint"; or raise the error."""
+    if name not in known:
+        there_are = f"; there are {', '.join(known)}" if known else ""
+        raise error(f"{what} is called {value_text(name)}{nearest(str(name), known)}{there_are}")
+    return list(known).index(name)
 
 
 def flag(value, what: str) -> bool:

@@ -6,11 +6,13 @@ the start.
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
 from taisoft.attributes import guarded_record
 from taisoft.scene import checks
+from taisoft.scene.loads import ScalarLoad
 
 MAX_OUTSIDE = 0.1  # heights of a tet by which a point may lie outside a body: curved surfaces do not meet exactly
 _ADD_ANOTHER = "remove it from its list and add another one before the Simulator is made"
@@ -47,23 +49,19 @@ class Spring:
 
 @guarded_record("tendon", "call sim.set_tension(name, force) or sim.set_length(name, length) in a simulation")
 @dataclass(frozen=True, eq=False)
-class Tendon:
+class Tendon(ScalarLoad):
     """A line through points, along which it slides without friction, of given tension or of given length at rest.
 
     It only pulls. One of given length is slack where its points are closer. Its tension is otherwise its stiffness times its
-    extension or, without a stiffness, that which keeps its length.
+    extension or, without a stiffness, that which keeps its length. Its value is a tension [N] or a length [m].
     """
 
     name: str
     points: tuple[Point, ...]
-    value: np.ndarray | None  #: () tension [N] or length [m]; None if it follows a path
-    path: Callable | None = None  #: t [s] -> such a value
-    path_shape: tuple[int, ...] | None = None  #: of all values along the path
     given: str = "force"  #: "force" or "length": what its value is
     stiffness: float | None = None  #: [N/m] of one of given length; None: inextensible
-
-    def __post_init__(self):
-        checks.store(self, value=self.value)
+    damping: ClassVar[float] = 0.0  #: [N s/m]
+    owners = Spring.owners
 
     @property
     def kind(self) -> str:
@@ -83,21 +81,6 @@ class Tendon:
     def is_inextensible(self) -> bool:
         """Whether its tension is a Lagrange multiplier, which keeps its length."""
         return self.given == "length" and self.stiffness is None
-
-    @property
-    def shapes(self) -> tuple[tuple[int, ...], ...]:
-        """Shapes that its values may have."""
-        return ((),)
-
-    @property
-    def damping(self) -> float:
-        """[N s/m]"""
-        return 0.0
-
-    @property
-    def owners(self) -> list[str]:
-        """Names of the bodies and obstacles of its points."""
-        return [point.owner for point in self.points]
 
 
 @guarded_record("attachment", _ADD_ANOTHER)

@@ -12,19 +12,17 @@ from taisoft.scene import checks
 from taisoft.scene.key_frames import KeyFrames
 
 
-@guarded_record("traction", "call sim.set_traction(body, index, value) in a simulation")
-@dataclass(frozen=True, eq=False)
-class Traction:
-    """A dead load on surface triangles."""
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Load:
+    """What all loads have: a value, constant or along a path."""
 
-    kind: ClassVar[str] = "traction"
-    triangles: np.ndarray  #: (k,) int64 rows of mesh.surface
-    value: np.ndarray | None  #: (3,) force per reference area [Pa]; None if it follows a path
+    kind: ClassVar[str]
+    value: np.ndarray | None  #: in one of `shapes`, in the unit of the load; None if it follows a path
     path: Callable | None = None  #: t [s] -> such a value
     path_shape: tuple[int, ...] | None = None  #: of all values along the path
 
     def __post_init__(self):
-        checks.store(self, triangles=self.triangles, value=self.value)
+        checks.store(self, **{name: one for name, one in vars(self).items() if isinstance(one, np.ndarray)})
 
     @property
     def shapes(self) -> tuple[tuple[int, ...], ...]:
@@ -32,20 +30,23 @@ class Traction:
         return ((3,),)
 
 
+@guarded_record("traction", "call sim.set_traction(body, index, value) in a simulation")
+@dataclass(frozen=True, eq=False)
+class Traction(Load):
+    """A dead load on surface triangles, its value a force per reference area [Pa]."""
+
+    kind: ClassVar[str] = "traction"
+    triangles: np.ndarray  #: (k,) int64 rows of mesh.surface
+
+
 @guarded_record("force", "call sim.set_force(body, index, value) in a simulation")
 @dataclass(frozen=True, eq=False)
-class NodalForce:
-    """A dead load on nodes: a total force distributed by lumped mass, or one force per node."""
+class NodalForce(Load):
+    """A dead load on nodes: a total force (3,) [N] distributed by lumped mass, or one force per node (k,3) [N]."""
 
     kind: ClassVar[str] = "force"
     nodes: np.ndarray  #: (k,) int64 node ids
-    value: np.ndarray | None  #: (3,) total force, or (k,3) one per node [N]; None if it follows a path
     where: Callable | None = None  #: as in `Constraint`
-    path: Callable | None = None  #: t [s] -> such a value
-    path_shape: tuple[int, ...] | None = None  #: of all values along the path
-
-    def __post_init__(self):
-        checks.store(self, nodes=self.nodes, value=self.value)
 
     @property
     def shapes(self) -> tuple[tuple[int, ...], ...]:
@@ -54,16 +55,10 @@ class NodalForce:
 
 
 @dataclass(frozen=True, eq=False)
-class ScalarLoad:
+class ScalarLoad(Load):
     """A load that is one number."""
 
     kind: ClassVar[str] = "number"
-    value: np.ndarray | None  #: (), in the unit of the load; None if it follows a path
-    path: Callable | None = None  #: t [s] -> such a number
-    path_shape: tuple[int, ...] | None = None  #: of all values along the path
-
-    def __post_init__(self):
-        checks.store(self, value=self.value)
 
     @property
     def shapes(self) -> tuple[tuple[int, ...], ...]:
@@ -72,16 +67,13 @@ class ScalarLoad:
 
 
 @guarded_record("pressure", "call sim.set_pressure(body, index, value) in a simulation")
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(frozen=True, eq=False)
 class Pressure(ScalarLoad):
     """A follower load on surface triangles: its value [Pa] pushes along the deformed inward normal."""
 
     kind: ClassVar[str] = "pressure"
     triangles: np.ndarray  #: (k,) int64 rows of mesh.surface
     closed: bool  #: whether these have no border; the load then has a potential
-
-    def __post_init__(self):
-        checks.store(self, value=self.value, triangles=self.triangles)
 
     @property
     def has_potential(self) -> bool:
@@ -90,7 +82,7 @@ class Pressure(ScalarLoad):
 
 
 @guarded_record("cavity", "call sim.set_cavity(name, value) in a simulation")
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(frozen=True, eq=False)
 class Cavity(ScalarLoad):
     """A closed inner surface with a fluid of given pressure [Pa], or an incompressible one of given volume [m^3], its value."""
 
@@ -98,9 +90,6 @@ class Cavity(ScalarLoad):
     triangles: np.ndarray  #: (k,) int64 rows of mesh.surface
     given: str  #: "pressure" or "volume"
     rest_volume: float  #: [m^3]
-
-    def __post_init__(self):
-        checks.store(self, value=self.value, triangles=self.triangles)
 
     @property
     def kind(self) -> str:
@@ -144,7 +133,7 @@ def value_or_path(load, what: str, kind: str, shapes: tuple[tuple[int, ...], ...
     return {"value": None, "path": load, "path_shape": _along(load, 0.0, what, kind, shapes).shape}
 
 
-def value_at(load: Traction | NodalForce, t: float, what: str) -> np.ndarray:
+def value_at(load: Load, t: float, what: str) -> np.ndarray:
     """Return a load's value at t [s], (3,) or (k,3). what: start of messages. Raises SimulationError if its path fails."""
     if load.path is None:
         return load.value

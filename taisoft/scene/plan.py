@@ -212,9 +212,7 @@ def change_load(body: Body, kind: str, index: int, value) -> None:
 def change_tendon(scene: Scene, given: str, name: str, value) -> None:
     """Set the tension [N] or the length [m] of a tendon; it replaces a path. given: which of the two. Raises SceneError."""
     names, calls = [tendon.name for tendon in scene.tendons], {"force": "set_tension", "length": "set_length"}
-    if name not in names:
-        raise SceneError(f"{calls[given]}: no tendon is called {name!r}{checks.nearest(str(name), names)}")
-    index, what = names.index(name), f"tendon {name!r}"
+    index, what = checks.index(name, names, f"{calls[given]}: no tendon"), f"tendon {name!r}"
     old = scene.tendons[index]
     if old.given != given:
         raise SceneError(f"{calls[given]}: {what} has a given {old.given}: call {calls[old.given]}")

@@ -9,6 +9,7 @@ less if there are more of them.
 """
 
 import copy
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -21,7 +22,7 @@ from taisoft.mesh.topology import distinct_edges
 from taisoft.scene.body import Body, Constraint
 from taisoft.scene.connection_records import Attachment
 from taisoft.scene.key_frames import KeyFrames, NodePath
-from taisoft.scene.loads import Cavity, LoadPath, NodalForce, Pressure, Traction
+from taisoft.scene.loads import Load, LoadPath, NodalForce
 from taisoft.scene.rigid import RigidBody
 from taisoft.scene.scene import Scene
 
@@ -78,12 +79,7 @@ def _refined(old: Body) -> tuple[Body, np.ndarray]:
     # Row of the new surface -> triangle of the old one: split.surface lists the four parts of each triangle in sequence.
     rows = {tuple(sorted(t)): k // 4 for k, t in enumerate(split.surface.tolist())}
     parents = np.array([rows[tuple(sorted(t))] for t in mesh.surface.tolist()])
-    for load in old.tractions:
-        new.add_traction(np.isin(parents, load.triangles), _load_of(load))
-    for load in old.pressures:
-        new.add_pressure(np.isin(parents, load.triangles), _load_of(load))
-    for cavity in old.cavities:
-        new.add_cavity(np.isin(parents, cavity.triangles), name=cavity.name, **{cavity.given: _load_of(cavity)})
+    _add_surface_loads(new, old, lambda triangles: np.isin(parents, triangles))
     return new, parents_of_nodes
 
 
@@ -92,13 +88,18 @@ def _of_order(old: Body, order: int) -> tuple[Body, np.ndarray]:
     if order == 2:
         parents = np.concatenate([parents, distinct_edges(old.mesh.tets)[0]])
     new = _on_mesh(old, old.mesh, order, parents)
-    for load in old.tractions:
-        new.add_traction(load.triangles, _load_of(load))
-    for load in old.pressures:
-        new.add_pressure(load.triangles, _load_of(load))
-    for cavity in old.cavities:
-        new.add_cavity(cavity.triangles, name=cavity.name, **{cavity.given: _load_of(cavity)})
+    _add_surface_loads(new, old, lambda triangles: triangles)
     return new, parents
+
+
+def _add_surface_loads(new: Body, old: Body, chosen: Callable[[np.ndarray], np.ndarray]) -> None:
+    """Add the loads on triangles of the old body. chosen: old triangles -> what chooses the new ones."""
+    for load in old.tractions:
+        new.add_traction(chosen(load.triangles), _load_of(load))
+    for load in old.pressures:
+        new.add_pressure(chosen(load.triangles), _load_of(load))
+    for cavity in old.cavities:
+        new.add_cavity(chosen(cavity.triangles), name=cavity.name, **{cavity.given: _load_of(cavity)})
 
 
 def _own_parents(n: int) -> np.ndarray:
@@ -136,7 +137,7 @@ def _on_mesh(old: Body, mesh: TetMesh, order: int, parents: np.ndarray) -> Body:
     return new
 
 
-def _load_of(load: Traction | NodalForce | Pressure | Cavity):
+def _load_of(load: Load):
     """Return what the method that added a load was given: a value or a path."""
     return load.value if load.path is None else load.path.frames if isinstance(load.path, LoadPath) else load.path
 

@@ -7,7 +7,7 @@ among each other, do not touch; a floor that a robot stands on belongs in its fi
 """
 
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -157,7 +157,7 @@ def _add_servos(mujoco, spec, file: Path, servo) -> list[str]:
     names = [joint.name for joint in spec.joints if joint.type in simple and joint.name and joint.name not in driven]
     by_joint = servo if isinstance(servo, Mapping) else {name: servo for name in names if name not in followers}
     for name, numbers in by_joint.items():
-        _index(name, names, f"{file}: servo: no hinge or slider without an actuator")
+        checks.index(name, names, f"{file}: servo: no hinge or slider without an actuator")
         stiffness, damping = checks.array(numbers, f"{file}: servo", ((2,),)).tolist()
         if stiffness <= 0.0 or damping < 0.0:
             raise SceneError(f"{file}: servo must be a stiffness above 0 and a damping of at least 0, not {numbers}")
@@ -172,9 +172,9 @@ def _start(mujoco, model, file: Path, joints: Mapping, keyframe, added: list[str
     """Return MuJoCo's data at the start. Position servos hold where they are, but for those whose control a key frame gives."""
     data, names = mujoco.MjData(model), names_of(model, "joint")
     if keyframe is not None:
-        mujoco.mj_resetDataKeyframe(model, data, _index(keyframe, names_of(model, "key"), f"{file}: no key frame"))
+        mujoco.mj_resetDataKeyframe(model, data, checks.index(keyframe, names_of(model, "key"), f"{file}: no key frame"))
     for name, value in joints.items():
-        _index(name, names, f"{file}: no joint")
+        checks.index(name, names, f"{file}: no joint")
         own, one = data.joint(name).qpos, model.joint(name)
         own[:] = checks.array(np.atleast_1d(value), f"{file}: joint {name!r}", (own.shape,))
         if one.limited[0] and len(own) == 1 and not one.range[0] <= own[0] <= one.range[1]:
@@ -228,11 +228,11 @@ def add_robot(
     iterations = checks.whole(iterations, f"{what}: iterations", range(1, MAX_ITERATIONS + 1))
     touched = {"world", *robot.links} if links is None else set(links)
     for one in touched - {"world"}:
-        _index(one, robot.links, f"{what}: no link")
+        checks.index(one, robot.links, f"{what}: no link")
     controls, actuators = {}, names_of(model, "actuator")
     for one, given in (control or {}).items():
-        k = _index(one, actuators, f"{what}: no actuator")
-        controls[k] = load = ScalarLoad(**{"value": None, **value_or_path(given, what, f"control of {one!r}", ((),))})
+        k = checks.index(one, actuators, f"{what}: no actuator")
+        controls[k] = load = ScalarLoad(**value_or_path(given, what, f"control of {one!r}", ((),)))
         if load.path is None:
             check_control(model, k, float(load.value), f"{what}: control of {one!r}")
     placed, data = PlacedRobot(robot, name, position, axes, iterations, controls), robot.make_data()
@@ -258,10 +258,3 @@ def add_robot(
         list.append(self.obstacles, obstacle)
     list.append(self.robots, placed)
     return placed
-
-
-def _index(name, names: Sequence[str], what: str) -> int:
-    """Return the index of a name. what: start of the message, such as "no joint". Raises SceneError if it is unknown."""
-    if name not in names:
-        raise SceneError(f"{what} is called {name!r}{checks.nearest(str(name), names)}; there are {list(names)}")
-    return list(names).index(name)

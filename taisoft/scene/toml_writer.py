@@ -16,10 +16,11 @@ from taisoft.errors import OutputError, SceneError
 from taisoft.files import write_bytes
 from taisoft.mesh.files import write_mesh
 from taisoft.mesh.tet_mesh import TetMesh
+from taisoft.scene import checks
 from taisoft.scene.body import QUADRATURE_DEGREES, Body
-from taisoft.scene.checks import SOLVER_CHECKS, check_solver, nearest
+from taisoft.scene.checks import SOLVER_CHECKS, check_solver
 from taisoft.scene.key_frames import ShapePath
-from taisoft.scene.loads import Cavity, LoadPath, NodalForce, Pressure, Traction
+from taisoft.scene.loads import Cavity, Load, LoadPath, NodalForce
 from taisoft.scene.material import Material
 from taisoft.scene.obstacles import Obstacle
 from taisoft.scene.rigid import RigidBody
@@ -120,9 +121,7 @@ def _solver(solver: dict) -> dict:
         value = value.item() if isinstance(value, np.generic) else value
         plain[key] = float(value) if isinstance(value, Real) and not isinstance(value, int) else value
     for key in plain:
-        if key not in SOLVER_CHECKS:
-            there_are = f"{nearest(str(key), SOLVER_CHECKS)}; there are {', '.join(SOLVER_CHECKS)}"
-            raise SceneError(f"solver: no setting is called {key!r}{there_are}")
+        checks.index(key, SOLVER_CHECKS, "solver: no setting")
     try:
         check_solver(**plain)
     except SceneError as error:
@@ -157,19 +156,17 @@ def _body(body: Body, materials: dict[Material, str], stem: str, meshes: dict[st
     chosen = lambda c: {"nodes": _ids(c.nodes, body.nodes.n_elastic)}  # noqa: E731
     table |= constraint_tables(body, f"body {body.name!r}", chosen, foreign, _fields)
     table |= {key: [] for key in ("traction", "force", "pressure", "cavity")}
-    for load in body.tractions:
-        table["traction"].append({"triangles": _ids(load.triangles, len(body.mesh.surface)), "traction": _load(body, load)})
-    for load in body.pressures:
-        table["pressure"].append({"triangles": _ids(load.triangles, len(body.mesh.surface)), "pressure": _load(body, load)})
-    for cavity in body.cavities:
-        entry = {"name": cavity.name, "triangles": _ids(cavity.triangles, len(body.mesh.surface))}
-        table["cavity"].append(entry | {cavity.given: _load(body, cavity)})
-    for load in body.forces:
-        table["force"].append({"nodes": _ids(load.nodes, body.nodes.n_elastic), "force": _load(body, load)})
+    for load in body.loads:
+        kind, named = ("cavity", {"name": load.name}) if isinstance(load, Cavity) else (load.kind, {})
+        if isinstance(load, NodalForce):
+            where = {"nodes": _ids(load.nodes, body.nodes.n_elastic)}
+        else:
+            where = {"triangles": _ids(load.triangles, len(body.mesh.surface))}
+        table[kind].append(named | where | {load.kind: _load(body, load)})
     return table
 
 
-def _load(body: Body, load: Traction | NodalForce | Pressure | Cavity):
+def _load(body: Body, load: Load):
     """Return a load's value, or the fields of its key frames."""
     if load.path is None:
         return load.value if load.value.ndim else float(load.value)

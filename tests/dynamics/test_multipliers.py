@@ -211,7 +211,7 @@ def test_a_load_slides_to_where_both_segments_are_equally_steep(kind):
     assert result.converged and result.tension("line") == pytest.approx(tension, rel=1e-5)
     assert sum(np.linalg.norm(end - expected) for end in (left, right)) == pytest.approx(total, rel=1e-9)
     assert held_point(scene, result.positions("load")) == pytest.approx(expected, abs=1e-5)
-    with pytest.raises(SceneError, match=r"^tension: no spring or tendon is called 'lin' \(did you mean line\?\)$"):
+    with pytest.raises(SceneError, match=r"^tension: no spring or tendon is called 'lin' \(did you mean line\?\); there are "):
         result.tension("lin")
 
 

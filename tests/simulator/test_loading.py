@@ -151,7 +151,7 @@ INVALID = [
     (lambda s: s.set_traction("beam", 0, PER_NODE), r"traction 0 must have shape \(3,\), not \(4, 3\)"),
     (lambda s: s.scene.body("beam").add_pressure([0], 1.0), "call sim.set_pressure"),
     (lambda s: s.set_tension("rope", -1.0), "tendon 'rope': force must be at least 0 N, not -1: a tendon cannot push"),
-    (lambda s: s.set_tension("rop", 1.0), r"^set_tension: no tendon is called 'rop' \(did you mean rope\?\)$"),
+    (lambda s: s.set_tension("rop", 1.0), r"^set_tension: no tendon is called 'rop' \(did you mean rope\?\); there are "),
     (lambda s: s.set_tension("band", 1.0), "^set_tension: tendon 'band' has a given length: call set_length$"),
     (lambda s: s.set_length("band", -1.0), "^tendon 'band': length must be above 0 m, not -1$"),
     (lambda s: s.set_length("rope", 1.0), "^set_length: tendon 'rope' has a given force: call set_tension$"),
