@@ -1,12 +1,10 @@
 """OpenUSD export: `chunks/points_<first frame>.usdc` while a run lasts, `scene.usdc` when it ends.
 
 Each chunk is a complete scene (topology, materials, a few frames), published whole. So a killed run leaves readable files, and
-loses at most the frames of the unfinished chunk. The same frames are appended to a temporary `scene.usdc.*.part`, which becomes
-the self-contained `scene.usdc` at the end; then the chunks are removed. Appending costs only the new frames (the crate format
-writes new values after the old ones) and frees their memory, but it would corrupt the file if the process died meanwhile; hence
-the separate chunks. Composing the chunks as layers does not work: USD takes an attribute's time samples from the strongest layer
-alone, and many readers do not support value clips.
-A resumed run starts from the earlier frames of `scene.usdc` and of the chunks that a killed run left.
+loses at most the frames of the unfinished chunk. At the end they are joined to the self-contained `scene.usdc` and removed. They
+are appended to a temporary file one by one, which frees their memory. Composing the chunks as layers does not work: USD takes an
+attribute's time samples from the strongest layer alone, and many readers do not support value clips. A resumed run also joins
+the earlier frames of `scene.usdc` and of the chunks that a killed run left.
 
 Time codes are frame numbers; a state before the time of its frame, as at the end of a run between two frames, has the fraction
 that is its time. Units are metres, up is the scene's. A body is `/World/<name>` with `surface` (Mesh), `tets` (TetMesh, purpose
@@ -21,14 +19,13 @@ a camera and lights (`usd_scene.py`).
 """
 
 import math
-from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 
 from taisoft.dynamics.readout import nodal_impulses
 from taisoft.errors import OutputError
-from taisoft.files import part_path, publish, replacing
+from taisoft.files import replacing
 from taisoft.mesh.usd_content import usd_message
 from taisoft.output.files import make_folder, output_errors
 from taisoft.output.nodal_fields import UNKNOWN_ERROR, NodalMean, von_mises
@@ -71,31 +68,32 @@ class UsdWriter:
         self._touching, self._errors = scene.pushes(self_collision), errors
         self._tracks, self._obstacles, self._curves, self._view, self._template = scene_layer(scene, fps, self._touching, errors)
         self._mean = NodalMean(scene.bodies)
-        self._joined = _Joined(self.path, self._template)
         self._chunk, self._moved = None, set()  # tracks of the obstacles that have moved
         self._codes: list[float] = []  # time codes in the unfinished chunk
         self._fps, self._start, self._latest = fps, 0.0, float(first - 1)  # start: time of frame 0 [s]; latest: time code
-        try:
-            self._copy_earlier_frames(first)
-        except BaseException:
-            self._joined.discard()
-            raise
+        self._is_open, self._kept = True, first - 1  # kept: the last frame of earlier files that stays
+        self._earlier: list[Path] = []  # these files, of which later ones override earlier ones
+        self._written: list[Path] = []  # chunks
+        self._take_over([path for path in (self.path, *_chunk_paths(self.chunks)) if first > 0 and path.exists()])
 
-    def _copy_earlier_frames(self, first: int) -> None:
-        """Copy the frames before `first` from an earlier run's scene and from its chunks, which override it."""
-        old = [path for path in (self.path, *_chunk_paths(self.chunks)) if first > 0 and path.exists()]
+    def _take_over(self, old: list[Path]) -> None:
+        """Check the files of an earlier run, and take over what later frames depend on."""
+        eye = None
         for path in old:
             layer = _opened(path)
             if layer.timeCodesPerSecond != self._template.timeCodesPerSecond or _structure(layer) != _structure(self._template):
                 raise OutputError(
                     f"{path} is of another scene, up axis, frame rate or --error, so no run can resume in it: name another folder"
                 )
-            self._joined.append(layer, first)
-        samples = self._joined.layer.ListTimeSamplesForPath
-        self._moved = {track for track, _ in self._obstacles if samples(track.points)}
-        times = samples(self._view.attribute)
-        if times:
-            self._view.resume(np.array(self._joined.layer.QueryTimeSample(self._view.attribute, times[-1])))
+            if layer.startTimeCode > self._kept:
+                continue
+            self._earlier.append(path)
+            times = {track: layer.ListTimeSamplesForPath(track.points) for track, _ in self._obstacles}
+            self._moved |= {track for track, codes in times.items() if codes and codes[0] <= self._kept}
+            if codes := [code for code in layer.ListTimeSamplesForPath(self._view.attribute) if code <= self._kept]:
+                eye = layer.QueryTimeSample(self._view.attribute, codes[-1])
+        if eye is not None:
+            self._view.resume(np.array(eye))
 
     def frame(self, sim, index: int) -> None:
         """Record sim's state as frame index, which must ascend; the first, if not 0, counts from time 0. Raises OutputError."""
@@ -140,9 +138,9 @@ class UsdWriter:
         After a failed write nothing is completed, and the chunks stay.
         """
         self.flush()
-        if self._joined is not None:
-            joined, self._joined = self._joined, None
-            joined.publish()
+        if self._is_open:
+            self._is_open = False
+            self._join()
             _remove_chunks(self.chunks)
 
     def flush(self) -> None:
@@ -153,65 +151,36 @@ class UsdWriter:
     def _publish_chunk(self) -> None:
         chunk, codes = self._chunk, self._codes
         self._chunk, self._codes = None, []
-        if self._joined is None:
+        if not self._is_open:
             raise OutputError(f"cannot continue writing {self.path}: an earlier write failed")
-        try:
-            chunk.startTimeCode, chunk.endTimeCode = codes[0], codes[-1]
-            path = self.chunks / f"points_{math.ceil(codes[0]):05d}.usdc"
-            with replacing(path) as part:
-                _write_checked(path, chunk, lambda: chunk.Export(str(part), args={"format": "usdc"}))
-            self._joined.append(chunk)
-        except Exception:
-            self._joined.discard()
-            self._joined = None
-            raise
+        self._is_open = False  # unless this succeeds
+        chunk.startTimeCode, chunk.endTimeCode = codes[0], codes[-1]
+        path = self.chunks / f"points_{math.ceil(codes[0]):05d}.usdc"
+        with replacing(path) as part:
+            _write_checked(path, chunk, lambda: chunk.Export(str(part), args={"format": "usdc"}))
+        self._written.append(path)
+        self._is_open = True
 
-
-class _Joined:
-    """The unfinished `scene.usdc`, under a temporary name until `publish`."""
-
-    def __init__(self, path: Path, template):
+    def _join(self) -> None:
+        """Write the earlier frames that stay, and those of the chunks, to scene.usdc. Raises OutputError."""
         from pxr import Sdf
 
-        self.path, self.part = path, part_path(path)
-        self.first: float | None = None
-        self.layer = Sdf.Layer.New(Sdf.FileFormat.FindById("usdc"), str(self.part))
-        self.layer.TransferContent(template)
-
-    def append(self, chunk, end: int | None = None) -> None:
-        """Add the chunk's frames, or only those before `end`, and save, which frees their memory. Raises OutputError."""
-        last = chunk.endTimeCode if end is None else min(chunk.endTimeCode, end - 1)
-        if last < chunk.startTimeCode:
+        paths = [*(path for path in self._earlier if path.exists()), *self._written]
+        if not paths:
             return
-        for path, time in _samples(chunk):
-            if time <= last:
-                self.layer.SetTimeSample(path, time, chunk.QueryTimeSample(path, time))
-        self.first = chunk.startTimeCode if self.first is None else self.first
-        self.layer.startTimeCode, self.layer.endTimeCode = float(self.first), float(max(last, self.layer.endTimeCode))
-        try:
-            _write_checked(self.path, chunk, self.layer.Save)
-        except OutputError:
-            self.discard()
-            raise
-
-    def publish(self) -> None:
-        """Rename the file to its final name; without frames, discard it. Raises OutputError."""
-        if self.first is None:
-            self.discard()
-            return
-        self.layer = None
-        try:
-            with output_errors(f"cannot write {self.path}"):
-                publish(self.part, self.path)
-        except OutputError:
-            self.discard()
-            raise
-
-    def discard(self) -> None:
-        """Discard the layer and its temporary file."""
-        self.layer = None
-        with suppress(OSError):  # the folder may be unreachable
-            self.part.unlink()
+        with replacing(self.path) as part:
+            layer = Sdf.Layer.New(Sdf.FileFormat.FindById("usdc"), str(part))
+            layer.TransferContent(self._template)
+            for k, path in enumerate(paths):
+                chunk = _opened(path)
+                last = chunk.endTimeCode if path in self._written else min(chunk.endTimeCode, self._kept)
+                for attribute, code in _samples(chunk):
+                    if code <= last:
+                        layer.SetTimeSample(attribute, code, chunk.QueryTimeSample(attribute, code))
+                layer.startTimeCode = layer.startTimeCode if k else chunk.startTimeCode
+                layer.endTimeCode = max(last, layer.endTimeCode)
+                _write_checked(self.path, chunk, layer.Save)  # which frees the memory of its frames
+            del layer
 
 
 def _sampled(layer) -> list:

@@ -237,6 +237,7 @@ def test_a_full_disk_is_an_error_and_leaves_no_partial_file(tmp_path):
         with pytest.raises(OutputError, match=r"cannot write .*usdc \(\d+ bytes"):
             for index in range(50):
                 writer.frame(sim, index)
+            writer.close()
         n_chunks = len(list((tmp_path / "chunks").glob("*.usdc")))
         writer.close()  # does not raise again
     finally:
