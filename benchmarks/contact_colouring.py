@@ -13,8 +13,8 @@ import taichi as ti
 
 from taisoft.backend.arrays import FieldArena
 from taisoft.backend.runtime import Runtime
-from taisoft.contact.colouring import colour_contacts, colour_greedy, colour_random, graph_of
-from taisoft.contact.problem import ContactProblem, build_node_problem, fill_rows, find_factors, index_nodes
+from taisoft.contact.colouring import UNCOLOURED, colour_contacts, colour_greedy
+from taisoft.contact.problem import ContactProblem, build_node_problem, fill_rows, find_factors, index_nodes, read_entries
 
 from .contact_runs import COLOURED, SERIAL, THREADED, Outcome, Solvers
 from .document import crossovers, ms, table
@@ -43,6 +43,57 @@ class Colouring:
     numbers: list[int]
     largest: list[int]
     seconds: list[float]
+
+
+def node_graph(contact: np.ndarray, node: np.ndarray, k: int, inverse_mass: np.ndarray) -> sp.csr_matrix:
+    """Adjacency (k,k), bool, of contacts over nodes.
+
+    contact, node: of each entry; k: number of contacts; inverse_mass: (n_nodes, 3) [1/kg].
+    """
+    free = np.any(inverse_mass[node] != 0.0, axis=1)
+    touches = sp.csr_matrix((np.ones(free.sum(), dtype=np.int32), (contact[free], node[free])), shape=(k, len(inverse_mass)))
+    joined = (touches @ touches.T).tocoo()
+    off = joined.row != joined.col
+    return sp.csr_matrix((np.ones(off.sum(), dtype=bool), (joined.row[off], joined.col[off])), shape=(k, k))
+
+
+def graph_of(problem: ContactProblem) -> sp.csr_matrix:
+    """Adjacency matrix of the contacts of a problem over nodes."""
+    contact, node, _ = read_entries(problem)
+    return node_graph(contact, node, int(problem.count[0]), problem.inverse_mass.to_numpy())
+
+
+def colour_random(graph: sp.csr_matrix, seed: int = 0, shrink: float = 3.0) -> np.ndarray:
+    """Colours (k,) from 0 by Vivace, Fratarcangeli, Tibaldo and Pellacini 2016; palettes start with degree / shrink colours.
+
+    Tentative colours are random, and kept if no neighbour of lower index has the same; an exhausted palette grows by one colour.
+    """
+    k = graph.shape[0]
+    generator = np.random.default_rng(seed)
+    edges = sp.triu(graph).tocoo()
+    a, b = edges.row, edges.col
+    degree = np.diff(graph.indptr)
+    size = np.maximum(1, np.ceil(degree / shrink)).astype(int)  # of the palettes; degree + 1 suffices
+    number = np.arange(int(degree.max(initial=0)) + 2)
+    taken = np.zeros((k, len(number)), dtype=bool)
+    colour = np.full(k, UNCOLOURED, dtype=np.int32)
+    while True:
+        uncoloured = np.flatnonzero(colour == UNCOLOURED)
+        if not len(uncoloured):
+            return np.unique(colour, return_inverse=True)[1].astype(np.int32)  # numbers the colours without gaps
+        free = (number < size[uncoloured, None]) & ~taken[uncoloured]
+        exhausted = ~free.any(axis=1)
+        size[uncoloured[exhausted]] += 1
+        uncoloured, free = uncoloured[~exhausted], free[~exhausted]
+        tentative = np.full(k, UNCOLOURED)
+        tentative[uncoloured] = np.argmax(np.where(free, generator.random(free.shape), -1.0), axis=1)
+        keep = tentative != UNCOLOURED
+        # of two equal colours the lower index keeps its own: if neither did, two equal palettes of one colour would loop forever
+        keep[b[keep[a] & (tentative[a] == tentative[b])]] = False
+        colour[keep] = tentative[keep]
+        for one, other in ((a, b), (b, a)):
+            kept = keep[one]
+            taken[other[kept], colour[one[kept]]] = True
 
 
 def proper(graph: sp.csr_matrix, colour: np.ndarray) -> bool:

@@ -6,9 +6,7 @@ nodes add no edges. For a W given as a matrix, an edge is a nonzero block off th
     colour_contacts  in kernels, once a step: Jones and Plassmann 1993. A contact takes the first free colour once all its
                      neighbours of higher priority are coloured. The result is first-fit in the order of the priorities,
                      independent of threads. Priorities are hashes, which keeps the longest chain of waiting contacts short;
-    colour_greedy    on the host: networkx, largest degree first or another of its strategies;
-    colour_random    on the host: Vivace, Fratarcangeli, Tibaldo and Pellacini 2016. Random tentative colours, kept if no
-                     neighbour of lower index has the same; an exhausted palette grows by one colour.
+    colour_greedy    on the host: networkx, largest degree first or another of its strategies.
 """
 
 import numpy as np
@@ -17,7 +15,7 @@ import taichi as ti
 
 from taisoft.backend.lists import add_up_counts, clear_counts, count_entry, place_of_entry, sort_lists
 from taisoft.backend.runtime import kernel
-from taisoft.contact.problem import ContactProblem, fill_field, read_entries
+from taisoft.contact.problem import ContactProblem, fill_field
 from taisoft.errors import SimulationError
 
 UNCOLOURED = -1
@@ -27,32 +25,12 @@ BITS = 30  # colours tested at a time, as bits of an integer
 # --- on the host ------------------------------------------------------------------------------------------------------
 
 
-def node_graph(contact: np.ndarray, node: np.ndarray, k: int, inverse_mass: np.ndarray) -> sp.csr_matrix:
-    """Adjacency (k,k), bool, of contacts over nodes.
-
-    contact, node: of each entry; k: number of contacts; inverse_mass: (n_nodes, 3) [1/kg].
-    """
-    free = np.any(inverse_mass[node] != 0.0, axis=1)
-    touches = sp.csr_matrix((np.ones(free.sum(), dtype=np.int32), (contact[free], node[free])), shape=(k, len(inverse_mass)))
-    return _without_loops(touches @ touches.T)
-
-
-def graph_of(problem: ContactProblem) -> sp.csr_matrix:
-    """Adjacency matrix of the contacts of a problem over nodes."""
-    contact, node, _ = read_entries(problem)
-    return node_graph(contact, node, int(problem.count[0]), problem.inverse_mass.to_numpy())
-
-
 def matrix_graph(W: sp.spmatrix) -> sp.csr_matrix:
     """Adjacency (k,k), bool, of the contacts of W (3k,3k)."""
     W = W.tocoo()
     k, used = W.shape[0] // 3, W.data != 0.0
     blocks = sp.csr_matrix((np.ones(used.sum(), dtype=np.int32), (W.row[used] // 3, W.col[used] // 3)), shape=(k, k))
-    return _without_loops(blocks + blocks.T)
-
-
-def _without_loops(joined: sp.spmatrix) -> sp.csr_matrix:
-    joined = joined.tocoo()
+    joined = (blocks + blocks.T).tocoo()
     off = joined.row != joined.col
     return sp.csr_matrix((np.ones(off.sum(), dtype=bool), (joined.row[off], joined.col[off])), shape=joined.shape)
 
@@ -63,36 +41,6 @@ def colour_greedy(graph: sp.csr_matrix, strategy: str = "largest_first") -> np.n
 
     colours = nx.greedy_color(nx.from_scipy_sparse_array(graph), strategy=strategy)
     return np.array([colours[c] for c in range(graph.shape[0])], dtype=np.int32)
-
-
-def colour_random(graph: sp.csr_matrix, seed: int = 0, shrink: float = 3.0) -> np.ndarray:
-    """Colours (k,) from 0 by Vivace; palettes start with degree / shrink colours."""
-    k = graph.shape[0]
-    generator = np.random.default_rng(seed)
-    edges = sp.triu(graph).tocoo()
-    a, b = edges.row, edges.col
-    degree = np.diff(graph.indptr)
-    size = np.maximum(1, np.ceil(degree / shrink)).astype(int)  # of the palettes; degree + 1 suffices
-    number = np.arange(int(degree.max(initial=0)) + 2)
-    taken = np.zeros((k, len(number)), dtype=bool)
-    colour = np.full(k, UNCOLOURED, dtype=np.int32)
-    while True:
-        uncoloured = np.flatnonzero(colour == UNCOLOURED)
-        if not len(uncoloured):
-            return np.unique(colour, return_inverse=True)[1].astype(np.int32)  # numbers the colours without gaps
-        free = (number < size[uncoloured, None]) & ~taken[uncoloured]
-        exhausted = ~free.any(axis=1)
-        size[uncoloured[exhausted]] += 1
-        uncoloured, free = uncoloured[~exhausted], free[~exhausted]
-        tentative = np.full(k, UNCOLOURED)
-        tentative[uncoloured] = np.argmax(np.where(free, generator.random(free.shape), -1.0), axis=1)
-        keep = tentative != UNCOLOURED
-        # of two equal colours the lower index keeps its own: if neither did, two equal palettes of one colour would loop forever
-        keep[b[keep[a] & (tentative[a] == tentative[b])]] = False
-        colour[keep] = tentative[keep]
-        for one, other in ((a, b), (b, a)):
-            kept = keep[one]
-            taken[other[kept], colour[one[kept]]] = True
 
 
 def groups(colour: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -11,8 +11,10 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 
+from benchmarks import contact_colouring
+from benchmarks.contact_colouring import colour_random, node_graph
 from taisoft.contact import colouring, problem
-from taisoft.contact.colouring import colour_greedy, colour_random, groups, matrix_graph, node_graph
+from taisoft.contact.colouring import colour_greedy, groups, matrix_graph
 from tests.contact import contact_oracle as oracle
 from tests.contact.contact_rig import N_NODES
 
@@ -36,7 +38,7 @@ def is_colouring(graph: sp.csr_matrix, colour: np.ndarray) -> bool:
 def test_graph_of_nodes(rig):
     made = oracle.random_contacts(0, 60, N_NODES, prescribed=True)
     expected = adjacency(made)
-    for graph in (graph_of(made), matrix_graph(sp.csr_matrix(made.W)), colouring.graph_of(rig.nodes(made))):
+    for graph in (graph_of(made), matrix_graph(sp.csr_matrix(made.W)), contact_colouring.graph_of(rig.nodes(made))):
         assert np.array_equal(graph.toarray(), expected)
     assert expected.sum() < adjacency(oracle.random_contacts(0, 60, N_NODES)).sum()
 
