@@ -18,7 +18,7 @@ from taisoft.scene import checks
 from taisoft.scene.collision import CONTACT_MODES
 from taisoft.scene.composition import Composition, compose
 from taisoft.scene.key_frames import AT_REST, KeyFrames, NodePath
-from taisoft.scene.loads import Cavity, Load, NodalForce, Pressure, Traction, value_or_path
+from taisoft.scene.loads import LOADS, Cavity, Load, NodalForce, Pressure, Traction, value_or_path
 from taisoft.scene.material import Material
 from taisoft.scene.skins import Skin, embed
 
@@ -31,10 +31,8 @@ QUADRATURE_DEGREES = {1: (1,), 2: (2, 4)}  # by element order: degrees of polyno
 _SHAPE = ("name", "mesh", "order", "quadrature_degree", "dilatation", "given_dilatation", "nodes", "rest_positions", "n_nodes")
 _READ_ONLY = (*_SHAPE, "composition", "mass", "loads", "skin")
 USE_A_COPY = "change a copy made by scene.snapshot() and make a new Simulator of it"
-_SET_FORCE = f"call sim.set_force(body, index, value) for an existing one; otherwise {USE_A_COPY}"
-_SET_TRACTION = f"call sim.set_traction(body, index, value) for an existing one; otherwise {USE_A_COPY}"
-_SET_CAVITY = f"call sim.set_cavity(name, value) for an existing one; otherwise {USE_A_COPY}"
-_SET_PRESSURE = f"call sim.set_pressure(body, index, value) for an existing one; otherwise {USE_A_COPY}"
+_SET = {kind: f"call sim.set_{kind}(body, index, value) for an existing one; otherwise {USE_A_COPY}" for kind in LOADS}
+_SET["cavity"] = f"call sim.set_cavity(name, value) for an existing one; otherwise {USE_A_COPY}"
 
 
 @guarded_record("constraint", "add another one by body.fix or body.move")
@@ -84,13 +82,7 @@ class Body(Guarded):
         "skin": "call body.embed",
         "loads": "call body.add_force, body.add_traction or body.add_pressure",
     }
-    _contents = {
-        "constraints": "call body.fix or body.move",
-        "tractions": "call body.add_traction",
-        "forces": "call body.add_force",
-        "pressures": "call body.add_pressure",
-        "cavities": "call body.add_cavity",
-    }
+    _contents = {"constraints": "call body.fix or body.move", **{loads: f"call body.add_{kind}" for kind, loads in LOADS.items()}}
     extent: ClassVar[str] = "the height of the nearest tet"  # the unit of `distance_outside`
     _default_frozen = USE_A_COPY
     _instead_frozen = {
@@ -98,14 +90,7 @@ class Body(Guarded):
         **{name: f"call sim.set_material(body, {name}=...)" for name in ("young", "poisson", "density")},
         "position": "call sim.set_state(positions=..., body=...)",
         "velocity": "call sim.set_state(velocities=..., body=...)",
-        "add_force": _SET_FORCE,
-        "forces": _SET_FORCE,
-        "add_traction": _SET_TRACTION,
-        "tractions": _SET_TRACTION,
-        "add_pressure": _SET_PRESSURE,
-        "pressures": _SET_PRESSURE,
-        "add_cavity": _SET_CAVITY,
-        "cavities": _SET_CAVITY,
+        **{name: _SET[kind] for kind, loads in LOADS.items() for name in (f"add_{kind}", loads)},
     }
 
     def __init__(

@@ -11,6 +11,13 @@ from taisoft.errors import SceneError, SimulationError
 from taisoft.scene import checks
 from taisoft.scene.key_frames import KeyFrames
 
+LOADS = {  # kind of load -> the body's list of them
+    "force": "forces",
+    "traction": "tractions",
+    "pressure": "pressures",
+    "cavity": "cavities",
+}
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Load:

@@ -13,8 +13,9 @@ from taisoft.errors import SceneError
 from taisoft.scene import checks
 from taisoft.scene.body import Body
 from taisoft.scene.composition import BY_TET
+from taisoft.scene.loads import LOADS
 from taisoft.scene.material import Material
-from taisoft.scene.plan import LOADS, change_load, change_tendon
+from taisoft.scene.plan import change_load, change_tendon
 from taisoft.scene.rigid import RigidBody
 from taisoft.scene.scene import Scene
 

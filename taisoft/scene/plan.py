@@ -12,18 +12,13 @@ from taisoft.scene import checks
 from taisoft.scene.body import NEARLY_INCOMPRESSIBLE, Body, check_volume
 from taisoft.scene.collision import has_sharp_edges
 from taisoft.scene.connections import check_tendon
+from taisoft.scene.loads import LOADS
 from taisoft.scene.material import LAWS
 from taisoft.scene.obstacles import Box, MeshObstacle
 from taisoft.scene.rigid import RigidBody
 from taisoft.scene.scene import Scene
 
 CHANGEABLE = ("young", "poisson", "density", "mass_damping", "stiffness_damping")  # numbers of a material
-LOADS = {  # kind of load -> the body's list of them
-    "force": "forces",
-    "traction": "tractions",
-    "pressure": "pressures",
-    "cavity": "cavities",
-}
 
 
 @dataclass
