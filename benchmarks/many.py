@@ -13,7 +13,6 @@ import argparse
 import json
 import os
 import signal
-import subprocess
 import sys
 import tempfile
 import time
@@ -25,7 +24,7 @@ import taisoft as ts
 from taisoft.errors import SimulationError
 from taisoft.machine import THREADS, summarise, usable_cores
 from taisoft.output.tables import markdown
-from taisoft.processes import own_environment
+from taisoft.processes import start_python
 
 from .document import Limit, begin, check_out
 from .many_cases import rollout, slide
@@ -57,7 +56,7 @@ def run(name: str, n: int, workers: int, shuffled: bool = False, out: Path | Non
 
 def killed(name: str, n: int, workers: int, whole: bool, folder: Path) -> tuple[str, int]:
     """The digest after a kill in the middle, and how many rows were finished then. whole: of the caller, else of a worker."""
-    process = subprocess.Popen([sys.executable, *CHILD, name, str(n), str(workers), str(folder)], env=own_environment())
+    process = start_python(*CHILD, name, str(n), str(workers), str(folder))
     try:
         while (done := len(list((folder / "runs").glob("*.json")))) < n // 2:
             if process.poll() is not None:

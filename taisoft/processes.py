@@ -2,13 +2,20 @@
 
 import os
 import signal
+import subprocess
+import sys
 from pathlib import Path
 
 
-def own_environment() -> dict[str, str]:
-    """Return the environment for a child process that imports this version of taisoft."""
-    folder = str(Path(__file__).resolve().parents[1])
-    return os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, (folder, os.environ.get("PYTHONPATH"))))}
+def start_python(*arguments: str, environment: dict[str, str] | None = None, **options) -> subprocess.Popen:
+    """Start Python with this version of taisoft. environment: further variables; options: of Popen. Raises OSError.
+
+    Without a `stdin` it can read nothing, and a session of its own shields it from the terminal's Ctrl-C.
+    """
+    folders = (str(Path(__file__).resolve().parents[1]), os.environ.get("PYTHONPATH"))
+    full = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, folders))} | (environment or {})
+    options = {"stdin": subprocess.DEVNULL, "start_new_session": True} | options
+    return subprocess.Popen([sys.executable, *arguments], env=full, **options)
 
 
 def how_it_ended(status: int) -> str:

@@ -25,7 +25,7 @@ from typing import Protocol
 from taisoft.errors import SimulationError
 from taisoft.machine import THREADS
 from taisoft.nested import from_json, to_json
-from taisoft.processes import how_it_ended, own_environment
+from taisoft.processes import how_it_ended, start_python
 
 POLL_INTERVAL = 0.01  # [s]
 IDLE_SECONDS = 120.0  # after which a child without a request ends: that of a cluster's worker whose client was killed
@@ -146,17 +146,15 @@ class LocalPlace:
         self._process, self._request, self._answer = None, b"", None
 
     def _launch(self) -> None:
-        """Start a process. A new session shields it from the terminal's Ctrl-C."""
-        environment, on_cores = own_environment(), _pinned(self.cores)  # which count when NumPy and Taichi start
+        environment, on_cores = {}, _pinned(self.cores)  # which count when NumPy and Taichi start
         if self.threads is not None:
-            environment |= {THREADS: str(self.threads), "PYTHONHASHSEED": "0"} | dict.fromkeys(BLAS_THREADS, "1")
+            environment = {THREADS: str(self.threads), "PYTHONHASHSEED": "0"} | dict.fromkeys(BLAS_THREADS, "1")
             on_cores = nullcontext()
-        command = (sys.executable, *self._child)
         try:
             self._stdout, self._stderr, self._n_requests = tempfile.TemporaryFile(), tempfile.TemporaryFile(), 0
             streams = {"stdin": subprocess.PIPE, "stdout": self._stdout, "stderr": self._stderr}
             with on_cores:
-                self._process = subprocess.Popen(command, env=environment, start_new_session=True, **streams)
+                self._process = start_python(*self._child, environment=environment, **streams)
         except OSError as error:
             raise SimulationError(f"no further process can be started: {error.strerror or error}") from error
 

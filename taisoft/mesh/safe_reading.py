@@ -9,7 +9,6 @@ import builtins
 import contextlib
 import functools
 import io
-import os
 import re
 import subprocess
 import sys
@@ -22,6 +21,7 @@ from typing import NamedTuple
 import numpy as np
 
 from taisoft.errors import MeshError, one_line
+from taisoft.processes import start_python
 
 UTF16 = "the file is UTF-16 text; save it as UTF-8"
 HEAD = 64  # characters inspected to detect UTF-16 text
@@ -124,15 +124,8 @@ def run_child(folder: str, task: str, *arguments: str, seconds: float | None = N
 
     Raises MeshError with the last line that the child prints if it fails or takes more than `seconds`.
     """
-    path = [str(Path(__file__).resolve().parents[2]), os.environ.get("PYTHONPATH")]
-    child = subprocess.Popen(
-        [sys.executable, "-P", "-m", __name__, task, *arguments],
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.PIPE,
-        cwd=folder,
-        env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, path)), "OPENBLAS_NUM_THREADS": "1"},
-    )
+    streams = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE, "cwd": folder, "start_new_session": False}
+    child = start_python("-P", "-m", __name__, task, *arguments, environment={"OPENBLAS_NUM_THREADS": "1"}, **streams)
     with child:
         try:
             printed = child.communicate(timeout=seconds)[1].decode("utf-8", "replace").strip()

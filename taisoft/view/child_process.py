@@ -6,29 +6,23 @@ it is asked to, and when its caller ends, however that ends.
 """
 
 import subprocess
-import sys
 from collections.abc import Callable
 from contextlib import suppress
 from multiprocessing.connection import Connection
 
 from taisoft.errors import OutputError, TaisoftError, no_memory
-from taisoft.processes import how_it_ended, own_environment
+from taisoft.processes import how_it_ended, start_python
 from taisoft.view.link import Link, LinkClosed, SharedNodes, receive
 
 END_SECONDS = 5.0  # in which a process must end
 
 
-def python_module(name: str) -> tuple[str, ...]:
-    """Return the command that runs a module."""
-    return sys.executable, "-P", "-m", name
-
-
 class ChildProcess:
     """A process at the other end of a link.
 
-    command: to which the descriptors are appended; description: sent first; it gets `n_nodes`, of all bodies, and `slots` for
-    their data; failure: what cannot be done without the process, for messages. link: this end of the link. Raises OutputError if
-    the process cannot be started.
+    command: arguments of Python, to which the descriptors are appended; description: sent first; it gets `n_nodes`, of all
+    bodies, and `slots` for their data; failure: what cannot be done without the process, for messages. link: this end of the
+    link. Raises OutputError if the process cannot be started.
     """
 
     def __init__(self, command: tuple[str, ...], description: dict, failure: str, n_nodes: int, slots: int = 1):
@@ -38,7 +32,8 @@ class ChildProcess:
         except OSError as error:
             raise OutputError(f"{failure}: no memory can be shared with its process: {error.strerror or error}") from error
         try:
-            self._process = _start(command, other.fileno(), self.link.nodes.descriptor)
+            descriptors = (other.fileno(), self.link.nodes.descriptor)
+            self._process = start_python(*command, *map(str, descriptors), pass_fds=descriptors)
         except OSError as error:
             self.link.close()
             raise OutputError(f"{failure}: its process cannot be started: {error.strerror or error}") from error
@@ -73,13 +68,6 @@ class ChildProcess:
         except subprocess.TimeoutExpired:
             process.kill()
             process.wait()
-
-
-def _start(command: tuple[str, ...], *descriptors: int) -> subprocess.Popen:
-    """Start a process with this version of taisoft; a session of its own shields it from the terminal's Ctrl-C."""
-    full = [*command, *map(str, descriptors)]
-    streams = {"pass_fds": descriptors, "stdin": subprocess.DEVNULL}
-    return subprocess.Popen(full, env=own_environment(), start_new_session=True, **streams)
 
 
 def serve(make: Callable[[Link, dict], object], socket: int, memory: int) -> None:

@@ -14,7 +14,7 @@ from taisoft.machine import usable_cores
 from taisoft.output.files import make_folder
 from taisoft.output.frames import FRAMES_NAME, FrameWriter
 from taisoft.view.annotations import Annotations
-from taisoft.view.child_process import ChildProcess, python_module
+from taisoft.view.child_process import ChildProcess
 from taisoft.view.colouring import NodalValues
 from taisoft.view.connection_layer import ConnectionMarks
 from taisoft.view.link import LinkClosed
@@ -25,7 +25,7 @@ from taisoft.view.scene_view import IN_PICTURES, scene_size
 
 SLOTS = 8  # states that wait to be drawn, besides the pictures that wait to be written
 MIN_PICTURES = 30  # fewer take less time than it takes to start a process
-CHILD = python_module("taisoft.view.picture_process")
+CHILD = ("-P", "-m", "taisoft.view.picture_process")
 FAILURE = "the drawing of pictures failed"
 
 
@@ -78,8 +78,9 @@ def open_pictures(
 class PictureProcess:
     """Observer that writes folder/frames/<index>.png in another process.
 
-    plots: history of options.plots; child: command of the process, if not CHILD. What fails in the other process, and its end,
-    raises OutputError at the next `frame`, `flush` or `close`; later pictures are not written. Raises OutputError.
+    plots: history of options.plots; child: arguments of Python that start the process, if not CHILD. What fails in the other
+    process, and its end, raises OutputError at the next `frame`, `flush` or `close`; later pictures are not written. Raises
+    OutputError.
     """
 
     def __init__(

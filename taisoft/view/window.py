@@ -13,7 +13,7 @@ from typing import NoReturn
 from taisoft.errors import OutputError
 from taisoft.frames import dt_sentence, fit_dt
 from taisoft.records import RunReport, StepReport
-from taisoft.view.child_process import ChildProcess, python_module
+from taisoft.view.child_process import ChildProcess
 from taisoft.view.colouring import NodalValues
 from taisoft.view.connection_layer import ConnectionMarks
 from taisoft.view.controls import touching_pairs
@@ -26,14 +26,14 @@ from taisoft.view.scene_view import IN_WINDOW, scene_size
 FAILURE = "cannot open a window"
 START_SECONDS = 60.0  # in which the window must open
 FPS = 60.0  # of the window's pictures, at most
-CHILD = python_module("taisoft.view.window_process")
+CHILD = ("-P", "-m", "taisoft.view.window_process")
 
 
 class WindowProcess:
     """A window in a child process that shows a simulation.
 
     sim: a Simulator; controls: whether the window changes it, or only shows it; colour, layers: those shown initially;
-    child: command of the process, if not CHILD.
+    child: arguments of Python that start the process, if not CHILD.
     closed: whether it is; timing: once its user has closed it, times of its pictures and latencies of drags, see
     `taisoft.view.timing`. Raises OutputError if a display or a Vulkan driver is missing or the window does not open.
     """

@@ -1,7 +1,5 @@
 """What tests of pictures and windows share: masks of pictures, scenes with everything that is drawn, and child processes."""
 
-import sys
-
 import numpy as np
 import pytest
 
@@ -17,8 +15,8 @@ needs_vulkan = pytest.mark.skipif(bool(vulkan_missing()), reason="no Vulkan driv
 
 
 def program(code: str) -> tuple[str, ...]:
-    """The command of a process that stands in for a window or for the process of pictures."""
-    return sys.executable, "-c", code
+    """The arguments of Python for a process that stands in for a window or for the process of pictures."""
+    return "-c", code
 
 
 def body_mask(image):

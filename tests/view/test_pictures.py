@@ -171,8 +171,8 @@ def test_an_error_is_raised_once_it_is_known(tmp_path):
 
 def test_few_pictures_or_a_single_core_need_no_process(tmp_path, monkeypatch):
     """And a process that cannot be started is an error."""
-    sim, absent = FakeSimulator(beam_scene()), (str(tmp_path / "absent"),)
-    monkeypatch.setattr(pictures, "CHILD", absent)
+    sim = FakeSimulator(beam_scene())
+    monkeypatch.setattr("sys.executable", str(tmp_path / "absent"))
     for missing, cores in ((1, 2), (0, 1)):
         monkeypatch.setattr(pictures, "usable_cores", lambda cores=cores: list(range(cores)))
         open_pictures(tmp_path, sim, PictureOptions(SIZE), None, MIN_PICTURES - missing).close()
