@@ -2,7 +2,7 @@
 
 On a broken file meshio may end the program, print, raise any exception, loop forever, or allocate far more memory than the file
 can fill; the mesher fTetWild prints a lot and may end its process. So both run in a child process, meshio with bounded time and
-memory. Arrays pass in .npz files, without pickle. The child imports neither Taichi nor SciPy and starts in about 0.2 s.
+memory. What it finds comes back as JSON (`taisoft.nested`). The child imports neither Taichi nor SciPy and starts in about 0.2 s.
 """
 
 import builtins
@@ -21,6 +21,7 @@ from typing import NamedTuple
 import numpy as np
 
 from taisoft.errors import MeshError, one_line
+from taisoft.nested import from_json, to_json
 from taisoft.processes import start_python
 
 UTF16 = "the file is UTF-16 text; save it as UTF-8"
@@ -99,10 +100,8 @@ def read_by_meshio(file: Path, data: bytes) -> FileContent:
         except MeshError as error:
             place, text = re.match(r"((?:line|byte) \d+: )?(.*)", str(error)).groups()
             raise MeshError(f"{file}: {place or ''}not a supported mesh ({text})") from None
-    cells = [(str(name), found[f"cells{i}"]) for i, name in enumerate(found["kinds"])]
-    cell_data = {str(name): [found[f"data{j},{i}"] for i in range(len(cells))] for j, name in enumerate(found["data"])}
-    names = dict(zip(found["region_ids"].tolist(), found["region_names"].tolist()))
-    return FileContent(found["points"], cells, cell_data, names, found["notes"].tolist())
+    cells = [(kind, nodes) for kind, nodes in found["cells"]]
+    return FileContent(found["points"], cells, found["cell_data"], dict(found["region_names"]), found["notes"])
 
 
 def content_of(mesh) -> FileContent:
@@ -119,8 +118,8 @@ def content_of(mesh) -> FileContent:
     return FileContent(np.asarray(mesh.points), cells, numbers, names)
 
 
-def run_child(folder: str, task: str, *arguments: str, seconds: float | None = None) -> dict[str, np.ndarray]:
-    """Run a task of `main` in a child process inside a folder; return the arrays that it writes to result.npz there.
+def run_child(folder: str, task: str, *arguments: str, seconds: float | None = None) -> dict:
+    """Run a task of `main` in a child process inside a folder; return what it writes to result.json there.
 
     Raises MeshError with the last line that the child prints if it fails or takes more than `seconds`.
     """
@@ -133,19 +132,18 @@ def run_child(folder: str, task: str, *arguments: str, seconds: float | None = N
             raise MeshError(f"its reader was stopped after {seconds:.0f} s") from None
         finally:  # do not leave the process running after a signal
             child.kill()
-    result = Path(folder, "result.npz")
+    result = Path(folder, "result.json")
     if child.returncode != 0 or not result.is_file():
         raise MeshError(one_line(printed.rsplit("\n", 1)[-1]) or f"exit status {child.returncode}")
-    with np.load(result, allow_pickle=False) as found:
-        return dict(found)
+    return from_json(result.read_bytes())
 
 
 def main(task: str, *arguments: str) -> None:
     """Run a task in the child process: "read" a file by meshio, "usd" or "lone_usd": a stage, "mesh" surface.npz by fTetWild."""
-    np.savez("result.npz", **TASKS[task](*arguments))
+    Path("result.json").write_text(to_json(TASKS[task](*arguments), level=0))
 
 
-def _read_usd(path: str, seconds: str, alone: bool = False) -> dict[str, np.ndarray]:
+def _read_usd(path: str, seconds: str, alone: bool = False) -> dict:
     from taisoft.mesh.usd_content import read_stage
 
     _limit_resources(MEMORY + MEMORY_PER_BYTE * Path(path).stat().st_size, int(float(seconds)) + 1)
@@ -167,7 +165,7 @@ def _mesh() -> dict[str, np.ndarray]:
     return {"vertices": np.asarray(points, dtype=np.float64), "tets": np.asarray(tets, dtype=np.int64)}
 
 
-def _read(path: str, seconds: str) -> dict[str, np.ndarray]:
+def _read(path: str, seconds: str) -> dict:
     """Read a file by meshio; exit with one line that says why it failed, without repeating the file: it may be confidential."""
     import meshio
 
@@ -196,13 +194,9 @@ def _read(path: str, seconds: str) -> dict[str, np.ndarray]:
         sys.exit(_place(error, data) + text)
     if skipped := next((text for text in printed if "cannot handle" in text), None):
         sys.exit(f"cells of {skipped[skipped.rfind('(') + 1 :].rstrip(').')} of VTK are not known here")
-    numbers, names = content.cell_data, content.region_names
-    texts = {"kinds": [kind for kind, _ in content.cells], "data": list(numbers), "region_names": list(names.values())}
-    texts["notes"] = [_without_content(text, data.lower()) for text in printed]
-    found = {"points": arrays[0], "region_ids": np.array(list(names), dtype=np.int64)}
-    found |= {name: np.array(values, dtype=str) for name, values in texts.items()}
-    found |= {f"data{j},{i}": one for j, of_blocks in enumerate(numbers.values()) for i, one in enumerate(of_blocks)}
-    return found | {f"cells{i}": cells for i, cells in enumerate(arrays[1:])}
+    notes = [_without_content(text, data.lower()) for text in printed]
+    found = {"points": content.points, "cells": content.cells, "cell_data": content.cell_data}
+    return found | {"region_names": list(content.region_names.items()), "notes": notes}
 
 
 def _limit_resources(memory: int, seconds: int) -> None:

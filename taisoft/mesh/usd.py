@@ -86,10 +86,9 @@ def _read_prims(path, what: str, alone: bool, up: str) -> tuple[Path, dict[str, 
         except MeshError as error:
             raise MeshError(f"{file}: not a readable USD stage ({error})") from None
     prims: dict[str, _Prim] = {}
-    notes = found["notes"].tolist()
-    for k, (name, prim_path) in enumerate(zip(found["names"].tolist(), found["paths"].tolist())):
-        points = found[f"points{k}"] @ FROM_Y_UP[up].T
-        cells, source, surface = found[f"cells{k}"], f"{file}: {name}", None
+    notes = found["notes"]
+    for name, prim_path, points, cells in found["meshes"]:
+        points, source, surface = points @ FROM_Y_UP[up].T, f"{file}: {name}", None
         if cells.shape[1] == 3:
             surface = clean_surface(SurfaceMesh(points, cells, source), 0.0)
             if not surface.closed:

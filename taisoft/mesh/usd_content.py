@@ -22,8 +22,8 @@ def usd_message(error: Exception) -> str:
     return re.sub(r"^Error in '.*' at line \d+ in file \S+ : '(.*)'$", r"\1", lines[-1]) if lines else type(error).__name__
 
 
-def read_stage(path: str, alone: bool = False) -> dict[str, np.ndarray]:
-    """Return the meshes of a stage: points0 (n,3), cells0 (m,4) tets or (m,3) triangles, and so on, names, paths, and notes.
+def read_stage(path: str, alone: bool = False) -> dict:
+    """Return `meshes` of a stage, each a name, a path, points (n,3) and cells (m,4) tets or (m,3) triangles, and `notes`.
 
     alone: refuse a stage that names further files, without opening these. Exits with one line if the stage cannot be read or a
     mesh is inconsistent.
@@ -43,12 +43,8 @@ def read_stage(path: str, alone: bool = False) -> dict[str, np.ndarray]:
         turn = Y_UP_FROM_Z_UP if UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.z else None
     except Exception as error:
         sys.exit(_why_unreadable(error))
-    texts = {"names": [name for name, *_ in found], "paths": [prim_path for _, prim_path, *_ in found], "notes": notes}
-    arrays = {key: np.array(lines, dtype=str) for key, lines in texts.items()}
-    for k, (_, _, points, cells) in enumerate(found):
-        points = points if turn is None else points @ turn
-        arrays |= {f"points{k}": to_metres * points, f"cells{k}": cells}
-    return arrays
+    turned = ((*names, points if turn is None else points @ turn, cells) for *names, points, cells in found)
+    return {"meshes": [(*names, to_metres * points, cells) for *names, points, cells in turned], "notes": notes}
 
 
 def _why_unreadable(error: Exception) -> str:

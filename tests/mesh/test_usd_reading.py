@@ -47,10 +47,11 @@ def add_surface(stage, path, points, faces):
 def only(path) -> ts.TetMesh:
     """The tets of a stage that holds one mesh; a warning fails the test."""
     found = read_stage(str(path))
-    assert found["notes"].tolist() == [] and len(found["names"]) == 1
+    ((_, _, points, cells),) = found["meshes"]
+    assert found["notes"] == []
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        return ts.TetMesh(found["points0"], found["cells0"])
+        return ts.TetMesh(points, cells)
 
 
 @pytest.mark.filterwarnings("ignore:body ")
