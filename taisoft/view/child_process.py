@@ -12,7 +12,7 @@ from multiprocessing.connection import Connection
 
 from taisoft.errors import OutputError, TaisoftError, no_memory
 from taisoft.processes import how_it_ended, start_python
-from taisoft.view.link import Link, LinkClosed, SharedNodes, receive
+from taisoft.view.link import Link, LinkClosed, SharedNodes
 
 END_SECONDS = 5.0  # in which a process must end
 
@@ -75,10 +75,10 @@ def serve(make: Callable[[Link, dict], object], socket: int, memory: int) -> Non
 
     An error of `make` is sent as `error`; else `open` is. socket, memory: the descriptors.
     """
-    connection = Connection(socket)
+    link = Link(Connection(socket))
     with suppress(LinkClosed):
-        description = receive(connection, None)
-        link = Link(connection, SharedNodes(description["n_nodes"], description["slots"], memory))
+        description = link.receive(None)
+        link.nodes = SharedNodes(description["n_nodes"], description["slots"], memory)
         try:
             served = make(link, description)
         except (TaisoftError, MemoryError) as error:

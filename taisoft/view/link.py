@@ -46,9 +46,9 @@ def _anonymous_file() -> int:
 
 
 class Link:
-    """One end of the link. connection: to the other process; nodes: the shared memory."""
+    """One end of the link. connection: to the other process; nodes: the shared memory, once its size is known."""
 
-    def __init__(self, connection: Connection, nodes: SharedNodes):
+    def __init__(self, connection: Connection, nodes: SharedNodes | None = None):
         self._connection, self.nodes = connection, nodes
 
     @classmethod
@@ -66,18 +66,13 @@ class Link:
             raise LinkClosed from error
 
     def receive(self, timeout: float | None = 0.0) -> dict | None:
-        """Do as `receive`."""
-        return receive(self._connection, timeout)
+        """Return the next message, or None if there is none within the time [s]; None waits for one. Raises LinkClosed."""
+        try:
+            return from_json(self._connection.recv_bytes()) if self._connection.poll(timeout) else None
+        except (EOFError, OSError) as error:
+            raise LinkClosed from error
 
     def close(self) -> None:
         """Close this end."""
         self._connection.close()
         self.nodes.close()
-
-
-def receive(connection: Connection, timeout: float | None) -> dict | None:
-    """Return the next message, or None if there is none within the time [s]; None waits for one. Raises LinkClosed."""
-    try:
-        return from_json(connection.recv_bytes()) if connection.poll(timeout) else None
-    except (EOFError, OSError) as error:
-        raise LinkClosed from error

@@ -30,7 +30,7 @@ def describe_scene(scene, marks: ConnectionMarks) -> dict:
         "gravity": np.asarray(scene.gravity),
         "up": scene.up,
         "connections": [{"owners": list(one.owners)} for one in scene.connections],
-        "marks": {"attached": marks.attached, "pressed": marks.pressed},
+        "marks": [marks.attached, marks.pressed],
         "bodies": [
             {
                 "name": body.name,
@@ -128,35 +128,15 @@ def describe_state(sim, marks: ConnectionMarks, layers: set[str]) -> dict:
     return state | {"segments": segments}
 
 
-class MirrorMarks:
-    """The `ConnectionMarks` of a simulation in another process, with the values of its latest state."""
-
-    def __init__(self, attached: np.ndarray, pressed: list):
-        self.attached, self.pressed = attached, pressed
-        self._segments, self._pressures = None, [0.0] * len(self.pressed)
-
-    def take(self, state: dict) -> None:
-        """Take over a state."""
-        self._segments = state["segments"]
-        self._pressures = state.get("pressures", self._pressures)
-
-    def segments(self, _sim) -> tuple[np.ndarray, np.ndarray] | None:
-        """Return ends (k,2,3) [m] and tensions (k,) [N] of the connections drawn as lines; None without any."""
-        return self._segments
-
-    def pressures(self, _sim) -> list[float]:
-        """Return the pressures [Pa], in the order of `pressed`."""
-        return self._pressures
-
-
 class MirrorSimulation:
-    """The latest state of a simulation, with those attributes of `Simulator` that pictures need.
+    """The latest state of a simulation, with those attributes of `Simulator` and of `ConnectionMarks` that pictures need.
 
     nodal_values: (n_nodes,) of the quantity `nodal_kind`, None until they are known.
     """
 
     def __init__(self, description: dict, n_nodes: int):
-        self.scene, self.marks = MirrorScene(description), MirrorMarks(**description["marks"])
+        self.scene, (self.attached, self.pressed) = MirrorScene(description), description["marks"]
+        self._segments, self._pressures = None, [0.0] * len(self.pressed)
         self.time, self.step_count = 0.0, 0
         self._energies, self._contacts = Energies(0.0, 0.0, 0.0), None
         ends = np.cumsum([0] + [body.n_nodes for body in self.scene.bodies])
@@ -173,7 +153,7 @@ class MirrorSimulation:
         for traction, value in zip(tractions, state["tractions"]):
             traction.value = value
         self._contacts = state.get("contacts")
-        self.marks.take(state)
+        self._segments, self._pressures = state["segments"], state.get("pressures", self._pressures)
         self.nodal_kind = state["colour"]
         self.nodal_values = None if self.nodal_kind == "body" else values.copy()
 
@@ -189,6 +169,14 @@ class MirrorSimulation:
         """Return the contacts' point, normal and impulse, (k,3) each."""
         none = dict.fromkeys(("point", "normal", "impulse"), np.empty((0, 3)))
         return SimpleNamespace(**(self._contacts or none))
+
+    def segments(self, _sim) -> tuple[np.ndarray, np.ndarray] | None:
+        """Return ends (k,2,3) [m] and tensions (k,) [N] of the connections drawn as lines; None without any."""
+        return self._segments
+
+    def pressures(self, _sim) -> list[float]:
+        """Return the pressures [Pa], in the order of `pressed`."""
+        return self._pressures
 
     def values_of(self, kind: str, _sim=None) -> np.ndarray | None:
         """Return the quantity at the nodes (n_nodes,), or None until the simulation has sent it."""

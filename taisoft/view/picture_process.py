@@ -27,7 +27,7 @@ class Drawing:
         self._sim = MirrorSimulation(description, description["n_nodes"])
         options = PictureOptions(**{one.name: description[one.name] for one in fields(PictureOptions)})
         self._plots = PlotChoice(None, description["enabled"], tuple(options.plots)) if options.plots else None
-        drawn = {"values": self._sim.values_of, "marks": self._sim.marks}
+        drawn = {"values": self._sim.values_of, "marks": self._sim}
         self._writer = picture_writer(Path(description["folder"]), self._sim.scene, options, self._plots, **drawn)
 
     def run(self) -> None:

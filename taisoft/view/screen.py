@@ -44,7 +44,7 @@ class Screen(SceneView):
     """
 
     def __init__(self, sim: MirrorSimulation, description: dict, requests: Requests):
-        super().__init__(sim.scene, SIZE, None, description["colour"], tuple(description["layers"]), sim.values_of, sim.marks)
+        super().__init__(sim.scene, SIZE, None, description["colour"], tuple(description["layers"]), sim.values_of, sim)
         self.timing = Timing()
         self.layers.shown["shadows"] = True
         self._requests = requests

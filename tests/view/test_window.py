@@ -15,10 +15,10 @@ from tests.view.fake_simulator import FakeSimulator, beam_scene
 START = """
 import sys, time
 from multiprocessing.connection import Connection
-from taisoft.view.link import Link, LinkClosed, SharedNodes, receive
-connection = Connection(int(sys.argv[1]))
-description = receive(connection, None)
-link = Link(connection, SharedNodes(description["n_nodes"], description["slots"], int(sys.argv[2])))
+from taisoft.view.link import Link, LinkClosed, SharedNodes
+link = Link(Connection(int(sys.argv[1])))
+description = link.receive(None)
+link.nodes = SharedNodes(description["n_nodes"], description["slots"], int(sys.argv[2]))
 request = {"number": 0, "commands": [], "confirmed": 0, "colour": "body", "layers": []}
 """
 OPEN = START + "link.send({'open': True})\n"
