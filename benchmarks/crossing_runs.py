@@ -17,7 +17,7 @@ from taisoft.cli.scene_file import load_module, shipped_files
 from taisoft.errors import TaisoftError
 from taisoft.machine import machine, usable_cores
 from taisoft.many.places import LocalPlace, carry_out
-from taisoft.many.store import NoStore, Store, code_digest, digest
+from taisoft.many.store import Store, code_digest, digest
 from taisoft.records import RunReport, StepReport
 from taisoft.scene.scene import Scene
 
@@ -264,7 +264,7 @@ def sources() -> str:
 
 def carry_out_all(
     requests: list[dict],
-    store: Store | NoStore,
+    store: Store,
     *,
     seconds_left: Callable[[], float],
     stop_requested: Callable[[], bool],

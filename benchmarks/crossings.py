@@ -32,7 +32,7 @@ from taisoft.cli import Signals
 from taisoft.errors import OutputError
 from taisoft.machine import load_average
 from taisoft.many.places import serve
-from taisoft.many.store import NoStore, Store
+from taisoft.many.store import Store
 from taisoft.output.files import FolderLock, make_folder
 
 from .crossing_runs import DEMOS, DISTANCE_EVERY, GROUPS, HARD, HEAPS, JITTERED, NEAR, SHOTS, answer, carry_out_all, runs_of
@@ -176,7 +176,7 @@ def main(argv=None) -> int:
     document.add(text)
     end = time.monotonic() + options.budget
     with Signals("ending; runs that are finished are kept") as signals, ExitStack() as stack:
-        store = NoStore()
+        store = Store()
         if options.keep is not None:
             folder = make_folder(options.keep)
             stack.enter_context(closing(FolderLock(folder)))

@@ -24,7 +24,7 @@ from taisoft.cli import Signals
 from taisoft.errors import OutputError
 from taisoft.machine import load_average
 from taisoft.many.places import serve
-from taisoft.many.store import NoStore, Store
+from taisoft.many.store import Store
 from taisoft.output.files import FolderLock, make_folder
 
 from .document import Document, header, header_text
@@ -54,7 +54,7 @@ def measured(rows: list[Row], options: argparse.Namespace, document: Document) -
     document.add(text)
     end = time.monotonic() + options.budget
     with Signals("ending; runs that are finished are kept") as signals, ExitStack() as stack:
-        store = NoStore()
+        store = Store()
         if options.keep is not None:
             folder = make_folder(options.keep)
             stack.enter_context(closing(FolderLock(folder)))

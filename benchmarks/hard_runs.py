@@ -12,7 +12,7 @@ import numpy as np
 
 from taisoft.machine import machine, usable_cores
 from taisoft.many.places import LocalPlace, carry_out
-from taisoft.many.store import NoStore, Store, code_digest, digest
+from taisoft.many.store import Store, code_digest, digest
 
 from .hard_cases import CASES
 from .hard_cases.case import DEGRADED, END, FINER, OK, REFUSED, STOPPED, Case, Session, Variant, Verdict, judge
@@ -138,7 +138,7 @@ class Runner:
     """Runs rows in child processes. seconds_left: of the budget; stop_requested: whether to stop; say: prints progress."""
 
     arch: str
-    store: Store | NoStore
+    store: Store
     seconds_left: Callable[[], float]
     stop_requested: Callable[[], bool]
     say: Callable[[str], None]

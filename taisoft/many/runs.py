@@ -23,7 +23,7 @@ from taisoft.many.cluster import cluster_places, connect
 from taisoft.many.make import COLUMNS, Make, make_of
 from taisoft.many.places import LocalPlace, Place, carry_out
 from taisoft.many.results import Results, Row
-from taisoft.many.store import NoStore, Store, digest, digests
+from taisoft.many.store import Store, digest, digests
 from taisoft.output.files import FolderLock, check_free, make_folder
 from taisoft.output.report import Bar, clock_text, json_text, machine, versions
 from taisoft.scene import checks
@@ -66,7 +66,7 @@ def run_many(
     with ExitStack() as stack:
         client = None if cluster is None else stack.enter_context(closing(connect(cluster, "cluster")))
         threads = thread_count(1) if os.environ.get(THREADS) else None
-        many = Many(function, given, NoStore() if out is None else _store(Path(out), function, stack))
+        many = Many(function, given, Store() if out is None else _store(Path(out), function, stack))
         there = (
             _places(workers, threads, len(many.waiting)) if client is None else cluster_places(client, CHILD, False, threads)[0]
         )
@@ -133,7 +133,7 @@ def _places(workers: int | None, threads: int | None, n_runs: int) -> list[Local
 class Many:
     """Rows to run: each is executed once for equal parameters, or taken from the store."""
 
-    def __init__(self, make: Make, parameters: list[dict], store: Store | NoStore):
+    def __init__(self, make: Make, parameters: list[dict], store: Store):
         self._make, self._parameters, self._store = make, parameters, store
         self._request, self._notes, self._seen = make.request(), [], {}
         self._keys = [digest([make.name, one])[:32] for one in parameters]

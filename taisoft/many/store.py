@@ -67,17 +67,21 @@ def digest(values) -> str:
 
 
 class Store:
-    """Finished runs in a folder, which the caller has locked. damaged: sentences on files that could not be used."""
+    """Finished runs in a folder, which the caller has locked; without one nothing is kept.
 
-    def __init__(self, folder: Path):
-        self._folder = make_folder(folder / RUNS)
-        for part in (*self._folder.glob("*.part"), *folder.glob("*.part")):
+    damaged: sentences on files that could not be used.
+    """
+
+    def __init__(self, folder: Path | None = None):
+        self.folder, self.damaged = folder and make_folder(folder / RUNS), []
+        for part in () if folder is None else (*self.folder.glob("*.part"), *folder.glob("*.part")):
             with suppress(OSError):  # left by a study that was killed; harmless if it cannot be removed
                 part.unlink()
-        self.damaged: list[str] = []
 
     def read(self, key: str) -> dict | None:
         """Return the record with this key, or None if it is absent or damaged."""
+        if self.folder is None:
+            return None
         path = self._path(key)
         try:
             content = from_json(path.read_bytes())
@@ -95,22 +99,10 @@ class Store:
 
     def write(self, key: str, record: dict) -> dict:
         """Save a record, plain data and arrays, and return it. Raises OutputError."""
-        content = {"kind": KIND, "format": FORMAT, "key": key, "sha256": digest(record), "record": record}
-        write_bytes(self._path(key), to_json(content).encode())
+        if self.folder is not None:
+            content = {"kind": KIND, "format": FORMAT, "key": key, "sha256": digest(record), "record": record}
+            write_bytes(self._path(key), to_json(content).encode())
         return record
 
     def _path(self, key: str) -> Path:
-        return self._folder / f"{key}.json"
-
-
-class NoStore:
-    """Store without a folder: keeps nothing."""
-
-    damaged: list[str] = []
-
-    def read(self, key: str) -> None:
-        """Return None."""
-
-    def write(self, key: str, record: dict) -> dict:
-        """Return the record."""
-        return record
+        return self.folder / f"{key}.json"

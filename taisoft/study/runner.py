@@ -7,7 +7,7 @@ from taisoft.errors import SceneError, SimulationError
 from taisoft.estimation.comparison import Error
 from taisoft.machine import summarise, thread_count, usable_cores
 from taisoft.many.places import BUDGET_SPENT, CUT_BY_BUDGET, LocalPlace, Place, carry_out
-from taisoft.many.store import NoStore, Store, digest
+from taisoft.many.store import Store, digest
 from taisoft.study import Request, describe, mesh_name
 from taisoft.study.accuracy import Reference, Row, error_in_space, finest_own_error, make_reference, row_of
 from taisoft.study.results import Study
@@ -63,7 +63,7 @@ class Runner:
     stop_requested: Callable[[], bool]
     seconds_left: Callable[[], float]
     report: Callable[[str], None]
-    store: Store | NoStore = field(default_factory=NoStore)
+    store: Store = field(default_factory=Store)
     planner: Place = field(default_factory=lambda: LocalPlace(usable_cores(), CHILD))
 
     def plan(self) -> dict | None:
@@ -87,7 +87,7 @@ class Runner:
     def run(self, plan: dict) -> Study:
         """Return the study of a plan. Raises OutputError if a finished run cannot be saved."""
         study = Study(self.request, plan, notes=list(plan["notes"]), machines=self.machines, workers=len(self.places))
-        study.kept = isinstance(self.store, Store)
+        study.kept = self.store.folder is not None
         references, settings = tasks_of(plan)
         keys = [self.key(plan, task) for task in references + settings]
         tasks = dict(zip(keys, references + settings))

@@ -17,7 +17,7 @@ import pytest
 from taisoft.errors import OutputError
 from taisoft.machine import versions
 from taisoft.many import store as stores
-from taisoft.many.store import NoStore, Store
+from taisoft.many.store import Store
 from taisoft.study import Request, Setting
 from taisoft.study.output import check_scene, write
 from taisoft.study.results import csv_of, text_of
@@ -52,7 +52,7 @@ def plan(dts=DTS, integrators=("implicit_euler", "bdf2"), reference_dt=0.0125, *
 
 
 def run(place: Pendulum, store=None, request=REQUEST, machines=({"name": "here"},), requested=lambda: False, left=lambda: 1.0):
-    runner = Runner(request, [place], list(machines), requested, left, lambda line: None, store or NoStore(), planner=place)
+    runner = Runner(request, [place], list(machines), requested, left, lambda line: None, store or Store(), planner=place)
     return None if (planned := runner.plan()) is None else runner.run(planned)
 
 
