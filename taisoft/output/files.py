@@ -96,16 +96,6 @@ class OutputFolder:
         """Release the lock. A second call does nothing."""
         self._lock.close()
 
-    def __enter__(self) -> "OutputFolder":
-        return self
-
-    def __exit__(self, kind, value, traceback) -> None:
-        try:
-            if kind is None:
-                self.discard_stale()
-        finally:
-            self.close()
-
 
 class FolderLock:
     """A folder's lock, held until `close`. Raises OutputError if another process holds it or it cannot be taken."""

@@ -5,6 +5,7 @@ import itertools
 import os
 import resource
 import tempfile
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -78,13 +79,13 @@ def test_overwriting_removes_old_results_only(tmp_path):
     removed += ("chunks/points_00000.usdc.123-7.part", "chunks/points_00010.usdc.123-8.jtZrXE")  # USD's own
     for name in ("report.json", "scene.usdc", *kept, *removed):
         (tmp_path / name).write_text("old")
-    with pytest.raises(RuntimeError), OutputFolder(tmp_path, overwrite=True):
-        raise RuntimeError("the run broke down")
-    with OutputFolder(tmp_path, overwrite=True):
+    OutputFolder(tmp_path, overwrite=True).close()  # of a run that broke down
+    with closing(OutputFolder(tmp_path, overwrite=True)) as folder:
         assert names(tmp_path / "frames") == ["mine.png"] and names(tmp_path / "chunks") == []
         assert (tmp_path / "scene.usdc").read_text() == "old"  # until its successor is complete
         write_bytes(tmp_path / "report.json", b"new")
         write_bytes(tmp_path / "report.json", b"newer")
+        folder.discard_stale()
     assert names(tmp_path) == ["chunks", "frames", "notes.txt", "report.json", "report.json.2026-11-22.bak"]
     assert (tmp_path / "report.json").read_text() == "newer"
 
@@ -123,7 +124,7 @@ def test_a_folder_has_one_writer(tmp_path):
     folder.mkdir(parents=True)
     (folder / LOCK_NAME).write_text("1\n")  # left by a process that does not hold it
     (folder / "notes.txt").write_text("mine")
-    with OutputFolder(folder), OutputFolder(tmp_path / "new" / "er"):
+    with closing(OutputFolder(folder)), closing(OutputFolder(tmp_path / "new" / "er")):
         assert (folder / LOCK_NAME).read_text().strip() == str(os.getpid())
         with pytest.raises(OutputError, match=f"process {os.getpid()} is writing"):
             OutputFolder(folder, overwrite=True)
