@@ -34,13 +34,6 @@ class BlockRows:
     column: Any  # i32
     value: Any  # (lanes * C)-vectors
 
-    def to_scipy(self) -> sp.bsr_matrix:
-        """Copy to the host, in f64."""
-        blocks = self.value.to_numpy().astype(np.float64).reshape(-1, self.columns, self.lanes)
-        blocks = blocks[:, :, : self.rows].swapaxes(1, 2)
-        shape = self.n_rows * self.rows, self.n_columns * self.columns
-        return sp.bsr_matrix((blocks, self.column.to_numpy(), self.start.to_numpy()), shape=shape)
-
 
 @dataclass(frozen=True, eq=False)
 class CycleLevel:

@@ -1,6 +1,5 @@
 """What takes the place of measurements and simulators in tests of benchmarks."""
 
-import json
 from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
@@ -9,6 +8,7 @@ import numpy as np
 
 from benchmarks import ipc_runs
 from taisoft.dynamics.schemes import EXPLICIT
+from taisoft.nested import from_json, to_json
 from taisoft.records import StepReport
 
 TIME, SPACE, SOLVER = 1.0, 0.4, 1e-5  # of ModelSimulator's errors
@@ -66,7 +66,7 @@ def answered(module) -> Callable:
 
     def carry_out(requests, places, done, **_):
         for key, request in requests:
-            done(key, json.loads(json.dumps(module.answer(request))))
+            done(key, from_json(to_json(module.answer(request))))
         return {}
 
     return carry_out
