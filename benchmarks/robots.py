@@ -200,7 +200,7 @@ def gripper_cost(steps: int) -> dict:
         for _ in range(20):
             sim.step()
         sim.reset()
-        own = sim._dynamics.take_steps
+        own = sim._dynamics.advance
 
         def timed(n: int):
             begin = time.perf_counter()
@@ -209,7 +209,7 @@ def gripper_cost(steps: int) -> dict:
             finally:
                 bodies.append(time.perf_counter() - begin)
 
-        sim._dynamics.take_steps = timed
+        sim._dynamics.advance = timed
         for _ in range(steps):
             begin = time.perf_counter()
             sim.step()

@@ -101,11 +101,12 @@ class Simulator(Guarded):
         return self.advance(1)
 
     def advance(self, n: int) -> StepReport:
-        """Take up to n steps of dt, at least one: explicit steps in one launch, implicit steps one per call.
+        """Take up to n steps of dt, at least one: explicit steps in one launch, implicit ones and those of robots one per call.
 
         Raises SimulationError as `step` does, and unless n is an integer of at least 1.
         """
-        report = self._open().advance(check_count("n", n))
+        dynamics, n = self._open(), check_count("n", n)
+        report = dynamics.robots.step(dynamics) if dynamics.robots else dynamics.advance(n)
         if self._may_soften and (text := self._dynamics.describe_softening()):
             self._may_soften = False
             warnings.warn(text, UserWarning, stacklevel=2)

@@ -107,12 +107,8 @@ class Dynamics:
     def advance(self, n: int) -> StepReport:
         """Take up to n steps of dt, at least one: explicit steps in one launch, implicit steps one per call.
 
-        With robots one step. Raises SimulationError that names the step; the state stays the last good one.
+        Robots are not moved, see `Robots.step`. Raises SimulationError that names the step; the state stays the last good one.
         """
-        return self.robots.step(self) if self.robots else self.take_steps(n)
-
-    def take_steps(self, n: int) -> StepReport:
-        """Do as `advance`, of bodies alone."""
         spring, start = self.drag_spring, self.state.step_count
         begin, end = self.state.time, self.state.time + (n if self._explicit else 1) * self.dt
         if spring is not None and spring.drag is not None:

@@ -32,7 +32,7 @@ class Simulation(Bodies, Protocol):
     is_open: bool
 
     def command_poses(self, poses: dict[str, Pose]) -> None: ...
-    def take_steps(self, n: int) -> StepReport: ...
+    def advance(self, n: int) -> StepReport: ...
     def snapshot(self) -> dict: ...
     def restore(self, kept: dict) -> None: ...
 
@@ -113,7 +113,7 @@ class Robots:
         except SimulationError as error:
             raise SimulationError(f"step {bodies.state.step_count + 1}: {error}") from None
         bodies.command_poses(poses)
-        report = bodies.take_steps(1)
+        report = bodies.advance(1)
         self._measure(bodies)
         return report
 
