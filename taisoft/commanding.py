@@ -9,6 +9,7 @@ from taisoft.scene import checks
 from taisoft.scene.commands import Command
 from taisoft.scene.obstacles import Obstacle, checked_pose
 from taisoft.scene.rigid import Pose, RigidBody
+from taisoft.settings import refuse_robots
 
 if TYPE_CHECKING:
     from taisoft.simulator import Simulator
@@ -92,8 +93,7 @@ def _refuse_foresight(sim: "Simulator", call: str) -> None:
 
 def refuse_commands(sim: "Simulator", what: str) -> None:
     """Refuse a run that has to foresee motion while anything follows a command, or robots move. what: what asks for it."""
-    for robot in sim.scene.robots:
-        raise SimulationError(f"{what}: the motion of robot {robot.name!r} depends on forces and is not known ahead")
+    refuse_robots(sim.scene, what)
     for name in sim._host().commands:
         raise SimulationError(f"{what}: {name!r} follows a command, which cannot be foreseen: give a path, or call sim.reset()")
 

@@ -65,10 +65,15 @@ def check_settings(scene: Scene, **given) -> Settings:
     settings = dataclasses.replace(settings, **{name: float(value) for name, value in given.items()})
     _check_contact_solver(settings, scene.pushes(settings.self_collision))
     _check_multipliers(settings, scene)
-    if settings.tolerance is not None and scene.robots:
-        name = scene.robots[0].name
-        raise SimulationError(f"tolerance: the motion of robot {name!r} depends on forces and is not known ahead")
+    if settings.tolerance is not None:
+        refuse_robots(scene, "tolerance")
     return settings
+
+
+def refuse_robots(scene: Scene, what: str) -> None:
+    """Raise SimulationError if there are robots, where motion has to be known ahead. what: what asks for that."""
+    for robot in scene.robots:
+        raise SimulationError(f"{what}: the motion of robot {robot.name!r} depends on forces and is not known ahead")
 
 
 def plan_of(scene: Scene, integrator: str, self_collision: bool, draggable: bool) -> Plan:

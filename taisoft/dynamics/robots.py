@@ -76,8 +76,8 @@ class Robots:
 
     def step(self, bodies: Simulation) -> StepReport:
         """Take one step of the simulation and of the robots. Raises SimulationError; both are then as before."""
-        count, before = bodies.state.step_count, self.snapshot()
-        start = bodies.snapshot() if self._iterations > 1 else {}
+        count, start = bodies.state.step_count, bodies.snapshot() if self._iterations > 1 else {}
+        before = start["robots"] if start else self.snapshot()
         exchange = Exchange(list(self.running.values()), self._relaxation)
         try:
             report = self._take(bodies)

@@ -8,7 +8,7 @@ import numpy as np
 
 from taisoft.errors import SceneError, SimulationError
 from taisoft.scene import checks
-from taisoft.scene.loads import value_at
+from taisoft.scene.loads import ScalarLoad, value_at
 from taisoft.scene.obstacles import Obstacle
 from taisoft.scene.rigid import Pose
 from taisoft.scene.robot import PlacedRobot, check_control, import_mujoco, names_of, state_of
@@ -108,11 +108,12 @@ class RunningRobot:
         welded = model.body_weldid
         self.can_yield = (welded > 0) & (model.body_mocapid[welded] < 0)  # (nbody,) whether forces can move a body
         shapes = [(scene.obstacle(name), geom, int(model.geom_bodyid[geom])) for name, geom in placed.shapes.items()]
-        self._shapes = [(scene.colliders.index(one), one, body) for one, _, body in shapes]
+        self._body_of = {one.name: body for one, _, body in shapes}
+        self._body_of_collider = {scene.colliders.index(one): body for one, _, body in shapes}
         self._moving = [(one, geom) for one, geom, body in shapes if welded[body]]
         touched = [body for *_, body in shapes if self.can_yield[body]]
         self.lightest = float(model.body_mass[touched].min(initial=np.inf))  # touched link that forces can move [kg]
-        self.restart()
+        self._paths: dict[int, ScalarLoad] = {}  # of controls that were not set since the start, which `restart` brings
 
     # --- for users ----------------------------------------------------------------------------------------------------------
 
@@ -154,7 +155,7 @@ class RunningRobot:
         """Return to the start: joints, controls, no forces."""
         scratch = self.placed.robot.make_data(self.model)
         self.mujoco.mj_forward(self.model, scratch)  # would change what the first step begins with
-        self._paths = dict(self.placed.control)  # of controls that were not set since
+        self._paths = dict(self.placed.control)
         none = np.zeros_like(self.wrenches)
         self._set_state(self.placed.robot.state, scratch.sensordata, none, none)
 
@@ -203,10 +204,10 @@ class RunningRobot:
         """Set the wrenches to those of the last step: of contacts, and of what is attached to the links."""
         total = np.zeros((self.model.nbody, 6))  # force and moment about the origin
         touched = set() if bodies.contact is None else set(bodies.contact.pairs()[0].ravel().tolist())
-        for collider, obstacle, k in self._shapes:
-            if collider in touched:
-                total[k] += bodies.contact.mean_on(collider, None)[:6]
-            for forces, points in forces_on(bodies, obstacle):
+        for collider in sorted(touched & self._body_of_collider.keys()):  # in a fixed order, for the same bits
+            total[self._body_of_collider[collider]] += bodies.contact.mean_on(collider, None)[:6]
+        for obstacle, forces, points in forces_on_obstacles(bodies):
+            if (k := self._body_of.get(obstacle.name)) is not None:
                 total[k] += np.concatenate([forces, np.cross(points, forces)], axis=1).sum(axis=0)
         centres = self.placed.position + self.data.xipos @ self.placed.axes.T
         total[:, 3:] -= np.cross(centres, total[:, :3])
@@ -248,16 +249,16 @@ class RunningRobot:
         self.control.check = refuse
 
 
-def forces_on(bodies: Bodies, obstacle: Obstacle) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Yield forces (k,3) [N] of connections on an obstacle in the last step, and where they act (k,3) [m]."""
+def forces_on_obstacles(bodies: Bodies) -> Iterator[tuple[Obstacle, np.ndarray, np.ndarray]]:
+    """Yield obstacles that connections hold on to, their forces (k,3) [N] in the last step, and where they act (k,3) [m]."""
     scene, state = bodies.scene, bodies.state
+    obstacles = {one.name: one for one in scene.obstacles}
     for one in scene.exact_attachments:
-        if one.b == obstacle.name:
+        if one.b in obstacles:
             nodes = scene.first_nodes[one.a] + one.nodes
-            yield -bodies.stepper.reactions()[nodes], state.state()[0][nodes]
-    moving = None if state.springs is None else state.springs.moving
-    for other, places, signs, points in () if moving is None else moving.ends:
-        if other is obstacle:
-            x, v = state.state()
-            pulls = state.springs.pulls(x, v.astype(np.float64), state.amplitudes(state.time))[moving.element[places]]
-            yield signs[:, None] * pulls, obstacle.points_at(state.time, points)
+            yield obstacles[one.b], -bodies.stepper.reactions()[nodes], state.state()[0][nodes]
+    if state.springs is not None and (moving := state.springs.moving) is not None:
+        x, v = state.state()
+        pulls = state.springs.pulls(x, v.astype(np.float64), state.amplitudes(state.time))[moving.element]
+        for obstacle, places, signs, points in moving.ends:
+            yield obstacle, signs[:, None] * pulls[places], obstacle.points_at(state.time, points)

@@ -102,7 +102,8 @@ class PlacedRobot:
 
 def state_of(model: Any, data: Any) -> np.ndarray:
     """Return MuJoCo's state, all that its next step depends on."""
-    mujoco, kind = import_mujoco(), import_mujoco().mjtState.mjSTATE_INTEGRATION
+    mujoco = import_mujoco()
+    kind = mujoco.mjtState.mjSTATE_INTEGRATION
     state = np.empty(mujoco.mj_stateSize(model, kind))
     mujoco.mj_getState(model, data, state, kind)
     return state

@@ -8,6 +8,7 @@ from scipy.spatial import ConvexHull
 
 from taisoft.errors import SceneError
 from taisoft.mesh.shapes import ball_mesh
+from taisoft.mesh.topology import normals_and_heights
 from taisoft.scene.obstacles import DEGENERATE, Box, Capsule, HalfSpace, MeshObstacle, Shape, Sphere
 
 if TYPE_CHECKING:
@@ -42,8 +43,7 @@ def shape_of(model: Any, geom: int, what: str) -> Shape:
         return _hull(np.concatenate([ring, ring * (1.0, 1.0, -1.0)]))
     if kind == mjtGeom.mjGEOM_ELLIPSOID:
         ball = ball_mesh(1.0, BALL_CELLS)
-        used, triangles = np.unique(ball.surface, return_inverse=True)
-        return MeshObstacle(ball.vertices[used] * (a, b, c), triangles.reshape(-1, 3))
+        return _of_used(ball.vertices * (a, b, c), ball.surface)
     if kind == mjtGeom.mjGEOM_MESH:
         return _mesh(model, int(model.geom_dataid[geom]), what)
     raise SceneError(f"{what}: a geom of type {mjtGeom(kind).name} cannot be touched: leave its link out by links=")
@@ -59,26 +59,23 @@ def _mesh(model: Any, k: int, what: str) -> MeshObstacle:
     if np.linalg.det(vertices[triangles]).sum() < 0.0:  # six times the volume: it is inside out, and a solid for MuJoCo
         triangles = triangles[:, ::-1]
     try:
-        return MeshObstacle(vertices, triangles[_have_area(vertices, triangles)])
+        return MeshObstacle(vertices, triangles[normals_and_heights(vertices, triangles)[1] > DEGENERATE])
     except SceneError as error:
         text = str(error).removeprefix("mesh obstacle: ")
         warnings.warn(f"{what}: its mesh bounds no solid ({text}): bodies touch its convex hull", UserWarning, stacklevel=4)
         return _hull(vertices)
 
 
-def _have_area(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """Whether each triangle has area (t,)."""
-    a, b, c = vertices[triangles].transpose(1, 0, 2)
-    longest = np.max([np.linalg.norm(side, axis=1) for side in (b - a, c - b, a - c)], axis=0)
-    return np.linalg.norm(np.cross(b - a, c - a), axis=1) > DEGENERATE * longest**2
-
-
 def _hull(points: np.ndarray) -> MeshObstacle:
     """Return the convex hull of points (n,3)."""
     hull = ConvexHull(points)
-    triangles, normals = hull.simplices.copy(), hull.equations[:, :3]
-    a, b, c = points[triangles].transpose(1, 0, 2)
-    inward = (np.cross(b - a, c - a) * normals).sum(axis=1) < 0.0
-    triangles[inward] = triangles[inward][:, ::-1]
-    used, triangles = np.unique(triangles[_have_area(points, triangles)], return_inverse=True)
-    return MeshObstacle(points[used], triangles.reshape(-1, 3))
+    normals, heights = normals_and_heights(points, hull.simplices)
+    is_inward = (normals * hull.equations[:, :3]).sum(axis=1) < 0.0
+    triangles = np.where(is_inward[:, None], hull.simplices[:, ::-1], hull.simplices)
+    return _of_used(points, triangles[heights > DEGENERATE])
+
+
+def _of_used(vertices: np.ndarray, triangles: np.ndarray) -> MeshObstacle:
+    """Return a mesh of the vertices that its triangles use."""
+    used, triangles = np.unique(triangles, return_inverse=True)
+    return MeshObstacle(vertices[used], triangles.reshape(-1, 3))
