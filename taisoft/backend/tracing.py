@@ -204,6 +204,15 @@ def arithmetic(function: Callable) -> Callable:
     return build
 
 
+def untraced(function: Callable) -> Callable:
+    """Mark a function, or a method, that Python runs while a kernel is traced; it may call `ti.func` and `arithmetic` functions.
+
+    Values that it uses several times it should get from these or as arguments: an expression is not bound to a variable here.
+    """
+    function._is_taichi_function = False  # present: no warning from Taichi; False: not traced
+    return function
+
+
 if FAST_TRACING:
     kernel_impl._inside_class = _inside_class
     kernel_impl._get_tree_and_ctx = _tree_and_context

@@ -17,7 +17,14 @@ from taisoft.fem.model import Group, Layout, Setup
 from taisoft.fem.pattern import MATRIX_BLOCKS
 from taisoft.fem.springs import spring_table
 from taisoft.scene.rigid import RigidBody
-from taisoft.scene.scene import Scene
+from taisoft.scene.scene import Body, Scene
+
+ADDITIONS: tuple = ()  # modules, see `laws.additions`; each has `applies(body)`
+
+
+def additions_of(body: Body) -> tuple[int, ...]:
+    """The additions to a body's laws, as indices into ADDITIONS."""
+    return tuple(k for k, addition in enumerate(ADDITIONS) if addition.applies(body))
 
 
 def make_layout(scene: Scene, lanes: int) -> tuple[Layout, dict[tuple, np.ndarray]]:
@@ -30,7 +37,7 @@ def make_layout(scene: Scene, lanes: int) -> tuple[Layout, dict[tuple, np.ndarra
         for law in composition.laws:
             if mean and not hasattr(LAWS[law], "dilatation"):
                 raise SceneError(f'body {body.name!r}: its law {law} has no mean dilatation: give it dilatation="local"')
-            switches = composition.has_volume_floor, mean, isinstance(body, RigidBody)
+            switches = composition.has_volume_floor, mean, isinstance(body, RigidBody), additions_of(body)
             kind, tets = (body.order, body.quadrature_degree, list(LAWS).index(law), *switches), composition.tets_of_law(law)
             padded = np.minimum(np.arange(-(-len(tets) // lanes) * lanes), len(tets) - 1)
             parts.setdefault(kind, []).append(first + tets[padded])
@@ -101,12 +108,23 @@ def _strain_type(setup: Setup, elements: np.ndarray, Dm_inv: np.ndarray) -> Any:
 def _groups(kinds: dict[tuple, np.ndarray], lanes: int, real: Any, strain_real: Any) -> tuple[Group, ...]:
     n_points = {degree: len(reference.quadrature(degree).weights) for _, degree, *_ in kinds}
     groups, laws, last, nodes_at, force_at, matrix_at = [], list(LAWS), 0, 0, 0, 0
-    for (order, degree, law, floor, mean, rigid), tets in kinds.items():
+    for (order, degree, law, floor, mean, rigid, added), tets in kinds.items():
         n_nodes, first, last = len(reference.unit_mass(order)), last, last + len(tets) // lanes
         points_at = sum(n for other, n in n_points.items() if 1 < other < degree)  # order 1 has degree 1 and no table
         offsets = first, last, nodes_at, force_at, matrix_at, points_at
         types = (ti.f64, ti.f64) if rigid else (real, strain_real)
-        groups.append(Group(law_of(laws[law], floor), order, n_nodes, n_points[degree], mean, rigid, *offsets, *types))
+        groups.append(
+            Group(
+                law_of(laws[law], floor, tuple(ADDITIONS[k] for k in added)),
+                order,
+                n_nodes,
+                n_points[degree],
+                mean,
+                rigid,
+                *offsets,
+                *types,
+            )
+        )
         nodes_at += len(tets) * n_nodes
         force_at += (last - first) * n_nodes * 3
         matrix_at += (last - first) * MATRIX_BLOCKS[order] * 9

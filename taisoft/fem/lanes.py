@@ -11,7 +11,7 @@ from typing import Any
 import taichi as ti
 
 from taisoft.backend.runtime import CPU_LANES, compiled_function
-from taisoft.fem.laws import n_constants
+from taisoft.backend.tracing import untraced
 from taisoft.fem.math3 import ddot, dot, matmul_tn
 
 FIRST_LANE_MASK = 2**31 - CPU_LANES  # of an index: it shows the compiler that those of the other lanes do not overflow
@@ -60,11 +60,20 @@ def law_constants(m: ti.template(), g: ti.template(), b, real: ti.template()):
     if ti.static(m.elasticity_by_tet):
         return [
             ti.Vector([ti.cast(m.law_constants[b, k, q], real) for q in ti.static(range(m.lanes))])
-            for k in ti.static(range(n_constants(g.law)))
+            for k in ti.static(range(g.law.N_CONSTANTS))
         ]
     else:
         body = m.block_body[b]
-        return [broadcast(ti.cast(m.law_constants[body, k], real), m.lanes) for k in ti.static(range(n_constants(g.law)))]
+        return [broadcast(ti.cast(m.law_constants[body, k], real), m.lanes) for k in ti.static(range(g.law.N_CONSTANTS))]
+
+
+@untraced
+def with_additions(m, g, p, b, q, real):
+    """`law_constants` p, with those of the law's additions at quadrature point q after the law's own."""
+    n, added = g.law.N_CONSTANTS, []
+    for addition in getattr(g.law, "additions", ()):
+        added += addition.constants(m, g, b, q, real)
+    return p[:n] + added + p[n:]
 
 
 @ti.func

@@ -17,6 +17,7 @@ from taisoft.fem.lanes import (
     rest_gradients_of_F,
     store_lanes,
     volumes,
+    with_additions,
 )
 from taisoft.fem.laws import dpk1_projected, prepare_projected
 from taisoft.fem.mean_dilatation import stress_constants
@@ -64,10 +65,10 @@ def element_blocks(m: ti.template(), g: ti.template(), A: ti.template(), b, proj
         F = deformation_gradient(m, g, X, N, q, m.real)
         at = base + (N_PAIRS * 9 if ti.static(g.order == 2) else 0)
         if ti.static(projected):
-            S = prepare_projected(g.law, F, p)
-            projected_blocks(m, A, at, S, M, V)
+            S = prepare_projected(g.law, F, with_additions(m, g, p, b, q, m.real))
+            projected_blocks(m, A, g.law, at, S, M, V)
         else:
-            S = g.law.prepare(F, p)
+            S = g.law.prepare(F, with_additions(m, g, p, b, q, m.real))
             exact_blocks(m, A, g.law, at, F, S, M, V)
         if ti.static(g.order == 2):
             scatter_terms(m, A, base, at, g.points_at + q)
@@ -107,14 +108,14 @@ def exact_blocks(m: ti.template(), A: ti.template(), law: ti.template(), base, F
 
 
 @ti.func
-def projected_blocks(m: ti.template(), A: ti.template(), base, S, M, V):
+def projected_blocks(m: ti.template(), A: ti.template(), law: ti.template(), base, S, M, V):
     """Write K_ab of the projected second derivative, one column at a time: unrolled, it takes seconds to compile."""
     for a in ti.static(range(3)):
         for k in range(3):
             # unit displacement of corner a + 1 along axis k
             unit = [ti.select(k == r, ti.cast(1.0, m.real), ti.cast(0.0, m.real)) for r in ti.static(range(3))]
             D = [unit[r] * M[3 * a + c] for r in ti.static(range(3)) for c in ti.static(range(3))]
-            T = dpk1_projected(S, D)
+            T = dpk1_projected(law, S, D)
             store_column(m, A, base, a, k, T, M, V)
 
 

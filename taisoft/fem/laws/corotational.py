@@ -27,6 +27,7 @@ from taisoft.fem.math3 import (
 )
 
 NAME = "corotational"
+N_CONSTANTS = 4
 SOFTENS_BELOW = 0.0
 POINT_SECONDS = 60e-9  # per quadrature point of an explicit step, on one core
 MAX_EXTRA_ITERATIONS = 8  # maximum Halley iterations beyond the two that suffice for moderate strain

@@ -8,7 +8,7 @@ import taichi as ti
 
 from taisoft.backend.runtime import kernel, open_kind, open_runtime
 from taisoft.errors import SceneError
-from taisoft.fem.laws import dpk1_projected, law_of, n_constants, prepare_projected
+from taisoft.fem.laws import dpk1_projected, law_of, prepare_projected
 from taisoft.fem.laws.volume_floor import constants as floor_constants
 from taisoft.scene.scene import Material
 
@@ -31,7 +31,7 @@ def _store(out: ti.template(), b, A, lanes: ti.template()):
 def _evaluate(law: ti.template(), lanes: ti.template(), F: ARRAY, p: ARRAY, psi: ARRAY, P: ARRAY):
     for b in range(F.shape[0]):
         G = _load(F, b, lanes)
-        c = [ti.Vector([p[k] for q in ti.static(range(lanes))]) for k in ti.static(range(n_constants(law)))]
+        c = [ti.Vector([p[k] for q in ti.static(range(lanes))]) for k in ti.static(range(law.N_CONSTANTS))]
         energy = law.psi(G, c)
         stress = law.pk1(G, c)
         _store(P, b, stress, lanes)
@@ -44,9 +44,9 @@ def _differential(law: ti.template(), projected: ti.template(), lanes: ti.templa
     for b in range(F.shape[0]):
         G = _load(F, b, lanes)
         H = _load(D, b, lanes)
-        c = [ti.Vector([p[k] for q in ti.static(range(lanes))]) for k in ti.static(range(n_constants(law)))]
+        c = [ti.Vector([p[k] for q in ti.static(range(lanes))]) for k in ti.static(range(law.N_CONSTANTS))]
         if ti.static(projected):
-            _store(P, b, dpk1_projected(prepare_projected(law, G, c), H), lanes)
+            _store(P, b, dpk1_projected(law, prepare_projected(law, G, c), H), lanes)
         else:
             _store(P, b, law.dpk1(G, law.prepare(G, c), H), lanes)
 

@@ -12,6 +12,7 @@ from taisoft.backend.tracing import arithmetic
 from taisoft.fem.math3 import add_to_diagonal, ddot, dot, matmul, matmul_nt, matmul_tn, plus_pressure, transform
 
 NAME = "st_venant_kirchhoff"
+N_CONSTANTS = 4
 SOFTENS_BELOW = 0.6  # stretch that triggers a warning, slightly above 1/sqrt(3)
 POINT_SECONDS = 30e-9  # per quadrature point of an explicit step, on one core
 

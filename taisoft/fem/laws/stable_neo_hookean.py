@@ -13,6 +13,7 @@ from taisoft.backend.tracing import arithmetic
 from taisoft.fem.math3 import cofactor, cofactor_differential, cross, ddot, dot, plus_pressure, transform
 
 NAME = "stable_neo_hookean"
+N_CONSTANTS = 4
 SOFTENS_BELOW = 0.0
 POINT_SECONDS = 30e-9  # per quadrature point of an explicit step, on one core
 

@@ -25,23 +25,17 @@ def constants(floor: float | np.ndarray, mu: float | np.ndarray, lam: float | np
 
 
 @arithmetic
-def of_law(p):
-    """The law's own constants, with the pressure of mean dilatation if p has it."""
-    return p[:4] + p[6:]
-
-
-@arithmetic
 def energy(J, p):
-    """kappa/3 (d^3 - e^3) [Pa]."""
-    d, e = ti.max(p[4] - J, 0.0), ti.max(-J, 0.0)
-    return p[5] * (d * d * d - e * e * e) / 3.0
+    """kappa/3 (d^3 - e^3) [Pa]. p: (delta, kappa)."""
+    d, e = ti.max(p[0] - J, 0.0), ti.max(-J, 0.0)
+    return p[1] * (d * d * d - e * e * e) / 3.0
 
 
 @arithmetic
 def derivatives(J, p):
     """First and second derivative of `energy` by J [Pa]."""
-    d, e = ti.max(p[4] - J, 0.0), ti.max(-J, 0.0)
-    return -p[5] * (d * d - e * e), 2.0 * p[5] * (d - e)
+    d, e = ti.max(p[0] - J, 0.0), ti.max(-J, 0.0)
+    return -p[1] * (d * d - e * e), 2.0 * p[1] * (d - e)
 
 
 @arithmetic
@@ -100,9 +94,24 @@ def add_eigen(A, symmetric, antisymmetric, s, p):
 
 @dataclass(frozen=True)
 class VolumeFloor:
-    """A law with a volume floor, with the functions of a law; p has the two `constants` after the law's own four."""
+    """A law with a volume floor, with the functions of a law; p has the two `constants` after the law's own."""
 
     law: Any  # module of taisoft.fem.laws
+
+    @property
+    def N_CONSTANTS(self) -> int:
+        """Of the law, and the two of the floor."""
+        return self.law.N_CONSTANTS + 2
+
+    @arithmetic
+    def of_law(self, p):
+        """The law's own constants, with the pressure of mean dilatation if p has it."""
+        return p[: self.law.N_CONSTANTS] + p[self.N_CONSTANTS :]
+
+    @arithmetic
+    def of_floor(self, p):
+        """(delta, kappa)."""
+        return p[self.law.N_CONSTANTS : self.N_CONSTANTS]
 
     @property
     def SOFTENS_BELOW(self) -> float:
@@ -127,19 +136,19 @@ class VolumeFloor:
     @ti.func
     def psi(self, F, p):
         """Energy density [Pa], 0 at rest."""
-        return self.law.psi(F, of_law(p)) + energy(determinant(F), p)
+        return self.law.psi(F, self.of_law(p)) + energy(determinant(F), self.of_floor(p))
 
     @ti.func
     def pk1(self, F, p):
         """First Piola-Kirchhoff stress [Pa]; any F is valid."""
-        P = self.law.pk1(F, of_law(p))
-        return add_stress(P, F, p)
+        P = self.law.pk1(F, self.of_law(p))
+        return add_stress(P, F, self.of_floor(p))
 
     @ti.func
     def prepare(self, F, p):
         """Precompute for `dpk1` and `block`: what the law does, then `prepared`."""
-        S = self.law.prepare(F, of_law(p))
-        return S + prepared(F, p)
+        S = self.law.prepare(F, self.of_law(p))
+        return S + prepared(F, self.of_floor(p))
 
     @ti.func
     def dpk1(self, F, S, D):
@@ -156,5 +165,5 @@ class VolumeFloor:
     @ti.func
     def hessian_eigen(self, s, p):
         """Second derivatives in the SVD frame [Pa], over the stretches s: see `laws`."""
-        A, symmetric, antisymmetric = self.law.hessian_eigen(s, of_law(p))
-        return add_eigen(A, symmetric, antisymmetric, s, p)
+        A, symmetric, antisymmetric = self.law.hessian_eigen(s, self.of_law(p))
+        return add_eigen(A, symmetric, antisymmetric, s, self.of_floor(p))

@@ -25,6 +25,7 @@ from taisoft.fem.lanes import (
     store_forces,
     volumes,
     weight_at,
+    with_additions,
     zero_forces,
 )
 from taisoft.fem.laws import dpk1_projected, prepare_projected
@@ -54,9 +55,10 @@ def element_force(m: ti.template(), g: ti.template(), damped: ti.template(), b):
         for q in range(g.n_points):
             F = deformation_gradient(m, g, X, N, q, g.real)
             dF = gradient_at(m, g, V, M, q, g.real)
-            K = prepare_projected(g.law, F, p)
-            D = dpk1_projected(K, dF)
-            P = g.law.pk1(F, p)
+            c_q = with_additions(m, g, p, b, q, g.real)
+            K = prepare_projected(g.law, F, c_q)
+            D = dpk1_projected(g.law, K, dF)
+            P = g.law.pk1(F, c_q)
             Q = [P[k] + c * D[k] for k in ti.static(range(9))]
             if ti.static(g.mean_dilatation):
                 G = g.law.dilatation_gradient(F)
@@ -68,7 +70,7 @@ def element_force(m: ti.template(), g: ti.template(), damped: ti.template(), b):
     else:
         for q in range(g.n_points):
             F = deformation_gradient(m, g, X, N, q, g.real)
-            P = g.law.pk1(F, p)
+            P = g.law.pk1(F, with_additions(m, g, p, b, q, g.real))
             add_forces(m, g, S, P, M, q)
             lowest = ti.min(lowest, ti.cast(determinant(F), m.real))
     store_forces(m, g, b, S)
@@ -193,7 +195,7 @@ def element_energy(m: ti.template(), g: ti.template(), b):
     minor = broadcast(ti.cast(HUGE, ti.f64), m.lanes)
     for q in range(g.n_points):
         F = gradient_at(m, g, X, M, q, ti.f64)
-        energy += weight_at(m, g, q, ti.f64) * V * g.law.psi(F, p)
+        energy += weight_at(m, g, q, ti.f64) * V * g.law.psi(F, with_additions(m, g, p, b, q, ti.f64))
         lowest = ti.min(lowest, determinant(F))
         if ti.static(g.law.SOFTENS_BELOW > 0.0):
             C = matmul_tn(F, F)
@@ -226,7 +228,7 @@ def force_differential(m: ti.template(), dx: ti.template(), df: ti.template()):
             for q in range(g.n_points):
                 F = deformation_gradient(m, g, X, N, q, m.real)
                 dF = gradient_at(m, g, dX, M, q, m.real)
-                K = g.law.prepare(F, p)
+                K = g.law.prepare(F, with_additions(m, g, p, b, q, m.real))
                 dP = g.law.dpk1(F, K, dF)
                 if ti.static(g.mean_dilatation):
                     G = g.law.dilatation_gradient(F)
@@ -265,7 +267,7 @@ def cauchy_stress(m: ti.template(), sigma: ti.types.ndarray()):
             for q in range(g.n_points):
                 F = gradient_at(m, g, X, M, q, ti.f64)
                 w = weight_at(m, g, q, ti.f64)
-                P = g.law.pk1(F, p)
+                P = g.law.pk1(F, with_additions(m, g, p, b, q, ti.f64))
                 T = matmul_nt(P, F)
                 volume_ratio += w * determinant(F)
                 for k in ti.static(range(9)):
