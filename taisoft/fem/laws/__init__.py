@@ -3,7 +3,7 @@
 A law has NAME, N_CONSTANTS, SOFTENS_BELOW (the compressive stretch below which it softens, 0 for none), POINT_SECONDS
 (approximate time of a quadrature point in an explicit step, which sizes launches), `constants(mu, lam)` (on the host, its numbers
 per body) and the lane functions `psi`, `pk1`, `prepare`, `dpk1`, `block` (the same differential along e_k (x) g_a, times g_b, for
-assembly) and `hessian_eigen(s, p)`, see `projection`. Tests over the registry check them against each other by finite differences.
+assembly) and `hessian_eigen(s, p)`, see `projection`. Tests over the registry check them by finite differences.
 
 For mean dilatation a law is psi(F; mu, lambda) = psi(F; mu, 0) + lambda/2 theta(F)^2, with the lane functions `dilatation`,
 theta, and `dilatation_gradient`. p then has one more entry at its end, a pressure q [Pa], for which `pk1`, `prepare`, `dpk1`,

@@ -2,9 +2,10 @@
 
 An addition is a module with N_CONSTANTS and N_PREPARED, and these lane functions of F and its own constants p:
 `psi(F, p)`, `add_stress(P, F, p)`, `prepared(F, p)` (N_PREPARED entries), `add_differential(T, F, S, D)`,
-`add_block(K, F, S, ga, gb)`, `prepared_projected(F, p)` (N_PROJECTED entries) and `add_projected(T, S, D)`, whose differential has
-no negative eigenvalue. `constants(m, g, b, q, real)` gives the N_CONSTANTS numbers of quadrature point q of block b in lanes.
-The constants of a law with additions are the law's own, those of each addition, and the pressure of mean dilatation if it has one.
+`add_block(K, F, S, ga, gb)`, `prepared_projected(F, p)` (N_PROJECTED entries) and `add_projected(T, S, D)`, whose
+differential has no negative eigenvalue. `constants(m, g, b, q, real)` gives the N_CONSTANTS numbers of quadrature point q of
+block b in lanes, and `applies(body)` says on the host whether a body has the addition.
+The constants of a law with additions are the law's own, those of each addition, and the pressure of mean dilatation, if any.
 The projected differential is the sum of the parts' projections: exact where the additions have no negative eigenvalue.
 """
 
