@@ -11,7 +11,7 @@ from taisoft.display import drawn, simulator_text
 from taisoft.dynamics.dynamics import Dynamics
 from taisoft.errors import SceneError, SimulationError, no_memory
 from taisoft.estimation.first_choice import settings_for
-from taisoft.fem.laws import LAWS
+from taisoft.fem.laws import lane_law
 from taisoft.output.vtu import to_pyvista, write_vtu
 from taisoft.records import StepReport
 from taisoft.scene.scene import Scene
@@ -72,7 +72,7 @@ class Simulator(Guarded):
             warnings.warn(text, UserWarning, stacklevel=2)
         self.plan = plan_of(self._start_scene, self.settings.integrator, self_collision, draggable)
         laws = {law for body in scene.bodies for law in body.composition.laws}
-        self._may_soften = any(LAWS[law].SOFTENS_BELOW for law in laws)  # until a warning says so
+        self._may_soften = any(lane_law(law).SOFTENS_BELOW for law in laws)  # until a warning says so
         self._compiled_before = self._compile_reported = runtime.compile_clock()
         try:
             self._dynamics = Dynamics(scene, self.settings, self.plan)

@@ -15,6 +15,7 @@ from taichi.lang.enums import AutodiffMode as AutodiffMode
 from taichi.lang.expr import Expr as Expr
 from taichi.lang.kernel_impl import Kernel as Kernel
 from taichi.lang.kernel_impl import template as template
+from taichi.lang.matrix import make_matrix as make_matrix
 from taichi.types import ndarray_type as ndarray_type
 from taichi.types import primitive_types as primitive_types
 from taichi.ui.utils import get_field_info as get_field_info

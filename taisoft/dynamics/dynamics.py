@@ -23,7 +23,7 @@ from taisoft.dynamics.schemes import IMPLICIT
 from taisoft.dynamics.simulation_state import SimulationState
 from taisoft.errors import SimulationError
 from taisoft.fem.build import build_model
-from taisoft.fem.laws import LAWS
+from taisoft.fem.laws import lane_law
 from taisoft.fem.measure import NO_TET, measure, measure_parts
 from taisoft.fem.model import Model
 from taisoft.fem.state import FIRST_SOFTENED, LOADS
@@ -292,7 +292,7 @@ class Dynamics:
         at = int(layout.tet_of_lane[first])
         k = int(np.searchsorted(layout.tet_start, at, side="right")) - 1
         body, tet = self.scene.bodies[k], at - layout.tet_start[k]
-        law = LAWS[body.composition.law_of_tet(tet)]
+        law = lane_law(body.composition.law_of_tet(tet))
         floor = np.broadcast_to(body.composition.number("volume_floor"), body.mesh.n_tets)[tet]
         collapse = f"collapse to below their volume_floor of {floor:g}" if floor > 0.0 else "collapse or invert, and stay so"
         return (

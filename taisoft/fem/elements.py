@@ -12,10 +12,11 @@ import taichi as ti
 from taisoft.errors import SceneError
 from taisoft.fem import reference
 from taisoft.fem.dependent_table import dependent_table
-from taisoft.fem.laws import LAWS, law_of, volume_floor
+from taisoft.fem.laws import lane_law, law_of, volume_floor
 from taisoft.fem.model import Group, Layout, Setup
 from taisoft.fem.pattern import MATRIX_BLOCKS
 from taisoft.fem.springs import spring_table
+from taisoft.scene.laws import LAWS
 from taisoft.scene.rigid import RigidBody
 from taisoft.scene.scene import Body, Scene
 
@@ -35,7 +36,7 @@ def make_layout(scene: Scene, lanes: int) -> tuple[Layout, dict[tuple, np.ndarra
     for body, first in zip(scene.bodies, tet_start):
         composition, mean = body.composition, body.dilatation == "mean"
         for law in composition.laws:
-            if mean and not hasattr(LAWS[law], "dilatation"):
+            if mean and getattr(lane_law(law), "dilatation", None) is None:
                 raise SceneError(f'body {body.name!r}: its law {law} has no mean dilatation: give it dilatation="local"')
             switches = composition.has_volume_floor, mean, isinstance(body, RigidBody), additions_of(body)
             kind, tets = (body.order, body.quadrature_degree, list(LAWS).index(law), *switches), composition.tets_of_law(law)
@@ -158,21 +159,24 @@ def _gather_table(nodes: list[np.ndarray], groups: tuple[Group, ...], is_tet: np
 
 
 def law_table(scene: Scene, layout: Layout, by_tet: bool) -> np.ndarray:
-    """Law constants (n_bodies, 4), or (n_blocks, 4, lanes) if they may differ between the tets of a body.
+    """Law constants (n_bodies, c), or (n_blocks, c, lanes) if they may differ between the tets of a body; c as many as needed.
 
-    If some body has a volume floor, its two constants follow: 6 instead of 4. Under mean dilatation the law has no lambda, since
-    the patches have its part; the floor has it.
+    With a volume floor, its two constants follow those of the law. Under mean dilatation the law has no volumetric part, since
+    the patches have it; the floor has lambda.
     """
-    n_constants = 6 if any(body.composition.has_volume_floor for body in scene.bodies) else 4
+    compositions = [body.composition for body in scene.bodies]
+    width = max(lane_law(law).N_CONSTANTS + 2 * one.has_volume_floor for one in compositions for law in one.laws)
     start = layout.tet_start if by_tet else np.arange(len(scene.bodies) + 1)
-    table = np.zeros((start[-1], n_constants))
+    table = np.zeros((start[-1], width))
     for body, first, last in zip(scene.bodies, start, start[1:]):
-        own, numbers = body.composition, (*body.composition.lame, body.composition.number("volume_floor"))
-        mu, lam, floor = (np.broadcast_to(number, last - first) for number in numbers)
-        table[first:last, 4:] = np.stack(volume_floor.constants(floor, mu, lam), axis=1)[:, : n_constants - 4]
-        lam = 0.0 * lam if body.dilatation == "mean" else lam
-        for law in own.laws:
-            tets = own.tets_of_law(law) if by_tet else np.zeros(1, dtype=np.int64)
-            for c, values in enumerate(LAWS[law].constants(mu[tets], lam[tets])):
+        own, mean = body.composition, body.dilatation == "mean"
+        for name in own.laws:
+            law, tets = LAWS[name], own.tets_of_law(name) if by_tet else np.zeros(1, dtype=np.int64)
+            given = (*own.lame, own.dilatation_modulus, own.number("volume_floor"), *map(own.number, law.parameters))
+            mu, lam, modulus, floor, *numbers = (np.broadcast_to(one, last - first)[tets] for one in given)
+            of_floor = volume_floor.constants(floor, mu, lam) if own.has_volume_floor else ()
+            if mean:
+                lam, numbers = lam - modulus, [0.0 * x if one == law.modulus else x for one, x in zip(law.parameters, numbers)]
+            for c, values in enumerate((*lane_law(name).constants(mu, lam, *numbers), *of_floor)):
                 table[first + tets, c] = values
     return layout.blocks(table[layout.tet_of_lane]) if by_tet else table

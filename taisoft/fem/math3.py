@@ -90,7 +90,7 @@ def ddot(A, B):
 
 
 @arithmetic
-def _jacobi_angle(app, aqq, apq):
+def jacobi_angle(app, aqq, apq):
     """(cosine, sine) of the rotation that zeroes the off-diagonal apq of a symmetric 2x2 matrix."""
     small = abs(apq) <= 1e-30
     tau = (aqq - app) / ti.select(small, 1.0 + 0.0 * apq, 2.0 * apq)
@@ -127,7 +127,7 @@ def signed_svd(F, sweeps: ti.template()):
 
 @ti.func
 def _rotate_columns(A: ti.template(), V: ti.template(), p: ti.template(), q: ti.template()):
-    c, s = _jacobi_angle(dot(A[p::3], A[p::3]), dot(A[q::3], A[q::3]), dot(A[p::3], A[q::3]))
+    c, s = jacobi_angle(dot(A[p::3], A[p::3]), dot(A[q::3], A[q::3]), dot(A[p::3], A[q::3]))
     for r in ti.static(range(3)):
         ap, aq = c * A[3 * r + p] - s * A[3 * r + q], s * A[3 * r + p] + c * A[3 * r + q]
         vp, vq = c * V[3 * r + p] - s * V[3 * r + q], s * V[3 * r + p] + c * V[3 * r + q]
@@ -180,7 +180,7 @@ def clamp_symmetric(A, sweeps: ti.template()):
     Q = [one, zero, zero, zero, one, zero, zero, zero, one]
     for _ in range(sweeps):
         for p, q in ti.static(PAIRS):
-            c, s = _jacobi_angle(D[4 * p], D[4 * q], D[3 * p + q])
+            c, s = jacobi_angle(D[4 * p], D[4 * q], D[3 * p + q])
             for r in ti.static(range(3)):
                 dp, dq = c * D[3 * r + p] - s * D[3 * r + q], s * D[3 * r + p] + c * D[3 * r + q]
                 qp, qq = c * Q[3 * r + p] - s * Q[3 * r + q], s * Q[3 * r + p] + c * Q[3 * r + q]

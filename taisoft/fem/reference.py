@@ -96,7 +96,7 @@ def tet_patches(body: Body) -> np.ndarray:
 
 def patch_moduli(body: Body, patch: np.ndarray) -> np.ndarray:
     """Mean lambda (n_patches,) [Pa] of the patches. patch: `tet_patches`."""
-    volumes, lam = body.mesh.volumes, body.composition.lame[1]
+    volumes, lam = body.mesh.volumes, body.composition.dilatation_modulus
     return np.bincount(patch, volumes * lam) / np.bincount(patch, volumes)
 
 

@@ -189,7 +189,8 @@ class Body(Guarded):
         """What is given; if that is "auto", "mean" for linear tets some of which have a Poisson's ratio of at least 0.45."""
         if self.given_dilatation != "auto":
             return self.given_dilatation
-        return "mean" if self.order == 1 and np.max(self.poisson) >= NEARLY_INCOMPRESSIBLE else "local"
+        locks = self.order == 1 and np.max(self.poisson) >= NEARLY_INCOMPRESSIBLE
+        return "mean" if locks and self.composition.has_dilatation else "local"
 
     @property
     def mass(self) -> float:
@@ -216,7 +217,8 @@ class Body(Guarded):
         if self.order == 1 and self.dilatation == "local" and poisson >= NEARLY_INCOMPRESSIBLE:
             rule = f"is at least {NEARLY_INCOMPRESSIBLE}, where linear tets lock and bend too little"
             cure = "the default of a body that starts so" if kept else "the default"
-            rule += f': dilatation="mean", {cure}, does not lock, and order=2 locks less'
+            mean = f'dilatation="mean", {cure}, does not lock, and ' if self.composition.has_dilatation else ""
+            rule += f": {mean}order=2 locks less"
         elif kept:
             rule = f"is below {NEARLY_INCOMPRESSIBLE}, and its dilatation stays the mean that a larger one at the start asked for"
         else:

@@ -13,9 +13,10 @@ import numpy as np
 from taisoft.errors import MeshError, SceneError, value_text
 from taisoft.mesh.tet_mesh import TetMesh
 from taisoft.scene import checks
-from taisoft.scene.material import LAWS, Material, lame_parameters
+from taisoft.scene.laws import LAWS
+from taisoft.scene.material import MODULI, Material, lame_parameters
 
-BY_TET = ("young", "poisson", "density")  # numbers that may differ from tet to tet
+BY_TET = (*MODULI, "density")  # numbers that may differ from tet to tet, with parameters of laws
 OF_THE_BODY = ("friction", "restitution", "mass_damping", "stiffness_damping")
 
 
@@ -25,7 +26,7 @@ class Composition:
 
     mesh: TetMesh
     materials: dict[int | None, Material]  # by region, ascending; under None if one holds for all tets
-    by_tet: dict[str, np.ndarray]  # some of BY_TET: (m,), which replace the numbers of the materials
+    by_tet: dict[str, np.ndarray]  # some of `tet_numbers`: (m,), which replace the numbers of the materials
 
     @property
     def has_regions(self) -> bool:
@@ -34,8 +35,19 @@ class Composition:
 
     @property
     def elastic_by_tet(self) -> bool:
-        """Whether Young's modulus or Poisson's ratio may differ from tet to tet."""
-        return self.has_regions or "young" in self.by_tet or "poisson" in self.by_tet
+        """Whether Young's modulus, Poisson's ratio or a parameter of a law may differ from tet to tet."""
+        return self.has_regions or bool(self.by_tet.keys() - {"density"})
+
+    @cached_property
+    def parameters(self) -> tuple[str, ...]:
+        """Names of the parameters of its laws; () if none has any."""
+        return tuple(dict.fromkeys(name for material in self.materials.values() for name in material.parameters))
+
+    @property
+    def tet_numbers(self) -> tuple[str, ...]:
+        """Names of the numbers that may differ from tet to tet."""
+        laws = [LAWS[name] for name in self.laws]
+        return (*dict.fromkeys(name for law in laws for name in law.numbers), "density")
 
     @property
     def first(self) -> Material:
@@ -54,10 +66,15 @@ class Composition:
         return np.searchsorted(list(self.materials), self.mesh.regions)
 
     def number(self, name: str) -> float | np.ndarray:
-        """Return one of BY_TET, or `volume_floor`: a float if one holds for all tets by design, else (m,)."""
+        """Return one of BY_TET, a parameter, or `volume_floor`: a float if one holds for all tets by design, else (m,).
+
+        A parameter is not a number in tets whose law does not have it.
+        """
+        if name in MODULI and self.parameters and self.elastic_by_tet:
+            return self._moduli[MODULI.index(name)]
         if name in self.by_tet or not self.has_regions:
             return self.by_tet.get(name, getattr(self.first, name))
-        values = np.array([getattr(material, name) for material in self.materials.values()])[self._row]
+        values = np.array([getattr(material, name, np.nan) for material in self.materials.values()])[self._row]
         values.flags.writeable = False
         return values
 
@@ -66,10 +83,52 @@ class Composition:
         """Whether some tets stiffen against inversion."""
         return any(material.volume_floor > 0.0 for material in self.materials.values())
 
+    @cached_property
+    def _moduli(self) -> np.ndarray:
+        """Young's modulus [Pa] and Poisson's ratio (2, m) at rest, where a law has parameters."""
+        moduli = np.array([[getattr(one, name) for one in self.materials.values()] for name in MODULI])
+        moduli = moduli[:, self._row] if self.has_regions else np.repeat(moduli, self.mesh.n_tets, axis=1)
+        for name in self.laws:
+            law, tets = LAWS[name], self.tets_of_law(name)
+            own = {one: np.broadcast_to(self.number(one), self.mesh.n_tets)[tets] for one in law.parameters}
+            rows = np.unique(np.array(list(own.values())), axis=1, return_inverse=True) if own else None
+            if rows is not None:
+                moduli[:, tets] = np.array(law.moduli(dict(zip(own, rows[0]))))[:, rows[1].reshape(-1)]
+        moduli.setflags(write=False)
+        return moduli
+
     @property
     def lame(self) -> tuple[float | np.ndarray, float | np.ndarray]:
-        """Lamé's parameters (mu, lambda) [Pa], each a float or (m,)."""
+        """Lamé's parameters (mu, lambda) at rest [Pa], each a float or (m,)."""
         return lame_parameters(self.number("young"), self.number("poisson"))
+
+    @property
+    def dilatation_modulus(self) -> float | np.ndarray:
+        """The modulus of the volumetric part that mean dilatation averages [Pa]: lambda, or a parameter of the law."""
+        if not self.parameters:
+            return self.lame[1]
+        modulus = np.broadcast_to(self.lame[1], self.mesh.n_tets).copy()
+        for name in self.laws:
+            law, tets = LAWS[name], self.tets_of_law(name)
+            if law.modulus in law.parameters:
+                modulus[tets] = np.broadcast_to(self.number(law.modulus), self.mesh.n_tets)[tets]
+        return modulus if self.elastic_by_tet else float(modulus[0])
+
+    @property
+    def stiffnesses(self) -> dict[str, float | np.ndarray]:
+        """Young's modulus, or the parameters of its laws in Pa: numbers to which stresses are proportional."""
+        units = {name: one.unit for law in self.laws for name, one in LAWS[law].parameters.items()}
+        return {name: self.number(name) for name in self.tet_numbers if name == "young" or units.get(name) == "Pa"}
+
+    @property
+    def has_dilatation(self) -> bool:
+        """Whether the laws of all tets have a volumetric part that mean dilatation can average."""
+        return all(LAWS[name].has_dilatation for name in self.laws)
+
+    @property
+    def stiffest(self) -> float:
+        """By how much the stiffest strain at rest is stiffer than in an isotropic body with its moduli; 1 if it is one."""
+        return max(LAWS[one.law].stiffest(one.parameters) for one in self.materials.values())
 
     @cached_property
     def lowest_wave_speed(self) -> float:
@@ -89,24 +148,55 @@ class Composition:
     def changed(self, what: str, numbers: dict, region: int | str | None = None) -> "Composition":
         """Return a composition with other numbers of all tets, or of one region's.
 
-        numbers: of a `Material`; those of BY_TET may be (m,) unless a region is given. what: start of messages.
+        numbers: of a `Material`; `tet_numbers` may be (m,) unless a region is given. what: start of messages.
         Raises SceneError.
         """
         if region is not None:
             return self._changed_in(what, numbers, region)
         by_tet, everywhere = dict(self.by_tet), {}
         for name, value in numbers.items():
-            if name in BY_TET and (isinstance(value, (list, tuple)) or getattr(value, "ndim", 0)):
-                by_tet[name] = _tet_numbers(f"{what}: {name}", name, value, self.mesh.n_tets)
+            if name in self.tet_numbers and (isinstance(value, (list, tuple)) or getattr(value, "ndim", 0)):
+                by_tet[name] = self._tet_numbers(f"{what}: {name}", name, value)
             else:
                 by_tet.pop(name, None)
                 everywhere[name] = value
-        materials = {key: _replaced(what, material, everywhere) for key, material in self.materials.items()}
-        return replace(self, materials=materials, by_tet=by_tet)
+        materials = {
+            key: _replaced(what, material, {n: v for n, v in everywhere.items() if not self._is_foreign(n, material)})
+            for key, material in self.materials.items()
+        }
+        made = replace(self, materials=materials, by_tet=by_tet)
+        made._check_moduli(what)
+        return made
+
+    def _is_foreign(self, name: str, material: Material) -> bool:
+        """Whether a number is a parameter of another region's law, and not of this material's."""
+        return name in self.parameters and name not in material.parameters
+
+    def _check_moduli(self, what: str) -> None:
+        """Raise SceneError if parameters by tet make a law unstable at rest."""
+        if self.parameters and self.by_tet:
+            try:
+                _ = self._moduli
+            except SceneError as error:
+                raise SceneError(f"{what}: {error}") from None
+
+    def _tet_numbers(self, what: str, name: str, value) -> np.ndarray:
+        """Return numbers (m,) of all tets, each of which a `Material` could have."""
+        array = checks.array(value, what, ((self.mesh.n_tets,),))
+        own = next((LAWS[law].parameters[name] for law in self.laws if name in LAWS[law].parameters), None)
+        if own is not None:
+            own.check_all(array, what)
+        elif name == "poisson":
+            _check_tets(what, array, ~((array > -1.0) & (array < 0.5)), "lie in the open interval (-1, 0.5)")
+        else:
+            unit = "Pa" if name == "young" else "kg/m^3"
+            _check_tets(what, array, array < checks.SMALLEST, f"be greater than 0 {unit}")
+        array.setflags(write=False)
+        return array
 
     def _changed_in(self, what: str, numbers: dict, region: int | str) -> "Composition":
         """Return a composition with other numbers in one region: of its material, or by tet where they are given so."""
-        allowed = (*BY_TET, "volume_floor") if self.has_regions else BY_TET
+        allowed = (*self.tet_numbers, "volume_floor") if self.has_regions else self.tet_numbers
         for name in numbers:
             if name not in allowed:
                 raise SceneError(f"{what}: {name} is one number for the whole body; {', '.join(allowed)} can differ by region")
@@ -120,7 +210,9 @@ class Composition:
             if name in by_tet or not self.has_regions:
                 by_tet[name] = np.where(self.mesh.regions == key, getattr(changed, name), self.number(name))
                 by_tet[name].setflags(write=False)
-        return replace(self, materials=self.materials | ({key: changed} if self.has_regions else {}), by_tet=by_tet)
+        made = replace(self, materials=self.materials | ({key: changed} if self.has_regions else {}), by_tet=by_tet)
+        made._check_moduli(what)
+        return made
 
 
 def compose(what: str, mesh: TetMesh, material: Material | Mapping, **numbers) -> Composition:
@@ -174,15 +266,7 @@ def _replaced(what: str, material: Material, numbers: dict) -> Material:
         raise SceneError(f"{what}: {str(error).removeprefix('material: ')}") from None
 
 
-def _tet_numbers(what: str, name: str, value, n_tets: int) -> np.ndarray:
-    """Return numbers (m,) of all tets, each of which a `Material` could have."""
-    array = checks.array(value, what, ((n_tets,),))
-    if name == "poisson":
-        bad, rule = ~((array > -1.0) & (array < 0.5)), "lie in the open interval (-1, 0.5)"
-    else:
-        bad, rule = array < checks.SMALLEST, f"be greater than 0 {'Pa' if name == 'young' else 'kg/m^3'}"
+def _check_tets(what: str, array: np.ndarray, bad: np.ndarray, rule: str) -> None:
     if bad.any():
         tet = int(np.argmax(bad))
         raise SceneError(f"{what} of tet {tet} must {rule}, not {array[tet]:g}")
-    array.setflags(write=False)
-    return array

@@ -10,6 +10,7 @@ import numpy as np
 from taisoft.scene.body import Body
 from taisoft.scene.connection_records import Attachment, Connection, Tendon
 from taisoft.scene.key_frames import NodePath, ShapePath
+from taisoft.scene.laws import LAWS
 from taisoft.scene.loads import LoadPath
 from taisoft.scene.numbers import scene_numbers
 from taisoft.scene.rigid import RigidBody
@@ -52,7 +53,8 @@ def scene_digest(scene: Scene) -> str:
 def _body_parts(body: Body) -> dict[str, list]:
     """Return the values that define a body, by the part's name in messages."""
     rigid = isinstance(body, RigidBody)  # its law and its stiffness are chosen by the Simulator
-    laws = [] if rigid else [material.law for material in body.composition.materials.values()]
+    used = [] if rigid else [material.law for material in body.composition.materials.values()]
+    laws = [part for name in used for part in (name, *LAWS[name].fingerprint())]
     constraints = sorted(body.constraints, key=lambda c: c.path is not None)  # scene files have `fix` first
     return {
         "mesh": [body.mesh.vertices, body.mesh.tets],

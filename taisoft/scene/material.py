@@ -1,5 +1,8 @@
 """An elastic material: a law with its numbers, density, damping and surface parameters."""
 
+import dataclasses
+import functools
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -7,17 +10,54 @@ import numpy as np
 from taisoft.attributes import guarded_record
 from taisoft.errors import SceneError
 from taisoft.scene import checks
+from taisoft.scene.law import Law
+from taisoft.scene.laws import LAWS
 
 MIN_VOLUME_FLOOR = 1e-3  # smaller ones are the rounding of J = det F in f32
-LAWS = ("st_venant_kirchhoff", "corotational", "stable_neo_hookean")
+MODULI = ("young", "poisson")
+
+
+def _takes_parameters(cls: type) -> type:
+    """Let a material's law have numbers of its own, given by name or in a dict; young and poisson follow from them."""
+    init, fields = cls.__init__, [one.name for one in dataclasses.fields(cls)]
+
+    @functools.wraps(init)
+    def __init__(self, *values, **given):
+        named = dict(zip(fields, values)) | given
+        law = LAWS.get(checks.choice(named.get("law", cls.law), "material: law", tuple(LAWS)))
+        if len(values) <= len(fields) and law.parameters:
+            own = {name: named.pop(name) for name in list(named) if name not in fields}
+            values, given = (), _with_moduli(law, named, own)
+        elif given.get("parameters"):
+            raise SceneError(f"material: law {law.name} has no parameters: it takes young and poisson")
+        init(self, *values, **given)
+
+    cls.__init__ = __init__
+    return cls
+
+
+def _with_moduli(law: Law, named: dict, own: dict) -> dict:
+    """Return the fields of a material whose law has parameters. named: fields given; own: parameters given by their names."""
+    before = dict(named.pop("parameters", None) or {})
+    if before.keys() <= law.parameters.keys() == {*before, *own}:
+        is_copy = before.keys() == law.parameters.keys()  # of a material, with its moduli: `dataclasses.replace`
+    else:
+        is_copy = False
+    old = dict(zip(MODULI, law.moduli(before))) if is_copy else {}
+    for name in MODULI:
+        if name in named and named[name] != old.get(name):
+            raise SceneError(f"material: {name} follows from the numbers of law {law.name}: {', '.join(law.parameters)}")
+    parameters = law.checked({**before, **own}, "material: ")
+    return {**named, "parameters": parameters, **dict(zip(MODULI, law.moduli(parameters)))}
 
 
 @guarded_record("material", "make another one by dataclasses.replace, or call sim.set_material(body, {name}=...) in a simulation")
+@_takes_parameters
 @dataclass(frozen=True)
 class Material:
     """An elastic material with damping and surface parameters. Raises SceneError for values outside the rules below."""
 
-    law: str = "stable_neo_hookean"  #: "st_venant_kirchhoff", "corotational" or "stable_neo_hookean"
+    law: str = "stable_neo_hookean"  #: name of a law, such as "st_venant_kirchhoff", "corotational", "mooney_rivlin"
     young: float = 1e6  #: Young's modulus [Pa], > 0
     poisson: float = 0.3  #: Poisson's ratio, in the open interval (-1, 0.5)
     density: float = 1000.0  #: [kg/m^3], > 0
@@ -27,8 +67,9 @@ class Material:
     stiffness_damping: float = 0.0  #: [s], >= 0
     volume_floor: float = 0.0  #: J = det F below which the law stiffens against inversion, 0.001 to 1; 0 for none
 
+    parameters: Mapping[str, float] = dataclasses.field(default_factory=dict, hash=False)  #: numbers of a law that has its own
+
     def __post_init__(self):
-        checks.choice(self.law, "material: law", LAWS)
         limits = {
             "young": {"above": 0.0, "unit": "Pa"},
             "poisson": {},
@@ -47,9 +88,16 @@ class Material:
             rule = f"must be 0, for none, or at least {MIN_VOLUME_FLOOR:g} and below 1"
             raise SceneError(f"material: volume_floor {rule}, not {self.volume_floor:g}")
 
+    def __getattr__(self, name: str) -> float:
+        """Parameters of the law are attributes, too."""
+        try:
+            return self.__dict__["parameters"][name]
+        except KeyError:
+            raise AttributeError(f"material has no attribute {name!r}") from None
+
     @property
     def mu(self) -> float:
-        """Lamé's second parameter, the shear modulus [Pa]."""
+        """Lamé's second parameter, the shear modulus [Pa]; at rest, if the law has parameters."""
         return lame_parameters(self.young, self.poisson)[0]
 
     @property

@@ -12,16 +12,16 @@ from taisoft.attributes import thawed
 from taisoft.errors import SceneError
 from taisoft.scene import checks
 from taisoft.scene.body import Body
-from taisoft.scene.composition import BY_TET
+from taisoft.scene.laws import LAWS
 from taisoft.scene.loads import LOADS
-from taisoft.scene.material import Material
+from taisoft.scene.material import MODULI, Material
 from taisoft.scene.plan import change_load, change_tendon
 from taisoft.scene.rigid import RigidBody
 from taisoft.scene.scene import Scene
 
 Numbers = dict[str, float | list | np.ndarray | None]  # of a scene, by name
 Entry = tuple[str, float | list | np.ndarray | None, Callable]  # name, value, and the call that sets it
-NUMBERS = tuple(field.name for field in dataclasses.fields(Material) if field.name != "law")
+NUMBERS = tuple(field.name for field in dataclasses.fields(Material) if field.name not in ("law", "parameters"))
 LIMITS = dict.fromkeys(("friction", "rest_length", "damping"), {"minimum": 0.0}) | {"stiffness": {"above": 0.0}}
 LIMITS |= {"restitution": {"minimum": 0.0, "maximum": 1.0}}  # of the numbers of obstacles and connections
 
@@ -84,10 +84,11 @@ def _of_material(body: Body) -> Iterator[Entry]:
     composition = body.composition
     for region, material in composition.materials.items() if composition.has_regions else ():
         owner = f"{body.name}.{body.mesh.region_names.get(region, region)}"
-        for name in (*BY_TET, "volume_floor"):
+        for name in (*LAWS[material.law].numbers, "density", "volume_floor"):
             yield f"{owner}.{name}", getattr(material, name), partial(_set_material, body, name, region)
-    for name in NUMBERS:
-        by_region = {getattr(material, name) for material in composition.materials.values()}
+    own = composition.parameters
+    for name in (*own, *(name for name in NUMBERS if not (own and name in MODULI))):
+        by_region = {getattr(one, name) for one in composition.materials.values() if name not in own or name in one.parameters}
         value = composition.by_tet.get(name, by_region.pop() if len(by_region) == 1 else None)
         yield f"{body.name}.{name}", value, partial(_set_material, body, name, None)
 

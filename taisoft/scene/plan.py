@@ -12,13 +12,13 @@ from taisoft.scene import checks
 from taisoft.scene.body import NEARLY_INCOMPRESSIBLE, Body, check_volume
 from taisoft.scene.collision import has_sharp_edges
 from taisoft.scene.connections import check_tendon
+from taisoft.scene.laws import LAWS
 from taisoft.scene.loads import LOADS
-from taisoft.scene.material import LAWS
 from taisoft.scene.obstacles import Box, MeshObstacle
 from taisoft.scene.rigid import RigidBody
 from taisoft.scene.scene import Scene
 
-CHANGEABLE = ("young", "poisson", "density", "mass_damping", "stiffness_damping")  # numbers of a material
+CHANGEABLE = ("mass_damping", "stiffness_damping")  # numbers of a material, besides `Composition.tet_numbers`
 
 
 @dataclass
@@ -56,12 +56,12 @@ def make_plan(scene: Scene, explicit: bool, multistep: bool, self_collision: boo
         names = [b.name for b in scene.bodies if test(b)]
         plan.add(feature, bool(names), f"{why} {_shorten(names)}", why_not)
 
-    for law in LAWS:
+    for law in (one for one in LAWS if LAWS[one].is_classic or any(one in b.composition.laws for b in scene.bodies)):
         add_if_any(f"law:{law}", lambda b, law=law: law in b.composition.laws, "used by", "no body uses it")
     add_if_any(
         "elasticity_by_tet",
         lambda b: b.composition.elastic_by_tet,
-        "young or poisson may differ between the tets of",
+        "young, poisson or a parameter may differ between the tets of",
         "every body has one young and one poisson",
     )
     add_if_any("volume_floor", lambda b: b.composition.has_volume_floor, "material of", "every volume_floor is 0")
@@ -168,10 +168,11 @@ def change_material(body: Body, numbers: dict, on: dict[str, bool], region: int 
     what = f"body {body.name!r}"
     if isinstance(body, RigidBody):
         raise SceneError(f"rigid body {body.name!r}: its numbers cannot change: add another one before the Simulator is made")
+    changeable = (*body.composition.tet_numbers, *CHANGEABLE)
     for name in numbers:
-        if name not in CHANGEABLE:
-            hint = checks.nearest(name, CHANGEABLE)
-            raise SceneError(f"{what}: {name} cannot change while it runs{hint}; {', '.join(CHANGEABLE)} can")
+        if name not in changeable:
+            hint = checks.nearest(name, changeable)
+            raise SceneError(f"{what}: {name} cannot change while it runs{hint}; {', '.join(changeable)} can")
     composition = body.composition.changed(what, numbers, region)
     for name in numbers:
         if name in on and not on[name] and getattr(composition.first, name) != 0.0:
@@ -179,12 +180,12 @@ def change_material(body: Body, numbers: dict, on: dict[str, bool], region: int 
             raise SceneError(f"{what}: {name} {rule}")
     if composition.elastic_by_tet and not on["elasticity_by_tet"]:
         raise SceneError(
-            f"{what}: young and poisson cannot differ between tets, since those of no body did at the start: give them by tet to "
-            "add_body"
+            f"{what}: {' and '.join(body.composition.tet_numbers[:-1])} cannot differ between tets, since those of no body did "
+            "at the start: give them by tet to add_body"
         )
     with thawed(body):
         body.composition = composition
-    if "poisson" in numbers:
+    if numbers.keys() & {"poisson", *body.composition.parameters}:
         body.warn_locking(stacklevel=3)
 
 

@@ -25,6 +25,7 @@ from taisoft.scene import checks
 from taisoft.scene.body import Body, Constraint
 from taisoft.scene.composition import Composition, compose
 from taisoft.scene.key_frames import KeyFrames
+from taisoft.scene.laws import LAWS
 from taisoft.scene.loads import NodalForce
 from taisoft.scene.material import Material
 from taisoft.scene.obstacles import checked_pose
@@ -127,7 +128,8 @@ class RigidBody(Body):
         rigid motion.
         """
         old, soft = self.composition.first, [body for body in bodies if not isinstance(body, RigidBody)]
-        law = soft[0].composition.laws[0] if soft else old.law  # each further law is compiled
+        classic = [law for body in soft for law in body.composition.laws if LAWS[law].is_classic]
+        law = classic[0] if classic else old.law  # each further law is compiled
         damping = max((body.composition.first.stiffness_damping for body in attached), default=0.0)
         with thawed(self):
             if self.given_young is None:

@@ -223,24 +223,26 @@ class Scene(Guarded):
         poisson: float | np.ndarray | None = None,
         density: float | np.ndarray | None = None,
         dilatation: str = "auto",
+        parameters: Mapping[str, float | np.ndarray] | None = None,
     ) -> Body:
         """Add a body and return it.
 
         mesh: its shape at rest. material: for all tets, or a dict that gives each of the mesh's regions, by name or id, its
         own; laws may differ, but friction, restitution and damping must be the same in all. young [Pa], poisson, density
-        [kg/m^3]: numbers that replace the material's, one for the body, or (m,) with one for each tet. name: unique; "body0"
-        and so on by default. position: (3,) [m], initial translation. velocity: (3,) for all nodes or (n,3) [m/s]. order: 1,
-        linear tets, or 2, quadratic ones with nodes in the middle of every edge. quadrature_degree: None for the default; order
-        2 has four points (2) or fourteen (4). collision: contact geometry, "proximity", also for "auto", or "distance_field".
-        dilatation: "mean", averaged over patches of a few linear tets, or each quadratic tet, so that a Poisson's ratio near
-        0.5 does not lock them; "local", of each quadrature point; or "auto": "mean" for linear tets if that ratio is at least
-        0.45 in some of them. It stays as decided when the ratio changes during a run.
+        [kg/m^3], parameters: numbers that replace the material's, the last by name for laws that have parameters; one for the
+        body, or (m,) with one for each tet. name: unique; "body0" and so on by default. position: (3,) [m], initial
+        translation. velocity: (3,) for all nodes or (n,3) [m/s]. order: 1, linear tets, or 2, quadratic ones with nodes in the
+        middle of every edge. quadrature_degree: None for the default; order 2 has four points (2) or fourteen (4). collision:
+        contact geometry, "proximity", also for "auto", or "distance_field". dilatation: "mean", averaged over patches of a few
+        linear tets, or each quadratic tet, so that a Poisson's ratio near 0.5 does not lock them; "local", of each quadrature
+        point; or "auto": "mean" for linear tets if that ratio is at least 0.45 in some of them. It stays as decided when the
+        ratio changes during a run.
         Warns if tets of order 1 are far too stiff: if they lock, or in a thin body with so few tets through its thickness that
         it bends at most half as far as it should. Raises SceneError.
         """
         self._check_open("add_body")
         name = self._free_name(name, "body")
-        numbers = {"young": young, "poisson": poisson, "density": density}
+        numbers = {"young": young, "poisson": poisson, "density": density, **(parameters or {})}
         body = Body(name, mesh, material, position, velocity, order, quadrature_degree, collision, dilatation, **numbers)
         list.append(self.bodies, body)
         body.warn_locking(stacklevel=2)

@@ -42,6 +42,7 @@ from taisoft.scene import checks
 from taisoft.scene.body import Body
 from taisoft.scene.collision import CollisionSettings
 from taisoft.scene.key_frames import KeyFrames
+from taisoft.scene.laws import LAWS
 from taisoft.scene.material import Material
 from taisoft.scene.obstacles import Box, Capsule, HalfSpace, MeshObstacle, Sphere
 from taisoft.scene.scene import Scene
@@ -114,7 +115,7 @@ def _read(tables: Table, allow_outside: bool) -> tuple[Scene, dict]:
     if "solver" in tables:
         solver = tables.table("solver", list(checks.SOLVER_CHECKS)).make(_solver)
     parent = tables.named("materials")
-    materials = {name: parent.made(name, Material, "material: ") for name in parent.known}
+    materials = {name: _made_material(parent, name) for name in parent.known}
     bodies, rigid = tables.named("bodies"), tables.named("rigid_bodies")
     if not bodies.known and not rigid.known:
         raise tables.error("bodies", "must hold a table [bodies.NAME]" if "bodies" in tables else "is missing")
@@ -192,13 +193,20 @@ def _add_body(scene: Scene, name: str, table: Table, materials: dict[str, Materi
     return body
 
 
+def _made_material(table: Table, key: str) -> Material:
+    """Return the material of the table under a key, which has the parameters of its law, too."""
+    given, known = table.values[key], [name for name in arguments_of(Material)[0] if name != "parameters"]
+    law = LAWS.get(str(given.get("law"))) if isinstance(given, dict) else None
+    return table.table(key, known + list(law.parameters if law else ())).make(Material, "material: ")
+
+
 def _material(table: Table, key: str, materials: dict[str, Material]) -> Material:
     """Return the material under a key: the name of one, or a table."""
     if key not in table:
         raise table.error(key, "is missing")
     name = table.values[key]
     if not isinstance(name, str):
-        return table.made(key, Material, "material: ")
+        return _made_material(table, key)
     if name not in materials:
         raise table.error(key, f"{value_text(name)} is not among the materials{checks.nearest(name, materials)}")
     return materials[name]

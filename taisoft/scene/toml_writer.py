@@ -21,7 +21,7 @@ from taisoft.scene.body import QUADRATURE_DEGREES, Body
 from taisoft.scene.checks import SOLVER_CHECKS, check_solver
 from taisoft.scene.key_frames import ShapePath
 from taisoft.scene.loads import Cavity, Load, LoadPath, NodalForce
-from taisoft.scene.material import Material
+from taisoft.scene.material import MODULI, Material
 from taisoft.scene.obstacles import Obstacle
 from taisoft.scene.rigid import RigidBody
 from taisoft.scene.scene import Scene
@@ -103,7 +103,7 @@ def _document(scene: Scene, solver: dict, stem: str, meshes: dict[str, TetMesh])
         **({"body_order": order[: len(read)]} if read != order[: len(read)] else {}),
         "collision": _fields(scene.collision),
         "solver": _solver(solver),
-        "materials": {name: _fields(material) for material, name in materials.items()},
+        "materials": {name: _material(material) for material, name in materials.items()},
         "bodies": {body.name: _body(body, materials, stem, meshes) for body in elastic},
         "rigid_bodies": {
             body.name: rigid_table(body, lambda mesh: _mesh_table(mesh, stem, meshes), _fields, _load)
@@ -142,7 +142,11 @@ def _body(body: Body, materials: dict[Material, str], stem: str, meshes: dict[st
     composition = body.composition
     names = {body.mesh.region_names.get(key, str(key)): materials[one] for key, one in composition.materials.items()}
     table = {"materials": names} if composition.has_regions else {"material": materials[composition.first]}
-    table |= {"mesh": _mesh_table(body.mesh, stem, meshes)} | composition.by_tet
+    table |= {"mesh": _mesh_table(body.mesh, stem, meshes)}
+    own = {name: values for name, values in composition.by_tet.items() if name in composition.parameters}
+    table |= {name: values for name, values in composition.by_tet.items() if name not in own} | (
+        {"parameters": own} if own else {}
+    )
     table |= {key: getattr(body, key) for key in ("position", "velocity", "order", "collision")}
     # what was given, unless numbers have changed since so that it would be decided in another way
     table["dilatation"] = body.given_dilatation if body.dilatation == body.decided_dilatation else body.dilatation
@@ -183,6 +187,12 @@ def _fields(record) -> dict:
     """Return the fields of a record that are not None."""
     values = {field.name: getattr(record, field.name) for field in dataclasses.fields(record)}
     return {key: value for key, value in values.items() if value is not None}
+
+
+def _material(material: Material) -> dict:
+    """Return a material's numbers: of a law with parameters these, from which the moduli follow."""
+    fields, own = _fields(material), _fields(material).pop("parameters")
+    return {key: value for key, value in fields.items() if key != "parameters" and not (own and key in MODULI)} | own
 
 
 def _obstacle(obstacle: Obstacle) -> dict:

@@ -40,6 +40,7 @@ class Controls:
         elastic = [body for body in scene.bodies if not isinstance(body, RigidBody)]
         self._names = [body.name for body in scene.bodies]
         self._initial = {what: {body.name: getattr(body, what) for body in elastic} for what in DECADES}
+        self._stiffnesses = {body.name: body.composition.stiffnesses for body in elastic}
         self._exponents = {what: dict.fromkeys(self._initial[what], 0.0) for what in DECADES}
         self._pairs = touching_pairs(sim)
         self._frictions: list[float] | None = None  # of the pairs; None if unknown
@@ -94,16 +95,17 @@ class Controls:
         self._g = size
 
     def set_number(self, what: str, names: list[str], exponent: float) -> None:
-        """Multiply the initial young or density of elastic bodies by a power of ten.
+        """Multiply the initial young or density of elastic bodies by a power of ten; for young, all stiffnesses of a law.
 
         An explicit dt is lowered if it would not be stable; the requested one is restored as soon as it is.
         """
         sim = self._sim
         for name in names:
-            value = self._initial[what][name] * 10.0**exponent
+            initial = {what: self._initial[what][name]} if what != "young" else self._stiffnesses[name]
+            numbers = {number: value * 10.0**exponent for number, value in initial.items()}
             for k in range(HALVINGS):
                 try:
-                    sim.set_material(name, **{what: value})
+                    sim.set_material(name, **numbers)
                     break
                 except SimulationError:
                     if k == HALVINGS - 1:

@@ -14,21 +14,39 @@ A law that is not isotropic, or one with `Additions`, has `prepare_projected(F, 
 """
 
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import taichi as ti
 
 from taisoft.fem.laws import corotational, st_venant_kirchhoff, stable_neo_hookean
 from taisoft.fem.laws.additions import WithAdditions
+from taisoft.fem.laws.from_energy import EnergyLaw, lanes_of
 from taisoft.fem.laws.projection import dpk1_isotropic, prepare_isotropic
 from taisoft.fem.laws.volume_floor import VolumeFloor
+from taisoft.scene import laws
+from taisoft.scene.law import Law
 
+# written by hand
 LAWS = {law.NAME: law for law in (st_venant_kirchhoff, corotational, stable_neo_hookean)}
 
 
 def law_of(name: str, volume_floor: bool, additions: tuple = ()) -> Any:
     """The law of a name, with a volume floor or without one, and with `additions` (modules, see there)."""
-    law = VolumeFloor(LAWS[name]) if volume_floor else LAWS[name]
+    law = VolumeFloor(lane_law(name)) if volume_floor else lane_law(name)
     return WithAdditions(law, additions) if additions else law
+
+
+_made: "WeakKeyDictionary[Law, EnergyLaw]" = WeakKeyDictionary()  # each is compiled once
+
+
+def lane_law(name: str) -> Any:
+    """The law of a name in lanes."""
+    law = laws.LAWS[name]
+    if law.psi is None:
+        return law.functions or LAWS[name]
+    if law not in _made:
+        _made[law] = lanes_of(law)
+    return _made[law]
 
 
 @ti.func

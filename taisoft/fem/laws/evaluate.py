@@ -8,7 +8,7 @@ import taichi as ti
 
 from taisoft.backend.runtime import kernel, open_kind, open_runtime
 from taisoft.errors import SceneError
-from taisoft.fem.laws import dpk1_projected, law_of, prepare_projected
+from taisoft.fem.laws import dpk1_projected, lane_law, law_of, prepare_projected
 from taisoft.fem.laws.volume_floor import constants as floor_constants
 from taisoft.scene.scene import Material
 
@@ -51,8 +51,9 @@ def _differential(law: ti.template(), projected: ti.template(), lanes: ti.templa
             _store(P, b, law.dpk1(G, law.prepare(G, c), H), lanes)
 
 
-def _checked(law: str, F: np.ndarray, young: float, poisson: float, floor: float):
-    material = Material(law=law, young=young, poisson=poisson, density=1.0, volume_floor=floor)
+def _checked(law: str, F: np.ndarray, floor: float, fibre: tuple, **numbers: float | None):
+    given = {name: value for name, value in numbers.items() if value is not None}
+    material = Material(law=law, volume_floor=floor, **given)
     F = np.asarray(F, dtype=np.float64)
     if F.ndim != 3 or F.shape[1:] != (3, 3) or len(F) == 0:
         raise SceneError(f"F has shape {F.shape}: it must be (k, 3, 3) with k at least 1")
@@ -60,8 +61,9 @@ def _checked(law: str, F: np.ndarray, young: float, poisson: float, floor: float
     if len(bad):
         raise SceneError(f"F[{bad[0]}] is not finite")
     made = law_of(material.law, material.volume_floor > 0.0)
-    p = (law_of(law, False).constants(material.mu, material.lam), floor_constants(floor, material.mu, material.lam))
-    return made, F, np.concatenate(p)
+    constants = lane_law(law).constants(material.mu, material.lam, *material.parameters.values())
+    along = fibre if getattr(lane_law(law), "N_FIBRE", 0) else ()
+    return made, F, np.concatenate([constants, along, floor_constants(floor, material.mu, material.lam)])
 
 
 @contextmanager
@@ -89,14 +91,20 @@ def _from_lanes(data: np.ndarray, k: int) -> np.ndarray:
 
 
 def evaluate_law(
-    law: str, F: np.ndarray, young: float, poisson: float, volume_floor: float = 0.0
+    law: str,
+    F: np.ndarray,
+    young: float | None = None,
+    poisson: float | None = None,
+    volume_floor: float = 0.0,
+    fibre: tuple[float, float, float] = (1.0, 0.0, 0.0),
+    **parameters: float,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Energy density psi (k,) [Pa], 0 at F = I, and first Piola-Kirchhoff stress P (k,3,3) [Pa], in float64.
 
-    F: (k,3,3) deformation gradients; law, young [Pa], poisson, volume_floor: of a `Material`. Raises SceneError on a bad law,
-    number or shape.
+    F: (k,3,3) deformation gradients; law, young [Pa], poisson, volume_floor, parameters: of a `Material`; fibre: the unit
+    direction of a law with I4. Raises SceneError on a bad law, number or shape.
     """
-    law_module, F, p = _checked(law, F, young, poisson, volume_floor)
+    law_module, F, p = _checked(law, F, volume_floor, fibre, young=young, poisson=poisson, **parameters)
     with _double_precision() as lanes:
         lane_F = _to_lanes(F, lanes)
         P, psi = np.empty_like(lane_F), np.empty((len(lane_F), lanes))
@@ -105,12 +113,45 @@ def evaluate_law(
 
 
 def evaluate_differential(
-    law: str, F: np.ndarray, dF: np.ndarray, young: float, poisson: float, projected: bool = False, volume_floor: float = 0.0
+    law: str,
+    F: np.ndarray,
+    dF: np.ndarray,
+    young: float | None = None,
+    poisson: float | None = None,
+    projected: bool = False,
+    volume_floor: float = 0.0,
+    fibre: tuple[float, float, float] = (1.0, 0.0, 0.0),
+    **parameters: float,
 ) -> np.ndarray:
     """Stress differential dP (k,3,3) [Pa] along dF (k,3,3), in float64; projected: use the positive semi-definite part."""
-    law_module, F, p = _checked(law, F, young, poisson, volume_floor)
+    law_module, F, p = _checked(law, F, volume_floor, fibre, young=young, poisson=poisson, **parameters)
     with _double_precision() as lanes:
         lane_F, D = _to_lanes(F, lanes), _to_lanes(np.array(np.broadcast_to(dF, F.shape), dtype=np.float64), lanes)
         P = np.empty_like(lane_F)
         _differential(law_module, projected, lanes, lane_F, p, D, P)
     return _from_lanes(P, len(F)).copy()
+
+
+def evaluate_blocks(law: str, F: np.ndarray, **numbers: float) -> np.ndarray:
+    """Second derivative (k,9,9) [Pa] of psi by the law's `block`, in float64. numbers: as for `evaluate_law`."""
+    law_module, F, p = _checked(law, F, 0.0, (1.0, 0.0, 0.0), **numbers)
+    found = np.empty((len(F), 9, 9))
+    with _double_precision() as lanes:
+        lane_F = _to_lanes(F, lanes)
+        P = np.empty_like(lane_F)
+        for a in range(3):
+            for b in range(3):
+                _block(law_module, a, b, lanes, lane_F, p, P)
+                # entry (i, k): differential of P_ib along e_k (x) e_a
+                found.reshape(-1, 3, 3, 3, 3)[:, :, b, :, a] = _from_lanes(P, len(F))
+    return found
+
+
+@kernel
+def _block(law: ti.template(), a: ti.i32, b: ti.i32, lanes: ti.template(), F: ARRAY, p: ARRAY, P: ARRAY):
+    for n in range(F.shape[0]):
+        G = _load(F, n, lanes)
+        c = [ti.Vector([p[k] for q in ti.static(range(lanes))]) for k in ti.static(range(law.N_CONSTANTS))]
+        ga = [0.0 * G[k] + ti.cast(a == k, ti.i32) for k in ti.static(range(3))]
+        gb = [0.0 * G[k] + ti.cast(b == k, ti.i32) for k in ti.static(range(3))]
+        _store(P, n, law.block(G, law.prepare(G, c), ga, gb), lanes)

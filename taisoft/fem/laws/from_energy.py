@@ -1,0 +1,479 @@
+"""Laws from an energy density: stress, tangent and projection in lanes, differentiated while kernels are traced.
+
+An isotropic law is a function of I1, I2, J and trS, with closed forms of everything from its derivatives by these:
+    P = 2 psi_1 F + 2 psi_2 (I1 F - F C) + psi_J cof F + psi_S R,   C = F^T F,   F = R S,
+or of the principal stretches in the frame of F's SVD. Any other one is differentiated by the nine entries of F, and its second
+derivative is projected by eigenvalues of the 9x9 matrix. The constants p of a law are Lamé's parameters at rest, its own
+numbers, with I4 the fibre direction, and the pressure of mean dilatation if there is one.
+Source of the modes: Smith, de Goes, Kim, "Analytic Eigensystems for Isotropic Distortion Energies", ACM TOG 38(1), 2019.
+"""
+
+from typing import Any
+
+import numpy as np
+import taichi as ti
+
+import taisoft.fem.laws.corotational as corotational
+from taisoft.backend.private import Expr, impl
+from taisoft.backend.tracing import arithmetic, untraced
+from taisoft.fem.laws.projection import clamp_9x9, local_array, upper
+from taisoft.fem.math3 import (
+    cofactor,
+    cofactor_differential,
+    cross,
+    ddot,
+    dot,
+    matmul,
+    matmul_nt,
+    matmul_tn,
+    signed_svd,
+    transform,
+)
+from taisoft.scene.jets import Jet, Space
+from taisoft.scene.law import HOOKE, INVARIANTS, PAIRS, Law, fixed_matrix, invariants, jets_of_F, of_stretches, stretch_modes
+
+UPPER = [(i, j) for i in range(9) for j in range(i, 9)]  # of a symmetric 9x9 matrix
+
+
+class Lanes(Space):
+    """SIMD lanes of a kernel that is being traced, as values."""
+
+    log, exp, sqrt, tanh, select = (staticmethod(getattr(ti, name)) for name in ("log", "exp", "sqrt", "tanh", "select"))
+    power = staticmethod(lambda x, n: x**n)
+
+    def __init__(self, like: Expr, order: int):
+        """like: a vector of lanes, which gives the precision."""
+        super().__init__(order)
+        self._real = like.element_type()
+        self.eps = float(np.finfo(np.float64 if self._real == ti.f64 else np.float32).eps)
+
+    def constant(self, value: float) -> Expr:
+        """A literal would have the precision of Taichi's default."""
+        return Expr(float(value), dtype=self._real)
+
+    def bind(self, value: Any) -> Any:
+        """A variable of the kernel."""
+        return impl.expr_init(value) if isinstance(value, Expr) else value
+
+
+class EnergyLaw:
+    """What the laws from an energy density share. Compared by identity, as the modules of other laws are."""
+
+    SOFTENS_BELOW = 0.0
+    POINT_SECONDS = 60e-9  # per quadrature point of an explicit step, on one core
+
+    def __init__(self, law: Law):
+        self.law, self.NAME = law, law.name
+        self.names = (*HOOKE, *law.parameters)
+        self.N_FIBRE = 3 if "I4" in law.arguments else 0
+        self.N_CONSTANTS = len(self.names) + self.N_FIBRE
+        if law.dilatation is None:
+            self.dilatation = self.dilatation_gradient = None
+
+    def constants(self, mu: float | np.ndarray, lam: float | np.ndarray, *own: float | np.ndarray) -> tuple:
+        """Lamé's parameters at rest, and the law's own numbers."""
+        return mu, lam, *own
+
+    def _numbers(self, p: list) -> tuple[dict[str, Any], Any]:
+        """Numbers by name, and the pressure or None."""
+        return dict(zip(self.names, p)), p[self.N_CONSTANTS] if len(p) > self.N_CONSTANTS else None
+
+    def _at_rest(self, space: Space, p: list) -> Any:
+        """psi at F = I, which is counted as 0."""
+        one = space.fixed(1.0)
+        rest = fixed_matrix(space, [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0])
+        known = {"F": rest, "J": one, "I1": 3.0 * one, "I2": 3.0 * one, "I4": one, "stretches": [one, one, one], "trS": 3.0 * one}
+        return self.law.energy(space, known, self._numbers(p)[0]).value
+
+    def _volume(self, F: list, order: int) -> Jet:
+        space = Lanes(F[0], order)
+        return self.law.dilatation(space.variable(space.bind(dot(F, cofactor(F))), 0))
+
+    @untraced
+    def dilatation(self, F):
+        """theta(J)."""
+        return self._volume(F, 0).value + 0.0 * F[0]
+
+    @untraced
+    def dilatation_gradient(self, F):
+        """Derivative of `dilatation` by F."""
+        theta = self._volume(F, 1)
+        return scaled(theta.first.get(0, 0.0) + 0.0 * F[0], cofactor(F))
+
+
+class InvariantLaw(EnergyLaw):
+    """A law of I1, I2, J and trS, by whose numbers 0 to 3 derivatives are known."""
+
+    def __init__(self, law: Law):
+        super().__init__(law)
+        space = Space()
+        rest = {name: space.variable(value, k) for k, (name, value) in enumerate(zip(INVARIANTS, (3.0, 3.0, 1.0, 3.0)))}
+        psi = law.energy(space, rest, law.sample())
+        self.uses, self.pairs = set(psi.first), set(psi.second)  # derivatives that are not 0 for every F
+
+    def _energy(self, F_or_s: list, p: list, order: int) -> tuple[Jet, Lanes]:
+        space = Lanes(F_or_s[0], order)
+        if len(F_or_s) == 9:
+            values = invariants_of(F_or_s)
+            if 3 in self.uses:
+                values = [*values, ddot(corotational.rotation(F_or_s), F_or_s)]
+        else:
+            a, b, c = (one * one for one in F_or_s)
+            trace = F_or_s[0] + F_or_s[1] + F_or_s[2]
+            values = [a + b + c, a * b + a * c + b * c, F_or_s[0] * F_or_s[1] * F_or_s[2], trace]
+        used = {name: space.variable(space.bind(value), k) for k, (name, value) in enumerate(zip(INVARIANTS, values))}
+        return self.law.energy(space, used, *self._numbers(p)), space
+
+    @untraced
+    def psi(self, F, p):
+        """Energy density [Pa], 0 at rest."""
+        psi, space = self._energy(F, p, 0)
+        return psi.value - self._at_rest(space, p) + 0.0 * F[0]
+
+    @untraced
+    def pk1(self, F, p):
+        """First Piola-Kirchhoff stress [Pa]."""
+        psi, _ = self._energy(F, p, 1)
+        G = cofactor(F)
+        gradients = {0: F, 1: second_gradient(F) if 1 in self.uses else None, 2: G}
+        gradients[3] = corotational.rotation(F) if 3 in self.uses else None
+        total = None
+        for k, factor in psi.first.items():
+            factor = (2.0 if k == 0 else 1.0) * factor + 0.0 * F[0]
+            total = scaled(factor, gradients[k]) if total is None else add_scaled(total, factor, gradients[k])
+        return total
+
+    @untraced
+    def prepare(self, F, p):
+        """Precompute for `dpk1` and `block`: derivatives of psi, then the gradients of the invariants, I1, C and B."""
+        psi, space = self._energy(F, p, 2)
+        zero = space.bind(0.0 * F[0])
+        first = [space.bind(psi.first.get(k, 0.0) + zero) for k in range(4)]
+        second = [space.bind(psi.second.get(pair, 0.0) + zero) for pair in SECOND]
+        turned = corotational.prepare(F, [zero, zero])[:18] if 3 in self.uses else []
+        quadratic = [*second_gradient(F), *matmul_tn(F, F), *matmul_nt(F, F)] if 1 in self.uses else []
+        return first + second + cofactor(F) + turned + quadratic
+
+    def _parts(self, S: list) -> tuple[list, list, list, list, list]:
+        """From `prepare`: gradients of the invariants, up to factors; factors of `corotational.dpk1` that leave dR; C and B."""
+        zero = 0.0 * S[0]
+        G, at = S[14:23], 41 if 3 in self.uses else 23
+        turned = S[23:41] + [zero, zero, zero + 1.0]
+        return [S, S[at : at + 9], G, S[23:32]], turned, S[at + 9 : at + 18], S[at + 18 : at + 27]
+
+    def _coupled(self, k: int, S: list) -> list[tuple[int, Any]]:
+        """The invariants l with which psi couples invariant k, and psi_kl."""
+        pairs = [(l, (min(k, l), max(k, l))) for l in range(4)]
+        return [(l, S[4 + SECOND.index(pair)]) for l, pair in pairs if pair in self.pairs]
+
+    @untraced
+    def dpk1(self, F, S, D):
+        """Differential of the stress along D [Pa], with S = prepare(F, p)."""
+        gradients, turned, C, _ = self._parts(S)
+        gradients[0] = F
+        total = scaled(2.0 * S[0], D)
+        if 2 in self.uses:
+            total = add_scaled(total, S[2], cofactor_differential(F, D))
+        if 1 in self.uses:
+            total = add_scaled(total, S[1], second_gradient_differential(F, C, D))
+        if 3 in self.uses:
+            total = add_scaled(total, S[3], corotational.dpk1(F, turned, D))
+        for k in range(4):
+            terms = [FACTORS[k] * FACTORS[l] * factor * ddot(gradients[l], D) for l, factor in self._coupled(k, S)]
+            if terms:
+                total = add_scaled(total, sum(terms[1:], terms[0]), gradients[k])
+        return total
+
+    @untraced
+    def block(self, F, S, ga, gb):
+        """Differential of (P g_b)_i along the displacement gradient e_k (x) g_a: nine entries (i, k) [Pa/m^2]."""
+        gradients, turned, C, B = self._parts(S)
+        gradients[0] = F
+        diagonal = 2.0 * S[0] * dot(ga, gb)
+        coupled = [k for k in range(4) if self._coupled(k, S)]
+        a, b = ({k: scaled3(FACTORS[k], transform(gradients[k], g)) for k in coupled} for g in (ga, gb))
+        total = [0.0 * diagonal] * 9
+        for k in coupled:
+            total = add_outer(total, b[k], combined([(factor, a[l]) for l, factor in self._coupled(k, S)]))
+        if 1 in self.uses:
+            total = add_block_of_I2(total, F, C, B, S[1], ga, gb)
+        if 3 in self.uses:
+            total = add_scaled(total, S[3], corotational.block(F, turned, ga, gb))
+        return add_block_of_J(total, diagonal, transform(F, cross(ga, gb)), S[2])
+
+    @untraced
+    def hessian_eigen(self, s, p):
+        """Second derivatives in the SVD frame [Pa], over the stretches s: see `projection`."""
+        psi, space = self._energy(s, p, 2)
+        zero = space.bind(0.0 * s[0])
+        f = [space.bind(psi.first.get(k, 0.0) + zero) for k in range(4)]
+        squares = [space.bind(one * one) for one in s]
+        I1 = squares[0] + squares[1] + squares[2]
+        gradient = [
+            [2.0 * s[i] for i in range(3)],
+            [2.0 * s[i] * (I1 - squares[i]) for i in range(3)],
+            [s[1] * s[2], s[0] * s[2], s[0] * s[1]],
+            [zero + 1.0] * 3,
+        ]
+        A = []
+        for i in range(3):
+            for j in range(3):
+                if i == j:
+                    entry = 2.0 * f[0] + 2.0 * f[1] * (I1 - squares[i])
+                else:
+                    entry = 4.0 * f[1] * s[i] * s[j] + f[2] * s[3 - i - j]
+                for k, l in psi.second:
+                    product = gradient[k][i] * gradient[l][j]
+                    entry = entry + psi.second[k, l] * (product if k == l else product + gradient[l][i] * gradient[k][j])
+                A.append(space.bind(entry))
+        symmetric, antisymmetric = [], []
+        for i, j in PAIRS:
+            common, other = 2.0 * f[0] + 2.0 * f[1] * (I1 - squares[i] - squares[j]), f[2] * s[3 - i - j]
+            mixed = 2.0 * f[1] * s[i] * s[j] + other
+            symmetric.append(space.bind(common - mixed))
+            turning = 2.0 * f[3] / ti.max(s[i] + s[j], 1e-12 * (s[0] + 1e-18)) if 3 in self.uses else 0.0
+            antisymmetric.append(space.bind(common + mixed + turning))
+        return A, symmetric, antisymmetric
+
+
+SECOND = [(k, l) for k in range(4) for l in range(k, 4)]  # pairs of invariants
+FACTORS = (2.0, 1.0, 1.0, 1.0)  # of F, I1 F - F C times 2, cof F and R in the gradients of the invariants
+
+
+class StretchLaw(EnergyLaw):
+    """A law of the principal stretches."""
+
+    POINT_SECONDS = 300e-9
+
+    @untraced
+    def hessian_eigen(self, s, p):
+        """Second derivatives in the SVD frame [Pa], over the stretches s: see `projection`."""
+        space = Lanes(s[0], 2)
+        return stretch_modes(space, of_stretches(self.law, space, *self._numbers(p)), s)[1:]
+
+    @untraced
+    def psi(self, F, p):
+        """Energy density [Pa], 0 at rest."""
+        space, s = Lanes(F[0], 0), svd_of(F)[9:12]
+        value = of_stretches(self.law, space, *self._numbers(p))([space.fixed(one) for one in s]).value
+        return value - self._at_rest(space, p) + 0.0 * F[0]
+
+    @untraced
+    def pk1(self, F, p):
+        """First Piola-Kirchhoff stress [Pa]."""
+        frame, space = svd_of(F), Lanes(F[0], 1)
+        U, s, V = frame[:9], frame[9:12], frame[12:]
+        energy = of_stretches(self.law, space, *self._numbers(p))
+        psi = energy([space.variable(one, k) for k, one in enumerate(s)])
+        first = [space.bind(psi.first.get(k, 0.0) + 0.0 * F[0]) for k in range(3)]
+        return matmul_nt([U[3 * i + k] * first[k] for i in range(3) for k in range(3)], V)
+
+    @untraced
+    def prepare(self, F, p):
+        """Precompute for `dpk1` and `block`: U, V, and the modes."""
+        frame = svd_of(F)
+        A, symmetric, antisymmetric = self.hessian_eigen(frame[9:12], p)
+        return frame[:9] + frame[12:] + A + symmetric + antisymmetric
+
+    @untraced
+    def dpk1(self, F, S, D):
+        """Differential of the stress along D [Pa], with S = prepare(F, p)."""
+        return differential_of_modes(S, D)
+
+    @untraced
+    def block(self, F, S, ga, gb):
+        """Differential of (P g_b)_i along the displacement gradient e_k (x) g_a: nine entries (i, k) [Pa/m^2]."""
+        columns = []
+        for k in range(3):
+            T = self.dpk1(F, S, [ga[c] if r == k else 0.0 * ga[c] for r in range(3) for c in range(3)])
+            columns.append(transform(T, gb))
+        return [columns[k][i] for i in range(3) for k in range(3)]
+
+
+class GeneralLaw(EnergyLaw):
+    """Any other law: a function of F, or of I4 and others."""
+
+    POINT_SECONDS = 300e-9
+
+    def _energy(self, F: list, p: list, order: int) -> tuple[Jet, Lanes]:
+        space, (numbers, pressure) = Lanes(F[0], order), self._numbers(p)
+        return self.law.energy(space, invariants(self.law, jets_of_F(space, F), self._fibre(space, p)), numbers, pressure), space
+
+    def _fibre(self, space: Lanes, p: list) -> list:
+        return [space.fixed(one) for one in p[len(self.names) : self.N_CONSTANTS]]
+
+    @untraced
+    def given(self, F, D, p):
+        """The given stress, or its given differential along D if that is not None [Pa]."""
+        space = Lanes(F[0], 0)
+        values = self.law.stress(space, F, D, self._numbers(p)[0], self._fibre(space, p))
+        return [space.bind(one + 0.0 * F[0]) for one in values]
+
+    @untraced
+    def psi(self, F, p):
+        """Energy density [Pa], 0 at rest."""
+        psi, space = self._energy(F, p, 0)
+        return psi.value - self._at_rest(space, p) + 0.0 * F[0]
+
+    @untraced
+    def pk1(self, F, p):
+        """First Piola-Kirchhoff stress [Pa]."""
+        if self.law.pk1 is not None:
+            return self.given(F, None, p)
+        psi, space = self._energy(F, p, 1)
+        return [space.bind(psi.first.get(k, 0.0) + 0.0 * F[0]) for k in range(9)]
+
+    @untraced
+    def prepare(self, F, p):
+        """Precompute for `dpk1` and `block`: the upper triangle of the second derivative."""
+        if self.law.pk1 is not None:
+            return tangent(self, F, p)
+        psi, space = self._energy(F, p, 2)
+        return [space.bind(psi.second.get(pair, 0.0) + 0.0 * F[0]) for pair in UPPER]
+
+    @untraced
+    def dpk1(self, F, S, D):
+        """Differential of the stress along D [Pa], with S = prepare(F, p)."""
+        return self.dpk1_projected(S, D)
+
+    @untraced
+    def block(self, F, S, ga, gb):
+        """Differential of (P g_b)_i along the displacement gradient e_k (x) g_a: nine entries (i, k) [Pa/m^2]."""
+        entries = []
+        for i in range(3):
+            for k in range(3):
+                rows = [dot([S[upper(3 * i + j, 3 * k + l)] for l in range(3)], ga) for j in range(3)]
+                entries.append(dot(rows, gb))
+        return entries
+
+    @untraced
+    def prepare_projected(self, F, p):
+        """The upper triangle of the second derivative's positive semi-definite part."""
+        return clamp_9x9(self.prepare(F, p))
+
+    @untraced
+    def dpk1_projected(self, S, D):
+        """Stress differential along D [Pa], with S = prepare_projected(F, p)."""
+        return [ddot([S[upper(i, j)] for j in range(9)], D) for i in range(9)]
+
+
+def lanes_of(law: Law) -> EnergyLaw:
+    """The functions in lanes of a law that is given by its energy density."""
+    if not law.is_isotropic:
+        return GeneralLaw(law)
+    return StretchLaw(law) if "stretches" in law.arguments else InvariantLaw(law)
+
+
+@ti.func
+def tangent(law: ti.template(), F, p):
+    """The upper triangle of the second derivative from the given differential, a column at a time, which compiles faster."""
+    store = local_array(F[0][0], [0.0] * (81 * ti.static(F[0].n)))
+    for column in range(9):
+        D = [0.0 * F[k] + ti.cast(column == k, ti.i32) for k in ti.static(range(9))]
+        T = law.given(F, D, p)
+        for k in ti.static(range(9)):
+            for q in ti.static(range(F[0].n)):
+                store[(9 * column + k) * F[0].n + q] = T[k][q]
+    return [
+        ti.Vector([store[(9 * j + i) * F[0].n + q] for q in ti.static(range(F[0].n))])
+        for i in ti.static(range(9))
+        for j in ti.static(range(i, 9))
+    ]
+
+
+@ti.func
+def svd_of(F):
+    """U, s and V of the signed SVD in one list."""
+    U, s, V = signed_svd(F, 5)
+    return U + s + V
+
+
+@arithmetic
+def invariants_of(F):
+    """I1, I2 and J."""
+    C = matmul_tn(F, F)
+    I1 = C[0] + C[4] + C[8]
+    return [I1, 0.5 * (I1 * I1 - ddot(C, C)), dot(F, cofactor(F))]
+
+
+@arithmetic
+def second_gradient(F):
+    """Derivative of I2 by F, 2 (I1 F - F C)."""
+    C = matmul_tn(F, F)
+    FC = matmul(F, C)
+    I1 = C[0] + C[4] + C[8]
+    return [2.0 * (I1 * F[k] - FC[k]) for k in ti.static(range(9))]
+
+
+@arithmetic
+def second_gradient_differential(F, C, D):
+    """Its change along D."""
+    I1 = C[0] + C[4] + C[8]
+    change = 2.0 * ddot(F, D)
+    DC, B = matmul(D, C), matmul_tn(D, F)
+    E = [B[3 * i + j] + B[3 * j + i] for i in ti.static(range(3)) for j in ti.static(range(3))]
+    FE = matmul(F, E)
+    return [2.0 * (change * F[k] + I1 * D[k] - DC[k] - FE[k]) for k in ti.static(range(9))]
+
+
+@arithmetic
+def scaled(a, A):
+    """a A, nine entries."""
+    return [a * A[k] for k in ti.static(range(9))]
+
+
+@arithmetic
+def scaled3(a, x):
+    """a x, three entries."""
+    return [a * x[k] for k in ti.static(range(3))]
+
+
+@arithmetic
+def add_scaled(A, b, B):
+    """A + b B."""
+    return [A[k] + b * B[k] for k in ti.static(range(9))]
+
+
+@arithmetic
+def add_outer(A, x, y):
+    """A + x y^T."""
+    return [A[k] + x[k // 3] * y[k % 3] for k in ti.static(range(9))]
+
+
+@untraced
+def combined(terms):
+    """Sum of factors times 3-vectors."""
+    return [sum((c * x[k] for c, x in terms[1:]), terms[0][0] * terms[0][1][k]) for k in range(3)]
+
+
+@arithmetic
+def add_block_of_I2(K, F, C, B, a, ga, gb):
+    """K plus a times the part of `block` that comes from the change of the gradient of I2. B: F F^T."""
+    Fa, Fb, c = transform(F, ga), transform(F, gb), dot(ga, gb)
+    d = (C[0] + C[4] + C[8]) * c - dot(ga, transform(C, gb))
+    return [
+        K[k]
+        + 2.0 * a * (2.0 * Fb[k // 3] * Fa[k % 3] - Fa[k // 3] * Fb[k % 3] - c * B[k] + (d if ti.static(k % 4 == 0) else 0.0))
+        for k in ti.static(range(9))
+    ]
+
+
+@arithmetic
+def add_block_of_J(K, d, t, a):
+    """K + d I plus a times the part that comes from the change of cof F. t: F (ga x gb)."""
+    w = [a * t[k] for k in ti.static(range(3))]
+    return [K[0] + d, K[1] - w[2], K[2] + w[1], K[3] + w[2], K[4] + d, K[5] - w[0], K[6] - w[1], K[7] + w[0], K[8] + d]
+
+
+@arithmetic
+def differential_of_modes(S, D):
+    """U Y V^T with Y from X = U^T D V by the modes. S: U, V, the block (9), symmetric (3) and antisymmetric (3) eigenvalues."""
+    U, V = [S[k] for k in ti.static(range(9))], [S[9 + k] for k in ti.static(range(9))]
+    UD = matmul_tn(U, D)
+    X = matmul(UD, V)
+    d = [S[18 + 3 * i] * X[0] + S[19 + 3 * i] * X[4] + S[20 + 3 * i] * X[8] for i in ti.static(range(3))]
+    a = [0.5 * S[27 + k] * (X[3 * i + j] + X[3 * j + i]) for k, i, j in ti.static(((0, 0, 1), (1, 0, 2), (2, 1, 2)))]
+    b = [0.5 * S[30 + k] * (X[3 * i + j] - X[3 * j + i]) for k, i, j in ti.static(((0, 0, 1), (1, 0, 2), (2, 1, 2)))]
+    Y = [d[0], a[0] + b[0], a[1] + b[1], a[0] - b[0], d[1], a[2] + b[2], a[1] - b[1], a[2] - b[2], d[2]]
+    UY = matmul(U, Y)
+    return matmul_nt(UY, V)
