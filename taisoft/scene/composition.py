@@ -88,6 +88,8 @@ class Composition:
         """Young's modulus [Pa] and Poisson's ratio (2, m) at rest, where a law has parameters."""
         moduli = np.array([[getattr(one, name) for one in self.materials.values()] for name in MODULI])
         moduli = moduli[:, self._row] if self.has_regions else np.repeat(moduli, self.mesh.n_tets, axis=1)
+        for row, name in zip(moduli, MODULI):
+            row[:] = self.by_tet.get(name, row)
         for name in self.laws:
             law, tets = LAWS[name], self.tets_of_law(name)
             own = {one: np.broadcast_to(self.number(one), self.mesh.n_tets)[tets] for one in law.parameters}
@@ -169,8 +171,8 @@ class Composition:
         return made
 
     def _is_foreign(self, name: str, material: Material) -> bool:
-        """Whether a number is a parameter of another region's law, and not of this material's."""
-        return name in self.parameters and name not in material.parameters
+        """Whether a number belongs to another region's law, and not to this material's."""
+        return name in self.tet_numbers and name not in (*LAWS[material.law].numbers, "density")
 
     def _check_moduli(self, what: str) -> None:
         """Raise SceneError if parameters by tet make a law unstable at rest."""
@@ -182,6 +184,9 @@ class Composition:
 
     def _tet_numbers(self, what: str, name: str, value) -> np.ndarray:
         """Return numbers (m,) of all tets, each of which a `Material` could have."""
+        if self.has_regions and self.parameters and np.shape(value) == (self.mesh.n_tets,):  # it matters where a law has it
+            has = np.array([not self._is_foreign(name, material) for material in self.materials.values()])[self._row]
+            value = np.where(has, value, np.asarray(value)[has][0])
         array = checks.array(value, what, ((self.mesh.n_tets,),))
         own = next((LAWS[law].parameters[name] for law in self.laws if name in LAWS[law].parameters), None)
         if own is not None:

@@ -1,0 +1,388 @@
+"""Laws from an energy density: in kernels they equal their derivatives in NumPy, those written by hand and closed forms; wrong
+ones are refused by name; their numbers reach materials, scenes, files, checkpoints and running simulations.
+"""
+
+import dataclasses
+import types
+import warnings
+
+import numpy as np
+import pytest
+
+import taisoft as ts
+from taisoft.backend.counters import counting
+from taisoft.fem.laws import stable_neo_hookean
+from taisoft.fem.laws.evaluate import evaluate_blocks, evaluate_differential
+from taisoft.scene.law import evaluate
+from taisoft.scene.laws import LAWS, SHIPPED
+from tests.dynamics.scenes import COR, SNH, SVK
+
+RNG = np.random.default_rng(5)
+MODERATE = np.eye(3) + 0.35 * RNG.uniform(-1.0, 1.0, (37, 3, 3))
+STRETCHES = [[1.0, 1.0, 1.0], [1.3, 1.3, 1.3], [1.2, 1.2, 0.8], [1.2, 1.2 + 1e-7, 0.8], [1.2, 0.8, -0.9]]
+SPECIAL = np.array([np.diag(one) for one in STRETCHES])
+EXTREME = np.array([np.zeros((3, 3)), -9.0 * np.eye(3), np.diag([30.0, 0.0, -2.0])])
+ALL = np.concatenate([MODERATE, SPECIAL])
+SHIPPED_NUMBERS = {
+    "mooney_rivlin": {"c1": 0.9, "c2": 0.3, "bulk": 7.0},
+    "gent": {"shear": 1.3, "limit": 5.0, "bulk": 7.0},
+    "fung": {"shear": 1.3, "exponent": 0.7, "bulk": 7.0},
+    "ogden": {"mu1": 0.9, "alpha1": 1.7, "mu2": -0.2, "alpha2": -2.3, "mu3": 0.1, "alpha3": 3.1, "bulk": 7.0},
+}
+
+
+def E(F):
+    return (F.T @ F - np.eye(3)) / 2
+
+
+def svk_of_F(F, mu, lam):
+    return mu * np.trace(E(F) @ E(F)) + lam / 2 * np.trace(E(F)) ** 2
+
+
+def svk_stress(F, mu, lam):
+    return F @ (2 * mu * E(F) + lam * np.trace(E(F)) * np.eye(3))
+
+
+def svk_differential(F, D, mu, lam):
+    dE = (F.T @ D + D.T @ F) / 2
+    return D @ (2 * mu * E(F) + lam * np.trace(E(F)) * np.eye(3)) + F @ (2 * mu * dE + lam * np.trace(dE) * np.eye(3))
+
+
+def holzapfel(I1, I4, J, c, k1, k2, bulk):
+    fibres = np.exp(k2 * np.maximum(I4 - 1, 0) ** 2) - 1
+    return c * (I1 * ts.positive(J) ** (-2 / 3) - 3) + k1 / (2 * k2) * fibres + bulk / 2 * (J - 1) ** 2
+
+
+def neo_hookean(I1, J, mu, lam):
+    m, l = 4 / 3 * mu, lam + 5 / 6 * mu
+    return m / 2 * (I1 - 3) + l / 2 * (J - 1 - m / l + m / (4 * l)) ** 2 - m / 2 * np.log(I1 + 1)
+
+
+OLD = {  # those written by hand again, from their energies alone
+    SVK: lambda I1, I2, mu, lam: mu / 4 * (I1**2 - 2 * I2 - 2 * I1 + 3) + lam / 8 * (I1 - 3) ** 2,
+    COR: lambda I1, trS, mu, lam: mu * (I1 - 2 * trS + 3) + lam / 2 * (trS - 3) ** 2,
+    SNH: neo_hookean,
+}
+
+
+@pytest.fixture(autouse=True)
+def known_laws():
+    """Forget the laws that a test has registered."""
+    before = dict(LAWS)
+    yield
+    LAWS.clear()
+    LAWS.update(before)
+
+
+def tangent(law, F, numbers, projected=False):
+    units = np.eye(9).reshape(9, 3, 3)
+    return np.stack([evaluate_differential(law, F, D, projected=projected, **numbers).reshape(-1, 9) for D in units], axis=-1)
+
+
+def compare_with_numpy(law: str, F, numbers: dict, constants: dict, allowed: float = 1e-12):
+    psi, P, H = evaluate(LAWS[law], F, constants)
+    psi = psi - evaluate(LAWS[law], np.eye(3)[None], constants)[0]
+    found_psi, found_P = ts.evaluate_law(law, F, **numbers)
+    size = np.abs(H).max()
+    assert np.abs(found_psi - psi).max() < allowed * size
+    assert np.abs(found_P - P).max() < allowed * size
+    assert np.abs(tangent(law, F, numbers) - H).max() < 100 * allowed * size
+    assert np.abs(evaluate_blocks(law, F, **numbers) - H).max() < 100 * allowed * size
+    w, Q = np.linalg.eigh(H)
+    clamped = (Q * np.maximum(w, 0.0)[:, None]) @ Q.swapaxes(1, 2)
+    assert w.min() < -0.01 * size  # the projection matters
+    assert np.abs(tangent(law, F, numbers, projected=True) - clamped).max() < 1e-10 * size
+
+
+@pytest.mark.parametrize("law", SHIPPED_NUMBERS)
+def test_shipped_laws_in_kernels_equal_their_derivatives_in_numpy(law):
+    numbers = SHIPPED_NUMBERS[law]
+    ts.check_law(law, **numbers)
+    # two stretches that nearly coincide leave half of the digits of a symmetric mode of principal stretches
+    compare_with_numpy(law, ALL, numbers, numbers, 1e-10 if law == "ogden" else 1e-12)
+    assert np.isfinite(ts.evaluate_law(law, EXTREME, **numbers)[1]).all()
+
+
+@pytest.mark.parametrize("law", OLD)
+def test_the_laws_written_by_hand_follow_from_their_energies(law):
+    ts.register_law("again", OLD[law])
+    numbers = {"young": 3e5, "poisson": 0.35}
+    for found, expected in zip(ts.evaluate_law("again", MODERATE, **numbers), ts.evaluate_law(law, MODERATE, **numbers)):
+        assert np.abs(found - expected).max() < 1e-10 * np.abs(expected).max()
+    for projected in (False, True):
+        found, expected = (tangent(name, MODERATE, numbers, projected) for name in ("again", law))
+        assert np.abs(found - expected).max() < 1e-10 * np.abs(expected).max()
+
+
+def test_general_laws_of_F_of_fibres_and_with_a_given_stress():
+    numbers, lame = {"young": 1.0, "poisson": 0.3}, {"mu": 1 / 2.6, "lam": 0.3 / 0.52}
+    ts.register_law("of_F", svk_of_F)
+    compare_with_numpy("of_F", ALL, numbers, lame)
+    ts.register_law("given", svk_of_F, pk1=svk_stress, dpk1=svk_differential)
+    compare_with_numpy("given", ALL, numbers, lame)
+    ts.register_law("tissue", holzapfel, {"c": "Pa", "k1": "Pa", "k2": "", "bulk": "Pa"})
+    own = {"c": 1.0, "k1": 5.0, "k2": 0.8, "bulk": 6.0}
+    compare_with_numpy("tissue", ALL, own, own)
+    turned = ts.evaluate_law("tissue", MODERATE, fibre=(0.0, 0.6, 0.8), **own)[1]
+    assert np.abs(turned - evaluate(LAWS["tissue"], MODERATE, own, np.array([0.0, 0.6, 0.8]))[1]).max() < 1e-12
+
+
+def free_stretches(stress, s: float, free: tuple[int, ...], F) -> np.ndarray:
+    """Stretches with s given and those of the free axes, equal, such that their stress vanishes: closed forms in pressure."""
+    from scipy.optimize import brentq
+
+    return brentq(lambda t: stress(F(s, t))[free[0]], 0.3, 2.0, xtol=1e-15)
+
+
+STRESSES = {  # principal stresses [Pa] over the principal stretches, by hand
+    "mooney_rivlin": lambda l, J, p: (
+        2 * p["c1"] * J ** (-2 / 3) * (l**2 - np.sum(l**2) / 3) / l
+        + 2 * p["c2"] * J ** (-4 / 3) * (np.sum(l**2) * l**2 - l**4 - 2 / 3 * (J**2 * np.sum(l**-2.0))) / l
+        + p["bulk"] * (J - 1) * J / l
+    ),
+    "gent": lambda l, J, p: (
+        p["shear"]
+        * p["limit"]
+        / (p["limit"] - (np.sum(l**2) * J ** (-2 / 3) - 3))
+        * J ** (-2 / 3)
+        * (l**2 - np.sum(l**2) / 3)
+        / l
+        + p["bulk"] * (J - 1) * J / l
+    ),
+    "fung": lambda l, J, p: (
+        p["shear"] * np.exp(p["exponent"] * (np.sum(l**2) * J ** (-2 / 3) - 3)) * J ** (-2 / 3) * (l**2 - np.sum(l**2) / 3) / l
+        + p["bulk"] * (J - 1) * J / l
+    ),
+    "ogden": lambda l, J, p: (
+        sum(
+            p[f"mu{k}"] * J ** (-p[f"alpha{k}"] / 3) * (l ** p[f"alpha{k}"] - np.mean(l ** p[f"alpha{k}"])) / l for k in (1, 2, 3)
+        )
+        + p["bulk"] * (J - 1) * J / l
+    ),
+}
+
+
+@pytest.mark.parametrize("law", SHIPPED_NUMBERS)
+def test_uniaxial_biaxial_and_shear_follow_the_closed_forms(law):
+    p = SHIPPED_NUMBERS[law]
+    stress = lambda l: STRESSES[law](np.asarray(l), float(np.prod(l)), p)  # noqa: E731
+    for s in (0.8, 1.3):
+        for shape, free in ((lambda s, t: [s, t, t], (1, 2)), (lambda s, t: [s, s, t], (2,))):
+            t = free_stretches(stress, s, free, shape)
+            _, P = ts.evaluate_law(law, np.diag(shape(s, t))[None], **p)
+            assert np.abs(P[0] - np.diag(stress(shape(s, t)))).max() < 1e-8
+            assert np.abs(np.diag(P[0])[list(free)]).max() < 1e-8
+    k = 0.4  # simple shear: principal stretches l, 1/l, 1; the shear stress is (s_1 l - s_2 / l) / (l + 1/l) by Rivlin's relation
+    l = k / 2 + np.sqrt(1 + k**2 / 4)
+    P = ts.evaluate_law(law, np.array([[[1.0, k, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]]), **p)[1][0]
+    principal = stress([l, 1 / l, 1.0])
+    assert abs(P[0, 1] - (principal[0] * l - principal[1] / l) / (l + 1 / l)) < 1e-8
+
+
+def polynomial(I1, J, c1, c2, bulk):
+    return c1 * (I1 - 3 - 2 * np.log(J)) + c2 * (I1 - 3) ** 2 + bulk / 2 * (J - 1) ** 2
+
+
+POLYNOMIAL = {"c1": ts.Parameter("Pa", above=0.0), "c2": "Pa", "bulk": "Pa"}
+
+
+def with_function(**changes) -> types.ModuleType:
+    """Lane functions of stable neo-Hookean, some of them replaced."""
+    module = types.ModuleType("changed")
+    vars(module).update({**vars(stable_neo_hookean), **changes})
+    return module
+
+
+def times(name: str, factor: float):
+    """That function of stable neo-Hookean with a factor."""
+    original = getattr(stable_neo_hookean, name)
+
+    def changed(*arguments):
+        found = original(*arguments)
+        return [factor * one for one in found] if isinstance(found, list) else factor * found
+
+    changed._is_taichi_function = False
+    return changed
+
+
+def wrong_eigenvalues(s, p):
+    A, symmetric, antisymmetric = stable_neo_hookean.hessian_eigen(s, p)
+    return A, antisymmetric, symmetric
+
+
+wrong_eigenvalues._is_taichi_function = False
+SKEWED = np.array([[1.0, 0.3, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+WRONG = {
+    "a psi with half the stress": (
+        {"psi": lambda F, mu, lam: svk_of_F(F, mu, lam) / 2, "pk1": svk_stress, "dpk1": svk_differential},
+        "its stress is not the derivative of psi",
+    ),
+    "stress at rest": ({"psi": lambda I1, c1: c1 * I1, "parameters": {"c1": "Pa"}}, "stress of 2 Pa at rest"),
+    "a tangent times 3": (
+        {"psi": svk_of_F, "pk1": svk_stress, "dpk1": lambda F, D, mu, lam: 3 * svk_differential(F, D, mu, lam)},
+        "its tangent is not the derivative of its stress",
+    ),
+    "a stress that is no gradient": (
+        {
+            "psi": svk_of_F,
+            "pk1": lambda F, mu, lam: svk_stress(F, mu, lam) @ SKEWED,
+            "dpk1": lambda F, D, mu, lam: svk_differential(F, D, mu, lam) @ SKEWED,
+        },
+        "its stress is not the derivative of psi",
+    ),
+    "not objective": ({"psi": lambda F, mu, lam: svk_of_F(F.T, mu, lam) + mu * (F[0, 1] - F[1, 0]) ** 2}, "not objective"),
+    "unstable": (
+        {"psi": lambda I1, J, c1: c1 * (I1 - 3 - 2 * np.log(J)) - 5 * c1 * (J - 1) ** 2, "parameters": {"c1": "Pa"}},
+        "unstable",
+    ),
+    "other moduli": ({"psi": lambda I1, I2, mu, lam: 2 * OLD[SVK](I1, I2, mu, lam)}, "shear modulus at rest is 2 times"),
+    "a dilatation that is none": (
+        {"psi": lambda I1, I2, mu, lam: OLD[SVK](I1, I2, mu, 0), "dilatation": lambda J: J, "modulus": "lam"},
+        "stress of .* at rest",
+    ),
+    "a branch": ({"psi": lambda I1, mu, lam: mu * (I1 - 3) if I1 > 3 else 0.0}, "use np.maximum or np.minimum"),
+    "another function": ({"psi": lambda I1, mu, lam: mu * np.sin(I1 - 3)}, "cannot use numpy.sin"),
+    "a name that does not exist": ({"psi": lambda I1, J, c3: I1, "parameters": {"c1": "Pa"}}, "c3 is no variable"),
+    "a parameter that is not used": ({"psi": polynomial, "parameters": {**POLYNOMIAL, "c4": ""}}, "parameter c4 is not used"),
+    "the name of a number": (
+        {"psi": polynomial, "parameters": {**POLYNOMIAL, "friction": ""}},
+        "cannot be called friction",
+    ),
+    "no modulus": ({"psi": polynomial, "parameters": POLYNOMIAL, "dilatation": lambda J: J - 1}, "dilatation needs a modulus"),
+    "lane functions: psi": ({"functions": with_function(psi=times("psi", 2.0))}, "its stress is not the derivative of psi"),
+    "lane functions: tangent": ({"functions": with_function(dpk1=times("dpk1", 3.0))}, "its tangent is not the derivative"),
+    "lane functions: block": ({"functions": with_function(block=times("block", 1.1))}, "its block is not its differential"),
+    "lane functions: eigenvalues": ({"functions": with_function(hessian_eigen=wrong_eigenvalues)}, "its eigenvalues"),
+}
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_wrong_laws_are_refused_with_what_is_wrong(case):
+    arguments, message = WRONG[case]
+    with pytest.raises(ts.SceneError, match=f"law 'wrong'.*{message}"):
+        ts.register_law("wrong", **arguments)
+    assert "wrong" not in LAWS
+
+
+def test_names_of_the_package_and_values_out_of_range_are_refused():
+    with pytest.raises(ts.SceneError, match="is that of a law of the package"):
+        ts.register_law("gent", OLD[SVK])
+    with pytest.warns(UserWarning, match="'own' is not finite where det F < 0"):
+        found = ts.register_law("own", polynomial, POLYNOMIAL)
+    assert found.is_isotropic and not found.is_finite_inverted
+    numbers = {"c1": 2e4, "c2": 1e3, "bulk": 1e5}
+    for change, message in (
+        ({"c1": -1.0}, "material: c1 must be greater than 0 Pa, not -1"),
+        ({"c1": None}, "material: law own needs c1"),
+        ({"c4": 1.0}, "law own: no parameter is called 'c4'"),
+        ({"young": 1e5}, "young follows from the numbers of law own: c1, c2, bulk"),
+        ({"bulk": -1e5}, "law 'own' is unstable at rest with c1 = 20000, c2 = 1000, bulk = -100000"),
+    ):
+        given = {name: value for name, value in {**numbers, **change}.items() if value is not None}
+        with pytest.raises(ts.SceneError, match=message):
+            ts.Material(law="own", **given)
+    with pytest.raises(ts.SceneError, match="law corotational has no parameters"):
+        ts.Material(law=COR, parameters={"c1": 1.0})
+
+
+def test_moduli_at_rest_follow_from_the_parameters():
+    material = ts.Material(law="mooney_rivlin", c1=2e4, c2=5e3, bulk=1e6, friction=0.1)
+    assert material.mu == pytest.approx(5e4) and material.lam == pytest.approx(1e6 - 2 / 3 * 5e4)
+    assert (material.c1, material.parameters["bulk"], material.friction) == (2e4, 1e6, 0.1)
+    changed = dataclasses.replace(material, c1=4e4)
+    assert changed.mu == pytest.approx(9e4) and changed.friction == 0.1
+    assert dataclasses.replace(material, friction=0.3).c1 == 2e4
+    assert ts.Material(law="ogden", mu1=3e4, alpha1=4.0, bulk=1e6).mu == pytest.approx(6e4)
+
+
+def block(material, **arguments) -> ts.Scene:
+    """A block that is held at its left end and pulled at its right one."""
+    scene = ts.Scene()
+    body = scene.add_body(ts.box_mesh((2, 1, 1), (2, 1, 1)), material, name="block", **arguments)
+    body.fix(lambda X: X[:, 0] < -0.9)
+    body.add_force(lambda X: X[:, 0] > 0.9, (3e4, 1e4, 0))
+    return scene
+
+
+def test_statics_of_a_law_from_its_energy_equal_those_of_the_one_written_by_hand():
+    ts.register_law("again", neo_hookean)
+    for order in (1, 2):
+        found, expected = (
+            ts.solve_static(block(ts.Material(law=law, young=1e5, poisson=0.4), order=order)).positions("block")
+            for law in ("again", SNH)
+        )
+        assert np.abs(found - expected).max() < 1e-9
+        assert np.abs(expected[:, 0].max() - 1.0) > 0.2
+
+
+def test_mean_dilatation_takes_the_volumetric_part():
+    """Of neo-Hookean as psi + lam/2 (J - 1)^2, on patches as the law written by hand."""
+
+    def without_volume(I1, J, mu):
+        return 2 / 3 * mu * (I1 - 3 - np.log((I1 + 1) / 4)) + 5 / 12 * mu * (J - 1) ** 2 - mu * (J - 1)
+
+    ts.register_law("mean", lambda I1, J, mu, lam: without_volume(I1, J, mu), dilatation=lambda J: J - 1, modulus="lam")
+    made = {law: block(ts.Material(law=law, young=1e5, poisson=0.48)) for law in ("mean", SNH)}
+    assert made["mean"].bodies[0].dilatation == "mean"
+    found, expected = (ts.solve_static(scene).positions("block") for scene in made.values())
+    assert np.abs(found - expected).max() < 1e-9
+    rubber = ts.Material(law="mooney_rivlin", c1=2e4, bulk=2e6)
+    local, mean = (ts.solve_static(block(rubber, dilatation=one)).positions("block")[:, 0].max() for one in ("local", "mean"))
+    assert mean > 1.02 * local  # linear tets lock
+
+
+def test_parameters_by_region_and_by_tet_in_files_runs_and_checkpoints(tmp_path):
+    mesh = ts.box_mesh((2, 1, 1), (2, 1, 1))
+    left = mesh.vertices[mesh.tets].mean(axis=1)[:, 0] < 0
+    mesh = ts.TetMesh(mesh.vertices, mesh.tets, regions=np.where(left, 1, 2), region_names={1: "soft", 2: "hard"})
+    materials = {"soft": ts.Material(law="mooney_rivlin", c1=2e4, bulk=1e5), "hard": ts.Material(law=SNH, young=4e5)}
+    c1 = np.where(left, 2e4, np.nan)
+    scene = block(materials[("soft")], parameters={"c1": np.linspace(2e4, 4e4, mesh.n_tets)})
+    scene.add_body(mesh, materials, name="two", position=(0, 5, 0))
+    assert np.array_equal(scene.body("two").young < 2e5, left)
+    ts.write_scene(tmp_path / "scene.toml", scene)
+    again, _ = ts.read_scene(tmp_path / "scene.toml")
+    for name in ("block", "two"):
+        assert np.array_equal(
+            again.body(name).composition.number("c1"), scene.body(name).composition.number("c1"), equal_nan=True
+        )
+        assert again.body(name).composition.materials == scene.body(name).composition.materials
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        with ts.Simulator(scene, dt=0.01, precision="f64") as sim:
+            sim.step()
+            sim.set_material("two", region="soft", c1=3e4)
+            sim.set_material("two", c1=1.5 * c1, young=5e5)
+            with counting() as counts:
+                sim.set_material("block", c1=5e4)
+            assert not counts.compiled
+            with pytest.raises(ts.SceneError, match="c3 cannot change while it runs .did you mean c2"):
+                sim.set_material("block", c3=1.0)
+            with pytest.raises(ts.SceneError, match="c1 of tet 3 .*must|shear modulus"):
+                sim.set_material("block", c1=np.where(np.arange(mesh.n_tets) == 3, -1e5, 1e4))
+            sim.step()
+            sim.save_checkpoint(tmp_path / "saved.npz")
+            sim.step()
+            expected = sim.positions()
+        with ts.Simulator.load_checkpoint(tmp_path / "saved.npz", scene) as sim:
+            assert sim.scene.body("block").composition.number("c1") == 5e4
+            assert np.nanmax(sim.scene.body("two").composition.number("c1")) == 3e4
+            sim.step()
+            assert np.array_equal(sim.positions(), expected)
+
+
+def test_a_law_that_has_changed_does_not_continue_a_checkpoint(tmp_path):
+    ts.register_law("own", neo_hookean)
+    scene = block(ts.Material(law="own", young=1e5))
+    with ts.Simulator(scene, dt=0.01) as sim:
+        sim.step()
+        sim.save_checkpoint(tmp_path / "saved.npz")
+    ts.register_law("own", OLD[SVK])
+    with pytest.raises(ts.SceneError, match="body 'block': order, quadrature, dilatation, law or collision"):
+        ts.Simulator.load_checkpoint(tmp_path / "saved.npz", scene)
+
+
+def test_every_law_of_the_package_passes_the_check():
+    for law in SHIPPED:
+        found = ts.check_law(law.name)
+        assert found.is_isotropic and found.is_finite_inverted
