@@ -35,6 +35,7 @@ WRITES = {
     "startup": ("json",),
     "launches": ("json",),
     "gym": ("json",),
+    "laws": ("json",),
     "pictures": ("json",),
     "window": ("json",),
 }

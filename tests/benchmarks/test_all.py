@@ -32,6 +32,7 @@ from benchmarks import (
     gym,
     hard_runs,
     launches,
+    laws,
     many,
     order,
     path_runs,
@@ -136,6 +137,10 @@ def error_check(n):
     true = {"time": TIME * dt * 15 / 16 + SOLVER, "space": SPACE / n_tets * 63 / 64, "solver": SOLVER}
     for what, value in true.items():
         assert beam["true"][what] == pytest.approx(value / (1.0 + SPACE / n_tets + TIME * dt / 16), rel=1e-6)
+
+
+def laws_small(patch, folder):
+    replace(patch, laws, QUICK_SIZES={"step": (2, 1, 1), "assembly": (2, 1, 1)}, compile_seconds=lambda name: 1.0, STEPS=1)
 
 
 def gym_small(patch, folder):
@@ -288,6 +293,7 @@ RUNS = {
     "launches": Small(
         QUICK, ("| 200 | 2.00 (2.00 to 2.00) | 8.00 (8.00 to 8.00) | 0.25 (0.25 to 0.25) |", "| resting"), launches_small
     ),
+    "laws": Small(QUICK, ("| psi of SNH | stable_neo_hookean |", "| psi of F | st_venant_kirchhoff |"), laws_small),
     "many": Small(QUICK, ("| sums | 6 |", "| killed and called again |", "| met |"), many_small, many_check),
     "order": Small(QUICK, ("| SNH | 1 | 1 | 11x2x2 | 220 | 108 | -2.26758 | 16.3 |",), order_small),
     "paths": Small(("--what", "cost", "--quick"), ("## Cost", "| hanging_beam |", "| met |"), paths_small, paths_check),

@@ -244,10 +244,7 @@ WRONG = {
     "another function": ({"psi": lambda I1, mu, lam: mu * np.sin(I1 - 3)}, "cannot use numpy.sin"),
     "a name that does not exist": ({"psi": lambda I1, J, c3: I1, "parameters": {"c1": "Pa"}}, "c3 is no variable"),
     "a parameter that is not used": ({"psi": polynomial, "parameters": {**POLYNOMIAL, "c4": ""}}, "parameter c4 is not used"),
-    "the name of a number": (
-        {"psi": polynomial, "parameters": {**POLYNOMIAL, "friction": ""}},
-        "cannot be called friction",
-    ),
+    "the name of a number": ({"psi": polynomial, "parameters": {**POLYNOMIAL, "friction": ""}}, "cannot be called friction"),
     "no modulus": ({"psi": polynomial, "parameters": POLYNOMIAL, "dilatation": lambda J: J - 1}, "dilatation needs a modulus"),
     "lane functions: psi": ({"functions": with_function(psi=times("psi", 2.0))}, "its stress is not the derivative of psi"),
     "lane functions: tangent": ({"functions": with_function(dpk1=times("dpk1", 3.0))}, "its tangent is not the derivative"),
