@@ -11,6 +11,7 @@ from taisoft.fem.laws.st_venant_kirchhoff import _green_strain
 from taisoft.fem.math3 import cofactor, cofactor_differential, cross, ddot, dot, matmul, matmul_nt, matmul_tn, transform
 
 NAME = "modified_svk"
+N_CONSTANTS = 4
 SOFTENS_BELOW = 0.6
 POINT_SECONDS = 30e-9
 
