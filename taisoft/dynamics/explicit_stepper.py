@@ -266,8 +266,12 @@ class ExplicitStepper:
         for row in range(n):
             if needs_drift(row):
                 explicit.begin_shared(m, s, row, dt)
+            if s.verlet:
+                self.simulation.move_branches(dt)
             explicit.run_elements(m)
             explicit.end_shared(m, s, row, dt, int(s.verlet and row < n - 1 and not needs_drift(row + 1)))
+            if not s.verlet:
+                self.simulation.move_branches(dt)
         if s.n_held:
             explicit.find_reactions(m, s, dt)
 

@@ -5,9 +5,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from taisoft.attributes import guarded_record
-from taisoft.errors import SceneError
+from taisoft.errors import SceneError, value_text
 from taisoft.scene import checks
 
+MAX_BRANCHES = 8
 MIN_VOLUME_FLOOR = 1e-3  # smaller ones are the rounding of J = det F in f32
 LAWS = ("st_venant_kirchhoff", "corotational", "stable_neo_hookean")
 
@@ -26,6 +27,9 @@ class Material:
     mass_damping: float = 0.0  #: [1/s], >= 0
     stiffness_damping: float = 0.0  #: [s], >= 0
     volume_floor: float = 0.0  #: J = det F below which the law stiffens against inversion, 0.001 to 1; 0 for none
+    branches: tuple[
+        tuple[float, float], ...
+    ] = ()  #: of Maxwell, at most 8: relaxation time [s] and stiffness over the law's mu at rest
 
     def __post_init__(self):
         checks.choice(self.law, "material: law", LAWS)
@@ -41,6 +45,7 @@ class Material:
         }
         numbers = {k: checks.number(getattr(self, k), f"material: {k}", **limit) for k, limit in limits.items()}
         checks.store(self, **numbers)
+        checks.store(self, branches=_branches(self.branches))
         if not -1.0 < self.poisson < 0.5:
             raise SceneError(f"material: poisson must lie in the open interval (-1, 0.5), not {self.poisson:g}")
         if self.volume_floor != 0.0 and not MIN_VOLUME_FLOOR <= self.volume_floor < 1.0:
@@ -56,6 +61,19 @@ class Material:
     def lam(self) -> float:
         """Lamé's first parameter [Pa]."""
         return lame_parameters(self.young, self.poisson)[1]
+
+
+def _branches(given) -> tuple[tuple[float, float], ...]:
+    rule = f"must be at most {MAX_BRANCHES} pairs (relaxation time, fraction)"
+    if not isinstance(given, (list, tuple)) or len(given) > MAX_BRANCHES:
+        raise SceneError(f"material: branches {rule}, not {value_text(given)}")
+    found = []
+    for k, pair in enumerate(given):
+        if not isinstance(pair, (list, tuple)) or len(pair) != 2:
+            raise SceneError(f"material: branches {rule}, not {value_text(pair)} in branch {k}")
+        named = zip(("relaxation time", "fraction"), pair, ("s", ""))
+        found.append(tuple(checks.number(x, f"material: {name} of branch {k}", above=0.0, unit=unit) for name, x, unit in named))
+    return tuple(found)
 
 
 def lame_parameters(young: float | np.ndarray, poisson: float | np.ndarray) -> tuple[float | np.ndarray, float | np.ndarray]:
