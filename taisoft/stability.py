@@ -1,8 +1,8 @@
 """Linear vibration about the rest shape: Hooke stiffness, highest frequency, stable steps, eigenmodes. NumPy and SciPy.
 
 All three laws linearise to Hooke's law at F = I, so they share one stiffness: sigma = 2 mu eps + lambda tr(eps) I. With mean
-dilatation tr(eps) is averaged over patches. Explicit steps also resolve what a volume floor adds to flat tets, and Maxwell branches. Modes are those of
-relaxed branches.
+dilatation tr(eps) is averaged over patches. Explicit steps also resolve what a volume floor adds to flat tets, and Maxwell
+branches, which are relaxed in modes.
 """
 
 from typing import NamedTuple
@@ -289,8 +289,9 @@ class Modes(NamedTuple):
 def modes(scene: Scene, k: int, mass: str = "lumped") -> Modes:
     """The lowest k eigenfrequencies [Hz] and shapes of a scene at rest, with its constraints; rigid motions count as 0 Hz.
 
-    mass: "lumped" or "consistent". Maxwell branches are relaxed. Springs and tendons act as they do at the start: an elastic tendon that is slack there does
-    not. Raises SceneError for an invalid k or mass, and for an inextensible tendon, whose tension there is unknown.
+    mass: "lumped" or "consistent". Maxwell branches are relaxed. Springs and tendons act as they do at the start: an elastic
+    tendon that is slack there does not. Raises SceneError for an invalid k or mass, and for an inextensible tendon, whose tension
+    there is unknown.
     """
     if mass not in ("lumped", "consistent"):
         raise SceneError(f"mass '{mass}' is unknown: it must be 'lumped' or 'consistent'")

@@ -87,7 +87,7 @@ class SimulationState:
         upload([(self.model.state.x, x), (self.model.state.v, v)])
 
     def begin_branches(self, h: float) -> None:
-        """Let the stresses of Maxwell branches be those at the end of an interval h [s] from their history on; 0: at its start."""
+        """Let Maxwell branches have their stresses at the end of an interval h [s], which begins at their history."""
         if self.model.viscous:
             viscosity.begin_interval(self.model, h)
 

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 import taichi as ti
 
-from taisoft.backend.arrays import Array, Count
+from taisoft.backend.arrays import Count
 from taisoft.backend.runtime import kernel
 from taisoft.backend.tracing import arithmetic
 from taisoft.fem import reference

@@ -1,4 +1,4 @@
-"""Maxwell branches over a step: an addition to a law (see `additions`), whose constants follow from the history (`fem.viscosity`).
+"""Maxwell branches over a step: an addition to a law (see `additions`), with constants from their history (`fem.viscosity`).
 
     psi = mu' |dev E - Z|^2 + c,   P = F S,   S = 2 mu' (dev E - Z),   E = (F^T F - I)/2,
 which is St. Venant-Kirchhoff's law with lambda = -2/3 mu' about the strain Z. The projected differential of P is

@@ -1,0 +1,183 @@
+"""Maxwell branches: the addition to a law is consistent, objective and projected for every F; branches relax and dissipate exactly
+between given strains, in every kind of element, and volumes stay elastic; bad branches are refused; files, plan, `stable_dt`,
+modes and statics know them.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+import taisoft as ts
+from taisoft.fem.laws import evaluate, law_of
+from taisoft.fem.laws import viscosity as addition
+from taisoft.fem.laws.additions import WithAdditions
+from taisoft.fem.terms.elasticity import cauchy_stress
+from taisoft.scene.fingerprint import scene_digest
+from taisoft.scene.material import lame_parameters
+from taisoft.scene.plan import make_plan
+from taisoft.stability import stable_dt
+from tests.dynamics.scenes import SNH, SVK, cube, dynamics, halved, rubber, set_state
+from tests.fem.test_laws import MODERATE
+from tests.scene.toml_scenes import there_and_back
+
+BRANCHES = ((0.1, 0.5), (0.02, 0.3))
+MU, LAM = lame_parameters(1e5, 0.3)
+SHEAR = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
+
+
+@dataclass(frozen=True)
+class Branched(WithAdditions):
+    """A law with the addition, whose constants are given."""
+
+    @property
+    def N_CONSTANTS(self) -> int:
+        """Of both."""
+        return self.law.N_CONSTANTS + addition.N_CONSTANTS
+
+
+def at_points(F, p, D=None, projected: bool = False):
+    """psi (k,) and P (k,3,3), or the differential along D (k,3,3), of the law and the addition with constants p."""
+    law = Branched(law_of(SNH, False), (addition,))
+    constants = np.array([*law.law.constants(MU, LAM), *p], dtype=np.float64)
+    with evaluate._double_precision() as lanes:
+        blocks = evaluate._to_lanes(np.asarray(F), lanes)
+        P, psi = np.empty_like(blocks), np.empty((len(blocks), lanes))
+        if D is None:
+            evaluate._evaluate(law, lanes, blocks, constants, psi, P)
+        else:
+            evaluate._differential(law, projected, lanes, blocks, constants, evaluate._to_lanes(D, lanes), P)
+    return psi.reshape(-1)[: len(F)], evaluate._from_lanes(P, len(F))
+
+
+def test_the_addition_is_consistent_objective_and_projected():
+    rng = np.random.default_rng(1)
+    p, F, D, h = [3e4, 7.0, 0.3, -0.2, -0.1, 0.15, -0.3, 0.2], MODERATE, rng.standard_normal(MODERATE.shape), 1e-6
+    psi, P = at_points(F, p)
+    ends = [at_points(F + s * h * D, p) for s in (1, -1)]
+    scale = 1e5 * (1.0 + np.abs(F).max(axis=(1, 2))) ** 3
+    assert (np.abs((ends[0][0] - ends[1][0]) / (2 * h) - np.einsum("kij,kij->k", P, D)) < 1e-5 * scale).all()
+    exact = at_points(F, p, D)[1]
+    assert (np.abs((ends[0][1] - ends[1][1]) / (2 * h) - exact) < 1e-5 * scale[:, None, None]).all()
+    R = np.linalg.qr(rng.standard_normal((3, 3)))[0]
+    assert np.allclose(at_points(np.linalg.det(R) * R @ F, p)[0], psi, rtol=1e-9)
+    projected = at_points(F, p, D, projected=True)[1]
+    assert (np.einsum("kij,kij->k", projected, D) >= -1e-9 * scale).all()
+    # without stress in the branches the addition is its own projection
+    E = 0.5 * (F[:1].transpose(0, 2, 1) @ F[:1] - np.eye(3))
+    Z = (E - np.trace(E[0]) / 3.0 * np.eye(3))[0]
+    free = [3e4, 0.0, Z[0, 0], Z[1, 1], Z[2, 2], Z[1, 2], Z[0, 2], Z[0, 1]]
+    added = [
+        at_points(F[:1], free, D[:1], q)[1] - evaluate.evaluate_differential(SNH, F[:1], D[:1], 1e5, 0.3, q)
+        for q in (False, True)
+    ]
+    assert np.allclose(*added, rtol=1e-9, atol=1e-6) and np.abs(added[0]).max() > 1e3
+
+
+def test_branches_are_checked():
+    assert rubber(branches=[[0.1, 1], (2, 0.5)]).branches == ((0.1, 1.0), (2.0, 0.5)) and hash(rubber(branches=BRANCHES))
+    for bad, words in (
+        ([(0.0, 0.5)], "material: relaxation time of branch 0 must be greater than 0 s, not 0"),
+        ([(0.1, 0.5), (0.1, -1.0)], "material: fraction of branch 1 must be greater than 0, not -1"),
+        ([(0.1,)], "material: branches must be at most 8 pairs (relaxation time, fraction), not "),
+        (0.1, "material: branches must be at most 8 pairs"),
+        ([(0.1, 0.1)] * 9, "material: branches must be at most 8 pairs"),
+    ):
+        with pytest.raises(ts.SceneError) as refused:
+            rubber(branches=bad)
+        assert words in str(refused.value)
+
+
+def block(material, **arguments) -> ts.Scene:
+    scene = ts.Scene(gravity=(0, 0, 0))
+    scene.add_body(halved(cube(cells=(2, 1, 1))), material, name="block", **arguments)
+    return scene
+
+
+def test_files_plan_and_digests_know_branches(tmp_path):
+    given = block({"left": rubber(branches=BRANCHES), 7: rubber()})
+    there_and_back(tmp_path / "scene.toml", given, {})
+    read, _ = ts.read_scene(tmp_path / "scene.toml")
+    assert read.bodies[0].composition.materials[3].branches == BRANCHES and scene_digest(read) == scene_digest(given)
+    other = block({"left": rubber(), 7: rubber(branches=BRANCHES)})
+    assert scene_digest(other) != scene_digest(given)
+    for scene, expected in ((given, "Maxwell branches of block"), (block(rubber()), "no material has branches")):
+        assert make_plan(scene, explicit=False, multistep=False).why("viscosity") == expected
+
+
+KINDS = {
+    "linear": {"material": rubber(SVK, branches=BRANCHES)},
+    "quadratic": {"material": rubber(SVK, branches=BRANCHES), "order": 2},
+    "mean dilatation": {"material": rubber(SVK, poisson=0.48, branches=BRANCHES), "dilatation": "mean"},
+    "regions": {"material": {"left": rubber(SVK, branches=BRANCHES[:1]), 7: rubber(SNH, young=3e5)}},
+}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_held_strains_relax_and_dissipate_exactly(kind):
+    """A sudden shear and compression; the law's own stress stays, that of each branch and its energy decay."""
+    scene = block(**KINDS[kind])
+    (body,) = scene.bodies
+    small, t = 1e-5, 0.07
+    strain = small * (SHEAR + 0.5 * np.diag([-1.0, 1.0, -1.0]))
+    mu = np.broadcast_to(body.composition.lame[0], body.mesh.n_tets)
+    tau, g = np.moveaxis(body.composition.branches, 2, 0)
+    with dynamics(scene, dt=1e-3, integrator="symplectic_euler", precision="f64") as d:
+        x = d.state.state()[0]
+        set_state(d, x=x + x @ strain.T)
+        d.state.move_branches(0.0)
+        start, sudden = d.energies(), stresses(d)
+        for part in (0.2, 0.5, 0.3):
+            d.state.move_branches(part * t)
+        end, later = d.energies(), stresses(d)
+        d.state.begin_branches(1e9)  # at the end of which the law is left
+        relaxed = stresses(d)
+    E = 0.5 * (strain + strain.T)
+    E = E - np.trace(E) / 3.0 * np.eye(3)
+    for found, decay in ((sudden, np.ones_like(tau)), (later, np.exp(-t / tau))):
+        modulus = 2.0 * mu * (g * decay).sum(axis=1)
+        assert np.allclose(found - relaxed, modulus[:, None, None] * E, atol=1e-4 * 2 * mu.max() * small)
+    stored = (mu * body.mesh.volumes)[:, None] * g * (E * E).sum() * (1.0 - np.exp(-2.0 * t / tau))
+    assert end.dissipated == pytest.approx(stored.sum(), rel=1e-4) and start.dissipated == 0.0
+    assert end.elastic + end.dissipated == pytest.approx(start.elastic, rel=1e-12)
+
+
+def stresses(d) -> np.ndarray:
+    """Cauchy stresses (n_tets,3,3) [Pa]."""
+    out = np.empty((d.model.n_blocks * d.model.lanes, 9))
+    cauchy_stress(d.model, out)
+    return out[d.state.layout.lane_of_tet].reshape(-1, 3, 3)
+
+
+def test_a_ramp_is_followed_exactly():
+    """One interval in which strains grow linearly equals a hundred parts of it, with what they dissipate."""
+    scene, rate = block(rubber(SVK, branches=BRANCHES)), 1e-4 * SHEAR
+    ends = []
+    with dynamics(scene, dt=1e-3, integrator="symplectic_euler", precision="f64") as d:
+        x = d.state.state()[0]
+        for parts in (1, 100):
+            d.reset()
+            assert not d.energies().dissipated and not np.abs(stresses(d)).any()
+            for k in range(parts):
+                set_state(d, x=x + (k + 1) / parts * x @ rate.T)
+                d.state.move_branches(0.08 / parts)
+            ends.append((stresses(d)[:, 0, 1], d.energies().dissipated))
+    assert np.allclose(ends[0][0], ends[1][0], rtol=1e-4) and ends[0][1] == pytest.approx(ends[1][1], rel=1e-3)
+    assert ends[0][1] > 0.0
+
+
+def test_modes_and_statics_are_relaxed_and_stable_dt_instantaneous():
+    def scene(**numbers) -> ts.Scene:
+        made = block(rubber(SVK, **numbers))
+        made.bodies[0].fix(lambda X: X[:, 0] < -0.49)
+        made.bodies[0].add_force(lambda X: X[:, 0] > 0.49, (0.0, -20.0, 5.0))
+        return made
+
+    branched, relaxed = scene(branches=BRANCHES), scene()
+    assert np.array_equal(ts.modes(branched, 3).frequencies, ts.modes(relaxed, 3).frequencies)
+    assert np.array_equal(ts.solve_static(branched).positions(), ts.solve_static(relaxed).positions())
+    bulk, shear = LAM + 2.0 / 3.0 * MU, 1.8 * MU  # at once
+    stiff = {"young": 9 * bulk * shear / (3 * bulk + shear), "poisson": (3 * bulk - 2 * shear) / (2 * (3 * bulk + shear))}
+    for verlet in (False, True):
+        found, expected = (stable_dt(s, verlet) for s in (branched, scene(**stiff)))
+        assert found == pytest.approx(expected, rel=1e-6)
