@@ -1,0 +1,243 @@
+"""Bodies with Maxwell branches in time: relaxation, creep and hysteresis follow closed forms within 0.1 %; every integrator keeps
+its order, and energies and dissipation add up; contacts, threads and repeated steps change nothing; failures, resets, checkpoints
+and changed numbers have the right history.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import taisoft as ts
+from taisoft.dynamics import implicit_stages
+from taisoft.dynamics.contact import BLOCKED, MET
+from taisoft.dynamics.explicit_stepper import ExplicitStepper
+from taisoft.dynamics.part_length import PartLength
+from taisoft.dynamics.schemes import INTEGRATORS, SECOND_ORDER
+from taisoft.scene.material import lame_parameters
+from tests.dynamics.scenes import SVK, cube, rubber, use_threads
+from tests.dynamics.test_retries import patch_ways
+from tests.simulator.scenes import follow
+from tests.simulator.test_checkpoint import assert_same
+
+TAU, G = 0.1, 0.5
+BRANCHED = rubber(branches=((TAU, G), (0.02, 0.3)))
+LIGHT = rubber(SVK, density=1e-6, branches=((TAU, G),))  # without inertia to speak of
+MU, LAM = lame_parameters(LIGHT.young, LIGHT.poisson)
+BULK = LAM + 2.0 / 3.0 * MU
+SMALL = 1e-5  # strain: closed forms are of the linear theory
+
+
+def bar(holds_top: bool) -> ts.Scene:
+    """A block on rollers, whose top is held along y or free; it can widen."""
+    scene = ts.Scene(gravity=(0, 0, 0))
+    body = scene.add_body(ts.box_mesh((1, 1, 1), (1, 1, 1), (0.5, 0.5, 0.5)), LIGHT, name="bar")
+    for axis, name in enumerate("xyz"):
+        body.fix(lambda X, axis=axis: X[:, axis] < 1e-9, axes=name)
+    if holds_top:
+        body.fix(lambda X: X[:, 1] > 1 - 1e-9, axes="y")
+    return scene
+
+
+def strained(sim: ts.Simulator, axial: float, lateral: float) -> None:
+    sim.set_state(positions=sim.positions() * (1.0 + np.array([lateral, axial, lateral])))
+
+
+def stretch_per_stress(shear: float) -> tuple[float, float]:
+    """Axial and lateral strain [1/Pa] of a bar with that shear modulus."""
+    return 1 / (9 * BULK) + 1 / (3 * shear), 1 / (9 * BULK) - 1 / (6 * shear)
+
+
+def test_a_stretched_bar_relaxes():
+    """E(t) = E_inf + (E_0 - E_inf) exp(-t/tau_E)."""
+    at_once, relaxed = (9 * BULK * shear / (3 * BULK + shear) for shear in (MU * (1 + G), MU))
+    tau = TAU * (3 * BULK + MU * (1 + G)) / (3 * BULK + MU)
+    axial, lateral = stretch_per_stress(MU * (1 + G))
+    with ts.Simulator(bar(True), dt=TAU / 50, integrator="bdf2", precision="f64") as sim:
+        strained(sim, SMALL, SMALL * lateral / axial)
+        for _ in range(100):
+            sim.step()
+            stress, expected = sim.stress()[:, 1, 1], relaxed + (at_once - relaxed) * np.exp(-sim.time / tau)
+            assert np.abs(stress / (SMALL * expected) - 1.0).max() < 1e-3
+
+
+def test_a_loaded_bar_creeps():
+    """Its shear compliance is (1 - g/(1 + g) exp(-t/(tau (1 + g)))) / mu."""
+    load = SMALL * MU
+    scene = bar(False)
+    scene.bodies[0].add_traction(lambda X: X[:, 1] > 1 - 1e-9, (0.0, load, 0.0))
+    axial, lateral = stretch_per_stress(MU * (1 + G))
+    with ts.Simulator(scene, dt=TAU / 50, integrator="bdf2", precision="f64") as sim:
+        strained(sim, load * axial, load * lateral)
+        for _ in range(150):
+            sim.step()
+            shear = MU / (1.0 - G / (1 + G) * np.exp(-sim.time / (TAU * (1 + G))))
+            length = np.ptp(sim.positions()[:, 1]) - 1.0
+            assert length / (load * stretch_per_stress(shear)[0]) == pytest.approx(1.0, abs=1e-3)
+
+
+def test_a_cycle_of_shear_dissipates_the_loss_modulus():
+    """pi gamma^2 mu g w tau / (1 + (w tau)^2) per volume, once the start is forgotten."""
+    frequency, n = 3.0, 100
+    w = 2 * np.pi * frequency * TAU
+    scene = ts.Scene(gravity=(0, 0, 0))
+    body = scene.add_body(ts.box_mesh((1, 1, 1), (1, 1, 1)), LIGHT)
+    body.fix(lambda X: X[:, 1] < 0)
+    body.move(lambda X: X[:, 1] > 0, lambda t: (SMALL * np.sin(2 * np.pi * frequency * t), 0, 0))
+    with ts.Simulator(scene, dt=1 / (frequency * n), integrator="implicit_euler", precision="f64") as sim:
+        dissipated = [sim.step().dissipated for _ in range(4 * n)]
+    cycle = dissipated[-1] - dissipated[-1 - n]
+    assert cycle == pytest.approx(np.pi * SMALL**2 * MU * G * w / (1 + w * w), rel=1e-3)
+
+
+def swinging(material=BRANCHED) -> ts.Scene:
+    scene = ts.Scene(gravity=(0, 0, 0))
+    scene.contact_forces = False
+    scene.add_body(cube(), material, name="block").fix(lambda X: X[:, 1] < -0.44)
+    return scene
+
+
+def shear(sim: ts.Simulator) -> None:
+    x = sim.positions()
+    sim.set_state(positions=x + 0.1 * (x[:, 1:2] + 0.45) * [1.0, 0.0, 0.0])
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_integrators_keep_their_order_and_energies_add_up(integrator):
+    """Of steps dt, dt/2 and dt/4. Midpoint and Verlet lose no energy but to the branches; the others damp by themselves."""
+    ends, losses = [], []
+    tight = {} if integrator in ("symplectic_euler", "velocity_verlet") else {"newton_tolerance": 1e-12}
+    with ts.Simulator(swinging(), dt=1e-3, integrator=integrator, precision="f64", **tight) as sim:
+        for dt in (4e-3, 2e-3, 1e-3):
+            sim.reset()
+            sim.dt = dt
+            shear(sim)
+            start = sim.energies()
+            while sim.time < 0.1 - 1e-9:
+                sim.step()
+            ends.append(sim.positions())
+            losses.append(start.total - sim.energies().total - sim.energies().dissipated)
+    order, expected = np.log2(np.linalg.norm(ends[0] - ends[1]) / np.linalg.norm(ends[1] - ends[2])), nominal(integrator)
+    assert order == pytest.approx(expected, abs=0.15)
+    assert abs(losses[1] / losses[2]) > 1.8**expected and abs(losses[2]) < 0.03 * start.total
+    if integrator in ("implicit_midpoint", "velocity_verlet"):
+        assert abs(losses[2]) < 1e-4 * start.total
+
+
+def nominal(integrator: str) -> int:
+    return 2 if integrator in SECOND_ORDER else 1
+
+
+@pytest.mark.parametrize("integrator", ["symplectic_euler", "velocity_verlet"])
+def test_explicit_steps_are_alike_alone_on_threads_and_with_contacts(integrator, monkeypatch):
+    def end(touches: bool) -> list:
+        scene = swinging()
+        if touches:
+            scene.contact_forces = True
+            scene.add_obstacle(ts.HalfSpace((0, -9, 0), (0, 1, 0)))
+        with ts.Simulator(scene, dt=2e-3, integrator=integrator, precision="f64") as sim:
+            shear(sim)
+            for _ in range(10):
+                sim.step()
+            return [sim.positions(), sim.stress(), sim.energies().dissipated]
+
+    ends = [end(False), end(True)]
+    use_threads(monkeypatch)
+    ends.append(end(False))
+    for other in ends[1:]:
+        assert all(np.allclose(a, b, rtol=1e-12, atol=1e-10) for a, b in zip(other, ends[0])) and ends[0][2] > 1.0
+
+
+@pytest.mark.parametrize("integrator", ["symplectic_euler", "velocity_verlet"])
+def test_a_repeated_substep_begins_at_the_history_before_it(integrator, monkeypatch):
+    """What is found on the way of an explicit sub-step with contacts repeats it; here nothing is found."""
+    scene = swinging()
+    scene.contact_forces = True
+    scene.add_obstacle(ts.HalfSpace((0, -9, 0), (0, 1, 0)))
+    ends = []
+    with ts.Simulator(scene, dt=2e-3, integrator=integrator, precision="f64") as sim:
+        for ways in ([], [MET, MET], [BLOCKED]):
+            sim.reset()
+            shear(sim)
+            patch_ways(monkeypatch, ways)
+            for _ in range(3):
+                sim.step()
+            ends.append([sim.positions(), sim.stress(), sim.energies().dissipated])
+            monkeypatch.undo()
+    for other in ends[1:]:
+        assert all(np.allclose(a, b, rtol=1e-12, atol=1e-10) for a, b in zip(other, ends[0])) and ends[0][2] > 1.0
+
+
+@pytest.mark.parametrize("integrator", ["implicit_euler", "bdf2", "implicit_midpoint"])
+def test_a_step_in_parts_equals_as_many_steps(integrator, monkeypatch):
+    solve, calls = implicit_stages.solve, []
+
+    def first_unconverged(system, stage):
+        calls.append(stage.dt)
+        return replace(solve(system, stage), converged=len(calls) > 1)
+
+    with ts.Simulator(swinging(), dt=4e-3, integrator=integrator, precision="f64", newton_tolerance=1e-11) as sim:
+        shear(sim)
+        for _ in range(2):
+            sim.step()
+        expected = [sim.positions(), sim.stress(), sim.energies().dissipated]
+        sim.reset()
+        shear(sim)
+        sim.dt = 8e-3
+        monkeypatch.setattr(implicit_stages, "solve", first_unconverged)
+        assert sim.step().substeps == 2 and calls == [8e-3, 4e-3, 4e-3]
+        found = [sim.positions(), sim.stress(), sim.energies().dissipated]
+    assert all(np.allclose(a, b, rtol=1e-8, atol=1e-6) for a, b in zip(found, expected)) and expected[2] > 1.0
+
+
+@pytest.mark.parametrize("integrator", ["velocity_verlet", "implicit_euler"])
+def test_an_interrupted_step_leaves_the_history_before_it(integrator, monkeypatch):
+    launch = ExplicitStepper._launch
+
+    def interrupted(self, *arguments):
+        if integrator == "velocity_verlet":
+            launch(self, *arguments)
+        raise KeyboardInterrupt
+
+    def state(sim: ts.Simulator) -> list:
+        return [sim.stress(), sim.energies().dissipated, sim._dynamics.model.viscosity.history.to_numpy()]
+
+    with ts.Simulator(swinging(), dt=2e-3, integrator=integrator, precision="f64") as sim:
+        shear(sim)
+        sim.step()
+        before = state(sim)
+        monkeypatch.setattr(ExplicitStepper, "_launch", interrupted)
+        monkeypatch.setattr(PartLength, "keep", interrupted)  # after the part has ended
+        with pytest.raises(KeyboardInterrupt):
+            sim.step()
+        assert all(np.array_equal(a, b) for a, b in zip(state(sim), before)) and before[1] > 0.0
+        sim.reset()
+        assert not any(np.abs(values).max() > 0.0 for values in state(sim)[1:])
+
+
+@pytest.mark.parametrize("integrator, precision", [("velocity_verlet", "f32"), ("bdf2", "f64")])
+def test_a_checkpoint_continues_bitwise(integrator, precision, tmp_path):
+    path, scene = tmp_path / "checkpoint.npz", swinging()
+    with ts.Simulator(scene, dt=1e-3, integrator=integrator, precision=precision) as sim:
+        shear(sim)
+        follow(sim, 3)
+        sim.set_material("block", young=5e4)
+        follow(sim, 2)
+        sim.save_checkpoint(path)
+        stress, expected = sim.stress(), follow(sim, 4)
+    with ts.Simulator.load_checkpoint(path, scene) as loaded:
+        assert np.array_equal(loaded.stress(), stress)
+        assert_same(follow(loaded, 4), expected)
+    assert expected[-1][3].dissipated > expected[-2][3].dissipated > 0.0
+
+
+def test_changes_by_hand():
+    """A jump strains the branches at once; stiffnesses follow young, and branches themselves are fixed."""
+    with ts.Simulator(swinging(), dt=2e-3, integrator="velocity_verlet", precision="f64") as sim:
+        shear(sim)
+        energy, stress = sim.energies(), sim.stress()
+        sim.set_material("block", young=2 * BRANCHED.young)
+        assert np.allclose(sim.stress(), 2 * stress, rtol=1e-12)
+        assert sim.energies().elastic == pytest.approx(2 * energy.elastic, rel=1e-12) and energy.dissipated == 0.0
+        with pytest.raises(ts.SceneError, match="branches cannot change while it runs"):
+            sim.set_material("block", branches=())
