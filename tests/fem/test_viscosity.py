@@ -3,15 +3,13 @@ exactly between given strains, in every kind of element, and volumes stay elasti
 `stable_dt`, modes and statics know them.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 import pytest
+import taichi as ti
 
 import taisoft as ts
-from taisoft.fem.laws import evaluate, law_of
+from taisoft.backend.runtime import kernel
 from taisoft.fem.laws import viscosity as addition
-from taisoft.fem.laws.additions import WithAdditions
 from taisoft.fem.terms.elasticity import cauchy_stress, force_differential
 from taisoft.fem.viscosity import begin_interval
 from taisoft.linear.block_csr import assemble, build_block_csr, to_bsr
@@ -19,6 +17,8 @@ from taisoft.scene.fingerprint import scene_digest
 from taisoft.scene.material import lame_parameters
 from taisoft.scene.plan import make_plan
 from taisoft.stability import stable_dt
+from tests.backend.lanes import load, opened, packed, store, unpacked
+from tests.collision.rotations import rotation
 from tests.dynamics.scenes import SNH, SVK, built, cube, dynamics, halved, rubber, set_state
 from tests.fem.test_laws import MODERATE
 from tests.scene.toml_scenes import there_and_back
@@ -28,52 +28,44 @@ MU, LAM = lame_parameters(1e5, 0.3)
 SHEAR = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
 
 
-@dataclass(frozen=True)
-class Branched(WithAdditions):
-    """A law with the addition, whose constants are given."""
+@kernel
+def evaluate(lanes: ti.template(), A: ti.types.ndarray(), out: ti.types.ndarray()):
+    """psi, P, and the exact and the projected differential of the addition. A: F, D and the constants."""
+    for b in range(A.shape[0]):
+        Z = load(A, b, lanes, 26)
+        F, D, p, zero = Z[:9], Z[9:18], Z[18:], [0.0 * Z[k] for k in ti.static(range(9))]
+        S, T = addition.prepared(F, p), addition.prepared_projected(F, p)
+        store(out, b, 0, [addition.psi(F, p)], lanes)
+        store(out, b, 1, addition.add_stress(zero, F, p), lanes)
+        store(out, b, 10, addition.add_differential(zero, F, S, D), lanes)
+        store(out, b, 19, addition.add_projected(zero, T, D), lanes)
 
-    @property
-    def N_CONSTANTS(self) -> int:
-        """Of both."""
-        return self.law.N_CONSTANTS + addition.N_CONSTANTS
 
-
-def at_points(F, p, D=None, projected: bool = False):
-    """psi (k,) and P (k,3,3), or the differential along D (k,3,3), of the law and the addition with constants p."""
-    law = Branched(law_of(SNH, False), (addition,))
-    constants = np.array([*law.law.constants(MU, LAM), *p], dtype=np.float64)
-    with evaluate._double_precision() as lanes:
-        blocks = evaluate._to_lanes(np.asarray(F), lanes)
-        P, psi = np.empty_like(blocks), np.empty((len(blocks), lanes))
-        if D is None:
-            evaluate._evaluate(law, lanes, blocks, constants, psi, P)
-        else:
-            evaluate._differential(law, projected, lanes, blocks, constants, evaluate._to_lanes(D, lanes), P)
-    return psi.reshape(-1)[: len(F)], evaluate._from_lanes(P, len(F))
+def at_points(F, D, p) -> tuple:
+    """psi (k,), P (k,3,3) and the differentials (k,3,3) along D, exact and projected."""
+    with opened("f64") as machine:
+        rows = np.concatenate([F.reshape(-1, 9), D.reshape(-1, 9), np.tile(p, (len(F), 1))], axis=1)
+        blocks = packed(rows, machine.lanes, np.float64)
+        out = np.empty((len(blocks), 28, machine.lanes))
+        evaluate(machine.lanes, blocks, out)
+    found = unpacked(out, len(F))
+    return found[:, 0], *(found[:, k : k + 9].reshape(-1, 3, 3) for k in (1, 10, 19))
 
 
 def test_the_addition_is_consistent_objective_and_projected():
     rng = np.random.default_rng(1)
     p, F, D, h = [3e4, 7.0, 0.3, -0.2, -0.1, 0.15, -0.3, 0.2], MODERATE, rng.standard_normal(MODERATE.shape), 1e-6
-    psi, P = at_points(F, p)
-    ends = [at_points(F + s * h * D, p) for s in (1, -1)]
-    scale = 1e5 * (1.0 + np.abs(F).max(axis=(1, 2))) ** 3
-    assert (np.abs((ends[0][0] - ends[1][0]) / (2 * h) - np.einsum("kij,kij->k", P, D)) < 1e-5 * scale).all()
-    exact = at_points(F, p, D)[1]
-    assert (np.abs((ends[0][1] - ends[1][1]) / (2 * h) - exact) < 1e-5 * scale[:, None, None]).all()
-    R = np.linalg.qr(rng.standard_normal((3, 3)))[0]
-    assert np.allclose(at_points(np.linalg.det(R) * R @ F, p)[0], psi, rtol=1e-9)
-    projected = at_points(F, p, D, projected=True)[1]
-    assert (np.einsum("kij,kij->k", projected, D) >= -1e-9 * scale).all()
-    # without stress in the branches the addition is its own projection
-    E = 0.5 * (F[:1].transpose(0, 2, 1) @ F[:1] - np.eye(3))
-    Z = (E - np.trace(E[0]) / 3.0 * np.eye(3))[0]
-    free = [3e4, 0.0, Z[0, 0], Z[1, 1], Z[2, 2], Z[1, 2], Z[0, 2], Z[0, 1]]
-    added = [
-        at_points(F[:1], free, D[:1], q)[1] - evaluate.evaluate_differential(SNH, F[:1], D[:1], 1e5, 0.3, q)
-        for q in (False, True)
-    ]
-    assert np.allclose(*added, rtol=1e-9, atol=1e-6) and np.abs(added[0]).max() > 1e3
+    psi, P, exact, projected = at_points(F, D, p)
+    (above, P_above, *_), (below, P_below, *_) = (at_points(F + s * h * D, D, p) for s in (1, -1))
+    scale = p[0] * (1.0 + np.abs(F).max(axis=(1, 2))) ** 4
+    assert (np.abs((above - below) / (2 * h) - np.einsum("kij,kij->k", P, D)) < 1e-7 * scale).all()
+    assert (np.abs((P_above - P_below) / (2 * h) - exact) < 1e-7 * scale[:, None, None]).all()
+    assert (psi >= p[1]).all() and np.allclose(at_points(rotation((1, 2, 3), 2.0) @ F, D, p)[0], psi, rtol=1e-9)
+    assert (np.einsum("kij,kij->k", projected, D) >= -1e-12 * scale).all()
+    E = 0.5 * (F[0].T @ F[0] - np.eye(3))
+    Z = E - np.trace(E) / 3.0 * np.eye(3)
+    _, P, exact, projected = at_points(F[:1], D[:1], [p[0], 0.0, *Z[[0, 1, 2, 1, 0, 0], [0, 1, 2, 2, 2, 1]]])
+    assert np.abs(P).max() < 1e-9 * np.abs(exact).max() and np.allclose(exact, projected, rtol=1e-9, atol=1e-6)
 
 
 def test_the_assembled_stiffness_is_the_differential_of_the_forces():
