@@ -1,4 +1,4 @@
-"""A bar and a block with one Maxwell branch at small strains, without inertia to speak of: relaxation, creep and a cycle of shear.
+"""A bar and a block with one Maxwell branch at small strains, with little inertia: relaxation, creep and a cycle of shear.
 
 A bulk modulus K stays elastic, and the shear modulus relaxes as mu (1 + g exp(-t/tau)).
 """

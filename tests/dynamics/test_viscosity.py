@@ -1,5 +1,5 @@
-"""Bodies with Maxwell branches in time: every integrator keeps its order, and energies and dissipation add up; contacts, threads and
-repeated steps change nothing; failures, resets, checkpoints and changed numbers have the right history (relaxation, creep and
+"""Bodies with Maxwell branches in time: every integrator keeps its order, and energies and dissipation add up; contacts, threads
+and repeated steps change nothing; failures, resets, checkpoints and changed numbers have the right history (relaxation, creep and
 hysteresis: `test_references`).
 """
 
