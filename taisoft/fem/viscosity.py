@@ -156,49 +156,56 @@ def _decays(m: ti.template(), at, i: ti.template()):
 
 
 @ti.func
-def _set_constants(m: ti.template(), at, ahead: ti.template()):
-    """Set the constants of point `at` for the interval of `decay` that begins at its history, or for none if not `ahead`."""
+def _zeros(m: ti.template(), n: ti.template()):
+    return [broadcast(ti.cast(0.0, ti.f64), m.lanes) for k in ti.static(range(n))]
+
+
+@ti.func
+def _set_constants(m: ti.template(), at, E, sums):
+    """Set the constants of point `at`. E: dev E_0; sums: mu g times k, e^2/k |M|^2 and e M, over the branches."""
+    Y = [sums[2 + j] / ti.select(sums[0] > 0.0, sums[0], 1.0) for j in ti.static(range(6))]  # dev E_0 - Z
+    _store(m, m.viscosity.constants, at, 0, [sums[0], sums[1] - sums[0] * _inner(Y, Y)])
+    _store(m, m.viscosity.constants, at, 2, [E[j] - Y[j] for j in ti.static(range(6))])
+
+
+@ti.func
+def _look_ahead(m: ti.template(), at):
+    """Set the constants of point `at` for the interval of `decay`, which begins at its history."""
     (v,) = ti.static((m.viscosity,))
-    zero = broadcast(ti.cast(0.0, ti.f64), m.lanes)
-    modulus, sums = zero, [zero + 0.0 for _ in ti.static(range(6))]
+    sums = _zeros(m, 8)
     for i in ti.static(range(v.n_branches)):
         (stiff,) = _load(m, v.stiffness, at, i, 1)
-        M, d = _load(m, v.history, at, BRANCHES + 6 * i, 6), _decays(m, at, i)
-        modulus += stiff * (d[1] if ti.static(ahead) else 1.0)
+        e, k, _, _ = _decays(m, at, i)
+        M = _load(m, v.history, at, BRANCHES + 6 * i, 6)
+        sums[0] += stiff * k
+        sums[1] += stiff * e * e / k * _inner(M, M)
         for j in ti.static(range(6)):
-            sums[j] += stiff * M[j] * (d[0] if ti.static(ahead) else 1.0)
-    Y = [-sums[j] / ti.select(modulus > 0.0, modulus, 1.0) for j in ti.static(range(6))]  # Z - dev E_0
-    energy = zero
-    for i in ti.static(range(v.n_branches)):
-        (stiff,) = _load(m, v.stiffness, at, i, 1)
-        M, d = _load(m, v.history, at, BRANCHES + 6 * i, 6), _decays(m, at, i)
-        if ti.static(ahead):
-            N = [d[0] * M[j] + d[1] * Y[j] for j in ti.static(range(6))]
-            energy += stiff / d[1] * _inner(N, N)
-        else:
-            N = [M[j] + Y[j] for j in ti.static(range(6))]
-            energy += stiff * _inner(N, N)
+            sums[2 + j] += stiff * e * M[j]
     E = _load(m, v.history, at, STRAIN, 6)
-    _store(m, v.constants, at, 0, [modulus, energy])
-    _store(m, v.constants, at, 2, [E[j] + Y[j] for j in ti.static(range(6))])
+    _set_constants(m, at, E, sums)
 
 
 @ti.func
 def _follow(m: ti.template(), at, F):
     """Move the history of point `at` over the interval of `decay` to F, and set its constants for no interval."""
     (v,) = ti.static((m.viscosity,))
+    sums = _zeros(m, 8)
     E, start = _deviator(F), _load(m, v.history, at, STRAIN, 6)
     D = [E[j] - start[j] for j in ti.static(range(6))]
     (heat,) = _load(m, v.history, at, HEAT, 1)
     for i in ti.static(range(v.n_branches)):
         (stiff,) = _load(m, v.stiffness, at, i, 1)
-        M, d = _load(m, v.history, at, BRANCHES + 6 * i, 6), _decays(m, at, i)
-        zk = d[2] * d[1]
-        lost = zk * (0.5 * (1.0 + d[0]) * _inner(M, M) + d[1] * _inner(M, D)) + d[3] * _inner(D, D)
-        heat += 2.0 * stiff * lost
-        _store(m, v.history, at, BRANCHES + 6 * i, [d[0] * M[j] + d[1] * D[j] for j in ti.static(range(6))])
+        e, k, z, c = _decays(m, at, i)
+        M = _load(m, v.history, at, BRANCHES + 6 * i, 6)
+        heat += 2.0 * stiff * (z * k * (0.5 * (1.0 + e) * _inner(M, M) + k * _inner(M, D)) + c * _inner(D, D))
+        N = [e * M[j] + k * D[j] for j in ti.static(range(6))]
+        _store(m, v.history, at, BRANCHES + 6 * i, N)
+        sums[0] += stiff
+        sums[1] += stiff * _inner(N, N)
+        for j in ti.static(range(6)):
+            sums[2 + j] += stiff * N[j]
     _store(m, v.history, at, STRAIN, E + [heat])
-    _set_constants(m, at, False)
+    _set_constants(m, at, E, sums)
 
 
 # --- loops: at the top level of a kernel, or inside another loop on one thread --------------------------------------------
@@ -244,7 +251,7 @@ def begin_interval(m: ti.template(), h: ti.f64):
     set_interval(m, h)
     ti.loop_config(serialize=m.serial)
     for at in range(m.viscosity.n_points):
-        _set_constants(m, at, True)
+        _look_ahead(m, at)
 
 
 @kernel
