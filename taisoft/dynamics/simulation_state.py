@@ -97,8 +97,8 @@ class SimulationState:
             viscosity.end_interval(self.model, h)
 
     def dissipated(self) -> np.ndarray:
-        """Return the energies (n_blocks * lanes,) [J] that Maxwell branches have dissipated, by lane; (0,) if there are none."""
-        lanes = np.zeros(self.model.n_blocks * self.model.lanes if self.model.viscous else 0)
+        """Return the energies (n_blocks * lanes,) [J] that Maxwell branches have dissipated, by lane."""
+        lanes = np.zeros(self.model.n_blocks * self.model.lanes)
         if self.model.viscous:
             viscosity.dissipated_energies(self.model, lanes)
         return lanes

@@ -27,9 +27,7 @@ class Material:
     mass_damping: float = 0.0  #: [1/s], >= 0
     stiffness_damping: float = 0.0  #: [s], >= 0
     volume_floor: float = 0.0  #: J = det F below which the law stiffens against inversion, 0.001 to 1; 0 for none
-    branches: tuple[
-        tuple[float, float], ...
-    ] = ()  #: of Maxwell, at most 8: relaxation time [s] and stiffness over the law's mu at rest
+    branches: tuple[tuple[float, float], ...] = ()  #: Maxwell branches, at most 8: relaxation time [s], stiffness over mu
 
     def __post_init__(self):
         checks.choice(self.law, "material: law", LAWS)
@@ -67,13 +65,14 @@ def _branches(given) -> tuple[tuple[float, float], ...]:
     rule = f"must be at most {MAX_BRANCHES} pairs (relaxation time, fraction)"
     if not isinstance(given, (list, tuple)) or len(given) > MAX_BRANCHES:
         raise SceneError(f"material: branches {rule}, not {value_text(given)}")
-    found = []
     for k, pair in enumerate(given):
         if not isinstance(pair, (list, tuple)) or len(pair) != 2:
             raise SceneError(f"material: branches {rule}, not {value_text(pair)} in branch {k}")
-        named = zip(("relaxation time", "fraction"), pair, ("s", ""))
-        found.append(tuple(checks.number(x, f"material: {name} of branch {k}", above=0.0, unit=unit) for name, x, unit in named))
-    return tuple(found)
+
+    def positive(value, name: str, branch: int, unit: str = "") -> float:
+        return checks.number(value, f"material: {name} of branch {branch}", above=0.0, unit=unit)
+
+    return tuple((positive(tau, "relaxation time", k, "s"), positive(g, "fraction", k)) for k, (tau, g) in enumerate(given))
 
 
 def lame_parameters(young: float | np.ndarray, poisson: float | np.ndarray) -> tuple[float | np.ndarray, float | np.ndarray]:
