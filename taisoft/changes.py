@@ -76,7 +76,8 @@ def reset(self: "Simulator") -> None:
 def set_state(self: "Simulator", positions=None, velocities=None, body: str | None = None) -> None:
     """Set positions [m] and velocities [m/s], (n_nodes, 3) each. Velocities on constrained axes become 0.
 
-    Nodes that are attached exactly follow the other body's. Copies arrays; compiles nothing.
+    Nodes that are attached exactly follow the other body's. Maxwell branches are strained at once, as by a sudden motion. Copies
+    arrays; compiles nothing.
     """
     dynamics, rows = self._open(), nodes_of(self, body)
     for name, value in (("positions", positions), ("velocities", velocities)):
@@ -89,6 +90,7 @@ def set_state(self: "Simulator", positions=None, velocities=None, body: str | No
         v[rows] = velocities
         v[dynamics.state.dirichlet.constrained()] = 0.0
     dynamics.state.set_state(x, v)
+    dynamics.state.move_branches(0.0)
     dynamics.state_changed()
 
 

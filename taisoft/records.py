@@ -13,6 +13,7 @@ class Energies:
     elastic: float  #: [J], 0 at rest
     gravity: float  #: -sum m g.x [J], 0 at the origin
     loads: float = 0.0  #: -sum f.x of forces, tractions and a drag, 0 at the origin, and p V of pressures on closed surfaces [J]
+    dissipated: float = 0.0  #: by Maxwell branches since the start [J]
 
     @property
     def total(self) -> float:
@@ -46,6 +47,7 @@ class StepReport:
     elastic: float = 0.0  #: [J]
     gravity: float = 0.0  #: [J]
     loads: float = 0.0  #: of dead loads, -sum f.x [J]
+    dissipated: float = 0.0  #: by Maxwell branches since the start [J]
     converged: bool = True  #: residuals are within their tolerances
     problems: list[str] = field(default_factory=list)  #: sentences
     details: dict[str, float] = field(default_factory=dict)  #: of a run with `details`, at the end, by heading in steps.csv

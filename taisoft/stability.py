@@ -1,7 +1,8 @@
 """Linear vibration about the rest shape: Hooke stiffness, highest frequency, stable steps, eigenmodes. NumPy and SciPy.
 
 All three laws linearise to Hooke's law at F = I, so they share one stiffness: sigma = 2 mu eps + lambda tr(eps) I. With mean
-dilatation tr(eps) is averaged over patches. Explicit steps also resolve what a volume floor adds to flat tets.
+dilatation tr(eps) is averaged over patches. Explicit steps also resolve what a volume floor adds to flat tets, and Maxwell
+branches, which are relaxed in modes.
 """
 
 from typing import NamedTuple
@@ -27,16 +28,18 @@ SMALL = 1e-3  # of the frequency and damping rate of connections: a frequency th
 LANCZOS_MARGIN = 1.005  # Lanczos approaches the highest frequency from below; its tolerance is half this margin
 
 
-def hooke_differential(body: Body, with_floor: bool = False):
+def hooke_differential(body: Body, stiffest: bool = False):
     """Return v -> K v of one body at rest, matrix-free: a function (n,3) -> (n,3) [N per unit of v].
 
-    with_floor: add what a volume floor delta adds to flat tets whose sides have their lengths at rest: at most 2/delta times the
-    stiffness of each, with its own dilatation, see `laws.volume_floor`.
+    stiffest: add what a volume floor delta adds to flat tets whose sides have their lengths at rest: at most 2/delta times the
+    stiffness of each, with its own dilatation, see `laws.volume_floor`; and Maxwell branches that have not relaxed.
     """
     nodes, (mu, lam) = body.nodes.elements, body.composition.lame
     gradients, volumes = reference.shape_gradients(body)
-    added, is_mean = _floor_stiffness(body) if with_floor else 0.0, body.dilatation == "mean"
-    mu, lam = mu * (1.0 + added), lam * (added if is_mean else 1.0 + added)
+    added, is_mean = _floor_stiffness(body) if stiffest else 0.0, body.dilatation == "mean"
+    fractions = body.composition.branches[..., 1].sum(axis=1)
+    branches = mu * (fractions if body.composition.elastic_by_tet else fractions[0]) if stiffest else 0.0
+    mu, lam = mu * (1.0 + added) + branches, lam * (added if is_mean else 1.0 + added) - 2.0 / 3.0 * branches
     if body.composition.elastic_by_tet:  # one row for each quadrature point
         mu, lam = (np.repeat(np.broadcast_to(x, len(nodes)), volumes.shape[1])[:, None] for x in (mu, lam))
         mu = mu[:, :, None]
@@ -121,7 +124,7 @@ _frequencies: "WeakKeyDictionary[Composition, dict[tuple, float]]" = WeakKeyDict
 def highest_frequency(body: Body) -> float:
     """omega_max [rad/s] that explicit steps of a body must resolve, by Lanczos; overestimated by a fraction of a percent.
 
-    It is that at rest with lumped mass. A volume floor stiffens its tets by what it adds to flat ones, see `hooke_differential`.
+    It is that at rest with lumped mass, of bodies that are as stiff as they may be, see `hooke_differential`.
     """
     free = ~constrained_axes(body, prescribed=False)  # a path may release its nodes
     free[body.nodes.n_elastic :] = False
@@ -138,7 +141,7 @@ def _highest_frequency(body: Body, free: np.ndarray) -> float:
     scale = np.where(free, 1.0 / np.sqrt(np.where(free, mass[:, None], 1.0)), 0.0)
     if not free.any():
         return 0.0
-    apply = hooke_differential(body, with_floor=True)
+    apply = hooke_differential(body, stiffest=True)
     size = scale.size
     operator = spl.LinearOperator(
         (size, size), matvec=lambda y: (scale * apply(scale * y.reshape(-1, 3))).reshape(-1), dtype=np.float64
@@ -286,8 +289,9 @@ class Modes(NamedTuple):
 def modes(scene: Scene, k: int, mass: str = "lumped") -> Modes:
     """The lowest k eigenfrequencies [Hz] and shapes of a scene at rest, with its constraints; rigid motions count as 0 Hz.
 
-    mass: "lumped" or "consistent". Springs and tendons act as they do at the start: an elastic tendon that is slack there does
-    not. Raises SceneError for an invalid k or mass, and for an inextensible tendon, whose tension there is unknown.
+    mass: "lumped" or "consistent". Maxwell branches are relaxed. Springs and tendons act as they do at the start: an elastic
+    tendon that is slack there does not. Raises SceneError for an invalid k or mass, and for an inextensible tendon, whose tension
+    there is unknown.
     """
     if mass not in ("lumped", "consistent"):
         raise SceneError(f"mass '{mass}' is unknown: it must be 'lumped' or 'consistent'")

@@ -92,9 +92,9 @@ def solve_static(
     """Find the rest state under gravity, loads and constraints; prescribed nodes and loads follow their paths at `time` [s].
 
     tolerance: on |residual on free axes| / |applied load| (without load, relative to the constraint forces). An open f64
-    runtime is reused; otherwise one is opened and closed. Contact is ignored. Raises SceneError if a body is not constrained
-    along every axis, the scene has obstacles and contact forces, or `time` is no finite number, SimulationError if the runtime
-    is in use. A solve that does not converge returns converged=False.
+    runtime is reused; otherwise one is opened and closed. Contact is ignored, and Maxwell branches are relaxed. Raises SceneError
+    if a body is not constrained along every axis, the scene has obstacles and contact forces, or `time` is no finite number,
+    SimulationError if the runtime is in use. A solve that does not converge returns converged=False.
     """
     _check(scene, tolerance)
     scene = scene.snapshot()  # in which rigid bodies are as stiff as the others ask for
@@ -153,7 +153,8 @@ class StaticSolver:
             scene,
             runtime,
             arena,
-            plan.on | dict.fromkeys(("mass_damping", "stiffness_damping", "spring_damping", "consistent_mass"), False),
+            plan.on
+            | dict.fromkeys(("mass_damping", "stiffness_damping", "spring_damping", "consistent_mass", "viscosity"), False),
         )
         self.simulation = SimulationState(scene, runtime, arena, model, layout, DirichletConditions(scene, layout))
         self.multipliers, self.time = None, time

@@ -7,7 +7,7 @@ Weak: the deviatoric part still softens in compression.
 import taichi as ti
 
 from taisoft.backend.tracing import arithmetic
-from taisoft.fem.laws.st_venant_kirchhoff import _green_strain
+from taisoft.fem.laws.st_venant_kirchhoff import green_strain
 from taisoft.fem.math3 import cofactor, cofactor_differential, cross, ddot, dot, matmul, matmul_nt, matmul_tn, transform
 
 NAME = "modified_svk"
@@ -32,7 +32,7 @@ def _volume_change(F):
 @arithmetic
 def psi(F, p):
     """Energy density [Pa], 0 at rest."""
-    E = _green_strain(F)
+    E = green_strain(F)
     e = _volume_change(F)
     return p[0] * ddot(E, E) + 0.5 * p[1] * e * e
 
@@ -40,7 +40,7 @@ def psi(F, p):
 @arithmetic
 def pk1(F, p):
     """First Piola-Kirchhoff stress [Pa]."""
-    FE = matmul(F, _green_strain(F))
+    FE = matmul(F, green_strain(F))
     G = cofactor(F)
     b = p[1] * _volume_change(F)
     return [2.0 * p[0] * FE[k] + b * G[k] for k in ti.static(range(9))]
@@ -49,7 +49,7 @@ def pk1(F, p):
 @arithmetic
 def prepare(F, p):
     """What `dpk1` and `block` need of F: S = 2 mu E, cof F, mu F F^T, and the factors mu, lambda, lambda (J - 1)."""
-    E = _green_strain(F)
+    E = green_strain(F)
     B = matmul_nt(F, F)
     S = [2.0 * p[0] * E[k] for k in ti.static(range(9))]
     return S + cofactor(F) + [p[0] * B[k] for k in ti.static(range(9))] + [p[0], p[1], p[1] * _volume_change(F)]

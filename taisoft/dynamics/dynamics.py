@@ -275,14 +275,16 @@ class Dynamics:
         measure_parts(m, lanes, nodes)
         elastic = np.add.reduceat(lanes[layout.lane_of_tet], layout.tet_start[:-1])
         kinetic, gravity, loads = np.add.reduceat(nodes, layout.node_start[:-1]).T
-        return [Energies(*row) for row in zip(*(part.tolist() for part in (kinetic, elastic, gravity, loads)))]
+        lost = np.add.reduceat(self.state.dissipated()[layout.lane_of_tet], layout.tet_start[:-1])
+        return [Energies(*row) for row in zip(*(part.tolist() for part in (kinetic, elastic, gravity, loads, lost)))]
 
     def _measure(self) -> tuple[Energies, float, int]:
         """Return the energies of the present state [J], its smallest J, and its number of inverted tets."""
         self.state.set_load_time(self.state.time)
         measure(self.model)
         elastic, lowest, inverted, kinetic, gravity, _, loads = self.model.state.scalars.to_numpy()[: LOADS + 1].tolist()
-        return Energies(kinetic, elastic, gravity, loads), lowest, int(inverted)
+        lost = float(self.state.dissipated().sum()) if self.model.viscous else 0.0
+        return Energies(kinetic, elastic, gravity, loads, lost), lowest, int(inverted)
 
     def describe_softening(self) -> str | None:
         """Name the tet that was first compressed so far that its material law softens; None if there is none."""

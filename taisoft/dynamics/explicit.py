@@ -4,6 +4,7 @@ Symplectic Euler (semi-implicit Euler): v += dt a(x, v); x += dt v. First order,
 Velocity Verlet: half kick, drift, force, half kick. Second order, same cost and stability limit.
 Damping: the stiffness part -c K(x) v enters the force (K projected positive), as that of springs does; Verlet extrapolates v to
 the force's time, which keeps it second order; the mass part is a factor on v, exact in Verlet and `1 - dt a` in Euler.
+Maxwell branches move with x: before the forces of Verlet, at the end of a sub-step of Euler.
 A small mesh runs all its sub-steps in one serial kernel; a large one takes two parallel loops per sub-step.
 """
 
@@ -11,6 +12,7 @@ import taichi as ti
 
 from taisoft.backend.runtime import kernel
 from taisoft.dynamics.rigid_motion import project_all, turn_all
+from taisoft.fem import viscosity
 from taisoft.fem.dependents import force_with_dependents, place_all
 from taisoft.fem.state import FAILED, INVERTED_NOW, LOWEST_J, MOST_INVERTED, STEPS_DONE
 from taisoft.fem.terms import elasticity, rayleigh_damping
@@ -277,9 +279,13 @@ def advance_alone(m: ti.template(), s: ti.template(), n: ti.i32, dt: ti.f64, res
         if ti.static(s.verlet):
             starting = restart != 0
             keep_decays(m, s, dt)
+        if ti.static(m.viscous):
+            viscosity.set_interval(m, dt)
         while starting or (row < n and m.state.scalars[FAILED] == 0.0):
             if not starting:
                 begin_substep(m, s, row, dt, int(row == n - 1), 1 - begun)
+                if ti.static(s.verlet):
+                    viscosity.follow(m)
             elasticity.sum_elements_with_damping(m)
             if starting:  # forces alone, in the loop of the sub-steps: another copy of them takes long to compile
                 if ti.static(s.verlet):
@@ -291,6 +297,8 @@ def advance_alone(m: ti.template(), s: ti.template(), n: ti.i32, dt: ti.f64, res
                 if ti.static(s.verlet and not begins_alone(m, s)):
                     begun = int(row < n - ti.static(2 if s.has_held else 1))  # held: velocities before the last one are needed
                 end_substep(m, s, row, dt, begun)
+                if ti.static(not s.verlet):
+                    viscosity.follow(m)
                 row += 1
         if ti.static(s.has_held):
             compute_reactions(m, s, dt)

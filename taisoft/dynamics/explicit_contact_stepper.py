@@ -120,10 +120,18 @@ class ContactExplicitStepper(ExplicitStepper):
             self.acceleration_stale = True
             if way == BLOCKED or tries == MAX_PASSAGES:
                 held = contact.paths.hold_back(good.x)
+                self._move_branches(dt)
                 return replace(result, converged=result.converged and not held) if result else None
             simulation.now.copy_nodes_from(good)
+            simulation.now.copy_history_from(good)
+            simulation.begin_branches(0.0)
             contact.search_along(time, dt)
         return result
+
+    def _move_branches(self, dt: float) -> None:
+        """Move Maxwell branches from the start of the sub-step, dt before, to the present positions."""
+        self.simulation.now.copy_history_from(self.good)
+        self.simulation.move_branches(dt)
 
     def _solve_and_move(self, step: int, time: float, dt: float) -> SolveResult | None:
         """Solve for the impulses of the contacts found, and move; return the contact solver's result, None without contacts."""
@@ -147,6 +155,7 @@ class ContactExplicitStepper(ExplicitStepper):
                     colour_contacts(problem)
                 result = solve(problem, self.method, self.contact_tolerance, MAX_SWEEPS)
         move(model, work, contact.problem, dt, int(n > 0))
+        self.simulation.move_branches(dt)
         if work.verlet:
             self.simulation.set_load_time(time + dt)
             explicit.run_elements(model)

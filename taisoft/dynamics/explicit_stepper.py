@@ -78,8 +78,8 @@ def largest_batch(m: Model) -> int:
     A launch takes about 0.1 s at most, so that Ctrl-C takes effect; a GPU does about 30 times as much in that time. Where loops
     are divided, each sub-step has launches of its own, and the measurement that ends a batch takes almost as long as a sub-step.
     """
-    damping = 800e-9 if m.stiffness_damping else 0.0  # [s] a point, to project its stiffness
-    seconds = sum((g.last - g.first) * m.lanes * g.n_points * (g.law.POINT_SECONDS + damping) for g in m.groups)
+    more = (800e-9 if m.stiffness_damping else 0.0) + (40e-9 if m.viscous else 0.0)  # [s] a point: projection, branches
+    seconds = sum((g.last - g.first) * m.lanes * g.n_points * (g.law.POINT_SECONDS + more) for g in m.groups)
     longest = 0.1 * 30 if not m.on_cpu else 0.4 if m.chunks > 1 else 0.1
     return max(1, min(4096, int(longest / seconds)))
 
@@ -266,8 +266,12 @@ class ExplicitStepper:
         for row in range(n):
             if needs_drift(row):
                 explicit.begin_shared(m, s, row, dt)
+            if s.verlet:
+                self.simulation.move_branches(dt)
             explicit.run_elements(m)
             explicit.end_shared(m, s, row, dt, int(s.verlet and row < n - 1 and not needs_drift(row + 1)))
+            if not s.verlet:
+                self.simulation.move_branches(dt)
         if s.n_held:
             explicit.find_reactions(m, s, dt)
 

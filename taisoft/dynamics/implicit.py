@@ -101,6 +101,7 @@ class ImplicitStepper(ImplicitStages):
             result, part_held = (result, 1.0) if is_rest else self._hold_back(result, dt)
             held += units / PARTS * part_held
             left -= units
+            self.simulation.move_branches(part)
             contact.end_part(now + part, part if left else dt, self.start.x, self.dissipative)
             length.keep(units, converged)
             kept.append(result)

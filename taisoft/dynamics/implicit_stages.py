@@ -187,6 +187,7 @@ class ImplicitStages:
             self._multipliers.begin(time + dt, self.contact.n_contacts == 0 and model.on_cpu)
         self._beta = scheme.beta_over_dt * dt
         self.contact.set_impulse_fraction(scheme.beta_over_dt)
+        simulation.begin_branches((0.5 if scheme.midpoint else 1.0) * dt)
         self.solver.assemble_damper()
         extrapolation = (0.5 if scheme.midpoint else 1.0) if self.n_previous > 1 and not scheme.one_iteration else 0.0
         self._begin(scheme, extrapolation)

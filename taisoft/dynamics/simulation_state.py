@@ -9,6 +9,7 @@ from taisoft.backend.arrays import FieldArena, download, upload
 from taisoft.backend.runtime import Runtime
 from taisoft.dynamics.dirichlet import DirichletConditions
 from taisoft.dynamics.state import StepState
+from taisoft.fem import viscosity
 from taisoft.fem.dependent_table import DependentTable
 from taisoft.fem.elements import law_table
 from taisoft.fem.loads import SceneLoads
@@ -51,6 +52,7 @@ class SimulationState:
         nodes, gravity = self.model.state, np.array(self.scene.gravity)
         multipliers, flight = np.zeros(len(self.loads.multipliers)), np.zeros(len(self.scene.colliders))
         self.now = StepState(self.model, nodes.x, nodes.v, self.dirichlet.released, multipliers, flight, gravity)
+        self.now.history = self.model.viscosity.history if self.model.viscous else None
 
     @property
     def dependents(self) -> DependentTable | None:
@@ -84,9 +86,27 @@ class SimulationState:
             self.dependents.place(v)
         upload([(self.model.state.x, x), (self.model.state.v, v)])
 
+    def begin_branches(self, h: float) -> None:
+        """Let Maxwell branches have their stresses at the end of an interval h [s], which begins at their history."""
+        if self.model.viscous:
+            viscosity.begin_interval(self.model, h)
+
+    def move_branches(self, h: float) -> None:
+        """Move Maxwell branches over an interval h [s] to the present positions; 0: a jump, which they resist as springs."""
+        if self.model.viscous:
+            viscosity.end_interval(self.model, h)
+
+    def dissipated(self) -> np.ndarray:
+        """Return the energies (n_blocks * lanes,) [J] that Maxwell branches have dissipated, by lane."""
+        lanes = np.zeros(self.model.n_blocks * self.model.lanes)
+        if self.model.viscous:
+            viscosity.dissipated_energies(self.model, lanes)
+        return lanes
+
     def snapshot(self) -> dict:
         """Return the state for a checkpoint; see `taisoft/checkpoint.py`."""
-        return {"time": self.time, "step_count": self.step_count} | self.now.snapshot()
+        own = {"time": self.time, "step_count": self.step_count} | self.now.snapshot()
+        return own | ({"branches": viscosity.history_by_tet(self.model, self.scene, self.layout)} if self.model.viscous else {})
 
     def restore(self, kept: dict) -> None:
         """Restore a `snapshot`, also one of another instance of the same scene."""
@@ -95,6 +115,8 @@ class SimulationState:
         self.now.none_cross = bool(kept["none_cross"])
         if self.now.held is not None and "held" in kept:  # another instance may have no contacts
             self.now.held, self.now.misplaced = self.now.held.at_start(kept["held"]), kept["misplaced"]
+        if self.model.viscous:
+            viscosity.set_history(self.model, self.scene, self.layout, kept["branches"])
         self.upload_constraints()
         self.set_state(kept["x"], kept["v"])
         self._begin_at(float(kept["time"]), int(kept["step_count"]), kept["multipliers"])
@@ -103,6 +125,8 @@ class SimulationState:
         """Set the initial state of the scene. From the first reset after a step on, it is kept ready: learning resets often."""
         self.now.released[:] = False
         m = self.model
+        if m.viscous:
+            m.viscosity.history.fill(0.0)
         arrays = (m.free, m.state.x, m.state.v)
         if self._start is not None:
             upload(list(zip(arrays, self._start)))
@@ -116,12 +140,14 @@ class SimulationState:
         self.time, self.step_count = time, step_count
         self.set_multipliers(multipliers)
         self.set_load_time(time)
+        self.begin_branches(0.0)
 
     def return_to(self, earlier: StepState) -> None:
         """Return to an earlier state of the same step."""
         is_constrained_alike = (self.now.released == earlier.released).all()
         self.now.copy_from(earlier)
         self.set_multipliers(earlier.multipliers)
+        self.begin_branches(0.0)
         if not is_constrained_alike:
             self.upload_constraints()
 
@@ -158,11 +184,14 @@ class SimulationState:
             numbers.append((m.mean.modulus, patch_moduli(self.scene)))
         if m.damping is not None:
             numbers.append((m.damping, damping_table(self.scene)))
+        if m.viscous:
+            numbers.append((m.viscosity.stiffness, viscosity.stiffness_table(self.scene, self.layout)))
         if density:
             numbers.append((m.mass, lumped_masses(self.scene, self.dependents)))
             if m.gravity_mass is not m.mass:
                 numbers.append((m.gravity_mass, gravity_masses(self.scene, self.dependents)))
         upload(numbers)
+        self.begin_branches(0.0)
         if density and m.consistent:
             upload_mass_matrix(self.scene, self.dependents, m.mass_matrix)
 

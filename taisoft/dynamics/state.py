@@ -13,6 +13,7 @@ import taichi as ti
 from taisoft.backend.arrays import Array, FieldArena, download
 from taisoft.backend.runtime import kernel
 from taisoft.fem.model import Model
+from taisoft.fem.viscosity import copy_history
 
 if TYPE_CHECKING:
     from taisoft.collision.path_check import HeldPassages
@@ -37,6 +38,7 @@ class StepState:
     multipliers: np.ndarray  # (k,) Lagrange multipliers [Pa] or [N], see `SceneLoads.multipliers`
     flight: np.ndarray  # (n_colliders,) [s^2], see `Rebounds`,
     gravity: np.ndarray  # and gravity (3,) meanwhile [m/s^2]
+    history: Array | None = None  # of Maxwell branches, see `fem.viscosity`; None if there are none
     none_cross: bool = True  # whether no surfaces are known to cross, so that all paths are checked
     misplaced: np.ndarray | None = None  # (k,9), see `Misplacement`; replaced, never changed. None where nothing can touch,
     held: "HeldPassages | None" = None  # as are the passages that the next search adds as contacts
@@ -45,7 +47,8 @@ class StepState:
         """Return a copy with arrays of its own, called x_name and v_name; its nodes are at 0."""
         x, v = (arena.vectors(f"{array}_{name}", ti.f64, self.model.n_nodes) for array in "xv")
         own = (numbers.copy() for numbers in (self.released, self.multipliers, self.flight, self.gravity))
-        return StepState(self.model, x, v, *own, self.none_cross)
+        kept = None if self.history is None else arena.field(f"branch_history_{name}", ti.f64, self.history.shape)
+        return StepState(self.model, x, v, *own, kept, self.none_cross)
 
     def copy_from(self, other: "StepState") -> None:
         """Become equal to another state."""
@@ -61,6 +64,12 @@ class StepState:
         self.released[:], self.flight[:], self.gravity[:] = other.released, other.flight, other.gravity
         self.multipliers, self.none_cross = other.multipliers, other.none_cross
         self.misplaced, self.held = other.misplaced, other.held
+        self.copy_history_from(other)
+
+    def copy_history_from(self, other: "StepState") -> None:
+        """Take over the history of Maxwell branches, if there are any."""
+        if self.history is not None:
+            copy_history(self.model, self.history, other.history)
 
     def snapshot(self) -> dict:
         """Return the state for a checkpoint, where held passages are at the start of a step."""

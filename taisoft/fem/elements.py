@@ -12,7 +12,7 @@ import taichi as ti
 from taisoft.errors import SceneError
 from taisoft.fem import reference
 from taisoft.fem.dependent_table import dependent_table
-from taisoft.fem.laws import lane_law, law_of, volume_floor
+from taisoft.fem.laws import lane_law, law_of, viscosity, volume_floor
 from taisoft.fem.model import Group, Layout, Setup
 from taisoft.fem.pattern import MATRIX_BLOCKS
 from taisoft.fem.springs import spring_table
@@ -20,15 +20,15 @@ from taisoft.scene.laws import LAWS
 from taisoft.scene.rigid import RigidBody
 from taisoft.scene.scene import Body, Scene
 
-ADDITIONS: tuple = ()  # modules, see `laws.additions`; each has `applies(body)`
+ADDITIONS: tuple = (viscosity,)  # modules, see `laws.additions`; each has `applies(body)`, and SWITCH if the plan turns it off
 
 
-def additions_of(body: Body) -> tuple[int, ...]:
-    """The additions to a body's laws, as indices into ADDITIONS."""
-    return tuple(k for k, addition in enumerate(ADDITIONS) if addition.applies(body))
+def additions_of(body: Body, on: dict[str, bool]) -> tuple[int, ...]:
+    """The additions to a body's laws, as indices into ADDITIONS. on: the plan's switches."""
+    return tuple(k for k, one in enumerate(ADDITIONS) if on.get(getattr(one, "SWITCH", None), True) and one.applies(body))
 
 
-def make_layout(scene: Scene, lanes: int) -> tuple[Layout, dict[tuple, np.ndarray]]:
+def make_layout(scene: Scene, lanes: int, on: dict[str, bool]) -> tuple[Layout, dict[tuple, np.ndarray]]:
     """Where the nodes and tets of a scene stand, and the tets of each of its groups, by their kind. Raises SceneError."""
     node_start = np.cumsum([0, *(body.n_nodes for body in scene.bodies)])
     tet_start = np.cumsum([0, *(body.mesh.n_tets for body in scene.bodies)])
@@ -38,7 +38,7 @@ def make_layout(scene: Scene, lanes: int) -> tuple[Layout, dict[tuple, np.ndarra
         for law in composition.laws:
             if mean and getattr(lane_law(law), "dilatation", None) is None:
                 raise SceneError(f'body {body.name!r}: its law {law} has no mean dilatation: give it dilatation="local"')
-            switches = composition.has_volume_floor, mean, isinstance(body, RigidBody), additions_of(body)
+            switches = composition.has_volume_floor, mean, isinstance(body, RigidBody), additions_of(body, on)
             kind, tets = (body.order, body.quadrature_degree, list(LAWS).index(law), *switches), composition.tets_of_law(law)
             padded = np.minimum(np.arange(-(-len(tets) // lanes) * lanes), len(tets) - 1)
             parts.setdefault(kind, []).append(first + tets[padded])

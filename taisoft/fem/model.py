@@ -89,6 +89,7 @@ class Model:
     spring_damping: bool = False
     mean_dilatation: bool = False  # of some group
     mean: Any = None  # fem.mean_dilatation.MeanDilatation
+    viscosity: Any = None  # fem.viscosity.Viscosity
     elasticity_by_tet: bool  # law_constants may differ between the tets of a body
     chunks: int  # of a loop, each with its own partial sums
 
@@ -106,6 +107,11 @@ class Model:
     def sweep(self) -> SweepOrder:
         """Order of a Gauss-Seidel sweep, which is divided in scenes whose loops are, on the CPU."""
         return SweepOrder.of(self.n_nodes) if self.on_cpu and self.chunks > 1 else SweepOrder()
+
+    @property
+    def viscous(self) -> bool:
+        """Whether some law has Maxwell branches."""
+        return self.viscosity is not None
 
     @property
     def depends_on_velocity(self) -> bool:

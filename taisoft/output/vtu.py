@@ -14,7 +14,7 @@ tet (01, 12, 20, 03, 13, 23), taisoft (01, 02, 03, 12, 13, 23).
 | stress | cells | Cauchy stress [Pa], xx yy zz xy yz xz, not finite in a flat tet, 0 in triangles |
 | von_mises | cells | its von Mises equivalent [Pa] |
 | TimeValue | file | time [s] |
-| kinetic, elastic, gravity, loads | file | energies [J] |
+| kinetic, elastic, gravity, loads, dissipated | file | energies [J] |
 | body NAME | file | number of the body called NAME |
 
 Points are float64, what is derived from them float32. Arrays are compressed by zlib, where that helps, and encoded in base64.

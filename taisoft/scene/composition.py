@@ -99,6 +99,15 @@ class Composition:
         moduli.setflags(write=False)
         return moduli
 
+    @cached_property
+    def branches(self) -> np.ndarray:
+        """Maxwell branches of the tets (m, n, 2): relaxation time [s] and fraction; 1 s and 0 for those that a region lacks."""
+        of_material = [material.branches for material in self.materials.values()]
+        table = np.tile((1.0, 0.0), (len(of_material), max(map(len, of_material)), 1))
+        for row, branches in zip(table, of_material):
+            row[: len(branches)] = np.reshape(branches, (-1, 2))
+        return table[self._row] if self.has_regions else np.broadcast_to(table, (self.mesh.n_tets, *table.shape[1:]))
+
     @property
     def lame(self) -> tuple[float | np.ndarray, float | np.ndarray]:
         """Lamé's parameters (mu, lambda) at rest [Pa], each a float or (m,)."""

@@ -53,15 +53,16 @@ def scene_digest(scene: Scene) -> str:
 def _body_parts(body: Body) -> dict[str, list]:
     """Return the values that define a body, by the part's name in messages."""
     rigid = isinstance(body, RigidBody)  # its law and its stiffness are chosen by the Simulator
-    used = [] if rigid else [material.law for material in body.composition.materials.values()]
-    laws = [part for name in used for part in (name, *LAWS[name].fingerprint())]
+    materials = [] if rigid else body.composition.materials.values()
+    laws = [part for one in materials for part in (one.law, *LAWS[one.law].fingerprint())]
+    laws += [material.branches for material in materials] if any(material.branches for material in materials) else []
     constraints = sorted(body.constraints, key=lambda c: c.path is not None)  # scene files have `fix` first
     return {
         "mesh": [body.mesh.vertices, body.mesh.tets],
         "surface": [body.rest_positions[body.nodes.n_elastic :], body.nodes.surface] if body.nodes.embedded is not None else [],
         "skin": [] if body.skin is None else [body.skin.surface.vertices, body.skin.surface.triangles, body.skin.contact],
         "regions": [body.mesh.regions, list(body.composition.materials)] if body.composition.has_regions else [],
-        "order, quadrature, dilatation, law or collision": [
+        "order, quadrature, dilatation, law, branches or collision": [
             body.order,
             body.quadrature_degree,
             body.dilatation,

@@ -8,11 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from taisoft.attributes import guarded_record
-from taisoft.errors import SceneError
+from taisoft.errors import SceneError, value_text
 from taisoft.scene import checks
 from taisoft.scene.law import Law
 from taisoft.scene.laws import LAWS
 
+MAX_BRANCHES = 8
 MIN_VOLUME_FLOOR = 1e-3  # smaller ones are the rounding of J = det F in f32
 MODULI = ("young", "poisson")
 
@@ -66,6 +67,7 @@ class Material:
     mass_damping: float = 0.0  #: [1/s], >= 0
     stiffness_damping: float = 0.0  #: [s], >= 0
     volume_floor: float = 0.0  #: J = det F below which the law stiffens against inversion, 0.001 to 1; 0 for none
+    branches: tuple[tuple[float, float], ...] = ()  #: Maxwell branches, at most 8: relaxation time [s], stiffness over mu
 
     parameters: Mapping[str, float] = dataclasses.field(default_factory=dict, hash=False)  #: numbers of a law that has its own
 
@@ -82,6 +84,7 @@ class Material:
         }
         numbers = {k: checks.number(getattr(self, k), f"material: {k}", **limit) for k, limit in limits.items()}
         checks.store(self, **numbers)
+        checks.store(self, branches=_branches(self.branches))
         if not -1.0 < self.poisson < 0.5:
             raise SceneError(f"material: poisson must lie in the open interval (-1, 0.5), not {self.poisson:g}")
         if self.volume_floor != 0.0 and not MIN_VOLUME_FLOOR <= self.volume_floor < 1.0:
@@ -104,6 +107,20 @@ class Material:
     def lam(self) -> float:
         """Lamé's first parameter [Pa]."""
         return lame_parameters(self.young, self.poisson)[1]
+
+
+def _branches(given) -> tuple[tuple[float, float], ...]:
+    rule = f"must be at most {MAX_BRANCHES} pairs (relaxation time, fraction)"
+    if not isinstance(given, (list, tuple)) or len(given) > MAX_BRANCHES:
+        raise SceneError(f"material: branches {rule}, not {value_text(given)}")
+    for k, pair in enumerate(given):
+        if not isinstance(pair, (list, tuple)) or len(pair) != 2:
+            raise SceneError(f"material: branches {rule}, not {value_text(pair)} in branch {k}")
+
+    def positive(value, name: str, branch: int, unit: str = "") -> float:
+        return checks.number(value, f"material: {name} of branch {branch}", above=0.0, unit=unit)
+
+    return tuple((positive(tau, "relaxation time", k, "s"), positive(g, "fraction", k)) for k, (tau, g) in enumerate(given))
 
 
 def lame_parameters(young: float | np.ndarray, poisson: float | np.ndarray) -> tuple[float | np.ndarray, float | np.ndarray]:

@@ -21,7 +21,7 @@ from taisoft.scene.scene import Scene
 
 Numbers = dict[str, float | list | np.ndarray | None]  # of a scene, by name
 Entry = tuple[str, float | list | np.ndarray | None, Callable]  # name, value, and the call that sets it
-NUMBERS = tuple(field.name for field in dataclasses.fields(Material) if field.name not in ("law", "parameters"))
+NUMBERS = tuple(one.name for one in dataclasses.fields(Material) if one.name not in ("law", "parameters", "branches"))
 LIMITS = dict.fromkeys(("friction", "rest_length", "damping"), {"minimum": 0.0}) | {"stiffness": {"above": 0.0}}
 LIMITS |= {"restitution": {"minimum": 0.0, "maximum": 1.0}}  # of the numbers of obstacles and connections
 

@@ -65,6 +65,7 @@ def make_plan(scene: Scene, explicit: bool, multistep: bool, self_collision: boo
         "every body has one young and one poisson",
     )
     add_if_any("volume_floor", lambda b: b.composition.has_volume_floor, "material of", "every volume_floor is 0")
+    add_if_any("viscosity", lambda b: b.composition.branches.shape[1], "Maxwell branches of", "no material has branches")
     reasons = []
     for given, why in (("auto", f"a poisson of at least {NEARLY_INCOMPRESSIBLE} in linear tets of"), ("mean", "requested for")):
         if names := [b.name for b in scene.bodies if (b.given_dilatation, b.dilatation) == (given, "mean")]:

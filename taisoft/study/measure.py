@@ -77,7 +77,7 @@ def _scene_facts(scene: Scene, task: dict) -> dict:
     """Return what is known before the run: sizes, and which conservation laws hold."""
     bodies = scene.bodies
     mass_damped = any(b.composition.first.mass_damping for b in bodies)
-    damped = mass_damped or any(b.composition.first.stiffness_damping for b in bodies)
+    damped = mass_damped or any(b.composition.first.stiffness_damping or b.composition.branches.size for b in bodies)
     damped = damped or any(one.damping for one in scene.connections)
     prescribed = any(c.path is not None for b in bodies for c in b.constraints) or any(
         o.path is not None for o in scene.obstacles

@@ -74,7 +74,7 @@ def test_points_cells_and_data_come_back_from_meshio(written):
     assert np.array_equal(cells["von_mises"], von_mises(sigma).astype(np.float32))
     assert np.array_equal(cells["body"], np.repeat([0, 1], [len(quadratic.mesh.tets), len(linear.mesh.tets)]))
     assert np.array_equal(cells["region"], np.concatenate([quadratic.mesh.regions, np.zeros(len(linear.mesh.tets))]))
-    expected = {name: getattr(sim.energies(), name) for name in ("kinetic", "elastic", "gravity", "loads")}
+    expected = {name: getattr(sim.energies(), name) for name in ("kinetic", "elastic", "gravity", "loads", "dissipated")}
     expected |= {"TimeValue": sim.time, "body a & <b>": 0, "body linear": 1}
     assert {name: value.item() for name, value in mesh.field_data.items()} == expected
     # VTK's file format: nodes 4 to 9 of type 24 lie on the edges 01, 12, 20, 03, 13, 23

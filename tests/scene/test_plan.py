@@ -48,7 +48,7 @@ def test_every_feature_can_be_on_and_off():
     full.body("beam").add_force([4], lambda t: (t, 0, 0))
     full.body("beam").add_pressure([4], 1.0)
     full.body("beam").collision, full.contact_forces = "distance_field", True
-    full.add_body(cube((9, 0, 0)), rubber(volume_floor=0.1), dilatation="mean")
+    full.add_body(cube((9, 0, 0)), rubber(volume_floor=0.1, branches=((0.1, 0.5),)), dilatation="mean")
     full.add_rigid_body(cube((19, 0, 0)))
     on = make_plan(full, explicit=False, multistep=True, self_collision=True).on
     laws = {name for name in on if name.startswith("law:")}

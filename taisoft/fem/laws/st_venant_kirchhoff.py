@@ -23,7 +23,7 @@ def constants(mu: float, lam: float) -> tuple[float, float, float, float]:
 
 
 @arithmetic
-def _green_strain(F):
+def green_strain(F):
     """E = (F^T F - I)/2, computed from H = F - I to avoid cancellation at small strains."""
     H = [F[k] - (1.0 if ti.static(k % 4 == 0) else 0.0) for k in ti.static(range(9))]
     C = matmul_tn(H, H)
@@ -39,7 +39,7 @@ def _trace_stress(t, p):
 @arithmetic
 def dilatation(F):
     """tr(E)."""
-    E = _green_strain(F)
+    E = green_strain(F)
     return E[0] + E[4] + E[8]
 
 
@@ -59,7 +59,7 @@ def _second_pk(E, p):
 @arithmetic
 def psi(F, p):
     """Energy density [Pa], 0 at rest."""
-    E = _green_strain(F)
+    E = green_strain(F)
     t = E[0] + E[4] + E[8]
     return p[0] * ddot(E, E) + 0.5 * p[1] * t * t
 
@@ -77,7 +77,7 @@ def pk1(F, p):
 def prepare(F, p):
     """Precompute for `dpk1` and `block`: the second Piola-Kirchhoff stress, the Lamé parameters, mu F F^T."""
     B = matmul_nt(F, F)
-    return _second_pk(_green_strain(F), p) + [p[0], p[1]] + [p[0] * B[k] for k in ti.static(range(9))]
+    return _second_pk(green_strain(F), p) + [p[0], p[1]] + [p[0] * B[k] for k in ti.static(range(9))]
 
 
 @arithmetic
