@@ -376,7 +376,7 @@ def test_a_law_that_has_changed_does_not_continue_a_checkpoint(tmp_path):
         sim.step()
         sim.save_checkpoint(tmp_path / "saved.npz")
     ts.register_law("own", OLD[SVK])
-    with pytest.raises(ts.SceneError, match="body 'block': order, quadrature, dilatation, law or collision"):
+    with pytest.raises(ts.SceneError, match="body 'block': order, quadrature, dilatation, law, branches or collision"):
         ts.Simulator.load_checkpoint(tmp_path / "saved.npz", scene)
 
 
