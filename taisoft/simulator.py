@@ -192,6 +192,7 @@ class Simulator(Guarded):
     set_length = changes.set_length
     set_pressure = changes.set_pressure
     set_cavity = changes.set_cavity
+    set_activation = changes.set_activation
     set_pose = commanding.set_pose
     set_velocity = commanding.set_velocity
     set_displacement = commanding.set_displacement

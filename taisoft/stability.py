@@ -1,7 +1,7 @@
 """Linear vibration about the rest shape: Hooke stiffness, highest frequency, stable steps, eigenmodes. NumPy and SciPy.
 
 All three laws linearise to Hooke's law at F = I, so they share one stiffness: sigma = 2 mu eps + lambda tr(eps) I. With mean
-dilatation tr(eps) is averaged over patches. Explicit steps also resolve what a volume floor adds to flat tets.
+dilatation tr(eps) is averaged over patches. Fibres add to it as taut ones. Explicit steps also resolve what a volume floor adds to flat tets.
 """
 
 from typing import NamedTuple
@@ -15,6 +15,7 @@ from taisoft.display import short_repr
 from taisoft.errors import SceneError
 from taisoft.fem import reference
 from taisoft.fem.dependent_table import DependentTable, dependent_table
+from taisoft.fem.fibres import fibre_tangent, start_activation
 from taisoft.fem.loads import SceneLoads
 from taisoft.fem.spring_table import SpringTable, length_and_gradient
 from taisoft.fem.springs import spring_table
@@ -28,7 +29,7 @@ LANCZOS_MARGIN = 1.005  # Lanczos approaches the highest frequency from below; i
 
 
 def hooke_differential(body: Body, with_floor: bool = False):
-    """Return v -> K v of one body at rest, matrix-free: a function (n,3) -> (n,3) [N per unit of v].
+    """Return v -> K v of one body at rest, matrix-free: a function (n,3) -> (n,3) [N per unit of v]. Fibres are fully active.
 
     with_floor: add what a volume floor delta adds to flat tets whose sides have their lengths at rest: at most 2/delta times the
     stiffness of each, with its own dilatation, see `laws.volume_floor`.
@@ -46,6 +47,8 @@ def hooke_differential(body: Body, with_floor: bool = False):
     starts = np.arange(0, rows.size + 1, nodes.shape[1])
     gradient = sp.csr_matrix((rows.reshape(-1), columns.reshape(-1), starts), shape=(len(starts) - 1, body.n_nodes))
     divergence, weight = gradient.T.tocsr(), volumes.reshape(-1, 1, 1)
+    if body.fibres is not None:
+        a, B = (np.repeat(x, volumes.shape[1], axis=0) for x in (body.fibres, fibre_tangent(body, 1.0)))
 
     def apply(v: np.ndarray) -> np.ndarray:
         H = (gradient @ v).reshape(-1, 3, 3)
@@ -54,6 +57,8 @@ def hooke_differential(body: Body, with_floor: bool = False):
         P[:, (0, 1, 2), (0, 1, 2)] += lam * theta[:, None]
         if is_mean:
             P[:, (0, 1, 2), (0, 1, 2)] += patch_lam * average(theta)[:, None]
+        if body.fibres is not None:
+            P += (B @ H @ a[:, :, None]) * a[:, None]
         return divergence @ (weight * P).reshape(-1, 3)
 
     return apply
@@ -78,7 +83,7 @@ def _patch_average(body: Body, volumes: np.ndarray):
 
 
 def hooke_stiffness(body: Body) -> sp.csr_matrix:
-    """Stiffness matrix (3n, 3n) of one body at rest [N/m]."""
+    """Stiffness matrix (3n, 3n) of one body at rest [N/m]. Fibres are as active as at the start."""
     nodes, (mu, lam) = body.nodes.elements, body.composition.lame
     mu, lam = (np.reshape(x, (-1, 1, 1, 1, 1)) for x in (mu, lam))
     gradients, volumes = reference.shape_gradients(body)
@@ -87,6 +92,10 @@ def hooke_stiffness(body: Body) -> sp.csr_matrix:
     is_mean = body.dilatation == "mean"
     lam = 0.0 if is_mean else lam
     K = mu * (np.einsum("eabii->eab", G)[..., None, None] * np.eye(3) + G.swapaxes(3, 4)) + lam * G
+    if body.fibres is not None:
+        along = np.einsum("eqai,ei->eqa", gradients, body.fibres)
+        B = fibre_tangent(body, start_activation(body))
+        K = K + np.einsum("eq,eqa,eqb,eij->eabij", volumes, along, along, B, optimize=True)
     dof = 3 * nodes[:, :, None] + np.arange(3)
     rows = np.broadcast_to(dof[:, :, None, :, None], K.shape)
     columns = np.broadcast_to(dof[:, None, :, None, :], K.shape)
@@ -121,7 +130,7 @@ _frequencies: "WeakKeyDictionary[Composition, dict[tuple, float]]" = WeakKeyDict
 def highest_frequency(body: Body) -> float:
     """omega_max [rad/s] that explicit steps of a body must resolve, by Lanczos; overestimated by a fraction of a percent.
 
-    It is that at rest with lumped mass. A volume floor stiffens its tets by what it adds to flat ones, see `hooke_differential`.
+    It is that at rest with lumped mass, for any activation of fibres, without what their exponential adds under strain. A volume floor stiffens its tets by what it adds to flat ones, see `hooke_differential`.
     """
     free = ~constrained_axes(body, prescribed=False)  # a path may release its nodes
     free[body.nodes.n_elastic :] = False

@@ -12,14 +12,14 @@ import taichi as ti
 from taisoft.errors import SceneError
 from taisoft.fem import reference
 from taisoft.fem.dependent_table import dependent_table
-from taisoft.fem.laws import LAWS, law_of, volume_floor
+from taisoft.fem.laws import LAWS, fibres, law_of, volume_floor
 from taisoft.fem.model import Group, Layout, Setup
 from taisoft.fem.pattern import MATRIX_BLOCKS
 from taisoft.fem.springs import spring_table
 from taisoft.scene.rigid import RigidBody
 from taisoft.scene.scene import Body, Scene
 
-ADDITIONS: tuple = ()  # modules, see `laws.additions`; each has `applies(body)`
+ADDITIONS: tuple = (fibres,)  # modules, see `laws.additions`; each has `applies(body)`
 
 
 def additions_of(body: Body) -> tuple[int, ...]:

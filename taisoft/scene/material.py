@@ -10,6 +10,7 @@ from taisoft.scene import checks
 
 MIN_VOLUME_FLOOR = 1e-3  # smaller ones are the rounding of J = det F in f32
 LAWS = ("st_venant_kirchhoff", "corotational", "stable_neo_hookean")
+FIBRE_NUMBERS = ("fibre_stiffness", "fibre_exponent", "active_stress", "active_strain")  # see `fem.laws.fibres`
 
 
 @guarded_record("material", "make another one by dataclasses.replace, or call sim.set_material(body, {name}=...) in a simulation")
@@ -26,6 +27,10 @@ class Material:
     mass_damping: float = 0.0  #: [1/s], >= 0
     stiffness_damping: float = 0.0  #: [s], >= 0
     volume_floor: float = 0.0  #: J = det F below which the law stiffens against inversion, 0.001 to 1; 0 for none
+    fibre_stiffness: float = 0.0  #: k1 [Pa] of fibres, >= 0; at small strains they add 4 k1 to the stiffness along them
+    fibre_exponent: float = 0.0  #: k2 of their exponential stiffening, >= 0; 0: stress linear in Green's strain
+    active_stress: float = 0.0  #: nominal tension [Pa] of fully activated fibres, >= 0
+    active_strain: float = 0.0  #: shortening of fully activated fibres, 0 to below 1
 
     def __post_init__(self):
         checks.choice(self.law, "material: law", LAWS)
@@ -38,6 +43,7 @@ class Material:
             "mass_damping": {"minimum": 0.0, "unit": "1/s"},
             "stiffness_damping": {"minimum": 0.0, "unit": "s"},
             "volume_floor": {},
+            **dict.fromkeys(FIBRE_NUMBERS, {"minimum": 0.0}),
         }
         numbers = {k: checks.number(getattr(self, k), f"material: {k}", **limit) for k, limit in limits.items()}
         checks.store(self, **numbers)
@@ -46,6 +52,14 @@ class Material:
         if self.volume_floor != 0.0 and not MIN_VOLUME_FLOOR <= self.volume_floor < 1.0:
             rule = f"must be 0, for none, or at least {MIN_VOLUME_FLOOR:g} and below 1"
             raise SceneError(f"material: volume_floor {rule}, not {self.volume_floor:g}")
+
+        if self.active_strain >= 1.0:
+            raise SceneError(f"material: active_strain must be below 1, not {self.active_strain:g}")
+
+    @property
+    def has_fibres(self) -> bool:
+        """Whether any number of its fibres is above 0."""
+        return any(getattr(self, name) > 0.0 for name in FIBRE_NUMBERS)
 
     @property
     def mu(self) -> float:

@@ -12,9 +12,9 @@ from taisoft.attributes import thawed
 from taisoft.errors import SceneError
 from taisoft.scene import checks
 from taisoft.scene.body import Body
-from taisoft.scene.composition import BY_TET
+from taisoft.scene.composition import BY_REGION
 from taisoft.scene.loads import LOADS
-from taisoft.scene.material import Material
+from taisoft.scene.material import FIBRE_NUMBERS, Material
 from taisoft.scene.plan import change_load, change_tendon
 from taisoft.scene.rigid import RigidBody
 from taisoft.scene.scene import Scene
@@ -84,12 +84,17 @@ def _of_material(body: Body) -> Iterator[Entry]:
     composition = body.composition
     for region, material in composition.materials.items() if composition.has_regions else ():
         owner = f"{body.name}.{body.mesh.region_names.get(region, region)}"
-        for name in (*BY_TET, "volume_floor"):
+        for name in BY_REGION if body.fibres is not None else [one for one in BY_REGION if one not in FIBRE_NUMBERS]:
             yield f"{owner}.{name}", getattr(material, name), partial(_set_material, body, name, region)
-    for name in NUMBERS:
+    for name in NUMBERS if body.fibres is not None else [one for one in NUMBERS if one not in FIBRE_NUMBERS]:
         by_region = {getattr(material, name) for material in composition.materials.values()}
         value = composition.by_tet.get(name, by_region.pop() if len(by_region) == 1 else None)
         yield f"{body.name}.{name}", value, partial(_set_material, body, name, None)
+    for region in (None, *body.mesh.region_ids) if body.activations else ():
+        owner = body.name if region is None else f"{body.name}.{body.mesh.region_names.get(region, region)}"
+        values = {None if one.value is None else float(one.value) for one in body.activations if region in (None, one.region)}
+        value = values.pop() if len(values) == 1 else None
+        yield f"{owner}.activation", value, partial(body.set_activation, region=region, what=f"body {body.name!r}: activate")
 
 
 def _of_rigid(body: RigidBody) -> Iterator[Entry]:

@@ -13,12 +13,12 @@ from taisoft.scene.body import NEARLY_INCOMPRESSIBLE, Body, check_volume
 from taisoft.scene.collision import has_sharp_edges
 from taisoft.scene.connections import check_tendon
 from taisoft.scene.loads import LOADS
-from taisoft.scene.material import LAWS
+from taisoft.scene.material import FIBRE_NUMBERS, LAWS
 from taisoft.scene.obstacles import Box, MeshObstacle
 from taisoft.scene.rigid import RigidBody
 from taisoft.scene.scene import Scene
 
-CHANGEABLE = ("young", "poisson", "density", "mass_damping", "stiffness_damping")  # numbers of a material
+CHANGEABLE = ("young", "poisson", "density", "mass_damping", "stiffness_damping", *FIBRE_NUMBERS)  # numbers of a material
 
 
 @dataclass
@@ -65,6 +65,7 @@ def make_plan(scene: Scene, explicit: bool, multistep: bool, self_collision: boo
         "every body has one young and one poisson",
     )
     add_if_any("volume_floor", lambda b: b.composition.has_volume_floor, "material of", "every volume_floor is 0")
+    add_if_any("fibres", lambda b: b.fibres is not None, "material and directions of", "no material has fibres")
     reasons = []
     for given, why in (("auto", f"a poisson of at least {NEARLY_INCOMPRESSIBLE} in linear tets of"), ("mean", "requested for")):
         if names := [b.name for b in scene.bodies if (b.given_dilatation, b.dilatation) == (given, "mean")]:
