@@ -150,6 +150,7 @@ class Simulator(Guarded):
     cavity_volume = queries.cavity_volume
     cavity_pressure = queries.cavity_pressure
     stress = queries.stress
+    fibres = queries.fibres
     elastic_forces = queries.elastic_forces
     force_differential = queries.force_differential
     stable_dt = property(queries.stable_dt)

@@ -1,7 +1,8 @@
 """Linear vibration about the rest shape: Hooke stiffness, highest frequency, stable steps, eigenmodes. NumPy and SciPy.
 
 All three laws linearise to Hooke's law at F = I, so they share one stiffness: sigma = 2 mu eps + lambda tr(eps) I. With mean
-dilatation tr(eps) is averaged over patches. Fibres add to it as taut ones. Explicit steps also resolve what a volume floor adds to flat tets.
+dilatation tr(eps) is averaged over patches. Fibres add their own, as if they were taut. Explicit steps also resolve what a
+volume floor adds to flat tets.
 """
 
 from typing import NamedTuple
@@ -130,7 +131,8 @@ _frequencies: "WeakKeyDictionary[Composition, dict[tuple, float]]" = WeakKeyDict
 def highest_frequency(body: Body) -> float:
     """omega_max [rad/s] that explicit steps of a body must resolve, by Lanczos; overestimated by a fraction of a percent.
 
-    It is that at rest with lumped mass, for any activation of fibres, without what their exponential adds under strain. A volume floor stiffens its tets by what it adds to flat ones, see `hooke_differential`.
+    It is that at rest with lumped mass. A volume floor stiffens its tets by what it adds to flat ones, see `hooke_differential`.
+    Fibres count as fully active; what their exponential adds under strain is left out.
     """
     free = ~constrained_axes(body, prescribed=False)  # a path may release its nodes
     free[body.nodes.n_elastic :] = False

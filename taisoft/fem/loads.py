@@ -43,9 +43,10 @@ class SceneLoads:
     """The loads of a scene with its present values.
 
     nodes: those whose loads follow a path, ascending. multipliers: amplitudes that are Lagrange multipliers, the pressures in
-    cavities of given volume and the tensions of inextensible tendons. has_potential: whether energies count the work of all
-    loads but those along a path: not that of a pressure on an open surface, which depends on the path of its border, of the
-    fluid in a given volume, and of a tendon whose given length follows a path. That of active fibres is elastic energy.
+    cavities of given volume and the tensions of inextensible tendons; activations: those that activate fibres, whose energy is
+    elastic. has_potential: whether energies count the work of all loads but those along a path: not that of a pressure on an
+    open surface, which depends on the path of its border, of the fluid in a given volume, and of a tendon whose given length
+    follows a path.
     """
 
     def __init__(self, scene: Scene, springs: SpringTable | None = None):
@@ -63,6 +64,9 @@ class SceneLoads:
         self.nodes = np.unique(np.concatenate([np.zeros(0, dtype=np.int64), *(path.nodes for path in self._paths)]))
         self._scalars, self._moving = scalar_loads(scene), None if springs is None else springs.moving
         self.multipliers = np.array([n for n, (_, load) in enumerate(self._scalars) if load is FOLLOWS], dtype=np.int64)
+        self.activations = np.array(
+            [n for n, (_, load) in enumerate(self._scalars) if isinstance(load, Activation)], dtype=np.int64
+        )
         others = [load for _, load in pressures_of(scene) if not load.has_potential]
         winches = [tendon for tendon in scene.tendons if tendon.is_inextensible and tendon.path is not None]
         self.has_potential = not (winches or any(load.path is not None or load.value.any() for load in others))
