@@ -37,7 +37,7 @@ def build() -> ts.Scene:
 
 
 def stretch(tension: float) -> float:
-    """Stretch along the fibres of a fully activated bar under a nominal tension [Pa]: Smith et al. 2018, Holzapfel et al. 2000."""
+    """Stretch of a fully activated bar under a nominal tension [Pa]: Smith et al. 2018, Holzapfel et al. 2000."""
     m, l = 4.0 / 3.0 * FLESH.mu, FLESH.lam + 5.0 / 6.0 * FLESH.mu
     alpha = 1.0 + 0.75 * m / l
 

@@ -87,6 +87,7 @@ class Grid:
 
     def __init__(self, scene):
         self._names, self._start = [body.name for body in scene.bodies], start_positions(scene)
+        self._has_fibres = any(body.fibres is not None for body in scene.bodies)
         connectivity, sizes, body, region, tet, first, n_tet = [], [], [], [], [], 0, 0
         for k, one in enumerate(scene.bodies):
             n_tets, regions = one.mesh.n_tets, one.mesh.regions
@@ -128,7 +129,7 @@ class Grid:
             points["estimated_error"] = np.nan_to_num(sim.nodal_errors(), nan=UNKNOWN_ERROR)
         with np.errstate(invalid="ignore"):  # of flat tets
             cells = {"stress": sigma[:, SYMMETRIC[0], SYMMETRIC[1]], "von_mises": von_mises(sigma)}
-        if sim.plan.on["fibres"]:
+        if self._has_fibres:
             cells["fibres"] = sim.fibres()[self._tet]
             cells["fibres"][self._tet < 0] = 0.0
         of_file = {"TimeValue": sim.time} | dataclasses.asdict(sim.energies())

@@ -7,21 +7,25 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import taichi as ti
 
 import taisoft as ts
+from taisoft.backend.runtime import kernel
 from taisoft.errors import MeshError, SceneError, SimulationError
 from taisoft.fem.fibres import fibre_tangent
-from taisoft.fem.laws import evaluate, fibres, stable_neo_hookean
+from taisoft.fem.laws import fibres, stable_neo_hookean
 from taisoft.fem.laws.additions import WithAdditions
 from taisoft.scene.fingerprint import scene_digest
 from taisoft.scene.numbers import scene_numbers, set_numbers
 from taisoft.scene.refine import refined, with_order
 from taisoft.stability import highest_frequency, hooke_stiffness
+from tests.backend.lanes import load, opened, packed, store, unpacked
 from tests.dynamics.scenes import SNH, cube, halved, rubber
 from tests.fem import oracle_laws as oracle
 from tests.fem.matrices import MATRICES
 from tests.scene.toml_scenes import there_and_back
 
+ARRAY = ti.types.ndarray()
 MESH = halved(cube(cells=(2, 1, 1)))
 MUSCLE = rubber(fibre_stiffness=3e4, fibre_exponent=2.0, active_stress=4e4, active_strain=0.2)
 TILTED = np.array([np.cos(0.4), np.sin(0.4), 0.0])
@@ -46,33 +50,41 @@ def numbers(material: ts.Material, activation: float) -> tuple:
     return material.fibre_stiffness, material.fibre_exponent, activation * material.active_stress, s
 
 
-class All(WithAdditions):
-    """A law with fibres, whose constants are all given."""
-
-    N_CONSTANTS = 11
-
-
-LAW = All(stable_neo_hookean, (fibres,))
+LAW = WithAdditions(stable_neo_hookean, (fibres,))
 CASES = [(TILTED, 3e4, 2.0, 4e4, 1.3), (TILTED, 5e4, 0.0, 0.0, 1.0), (np.eye(3)[2], 0.0, 1.0, 3e4, 1.0)]
 each_case = pytest.mark.parametrize("a, k1, k2, T, s", CASES)
 
 
-def values(F, *case):
-    p, lanes = np.concatenate([stable_neo_hookean.constants(1e4, 2e4), case[0], case[1:]]), 4
-    lane_F = evaluate._to_lanes(F, lanes)
-    P, psi = np.empty_like(lane_F), np.empty((len(lane_F), lanes))
-    with evaluate._double_precision():
-        evaluate._evaluate(LAW, lanes, lane_F, p, psi, P)
-    return psi.reshape(-1)[: len(F)], evaluate._from_lanes(P, len(F))
+@kernel
+def evaluate(law: ti.template(), lanes: ti.template(), F: ARRAY, D: ARRAY, p: ARRAY, out: ARRAY):
+    """psi, then the stress, its differential along D and the projected one, of blocks of lanes."""
+    for b in range(F.shape[0]):
+        G, H = load(F, b, lanes, 9), load(D, b, lanes, 9)
+        c = [ti.Vector([p[k] for q in ti.static(range(lanes))]) for k in ti.static(range(11))]
+        energy = [law.psi(G, c)]
+        store(out, b, 0, energy, lanes)
+        store(out, b, 1, law.pk1(G, c), lanes)
+        store(out, b, 10, law.dpk1(G, law.prepare(G, c), H), lanes)
+        store(out, b, 19, law.dpk1_projected(law.prepare_projected(G, c), H), lanes)
 
 
-def differential(F, D, projected, *case):
-    p, lanes = np.concatenate([stable_neo_hookean.constants(1e4, 2e4), case[0], case[1:]]), 4
-    lane_F = evaluate._to_lanes(F, lanes)
-    P = np.empty_like(lane_F)
-    with evaluate._double_precision():
-        evaluate._differential(LAW, projected, lanes, lane_F, p, evaluate._to_lanes(np.broadcast_to(D, F.shape), lanes), P)
-    return evaluate._from_lanes(P, len(F))
+def everything(F, D, *case) -> tuple:
+    """psi (k,), P, dP and the projected dP (k,3,3) of the law with fibres."""
+    p = np.concatenate([stable_neo_hookean.constants(1e4, 2e4), case[0], case[1:]])
+    with opened("f64") as runtime:
+        blocks, along = (packed(values, runtime.lanes, np.float64) for values in (F, np.broadcast_to(D, F.shape)))
+        out = np.zeros((len(blocks), 28, runtime.lanes))
+        evaluate(LAW, runtime.lanes, blocks, along, p, out)
+    found = unpacked(out, len(F))
+    return found[:, 0], *(found[:, k : k + 9].reshape(-1, 3, 3) for k in (1, 10, 19))
+
+
+def values(F, *case) -> tuple:
+    return everything(F, np.zeros((3, 3)), *case)[:2]
+
+
+def differential(F, D, projected, *case) -> np.ndarray:
+    return everything(F, D, *case)[3 if projected else 2]
 
 
 NEAR = np.eye(3) + 0.25 * np.random.default_rng(1).standard_normal((60, 3, 3))
@@ -92,11 +104,10 @@ def test_energy_and_stress_follow_the_formula_and_differentials_the_stress(a, k1
     dP = differential(F, D, False, *case)
     moved = (values(F + h * D, *case)[1] - values(F - h * D, *case)[1]) / (2 * h)
     assert np.abs(dP - moved).max() < 1e-6 * np.abs(dP).max()
-    block = evaluate_blocks(F, *case)
-    assert np.abs(block).max() < 1e-12 * np.abs(dP).max()
+    assert np.abs(unprojected(F, *case)).max() < 1e-12 * np.abs(dP).max()
 
 
-def evaluate_blocks(F, *case) -> np.ndarray:
+def unprojected(F, *case) -> np.ndarray:
     """Fibres' part of the differential minus its projection, which is the same: no eigenvalue is negative."""
     apart = [differential(F, D, False, *case) - differential(F, D, False, *PLAIN) for D in oracle.UNIT]
     projected = [differential(F, D, True, *case) - differential(F, D, True, *PLAIN) for D in oracle.UNIT]
@@ -338,5 +349,4 @@ def test_scenes_without_fibres_have_none_of_their_data():
     scene = ts.Scene()
     scene.add_body(MESH, rubber(), name="plain")
     with ts.Simulator(scene, precision="f64") as sim:
-        assert not sim.plan.on["fibres"] and sim._host().model.fibres is None and sim._host().model.amplitudes is None
-        assert sim._host().model.groups[0].law is stable_neo_hookean
+        assert not sim.plan.on["fibres"] and not {"fibres", "fibre_slot", "amplitudes"} & set(sim.field_bytes)
