@@ -27,8 +27,8 @@ DECAY = 0.99  # factor on the running maxima per picture
 class ConnectionMarks:
     """What is drawn of the connections and pressures of a scene, and their present values.
 
-    attached: (k,) attached nodes; pressed: nodes (k,3) of some triangles under each pressure, and its longest arrow [m]. strokes:
-    of each body with fibres, nodes (k,4) of tets, and their weights (k,2,4) in the ends of strokes.
+    attached: (k,) attached nodes; pressed: nodes (k,3) of some triangles under each pressure, and its longest arrow [m].
+    strokes: of each body with fibres and without a skin, nodes (k,4) of tets and their weights (k,2,4) in the ends of strokes.
     """
 
     def __init__(self, scene, size: float):
@@ -51,10 +51,8 @@ class ConnectionMarks:
                 self._loads.append((load, key))
                 longest = min(PRESSURE_ARROW * size, IN_CHANNEL * float(extent))
                 self.pressed.append((corners[:: -(-len(corners) // MAX_ARROWS)] + starts[body.name], longest))
-
-        self.strokes = [
-            (starts[one.name] + nodes, w) for one in scene.bodies if one.fibres is not None for nodes, w in [_strokes(one)]
-        ]
+        fibrous = [body for body in scene.bodies if body.fibres is not None and body.skin is None]
+        self.strokes = [_strokes(body, starts[body.name]) for body in fibrous]
 
     def segments(self, sim) -> tuple[np.ndarray, np.ndarray] | None:
         """Return ends (k,2,3) [m] and tensions (k,) [N] of springs, tendons and attachments by springs; None without any."""
@@ -74,8 +72,11 @@ class ConnectionMarks:
         return found
 
 
-def _strokes(body) -> tuple[np.ndarray, np.ndarray]:
-    """Nodes (k,4) of tets, and their weights (k,2,4) in the ends of strokes along a body's fibres in triangles of its surface."""
+def _strokes(body, first: int) -> tuple[np.ndarray, np.ndarray]:
+    """Nodes (k,4) of tets, and their weights (k,2,4) in the ends of strokes along a body's fibres in triangles of its surface.
+
+    first: the body's first node.
+    """
     mesh, chosen = body.mesh, np.arange(len(body.mesh.surface))
     chosen = chosen[body.fibres[mesh.surface_tets].any(axis=1)]
     chosen = chosen[:: -(-len(chosen) // MAX_STROKES) or 1]
@@ -89,7 +90,7 @@ def _strokes(body) -> tuple[np.ndarray, np.ndarray]:
     corners = mesh.vertices[tets]
     Dm_inv = np.linalg.inv(corners[:, 1:] - corners[:, :1])
     weights = (ends - corners[:, :1]) @ Dm_inv
-    return tets, np.concatenate([1.0 - weights.sum(axis=2, keepdims=True), weights], axis=2)
+    return first + tets, np.concatenate([1.0 - weights.sum(axis=2, keepdims=True), weights], axis=2)
 
 
 class ConnectionLayer:

@@ -140,7 +140,7 @@ def block(material=MUSCLE, order: int = 1, mesh=MESH, **directions) -> ts.Scene:
 
 
 @pytest.mark.parametrize("order, change", [(1, {}), (2, {}), (1, {"poisson": 0.47, "volume_floor": 0.05})])
-def test_stress_of_a_block_with_fibres_at_an_angle_has_its_closed_form(order, change):
+def test_stress_of_a_block_with_fibres_at_an_angle_has_its_closed_form(order, change, tmp_path):
     """The last one has mean dilatation and a volume floor that does not act."""
     material = replace(MUSCLE, **change)
     scene, F = block(material, order), np.array([[1.2, 0.1, 0.0], [0.05, 0.95, 0.1], [0.0, 0.0, 1.05]])
@@ -155,6 +155,8 @@ def test_stress_of_a_block_with_fibres_at_an_angle_has_its_closed_form(order, ch
             psi = oracle.psi(SNH, F[None], material.young, material.poisson) + fibre_energy(F[None], *case)
             assert sim.energies().elastic == pytest.approx(psi[0] * MESH.volumes.sum(), rel=1e-10)
             assert np.allclose(sim.fibres(), F @ TILTED, atol=1e-14)
+        sim.write_vtu(tmp_path / "a.vtu")
+        assert np.allclose(ts.read_mesh(tmp_path / "a.vtu").fibres, F @ TILTED, atol=1e-6)
         softer = replace(material, fibre_stiffness=1e4)
         sim.set_material("muscle", fibre_stiffness=1e4)
         P = oracle.pk1(SNH, F[None], softer.young, softer.poisson) + fibre_stress(F[None], TILTED, *numbers(softer, 0.75))
