@@ -203,7 +203,7 @@ def set_activation(self: "Simulator", body: str, value: float, region: int | str
     what = f"body {changed.name!r}: set_activation"
     if callable(value):
         raise SceneError(f"{what}: it must be a number: give body.activate a path before the Simulator is made")
-    changed.set_activation(value, region, what)
+    changed._activate(value, region, what)
     dynamics.loads_changed()
 
 

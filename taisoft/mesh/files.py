@@ -53,10 +53,9 @@ def read_mesh(path, fix_orientation: bool = False, weld: float | None = None, re
     path: the file; its extension selects the format. fix_orientation: as for `TetMesh`. weld: merge vertices at most this far
     apart [m]; 0 merges only equal ones, None merges nothing. regions: name of the cell data that hold the tets' regions; by
     default the physical groups of .msh, the references of .mesh, or data called "region". Cell data "fibres" or "fibers" of three
-    components are its fibres. Points, lines and triangles beside
-    the tets, and vertices of no tet, are ignored with a warning; any other element type is refused with its name and count.
-    Second-order tets keep only their corners; a warning reports the number of curved edges that become straight. Raises
-    MeshError.
+    components are its fibres. Points, lines and triangles beside the tets, and vertices of no tet, are ignored with a warning;
+    any other element type is refused with its name and count. Second-order tets keep only their corners; a warning reports the
+    number of curved edges that become straight. Raises MeshError.
     """
     try:
         file = Path(path)

@@ -92,7 +92,8 @@ _GMSH_HEAD = re.compile(rb"\s*(?:\$Comments.*?\$EndComments\s*)?\$MeshFormat\s+(
 _NAMES = re.compile(rb"^[ \t]*\$PhysicalNames\b.*?^[ \t]*\$EndPhysicalNames\b[^\n]*\n?", re.MULTILINE | re.DOTALL)
 _VOLUME_NAME = re.compile(rb'^[ \t]*3[ \t]+(-?\d{1,10})[ \t]+"([^"\n]*)"', re.MULTILINE)
 _FIBRES = re.compile(rb'\s*\d+\s+"(?:%s)"[ \t\r]*\n(?:[ \t]*"[^"\n]*"[ \t\r]*\n)*' % "|".join(FIBRES).encode())
-_TAGS = re.compile(rb"\s*(\d{1,3})((?:\s+\S+)*?)\s+([34])\s+\d+\s+3\s+(\d{1,15})(?:\s+\d+)?[ \t\r]*\n")
+# of such a section: real numbers, then a step, three components, the number of rows, and perhaps the part
+_TAGS = re.compile(rb"\s*(?:0|1\s+\S+)\s+(?:3\s+\d+\s+3\s+(\d{1,15})|4\s+\d+\s+3\s+(\d{1,15})\s+\d+)[ \t\r]*\n")
 _OPENING = re.compile(rb"^[ \t]*\$(?!End)(\w+)[ \t\r]*\n", re.MULTILINE)
 
 
@@ -131,7 +132,7 @@ def read_gmsh(name: str, data: bytes) -> FileContent | None:
                 raise MeshError(f"{name}: line {line} (${section}): expected numbers of tags, three components and a count")
             at = found.end()
             numbers = _Binary(name, data, at, section, order, size) if binary else _Text(name, data, at, section)
-            fibres, at = numbers.rows(int(found[4]), 3), numbers.close()
+            fibres, at = numbers.rows(int(found[1] or found[2]), 3), numbers.close()
             continue
         if section not in readers:
             line, at = data.count(b"\n", 0, at), data.find(b"$End" + opening[1], at)

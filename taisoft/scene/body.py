@@ -69,9 +69,8 @@ class Body(Guarded):
     given_dilatation: one of DILATATIONS. nodes: `Nodes`, the mesh's vertices, for order 2 its mid-edge nodes, and the vertices
     of a skin that is touched; methods choose among those of tets only. skin: `Skin` or None, see `embed`. fibres: (m,3) unit
     vectors at rest, read-only, or None; activations: of the fibres, an `Activation` for each region of the mesh, or one.
-    constraints,
-    tractions, forces, pressures, cavities: lists of `Constraint`, `Traction`, `NodalForce`, `Pressure`, `Cavity`; items can be
-    removed, but only methods add them.
+    constraints, tractions, forces, pressures, cavities: lists of `Constraint`, `Traction`, `NodalForce`, `Pressure`, `Cavity`;
+    items can be removed, but only methods add them.
     collision: one of CONTACT_MODES. Only material, its numbers, position, velocity and collision can be assigned; each is
     validated. `warn_locking` and `warn_bending` warn if tets of order 1 are far too stiff; `Scene.add_body` calls both.
     """
@@ -386,9 +385,9 @@ class Body(Guarded):
         values. Raises SceneError if the body has no fibres, or the region or the activation is invalid.
         """
         self._check_open("activate")
-        self.set_activation(activation, region, f"{self._label()}: activate")
+        self._activate(activation, region, f"{self._label()}: activate")
 
-    def set_activation(self, activation, region: int | str | None, what: str) -> None:
+    def _activate(self, activation, region: int | str | None, what: str) -> None:
         """As `activate`, also during a run. what: start of messages."""
         if self.fibres is None:
             raise SceneError(f"{what}: it has no fibres: give add_body fibres")

@@ -94,7 +94,7 @@ def _of_material(body: Body) -> Iterator[Entry]:
         owner = body.name if region is None else f"{body.name}.{body.mesh.region_names.get(region, region)}"
         values = {None if one.value is None else float(one.value) for one in body.activations if region in (None, one.region)}
         value = values.pop() if len(values) == 1 else None
-        yield f"{owner}.activation", value, partial(body.set_activation, region=region, what=f"body {body.name!r}: activate")
+        yield f"{owner}.activation", value, partial(body._activate, region=region, what=f"body {body.name!r}: activate")
 
 
 def _of_rigid(body: RigidBody) -> Iterator[Entry]:
