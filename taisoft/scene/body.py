@@ -183,6 +183,7 @@ class Body(Guarded):
         self._compose(compose(self._label(), self.mesh, value, self.fibres))
 
     def _compose(self, composition: Composition) -> None:
+        composition.check_fibres(self._label())
         warns = self._sealed  # add_body and the simulator issue their own warnings
         with thawed(self):
             self.composition = composition

@@ -17,11 +17,6 @@ from taisoft.scene.fibres import directions
 from taisoft.scene.material import FIBRE_NUMBERS, LAWS, Material, lame_parameters
 
 BY_TET = ("young", "poisson", "density")  # numbers that may differ from tet to tet
-BY_REGION = (
-    *BY_TET,
-    "volume_floor",
-    *FIBRE_NUMBERS,
-)  # that may differ between the regions of a body whose regions have materials
 OF_THE_BODY = ("friction", "restitution", "mass_damping", "stiffness_damping")
 
 
@@ -61,7 +56,7 @@ class Composition:
         return np.searchsorted(list(self.materials), self.mesh.regions)
 
     def number(self, name: str) -> float | np.ndarray:
-        """Return one of BY_REGION: a float if one holds for all tets by design, else (m,)."""
+        """Return one of BY_TET, or `volume_floor`: a float if one holds for all tets by design, else (m,)."""
         if name in self.by_tet or not self.has_regions:
             return self.by_tet.get(name, getattr(self.first, name))
         values = np.array([getattr(material, name) for material in self.materials.values()])[self._row]
@@ -77,6 +72,16 @@ class Composition:
     def has_fibres(self) -> bool:
         """Whether some material has fibres."""
         return any(material.has_fibres for material in self.materials.values())
+
+    def check_fibres(self, what: str) -> None:
+        """Raise SceneError if the material of a tet has fibres, but they have no direction there. what: start of messages."""
+        if self.has_fibres and self.fibres is None:
+            raise SceneError(f"{what}: its material has fibres, so it needs their directions: give add_body fibres")
+        if self.has_fibres:
+            numbers = [np.broadcast_to(self.number(name), self.mesh.n_tets) for name in FIBRE_NUMBERS]
+            if (missing := np.any(numbers, axis=0) & ~self.fibres.any(axis=1)).any():
+                tet = int(np.argmax(missing))
+                raise SceneError(f"{what}: fibres: the direction of tet {tet} is zero, but its material has fibres")
 
     @property
     def lame(self) -> tuple[float | np.ndarray, float | np.ndarray]:
@@ -114,11 +119,11 @@ class Composition:
                 by_tet.pop(name, None)
                 everywhere[name] = value
         materials = {key: _replaced(what, material, everywhere) for key, material in self.materials.items()}
-        return _with_fibres(what, replace(self, materials=materials, by_tet=by_tet))
+        return replace(self, materials=materials, by_tet=by_tet)
 
     def _changed_in(self, what: str, numbers: dict, region: int | str) -> "Composition":
         """Return a composition with other numbers in one region: of its material, or by tet where they are given so."""
-        allowed = BY_REGION if self.has_regions else BY_TET
+        allowed = (*BY_TET, "volume_floor", *FIBRE_NUMBERS) if self.has_regions else BY_TET
         for name in numbers:
             if name not in allowed:
                 raise SceneError(f"{what}: {name} is one number for the whole body; {', '.join(allowed)} can differ by region")
@@ -132,8 +137,7 @@ class Composition:
             if name in by_tet or not self.has_regions:
                 by_tet[name] = np.where(self.mesh.regions == key, getattr(changed, name), self.number(name))
                 by_tet[name].setflags(write=False)
-        materials = self.materials | ({key: changed} if self.has_regions else {})
-        return _with_fibres(what, replace(self, materials=materials, by_tet=by_tet))
+        return replace(self, materials=self.materials | ({key: changed} if self.has_regions else {}), by_tet=by_tet)
 
 
 def compose(what: str, mesh: TetMesh, material: Material | Mapping, fibres=None, **numbers) -> Composition:
@@ -149,19 +153,8 @@ def compose(what: str, mesh: TetMesh, material: Material | Mapping, fibres=None,
         if not made.has_fibres:
             raise SceneError(f"{what}: it has fibres, but {', '.join(FIBRE_NUMBERS)} of its material are 0")
         made = replace(made, fibres=directions(what, mesh, mesh.fibres if fibres is None else fibres))
+    made.check_fibres(what)
     return made.changed(what, {name: value for name, value in numbers.items() if value is not None})
-
-
-def _with_fibres(what: str, made: Composition) -> Composition:
-    """Return a composition whose fibres fit its materials. Raises SceneError if a tet has their numbers, but no direction."""
-    if not made.has_fibres:
-        return made
-    if made.fibres is None:
-        raise SceneError(f"{what}: its material has fibres, so it needs their directions: give add_body fibres")
-    has_numbers = np.any([np.broadcast_to(made.number(name), made.mesh.n_tets) > 0.0 for name in FIBRE_NUMBERS], axis=0)
-    if (missing := has_numbers & ~made.fibres.any(axis=1)).any():
-        raise SceneError(f"{what}: fibres: the direction of tet {int(np.argmax(missing))} is zero, but its material has fibres")
-    return made
 
 
 def _by_region(what: str, mesh: TetMesh, materials: Mapping) -> dict[int, Material]:

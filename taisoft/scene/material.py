@@ -8,9 +8,9 @@ from taisoft.attributes import guarded_record
 from taisoft.errors import SceneError
 from taisoft.scene import checks
 
+FIBRE_NUMBERS = ("fibre_stiffness", "fibre_exponent", "active_stress", "active_strain")  # see `fem.laws.fibres`
 MIN_VOLUME_FLOOR = 1e-3  # smaller ones are the rounding of J = det F in f32
 LAWS = ("st_venant_kirchhoff", "corotational", "stable_neo_hookean")
-FIBRE_NUMBERS = ("fibre_stiffness", "fibre_exponent", "active_stress", "active_strain")  # see `fem.laws.fibres`
 
 
 @guarded_record("material", "make another one by dataclasses.replace, or call sim.set_material(body, {name}=...) in a simulation")
@@ -49,17 +49,11 @@ class Material:
         checks.store(self, **numbers)
         if not -1.0 < self.poisson < 0.5:
             raise SceneError(f"material: poisson must lie in the open interval (-1, 0.5), not {self.poisson:g}")
+        if self.active_strain >= 1.0:
+            raise SceneError(f"material: active_strain must be below 1, not {self.active_strain:g}")
         if self.volume_floor != 0.0 and not MIN_VOLUME_FLOOR <= self.volume_floor < 1.0:
             rule = f"must be 0, for none, or at least {MIN_VOLUME_FLOOR:g} and below 1"
             raise SceneError(f"material: volume_floor {rule}, not {self.volume_floor:g}")
-
-        if self.active_strain >= 1.0:
-            raise SceneError(f"material: active_strain must be below 1, not {self.active_strain:g}")
-
-    @property
-    def has_fibres(self) -> bool:
-        """Whether any number of its fibres is above 0."""
-        return any(getattr(self, name) > 0.0 for name in FIBRE_NUMBERS)
 
     @property
     def mu(self) -> float:
@@ -70,6 +64,11 @@ class Material:
     def lam(self) -> float:
         """Lamé's first parameter [Pa]."""
         return lame_parameters(self.young, self.poisson)[1]
+
+    @property
+    def has_fibres(self) -> bool:
+        """Whether any number of its fibres is above 0."""
+        return any(getattr(self, name) > 0.0 for name in FIBRE_NUMBERS)
 
 
 def lame_parameters(young: float | np.ndarray, poisson: float | np.ndarray) -> tuple[float | np.ndarray, float | np.ndarray]:

@@ -12,7 +12,7 @@ from taisoft.attributes import thawed
 from taisoft.errors import SceneError
 from taisoft.scene import checks
 from taisoft.scene.body import Body
-from taisoft.scene.composition import BY_REGION
+from taisoft.scene.composition import BY_TET
 from taisoft.scene.loads import LOADS
 from taisoft.scene.material import FIBRE_NUMBERS, Material
 from taisoft.scene.plan import change_load, change_tendon
@@ -59,7 +59,9 @@ def set_numbers(scene: Scene, numbers: Numbers) -> None:
 def _entries(scene: Scene) -> Iterator[Entry]:
     yield "gravity", scene.gravity.tolist(), partial(setattr, scene, "gravity")
     for body in scene.bodies:
-        yield from (_of_rigid if isinstance(body, RigidBody) else _of_material)(body)
+        own = (_of_rigid if isinstance(body, RigidBody) else _of_material)(body)
+        yield from (one for one in own if body.fibres is not None or one[0].rpartition(".")[2] not in FIBRE_NUMBERS)
+        yield from () if body.fibres is None else _of_fibres(body)
         for kind, loads in LOADS.items():
             for i, load in enumerate(getattr(body, loads)):
                 name = f"{load.name}.{load.given}" if kind == "cavity" else f"{body.name}.{kind}.{i}"
@@ -84,14 +86,21 @@ def _of_material(body: Body) -> Iterator[Entry]:
     composition = body.composition
     for region, material in composition.materials.items() if composition.has_regions else ():
         owner = f"{body.name}.{body.mesh.region_names.get(region, region)}"
-        for name in BY_REGION if body.fibres is not None else [one for one in BY_REGION if one not in FIBRE_NUMBERS]:
+        for name in (*BY_TET, "volume_floor"):
             yield f"{owner}.{name}", getattr(material, name), partial(_set_material, body, name, region)
-    for name in NUMBERS if body.fibres is not None else [one for one in NUMBERS if one not in FIBRE_NUMBERS]:
+    for name in NUMBERS:
         by_region = {getattr(material, name) for material in composition.materials.values()}
         value = composition.by_tet.get(name, by_region.pop() if len(by_region) == 1 else None)
         yield f"{body.name}.{name}", value, partial(_set_material, body, name, None)
-    for region in (None, *body.mesh.region_ids) if body.activations else ():
+
+
+def _of_fibres(body: Body) -> Iterator[Entry]:
+    """Activations, and the numbers of the fibres of regions with their own material."""
+    for region in (None, *body.mesh.region_ids):
         owner = body.name if region is None else f"{body.name}.{body.mesh.region_names.get(region, region)}"
+        for name in FIBRE_NUMBERS if body.composition.has_regions and region is not None else ():
+            value = getattr(body.composition.materials[region], name)
+            yield f"{owner}.{name}", value, partial(_set_material, body, name, region)
         values = {None if one.value is None else float(one.value) for one in body.activations if region in (None, one.region)}
         value = values.pop() if len(values) == 1 else None
         yield f"{owner}.activation", value, partial(body._activate, region=region, what=f"body {body.name!r}: activate")

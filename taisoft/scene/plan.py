@@ -174,6 +174,7 @@ def change_material(body: Body, numbers: dict, on: dict[str, bool], region: int 
             hint = checks.nearest(name, CHANGEABLE)
             raise SceneError(f"{what}: {name} cannot change while it runs{hint}; {', '.join(CHANGEABLE)} can")
     composition = body.composition.changed(what, numbers, region)
+    composition.check_fibres(what)
     for name in numbers:
         if name in on and not on[name] and getattr(composition.first, name) != 0.0:
             rule = "was 0 everywhere at the start and is not modelled; start with a small value to change it later"
