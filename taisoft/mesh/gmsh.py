@@ -279,13 +279,13 @@ def _elements_2(numbers: _Text) -> tuple[Blocks, list[np.ndarray], list[np.ndarr
         numbers.at = start + at + 2  # the place of an error
         code, n_labels = (values[at + 1 : at + 3] + [0, -1])[:2]
         kind = _element_type(numbers, code) if n_labels >= 0 else ("", 0)
-        first, own = at + 3 + n_labels, values[at]
+        begin, first = at, at + 3 + n_labels
         at = first + kind[1]
         if n_labels < 0 or at > len(values):
             raise numbers.error("this element is not complete")
         nodes, groups, tags = found.setdefault(kind, ([], [], []))
         nodes.extend(values[first:at])
-        tags.append(own)
+        tags.append(values[begin])
         groups.append(values[first - n_labels] if n_labels else 0)
     numbers.at = start + at
     blocks = [(name, np.array(nodes, dtype=np.int64).reshape(-1, n)) for (name, n), (nodes, _, _) in found.items()]
