@@ -25,6 +25,7 @@ _MODULES = {  # public name -> the module that defines it
     "read_surface": "taisoft.mesh.surface_mesh",
     "tetrahedralize": "taisoft.mesh.surface_mesh",
     "place": "taisoft.mesh.placing",
+    "harmonic_fibres": "taisoft.scene.fibres",
     "Material": "taisoft.scene.scene",
     "Body": "taisoft.scene.scene",
     "Scene": "taisoft.scene.scene",

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 
 INSTEAD = {  # what to do instead of assigning to an attribute that a simulator has or might be expected to have
     **{name: f"call sim.set_material(body, {name}=...)" for name in CHANGEABLE},
+    **dict.fromkeys(("activation", "activations"), "call sim.set_activation(body, value)"),
     **{name: f"call sim.set_contact(name_a, name_b, {name}=...)" for name in ("friction", "restitution")},
     **{name: f"call sim.set_state({name}=...)" for name in ("positions", "velocities")},
     **{name: f"call sim.rebuild({name}=...)" for name in NAMES if name not in FIXED},
@@ -104,7 +105,7 @@ def set_gravity(self: "Simulator", gravity) -> None:
 
 
 def set_material(self: "Simulator", body: str, region: int | str | None = None, **numbers) -> None:
-    """Change numbers of a body's material (young, poisson, density, mass_damping, stiffness_damping); the law stays.
+    """Change numbers of a body's material (young, poisson, density, damping, those of fibres); the law stays.
 
     Without a region they hold for all tets; young, poisson and density may also be (m,), young and poisson only if they were
     given by tet or by region when the Simulator was made. With a region, given by name or id, the three change there only.
@@ -193,6 +194,19 @@ def set_cavity(self: "Simulator", name: str, value: float) -> None:
     """
     body, cavity = self.scene.cavity(name)
     _set_load(self, "cavity", body.name, body.cavities.index(cavity), value)
+
+
+def set_activation(self: "Simulator", body: str, value: float, region: int | str | None = None) -> None:
+    """Change the activation, from 0 to 1, of a body's fibres, or of those in one region of its mesh, from the next step on.
+
+    It replaces a path. Raises SceneError if the body has no fibres, or the region or the value is invalid.
+    """
+    dynamics, changed = self._open(), self.scene.bodies[body_index(self, body)]
+    what = f"body {changed.name!r}: set_activation"
+    if callable(value):
+        raise SceneError(f"{what}: it must be a number: give body.activate a path before the Simulator is made")
+    changed._activate(value, region, what)
+    dynamics.loads_changed()
 
 
 def _set_load(sim: "Simulator", kind: str, body: str, index: int, value) -> None:

@@ -79,7 +79,7 @@ class EnergyCheck:
         self._first = True  # the next step is the first since the start
         self._start_internal, self._start_potential = now.kinetic + now.elastic, now.gravity + now.loads
         self._upper_bound = self._start_internal + self._bounds(now)[1]
-        self._motion_energy = self._start_internal + self._negligible
+        self._motion_energy = max(self._start_internal, 0.0) + self._negligible  # of active fibres it may be negative
 
     def _bounds(self, now: Energies | StepReport) -> tuple[float, float]:
         """Largest amounts by which H can lie below and above E [J]."""

@@ -8,7 +8,7 @@ from taisoft.backend import runtime
 from taisoft.backend.arrays import upload
 from taisoft.dynamics.drag_spring import Drag
 from taisoft.errors import SceneError, SimulationError
-from taisoft.fem.reference import gravity_mass, lumped_mass
+from taisoft.fem.reference import gravity_mass, inverse_rest_edges, lumped_mass
 from taisoft.fem.terms import elasticity
 from taisoft.records import Energies, ErrorEstimate
 from taisoft.scene.obstacles import Obstacle
@@ -105,10 +105,24 @@ def stress(self: "Simulator", body: str | None = None) -> np.ndarray:
     """Return the Cauchy stress per tet (m,3,3) [Pa], not finite in a flat tet; without a name, of all bodies as added."""
     state = self._open().state
     m, layout = state.model, state.layout
+    state.set_load_time(state.time)  # of activations
     lanes = layout.lane_of_tet if body is None else layout.lane_of_tet[layout.tets(body_index(self, body))]
     sigma = np.zeros((m.n_blocks * m.lanes, 9))
     elasticity.cauchy_stress(m, sigma)
     return sigma[lanes].reshape(-1, 3, 3)
+
+
+def fibres(self: "Simulator", body: str | None = None) -> np.ndarray:
+    """Return F a (m,3) of the unit vectors a of fibres at rest: their present directions, each as long as its stretch.
+
+    0 in tets without; of quadratic tets with F of the corners. Without a name, of all bodies as added.
+    """
+    found = []
+    for one in self.scene.bodies if body is None else [self.scene.bodies[body_index(self, body)]]:
+        a = np.zeros((one.mesh.n_tets, 3)) if one.fibres is None else one.fibres
+        corners, Dm_inv = self.positions(one.name)[one.mesh.tets], inverse_rest_edges(one.mesh.vertices, one.mesh.tets)[0]
+        found.append(np.einsum("eki,ekj,ej->ei", corners[:, 1:] - corners[:, :1], Dm_inv, a))
+    return np.concatenate(found)
 
 
 def elastic_forces(self: "Simulator") -> np.ndarray:

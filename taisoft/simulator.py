@@ -150,6 +150,7 @@ class Simulator(Guarded):
     cavity_volume = queries.cavity_volume
     cavity_pressure = queries.cavity_pressure
     stress = queries.stress
+    fibres = queries.fibres
     elastic_forces = queries.elastic_forces
     force_differential = queries.force_differential
     stable_dt = property(queries.stable_dt)
@@ -192,6 +193,7 @@ class Simulator(Guarded):
     set_length = changes.set_length
     set_pressure = changes.set_pressure
     set_cavity = changes.set_cavity
+    set_activation = changes.set_activation
     set_pose = commanding.set_pose
     set_velocity = commanding.set_velocity
     set_displacement = commanding.set_displacement

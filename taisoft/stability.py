@@ -1,8 +1,8 @@
 """Linear vibration about the rest shape: Hooke stiffness, highest frequency, stable steps, eigenmodes. NumPy and SciPy.
 
-All three laws linearise to Hooke's law at F = I, so they share one stiffness: sigma = 2 mu eps + lambda tr(eps) I. With mean
-dilatation tr(eps) is averaged over patches. Explicit steps also resolve what a volume floor adds to flat tets, and Maxwell
-branches, which are relaxed in modes.
+Isotropic laws linearise to Hooke's law at F = I, so they share one stiffness: sigma = 2 mu eps + lambda tr(eps) I. With mean
+dilatation tr(eps) is averaged over patches. Fibres add their own, as if they were taut. Explicit steps also resolve what a
+volume floor adds to flat tets, and Maxwell branches, which are relaxed in modes.
 """
 
 from typing import NamedTuple
@@ -16,6 +16,7 @@ from taisoft.display import short_repr
 from taisoft.errors import SceneError
 from taisoft.fem import reference
 from taisoft.fem.dependent_table import DependentTable, dependent_table
+from taisoft.fem.fibres import fibre_tangent, start_activation
 from taisoft.fem.loads import SceneLoads
 from taisoft.fem.spring_table import SpringTable, length_and_gradient
 from taisoft.fem.springs import spring_table
@@ -29,7 +30,7 @@ LANCZOS_MARGIN = 1.005  # Lanczos approaches the highest frequency from below; i
 
 
 def hooke_differential(body: Body, stiffest: bool = False):
-    """Return v -> K v of one body at rest, matrix-free: a function (n,3) -> (n,3) [N per unit of v].
+    """Return v -> K v of one body at rest, matrix-free: a function (n,3) -> (n,3) [N per unit of v]. Fibres are fully active.
 
     stiffest: add what a volume floor delta adds to flat tets whose sides have their lengths at rest: at most 2/delta times the
     stiffness of each, with its own dilatation, see `laws.volume_floor`; and Maxwell branches that have not relaxed.
@@ -39,7 +40,8 @@ def hooke_differential(body: Body, stiffest: bool = False):
     added, is_mean = _floor_stiffness(body) if stiffest else 0.0, body.dilatation == "mean"
     fractions = body.composition.branches[..., 1].sum(axis=1)
     branches = mu * (fractions if body.composition.elastic_by_tet else fractions[0]) if stiffest else 0.0
-    mu, lam = mu * (1.0 + added) + branches, lam * (added if is_mean else 1.0 + added) - 2.0 / 3.0 * branches
+    local = lam - body.composition.dilatation_modulus if is_mean else 0.0
+    mu, lam = mu * (1.0 + added) + branches, lam * (added if is_mean else 1.0 + added) + local - 2.0 / 3.0 * branches
     if body.composition.elastic_by_tet:  # one row for each quadrature point
         mu, lam = (np.repeat(np.broadcast_to(x, len(nodes)), volumes.shape[1])[:, None] for x in (mu, lam))
         mu = mu[:, :, None]
@@ -49,6 +51,11 @@ def hooke_differential(body: Body, stiffest: bool = False):
     starts = np.arange(0, rows.size + 1, nodes.shape[1])
     gradient = sp.csr_matrix((rows.reshape(-1), columns.reshape(-1), starts), shape=(len(starts) - 1, body.n_nodes))
     divergence, weight = gradient.T.tocsr(), volumes.reshape(-1, 1, 1)
+    if body.fibres is not None:
+        a, B = (np.repeat(x, volumes.shape[1], axis=0) for x in (body.fibres, fibre_tangent(body, 1.0)))
+
+    extra = body.composition.anisotropy
+    extra = None if extra is None else np.repeat(extra, volumes.shape[1], axis=0)
 
     def apply(v: np.ndarray) -> np.ndarray:
         H = (gradient @ v).reshape(-1, 3, 3)
@@ -57,6 +64,10 @@ def hooke_differential(body: Body, stiffest: bool = False):
         P[:, (0, 1, 2), (0, 1, 2)] += lam * theta[:, None]
         if is_mean:
             P[:, (0, 1, 2), (0, 1, 2)] += patch_lam * average(theta)[:, None]
+        if extra is not None:
+            P += (extra @ H.reshape(-1, 9, 1)).reshape(-1, 3, 3)
+        if body.fibres is not None:
+            P += (B @ H @ a[:, :, None]) * a[:, None]
         return divergence @ (weight * P).reshape(-1, 3)
 
     return apply
@@ -81,15 +92,22 @@ def _patch_average(body: Body, volumes: np.ndarray):
 
 
 def hooke_stiffness(body: Body) -> sp.csr_matrix:
-    """Stiffness matrix (3n, 3n) of one body at rest [N/m]."""
+    """Stiffness matrix (3n, 3n) of one body at rest [N/m]. Fibres are as active as at the start."""
     nodes, (mu, lam) = body.nodes.elements, body.composition.lame
     mu, lam = (np.reshape(x, (-1, 1, 1, 1, 1)) for x in (mu, lam))
     gradients, volumes = reference.shape_gradients(body)
     # G_ab = sum_q V_q ga gb^T, and K_ab = mu (tr(G_ab) I + G_ab^T) + lambda G_ab
     G = np.einsum("eq,eqai,eqbj->eabij", volumes, gradients, gradients, optimize=True)
     is_mean = body.dilatation == "mean"
-    lam = 0.0 if is_mean else lam
+    lam = lam - np.reshape(body.composition.dilatation_modulus, (-1, 1, 1, 1, 1)) if is_mean else lam
     K = mu * (np.einsum("eabii->eab", G)[..., None, None] * np.eye(3) + G.swapaxes(3, 4)) + lam * G
+    if (extra := body.composition.anisotropy) is not None:
+        extra = extra.reshape(-1, 3, 3, 3, 3)
+        K = K + np.einsum("eq,eqaj,eqbl,eijkl->eabik", volumes, gradients, gradients, extra, optimize=True)
+    if body.fibres is not None:
+        along = np.einsum("eqai,ei->eqa", gradients, body.fibres)
+        B = fibre_tangent(body, start_activation(body))
+        K = K + np.einsum("eq,eqa,eqb,eij->eabij", volumes, along, along, B, optimize=True)
     dof = 3 * nodes[:, :, None] + np.arange(3)
     rows = np.broadcast_to(dof[:, :, None, :, None], K.shape)
     columns = np.broadcast_to(dof[:, None, :, None, :], K.shape)
@@ -125,6 +143,7 @@ def highest_frequency(body: Body) -> float:
     """omega_max [rad/s] that explicit steps of a body must resolve, by Lanczos; overestimated by a fraction of a percent.
 
     It is that at rest with lumped mass, of bodies that are as stiff as they may be, see `hooke_differential`.
+    Fibres count as fully active; what their exponential adds under strain is left out.
     """
     free = ~constrained_axes(body, prescribed=False)  # a path may release its nodes
     free[body.nodes.n_elastic :] = False

@@ -217,7 +217,9 @@ class StaticSolver:
 
     def _residual(self, result: StageResult) -> float:
         """The residual of the result; 0 without load and constraint forces, where it would be rounding over rounding."""
-        loaded = self.gravity.any() or any(full.any() for *_, full in self.loads) or self.multipliers is not None
+        m, active = self.simulation.model, self.simulation.loads.activations
+        applied = [np.delete(full, active) if field is m.amplitudes else full for field, _, full in self.loads]
+        loaded = self.gravity.any() or any(full.any() for full in applied) or self.multipliers is not None
         only_rounding = not loaded and np.linalg.norm(self.solver.held_residual()) <= self.solver.rounding.force
         return 0.0 if only_rounding and result.converged else result.residual
 

@@ -235,7 +235,7 @@ def _add_run(add) -> None:
     option("--error-mesh", choices=("refined", "order"), help="also by one on another mesh; implies --error")
     colours = ("body", "stress", "stretch", "speed", "error")
     option("--colour", choices=colours, default="body", help="colouring of bodies in pictures and the window")
-    layers = "what they show besides bodies: wires, contacts, tractions, pressures, connections, fixed_nodes, or none"
+    layers = "what they show besides bodies: wires, contacts, tractions, pressures, connections, fibres, fixed_nodes, or none"
     option("--layers", metavar="NAME,...", help=layers)
     plots = "on pictures, over time: energies, residuals, iterations, contacts, step_time, error, forces, kinetic, elastic"
     option("--plots", metavar="NAME,...", help=plots)

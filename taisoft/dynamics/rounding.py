@@ -24,6 +24,9 @@ class RoundingFloor:
         volume, Dm_inv, mass = (a.astype(np.float64) for a in (volume, Dm_inv, mass))
         stiffness = np.abs(constants[:, :2]).sum(axis=1)  # of each body, or of each lane
         stiffness = stiffness if m.elasticity_by_tet else stiffness[body][:, None]
+        if m.fibres is not None:
+            numbers = download([m.fibres.numbers])[0]
+            stiffness = stiffness + 4.0 * numbers[:, 3] + numbers[:, 5]
         g = np.sqrt((Dm_inv**2).sum(axis=1))
         if m.points is not None:  # the gradients of quadratic shape functions are larger
             steepest = float(np.abs(m.points.to_numpy()[:, 1:]).max())

@@ -12,6 +12,7 @@ from taisoft.dynamics.state import StepState
 from taisoft.fem import viscosity
 from taisoft.fem.dependent_table import DependentTable
 from taisoft.fem.elements import law_table
+from taisoft.fem.fibres import fibre_table
 from taisoft.fem.loads import SceneLoads
 from taisoft.fem.masses import upload_mass_matrix
 from taisoft.fem.mean_dilatation import patch_moduli
@@ -182,6 +183,8 @@ class SimulationState:
         numbers = [(m.law_constants, law_table(self.scene, self.layout, m.elasticity_by_tet))]
         if m.mean_dilatation:
             numbers.append((m.mean.modulus, patch_moduli(self.scene)))
+        if m.fibres is not None:
+            numbers.append((m.fibres.numbers, fibre_table(self.scene, self.layout)))
         if m.damping is not None:
             numbers.append((m.damping, damping_table(self.scene)))
         if m.viscous:

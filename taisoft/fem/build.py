@@ -14,14 +14,14 @@ import taichi as ti
 from taisoft.backend import parallel
 from taisoft.backend.arrays import FieldArena
 from taisoft.backend.runtime import Runtime
-from taisoft.fem import dependents, elements, loads, masses, mean_dilatation, pressure, rigid_tets, springs, viscosity
+from taisoft.fem import dependents, elements, fibres, loads, masses, mean_dilatation, pressure, rigid_tets, springs, viscosity
 from taisoft.fem.model import Group, Layout, Model, Setup
 from taisoft.fem.pattern import model_graph
 from taisoft.fem.state import N_COLUMNS, N_SCALARS, State
 from taisoft.fem.terms import rayleigh_damping, terms_of
 from taisoft.scene.scene import Scene
 
-FEATURES = (masses, dependents, springs, loads, rigid_tets, rayleigh_damping, mean_dilatation, viscosity)
+FEATURES = (masses, dependents, springs, loads, rigid_tets, rayleigh_damping, mean_dilatation, fibres, viscosity)
 ON_PATTERN = {"consistent_mass": masses, "pressure": pressure}  # switch -> module
 # Quadrature points from which loops on the CPU are divided into chunks; below, one thread is faster on every machine
 CHUNKED_FROM = 20_000

@@ -12,7 +12,7 @@ import taichi as ti
 from taisoft.errors import SceneError
 from taisoft.fem import reference
 from taisoft.fem.dependent_table import dependent_table
-from taisoft.fem.laws import lane_law, law_of, viscosity, volume_floor
+from taisoft.fem.laws import fibres, lane_law, law_of, viscosity, volume_floor
 from taisoft.fem.model import Group, Layout, Setup
 from taisoft.fem.pattern import MATRIX_BLOCKS
 from taisoft.fem.springs import spring_table
@@ -20,7 +20,10 @@ from taisoft.scene.laws import LAWS
 from taisoft.scene.rigid import RigidBody
 from taisoft.scene.scene import Body, Scene
 
-ADDITIONS: tuple = (viscosity,)  # modules, see `laws.additions`; each has `applies(body)`, and SWITCH if the plan turns it off
+ADDITIONS: tuple = (
+    fibres,
+    viscosity,
+)  # modules, see `laws.additions`; each has `applies(body)`, and SWITCH if the plan turns it off
 
 
 def additions_of(body: Body, on: dict[str, bool]) -> tuple[int, ...]:
@@ -177,6 +180,7 @@ def law_table(scene: Scene, layout: Layout, by_tet: bool) -> np.ndarray:
             of_floor = volume_floor.constants(floor, mu, lam) if own.has_volume_floor else ()
             if mean:
                 lam, numbers = lam - modulus, [0.0 * x if one == law.modulus else x for one, x in zip(law.parameters, numbers)]
-            for c, values in enumerate((*lane_law(name).constants(mu, lam, *numbers), *of_floor)):
+            along = own.fibres[tets].T if "I4" in law.arguments else ()
+            for c, values in enumerate((*lane_law(name).constants(mu, lam, *numbers), *along, *of_floor)):
                 table[first + tets, c] = values
     return layout.blocks(table[layout.tet_of_lane]) if by_tet else table

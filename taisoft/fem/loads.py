@@ -16,7 +16,7 @@ from taisoft.fem.model import Setup
 from taisoft.fem.pressure import pressures_of
 from taisoft.fem.spring_table import SpringTable
 from taisoft.scene.connection_records import Tendon
-from taisoft.scene.loads import NodalForce, ScalarLoad, Traction, value_at
+from taisoft.scene.loads import Activation, NodalForce, ScalarLoad, Traction, value_at
 from taisoft.scene.rigid import RigidBody
 from taisoft.scene.scene import Body, Scene
 
@@ -43,9 +43,10 @@ class SceneLoads:
     """The loads of a scene with its present values.
 
     nodes: those whose loads follow a path, ascending. multipliers: amplitudes that are Lagrange multipliers, the pressures in
-    cavities of given volume and the tensions of inextensible tendons. has_potential: whether energies count the work of all
-    loads but those along a path: not that of a pressure on an open surface, which depends on the path of its border, of the
-    fluid in a given volume, and of a tendon whose given length follows a path.
+    cavities of given volume and the tensions of inextensible tendons; activations: those that activate fibres, whose energy is
+    elastic. has_potential: whether energies count the work of all loads but those along a path: not that of a pressure on an
+    open surface, which depends on the path of its border, of the fluid in a given volume, and of a tendon whose given length
+    follows a path.
     """
 
     def __init__(self, scene: Scene, springs: SpringTable | None = None):
@@ -63,6 +64,9 @@ class SceneLoads:
         self.nodes = np.unique(np.concatenate([np.zeros(0, dtype=np.int64), *(path.nodes for path in self._paths)]))
         self._scalars, self._moving = scalar_loads(scene), None if springs is None else springs.moving
         self.multipliers = np.array([n for n, (_, load) in enumerate(self._scalars) if load is FOLLOWS], dtype=np.int64)
+        self.activations = np.array(
+            [n for n, (_, load) in enumerate(self._scalars) if isinstance(load, Activation)], dtype=np.int64
+        )
         others = [load for _, load in pressures_of(scene) if not load.has_potential]
         winches = [tendon for tendon in scene.tendons if tendon.is_inextensible and tendon.path is not None]
         self.has_potential = not (winches or any(load.path is not None or load.value.any() for load in others))
@@ -121,6 +125,8 @@ def number_at(load: ScalarLoad | Tendon, t: float, what: str) -> float:
     if isinstance(load, Tendon) and not load.allows(value):
         unit, rule = ("N", "a tendon cannot push") if load.given == "force" else ("m", "a length must be above 0")
         raise SimulationError(f"{what}: its path gave {value:g} {unit} at t = {t:g} s: {rule}")
+    if isinstance(load, Activation) and not 0.0 <= value <= 1.0:
+        raise SimulationError(f"{what}: its path gave {value:g} at t = {t:g} s: an activation must lie from 0 to 1")
     return value
 
 
@@ -130,7 +136,15 @@ def scalar_loads(scene: Scene) -> list[tuple[str, ScalarLoad | Tendon]]:
     for body in scene.bodies:
         found += [(f"body {body.name!r}: pressure {k}", load) for k, load in enumerate(body.pressures)]
         found += [(f"cavity {cavity.name!r}", FOLLOWS if cavity.given == "volume" else cavity) for cavity in body.cavities]
+    for body in scene.bodies:
+        found += [(f"body {body.name!r}: activation", load) for load in body.activations]
     return found + [(f"tendon {one.name!r}", FOLLOWS if one.is_inextensible else one) for one in scene.tendons]
+
+
+def activation_slots(scene: Scene) -> dict[int, int]:
+    """The place of the first activation of each body with fibres among the model's `amplitudes`, by the body's number."""
+    first = np.cumsum([len(pressures_of(scene)), *(len(body.activations) for body in scene.bodies)])
+    return {k: int(first[k]) for k, body in enumerate(scene.bodies) if body.activations}
 
 
 def tendon_slots(scene: Scene) -> dict[str, int]:

@@ -89,6 +89,7 @@ class Model:
     spring_damping: bool = False
     mean_dilatation: bool = False  # of some group
     mean: Any = None  # fem.mean_dilatation.MeanDilatation
+    fibres: Any = None  # fem.fibres.FibreTable
     viscosity: Any = None  # fem.viscosity.Viscosity
     elasticity_by_tet: bool  # law_constants may differ between the tets of a body
     chunks: int  # of a loop, each with its own partial sums

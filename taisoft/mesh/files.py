@@ -21,7 +21,8 @@ import numpy as np
 from taisoft.errors import MeshError, listed, value_text
 from taisoft.files import replacing
 from taisoft.mesh.abaqus import read_abaqus
-from taisoft.mesh.gmsh import PHYSICAL, read_gmsh, split_names
+from taisoft.mesh.fibres import FIBRES
+from taisoft.mesh.gmsh import PHYSICAL, element_data, read_gmsh, split_names
 from taisoft.mesh.medit import REFERENCE, read_medit
 from taisoft.mesh.nastran import read_nastran
 from taisoft.mesh.quality import edge_lengths
@@ -51,10 +52,10 @@ def read_mesh(path, fix_orientation: bool = False, weld: float | None = None, re
 
     path: the file; its extension selects the format. fix_orientation: as for `TetMesh`. weld: merge vertices at most this far
     apart [m]; 0 merges only equal ones, None merges nothing. regions: name of the cell data that hold the tets' regions; by
-    default the physical groups of .msh, the references of .mesh, or data called "region". Points, lines and triangles beside
-    the tets, and vertices of no tet, are ignored with a warning; any other element type is refused with its name and count.
-    Second-order tets keep only their corners; a warning reports the number of curved edges that become straight. Raises
-    MeshError.
+    default the physical groups of .msh, the references of .mesh, or data called "region". Cell data "fibres" or "fibers" of three
+    components are its fibres. Points, lines and triangles beside the tets, and vertices of no tet, are ignored with a warning;
+    any other element type is refused with its name and count. Second-order tets keep only their corners; a warning reports the
+    number of curved edges that become straight. Raises MeshError.
     """
     try:
         file = Path(path)
@@ -89,22 +90,33 @@ def write_mesh(path, mesh: TetMesh, regions: bool = True) -> None:
     """Write a mesh atomically as .msh (Gmsh 4.1, with regions 2.2, text), .vtk, .vtu or .mesh (Medit).
 
     Regions become physical groups in .msh, references in .mesh, and else cell data called "region"; a warning says where their
-    names are lost. regions: whether to write them. Raises MeshError for another extension, anything but a TetMesh, or regions
-    that would be read as none, OutputError if the file cannot be written.
+    names are lost. Fibres are vectors of the cells, which .mesh cannot hold. regions: whether to write them. Raises MeshError
+    for another extension, anything but a TetMesh, or regions that would be read as none, OutputError if the file cannot be
+    written.
     """
     file = Path(path)
     ending = check_ending(file)
     if not isinstance(mesh, TetMesh):
         raise MeshError(f"{file}: write_mesh needs a TetMesh, not {type(mesh).__name__}")
-    record = mesh.to_meshio() if regions else meshio.Mesh(mesh.vertices, [("tetra", mesh.tets)])
+    record = mesh.to_meshio()
+    fibres = record.cell_data.pop(FIBRES[0], None)
+    if not regions:
+        record.cell_data, record.field_data = {}, {}
     options = {"file_format": WRITERS[ending]} | ({"binary": False} if ending == ".msh" else {})
     if record.cell_data:
         options |= _region_options(file, record, mesh)
     elif ending == ".mesh":
         record.cell_data[REFERENCE] = [np.zeros(mesh.n_tets, dtype=np.int32)]  # meshio would write 1
+    if fibres is not None and ending == ".mesh":
+        warnings.warn(f"{file}: {ending} cannot hold fibres", UserWarning, stacklevel=2)
+    elif fibres is not None and ending != ".msh":
+        record.cell_data[FIBRES[0]] = fibres
     with replacing(file) as part:
         with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
             meshio.write(part, record, **options)
+        if fibres is not None and ending == ".msh":  # meshio writes numbers of NumPy 2 as np.float64(...)
+            with open(part, "ab") as stream:
+                stream.write(element_data(FIBRES[0], fibres[0]))
 
 
 def _region_options(file: Path, record: meshio.Mesh, mesh: TetMesh) -> dict:
@@ -202,6 +214,9 @@ def _clean_mesh(name: str, content: FileContent, fix_orientation: bool, weld, re
     blocks, notes = _tet_blocks(name, content.cells)
     ids, names, region_notes = _regions(name, content, regions)
     points, notes, labels = content.points, content.notes + notes + region_notes, {"regions": ids, "region_names": names}
+    if content.fibres:
+        of_tets = [own for (kind, nodes), own in zip(content.cells, content.fibres) if kind in TETS and len(nodes)]
+        labels["fibres"] = np.concatenate(of_tets)
     tets = np.concatenate([nodes[..., :4] for nodes in blocks])
     valid = (
         points.ndim == 2

@@ -15,6 +15,7 @@ from meshio._common import num_nodes_per_cell
 from meshio.gmsh import gmsh_to_meshio_type
 
 from taisoft.errors import MeshError
+from taisoft.mesh.fibres import FIBRES
 from taisoft.mesh.safe_reading import Blocks, FileContent
 from taisoft.mesh.words import Words, last_line
 
@@ -90,6 +91,9 @@ class _Binary:
 _GMSH_HEAD = re.compile(rb"\s*(?:\$Comments.*?\$EndComments\s*)?\$MeshFormat\s+(\S+)\s+([01])\s+(\d{1,2})[ \t\r]*\n", re.DOTALL)
 _NAMES = re.compile(rb"^[ \t]*\$PhysicalNames\b.*?^[ \t]*\$EndPhysicalNames\b[^\n]*\n?", re.MULTILINE | re.DOTALL)
 _VOLUME_NAME = re.compile(rb'^[ \t]*3[ \t]+(-?\d{1,10})[ \t]+"([^"\n]*)"', re.MULTILINE)
+_FIBRES = re.compile(rb'\s*\d+\s+"(?:%s)"[ \t\r]*\n(?:[ \t]*"[^"\n]*"[ \t\r]*\n)*' % "|".join(FIBRES).encode())
+# of such a section: real numbers, then a step, three components, the number of rows, and perhaps the part
+_TAGS = re.compile(rb"\s*(?:0|1\s+\S+)\s+(?:3\s+\d+\s+3\s+(\d{1,15})|4\s+\d+\s+3\s+(\d{1,15})\s+\d+)[ \t\r]*\n")
 _OPENING = re.compile(rb"^[ \t]*\$(?!End)(\w+)[ \t\r]*\n", re.MULTILINE)
 
 
@@ -119,9 +123,17 @@ def read_gmsh(name: str, data: bytes) -> FileContent | None:
         parts = partial(_entities_4, parted=True)
         readers = {"Nodes": _nodes_4, "Elements": _elements_4, "Entities": _entities_4, "PartitionedEntities": parts}
         readers = {section: partial(reader, old=version != "4.1") for section, reader in readers.items()}
-    sections = {}
+    sections, fibres = {}, None
     while opening := _OPENING.search(data, at):
         section, at = opening[1].decode("ascii", "replace"), opening.end()
+        if section == "ElementData" and (start := _FIBRES.match(data, at)):
+            if (found := _TAGS.match(data, start.end())) is None:
+                line = data.count(b"\n", 0, start.end()) + 1
+                raise MeshError(f"{name}: line {line} (${section}): expected numbers of tags, three components and a count")
+            at = found.end()
+            numbers = _Binary(name, data, at, section, order, size) if binary else _Text(name, data, at, section)
+            fibres, at = numbers.rows(int(found[1] or found[2]), 3), numbers.close()
+            continue
         if section not in readers:
             line, at = data.count(b"\n", 0, at), data.find(b"$End" + opening[1], at)
             if at < 0:
@@ -137,13 +149,29 @@ def read_gmsh(name: str, data: bytes) -> FileContent | None:
         if section not in sections:
             raise MeshError(f"{name}: line {last_line(data)}: expected a ${section} section before the file's end")
     tags, points = sections["Nodes"]
-    blocks, groups = sections["Elements"]
+    blocks, groups, tags_of = sections["Elements"]
     if major == "4":  # of an entity, whose elements are one block or several
         of_wholes, (of_parts, wholes) = (sections.get(key, ({}, {})) for key in ("Entities", "PartitionedEntities"))
         of_wholes = of_wholes[0]  # Gmsh may add groups of its own to parts
         physical = of_wholes | of_parts | {part: of_wholes[whole] for part, whole in wholes.items() if whole in of_wholes}
         groups = [np.full(len(block[1]), physical.get(entity, 0)) for block, entity in zip(blocks, groups)]
-    return FileContent(points, _tags_to_indices(name, tags, blocks), {PHYSICAL: groups}, split_names(data)[0])
+    by_block = None if fibres is None else [_of_elements(own, *fibres) for own in tags_of]
+    return FileContent(points, _tags_to_indices(name, tags, blocks), {PHYSICAL: groups}, split_names(data)[0], fibres=by_block)
+
+
+def _of_elements(tags: np.ndarray, given: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Return values (k,3) of elements with these tags (k,), 0 where none are given. given: tags (n,) of values (n,3)."""
+    found, order = np.zeros((len(tags), 3)), np.argsort(given)
+    if len(given):
+        at = order[np.minimum(np.searchsorted(given[order], tags), len(given) - 1)]
+        found[given[at] == tags] = values[at[given[at] == tags]]
+    return found
+
+
+def element_data(name: str, values: np.ndarray) -> bytes:
+    """Return the section of a file that holds vectors (m,3) of elements with the tags 1 to m, as text."""
+    rows = "".join(f"{k} {x!r} {y!r} {z!r}\n" for k, (x, y, z) in enumerate(values.tolist(), 1))
+    return f'$ElementData\n1\n"{name}"\n1\n0.0\n3\n0\n3\n{len(values)}\n{rows}$EndElementData\n'.encode()
 
 
 def split_names(data: bytes) -> tuple[dict[int, str], bytes]:
@@ -202,18 +230,23 @@ def _entities_4(numbers, old: bool, parted: bool = False) -> tuple[dict, dict]:
     return found, wholes
 
 
-def _elements_4(numbers, old: bool) -> tuple[Blocks, list[tuple[int, int]]]:
-    """Read type names and node tags (k,nodes), and the entity (dimension, tag) of each block. old: version 4.0."""
+def _elements_4(numbers, old: bool) -> tuple[Blocks, list[tuple[int, int]], list[np.ndarray]]:
+    """Read type names and node tags (k,nodes), the entity (dimension, tag) and the elements' tags of each block.
+
+    old: version 4.0.
+    """
     n_blocks, total = numbers.ints(2 if old else 4)[:2]
-    blocks, entities = [], []
+    blocks, entities, tags = [], [], []
     for _ in range(n_blocks):
         dim, entity, code = numbers.ints(3, "int")[[1, 0, 2] if old else [0, 1, 2]].tolist()
         kind, n_nodes = _element_type(numbers, code)
         entities.append((dim, entity))
         n = numbers.count()
-        blocks.append((kind, numbers.ints(n * (1 + n_nodes), "int" if old else "size").reshape(n, 1 + n_nodes)[:, 1:]))
+        rows = numbers.ints(n * (1 + n_nodes), "int" if old else "size").reshape(n, 1 + n_nodes)
+        blocks.append((kind, rows[:, 1:]))
+        tags.append(rows[:, 0])
     _check_total(numbers, total, sum(len(tags) for _, tags in blocks), "elements")
-    return blocks, entities
+    return blocks, entities, tags
 
 
 def _check_total(numbers, total: int, found: int, what: str) -> None:
@@ -233,29 +266,30 @@ def _nodes_2(numbers: _Text) -> tuple[np.ndarray, np.ndarray]:
     return numbers.rows(numbers.count(), 3)
 
 
-def _elements_2(numbers: _Text) -> tuple[Blocks, list[np.ndarray]]:
-    """Read type names and node tags (k,nodes), and the physical group of each element (k,) of each block, version 2.
+def _elements_2(numbers: _Text) -> tuple[Blocks, list[np.ndarray], list[np.ndarray]]:
+    """Read type names and node tags (k,nodes), and physical groups and tags (k,) of the elements of each block, version 2.
 
     A count, then rows of tag, type, number of labels, labels, nodes; the first label is the group.
     """
     n, start = numbers.count(), numbers.at
     values = numbers.ints(numbers.left()).tolist()
-    found: dict[tuple[str, int], tuple[list[int], list[int]]] = {}
+    found: dict[tuple[str, int], tuple[list[int], list[int], list[int]]] = {}
     at = 0
     for _ in range(n):
         numbers.at = start + at + 2  # the place of an error
         code, n_labels = (values[at + 1 : at + 3] + [0, -1])[:2]
         kind = _element_type(numbers, code) if n_labels >= 0 else ("", 0)
-        first = at + 3 + n_labels
+        begin, first = at, at + 3 + n_labels
         at = first + kind[1]
         if n_labels < 0 or at > len(values):
             raise numbers.error("this element is not complete")
-        tags, groups = found.setdefault(kind, ([], []))
-        tags.extend(values[first:at])
+        nodes, groups, tags = found.setdefault(kind, ([], [], []))
+        nodes.extend(values[first:at])
+        tags.append(values[begin])
         groups.append(values[first - n_labels] if n_labels else 0)
     numbers.at = start + at
-    blocks = [(name, np.array(tags, dtype=np.int64).reshape(-1, n)) for (name, n), (tags, _) in found.items()]
-    return blocks, [np.array(groups, dtype=np.int64) for _, groups in found.values()]
+    blocks = [(name, np.array(nodes, dtype=np.int64).reshape(-1, n)) for (name, n), (nodes, _, _) in found.items()]
+    return blocks, *([np.array(own[k], dtype=np.int64) for own in found.values()] for k in (1, 2))
 
 
 def _tags_to_indices(name: str, tags: np.ndarray, blocks: Blocks) -> Blocks:

@@ -23,7 +23,7 @@ UP = {up: turn[:, 1] for up, turn in FROM_Y_UP.items()}  # -> unit vector (3,)
 
 
 def place(mesh: TetMesh | SurfaceMesh, up: str = "y", scale: float = 1.0, rotate=(0.0, 0.0, 0.0), at=None, to: str = "y"):
-    """Return a copy of a mesh or a surface, placed, with its regions.
+    """Return a copy of a mesh or a surface, placed, with its regions and fibres.
 
     up: axis of the given vertices that points up, "x", "y" or "z". to: that of the scene, "y" or "z", to which it is turned: "z"
     to "y" turns (x, y, z) to (x, z, -y), "x" to "y" to (-y, x, z). scale: factor, such as 0.001 for a file in millimetres.
@@ -33,14 +33,17 @@ def place(mesh: TetMesh | SurfaceMesh, up: str = "y", scale: float = 1.0, rotate
     mesh = as_surface(mesh)
     if not isinstance(mesh, (TetMesh, SurfaceMesh)):
         raise MeshError(f"place needs a TetMesh or a SurfaceMesh, not {type(mesh).__name__}")
-    vertices = mesh.vertices @ placement(up, scale, rotate, to).T
+    turn = placement(up, scale, rotate, to)
+    vertices = mesh.vertices @ turn.T
     if at is not None:
         vertices = vertices + (checked_vector(at, "place", "at") - underside(vertices, to))
     if isinstance(mesh, SurfaceMesh):
         return SurfaceMesh(vertices, mesh.triangles, mesh.source, list(mesh.warnings))
     with warnings.catch_warnings(record=True) as found:
         warnings.simplefilter("always")
-        placed = TetMesh(vertices, mesh.tets, regions=mesh.regions, region_names=dict(mesh.region_names), source=mesh.source)
+        fibres = None if mesh.fibres is None else mesh.fibres @ turn.T
+        labels = {"regions": mesh.regions, "region_names": dict(mesh.region_names), "fibres": fibres}
+        placed = TetMesh(vertices, mesh.tets, **labels, source=mesh.source)
     for warning, text in zip(found, placed.warnings):  # one for each
         if text not in mesh.warnings:
             warnings.warn(warning.message, stacklevel=2)

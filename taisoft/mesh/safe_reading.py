@@ -21,6 +21,7 @@ from typing import NamedTuple
 import numpy as np
 
 from taisoft.errors import MeshError, one_line
+from taisoft.mesh.fibres import FIBRES
 from taisoft.nested import from_json, to_json
 from taisoft.processes import start_python
 
@@ -48,6 +49,7 @@ class FileContent(NamedTuple):
     cell_data: dict[str, list[np.ndarray] | Callable[[], list[np.ndarray]]] = {}
     region_names: dict[int, str] = {}
     notes: list[str] = []  # what was left out
+    fibres: list[np.ndarray] | None = None  # (k,3) of each block's elements, 0 of those without
 
 
 def read_content(file: Path) -> bytes:
@@ -101,7 +103,8 @@ def read_by_meshio(file: Path, data: bytes) -> FileContent:
             place, text = re.match(r"((?:line|byte) \d+: )?(.*)", str(error)).groups()
             raise MeshError(f"{file}: {place or ''}not a supported mesh ({text})") from None
     cells = [(kind, nodes) for kind, nodes in found["cells"]]
-    return FileContent(found["points"], cells, found["cell_data"], dict(found["region_names"]), found["notes"])
+    names = dict(found["region_names"])
+    return FileContent(found["points"], cells, found["cell_data"], names, found["notes"], found["fibres"])
 
 
 def content_of(mesh) -> FileContent:
@@ -115,7 +118,9 @@ def content_of(mesh) -> FileContent:
     fields = {name: np.asarray(value) for name, value in mesh.field_data.items()}  # of any kind, such as a time
     pairs = {name: value for name, value in fields.items() if value.shape == (2,) and value.dtype.kind in "iu"}
     names = {int(tag): name for name, (tag, dim) in pairs.items() if dim == 3}
-    return FileContent(np.asarray(mesh.points), cells, numbers, names)
+    vectors = [of_cells[name] for name in FIBRES if name in of_cells]
+    fibres = next((of for of in vectors if all(one.shape[1:] == (3,) and one.dtype.kind in "iuf" for one in of)), None)
+    return FileContent(np.asarray(mesh.points), cells, numbers, names, fibres=fibres)
 
 
 def run_child(folder: str, task: str, *arguments: str, seconds: float | None = None) -> dict:
@@ -195,7 +200,7 @@ def _read(path: str, seconds: str) -> dict:
     if skipped := next((text for text in printed if "cannot handle" in text), None):
         sys.exit(f"cells of {skipped[skipped.rfind('(') + 1 :].rstrip(').')} of VTK are not known here")
     notes = [_without_content(text, data.lower()) for text in printed]
-    found = {"points": content.points, "cells": content.cells, "cell_data": content.cell_data}
+    found = {"points": content.points, "cells": content.cells, "cell_data": content.cell_data, "fibres": content.fibres}
     return found | {"region_names": list(content.region_names.items()), "notes": notes}
 
 

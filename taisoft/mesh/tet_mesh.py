@@ -14,6 +14,7 @@ import numpy as np
 from taisoft.attributes import Guarded, MeshAttributeError
 from taisoft.errors import MeshError, listed, one_line
 from taisoft.machine import require
+from taisoft.mesh.fibres import FIBRES, checked_fibres
 from taisoft.mesh.quality import edge_lengths, mean_ratio
 from taisoft.mesh.regions import checked_names, checked_regions, region_id, region_text
 from taisoft.mesh.topology import Faces, connected_pieces, first_repeated_tet, joint_edges, joint_vertices, merge_labels
@@ -48,7 +49,7 @@ class TetMesh(Guarded):
     surface: (t,3) int64, the faces that belong to one tet, normals outward; surface_tets: (t,) int64, the tet of each.
     flipped: int64 indices of the tets whose orientation was changed. n_components: number of parts connected by vertices.
     regions: (m,) int64, of each tet, or None; region_ids: tuple of those that tets are in, ascending; region_names: {region:
-    name}, of regions that have one.
+    name}, of regions that have one. fibres: (m,3) directions of fibres, of any length, 0 in tets without, or None.
     warnings: list of str, each also issued as a UserWarning. recipe: for a mesh from `box_mesh`, `sheet_mesh` or
     `ball_mesh` the shape's name and the arguments that reproduce its arrays, else None.
     """
@@ -63,6 +64,7 @@ class TetMesh(Guarded):
         *,
         regions=None,
         region_names: dict[int, str] | None = None,
+        fibres=None,
         source: str | None = None,
         notes: tuple[str, ...] = (),
     ):
@@ -70,8 +72,9 @@ class TetMesh(Guarded):
 
         vertices: (n,3) numbers [m]. tets: (m,4) integers, counted from 0. fix_orientation: if only some tets are inverted, flip
         them and list them in `warnings` instead of refusing them. regions: (m,) integers, which say what material each tet is
-        made of, see `Scene.add_body`; region_names: names of some or all of these numbers. source: the mesh's origin, such as a
-        file's name, which starts every message. notes: a reader's warnings, added to `warnings`. Raises MeshError.
+        made of, see `Scene.add_body`; region_names: names of some or all of these numbers. fibres: (m,3)
+        numbers. source: the mesh's origin, such as a file's name, which starts every message. notes: a reader's warnings, added
+        to `warnings`. Raises MeshError.
         """
         self.source = source
         self.recipe: dict | None = None
@@ -82,6 +85,7 @@ class TetMesh(Guarded):
         self.regions = checked_regions(regions, self.n_tets, self._mesh_error)
         self.region_ids = () if self.regions is None else tuple(np.unique(self.regions).tolist())
         self.region_names = checked_names(region_names, self.region_ids, self._mesh_error)
+        self.fibres = checked_fibres(fibres, self.n_tets, self._mesh_error)
         self._region_of = {key: one for one in self.region_ids for key in (one, self.region_names.get(one, one))}
         faces = self._checked_faces()
         rows = faces.surface()
@@ -142,7 +146,7 @@ class TetMesh(Guarded):
         """Return the mesh as a meshio.Mesh, from which `from_meshio` makes an equal one.
 
         Its regions are the cell data "gmsh:physical" ("region" if all are 0), their names field data, as meshio reads them from
-        .msh files.
+        .msh files; its fibres are the cell data "fibres".
         """
         import meshio
 
@@ -151,6 +155,8 @@ class TetMesh(Guarded):
             names = ("gmsh:physical", "gmsh:geometrical") if self.regions.any() else ("region",)
             record.cell_data = {name: [self.regions.astype(np.int32)] for name in names}
             record.field_data = {name: np.array([region, 3]) for region, name in self.region_names.items()}
+        if self.fibres is not None:
+            record.cell_data[FIBRES[0]] = [self.fibres.copy()]
         return record
 
     def to_pyvista(self):

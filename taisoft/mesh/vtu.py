@@ -20,6 +20,7 @@ from meshio._common import num_nodes_per_cell
 from meshio._vtk_common import vtk_to_meshio_type
 
 from taisoft.errors import MeshError
+from taisoft.mesh.fibres import FIBRES
 from taisoft.mesh.safe_reading import MAX_ENTRIES_PER_BYTE, Blocks, FileContent
 from taisoft.mesh.words import Words
 
@@ -138,18 +139,22 @@ class _Reader:
                 blocks.append((kind, own[kept[begin:end]]))
             pieces.append((piece, first, kept))
             total, n_ghosts = total + n_points, n_ghosts + n_cells - int(kept.sum())
-        keys = {key: None for piece, _, _ in pieces for key in piece.arrays.get("CellData", {}) if _is_scalar(piece, key)}
+        keys = {key: None for piece, _, _ in pieces for key in piece.arrays.get("CellData", {}) if _components(piece, key) == 1}
         notes = [f"{n_ghosts} cells that {_GHOSTS} marks are left out"] if n_ghosts else []
         by_name = {key: partial(self._of_cells, key, pieces) for key in keys if key != _GHOSTS}
-        return FileContent(np.concatenate(points), blocks, by_name, notes=notes)
+        vectors = [key for key in FIBRES if pieces and all(_components(piece, key) == 3 for piece, _, _ in pieces)]
+        fibres = self._of_cells(vectors[0], pieces) if vectors else None
+        return FileContent(np.concatenate(points), blocks, by_name, notes=notes, fibres=fibres)
 
     def _of_cells(self, key: str, pieces: list[tuple[_Piece, np.ndarray, np.ndarray]]) -> list[np.ndarray]:
         """Return data of cells by blocks; none if pieces lack them."""
-        if not all(_is_scalar(piece, key) for piece, _, _ in pieces):
+        width = _components(pieces[0][0], key)
+        if not all(_components(piece, key) == width for piece, _, _ in pieces):
             return []
         found = []
         for piece, first, kept in pieces:
-            values = self._numbers(piece, "CellData", key, len(kept))
+            values = self._numbers(piece, "CellData", key, width * len(kept))
+            values = values if width == 1 else values.reshape(-1, width)
             found += [one[own] for one, own in zip(np.split(values, first[1:]), np.split(kept, first[1:]))]
         return found
 
@@ -223,11 +228,12 @@ class _Reader:
         return np.frombuffer(data, kind)
 
 
-def _is_scalar(piece: _Piece, key: str) -> bool:
-    """Return whether data of a piece's cells are one number each."""
+def _components(piece: _Piece, key: str) -> int:
+    """Return how many numbers the data of a piece's cells have each; 0 if there are none, or no numbers."""
     array = piece.arrays.get("CellData", {}).get(key)
     attributes = array.attributes if array else {}
-    return attributes.get("type") in _TYPES and attributes.get("NumberOfComponents", "1") in ("", "1")
+    width = attributes.get("NumberOfComponents") or "1"
+    return int(width) if attributes.get("type") in _TYPES and width in ("1", "3") else 0
 
 
 class _Stream:

@@ -13,6 +13,7 @@ tet (01, 12, 20, 03, 13, 23), taisoft (01, 02, 03, 12, 13, 23).
 | region | cells | of the mesh, 0 for bodies without regions; absent if no body has any |
 | stress | cells | Cauchy stress [Pa], xx yy zz xy yz xz, not finite in a flat tet, 0 in triangles |
 | von_mises | cells | its von Mises equivalent [Pa] |
+| fibres | cells | `sim.fibres()`: directions of fibres, each as long as its stretch, 0 elsewhere; absent if no body has any |
 | TimeValue | file | time [s] |
 | kinetic, elastic, gravity, loads, dissipated | file | energies [J] |
 | body NAME | file | number of the body called NAME |
@@ -86,6 +87,7 @@ class Grid:
 
     def __init__(self, scene):
         self._names, self._start = [body.name for body in scene.bodies], start_positions(scene)
+        self._has_fibres = any(body.fibres is not None for body in scene.bodies)
         connectivity, sizes, body, region, tet, first, n_tet = [], [], [], [], [], 0, 0
         for k, one in enumerate(scene.bodies):
             n_tets, regions = one.mesh.n_tets, one.mesh.regions
@@ -127,6 +129,9 @@ class Grid:
             points["estimated_error"] = np.nan_to_num(sim.nodal_errors(), nan=UNKNOWN_ERROR)
         with np.errstate(invalid="ignore"):  # of flat tets
             cells = {"stress": sigma[:, SYMMETRIC[0], SYMMETRIC[1]], "von_mises": von_mises(sigma)}
+        if self._has_fibres:
+            cells["fibres"] = sim.fibres()[self._tet]
+            cells["fibres"][self._tet < 0] = 0.0
         of_file = {"TimeValue": sim.time} | dataclasses.asdict(sim.energies())
         of_file |= {f"body {name}": k for k, name in enumerate(self._names)}
         points, cells = ({name: values.astype(np.float32) for name, values in of.items()} for of in (points, cells))

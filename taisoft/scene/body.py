@@ -9,7 +9,7 @@ from typing import ClassVar
 import numpy as np
 
 from taisoft.attributes import Guarded, guarded_record, thawed
-from taisoft.errors import SceneError, value_text
+from taisoft.errors import MeshError, SceneError, value_text
 from taisoft.mesh.nodes import Nodes, make_nodes
 from taisoft.mesh.solids import is_closed
 from taisoft.mesh.tet_mesh import TetMesh
@@ -18,7 +18,7 @@ from taisoft.scene import checks
 from taisoft.scene.collision import CONTACT_MODES
 from taisoft.scene.composition import Composition, compose
 from taisoft.scene.key_frames import AT_REST, KeyFrames, NodePath
-from taisoft.scene.loads import LOADS, Cavity, Load, NodalForce, Pressure, Traction, value_or_path
+from taisoft.scene.loads import LOADS, Activation, Cavity, Load, NodalForce, Pressure, Traction, value_or_path
 from taisoft.scene.material import Material
 from taisoft.scene.skins import Skin, embed
 
@@ -29,7 +29,7 @@ DILATATIONS = ("auto", "local", "mean")
 QUADRATURE_DEGREES = {1: (1,), 2: (2, 4)}  # by element order: degrees of polynomials integrated exactly, the default first
 # other data depend on these
 _SHAPE = ("name", "mesh", "order", "quadrature_degree", "dilatation", "given_dilatation", "nodes", "rest_positions", "n_nodes")
-_READ_ONLY = (*_SHAPE, "composition", "mass", "loads", "skin")
+_READ_ONLY = (*_SHAPE, "composition", "mass", "loads", "skin", "fibres", "activations")
 USE_A_COPY = "change a copy made by scene.snapshot() and make a new Simulator of it"
 _SET = {kind: f"call sim.set_{kind}(body, index, value) for an existing one; otherwise {USE_A_COPY}" for kind in LOADS}
 _SET["cavity"] = f"call sim.set_cavity(name, value) for an existing one; otherwise {USE_A_COPY}"
@@ -67,9 +67,10 @@ class Body(Guarded):
     shape functions; quadrature_degree: degree of polynomials integrated exactly. dilatation: "local" or "mean", decided by
     `decided_dilatation` when the body is made and when its material or a number of it is set, but not during a run;
     given_dilatation: one of DILATATIONS. nodes: `Nodes`, the mesh's vertices, for order 2 its mid-edge nodes, and the vertices
-    of a skin that is touched; methods choose among those of tets only. skin: `Skin` or None, see `embed`. constraints,
-    tractions, forces, pressures, cavities: lists of `Constraint`, `Traction`, `NodalForce`, `Pressure`, `Cavity`; items can be
-    removed, but only methods add them.
+    of a skin that is touched; methods choose among those of tets only. skin: `Skin` or None, see `embed`. fibres: (m,3) unit
+    vectors at rest, read-only, or None; activations: of the fibres, an `Activation` for each region of the mesh, or one.
+    constraints, tractions, forces, pressures, cavities: lists of `Constraint`, `Traction`, `NodalForce`, `Pressure`, `Cavity`;
+    items can be removed, but only methods add them.
     collision: one of CONTACT_MODES. Only material, its numbers, position, velocity and collision can be assigned; each is
     validated. `warn_locking` and `warn_bending` warn if tets of order 1 are far too stiff; `Scene.add_body` calls both.
     """
@@ -80,6 +81,7 @@ class Body(Guarded):
         "composition": "set body.material",
         "mass": "set body.density",
         "skin": "call body.embed",
+        "activations": "call body.activate",
         "loads": "call body.add_force, body.add_traction or body.add_pressure",
     }
     _contents = {"constraints": "call body.fix or body.move", **{loads: f"call body.add_{kind}" for kind, loads in LOADS.items()}}
@@ -88,6 +90,7 @@ class Body(Guarded):
     _instead_frozen = {
         "material": "call sim.set_material(body, young=...)",
         **{name: f"call sim.set_material(body, {name}=...)" for name in ("young", "poisson", "density")},
+        **dict.fromkeys(("activate", "activations"), "call sim.set_activation(body, value)"),
         "position": "call sim.set_state(positions=..., body=...)",
         "velocity": "call sim.set_state(velocities=..., body=...)",
         **{name: _SET[kind] for kind, loads in LOADS.items() for name in (f"add_{kind}", loads)},
@@ -104,13 +107,14 @@ class Body(Guarded):
         quadrature_degree: int | None,
         collision: str,
         dilatation: str = "auto",
+        fibres=None,
         **numbers,
     ):
         """The arguments of `Scene.add_body`; numbers: young, poisson and density, if they replace the material's."""
         what = f"body {name!r}"
         if not isinstance(mesh, TetMesh):
             raise SceneError(f"{what}: mesh must be a TetMesh, not {type(mesh).__name__}")
-        self.name, self.mesh, self.composition = name, mesh, compose(what, mesh, material, **numbers)
+        self.name, self.mesh, self.composition = name, mesh, compose(what, mesh, material, fibres, **numbers)
         self.order = checks.whole(order, f"{what}: order", tuple(QUADRATURE_DEGREES))
         degrees = QUADRATURE_DEGREES[self.order]
         degree = degrees[0] if quadrature_degree is None else quadrature_degree
@@ -125,6 +129,7 @@ class Body(Guarded):
         self.pressures: list[Pressure] = []
         self.cavities: list[Cavity] = []
         self.skin: Skin | None = None
+        self.activations = self._inactive()
         self._seal(Body.__init__)
 
     def _label(self) -> str:
@@ -152,8 +157,13 @@ class Body(Guarded):
 
     @property
     def loads(self) -> list[Load]:
-        """Its tractions, then its forces, its pressures and its cavities."""
-        return [*self.tractions, *self.forces, *self.pressures, *self.cavities]
+        """Its tractions, then its forces, its pressures, its cavities and the activations of its fibres."""
+        return [*self.tractions, *self.forces, *self.pressures, *self.cavities, *self.activations]
+
+    @property
+    def fibres(self) -> np.ndarray | None:
+        """Unit vectors (m,3) of the fibres at rest, read-only, 0 in tets without; None if the body has none."""
+        return self.composition.fibres
 
     @property
     def n_nodes(self) -> int:
@@ -170,15 +180,21 @@ class Body(Guarded):
 
     @material.setter
     def material(self, value: Material | Mapping) -> None:
-        self._compose(compose(self._label(), self.mesh, value))
+        self._compose(compose(self._label(), self.mesh, value, self.fibres))
 
     def _compose(self, composition: Composition) -> None:
+        composition.check_fibres(self._label())
         warns = self._sealed  # add_body and the simulator issue their own warnings
         with thawed(self):
             self.composition = composition
             self.dilatation = self.decided_dilatation
+            self.activations = self.activations or self._inactive()
         if warns:
             self.warn_locking(stacklevel=4)
+
+    def _inactive(self) -> tuple[Activation, ...]:
+        regions = () if self.fibres is None else self.mesh.region_ids or (None,)
+        return tuple(Activation(value=np.zeros(()), region=region) for region in regions)
 
     young = tet_number("young", "Young's modulus [Pa], a float or (m,).")
     poisson = tet_number("poisson", "Poisson's ratio, a float or (m,).")
@@ -364,6 +380,32 @@ class Body(Guarded):
         """Return the chosen rows of mesh.surface, by their centroids at rest."""
         centroids = self.mesh.vertices[self.mesh.surface].mean(axis=1)
         return checks.selection(where, centroids, what, "surface triangle")
+
+    def activate(self, activation, region: int | str | None = None) -> None:
+        """Activate the fibres of the body, or those of one region of its mesh, given by name or id; it replaces what was given.
+
+        activation: a number from 0 to 1, or its path: callable t [s] -> number, called once here for t = 0, or `KeyFrames` with
+        values. Raises SceneError if the body has no fibres, or the region or the activation is invalid.
+        """
+        self._check_open("activate")
+        self._activate(activation, region, f"{self._label()}: activate")
+
+    def _activate(self, activation, region: int | str | None, what: str) -> None:
+        """As `activate`, also during a run. what: start of messages."""
+        if self.fibres is None:
+            raise SceneError(f"{what}: it has no fibres: give add_body fibres")
+        given = value_or_path(activation, what, "activation", ((),))
+        start = float(given["value"] if given["value"] is not None else given["path"](0.0))
+        if not 0.0 <= start <= 1.0:
+            raise SceneError(f"{what}: an activation must lie from 0 to 1, not {start:g}")
+        try:
+            key = None if region is None else self.mesh.region_id(region)
+        except MeshError as error:
+            raise SceneError(f"{what}: {error}") from None
+        with thawed(self):
+            self.activations = tuple(
+                Activation(**given, region=one.region) if key in (None, one.region) else one for one in self.activations
+            )
 
     def add_force(self, where, force) -> NodalForce:
         """Apply a dead load to nodes: a total force distributed by lumped mass, or one force per node.

@@ -13,8 +13,10 @@ import numpy as np
 from taisoft.errors import MeshError, SceneError, value_text
 from taisoft.mesh.tet_mesh import TetMesh
 from taisoft.scene import checks
+from taisoft.scene.fibres import directions
+from taisoft.scene.law import FIBRE, HOOKE
 from taisoft.scene.laws import LAWS
-from taisoft.scene.material import MODULI, Material, lame_parameters
+from taisoft.scene.material import FIBRE_NUMBERS, MODULI, Material, lame_parameters
 
 BY_TET = (*MODULI, "density")  # numbers that may differ from tet to tet, with parameters of laws
 OF_THE_BODY = ("friction", "restitution", "mass_damping", "stiffness_damping")
@@ -27,6 +29,7 @@ class Composition:
     mesh: TetMesh
     materials: dict[int | None, Material]  # by region, ascending; under None if one holds for all tets
     by_tet: dict[str, np.ndarray]  # some of `tet_numbers`: (m,), which replace the numbers of the materials
+    fibres: np.ndarray | None = None  # (m,3) unit vectors at rest, or 0 where the material has no fibres
 
     @property
     def has_regions(self) -> bool:
@@ -35,8 +38,8 @@ class Composition:
 
     @property
     def elastic_by_tet(self) -> bool:
-        """Whether Young's modulus, Poisson's ratio or a parameter of a law may differ from tet to tet."""
-        return self.has_regions or bool(self.by_tet.keys() - {"density"})
+        """Whether Young's modulus, Poisson's ratio, a parameter or a fibre direction of a law may differ from tet to tet."""
+        return self.has_regions or bool(self.by_tet.keys() - {"density"}) or any("I4" in LAWS[one].arguments for one in self.laws)
 
     @cached_property
     def parameters(self) -> tuple[str, ...]:
@@ -109,6 +112,23 @@ class Composition:
         return table[self._row] if self.has_regions else np.broadcast_to(table, (self.mesh.n_tets, *table.shape[1:]))
 
     @property
+    def has_fibres(self) -> bool:
+        """Whether some material has fibres."""
+        return any(material.has_fibres for material in self.materials.values())
+
+    def check_fibres(self, what: str) -> None:
+        """Raise SceneError if the material of a tet has fibres, but they have no direction there. what: start of messages."""
+        if self.has_fibres and self.fibres is None:
+            raise SceneError(f"{what}: its material has fibres, so it needs their directions: give add_body fibres")
+        if self.has_fibres:
+            needs = np.any([np.broadcast_to(self.number(name), self.mesh.n_tets) for name in FIBRE_NUMBERS], axis=0)
+            for law in self.laws:
+                needs[self.tets_of_law(law)] |= "I4" in LAWS[law].arguments
+            if (missing := needs & ~self.fibres.any(axis=1)).any():
+                tet = int(np.argmax(missing))
+                raise SceneError(f"{what}: fibres: the direction of tet {tet} is zero, but its material has fibres")
+
+    @property
     def lame(self) -> tuple[float | np.ndarray, float | np.ndarray]:
         """Lamé's parameters (mu, lambda) at rest [Pa], each a float or (m,)."""
         return lame_parameters(self.number("young"), self.number("poisson"))
@@ -136,10 +156,22 @@ class Composition:
         """Whether the laws of all tets have a volumetric part that mean dilatation can average."""
         return all(LAWS[name].has_dilatation for name in self.laws)
 
-    @property
-    def stiffest(self) -> float:
-        """By how much the stiffest strain at rest is stiffer than in an isotropic body with its moduli; 1 if it is one."""
-        return max(LAWS[one.law].stiffest(one.parameters) for one in self.materials.values())
+    @cached_property
+    def anisotropy(self) -> np.ndarray | None:
+        """What the laws' second derivatives at rest (m,9,9) [Pa] have beyond Hooke's law with `lame`; None if none may have."""
+        laws = [LAWS[name] for name in self.laws if not LAWS[name].is_isotropic]
+        if not laws:
+            return None
+        found, eye = np.zeros((self.mesh.n_tets, 9, 9)), np.eye(9).reshape(3, 3, 9)
+        mu, lam = (np.broadcast_to(one, self.mesh.n_tets)[:, None, None] for one in self.lame)
+        symmetric = (eye + eye.swapaxes(0, 1)).reshape(9, 9)
+        for law in laws:
+            tets = self.tets_of_law(law.name)
+            numbers = dict(zip(HOOKE, (mu[tets, 0, 0], lam[tets, 0, 0])))
+            numbers |= {one: np.broadcast_to(self.number(one), self.mesh.n_tets)[tets] for one in law.parameters}
+            hooke = mu[tets] * symmetric + lam[tets] * np.outer(np.eye(3), np.eye(3))
+            found[tets] = law.rest_tangent(numbers, FIBRE if self.fibres is None else self.fibres[tets]) - hooke
+        return found
 
     @cached_property
     def lowest_wave_speed(self) -> float:
@@ -210,7 +242,7 @@ class Composition:
 
     def _changed_in(self, what: str, numbers: dict, region: int | str) -> "Composition":
         """Return a composition with other numbers in one region: of its material, or by tet where they are given so."""
-        allowed = (*self.tet_numbers, "volume_floor") if self.has_regions else self.tet_numbers
+        allowed = (*self.tet_numbers, "volume_floor", *FIBRE_NUMBERS) if self.has_regions else self.tet_numbers
         for name in numbers:
             if name not in allowed:
                 raise SceneError(f"{what}: {name} is one number for the whole body; {', '.join(allowed)} can differ by region")
@@ -229,8 +261,8 @@ class Composition:
         return made
 
 
-def compose(what: str, mesh: TetMesh, material: Material | Mapping, **numbers) -> Composition:
-    """Return the composition of a body. what: start of messages; material, numbers: of `Scene.add_body`. Raises SceneError."""
+def compose(what: str, mesh: TetMesh, material: Material | Mapping, fibres=None, **numbers) -> Composition:
+    """Return the composition of a body. what: start of messages; the others: of `Scene.add_body`. Raises SceneError."""
     if isinstance(material, Material):
         made = Composition(mesh, {None: material}, {})
     elif isinstance(material, Mapping):
@@ -238,6 +270,13 @@ def compose(what: str, mesh: TetMesh, material: Material | Mapping, **numbers) -
     else:
         kinds = "a Material, or a dict that gives each region one"
         raise SceneError(f"{what}: material must be {kinds}, not {type(material).__name__}")
+    if fibres is not None or (mesh.fibres is not None and made.has_fibres):
+        if not made.has_fibres:
+            raise SceneError(
+                f"{what}: it has fibres, but {', '.join(FIBRE_NUMBERS)} of its material are 0, and its law has no I4"
+            )
+        made = replace(made, fibres=directions(what, mesh, mesh.fibres if fibres is None else fibres))
+    made.check_fibres(what)
     return made.changed(what, {name: value for name, value in numbers.items() if value is not None})
 
 

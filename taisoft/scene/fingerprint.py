@@ -69,6 +69,7 @@ def _body_parts(body: Body) -> dict[str, list]:
             laws,
             body.collision,
         ],
+        **({} if body.fibres is None else {"fibres": [body.fibres, *(x for a in body.activations for x in _path_parts(a.path))]}),
         "start": [body.position, body.velocity],
         "constraints": [x for c in constraints for x in (c.nodes, c.axes, *_path_parts(c.path))],
         "loads": [

@@ -162,10 +162,10 @@ class Law:
         given = {name: 1.0 if one.default is None else one.default for name, one in self.parameters.items()}
         return given | (dict(zip(HOOKE, (1.0 / 2.6, 0.3 / 0.52))) if not self.parameters else {})
 
-    def rest_tangent(self, numbers: dict[str, Any]) -> np.ndarray:
-        """Return d2psi/dF2 at F = I (k,9,9) [Pa]. numbers: values of the parameters, floats or (k,)."""
-        k = max([1, *(np.size(value) for value in numbers.values())])
-        return evaluate(self, np.broadcast_to(np.eye(3), (k, 3, 3)), numbers)[2]
+    def rest_tangent(self, numbers: dict[str, Any], fibres: np.ndarray = FIBRE) -> np.ndarray:
+        """Return d2psi/dF2 at F = I (k,9,9) [Pa]. numbers: values of the parameters, floats or (k,). fibres: (3,) or (k,3)."""
+        k = max([1, *(np.size(value) for value in numbers.values()), np.size(fibres) // 3])
+        return evaluate(self, np.broadcast_to(np.eye(3), (k, 3, 3)), numbers, fibres)[2]
 
     def lame(self, numbers: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
         """Return Lamé's parameters (mu, lambda) at rest (k,) [Pa]; of an anisotropic law their means over directions (Voigt)."""
@@ -173,25 +173,10 @@ class Law:
         a, b = np.einsum("eiijj->e", C), np.einsum("eijij->e", C)
         return (3.0 * b - a) / 30.0, (2.0 * a - b) / 15.0
 
-    def stiffest(self, numbers: dict[str, Any]) -> float:
-        """Return by how much the stiffest strain at rest is stiffer than in an isotropic body with the moduli of `lame`."""
-        if self.is_isotropic:
-            return 1.0
-        symmetric = np.array([(one + one.T).reshape(9) / np.linalg.norm(one + one.T) for one in _SYMMETRIC])
-        C = np.einsum("ap,epq,bq->eab", symmetric, self.rest_tangent(numbers), symmetric)
-        mu, lam = (one[:, None, None] for one in self.lame(numbers))
-        trace = np.einsum("ap,p->a", symmetric, np.eye(3).reshape(9))
-        return max(
-            1.0, float(np.linalg.eigvals(np.linalg.solve(2.0 * mu * np.eye(6) + lam * np.outer(trace, trace), C)).real.max())
-        )
-
 
 def arguments_of(function: Callable) -> tuple[str, ...]:
     """Return the names of the arguments of a function."""
     return tuple(inspect.signature(function).parameters)
-
-
-_SYMMETRIC = [np.outer(np.eye(3)[i], np.eye(3)[j]) for i in range(3) for j in range(i, 3)]
 
 
 def invariants(law: Law, F: Any, fibre: list) -> dict[str, Any]:
@@ -246,13 +231,16 @@ def stretch_modes(space: Space, energy: Callable, s: list) -> tuple[Jet, list, l
 
 
 def evaluate(law: Law, F: np.ndarray, numbers: dict[str, Any], fibre: np.ndarray = FIBRE) -> tuple[np.ndarray, ...]:
-    """Return psi (k,), P (k,3,3) and d2psi/dF2 (k,9,9) [Pa] at F (k,3,3), in the precision of F; not finite where psi is not."""
+    """Return psi (k,), P (k,3,3) and d2psi/dF2 (k,9,9) [Pa] at F (k,3,3), in the precision of F; not finite where psi is not.
+
+    fibre: (3,) or (k,3), the unit direction of I4.
+    """
     space, k = Space(), len(F)
     space.eps = float(np.finfo(F.dtype).eps)
     with np.errstate(all="ignore"):
         if {"stretches", "trS"} & set(law.arguments):
             return _from_stretches(law, space, F, numbers)
-        values, direction = list(F.reshape(k, 9).T), [space.fixed(float(one)) for one in fibre]
+        values, direction = list(F.reshape(k, 9).T), [space.fixed(one) for one in np.asarray(fibre, F.dtype).T]
         psi = law.energy(space, invariants(law, jets_of_F(space, values), direction), numbers)
         P, H = np.zeros((k, 9), F.dtype), np.zeros((k, 9, 9), F.dtype)
         if law.pk1 is not None:

@@ -109,6 +109,15 @@ class Cavity(ScalarLoad):
         return self.given == "pressure"
 
 
+@guarded_record("activation", "call sim.set_activation(body, value) in a simulation")
+@dataclass(frozen=True, eq=False)
+class Activation(ScalarLoad):
+    """How active the fibres of a body are, or those of one of its regions: from 0 to 1."""
+
+    kind: ClassVar[str] = "activation"
+    region: int | None = None  #: its id; None: all tets
+
+
 @dataclass(frozen=True, eq=False)
 class LoadPath:
     """Key frames as a path of a load: t [s] -> value (3,), their translations in the unit of the load, or a number, theirs."""

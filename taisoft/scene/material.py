@@ -13,6 +13,7 @@ from taisoft.scene import checks
 from taisoft.scene.law import Law
 from taisoft.scene.laws import LAWS
 
+FIBRE_NUMBERS = ("fibre_stiffness", "fibre_exponent", "active_stress", "active_strain")  # see `fem.laws.fibres`
 MAX_BRANCHES = 8
 MIN_VOLUME_FLOOR = 1e-3  # smaller ones are the rounding of J = det F in f32
 MODULI = ("young", "poisson")
@@ -68,7 +69,10 @@ class Material:
     stiffness_damping: float = 0.0  #: [s], >= 0
     volume_floor: float = 0.0  #: J = det F below which the law stiffens against inversion, 0.001 to 1; 0 for none
     branches: tuple[tuple[float, float], ...] = ()  #: Maxwell branches, at most 8: relaxation time [s], stiffness over mu
-
+    fibre_stiffness: float = 0.0  #: k1 [Pa] of fibres, >= 0; at small strains they add 4 k1 to the stiffness along them
+    fibre_exponent: float = 0.0  #: k2 of their exponential stiffening, >= 0; 0: stress linear in Green's strain
+    active_stress: float = 0.0  #: nominal tension [Pa] of fully activated fibres, >= 0
+    active_strain: float = 0.0  #: shortening of fully activated fibres, 0 to below 1
     parameters: Mapping[str, float] = dataclasses.field(default_factory=dict, hash=False)  #: numbers of a law that has its own
 
     def __post_init__(self):
@@ -81,12 +85,15 @@ class Material:
             "mass_damping": {"minimum": 0.0, "unit": "1/s"},
             "stiffness_damping": {"minimum": 0.0, "unit": "s"},
             "volume_floor": {},
+            **dict.fromkeys(FIBRE_NUMBERS, {"minimum": 0.0}),
         }
         numbers = {k: checks.number(getattr(self, k), f"material: {k}", **limit) for k, limit in limits.items()}
         checks.store(self, **numbers)
         checks.store(self, branches=_branches(self.branches))
         if not -1.0 < self.poisson < 0.5:
             raise SceneError(f"material: poisson must lie in the open interval (-1, 0.5), not {self.poisson:g}")
+        if self.active_strain >= 1.0:
+            raise SceneError(f"material: active_strain must be below 1, not {self.active_strain:g}")
         if self.volume_floor != 0.0 and not MIN_VOLUME_FLOOR <= self.volume_floor < 1.0:
             rule = f"must be 0, for none, or at least {MIN_VOLUME_FLOOR:g} and below 1"
             raise SceneError(f"material: volume_floor {rule}, not {self.volume_floor:g}")
@@ -107,6 +114,11 @@ class Material:
     def lam(self) -> float:
         """Lamé's first parameter [Pa]."""
         return lame_parameters(self.young, self.poisson)[1]
+
+    @property
+    def has_fibres(self) -> bool:
+        """Whether any number of its fibres is above 0, or its law depends on their stretch."""
+        return "I4" in LAWS[self.law].arguments or any(getattr(self, name) > 0.0 for name in FIBRE_NUMBERS)
 
 
 def _branches(given) -> tuple[tuple[float, float], ...]:

@@ -14,7 +14,7 @@ from taisoft.scene import checks
 from taisoft.scene.body import Body
 from taisoft.scene.laws import LAWS
 from taisoft.scene.loads import LOADS
-from taisoft.scene.material import MODULI, Material
+from taisoft.scene.material import FIBRE_NUMBERS, MODULI, Material
 from taisoft.scene.plan import change_load, change_tendon
 from taisoft.scene.rigid import RigidBody
 from taisoft.scene.scene import Scene
@@ -59,7 +59,9 @@ def set_numbers(scene: Scene, numbers: Numbers) -> None:
 def _entries(scene: Scene) -> Iterator[Entry]:
     yield "gravity", scene.gravity.tolist(), partial(setattr, scene, "gravity")
     for body in scene.bodies:
-        yield from (_of_rigid if isinstance(body, RigidBody) else _of_material)(body)
+        own = (_of_rigid if isinstance(body, RigidBody) else _of_material)(body)
+        yield from (one for one in own if body.fibres is not None or one[0].rpartition(".")[2] not in FIBRE_NUMBERS)
+        yield from () if body.fibres is None else _of_fibres(body)
         for kind, loads in LOADS.items():
             for i, load in enumerate(getattr(body, loads)):
                 name = f"{load.name}.{load.given}" if kind == "cavity" else f"{body.name}.{kind}.{i}"
@@ -91,6 +93,18 @@ def _of_material(body: Body) -> Iterator[Entry]:
         by_region = {getattr(one, name) for one in composition.materials.values() if name not in own or name in one.parameters}
         value = composition.by_tet.get(name, by_region.pop() if len(by_region) == 1 else None)
         yield f"{body.name}.{name}", value, partial(_set_material, body, name, None)
+
+
+def _of_fibres(body: Body) -> Iterator[Entry]:
+    """Activations, and the numbers of the fibres of regions with their own material."""
+    for region in (None, *body.mesh.region_ids):
+        owner = body.name if region is None else f"{body.name}.{body.mesh.region_names.get(region, region)}"
+        for name in FIBRE_NUMBERS if body.composition.has_regions and region is not None else ():
+            value = getattr(body.composition.materials[region], name)
+            yield f"{owner}.{name}", value, partial(_set_material, body, name, region)
+        values = {None if one.value is None else float(one.value) for one in body.activations if region in (None, one.region)}
+        value = values.pop() if len(values) == 1 else None
+        yield f"{owner}.activation", value, partial(body._activate, region=region, what=f"body {body.name!r}: activate")
 
 
 def _of_rigid(body: RigidBody) -> Iterator[Entry]:

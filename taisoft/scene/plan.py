@@ -14,11 +14,12 @@ from taisoft.scene.collision import has_sharp_edges
 from taisoft.scene.connections import check_tendon
 from taisoft.scene.laws import LAWS
 from taisoft.scene.loads import LOADS
+from taisoft.scene.material import FIBRE_NUMBERS
 from taisoft.scene.obstacles import Box, MeshObstacle
 from taisoft.scene.rigid import RigidBody
 from taisoft.scene.scene import Scene
 
-CHANGEABLE = ("mass_damping", "stiffness_damping")  # numbers of a material, besides `Composition.tet_numbers`
+CHANGEABLE = ("mass_damping", "stiffness_damping", *FIBRE_NUMBERS)  # numbers of a material, besides `Composition.tet_numbers`
 
 
 @dataclass
@@ -65,6 +66,7 @@ def make_plan(scene: Scene, explicit: bool, multistep: bool, self_collision: boo
         "every body has one young and one poisson",
     )
     add_if_any("volume_floor", lambda b: b.composition.has_volume_floor, "material of", "every volume_floor is 0")
+    add_if_any("fibres", lambda b: b.fibres is not None, "material and directions of", "no material has fibres")
     add_if_any("viscosity", lambda b: b.composition.branches.shape[1], "Maxwell branches of", "no material has branches")
     reasons = []
     for given, why in (("auto", f"a poisson of at least {NEARLY_INCOMPRESSIBLE} in linear tets of"), ("mean", "requested for")):
@@ -175,6 +177,7 @@ def change_material(body: Body, numbers: dict, on: dict[str, bool], region: int 
             hint = checks.nearest(name, changeable)
             raise SceneError(f"{what}: {name} cannot change while it runs{hint}; {', '.join(changeable)} can")
     composition = body.composition.changed(what, numbers, region)
+    composition.check_fibres(what)
     for name in numbers:
         if name in on and not on[name] and getattr(composition.first, name) != 0.0:
             rule = "was 0 everywhere at the start and is not modelled; start with a small value to change it later"

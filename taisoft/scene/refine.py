@@ -72,7 +72,8 @@ def _with_bodies(scene: Scene, made: list[tuple[Body, np.ndarray]], finer: float
 def _refined(old: Body) -> tuple[Body, np.ndarray]:
     split = make_nodes(old.mesh, 2)
     regions = None if old.mesh.regions is None else np.repeat(old.mesh.regions, PARTS)
-    mesh = TetMesh(split.positions, split.tets, regions=regions, region_names=old.mesh.region_names)
+    fibres = None if old.mesh.fibres is None else np.repeat(old.mesh.fibres, PARTS, axis=0)
+    mesh = TetMesh(split.positions, split.tets, regions=regions, region_names=old.mesh.region_names, fibres=fibres)
     edges, _ = distinct_edges(mesh.tets if old.order == 2 else old.mesh.tets)
     parents_of_nodes = np.concatenate([_own_parents(old.nodes.n_elastic), edges])
     new = _on_mesh(old, mesh, old.order, parents_of_nodes)
@@ -112,9 +113,11 @@ def _on_mesh(old: Body, mesh: TetMesh, order: int, parents: np.ndarray) -> Body:
     degree = old.quadrature_degree if order == old.order else None
     copies = mesh.n_tets // old.mesh.n_tets
     numbers = {name: np.repeat(values, copies) for name, values in old.composition.by_tet.items()}
-    new = Body(
-        old.name, mesh, old.material, old.position, velocity, order, degree, old.collision, old.given_dilatation, **numbers
-    )
+    fibres = None if old.fibres is None else np.repeat(old.fibres, copies, axis=0)
+    kept = old.collision, old.given_dilatation, fibres
+    new = Body(old.name, mesh, old.material, old.position, velocity, order, degree, *kept, **numbers)
+    with thawed(new):
+        new.activations = old.activations
     if order == old.order:  # as decided, whatever numbers have changed since
         with thawed(new):
             new.dilatation = old.dilatation

@@ -224,6 +224,7 @@ class Scene(Guarded):
         density: float | np.ndarray | None = None,
         dilatation: str = "auto",
         parameters: Mapping[str, float | np.ndarray] | None = None,
+        fibres=None,
     ) -> Body:
         """Add a body and return it.
 
@@ -237,13 +238,15 @@ class Scene(Guarded):
         linear tets, or each quadratic tet, so that a Poisson's ratio near 0.5 does not lock them; "local", of each quadrature
         point; or "auto": "mean" for linear tets if that ratio is at least 0.45 in some of them. It stays as decided when the
         ratio changes during a run.
+        fibres: directions at rest of the fibres that numbers of the material describe: (3,), (m,3) by tet, or a function of the
+        tets' centroids (m,3) that returns (m,3), of any length, 0 in tets without; by default those of the mesh.
         Warns if tets of order 1 are far too stiff: if they lock, or in a thin body with so few tets through its thickness that
         it bends at most half as far as it should. Raises SceneError.
         """
         self._check_open("add_body")
         name = self._free_name(name, "body")
         numbers = {"young": young, "poisson": poisson, "density": density, **(parameters or {})}
-        body = Body(name, mesh, material, position, velocity, order, quadrature_degree, collision, dilatation, **numbers)
+        body = Body(name, mesh, material, position, velocity, order, quadrature_degree, collision, dilatation, fibres, **numbers)
         list.append(self.bodies, body)
         body.warn_locking(stacklevel=2)
         body.warn_bending(stacklevel=2)

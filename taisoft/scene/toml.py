@@ -10,6 +10,7 @@
     [[bodies.NAME.fix]]       nodes, axes                   [[bodies.NAME.move]]   nodes, path (KeyFrames), axes
     [[bodies.NAME.traction]]  triangles, traction [Pa]      [[bodies.NAME.force]]  nodes, force [N], or their KeyFrames
     [[bodies.NAME.pressure]]  triangles, pressure [Pa]      [[bodies.NAME.cavity]] triangles, pressure or volume, name
+    [[bodies.NAME.activate]]  activation, or its KeyFrames, region
     [bodies.NAME.skin]        surface (below), contact
     [rigid_bodies.NAME]       mesh (below, or a surface), and the arguments of Scene.add_rigid_body
     [[rigid_bodies.NAME.fix]] axes, rotations               [[rigid_bodies.NAME.move]] path (KeyFrames), axes
@@ -60,6 +61,7 @@ METHODS = {
     "force": Body.add_force,
     "pressure": Body.add_pressure,
     "cavity": Body.add_cavity,
+    "activate": Body.activate,
 }
 GROUND = "ground"  # a shape as well: a half-space whose normal is up
 ON_TRIANGLES = ("traction", "pressure", "cavity")  # methods that choose surface triangles, not nodes

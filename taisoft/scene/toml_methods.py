@@ -9,7 +9,7 @@ from taisoft.scene.body import Body
 from taisoft.scene.key_frames import KeyFrames, NodePath
 from taisoft.scene.tables import Table, arguments_of
 
-VARYING = ("pressure", "volume")  # arguments that may be key frames, besides the one named like the list
+VARYING = ("pressure", "volume", "activation")  # arguments that may be key frames, besides the one named like the list
 
 
 def call_methods(

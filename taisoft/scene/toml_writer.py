@@ -19,6 +19,7 @@ from taisoft.mesh.tet_mesh import TetMesh
 from taisoft.scene import checks
 from taisoft.scene.body import QUADRATURE_DEGREES, Body
 from taisoft.scene.checks import SOLVER_CHECKS, check_solver
+from taisoft.scene.fibres import directions
 from taisoft.scene.key_frames import ShapePath
 from taisoft.scene.loads import Cavity, Load, LoadPath, NodalForce
 from taisoft.scene.material import MODULI, Material
@@ -160,7 +161,14 @@ def _body(body: Body, materials: dict[Material, str], stem: str, meshes: dict[st
     chosen = lambda c: {"nodes": _ids(c.nodes, body.nodes.n_elastic)}  # noqa: E731
     table |= constraint_tables(body, f"body {body.name!r}", chosen, foreign, _fields)
     table |= {key: [] for key in ("traction", "force", "pressure", "cavity")}
-    for load in body.loads:
+    if body.fibres is not None and (
+        body.mesh.fibres is None or not np.array_equal(body.fibres, directions("", body.mesh, body.mesh.fibres))
+    ):
+        table["fibres"] = body.fibres[0] if (body.fibres == body.fibres[0]).all() else body.fibres
+    active = [one for one in body.activations if one.path is not None or one.value != 0.0]
+    regions = [{} if one.region is None else {"region": body.mesh.region_names.get(one.region, one.region)} for one in active]
+    table["activate"] = [named | {"activation": _load(body, one)} for named, one in zip(regions, active)]
+    for load in body.loads[: len(body.loads) - len(body.activations)]:
         kind, named = ("cavity", {"name": load.name}) if isinstance(load, Cavity) else (load.kind, {})
         if isinstance(load, NodalForce):
             where = {"nodes": _ids(load.nodes, body.nodes.n_elastic)}

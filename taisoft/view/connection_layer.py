@@ -1,8 +1,9 @@
-"""Layers of pictures and the window for connections and pressures.
+"""Layers of pictures and the window for connections, pressures and fibres.
 
 Springs and tendons are drawn as bands, coloured from low to high by the size of their tension relative to the recent maximum, and
 attached nodes as crosses; attachments by springs have a line from each node to its place, too. Arrows show pressures: they point
-along the force, with lengths relative to the recent maximum of pressures.
+along the force, with lengths relative to the recent maximum of pressures. Strokes show fibres at the surface: they lie in
+triangles, move with the tets there, and are shorter where fibres leave the surface.
 """
 
 import numpy as np
@@ -19,6 +20,7 @@ CROSS = 0.008  # of the scene's size
 # Longest arrow, of the scene's size, and of the middle extent of the pressed surface, so that it fits a channel; head of an arrow
 PRESSURE_ARROW, IN_CHANNEL, HEAD = 0.07, 0.4, 0.3
 MAX_SEGMENTS, MAX_CROSSES, MAX_ARROWS = 400, 150, 40  # segments in all; crosses of an attachment; arrows of a pressure
+MAX_STROKES, STROKE = 1500, 0.9  # strokes of fibres in a body; their length over the square root of a triangle's area
 DECAY = 0.99  # factor on the running maxima per picture
 
 
@@ -26,6 +28,7 @@ class ConnectionMarks:
     """What is drawn of the connections and pressures of a scene, and their present values.
 
     attached: (k,) attached nodes; pressed: nodes (k,3) of some triangles under each pressure, and its longest arrow [m].
+    strokes: of each body with fibres and without a skin, nodes (k,4) of tets and their weights (k,2,4) in the ends of strokes.
     """
 
     def __init__(self, scene, size: float):
@@ -48,6 +51,8 @@ class ConnectionMarks:
                 self._loads.append((load, key))
                 longest = min(PRESSURE_ARROW * size, IN_CHANNEL * float(extent))
                 self.pressed.append((corners[:: -(-len(corners) // MAX_ARROWS)] + starts[body.name], longest))
+        fibrous = [body for body in scene.bodies if body.fibres is not None and body.skin is None]
+        self.strokes = [_strokes(body, starts[body.name]) for body in fibrous]
 
     def segments(self, sim) -> tuple[np.ndarray, np.ndarray] | None:
         """Return ends (k,2,3) [m] and tensions (k,) [N] of springs, tendons and attachments by springs; None without any."""
@@ -65,6 +70,27 @@ class ConnectionMarks:
             name, index = key
             found.append(float(value_at(sim.scene.body(name).pressures[index], sim.time, f"body {name!r}: pressure {index}")))
         return found
+
+
+def _strokes(body, first: int) -> tuple[np.ndarray, np.ndarray]:
+    """Nodes (k,4) of tets, and their weights (k,2,4) in the ends of strokes along a body's fibres in triangles of its surface.
+
+    first: the body's first node.
+    """
+    mesh, chosen = body.mesh, np.arange(len(body.mesh.surface))
+    chosen = chosen[body.fibres[mesh.surface_tets].any(axis=1)]
+    chosen = chosen[:: -(-len(chosen) // MAX_STROKES) or 1]
+    a, b, c = np.moveaxis(mesh.vertices[mesh.surface[chosen]], 1, 0)
+    normal, tets = np.cross(b - a, c - a), mesh.tets[mesh.surface_tets[chosen]]
+    area = np.linalg.norm(normal, axis=1, keepdims=True)
+    direction, normal = body.fibres[mesh.surface_tets[chosen]], normal / area
+    along = direction - (direction * normal).sum(axis=1, keepdims=True) * normal
+    half = 0.5 * STROKE * np.sqrt(0.5 * area) * along
+    ends = (a + b + c)[:, None] / 3.0 + half[:, None] * np.array([-1.0, 1.0])[:, None]
+    corners = mesh.vertices[tets]
+    Dm_inv = np.linalg.inv(corners[:, 1:] - corners[:, :1])
+    weights = (ends - corners[:, :1]) @ Dm_inv
+    return first + tets, np.concatenate([1.0 - weights.sum(axis=2, keepdims=True), weights], axis=2)
 
 
 class ConnectionLayer:

@@ -30,7 +30,7 @@ def describe_scene(scene, marks: ConnectionMarks) -> dict:
         "gravity": np.asarray(scene.gravity),
         "up": scene.up,
         "connections": [{"owners": list(one.owners)} for one in scene.connections],
-        "marks": [marks.attached, marks.pressed],
+        "marks": [marks.attached, marks.pressed, marks.strokes],
         "bodies": [
             {
                 "name": body.name,
@@ -135,7 +135,7 @@ class MirrorSimulation:
     """
 
     def __init__(self, description: dict, n_nodes: int):
-        self.scene, (self.attached, self.pressed) = MirrorScene(description), description["marks"]
+        self.scene, (self.attached, self.pressed, self.strokes) = MirrorScene(description), description["marks"]
         self._segments, self._pressures = None, [0.0] * len(self.pressed)
         self.time, self.step_count = 0.0, 0
         self._energies, self._contacts = Energies(0.0, 0.0, 0.0), None

@@ -29,8 +29,8 @@ MARKER_COLOUR = np.array([0.20, 0.22, 0.26])  # sRGB
 MARKER_SIZE = 0.16  # radius in units of the mean edge length of the body's surface
 MAX_MARKERS = 500  # per body; of more fixed nodes, evenly selected ones are shown
 
-LAYERS = ("wires", "contacts", "tractions", "pressures", "connections", "fixed_nodes")
-IN_PICTURES = ("pressures", "connections", "fixed_nodes")  # shown by default
+LAYERS = ("wires", "contacts", "tractions", "pressures", "connections", "fibres", "fixed_nodes")
+IN_PICTURES = ("pressures", "connections", "fibres", "fixed_nodes")  # shown by default
 IN_WINDOW = ("tractions", *IN_PICTURES)
 MAX_MARK_LINES = 4000  # largest number of lines of contacts and arrows, besides the wires
 MAX_CONTACTS = MAX_MARK_LINES // 4  # of which lines are drawn
@@ -40,6 +40,7 @@ MAX_ARROWS = 60  # of one traction
 DECAY = 0.99  # factor on the running maximum of impulses per picture
 WIRE_COLOUR, NORMAL_COLOUR = np.array([0.12, 0.14, 0.18]), np.array([0.10, 0.55, 0.25])  # sRGB
 IMPULSE_COLOUR, TRACTION_COLOUR = np.array([0.85, 0.12, 0.12]), np.array([0.55, 0.15, 0.65])
+FIBRE_COLOUR = np.array([0.38, 0.06, 0.10])
 
 
 class SceneView:
@@ -155,9 +156,10 @@ class Layers:
         self._shown = ShownBodies(scene)
         surfaces = zip(self._shown.surfaces, self._shown.starts)
         self._edges = np.concatenate([triangle_edges(triangles)[0] + n for (_, triangles), n in surfaces])
-        self.n_segments = len(self._edges) + MAX_MARK_LINES
         self._size, self.peak = scene_size(scene), 0.0
         marks = marks or ConnectionMarks(scene, self._size)
+        self._strokes = marks.strokes
+        self.n_segments = len(self._edges) + MAX_MARK_LINES + sum(len(nodes) for nodes, _ in self._strokes)
         self.connections, self.pressures = ConnectionLayer(marks, self._size), PressureLayer(marks)
         self._loaded = [  # per traction, nodes (k,3) of the triangles that get an arrow
             body.mesh.surface[t.triangles[:: -(-len(t.triangles) // MAX_ARROWS)]] + n
@@ -178,6 +180,9 @@ class Layers:
         for name, layer in (("pressures", self.pressures), ("connections", self.connections)):
             marks += layer.lines(sim, x, camera) if self.shown[name] else []
         marks = [(camera.nearer(ends, IN_FRONT), colour) for ends, colour in marks]
+        for nodes, weights in self._strokes if self.shown["fibres"] else ():
+            ends = weights @ x[nodes]
+            marks.append((camera.nearer(ends.reshape(-1, 3), ON_SURFACE), FIBRE_COLOUR))
         if self.shown["wires"]:  # last, since lines beyond the renderer's limit are dropped from the end
             marks.append((camera.nearer(self._shown.of(x)[self._edges].reshape(-1, 3), ON_SURFACE), WIRE_COLOUR))
         ends = [np.empty((0, 3)), *(part for part, _ in marks)]

@@ -55,6 +55,8 @@ def samples(tmp_path_factory) -> dict[str, bytes]:
             meshio.write(folder / f"surface{ending}", triangles)
         meshio.write(folder / "text.ply", triangles, binary=False)
         meshio.write(folder / "binary.stl", triangles, binary=True)
+    for ending in (".msh", ".vtu"):
+        ts.write_mesh(folder / f"with_fibres{ending}", ts.TetMesh(MESH.vertices, MESH.tets, fibres=np.ones((MESH.n_tets, 3))))
     for ending in ("usda", "usdc"):
         stage = Usd.Stage.CreateNew(str(folder / f"stage.{ending}"))
         prim = UsdGeom.TetMesh.Define(stage, "/tets")
@@ -154,7 +156,7 @@ def test_readers_survive_mutated_files(tmp_path, samples):
                 with contextlib.suppress(ts.TaisoftError):  # meshio cannot read every file that it writes
                     read(path)
                 check_reader(path, mutated(data, rng))
-                for _ in range(N_SMALL if name.startswith("small") else N_QUICK if QUICK.match(name) else 0):
+                for _ in range(N_SMALL if name.startswith(("small", "with_fibres")) else N_QUICK if QUICK.match(name) else 0):
                     path.write_bytes(mutated(data, rng))
                     check_outcome(path)
     finally:

@@ -9,6 +9,7 @@ import pytest
 import taisoft as ts
 from taisoft.checkpoint import restore_numbers
 from taisoft.scene.fingerprint import scene_digest
+from taisoft.scene.material import FIBRE_NUMBERS
 from taisoft.scene.numbers import scene_numbers, set_numbers
 from tests.dynamics.scenes import cube, halved, rubber
 
@@ -26,6 +27,10 @@ def scene() -> ts.Scene:
     made.add_rigid_body(cube(), density=500.0, name="rigid", position=(9, 0, 0), angular_velocity=(0, 1, 0)).add_force(
         None, (1, 0, 0)
     )
+    muscle = rubber(fibre_stiffness=1e4, active_stress=1e4)
+    made.add_body(halved(cube()), {"left": muscle, 7: muscle}, name="muscle", position=(12, 0, 0), fibres=(1, 0, 0)).activate(
+        0.5, 7
+    )
     made.add_obstacle(ts.Sphere((0, 9, 0), 0.1), name="a.ball", friction=0.4)
     made.add_spring(("body", 0), ("two", 0), 10.0, rest_length=0.1, name="spring")
     made.add_tendon([("body", 0), ("body", 1)], length=2.0, stiffness=4.0, name="rope")
@@ -35,11 +40,13 @@ def scene() -> ts.Scene:
     return made
 
 
-NUMBERS = [field.name for field in dataclasses.fields(ts.Material) if field.name not in ("law", "parameters", "branches")]
 REGIONAL = ("young", "poisson", "density", "volume_floor")
+NO_NUMBERS = ("law", "parameters", "branches", *FIBRE_NUMBERS)
+PLAIN = [field.name for field in dataclasses.fields(ts.Material) if field.name not in NO_NUMBERS]
 EXPECTED = {
-    *(f"{name}.{number}" for name in ("body", "two", "by tet") for number in NUMBERS),
-    *(f"two.{region}.{number}" for region in ("left", 7) for number in REGIONAL),
+    *(f"{name}.{number}" for name in ("body", "two", "by tet", "muscle") for number in PLAIN),
+    *(f"{name}.{region}.{number}" for name in ("two", "muscle") for region in ("left", 7) for number in REGIONAL),
+    *(f"muscle.{region}{number}" for region in ("", "left.", "7.") for number in (*FIBRE_NUMBERS, "activation")),
     *(f"rigid.{number}" for number in ("density", "friction", "restitution", "young")),
     *("gravity", "body.force.0", "body.force.1", "body.traction.0", "body.pressure.0", "rigid.force.0"),
     *("a.ball.friction", "a.ball.restitution", "spring.stiffness", "spring.rest_length", "spring.damping"),
@@ -61,7 +68,7 @@ def test_every_number_can_be_set_and_no_other_changes():
         now, owner, number = scene_numbers(made), name.split(".")[0], name.split(".")[-1]
         changed = {one for one in before if not np.array_equal(now[one], before[one])} - {name}
         assert np.array_equal(now[name], value), name
-        assert changed <= ({f"two.{part}{number}" for part in ("", "left.", "7.")} if owner == "two" else set()), name
+        assert changed <= {f"{owner}.{part}{number}" for part in ("", "left.", "7.") if owner in ("two", "muscle")}, name
         digests.add(scene_digest(made))
     assert len(digests) == len(before) + 1
 

@@ -50,6 +50,7 @@ def test_every_feature_can_be_on_and_off():
     full.body("beam").collision, full.contact_forces = "distance_field", True
     full.add_body(cube((9, 0, 0)), rubber(volume_floor=0.1, branches=((0.1, 0.5),)), dilatation="mean")
     full.add_rigid_body(cube((19, 0, 0)))
+    full.add_body(cube((29, 0, 0)), rubber(active_stress=1.0), fibres=(1, 0, 0))
     on = make_plan(full, explicit=False, multistep=True, self_collision=True).on
     laws = {name for name in on if name.startswith("law:")}
     on["rigid_motion"] |= make_plan(full, explicit=True, multistep=False).on["rigid_motion"]

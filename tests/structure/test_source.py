@@ -44,7 +44,7 @@ ORDER = (
     ("fem.node_graph", "fem.model", "fem.reference"),
     ("fem.laws", "fem.pressure", "fem.masses", "fem.dependents", "fem.rigid_tets"),
     ("fem.lanes", "fem.loads"),
-    ("fem.mean_dilatation", "fem.springs", "fem.viscosity"),
+    ("fem.mean_dilatation", "fem.springs", "fem.fibres", "fem.viscosity"),
     ("fem.pattern",),
     ("fem.elements", "fem.terms"),
     ("fem.build", "fem.measure", "stability"),

@@ -103,8 +103,15 @@ class Shown(FakeSimulator):
         return {one.name: k + self.time for k, one in enumerate((*self.scene.springs, *self.scene.tendons))}
 
 
+def fibrous_scene() -> ts.Scene:
+    """With a body of fibres, too."""
+    scene, box = connected_scene(), ts.box_mesh((2, 1, 1), (1, 0.4, 0.4))
+    scene.add_body(box, ts.Material(active_stress=1.0), name="muscle", position=(0, -1, 0), fibres=(1, 0, 0))
+    return scene
+
+
 CASES = {
-    "connections": (connected_scene, PictureOptions(SIZE, layers=("wires", "connections", "pressures", "fixed_nodes"))),
+    "connections": (fibrous_scene, PictureOptions(SIZE, layers=("wires", "connections", "pressures", "fibres", "fixed_nodes"))),
     "contacts": (moving_scene, PictureOptions(SIZE, "speed", ("contacts", "tractions"), ("energies", "contacts"), "beams", True)),
 }
 

@@ -235,3 +235,19 @@ def test_lines_of_layers():
     a, b, _, c = (found["contacts"] - camera.position) / 0.1 + camera.position
     assert np.allclose(a, contacts.point) and np.allclose((b - a) / np.linalg.norm(b - a), contacts.normal)
     assert np.allclose(np.cross(c - a, contacts.impulse[0]), 0, atol=1e-12)
+
+
+def test_strokes_lie_in_triangles_along_deformed_fibres():
+    scene, (mesh, a) = ts.Scene(), (ts.box_mesh((2, 1, 1), (1, 0.4, 0.4)), np.array([0.6, 0.8, 0.0]))
+    scene.add_body(mesh, RUBBER, name="plain", position=(0, 3, 0))
+    scene.add_body(mesh, ts.Material(active_stress=1.0), name="muscle", fibres=a)
+    [(nodes, weights)] = marks_of(scene).strokes
+    F = np.array([[1.2, 0.3, 0.0], [0.0, 0.9, 0.1], [0.2, 0.0, 1.1]])
+    x = np.concatenate([mesh.vertices, mesh.vertices @ F.T])
+    ends, corners = weights @ x[nodes], (mesh.vertices @ F.T)[mesh.surface]
+    assert np.allclose(ends.mean(axis=1), corners.mean(axis=1))
+    p, q, r = (mesh.vertices[mesh.surface[:, k]] for k in range(3))
+    normal = np.cross(q - p, r - p)
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    along = (a - (normal @ a)[:, None] * normal) @ F.T
+    assert np.allclose(np.cross(ends[:, 1] - ends[:, 0], along), 0.0, atol=1e-12) and np.ptp(ends, axis=1).max() > 0.1
