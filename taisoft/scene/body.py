@@ -395,9 +395,11 @@ class Body(Guarded):
         if self.fibres is None:
             raise SceneError(f"{what}: it has no fibres: give add_body fibres")
         given = value_or_path(activation, what, "activation", ((),))
-        start = float(given["value"] if given["value"] is not None else given["path"](0.0))
-        if not 0.0 <= start <= 1.0:
-            raise SceneError(f"{what}: an activation must lie from 0 to 1, not {start:g}")
+        known = [given["value"] if given["value"] is not None else given["path"](0.0)]
+        known += list(activation.values) if isinstance(activation, KeyFrames) else []
+        for value in map(float, known):
+            if not 0.0 <= value <= 1.0:
+                raise SceneError(f"{what}: an activation must lie from 0 to 1, not {value:g}")
         try:
             key = None if region is None else self.mesh.region_id(region)
         except MeshError as error:

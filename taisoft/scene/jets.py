@@ -144,6 +144,9 @@ class Jet:
         """The smaller one."""
         return -(-self).maximum(-self._lifted(other))
 
+    def __abs__(self):
+        return self.maximum(-self)
+
     def __neg__(self):
         return self * -1.0
 
@@ -168,13 +171,16 @@ class Jet:
         """Apply one of NumPy's functions, entry by entry where an input is an array of jets."""
         function = UFUNCS.get(ufunc.__name__)
         if method != "__call__" or kwargs or function is None:
-            raise TypeError(f"an energy density cannot use numpy.{ufunc.__name__}: there are {', '.join(UFUNCS)}")
+            raise TypeError(f"there is no numpy.{ufunc.__name__} for energies; there are {', '.join(NAMES)}")
         if any(np.ndim(one) for one in inputs if not isinstance(one, Jet)):
             return np.frompyfunc(function, len(inputs), 1)(*[_boxed(one) for one in inputs])
         return function(*inputs)
 
     def __bool__(self):
         raise TypeError("an energy density cannot branch on its variables: use np.maximum or np.minimum")
+
+    def __float__(self):
+        raise TypeError("a variable has no single value here: use NumPy's functions, such as np.log")
 
     def __lt__(self, other):
         return bool(self)
@@ -190,6 +196,7 @@ UFUNCS: dict[str, Callable] = {
     "divide": operator.truediv,
     "power": operator.pow,
     "negative": operator.neg,
+    "absolute": abs,
     "square": lambda x: x * x,
     "sqrt": Jet.sqrt,
     "exp": Jet.exp,
@@ -198,6 +205,7 @@ UFUNCS: dict[str, Callable] = {
     "maximum": lambda a, b: a.maximum(b) if isinstance(a, Jet) else b.maximum(a),
     "minimum": lambda a, b: a.minimum(b) if isinstance(a, Jet) else b.minimum(a),
 }
+NAMES = ("exp", "log", "sqrt", "tanh", "power", "square", "maximum", "minimum", "absolute")  # of functions, not operators
 
 
 def _boxed(value: Any) -> Any:

@@ -136,7 +136,9 @@ class Law:
         """
         known = {**variables, **{name: space.fixed(value) for name, value in numbers.items()}}
         total = self._call(self.psi, known)
-        total = total if isinstance(total, Jet) else space.fixed(total)
+        if not isinstance(total, (Jet, int, float, np.number)):
+            raise SceneError(f"law {self.name!r}: psi must return a number, not {type(total).__name__}")
+        total = total if isinstance(total, Jet) else space.fixed(float(total))
         if self.dilatation is not None:
             theta = self.dilatation(variables["J"])
             total = total + 0.5 * known[self.modulus] * theta * theta
@@ -147,14 +149,18 @@ class Law:
         try:
             return function(**{name: known[name] for name in arguments_of(function)})
         except Exception as error:  # a user's function may raise anything
-            raise SceneError(f"law {self.name!r}: its function failed: {reason(error)}") from error
+            hint = "; det F is the variable J" if "'det'" in str(error) else ""
+            raise SceneError(f"law {self.name!r}: its function failed: {reason(error)}{hint}") from error
 
     def stress(self, space: Space, F: list, D: list | None, numbers: dict[str, Any], fibre: list) -> list:
         """Return the given P, or its differential along D if that is not None: nine values. F, D: nine values."""
         matrices = {name: fixed_matrix(space, one) for name, one in (("F", F), ("D", D)) if one is not None}
         known = invariants(self, matrices["F"], fibre) | matrices | {name: space.fixed(one) for name, one in numbers.items()}
         function = self.pk1 if D is None else self.dpk1
-        made = np.asarray(self._call(function, known), dtype=object).reshape(9)
+        made = np.asarray(self._call(function, known), dtype=object)
+        if made.shape != (3, 3):
+            raise SceneError(f"law {self.name!r}: pk1 and dpk1 must return a matrix (3, 3), not of shape {made.shape}")
+        made = made.reshape(9)
         return [one.value if isinstance(one, Jet) else one for one in made]
 
     def sample(self) -> dict[str, float]:

@@ -41,11 +41,8 @@ def _takes_parameters(cls: type) -> type:
 def _with_moduli(law: Law, named: dict, own: dict) -> dict:
     """Return the fields of a material whose law has parameters. named: fields given; own: parameters given by their names."""
     before = dict(named.pop("parameters", None) or {})
-    if before.keys() <= law.parameters.keys() == {*before, *own}:
-        is_copy = before.keys() == law.parameters.keys()  # of a material, with its moduli: `dataclasses.replace`
-    else:
-        is_copy = False
-    old = dict(zip(MODULI, law.moduli(before))) if is_copy else {}
+    # `dataclasses.replace` gives all parameters, and the moduli that followed from them
+    old = dict(zip(MODULI, law.moduli(before))) if before.keys() == law.parameters.keys() else {}
     for name in MODULI:
         if name in named and named[name] != old.get(name):
             raise SceneError(f"material: {name} follows from the numbers of law {law.name}: {', '.join(law.parameters)}")

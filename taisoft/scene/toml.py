@@ -199,6 +199,11 @@ def _made_material(table: Table, key: str) -> Material:
     """Return the material of the table under a key, which has the parameters of its law, too."""
     given, known = table.values[key], [name for name in arguments_of(Material)[0] if name != "parameters"]
     law = LAWS.get(str(given.get("law"))) if isinstance(given, dict) else None
+    if isinstance(given, dict) and isinstance(given.get("law"), str) and law is None:
+        own = "; one's own is registered in Python, by ts.register_law, before ts.read_scene"
+        raise table.error(
+            key, f"law {value_text(given['law'])} is none of {', '.join(LAWS)}{checks.nearest(given['law'], LAWS)}{own}"
+        )
     return table.table(key, known + list(law.parameters if law else ())).make(Material, "material: ")
 
 

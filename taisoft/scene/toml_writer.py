@@ -21,6 +21,7 @@ from taisoft.scene.body import QUADRATURE_DEGREES, Body
 from taisoft.scene.checks import SOLVER_CHECKS, check_solver
 from taisoft.scene.fibres import directions
 from taisoft.scene.key_frames import ShapePath
+from taisoft.scene.laws import SHIPPED
 from taisoft.scene.loads import Cavity, Load, LoadPath, NodalForce
 from taisoft.scene.material import MODULI, Material
 from taisoft.scene.obstacles import Obstacle
@@ -41,7 +42,7 @@ def write_scene(path, scene: Scene, solver: dict | None = None, overwrite: bool 
 
     path: a name that ends in .toml. solver: arguments of Simulator, seconds and fps. overwrite: replace existing files. Raises
     SceneError for content that cannot be stored, before any file is written, and OutputError. Files are written atomically,
-    the TOML last. Warns of a mesh whose only region, 0, is not stored.
+    the TOML last. Warns of a mesh whose only region, 0, is not stored, and of laws that must be registered before it is read.
     """
     file = Path(path)
     if file.suffix != ".toml":
@@ -50,6 +51,11 @@ def write_scene(path, scene: Scene, solver: dict | None = None, overwrite: bool 
         raise SceneError(f"{file}: write_scene needs a Scene, not {type(scene).__name__}")
     if not scene.bodies:
         raise SceneError(f"{file}: the scene holds no body")
+    shipped = {law.name for law in SHIPPED}
+    for law in sorted({law for body in scene.bodies for law in body.composition.laws} - shipped):
+        warnings.warn(
+            f"{file}: register law {law!r} before ts.read_scene: the command line does not know it", UserWarning, stacklevel=2
+        )
     meshes: dict[str, TetMesh] = {}
     text = toml_of(_document(scene, solver or {}, file.stem, meshes))
     try:

@@ -13,7 +13,7 @@ import taisoft as ts
 from taisoft.backend.counters import counting
 from taisoft.backend.tracing import untraced
 from taisoft.fem.laws import stable_neo_hookean
-from taisoft.fem.laws.evaluate import evaluate_blocks, evaluate_differential
+from taisoft.fem.laws.evaluate import double_precision, evaluate_blocks, evaluate_differential
 from taisoft.scene.law import evaluate
 from taisoft.scene.laws import LAWS, SHIPPED
 from tests.dynamics.scenes import COR, SNH, SVK
@@ -66,6 +66,13 @@ OLD = {  # those written by hand again, from their energies alone
 }
 
 
+@pytest.fixture
+def kernels():
+    """One runtime for all evaluations of a test."""
+    with double_precision():
+        yield
+
+
 @pytest.fixture(autouse=True)
 def known_laws():
     """Forget the laws that a test has registered."""
@@ -96,7 +103,7 @@ def compare_with_numpy(law: str, F, numbers: dict, constants: dict, allowed: flo
 
 
 @pytest.mark.parametrize("law", SHIPPED_NUMBERS)
-def test_shipped_laws_in_kernels_equal_their_derivatives_in_numpy(law):
+def test_shipped_laws_in_kernels_equal_their_derivatives_in_numpy(law, kernels):
     numbers = SHIPPED_NUMBERS[law]
     ts.check_law(law, **numbers)
     # two stretches that nearly coincide leave half of the digits of a symmetric mode of principal stretches
@@ -105,7 +112,7 @@ def test_shipped_laws_in_kernels_equal_their_derivatives_in_numpy(law):
 
 
 @pytest.mark.parametrize("law", OLD)
-def test_the_laws_written_by_hand_follow_from_their_energies(law):
+def test_the_laws_written_by_hand_follow_from_their_energies(law, kernels):
     ts.register_law("again", OLD[law])
     numbers = {"young": 3e5, "poisson": 0.35}
     for found, expected in zip(ts.evaluate_law("again", MODERATE, **numbers), ts.evaluate_law(law, MODERATE, **numbers)):
@@ -115,7 +122,7 @@ def test_the_laws_written_by_hand_follow_from_their_energies(law):
         assert np.abs(found - expected).max() < 1e-10 * np.abs(expected).max()
 
 
-def test_general_laws_of_F_of_fibres_and_with_a_given_stress():
+def test_general_laws_of_F_of_fibres_and_with_a_given_stress(kernels):
     numbers, lame = {"young": 1.0, "poisson": 0.3}, {"mu": 1 / 2.6, "lam": 0.3 / 0.52}
     ts.register_law("of_F", svk_of_F)
     compare_with_numpy("of_F", ALL, numbers, lame)
@@ -164,7 +171,7 @@ STRESSES = {  # principal stresses [Pa] over the principal stretches, by hand
 
 
 @pytest.mark.parametrize("law", SHIPPED_NUMBERS)
-def test_uniaxial_biaxial_and_shear_follow_the_closed_forms(law):
+def test_uniaxial_biaxial_and_shear_follow_the_closed_forms(law, kernels):
     p = SHIPPED_NUMBERS[law]
     stress = lambda l: STRESSES[law](np.asarray(l), float(np.prod(l)), p)  # noqa: E731
     for s in (0.8, 1.3):
@@ -242,7 +249,7 @@ WRONG = {
         "stress of .* at rest",
     ),
     "a branch": ({"psi": lambda I1, mu, lam: mu * (I1 - 3) if I1 > 3 else 0.0}, "use np.maximum or np.minimum"),
-    "another function": ({"psi": lambda I1, mu, lam: mu * np.sin(I1 - 3)}, "cannot use numpy.sin"),
+    "another function": ({"psi": lambda I1, mu, lam: mu * np.sin(I1 - 3)}, "there is no numpy.sin"),
     "a name that does not exist": ({"psi": lambda I1, J, c3: I1, "parameters": {"c1": "Pa"}}, "c3 is no variable"),
     "a parameter that is not used": ({"psi": polynomial, "parameters": {**POLYNOMIAL, "c4": ""}}, "parameter c4 is not used"),
     "the name of a number": ({"psi": polynomial, "parameters": {**POLYNOMIAL, "friction": ""}}, "cannot be called friction"),
@@ -380,7 +387,7 @@ def test_a_law_that_has_changed_does_not_continue_a_checkpoint(tmp_path):
         ts.Simulator.load_checkpoint(tmp_path / "saved.npz", scene)
 
 
-def test_every_law_of_the_package_passes_the_check():
+def test_every_law_of_the_package_passes_the_check(kernels):
     for law in SHIPPED:
         found = ts.check_law(law.name)
         assert found.is_isotropic and found.is_finite_inverted

@@ -108,7 +108,7 @@ def test_invalid_materials_are_refused():
         ("poisson", r"must lie in the open interval \(-1, 0.5\), not", [0.5, -1]),
         ("volume_floor", "must be", [-0.1, 1e-4, 1.0, np.nan]),
         ("law", "must be one of .*did you mean 'corotational'", ["corotated"]),
-        ("law", "must be one of st_venant_kirchhoff, corotational, .*ogden, not", ["hooke", "", None]),
+        ("law", "must be one of st_venant_kirchhoff, corotational, .*, not", ["hooke", "", None]),
     ):
         for value in values:
             with pytest.raises(SceneError, match=f"^material: {field} {rule}"):

@@ -67,7 +67,7 @@ def _checked(law: str, F: np.ndarray, floor: float, fibre: tuple, **numbers: flo
 
 
 @contextmanager
-def _double_precision() -> Iterator[int]:
+def double_precision() -> Iterator[int]:
     """Open an f64 runtime, or reuse an open one of any arch; yields its number of lanes."""
     kind = open_kind()
     arch = kind[0] if kind and kind[1] == "f64" else "cpu"
@@ -105,7 +105,7 @@ def evaluate_law(
     direction of a law with I4. Raises SceneError on a bad law, number or shape.
     """
     law_module, F, p = _checked(law, F, volume_floor, fibre, young=young, poisson=poisson, **parameters)
-    with _double_precision() as lanes:
+    with double_precision() as lanes:
         lane_F = _to_lanes(F, lanes)
         P, psi = np.empty_like(lane_F), np.empty((len(lane_F), lanes))
         _evaluate(law_module, lanes, lane_F, p, psi, P)
@@ -125,7 +125,7 @@ def evaluate_differential(
 ) -> np.ndarray:
     """Stress differential dP (k,3,3) [Pa] along dF (k,3,3), in float64; projected: use the positive semi-definite part."""
     law_module, F, p = _checked(law, F, volume_floor, fibre, young=young, poisson=poisson, **parameters)
-    with _double_precision() as lanes:
+    with double_precision() as lanes:
         lane_F, D = _to_lanes(F, lanes), _to_lanes(np.array(np.broadcast_to(dF, F.shape), dtype=np.float64), lanes)
         P = np.empty_like(lane_F)
         _differential(law_module, projected, lanes, lane_F, p, D, P)
@@ -136,7 +136,7 @@ def evaluate_blocks(law: str, F: np.ndarray, **numbers: float) -> np.ndarray:
     """Second derivative (k,9,9) [Pa] of psi by the law's `block`, in float64. numbers: as for `evaluate_law`."""
     law_module, F, p = _checked(law, F, 0.0, (1.0, 0.0, 0.0), **numbers)
     found = np.empty((len(F), 9, 9))
-    with _double_precision() as lanes:
+    with double_precision() as lanes:
         lane_F = _to_lanes(F, lanes)
         P = np.empty_like(lane_F)
         for a in range(3):

@@ -30,7 +30,7 @@ from taisoft.fem.math3 import (
     transform,
 )
 from taisoft.scene.jets import Jet, Space
-from taisoft.scene.law import HOOKE, INVARIANTS, PAIRS, Law, fixed_matrix, invariants, jets_of_F, of_stretches, stretch_modes
+from taisoft.scene.law import HOOKE, INVARIANTS, Law, fixed_matrix, invariants, jets_of_F, of_stretches, stretch_modes
 
 UPPER = [(i, j) for i in range(9) for j in range(i, 9)]  # of a symmetric 9x9 matrix
 
@@ -59,8 +59,7 @@ class Lanes(Space):
 class EnergyLaw:
     """What the laws from an energy density share. Compared by identity, as the modules of other laws are."""
 
-    SOFTENS_BELOW = 0.0
-    POINT_SECONDS = 60e-9  # per quadrature point of an explicit step, on one core
+    SOFTENS_BELOW, POINT_SECONDS = 0.0, 300e-9  # the latter per quadrature point of an explicit step, on one core
 
     def __init__(self, law: Law):
         self.law, self.NAME = law, law.name
@@ -101,149 +100,8 @@ class EnergyLaw:
         return scaled(theta.first.get(0, 0.0) + 0.0 * F[0], cofactor(F))
 
 
-class InvariantLaw(EnergyLaw):
-    """A law of I1, I2, J and trS, by whose numbers 0 to 3 derivatives are known."""
-
-    def __init__(self, law: Law):
-        super().__init__(law)
-        space = Space()
-        rest = {name: space.variable(value, k) for k, (name, value) in enumerate(zip(INVARIANTS, (3.0, 3.0, 1.0, 3.0)))}
-        psi = law.energy(space, rest, law.sample())
-        self.uses, self.pairs = set(psi.first), set(psi.second)  # derivatives that are not 0 for every F
-
-    def _energy(self, F_or_s: list, p: list, order: int) -> tuple[Jet, Lanes]:
-        space = Lanes(F_or_s[0], order)
-        if len(F_or_s) == 9:
-            values = invariants_of(F_or_s)
-            if 3 in self.uses:
-                values = [*values, ddot(corotational.rotation(F_or_s), F_or_s)]
-        else:
-            a, b, c = (one * one for one in F_or_s)
-            trace = F_or_s[0] + F_or_s[1] + F_or_s[2]
-            values = [a + b + c, a * b + a * c + b * c, F_or_s[0] * F_or_s[1] * F_or_s[2], trace]
-        used = {name: space.variable(space.bind(value), k) for k, (name, value) in enumerate(zip(INVARIANTS, values))}
-        return self.law.energy(space, used, *self._numbers(p)), space
-
-    @untraced
-    def psi(self, F, p):
-        """Energy density [Pa], 0 at rest."""
-        psi, space = self._energy(F, p, 0)
-        return psi.value - self._at_rest(space, p) + 0.0 * F[0]
-
-    @untraced
-    def pk1(self, F, p):
-        """First Piola-Kirchhoff stress [Pa]."""
-        psi, _ = self._energy(F, p, 1)
-        G = cofactor(F)
-        gradients = {0: F, 1: second_gradient(F) if 1 in self.uses else None, 2: G}
-        gradients[3] = corotational.rotation(F) if 3 in self.uses else None
-        total = None
-        for k, factor in psi.first.items():
-            factor = (2.0 if k == 0 else 1.0) * factor + 0.0 * F[0]
-            total = scaled(factor, gradients[k]) if total is None else add_scaled(total, factor, gradients[k])
-        return total
-
-    @untraced
-    def prepare(self, F, p):
-        """Precompute for `dpk1` and `block`: derivatives of psi, then the gradients of the invariants, I1, C and B."""
-        psi, space = self._energy(F, p, 2)
-        zero = space.bind(0.0 * F[0])
-        first = [space.bind(psi.first.get(k, 0.0) + zero) for k in range(4)]
-        second = [space.bind(psi.second.get(pair, 0.0) + zero) for pair in SECOND]
-        turned = corotational.prepare(F, [zero, zero])[:18] if 3 in self.uses else []
-        quadratic = [*second_gradient(F), *matmul_tn(F, F), *matmul_nt(F, F)] if 1 in self.uses else []
-        return first + second + cofactor(F) + turned + quadratic
-
-    def _parts(self, S: list) -> tuple[list, list, list, list, list]:
-        """From `prepare`: gradients of the invariants, up to factors; factors of `corotational.dpk1` that leave dR; C and B."""
-        zero = 0.0 * S[0]
-        G, at = S[14:23], 41 if 3 in self.uses else 23
-        turned = S[23:41] + [zero, zero, zero + 1.0]
-        return [S, S[at : at + 9], G, S[23:32]], turned, S[at + 9 : at + 18], S[at + 18 : at + 27]
-
-    def _coupled(self, k: int, S: list) -> list[tuple[int, Any]]:
-        """The invariants l with which psi couples invariant k, and psi_kl."""
-        pairs = [(l, (min(k, l), max(k, l))) for l in range(4)]
-        return [(l, S[4 + SECOND.index(pair)]) for l, pair in pairs if pair in self.pairs]
-
-    @untraced
-    def dpk1(self, F, S, D):
-        """Differential of the stress along D [Pa], with S = prepare(F, p)."""
-        gradients, turned, C, _ = self._parts(S)
-        gradients[0] = F
-        total = scaled(2.0 * S[0], D)
-        if 2 in self.uses:
-            total = add_scaled(total, S[2], cofactor_differential(F, D))
-        if 1 in self.uses:
-            total = add_scaled(total, S[1], second_gradient_differential(F, C, D))
-        if 3 in self.uses:
-            total = add_scaled(total, S[3], corotational.dpk1(F, turned, D))
-        for k in range(4):
-            terms = [FACTORS[k] * FACTORS[l] * factor * ddot(gradients[l], D) for l, factor in self._coupled(k, S)]
-            if terms:
-                total = add_scaled(total, sum(terms[1:], terms[0]), gradients[k])
-        return total
-
-    @untraced
-    def block(self, F, S, ga, gb):
-        """Differential of (P g_b)_i along the displacement gradient e_k (x) g_a: nine entries (i, k) [Pa/m^2]."""
-        gradients, turned, C, B = self._parts(S)
-        gradients[0] = F
-        diagonal = 2.0 * S[0] * dot(ga, gb)
-        coupled = [k for k in range(4) if self._coupled(k, S)]
-        a, b = ({k: scaled3(FACTORS[k], transform(gradients[k], g)) for k in coupled} for g in (ga, gb))
-        total = [0.0 * diagonal] * 9
-        for k in coupled:
-            total = add_outer(total, b[k], combined([(factor, a[l]) for l, factor in self._coupled(k, S)]))
-        if 1 in self.uses:
-            total = add_block_of_I2(total, F, C, B, S[1], ga, gb)
-        if 3 in self.uses:
-            total = add_scaled(total, S[3], corotational.block(F, turned, ga, gb))
-        return add_block_of_J(total, diagonal, transform(F, cross(ga, gb)), S[2])
-
-    @untraced
-    def hessian_eigen(self, s, p):
-        """Second derivatives in the SVD frame [Pa], over the stretches s: see `projection`."""
-        psi, space = self._energy(s, p, 2)
-        zero = space.bind(0.0 * s[0])
-        f = [space.bind(psi.first.get(k, 0.0) + zero) for k in range(4)]
-        squares = [space.bind(one * one) for one in s]
-        I1 = squares[0] + squares[1] + squares[2]
-        gradient = [
-            [2.0 * s[i] for i in range(3)],
-            [2.0 * s[i] * (I1 - squares[i]) for i in range(3)],
-            [s[1] * s[2], s[0] * s[2], s[0] * s[1]],
-            [zero + 1.0] * 3,
-        ]
-        A = []
-        for i in range(3):
-            for j in range(3):
-                if i == j:
-                    entry = 2.0 * f[0] + 2.0 * f[1] * (I1 - squares[i])
-                else:
-                    entry = 4.0 * f[1] * s[i] * s[j] + f[2] * s[3 - i - j]
-                for k, l in psi.second:
-                    product = gradient[k][i] * gradient[l][j]
-                    entry = entry + psi.second[k, l] * (product if k == l else product + gradient[l][i] * gradient[k][j])
-                A.append(space.bind(entry))
-        symmetric, antisymmetric = [], []
-        for i, j in PAIRS:
-            common, other = 2.0 * f[0] + 2.0 * f[1] * (I1 - squares[i] - squares[j]), f[2] * s[3 - i - j]
-            mixed = 2.0 * f[1] * s[i] * s[j] + other
-            symmetric.append(space.bind(common - mixed))
-            turning = 2.0 * f[3] / ti.max(s[i] + s[j], 1e-12 * (s[0] + 1e-18)) if 3 in self.uses else 0.0
-            antisymmetric.append(space.bind(common + mixed + turning))
-        return A, symmetric, antisymmetric
-
-
-SECOND = [(k, l) for k in range(4) for l in range(k, 4)]  # pairs of invariants
-FACTORS = (2.0, 1.0, 1.0, 1.0)  # of F, I1 F - F C times 2, cof F and R in the gradients of the invariants
-
-
 class StretchLaw(EnergyLaw):
     """A law of the principal stretches."""
-
-    POINT_SECONDS = 300e-9
 
     @untraced
     def hessian_eigen(self, s, p):
@@ -290,10 +148,106 @@ class StretchLaw(EnergyLaw):
         return [columns[k][i] for i in range(3) for k in range(3)]
 
 
+class InvariantLaw(StretchLaw):
+    """A law of I1, I2, J and trS, by whose numbers 0 to 3 derivatives are known.
+
+    It needs the stretches for the projection alone.
+    """
+
+    POINT_SECONDS = 60e-9  # per quadrature point of an explicit step, on one core
+
+    def __init__(self, law: Law):
+        super().__init__(law)
+        space = Space()
+        rest = {name: space.variable(value, k) for k, (name, value) in enumerate(zip(INVARIANTS, (3.0, 3.0, 1.0, 3.0)))}
+        psi = law.energy(space, rest, law.sample())
+        self.uses, self.pairs = set(psi.first), set(psi.second)  # derivatives that are not 0 for every F
+
+    def _energy(self, F: list, p: list, order: int) -> tuple[Jet, Lanes]:
+        space, values = Lanes(F[0], order), invariants_of(F)
+        if 3 in self.uses:
+            values = [*values, ddot(corotational.rotation(F), F)]
+        used = {name: space.variable(space.bind(value), k) for k, (name, value) in enumerate(zip(INVARIANTS, values))}
+        return self.law.energy(space, used, *self._numbers(p)), space
+
+    @untraced
+    def psi(self, F, p):
+        """Energy density [Pa], 0 at rest."""
+        psi, space = self._energy(F, p, 0)
+        return psi.value - self._at_rest(space, p) + 0.0 * F[0]
+
+    @untraced
+    def pk1(self, F, p):
+        """First Piola-Kirchhoff stress [Pa]."""
+        psi, _ = self._energy(F, p, 1)
+        made, total = (lambda F: scaled(2.0, F), second_gradient, cofactor, corotational.rotation), None
+        for k, factor in psi.first.items():
+            factor, gradient = factor + 0.0 * F[0], made[k](F)
+            total = scaled(factor, gradient) if total is None else add_scaled(total, factor, gradient)
+        return total
+
+    @untraced
+    def prepare(self, F, p):
+        """Precompute for `dpk1` and `block`: derivatives of psi, then the gradients of the invariants, I1, C and B."""
+        psi, space = self._energy(F, p, 2)
+        zero = space.bind(0.0 * F[0])
+        first = [space.bind(psi.first.get(k, 0.0) + zero) for k in range(4)]
+        second = [space.bind(psi.second.get(pair, 0.0) + zero) for pair in SECOND]
+        turned = corotational.prepare(F, [zero, zero])[:18] if 3 in self.uses else []
+        quadratic = [*second_gradient(F), *matmul_tn(F, F), *matmul_nt(F, F)] if 1 in self.uses else []
+        return first + second + cofactor(F) + turned + quadratic
+
+    def _parts(self, F: list, S: list) -> tuple[list, list, list, list]:
+        """From `prepare`: gradients of the invariants; factors of `corotational.dpk1` that leave dR; C and B."""
+        zero = 0.0 * S[0]
+        G, at = S[14:23], 41 if 3 in self.uses else 23
+        turned = S[23:41] + [zero, zero, zero + 1.0]
+        return [scaled(2.0, F), S[at : at + 9], G, S[23:32]], turned, S[at + 9 : at + 18], S[at + 18 : at + 27]
+
+    def _coupled(self, k: int, S: list) -> list[tuple[int, Any]]:
+        """The invariants l with which psi couples invariant k, and psi_kl."""
+        pairs = [(l, (min(k, l), max(k, l))) for l in range(4)]
+        return [(l, S[4 + SECOND.index(pair)]) for l, pair in pairs if pair in self.pairs]
+
+    @untraced
+    def dpk1(self, F, S, D):
+        """Differential of the stress along D [Pa], with S = prepare(F, p)."""
+        gradients, turned, C, _ = self._parts(F, S)
+        total = scaled(2.0 * S[0], D)
+        if 2 in self.uses:
+            total = add_scaled(total, S[2], cofactor_differential(F, D))
+        if 1 in self.uses:
+            total = add_scaled(total, S[1], second_gradient_differential(F, C, D))
+        if 3 in self.uses:
+            total = add_scaled(total, S[3], corotational.dpk1(F, turned, D))
+        for k in range(4):
+            terms = [factor * ddot(gradients[l], D) for l, factor in self._coupled(k, S)]
+            if terms:
+                total = add_scaled(total, sum(terms[1:], terms[0]), gradients[k])
+        return total
+
+    @untraced
+    def block(self, F, S, ga, gb):
+        """Differential of (P g_b)_i along the displacement gradient e_k (x) g_a: nine entries (i, k) [Pa/m^2]."""
+        gradients, turned, C, B = self._parts(F, S)
+        diagonal = 2.0 * S[0] * dot(ga, gb)
+        coupled = [k for k in range(4) if self._coupled(k, S)]
+        a, b = ({k: transform(gradients[k], g) for k in coupled} for g in (ga, gb))
+        total = [0.0 * diagonal] * 9
+        for k in coupled:
+            total = add_outer(total, b[k], combined([(factor, a[l]) for l, factor in self._coupled(k, S)]))
+        if 1 in self.uses:
+            total = add_block_of_I2(total, F, C, B, S[1], ga, gb)
+        if 3 in self.uses:
+            total = add_scaled(total, S[3], corotational.block(F, turned, ga, gb))
+        return add_block_of_J(total, diagonal, transform(F, cross(ga, gb)), S[2])
+
+
+SECOND = [(k, l) for k in range(4) for l in range(k, 4)]  # pairs of invariants
+
+
 class GeneralLaw(EnergyLaw):
     """Any other law: a function of F, or of I4 and others."""
-
-    POINT_SECONDS = 300e-9
 
     def _energy(self, F: list, p: list, order: int) -> tuple[Jet, Lanes]:
         space, (numbers, pressure) = Lanes(F[0], order), self._numbers(p)
@@ -420,12 +374,6 @@ def second_gradient_differential(F, C, D):
 def scaled(a, A):
     """a A, nine entries."""
     return [a * A[k] for k in ti.static(range(9))]
-
-
-@arithmetic
-def scaled3(a, x):
-    """a x, three entries."""
-    return [a * x[k] for k in ti.static(range(3))]
 
 
 @arithmetic
