@@ -212,28 +212,24 @@ def jets_of_F(space: Space, F: list) -> np.ndarray:
     return jets.reshape(3, 3)
 
 
-def stretch_modes(space: Space, energy: Callable, s: list) -> tuple[Jet, list, list, list]:
-    """Return psi over the principal stretches s, and its second derivative in the frame of F's SVD, see `fem.laws.projection`.
+def stretch_modes(space: Space, psi: Jet, s: list) -> tuple[list, list, list]:
+    """Return the second derivative in the frame of F's SVD, see `fem.laws.projection`: the block A and the eigenvalues.
 
-    energy: function of three jets. The eigenvalue (psi_i - psi_j) / (s_i - s_j) of a symmetric mode is, where two stretches
-    nearly coincide, psi_ii - psi_ij at their mean, which errs by the square of their difference.
+    psi: of the principal stretches s. The eigenvalue (psi_i - psi_j) / (s_i - s_j) of a symmetric mode is, where two stretches
+    nearly coincide, (psi_ii + psi_jj) / 2 - psi_ij, which errs by the square of their difference.
     """
-    psi = energy([space.variable(one, k) for k, one in enumerate(s)])
-    zero = 0.0 * (s[0] + psi.value)
-    first = [zero + psi.first.get(k, 0.0) for k in range(3)]
-    A = [zero + psi.second.get((min(i, j), max(i, j)), 0.0) for i in range(3) for j in range(3)]
+    zero = space.bind(0.0 * (s[0] + psi.value))
+    first = [space.bind(zero + psi.first.get(k, 0.0)) for k in range(3)]
+    A = [space.bind(zero + psi.second.get((min(i, j), max(i, j)), 0.0)) for i in range(3) for j in range(3)]
     symmetric, antisymmetric = [], []
     for i, j in PAIRS:
-        mean = space.bind(0.5 * (s[i] + s[j]))
-        at = energy([space.variable(mean if k in (i, j) else s[k], k) for k in range(3)]).second
-        limit = zero + at.get((i, i), 0.0) - at.get((i, j), 0.0)
         difference, total = s[i] - s[j], s[i] + s[j]
-        close = space.bind(abs(difference) <= space.eps ** (1.0 / 3.0) * abs(mean))
+        close = space.bind(abs(difference) <= space.eps ** (1.0 / 3.0) * abs(total))
         quotient = (first[i] - first[j]) / space.select(close, 1.0 + zero, difference)
-        symmetric.append(space.select(close, limit, quotient))
+        symmetric.append(space.select(close, 0.5 * (A[4 * i] + A[4 * j]) - A[3 * i + j], quotient))
         tiny = 1e-12 * abs(s[0]) + 1e-30
         antisymmetric.append((first[i] + first[j]) / space.select(abs(total) > tiny, total, tiny))
-    return psi, A, symmetric, antisymmetric
+    return A, symmetric, antisymmetric
 
 
 def evaluate(law: Law, F: np.ndarray, numbers: dict[str, Any], fibre: np.ndarray = FIBRE) -> tuple[np.ndarray, ...]:
@@ -277,7 +273,8 @@ def _from_stretches(law: Law, space: Space, F: np.ndarray, numbers: dict[str, An
     U, s, Vt = np.linalg.svd(F)
     flip = np.linalg.det(U) * np.linalg.det(Vt) < 0.0
     U[flip, :, 2], s[flip, 2] = -U[flip, :, 2], -s[flip, 2]
-    psi, A, symmetric, antisymmetric = stretch_modes(space, of_stretches(law, space, numbers), list(s.T))
+    psi = of_stretches(law, space, numbers)([space.variable(one, i) for i, one in enumerate(s.T)])
+    A, symmetric, antisymmetric = stretch_modes(space, psi, list(s.T))
     k = len(F)
     K = np.zeros((k, 3, 3, 3, 3), F.dtype)
     for i in range(3):

@@ -89,6 +89,12 @@ class EnergyLaw:
         return self.law.dilatation(space.variable(space.bind(dot(F, cofactor(F))), 0))
 
     @untraced
+    def psi(self, F, p):
+        """Energy density [Pa], 0 at rest."""
+        psi, space = self._energy(F, p, 0)
+        return psi.value - self._at_rest(space, p) + 0.0 * F[0]
+
+    @untraced
     def dilatation(self, F):
         """theta(J)."""
         return self._volume(F, 0).value + 0.0 * F[0]
@@ -103,26 +109,26 @@ class EnergyLaw:
 class StretchLaw(EnergyLaw):
     """A law of the principal stretches."""
 
+    def _energy(self, F: list, p: list, order: int) -> tuple[Jet, Lanes]:
+        return self._of_stretches(svd_of(F)[9:12], p, order)
+
+    def _of_stretches(self, s: list, p: list, order: int) -> tuple[Jet, Lanes]:
+        space = Lanes(s[0], order)
+        energy = of_stretches(self.law, space, *self._numbers(p))
+        return energy([space.variable(one, k) for k, one in enumerate(s)]), space
+
     @untraced
     def hessian_eigen(self, s, p):
         """Second derivatives in the SVD frame [Pa], over the stretches s: see `projection`."""
-        space = Lanes(s[0], 2)
-        return stretch_modes(space, of_stretches(self.law, space, *self._numbers(p)), s)[1:]
-
-    @untraced
-    def psi(self, F, p):
-        """Energy density [Pa], 0 at rest."""
-        space, s = Lanes(F[0], 0), svd_of(F)[9:12]
-        value = of_stretches(self.law, space, *self._numbers(p))([space.fixed(one) for one in s]).value
-        return value - self._at_rest(space, p) + 0.0 * F[0]
+        psi, space = self._of_stretches(s, p, 2)
+        return stretch_modes(space, psi, s)
 
     @untraced
     def pk1(self, F, p):
         """First Piola-Kirchhoff stress [Pa]."""
-        frame, space = svd_of(F), Lanes(F[0], 1)
-        U, s, V = frame[:9], frame[9:12], frame[12:]
-        energy = of_stretches(self.law, space, *self._numbers(p))
-        psi = energy([space.variable(one, k) for k, one in enumerate(s)])
+        frame = svd_of(F)
+        U, V = frame[:9], frame[12:]
+        psi, space = self._of_stretches(frame[9:12], p, 1)
         first = [space.bind(psi.first.get(k, 0.0) + 0.0 * F[0]) for k in range(3)]
         return matmul_nt([U[3 * i + k] * first[k] for i in range(3) for k in range(3)], V)
 
@@ -163,24 +169,19 @@ class InvariantLaw(StretchLaw):
         psi = law.energy(space, rest, law.sample())
         self.uses, self.pairs = set(psi.first), set(psi.second)  # derivatives that are not 0 for every F
 
-    def _energy(self, F: list, p: list, order: int) -> tuple[Jet, Lanes]:
+    def _energy(self, F: list, p: list, order: int, R: list | None = None) -> tuple[Jet, Lanes]:
         space, values = Lanes(F[0], order), invariants_of(F)
         if 3 in self.uses:
-            values = [*values, ddot(corotational.rotation(F), F)]
+            values = [*values, ddot(R or corotational.rotation(F), F)]
         used = {name: space.variable(space.bind(value), k) for k, (name, value) in enumerate(zip(INVARIANTS, values))}
         return self.law.energy(space, used, *self._numbers(p)), space
 
     @untraced
-    def psi(self, F, p):
-        """Energy density [Pa], 0 at rest."""
-        psi, space = self._energy(F, p, 0)
-        return psi.value - self._at_rest(space, p) + 0.0 * F[0]
-
-    @untraced
     def pk1(self, F, p):
         """First Piola-Kirchhoff stress [Pa]."""
-        psi, _ = self._energy(F, p, 1)
-        made, total = (lambda F: scaled(2.0, F), second_gradient, cofactor, corotational.rotation), None
+        R = corotational.rotation(F) if 3 in self.uses else None
+        psi, _ = self._energy(F, p, 1, R)
+        made, total = (lambda F: scaled(2.0, F), second_gradient, cofactor, lambda _: R), None
         for k, factor in psi.first.items():
             factor, gradient = factor + 0.0 * F[0], made[k](F)
             total = scaled(factor, gradient) if total is None else add_scaled(total, factor, gradient)
@@ -189,11 +190,11 @@ class InvariantLaw(StretchLaw):
     @untraced
     def prepare(self, F, p):
         """Precompute for `dpk1` and `block`: derivatives of psi, then the gradients of the invariants, I1, C and B."""
-        psi, space = self._energy(F, p, 2)
+        turned = corotational.prepare(F, [0.0 * F[0], 0.0 * F[0]])[:18] if 3 in self.uses else []
+        psi, space = self._energy(F, p, 2, turned[:9])
         zero = space.bind(0.0 * F[0])
         first = [space.bind(psi.first.get(k, 0.0) + zero) for k in range(4)]
         second = [space.bind(psi.second.get(pair, 0.0) + zero) for pair in SECOND]
-        turned = corotational.prepare(F, [zero, zero])[:18] if 3 in self.uses else []
         quadratic = [*second_gradient(F), *matmul_tn(F, F), *matmul_nt(F, F)] if 1 in self.uses else []
         return first + second + cofactor(F) + turned + quadratic
 
@@ -262,12 +263,6 @@ class GeneralLaw(EnergyLaw):
         space = Lanes(F[0], 0)
         values = self.law.stress(space, F, D, self._numbers(p)[0], self._fibre(space, p))
         return [space.bind(one + 0.0 * F[0]) for one in values]
-
-    @untraced
-    def psi(self, F, p):
-        """Energy density [Pa], 0 at rest."""
-        psi, space = self._energy(F, p, 0)
-        return psi.value - self._at_rest(space, p) + 0.0 * F[0]
 
     @untraced
     def pk1(self, F, p):
