@@ -117,18 +117,8 @@ def _groups(kinds: dict[tuple, np.ndarray], lanes: int, real: Any, strain_real: 
         points_at = sum(n for other, n in n_points.items() if 1 < other < degree)  # order 1 has degree 1 and no table
         offsets = first, last, nodes_at, force_at, matrix_at, points_at
         types = (ti.f64, ti.f64) if rigid else (real, strain_real)
-        groups.append(
-            Group(
-                law_of(laws[law], floor, tuple(ADDITIONS[k] for k in added)),
-                order,
-                n_nodes,
-                n_points[degree],
-                mean,
-                rigid,
-                *offsets,
-                *types,
-            )
-        )
+        law = law_of(laws[law], (volume_floor,) * floor + tuple(ADDITIONS[k] for k in added))
+        groups.append(Group(law, order, n_nodes, n_points[degree], mean, rigid, *offsets, *types))
         nodes_at += len(tets) * n_nodes
         force_at += (last - first) * n_nodes * 3
         matrix_at += (last - first) * MATRIX_BLOCKS[order] * 9
@@ -177,7 +167,7 @@ def law_table(scene: Scene, layout: Layout, by_tet: bool) -> np.ndarray:
             law, tets = LAWS[name], own.tets_of_law(name) if by_tet else np.zeros(1, dtype=np.int64)
             given = (*own.lame, own.dilatation_modulus, own.number("volume_floor"), *map(own.number, law.parameters))
             mu, lam, modulus, floor, *numbers = (np.broadcast_to(one, last - first)[tets] for one in given)
-            of_floor = volume_floor.constants(floor, mu, lam) if own.has_volume_floor else ()
+            of_floor = volume_floor.table(floor, mu, lam) if own.has_volume_floor else ()
             if mean:
                 lam, numbers = lam - modulus, [0.0 * x if one == law.modulus else x for one, x in zip(law.parameters, numbers)]
             along = own.fibres[tets].T if "I4" in law.arguments else ()

@@ -12,6 +12,7 @@ import taichi as ti
 
 from taisoft.backend.runtime import CPU_LANES, compiled_function
 from taisoft.backend.tracing import untraced
+from taisoft.fem.laws.table import table_constants
 from taisoft.fem.math3 import ddot, dot, matmul_tn
 
 FIRST_LANE_MASK = 2**31 - CPU_LANES  # of an index: it shows the compiler that those of the other lanes do not overflow
@@ -56,15 +57,8 @@ def volumes(m: ti.template(), b, real: ti.template()):
 
 @ti.func
 def law_constants(m: ti.template(), g: ti.template(), b, real: ti.template()):
-    """Law constants of the tets of block b of group g [Pa and pure numbers]: their own, or those of their body in every lane."""
-    if ti.static(m.elasticity_by_tet):
-        return [
-            ti.Vector([ti.cast(m.law_constants[b, k, q], real) for q in ti.static(range(m.lanes))])
-            for k in ti.static(range(g.law.N_CONSTANTS))
-        ]
-    else:
-        body = m.block_body[b]
-        return [broadcast(ti.cast(m.law_constants[body, k], real), m.lanes) for k in ti.static(range(g.law.N_CONSTANTS))]
+    """Law constants of the tets of block b of group g, without those of additions."""
+    return table_constants(m, b, 0, g.law.N_CONSTANTS, real)
 
 
 @untraced

@@ -24,7 +24,7 @@ from taisoft.scene.scene import Scene
 class Group:
     """Blocks of one element type and law, and the offsets of their data in the flat arrays."""
 
-    law: Any  # module of taisoft.fem.laws, or VolumeFloor of one
+    law: Any  # of taisoft.fem.laws, or WithAdditions
     order: int
     n_nodes: int  # of an element
     n_points: int

@@ -18,11 +18,11 @@ from weakref import WeakKeyDictionary
 
 import taichi as ti
 
+from taisoft.backend.tracing import untraced
 from taisoft.fem.laws import corotational, st_venant_kirchhoff, stable_neo_hookean
 from taisoft.fem.laws.additions import WithAdditions
 from taisoft.fem.laws.from_energy import EnergyLaw, lanes_of
 from taisoft.fem.laws.projection import dpk1_isotropic, prepare_isotropic
-from taisoft.fem.laws.volume_floor import VolumeFloor
 from taisoft.scene import laws
 from taisoft.scene.law import Law
 
@@ -30,10 +30,9 @@ from taisoft.scene.law import Law
 LAWS = {law.NAME: law for law in (st_venant_kirchhoff, corotational, stable_neo_hookean)}
 
 
-def law_of(name: str, volume_floor: bool, additions: tuple = ()) -> Any:
-    """The law of a name, with a volume floor or without one, and with `additions` (modules, see there)."""
-    law = VolumeFloor(lane_law(name)) if volume_floor else lane_law(name)
-    return WithAdditions(law, additions) if additions else law
+def law_of(name: str, additions: tuple = ()) -> Any:
+    """The law of a name with `additions` (modules, see there)."""
+    return WithAdditions(lane_law(name), additions) if additions else lane_law(name)
 
 
 _made: "WeakKeyDictionary[Law, EnergyLaw]" = WeakKeyDictionary()  # each is compiled once
@@ -47,6 +46,12 @@ def lane_law(name: str) -> Any:
     if law not in _made:
         _made[law] = lanes_of(law)
     return _made[law]
+
+
+@untraced
+def n_constants(law):
+    """Number of the constants p of a law with its additions, without the pressure of mean dilatation."""
+    return law.N_CONSTANTS + (law.n_added if hasattr(law, "n_added") else 0)
 
 
 @ti.func

@@ -2,26 +2,26 @@
 
 An addition is a module with N_CONSTANTS and N_PREPARED, and these lane functions of F and its own constants p:
 `psi(F, p)`, `add_stress(P, F, p)`, `prepared(F, p)` (N_PREPARED entries), `add_differential(T, F, S, D)`,
-`add_block(K, F, S, ga, gb)`, `prepared_projected(F, p)` (N_PROJECTED entries) and `add_projected(T, S, D)`, whose
-differential has no negative eigenvalue. `constants(m, g, b, q, real)` gives the N_CONSTANTS numbers of quadrature point q of
-block b in lanes, and `applies(body)` says on the host whether a body has the addition.
+`add_block(K, F, S, ga, gb)`. `constants(m, g, b, q, real)` gives the N_CONSTANTS numbers of quadrature point q of block b in
+lanes, and `applies(body)` says on the host whether a body has the addition. An isotropic one has
+`add_eigen(A, symmetric, antisymmetric, s, p)`, so that it is projected with the law, exactly. Others have
+`prepared_projected(F, p)` (N_PROJECTED entries) and `add_projected(T, S, D)`, whose differential has no negative eigenvalue.
 The constants of a law with additions are the law's own, those of each addition, and the pressure of mean dilatation, if any.
-The projected differential is the sum of the parts' projections: exact where the additions have no negative eigenvalue.
 """
 
 from dataclasses import dataclass
 from typing import Any
 
 from taisoft.backend.tracing import untraced
-from taisoft.fem.laws.projection import dpk1_isotropic, prepare_isotropic
+from taisoft.fem.laws.projection import clamp_9x9, dpk1_isotropic, prepare_isotropic, upper
 
 
 @dataclass(frozen=True)
 class WithAdditions:
     """A law with additions, with the functions of a law."""
 
-    law: Any  # module of taisoft.fem.laws, or VolumeFloor of one
-    additions: tuple  # modules
+    law: Any
+    additions: tuple  # modules, isotropic ones first
 
     def __getattr__(self, name: str) -> Any:
         if name in ("SOFTENS_BELOW", "POINT_SECONDS", "NAME", "N_CONSTANTS", "dilatation", "dilatation_gradient"):
@@ -44,13 +44,14 @@ class WithAdditions:
         """Each addition with its values, whose number is its attribute `size`, in a list that begins with them."""
         found, at = [], 0
         for one in self.additions:
-            found.append((one, values[at : at + getattr(one, size)]))
-            at += getattr(one, size)
+            n = getattr(one, size, 0)
+            found.append((one, values[at : at + n]))
+            at += n
         return found
 
     def _tail(self, S: list, size: str) -> tuple[list, list[tuple[Any, list]]]:
         """What the law has prepared, and what each addition has."""
-        at = len(S) - sum(getattr(one, size) for one in self.additions)
+        at = len(S) - sum(getattr(one, size, 0) for one in self.additions)
         return S[:at], self._split(S[at:], size)
 
     @untraced
@@ -96,14 +97,35 @@ class WithAdditions:
         return K
 
     @untraced
-    def prepare_projected(self, F, p):
-        """Precompute for `dpk1_projected`: what the law does, then each addition."""
-        own = self._of_law(p)
-        is_isotropic = hasattr(self.law, "hessian_eigen")
-        S = prepare_isotropic(self.law, F, own) if is_isotropic else self.law.prepare_projected(F, own)
+    def hessian_eigen(self, s, p):
+        """Second derivatives of the law and of isotropic additions in the SVD frame [Pa], see `projection`."""
+        modes = self.law.hessian_eigen(s, self._of_law(p))
         for one, constants in self._of_additions(p):
-            S = S + one.prepared_projected(F, constants)
+            modes = one.add_eigen(*modes, s, constants) if hasattr(one, "add_eigen") else modes
+        return modes
+
+    @untraced
+    def prepare_projected(self, F, p):
+        """Precompute for `dpk1_projected`: the law with isotropic additions, then each of the others."""
+        if hasattr(self.law, "hessian_eigen"):
+            S = prepare_isotropic(self, F, p)
+        else:
+            S = clamp_9x9(self._upper(F, p))
+        for one, constants in self._of_additions(p):
+            S = S + (one.prepared_projected(F, constants) if hasattr(one, "add_projected") else [])
         return S
+
+    def _upper(self, F: list, p: list) -> list:
+        """Upper triangle of the second derivative of a law that is not isotropic, with isotropic additions."""
+        H, zero = self.law.prepare(F, self._of_law(p)), 0.0 * F[0]
+        for one, constants in self._of_additions(p):
+            if hasattr(one, "add_eigen"):
+                S = one.prepared(F, constants)
+                for k in range(9):
+                    T = one.add_differential([zero] * 9, F, S, [zero + float(k == i) for i in range(9)])
+                    for i in range(k + 1):
+                        H[upper(i, k)] = H[upper(i, k)] + T[i]
+        return H
 
     @untraced
     def dpk1_projected(self, S, D):
@@ -111,5 +133,5 @@ class WithAdditions:
         own, others = self._tail(S, "N_PROJECTED")
         T = dpk1_isotropic(own, D) if hasattr(self.law, "hessian_eigen") else self.law.dpk1_projected(own, D)
         for one, prepared in others:
-            T = one.add_projected(T, prepared, D)
+            T = one.add_projected(T, prepared, D) if hasattr(one, "add_projected") else T
         return T

@@ -8,8 +8,7 @@ import taichi as ti
 
 from taisoft.backend.runtime import kernel, open_kind, open_runtime
 from taisoft.errors import SceneError
-from taisoft.fem.laws import dpk1_projected, lane_law, law_of, prepare_projected
-from taisoft.fem.laws.volume_floor import constants as floor_constants
+from taisoft.fem.laws import dpk1_projected, lane_law, law_of, n_constants, prepare_projected, volume_floor
 from taisoft.scene.scene import Material
 
 ARRAY = ti.types.ndarray()
@@ -31,7 +30,7 @@ def _store(out: ti.template(), b, A, lanes: ti.template()):
 def _evaluate(law: ti.template(), lanes: ti.template(), F: ARRAY, p: ARRAY, psi: ARRAY, P: ARRAY):
     for b in range(F.shape[0]):
         G = _load(F, b, lanes)
-        c = [ti.Vector([p[k] for q in ti.static(range(lanes))]) for k in ti.static(range(law.N_CONSTANTS))]
+        c = [ti.Vector([p[k] for q in ti.static(range(lanes))]) for k in ti.static(range(n_constants(law)))]
         energy = law.psi(G, c)
         stress = law.pk1(G, c)
         _store(P, b, stress, lanes)
@@ -44,7 +43,7 @@ def _differential(law: ti.template(), projected: ti.template(), lanes: ti.templa
     for b in range(F.shape[0]):
         G = _load(F, b, lanes)
         H = _load(D, b, lanes)
-        c = [ti.Vector([p[k] for q in ti.static(range(lanes))]) for k in ti.static(range(law.N_CONSTANTS))]
+        c = [ti.Vector([p[k] for q in ti.static(range(lanes))]) for k in ti.static(range(n_constants(law)))]
         if ti.static(projected):
             _store(P, b, dpk1_projected(law, prepare_projected(law, G, c), H), lanes)
         else:
@@ -60,10 +59,10 @@ def _checked(law: str, F: np.ndarray, floor: float, fibre: tuple, **numbers: flo
     bad = np.flatnonzero(~np.isfinite(F).all(axis=(1, 2)))
     if len(bad):
         raise SceneError(f"F[{bad[0]}] is not finite")
-    made = law_of(material.law, material.volume_floor > 0.0)
+    made = law_of(material.law, (volume_floor,) if material.volume_floor > 0.0 else ())
     constants = lane_law(law).constants(material.mu, material.lam, *material.parameters.values())
     along = fibre if getattr(lane_law(law), "N_FIBRE", 0) else ()
-    return made, F, np.concatenate([constants, along, floor_constants(floor, material.mu, material.lam)])
+    return made, F, np.concatenate([constants, along, volume_floor.table(floor, material.mu, material.lam)])
 
 
 @contextmanager
@@ -151,7 +150,7 @@ def evaluate_blocks(law: str, F: np.ndarray, **numbers: float) -> np.ndarray:
 def _block(law: ti.template(), a: ti.i32, b: ti.i32, lanes: ti.template(), F: ARRAY, p: ARRAY, P: ARRAY):
     for n in range(F.shape[0]):
         G = _load(F, n, lanes)
-        c = [ti.Vector([p[k] for q in ti.static(range(lanes))]) for k in ti.static(range(law.N_CONSTANTS))]
+        c = [ti.Vector([p[k] for q in ti.static(range(lanes))]) for k in ti.static(range(n_constants(law)))]
         ga = [0.0 * G[k] + ti.cast(a == k, ti.i32) for k in ti.static(range(3))]
         gb = [0.0 * G[k] + ti.cast(b == k, ti.i32) for k in ti.static(range(3))]
         _store(P, n, law.block(G, law.prepare(G, c), ga, gb), lanes)

@@ -1,6 +1,6 @@
-"""A law with a volume floor: it stiffens where a tet is squeezed below a fraction delta of its rest volume.
+"""A volume floor: an addition to a law (see `additions`) that stiffens a tet squeezed below a fraction delta of its rest volume.
 
-psi = psi_law + kappa/3 (d^3 - e^3),   d = max(0, delta - J),   e = max(0, -J),   kappa = (lambda + 2 mu) / delta^2,
+psi = kappa/3 (d^3 - e^3),   d = max(0, delta - J),   e = max(0, -J),   kappa = (lambda + 2 mu) / delta^2,
 twice continuously differentiable in J: nothing from J = delta on, a volumetric stress of lambda + 2 mu at J = 0, and the constant
 stiffness 2 (lambda + 2 mu) / delta below, which e bounds. All laws are finite at J = 0, so large enough pressures turn their tets
 inside out. lambda + 2 mu is the stiffness of a bar that cannot widen, about as much as the laws resist a flat tet.
@@ -8,32 +8,39 @@ The form is taisoft's own: a penalty, not a barrier. Inverted tets are valid and
 Weak: a flat tet whose sides have their lengths at rest vibrates sqrt(1 + 2/delta) times as fast as at rest, see `stability`.
 """
 
-from dataclasses import dataclass
-from typing import Any
-
 import numpy as np
 import taichi as ti
 
 from taisoft.backend.tracing import arithmetic
+from taisoft.fem.laws.table import table_constants
 from taisoft.fem.math3 import cofactor, cofactor_differential, cross, ddot, determinant, transform
 
+N_CONSTANTS, N_PREPARED = 2, 11
 
-def constants(floor: float | np.ndarray, mu: float | np.ndarray, lam: float | np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(delta, kappa [Pa]), which follow a law's own four constants; kappa is 0 where the floor is."""
+
+def table(floor: float | np.ndarray, mu: float | np.ndarray, lam: float | np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(delta, kappa [Pa]), which follow a law's own constants in the model's table; kappa is 0 where the floor is."""
     has = np.asarray(floor) > 0.0
     return np.where(has, floor, 0.0), np.where(has, (lam + 2.0 * mu) / np.where(has, floor, 1.0) ** 2, 0.0)
 
 
+@ti.func
+def constants(m: ti.template(), g: ti.template(), b, q, real: ti.template()):
+    """delta and kappa of the tets of block b."""
+    return table_constants(m, b, g.law.N_CONSTANTS, 2, real)
+
+
 @arithmetic
-def energy(J, p):
+def psi(F, p):
     """kappa/3 (d^3 - e^3) [Pa]. p: (delta, kappa)."""
+    J = determinant(F)
     d, e = ti.max(p[0] - J, 0.0), ti.max(-J, 0.0)
     return p[1] * (d * d * d - e * e * e) / 3.0
 
 
 @arithmetic
 def derivatives(J, p):
-    """First and second derivative of `energy` by J [Pa]."""
+    """First and second derivative of `psi` by J [Pa]."""
     d, e = ti.max(p[0] - J, 0.0), ti.max(-J, 0.0)
     return -p[1] * (d * d - e * e), 2.0 * p[1] * (d - e)
 
@@ -90,80 +97,3 @@ def add_eigen(A, symmetric, antisymmetric, s, p):
         [symmetric[n] - w * remaining[n] for n in ti.static(range(3))],
         [antisymmetric[n] + w * remaining[n] for n in ti.static(range(3))],
     )
-
-
-@dataclass(frozen=True)
-class VolumeFloor:
-    """A law with a volume floor, with the functions of a law; p has the two `constants` after the law's own."""
-
-    law: Any  # module of taisoft.fem.laws
-
-    @property
-    def N_CONSTANTS(self) -> int:
-        """Of the law, and the two of the floor."""
-        return self.law.N_CONSTANTS + 2
-
-    @arithmetic
-    def of_law(self, p):
-        """The law's own constants, with the pressure of mean dilatation if p has it."""
-        return p[: self.law.N_CONSTANTS] + p[self.N_CONSTANTS :]
-
-    @arithmetic
-    def of_floor(self, p):
-        """(delta, kappa)."""
-        return p[self.law.N_CONSTANTS : self.N_CONSTANTS]
-
-    @property
-    def SOFTENS_BELOW(self) -> float:
-        """Of the law."""
-        return self.law.SOFTENS_BELOW
-
-    @property
-    def POINT_SECONDS(self) -> float:
-        """Of the law: the term adds little."""
-        return self.law.POINT_SECONDS
-
-    @ti.func
-    def dilatation(self, F):
-        """theta of the law."""
-        return self.law.dilatation(F)
-
-    @ti.func
-    def dilatation_gradient(self, F):
-        """Derivative of `dilatation` by F."""
-        return self.law.dilatation_gradient(F)
-
-    @ti.func
-    def psi(self, F, p):
-        """Energy density [Pa], 0 at rest."""
-        return self.law.psi(F, self.of_law(p)) + energy(determinant(F), self.of_floor(p))
-
-    @ti.func
-    def pk1(self, F, p):
-        """First Piola-Kirchhoff stress [Pa]; any F is valid."""
-        P = self.law.pk1(F, self.of_law(p))
-        return add_stress(P, F, self.of_floor(p))
-
-    @ti.func
-    def prepare(self, F, p):
-        """Precompute for `dpk1` and `block`: what the law does, then `prepared`."""
-        S = self.law.prepare(F, self.of_law(p))
-        return S + prepared(F, self.of_floor(p))
-
-    @ti.func
-    def dpk1(self, F, S, D):
-        """Differential of the stress along D [Pa], with S = prepare(F, p)."""
-        T = self.law.dpk1(F, S, D)
-        return add_differential(T, F, S, D)
-
-    @ti.func
-    def block(self, F, S, ga, gb):
-        """Differential of (P g_b)_i along the displacement gradient e_k (x) g_a: nine entries (i, k) [Pa/m^2]."""
-        K = self.law.block(F, S, ga, gb)
-        return add_block(K, F, S, ga, gb)
-
-    @ti.func
-    def hessian_eigen(self, s, p):
-        """Second derivatives in the SVD frame [Pa], over the stretches s: see `laws`."""
-        A, symmetric, antisymmetric = self.law.hessian_eigen(s, self.of_law(p))
-        return add_eigen(A, symmetric, antisymmetric, s, self.of_floor(p))
