@@ -105,10 +105,11 @@ def set_gravity(self: "Simulator", gravity) -> None:
 
 
 def set_material(self: "Simulator", body: str, region: int | str | None = None, **numbers) -> None:
-    """Change numbers of a body's material (young, poisson, density, damping, those of fibres); the law stays.
+    """Change numbers of a body's material (young and poisson or parameters of the law, density, damping, fibres); the law stays.
 
-    Without a region they hold for all tets; young, poisson and density may also be (m,), young and poisson only if they were
-    given by tet or by region when the Simulator was made. With a region, given by name or id, the three change there only.
+    Without a region they hold for all tets; those of the law and the density may also be (m,), the former only if they were
+    given by tet or by region when the Simulator was made. With a region, given by name or id, they change there only; damping
+    cannot.
     Copies arrays and recomputes the rounding floor of the residual and the stable dt; compiles nothing.
     """
     dynamics, changed = self._open(), self.scene.bodies[body_index(self, body)]

@@ -229,14 +229,13 @@ class Composition:
             has = np.array([not self._is_foreign(name, material) for material in self.materials.values()])[self._row]
             value = np.where(has, value, np.asarray(value)[has][0])
         array = checks.array(value, what, ((self.mesh.n_tets,),))
-        own = next((LAWS[law].parameters[name] for law in self.laws if name in LAWS[law].parameters), None)
-        if own is not None:
-            own.check_all(array, what)
-        elif name == "poisson":
+        if name == "poisson":
             _check_tets(what, array, ~((array > -1.0) & (array < 0.5)), "lie in the open interval (-1, 0.5)")
-        else:
+        elif name in ("young", "density"):
             unit = "Pa" if name == "young" else "kg/m^3"
             _check_tets(what, array, array < checks.SMALLEST, f"be greater than 0 {unit}")
+        for law in (LAWS[one] for one in self.laws if name in LAWS[one].parameters):
+            law.parameters[name].check_all(array, self.tets_of_law(law.name), what)
         array.setflags(write=False)
         return array
 
@@ -261,7 +260,9 @@ class Composition:
         return made
 
 
-def compose(what: str, mesh: TetMesh, material: Material | Mapping, fibres=None, **numbers) -> Composition:
+def compose(
+    what: str, mesh: TetMesh, material: Material | Mapping, fibres=None, parameters: Mapping | None = None, **numbers
+) -> Composition:
     """Return the composition of a body. what: start of messages; the others: of `Scene.add_body`. Raises SceneError."""
     if isinstance(material, Material):
         made = Composition(mesh, {None: material}, {})
@@ -270,6 +271,10 @@ def compose(what: str, mesh: TetMesh, material: Material | Mapping, fibres=None,
     else:
         kinds = "a Material, or a dict that gives each region one"
         raise SceneError(f"{what}: material must be {kinds}, not {type(material).__name__}")
+    for one in made.materials.values():
+        one.check_law(what)
+    for name in parameters or {}:
+        checks.index(name, made.parameters, f"{what}: no parameter of its laws")
     if fibres is not None or (mesh.fibres is not None and made.has_fibres):
         if not made.has_fibres:
             raise SceneError(
@@ -277,7 +282,7 @@ def compose(what: str, mesh: TetMesh, material: Material | Mapping, fibres=None,
             )
         made = replace(made, fibres=directions(what, mesh, mesh.fibres if fibres is None else fibres))
     made.check_fibres(what)
-    return made.changed(what, {name: value for name, value in numbers.items() if value is not None})
+    return made.changed(what, {name: value for name, value in numbers.items() if value is not None} | dict(parameters or {}))
 
 
 def _by_region(what: str, mesh: TetMesh, materials: Mapping) -> dict[int, Material]:

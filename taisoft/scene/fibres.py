@@ -14,10 +14,9 @@ def directions(what: str, mesh: TetMesh, fibres) -> np.ndarray:
             fibres = fibres(mesh.vertices[mesh.tets].mean(axis=1))
         except Exception as error:  # a user's function may raise anything
             raise SceneError(f"{what}: the function of fibres failed: {reason(error)}") from error
-    given = np.asarray(fibres)
-    if given.dtype.kind in "fiu" and given.shape == (mesh.n_tets, 3) and not (finite := np.isfinite(given).all(axis=1)).all():
-        raise SceneError(f"{what}: fibres: the direction of tet {int(np.argmin(finite))} is not finite")
     given = checks.array(fibres, f"{what}: fibres", ((3,), (mesh.n_tets, 3)))
+    largest = np.abs(given).max(axis=-1, keepdims=True)
+    given = np.where((largest > 0.0) & (largest < 1e-100), given / np.where(largest > 0.0, largest, 1.0), given)  # squares vanish
     length = np.linalg.norm(given, axis=-1, keepdims=True)
     is_given = (length == 0.0) | (np.abs(length - 1.0) < 1e-15)  # so that unit vectors from files keep their bits
     unit = np.array(np.broadcast_to(given / np.where(is_given, 1.0, length), (mesh.n_tets, 3)))

@@ -185,7 +185,8 @@ class Jet:
     def __lt__(self, other):
         return bool(self)
 
-    __le__ = __gt__ = __ge__ = __lt__
+    __le__ = __gt__ = __ge__ = __eq__ = __ne__ = __lt__
+    __hash__ = None
 
 
 # NumPy's functions that energies may use

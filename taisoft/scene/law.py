@@ -35,18 +35,24 @@ class Parameter:
     minimum: float | None = None
     maximum: float | None = None
 
+    @property
+    def sample(self) -> float:
+        """The default, or a number in the range: 1 if that is in it."""
+        low, high = self.minimum if self.above is None else 2.0 * abs(self.above), self.maximum
+        return self.default if self.default is not None else float(np.clip(1.0, low, high))
+
     def checked(self, value, what: str) -> float:
         """Return a value in the range. Raises SceneError."""
         return checks.number(value, what, above=self.above, minimum=self.minimum, maximum=self.maximum, unit=self.unit)
 
-    def check_all(self, values: np.ndarray, what: str) -> None:
-        """Raise SceneError for the first of the values (m,) of tets that is not in the range."""
-        low = -np.inf if self.minimum is None else self.minimum
-        bad = (values < low) | (values > (np.inf if self.maximum is None else self.maximum))
-        bad |= values <= (-np.inf if self.above is None else self.above)
+    def check_all(self, values: np.ndarray, tets: np.ndarray, what: str) -> None:
+        """Raise SceneError for the first of the tets (k,) whose value, of (m,), is not in the range."""
+        low, high = -np.inf if self.minimum is None else self.minimum, np.inf if self.maximum is None else self.maximum
+        own = values[tets]
+        bad = (own < low) | (own > high) | (own <= (-np.inf if self.above is None else self.above))
         if bad.any():
-            tet = int(np.argmax(bad))
-            self.checked(values[tet], f"{what} of tet {tet}")
+            tet = int(tets[np.argmax(bad)])
+            self.checked(float(values[tet]), f"{what} of tet {tet}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,6 +122,10 @@ class Law:
         """Whether it is one of those written by hand in taisoft.fem.laws."""
         return self.psi is None and self.functions is None
 
+    def numbers_of(self, material: Any) -> dict[str, float]:
+        """Return the numbers of a `Material` by which psi is evaluated: Lamé's, and the parameters."""
+        return {"mu": material.mu, "lam": material.lam, **material.parameters}
+
     def fingerprint(self) -> list:
         """Return values by which two laws of a name differ: numbers of psi and the stress, rounded, at two F."""
         if self.psi is None:
@@ -140,7 +150,7 @@ class Law:
             raise SceneError(f"law {self.name!r}: psi must return a number, not {type(total).__name__}")
         total = total if isinstance(total, Jet) else space.fixed(float(total))
         if self.dilatation is not None:
-            theta = self.dilatation(variables["J"])
+            theta = self.volume_strain(variables["J"])
             total = total + 0.5 * known[self.modulus] * theta * theta
             total = total if pressure is None else total + space.fixed(pressure) * theta
         return total
@@ -151,6 +161,13 @@ class Law:
         except Exception as error:  # a user's function may raise anything
             hint = "; det F is the variable J" if "'det'" in str(error) else ""
             raise SceneError(f"law {self.name!r}: its function failed: {reason(error)}{hint}") from error
+
+    def volume_strain(self, J: Jet) -> Jet:
+        """Return theta of J."""
+        try:
+            return self.dilatation(J) + 0.0
+        except Exception as error:  # a user's function may raise anything
+            raise SceneError(f"law {self.name!r}: its dilatation failed: {reason(error)}") from error
 
     def stress(self, space: Space, F: list, D: list | None, numbers: dict[str, Any], fibre: list) -> list:
         """Return the given P, or its differential along D if that is not None: nine values. F, D: nine values."""
@@ -165,7 +182,7 @@ class Law:
 
     def sample(self) -> dict[str, float]:
         """Return numbers for checks: each parameter's default, or 1 if that is in its range, and a Poisson's ratio of 0.3."""
-        given = {name: 1.0 if one.default is None else one.default for name, one in self.parameters.items()}
+        given = {name: one.sample for name, one in self.parameters.items()}
         return given | (dict(zip(HOOKE, (1.0 / 2.6, 0.3 / 0.52))) if not self.parameters else {})
 
     def rest_tangent(self, numbers: dict[str, Any], fibres: np.ndarray = FIBRE) -> np.ndarray:
@@ -215,20 +232,21 @@ def jets_of_F(space: Space, F: list) -> np.ndarray:
 def stretch_modes(space: Space, psi: Jet, s: list) -> tuple[list, list, list]:
     """Return the second derivative in the frame of F's SVD, see `fem.laws.projection`: the block A and the eigenvalues.
 
-    psi: of the principal stretches s. The eigenvalue (psi_i - psi_j) / (s_i - s_j) of a symmetric mode is, where two stretches
-    nearly coincide, (psi_ii + psi_jj) / 2 - psi_ij, which errs by the square of their difference.
+    psi: of the principal stretches s, largest first. The eigenvalue (psi_i - psi_j) / (s_i - s_j) of a symmetric mode is, where
+    two stretches nearly coincide, (psi_ii + psi_jj) / 2 - psi_ij, which errs by the square of their difference; that of an
+    antisymmetric one, with plus signs, where they nearly cancel.
     """
     zero = space.bind(0.0 * (s[0] + psi.value))
     first = [space.bind(zero + psi.first.get(k, 0.0)) for k in range(3)]
     A = [space.bind(zero + psi.second.get((min(i, j), max(i, j)), 0.0)) for i in range(3) for j in range(3)]
     symmetric, antisymmetric = [], []
+    small = space.bind(space.eps ** (1.0 / 3.0) * abs(s[0]) + 1e-30)
     for i, j in PAIRS:
-        difference, total = s[i] - s[j], s[i] + s[j]
-        close = space.bind(abs(difference) <= space.eps ** (1.0 / 3.0) * abs(total))
-        quotient = (first[i] - first[j]) / space.select(close, 1.0 + zero, difference)
-        symmetric.append(space.select(close, 0.5 * (A[4 * i] + A[4 * j]) - A[3 * i + j], quotient))
-        tiny = 1e-12 * abs(s[0]) + 1e-30
-        antisymmetric.append((first[i] + first[j]) / space.select(abs(total) > tiny, total, tiny))
+        for sign, modes in ((-1.0, symmetric), (1.0, antisymmetric)):
+            width = s[i] + sign * s[j]
+            close = space.bind(abs(width) <= small)
+            quotient = (first[i] + sign * first[j]) / space.select(close, 1.0 + zero, width)
+            modes.append(space.select(close, 0.5 * (A[4 * i] + A[4 * j]) + sign * A[3 * i + j], quotient))
     return A, symmetric, antisymmetric
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from taisoft.attributes import guarded_record
+from taisoft.attributes import FrozenDict, guarded_record
 from taisoft.errors import SceneError, value_text
 from taisoft.scene import checks
 from taisoft.scene.law import Law
@@ -40,13 +40,16 @@ def _takes_parameters(cls: type) -> type:
 
 def _with_moduli(law: Law, named: dict, own: dict) -> dict:
     """Return the fields of a material whose law has parameters. named: fields given; own: parameters given by their names."""
-    before = dict(named.pop("parameters", None) or {})
+    before = named.pop("parameters", None) or {}
+    if not isinstance(before, Mapping):
+        raise SceneError(f"material: parameters must be a dict, not {value_text(before)}")
     # `dataclasses.replace` gives all parameters, and the moduli that followed from them
     old = dict(zip(MODULI, law.moduli(before))) if before.keys() == law.parameters.keys() else {}
     for name in MODULI:
-        if name in named and named[name] != old.get(name):
+        if name in named and (name not in old or named[name] != old[name]):
             raise SceneError(f"material: {name} follows from the numbers of law {law.name}: {', '.join(law.parameters)}")
-    parameters = law.checked({**before, **own}, "material: ")
+    parameters = FrozenDict(law.checked({**before, **own}, "material: "))
+    parameters._refusal = SceneError("material: parameters cannot change: make another one by dataclasses.replace")
     return {**named, "parameters": parameters, **dict(zip(MODULI, law.moduli(parameters)))}
 
 
@@ -101,6 +104,15 @@ class Material:
             return self.__dict__["parameters"][name]
         except KeyError:
             raise AttributeError(f"material has no attribute {name!r}") from None
+
+    def check_law(self, what: str) -> None:
+        """Raise SceneError if the law is not registered, or has been anew since. what: start of messages."""
+        law = LAWS.get(self.law)
+        if law is None:
+            raise SceneError(f"{what}: law {self.law!r} is not registered in this process: call ts.register_law before")
+        is_known = law.parameters.keys() == self.parameters.keys()
+        if not is_known or (law.parameters and law.moduli(self.parameters) != (self.young, self.poisson)):
+            raise SceneError(f"{what}: law {self.law!r} has been registered anew since its material was made: make that anew")
 
     @property
     def mu(self) -> float:

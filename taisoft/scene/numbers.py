@@ -88,9 +88,10 @@ def _of_material(body: Body) -> Iterator[Entry]:
         owner = f"{body.name}.{body.mesh.region_names.get(region, region)}"
         for name in (*LAWS[material.law].numbers, "density", "volume_floor"):
             yield f"{owner}.{name}", getattr(material, name), partial(_set_material, body, name, region)
-    own = composition.parameters
-    for name in (*own, *(name for name in NUMBERS if not (own and name in MODULI))):
-        by_region = {getattr(one, name) for one in composition.materials.values() if name not in own or name in one.parameters}
+    own = composition.tet_numbers  # young and poisson, parameters of laws, density
+    for name in (*own, *(name for name in NUMBERS if name not in (*own, *MODULI))):
+        has = [one for one in composition.materials.values() if name not in own or name in (*LAWS[one.law].numbers, "density")]
+        by_region = {getattr(one, name) for one in has}
         value = composition.by_tet.get(name, by_region.pop() if len(by_region) == 1 else None)
         yield f"{body.name}.{name}", value, partial(_set_material, body, name, None)
 

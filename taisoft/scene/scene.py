@@ -245,7 +245,7 @@ class Scene(Guarded):
         """
         self._check_open("add_body")
         name = self._free_name(name, "body")
-        numbers = {"young": young, "poisson": poisson, "density": density, **(parameters or {})}
+        numbers = {"young": young, "poisson": poisson, "density": density, "parameters": parameters}
         body = Body(name, mesh, material, position, velocity, order, quadrature_degree, collision, dilatation, fibres, **numbers)
         list.append(self.bodies, body)
         body.warn_locking(stacklevel=2)

@@ -311,7 +311,7 @@ WITHOUT = np.where(np.arange(MESH.n_tets)[:, None] == 2, 0.0, TILTED)
         ({"fibres": None}, "body 'muscle': its material has fibres, so it needs their directions"),
         ({"material": rubber()}, "body 'muscle': it has fibres, but fibre_stiffness, .* of its material are 0"),
         ({"fibres": WITHOUT}, "body 'muscle': fibres: the direction of tet 2 is zero"),
-        ({"fibres": np.where(WITHOUT == 0.0, np.nan, 1.0)}, "fibres: the direction of tet 0 is not finite"),
+        ({"fibres": np.where(WITHOUT == 0.0, np.nan, 1.0)}, "fibres: entry .0, 2. is nan, not finite"),
         ({"fibres": np.ones((4, 3))}, r"fibres must have shape \(3,\) or \(10, 3\), not \(4, 3\)"),
         ({"fibres": lambda x: x / 0}, None),
         ({"fibres": lambda x: y}, "the function of fibres failed"),  # noqa: F821

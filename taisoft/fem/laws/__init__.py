@@ -19,6 +19,7 @@ from weakref import WeakKeyDictionary
 import taichi as ti
 
 from taisoft.backend.tracing import untraced
+from taisoft.errors import SceneError
 from taisoft.fem.laws import corotational, st_venant_kirchhoff, stable_neo_hookean
 from taisoft.fem.laws.additions import WithAdditions
 from taisoft.fem.laws.from_energy import EnergyLaw, lanes_of
@@ -40,7 +41,9 @@ _made: "WeakKeyDictionary[Law, EnergyLaw]" = WeakKeyDictionary()  # each is comp
 
 def lane_law(name: str) -> Any:
     """The law of a name in lanes."""
-    law = laws.LAWS[name]
+    law = laws.LAWS.get(name)
+    if law is None:
+        raise SceneError(f"law {name!r} is not registered in this process: call ts.register_law before")
     if law.psi is None:
         return law.functions or LAWS[name]
     if law not in _made:

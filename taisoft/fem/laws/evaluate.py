@@ -9,6 +9,7 @@ import taichi as ti
 from taisoft.backend.runtime import kernel, open_kind, open_runtime
 from taisoft.errors import SceneError
 from taisoft.fem.laws import dpk1_projected, lane_law, law_of, n_constants, prepare_projected, volume_floor
+from taisoft.scene import checks
 from taisoft.scene.scene import Material
 
 ARRAY = ti.types.ndarray()
@@ -61,7 +62,10 @@ def _checked(law: str, F: np.ndarray, floor: float, fibre: tuple, **numbers: flo
         raise SceneError(f"F[{bad[0]}] is not finite")
     made = law_of(material.law, (volume_floor,) if material.volume_floor > 0.0 else ())
     constants = lane_law(law).constants(material.mu, material.lam, *material.parameters.values())
-    along = fibre if getattr(lane_law(law), "N_FIBRE", 0) else ()
+    length = float(np.linalg.norm(fibre := checks.array(fibre, "evaluate_law: fibre", ((3,),))))
+    if length == 0.0:
+        raise SceneError("evaluate_law: fibre must not be zero")
+    along = fibre / length if getattr(lane_law(law), "N_FIBRE", 0) else ()
     return made, F, np.concatenate([constants, along, volume_floor.table(floor, material.mu, material.lam)])
 
 
@@ -154,3 +158,26 @@ def _block(law: ti.template(), a: ti.i32, b: ti.i32, lanes: ti.template(), F: AR
         ga = [0.0 * G[k] + ti.cast(a == k, ti.i32) for k in ti.static(range(3))]
         gb = [0.0 * G[k] + ti.cast(b == k, ti.i32) for k in ti.static(range(3))]
         _store(P, n, law.block(G, law.prepare(G, c), ga, gb), lanes)
+
+
+def evaluate_dilatation(law: str, F: np.ndarray, **numbers: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """theta (k,) of mean dilatation, its derivative by F (k,3,3), and what a pressure of 1 Pa adds to the stress (k,3,3)."""
+    law_module, F, p = _checked(law, F, 0.0, (1.0, 0.0, 0.0), **numbers)
+    with double_precision() as lanes:
+        lane_F = _to_lanes(F, lanes)
+        theta, G, P = np.empty((len(lane_F), lanes)), np.empty_like(lane_F), np.empty_like(lane_F)
+        _dilatation(law_module, lanes, lane_F, p, theta, G, P)
+    return theta.reshape(-1)[: len(F)].copy(), _from_lanes(G, len(F)).copy(), _from_lanes(P, len(F)).copy()
+
+
+@kernel
+def _dilatation(law: ti.template(), lanes: ti.template(), F: ARRAY, p: ARRAY, theta: ARRAY, G: ARRAY, P: ARRAY):
+    for n in range(F.shape[0]):
+        A = _load(F, n, lanes)
+        c = [ti.Vector([p[k] for q in ti.static(range(lanes))]) for k in ti.static(range(n_constants(law)))]
+        with_pressure, without = law.pk1(A, c + [1.0 + 0.0 * A[0]]), law.pk1(A, c)
+        _store(P, n, [with_pressure[k] - without[k] for k in ti.static(range(9))], lanes)
+        _store(G, n, law.dilatation_gradient(A), lanes)
+        value = law.dilatation(A)
+        for q in ti.static(range(lanes)):
+            theta[n, q] = value[q]

@@ -86,7 +86,7 @@ class EnergyLaw:
 
     def _volume(self, F: list, order: int) -> Jet:
         space = Lanes(F[0], order)
-        return self.law.dilatation(space.variable(space.bind(dot(F, cofactor(F))), 0))
+        return self.law.volume_strain(space.variable(space.bind(dot(F, cofactor(F))), 0))
 
     @untraced
     def psi(self, F, p):

@@ -12,11 +12,13 @@ from typing import Any
 
 import numpy as np
 
-from taisoft.errors import SceneError
-from taisoft.fem.laws.evaluate import double_precision, evaluate_blocks, evaluate_differential, evaluate_law
+from taisoft.backend.runtime import open_kind
+from taisoft.errors import SceneError, value_text
+from taisoft.fem.laws import lane_law
+from taisoft.fem.laws.evaluate import double_precision, evaluate_blocks, evaluate_differential, evaluate_dilatation, evaluate_law
 from taisoft.scene import checks
 from taisoft.scene.jets import Space
-from taisoft.scene.law import HOOKE, VARIABLES, Law, Parameter, arguments_of, evaluate
+from taisoft.scene.law import HOOKE, VARIABLES, Law, Parameter, arguments_of, evaluate, of_stretches
 from taisoft.scene.laws import LAWS, SHIPPED
 from taisoft.scene.material import Material
 
@@ -24,6 +26,8 @@ H = 1e-5  # step of central differences of F, whose error is its square
 ALLOWED = 1e-6  # error of a derivative relative to the stiffness, which is above that of the differences
 AT_REST = 1e-8  # stress at rest relative to the stiffness
 IN_F32 = 1e-3  # error of a stress in f32 relative to the stiffness: a strain of that size
+# names of numbers and of arguments beside which a parameter stands
+TAKEN = {*VARIABLES, *HOOKE, *inspect.signature(Material).parameters, "D", "self", "body", "region", "activation", "fibre"}
 LANE_FUNCTIONS = ("N_CONSTANTS", "SOFTENS_BELOW", "POINT_SECONDS", "constants", "psi", "pk1", "prepare", "dpk1", "block")
 
 
@@ -68,22 +72,28 @@ def register_law(
     if name in [law.name for law in SHIPPED]:
         raise SceneError(f"{what}: the name is that of a law of the package")
     if functions is not None:
-        missing = [one for one in LANE_FUNCTIONS if not hasattr(functions, one)]
-        if missing or psi is not None:
-            raise SceneError(f"{what}: its lane functions lack {missing[0]}" if missing else f"{what}: give psi or functions")
+        projected = "prepare_projected" if hasattr(functions, "prepare_projected") else "hessian_eigen"
+        missing = [one for one in (*LANE_FUNCTIONS, projected) if not hasattr(functions, one)]
+        if missing or any(one is not None for one in (psi, parameters, pk1, dpk1, dilatation, modulus)):
+            raise SceneError(f"{what}: its lane functions lack {missing[0]}" if missing else f"{what}: functions are given alone")
         law = Law(name, functions=functions)
     else:
+        if not isinstance(parameters or {}, Mapping):
+            raise SceneError(f"{what}: parameters must be a dict of units or Parameters, not {value_text(parameters)}")
         made = {key: one if isinstance(one, Parameter) else Parameter(one) for key, one in (parameters or {}).items()}
         law = Law(name, psi, made, dilatation, modulus or "", pk1=pk1, dpk1=dpk1)
         _check_arguments(law)
     before = LAWS.get(name)
+    if before is not None and open_kind() is not None:
+        raise SceneError(f"{what}: it is registered already, and a simulator that may use it is open: close that first")
     LAWS[name] = law
     try:
         found = check_law(name)
     except BaseException as error:
-        LAWS.pop(name)
-        if before is not None:
-            LAWS[name] = before
+        if before is None:
+            del LAWS[name]
+        else:
+            LAWS[name] = before  # at its place among the others
         free = [f"{key} = 1" for key, one in law.parameters.items() if one.default is None]
         if isinstance(error, SceneError) and "unstable at rest" in str(error) and free:
             rule = f"checked with {', '.join(free)}: give a Parameter a default to check the law with another"
@@ -98,13 +108,19 @@ def register_law(
 def _check_arguments(law: Law) -> None:
     """Raise SceneError if arguments of psi, pk1 and dpk1 are not known, or parameters not used."""
     what = f"law {law.name!r}"
-    if not callable(law.psi):
-        raise SceneError(f"{what}: psi must be a function, not {type(law.psi).__name__}")
+    for name, function in (("psi", law.psi), ("pk1", law.pk1), ("dpk1", law.dpk1), ("dilatation", law.dilatation)):
+        try:
+            _ = None if function is None and name != "psi" else arguments_of(function)
+        except (TypeError, ValueError):
+            raise SceneError(f"{what}: {name} must be a function with named arguments, not {value_text(function)}") from None
     if (law.pk1 is None) != (law.dpk1 is None):
         raise SceneError(f"{what}: pk1 and dpk1 must be given together")
-    taken = {*VARIABLES, *HOOKE, *inspect.signature(Material).parameters}
-    for name in law.parameters:
-        if name in taken:
+    for name, one in law.parameters.items():
+        if not isinstance(name, str) or not name.isidentifier():
+            raise SceneError(f"{what}: a parameter's name must be an identifier, not {name!r}")
+        if one.default is not None:
+            one.checked(one.default, f"{what}: the default of {name}")
+        if name in TAKEN or hasattr(Material, name):
             raise SceneError(f"{what}: a parameter cannot be called {name}, which has a meaning already")
     numbers = tuple(law.parameters) or HOOKE
     for function, extra in ((law.psi, ()), (law.pk1, ()), (law.dpk1, ("D",))):
@@ -117,6 +133,8 @@ def _check_arguments(law: Law) -> None:
         raise SceneError(f"{what}: psi depends on none of {', '.join(VARIABLES)}")
     if {"stretches", "trS"} & set(law.variables) and {"F", "I4"} & set(law.variables):
         raise SceneError(f"{what}: psi of principal stretches cannot depend on F or I4 as well")
+    if {"stretches", "trS"} & set(law.variables) and law.pk1 is not None:
+        raise SceneError(f"{what}: pk1 and dpk1 are functions of F and invariants, and psi beside them, too")
     if law.pk1 is not None and law.dilatation is not None:
         raise SceneError(f"{what}: pk1 and dpk1 are the whole stress, which leaves nothing to a dilatation")
     if (law.dilatation is not None or law.modulus) and law.modulus not in numbers or bool(law.modulus) != bool(law.dilatation):
@@ -154,21 +172,26 @@ def _check(law: Law, numbers: dict[str, float]) -> LawCheck:
     if not at_rest <= AT_REST * scale:
         rule = f"where shear is resisted by {material.mu:.3g} Pa: a term such as -c (J - 1) balances it"
         raise SceneError(f"{what}: it has a stress of {at_rest:.3g} Pa at rest, F = I, {rule}")
-    (up, P_up, _), (down, P_down, _) = values(F + H * D), values(F - H * D)
     allowed = ALLOWED * max(scale, np.abs(tangent).max())
-    _compare(what, "its stress is not the derivative of psi", F, np.sum(P * D, axis=(1, 2)), (up - down) / (2.0 * H), allowed)
-    dP = np.einsum("epq,eq->ep", tangent, D.reshape(-1, 9))
-    _compare(what, "its tangent is not the derivative of its stress", F, dP, (P_up - P_down).reshape(-1, 9) / (2.0 * H), allowed)
-    _compare(what, "its stress is no gradient: its tangent is not symmetric", F, tangent, tangent.swapaxes(1, 2), allowed)
+    _check_derivatives(what, values, F, D, allowed)
+    if law.pk1 is not None:
+        large = np.concatenate([1.5 * F - 0.5 * np.eye(3), F * [1.0, 1.0, -1.0]])
+        finite = np.isfinite(sum(part.reshape(len(large), -1).sum(axis=1) for part in values(large)))
+        _check_derivatives(what, values, large[finite], np.tile(D, (2, 1, 1))[finite], 10.0 * allowed)
     if law.psi is None:
         _check_lanes(what, name, F, used, tangent, allowed)
+        if hasattr(lane_law(name), "dilatation"):
+            _check_dilatation(what, name, F, D, used)
     _compare(what, "psi changes with a rotation of space: it is not objective", F, values(Q @ F)[0], psi, ALLOWED * scale)
     turned = values(F @ W)[0]
     if law.is_isotropic:
         _compare(what, "psi changes with a rotation of the material: it is not isotropic", F, turned, psi, ALLOWED * scale)
+    if "stretches" in law.variables:
+        _check_order(what, law, law.numbers_of(material), ALLOWED * scale)
     _check_rest(what, law, material, values(rest)[2][0])
     _check_volume(what, law)
-    small = _in_f32(law, F, used) if law.psi is not None else P
+    numbers = {name: np.float32(value) for name, value in law.numbers_of(material).items()}
+    small = evaluate(law, F.astype(np.float32), numbers)[1] if law.psi is not None else P
     error = np.abs(small - P).max(axis=(1, 2)) / scale
     _refuse(what, "in f32 its stress is not finite or loses more than three digits", F, ~(error <= IN_F32))
     inverted = np.concatenate([F * [1.0, 1.0, -1.0], np.zeros((1, 3, 3)), np.diag([2.0, 0.5, 0.0])[None]])
@@ -178,6 +201,14 @@ def _check(law: Law, numbers: dict[str, float]) -> LawCheck:
     )
 
 
+def _check_derivatives(what: str, values: Callable, F: np.ndarray, D: np.ndarray, allowed: float) -> None:
+    """Compare the stress with differences of psi along D, and the tangent with those of the stress."""
+    (_, P, tangent), (up, P_up, _), (down, P_down, _) = values(F), values(F + H * D), values(F - H * D)
+    _compare(what, "its stress is not the derivative of psi", F, np.sum(P * D, axis=(1, 2)), (up - down) / (2.0 * H), allowed)
+    dP = np.einsum("epq,eq->ep", tangent, D.reshape(-1, 9))
+    _compare(what, "its tangent is not the derivative of its stress", F, dP, (P_up - P_down).reshape(-1, 9) / (2.0 * H), allowed)
+
+
 def _sample(law: Law) -> dict[str, float]:
     return {name: value for name, value in law.sample().items() if name not in HOOKE} or {"young": 1.0, "poisson": 0.3}
 
@@ -185,7 +216,7 @@ def _sample(law: Law) -> dict[str, float]:
 def _evaluator(law: Law, material: Material) -> Callable[[np.ndarray], tuple[np.ndarray, ...]]:
     """Return F (k,3,3) -> psi (k,) from rest, P (k,3,3), tangent (k,9,9)."""
     if law.psi is not None:
-        numbers = {"mu": material.mu, "lam": material.lam, **material.parameters}
+        numbers = law.numbers_of(material)
 
         def values(F: np.ndarray) -> tuple[np.ndarray, ...]:
             psi, P, tangent = evaluate(law, F, numbers)
@@ -219,6 +250,17 @@ def _check_lanes(what: str, name: str, F: np.ndarray, used: dict, tangent: np.nd
     _compare(what, wrong, large, _columns(name, large, used, True), clamped, allowed)
 
 
+def _check_dilatation(what: str, name: str, F: np.ndarray, D: np.ndarray, used: dict) -> None:
+    """Compare the parts of mean dilatation of a law that is written by hand with each other."""
+    n, at = len(F), np.concatenate([F, F + H * D, F - H * D, np.eye(3)[None]])
+    theta, G, pressed = evaluate_dilatation(name, at, **used)
+    slopes, along = (theta[n : 2 * n] - theta[2 * n : -1]) / (2.0 * H), np.sum(G[:n] * D, axis=(1, 2))
+    _compare(what, "its dilatation_gradient is not that of its dilatation", F, along, slopes, ALLOWED)
+    _compare(what, "a pressure does not add dilatation_gradient to its stress", F, pressed[:n], G[:n], ALLOWED)
+    _compare(what, "its dilatation has another slope than 1 at F = I", at[-1:], G[-1:], at[-1:], ALLOWED)
+    _compare(what, "its dilatation is not 0 at F = I", at[-1:], theta[-1:], 0.0 * theta[-1:], ALLOWED)
+
+
 def _check_rest(what: str, law: Law, material: Material, tangent: np.ndarray) -> None:
     """Raise SceneError if a law is unstable at rest, or has other moduli there than the numbers it takes."""
     symmetric = 0.5 * (np.eye(9) + np.eye(9).reshape(3, 3, 9).swapaxes(0, 1).reshape(9, 9))
@@ -234,19 +276,22 @@ def _check_rest(what: str, law: Law, material: Material, tangent: np.ndarray) ->
                 raise SceneError(f"{what}: its {symbol} at rest is {found / asked:.6g} times that of young and poisson: {rule}")
 
 
+def _check_order(what: str, law: Law, numbers: dict[str, float], allowed: float) -> None:
+    """Raise SceneError if psi depends on the order of the principal stretches."""
+    space, s = Space(0), np.random.default_rng(1).uniform(0.8, 1.2, (3, 20))
+    energy = of_stretches(law, space, numbers)
+    one, other = (energy([space.fixed(s[k]) for k in order]).value * np.ones(20) for order in ((0, 1, 2), (1, 2, 0)))
+    F = s.T[:, :, None] * np.eye(3)
+    _compare(what, "psi depends on the order of the stretches: it is not isotropic", F, other, one, allowed)
+
+
 def _check_volume(what: str, law: Law) -> None:
     """Raise SceneError if a dilatation is not a volume strain."""
     if law.dilatation is not None:
-        theta = law.dilatation(Space().variable(1.0, 0))
+        theta = law.volume_strain(Space().variable(1.0, 0))
         if abs(theta.value) > AT_REST or abs(theta.first.get(0, 0.0) - 1.0) > ALLOWED:
             found = f"{float(theta.value):.3g} with slope {float(theta.first.get(0, 0.0)):.3g}"
             raise SceneError(f"{what}: its dilatation must be 0 with slope 1 at J = 1, not {found}")
-
-
-def _in_f32(law: Law, F: np.ndarray, used: dict) -> np.ndarray:
-    material = Material(law=law.name, **used)
-    numbers = {"mu": material.mu, "lam": material.lam, **material.parameters}
-    return evaluate(law, F.astype(np.float32), {name: np.float32(value) for name, value in numbers.items()})[1]
 
 
 def _rotations(rng: np.random.Generator, k: int) -> np.ndarray:
