@@ -171,7 +171,7 @@ class Law:
 
     def stress(self, space: Space, F: list, D: list | None, numbers: dict[str, Any], fibre: list) -> list:
         """Return the given P, or its differential along D if that is not None: nine values. F, D: nine values."""
-        matrices = {name: fixed_matrix(space, one) for name, one in (("F", F), ("D", D)) if one is not None}
+        matrices = {name: jets_of_F(space, one, True) for name, one in (("F", F), ("D", D)) if one is not None}
         known = invariants(self, matrices["F"], fibre) | matrices | {name: space.fixed(one) for name, one in numbers.items()}
         function = self.pk1 if D is None else self.dpk1
         made = np.asarray(self._call(function, known), dtype=object)
@@ -215,17 +215,10 @@ def invariants(law: Law, F: Any, fibre: list) -> dict[str, Any]:
     return known
 
 
-def fixed_matrix(space: Space, F: list) -> np.ndarray:
-    """Return (3,3) jets without derivatives with the values F, row by row."""
+def jets_of_F(space: Space, F: list, fixed: bool = False) -> np.ndarray:
+    """Return (3,3) independent variables, or jets without derivatives, with the values F, row by row."""
     jets = np.empty(9, dtype=object)
-    jets[:] = [space.fixed(one) for one in F]
-    return jets.reshape(3, 3)
-
-
-def jets_of_F(space: Space, F: list) -> np.ndarray:
-    """Return (3,3) independent variables with the values F, row by row."""
-    jets = np.empty(9, dtype=object)
-    jets[:] = [space.variable(one, k) for k, one in enumerate(F)]
+    jets[:] = [space.fixed(one) if fixed else space.variable(one, k) for k, one in enumerate(F)]
     return jets.reshape(3, 3)
 
 

@@ -1,23 +1,22 @@
 """Laws from an energy density: in kernels they equal their derivatives in NumPy, those written by hand and closed forms; wrong
-ones are refused by name; their numbers reach materials, scenes, files, checkpoints and running simulations.
+ones are refused with what is wrong.
 """
 
-import dataclasses
 import types
-import warnings
 
 import numpy as np
 import pytest
 
 import taisoft as ts
-from taisoft.backend.counters import counting
 from taisoft.backend.tracing import untraced
 from taisoft.fem.laws import stable_neo_hookean
-from taisoft.fem.laws.evaluate import double_precision, evaluate_blocks, evaluate_differential
+from taisoft.fem.laws.evaluate import evaluate_blocks
 from taisoft.scene.law import evaluate
 from taisoft.scene.laws import LAWS, SHIPPED
-from tests.dynamics.scenes import COR, SNH, SVK
+from tests.dynamics.scenes import SVK
+from tests.fem.energies import OLD, POLYNOMIAL, holzapfel, polynomial, svk_differential, svk_of_F, svk_stress, tangent
 
+pytestmark = pytest.mark.usefixtures("known_laws")
 RNG = np.random.default_rng(5)
 MODERATE = np.eye(3) + 0.35 * RNG.uniform(-1.0, 1.0, (37, 3, 3))
 STRETCHES = [[1.0, 1.0, 1.0], [1.3, 1.3, 1.3], [1.2, 1.2, 0.8], [1.2, 1.2 + 1e-7, 0.8], [1.2, 0.8, -0.9], [1.2, 0.8, -0.8]]
@@ -30,61 +29,6 @@ SHIPPED_NUMBERS = {
     "fung": {"shear": 1.3, "exponent": 0.7, "bulk": 7.0},
     "ogden": {"mu1": 0.9, "alpha1": 1.7, "mu2": -0.2, "alpha2": -2.3, "mu3": 0.1, "alpha3": 3.1, "bulk": 7.0},
 }
-
-
-def E(F):
-    return (F.T @ F - np.eye(3)) / 2
-
-
-def svk_of_F(F, mu, lam):
-    return mu * np.trace(E(F) @ E(F)) + lam / 2 * np.trace(E(F)) ** 2
-
-
-def svk_stress(F, mu, lam):
-    return F @ (2 * mu * E(F) + lam * np.trace(E(F)) * np.eye(3))
-
-
-def svk_differential(F, D, mu, lam):
-    dE = (F.T @ D + D.T @ F) / 2
-    return D @ (2 * mu * E(F) + lam * np.trace(E(F)) * np.eye(3)) + F @ (2 * mu * dE + lam * np.trace(dE) * np.eye(3))
-
-
-def holzapfel(I1, I4, J, c, k1, k2, bulk):
-    fibres = np.exp(k2 * np.maximum(I4 - 1, 0) ** 2) - 1
-    return c * (I1 * ts.positive(J) ** (-2 / 3) - 3) + k1 / (2 * k2) * fibres + bulk / 2 * (J - 1) ** 2
-
-
-def neo_hookean(I1, J, mu, lam):
-    m, l = 4 / 3 * mu, lam + 5 / 6 * mu
-    return m / 2 * (I1 - 3) + l / 2 * (J - 1 - m / l + m / (4 * l)) ** 2 - m / 2 * np.log(I1 + 1)
-
-
-OLD = {  # those written by hand again, from their energies alone
-    SVK: lambda I1, I2, mu, lam: mu / 4 * (I1**2 - 2 * I2 - 2 * I1 + 3) + lam / 8 * (I1 - 3) ** 2,
-    COR: lambda I1, trS, mu, lam: mu * (I1 - 2 * trS + 3) + lam / 2 * (trS - 3) ** 2,
-    SNH: neo_hookean,
-}
-
-
-@pytest.fixture
-def kernels():
-    """One runtime for all evaluations of a test."""
-    with double_precision():
-        yield
-
-
-@pytest.fixture(autouse=True)
-def known_laws():
-    """Forget the laws that a test has registered."""
-    before = dict(LAWS)
-    yield
-    LAWS.clear()
-    LAWS.update(before)
-
-
-def tangent(law, F, numbers, projected=False):
-    units = np.eye(9).reshape(9, 3, 3)
-    return np.stack([evaluate_differential(law, F, D, projected=projected, **numbers).reshape(-1, 9) for D in units], axis=-1)
 
 
 def compare_with_numpy(law: str, F, numbers: dict, constants: dict, allowed: float = 1e-12):
@@ -193,13 +137,6 @@ def test_uniaxial_biaxial_and_shear_follow_the_closed_forms(law, kernels):
     assert abs(P[0, 1] - (principal[0] * l - principal[1] / l) / (l + 1 / l)) < 1e-8
 
 
-def polynomial(I1, J, c1, c2, bulk):
-    return c1 * (I1 - 3 - 2 * np.log(J)) + c2 * (I1 - 3) ** 2 + bulk / 2 * (J - 1) ** 2
-
-
-POLYNOMIAL = {"c1": ts.Parameter("Pa", above=0.0), "c2": "Pa", "bulk": "Pa"}
-
-
 def with_function(**changes) -> types.ModuleType:
     """Lane functions of stable neo-Hookean, some of them replaced."""
     module = types.ModuleType("changed")
@@ -299,113 +236,6 @@ def test_wrong_laws_are_refused_with_what_is_wrong(case):
     assert "wrong" not in LAWS
 
 
-def test_names_of_the_package_and_values_out_of_range_are_refused():
-    with pytest.raises(ts.SceneError, match="is that of a law of the package"):
-        ts.register_law("gent", OLD[SVK])
-    with pytest.warns(UserWarning, match="'own' is not finite where det F < 0"):
-        found = ts.register_law("own", polynomial, POLYNOMIAL)
-    assert found.is_isotropic and not found.is_finite_inverted
-    numbers = {"c1": 2e4, "c2": 1e3, "bulk": 1e5}
-    for change, message in (
-        ({"c1": -1.0}, "material: c1 must be greater than 0 Pa, not -1"),
-        ({"c1": None}, "material: law own needs c1"),
-        ({"c4": 1.0}, "law own: no parameter is called 'c4'"),
-        ({"young": 1e5}, "young follows from the numbers of law own: c1, c2, bulk"),
-        ({"bulk": -1e5}, "law 'own' is unstable at rest with c1 = 20000, c2 = 1000, bulk = -100000"),
-    ):
-        given = {name: value for name, value in {**numbers, **change}.items() if value is not None}
-        with pytest.raises(ts.SceneError, match=message):
-            ts.Material(law="own", **given)
-    with pytest.raises(ts.SceneError, match="law corotational has no parameters"):
-        ts.Material(law=COR, parameters={"c1": 1.0})
-
-
-def test_moduli_at_rest_follow_from_the_parameters():
-    material = ts.Material(law="mooney_rivlin", c1=2e4, c2=5e3, bulk=1e6, friction=0.1)
-    assert material.mu == pytest.approx(5e4) and material.lam == pytest.approx(1e6 - 2 / 3 * 5e4)
-    assert (material.c1, material.parameters["bulk"], material.friction) == (2e4, 1e6, 0.1)
-    changed = dataclasses.replace(material, c1=4e4)
-    assert changed.mu == pytest.approx(9e4) and changed.friction == 0.1
-    assert dataclasses.replace(material, friction=0.3).c1 == 2e4
-    assert ts.Material(law="ogden", mu1=3e4, alpha1=4.0, bulk=1e6).mu == pytest.approx(6e4)
-
-
-def block(material, **arguments) -> ts.Scene:
-    """A block that is held at its left end and pulled at its right one."""
-    scene = ts.Scene()
-    body = scene.add_body(ts.box_mesh((2, 1, 1), (2, 1, 1)), material, name="block", **arguments)
-    body.fix(lambda X: X[:, 0] < -0.9)
-    body.add_force(lambda X: X[:, 0] > 0.9, (3e4, 1e4, 0))
-    return scene
-
-
-def test_statics_of_a_law_from_its_energy_equal_those_of_the_one_written_by_hand():
-    ts.register_law("again", neo_hookean)
-    for order in (1, 2):
-        found, expected = (
-            ts.solve_static(block(ts.Material(law=law, young=1e5, poisson=0.4), order=order)).positions("block")
-            for law in ("again", SNH)
-        )
-        assert np.abs(found - expected).max() < 1e-9
-        assert np.abs(expected[:, 0].max() - 1.0) > 0.2
-
-
-def test_mean_dilatation_takes_the_volumetric_part():
-    """Of neo-Hookean as psi + lam/2 (J - 1)^2, on patches as the law written by hand."""
-
-    def without_volume(I1, J, mu):
-        return 2 / 3 * mu * (I1 - 3 - np.log((I1 + 1) / 4)) + 5 / 12 * mu * (J - 1) ** 2 - mu * (J - 1)
-
-    ts.register_law("mean", lambda I1, J, mu, lam: without_volume(I1, J, mu), dilatation=lambda J: J - 1, modulus="lam")
-    made = {law: block(ts.Material(law=law, young=1e5, poisson=0.48)) for law in ("mean", SNH)}
-    assert made["mean"].bodies[0].dilatation == "mean"
-    found, expected = (ts.solve_static(scene).positions("block") for scene in made.values())
-    assert np.abs(found - expected).max() < 1e-9
-    rubber = ts.Material(law="mooney_rivlin", c1=2e4, bulk=2e6)
-    local, mean = (ts.solve_static(block(rubber, dilatation=one)).positions("block")[:, 0].max() for one in ("local", "mean"))
-    assert mean > 1.02 * local  # linear tets lock
-
-
-def test_parameters_by_region_and_by_tet_in_files_runs_and_checkpoints(tmp_path):
-    mesh = ts.box_mesh((2, 1, 1), (2, 1, 1))
-    left = mesh.vertices[mesh.tets].mean(axis=1)[:, 0] < 0
-    mesh = ts.TetMesh(mesh.vertices, mesh.tets, regions=np.where(left, 1, 2), region_names={1: "soft", 2: "hard"})
-    materials = {"soft": ts.Material(law="mooney_rivlin", c1=2e4, bulk=1e5), "hard": ts.Material(law=SNH, young=4e5)}
-    c1 = np.where(left, 2e4, np.nan)
-    scene = block(materials[("soft")], parameters={"c1": np.linspace(2e4, 4e4, mesh.n_tets)})
-    scene.add_body(mesh, materials, name="two", position=(0, 5, 0))
-    assert np.array_equal(scene.body("two").young < 2e5, left)
-    ts.write_scene(tmp_path / "scene.toml", scene)
-    again, _ = ts.read_scene(tmp_path / "scene.toml")
-    for name in ("block", "two"):
-        assert np.array_equal(
-            again.body(name).composition.number("c1"), scene.body(name).composition.number("c1"), equal_nan=True
-        )
-        assert again.body(name).composition.materials == scene.body(name).composition.materials
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        with ts.Simulator(scene, dt=0.01, precision="f64") as sim:
-            sim.step()
-            sim.set_material("two", region="soft", c1=3e4)
-            sim.set_material("two", c1=1.5 * c1, young=5e5)
-            with counting() as counts:
-                sim.set_material("block", c1=5e4)
-            assert not counts.compiled
-            with pytest.raises(ts.SceneError, match="c3 cannot change while it runs .did you mean c2"):
-                sim.set_material("block", c3=1.0)
-            with pytest.raises(ts.SceneError, match="c1 of tet 3 .*must|shear modulus"):
-                sim.set_material("block", c1=np.where(np.arange(mesh.n_tets) == 3, -1e5, 1e4))
-            sim.step()
-            sim.save_checkpoint(tmp_path / "saved.npz")
-            sim.step()
-            expected = sim.positions()
-        with ts.Simulator.load_checkpoint(tmp_path / "saved.npz", scene) as sim:
-            assert sim.scene.body("block").composition.number("c1") == 5e4
-            assert np.nanmax(sim.scene.body("two").composition.number("c1")) == 3e4
-            sim.step()
-            assert np.array_equal(sim.positions(), expected)
-
-
 def test_a_volume_floor_on_any_law():
     """Beside a law of F it is projected with it."""
     ts.register_law("of_F", svk_of_F)
@@ -416,52 +246,6 @@ def test_a_volume_floor_on_any_law():
     for projected in (False, True):
         found, expected = (tangent(law, flat, numbers, projected) for law in ("of_F", SVK))
         assert np.abs(found - expected).max() < 1e-10
-
-
-def test_numbers_by_tet_of_mixed_bodies_reach_checkpoints(tmp_path):
-    mesh = ts.box_mesh((2, 1, 1), (2, 1, 1))
-    left = mesh.vertices[mesh.tets].mean(axis=1)[:, 0] < 0
-    mesh = ts.TetMesh(mesh.vertices, mesh.tets, regions=np.where(left, 1, 2))
-    scene = ts.Scene()
-    materials = {1: ts.Material(law="gent", shear=2e4, bulk=1e5), 2: ts.Material(law=SNH, young=4e5)}
-    scene.add_body(mesh, materials, name="two").fix(lambda X: X[:, 0] < -0.9)
-    with ts.Simulator(scene, dt=0.01, precision="f64") as sim:
-        sim.set_material("two", young=np.linspace(1e5, 9e5, mesh.n_tets))
-        sim.step()
-        sim.save_checkpoint(tmp_path / "saved.npz")
-        sim.step()
-        expected = sim.positions()
-    with ts.Simulator.load_checkpoint(tmp_path / "saved.npz", scene) as sim:
-        sim.step()
-        assert np.array_equal(sim.positions(), expected)
-
-
-def test_materials_of_a_law_that_was_registered_anew_are_refused():
-    ts.register_law("own", lambda I1, J, k: k * (I1 - 3 - 2 * (J - 1) + 2 * (J - 1) ** 2), {"k": "Pa"})
-    old = ts.Material(law="own", k=1e5)
-    with pytest.raises(ts.SceneError, match="parameters cannot change"):
-        old.parameters["k"] = 1.0
-    with ts.Simulator(block(old), dt=0.01), pytest.raises(ts.SceneError, match="registered already, and a simulator"):
-        ts.register_law("own", polynomial, POLYNOMIAL)
-    ts.register_law("own", lambda I1, J, k: 9 * k * (I1 - 3 - 2 * (J - 1) + 2 * (J - 1) ** 2), {"k": "Pa"})
-    with pytest.raises(ts.SceneError, match="law 'own' has been registered anew since its material was made"):
-        block(old)
-    with pytest.raises(ts.SceneError, match="no parameter of its laws is called 'friction'; there are k"):
-        block(ts.Material(law="own", k=1e5), parameters={"friction": 0.1})
-    del LAWS["own"]
-    with pytest.raises(ts.SceneError, match="law 'own' is not registered in this process"):
-        block(old)
-
-
-def test_a_law_that_has_changed_does_not_continue_a_checkpoint(tmp_path):
-    ts.register_law("own", neo_hookean)
-    scene = block(ts.Material(law="own", young=1e5))
-    with ts.Simulator(scene, dt=0.01) as sim:
-        sim.step()
-        sim.save_checkpoint(tmp_path / "saved.npz")
-    ts.register_law("own", OLD[SVK])
-    with pytest.raises(ts.SceneError, match="body 'block': order, quadrature, dilatation, law, branches or collision"):
-        ts.Simulator.load_checkpoint(tmp_path / "saved.npz", scene)
 
 
 def test_every_law_of_the_package_passes_the_check(kernels):

@@ -144,6 +144,31 @@ def prepare(F, p):
 
 
 @arithmetic
+def rotation_differential(R, K, B, factor):
+    """factor dR along D, with B = D R^T and R and K from `prepare`."""
+    w = transform(K, [B[7] - B[5], B[2] - B[6], B[3] - B[1]])
+    c = [factor * w[k] for k in ti.static(range(3))]
+    return [
+        c[(i + 1) % 3] * R[3 * ((i + 2) % 3) + j] - c[(i + 2) % 3] * R[3 * ((i + 1) % 3) + j]
+        for i in ti.static(range(3))
+        for j in ti.static(range(3))
+    ]
+
+
+@arithmetic
+def rotation_block(K, Ra, Rb, factor):
+    """factor dR g_b along e_k (x) g_a: nine entries (i, k), with Ra = R g_a and Rb = R g_b."""
+    # dR g_b = w x R g_b with w = K (R g_a x e_k), so the matrix over k is -[R g_b]x K [R g_a]x
+    N = [cross(K[3 * i : 3 * i + 3], Ra) for i in ti.static(range(3))]
+    c = [factor * Rb[k] for k in ti.static(range(3))]
+    return [
+        c[(i + 2) % 3] * N[(i + 1) % 3][k] - c[(i + 1) % 3] * N[(i + 2) % 3][k]
+        for i in ti.static(range(3))
+        for k in ti.static(range(3))
+    ]
+
+
+@arithmetic
 def dpk1(F, S, D):
     """Differential of the stress along D [Pa], with S = prepare(F, p).
 
@@ -152,14 +177,8 @@ def dpk1(F, S, D):
     R = [S[k] for k in ti.static(range(9))]
     K = [S[9 + k] for k in ti.static(range(9))]
     B = matmul_nt(D, R)
-    w = transform(K, [B[7] - B[5], B[2] - B[6], B[3] - B[1]])
     t = S[19] * (B[0] + B[4] + B[8])
-    c = [S[20] * w[k] for k in ti.static(range(3))]
-    dR = [
-        c[(i + 1) % 3] * R[3 * ((i + 2) % 3) + j] - c[(i + 2) % 3] * R[3 * ((i + 1) % 3) + j]
-        for i in ti.static(range(3))
-        for j in ti.static(range(3))
-    ]
+    dR = rotation_differential(R, K, B, S[20])
     return [2.0 * S[18] * D[k] + t * R[k] + dR[k] for k in ti.static(range(9))]
 
 
@@ -170,14 +189,7 @@ def block(F, S, ga, gb):
     Ra, Rb = transform(R, ga), transform(R, gb)
     d = 2.0 * S[18] * dot(ga, gb)
     l = [S[19] * Rb[k] for k in ti.static(range(3))]
-    # dR g_b = w x R g_b with w = K (R g_a x e_k), so the matrix over k is -[R g_b]x K [R g_a]x
-    N = [cross(S[9 + 3 * i : 12 + 3 * i], Ra) for i in ti.static(range(3))]
-    c = [S[20] * Rb[k] for k in ti.static(range(3))]
-    rotated = [
-        c[(i + 2) % 3] * N[(i + 1) % 3][k] - c[(i + 1) % 3] * N[(i + 2) % 3][k]
-        for i in ti.static(range(3))
-        for k in ti.static(range(3))
-    ]
+    rotated = rotation_block(S[9:18], Ra, Rb, S[20])
     return add_to_diagonal([rotated[k] + l[k // 3] * Ra[k % 3] for k in ti.static(range(9))], d)
 
 

@@ -16,8 +16,9 @@ import taichi as ti
 import taisoft.fem.laws.corotational as corotational
 from taisoft.backend.private import Expr, impl
 from taisoft.backend.tracing import arithmetic, untraced
-from taisoft.fem.laws.projection import clamp_9x9, local_array, upper
+from taisoft.fem.laws.projection import clamp_9x9, dpk1_isotropic, local_array, upper
 from taisoft.fem.math3 import (
+    add_to_diagonal,
     cofactor,
     cofactor_differential,
     cross,
@@ -30,7 +31,7 @@ from taisoft.fem.math3 import (
     transform,
 )
 from taisoft.scene.jets import Jet, Space
-from taisoft.scene.law import HOOKE, INVARIANTS, Law, fixed_matrix, invariants, jets_of_F, of_stretches, stretch_modes
+from taisoft.scene.law import HOOKE, INVARIANTS, Law, invariants, jets_of_F, of_stretches, stretch_modes
 
 UPPER = [(i, j) for i in range(9) for j in range(i, 9)]  # of a symmetric 9x9 matrix
 
@@ -44,12 +45,17 @@ class Lanes(Space):
     def __init__(self, like: Expr, order: int):
         """like: a vector of lanes, which gives the precision."""
         super().__init__(order)
-        self._real = like.element_type()
+        self._real, self._zero = like.element_type(), 0.0 * like
         self.eps = float(np.finfo(np.float64 if self._real == ti.f64 else np.float32).eps)
 
     def constant(self, value: float) -> Expr:
         """A literal would have the precision of Taichi's default."""
         return Expr(float(value), dtype=self._real)
+
+    def vector(self, value: Any) -> Any:
+        """A value in all lanes."""
+        is_vector = isinstance(value, Expr) and value.is_tensor()
+        return self.bind(value if is_vector else value + self._zero)
 
     def bind(self, value: Any) -> Any:
         """A variable of the kernel."""
@@ -80,7 +86,7 @@ class EnergyLaw:
     def _at_rest(self, space: Space, p: list) -> Any:
         """psi at F = I, which is counted as 0."""
         one = space.fixed(1.0)
-        rest = fixed_matrix(space, [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0])
+        rest = jets_of_F(space, [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0], True)
         known = {"F": rest, "J": one, "I1": 3.0 * one, "I2": 3.0 * one, "I4": one, "stretches": [one, one, one], "trS": 3.0 * one}
         return self.law.energy(space, known, self._numbers(p)[0]).value
 
@@ -92,7 +98,7 @@ class EnergyLaw:
     def psi(self, F, p):
         """Energy density [Pa], 0 at rest."""
         psi, space = self._energy(F, p, 0)
-        return psi.value - self._at_rest(space, p) + 0.0 * F[0]
+        return space.vector(psi.value - self._at_rest(space, p))
 
     @untraced
     def dilatation(self, F):
@@ -129,7 +135,7 @@ class StretchLaw(EnergyLaw):
         frame = svd_of(F)
         U, V = frame[:9], frame[12:]
         psi, space = self._of_stretches(frame[9:12], p, 1)
-        first = [space.bind(psi.first.get(k, 0.0) + 0.0 * F[0]) for k in range(3)]
+        first = [space.vector(psi.first.get(k, 0.0)) for k in range(3)]
         return matmul_nt([U[3 * i + k] * first[k] for i in range(3) for k in range(3)], V)
 
     @untraced
@@ -137,12 +143,12 @@ class StretchLaw(EnergyLaw):
         """Precompute for `dpk1` and `block`: U, V, and the modes."""
         frame = svd_of(F)
         A, symmetric, antisymmetric = self.hessian_eigen(frame[9:12], p)
-        return frame[:9] + frame[12:] + A + symmetric + antisymmetric
+        return frame[:9] + frame[12:] + A + [0.5 * one for one in symmetric + antisymmetric]
 
     @untraced
     def dpk1(self, F, S, D):
         """Differential of the stress along D [Pa], with S = prepare(F, p)."""
-        return differential_of_modes(S, D)
+        return dpk1_isotropic(S, D)
 
     @untraced
     def block(self, F, S, ga, gb):
@@ -180,10 +186,10 @@ class InvariantLaw(StretchLaw):
     def pk1(self, F, p):
         """First Piola-Kirchhoff stress [Pa]."""
         R = corotational.rotation(F) if 3 in self.uses else None
-        psi, _ = self._energy(F, p, 1, R)
+        psi, space = self._energy(F, p, 1, R)
         made, total = (lambda F: scaled(2.0, F), second_gradient, cofactor, lambda _: R), None
         for k, factor in psi.first.items():
-            factor, gradient = factor + 0.0 * F[0], made[k](F)
+            factor, gradient = space.vector(factor), made[k](F)
             total = scaled(factor, gradient) if total is None else add_scaled(total, factor, gradient)
         return total
 
@@ -192,18 +198,15 @@ class InvariantLaw(StretchLaw):
         """Precompute for `dpk1` and `block`: derivatives of psi, then the gradients of the invariants, I1, C and B."""
         turned = corotational.prepare(F, [0.0 * F[0], 0.0 * F[0]])[:18] if 3 in self.uses else []
         psi, space = self._energy(F, p, 2, turned[:9])
-        zero = space.bind(0.0 * F[0])
-        first = [space.bind(psi.first.get(k, 0.0) + zero) for k in range(4)]
-        second = [space.bind(psi.second.get(pair, 0.0) + zero) for pair in SECOND]
+        first = [space.vector(psi.first.get(k, 0.0)) for k in range(4)]
+        second = [space.vector(psi.second.get(pair, 0.0)) for pair in SECOND]
         quadratic = [*second_gradient(F), *matmul_tn(F, F), *matmul_nt(F, F)] if 1 in self.uses else []
         return first + second + cofactor(F) + turned + quadratic
 
     def _parts(self, F: list, S: list) -> tuple[list, list, list, list]:
-        """From `prepare`: gradients of the invariants; factors of `corotational.dpk1` that leave dR; C and B."""
-        zero = 0.0 * S[0]
+        """From `prepare`: gradients of the invariants; K of `corotational.prepare`; C and B."""
         G, at = S[14:23], 41 if 3 in self.uses else 23
-        turned = S[23:41] + [zero, zero, zero + 1.0]
-        return [scaled(2.0, F), S[at : at + 9], G, S[23:32]], turned, S[at + 9 : at + 18], S[at + 18 : at + 27]
+        return [scaled(2.0, F), S[at : at + 9], G, S[23:32]], S[32:41], S[at + 9 : at + 18], S[at + 18 : at + 27]
 
     def _coupled(self, k: int, S: list) -> list[tuple[int, Any]]:
         """The invariants l with which psi couples invariant k, and psi_kl."""
@@ -213,14 +216,15 @@ class InvariantLaw(StretchLaw):
     @untraced
     def dpk1(self, F, S, D):
         """Differential of the stress along D [Pa], with S = prepare(F, p)."""
-        gradients, turned, C, _ = self._parts(F, S)
+        gradients, K, C, _ = self._parts(F, S)
         total = scaled(2.0 * S[0], D)
         if 2 in self.uses:
             total = add_scaled(total, S[2], cofactor_differential(F, D))
         if 1 in self.uses:
             total = add_scaled(total, S[1], second_gradient_differential(F, C, D))
         if 3 in self.uses:
-            total = add_scaled(total, S[3], corotational.dpk1(F, turned, D))
+            R = gradients[3]
+            total = added(total, corotational.rotation_differential(R, K, matmul_nt(D, R), S[3]))
         for k in range(4):
             terms = [factor * ddot(gradients[l], D) for l, factor in self._coupled(k, S)]
             if terms:
@@ -230,17 +234,22 @@ class InvariantLaw(StretchLaw):
     @untraced
     def block(self, F, S, ga, gb):
         """Differential of (P g_b)_i along the displacement gradient e_k (x) g_a: nine entries (i, k) [Pa/m^2]."""
-        gradients, turned, C, B = self._parts(F, S)
+        gradients, K, C, B = self._parts(F, S)
         diagonal = 2.0 * S[0] * dot(ga, gb)
         coupled = [k for k in range(4) if self._coupled(k, S)]
         a, b = ({k: transform(gradients[k], g) for k in coupled} for g in (ga, gb))
-        total = [0.0 * diagonal] * 9
+        total = None
         for k in coupled:
-            total = add_outer(total, b[k], combined([(factor, a[l]) for l, factor in self._coupled(k, S)]))
+            y = combined([(factor, a[l]) for l, factor in self._coupled(k, S)])
+            total = outer(b[k], y) if total is None else add_outer(total, b[k], y)
+        total = [0.0 * diagonal] * 9 if total is None else total
         if 1 in self.uses:
             total = add_block_of_I2(total, F, C, B, S[1], ga, gb)
         if 3 in self.uses:
-            total = add_scaled(total, S[3], corotational.block(F, turned, ga, gb))
+            Ra, Rb = transform(gradients[3], ga), transform(gradients[3], gb)
+            total = added(total, corotational.rotation_block(K, Ra, Rb, S[3]))
+        if 2 not in self.uses:
+            return add_to_diagonal(total, diagonal)
         return add_block_of_J(total, diagonal, transform(F, cross(ga, gb)), S[2])
 
 
@@ -262,7 +271,7 @@ class GeneralLaw(EnergyLaw):
         """The given stress, or its given differential along D if that is not None [Pa]."""
         space = Lanes(F[0], 0)
         values = self.law.stress(space, F, D, self._numbers(p)[0], self._fibre(space, p))
-        return [space.bind(one + 0.0 * F[0]) for one in values]
+        return [space.vector(one) for one in values]
 
     @untraced
     def pk1(self, F, p):
@@ -270,7 +279,7 @@ class GeneralLaw(EnergyLaw):
         if self.law.pk1 is not None:
             return self.given(F, None, p)
         psi, space = self._energy(F, p, 1)
-        return [space.bind(psi.first.get(k, 0.0) + 0.0 * F[0]) for k in range(9)]
+        return [space.vector(psi.first.get(k, 0.0)) for k in range(9)]
 
     @untraced
     def prepare(self, F, p):
@@ -278,7 +287,7 @@ class GeneralLaw(EnergyLaw):
         if self.law.pk1 is not None:
             return tangent(self, F, p)
         psi, space = self._energy(F, p, 2)
-        return [space.bind(psi.second.get(pair, 0.0) + 0.0 * F[0]) for pair in UPPER]
+        return [space.vector(psi.second.get(pair, 0.0)) for pair in UPPER]
 
     @untraced
     def dpk1(self, F, S, D):
@@ -372,9 +381,21 @@ def scaled(a, A):
 
 
 @arithmetic
+def added(A, B):
+    """A + B."""
+    return [A[k] + B[k] for k in ti.static(range(9))]
+
+
+@arithmetic
 def add_scaled(A, b, B):
     """A + b B."""
     return [A[k] + b * B[k] for k in ti.static(range(9))]
+
+
+@arithmetic
+def outer(x, y):
+    """x y^T."""
+    return [x[k // 3] * y[k % 3] for k in ti.static(range(9))]
 
 
 @arithmetic
@@ -406,17 +427,3 @@ def add_block_of_J(K, d, t, a):
     """K + d I plus a times the part that comes from the change of cof F. t: F (ga x gb)."""
     w = [a * t[k] for k in ti.static(range(3))]
     return [K[0] + d, K[1] - w[2], K[2] + w[1], K[3] + w[2], K[4] + d, K[5] - w[0], K[6] - w[1], K[7] + w[0], K[8] + d]
-
-
-@arithmetic
-def differential_of_modes(S, D):
-    """U Y V^T with Y from X = U^T D V by the modes. S: U, V, the block (9), symmetric (3) and antisymmetric (3) eigenvalues."""
-    U, V = [S[k] for k in ti.static(range(9))], [S[9 + k] for k in ti.static(range(9))]
-    UD = matmul_tn(U, D)
-    X = matmul(UD, V)
-    d = [S[18 + 3 * i] * X[0] + S[19 + 3 * i] * X[4] + S[20 + 3 * i] * X[8] for i in ti.static(range(3))]
-    a = [0.5 * S[27 + k] * (X[3 * i + j] + X[3 * j + i]) for k, i, j in ti.static(((0, 0, 1), (1, 0, 2), (2, 1, 2)))]
-    b = [0.5 * S[30 + k] * (X[3 * i + j] - X[3 * j + i]) for k, i, j in ti.static(((0, 0, 1), (1, 0, 2), (2, 1, 2)))]
-    Y = [d[0], a[0] + b[0], a[1] + b[1], a[0] - b[0], d[1], a[2] + b[2], a[1] - b[1], a[2] - b[2], d[2]]
-    UY = matmul(U, Y)
-    return matmul_nt(UY, V)
