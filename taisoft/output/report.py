@@ -49,12 +49,13 @@ def write_report(folder: str | Path, result: RunReport, *, resumed: dict | None 
 
 
 def body_records(scene) -> list[dict]:
-    """Describe each body of a scene: name, laws, order, and numbers of regions with own materials, vertices, tets, nodes
-    and connected pieces."""
+    """Describe each body of a scene: name, laws, least and largest young [Pa] and poisson at rest, order, numbers of regions
+    with own materials, of vertices, tets, nodes and connected pieces."""
     return [
         {
             "name": b.name,
             "law": " and ".join(b.composition.laws),
+            **{name: [float(np.min(x := getattr(b, name))), float(np.max(x))] for name in ("young", "poisson")},
             "regions": len(b.composition.materials) if b.composition.has_regions else 0,
             "order": b.order,
             "vertices": b.mesh.n_verts,
