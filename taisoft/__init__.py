@@ -49,7 +49,7 @@ _MODULES = {  # public name -> the module that defines it
     "modes": "taisoft.stability",
     "evaluate_law": "taisoft.fem.laws.evaluate",
     "register_law": "taisoft.fem.laws.registration",
-    "check_law": "taisoft.fem.laws.registration",
+    "check_law": "taisoft.fem.laws.checking",
     "Parameter": "taisoft.scene.law",
     "positive": "taisoft.scene.laws",
     "solve_contact_problem": "taisoft.contact.api",
