@@ -22,6 +22,7 @@ from taisoft.fem.laws.invariants import (
     add_outer,
     add_scaled,
     added,
+    block_of_modes,
     combined,
     invariants_of,
     outer,
@@ -155,11 +156,7 @@ class StretchLaw(EnergyLaw):
     @untraced
     def block(self, F, S, ga, gb):
         """Differential of (P g_b)_i along the displacement gradient e_k (x) g_a: nine entries (i, k) [Pa/m^2]."""
-        columns = []
-        for k in range(3):
-            T = self.dpk1(F, S, [ga[c] if r == k else 0.0 * ga[c] for r in range(3) for c in range(3)])
-            columns.append(transform(T, gb))
-        return [columns[k][i] for i in range(3) for k in range(3)]
+        return block_of_modes(S, ga, gb)
 
 
 class InvariantLaw(StretchLaw):

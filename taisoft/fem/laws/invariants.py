@@ -3,7 +3,7 @@
 import taichi as ti
 
 from taisoft.backend.tracing import arithmetic, untraced
-from taisoft.fem.math3 import cofactor, ddot, dot, matmul, matmul_tn, signed_svd, transform
+from taisoft.fem.math3 import cofactor, ddot, dot, matmul, matmul_nt, matmul_tn, signed_svd, transform
 
 
 @ti.func
@@ -94,3 +94,28 @@ def add_block_of_J(K, d, t, a):
     """K + d I plus a times the part that comes from the change of cof F. t: F (ga x gb)."""
     w = [a * t[k] for k in ti.static(range(3))]
     return [K[0] + d, K[1] - w[2], K[2] + w[1], K[3] + w[2], K[4] + d, K[5] - w[0], K[6] - w[1], K[7] + w[0], K[8] + d]
+
+
+@arithmetic
+def block_of_modes(S, ga, gb):
+    """The `block` of the modes in S: U, V, A, and halves of the symmetric and antisymmetric eigenvalues, see `dpk1_isotropic`.
+
+    In the frame of the SVD dF = e_k (x) g_a is the matrix with rows U_ki a, a = V^T g_a.
+    """
+    U, V, A = S[0:9], S[9:18], S[18:27]
+    a, b = [dot(V[j::3], ga) for j in ti.static(range(3))], [dot(V[j::3], gb) for j in ti.static(range(3))]
+    p = [S[27 + k] + S[30 + k] for k in ti.static(range(3))]
+    m = [S[27 + k] - S[30 + k] for k in ti.static(range(3))]
+    M = [
+        A[0] * a[0] * b[0] + p[0] * a[1] * b[1] + p[1] * a[2] * b[2],
+        A[1] * a[1] * b[0] + m[0] * a[0] * b[1],
+        A[2] * a[2] * b[0] + m[1] * a[0] * b[2],
+        A[3] * a[0] * b[1] + m[0] * a[1] * b[0],
+        A[4] * a[1] * b[1] + p[0] * a[0] * b[0] + p[2] * a[2] * b[2],
+        A[5] * a[2] * b[1] + m[2] * a[1] * b[2],
+        A[6] * a[0] * b[2] + m[1] * a[2] * b[0],
+        A[7] * a[1] * b[2] + m[2] * a[2] * b[1],
+        A[8] * a[2] * b[2] + p[1] * a[0] * b[0] + p[2] * a[1] * b[1],
+    ]
+    UM = matmul(U, M)
+    return matmul_nt(UM, U)
