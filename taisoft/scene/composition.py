@@ -18,7 +18,6 @@ from taisoft.scene.law import FIBRE, HOOKE
 from taisoft.scene.laws import LAWS
 from taisoft.scene.material import FIBRE_NUMBERS, MODULI, Material, lame_parameters
 
-BY_TET = (*MODULI, "density")  # numbers that may differ from tet to tet, with parameters of laws
 OF_THE_BODY = ("friction", "restitution", "mass_damping", "stiffness_damping")
 
 
@@ -69,7 +68,7 @@ class Composition:
         return np.searchsorted(list(self.materials), self.mesh.regions)
 
     def number(self, name: str) -> float | np.ndarray:
-        """Return one of BY_TET, a parameter, or `volume_floor`: a float if one holds for all tets by design, else (m,).
+        """Return one of `tet_numbers`, or `volume_floor`: a float if one holds for all tets by design, else (m,).
 
         A parameter is not a number in tets whose law does not have it.
         """

@@ -38,8 +38,11 @@ class Parameter:
     @property
     def sample(self) -> float:
         """The default, or a number in the range: 1 if that is in it."""
-        low, high = self.minimum if self.above is None else 2.0 * abs(self.above), self.maximum
-        return self.default if self.default is not None else float(np.clip(1.0, low, high))
+        if self.default is not None:
+            return self.default
+        value = 1.0 if self.above is None or self.above < 1.0 else 2.0 * self.above
+        value = value if self.minimum is None else max(value, self.minimum)
+        return value if self.maximum is None else min(value, self.maximum)
 
     def checked(self, value, what: str) -> float:
         """Return a value in the range. Raises SceneError."""
