@@ -102,7 +102,10 @@ def cavity_pressure(self: "Simulator", name: str) -> float:
 
 
 def stress(self: "Simulator", body: str | None = None) -> np.ndarray:
-    """Return the Cauchy stress per tet (m,3,3) [Pa], not finite in a flat tet; without a name, of all bodies as added."""
+    """Return the Cauchy stress per tet (m,3,3) [Pa], of fibres and branches, too; not finite in a flat tet.
+
+    Without a name, of all bodies as added.
+    """
     state = self._open().state
     m, layout = state.model, state.layout
     state.set_load_time(state.time)  # of activations
