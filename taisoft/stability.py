@@ -316,6 +316,7 @@ def modes(scene: Scene, k: int, mass: str = "lumped") -> Modes:
         raise SceneError(f"mass '{mass}' is unknown: it must be 'lumped' or 'consistent'")
     if not scene.bodies:
         raise SceneError("the scene holds no body")
+    scene.check()
     for tendon in [one for one in scene.tendons if one.is_inextensible]:
         raise SceneError(f"modes: tendon {tendon.name!r} has a given length, but no stiffness: give it one")
     scene = scene.snapshot()  # in which rigid bodies are as stiff as the others ask for

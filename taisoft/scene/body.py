@@ -214,9 +214,11 @@ class Body(Guarded):
         return float(np.sum(self.composition.number("density") * self.mesh.volumes))
 
     def check(self) -> None:
-        """Raise SceneError if in-place changes made the arrays of position or velocity invalid."""
+        """Raise SceneError if in-place changes made the arrays of position or velocity invalid, or its law is another one now."""
         self._check_position(self.position)
         self._check_velocity(self.velocity)
+        for material in self.composition.materials.values():
+            material.check_law(self._label())
 
     @property
     def contact_mode(self) -> str:

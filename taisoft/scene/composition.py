@@ -248,6 +248,10 @@ class Composition:
             key = self.mesh.region_id(region)
         except MeshError as error:
             raise SceneError(f"{what}: {error}") from None
+        for name in numbers:
+            if self.has_regions and self._is_foreign(name, self.materials[key]):
+                law = self.materials[key].law
+                raise SceneError(f"{what}: law {law} of region {self.mesh.region_text(key)} has no number {name}")
         changed = _replaced(f"{what}: region {self.mesh.region_text(key)}", self.materials.get(key, self.first), numbers)
         by_tet = dict(self.by_tet)
         for name in numbers:
@@ -272,6 +276,8 @@ def compose(
         raise SceneError(f"{what}: material must be {kinds}, not {type(material).__name__}")
     for one in made.materials.values():
         one.check_law(what)
+    if not isinstance(parameters or {}, Mapping):
+        raise SceneError(f"{what}: parameters must be a dict, not {value_text(parameters)}")
     for name in parameters or {}:
         checks.index(name, made.parameters, f"{what}: no parameter of its laws")
     if fibres is not None or (mesh.fibres is not None and made.has_fibres):

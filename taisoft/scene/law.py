@@ -168,7 +168,8 @@ class Law:
     def volume_strain(self, J: Jet) -> Jet:
         """Return theta of J."""
         try:
-            return self.dilatation(J) + 0.0
+            theta = self.dilatation(J)
+            return theta if isinstance(theta, Jet) else J.space.fixed(float(theta))
         except Exception as error:  # a user's function may raise anything
             raise SceneError(f"law {self.name!r}: its dilatation failed: {reason(error)}") from error
 
@@ -184,7 +185,7 @@ class Law:
         return [one.value if isinstance(one, Jet) else one for one in made]
 
     def sample(self) -> dict[str, float]:
-        """Return numbers for checks: each parameter's default, or 1 if that is in its range, and a Poisson's ratio of 0.3."""
+        """Return numbers for checks: those of the parameters' `sample`, or Lamé's for a Poisson's ratio of 0.3."""
         given = {name: one.sample for name, one in self.parameters.items()}
         return given | (dict(zip(HOOKE, (1.0 / 2.6, 0.3 / 0.52))) if not self.parameters else {})
 

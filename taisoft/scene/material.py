@@ -46,7 +46,7 @@ def _with_moduli(law: Law, named: dict, own: dict) -> dict:
     # `dataclasses.replace` gives all parameters, and the moduli that followed from them
     old = dict(zip(MODULI, law.moduli(before))) if before.keys() == law.parameters.keys() else {}
     for name in MODULI:
-        if name in named and (name not in old or named[name] != old[name]):
+        if name in named and (name not in old or np.ndim(named[name]) or named[name] != old[name]):
             raise SceneError(f"material: {name} follows from the numbers of law {law.name}: {', '.join(law.parameters)}")
     parameters = FrozenDict(law.checked({**before, **own}, "material: "))
     parameters._refusal = SceneError("material: parameters cannot change: make another one by dataclasses.replace")

@@ -195,6 +195,16 @@ WRONG = {
         {"psi": lambda stretches, J, mu: mu * (sum(s**2 for s in stretches) - 3 - 2 * (J - 1)) + mu * (stretches[0] - 1) ** 2},
         "depends on the order of the stretches",
     ),
+    "two stretches that are swapped": (
+        {
+            "psi": lambda stretches, J, mu: (
+                mu * (sum(s**2 for s in stretches) - 3 - 2 * (J - 1))
+                + mu * (stretches[0] - stretches[1]) * (stretches[1] - stretches[2]) * (stretches[2] - stretches[0])
+            )
+        },
+        "depends on the order of the stretches",
+    ),
+    "the name of an option": ({"psi": polynomial, "parameters": {**POLYNOMIAL, "floor": ""}}, "cannot be called floor"),
     "a comparison": ({"psi": lambda I1, mu: mu * (I1 - 3) * (1 if mu == 1 else 2)}, "use np.maximum or np.minimum"),
     "a branch": ({"psi": lambda I1, mu, lam: mu * (I1 - 3) if I1 > 3 else 0.0}, "use np.maximum or np.minimum"),
     "another function": ({"psi": lambda I1, mu, lam: mu * np.sin(I1 - 3)}, "there is no numpy.sin"),

@@ -136,11 +136,15 @@ def test_materials_of_a_law_that_was_registered_anew_are_refused():
     old = ts.Material(law="own", k=1e5)
     with pytest.raises(ts.SceneError, match="parameters cannot change"):
         old.parameters["k"] = 1.0
-    with ts.Simulator(block(old), dt=0.01), pytest.raises(ts.SceneError, match="registered already, and a simulator"):
+    stale = block(old)
+    with ts.Simulator(stale, dt=0.01), pytest.raises(ts.SceneError, match="registered already, and a simulator"):
         ts.register_law("own", polynomial, POLYNOMIAL)
     ts.register_law("own", lambda I1, J, k: 9 * k * (I1 - 3 - 2 * (J - 1) + 2 * (J - 1) ** 2), {"k": "Pa"})
     with pytest.raises(ts.SceneError, match="law 'own' has been registered anew since its material was made"):
         block(old)
+    for use in (ts.Simulator, ts.solve_static, lambda scene: ts.modes(scene, 1)):
+        with pytest.raises(ts.SceneError, match="body 'block': law 'own' has been registered anew"):
+            use(stale)
     with pytest.raises(ts.SceneError, match="no parameter of its laws is called 'friction'; there are k"):
         block(ts.Material(law="own", k=1e5), parameters={"friction": 0.1})
     del LAWS["own"]

@@ -14,8 +14,10 @@ from taisoft.scene.laws import LAWS, SHIPPED
 from taisoft.scene.material import Material
 
 # names of numbers and of arguments beside which a parameter stands
-TAKEN = {*VARIABLES, *HOOKE, *inspect.signature(Material).parameters, "D", "self", "body", "region", "activation", "fibre"}
-LANE_FUNCTIONS = ("N_CONSTANTS", "SOFTENS_BELOW", "POINT_SECONDS", "constants", "psi", "pk1", "prepare", "dpk1", "block")
+TAKEN = {*VARIABLES, *HOOKE, *inspect.signature(Material).parameters, "D", "self", "name", "body", "region", "activation"}
+TAKEN |= {"fibre", "floor", "projected", "dF"}
+LANE_FUNCTIONS = ("N_CONSTANTS", "SOFTENS_BELOW", "POINT_SECONDS", "constants")
+LANE_FUNCTIONS += ("psi", "pk1", "prepare", "dpk1", "block", "hessian_eigen")
 
 
 def register_law(
@@ -46,8 +48,7 @@ def register_law(
     if name in [law.name for law in SHIPPED]:
         raise SceneError(f"{what}: the name is that of a law of the package")
     if functions is not None:
-        projected = "prepare_projected" if hasattr(functions, "prepare_projected") else "hessian_eigen"
-        missing = [one for one in (*LANE_FUNCTIONS, projected) if not hasattr(functions, one)]
+        missing = [one for one in LANE_FUNCTIONS if not hasattr(functions, one)]
         if missing or any(one is not None for one in (psi, parameters, pk1, dpk1, dilatation, modulus)):
             raise SceneError(f"{what}: its lane functions lack {missing[0]}" if missing else f"{what}: functions are given alone")
         law = Law(name, functions=functions)
