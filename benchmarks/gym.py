@@ -30,7 +30,7 @@ from .document import Document, Limit, begin, table
 from .exact_path import SAMPLE
 from .programs import mujoco_flex, own
 from .programs.session import Setting
-from .runner import add_named_out, make_parser, named_out, patched, progress, without_warnings
+from .runner import patched, progress, quick_options, without_warnings
 from .works.evaluation import evaluate
 from .works.references import MUJOCO, TAISOFT
 from .works.scenes import WORKS, Work
@@ -253,12 +253,7 @@ def add_works(document: Document, rows: list[dict], left_out: str) -> None:
 
 def main(argv=None) -> int:
     """Measure and print. Exit status: 0, or 1 if a limit is not met (not with --quick). Raises OutputError."""
-    parser = make_parser("gym", __doc__)
-    parser.add_argument("--quick", action="store_true", help="few steps, two processes, W1 alone, no limits")
-    add_named_out(parser)
-    parser.set_defaults(arch="cpu")
-    options = parser.parse_args(argv)
-    options.out = named_out(options, "gym")
+    options = quick_options("gym", __doc__, argv, "few steps, two processes, W1 alone, no limits")
     quick, left_out = options.quick, mujoco_flex.problem()
     document, numbers = begin("What an episode costs", "arch cpu", packages=("taichi", "gymnasium", "mujoco-core", "numpy"))
     costs = {}

@@ -27,7 +27,7 @@ from taisoft.machine import summarise
 from taisoft.output.tables import percent, spread_of
 
 from .document import Limit, begin, table
-from .runner import add_named_out, make_parser, named_out, parse_result, print_result, progress, run_python, without_warnings
+from .runner import parse_result, print_result, progress, quick_options, run_python, without_warnings
 
 COR, SNH, SVK = "corotational", "stable_neo_hookean", "st_venant_kirchhoff"
 STEPS, ROUNDS = 10, 7
@@ -181,12 +181,7 @@ def ratio(values: list[float]) -> str:
 
 def main(argv=None) -> int:
     """Measure and print. Exit status: 0, or 1 if a limit is not met (not with --quick)."""
-    parser = make_parser("laws", __doc__)
-    parser.add_argument("--quick", action="store_true", help="small blocks, two rounds, two laws, no limits")
-    add_named_out(parser)
-    parser.set_defaults(arch="cpu")
-    options = parser.parse_args(argv)
-    options.out = named_out(options, "laws")
+    options = quick_options("laws", __doc__, argv, "small blocks, two rounds, two laws, no limits")
     document, numbers = begin("Laws from their energy densities", "arch cpu")
     with without_warnings():
         register()

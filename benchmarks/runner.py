@@ -60,6 +60,17 @@ def named_out(options: argparse.Namespace, name: str) -> Path | None:
     return out
 
 
+def quick_options(name: str, doc: str, argv: list[str] | None, quick: str) -> argparse.Namespace:
+    """Parse --quick and --out [FILE.json] of a benchmark on the CPU. quick: help of --quick. Raises OutputError."""
+    parser = make_parser(name, doc)
+    parser.add_argument("--quick", action="store_true", help=quick)
+    add_named_out(parser)
+    parser.set_defaults(arch="cpu")
+    options = parser.parse_args(argv)
+    options.out = named_out(options, name)
+    return options
+
+
 def parse_options(parser: argparse.ArgumentParser, argv: list[str] | None, drawn: str = "") -> argparse.Namespace:
     """Add --arch, --out and, if something is drawn, --plot; parse, and check that the files can be written."""
     add_arch(parser)

@@ -20,10 +20,8 @@ from taisoft.scene.laws import LAWS
 from taisoft.scene.rigid import RigidBody
 from taisoft.scene.scene import Body, Scene
 
-ADDITIONS: tuple = (
-    fibres,
-    viscosity,
-)  # modules, see `laws.additions`; each has `applies(body)`, and SWITCH if the plan turns it off
+# see `laws.additions`; each has `applies(body)`, and SWITCH if the plan may turn it off
+ADDITIONS = (fibres, viscosity)
 
 
 def additions_of(body: Body, on: dict[str, bool]) -> tuple[int, ...]:

@@ -8,6 +8,7 @@ Am. J. Physiol. 213, 1967, in the isotropic form of Demiray, J. Biomech. 5, 1972
 
 import numpy as np
 
+from taisoft.errors import SceneError
 from taisoft.scene.law import Law, Parameter
 
 LARGEST_EXPONENT = 40.0  # of Fung's law: beyond, its exponential becomes a parabola, since f32 ends at exp(88)
@@ -81,3 +82,10 @@ SHIPPED = (
     Law("ogden", ogden, _OGDEN, _volume, "bulk"),
 )
 LAWS: dict[str, Law] = {law.name: law for law in SHIPPED}  # `fem.laws.registration` adds others
+
+
+def registered(name: str, what: str = "") -> Law:
+    """Return the law of a name. what: start of messages. Raises SceneError if this process does not know it."""
+    if name not in LAWS:
+        raise SceneError(f"{what}law {name!r} is not registered in this process: call ts.register_law before")
+    return LAWS[name]

@@ -11,7 +11,7 @@ from taisoft.attributes import FrozenDict, guarded_record
 from taisoft.errors import SceneError, value_text
 from taisoft.scene import checks
 from taisoft.scene.law import Law
-from taisoft.scene.laws import LAWS
+from taisoft.scene.laws import LAWS, registered
 
 FIBRE_NUMBERS = ("fibre_stiffness", "fibre_exponent", "active_stress", "active_strain")  # see `fem.laws.fibres`
 MAX_BRANCHES = 8
@@ -107,9 +107,7 @@ class Material:
 
     def check_law(self, what: str) -> None:
         """Raise SceneError if the law is not registered, or has been anew since. what: start of messages."""
-        law = LAWS.get(self.law)
-        if law is None:
-            raise SceneError(f"{what}: law {self.law!r} is not registered in this process: call ts.register_law before")
+        law = registered(self.law, f"{what}: ")
         is_known = law.parameters.keys() == self.parameters.keys()
         if not is_known or (law.parameters and law.moduli(self.parameters) != (self.young, self.poisson)):
             raise SceneError(f"{what}: law {self.law!r} has been registered anew since its material was made: make that anew")

@@ -9,7 +9,7 @@ For mean dilatation a law is psi(F; mu, lambda) = psi(F; mu, 0) + lambda/2 theta
 theta, and `dilatation_gradient`. p then has one more entry at its end, a pressure q [Pa], for which `pk1`, `prepare`, `dpk1`,
 `block` and `hessian_eigen` are those of psi(F; p) + q theta(F).
 
-A law that is not isotropic, or one with `Additions`, has `prepare_projected(F, p)` and `dpk1_projected(S, D)` instead of
+A law that is not isotropic, or one `WithAdditions`, has `prepare_projected(F, p)` and `dpk1_projected(S, D)` instead of
 `hessian_eigen`: a positive semi-definite part of its second derivative.
 """
 
@@ -19,13 +19,12 @@ from weakref import WeakKeyDictionary
 import taichi as ti
 
 from taisoft.backend.tracing import untraced
-from taisoft.errors import SceneError
 from taisoft.fem.laws import corotational, st_venant_kirchhoff, stable_neo_hookean
 from taisoft.fem.laws.additions import WithAdditions
 from taisoft.fem.laws.from_energy import EnergyLaw, lanes_of
 from taisoft.fem.laws.projection import dpk1_isotropic, prepare_isotropic
-from taisoft.scene import laws
 from taisoft.scene.law import Law
+from taisoft.scene.laws import registered
 
 # written by hand
 LAWS = {law.NAME: law for law in (st_venant_kirchhoff, corotational, stable_neo_hookean)}
@@ -41,9 +40,7 @@ _made: "WeakKeyDictionary[Law, EnergyLaw]" = WeakKeyDictionary()  # each is comp
 
 def lane_law(name: str) -> Any:
     """The law of a name in lanes."""
-    law = laws.LAWS.get(name)
-    if law is None:
-        raise SceneError(f"law {name!r} is not registered in this process: call ts.register_law before")
+    law = registered(name)
     if law.psi is None:
         return law.functions or LAWS[name]
     if law not in _made:

@@ -27,11 +27,16 @@ def _store(out: ti.template(), b, A, lanes: ti.template()):
             out[b, k, q] = A[k][q]
 
 
+@ti.func
+def _constants(law: ti.template(), p: ti.template(), lanes: ti.template()):
+    return [ti.Vector([p[k] for q in ti.static(range(lanes))]) for k in ti.static(range(n_constants(law)))]
+
+
 @kernel
 def _evaluate(law: ti.template(), lanes: ti.template(), F: ARRAY, p: ARRAY, psi: ARRAY, P: ARRAY):
     for b in range(F.shape[0]):
         G = _load(F, b, lanes)
-        c = [ti.Vector([p[k] for q in ti.static(range(lanes))]) for k in ti.static(range(n_constants(law)))]
+        c = _constants(law, p, lanes)
         energy = law.psi(G, c)
         stress = law.pk1(G, c)
         _store(P, b, stress, lanes)
@@ -44,7 +49,7 @@ def _differential(law: ti.template(), projected: ti.template(), lanes: ti.templa
     for b in range(F.shape[0]):
         G = _load(F, b, lanes)
         H = _load(D, b, lanes)
-        c = [ti.Vector([p[k] for q in ti.static(range(lanes))]) for k in ti.static(range(n_constants(law)))]
+        c = _constants(law, p, lanes)
         if ti.static(projected):
             _store(P, b, dpk1_projected(law, prepare_projected(law, G, c), H), lanes)
         else:
@@ -154,7 +159,7 @@ def evaluate_blocks(law: str, F: np.ndarray, **numbers: float) -> np.ndarray:
 def _block(law: ti.template(), a: ti.i32, b: ti.i32, lanes: ti.template(), F: ARRAY, p: ARRAY, P: ARRAY):
     for n in range(F.shape[0]):
         G = _load(F, n, lanes)
-        c = [ti.Vector([p[k] for q in ti.static(range(lanes))]) for k in ti.static(range(n_constants(law)))]
+        c = _constants(law, p, lanes)
         ga = [0.0 * G[k] + ti.cast(a == k, ti.i32) for k in ti.static(range(3))]
         gb = [0.0 * G[k] + ti.cast(b == k, ti.i32) for k in ti.static(range(3))]
         _store(P, n, law.block(G, law.prepare(G, c), ga, gb), lanes)
@@ -174,7 +179,7 @@ def evaluate_dilatation(law: str, F: np.ndarray, **numbers: float) -> tuple[np.n
 def _dilatation(law: ti.template(), lanes: ti.template(), F: ARRAY, p: ARRAY, theta: ARRAY, G: ARRAY, P: ARRAY):
     for n in range(F.shape[0]):
         A = _load(F, n, lanes)
-        c = [ti.Vector([p[k] for q in ti.static(range(lanes))]) for k in ti.static(range(n_constants(law)))]
+        c = _constants(law, p, lanes)
         with_pressure, without = law.pk1(A, c + [1.0 + 0.0 * A[0]]), law.pk1(A, c)
         _store(P, n, [with_pressure[k] - without[k] for k in ti.static(range(9))], lanes)
         _store(G, n, law.dilatation_gradient(A), lanes)

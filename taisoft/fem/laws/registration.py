@@ -69,7 +69,7 @@ def register_law(
             del LAWS[name]
         else:
             LAWS[name] = before  # at its place among the others
-        free = [f"{key} = 1" for key, one in law.parameters.items() if one.default is None]
+        free = [f"{key} = {one.sample:g}" for key, one in law.parameters.items() if one.default is None]
         if isinstance(error, SceneError) and "unstable at rest" in str(error) and free:
             rule = f"checked with {', '.join(free)}: give a Parameter a default to check the law with another"
             raise SceneError(f"{error} ({rule})") from None
