@@ -45,7 +45,7 @@ class EnergyCheck:
         """Check the energies at the end of a step or batch."""
         driven, self._driven = self._driven, self._sim._host().is_driven
         overlap_resolved = self._sim.scene.allow_initial_overlap and report.max_penetration > 0.0
-        if driven or self._driven or overlap_resolved:
+        if driven or self._driven or overlap_resolved or self._sim.settings.static:
             self._start(report)
             return
         if self._first and report.n_contacts:

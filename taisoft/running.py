@@ -62,7 +62,7 @@ def run(
     on_iteration: IterationCallback | None = None,
     details: tuple[str, ...] = (),
 ) -> RunReport:
-    """Step for `seconds` [s] from now, to the nearest step, with frames at fps, or after every step if fps is None.
+    """Step for `seconds` [s] from now, to the nearest step, with frames at fps, or after every step in statics or if it is None.
 
     on_frame(sim, index, report): called for frame 0 (the start, report None) and after every frame. stop: called between steps,
     and in long ones; True ends the run. dt is lowered once to the next divisor of 1/fps, or rounded to one within NEAR of it,
@@ -79,6 +79,7 @@ def run(
     A simulator with a tolerance first chooses integrator and dt by pilots, unless the run is resumed; the report then holds the
     error in time.
     """
+    fps = None if sim.settings.static else fps
     if error_mesh is not None and not error:
         raise SimulationError("error_mesh needs error=True")
     seconds = checks.number(seconds, "seconds", above=0.0, unit="s", error=SimulationError)

@@ -6,15 +6,16 @@ import numpy as np
 
 from taisoft.attributes import guarded_record
 from taisoft.contact import SOLVERS as EXPLICIT_CONTACT
-from taisoft.dynamics.schemes import EXPLICIT, INTEGRATORS, is_multistep, takes_contacts
+from taisoft.dynamics.schemes import CHOICES, EXPLICIT, STATIC, is_multistep, takes_contacts
 from taisoft.errors import SceneError, SimulationError
 from taisoft.scene import checks
+from taisoft.scene.holding import check_held
 from taisoft.scene.plan import Plan, make_plan
 from taisoft.scene.scene import Scene
 
 IMPLICIT_CONTACT = ("augmented_lagrangian",)
 # Integrators that can keep the volume of a cavity or the length of a tendon: others fix the forces before the end of a step
-WITH_MULTIPLIERS = ("implicit_euler", "bdf2")
+WITH_MULTIPLIERS = ("implicit_euler", "bdf2", STATIC)
 CONTACT_SOLVERS = ("auto", *EXPLICIT_CONTACT, *IMPLICIT_CONTACT)
 
 
@@ -35,11 +36,17 @@ class Settings:
     contact_tolerance: float | None = None
     draggable: bool = False
     tolerance: float | None = None  # of a run's positions, over the largest excursion
+    ramp: float | None = None  # [s] in which constant loads and gravity grow from 0; of statics only
 
     @property
     def explicit(self) -> bool:
         """Whether the integrator is explicit."""
         return self.integrator in EXPLICIT
+
+    @property
+    def static(self) -> bool:
+        """Whether steps are load steps, without inertia."""
+        return self.integrator == STATIC
 
 
 NAMES = tuple(field.name for field in dataclasses.fields(Settings))
@@ -57,7 +64,7 @@ def check_settings(scene: Scene, **given) -> Settings:
     settings = Settings(**given | {"dt": check_dt(given.get("dt", Settings.dt))})
     try:
         checks.check_solver(**dataclasses.asdict(settings))
-        checks.choice(settings.integrator, "integrator", INTEGRATORS)
+        checks.choice(settings.integrator, "integrator", CHOICES)
         checks.choice(settings.contact_solver, "contact_solver", CONTACT_SOLVERS)
     except SceneError as error:
         raise SimulationError(str(error)) from None
@@ -67,7 +74,7 @@ def check_settings(scene: Scene, **given) -> Settings:
     _check_multipliers(settings, scene)
     if settings.tolerance is not None:
         refuse_robots(scene, "tolerance")
-    return settings
+    return _check_static(settings, scene)
 
 
 def refuse_robots(scene: Scene, what: str) -> None:
@@ -78,7 +85,8 @@ def refuse_robots(scene: Scene, what: str) -> None:
 
 def plan_of(scene: Scene, integrator: str, self_collision: bool, draggable: bool) -> Plan:
     """Return the plan of a scene under an integrator, with the laws and the damping that its rigid bodies take on in a run."""
-    return make_plan(scene.snapshot(), integrator in EXPLICIT, is_multistep(integrator), self_collision, draggable)
+    plan = make_plan(scene.snapshot(), integrator in EXPLICIT, is_multistep(integrator), self_collision, draggable)
+    return plan.without_rates() if integrator == STATIC else plan
 
 
 def contact_solvers(integrator: str) -> tuple[str, ...]:
@@ -105,6 +113,20 @@ def kept_by_multipliers(scene: Scene) -> list[str]:
     return [f"cavity {one.name!r} of given volume" for one in cavities] + [
         f"tendon {one.name!r} of given length without a stiffness" for one in tendons
     ]
+
+
+def _check_static(settings: Settings, scene: Scene) -> Settings:
+    """Return the settings with the ramp of statics. Raises SceneError or SimulationError."""
+    if not settings.static:
+        if settings.ramp is not None:
+            raise SimulationError(f"ramp needs integrator {STATIC!r}")
+        return settings
+    if settings.tolerance is not None:
+        raise SimulationError(f"tolerance chooses steps in time, and integrator {STATIC!r} takes load steps: use error=True")
+    refuse_robots(scene, f"integrator {STATIC!r}")
+    if not scene.pushes(settings.self_collision):
+        check_held(scene)
+    return dataclasses.replace(settings, ramp=float(settings.ramp or settings.dt))
 
 
 def _check_multipliers(settings: Settings, scene: Scene) -> None:

@@ -27,7 +27,9 @@ class Simulator(Guarded):
 
     The scene is frozen. The simulator has its own copy of the scene's numbers, which its set_ methods change, as `dt` changes dt.
     dt: step [s]. integrator: "symplectic_euler" or "velocity_verlet" (explicit), "linearly_implicit_euler", "implicit_euler",
-    "implicit_midpoint" (without contacts) or "bdf2" (implicit). contact_solver: "auto"; in explicit steps also "gauss_seidel",
+    "implicit_midpoint" (without contacts) or "bdf2" (implicit); "static": each step is a load step, which ends at rest under the
+    loads, prescribed nodes and obstacles of its end, see `solve_static`; constant loads grow during `ramp` [s], by default the
+    first dt. contact_solver: "auto"; in explicit steps also "gauss_seidel",
     "coloured_gauss_seidel", "jacobi" or "hybrid", in implicit ones "augmented_lagrangian". self_collision: whether bodies touch
     themselves. precision: "f32" or "f64". arch: "cpu" or "cuda". newton_tolerance, linear_tolerance, contact_tolerance: relative;
     None: the default of the precision, for linear solves adaptive. draggable: allow `drag`.
@@ -59,6 +61,7 @@ class Simulator(Guarded):
         contact_tolerance: float | None = None,
         draggable: bool = False,
         tolerance: float | None = None,
+        ramp: float | None = None,
     ):
         given = locals()  # of the arguments alone, as long as this is the first line
         self.settings = check_settings(scene, **{name: given[name] for name in NAMES})

@@ -1,6 +1,11 @@
-"""Static equilibrium: Newton's method on the elastic forces, with load steps if the full load fails in one step."""
+"""Static equilibrium: Newton's method on the forces, in load steps where contacts, friction or the caller ask for them.
 
-from dataclasses import dataclass
+Without contacts the full load is applied in one step, and in smaller ones if that fails. With contacts each load step is a step
+of the integrator "static": implicit Euler without inertia, by the code of steps in time.
+"""
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -13,6 +18,7 @@ from taisoft.dynamics.multipliers import Multipliers
 from taisoft.dynamics.newton import solve
 from taisoft.dynamics.no_contacts import NoContacts
 from taisoft.dynamics.results import StageResult
+from taisoft.dynamics.schemes import STATIC
 from taisoft.dynamics.simulation_state import SimulationState
 from taisoft.dynamics.stage import Stage
 from taisoft.dynamics.stage_system import StageSystem
@@ -23,62 +29,114 @@ from taisoft.fem.model import Layout
 from taisoft.fem.pressure import cavity_form
 from taisoft.fem.spring_table import SpringTable
 from taisoft.fem.state import ELASTIC, N_INVERTED
+from taisoft.records import ErrorEstimate, StepReport
 from taisoft.scene import checks
+from taisoft.scene.holding import check_held
 from taisoft.scene.plan import make_plan
 from taisoft.scene.scene import Scene
+from taisoft.settings import check_count
+
+if TYPE_CHECKING:
+    from taisoft.collision.contacts import Contacts
+    from taisoft.simulator import Simulator
 
 MAX_NEWTON = 100
 SMALLEST_LOAD_STEP = 1.0 / 256.0
 
 
 @dataclass(frozen=True)
-class StaticResult:
-    """A state of equilibrium, or the closest one found."""
+class LoadStep:
+    """A state of equilibrium at the end of a load step."""
 
-    converged: bool  #: the residual is within the tolerance, for the whole load
+    time: float  # [s]
+    x: np.ndarray  # (n_nodes, 3) [m]
+    reactions: np.ndarray  # (n_nodes, 3) [N]
+    amplitudes: np.ndarray  # loads that are one number, see `SceneLoads`
+    cavity_pressures: dict[str, float]  # [Pa]
+    contacts: "Contacts | None" = None  # None where nothing can touch
+    on_pairs: dict[tuple[str, str], np.ndarray] = field(default_factory=dict)  # force [N] and torque [N m] on the first, (6,)
+
+
+@dataclass(frozen=True)
+class StaticResult:
+    """States of equilibrium, by load step, or the closest ones found. `step` counts load steps, from 0 or back from -1."""
+
+    converged: bool  #: the residual is within the tolerance in every load step, for the whole load
     load: float  #: fraction of the load for which equilibrium was found; below 1 the state is that of the last, failed attempt
     at_rounding: bool  #: the residual is down at the rounding of the forces, so no tolerance below it can be met
     residual: float  #: |force on free axes| / |applied load|, without load relative to the constraint forces
-    iterations: int  #: of Newton's method, over all load steps; at most as many as in an implicit step
+    iterations: int  #: of Newton's method, over all load steps
     linear_iterations: int  #: of conjugate gradients
     multigrid_solves: int  #: linear systems that multigrid preconditioned
-    load_steps: int  #: steps that the load was applied in
+    load_steps: int  #: steps that the load was applied in, with the parts of those that were cut
     elastic: float  #: stored energy [J]
     n_inverted: int  #: tets with J <= 0
     imbalance: str  #: the node where forces are least balanced, and the largest of them, if it has not converged
     _scene: Scene
     _layout: Layout
-    _positions: np.ndarray
-    _reactions: np.ndarray
-    _pressures: dict[str, float]
     _springs: SpringTable | None
-    _amplitudes: np.ndarray
+    _states: tuple[LoadStep, ...]
+    step_reports: tuple[StepReport, ...] = ()  #: one a load step, of solves with contacts or `steps`
+    problems: tuple[str, ...] = ()  #: sentences, as of a `RunReport`
+    error_estimate: ErrorEstimate | None = None  #: with error=True; its error in time is that of the load steps
 
     __repr__ = short_repr
 
-    def positions(self, name: str | None = None) -> np.ndarray:
+    @property
+    def times(self) -> np.ndarray:
+        """Times (n_steps,) [s] of the ends of the load steps."""
+        return np.array([state.time for state in self._states])
+
+    def positions(self, name: str | None = None, step: int = -1) -> np.ndarray:
         """Positions (n_nodes, 3) [m] of a body, or of all bodies concatenated."""
-        return self._positions[self._rows(name)].copy()
+        return self._at(step).x[self._rows(name)].copy()
 
-    def reactions(self, name: str | None = None) -> np.ndarray:
+    def reactions(self, name: str | None = None, step: int = -1) -> np.ndarray:
         """Constraint forces (n_nodes, 3) [N] of a body, or of all bodies concatenated."""
-        return self._reactions[self._rows(name)].copy()
+        return self._at(step).reactions[self._rows(name)].copy()
 
-    def cavity_volume(self, name: str) -> float:
+    def contacts(self, step: int = -1) -> "Contacts":
+        """The contacts of a load step, as of `Simulator.contacts`: `impulse / duration` is the force [N] of each.
+
+        Raises SceneError if nothing can touch.
+        """
+        if (found := self._at(step).contacts) is None:
+            raise SceneError("contacts: nothing in the scene can touch")
+        return found
+
+    def contact_force(self, name: str, other: str | None = None, step: int = -1) -> np.ndarray:
+        """Contact force (3,) [N] on a body or an obstacle, from all others or from `other`. Raises SceneError."""
+        return self._on(name, other, step)[:3]
+
+    def contact_torque(self, name: str, other: str | None = None, step: int = -1) -> np.ndarray:
+        """Torque (3,) [N m] of `contact_force`, about a body's centre of mass or an obstacle's pivot. Raises SceneError."""
+        return self._on(name, other, step)[3:]
+
+    def cavity_volume(self, name: str, step: int = -1) -> float:
         """Volume [m^3] of a cavity."""
-        return cavity_form(self._scene, name).value_and_gradient(self._positions)[0]
+        return cavity_form(self._scene, name).value_and_gradient(self._at(step).x)[0]
 
-    def cavity_pressure(self, name: str) -> float:
+    def cavity_pressure(self, name: str, step: int = -1) -> float:
         """Pressure [Pa] in a cavity."""
         self._scene.cavity(name)
-        return self._pressures[name]
+        return self._at(step).cavity_pressures[name]
 
-    def tension(self, name: str) -> float:
+    def tension(self, name: str, step: int = -1) -> float:
         """Tension [N] of a spring or tendon; negative: it pushes. Raises SceneError."""
         names = [one.name for one in (*self._scene.springs, *self._scene.tendons)]
         checks.index(name, names, "tension: no spring or tendon")
-        state = self._positions, np.zeros_like(self._positions), self._amplitudes
-        return float(self._springs.tensions(*state)[self._springs.elements[name]][0])
+        x, amplitudes = self._at(step).x, self._at(step).amplitudes
+        return float(self._springs.tensions(x, np.zeros_like(x), amplitudes)[self._springs.elements[name]][0])
+
+    def _at(self, step: int) -> LoadStep:
+        n = len(self._states)
+        return self._states[checks.whole(step, "step", range(-n, n))]
+
+    def _on(self, name: str, other: str | None, step: int) -> np.ndarray:
+        for one in (name, *(() if other is None else (other,))):
+            self._scene.collider(one)
+        found = [own for pair, own in self._at(step).on_pairs.items() if pair[0] == name and other in (None, pair[1])]
+        return np.sum(found, axis=0) if found else np.zeros(6)
 
     def _rows(self, name: str | None) -> slice:
         if name is None:
@@ -87,20 +145,49 @@ class StaticResult:
 
 
 def solve_static(
-    scene: Scene, tolerance: float = 1e-6, precision: str = "f64", arch: str = "cpu", time: float = 0.0
+    scene: Scene,
+    tolerance: float = 1e-6,
+    precision: str = "f64",
+    arch: str = "cpu",
+    time: float | None = None,
+    steps: int | None = None,
+    self_collision: bool = False,
+    error: bool = False,
+    error_mesh: str | Scene | None = None,
 ) -> StaticResult:
-    """Find the rest state under gravity, loads and constraints; prescribed nodes and loads follow their paths at `time` [s].
+    """Find states of rest under gravity, loads, constraints and contacts with friction.
 
-    tolerance: on |residual on free axes| / |applied load| (without load, relative to the constraint forces). An open f64
-    runtime is reused; otherwise one is opened and closed. Contact is ignored, and Maxwell branches are relaxed. Raises SceneError
-    if a body is not constrained along every axis, the scene has obstacles and contact forces, or `time` is no finite number,
-    SimulationError if the runtime is in use. A solve that does not converge returns converged=False.
+    tolerance: on |residual on free axes| / |applied load| (without load, relative to the constraint forces); with contacts
+    relative to all forces.
+    Without contacts, and without `steps`, prescribed nodes and loads have their values at `time` (default 0) [s].
+    With contacts that may act, or `steps`, the load is applied in `steps` load steps (default 1), each cut where it does not
+    converge: prescribed nodes, obstacles and loads that have paths follow them from 0 to `time` (default 1) [s], constant loads
+    and gravity grow from 0. Each load step is one of backward Euler for friction: displacements since its start count as slip, so
+    that with friction the result depends on `steps`; error=True estimates by how much, with twins of other load steps and tighter
+    tolerances, and with error_mesh the error of the mesh, as `Simulator.run` does.
+    An open runtime of this precision is reused; otherwise one is opened and closed. Maxwell branches are relaxed, and nothing
+    rebounds. Raises SceneError for invalid arguments, and if nothing can hold a body, SimulationError if nothing does, or if the
+    runtime is in use. A solve that does not converge returns converged=False.
     """
     _check(scene, tolerance)
-    scene = scene.snapshot()  # in which rigid bodies are as stiff as the others ask for
-    time = checks.number(time, "time")
     kind = open_kind()
     arch = kind[0] if kind is not None and kind[1] == precision else arch
+    if steps is not None or scene.pushes(self_collision):
+        return _solve_in_steps(
+            scene,
+            1.0 if time is None else checks.number(time, "time", above=0.0, unit="s"),
+            1 if steps is None else check_count("steps", steps),
+            {"error": error, "error_mesh": error_mesh},
+            newton_tolerance=tolerance,
+            self_collision=self_collision,
+            precision=precision,
+            arch=arch,
+        )
+    if error or error_mesh is not None:
+        raise SceneError("solve_static: error needs steps, or a scene with contacts")
+    check_held(scene)
+    scene = scene.snapshot()  # in which rigid bodies are as stiff as the others ask for
+    time = 0.0 if time is None else checks.number(time, "time")
     runtime = open_runtime(arch, precision, "solve_static")
     arena, solver = FieldArena(), None
     try:
@@ -119,43 +206,61 @@ def _check(scene: Scene, tolerance: float) -> None:
     scene.check()
     if isinstance(tolerance, bool) or not isinstance(tolerance, (int, float)) or not 0.0 < tolerance < 1.0:
         raise SceneError(f"tolerance = {tolerance!r}: it must lie between 0 and 1")
-    if scene.obstacles and scene.contact_forces:
-        raise SceneError(
-            f"solve_static models no contact, and '{scene.obstacles[0].name}' is an obstacle: take implicit_euler steps with "
-            "mass_damping in the materials until the bodies rest (contact_forces = False would solve another problem)"
+
+
+def _solve_in_steps(scene: Scene, time: float, steps: int, estimate: dict, **settings) -> StaticResult:
+    """Solve as a run of the integrator "static" for `time` [s]. estimate, settings: arguments of that run and its simulator."""
+    from taisoft.simulator import Simulator
+
+    states: list[LoadStep] = []
+    with Simulator(scene.snapshot(), dt=time / steps, integrator=STATIC, ramp=time, **settings) as sim:
+        state = sim._host().state
+        run = sim.run(
+            time, fps=None, on_frame=lambda sim, index, report: states.append(_load_step(sim)) if index else None, **estimate
         )
-    held = {body.name: np.any([c.axes for c in body.constraints], axis=0) for body in scene.bodies if body.constraints}
-    for names in _connected(scene):
-        together = np.any([held.get(name, np.zeros(3, dtype=bool)) for name in names], axis=0)
-        held |= dict.fromkeys(names, together | any(name not in [body.name for body in scene.bodies] for name in names))
-    for body in scene.bodies:
-        constrained = held.get(body.name, np.zeros(3, dtype=bool))
-        if not constrained.all():
-            missing = "".join(a for a, is_constrained in zip("xyz", constrained, strict=True) if not is_constrained)
-            raise SceneError(f"body '{body.name}': nothing holds it along {missing}, so it has no static state")
+        reports = run.step_reports
+        if run.status == "failed":
+            raise SimulationError(f"solve_static: {run.problems[-1]}")
+        return StaticResult(
+            converged=all(one.converged and not one.n_inverted for one in reports),
+            load=max([one.time for one in reports if one.converged and not one.n_inverted], default=0.0) / time,
+            at_rounding=False,
+            residual=max(one.residual for one in reports),
+            iterations=sum(one.newton_iterations for one in reports),
+            linear_iterations=sum(one.linear_iterations for one in reports),
+            multigrid_solves=sum(one.multigrid_solves for one in reports),
+            load_steps=sum(one.substeps for one in reports),
+            elastic=reports[-1].elastic,
+            n_inverted=reports[-1].n_inverted,
+            imbalance="; ".join(text for one in reports if not one.converged for text in one.problems),
+            _scene=sim.scene,
+            _layout=state.layout,
+            _springs=state.springs,
+            _states=tuple(states),
+            step_reports=tuple(reports),
+            problems=tuple(run.problems),
+            error_estimate=run.error_estimate,
+        )
 
 
-def _connected(scene: Scene) -> list[set[str]]:
-    """Return the names of bodies and obstacles that connections join, a set for each group."""
-    groups: list[set[str]] = []
-    for one in scene.connections:
-        joined = [group for group in groups if group & set(one.owners)]
-        groups = [group for group in groups if group not in joined] + [set(one.owners).union(*joined)]
-    return groups
+def _load_step(sim: "Simulator") -> LoadStep:
+    """Return the present state of a simulator in statics."""
+    state, pairs = sim._host().state, sim.pairs_in_contact()
+    on_pairs = {
+        (a, b): np.concatenate([sim.contact_force(a, b), sim.contact_torque(a, b)]) for one in pairs for a, b in (one, one[::-1])
+    }
+    fraction = min(1.0, sim.time / state.ramp)
+    amplitudes, pressures = state.amplitudes(sim.time, fraction), state.cavity_pressures_by_name(sim.time, fraction)
+    contacts = sim.contacts() if sim.touches else None
+    return LoadStep(sim.time, sim.positions(), sim.reactions(), amplitudes, pressures, contacts, on_pairs)
 
 
 class StaticSolver:
     """Static solver of a scene in an open runtime; each call of `solve` starts from the rest positions."""
 
     def __init__(self, scene: Scene, runtime: Runtime, arena: FieldArena, tolerance: float, time: float):
-        plan = make_plan(scene, explicit=False, multistep=False)
-        model, layout = build_model(
-            scene,
-            runtime,
-            arena,
-            plan.on
-            | dict.fromkeys(("mass_damping", "stiffness_damping", "spring_damping", "consistent_mass", "viscosity"), False),
-        )
+        plan = make_plan(scene, explicit=False, multistep=False).without_rates()
+        model, layout = build_model(scene, runtime, arena, plan.on)
         self.simulation = SimulationState(scene, runtime, arena, model, layout, DirichletConditions(scene, layout))
         self.multipliers, self.time = None, time
         if len(self.simulation.loads.multipliers):
@@ -215,14 +320,6 @@ class StaticSolver:
         self.multigrid += result.multigrid_solves
         return result
 
-    def _residual(self, result: StageResult) -> float:
-        """The residual of the result; 0 without load and constraint forces, where it would be rounding over rounding."""
-        m, active = self.simulation.model, self.simulation.loads.activations
-        applied = [np.delete(full, active) if field is m.amplitudes else full for field, _, full in self.loads]
-        loaded = self.gravity.any() or any(full.any() for full in applied) or self.multipliers is not None
-        only_rounding = not loaded and np.linalg.norm(self.solver.held_residual()) <= self.solver.rounding.force
-        return 0.0 if only_rounding and result.converged else result.residual
-
     def _result(self, result: StageResult, steps: int, load: float) -> StaticResult:
         simulation = self.simulation
         measure(simulation.model)
@@ -233,7 +330,7 @@ class StaticSolver:
             converged=result.converged and load == 1.0,
             load=load,
             at_rounding=result.at_rounding,
-            residual=self._residual(result),
+            residual=result.residual,
             iterations=round(self.newton),
             linear_iterations=self.linear,
             multigrid_solves=self.multigrid,
@@ -243,9 +340,14 @@ class StaticSolver:
             imbalance="" if result.converged else describe_imbalance(simulation, self.solver, NoContacts()),
             _scene=simulation.scene,
             _layout=simulation.layout,
-            _positions=simulation.model.state.x.to_numpy(),
-            _reactions=self.solver.held_residual(),
-            _pressures=simulation.cavity_pressures_by_name(self.time),
             _springs=simulation.springs,
-            _amplitudes=simulation.amplitudes(self.time),
+            _states=(
+                LoadStep(
+                    self.time,
+                    simulation.model.state.x.to_numpy(),
+                    self.solver.held_residual(),
+                    simulation.amplitudes(self.time),
+                    simulation.cavity_pressures_by_name(self.time),
+                ),
+            ),
         )

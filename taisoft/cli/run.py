@@ -21,6 +21,7 @@ from taisoft.cli.recording import DisplayOptions, Observers, Recording, check_mo
 from taisoft.cli.scene_file import OF_SCENE, load_scene, refuse_unknown
 from taisoft.cli.summary import print_plan, print_state, print_summary
 from taisoft.cli.units import warn_millimetres
+from taisoft.dynamics.schemes import STATIC
 from taisoft.errors import SceneError, SimulationError
 from taisoft.frames import check_length, first_frame
 from taisoft.output.files import check_free
@@ -128,7 +129,7 @@ def resolve(solver: dict, arguments: Namespace, simulator_class: type, saved: di
         changed = [key for key in MAY_CHANGE if key in given]
         run_keys = {key: merged[key] for key in RUN_KEYS if key in merged}
         merged = run_keys | saved | {key: given[key] for key in changed}
-    fps = merged.get("fps", 60.0)
+    fps = None if merged.get("integrator") == STATIC else merged.get("fps", 60.0)
     return RunSettings(
         simulator={key: value for key, value in merged.items() if key not in RUN_KEYS},
         seconds=checks.number(merged.get("seconds", 1.0), "seconds", above=0.0),

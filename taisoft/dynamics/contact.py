@@ -66,7 +66,7 @@ class ContactStep:
     LEAST_DEEP = 1.0 / 16.0  # of a step: parts up to this long are kept even if they lead deeper
     WORSENING = 1.1  # growth of an existing penetration that counts as a new one
 
-    def __init__(self, simulation: SimulationState, self_collision: bool, explicit: bool):
+    def __init__(self, simulation: SimulationState, self_collision: bool, explicit: bool, static: bool = False):
         self.simulation = simulation
         model, scene = simulation.model, simulation.scene
         self.detection = Detection(scene, model, simulation.layout, simulation.runtime, self_collision)
@@ -80,7 +80,7 @@ class ContactStep:
             most = self.MOST_OFFSET * detection.margin / (SELF_CONTACT if self_collision else 1.0)
             self.contact_offset = min(self.contact_offset, most)
         # parts of a penetration and of a missing contact offset that a step corrects
-        self._corrections = (0.05, 0.005) if explicit else (0.2, 0.02)
+        self._corrections = (0.05, 0.005) if explicit else (1.0, 1.0) if static else (0.2, 0.02)
         self._substep_fraction = 1.0  # of the step, that the current substep takes
         self.gap_targets = self._gap_targets()
         self._arena = FieldArena()
@@ -202,10 +202,11 @@ class ContactStep:
     def _gap_targets(self) -> tuple[float, float, float, float]:
         """Contact offset [m]; fractions of a penetration and of a missing offset corrected per substep; maximum speed [m/s]."""
         slowest = min(b.composition.lowest_wave_speed for b in self.simulation.scene.bodies)
+        fraction = 1.0 if self._corrections[0] == 1.0 else self._substep_fraction
         return (
             self.contact_offset,
-            self._substep_fraction * self._corrections[0],
-            self._substep_fraction * self._corrections[1],
+            fraction * self._corrections[0],
+            fraction * self._corrections[1],
             self.MAX_OPENING_SPEED * slowest,
         )
 
@@ -400,7 +401,7 @@ class ContactStep:
         has_left = not self._explicit and paths.left_searched(start.x)  # explicit steps seldom do, and are many
         passes = not has_left and paths.find()
         if has_left or paths.uncovered:
-            self._search_way(time, dt, start)
+            self.search_way(time, dt, start)
             passes = paths.find(as_searched=True)
         elif passes and self._explicit:
             paths.left_searched(start.x)  # which keeps the way
@@ -419,7 +420,7 @@ class ContactStep:
         is_deep = self.relative_penetration > self._deepest or self.crossing > self._most_crossed
         if not is_deep or dt <= self.LEAST_DEEP * self._step_dt:
             return FREE
-        self._search_way(time, dt, start)
+        self.search_way(time, dt, start)
         return BLOCKED if known.issuperset(self.found_features()) else MET
 
     def refuse_fast_closing(self, dt: float) -> None:
@@ -428,7 +429,7 @@ class ContactStep:
             number = self.simulation.step_count + 1
             raise SimulationError(f"step {number}: {self.measures.describe_fast_closing(dt, PARTS)}")
 
-    def _search_way(self, time: float, dt: float, start: StepState) -> None:
+    def search_way(self, time: float, dt: float, start: StepState) -> None:
         """Search the way from a start to the present state, which stays."""
         self.paths.left_searched(start.x)
         end = self.simulation.state()

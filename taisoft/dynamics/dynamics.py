@@ -19,7 +19,7 @@ from taisoft.dynamics.no_contacts import NoContacts
 from taisoft.dynamics.prescribed_paths import PrescribedPaths
 from taisoft.dynamics.results import StepResult
 from taisoft.dynamics.robots import Robots
-from taisoft.dynamics.schemes import IMPLICIT
+from taisoft.dynamics.schemes import SCHEMES
 from taisoft.dynamics.simulation_state import SimulationState
 from taisoft.errors import SimulationError
 from taisoft.fem.build import build_model
@@ -69,13 +69,14 @@ class Dynamics:
     def _build(self, scene: Scene, settings: Settings, plan: Plan) -> None:
         model, layout = build_model(scene, self.runtime, self.arena, plan.on)
         self.state = SimulationState(scene, self.runtime, self.arena, model, layout, DirichletConditions(scene, layout))
+        self.state.ramp = settings.ramp or 0.0
         self.contact = None
         if plan.on["contact_forces"]:
             from taisoft.dynamics.contact import ContactStep
 
-            self.contact = ContactStep(self.state, settings.self_collision, settings.explicit)
+            self.contact = ContactStep(self.state, settings.self_collision, settings.explicit, settings.static)
             self._owned.append(self.contact)
-        self._self_collision = settings.self_collision
+        self._self_collision, self._static = settings.self_collision, settings.static
         self._idle_detection: Detection | None = None  # of a scene without contact forces; made on request
         self.drag_spring = DragSpring(self.state) if settings.draggable else None
         self.stepper = make_stepper(self.state, settings, self.contact or NoContacts())
@@ -274,7 +275,7 @@ class Dynamics:
         self.state.set_load_time(self.state.time)
         measure_parts(m, lanes, nodes)
         elastic = np.add.reduceat(lanes[layout.lane_of_tet], layout.tet_start[:-1])
-        kinetic, gravity, loads = np.add.reduceat(nodes, layout.node_start[:-1]).T
+        kinetic, gravity, loads = np.add.reduceat(nodes * (not self._static, 1.0, 1.0), layout.node_start[:-1]).T
         lost = np.add.reduceat(self.state.dissipated()[layout.lane_of_tet], layout.tet_start[:-1])
         return [Energies(*row) for row in zip(*(part.tolist() for part in (kinetic, elastic, gravity, loads, lost)))]
 
@@ -283,7 +284,7 @@ class Dynamics:
         self.state.set_load_time(self.state.time)
         measure(self.model)
         elastic, lowest, inverted, kinetic, gravity, _, loads = self.model.state.scalars.to_numpy()[: LOADS + 1].tolist()
-        lost = float(self.state.dissipated().sum()) if self.model.viscous else 0.0
+        lost, kinetic = float(self.state.dissipated().sum()) if self.model.viscous else 0.0, 0.0 if self._static else kinetic
         return Energies(kinetic, elastic, gravity, loads, lost), lowest, int(inverted)
 
     def describe_softening(self) -> str | None:
@@ -368,7 +369,7 @@ def make_stepper(
     simulation: SimulationState, settings: Settings, contact: "ContactStep | NoContacts"
 ) -> "ExplicitStepper | ImplicitStepper":
     """Return the stepper of checked settings."""
-    if settings.integrator in IMPLICIT:
+    if settings.integrator in SCHEMES:
         from taisoft.dynamics.implicit import ImplicitStepper
 
         return ImplicitStepper(simulation, settings, contact)

@@ -27,6 +27,8 @@ from taisoft.fem.measure import measure
 from taisoft.fem.state import N_INVERTED
 from taisoft.settings import Settings
 
+RUNAWAY = 1.9  # sizes that a piece has moved in a static part without equilibrium: nothing holds it
+
 
 class ImplicitStepper(ImplicitStages):
     """Take steps of one scheme, see above."""
@@ -89,6 +91,10 @@ class ImplicitStepper(ImplicitStages):
             result = self._hold(now, part) if is_rest else self._attempt(now, part)
             # linearly implicit stages do not iterate: shorter ones need not converge sooner
             converged = result.converged or self.scheme.one_iteration
+            if self.scheme.c == 0.0:  # where tets are inverted, it may be a state that no path leads to
+                converged = converged and self._count_inverted() == 0
+            if self.scheme.c == 0.0 and not result.converged:
+                self._refuse_runaway()
             if not self._is_spent() and length.should_halve(result.free, converged, units):
                 if not (is_finite := math.isfinite(result.residual)):
                     self.solver.linear_solver.forget()
@@ -113,6 +119,8 @@ class ImplicitStepper(ImplicitStages):
         contact, results, start, n_previous = self.contact, [], None, self.n_previous + 1
         self.start.copy_rest_from(self.simulation.now)
         contact.start_substep(dt)
+        if self.scheme.c == 0.0 and not contact.idle and contact.detection.overlay is None:
+            start = self.follow_prescribed(time, dt)
         while True:
             result = self.solve_stage(time, dt, start)
             results.append(result)
@@ -121,13 +129,26 @@ class ImplicitStepper(ImplicitStages):
             if not math.isfinite(result.residual):
                 return count_all(result, results[:-1])
             way = contact.certify(time, dt, self.start)
-            is_hopeless = not (result.converged or self.scheme.one_iteration)
+            is_hopeless = not (result.converged or self.scheme.one_iteration or self.scheme.c == 0.0)
             if way != MET or len(results) > MAX_PASSAGES or is_hopeless or self._is_spent():
                 return count_all(replace(result, free=way == FREE), results[:-1])
-            start = self.simulation.velocities()
+            if result.converged or self.scheme.c > 0.0:  # else what falls starts again, above what it meets
+                start = self.simulation.velocities()
             self.simulation.now.copy_nodes_from(self.start)
             self.n_previous = 0
             contact.search_along(time, dt)
+
+    def _refuse_runaway(self) -> None:
+        """Raise SimulationError if a body has left, in a static part that did not converge."""
+        if not self.solver.is_loose:
+            return
+        end, start = download([self.simulation.model.state.x, self.start.x])
+        far, name = self.solver.pieces.farthest(end - start)
+        if far >= RUNAWAY:
+            raise SimulationError(
+                f"step {self.simulation.step_count + 1}: nothing holds {name}: it moved by {far:.3g} times its size, and no "
+                "equilibrium was found: hold it, take smaller load steps, or simulate its motion in time"
+            )
 
     def _undo(self, discard_impulses: bool) -> None:
         """Return to the start of the part, for a shorter one. discard_impulses: they would not help it."""

@@ -30,6 +30,7 @@ from taisoft.fem.rigid_tets import begin_rigid_stage
 from taisoft.settings import Settings
 
 MAX_NEWTON, MAX_NEWTON_WITH_CONTACTS = 50, 25  # a stage that needs more has failed
+MAX_STATIC, MAX_FALL = 100, 8  # of static ones without contacts; the latter where bodies have to meet something first
 DEFAULT_TOLERANCE = {"f32": 1e-4, "f64": 1e-8}  # relative residual; f32 forces carry 1e-6 to 1e-5 of rounding
 
 
@@ -159,6 +160,23 @@ class ImplicitStages:
             self.n_previous = 0
         return result
 
+    def follow_prescribed(self, time: float, dt: float) -> np.ndarray | None:
+        """Return first velocities (n_nodes, 3) [m/s] of a static part from the present state, at which all follow the prescribed
+        nodes and nothing resists; None if these rest. What is met on that way is searched."""
+        simulation, moves = self.simulation, self.simulation.prescribed_moves(time + dt)
+        if moves is None or not np.nan_to_num(moves[1]).any():
+            return None
+        self.start.copy_nodes_from(simulation.now)
+        x, v = simulation.state()
+        v[:] = 0.0
+        v[moves[0]] = np.nan_to_num(moves[1]) / dt
+        v = self.solver.follow(v, dt)
+        simulation.set_state(x + dt * v, v)
+        v = simulation.velocities()
+        self.contact.search_way(time, dt, self.start)
+        simulation.now.copy_nodes_from(self.start)
+        return v
+
     def _prepare(self, time: float, dt: float, start: np.ndarray | None) -> tuple[Scheme, bool]:
         """Search contacts and begin the stage of a substep; return its scheme, and whether any contacts rebound."""
         simulation, model, work = self.simulation, self.simulation.model, self.solver.work
@@ -169,7 +187,7 @@ class ImplicitStages:
         self.contact.begin(time, dt)
         # multistep schemes restart at an impact: they would take the velocity jump for an acceleration
         impact = self.scheme.before and self.contact.detect_impact(dt)
-        if (bounces := self.contact.detect_rebounds(dt)) or impact:
+        if (bounces := self.scheme.c > 0.0 and self.contact.detect_rebounds(dt)) or impact:
             self.n_previous = 0
         self._dt = dt
         scheme = self.scheme if self.n_previous > 0 or self.scheme.start is None else self.scheme.start
@@ -197,7 +215,7 @@ class ImplicitStages:
 
     def _begin(self, scheme: Scheme, extrapolation: float) -> None:
         """Begin the stage from the present state."""
-        multistep, still = self.scheme.before > 0.0, float(scheme.one_iteration)
+        multistep, still = self.scheme.before > 0.0, float(scheme.one_iteration or scheme.c == 0.0)
         begin_step(
             self.simulation.model, self.solver.work, self.history, multistep, scheme.now, scheme.before, still, extrapolation
         )
@@ -222,8 +240,10 @@ class ImplicitStages:
 
     def _stage(self, scheme: Scheme, dt: float, tolerance: float) -> Stage:
         max_newton = MAX_NEWTON if self.contact.n_contacts == 0 else MAX_NEWTON_WITH_CONTACTS
+        if scheme.c == 0.0 and self.contact.n_contacts == 0:
+            max_newton = MAX_FALL if not self.contact.idle and self.solver.is_loose else MAX_STATIC
         return Stage(
-            1.0,
+            scheme.c,
             self._beta,
             dt,
             tolerance,

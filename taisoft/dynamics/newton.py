@@ -144,6 +144,11 @@ class Newton:
             return self._is_balanced or self.rounding
         return self.r <= system.floor and system.impulses_are_rounding()
 
+    @property
+    def _is_unloaded(self) -> bool:
+        """Whether all forces of a static stage are rounding, so that nothing is a scale for it."""
+        return self.stage.c == 0.0 and max(self.r, self.scale) <= self.system.floor
+
     def _find_rounding(self) -> None:
         """Find out whether |r| is only rounding after an iteration. Statics continues down to the floor."""
         near = self.r <= (Friction.ROUNDING if self.stage.c > 0.0 else 1.0) * self.system.floor
@@ -186,7 +191,7 @@ class Newton:
         return StageResult(
             self.newton,
             round(self.linear),
-            relative(self.r, self.scale),
+            0.0 if self._is_unloaded and converged else relative(self.r, self.scale),
             converged and math.isfinite(self.r),
             self.rounding or self.r <= system.floor,
             self.updates,

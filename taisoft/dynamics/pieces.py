@@ -59,6 +59,7 @@ class Pieces:
     LIMIT = 0.01  # of the forces on a piece: a larger mean residual of a linearised step means wrong motion
     NEGLIGIBLE_MOMENTUM = 1e-9  # of a piece's momentum and forces: momentum error that a step may always make
     MEAN_ROUNDING = 4.0  # times the rounding of a mean residual
+    REACH = 0.25  # of the size of a piece: the most that it moves in a static iteration where nothing resists
     ROW = 256  # least nodes of a partial sum: of larger scenes, the root of all nodes
 
     def __init__(self, simulation: SimulationState, arena: FieldArena):
@@ -74,6 +75,11 @@ class Pieces:
         self._names, self.body = [names[k] for k in np.argsort(number)], self.body[np.argsort(number)]
         component, piece = component[np.argsort(number)], number[piece]
         self.of_node, self._component = piece, component[piece]
+        rest, bodies = simulation.layout.rest, simulation.scene.bodies
+        self._size = np.array([np.ptp(rest[piece == k], axis=0).max() for k in range(n)])
+        self._mass = np.bincount(piece, self.model.mass.to_numpy(), n)
+        speed = np.array([bodies[k].composition.lowest_wave_speed for k in self.body])
+        self._softest = float((speed / self._size).min() ** 2)  # lowest E / (rho L^2) [1/s^2]
         self._free, self._any_free = np.zeros(0), False  # of the last call of `any_free`
         self._independent = np.ones(n_nodes, dtype=bool)
         if simulation.dependents is not None:
@@ -132,6 +138,28 @@ class Pieces:
             fixed = [np.bincount(self._component, held[:, axis], len(self.anchored)) for axis in range(3)]
             self._free, self._any_free = free.copy(), bool(((np.array(fixed) == 0.0) & ~self.anchored).any())
         return self._any_free
+
+    def any_loose(self, free: np.ndarray) -> bool:
+        """Return whether some component is not held along every axis, but for contacts. free: as in `any_free`."""
+        held = (free == 0.0) & self._independent[:, None]
+        fixed = [np.bincount(self._component, held[:, axis], len(self.anchored)) for axis in range(3)]
+        return bool((np.array(fixed) == 0.0).any())
+
+    def farthest(self, way: np.ndarray) -> tuple[float, str]:
+        """Return the largest mean displacement of a piece over its size, and its name. way: (n_nodes, 3) [m]."""
+        n = np.bincount(self.of_node, minlength=self.work.n)
+        mean = np.array([np.bincount(self.of_node, way[:, axis], self.work.n) for axis in range(3)]) / n
+        far = np.linalg.norm(mean, axis=0) / self._size
+        k = int(np.argmax(far))
+        return float(far[k]), self._names[k]
+
+    def proximal(self, residual: np.ndarray, beta: float, eps: float) -> float:
+        """Return c, as in c M + beta^2 K: small beside beta^2 K, but so large that no piece moves farther than REACH of its size.
+
+        residual (n_nodes, 3): [N s], on the free axes.
+        """
+        net = np.linalg.norm([np.bincount(self.of_node, residual[:, axis], self.work.n) for axis in range(3)], axis=0)
+        return max(float((beta * net / (self.REACH * self._size * self._mass)).max()), math.sqrt(eps) * beta**2 * self._softest)
 
     def forget_weights(self) -> None:
         """Let all pieces count alike, and linear solves without factors."""

@@ -1,6 +1,6 @@
 """Integrators by name. To add an implicit one, add its `Scheme` to SCHEMES.
 
-A step of an implicit integrator is one stage x = x_hat + beta v, M (v - v_hat) = beta f(x, v), solved by Newton's method.
+A step of an implicit integrator is one stage x = x_hat + beta v, c M (v - v_hat) = beta f(x, v), solved by Newton's method.
 """
 
 from dataclasses import dataclass
@@ -17,6 +17,7 @@ class Scheme:
     before: float = 0.0
     midpoint: bool = False
     one_iteration: bool = False  # linearised at x_n, one Newton step, no line search
+    c: float = 1.0  # 0: without inertia
     start: "Scheme | None" = None  # scheme of the first step, without history
 
 
@@ -40,7 +41,11 @@ SCHEMES = {
     "implicit_midpoint": Scheme(beta_over_dt=0.5, midpoint=True),
 }
 IMPLICIT = tuple(SCHEMES)
+# Equilibrium at the loads of the step's end: statics in load steps of dt. With friction each is a step of implicit Euler.
+STATIC = "static"
+SCHEMES[STATIC] = Scheme(beta_over_dt=1.0, c=0.0)
 INTEGRATORS = (*EXPLICIT, *IMPLICIT)
+CHOICES = (*INTEGRATORS, STATIC)
 SECOND_ORDER = ("velocity_verlet", "bdf2", "implicit_midpoint")  # in time, of smooth motion; others are of first order
 
 

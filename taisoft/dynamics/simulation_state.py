@@ -44,6 +44,7 @@ class SimulationState:
     releases: int = 0  # number of releases of prescribed nodes; each invalidates the steppers' history
     now: StepState = field(init=False)
     drag: tuple[np.ndarray, np.ndarray] | None = None  # nodes (k,) and forces (k, 3) [N] of a drag spring
+    ramp: float = 0.0  # [s] from the start, in which constant loads and gravity grow; statics only
     _loads: SceneLoads | None = None  # None: not computed, or outdated
     load_time: float | None = None  # of the loads on the device; None: several, or outdated
     _start: list[np.ndarray] | None = None  # free axes, positions and velocities at the start
@@ -223,29 +224,37 @@ class SimulationState:
     def set_load_time(self, time: float) -> None:
         """Upload the loads of a time [s], with the drag force, unless the device has them or they are the same at any time."""
         m = self.model
-        has_loads = m.loaded or m.amplitudes is not None
-        if not has_loads or self.load_time == time or (self.load_time is not None and not self.loads.vary):
+        has_loads = m.loaded or m.amplitudes is not None or self.ramp
+        if not has_loads or self.load_time == time or not (self.load_time is None or self.ramp or self.loads.vary):
             return
-        fields = []
+        fraction = min(1.0, time / self.ramp) if self.ramp else 1.0
+        fields = [(m.gravity, fraction * np.array(self.scene.gravity)[None])] if self.ramp else []
         if m.loaded:
-            loads = self.loads.at(time)
+            loads = self.loads.at(time, fraction)
             if self.drag is not None:
                 np.add.at(loads, *self.drag)
             fields.append((m.loads, loads))
         if m.amplitudes is not None:
-            fields.append((m.amplitudes, self.amplitudes(time)))
+            fields.append((m.amplitudes, self.amplitudes(time, fraction)))
         upload(fields)
         self.load_time = time
 
-    def amplitudes(self, time: float) -> np.ndarray:
-        """Return the loads that are one number at a time [s], with the present Lagrange multipliers."""
+    def amplitudes(self, time: float, fraction: float = 1.0) -> np.ndarray:
+        """Return the loads that are one number at a time [s], with the present Lagrange multipliers.
+
+        fraction: of the way from their values at rest to those of constant ones.
+        """
         amplitudes = self.loads.amplitudes([time])[0]
+        if fraction < 1.0:
+            n, springs = len(amplitudes), self.springs
+            rest = np.zeros(n) if springs is None else springs.rest_amplitudes(n, self.layout.rest)
+            amplitudes = np.where(self.loads.is_constant, rest + fraction * (amplitudes - rest), amplitudes)
         amplitudes[self.loads.multipliers] = self.now.multipliers
         return amplitudes
 
-    def cavity_pressures_by_name(self, time: float) -> dict[str, float]:
-        """Return the pressures [Pa] in all cavities at a time [s]."""
-        found = zip(pressures_of(self.scene), self.amplitudes(time))
+    def cavity_pressures_by_name(self, time: float, fraction: float = 1.0) -> dict[str, float]:
+        """Return the pressures [Pa] in all cavities at a time [s]; fraction: as of `amplitudes`."""
+        found = zip(pressures_of(self.scene), self.amplitudes(time, fraction))
         return {load.name: float(p) for (_, load), p in found if isinstance(load, Cavity)}
 
     def cavity_form(self, name: str) -> CavityForm:

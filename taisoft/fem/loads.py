@@ -93,9 +93,14 @@ class SceneLoads:
             rows = [[*row, *self._moving.amplitudes(float(t))] for row, t in zip(rows, times)]
         return np.array(rows).reshape(len(times), self.n_amplitudes)
 
-    def at(self, t: float) -> np.ndarray:
-        """Forces (n_nodes, 3) [N] on all nodes at t [s]. Raises SimulationError if a path fails."""
-        total = self._constant.copy()
+    @property
+    def is_constant(self) -> np.ndarray:
+        """Which amplitudes (n_amplitudes,) follow no path."""
+        return np.array([load.path is None for _, load in self._scalars] + [False] * (self.n_amplitudes - len(self._scalars)))
+
+    def at(self, t: float, fraction: float = 1.0) -> np.ndarray:
+        """Forces (n_nodes, 3) [N] on all nodes at t [s], a fraction of constant ones. Raises SimulationError if a path fails."""
+        total = fraction * self._constant
         for path in self._paths:
             total[path.nodes] += path.forces([t])[0]
         return total

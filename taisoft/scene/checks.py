@@ -253,6 +253,7 @@ SOLVER_CHECKS = {  # key of the `solver` dict -> check
     "linear_tolerance": _tolerance,
     "contact_tolerance": _tolerance,
     "tolerance": _tolerance,
+    "ramp": lambda value, what: value is None or _positive(value, what),
     "seconds": _positive,
     "fps": lambda value, what: value is None or _positive(value, what),
 }

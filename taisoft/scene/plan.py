@@ -19,6 +19,7 @@ from taisoft.scene.obstacles import Box, MeshObstacle
 from taisoft.scene.rigid import RigidBody
 from taisoft.scene.scene import Scene
 
+OF_RATES = ("mass_damping", "stiffness_damping", "spring_damping", "rigid_damping", "consistent_mass", "viscosity")
 CHANGEABLE = ("mass_damping", "stiffness_damping", *FIBRE_NUMBERS)  # numbers of a material, besides `Composition.tet_numbers`
 
 
@@ -39,6 +40,11 @@ class Plan:
     def why(self, feature: str) -> str:
         """Return why a feature is or is not modelled."""
         return next(e["why"] for e in self.entries if e["feature"] == feature)
+
+    def without_rates(self) -> "Plan":
+        """Return the plan of statics, which models nothing that depends on velocities."""
+        static = {"on": False, "why": "statics has no velocities"}
+        return Plan([one | static if one["feature"] in OF_RATES else one for one in self.entries])
 
     def add(self, feature: str, on: bool, why: str, why_not: str) -> None:
         """Add a feature with the reason for its state."""

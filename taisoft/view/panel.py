@@ -9,7 +9,7 @@ import math
 import textwrap
 from collections.abc import Callable
 
-from taisoft.dynamics.schemes import INTEGRATORS
+from taisoft.dynamics.schemes import CHOICES
 from taisoft.settings import contact_solvers
 from taisoft.view.colouring import TITLES, Colouring, following
 from taisoft.view.controls import DECADES
@@ -196,7 +196,7 @@ class Panel:
         present = (values["integrator"], values["contact_solver"])
         integrator, solver = self._solver or present
         if gui.button(f"integrator: {integrator}###integrator"):
-            integrator = following(INTEGRATORS, integrator)
+            integrator = following(CHOICES, integrator)
         solvers = ("auto", *contact_solvers(integrator))
         if solver not in solvers:
             solver = "auto"
