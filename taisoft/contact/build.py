@@ -393,12 +393,12 @@ def gap_minus_target(
     common_offset: contact offset between different bodies [m]. penetration_fraction, offset_fraction: fractions of a penetration
     and of a missing contact offset that the step corrects, at most at max_speed [m/s]. min_opening: for restitution, or 0 [m].
     least_gap: part of the contact offset to which a smaller gap opens at once.
-    Where all of a penetration is corrected, so are all gaps.
+    Where offset_fraction is 1, every gap opens to the contact offset at once.
     """
     gap, own, contact_offset = p.gap[c], _self_contact_factor(p.body[c]), contact_offset_of(p, c, common_offset)
     whole = own * common_offset  # of a guard, too, where it says what rests
     target = contact_offset
-    if gap < contact_offset and penetration_fraction < 1.0:
+    if gap < contact_offset and offset_fraction < 1.0:
         above = ti.max(gap, 0.0)
         opening = own * (offset_fraction * (contact_offset - above) + penetration_fraction * (above - gap))
         if gap >= 0.0:

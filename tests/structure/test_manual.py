@@ -21,7 +21,7 @@ import pytest
 import taisoft as ts
 from taisoft.cli import command_parser
 from taisoft.contact import SOLVERS
-from taisoft.dynamics.schemes import INTEGRATORS
+from taisoft.dynamics.schemes import CHOICES
 from taisoft.scene.laws import SHIPPED
 from taisoft.settings import IMPLICIT_CONTACT, Settings
 from taisoft.view.keys import KEYS, MOUSE
@@ -110,13 +110,13 @@ def test_the_reference_and_the_docstring_list_arguments_values_and_methods_of_a_
     parameters = inspect.signature(ts.Simulator).parameters
     assert [name for name, _, _ in rows] == list(parameters)
     values = {name: set(re.findall(r'"(\w+)"', documented)) for name, documented, _ in rows}
-    assert values["integrator"] == set(INTEGRATORS) and values["contact_solver"] == {"auto", *SOLVERS, *IMPLICIT_CONTACT}
+    assert values["integrator"] == set(CHOICES) and values["contact_solver"] == {"auto", *SOLVERS, *IMPLICIT_CONTACT}
     assert values["precision"] == {"f32", "f64"} and values["arch"] == {"cpu", "cuda"}
     for name, _, default in rows[1:]:
         assert eval(default.strip(" `")) == parameters[name].default
     assert set(Settings.__dataclass_fields__) == set(parameters) - {"scene"}
     names = set(re.findall(r'"(\w+)"', ts.Simulator.__doc__))
-    assert names == {"auto", "f32", "f64", "cpu", "cuda", *INTEGRATORS, *SOLVERS, *IMPLICIT_CONTACT}
+    assert names == {"auto", "f32", "f64", "cpu", "cuda", *CHOICES, *SOLVERS, *IMPLICIT_CONTACT}
     listed = re.search(r"autoclass:: taisoft\.Simulator\n +:members: (.*)", text("api.md"))[1].split(", ")
     own = {name for name in dir(ts.Simulator) if not name.startswith("_")}
     assert set(listed) <= own and own - set(listed) <= {"from_checkpoint", "draggable", "dragged"}
@@ -155,7 +155,7 @@ def test_the_page_lists_the_options_of_the_command():
 
 
 def test_tables_list_keys_integrators_and_laws():
-    for heading, names in (("Integrators", INTEGRATORS), ("Material law", [law.name for law in SHIPPED])):
+    for heading, names in (("Integrators", CHOICES), ("Material law", [law.name for law in SHIPPED])):
         rows = re.findall(r"^\| `(\w+)` \|", section("choosing.md", heading), re.MULTILINE)
         assert sorted(rows) == sorted(names)
     rows = re.findall(r"^\| (.*?) +\| (.*?) +\|", section("cli.md", "The live window"), re.MULTILINE)[2:]
