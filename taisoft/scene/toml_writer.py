@@ -129,6 +129,8 @@ def _solver(solver: dict) -> dict:
         plain[key] = float(value) if isinstance(value, Real) and not isinstance(value, int) else value
     for key in plain:
         checks.index(key, SOLVER_CHECKS, "solver: no setting")
+    for name, one in plain.get("quantities", {}).items():
+        checks.text(one, f"solver: quantity {name!r}, in a file,")
     try:
         check_solver(**plain)
     except SceneError as error:

@@ -7,7 +7,7 @@ import pytest
 
 import taisoft as ts
 from taisoft.errors import SimulationError
-from taisoft.estimation.estimator import Differences
+from taisoft.estimation.comparison import Differences
 from taisoft.estimation.twins import larger_steps, on_mesh, other_mesh, smaller_steps, tighter
 from taisoft.running import run
 from taisoft.stability import stable_dt
