@@ -23,7 +23,7 @@ OF_PAIRS = {  # heading of an axis, the first and the second of a pair -> query
 OF_BODIES = ("kinetic", "elastic")  # [J]
 
 
-def details_of(sim: "Simulator", wanted: tuple[str, ...], measured: "dict[str, Definition] | None" = None) -> dict[str, float]:
+def details_of(sim: "Simulator", wanted: tuple[str, ...], measured: "dict[str, Definition]") -> dict[str, float]:
     """Return numbers of sim's last step and present state, by heading. wanted: some of DETAILS; NaN: of no value."""
     found = {}
     for a, b in sim.pairs_in_contact() if "pairs" in wanted else ():
@@ -32,7 +32,7 @@ def details_of(sim: "Simulator", wanted: tuple[str, ...], measured: "dict[str, D
             found |= {heading.format(axis, a, b): value for axis, value in zip("xyz", values)}
     for body, energies in zip(sim.scene.bodies, sim._open().body_energies()) if "bodies" in wanted else ():
         found |= {f"{name} of {body.name} [J]": getattr(energies, name) for name in OF_BODIES}
-    for name, one in (measured or {}).items() if "quantities" in wanted else ():
+    for name, one in measured.items() if "quantities" in wanted else ():
         value, _ = one.measure(sim)
         found[f"quantity {name}" + (f" [{one.unit}]" if one.unit else "")] = np.nan if value is None else value
     return found

@@ -75,10 +75,9 @@ def run(
     another one: "refined", "order" (the elements' other order), or the same scene on a mesh that shares nodes. on_iteration(n):
     called a few times a second in implicit steps of more than 1 s of wall time, with their Newton iterations so far. details:
     some of "pairs", "bodies" and "quantities": each report then holds forces, torques and slip velocities of the pairs that
-    pressed in its last step, kinetic and elastic energies of bodies, and the quantities, see `StepReport.details`. quantities: by
-    name, functions of the simulator that return a number, or texts such as "contact_force.x finger fruit", see
-    `taisoft.estimation.quantities`. The report holds their values at the end and, with error=True, their errors. Functions are
-    called with the twins too, which may have another mesh: they must not choose nodes by number.
+    pressed in its last step, energies of bodies, and the quantities, see `StepReport.details`. quantities: functions of the
+    simulator that return a number, or texts such as "contact_force.x finger fruit" (docs/errors.md), by name; the report holds
+    their values at the end and, with error=True, their errors. Functions see the twins too, whose mesh may have other nodes.
     A run that fails, or that `stop` ends, does not raise: see the report's status and problems. Ctrl-C undoes the present step
     and is raised as KeyboardInterrupt; `stop` alone ends a run in another thread than the main one. Raises SimulationError for
     bad arguments, and for a twin that cannot be made. A simulator with a tolerance first chooses integrator and dt by pilots,

@@ -103,7 +103,8 @@ def run(arguments: Namespace) -> int:
             _check_time_left(sim, settings, arguments)
             with _prefix_errors(arguments.scene):
                 check_length(settings.seconds, sim.dt, settings.fps)
-                definitions(sim, settings.quantities)
+                if not definitions(sim, settings.quantities) and "quantities" in shown.details:
+                    raise SceneError("--details quantities: the run has none, give --quantity")
                 if arguments.error_mesh is not None:
                     from taisoft.estimation.twins import other_mesh  # loads modules with kernels that the run may not need
 

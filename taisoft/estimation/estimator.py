@@ -34,7 +34,8 @@ if TYPE_CHECKING:
     from taisoft.simulator import Simulator
 
 MIN_STEPS = 32  # of a run whose error is estimated by larger steps
-SOLVER_FACTOR = error_over_difference(TIGHTER, 1)  # errors are about proportional to the tolerances
+SOLVER_ORDER = 1  # errors are about proportional to the tolerances
+SOLVER_FACTOR = error_over_difference(TIGHTER, SOLVER_ORDER)
 PARTED = 0.1  # with one twin: difference, over the excursion, above which paths may have parted for good
 NEGLIGIBLE = {"f32": 1e-6, "f64": 1e-9}  # differences, over the excursion, that are rounding
 SOLVED = 0.01  # differences, over the excursion and Newton's tolerance, that come from this
@@ -207,14 +208,14 @@ class ErrorEstimator:
             for quantity in found.values():
                 quantity.notes += self.estimate().notes
             return
-        settings = self._sim.settings
-        nominal = float(nominal_order(settings.integrator, self._sim.scene, self._sim.touches))
+        settings, levels = self._sim.settings, {}
+        nominal = nominal_order(settings.integrator, self._sim.scene, self._sim.touches)
         most = 2.0 if settings.integrator in SECOND_ORDER else 1.0
-        levels = [quantities.Level("time", self._in_time, [twin.ratio for twin in self._in_time], nominal, most)]
         if self._solver is not None:
-            levels.insert(0, quantities.Level("solver", [self._solver], [TIGHTER], quantities.SOLVER_ORDER))
+            levels["solver"] = [self._solver], [TIGHTER], SOLVER_ORDER, SOLVER_ORDER
+        levels["time"] = self._in_time, [twin.ratio for twin in self._in_time], nominal, most
         if self._space is not None:
-            levels.append(quantities.Level("space", [self._space], self._width, quantities.MESH_ORDER))
+            levels["space"] = [self._space], self._width, quantities.MESH_ORDER, quantities.MESH_ORDER
         self._samples.set_errors(found, levels, self._sim.time, self._rounding)
 
     def _estimate_all(self, changed: str) -> ErrorEstimate:

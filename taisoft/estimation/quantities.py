@@ -1,17 +1,13 @@
 """Quantities of a run, such as a contact force, with errors from their values in runs of other steps, tolerances and meshes.
 
-A quantity is a function of the simulator, or a text: a kind, a dot and a component unless it is the default, and what it is of,
-    contact_force.x finger fruit        [N]    on the first by the second, or by all others; contact_torque likewise [N m]
-    reaction.y beam                     [N]    sum of the constraint forces on a body
-    displacement.y beam 4 0.5 0.5       [m]    since the start, of the point that is there at rest
-    stress.xx beam 0 0.5 0.5            [Pa]   Cauchy stress, by default von Mises, as means over the tets at each vertex
-    max_pressure ball                   [Pa]   of the contacts of a body
-Components of vectors are x, y and z, by default the length. Points are found anew in the mesh of each run.
+A quantity is a function of the simulator, or a text of a kind (KINDS), a dot and a component unless it is the default, and names:
+    contact_force.x finger fruit, contact_torque.z press, reaction.y beam, max_pressure ball
+    displacement.y beam 4 0.5 0.5, stress.xx beam 0 0.5 0.5: at a point of the body at rest, found anew in the mesh of each run
+The default is the length of a vector, and the von Mises stress, of means over the tets at each vertex.
 
-The error follows from the observed order (`order`) where there are three levels, else from a nominal one. In time that is the
-integrator's. In the mesh width, forces fall with order 1 where slip or corners rule and with 2 in smooth contact: MESH_ORDER lies
-between, and is wrong by at most a factor of 1.9 either way. Weak: two levels may agree by chance, as where a quantity is not
-monotone in the width; three show that.
+Three levels show an order, else it is assumed. In the mesh width, forces converge with order 1 where slip or corners rule and
+with 2 in smooth contact: MESH_ORDER lies between, and is wrong by less than a factor of 2 either way. Weak: two levels may agree
+by chance, as where a quantity is not monotone in the width.
 """
 
 import shlex
@@ -21,10 +17,11 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from taisoft.errors import SceneError, TaisoftError
-from taisoft.estimation.order import MIN_ORDER, error_over_difference, observed_order
+from taisoft.estimation.order import error_over_difference, observed_order
 from taisoft.output.nodal_fields import von_mises
 from taisoft.records import Quantity, RunReport
 from taisoft.scene import checks
+from taisoft.scene.body import Body
 from taisoft.scene.connection_records import MAX_OUTSIDE
 from taisoft.scene.locate import locate
 from taisoft.scene.rigid import RigidBody
@@ -34,10 +31,6 @@ if TYPE_CHECKING:
     from taisoft.simulator import Simulator
 
 MESH_ORDER = 1.5  # of quantities in the mesh width: see above
-SOLVER_ORDER = 1  # errors are about proportional to the tolerances
-
-
-# --- definitions ------------------------------------------------------------------------------------------------------
 
 
 class Definition(NamedTuple):
@@ -57,65 +50,64 @@ class Definition(NamedTuple):
 
 def definitions(sim: "Simulator", given: dict | None) -> dict[str, Definition]:
     """Return the quantities given to a run, by name. Raises SceneError for what is neither a function nor a valid text."""
-    given = checks.check_solver(quantities=given or {})["quantities"]
-    return {name: Definition(one) if callable(one) else _parsed(sim, f"quantity {name!r}", one) for name, one in given.items()}
-
-
-def _parsed(sim: "Simulator", what: str, text: str) -> Definition:
-    try:
-        kind, *words = shlex.split(text)
-    except ValueError:  # an open quotation mark, or no word
-        raise SceneError(f"{what}: {text!r} must begin with its kind, and quotation marks must be closed") from None
-    kind, _, component = kind.partition(".")
-    function, unit, names, components = KINDS[checks.choice(kind, f"{what}: its kind", tuple(KINDS))]
-    if component:
-        checks.choice(component, f"{what}: the component of {kind}", components or ("none",))
-    if not names[0] <= len(words) <= names[1]:
-        raise SceneError(f"{what}: {text!r} must name {kind}{names[2]}")
-    if names is OF_POINT:
-        words = [words[0], _point(sim, what, *words)]
-
-    def value(sim: "Simulator") -> float:
-        found = function(sim, *words)
-        if not components:
-            return found
-        if len(component) == found.ndim:
-            return found[tuple("xyz".index(axis) for axis in component)]
-        return von_mises(found) if found.ndim == 2 else np.linalg.norm(found)
-
-    if names is OF_PAIR and not sim.touches:
-        raise SceneError(f"{what}: contact forces are not simulated here")
-    try:
-        value(sim)
-    except SceneError as error:
-        raise SceneError(f"{what}: {error}") from None
-    return Definition(value, unit)
+    made = {}
+    for name, one in checks.check_solver(quantities=given or {})["quantities"].items():
+        try:
+            made[name] = Definition(one) if callable(one) else _parsed(sim, one)
+        except SceneError as error:
+            raise SceneError(f"quantity {name!r}: {error}") from None
+    return made
 
 
 def measure_at_end(sim: "Simulator", measured: dict[str, Definition], report: RunReport) -> None:
     """Add quantities of the present state to the report of a run, which one without a value degrades."""
     for name, definition in measured.items():
         value, reason = definition.measure(sim)
-        report.quantities[name] = made = Quantity(value=value, unit=definition.unit)
+        report.quantities[name] = Quantity(value=value, unit=definition.unit)
         if reason:
-            made.notes.append(f"the value of {name!r} is unknown: {reason}")
-            report.problems += made.notes
+            report.quantities[name].notes.append(f"the value of {name!r} is unknown: {reason}")
+            report.problems += report.quantities[name].notes
             report.status = "degraded" if report.status == "ok" else report.status
 
 
-def _point(sim: "Simulator", what: str, name: str, *words: str) -> np.ndarray:
-    """Return a point (3,) [m] of a body at rest."""
+# --- texts ------------------------------------------------------------------------------------------------------------
+
+
+def _parsed(sim: "Simulator", text: str) -> Definition:
+    """Return what a text means, measured once to check it. Raises SceneError."""
     try:
-        point = np.array([checks.number(float(word), f"{what}: a coordinate") for word in words])
+        kind, *words = shlex.split(text)
+    except ValueError:  # an open quotation mark, or no word
+        raise SceneError(f"{text!r} must begin with its kind, and quotation marks must be closed") from None
+    kind, _, component = kind.partition(".")
+    function, unit, (least, most, what), components = KINDS[checks.choice(kind, "its kind", tuple(KINDS))]
+    if component:
+        checks.choice(component, f"the component of {kind}", components or ("none",))
+    if not least <= len(words) <= most:
+        raise SceneError(f"{text!r} must name {kind} of {what}")
+    if most == 2 and not sim.touches:
+        raise SceneError("contact forces are not simulated here")
+    arguments = words if most < 4 else [words[0], _point(sim.scene.body(words[0]), words[1:])]
+
+    def value(sim: "Simulator") -> float:
+        found = function(sim, *arguments)
+        if len(component) == np.ndim(found):
+            return found[tuple(map("xyz".index, component))] if component else found
+        return von_mises(found) if np.ndim(found) == 2 else np.linalg.norm(found)
+
+    value(sim)
+    return Definition(value, unit)
+
+
+def _point(body: Body, words: list[str]) -> np.ndarray:
+    """Return a point (3,) [m] of a body at rest. Raises SceneError."""
+    try:
+        point = np.array([float(word) for word in words])
+        outside = float(locate(body, point[None])[2][0])
     except ValueError:
-        raise SceneError(f"{what}: {' '.join(words)!r} must be three numbers, a point of the body at rest [m]") from None
-    try:
-        body = sim.scene.body(name)
-    except SceneError as error:
-        raise SceneError(f"{what}: {error}") from None
-    outside = float(locate(body, point[None])[2][0])
+        raise SceneError(f"{' '.join(words)!r} must be three finite numbers, a point of the body at rest [m]") from None
     if outside > MAX_OUTSIDE:
-        raise SceneError(f"{what}: the point lies outside of body {name!r}, by {outside:.2g} times {body.extent}")
+        raise SceneError(f"the point lies outside of body {body.name!r}, by {outside:.2g} times {body.extent}")
     return point
 
 
@@ -137,17 +129,17 @@ def _stress(sim: "Simulator", name: str, point: np.ndarray) -> np.ndarray:
     return means[0] + np.tensordot(upper, means[1:] - means[0], 1)
 
 
-OF_PAIR = (1, 2, " of one thing that touches, or on one by another")
-OF_BODY = (1, 1, " of one body")
-OF_POINT = (4, 4, " of a body and three coordinates of a point")
-TENSOR = ("xx", "yy", "zz", "xy", "yz", "xz")
-KINDS = {  # kind -> function of a simulator and the words; unit; least and most words, and what they are; components
-    "contact_force": (lambda sim, *names: sim.contact_force(*names), "N", OF_PAIR, ("x", "y", "z")),
-    "contact_torque": (lambda sim, *names: sim.contact_torque(*names), "N m", OF_PAIR, ("x", "y", "z")),
-    "reaction": (lambda sim, name: sim.reactions(name).sum(axis=0), "N", OF_BODY, ("x", "y", "z")),
-    "displacement": (_displacement, "m", OF_POINT, ("x", "y", "z")),
-    "stress": (_stress, "Pa", OF_POINT, TENSOR),
-    "max_pressure": (lambda sim, name: sim.contact_pressure(name).pressure.max(), "Pa", OF_BODY, ()),
+PAIR = (1, 2, "one thing that touches, or on one by another")  # least and most words after the kind, and what they are
+BODY = (1, 1, "one body")
+POINT = (4, 4, "a body and three coordinates of a point")
+AXES, PLANES = ("x", "y", "z"), ("xx", "yy", "zz", "xy", "yz", "xz")
+KINDS = {  # kind -> function of a simulator, names and point; unit; words; components
+    "contact_force": (lambda sim, *names: sim.contact_force(*names), "N", PAIR, AXES),
+    "contact_torque": (lambda sim, *names: sim.contact_torque(*names), "N m", PAIR, AXES),
+    "reaction": (lambda sim, name: sim.reactions(name).sum(axis=0), "N", BODY, AXES),
+    "displacement": (_displacement, "m", POINT, AXES),
+    "stress": (_stress, "Pa", POINT, PLANES),
+    "max_pressure": (lambda sim, name: sim.contact_pressure(name).pressure.max(), "Pa", BODY, ()),
 }
 
 
@@ -155,7 +147,7 @@ KINDS = {  # kind -> function of a simulator and the words; unit; least and most
 
 
 class LevelError(NamedTuple):
-    """Error of a quantity. error: None if it cannot be told, and then the reason; order: as observed, None if assumed."""
+    """Error of a quantity. order: as observed, else None. reason: why the error is None, or the range of the values."""
 
     error: float | None
     order: float | None = None
@@ -169,7 +161,8 @@ def error_of_levels(
 
     values: (levels,), or (levels, k) at k times, of which the last counts, and the others only for the order; those of the run
     come first. sizes: (levels,) of the steps, widths or tolerances over those of the run. nominal: order assumed of two levels;
-    most: highest order that three show, since a higher one may be chance. negligible: difference that is rounding.
+    most: highest order that three show, since a higher one may be chance. negligible: difference that is rounding. Three levels
+    that approach each other, but show no order, give the range of their values; of others the error is unknown.
     """
     values, sizes = np.reshape(np.asarray(values, dtype=float), (len(sizes), -1)), np.asarray(sizes, dtype=float)
     if not np.isfinite(values[:, -1]).all():
@@ -177,30 +170,18 @@ def error_of_levels(
     finest_first = np.argsort(sizes)
     values, sizes = values[finest_first][:, np.isfinite(values).all(axis=0)], sizes[finest_first]
     differences, near, order = np.diff(values, axis=0), sizes[1] / sizes[0], None
-    largest = np.sqrt(np.mean(differences**2, axis=1))
-    if len(sizes) > 2 and largest[0] > negligible:
-        if np.sum(differences[0] * differences[1]) > 0.0:
-            order = observed_order(largest[0], largest[1], most, near, sizes[2] / sizes[1])
+    rms = np.sqrt(np.mean(differences**2, axis=1))
+    if len(sizes) > 2 and rms[0] > negligible:
+        for one in (differences, differences[:, -1:]):  # earlier ones may have parted, and be forgotten
+            fine, coarse = np.sqrt(np.mean(one**2, axis=1))
+            if order is None and np.sum(one[0] * one[1]) > 0.0:  # else not monotone
+                order = observed_order(fine, coarse, most, near, sizes[2] / sizes[1])
         if order is None:
-            return LevelError(
-                None, reason=f"its values {_listed(values[:, -1])} on three levels show no order above {MIN_ORDER:g}"
-            )
+            listed = ", ".join(f"{value:.6g}" for value in values[:, -1])
+            reason = f"its values on three levels, {listed}, show no order"
+            return LevelError(float(np.ptp(values[:, -1])) if fine <= coarse else None, reason=reason)
     assumed = nominal if order is None else order
     return LevelError(float(abs(differences[0, -1]) * error_over_difference(near, assumed) / sizes[0] ** assumed), order)
-
-
-def _listed(values: np.ndarray) -> str:
-    return ", ".join(f"{value:.6g}" for value in values)
-
-
-class Level(NamedTuple):
-    """Twins that show one kind of error. sizes: over those of the run; None where the run is compared with a better method."""
-
-    kind: str
-    twins: Sequence["Twin"]
-    sizes: Sequence[float] | None
-    nominal: float
-    most: float = 2.0
 
 
 class Samples:
@@ -220,31 +201,29 @@ class Samples:
                 value, self._reasons[name, twin] = definition.measure(sim if twin is None else twin.sim)
                 self._values.setdefault((name, twin), []).append(np.nan if value is None else value)
 
-    def set_errors(self, found: dict[str, Quantity], levels: list[Level], time: float, rounding: float) -> None:
+    def set_errors(self, found: dict[str, Quantity], levels: dict[str, tuple], time: float, rounding: float) -> None:
         """Set the errors of the quantities of a run that ended at `time` [s].
 
-        levels: the solvers first; without them nothing is solved. rounding: of values, relative to the largest.
+        levels: by kind of error, twins, and sizes, nominal and highest order as in `error_of_levels`, but sizes are None where
+        the difference itself counts; solvers first. rounding: of values, relative to the largest.
         """
         for name, quantity in found.items():
-            quantity.solver = 0.0
-            for level in levels:
-                quantity_error = self._error(name, level, rounding, quantity.solver or 0.0)
-                setattr(quantity, level.kind, quantity_error.error)
-                if quantity_error.order is not None:
-                    quantity.orders[level.kind] = quantity_error.order
-                if quantity_error.reason:
-                    quantity.notes.append(f"the error of {name!r} in {level.kind} is unknown: {quantity_error.reason}")
+            quantity.solver = 0.0  # where nothing is solved
+            for kind, (twins, *how) in levels.items():
+                error, order, reason = self._error(name, twins, *how, rounding, quantity.solver or 0.0)
+                setattr(quantity, kind, error)
+                quantity.orders |= {} if order is None else {kind: order}
+                what = "unknown" if error is None else "the range of its values"
+                quantity.notes += [f"the error of {name!r} in {kind} is {what}: {reason}"] if reason else []
             if abs(self._time - time) > 1e-9 * time:
                 quantity.notes.append(f"the errors of {name!r} are those at t = {self._time:.6g} s, where the twins meet the run")
 
-    def _error(self, name: str, level: Level, rounding: float, solved: float) -> LevelError:
-        """Return one kind of error. Differences below rounding, relative, or below the solvers' error show no order."""
-        for twin in (None, *level.twins):
-            where = "the run" if twin is None else f"the twin with {twin.what}"
+    def _error(self, name: str, twins: list, sizes: list | None, nominal: float, most: float, rounding: float, solved: float):
+        for twin in (None, *twins):
             if reason := self._reasons.get((name, twin)) or (twin and twin.failed):
-                return LevelError(None, reason=f"in {where}, {reason}")
-        values = np.array([self._values[name, twin] for twin in (None, *level.twins)])
-        if level.sizes is None:
+                return LevelError(None, reason=f"in the {f'twin with {twin.what}' if twin else 'run'}, {reason}")
+        values = np.array([self._values[name, twin] for twin in (None, *twins)])
+        if sizes is None:
             return LevelError(float(abs(values[1, -1] - values[0, -1])))
-        negligible = max(rounding * float(np.nanmax(np.abs(values))), solved)
-        return error_of_levels(values, (1.0, *level.sizes), level.nominal, level.most, negligible)
+        negligible = max(rounding * float(np.nanmax(np.abs(values))), solved)  # errors of the solvers show no order
+        return error_of_levels(values, (1.0, *sizes), nominal, most, negligible)

@@ -164,10 +164,8 @@ def _placement(sim: "Simulator") -> np.ndarray:
 
 
 def _check_start(sim: "Simulator", other: "Simulator", nodes: tuple[np.ndarray, np.ndarray], shift: np.ndarray) -> None:
-    """Raise SimulationError unless a twin on another mesh, which starts as its scene does, has the run's state.
-
-    shift: of the scenes' bodies, (k,3) [m]; they may be apart by PLACED, such as bodies that start at the contact offset.
-    """
+    """Raise SimulationError unless a twin on another mesh, which starts as its scene does, has the run's state, but for a shift
+    (k,3) [m] of at most PLACED, as of bodies that start at the contact offset."""
     own, theirs = nodes
     x, v, dt = sim.positions(), sim.velocities(), max(sim.dt, 1.0 / 60.0)
     size = np.ptp(x, axis=0).max()

@@ -129,12 +129,13 @@ def _solver(solver: dict) -> dict:
         plain[key] = float(value) if isinstance(value, Real) and not isinstance(value, int) else value
     for key in plain:
         checks.index(key, SOLVER_CHECKS, "solver: no setting")
-    for name, one in plain.get("quantities", {}).items():
-        checks.text(one, f"solver: quantity {name!r}, in a file,")
     try:
         check_solver(**plain)
     except SceneError as error:
         raise SceneError(f"solver: {error}") from None
+    for name, one in plain.get("quantities", {}).items():
+        if callable(one):
+            raise SceneError(f"solver: quantity {name!r} is a function, which a file cannot store: use a text")
     return {key: NONE_TEXT if value is None else value for key, value in plain.items()}
 
 

@@ -40,9 +40,11 @@ def test_the_order_is_that_of_all_times():
 
 
 def test_what_levels_cannot_tell_is_unknown_with_a_reason():
-    for values in ((1.0, 1.2, 0.9), (1.0, 1.2, 1.25)):  # not monotone; no order
-        error, order, reason = error_of_levels(values, (1, 2, 4), 1.0)
-        assert error is order is None and "1.2" in reason and "show no order" in reason
+    for values, range_of in (((1.0, 1.2, 1.25), None), ((1.0, 1.2, 1.1), None), ((1.0, 1.2, 0.9), 0.3), ((1.0, 1.2, 1.41), 0.41)):
+        error, order, reason = error_of_levels(values, (1, 2, 4), 1.0)  # apart, or ever nearer
+        assert error == pytest.approx(range_of) and order is None and "1, 1.2, " in reason
+    parted_first = [[1.0, 2.0], [5.0, 2.1], [2.0, 2.3]]
+    assert error_of_levels(parted_first, (1, 2, 4), 1.0) == (pytest.approx(0.1), pytest.approx(1.0), "")
     assert error_of_levels((1.0, np.nan), (1, 2), 1.0) == (None, None, "it has no value on one of the levels")
     assert error_of_levels((1.0, 1.0 + 1e-12, 1.0), (1, 2, 4), 1.0, negligible=1e-9).error < 2e-12  # rounding needs no order
 
@@ -213,6 +215,13 @@ def test_the_stress_at_a_point_is_that_of_a_uniform_state():
         assert found["mises"].value == pytest.approx(before[0, 0] - before[1, 1], rel=1e-3)
 
 
+@pytest.mark.skipif(not hasattr(ts.Simulator, "contact_pressure"), reason="there are no contact pressures yet")
+def test_the_largest_pressure_of_a_body(pushing):
+    report = pushing.run(0.1, fps=None, quantities={"p": "max_pressure block"})
+    assert report.quantities["p"].value == pytest.approx(pushing.contact_pressure("block").pressure.max())
+    assert report.quantities["p"].value > 1e3 and report.quantities["p"].unit == "Pa"
+
+
 @pytest.mark.parametrize(
     "given, message",
     [
@@ -227,7 +236,8 @@ def test_the_stress_at_a_point_is_that_of_a_uniform_state():
         ({"q": "contact_force block block"}, "exerts no net force on itself"),
         ({"q": "displacement block 1 2"}, "a body and three coordinates of a point"),
         ({"q": "displacement blok 0 0 0"}, "quantity 'q': scene: no body is called 'blok'"),
-        ({"q": "displacement block 0 0 up"}, "'0 0 up' must be three numbers"),
+        ({"q": "displacement block 0 0 up"}, "'0 0 up' must be three finite numbers"),
+        ({"q": "displacement block 0 0 nan"}, "'0 0 nan' must be three finite numbers"),
         ({"q": "displacement block 0 2 0"}, "the point lies outside of body 'block', by "),
     ],
 )

@@ -162,6 +162,8 @@ def test_scenes_that_a_file_cannot_store_are_refused(tmp_path):
     refused("the scene holds no body")
     body = scene.add_body(TURNED, ts.Material(), name="a")
     refused(r"solver: no setting is called 'dtt' \(did you mean dt\?\)", solver={"dtt": 1})
+    refused("solver: quantities must be texts or functions by name, not 3", solver={"quantities": {"q": 3}})
+    refused("solver: quantity 'q' is a function, which a file cannot store: use a text", solver={"quantities": {"q": len}})
     refused(r"end in \.toml", tmp_path / "a.tml")
     refused("needs a Scene, not dict", given={})
     refused("cannot write .*: No such file", tmp_path / "gone" / "a.toml")
