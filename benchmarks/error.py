@@ -206,7 +206,7 @@ def main(argv: list[str] | None = None) -> int:
         document.add(row_table(rows))
     if options.forces or not (options.scene or options.quick):
         forces = list(force_rows())
-        document.add(f"## Contact forces\n\n{force_table(forces)}")
+        document.add(f"## Contact forces, f64\n\n{force_table(forces)}")
     limits = [*(find_limits(rows) if rows else ()), *(force_limits(forces) if forces else ())]
     return document.finish(options, numbers | {"precision": "f32", "rows": rows, "forces": forces}, limits)
 

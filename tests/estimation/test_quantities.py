@@ -3,11 +3,13 @@ mean, and what is refused; a quantity without a value, or with none in a twin, i
 """
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 import taisoft as ts
+from benchmarks.error_quantities import FORCES, estimated
 from taisoft.errors import SceneError
 from taisoft.estimation.quantities import error_of_levels
 from taisoft.output.report import write_report
@@ -127,6 +129,14 @@ def test_the_report_shows_them(bars, tmp_path):
     assert tip["value"] == own.value and tip["space"] == own.space and tip["unit"] == "m" and tip["notes"] == own.notes
     line = f"tip = {own.value:.6g} m, errors: time {own.time:.2g}, space {own.space:.2g}, solver {own.solver:.2g}"
     assert line in repr(report) and line in report._repr_html_() and repr(own) == f"Quantity({line.removeprefix('tip = ')})"
+
+
+@pytest.mark.parametrize("n, cells", [(0, (4, 8)), (4, (8, 4)), (9, (10, 20)), (9, (20, 10)), (11, (6, 3))])
+def test_contact_forces_against_independent_references(n, cells):
+    """Of a ball on a plane, smooth and rough, of a pushed block and of a ball on a block, by a finer mesh or a coarser one."""
+    found = estimated(replace(FORCES[n], cells=cells))
+    true = abs(found.value - FORCES[n].truth)
+    assert true / WITHIN < found.space < WITHIN * true and found.solver < 1e-3 * true and not found.notes
 
 
 def raises_where(test):
