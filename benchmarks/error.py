@@ -1,13 +1,14 @@
-"""Estimated against true errors: twelve scenes of smooth motion, impacts and friction.
+"""Estimated against true errors: twelve scenes of smooth motion, impacts and friction, and contact forces with references.
 
-taisoft bench error [--scene NAME ...] [--quick] [--out [FILE.json]]
+taisoft bench error [--scene NAME ... | --forces] [--quick] [--out [FILE.json]]
 
 Each scene runs once with error=True and error_mesh="refined" (`taisoft.estimation`), in single precision. True errors are
 distances to other runs at the frames, over the largest excursion: in time to one with a sixteenth of the step in double
 precision; of the solvers to one with the same step, tolerances of 1e-9 and 1e-8 of the contact laws, in double precision; in
 space, at the nodes of the first mesh, to one on the mesh refined twice with the steps of the first, or of its twin if they are
 explicit. An excursion is the largest distance of a node from its start. Ratio: estimate over truth. Twins: their wall time over
-the run's, without that on the refined mesh. Exit status: 0, or 1 if too many ratios are outside their limits.
+the run's, without that on the refined mesh. Forces: see `error_quantities`. Exit status: 0, or 1 if too many ratios are outside
+their limits.
 """
 
 import argparse
@@ -27,6 +28,7 @@ from taisoft.scene.scene import Scene
 
 from .document import Limit, begin, table
 from .error_cases import CASES, CONTACT, SMOOTH, Case
+from .error_quantities import force_limits, force_rows, force_table
 from .runner import add_named_out, make_parser, named_out, progress, without_warnings
 
 STEPS_A_FRAME = 4  # of implicit runs: twins with four times the step then meet every frame
@@ -182,6 +184,7 @@ def parser() -> argparse.ArgumentParser:
     names = [case.name for case in CASES]
     made.add_argument("--scene", nargs="+", choices=names, metavar="NAME", help=f"only these: {', '.join(names)}")
     made.add_argument("--quick", action="store_true", help=f"only {' and '.join(QUICK)}")
+    made.add_argument("--forces", action="store_true", help="only contact forces; without --scene and --quick they follow")
     add_named_out(made)
     return made
 
@@ -192,15 +195,20 @@ def main(argv: list[str] | None = None) -> int:
     options.arch = "cpu"
     options.out = named_out(options, "error")
     document, numbers = begin("Estimated against true errors", "cpu", "f32")
-    names = options.scene or (QUICK if options.quick else [case.name for case in CASES])
-    rows, start = [], time.perf_counter()
+    names = [] if options.forces else options.scene or (QUICK if options.quick else [case.name for case in CASES])
+    rows, forces, start = [], [], time.perf_counter()
     for case in CASES:
         if case.name in names:
             progress(f"{case.name}, {time.perf_counter() - start:.0f} s")
             with without_warnings():
                 rows.append(measured(case))
-    document.add(row_table(rows))
-    return document.finish(options, numbers | {"precision": "f32", "rows": rows}, find_limits(rows))
+    if rows:
+        document.add(row_table(rows))
+    if options.forces or not (options.scene or options.quick):
+        forces = list(force_rows())
+        document.add(f"## Contact forces, f64\n\n{force_table(forces)}")
+    limits = [*(find_limits(rows) if rows else ()), *(force_limits(forces) if forces else ())]
+    return document.finish(options, numbers | {"precision": "f32", "rows": rows, "forces": forces}, limits)
 
 
 if __name__ == "__main__":

@@ -77,24 +77,44 @@ def headings(reports: list[StepReport]) -> list[str]:
 
 @dataclass
 class BodyError:
-    """Estimated errors of a body's positions, as in `ErrorEstimate`."""
+    """Estimated errors of a body's positions, as in `ErrorEstimate`. None where one is unknown."""
 
-    time: float | None = None
-    space: float | None = None
-    solver: float | None = None
+    time: float | None = None  #: of the steps
+    space: float | None = None  #: of the mesh; needs `error_mesh`
+    solver: float | None = None  #: of the solvers' tolerances
+
+    @property
+    def total(self) -> float | None:
+        """Sum of the errors that are known; None without the error in time."""
+        return None if self.time is None else self.time + (self.space or 0.0) + (self.solver or 0.0)
 
 
 @dataclass
-class ErrorEstimate:
+class Quantity(BodyError):
+    """A quantity at the end of a run, and its estimated errors in the same unit, see `Simulator.run`."""
+
+    value: float | None = None  #: None if it could not be measured; the notes say why
+    unit: str = ""  #: such as "N"; of a function it is unknown, ""
+    orders: dict[str, float] = field(default_factory=dict)  #: that three levels showed, by the kind of error
+    notes: list[str] = field(default_factory=list)  #: reasons for what is unknown, sentences
+
+    def __str__(self) -> str:
+        known = [f"{kind} {getattr(self, kind):.2g}" for kind in ERROR_KINDS if getattr(self, kind) is not None]
+        value = "unknown" if self.value is None else f"{self.value:.6g}{self.unit and ' '}{self.unit}"
+        return value + (f", errors: {', '.join(known)}" if known else "")
+
+    def __repr__(self) -> str:
+        return f"Quantity({self})"
+
+
+@dataclass
+class ErrorEstimate(BodyError):
     """Estimated error of a run's positions: the largest distance of a node from its exact place at any compared time.
 
     All errors are relative to the largest excursion, the largest distance of any node from its start. None where an error could
     not be estimated; the notes give the reason. See `Simulator.run`.
     """
 
-    time: float | None = None  #: of the steps
-    space: float | None = None  #: of the mesh; needs `error_mesh`
-    solver: float | None = None  #: of the solvers' tolerances
     excursion: float = 0.0  #: [m]
     order: float | None = None  #: in time, as observed, or assumed if one twin has a smaller step
     agree_until: float | None = None  #: where the paths of different steps part: time until which they agree [s]
@@ -105,11 +125,6 @@ class ErrorEstimate:
     twins: list[str] = field(default_factory=list)  #: how the errors were estimated, a sentence each
     notes: list[str] = field(default_factory=list)  #: reasons for caution, sentences
     wall_seconds: float = 0.0  #: of the twins, without compile time [s]; not in the run's
-
-    @property
-    def total(self) -> float | None:
-        """Sum of the errors that are known; None without the error in time."""
-        return None if self.time is None else self.time + (self.space or 0.0) + (self.solver or 0.0)
 
     def __repr__(self) -> str:
         known = [f"{kind} {percent(getattr(self, kind))} %" for kind in ERROR_KINDS if getattr(self, kind) is not None]
@@ -132,6 +147,7 @@ class RunReport:
     dt_requested: float | None = None  #: that the simulator had, where the run changed it to fit the frames [s]
     pilot_seconds: float = 0.0  #: wall time of the pilots of a run with a tolerance, without compile time [s]
     error_estimate: ErrorEstimate | None = None  #: of a run with error=True or a tolerance
+    quantities: dict[str, Quantity] = field(default_factory=dict)  #: of a run with `quantities`, at its end, by name
 
     def to_dicts(self) -> list[dict]:
         """Return the rows of steps.csv, which pandas.DataFrame takes."""
@@ -147,6 +163,7 @@ class RunReport:
         lines += [f"  {text}" for text in self.problems[:PROBLEMS_SHOWN]]
         lines += [f"  and {len(self.problems) - PROBLEMS_SHOWN} more problems"] if len(self.problems) > PROBLEMS_SHOWN else []
         lines += [f"  {self.error_estimate!r}"] if self.error_estimate is not None else []
+        lines += [f"  {name} = {quantity}" for name, quantity in self.quantities.items()]
         return "\n".join(lines)
 
     def _repr_html_(self) -> str:

@@ -12,6 +12,7 @@ from taisoft.details import detailed
 from taisoft.dynamics.newton_budget import watched
 from taisoft.energy_check import EnergyCheck
 from taisoft.errors import SimulationError, no_memory
+from taisoft.estimation.quantities import Definition, definitions, measure_at_end, with_columns
 from taisoft.frames import ROUNDING, check_length, fit_dt
 from taisoft.records import RunReport, StepReport
 from taisoft.scene import checks
@@ -61,6 +62,7 @@ def run(
     error_mesh: "str | Scene | None" = None,
     on_iteration: IterationCallback | None = None,
     details: tuple[str, ...] = (),
+    quantities: "dict[str, str | Callable[[Simulator], float]] | None" = None,
 ) -> RunReport:
     """Step for `seconds` [s] from now, to the nearest step, with frames at fps, or after every step in statics or if it is None.
 
@@ -72,12 +74,14 @@ def run(
     with other steps and tighter tolerances; the report holds it. error_mesh: also estimate the error of the mesh, by a twin on
     another one: "refined", "order" (the elements' other order), or the same scene on a mesh that shares nodes. on_iteration(n):
     called a few times a second in implicit steps of more than 1 s of wall time, with their Newton iterations so far. details:
-    "pairs", "bodies" or both: each report then holds forces, torques and slip velocities of the pairs that pressed in its last
-    step, and kinetic and elastic energies of bodies, see `StepReport.details`. A run that fails, or that `stop` ends, does not
-    raise: see the report's status and problems. Ctrl-C undoes the present step and is raised as KeyboardInterrupt; `stop` alone
-    ends a run in another thread than the main one. Raises SimulationError for bad arguments, and for a twin that cannot be made.
-    A simulator with a tolerance first chooses integrator and dt by pilots, unless the run is resumed; the report then holds the
-    error in time.
+    some of "pairs", "bodies" and "quantities": each report then holds forces, torques and slip velocities of the pairs that
+    pressed in its last step, energies of bodies, and the quantities, see `StepReport.details`. quantities: functions of the
+    simulator that return a number, or texts such as "contact_force.x finger fruit" (docs/errors.md), by name; the report holds
+    their values at the end and, with error=True, their errors. Functions see the twins too, whose mesh may have other nodes.
+    A run that fails, or that `stop` ends, does not raise: see the report's status and problems. Ctrl-C undoes the present step
+    and is raised as KeyboardInterrupt; `stop` alone ends a run in another thread than the main one. Raises SimulationError for
+    bad arguments, and for a twin that cannot be made. A simulator with a tolerance first chooses integrator and dt by pilots,
+    unless the run is resumed; the report then holds the error in time.
     """
     fps = None if sim.settings.static else fps
     if error_mesh is not None and not error:
@@ -85,8 +89,14 @@ def run(
     seconds = checks.number(seconds, "seconds", above=0.0, unit="s", error=SimulationError)
     fps = None if fps is None else checks.number(fps, "fps", above=0.0, unit="1/s", error=SimulationError)
     check_length(seconds, sim.dt, fps)
+    measured = definitions(sim, quantities)
+    details = (details,) if isinstance(details, str) else tuple(details)
+    if "quantities" in details:
+        details = tuple(name for name in details if name != "quantities")
+        on_step = with_columns(sim, measured, on_step)
     on_step = detailed(sim, details, on_step) if details else on_step
     arguments = {"on_frame": on_frame, "on_step": on_step, "error": error, "error_mesh": error_mesh, "on_iteration": on_iteration}
+    arguments |= {"measured": measured}
     if sim.settings.tolerance is None or resumed:
         report = run_steps(sim, seconds, fps=fps, stop=stop, resumed=resumed, **arguments)
         if resumed and sim.settings.tolerance is not None:
@@ -109,8 +119,9 @@ def run_steps(
     error: bool = False,
     error_mesh: "str | Scene | None" = None,
     on_iteration: IterationCallback | None = None,
+    measured: dict[str, Definition] | None = None,
 ) -> RunReport:
-    """Run as `run`, with the simulator's integrator and dt, and checked arguments."""
+    """Run as `run`, with the simulator's integrator and dt, and checked arguments. measured: its quantities."""
     report = RunReport()
     compiled = sim.compile_seconds
     clock = time.perf_counter()
@@ -122,7 +133,7 @@ def run_steps(
     elapsed_steps = round(sim.time / sim.dt) if resumed else 0  # steps of this dt since time 0
     first_step = start_count - elapsed_steps
     energy: EnergyCheck | None = None
-    estimator = sim._begin_estimate(total - elapsed_steps, error_mesh) if error else None
+    estimator = sim._begin_estimate(total - elapsed_steps, error_mesh, measured or {}) if error else None
     try:
         try:
             energy = EnergyCheck(sim)
@@ -144,8 +155,10 @@ def run_steps(
             report.problems.append(str(no_memory("the next step", failure) if isinstance(failure, MemoryError) else failure))
         except _StepStopped:
             _mark_interrupted(report)
+        measure_at_end(sim, measured or {}, report)
         if estimator is not None:
             report.error_estimate = estimator.estimate()
+            estimator.set_errors(report.quantities)
     finally:  # after Ctrl-C, too
         if estimator is not None:
             sim._end_estimate()

@@ -117,14 +117,14 @@ class Simulator(Guarded):
 
     run = running.run
 
-    def _begin_estimate(self, steps: int, mesh: str | Scene | None) -> "ErrorEstimator":
-        """Make the twins of a run of `steps` steps; see `run`."""
+    def _begin_estimate(self, steps: int, mesh: str | Scene | None, measured: dict) -> "ErrorEstimator":
+        """Make the twins of a run of `steps` steps, in which quantities are measured too; see `run`."""
         from taisoft.estimation.estimator import ErrorEstimator  # loads modules with kernels that the run may not need
 
         if self._estimator is not None:
             raise SimulationError("a run with error=True cannot be started during another one")
         commanding.refuse_commands(self, "error=True")
-        self._estimator = ErrorEstimator(self, steps, mesh)
+        self._estimator = ErrorEstimator(self, steps, mesh, measured)
         return self._estimator
 
     def _end_estimate(self) -> None:

@@ -229,7 +229,9 @@ def _add_run(add) -> None:
     option("--view", type=float, nargs=2, metavar=("AZIMUTH", "ELEVATION"), help=directions)
     option("--vtu", action="store_true", help="also write every frame as a .vtu file, and scene.pvd, which ParaView opens")
     option("--no-usd", action="store_true", help="write no scene.usdc")
-    details = "also write per step: pairs (forces, torques, slip velocities of what presses), bodies (their energies)"
+    quantity = "report a number at the end, with --error its error too: docs/errors.md lists the texts; may be repeated"
+    option("--quantity", action="append", default=[], metavar="NAME=TEXT", help=quantity)
+    details = "also write per step: pairs (forces, torques, slip velocities of what presses), bodies (their energies), quantities"
     option("--details", metavar="NAME,...", help=details)
     option("--error", action="store_true", help="estimate the error by runs with other steps and tolerances beside this one")
     option("--error-mesh", choices=("refined", "order"), help="also by one on another mesh; implies --error")

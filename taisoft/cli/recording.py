@@ -56,7 +56,7 @@ def display_options(arguments: Namespace, has_window: bool) -> DisplayOptions:
     """Return the requested display options. Raises SceneError for unknown names and for options that nothing would show."""
     pictures = arguments.out is not None and not arguments.no_frames
     layers, plots = _names("layers", arguments.layers, LAYERS), _names("plots", arguments.plots, PLOTS) or ()
-    details = _names("details", arguments.details, DETAILS) or ()
+    details = _names("details", arguments.details, (*DETAILS, "quantities")) or ()
     requested = {"video": arguments.video, "caption": arguments.caption, "plots": bool(plots)}
     requested |= {"size": arguments.size is not None, "view": arguments.view is not None}
     if not has_window:

@@ -23,6 +23,7 @@ from taisoft.cli.summary import print_plan, print_state, print_summary
 from taisoft.cli.units import warn_millimetres
 from taisoft.dynamics.schemes import STATIC
 from taisoft.errors import SceneError, SimulationError
+from taisoft.estimation.quantities import definitions
 from taisoft.frames import check_length, first_frame
 from taisoft.output.files import check_free
 from taisoft.output.report import Progress
@@ -34,7 +35,7 @@ from taisoft.simulator import Simulator
 from taisoft.view.ggui import display_missing, vulkan_missing
 from taisoft.view.plots import Plots
 
-RUN_KEYS = ("seconds", "fps")  # arguments of Simulator.run that a `solver` dict may hold too
+RUN_KEYS = ("seconds", "fps", "quantities")  # arguments of Simulator.run that a `solver` dict may hold too
 TWINS = {  # by --error-mesh
     None: "for two to three times its work",
     "refined": "the one on the refined mesh for some 10 to 40 times its work: see docs/errors.md",
@@ -45,7 +46,8 @@ MAY_CHANGE = ("dt", "arch")  # arguments of Simulator that may change when a run
 
 @dataclass
 class RunSettings:
-    """Settings of a run. simulator: arguments of Simulator; seconds [s]; fps [1/s], None for a frame per step.
+    """Settings of a run. simulator: arguments of Simulator; seconds [s]; fps [1/s], None for a frame per step; quantities: of
+    Simulator.run, by name.
 
     defaults: Simulator's own; changed: for a resumed run, the arguments that replace the checkpoint's; numbers: of the scene, by
     --set.
@@ -57,6 +59,7 @@ class RunSettings:
     defaults: dict
     changed: list[str] = field(default_factory=list)
     numbers: dict = field(default_factory=dict)
+    quantities: dict = field(default_factory=dict)
 
     def as_dict(self) -> dict:
         """Return every setting of the run by name, given or default."""
@@ -101,6 +104,8 @@ def run(arguments: Namespace) -> int:
             _check_time_left(sim, settings, arguments)
             with _prefix_errors(arguments.scene):
                 check_length(settings.seconds, sim.dt, settings.fps)
+                if not definitions(sim, settings.quantities) and "quantities" in shown.details:
+                    raise SceneError("--details quantities: the run has none, give --quantity")
                 if arguments.error_mesh is not None:
                     from taisoft.estimation.twins import other_mesh  # loads modules with kernels that the run may not need
 
@@ -136,6 +141,7 @@ def resolve(solver: dict, arguments: Namespace, simulator_class: type, saved: di
         fps=None if fps is None else checks.number(fps, "fps", above=0.0),
         defaults=defaults,
         changed=changed,
+        quantities=merged.get("quantities", {}) | _quantities(arguments.quantity),
     )
 
 
@@ -154,6 +160,15 @@ def set_given(scene: Scene, assignments: list[str]) -> dict:
         except SceneError as error:
             raise SceneError(f"--set {assignment}: {error}") from None
     return given
+
+
+def _quantities(texts: list[str]) -> dict[str, str]:
+    """Return the texts of --quantity NAME=TEXT by name. Raises SceneError."""
+    pairs = [[part.strip() for part in text.partition("=")] for text in texts]
+    for text, (name, _, what) in zip(texts, pairs):
+        if not name or not what:
+            raise SceneError(f"--quantity {text}: write NAME=TEXT, such as 'grip=contact_force.x finger fruit'")
+    return {name: what for name, _, what in pairs}
 
 
 def _number_or_list(text: str, assignment: str) -> float | int | bool | str | list | None:
@@ -176,7 +191,7 @@ def _given(arguments: Namespace, keys: list[str]) -> dict:
         if head == "solver":
             refuse_unknown([key], keys, f"--set {assignment}: ")
             given[key] = parse_scalar(text.strip(), assignment)
-    for key in ("arch", "precision", "tolerance", *RUN_KEYS):
+    for key in ("arch", "precision", "tolerance", "seconds", "fps"):
         option = getattr(arguments, key)
         if option is None:
             continue
@@ -295,6 +310,7 @@ def _run(sim, settings: RunSettings, arguments, signals, warned: list[str], save
             error_mesh=arguments.error_mesh,
             on_iteration=progress.iteration,
             details=shown.details,
+            quantities=settings.quantities,
         )
         observers.close()
         if recording is not None:

@@ -46,6 +46,8 @@ def print_summary(result: RunReport, sim, observers: Observers, recording: Recor
         _print_lines("", [f"and {len(entries) - PROBLEMS_SHOWN} more"])
     if result.error_estimate is not None:
         _print_lines("error", describe_error(result.error_estimate))
+    for name, quantity in result.quantities.items():
+        _print_lines("quantity", [f"{name} = {quantity}", *(note for note in quantity.notes if note not in result.problems)])
     print_state(sim)
     output = f"{observers.seconds:.2f} s of it for output"
     compiling = f"{result.compile_seconds:.2f} s for kernels"

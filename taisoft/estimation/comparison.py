@@ -21,6 +21,27 @@ class Error:
     max: float
 
 
+class Differences:
+    """Distances between two paths at each comparison. maxima: per body (k, n_bodies); squares: mean squares (k,)."""
+
+    def __init__(self, bodies: np.ndarray):
+        self._starts = np.flatnonzero(np.diff(bodies, prepend=-1))  # of the bodies, in the compared nodes
+        self.maxima: list[np.ndarray] = []
+        self.squares: list[float] = []
+        self.map = np.zeros(len(bodies))  # distances at the last comparison
+
+    def add(self, x: np.ndarray, other: np.ndarray) -> None:
+        """Compare positions (n,3) [m]."""
+        squared = ((x - other) ** 2).sum(axis=1)
+        self.squares.append(float(squared.mean()))
+        self.map = np.sqrt(squared)
+        self.maxima.append(np.maximum.reduceat(self.map, self._starts))
+
+    def largest(self, k: int | None = None) -> np.ndarray:
+        """Largest distance of each body over the first k comparisons (n_bodies,) [m]."""
+        return np.max(self.maxima[:k], axis=0)
+
+
 def largest_excursion(path: np.ndarray) -> float:
     """Return the largest excursion of a path (k,n,3) [m]."""
     return float(np.sqrt(((path - path[0]) ** 2).sum(axis=2).max()))

@@ -21,50 +21,34 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from taisoft.dynamics.schemes import SECOND_ORDER
+from taisoft.estimation import quantities
+from taisoft.estimation.comparison import Differences
 from taisoft.estimation.order import MESH_ORDER, MIN_ORDER, agreement, error_over_difference, nominal_order, observed_order
 from taisoft.estimation.twins import TIGHTER, Twin, larger_steps, on_mesh, smaller_steps, tighter
 from taisoft.ranges import owners
-from taisoft.records import BodyError, Energies, ErrorEstimate
+from taisoft.records import BodyError, Energies, ErrorEstimate, Quantity
+from taisoft.scene.rigid import RigidBody
 from taisoft.scene.scene import Scene
 
 if TYPE_CHECKING:
     from taisoft.simulator import Simulator
 
 MIN_STEPS = 32  # of a run whose error is estimated by larger steps
-SOLVER_FACTOR = error_over_difference(TIGHTER, 1)  # errors are about proportional to the tolerances
+SOLVER_ORDER = 1  # errors are about proportional to the tolerances
+SOLVER_FACTOR = error_over_difference(TIGHTER, SOLVER_ORDER)
 PARTED = 0.1  # with one twin: difference, over the excursion, above which paths may have parted for good
 NEGLIGIBLE = {"f32": 1e-6, "f64": 1e-9}  # differences, over the excursion, that are rounding
 SOLVED = 0.01  # differences, over the excursion and Newton's tolerance, that come from this
 
 
-class Differences:
-    """Distances between two paths at each comparison. maxima: per body (k, n_bodies); squares: mean squares (k,)."""
-
-    def __init__(self, bodies: np.ndarray):
-        self._starts = np.flatnonzero(np.diff(bodies, prepend=-1))  # of the bodies, in the compared nodes
-        self.maxima: list[np.ndarray] = []
-        self.squares: list[float] = []
-        self.map = np.zeros(len(bodies))  # distances at the last comparison
-
-    def add(self, x: np.ndarray, other: np.ndarray) -> None:
-        """Compare positions (n,3) [m]."""
-        squared = ((x - other) ** 2).sum(axis=1)
-        self.squares.append(float(squared.mean()))
-        self.map = np.sqrt(squared)
-        self.maxima.append(np.maximum.reduceat(self.map, self._starts))
-
-    def largest(self, k: int | None = None) -> np.ndarray:
-        """Largest distance of each body over the first k comparisons (n_bodies,) [m]."""
-        return np.max(self.maxima[:k], axis=0)
-
-
 class ErrorEstimator:
     """Twins of a run of `steps` steps. Call `compare` at steps for `next_comparison`; `estimate` gives the errors so far.
 
-    mesh: see `twins.on_mesh`. Raises SceneError or SimulationError if a twin cannot be made.
+    mesh: see `twins.on_mesh`; measured: the quantities of `set_errors`. Raises SceneError or SimulationError if a twin cannot be
+    made.
     """
 
-    def __init__(self, sim: "Simulator", steps: int, mesh: str | Scene | None = None):
+    def __init__(self, sim: "Simulator", steps: int, mesh: str | Scene | None, measured: dict[str, quantities.Definition]):
         begin, compiled = time.perf_counter(), sim.compile_seconds
         self._sim, self._first, self._given = sim, sim.step_count, (sim._host().changes, sim.dt)
         self._changed = ""
@@ -72,6 +56,7 @@ class ErrorEstimator:
         self._differences: dict[Twin, Differences] = {}
         self.times: list[float] = []
         self._made: ErrorEstimate | None = None  # since the last comparison
+        self._samples = quantities.Samples(measured)
         bodies = sim.scene.bodies
         self._sizes = np.array([b.n_nodes for b in bodies])
         self._bodies = owners(self._sizes)
@@ -95,6 +80,9 @@ class ErrorEstimator:
         if mesh is not None:
             twin, ratios = on_mesh(sim, mesh)
             self._space = self._add(twin)  # with another order the error is the difference itself
+            soft = [ratio for body, ratio in zip(sim.scene.bodies, ratios) if not isinstance(body, RigidBody)]
+            nearest = min((abs(np.log(ratio or 1.0)), ratio) for ratio in soft)[1] if soft else None  # to 1: the largest error
+            self._width = nearest and [nearest]
             self._space_factors = np.array([error_over_difference(r, MESH_ORDER) if r else 1.0 for r in ratios])
         self._in_time = [self._add(twin) for twin in larger_steps(sim)] if steps >= MIN_STEPS else []
         if not self._in_time:
@@ -138,6 +126,7 @@ class ErrorEstimator:
             for twin in self._twins:
                 twin.follow(steps)
         self._compare()
+        self._samples.add(self._sim, self._twins)
         self.wall_seconds += time.perf_counter() - begin - (self._sim.compile_seconds - compiled)
 
     def _change(self) -> str:
@@ -198,9 +187,13 @@ class ErrorEstimator:
     @property
     def _negligible(self) -> float:
         """Difference that shows no order [m]."""
+        return self._rounding * self._excursion
+
+    @property
+    def _rounding(self) -> float:
         settings = self._sim.settings
         solved = 0.0 if settings.explicit else settings.newton_tolerance or 0.0
-        return max(NEGLIGIBLE[settings.precision], SOLVED * solved) * self._excursion
+        return max(NEGLIGIBLE[settings.precision], SOLVED * solved)
 
     def estimate(self) -> ErrorEstimate:
         """The estimate of the run so far."""
@@ -208,6 +201,22 @@ class ErrorEstimator:
         if self._made is None or changed != self._changed:
             self._changed, self._made = changed, self._estimate_all(changed)
         return self._made
+
+    def set_errors(self, found: dict[str, Quantity]) -> None:
+        """Set the errors of quantities, which were measured at the end of the run."""
+        if self._changed or self._change() or not self.times:
+            for quantity in found.values():
+                quantity.notes += self.estimate().notes
+            return
+        settings, levels = self._sim.settings, {}
+        nominal = nominal_order(settings.integrator, self._sim.scene, self._sim.touches)
+        most = 2.0 if settings.integrator in SECOND_ORDER else 1.0
+        if self._solver is not None:
+            levels["solver"] = [self._solver], [TIGHTER], SOLVER_ORDER, SOLVER_ORDER
+        levels["time"] = self._in_time, [twin.ratio for twin in self._in_time], nominal, most
+        if self._space is not None:
+            levels["space"] = [self._space], self._width, quantities.MESH_ORDER, quantities.MESH_ORDER
+        self._samples.set_errors(found, levels, self._sim.time, self._rounding)
 
     def _estimate_all(self, changed: str) -> ErrorEstimate:
         made = ErrorEstimate(excursion=self._excursion, wall_seconds=self.wall_seconds)

@@ -26,18 +26,20 @@ TIGHTER = 0.1  # a twin's tolerances over those of the run; much less takes many
 REFINED, ORDER = "refined", "order"  # meshes of a twin, besides a scene
 MESHES = (REFINED, ORDER)
 MIN_WIDTH_RATIO = 1.2  # of two meshes: below it chance rules their difference
+PLACED = 1e-2  # largest distance of bodies in two scenes, over the size of the first
 SAME_STATE = 1e-6  # largest distance of shared nodes at the start, over the size of the scene
 
 
 class Twin:
     """One twin. Nodes `own` of the run are compared with nodes `theirs` of the twin. failed: the reason, if it did, else "".
 
-    what: in words; ratio: of its step, or mesh width, over the run's; steps: taken while the run takes `per` steps.
+    what: in words; ratio: of its step, or mesh width, over the run's; steps: taken while the run takes `per` steps. nodes: those
+    of both, and the vector [m] from where the former start to the latter.
     """
 
-    def __init__(self, what: str, sim: "Simulator", ratio: float, steps: int = 1, per: int = 1, nodes=(slice(None), slice(None))):
+    def __init__(self, what: str, sim: "Simulator", ratio: float, steps=1, per=1, nodes=(slice(None), slice(None), 0.0)):
         self.what, self.sim, self.ratio, self.steps, self.per = what, sim, ratio, steps, per
-        self.own, self.theirs = nodes
+        self.own, self.theirs, self._shift = nodes
         self.failed = ""
         self.reports = self.unconverged = 0
         self._start = sim.step_count
@@ -54,8 +56,8 @@ class Twin:
             self.failed = str(no_memory("its next step", error) if isinstance(error, MemoryError) else error)
 
     def positions(self) -> np.ndarray:
-        """Positions of the compared nodes (k,3) [m]."""
-        return self.sim.positions()[self.theirs]
+        """Positions of the compared nodes (k,3) [m], had they started where the run's did."""
+        return self.sim.positions()[self.theirs] - self._shift
 
 
 def larger_steps(sim: "Simulator") -> Iterator[Twin]:
@@ -99,13 +101,14 @@ def on_mesh(sim: "Simulator", mesh: str | Scene) -> tuple[Twin, list[float | Non
     other = type(sim)(scene, **settings | {"dt": dt / steps})
     try:
         nodes = shared_nodes(*_nodes(sim), *_nodes(other))
-        _check_start(sim, other, nodes)
+        shift = _placement(other)[nodes[1]] - _placement(sim)[nodes[0]]
+        _check_start(sim, other, nodes, shift)
         _check_free(sim.scene, nodes[0])
     except BaseException:
         other.close()
         raise
     what = mesh if isinstance(mesh, str) else f"{sum(b.mesh.n_tets for b in scene.bodies):,} tets"
-    return Twin(f"mesh: {what}", other, 1.0, steps, nodes=nodes), ratios
+    return Twin(f"mesh: {what}", other, 1.0, steps, nodes=(*nodes, shift)), ratios
 
 
 def _width_ratio(own: Body, other: Body) -> float | None:
@@ -155,12 +158,20 @@ def _nodes(sim: "Simulator") -> tuple[np.ndarray, list]:
     return np.concatenate([b.rest_positions for b in bodies]), [[b.name, b.n_nodes] for b in bodies]
 
 
-def _check_start(sim: "Simulator", other: "Simulator", nodes: tuple[np.ndarray, np.ndarray]) -> None:
-    """Raise SimulationError unless a twin on another mesh, which starts as its scene does, has the run's state."""
+def _placement(sim: "Simulator") -> np.ndarray:
+    """Where the scene puts the body of each node (n,3) [m]."""
+    return np.concatenate([np.broadcast_to(body.position, (body.n_nodes, 3)) for body in sim.scene.bodies])
+
+
+def _check_start(sim: "Simulator", other: "Simulator", nodes: tuple[np.ndarray, np.ndarray], shift: np.ndarray) -> None:
+    """Raise SimulationError unless a twin on another mesh, which starts as its scene does, has the run's state, but for a shift
+    (k,3) [m] of at most PLACED, as of bodies that start at the contact offset."""
     own, theirs = nodes
     x, v, dt = sim.positions(), sim.velocities(), max(sim.dt, 1.0 / 60.0)
     size = np.ptp(x, axis=0).max()
-    apart = np.abs(x[own] - other.positions()[theirs]).max()
+    if np.abs(shift).max() > PLACED * size:
+        raise SimulationError(f"error_mesh: the scene's bodies are {np.abs(shift).max():.2g} m from their places in the run")
+    apart = np.abs(x[own] - other.positions()[theirs] + shift).max()
     faster = np.abs(v[own] - other.velocities()[theirs]).max() * dt
     if sim.time != other.time or max(apart, faster) > SAME_STATE * size:
         raise SimulationError(

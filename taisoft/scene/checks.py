@@ -240,6 +240,14 @@ def _tolerance(value, what: str) -> None:
         raise SceneError(f"{what} must be below {limit:g}, or None for the default, not {value_text(value)}")
 
 
+def _named_quantities(value, what: str) -> dict:
+    """Return a dict of names and texts, or functions. What the texts say is checked where the run begins."""
+    for key, one in value.items() if isinstance(value, dict) else [("", value)]:
+        if not key or not isinstance(key, str) or not (isinstance(one, str) or callable(one)):
+            raise SceneError(f"{what} must be texts or functions by name, not {value_text(one)}")
+    return value
+
+
 SOLVER_CHECKS = {  # key of the `solver` dict -> check
     "dt": _positive,
     "integrator": text,
@@ -256,6 +264,7 @@ SOLVER_CHECKS = {  # key of the `solver` dict -> check
     "ramp": lambda value, what: value is None or _positive(value, what),
     "seconds": _positive,
     "fps": lambda value, what: value is None or _positive(value, what),
+    "quantities": _named_quantities,
 }
 
 

@@ -133,6 +133,9 @@ def _solver(solver: dict) -> dict:
         check_solver(**plain)
     except SceneError as error:
         raise SceneError(f"solver: {error}") from None
+    for name, one in plain.get("quantities", {}).items():
+        if callable(one):
+            raise SceneError(f"solver: quantity {name!r} is a function, which a file cannot store: use a text")
     return {key: NONE_TEXT if value is None else value for key, value in plain.items()}
 
 

@@ -114,7 +114,7 @@ class Planner:
         self._limits: dict[tuple, float] = {}
         self._notes: list[str] = []
         # all other entries of the solver dict apply to every run
-        left_out = (*AXES, "seconds", "fps", "draggable", "tolerance")
+        left_out = (*AXES, "seconds", "fps", "quantities", "draggable", "tolerance")
         self.fixed = {key: value for key, value in solver.items() if key not in left_out}
 
     def plan(self) -> dict:

@@ -9,7 +9,7 @@ import math
 import pytest
 
 import taisoft as ts
-from benchmarks import error, scaling
+from benchmarks import error, error_quantities, scaling
 from benchmarks.document import Limit
 from benchmarks.elasticity_steps import Cost, Frames, cost_limits, cost_table, frame_limits
 from benchmarks.error_cases import CONTACT, SMOOTH
@@ -42,6 +42,21 @@ def test_costs_are_compared_sample_by_sample():
     rows = [Frames(540, "velocity_verlet", 84, [11e-6, 22e-6, 5.5e-6], [10e-6, 20e-6, 5e-6])]
     (limit,) = frame_limits([*rows, Frames(540, "implicit_euler", 1, [2e-3], [1e-3])])
     assert limit.value == pytest.approx(1.1) and limit.spread == pytest.approx(0) and not limit.met
+
+
+def test_limits_of_forces():
+    """What is settled does not count; what is unknown is not within any range."""
+
+    def row(time: float | None, space: float, true=math.nan) -> error_quantities.ForceRow:
+        estimated = {"time": time, "space": space, "solver": 0.0}
+        return error_quantities.ForceRow("", (1, 2), "", 100.0, estimated, {"time": 1e-6, "space": 10.0, "solver": true}, [])
+
+    rows = [row(0.0, 4.0), row(2e-6, 29.0)]
+    assert rows[0].ratio("space") == 0.4 and all(math.isnan(rows[0].ratio(kind)) for kind in ("time", "solver"))
+    assert met(error_quantities.force_limits(rows)) == [True]
+    assert met(error_quantities.force_limits([*rows, row(None, 4.0)])) == [False]
+    assert met(error_quantities.force_limits([*rows, row(0.0, 3.0)])) == [False]
+    assert "unknown" in error_quantities.force_table([row(None, 4.0)])
 
 
 def test_limits_of_error():

@@ -44,6 +44,9 @@ BAD_SETTINGS = [
     (["--set", "beam.young"], "write NAME.NUMBER=VALUE, such as beam.young=2e5, or solver.KEY=VALUE"),
     (["--details", "pair"], "did you mean pairs?"),
     (["--details", "pairs"], "--details pairs: contact forces are not modelled (one body"),
+    (["--details", "quantities"], "--details quantities: the run has none"),
+    (["--quantity", "reaction beam"], "--quantity reaction beam: write NAME=TEXT"),
+    (["--quantity", "q=reaction bean"], "quantity 'q': scene: no body is called 'bean'; did you mean 'beam'?"),
     (["--set", "gravity=3,1"], "scene: gravity must have shape (3,), not (2,)"),
     (["--set", "solver.dt=1 ms"], "'1 ms' is not a number"),
     (["--seconds", "nan"], "seconds must be finite, not nan"),
@@ -91,11 +94,13 @@ def test_scalars_keep_their_type():
 
 def test_options_override_set_and_set_overrides_the_scene():
     given = {"arch": None, "precision": "f64", "tolerance": None, "seconds": 2.0, "fps": None}
-    arguments = Namespace(**given, assignments=["solver.dt=0.5", "solver.fps=none"])
-    resolved = resolve({"dt": 0.1, "precision": "f32", "seconds": 1.0, "fps": 30}, arguments, ts.Simulator)
+    arguments = Namespace(**given, assignments=["solver.dt=0.5", "solver.fps=none"], quantity=["a = reaction b"])
+    own = {"a": "reaction c", "b": "reaction d"}
+    resolved = resolve({"dt": 0.1, "precision": "f32", "seconds": 1.0, "fps": 30, "quantities": own}, arguments, ts.Simulator)
     assert resolved.simulator == {"dt": 0.5, "precision": "f64"}
     expected = {"dt": 0.5, "arch": "cpu", "precision": "f64", "newton_tolerance": None, "seconds": 2.0, "fps": None}
     assert expected.items() <= resolved.as_dict().items() and (resolved.seconds, resolved.fps) == (2.0, None)
+    assert resolved.quantities == {"a": "reaction b", "b": "reaction d"}
 
 
 @pytest.mark.parametrize("kind", ["wheel", "checkout"])

@@ -7,6 +7,7 @@
 * without a display there is no window.
 """
 
+import csv
 import re
 import signal
 
@@ -89,9 +90,16 @@ def test_notes_and_warnings_are_printed_and_reported(tmp_path, capsys):
     assert "problem" not in shown and shown.index("\nwarning") < shown.index("\nnote")
 
 
-def test_a_run_with_twins_says_what_they_cost(beam, capsys):
-    assert run(beam, "--seconds", "0.05", "--error-mesh", "refined") == 0
-    shown = capsys.readouterr().out
+def test_a_run_with_twins_says_what_they_cost(beam, tmp_path, capsys):
+    """It also prints and writes quantities with their errors."""
+    out, heading = tmp_path / "out", "quantity the tip [m]"
+    tip = ("--quantity", "the tip=displacement.y beam 2 0 0", "--details", "quantities")
+    assert run(beam, "--seconds", "0.05", "--error-mesh", "refined", *tip, "--out", out, *SHORT_OUTPUT) == 0
+    shown, found = capsys.readouterr().out, report(out)["quantities"]["the tip"]
+    assert re.search(r"\nquantity the tip = -0.01\d+ m, errors: time .*, space .*, solver 0\n", shown)
+    assert -0.02 < found["value"] < -0.01 and 0.0 < found["space"] < 0.01 and found["solver"] == 0.0
+    *_, last = csv.DictReader((out / "steps.csv").read_text().splitlines())
+    assert float(last[heading]) == found["value"]
     assert "\ntwins    follow the run, the one on the refined mesh for some 10 to 40 times its work" in shown
     assert re.search(r"; plus \d+\.\d\d s of twins for the error and ", shown)
 

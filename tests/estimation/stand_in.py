@@ -126,8 +126,8 @@ class StandIn:
     def _take_compile_seconds(self) -> float:
         return 0.0
 
-    def _begin_estimate(self, steps, mesh):
-        self._estimator = ErrorEstimator(self, steps, mesh)
+    def _begin_estimate(self, steps, mesh, measured):
+        self._estimator = ErrorEstimator(self, steps, mesh, measured)
         return self._estimator
 
     def _end_estimate(self) -> None:

@@ -7,7 +7,7 @@ import pytest
 
 import taisoft as ts
 from taisoft.errors import SimulationError
-from taisoft.estimation.estimator import Differences
+from taisoft.estimation.comparison import Differences
 from taisoft.estimation.twins import larger_steps, on_mesh, other_mesh, smaller_steps, tighter
 from taisoft.running import run
 from taisoft.stability import stable_dt
@@ -195,6 +195,20 @@ def test_meshes_that_cannot_be_compared_are_refused():
     assert sim.made[-1].closed
     with pytest.raises(SimulationError, match="error_mesh needs error=True"):
         run(sim, 1.0, error_mesh="refined")
+
+
+def test_a_body_on_another_mesh_may_be_placed_a_little_differently():
+    """The error is that of the motion: the same wherever it starts. Farther away it is not the run's."""
+    kind, found = motion(frequency=0.0, width_error=1.0), []
+    for height in (0.0, 0.005, 0.5):
+        moved = block(cells=(2, 2, 2))
+        moved.body("block").position = moved.body("block").position + (0.0, height, 0.0)
+        if height == 0.5:
+            with pytest.raises(SimulationError, match="the scene's bodies are 0.5 m from their places in the run"):
+                on_mesh(kind(block()), moved)
+        else:
+            found.append(estimate(kind(block()), error_mesh=moved).space)
+    assert found[0] == pytest.approx(found[1]) and found[0] > 0.0
 
 
 def test_a_broken_run_releases_its_twins():

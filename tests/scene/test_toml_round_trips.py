@@ -83,6 +83,7 @@ def everything() -> ts.Scene:
 EVERY_SETTING = {"dt": np.float64(1 / 120), "integrator": "bdf2", "contact_solver": "auto", "self_collision": np.bool_(True)}
 EVERY_SETTING |= {"precision": "f64", "arch": "cpu", "allow_unstable": False, "draggable": True, "newton_tolerance": 1e-5}
 EVERY_SETTING |= {"linear_tolerance": None, "contact_tolerance": 1e-3, "tolerance": 0.01, "seconds": np.int64(2), "fps": None}
+EVERY_SETTING |= {"quantities": {"sag": "displacement.y beam 4 0.5 0.5", 'of "b"': "reaction b"}}
 
 
 def test_a_scene_with_everything_is_read_back(tmp_path):
@@ -161,6 +162,8 @@ def test_scenes_that_a_file_cannot_store_are_refused(tmp_path):
     refused("the scene holds no body")
     body = scene.add_body(TURNED, ts.Material(), name="a")
     refused(r"solver: no setting is called 'dtt' \(did you mean dt\?\)", solver={"dtt": 1})
+    refused("solver: quantities must be texts or functions by name, not 3", solver={"quantities": {"q": 3}})
+    refused("solver: quantity 'q' is a function, which a file cannot store: use a text", solver={"quantities": {"q": len}})
     refused(r"end in \.toml", tmp_path / "a.tml")
     refused("needs a Scene, not dict", given={})
     refused("cannot write .*: No such file", tmp_path / "gone" / "a.toml")
