@@ -29,7 +29,7 @@ from taisoft.fem.model import Layout
 from taisoft.fem.pressure import cavity_form
 from taisoft.fem.spring_table import SpringTable
 from taisoft.fem.state import ELASTIC, N_INVERTED
-from taisoft.records import ErrorEstimate, StepReport
+from taisoft.records import ErrorEstimate, Quantity, StepReport
 from taisoft.scene import checks
 from taisoft.scene.holding import check_held
 from taisoft.scene.plan import make_plan
@@ -79,6 +79,7 @@ class StaticResult:
     step_reports: tuple[StepReport, ...] = ()  #: one a load step, of solves with contacts or `steps`
     problems: tuple[str, ...] = ()  #: sentences, as of a `RunReport`
     error_estimate: ErrorEstimate | None = None  #: with error=True; its error in time is that of the load steps
+    quantities: dict[str, Quantity] = field(default_factory=dict)  #: those asked for, at the end, by name
 
     __repr__ = short_repr
 
@@ -154,6 +155,7 @@ def solve_static(
     self_collision: bool = False,
     error: bool = False,
     error_mesh: str | Scene | None = None,
+    quantities: dict | None = None,
 ) -> StaticResult:
     """Find states of rest under gravity, loads, constraints and contacts with friction.
 
@@ -164,7 +166,7 @@ def solve_static(
     converge: prescribed nodes, obstacles and loads that have paths follow them from 0 to `time` (default 1) [s], constant loads
     and gravity grow from 0. Each load step is one of backward Euler for friction: displacements since its start count as slip, so
     that with friction the result depends on `steps`; error=True estimates by how much, with twins of other load steps and tighter
-    tolerances, and with error_mesh the error of the mesh, as `Simulator.run` does.
+    tolerances, and with error_mesh the error of the mesh, as `Simulator.run` does, whose `quantities` are those here.
     An open runtime of this precision is reused; otherwise one is opened and closed. Maxwell branches are relaxed, and nothing
     rebounds. Raises SceneError for invalid arguments, and if nothing can hold a body, SimulationError if nothing does, or if the
     runtime is in use. A solve that does not converge returns converged=False.
@@ -177,14 +179,14 @@ def solve_static(
             scene,
             1.0 if time is None else checks.number(time, "time", above=0.0, unit="s"),
             1 if steps is None else check_count("steps", steps),
-            {"error": error, "error_mesh": error_mesh},
+            {"error": error, "error_mesh": error_mesh, "quantities": quantities},
             newton_tolerance=tolerance,
             self_collision=self_collision,
             precision=precision,
             arch=arch,
         )
-    if error or error_mesh is not None:
-        raise SceneError("solve_static: error needs steps, or a scene with contacts")
+    if error or error_mesh is not None or quantities:
+        raise SceneError("solve_static: error and quantities need steps, or a scene with contacts")
     check_held(scene)
     scene = scene.snapshot()  # in which rigid bodies are as stiff as the others ask for
     time = 0.0 if time is None else checks.number(time, "time")
@@ -240,6 +242,7 @@ def _solve_in_steps(scene: Scene, time: float, steps: int, estimate: dict, **set
             step_reports=tuple(reports),
             problems=tuple(run.problems),
             error_estimate=run.error_estimate,
+            quantities=run.quantities,
         )
 
 

@@ -142,7 +142,7 @@ def test_what_nothing_can_hold_is_refused():
         (away, {}, ts.SimulationError, "nothing holds body 'block'"),
         (block_on_ground(), {"time": 0.0}, ts.SceneError, "time must be greater than 0 s"),
         (block_on_ground(), {"steps": 0}, ts.SimulationError, "steps must be an integer of at least 1"),
-        (loose, {"error": True}, ts.SceneError, "error needs steps, or a scene with contacts"),
+        (loose, {"error": True}, ts.SceneError, "error and quantities need steps, or a scene"),
     ):
         with pytest.raises(error, match=message):
             ts.solve_static(scene, **settings)

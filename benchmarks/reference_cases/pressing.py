@@ -1,0 +1,274 @@
+"""Bodies pressed on each other and on rigid surfaces, in static load steps: forces, pressures, sticking zones.
+
+The references come from closed forms, an axisymmetric and a plane code with normals at the end of the step, and mortar contact of
+an independent code on the same tets. All bodies touch at the start. Meshes are graded towards the contact by sinh.
+"""
+
+from functools import partial
+
+import numpy as np
+from scipy.optimize import minimize_scalar
+
+import taisoft as ts
+from taisoft.scene.body import Body
+from taisoft.static import StaticResult
+
+from .record import Case, Check, material, near, reported, small
+
+GRADING = 3.0
+HERTZ = np.sqrt(2.5)  # of the root mean square radius of Hertz's pressure: its reach
+DOWN, ALONG, LATE = 5, 60, 20  # load steps of ironing: pressing, sliding, and the last ones, which are averaged
+SHARES = (0.2, 0.4, 0.6, 0.8)  # of the friction limit, Q / (mu P), of Mindlin's balls
+AWAY = 1.0 - 1e-9
+
+
+def graded(n: int) -> np.ndarray:
+    """n + 1 numbers from 0 to 1, closest at 0."""
+    return np.sinh(GRADING * np.linspace(0.0, 1.0, n + 1)) / np.sinh(GRADING)
+
+
+def grid(*axes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Points (n,3) of the grid of these coordinates, and its tets, six a cell around the diagonal along which all grow."""
+    cells = [len(axis) - 1 for axis in axes]
+    tets = ts.box_mesh(cells, (1.0, 1.0, 1.0), pattern="six").tets
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3), tets
+
+
+def mirrored(tets: np.ndarray) -> np.ndarray:
+    """The tets with the other orientation."""
+    return tets[:, [0, 1, 3, 2]]
+
+
+def quarter_ball(n: int) -> ts.TetMesh:
+    """A quarter of half a ball of radius 1, x, z >= 0, whose pole at the origin points down: n cells along x and z, 3n/4 along y."""
+    p, tets = grid(graded(n), 1.0 - graded(3 * n // 4)[::-1], graded(n))
+    X, D, Z = (p**2).T  # D grows from the equator, 0, to the pole
+    x = p[:, 0] * np.sqrt(1 - D / 2 - Z / 2 + D * Z / 3)
+    y = p[:, 1] * np.sqrt(1 - X / 2 - Z / 2 + X * Z / 3)
+    z = p[:, 2] * np.sqrt(1 - X / 2 - D / 2 + X * D / 3)
+    return ts.TetMesh(np.stack([x, 1.0 - y, z], axis=1), mirrored(tets))
+
+
+def quarter_block(n: int, layers: int) -> ts.TetMesh:
+    """A quarter of a block, x and z from 0 to 1, y from -1 to 0."""
+    p, tets = grid(graded(n), graded(layers), graded(n))
+    return ts.TetMesh(p * (1.0, -1.0, 1.0), mirrored(tets))
+
+
+def on_symmetry(*bodies: Body) -> None:
+    """Hold the nodes on the planes x = 0 and z = 0 there."""
+    for body in bodies:
+        for axis in (0, 2):
+            body.fix(lambda X, a=axis: np.abs(X[:, a]) < 1e-9, axes="xyz"[axis])
+
+
+def solved(made: ts.Scene, arch: str, **settings) -> tuple[StaticResult, Check]:
+    """The static result, and the check that all load steps converged."""
+    found = ts.solve_static(made, arch=arch, **settings)
+    iterations = np.median([report.newton_iterations for report in found.step_reports])
+    return found, Check("Newton iterations a load step, median", iterations, 10.0, 0.0 if found.converged else np.inf, 0.0)
+
+
+# --- a ball on a rigid plane ------------------------------------------------------------------------------------------
+
+
+def ball_rough(n: int, order: int, mu: float, limits: dict, reference: dict, arch: str):
+    """Half a ball whose equator comes down, in one load step: force, reach, profile of the pressure, radial friction."""
+    value, made = reference["value"]["SNH"][f"mu{mu:g}"], ts.Scene(gravity=(0, 0, 0))
+    curve = ts.Sphere((0, 1, 0), 1.0) if order == 2 else None
+    ball = made.add_body(quarter_ball(n), material(reference, "SNH"), name="ball", order=order, curve=curve)
+    on_symmetry(ball)
+    ball.move(lambda X: X[:, 1] > AWAY, lambda t: (0.0, -0.02 * t, 0.0), axes="y")
+    made.add_obstacle(ts.HalfSpace((0, 0, 0), (0, 1, 0)), name="plane")
+    made.set_contact("ball", "plane", friction=mu)
+    found, check = solved(made, arch)
+    yield check
+    force = 4.0 * found.contact_force("ball", "plane")
+    yield near("force [N]", force[1], value["F"], limits.get("F"))
+    p = found.contact_pressure("ball")
+    X = ball.rest_positions[p.index]
+    r, load = np.hypot(X[:, 0], X[:, 2]), p.pressure * p.area
+    if mu == 0.0:
+        reach = HERTZ * np.sqrt((load * r**2).sum() / load.sum())
+        yield near("reach of the pressure [m]", reach, value["a"], limits.get("a"))
+        profile = {float(at): p0 for at, p0 in value["p"].items() if float(at) < 0.1}
+        peak, order_of_r = max(profile.values()), np.argsort(r)
+        misses = [np.interp(at, r[order_of_r], p.pressure[order_of_r]) - p0 for at, p0 in profile.items()]
+        yield small("pressure at radii, rms over the largest", np.sqrt(np.mean(np.square(misses))) / peak, limits.get("p", np.inf))
+        return
+    outward = (p.traction[:, [0, 2]] * X[:, [0, 2]]).sum(axis=1) / np.maximum(r, 1e-12)
+    yield near("radial friction [N]", 4.0 * abs((outward * p.area).sum()), value["T"], limits.get("T"))
+    sticks = r[p.state == "stick"].max(initial=0.0)
+    yield near("radius of the sticking zone [m]", sticks, value["stick"], limits.get("stick"))
+
+
+# --- like balls, pushed across -----------------------------------------------------------------------------------------
+
+
+def half_ball(n: int, up: bool) -> ts.TetMesh:
+    """Half of half a ball of radius 1, z >= 0, with its pole at the origin: `quarter_ball` and its mirror image in x."""
+    quarter = quarter_ball(n)
+    x = np.concatenate([quarter.vertices, quarter.vertices * (-1.0, 1.0, 1.0)])
+    tets = np.concatenate([quarter.tets, mirrored(quarter.tets) + len(quarter.vertices)])
+    used, first, number = np.unique(np.round(x, 9) + 0.0, axis=0, return_index=True, return_inverse=True)
+    mesh = ts.TetMesh(x[first], number.reshape(-1)[tets])
+    return mesh if up else ts.TetMesh(mesh.vertices * (1.0, -1.0, 1.0), mirrored(mesh.tets))
+
+
+def mindlin(n: int, precision: str, limits: dict, _reference: dict, arch: str):
+    """Two like balls: within c = a (1 - Q / (mu P))^(1/3) they stick, outside the traction is mu p (Cattaneo 1938, Mindlin 1949)."""
+    made, mu, press, across = ts.Scene(gravity=(0, 0, 0)), 0.3, 0.012, 3e-3
+    for name, up in (("upper", True), ("lower", False)):
+        body = made.add_body(half_ball(n, up), ts.Material(young=1e6, poisson=0.3, friction=mu), name=name)
+        body.fix(lambda X: np.abs(X[:, 2]) < 1e-9, axes="z")
+        sign = 1.0 if up else -1.0
+        path = lambda t, s=sign: (s * across * max(0.0, t - 1.0), -s * 0.5 * press * min(t, 1.0), 0.0)  # noqa: E731
+        body.move(lambda X, s=sign: s * X[:, 1] > AWAY, path, axes="xy")
+    found, check = solved(made, arch, time=2.0, steps=8, precision=precision)
+    yield check
+    a0, ball = None, made.body("upper")
+    X, upper_half = ball.rest_positions, []
+    for step in range(4, 8):
+        p = found.contact_pressure("upper", step=step)
+        P, Q = (2.0 * abs(found.contact_force("upper", "lower", step=step)[axis]) for axis in (1, 0))
+        r, load = np.linalg.norm(X[p.index][:, [0, 2]], axis=1), p.pressure * p.area
+        a = HERTZ * np.sqrt((load * r**2).sum() / load.sum())
+        c = a * np.cbrt(1.0 - Q / (mu * P))
+        pressed = p.pressure > 0.0
+        width = np.sqrt(np.median(p.area[pressed & (np.abs(r - c) < 0.3 * a)]) * 2.0)
+        sticks = np.sqrt(2.0 * p.area[p.state == "stick"].sum() / np.pi)
+        what = f"Q = {Q / (mu * P):.2f} mu P: "
+        upper_half.append(near(what + "radius of the zone that sticks, in elements", sticks / width, c / width, limits.get("state"), 1.0))
+        yield upper_half[-1]
+        fitted = fitted_radius(r[pressed], mu * p.pressure[pressed], np.abs(p.traction[pressed, 0]), p.area[pressed], a)
+        yield near(what + "the same by the traction [m]", fitted, c, limits.get("fit"))
+
+
+def fitted_radius(r: np.ndarray, most: np.ndarray, traction: np.ndarray, area: np.ndarray, a: float) -> float:
+    """The radius c [m] of the sticking zone that fits tractions (n,) at radii r best: most - q0 (c/a) sqrt(1 - r^2/c^2) within c.
+
+    most: (n,) friction times pressure [Pa], whose integral gives q0, its peak by Hertz. area: weights (n,).
+    """
+    q0 = 1.5 * 2.0 * (most * area).sum() / (np.pi * a**2)  # half of the ball is modelled
+
+    def miss(c: float) -> float:
+        model = most - q0 * c / a * np.sqrt(np.clip(1.0 - (r / c) ** 2, 0.0, None))
+        return float((area * (traction - model) ** 2).sum())
+
+    return float(minimize_scalar(miss, bounds=(0.02 * a, a), method="bounded").x)
+
+
+# --- bodies on bodies and on planes -------------------------------------------------------------------------------------
+
+
+def patch(n: int, order: int, limits: dict, reference: dict, arch: str):
+    """Two blocks of different meshes, flush on each other under a uniform pressure: it must be uniform in between."""
+    made, p = ts.Scene(gravity=(0, 0, 0)), 1e4
+    for name, cells, y in (("low", (4 * n, 2 * n, 4 * n), 0.25), ("top", (5 * n, 3 * n, 5 * n), 0.75)):
+        mesh = ts.box_mesh(cells, (1.0, 0.5, 1.0), (0.5, y, 0.5))
+        body = made.add_body(mesh, material(reference, "SVK"), name=name, order=order)
+        on_symmetry(body)
+    made.body("low").fix(lambda X: X[:, 1] < 1e-9, axes="y")
+    body.add_traction(lambda C: C[:, 1] > AWAY, (0.0, -p, 0.0))
+    found, check = solved(made, arch, contact_tolerance=1e-9)
+    yield check
+    for name in ("low", "top"):
+        load = found.contact_pressure(name)
+        on = load.pressure > 0.0
+        mean = (load.pressure * load.area)[on].sum() / load.area[on].sum()
+        rms = np.sqrt(np.mean((load.pressure[on] / mean - 1.0) ** 2))
+        yield small(f"{name}: rms of the pressure about its mean", rms, limits["rms"])
+    yield near("force [N]", found.contact_force("top", "low")[1], p, 1e-6)
+
+
+def push_block(cells: tuple[int, int], order: int, limits: dict, reference: dict, arch: str):
+    """A block under pressure, pushed by its left face over a rough plane: friction over normal force after each push."""
+    value, made = reference["value"], ts.Scene(gravity=(0, 0, 0))
+    thickness, mu, pushes = 4.0 / cells[0], 0.4, (0.002, 0.004, 0.006, 0.008, 0.010)
+    mesh = ts.box_mesh((*cells, 1), (4.0, 1.0, thickness), (2.0, 0.5, 0.0))
+    block = made.add_body(mesh, material(reference, "SNH"), name="block", order=order)
+    block.fix(lambda X: np.ones(len(X), dtype=bool), axes="z")
+    steps = np.arange(len(pushes) + 2.0)
+    block.move(lambda X: X[:, 0] < 1e-9, lambda t: (np.interp(t, steps, (0.0, 0.0, *pushes)), 0.0, 0.0), axes="x")
+    block.add_traction(lambda C: C[:, 1] > AWAY, lambda t: (0.0, -1e4 * min(t, 1.0), 0.0))
+    made.add_obstacle(ts.HalfSpace((0, 0, 0), (0, 1, 0)), name="plane")
+    made.set_contact("block", "plane", friction=mu)
+    found, check = solved(made, arch, time=steps[-1], steps=len(pushes) + 1)
+    yield check
+    for k, s in enumerate(pushes):
+        force = found.contact_force("block", "plane", step=k + 1)
+        ratio = f"{s:.3f}" if f"{s:.3f}" in value["T_over_N"] else f"{s:g}"
+        yield near(f"T / N after {s:g} m", -force[0] / force[1], value["T_over_N"][ratio], limits.get("T"))
+    yield near("normal force [N/m]", force[1] / thickness, value["N"], 1e-5)
+
+
+def two_bodies(n: int, limits: dict, reference: dict, arch: str):
+    """Half a ball on a block, the same tets as in the other code: force, and how far the block gives way."""
+    made, value = ts.Scene(gravity=(0, 0, 0)), reference["value"][f"n{n}"]
+    soft = material(reference, "SVK")
+    ball = made.add_body(quarter_ball(n), soft, name="ball")
+    block = made.add_body(quarter_block(n + 2, 3 * n // 4), soft, name="block")
+    on_symmetry(ball, block)
+    block.fix(lambda X: X[:, 1] < -AWAY, axes="y")
+    ball.move(lambda X: X[:, 1] > AWAY, lambda t: (0.0, -0.04 * t, 0.0), axes="y")
+    made.set_contact("ball", "block", friction=0.0)
+    found, check = solved(made, arch)
+    yield check
+    yield near("force [N]", 4.0 * found.contact_force("ball", "block")[1], value["F"], limits.get("F"))
+    down = found.positions("block")[np.abs(block.rest_positions).max(axis=1) < 1e-12, 1][0]
+    yield near("how far the block gives way [m]", -down, -value["uy_origin"], limits.get("u"))
+
+
+def ironing(h: float, order: int, mu: float, limits: dict, reference: dict, arch: str):
+    """A cylinder that is pressed into a block and slides along it without turning: steady forces."""
+    value, made = reference["value"][f"mu{mu:g}"], ts.Scene(gravity=(0, 0, 0))
+    mesh = ts.box_mesh((round(3.8 / h), round(1.0 / h), 1), (3.8, 1.0, h), (0.7, -0.5, 0.0))
+    block = made.add_body(mesh, material(reference, "SNH"), name="block", order=order)
+    block.fix(lambda X: np.ones(len(X), dtype=bool), axes="z")
+    block.fix(lambda X: X[:, 1] < -AWAY, axes="xy")
+    path = ts.KeyFrames([0.0, DOWN, DOWN + ALONG], [[0, 0, 0], [0, -0.1, 0], [1.2, -0.1, 0]])
+    made.add_obstacle(ts.Capsule((0, 0.5, -1), (0, 0.5, 1), 0.5), name="iron", path=path)
+    made.set_contact("block", "iron", friction=mu)
+    found, check = solved(made, arch, time=DOWN + ALONG, steps=DOWN + ALONG)
+    yield check
+    late = range(DOWN + ALONG - LATE, DOWN + ALONG)
+    T, N, _ = np.mean([found.contact_force("block", "iron", step=step) for step in late], axis=0)
+    yield near("normal force [N/m]", -N / h, value["N"], limits.get("N"))
+    yield near("friction over normal force", -T / N, value["T_over_N"], limits.get("T"), scale=1.0)
+
+
+NO_LIMITS: dict[str, float] = {}
+CASES = (
+    *(
+        Case("ball_rough", "SNH", f"n = {n}, order {order}, mu {mu:g}", partial(ball_rough, n, order, mu, limits), fine)
+        for n, order, mu, limits, fine in (
+            (8, 1, 0.0, NO_LIMITS, False),
+            (12, 1, 0.0, {"F": 0.05, "a": 0.03}, True),
+            (16, 1, 0.0, {"F": 0.03, "a": 0.02}, True),
+            (12, 1, 0.5, {"F": 0.05, "stick": 0.05}, True),
+            (6, 2, 0.0, {"F": 0.015}, False),
+            (8, 2, 0.0, {"F": 0.008}, True),
+            (12, 2, 0.0, {"F": 0.003, "a": 0.015, "p": 0.02}, True),
+            (8, 2, 0.5, {"F": 0.01}, True),
+            (12, 2, 0.5, {"F": 0.005, "T": 0.01}, True),
+        )
+    ),
+    *(
+        Case("contact_patch", "SVK", f"n = {n}, order {order}", partial(patch, n, order, {"rms": 0.02}), fine)
+        for n, order, fine in ((1, 1, False), (2, 1, True), (1, 2, True))
+    ),
+    *(
+        Case("push_block", "SNH", f"{nx}x{nx // 4}, order {order}", partial(push_block, (nx, nx // 4), order, limits), fine)
+        for nx, order, limits, fine in (
+            (20, 1, {"T": 0.04}, False),
+            (40, 1, {"T": 0.02}, True),
+            (20, 2, {"T": 0.015}, True),
+            (40, 2, {"T": 0.01}, True),
+        )
+    ),
+    *(Case("two_bodies", "SVK", f"n = {n}", partial(two_bodies, n, {"F": 0.02}), n > 8) for n in (8, 12, 16)),
+    *(
+        Case("ironing", "SNH", f"h = {h:g}, order {order}, mu {mu:g}", partial(ironing, h, order, mu, {"T": 0.005}), True)
+        for h, order, mu in ((0.1, 1, 0.3), (0.05, 1, 0.3), (0.1, 1, 0.0), (0.1, 2, 0.3))
+    ),
+)
