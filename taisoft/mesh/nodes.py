@@ -18,6 +18,7 @@ from taisoft.errors import MeshError
 from taisoft.mesh.tet_mesh import TetMesh
 from taisoft.mesh.topology import EDGES, distinct_edges
 
+PARTS = 8  # linear tets of a second-order one; `Nodes.tets` lists those of each tet in sequence
 TIE_TOLERANCE = 1e-9  # relative difference below which squared diagonals count as equal
 STRAIGHT = 1e-6  # distance of a node from its edge's midpoint, over the edge's length, up to which the edge is straight
 

@@ -17,7 +17,7 @@ from scipy.sparse.csgraph import connected_components
 
 from taisoft.errors import SceneError, value_text
 from taisoft.mesh import quadratic
-from taisoft.mesh.nodes import Nodes
+from taisoft.mesh.nodes import PARTS, Nodes
 from taisoft.mesh.sdf import nearest_points
 from taisoft.mesh.surface_mesh import SurfaceMesh
 from taisoft.mesh.tet_mesh import TetMesh
@@ -63,7 +63,7 @@ def check_shape(what: str, nodes: Nodes) -> None:
     rows = np.flatnonzero(nodes.curved)
     x = nodes.positions[nodes.elements[rows]]
     least = np.min([quadratic.point_volumes(x, quadratic.quadrature(degree)).min(axis=1) for degree in (2, 4)], axis=0)
-    parts = nodes.positions[nodes.tets.reshape(-1, 8, 4)[rows]]
+    parts = nodes.positions[nodes.tets.reshape(-1, PARTS, 4)[rows]]
     least = np.minimum(least, np.linalg.det(parts[:, :, 1:] - parts[:, :, :1]).min(axis=1))
     if (least <= 0.0).any():
         e = rows[np.argmax(least <= 0.0)]

@@ -6,6 +6,7 @@ import numpy as np
 import scipy
 import scipy.sparse as sp
 
+from taisoft.mesh.nodes import PARTS
 from taisoft.mesh.quadratic import shape_derivatives, shape_functions
 
 if TYPE_CHECKING:
@@ -25,7 +26,7 @@ def locate(body: "Body", points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np
     in sizes of a rigid body; 0 inside. The weights of a point outside extrapolate from the tet in whose heights it is nearest.
     They sum to 1 and reproduce the point, so that they follow every affine motion exactly.
     """
-    corners = body.mesh.vertices[body.mesh.tets]
+    corners = body.rest_positions[body.nodes.tets if body.is_curved else body.mesh.tets]  # parts are closer to curved tets
     inverse = np.linalg.inv((corners[:, 1:] - corners[:, :1]).transpose(0, 2, 1))
     _, near = scipy.spatial.cKDTree(corners.mean(axis=1)).query(points, k=min(NEAREST, len(corners)))
     tet = _deepest(corners, inverse, points, near.reshape(len(points), -1))
@@ -33,6 +34,10 @@ def locate(body: "Body", points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np
     chunk, everything = max(1, PAIRS_AT_ONCE // len(corners)), np.arange(len(corners))
     for rows in np.split(far, range(chunk, len(far), chunk)):
         tet[rows] = _deepest(corners, inverse, points[rows], np.broadcast_to(everything, (len(rows), len(corners))))
+    if body.is_curved:
+        tet = tet // PARTS
+        corners = body.rest_positions[body.mesh.tets]
+        inverse = np.linalg.inv((corners[:, 1:] - corners[:, :1]).transpose(0, 2, 1))
     barycentric = _barycentric(corners[tet], inverse[tet], points)
     barycentric[np.abs(barycentric) < WEIGHTLESS] = 0.0
     if body.is_curved:

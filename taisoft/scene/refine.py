@@ -17,7 +17,7 @@ import numpy as np
 
 from taisoft.attributes import thawed
 from taisoft.errors import SceneError
-from taisoft.mesh.nodes import Nodes, make_nodes
+from taisoft.mesh.nodes import PARTS, Nodes, make_nodes
 from taisoft.mesh.quadratic import shape_functions
 from taisoft.mesh.tet_mesh import TetMesh
 from taisoft.mesh.topology import EDGES, distinct_edges
@@ -27,8 +27,6 @@ from taisoft.scene.key_frames import KeyFrames, NodePath
 from taisoft.scene.loads import Load, LoadPath, NodalForce
 from taisoft.scene.rigid import RigidBody
 from taisoft.scene.scene import Scene
-
-PARTS = 8  # of a tet; `make_nodes` lists the parts of each tet in sequence
 
 
 def refined(scene: Scene) -> Scene:
