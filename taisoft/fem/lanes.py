@@ -105,23 +105,19 @@ def gradients_at(m: ti.template(), g: ti.template(), M, b, q, real: ti.template(
 @ti.func
 def volume_ratio_at(m: ti.template(), g: ti.template(), b, q, real: ti.template()):
     """Volume per reference volume at quadrature point q of block b over its mean, which is 1 in straight tets."""
-    r = ti.cast(1.0, real)
     if ti.static(g.curved):
         return curved_at(m, g, b, q, 9, real)
     else:
-        return r
+        return ti.cast(1.0, real)
 
 
 @ti.func
 def weight_at(m: ti.template(), g: ti.template(), b, q, real: ti.template()):
     """Weight of quadrature point q of block b of group g, as a fraction of the volume."""
-    w = ti.cast(1.0, real)
+    w = volume_ratio_at(m, g, b, q, real)
     if ti.static(g.order == 2):
-        w = ti.cast(m.points[g.points_at + q, 0], real)
-    if ti.static(g.curved):
-        return w * curved_at(m, g, b, q, 9, real)
-    else:
-        return w
+        w = ti.cast(m.points[g.points_at + q, 0], real) * w
+    return w
 
 
 @ti.func

@@ -81,21 +81,21 @@ def lumped_mass(body: Body) -> np.ndarray:
 
     Source for order 2: Hinton, Rock, Zienkiewicz 1976. For order 1 each vertex gets a quarter, as with row sums.
     """
-    if body.is_curved:
-        volumes, N = _curved_points(body)
-        diagonal = volumes @ N**2
-        return _distribute(body, diagonal / diagonal.sum(axis=1, keepdims=True))
     corner, middle = HRZ_FRACTIONS[body.order]
     fractions = np.repeat([corner, middle], [4, body.nodes.elements.shape[1] - 4])
+    if body.is_curved:
+        volumes, N = _curved_points(body)
+        fractions = volumes @ N**2
+        fractions /= fractions.sum(axis=1, keepdims=True)
     return _distribute(body, fractions)
 
 
 def gravity_mass(body: Body) -> np.ndarray:
     """int rho N_a dV at each node (n,) [kg], the mass used for weight; for order 2 negative at the corners."""
+    fractions = np.full(4, 0.25) if body.order == 1 else np.repeat([-0.05, 0.2], [4, 6])
     if body.is_curved:
         volumes, N = _curved_points(body)
-        return _distribute(body, volumes @ N / body.volumes[:, None])
-    fractions = np.full(4, 0.25) if body.order == 1 else np.repeat([-0.05, 0.2], [4, 6])
+        fractions = volumes @ N / body.volumes[:, None]
     return _distribute(body, fractions)
 
 

@@ -104,6 +104,13 @@ def embed(nodes: Nodes, vertices: np.ndarray, triangles: np.ndarray, weights: sp
     return replace(nodes, positions=positions, surface=triangles + len(nodes.positions), embedded=weights)
 
 
+def part_coordinates(nodes: Nodes) -> np.ndarray:
+    """Barycentric coordinates (j,4,4) of the corners of `Nodes.tets` in their second-order elements."""
+    of_nodes = np.concatenate([np.eye(4), np.eye(4)[list(EDGES)].mean(axis=1)])
+    place = (nodes.tets.reshape(-1, PARTS, 4)[..., None] == nodes.elements[:, None, None]).argmax(axis=3)
+    return of_nodes[place].reshape(-1, 4, 4)
+
+
 def _shortest_diagonals(mesh: TetMesh) -> np.ndarray:
     """Return (m,) k = 0, 1 or 2: the diagonal between edges k and 5 - k is the octahedron's shortest."""
     ascending = np.argsort(mesh.tets, axis=1)  # local corners by ascending vertex number

@@ -91,14 +91,16 @@ class TetMesh(Guarded):
         self.source = source
         self.recipe: dict | None = None
         self.warnings: list[str] = []
-        self.vertices = self._checked_vertices(vertices)
+        self.vertices = self._checked_points(vertices)
         self.tets = self._checked_tets(tets)
         self.volumes = self._oriented_volumes(fix_orientation)
         self.regions = checked_regions(regions, self.n_tets, self._mesh_error)
         self.region_ids = () if self.regions is None else tuple(np.unique(self.regions).tolist())
         self.region_names = checked_names(region_names, self.region_ids, self._mesh_error)
         self.fibres = checked_fibres(fibres, self.n_tets, self._mesh_error)
-        self.mid_edge = None if mid_edge is None else self._checked_middles(mid_edge)
+        self.mid_edge = None if mid_edge is None else self._checked_points(mid_edge, "mid_edge", "mid_edge")
+        if mid_edge is not None and len(self.mid_edge) != (n := len(distinct_edges(self.tets)[0])):
+            raise self._mesh_error(f"mid_edge has {len(self.mid_edge)} rows for {n} edges")
         self._region_of = {key: one for one in self.region_ids for key in (one, self.region_names.get(one, one))}
         faces = self._checked_faces()
         rows = faces.surface()
@@ -206,9 +208,9 @@ class TetMesh(Guarded):
         self.warnings.append(text)
         warnings.warn(self._named(text), UserWarning, stacklevel=4)
 
-    def _checked_vertices(self, vertices) -> np.ndarray:
+    def _checked_points(self, points, what: str = "vertices", one: str = "vertex") -> np.ndarray:
         """Return an (n,3) float64 copy of finite coordinates."""
-        array = checked_array(vertices, "vertices", 3, "fiu", "numbers", self._mesh_error)
+        array = checked_array(points, what, 3, "fiu", "numbers", self._mesh_error)
         array = np.array(array, dtype=np.float64, order="C")
         for bad, rule in (
             (~np.isfinite(array), "is not finite"),
@@ -216,17 +218,7 @@ class TetMesh(Guarded):
         ):
             if bad.any():
                 i, k = np.argwhere(bad)[0]
-                raise self._mesh_error(f"vertex {i} coordinate {k} {rule.format(array[i, k])}")
-        return array
-
-    def _checked_middles(self, mid_edge) -> np.ndarray:
-        """Return a (k,3) float64 copy, one row for each edge."""
-        array = np.array(checked_array(mid_edge, "mid_edge", 3, "fiu", "numbers", self._mesh_error), dtype=np.float64, order="C")
-        if len(array) != (n := len(distinct_edges(self.tets)[0])):
-            raise self._mesh_error(f"mid_edge has {len(array)} rows for {n} edges")
-        bad = ~(np.abs(array) <= LARGEST_COORDINATE).all(axis=1)
-        if bad.any():
-            raise self._mesh_error(f"mid_edge {int(np.argmax(bad))} is not finite or too large for a 32-bit float")
+                raise self._mesh_error(f"{one} {i} coordinate {k} {rule.format(array[i, k])}")
         return array
 
     def _checked_tets(self, tets) -> np.ndarray:

@@ -6,8 +6,8 @@ import numpy as np
 import scipy
 import scipy.sparse as sp
 
-from taisoft.mesh.nodes import PARTS
-from taisoft.mesh.quadratic import shape_derivatives, shape_functions
+from taisoft.mesh.nodes import PARTS, part_coordinates
+from taisoft.mesh.quadratic import shape_functions
 
 if TYPE_CHECKING:
     from taisoft.scene.body import Body
@@ -15,7 +15,6 @@ if TYPE_CHECKING:
 NEAREST = 64  # tets by their centroids that are tried first
 INSIDE = -1e-9  # barycentric coordinate from which a point counts as inside a tet
 PAIRS_AT_ONCE = 2_000_000  # of points and tets; bounds the memory, about 100 bytes each
-NEWTON = 12  # iterations in a curved tet
 WEIGHTLESS = 1e-12  # smaller barycentric coordinates are rounding
 
 
@@ -34,36 +33,19 @@ def locate(body: "Body", points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np
     chunk, everything = max(1, PAIRS_AT_ONCE // len(corners)), np.arange(len(corners))
     for rows in np.split(far, range(chunk, len(far), chunk)):
         tet[rows] = _deepest(corners, inverse, points[rows], np.broadcast_to(everything, (len(rows), len(corners))))
-    if body.is_curved:
-        tet = tet // PARTS
-        corners = body.rest_positions[body.mesh.tets]
-        inverse = np.linalg.inv((corners[:, 1:] - corners[:, :1]).transpose(0, 2, 1))
     barycentric = _barycentric(corners[tet], inverse[tet], points)
-    barycentric[np.abs(barycentric) < WEIGHTLESS] = 0.0
     if body.is_curved:
-        rows = np.flatnonzero(body.nodes.curved[tet])
-        x = body.rest_positions[body.nodes.elements[tet[rows]]]
-        barycentric[rows], found = _in_curved(x, barycentric[rows], points[rows])
+        barycentric = np.einsum("pk,pkc->pc", barycentric, part_coordinates(body.nodes)[tet])
+        tet = tet // PARTS
+    barycentric[np.abs(barycentric) < WEIGHTLESS] = 0.0
     weights = shape_functions(body.order, barycentric)
-    if body.is_curved:  # far outside of a curved tet, extrapolate from its corners
-        weights[rows[~found], :4], weights[rows[~found], 4:] = barycentric[rows[~found]], 0.0
+    if body.is_curved:  # what the flat parts miss, by the corners
+        x = body.rest_positions[body.nodes.elements[tet]]
+        missed = points - np.einsum("pa,pax->px", weights, x)
+        step = np.linalg.solve((x[:, 1:4] - x[:, :1]).transpose(0, 2, 1), missed[..., None])[..., 0]
+        weights[:, :4] += np.concatenate([-step.sum(axis=1, keepdims=True), step], axis=1)
     outside = body.distance_outside(points, np.maximum(-barycentric.min(axis=1), 0.0))
     return body.nodes.elements[tet], weights, outside
-
-
-def _in_curved(x: np.ndarray, start: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the barycentric coordinates (p,4) of points (p,3) in quadratic tets with nodes x (p,10,3), by Newton's method, and
-    whether (p,) it has converged; else they stay those at the start, in the tets of the corners."""
-    found, size = start.copy(), np.ptp(x, axis=1).max(axis=1, initial=0.0)
-    for _ in range(NEWTON):
-        rest = points - np.einsum("pa,pax->px", shape_functions(2, found), x)
-        s = shape_derivatives(2, found)
-        J = np.einsum("pax,pac->pxc", x, s[:, :, 1:] - s[:, :, :1])
-        step = np.einsum("pcx,px->pc", np.linalg.pinv(J), rest)
-        found += np.concatenate([-step.sum(axis=1, keepdims=True), step], axis=1)
-    with np.errstate(invalid="ignore"):
-        converged = (np.linalg.norm(rest, axis=1) <= -INSIDE * size) & (np.abs(found - start).max(axis=1, initial=0.0) < 1.0)
-    return np.where(converged[:, None], found, start), converged
 
 
 def weight_matrix(nodes: np.ndarray, weights: np.ndarray, n_nodes: int) -> sp.csr_matrix:

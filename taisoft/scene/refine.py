@@ -17,7 +17,7 @@ import numpy as np
 
 from taisoft.attributes import thawed
 from taisoft.errors import SceneError
-from taisoft.mesh.nodes import PARTS, Nodes, make_nodes
+from taisoft.mesh.nodes import PARTS, Nodes, make_nodes, part_coordinates
 from taisoft.mesh.quadratic import shape_functions
 from taisoft.mesh.tet_mesh import TetMesh
 from taisoft.mesh.topology import EDGES, distinct_edges
@@ -87,12 +87,8 @@ def _refined(old: Body) -> tuple[Body, np.ndarray]:
 
 def _middles_of_parts(split: Nodes) -> np.ndarray:
     """Return where curved elements map the midpoints of the edges of their parts, in the order of `distinct_edges` (k,3) [m]."""
-    corners = np.eye(4)
-    ten = np.concatenate([corners, corners[list(EDGES)].mean(axis=1)])  # barycentric coordinates of an element's nodes
-    parts = split.tets.reshape(-1, PARTS, 4)
-    place = (parts[..., None] == split.elements[:, None, None]).argmax(axis=3)
-    points = ten[place][:, :, EDGES].mean(axis=3).reshape(-1, 4)
-    weights = shape_functions(2, points).reshape(len(parts), -1, len(ten))
+    points = part_coordinates(split)[:, EDGES].mean(axis=2).reshape(-1, 4)
+    weights = shape_functions(2, points).reshape(len(split.elements), -1, 10)
     edges, edge_of_part = distinct_edges(split.tets)
     middles = np.empty((len(edges), 3))
     middles[edge_of_part.reshape(-1)] = (weights @ split.positions[split.elements]).reshape(-1, 3)
