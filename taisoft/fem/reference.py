@@ -128,11 +128,10 @@ def consistent_mass(body: Body) -> sp.csr_matrix:
     if isinstance(body, RigidBody):
         return sp.diags(lumped_mass(body), format="csr")
     elements = body.nodes.elements
+    values = (body.composition.number("density") * body.volumes)[:, None, None] * unit_mass(body.order)
     if body.is_curved:
         volumes, N = _curved_points(body)
-        values = np.reshape(body.composition.number("density"), (-1, 1, 1)) * np.einsum("mp,pa,pb->mab", volumes, N, N)
-    else:
-        values = (body.composition.number("density") * body.mesh.volumes)[:, None, None] * unit_mass(body.order)
+        values = np.reshape(body.composition.number("density"), (-1, 1, 1)) * np.tensordot(volumes, N[:, :, None] * N[:, None], 1)
     rows, columns = np.broadcast_arrays(elements[:, :, None], elements[:, None, :])
     return sp.csr_matrix((values.reshape(-1), (rows.reshape(-1), columns.reshape(-1))), shape=(body.n_nodes,) * 2)
 

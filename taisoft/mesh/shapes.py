@@ -80,7 +80,7 @@ def ball_mesh(radius: float, cells: int, center=(0.0, 0.0, 0.0), grading: float 
     the sphere, which would make it nearly flat.
     """
     _check_across(cells, "ball_mesh")
-    radius = float(checked_vector([radius] * 3, "ball_mesh", "radius", positive=True)[0])
+    radius = _positive(radius, "ball_mesh", "radius")
     center, grid = checked_vector(center, "ball_mesh", "center"), np.array([cells] * 3)
     _check_count(grid, 6, "ball_mesh")
     grading, towards = _checked_grading(grading, towards, "ball_mesh")
@@ -103,9 +103,7 @@ def cylinder_mesh(
         raise MeshError(f"cylinder_mesh: axis must be one of x, y, z, not {value_text(axis)}")
     across, along = _checked_cells(cells, "cylinder_mesh", (2,)).tolist()
     _check_across(across, "cylinder_mesh")
-    radius, height, _ = checked_vector(
-        [radius, height, 1.0], "cylinder_mesh", "radius and height, and 1,", positive=True
-    ).tolist()
+    radius, height = _positive(radius, "cylinder_mesh", "radius"), _positive(height, "cylinder_mesh", "height")
     center, grid = checked_vector(center, "cylinder_mesh", "center"), np.array([across, across, along])
     _check_count(grid, 6, "cylinder_mesh")
     grading, towards = _checked_grading(grading, towards, "cylinder_mesh")
@@ -128,10 +126,13 @@ def _check_across(cells, shape: str) -> None:
         raise MeshError(f"{shape}: cells must be an even integer, at least 2, not {value_text(cells)}")
 
 
+def _positive(value, owner: str, what: str) -> float:
+    return float(checked_vector([value] * 3, owner, what, positive=True)[0])
+
+
 def _checked_grading(grading, towards, shape: str) -> tuple[float, np.ndarray]:
     """Return the grading and the unit vector (3,)."""
-    grading = float(checked_vector([grading] * 3, shape, "grading", positive=True)[0])
-    towards = checked_vector(towards, shape, "towards")
+    grading, towards = _positive(grading, shape, "grading"), checked_vector(towards, shape, "towards")
     length = np.linalg.norm(towards)
     if length == 0.0:
         raise MeshError(f"{shape}: towards must be a direction, not (0, 0, 0)")

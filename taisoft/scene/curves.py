@@ -21,7 +21,7 @@ from taisoft.mesh.nodes import PARTS, Nodes
 from taisoft.mesh.sdf import nearest_points
 from taisoft.mesh.surface_mesh import SurfaceMesh
 from taisoft.mesh.tet_mesh import TetMesh
-from taisoft.mesh.topology import distinct_edges, normals_and_heights, triangle_edges
+from taisoft.mesh.topology import HALF_EDGES, distinct_edges, normals_and_heights, triangle_edges
 from taisoft.scene.obstacles import Capsule, Sphere
 
 Curve = str | Sphere | Capsule | SurfaceMesh
@@ -36,15 +36,14 @@ def middle_nodes(what: str, mesh: TetMesh, order: int, curve: Curve | None) -> n
 
     curve: as for `Scene.add_body`. what: start of messages. Raises SceneError.
     """
+    word = curve if isinstance(curve, str) else None
     if curve is not None and order == 1:
         raise SceneError(f"{what}: curve needs order=2: linear tets have straight edges")
-    if order == 1 or curve is None:
-        return mesh.mid_edge if order == 2 else None
-    if isinstance(curve, str) and curve == "straight":
-        return None
+    if order == 1 or word == "straight" or curve is None:
+        return mesh.mid_edge if order == 2 and curve is None else None
     edges = distinct_edges(mesh.tets)[0]
     middles = mesh.vertices[edges].mean(axis=1) if mesh.mid_edge is None else mesh.mid_edge.copy()
-    if isinstance(curve, str) and curve == "smooth":
+    if word == "smooth":
         ends, found = _smooth(mesh)
     elif isinstance(curve, (Sphere, Capsule, SurfaceMesh)):
         ends, found = _on_shape(what, mesh, curve)
@@ -110,61 +109,56 @@ def _on_shape(what: str, mesh: TetMesh, curve: Sphere | Capsule | SurfaceMesh) -
 def _smooth(mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
     """Return the edges (k,2) of the surface, ascending, and their middle nodes (k,3) on a smooth surface through the vertices."""
     x, faces = mesh.vertices, mesh.surface
-    half = np.sort(faces[:, [(0, 1), (1, 2), (2, 0)]].reshape(-1, 2), axis=1)
+    half = np.sort(faces[:, HALF_EDGES].reshape(-1, 2), axis=1)  # half-edge 3t + k begins at corner k of face t
     edges, edge, counts = np.unique(half, axis=0, return_inverse=True, return_counts=True)
-    edge = edge.reshape(-1)
-    by_edge = np.argsort(edge, kind="stable")  # half-edge 3t + k runs from corner k of face t
     first = np.cumsum(counts) - counts
-    one, other = by_edge[first], by_edge[first + 1]  # of a closed surface; where four faces meet, the edge is sharp
-    normals = normals_and_heights(x, faces)[0]
-    sharp = (counts != 2) | (np.einsum("ex,ex->e", normals[one // 3], normals[other // 3]) < SHARP)
-    # corners of faces around a vertex between sharp edges share a normal: 3t + k is corner k of face t
-    follow = lambda h: h // 3 * 3 + (h + 1) % 3  # noqa: E731
-    a, b = one[~sharp], other[~sharp]
-    links = np.concatenate([np.stack([a, follow(b)]), np.stack([follow(a), b])], axis=1)
-    n = faces.size
-    fan = connected_components(coo_matrix((np.ones(links.shape[1]), links), (n, n)), directed=False)[1]
-    corners = x[faces]
+    one, other = np.argsort(edge.reshape(-1), kind="stable")[np.stack([first, first + 1])]  # the surface is closed
+    facing = normals_and_heights(x, faces)[0]
+    sharp = (counts != 2) | (np.einsum("ex,ex->e", facing[one // 3], facing[other // 3]) < SHARP)
+    end = (np.arange(faces.size).reshape(-1, 3)[:, [1, 2, 0]]).reshape(-1)  # corner at the end of each half-edge
+    normal = _corner_normals(x[faces], np.stack([one, end[one]])[:, ~sharp], np.stack([end[other], other])[:, ~sharp])
+    upward = faces.reshape(-1)[one] == edges[:, 0]
+    i, j = normal[np.where(upward, one, end[one])], normal[np.where(upward, end[one], one)]
+    chord = x[edges[:, 1]] - x[edges[:, 0]]
+    lengths = np.linalg.norm(chord, axis=1, keepdims=True)
+    bulge = np.zeros_like(chord)
+    for n, sign in ((i, -1.0), (j, 1.0)):
+        sine = np.einsum("ex,ex->e", chord, n)[:, None] / lengths
+        cosine = np.sqrt(1.0 - np.minimum(sine**2, STEEPEST))
+        bulge += sign * lengths * sine / (4.0 * cosine * (1.0 + cosine)) * n
+    bulge[sharp] = _along_sharp(x, edges[sharp])
+    return edges, x[edges].mean(axis=1) + bulge
+
+
+def _corner_normals(corners: np.ndarray, same: np.ndarray, also: np.ndarray) -> np.ndarray:
+    """Return the unit normals (3t, 3) of the corners of faces (t,3,3); those linked by equal entries of same and also share one."""
+    n, links = 3 * len(corners), (same.reshape(-1), also.reshape(-1))
+    group = connected_components(coo_matrix((np.ones(same.size), links), (n, n)), directed=False)[1]
     to_next, to_last = np.roll(corners, -1, axis=1) - corners, np.roll(corners, 1, axis=1) - corners
     weight = np.einsum("tkx,tkx->tk", to_next, to_next) * np.einsum("tkx,tkx->tk", to_last, to_last)
     parts = (np.cross(to_next, to_last) / weight[..., None]).reshape(-1, 3)
-    normal = _unit(np.stack([np.bincount(fan, parts[:, k]) for k in range(3)], axis=1))
-    ends = x[edges]
-    chord, middles = ends[:, 1] - ends[:, 0], ends.mean(axis=1)
-    # at half-edge h, the corner at its first vertex and the one at its second; sorted vertices take them in that order
-    swapped = faces.reshape(-1)[one] != edges[:, 0]
-    i, j = normal[fan[np.where(swapped, follow(one), one)]], normal[fan[np.where(swapped, one, follow(one))]]
-    lengths = np.linalg.norm(chord, axis=1)
-    rise = np.stack([np.einsum("ex,ex->e", chord, normal) / lengths for normal in (i, j)], axis=1)[:, :, None]
-    level = np.sqrt(1.0 - np.minimum(rise**2, STEEPEST))
-    rise *= lengths[:, None, None] / (4.0 * level * (1.0 + level))
-    bulge = rise[:, 1] * j - rise[:, 0] * i
-    bulge[sharp] = _along_sharp(x, edges[sharp])
-    return edges, middles + bulge
+    return _unit(np.stack([np.bincount(group, part) for part in parts.T], axis=1))[group]
 
 
 def _along_sharp(x: np.ndarray, edges: np.ndarray) -> np.ndarray:
     """Return what the middles of sharp edges (k,2) are moved by (k,3). A vertex where other than two of them meet, or where they
-    turn by more than SHARP, is a corner; an edge from a corner is an arc."""
-    both = np.concatenate([edges, edges[:, ::-1]])
-    out = x[both[:, 1]] - x[both[:, 0]]
-    squared = np.einsum("ex,ex->e", out, out)[:, None]
-    counts = np.bincount(both[:, 0], minlength=len(x))
-    # the tangent out/|out|^2 - other/|other|^2 of a circle through three points; of both edges at the vertex, so with either sign
-    total = np.stack([np.bincount(both[:, 0], out[:, k] / squared[:, 0], len(x)) for k in range(3)], axis=1)
-    facing = np.stack([np.bincount(both[:, 0], out[:, k] / np.sqrt(squared[:, 0]), len(x)) for k in range(3)], axis=1)
-    tangent = _unit(2.0 * out / squared - total[both[:, 0]])
-    turn = 0.5 * np.einsum("vx,vx->v", facing, facing) - 1.0  # cosine between the two edges, -1 where they are in line
-    corner = (counts != 2) | (turn > -SHARP)
-    n, chord = len(edges), _unit(out[: len(edges)])
-    start, end = tangent[:n], -tangent[n:]
-    at_start, at_end = corner[edges[:, 0]], corner[edges[:, 1]]
-    mirrored = lambda t: 2.0 * np.einsum("ex,ex->e", t, chord)[:, None] * chord - t  # noqa: E731
-    start, end = np.where(at_start[:, None], mirrored(end), start), np.where(at_end[:, None], mirrored(start), end)
-    level = np.maximum(np.einsum("ex,ex->e", start + end, chord), 0.0)[:, None]  # twice the cosine
-    bulge = np.sqrt(squared[:n]) * (start - end) / (4.0 + 2.0 * level)
-    bulge[at_start & at_end] = 0.0
-    return bulge
+    turn by more than SHARP, is a corner; an edge with one corner is an arc, one with two is straight."""
+    n, start = len(edges), np.concatenate([edges[:, 0], edges[:, 1]])
+    out = x[np.concatenate([edges[:, 1], edges[:, 0]])] - x[start]
+    length = np.linalg.norm(out, axis=1, keepdims=True)
+    total, both = (np.stack([np.bincount(start, part, len(x)) for part in v.T], axis=1) for v in (out / length**2, out / length))
+    # a circle through three points has the tangent out/|out|^2 - other/|other|^2 at the one in the middle
+    tangent = _unit(2.0 * out / length**2 - total[start])
+    turn = 1.0 - 0.5 * np.einsum("ex,ex->e", both, both)[start]  # cosine of the angle by which two edges turn
+    corner = ((np.bincount(start)[start] != 2) | (turn < SHARP))[:, None]
+    along, other = (
+        out / length,
+        np.roll(tangent, n, axis=0),
+    )  # at the other end: from a corner, the arc leaves in its mirror image
+    tangent = np.where(corner, other - 2.0 * np.einsum("ex,ex->e", other, along)[:, None] * along, tangent)
+    level = np.einsum("ex,ex->e", tangent[:n] - tangent[n:], along[:n])[:, None]  # twice the mean cosine
+    bulge = length[:n] * (tangent[:n] + tangent[n:]) / (4.0 + 2.0 * np.maximum(level, 0.0))
+    return np.where(corner[:n] & corner[n:], 0.0, bulge)
 
 
 def _unit(vectors: np.ndarray) -> np.ndarray:
