@@ -131,7 +131,7 @@ def _smooth(mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _corner_normals(corners: np.ndarray, same: np.ndarray, also: np.ndarray) -> np.ndarray:
-    """Return the unit normals (3t, 3) of the corners of faces (t,3,3); those linked by equal entries of same and also share one."""
+    """Return the unit normals (3t,3) of the corners of faces (t,3,3). same, also: corners that share one, pair by pair."""
     n, links = 3 * len(corners), (same.reshape(-1), also.reshape(-1))
     group = connected_components(coo_matrix((np.ones(same.size), links), (n, n)), directed=False)[1]
     to_next, to_last = np.roll(corners, -1, axis=1) - corners, np.roll(corners, 1, axis=1) - corners

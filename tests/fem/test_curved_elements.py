@@ -9,6 +9,7 @@ import pytest
 import taisoft as ts
 from taisoft.fem import reference
 from taisoft.fem.loads import SceneLoads
+from taisoft.fem.pressure import all_terms, force_terms
 from taisoft.linear import block_csr
 from taisoft.mesh.nodes import make_nodes
 from tests.collision.rotations import rotation
@@ -104,6 +105,30 @@ def test_masses_and_loads_add_up():
     body.add_traction(lambda X: X[:, 0] < np.inf, (1.0, -2.0, 3.0))
     assert SceneLoads(scene).at(0.0).sum(axis=0) == pytest.approx(body.areas.sum() * np.array([1.0, -2.0, 3.0]))
     assert body.areas.sum() > 1.001 * 10.0
+
+
+def test_pressure_balances_a_uniform_stress():
+    """By Gauss's theorem: the integral of grad N_a over the tets is that of N_a n over the surface."""
+    scene = scene_of(bent_mesh(), quadrature_degree=4)
+    (body,) = scene.bodies
+    body.add_pressure(lambda X: X[:, 0] < np.inf, 1.0)
+    rows, w = all_terms(scene, np.array([0]), force_terms)
+    i, b, c = (body.rest_positions[ids] for ids in rows[:, :3].T)
+    outward = np.zeros((body.n_nodes, 3))
+    np.add.at(outward, rows[:, 0], w[:, None] * np.cross(b - i, c - i))
+    gradients, volumes = reference.shape_gradients(body)
+    total = np.zeros_like(outward)
+    np.add.at(total, body.nodes.elements, np.einsum("mp,mpai->mai", volumes, gradients))
+    assert np.abs(outward - total).max() < 1e-14 < np.abs(total).max()
+
+
+def test_stress_of_a_linear_field_is_uniform():
+    scene = scene_of(ts.ball_mesh(1.0, 2), curve="smooth")
+    _, P = ts.evaluate_law("stable_neo_hookean", STRETCH[None], 1e5, 0.3)
+    with ts.Simulator(scene, dt=1e-3, integrator="symplectic_euler", precision="f64") as sim:
+        sim.set_state(positions=scene.bodies[0].rest_positions @ STRETCH.T)
+        sigma = sim.stress()
+    assert np.abs(sigma - P @ STRETCH.T / np.linalg.det(STRETCH)).max() < 1e-12 * np.abs(sigma).max()
 
 
 def test_frequencies_of_a_free_ball():

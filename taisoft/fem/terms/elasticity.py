@@ -272,7 +272,7 @@ def cauchy_stress(m: ti.template(), sigma: ti.types.ndarray()):
                 volume_ratio += w * determinant(F)
                 for k in ti.static(range(9)):
                     for l in ti.static(range(m.lanes)):
-                        sigma[b * m.lanes + l, k] += w * T[k][l]
+                        sigma[b * m.lanes + l, k] += (w * T[k])[l]
             for k in range(9):
                 for q in ti.static(range(m.lanes)):
                     sigma[b * m.lanes + q, k] /= volume_ratio[q]
