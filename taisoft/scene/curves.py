@@ -5,10 +5,11 @@ along the normals n_i, n_j of its ends, as the cubic edge of a PN triangle does,
     x = (x_i + x_j)/2 - ((x_j - x_i).n_i n_i - (x_j - x_i).n_j n_j) / 8,
 and on a sharp edge along the tangents t_i, t_j of the curve of sharp edges, x = (x_i + x_j)/2 + |x_j - x_i| (t_i - t_j) / 8.
 Both are scaled by a factor that tends to 1 with the angle to the edge and is exact for arcs of circles. Normals and tangents are
-weighted so that those of vertices on a sphere or a circle are exact.
+weighted so that those of vertices on a sphere or a circle are exact; an edge from a sharp edge into the surface, where a normal
+would see one side only, is the arc that its other end begins.
 Sources: Vlachos, Peters, Boyd, Mitchell, Curved PN triangles, 2001; Max, Weights for computing vertex normals from facet normals,
 J. Graphics Tools 4, 1999.
-Weak: normals at a sharp edge see one side only, and are of first order there unless the surface is straight across it.
+Weak: an edge that crosses a strip of one element between two sharp edges has normals of one side.
 """
 
 import numpy as np
@@ -121,6 +122,8 @@ def _smooth(mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
     i, j = normal[np.where(upward, one, end[one])], normal[np.where(upward, end[one], one)]
     chord = x[edges[:, 1]] - x[edges[:, 0]]
     lengths = np.linalg.norm(chord, axis=1, keepdims=True)
+    a, b = np.isin(edges, edges[sharp]).T[..., None]  # at a sharp edge one side shows: the arc follows from its other end
+    i, j = np.where(a & ~b, _mirrored(j, chord / lengths), i), np.where(b & ~a, _mirrored(i, chord / lengths), j)
     bulge = np.zeros_like(chord)
     for n, sign in ((i, -1.0), (j, 1.0)):
         sine = np.einsum("ex,ex->e", chord, n)[:, None] / lengths
@@ -155,10 +158,15 @@ def _along_sharp(x: np.ndarray, edges: np.ndarray) -> np.ndarray:
         out / length,
         np.roll(tangent, n, axis=0),
     )  # at the other end: from a corner, the arc leaves in its mirror image
-    tangent = np.where(corner, other - 2.0 * np.einsum("ex,ex->e", other, along)[:, None] * along, tangent)
+    tangent = np.where(corner, _mirrored(other, along), tangent)
     level = np.einsum("ex,ex->e", tangent[:n] - tangent[n:], along[:n])[:, None]  # twice the mean cosine
     bulge = length[:n] * (tangent[:n] + tangent[n:]) / (4.0 + 2.0 * np.maximum(level, 0.0))
     return np.where(corner[:n] & corner[n:], 0.0, bulge)
+
+
+def _mirrored(vectors: np.ndarray, along: np.ndarray) -> np.ndarray:
+    """Return vectors (e,3) mirrored along unit vectors (e,3)."""
+    return vectors - 2.0 * np.einsum("ex,ex->e", vectors, along)[:, None] * along
 
 
 def _unit(vectors: np.ndarray) -> np.ndarray:
