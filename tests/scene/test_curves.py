@@ -82,6 +82,12 @@ def test_fine_surface_and_given_nodes():
     assert np.allclose(body_of(turned).rest_positions, 2.0 * exact @ np.array([[0, 1, 0], [-1, 0, 0], [0, 0, 1]]), atol=1e-14)
 
 
+def test_smooth_edges_of_a_half_ball_are_arcs():
+    """Its normals and tangents are exact, and edges from the sharp rim are the arcs of their other ends."""
+    mesh = half_ball(4)
+    assert np.abs(body_of(mesh, "smooth").rest_positions - body_of(mesh, SPHERE).rest_positions).max() < 1e-14
+
+
 def test_refusals():
     ball, folded = ts.ball_mesh(1.0, 4), ts.box_mesh((1, 1, 1), (1, 1, 1))
     middles = body_of(folded).rest_positions[folded.n_verts :].copy()
