@@ -108,7 +108,7 @@ def cylinder_mesh(
     _check_count(grid, 6, "cylinder_mesh")
     grading, towards = _checked_grading(grading, towards, "cylinder_mesh")
     order = (np.arange(1, 4) + "xyz".index(axis)) % 3  # the axis last
-    local = towards[order]
+    local = np.round(towards[order], 12)
     if grading != 1.0 and 0.0 < abs(local[2]) < 1.0:
         raise MeshError(f"cylinder_mesh: towards must be along the axis or perpendicular to it, not {value_text(towards)}")
     recipe = {"shape": "cylinder", "radius": radius, "height": height, "cells": np.array([across, along])}
