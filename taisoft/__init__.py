@@ -18,6 +18,7 @@ _MODULES = {  # public name -> the module that defines it
     "box_mesh": "taisoft.mesh.shapes",
     "sheet_mesh": "taisoft.mesh.shapes",
     "ball_mesh": "taisoft.mesh.shapes",
+    "cylinder_mesh": "taisoft.mesh.shapes",
     "read_mesh": "taisoft.mesh.files",
     "write_mesh": "taisoft.mesh.files",
     "read_usd": "taisoft.mesh.usd",

@@ -112,5 +112,5 @@ def opening_energy(scene: Scene, distance: float) -> float:
 
 
 def _energy(scene: Scene, body: Body, strain: float, lift: float) -> float:
-    stretched = 0.5 * float(np.sum(body.composition.number("young") * body.mesh.volumes)) * strain**2
+    stretched = 0.5 * float(np.sum(body.composition.number("young") * body.volumes)) * strain**2
     return stretched + body.mass * float(np.linalg.norm(scene.gravity)) * lift

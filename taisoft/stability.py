@@ -121,7 +121,7 @@ def _patch_stiffness(body: Body, divergence: np.ndarray, dof: np.ndarray) -> sp.
     patch = reference.tet_patches(body)
     rows = np.broadcast_to(patch[:, None, None], dof.shape).reshape(-1)
     D = sp.csr_matrix((divergence.reshape(-1), (rows, dof.reshape(-1))), shape=(int(patch.max()) + 1, 3 * body.n_nodes))
-    return D.T @ sp.diags(reference.patch_moduli(body, patch) / np.bincount(patch, body.mesh.volumes)) @ D
+    return D.T @ sp.diags(reference.patch_moduli(body, patch) / np.bincount(patch, reference.rest_volumes(body))) @ D
 
 
 def constrained_axes(body: Body, prescribed: bool, scene: Scene | None = None) -> np.ndarray:
@@ -178,8 +178,8 @@ def scale_warnings(scene: Scene) -> list[str]:
     warnings = []
     for body in scene.bodies:
         size = float(np.ptp(body.rest_positions, axis=0).max())
-        mass, volume, gravity = body.mass, float(body.mesh.volumes.sum()), float(np.linalg.norm(scene.gravity))
-        young = volume / float(np.sum(body.mesh.volumes / body.composition.number("young")))  # of layers in series
+        mass, volume, gravity = body.mass, float(body.volumes.sum()), float(np.linalg.norm(scene.gravity))
+        young = volume / float(np.sum(body.volumes / body.composition.number("young")))  # of layers in series
         strain = mass / volume * gravity * size / young
         if strain > MAX_WEIGHT_STRAIN:
             crossing = size / np.sqrt(young * volume / mass)

@@ -108,6 +108,7 @@ def describe(mesh: TetMesh) -> list[tuple[str, str]]:
         ("volume", f"{mesh.volumes.sum():.6g}"),
         *_cavity_lines(mesh),
         *_region_lines(mesh),
+        *([] if mesh.mid_edge is None else [("second order", "bodies with order=2 are curved by its mid-edge nodes")]),
         *([] if mesh.fibres is None else [("fibres", f"in {np.count_nonzero(mesh.fibres.any(axis=1))} tets")]),
         _edge_line(lengths),
         ("quality", f"mean ratio {ratios}; 1 is a regular tet, {poor} are below {POOR_QUALITY}"),

@@ -62,7 +62,7 @@ class DragSpring:
             every = np.bincount(nodes, weights, dependents.n_nodes) @ dependents.matrix
             nodes, weights = np.flatnonzero(every), every[every != 0.0]
         mass = 1.0 / float((weights**2 / masses[nodes]).sum())
-        area = (mass * float(own.mesh.volumes.sum()) / own.mass) ** (2 / 3)
+        area = (mass * float(own.volumes.sum()) / own.mass) ** (2 / 3)
         max_force = min(self.STRAIN * float(np.min(own.young)) * area, self.HEAVY * EARTH * own.mass)
         self.release()  # removes the force from the previous nodes
         self.drag = Drag(own.name, nodes, weights, target, stiffness, mass, max_force, target, np.zeros(3))

@@ -16,6 +16,7 @@ from taisoft.fem.laws import fibres, lane_law, law_of, viscosity, volume_floor
 from taisoft.fem.model import Group, Layout, Setup
 from taisoft.fem.pattern import MATRIX_BLOCKS
 from taisoft.fem.springs import spring_table
+from taisoft.mesh import quadratic
 from taisoft.scene.laws import LAWS
 from taisoft.scene.rigid import RigidBody
 from taisoft.scene.scene import Body, Scene
@@ -39,7 +40,7 @@ def make_layout(scene: Scene, lanes: int, on: dict[str, bool]) -> tuple[Layout, 
         for law in composition.laws:
             if mean and getattr(lane_law(law), "dilatation", None) is None:
                 raise SceneError(f'body {body.name!r}: its law {law} has no mean dilatation: give it dilatation="local"')
-            switches = composition.has_volume_floor, mean, isinstance(body, RigidBody), additions_of(body, on)
+            switches = composition.has_volume_floor, mean, isinstance(body, RigidBody), additions_of(body, on), body.is_curved
             kind, tets = (body.order, body.quadrature_degree, list(LAWS).index(law), *switches), composition.tets_of_law(law)
             padded = np.minimum(np.arange(-(-len(tets) // lanes) * lanes), len(tets) - 1)
             parts.setdefault(kind, []).append(first + tets[padded])
@@ -69,6 +70,7 @@ def model_fields(setup: Setup, kinds: dict[tuple, np.ndarray]) -> dict[str, Any]
         "n_blocks": groups[-1].last,
         "nodes": arena.filled("nodes", ti.i32, np.concatenate([layout.blocks(own).reshape(-1) for own in nodes])),
         **_rule_fields(setup),
+        **_curved_fields(setup, kinds, elements, volumes, rest_real),
         "Dm_inv": arena.filled("Dm_inv", rest_real, layout.blocks(Dm_inv[layout.tet_of_lane].reshape(-1, 9))),
         "volume": arena.filled("volume", real, volume.reshape(-1, layout.lanes)),
         "block_body": arena.filled("block_body", ti.i32, body),
@@ -90,6 +92,8 @@ def _tets(scene: Scene, layout: Layout) -> tuple[np.ndarray, np.ndarray, np.ndar
         own = np.concatenate([np.sort(own[:, :4], axis=1), np.sort(own[:, 4:], axis=1)], axis=1)
         Dm_inv[rows], volumes[rows] = reference.inverse_rest_edges(body.mesh.vertices, own[:, :4])
         elements[rows, : own.shape[1]] = own + layout.node_start[k]
+        if body.is_curved:
+            volumes[rows] = reference.rest_volumes(body)
     return elements, Dm_inv, volumes
 
 
@@ -108,32 +112,48 @@ def _strain_type(setup: Setup, elements: np.ndarray, Dm_inv: np.ndarray) -> Any:
 
 
 def _groups(kinds: dict[tuple, np.ndarray], lanes: int, real: Any, strain_real: Any) -> tuple[Group, ...]:
-    n_points = {degree: len(reference.quadrature(degree).weights) for _, degree, *_ in kinds}
-    groups, laws, last, nodes_at, force_at, matrix_at = [], list(LAWS), 0, 0, 0, 0
-    for (order, degree, law, floor, mean, rigid, added), tets in kinds.items():
+    n_points = {degree: len(quadratic.quadrature(degree).weights) for _, degree, *_ in kinds}
+    groups, laws, last, nodes_at, force_at, matrix_at, curved_at = [], list(LAWS), 0, 0, 0, 0, 0
+    for (order, degree, law, floor, mean, rigid, added, curved), tets in kinds.items():
         n_nodes, first, last = len(reference.unit_mass(order)), last, last + len(tets) // lanes
         points_at = sum(n for other, n in n_points.items() if 1 < other < degree)  # order 1 has degree 1 and no table
-        offsets = first, last, nodes_at, force_at, matrix_at, points_at
+        offsets = first, last, nodes_at, force_at, matrix_at, points_at, curved_at
         types = (ti.f64, ti.f64) if rigid else (real, strain_real)
         law = law_of(laws[law], (volume_floor,) * floor + tuple(ADDITIONS[k] for k in added))
-        groups.append(Group(law, order, n_nodes, n_points[degree], mean, rigid, *offsets, *types))
+        groups.append(Group(law, order, n_nodes, n_points[degree], mean, rigid, curved, *offsets, *types))
         nodes_at += len(tets) * n_nodes
         force_at += (last - first) * n_nodes * 3
         matrix_at += (last - first) * MATRIX_BLOCKS[order] * 9
+        curved_at += (last - first) * n_points[degree] if curved else 0
     return tuple(groups)
 
 
 def _rule_fields(setup: Setup) -> dict[str, Any]:
     """Quadrature rules of quadratic tets, and their points."""
     degrees = sorted({body.quadrature_degree for body in setup.scene.bodies if body.order == 2})
-    rules = tuple(reference.quadrature(degree) for degree in degrees)
+    rules = tuple(quadratic.quadrature(degree) for degree in degrees)
     if not rules:
         return {"rules": rules}
     points, weights = np.concatenate([rule.points for rule in rules]), np.concatenate([rule.weights for rule in rules])
     # from the four barycentric derivatives; l_0 = 1 - l_1 - l_2 - l_3
-    slopes = reference.shape_derivatives(2, points)[:, 1:]
+    slopes = quadratic.shape_derivatives(2, points)[:, 1:]
     table = np.column_stack([weights, (slopes[:, :, 1:] - slopes[:, :, :1]).reshape(len(points), 27)])
     return {"rules": rules, "points": setup.arena.filled("points", ti.f64, table)}
+
+
+def _curved_fields(
+    setup: Setup, kinds: dict[tuple, np.ndarray], elements: np.ndarray, volumes: np.ndarray, real
+) -> dict[str, Any]:
+    """Rest shapes of bodies with curved edges at their quadrature points. real: Taichi type of `Dm_inv`."""
+    rest, tables = np.concatenate([body.rest_positions for body in setup.scene.bodies]), []
+    for (_, degree, *_, curved), tets in kinds.items():
+        if curved:
+            J = quadratic.jacobians(rest[elements[tets]], quadratic.quadrature(degree).points)
+            ratio = np.abs(np.linalg.det(J)) / (6.0 * volumes[tets, None])
+            values = np.concatenate([np.linalg.inv(J).reshape(*ratio.shape, 9), ratio[..., None]], axis=2)
+            blocks = values.reshape(-1, setup.layout.lanes, *values.shape[1:]).transpose(0, 2, 3, 1)
+            tables.append(blocks.reshape(-1, 10, setup.layout.lanes))
+    return {"curved": setup.arena.filled("curved", real, np.concatenate(tables))} if tables else {}
 
 
 def _gather_table(nodes: list[np.ndarray], groups: tuple[Group, ...], is_tet: np.ndarray, layout: Layout):

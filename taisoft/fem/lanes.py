@@ -2,7 +2,8 @@
 
 With d_a = x_a - x_0 and c_a(q) = dN_a/d(l_1, l_2, l_3) at a quadrature point,
     F_q = D_q Dm^-1,  D_q = sum_a d_a c_a(q)^T,     f_a = -V sum_q w_q (P_q Dm^-T) c_a(q),  f_0 = -sum_a f_a.
-For order 1, c_a are the unit vectors, one point suffices, and F = Ds Dm^-1.
+For order 1, c_a are the unit vectors, one point suffices, and F = Ds Dm^-1. In bodies with curved edges, Dm is the Jacobian of
+the rest shape at each point, and w_q the fraction of the volume there.
 """
 
 from collections.abc import Callable
@@ -86,11 +87,36 @@ def differences(m: ti.template(), g: ti.template(), field: ti.template(), b, rea
 
 
 @ti.func
-def weight_at(m: ti.template(), g: ti.template(), q, real: ti.template()):
-    """Weight of quadrature point q of group g, as a fraction of the volume."""
-    w = ti.cast(1.0, real)
+def curved_at(m: ti.template(), g: ti.template(), b, q, c: ti.template(), real: ti.template()):
+    """Number c of the rest shape of block b at quadrature point q, per lane, see `Model.curved`."""
+    row = g.curved_at + (b - g.first) * g.n_points + q
+    return ti.Vector([ti.cast(m.curved[row, c, l], real) for l in ti.static(range(m.lanes))])
+
+
+@ti.func
+def gradients_at(m: ti.template(), g: ti.template(), M, b, q, real: ti.template()):
+    """Dm^-1 at quadrature point q of block b: M, that of the tets, unless they are curved."""
+    if ti.static(g.curved):
+        return [curved_at(m, g, b, q, c, real) for c in ti.static(range(9))]
+    else:
+        return M
+
+
+@ti.func
+def volume_ratio_at(m: ti.template(), g: ti.template(), b, q, real: ti.template()):
+    """Volume per reference volume at quadrature point q of block b over its mean, which is 1 in straight tets."""
+    if ti.static(g.curved):
+        return curved_at(m, g, b, q, 9, real)
+    else:
+        return ti.cast(1.0, real)
+
+
+@ti.func
+def weight_at(m: ti.template(), g: ti.template(), b, q, real: ti.template()):
+    """Weight of quadrature point q of block b of group g, as a fraction of the volume."""
+    w = volume_ratio_at(m, g, b, q, real)
     if ti.static(g.order == 2):
-        w = ti.cast(m.points[g.points_at + q, 0], real)
+        w = ti.cast(m.points[g.points_at + q, 0], real) * w
     return w
 
 
@@ -101,14 +127,14 @@ def derivatives_at(m: ti.template(), g: ti.template(), q, real: ti.template()):
 
 
 @ti.func
-def gradient_at(m: ti.template(), g: ti.template(), E, M, q, real: ti.template()):
+def gradient_at(m: ti.template(), g: ti.template(), E, M, b, q, real: ti.template()):
     """Gradient with respect to rest positions at quadrature point q: F if E holds the differences of x. M: `rest_gradients`."""
     if ti.static(g.order == 1):
         return matmul_tn(E, M)  # E holds D by columns
     else:
         C = derivatives_at(m, g, q, real)
         D = [ddot(E[r::3], C[c::3]) for c in ti.static(range(3)) for r in ti.static(range(3))]
-        return matmul_tn(D, M)
+        return matmul_tn(D, gradients_at(m, g, M, b, q, real))
 
 
 @ti.func
@@ -124,12 +150,12 @@ def position_differences(m: ti.template(), g: ti.template(), b):
 
 
 @ti.func
-def deformation_gradient(m: ti.template(), g: ti.template(), X, N, q, real: ti.template()):
+def deformation_gradient(m: ti.template(), g: ti.template(), X, N, b, q, real: ti.template()):
     """F at quadrature point q, rounded to `real`. X: `position_differences`; N: `rest_gradients_of_F`."""
     if ti.static(g.strain_real == real):
-        return gradient_at(m, g, X, N, q, real)
+        return gradient_at(m, g, X, N, b, q, real)
     else:
-        F = gradient_at(m, g, X, N, q, g.strain_real)
+        F = gradient_at(m, g, X, N, b, q, g.strain_real)
         return [ti.cast(F[k], real) for k in ti.static(range(9))]
 
 
@@ -140,10 +166,10 @@ def zero_forces(m: ti.template(), g: ti.template()):
 
 
 @ti.func
-def add_forces(m: ti.template(), g: ti.template(), S: ti.template(), P, M, q):
+def add_forces(m: ti.template(), g: ti.template(), S: ti.template(), P, M, b, q):
     """Add the contribution of stress P at quadrature point q to S, forces per volume: entry 3 (a - 1) + i, nodes a >= 1."""
-    w = weight_at(m, g, q, g.real)
-    H = [w * dot(P[3 * i : 3 * i + 3], M[3 * c : 3 * c + 3]) for c in ti.static(range(3)) for i in ti.static(range(3))]
+    w, G = weight_at(m, g, b, q, g.real), gradients_at(m, g, M, b, q, g.real)
+    H = [w * dot(P[3 * i : 3 * i + 3], G[3 * c : 3 * c + 3]) for c in ti.static(range(3)) for i in ti.static(range(3))]
     if ti.static(g.order == 1):
         for k in ti.static(range(9)):
             S[k] += H[k]

@@ -62,7 +62,7 @@ def model_fields(setup: Setup) -> dict[str, Any]:
         if body.dilatation == "mean":
             patch = reference.tet_patches(body)
             of_tet[layout.tets(k)] = patch + sum(len(own) for own in volume)
-            volume.append(np.bincount(patch, body.mesh.volumes))
+            volume.append(np.bincount(patch, reference.rest_volumes(body)))
     mean = np.flatnonzero(of_tet >= 0)
     tets = mean[np.argsort(of_tet[mean], kind="stable")]
     volume, n_lanes = np.concatenate(volume), len(layout.tet_of_lane)
@@ -127,8 +127,8 @@ def element_dilatation(m: ti.template(), g: ti.template(), b):
     X, M = differences(m, g, m.state.x, b, ti.f64), rest_gradients(m, b, ti.f64)
     total = broadcast(ti.cast(0.0, ti.f64), m.lanes)
     for q in range(g.n_points):
-        F = gradient_at(m, g, X, M, q, ti.f64)
-        total += weight_at(m, g, q, ti.f64) * g.law.dilatation(F)
+        F = gradient_at(m, g, X, M, b, q, ti.f64)
+        total += weight_at(m, g, b, q, ti.f64) * g.law.dilatation(F)
     store_content(m, b, volumes(m, b, ti.f64) * total)
 
 
@@ -139,10 +139,10 @@ def element_rate(m: ti.template(), g: ti.template(), b, u: ti.template()):
     U, M = differences(m, g, u, b, m.real), rest_gradients(m, b, m.real)
     total = broadcast(ti.cast(0.0, m.real), m.lanes)
     for q in range(g.n_points):
-        F = deformation_gradient(m, g, X, N, q, m.real)
-        dF = gradient_at(m, g, U, M, q, m.real)
+        F = deformation_gradient(m, g, X, N, b, q, m.real)
+        dF = gradient_at(m, g, U, M, b, q, m.real)
         G = g.law.dilatation_gradient(F)
-        total += weight_at(m, g, q, m.real) * ddot(G, dF)
+        total += weight_at(m, g, b, q, m.real) * ddot(G, dF)
     store_content(m, b, volumes(m, b, m.real) * total)
 
 

@@ -30,12 +30,14 @@ class Group:
     n_points: int
     mean_dilatation: bool
     rigid: bool  # of rigid bodies, whose strains are as small as the rounding of f32
+    curved: bool  # of bodies some of whose edges are curved at rest
     first: Count  # first block
     last: Count  # one past the last block
     nodes_at: Count  # offset in Model.nodes
     force_at: Count  # offset in State.element_force, in vectors of lanes
     matrix_at: Count  # offset in the assembly buffer
     points_at: Count  # first row in Model.points
+    curved_at: Count  # first row in Model.curved
     real: Any  # Taichi type of stress
     strain_real: Any  # Taichi type in which the deformation gradient is formed
 
@@ -57,8 +59,9 @@ class Model:
     state: State  # positions, velocities, scratch
     terms: tuple  # modules of fem.terms
     nodes: Any  # i32: nodes of each tet, per block (node, lane); corners, then mid-edge nodes, each ascending
-    rules: tuple  # reference.Quadrature of the order 2 groups, in ascending degree
+    rules: tuple  # mesh.quadratic.Quadrature of the order 2 groups, in ascending degree
     points: Any = None  # (points, 28): weight and dN_a/d(l_1, l_2, l_3) of nodes 1 to 9 at the points of these rules
+    curved: Any = None  # (rows, 10, lanes), by block and point: Dm^-1 there [1/m], `lanes.volume_ratio_at`
     Dm_inv: Any  # (n_blocks, 9, lanes) [1/m]
     volume: Any  # (n_blocks, lanes) [m^3]
     block_body: Any  # (n_blocks) i32

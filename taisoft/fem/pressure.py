@@ -20,6 +20,7 @@ import taichi as ti
 from taisoft.fem.dependent_table import DependentTable
 from taisoft.fem.model import Setup
 from taisoft.fem.node_graph import NodeGraph
+from taisoft.mesh.quadratic import triangle_rule
 from taisoft.ranges import entries_of
 from taisoft.scene.body import Body
 from taisoft.scene.loads import Cavity, Pressure
@@ -51,30 +52,9 @@ def pressures_of(scene: Scene) -> list[tuple[int, Pressure | Cavity]]:
 @cache
 def triangle_weights(order: int) -> np.ndarray:
     """w (n, n, n) of a triangle with n = 3 or 6 nodes, those between the corners 0 and 1, 1 and 2, 2 and 0 last."""
-    # Gauss points (s, t) = (a, (1 - a) b): exact for degree 4, the highest that occurs
-    point, weight = np.polynomial.legendre.leggauss(3)
-    a, b = (g.reshape(-1) for g in np.meshgrid(0.5 + 0.5 * point, 0.5 + 0.5 * point, indexing="ij"))
-    weights = np.outer(0.5 * weight, 0.5 * weight).reshape(-1) * (1.0 - a)
-    corner = np.stack([1.0 - a - (1.0 - a) * b, a, (1.0 - a) * b])
-    slopes = np.array([(-1.0, -1.0), (1.0, 0.0), (0.0, 1.0)])  # of the barycentric coordinates along s and t
-    if order == 1:
-        value, slope = corner, np.broadcast_to(slopes[:, :, None], (3, 2, len(a)))
-    else:
-        ends = [(0, 1), (1, 2), (2, 0)]
-        value = np.concatenate([corner * (2.0 * corner - 1.0), [4.0 * corner[k] * corner[l] for k, l in ends]])
-        own = (4.0 * corner - 1.0)[:, None] * slopes[:, :, None]
-        middle = [4.0 * (slopes[k][:, None] * corner[l] + corner[k] * slopes[l][:, None]) for k, l in ends]
-        slope = np.concatenate([own, middle])
+    weights, value, slope = triangle_rule(order)
     product = np.einsum("q,iq,bq,cq->ibc", weights, value, slope[:, 0], slope[:, 1])
     return product - product.transpose(0, 2, 1)
-
-
-def triangle_nodes(body: Body, triangles: np.ndarray) -> np.ndarray:
-    """Nodes (k, 3 or 6) of rows (k,) of mesh.surface: corners, then the middles of their edges."""
-    if body.order == 1:
-        return body.mesh.surface[triangles]
-    split = body.nodes.boundary.reshape(-1, 4, 3)[triangles]  # (a, ab, ca), (ab, b, bc), (ca, bc, c), ...
-    return np.stack([split[:, 0, 0], split[:, 1, 1], split[:, 2, 2], split[:, 0, 1], split[:, 1, 2], split[:, 0, 2]], axis=1)
 
 
 def force_terms(nodes: np.ndarray, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -109,7 +89,7 @@ class CavityForm:
     """The volume of a cavity as a function of all nodes' positions."""
 
     def __init__(self, body: Body, cavity: Cavity, first_node: int):
-        rows, self._weights = merged(*force_terms(triangle_nodes(body, cavity.triangles), triangle_weights(body.order)))
+        rows, self._weights = merged(*force_terms(body.face_nodes(cavity.triangles), triangle_weights(body.order)))
         self.nodes, place = np.unique(rows, return_inverse=True)
         self._rows = place.reshape(-1, 3)
         self.nodes = self.nodes + first_node
@@ -137,7 +117,7 @@ def all_terms(scene: Scene, node_start: np.ndarray, terms) -> tuple[np.ndarray, 
     ids, weights = [np.zeros((0, 4), dtype=np.int64)], [np.zeros(0)]
     for n, (k, pressure) in enumerate(pressures_of(scene)):
         body = scene.bodies[k]
-        nodes = node_start[k] + triangle_nodes(body, pressure.triangles)
+        nodes = node_start[k] + body.face_nodes(pressure.triangles)
         own, w = merged(*terms(nodes, triangle_weights(body.order)))
         ids.append(np.column_stack([own, np.full(len(own), n)]))
         weights.append(w)

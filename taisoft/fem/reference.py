@@ -1,7 +1,7 @@
-"""Shape functions, quadrature and masses of linear and quadratic tetrahedra, in barycentric coordinates l_0..l_3. NumPy.
+"""Rest gradients and masses of linear and quadratic tetrahedra, see `mesh.quadratic` for their shape functions. NumPy.
 
-Order 1: N_a = l_a. Order 2: N_a = l_a (2 l_a - 1) at the corners, N_ab = 4 l_a l_b in the middle of the edge ab. Edges are
-straight at rest, so grad l_k and the Jacobian of the rest shape are constant over a tet.
+Where edges are straight at rest, grad l_k and the Jacobian of the rest shape are constant over a tet. In a body with curved edges
+they belong to a quadrature point, and masses are integrated by the rule of degree 4, which is exact for int rho N_a dV.
 Integrals over a tet are V times a weighted sum over points: for order 1 the centre, since F is constant; for order 2 four
 points, exact for degree 2 (Hammer, Stroud 1956), or fourteen, exact for degree 5 (Walkington 2000).
 
@@ -11,60 +11,27 @@ so they use the consistent matrix there. Linear bodies stay lumped: in a scene w
 the diagonal.
 """
 
-from dataclasses import dataclass
 from functools import cache
-from itertools import permutations
 
 import numpy as np
 import scipy.sparse as sp
 
 from taisoft.fem.dependent_table import DependentTable, dependent_table
 from taisoft.mesh import aggregates
+from taisoft.mesh.quadratic import (
+    area_vectors,
+    jacobians,
+    point_volumes,
+    quadrature,
+    shape_derivatives,
+    shape_functions,
+    triangle_rule,
+)
 from taisoft.mesh.topology import EDGES
 from taisoft.scene.rigid import RigidBody
 from taisoft.scene.scene import Body, Scene
 
 HRZ_FRACTIONS = {1: (1 / 4, 0.0), 2: (1 / 36, 4 / 27)}  # fraction of a tet's mass at a corner, at a mid-edge node
-# by degree, symmetric rules: (weight of each point, one point of the orbit); the rule of 4 is exact for degree 5
-RULES = {
-    1: ((1.0, (1 / 4, 1 / 4, 1 / 4, 1 / 4)),),
-    2: ((1 / 4, (0.58541019662496845446, *3 * (0.13819660112501051518,))),),
-    4: (
-        (0.11268792571801585080, (1 - 3 * 0.31088591926330060980, *3 * (0.31088591926330060980,))),
-        (0.07349304311636194955, (1 - 3 * 0.09273525031089122640, *3 * (0.09273525031089122640,))),
-        (0.04254602077708146644, (*2 * (0.04550370412564964949,), *2 * (0.5 - 0.04550370412564964949,))),
-    ),
-}
-
-
-@dataclass(frozen=True)
-class Quadrature:
-    """points (p,4): barycentric coordinates; weights (p,): fractions of the volume, all positive, sum 1."""
-
-    points: np.ndarray
-    weights: np.ndarray
-
-
-@cache
-def quadrature(degree: int) -> Quadrature:
-    """The rule that integrates polynomials of the given degree (1, 2 or 4) exactly."""
-    points, weights = [], []
-    for weight, point in RULES[degree]:
-        orbit = sorted(set(permutations(point)), reverse=True)
-        points += orbit
-        weights += [weight] * len(orbit)
-    return Quadrature(np.array(points), np.array(weights) / np.sum(weights))
-
-
-def shape_derivatives(order: int, points: np.ndarray) -> np.ndarray:
-    """s (p, 4 or 10, 4) with grad N_a = sum_k s_ak grad l_k at barycentric points (p,4)."""
-    corner = np.eye(4) * (np.ones((len(points), 1)) if order == 1 else 4.0 * points - 1.0)[:, :, None]
-    if order == 1:
-        return corner
-    middle = np.zeros((len(points), 6, 4))
-    for e, (a, b) in enumerate(EDGES):
-        middle[:, e, a], middle[:, e, b] = 4.0 * points[:, b], 4.0 * points[:, a]
-    return np.concatenate([corner, middle], axis=1)
 
 
 def inverse_rest_edges(vertices: np.ndarray, tets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -80,10 +47,19 @@ def inverse_rest_edges(vertices: np.ndarray, tets: np.ndarray) -> tuple[np.ndarr
 def shape_gradients(body: Body) -> tuple[np.ndarray, np.ndarray]:
     """Rest gradients of the shape functions (m, p, 4 or 10, 3) [1/m] at the body's quadrature points, and the
     volumes of these points (m, p) [m^3]."""
+    rule = quadrature(body.quadrature_degree)
+    if body.is_curved:
+        x, s = body.rest_positions[body.nodes.elements], shape_derivatives(2, rule.points)
+        J = jacobians(x, rule.points)
+        return (s[:, :, 1:] - s[:, :, :1]) @ np.linalg.inv(J), np.linalg.det(J) * rule.weights / 6.0
     Dm_inv, volumes = inverse_rest_edges(body.mesh.vertices, body.mesh.tets)
     barycentric = np.concatenate([-Dm_inv.sum(axis=1, keepdims=True), Dm_inv], axis=1)
-    rule = quadrature(body.quadrature_degree)
     return shape_derivatives(body.order, rule.points) @ barycentric[:, None], np.outer(volumes, rule.weights)
+
+
+def rest_volumes(body: Body) -> np.ndarray:
+    """Volumes (m,) [m^3] of the tets, as the body's quadrature gives them."""
+    return shape_gradients(body)[1].sum(axis=1) if body.is_curved else body.mesh.volumes
 
 
 def tet_patches(body: Body) -> np.ndarray:
@@ -96,7 +72,7 @@ def tet_patches(body: Body) -> np.ndarray:
 
 def patch_moduli(body: Body, patch: np.ndarray) -> np.ndarray:
     """Mean lambda (n_patches,) [Pa] of the patches. patch: `tet_patches`."""
-    volumes, lam = body.mesh.volumes, body.composition.dilatation_modulus
+    volumes, lam = rest_volumes(body), body.composition.dilatation_modulus
     return np.bincount(patch, volumes * lam) / np.bincount(patch, volumes)
 
 
@@ -107,18 +83,32 @@ def lumped_mass(body: Body) -> np.ndarray:
     """
     corner, middle = HRZ_FRACTIONS[body.order]
     fractions = np.repeat([corner, middle], [4, body.nodes.elements.shape[1] - 4])
+    if body.is_curved:
+        volumes, N = _curved_points(body)
+        fractions = volumes @ N**2
+        fractions /= fractions.sum(axis=1, keepdims=True)
     return _distribute(body, fractions)
 
 
 def gravity_mass(body: Body) -> np.ndarray:
     """int rho N_a dV at each node (n,) [kg], the mass used for weight; for order 2 negative at the corners."""
     fractions = np.full(4, 0.25) if body.order == 1 else np.repeat([-0.05, 0.2], [4, 6])
+    if body.is_curved:
+        volumes, N = _curved_points(body)
+        fractions = volumes @ N / body.volumes[:, None]
     return _distribute(body, fractions)
 
 
 def _distribute(body: Body, fractions: np.ndarray) -> np.ndarray:
-    values = np.reshape(body.composition.number("density"), (-1, 1)) * np.outer(body.mesh.volumes, fractions)
+    """Masses (n,) [kg] of fractions of the tets' masses at their nodes, (10,) or (m,10)."""
+    values = np.reshape(body.composition.number("density"), (-1, 1)) * (body.volumes[:, None] * fractions)
     return np.bincount(body.nodes.elements.reshape(-1), values.reshape(-1), body.n_nodes)
+
+
+def _curved_points(body: Body) -> tuple[np.ndarray, np.ndarray]:
+    """Volumes (m,p) [m^3] of the points of the rule of degree 4, and N_a there (p,10)."""
+    rule = quadrature(4)
+    return point_volumes(body.rest_positions[body.nodes.elements], rule), shape_functions(2, rule.points)
 
 
 @cache
@@ -138,7 +128,10 @@ def consistent_mass(body: Body) -> sp.csr_matrix:
     if isinstance(body, RigidBody):
         return sp.diags(lumped_mass(body), format="csr")
     elements = body.nodes.elements
-    values = (body.composition.number("density") * body.mesh.volumes)[:, None, None] * unit_mass(body.order)
+    values = (body.composition.number("density") * body.volumes)[:, None, None] * unit_mass(body.order)
+    if body.is_curved:
+        volumes, N = _curved_points(body)
+        values = np.reshape(body.composition.number("density"), (-1, 1, 1)) * np.tensordot(volumes, N[:, :, None] * N[:, None], 1)
     rows, columns = np.broadcast_arrays(elements[:, :, None], elements[:, None, :])
     return sp.csr_matrix((values.reshape(-1), (rows.reshape(-1), columns.reshape(-1))), shape=(body.n_nodes,) * 2)
 
@@ -165,13 +158,14 @@ def mass_matrix(scene: Scene, dependents: DependentTable | None = None) -> sp.cs
 def triangle_areas(body: Body, triangles: np.ndarray) -> np.ndarray:
     """Reference areas at the nodes (n,) [m^2] of rows (k,) of mesh.surface: a uniform traction times them is the nodal forces.
 
-    A third of a triangle goes to each corner for linear tets, to each mid-edge node for quadratic ones.
+    A third of a triangle goes to each corner for linear tets, to each mid-edge node for quadratic ones with straight edges.
     """
+    if body.is_curved:
+        nodes = body.face_nodes(triangles)
+        parts = np.linalg.norm(area_vectors(body.rest_positions[nodes]), axis=2) @ triangle_rule(2)[1].T
+        return np.bincount(nodes.reshape(-1), parts.reshape(-1), body.n_nodes)
     corners = body.mesh.surface[triangles]
     a, b, c = (body.mesh.vertices[corners[:, k]] for k in range(3))
     area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
-    if body.order == 1:
-        nodes = corners
-    else:  # the last of a face's four triangles connects the mid-edge nodes
-        nodes = body.nodes.boundary.reshape(-1, 4, 3)[triangles, 3]
+    nodes = corners if body.order == 1 else body.face_nodes(triangles)[:, 3:]
     return np.bincount(nodes.reshape(-1), np.repeat(area / 3.0, 3), body.n_nodes)

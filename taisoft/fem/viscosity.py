@@ -23,12 +23,12 @@ import taichi as ti
 from taisoft.backend.arrays import Count
 from taisoft.backend.runtime import kernel
 from taisoft.backend.tracing import arithmetic
-from taisoft.fem import reference
 from taisoft.fem.dependents import place_all
 from taisoft.fem.lanes import broadcast, differences, gradient_at, rest_gradients, volumes, weight_at
 from taisoft.fem.laws import viscosity as law
 from taisoft.fem.laws.st_venant_kirchhoff import green_strain
 from taisoft.fem.model import Group, Layout, Model, Setup
+from taisoft.mesh.quadratic import quadrature
 from taisoft.scene.scene import Scene
 
 STRAIN, HEAT, BRANCHES = 0, 6, 7  # in a point's history: dev E, dissipated energy density [Pa], M of each branch
@@ -76,7 +76,7 @@ def model_fields(setup: Setup) -> dict[str, Any]:
 
 def _points(scene: Scene, layout: Layout) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """First point (n_blocks,) of each block, tets (n_points, lanes) of each point, and its number (n_points, lanes) by tets."""
-    counts = [len(reference.quadrature(b.quadrature_degree).weights) if law.applies(b) else 0 for b in scene.bodies]
+    counts = [len(quadrature(b.quadrature_degree).weights) if law.applies(b) else 0 for b in scene.bodies]
     by_tet = np.repeat(counts, np.diff(layout.tet_start))
     tets = layout.tet_of_lane.reshape(-1, layout.lanes)
     by_block = by_tet[tets[:, 0]]
@@ -238,7 +238,7 @@ def follow(m: ti.template()):
             for b in range(g.first, g.last):
                 X, N = differences(m, g, m.state.x, b, ti.f64), rest_gradients(m, b, ti.f64)
                 for q in range(g.n_points):
-                    F = gradient_at(m, g, X, N, q, ti.f64)
+                    F = gradient_at(m, g, X, N, b, q, ti.f64)
                     _follow(m, m.viscosity.first_point[b] + q, F)
 
 
@@ -280,7 +280,7 @@ def dissipated_energies(m: ti.template(), tets: ti.types.ndarray()):
             heat = broadcast(ti.cast(0.0, ti.f64), m.lanes)
             for q in range(g.n_points):
                 (own,) = _load(m, m.viscosity.history, m.viscosity.first_point[b] + q, HEAT, 1)
-                heat += weight_at(m, g, q, ti.f64) * own
+                heat += weight_at(m, g, b, q, ti.f64) * own
             lost = volumes(m, b, ti.f64) * heat
             for l in ti.static(range(m.lanes)):
                 tets[b * m.lanes + l] = lost[l]

@@ -11,11 +11,13 @@ import taichi as ti
 from taisoft.fem.lanes import (
     broadcast,
     deformation_gradient,
+    gradients_at,
     load_lanes,
     position_differences,
     rest_gradients,
     rest_gradients_of_F,
     store_lanes,
+    volume_ratio_at,
     volumes,
     with_additions,
 )
@@ -23,7 +25,7 @@ from taisoft.fem.laws import dpk1_projected, prepare_projected
 from taisoft.fem.mean_dilatation import stress_constants
 from taisoft.fem.node_graph import PAIRS
 from taisoft.fem.pattern import MATRIX_BLOCKS
-from taisoft.fem.reference import Quadrature, shape_derivatives
+from taisoft.mesh.quadratic import Quadrature, shape_derivatives
 
 N_PAIRS = len(PAIRS[2])
 
@@ -62,14 +64,15 @@ def element_blocks(m: ti.template(), g: ti.template(), A: ti.template(), b, proj
         for k in range(N_PAIRS * 9):
             store_lanes(m, A.element, base + k, broadcast(ti.cast(0.0, m.real), m.lanes))
     for q in range(g.n_points):
-        F = deformation_gradient(m, g, X, N, q, m.real)
+        F = deformation_gradient(m, g, X, N, b, q, m.real)
+        G, U = gradients_at(m, g, M, b, q, m.real), V * volume_ratio_at(m, g, b, q, m.real)
         at = base + (N_PAIRS * 9 if ti.static(g.order == 2) else 0)
         if ti.static(projected):
             S = prepare_projected(g.law, F, with_additions(m, g, p, b, q, m.real))
-            projected_blocks(m, A, g.law, at, S, M, V)
+            projected_blocks(m, A, g.law, at, S, G, U)
         else:
             S = g.law.prepare(F, with_additions(m, g, p, b, q, m.real))
-            exact_blocks(m, A, g.law, at, F, S, M, V)
+            exact_blocks(m, A, g.law, at, F, S, G, U)
         if ti.static(g.order == 2):
             scatter_terms(m, A, base, at, g.points_at + q)
 

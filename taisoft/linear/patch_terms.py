@@ -106,9 +106,9 @@ def element_gradients(m: ti.template(), g: ti.template(), A: ti.template(), b):
     M, V = rest_gradients(m, b, m.real), volumes(m, b, m.real)
     S = zero_forces(m, g)
     for q in range(g.n_points):
-        F = deformation_gradient(m, g, X, N, q, m.real)
+        F = deformation_gradient(m, g, X, N, b, q, m.real)
         G = g.law.dilatation_gradient(F)
-        add_forces(m, g, S, G, M, q)
+        add_forces(m, g, S, G, M, b, q)
     base = g.matrix_at + (b - g.first) * (MATRIX_BLOCKS[g.order] * 9)
     for i in ti.static(range(3)):
         total = broadcast(ti.cast(0.0, m.real), m.lanes)

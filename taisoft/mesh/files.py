@@ -3,9 +3,9 @@
 The formats that meshio reads wrongly have modules of their own; every other one is read by meshio in a child process
 (`safe_reading.py`).
 
-Second-order tets in a file have ten nodes, four corners and then one on each edge. Only the corners enter the mesh:
-second-order bodies have straight edges at rest and mid-edge nodes of their own. Curved edges are reported. Formats differ in
-the order of the edges, and readers do not always know it, so the order is inferred from the nodes' positions.
+Second-order tets in a file have ten nodes, four corners and then one on each edge. Where some edge is curved, the latter become
+the mesh's `mid_edge`; straight ones need none. Formats differ in the order of the edges, and readers do not always know it, so
+the order is inferred from the nodes' positions.
 
 Regions are numbers of the elements: physical groups, references, or other cell data. Weak: only .msh holds their names.
 """
@@ -25,13 +25,14 @@ from taisoft.mesh.fibres import FIBRES
 from taisoft.mesh.gmsh import PHYSICAL, element_data, read_gmsh, split_names
 from taisoft.mesh.medit import REFERENCE, read_medit
 from taisoft.mesh.nastran import read_nastran
+from taisoft.mesh.nodes import STRAIGHT
 from taisoft.mesh.quality import edge_lengths
 from taisoft.mesh.regions import LARGEST_ID, usable_names
 from taisoft.mesh.safe_reading import Blocks, FileContent, content_of, read_by_meshio, read_content
 from taisoft.mesh.surface_mesh import READERS as SURFACE_READERS
 from taisoft.mesh.tet_mesh import LARGEST_COORDINATE, TetMesh
 from taisoft.mesh.tetgen import read_tetgen
-from taisoft.mesh.topology import EDGES, merge_labels
+from taisoft.mesh.topology import EDGES, distinct_edges, merge_labels
 from taisoft.mesh.vtu import read_vtu
 
 TETS = ("tetra", "tetra10")
@@ -41,8 +42,8 @@ WRITERS = {".msh": "gmsh", ".vtk": "vtk", ".vtu": "vtu", ".mesh": "medit"}
 REGION = "region"  # a name of cell data that hold regions, as PHYSICAL and REFERENCE do
 NONE_IF_ZERO = (PHYSICAL, REFERENCE)  # such data are in files without regions too, where all are 0
 
-STRAIGHT = 1e-6  # tolerated distance of a node from its edge's midpoint, over the edge's length
-KNOWN_ORDER = 0.25  # largest median of that ratio for which the inferred node order is accepted
+# largest median distance of nodes from their edges' midpoints, over the edges' lengths, for which their order is inferred
+KNOWN_ORDER = 0.25
 
 _PLURALS = {"vertex": "vertices", "line": "lines", "triangle": "triangles", "quad": "quads", "hexahedron": "hexahedra"}
 
@@ -54,8 +55,8 @@ def read_mesh(path, fix_orientation: bool = False, weld: float | None = None, re
     apart [m]; 0 merges only equal ones, None merges nothing. regions: name of the cell data that hold the tets' regions; by
     default the physical groups of .msh, the references of .mesh, or data called "region". Cell data "fibres" or "fibers" of three
     components are its fibres. Points, lines and triangles beside the tets, and vertices of no tet, are ignored with a warning;
-    any other element type is refused with its name and count. Second-order tets keep only their corners; a warning reports the
-    number of curved edges that become straight. Raises MeshError.
+    any other element type is refused with its name and count. Nodes on curved edges of second-order tets are the mesh's
+    `mid_edge`. Raises MeshError.
     """
     try:
         file = Path(path)
@@ -99,6 +100,9 @@ def write_mesh(path, mesh: TetMesh, regions: bool = True) -> None:
     if not isinstance(mesh, TetMesh):
         raise MeshError(f"{file}: write_mesh needs a TetMesh, not {type(mesh).__name__}")
     record = mesh.to_meshio()
+    if ending == ".mesh" and mesh.mid_edge is not None:
+        warnings.warn(f"{file}: {ending} cannot hold mid-edge nodes; its edges are straight", UserWarning, stacklevel=2)
+        record.points, record.cells[0] = mesh.vertices, meshio.CellBlock("tetra", mesh.tets)
     fibres = record.cell_data.pop(FIBRES[0], None)
     if not regions:
         record.cell_data, record.field_data = {}, {}
@@ -234,14 +238,14 @@ def _clean_mesh(name: str, content: FileContent, fix_orientation: bool, weld, re
     points = points.astype(np.float64)
     unused = np.ones(len(points), dtype=bool)
     unused[tets] = False
-    used = ~unused
+    used, middles = ~unused, None
     second_order = [nodes for nodes in blocks if nodes.shape[1] == 10]
     if second_order:
         cells = np.concatenate(second_order)
         bad = np.argwhere((cells < 0) | (cells >= len(points)))
         if len(bad):
             raise MeshError(f"{name}: second-order tet {bad[0, 0]}: node {cells[tuple(bad[0])]} does not exist")
-        notes += _curved_edge_warnings(name, points, cells)
+        middles = _curved_middles(name, points, cells)
         unused[cells] = False
     if unused.any():
         notes.append(f"{unused.sum()} vertices of no tet are left out, the first is vertex {unused.argmax()} of the file")
@@ -249,11 +253,15 @@ def _clean_mesh(name: str, content: FileContent, fix_orientation: bool, weld, re
     if weld is not None:
         points, tets, note = _weld(name, points, tets, weld)
         notes += note
+    if middles is not None:
+        is_second = np.repeat([nodes.shape[1] == 10 for nodes in blocks], [len(nodes) for nodes in blocks])
+        labels["mid_edge"] = _middles_by_edge(name, points, tets, is_second, middles)
     return TetMesh(points, tets, fix_orientation, source=name, notes=tuple(notes), **labels)
 
 
-def _curved_edge_warnings(name: str, points: np.ndarray, cells: np.ndarray) -> list[str]:
-    """Return a warning if edges of second-order tets (m,10) are curved. Raises MeshError if nodes do not lie on the edges."""
+def _curved_middles(name: str, points: np.ndarray, cells: np.ndarray) -> np.ndarray | None:
+    """Return the nodes (m,6,3) on the EDGES of second-order tets (m,10), None if all are straight. Raises MeshError if nodes do
+    not lie on the edges."""
     corners, nodes = points[cells[:, :4]], points[cells[:, 4:]]
     a, b = np.array(EDGES).T
     midpoints = 0.5 * (corners[:, a] + corners[:, b])
@@ -264,18 +272,25 @@ def _curved_edge_warnings(name: str, points: np.ndarray, cells: np.ndarray) -> l
     edge = typical.argmin(axis=1)
     if len(set(edge.tolist())) < 6 or typical.min(axis=1).max() > KNOWN_ORDER:
         raise MeshError(f"{name}: the tets' ten nodes are not four corners and then one on each edge")
-    deviation = deviation[np.arange(6), :, edge]  # (6,m)
-    curved = np.argwhere(deviation > STRAIGHT)
-    if not len(curved):
-        return []
-    ends = np.sort(cells[:, :4][:, EDGES], axis=2)[:, edge]
-    n = len(np.unique(ends[curved[:, 1], curved[:, 0]], axis=0))
-    k, e = np.unravel_index(int(deviation.argmax()), deviation.shape)
-    first, second = ends[e, k].tolist()
-    return [
-        f"{n} edges of second-order tets are curved and become straight; the largest deviation is {deviation[k, e]:.2g} of the "
-        f"edge's length, between vertices {first} and {second} of the file"
-    ]
+    is_curved = deviation[np.arange(6), :, edge].max() > STRAIGHT
+    return nodes[:, np.argsort(edge)] if is_curved else None
+
+
+def _middles_by_edge(name: str, points: np.ndarray, tets: np.ndarray, rows: np.ndarray, nodes: np.ndarray) -> np.ndarray:
+    """Return the nodes (k,3) on all edges of tets (m,4), in the order of `distinct_edges`; those of first order get midpoints.
+
+    rows: (m,) bool, tets of second order, with nodes (., 6, 3) on their EDGES. Raises MeshError if tets differ about an edge.
+    """
+    edges, edge_of_tet = distinct_edges(tets)
+    ends, of_nodes = points[edges], edge_of_tet[rows]
+    middles = ends.mean(axis=1)
+    middles[of_nodes.reshape(-1)] = nodes.reshape(-1, 3)
+    length = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
+    differ = np.argwhere(np.linalg.norm(middles[of_nodes] - nodes, axis=2) > STRAIGHT * length[of_nodes])
+    if len(differ):
+        a, b = edges[of_nodes[tuple(differ[0])]]
+        raise MeshError(f"{name}: tets have different nodes on the edge between vertices {a} and {b}: weld or remesh their parts")
+    return middles
 
 
 def _weld(name: str, points: np.ndarray, tets: np.ndarray, weld) -> tuple[np.ndarray, np.ndarray, list[str]]:

@@ -3,8 +3,8 @@
 Drawing and contact need flat triangles with a linear tet behind each. A second-order tet is therefore also split into
 eight: one of half size at each corner, and four around the shortest diagonal of the octahedron between them, which gives
 the best shapes (Bey 1995, Tetrahedral grid refinement, Computing 55). The split depends only on node numbers and positions,
-not on the order of a tet's corners. Edges are straight at rest, so the eight fill the tet. In a deformed body they
-interpolate the nodes linearly and differ from the curved element.
+not on the order of a tet's corners. Where edges are straight at rest the eight fill the tet. In a deformed body, and in a
+curved element, they interpolate the nodes linearly.
 """
 
 from dataclasses import dataclass, replace
@@ -18,7 +18,9 @@ from taisoft.errors import MeshError
 from taisoft.mesh.tet_mesh import TetMesh
 from taisoft.mesh.topology import EDGES, distinct_edges
 
+PARTS = 8  # linear tets of a second-order one; `Nodes.tets` lists those of each tet in sequence
 TIE_TOLERANCE = 1e-9  # relative difference below which squared diagonals count as equal
+STRAIGHT = 1e-6  # distance of a node from its edge's midpoint, over the edge's length, up to which the edge is straight
 
 # Nodes of an element: corners 0 to 3, then the midpoint of edge k as 4 + k. The sub-tet at each corner:
 _CORNER_TETS = np.array([(0, 4, 5, 6), (4, 1, 7, 8), (5, 7, 2, 9), (6, 8, 9, 3)])
@@ -44,6 +46,7 @@ class Nodes:
     boundary: (b,3) int64, the elements' flat triangles, normals outward; boundary_tets: (b,4) int64, the linear tet behind each.
     tets: (j,4) int64, linear tets that fill the body. Tets are positive, det(x1-x0, x2-x0, x3-x0) > 0.
     surface: (k,3) int64, the triangles that touch and are touched: the boundary, unless vertices of a skin are embedded.
+    curved: (m,) bool, the elements some of whose edges are curved, or None if no edge is.
     embedded: (v, n - v) weights, or None: the last v nodes belong to no element but lie at these sums of the others.
     """
 
@@ -53,6 +56,7 @@ class Nodes:
     boundary_tets: np.ndarray
     tets: np.ndarray
     surface: np.ndarray
+    curved: np.ndarray | None = None
     embedded: sp.csr_matrix | None = None
 
     __repr__ = short_repr
@@ -67,8 +71,8 @@ class Nodes:
         return len(self.positions) - (0 if self.embedded is None else self.embedded.shape[0])
 
 
-def make_nodes(mesh: TetMesh, order: int) -> Nodes:
-    """Return the nodes of elements of order 1 or 2 on a mesh.
+def make_nodes(mesh: TetMesh, order: int, middles: np.ndarray | None = None) -> Nodes:
+    """Return the nodes of elements of order 1 or 2 on a mesh. middles: (k,3) [m] of curved edges; None: the edges' midpoints.
 
     Order 1: the mesh's own arrays. Order 2: the vertices, then the mid-edge nodes in lexicographic order of their
     ascending vertex pairs; sub-tets 8e to 8e+3 of tet e lie at its corners, the next four around the shortest diagonal
@@ -80,13 +84,18 @@ def make_nodes(mesh: TetMesh, order: int) -> Nodes:
     if order == 1:
         return Nodes(mesh.vertices, mesh.tets, mesh.surface, mesh.tets[mesh.surface_tets], mesh.tets, mesh.surface)
     edges, edge_of_tet = distinct_edges(mesh.tets)
-    positions = np.concatenate([mesh.vertices, 0.5 * (mesh.vertices[edges[:, 0]] + mesh.vertices[edges[:, 1]])])
+    a, b = mesh.vertices[edges[:, 0]], mesh.vertices[edges[:, 1]]
+    midpoints, curved = 0.5 * (a + b), None
+    if middles is not None:
+        bent = np.linalg.norm(middles - midpoints, axis=1) > STRAIGHT * np.linalg.norm(b - a, axis=1)
+        midpoints[bent], curved = middles[bent], bent[edge_of_tet].any(axis=1) if bent.any() else None
+    positions = np.concatenate([mesh.vertices, midpoints])
     elements = np.concatenate([mesh.tets, mesh.n_verts + edge_of_tet], axis=1)
     inner = _INNER_TETS[_shortest_diagonals(mesh)]
     local = np.concatenate([np.broadcast_to(_CORNER_TETS, (mesh.n_tets, 4, 4)), inner], axis=1)
     tets = np.take_along_axis(elements, local.reshape(-1, 32), axis=1).reshape(-1, 8, 4)
     surface, surface_tets = _split_surface(mesh, elements, tets)
-    return Nodes(positions, elements, surface, surface_tets, tets.reshape(-1, 4), surface)
+    return Nodes(positions, elements, surface, surface_tets, tets.reshape(-1, 4), surface, curved)
 
 
 def embed(nodes: Nodes, vertices: np.ndarray, triangles: np.ndarray, weights: sp.csr_matrix) -> Nodes:
@@ -95,12 +104,11 @@ def embed(nodes: Nodes, vertices: np.ndarray, triangles: np.ndarray, weights: sp
     return replace(nodes, positions=positions, surface=triangles + len(nodes.positions), embedded=weights)
 
 
-def shape_functions(order: int, points: np.ndarray) -> np.ndarray:
-    """N_a (p, 4 or 10) at barycentric points (p,4)."""
-    if order == 1:
-        return points.copy()
-    middles = [4.0 * points[:, a] * points[:, b] for a, b in EDGES]
-    return np.concatenate([points * (2.0 * points - 1.0), np.stack(middles, axis=1)], axis=1)
+def part_coordinates(nodes: Nodes) -> np.ndarray:
+    """Barycentric coordinates (j,4,4) of the corners of `Nodes.tets` in their second-order elements."""
+    of_nodes = np.concatenate([np.eye(4), np.eye(4)[list(EDGES)].mean(axis=1)])
+    place = (nodes.tets.reshape(-1, PARTS, 4)[..., None] == nodes.elements[:, None, None]).argmax(axis=3)
+    return of_nodes[place].reshape(-1, 4, 4)
 
 
 def _shortest_diagonals(mesh: TetMesh) -> np.ndarray:

@@ -34,15 +34,17 @@ def place(mesh: TetMesh | SurfaceMesh, up: str = "y", scale: float = 1.0, rotate
     if not isinstance(mesh, (TetMesh, SurfaceMesh)):
         raise MeshError(f"place needs a TetMesh or a SurfaceMesh, not {type(mesh).__name__}")
     turn = placement(up, scale, rotate, to)
-    vertices = mesh.vertices @ turn.T
+    vertices, shift = mesh.vertices @ turn.T, 0.0
     if at is not None:
-        vertices = vertices + (checked_vector(at, "place", "at") - underside(vertices, to))
+        shift = checked_vector(at, "place", "at") - underside(vertices, to)
+        vertices = vertices + shift
     if isinstance(mesh, SurfaceMesh):
         return SurfaceMesh(vertices, mesh.triangles, mesh.source, list(mesh.warnings))
     with warnings.catch_warnings(record=True) as found:
         warnings.simplefilter("always")
         fibres = None if mesh.fibres is None else mesh.fibres @ turn.T
-        labels = {"regions": mesh.regions, "region_names": dict(mesh.region_names), "fibres": fibres}
+        middles = None if mesh.mid_edge is None else mesh.mid_edge @ turn.T + shift
+        labels = {"mid_edge": middles, "regions": mesh.regions, "region_names": dict(mesh.region_names), "fibres": fibres}
         placed = TetMesh(vertices, mesh.tets, **labels, source=mesh.source)
     for warning, text in zip(found, placed.warnings):  # one for each
         if text not in mesh.warnings:

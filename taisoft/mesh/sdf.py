@@ -146,6 +146,21 @@ def greatest_depth(vertices: np.ndarray, triangles: np.ndarray, points: np.ndarr
     return deepest
 
 
+def nearest_points(vertices: np.ndarray, triangles: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the nearest points (k,3) [m] of triangles (t,3), which may be open, to points (k,3), and their triangles (k,)."""
+    corners = vertices[triangles]
+    edges, normals = np.roll(corners, -1, axis=1) - corners, normals_and_heights(vertices, triangles)[0]
+    centroid = corners.mean(axis=1)
+    radius = np.linalg.norm(corners - centroid[:, None], axis=2).max(axis=1)
+    guess = scipy.spatial.cKDTree(centroid).query(points)[1]
+    reach = np.sqrt(_offsets(points, corners[guess], edges[guess], normals[guess])[0])
+    point, triangle = BallTree(centroid, radius).pairs(points, reach)
+    squared, offset, _ = _offsets(points[point], corners[triangle], edges[triangle], normals[triangle])
+    order = np.lexsort((triangle, squared, point))
+    best = order[np.searchsorted(point[order], np.arange(len(points)))]
+    return points - offset[best], triangle[best]
+
+
 class BallTree:
     """Balls, found by one k-d tree for each size class: large balls widen only their own search."""
 
@@ -256,21 +271,25 @@ class _Surface:
 
         points: (p,3). triangle: (p,), one for each point.
         """
-        normal, edges = self.normals[triangle], self.edges[triangle]
-        d = points[:, None] - self.corners[triangle]  # from each corner
-        along = np.einsum("pkx,pkx->pk", d, edges) / np.einsum("pkx,pkx->pk", edges, edges)
-        along = np.clip(along, 0.0, 1.0)
-        offset = d - along[:, :, None] * edges
-        squared = np.einsum("pkx,pkx->pk", offset, offset)
-        rows, k = np.arange(len(points)), np.argmin(squared, axis=1)
-        t = along[rows, k]
-        feature = np.where(t == 0.0, 4 + k, np.where(t == 1.0, 4 + (k + 1) % 3, 1 + k))
-        squared, offset = squared[rows, k], offset[rows, k]
-        # The point projects into the face if it is to the left of all three edges.
-        face = (np.einsum("pkx,pkx->pk", np.cross(edges, d), normal[:, None]) >= 0).all(axis=1)
-        height = np.einsum("px,px->p", d[:, 0], normal)
-        return (
-            np.where(face, height**2, squared),
-            np.where(face[:, None], height[:, None] * normal, offset),
-            np.where(face, 0, feature),
-        )
+        return _offsets(points, self.corners[triangle], self.edges[triangle], self.normals[triangle])
+
+
+def _offsets(points: np.ndarray, corners: np.ndarray, edges: np.ndarray, normal: np.ndarray):
+    """See `_Surface.nearest`, for points (p,3) and the corners and edges (p,3,3) and normals (p,3) of one triangle each."""
+    d = points[:, None] - corners  # from each corner
+    along = np.einsum("pkx,pkx->pk", d, edges) / np.einsum("pkx,pkx->pk", edges, edges)
+    along = np.clip(along, 0.0, 1.0)
+    offset = d - along[:, :, None] * edges
+    squared = np.einsum("pkx,pkx->pk", offset, offset)
+    rows, k = np.arange(len(points)), np.argmin(squared, axis=1)
+    t = along[rows, k]
+    feature = np.where(t == 0.0, 4 + k, np.where(t == 1.0, 4 + (k + 1) % 3, 1 + k))
+    squared, offset = squared[rows, k], offset[rows, k]
+    # The point projects into the face if it is to the left of all three edges.
+    face = (np.einsum("pkx,pkx->pk", np.cross(edges, d), normal[:, None]) >= 0).all(axis=1)
+    height = np.einsum("px,px->p", d[:, 0], normal)
+    return (
+        np.where(face, height**2, squared),
+        np.where(face[:, None], height[:, None] * normal, offset),
+        np.where(face, 0, feature),
+    )

@@ -17,13 +17,22 @@ from taisoft.machine import require
 from taisoft.mesh.fibres import FIBRES, checked_fibres
 from taisoft.mesh.quality import edge_lengths, mean_ratio
 from taisoft.mesh.regions import checked_names, checked_regions, region_id, region_text
-from taisoft.mesh.topology import Faces, connected_pieces, first_repeated_tet, joint_edges, joint_vertices, merge_labels
+from taisoft.mesh.topology import (
+    Faces,
+    connected_pieces,
+    distinct_edges,
+    first_repeated_tet,
+    joint_edges,
+    joint_vertices,
+    merge_labels,
+)
 
 DEGENERATE = 1e-9  # a tet has no volume if it is below this times its longest edge cubed
 NEARLY_FLAT = 0.02  # mean ratio below which a tet causes a warning; grids and common meshers stay above
 LARGEST_COORDINATE = float(np.finfo(np.float32).max)  # [m], since forces may be computed in 32 bits
 MAX_OFFSET_RATIO = 1e5  # distance from the origin over size above which a warning is issued
-VTK_TETRA = 10  # VTK's number of the cell type
+VTK_TETRA, VTK_TETRA10 = 10, 24  # VTK's numbers of the cell types
+VTK_ORDER = [0, 1, 2, 3, 4, 7, 5, 6, 8, 9]  # taisoft's nodes of a quadratic tet in VTK's order
 COINCIDENT = 1e-9  # vertices closer than this times the mesh's diagonal are coincident
 
 
@@ -49,9 +58,10 @@ class TetMesh(Guarded):
     surface: (t,3) int64, the faces that belong to one tet, normals outward; surface_tets: (t,) int64, the tet of each.
     flipped: int64 indices of the tets whose orientation was changed. n_components: number of parts connected by vertices.
     regions: (m,) int64, of each tet, or None; region_ids: tuple of those that tets are in, ascending; region_names: {region:
-    name}, of regions that have one. fibres: (m,3) directions of fibres, of any length, 0 in tets without, or None.
-    warnings: list of str, each also issued as a UserWarning. recipe: for a mesh from `box_mesh`, `sheet_mesh` or
-    `ball_mesh` the shape's name and the arguments that reproduce its arrays, else None.
+    name}, of regions that have one. mid_edge: (k,3) float64 [m], the nodes on the edges of a second-order mesh, which
+    curve bodies of order 2, or None. fibres: (m,3) directions of fibres, of any length, 0 in tets without, or None. warnings:
+    list of str, each also issued as a UserWarning. recipe: for a mesh from `box_mesh`, `sheet_mesh`, `ball_mesh` or
+    `cylinder_mesh` the shape's name and the arguments that reproduce its arrays, else None.
     """
 
     _error = MeshAttributeError
@@ -65,6 +75,7 @@ class TetMesh(Guarded):
         regions=None,
         region_names: dict[int, str] | None = None,
         fibres=None,
+        mid_edge=None,
         source: str | None = None,
         notes: tuple[str, ...] = (),
     ):
@@ -73,19 +84,23 @@ class TetMesh(Guarded):
         vertices: (n,3) numbers [m]. tets: (m,4) integers, counted from 0. fix_orientation: if only some tets are inverted, flip
         them and list them in `warnings` instead of refusing them. regions: (m,) integers, which say what material each tet is
         made of, see `Scene.add_body`; region_names: names of some or all of these numbers. fibres: (m,3)
-        numbers. source: the mesh's origin, such as a file's name, which starts every message. notes: a reader's warnings, added
-        to `warnings`. Raises MeshError.
+        numbers. mid_edge: (k,3) [m], nodes on the k edges, which are sorted by their smaller and then by their larger vertex:
+        bodies of order 2 are curved by them, others ignore them. source: the mesh's origin, such as a file's name, which starts
+        every message. notes: a reader's warnings, added to `warnings`. Raises MeshError.
         """
         self.source = source
         self.recipe: dict | None = None
         self.warnings: list[str] = []
-        self.vertices = self._checked_vertices(vertices)
+        self.vertices = self._checked_points(vertices)
         self.tets = self._checked_tets(tets)
         self.volumes = self._oriented_volumes(fix_orientation)
         self.regions = checked_regions(regions, self.n_tets, self._mesh_error)
         self.region_ids = () if self.regions is None else tuple(np.unique(self.regions).tolist())
         self.region_names = checked_names(region_names, self.region_ids, self._mesh_error)
         self.fibres = checked_fibres(fibres, self.n_tets, self._mesh_error)
+        self.mid_edge = None if mid_edge is None else self._checked_points(mid_edge, "mid_edge", "mid_edge")
+        if mid_edge is not None and len(self.mid_edge) != (n := len(distinct_edges(self.tets)[0])):
+            raise self._mesh_error(f"mid_edge has {len(self.mid_edge)} rows for {n} edges")
         self._region_of = {key: one for one in self.region_ids for key in (one, self.region_names.get(one, one))}
         faces = self._checked_faces()
         rows = faces.surface()
@@ -146,11 +161,12 @@ class TetMesh(Guarded):
         """Return the mesh as a meshio.Mesh, from which `from_meshio` makes an equal one.
 
         Its regions are the cell data "gmsh:physical" ("region" if all are 0), their names field data, as meshio reads them from
-        .msh files; its fibres are the cell data "fibres".
+        .msh files; its fibres are the cell data "fibres". With mid-edge nodes its cells are "tetra10".
         """
         import meshio
 
-        record = meshio.Mesh(self.vertices.copy(), [("tetra", self.tets.copy())])
+        points, cells = (self.vertices.copy(), self.tets.copy()) if self.mid_edge is None else self._second_order()
+        record = meshio.Mesh(points, [("tetra" if cells.shape[1] == 4 else "tetra10", cells)])
         if self.regions is not None:
             names = ("gmsh:physical", "gmsh:geometrical") if self.regions.any() else ("region",)
             record.cell_data = {name: [self.regions.astype(np.int32)] for name in names}
@@ -161,10 +177,17 @@ class TetMesh(Guarded):
 
     def to_pyvista(self):
         """Return the mesh as a pyvista.UnstructuredGrid, regions as cell data "region". Raises OutputError without pyvista."""
-        grid = require("pyvista", "to_pyvista", "pyvista").UnstructuredGrid({VTK_TETRA: self.tets}, self.vertices.copy())
+        points, cells = (self.vertices.copy(), self.tets) if self.mid_edge is None else self._second_order()
+        make = require("pyvista", "to_pyvista", "pyvista").UnstructuredGrid
+        grid = make({VTK_TETRA if cells.shape[1] == 4 else VTK_TETRA10: cells}, points)
         if self.regions is not None:
             grid.cell_data["region"] = self.regions
         return grid
+
+    def _second_order(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return vertices and then mid-edge nodes (n + k, 3), and tets (m,10) in VTK's order."""
+        cells = np.concatenate([self.tets, self.n_verts + distinct_edges(self.tets)[1]], axis=1)
+        return np.concatenate([self.vertices, self.mid_edge]), cells[:, VTK_ORDER]
 
     def _warn_distance(self) -> None:
         """Warn of a mesh far from the origin: its positions lose some of their 16 digits to the distance."""
@@ -185,9 +208,9 @@ class TetMesh(Guarded):
         self.warnings.append(text)
         warnings.warn(self._named(text), UserWarning, stacklevel=4)
 
-    def _checked_vertices(self, vertices) -> np.ndarray:
+    def _checked_points(self, points, what: str = "vertices", one: str = "vertex") -> np.ndarray:
         """Return an (n,3) float64 copy of finite coordinates."""
-        array = checked_array(vertices, "vertices", 3, "fiu", "numbers", self._mesh_error)
+        array = checked_array(points, what, 3, "fiu", "numbers", self._mesh_error)
         array = np.array(array, dtype=np.float64, order="C")
         for bad, rule in (
             (~np.isfinite(array), "is not finite"),
@@ -195,7 +218,7 @@ class TetMesh(Guarded):
         ):
             if bad.any():
                 i, k = np.argwhere(bad)[0]
-                raise self._mesh_error(f"vertex {i} coordinate {k} {rule.format(array[i, k])}")
+                raise self._mesh_error(f"{one} {i} coordinate {k} {rule.format(array[i, k])}")
         return array
 
     def _checked_tets(self, tets) -> np.ndarray:

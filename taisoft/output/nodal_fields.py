@@ -25,7 +25,7 @@ class NodalMean:
             rows.append(n + elements.ravel())
             columns.append(m + np.repeat(np.arange(len(elements)), elements.shape[1]))
             n, m = n + body.n_nodes, m + len(elements)
-        volumes = np.concatenate([body.mesh.volumes for body in bodies])
+        volumes = np.concatenate([body.volumes for body in bodies])
         rows, columns = np.concatenate(rows), np.concatenate(columns)
         weights = volumes[columns] / np.bincount(rows, volumes[columns], n)[rows]
         self._mean = sp.csr_matrix((weights, (rows, columns)), shape=(n, m))

@@ -36,6 +36,7 @@ from taisoft.dynamics.readout import nodal_impulses
 from taisoft.errors import OutputError
 from taisoft.files import write_bytes
 from taisoft.machine import require
+from taisoft.mesh.tet_mesh import VTK_ORDER
 from taisoft.output.camera import start_positions
 from taisoft.output.nodal_fields import UNKNOWN_ERROR, von_mises
 from taisoft.scene.rigid import RigidBody
@@ -45,7 +46,6 @@ if TYPE_CHECKING:
 
 ENDING = ".vtu"
 CELL_TYPES = {3: 5, 4: 10, 10: 24}  # nodes of a cell -> VTK's number of its type
-VTK_ORDER = [0, 1, 2, 3, 4, 7, 5, 6, 8, 9]  # taisoft's nodes of a quadratic tet in VTK's order
 SYMMETRIC = ([0, 1, 2, 0, 1, 0], [0, 1, 2, 1, 2, 2])  # rows and columns of a tensor's six components in VTK's order
 TYPES = {"float64": "Float64", "float32": "Float32", "int64": "Int64", "int32": "Int32", "uint8": "UInt8"}
 BLOCK = 2**20  # bytes that are compressed at a time

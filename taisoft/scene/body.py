@@ -10,6 +10,7 @@ import numpy as np
 
 from taisoft.attributes import Guarded, guarded_record, thawed
 from taisoft.errors import MeshError, SceneError, value_text
+from taisoft.mesh import quadratic
 from taisoft.mesh.nodes import Nodes, make_nodes
 from taisoft.mesh.solids import is_closed
 from taisoft.mesh.tet_mesh import TetMesh
@@ -17,6 +18,7 @@ from taisoft.mesh.thickness import coarse_bending
 from taisoft.scene import checks
 from taisoft.scene.collision import CONTACT_MODES
 from taisoft.scene.composition import Composition, compose
+from taisoft.scene.curves import Curve, check_shape, middle_nodes
 from taisoft.scene.key_frames import AT_REST, KeyFrames, NodePath
 from taisoft.scene.loads import LOADS, Activation, Cavity, Load, NodalForce, Pressure, Traction, value_or_path
 from taisoft.scene.material import Material
@@ -28,8 +30,9 @@ NEARLY_INCOMPRESSIBLE = 0.45
 DILATATIONS = ("auto", "local", "mean")
 QUADRATURE_DEGREES = {1: (1,), 2: (2, 4)}  # by element order: degrees of polynomials integrated exactly, the default first
 # other data depend on these
-_SHAPE = ("name", "mesh", "order", "quadrature_degree", "dilatation", "given_dilatation", "nodes", "rest_positions", "n_nodes")
-_READ_ONLY = (*_SHAPE, "composition", "mass", "loads", "skin", "fibres", "activations")
+_SHAPE = ("name", "mesh", "order", "curve", "quadrature_degree", "dilatation", "given_dilatation", "nodes")
+_DERIVED = ("rest_positions", "n_nodes", "is_curved", "volumes", "areas", "composition", "mass", "loads", "skin", "fibres")
+_READ_ONLY = (*_SHAPE, *_DERIVED, "activations")
 USE_A_COPY = "change a copy made by scene.snapshot() and make a new Simulator of it"
 _SET = {kind: f"call sim.set_{kind}(body, index, value) for an existing one; otherwise {USE_A_COPY}" for kind in LOADS}
 _SET["cavity"] = f"call sim.set_cavity(name, value) for an existing one; otherwise {USE_A_COPY}"
@@ -64,11 +67,13 @@ class Body(Guarded):
     name, mesh. material: a `Material`, or a read-only dict of one for each region, by its id. young, poisson, density: what
     the tets have, a float, or (m,) where it may differ from tet to tet; setting one replaces the material's. position: (3,)
     [m]; nodes start at rest_positions + position. velocity: (3,) or (n,3) [m/s], initial. order: 1 or 2, of the elements'
-    shape functions; quadrature_degree: degree of polynomials integrated exactly. dilatation: "local" or "mean", decided by
-    `decided_dilatation` when the body is made and when its material or a number of it is set, but not during a run;
-    given_dilatation: one of DILATATIONS. nodes: `Nodes`, the mesh's vertices, for order 2 its mid-edge nodes, and the vertices
-    of a skin that is touched; methods choose among those of tets only. skin: `Skin` or None, see `embed`. fibres: (m,3) unit
-    vectors at rest, read-only, or None; activations: of the fibres, an `Activation` for each region of the mesh, or one.
+    shape functions; quadrature_degree: degree of polynomials integrated exactly. curve: what the edges of its surface follow at
+    rest, see `Scene.add_body`; is_curved: whether some edge is curved. volumes: (m,) [m^3], areas: (t,) [m^2] of mesh.surface,
+    both at rest with the curvature of the edges. dilatation: "local" or "mean", decided by `decided_dilatation` when the body is
+    made and when its material or a number of it is set, but not during a run; given_dilatation: one of DILATATIONS. nodes:
+    `Nodes`, the mesh's vertices, for order 2 its mid-edge nodes, and the vertices of a skin that is touched; methods choose among
+    those of tets only. skin: `Skin` or None, see `embed`. fibres: (m,3) unit vectors at rest, read-only, or None; activations:
+    of the fibres, an `Activation` for each region of the mesh, or one.
     constraints, tractions, forces, pressures, cavities: lists of `Constraint`, `Traction`, `NodalForce`, `Pressure`, `Cavity`;
     items can be removed, but only methods add them.
     collision: one of CONTACT_MODES. Only material, its numbers, position, velocity and collision can be assigned; each is
@@ -108,6 +113,7 @@ class Body(Guarded):
         collision: str,
         dilatation: str = "auto",
         fibres=None,
+        curve: Curve | None = None,
         **numbers,
     ):
         """The arguments of `Scene.add_body`; numbers: young, poisson and density, if they replace the material's."""
@@ -121,7 +127,9 @@ class Body(Guarded):
         self.quadrature_degree = checks.whole(degree, f"{what}: quadrature_degree of order {self.order}", degrees)
         self.given_dilatation = checks.choice(dilatation, f"{what}: dilatation", DILATATIONS)
         self.dilatation = self.decided_dilatation
-        self.nodes: Nodes = make_nodes(mesh, self.order)
+        self.curve = curve
+        self.nodes: Nodes = make_nodes(mesh, self.order, middle_nodes(what, mesh, self.order, curve))
+        check_shape(what, self.nodes)
         self.position, self.velocity, self.collision = position, velocity, collision
         self.constraints: list[Constraint] = []
         self.tractions: list[Traction] = []
@@ -211,7 +219,32 @@ class Body(Guarded):
     @property
     def mass(self) -> float:
         """Mass [kg]."""
-        return float(np.sum(self.composition.number("density") * self.mesh.volumes))
+        return float(np.sum(self.composition.number("density") * self.volumes))
+
+    @property
+    def is_curved(self) -> bool:
+        """Whether some edge is curved at rest."""
+        return self.nodes.curved is not None
+
+    @property
+    def volumes(self) -> np.ndarray:
+        """Volumes (m,) [m^3] of the tets at rest, with the curvature of their edges."""
+        if not self.is_curved:
+            return self.mesh.volumes
+        return quadratic.point_volumes(self.rest_positions[self.nodes.elements], quadratic.quadrature(4)).sum(axis=1)
+
+    @property
+    def areas(self) -> np.ndarray:
+        """Areas (t,) [m^2] of the rows of mesh.surface at rest, with the curvature of their edges."""
+        nodes = self.face_nodes(np.arange(len(self.mesh.surface)))
+        return np.linalg.norm(quadratic.area_vectors(self.rest_positions[nodes]), axis=2).sum(axis=1)
+
+    def face_nodes(self, triangles: np.ndarray) -> np.ndarray:
+        """Return the nodes (k, 3 or 6) of rows (k,) of mesh.surface: corners, then the middles of their edges."""
+        if self.order == 1:
+            return self.mesh.surface[triangles]
+        split = self.nodes.boundary.reshape(-1, 4, 3)[triangles]  # (a, ab, ca), (ab, b, bc), (ca, bc, c), ...
+        return np.stack([split[:, 0, 0], split[:, 1, 1], split[:, 2, 2], split[:, 0, 1], split[:, 1, 2], split[:, 0, 2]], axis=1)
 
     def check(self) -> None:
         """Raise SceneError if in-place changes made the arrays of position or velocity invalid, or its law is another one now."""
@@ -375,8 +408,12 @@ class Body(Guarded):
         return self._enclosed(self._triangles(where, f"{self._label()}: enclosed_volume"))
 
     def _enclosed(self, triangles: np.ndarray) -> float:
-        corners = self.mesh.vertices[self.mesh.surface[triangles]]
-        return -float(np.linalg.det(corners - corners[0, 0]).sum()) / 6.0
+        x = self.rest_positions[self.face_nodes(triangles)]
+        x = x - x[0, 0]
+        if not self.is_curved:
+            return -float(np.linalg.det(x[:, :3]).sum()) / 6.0
+        points = np.einsum("tax,aq->tqx", x, quadratic.triangle_rule(2)[1])
+        return -float((points * quadratic.area_vectors(x)).sum()) / 3.0
 
     def _triangles(self, where, what: str) -> np.ndarray:
         """Return the chosen rows of mesh.surface, by their centroids at rest."""

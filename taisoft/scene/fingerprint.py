@@ -58,7 +58,7 @@ def _body_parts(body: Body) -> dict[str, list]:
     laws += [material.branches for material in materials] if any(material.branches for material in materials) else []
     constraints = sorted(body.constraints, key=lambda c: c.path is not None)  # scene files have `fix` first
     return {
-        "mesh": [body.mesh.vertices, body.mesh.tets],
+        "mesh": [body.mesh.vertices, body.mesh.tets] + [body.rest_positions] * body.is_curved,
         "surface": [body.rest_positions[body.nodes.n_elastic :], body.nodes.surface] if body.nodes.embedded is not None else [],
         "skin": [] if body.skin is None else [body.skin.surface.vertices, body.skin.surface.triangles, body.skin.contact],
         "regions": [body.mesh.regions, list(body.composition.materials)] if body.composition.has_regions else [],

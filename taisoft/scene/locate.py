@@ -6,7 +6,8 @@ import numpy as np
 import scipy
 import scipy.sparse as sp
 
-from taisoft.mesh.nodes import shape_functions
+from taisoft.mesh.nodes import PARTS, part_coordinates
+from taisoft.mesh.quadratic import shape_functions
 
 if TYPE_CHECKING:
     from taisoft.scene.body import Body
@@ -24,7 +25,7 @@ def locate(body: "Body", points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np
     in sizes of a rigid body; 0 inside. The weights of a point outside extrapolate from the tet in whose heights it is nearest.
     They sum to 1 and reproduce the point, so that they follow every affine motion exactly.
     """
-    corners = body.mesh.vertices[body.mesh.tets]
+    corners = body.rest_positions[body.nodes.tets if body.is_curved else body.mesh.tets]  # parts are closer to curved tets
     inverse = np.linalg.inv((corners[:, 1:] - corners[:, :1]).transpose(0, 2, 1))
     _, near = scipy.spatial.cKDTree(corners.mean(axis=1)).query(points, k=min(NEAREST, len(corners)))
     tet = _deepest(corners, inverse, points, near.reshape(len(points), -1))
@@ -33,9 +34,18 @@ def locate(body: "Body", points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np
     for rows in np.split(far, range(chunk, len(far), chunk)):
         tet[rows] = _deepest(corners, inverse, points[rows], np.broadcast_to(everything, (len(rows), len(corners))))
     barycentric = _barycentric(corners[tet], inverse[tet], points)
+    if body.is_curved:
+        barycentric = np.einsum("pk,pkc->pc", barycentric, part_coordinates(body.nodes)[tet])
+        tet = tet // PARTS
     barycentric[np.abs(barycentric) < WEIGHTLESS] = 0.0
+    weights = shape_functions(body.order, barycentric)
+    if body.is_curved:  # what the flat parts miss, by the corners
+        x = body.rest_positions[body.nodes.elements[tet]]
+        missed = points - np.einsum("pa,pax->px", weights, x)
+        step = np.linalg.solve((x[:, 1:4] - x[:, :1]).transpose(0, 2, 1), missed[..., None])[..., 0]
+        weights[:, :4] += np.concatenate([-step.sum(axis=1, keepdims=True), step], axis=1)
     outside = body.distance_outside(points, np.maximum(-barycentric.min(axis=1), 0.0))
-    return body.nodes.elements[tet], shape_functions(body.order, barycentric), outside
+    return body.nodes.elements[tet], weights, outside
 
 
 def weight_matrix(nodes: np.ndarray, weights: np.ndarray, n_nodes: int) -> sp.csr_matrix:

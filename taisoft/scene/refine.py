@@ -1,7 +1,8 @@
 """Refine a scene's meshes by splitting every tet into eight, or change its element order; all else is kept.
 
 Old nodes keep their positions and come first; new nodes are edge midpoints, so two solutions can be compared node by node. The
-geometry stays that of the mesh: new nodes of a ball do not move to the sphere. Functions that choose nodes are evaluated again.
+geometry stays that of the mesh, curved edges included: new nodes of a ball do not move to the sphere. Functions that choose nodes
+are evaluated again.
 For nodes chosen by id, a midpoint is chosen if its edge belongs to a surface triangle or tet whose nodes are all chosen; if
 only the two ends are chosen, the case is ambiguous and refused. Tractions and pressures pass to the parts of their triangles.
 Forces given per node stay point forces. The stiffness and damping of an attachment stay the same in all: each of its nodes gets
@@ -16,17 +17,16 @@ import numpy as np
 
 from taisoft.attributes import thawed
 from taisoft.errors import SceneError
-from taisoft.mesh.nodes import make_nodes
+from taisoft.mesh.nodes import PARTS, Nodes, make_nodes, part_coordinates
+from taisoft.mesh.quadratic import shape_functions
 from taisoft.mesh.tet_mesh import TetMesh
-from taisoft.mesh.topology import distinct_edges
+from taisoft.mesh.topology import EDGES, distinct_edges
 from taisoft.scene.body import Body, Constraint
 from taisoft.scene.connection_records import Attachment
 from taisoft.scene.key_frames import KeyFrames, NodePath
 from taisoft.scene.loads import Load, LoadPath, NodalForce
 from taisoft.scene.rigid import RigidBody
 from taisoft.scene.scene import Scene
-
-PARTS = 8  # of a tet; `make_nodes` lists the parts of each tet in sequence
 
 
 def refined(scene: Scene) -> Scene:
@@ -70,10 +70,11 @@ def _with_bodies(scene: Scene, made: list[tuple[Body, np.ndarray]], finer: float
 
 
 def _refined(old: Body) -> tuple[Body, np.ndarray]:
-    split = make_nodes(old.mesh, 2)
+    split = make_nodes(old.mesh, 2, old.rest_positions[old.mesh.n_verts : old.nodes.n_elastic] if old.is_curved else None)
     regions = None if old.mesh.regions is None else np.repeat(old.mesh.regions, PARTS)
     fibres = None if old.mesh.fibres is None else np.repeat(old.mesh.fibres, PARTS, axis=0)
-    mesh = TetMesh(split.positions, split.tets, regions=regions, region_names=old.mesh.region_names, fibres=fibres)
+    labels = {"regions": regions, "region_names": old.mesh.region_names, "fibres": fibres}
+    mesh = TetMesh(split.positions, split.tets, mid_edge=_middles_of_parts(split) if old.is_curved else None, **labels)
     edges, _ = distinct_edges(mesh.tets if old.order == 2 else old.mesh.tets)
     parents_of_nodes = np.concatenate([_own_parents(old.nodes.n_elastic), edges])
     new = _on_mesh(old, mesh, old.order, parents_of_nodes)
@@ -82,6 +83,16 @@ def _refined(old: Body) -> tuple[Body, np.ndarray]:
     parents = np.array([rows[tuple(sorted(t))] for t in mesh.surface.tolist()])
     _add_surface_loads(new, old, lambda triangles: np.isin(parents, triangles))
     return new, parents_of_nodes
+
+
+def _middles_of_parts(split: Nodes) -> np.ndarray:
+    """Return where curved elements map the midpoints of the edges of their parts, in the order of `distinct_edges` (k,3) [m]."""
+    points = part_coordinates(split)[:, EDGES].mean(axis=2).reshape(-1, 4)
+    weights = shape_functions(2, points).reshape(len(split.elements), -1, 10)
+    edges, edge_of_part = distinct_edges(split.tets)
+    middles = np.empty((len(edges), 3))
+    middles[edge_of_part.reshape(-1)] = (weights @ split.positions[split.elements]).reshape(-1, 3)
+    return middles
 
 
 def _of_order(old: Body, order: int) -> tuple[Body, np.ndarray]:
@@ -114,7 +125,8 @@ def _on_mesh(old: Body, mesh: TetMesh, order: int, parents: np.ndarray) -> Body:
     copies = mesh.n_tets // old.mesh.n_tets
     numbers = {name: np.repeat(values, copies) for name, values in old.composition.by_tet.items()}
     fibres = None if old.fibres is None else np.repeat(old.fibres, copies, axis=0)
-    kept = old.collision, old.given_dilatation, fibres
+    curve = "straight" if order == 2 and not old.is_curved else None  # None: the mesh's mid-edge nodes
+    kept = old.collision, old.given_dilatation, fibres, curve
     new = Body(old.name, mesh, old.material, old.position, velocity, order, degree, *kept, **numbers)
     with thawed(new):
         new.activations = old.activations

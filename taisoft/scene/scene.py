@@ -21,6 +21,7 @@ from taisoft.scene.body import USE_A_COPY, Body, Constraint
 from taisoft.scene.collision import CollisionSettings
 from taisoft.scene.connection_records import Attachment, Connection, Spring, Tendon
 from taisoft.scene.connections import add_spring, add_tendon, attach, attached_pairs, check_connections, constraint_of
+from taisoft.scene.curves import Curve
 from taisoft.scene.loads import Cavity
 from taisoft.scene.material import Material
 from taisoft.scene.obstacles import HalfSpace, Obstacle, Shape, surface_numbers
@@ -225,6 +226,7 @@ class Scene(Guarded):
         dilatation: str = "auto",
         parameters: Mapping[str, float | np.ndarray] | None = None,
         fibres=None,
+        curve: Curve | None = None,
     ) -> Body:
         """Add a body and return it.
 
@@ -240,13 +242,18 @@ class Scene(Guarded):
         ratio changes during a run.
         fibres: directions at rest of the fibres that numbers of the material describe: (3,), (m,3) by tet, or a function of the
         tets' centroids (m,3) that returns (m,3), of any length, 0 in tets without; by default those of the mesh.
+        curve: for order 2, what the edges of its surface follow at rest: a Sphere, a Capsule, which is a cylinder between its
+        ends, or a fine SurfaceMesh, in the coordinates of the mesh: the edges of faces whose corners all lie on it, within 1 % of
+        an edge, follow it; "smooth", a smooth surface through the vertices, on which edges of more than 40 degrees stay sharp;
+        or "straight". None: the mesh's mid-edge nodes, if it has any, else straight.
         Warns if tets of order 1 are far too stiff: if they lock, or in a thin body with so few tets through its thickness that
         it bends at most half as far as it should. Raises SceneError.
         """
         self._check_open("add_body")
         name = self._free_name(name, "body")
         numbers = {"young": young, "poisson": poisson, "density": density, "parameters": parameters}
-        body = Body(name, mesh, material, position, velocity, order, quadrature_degree, collision, dilatation, fibres, **numbers)
+        shape = order, quadrature_degree, collision, dilatation, fibres, curve
+        body = Body(name, mesh, material, position, velocity, *shape, **numbers)
         list.append(self.bodies, body)
         body.warn_locking(stacklevel=2)
         body.warn_bending(stacklevel=2)

@@ -5,7 +5,8 @@
     [collision]               CollisionSettings
     [solver]                  arguments of Simulator, seconds, fps; "none" for Python's None
     [materials.NAME]          Material
-    [bodies.NAME]             material (a name, or a table), mesh (below), and the arguments of Scene.add_body
+    [bodies.NAME]             material (a name, or a table), mesh (below), and the arguments of Scene.add_body; curve is "smooth",
+                              "straight", a shape = "sphere" or "capsule" with its arguments, or a surface (below)
     [bodies.NAME.materials]   instead of material: one for each region of the mesh, REGION = a name, or a table
     [[bodies.NAME.fix]]       nodes, axes                   [[bodies.NAME.move]]   nodes, path (KeyFrames), axes
     [[bodies.NAME.traction]]  triangles, traction [Pa]      [[bodies.NAME.force]]  nodes, force [N], or their KeyFrames
@@ -42,6 +43,7 @@ from taisoft.mesh.tet_mesh import TetMesh
 from taisoft.scene import checks
 from taisoft.scene.body import Body
 from taisoft.scene.collision import CollisionSettings
+from taisoft.scene.curves import Curve
 from taisoft.scene.key_frames import KeyFrames
 from taisoft.scene.laws import LAWS
 from taisoft.scene.material import Material
@@ -133,7 +135,7 @@ def _read(tables: Table, allow_outside: bool) -> tuple[Scene, dict]:
 
     for name in bodies.known:
         table = bodies.table(name, [*known, *METHODS, "materials", "skin"], ["mesh"])
-        body = _add_body(scene, name, table, materials, shared(table, mesh_of))
+        body = _add_body(scene, name, table, materials, shared(table, mesh_of), _curve(table, allow_outside))
         if "skin" in table:
             skin = table.table("skin", ["surface", "contact"], ["surface"])
             surface = surface_of(skin, "surface", allow_outside)
@@ -181,7 +183,7 @@ def _parsed(file: Path) -> dict:
     return tables
 
 
-def _add_body(scene: Scene, name: str, table: Table, materials: dict[str, Material], mesh: TetMesh) -> Body:
+def _add_body(scene: Scene, name: str, table: Table, materials: dict[str, Material], mesh: TetMesh, curve: Curve | None) -> Body:
     if "material" in table and "materials" in table:
         raise table.error("", "must have either a material or materials, one for each region")
     if "materials" not in table:
@@ -189,10 +191,25 @@ def _add_body(scene: Scene, name: str, table: Table, materials: dict[str, Materi
     else:
         regions = table.named("materials")
         material = {_region(mesh, key): _material(regions, key, materials) for key in regions.known}
-    keys, _ = arguments_of(Scene.add_body, "name", "mesh", "material")
-    body = table.make(scene.add_body, f"body {name!r}: ", "scene: ", keys=keys, mesh=mesh, material=material, name=name)
+    keys, _ = arguments_of(Scene.add_body, "name", "mesh", "material", "curve")
+    made = {"mesh": mesh, "material": material, "name": name, "curve": curve}
+    body = table.make(scene.add_body, f"body {name!r}: ", "scene: ", keys=keys, **made)
     call_methods(body, table, f"body {name!r}", METHODS, lambda key: "triangles" if key in ON_TRIANGLES else "nodes", selection)
     return body
+
+
+def _curve(table: Table, allow_outside: bool) -> Curve | None:
+    """Return what the edges of a body follow: a word, a shape with its arguments, or a surface."""
+    value = table.values.get("curve")
+    if not isinstance(value, dict):
+        return value
+    if "shape" not in value:
+        return surface_of(table, "curve", allow_outside)
+    shapes = {name: SHAPES[name] for name in ("sphere", "capsule")}
+    known = [key for shape in shapes.values() for key in arguments_of(shape)[0]]
+    kind = kind_of(table.table("curve", ["shape", *known]), shapes)
+    keys, required = arguments_of(shapes[kind])
+    return table.table("curve", ["shape", *keys], required).make(shapes[kind], f"{kind}: ", keys=keys)
 
 
 def _made_material(table: Table, key: str) -> Material:

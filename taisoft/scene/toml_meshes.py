@@ -7,14 +7,14 @@ from pathlib import Path
 
 from taisoft.errors import MeshError
 from taisoft.mesh.files import WRITERS, read_mesh
-from taisoft.mesh.shapes import ball_mesh, box_mesh, sheet_mesh
+from taisoft.mesh.shapes import ball_mesh, box_mesh, cylinder_mesh, sheet_mesh
 from taisoft.mesh.surface_mesh import FORMATS, SurfaceMesh, read_surface
 from taisoft.mesh.tet_mesh import TetMesh
 from taisoft.mesh.usd import USD_FORMATS, read_usd_prim
 from taisoft.scene import checks
 from taisoft.scene.tables import Table, arguments_of, value_text
 
-MESHES = {"box": box_mesh, "sheet": sheet_mesh, "ball": ball_mesh}
+MESHES = {"box": box_mesh, "sheet": sheet_mesh, "ball": ball_mesh, "cylinder": cylinder_mesh}
 STANDALONE = (*WRITERS, ".node", ".ele", ".inp", ".bdf", ".nas", ".fem")  # their readers open no other files
 
 

@@ -162,6 +162,11 @@ def _body(body: Body, materials: dict[Material, str], stem: str, meshes: dict[st
     table["dilatation"] = body.given_dilatation if body.dilatation == body.decided_dilatation else body.dilatation
     if body.quadrature_degree != QUADRATURE_DEGREES[body.order][0]:  # the default stays away, so that order can be edited
         table["quadrature_degree"] = body.quadrature_degree
+    if body.curve is not None:
+        shape = next((name for name, known in SHAPES.items() if known is type(body.curve)), None)
+        table["curve"] = body.curve if isinstance(body.curve, str) else {"shape": shape} | _fields(body.curve)
+        if shape is None and not isinstance(body.curve, str):
+            table["curve"] = surface_table(body.curve)
     if body.velocity.ndim == 2:
         table["velocity"] = body.velocity[: body.nodes.n_elastic]
     if body.skin is not None:

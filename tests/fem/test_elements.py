@@ -11,7 +11,7 @@ import pytest
 import taisoft as ts
 from taisoft.fem import reference
 from taisoft.fem.loads import SceneLoads
-from taisoft.mesh.nodes import shape_functions
+from taisoft.mesh.quadratic import shape_functions
 from taisoft.mesh.topology import EDGES
 from tests.dynamics.scenes import built, cube, driven_scene, mixed_scene, rubber
 from tests.fem.composition import composition

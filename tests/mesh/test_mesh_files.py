@@ -1,5 +1,5 @@
 """Reading and writing of mesh files (random and mutated ones: faults/test_fuzz.py): written meshes are read back bitwise; every
-format and encoding gives the same mesh; second-order tets give their corners, and curved edges a warning; welding merges
+format and encoding gives the same mesh; second-order tets with straight edges give their corners; welding merges
 vertices. Broken files give one MeshError, which starts with the name and gives the line or node of Gmsh's and TetGen's files.
 """
 
@@ -174,19 +174,6 @@ def test_corners_make_the_mesh_for_any_order_of_the_edges(tmp_path, options):
         head = f"{len(rows)} {rows.shape[1]} 0 0"
         np.savetxt(tmp_path / name, np.column_stack([np.arange(len(rows)), rows]), "%.17g", header=head, comments="")
     assert same(read_mesh(tmp_path / "t.ele"))
-
-
-def test_curved_edges_are_straightened_with_a_warning(tmp_path):
-    points, (a, b, middle) = NODES.positions.copy(), NODES.elements[0, [0, 1, 4]]
-    edge = points[b] - points[a]
-    points[middle] += 0.1 * np.cross(edge, (0.3, 0.5, -0.7))
-    points[MESH.n_verts + (middle == MESH.n_verts)] += 1e-3
-    deviation = np.linalg.norm(points[middle] - (points[a] + points[b]) / 2) / np.linalg.norm(edge)
-    with pytest.warns(UserWarning, match="part.msh: 2 edges of second-order tets are curved") as caught:
-        mesh = read_mesh(write_quadratic(tmp_path / "part.msh", points))
-    assert same(mesh) and len(mesh.warnings) == len(caught) == 1
-    worst = f"largest deviation is {deviation:.2g} of the edge's length, between vertices {min(a, b)} and {max(a, b)} of "
-    assert worst in mesh.warnings[0]
 
 
 def test_nodes_off_the_edges_and_unknown_ones_are_rejected(tmp_path):

@@ -30,7 +30,11 @@ BAD = [
     ('between = ["beam", "ground"]', 'between = ["beam"]', "contacts[0].between must be a list of two names"),
     ('[bodies."the ball"]', "[bodies.beam]", "Cannot declare"),
     ('[bodies."the ball"]', '[bodies.""]', 'bodies."": body name must be a text that is not empty'),
-    ('shape = "box"', 'shape = "bax"', "bodies.beam.mesh.shape must be one of box, sheet, ball, not 'bax'; did you mean 'box'?"),
+    (
+        'shape = "box"',
+        'shape = "bax"',
+        "bodies.beam.mesh.shape must be one of box, sheet, ball, cylinder, not 'bax'; did you mean 'box'?",
+    ),
     ('shape = "box"', 'file = "box"', "bodies.beam.mesh.cells is not known"),
     ("min = [-1,", "min = [1,", "bodies.beam.fix[0].nodes.box.min must not exceed max"),
     ("min = [-1, -1", "min = [-2, -1", ""),

@@ -53,8 +53,8 @@ def element_force(m: ti.template(), g: ti.template(), damped: ti.template(), b):
         V = differences(m, g, m.state.v, b, g.real)
         c = broadcast(ti.cast(m.damping[m.block_body[b], 1], g.real), m.lanes)
         for q in range(g.n_points):
-            F = deformation_gradient(m, g, X, N, q, g.real)
-            dF = gradient_at(m, g, V, M, q, g.real)
+            F = deformation_gradient(m, g, X, N, b, q, g.real)
+            dF = gradient_at(m, g, V, M, b, q, g.real)
             c_q = with_additions(m, g, p, b, q, g.real)
             K = prepare_projected(g.law, F, c_q)
             D = dpk1_projected(g.law, K, dF)
@@ -63,15 +63,15 @@ def element_force(m: ti.template(), g: ti.template(), damped: ti.template(), b):
             if ti.static(g.mean_dilatation):
                 G = g.law.dilatation_gradient(F)
                 r = c * patch_values(m, b, m.mean.rate, m.real)
-                add_forces(m, g, S, [Q[k] + r * G[k] for k in ti.static(range(9))], M, q)
+                add_forces(m, g, S, [Q[k] + r * G[k] for k in ti.static(range(9))], M, b, q)
             else:
-                add_forces(m, g, S, Q, M, q)
+                add_forces(m, g, S, Q, M, b, q)
             lowest = ti.min(lowest, ti.cast(determinant(F), m.real))
     else:
         for q in range(g.n_points):
-            F = deformation_gradient(m, g, X, N, q, g.real)
+            F = deformation_gradient(m, g, X, N, b, q, g.real)
             P = g.law.pk1(F, with_additions(m, g, p, b, q, g.real))
-            add_forces(m, g, S, P, M, q)
+            add_forces(m, g, S, P, M, b, q)
             lowest = ti.min(lowest, ti.cast(determinant(F), m.real))
     store_forces(m, g, b, S)
     return lowest
@@ -194,8 +194,8 @@ def element_energy(m: ti.template(), g: ti.template(), b):
     lowest = broadcast(ti.cast(HUGE, ti.f64), m.lanes)
     minor = broadcast(ti.cast(HUGE, ti.f64), m.lanes)
     for q in range(g.n_points):
-        F = gradient_at(m, g, X, M, q, ti.f64)
-        energy += weight_at(m, g, q, ti.f64) * V * g.law.psi(F, with_additions(m, g, p, b, q, ti.f64))
+        F = gradient_at(m, g, X, M, b, q, ti.f64)
+        energy += weight_at(m, g, b, q, ti.f64) * V * g.law.psi(F, with_additions(m, g, p, b, q, ti.f64))
         lowest = ti.min(lowest, determinant(F))
         if ti.static(g.law.SOFTENS_BELOW > 0.0):
             C = matmul_tn(F, F)
@@ -226,16 +226,16 @@ def force_differential(m: ti.template(), dx: ti.template(), df: ti.template()):
             p = stress_constants(m, g, b, m.real)
             S = zero_forces(m, g)
             for q in range(g.n_points):
-                F = deformation_gradient(m, g, X, N, q, m.real)
-                dF = gradient_at(m, g, dX, M, q, m.real)
+                F = deformation_gradient(m, g, X, N, b, q, m.real)
+                dF = gradient_at(m, g, dX, M, b, q, m.real)
                 K = g.law.prepare(F, with_additions(m, g, p, b, q, m.real))
                 dP = g.law.dpk1(F, K, dF)
                 if ti.static(g.mean_dilatation):
                     G = g.law.dilatation_gradient(F)
                     r = patch_values(m, b, m.mean.rate, m.real)
-                    add_forces(m, g, S, [dP[k] + r * G[k] for k in ti.static(range(9))], M, q)
+                    add_forces(m, g, S, [dP[k] + r * G[k] for k in ti.static(range(9))], M, b, q)
                 else:
-                    add_forces(m, g, S, dP, M, q)
+                    add_forces(m, g, S, dP, M, b, q)
             store_forces(m, g, b, S)
     ti.loop_config(serialize=m.serial)
     for i in range(m.n_nodes):
@@ -265,14 +265,14 @@ def cauchy_stress(m: ti.template(), sigma: ti.types.ndarray()):
                 for q in ti.static(range(m.lanes)):
                     sigma[b * m.lanes + q, k] = 0.0
             for q in range(g.n_points):
-                F = gradient_at(m, g, X, M, q, ti.f64)
-                w = weight_at(m, g, q, ti.f64)
+                F = gradient_at(m, g, X, M, b, q, ti.f64)
+                w = weight_at(m, g, b, q, ti.f64)
                 P = g.law.pk1(F, with_additions(m, g, p, b, q, ti.f64))
                 T = matmul_nt(P, F)
                 volume_ratio += w * determinant(F)
                 for k in ti.static(range(9)):
                     for l in ti.static(range(m.lanes)):
-                        sigma[b * m.lanes + l, k] += w * T[k][l]
+                        sigma[b * m.lanes + l, k] += (w * T[k])[l]
             for k in range(9):
                 for q in ti.static(range(m.lanes)):
                     sigma[b * m.lanes + q, k] /= volume_ratio[q]
