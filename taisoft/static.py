@@ -1,47 +1,27 @@
-"""Static equilibrium: Newton's method on the forces, in load steps where contacts, friction or the caller ask for them.
-
-Without contacts the full load is applied in one step, and in smaller ones if that fails. With contacts each load step is a step
-of the integrator "static": implicit Euler without inertia, by the code of steps in time.
-"""
+"""Static equilibrium: load steps of the integrator "static", implicit Euler without inertia, by the code of steps in time."""
 
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from taisoft.backend.arrays import FieldArena, upload
-from taisoft.backend.runtime import Runtime, open_kind, open_runtime
+from taisoft.backend.runtime import open_kind
 from taisoft.display import short_repr
-from taisoft.dynamics.dirichlet import DirichletConditions
-from taisoft.dynamics.imbalance import describe_imbalance
-from taisoft.dynamics.multipliers import Multipliers
-from taisoft.dynamics.newton import solve
-from taisoft.dynamics.no_contacts import NoContacts
-from taisoft.dynamics.results import StageResult
 from taisoft.dynamics.schemes import STATIC
-from taisoft.dynamics.simulation_state import SimulationState
-from taisoft.dynamics.stage import Stage
-from taisoft.dynamics.stage_system import StageSystem
 from taisoft.errors import SceneError, SimulationError
-from taisoft.fem.build import build_model
-from taisoft.fem.measure import measure
 from taisoft.fem.model import Layout
 from taisoft.fem.pressure import cavity_form
 from taisoft.fem.spring_table import SpringTable
-from taisoft.fem.state import ELASTIC, N_INVERTED
 from taisoft.records import ErrorEstimate, Quantity, StepReport
 from taisoft.scene import checks
-from taisoft.scene.holding import check_held
-from taisoft.scene.plan import make_plan
 from taisoft.scene.scene import Scene
 from taisoft.settings import check_count
+from taisoft.simulator import Simulator
 
 if TYPE_CHECKING:
     from taisoft.collision.contacts import Contacts
-    from taisoft.simulator import Simulator
 
-MAX_NEWTON = 100
-SMALLEST_LOAD_STEP = 1.0 / 256.0
+LOOSEST = 0.099  # tolerance of Newton's method that a Simulator takes
 
 
 @dataclass(frozen=True)
@@ -172,34 +152,23 @@ def solve_static(
     runtime is in use. A solve that does not converge returns converged=False.
     """
     _check(scene, tolerance)
-    kind = open_kind()
-    arch = kind[0] if kind is not None and kind[1] == precision else arch
-    if steps is not None or scene.pushes(self_collision):
-        return _solve_in_steps(
-            scene,
-            1.0 if time is None else checks.number(time, "time", above=0.0, unit="s"),
-            1 if steps is None else check_count("steps", steps),
-            {"error": error, "error_mesh": error_mesh, "quantities": quantities},
-            newton_tolerance=tolerance,
-            self_collision=self_collision,
-            precision=precision,
-            arch=arch,
-        )
-    if error or error_mesh is not None or quantities:
-        raise SceneError("solve_static: error and quantities need steps, or a scene with contacts")
-    check_held(scene)
-    scene = scene.snapshot()  # in which rigid bodies are as stiff as the others ask for
-    time = 0.0 if time is None else checks.number(time, "time")
-    runtime = open_runtime(arch, precision, "solve_static")
-    arena, solver = FieldArena(), None
-    try:
-        solver = StaticSolver(scene, runtime, arena, tolerance, time)
-        return solver.solve()
-    finally:
-        if solver is not None:
-            solver.solver.release()
-        arena.release()
-        runtime.close()
+    kind, estimate = open_kind(), {"error": error, "error_mesh": error_mesh, "quantities": quantities}
+    arch, at = kind[0] if kind is not None and kind[1] == precision else arch, None
+    if steps is None and not scene.pushes(self_collision):
+        if error or error_mesh is not None or quantities:
+            raise SceneError("solve_static: error and quantities need steps, or a scene with contacts")
+        at, time = 0.0 if time is None else checks.number(time, "time"), 1.0
+    time = 1.0 if time is None else checks.number(time, "time", above=0.0, unit="s")
+    steps = 1 if steps is None else check_count("steps", steps)
+    settings = {
+        "newton_tolerance": min(tolerance, LOOSEST),
+        "self_collision": self_collision,
+        "precision": precision,
+        "arch": arch,
+    }
+    with Simulator(scene.snapshot(), dt=time / steps, integrator=STATIC, ramp=time, **settings) as sim:
+        sim._host().state.at = at
+        return _solve(sim, time, estimate)
 
 
 def _check(scene: Scene, tolerance: float) -> None:
@@ -210,147 +179,46 @@ def _check(scene: Scene, tolerance: float) -> None:
         raise SceneError(f"tolerance = {tolerance!r}: it must lie between 0 and 1")
 
 
-def _solve_in_steps(scene: Scene, time: float, steps: int, estimate: dict, **settings) -> StaticResult:
-    """Solve as a run of the integrator "static" for `time` [s]. estimate, settings: arguments of that run and its simulator."""
-    from taisoft.simulator import Simulator
-
+def _solve(sim: Simulator, time: float, estimate: dict) -> StaticResult:
+    """Take load steps until a time [s]. estimate: arguments of the run."""
     states: list[LoadStep] = []
-    with Simulator(scene.snapshot(), dt=time / steps, integrator=STATIC, ramp=time, **settings) as sim:
-        state = sim._host().state
-        run = sim.run(
-            time, fps=None, on_frame=lambda sim, index, report: states.append(_load_step(sim)) if index else None, **estimate
-        )
-        reports = run.step_reports
-        if run.status == "failed":
-            raise SimulationError(f"solve_static: {run.problems[-1]}")
-        return StaticResult(
-            converged=all(one.converged and not one.n_inverted for one in reports),
-            load=max([one.time for one in reports if one.converged and not one.n_inverted], default=0.0) / time,
-            at_rounding=False,
-            residual=max(one.residual for one in reports),
-            iterations=sum(one.newton_iterations for one in reports),
-            linear_iterations=sum(one.linear_iterations for one in reports),
-            multigrid_solves=sum(one.multigrid_solves for one in reports),
-            load_steps=sum(one.substeps for one in reports),
-            elastic=reports[-1].elastic,
-            n_inverted=reports[-1].n_inverted,
-            imbalance="; ".join(text for one in reports if not one.converged for text in one.problems),
-            _scene=sim.scene,
-            _layout=state.layout,
-            _springs=state.springs,
-            _states=tuple(states),
-            step_reports=tuple(reports),
-            problems=tuple(run.problems),
-            error_estimate=run.error_estimate,
-            quantities=run.quantities,
-        )
+    keep = lambda sim, index, report: states.append(_load_step(sim)) if index else None  # noqa: E731
+    run = sim.run(time, fps=None, on_frame=keep, **estimate)
+    if run.status == "failed":
+        raise SimulationError(f"solve_static: {run.problems[-1]}")
+    reports, stepper, state = run.step_reports, sim._host().stepper, sim._host().state
+    good = [one.converged and not one.n_inverted for one in reports]
+    n_good = good.index(False) if False in good else len(good)
+    return StaticResult(
+        converged=all(good),
+        load=1.0 if all(good) else (n_good + (stepper.reached if n_good == len(good) - 1 else 0.0)) / len(good),
+        at_rounding=stepper.last.at_rounding,
+        residual=max(one.residual for one in reports),
+        iterations=sum(one.newton_iterations for one in reports),
+        linear_iterations=sum(one.linear_iterations for one in reports),
+        multigrid_solves=sum(one.multigrid_solves for one in reports),
+        load_steps=sum(one.substeps for one in reports),
+        elastic=reports[-1].elastic,
+        n_inverted=reports[-1].n_inverted,
+        imbalance="" if reports[-1].converged else stepper.last.imbalance,
+        _scene=sim.scene,
+        _layout=state.layout,
+        _springs=state.springs,
+        _states=tuple(states),
+        step_reports=tuple(reports),
+        problems=tuple(run.problems),
+        error_estimate=run.error_estimate,
+        quantities=run.quantities,
+    )
 
 
-def _load_step(sim: "Simulator") -> LoadStep:
+def _load_step(sim: Simulator) -> LoadStep:
     """Return the present state of a simulator in statics."""
     state, pairs = sim._host().state, sim.pairs_in_contact()
     on_pairs = {
         (a, b): np.concatenate([sim.contact_force(a, b), sim.contact_torque(a, b)]) for one in pairs for a, b in (one, one[::-1])
     }
-    fraction = min(1.0, sim.time / state.ramp)
-    amplitudes, pressures = state.amplitudes(sim.time, fraction), state.cavity_pressures_by_name(sim.time, fraction)
+    time, cavities = sim.time, state.cavity_pressures_by_name(sim.time)
     contacts = sim.contacts() if sim.touches else None
-    return LoadStep(sim.time, sim.positions(), sim.reactions(), amplitudes, pressures, contacts, on_pairs)
-
-
-class StaticSolver:
-    """Static solver of a scene in an open runtime; each call of `solve` starts from the rest positions."""
-
-    def __init__(self, scene: Scene, runtime: Runtime, arena: FieldArena, tolerance: float, time: float):
-        plan = make_plan(scene, explicit=False, multistep=False).without_rates()
-        model, layout = build_model(scene, runtime, arena, plan.on)
-        self.simulation = SimulationState(scene, runtime, arena, model, layout, DirichletConditions(scene, layout))
-        self.multipliers, self.time = None, time
-        if len(self.simulation.loads.multipliers):
-            self.multipliers = Multipliers(self.simulation)
-            self.simulation.set_multipliers(self.multipliers.static_start())
-        self.solver = StageSystem(self.simulation, NoContacts(), multipliers=self.multipliers)
-        self.tolerance = tolerance
-        self.target = self.simulation.next_target(time)
-        self.simulation.upload_constraints()
-        self.gravity = np.array(scene.gravity, dtype=np.float64)
-        self.simulation.set_load_time(time)
-        self.loads = [(field, 0.0, field.to_numpy()) for field in (model.loads, model.amplitudes) if field is not None]
-        if self.simulation.springs is not None and model.amplitudes is not None:
-            full = model.amplitudes.to_numpy()
-            self.loads[-1] = model.amplitudes, self.simulation.springs.rest_amplitudes(len(full), layout.rest), full
-
-    def solve(self) -> StaticResult:
-        """Apply the full load in one step; if that fails, use load steps that halve on failure and grow by half on success."""
-        rest = self.simulation.layout.rest
-        self.newton = self.linear = self.multigrid = 0
-        self.solver.budget.begin()
-        result, steps, applied = self._attempt(rest, 1.0, self.tolerance), 1, 1.0
-        if not self._is_acceptable(result):
-            applied, step, x, steps = 0.0, 0.25, rest, 0
-            while applied < 1.0 and step >= SMALLEST_LOAD_STEP and self.solver.budget.left:
-                target = min(1.0, applied + step)
-                result = self._attempt(x, target, self.tolerance if target == 1.0 else max(self.tolerance, 1e-3))
-                if self._is_acceptable(result):
-                    applied, step, steps, x = target, 1.5 * step, steps + 1, self.simulation.model.state.x.to_numpy()
-                else:
-                    step *= 0.5
-            if applied < 1.0:  # residual of the last good state under the full load
-                result = self._attempt(x, 1.0, self.tolerance, max_newton=0)
-        return self._result(result, steps, applied)
-
-    def _is_acceptable(self, result: StageResult) -> bool:
-        """Whether no tet is inverted and the residual has met the tolerance or reached rounding."""
-        measure(self.simulation.model)
-        return (result.converged or result.at_rounding) and self.simulation.model.state.scalars[N_INVERTED] == 0.0
-
-    def _attempt(self, x: np.ndarray, fraction: float, tolerance: float, max_newton: int = MAX_NEWTON) -> StageResult:
-        """Solve with a fraction of the load, starting at x."""
-        m, w = self.simulation.model, self.solver.work
-        start = [(m.gravity, fraction * self.gravity[None]), (w.x_hat, x), (m.state.x, x), (m.state.v, np.zeros_like(x))]
-        start += [(field, rest + fraction * (full - rest)) for field, rest, full in self.loads]
-        if self.target is not None:
-            rest = self.simulation.layout.rest[self.simulation.dirichlet.prescribed_nodes]
-            axes = self.simulation.dirichlet.prescribed_axes()
-            start += [(w.targets, rest + fraction * (self.target - rest)), (w.prescribed_axes, axes)]
-        upload(start)
-        if self.multipliers is not None:
-            self.multipliers.begin(self.time, m.on_cpu, fraction)
-        stage = Stage(0.0, 1.0, 1.0, tolerance, max_newton=max_newton)
-        result = solve(self.solver, stage)
-        self.newton += result.newton_iterations
-        self.linear += result.linear_iterations
-        self.multigrid += result.multigrid_solves
-        return result
-
-    def _result(self, result: StageResult, steps: int, load: float) -> StaticResult:
-        simulation = self.simulation
-        measure(simulation.model)
-        scalars = simulation.model.state.scalars.to_numpy()
-        if not np.isfinite(result.residual):
-            raise SimulationError(f"solve_static: {simulation.find_nonfinite() or 'the residual is not finite'}")
-        return StaticResult(
-            converged=result.converged and load == 1.0,
-            load=load,
-            at_rounding=result.at_rounding,
-            residual=result.residual,
-            iterations=round(self.newton),
-            linear_iterations=self.linear,
-            multigrid_solves=self.multigrid,
-            load_steps=steps,
-            elastic=float(scalars[ELASTIC]),
-            n_inverted=int(scalars[N_INVERTED]),
-            imbalance="" if result.converged else describe_imbalance(simulation, self.solver, NoContacts()),
-            _scene=simulation.scene,
-            _layout=simulation.layout,
-            _springs=simulation.springs,
-            _states=(
-                LoadStep(
-                    self.time,
-                    simulation.model.state.x.to_numpy(),
-                    self.solver.held_residual(),
-                    simulation.amplitudes(self.time),
-                    simulation.cavity_pressures_by_name(self.time),
-                ),
-            ),
-        )
+    at = time if state.at is None else state.at
+    return LoadStep(at, sim.positions(), sim.reactions(), state.amplitudes(time), cavities, contacts, on_pairs)

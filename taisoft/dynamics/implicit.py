@@ -36,6 +36,7 @@ class ImplicitStepper(ImplicitStages):
     def __init__(self, simulation: SimulationState, settings: Settings, contact: ContactStep | NoContacts):
         super().__init__(simulation, settings, contact)
         self.first = simulation.now.another(simulation.arena, "first")  # state before the step
+        self.reached, self.last = 0.0, None  # fraction of the last step until which all parts converged; result of its last part
         self.forget()
 
     def forget(self) -> None:
@@ -76,6 +77,7 @@ class ImplicitStepper(ImplicitStages):
                 length.give_up()
         if self._is_spent():
             self._length.give_up()
+        self.last = kept[-1]
         return self._report(count_all(merge(kept), dropped), len(kept), held)
 
     def _take_parts(self, dt: float, dropped: list[StageResult]) -> tuple[list[StageResult], float]:
@@ -83,6 +85,7 @@ class ImplicitStepper(ImplicitStages):
         others, and the fraction of the step in which motion was held back for lack of iterations."""
         contact, length, time = self.contact, self._length, self.simulation.time
         kept, held, left = [], 0.0, PARTS  # left: in dt / PARTS
+        self.reached = 0.0
         contact.start_step(time, dt)
         while left:
             now, is_rest = time + (1.0 - left / PARTS) * dt, self._is_spent()
@@ -92,7 +95,7 @@ class ImplicitStepper(ImplicitStages):
             # linearly implicit stages do not iterate: shorter ones need not converge sooner
             converged = result.converged or self.scheme.one_iteration
             if self.scheme.c == 0.0:  # where tets are inverted, it may be a state that no path leads to
-                converged = converged and self._count_inverted() == 0
+                converged = (converged or result.at_rounding) and self._count_inverted() == 0
             if self.scheme.c == 0.0 and not result.converged:
                 self._refuse_runaway()
             if not self._is_spent() and length.should_halve(result.free, converged, units):
@@ -110,6 +113,8 @@ class ImplicitStepper(ImplicitStages):
             self.simulation.move_branches(part)
             contact.end_part(now + part, part if left else dt, self.start.x, self.dissipative)
             length.keep(units, converged)
+            if converged and self.reached == 1.0 - (left + units) / PARTS:
+                self.reached = 1.0 - left / PARTS
             kept.append(result)
         return kept, held
 

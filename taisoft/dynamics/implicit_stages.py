@@ -109,6 +109,8 @@ class ImplicitStages:
         """Discard the history, after the state was set."""
         self.n_previous = 0  # previous states in the history
         self._beta = self._dt = 0.0  # of the last step
+        if self.scheme.c == 0.0 and self._multipliers is not None and self.simulation.time == 0.0:
+            self.simulation.set_multipliers(self._multipliers.static_start())
         self.contact.forget()
         self.solver.linear_solver.forget()
 

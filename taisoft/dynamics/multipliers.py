@@ -75,8 +75,8 @@ class Multipliers:
         """Values (k,) from which statics starts: tendons carry the weight, and so hold bodies across from the first step."""
         return np.where(self._is_tendon, self._weight / max(1, int(self._is_tendon.sum())), 0.0)
 
-    def begin(self, time: float, penalised: bool, fraction: float = 1.0) -> None:
-        """Set volumes and lengths of a time [s], or a fraction of the way there from those at rest. Raises SimulationError.
+    def begin(self, time: float, penalised: bool) -> None:
+        """Set volumes and lengths of a time [s]. Raises SimulationError.
 
         penalised: whether the stage's residual is that of p + k c, and p changes while it is solved.
         """
@@ -84,8 +84,10 @@ class Multipliers:
         scene = self._simulation.scene
         tendons = {one.name: one for one in scene.tendons}
         present = [tendons[one.name] if isinstance(one, Tendon) else scene.cavity(one.name)[1] for one in self._owners]
-        wanted = np.array([self._wanted(one, time) for one in present])
-        self.targets = self._rest + fraction * (wanted - self._rest)
+        at, fraction = self._simulation.at, self._simulation.fraction(time)
+        wanted = np.array([self._wanted(one, time if at is None else at) for one in present])
+        grows = np.array([at is not None or one.path is None for one in present])
+        self.targets = self._rest + np.where(grows, fraction, 1.0) * (wanted - self._rest)
         self.values = self._simulation.now.multipliers.copy()
         young = [1.0 if isinstance(one, Tendon) else float(np.max(scene.cavity(one.name)[0].young)) for one in present]
         force = np.where(self._is_tendon, np.maximum(self.values, self._weight), PENALTY * np.array(young))

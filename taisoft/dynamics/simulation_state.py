@@ -44,7 +44,8 @@ class SimulationState:
     releases: int = 0  # number of releases of prescribed nodes; each invalidates the steppers' history
     now: StepState = field(init=False)
     drag: tuple[np.ndarray, np.ndarray] | None = None  # nodes (k,) and forces (k, 3) [N] of a drag spring
-    ramp: float = 0.0  # [s] from the start, in which constant loads and gravity grow; statics only
+    ramp: float = 0.0  # [s] from the start, in which constant loads and gravity grow; statics only, as is:
+    at: float | None = None  # [s] when all that follows paths has the values towards which it grows, too; None: it follows them
     _loads: SceneLoads | None = None  # None: not computed, or outdated
     load_time: float | None = None  # of the loads on the device; None: several, or outdated
     _start: list[np.ndarray] | None = None  # free axes, positions and velocities at the start
@@ -227,34 +228,37 @@ class SimulationState:
         has_loads = m.loaded or m.amplitudes is not None or self.ramp
         if not has_loads or self.load_time == time or not (self.load_time is None or self.ramp or self.loads.vary):
             return
-        fraction = min(1.0, time / self.ramp) if self.ramp else 1.0
+        fraction = self.fraction(time)
         fields = [(m.gravity, fraction * np.array(self.scene.gravity)[None])] if self.ramp else []
         if m.loaded:
-            loads = self.loads.at(time, fraction)
+            loads = self.loads.at(time, fraction) if self.at is None else fraction * self.loads.at(self.at)
             if self.drag is not None:
                 np.add.at(loads, *self.drag)
             fields.append((m.loads, loads))
         if m.amplitudes is not None:
-            fields.append((m.amplitudes, self.amplitudes(time, fraction)))
+            fields.append((m.amplitudes, self.amplitudes(time)))
         upload(fields)
         self.load_time = time
 
-    def amplitudes(self, time: float, fraction: float = 1.0) -> np.ndarray:
-        """Return the loads that are one number at a time [s], with the present Lagrange multipliers.
+    def fraction(self, time: float) -> float:
+        """Return the fraction of constant loads that acts at a time [s]."""
+        return min(1.0, time / self.ramp) if self.ramp else 1.0
 
-        fraction: of the way from their values at rest to those of constant ones.
-        """
-        amplitudes = self.loads.amplitudes([time])[0]
+    def amplitudes(self, time: float) -> np.ndarray:
+        """Return the loads that are one number at a time [s], with the present Lagrange multipliers."""
+        amplitudes, fraction = self.loads.amplitudes([time if self.at is None else self.at])[0], self.fraction(time)
         if fraction < 1.0:
             n, springs = len(amplitudes), self.springs
             rest = np.zeros(n) if springs is None else springs.rest_amplitudes(n, self.layout.rest)
-            amplitudes = np.where(self.loads.is_constant, rest + fraction * (amplitudes - rest), amplitudes)
+            amplitudes = np.where(
+                self.loads.is_constant | (self.at is not None), rest + fraction * (amplitudes - rest), amplitudes
+            )
         amplitudes[self.loads.multipliers] = self.now.multipliers
         return amplitudes
 
-    def cavity_pressures_by_name(self, time: float, fraction: float = 1.0) -> dict[str, float]:
-        """Return the pressures [Pa] in all cavities at a time [s]; fraction: as of `amplitudes`."""
-        found = zip(pressures_of(self.scene), self.amplitudes(time, fraction))
+    def cavity_pressures_by_name(self, time: float) -> dict[str, float]:
+        """Return the pressures [Pa] in all cavities at a time [s]."""
+        found = zip(pressures_of(self.scene), self.amplitudes(time))
         return {load.name: float(p) for (_, load), p in found if isinstance(load, Cavity)}
 
     def cavity_form(self, name: str) -> CavityForm:
@@ -284,11 +288,15 @@ class SimulationState:
         """
         if self.dirichlet.n_prescribed == 0:
             return None
-        rows, releasing = self.dirichlet.targets(times)
+        asked = times if self.at is None else np.full(len(times), self.at)
+        rows, releasing = self.dirichlet.targets(asked)
         while releasing and len(rows) == 0:
             self.releases += 1
             self.upload_constraints()
-            rows, releasing = self.dirichlet.targets(times)
+            rows, releasing = self.dirichlet.targets(asked)
+        if self.at is not None:
+            rest = self.layout.rest[self.dirichlet.prescribed_nodes]
+            rows = rest + np.array([self.fraction(t) for t in times[: len(rows)]])[:, None, None] * (rows - rest)
         return rows
 
     def next_target(self, t: float) -> np.ndarray | None:

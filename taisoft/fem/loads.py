@@ -96,7 +96,8 @@ class SceneLoads:
     @property
     def is_constant(self) -> np.ndarray:
         """Which amplitudes (n_amplitudes,) follow no path."""
-        return np.array([load.path is None for _, load in self._scalars] + [False] * (self.n_amplitudes - len(self._scalars)))
+        own = [load.path is None for _, load in self._scalars]
+        return np.array(own + [False] * (self.n_amplitudes - len(own)), dtype=bool)
 
     def at(self, t: float, fraction: float = 1.0) -> np.ndarray:
         """Forces (n_nodes, 3) [N] on all nodes at t [s], a fraction of constant ones. Raises SimulationError if a path fails."""

@@ -84,11 +84,11 @@ def test_residual_is_zero_without_forces(time):
 
 
 def test_unreachable_equilibrium_is_reported():
-    """Nodes that are moved through the block's other side invert it; the residual is that of the whole load."""
+    """Nodes that are moved through the block's other side invert it: a balance of forces there is no state that a path leads to."""
     scene = hanging(path=lambda t: (-2.0 * t, 0.0, 0.0))
     result = ts.solve_static(scene, time=1.0)
-    assert not result.converged and not result.at_rounding and result.load < 1.0
-    assert result.residual == pytest.approx(oracle_residual(scene, result, 1.0), rel=1e-4) and result.residual > 1e-3
+    assert not result.converged and result.load < 1.0 and result.n_inverted > 0
+    assert any("tets were inverted" in problem for problem in result.problems)
     assert runtime.open_kind() is None
 
 
