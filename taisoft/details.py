@@ -4,6 +4,8 @@ each body."""
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from taisoft.errors import SceneError
 from taisoft.records import StepReport
 from taisoft.scene import checks
@@ -20,28 +22,43 @@ OF_PAIRS = {  # heading of an axis, the first and the second of a pair -> query
 OF_BODIES = ("kinetic", "elastic")  # [J]
 
 
-def details_of(sim: "Simulator", wanted: tuple[str, ...]) -> dict[str, float]:
-    """Return numbers of sim's last step and present state, by heading. wanted: some of DETAILS."""
+def details(self: "Simulator", wanted: str | tuple[str, ...] = DETAILS, about=None) -> dict[str, float]:
+    """Return numbers of the last step and the present state, by their headings in steps.csv, as `run` adds them to its reports.
+
+    wanted: "pairs", "bodies" or both; about: a point (3,) [m] of torques, else the first body's centre of mass, or an obstacle's
+    pivot. Raises SceneError.
+    """
+    wanted, about = _checked(self, wanted, about)
     found = {}
-    for a, b in sim.pairs_in_contact() if "pairs" in wanted else ():
+    for a, b in self.pairs_in_contact() if "pairs" in wanted else ():
         for heading, query in OF_PAIRS.items():
-            values = getattr(sim, query)(a, b).tolist()
-            found |= {heading.format(axis, a, b): value for axis, value in zip("xyz", values)}
-    for body, energies in zip(sim.scene.bodies, sim._open().body_energies()) if "bodies" in wanted else ():
+            at = {} if about is None or query != "contact_torque" else {"about": about}
+            values = getattr(self, query)(a, b, **at).tolist()
+            point = " about ({:g}, {:g}, {:g}) [".format(*about) if at else " ["
+            found |= {heading.replace(" [", point).format(axis, a, b): value for axis, value in zip("xyz", values)}
+    for body, energies in zip(self.scene.bodies, self._open().body_energies()) if "bodies" in wanted else ():
         found |= {f"{name} of {body.name} [J]": getattr(energies, name) for name in OF_BODIES}
     return found
 
 
-def detailed(sim: "Simulator", wanted: tuple[str, ...], on_step: Callable | None) -> Callable[[StepReport, float], None]:
-    """Return an `on_step` of `run` that fills the details of each report, then calls the given one. Raises SceneError."""
+def _checked(sim: "Simulator", wanted: str | tuple[str, ...], about) -> tuple[tuple[str, ...], np.ndarray | None]:
+    """Return the arguments of `details`. Raises SceneError."""
     wanted = (wanted,) if isinstance(wanted, str) else tuple(wanted)
     for name in wanted:
         checks.choice(name, "details", DETAILS)
     if "pairs" in wanted and not sim.touches:
         raise SceneError("details: pairs need contact forces, which are not simulated here")
+    return wanted, None if about is None else checks.array(about, "details: about", ((3,),))
+
+
+def detailed(
+    sim: "Simulator", wanted: str | tuple[str, ...], about, on_step: Callable | None
+) -> Callable[[StepReport, float], None]:
+    """Return an `on_step` of `run` that fills the details of each report, then calls the given one. Raises SceneError."""
+    wanted, about = _checked(sim, wanted, about)
 
     def fill(report: StepReport, seconds: float) -> None:
-        report.details = details_of(sim, wanted)
+        report.details = sim.details(wanted, about)
         if on_step is not None:
             on_step(report, seconds)
 

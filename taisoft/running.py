@@ -61,6 +61,7 @@ def run(
     error_mesh: "str | Scene | None" = None,
     on_iteration: IterationCallback | None = None,
     details: tuple[str, ...] = (),
+    about: tuple[float, float, float] | None = None,
 ) -> RunReport:
     """Step for `seconds` [s] from now, to the nearest step, with frames at fps, or after every step if fps is None.
 
@@ -73,18 +74,18 @@ def run(
     another one: "refined", "order" (the elements' other order), or the same scene on a mesh that shares nodes. on_iteration(n):
     called a few times a second in implicit steps of more than 1 s of wall time, with their Newton iterations so far. details:
     "pairs", "bodies" or both: each report then holds forces, torques and slip velocities of the pairs that pressed in its last
-    step, and kinetic and elastic energies of bodies, see `StepReport.details`. A run that fails, or that `stop` ends, does not
-    raise: see the report's status and problems. Ctrl-C undoes the present step and is raised as KeyboardInterrupt; `stop` alone
-    ends a run in another thread than the main one. Raises SimulationError for bad arguments, and for a twin that cannot be made.
-    A simulator with a tolerance first chooses integrator and dt by pilots, unless the run is resumed; the report then holds the
-    error in time.
+    step, and kinetic and elastic energies of bodies, see `StepReport.details`; about: the point of torques, as of `details`.
+    A run that fails, or that `stop` ends, does not raise: see the report's status and problems. Ctrl-C undoes the present step
+    and is raised as KeyboardInterrupt; `stop` alone ends a run in another thread than the main one. Raises SimulationError for
+    bad arguments, and for a twin that cannot be made. A simulator with a tolerance first chooses integrator and dt by pilots,
+    unless the run is resumed; the report then holds the error in time.
     """
     if error_mesh is not None and not error:
         raise SimulationError("error_mesh needs error=True")
     seconds = checks.number(seconds, "seconds", above=0.0, unit="s", error=SimulationError)
     fps = None if fps is None else checks.number(fps, "fps", above=0.0, unit="1/s", error=SimulationError)
     check_length(seconds, sim.dt, fps)
-    on_step = detailed(sim, details, on_step) if details else on_step
+    on_step = detailed(sim, details, about, on_step) if details else on_step
     arguments = {"on_frame": on_frame, "on_step": on_step, "error": error, "error_mesh": error_mesh, "on_iteration": on_iteration}
     if sim.settings.tolerance is None or resumed:
         report = run_steps(sim, seconds, fps=fps, stop=stop, resumed=resumed, **arguments)

@@ -294,6 +294,7 @@ def _run(sim, settings: RunSettings, arguments, signals, warned: list[str], save
             error_mesh=arguments.error_mesh,
             on_iteration=progress.iteration,
             details=shown.details,
+            about=arguments.about,
         )
         observers.close()
         if recording is not None:
