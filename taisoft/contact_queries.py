@@ -76,7 +76,7 @@ def contact_pressure(self: "Simulator", body: str, by: str = "node") -> "Contact
     checks.choice(by, "contact_pressure: by", ("node", "triangle"))
     if not self.touches:
         raise SceneError(f"contact_pressure: contact forces are not simulated here ({self.plan.why('contact_forces')})")
-    return self._open().contact.surface_loads.pressure(body_index(self, body), by == "triangle")
+    return self._open().contact.pressure(body_index(self, body), by == "triangle")
 
 
 def contact_force(self: "Simulator", name: str, other: str | None = None) -> np.ndarray:

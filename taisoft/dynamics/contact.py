@@ -48,7 +48,7 @@ from taisoft.dynamics.rebounds import Rebounds
 from taisoft.dynamics.renewal import Renewal
 from taisoft.dynamics.simulation_state import SimulationState
 from taisoft.dynamics.state import StepState
-from taisoft.dynamics.surface_loads import SurfaceLoads
+from taisoft.dynamics.surface_loads import ContactPressure, SurfaceLoads
 from taisoft.errors import SimulationError
 from taisoft.scene.rigid import RigidBody
 
@@ -91,7 +91,7 @@ class ContactStep:
         self.numbers = build_pair_numbers(self._numbers_arena, scene)
         self.rebounds = Rebounds(simulation, self._lasting)
         simulation.now.slip = self._lasting.field("accumulated_slip", ti.f64, model.n_nodes)
-        self.surface_loads = SurfaceLoads(self)
+        self._surface_loads = SurfaceLoads(simulation)
         self._searched: tuple[float, float] | None = None  # time and dt of the valid search
         self._measured_end: tuple[float, float] | None = None  # time and dt of the measured end, until the next substep begins
         self._depth = 0.0  # deepest penetration there [m]
@@ -505,8 +505,12 @@ class ContactStep:
         a, b = rows.collider.T
         further = {"offsets": offsets_of(self.contact_offset, a == b, rows.guard == 1)}
         if areas:
-            further["tributary_area"] = self.surface_loads.tributary_areas()
+            further["tributary_area"] = self._surface_loads.tributary_areas(self.rows(own=True), self.duration)
         return rows.named(self.simulation.scene, **counts, duration=self.duration, **further)
+
+    def pressure(self, body: int, by_triangle: bool) -> ContactPressure:
+        """Return the contact loads on a body's surface in the last substep, by node or by triangle."""
+        return self._surface_loads.pressure(body, by_triangle, self.rows(own=True), self.duration)
 
     @property
     def field_bytes(self) -> dict[str, int]:

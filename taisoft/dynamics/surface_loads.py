@@ -10,7 +10,6 @@ A triangle's force is that of its corners, divided by area: sums over nodes, ove
 """
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.sparse as sp
@@ -19,9 +18,7 @@ from taisoft.collision.contacts import STATES
 from taisoft.contact.prox import OPEN, SLIP, STICK
 from taisoft.display import short_repr
 from taisoft.dynamics.readout import ContactRows
-
-if TYPE_CHECKING:
-    from taisoft.dynamics.contact import ContactStep
+from taisoft.dynamics.simulation_state import SimulationState
 
 FACING = 0.5  # least cosine between a triangle's normal and the mean direction that presses on its node
 
@@ -89,30 +86,30 @@ class _Loads:
 
 
 class SurfaceLoads:
-    """Contact loads on the bodies of a `ContactStep`. Where a surface depends on other nodes, as skins do, they are its own."""
+    """Contact loads on the bodies of a simulation.
 
-    def __init__(self, step: "ContactStep"):
-        self._step, self._surfaces = step, {}
+    rows of contacts are those before dependent nodes were replaced, so that skins and rigid bodies have loads at their own nodes;
+    duration [s]: in which their impulses acted.
+    """
 
-    def tributary_areas(self) -> np.ndarray:
+    def __init__(self, simulation: SimulationState):
+        self._simulation, self._surfaces = simulation, {}
+
+    def tributary_areas(self, rows: ContactRows, duration: float) -> np.ndarray:
         """Return the part (k,) [m^2] of the loaded surface that each contact carries, on the side where it is smaller."""
-        rows = self._step.rows(own=True)
-        areas, normal = np.full(len(rows.gap), np.inf), self._normal_forces(rows)
+        areas, normal = np.full(len(rows.gap), np.inf), _normal_forces(rows, duration)
         for k in np.unique(rows.collider[normal > 0.0]):
-            if k < len(self._step.simulation.scene.bodies):
-                one = self._loads(k, rows)
+            if k < len(self._simulation.scene.bodies):
+                one = self._loads(k, rows, duration)
                 load = one.sums[:, 0]
                 part = one.hats @ np.divide(one.area, load, out=np.zeros_like(load), where=load > 0.0) * normal[one.contact]
                 np.minimum.at(areas, one.contact, part)
         return np.where(np.isfinite(areas), areas, 0.0)
 
-    def pressure(self, k: int, by_triangle: bool) -> ContactPressure:
+    def pressure(self, k: int, by_triangle: bool, rows: ContactRows, duration: float) -> ContactPressure:
         """Return the record of body k by node or by triangle."""
-        one, step = self._loads(k, self._step.rows(own=True)), self._step
-        surface, slid = one.surface, step.simulation.now.slip.to_numpy()[:, None]
-        if step.simulation.dependents is not None:
-            step.simulation.dependents.place(slid)
-        slid = slid[step.simulation.layout.nodes(k), 0]
+        one = self._loads(k, rows, duration)
+        surface, slid = one.surface, self._accumulated(k, one.surface)
         if by_triangle:
             index, area = np.arange(len(surface.triangles)), one.triangle_area
             at_corner = one.shares @ sp.diags(1.0 / np.where(one.area > 0.0, one.area, 1.0))
@@ -131,12 +128,20 @@ class SurfaceLoads:
         every = normal, density[:, 0], density[:, 2:5], np.array(STATES, dtype=object)[state], slip, slid, gap, area, force
         return ContactPressure(index, *(values[index] for values in every))
 
-    def _normal_forces(self, rows: ContactRows) -> np.ndarray:
-        return (rows.impulse * rows.normal).sum(axis=1) / (self._step.duration or 1.0)
+    def _accumulated(self, k: int, surface: _Surface) -> np.ndarray:
+        """Return the accumulated slip (n,) [m] of body k: of dependent nodes from those that they depend on, and of corners of
+        quadratic faces, which carry no uniform pressure, the mean of the middles around them that have slipped."""
+        simulation, slid = self._simulation, self._simulation.now.slip.to_numpy()[:, None]
+        if simulation.dependents is not None:
+            simulation.dependents.place(slid)
+        slid = slid[simulation.layout.nodes(k), 0]
+        middles = sp.tril(surface.hats, k=-1).T
+        around = middles @ (slid > 0.0).astype(np.float64)
+        return np.divide(middles @ slid, around, out=slid.copy(), where=around > 0.0)
 
-    def _loads(self, k: int, rows: ContactRows) -> _Loads:
+    def _loads(self, k: int, rows: ContactRows, duration: float) -> _Loads:
         """Return the loads on body k."""
-        simulation = self._step.simulation
+        simulation = self._simulation
         if k not in self._surfaces:
             self._surfaces[k] = _Surface(simulation.scene.bodies[k])
         surface, own, half = self._surfaces[k], simulation.layout.nodes(k), rows.nodes.shape[1] // 2
@@ -146,8 +151,8 @@ class SurfaceLoads:
         row, column = np.nonzero((node >= own.start) & (node < own.stop))
         shape = len(contact), own.stop - own.start
         weights = sp.csr_matrix((weight[row, column], (row, node[row, column] - own.start)), shape=shape)
-        hats, sign, load = weights @ surface.hats, 1.0 - 2.0 * on_b[:, None], self._normal_forces(rows)[contact, None]
-        force = sign * rows.impulse[contact] / (self._step.duration or 1.0)
+        hats, sign, load = weights @ surface.hats, 1.0 - 2.0 * on_b[:, None], _normal_forces(rows, duration)[contact, None]
+        force = sign * rows.impulse[contact] / (duration or 1.0)
         inward, slips = sign * rows.normal[contact], rows.state[contact, None] == SLIP
         sums = hats.T @ np.hstack(
             [load, load * slips, force - load * inward, load * slips * sign * rows.slip[contact], -load * inward]
@@ -159,19 +164,23 @@ class SurfaceLoads:
         normal = 0.5 * np.cross(x[:, 1] - x[:, 0], x[:, 2] - x[:, 0])
         area = np.linalg.norm(normal, axis=1)
         normal /= np.maximum(area, 1e-300)[:, None]
-        shares = self._shares(surface, area, normal, sums[:, 8:], sums[:, 0])
+        shares = _shares(surface, area, normal, sums[:, 8:], sums[:, 0])
         of_nodes = np.asarray(shares.sum(axis=0)).ravel()
         return _Loads(surface, contact, hats, weights.T @ force, gap, sums, of_nodes, area, normal, shares)
 
-    @staticmethod
-    def _shares(surface: _Surface, area: np.ndarray, normal: np.ndarray, pressed: np.ndarray, load: np.ndarray) -> sp.csr_matrix:
-        """Return the part of A_a in each triangle (t, n) [m^2]: of those that face what presses there, or of all if none does.
 
-        pressed: (n,3) sums of outward normals times normal forces [N]; load: (n,) those of the forces.
-        """
-        means = surface.means
-        along = np.einsum("ei,ei->e", normal[means.row], pressed[means.col])
-        facing = along >= FACING * np.linalg.norm(pressed, axis=1)[means.col]
-        n_facing = np.bincount(means.col, facing, means.shape[1])
-        kept = facing | (load[means.col] <= 0.0) | (n_facing[means.col] == 0)
-        return sp.csr_matrix((means.data * area[means.row] * kept, (means.row, means.col)), shape=means.shape)
+def _normal_forces(rows: ContactRows, duration: float) -> np.ndarray:
+    return (rows.impulse * rows.normal).sum(axis=1) / (duration or 1.0)
+
+
+def _shares(surface: _Surface, area: np.ndarray, normal: np.ndarray, pressed: np.ndarray, load: np.ndarray) -> sp.csr_matrix:
+    """Return the part of A_a in each triangle (t, n) [m^2]: of those that face what presses there, or of all if none does.
+
+    pressed: (n,3) sums of outward normals times normal forces [N]; load: (n,) those of the forces.
+    """
+    means = surface.means
+    along = np.einsum("ei,ei->e", normal[means.row], pressed[means.col])
+    facing = along >= FACING * np.linalg.norm(pressed, axis=1)[means.col]
+    n_facing = np.bincount(means.col, facing, means.shape[1])
+    kept = facing | (load[means.col] <= 0.0) | (n_facing[means.col] == 0)
+    return sp.csr_matrix((means.data * area[means.row] * kept, (means.row, means.col)), shape=means.shape)
