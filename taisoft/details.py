@@ -4,8 +4,6 @@ each body."""
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from taisoft.errors import SceneError
 from taisoft.records import StepReport
 from taisoft.scene import checks
@@ -28,34 +26,26 @@ def details(self: "Simulator", wanted: str | tuple[str, ...] = DETAILS, about=No
     wanted: "pairs", "bodies" or both; about: a point (3,) [m] of torques, else the first body's centre of mass, or an obstacle's
     pivot. Raises SceneError.
     """
-    wanted, about = _checked(self, wanted, about)
-    found = {}
+    wanted, found = (wanted,) if isinstance(wanted, str) else tuple(wanted), {}
+    for name in wanted:
+        checks.choice(name, "details", DETAILS)
+    if "pairs" in wanted and not self.touches:
+        raise SceneError("details: pairs need contact forces, which are not simulated here")
+    at = {} if about is None else {"about": checks.array(about, "details: about", ((3,),)).tolist()}
     for a, b in self.pairs_in_contact() if "pairs" in wanted else ():
         for heading, query in OF_PAIRS.items():
-            at = {} if about is None or query != "contact_torque" else {"about": about}
-            values = getattr(self, query)(a, b, **at).tolist()
-            point = " about ({:g}, {:g}, {:g}) [".format(*about) if at else " ["
+            given = at if query == "contact_torque" else {}
+            point = " about ({:g}, {:g}, {:g}) [".format(*given["about"]) if given else " ["
+            values = getattr(self, query)(a, b, **given).tolist()
             found |= {heading.replace(" [", point).format(axis, a, b): value for axis, value in zip("xyz", values)}
     for body, energies in zip(self.scene.bodies, self._open().body_energies()) if "bodies" in wanted else ():
         found |= {f"{name} of {body.name} [J]": getattr(energies, name) for name in OF_BODIES}
     return found
 
 
-def _checked(sim: "Simulator", wanted: str | tuple[str, ...], about) -> tuple[tuple[str, ...], np.ndarray | None]:
-    """Return the arguments of `details`. Raises SceneError."""
-    wanted = (wanted,) if isinstance(wanted, str) else tuple(wanted)
-    for name in wanted:
-        checks.choice(name, "details", DETAILS)
-    if "pairs" in wanted and not sim.touches:
-        raise SceneError("details: pairs need contact forces, which are not simulated here")
-    return wanted, None if about is None else checks.array(about, "details: about", ((3,),))
-
-
-def detailed(
-    sim: "Simulator", wanted: str | tuple[str, ...], about, on_step: Callable | None
-) -> Callable[[StepReport, float], None]:
+def detailed(sim: "Simulator", wanted, about, on_step: Callable | None) -> Callable[[StepReport, float], None]:
     """Return an `on_step` of `run` that fills the details of each report, then calls the given one. Raises SceneError."""
-    wanted, about = _checked(sim, wanted, about)
+    sim.details(wanted, about)  # refuses invalid arguments before the run
 
     def fill(report: StepReport, seconds: float) -> None:
         report.details = sim.details(wanted, about)

@@ -77,7 +77,8 @@ class Simulator(Guarded):
         try:
             self._dynamics = Dynamics(scene, self.settings, self.plan)
             self._refuse_overlap()
-            self.plan.add_why("contact_forces", f"they keep {self.contact_offset:.3g} m apart")
+            if self.touches:
+                self.plan.add_why("contact_forces", f"they keep {self.contact_offset:.3g} m apart")
         except BaseException as error:
             self.close()
             if isinstance(error, MemoryError):

@@ -499,7 +499,7 @@ class ContactStep:
             self._searched = None  # where none cross, other contacts are found
         return self.crossing
 
-    def contacts(self, areas: bool) -> Contacts:
+    def contacts(self, areas: bool = False) -> Contacts:
         """Return the contacts of the last substep with their impulses. areas: whether with tributary areas."""
         rows, counts = self.rows(), dict(zip(("found", "unmapped"), self._search_counts))  # others have searched since
         a, b = rows.collider.T

@@ -39,8 +39,10 @@ class ContactPressure:
     slip: np.ndarray  #: (n,3) [m] tangential displacement relative to what it touches, weighted by force; what sticks counts 0
     accumulated_slip: np.ndarray  #: (n,) [m] length of the path of such slips since the start or the last reset
     gap: np.ndarray  #: (n,) [m] mean of the contacts found there, nan without any
-    area: np.ndarray  #: (n,) [m^2] deformed; of a node its part of the triangles around
-    force: np.ndarray  #: (n,3) [N]; of a mid-edge node or its corners, as it acts on the nodes
+    area: (
+        np.ndarray
+    )  #: (n,) [m^2] deformed; of a node its part of the triangles around, 0 at mid-edge nodes, whose corners have it
+    force: np.ndarray  #: (n,3) [N]; of a node as it acts there
 
     __repr__ = short_repr
 
@@ -115,7 +117,7 @@ class SurfaceLoads:
             at_corner = one.shares @ sp.diags(1.0 / np.where(one.area > 0.0, one.area, 1.0))
             sums, normal, corners = at_corner @ one.sums, one.triangle_normal, surface.triangles
             force, slid, gap = at_corner @ (surface.hats.T @ one.force), slid[corners].mean(axis=1), one.gap[corners].mean(axis=1)
-            density = sums / area[:, None]
+            density = sums / np.maximum(area, 1e-300)[:, None]
         else:
             index, area, gap = surface.nodes, one.area, one.gap
             at_node = surface.hats.multiply(surface.around @ one.shares > 0.0)  # not beyond edges of what is pressed

@@ -45,10 +45,8 @@ class Plan:
         self.entries.append({"feature": feature, "on": bool(on), "why": why if on else why_not})
 
     def add_why(self, feature: str, why: str) -> None:
-        """Add to the reason for a feature, if it is modelled."""
-        for entry in self.entries:
-            if entry["feature"] == feature and entry["on"]:
-                entry["why"] += f"; {why}"
+        """Add to the reason for a feature that is modelled."""
+        next(e for e in self.entries if e["feature"] == feature)["why"] += f"; {why}"
 
 
 def _shorten(names: list[str]) -> str:

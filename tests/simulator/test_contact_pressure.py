@@ -14,7 +14,7 @@ def patch(order: int, top_first: bool = False) -> ts.Scene:
     scene, soft = ts.Scene(gravity=(0, 0, 0)), ts.Material("st_venant_kirchhoff", young=1e6, density=1e-3, friction=0.2)
     cells = {"low": (2, 1, 2), "top": (3, 2, 3)}
     for name in sorted(cells, reverse=top_first):
-        y = 0.25 if name == "low" else 0.7505
+        y = 0.25 if name == "low" else 0.751
         body = scene.add_body(ts.box_mesh(cells[name], (1, 0.5, 1), (0.5, y, 0.5)), soft, name=name, order=order)
         for axis, k in (("x", 0), ("z", 2)):
             body.fix(lambda X, k=k: X[:, k] < 1e-9, axes=axis)
