@@ -132,18 +132,11 @@ class Contacts:
 
 
 def named_contacts(
-    scene: Scene,
-    *,
-    found: int = 0,
-    unmapped: int = 0,
-    duration: float = 0.0,
-    offsets: np.ndarray | float = 0.0,
-    tributary_area: np.ndarray | float = np.nan,
-    **rows: np.ndarray,
+    scene: Scene, *, found=0, unmapped=0, duration: float = 0.0, offsets=0.0, tributary_area=np.nan, **rows: np.ndarray
 ) -> Contacts:
     """Return the record of contacts in a stable order, with names, numbers of the pairs, pressures and clearances.
 
-    rows: arrays (k, ...), of which impulse, state and slip may be missing, for 0; collider: (k,2) indices.
+    rows: arrays (k, ...), of which impulse, state and slip may be missing, for 0; collider: (k,2) indices; offsets: (k,) [m].
     """
     collider, feature = rows.pop("collider"), rows.pop("feature")
     n, names = len(collider), np.array([c.name for c in scene.colliders], dtype=object)
