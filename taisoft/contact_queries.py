@@ -1,17 +1,21 @@
 """Contacts and overlaps of a simulator's present state and last step: methods of `Simulator`, as in `queries`."""
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from taisoft.dynamics.readout import offsets_of
 from taisoft.errors import SceneError
 from taisoft.fem.reference import gravity_mass
-from taisoft.queries import nodes_of
+from taisoft.queries import body_index, nodes_of
+from taisoft.scene import checks
 from taisoft.scene.body import Body
 
 if TYPE_CHECKING:
     from taisoft.collision.contacts import Contacts
     from taisoft.collision.overlap import Overlap
+    from taisoft.dynamics.surface_loads import ContactPressure
     from taisoft.simulator import Simulator
 
 
@@ -26,6 +30,15 @@ def contact_limit(self: "Simulator", a: str, b: str) -> float:
     return self._host().contact.measures.deep_from(names.index(a), names.index(b))
 
 
+def contact_offset(self: "Simulator") -> float:
+    """Gap [m] that contacts of different bodies keep, `CollisionSettings.offset` of an edge; 0 where nothing can touch.
+
+    Contacts marked as `guard` keep half of it, and parts of one body 5 times it.
+    """
+    contact = self._open().contact
+    return 0.0 if contact is None else contact.contact_offset
+
+
 def detect_contacts(self: "Simulator") -> "Contacts":
     """Detect the contacts of the present state swept by dt v, with impulses 0, without taking a step.
 
@@ -33,21 +46,37 @@ def detect_contacts(self: "Simulator") -> "Contacts":
     Memory and kernels are made at the first call. Raises MeshError if a distance field cannot be made, SimulationError
     if positions or velocities are not finite or a buffer would grow beyond `max_capacity`.
     """
-    return self._open().find_contacts(self.dt).contacts()
+    found = self._open().find_contacts(self.dt).contacts()
+    offsets = offsets_of(self.contact_offset, found.body_a == found.body_b, found.guard)
+    return replace(found, clearance=found.gap - offsets)
 
 
-def contacts(self: "Simulator") -> "Contacts":
-    """Return the contacts of the last step, with gaps at its start [m] and the impulses it applied [N s].
+def contacts(self: "Simulator", areas: bool = False) -> "Contacts":
+    """Return the contacts of the last step, with gaps at its end [m] and the impulses it applied [N s].
 
     After a step that was cut into substeps, those of the last substep: then impulse / duration is the force of a contact, and
-    impulse / dt is not; `contact_force` is a mean over the whole step. Empty before the first step and if nothing can touch.
+    impulse / dt is not; `contact_force` is a mean over the whole step. areas: also find tributary areas, which
+    takes longer than all the rest. Empty before the first step and if nothing can touch.
     """
     dynamics = self._open()
     if dynamics.contact is not None:
-        return dynamics.contact.contacts()
+        return dynamics.contact.contacts(areas)
     from taisoft.collision.contacts import no_contacts
 
     return no_contacts(self.scene)
+
+
+def contact_pressure(self: "Simulator", body: str, by: str = "node") -> "ContactPressure":
+    """Return pressure, traction, state and slip at the surface of a body by "node" or by "triangle", in the last step.
+
+    The record is of the last substep where the step was cut, as `contacts` is. A skin that touches, and a rigid body, have their
+    own nodes. Before the first step nothing presses. Raises SceneError for unknown names, for obstacles, and where contact forces
+    are not simulated.
+    """
+    checks.choice(by, "contact_pressure: by", ("node", "triangle"))
+    if not self.touches:
+        raise SceneError(f"contact_pressure: contact forces are not simulated here ({self.plan.why('contact_forces')})")
+    return self._open().contact.pressure(body_index(self, body), by == "triangle")
 
 
 def contact_force(self: "Simulator", name: str, other: str | None = None) -> np.ndarray:
@@ -58,10 +87,12 @@ def contact_force(self: "Simulator", name: str, other: str | None = None) -> np.
     return _mean_contact(self, "contact_force", name, other)[:3]
 
 
-def contact_torque(self: "Simulator", name: str, other: str | None = None) -> np.ndarray:
-    """Return the torque (3,) [N m] of `contact_force`: about a body's centre of mass, or an obstacle's pivot."""
+def contact_torque(self: "Simulator", name: str, other: str | None = None, about=None) -> np.ndarray:
+    """Return the torque (3,) [N m] of `contact_force` about a point (3,) [m]; None: a centre of mass, or an obstacle's pivot."""
     found, one = _mean_contact(self, "contact_torque", name, other), self.scene.collider(name)
-    if isinstance(one, Body):
+    if about is not None:
+        centre = checks.array(about, "contact_torque: about", ((3,),))
+    elif isinstance(one, Body):
         nodes, (x, _) = nodes_of(self, name), self._host().state.state()
         centre = np.average(x[nodes], axis=0, weights=gravity_mass(one))
     else:

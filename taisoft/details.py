@@ -20,28 +20,35 @@ OF_PAIRS = {  # heading of an axis, the first and the second of a pair -> query
 OF_BODIES = ("kinetic", "elastic")  # [J]
 
 
-def details_of(sim: "Simulator", wanted: tuple[str, ...]) -> dict[str, float]:
-    """Return numbers of sim's last step and present state, by heading. wanted: some of DETAILS."""
-    found = {}
-    for a, b in sim.pairs_in_contact() if "pairs" in wanted else ():
+def details(self: "Simulator", wanted: str | tuple[str, ...] = DETAILS, about=None) -> dict[str, float]:
+    """Return numbers of the last step and the present state, by their headings in steps.csv, as `run` adds them to its reports.
+
+    wanted: "pairs", "bodies" or both; about: a point (3,) [m] of torques, else the first body's centre of mass, or an obstacle's
+    pivot. Raises SceneError.
+    """
+    wanted, found = (wanted,) if isinstance(wanted, str) else tuple(wanted), {}
+    for name in wanted:
+        checks.choice(name, "details", DETAILS)
+    if "pairs" in wanted and not self.touches:
+        raise SceneError("details: pairs need contact forces, which are not simulated here")
+    at = {} if about is None else {"about": checks.array(about, "details: about", ((3,),)).tolist()}
+    for a, b in self.pairs_in_contact() if "pairs" in wanted else ():
         for heading, query in OF_PAIRS.items():
-            values = getattr(sim, query)(a, b).tolist()
-            found |= {heading.format(axis, a, b): value for axis, value in zip("xyz", values)}
-    for body, energies in zip(sim.scene.bodies, sim._open().body_energies()) if "bodies" in wanted else ():
+            given = at if query == "contact_torque" else {}
+            point = " about ({:g}, {:g}, {:g}) [".format(*given["about"]) if given else " ["
+            values = getattr(self, query)(a, b, **given).tolist()
+            found |= {heading.replace(" [", point).format(axis, a, b): value for axis, value in zip("xyz", values)}
+    for body, energies in zip(self.scene.bodies, self._open().body_energies()) if "bodies" in wanted else ():
         found |= {f"{name} of {body.name} [J]": getattr(energies, name) for name in OF_BODIES}
     return found
 
 
-def detailed(sim: "Simulator", wanted: tuple[str, ...], on_step: Callable | None) -> Callable[[StepReport, float], None]:
+def detailed(sim: "Simulator", wanted, about, on_step: Callable | None) -> Callable[[StepReport, float], None]:
     """Return an `on_step` of `run` that fills the details of each report, then calls the given one. Raises SceneError."""
-    wanted = (wanted,) if isinstance(wanted, str) else tuple(wanted)
-    for name in wanted:
-        checks.choice(name, "details", DETAILS)
-    if "pairs" in wanted and not sim.touches:
-        raise SceneError("details: pairs need contact forces, which are not simulated here")
+    sim.details(wanted, about)  # refuses invalid arguments before the run
 
     def fill(report: StepReport, seconds: float) -> None:
-        report.details = details_of(sim, wanted)
+        report.details = sim.details(wanted, about)
         if on_step is not None:
             on_step(report, seconds)
 

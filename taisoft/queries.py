@@ -259,9 +259,10 @@ def buffer_growths(self: "Simulator") -> dict[str, int]:
 def picture(self: "Simulator", size: tuple[int, int] = (1280, 720), colour: str = "stress") -> np.ndarray:
     """Return a picture of the present state, uint8 (height, width, 3), first row on top.
 
-    size: width and height in pixels; colour: of the bodies, by "stress" (von Mises), "stretch" or "speed", on a scale up to the
-    state's 99 % quantile, "error" in a run with error=True, or "body". The camera frames the bodies at the start, and steps back
-    if one would leave the picture. Needs no display. Raises OutputError for another size or colour.
+    size: width and height in pixels; colour: of the bodies, by "stress" (von Mises), "stretch", "speed", contact "pressure" or
+    accumulated "slip", on a scale up to the state's 99 % quantile, "error" in a run with error=True, or "body". The camera frames
+    the bodies at the start, and steps back if one would leave the picture. Needs no display. Raises OutputError for another size
+    or colour.
     """
     from taisoft.view.offscreen import Offscreen  # compiles kernels at the first picture
 

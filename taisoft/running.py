@@ -63,6 +63,7 @@ def run(
     on_iteration: IterationCallback | None = None,
     details: tuple[str, ...] = (),
     quantities: "dict[str, str | Callable[[Simulator], float]] | None" = None,
+    about: tuple[float, float, float] | None = None,
 ) -> RunReport:
     """Step for `seconds` [s] from now, to the nearest step, with frames at fps, or after every step in statics or if it is None.
 
@@ -75,9 +76,10 @@ def run(
     another one: "refined", "order" (the elements' other order), or the same scene on a mesh that shares nodes. on_iteration(n):
     called a few times a second in implicit steps of more than 1 s of wall time, with their Newton iterations so far. details:
     some of "pairs", "bodies" and "quantities": each report then holds forces, torques and slip velocities of the pairs that
-    pressed in its last step, energies of bodies, and the quantities, see `StepReport.details`. quantities: functions of the
-    simulator that return a number, or texts such as "contact_force.x finger fruit" (docs/errors.md), by name; the report holds
-    their values at the end and, with error=True, their errors. Functions see the twins too, whose mesh may have other nodes.
+    pressed in its last step, energies of bodies, and the quantities, see `StepReport.details`; about: the point of torques, as of
+    `details`. quantities: functions of the simulator that return a number, or texts such as "contact_force.x finger fruit"
+    (docs/errors.md), by name; the report holds their values at the end and, with error=True, their errors. Functions see the
+    twins too, whose mesh may have other nodes.
     A run that fails, or that `stop` ends, does not raise: see the report's status and problems. Ctrl-C undoes the present step
     and is raised as KeyboardInterrupt; `stop` alone ends a run in another thread than the main one. Raises SimulationError for
     bad arguments, and for a twin that cannot be made. A simulator with a tolerance first chooses integrator and dt by pilots,
@@ -94,7 +96,7 @@ def run(
     if "quantities" in details:
         details = tuple(name for name in details if name != "quantities")
         on_step = with_columns(sim, measured, on_step)
-    on_step = detailed(sim, details, on_step) if details else on_step
+    on_step = detailed(sim, details, about, on_step) if details else on_step
     arguments = {"on_frame": on_frame, "on_step": on_step, "error": error, "error_mesh": error_mesh, "on_iteration": on_iteration}
     arguments |= {"measured": measured}
     if sim.settings.tolerance is None or resumed:

@@ -4,7 +4,7 @@ import dataclasses
 import warnings
 from typing import TYPE_CHECKING
 
-from taisoft import changes, checkpoint, commanding, contact_queries, queries, running
+from taisoft import changes, checkpoint, commanding, contact_queries, details, queries, running
 from taisoft.attributes import Guarded, SimulationAttributeError, thawed
 from taisoft.backend import runtime
 from taisoft.display import drawn, simulator_text
@@ -80,6 +80,8 @@ class Simulator(Guarded):
         try:
             self._dynamics = Dynamics(scene, self.settings, self.plan)
             self._refuse_overlap()
+            if self.touches:
+                self.plan.add_why("contact_forces", f"they keep {self.contact_offset:.3g} m apart")
         except BaseException as error:
             self.close()
             if isinstance(error, MemoryError):
@@ -161,6 +163,9 @@ class Simulator(Guarded):
     contact_limit = contact_queries.contact_limit
     detect_contacts = contact_queries.detect_contacts
     contacts = contact_queries.contacts
+    contact_offset = property(contact_queries.contact_offset)
+    contact_pressure = contact_queries.contact_pressure
+    details = details.details
     contact_force = contact_queries.contact_force
     contact_torque = contact_queries.contact_torque
     slip_velocity = contact_queries.slip_velocity

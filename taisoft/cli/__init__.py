@@ -233,13 +233,14 @@ def _add_run(add) -> None:
     option("--quantity", action="append", default=[], metavar="NAME=TEXT", help=quantity)
     details = "also write per step: pairs (forces, torques, slip velocities of what presses), bodies (their energies), quantities"
     option("--details", metavar="NAME,...", help=details)
+    option("--about", type=float, nargs=3, metavar=("X", "Y", "Z"), help="point of torques [m] (default: centres of mass)")
     option("--error", action="store_true", help="estimate the error by runs with other steps and tolerances beside this one")
     option("--error-mesh", choices=("refined", "order"), help="also by one on another mesh; implies --error")
-    colours = ("body", "stress", "stretch", "speed", "error")
+    colours = ("body", "stress", "stretch", "speed", "pressure", "slip", "error")
     option("--colour", choices=colours, default="body", help="colouring of bodies in pictures and the window")
     layers = "what they show besides bodies: wires, contacts, tractions, pressures, connections, fibres, fixed_nodes, or none"
     option("--layers", metavar="NAME,...", help=layers)
-    plots = "on pictures, over time: energies, residuals, iterations, contacts, step_time, error, forces, kinetic, elastic"
+    plots = "on pictures: energies, residuals, iterations, contacts, step_time, error, forces, torques, kinetic, elastic"
     option("--plots", metavar="NAME,...", help=plots)
     option("--caption", action="store_true", help="write scene, frame, time and energies on pictures")
     option("--no-frames", action="store_true", help="write no pictures")

@@ -64,6 +64,8 @@ def display_options(arguments: Namespace, has_window: bool) -> DisplayOptions:
     for option, given in requested.items():
         if given and not pictures:
             raise SceneError(f"--{option} needs --out, the folder to write to, and pictures, so it excludes --no-frames")
+    if arguments.about is not None and "pairs" not in details:
+        raise SceneError("--about is the point of torques, so it needs --details pairs")
     for option, given in {"vtu": arguments.vtu, "details": details}.items():
         if given and arguments.out is None:
             raise SceneError(f"--{option} needs --out, the folder to write to")
@@ -249,6 +251,7 @@ class Recording:
             precision=settings["precision"],
             settings=settings | sim._arguments(),
             plan=sim.plan.entries,
+            contact_offset=sim.contact_offset,
             resumed=self._resumed,
             bodies=body_records(sim.scene),
             buffer_growths=sim.buffer_growths,

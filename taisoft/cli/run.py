@@ -311,6 +311,7 @@ def _run(sim, settings: RunSettings, arguments, signals, warned: list[str], save
             on_iteration=progress.iteration,
             details=shown.details,
             quantities=settings.quantities,
+            about=arguments.about,
         )
         observers.close()
         if recording is not None:

@@ -22,6 +22,7 @@ from taisoft.scene.scene import Scene
 # kinds of contacts; their two ids are: vertex and triangle; edge and edge (3 triangle + local edge); vertex and collider;
 # triangle and collider; a passage (`passages`); vertex and collider (`mortar`)
 VERTEX_FACE, EDGE_EDGE, VERTEX_FIELD, FACE_FIELD, FACE_FACE, MORTAR = range(6)
+STATES = ("open", "stick", "slip")
 KINDS = ("vertex_face", "edge_edge", "vertex_field", "face_field", "face_face", "mortar")
 # capacity for vertices of mortar contacts, over that for contacts: at first; at most, since a list that does not fit is overrated
 LISTED, MOST_LISTED = 8, 64
@@ -73,7 +74,7 @@ class ContactFields:
 
 @dataclass(frozen=True, eq=False)
 class Contacts:
-    """Contacts on the host, all arrays (k, ...) and in an order that does not depend on threads.
+    """Contacts on the host, all arrays (k, ...), in order of bodies, as added, kind and feature, so that order and sides stay.
 
     An attribute of a record from `sim.contacts()` holds for the last step, or for its last substep if it was cut into several.
     point, normal, gap: geometry at its end, but point and normal of an explicit step, and of contacts that keep the geometry of
@@ -98,6 +99,12 @@ class Contacts:
     guard: np.ndarray  #: (k,) bool: keeps half the contact offset only, since a mortar contact carries the load
     area: np.ndarray  #: (k,) [m^2] over which a mortar contact is a mean, 0 for others
     pressure: np.ndarray  #: (k,) [Pa] at the node of a mortar contact: its normal force over its area; nan for others
+    state: np.ndarray  #: (k,) "open", "stick" or "slip" at the end, as the solver left it
+    slip: np.ndarray  #: (k,3) [m] tangential displacement of a relative to b in `duration`
+    clearance: (
+        np.ndarray
+    )  #: (k,) [m] gap minus the offset that this contact keeps, half of it at guards and 5 times within a body
+    tributary_area: np.ndarray  #: (k,) [m^2] of the loaded surface, divided among contacts by force; nan unless asked for
     found: int  #: contacts before the reduction
     unmapped: int  #: triangles whose tet is inverted, so that a distance field could not be used
     duration: float = 0.0  #: in which the impulses acted [s]: the step, or its last substep; 0 without a step
@@ -107,51 +114,52 @@ class Contacts:
     def __len__(self) -> int:
         return len(self.gap)
 
+    @property
+    def tangential_impulse(self) -> np.ndarray:
+        """The tangential part (k,3) of `impulse` [N s], which is friction."""
+        return self.impulse - (self.impulse * self.normal).sum(axis=1, keepdims=True) * self.normal
+
     def to_dict(self) -> dict[str, np.ndarray]:
         """Return the columns of a table with a row for each contact, which pandas.DataFrame takes.
 
         A vector has three, such as point_x, point_y and point_z, and feature two; nodes and weights are left out.
         """
         columns = {name: values for name, values in vars(self).items() if np.ndim(values) == 1}
-        for name, axes in {"point": "xyz", "normal": "xyz", "impulse": "xyz", "feature": "01"}.items():
+        vectors = dict.fromkeys(("point", "normal", "impulse", "tangential_impulse", "slip"), "xyz")
+        for name, axes in (vectors | {"feature": "01"}).items():
             columns |= {f"{name}_{axis}": column for axis, column in zip(axes, getattr(self, name).T)}
         return columns
 
 
 def named_contacts(
-    scene: Scene,
-    point,
-    normal,
-    gap,
-    impulse,
-    collider,
-    feature,
-    nodes,
-    weights,
-    guard,
-    area,
-    *,
-    found: int,
-    unmapped: int,
-    duration: float = 0.0,
+    scene: Scene, *, found=0, unmapped=0, duration: float = 0.0, offsets=0.0, tributary_area=np.nan, **rows: np.ndarray
 ) -> Contacts:
-    """Return the record of contact arrays (k, ...), with names, numbers of the pairs, pressures. collider: (k,2) indices."""
-    names, kinds = np.array([c.name for c in scene.colliders], dtype=object), np.array(KINDS, dtype=object)
+    """Return the record of contacts in a stable order, with names, numbers of the pairs, pressures and clearances.
+
+    rows: arrays (k, ...), of which impulse, state and slip may be missing, for 0; collider: (k,2) indices; offsets: (k,) [m].
+    """
+    collider, feature = rows.pop("collider"), rows.pop("feature")
+    n, names = len(collider), np.array([c.name for c in scene.colliders], dtype=object)
+    rows = {"impulse": np.zeros((n, 3)), "state": np.zeros(n, dtype=np.int64), "slip": np.zeros((n, 3))} | rows
     pairs, pair = np.unique(collider, axis=0, return_inverse=True)
     numbers = np.array([scene.contact_numbers(names[a], names[b]) for a, b in pairs]).reshape(-1, 2)[pair.reshape(-1)]
-    geometry, labels = (point, normal, gap, impulse), (names[collider[:, 0]], names[collider[:, 1]])
-    what = (nodes, weights, kinds[feature[:, 0]], feature[:, 1:], numbers[:, 0], numbers[:, 1])
-    pressure = np.full(len(gap), np.nan)
-    normal_force = (impulse * normal).sum(axis=1) / (duration or 1.0)
-    np.divide(normal_force, area, out=pressure, where=area > 0.0)
-    return Contacts(*geometry, *labels, *what, guard == 1, area, pressure, found, unmapped, duration)
+    pressure = np.full(n, np.nan)
+    normal_force = (rows["impulse"] * rows["normal"]).sum(axis=1) / (duration or 1.0)
+    np.divide(normal_force, rows["area"], out=pressure, where=rows["area"] > 0.0)
+    kinds, states = (np.array(words, dtype=object) for words in (KINDS, STATES))
+    rows |= {"body_a": names[collider[:, 0]], "body_b": names[collider[:, 1]], "kind": kinds[feature[:, 0]]}
+    rows |= {"feature": feature[:, 1:], "friction": numbers[:, 0], "restitution": numbers[:, 1], "pressure": pressure}
+    rows |= {"guard": rows["guard"] == 1, "state": states[rows["state"]], "clearance": rows["gap"] - offsets}
+    rows["tributary_area"] = np.broadcast_to(tributary_area, n)
+    order = np.lexsort(np.hstack([collider, feature])[:, ::-1].T)
+    return Contacts(**{name: values[order] for name, values in rows.items()}, found=found, unmapped=unmapped, duration=duration)
 
 
 def no_contacts(scene: Scene) -> Contacts:
     """Return an empty record."""
-    geometry = np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros((0, 3))
-    integers = (np.zeros((0, n), dtype=np.int64) for n in (2, 3, 6))
-    return named_contacts(scene, *geometry, *integers, np.zeros((0, 6)), np.zeros(0), np.zeros(0), found=0, unmapped=0)
+    integers = {name: np.zeros((0, n), dtype=np.int64) for name, n in (("collider", 2), ("feature", 3), ("nodes", 6))}
+    vectors = {name: np.zeros((0, n)) for name, n in (("point", 3), ("normal", 3), ("weights", 6))}
+    return named_contacts(scene, **integers, **vectors, **{name: np.zeros(0) for name in ("gap", "guard", "area")})
 
 
 def contact_fields(arena: FieldArena, capacity: int) -> ContactFields:

@@ -295,9 +295,9 @@ class Detection:
         threads or chunks."""
         data, at, counts = self.buffer.data, self.kept.to_numpy(self.counts.contacts), self.counts
         at = at[np.lexsort(np.hstack([data.body[at], data.feature[at]])[:, ::-1].T)]
-        point, normal, gap, collider, feature = (x[at] for x in (data.point, data.normal, data.gap, data.body, data.feature))
-        what = np.zeros((len(at), 3)), collider, feature, *self.sides(at), data.guard[at], data.area[at]
-        return named_contacts(self.scene, point, normal, gap, *what, found=counts.found, unmapped=counts.unmapped)
+        geometry = {name: getattr(data, name)[at] for name in ("point", "normal", "gap", "feature", "guard", "area")}
+        geometry |= dict(zip(("collider", "nodes", "weights"), (data.body[at], *self.sides(at))))
+        return named_contacts(self.scene, **geometry, found=counts.found, unmapped=counts.unmapped)
 
     def sides(self, at: np.ndarray, data: ContactFields | None = None) -> tuple[np.ndarray, np.ndarray]:
         """Nodes and weights (k, 2 w) of the contacts at places (k,) of a buffer, before dependent nodes are replaced.

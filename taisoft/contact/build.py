@@ -22,7 +22,7 @@ from taisoft.backend.arrays import FieldArena
 from taisoft.backend.lists import add_up_counts, bucket_of, clear_counts, count_entries
 from taisoft.backend.runtime import kernel
 from taisoft.contact.problem import NODES, fill_field, to_frame, to_world
-from taisoft.contact.prox import dvec, prox, tangent
+from taisoft.contact.prox import OPEN, SLIP, dvec, prox, scaled, state_of, tangent
 from taisoft.fem.model import Model
 from taisoft.scene.scene import Scene
 
@@ -330,6 +330,7 @@ def fill_row(p: ti.template(), m: ti.template(), s: ti.template(), q: ti.templat
     _add_sides(p, m, s, c, first, found, row)
     p.min_opening[c], p.impact_impulse[c] = 0.0, dvec(0.0)
     p.guard[c], p.area[c] = found.guard[row], found.area[row]
+    p.status[c], p.slip[c] = OPEN, dvec(0.0)
 
 
 @kernel
@@ -448,15 +449,36 @@ def has_impact(p: ti.template(), rigid: ti.template(), dt: ti.f64, contact_offse
 
 
 @kernel
-def set_end_gaps(p: ti.template(), m: ti.template(), x_start: ti.template()):
-    """Set gaps to those at the present positions, after a step from the positions x_start (n_nodes) [m]."""
+def end_contacts(p: ti.template(), m: ti.template(), x_start: ti.template(), accumulated: ti.template(), explicit_dt: ti.f64):
+    """Set gaps to those at the present positions, after a step from the positions x_start (n_nodes) [m], and the slips since.
+
+    Add to `accumulated` (n_nodes) f64 [m] the length of each node's mean slip, weighted by normal impulses, in which what sticks
+    counts 0. explicit_dt: dt of an explicit step [s], whose states are set; 0 for an implicit one, which has set them.
+    """
     ti.loop_config(serialize=p.serial)
     for c in range(p.count[0]):
         motion = -p.obstacle_displacement[c]
         for e in range(p.first[c], p.first[c] + p.arity[c]):
             i = p.node[e]
             motion += p.weight[e] * (m.state.x[i] - x_start[i])
-        p.gap[c] += p.normal[c].dot(motion)
+        normal = p.normal[c].dot(motion)
+        p.gap[c] += normal
+        p.slip[c] = motion - normal * p.normal[c]
+        if explicit_dt > 0.0:
+            step = scaled(p.factor[c], to_frame(p, c, p.slip[c] / explicit_dt))
+            p.status[c] = state_of(p.r[c] - step, p.friction[c] * p.r[c][0])
+    ti.loop_config(serialize=m.serial)
+    for i in range(m.n_nodes):
+        slip, load = dvec(0.0), ti.cast(0.0, ti.f64)
+        for at in range(p.by_node.start[i], p.by_node.start[i + 1]):
+            c = p.contact[p.entry[at]]
+            if p.status[c] != OPEN:
+                part = ti.abs(p.weight[p.entry[at]]) * (p.r[c][0] + p.impact_impulse[c].dot(p.normal[c]))
+                load += part
+                if p.status[c] == SLIP:
+                    slip += part * p.slip[c]
+        if load > 0.0:
+            accumulated[i] += slip.norm() / load
 
 
 @kernel

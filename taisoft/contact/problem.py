@@ -112,6 +112,8 @@ class ContactProblem:
     gap: Any = None  # f64 [m]
     area: Any = None  # f64: of mortar contacts, else 0 [m^2]
     guard: Any = None  # i32: 1 where a mortar contact carries the load
+    status: Any = None  # i32: OPEN, STICK or SLIP, by the last projection of the impulse (`prox`)
+    slip: Any = None  # 3-vectors: tangential displacement of side a relative to side b in the last step or substep [m]
     target: Any = None  # f64: smallest gap at the end of an implicit step [m], see `build`
     obstacle_displacement: Any = None  # 3-vectors: obstacle's displacement at the contact in the step [m]
     approach: Any = None  # f64: normal velocity at the start of the step, negative if surfaces approach [m/s]
@@ -149,10 +151,10 @@ def build_node_problem(arena: FieldArena, capacity: int, n_nodes: int, serial: b
         past=past,
         renewal=renewal,
         **_solver_fields(arena, n, serial),
-        **_fields(arena, "first arity arity_a guard", ti.i32, n),
+        **_fields(arena, "first arity arity_a guard status", ti.i32, n),
         **_fields(arena, "node contact entry", ti.i32, entries),
         **_fields(arena, "weight", ti.f64, entries),
-        **_fields(arena, "normal tangent point obstacle_displacement impact_impulse", ti.f64, n, 3),
+        **_fields(arena, "normal tangent point slip obstacle_displacement impact_impulse", ti.f64, n, 3),
         **_fields(arena, "gap area target approach load restitution min_velocity min_opening", ti.f64, n),
         **_fields(arena, "body", ti.i32, n, 2),
         **_fields(arena, "feature", ti.i32, n, 3),

@@ -8,6 +8,8 @@ friction * r_n. Both tangents must share one factor: with two, the fixed point s
 import taichi as ti
 
 dvec = ti.types.vector(3, ti.f64)
+OPEN, STICK, SLIP = range(3)  # states of a contact
+ON_DISK = 1.0 - 1e-12  # of the disk's radius: a tangential impulse as large was projected onto it, or would be
 
 
 @ti.func
@@ -40,6 +42,18 @@ def prox(z, friction):
     """Project z to an admissible impulse: first the normal part, then the tangential part onto its friction disk."""
     normal = ti.max(z[0], 0.0)
     return into_disk(dvec(normal, z[1], z[2]), friction * normal)
+
+
+@ti.func
+def state_of(z, radius):
+    """State of a contact by z = r - f u, u tangential, and the radius of its disk. Without a disk it slips, even at rest.
+
+    An impulse r on the disk's boundary, or inside it by a solver's tolerance, slips if u carries z beyond.
+    """
+    state = OPEN
+    if z[0] > 0.0:
+        state = ti.select(ti.sqrt(z[1] * z[1] + z[2] * z[2]) >= ti.cast(ON_DISK, ti.f64) * radius, SLIP, STICK)
+    return state
 
 
 @ti.func

@@ -18,12 +18,12 @@ from taisoft.contact.build import (
     SELF_CONTACT,
     build_pair_numbers,
     drop_vanishing,
+    end_contacts,
     fill,
     has_impact,
     keep_impulses,
     most_entries,
     scale_impulses,
-    set_end_gaps,
     set_targets,
     upload_pair_numbers,
 )
@@ -37,6 +37,7 @@ from taisoft.dynamics.readout import (
     ContactRows,
     Pairs,
     nodal_impulses,
+    offsets_of,
     read_contacts,
     read_rows,
     sum_on,
@@ -47,6 +48,7 @@ from taisoft.dynamics.rebounds import Rebounds
 from taisoft.dynamics.renewal import Renewal
 from taisoft.dynamics.simulation_state import SimulationState
 from taisoft.dynamics.state import StepState
+from taisoft.dynamics.surface_loads import ContactPressure, SurfaceLoads
 from taisoft.errors import SimulationError
 from taisoft.scene.rigid import RigidBody
 
@@ -59,7 +61,6 @@ class ContactStep:
     """Find the contacts of each step and keep their problem. explicit: whether the steps are explicit."""
 
     idle = False  # see `NoContacts`
-    OFFSET = 2e-3  # of the finest body's mean surface edge: gap to keep, so that motion in curves seldom needs a repetition
     MOST_OFFSET = 0.1  # of the margin: half of what `mortar` takes for near
     MAX_OPENING_SPEED = 0.01  # of the slowest bar wave speed, sqrt(E / rho): of what is corrected; a strain as large
     MAX_CLOSING_RATIO = 2.0  # along the way of a part, where surfaces cross: its speed was not known when the step was cut
@@ -75,7 +76,7 @@ class ContactStep:
         self.paths = ContactPaths(simulation, self.detection, self._lasting)
         self.misplaced = Misplacement(simulation, self.detection)
         detection = self.detection
-        self.contact_offset = self.OFFSET * float(detection.edges[: len(scene.bodies)].min())
+        self.contact_offset = scene.collision.offset * float(detection.edges[: len(scene.bodies)].min())
         if detection.margin > 0.0:
             most = self.MOST_OFFSET * detection.margin / (SELF_CONTACT if self_collision else 1.0)
             self.contact_offset = min(self.contact_offset, most)
@@ -89,6 +90,8 @@ class ContactStep:
         self._numbers_arena = FieldArena()
         self.numbers = build_pair_numbers(self._numbers_arena, scene)
         self.rebounds = Rebounds(simulation, self._lasting)
+        simulation.now.slip = self._lasting.field("accumulated_slip", ti.f64, model.n_nodes)
+        self._surface_loads = SurfaceLoads(simulation)
         self._searched: tuple[float, float] | None = None  # time and dt of the valid search
         self._measured_end: tuple[float, float] | None = None  # time and dt of the measured end, until the next substep begins
         self._depth = 0.0  # deepest penetration there [m]
@@ -179,6 +182,7 @@ class ContactStep:
             "found": self._search_counts[0],
             "unmapped": self._search_counts[1],
             "rows": read_rows(self.problem),
+            "sides": list(self._renewal.sides or ()),
         }
 
     def restore(self, kept: dict) -> None:
@@ -193,7 +197,7 @@ class ContactStep:
         self.had_impact, self.dropped = bool(kept["met"]), int(kept["dropped"])
         self._search_counts = int(kept["found"]), int(kept["unmapped"])
         self.paths.forget()
-        self._renewal.sides = None
+        self._renewal.sides = tuple(kept.get("sides", ())) or None
         self.misplaced.start_step()
         self.crossing, self.last_crossing = 0.0 if self.paths.none_cross else None, Crossing()
         self._searched = self._measured_end = None
@@ -336,15 +340,15 @@ class ContactStep:
         self.rebounds.count_flight(self.problem, self.n_contacts, self._substep_fraction * self._step_dt, dissipative)
 
     def end_substep(self, x_start: Any) -> None:
-        """Add the impulses of a substep that began at positions x_start, and what they misplace; set gaps to those at its end.
+        """Add impulses and slips of a substep that began at positions x_start, and what they misplace; set gaps at its end.
 
         Check the paths of colliders that do not cross any more.
         """
         if self.n_contacts:
+            dt, simulation = self._substep_fraction * self._step_dt, self.simulation
             if not self._explicit:
-                dt = self._substep_fraction * self._step_dt
                 self.misplaced.add(self.problem, dt, self.contact_offset, self.paths.has_found)
-            set_end_gaps(self.problem, self.simulation.model, x_start)
+            end_contacts(self.problem, simulation.model, x_start, simulation.now.slip, dt if self._explicit else 0.0)
         if not self.paths.none_cross:
             self.paths.exempt_crossing()
             if self.paths.none_cross:
@@ -353,7 +357,7 @@ class ContactStep:
             self._pairs = self._sum_pairs()
 
     @property
-    def _duration(self) -> float:
+    def duration(self) -> float:
         """Time [s] in which the impulses of the last substep acted."""
         return self._last_time / self._impulse_fraction
 
@@ -367,7 +371,7 @@ class ContactStep:
 
     def _sum_pairs(self) -> Pairs:
         """Add the last substep's contacts to the sums of earlier substeps."""
-        return sum_pairs(self.problem, self.rows(own=True), self._duration, *self.simulation.state(), self._pairs)
+        return sum_pairs(self.problem, self.rows(own=True), self.duration, *self.simulation.state(), self._pairs)
 
     def pairs(self) -> Pairs:
         """Return the sums over the contacts of each pair in the last step, see `sum_pairs`."""
@@ -496,10 +500,18 @@ class ContactStep:
             self._searched = None  # where none cross, other contacts are found
         return self.crossing
 
-    def contacts(self) -> Contacts:
-        """Return the contacts of the last substep with their impulses."""
-        found, unmapped = self._search_counts  # others have searched since
-        return self.rows().named(self.simulation.scene, found=found, unmapped=unmapped, duration=self._duration)
+    def contacts(self, areas: bool = False) -> Contacts:
+        """Return the contacts of the last substep with their impulses. areas: whether with tributary areas."""
+        rows, counts = self.rows(), dict(zip(("found", "unmapped"), self._search_counts))  # others have searched since
+        a, b = rows.collider.T
+        further = {"offsets": offsets_of(self.contact_offset, a == b, rows.guard == 1)}
+        if areas:
+            further["tributary_area"] = self._surface_loads.tributary_areas(self.rows(own=True), self.duration)
+        return rows.named(self.simulation.scene, **counts, duration=self.duration, **further)
+
+    def pressure(self, body: int, by_triangle: bool) -> ContactPressure:
+        """Return the contact loads on a body's surface in the last substep, by node or by triangle."""
+        return self._surface_loads.pressure(body, by_triangle, self.rows(own=True), self.duration)
 
     @property
     def field_bytes(self) -> dict[str, int]:

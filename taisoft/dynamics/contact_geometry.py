@@ -326,7 +326,7 @@ def _copy(p: ti.template(), c, to, first):
     p.obstacle_displacement[to], p.impact_impulse[to], p.r[to] = p.obstacle_displacement[c], p.impact_impulse[c], p.r[c]
     p.body[to], p.feature[to] = p.body[c], p.feature[c]
     p.gap[to], p.target[to], p.approach[to], p.load[to] = p.gap[c], p.target[c], p.approach[c], p.load[c]
-    p.area[to], p.guard[to] = p.area[c], p.guard[c]
+    p.area[to], p.guard[to], p.status[to] = p.area[c], p.guard[c], p.status[c]
     p.friction[to], p.restitution[to], p.min_opening[to] = p.friction[c], p.restitution[c], p.min_opening[c]
     for k in range(p.arity[c]):
         at, e = first + k, p.first[c] + k

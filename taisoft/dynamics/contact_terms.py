@@ -16,7 +16,7 @@ from taisoft.backend.arrays import FieldArena
 from taisoft.backend.runtime import kernel
 from taisoft.contact.build import contact_offset_of
 from taisoft.contact.problem import RESIDUAL, ContactProblem, residual_of
-from taisoft.contact.prox import dvec, into_disk, prox, scaled
+from taisoft.contact.prox import OPEN, dvec, into_disk, prox, scaled, state_of
 from taisoft.fem.chunks import THREADS, block_total, share
 from taisoft.fem.model import Model
 from taisoft.linear.block_csr import BLOCK
@@ -179,6 +179,10 @@ def update_contact(m: ti.template(), contacts: ti.template(), c, beta, r_scale):
     size = ti.sqrt(z[1] * z[1] + z[2] * z[2])
     r = projected_impulse(contacts, c, z)
     rows.r[c] = r
+    step = scaled(rows.factor[c], u)
+    state = state_of(dvec(r[0], r[1] - step[1], r[2] - step[2]), rho)
+    if state != OPEN or rows.impact_impulse[c].norm() == 0.0:  # what pressed in an impact alone keeps its state there
+        rows.status[c] = state
     # D in the contact frame, then in world axes
     Dn = ti.select(z[0] > 0.0, Rn, 0.0)
     D_along, D_across = Rt, Rt  # along z_t, and perpendicular to it
@@ -197,7 +201,7 @@ def update_contact(m: ti.template(), contacts: ti.template(), c, beta, r_scale):
         for j in ti.static(range(3)):
             work.block[c][4 * j + i] = ti.cast(Dn * n[i] * n[j] + D_along * e[i] * e[j] + D_across * g[i] * g[j], m.real)
     work.active[c] = int(Dn > 0.0 or D_along > 0.0 or D_across > 0.0)
-    d = r - prox(r - scaled(rows.factor[c], u), rows.friction[c])
+    d = r - prox(r - step, rows.friction[c])
     # only a node that can move can open a gap
     missed = ti.select(rows.factor[c][0] > 0.0, -u[0] * beta * work.gap_weight[c], 0.0)
     within_rounding = rows.factor[c][0] * work.rounding[c]  # an impulse that only this would change, as between bodies at rest

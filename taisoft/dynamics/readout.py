@@ -9,12 +9,15 @@ import numpy as np
 
 from taisoft.backend.arrays import download
 from taisoft.collision.contacts import Contacts, in_columns, named_contacts
+from taisoft.contact.build import GUARD, SELF_CONTACT
 from taisoft.contact.problem import ContactProblem, fill_rows, read_entries
 from taisoft.scene.scene import Scene
 
 Pairs = tuple[np.ndarray, np.ndarray]  # colliders (k,2), the lower index first, and their sums (k,13), see `sum_pairs`
 IMPULSE, MOMENTS, SLIP, NORMAL = slice(0, 3), (slice(3, 6), slice(6, 9)), slice(9, 12), slice(12, 13)  # columns
-ROWS = "normal tangent r impact_impulse arity arity_a point gap area guard body feature factor".split()  # what a later step needs
+ROWS = (
+    "normal tangent r impact_impulse arity arity_a point gap area guard status slip body feature factor".split()
+)  # what a later step needs
 MORE_ROWS = [*ROWS, *"friction restitution obstacle_displacement approach load target min_opening".split()]
 
 
@@ -32,11 +35,17 @@ class ContactRows:
     weights: np.ndarray  # (k, 2 w)
     guard: np.ndarray  # (k,) as of `Contacts`
     area: np.ndarray  # (k,) of mortar contacts, else 0 [m^2]
+    state: np.ndarray  # (k,) of `prox`
+    slip: np.ndarray  # (k,3) of side a over side b [m]
 
-    def named(self, scene: Scene, **counts) -> Contacts:
-        """Return the record by names. counts: `found`, `unmapped` and `duration` of a `Contacts`."""
-        geometry = self.point, self.normal, self.gap, self.impulse, self.collider, self.feature, self.nodes, self.weights
-        return named_contacts(scene, *geometry, self.guard, self.area, **counts)
+    def named(self, scene: Scene, **further) -> Contacts:
+        """Return the record by names. further: what `named_contacts` takes besides."""
+        return named_contacts(scene, **vars(self), **further)
+
+
+def offsets_of(common: float, within: np.ndarray, guard: np.ndarray) -> np.ndarray:
+    """Return the offsets (k,) [m] of contacts. common: between different bodies; within: (k,) bool: parts of one touch."""
+    return common * np.where(within, SELF_CONTACT, 1.0) * np.where(guard, GUARD, 1.0)
 
 
 def read_contacts(problem: ContactProblem, impulse_fraction: float) -> ContactRows:
@@ -48,7 +57,8 @@ def read_contacts(problem: ContactProblem, impulse_fraction: float) -> ContactRo
     on_b = slice(weights.shape[1] // 2, None)
     weights[:, on_b] = 0.0 - weights[:, on_b]
     return ContactRows(
-        rows["body"], rows["feature"], rows["point"], normal, rows["gap"], impulse, nodes, weights, rows["guard"], rows["area"]
+        *(rows["body"], rows["feature"], rows["point"], normal, rows["gap"], impulse, nodes, weights),
+        *(rows["guard"], rows["area"], rows["status"], rows["slip"]),
     )
 
 

@@ -118,6 +118,8 @@ class SimulationState:
         self.now.none_cross = bool(kept["none_cross"])
         if self.now.held is not None and "held" in kept:  # another instance may have no contacts
             self.now.held, self.now.misplaced = self.now.held.at_start(kept["held"]), kept["misplaced"]
+        if self.now.slip is not None and "slip" in kept:
+            self.now.slip.from_numpy(kept["slip"])
         if self.model.viscous:
             viscosity.set_history(self.model, self.scene, self.layout, kept["branches"])
         self.upload_constraints()
@@ -130,6 +132,8 @@ class SimulationState:
         m = self.model
         if m.viscous:
             m.viscosity.history.fill(0.0)
+        if self.now.slip is not None:
+            self.now.slip.fill(0.0)
         arrays = (m.free, m.state.x, m.state.v)
         if self._start is not None:
             upload(list(zip(arrays, self._start)))

@@ -27,6 +27,14 @@ def copy_nodes(m: ti.template(), x: ti.template(), v: ti.template(), from_x: ti.
         x[i], v[i] = from_x[i], from_v[i]
 
 
+@kernel
+def copy_slip(m: ti.template(), slip: ti.template(), from_slip: ti.template()):
+    """Copy accumulated slips (n_nodes)."""
+    ti.loop_config(serialize=m.serial)
+    for i in range(m.n_nodes):
+        slip[i] = from_slip[i]
+
+
 @dataclass(eq=False)
 class StepState:
     """A state. Its arrays of numbers belong to it alone, but for `multipliers`, which are replaced and never changed."""
@@ -39,6 +47,7 @@ class StepState:
     flight: np.ndarray  # (n_colliders,) [s^2], see `Rebounds`,
     gravity: np.ndarray  # and gravity (3,) meanwhile [m/s^2]
     history: Array | None = None  # of Maxwell branches, see `fem.viscosity`; None if there are none
+    slip: Array | None = None  # (n_nodes) f64: accumulated at contacts [m]; None where nothing can touch
     none_cross: bool = True  # whether no surfaces are known to cross, so that all paths are checked
     misplaced: np.ndarray | None = None  # (k,9), see `Misplacement`; replaced, never changed. None where nothing can touch,
     held: "HeldPassages | None" = None  # as are the passages that the next search adds as contacts
@@ -48,7 +57,8 @@ class StepState:
         x, v = (arena.vectors(f"{array}_{name}", ti.f64, self.model.n_nodes) for array in "xv")
         own = (numbers.copy() for numbers in (self.released, self.multipliers, self.flight, self.gravity))
         kept = None if self.history is None else arena.field(f"branch_history_{name}", ti.f64, self.history.shape)
-        return StepState(self.model, x, v, *own, kept, self.none_cross)
+        slip = None if self.slip is None else arena.field(f"accumulated_slip_{name}", ti.f64, self.model.n_nodes)
+        return StepState(self.model, x, v, *own, kept, slip, self.none_cross)
 
     def copy_from(self, other: "StepState") -> None:
         """Become equal to another state."""
@@ -65,6 +75,8 @@ class StepState:
         self.multipliers, self.none_cross = other.multipliers, other.none_cross
         self.misplaced, self.held = other.misplaced, other.held
         self.copy_history_from(other)
+        if self.slip is not None:
+            copy_slip(self.model, self.slip, other.slip)
 
     def copy_history_from(self, other: "StepState") -> None:
         """Take over the history of Maxwell branches, if there are any."""
@@ -76,4 +88,5 @@ class StepState:
         x, v = download([self.x, self.v])
         numbers = {name: getattr(self, name).copy() for name in ("released", "multipliers", "flight", "gravity")}
         of_contacts = {} if self.held is None else {"held": self.held.pairs, "misplaced": self.misplaced}
+        of_contacts |= {} if self.slip is None else {"slip": self.slip.to_numpy()}
         return {"x": x, "v": v, "none_cross": self.none_cross} | numbers | of_contacts

@@ -1,4 +1,4 @@
-"""Nodal fields for viewers, computed on the host from a simulator's tets and contacts: stress and contact impulses.
+"""Nodal fields for viewers, computed on the host from a simulator's tets and contacts: stress and contact loads.
 
 The stress at node i is the mean over its tets e, weighted by their rest volumes V_e,
     sigma_i = sum_e V_e sigma_e / sum_e V_e,
@@ -12,6 +12,7 @@ mean is first-order accurate.
 import numpy as np
 import scipy.sparse as sp
 
+VECTORS = ("traction", "slip")  # of `ContactPressure`
 UNKNOWN_ERROR = -1.0  # in files, of nodes whose error is unknown
 
 
@@ -53,6 +54,23 @@ def _spread(body) -> sp.csr_matrix:
     if embedded is None:
         return own
     return sp.hstack([sp.vstack([own, embedded]), sp.csr_matrix((body.n_nodes, embedded.shape[0]))], format="csr")
+
+
+def surface_values(sim, *names: str) -> list[np.ndarray]:
+    """Return fields of `sim.contact_pressure` at the nodes of all bodies (n, ...): 0 inside, and where nothing can touch.
+
+    States are their numbers.
+    """
+    from taisoft.collision.contacts import STATES  # loads Taichi, which windows do without
+
+    starts = np.cumsum([0, *(body.n_nodes for body in sim.scene.bodies)])
+    found = [np.zeros((starts[-1], 3) if name in VECTORS else starts[-1]) for name in names]
+    for body, first in zip(sim.scene.bodies if sim.touches else (), starts):
+        record = sim.contact_pressure(body.name)
+        for one, name in zip(found, names):
+            values = getattr(record, name)
+            one[first + record.index] = values if name != "state" else np.array([STATES.index(state) for state in values])
+    return found
 
 
 def von_mises(sigma: np.ndarray) -> np.ndarray:

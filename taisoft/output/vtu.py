@@ -8,6 +8,9 @@ tet (01, 12, 20, 03, 13, 23), taisoft (01, 02, 03, 12, 13, 23).
 | --- | --- | --- |
 | displacement, velocity | points | from the rest shape at its place [m]; [m/s] |
 | contact_impulse | points | of the last step's contacts on the node [N s], where things can touch |
+| contact_pressure, contact_traction | points | of the last step, on the deformed surface [Pa], 0 inside |
+| contact_slip, accumulated_slip | points | in the last step and since the start [m], see `contact_pressure` |
+| contact_state | points | 0 open, 1 stick, 2 slip |
 | estimated_error | points | of the position [m], -1 where unknown, in a run with error=True |
 | body | cells | number of the body |
 | region | cells | of the mesh, 0 for bodies without regions; absent if no body has any |
@@ -38,7 +41,7 @@ from taisoft.files import write_bytes
 from taisoft.machine import require
 from taisoft.mesh.tet_mesh import VTK_ORDER
 from taisoft.output.camera import start_positions
-from taisoft.output.nodal_fields import UNKNOWN_ERROR, von_mises
+from taisoft.output.nodal_fields import UNKNOWN_ERROR, surface_values, von_mises
 from taisoft.scene.rigid import RigidBody
 
 if TYPE_CHECKING:
@@ -50,6 +53,8 @@ SYMMETRIC = ([0, 1, 2, 0, 1, 0], [0, 1, 2, 1, 2, 2])  # rows and columns of a te
 TYPES = {"float64": "Float64", "float32": "Float32", "int64": "Int64", "int32": "Int32", "uint8": "UInt8"}
 BLOCK = 2**20  # bytes that are compressed at a time
 COMPRESSION = 1  # zlib's level; higher ones take several times as long for a few percent of such numbers
+OF_SURFACE = {"contact_pressure": "pressure", "contact_traction": "traction", "contact_slip": "slip"}
+OF_SURFACE |= {"accumulated_slip": "accumulated_slip", "contact_state": "state"}  # data of points -> field of `ContactPressure`
 SAMPLE, WORTHWHILE = 2**14, 0.5  # a block is compressed if its first SAMPLE bytes shrink to this fraction, else stored as it is
 
 
@@ -125,6 +130,7 @@ class Grid:
         points = {"displacement": x - self._start, "velocity": sim.velocities()}
         if sim.touches:
             points["contact_impulse"] = nodal_impulses(sim.contacts(), len(x))
+            points |= dict(zip(OF_SURFACE, surface_values(sim, *OF_SURFACE.values())))
         if errors:
             points["estimated_error"] = np.nan_to_num(sim.nodal_errors(), nan=UNKNOWN_ERROR)
         with np.errstate(invalid="ignore"):  # of flat tets

@@ -50,6 +50,10 @@ class Plan:
         """Add a feature with the reason for its state."""
         self.entries.append({"feature": feature, "on": bool(on), "why": why if on else why_not})
 
+    def add_why(self, feature: str, why: str) -> None:
+        """Add to the reason for a feature that is modelled."""
+        next(e for e in self.entries if e["feature"] == feature)["why"] += f"; {why}"
+
 
 def _shorten(names: list[str]) -> str:
     return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")

@@ -1,8 +1,9 @@
-"""Colours of drawn vertices: by a quantity at the nodes (von Mises stress, largest stretch, speed, error), and shading.
+"""Colours of drawn vertices: by a quantity at the nodes (von Mises stress, contact pressure, speed, ...), and shading.
 
 The scale begins at 0 (stretch: at 1). It ends at 1, 2 or 5 times a power of ten above a running maximum of the 99 % quantile over
-the nodes; a quantile, since stress in a nearly flat tet is unbounded. The running maximum decays slowly, and the end is lowered
-only when it is clearly too high. So the scale does not flicker, and recovers after an impact.
+the nodes, of pressure and slip over those that have any; a quantile, since stress in a nearly flat tet is unbounded. The running
+maximum decays slowly, and the end is lowered only when it is clearly too high. So the scale does not flicker, and recovers after
+an impact.
 
 Shading is computed per drawn vertex on the host, so that it is the same in pictures and in the window:
 colour = base * (hemisphere of sky and ground light + key light + fill light) * darkening at grazing angles, which emphasizes
@@ -19,21 +20,25 @@ from taisoft.errors import OutputError
 from taisoft.fem.reference import inverse_rest_edges
 from taisoft.mesh.placing import UP
 from taisoft.output.camera import Camera
-from taisoft.output.nodal_fields import NodalMean, von_mises
+from taisoft.output.nodal_fields import NodalMean, surface_values, von_mises
 from taisoft.scene.rigid import RigidBody
 
-UNITS = {"body": "", "stress": "Pa", "stretch": "", "speed": "m/s", "error": "m"}
+UNITS = {"body": "", "stress": "Pa", "stretch": "", "speed": "m/s", "pressure": "Pa", "slip": "m", "error": "m"}
 TITLES = {
     "body": "own colour",
     "stress": "von Mises stress",
     "stretch": "largest stretch",
     "speed": "speed",
+    "pressure": "contact pressure",
+    "slip": "accumulated slip",
     "error": "estimated error",
 }
 QUANTILE = 0.99  # fraction of the nodes whose values lie within the scale
 DECAY = 0.998  # factor on the running maximum per picture
 LOWER_MARGIN = 1.5  # the end is lowered once this times the running maximum, rounded up, is below it
-MIN_SPAN = {"stress": 1.0, "stretch": 1e-3, "speed": 1e-3, "error": 1e-12}  # smallest span of the scale, for a scene at rest
+OF_CONTACTS = {"pressure": "pressure", "slip": "accumulated_slip"}  # quantity -> field of `ContactPressure`
+# smallest span of the scale, for a scene at rest
+MIN_SPAN = {"stress": 1.0, "stretch": 1e-3, "speed": 1e-3, "pressure": 1.0, "slip": 1e-12, "error": 1e-12}
 # sRGB, from low to high
 UNKNOWN = np.array([0.55, 0.55, 0.55])  # where the quantity is unknown
 COLOURS = np.array([(0.27, 0.42, 0.80), (0.33, 0.70, 0.78), (0.72, 0.82, 0.45), (0.97, 0.70, 0.27), (0.82, 0.20, 0.17)])
@@ -64,6 +69,8 @@ class NodalValues:
             return np.where(self._rigid, np.nan, von_mises(self._mean(sim.stress())))  # a rigid body's tet is not its material
         if kind == "error":
             return sim.nodal_errors()
+        if kind in OF_CONTACTS:
+            return surface_values(sim, OF_CONTACTS[kind])[0]
         return self._mean(self._stretches(sim)) if kind == "stretch" else np.linalg.norm(sim.velocities(), axis=1)
 
     @cached_property
@@ -125,7 +132,7 @@ class Colouring:
         if values is None:
             return self._surfaces.colours
         above = values - self.low
-        finite = above[np.isfinite(above)]
+        finite = above[np.isfinite(above) & ((above > 0.0) | (self.kind not in OF_CONTACTS))]
         value = float(np.quantile(finite, QUANTILE)) if len(finite) else 0.0
         self._peak = max(value, DECAY * self._peak, MIN_SPAN[self.kind])
         if self._peak > self.span or round_up(LOWER_MARGIN * self._peak) < self.span:

@@ -25,7 +25,7 @@ KEYS = (
     Key(("x",), "X", "unbound", "as fast as possible", "run as fast as the solver can, or bound to the clock again"),
     Key(("h",), "H", "frame", "frame the bodies", "frame the bodies"),
     Key(("l",), "L", "follow", "follow them", "the camera follows the bodies, or stays"),
-    Key(("v",), "V", "colour", "colours", "colour bodies by stress, stretch, speed or body"),
+    Key(("v",), "V", "colour", "colours", "colour bodies by stress, stretch, speed, pressure, slip or body"),
     Key(("w",), "W", "wires", "wires", "wires"),
     Key(("c",), "C", "contacts", "contacts", "contacts: normals green, impulses red"),
     Key(("t",), "T", "tractions", "tractions", "tractions"),

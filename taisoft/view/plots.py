@@ -28,6 +28,7 @@ MIN_SPAN = 1e-200  # values that span less count as constant
 MAX_DECADES = 12  # of a logarithmic axis; smaller values, and zero, lie on its lower end
 
 
+OF_PAIRS = {"forces": "contact_force", "torques": "contact_torque"}  # plot by pair -> query
 CAPACITY = 256  # bins, an even number
 ENERGIES = ("kinetic", "elastic", "gravity")  # [J]
 SOLVERS = ("newton_residual", "contact_residual", "newton_iterations", "linear_iterations", "contact_iterations", "n_contacts")
@@ -84,6 +85,7 @@ PLOTS = {
         log=True,
     ),
     "forces": Plot("force by pair", "N", (Series("", "forces", DARK, "contact"),), many=True),
+    "torques": Plot("torque by pair", "N m", (Series("", "torques", DARK, "contact"),), many=True),
     "kinetic": Plot("kinetic energy by body", "J", (Series("", "kinetic", DARK),), many=True),
     "elastic": Plot("elastic energy by body", "J", (Series("", "elastic", DARK),), many=True),
 }
@@ -277,10 +279,11 @@ class Plots(PlotChoice):
         self.history.take(report, seconds, self._sim.settings.explicit, self._touching, errors, **self._by_name())
 
     def _by_name(self) -> dict[str, float]:
-        """Return the columns of the requested plots by pair or body: forces [N] and energies [J]."""
+        """Return the columns of the requested plots by pair or body: forces [N], torques [N m] and energies [J]."""
         sim, found, kinds = self._sim, {}, [kind for kind in ("kinetic", "elastic") if kind in self.names]
-        for a, b in sim.pairs_in_contact() if "forces" in self.names else ():
-            found[f"forces: {a}, {b}"] = float(np.linalg.norm(sim.contact_force(a, b)))
+        queries = {name: query for name, query in OF_PAIRS.items() if name in self.names}
+        for a, b in sim.pairs_in_contact() if queries else ():
+            found |= {f"{name}: {a}, {b}": float(np.linalg.norm(getattr(sim, query)(a, b))) for name, query in queries.items()}
         for body, energies in zip(sim.scene.bodies, sim._open().body_energies()) if kinds else ():
             found |= {f"{kind}: {body.name}": getattr(energies, kind) for kind in kinds}
         return found

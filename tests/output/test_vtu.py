@@ -35,6 +35,13 @@ class Touching(FakeSimulator):
     def stress(self, name=None):
         return super().stress(name) + 10.0 * np.array([(0, 1, 2), (1, 0, 3), (2, 3, 0)])
 
+    def contact_pressure(self, body):
+        nodes = np.unique(self.scene.body(body).nodes.surface)
+        vectors = np.column_stack([nodes, 2 * nodes, 3 * nodes])
+        state = np.array(["open", "stick", "slip"], dtype=object)[nodes % 3]
+        fields = {"pressure": 1.0 * nodes, "traction": vectors, "slip": -vectors, "accumulated_slip": 5.0 * nodes, "state": state}
+        return SimpleNamespace(index=nodes, **fields)
+
     def energies(self):
         return Energies(kinetic=1.0, elastic=2.0, gravity=-3.0, loads=4.0)
 

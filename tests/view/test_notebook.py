@@ -69,7 +69,10 @@ def test_bad_sizes_and_colours_are_refused(ran):
         ({"size": (0, 10)}, "a picture of 0 x 10 pixels cannot be drawn: both must be 1 to 16384"),
         ({"size": (1.5, 2)}, r"must be two whole numbers, width and height, not \(1.5, 2\)"),
         ({"size": (10, 10**9)}, "a picture of 10 x 1000000000 pixels cannot be drawn"),
-        ({"colour": "rainbow"}, "colour 'rainbow' is unknown: it must be one of body, stress, stretch, speed, error"),
+        (
+            {"colour": "rainbow"},
+            "colour 'rainbow' is unknown: it must be one of body, stress, stretch, speed, pressure, slip, error",
+        ),
     ):
         for make in (ran[0].picture, ts.Film):
             with pytest.raises(OutputError, match=message):

@@ -165,7 +165,7 @@ def test_only_simulated_quantities_are_available():
         available = {name: [s.name for s in plot.series] for name, plot in Plots(Stub(*kind)).available().items()}
         assert available.pop("step_time") == ["step"] and len(available.pop("energies")) == 4
         assert [available.pop(name) for name in ("kinetic", "elastic")] == [[""], [""]]
-        assert bool(available.pop("forces", None)) == kind[1] and available == expected
+        assert [bool(available.pop(name, None)) for name in ("forces", "torques")] == [kind[1]] * 2 and available == expected
     for stub, name, message in (
         (Stub(True, False), "residuals", "not available: steps of velocity_verlet are explicit .* and contact forces"),
         (Stub(), "energy", "plot 'energy' is unknown.*did you mean energies"),
