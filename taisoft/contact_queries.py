@@ -82,7 +82,8 @@ def contact_pressure(self: "Simulator", body: str, by: str = "node") -> "Contact
 def contact_force(self: "Simulator", name: str, other: str | None = None) -> np.ndarray:
     """Return the contact force (3,) on a body or an obstacle [N]: from all others, or from `other`, a body or an obstacle.
 
-    It is the mean over the last step, also where that was cut into substeps. Raises SceneError for unknown names.
+    It is the mean over the last step, also where that was cut into substeps; in statics that at its end. Raises SceneError for
+    unknown names.
     """
     return _mean_contact(self, "contact_force", name, other)[:3]
 

@@ -20,6 +20,7 @@ from taisoft.simulator import Simulator
 
 if TYPE_CHECKING:
     from taisoft.collision.contacts import Contacts
+    from taisoft.dynamics.surface_loads import ContactPressure
 
 LOOSEST = 0.099  # tolerance of Newton's method that a Simulator takes
 
@@ -35,6 +36,7 @@ class LoadStep:
     cavity_pressures: dict[str, float]  # [Pa]
     contacts: "Contacts | None" = None  # None where nothing can touch
     on_pairs: dict[tuple[str, str], np.ndarray] = field(default_factory=dict)  # force [N] and torque [N m] on the first, (6,)
+    pressures: "dict[tuple[str, str], ContactPressure]" = field(default_factory=dict)  # by body, and "node" or "triangle"
 
 
 @dataclass(frozen=True)
@@ -85,6 +87,15 @@ class StaticResult:
             raise SceneError("contacts: nothing in the scene can touch")
         return found
 
+    def contact_pressure(self, body: str, by: str = "node", step: int = -1) -> "ContactPressure":
+        """Pressure, traction, state and slip at the surface of a body, as of `Simulator.contact_pressure`.
+
+        Raises SceneError for unknown names, and if nothing can touch.
+        """
+        self.contacts(step)
+        self._scene.body(body)
+        return self._at(step).pressures[body, checks.choice(by, "contact_pressure: by", ("node", "triangle"))]
+
     def contact_force(self, name: str, other: str | None = None, step: int = -1) -> np.ndarray:
         """Contact force (3,) [N] on a body or an obstacle, from all others or from `other`. Raises SceneError."""
         return self._on(name, other, step)[:3]
@@ -133,6 +144,7 @@ def solve_static(
     time: float | None = None,
     steps: int | None = None,
     self_collision: bool = False,
+    contact_tolerance: float | None = None,
     error: bool = False,
     error_mesh: str | Scene | None = None,
     quantities: dict | None = None,
@@ -140,7 +152,7 @@ def solve_static(
     """Find states of rest under gravity, loads, constraints and contacts with friction.
 
     tolerance: on |residual on free axes| / |applied load| (without load, relative to the constraint forces); with contacts
-    relative to all forces.
+    relative to all forces. contact_tolerance: as of a Simulator.
     Without contacts, and without `steps`, prescribed nodes and loads have their values at `time` (default 0) [s].
     With contacts that may act, or `steps`, the load is applied in `steps` load steps (default 1), each cut where it does not
     converge: prescribed nodes, obstacles and loads that have paths follow them from 0 to `time` (default 1) [s], constant loads
@@ -219,6 +231,7 @@ def _load_step(sim: Simulator) -> LoadStep:
         (a, b): np.concatenate([sim.contact_force(a, b), sim.contact_torque(a, b)]) for one in pairs for a, b in (one, one[::-1])
     }
     time, cavities = sim.time, state.cavity_pressures_by_name(sim.time)
-    contacts = sim.contacts() if sim.touches else None
+    contacts, every = sim.contacts() if sim.touches else None, [one.name for one in sim.scene.bodies if sim.touches]
+    fields = {(name, by): sim.contact_pressure(name, by) for name in every for by in ("node", "triangle")}
     at = time if state.at is None else state.at
-    return LoadStep(at, sim.positions(), sim.reactions(), state.amplitudes(time), cavities, contacts, on_pairs)
+    return LoadStep(at, sim.positions(), sim.reactions(), state.amplitudes(time), cavities, contacts, on_pairs, fields)

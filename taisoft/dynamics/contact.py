@@ -61,6 +61,9 @@ class ContactStep:
     """Find the contacts of each step and keep their problem. explicit: whether the steps are explicit."""
 
     idle = False  # see `NoContacts`
+    # of the finest body's mean surface edge: gap to keep, so that motion in curves seldom needs a repetition. Means between
+    # meshes carry pressures only where faces are flat to half of it. Without either it may be small beside what a load moves
+    OFFSET, STATIC_OFFSET = 2e-3, 2e-5
     MOST_OFFSET = 0.1  # of the margin: half of what `mortar` takes for near
     MAX_OPENING_SPEED = 0.01  # of the slowest bar wave speed, sqrt(E / rho): of what is corrected; a strain as large
     MAX_CLOSING_RATIO = 2.0  # along the way of a part, where surfaces cross: its speed was not known when the step was cut
@@ -76,11 +79,13 @@ class ContactStep:
         self.paths = ContactPaths(simulation, self.detection, self._lasting)
         self.misplaced = Misplacement(simulation, self.detection)
         detection = self.detection
-        self.contact_offset = scene.collision.offset * float(detection.edges[: len(scene.bodies)].min())
+        offset = self.STATIC_OFFSET if static and detection.overlay is None else self.OFFSET
+        self.contact_offset = (scene.collision.offset or offset) * float(detection.edges[: len(scene.bodies)].min())
         if detection.margin > 0.0:
             most = self.MOST_OFFSET * detection.margin / (SELF_CONTACT if self_collision else 1.0)
             self.contact_offset = min(self.contact_offset, most)
         # parts of a penetration and of a missing contact offset that a step corrects
+        self._static = static
         self._corrections = (0.05, 0.005) if explicit else (1.0, 1.0) if static else (0.2, 0.02)
         self._substep_fraction = 1.0  # of the step, that the current substep takes
         self.gap_targets = self._gap_targets()
@@ -206,7 +211,7 @@ class ContactStep:
     def _gap_targets(self) -> tuple[float, float, float, float]:
         """Contact offset [m]; fractions of a penetration and of a missing offset corrected per substep; maximum speed [m/s]."""
         slowest = min(b.composition.lowest_wave_speed for b in self.simulation.scene.bodies)
-        fraction = 1.0 if self._corrections[0] == 1.0 else self._substep_fraction
+        fraction = 1.0 if self._static else self._substep_fraction
         return (
             self.contact_offset,
             fraction * self._corrections[0],
@@ -353,7 +358,7 @@ class ContactStep:
             self.paths.exempt_crossing()
             if self.paths.none_cross:
                 self._searched = None  # where none cross, other contacts are found
-        if self._substep_fraction < 1.0:
+        if self._substep_fraction < 1.0 and not self._static:
             self._pairs = self._sum_pairs()
 
     @property
@@ -380,8 +385,9 @@ class ContactStep:
         return self._pairs
 
     def mean_on(self, collider: int, other: int | None) -> np.ndarray:
-        """Return the means of `sum_on` over the last step, (10,): force [N], moment [N m], and so on."""
-        return sum_on(self.pairs(), collider, other) / (self._step_dt or 1.0)
+        """Return the means of `sum_on` over the last step, in statics over its last part, (10,): force [N], moment [N m], ..."""
+        time = self.duration if self._static and self._last_time else self._step_dt
+        return sum_on(self.pairs(), collider, other) / (time or 1.0)
 
     def own_forces(self) -> np.ndarray:
         """Return the contact forces of the last substep on the nodes that touch, dependent ones too, (n_nodes, 3) [N].

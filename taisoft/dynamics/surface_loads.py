@@ -4,8 +4,11 @@ A contact with the weights w_i at nodes i has L_a = sum_i w_i lambda_a(x_i) of i
 lambda_a is the hat function of flat faces, and with the normal forces f
     p_a = N_a / A_a,   N_a = sum_c L_ca f_c,   A_a = int lambda_a dA over the deformed triangles around a.
 On quadratic faces this uses lambda_a = N_a + half of the shape functions of the middles of its edges: those of corners alone have
-no area. Middles have the mean of their corners. A uniform pressure so comes out uniform. Beside an edge of the body, A_a counts
-only triangles that face what presses there. Where that covers a part of them, p_a is a mean over all.
+no area. Middles have the mean of their corners. A uniform pressure so comes out uniform. As a mean over the faces around a node,
+p_a would be too small where the pressure bends down; with the mass matrix M_ab = int lambda_a lambda_b dA each pair of corners
+exchanges s M_ab (p_a - p_b), which takes that back to second order: the first step of Jacobi's method for M p = N. s <= 1 lets no
+corner lose more than half of its load. Friction and slip of a corner change with its pressure. The sum of N stays. Beside an edge
+of the body, A_a counts only triangles that face what presses there. Where that covers a part of them, p_a is a mean over all.
 A triangle's force is that of its corners, divided by area: sums over nodes, over triangles and over contacts are the same.
 """
 
@@ -86,6 +89,22 @@ class _Loads:
     triangle_normal: np.ndarray
     shares: sp.csr_matrix  # (t, n): part of A_a within each triangle [m^2]
 
+    def sharpened(self) -> np.ndarray:
+        """Return the sums (n,11) after corners have exchanged what the mean over the faces around them takes, see above."""
+        area, load = np.where(self.area > 0.0, self.area, 1.0), self.sums[:, 0]
+        at = self.surface.hats[self.surface.triangles.ravel()]  # values of hats at the corners of triangles
+        weight = np.repeat(self.triangle_area * (self.shares.sum(axis=1).A1 > 0.0) / 12.0, 3)
+        total = sp.kron(sp.identity(len(self.triangle_area)), np.ones((3, 3)), format="csr")
+        pair = (at.T @ sp.diags(weight) @ (at + total @ at)).tocoo()
+        a, b, pressure = pair.row, pair.col, load / area
+        used = (load[a] > 0.0) & (load[b] > 0.0) & (pressure[a] > pressure[b])
+        a, b, mass = a[used], b[used], pair.data[used]
+        lost = np.bincount(b, mass * (pressure[a] - pressure[b]), len(load))
+        mass *= np.minimum(1.0, 0.5 * load / np.maximum(lost, 1e-300))[b]
+        flow = mass * (pressure[a] - pressure[b])
+        gained = np.bincount(a, flow, len(load)) - np.bincount(b, flow, len(load))
+        return self.sums * (1.0 + gained / np.where(load > 0.0, load, 1.0))[:, None]
+
 
 class SurfaceLoads:
     """Contact loads on the bodies of a simulation.
@@ -115,13 +134,13 @@ class SurfaceLoads:
         if by_triangle:
             index, area = np.arange(len(surface.triangles)), one.triangle_area
             at_corner = one.shares @ sp.diags(1.0 / np.where(one.area > 0.0, one.area, 1.0))
-            sums, normal, corners = at_corner @ one.sums, one.triangle_normal, surface.triangles
+            sums, normal, corners = at_corner @ one.sharpened(), one.triangle_normal, surface.triangles
             force, slid, gap = at_corner @ (surface.hats.T @ one.force), slid[corners].mean(axis=1), one.gap[corners].mean(axis=1)
             density = sums / np.maximum(area, 1e-300)[:, None]
         else:
             index, area, gap = surface.nodes, one.area, one.gap
             at_node = surface.hats.multiply(surface.around @ one.shares > 0.0)  # not beyond edges of what is pressed
-            density = at_node @ np.divide(one.sums, area[:, None], out=np.zeros_like(one.sums), where=area[:, None] > 0.0)
+            density = at_node @ np.divide(one.sharpened(), area[:, None], out=np.zeros_like(one.sums), where=area[:, None] > 0.0)
             sums, normal, force = at_node @ one.sums, at_node @ (one.shares.T @ one.triangle_normal), one.force
             normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
         load, slipping, slip = sums[:, 0], sums[:, 1], sums[:, 5:8]

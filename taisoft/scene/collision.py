@@ -30,7 +30,9 @@ class CollisionSettings:
     broad_phase: str = "auto"  #: "auto", "spatial_hash" or "bvh"; auto: bvh on the CPU for up to 200 colliders, else the hash
     cell_ratio: float = 2.2  #: edge of a hash cell over the mean surface edge, > 0
     margin: float | None = None  #: distance within which contacts are reported [m], >= 0; None: 0.1 of the mean surface edge
-    offset: float = 2e-3  #: gap that contacts keep, over the finest body's mean surface edge; 1e-5 to 0.1
+    #: gap that contacts keep, over the finest body's mean surface edge, 1e-5 to 0.1; None: 2e-3, in statics without contacts
+    #: between meshes 2e-5
+    offset: float | None = None
     k_dop: int = 6  #: planes of the boxes of "bvh": 6, 14 or 18
     field_cells: int = 32  #: cells of a distance field along a body's longest side, 8 to 256
     initial_capacity: int | None = None  #: of the buffers of pairs and contacts, at least 64; None: from the surface
@@ -41,10 +43,11 @@ class CollisionSettings:
         checks.choice(self.broad_phase, f"{what}: broad_phase", BROAD_PHASES)
         validated = {
             "cell_ratio": checks.number(self.cell_ratio, f"{what}: cell_ratio", above=0.0),
-            "offset": checks.number(self.offset, f"{what}: offset", minimum=1e-5, maximum=0.1),
             "k_dop": checks.whole(self.k_dop, f"{what}: k_dop", (6, 14, 18)),
             "field_cells": checks.whole(self.field_cells, f"{what}: field_cells", range(8, 257)),
         }
+        if self.offset is not None:
+            validated["offset"] = checks.number(self.offset, f"{what}: offset", minimum=1e-5, maximum=0.1)
         if self.margin is not None:
             validated["margin"] = checks.number(self.margin, f"{what}: margin", minimum=0.0, unit="m")
         for field in ("initial_capacity", "max_capacity"):
