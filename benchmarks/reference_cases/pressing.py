@@ -7,18 +7,15 @@ an independent code on the same tets. All bodies touch at the start. Meshes are 
 from functools import partial
 
 import numpy as np
-from scipy.optimize import minimize_scalar
 
 import taisoft as ts
 from taisoft.scene.body import Body
 from taisoft.static import StaticResult
 
-from .record import Case, Check, material, near, reported, small
+from .record import Case, Check, material, near, small
 
 GRADING = 3.0
-HERTZ = np.sqrt(2.5)  # of the root mean square radius of Hertz's pressure: its reach
 DOWN, ALONG, LATE = 5, 60, 20  # load steps of ironing: pressing, sliding, and the last ones, which are averaged
-SHARES = (0.2, 0.4, 0.6, 0.8)  # of the friction limit, Q / (mu P), of Mindlin's balls
 AWAY = 1.0 - 1e-9
 
 
@@ -40,13 +37,23 @@ def mirrored(tets: np.ndarray) -> np.ndarray:
 
 
 def quarter_ball(n: int) -> ts.TetMesh:
-    """A quarter of half a ball of radius 1, x, z >= 0, whose pole at the origin points down: n cells along x and z, 3n/4 along y."""
+    """A quarter of half a ball of radius 1, x, z >= 0, pole down at the origin: n cells along x and z, 3n/4 along y."""
     p, tets = grid(graded(n), 1.0 - graded(3 * n // 4)[::-1], graded(n))
     X, D, Z = (p**2).T  # D grows from the equator, 0, to the pole
     x = p[:, 0] * np.sqrt(1 - D / 2 - Z / 2 + D * Z / 3)
     y = p[:, 1] * np.sqrt(1 - X / 2 - Z / 2 + X * Z / 3)
     z = p[:, 2] * np.sqrt(1 - X / 2 - D / 2 + X * D / 3)
     return ts.TetMesh(np.stack([x, 1.0 - y, z], axis=1), mirrored(tets))
+
+
+def half_ball(n: int, up: bool = True) -> ts.TetMesh:
+    """Half of half a ball, z >= 0: `quarter_ball` and its mirror image in x; or with the pole up at the origin."""
+    quarter = quarter_ball(n)
+    x = np.concatenate([quarter.vertices, quarter.vertices * (-1.0, 1.0, 1.0)])
+    tets = np.concatenate([quarter.tets, mirrored(quarter.tets) + len(quarter.vertices)])
+    _, first, number = np.unique(np.round(x, 9) + 0.0, axis=0, return_index=True, return_inverse=True)
+    x, tets = x[first], number.reshape(-1)[tets]
+    return ts.TetMesh(x, tets) if up else ts.TetMesh(x * (1.0, -1.0, 1.0), mirrored(tets))
 
 
 def quarter_block(n: int, layers: int) -> ts.TetMesh:
@@ -62,6 +69,11 @@ def on_symmetry(*bodies: Body) -> None:
             body.fix(lambda X, a=axis: np.abs(X[:, a]) < 1e-9, axes="xyz"[axis])
 
 
+def reach(load: np.ndarray, r: np.ndarray) -> float:
+    """Radius [m] within which Hertz's pressure has the moment of the loads (n,) at radii (n,)."""
+    return float(np.sqrt(2.5 * (load * r**2).sum() / load.sum()))
+
+
 def solved(made: ts.Scene, arch: str, **settings) -> tuple[StaticResult, Check]:
     """The static result, and the check that all load steps converged."""
     found = ts.solve_static(made, arch=arch, **settings)
@@ -73,7 +85,7 @@ def solved(made: ts.Scene, arch: str, **settings) -> tuple[StaticResult, Check]:
 
 
 def nominal_pressure(ball: Body, found: StaticResult, reach: float) -> np.poly1d:
-    """The square of the pressure over the area at rest [Pa^2] as a quadratic function of r^2 [m^2], fitted within 0.8 of its reach.
+    """The square of the pressure over the area at rest [Pa^2], fitted within 0.8 of its reach [m] by a quadratic function of r^2.
 
     Hertz's is a linear one.
     """
@@ -101,8 +113,7 @@ def ball_rough(n: int, order: int, mu: float, limits: dict, reference: dict, arc
     X = ball.rest_positions[p.index]
     r, load = np.hypot(X[:, 0], X[:, 2]), p.force[:, 1]
     if mu == 0.0:
-        reach = HERTZ * np.sqrt((load * r**2).sum() / load.sum())
-        yield near("reach of the pressure [m]", reach, value["a"], limits.get("a"))
+        yield near("reach of the pressure [m]", reach(load, r), value["a"], limits.get("a"))
         profile = {float(at): p0 for at, p0 in value["p"].items() if float(at) < 0.1}
         peak = max(profile.values())
         square = nominal_pressure(ball, found, value["a"])
@@ -115,64 +126,6 @@ def ball_rough(n: int, order: int, mu: float, limits: dict, reference: dict, arc
     yield near("radial friction [N]", 4.0 * abs(outward.sum()), value["T"], limits.get("T"))
     sticks = r[p.state == "stick"].max(initial=0.0)
     yield near("radius of the sticking zone [m]", sticks, value["stick"], limits.get("stick"))
-
-
-# --- like balls, pushed across -----------------------------------------------------------------------------------------
-
-
-def half_ball(n: int, up: bool) -> ts.TetMesh:
-    """Half of half a ball of radius 1, z >= 0, with its pole at the origin: `quarter_ball` and its mirror image in x."""
-    quarter = quarter_ball(n)
-    x = np.concatenate([quarter.vertices, quarter.vertices * (-1.0, 1.0, 1.0)])
-    tets = np.concatenate([quarter.tets, mirrored(quarter.tets) + len(quarter.vertices)])
-    used, first, number = np.unique(np.round(x, 9) + 0.0, axis=0, return_index=True, return_inverse=True)
-    mesh = ts.TetMesh(x[first], number.reshape(-1)[tets])
-    return mesh if up else ts.TetMesh(mesh.vertices * (1.0, -1.0, 1.0), mirrored(mesh.tets))
-
-
-def mindlin(n: int, precision: str, limits: dict, _reference: dict, arch: str):
-    """Two like balls: within c = a (1 - Q / (mu P))^(1/3) they stick, outside the traction is mu p (Cattaneo 1938, Mindlin 1949)."""
-    made, mu, press, across = ts.Scene(gravity=(0, 0, 0)), 0.3, 0.012, 3e-3
-    for name, up in (("upper", True), ("lower", False)):
-        body = made.add_body(half_ball(n, up), ts.Material(young=1e6, poisson=0.3, friction=mu), name=name)
-        body.fix(lambda X: np.abs(X[:, 2]) < 1e-9, axes="z")
-        sign = 1.0 if up else -1.0
-        path = lambda t, s=sign: (s * across * max(0.0, t - 1.0), -s * 0.5 * press * min(t, 1.0), 0.0)  # noqa: E731
-        body.move(lambda X, s=sign: s * X[:, 1] > AWAY, path, axes="xy")
-    found, check = solved(made, arch, time=2.0, steps=8, precision=precision)
-    yield check
-    a0, ball = None, made.body("upper")
-    X, upper_half = ball.rest_positions, []
-    for step in range(4, 8):
-        p = found.contact_pressure("upper", step=step)
-        P, Q = (2.0 * abs(found.contact_force("upper", "lower", step=step)[axis]) for axis in (1, 0))
-        r, load = np.linalg.norm(X[p.index][:, [0, 2]], axis=1), p.pressure * p.area
-        a = HERTZ * np.sqrt((load * r**2).sum() / load.sum())
-        c = a * np.cbrt(1.0 - Q / (mu * P))
-        pressed = p.pressure > 0.0
-        width = np.sqrt(np.median(p.area[pressed & (np.abs(r - c) < 0.3 * a)]) * 2.0)
-        sticks = np.sqrt(2.0 * p.area[p.state == "stick"].sum() / np.pi)
-        what = f"Q = {Q / (mu * P):.2f} mu P: "
-        upper_half.append(
-            near(what + "radius of the zone that sticks, in elements", sticks / width, c / width, limits.get("state"), 1.0)
-        )
-        yield upper_half[-1]
-        fitted = fitted_radius(r[pressed], mu * p.pressure[pressed], np.abs(p.traction[pressed, 0]), p.area[pressed], a)
-        yield near(what + "the same by the traction [m]", fitted, c, limits.get("fit"))
-
-
-def fitted_radius(r: np.ndarray, most: np.ndarray, traction: np.ndarray, area: np.ndarray, a: float) -> float:
-    """The radius c [m] of the sticking zone that fits tractions (n,) at radii r best: most - q0 (c/a) sqrt(1 - r^2/c^2) within c.
-
-    most: (n,) friction times pressure [Pa], whose integral gives q0, its peak by Hertz. area: weights (n,).
-    """
-    q0 = 1.5 * 2.0 * (most * area).sum() / (np.pi * a**2)  # half of the ball is modelled
-
-    def miss(c: float) -> float:
-        model = most - q0 * c / a * np.sqrt(np.clip(1.0 - (r / c) ** 2, 0.0, None))
-        return float((area * (traction - model) ** 2).sum())
-
-    return float(minimize_scalar(miss, bounds=(0.02 * a, a), method="bounded").x)
 
 
 # --- bodies on bodies and on planes -------------------------------------------------------------------------------------
