@@ -1,8 +1,8 @@
 """Balls that are pressed together and pushed across: within c = a (1 - Q / (mu P))^(1/3) they stick.
 
 For two like balls, in which tangential forces do not change the pressure. Nor do they between an incompressible ball and a rigid
-plane, where no meshes meet. Within c the friction is mu p - mu p_0 (c / a) sqrt(1 - r^2 / c^2), outside mu p: what is left of mu p
-is a pressure of Hertz's form, whose reach gives c, as that of p gives a. Source: Cattaneo 1938, Mindlin 1949.
+plane, where no meshes meet. Within c the friction is mu p - mu p_0 (c / a) sqrt(1 - r^2 / c^2), outside mu p: what is left of
+mu p is a pressure of Hertz's form, whose reach gives c, as that of p gives a. Source: Cattaneo 1938, Mindlin 1949.
 """
 
 from functools import partial

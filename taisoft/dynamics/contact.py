@@ -50,6 +50,7 @@ from taisoft.dynamics.simulation_state import SimulationState
 from taisoft.dynamics.state import StepState
 from taisoft.dynamics.surface_loads import ContactPressure, SurfaceLoads
 from taisoft.errors import SimulationError
+from taisoft.scene.obstacles import HalfSpace
 from taisoft.scene.rigid import RigidBody
 
 MAX_PASSAGES = 8  # repetitions of a part with what its way meets
@@ -61,8 +62,8 @@ class ContactStep:
     """Find the contacts of each step and keep their problem. explicit: whether the steps are explicit."""
 
     idle = False  # see `NoContacts`
-    # of the finest body's mean surface edge: gap to keep, so that motion in curves seldom needs a repetition. Means between
-    # meshes carry pressures only where faces are flat to half of it. Without either it may be small beside what a load moves
+    # of the finest body's mean surface edge: gap to keep. On curves and between meshes it is the room for a straight way and for
+    # means of faces that are not flat; statics on planes needs neither, and there it is small beside what a load moves
     OFFSET, STATIC_OFFSET = 2e-3, 2e-5
     MOST_OFFSET = 0.1  # of the margin: half of what `mortar` takes for near
     MAX_OPENING_SPEED = 0.01  # of the slowest bar wave speed, sqrt(E / rho): of what is corrected; a strain as large
@@ -79,7 +80,8 @@ class ContactStep:
         self.paths = ContactPaths(simulation, self.detection, self._lasting)
         self.misplaced = Misplacement(simulation, self.detection)
         detection = self.detection
-        offset = self.STATIC_OFFSET if static and detection.overlay is None else self.OFFSET
+        is_flat = detection.overlay is None and all(isinstance(one.shape, HalfSpace) for one in scene.obstacles)
+        offset = self.STATIC_OFFSET if static and is_flat else self.OFFSET
         self.contact_offset = (scene.collision.offset or offset) * float(detection.edges[: len(scene.bodies)].min())
         if detection.margin > 0.0:
             most = self.MOST_OFFSET * detection.margin / (SELF_CONTACT if self_collision else 1.0)

@@ -30,8 +30,8 @@ class CollisionSettings:
     broad_phase: str = "auto"  #: "auto", "spatial_hash" or "bvh"; auto: bvh on the CPU for up to 200 colliders, else the hash
     cell_ratio: float = 2.2  #: edge of a hash cell over the mean surface edge, > 0
     margin: float | None = None  #: distance within which contacts are reported [m], >= 0; None: 0.1 of the mean surface edge
-    #: gap that contacts keep, over the finest body's mean surface edge, 1e-5 to 0.1; None: 2e-3, in statics without contacts
-    #: between meshes 2e-5
+    #: gap that contacts keep, over the finest body's mean surface edge, 1e-5 to 0.1; None: 2e-3, in statics where bodies meet
+    #: half-spaces alone 2e-5
     offset: float | None = None
     k_dop: int = 6  #: planes of the boxes of "bvh": 6, 14 or 18
     field_cells: int = 32  #: cells of a distance field along a body's longest side, 8 to 256
