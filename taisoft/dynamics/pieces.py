@@ -14,6 +14,7 @@ In a linearly implicit step the arms are those of its start, and the forces f - 
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -75,12 +76,8 @@ class Pieces:
         self._names, self.body = [names[k] for k in np.argsort(number)], self.body[np.argsort(number)]
         component, piece = component[np.argsort(number)], number[piece]
         self.of_node, self._component = piece, component[piece]
-        rest, bodies = simulation.layout.rest, simulation.scene.bodies
-        self._size = np.array([np.ptp(rest[piece == k], axis=0).max() for k in range(n)])
-        self._mass = np.bincount(piece, self.model.mass.to_numpy(), n)
-        speed = np.array([bodies[k].composition.lowest_wave_speed for k in self.body])
-        self._softest = float((speed / self._size).min() ** 2)  # lowest E / (rho L^2) [1/s^2]
-        self._free, self._any_free = np.zeros(0), False  # of the last call of `any_free`
+        self._simulation = simulation
+        self._free, self._unheld = np.zeros(0), np.zeros((3, 0), dtype=bool)  # of the last call of `_held_nowhere`
         self._independent = np.ones(n_nodes, dtype=bool)
         if simulation.dependents is not None:
             self._independent[simulation.dependents.node] = False
@@ -133,17 +130,27 @@ class Pieces:
 
     def any_free(self, free: np.ndarray) -> bool:
         """Return whether some component is free along some axis, but for contacts. free: (n_nodes, 3), 0 on constrained axes."""
+        return bool((self._held_nowhere(free) & ~self.anchored).any())
+
+    def any_loose(self, free: np.ndarray) -> bool:
+        """Return whether no node of some component is held along some axis. free: as in `any_free`."""
+        return bool(self._held_nowhere(free).any())
+
+    def _held_nowhere(self, free: np.ndarray) -> np.ndarray:
+        """Return the axes (3, n_components) along which no node of a component is held."""
         if not np.array_equal(free, self._free):
             held = (free == 0.0) & self._independent[:, None]
             fixed = [np.bincount(self._component, held[:, axis], len(self.anchored)) for axis in range(3)]
-            self._free, self._any_free = free.copy(), bool(((np.array(fixed) == 0.0) & ~self.anchored).any())
-        return self._any_free
+            self._free, self._unheld = free.copy(), np.array(fixed) == 0.0
+        return self._unheld
 
-    def any_loose(self, free: np.ndarray) -> bool:
-        """Return whether some component is not held along every axis, but for contacts. free: as in `any_free`."""
-        held = (free == 0.0) & self._independent[:, None]
-        fixed = [np.bincount(self._component, held[:, axis], len(self.anchored)) for axis in range(3)]
-        return bool((np.array(fixed) == 0.0).any())
+    @cached_property
+    def _size(self) -> np.ndarray:
+        """Sizes (n,) of the pieces at rest [m]."""
+        rest, ends = self._simulation.layout.rest, np.full((2, self.work.n, 3), -np.inf)
+        for end, sign in zip(ends, (1.0, -1.0)):
+            np.maximum.at(end, self.of_node, sign * rest)
+        return ends.sum(axis=0).max(axis=1)
 
     def farthest(self, way: np.ndarray) -> tuple[float, str]:
         """Return the largest mean displacement of a piece over its size, and its name. way: (n_nodes, 3) [m]."""
@@ -159,7 +166,10 @@ class Pieces:
         residual (n_nodes, 3): [N s], on the free axes.
         """
         net = np.linalg.norm([np.bincount(self.of_node, residual[:, axis], self.work.n) for axis in range(3)], axis=0)
-        return max(float((beta * net / (self.REACH * self._size * self._mass)).max()), math.sqrt(eps) * beta**2 * self._softest)
+        mass = np.bincount(self.of_node, self.model.mass.to_numpy(), self.work.n)
+        bodies = self._simulation.scene.bodies
+        slowest = min(bodies[k].composition.lowest_wave_speed / size for k, size in zip(self.body, self._size))
+        return max(float((beta * net / (self.REACH * self._size * mass)).max()), math.sqrt(eps) * (beta * slowest) ** 2)
 
     def forget_weights(self) -> None:
         """Let all pieces count alike, and linear solves without factors."""
