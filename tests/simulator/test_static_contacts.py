@@ -37,6 +37,7 @@ def pressed_ball(density: float = 1000.0, friction: float = 0.5, turned: np.ndar
     ball.move(equator, lambda t: -0.08 * t * up)
     scene.add_obstacle(ts.HalfSpace(-(1.0 + OFFSET) * up, up), name="plane")
     scene.set_contact("ball", "plane", friction=friction)
+    scene.collision = ts.CollisionSettings(offset=2e-3)  # that of steps in time
     return scene
 
 
@@ -119,6 +120,17 @@ def test_constant_loads_grow_and_paths_are_followed():
         for step, pull in enumerate(expected):
             on_block = result.contact_force("block", step=step)
             assert on_block[:2] == pytest.approx([-pull, 0.5 * (step + 1) * WEIGHT], rel=1e-5)
+
+
+def test_offset_is_small_on_planes_alone():
+    """Where it adds to a given displacement; curves and meshes keep the room that they have in time."""
+    scene = block_on_ground()
+    edge, offsets = 0.05 * (2 + 2**0.5) / 3, []
+    for shape in (ts.HalfSpace((0, 1, 0), (0, -1, 0)), ts.Sphere((0, 1, 0), 0.1)):
+        scene.add_obstacle(shape)
+        with ts.Simulator(scene.snapshot(), integrator="static") as sim:
+            offsets.append(sim.contact_offset / edge)
+    assert offsets == pytest.approx([2e-5, 2e-3], rel=0.05)
 
 
 def test_reversed_push_leaves_friction():
