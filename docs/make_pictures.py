@@ -1,6 +1,7 @@
 """Draws pictures and plots of the manual: `python docs/make_pictures.py [NAME ...]` writes docs/pictures/NAME.png."""
 
 import json
+import re
 import sys
 from pathlib import Path
 
@@ -146,6 +147,41 @@ def episode(mean: list[float], corners=None, seed: int = 5):
             yield env
 
 
+def pressed_ball() -> np.ndarray:
+    """Pressure and friction on the ball of the chapter on contact mechanics, whose first block builds it."""
+    page = (Path(__file__).parent / "tutorials" / "contact_mechanics.md").read_text(encoding="utf-8")
+    names: dict = {}
+    exec(re.search(r"^```python\n(.*?)^```", page, re.DOTALL | re.MULTILINE)[1], names)
+    figure = Figure((8.0, 3.2), dpi=100, layout="constrained")
+    pressure, friction = figure.subplots(1, 2, sharex=True)
+    for mu, colour in ((0.0, "tab:blue"), (0.5, "tab:orange")):
+        found = ts.solve_static(names["build"](16, friction=mu), steps=4 if mu else 1)
+        p = found.contact_pressure("ball")
+        on = (p.area > 0.0) & (p.pressure > 0.0)  # corners; middles have means
+        x = found.positions("ball")[p.index[on]][:, [0, 2]]
+        r, value = np.linalg.norm(x, axis=1), 1e-3 * p.pressure[on]
+        pressure.plot(r, value, "o", color=colour, markersize=4, label=f"friction {mu:g}")
+        if mu == 0.0:
+            force = 4 * found.contact_force("ball", "plane")[1]
+            reach = np.cbrt(0.75 * force * (1 - 0.3**2) / 1e6)
+            fine = np.linspace(0.0, reach, 200)
+            hertz = 1.5e-3 * force / (np.pi * reach**2) * np.sqrt(1 - (fine / reach) ** 2)
+            pressure.plot(fine, hertz, color="black", linewidth=1, label="Hertz, friction 0")
+    outward = 1e-3 * (p.traction[on][:, [0, 2]] * x).sum(axis=1) / np.maximum(r, 1e-12)
+    for state, colour in (("stick", "tab:green"), ("slip", "tab:red")):
+        own = p.state[on] == state
+        friction.plot(r[own], outward[own], "o", color=colour, markersize=4, label=state)
+    order = np.argsort(r)
+    friction.plot(r[order], mu * value[order], color="gray", linewidth=1, label="friction times pressure")
+    pressure.set(xlabel="radius [m]", ylabel="pressure [kPa]", xlim=(-0.005, 0.18))
+    friction.set(
+        xlabel="radius [m]", ylabel="radial traction on the ball [kPa]", ylim=(-2.5, 80.0), title="friction 0.5, four load steps"
+    )
+    pressure.legend()
+    friction.legend(loc="upper right")
+    return drawn(figure)
+
+
 PICTURES = {
     "drop": drop,
     "ring": ring,
@@ -153,6 +189,7 @@ PICTURES = {
     "drop_force": drop_force,
     "foot_forces": foot_forces,
     "hopper": hopper,
+    "pressed_ball": pressed_ball,
 }
 
 

@@ -174,6 +174,7 @@ def solve_static(
     steps = 1 if steps is None else check_count("steps", steps)
     settings = {
         "newton_tolerance": min(tolerance, LOOSEST),
+        "contact_tolerance": contact_tolerance,
         "self_collision": self_collision,
         "precision": precision,
         "arch": arch,

@@ -42,9 +42,9 @@ def test_reference(case, shared):
     assert not [check for check in checks if not check.passed]
 
 
-def test_every_problem_but_one_has_a_coarse_case():
+def test_problems_have_coarse_cases_but_long_ones():
     coarse = {case.problem for case in CASES if not case.fine}
-    assert set(PROBLEMS) - coarse == {"beam_fall_converged", "pressure_varies"}
+    assert set(PROBLEMS) - coarse == {"beam_fall_converged", "pressure_varies", "ironing"}
     assert len({case.name for case in CASES}) == len(CASES)
 
 

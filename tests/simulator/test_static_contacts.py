@@ -48,7 +48,9 @@ def pressed() -> StaticResult:
 
 def test_load_steps_are_slow_steps_in_time(pressed):
     """A ball so light that inertia is 1e-9 of the forces; the contact law is the same."""
-    with ts.Simulator(pressed_ball(density=1e-3), dt=0.5, precision="f64") as sim:
+    scene = pressed_ball(density=1e-3)
+    scene.collision = ts.CollisionSettings(offset=2e-5)  # the default of statics
+    with ts.Simulator(scene, dt=0.5, precision="f64") as sim:
         for step in range(2):
             sim.step()
             force = sim.contact_force("ball", "plane")
@@ -154,6 +156,7 @@ def test_what_nothing_can_hold_is_refused():
         (away, {}, ts.SimulationError, "nothing holds body 'block'"),
         (block_on_ground(), {"time": 0.0}, ts.SceneError, "time must be greater than 0 s"),
         (block_on_ground(), {"steps": 0}, ts.SimulationError, "steps must be an integer of at least 1"),
+        (block_on_ground(), {"contact_tolerance": 2.0}, ts.SimulationError, "contact_tolerance"),
         (loose, {"error": True}, ts.SceneError, "error and quantities need steps, or a scene"),
     ):
         with pytest.raises(error, match=message):
