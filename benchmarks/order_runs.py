@@ -10,11 +10,9 @@ from dataclasses import asdict, dataclass, field
 import numpy as np
 
 import taisoft as ts
-from taisoft.backend.arrays import FieldArena
 from taisoft.backend.runtime import Runtime, compile_clock
 from taisoft.errors import SimulationError, TaisoftError
 from taisoft.machine import Timing, summarise
-from taisoft.static import StaticSolver
 from taisoft.study.measure import TimedRun, advance
 
 from .order_cases import Case, Element, Reference
@@ -64,27 +62,27 @@ class Statics:
     """An equilibrium that can be solved repeatedly."""
 
     def __init__(self, case: Case, scene: ts.Scene, runtime: Runtime):
-        self._case, self._scene, self._arena = case, scene, FieldArena()
-        self._static = StaticSolver(scene, runtime, self._arena, TOLERANCE, 0.0)
+        self._case, self._body = case, scene.bodies[0]
+        settings = {"newton_tolerance": TOLERANCE, "precision": "f64", "arch": runtime.arch}
+        self._sim = ts.Simulator(scene, dt=1.0, integrator="static", **settings)
 
     def first(self, row: Row) -> None:
         """Solve and record the results. Raises SimulationError if there is no equilibrium."""
-        result = self._static.solve()
-        row.newton, row.linear = result.iterations, result.linear_iterations
-        row.field_bytes = sum(self._arena.bytes.values())
-        if not result.converged:
-            if result.load == 1.0:
-                raise SimulationError(f"not converged: the residual is {result.residual:.1e} of the load")
-            raise SimulationError(f"no equilibrium beyond {result.load:.0%} of the load")
-        row.measured = self._case.read(self._scene.bodies[0], result).tolist()
+        report = self._sim.step()
+        row.newton, row.linear = report.newton_iterations, report.linear_iterations
+        row.field_bytes = sum(self._sim.field_bytes.values())
+        if not report.converged or report.n_inverted:
+            raise SimulationError(f"not converged: the residual is {report.residual:.1e} of the load")
+        row.measured = self._case.read(self._body, self._sim).tolist()
 
     def again(self) -> None:
         """Solve from the rest shape."""
-        self._static.solve()
+        self._sim.reset()
+        self._sim.step()
 
     def close(self) -> None:
         """Free the memory."""
-        self._arena.release()
+        self._sim.close()
 
 
 class Fall:

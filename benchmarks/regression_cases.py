@@ -14,10 +14,8 @@ from functools import partial
 import numpy as np
 
 import taisoft as ts
-from taisoft.backend.arrays import FieldArena
 from taisoft.backend.runtime import open_runtime
 from taisoft.scene.scene import Scene
-from taisoft.static import StaticSolver
 
 from .collision_cases import DEEP_PENETRATION, SHEET, cubes_setup
 from .collision_runs import Rig
@@ -149,16 +147,13 @@ def demo(name: str, precision: str, seconds: float) -> Case:
 
 def static(tolerance: float, order: int, arch: str) -> Found:
     """The equilibrium of the beam: mean displacement of its nodes."""
-    arena, scene = FieldArena(), beam("SNH", order=order)
-    with closing(open_runtime(arch, "f64", "the regression cases")) as runtime:
-        try:
-            result, seconds = timed(StaticSolver(scene, runtime, arena, tolerance, 0.0).solve)
-            measured = (result.positions() - scene.bodies[0].rest_positions).mean(axis=0)
-            counts = {"newton": result.iterations, "linear": result.linear_iterations}
-            status = "ok" if result.converged else "not converged"
-            return Found(measured.tolist(), counts, status, sum(arena.bytes.values()), seconds)
-        finally:
-            arena.release()
+    settings = {"newton_tolerance": tolerance, "precision": "f64", "arch": arch}
+    with ts.Simulator(beam("SNH", order=order), dt=1.0, integrator="static", **settings) as sim:
+        report, seconds = timed(sim.step)
+        measured = (sim.positions() - sim.scene.bodies[0].rest_positions).mean(axis=0)
+        counts = {"newton": report.newton_iterations, "linear": report.linear_iterations}
+        status = "ok" if report.converged else "not converged"
+        return Found(measured.tolist(), counts, status, sum(sim.field_bytes.values()), seconds)
 
 
 def search(setup, arch: str) -> Found:

@@ -84,7 +84,7 @@ def test_residual_is_zero_without_forces(time):
 
 
 def test_unreachable_equilibrium_is_reported():
-    """Nodes that are moved through the block's other side invert it: a balance of forces there is no state that a path leads to."""
+    """Nodes that are moved through the block's other side invert it: no path leads to the balance of forces there."""
     scene = hanging(path=lambda t: (-2.0 * t, 0.0, 0.0))
     result = ts.solve_static(scene, time=1.0)
     assert not result.converged and result.load < 1.0 and result.n_inverted > 0

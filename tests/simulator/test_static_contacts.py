@@ -9,6 +9,7 @@ import taisoft as ts
 from taisoft.backend import runtime
 from taisoft.static import StaticResult
 
+UPRIGHT = np.eye(3)
 OFFSET = 1e-3  # of the ball's radius [m], more than contacts keep
 SIDE, WEIGHT = 0.1, 9.81  # of a block of 1000 kg/m^3 [m], [N]
 
@@ -25,7 +26,7 @@ def block_on_ground(gap: float = 0.0, cells: int = 2, friction: float = 0.5, **f
     return scene
 
 
-def pressed_ball(density: float = 1000.0, friction: float = 0.5, turned: np.ndarray = np.eye(3)) -> ts.Scene:
+def pressed_ball(density: float = 1000.0, friction: float = 0.5, turned: np.ndarray = UPRIGHT) -> ts.Scene:
     """Half a ball above a plane by the contact offset, whose equator comes down by 8 % of the radius until t = 1 s."""
     whole = ts.ball_mesh(1.0, 10)
     below = whole.vertices[whole.tets].mean(axis=1)[:, 1] < 0.0
@@ -85,7 +86,7 @@ def test_friction_depends_on_the_load_steps_and_says_so(pressed):
 
 def test_turned_scene_has_turned_results():
     axis = np.array([[0.36, 0.48, -0.8], [-0.8, 0.6, 0.0], [0.48, 0.64, 0.6]])
-    upright, turned = (ts.solve_static(pressed_ball(turned=R), tolerance=1e-9) for R in (np.eye(3), axis))
+    upright, turned = (ts.solve_static(pressed_ball(turned=R), tolerance=1e-9) for R in (UPRIGHT, axis))
     assert turned.positions() == pytest.approx(upright.positions() @ axis.T, abs=1e-6 * 0.08)
 
 
