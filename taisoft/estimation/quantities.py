@@ -19,7 +19,7 @@ import numpy as np
 from taisoft.errors import SceneError, TaisoftError
 from taisoft.estimation.order import error_over_difference, observed_order
 from taisoft.output.nodal_fields import von_mises
-from taisoft.records import Quantity, RunReport, StepReport
+from taisoft.records import Quantity, RunReport
 from taisoft.scene import checks
 from taisoft.scene.body import Body
 from taisoft.scene.connection_records import MAX_OUTSIDE
@@ -70,19 +70,10 @@ def measure_at_end(sim: "Simulator", measured: dict[str, Definition], report: Ru
             report.status = "degraded" if report.status == "ok" else report.status
 
 
-def with_columns(sim: "Simulator", measured: dict[str, Definition], on_step: Callable | None) -> Callable:
-    """Return an `on_step` of `run` that adds quantities to the details of a report, NaN without a value, then calls the given."""
-    if not measured:
-        raise SceneError("details: the run has no quantities")
-
-    def fill(report: StepReport, seconds: float) -> None:
-        for name, one in measured.items():
-            value, _ = one.measure(sim)
-            report.details[f"quantity {name}" + (f" [{one.unit}]" if one.unit else "")] = np.nan if value is None else value
-        if on_step is not None:
-            on_step(report, seconds)
-
-    return fill
+def columns(sim: "Simulator", measured: dict[str, Definition]) -> dict[str, float]:
+    """Return the present values of quantities by their headings in steps.csv, NaN without a value."""
+    values = {f"quantity {name}" + (f" [{one.unit}]" if one.unit else ""): one.measure(sim)[0] for name, one in measured.items()}
+    return {heading: np.nan if value is None else value for heading, value in values.items()}
 
 
 # --- texts ------------------------------------------------------------------------------------------------------------
