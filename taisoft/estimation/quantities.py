@@ -22,7 +22,7 @@ from taisoft.output.nodal_fields import von_mises
 from taisoft.records import Quantity, RunReport
 from taisoft.scene import checks
 from taisoft.scene.body import Body
-from taisoft.scene.connection_records import MAX_OUTSIDE
+from taisoft.scene.connections import check_inside
 from taisoft.scene.locate import locate
 from taisoft.scene.rigid import RigidBody
 
@@ -109,11 +109,9 @@ def _point(body: Body, words: list[str]) -> np.ndarray:
     """Return a point (3,) [m] of a body at rest. Raises SceneError."""
     try:
         point = np.array([float(word) for word in words])
-        outside = float(locate(body, point[None])[2][0])
+        check_inside(body, point, "the point")
     except ValueError:
         raise SceneError(f"{' '.join(words)!r} must be three finite numbers, a point of the body at rest [m]") from None
-    if outside > MAX_OUTSIDE:
-        raise SceneError(f"the point lies outside of body {body.name!r}, by {outside:.2g} times {body.extent}")
     return point
 
 
