@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from taisoft.details import DETAILS, QUANTITIES
-from taisoft.errors import OutputError, SceneError
+from taisoft.errors import OutputError, SceneError, reworded
 from taisoft.output.camera import MAX_ELEVATION
 from taisoft.output.files import RESULT_FILES, RESULT_FOLDERS, CheckpointWriter, OutputFolder
 from taisoft.output.frame_files import VTU_NAME, VtuWriter, cut_pvd
@@ -102,10 +102,8 @@ def _size_of(text: str) -> tuple[int, int]:
     width, x, height = text.partition("x")
     if not (x and width.isdecimal() and height.isdecimal()):
         raise SceneError(f"--size {text}: write width and height in pixels, such as 640x360")
-    try:
+    with reworded(OutputError, f"--size {text}: ", raised=SceneError):
         return checked_size((int(width), int(height)))
-    except OutputError as error:
-        raise SceneError(f"--size {text}: {error}") from None
 
 
 def _names(option: str, text: str | None, known) -> tuple[str, ...] | None:

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from taisoft.errors import SceneError, TaisoftError
+from taisoft.errors import SceneError, TaisoftError, reworded
 from taisoft.estimation.order import error_over_difference, observed_order
 from taisoft.output.nodal_fields import von_mises
 from taisoft.records import Quantity, RunReport
@@ -52,10 +52,8 @@ def definitions(sim: "Simulator", given: dict | None) -> dict[str, Definition]:
     """Return the quantities given to a run, by name. Raises SceneError for what is neither a function nor a valid text."""
     made = {}
     for name, one in checks.check_solver(quantities=given or {})["quantities"].items():
-        try:
+        with reworded(SceneError, f"quantity {name!r}: "):
             made[name] = Definition(one) if callable(one) else _parsed(sim, one)
-        except SceneError as error:
-            raise SceneError(f"quantity {name!r}: {error}") from None
     return made
 
 

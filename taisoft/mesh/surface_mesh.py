@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from taisoft.attributes import MeshAttributeError, guarded_record
-from taisoft.errors import MeshError
+from taisoft.errors import MeshError, reworded
 from taisoft.files import as_path
 from taisoft.machine import require
 from taisoft.mesh.obj_off import read_obj, read_off
@@ -258,8 +258,6 @@ def _run_mesher(name: str, vertices: np.ndarray, triangles: np.ndarray, length: 
     center = vertices.mean(axis=0)  # centre the surface: far from the origin digits are lost
     with tempfile.TemporaryDirectory(prefix="taisoft-") as folder:
         np.savez(Path(folder, "surface.npz"), vertices=vertices - center, triangles=triangles, numbers=(length, envelope))
-        try:
+        with reworded(MeshError, f"{name}: the mesher failed: "):
             found = run_child(folder, "mesh")
-        except MeshError as error:
-            raise MeshError(f"{name}: the mesher failed: {error}") from None
     return found["vertices"] + center, found["tets"]

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from taisoft.errors import SceneError
+from taisoft.errors import SceneError, reworded
 from taisoft.scene import checks
 from taisoft.scene.body import Body, Constraint
 from taisoft.scene.connection_records import MAX_OUTSIDE, Attachment, Point, Spring, Tendon
@@ -252,11 +252,8 @@ def check_inside(owner, position: np.ndarray, what: str) -> None:
 
 def _owner(scene: "Scene", name: str, what: str):
     """Return a body or an obstacle. Raises SceneError."""
-    try:
-        owner = scene.collider(name)
-    except SceneError as error:
-        raise SceneError(f"{what}: {str(error).removeprefix('scene: ')}") from None
-    return owner
+    with reworded(SceneError, f"{what}: ", without="scene: "):
+        return scene.collider(name)
 
 
 def _check_distinct(scene: "Scene", points: tuple[Point, ...], what: str) -> None:
