@@ -13,7 +13,7 @@ from dataclasses import asdict
 from fractions import Fraction
 
 from taisoft.dynamics.schemes import EXPLICIT, INTEGRATORS
-from taisoft.errors import SceneError, TaisoftError
+from taisoft.errors import SceneError, TaisoftError, reworded
 from taisoft.estimation.order import nominal_order
 from taisoft.scene.scene import Scene
 from taisoft.settings import WITH_MULTIPLIERS, check_settings, kept_by_multipliers
@@ -146,7 +146,7 @@ class Planner:
     def _reference(self, mesh: tuple, kind: str, target: float, frame: float) -> dict:
         """Return a setting with its steps per frame, an even number. Errors name it: the user may not have requested it."""
         refine, order = mesh
-        try:
+        with reworded(TaisoftError, f"the reference ({mesh_name({'refine': refine, 'order': order})}): ", raised=SceneError):
             scene = self._scene(mesh)
             integrator = self._integrator(scene, mesh, kind, target)
             steps = 2 * math.ceil(frame / target / 2 - 1e-9)
@@ -160,8 +160,6 @@ class Planner:
                 steps = max(steps, 2 * math.ceil(frame / limit))
             setting = Setting(frame / steps, integrator, order, refine, "f64")
             self._check(scene, setting)
-        except TaisoftError as error:
-            raise SceneError(f"the reference ({mesh_name({'refine': refine, 'order': order})}): {error}") from error
         order_in_time = nominal_order(integrator, scene, self._touches(scene))
         return {"setting": asdict(setting), "kind": kind, "order_in_time": order_in_time, "steps": steps}
 
