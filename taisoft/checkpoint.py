@@ -170,9 +170,6 @@ def _contents(path: Path) -> tuple[dict, dict[str, np.ndarray]]:
     with file:
         try:
             _check_sizes(path)
-        except Exception as error:
-            raise _no_checkpoint(path, error) from None
-        try:
             text = file["header"]
             header = json.loads(text.tobytes())
             kind, version = header["kind"], int(header["format"])

@@ -5,13 +5,14 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from taisoft.errors import SceneError
+from taisoft.estimation.quantities import Definition, columns
 from taisoft.records import StepReport
 from taisoft.scene import checks
 
 if TYPE_CHECKING:
     from taisoft.simulator import Simulator
 
-DETAILS = ("pairs", "bodies")
+DETAILS, QUANTITIES = ("pairs", "bodies"), "quantities"  # the latter only of runs
 OF_PAIRS = {  # heading of an axis, the first and the second of a pair -> query
     "force {} on {} by {} [N]": "contact_force",
     "torque {} on {} by {} [N m]": "contact_torque",
@@ -43,12 +44,19 @@ def details(self: "Simulator", wanted: str | tuple[str, ...] = DETAILS, about=No
     return found
 
 
-def detailed(sim: "Simulator", wanted, about, on_step: Callable | None) -> Callable[[StepReport, float], None]:
-    """Return an `on_step` of `run` that fills the details of each report, then calls the given one. Raises SceneError."""
-    sim.details(wanted, about)  # refuses invalid arguments before the run
+def detailed(
+    sim: "Simulator", wanted: str | tuple[str, ...], about, measured: dict[str, Definition], on_step: Callable | None
+) -> Callable[[StepReport, float], None]:
+    """Return an `on_step` of `run` that fills the details of each report, then calls the given one. measured: the quantities of
+    the run. Raises SceneError."""
+    wanted = (wanted,) if isinstance(wanted, str) else tuple(wanted)
+    own = tuple(name for name in wanted if name != QUANTITIES)
+    if own != wanted and not measured:
+        raise SceneError("details: the run has no quantities")
+    sim.details(own, about)  # refuses invalid arguments before the run
 
     def fill(report: StepReport, seconds: float) -> None:
-        report.details = sim.details(wanted, about)
+        report.details = sim.details(own, about) | (columns(sim, measured) if own != wanted else {})
         if on_step is not None:
             on_step(report, seconds)
 

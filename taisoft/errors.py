@@ -1,6 +1,7 @@
 """Errors that users can get. Each message is one sentence: the object, the index, the rule it breaks."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 
 MAX_TEXT, MAX_LISTED = 120, 20  # in a message, maximum number of characters of a text or value, and of items of a list
 
@@ -27,6 +28,17 @@ class OutputError(TaisoftError):
 
 class SimulationError(TaisoftError):
     """A run cannot start, or a step failed; the state stays the last good one."""
+
+
+@contextmanager
+def reworded(
+    caught: type[TaisoftError] | tuple, prefix: str = "", raised: type[TaisoftError] | None = None, without: str = ""
+) -> Iterator[None]:
+    """Raise an error of the block with a prefix, without what its text may begin with, and as another kind if one is given."""
+    try:
+        yield
+    except caught as error:
+        raise (raised or type(error))(prefix + str(error).removeprefix(without)) from error.__cause__
 
 
 def no_memory(what: str, error: MemoryError) -> SimulationError:

@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from taisoft.errors import OutputError
+from taisoft.errors import OutputError, value_text
 
 _part_numbers = itertools.count()
 
@@ -32,6 +32,14 @@ def write_error(path: Path, error: OSError, n_bytes: int | None = None) -> Outpu
     """Return the OutputError for a failed write: path, size if known [bytes], and the system's reason."""
     size = "" if n_bytes is None else f" ({n_bytes} bytes)"
     return OutputError(f"cannot write {path}{size}: {error.strerror or error}")
+
+
+def as_path(path, what: str, error: type[Exception], rule: str = "be a file's name") -> Path:
+    """Return a path. what: start of the message about a value that is none, with the rule that it breaks; or raise the error."""
+    try:
+        return Path(path)
+    except TypeError:
+        raise error(f"{what}: path must {rule}, not {value_text(path)}") from None
 
 
 def part_path(path: Path) -> Path:

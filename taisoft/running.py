@@ -12,7 +12,7 @@ from taisoft.details import detailed
 from taisoft.dynamics.newton_budget import watched
 from taisoft.energy_check import EnergyCheck
 from taisoft.errors import SimulationError, no_memory
-from taisoft.estimation.quantities import Definition, definitions, measure_at_end, with_columns
+from taisoft.estimation.quantities import Definition, definitions, measure_at_end
 from taisoft.frames import ROUNDING, check_length, fit_dt
 from taisoft.records import RunReport, StepReport
 from taisoft.scene import checks
@@ -92,11 +92,7 @@ def run(
     fps = None if fps is None else checks.number(fps, "fps", above=0.0, unit="1/s", error=SimulationError)
     check_length(seconds, sim.dt, fps)
     measured = definitions(sim, quantities)
-    details = (details,) if isinstance(details, str) else tuple(details)
-    if "quantities" in details:
-        details = tuple(name for name in details if name != "quantities")
-        on_step = with_columns(sim, measured, on_step)
-    on_step = detailed(sim, details, about, on_step) if details else on_step
+    on_step = detailed(sim, details, about, measured, on_step) if details else on_step
     arguments = {"on_frame": on_frame, "on_step": on_step, "error": error, "error_mesh": error_mesh, "on_iteration": on_iteration}
     arguments |= {"measured": measured}
     if sim.settings.tolerance is None or resumed:

@@ -8,8 +8,8 @@ from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from taisoft.details import DETAILS
-from taisoft.errors import OutputError, SceneError
+from taisoft.details import DETAILS, QUANTITIES
+from taisoft.errors import OutputError, SceneError, reworded
 from taisoft.output.camera import MAX_ELEVATION
 from taisoft.output.files import RESULT_FILES, RESULT_FOLDERS, CheckpointWriter, OutputFolder
 from taisoft.output.frame_files import VTU_NAME, VtuWriter, cut_pvd
@@ -56,7 +56,7 @@ def display_options(arguments: Namespace, has_window: bool) -> DisplayOptions:
     """Return the requested display options. Raises SceneError for unknown names and for options that nothing would show."""
     pictures = arguments.out is not None and not arguments.no_frames
     layers, plots = _names("layers", arguments.layers, LAYERS), _names("plots", arguments.plots, PLOTS) or ()
-    details = _names("details", arguments.details, (*DETAILS, "quantities")) or ()
+    details = _names("details", arguments.details, (*DETAILS, QUANTITIES)) or ()
     requested = {"video": arguments.video, "caption": arguments.caption, "plots": bool(plots)}
     requested |= {"size": arguments.size is not None, "view": arguments.view is not None}
     if not has_window:
@@ -102,10 +102,8 @@ def _size_of(text: str) -> tuple[int, int]:
     width, x, height = text.partition("x")
     if not (x and width.isdecimal() and height.isdecimal()):
         raise SceneError(f"--size {text}: write width and height in pixels, such as 640x360")
-    try:
+    with reworded(OutputError, f"--size {text}: ", raised=SceneError):
         return checked_size((int(width), int(height)))
-    except OutputError as error:
-        raise SceneError(f"--size {text}: {error}") from None
 
 
 def _names(option: str, text: str | None, known) -> tuple[str, ...] | None:

@@ -8,8 +8,7 @@ import os
 import sys
 import tomllib
 from argparse import Namespace
-from collections.abc import Iterator
-from contextlib import ExitStack, closing, contextmanager, suppress
+from contextlib import ExitStack, closing, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -22,7 +21,7 @@ from taisoft.cli.scene_file import OF_SCENE, load_scene, refuse_unknown
 from taisoft.cli.summary import print_plan, print_state, print_summary
 from taisoft.cli.units import warn_millimetres
 from taisoft.dynamics.schemes import STATIC
-from taisoft.errors import SceneError, SimulationError
+from taisoft.errors import SceneError, SimulationError, reworded
 from taisoft.estimation.quantities import definitions
 from taisoft.frames import check_length, first_frame
 from taisoft.output.files import check_free
@@ -86,7 +85,7 @@ def run(arguments: Namespace) -> int:
             _check_tolerance(settings, interactive)
             if arguments.out is not None:
                 check_free(arguments.out, arguments.overwrite)
-            with _prefix_errors(arguments.scene):
+            with reworded((SceneError, SimulationError), f"{arguments.scene}: "):
                 sim = Simulator(scene, **settings.simulator | ({"draggable": True} if interactive else {}))  # by the mouse
         else:
             saved = read_checkpoint(arguments.resume)
@@ -102,7 +101,7 @@ def run(arguments: Namespace) -> int:
             if interactive:
                 return _show_window(sim, settings, shown)
             _check_time_left(sim, settings, arguments)
-            with _prefix_errors(arguments.scene):
+            with reworded((SceneError, SimulationError), f"{arguments.scene}: "):
                 check_length(settings.seconds, sim.dt, settings.fps)
                 if not definitions(sim, settings.quantities) and "quantities" in shown.details:
                     raise SceneError("--details quantities: the run has none, give --quantity")
@@ -155,10 +154,8 @@ def set_given(scene: Scene, assignments: list[str]) -> dict:
         if name.startswith("solver."):
             continue
         given[name] = _number_or_list(text, assignment)
-        try:
+        with reworded(SceneError, f"--set {assignment}: "):
             set_numbers(scene, {name: given[name]})
-        except SceneError as error:
-            raise SceneError(f"--set {assignment}: {error}") from None
     return given
 
 
@@ -199,15 +196,6 @@ def _given(arguments: Namespace, keys: list[str]) -> dict:
             raise SceneError(f"--{key} {option} and --set solver.{key}={given[key]} disagree; give one of them")
         given[key] = option
     return given
-
-
-@contextmanager
-def _prefix_errors(scene: str) -> Iterator[None]:
-    """Prefix errors raised in the context with the scene's name."""
-    try:
-        yield
-    except (SceneError, SimulationError) as error:
-        raise type(error)(f"{scene}: {error}") from error
 
 
 def _check_checkpoint_interval(arguments: Namespace) -> None:

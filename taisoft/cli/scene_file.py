@@ -16,7 +16,7 @@ from argparse import Namespace
 from pathlib import Path
 from types import ModuleType
 
-from taisoft.errors import MeshError, MissingPackage, SceneError
+from taisoft.errors import MeshError, MissingPackage, SceneError, reworded
 from taisoft.scene.checks import SOLVER_CHECKS, check_solver, nearest
 from taisoft.scene.refine import refined, with_order
 from taisoft.scene.scene import Scene
@@ -166,10 +166,8 @@ def _load(name: str, allow_outside: bool, requested: dict) -> tuple[Scene, dict,
 def check_scene_solver(solver: dict) -> None:
     """Raise SceneError if a scene's `solver` dict has unknown keys or invalid values."""
     refuse_unknown(solver, list(SOLVER_CHECKS), OF_SCENE)
-    try:
+    with reworded(SceneError, OF_SCENE):
         check_solver(**solver)
-    except SceneError as error:
-        raise SceneError(f"{OF_SCENE}{error}") from None
 
 
 def refuse_unknown(names, keys: list[str], where: str) -> None:

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from taisoft.cli import EXIT_FAILED, EXIT_SIGNAL, Interrupted, Signals, parse_scalar
 from taisoft.cli.scene_file import check_scene_solver, find_scene, load_scene
-from taisoft.errors import SceneError, TaisoftError
+from taisoft.errors import SceneError, TaisoftError, reworded
 from taisoft.machine import usable_cores
 from taisoft.many.cluster import cluster_places, connect
 from taisoft.many.places import LocalPlace, serve
@@ -116,10 +116,8 @@ def values_of(key: str, text: str) -> list:
         if key in INTEGER_AXES:
             checks.whole(value, option, INTEGER_AXES[key])
         else:
-            try:
+            with reworded(SceneError, f"{option} {text}: "):
                 check_solver(**{key: value})
-            except SceneError as error:
-                raise SceneError(f"{option} {text}: {error}") from None
         if value in values[:k]:
             raise SceneError(f"{option} {text}: {value} is given twice")
     return [float(value) if key == "dt" else value for value in values]

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from taisoft.errors import MeshError
+from taisoft.errors import MeshError, reworded
 from taisoft.fem.model import Layout
 from taisoft.mesh.sdf import SdfGrid, cached_sdf_grid
 from taisoft.ranges import owners
@@ -84,10 +84,8 @@ def body_grid(body: Body, cells: int, margin: float) -> SdfGrid:
     Farther out, samples add the distance to the grid. Raise MeshError, naming the body, if the grid cannot be made.
     """
     size = float(np.ptp(body.nodes.positions, axis=0).max())
-    try:
+    with reworded(MeshError, f"body {body.name!r}: its distance field cannot be made: "):
         return cached_sdf_grid(body.nodes.positions, body.nodes.surface, cells, margin=min(margin, 0.25 * size))
-    except MeshError as error:
-        raise MeshError(f"body {body.name!r}: its distance field cannot be made: {error}") from None
 
 
 def collider_surfaces(scene: Scene, layout: Layout) -> tuple[Topology, np.ndarray]:

@@ -101,9 +101,7 @@ class Contacts:
     pressure: np.ndarray  #: (k,) [Pa] at the node of a mortar contact: its normal force over its area; nan for others
     state: np.ndarray  #: (k,) "open", "stick" or "slip" at the end, as the solver left it
     slip: np.ndarray  #: (k,3) [m] tangential displacement of a relative to b in `duration`
-    clearance: (
-        np.ndarray
-    )  #: (k,) [m] gap minus the offset that this contact keeps, half of it at guards and 5 times within a body
+    clearance: np.ndarray  #: (k,) [m] gap minus the offset that this contact keeps: at guards half, within a body 5 times it
     tributary_area: np.ndarray  #: (k,) [m^2] of the loaded surface, divided among contacts by force; nan unless asked for
     found: int  #: contacts before the reduction
     unmapped: int  #: triangles whose tet is inverted, so that a distance field could not be used

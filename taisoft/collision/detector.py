@@ -30,7 +30,7 @@ from taisoft.collision.path_check import IN_BOXES, NO_PASSAGES, HeldPassages, Pa
 from taisoft.collision.reduction import Reduction
 from taisoft.collision.spatial_hash import SpatialHash
 from taisoft.collision.surface import ACTIVE, NONFINITE, PAIRS, build_surface, update_surface
-from taisoft.errors import SceneError, SimulationError
+from taisoft.errors import SceneError, SimulationError, reworded
 from taisoft.fem.model import Layout, Model
 from taisoft.mesh.quality import mean_surface_edge
 from taisoft.scene.connections import attached_pairs
@@ -185,10 +185,8 @@ class Detection:
     def _move(self, time: float, dt: float, prescribed=None, path=None, x=None) -> None:
         """Update positions and displacements of the surface, and the boxes. x: the nodes' positions if not the present ones."""
         s, m = self.surface, self.model
-        try:
+        with reworded(SceneError, raised=SimulationError):
             self._place_obstacles(time, dt)
-        except SceneError as error:
-            raise SimulationError(str(error)) from None
         has_prescribed = prescribed is not None and len(prescribed[0]) > 0
         if has_prescribed:
             if self._prescribed_moves is None:

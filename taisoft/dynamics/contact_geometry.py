@@ -423,11 +423,3 @@ def largest_motion(
                         motion -= p.weight[e] * seen[p.node[e]]
                 largest = ti.max(largest, motion.norm())
     return largest
-
-
-@kernel
-def keep_displacements(m: ti.template(), displacement: ti.template(), seen: ti.template()):
-    """Copy displacements (n_nodes) [m]."""
-    ti.loop_config(serialize=m.serial)
-    for i in range(m.n_nodes):
-        seen[i] = displacement[i]

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from taisoft.errors import SceneError, SimulationError
+from taisoft.errors import SceneError, SimulationError, reworded
 from taisoft.fem.model import Layout
 from taisoft.scene import checks
 from taisoft.scene.body import Constraint
@@ -142,7 +142,5 @@ class DirichletConditions:
     def _displacement(group: MovedNodes, t: float) -> np.ndarray | None:
         """Return a path's displacement at t, checked; a SimulationError names the body, the time and the rule."""
         what = f"body {group.name!r}: moved nodes"
-        try:
+        with reworded(SceneError, raised=SimulationError):
             return checks.path_value(group.path, t, what, "displacement", ((3,), (len(group.nodes), 3)))
-        except SceneError as error:
-            raise SimulationError(str(error)) from error.__cause__

@@ -15,9 +15,8 @@ from taisoft.scene.scene import Scene
 
 Pairs = tuple[np.ndarray, np.ndarray]  # colliders (k,2), the lower index first, and their sums (k,13), see `sum_pairs`
 IMPULSE, MOMENTS, SLIP, NORMAL = slice(0, 3), (slice(3, 6), slice(6, 9)), slice(9, 12), slice(12, 13)  # columns
-ROWS = (
-    "normal tangent r impact_impulse arity arity_a point gap area guard status slip body feature factor".split()
-)  # what a later step needs
+# what a later step needs
+ROWS = "normal tangent r impact_impulse arity arity_a point gap area guard status slip body feature factor".split()
 MORE_ROWS = [*ROWS, *"friction restitution obstacle_displacement approach load target min_opening".split()]
 
 

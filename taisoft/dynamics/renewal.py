@@ -10,7 +10,8 @@ from taisoft.collision.detector import Detection
 from taisoft.collision.end_search import EndSearch
 from taisoft.contact.build import PairNumbers, drop_vanishing
 from taisoft.contact.problem import ContactProblem, index_nodes
-from taisoft.dynamics.contact_geometry import IN_PLACE, KEPT, REJECTED, STILL, adopt, judge, keep_displacements, largest_motion
+from taisoft.dynamics.contact_geometry import IN_PLACE, KEPT, REJECTED, STILL, adopt, judge, largest_motion
+from taisoft.dynamics.state import copy_values
 from taisoft.fem.model import Model
 
 
@@ -40,7 +41,7 @@ class Renewal:
         if not moved > STILL * offset:
             return 0
         self.n_looks += 1
-        keep_displacements(self._model, displacement, self._seen)
+        copy_values(self._model, self._seen, displacement)
         self._found = end = self._detection.find_at_end(time, dt, x_start, displacement, self.TRUSTED * self._detection.edge)
         if end is None:
             return 0

@@ -13,7 +13,7 @@ from typing import Protocol
 import numpy as np
 
 from taisoft.dynamics.running_robot import Bodies, RunningRobot
-from taisoft.errors import SimulationError
+from taisoft.errors import SimulationError, reworded
 from taisoft.records import StepReport
 from taisoft.scene.rigid import Pose
 from taisoft.scene.scene import Scene
@@ -107,11 +107,9 @@ class Robots:
     def _take(self, bodies: Simulation) -> StepReport:
         """Let the robots move, and the bodies take their step against them."""
         poses, dt = {}, bodies.dt
-        try:
+        with reworded(SimulationError, f"step {bodies.state.step_count + 1}: "):
             for robot in self.running.values():
                 poses |= robot.advance(dt, bodies.state.time + dt)
-        except SimulationError as error:
-            raise SimulationError(f"step {bodies.state.step_count + 1}: {error}") from None
         bodies.command_poses(poses)
         report = bodies.advance(1)
         self._measure(bodies)

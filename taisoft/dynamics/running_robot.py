@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 import numpy as np
 
-from taisoft.errors import SceneError, SimulationError
+from taisoft.errors import SceneError, SimulationError, reworded
 from taisoft.scene import checks
 from taisoft.scene.loads import ScalarLoad, value_at
 from taisoft.scene.obstacles import Obstacle
@@ -172,10 +172,8 @@ class RunningRobot:
         for k, path in self._paths.items():
             what = f"robot {self.name!r}: control of {self.control.names[k]!r}"
             data.ctrl[k] = float(value_at(path, end, what))
-            try:
+            with reworded(SceneError, raised=SimulationError):
                 check_control(model, k, data.ctrl[k], f"{what} at t = {end:g}")
-            except SceneError as error:
-                raise SimulationError(str(error)) from None
         self._take_steps(n)
         self._place()
         return {one.name: Pose(*placed_pose(self.placed, one.shape, data, geom)) for one, geom in self._moving}

@@ -28,11 +28,11 @@ def copy_nodes(m: ti.template(), x: ti.template(), v: ti.template(), from_x: ti.
 
 
 @kernel
-def copy_slip(m: ti.template(), slip: ti.template(), from_slip: ti.template()):
-    """Copy accumulated slips (n_nodes)."""
+def copy_values(m: ti.template(), to: ti.template(), values: ti.template()):
+    """Copy numbers or vectors (n_nodes)."""
     ti.loop_config(serialize=m.serial)
     for i in range(m.n_nodes):
-        slip[i] = from_slip[i]
+        to[i] = values[i]
 
 
 @dataclass(eq=False)
@@ -76,7 +76,7 @@ class StepState:
         self.misplaced, self.held = other.misplaced, other.held
         self.copy_history_from(other)
         if self.slip is not None:
-            copy_slip(self.model, self.slip, other.slip)
+            copy_values(self.model, self.slip, other.slip)
 
     def copy_history_from(self, other: "StepState") -> None:
         """Take over the history of Maxwell branches, if there are any."""

@@ -42,9 +42,7 @@ class ContactPressure:
     slip: np.ndarray  #: (n,3) [m] tangential displacement relative to what it touches, weighted by force; what sticks counts 0
     accumulated_slip: np.ndarray  #: (n,) [m] length of the path of such slips since the start or the last reset
     gap: np.ndarray  #: (n,) [m] mean of the contacts found there, nan without any
-    area: (
-        np.ndarray
-    )  #: (n,) [m^2] deformed; of a node its part of the triangles around, 0 at mid-edge nodes, whose corners have it
+    area: np.ndarray  #: (n,) [m^2] deformed; of a node its part of the triangles around, of mid-edge nodes 0: corners have it
     force: np.ndarray  #: (n,3) [N]; of a node as it acts there
 
     __repr__ = short_repr

@@ -16,13 +16,13 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from taisoft.errors import SceneError, TaisoftError
+from taisoft.errors import SceneError, TaisoftError, reworded
 from taisoft.estimation.order import error_over_difference, observed_order
 from taisoft.output.nodal_fields import von_mises
-from taisoft.records import Quantity, RunReport, StepReport
+from taisoft.records import Quantity, RunReport
 from taisoft.scene import checks
 from taisoft.scene.body import Body
-from taisoft.scene.connection_records import MAX_OUTSIDE
+from taisoft.scene.connections import check_inside
 from taisoft.scene.locate import locate
 from taisoft.scene.rigid import RigidBody
 
@@ -52,10 +52,8 @@ def definitions(sim: "Simulator", given: dict | None) -> dict[str, Definition]:
     """Return the quantities given to a run, by name. Raises SceneError for what is neither a function nor a valid text."""
     made = {}
     for name, one in checks.check_solver(quantities=given or {})["quantities"].items():
-        try:
+        with reworded(SceneError, f"quantity {name!r}: "):
             made[name] = Definition(one) if callable(one) else _parsed(sim, one)
-        except SceneError as error:
-            raise SceneError(f"quantity {name!r}: {error}") from None
     return made
 
 
@@ -70,19 +68,10 @@ def measure_at_end(sim: "Simulator", measured: dict[str, Definition], report: Ru
             report.status = "degraded" if report.status == "ok" else report.status
 
 
-def with_columns(sim: "Simulator", measured: dict[str, Definition], on_step: Callable | None) -> Callable:
-    """Return an `on_step` of `run` that adds quantities to the details of a report, NaN without a value, then calls the given."""
-    if not measured:
-        raise SceneError("details: the run has no quantities")
-
-    def fill(report: StepReport, seconds: float) -> None:
-        for name, one in measured.items():
-            value, _ = one.measure(sim)
-            report.details[f"quantity {name}" + (f" [{one.unit}]" if one.unit else "")] = np.nan if value is None else value
-        if on_step is not None:
-            on_step(report, seconds)
-
-    return fill
+def columns(sim: "Simulator", measured: dict[str, Definition]) -> dict[str, float]:
+    """Return the present values of quantities by their headings in steps.csv, NaN without a value."""
+    values = {f"quantity {name}" + (f" [{one.unit}]" if one.unit else ""): one.measure(sim)[0] for name, one in measured.items()}
+    return {heading: np.nan if value is None else value for heading, value in values.items()}
 
 
 # --- texts ------------------------------------------------------------------------------------------------------------
@@ -118,11 +107,9 @@ def _point(body: Body, words: list[str]) -> np.ndarray:
     """Return a point (3,) [m] of a body at rest. Raises SceneError."""
     try:
         point = np.array([float(word) for word in words])
-        outside = float(locate(body, point[None])[2][0])
+        check_inside(body, point, "the point")
     except ValueError:
         raise SceneError(f"{' '.join(words)!r} must be three finite numbers, a point of the body at rest [m]") from None
-    if outside > MAX_OUTSIDE:
-        raise SceneError(f"the point lies outside of body {body.name!r}, by {outside:.2g} times {body.extent}")
     return point
 
 

@@ -17,16 +17,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from taisoft.fem.dependent_table import DependentTable, dependent_table
-from taisoft.mesh import aggregates
-from taisoft.mesh.quadratic import (
-    area_vectors,
-    jacobians,
-    point_volumes,
-    quadrature,
-    shape_derivatives,
-    shape_functions,
-    triangle_rule,
-)
+from taisoft.mesh import aggregates, quadratic
 from taisoft.mesh.topology import EDGES
 from taisoft.scene.rigid import RigidBody
 from taisoft.scene.scene import Body, Scene
@@ -47,14 +38,14 @@ def inverse_rest_edges(vertices: np.ndarray, tets: np.ndarray) -> tuple[np.ndarr
 def shape_gradients(body: Body) -> tuple[np.ndarray, np.ndarray]:
     """Rest gradients of the shape functions (m, p, 4 or 10, 3) [1/m] at the body's quadrature points, and the
     volumes of these points (m, p) [m^3]."""
-    rule = quadrature(body.quadrature_degree)
+    rule = quadratic.quadrature(body.quadrature_degree)
     if body.is_curved:
-        x, s = body.rest_positions[body.nodes.elements], shape_derivatives(2, rule.points)
-        J = jacobians(x, rule.points)
+        x, s = body.rest_positions[body.nodes.elements], quadratic.shape_derivatives(2, rule.points)
+        J = quadratic.jacobians(x, rule.points)
         return (s[:, :, 1:] - s[:, :, :1]) @ np.linalg.inv(J), np.linalg.det(J) * rule.weights / 6.0
     Dm_inv, volumes = inverse_rest_edges(body.mesh.vertices, body.mesh.tets)
     barycentric = np.concatenate([-Dm_inv.sum(axis=1, keepdims=True), Dm_inv], axis=1)
-    return shape_derivatives(body.order, rule.points) @ barycentric[:, None], np.outer(volumes, rule.weights)
+    return quadratic.shape_derivatives(body.order, rule.points) @ barycentric[:, None], np.outer(volumes, rule.weights)
 
 
 def rest_volumes(body: Body) -> np.ndarray:
@@ -107,8 +98,8 @@ def _distribute(body: Body, fractions: np.ndarray) -> np.ndarray:
 
 def _curved_points(body: Body) -> tuple[np.ndarray, np.ndarray]:
     """Volumes (m,p) [m^3] of the points of the rule of degree 4, and N_a there (p,10)."""
-    rule = quadrature(4)
-    return point_volumes(body.rest_positions[body.nodes.elements], rule), shape_functions(2, rule.points)
+    rule = quadratic.quadrature(4)
+    return quadratic.point_volumes(body.rest_positions[body.nodes.elements], rule), quadratic.shape_functions(2, rule.points)
 
 
 @cache
@@ -162,7 +153,7 @@ def triangle_areas(body: Body, triangles: np.ndarray) -> np.ndarray:
     """
     if body.is_curved:
         nodes = body.face_nodes(triangles)
-        parts = np.linalg.norm(area_vectors(body.rest_positions[nodes]), axis=2) @ triangle_rule(2)[1].T
+        parts = np.linalg.norm(quadratic.area_vectors(body.rest_positions[nodes]), axis=2) @ quadratic.triangle_rule(2)[1].T
         return np.bincount(nodes.reshape(-1), parts.reshape(-1), body.n_nodes)
     corners = body.mesh.surface[triangles]
     a, b, c = (body.mesh.vertices[corners[:, k]] for k in range(3))

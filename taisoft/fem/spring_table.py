@@ -21,7 +21,7 @@ from functools import cached_property
 import numpy as np
 import scipy.sparse as sp
 
-from taisoft.errors import SceneError, SimulationError
+from taisoft.errors import SceneError, SimulationError, reworded
 from taisoft.ranges import owners
 from taisoft.scene.commands import Command
 from taisoft.scene.obstacles import Obstacle
@@ -66,12 +66,10 @@ class MovingEnds:
 
     def amplitudes(self, t: float) -> np.ndarray:
         """Offsets, and rates if they are needed, at t [s]. Raises SimulationError if a path fails."""
-        try:
+        with reworded(SceneError, raised=SimulationError):
             found = [self.offsets(t)]
             if self.damped:
                 found.append(self._rates(t))
-        except SceneError as error:
-            raise SimulationError(str(error)) from error.__cause__
         return np.concatenate(found).reshape(-1)
 
 

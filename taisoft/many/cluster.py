@@ -11,7 +11,7 @@ import uuid
 from contextlib import suppress
 
 from taisoft.errors import SceneError
-from taisoft.machine import usable_cores
+from taisoft.machine import require, usable_cores
 from taisoft.many.places import POLL_INTERVAL, LocalPlace
 from taisoft.output.report import machine
 
@@ -100,12 +100,9 @@ def _worker_info() -> dict:
 
 def connect(address: str, argument: str):
     """Return a client of the scheduler at this address. argument: gives it, in messages. Raises SceneError if there is none."""
+    distributed = require("distributed", argument, "cluster", SceneError)
     try:
-        from distributed import Client
-    except ImportError:
-        raise SceneError(f"{argument} needs the package distributed, which is missing: pip install 'taisoft[cluster]'") from None
-    try:
-        return Client(address, timeout=CONNECT_SECONDS, set_as_default=False)
+        return distributed.Client(address, timeout=CONNECT_SECONDS, set_as_default=False)
     except (OSError, ValueError, TimeoutError) as error:
         raise SceneError(f"{argument} {address}: no Dask scheduler answers there ({type(error).__name__})") from None
 

@@ -19,7 +19,7 @@ import meshio
 import numpy as np
 
 from taisoft.errors import MeshError, listed, value_text
-from taisoft.files import replacing
+from taisoft.files import as_path, replacing
 from taisoft.mesh.abaqus import read_abaqus
 from taisoft.mesh.fibres import FIBRES
 from taisoft.mesh.gmsh import PHYSICAL, element_data, read_gmsh, split_names
@@ -58,10 +58,7 @@ def read_mesh(path, fix_orientation: bool = False, weld: float | None = None, re
     any other element type is refused with its name and count. Nodes on curved edges of second-order tets are the mesh's
     `mid_edge`. Raises MeshError.
     """
-    try:
-        file = Path(path)
-    except TypeError as error:
-        raise MeshError(f"read_mesh: path must be a file's name, not {path!r}") from error
+    file = as_path(path, "read_mesh", MeshError)
     name = str(file)
     data = read_content(file)
     ending = file.suffix.lower()

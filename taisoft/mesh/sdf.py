@@ -148,14 +148,9 @@ def greatest_depth(vertices: np.ndarray, triangles: np.ndarray, points: np.ndarr
 
 def nearest_points(vertices: np.ndarray, triangles: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the nearest points (k,3) [m] of triangles (t,3), which may be open, to points (k,3), and their triangles (k,)."""
-    corners = vertices[triangles]
-    edges, normals = np.roll(corners, -1, axis=1) - corners, normals_and_heights(vertices, triangles)[0]
-    centroid = corners.mean(axis=1)
-    radius = np.linalg.norm(corners - centroid[:, None], axis=2).max(axis=1)
-    guess = scipy.spatial.cKDTree(centroid).query(points)[1]
-    reach = np.sqrt(_offsets(points, corners[guess], edges[guess], normals[guess])[0])
-    point, triangle = BallTree(centroid, radius).pairs(points, reach)
-    squared, offset, _ = _offsets(points[point], corners[triangle], edges[triangle], normals[triangle])
+    surface = _Triangles(vertices, triangles)
+    point, triangle = surface.balls.pairs(points, surface.upper(points))
+    squared, offset, _ = surface.nearest(points[point], triangle)
     order = np.lexsort((triangle, squared, point))
     best = order[np.searchsorted(point[order], np.arange(len(points)))]
     return points - offset[best], triangle[best]
@@ -180,12 +175,52 @@ class BallTree:
         return tuple(np.concatenate(found, axis=1))
 
 
-class _Surface:
-    """Triangles with precomputed data for distance and sign."""
+class _Triangles:
+    """Triangles with precomputed data for distances."""
 
     def __init__(self, vertices: np.ndarray, triangles: np.ndarray):
-        self.normals, heights = normals_and_heights(vertices, triangles)
-        flat = ~(heights > 0)
+        self.triangles, self.corners = triangles, vertices[triangles]  # (t,3,3)
+        self.normals = normals_and_heights(vertices, triangles)[0]
+        self.edges = np.roll(self.corners, -1, axis=1) - self.corners
+        self.centroid = self.corners.mean(axis=1)
+        self.radius = np.linalg.norm(self.corners - self.centroid[:, None], axis=2).max(axis=1)
+        self._tree, self.balls = scipy.spatial.cKDTree(self.centroid), BallTree(self.centroid, self.radius)
+
+    def upper(self, points: np.ndarray) -> np.ndarray:
+        """Return upper bounds (p,) [m] of the distances of points (p,3)."""
+        triangle = self._tree.query(points)[1] if len(points) else np.zeros(0, dtype=np.int64)
+        return np.sqrt(self.nearest(points, triangle)[0])
+
+    def nearest(self, points: np.ndarray, triangle: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return squared distances (p,), offsets (p,3) from the nearest point, and its feature (p,), a column of `pseudonormals`.
+
+        points: (p,3). triangle: (p,), one for each point.
+        """
+        normal, edges = self.normals[triangle], self.edges[triangle]
+        d = points[:, None] - self.corners[triangle]  # from each corner
+        along = np.einsum("pkx,pkx->pk", d, edges) / np.einsum("pkx,pkx->pk", edges, edges)
+        along = np.clip(along, 0.0, 1.0)
+        offset = d - along[:, :, None] * edges
+        squared = np.einsum("pkx,pkx->pk", offset, offset)
+        rows, k = np.arange(len(points)), np.argmin(squared, axis=1)
+        t = along[rows, k]
+        feature = np.where(t == 0.0, 4 + k, np.where(t == 1.0, 4 + (k + 1) % 3, 1 + k))
+        squared, offset = squared[rows, k], offset[rows, k]
+        # The point projects into the face if it is to the left of all three edges.
+        face = (np.einsum("pkx,pkx->pk", np.cross(edges, d), normal[:, None]) >= 0).all(axis=1)
+        height = np.einsum("px,px->p", d[:, 0], normal)
+        return (
+            np.where(face, height**2, squared),
+            np.where(face[:, None], height[:, None] * normal, offset),
+            np.where(face, 0, feature),
+        )
+
+
+class _Surface(_Triangles):
+    """A closed surface with precomputed data for distance and sign."""
+
+    def __init__(self, vertices: np.ndarray, triangles: np.ndarray):
+        flat = ~(normals_and_heights(vertices, triangles)[1] > 0)
         if flat.any():
             raise MeshError(f"a distance field needs triangles with area: triangle {int(np.argmax(flat))} has none")
         opposite = opposite_half_edges(triangles)
@@ -196,12 +231,7 @@ class _Surface:
                 f"a distance field needs a closed surface: edge {edge} belongs to triangle {t} alone "
                 f"({int((opposite < 0).sum())} such edges)"
             )
-        self.triangles = triangles
-        self.corners = vertices[triangles]  # (t,3,3)
-        self.edges = np.roll(self.corners, -1, axis=1) - self.corners
-        self.centroid = self.corners.mean(axis=1)
-        self.radius = np.linalg.norm(self.corners - self.centroid[:, None], axis=2).max(axis=1)
-        self._tree, self._balls = scipy.spatial.cKDTree(self.centroid), BallTree(self.centroid, self.radius)
+        super().__init__(vertices, triangles)
         self._slack = _SLACK * float(np.linalg.norm(np.ptp(self.corners, axis=(0, 1))))
         # (t,7,3): pseudonormals of the face, its three edges and its three corners, of any length.
         at_edges = self.normals[:, None] + self.normals[opposite // 3]
@@ -226,14 +256,9 @@ class _Surface:
         total = np.stack([np.bincount(part, weighted[:, x]) for x in range(3)], axis=1)
         return total[part].reshape(-1, 3, 3)
 
-    def upper(self, points: np.ndarray) -> np.ndarray:
-        """Return upper bounds (p,) [m] of the distances of points (p,3)."""
-        triangle = self._tree.query(points)[1] if len(points) else np.zeros(0, dtype=np.int64)
-        return np.sqrt(self.nearest(points, triangle)[0])
-
     def signed(self, points: np.ndarray, upper: np.ndarray) -> np.ndarray:
         """Return signed distances (p,) [m] of points (p,3), p > 0, with these upper bounds."""
-        point, triangle = self._balls.pairs(points, upper)
+        point, triangle = self.balls.pairs(points, upper)
         near = np.flatnonzero(self.bound(points[point], triangle) <= upper[point] * (1.0 + _SLACK) + self._slack)
         near = near[np.lexsort((triangle[near], point[near]))]
         point, triangle = point[near], triangle[near]
@@ -265,31 +290,3 @@ class _Surface:
         height = np.einsum("px,px->p", d, self.normals[triangle])
         across = np.sqrt(np.maximum(np.einsum("px,px->p", d, d) - height**2, 0.0)) - self.radius[triangle]
         return np.sqrt(height**2 + np.maximum(across, 0.0) ** 2)
-
-    def nearest(self, points: np.ndarray, triangle: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return squared distances (p,), offsets (p,3) from the nearest point, and its feature (p,), a column of `pseudonormals`.
-
-        points: (p,3). triangle: (p,), one for each point.
-        """
-        return _offsets(points, self.corners[triangle], self.edges[triangle], self.normals[triangle])
-
-
-def _offsets(points: np.ndarray, corners: np.ndarray, edges: np.ndarray, normal: np.ndarray):
-    """See `_Surface.nearest`, for points (p,3) and the corners and edges (p,3,3) and normals (p,3) of one triangle each."""
-    d = points[:, None] - corners  # from each corner
-    along = np.einsum("pkx,pkx->pk", d, edges) / np.einsum("pkx,pkx->pk", edges, edges)
-    along = np.clip(along, 0.0, 1.0)
-    offset = d - along[:, :, None] * edges
-    squared = np.einsum("pkx,pkx->pk", offset, offset)
-    rows, k = np.arange(len(points)), np.argmin(squared, axis=1)
-    t = along[rows, k]
-    feature = np.where(t == 0.0, 4 + k, np.where(t == 1.0, 4 + (k + 1) % 3, 1 + k))
-    squared, offset = squared[rows, k], offset[rows, k]
-    # The point projects into the face if it is to the left of all three edges.
-    face = (np.einsum("pkx,pkx->pk", np.cross(edges, d), normal[:, None]) >= 0).all(axis=1)
-    height = np.einsum("px,px->p", d[:, 0], normal)
-    return (
-        np.where(face, height**2, squared),
-        np.where(face[:, None], height[:, None] * normal, offset),
-        np.where(face, 0, feature),
-    )

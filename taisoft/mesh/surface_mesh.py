@@ -15,7 +15,8 @@ from pathlib import Path
 import numpy as np
 
 from taisoft.attributes import MeshAttributeError, guarded_record
-from taisoft.errors import MeshError, value_text
+from taisoft.errors import MeshError, reworded
+from taisoft.files import as_path
 from taisoft.machine import require
 from taisoft.mesh.obj_off import read_obj, read_off
 from taisoft.mesh.ply import read_ply
@@ -156,10 +157,7 @@ def read_surface(path, weld: float = 0.0) -> SurfaceMesh:
     surface = as_surface(path, weld)
     if surface is not path:
         return surface
-    try:
-        file = Path(path)
-    except TypeError as error:
-        raise MeshError(f"read_surface: path must be a file's name or have vertices and faces, not {value_text(path)}") from error
+    file = as_path(path, "read_surface", MeshError, "be a file's name or have vertices and faces")
     name, ending = str(file), file.suffix.lower()
     if ending not in FORMATS:
         raise MeshError(f"{name}: a surface is read from {', '.join(FORMATS)}, not from {ending or 'a file without ending'}")
@@ -260,8 +258,6 @@ def _run_mesher(name: str, vertices: np.ndarray, triangles: np.ndarray, length: 
     center = vertices.mean(axis=0)  # centre the surface: far from the origin digits are lost
     with tempfile.TemporaryDirectory(prefix="taisoft-") as folder:
         np.savez(Path(folder, "surface.npz"), vertices=vertices - center, triangles=triangles, numbers=(length, envelope))
-        try:
+        with reworded(MeshError, f"{name}: the mesher failed: "):
             found = run_child(folder, "mesh")
-        except MeshError as error:
-            raise MeshError(f"{name}: the mesher failed: {error}") from None
     return found["vertices"] + center, found["tets"]

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from taisoft.errors import MeshError, listed, value_text
+from taisoft.files import as_path
 from taisoft.mesh.placing import FROM_Y_UP
 from taisoft.mesh.safe_reading import SECONDS, SECONDS_PER_BYTE, WALL_FACTOR, read_content, run_child
 from taisoft.mesh.surface_mesh import SurfaceMesh, clean_surface, tetrahedralize
@@ -70,10 +71,7 @@ def read_usd_prim(path, prim: str | None = None, edge_length: float | None = Non
 
 def _read_prims(path, what: str, alone: bool, up: str) -> tuple[Path, dict[str, _Prim], list[str]]:
     """Return the file, its meshes by name, and notes about what is left out. Raises MeshError, if there are none too."""
-    try:
-        file = Path(path)
-    except TypeError as error:
-        raise MeshError(f"{what}: path must be a file's name, not {path!r}") from error
+    file = as_path(path, what, MeshError)
     if file.suffix.lower() not in USD_FORMATS:
         raise MeshError(f"{file}: a USD stage is read from {', '.join(USD_FORMATS)}, not from {file.suffix or 'no ending'}")
     if up not in FROM_Y_UP:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.sparse as sp
 
-from taisoft.errors import OutputError, SceneError
+from taisoft.errors import OutputError, SceneError, reworded
 from taisoft.output.camera import clip_polygon, start_positions
 from taisoft.scene.obstacles import Capsule, HalfSpace, Obstacle, Sphere
 
@@ -95,10 +95,8 @@ class ObstacleSurface:
 
     def at(self, t: float) -> np.ndarray:
         """Return the vertices (n,3) [m] at time t [s]. Raises OutputError if the obstacle's path fails."""
-        try:
+        with reworded(SceneError, "an obstacle cannot be shown: ", raised=OutputError):
             translation, rotation = self.obstacle.pose(t)
-        except SceneError as error:
-            raise OutputError(f"an obstacle cannot be shown: {error}") from error
         shape = self.obstacle.shape
         pivot, at = shape.pivot, shape.pivot + translation
         if isinstance(shape, HalfSpace) and self.obstacle.path is not None:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import scipy.sparse as sp
 
-from taisoft.errors import OutputError, SceneError
+from taisoft.errors import OutputError, SceneError, reworded
 from taisoft.scene.body import Body
 from taisoft.scene.connection_records import Attachment, Connection, Point
 from taisoft.scene.connections import locate_nodes
@@ -73,11 +73,9 @@ class ConnectionLines:
     def points(self, x: np.ndarray, t: float) -> np.ndarray:
         """All points (n,3) [m] of node positions x (n_nodes,3) at time t [s]. Raises OutputError if an obstacle's path fails."""
         points = self._matrix @ x
-        try:
+        with reworded(SceneError, raised=OutputError):
             for obstacle, rows, undisplaced in self._placed:
                 points[rows] = obstacle.points_at(t, undisplaced)
-        except SceneError as error:
-            raise OutputError(str(error)) from error
         return points
 
     @property

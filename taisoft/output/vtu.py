@@ -29,7 +29,6 @@ import base64
 import dataclasses
 import functools
 import zlib
-from pathlib import Path
 from typing import TYPE_CHECKING
 from xml.sax.saxutils import quoteattr
 
@@ -37,7 +36,7 @@ import numpy as np
 
 from taisoft.dynamics.readout import nodal_impulses
 from taisoft.errors import OutputError
-from taisoft.files import write_bytes
+from taisoft.files import as_path, write_bytes
 from taisoft.machine import require
 from taisoft.mesh.tet_mesh import VTK_ORDER
 from taisoft.output.camera import start_positions
@@ -64,10 +63,7 @@ def write_vtu(self: "Simulator", path) -> None:
     path: a name that ends in .vtu. `taisoft/output/vtu.py` and the manual's page on files list the data. Raises OutputError for
     another ending, or if the file cannot be written.
     """
-    try:
-        file = Path(path)
-    except TypeError as error:
-        raise OutputError(f"write_vtu: path must be a file's name, not {path!r}") from error
+    file = as_path(path, "write_vtu", OutputError)
     if file.suffix.lower() != ENDING:
         raise OutputError(f"{file}: the name of a VTK file of tets must end in {ENDING}")
     write_bytes(file, Grid(self.scene).encoded(self))

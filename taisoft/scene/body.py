@@ -9,7 +9,7 @@ from typing import ClassVar
 import numpy as np
 
 from taisoft.attributes import Guarded, guarded_record, thawed
-from taisoft.errors import MeshError, SceneError, value_text
+from taisoft.errors import MeshError, SceneError, reworded, value_text
 from taisoft.mesh import quadratic
 from taisoft.mesh.nodes import Nodes, make_nodes
 from taisoft.mesh.solids import is_closed
@@ -439,10 +439,8 @@ class Body(Guarded):
         for value in map(float, known):
             if not 0.0 <= value <= 1.0:
                 raise SceneError(f"{what}: an activation must lie from 0 to 1, not {value:g}")
-        try:
+        with reworded(MeshError, f"{what}: ", raised=SceneError):
             key = None if region is None else self.mesh.region_id(region)
-        except MeshError as error:
-            raise SceneError(f"{what}: {error}") from None
         with thawed(self):
             self.activations = tuple(
                 Activation(**given, region=one.region) if key in (None, one.region) else one for one in self.activations

@@ -10,7 +10,7 @@ from functools import cached_property
 
 import numpy as np
 
-from taisoft.errors import MeshError, SceneError, value_text
+from taisoft.errors import MeshError, SceneError, reworded, value_text
 from taisoft.mesh.tet_mesh import TetMesh
 from taisoft.scene import checks
 from taisoft.scene.fibres import directions
@@ -217,10 +217,8 @@ class Composition:
     def _check_moduli(self, what: str) -> None:
         """Raise SceneError if parameters by tet make a law unstable at rest."""
         if self.parameters and self.by_tet:
-            try:
+            with reworded(SceneError, f"{what}: "):
                 _ = self._moduli
-            except SceneError as error:
-                raise SceneError(f"{what}: {error}") from None
 
     def _tet_numbers(self, what: str, name: str, value) -> np.ndarray:
         """Return numbers (m,) of all tets, each of which a `Material` could have."""
@@ -244,10 +242,8 @@ class Composition:
         for name in numbers:
             if name not in allowed:
                 raise SceneError(f"{what}: {name} is one number for the whole body; {', '.join(allowed)} can differ by region")
-        try:
+        with reworded(MeshError, f"{what}: ", raised=SceneError):
             key = self.mesh.region_id(region)
-        except MeshError as error:
-            raise SceneError(f"{what}: {error}") from None
         for name in numbers:
             if self.has_regions and self._is_foreign(name, self.materials[key]):
                 law = self.materials[key].law
@@ -296,10 +292,8 @@ def _by_region(what: str, mesh: TetMesh, materials: Mapping) -> dict[int, Materi
         raise SceneError(f"{what}: materials are given by region, but its mesh has no regions")
     found: dict[int, Material] = {}
     for key, material in materials.items():
-        try:
+        with reworded(MeshError, f"{what}: material: ", raised=SceneError):
             region = mesh.region_id(key)
-        except MeshError as error:
-            raise SceneError(f"{what}: material: {error}") from None
         if not isinstance(material, Material):
             raise SceneError(
                 f"{what}: the material of region {value_text(key)} must be a Material, not {type(material).__name__}"
@@ -323,10 +317,8 @@ def _by_region(what: str, mesh: TetMesh, materials: Mapping) -> dict[int, Materi
 
 
 def _replaced(what: str, material: Material, numbers: dict) -> Material:
-    try:
+    with reworded(SceneError, f"{what}: ", without="material: "):  # of an argument
         return replace(material, **numbers) if numbers else material
-    except SceneError as error:  # of an argument
-        raise SceneError(f"{what}: {str(error).removeprefix('material: ')}") from None
 
 
 def _check_tets(what: str, array: np.ndarray, bad: np.ndarray, rule: str) -> None:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from taisoft.errors import SceneError
+from taisoft.errors import SceneError, reworded
 from taisoft.scene import checks
 from taisoft.scene.body import Body, Constraint
 from taisoft.scene.connection_records import MAX_OUTSIDE, Attachment, Point, Spring, Tendon
@@ -126,7 +126,7 @@ def check_connections(scene: "Scene") -> None:
         found = [_owner(scene, owner, what) for owner in one.owners]
         if not isinstance(one, Attachment):
             for k, (point, owner) in enumerate(zip(one.points, found)):
-                _check_inside(owner, point.position, f"{what}: point {k}")
+                check_inside(owner, point.position, f"{what}: point {k}")
             if isinstance(one, Tendon):
                 _check_distinct(scene, one.points, what)
         elif not isinstance(found[0], Body) or one.nodes.max() >= found[0].n_nodes:
@@ -240,22 +240,20 @@ def _point(scene: "Scene", end, what: str) -> Point:
         node = rows.start + checks.whole(end[1], f"{what}: the node", range(rows.stop - rows.start))
         return Point(owner.name, owner.rest_positions[node].copy())
     position = checks.array(end[1], f"{what}: the point", ((3,),))
-    _check_inside(owner, position, f"{what}: the point")
+    check_inside(owner, position, f"{what}: the point")
     return Point(owner.name, position)
 
 
-def _check_inside(owner, position: np.ndarray, what: str) -> None:
+def check_inside(owner, position: np.ndarray, what: str) -> None:
+    """Raise SceneError if a point (3,) [m] lies outside of a body at rest. what: the point, in messages."""
     if isinstance(owner, Body):
         _check_outside(locate(owner, position[None])[2], lambda _: what, owner)
 
 
 def _owner(scene: "Scene", name: str, what: str):
     """Return a body or an obstacle. Raises SceneError."""
-    try:
-        owner = scene.collider(name)
-    except SceneError as error:
-        raise SceneError(f"{what}: {str(error).removeprefix('scene: ')}") from None
-    return owner
+    with reworded(SceneError, f"{what}: ", without="scene: "):
+        return scene.collider(name)
 
 
 def _check_distinct(scene: "Scene", points: tuple[Point, ...], what: str) -> None:

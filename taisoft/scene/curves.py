@@ -13,8 +13,6 @@ Weak: an edge that crosses a strip of one element between two sharp edges has no
 """
 
 import numpy as np
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 
 from taisoft.errors import SceneError, value_text
 from taisoft.mesh import quadratic
@@ -22,7 +20,7 @@ from taisoft.mesh.nodes import PARTS, Nodes
 from taisoft.mesh.sdf import nearest_points
 from taisoft.mesh.surface_mesh import SurfaceMesh
 from taisoft.mesh.tet_mesh import TetMesh
-from taisoft.mesh.topology import HALF_EDGES, distinct_edges, normals_and_heights, triangle_edges
+from taisoft.mesh.topology import HALF_EDGES, distinct_edges, linked_groups, normals_and_heights, triangle_edges
 from taisoft.scene.obstacles import Capsule, Sphere
 
 Curve = str | Sphere | Capsule | SurfaceMesh
@@ -135,8 +133,7 @@ def _smooth(mesh: TetMesh) -> tuple[np.ndarray, np.ndarray]:
 
 def _corner_normals(corners: np.ndarray, same: np.ndarray, also: np.ndarray) -> np.ndarray:
     """Return the unit normals (3t,3) of the corners of faces (t,3,3). same, also: corners that share one, pair by pair."""
-    n, links = 3 * len(corners), (same.reshape(-1), also.reshape(-1))
-    group = connected_components(coo_matrix((np.ones(same.size), links), (n, n)), directed=False)[1]
+    group = linked_groups(same.reshape(-1), also.reshape(-1), 3 * len(corners))[1]
     to_next, to_last = np.roll(corners, -1, axis=1) - corners, np.roll(corners, 1, axis=1) - corners
     weight = np.einsum("tkx,tkx->tk", to_next, to_next) * np.einsum("tkx,tkx->tk", to_last, to_last)
     parts = (np.cross(to_next, to_last) / weight[..., None]).reshape(-1, 3)
@@ -154,11 +151,8 @@ def _along_sharp(x: np.ndarray, edges: np.ndarray) -> np.ndarray:
     tangent = _unit(2.0 * out / length**2 - total[start])
     turn = 1.0 - 0.5 * np.einsum("ex,ex->e", both, both)[start]  # cosine of the angle by which two edges turn
     corner = ((np.bincount(start)[start] != 2) | (turn < SHARP))[:, None]
-    along, other = (
-        out / length,
-        np.roll(tangent, n, axis=0),
-    )  # at the other end: from a corner, the arc leaves in its mirror image
-    tangent = np.where(corner, _mirrored(other, along), tangent)
+    along, other = out / length, np.roll(tangent, n, axis=0)  # at the other end
+    tangent = np.where(corner, _mirrored(other, along), tangent)  # an arc leaves a corner in the mirror image of its end
     level = np.einsum("ex,ex->e", tangent[:n] - tangent[n:], along[:n])[:, None]  # twice the mean cosine
     bulge = length[:n] * (tangent[:n] + tangent[n:]) / (4.0 + 2.0 * np.maximum(level, 0.0))
     return np.where(corner[:n] & corner[n:], 0.0, bulge)

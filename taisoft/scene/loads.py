@@ -7,7 +7,7 @@ from typing import ClassVar
 import numpy as np
 
 from taisoft.attributes import guarded_record
-from taisoft.errors import SceneError, SimulationError
+from taisoft.errors import SceneError, SimulationError, reworded
 from taisoft.scene import checks
 from taisoft.scene.key_frames import KeyFrames
 
@@ -140,10 +140,8 @@ def value_or_path(load, what: str, kind: str, shapes: tuple[tuple[int, ...], ...
     if isinstance(load, KeyFrames):
         if (load.values is None) != (() not in shapes):
             raise SceneError(f"{what}: {kind}: key frames need {'values' if () in shapes else 'translations'} here")
-        try:
+        with reworded(SceneError, f"{what}: {kind}: "):
             load = LoadPath(load)
-        except SceneError as error:
-            raise SceneError(f"{what}: {kind}: {error}") from None
     if not callable(load):
         return {"value": checks.array(load, f"{what}: {kind}", shapes)}
     return {"value": None, "path": load, "path_shape": _along(load, 0.0, what, kind, shapes).shape}
@@ -153,10 +151,8 @@ def value_at(load: Load, t: float, what: str) -> np.ndarray:
     """Return a load's value at t [s], (3,) or (k,3). what: start of messages. Raises SimulationError if its path fails."""
     if load.path is None:
         return load.value
-    try:
+    with reworded(SceneError, raised=SimulationError):
         return _along(load.path, t, what, load.kind, (load.path_shape,))
-    except SceneError as error:
-        raise SimulationError(str(error)) from error.__cause__
 
 
 def _along(path: Callable, t: float, what: str, kind: str, shapes: tuple[tuple[int, ...], ...]) -> np.ndarray:

@@ -13,7 +13,7 @@ import numpy as np
 
 from taisoft.attributes import guarded_record
 from taisoft.display import short_repr
-from taisoft.errors import MeshError, SceneError, reason, value_text
+from taisoft.errors import MeshError, SceneError, reason, reworded, value_text
 from taisoft.mesh.shapes import box_mesh
 from taisoft.mesh.surface_mesh import SurfaceMesh
 from taisoft.mesh.topology import normals_and_heights, opposite_half_edges
@@ -171,7 +171,7 @@ class MeshObstacle(Shape):
 
     def __post_init__(self):
         vertices = checks.array(self.vertices, "mesh obstacle: vertices", ((max(checks.length(self.vertices), 3), 3),))
-        try:
+        with reworded(MeshError, "mesh obstacle: ", raised=SceneError, without="mesh obstacle: "):
             triangles = SurfaceMesh(vertices, self.triangles, "mesh obstacle").triangles
             flat = np.flatnonzero(~(normals_and_heights(vertices, triangles)[1] > DEGENERATE))
             if len(flat):
@@ -180,8 +180,6 @@ class MeshObstacle(Shape):
                     f"({len(flat)} such triangles; the smallest height must exceed {DEGENERATE:g} of the longest edge)"
                 )
             opposite_half_edges(triangles)
-        except MeshError as error:
-            raise SceneError(f"mesh obstacle: {str(error).removeprefix('mesh obstacle: ')}") from None
         checks.store(self, vertices=vertices, triangles=triangles, _mean=vertices.mean(axis=0))
 
     @property

@@ -37,6 +37,7 @@ from pathlib import Path
 import numpy as np
 
 from taisoft.errors import SceneError
+from taisoft.files import as_path
 from taisoft.mesh.safe_reading import UTF16, utf16_head
 from taisoft.mesh.surface_mesh import SurfaceMesh
 from taisoft.mesh.tet_mesh import TetMesh
@@ -92,10 +93,7 @@ def read_scene(path, allow_outside: bool = False) -> tuple[Scene, dict]:
     path: the file. allow_outside: allow mesh files outside its folder and in any format that meshio reads. Raises SceneError
     or MeshError with the file, the key path, and the rule. Warnings point to the line of the caller.
     """
-    try:
-        file = Path(path)
-    except TypeError as error:
-        raise SceneError(f"read_scene: path must be a file's name, not {path!r}") from error
+    file = as_path(path, "read_scene", SceneError)
     found: list[warnings.WarningMessage] = []
     try:
         with warnings.catch_warnings(record=True) as found:

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from taisoft.errors import OutputError, SceneError
+from taisoft.errors import OutputError, SceneError, reworded
 from taisoft.files import write_bytes
 from taisoft.mesh.files import write_mesh
 from taisoft.mesh.tet_mesh import TetMesh
@@ -129,10 +129,8 @@ def _solver(solver: dict) -> dict:
         plain[key] = float(value) if isinstance(value, Real) and not isinstance(value, int) else value
     for key in plain:
         checks.index(key, SOLVER_CHECKS, "solver: no setting")
-    try:
+    with reworded(SceneError, "solver: "):
         check_solver(**plain)
-    except SceneError as error:
-        raise SceneError(f"solver: {error}") from None
     for name, one in plain.get("quantities", {}).items():
         if callable(one):
             raise SceneError(f"solver: quantity {name!r} is a function, which a file cannot store: use a text")

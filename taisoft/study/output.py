@@ -11,6 +11,7 @@ import numpy as np
 
 from taisoft.errors import OutputError
 from taisoft.files import write_bytes
+from taisoft.output.files import output_errors
 from taisoft.output.report import json_text
 from taisoft.output.tables import require_matplotlib, save, ticks
 from taisoft.study.accuracy import Row
@@ -63,10 +64,8 @@ def write(study: Study, folder: Path) -> str:
             _draw(study, rows, picture)
             return ""
         reason = "study.png is not drawn, because no setting has both a time and an error"
-    try:
+    with output_errors(f"cannot remove the earlier {picture}"):
         picture.unlink(missing_ok=True)  # from an earlier study: the folder holds only one
-    except OSError as error:
-        raise OutputError(f"cannot remove the earlier {picture}: {error.strerror or error}") from error
     return reason
 
 

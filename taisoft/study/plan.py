@@ -9,11 +9,11 @@ the error in space of all runs.
 import itertools
 import math
 from collections.abc import Callable, Iterable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from fractions import Fraction
 
 from taisoft.dynamics.schemes import EXPLICIT, INTEGRATORS
-from taisoft.errors import SceneError, TaisoftError
+from taisoft.errors import SceneError, TaisoftError, reworded
 from taisoft.estimation.order import nominal_order
 from taisoft.scene.scene import Scene
 from taisoft.settings import WITH_MULTIPLIERS, check_settings, kept_by_multipliers
@@ -33,14 +33,6 @@ EXPLICIT_DT_RATIO = 16  # explicit references may use steps this many times smal
 Variant = Callable[[int, int | None], Scene]  # (refine, order) -> scene
 
 
-@dataclass(frozen=True)
-class Case:
-    """A combination, and why it is not run (empty if it is)."""
-
-    setting: Setting
-    refused: str = ""
-
-
 def complete(given: dict[str, list], solver: dict) -> dict[str, list]:
     """Return all axes: as given, else from the scene's solver dict; dt and integrator default to several around the scene's."""
     own = DEFAULTS | {"dt": 1 / 60, "integrator": "implicit_euler"} | solver
@@ -55,26 +47,6 @@ def expand(axes: dict[str, list]) -> list[Setting]:
     axes = axes | {"dt": sorted(axes["dt"], reverse=True)}
     keys = [*FIRST_AXES, *(key for key in AXES if key not in FIRST_AXES and key != "dt"), "dt"]
     return [Setting(**dict(zip(keys, values))) for values in itertools.product(*(axes[key] for key in keys))]
-
-
-def cases(
-    settings: Iterable[Setting], refusal: Callable[[Setting], str], unused: Callable[[Setting], dict[str, str]]
-) -> list[Case]:
-    """Return a case for every setting; of settings that differ only in unused axes, only the first is run.
-
-    refusal: why a setting cannot be run, or an empty text. unused: axes that a setting does not use -> why.
-    """
-    found: list[Case] = []
-    first: dict[tuple, Setting] = {}
-    for setting in settings:
-        reason = refusal(setting)
-        if not reason:
-            unused_axes = unused(setting)
-            same = first.setdefault(tuple(v for name, v in asdict(setting).items() if name not in unused_axes), setting)
-            differing = [name for name in unused_axes if getattr(setting, name) != getattr(same, name)]
-            reason = f"the same run as one above: {unused_axes[differing[0]]}" if differing else ""
-        found.append(Case(setting, reason))
-    return found
 
 
 def frame_time(steps: Iterable[float], seconds: float) -> tuple[float, int]:
@@ -120,11 +92,11 @@ class Planner:
     def plan(self) -> dict:
         """Return the plan; see `make_plan`."""
         base = self._scene((0, None))
-        found = cases(expand(complete(self._request["axes"], self._solver)), self.refusal, self.unused)
-        settings = [case.setting for case in found if not case.refused]
+        refused = {one: self.refusal(one) for one in expand(complete(self._request["axes"], self._solver))}
+        settings = [one for one, why in refused.items() if not why]
         plan = {
             "fixed": self.fixed,
-            "cases": [asdict(case) for case in found],
+            "cases": [{"setting": asdict(one), "refused": why} for one, why in refused.items()],
             "touching": self._touches(base),
             "frame": None,
             "frames": 0,
@@ -152,15 +124,6 @@ class Planner:
             return ""
         return f"dt = {setting.dt:.3g} s is above the stability limit of {setting.integrator}, {limit:.3g} s"
 
-    def unused(self, setting: Setting) -> dict[str, str]:
-        """Return the axes that a setting does not use, and why."""
-        unused_axes = {}
-        if setting.integrator in EXPLICIT:
-            unused_axes |= dict.fromkeys(("newton_tolerance", "linear_tolerance"), f"{setting.integrator} solves no equations")
-        if not self._touches(self._scene(setting.mesh)):
-            unused_axes |= dict.fromkeys(("contact_solver", "contact_tolerance"), "nothing can come into contact in this scene")
-        return unused_axes
-
     def _references(self, settings: list[Setting], target: float, frame: float) -> dict:
         """Return the references of the settings' meshes, and the index of the one for errors in space, or None."""
         extra = self._request["reference_refine"]
@@ -183,7 +146,7 @@ class Planner:
     def _reference(self, mesh: tuple, kind: str, target: float, frame: float) -> dict:
         """Return a setting with its steps per frame, an even number. Errors name it: the user may not have requested it."""
         refine, order = mesh
-        try:
+        with reworded(TaisoftError, f"the reference ({mesh_name({'refine': refine, 'order': order})}): ", raised=SceneError):
             scene = self._scene(mesh)
             integrator = self._integrator(scene, mesh, kind, target)
             steps = 2 * math.ceil(frame / target / 2 - 1e-9)
@@ -197,8 +160,6 @@ class Planner:
                 steps = max(steps, 2 * math.ceil(frame / limit))
             setting = Setting(frame / steps, integrator, order, refine, "f64")
             self._check(scene, setting)
-        except TaisoftError as error:
-            raise SceneError(f"the reference ({mesh_name({'refine': refine, 'order': order})}): {error}") from error
         order_in_time = nominal_order(integrator, scene, self._touches(scene))
         return {"setting": asdict(setting), "kind": kind, "order_in_time": order_in_time, "steps": steps}
 

@@ -138,7 +138,7 @@ def _run_table(study: Study, rows: list[Row]) -> str:
     if study.plan["touching"]:
         columns["penetration/edge"] = lambda r: _number(r.penetration)
         columns["contact residual"] = lambda r: _number(r.contact_residual)
-    columns |= {"unconverged": lambda r: _count(r.unconverged), "inverted": lambda r: _count(r.inverted)}
+    columns |= {"unconverged": lambda r: _number(r.unconverged), "inverted": lambda r: _number(r.inverted)}
     columns["status"] = lambda r: r.status
     left = [k for k, name in enumerate(columns) if name in LEFT_ALIGNED]
     return markdown(list(columns), [[cell(row) for cell in columns.values()] for row in rows], left=left)
@@ -201,12 +201,8 @@ def _axis(value) -> str:
     return "adaptive" if value is None else f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
-def _number(value: float | None) -> str:
-    return "" if value is None else f"{value:.2g}"
-
-
-def _count(value: int | None) -> str:
-    return "" if value is None else str(value)
+def _number(value: float | int | None) -> str:
+    return "" if value is None else str(value) if isinstance(value, int) else f"{value:.2g}"
 
 
 def csv_of(study: Study) -> str:

@@ -11,6 +11,7 @@ from contextlib import suppress
 from multiprocessing.connection import Connection
 
 from taisoft.errors import OutputError, TaisoftError, no_memory
+from taisoft.output.files import output_errors
 from taisoft.processes import how_it_ended, start_python
 from taisoft.view.link import Link, LinkClosed, SharedNodes
 
@@ -27,10 +28,8 @@ class ChildProcess:
 
     def __init__(self, command: tuple[str, ...], description: dict, failure: str, n_nodes: int, slots: int = 1):
         self._process: subprocess.Popen | None = None
-        try:
+        with output_errors(f"{failure}: no memory can be shared with its process"):
             self.link, other = Link.pair(n_nodes, slots)
-        except OSError as error:
-            raise OutputError(f"{failure}: no memory can be shared with its process: {error.strerror or error}") from error
         try:
             descriptors = (other.fileno(), self.link.nodes.descriptor)
             self._process = start_python(*command, *map(str, descriptors), pass_fds=descriptors)

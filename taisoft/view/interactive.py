@@ -17,8 +17,8 @@ from taisoft.errors import OutputError
 from taisoft.output.appearance import OBSTACLE_COLOUR, compact_surface, linear_rgb, obstacle_surfaces
 from taisoft.output.camera import Camera, framed_points
 from taisoft.scene.obstacles import HalfSpace
-from taisoft.view.colouring import Colouring, checked_colour
-from taisoft.view.notebook import framed, write_page
+from taisoft.view.colouring import Colouring
+from taisoft.view.notebook import FramesOnPage
 from taisoft.view.scene_view import Surfaces
 
 HEIGHT = 420  # of the view in a notebook [pixels]
@@ -37,7 +37,7 @@ def _quiet() -> Iterator[None]:
         console.quiet = before
 
 
-class InteractiveView:
+class InteractiveView(FramesOnPage):
     """Bodies and obstacles over time, in 3-D.
 
     `sim.run(seconds, on_frame=view)` adds a frame each; `view(sim)` adds the present state. colour: as for `Simulator.picture`,
@@ -47,9 +47,7 @@ class InteractiveView:
     def __init__(self, colour: str = "stress"):
         if find_spec("viser") is None:
             raise OutputError(MISSING)
-        self.colour = checked_colour(colour)
-        self.times: list[float] = []  #: of the frames [s]
-        self.scales: list[str] = []  #: what red means in each of them, empty for own colours
+        super().__init__(colour, HEIGHT)
         self._frames: list[tuple[np.ndarray, np.ndarray]] = []  # vertices and colours of bodies
         self._moved: list[dict[int, np.ndarray]] = []  # vertices of the obstacles that move, by number
         self._scene = None
@@ -68,17 +66,6 @@ class InteractiveView:
         self._moved.append({number: one.at(sim.time).astype(np.float32) for number, one in moving})
         self.scales.append(self._colouring.scale_text)
         self.times.append(sim.time)
-
-    def __len__(self) -> int:
-        return len(self.times)
-
-    def __bool__(self) -> bool:
-        return True
-
-    def __repr__(self) -> str:
-        return f"InteractiveView({len(self)} frames" + (
-            f", t = {self.times[0]:.6g} to {self.times[-1]:.6g} s)" if self.times else ")"
-        )
 
     def as_html(self) -> str:
         """Return a page with the view, which any browser shows without a network. Raises OutputError if there is no frame."""
@@ -99,13 +86,6 @@ class InteractiveView:
         """Return a line over the view that says what red means in the last frame, and whether earlier ones had another scale."""
         text = self.scales[-1] + (", at the end" if len(set(self.scales)) > 1 else "")
         return f'<div style="{SCALE_STYLE}">{html.escape(text)}</div>' if text else ""
-
-    def save(self, path) -> None:
-        """Write a page with the view. Raises OutputError."""
-        write_page(path, self.as_html())
-
-    def _repr_html_(self) -> str | None:
-        return framed(self.as_html(), HEIGHT) if self._frames else None
 
     def _recorded(self, server):
         """Put the frames on a server; return viser's recording of them.

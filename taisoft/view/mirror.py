@@ -11,7 +11,7 @@ from types import SimpleNamespace
 import numpy as np
 import scipy.sparse as sp
 
-from taisoft.errors import OutputError, SceneError, SimulationError
+from taisoft.errors import OutputError, SceneError, SimulationError, reworded
 from taisoft.records import Energies
 from taisoft.scene import checks
 from taisoft.scene.loads import value_at
@@ -104,14 +104,12 @@ def describe_state(sim, marks: ConnectionMarks, layers: set[str]) -> dict:
 
     marks: as for `describe_scene`; layers: those that are visible. Raises OutputError if a path fails.
     """
-    try:
+    with reworded((SceneError, SimulationError), "the scene cannot be shown: ", raised=OutputError):
         poses = {o.name: o.pose(sim.time) for o in sim.scene.obstacles if o.path is not None}
         loads = [(t, body.name) for body in sim.scene.bodies for t in body.tractions if "tractions" in layers]
         tractions = [value_at(t, sim.time, name) for t, name in loads]
         segments = marks.segments(sim) if "connections" in layers else None
         pressures = marks.pressures(sim) if "pressures" in layers else []
-    except (SceneError, SimulationError) as error:
-        raise OutputError(f"the scene cannot be shown: {error}") from error
     energies = sim.energies()
     state = {
         "time": sim.time,

@@ -67,18 +67,51 @@ def write_page(path, page: str) -> None:
     write_bytes(file, page.encode())
 
 
-class Film:
+class FramesOnPage:
+    """Frames of a run on a page of HTML, which notebooks show and any browser shows without a network.
+
+    colour: as for `Simulator.picture`; height: of the page [pixels]. A subclass has `as_html()`, and is called with a simulator
+    to add a frame. Raises OutputError for another colour.
+    """
+
+    word = "frames"
+
+    def __init__(self, colour: str, height: int):
+        self.colour, self._height = checked_colour(colour), height
+        self.times: list[float] = []  #: of the frames [s]
+        self.scales: list[str] = []  #: what red means in each of them, empty for own colours and pictures from a disk
+
+    def __len__(self) -> int:
+        return len(self.times)
+
+    def __bool__(self) -> bool:
+        return True
+
+    def __repr__(self) -> str:
+        until = f", t = {self.times[0]:.6g} to {self.times[-1]:.6g} s" if self.times else ""
+        return f"{type(self).__name__}({len(self)} {self.word}{until})"
+
+    def save(self, path) -> None:
+        """Write the page. Raises OutputError."""
+        write_page(path, self.as_html())
+
+    def _repr_html_(self) -> str | None:
+        return framed(self.as_html(), self._height) if self.times else None
+
+
+class Film(FramesOnPage):
     """Pictures of a run, and a player for them in notebooks and static pages.
 
     `sim.run(seconds, on_frame=film)` adds a picture a frame; `film(sim)` adds one of the present state. size: width and height in
     pixels; colour: as for `Simulator.picture`, on one scale for all pictures. Raises OutputError for another size or colour.
     """
 
+    word = "pictures"
+
     def __init__(self, size: tuple[int, int] = SIZE, colour: str = "stress"):
-        self.size, self.colour = checked_size(size), checked_colour(colour)
-        self.times: list[float] = []  #: of the pictures [s]
+        self.size = checked_size(size)
+        super().__init__(colour, self.size[1] + 84)
         self.pngs: list[bytes] = []  #: the pictures
-        self.scales: list[str] = []  #: what red means in each of them, empty for own colours and pictures from a disk
         self._drawing: Offscreen | None = None
         self._scene = None
 
@@ -110,28 +143,12 @@ class Film:
         self.scales.append(self._drawing.colouring.scale_text)
         self.times.append(sim.time)
 
-    def __len__(self) -> int:
-        return len(self.pngs)
-
-    def __bool__(self) -> bool:
-        return True
-
-    def __repr__(self) -> str:
-        return f"Film({len(self)} pictures" + (f", t = {self.times[0]:.6g} to {self.times[-1]:.6g} s)" if self.times else ")")
-
     def as_html(self) -> str:
         """Return a page with the player. Raises OutputError if there is no picture."""
         if not self.pngs:
             raise OutputError("the film holds no picture: pass it to sim.run(seconds, on_frame=film)")
         numbers = {"times": self.times, "scales": self.scales, "pictures": [_data_url(png) for png in self.pngs]}
         return PLAYER.replace("DATA", json.dumps(numbers))
-
-    def save(self, path) -> None:
-        """Write a page with the player, which any browser shows without a network. Raises OutputError."""
-        write_page(path, self.as_html())
-
-    def _repr_html_(self) -> str | None:
-        return framed(self.as_html(), self.size[1] + 84) if self.pngs else None
 
 
 PLAYER = """<!DOCTYPE html>

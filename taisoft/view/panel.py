@@ -85,8 +85,10 @@ class Panel:
         for action, text in names.items():
             if gui.button(f"{text}###{action}"):
                 self.pressed.add(action)
-        self._logarithmic(gui, "dt", f"dt {values['dt']:.3g} s", values["dt"], values["dt_ends"])
-        self._slider(gui, "gravity", "g {:.3g} m/s2", values["gravity"], (0.0, values["max_gravity"]))
+        dt, ends = self._present("dt", math.log10(values["dt"])), map(math.log10, values["dt_ends"])
+        self._slider(gui, "dt", f"dt {values['dt']:.3g} s", dt, ends, "set_dt", convert=lambda new: 10.0**new)
+        g = self._present("gravity", values["gravity"])
+        self._slider(gui, "gravity", f"g {g:.3g} m/s2", g, (0.0, values["max_gravity"]), "set_gravity")
         self._materials(gui, values)
         if self._pairs:
             self._all_frictions(gui, values["friction"])
@@ -103,62 +105,47 @@ class Panel:
 
     # --- sliders ------------------------------------------------------------------------------------------------------
 
-    def _present(self, name: str, value: float) -> float:
+    def _present(self, key: str, value: float) -> float:
         """Return a slider's value: the one set until the simulation has answered."""
-        if name in self._set and self._set[name][1] <= self._state["answered"]:
-            del self._set[name]
-        return self._set[name][0] if name in self._set else value
+        if key in self._set and self._set[key][1] <= self._state["answered"]:
+            del self._set[key]
+        return self._set[key][0] if key in self._set else value
 
-    def _moved(self, gui, name: str, label: str, value: float, ends: tuple[float, float]) -> float | None:
-        """Declare a slider; return the new value if it was moved."""
-        new = gui.slider_float(f"{label}###{name}", value, *ends)
-        if not changed(new, value):
-            return None
-        self._set[name] = (new, self._requests.next_number)
-        return new
+    def _slider(self, gui, name: str, label: str, present: float, ends, *command, of: str = "", convert=float) -> None:
+        """Declare a slider, and request its change: a command and its arguments, of which the converted new value is the last.
 
-    def _slider(self, gui, name: str, label: str, value: float, ends: tuple[float, float]) -> None:
-        present = self._present(name, value)
-        new = self._moved(gui, name, label.format(present), present, ends)
-        if new is not None:
-            self._requests.add(f"set_{name}", new, key=name)
-
-    def _logarithmic(self, gui, name: str, label: str, value: float, ends: tuple[float, float]) -> None:
-        present = self._present(name, math.log10(value))
-        new = self._moved(gui, name, label, present, (math.log10(ends[0]), math.log10(ends[1])))
-        if new is not None:
-            self._requests.add(f"set_{name}", 10.0**new, key=name)
+        of: what the value belongs to, if that changes; its key is name + of.
+        """
+        low, high = ends
+        new = gui.slider_float(f"{label}###{name}", present, low, max(high, present))
+        if changed(new, present):
+            self._set[name + of] = (new, self._requests.next_number)
+            self._requests.add(*command, convert(new), key=name + of)
 
     def _materials(self, gui, values: dict) -> None:
         """Declare sliders of Young's modulus and density, of the chosen body or of all."""
         if len(self._bodies) > 1 and gui.button(("all bodies" if self._all_bodies else self.chosen) + "###which"):
             self._all_bodies = not self._all_bodies
         shown = [self.chosen, *(self._bodies if self._all_bodies else ())]
-        for what, decades in DECADES.items():
+        for what in DECADES:
             ranges = dict(zip(self._bodies, values[what]))
-            known = [name for name in shown if ranges[name] is not None]  # rigid bodies have none
-            if not known:
-                continue
-            low, high, exponent = ranges[known[0]]
-            text = f"{low:.4g}" if f"{low:.4g}" == f"{high:.4g}" else f"{low:.3g} to {high:.3g}"
-            initial = math.log10(high) - exponent
-            name = f"{what} of {known[0]}"
-            present = self._present(name, math.log10(high))
-            label, ends = f"{TITLE[what]} {text} {UNIT[what]}", (initial - decades, initial + decades)
-            new = gui.slider_float(f"{label}###{what}", present, *ends)
-            if changed(new, present):
-                self._set[name] = (new, self._requests.next_number)
-                names = [one for one in self._bodies if one in known]
-                self._requests.add("set_number", what, names, new - initial, key=name)
+            if known := [name for name in shown if ranges[name] is not None]:  # rigid bodies have none
+                self._material(gui, what, known, *ranges[known[0]])
+
+    def _material(self, gui, what: str, names: list[str], low: float, high: float, exponent: float) -> None:
+        """Declare a slider of a number of bodies, which shows that of the first."""
+        text = f"{low:.4g}" if f"{low:.4g}" == f"{high:.4g}" else f"{low:.3g} to {high:.3g}"
+        initial, of = math.log10(high) - exponent, f" of {names[0]}"
+        present, ends = self._present(what + of, math.log10(high)), (initial - DECADES[what], initial + DECADES[what])
+        command = "set_number", what, [one for one in self._bodies if one in names]
+        label = f"{TITLE[what]} {text} {UNIT[what]}"
+        self._slider(gui, what, label, present, ends, *command, of=of, convert=lambda new: new - initial)
 
     def _all_frictions(self, gui, frictions: list[float]) -> None:
         """Declare a slider that sets the friction of all pairs; it shows the largest one."""
         low, high = f"{min(frictions):.2f}", f"{max(frictions):.2f}"
-        present = self._present("friction", max(frictions))
-        label = f"mu {low if low == high else f'{low}-{high}'}"
-        new = self._moved(gui, "friction", label, present, (0.0, max(MAX_FRICTION, present)))
-        if new is not None:
-            self._requests.add("set_friction", None, new, key="friction")
+        present, label = self._present("friction", max(frictions)), f"mu {low if low == high else f'{low}-{high}'}"
+        self._slider(gui, "friction", label, present, (0.0, MAX_FRICTION), "set_friction", None)
 
     # --- sections -----------------------------------------------------------------------------------------------------
 
@@ -179,9 +166,7 @@ class Panel:
         for k, (pair, friction) in enumerate(zip(self._pairs[:MAX_PAIRS], frictions)):
             name = f"friction {k}"
             present = self._present(name, friction)
-            new = self._moved(gui, name, f"{present:.2f} {pair[0]}, {pair[1]}", present, (0.0, max(MAX_FRICTION, present)))
-            if new is not None:
-                self._requests.add("set_friction", k, new, key=name)
+            self._slider(gui, name, f"{present:.2f} {pair[0]}, {pair[1]}", present, (0.0, MAX_FRICTION), "set_friction", k)
         if len(self._pairs) > MAX_PAIRS:
             gui.text(f"and {len(self._pairs) - MAX_PAIRS} more pairs")
 

@@ -26,8 +26,6 @@ COLOURS = (BLUE, ORANGE, GREEN, DARK)  # of a plot with curves by pair or body, 
 GRID_LINES = 4  # at most, between the ends of an axis
 MIN_SPAN = 1e-200  # values that span less count as constant
 MAX_DECADES = 12  # of a logarithmic axis; smaller values, and zero, lie on its lower end
-
-
 OF_PAIRS = {"forces": "contact_force", "torques": "contact_torque"}  # plot by pair -> query
 CAPACITY = 256  # bins, an even number
 ENERGIES = ("kinetic", "elastic", "gravity")  # [J]

@@ -11,7 +11,7 @@ import pytest
 import taisoft as ts
 from taisoft.fem import reference
 from taisoft.fem.loads import SceneLoads
-from taisoft.mesh.quadratic import shape_functions
+from taisoft.mesh import quadratic
 from taisoft.mesh.topology import EDGES
 from tests.dynamics.scenes import built, cube, driven_scene, mixed_scene, rubber
 from tests.fem.composition import composition
@@ -44,21 +44,21 @@ def polynomial(order: int):
 def test_nodes_and_shape_functions(order):
     made, expected = body(order), Elements(body(order).mesh, order)
     assert np.array_equal(made.rest_positions, expected.X) and np.array_equal(made.nodes.elements, expected.tets)
-    N, s = shape_functions(order, POINTS), reference.shape_derivatives(order, POINTS)
+    N, s = quadratic.shape_functions(order, POINTS), quadratic.shape_derivatives(order, POINTS)
     assert N.shape == (20, (4, 10)[order - 1]) and np.abs(N.sum(axis=1) - 1).max() < 1e-15
     at_nodes = np.concatenate([np.eye(4), [(np.eye(4)[a] + np.eye(4)[b]) / 2 for a, b in EDGES]])[: N.shape[1]]
-    assert np.array_equal(shape_functions(order, at_nodes), np.eye(N.shape[1]))
+    assert np.array_equal(quadratic.shape_functions(order, at_nodes), np.eye(N.shape[1]))
     h = 1e-6
     for k in range(4):  # N is a polynomial in all four coordinates
         step = h * np.eye(4)[k]
-        change = shape_functions(order, POINTS + step) - shape_functions(order, POINTS - step)
+        change = quadratic.shape_functions(order, POINTS + step) - quadratic.shape_functions(order, POINTS - step)
         assert np.abs(s[:, :, k] - change / (2 * h)).max() < 1e-9
 
 
 @pytest.mark.parametrize("degree, exact, count", [(1, 1, 1), (2, 2, 4), (4, 5, 14)])
 def test_quadrature(degree, exact, count):
     """The integral of l_0^a l_1^b l_2^c l_3^d over a tet is 6 V a! b! c! d! / (a + b + c + d + 3)!."""
-    rule = reference.quadrature(degree)
+    rule = quadratic.quadrature(degree)
     assert rule.points.shape == (count, 4) and rule.weights.shape == (count,)
     assert rule.weights.min() > 0 and rule.points.min() > 0 and rule.points.sum(axis=1) == pytest.approx(1, abs=1e-15)
     for powers in product(range(exact + 1), repeat=4):
@@ -73,9 +73,9 @@ def test_polynomials_of_the_elements_order(order, degree):
     corners, u = made.mesh.vertices[made.mesh.tets], field(made.rest_positions)
     g, volumes = reference.shape_gradients(made)
     found = np.einsum("eai,epaj->epij", u[made.nodes.elements], g)
-    assert np.abs(found - gradient(reference.quadrature(made.quadrature_degree).points @ corners)).max() < 1e-13
+    assert np.abs(found - gradient(quadratic.quadrature(made.quadrature_degree).points @ corners)).max() < 1e-13
     assert volumes.sum() == pytest.approx(1.0 * 0.9 * 1.1) and volumes.min() > 0
-    rule, M = reference.quadrature(4), reference.consistent_mass(made)
+    rule, M = quadratic.quadrature(4), reference.consistent_mass(made)
     values = field(rule.points @ corners)
     exact = 1200 * np.einsum("e,p,epi,epi->", made.mesh.volumes, rule.weights, values, values)
     assert np.sum(u * (M @ u)) == pytest.approx(exact, rel=1e-13)

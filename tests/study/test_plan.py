@@ -1,6 +1,6 @@
 """The plan of a study, made without running the scene:
 
-* the grid is the product of the axes; combinations that are invalid or repeat another run stay in the list with the reason;
+* the grid is the product of the axes; combinations that are invalid stay in the list with the reason;
 * frames are common multiples of all steps;
 * references are of second order, respect the explicit limit, and there is one for each mesh and, with quadratic tets, for each
   kind of mass; the finest mesh's reference is that for errors in space.
@@ -125,15 +125,15 @@ def test_settings_that_cannot_be_run_stay_in_the_list_with_the_reason():
     reasons = {(s.refine, s.integrator, s.dt, s.newton_tolerance): c["refused"] for s, c in zip(settings, plan["cases"])}
     large = reasons[0, "velocity_verlet", 0.1, None]
     assert large.startswith("dt = 0.1 s is above the stability limit of velocity_verlet, 0.0")
-    assert reasons[0, "velocity_verlet", 0.1, 1e-3] == large and reasons[0, "velocity_verlet", 0.01, None] == ""
-    assert reasons[0, "velocity_verlet", 0.01, 1e-3] == "the same run as one above: velocity_verlet solves no equations"
+    assert reasons[0, "velocity_verlet", 0.1, 1e-3] == large
+    assert reasons[0, "velocity_verlet", 0.01, None] == reasons[0, "velocity_verlet", 0.01, 1e-3] == ""
     assert not any(reason for (refine, name, *_), reason in reasons.items() if (refine, name) == (0, "bdf2"))
     assert all("choose by a function" in reason for (refine, *_), reason in reasons.items() if refine)
     with pytest.raises(SceneError, match=r"^the reference \(refine 1\): body 'bar'"):
         plan_of(bar_scene(fixed_by_ids=True), {"dt": [0.01], "integrator": ["bdf2"]}, reference_refine=1)
 
 
-def test_settings_unfit_for_contacts_or_without_effect_are_refused():
+def test_settings_unfit_for_contacts_are_refused():
     axes = {"dt": [0.01], "integrator": ["implicit_euler", "implicit_midpoint"], "contact_solver": ["auto", "jacobi"]}
     plan = plan_of(bar_scene(ground=True), axes)
     reasons = [case["refused"] for case in plan["cases"]]
@@ -141,9 +141,6 @@ def test_settings_unfit_for_contacts_or_without_effect_are_refused():
     assert sum("implicit_midpoint does not support contacts" in r for r in reasons) == 2 and reasons.count("") == 1
     assert plan["touching"] and plan["references"][0]["setting"]["integrator"] == "bdf2"
     assert plan["references"][0]["order_in_time"] == 1
-    axes = {"dt": [0.01], "integrator": ["velocity_verlet"], "contact_tolerance": [None, 1e-2]}
-    reasons = [case["refused"] for case in plan_of(bar_scene(), axes)["cases"]]
-    assert reasons[0] == "" and "nothing can come into contact in this scene" in reasons[1] and len(reasons) == 2
 
 
 @pytest.mark.parametrize("dt, density, integrator", [(0.01, 1000.0, "velocity_verlet"), (1.6, 1.0, "implicit_midpoint")])
