@@ -15,7 +15,7 @@ from taisoft.scene.scene import Scene
 
 IMPLICIT_CONTACT = ("augmented_lagrangian",)
 # Integrators that can keep the volume of a cavity or the length of a tendon: others fix the forces before the end of a step
-WITH_MULTIPLIERS = ("implicit_euler", "bdf2", STATIC)
+WITH_MULTIPLIERS = ("implicit_euler", "bdf2")
 CONTACT_SOLVERS = ("auto", *EXPLICIT_CONTACT, *IMPLICIT_CONTACT)
 
 
@@ -132,7 +132,7 @@ def _check_static(settings: Settings, scene: Scene) -> Settings:
 def _check_multipliers(settings: Settings, scene: Scene) -> None:
     """Raise SimulationError unless the integrator can keep given volumes and lengths."""
     given = kept_by_multipliers(scene)
-    if given and (settings.integrator not in WITH_MULTIPLIERS or settings.tolerance is not None):
+    if given and (settings.integrator not in (*WITH_MULTIPLIERS, STATIC) or settings.tolerance is not None):
         instead = " or ".join(WITH_MULTIPLIERS)
         raise SimulationError(f"{given[0]} needs integrator {instead}, without a tolerance of the run")
 
