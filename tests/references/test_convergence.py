@@ -85,6 +85,7 @@ def irregular() -> ts.TetMesh:
 def solved(request) -> tuple[int, dict[tuple, Case], StaticResult]:
     """The order, cases by (name, cells along x), and the result."""
     scene, cases, order = ts.Scene(gravity=(0, 0, 0)), {}, request.param
+    scene.contact_forces = False
 
     def add(name: str, cells: int, mesh: ts.TetMesh, young: float) -> Case:
         body = scene.add_body(mesh, rubber(SNH, young=young, poisson=POISSON), **element(order, 2))

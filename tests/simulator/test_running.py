@@ -22,7 +22,8 @@ class StandIn:
     """A simulator that only counts steps; `events` maps a step to an exception or to fields of its report."""
 
     def __init__(self, explicit: bool, dt: float = 0.01, events=None, largest_batch: int = 4):
-        self.settings, self.touches = SimpleNamespace(explicit=explicit, integrator="symplectic_euler", tolerance=None), False
+        self.settings = SimpleNamespace(explicit=explicit, static=False, integrator="symplectic_euler", tolerance=None)
+        self.touches = False
         self.dt, self.step_count, self.time, self.compile_seconds = dt, 0, 0.0, 0.0
         self.events, self.largest_batch = events or {}, largest_batch
         self.contact = SimpleNamespace(contact_offset=0.01)

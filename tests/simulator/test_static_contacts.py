@@ -38,7 +38,7 @@ def pressed_ball(density: float = 1000.0, friction: float = 0.5, turned: np.ndar
     ball.move(equator, lambda t: -0.08 * t * up)
     scene.add_obstacle(ts.HalfSpace(-(1.0 + OFFSET) * up, up), name="plane")
     scene.set_contact("ball", "plane", friction=friction)
-    scene.collision = ts.CollisionSettings(offset=2e-3)  # that of steps in time
+    scene.collision = ts.CollisionSettings(offset=2e-5)  # the default of statics
     return scene
 
 
@@ -49,9 +49,7 @@ def pressed() -> StaticResult:
 
 def test_load_steps_are_slow_steps_in_time(pressed):
     """A ball so light that inertia is 1e-9 of the forces; the contact law is the same."""
-    scene = pressed_ball(density=1e-3)
-    scene.collision = ts.CollisionSettings(offset=2e-5)  # the default of statics
-    with ts.Simulator(scene, dt=0.5, precision="f64") as sim:
+    with ts.Simulator(pressed_ball(density=1e-3), dt=0.5, precision="f64") as sim:
         for step in range(2):
             sim.step()
             force = sim.contact_force("ball", "plane")
