@@ -26,6 +26,7 @@ from taisoft.dynamics.simulation_state import SimulationState
 from taisoft.dynamics.stage import StageWork
 from taisoft.mesh.topology import connected_pieces, linked_groups
 
+RIGID = 1e-10  # least over largest eigenvalue of what holds a component: below it some rigid motion is left
 ROUNDED = 1e-12  # sum of the weights of an element of springs, between points of bodies: 0 but for rounding
 
 
@@ -77,6 +78,7 @@ class Pieces:
         component, piece = component[np.argsort(number)], number[piece]
         self.of_node, self._component = piece, component[piece]
         self._simulation = simulation
+        self._loose_free, self._loose = np.zeros(0), True  # of the last call of `any_loose`
         self._free, self._unheld = np.zeros(0), np.zeros((3, 0), dtype=bool)  # of the last call of `_held_nowhere`
         self._independent = np.ones(n_nodes, dtype=bool)
         if simulation.dependents is not None:
@@ -133,8 +135,18 @@ class Pieces:
         return bool((self._held_nowhere(free) & ~self.anchored).any())
 
     def any_loose(self, free: np.ndarray) -> bool:
-        """Return whether no node of some component is held along some axis. free: as in `any_free`."""
-        return bool(self._held_nowhere(free).any())
+        """Return whether constraints leave some component a rigid motion, as of a hinge. free: as in `any_free`."""
+        if not np.array_equal(free, self._loose_free):
+            rest = self._simulation.layout.rest
+            node, axis = np.nonzero((free == 0.0) & self._independent[:, None])
+            along, n = np.eye(3)[axis], len(self.anchored)
+            arm = (rest[node] - rest.mean(axis=0)) / np.ptp(rest, axis=0).max()
+            held = np.hstack([along, np.cross(arm, along)])  # its work is zero in the motions that are left
+            number = 36 * self._component[node][:, None] + np.arange(36)
+            grams = np.bincount(number.ravel(), (held[:, :, None] * held[:, None]).ravel(), 36 * n).reshape(n, 6, 6)
+            least, *_, largest = np.linalg.eigvalsh(grams).T
+            self._loose_free, self._loose = free.copy(), bool((least <= RIGID * largest).any())
+        return self._loose
 
     def _held_nowhere(self, free: np.ndarray) -> np.ndarray:
         """Return the axes (3, n_components) along which no node of a component is held."""

@@ -58,6 +58,18 @@ def test_load_steps_are_slow_steps_in_time(pressed):
             assert size < 1e-6 * 0.08, "positions differ"
 
 
+def test_contacts_hold_what_a_hinge_leaves():
+    """A bar turns about its lower left edge until a ball carries its other end."""
+    scene = ts.Scene()
+    bar = scene.add_body(ts.box_mesh((8, 2, 2), (0.4, 0.1, 0.1)), ts.Material(young=1e5), name="bar", position=(0, 0.1, 0))
+    bar.fix(lambda X: (X[:, 0] < -0.199) & (X[:, 1] < -0.049))
+    scene.add_obstacle(ts.Sphere((0.18, -0.051, 0), 0.1), name="ball", friction=0.3)
+    found = ts.solve_static(scene)
+    force = found.contact_force("bar", "ball")[1]
+    assert found.converged and force > 10.0
+    assert force + found.reactions("bar")[:, 1].sum() == pytest.approx(4.0 * 9.81, rel=1e-4)
+
+
 def test_results_by_load_step(pressed):
     assert pressed.converged and pressed.times == pytest.approx([0.5, 1.0]) and len(pressed.step_reports) == 2
     assert not any(report.kinetic for report in pressed.step_reports)
