@@ -7,9 +7,10 @@ On quadratic faces this uses lambda_a = N_a + half of the shape functions of the
 no area. Middles have the mean of their corners. A uniform pressure so comes out uniform. As a mean over the faces around a node,
 p_a would be too small where the pressure bends down; with the mass matrix M_ab = int lambda_a lambda_b dA each pair of corners
 exchanges s M_ab (p_a - p_b), which takes that back to second order: the first step of Jacobi's method for M p = N. s <= 1 lets no
-corner lose more than half of its load. Friction and slip of a corner change with its pressure. The sum of N stays. Beside an edge
-of the body, A_a counts only triangles that face what presses there. Where that covers a part of them, p_a is a mean over all.
-A triangle's force is that of its corners, divided by area: sums over nodes, over triangles and over contacts are the same.
+corner lose more than half of its load, which takes its friction and slip along: sums stay, and no friction exceeds its limit.
+Beside an edge of the body, A_a counts only triangles that face what presses there. Where that covers a part of them, p_a is a
+mean over all. A triangle's force is that of its corners, divided by area: sums over nodes, over triangles and over contacts are
+the same.
 """
 
 from dataclasses import dataclass
@@ -98,10 +99,9 @@ class _Loads:
         used = (load[a] > 0.0) & (load[b] > 0.0) & (pressure[a] > pressure[b])
         a, b, mass = a[used], b[used], pair.data[used]
         lost = np.bincount(b, mass * (pressure[a] - pressure[b]), len(load))
-        mass *= np.minimum(1.0, 0.5 * load / np.maximum(lost, 1e-300))[b]
-        flow = mass * (pressure[a] - pressure[b])
-        gained = np.bincount(a, flow, len(load)) - np.bincount(b, flow, len(load))
-        return self.sums * (1.0 + gained / np.where(load > 0.0, load, 1.0))[:, None]
+        share = mass * (pressure[a] - pressure[b]) * np.minimum(1.0, 0.5 * load / np.maximum(lost, 1e-300))[b] / load[b]
+        moved = sp.csr_matrix((share, (a, b)), shape=self.hats.shape[1:] * 2)  # parts of the load at b that a has
+        return self.sums + moved @ self.sums - np.asarray(moved.sum(axis=0)).T * self.sums
 
 
 class SurfaceLoads:

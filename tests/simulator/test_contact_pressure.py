@@ -85,6 +85,17 @@ def test_a_block_sticks_below_the_threshold_and_slips_above(precision, integrato
             ).all()
 
 
+@pytest.mark.parametrize("by", ["node", "triangle"])
+def test_tractions_sum_to_the_friction(by):
+    with ts.Simulator(on_ground(0.8), dt=1.0, integrator="static", precision="f64") as sim:
+        sim.step()
+        found, force = sim.contact_pressure("block", by), sim.contact_force("block", "ground")
+        assert set(found.state) == {"open", "stick", "slip"}
+        assert np.allclose(
+            (found.traction * found.area[:, None]).sum(axis=0) * (1, 0, 1), force * (1, 0, 1), atol=1e-9 * force[1]
+        )
+
+
 def test_forces_at_rest_equal_the_weight():
     with ts.Simulator(on_ground(0.0), dt=0.02) as sim:
         report = sim.run(2.0, fps=None, details="pairs", about=(1.0, 0.0, 0.0)).step_reports[-1]
