@@ -66,6 +66,8 @@ def measure_at_end(sim: "Simulator", measured: dict[str, Definition], report: Ru
             report.quantities[name].notes.append(f"the value of {name!r} is unknown: {reason}")
             report.problems += report.quantities[name].notes
             report.status = "degraded" if report.status == "ok" else report.status
+        if unsolved := sum(not one.converged for one in report.step_reports):
+            report.quantities[name].notes.append(f"steps of the run did not converge ({unsolved}): no error tells what that does")
 
 
 def columns(sim: "Simulator", measured: dict[str, Definition]) -> dict[str, float]:
@@ -217,6 +219,8 @@ class Samples:
                 quantity.orders |= {} if order is None else {kind: order}
                 what = "unknown" if error is None else "the range of its values"
                 quantity.notes += [f"the error of {name!r} in {kind} is {what}: {reason}"] if reason else []
+                unsolved = [f"{one.what} ({one.unconverged} of {one.reports})" for one in twins if one.unconverged]
+                quantity.notes += [f"steps of a twin did not converge: {', '.join(unsolved)}"] if unsolved else []
             if abs(self._time - time) > 1e-9 * time:
                 quantity.notes.append(f"the errors of {name!r} are those at t = {self._time:.6g} s, where the twins meet the run")
 
