@@ -36,7 +36,7 @@ class ImplicitStepper(ImplicitStages):
     def __init__(self, simulation: SimulationState, settings: Settings, contact: ContactStep | NoContacts):
         super().__init__(simulation, settings, contact)
         self.first = simulation.now.another(simulation.arena, "first")  # state before the step
-        self.reached, self.last = 0.0, None  # fraction of the last step until which all parts converged; result of its last part
+        self.reached, self.last = 0.0, None  # fraction of the last step until which all parts converged; its result
         self.forget()
 
     def forget(self) -> None:
@@ -77,8 +77,8 @@ class ImplicitStepper(ImplicitStages):
                 length.give_up()
         if self._is_spent():
             self._length.give_up()
-        self.last = kept[-1]
-        return self._report(count_all(merge(kept), dropped), len(kept), held)
+        self.last = merge(kept)
+        return self._report(count_all(self.last, dropped), len(kept), held)
 
     def _take_parts(self, dt: float, dropped: list[StageResult]) -> tuple[list[StageResult], float]:
         """Take a step of dt in parts, which are halved while they are rejected, and then in `dropped`. Return the results of the
