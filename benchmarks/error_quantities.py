@@ -6,7 +6,6 @@ Bodies start at the contact offset, which depends on the mesh. True errors: in s
 the run with TRUTH times the steps on the same mesh; of the solvers, to one with tolerances of EXACT, which not every mesh meets.
 """
 
-import itertools
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
@@ -18,6 +17,7 @@ from taisoft.mesh.quality import mean_surface_edge
 from taisoft.records import ERROR_KINDS, Quantity
 
 from .document import Limit, table
+from .reference_cases.pressing import quarter_ball, quarter_block
 from .runner import progress, without_warnings
 
 TRUTH = 16  # steps of the truth over those of the run
@@ -64,33 +64,6 @@ class ForceRow:
 # --- scenes -----------------------------------------------------------------------------------------------------------
 
 
-def graded(n: int) -> np.ndarray:
-    """n + 1 numbers from 0 to 1, finest at 0; those of n/2 are every other of them."""
-    return np.sinh(3.0 * np.linspace(0.0, 1.0, n + 1)) / np.sinh(3.0)
-
-
-def grid_mesh(points: np.ndarray) -> ts.TetMesh:
-    """Six tets around a diagonal of each cell of a grid of points (i,j,k,3)."""
-    ids, tets = np.arange(points[..., 0].size).reshape(points.shape[:3]), []
-    for order in itertools.permutations(range(3)):
-        corners = np.cumsum([np.zeros(3, int), *np.eye(3, dtype=int)[list(order)]], axis=0)
-        tets.append(np.stack([ids[tuple(slice(c, c - 1 or None) for c in corner)].ravel() for corner in corners], axis=1))
-    vertices, tets = points.reshape(-1, 3), np.concatenate(tets)
-    inverted = np.linalg.det(vertices[tets][:, 1:] - vertices[tets][:, :1]) < 0
-    tets[inverted] = tets[inverted][:, [0, 1, 3, 2]]
-    return ts.TetMesh(vertices, tets)
-
-
-def quarter_ball(n: int) -> ts.TetMesh:
-    """A quarter of the lower half of a ball of radius 1 whose pole is the origin."""
-    X, D, Z = np.meshgrid(graded(n), 1.0 - graded(3 * n // 4)[::-1], graded(n), indexing="ij")
-
-    def side(a, b, c):
-        return a * np.sqrt(1.0 - b**2 / 2.0 - c**2 / 2.0 + b**2 * c**2 / 3.0)
-
-    return grid_mesh(np.stack([side(X, D, Z), 1.0 - side(D, X, Z), side(Z, X, D)], axis=-1))
-
-
 def offset(*meshes: ts.TetMesh, order: int = 1) -> float:
     """The contact offset [m] of bodies of these meshes; a quadratic face touches as four triangles."""
     return OFFSET * min(mean_surface_edge([(mesh.vertices, mesh.surface)]) for mesh in meshes) / order
@@ -102,8 +75,7 @@ def ball(n: int, order: int = 1, friction: float = 0.0, block: bool = False) -> 
     law, depth = ("st_venant_kirchhoff", 0.04) if block else ("stable_neo_hookean", 0.02)
     meshes = {"ball": mesh}
     if block:
-        x, y = graded(n + n // 4), -graded(3 * n // 4)
-        meshes["block"] = grid_mesh(np.stack(np.meshgrid(x, y, x, indexing="ij"), axis=-1))
+        meshes["block"] = quarter_block(n + n // 4, 3 * n // 4)
     else:
         scene.add_obstacle(ts.HalfSpace((0.0, 0.0, 0.0), (0.0, 1.0, 0.0)), name="plane", friction=friction)
     gap = offset(*meshes.values(), order=order)

@@ -31,8 +31,8 @@ FACING = 0.5  # least cosine between a triangle's normal and the mean direction 
 class ContactPressure:
     """What contacts do to a body's surface in the last step, or its last substep, by node or by triangle, arrays (n, ...).
 
-    The force on an entry is `force`, and -pressure * area along its contacts' normals with traction * area across them. A state
-    is that of the contacts which carry most of the normal force.
+    The sum of `force` is that of -pressure * area along the contacts' normals and traction * area across them; at single nodes
+    they differ, since pressures are means around corners. A state is that of the contacts which carry most of the normal force.
     """
 
     index: np.ndarray  #: (n,) nodes of the surface, ascending, or rows of `body.nodes.surface`
