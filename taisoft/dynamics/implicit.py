@@ -152,8 +152,7 @@ class ImplicitStepper(ImplicitStages):
         if far >= RUNAWAY:
             raise SimulationError(
                 f"step {self.simulation.step_count + 1}: nothing holds {name}: it moved by {far:.3g} times its size, and no "
-                "equilibrium was found: hold it, start it nearer to what holds it, take smaller load steps, or simulate its motion "
-                "in time"
+                "equilibrium was found: hold it, start it nearer, take smaller load steps, or simulate its motion in time"
             )
 
     def _undo(self, discard_impulses: bool) -> None:
