@@ -204,7 +204,7 @@ class ContactStep:
         self.had_impact, self.dropped = bool(kept["met"]), int(kept["dropped"])
         self._search_counts = int(kept["found"]), int(kept["unmapped"])
         self.paths.forget()
-        self._renewal.sides = tuple(kept.get("sides", ())) or None
+        self._renewal.sides = tuple(kept["sides"]) or None
         self.misplaced.start_step()
         self.crossing, self.last_crossing = 0.0 if self.paths.none_cross else None, Crossing()
         self._searched = self._measured_end = None
