@@ -60,6 +60,7 @@ CASES = tuple(
         partial(mindlin, n, order, like, precision, limits),
         fine=True,
         closed_form=True,
+        precision=precision,
     )
     for n, order, like, precision, limits in (
         (12, 1, False, "f64", {"states": 0.5, "friction": 0.03}),

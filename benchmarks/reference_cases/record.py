@@ -59,6 +59,7 @@ class Case:
     compute: Callable[[dict, str], Iterable[Check]]  # (reference, arch) -> checks
     fine: bool = False
     closed_form: bool = False  # the reference is a formula in the code, and there is no file
+    precision: str = "f64"
 
     @property
     def name(self) -> str:
