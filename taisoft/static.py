@@ -194,7 +194,11 @@ def _check(scene: Scene, tolerance: float) -> None:
 def _solve(sim: Simulator, time: float, estimate: dict) -> StaticResult:
     """Take load steps until a time [s]. estimate: arguments of the run."""
     states: list[LoadStep] = []
-    keep = lambda sim, index, report: states.append(_load_step(sim)) if index else None  # noqa: E731
+
+    def keep(sim: Simulator, index: int, _) -> None:
+        if index:
+            states.append(_load_step(sim))
+
     run = sim.run(time, fps=None, on_frame=keep, **estimate)
     if run.status == "failed":
         raise SimulationError(f"solve_static: {run.problems[-1]}")

@@ -13,6 +13,7 @@ from taisoft.scene.body import Body
 from taisoft.static import StaticResult
 
 from .record import Case, Check, material, near, small
+from .spheres import hold_planes
 
 GRADING = 3.0
 CONVERGED = 6304.0  # [N] force of `two_bodies` on ever finer meshes, of four of which the extrapolations agree to 0.2 %
@@ -63,13 +64,6 @@ def quarter_block(n: int, layers: int) -> ts.TetMesh:
     return ts.TetMesh(p * (1.0, -1.0, 1.0), mirrored(tets))
 
 
-def on_symmetry(*bodies: Body) -> None:
-    """Hold the nodes on the planes x = 0 and z = 0 there."""
-    for body in bodies:
-        for axis in (0, 2):
-            body.fix(lambda X, a=axis: np.abs(X[:, a]) < 1e-9, axes="xyz"[axis])
-
-
 def reach(load: np.ndarray, r: np.ndarray) -> float:
     """Radius [m] within which Hertz's pressure has the moment of the loads (n,) at radii (n,)."""
     return float(np.sqrt(2.5 * (load * r**2).sum() / load.sum()))
@@ -104,7 +98,7 @@ def ball_rough(n: int, order: int, mu: float, limits: dict, reference: dict, arc
     value, made = reference["value"]["SNH"][f"mu{mu:g}"], ts.Scene(gravity=(0, 0, 0))
     curve = ts.Sphere((0, 1, 0), 1.0) if order == 2 else None
     ball = made.add_body(quarter_ball(n), material(reference, "SNH"), name="ball", order=order, curve=curve)
-    on_symmetry(ball)
+    hold_planes(ball, "xz")
     ball.move(lambda X: X[:, 1] > AWAY, lambda t: (0.0, -0.02 * t, 0.0), axes="y")
     made.add_obstacle(ts.HalfSpace((0, 0, 0), (0, 1, 0)), name="plane")
     made.set_contact("ball", "plane", friction=mu)
@@ -140,7 +134,7 @@ def patch(n: int, order: int, limits: dict, reference: dict, arch: str):
     for name, cells, y in (("low", (4 * n, 2 * n, 4 * n), 0.25), ("top", (5 * n, 3 * n, 5 * n), 0.75)):
         mesh = ts.box_mesh(cells, (1.0, 0.5, 1.0), (0.5, y, 0.5))
         body = made.add_body(mesh, material(reference, "SVK"), name=name, order=order)
-        on_symmetry(body)
+        hold_planes(body, "xz")
     made.body("low").fix(lambda X: X[:, 1] < 1e-9, axes="y")
     body.add_traction(lambda C: C[:, 1] > AWAY, (0.0, -p, 0.0))
     found, check = solved(made, arch, contact_tolerance=1e-9)
@@ -181,7 +175,8 @@ def two_bodies(n: int, order: int, limits: dict, reference: dict, arch: str):
     soft, curve = material(reference, "SVK"), ts.Sphere((0, 1, 0), 1.0) if order == 2 else None
     ball = made.add_body(quarter_ball(n), soft, name="ball", order=order, curve=curve)
     block = made.add_body(quarter_block(n + 2, 3 * n // 4), soft, name="block", order=order)
-    on_symmetry(ball, block)
+    hold_planes(ball, "xz")
+    hold_planes(block, "xz")
     block.fix(lambda X: X[:, 1] < -AWAY, axes="y")
     ball.move(lambda X: X[:, 1] > AWAY, lambda t: (0.0, -0.04 * t, 0.0), axes="y")
     made.set_contact("ball", "block", friction=0.0)

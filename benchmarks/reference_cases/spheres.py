@@ -57,9 +57,9 @@ def inside(mesh: ts.TetMesh, radius: float) -> np.ndarray:
     return np.flatnonzero((np.linalg.norm(mesh.vertices[mesh.surface], axis=2) < 1.1 * radius).all(axis=1))
 
 
-def hold_planes(body) -> None:
-    """Fix the nodes on the planes of symmetry along their normals."""
-    for axis in range(3):
+def hold_planes(body, axes: str = "xyz") -> None:
+    """Fix the nodes on the planes of symmetry across the axes along their normals."""
+    for axis in map("xyz".index, axes):
         body.fix(lambda X, a=axis: np.abs(X[:, a]) < 1e-9, axes="xyz"[axis])
 
 

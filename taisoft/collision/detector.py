@@ -292,7 +292,6 @@ class Detection:
         """Return the contacts of the last search, with impulses 0, in order of colliders and feature: one that does not depend on
         threads or chunks."""
         data, at, counts = self.buffer.data, self.kept.to_numpy(self.counts.contacts), self.counts
-        at = at[np.lexsort(np.hstack([data.body[at], data.feature[at]])[:, ::-1].T)]
         geometry = {name: getattr(data, name)[at] for name in ("point", "normal", "gap", "feature", "guard", "area")}
         geometry |= dict(zip(("collider", "nodes", "weights"), (data.body[at], *self.sides(at))))
         return named_contacts(self.scene, **geometry, found=counts.found, unmapped=counts.unmapped)

@@ -79,7 +79,7 @@ class Pieces:
         self.of_node, self._component = piece, component[piece]
         self._simulation = simulation
         self._loose_free, self._loose = np.zeros(0), True  # of the last call of `any_loose`
-        self._free, self._unheld = np.zeros(0), np.zeros((3, 0), dtype=bool)  # of the last call of `_held_nowhere`
+        self._free, self._any_free = np.zeros(0), False  # of the last call of `any_free`
         self._independent = np.ones(n_nodes, dtype=bool)
         if simulation.dependents is not None:
             self._independent[simulation.dependents.node] = False
@@ -132,7 +132,11 @@ class Pieces:
 
     def any_free(self, free: np.ndarray) -> bool:
         """Return whether some component is free along some axis, but for contacts. free: (n_nodes, 3), 0 on constrained axes."""
-        return bool((self._held_nowhere(free) & ~self.anchored).any())
+        if not np.array_equal(free, self._free):
+            held = (free == 0.0) & self._independent[:, None]
+            fixed = [np.bincount(self._component, held[:, axis], len(self.anchored)) for axis in range(3)]
+            self._free, self._any_free = free.copy(), bool(((np.array(fixed) == 0.0) & ~self.anchored).any())
+        return self._any_free
 
     def any_loose(self, free: np.ndarray) -> bool:
         """Return whether constraints leave some component a rigid motion, as of a hinge. free: as in `any_free`."""
@@ -148,13 +152,9 @@ class Pieces:
             self._loose_free, self._loose = free.copy(), bool((least <= RIGID * largest).any())
         return self._loose
 
-    def _held_nowhere(self, free: np.ndarray) -> np.ndarray:
-        """Return the axes (3, n_components) along which no node of a component is held."""
-        if not np.array_equal(free, self._free):
-            held = (free == 0.0) & self._independent[:, None]
-            fixed = [np.bincount(self._component, held[:, axis], len(self.anchored)) for axis in range(3)]
-            self._free, self._unheld = free.copy(), np.array(fixed) == 0.0
-        return self._unheld
+    def _sums(self, values: np.ndarray) -> np.ndarray:
+        """Return the sums (3, n) over each piece of values (n_nodes, 3)."""
+        return np.array([np.bincount(self.of_node, values[:, axis], self.work.n) for axis in range(3)])
 
     @cached_property
     def _size(self) -> np.ndarray:
@@ -166,8 +166,7 @@ class Pieces:
 
     def farthest(self, way: np.ndarray) -> tuple[float, str]:
         """Return the largest mean displacement of a piece over its size, and its name. way: (n_nodes, 3) [m]."""
-        n = np.bincount(self.of_node, minlength=self.work.n)
-        mean = np.array([np.bincount(self.of_node, way[:, axis], self.work.n) for axis in range(3)]) / n
+        mean = self._sums(way) / np.bincount(self.of_node, minlength=self.work.n)
         far = np.linalg.norm(mean, axis=0) / self._size
         k = int(np.argmax(far))
         return float(far[k]), self._names[k]
@@ -177,7 +176,7 @@ class Pieces:
 
         residual (n_nodes, 3): [N s], on the free axes.
         """
-        net = np.linalg.norm([np.bincount(self.of_node, residual[:, axis], self.work.n) for axis in range(3)], axis=0)
+        net = np.linalg.norm(self._sums(residual), axis=0)
         mass = np.bincount(self.of_node, self.model.mass.to_numpy(), self.work.n)
         bodies = self._simulation.scene.bodies
         slowest = min(bodies[k].composition.lowest_wave_speed / size for k, size in zip(self.body, self._size))
@@ -206,10 +205,7 @@ class Pieces:
         measure_pieces(m, stage_work, self.work, beta)
         _r, inertia, internal, loads, _held = np.sqrt(self.work.norms.to_numpy()).T
         residual, v, free, mass = (a.astype(np.float64) for a in download([stage_work.residual, m.state.v, m.free, m.mass]))
-        means = np.zeros((3, n))
-        for axis in range(3):
-            constrained = np.bincount(self.of_node, 1.0 - free[:, axis], n) > 0.0
-            means[axis] = np.where(constrained, 0.0, np.bincount(self.of_node, residual[:, axis], n))
+        means = np.where(self._sums(1.0 - free) > 0.0, 0.0, self._sums(residual))
         mean = np.linalg.norm(means, axis=0) / np.sqrt(np.bincount(self.of_node, minlength=n))
         floor = max(eps, self.NEGLIGIBLE_MOMENTUM) * (self.momenta(mass, v) + beta * internal) + least / beta
         with np.errstate(divide="ignore", invalid="ignore"):

@@ -486,7 +486,7 @@ class StageSystem:
 
     @property
     def is_loose(self) -> bool:
-        """Whether some component is not held along every axis, but for contacts."""
+        """Whether constraints leave some component a rigid motion."""
         return self.pieces.any_loose(self.model.free.to_numpy())
 
     def form(self, projected: bool, c: float, beta: float) -> None:

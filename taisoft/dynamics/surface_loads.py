@@ -14,6 +14,7 @@ the same.
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import scipy.sparse as sp
@@ -72,6 +73,12 @@ class _Surface:
         thirds = sp.csr_matrix((np.full(3 * t, 1.0 / 3.0), (np.repeat(np.arange(t), 3), self.triangles.ravel())), shape=(t, n))
         self.means, self.around = (thirds @ self.hats).tocoo(), thirds.T.tocsr()
 
+    @cached_property
+    def at_corners(self) -> tuple[sp.csr_matrix, sp.csr_matrix]:
+        """Values (3 t, n) of hats at the corners of triangles, and those plus their sum over the triangle."""
+        at = self.hats[self.triangles.ravel()]
+        return at, at + sp.kron(sp.identity(len(self.triangles)), np.ones((3, 3)), format="csr") @ at
+
 
 @dataclass(frozen=True, eq=False)
 class _Loads:
@@ -91,10 +98,9 @@ class _Loads:
     def sharpened(self) -> np.ndarray:
         """Return the sums (n,11) after corners have exchanged what the mean over the faces around them takes, see above."""
         area, load = np.where(self.area > 0.0, self.area, 1.0), self.sums[:, 0]
-        at = self.surface.hats[self.surface.triangles.ravel()]  # values of hats at the corners of triangles
+        at, beside = self.surface.at_corners
         weight = np.repeat(self.triangle_area * (self.shares.sum(axis=1).A1 > 0.0) / 12.0, 3)
-        total = sp.kron(sp.identity(len(self.triangle_area)), np.ones((3, 3)), format="csr")
-        pair = (at.T @ sp.diags(weight) @ (at + total @ at)).tocoo()
+        pair = (at.T @ sp.diags(weight) @ beside).tocoo()
         a, b, pressure = pair.row, pair.col, load / area
         used = (load[a] > 0.0) & (load[b] > 0.0) & (pressure[a] > pressure[b])
         a, b, mass = a[used], b[used], pair.data[used]

@@ -225,7 +225,6 @@ def test_the_stress_at_a_point_is_that_of_a_uniform_state():
         assert found["mises"].value == pytest.approx(before[0, 0] - before[1, 1], rel=1e-3)
 
 
-@pytest.mark.skipif(not hasattr(ts.Simulator, "contact_pressure"), reason="there are no contact pressures yet")
 def test_the_largest_pressure_of_a_body(pushing):
     report = pushing.run(0.1, fps=None, quantities={"p": "max_pressure block"})
     assert report.quantities["p"].value == pytest.approx(pushing.contact_pressure("block").pressure.max())
