@@ -13,8 +13,8 @@ import numpy as np
 import taisoft as ts
 from taisoft.cli.scene_file import load_module
 from taisoft.files import write_bytes
-from taisoft.output.camera import Camera
 from taisoft.output.frames import SMALLEST, png_bytes
+from taisoft.output.viewpoint import Viewpoint
 from taisoft.view.offscreen import Offscreen
 from taisoft.view.scene_view import IN_PICTURES
 
@@ -69,7 +69,7 @@ def film(
     on_moment: called with each picture; on_step: as `Simulator.run` has it; colour: as of `Offscreen`.
     """
     target, distance, azimuth, elevation = view
-    camera = Camera(np.array(target), distance, azimuth, elevation, up=sim.scene.up)
+    camera = Viewpoint(np.array(target), distance, azimuth, elevation, up=sim.scene.up)
     drawing = Offscreen(sim.scene, size, camera, colour=colour, layers=layers)
     frames = [round(moment * fps) for moment in moments]
     pictures: list[np.ndarray] = []

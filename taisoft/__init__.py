@@ -38,6 +38,8 @@ _MODULES = {  # public name -> the module that defines it
     "Obstacle": "taisoft.scene.obstacles",
     "Robot": "taisoft.scene.robot",
     "KeyFrames": "taisoft.scene.key_frames",
+    "Camera": "taisoft.scene.look",
+    "Light": "taisoft.scene.look",
     "read_scene": "taisoft.scene.toml",
     "write_scene": "taisoft.scene.toml_writer",
     "CollisionSettings": "taisoft.scene.collision",

@@ -9,7 +9,7 @@ import numpy as np
 from taisoft.cli.scene_file import load_scene
 from taisoft.errors import MissingPackage, SceneError, SimulationError, value_text
 from taisoft.machine import require
-from taisoft.output.camera import Camera, framed_points
+from taisoft.output.viewpoint import Viewpoint, framed_points
 from taisoft.records import StepReport
 from taisoft.scene import checks
 from taisoft.scene.scene import Scene
@@ -167,7 +167,7 @@ class Env(gymnasium.Env):
             return None
         if self._drawing is None:
             scene = self.sim.scene
-            camera = Camera.framing(framed_points(scene) if self._view is None else self._view, self._size, up=scene.up)
+            camera = Viewpoint.framing(framed_points(scene) if self._view is None else self._view, self._size, up=scene.up)
             self._drawing = Offscreen(scene, self._size, camera, self._colour)
         return self._drawing.image(self.sim)
 

@@ -10,13 +10,13 @@ from pathlib import Path
 
 from taisoft.details import DETAILS, QUANTITIES
 from taisoft.errors import OutputError, SceneError, reworded
-from taisoft.output.camera import MAX_ELEVATION
 from taisoft.output.files import RESULT_FILES, RESULT_FOLDERS, CheckpointWriter, OutputFolder
 from taisoft.output.frame_files import VTU_NAME, VtuWriter, cut_pvd
 from taisoft.output.frame_table import FrameTable
 from taisoft.output.frames import FRAMES_NAME, FrameWriter, ffmpeg_command, find_ffmpeg, picture_numbers, write_video
 from taisoft.output.report import body_records, write_report
 from taisoft.output.usd import UsdWriter
+from taisoft.output.viewpoint import MAX_ELEVATION
 from taisoft.records import RunReport
 from taisoft.scene import checks
 from taisoft.scene.checks import nearest

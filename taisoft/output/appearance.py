@@ -11,7 +11,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from taisoft.errors import OutputError, SceneError, reworded
-from taisoft.output.camera import clip_polygon, start_positions
+from taisoft.output.viewpoint import clip_polygon, start_positions
 from taisoft.scene.obstacles import Capsule, HalfSpace, Obstacle, Sphere
 
 # sRGB; distinct hues of similar lightness, so that shading shows the shape
@@ -26,9 +26,15 @@ TINY = 1e-9  # relative to the square's half side: closer corners and boundaries
 AROUND, ALONG = 40, 10  # facets of spheres and capsules: around the axis, and from the equator to a pole
 
 
-def body_colour(index: int) -> np.ndarray:
-    """Return the sRGB colour (3,) in [0, 1] of the body with the given index; the palette repeats."""
-    return BODY_COLOURS[index % len(BODY_COLOURS)]
+def body_colours(scene) -> list[np.ndarray]:
+    """Return the sRGB colours (3,) in [0, 1] of all bodies: their own, else those of the palette, which repeats."""
+    palette = (BODY_COLOURS[k % len(BODY_COLOURS)] for k in range(len(scene.bodies)))
+    return [other if body.colour is None else body.colour for body, other in zip(scene.bodies, palette)]
+
+
+def obstacle_colour(obstacle: Obstacle) -> np.ndarray:
+    """Return the sRGB colour (3,) in [0, 1] of an obstacle."""
+    return OBSTACLE_COLOUR if obstacle.colour is None else obstacle.colour
 
 
 def linear_rgb(srgb: np.ndarray) -> np.ndarray:

@@ -6,8 +6,8 @@
 import numpy as np
 
 from taisoft.output.appearance import linear_rgb
-from taisoft.output.camera import start_positions
 from taisoft.output.connection_lines import ConnectionLines
+from taisoft.output.viewpoint import start_positions
 
 TENSION = "tension"  # primvar
 COLOUR = np.array([0.75, 0.20, 0.15])  # sRGB

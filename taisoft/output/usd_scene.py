@@ -20,15 +20,15 @@ import numpy as np
 from taisoft.mesh.topology import opposite_half_edges
 from taisoft.mesh.usd_content import NAME
 from taisoft.output.appearance import (
-    OBSTACLE_COLOUR,
     ObstacleSurface,
-    body_colour,
+    body_colours,
     compact_surface,
     linear_rgb,
+    obstacle_colour,
     obstacle_surfaces,
 )
-from taisoft.output.camera import MAX_WIDENING, Camera, framed_points
 from taisoft.output.usd_curves import Curves
+from taisoft.output.viewpoint import MAX_WIDENING, Viewpoint, framed_points
 from taisoft.scene.obstacles import HalfSpace, MeshObstacle
 from taisoft.scene.rigid import RigidBody
 
@@ -98,7 +98,7 @@ class ViewTrack:
     def __init__(self, stage, scene):
         from pxr import Gf, UsdGeom, UsdLux
 
-        self.camera = Camera.framing(framed_points(scene), PICTURE, up=scene.up)
+        self.camera = Viewpoint.framing(framed_points(scene), PICTURE, up=scene.up)
         self._widest = MAX_WIDENING * self.camera.distance
         UsdGeom.Xform.Define(stage, VIEW)
 
@@ -155,8 +155,8 @@ def scene_layer(scene, fps: float, touching: bool, errors: bool) -> tuple[list[T
     stage.SetDefaultPrim(UsdGeom.Xform.Define(stage, ROOT).GetPrim())
     legal = prim_names([one.name for one in (*scene.colliders, *scene.springs, *scene.tendons)])
     tracks, first = [], 0
-    for k, (body, name) in enumerate(zip(scene.bodies, legal)):
-        tracks += _define_body(stage, body, name, body_colour(k), first, touching, errors)
+    for body, name, colour in zip(scene.bodies, legal, body_colours(scene)):
+        tracks += _define_body(stage, body, name, colour, first, touching, errors)
         first += body.n_nodes
     view = ViewTrack(stage, scene)
     n_bodies, n_colliders = len(scene.bodies), len(scene.colliders)
@@ -208,7 +208,7 @@ def _define_obstacle(stage, shown: ObstacleSurface, legal_name: str, eye: np.nda
     from pxr import UsdGeom, Vt
 
     shape, x = shown.obstacle.shape, shown.at(0.0)
-    _, surface, paint = _define_surface(stage, shown.obstacle.name, legal_name, OBSTACLE_COLOUR, shown.triangles)
+    _, surface, paint = _define_surface(stage, shown.obstacle.name, legal_name, obstacle_colour(shown.obstacle), shown.triangles)
     points = x.astype(np.float32)
     surface.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(points))
     surface.CreateExtentAttr(Vt.Vec3fArray.FromNumpy(_extent(points)))

@@ -39,8 +39,8 @@ from taisoft.errors import OutputError
 from taisoft.files import as_path, write_bytes
 from taisoft.machine import require
 from taisoft.mesh.tet_mesh import VTK_ORDER
-from taisoft.output.camera import start_positions
 from taisoft.output.nodal_fields import UNKNOWN_ERROR, surface_values, von_mises
+from taisoft.output.viewpoint import start_positions
 from taisoft.scene.rigid import RigidBody
 
 if TYPE_CHECKING:

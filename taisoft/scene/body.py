@@ -21,6 +21,7 @@ from taisoft.scene.composition import Composition, compose
 from taisoft.scene.curves import Curve, check_shape, middle_nodes
 from taisoft.scene.key_frames import AT_REST, KeyFrames, NodePath
 from taisoft.scene.loads import LOADS, Activation, Cavity, Load, NodalForce, Pressure, Traction, value_or_path
+from taisoft.scene.look import colour_or_none, opacity_of
 from taisoft.scene.material import Material
 from taisoft.scene.skins import Skin, embed
 
@@ -74,10 +75,12 @@ class Body(Guarded):
     `Nodes`, the mesh's vertices, for order 2 its mid-edge nodes, and the vertices of a skin that is touched; methods choose among
     those of tets only. skin: `Skin` or None, see `embed`. fibres: (m,3) unit vectors at rest, read-only, or None; activations:
     of the fibres, an `Activation` for each region of the mesh, or one.
+    colour: sRGB (3,) of its surface or skin in pictures, None for one of the palette; opacity: 1 hides what is behind.
     constraints, tractions, forces, pressures, cavities: lists of `Constraint`, `Traction`, `NodalForce`, `Pressure`, `Cavity`;
     items can be removed, but only methods add them.
-    collision: one of CONTACT_MODES. Only material, its numbers, position, velocity and collision can be assigned; each is
-    validated. `warn_locking` and `warn_bending` warn if tets of order 1 are far too stiff; `Scene.add_body` calls both.
+    collision: one of CONTACT_MODES. Only material, its numbers, position, velocity, collision, colour and opacity can be
+    assigned; each is validated. `warn_locking` and `warn_bending` warn if tets of order 1 are far too stiff; `Scene.add_body`
+    calls both.
     """
 
     _read_only = frozenset(_READ_ONLY)
@@ -131,6 +134,7 @@ class Body(Guarded):
         self.nodes: Nodes = make_nodes(mesh, self.order, middle_nodes(what, mesh, self.order, curve))
         check_shape(what, self.nodes)
         self.position, self.velocity, self.collision = position, velocity, collision
+        self.colour, self.opacity = None, 1.0
         self.constraints: list[Constraint] = []
         self.tractions: list[Traction] = []
         self.forces: list[NodalForce] = []
@@ -157,6 +161,14 @@ class Body(Guarded):
     position = checks.attribute("position", _check_position, "Initial translation (3,) [m].")
     velocity = checks.attribute("velocity", _check_velocity, "Initial velocity (3,) or (n,3) [m/s].")
     collision = checks.attribute("collision", _check_collision, "Contact geometry, one of CONTACT_MODES.")
+    colour = checks.attribute(
+        "colour",
+        lambda self, value: colour_or_none(value, f"{self._label()}: colour"),
+        'sRGB (3,) in [0, 1], also set as "#rrggbb"; None: one of the palette.',
+    )
+    opacity = checks.attribute(
+        "opacity", lambda self, value: opacity_of(value, f"{self._label()}: opacity"), "Of its surface: 1 hides what is behind."
+    )
 
     @property
     def rest_positions(self) -> np.ndarray:

@@ -20,6 +20,7 @@ from taisoft.mesh.topology import normals_and_heights, opposite_half_edges
 from taisoft.scene import checks
 from taisoft.scene.commands import Command
 from taisoft.scene.key_frames import KeyFrames, ShapePath
+from taisoft.scene.look import colour_or_none, opacity_of
 
 DEGENERATE = 1e-9  # a triangle has no area if its smallest height is below this times its longest edge
 UNIT_TOLERANCE = 8 * np.finfo(np.float64).eps  # squared lengths this close to 1 are kept, so normals read back unchanged
@@ -244,6 +245,8 @@ class Obstacle:
     friction: float = 0.5  #: Coulomb's coefficient, >= 0
     restitution: float = 0.0  #: 0 to 1
     path: Callable | None = None
+    colour: np.ndarray | None = None  #: sRGB (3,) in pictures, also given as "#rrggbb"; None: grey
+    opacity: float = 1.0  #: 1 hides what is behind
 
     def __post_init__(self):
         what = f"obstacle {self.name!r}"
@@ -253,7 +256,8 @@ class Obstacle:
             )
         friction, restitution = surface_numbers(self.friction, self.restitution, what)
         path = ShapePath(self.path, self.shape.pivot) if isinstance(self.path, KeyFrames) else self.path
-        checks.store(self, friction=friction, restitution=restitution, path=path)
+        look = {"colour": colour_or_none(self.colour, f"{what}: colour"), "opacity": opacity_of(self.opacity, f"{what}: opacity")}
+        checks.store(self, friction=friction, restitution=restitution, path=path, **look)
         if self.path is not None and not callable(self.path):
             raise SceneError(f"{what}: path must be a function of time, not {value_text(self.path)}")
         checks.store(self, given_path=self.path, _start=self.pose(0.0))  # a simulation may replace the path

@@ -23,6 +23,7 @@ from taisoft.scene.connection_records import Attachment, Connection, Spring, Ten
 from taisoft.scene.connections import add_spring, add_tendon, attach, attached_pairs, check_connections, constraint_of
 from taisoft.scene.curves import Curve
 from taisoft.scene.loads import Cavity
+from taisoft.scene.look import Camera, background_of, lights_of
 from taisoft.scene.material import Material
 from taisoft.scene.obstacles import HalfSpace, Obstacle, Shape, surface_numbers
 from taisoft.scene.rigid import RigidBody
@@ -37,7 +38,10 @@ class Scene(Guarded):
 
     contact_pairs: {frozenset of two names, or of one for a body with itself: (friction, restitution)}, each a number, or
     None for the default of `contact_numbers`; read-only, changed by `set_contact`. Bodies, obstacles and connections can be
-    removed from their lists, but only methods add them. A Simulator freezes the scene that it takes, see `freeze`.
+    removed from their lists, but only methods add them.
+
+    background, lights, camera: how pictures show the scene; see `taisoft.scene.look`.
+    A Simulator freezes the scene that it takes, see `freeze`.
     """
 
     _contents = {
@@ -72,6 +76,7 @@ class Scene(Guarded):
         self.contact_pairs: dict[frozenset[str], tuple[float | None, float | None]] = {}
         self.collision = CollisionSettings()
         self.allow_initial_overlap, self.contact_forces = False, True
+        self.background = self.lights = self.camera = None
         self._start: Scene | None = None  # see `snapshot`
         self._seal(Scene.__init__)
 
@@ -81,6 +86,11 @@ class Scene(Guarded):
     def _check_collision(self, value) -> CollisionSettings:
         if not isinstance(value, CollisionSettings):
             raise SceneError(f"scene: collision must be CollisionSettings, not {type(value).__name__}")
+        return value
+
+    def _check_camera(self, value) -> Camera | None:
+        if value is not None and not isinstance(value, Camera):
+            raise SceneError(f"scene: camera must be a Camera or None, not {type(value).__name__}")
         return value
 
     gravity = checks.attribute("gravity", _check_gravity, "Acceleration of gravity (3,) [m/s^2].")
@@ -99,6 +109,20 @@ class Scene(Guarded):
         "contact_forces",
         lambda _, value: checks.flag(value, "scene: contact_forces"),
         "Whether contacts exert forces. Otherwise bodies pass through each other, and contacts are detected only on request.",
+    )
+
+    background = checks.attribute(
+        "background",
+        lambda _, value: background_of(value),
+        'sRGB colours (2,3) at the top and the bottom of pictures, also set as one for both, or as "#rrggbb"; None: light grey.',
+    )
+    lights = checks.attribute(
+        "lights",
+        lambda _, value: lights_of(value),
+        "Lights of pictures and USD, a tuple of `Light`, beside that of the sky; None: two that move with the camera.",
+    )
+    camera = checks.attribute(
+        "camera", _check_camera, "`Camera` of pictures, films and USD; None: one that frames the bodies and steps back from them."
     )
 
     def pushes(self, self_collision: bool) -> bool:
@@ -160,6 +184,8 @@ class Scene(Guarded):
                 if cavity.name in names:
                     raise SceneError(f"body {body.name!r}: cavity name {cavity.name!r} is taken; names must be unique")
                 names.add(cavity.name)
+        if self.camera is not None and self.camera.follow is not None:
+            checks.index(self.camera.follow, [body.name for body in self.bodies], "camera: follow: no body")
         check_connections(self)
 
     @property
@@ -227,6 +253,8 @@ class Scene(Guarded):
         parameters: Mapping[str, float | np.ndarray] | None = None,
         fibres=None,
         curve: Curve | None = None,
+        colour=None,
+        opacity: float = 1.0,
     ) -> Body:
         """Add a body and return it.
 
@@ -246,6 +274,8 @@ class Scene(Guarded):
         ends, or a fine SurfaceMesh, in the coordinates of the mesh: the edges of faces whose corners all lie on it, within 1 % of
         an edge, follow it; "smooth", a smooth surface through the vertices, on which edges of more than 40 degrees stay sharp;
         or "straight". None: the mesh's mid-edge nodes, if it has any, else straight.
+        colour: sRGB in pictures and USD, "#rrggbb" or (3,) in [0, 1]; None for one of the palette. opacity: 1 hides what is
+        behind.
         Warns if tets of order 1 are far too stiff: if they lock, or in a thin body with so few tets through its thickness that
         it bends at most half as far as it should. Raises SceneError.
         """
@@ -254,6 +284,7 @@ class Scene(Guarded):
         numbers = {"young": young, "poisson": poisson, "density": density, "parameters": parameters}
         shape = order, quadrature_degree, collision, dilatation, fibres, curve
         body = Body(name, mesh, material, position, velocity, *shape, **numbers)
+        body.colour, body.opacity = colour, opacity
         list.append(self.bodies, body)
         body.warn_locking(stacklevel=2)
         body.warn_bending(stacklevel=2)
@@ -270,40 +301,57 @@ class Scene(Guarded):
         friction: float = 0.5,
         restitution: float = 0.0,
         young: float | None = None,
+        colour=None,
+        opacity: float = 1.0,
     ) -> RigidBody:
         """Add a rigid body and return it; it touches everything as other bodies do.
 
         mesh: its shape at rest, a closed surface or tets, of which only the surface counts. density: [kg/m^3]. name: unique;
         "rigid0" and so on by default. position: (3,) [m], initial translation. velocity: (3,) [m/s] of its centre;
         angular_velocity: (3,) [rad/s]. young: [Pa], how stiff it is; by default so stiff that its weight, its spin, impacts at
-        the largest speed at the start and soft bodies hardly strain it, see `sim.rigid_strain`. Raises SceneError.
+        the largest speed at the start and soft bodies hardly strain it, see `sim.rigid_strain`. colour, opacity: as for
+        `add_body`. Raises SceneError.
         """
         self._check_open("add_rigid_body")
         name = self._free_name(name, "rigid")
         body = RigidBody(name, mesh, density, position, velocity, angular_velocity, friction, restitution, young)
+        body.colour, body.opacity = colour, opacity
         list.append(self.bodies, body)
         return body
 
     def add_obstacle(
-        self, shape: Shape, name: str | None = None, friction: float = 0.5, restitution: float = 0.0, path: Callable | None = None
+        self,
+        shape: Shape,
+        name: str | None = None,
+        friction: float = 0.5,
+        restitution: float = 0.0,
+        path: Callable | None = None,
+        colour=None,
+        opacity: float = 1.0,
     ) -> Obstacle:
         """Add an obstacle and return it.
 
         shape: HalfSpace, Sphere, Box, Capsule or MeshObstacle. name: unique; "obstacle0" and so on by default. path:
         callable t [s] -> (translation (3,) [m], rotation (3,3) about the shape's pivot), called once here for t = 0;
-        or `KeyFrames`. Raises SceneError.
+        or `KeyFrames`. colour, opacity: as for `add_body`. Raises SceneError.
         """
         self._check_open("add_obstacle")
-        obstacle = Obstacle(shape, self._free_name(name, "obstacle"), friction, restitution, path)
+        obstacle = Obstacle(shape, self._free_name(name, "obstacle"), friction, restitution, path, colour, opacity)
         list.append(self.obstacles, obstacle)
         return obstacle
 
     def add_ground(
-        self, height: float = 0.0, friction: float = 0.5, restitution: float = 0.0, name: str | None = "ground"
+        self,
+        height: float = 0.0,
+        friction: float = 0.5,
+        restitution: float = 0.0,
+        name: str | None = "ground",
+        colour=None,
+        opacity: float = 1.0,
     ) -> Obstacle:
         """Add a half-space that is level and whose surface has this height [m] along `up`; return it. Raises SceneError."""
         point = checks.number(height, "ground: height", unit="m") * UP[self.up] + 0.0
-        return self.add_obstacle(HalfSpace(point, UP[self.up]), name, friction, restitution)
+        return self.add_obstacle(HalfSpace(point, UP[self.up]), name, friction, restitution, None, colour, opacity)
 
     def body(self, name: str) -> Body:
         """Return the body with this name. Raises SceneError if there is none."""

@@ -32,12 +32,13 @@ class Skin:
     weights: sp.csr_matrix  #: (v, n): vertices are these sums of the nodes of the body's tets
 
 
-def embed(self: "Body", surface: SurfaceMesh, contact: bool = False) -> Skin:
+def embed(self: "Body", surface: SurfaceMesh, contact: bool = False, colour=None, opacity: float | None = None) -> Skin:
     """Let a surface ride in the body's tets, and return it as a skin.
 
     surface: in the coordinates of the mesh; each vertex lies in the body, or outside by at most half the height of the nearest
     tet. Pictures, the window and USD show it instead of the tets' surface. contact: whether it is also what touches and is
-    touched; it must then be closed, and its vertices follow the nodes of the tets in all results. Raises SceneError.
+    touched; it must then be closed, and its vertices follow the nodes of the tets in all results. colour, opacity: set those of
+    the body. Raises SceneError.
     """
     self._check_open("embed")
     what = f"{self._label()}: embed"
@@ -60,6 +61,8 @@ def embed(self: "Body", surface: SurfaceMesh, contact: bool = False) -> Skin:
         )
     matrix = weight_matrix(nodes, weights, self.n_nodes)
     matrix.eliminate_zeros()
+    self.colour = self.colour if colour is None else colour
+    self.opacity = self.opacity if opacity is None else opacity
     with thawed(self):
         self.skin = Skin(surface, contact, matrix)
         if contact:

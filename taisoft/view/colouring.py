@@ -19,8 +19,8 @@ import numpy as np
 from taisoft.errors import OutputError
 from taisoft.fem.reference import inverse_rest_edges
 from taisoft.mesh.placing import UP
-from taisoft.output.camera import Camera
 from taisoft.output.nodal_fields import NodalMean, surface_values, von_mises
+from taisoft.output.viewpoint import Viewpoint
 from taisoft.scene.rigid import RigidBody
 
 UNITS = {"body": "", "stress": "Pa", "stretch": "", "speed": "m/s", "pressure": "Pa", "slip": "m", "error": "m"}
@@ -172,7 +172,7 @@ def round_up(value: float) -> float:
     return next((k * power for k in (1.0, 2.0, 5.0) if k * power >= value * (1.0 - 1e-12)), 10.0 * power)
 
 
-def lit_colours(x: np.ndarray, normals: np.ndarray, base: np.ndarray, camera: Camera) -> np.ndarray:
+def lit_colours(x: np.ndarray, normals: np.ndarray, base: np.ndarray, camera: Viewpoint) -> np.ndarray:
     """Return shaded colours (n,3) in [0, 1] of vertices x (n,3) with unit normals (n,3) and base colours (n,3) for a camera."""
     right, up, forward = camera.axes
     frame = np.array([right, up, -forward])

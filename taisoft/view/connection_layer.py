@@ -8,8 +8,8 @@ triangles, move with the tets there, and are shorter where fibres leave the surf
 
 import numpy as np
 
-from taisoft.output.camera import Camera
 from taisoft.output.connection_lines import ConnectionLines
+from taisoft.output.viewpoint import Viewpoint
 from taisoft.scene.loads import Cavity, value_at
 from taisoft.view.colouring import colours_of
 
@@ -100,7 +100,7 @@ class ConnectionLayer:
     def __init__(self, marks, size: float):
         self._marks, self._size, self.peak = marks, size, 0.0
 
-    def lines(self, sim, x: np.ndarray, camera: Camera) -> list[tuple[np.ndarray, np.ndarray]]:
+    def lines(self, sim, x: np.ndarray, camera: Viewpoint) -> list[tuple[np.ndarray, np.ndarray]]:
         """Return ends (2k,3) [m] and colours, one or (2k,3), of parts of the layer. x: (n_nodes,3) [m]."""
         found, segments = [], self._marks.segments(sim)
         if segments is not None:
@@ -123,7 +123,7 @@ class PressureLayer:
     def __init__(self, marks):
         self._marks, self.peak = marks, 0.0
 
-    def lines(self, sim, x: np.ndarray, camera: Camera) -> list[tuple[np.ndarray, np.ndarray]]:
+    def lines(self, sim, x: np.ndarray, camera: Viewpoint) -> list[tuple[np.ndarray, np.ndarray]]:
         """Return ends (2k,3) [m] and the colour of the arrows. x: (n_nodes,3) [m]."""
         pressures = self._marks.pressures(sim)
         self.peak, found = max([DECAY * self.peak, *map(abs, pressures)]), []
@@ -140,7 +140,7 @@ class PressureLayer:
         return found
 
 
-def _bands(ends: np.ndarray, camera: Camera) -> np.ndarray:
+def _bands(ends: np.ndarray, camera: Viewpoint) -> np.ndarray:
     """Ends (2k,3) of parallel lines, one set of all segments (n,2,3) after the other, side by side in the picture."""
     across = np.cross(ends[:, 1] - ends[:, 0], camera.forward)
     across /= np.maximum(np.linalg.norm(across, axis=1, keepdims=True), np.finfo(float).tiny)
@@ -149,7 +149,7 @@ def _bands(ends: np.ndarray, camera: Camera) -> np.ndarray:
     return np.concatenate([(ends + s * offset).reshape(-1, 3) for s in BAND])
 
 
-def arrows(tips: np.ndarray, arrow: np.ndarray, camera: Camera) -> np.ndarray:
+def arrows(tips: np.ndarray, arrow: np.ndarray, camera: Viewpoint) -> np.ndarray:
     """Return the lines of arrows (3,) or (k,3) that end at tips (k,3): a shaft and two head strokes in the picture's plane."""
     side = np.cross(arrow, camera.forward)
     starts = [arrow, *(HEAD * (arrow + s * 0.5 * side) for s in (-1.0, 1.0))]

@@ -25,7 +25,7 @@ from taisoft.backend.private import core, get_field_info
 from taisoft.backend.runtime import open_kind, open_runtime
 from taisoft.errors import OutputError
 from taisoft.mesh.placing import UP
-from taisoft.output.camera import Camera
+from taisoft.output.viewpoint import Viewpoint
 from taisoft.view.scene_view import Surfaces
 
 LINE_WIDTH = 2.0  # pixels
@@ -137,7 +137,7 @@ class Canvas:
         self,
         x: np.ndarray,
         colours: np.ndarray,
-        camera: Camera,
+        camera: Viewpoint,
         background: tuple,
         lines: tuple,
         decals: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None,

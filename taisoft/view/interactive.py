@@ -15,7 +15,7 @@ import rich
 
 from taisoft.errors import OutputError
 from taisoft.output.appearance import OBSTACLE_COLOUR, compact_surface, linear_rgb, obstacle_surfaces
-from taisoft.output.camera import Camera, framed_points
+from taisoft.output.viewpoint import Viewpoint, framed_points
 from taisoft.scene.obstacles import HalfSpace
 from taisoft.view.colouring import Colouring
 from taisoft.view.notebook import FramesOnPage
@@ -94,7 +94,7 @@ class InteractiveView(FramesOnPage):
         """
         import trimesh
 
-        camera = Camera.framing(framed_points(self._scene), up=self._scene.up)
+        camera = Viewpoint.framing(framed_points(self._scene), up=self._scene.up)
         server.scene.set_up_direction(f"+{self._scene.up}")
         server.initial_camera.position, server.initial_camera.look_at = tuple(camera.position), tuple(camera.target)
         server.initial_camera.fov = math.radians(camera.fov)

@@ -34,6 +34,8 @@ def describe_scene(scene, marks: ConnectionMarks) -> dict:
         "bodies": [
             {
                 "name": body.name,
+                "colour": body.colour,
+                "opacity": body.opacity,
                 "position": np.asarray(body.position),
                 "rest_positions": np.asarray(body.rest_positions),
                 "n_nodes": body.n_nodes,
@@ -50,6 +52,7 @@ def describe_scene(scene, marks: ConnectionMarks) -> dict:
         "obstacles": [
             {
                 "name": o.name,
+                "look": {"colour": o.colour, "opacity": o.opacity},
                 "shape": type(o.shape).__name__,
                 "fields": {field.name: getattr(o.shape, field.name) for field in fields(o.shape)},
                 "pose": None if o.path is None else o.pose(0.0),
@@ -81,7 +84,7 @@ class MirrorScene:
             parts = skin.weights
             skin.weights = sp.csr_matrix((parts.data, parts.indices, parts.indptr), shape=parts.shape)
         self.gravity, self.up = description["gravity"], description["up"]
-        self.obstacles = [Obstacle(SHAPES[o["shape"]](**o["fields"]), o["name"]) for o in description["obstacles"]]
+        self.obstacles = [Obstacle(SHAPES[o["shape"]](**o["fields"]), o["name"], **o["look"]) for o in description["obstacles"]]
         self.poses = {}
         self.take_poses({o["name"]: o["pose"] for o in description["obstacles"] if o["pose"] is not None})
 

@@ -8,8 +8,8 @@ from pathlib import Path
 from taisoft.display import caption
 from taisoft.errors import OutputError
 from taisoft.files import write_bytes
-from taisoft.output.camera import start_positions
 from taisoft.output.frames import FRAMES_NAME, png_bytes
+from taisoft.output.viewpoint import start_positions
 from taisoft.view.colouring import checked_colour
 from taisoft.view.offscreen import Offscreen, checked_size
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from taisoft.backend.runtime import open_kind, open_runtime
 from taisoft.errors import OutputError, value_text
-from taisoft.output.camera import MAX_WIDENING, Camera, framed_points
+from taisoft.output.viewpoint import MAX_WIDENING, Viewpoint, framed_points
 from taisoft.view.colouring import background
 from taisoft.view.raster import Raster
 from taisoft.view.scene_view import IN_PICTURES, SceneView
@@ -45,7 +45,7 @@ class Offscreen(SceneView):
         self,
         scene,
         size: tuple[int, int] = SIZE,
-        camera: Camera | None = None,
+        camera: Viewpoint | None = None,
         colour: str = "body",
         layers: tuple[str, ...] = IN_PICTURES,
         values: Callable | None = None,
@@ -102,8 +102,8 @@ class Offscreen(SceneView):
         return picture
 
     def look_from(self, scene, azimuth: float, elevation: float) -> None:
-        """Frame the scene's start from another direction [deg], as of `Camera`; the camera moves back as before."""
-        self.camera = Camera.framing(framed_points(scene), self.size, up=scene.up, azimuth=azimuth, elevation=elevation)
+        """Frame the scene's start from another direction [deg], as of `Viewpoint`; the camera moves back as before."""
+        self.camera = Viewpoint.framing(framed_points(scene), self.size, up=scene.up, azimuth=azimuth, elevation=elevation)
         self._widest = MAX_WIDENING * self.camera.distance
 
     def _triangles(self, x: np.ndarray, attributes: np.ndarray, lines: tuple) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from taisoft.mesh.solids import ray_hits
-from taisoft.output.camera import Camera
+from taisoft.output.viewpoint import Viewpoint
 
 PATCH = 0.1  # radius in units of the diagonal of the body's bounding box at rest
 MIN_NODES = 4  # with fewer nodes in the patch, only those that carry the point are dragged
@@ -41,7 +41,7 @@ def nearest_hit(origin: np.ndarray, direction: np.ndarray, x: np.ndarray, triang
     return None if np.isinf(along[t]) else (t, np.array([1 - u[t] - v[t], u[t], v[t]]))
 
 
-def pick(sim, camera: Camera, cursor: tuple[float, float], size: tuple[int, int]) -> Hit | None:
+def pick(sim, camera: Viewpoint, cursor: tuple[float, float], size: tuple[int, int]) -> Hit | None:
     """Return the point of a body under the cursor, or None.
 
     cursor: in [0, 1] from the window's lower left corner; size: (width, height) of the window.
@@ -86,7 +86,7 @@ class MouseDrag:
         self._offset = self._point(sim) - hit.point
         self.target = hit.point + self._offset
 
-    def move(self, camera: Camera, cursor: tuple[float, float], size: tuple[int, int]) -> bool:
+    def move(self, camera: Viewpoint, cursor: tuple[float, float], size: tuple[int, int]) -> bool:
         """Move the target with the cursor; return whether it changed."""
         before, ray, forward = self.target, camera.ray(cursor, size), camera.forward
         on_plane = camera.position + ray * ((self._plane - camera.position) @ forward / (ray @ forward))

@@ -35,7 +35,7 @@ class PictureOptions:
 
     size: width and height [pixels]; colour, layers: as for `Offscreen`; plots: names of those drawn; caption: the scene's name,
     or None for no caption; bar: whether there is a colour bar, for a colour other than "body"; kept: what an earlier run kept;
-    view: azimuth and elevation [deg], None for those of `Camera`.
+    view: azimuth and elevation [deg], None for those of `Viewpoint`.
     """
 
     size: tuple[int, int] = SIZE

@@ -16,8 +16,8 @@ import numpy as np
 
 from taisoft.errors import OutputError
 from taisoft.mesh.topology import linked_groups, triangle_edges
-from taisoft.output.appearance import OBSTACLE_COLOUR, ObstacleSurface, ShownBodies, body_colour, obstacle_surfaces, subdivide
-from taisoft.output.camera import MAX_WIDENING, Camera, framed_points, start_positions
+from taisoft.output.appearance import ObstacleSurface, ShownBodies, body_colours, obstacle_colour, obstacle_surfaces, subdivide
+from taisoft.output.viewpoint import MAX_WIDENING, Viewpoint, framed_points, start_positions
 from taisoft.scene.loads import value_at
 from taisoft.scene.obstacles import HalfSpace
 from taisoft.view.colouring import Colouring, lit_colours
@@ -55,13 +55,13 @@ class SceneView:
         self,
         scene,
         size: tuple[int, int],
-        camera: Camera | None,
+        camera: Viewpoint | None,
         colour: str,
         layers: tuple[str, ...],
         values: Callable | None = None,
         marks=None,
     ):
-        self.camera = camera or Camera.framing(framed_points(scene), size, up=scene.up)
+        self.camera = camera or Viewpoint.framing(framed_points(scene), size, up=scene.up)
         self._widest = 0.0 if camera else MAX_WIDENING * self.camera.distance  # largest automatic distance [m]; 0: fixed camera
         self.surfaces = Surfaces(scene)
         self.layers = Layers(scene, layers, marks)
@@ -86,10 +86,8 @@ class Surfaces:
 
     def __init__(self, scene):
         self._shown = ShownBodies(scene)
-        surfaces = zip(scene.bodies, self._shown.surfaces)
-        self._bodies = [
-            _BodySurface(body, *surface, body_colour(k), scene.constraints(body)) for k, (body, surface) in enumerate(surfaces)
-        ]
+        surfaces = zip(scene.bodies, self._shown.surfaces, body_colours(scene))
+        self._bodies = [_BodySurface(body, *surface, colour, scene.constraints(body)) for body, surface, colour in surfaces]
         fixed = [o.shape for o in scene.obstacles if isinstance(o.shape, HalfSpace) and o.path is None]
         self._obstacles = [_RigidSurface(surface, fixed) for surface in obstacle_surfaces(scene)]
         nodes = [body.nodes + start for body, start in zip(self._bodies, self._shown.starts)]
@@ -167,7 +165,7 @@ class Layers:
             for t in body.tractions
         ]
 
-    def lines(self, sim, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    def lines(self, sim, camera: Viewpoint) -> tuple[np.ndarray, np.ndarray]:
         """Return the ends (2k,3) [m] of the lines, as drawn for this camera, and their colours (2k,3)."""
         x = sim.positions()
         marks = self._contact_lines(sim) if self.shown["contacts"] else []
@@ -241,7 +239,7 @@ class _RigidSurface:
         self._nodes, self._corners = smoothing_groups(surface.vertices, surface.triangles)
         self._drawn: tuple | None = None  # the last vertices and eye, and what was drawn for them
         self.triangles = np.arange(self._corners.size).reshape(-1, 3)
-        self.colours = np.tile(OBSTACLE_COLOUR, (self._corners.size, 1))
+        self.colours = np.tile(obstacle_colour(surface.obstacle), (self._corners.size, 1))
 
     def at(self, t: float, bodies: np.ndarray) -> np.ndarray:
         """Return the vertices (n,3) [m] at time t [s], with bodies at (m,3) [m], all finite."""

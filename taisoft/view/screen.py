@@ -9,9 +9,9 @@ import taichi as ti
 
 from taisoft.errors import OutputError
 from taisoft.files import write_bytes
-from taisoft.output.camera import MAX_WIDENING, Camera
 from taisoft.output.files import make_folder
 from taisoft.output.frames import png_bytes
+from taisoft.output.viewpoint import MAX_WIDENING, Viewpoint
 from taisoft.view.colouring import BACKGROUND_TOP
 from taisoft.view.ggui import Canvas
 from taisoft.view.keys import ACTIONS
@@ -136,7 +136,7 @@ class Screen(SceneView):
         x = x[np.isfinite(x).all(axis=1)]
         if len(x):
             kept = {name: getattr(self.camera, name) for name in ("up", "azimuth", "elevation")}
-            self.camera = Camera.framing(x, size, **kept)
+            self.camera = Viewpoint.framing(x, size, **kept)
             self._widest = MAX_WIDENING * self.camera.distance
 
     def _move_camera(self, right: float, up: float, size) -> None:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from taisoft.mesh.placing import UP
-from taisoft.output.camera import start_positions
+from taisoft.output.viewpoint import start_positions
 from taisoft.view.raster import Raster
 
 TEXELS = 128  # per side of a map

@@ -8,7 +8,7 @@ from scipy.spatial import ConvexHull
 
 from taisoft.mesh.placing import UP
 from taisoft.output.appearance import OBSTACLE_COLOUR
-from taisoft.output.camera import Camera
+from taisoft.output.viewpoint import Viewpoint
 from taisoft.scene.obstacles import HalfSpace
 from taisoft.view.colouring import lit_colours
 from taisoft.view.shadow import MIN_SLOPE, TEXELS, Shadows
@@ -33,7 +33,7 @@ class ShadowMesh:
         self._triangles = np.concatenate([corner + [0, 1, side], corner + [1, side + 1, side]])
         self.size = (n_maps * side * side, n_maps * len(self._triangles))
 
-    def draw(self, x: np.ndarray, t: float, camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+    def draw(self, x: np.ndarray, t: float, camera: Viewpoint) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
         """Return positions [m] and lit colours (n,3) of the meshes and their triangles (t,3), or None without a shadow.
 
         x: (n,3) drawn vertices of `Surfaces`; t: time [s].

@@ -8,10 +8,10 @@ import pytest
 from pxr import Usd, UsdGeom
 
 import taisoft as ts
-from taisoft.output.camera import Camera
 from taisoft.output.connection_lines import ConnectionLines
 from taisoft.output.frame_table import FrameTable
 from taisoft.output.usd import UsdWriter
+from taisoft.output.viewpoint import Viewpoint
 from taisoft.view.colouring import COLOURS
 from taisoft.view.connection_layer import ATTACHED_COLOUR, PRESSURE_COLOUR, ConnectionMarks, PressureLayer
 from taisoft.view.offscreen import Offscreen
@@ -105,7 +105,7 @@ def hollow_scene() -> ts.Scene:
 @pytest.mark.parametrize("pressure", [2.0, -2.0])
 def test_arrows_point_along_the_force(pressure):
     """A push ends at the surface, a pull begins there; the longest belongs to the highest pressure."""
-    scene, camera = hollow_scene(), Camera(np.zeros(3), 10.0)
+    scene, camera = hollow_scene(), Viewpoint(np.zeros(3), 10.0)
     sim = SimpleNamespace(scene=scene, time=0.0, cavity_pressure={"water": pressure}.get)
     found = PressureLayer(ConnectionMarks(scene, 3.0)).lines(sim, scene.bodies[0].rest_positions, camera)
     shafts = [ends[: len(ends) // 3].reshape(-1, 2, 3) for ends, _ in found]  # of the side, then of the cavity

@@ -8,10 +8,10 @@ from pxr import Tf, Usd, UsdGeom, UsdLux, UsdShade
 
 from taisoft.dynamics.readout import nodal_impulses
 from taisoft.errors import OutputError
-from taisoft.output.camera import Camera, start_positions
 from taisoft.output.nodal_fields import NodalMean, von_mises
 from taisoft.output.usd import UsdWriter
 from taisoft.output.usd_scene import prim_names
+from taisoft.output.viewpoint import Viewpoint, start_positions
 from taisoft.scene.checks import store
 from taisoft.scene.obstacles import Sphere
 from tests.output.usd_stage import check_frames, faults
@@ -112,7 +112,7 @@ def test_the_camera_projects_like_that_of_the_images(tmp_path, up):
     scene = beam_scene()
     scene.up = up
     sim, writer, size = FakeSimulator(scene), UsdWriter(tmp_path, scene), (1600, 900)
-    camera, expected = Camera.framing(start_positions(scene), size, up=up), []
+    camera, expected = Viewpoint.framing(start_positions(scene), size, up=up), []
     for index in range(4):
         sim.time = 0.5 * index
         writer.frame(sim, index)

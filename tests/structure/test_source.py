@@ -53,7 +53,7 @@ ORDER = (
     ("dynamics.schemes",),
     ("settings",),
     ("dynamics",),
-    ("output.camera", "output.nodal_fields"),
+    ("output.viewpoint", "output.nodal_fields"),
     ("output.appearance", "view.shading"),
     ("view.colouring", "view.raster"),
     ("output.connection_lines",),

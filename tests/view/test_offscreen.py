@@ -10,7 +10,7 @@ import taisoft as ts
 from taisoft.backend.runtime import open_kind, open_runtime
 from taisoft.errors import OutputError, SimulationError
 from taisoft.mesh.placing import FROM_Y_UP
-from taisoft.output.camera import Camera, start_positions
+from taisoft.output.viewpoint import Viewpoint, start_positions
 from taisoft.view.colouring import COLOURS, Colouring, round_up
 from taisoft.view.ggui import Canvas
 from taisoft.view.offscreen import Offscreen, stroke
@@ -55,7 +55,7 @@ def test_falling_body_stays_in_the_picture():
     mask = body_mask(drawing.image(sim))
     assert first < drawing.camera.distance < 4 * first
     assert 170 <= np.flatnonzero(mask.any(axis=1)).max() <= 175, "complete, with a border of 3 % below"
-    image = Offscreen(scene, SIZE, Camera(np.array([0.0, 100.0, 0.0]), 5.0)).image(FakeSimulator(scene))
+    image = Offscreen(scene, SIZE, Viewpoint(np.array([0.0, 100.0, 0.0]), 5.0)).image(FakeSimulator(scene))
     assert not body_mask(image).any() and image.std(axis=1).max() == 0, "the background alone"
     drawing.look_from(scene, 90.0, 0.0)  # along the beam
     assert np.allclose(drawing.camera.forward, (-1, 0, 0))
@@ -226,7 +226,7 @@ def test_a_process_has_one_window_which_leaves_no_files(tmp_path, monkeypatch):
 @needs_vulkan
 def test_lines_that_are_gone_are_not_drawn_any_more():
     surfaces = Surfaces(beam_scene())
-    camera, n = Camera.framing(np.array([(-1.0, -1, -1), (1, 1, 1)])), len(surfaces.colours)
+    camera, n = Viewpoint.framing(np.array([(-1.0, -1, -1), (1, 1, 1)])), len(surfaces.colours)
     ends, red = np.array([(-0.5, 0, 0), (0.5, 0, 0), (0, -0.5, 0), (0, 0.5, 0)]), np.tile((1.0, 0.0, 0.0), (4, 1))
     canvas, pictures = Canvas(surfaces, SIZE, visible=False, n_segments=4), []
     try:

@@ -9,7 +9,7 @@ import pytest
 import taichi as ti
 
 import taisoft as ts
-from taisoft.output.camera import Camera
+from taisoft.output.viewpoint import Viewpoint
 from taisoft.view.controls import Controls, touching_pairs
 from taisoft.view.mirror import MirrorSimulation, describe_scene, describe_state
 from taisoft.view.panel import Panel, Requests
@@ -227,7 +227,7 @@ def test_keys(screen, tmp_path, cubes):
     assert [path.name for path in sorted((tmp_path / "out").iterdir())] == ["window-1.png", "window-2.png"]
     screen.camera = replace(screen.camera, target=np.ones(3), azimuth=70.0)
     act("h")
-    expected = Camera.framing(cubes.positions(), SIZE, azimuth=70.0, elevation=screen.camera.elevation)
+    expected = Viewpoint.framing(cubes.positions(), SIZE, azimuth=70.0, elevation=screen.camera.elevation)
     assert np.allclose(screen.camera.position, expected.position) and np.allclose(screen.camera.target, expected.target)
     assert not screen.closed
     act([ti.ui.ESCAPE])

@@ -8,7 +8,7 @@ import pytest
 import taisoft as ts
 from taisoft.errors import OutputError
 from taisoft.nested import from_json, to_json
-from taisoft.output.camera import framed_points
+from taisoft.output.viewpoint import framed_points
 from taisoft.records import StepReport
 from taisoft.scene.checks import store
 from taisoft.scene.plan import Plan

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import taisoft as ts
-from taisoft.output.camera import Camera
+from taisoft.output.viewpoint import Viewpoint
 from taisoft.scene.key_frames import KeyFrames
 from taisoft.view.ground import Square, finite_points
 from taisoft.view.mirror import MirrorSimulation, describe_scene, describe_state
@@ -81,7 +81,7 @@ def test_a_square_moves_along_with_the_bodies_and_grows():
         assert [low != pytest.approx(-2.0) for low, _ in extent(others, cloud((9.0, 1.0, 9.0)))] == moves
 
 
-ABOVE = Camera(target=np.array([0.0, 0.0, 0.0]), distance=8.0, azimuth=0.0, elevation=15.0)
+ABOVE = Viewpoint(target=np.array([0.0, 0.0, 0.0]), distance=8.0, azimuth=0.0, elevation=15.0)
 
 
 def cube_above(height, normal=(0.0, 1.0, 0.0), path=None):
@@ -187,7 +187,7 @@ def test_cursor_picks_and_drags_a_body(build, arguments):
     scene, size = build(*arguments), (1600, 900)
     real, marks, body = FakeSimulator(scene), marks_of(scene), scene.bodies[-1]
     real.time, n = 1.0, sum(body.n_nodes for body in scene.bodies)
-    sim, camera, x = MirrorSimulation(describe_scene(scene, marks), n), Camera.framing(real.positions()), real.positions("two")
+    sim, camera, x = MirrorSimulation(describe_scene(scene, marks), n), Viewpoint.framing(real.positions()), real.positions("two")
     sim.take(describe_state(real, marks, set()) | {"colour": "body"}, real.positions(), np.zeros(n))
     skin = body.riding_skin
     shown, triangles = (x, body.nodes.surface) if skin is None else (skin.weights @ x, skin.surface.triangles)
@@ -222,7 +222,7 @@ def test_cursor_picks_and_drags_a_body(build, arguments):
 def test_lines_of_layers():
     scene = beam_scene()
     scene.bodies[0].add_traction(lambda c: c[:, 0] > 1.99, (0, 0, 50.0))
-    sim, layers, camera = FakeSimulator(scene), Layers(scene), Camera.framing(scene.bodies[0].rest_positions)
+    sim, layers, camera = FakeSimulator(scene), Layers(scene), Viewpoint.framing(scene.bodies[0].rest_positions)
     contacts, found = sim.contacts(), {}
     loaded = 2 * 2 * 2  # triangles of the end
     counts = {"wires": 3 * len(scene.bodies[0].mesh.surface) // 2, "contacts": 2, "tractions": 3 * loaded, "fixed_nodes": 0}

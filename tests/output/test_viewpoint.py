@@ -6,7 +6,7 @@ import pytest
 import taisoft as ts
 from benchmarks.numpy_raster import rasterise
 from taisoft.mesh.placing import FROM_Y_UP
-from taisoft.output.camera import Camera, framed_points, start_positions
+from taisoft.output.viewpoint import Viewpoint, framed_points, start_positions
 
 SIZE = (320, 180)
 
@@ -14,7 +14,7 @@ SIZE = (320, 180)
 @pytest.mark.parametrize("azimuth, elevation", [(0, 0), (32, 20), (140, -60), (270, 89)])
 def test_framing_shows_all_points(azimuth, elevation):
     points = np.random.default_rng(0).uniform(-1, 1, (200, 3)) * (4, 1, 1) + (10, 20, 30)
-    camera = Camera.framing(points, azimuth=azimuth, elevation=elevation)
+    camera = Viewpoint.framing(points, azimuth=azimuth, elevation=elevation)
     projected = camera.project(points, SIZE)
     assert (projected[:, 2] > 0).all()
     fill = np.abs(2 * projected[:, :2] / SIZE - 1).max(axis=0)  # of the picture's width and height
@@ -33,7 +33,7 @@ def falling_cube(height: float, gravity=(0, -9.81, 0), normal=(0, 1, 0)) -> ts.S
 def test_the_first_picture_shows_the_ground_below_a_falling_body():
     points = framed_points(falling_cube(2.0))
     assert points[:, 1].min() == pytest.approx(0.0) and points[:, 1].max() == pytest.approx(3.0) and len(points) == 16
-    camera = Camera.framing(points, SIZE)
+    camera = Viewpoint.framing(points, SIZE)
     down = camera.project(points, SIZE)[:, 1]
     assert down.min() > 0.15 * SIZE[1] and down.max() < 0.85 * SIZE[1] and camera.target[1] == pytest.approx(1.5)
     tilted = falling_cube(2.0, normal=(1, 1, 0))
@@ -53,11 +53,11 @@ def test_a_fall_is_framed_only_where_it_is_known():
 
 def test_projection_is_that_of_a_pinhole_camera():
     """Which rays invert."""
-    camera = Camera(target=np.zeros(3), distance=10.0, azimuth=0.0, elevation=0.0, fov=90.0)
+    camera = Viewpoint(target=np.zeros(3), distance=10.0, azimuth=0.0, elevation=0.0, fov=90.0)
     projected = camera.project(np.array([[1.0, 0, 0], [0, 2.0, 0], [0, 0, 5.0], [1.0, 0, 5.0]]), (200, 100))
     # half the height, 50 pixels, is 10 m at a depth of 10 m: 5 pixels per metre, 10 at 5 m; x right, y up, z towards the camera
     assert np.allclose(projected, [[105, 50, 10], [100, 40, 10], [100, 50, 5], [110, 50, 5]])
-    camera = Camera(target=np.array([1.0, 2, 3]), distance=4.0, azimuth=70.0, elevation=-30.0)
+    camera = Viewpoint(target=np.array([1.0, 2, 3]), distance=4.0, azimuth=70.0, elevation=-30.0)
     for point in np.random.default_rng(1).uniform(-1, 1, (20, 3)) + camera.target:
         across, down, _ = camera.project(point[None], SIZE)[0]
         ray = camera.ray((across / SIZE[0], 1 - down / SIZE[1]), SIZE)
@@ -65,7 +65,7 @@ def test_projection_is_that_of_a_pinhole_camera():
 
 
 def test_orbit_zoom_and_pan():
-    camera = Camera(target=np.zeros(3), distance=10.0, azimuth=350.0, elevation=80.0)
+    camera = Viewpoint(target=np.zeros(3), distance=10.0, azimuth=350.0, elevation=80.0)
     orbited, panned = camera.orbit(20.0, 50.0), camera.pan(0.0, 0.25)  # up by a quarter of the picture's height
     assert orbited.azimuth == pytest.approx(10.0) and orbited.elevation == 89.0
     assert np.linalg.norm(orbited.position - orbited.target) == pytest.approx(10.0) and camera.zoom(0.5).distance == 5.0
@@ -76,15 +76,15 @@ def test_a_camera_with_z_up_is_one_with_y_up_turned():
     """At azimuth 0 it looks along y, at 90 along -x; turning it leaves the horizon level."""
     turn, points = FROM_Y_UP["z"], np.random.default_rng(2).uniform(-1, 1, (20, 3))
     for azimuth, elevation in ((0.0, 0.0), (90.0, 0.0), (32.0, -40.0)):
-        upright = Camera.framing(points, azimuth=azimuth, elevation=elevation).orbit(10.0, 20.0)
-        turned = Camera.framing(points @ turn.T, up="z", azimuth=azimuth, elevation=elevation).orbit(10.0, 20.0)
+        upright = Viewpoint.framing(points, azimuth=azimuth, elevation=elevation).orbit(10.0, 20.0)
+        turned = Viewpoint.framing(points @ turn.T, up="z", azimuth=azimuth, elevation=elevation).orbit(10.0, 20.0)
         assert np.allclose(turned.position, turn @ upright.position) and np.allclose(turned.axes, upright.axes @ turn.T)
         assert abs(turned.axes[0, 2]) < 1e-15
-    assert np.allclose([Camera(azimuth=a, elevation=0.0, up="z").forward for a in (0.0, 90.0)], [(0, 1, 0), (-1, 0, 0)])
+    assert np.allclose([Viewpoint(azimuth=a, elevation=0.0, up="z").forward for a in (0.0, 90.0)], [(0, 1, 0), (-1, 0, 0)])
 
 
 def test_camera_moves_back_from_approaching_bodies():
-    camera = Camera(target=np.zeros(3), distance=10.0, azimuth=0.0, elevation=0.0, fov=90.0)
+    camera = Viewpoint(target=np.zeros(3), distance=10.0, azimuth=0.0, elevation=0.0, fov=90.0)
     near = np.array([[0.0, 1, 0], [2, 0, 0]])
     border = 40 / camera.widened(np.array([[0.0, -40, 0]]), (200, 100), 100.0).distance
     assert 0.9 < border < 1
@@ -100,7 +100,7 @@ def test_floor_that_reaches_behind_the_camera_is_clipped():
     floor = [[-half, 0, -half], [half, 0, -half], [half, 0, half], [-half, 0, half]]
     corners = np.array([*floor, [0, 1, -9], [1, 1, -9], [0, 2, -9], [0, 1, 9], [1, 1, 9], [0, 2, 9]])
     shades, triangles = (corners + half) / (2 * half), np.array([[0, 2, 1], [0, 3, 2], [4, 5, 6], [7, 8, 9]])
-    camera = Camera(target=np.array([0.0, 0.5, 0.0]), distance=3.0, azimuth=20.0, elevation=10.0)
+    camera = Viewpoint(target=np.array([0.0, 0.5, 0.0]), distance=3.0, azimuth=20.0, elevation=10.0)
     x, cut, colours = camera.clipped(corners, triangles, shades, SIZE)
     assert not (cut == 7).any() and np.array_equal(x[: len(corners)], corners) and (cut == [4, 5, 6]).all(axis=1).sum() == 1
     image, below = np.zeros((height, width, 3), dtype=np.uint8), (cut != [4, 5, 6]).all(axis=1)
@@ -122,7 +122,7 @@ def test_floor_that_reaches_behind_the_camera_is_clipped():
 
 
 def test_lines_are_clipped_at_the_near_plane():
-    camera = Camera(target=np.zeros(3), distance=10.0, azimuth=0.0, elevation=0.0)
+    camera = Viewpoint(target=np.zeros(3), distance=10.0, azimuth=0.0, elevation=0.0)
     ahead, behind = np.array([0.0, 1, 0]), np.array([0.0, 1, 20])
     ends = np.array([ahead, behind, behind, ahead, ahead, 2 * ahead, behind, behind + 1, ahead, [0, np.nan, 0]])
     colours = np.repeat(np.arange(10) / 10, 3).reshape(-1, 3)

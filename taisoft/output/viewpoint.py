@@ -6,7 +6,7 @@ from functools import cached_property
 
 import numpy as np
 
-from taisoft.mesh.placing import FROM_Y_UP, UP
+from taisoft.mesh.placing import FROM_Y_UP
 from taisoft.scene.obstacles import HalfSpace
 
 MAX_ELEVATION = 89.0  # [deg]; at 90 "up" is undefined
@@ -47,6 +47,20 @@ def _landed(scene, x: np.ndarray, longest: float) -> np.ndarray:
     return x + min(*depths, longest) / strength * np.asarray(scene.gravity)
 
 
+def camera_viewpoint(scene, t: float, x: np.ndarray) -> "Viewpoint | None":
+    """Return where the scene's own camera is at time t [s], with all nodes at x (n,3) [m]; None without a camera."""
+    if scene.camera is None:
+        return None
+    at, first = scene.camera.at(t, scene.up), 0
+    for body in scene.bodies:
+        if body.name == scene.camera.follow:
+            moved = x[first : first + body.n_nodes] - (body.rest_positions + body.position)
+            moved = moved[np.isfinite(moved).all(axis=1)]
+            at["target"] = at["target"] + (moved.mean(axis=0) if len(moved) else 0.0)
+        first += body.n_nodes
+    return Viewpoint(**at)
+
+
 def clip_polygon(polygon: np.ndarray, k: int = 0) -> np.ndarray:
     """Clip a convex polygon to the side of a plane where the height is not negative (Sutherland and Hodgman 1974).
 
@@ -62,7 +76,7 @@ def clip_polygon(polygon: np.ndarray, k: int = 0) -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class Camera:
+class Viewpoint:
     """A camera aimed at target (3,) [m] from a distance [m].
 
     azimuth [deg] about up: 0 looks along -z (with z up: +y), 90 along -x; elevation [deg] above the horizon; fov [deg]: vertical
@@ -77,7 +91,7 @@ class Camera:
     up: str = "y"
 
     @classmethod
-    def framing(cls, points: np.ndarray, size: tuple[int, int] = (16, 9), **angles) -> "Camera":
+    def framing(cls, points: np.ndarray, size: tuple[int, int] = (16, 9), **angles) -> "Viewpoint":
         """Return a camera aimed at the centre of the bounding box of points (n,3), which fill FILL of the picture.
 
         size: width and height of the picture, in any unit.
@@ -100,8 +114,8 @@ class Camera:
     @cached_property
     def axes(self) -> np.ndarray:
         """Orthonormal axes of the picture (3,3), rows right, up, forward."""
-        right = np.cross(self.forward, UP[self.up])
-        right /= np.linalg.norm(right)
+        azimuth = math.radians(self.azimuth)  # from straight above, "up" gives no direction
+        right = FROM_Y_UP[self.up] @ np.array([math.cos(azimuth), 0.0, -math.sin(azimuth)])
         return np.array([right, np.cross(right, self.forward), self.forward])
 
     @property
@@ -114,7 +128,7 @@ class Camera:
         """Distances of the near and the far clipping plane [m]."""
         return NEAR * self.distance, FAR * self.distance
 
-    def widened(self, points: np.ndarray, size: tuple[int, int], limit: float) -> "Camera":
+    def widened(self, points: np.ndarray, size: tuple[int, int], limit: float) -> "Viewpoint":
         """Return the camera moved back, to limit [m] at most, until points (n,3) lie within the picture less BORDER.
 
         size: width and height of the picture. Never moves nearer; points that are not finite are ignored.
@@ -174,16 +188,16 @@ class Camera:
         lines[crossing, behind] = a + (h[:, 0] / (h[:, 0] - h[:, 1]))[:, None] * (b - a)
         return lines[..., :3].reshape(-1, 3), lines[..., 3:].reshape(-1, 3)
 
-    def orbit(self, azimuth: float, elevation: float) -> "Camera":
+    def orbit(self, azimuth: float, elevation: float) -> "Viewpoint":
         """Return the camera turned about the target by angles [deg]; elevation is limited to MAX_ELEVATION."""
         raised = min(max(self.elevation + elevation, -MAX_ELEVATION), MAX_ELEVATION)
         return replace(self, azimuth=(self.azimuth + azimuth) % 360.0, elevation=raised)
 
-    def zoom(self, factor: float) -> "Camera":
+    def zoom(self, factor: float) -> "Viewpoint":
         """Return the camera with its distance multiplied by factor."""
         return replace(self, distance=self.distance * factor)
 
-    def pan(self, right: float, up: float) -> "Camera":
+    def pan(self, right: float, up: float) -> "Viewpoint":
         """Return the camera moved in the picture's plane, in units of the picture's height at the target."""
         height = 2 * self.distance * self.slope
         return replace(self, target=self.target + height * (right * self.axes[0] + up * self.axes[1]))
